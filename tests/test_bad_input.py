@@ -193,9 +193,9 @@ MERGE = {
     "nowhere --out x": "run = nowhere holds no manifest.json: give the folder of a run",
     "file --out x": "run = file holds no manifest.json",
     "cut --out x": "cut/manifest.json is corrupt",
-    "lacking --out x": "run = lacking is not of a sweep: give the folder of",
+    "lacking --out x": "run = lacking does not hold a sweep: give the folder of",
     "run --out x": "run = run lacks 1 of 1 parts: run the same command again",
-    "run in_c --out x": "run = in_c is of another plan than run .engine = 'mjx' there",
+    "run in_c --out x": "run = in_c has another plan than run .engine = 'mjx' there",
     "run --out file": "out = file cannot be written",
 }
 REPLAY = {
@@ -213,8 +213,8 @@ REPLAY = {
     "few 0": "few/manifest.json is corrupt .parameters of RPSParams are eta, .* and not L.:",
     "laws 0": "laws/manifest.json is corrupt",
     "physics 0": "physics/manifest.json is corrupt .timestep = -1 is not allowed",
-    "older 0": "run = older was made by another version .rules.max_lost = 'nothing' there, 150",
-    "arms 0": "run = arms was made by rps_jax 0.2.0: use that version",
+    "older 0": "run = older was written by another version .rules.max_lost = 'nothing' there, 150",
+    "arms 0": "run = arms was written by rps_jax 0.2.0: use that version",
 }
 VIEW = {
     "--object sphere": "unknown object 'sphere': choose from box",
@@ -250,7 +250,7 @@ FILM = {
     "run --out folder.json": "out = folder.json is a folder: name a file",
     "run --out file/film.mp4": "out = file cannot be written",
     "cut": "cut/manifest.json is corrupt",
-    "done": "run = done is not of a sweep: give the folder of",
+    "done": "run = done does not hold a sweep: give the folder of",
     "file": "run = file holds no manifest.json",
     "table --object cylinder": "unknown object of the run 'cylinder': choose from box",
     "table --law aps": "unknown law of the run 'aps': choose from rps, nps",

@@ -95,7 +95,7 @@ def test_a_reader_that_we_did_not_write_opens_the_bag(recorded):
                 pose = message.pose.pose.position.x, message.pose.pose.position.y
     assert counts["/odom"] == counts["/cmd_vel"] == counts["/taxels"] == 301
     assert counts["/target_marker"] == 7
-    np.testing.assert_allclose(pose, trace.followed.snapshots.qpos[50, :2], atol=1e-7)
+    np.testing.assert_allclose(pose, trace.trajectory.snapshots.qpos[50, :2], atol=1e-7)
 
 
 def test_the_commands_write_and_shadow_a_bag(tmp_path, capsys, recorded):

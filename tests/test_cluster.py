@@ -33,7 +33,7 @@ SWEEP = [
 
 def test_a_task_has_parts_of_one_kind_and_every_part_one_task():
     kinds = [list(range(0, 20)), list(range(20, 27))]
-    tasks = list(cluster._divided(kinds, 3))
+    tasks = list(cluster._divide(kinds, 3))
     assert [number for task in tasks for number in task] == list(range(27))
     assert all(set(task) <= set(kinds[0]) or set(task) <= set(kinds[1]) for task in tasks)
     assert len(tasks) == 10 + 7  # four of each worker and kind, at most
@@ -45,11 +45,11 @@ def test_room_for_workers_by_hand():
         {"Alive": True, "Resources": {"CPU": 3.0, "GPU": 4.0}},
         {"Alive": False, "Resources": {"CPU": 8.0, "GPU": 8.0}},
     ]
-    assert cluster._room(hosts, 1, 0) == 11
-    assert cluster._room(hosts, 3, 0) == 3
-    assert cluster._room(hosts, 1, 1) == 3
+    assert cluster._count_workers(hosts, 1, 0) == 11
+    assert cluster._count_workers(hosts, 3, 0) == 3
+    assert cluster._count_workers(hosts, 1, 1) == 3
     with pytest.raises(InputError, match=r"workers = 9 .* so many processors"):
-        cluster._room(hosts, 9, 0)
+        cluster._count_workers(hosts, 9, 0)
 
 
 # --- without a cluster ---------------------------------------------------------------------

@@ -170,7 +170,7 @@ def test_outcomes_are_written_as_a_long_table(tmp_path, monkeypatch):
     ("options", "words"),
     [
         ({"table": "results.xls"}, "name a file NAME.csv or NAME.parquet"),
-        ({"table": "nowhere/results.csv"}, "nowhere is no folder"),
+        ({"table": "nowhere/results.csv"}, "nowhere is not a folder"),
         ({"table": "r.csv", "shard": "1/2", "out": "run"}, "table is not allowed with a shard"),
         ({"table": "results.parquet"}, "run pip install pyarrow, or name a .csv file"),
     ],

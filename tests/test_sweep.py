@@ -353,7 +353,7 @@ def test_the_report_of_one_world_says_how_to_replay_its_failure(whole, tmp_path)
     results = merge([folder], out=folder)
     one = results.isel(world=[0])
     one.success[:] = [[1], [0]]
-    text = str(sweep.report_of(load_plan(folder), one, folder))
+    text = str(sweep.plan_sections(load_plan(folder), one, folder))
     assert f"rps replay '{folder}' 0 --law nps" in text  # the law that fails
     assert tables.influence_table(one, "rps")[1:] == []
 

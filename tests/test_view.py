@@ -96,7 +96,7 @@ def test_every_kind_of_law_is_shown_live(law, tmp_path, monkeypatch, registries)
     push = shown.push_of(request)
     push.live.step(25)
     assert law in push.title
-    assert push.live.past[-1].seen.qpos[0] > 0.002  # [m] it drives
+    assert push.live.past[-1].snapshot.qpos[0] > 0.002  # [m] it drives
 
 
 # --- the trial -----------------------------------------------------------------------------
@@ -109,7 +109,7 @@ def test_a_push_that_is_left_alone_ends_as_any_other_trial(live):
     assert live.done
     for name, value in live.outcome._asdict().items():
         np.testing.assert_allclose(value, getattr(found, name)[0], atol=1e-5, err_msg=name)
-    assert live.past[-1].seen.time == pytest.approx(float(found.time[0]), abs=1e-4)
+    assert live.past[-1].snapshot.time == pytest.approx(float(found.time[0]), abs=1e-4)
 
 
 def test_a_target_that_is_dragged_is_the_one_that_counts(live):
@@ -134,14 +134,16 @@ def test_a_target_that_is_dragged_is_the_one_that_counts(live):
 def test_a_shove_moves_the_object_once_in_the_frame_of_the_robot(live):
     live.set_target((0.0, 3.0))
     live.step(250)
-    before = p_robot_object(live.past[-1].seen)
-    assert abs(live.past[-1].seen.qpos[2]) > 0.05  # turned, so that the frames differ
+    before = p_robot_object(live.past[-1].snapshot)
+    assert abs(live.past[-1].snapshot.qpos[2]) > 0.05  # turned, so that the frames differ
     live.shove((0.3, -0.2))
     live.step(1)
-    np.testing.assert_allclose(p_robot_object(live.past[-1].seen) - before, (0.3, -0.2), atol=3e-3)
-    shoved = live.past[-1].seen.qpos[3:5]
+    np.testing.assert_allclose(
+        p_robot_object(live.past[-1].snapshot) - before, (0.3, -0.2), atol=3e-3
+    )
+    shoved = live.past[-1].snapshot.qpos[3:5]
     live.step(2)
-    assert math.dist(live.past[-1].seen.qpos[3:5], shoved) < 3e-3
+    assert math.dist(live.past[-1].snapshot.qpos[3:5], shoved) < 3e-3
 
 
 def test_a_shove_after_the_end_happens_once(live):
@@ -153,12 +155,12 @@ def test_a_shove_after_the_end_happens_once(live):
     assert live.done
     live.shove((0.0, 0.02))
     live.step(1)
-    shoved = live.past[-1].seen.qpos[3:5]
+    shoved = live.past[-1].snapshot.qpos[3:5]
     for _ in range(3):  # the trial ends again at once, at the same step of its clock
         live.set_target(tuple(p_world_contact(live)))
         live.step(1)
         assert live.done
-    assert math.dist(live.past[-1].seen.qpos[3:5], shoved) < 3e-3
+    assert math.dist(live.past[-1].snapshot.qpos[3:5], shoved) < 3e-3
 
 
 def test_going_back_forgets_what_came_after(live):
@@ -170,7 +172,7 @@ def test_going_back_forgets_what_came_after(live):
     live.step(5)
     live.rewind(20)
     live.step(39)
-    np.testing.assert_array_equal(last.seen.qpos, live.past[-1].seen.qpos)
+    np.testing.assert_array_equal(last.snapshot.qpos, live.past[-1].snapshot.qpos)
 
 
 def test_the_foam_gives_way_only_where_the_object_is_felt(live):

@@ -111,20 +111,23 @@ class Drawing:
     def show(self, past: Sequence[Moment], index: int) -> None:
         """Draw one moment, and the paths up to there."""
         moment = past[index]
-        x, y, yaw = map(float, moment.seen.qpos[:3])
+        x, y, yaw = map(float, moment.snapshot.qpos[:3])
         self._base.position = (x, y, 0.0)
         self._base.wxyz = (math.cos(yaw / 2), 0.0, 0.0, math.sin(yaw / 2))
-        self._object.position, self._object.wxyz = moment.seen.qpos[3:6], moment.seen.qpos[6:10]
+        self._object.position, self._object.wxyz = (
+            moment.snapshot.qpos[3:6],
+            moment.snapshot.qpos[6:10],
+        )
         colour = _SKIN + moment.compression[:, None] * (_PRESSED - _SKIN)
         self._taxels.batched_colors = np.round(colour).astype(np.uint8)
-        touching = int(moment.seen.reading.contact_type) != NONE
+        touching = int(moment.snapshot.reading.contact_type) != NONE
         self._contact.visible = touching
         if touching:
-            felt = map(float, moment.seen.reading.p_robot_contact)
+            felt = map(float, moment.snapshot.reading.p_robot_contact)
             self._contact.position = (*felt, rendering.CONTACT_HEIGHT + 0.03)
-        self._show_twist(*map(float, moment.seen.twist))
+        self._show_twist(*map(float, moment.snapshot.twist))
         way = [past[i] for i in (*range(0, index, _PATH_STEP), index)]
-        self._paths["base_path"].points = _joined(np.array([m.seen.qpos[:2] for m in way]))
+        self._paths["base_path"].points = _joined(np.array([m.snapshot.qpos[:2] for m in way]))
         self._paths["contact_path"].points = _joined(np.array([m.p_world_contact for m in way]))
 
     def _show_twist(self, v_x: float, v_y: float, omega: float) -> None:

@@ -1,8 +1,7 @@
 """Laws for robots and browsers: `rps export c`, `rps export js`, `rps export onnx`."""
 
-import contextlib
 import functools
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,11 +14,12 @@ from rps_jax.record import files, folder
 from rps_jax.record.options import option
 from rps_jax.robot.robot import RobotLike
 from rps_jax.robot.skin import SkinLike
-from rps_jax.runs.question import Question, Run, call_of
+from rps_jax.runs.question import Action, call_of
+from rps_jax.trials.progress import ProgressCallback
 
 
 @dataclass(frozen=True)
-class Export(Question[Path]):
+class Export(Action[Path]):
     """Export of a law with its parameters, and of the skin of a robot, to another language."""
 
     law: LawLike = "rps_plus"
@@ -53,15 +53,11 @@ class Export(Question[Path]):
         _ = self.program
         folder.ensure_writable(Path(self.out or self.default_folder))
 
-    @contextlib.contextmanager
-    def open_folder(self) -> Iterator[None]:
-        yield None
-
     def texts(self) -> Mapping[str, str | bytes]:
         """Return the contents of the files, by name."""
         raise NotImplementedError
 
-    def answer(self, run: Run) -> Path:
+    def perform(self, callback: ProgressCallback) -> Path:
         out, texts = Path(self.out or self.default_folder), self.texts()
         for name, text in texts.items():
             files.write_bytes(out / name, text if isinstance(text, bytes) else text.encode())

@@ -5,7 +5,6 @@ Neither trajectories nor images are stored, so memory does not grow with the fil
 
 from __future__ import annotations
 
-import contextlib
 import math
 import re
 from collections.abc import Iterator, Sequence
@@ -25,7 +24,7 @@ from rps_jax.record import files, folder
 from rps_jax.record.options import option
 from rps_jax.runs.plan import Plan, build_batch, scene_of
 from rps_jax.runs.push import another_engine, select_law
-from rps_jax.runs.question import Question, Run, call_of
+from rps_jax.runs.question import Action, call_of
 from rps_jax.studies.table import table_of
 from rps_jax.trials import pushes, trial
 from rps_jax.trials.batch import WorldBatch, rows
@@ -45,7 +44,7 @@ _FPS = 12  # frames per second
 
 
 @dataclass(frozen=True)
-class Film(Question[Path]):
+class Film(Action[Path]):
     """Film many trials of a run side by side: the targets of a table, or worlds of a sweep."""
 
     run: str | Path = option("", positional=True)
@@ -114,18 +113,13 @@ class Film(Question[Path]):
         """Simulated time that is filmed, at most [s]."""
         return min(float(setting.rules.horizon), self.seconds or math.inf)
 
-    @contextlib.contextmanager
-    def open_folder(self) -> Iterator[None]:
-        """No run folder."""
-        yield None
-
-    def answer(self, run: Run) -> Path:
+    def perform(self, callback: ProgressCallback) -> Path:
         """Run the trials again and film them."""
         takes, setting = self.takes()
         seconds, out = self._length(setting), Path(self.out or self.default_folder)
         speed = self.speed or float(max(1, math.ceil(seconds / _LENGTH)))
         of_takes = [list(map(Tile, take.scenes, take.part.worlds.p_world_target)) for take in takes]
-        frames = _frames(takes, setting, speed, seconds, run.callback)
+        frames = _frames(takes, setting, speed, seconds, callback)
         size = _tile_size(self.shape)
         grid = {"shape": self.shape, "size": size, "fps": _FPS, "camera": self.camera}
         try:
@@ -289,7 +283,7 @@ def _shots(take: Take, setting: Setting, interval: int) -> Iterator[tuple[bool, 
     trials = trial.start_all(
         part.worlds, part.params, np.ones(len(take.labels), bool), law=take.law
     )
-    advance = pushes.recorder(part, trials, setting, take.law, steps=interval, every=interval)
+    advance = pushes.recorder(part, trials, setting, take.law, steps=interval, stride=interval)
     shots: list[Shot] = []
     ended = np.zeros(len(take.labels), bool)
     while True:

@@ -31,9 +31,10 @@ from rps_jax.record.options import option
 from rps_jax.runs.plan import Plan, build_batch, scene_of, world_title
 from rps_jax.runs.push import Push as PushQuestion
 from rps_jax.runs.push import another_engine, case_options, select_law
-from rps_jax.runs.question import call_of
+from rps_jax.runs.question import Action, call_of
 from rps_jax.trials import pushes
 from rps_jax.trials.case import Case, label_of
+from rps_jax.trials.progress import Bar, ProgressCallback
 from rps_jax.trials.stepper import CHUNK, Live
 from rps_jax.world import objects
 from rps_jax.world.scene import Scene
@@ -61,7 +62,7 @@ class Push(NamedTuple):
 
 
 @dataclass(frozen=True)
-class View(PushQuestion):
+class View(Action[Any], PushQuestion):
     """Push in the browser: watch, drag the target, shove the object, push again."""
 
     law: LawLike | None = None
@@ -113,7 +114,11 @@ class View(PushQuestion):
             Path(str(self.run)), self.world, None if self.law is None else str(self.law)
         )
 
-    def in_shell(self) -> None:
+    def progress_bar(self) -> Bar:
+        """Return no bar: the page shows the trial."""
+        return Bar(self.name, shown=False)
+
+    def perform(self, callback: ProgressCallback) -> None:
         """Serve the page until it is ended."""
         law = self._law_of_options if isinstance(self._law_of_options, str) else "rps"
         friction = self.friction if isinstance(self.friction, str) else label_of(self.friction)
@@ -319,7 +324,7 @@ class Page:
 
     def _state_text(self, live: Live) -> str:
         index = min(int(self._cursor), len(live.past) - 1)
-        moment = live.past[index].seen
+        moment = live.past[index].snapshot
         words = [f"{index * live.period:.1f} s"]
         words.append(f"{float(moment.details.distance):.2f} m to the target")
         words.append(_CONTACTS[int(moment.reading.contact_type)])

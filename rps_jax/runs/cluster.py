@@ -1,13 +1,13 @@
-"""A sweep on several hosts, through Ray: its parts go to workers, and their files come back.
+"""A sweep on several hosts through Ray: workers run chunks, and this process stores their files.
 
-A task runs some parts of one kind on one GPU, or on processors where the cluster has no GPU, and
-returns their contents. Ray gives tasks to whichever worker is free, and begins a task again when
-its worker dies. The hosts need not share a file system: the process that was started by the user,
-alone, writes into the run folder.
+A task runs some chunks of one program on one GPU, or on processors where the cluster has no GPU,
+and returns their contents. Ray gives tasks to free workers, and restarts a task when its worker
+dies. The hosts need no shared file system: only the process that the user started writes into the
+run folder.
 
-A part has the bits that one process gives it which sees one GPU, or processors alone, with as many
-`slots`: whatever the number of workers and threads, whichever worker runs it, and with whatever
-other parts. That asks for devices of one kind; versions and commit are compared in every task.
+A chunk has the same bits as in one process that uses one GPU, or processors alone, with as many
+`slots`. The number of workers and threads, the worker and the other chunks do not matter. All
+devices must be of one kind; every task compares versions and commit.
 """
 
 import contextlib
@@ -18,7 +18,7 @@ import math
 import os
 import socket
 import warnings
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -34,8 +34,10 @@ from rps_jax.runs.plan import Plan, Shard
 from rps_jax.trials.progress import Progress, ProgressCallback, no_progress
 
 PATIENCE = 10.0  # [s] to reach a cluster
-RETRIES = 16  # how often a task is begun again
-_TASKS = 4  # of each worker and kind, so that little is lost with a worker
+RETRIES = 16  # of a task
+_TASKS = 4  # per worker and program, so that little work is lost with a worker
+
+Environment = dict[str, Any]  # JSON record of versions, devices and host
 
 
 # --- a worker ------------------------------------------------------------------------------
@@ -44,33 +46,31 @@ _TASKS = 4  # of each worker and kind, so that little is lost with a worker
 def _work(
     plan: Plan,
     numbers: Sequence[int],
-    same: dict[str, Any],
-    prepare: Callable[[], Any],
+    software: Environment,
+    prepare: Callable[[], object],
     slots: int | None,
     threads: int,
-) -> tuple[dict[int, bytes], Progress, dict[str, Any]]:
-    """Run parts of one kind, as a task of Ray: their contents, progress, and the environment."""
+) -> tuple[dict[int, bytes], Progress, Environment]:
+    """Run chunks of one program as a task of Ray; return contents, progress and environment."""
     prepare()
-    environment = devices.collect_environment() | {
-        "host": socket.gethostname(),
-        "pid": os.getpid(),
-    }
-    if _same(environment) != same:
+    environment = devices.collect_environment()
+    environment |= {"host": socket.gethostname(), "pid": os.getpid()}
+    if _software(environment) != software:
+        difference = run_folder.describe_difference(_software(environment), software)
         raise InputError(
-            f"ray: host {environment['host']} has other software "
-            f"({run_folder.describe_difference(_same(environment), same)}): install the same on "
-            "all hosts."
+            f"ray: host {environment['host']} has other software ({difference}): install the same "
+            "on all hosts."
         )
-    found, heard = dict[int, bytes](), [Progress(0, 0.0)]
+    contents, progress = dict[int, bytes](), [Progress(0, 0.0)]
     execution.run_chunks(
         plan,
         {plan.program_key(numbers[0]): numbers},
-        lambda number, part: found.update({number: results.encoded(part)}),
-        callback=heard.append,
+        lambda number, chunk: contents.update({number: results.encoded(chunk)}),
+        callback=progress.append,
         slots=slots,
         workers=threads,
     )
-    return found, heard[-1], environment
+    return contents, progress[-1], environment
 
 
 # --- the process that the user started -----------------------------------------------------
@@ -78,11 +78,10 @@ def _work(
 
 @contextlib.contextmanager
 def connected(address: str, **options: Any) -> Iterator[ModuleType]:
-    """Ray itself, connected to the cluster at an address; left as it is if it was connected.
+    """Connect Ray to the cluster at an address, unless it is connected; yield the module.
 
-    The address is host:port, `auto` (the cluster that this host is part of), or `local`: one of
-    this host alone, which ends with the context and reports to nobody. The options are of
-    `ray.init`.
+    The address is host:port, `auto` (the cluster that this host is part of), or `local`: a cluster
+    of this host alone, which ends with the context. The options are those of `ray.init`.
     """
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
     ray = errors.require("ray", "cluster")
@@ -98,8 +97,8 @@ def connected(address: str, **options: Any) -> Iterator[ModuleType]:
             ray.init(address, log_to_driver=False, logging_level=logging.ERROR, **options)
     except (OSError, RuntimeError, ValueError, SystemExit) as error:  # SystemExit: Ray gave up
         raise InputError(
-            f"ray = {address} is no cluster that can be reached ({_line(error)}): run `ray start` "
-            "here and on its other hosts, or choose local."
+            f"ray = {address} cannot be reached as a cluster ({_last_line(error)}): run `ray "
+            "start` here and on its other hosts, or choose local."
         ) from error
     try:
         yield ray
@@ -108,7 +107,7 @@ def connected(address: str, **options: Any) -> Iterator[ModuleType]:
 
 
 def _reach(address: str) -> None:
-    """Try the address soon: Ray itself tries for minutes, and then ends the process."""
+    """Try the address first: Ray itself tries for minutes, and then ends the process."""
     if address == "auto":
         address = os.environ.get("RAY_ADDRESS", "auto")
     host, _, port = address.rpartition(":")
@@ -116,8 +115,8 @@ def _reach(address: str) -> None:
         socket.create_connection((host, int(port)), PATIENCE).close()
 
 
-def _line(error: BaseException) -> str:
-    """The last line of a message, which says what is wrong, without its full stop."""
+def _last_line(error: BaseException) -> str:
+    """Return the last line of a message, which says what is wrong, without its full stop."""
     return (str(error).strip().splitlines() or [type(error).__name__])[-1].rstrip(".")
 
 
@@ -126,62 +125,64 @@ def run_on_cluster(
     plan: Plan,
     *,
     address: str,
-    prepare: Callable[[], Any],
+    prepare: Callable[[], object],
     gpus: bool = True,
     shard: Shard = Shard(),
     callback: ProgressCallback = no_progress,
     slots: int | None = None,
     workers: int | None = None,
 ) -> None:
-    """Run what is missing of a plan, as `execution.run_missing` does, on the workers of a cluster.
+    """Run the missing chunks of a plan on a cluster, as `execution.run_missing` does in a process.
 
-    What came back is kept whatever error ends the run, and `environment.json` names the workers.
-    Each task calls `prepare` first, to choose its device and its cache of programs. It has as many
-    threads as `workers` says, by default one, and claims as many processors, and with `gpus` a GPU
-    if the cluster has any and the engine can use one.
+    Returned chunks are stored, whatever error ends the run, and `environment.json` names the
+    workers. Each task calls `prepare` first, to choose its device and its cache of programs. It has
+    `workers` threads, by default one, and claims as many processors, and with `gpus` a GPU if the
+    cluster has any and the engine can use one.
     """
-    own, known = devices.collect_environment(), dict[tuple[str, int], dict[str, Any]]()
-    missing, before = execution.missing_chunks(folder, plan, shard)
+    environment = devices.collect_environment()
+    missing, finished = execution.missing_chunks(folder, plan, shard)
     if missing:
-        provenance.write_environment(folder, own)
-    done = Progress(before, 0.0)
-    callback(done)
+        provenance.write_environment(folder, environment)
+    total = Progress(finished, 0.0)
+    callback(total)
     if not missing:
         return
-    threads = workers or 1
+    threads, known = workers or 1, dict[tuple[str, int], Environment]()
     with connected(address) as ray:
         gpu = gpus and engines.get(plan.setting.engine).traced
         gpu = gpu and bool(ray.cluster_resources().get("GPU"))
-        room = _room(ray.nodes(), threads, int(gpu))
-        # A process of a GPU's task would else end with it, and compile again.
-        kept = {"max_calls": 0, "max_retries": RETRIES, "scheduling_strategy": "SPREAD"}
-        task = ray.remote(num_cpus=threads, num_gpus=int(gpu), **kept)(_work)
-        bare = ray.put(dataclasses.replace(plan))  # without what it has worked out
-        given = _same(own), prepare, slots, threads
-        waiting = [task.remote(bare, some, *given) for some in _divided(missing.values(), room)]
-        with _told_in_a_sentence(ray, waiting):
+        count = _count_workers(ray.nodes(), threads, int(gpu))
+        # Otherwise the process of a GPU's task would end with the task, and compile again.
+        options = {"max_calls": 0, "max_retries": RETRIES, "scheduling_strategy": "SPREAD"}
+        task = ray.remote(num_cpus=threads, num_gpus=int(gpu), **options)(_work)
+        bare_plan = ray.put(dataclasses.replace(plan))  # without its cached properties
+        shared = _software(environment), prepare, slots, threads
+        shares = _divide(missing.values(), count)
+        waiting = [task.remote(bare_plan, numbers, *shared) for numbers in shares]
+        with _one_sentence_errors(ray, waiting):
             while waiting:
                 (ended,), waiting[:] = ray.wait(waiting)
-                contents, progress, environment = ray.get(ended)
+                contents, progress, worker = ray.get(ended)
                 for number, content in contents.items():
                     execution.store_chunk(folder, number, content)
-                known[environment["host"], environment["pid"]] = environment
-                provenance.write_environment(folder, own | _environment(list(known.values())))
-                simulated = done.simulated + progress.simulated
-                done = Progress(done.finished + progress.finished, simulated)
-                callback(done)
+                known[worker["host"], worker["pid"]] = worker
+                all_workers = _join_environments(list(known.values()))
+                provenance.write_environment(folder, environment | all_workers)
+                simulated = total.simulated + progress.simulated
+                total = Progress(total.finished + progress.finished, simulated)
+                callback(total)
 
 
-def _divided(kinds: Iterable[Sequence[int]], workers: int) -> Iterator[Sequence[int]]:
-    """Parts of each kind in equal shares, one after the other: a task has parts of one kind."""
-    for numbers in kinds:
+def _divide(chunks: Iterable[Sequence[int]], workers: int) -> Iterator[Sequence[int]]:
+    """Divide the chunks of each program into equal shares, one for each task."""
+    for numbers in chunks:
         size = math.ceil(len(numbers) / (workers * _TASKS))
         yield from (numbers[i : i + size] for i in range(0, len(numbers), size))
 
 
 @contextlib.contextmanager
-def _told_in_a_sentence(ray: ModuleType, waiting: Sequence[Any]) -> Iterator[None]:
-    """Raise what went wrong in a task as itself; no other task runs on then."""
+def _one_sentence_errors(ray: ModuleType, waiting: Sequence[Any]) -> Iterator[None]:
+    """Raise the error of a task in this process, and cancel all tasks."""
     try:
         yield
     except ray.exceptions.RayError as error:
@@ -189,7 +190,8 @@ def _told_in_a_sentence(ray: ModuleType, waiting: Sequence[Any]) -> Iterator[Non
         if cause is not None and not isinstance(cause, ray.exceptions.RayError):
             raise cause from error
         raise InputError(
-            f"ray has failed ({_line(error)}): what came back is kept; run the same command again."
+            f"ray has failed ({_last_line(error)}): finished chunks are stored; run the same "
+            "command again."
         ) from error
     finally:
         for task in waiting:
@@ -197,7 +199,7 @@ def _told_in_a_sentence(ray: ModuleType, waiting: Sequence[Any]) -> Iterator[Non
 
 
 def on_cluster(address: str, device: Device) -> Callable[..., None]:
-    """What runs a plan on the workers of a cluster, each on this device."""
+    """Return a function that runs a plan on the workers of a cluster, each on this device."""
     import jax
 
     return functools.partial(
@@ -209,7 +211,7 @@ def on_cluster(address: str, device: Device) -> Callable[..., None]:
 
 
 def _prepare(device: Device, x64: bool) -> None:
-    """Make a worker's process compute as this one would."""
+    """Configure the process of a worker as this process is configured."""
     import jax
 
     devices.configure_xla()
@@ -218,13 +220,13 @@ def _prepare(device: Device, x64: bool) -> None:
     cache.use_cache()
 
 
-def _room(hosts: Sequence[Mapping[str, Any]], num_cpus: int, num_gpus: int) -> int:
-    """How many workers with such claims the hosts of a cluster hold."""
+def _count_workers(hosts: Sequence[Environment], num_cpus: int, num_gpus: int) -> int:
+    """Return how many workers with such claims fit on the hosts of a cluster."""
     count = 0
     for host in hosts:
-        there = host["Resources"] if host["Alive"] else {}
-        room = there.get("CPU", 0) // num_cpus
-        count += int(min(room, there.get("GPU", 0) // num_gpus) if num_gpus else room)
+        resources = host["Resources"] if host["Alive"] else {}
+        fitting = resources.get("CPU", 0) // num_cpus
+        count += int(min(fitting, resources.get("GPU", 0) // num_gpus) if num_gpus else fitting)
     if not count:
         with_gpu = " beside a GPU" if num_gpus else ""
         raise InputError(
@@ -234,19 +236,17 @@ def _room(hosts: Sequence[Mapping[str, Any]], num_cpus: int, num_gpus: int) -> i
     return count
 
 
-def _environment(workers: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Return the environment record of all workers, and who they are."""
-    some = workers[0]
+def _join_environments(workers: Sequence[Environment]) -> Environment:
+    """Return the environment record of all workers, and their names."""
     processors = {worker["host"]: worker["processors"] for worker in workers}
+    names = ("host", "pid", "device")
     return {
         "processors": sum(processors.values()),
-        "device": some["device"] | {"count": len(workers)},
-        "workers": [
-            {name: worker[name] for name in ("host", "pid", "device")} for worker in workers
-        ],
+        "device": workers[0]["device"] | {"count": len(workers)},
+        "workers": [{name: worker[name] for name in names} for worker in workers],
     }
 
 
-def _same(environment: Mapping[str, Any]) -> dict[str, Any]:
-    """What all workers must have in common, or their bits differ."""
+def _software(environment: Environment) -> Environment:
+    """Return the part of the environment on which the bits of results depend."""
     return {name: environment[name] for name in ("packages", "commit", "x64")}

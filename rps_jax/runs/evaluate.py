@@ -1,6 +1,6 @@
-"""Candidates in random worlds: each set of parameters meets the same ones, all in one batch.
+"""Scores of candidates, parameters of one law, in random worlds: all candidates in one batch.
 
-Worlds for tuning, validation and testing come from seeds that never meet.
+Worlds for tuning, validation and testing have different seeds.
 """
 
 from collections.abc import Sequence
@@ -46,7 +46,7 @@ def evaluate(
     progress: bool | None = None,
     report_to: ProgressCallback | None = None,
 ) -> xr.Dataset:
-    """Score candidates, parameters of one law, in random worlds, all of them in the same ones.
+    """Score candidates, parameters of one law, in the same random worlds.
 
     All candidates run through one compiled program for each shape family of the objects. A later
     call with as many candidates and worlds, of whatever values and seed, compiles nothing.
@@ -55,21 +55,21 @@ def evaluate(
       law: the candidates: parameters of a law, a pytree whose leaves are all (P, ...), one entry
         for each of P candidates (`stack` makes one of several); or several laws of one class; or
         one alone.
-      domain: ranges of what differs between worlds, by name, or a file's.
-      worlds: how many each candidate meets, of indices 0, 1, ...
-      points: points of the unit cube at which the worlds lie instead, as of `worlds_at`.
-      split: what the worlds are for; those of two splits differ, whatever the seeds.
-      objective: what scores a trial.
-      robot: by its name, as kairos, or a JSON file's; None: the domain's.
+      domain: ranges from which worlds are drawn: a name, or a file of ranges.
+      worlds: number of worlds for each candidate, of indices 0, 1, ...
+      points: points of the unit cube at which the worlds lie instead, as `worlds_at` returns.
+      split: use of the worlds; two splits have different worlds, whatever the seeds.
+      objective: score of a trial.
+      robot: its name, as kairos, or a JSON file; None: the domain's.
       setting: engine, physics, fidelity, rules, and the seed of the worlds.
-      slots: worlds stepped at once by a worker; by default as suits engine and device.
+      slots: worlds that one worker steps at once; by default as suits engine and device.
       workers: host threads; by default as suits engine and device.
       progress: whether a bar shows the progress; by default in a terminal and in a notebook.
-      report_to: hears of the progress instead of a bar.
+      report_to: callback that receives the progress instead of a bar.
 
     Returns:
-      Scores, of which less is better, and outcomes (candidate, world), and what was drawn (world)
-      as coordinates.
+      Scores and outcomes (candidate, world), and the drawn quantities (world) as coordinates. A
+      lower score is better.
 
     Raises:
       InputError: an argument is not allowed.
@@ -80,8 +80,8 @@ def evaluate(
       >>> drums, rules = rps_jax.Domain(("random_cylinder",)), rps_jax.Rules(horizon=2.0)
       >>> four = rps_jax.stack([f"rps,L={length}" for length in (0.1, 0.2, 0.5, 1.0)])
       >>> setting = rps_jax.Setting("quasistatic", rules=rules)
-      >>> found = rps_jax.evaluate(four, drums, 2, setting=setting)
-      >>> found.score.mean("world").shape
+      >>> results = rps_jax.evaluate(four, drums, 2, setting=setting)
+      >>> results.score.mean("world").shape
       (4,)
     """
     ranges, params = parse_domain(domain, robot), candidates(law)
@@ -90,19 +90,19 @@ def evaluate(
     errors.check_count("worlds", count, at_most=10_000_000)
     errors.check_count("seed", setting.seed, at_least=0, at_most=2**30)
     setting.check_here(ranges.weakest, [params])
-    ask = Candidates(_checked(params), seed_of(setting.seed, split), np.arange(count), at)
+    request = Candidates(_checked(params), seed_of(setting.seed, split), np.arange(count), at)
     cache.use_cache_if_requested()
-    shown = is_interactive() if progress is None else progress
-    with Bar("evaluate", ask.count * count, shown=shown and report_to is None) as bar:
+    is_shown = is_interactive() if progress is None else progress
+    with Bar("evaluate", request.count * count, shown=is_shown and report_to is None) as bar:
         options = BatchOptions(callback=report_to or bar, slots=slots, workers=workers)
-        (answer,), _ = score_candidates([ask], [ranges], setting, objective, **options)
+        (scored,), _ = score_candidates([request], [ranges], setting, objective, **options)
     variables: dict[str, Any] = {
-        "score": (("candidate", "world"), answer.score, {"units": "1", "long_name": "objective"})
+        "score": (("candidate", "world"), scored.score, {"units": "1", "long_name": "objective"})
     }
-    for name, values in answer.outcome._asdict().items():
+    for name, values in scored.outcome._asdict().items():
         variables[name] = variable(name, ("candidate", "world"), values)
-    drawn = points_.drawn_columns(ranges, ask.object_of(ranges), partial(ask.draw, ranges))
-    return xr.Dataset(variables, {"pose": ["x", "y", "yaw"], "world": ask.worlds} | drawn)
+    drawn = points_.drawn_columns(ranges, request.object_of(ranges), partial(request.draw, ranges))
+    return xr.Dataset(variables, {"pose": ["x", "y", "yaw"], "world": request.worlds} | drawn)
 
 
 def stack(laws: Sequence[LawLike]) -> LawParams:
@@ -133,25 +133,25 @@ def stack(laws: Sequence[LawLike]) -> LawParams:
 
 
 def candidates(law: Any) -> LawParams:
-    """Parameters with leaves (P, ...) of whatever names or holds candidates."""
+    """Return parameters with leaves (P, ...) of one law, several laws, or stacked parameters."""
     if isinstance(law, str):
         return stack([law])
     if isinstance(law, list) or type(law) is tuple:
         return stack(law)
-    like = next((p for p in registry.LAWS.values() if type(p) is type(law)), None)
-    alone = like is not None and all(
+    example = next((p for p in registry.LAWS.values() if type(p) is type(law)), None)
+    is_single = example is not None and all(
         np.ndim(x) == np.ndim(y)
-        for x, y in zip(jax.tree.leaves(law), jax.tree.leaves(like), strict=True)
+        for x, y in zip(jax.tree.leaves(law), jax.tree.leaves(example), strict=True)
     )
-    return stack([law]) if alone else law
+    return stack([law]) if is_single else law
 
 
 def _checked(params: LawParams) -> LawParams:
-    """Bring parameters of candidates of one law to the host; InputError if they are none."""
+    """Return parameters of candidates on the host, or raise InputError if they are not valid."""
     law, name = registry.law_of(params), type(params).__name__
     sizes = {}
-    for place, leaf in registry.named_leaves(params).items():
-        field, values = f"{name}.{place}", np.asarray(leaf)
+    for path, leaf in registry.named_leaves(params).items():
+        field, values = f"{name}.{path}", np.asarray(leaf)
         if values.dtype.kind not in "biuf" or not values.ndim or not len(values):
             raise InputError(
                 f"{field} = {leaf} is not allowed: give an array of numbers, one for each "
@@ -161,11 +161,11 @@ def _checked(params: LawParams) -> LawParams:
             raise InputError(f"{field} of a candidate = nan is not allowed: it must be a number.")
         sizes[field] = len(values)
     (first, count), *_ = sizes.items()
-    for field, other in sizes.items():
-        if other != count:
+    for field, size in sizes.items():
+        if size != count:
             raise InputError(
-                f"{first} of {count} candidates and {field} of {other} are not allowed: give as "
-                "many of each."
+                f"{first} of {count} candidates and {field} of {size} are not allowed: give "
+                "equal numbers."
             )
     params = jax.tree.map(np.asarray, params)
     for p in range(count):

@@ -7,8 +7,6 @@ over the models is the effect of another simulation.
 
 import contextlib
 from dataclasses import replace
-from pathlib import Path
-from typing import Any
 
 import xarray as xr
 
@@ -17,17 +15,15 @@ from rps_jax.errors import InputError
 from rps_jax.record import files
 from rps_jax.runs.execution import run_plan
 from rps_jax.runs.plan import Plan
-from rps_jax.runs.question import Run
-from rps_jax.trials.progress import ProgressCallback, SequentialProgress, no_progress
+from rps_jax.runs.run import Run
+from rps_jax.trials.progress import SequentialProgress
 from rps_jax.world.physics import MUJOCO_GROUND, preset
 
 _HALVED = replace(preset(), timestep=0.005)
-# Fine enough for MuJoCo's own ground, on which sliding objects hop.
+# Short steps for MuJoCo's default ground, on which sliding objects hop.
 _FINE = replace(preset(), timestep=0.002, **MUJOCO_GROUND)
-OWN = "as asked"  # the model of the sweep itself
+OWN = "as asked"  # label of the model that the sweep itself has
 
-
-# What can be defended, beside what a sweep was asked for.
 MODELS = {
     "this ground, 10 ms": preset(),
     "this ground, 5 ms": _HALVED,
@@ -37,57 +33,39 @@ MODELS = {
     "quasi-static": preset(),
     "friction pyramid, 1 ms": preset("paper_gazebo"),
 }
-ENGINES: dict[str, EngineName] = {"quasi-static": "quasistatic"}  # of the others that of the sweep
+ENGINES: dict[str, EngineName] = {"quasi-static": "quasistatic"}  # the rest: the sweep's engine
 
 
 def model_plans(plan: Plan) -> dict[str, Plan]:
-    """A sweep on every model that can step its worlds, its own first; the worlds are the same."""
-    found = {OWN: plan}
+    """Return a plan on every model that can step its worlds, its own model first."""
+    plans = {OWN: plan}
     for name, physics in MODELS.items():
         engine = ENGINES.get(name, plan.setting.engine)
-        with contextlib.suppress(InputError):  # the engine knows no such worlds, laws or physics
+        with contextlib.suppress(InputError):  # the engine lacks such worlds, laws or physics
             setting = replace(plan.setting, physics=physics, engine=engine)
-            other = replace(plan, setting=setting)
-            other.check_here()
+            model_plan = replace(plan, setting=setting)
+            model_plan.check_here()
             if setting != plan.setting:
-                found[name] = other
-    return found
+                plans[name] = model_plan
+    return plans
 
 
-def with_models(found: xr.Dataset, every: xr.Dataset) -> xr.Dataset:
-    """Outcomes (law, world) with the success of the same worlds on every model beside them."""
-    success = every.success.assign_coords(model=every.model)
-    return found.assign(model_success=success.transpose("model", "law", "world"))
+def add_models(results: xr.Dataset, plan: Plan, run: Run) -> xr.Dataset:
+    """Run a plan on every other model, and add the success (model, law, world) to its results.
 
-
-def add_models(found: xr.Dataset, plan: Plan, run: Run) -> xr.Dataset:
-    """Outcomes of a plan, and beside them the success of the same worlds on every other model."""
-    every = run_models(plan, run.folder, found, **run.batch_options)
-    if run.folder is not None:
-        files.write_results(run.folder / "models.nc", every)
-    return with_models(found, every)
-
-
-def run_models(
-    plan: Plan,
-    out: Path | None,
-    own: xr.Dataset | None = None,
-    *,
-    callback: ProgressCallback = no_progress,
-    **shape: Any,
-) -> xr.Dataset:
-    """What a run folder lacks of a sweep on every model, and the whole as (model, law, world).
-
-    The sweep as it was asked for stands in the folder itself, the others in folders of their own
-    in it. Its `own` results are not run or read again, if they are at hand.
+    The run on another model has its own folder in `models`. `models.nc` has all outcomes.
     """
-    found, heard = {} if own is None else {OWN: own}, SequentialProgress(callback)
-    for name, one in model_plans(plan).items():
-        if name in found:
-            continue
-        plain = "".join(letter if letter.isalnum() else "_" for letter in name)
-        folder = out if out is None or one is plan else out / "models" / plain
-        found[name] = run_plan(one, folder, callback=heard, **shape)
-        heard.finish(one.num_trials)
-    joined = xr.concat(found.values(), "model", coords="minimal", compat="override")
-    return joined.assign_coords(model=list(found))
+    by_model, progress = {OWN: results}, SequentialProgress(run.callback)
+    options = run._replace(callback=progress).batch_options
+    progress.finish(plan.num_trials)
+    for name, model_plan in model_plans(plan).items():
+        if name != OWN:
+            safe = "".join(letter if letter.isalnum() else "_" for letter in name)
+            folder = run.folder and run.folder / "models" / safe
+            by_model[name] = run_plan(model_plan, folder, **options)
+            progress.finish(model_plan.num_trials)
+    joined = xr.concat(by_model.values(), "model", coords="minimal", compat="override")
+    joined = joined.assign_coords(model=list(by_model))
+    if run.folder is not None:
+        files.write_results(run.folder / "models.nc", joined)
+    return results.assign(model_success=joined.success.transpose("model", "law", "world"))

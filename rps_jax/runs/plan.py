@@ -1,7 +1,7 @@
-"""What a sweep runs: every law, a law with its parameters, in the same random worlds.
+"""Plans: all trials of a sweep, which are every law in the same random worlds, and their chunks.
 
-Trials are kept in parts, each of one law and one object; parts of one kind are run by one compiled
-program.
+A chunk has trials of one law and one object. One compiled program, named by its `ProgramKey`, runs
+all chunks of the same shapes. The manifest of a run folder is the plan as JSON.
 """
 
 from __future__ import annotations
@@ -12,13 +12,14 @@ import json
 import math
 import re
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import jax
 import numpy as np
+from numpy.typing import ArrayLike
 
 from rps_jax import errors
 from rps_jax.control import registry
@@ -37,19 +38,22 @@ from rps_jax.world.physics import Physics
 from rps_jax.world.points import Points
 from rps_jax.world.scene import Scene
 
-ProgramKey = tuple[Any, ...]  # of a part: the object's number, and the form of the law's parameters
+ProgramKey = tuple[Any, ...]  # index of the object, class and shapes of the law's parameters
 
 
 @dataclass(frozen=True)
 class Plan:
-    """What is run: every law in the worlds 0 to `worlds` - 1 of a domain, or of its `points`."""
+    """Trials to run: every law in the worlds 0 to `worlds` - 1 of a domain, or at its `points`.
+
+    Trial a * `worlds` + i is that of law a in world i.
+    """
 
     domain: Domain
     worlds: int
     laws: Mapping[str, LawParams]
     setting: Setting = Setting()  # its seed draws the worlds, too
-    part: int = 1024  # trials of a part, at most
-    points: Points | None = None  # of the unit cube at which the worlds lie; None: drawn ones
+    part: int = 1024  # trials of a chunk, at most
+    points: Points | None = None  # of the unit cube at which the worlds lie; None: drawn worlds
 
     def __post_init__(self) -> None:
         errors.check_count("worlds", self.worlds, at_most=1_000_000_000)
@@ -62,58 +66,58 @@ class Plan:
             raise InputError(f"worlds = {self.worlds} is not allowed: {len(self.points.u)} points.")
 
     def check_here(self) -> None:
-        """Raises InputError unless the engine can step these worlds on this machine."""
+        """Raise InputError unless the engine can step these worlds on this machine."""
         self.setting.check_here(self.domain.weakest, self.laws.values())
 
     @property
     def num_trials(self) -> int:
-        """How many: trial a * worlds + i is of law a in world i."""
+        """Number of trials."""
         return len(self.laws) * self.worlds
 
     def object_of(self, index: np.ndarray) -> np.ndarray:
-        """Which of the domain's objects the worlds `index` have."""
+        """Return the indices of the domain's objects in the worlds `index`."""
         return self.domain.object_of(points.cases(self.domain, self.points, index))
 
     @functools.cached_property
-    def blocks(self) -> int:
-        """Parts of one law and one object, at most."""
-        of_objects = np.bincount(self.object_of(np.arange(self.worlds)))
-        return math.ceil(of_objects.max() / self.part)
+    def max_chunks(self) -> int:
+        """Number of chunks of one law and one object, at most."""
+        worlds_of_objects = np.bincount(self.object_of(np.arange(self.worlds)))
+        return math.ceil(worlds_of_objects.max() / self.part)
 
     @functools.cached_property
     def chunks(self) -> dict[int, np.ndarray]:
-        """Numbers of the trials of every part, by the part's number."""
-        found, objects = {}, self.object_of(np.arange(self.worlds))
+        """Indices of the trials of every chunk, by the chunk's number."""
+        chunks, objects = {}, self.object_of(np.arange(self.worlds))
         for which in range(len(self.domain.objects)):
-            of_object = np.flatnonzero(objects == which)
+            worlds = np.flatnonzero(objects == which)
             for law in range(len(self.laws)):
-                for block in range(math.ceil(of_object.size / self.part)):
-                    some = of_object[block * self.part : (block + 1) * self.part]
-                    number = (law * len(self.domain.objects) + which) * self.blocks + block
-                    found[number] = law * self.worlds + some
-        return found
+                first = (law * len(self.domain.objects) + which) * self.max_chunks
+                for block in range(math.ceil(worlds.size / self.part)):
+                    members = worlds[block * self.part : (block + 1) * self.part]
+                    chunks[first + block] = law * self.worlds + members
+        return chunks
 
-    def law_and_object(self, part: int) -> tuple[int, int]:
-        """Which law a part is of, and which object."""
-        return divmod(part // self.blocks, len(self.domain.objects))
+    def law_and_object(self, chunk: int) -> tuple[int, int]:
+        """Return the indices of the law and the object of a chunk."""
+        return divmod(chunk // self.max_chunks, len(self.domain.objects))
 
-    def program_key(self, part: int) -> ProgramKey:
-        """Parts of a kind are run by one compiled program."""
-        law, which = self.law_and_object(part)
+    def program_key(self, chunk: int) -> ProgramKey:
+        """Return the key of the program that runs a chunk."""
+        law, which = self.law_and_object(chunk)
         params = list(self.laws.values())[law]
         return which, type(params), *map(np.shape, jax.tree.leaves(params))
 
     @functools.cached_property
     def trials_by_key(self) -> Counter[ProgramKey]:
-        """How many trials of each kind there are."""
+        """Number of trials of each program."""
         counts: Counter[ProgramKey] = Counter()
         for number, trials in self.chunks.items():
             counts[self.program_key(number)] += trials.size
         return counts
 
     def configuration(self) -> dict[str, Any]:
-        """All that the results depend on, as JSON."""
-        whole = {
+        """Return everything that the results depend on, as JSON."""
+        record = {
             "domain": dataclasses.asdict(self.domain),
             "worlds": self.worlds,
             "laws": {name: registry.params_to_json(params) for name, params in self.laws.items()},
@@ -124,32 +128,46 @@ class Plan:
             "part": self.part,
         }
         if self.points is not None:
-            whole["points"] = self.points.digest
-        return whole
+            record["points"] = self.points.digest
+        return record
 
 
 @dataclass(frozen=True)
 class Shard:
-    """One of several shares of a run, to be merged: parts number, number + of, ..."""
+    """One of `of` equal shares of a plan, to be run separately and merged."""
 
-    number: int = 1
+    number: int = 1  # from 1 to `of`
     of: int = 1
 
     @classmethod
-    def named(cls, text: str) -> Shard:
-        """Read a share written as K/N; InputError if it is none."""
-        found = re.fullmatch(r"([0-9]{1,9})/([0-9]{1,9})", str(text))
-        if not found:
+    def parse(cls, text: str) -> Shard:
+        """Read a shard written as K/N; raise InputError if it is not valid."""
+        match = re.fullmatch(r"([0-9]{1,9})/([0-9]{1,9})", str(text))
+        if not match:
             raise InputError(f"shard = {text} is not allowed: write k/n, as 3/8.")
-        return cls(int(found[1]), int(found[2]))
+        return cls(int(match[1]), int(match[2]))
 
     def __post_init__(self) -> None:
         errors.check_count("shard", self.of, at_most=1_000_000)
         errors.check_count("shard", self.number, at_most=self.of)
 
 
+def shard_chunks(plan: Plan, shard: Shard) -> dict[int, np.ndarray]:
+    """Return the chunks of one shard, every `of`-th: indices of their trials, by their numbers."""
+    chunks = enumerate(plan.chunks.items())
+    return {n: trials for i, (n, trials) in chunks if i % shard.of == shard.number - 1}
+
+
+def chunks_by_key(plan: Plan, numbers: Iterable[int]) -> dict[ProgramKey, list[int]]:
+    """Return chunks by the program that runs them."""
+    groups: dict[ProgramKey, list[int]] = {}
+    for number in numbers:
+        groups.setdefault(plan.program_key(number), []).append(number)
+    return groups
+
+
 def open_run(folder: Path, plan: Plan) -> Path:
-    """The run folder with the plan in it; InputError if it holds another one."""
+    """Write a plan into a run folder; raise InputError if the folder holds another one."""
     run_folder.claim(folder, plan.configuration())
     if plan.points is not None:
         plan.points.write(folder, plan.domain)
@@ -157,63 +175,59 @@ def open_run(folder: Path, plan: Plan) -> Path:
 
 
 def load_plan(folder: Path) -> Plan:
-    """The plan of a run folder; InputError if it holds none, or one of another version."""
-    found = run_folder.read_manifest(folder)
-    if "arms" in found or "strategies" in found:  # as 0.2.0 called them
+    """Read the plan of a run folder.
+
+    Raises:
+      InputError: the folder holds no plan, or one of another version.
+    """
+    record = run_folder.read_manifest(folder)
+    if "arms" in record or "strategies" in record:  # as 0.2.0 called them
         raise InputError(
-            f"run = {folder} was made by {provenance.package_version(folder)}: use that version."
+            f"run = {folder} was written by {provenance.package_version(folder)}: use that version."
         )
-    if "laws" not in found:
-        raise InputError(f"run = {folder} is not of a sweep: give the folder of `rps sweep`.")
+    if "laws" not in record:
+        raise InputError(f"run = {folder} does not hold a sweep: give the folder of `rps sweep`.")
     try:
         plan = Plan(
-            domain.from_json(found["domain"]),
-            found["worlds"],
-            {name: registry.params_from_json(law) for name, law in found["laws"].items()},
-            setting_of(found),
-            found["part"],
+            domain.from_json(record["domain"]),
+            record["worlds"],
+            {name: registry.params_from_json(law) for name, law in record["laws"].items()},
+            setting_of(record),
+            record["part"],
         )
     except (LookupError, TypeError, AttributeError, ValueError, ArithmeticError) as error:
         raise files.CorruptFileError(folder / run_folder.MANIFEST, error) from error
-    if "points" in found:
-        plan = dataclasses.replace(plan, points=Points.read(folder, str(found["points"])))
-    # What an older version did not write down would else be what this one does by default.
-    if (now := json.loads(json.dumps(plan.configuration()))) != found:
+    if "points" in record:
+        plan = dataclasses.replace(plan, points=Points.read(folder, str(record["points"])))
+    # Options that an older version did not store would otherwise get the defaults of this version.
+    if (current := json.loads(json.dumps(plan.configuration()))) != record:
         raise InputError(
-            f"run = {folder} was made by another version "
-            f"({run_folder.describe_difference(found, now)}), "
+            f"run = {folder} was written by another version "
+            f"({run_folder.describe_difference(record, current)}), "
             f"{provenance.package_version(folder)}: use that one."
         )
     return plan
 
 
-def setting_of(found: Mapping[str, Any]) -> Setting:
-    """Read a setting as manifests have it; `question.setting_as_json` is the opposite."""
-    physics: dict[str, Any] = {
-        k: tuple(v) if isinstance(v, list) else v for k, v in found["physics"].items()
-    }
-    rules = Rules(**found["rules"])
-    return Setting(found["engine"], Physics(**physics), rules=rules, seed=found["seed"])
+def setting_of(record: Mapping[str, Any]) -> Setting:
+    """Read a setting as manifests have it; `question.setting_as_json` writes it."""
+    fields = record["physics"].items()
+    physics = Physics(**{k: tuple(v) if isinstance(v, list) else v for k, v in fields})
+    return Setting(record["engine"], physics, rules=Rules(**record["rules"]), seed=record["seed"])
 
 
-def shard_chunks(plan: Plan, shard: Shard) -> dict[int, np.ndarray]:
-    """The parts of one shard: numbers of their trials, by the part's number."""
-    every = plan.chunks.items()
-    return {n: trials for i, (n, trials) in enumerate(every) if i % shard.of == shard.number - 1}
-
-
-def draw(plan: Plan, index: Any) -> Draw:
-    """What is drawn for worlds of one object, by their indices."""
+def draw(plan: Plan, index: ArrayLike) -> Draw:
+    """Draw worlds of one object, by their indices."""
     return points.draw(plan.domain, plan.setting.seed, plan.points, index)
 
 
 def scene_of(plan: Plan, index: int) -> Scene:
-    """The compiled scene of one world, for pictures."""
+    """Compile the scene of one world, for pictures."""
     return drawn_scene(plan.domain, draw(plan, [index]), plan.setting.physics, 0)
 
 
 def world_title(plan: Plan, index: int) -> str:
-    """What one world is, in words."""
+    """Return the object and the main drawn quantities of a world, in words."""
     drawn = draws.table(draw(plan, [index]))
     name = plan.domain.objects[int(plan.object_of(np.asarray(index)))].replace("_", " ")
     value = {key: float(values[0]) for key, (values, _) in drawn.items()}
@@ -223,12 +237,7 @@ def world_title(plan: Plan, index: int) -> str:
     )
 
 
-def build_batch(plan: Plan, law: int, index: Any) -> WorldBatch:
-    """Worlds of one object, by their indices, with the parameters of a law."""
-    return made(plan, law, draw(plan, index))
-
-
-def made(plan: Plan, law: int, drawn: Draw) -> WorldBatch:
-    """The worlds of a draw, with the parameters of a law."""
-    params = list(plan.laws.values())[law]
-    return drawn_worlds(plan.domain, drawn, plan.setting).with_params(params)
+def build_batch(plan: Plan, law: int, index: ArrayLike) -> WorldBatch:
+    """Build worlds of one object, by their indices, with the parameters of a law."""
+    batch = drawn_worlds(plan.domain, draw(plan, index), plan.setting)
+    return batch.with_params(list(plan.laws.values())[law])

@@ -1,6 +1,6 @@
-"""One trial, followed from its start to its end: its data, its picture and its film.
+"""The commands `push` and `replay`: one trial over time, with its data, figure and film.
 
-It is asked for by name (`push`), or is a world of a sweep again (`replay`).
+`push` runs a named case; `replay` runs one world of a sweep again. The result is a `Trace`.
 """
 
 from __future__ import annotations
@@ -16,11 +16,13 @@ from typing import TYPE_CHECKING, Any
 import jax
 import numpy as np
 import xarray as xr
+from numpy.typing import ArrayLike
 
 from rps_jax import engines, errors
 from rps_jax.analysis.report import Picture, Section
 from rps_jax.control import registry
-from rps_jax.control.base import Law
+from rps_jax.control.base import Law, LawParams
+from rps_jax.control.observation import Twist
 from rps_jax.record import bag as bags
 from rps_jax.record import folder
 from rps_jax.record.bag import Step
@@ -42,14 +44,14 @@ if TYPE_CHECKING:
 
 
 _STILL = (640, 360)  # [px] width and height of one of several pictures side by side
-FILM_LENGTH = 10.0  # [s] by default, whatever the trial's
+FILM_LENGTH = 10.0  # [s] default, whatever the length of the trial
 
 
 @dataclass(frozen=True, repr=False)
 class Trace:
-    """One trial that was followed."""
+    """One recorded trial, with its scene and its figures."""
 
-    followed: Trajectory  # arrays over time, (T, ...)
+    trajectory: Trajectory  # arrays over time, (T, ...)
     scene: Scene
     title: str
     engine: str
@@ -60,23 +62,23 @@ class Trace:
 
     @property
     def summary(self) -> str:
-        """How it ended, in words."""
-        ended, (x, y) = self.outcome, self.followed.p_world_target
+        """Outcome in words."""
+        outcome, (x, y) = self.outcome, self.trajectory.p_world_target
         return (
-            f"target ({x:g}, {y:g}) m {'reached' if ended.success else 'not reached'} at "
-            f"{float(ended.time):.1f} s, least distance {float(ended.min_distance):.3f} m, contact "
-            f"lost for {float(ended.contact_lost_time):.1f} s"
+            f"target ({x:g}, {y:g}) m {'reached' if outcome.success else 'not reached'} at "
+            f"{float(outcome.time):.1f} s, least distance {float(outcome.min_distance):.3f} m, "
+            f"contact lost for {float(outcome.contact_lost_time):.1f} s"
         )
 
     @property
     def outcome(self) -> Outcome:
         """The result of the trial, without a leading axis."""
-        return self.followed.outcome
+        return self.trajectory.outcome
 
     @property
     def data(self) -> xr.Dataset:
         """The trial over time: variables (time, ...), its outcome as scalars."""
-        return results.trace_dataset(self.followed)
+        return results.trace_dataset(self.trajectory)
 
     def plot(self, path: str | Path | None = None) -> Figure:
         """Draw the trial as Fig. 6 of the paper does; with a path it is written there, too."""
@@ -89,7 +91,7 @@ class Trace:
         return drawn
 
     def stills(self, count: int = 6) -> Figure:
-        """Draw some moments of the trial side by side.
+        """Draw images of the trial at equal intervals, side by side.
 
         Raises:
           VideoError: this machine cannot draw.
@@ -97,13 +99,13 @@ class Trace:
         from rps_jax.analysis import figures
         from rps_jax.world import rendering
 
-        seen = self.followed.snapshots
-        shown = _evenly(len(seen.time), count)
-        tiles = [rendering.Tile(self.scene, self.followed.p_world_target)] * len(shown)
-        with rendering.open_renderers(tiles, _STILL, "oblique") as each:
-            drawn = zip(each, seen.qpos[shown], strict=True)
-            images = [one.draw(qpos, rendering.NO_CONTACT) for one, qpos in drawn]
-        return figures.stills(images, [f"{seen.time[i]:.0f} s" for i in shown])
+        snapshots = self.trajectory.snapshots
+        shown = _evenly_spaced(len(snapshots.time), count)
+        tiles = [rendering.Tile(self.scene, self.trajectory.p_world_target)] * len(shown)
+        with rendering.open_renderers(tiles, _STILL, "oblique") as renderers:
+            poses = zip(renderers, snapshots.qpos[shown], strict=True)
+            images = [renderer.draw(qpos, rendering.NO_CONTACT) for renderer, qpos in poses]
+        return figures.stills(images, [f"{snapshots.time[i]:.0f} s" for i in shown])
 
     def film(
         self,
@@ -112,7 +114,7 @@ class Trace:
         *,
         fps: int = 20,
         size: tuple[int, int] = (960, 540),
-        watch: Callable[[Iterable[Any]], Iterable[Any]] = iter,
+        watch: Callable[[Iterable[ArrayLike]], Iterable[ArrayLike]] = iter,
     ) -> Path:
         """Write an MP4 of the trial.
 
@@ -121,7 +123,7 @@ class Trace:
           seconds: length of the film, whatever the trial's.
           fps: frames per second of the film.
           size: width and height [px], even numbers.
-          watch: is handed the frames and hands them on, as `tqdm.tqdm` does.
+          watch: wraps the iterable of frames, as `tqdm.tqdm` does.
 
         Raises:
           InputError: the length, rate or size is not allowed.
@@ -130,14 +132,14 @@ class Trace:
         from rps_jax.world import video
 
         check_length(seconds)
-        seen = self.followed.snapshots
-        shown = _evenly(len(seen.time), round(seconds * fps))
+        snapshots = self.trajectory.snapshots
+        shown = _evenly_spaced(len(snapshots.time), round(seconds * fps))
         video.render(
             self.scene,
-            watch(seen.qpos[shown]),
+            watch(snapshots.qpos[shown]),
             Path(path),
-            p_world_target=np.array(self.followed.p_world_target),
-            p_world_contacts=np.asarray(p_world_contact(seen))[shown],
+            p_world_target=np.array(self.trajectory.p_world_target),
+            p_world_contacts=np.asarray(p_world_contact(snapshots))[shown],
             fps=fps,
             size=size,
         )
@@ -145,13 +147,13 @@ class Trace:
 
 
 def check_length(seconds: float) -> None:
-    """Raises InputError unless a film may be this long [s]."""
+    """Raise InputError unless a film may have this length [s]."""
     errors.check_finite("film_length", seconds, above=0, at_most=600, unit="s")
 
 
 @dataclass(frozen=True)
 class TraceQuestion(Question[Trace]):
-    """A question whose answer is one trial, followed over time."""
+    """Base class of questions whose answer is one trial over time."""
 
     bag: str | Path | None = option(None, kw_only=True)
     """MCAP file to write: the trial as messages of ROS 2, which Foxglove shows (extra bags)."""
@@ -161,21 +163,21 @@ class TraceQuestion(Question[Trace]):
             bags.check()
             folder.ensure_writable(Path(self.bag).parent)
 
-    def followed(self, part: WorldBatch, law: Law, setting: Setting, run: Run) -> Trajectory:
-        """Follow a world, and write its bag."""
+    def record(self, world: WorldBatch, law: Law, setting: Setting, run: Run) -> Trajectory:
+        """Run a world and record it, and write its bag if one is named."""
         if self.bag is None:
-            return pushes.record_batch(part, law, setting, callback=run.callback)[0]
+            return pushes.record_batch(world, law, setting, callback=run.callback)[0]
         period = setting.physics.control_period
-        (whole,) = pushes.record_batch(
-            part, recorded_law(law), setting, interval=period, callback=run.callback
+        (fine,) = pushes.record_batch(
+            world, recorded_law(law), setting, interval=period, callback=run.callback
         )
-        details, seen = tuple(whole.snapshots.details)  # of `recorded_law`
-        whole = dataclasses.replace(whole, snapshots=whole.snapshots._replace(details=details))
-        about = {"law": json.dumps(registry.params_to_json(whole.params)), "period": str(period)}
-        bags.write(Path(self.bag), steps_of(whole, seen, period), about)
-        every = max(1, round(0.1 / period))
-        thin = jax.tree.map(lambda x: x[::every], whole.snapshots)
-        return dataclasses.replace(whole, snapshots=thin)
+        details, observations = tuple(fine.snapshots.details)  # of `recorded_law`
+        fine = dataclasses.replace(fine, snapshots=fine.snapshots._replace(details=details))
+        attrs = {"law": json.dumps(registry.params_to_json(fine.params)), "period": str(period)}
+        bags.write(Path(self.bag), bag_steps(fine, observations, period), attrs)
+        stride = max(1, round(0.1 / period))
+        coarse = jax.tree.map(lambda x: x[::stride], fine.snapshots)
+        return dataclasses.replace(fine, snapshots=coarse)
 
     @property
     def horizon(self) -> float:
@@ -194,42 +196,42 @@ class TraceQuestion(Question[Trace]):
 
 
 def recorded_law(law: Law) -> Law:
-    """The law whose details are joined by what it observed; one that senses touch observes taxels.
+    """Return a law whose details are (details, observation), for the messages of a bag.
 
-    So a bag has the taxels, too.
+    A law that senses touch observes taxels as well, so that the bag has them.
     """
-    touch = law.senses == "touch"
+    is_touch = law.senses == "touch"
 
-    def step(params: Any, memory: Any, seen: Any) -> Any:
-        memory, twist, details = law.step(params, memory, seen.touch if touch else seen)
-        return memory, twist, (details, seen)
+    def step(params: LawParams, state: Any, obs: Any) -> tuple[Any, Twist, Any]:
+        state, twist, details = law.step(params, state, obs.touch if is_touch else obs)
+        return state, twist, (details, obs)
 
-    return dataclasses.replace(law, step=step, senses="taxels" if touch else law.senses)
+    return dataclasses.replace(law, step=step, senses="taxels" if is_touch else law.senses)
 
 
-def steps_of(followed: Trajectory, seen: Any, period: float) -> Iterator[Step]:
-    """Steps of a bag of a trial that was followed, with its observations (T, ...) at each."""
-    snapshots, touch = followed.snapshots, seen.touch
-    beside = {"signal", "f_robot", "p_world_object", "r_object"} & set(seen._fields)
+def bag_steps(trajectory: Trajectory, obs: Any, period: float) -> Iterator[Step]:
+    """Yield the steps of a bag of a recorded trial, with its observations (T, ...)."""
+    snapshots, touch = trajectory.snapshots, obs.touch
+    extra = {"signal", "f_robot", "p_world_object", "r_object"} & set(obs._fields)
     for i in range(len(snapshots.time)):
-        thing, yaw = object_pose(snapshots.qpos[i])
+        position, yaw = object_pose(snapshots.qpos[i])
         yield Step(
             i * period,
             [*touch.p_world_robot[i], touch.yaw[i]],
             touch.p_world_target[i],
             int(snapshots.reading.contact_type[i]),
             touch.p_robot_contact[i],
-            [np.broadcast_to(one, snapshots.time.shape)[i] for one in snapshots.twist],
-            object_pose=[*np.asarray(thing), float(yaw)],
-            **{name: getattr(seen, name)[i] for name in beside},
+            [np.broadcast_to(v, snapshots.time.shape)[i] for v in snapshots.twist],
+            object_pose=[*np.asarray(position), float(yaw)],
+            **{name: getattr(obs, name)[i] for name in extra},
         )
 
 
-def case_options(given: TrialOptions, setting: Setting) -> dict[str, Any]:
-    """What is given beside object, friction, target and law, as fields of `Case`."""
-    named = {one.name: getattr(given, one.name) for one in dataclasses.fields(TrialOptions)}
-    usual = paper.SKIN.get(setting.physics_name, "ideal")
-    return named | {"skin": given.skin or usual}
+def case_options(options: TrialOptions, setting: Setting) -> dict[str, Any]:
+    """Return the options of a trial as arguments of `Case`; the skin follows the physics."""
+    fields = {f.name: getattr(options, f.name) for f in dataclasses.fields(TrialOptions)}
+    default = paper.SKIN.get(setting.physics_name, "ideal")
+    return fields | {"skin": options.skin or default}
 
 
 @dataclass(frozen=True)
@@ -245,7 +247,7 @@ class Push(Case, TraceQuestion, SimulationQuestion[Trace]):
     """
 
     def __post_init__(self) -> None:
-        """Check the trial when it is asked for, and not before."""
+        """Defer the checks of `Case` to `check`."""
 
     @property
     def horizon(self) -> float:
@@ -258,8 +260,8 @@ class Push(Case, TraceQuestion, SimulationQuestion[Trace]):
     @property
     def case(self) -> Case:
         """The trial."""
-        own = {one.name: getattr(self, one.name) for one in dataclasses.fields(Case)}
-        return Case(**own | case_options(self, self.setting))
+        fields = {f.name: getattr(self, f.name) for f in dataclasses.fields(Case)}
+        return Case(**fields | case_options(self, self.setting))
 
     def check(self) -> None:
         super().check()
@@ -267,10 +269,10 @@ class Push(Case, TraceQuestion, SimulationQuestion[Trace]):
 
     def answer(self, run: Run) -> Trace:
         case, setting = self.case, self.setting
-        part = pushes.build([case], setting)
-        followed = self.followed(part, registry.law_of(case.params), setting, run)
+        world = pushes.build([case], setting)
+        trajectory = self.record(world, registry.law_of(case.params), setting, run)
         scene = pushes.scene_of(case, setting.physics)
-        return Trace(followed, scene, case.title, setting.engine)
+        return Trace(trajectory, scene, case.title, setting.engine)
 
 
 push = call_of(Push)
@@ -286,9 +288,9 @@ class Replay(TraceQuestion):
       >>> drums, rules = rps_jax.Domain(("random_cylinder",)), rps_jax.Rules(horizon=2.0)
       >>> setting = rps_jax.Setting("quasistatic", rules=rules)
       >>> with tempfile.TemporaryDirectory() as run:
-      ...     found = rps_jax.sweep("rps", drums, worlds=8, setting=setting, out=run)
-      ...     again = rps_jax.replay(run, 2)
-      >>> bool(again.outcome.success) == bool(found.success.sel(law="rps", world=2))
+      ...     results = rps_jax.sweep("rps", drums, worlds=8, setting=setting, out=run)
+      ...     trace = rps_jax.replay(run, 2)
+      >>> bool(trace.outcome.success) == bool(results.success.sel(law="rps", world=2))
       True
     """
 
@@ -297,7 +299,7 @@ class Replay(TraceQuestion):
     world: int = option(0, 0, positional=True)
     """Index of the world."""
     law: str | None = None
-    """Which of the sweep's laws; by default the first."""
+    """Law of the sweep, by its label; by default the first."""
 
     @property
     def default_folder(self) -> Path:
@@ -324,26 +326,26 @@ class Replay(TraceQuestion):
 
     def answer(self, run: Run) -> Trace:
         plan, name = self._chosen
-        part = build_batch(plan, list(plan.laws).index(name), [self.world])
+        world = build_batch(plan, list(plan.laws).index(name), [self.world])
         law = registry.law_of(plan.laws[name])
-        followed = self.followed(part, law, plan.setting, run)
+        trajectory = self.record(world, law, plan.setting, run)
         title = f"{world_title(plan, self.world)}, {name}"
-        return Trace(followed, scene_of(plan, self.world), title, plan.setting.engine)
+        return Trace(trajectory, scene_of(plan, self.world), title, plan.setting.engine)
 
 
 replay = call_of(Replay)
 
 
-def _evenly(length: int, count: int) -> list[int]:
+def _evenly_spaced(length: int, count: int) -> list[int]:
     """At least two indices into `length` items, from the first to the last."""
     count = max(2, count)
     return [round(i * (length - 1) / (count - 1)) for i in range(count)]
 
 
 def select_law(run: Path, world: int, law: str | None = None) -> tuple[Plan, str]:
-    """The plan of a sweep, one of whose worlds can be followed, and the law that is meant.
+    """Return the plan of a sweep for recording one of its worlds, and the label of the law.
 
-    An engine whose trials cannot be followed is replaced by the fused one.
+    The fused engine replaces an engine whose trials cannot be recorded.
 
     Raises:
       InputError: the folder holds no sweep, or not this world or law.
@@ -357,8 +359,8 @@ def select_law(run: Path, world: int, law: str | None = None) -> tuple[Plan, str
 
 
 def another_engine(run: Path) -> str:
-    """Tell that worlds of a sweep are followed in another engine than the sweep's, if so."""
-    theirs, ours = load_plan(run).setting.engine, select_law(run, 0)[0].setting.engine
-    if theirs == ours:
+    """Return a note if worlds of a sweep are recorded with another engine than the sweep's."""
+    sweep_engine, engine = load_plan(run).setting.engine, select_law(run, 0)[0].setting.engine
+    if sweep_engine == engine:
         return ""
-    return f"Trials of the engine {theirs} cannot be followed: this is the engine {ours}."
+    return f"Trials of the engine {sweep_engine} cannot be recorded: this is the engine {engine}."

@@ -21,7 +21,7 @@ from __future__ import annotations
 import functools
 import threading
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Hashable, Iterable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, as_completed
 from functools import partial
 from typing import Any, NamedTuple, TypedDict, TypeVar, Unpack
@@ -92,11 +92,16 @@ class Job(NamedTuple):
 Collect = Callable[[np.ndarray, Outcome], object]  # indices (m,) of trials and their outcomes
 
 
-class BatchOptions(TypedDict, total=False):
-    """Keyword arguments of functions that run trials."""
+class BatchSize(TypedDict, total=False):
+    """Resources of functions that run trials."""
 
     slots: int | None  # worlds that one worker steps at once on each device of the host
     workers: int | None  # host threads
+
+
+class BatchOptions(BatchSize, total=False):
+    """Keyword arguments of functions that run trials."""
+
     callback: ProgressCallback
 
 
@@ -279,12 +284,11 @@ class _TrialQueue:
 class _Schedule:
     """Order of the programs: first one for each queue, then those for suspended trials."""
 
-    single: list[_Program]  # each for one queue, until few of its trials run
-    joint: list[_Program]  # for suspended trials and short queues, several queues side by side
-
     def __init__(self, queues: Sequence[_TrialQueue], setting: Setting, slots: int, workers: int):
         devices, self.max_suspended = jax.device_count(), _max_suspended()
-        self.single, groups = [], {}
+        self.single: list[_Program] = []  # each for one queue, until few of its trials run
+        self.joint: list[_Program] = []  # for suspended trials and short queues, side by side
+        groups: dict[Hashable, list[tuple[_TrialQueue, int]]] = {}
         side_by_side = engines.get(setting.engine).side_by_side
         for index, queue in enumerate(queues):
             per_device = -(-queue.num_trials // devices)
@@ -294,11 +298,10 @@ class _Schedule:
                 width = min(devices * per_device, workers * self.max_suspended)
             if width:
                 groups.setdefault(queue.law if side_by_side else index, []).append((queue, width))
-        self.joint = [
-            _Program(*zip(*group[i : i + _MAX_SIDE_BY_SIDE], strict=True), setting)
-            for group in groups.values()
-            for i in range(0, len(group), _MAX_SIDE_BY_SIDE)
-        ]
+        for group in groups.values():
+            for i in range(0, len(group), _MAX_SIDE_BY_SIDE):
+                members, widths = zip(*group[i : i + _MAX_SIDE_BY_SIDE], strict=True)
+                self.joint.append(_Program(members, widths, setting))
 
 
 def _max_suspended() -> int:

@@ -1,4 +1,4 @@
-"""One trial as it is asked for by name: what is pushed where, by which law, on which ground."""
+"""Named cases: object, target, law, friction, skin and robot of one trial."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -21,10 +21,10 @@ FrictionLike = str | Friction | tuple[float, float]  # a friction set, or coeffi
 
 @dataclass(frozen=True, kw_only=True)
 class TrialOptions:
-    """What is given beside object, friction, target and law, for one trial or for many."""
+    """Options of one trial or many trials besides object, friction, target and law."""
 
     mass: float | None = None
-    """Mass of the object [kg]; by default its own."""
+    """Mass of the object [kg]; by default that of the model."""
     skin: SkinLike | None = None
     """The skin: ideal is the paper's simulated contact sensor under foam, thin is one without foam,
     capacitive has 42 taxels, and hardware adds noise and unequal gains to these. Changes follow, as
@@ -42,14 +42,14 @@ class TrialOptions:
 
 @dataclass(frozen=True)
 class Case(TrialOptions):
-    """One trial to run: all that may differ from world to world.
+    """One trial to run: everything that may differ between worlds.
 
     Raises:
-      InputError: something names or means no trial.
+      InputError: a name or value is not valid.
     """
 
     object: str = "box"
-    """Object to push: its name, or an MJCF file of one's own, FILE.xml."""
+    """Object to push: its name, or a custom MJCF file, FILE.xml."""
     friction: FrictionLike = "S1"
     """Friction: a set of the paper's Table I (S1, S2), or coefficients GROUND,ROBOT."""
     target: tuple[float, float] = (-2.0, 0.0)
@@ -58,9 +58,9 @@ class Case(TrialOptions):
     """The law: its name, as rps, rps_tuned or rps_plus, or a file's, as my_law.py:MyParams or
     policy.npz; changes follow, as rps,K_h=0.3 or rps,tuned.json."""
     bearing: float = option(0.0, -10, 10, unit="rad", kw_only=True, hidden=True)
-    """Angle by which the whole trial is turned [rad], which matters to a friction pyramid alone."""
+    """Rotation of the whole trial [rad]; only a friction pyramid makes a difference."""
     shift: Shift = option(Shift(), kw_only=True, hidden=True)
-    """How the object is moved by a hand during the push."""
+    """Scripted shift of the object during the push."""
 
     def __post_init__(self) -> None:
         errors.check_name("object", objects.parse_object(self.object), objects.OBJECTS)
@@ -104,7 +104,7 @@ class Case(TrialOptions):
 
     @property
     def title(self) -> str:
-        """What is pushed on which ground, in words."""
+        """Object and friction, in words."""
         return (
             f"{self.object_name.replace('_', ' ')}, $\\mu$ ground {self.contact.ground:g}, "
             f"robot {self.contact.robot:g}"
@@ -112,10 +112,10 @@ class Case(TrialOptions):
 
 
 def friction_of(friction: FrictionLike) -> Friction:
-    """Read the coefficients of a friction set by its name, or of a text `ground,robot`.
+    """Return the coefficients of a friction set, by its name or as a text `ground,robot`.
 
     Raises:
-      InputError: they are not such.
+      InputError: the text is not valid.
     """
     if not isinstance(friction, str):
         if not isinstance(friction, tuple | list) or len(friction) != 2:
@@ -138,5 +138,5 @@ def friction_of(friction: FrictionLike) -> Friction:
 
 
 def label_of(friction: FrictionLike) -> str:
-    """A friction set's name, or its coefficients."""
+    """Return the name of a friction set, or its coefficients as a text."""
     return friction if isinstance(friction, str) else ",".join(f"{value:g}" for value in friction)

@@ -1,11 +1,11 @@
-"""Pushing as an environment for a learning loop of one's own, as mujoco_playground has them.
+"""Pushing as an environment for custom learning loops, with the interface of mujoco_playground.
 
     env = PushEnv("random_box")
     state = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.key(0), 512))
     state = jax.jit(jax.vmap(env.step))(state, actions)
 
-`reset` and `step` are pure functions of one world. Skin, odometry, physics and the rules by which
-a trial ends are those of every other trial here; only what decides is left to the loop.
+`reset` and `step` are pure functions of one world. Skin, odometry, physics and rules are those of
+all trials; the learning loop takes the place of the law.
 """
 
 from __future__ import annotations
@@ -45,15 +45,15 @@ from rps_jax.world.scene import Scene
 
 
 class Reward(NamedTuple):
-    """What a step is worth."""
+    """Weights of the terms of the reward."""
 
-    # [1/m] that the contact point is nearer to the target than when last felt
+    # [1/m] of the decrease of the distance from contact point to target since the last contact
     progress: float = 1.0
-    no_contact: float = 0.05  # [1/s] cost of being out of contact: that of progress at 5 cm/s
-    success: float = 1.0  # [1] for arriving, once
-    # Of what the law is not told, for loops that ask for it.
-    object: float = 0.0  # [1/m] that the outline of the object is nearer to the target than before
-    behind: float = 0.0  # [1] that target and object are seen nearer to one direction: the cosine
+    no_contact: float = 0.05  # [1/s] cost without contact, which equals progress at 5 cm/s
+    success: float = 1.0  # [1] once, for a success
+    # Terms that use the true state, which a law does not observe.
+    object: float = 0.0  # [1/m] of the decrease of the distance from outline to target
+    behind: float = 0.0  # [1] of the increase of the cosine between directions to target and object
 
 
 # Default weights of `rps learn` and of the Gymnasium environment.
@@ -63,56 +63,56 @@ SHAPED_REWARD = Reward(progress=0.5, no_contact=0.02, success=1.0, object=0.5, b
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class State:
-    """What `reset` and `step` return; the fields are those of mujoco_playground's `State`."""
+    """State of an environment, with the fields of mujoco_playground's `State`."""
 
-    data: Trial  # with qpos (10,), qvel (9,), and all that the rules count
+    data: Trial  # with qpos (10,), qvel (9,) and the counters of the rules
     obs: jax.Array  # (44,) see `PushEnv`
     reward: jax.Array  # () [1]
     done: jax.Array  # () [1] 0 or 1
     metrics: dict[str, jax.Array]  # () each
-    # `world`: the World; `index`: its number in the domain; `told`: the TaxelObservation.
+    # `world`: the World; `index`: its index in the domain; `observation`: the TaxelObservation.
     info: dict[str, Any]
 
     def replace(self, **changes: Any) -> State:
-        """The state with other values."""
+        """Return the state with other values."""
         return dataclasses.replace(self, **changes)
 
 
 @dataclass(frozen=True, eq=False)
 class PushEnv:
-    """One object to be pushed to a target by touch.
+    """Environment: push one object to a target by touch.
 
     Observation (T + 2,): the T taxels of the robot, the paper's 42, in the order of `Shell.taxels`,
     each the filtered relative change of its capacitance [1], 0 if it is dead; then the target
-    (x, y) [m] in the robot's frame, by where the base believes to be.
+    (x, y) [m] in the robot's frame, at the pose that the odometry estimates.
 
     Action (3,): the twist (v_x, v_y, omega) in the robot's frame, in units of the parameters'
     v_max, v_max and omega_max. (v_x, v_y) is scaled down to a norm of 1, omega is clipped to +-1.
 
-    Reward: see `Reward`. Without contact nothing is gained; a contact that is found again counts
-    from where it was lost, so a sum of rewards tells by how much a push came nearer.
+    Reward: see `Reward`. There is no progress without contact; after a new contact, progress counts
+    from where the contact was lost. So the sum of rewards measures how much nearer the object is.
 
-    Done: by the rules of `setting` (the paper's: arrived, 300 s, or 150 s without contact; or
-    the object fell over), or if the physics diverged. A state that is done stays as it is, and
-    earns nothing.
+    Done: by the rules of `setting` (the paper's: success, 300 s, or 150 s without contact; or
+    the object fell over), or if the physics diverged. A state that is done does not change, and
+    its rewards are 0.
 
-    Every reset takes one of `worlds` random worlds of the domain, drawn in advance on the host,
-    and noise of its own; no other randomisation is needed. Shape family and engine are static.
+    Every reset takes one of `worlds` random worlds of the domain, which are drawn in advance on the
+    host, and new noise. Shape family and engine are static.
 
     Raises:
       InputError: an unknown object, a skin without taxels, or an engine that JAX does not run.
     """
 
-    object: str = "random_box"  # of all worlds; those of the domain are not used
+    object: str = "random_box"  # in all worlds; the objects of the domain are not used
     domain: Domain = DOMAINS["wide"]
-    params: RPSParams = RPSParams.paper()  # of which the bounds of the twist and d_success count
+    params: RPSParams = RPSParams.paper()  # only the bounds of the twist and d_success are used
     setting: Setting = Setting(engine="fused")
-    robot: Robot | str | None = None  # by its name, as kairos; None: the domain's
+    robot: Robot | str | None = None  # name, as kairos; None: the domain's
     weights: Reward = Reward()
     worlds: int = 1024
 
     def __post_init__(self) -> None:
-        """Draws the worlds: now, and not while a loop is traced."""
+        """Check the options, and draw the worlds before a loop is traced."""
         engines.get(self.setting.engine).check_traced()
         errors.check_name("skin of an environment", self.domain.skin, ("capacitive",))
         errors.check_count("worlds", self.worlds, at_most=1_000_000)
@@ -123,7 +123,7 @@ class PushEnv:
     # --- the loop ---
 
     def reset(self, rng: jax.Array) -> State:
-        """A world by chance, at its start, from a key."""
+        """Return a random world at its start, from a key."""
         key_world, key = jax.random.split(rng)
         index = jax.random.randint(key_world, (), 0, self.worlds)
         world = rows(self.table, index)
@@ -131,78 +131,87 @@ class PushEnv:
 
     @property
     def table(self) -> World:
-        """All its worlds, as leaves (worlds, ...)."""
-        return self._part.worlds
+        """Worlds of the domain, with leaves (worlds, ...)."""
+        return self._batch.worlds
 
     def begin(self, world: World, index: jax.Array) -> State:
-        """A world, of the index or one that was made of it, at its start."""
-        before = trial.start(world, self.params)
-        never_felt = jnp.full_like(before.min_distance, jnp.inf)
-        now, seen = self._observe(world, before._replace(law_state=never_felt))
-        nothing = jnp.zeros_like(now.min_distance)
-        info = {"world": world, "index": index, "observation": self._observation(world, now, seen)}
-        return State(now, _obs(now, seen), nothing, nothing, _metrics(now, seen, nothing), info)
+        """Return the start of the world `index`, or of one derived from it."""
+        start = trial.start(world, self.params)
+        no_contact = jnp.full_like(start.min_distance, jnp.inf)
+        current, measured = self._observe(world, start._replace(law_state=no_contact))
+        zero = jnp.zeros_like(current.min_distance)
+        obs = self._observation(world, current, measured)
+        info = {"world": world, "index": index, "observation": obs}
+        metrics = _metrics(current, measured, zero)
+        return State(current, _obs(current, measured), zero, zero, metrics, info)
 
     def step(self, state: State, action: jax.Array) -> State:
-        """One control period with the base at the twist of an action (3,)."""
-        world, before = state.info["world"], state.data
-        told, twist = trial.execute(world, before, self.twist(action), self.dt)
+        """Run one control period with the base at the twist of an action (3,)."""
+        world, previous = state.info["world"], state.data
+        decided, twist = trial.execute(world, previous, self.twist(action), self.dt)
         robot = trial.pushing(world)
-        driven = self._drive(world.fields, trial.motion(told), twist, robot)
-        moved = trial.settle(before, told, driven)
-        now, seen = self._observe(world, moved)
-        gone = moved.done  # it had ended before, or the physics ended it
-        progress = jnp.where(jnp.isfinite(before.law_state), before.law_state - now.law_state, 0.0)
+        driven = self._drive(world.fields, trial.motion(decided), twist, robot)
+        moved = trial.settle(previous, decided, driven)
+        current, measured = self._observe(world, moved)
+        ended = moved.done  # before this step, or because the physics diverged
+        distance = previous.law_state
+        progress = jnp.where(jnp.isfinite(distance), distance - current.law_state, 0.0)
         reward = (
             self.weights.progress * progress
-            - self.weights.no_contact * self.dt * ~seen.reading.in_contact
-            + self.weights.success * now.success
+            - self.weights.no_contact * self.dt * ~measured.reading.in_contact
+            + self.weights.success * current.success
         )
-        for weight, gain in zip(self.weights[3:], self._gains(world, before, now), strict=True):
-            reward += weight * gain if weight else 0.0
+        terms = self._true_state_terms(world, previous, current)
+        for weight, term in zip(self.weights[3:], terms, strict=True):
+            reward += weight * term if weight else 0.0
+        obs = self._observation(world, current, measured)
         return state.replace(
-            data=now,
-            obs=_obs(now, seen),
-            reward=jnp.where(gone, 0.0, reward),
-            done=now.done.astype(reward.dtype),
-            metrics=state.metrics | _metrics(now, seen, jnp.where(gone, 0.0, progress)),
-            info=state.info | {"observation": self._observation(world, now, seen)},
+            data=current,
+            obs=_obs(current, measured),
+            reward=jnp.where(ended, 0.0, reward),
+            done=current.done.astype(reward.dtype),
+            metrics=state.metrics | _metrics(current, measured, jnp.where(ended, 0.0, progress)),
+            info=state.info | {"observation": obs},
         )
 
     def twist(self, action: jax.Array) -> Twist:
-        """The twist [m/s, m/s, rad/s] that an action (3,) asks for."""
+        """Return the twist [m/s, m/s, rad/s] of an action (3,), within the bounds."""
         v_max, omega_max = self.params.v_max, self.params.omega_max
-        wanted = Twist(v_max * action[0], v_max * action[1], omega_max * action[2])
-        return rps.saturate(self.params, wanted)
+        twist = Twist(v_max * action[0], v_max * action[1], omega_max * action[2])
+        return rps.saturate(self.params, twist)
 
-    def _gains(self, world: World, before: Trial, now: Trial) -> tuple[jax.Array, jax.Array]:
-        """By how much a step brought the object nearer [m], and the base behind it [1]."""
+    def _true_state_terms(
+        self, world: World, previous: Trial, current: Trial
+    ) -> tuple[jax.Array, jax.Array]:
+        """Return the changes of the terms `object` [m] and `behind` [1] of the reward."""
 
-        def of(state: Trial) -> tuple[jax.Array, jax.Array]:
+        def terms(state: Trial) -> tuple[jax.Array, jax.Array]:
             p_object, _ = trial.object_pose(state.qpos)
-            away = planar.norm(world.p_world_target - p_object) - fp.circumradius(world.footprint)
+            to_target = planar.norm(world.p_world_target - p_object)
+            gap = to_target - fp.circumradius(world.footprint)
             ways = p_object - state.qpos[:2], world.p_world_target - state.qpos[:2]
             lengths = jnp.maximum(planar.norm(ways[0]) * planar.norm(ways[1]), 1e-6)
-            return jnp.maximum(away, 0.0), jnp.dot(*ways) / lengths
+            return jnp.maximum(gap, 0.0), jnp.dot(*ways) / lengths
 
-        (far, apart), (near, together) = of(before), of(now)
-        return far - near, together - apart
+        (old_gap, old_cosine), (gap, cosine) = terms(previous), terms(current)
+        return old_gap - gap, cosine - old_cosine
 
-    def _observe(self, world: World, before: Trial) -> tuple[Trial, Measurement]:
-        """Sense and judge, unless the trial has ended."""
+    def _observe(self, world: World, previous: Trial) -> tuple[Trial, Measurement]:
+        """Sense and judge, unless the trial has ended; `law_state` is the last distance felt."""
         physics, rules = self.setting.physics, self.setting.rules
-        told, seen = trial.observe(world, self.params, before, physics=physics, rules=rules)
-        felt = jnp.where(seen.reading.in_contact, seen.distance, before.law_state)
-        told = told._replace(law_state=felt)
-        return jax.tree.map(lambda a, b: jnp.where(before.done, a, b), before, told), seen
+        judged, measured = trial.observe(world, self.params, previous, physics=physics, rules=rules)
+        distance = jnp.where(measured.reading.in_contact, measured.distance, previous.law_state)
+        judged = judged._replace(law_state=distance)
+        frozen = jax.tree.map(lambda a, b: jnp.where(previous.done, a, b), previous, judged)
+        return frozen, measured
 
-    def _observation(self, world: World, now: Trial, seen: Measurement) -> TaxelObservation:
-        """What a law that senses taxels is told."""
-        felt = world.skin, now.skin, trial.outline(world, now.qpos)
-        touch = seen.observation._replace(period=jnp.asarray(self.dt))
-        return features.taxel_observation(touch, seen.reading, *felt)
+    def _observation(self, world: World, current: Trial, measured: Measurement) -> TaxelObservation:
+        """Return the observation of a law that senses taxels."""
+        skin = world.skin, current.skin, trial.outline(world, current.qpos)
+        touch = measured.observation._replace(period=jnp.asarray(self.dt))
+        return features.taxel_observation(touch, measured.reading, *skin)
 
-    # --- what it is made of ---
+    # --- properties ---
 
     @property
     def observation_size(self) -> int:
@@ -231,7 +240,7 @@ class PushEnv:
 
     @property
     def unwrapped(self) -> PushEnv:
-        """Itself."""
+        """This environment."""
         return self
 
     @property
@@ -242,12 +251,12 @@ class PushEnv:
 
     @property
     def mj_model(self) -> mujoco.MjModel:
-        """World 0, with all that is seen."""
+        """Model of world 0, with its visual geoms."""
         return self._scene(0).model
 
     @property
     def mjx_model(self) -> mjx.Model:
-        """World 0, what touches alone: what the engine `mjx` steps."""
+        """Collision model of world 0, which the engine `mjx` steps."""
         return mjx.put_model(self._scene(0).physics)
 
     @functools.cached_property
@@ -261,14 +270,14 @@ class PushEnv:
         return draws.draw(self._alone, self.setting.seed, np.arange(self.worlds))
 
     @functools.cached_property
-    def _part(self) -> WorldBatch:
-        """All worlds, on the device."""
+    def _batch(self) -> WorldBatch:
+        """Worlds of the domain, on the device."""
         part = drawn_worlds(self._alone, self._drawn, self.setting)
         return part._replace(worlds=jax.tree.map(jnp.asarray, part.worlds))
 
     @functools.cached_property
     def _drive(self) -> Callable[..., Driven]:
-        return one_of_many(self._part.stage, self.setting)
+        return world_driver(self._batch.stage, self.setting)
 
     def _scene(self, index: int) -> Scene:
         return drawn_scene(self._alone, self._drawn, self.setting.physics, index)
@@ -282,9 +291,9 @@ class PushEnv:
         scene_option: None = None,  # unused
         modify_scene_fns: None = None,  # unused
     ) -> Any:
-        """Images (height, width, 3) uint8 of states without a batch axis: a list, or one of one.
+        """Render images (height, width, 3) uint8 of states without a batch axis.
 
-        Each is drawn in its own world, by the camera oblique (the default) or above.
+        The camera is oblique (the default) or above. One state gives one image.
         """
         del scene_option, modify_scene_fns
         if isinstance(trajectory, State):
@@ -303,38 +312,41 @@ class PushEnv:
         return images
 
 
-def _obs(now: Trial, seen: Measurement) -> jax.Array:
-    taxels = jnp.where(now.skin.alive, now.skin.signal, 0.0)
-    told = seen.observation
-    p_robot_target = planar.rotate(-told.yaw, told.p_world_target - told.p_world_robot)
+def _obs(current: Trial, measured: Measurement) -> jax.Array:
+    """Return the observation (T + 2,) of `PushEnv`."""
+    taxels = jnp.where(current.skin.alive, current.skin.signal, 0.0)
+    obs = measured.observation
+    p_robot_target = planar.rotate(-obs.yaw, obs.p_world_target - obs.p_world_robot)
     return jnp.concatenate([taxels, p_robot_target])
 
 
-def _metrics(now: Trial, seen: Measurement, progress: jax.Array) -> dict[str, jax.Array]:
+def _metrics(current: Trial, measured: Measurement, progress: jax.Array) -> dict[str, jax.Array]:
     flags = {
-        "in_contact": seen.reading.in_contact,
-        "success": now.success,
-        "diverged": now.diverged,
+        "in_contact": measured.reading.in_contact,
+        "success": current.success,
+        "diverged": current.diverged,
     }
     return {"progress": progress} | {k: v.astype(progress.dtype) for k, v in flags.items()}
 
 
-def one_of_many(stage: Stage, setting: Setting) -> Callable[..., Driven]:
-    """Drives one world; under vmap the stage drives the whole batch, on a GPU as one kernel."""
+def world_driver(stage: Stage, setting: Setting) -> Callable[..., Driven]:
+    """Return a function that drives one world; under vmap, the stage drives the whole batch."""
 
-    def together(fields: Any, motion: Motion, twist: Twist, robot: Robot | None = None) -> Driven:
+    def drive_batch(
+        fields: Any, motion: Motion, twist: Twist, robot: Robot | None = None
+    ) -> Driven:
         return stage.drive(fields, motion, ControlPeriod(twist, setting.physics, robot))
 
     @jax.custom_batching.custom_vmap
-    def drive(*one: Any) -> Driven:
-        return rows(together(*jax.tree.map(lambda x: jnp.asarray(x)[None], one)), 0)
+    def drive(*arguments: Any) -> Driven:
+        return rows(drive_batch(*jax.tree.map(lambda x: jnp.asarray(x)[None], arguments)), 0)
 
     @drive.def_vmap
-    def _(size: int, batched: Any, *args: Any) -> tuple[Driven, Driven]:
-        def full(x: Any, has: bool) -> Any:
-            return x if has else jnp.broadcast_to(x, (size, *jnp.shape(x)))
+    def _(size: int, batched: Any, *arguments: Any) -> tuple[Driven, Driven]:
+        def broadcast(x: jax.Array, is_batched: bool) -> jax.Array:
+            return x if is_batched else jnp.broadcast_to(x, (size, *jnp.shape(x)))
 
-        driven = together(*jax.tree.map(full, args, tuple(batched)))
+        driven = drive_batch(*jax.tree.map(broadcast, arguments, tuple(batched)))
         return driven, jax.tree.map(lambda _: True, driven)
 
     return drive

@@ -1,7 +1,7 @@
-"""Trials of an engine that JAX does not trace: stepped on the host, decided through JAX.
+"""Trials with an engine that JAX does not trace, such as C MuJoCo: it steps worlds on the host.
 
-Sensing, deciding and the rules are those of `trial`; the engine is the only difference. Positions
-are handed over in JAX's precision and stepped in the engine's own.
+Sensing, laws and rules run in JAX, as in `trial`. The engine gets positions in the precision of
+JAX and steps them in its own precision.
 """
 
 from collections.abc import Callable
@@ -15,7 +15,7 @@ from rps_jax.engines.base import Driven, Engine, Motion
 from rps_jax.trials import trial
 from rps_jax.trials.trial import ControlLoop, Snapshot, Trial, World
 
-_LOOK = 500  # control steps between two reports
+_REPORT_STEPS = 500  # control steps between two reports
 
 
 _decide = jax.jit(jax.vmap(trial.decide, (0, 0, 0, None)))
@@ -31,44 +31,54 @@ def run(
     *,
     threads: int,
     callback: Callable[[np.ndarray, Trial, float], bool],
-    watch: Callable[[int, Snapshot], Any] = lambda step, seen: None,
+    watch: Callable[[int, Snapshot], object] = lambda step, snapshot: None,
 ) -> Trial:
     """Run a batch of worlds to their ends, and return the trials.
 
-    `report(ended, trials, simulated)` hears now and then which trials (n,) have ended since, and
-    how many seconds were simulated, summed over all; it answers whether to go on. `watch` is handed
-    every control step, with what all trials looked like at its beginning.
+    Args:
+      engine: an engine that JAX does not trace.
+      stage: argument of the engine's `stepper`.
+      worlds: with leaves (n, ...).
+      params: law parameters, likewise.
+      loop: physics, rules and law.
+      threads: number of threads of the engine.
+      callback: called at times as `callback(ended, trials, simulated)` with the indices of the
+        trials that have ended since the last call and the simulated time [s] summed over trials;
+        returns whether to go on.
+      watch: called in every control step with its index and the snapshot of all trials.
     """
     physics, law = loop.physics, loop.law
     count = len(worlds.qpos)
-    host = jax.devices("cpu")[0]  # where the engine is
+    host = jax.devices("cpu")[0]
     worlds, params = jax.device_put((worlds, params), host)
     trials = trial.start_all(worlds, params, np.ones(count, bool), law=law)
-    batch = engine.stepper(stage, np.asarray(trials.qpos, float), threads, trial.pushing(worlds))
+    robot = trial.pushing(worlds)
+    stepper = engine.stepper(stage, np.asarray(trials.qpos, float), threads, robot)
     try:
-        told_of = np.zeros(count, bool)
-        before, passes, dtype = 0, 0, trials.qpos.dtype
-        while not told_of.all():
-            told, twist, seen = _decide(worlds, params, trials, loop)
-            now = np.asarray(told.qpos)
-            watch(passes, seen)
-            going = np.flatnonzero(~np.asarray(told.done))
-            # Only a hand that shifts the object moves it outside the engine.
-            shifted = np.flatnonzero(np.any(now != np.asarray(trials.qpos), axis=1))
-            batch.qpos[shifted] = now[shifted]
-            if going.size:
-                batch.drive(going, np.stack(twist, axis=1)[going].astype(float), physics.substeps)
-            after = Motion(batch.qpos, batch.qvel, batch.warmstart, batch.integral)
+        reported = np.zeros(count, bool)
+        steps_reported, step, dtype = 0, 0, trials.qpos.dtype
+        while not reported.all():
+            decided, twist, snapshot = _decide(worlds, params, trials, loop)
+            qpos = np.asarray(decided.qpos)
+            watch(step, snapshot)
+            running = np.flatnonzero(~np.asarray(decided.done))
+            # Only a scripted shift moves the object outside of the engine.
+            shifted = np.flatnonzero(np.any(qpos != np.asarray(trials.qpos), axis=1))
+            stepper.qpos[shifted] = qpos[shifted]
+            if running.size:
+                twists = np.stack(twist, axis=1)[running].astype(float)
+                stepper.drive(running, twists, physics.substeps)
+            after = Motion(stepper.qpos, stepper.qvel, stepper.warmstart, stepper.integral)
             motion = jax.tree.map(lambda x: x.astype(dtype), after)
-            felt = batch.force.astype(dtype) if law.senses == "force" else None
-            trials = _settle(trials, told, Driven(motion, force=felt))
-            passes += 1
-            if passes % _LOOK == 0 or not going.size:
+            force = stepper.force.astype(dtype) if law.senses == "force" else None
+            trials = _settle(trials, decided, Driven(motion, force=force))
+            step += 1
+            if step % _REPORT_STEPS == 0 or not running.size:
                 done, steps = np.asarray(trials.done), int(np.asarray(trials.steps).sum())
-                simulated = (steps - before) * physics.control_period
-                if not callback(np.flatnonzero(done & ~told_of), trials, simulated):
+                simulated = (steps - steps_reported) * physics.control_period
+                if not callback(np.flatnonzero(done & ~reported), trials, simulated):
                     return trials
-                told_of, before = done, steps
+                reported, steps_reported = done, steps
         return trials
     finally:
-        batch.close()
+        stepper.close()

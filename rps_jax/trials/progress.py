@@ -1,4 +1,4 @@
-"""What a run tells of itself while it runs: how far it is, and where the time went."""
+"""Progress of a run and its times: records, callbacks and the progress bar."""
 
 from __future__ import annotations
 
@@ -7,12 +7,15 @@ import sys
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Literal, NoReturn
+
+if TYPE_CHECKING:
+    from tqdm import tqdm
 
 
 @dataclass(frozen=True)
 class Progress:
-    """A look at a run under way."""
+    """Progress of a run."""
 
     finished: int  # trials
     simulated: float  # [s] summed over trials, ended or running
@@ -20,37 +23,38 @@ class Progress:
     rounds: int = 0  # generations or updates that are done
 
 
-ProgressCallback = Callable[[Progress], object]  # called now and then by what runs
+ProgressCallback = Callable[[Progress], object]
 
 
 def no_progress(progress: Progress) -> None:
-    """Ignore the progress of a run that nobody watches."""
+    """Ignore the progress of a run."""
 
 
 class SequentialProgress:
-    """ProgressCallback of runs that follow one another, as if they were one."""
+    """Callback of successive runs, which reports them as one run."""
 
     def __init__(self, callback: ProgressCallback):
-        self._report = callback
-        self._before = self._now = Progress(0, 0.0)
+        self._callback = callback
+        self._previous = self._current = Progress(0, 0.0)  # of finished runs, and in all
 
     def __call__(self, progress: Progress) -> None:
-        before = self._before
-        self._now = Progress(
-            before.finished + progress.finished,
-            before.simulated + progress.simulated,
-            before.compile + progress.compile,
+        previous = self._previous
+        self._current = Progress(
+            previous.finished + progress.finished,
+            previous.simulated + progress.simulated,
+            previous.compile + progress.compile,
         )
-        self._report(self._now)
+        self._callback(self._current)
 
     def finish(self, trials: int) -> None:
-        """Count a run of so many trials as ended, even if it had nothing left to run."""
-        self._before = self._now = replace(self._now, finished=self._before.finished + trials)
+        """Count a run of this number of trials as finished, even if it had nothing left to run."""
+        finished = self._previous.finished + trials
+        self._previous = self._current = replace(self._current, finished=finished)
 
 
 @dataclass(frozen=True)
 class Timing:
-    """Where the time of a run went."""
+    """Times of a run."""
 
     compile: float  # [s] until the worker who waited longest had its programs
     run: float  # [s] wall clock after that
@@ -58,10 +62,10 @@ class Timing:
 
 
 class Bar:
-    """Progress bar on the error stream, with rate and time left, to be handed to a run as `report`.
+    """Progress bar on the error stream, with rate and time left; a callback of a run.
 
-    It says `compile` until the first trials have run, and then the phase of the run. Without a
-    known total it counts, and shows itself with the first trials.
+    It shows `compile` until the first trials have run, and then the phase of the run. Without a
+    known total it appears with the first trials and counts.
 
     Example:
       >>> import rps_jax
@@ -69,28 +73,28 @@ class Bar:
       >>> drums, rules = rps_jax.Domain(("random_cylinder",)), rps_jax.Rules(horizon=2.0)
       >>> setting = rps_jax.Setting("quasistatic", rules=rules)
       >>> with Bar("sweep", 8, shown=False) as bar:
-      ...     found = rps_jax.sweep("rps", drums, worlds=8, setting=setting, report_to=bar)
+      ...     results = rps_jax.sweep("rps", drums, worlds=8, setting=setting, report_to=bar)
       >>> bar.timing.simulated > 0
       True
     """
 
     def __init__(
         self,
-        what: str,
+        phase: str,
         total: float | None = None,
         over: Literal["trials", "simulated", "clock", "generations", "updates"] = "trials",
         *,
         shown: bool = True,
     ):
         """A bar over trials, simulated seconds, seconds of wall clock, generations or updates."""
-        self._what, self._total, self.over, self._shown = what, total, over, shown
-        self._bar: Any = None
-        self._began = time.perf_counter()
+        self._phase, self._total, self.over, self._shown = phase, total, over, shown
+        self._bar: tqdm[NoReturn] | None = None
+        self._start_time = time.perf_counter()
         self._last = Progress(0, 0.0)
         self.on_compiled: Callable[[], object] | None = None  # called once, when trials run
 
     def __enter__(self) -> Bar:
-        self._began = time.perf_counter()
+        self._start_time = time.perf_counter()
         if self._total is not None:
             self._open("compile")
         return self
@@ -99,34 +103,39 @@ class Bar:
         if self._bar is not None:
             self._bar.close()
 
-    def _open(self, what: str) -> Any:
+    def _open(self, phase: str) -> tqdm[NoReturn]:
         from tqdm import tqdm
 
-        own: dict[str, Any] = {"mininterval": 0.5}
-        if self.over == "simulated":
-            own = {"smoothing": 0.05}
+        smoothing = 0.05 if self.over == "simulated" else 0.3
+        interval = 0.1 if self.over == "simulated" else 0.5
         unit = "s" if self.over in ("simulated", "clock") else self.over.removesuffix("s")
         self._bar = tqdm(
-            total=self._total, unit=unit, desc=what, disable=not self._shown, file=sys.stderr, **own
+            total=self._total,
+            unit=unit,
+            desc=phase,
+            disable=not self._shown,
+            file=sys.stderr,
+            mininterval=interval,
+            smoothing=smoothing,
         )
         return self._bar
 
     @property
     def elapsed(self) -> float:
-        """Wall clock [s] since it began."""
-        return time.perf_counter() - self._began
+        """Wall clock [s] since the start of the bar."""
+        return time.perf_counter() - self._start_time
 
-    def phase(self, what: str) -> None:
-        """Say what is done from now on."""
-        self._what = what
+    def phase(self, name: str) -> None:
+        """Show the name of the next phase of the run."""
+        self._phase = name
         if self._bar is not None:
-            self._bar.set_description(what)
+            self._bar.set_description(name)
 
     def __call__(self, progress: Progress) -> None:
         self._last = progress
         if progress.compile and self.on_compiled is not None:
-            called, self.on_compiled = self.on_compiled, None
-            called()
+            on_compiled, self.on_compiled = self.on_compiled, None
+            on_compiled()
         note = f"{progress.simulated:.0f} s simulated"
         if self.over == "trials":
             self.move(progress.finished, note)
@@ -138,27 +147,27 @@ class Bar:
             self.move(progress.rounds, note)
 
     def move(self, done: float, note: str = "") -> None:
-        """Show that so many units are done, with a note beside."""
-        bar = self._open(self._what) if self._bar is None else self._bar
-        bar.set_description(self._what, refresh=False)
+        """Show the number of finished units, with a note."""
+        bar = self._open(self._phase) if self._bar is None else self._bar
+        bar.set_description(self._phase, refresh=False)
         if note:
             bar.set_postfix_str(note, refresh=False)
         bar.update(round(done - bar.n, 3))
 
     @property
     def timing(self) -> Timing:
-        """Where the time went until now."""
+        """Times of the run so far."""
         return Timing(self._last.compile, self.elapsed - self._last.compile, self._last.simulated)
 
 
-def set_phase(callback: ProgressCallback, what: str) -> None:
-    """Tell a bar what is done from now on; others do not hear of it."""
+def set_phase(callback: ProgressCallback, name: str) -> None:
+    """Show the name of the next phase if the callback is a bar."""
     if isinstance(callback, Bar):
-        callback.phase(what)
+        callback.phase(name)
 
 
 def is_interactive() -> bool:
-    """Whether somebody looks: the error stream is a terminal, or this is a notebook."""
+    """Return whether the error stream is a terminal, or this is a notebook."""
     if "ipykernel" in sys.modules:
         return True
     return sys.stderr is not None and sys.stderr.isatty()

@@ -1,11 +1,11 @@
-"""The trials that are asked for one by one: cases -> worlds -> outcomes, or traces over time."""
+"""Named cases: their worlds, their outcomes (`run`), and their trajectories (`record_cases`)."""
 
 import math
 import time
 from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
+from typing import Any, Unpack
 
 import jax
 import jax.numpy as jnp
@@ -21,7 +21,7 @@ from rps_jax.geometry.footprint import Footprint
 from rps_jax.robot.base import Odometry
 from rps_jax.robot.shell import Shell
 from rps_jax.trials import batch, host, trial, worlds
-from rps_jax.trials.batch import SEGMENT, Job, WorldBatch, rows
+from rps_jax.trials.batch import SEGMENT, BatchOptions, Job, WorldBatch, rows
 from rps_jax.trials.case import Case
 from rps_jax.trials.progress import Progress, ProgressCallback, Timing, no_progress
 from rps_jax.trials.setting import Setting
@@ -34,11 +34,11 @@ from rps_jax.world.scene import JOINTS, Friction, Scene
 
 @dataclass(frozen=True)
 class Trajectory:
-    """One trial, seen every `interval` [s]: arrays over time, (T, ...)."""
+    """One trial over time: snapshots at equal intervals, arrays (T, ...)."""
 
     snapshots: Snapshot
     outcome: Outcome  # without a leading axis
-    timing: Timing  # of all trials followed together
+    timing: Timing  # of all trials in the batch
     p_world_target: tuple[float, float]  # [m]
     params: LawParams
     half: tuple[float, float]  # [m] half length and half width of the base
@@ -118,7 +118,7 @@ def build(
 
 
 def kind(case: Case) -> Hashable:
-    """What decides which compiled program runs a case: family, law, sensor and robot."""
+    """Return the key of the compiled program for a case: family, law, sensor and robot."""
     return (
         FAMILIES[case.object_name],
         type(case.params),
@@ -132,27 +132,29 @@ def _stack(trees: Sequence[Any], dtype: Any = float) -> Any:
 
 
 def run(
-    cases: Sequence[Case], setting: Setting = Setting(engine="mjx"), **shape: Any
+    cases: Sequence[Case],
+    setting: Setting = Setting(engine="mjx"),
+    **options: Unpack[BatchOptions],
 ) -> tuple[Outcome, Timing]:
     """Run every case to its end, in any mixture of objects, frictions, targets and parameters.
 
-    Slots, workers and report are those of `batch.run`. Results are bit-identical for equal slots on
-    one kind of device, whatever shares the batch.
+    The options are those of `batch.run`. Results are bit-identical for equal slots on one kind of
+    device, whatever shares the batch.
 
     Returns:
       Outcomes as numpy arrays (len(cases), ...), in the order of `cases`; and the timing.
     """
-    # Without reaction most trials lose the object and wait for their end: the longest go first, so
-    # that the last slots to run are not theirs.
-    lasts = [float(c.params.reactive) if isinstance(c.params, RPSParams) else 0.0 for c in cases]
-    jobs, kinds = [], dict[Hashable, list[int]]()
-    for i in np.argsort(lasts, kind="stable").tolist():
-        kinds.setdefault(kind(cases[i]), []).append(i)
-    for indices in kinds.values():
-        mine = [cases[i] for i in indices]
-        part = build(mine, setting, indices)
-        jobs.append(Job(registry.law_of(mine[0].params), len(mine), [part]))
-    return batch.run_all(jobs, setting, len(cases), **shape)
+    # Without reaction most trials lose the object and run to the horizon. They start first, so that
+    # few slots are idle at the end.
+    order = [float(c.params.reactive) if isinstance(c.params, RPSParams) else 0.0 for c in cases]
+    jobs, groups = [], dict[Hashable, list[int]]()
+    for i in np.argsort(order, kind="stable").tolist():
+        groups.setdefault(kind(cases[i]), []).append(i)
+    for indices in groups.values():
+        members = [cases[i] for i in indices]
+        built = build(members, setting, indices)
+        jobs.append(Job(registry.law_of(members[0].params), len(members), [built]))
+    return batch.run_all(jobs, setting, len(cases), **options)
 
 
 def record_cases(
@@ -162,119 +164,125 @@ def record_cases(
     interval: float = 0.1,
     callback: ProgressCallback = no_progress,
 ) -> list[Trajectory]:
-    """Run trials of one kind to their ends and keep what they looked like every `interval` [s]."""
-    part = build(cases, setting)
+    """Run cases of one kind to their ends, with a snapshot every `interval` [s]."""
     law = registry.law_of(cases[0].params)
-    return record_batch(part, law, setting, interval=interval, callback=callback)
+    return record_batch(build(cases, setting), law, setting, interval=interval, callback=callback)
 
 
 def record_batch(
-    part: WorldBatch,
+    worlds: WorldBatch,
     law: Law,
     setting: Setting,
     *,
     interval: float = 0.1,
     callback: ProgressCallback = no_progress,
 ) -> list[Trajectory]:
-    """`follow`, for worlds that are built."""
+    """Run trials of one stage to their ends, with a snapshot every `interval` [s]."""
     period = setting.physics.control_period
-    every = max(1, round(interval / period))
+    stride = max(1, round(interval / period))
     if not engines.get(setting.engine).traced:
-        return _followed(part, *_follow_on_host(part, law, setting, every, callback))
-    steps = every * max(1, round(SEGMENT / (every * period)))
-    part = jax.device_put(part)
-    trials = trial.start_all(part.worlds, part.params, np.ones(part.indices.size, bool), law=law)
-    began = time.perf_counter()
-    record = recorder(part, trials, setting, law, steps=steps, every=every)
-    compiled = time.perf_counter()
-    parts = []
+        return _trajectories(worlds, *_record_on_host(worlds, law, setting, stride, callback))
+    steps = stride * max(1, round(SEGMENT / (stride * period)))
+    worlds = jax.device_put(worlds)
+    trials = trial.start_all(*worlds.inputs, np.ones(worlds.indices.size, bool), law=law)
+    start_time = time.perf_counter()
+    record = recorder(worlds, trials, setting, law, steps=steps, stride=stride)
+    compiled_at = time.perf_counter()
+    compile_time = compiled_at - start_time
+    segments = []
     while True:
         trials, snapshots, outcomes = record(trials)
         done, steps_done, snapshots, outcomes = jax.device_get(
             (trials.done, trials.steps, snapshots, outcomes)
         )
-        parts.append(snapshots)
-        callback(Progress(int(done.sum()), float(steps_done.sum()) * period, compiled - began))
+        segments.append(snapshots)
+        callback(Progress(int(done.sum()), float(steps_done.sum()) * period, compile_time))
         if done.all():
             break
-    whole = jax.tree.map(lambda *arrays: np.concatenate(arrays), *parts)
-    timing = Timing(compiled - began, time.perf_counter() - compiled, float(np.sum(outcomes.time)))
-    return _followed(part, whole, outcomes, timing)
+    snapshots = jax.tree.map(lambda *arrays: np.concatenate(arrays), *segments)
+    run_time = time.perf_counter() - compiled_at
+    timing = Timing(compile_time, run_time, float(np.sum(outcomes.time)))
+    return _trajectories(worlds, snapshots, outcomes, timing)
 
 
 def recorder(
-    part: WorldBatch, trials: Trial, setting: Setting, law: Law, *, steps: int, every: int
+    worlds: WorldBatch, trials: Trial, setting: Setting, law: Law, *, steps: int, stride: int
 ) -> Callable[[Trial], tuple[Trial, Snapshot, Outcome]]:
-    """`trial.record` of a batch and how its trials stand then, compiled, or kept by a process."""
-    own = {"physics": setting.physics, "law": law, "steps": steps, "every": every}
+    """Compile `trial.record` for a batch, or load it from the cache.
 
-    def record(*given: Any) -> tuple[Trial, Snapshot, Outcome]:
-        *batch, rules = given
-        after, snapshots = trial.record(*batch, rules=rules, **own)
-        return after, snapshots, trial.outcome(after, setting.physics.control_period)
+    The function returns trials after `steps` control steps, snapshots, and the outcomes so far.
+    """
+    physics = setting.physics
 
-    inputs = part.stage, part.worlds, part.params
-    given = *inputs, trials, setting.rules
-    static = (setting.physics, steps, every)
-    program = programs.compile_function(record, given, law=law, donate=3, static=static)
-    return lambda now: program(*inputs, now, setting.rules)
+    def record(*arguments: Any) -> tuple[Trial, Snapshot, Outcome]:
+        *state, rules = arguments
+        after, snapshots = trial.record(
+            *state, rules=rules, physics=physics, law=law, steps=steps, stride=stride
+        )
+        return after, snapshots, trial.outcome(after, physics.control_period)
+
+    fixed = worlds.stage, *worlds.inputs
+    arguments = *fixed, trials, setting.rules
+    static = (physics, steps, stride)
+    program = programs.compile_function(record, arguments, law=law, donate=3, static=static)
+    return lambda trials: program(*fixed, trials, setting.rules)
 
 
-def _follow_on_host(
-    part: WorldBatch, law: Law, setting: Setting, every: int, callback: ProgressCallback
+def _record_on_host(
+    worlds: WorldBatch, law: Law, setting: Setting, stride: int, callback: ProgressCallback
 ) -> tuple[Snapshot, Outcome, Timing]:
-    """What `host.run` sees every so many control steps: (T, B, ...), outcomes and timing."""
-    seen: list[Snapshot] = []
-    total, began, compiled = 0.0, time.perf_counter(), 0.0
+    """Run trials with an engine outside of JAX; return snapshots (T, B, ...), outcomes, timing."""
+    snapshots: list[Snapshot] = []
+    total, start_time, compile_time = 0.0, time.perf_counter(), 0.0
 
-    def watch(step: int, now: Snapshot) -> None:
-        nonlocal compiled
-        compiled = compiled or time.perf_counter() - began  # the first step is decided
-        if step % every == 0:
-            seen.append(jax.device_get(now))
+    def watch(step: int, snapshot: Snapshot) -> None:
+        nonlocal compile_time
+        compile_time = compile_time or time.perf_counter() - start_time  # of the first step
+        if step % stride == 0:
+            snapshots.append(jax.device_get(snapshot))
 
-    def tell(_: np.ndarray, trials: Trial, simulated: float) -> bool:
+    def report(_: np.ndarray, trials: Trial, simulated: float) -> bool:
         nonlocal total
         total += simulated
-        callback(Progress(int(np.asarray(trials.done).sum()), total, compiled))
+        callback(Progress(int(np.asarray(trials.done).sum()), total, compile_time))
         return True
 
     trials = host.run(
         engines.get(setting.engine),
-        part.stage,
-        part.worlds,
-        part.params,
+        worlds.stage,
+        *worlds.inputs,
         ControlLoop(setting.physics, setting.rules, law),
-        threads=1 if part.indices.size == 1 else device.count_processors(),
-        callback=tell,
+        threads=1 if worlds.indices.size == 1 else device.count_processors(),
+        callback=report,
         watch=watch,
     )
     outcomes = jax.device_get(trial.outcome(trials, setting.physics.control_period))
-    ran = time.perf_counter() - began - compiled
-    timing = Timing(compiled, ran, float(np.sum(outcomes.time)))
-    return jax.tree.map(lambda *each: np.stack(each), *seen), outcomes, timing
+    run_time = time.perf_counter() - start_time - compile_time
+    timing = Timing(compile_time, run_time, float(np.sum(outcomes.time)))
+    return jax.tree.map(lambda *leaves: np.stack(leaves), *snapshots), outcomes, timing
 
 
-def _followed(
-    part: WorldBatch, whole: Snapshot, outcomes: Outcome, timing: Timing
+def _trajectories(
+    worlds: WorldBatch, snapshots: Snapshot, outcomes: Outcome, timing: Timing
 ) -> list[Trajectory]:
-    """What was seen (T, B, ...), trial by trial, each until its end."""
+    """Return snapshots (T, B, ...) trial by trial, each until its end."""
+    targets = worlds.worlds.p_world_target
     return [
         Trajectory(
-            rows(whole, (~whole.done[:, i], i)),
+            rows(snapshots, (~snapshots.done[:, i], i)),
             rows(outcomes, i),
             timing,
-            (float(part.worlds.p_world_target[i][0]), float(part.worlds.p_world_target[i][1])),
-            rows(part.params, i),
-            _half(rows(part.worlds.skin.shell, i)),
-            _outline(rows(part.worlds.footprint, i)),
+            (float(targets[i][0]), float(targets[i][1])),
+            rows(worlds.params, i),
+            _half(rows(worlds.worlds.skin.shell, i)),
+            _outline(rows(worlds.worlds.footprint, i)),
         )
-        for i in range(part.indices.size)
+        for i in range(worlds.indices.size)
     ]
 
 
 def _outline(shape: Footprint) -> np.ndarray:
-    """Outline (N, 2) [m] of a footprint, closed; a circle as a polygon."""
+    """Return the outline (N, 2) [m] of a footprint, closed; of a circle a polygon."""
     corners, radius = np.asarray(shape.vertices, float), float(shape.radius)
     if radius > 0:
         angle = np.linspace(0, 2 * np.pi, 49)

@@ -1,10 +1,10 @@
-"""What trials came to, as labelled data: a grid of outcomes, or one trial over time."""
+"""Labelled data of outcomes: a grid of trials, or one trial over time."""
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 import xarray as xr
+from numpy.typing import ArrayLike
 
 from rps_jax.control.laws.rps import RPSParams
 from rps_jax.trials import trial
@@ -35,7 +35,7 @@ def outcome_dataset(
     frictions: Sequence[str],
     targets: Sequence[tuple[float, float]],
 ) -> xr.Dataset:
-    """Outcomes (S * O * F * T, ...) in this nesting order, as a Dataset labelled by `DIMS`."""
+    """Return outcomes (S * O * F * T, ...), nested in this order, as a dataset with `DIMS`."""
     shape = (len(laws), len(objects), len(frictions), len(targets))
     variables = {}
     for name, values in outcome._asdict().items():
@@ -56,47 +56,49 @@ def outcome_dataset(
 
 
 def variable(name: str, dims: Sequence[str], values: np.ndarray) -> xr.Variable:
-    """What outcomes are in one respect, with its unit; poses (..., 3) have a dimension more."""
+    """Return one field of outcomes with its unit; poses (..., 3) have one more dimension."""
     unit, meaning = UNITS[name]
     attrs = {"units": unit, "long_name": meaning}
     return xr.Variable((*dims, "pose")[: values.ndim], _plain(values), attrs)
 
 
-def _plain(values: Any) -> np.ndarray:
-    """As an array that NetCDF can hold, which has no booleans."""
+def _plain(values: ArrayLike) -> np.ndarray:
+    """Return an array that NetCDF can hold, which has no booleans."""
     values = np.asarray(values)
     return values.astype(np.int8) if values.dtype == bool else values
 
 
-def trace_dataset(trace: Trajectory) -> xr.Dataset:
-    """One trial over time: variables (time, ...), and its outcome, target and thresholds alone."""
-    seen = trace.snapshots
+def trace_dataset(trajectory: Trajectory) -> xr.Dataset:
+    """Return one trial over time (time, ...), with its outcome, target and thresholds."""
+    snapshots = trajectory.snapshots
 
-    def over_time(values: Any, unit: str, *dims: str) -> xr.Variable:
+    def over_time(values: ArrayLike, unit: str, *dims: str) -> xr.Variable:
         return xr.Variable(("time", *dims), _plain(values), {"units": unit})
 
     variables = {
-        "qpos": over_time(seen.qpos, "m, rad, 1", "joint"),
-        "contact_type": over_time(seen.reading.contact_type, "1"),
-        "p_robot_contact": over_time(seen.reading.p_robot_contact, "m", "axis"),
-        "v_x": over_time(seen.twist.v_x, "m/s"),
-        "v_y": over_time(seen.twist.v_y, "m/s"),
-        "omega": over_time(seen.twist.omega, "rad/s"),
-        "l": over_time(seen.details.l, "m"),
-        "distance": over_time(seen.details.distance, "m"),
-        "a_r": over_time(seen.details.a_r, "1"),
-        "gamma": over_time(seen.details.gamma, "rad"),
-        "realigning": over_time(seen.details.realigning, "1"),
+        "qpos": over_time(snapshots.qpos, "m, rad, 1", "joint"),
+        "contact_type": over_time(snapshots.reading.contact_type, "1"),
+        "p_robot_contact": over_time(snapshots.reading.p_robot_contact, "m", "axis"),
+        "v_x": over_time(snapshots.twist.v_x, "m/s"),
+        "v_y": over_time(snapshots.twist.v_y, "m/s"),
+        "omega": over_time(snapshots.twist.omega, "rad/s"),
+        "l": over_time(snapshots.details.l, "m"),
+        "distance": over_time(snapshots.details.distance, "m"),
+        "a_r": over_time(snapshots.details.a_r, "1"),
+        "gamma": over_time(snapshots.details.gamma, "rad"),
+        "realigning": over_time(snapshots.details.realigning, "1"),
     }
-    for name, value in trace.outcome._asdict().items():
+    for name, value in trajectory.outcome._asdict().items():
         variables[f"outcome_{name}"] = variable(name, (), np.asarray(value))
-    variables["p_world_contact"] = over_time(trial.p_world_contact(seen), "m", "axis")
-    variables["p_world_target"] = xr.Variable("axis", list(trace.p_world_target), {"units": "m"})
-    for name in ("d_success", *(("l_cr",) if isinstance(trace.params, RPSParams) else ())):
-        variables[name] = xr.Variable((), _plain(getattr(trace.params, name)), {"units": "m"})
-    for name, value in zip(("half_length", "half_width"), trace.half, strict=True):
+    variables["p_world_contact"] = over_time(trial.p_world_contact(snapshots), "m", "axis")
+    variables["p_world_target"] = xr.Variable(
+        "axis", list(trajectory.p_world_target), {"units": "m"}
+    )
+    for name in ("d_success", *(("l_cr",) if isinstance(trajectory.params, RPSParams) else ())):
+        variables[name] = xr.Variable((), _plain(getattr(trajectory.params, name)), {"units": "m"})
+    for name, value in zip(("half_length", "half_width"), trajectory.half, strict=True):
         attrs = {"units": "m", "long_name": f"{name.replace('_', ' ')} of the base"}
         variables[name] = xr.Variable((), value, attrs)
     attrs = {"units": "m", "long_name": "outline of the object in its own frame"}
-    variables["outline"] = xr.Variable(("corner", "axis"), trace.outline, attrs)
-    return xr.Dataset(variables, coords={"time": ("time", seen.time, {"units": "s"})})
+    variables["outline"] = xr.Variable(("corner", "axis"), trajectory.outline, attrs)
+    return xr.Dataset(variables, coords={"time": ("time", snapshots.time, {"units": "s"})})

@@ -1,8 +1,9 @@
-"""What all trials of a run share: what steps them, when they end, and the seed."""
+"""Setting of all trials of a run: engine, physics, rules and seed."""
+
+from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Any
 
 from rps_jax import engines, errors
 from rps_jax.control import registry
@@ -15,27 +16,27 @@ from rps_jax.world.physics import Fidelity, Physics
 
 
 class PhysicsField:
-    """A field that takes a physics or its text, and gives the physics.
+    """Field that accepts a physics or its text, and returns the physics.
 
     Texts are those of `world.physics.parse_physics`, of the fidelity of the same object.
     """
 
-    def __get__(self, instance: Any, owner: type | None = None) -> Physics:
+    def __get__(self, instance: Setting | None, owner: type | None = None) -> Physics:
         if instance is None:
             return "default"  # pyright: ignore[reportReturnType]  # of the dataclass's field
-        given = instance.__dict__["physics"]
-        return physics_.parse_physics(given, instance.fidelity)
+        value = instance.__dict__["physics"]
+        return physics_.parse_physics(value, instance.fidelity)
 
-    def __set__(self, instance: Any, value: str | Physics) -> None:
+    def __set__(self, instance: Setting, value: str | Physics) -> None:
         instance.__dict__["physics"] = value
 
 
 @dataclass(frozen=True)
 class Setting:
-    """What all trials of a run share.
+    """Setting of all trials of a run.
 
     Raises:
-      InputError: physics, rules, a seed or an engine that mean nothing, or do together.
+      InputError: an engine, physics, rules or seed that are not valid, or not together.
     """
 
     engine: EngineName = "fused"
@@ -57,11 +58,11 @@ class Setting:
         errors.check_name("engine", self.engine, engines.ENGINES)
         self.rules.check()
         errors.check_count("seed", self.seed, at_least=0, at_most=2**32 - 1)
-        if self.physics.cone != "elliptic":  # which all know: an engine is imported when needed
+        if self.physics.cone != "elliptic":  # all engines have this one: import no engine
             engines.get(self.engine).check_physics(self.physics)
 
     def check_here(self, robot: Robot, laws: Iterable[LawParams] = ()) -> None:
-        """Raises InputError unless the engine steps such a robot with these laws."""
+        """Raise InputError unless the engine can step such a robot with these laws."""
         engine = engines.get(self.engine)
         engine.check_robot(robot)
         for params in laws:
@@ -69,5 +70,5 @@ class Setting:
 
     @property
     def physics_name(self) -> str:
-        """Name of the physics by its friction: `default` is isotropic, `paper_gazebo` a pyramid."""
+        """Name of the physics by its friction: `default`, or `paper_gazebo` for a pyramid."""
         return "default" if self.physics.cone == "elliptic" else "paper_gazebo"

@@ -1,4 +1,4 @@
-"""One trial, live: stepped by hand, disturbed as it goes, its past kept to be gone back to.
+"""Live trials: one world that is stepped on demand, disturbed and rewound, as in the viewer.
 
 live = Live.of_case(case, setting)
 moment = live.step()
@@ -18,7 +18,7 @@ from rps_jax import engines, errors
 from rps_jax.control import registry
 from rps_jax.control.base import Law, LawParams
 from rps_jax.geometry.footprint import Footprint
-from rps_jax.robot.skin import CapacitiveSkin
+from rps_jax.robot.skin import CapacitiveSkin, Skin
 from rps_jax.trials import pushes, trial
 from rps_jax.trials.batch import WorldBatch, rows
 from rps_jax.trials.pushes import Case
@@ -29,23 +29,23 @@ CHUNK = 25  # steps, at most, that one call of the compiled program takes
 
 
 class Moment(NamedTuple):
-    """One control step, on the host: where everything was, and what was seen and done."""
+    """State and snapshot of one control step, on the host."""
 
-    worlds: World  # of this moment, (1, ...): its target and its shove
-    before: Trial  # as the step found it
-    seen: Snapshot
+    worlds: World  # (1, ...) with the target and the shove of this step
+    trial: Trial  # before the step
+    snapshot: Snapshot
     p_world_contact: np.ndarray  # (2,) [m], NaN without contact
     compression: np.ndarray  # (T,) [1] of the foam under each taxel, in strip order
 
 
 class Live:
-    """One world, stepped a control period at a time.
+    """One world that is stepped a control period at a time.
 
-    What is changed takes hold with the next step. A trial that has arrived goes on when its target
-    moves or its object is shoved; one whose time is over, or whose physics ran away, does not.
+    Changes take effect with the next step. A trial that has succeeded continues when its target
+    moves or its object is shoved; one that has failed or diverged does not.
 
     Raises:
-      InputError: an engine that cannot be followed.
+      InputError: an engine that JAX does not trace.
     """
 
     def __init__(self, part: WorldBatch, law: Law, setting: Setting) -> None:
@@ -58,73 +58,72 @@ class Live:
 
     @classmethod
     def of_case(cls, case: Case, setting: Setting) -> Live:
-        """The trial of a case."""
+        """Return the live trial of a case."""
         return cls(pushes.build([case], setting), registry.law_of(case.params), setting)
 
-    # --- what it is now ---
+    # --- state ---
 
     @property
     def period(self) -> float:
-        """Between two steps [s]."""
+        """Control period [s]."""
         return self._loop.physics.control_period
 
     @property
     def done(self) -> bool:
         """Whether the trial has ended."""
-        return bool(self._now.done[0])
+        return bool(self._trial.done[0])
 
     @property
     def outcome(self) -> Outcome:
-        """The result so far, without a batch axis."""
-        return rows(jax.device_get(trial.outcome(self._now, self.period)), 0)
+        """Outcome so far, without a batch axis."""
+        return rows(jax.device_get(trial.outcome(self._trial, self.period)), 0)
 
     @property
     def p_world_target(self) -> np.ndarray:
-        """(2,) [m]."""
+        """Target (2,) [m] in the world."""
         return np.asarray(self._worlds.p_world_target[0])
 
-    # --- what can be done with it ---
+    # --- control ---
 
     def reset(self) -> None:
-        """Back to the start, and the target with it."""
+        """Return to the start, with the first target."""
         self._worlds = self._first
         started = trial.start_all(self._worlds, self._params, np.ones(1, bool), law=self._loop.law)
-        self._now: Trial = jax.device_get(started)
+        self._trial: Trial = jax.device_get(started)
         self.past.clear()
 
     def step(self, count: int = 1) -> None:
-        """Some control periods, fewer if the trial ends before."""
+        """Run up to `count` control steps; fewer if the trial ends."""
         while count > 0 and not self.done:
-            some = min(count, CHUNK)
-            made = _steps(self._stage, self._worlds, self._params, self._now, some, self._loop)
-            self._now, kept = jax.device_get(made)
-            some -= int(kept[0].done[:some].sum())  # it ended before these
-            self.past += [Moment(self._worlds, *rows(kept, i)) for i in range(some)]
-            # Done: an ended trial's clock stands, and would meet the moment of the shove again.
+            chunk = min(count, CHUNK)
+            steps = _steps(self._stage, self._worlds, self._params, self._trial, chunk, self._loop)
+            self._trial, (trials, *records) = jax.device_get(steps)
+            ran = chunk - int(trials.done[:chunk].sum())  # the rest came after the end
+            self.past += [Moment(self._worlds, *rows((trials, *records), i)) for i in range(ran)]
+            # Reset: the clock of an ended trial stands still, and would repeat the shift.
             self._worlds = self._worlds._replace(shift=self._first.shift)
             count -= CHUNK
 
     def rewind(self, index: int) -> None:
-        """Forget what came after the moment `index`, and go on from there."""
-        after = index + 1
-        if after < len(self.past):
+        """Remove the moments after the moment `index`, and continue from there."""
+        if index + 1 < len(self.past):
             self._worlds = self.past[index].worlds
-            self._now = rows(self.past[after].before, None)
-            del self.past[after:]
+            self._trial = rows(self.past[index + 1].trial, None)
+            del self.past[index + 1 :]
 
     def set_target(self, p_world_target: tuple[float, float]) -> None:
-        """Push towards another place [m] from now on.
+        """Move the target [m].
 
         Raises:
-          InputError: it is not finite, or out of the world.
+          InputError: it is not finite, or out of bounds.
         """
         target = [
             errors.check_finite(f"target {axis}", value, at_least=-50, at_most=50, unit="m")
             for axis, value in zip("xy", p_world_target, strict=True)
         ]
-        like = self._worlds.p_world_target
-        self._worlds = self._worlds._replace(p_world_target=np.array([target], like.dtype))
-        self._go_on(min_distance=np.full_like(self._now.min_distance, np.inf))
+        dtype = self._worlds.p_world_target.dtype
+        self._worlds = self._worlds._replace(p_world_target=np.array([target], dtype))
+        self._continue(min_distance=np.full_like(self._trial.min_distance, np.inf))
 
     def shove(self, p_robot: tuple[float, float]) -> None:
         """Move the object by this much [m] in the robot's frame, at once.
@@ -132,48 +131,55 @@ class Live:
         Raises:
           InputError: it is not finite, or more than 5 m.
         """
-        by = [
+        offset = [
             errors.check_finite(f"shove {axis}", value, at_least=-5, at_most=5, unit="m")
             for axis, value in zip("xy", p_robot, strict=True)
         ]
-        time = self._now.steps * self.period
+        time = self._trial.steps * self.period
         dtype = self._worlds.qpos.dtype
-        shift = Shift(jnp.asarray(time, dtype), jnp.array([by], dtype))
+        shift = Shift(jnp.asarray(time, dtype), jnp.array([offset], dtype))
         self._worlds = self._worlds._replace(shift=shift)
-        self._go_on()
+        self._continue()
 
-    def _go_on(self, **changes: Any) -> None:
-        """Go on after an arrival."""
-        arrived = np.zeros_like(self._now.success)
-        ended = np.array(self._now.diverged)
-        self._now = self._now._replace(done=ended, success=arrived, **changes)
+    def _continue(self, **changes: Any) -> None:
+        """Continue a trial that has succeeded, with changes of its state."""
+        success = np.zeros_like(self._trial.success)
+        done = np.array(self._trial.diverged)
+        self._trial = self._trial._replace(done=done, success=success, **changes)
 
 
 @jax.jit
 def _steps(
     stage: Any, worlds: World, params: LawParams, trials: Trial, count: int, loop: ControlLoop
 ) -> tuple[Trial, tuple[Trial, Snapshot, jax.Array, jax.Array]]:
-    """Up to CHUNK control steps of a world (1, ...), and what each was: rows (CHUNK, ...)."""
+    """Run up to CHUNK control steps of a world (1, ...).
 
-    def one(trials: Trial) -> tuple[Trial, Any]:
-        after, seen = trial.control_step(stage, worlds, params, trials, loop)
-        placed = jax.vmap(trial.outline)(worlds, seen.qpos)
-        compression = jax.vmap(_compression)(worlds.skin, placed)
-        contact = trial.p_world_contact(seen)
-        return after, rows((trials, seen, contact, compression), 0)
+    Returns the trial, and for each step, as rows (CHUNK, ...), the trial before it, the snapshot,
+    the contact point and the compression.
+    """
+
+    def step(trials: Trial) -> tuple[Trial, tuple[Trial, Snapshot, jax.Array, jax.Array]]:
+        after, snapshot = trial.control_step(stage, worlds, params, trials, loop)
+        outlines = jax.vmap(trial.outline)(worlds, snapshot.qpos)
+        compression = jax.vmap(_compression)(worlds.skin, outlines)
+        contact = trial.p_world_contact(snapshot)
+        return after, rows((trials, snapshot, contact, compression), 0)
 
     def body(i: jax.Array, carry: tuple[Trial, Any]) -> tuple[Trial, Any]:
-        after, moment = one(carry[0])
-        return after, jax.tree.map(lambda every, x: every.at[i].set(x), carry[1], moment)
+        after, record = step(carry[0])
+        return after, jax.tree.map(lambda values, x: values.at[i].set(x), carry[1], record)
 
-    like = jax.eval_shape(one, trials)[1]
-    blank = jax.tree.map(lambda x: jnp.zeros((CHUNK, *x.shape), x.dtype), like)
+    shapes = jax.eval_shape(step, trials)[1]
+    blank = jax.tree.map(lambda x: jnp.zeros((CHUNK, *x.shape), x.dtype), shapes)
     return jax.lax.fori_loop(0, count, body, (trials, blank))
 
 
-def _compression(sensor: Any, placed: Footprint) -> jax.Array:
-    """Greatest compression (T,) [1] under each taxel; an ideal sensor's tolerance is its foam."""
-    thickness = sensor.foam if isinstance(sensor, CapacitiveSkin) else sensor.tolerance
+def _compression(skin: Skin, outline: Footprint) -> jax.Array:
+    """Return the greatest compression (T,) [1] under each taxel.
+
+    The tolerance of an ideal sensor counts as its foam.
+    """
+    thickness = skin.foam if isinstance(skin, CapacitiveSkin) else skin.tolerance
     foam = jnp.maximum(thickness, 1e-6)
-    felt = CapacitiveSkin(foam=foam, shell=sensor.shell).compression(placed)
-    return jnp.max(felt, axis=-1) / foam
+    compression = CapacitiveSkin(foam=foam, shell=skin.shell).compression(outline)
+    return jnp.max(compression, axis=-1) / foam

@@ -1,8 +1,9 @@
-"""One pushing trial: sense -> decide -> step, until the paper's success rule says stop.
+"""Trials: the control loop of a pushing robot in a batch of worlds, and the rules that end it.
 
-`decide` and `settle` are pure functions of one world; between them an engine drives the batch.
-`advance` and `record` jit that for a batch of worlds of one shape family; a world that has ended
-is frozen, and a batch whose worlds have all ended stops.
+A control step is `decide` (sense, judge, run the law), then the engine's physics steps, then
+`settle`. `decide` and `settle` are pure functions of one world; the engine steps the batch between
+them. `advance` runs many control steps, and `record` also returns snapshots. The state of a trial
+that has ended stays as it is, and a batch stops when all its trials have ended.
 """
 
 import dataclasses
@@ -107,7 +108,7 @@ class Trial(NamedTuple):
     law_state: Any  # what the law remembers
     skin: SkinState
     poses: Float[Array, "*B K 3"]  # [m, m, rad] of the base in the last steps, the latest first
-    twists: Float[Array, "*B K 3"]  # [m/s, m/s, rad/s] commanded, likewise
+    twists: Float[Array, "*B K 3"]  # [m/s, m/s, rad/s] commanded, the latest first
     steps: Int[Array, "*B"]  # control steps done
     contact_steps: Int[Array, "*B"]  # of them in contact
     lost_steps: Int[Array, "*B"]  # without contact after the first touch
@@ -124,7 +125,7 @@ class Trial(NamedTuple):
 
 
 class Snapshot(NamedTuple):
-    """What one control step saw and did."""
+    """Observations and actions of one control step."""
 
     time: Float[Array, "*B"]  # [s]
     qpos: Float[Array, "*B 10"]  # as in `Trial`
@@ -148,24 +149,25 @@ class Outcome(NamedTuple):
     diverged: Bool[Array, "*B"]
     stalled: Bool[Array, "*B"]  # it ended with the base standing still against the object
     base_pose: Float[Array, "*B 3"]  # [m, m, rad] in the world, at the end
-    object_pose: Float[Array, "*B 3"]  # [m, m, rad] likewise
+    object_pose: Float[Array, "*B 3"]  # [m, m, rad] of the object in the world, at the end
 
 
 def object_pose(qpos: Float[Array, "10"]) -> tuple[Float[Array, "2"], Float[Array, ""]]:
-    """Planar position [m] and yaw [rad] of the object in the world."""
+    """Return the planar position [m] and yaw [rad] of the object in the world."""
     free = qpos[JOINTS.object]
     return free[:2], planar.yaw_of_quaternion(free[3:])
 
 
 @jax.jit
-def p_world_contact(seen: Snapshot) -> Float[Array, "T 2"]:
-    """Contact points of snapshots (T, ...) in the world [m]; NaN without contact."""
-    point = seen.qpos[:, :2] + planar.rotate(seen.qpos[:, 2], seen.reading.p_robot_contact)
-    return jnp.where((seen.reading.contact_type != NONE)[:, None], point, jnp.nan)
+def p_world_contact(snapshots: Snapshot) -> Float[Array, "T 2"]:
+    """Return the contact points of snapshots (T, ...) in the world [m]; NaN without contact."""
+    qpos, reading = snapshots.qpos, snapshots.reading
+    point = qpos[:, :2] + planar.rotate(qpos[:, 2], reading.p_robot_contact)
+    return jnp.where((reading.contact_type != NONE)[:, None], point, jnp.nan)
 
 
 def start(world: World, params: LawParams, law: Law = rps.LAW) -> Trial:
-    """The trial of a world before its first control step."""
+    """Return the trial of a world before its first control step."""
     zero, false = jnp.zeros((), jnp.int32), jnp.zeros((), bool)
     return Trial(
         qpos=world.qpos,
@@ -192,16 +194,16 @@ def start(world: World, params: LawParams, law: Law = rps.LAW) -> Trial:
 
 
 def shifted(world: World, trial: Trial, period: float) -> Trial:
-    """The trial with its object moved, if this is the control step nearest to when it shall be."""
-    # A step's number, since rounded times could meet twice or never.
-    now = trial.steps == jnp.round(world.shift.time / period)
-    by = planar.rotate(trial.qpos[2], jnp.asarray(world.shift.p_robot))
+    """Return the trial with the world's scripted shift, if it is due in this control step."""
+    # Compare step numbers: rounded times could be equal twice or never.
+    due = trial.steps == jnp.round(world.shift.time / period)
+    offset = planar.rotate(trial.qpos[2], jnp.asarray(world.shift.p_robot))
     x = JOINTS.object.start
-    return trial._replace(qpos=trial.qpos.at[x : x + 2].add(jnp.where(now, by, 0.0)))
+    return trial._replace(qpos=trial.qpos.at[x : x + 2].add(jnp.where(due, offset, 0.0)))
 
 
 def outline(world: World, qpos: Float[Array, "10"]) -> Footprint:
-    """The object's outline in the robot frame, where qpos has them both."""
+    """Return the object's outline in the robot frame, at the positions qpos."""
     p_world_robot, yaw = qpos[:2], qpos[2]
     p_world_object, object_yaw = object_pose(qpos)
     p_robot_object = planar.rotate(-yaw, p_world_object - p_world_robot)
@@ -211,9 +213,9 @@ def outline(world: World, qpos: Float[Array, "10"]) -> Footprint:
 def sense(
     world: World, trial: Trial, period: float
 ) -> tuple[SkinState, Reading | SmoothReading, Observation]:
-    """Read the skin for the object where it stands now, and say what the law observes.
+    """Read the skin at the current positions; return its state, the reading and the observation.
 
-    `period` [s] is that of the control loop.
+    `period` [s] is the control period.
     """
     p_world_robot, yaw = trial.qpos[:2], trial.qpos[2]
     placed = outline(world, trial.qpos)
@@ -230,31 +232,31 @@ def sense(
 
 
 class Measurement(NamedTuple):
-    """What skin and odometry tell at one moment."""
+    """Readings of skin and odometry in one control step."""
 
     reading: Reading | SmoothReading
-    observation: Observation  # by where the base believes to be
-    # [m] contact point to target, by where it is; without contact, base's
+    observation: Observation  # at the pose that the odometry estimates
+    # [m] contact point to target, at the true pose; without contact, that of the base
     distance: Float[Array, "*B"]
 
 
 def observe(
     world: World, params: LawParams, trial: Trial, *, physics: Physics, rules: Rules = Rules()
 ) -> tuple[Trial, Measurement]:
-    """The first half of `decide`: sense and judge.
+    """Sense, and judge by the rules: the first half of `decide`.
 
-    The rules judge by where the base is, the law by where it believes to be.
+    The rules use the true pose of the base; the law gets the pose that the odometry estimates.
     """
     period = physics.control_period
     time = trial.steps * period
     trial = shifted(world, trial, period)
     skin, reading, observation = sense(world, trial, period)
     distance = planar.norm(displacement(observation))
-    now = trial.qpos[JOINTS.base]
+    pose = trial.qpos[JOINTS.base]
     poses, believed = base.observe_pose(
-        world.odometry, trial.poses, now, world.key, trial.steps, period
+        world.odometry, trial.poses, pose, world.key, trial.steps, period
     )
-    seen = observation._replace(p_world_robot=believed[:2], yaw=believed[2])
+    observation = observation._replace(p_world_robot=believed[:2], yaw=believed[2])
 
     touch = reading.contact_type != NONE
     lost_steps = trial.lost_steps + (~touch & (trial.contact_steps > 0))
@@ -262,7 +264,7 @@ def observe(
     tilt = planar.tilt(trial.qpos[JOINTS.object][3:])
     tipped = tilt > rules.max_tilt
     over = (time >= rules.horizon) | (lost_steps * period > rules.max_lost) | tipped
-    told = trial._replace(
+    judged = trial._replace(
         skin=skin,
         poses=poses,
         contact_steps=trial.contact_steps + touch,
@@ -276,17 +278,17 @@ def observe(
         tipped=tipped,
         done=success | over,
     )
-    return told, Measurement(reading, seen, distance)
+    return judged, Measurement(reading, observation, distance)
 
 
 def execute(world: World, trial: Trial, twist: Twist, period: float) -> tuple[Trial, Twist]:
-    """The trial that remembers a commanded twist, and the twist that the base carries out.
+    """Return the trial with a commanded twist stored, and the twist that the base executes.
 
-    Both are in the robot frame; `period` [s] is that of the control loop.
+    Both twists are in the robot frame; `period` [s] is the control period.
     """
     if trial.twists.shape[0]:
-        twists, done = base.delay_twist(world.odometry, trial.twists, jnp.stack(twist), period)
-        trial, twist = trial._replace(twists=twists), Twist(*done)
+        twists, delayed = base.delay_twist(world.odometry, trial.twists, jnp.stack(twist), period)
+        trial, twist = trial._replace(twists=twists), Twist(*delayed)
     if world.robot is None or trial.drive is None:
         return trial, twist
     aim = drive.aim(world.robot, trial.drive.aim, jnp.stack(twist), period)
@@ -297,58 +299,57 @@ def execute(world: World, trial: Trial, twist: Twist, period: float) -> tuple[Tr
 def decide(
     world: World, params: LawParams, trial: Trial, loop: ControlLoop
 ) -> tuple[Trial, Twist, Snapshot]:
-    """What happens between two control periods of one world: sense, judge, decide.
+    """Sense, judge and run the law in one world.
 
-    Returns the trial as it is driven on, or ended; the twist carried out; and what was seen.
+    Returns the trial before its physics steps, the twist that the base executes, and a snapshot.
     """
     period, law = loop.physics.control_period, loop.law
-    told, seen = observe(world, params, trial, physics=loop.physics, rules=loop.rules)
-    observation: Any = seen.observation
+    judged, measured = observe(world, params, trial, physics=loop.physics, rules=loop.rules)
+    obs: Any = measured.observation
     if not law.smooth:
-        observation = observation._replace(in_contact=seen.reading.contact_type != NONE)
+        obs = obs._replace(in_contact=measured.reading.contact_type != NONE)
     if law.senses == "pose":
-        observation = PoseObservation(
-            observation, object_pose(told.qpos)[0], fp.circumradius(world.footprint)
-        )
+        obs = PoseObservation(obs, object_pose(judged.qpos)[0], fp.circumradius(world.footprint))
     if law.senses == "taxels":
-        skin = world.skin, told.skin, outline(world, told.qpos)
-        observation = features.taxel_observation(observation, seen.reading, *skin)
-    if told.load is not None:
-        felt, force = law.cell.read(told.load, world.key, told.steps, period)
-        told, observation = told._replace(load=felt), ForceObservation(observation, force)
-    state, twist, details = law.step(params, trial.law_state, observation)
-    snapshot = Snapshot(trial.steps * period, told.qpos, seen.reading, twist, details, trial.done)
-    told, twist = execute(world, told._replace(law_state=state), twist, period)
-    return told, twist, snapshot
+        skin = world.skin, judged.skin, outline(world, judged.qpos)
+        obs = features.taxel_observation(obs, measured.reading, *skin)
+    if judged.load is not None:
+        load, force = law.cell.read(judged.load, world.key, judged.steps, period)
+        judged, obs = judged._replace(load=load), ForceObservation(obs, force)
+    state, twist, details = law.step(params, trial.law_state, obs)
+    time, reading = trial.steps * period, measured.reading
+    snapshot = Snapshot(time, judged.qpos, reading, twist, details, trial.done)
+    decided, twist = execute(world, judged._replace(law_state=state), twist, period)
+    return decided, twist, snapshot
 
 
-def settle(before: Trial, told: Trial, driven: Driven) -> Trial:
-    """The trial after one control period: `told` as it was `driven`, or ended.
+def settle(previous: Trial, decided: Trial, driven: Driven) -> Trial:
+    """Return the trial after one control period: `decided` at the positions `driven`, or ended.
 
-    A trial that had ended `before` comes back as it was.
+    A trial that had ended before, as `previous` says, is returned as it was.
     """
     (qpos, qvel, warmstart, integral), force = driven
     sane = (
         jnp.all(jnp.isfinite(qpos))
         & jnp.all(jnp.abs(qvel) < _MAX_SPEED)
-        & jnp.all(jnp.abs(qpos.at[2].set(0.0)) < _MAX_DISTANCE)  # but for the turns of the base
+        & jnp.all(jnp.abs(qpos.at[2].set(0.0)) < _MAX_DISTANCE)  # the base may turn without limit
     )
-    now = told.drive
-    if now is not None:
-        now = drive.count_stalled_steps(
-            now if integral is None else now._replace(integral=integral), qvel
-        )
-    moved = told._replace(
+    state = decided.drive
+    if state is not None:
+        state = state if integral is None else state._replace(integral=integral)
+        state = drive.count_stalled_steps(state, qvel)
+    moved = decided._replace(
         qpos=qpos,
         qvel=qvel,
         warmstart=warmstart,
-        path_length=told.path_length + planar.norm(qpos[:2] - told.qpos[:2]),
-        steps=told.steps + 1,
-        drive=now,
-        load=told.load and told.load._replace(wrench=force),
+        path_length=decided.path_length + planar.norm(qpos[:2] - decided.qpos[:2]),
+        steps=decided.steps + 1,
+        drive=state,
+        load=decided.load and decided.load._replace(wrench=force),
     )
-    stopped = told._replace(done=jnp.ones((), bool), diverged=~told.done & ~sane)
-    return soft.tree_where(before.done, before, soft.tree_where(told.done | ~sane, stopped, moved))
+    ended = decided._replace(done=jnp.ones((), bool), diverged=~decided.done & ~sane)
+    stepped = soft.tree_where(decided.done | ~sane, ended, moved)
+    return soft.tree_where(previous.done, previous, stepped)
 
 
 def control_step(
@@ -359,30 +360,30 @@ def control_step(
     loop: ControlLoop,
     mapped: Callable[..., Any] = jax.vmap,
 ) -> tuple[Trial, Snapshot]:
-    """One pass of the loop of a batch of worlds. One that has ended comes back as it is.
+    """Run one control step of a batch of worlds; trials that have ended do not change.
 
-    Of one world alone, where a stage drives that, `mapped` gives back what it is given.
+    For a single world without batch dimension, `mapped` returns its function unchanged.
     """
-    told, twists, snapshots = mapped(decide, (0, 0, 0, None))(worlds, params, trials, loop)
+    decided, twists, snapshots = mapped(decide, (0, 0, 0, None))(worlds, params, trials, loop)
     force = loop.law.senses == "force"
     period = ControlPeriod(twists, loop.physics, pushing(worlds), force)
-    driven = stage.drive(worlds.fields, motion(told), period)
-    return mapped(settle)(trials, told, driven), snapshots
+    driven = stage.drive(worlds.fields, motion(decided), period)
+    return mapped(settle)(trials, decided, driven), snapshots
 
 
 def motion(trials: Trial) -> Motion:
-    """What an engine steps of trials."""
+    """Return the part of trials that an engine steps."""
     integral = None if trials.drive is None else trials.drive.integral
     return Motion(trials.qpos, trials.qvel, trials.warmstart, integral)
 
 
 def pushing(worlds: World) -> Robot | None:
-    """The bodies of the robots of worlds, if contact can slow and stop them."""
+    """Return the bodies of the worlds' robots, if contact can slow and stop them."""
     return worlds.robot.body if worlds.robot is not None and worlds.robot.driven else None
 
 
 def outcome(trial: Trial, period: float) -> Outcome:
-    """The result of a trial of control period `period` [s], batched or not."""
+    """Return the result of a trial with the control period `period` [s], batched or not."""
     position, yaw = jax.vmap(object_pose)(trial.qpos.reshape(-1, 10))
     pose = jnp.concatenate([position, yaw[:, None]], axis=-1)
     return Outcome(
@@ -407,12 +408,12 @@ def outcome(trial: Trial, period: float) -> Outcome:
 def start_all(
     worlds: World, params: LawParams, live: Bool[Array, " B"], law: Law = rps.LAW
 ) -> Trial:
-    """Trials of a batch of worlds; those not `live` are padding, ended from the start."""
+    """Return the trials of a batch of worlds before their start; those not `live` are padding."""
     trials = jax.vmap(partial(start, law=law))(worlds, params)
     return trials._replace(done=~live)
 
 
-_UNASKED = 20  # control steps of a GPU between two looks at whether any trial runs, at most
+_MAX_UNCHECKED = 20  # control steps on a GPU before the host checks whether any trial runs
 
 
 def advance(
@@ -423,40 +424,45 @@ def advance(
     loop: ControlLoop,
     steps: int,
 ) -> tuple[Trial, ...]:
-    """Up to `steps` control steps of batches side by side; fewer if all of them end before.
+    """Run up to `steps` control steps of batches side by side; fewer if all trials end.
 
-    Each batch is of a stage and a shape family of its own.
+    Every batch has its own stage and shape family.
     """
     if not (all(getattr(stage, "native", False) for stage in stages) and native.is_available()):
-        return _side_by_side(stages, worlds, params, trials, loop, steps)
+        return _advance_in_xla(stages, worlds, params, trials, loop, steps)
 
-    def one(stage: Stage, world: World, params: LawParams, now: Trial, rules: Any) -> Trial:
-        def on(carry: tuple[Any, Trial]) -> tuple[Any, Trial]:
-            own = dataclasses.replace(loop, rules=rules)
-            after, _ = control_step(stage, world, params, carry[1], own, lambda f, *_: f)
-            return carry[0] + 1, after
+    def single(stage: Stage, world: World, params: LawParams, trial: Trial, rules: Any) -> Trial:
+        """Advance one world."""
+        world_loop = dataclasses.replace(loop, rules=rules)
 
-        return jax.lax.while_loop(lambda c: (c[0] < steps) & ~c[1].done, on, (0, now))[1]
+        def step(carry: tuple[jax.Array, Trial]) -> tuple[jax.Array, Trial]:
+            count, trial = carry
+            return count + 1, control_step(
+                stage, world, params, trial, world_loop, lambda f, *_: f
+            )[0]
 
-    def whole(*given: Any) -> tuple[Trial, ...]:
-        some, params, now, rules = zip(*given, strict=True)
-        own = dataclasses.replace(loop, rules=jax.tree.map(lambda x: x[0], rules[0]))
-        return _side_by_side(stages, some, params, now, own, steps)
+        return jax.lax.while_loop(lambda c: (c[0] < steps) & ~c[1].done, step, (0, trial))[1]
 
-    given = [
-        (some, own, now, jax.tree.map(lambda x, n=now.done.size: jnp.full(n, x, float), loop.rules))
-        for some, own, now in zip(worlds, params, trials, strict=True)
-    ]
+    def in_xla(*batches: Any) -> tuple[Trial, ...]:  # (worlds, params, trials, rules) of each
+        """Advance all batches where the native compiler is not used."""
+        worlds, params, trials, rules = zip(*batches, strict=True)
+        shared = dataclasses.replace(loop, rules=jax.tree.map(lambda x: x[0], rules[0]))
+        return _advance_in_xla(stages, worlds, params, trials, shared, steps)
 
-    def phase(some: World, params: LawParams, now: Trial, rules: Any) -> Any:
-        """Those that push, those that are still on their way, and those that have ended."""
-        return 2 * now.done + (now.contact_steps == 0)
+    def phase(world: World, params: LawParams, trial: Trial, rules: Any) -> jax.Array:
+        """Return 0 for trials that push, 1 for those before the first touch, above for ended."""
+        return 2 * trial.done + (trial.contact_steps == 0)
 
-    ones = [partial(one, stage) for stage in stages]
-    return tuple(native.concurrent(ones, whole, phase)(*given))
+    batches = []
+    for batch in zip(worlds, params, trials, strict=True):
+        count = batch[-1].done.size
+        rules = jax.tree.map(lambda x, n=count: jnp.full(n, x, float), loop.rules)
+        batches.append((*batch, rules))
+    singles = [partial(single, stage) for stage in stages]
+    return tuple(native.concurrent(singles, in_xla, phase)(*batches))
 
 
-def _side_by_side(
+def _advance_in_xla(
     stages: tuple[Stage, ...],
     worlds: tuple[World, ...],
     params: tuple[LawParams, ...],
@@ -464,28 +470,29 @@ def _side_by_side(
     loop: ControlLoop,
     steps: int,
 ) -> tuple[Trial, ...]:
-    """`advance` as XLA compiles it."""
+    """Run `advance` as a program of XLA."""
 
-    def some_run(carry):
+    def any_runs(carry):
         count, batches = carry
-        return (count < steps) & ~jnp.all(jnp.stack([jnp.all(each.done) for each in batches]))
+        return (count < steps) & ~jnp.all(jnp.stack([jnp.all(batch.done) for batch in batches]))
 
-    def on(_, batches):
-        every = zip(stages, worlds, params, batches, strict=True)
-        return tuple(control_step(*each, loop)[0] for each in every)
+    def step(_, batches):
+        arguments = zip(stages, worlds, params, batches, strict=True)
+        return tuple(control_step(*args, loop)[0] for args in arguments)
 
-    # A GPU waits for the host whenever it is asked whether any still runs.
-    between = 1 if jax.default_backend() == "cpu" else math.gcd(steps, _UNASKED)
+    # A GPU waits for the host at every check whether any trial runs.
+    unchecked = 1 if jax.default_backend() == "cpu" else math.gcd(steps, _MAX_UNCHECKED)
 
     def body(carry):
         count, batches = carry
-        after = jax.lax.fori_loop(0, between, on, batches) if between > 1 else on(0, batches)
-        return count + between, after
+        if unchecked > 1:
+            return count + unchecked, jax.lax.fori_loop(0, unchecked, step, batches)
+        return count + 1, step(0, batches)
 
-    return jax.lax.while_loop(some_run, body, (0, trials))[1]
+    return jax.lax.while_loop(any_runs, body, (0, trials))[1]
 
 
-@partial(jax.jit, static_argnames=("physics", "law", "steps", "every"), donate_argnames="trials")
+@partial(jax.jit, static_argnames=("physics", "law", "steps", "stride"), donate_argnames="trials")
 def record(
     stage: Stage,
     worlds: World,
@@ -496,16 +503,16 @@ def record(
     rules: Rules = Rules(),
     law: Law = rps.LAW,
     steps: int,
-    every: int = 1,
+    stride: int = 1,
 ) -> tuple[Trial, Snapshot]:
-    """`steps` control steps of a batch, and every `every`-th snapshot (steps // every, B, ...)."""
+    """Run `steps` control steps of a batch; return also snapshots (steps // stride, B, ...)."""
     loop = ControlLoop(physics, rules, law)
 
     def body(trials, _):
         return control_step(stage, worlds, params, trials, loop)
 
     def interval(trials, _):
-        trials, snapshots = jax.lax.scan(body, trials, length=every)
+        trials, snapshots = jax.lax.scan(body, trials, length=stride)
         return trials, jax.tree.map(lambda x: x[0], snapshots)
 
-    return jax.lax.scan(interval, trials, length=steps // every)
+    return jax.lax.scan(interval, trials, length=steps // stride)

@@ -31,7 +31,8 @@ from rps_jax.record import files
 from rps_jax.record.options import option
 from rps_jax.runs import evaluate
 from rps_jax.runs.evaluate import Candidates, CandidateScores
-from rps_jax.runs.question import LawQuestion, Run, StepFormat, seed_of
+from rps_jax.runs.question import LawQuestion, Run, seed_of
+from rps_jax.runs.run import StepFormat
 from rps_jax.trials.progress import Bar, Progress
 from rps_jax.trials.score import Objective
 from rps_jax.trials.setting import Setting

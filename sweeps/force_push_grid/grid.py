@@ -246,7 +246,7 @@ def run_grid(
     while steps * period < horizon:
         options = {"physics": physics, "rules": rules, "law": law}
         trials, snapshots = trial.record(
-            stage, *inputs, trials, **options, steps=_SEGMENT, every=_LOOK
+            stage, *inputs, trials, **options, steps=_SEGMENT, stride=_LOOK
         )
         away = np.asarray(snapshots.qpos[..., 3:5] - snapshots.qpos[..., :2])
         apart = np.maximum(apart, np.hypot(*np.moveaxis(away, -1, 0)).max(axis=0))

@@ -32,11 +32,11 @@ from rps_jax.errors import InputError, check_name
 from rps_jax.record import options
 from rps_jax.record.options import option
 from rps_jax.runs.push import FILM_LENGTH, TraceQuestion
-from rps_jax.runs.question import Question, SimulationQuestion
+from rps_jax.runs.question import Action, Command, SimulationQuestion
 from rps_jax.trials.setting import PhysicsField, Setting
 from rps_jax.trials.trial import Rules
 
-Q = TypeVar("Q", bound=Question[object])
+Q = TypeVar("Q", bound=Command[object])
 _REGISTRY = ConstructorRegistry()
 _NO_PREFIX = tyro.conf.arg(name="")
 _NUMBER_NOUNS = {int: "a whole number", float: "a number"}
@@ -89,7 +89,7 @@ def session_type(question_type: type) -> type[Session]:
     """Return the type of the options that a command has beside those of its question."""
     if not issubclass(question_type, SimulationQuestion | TraceQuestion):
         return NoSession
-    if hasattr(question_type, "in_shell"):
+    if issubclass(question_type, Action):
         return DeviceSession
     return FilmSession if issubclass(question_type, TraceQuestion) else FolderSession
 

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
     from rps_jax.app.cli.flags import Session
     from rps_jax.runs.push import Trace
-    from rps_jax.runs.question import Question
+    from rps_jax.runs.question import Command, Question
     from rps_jax.trials.progress import Bar
 
 _DISK_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
@@ -118,52 +118,49 @@ def _raise_interrupts() -> None:
         raise KeyboardInterrupt
 
 
-def execute(question: Question[object], session: Session) -> None:
-    """Check a question, compute its results, and write and print its report."""
+def execute(command: Command[object], session: Session) -> None:
+    """Check a command and execute it; write and print the report of a question."""
     from tqdm import tqdm
 
     from rps_jax.engines import device
     from rps_jax.record import cache, folder
     from rps_jax.runs.push import Trace
-    from rps_jax.runs.question import timing_line
+    from rps_jax.runs.question import Action, Question, timing_line
 
-    in_shell = hasattr(question, "in_shell")
-    if question.out is None and not in_shell:
-        question = dataclasses.replace(question, out=question.default_folder)
-    is_small = session.device == "auto" and question.suits_processors()
-    device.choose("cpu" if is_small or getattr(question, "ray", None) else session.device)
-    question.validate()
+    if command.out is None:
+        command = dataclasses.replace(command, out=command.default_folder)
+    is_small = session.device == "auto" and command.suits_processors()
+    device.choose("cpu" if is_small or getattr(command, "ray", None) else session.device)
+    command.validate()
     _raise_interrupts()
-    if note := question.note():
+    if note := command.note():
         print(note)
     cache.use_cache()
-    if in_shell:
-        question.in_shell()
-        return
-    out = Path(str(question.out))
+    out = Path(str(command.out))
     if session.overwrite:
         folder.remove_run(out)
     tqdm.set_lock(threading.RLock())  # of this process alone: no semaphore is left if it is stopped
     film = None
-    with question.progress_bar() as bar:
+    with command.progress_bar() as bar:
         _raise_interrupts()
         importlib.import_module("scipy.special")  # JAX does, too: in two threads they could meet
         bar.on_compiled = _import_early
-        results = question.execute(bar)
+        results = command.execute(bar)
         timed = bar.timing.simulated > 0 and bar.over != "clock"
         timing = timing_line(bar.timing, device.device_name()) if timed else ""
-        if isinstance(results, Path):
-            print(f"{question.name}: {results}")
+        if isinstance(command, Action) or not isinstance(command, Question):
+            if results is not None:
+                print(f"{command.name}: {results}")
             return
         if session.video and isinstance(results, Trace):
             film = _Film(results, out, session.film_length)
-        report = _write_report(question, results, bar)
+        report = _write_report(command, results, bar)
     print(report.read_text(encoding="utf-8"))
     if timing:
         print(timing)
     if film is not None:
         film.finish()
-    if getattr(question, "film", False) and (out / "worlds").is_dir():
+    if getattr(command, "film", False) and (out / "worlds").is_dir():
         from rps_jax.app.film import Film
 
         print(f"film: {Film(out / 'worlds', grid='3x4', which='hardest')()}")

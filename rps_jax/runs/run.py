@@ -1,0 +1,115 @@
+"""Run folder and resources of one execution of a command, and its resumable loop."""
+
+from __future__ import annotations
+
+import itertools
+import warnings
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, Generic, NamedTuple, TypeVar
+
+import xarray as xr
+
+from rps_jax.record import files
+from rps_jax.record.checkpoint import Checkpoints
+from rps_jax.trials.batch import BatchOptions
+from rps_jax.trials.progress import ProgressCallback
+
+S = TypeVar("S")
+_OLD_NAMES = {"part": "checkpoint", "parts": "checkpoints", "report": "callback"}
+
+
+class StepFormat(NamedTuple, Generic[S]):
+    """File format of the results of a loop's steps."""
+
+    encode: Callable[[str, S], bytes]  # name of the step, result -> content
+    decode: Callable[[Path, bytes], S]  # path and content -> result; raises InputError
+    suffix: str
+
+
+def _encode_step(name: str, results: xr.Dataset) -> bytes:
+    return files.encode_results(results.assign_attrs(part=name))
+
+
+def _decode_step(path: Path, content: bytes) -> xr.Dataset:
+    results = files.decode_results(content, path, signed=True)
+    if not path.name.startswith(f"{results.attrs.pop('part', None)}-"):
+        raise files.CorruptFileError(path, "it holds another part")
+    return results
+
+
+DATASETS = StepFormat(_encode_step, _decode_step, ".nc")
+
+
+class Run(NamedTuple):
+    """Run folder and resources of one execution of a question, and what the folder already holds.
+
+    A long run is a sequence of steps that are stored as checkpoints, so that it can be killed and
+    resumed. `checkpoint` runs one step; `steps` is the loop over numbered steps:
+
+        state = initial
+        for state in run.steps(lambda i: next_state(state, i), lambda i: i < 100):
+            ...
+
+    Steps in the folder are loaded and not computed again. The loop body must depend on nothing but
+    the results of earlier steps, so that a resumed loop continues as if it had never stopped.
+    """
+
+    folder: Path | None  # None keeps all results in memory
+    callback: ProgressCallback  # called with the progress of the run
+    slots: int | None = None  # worlds that one worker steps at once
+    workers: int | None = None  # host threads
+
+    @property
+    def checkpoints(self) -> Checkpoints | None:
+        """Finished steps of the run, if it has a folder."""
+        return None if self.folder is None else Checkpoints(self.folder)
+
+    def checkpoint(self, name: str, compute: Callable[[], xr.Dataset]) -> xr.Dataset:
+        """Return the dataset that is stored under a name; compute and store it if there is none."""
+        stored = self.checkpoints
+        return compute() if stored is None else stored.load_or_compute(name, compute)
+
+    def steps(
+        self,
+        compute: Callable[[int], S],
+        proceed: Callable[[int], bool],
+        *,
+        name: str = "{:06d}",
+        form: StepFormat[S] = DATASETS,
+    ) -> Iterator[S]:
+        """Yield the results of the steps 0, 1, ... of a loop, in this order.
+
+        Args:
+          compute: returns the result of a step by its index.
+          proceed: whether a step is computed if the folder lacks it; if not, the loop ends.
+          name: name of a step's checkpoint, with its index.
+          form: how a result is stored; by default as a labelled dataset.
+        """
+        stored = self.checkpoints
+        finished = {} if stored is None else stored.paths()
+        for index in itertools.count():
+            key = name.format(index)
+            content = None if stored is None or key not in finished else stored.get(key)
+            if content is not None:
+                yield form.decode(finished[key], content)
+            elif proceed(index):
+                result = compute(index)
+                if stored is not None:
+                    stored.put(key, form.encode(key, result), form.suffix)
+                yield result
+            else:
+                return
+
+    @property
+    def batch_options(self) -> BatchOptions:
+        """Slots, workers and callback, as keyword arguments of functions that run trials."""
+        return BatchOptions(slots=self.slots, workers=self.workers, callback=self.callback)
+
+    def __getattr__(self, name: str) -> Any:
+        """Return an attribute by its name in version 0.3, with a warning."""
+        if name not in _OLD_NAMES:
+            raise AttributeError(f"'Run' object has no attribute '{name}'")
+        new = _OLD_NAMES[name]
+        warnings.warn(f"Run.{name} is now Run.{new}", DeprecationWarning, stacklevel=2)
+        return getattr(self, new)
