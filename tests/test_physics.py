@@ -137,7 +137,7 @@ def films(engine):
 
 
 @pytest.fixture
-def seen(request, optimised):
+def all_films(request, optimised):
     """Films of all worlds in one engine."""
     return films(request.param)
 

@@ -42,7 +42,7 @@ def chain(error):
 def test_a_law_is_given_no_observation_of_another_shape_or_kind(change, field):
     state = RPSState.init(PAPER)
     rps.step(PAPER, state, OBSERVATION)
-    with pytest.raises(TypeCheckError, match="typechecking parameter 'observation'") as caught:
+    with pytest.raises(TypeCheckError, match="typechecking parameter 'obs'") as caught:
         rps.step(PAPER, state, OBSERVATION._replace(**change))
     assert f"Observation.{field} is " in " ".join(chain(caught.value))
 
@@ -51,7 +51,7 @@ def test_batched_worlds_are_single_ones_to_a_law():
     """`jax.vmap` hides the axis; without it the law refuses the batch."""
     batch = jax.tree.map(lambda x: jnp.stack([jnp.asarray(x)] * 3), OBSERVATION)
     assert jax.vmap(rps.displacement)(batch).shape == (3, 2)
-    with pytest.raises(TypeCheckError, match="typechecking parameter 'observation'"):
+    with pytest.raises(TypeCheckError, match="typechecking parameter 'obs'"):
         rps.displacement(batch)
 
 
