@@ -33,30 +33,30 @@ PATIENCE = 10.0  # [s] after which a command hangs
 
 
 class Case(NamedTuple):
-    """One fault: arguments of a command in a folder that was prepared."""
+    """Arguments of a command that has one fault."""
 
-    what: str
+    title: str
     arguments: tuple[str, ...]
 
 
-class Found(NamedTuple):
-    """How a command took a fault."""
+class Attempt(NamedTuple):
+    """Outcome of a command that was given a fault."""
 
     how: str  # refused, accepted, told, traceback, hang
     text: str
 
 
 class Accepted(BaseException):
-    """The input was taken for good: worlds would be stepped now."""
+    """Signal that the input was accepted and stepping would start."""
 
 
 class Hang(BaseException):
-    """It took too long."""
+    """Signal that a command exceeded its time limit."""
 
 
 @contextlib.contextmanager
 def never_stepping() -> Iterator[None]:
-    """Commands stop where the first world would be stepped or the first program be compiled."""
+    """Stop commands before the first world is stepped or the first program is compiled."""
     from rps_jax.app import film
     from rps_jax.trials import trial
     from rps_jax.tuning import rollout
@@ -65,31 +65,31 @@ def never_stepping() -> Iterator[None]:
         raise Accepted
 
     starts = ((trial, "start_all"), (rollout, "begin"), (film, "_shots"))
-    before = [(module, name, getattr(module, name)) for module, name in starts]
-    for module, name, _ in before:
+    originals = [(module, name, getattr(module, name)) for module, name in starts]
+    for module, name, _ in originals:
         setattr(module, name, stop)
     try:
         yield
     finally:
-        for module, name, function in before:
+        for module, name, function in originals:
             setattr(module, name, function)
 
 
-def attempt(arguments: Sequence[str], patience: float = PATIENCE) -> Found:
+def attempt(arguments: Sequence[str], patience: float = PATIENCE) -> Attempt:
     """Run a command in this process."""
     from rps_jax.app import cli
 
-    began, busy = time.monotonic(), time.process_time()
+    start_time, busy = time.monotonic(), time.process_time()
 
     def late(*_: Any) -> None:
-        # On a crowded machine this process has had but a share of the time.
-        if time.process_time() - busy < patience and time.monotonic() - began < 4 * patience:
+        # On a busy machine, wall-clock time exceeds the process time.
+        if time.process_time() - busy < patience and time.monotonic() - start_time < 4 * patience:
             signal.setitimer(signal.ITIMER_REAL, patience / 2)
             return
         raise Hang
 
     out, err = io.StringIO(), io.StringIO()
-    before = signal.signal(signal.SIGALRM, late)
+    previous = signal.signal(signal.SIGALRM, late)
     signal.setitimer(signal.ITIMER_REAL, patience)
     try:
         with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
@@ -97,23 +97,23 @@ def attempt(arguments: Sequence[str], patience: float = PATIENCE) -> Found:
     except SystemExit as end:
         code = end.code
     except Accepted:
-        return Found("accepted", "")
+        return Attempt("accepted", "")
     except Hang:
-        return Found("hang", "".join(traceback.format_exc().splitlines(True)[-8:]))
+        return Attempt("hang", "".join(traceback.format_exc().splitlines(True)[-8:]))
     except BaseException:
-        return Found("traceback", traceback.format_exc())
+        return Attempt("traceback", traceback.format_exc())
     finally:
         signal.setitimer(signal.ITIMER_REAL, 0)
-        signal.signal(signal.SIGALRM, before)
+        signal.signal(signal.SIGALRM, previous)
     if "Traceback (most recent call last)" in err.getvalue():
-        return Found("traceback", err.getvalue())
+        return Attempt("traceback", err.getvalue())
     if code == 2:
-        return Found("refused" if _one_sentence(err.getvalue()) else "wordy", err.getvalue())
-    return Found("told", f"{code} {out.getvalue()[-300:]}{err.getvalue()[-300:]}")
+        return Attempt("refused" if _one_sentence(err.getvalue()) else "wordy", err.getvalue())
+    return Attempt("told", f"{code} {out.getvalue()[-300:]}{err.getvalue()[-300:]}")
 
 
 def _one_sentence(text: str) -> bool:
-    """One sentence of ours."""
+    """Return whether the error is a single short sentence of `rps`."""
     last = [line for line in text.splitlines() if line.startswith("rps: error: ")]
     return len(last) == 1 and text.rstrip().endswith(".") and len(last[0]) < 2000
 
@@ -170,7 +170,7 @@ VALUES = (
 
 
 def furnish(folder: Path) -> None:
-    """Files that values name."""
+    """Write the files that `VALUES` names."""
     (folder / "list.json").write_text("[1, 2]")
     (folder / "null.json").write_text("null")
     (folder / "number.json").write_text("7")
@@ -231,8 +231,8 @@ def options(command: Sequence[str]) -> list[str]:
 
 
 def values(seed: int = 0) -> Iterator[Case]:
-    """Every option of every command with every value, in an order by chance."""
-    every = [
+    """Yield all options of all commands with all values, in random order."""
+    cases = [
         Case(f"{' '.join(command)} {option} {value[:30]!r}", (*command, *needs, option, value))
         for command in commands()
         for option in options(command)
@@ -240,8 +240,8 @@ def values(seed: int = 0) -> Iterator[Case]:
         for value in VALUES
         if not (option == "--out" and value in ("/", "..", "~"))  # which may be written
     ]
-    random.Random(seed).shuffle(every)
-    yield from every
+    random.Random(seed).shuffle(cases)
+    yield from cases
 
 
 # What a command needs beside the option that is tried.
@@ -254,7 +254,7 @@ NEEDS = {
 }
 
 
-# --- laws of one's own that are wrong ---------------------------------------------------------
+# --- invalid custom laws ----------------------------------------------------------------------
 
 LAW = """
 import math, sys
@@ -278,7 +278,7 @@ def step({takes}):
     return {returns}
 {register}
 """
-USUAL = {
+DEFAULTS = {
     "head": "", "field": "", "before": "", "takes_init": "params", "starts": "pass",
     "memory": "jnp.zeros(2)", "takes": "params, memory, seen", "body": "pass",
     "returns": "memory, Twist(params.v, 0.0, 0.0), Details.from_obs(seen)",
@@ -390,37 +390,37 @@ _WRONG: dict[str, Sequence[str]] = {
         "{P}.d_success = None\nrps_jax.register_law('{name}', rps_jax.Law(init, step), {P}())",
     ),
 }
-# Of these, what is a law all the same.
-_RIGHT = {
-    *(f"memory: {what}" for what in ("0", "1j", "None", "[jnp.zeros(2)]", "np.zeros(2, int)")),
+# Fragments above that give a valid law.
+_VALID_LAWS = {
+    *(f"memory: {value}" for value in ("0", "1j", "None", "[jnp.zeros(2)]", "np.zeros(2, int)")),
     "body: jax.random.key(seen.yaw)",
     "register: rps_jax.register_law('{name}', rps_jax.Law(init, step, check=init), {P}())",
 }
 
 
 def wrong_laws() -> Iterator[tuple[str, str]]:
-    """What is wrong, and the file of the law."""
-    for number, (where, what) in enumerate((k, v) for k, vs in _WRONG.items() for v in vs):
-        parts = {k: v.replace("{name}", f"wrong_{number}") for k, v in USUAL.items()}
-        parts[where] = what.replace("{name}", f"wrong_{number}")
+    """Yield the fault of an invalid law and the text of its file."""
+    for index, (slot, fragment) in enumerate((k, v) for k, vs in _WRONG.items() for v in vs):
+        parts = {k: v.replace("{name}", f"wrong_{index}") for k, v in DEFAULTS.items()}
+        parts[slot] = fragment.replace("{name}", f"wrong_{index}")
         text = LAW
         for key, part in parts.items():
             text = text.replace(f"{{{key}}}", part)
-        yield f"{where}: {what}", text.replace("{P}", f"P{number}")
+        yield f"{slot}: {fragment}", text.replace("{P}", f"P{index}")
 
 
-def run_laws(most: int, seed: int, tell: Callable[[str], None]) -> Counter[str]:
-    """Wrong laws, each in a sweep that stops where worlds would be stepped."""
+def run_laws(limit: int, seed: int, tell: Callable[[str], None]) -> Counter[str]:
+    """Run sweeps of invalid laws up to the first step of a world."""
     counts: Counter[str] = Counter()
     with tempfile.TemporaryDirectory() as folder, contextlib.chdir(folder), never_stepping():
-        for number, (what, text) in enumerate(itertools.islice(wrong_laws(), most)):
-            file = Path(f"law_{number}.py")
+        for index, (title, text) in enumerate(itertools.islice(wrong_laws(), limit)):
+            file = Path(f"law_{index}.py")
             file.write_text(text)
-            found = attempt(("sweep", "--laws", f"{file}:P{number}", "--worlds", "8"))
-            how = "right" if found.how == "accepted" and what in _RIGHT else found.how
+            result = attempt(("sweep", "--laws", f"{file}:P{index}", "--worlds", "8"))
+            how = "right" if result.how == "accepted" and title in _VALID_LAWS else result.how
             counts[how] += 1
             if how not in ("refused", "right") or LOUD:
-                tell(f"{how}: {what}\n{found.text[-1500:]}")
+                tell(f"{how}: {title}\n{result.text[-1500:]}")
             shutil.rmtree("runs", ignore_errors=True)
     return counts
 
@@ -439,51 +439,51 @@ ODD: tuple[Any, ...] = (
 class Edit(NamedTuple):
     """A change of one file of a run folder, consistent with its checksum unless it is damage."""
 
-    what: str
+    title: str
     file: str
     make: Callable[[Path], None]
 
 
-def places(tree: Any, at: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
-    """Where in a JSON value something stands."""
+def json_paths(tree: Any, at: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
+    """Yield the path of keys and indices of each value in a JSON tree."""
     inner = tree.items() if isinstance(tree, dict) else enumerate(tree)
     for key, value in inner:
         yield (*at, key)
         if isinstance(value, dict | list) and len(at) < 5:
-            yield from places(value, (*at, key))
+            yield from json_paths(value, (*at, key))
 
 
 def _changed(tree: Any, at: tuple[Any, ...], value: Any) -> Any:
-    """A JSON value with something else at a place; with `...` nothing stands there any more."""
+    """Return a copy of a JSON tree with another value at a path; `...` deletes the value."""
     tree = json.loads(json.dumps(tree))
-    one = tree
+    parent = tree
     for key in at[:-1]:
-        one = one[key]
+        parent = parent[key]
     if value is ...:
-        del one[at[-1]]
+        del parent[at[-1]]
     else:
-        one[at[-1]] = value
+        parent[at[-1]] = value
     return tree
 
 
 def _sign(path: Path) -> None:
-    """Make the checksum that of the content."""
+    """Update the checksum of an edited file."""
     import hashlib
 
     digest = hashlib.sha256(path.read_bytes()).hexdigest()
-    beside = path.with_name(f"{path.name}.sha256")
-    if beside.exists():
-        beside.write_text(f"{digest}  {path.name}\n")
+    checksum_file = path.with_name(f"{path.name}.sha256")
+    if checksum_file.exists():
+        checksum_file.write_text(f"{digest}  {path.name}\n")
     if path.parent.name == "parts":
         name = path.stem.rpartition("-")[0]
         path.rename(path.with_name(f"{name}-{digest[:16]}{path.suffix}"))
 
 
-def json_edits(path: Path, rng: random.Random, most: int) -> Iterator[Edit]:
-    """Other values at places of a JSON file."""
+def json_edits(path: Path, rng: random.Random, limit: int) -> Iterator[Edit]:
+    """Yield replaced or deleted values of a JSON file."""
     tree = json.loads(path.read_text())
-    every = [(at, value) for at in places(tree) for value in (*ODD, ...)]
-    for at, value in rng.sample(every, min(most, len(every))):
+    candidates = [(at, value) for at in json_paths(tree) for value in (*ODD, ...)]
+    for at, value in rng.sample(candidates, min(limit, len(candidates))):
 
         def make(file: Path, at: tuple[Any, ...] = at, value: Any = value) -> None:
             file.write_text(json.dumps(_changed(tree, at, value)))
@@ -500,125 +500,136 @@ def json_edits(path: Path, rng: random.Random, most: int) -> Iterator[Edit]:
         yield Edit(f"the whole = {value!r}", path.name, whole)
 
 
-def dataset_edits(path: Path, rng: random.Random, most: int) -> Iterator[Edit]:
-    """Other variables, shapes, types and units of a NetCDF file."""
+def dataset_edits(path: Path, rng: random.Random, limit: int) -> Iterator[Edit]:
+    """Yield other variables, shapes, types and units of a NetCDF file."""
     import numpy as np
     import xarray as xr
 
     with xr.open_dataset(path, engine="h5netcdf") as lazy:
-        found = lazy.load()
+        dataset = lazy.load()
 
     def column(name: str, values: Any, dims: Any = None, **attrs: Any) -> Any:
-        old = found[name]
+        old = dataset[name]
         new = (dims or old.dims, values, old.attrs | attrs)
-        return found.drop_vars(name).assign({name: new})
+        return dataset.drop_vars(name).assign({name: new})
 
     changes: list[tuple[str, Callable[[], Any]]] = []
-    for name in map(str, found.variables):
-        one = found[name]
+    for name in map(str, dataset.variables):
+        variable = dataset[name]
 
-        def change(what: str, make: Callable[[Any, str], Any], name: str = name) -> None:
-            changes.append((f"{name}: {what}", lambda: make(found[name], name)))
+        def change(title: str, edit: Callable[[Any, str], Any], name: str = name) -> None:
+            changes.append((f"{name}: {title}", lambda: edit(dataset[name], name)))
 
-        change("is missing", lambda one, name: found.drop_vars(name))
-        change("other units", lambda one, name: column(name, one.values, units="furlong"))
-        change("units are a number", lambda one, name: column(name, one.values, units=7))
-        change("texts", lambda one, name: column(name, one.values.astype(str)))
-        change("bytes", lambda one, name: column(name, one.values.astype("S8")))
-        change("another name", lambda one, name: found.rename({name: f"{name}_"}))
-        if one.dtype.kind in "fiu":
-            change("NaN", lambda one, name: column(name, np.full(one.shape, np.nan)))
-            change("huge", lambda one, name: column(name, np.full(one.shape, 1e300)))
-            change("a number", lambda one, name: column(name, 1.0, ()))
-            change("64 bits", lambda one, name: column(name, one.values.astype(complex).real))
-            change("complex", lambda one, name: column(name, one.values.astype(complex)))
-        if one.ndim:
-            change("one row less", lambda one, name: found.isel({one.dims[-1]: slice(1, None)}))
+        change("is missing", lambda variable, name: dataset.drop_vars(name))
+        change("other units", lambda variable, name: column(name, variable.values, units="furlong"))
+        change("units are a number", lambda variable, name: column(name, variable.values, units=7))
+        change("texts", lambda variable, name: column(name, variable.values.astype(str)))
+        change("bytes", lambda variable, name: column(name, variable.values.astype("S8")))
+        change("another name", lambda variable, name: dataset.rename({name: f"{name}_"}))
+        if variable.dtype.kind in "fiu":
+            change("NaN", lambda variable, name: column(name, np.full(variable.shape, np.nan)))
+            change("huge", lambda variable, name: column(name, np.full(variable.shape, 1e300)))
+            change("a number", lambda variable, name: column(name, 1.0, ()))
+            change(
+                "64 bits", lambda variable, name: column(name, variable.values.astype(complex).real)
+            )
+            change("complex", lambda variable, name: column(name, variable.values.astype(complex)))
+        if variable.ndim:
+            change(
+                "one row less",
+                lambda variable, name: dataset.isel({variable.dims[-1]: slice(1, None)}),
+            )
             change(
                 "another axis",
-                lambda one, name: column(name, one.values[None], ("more", *one.dims)),
+                lambda variable, name: column(
+                    name, variable.values[None], ("more", *variable.dims)
+                ),
             )
             change(
                 "twice",
-                lambda one, name: column(
-                    name, np.concatenate([one.values, one.values]), ("more", *one.dims[1:])
+                lambda variable, name: column(
+                    name,
+                    np.concatenate([variable.values, variable.values]),
+                    ("more", *variable.dims[1:]),
                 ),
             )
     changes.append(("nothing in it", lambda: xr.Dataset()))
     changes.append(("another dataset", lambda: xr.Dataset({"a": ("b", [1, 2])})))
-    for what, make in rng.sample(changes, min(most, len(changes))):
+    for title, edit in rng.sample(changes, min(limit, len(changes))):
 
-        def write(file: Path, make: Callable[[], Any] = make) -> None:
+        def write(file: Path, edit: Callable[[], Any] = edit) -> None:
             try:
-                edited = make()
-                for one in edited.variables.values():
-                    one.encoding = {}
+                edited = edit()
+                for variable in edited.variables.values():
+                    variable.encoding = {}
                 content = bytes(edited.to_netcdf(engine="h5netcdf", invalid_netcdf=True))
-            except Exception:  # xarray cannot write such a thing
+            except Exception:  # xarray cannot write this dataset
                 content = b"not written"
             file.write_bytes(content)
             _sign(file)
 
-        yield Edit(what, path.name, write)
+        yield Edit(title, path.name, write)
 
 
-def archive_edits(path: Path, rng: random.Random, most: int) -> Iterator[Edit]:
-    """Other arrays of a NumPy archive."""
+def archive_edits(path: Path, rng: random.Random, limit: int) -> Iterator[Edit]:
+    """Yield other arrays of a NumPy archive."""
     import numpy as np
 
     with np.load(path, allow_pickle=False) as file:
         arrays = {name: file[name] for name in file.files}
     changes: list[tuple[str, dict[str, Any]]] = []
-    for name, one in arrays.items():
+    for name, array in arrays.items():
         less = {k: v for k, v in arrays.items() if k != name}
         changes += [
             (f"{name} is missing", less),
-            (f"{name}: texts", arrays | {name: one.astype(str)}),
-            (f"{name}: flat", arrays | {name: one.ravel()[:1]}),
-            (f"{name}: another axis", arrays | {name: one[None]}),
+            (f"{name}: texts", arrays | {name: array.astype(str)}),
+            (f"{name}: flat", arrays | {name: array.ravel()[:1]}),
+            (f"{name}: another axis", arrays | {name: array[None]}),
             (f"{name}: pickles", arrays | {name: np.array([{"a": 1}], object)}),
             (f"{name}: structured", arrays | {name: np.zeros(2, "i4,f4")}),
         ]
-        if one.dtype.kind in "fiu":
+        if array.dtype.kind in "fiu":
             changes += [
-                (f"{name}: NaN", arrays | {name: np.full(one.shape, np.nan)}),
-                (f"{name}: other bits", arrays | {name: one.astype(np.float16)}),
+                (f"{name}: NaN", arrays | {name: np.full(array.shape, np.nan)}),
+                (f"{name}: other bits", arrays | {name: array.astype(np.float16)}),
             ]
-        if one.dtype.kind == "U":
+        if array.dtype.kind == "U":
             try:
-                tree = json.loads(str(one))
+                tree = json.loads(str(array))
             except ValueError:
                 continue
-            every = [(at, value) for at in places(tree) for value in (*ODD, ...)]
-            for at, value in rng.sample(every, min(40, len(every))):
-                told = json.dumps(_changed(tree, at, value))
-                changes.append((f"{name}.{at} = {value!r}"[:80], arrays | {name: np.array(told)}))
-    for what, content in rng.sample(changes, min(most, len(changes))):
+            candidates = [(at, value) for at in json_paths(tree) for value in (*ODD, ...)]
+            for at, value in rng.sample(candidates, min(40, len(candidates))):
+                encoded = json.dumps(_changed(tree, at, value))
+                changes.append(
+                    (f"{name}.{at} = {value!r}"[:80], arrays | {name: np.array(encoded)})
+                )
+    for title, content in rng.sample(changes, min(limit, len(changes))):
 
         def write(file: Path, content: dict[str, Any] = content) -> None:
             np.savez(file, **content)
             _sign(file)
 
-        yield Edit(what, path.name, write)
+        yield Edit(title, path.name, write)
 
 
 def discard(*_: Any) -> None:
-    """What several actions return, for a lambda."""
+    """Return None, so that a lambda can run several actions."""
 
 
-def damages(path: Path, rng: random.Random, most: int) -> Iterator[Edit]:
-    """Bytes that changed, and things that are no files."""
+def damages(path: Path, rng: random.Random, limit: int) -> Iterator[Edit]:
+    """Yield corrupt contents, and folders, pipes and links in place of the file."""
     content = path.read_bytes()
 
-    def bytes_(what: str, new: bytes) -> Edit:
-        return Edit(what, path.name, lambda file: discard(file.write_bytes(new)))
+    def bytes_(title: str, new: bytes) -> Edit:
+        return Edit(title, path.name, lambda file: discard(file.write_bytes(new)))
 
-    def instead(what: str, make: Callable[[Path], Any]) -> Edit:
-        return Edit(what, path.name, lambda file: discard(file.unlink(), make(file)))
+    def instead(title: str, make: Callable[[Path], Any]) -> Edit:
+        return Edit(title, path.name, lambda file: discard(file.unlink(), make(file)))
 
     at = rng.randrange(max(1, len(content)))
     flipped = content[:at] + bytes([content[at] ^ 1 << rng.randrange(8)]) + content[at + 1 :]
-    every = [
+    edits = [
         bytes_("empty", b""), bytes_(f"cut at {at}", content[:at]), bytes_("twice", content * 2),
         bytes_(f"bit at {at}", flipped), bytes_("zeros", bytes(len(content))),
         bytes_("random", rng.randbytes(len(content))), bytes_("HDF5 in name", b"\x89HDF\r\n\x1a\n"),
@@ -631,7 +642,7 @@ def damages(path: Path, rng: random.Random, most: int) -> Iterator[Edit]:
         instead("a link to nothing", lambda file: file.symlink_to("/nowhere")),
         instead("memory", lambda file: file.symlink_to("/proc/self/mem")),
     ]  # fmt: skip
-    yield from rng.sample(every, min(most, len(every)))
+    yield from rng.sample(edits, min(limit, len(edits)))
 
 
 @functools.cache
@@ -659,8 +670,8 @@ def furnish_runs(folder: Path, learned: bool) -> dict[str, list[tuple[str, ...]]
     (folder / "policy").mkdir()
     shutil.copy(Path(policy.__file__).parent / "learned_mlp.npz", folder / "policy" / "policy.npz")
     for command in (SWEEP, TUNE, LEARN)[: 3 if learned else 2]:
-        if (made := attempt(command, 300)).how != "told":
-            raise RuntimeError(f"rps {' '.join(command)} made no run ({made.how}): {made.text}")
+        if (result := attempt(command, 300)).how != "told":
+            raise RuntimeError(f"rps {' '.join(command)} made no run ({result.how}): {result.text}")
     return {
         "sweep": [
             ("merge", "sweep", "--out", "merged"), ("replay", "sweep", "0"), ("film", "sweep"),
@@ -689,63 +700,63 @@ LEARN = (
 )
 
 
-def run_edits(most: int, seed: int, tell: Callable[[str], None]) -> Counter[str]:
-    """Edited and damaged run folders, each read by commands that stop where worlds are stepped."""
-    return _run_folders(most, seed, tell, (json_edits, dataset_edits, archive_edits))
+def run_edits(limit: int, seed: int, tell: Callable[[str], None]) -> Counter[str]:
+    """Edited run folders, each read by commands that stop where worlds are stepped."""
+    return _run_folders(limit, seed, tell, (json_edits, dataset_edits, archive_edits))
 
 
-def run_damages(most: int, seed: int, tell: Callable[[str], None]) -> Counter[str]:
-    """Damaged run folders, likewise."""
-    return _run_folders(most, seed, tell, (damages,))
+def run_damages(limit: int, seed: int, tell: Callable[[str], None]) -> Counter[str]:
+    """Damaged run folders, each read by commands that stop where worlds are stepped."""
+    return _run_folders(limit, seed, tell, (damages,))
 
 
 def _run_folders(
-    most: int, seed: int, tell: Callable[[str], None], kinds: Sequence[Callable[..., Any]]
+    limit: int, seed: int, tell: Callable[[str], None], kinds: Sequence[Callable[..., Any]]
 ) -> Counter[str]:
     counts: Counter[str] = Counter()
     rng = random.Random(seed)
     readers = {".json": json_edits, ".nc": dataset_edits, ".npz": archive_edits}
-    home, reads = _furnished(learned=most >= 100)
+    home, reads = _furnished(learned=limit >= 100)
     with contextlib.chdir(home):
-        every = []
+        candidates = []
         for name in reads:
             for path in sorted(Path(name).rglob("*")):
-                own = damages if damages in kinds else readers.get(path.suffix)
-                if own in kinds and own and path.is_file() and not path.name.startswith("."):
-                    for edit in own(path, rng, max(4, most // 8)):
-                        every.append((name, path, edit))
+                editor = damages if damages in kinds else readers.get(path.suffix)
+                if editor in kinds and editor and path.is_file() and not path.name.startswith("."):
+                    for edit in editor(path, rng, max(4, limit // 8)):
+                        candidates.append((name, path, edit))
         with never_stepping():
-            for name, path, edit in rng.sample(every, min(most, len(every))):
+            for name, path, edit in rng.sample(candidates, min(limit, len(candidates))):
                 shutil.move(name, f"{name}.sound")
                 shutil.copytree(f"{name}.sound", name)
                 edit.make(path)
                 command = rng.choice(reads[name])
-                found = attempt(command)
-                counts[found.how] += 1
-                if found.how in ("traceback", "hang", "wordy") or LOUD:
-                    what = f"{found.how}: {path}: {edit.what}: rps {' '.join(command)}"
-                    tell(f"{what}\n{found.text[-1800:]}")
+                result = attempt(command)
+                counts[result.how] += 1
+                if result.how in ("traceback", "hang", "wordy") or LOUD:
+                    summary = f"{result.how}: {path}: {edit.title}: rps {' '.join(command)}"
+                    tell(f"{summary}\n{result.text[-1800:]}")
                 shutil.rmtree(name)
                 shutil.move(f"{name}.sound", name)
-                for made in ("merged", "runs"):
-                    shutil.rmtree(made, ignore_errors=True)
+                for leftover in ("merged", "runs"):
+                    shutil.rmtree(leftover, ignore_errors=True)
     return counts
 
 
 # --- the table -------------------------------------------------------------------------------
 
 
-def run_values(most: int, seed: int, tell: Callable[[str], None]) -> Counter[str]:
-    """Bad values, each in one command that stops where worlds would be stepped."""
+def run_values(limit: int, seed: int, tell: Callable[[str], None]) -> Counter[str]:
+    """Run commands with bad values up to the first step of a world."""
     counts: Counter[str] = Counter()
     with tempfile.TemporaryDirectory() as folder, contextlib.chdir(folder):
         furnish(Path(folder))
         with never_stepping():
-            for case in itertools.islice(values(seed), most):
-                found = attempt(case.arguments)
-                counts[found.how] += 1
-                if found.how in ("traceback", "hang", "wordy"):
-                    tell(f"{found.how}: rps {case.arguments}"[:400] + f"\n{found.text[-1500:]}")
+            for case in itertools.islice(values(seed), limit):
+                result = attempt(case.arguments)
+                counts[result.how] += 1
+                if result.how in ("traceback", "hang", "wordy"):
+                    tell(f"{result.how}: rps {case.arguments}"[:400] + f"\n{result.text[-1500:]}")
                 for name in ("runs", "merged"):
                     shutil.rmtree(name, ignore_errors=True)
     return counts
@@ -760,20 +771,24 @@ CLASSES = {
 
 
 def main() -> int:
-    """Throw faults, tell what did not hold, and print the table."""
+    """Inject the faults, print failures and the table of outcomes."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("classes", nargs="*", default=list(CLASSES), metavar="CLASS")
     parser.add_argument("--most", type=int, help="cases of each class")
     parser.add_argument("--seed", type=int, default=0)
-    given = parser.parse_args()
+    choice = parser.parse_args()
     table = {}
-    for name in given.classes:
-        run, usual = CLASSES[name]
-        began = time.monotonic()
-        counts = run(given.most or usual, given.seed, lambda text: print(text, flush=True))
-        table[name] = dict(counts) | {"seconds": round(time.monotonic() - began)}
+    for name in choice.classes:
+        run, default = CLASSES[name]
+        start_time = time.monotonic()
+        counts = run(choice.most or default, choice.seed, lambda text: print(text, flush=True))
+        table[name] = dict(counts) | {"seconds": round(time.monotonic() - start_time)}
         print(json.dumps({name: table[name]}), flush=True)
-    bad = sum(one.get(how, 0) for one in table.values() for how in ("traceback", "hang", "wordy"))
+    bad = sum(
+        counts_of_class.get(how, 0)
+        for counts_of_class in table.values()
+        for how in ("traceback", "hang", "wordy")
+    )
     return int(bad > 0)
 
 

@@ -1,10 +1,10 @@
-"""Faults that need processes of their own: kills, full disks, signals, pipes, locales, neighbours.
+"""Faults that need separate processes: kills, full disks, signals, pipes, locales, neighbours.
 
     python tests/fuzz_process.py            # all of them: some twenty minutes on two cores
     python tests/fuzz_process.py kills --most 14
 
-A killed command is run again, with nothing else said, until it ends; what it then holds must be
-what a command that nobody killed holds, bit for bit but for clocks.
+A killed command is repeated with the same arguments until it ends. Its results must then equal
+those of an undisturbed command bit for bit, except for clocks.
 """
 
 from __future__ import annotations
@@ -91,14 +91,14 @@ _CLOCKS = ("compile", "run")  # of a tuner's generation; others say "wall clock"
 
 
 def start(*words: str, **how: Any) -> subprocess.Popen[str]:
-    """Start a command, on the processor, with its pipes caught."""
+    """Start a command on the CPU with captured output."""
     env = os.environ | {"JAX_PLATFORMS": "cpu", "PYTHONPATH": str(HOME)} | how.pop("env", {})
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True} | how
     return subprocess.Popen([*RPS, *words], env=env, **pipes)
 
 
 def ended(process: subprocess.Popen[str], patience: float = 300.0) -> tuple[int, str]:
-    """Code and last words of a process, which is killed when it takes too long."""
+    """Return exit code and output of a process; kill it when it takes too long."""
     try:
         out, err = process.communicate(timeout=patience)
     except subprocess.TimeoutExpired:
@@ -109,46 +109,56 @@ def ended(process: subprocess.Popen[str], patience: float = 300.0) -> tuple[int,
 
 
 def payload(folder: Path) -> dict[str, Any]:
-    """Every variable and array that a run folder holds, but clocks, by file and name."""
+    """Return all variables and arrays of a run folder except clocks, by file and name."""
     import numpy as np
     import xarray as xr
 
-    found: dict[str, Any] = {}
+    contents: dict[str, Any] = {}
     for path in sorted(folder.rglob("*")):
         name = str(path.relative_to(folder))
         if path.suffix == ".nc" and path.parent == folder:
             with xr.open_dataset(path, engine="h5netcdf") as data:
-                for key, one in data.variables.items():
-                    if key not in _CLOCKS and "wall clock" not in one.attrs.get("long_name", ""):
-                        found[f"{name}:{key}"] = (one.dims, str(one.dtype), one.values.tobytes())
-                        if one.dtype == object:
-                            found[f"{name}:{key}"] = (one.dims, "text", tuple(one.values.ravel()))
+                for key, variable in data.variables.items():
+                    if key not in _CLOCKS and "wall clock" not in variable.attrs.get(
+                        "long_name", ""
+                    ):
+                        contents[f"{name}:{key}"] = (
+                            variable.dims,
+                            str(variable.dtype),
+                            variable.values.tobytes(),
+                        )
+                        if variable.dtype == object:
+                            contents[f"{name}:{key}"] = (
+                                variable.dims,
+                                "text",
+                                tuple(variable.values.ravel()),
+                            )
         elif path.name in ("policy.npz", "elites.npz"):
             with np.load(path, allow_pickle=False) as archive:
                 for key in archive.files:
                     if archive[key].dtype.kind != "U":
-                        found[f"{name}:{key}"] = archive[key].tobytes()
+                        contents[f"{name}:{key}"] = archive[key].tobytes()
         elif path.name == "tuned.json":
-            found[name] = json.loads(path.read_text()).get("params", path.read_text())
-    return found
+            contents[name] = json.loads(path.read_text()).get("params", path.read_text())
+    return contents
 
 
 def fault(text: str) -> str:
-    """What of a command's words nobody should see."""
+    """Return "hang" or "Traceback" if the output of a command shows it, else ""."""
     return "hang" if text == "hang" else "Traceback" * ("Traceback (most recent" in text)
 
 
-def run_kills(most: int, seed: int, tell: Callable[[str], None]) -> Counter[str]:
-    """Kill seven commands at times by chance, run them again, and compare what they hold."""
+def run_kills(limit: int, seed: int, tell: Callable[[str], None]) -> Counter[str]:
+    """Kill seven commands at random times, repeat them, and compare their results."""
     counts: Counter[str] = Counter()
     rng = random.Random(seed)
     with tempfile.TemporaryDirectory() as home:
-        for number, (name, words) in enumerate(KILLED.items()):
-            kills = most // len(KILLED) + (number < most % len(KILLED))
+        for index, (name, words) in enumerate(KILLED.items()):
+            kills = limit // len(KILLED) + (index < limit % len(KILLED))
             ended(start(*words, "--out", f"{home}/warm-{name}"))  # compiles
-            began = time.monotonic()
+            start_time = time.monotonic()
             code, text = ended(start(*words, "--out", f"{home}/{name}"))
-            whole = time.monotonic() - began
+            whole = time.monotonic() - start_time
             if code or fault(text):
                 counts["traceback"] += 1
                 tell(f"{name}: code {code}: {text[-1500:]}")
@@ -185,20 +195,20 @@ def run_kills(most: int, seed: int, tell: Callable[[str], None]) -> Counter[str]
 
 @contextlib.contextmanager
 def small_disk(megabytes: float) -> Iterator[Path]:
-    """A folder on a file system of its own, of a few MB; it needs the right to mount."""
-    with tempfile.TemporaryDirectory() as place:
+    """Mount a small file system and yield its folder; this needs the right to mount."""
+    with tempfile.TemporaryDirectory() as mount_point:
         size = f"size={int(megabytes * 1024)}k"
-        words = ["mount", "-t", "tmpfs", "-o", size, "tmpfs", place]
+        words = ["mount", "-t", "tmpfs", "-o", size, "tmpfs", mount_point]
         if subprocess.run(words, capture_output=True).returncode:
             raise PermissionError("this user may not mount a small disk")
         try:
-            yield Path(place)
+            yield Path(mount_point)
         finally:
-            subprocess.run(["umount", "-l", place], check=True)
+            subprocess.run(["umount", "-l", mount_point], check=True)
 
 
 def limited(kilobytes: int) -> Callable[[], None]:
-    """What a child does so that no file of it grows above some size, as on a full disk."""
+    """Return a `preexec_fn` that limits the size of a child's files, as on a full disk."""
 
     def limit() -> None:
         import resource
@@ -210,7 +220,7 @@ def limited(kilobytes: int) -> Callable[[], None]:
 
 
 def machine(home: Path) -> Iterator[tuple[str, str, int, str]]:
-    """Names of faults of the machine, with the code wanted, and the code and words that came."""
+    """Yield faults of the machine: title, expected exit code, exit code and output."""
     sound = home / "sound"
     ended(start(*SWEEP, "--out", str(sound)))
     right = payload(sound)
@@ -231,21 +241,24 @@ def machine(home: Path) -> Iterator[tuple[str, str, int, str]]:
                 yield f"a disk of {size} MB", "2", code, text
     except PermissionError as error:
         print(f"left out: {error}")
-    for what, temporary in (("no temporary folder", "/nowhere"), ("temporary is a file", __file__)):
-        out = home / what
+    for title, temporary in (
+        ("no temporary folder", "/nowhere"),
+        ("temporary is a file", __file__),
+    ):
+        out = home / title
         code, text = ended(start(*SWEEP, "--out", str(out), env={"TMPDIR": temporary}))
-        yield what, "0", code, text + same(out)
-    for what, cache in (("no cache", "/dev/null/x"), ("the cache is a file", __file__)):
-        out = home / what
+        yield title, "0", code, text + same(out)
+    for title, cache in (("no cache", "/dev/null/x"), ("the cache is a file", __file__)):
+        out = home / title
         code, text = ended(start(*SWEEP, "--out", str(out), env={"RPS_CACHE": cache}))
-        yield what, "0 or 2", code, text
+        yield title, "0 or 2", code, text
     code, text = ended(start(*SWEEP, "--out", str(out), env={"HOME": "/nowhere"}))
     yield "no home", "0 or 2", code, text
     out = home / "two"
     both = [start(*SWEEP, "--out", str(out)) for _ in range(2)]
-    codes = [ended(one) for one in both]
+    codes = [ended(process) for process in both]
     yield "two processes: one does it", "0", min(codes)[0], min(codes)[1] + same(out)
-    yield "two processes: the other is told", "0 or 2", max(codes)[0], max(codes)[1]
+    yield "two processes: the second is refused", "0 or 2", max(codes)[0], max(codes)[1]
     for when in (0.5, 1.5, 3.0, 4.5, 6.0):
         out = home / f"interrupt-{when}"
         process = start(*SWEEP, "--worlds", "20000", "--part", "64", "--out", str(out))
@@ -289,22 +302,22 @@ def machine(home: Path) -> Iterator[tuple[str, str, int, str]]:
     yield "doctor where nothing can be written", "0", code, text
 
 
-def run_machine(most: int, seed: int, tell: Callable[[str], None]) -> Counter[str]:
-    """Faults of the machine: disks, folders, signals, pipes, locales and paths."""
+def run_machine(limit: int, seed: int, tell: Callable[[str], None]) -> Counter[str]:
+    """Check faults of the machine: disks, folders, signals, pipes, locales and paths."""
     counts: Counter[str] = Counter()
     with tempfile.TemporaryDirectory() as home:
-        for number, (what, wanted, code, text) in enumerate(machine(Path(home))):
-            if number >= most:
+        for index, (title, expected, code, text) in enumerate(machine(Path(home))):
+            if index >= limit:
                 break
-            good = str(code) in wanted.split(" or ") and not fault(text)
+            good = str(code) in expected.split(" or ") and not fault(text)
             counts["held" if good else "traceback" if fault(text) else "wrong code"] += 1
             if not good:
-                tell(f"{what}: code {code}, not {wanted}: {text[-1200:]}")
+                tell(f"{title}: code {code}, not {expected}: {text[-1200:]}")
     return counts
 
 
-def run_memory(most: int, seed: int, tell: Callable[[str], None]) -> Counter[str]:
-    """Call `evaluate` many times in one process: after the fifth call memory does not grow."""
+def run_memory(num_calls: int, seed: int, tell: Callable[[str], None]) -> Counter[str]:
+    """Check that memory does not grow after the fifth call of `evaluate` in a process."""
     program = f"""
 import dataclasses, gc, rps_jax
 drums = rps_jax.Domain(("random_cylinder",))
@@ -312,10 +325,10 @@ setting = rps_jax.Setting("quasistatic", rules=rps_jax.Rules(horizon=2.0))
 def now():
     gc.collect()
     return int(open("/proc/self/statm").read().split()[1]) * 4096 / 2**20
-for call in range({most}):
+for call in range({num_calls}):
     seeded = dataclasses.replace(setting, seed=call)
     rps_jax.evaluate(rps_jax.RPSParams.paper(), drums, worlds=16, setting=seeded)
-    if call in (4, {most - 1}):
+    if call in (4, {num_calls - 1}):
         print(f"{{now():.1f}}")
 """
     words = [sys.executable, "-c", program]
@@ -325,7 +338,7 @@ for call in range({most}):
         tell(done.stderr[-2000:])
         return Counter(traceback=1)
     fifth, last = map(float, done.stdout.split())
-    print(f"memory after call 5: {fifth} MB, after call {most}: {last} MB")
+    print(f"memory after call 5: {fifth} MB, after call {num_calls}: {last} MB")
     grown = last > fifth + 8.0
     if grown:
         tell(f"memory grew from {fifth} to {last} MB")
@@ -336,18 +349,18 @@ CLASSES = {"kills": (run_kills, 100), "machine": (run_machine, 1000), "memory": 
 
 
 def main() -> int:
-    """Throw faults, tell what did not hold, and print the table."""
+    """Inject the faults, print failures and the table of outcomes."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("classes", nargs="*", default=list(CLASSES), metavar="CLASS")
     parser.add_argument("--most", type=int, help="cases of each class")
     parser.add_argument("--seed", type=int, default=0)
-    given = parser.parse_args()
+    options = parser.parse_args()
     bad = 0
-    for name in given.classes:
-        run, usual = CLASSES[name]
-        began = time.monotonic()
-        counts = run(given.most or usual, given.seed, lambda text: print(text, flush=True))
-        seconds = {"seconds": round(time.monotonic() - began)}
+    for name in options.classes:
+        run, default = CLASSES[name]
+        start_time = time.monotonic()
+        counts = run(options.most or default, options.seed, lambda text: print(text, flush=True))
+        seconds = {"seconds": round(time.monotonic() - start_time)}
         print(json.dumps({name: dict(counts) | seconds}), flush=True)
         bad += sum(counts[how] for how in ("traceback", "wrong", "wrong code", "grown"))
     return int(bad > 0)

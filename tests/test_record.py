@@ -1,4 +1,4 @@
-"""What a run leaves behind: files whole or not at all, known when damaged, and held by one."""
+"""Files of a run: atomic writes, detection of damage, and locks."""
 
 import hashlib
 import io
@@ -30,7 +30,7 @@ RESULTS = xr.Dataset(
 
 
 def state(generation):
-    """Of a search, as it is kept between two generations."""
+    """Return the checkpoint of a search after a generation."""
     file = io.BytesIO()
     np.savez(file, mean=np.arange(12.0), generation=generation)
     return file.getvalue()
@@ -52,7 +52,7 @@ def flipped(share, bit):
 
 
 def blank(share, size):
-    """A block of zeros; of ones where there are zeros already."""
+    """Overwrite a block with zeros, or with ones where it is zero already."""
 
     def fill(content):
         at = int(share * len(content))
@@ -92,41 +92,41 @@ def sound(tmp_path_factory):
     provenance.write_environment(folder, {"command": ["rps", "sweep"], "time": "now"})
     files.write_results(folder / "results.nc", RESULTS)
     parts = Checkpoints(folder)
-    for number in range(3):
-        parts.put(f"{number:07d}", files.encode_results(RESULTS.isel(world=[number])))
+    for index in range(3):
+        parts.put(f"{index:07d}", files.encode_results(RESULTS.isel(world=[index])))
     parts.put("state", state(4), ".npz")
     return folder
 
 
 @pytest.fixture
 def folder(sound, tmp_path, monkeypatch):
-    """A copy of it, and nothing that is damaged may come to HDF5."""
+    """A copy of the run folder; HDF5 must not open damaged files."""
     monkeypatch.setattr(xr, "load_dataset", lambda *_, **__: pytest.fail("HDF5 opened a file"))
     return shutil.copytree(sound, tmp_path / "run")
 
 
-def in_one_sentence(path, read, *arguments):
+def reports_corruption(path, read, *arguments):
     with pytest.raises(InputError) as caught:
         read(*arguments)
-    told = str(caught.value)
-    assert told.startswith(f"{path} is corrupt")
-    assert told.endswith(".")
-    assert "\n" not in told
+    message = str(caught.value)
+    assert message.startswith(f"{path} is corrupt")
+    assert message.endswith(".")
+    assert "\n" not in message
 
 
 @pytest.mark.parametrize("damage", DAMAGE)
-def test_damage_is_known_before_anything_reads_it_and_nothing_else_is_lost(damage, folder):
-    parts, before = Checkpoints(folder), dict(Checkpoints(folder).items())
-    began = time.perf_counter()
+def test_damage_is_detected_before_reading_and_other_files_survive(damage, folder):
+    parts, contents = Checkpoints(folder), dict(Checkpoints(folder).items())
+    start_time = time.perf_counter()
     for name, path in parts.paths().items():
-        damaged = DAMAGE[damage](before[name])
+        damaged = DAMAGE[damage](contents[name])
         path.write_bytes(damaged)
         assert parts.get(name) is None
         assert path.with_name(f"{path.name}.corrupt").read_bytes() == damaged
-        others = {other: content for other, content in before.items() if other != name}
-        assert dict(parts.items()) == others
-        parts.put(name, before[name], path.suffix)
-    assert dict(parts.items()) == before
+        rest = {key: content for key, content in contents.items() if key != name}
+        assert dict(parts.items()) == rest
+        parts.put(name, contents[name], path.suffix)
+    assert dict(parts.items()) == contents
     for name, *readers in (
         ("results.nc", files.read_results),
         ("manifest.json", run_folder.read_manifest, lambda f: run_folder.claim(f, {"worlds": 300})),
@@ -141,10 +141,10 @@ def test_damage_is_known_before_anything_reads_it_and_nothing_else_is_lost(damag
         damaged = DAMAGE[damage](content)
         path.write_bytes(damaged)
         for read in readers:
-            in_one_sentence(path, read, folder)
-        assert path.read_bytes() == damaged  # it is kept
+            reports_corruption(path, read, folder)
+        assert path.read_bytes() == damaged  # the damaged file stays
         path.write_bytes(content)
-    assert time.perf_counter() - began < 1.0
+    assert time.perf_counter() - start_time < 1.0
     assert len(DAMAGE) >= 50
 
 
@@ -152,27 +152,27 @@ def test_a_wrong_digest_is_damage_too(folder):
     path = Checkpoints(folder).paths()["0000001"]
     path.rename(path.with_name("0000001-0123456789abcdef.nc"))
     assert list(Checkpoints(folder).paths()) == ["0000000", "0000002", "state"]
-    for other in ("0" * 64, "", "\N{SNOWMAN}"):
-        files.checksum_path(folder / "results.nc").write_text(f"{other}  results.nc\n")
-        in_one_sentence(folder / "results.nc", files.read_results, folder)
+    for digest in ("0" * 64, "", "\N{SNOWMAN}"):
+        files.checksum_path(folder / "results.nc").write_text(f"{digest}  results.nc\n")
+        reports_corruption(folder / "results.nc", files.read_results, folder)
 
 
 @pytest.mark.parametrize(
     "content", [b"", b"torn", b"\xff\xfe", b"[1]", b"[" * 100_000, b"{'a': 1}"]
 )
-def test_a_file_without_checksum_that_is_no_json_is_named(content, folder):
-    """As an older version left it."""
+def test_invalid_json_without_checksum_is_reported(content, folder):
+    """Older versions wrote no checksums."""
     for name, read in (
         ("manifest.json", run_folder.read_manifest),
         ("environment.json", provenance.describe),
     ):
         files.checksum_path(folder / name).unlink()
         (folder / name).write_bytes(content)
-        in_one_sentence(folder / name, read, folder)
+        reports_corruption(folder / name, read, folder)
 
 
 def test_a_file_without_checksum_is_read(sound, tmp_path):
-    """As an older version left it."""
+    """Older versions wrote no checksums."""
     folder = shutil.copytree(sound, tmp_path / "run")
     for path in folder.glob("*.sha256"):
         path.unlink()
@@ -183,11 +183,11 @@ def test_a_file_without_checksum_is_read(sound, tmp_path):
         {"command": ["rps", "sweep"], "time": "now"}
     ]
     (folder / "results.nc").write_bytes(b"torn")
-    in_one_sentence(folder / "results.nc", files.read_results, folder)
+    reports_corruption(folder / "results.nc", files.read_results, folder)
 
 
 def test_a_part_is_named_by_its_number_and_digest(tmp_path):
-    """As every version names it, so that a sweep goes on that another version began."""
+    """The name is stable, so that a sweep of another version can be resumed."""
     content = files.encode_results(RESULTS.assign_attrs(part="0000012"))
     digest = hashlib.sha256(content).hexdigest()[:16]
     (tmp_path / "parts").mkdir()
@@ -217,19 +217,19 @@ def test_sha256sum_checks_what_was_written(sound):
 
 
 class Killed(BaseException):
-    """What nothing catches."""
+    """Simulated SIGKILL, which no `except Exception` catches."""
 
 
 def killed_everywhere(monkeypatch, act, check):
-    """Act, and be killed before the first, the second, ... of its calls that change a disk."""
+    """Call `act`, killed before its first, second, ... call that changes the disk."""
     owners = ((os, "replace"), (os, "fsync"), (Path, "unlink"), (Path, "write_bytes"))
     for kill in range(100):
-        left = [kill]
+        calls_left = [kill]
 
-        def dies(call, left=left):
+        def dies(call, calls_left=calls_left):
             def called(*arguments, **options):
-                left[0] -= 1
-                if left[0] < 0:
+                calls_left[0] -= 1
+                if calls_left[0] < 0:
                     raise Killed
                 return call(*arguments, **options)
 
@@ -249,10 +249,10 @@ def killed_everywhere(monkeypatch, act, check):
 
 
 def test_a_write_killed_at_any_moment_leaves_the_old_file_or_the_new(tmp_path, monkeypatch):
-    path, seen = tmp_path / "results.nc", set()
+    path, contents = tmp_path / "results.nc", set()
 
     def check():
-        seen.add(files.read_checked(path))
+        contents.add(files.read_checked(path))
         if files.checksum_path(path).exists():
             stated = files.checksum_path(path).read_text().split()[0]
             assert stated == hashlib.sha256(path.read_bytes()).hexdigest()
@@ -261,27 +261,27 @@ def test_a_write_killed_at_any_moment_leaves_the_old_file_or_the_new(tmp_path, m
     files.write_bytes(path, b"old", checked=True)
     write = lambda: files.write_bytes(path, b"new", checked=True)  # noqa: E731
     assert killed_everywhere(monkeypatch, write, check) > 6
-    assert seen == {b"old", b"new"}
+    assert contents == {b"old", b"new"}
     assert files.checksum_path(path).exists()
 
 
-def test_a_part_that_is_replaced_is_the_old_one_or_the_new(tmp_path, monkeypatch):
+def test_a_killed_replacement_leaves_the_old_or_the_new_part(tmp_path, monkeypatch):
     """Whenever the process is killed."""
-    parts, seen = Checkpoints(tmp_path), set()
+    parts, contents = Checkpoints(tmp_path), set()
 
     def check():
-        seen.add(parts.get("state"))
+        contents.add(parts.get("state"))
         parts.put("state", state(1), ".npz")
 
     parts.put("state", state(1), ".npz")
     parts.put("state-of-another", b"other")
     put = lambda: parts.put("state", state(2), ".npz")  # noqa: E731
     assert killed_everywhere(monkeypatch, put, check) > 3
-    assert seen == {state(1), state(2)}
+    assert contents == {state(1), state(2)}
     assert len(list(parts.folder.glob("[!.]*"))) == 2
 
 
-def test_of_two_files_of_a_part_the_newer_counts_if_it_is_sound(tmp_path):
+def test_the_newest_valid_file_of_a_part_is_read(tmp_path):
     parts = Checkpoints(tmp_path)
     for age, content in ((100, b"old"), (0, b"new")):
         path = parts.put("state", content, new=True)
@@ -294,9 +294,9 @@ def test_of_two_files_of_a_part_the_newer_counts_if_it_is_sound(tmp_path):
 # --- one at a time -------------------------------------------------------------------------
 
 
-def refused(folder, number=1, of=1):
+def refused(folder, shard=1, num_shards=1):
     with pytest.raises(InputError, match="in use by another process"):
-        run_folder.lock(folder, number, of).__enter__()
+        run_folder.lock(folder, shard, num_shards).__enter__()
 
 
 def test_two_processes_may_not_share_a_run_but_may_share_its_shards(tmp_path):
@@ -324,48 +324,57 @@ with run_folder.lock(Path(sys.argv[1])):
 """
 
 
-def test_a_killed_process_holds_nothing_and_the_record_needs_no_jax(tmp_path):
+def test_a_killed_process_releases_its_lock_and_the_record_needs_no_jax(tmp_path):
     command = [sys.executable, "-c", _HOLDER, str(tmp_path)]
-    with subprocess.Popen(command, cwd=ROOT, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as one:
-        assert one.stdout.readline() == b"held\n"
+    with subprocess.Popen(
+        command, cwd=ROOT, stdin=subprocess.PIPE, stdout=subprocess.PIPE
+    ) as holder:
+        assert holder.stdout.readline() == b"held\n"
         refused(tmp_path)
-        one.kill()
-        one.wait()
+        holder.kill()
+        holder.wait()
         with run_folder.lock(tmp_path):
             pass
 
 
-def test_of_those_that_begin_a_run_at_once_all_agree_or_are_refused(tmp_path):
-    """Threads, whose file locks are as much each one's own as those of processes."""
+def test_concurrent_starts_of_a_run_agree_or_are_refused(tmp_path):
+    """Threads have separate file locks, as processes do."""
     together = threading.Barrier(8)
 
-    def begin(number):
-        wanted = {"worlds": number % 2}
+    def start_run(index):
+        manifest = {"worlds": index % 2}
         together.wait()
         try:
-            run_folder.claim(tmp_path, wanted)
+            run_folder.claim(tmp_path, manifest)
         except InputError as error:
             return str(error)
-        provenance.write_environment(tmp_path, {"time": number})
-        return wanted
+        provenance.write_environment(tmp_path, {"time": index})
+        return manifest
 
     with ThreadPoolExecutor(8) as pool:
-        told = list(pool.map(begin, range(8)))
-    kept = run_folder.read_manifest(tmp_path)
-    assert sorted(t == kept for t in told) == [False] * 4 + [True] * 4
-    assert all("holds another run" in t for t in told if t != kept)
+        answers = list(pool.map(start_run, range(8)))
+    stored = run_folder.read_manifest(tmp_path)
+    assert sorted(answer == stored for answer in answers) == [False] * 4 + [True] * 4
+    assert all("holds another run" in answer for answer in answers if answer != stored)
     assert provenance.read_environment(tmp_path)["time"] in range(8)
 
 
-def test_what_a_run_was_made_on_before_is_not_forgotten(tmp_path):
-    this = device.collect_environment()
-    there = this | {"commit": "abc", "device": this["device"] | {"kind": "H200"}, "time": "then"}
-    provenance.write_environment(tmp_path, there)
-    provenance.write_environment(tmp_path, this)
-    provenance.write_environment(tmp_path, this | {"processors": 99})  # of a cluster that grows
-    provenance.write_environment(tmp_path, this)
-    provenance.write_environment(tmp_path, this | {"time": "later"})  # the same command again
-    assert provenance.read_environment(tmp_path) == this | {"time": "later", "before": [there]}
+def test_previous_environments_of_a_run_are_kept(tmp_path):
+    current = device.collect_environment()
+    previous = current | {
+        "commit": "abc",
+        "device": current["device"] | {"kind": "H200"},
+        "time": "then",
+    }
+    provenance.write_environment(tmp_path, previous)
+    provenance.write_environment(tmp_path, current)
+    provenance.write_environment(tmp_path, current | {"processors": 99})  # of a cluster that grows
+    provenance.write_environment(tmp_path, current)
+    provenance.write_environment(tmp_path, current | {"time": "later"})  # the same command again
+    assert provenance.read_environment(tmp_path) == current | {
+        "time": "later",
+        "before": [previous],
+    }
     text = provenance.describe(tmp_path)
     assert text.index("later") < text.index("before that by") < text.index("commit abc, then, on H")
     (tmp_path / provenance.ENVIRONMENT).write_text("{}")
@@ -373,8 +382,8 @@ def test_what_a_run_was_made_on_before_is_not_forgotten(tmp_path):
         provenance.describe(tmp_path)
 
 
-def test_names_that_are_no_utf8_keep_their_bytes(tmp_path):
-    """As in the C locale, where Python reads a snowman in a path as three lone surrogates."""
+def test_paths_that_are_not_utf8_keep_their_bytes(tmp_path):
+    """Python reads a snowman in a path as three lone surrogates in the C locale."""
     name = "\N{SNOWMAN}".encode().decode("ascii", errors="surrogateescape")
     path = files.write_text(tmp_path / "report.md", f"run folder: {name}")
     assert path.read_bytes() == "run folder: \N{SNOWMAN}".encode()

@@ -54,8 +54,8 @@ def binary(tmp_path_factory):
     (folder / "driver.cpp").write_text(DRIVER)
     include = ["-I", str(folder), "-I", str(FOLDER / "include")]
     warned = ["-std=c++17", "-O1", "-Wall", "-Wextra", "-Werror", "-fsanitize=address,undefined"]
-    made = [str(folder / "driver.cpp"), "-o", str(folder / "driver")]
-    subprocess.run(["g++", *warned, *include, *made], check=True)
+    sources = [str(folder / "driver.cpp"), "-o", str(folder / "driver")]
+    subprocess.run(["g++", *warned, *include, *sources], check=True)
     return folder / "driver"
 
 
@@ -66,76 +66,78 @@ def python():
 
 @pytest.fixture(params=["c++", "python"])
 def driven(request):
-    """Commands (n, 3) and statuses of a controller that hears events, one at each tick."""
+    """Function from events to the commands (n, 3) and statuses of a controller, one per tick."""
     if request.param == "c++":
         request.getfixturevalue("binary")
 
     def in_python(events):
-        controller, found = request.getfixturevalue("python"), []
+        controller, commands = request.getfixturevalue("python"), []
         controller.reset()
-        for what, *numbers in events:
-            if what == "skin":
-                controller.skin(numbers[0], numbers[1:])
-            elif (command := getattr(controller, what)(*numbers)) is not None:
-                found.append(command)
-        return np.array([one[:3] for one in found]), [one.status for one in found]
+        for topic, *values in events:
+            if topic == "skin":
+                controller.skin(values[0], values[1:])
+            elif (command := getattr(controller, topic)(*values)) is not None:
+                commands.append(command)
+        return np.array([command[:3] for command in commands]), [
+            command.status for command in commands
+        ]
 
     def in_cpp(events):
-        text = "".join(f"{what} {' '.join(map(repr, map(float, x)))}\n" for what, *x in events)
+        text = "".join(f"{topic} {' '.join(map(repr, map(float, x)))}\n" for topic, *x in events)
         run = [str(request.getfixturevalue("binary"))]
-        said = subprocess.run(run, input=text, capture_output=True, text=True, check=True).stdout
-        rows = [line.split(" ", 3) for line in said.splitlines()]
+        output = subprocess.run(run, input=text, capture_output=True, text=True, check=True).stdout
+        rows = [line.split(" ", 3) for line in output.splitlines()]
         return np.array([row[:3] for row in rows], float), [row[3] for row in rows]
 
     return in_cpp if request.param == "c++" else in_python
 
 
 def events(seconds=2.0, silent="", since=1.0, odd=None, taxels=FELT):
-    """What a robot hears that stands still before an object, 50 times a second."""
+    """Yield the inputs of a robot at rest in front of an object, at 50 Hz."""
     for i in range(round(seconds / 0.02)):
-        now = 0.02 * (i + 1)
-        heard = {"odometry": [0, 0, 0], "target": [-2, 0.5], "skin": list(taxels)}
-        for name, numbers in heard.items():
-            if name == silent and now > since:
+        time = 0.02 * (i + 1)
+        messages = {"odometry": [0, 0, 0], "target": [-2, 0.5], "skin": list(taxels)}
+        for name, values in messages.items():
+            if name == silent and time > since:
                 if odd is None:
                     continue
-                numbers[0] = odd
-            yield (name, now, *numbers)
-        yield ("tick", now + 0.005)
+                values[0] = odd
+            yield (name, time, *values)
+        yield ("tick", time + 0.005)
 
 
 def test_it_pushes_within_the_limits_of_speed_and_acceleration(driven):
-    twists, said = driven(events())
-    assert set(said) == {"pushing"}
+    twists, statuses = driven(events())
+    assert set(statuses) == {"pushing"}
     assert np.hypot(twists[-1, 0], twists[-1, 1]) == pytest.approx(0.05, rel=1e-3)
     assert np.hypot(*twists[:, :2].T).max() <= 0.05 + 1e-9
     assert np.abs(twists[:, 2]).max() <= 0.15 + 1e-9
     change = np.diff(np.concatenate([np.zeros((1, 3)), twists]), axis=0)
     assert np.hypot(*change[:, :2].T).max() <= 0.5 * 0.02 + 1e-9
     assert np.abs(change[:, 2]).max() <= 1.0 * 0.02 + 1e-9
-    assert np.hypot(*change[1, :2]) > 0.009  # it was held back
+    assert np.hypot(*change[1, :2]) > 0.009  # limited by the acceleration
 
 
 @pytest.mark.parametrize("silent", ["odometry", "target", "skin"])
 @pytest.mark.parametrize("odd", [None, float("nan"), float("inf")])
 def test_silence_of_any_input_commands_zero_within_100_ms(driven, silent, odd):
-    twists, said = driven(events(silent=silent, odd=odd))
+    twists, statuses = driven(events(silent=silent, odd=odd))
     times = 0.02 * np.arange(1, len(twists) + 1) + 0.005
     assert (np.abs(twists[(times > 0.5) & (times < 1.0)]).sum(-1) > 0.01).all()
     assert not twists[times > 1.0 + 0.1].any()
     words = {"odometry": "odometry", "target": "a target", "skin": "taxels"}[silent]
-    assert said[-1] == f"waiting for {words}"
+    assert statuses[-1] == f"waiting for {words}"
 
 
-def test_it_waits_for_all_and_starts_again_after_silence(driven):
-    some = [one for one in events(1.0) if one[0] != "target"]
-    twists, said = driven(some)
+def test_it_waits_for_all_inputs_and_resumes_after_silence(driven):
+    no_target = [event for event in events(1.0) if event[0] != "target"]
+    twists, statuses = driven(no_target)
     assert not twists.any()
-    assert set(said) == {"waiting for a target"}
-    gap = [one for one in events(3.0) if one[0] != "skin" or not 1.0 < one[1] < 2.0]
-    twists, said = driven(gap)
-    assert said[60] == "waiting for taxels"
-    assert said[-1] == "pushing"
+    assert set(statuses) == {"waiting for a target"}
+    skin_gap = [event for event in events(3.0) if event[0] != "skin" or not 1.0 < event[1] < 2.0]
+    twists, statuses = driven(skin_gap)
+    assert statuses[60] == "waiting for taxels"
+    assert statuses[-1] == "pushing"
     assert np.abs(twists[-1]).sum() > 0.01
 
 
@@ -143,40 +145,40 @@ def test_a_skin_of_another_size_is_silent(driven):
     assert set(driven(events(0.5, taxels=FELT[:41]))[1]) == {"waiting for taxels"}
 
 
-def test_a_clock_that_stands_still_commands_zero(driven):
-    twists, said = driven([*events(0.5), ("tick", 0.505)])
-    assert said[-1] == "the clock does not advance"
+def test_a_stopped_clock_commands_zero(driven):
+    twists, statuses = driven([*events(0.5), ("tick", 0.505)])
+    assert statuses[-1] == "the clock does not advance"
     assert not twists[-1].any()
 
 
-def test_a_recorded_bag_drives_both_alike(binary, tmp_path, request, python):
+def test_cpp_and_python_agree_on_a_recorded_bag(binary, tmp_path, request, python):
     pytest.importorskip("mcap_ros2")
     path = tmp_path / "push.mcap"
     setting = rps_jax.Setting("quasistatic", rules=rps_jax.Rules(horizon=10.0))
     push("box", target=(-1.0, 0.5), law="rps_plus", bag=path, setting=setting)
     read = bag.read(path)
-    heard = []
-    for i, now in enumerate(read["time"]):
-        heard += [("odometry", now, *read["pose"][i]), ("target", now, *read["target"][i])]
-        heard += [("skin", now, *read["signal"][i]), ("tick", now)]
-    text = "".join(f"{what} {' '.join(map(repr, map(float, x)))}\n" for what, *x in heard)
-    said = subprocess.run([str(binary)], input=text, capture_output=True, text=True, check=True)
-    cpp = np.array([line.split(" ")[:3] for line in said.stdout.splitlines()], float)
+    messages = []
+    for i, time in enumerate(read["time"]):
+        messages += [("odometry", time, *read["pose"][i]), ("target", time, *read["target"][i])]
+        messages += [("skin", time, *read["signal"][i]), ("tick", time)]
+    text = "".join(f"{topic} {' '.join(map(repr, map(float, x)))}\n" for topic, *x in messages)
+    done = subprocess.run([str(binary)], input=text, capture_output=True, text=True, check=True)
+    cpp = np.array([line.split(" ")[:3] for line in done.stdout.splitlines()], float)
     python.reset()
-    mine = []
-    for what, now, *numbers in heard:
-        if what == "skin":
-            python.skin(now, numbers)
-        elif (command := getattr(python, what)(now, *numbers)) is not None:
-            mine.append(command[:3])
-    apart = np.abs(cpp - np.array(mine)).max(-1)
-    assert np.mean(apart > 1e-5) < 0.01
+    python_twists = []
+    for topic, time, *values in messages:
+        if topic == "skin":
+            python.skin(time, values)
+        elif (command := getattr(python, topic)(time, *values)) is not None:
+            python_twists.append(command[:3])
+    difference = np.abs(cpp - np.array(python_twists)).max(-1)
+    assert np.mean(difference > 1e-5) < 0.01
     # The bag's law felt contact at once, and these through foam, a filter and bounds.
     near = np.abs(cpp - read["twist"])[:, :2].max(-1)
     assert np.mean(near < 0.02) > 0.8
 
 
-# --- what could not be run is at least consistent ------------------------------------------
+# --- consistency of the nodes, which need ROS to run ---------------------------------------
 
 
 def test_the_nodes_name_the_same_topics_and_parameters():
@@ -188,19 +190,23 @@ def test_the_nodes_name_the_same_topics_and_parameters():
         assert f'"{topic}"' in text
     ranges = dict(re.findall(r'number\("(\w+)", "[^"]*", ([\d., ]+)\)', cpp))
     declared = runpy_parameters(text)
-    for name, (about, least, most) in declared.items():
-        usual = getattr(PYTHON["Limits"](), name)
-        assert ranges[name].split(", ") == [str(x) for x in (usual, least, most)]
+    for name, (about, smallest, largest) in declared.items():
+        default = getattr(PYTHON["Limits"](), name)
+        assert ranges[name].split(", ") == [str(x) for x in (default, smallest, largest)]
         assert about in cpp
-    usual = dict(
+    defaults = dict(
         re.findall(r"^    (\w+): ([\d.]+)", (FOLDER / "config/push.yaml").read_text(), re.M)
     )
-    assert {name: float(x) for name, x in usual.items()} == vars(PYTHON["Limits"]())
-    assert set(declared) == set(usual)
+    assert {name: float(x) for name, x in defaults.items()} == vars(PYTHON["Limits"]())
+    assert set(declared) == set(defaults)
     package = ET.parse(FOLDER / "package.xml").getroot()
-    needed = {one.text for one in package.findall("depend")}
-    found = re.findall(r"find_package\((\w+) REQUIRED\)", (FOLDER / "CMakeLists.txt").read_text())
-    assert needed == {one for one in found if not one.startswith("ament")}
+    needed = {package_name.text for package_name in package.findall("depend")}
+    required = re.findall(
+        r"find_package\((\w+) REQUIRED\)", (FOLDER / "CMakeLists.txt").read_text()
+    )
+    assert needed == {
+        package_name for package_name in required if not package_name.startswith("ament")
+    }
 
 
 def runpy_parameters(text):
