@@ -627,7 +627,7 @@ def plus_moments(count=40):
 
 
 def test_without_heat_smooth_rps_plus_is_the_hard_one(monkeypatch):
-    for name in ("_WARM_FACING", "_WARM_LOST"):
+    for name in ("_FACING_WIDTH", "_LOST_WIDTH"):
         monkeypatch.setattr(rps_plus, name, 1e-6)
     params = RPSPlusParams(n_lost=2.5)  # a count meets no threshold that is a count
     hard, cold = registry.law_of(params), registry.smooth_law(rps_plus.LAW, COLD)
@@ -670,6 +670,6 @@ def test_only_rps_and_rps_plus_have_a_smooth_form():
     smooth = [registry.smooth_law(law) for law in (rps.LAW, rps_plus.LAW)]
     assert [law.smooth for law in smooth] == [True, True]
     assert smooth[0] != smooth[1]
-    words = "this law has no smooth form .*: choose rps, rps_tuned, nps, rps_plus"
+    words = "this law has no smooth form.*: choose rps, rps_tuned, nps, rps_plus"
     with pytest.raises(errors.InputError, match=words):
         registry.smooth_law(registry.law_of(PursuitParams()))
