@@ -1,4 +1,4 @@
-"""Bags: what is written is ROS 2 to others, gives every twist back, and odd files are refused."""
+"""Bags: valid ROS 2 files, exact replay of every twist, and refusal of invalid files."""
 
 import json
 import struct
@@ -34,20 +34,20 @@ def test_simulation_to_bag_to_law_gives_every_twist_back(law, tmp_path, recorded
     if law != "rps_plus":
         path = tmp_path / "push.mcap"
         push("cylinder", target=(-1.0, 0.5), law=law, bag=path, setting=BRIEF)
-    found = shadow(path, law)
-    assert found.sizes == {"source": 2, "time": 301}
+    results = shadow(path, law)
+    assert results.sizes == {"source": 2, "time": 301}
     for name in ("v_x", "v_y", "omega"):
-        np.testing.assert_allclose(found[name][1], found[name][0], atol=1e-6)
-    assert float(np.abs(found.v_x).max()) > 0.005
+        np.testing.assert_allclose(results[name][1], results[name][0], atol=1e-6)
+    assert float(np.abs(results.v_x).max()) > 0.005
 
 
 def test_a_law_that_senses_force_gives_its_twists_back(tmp_path):
     path = tmp_path / "push.mcap"
     setting = rps_jax.Setting("fused", rules=rps_jax.Rules(horizon=10.0))
     push("box", target=(1.5, 0.2), law="force_push_published", bag=path, setting=setting)
-    found = shadow(path, "force_push_published")
+    results = shadow(path, "force_push_published")
     for name in ("v_x", "v_y", "omega"):
-        np.testing.assert_allclose(found[name][1], found[name][0], atol=1e-6)
+        np.testing.assert_allclose(results[name][1], results[name][0], atol=1e-6)
     assert np.abs(bag.read(path)["f_robot"]).max() > 1
 
 
@@ -55,34 +55,34 @@ def test_a_law_that_senses_force_gives_its_twists_back(tmp_path):
 def test_a_law_that_observes_its_last_twist_gives_its_twists_back(tmp_path, law):
     path = tmp_path / "push.mcap"
     push("cylinder", target=(-1.0, 0.5), law=law, bag=path, setting=BRIEF)
-    found = shadow(path, law)
+    results = shadow(path, law)
     for name in ("v_x", "v_y", "omega"):
-        np.testing.assert_allclose(found[name][1], found[name][0], atol=1e-6)
-    assert float(np.abs(found.v_x).max()) > 0.005
+        np.testing.assert_allclose(results[name][1], results[name][0], atol=1e-6)
+    assert float(np.abs(results.v_x).max()) > 0.005
 
 
 def test_a_bag_does_not_change_the_trial(recorded):
     path, trace = recorded
-    other = push("cylinder", target=(-1.0, 0.5), law="rps_plus", setting=BRIEF)
-    np.testing.assert_array_equal(trace.data.time, other.data.time)
+    without_bag = push("cylinder", target=(-1.0, 0.5), law="rps_plus", setting=BRIEF)
+    np.testing.assert_array_equal(trace.data.time, without_bag.data.time)
     for name in ("v_x", "l", "distance"):
-        np.testing.assert_allclose(trace.data[name], other.data[name], atol=1e-5)
+        np.testing.assert_allclose(trace.data[name], without_bag.data[name], atol=1e-5)
     read = bag.read(path)
     np.testing.assert_allclose(read["twist"][::5, 0], trace.data.v_x, atol=1e-7)
 
 
 def test_another_law_commands_otherwise(recorded):
-    found = shadow(recorded[0], "rps_plus,law.v_approach=0.02")
-    assert float(np.abs(found.v_x[1] - found.v_x[0]).max()) == pytest.approx(0.01, abs=1e-4)
+    results = shadow(recorded[0], "rps_plus,law.v_approach=0.02")
+    assert float(np.abs(results.v_x[1] - results.v_x[0]).max()) == pytest.approx(0.01, abs=1e-4)
 
 
-def test_a_reader_that_we_did_not_write_opens_the_bag(recorded):
+def test_a_third_party_reader_opens_the_bag(recorded):
     highlevel = pytest.importorskip("rosbags.highlevel")
     from rosbags.typesys import Stores, get_typestore
 
     path, trace = recorded
     with highlevel.AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as bags:
-        kinds = {one.topic: one.msgtype for one in bags.connections}
+        kinds = {connection.topic: connection.msgtype for connection in bags.connections}
         assert kinds["/odom"] == "nav_msgs/msg/Odometry"
         assert kinds["/cmd_vel"] == "geometry_msgs/msg/TwistStamped"
         assert kinds["/tf"] == "tf2_msgs/msg/TFMessage"
@@ -108,34 +108,34 @@ def test_the_commands_write_and_shadow_a_bag(tmp_path, capsys, recorded):
     mine.write_text(json.dumps({"d_near": 0.3}))
     out = tmp_path / "shadow"
     assert rps("shadow", path, "--law", f"rps_plus,{mine}", "--out", out) == 0
-    said = capsys.readouterr().out
-    assert "151 commands in 3.0 s" in said
-    assert "omega [rad/s]" in said
+    output = capsys.readouterr().out
+    assert "151 commands in 3.0 s" in output
+    assert "omega [rad/s]" in output
     assert (out / "shadow.png").exists()
 
 
-# --- files that are none -------------------------------------------------------------------
+# --- invalid files -------------------------------------------------------------------------
 
 
 def steps(count=3, **changes):
-    one = Step(0.0, (0, 0, 0), (1, 0), 1, (0.36, 0), (0.05, 0, 0))._replace(**changes)
-    return [one._replace(time=0.02 * i) for i in range(count)]
+    step = Step(0.0, (0, 0, 0), (1, 0), 1, (0.36, 0), (0.05, 0, 0))._replace(**changes)
+    return [step._replace(time=0.02 * i) for i in range(count)]
 
 
-def said_of(path):
+def error_of(path):
     with pytest.raises(rps_jax.InputError) as error:
         bag.read(path)
     assert str(error.value).count("\n") == 0
     return str(error.value)
 
 
-def test_what_a_bag_keeps(tmp_path):
-    rows = [one._replace(pose=(1, 2, 2.5 * i)) for i, one in enumerate(steps(4, contact_type=2))]
-    found = bag.read(bag.write(tmp_path / "a.mcap", rows, {}))
-    np.testing.assert_allclose(found["pose"], [[1, 2, 2.5 * i] for i in range(4)], atol=1e-12)
-    np.testing.assert_allclose(found["period"], 0.02, atol=1e-9)
-    assert found["contact_type"].tolist() == [2] * 4
-    assert "signal" not in found
+def test_a_bag_stores_pose_period_and_contact(tmp_path):
+    rows = [step._replace(pose=(1, 2, 2.5 * i)) for i, step in enumerate(steps(4, contact_type=2))]
+    columns = bag.read(bag.write(tmp_path / "a.mcap", rows, {}))
+    np.testing.assert_allclose(columns["pose"], [[1, 2, 2.5 * i] for i in range(4)], atol=1e-12)
+    np.testing.assert_allclose(columns["period"], 0.02, atol=1e-9)
+    assert columns["contact_type"].tolist() == [2] * 4
+    assert "signal" not in columns
 
 
 def test_odd_files_are_refused_in_one_sentence(tmp_path, recorded):
@@ -143,18 +143,18 @@ def test_odd_files_are_refused_in_one_sentence(tmp_path, recorded):
     path = tmp_path / "odd.mcap"
     for odd in (b"", b"no bag", content[: len(content) // 2], content[:8] + content[200:]):
         path.write_bytes(odd)
-        assert "odd.mcap" in said_of(path)
-    assert "cannot be read" in said_of(tmp_path)  # a folder
+        assert "odd.mcap" in error_of(path)
+    assert "cannot be read" in error_of(tmp_path)  # a folder
     bag.write(path, steps(1), {})
-    assert "at least two" in said_of(path)
+    assert "at least two" in error_of(path)
     bag.write(path, steps(pose=(float("nan"), 0, 0)), {})
-    assert "pose is not finite" in said_of(path)
+    assert "pose is not finite" in error_of(path)
     bag.write(path, [], {})
-    assert "no messages on /odom, /target, /cmd_vel, /contact or /taxels" in said_of(path)
+    assert "no messages on /odom, /target, /cmd_vel, /contact or /taxels" in error_of(path)
 
 
 def test_damage_anywhere_is_refused_or_read(tmp_path):
-    """Any error of a reader becomes one sentence."""
+    """Any error of a reader becomes a single-sentence error."""
     whole = bag.write(tmp_path / "a.mcap", steps(30), {}).read_bytes()
     rng, path, refused = np.random.default_rng(0), tmp_path / "b.mcap", 0
     for _ in range(150):
@@ -170,56 +170,56 @@ def test_damage_anywhere_is_refused_or_read(tmp_path):
 
 
 def without_contacts(path, steps, monkeypatch):
-    """A bag as a robot records it: taxels as its skin answers, and no contacts."""
+    """Write a bag as a robot records it, with unfiltered taxels and no contacts."""
     whole = bag._messages
     monkeypatch.setattr(bag, "_messages", lambda s: (m for m in whole(s) if m[0] != "/contact"))
-    found = bag.write(path, steps, {})
+    written = bag.write(path, steps, {})
     monkeypatch.undo()
-    return found
+    return written
 
 
 def test_the_skin_feels_the_taxels_of_a_bag_without_contacts(tmp_path, capsys, monkeypatch):
-    """It filters them: of a taxel at 0.4, (1 - exp(-t / 50 ms)) 0.4 > 0.25 from the third on."""
+    """The skin filters a taxel at 0.4: (1 - exp(-t / 50 ms)) 0.4 > 0.25 from the third step."""
     signal = np.zeros(42)
     signal[20] = 0.4
     path = without_contacts(tmp_path / "a.mcap", steps(9, signal=signal), monkeypatch)
     assert "contact_type" not in bag.read(path)
-    found = with_contacts(bag.read(path), Robot().shell, "bag")
-    assert found["contact_type"].tolist() == [0, 0] + [1] * 7
-    place = [0.3625, 0.29 - 0.58 * 5.5 / 12]  # the sixth of the front's twelve
-    np.testing.assert_allclose(found["p_robot_contact"][2:], [place] * 7, atol=1e-6)
-    np.testing.assert_allclose(found["signal"][1, 20], 0.4 * (1 - np.exp(-0.8)), rtol=1e-5)
+    columns = with_contacts(bag.read(path), Robot().shell, "bag")
+    assert columns["contact_type"].tolist() == [0, 0] + [1] * 7
+    p_robot_contact = [0.3625, 0.29 - 0.58 * 5.5 / 12]  # the sixth of the front's twelve
+    np.testing.assert_allclose(columns["p_robot_contact"][2:], [p_robot_contact] * 7, atol=1e-6)
+    np.testing.assert_allclose(columns["signal"][1, 20], 0.4 * (1 - np.exp(-0.8)), rtol=1e-5)
     twists = np.stack([shadow(path, "rps")[name][1] for name in ("v_x", "v_y", "omega")], -1)
-    touched = steps(9, signal=signal, p_robot_contact=place)
-    touched = [one._replace(contact_type=int(i > 1)) for i, one in enumerate(touched)]
+    touched = steps(9, signal=signal, p_robot_contact=p_robot_contact)
+    touched = [step._replace(contact_type=int(i > 1)) for i, step in enumerate(touched)]
     same = shadow(bag.write(tmp_path / "b.mcap", touched, {}), "rps")
     np.testing.assert_allclose(twists[:, 0], same.v_x[1], atol=1e-6)
     np.testing.assert_allclose(twists[:, 1], same.v_y[1], atol=1e-6)
-    said = refusal(capsys, "shadow", path, "--robot", "ridgeback", "--out", tmp_path / "run")
-    assert "has 42 taxels, and the robot 51: name the log's robot by --robot" in said
+    error = refusal(capsys, "shadow", path, "--robot", "ridgeback", "--out", tmp_path / "run")
+    assert "has 42 taxels, and the robot 51: name the log's robot by --robot" in error
 
 
 def test_steps_begin_with_the_first_contact(tmp_path, monkeypatch):
     signal, whole = np.zeros(42), bag._messages
     late = lambda s: (m for m in whole(s) if m[0] != "/contact" or m[1] > 0.05e9)  # noqa: E731
     monkeypatch.setattr(bag, "_messages", late)
-    found = bag.read(bag.write(tmp_path / "a.mcap", steps(6, signal=signal), {}))
-    np.testing.assert_allclose(found["time"], [0.06, 0.08, 0.1])
-    assert found["contact_type"].tolist() == [1, 1, 1]
+    columns = bag.read(bag.write(tmp_path / "a.mcap", steps(6, signal=signal), {}))
+    np.testing.assert_allclose(columns["time"], [0.06, 0.08, 0.1])
+    assert columns["contact_type"].tolist() == [1, 1, 1]
 
 
 def test_a_foreign_topic_of_another_type_is_named(tmp_path, monkeypatch):
     monkeypatch.setitem(bag.TOPICS, "/cmd_vel", "geometry_msgs/TwistStamped")
     path = bag.write(tmp_path / "a.mcap", steps(), {})
     monkeypatch.setitem(bag.TOPICS, "/target", "nav_msgs/Odometry")
-    assert "/target has geometry_msgs/msg/PointStamped for nav_msgs/Odometry" in said_of(path)
+    assert "/target has geometry_msgs/msg/PointStamped for nav_msgs/Odometry" in error_of(path)
 
 
 def record(opcode, content):
     return struct.pack("<BQ", opcode, len(content)) + content
 
 
-def test_what_is_huge_is_refused_before_it_is_unpacked(tmp_path, monkeypatch):
+def test_oversized_content_is_refused_before_decompression(tmp_path, monkeypatch):
     magic = bytes((137, 77, 67, 65, 80, 48, 13, 10))
     header = record(1, struct.pack("<I", 4) + b"ros2" + struct.pack("<I", 0))
     bomb = zstandard.compress(bytes(300 * 2**20), 19)
@@ -228,21 +228,21 @@ def test_what_is_huge_is_refused_before_it_is_unpacked(tmp_path, monkeypatch):
     path = tmp_path / "bomb.mcap"
     path.write_bytes(magic + header + chunk + magic)
     assert path.stat().st_size < 10**6
-    assert "bytes has another size" in said_of(path)
+    assert "bytes has another size" in error_of(path)
     path.write_bytes(magic + header + struct.pack("<BQ", 5, 2**40) + bytes(1000))
-    assert "bomb.mcap" in said_of(path)
+    assert "bomb.mcap" in error_of(path)
     monkeypatch.setattr(bag, "_MOST_NUMBERS", 2000)
     bag.read(bag.write(path, steps(12), {}))  # 12 times 11 numbers in 6 fields
-    many = steps(12, signal=np.zeros(500))
-    assert "more than 2000 numbers" in said_of(bag.write(path, many, {}))
+    rows = steps(12, signal=np.zeros(500))
+    assert "more than 2000 numbers" in error_of(bag.write(path, rows, {}))
 
 
-def test_what_a_bag_lacks_is_named(tmp_path, capsys, monkeypatch):
+def test_a_missing_column_is_named(tmp_path, capsys, monkeypatch):
     path = bag.write(tmp_path / "a.mcap", steps(), {})
-    for law, what in (("learned_mlp", "signal"), ("aps", "p_world_object")):
-        with pytest.raises(rps_jax.InputError, match=f"has no {what}, which the law senses"):
+    for law, column in (("learned_mlp", "signal"), ("aps", "p_world_object")):
+        with pytest.raises(rps_jax.InputError, match=f"has no {column}, which the law senses"):
             Shadow(path, law)()
     assert "give an MCAP file" in refusal(capsys, "shadow", tmp_path / "none.mcap")
     monkeypatch.setitem(sys.modules, "mcap_ros2.writer", None)
-    said = refusal(capsys, "push", "--bag", path, "--no-video", "--out", tmp_path / "push")
-    assert "pip install 'rps_jax[bags]'" in said
+    error = refusal(capsys, "push", "--bag", path, "--no-video", "--out", tmp_path / "push")
+    assert "pip install 'rps_jax[bags]'" in error

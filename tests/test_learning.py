@@ -41,13 +41,13 @@ def network_of(kind, **changes):
 
 
 def weights_of(network, seed=0):
-    """Weights by chance, none of them small."""
+    """Return random weights, none of them small."""
     drawn = networks.init_weights(network.shapes, jax.random.PRNGKey(seed))
     return {name: np.asarray(weight, np.float32) for name, weight in drawn.items()}
 
 
-def seen_at(seed, mirror=False):
-    """What is told at a moment by chance, or in its mirror image."""
+def random_obs(seed, mirror=False):
+    """Return a random observation, or its mirror image."""
     rng = np.random.default_rng(seed)
     side = np.array([1, -1 if mirror else 1])
     yaw, signal = rng.uniform(-3, 3), rng.uniform(0, 2, 42)
@@ -60,8 +60,8 @@ def seen_at(seed, mirror=False):
         0.02,
     )
     signal = signal[::-1] if mirror else signal
-    told = TaxelObservation(touch, signal, np.asarray(seed % 2 > 0))
-    return jax.tree.map(jnp.asarray, told)
+    obs = TaxelObservation(touch, signal, np.asarray(seed % 2 > 0))
+    return jax.tree.map(jnp.asarray, obs)
 
 
 # --- network -------------------------------------------------------------------------------
@@ -69,7 +69,7 @@ def seen_at(seed, mirror=False):
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_in_a_mirrored_world_the_law_does_the_mirrored_thing(kind):
-    """Whatever its weights, for as long as it goes on: also through what it remembers."""
+    """This holds for random weights and over several steps, including the memory."""
     network = network_of(kind)
     _, params = _registered(network)
     law = jax.jit(partial(networks.step, network, weights_of(network)))
@@ -77,11 +77,11 @@ def test_in_a_mirrored_world_the_law_does_the_mirrored_thing(kind):
     twists = []
     for seed in range(12):
         for i, mirror in enumerate((False, True)):
-            memories[i], twist, _ = law(params, memories[i], seen_at(seed, mirror))
+            memories[i], twist, _ = law(params, memories[i], random_obs(seed, mirror))
             twists.append(np.array(twist))
-    there, mirrored = np.array(twists).reshape(12, 2, 3).swapaxes(0, 1)
-    np.testing.assert_allclose(mirrored, there * [1, -1, -1], atol=1e-7)
-    assert np.abs(there[:, 1:]).max() > 1e-3  # it does turn
+    plain, mirrored = np.array(twists).reshape(12, 2, 3).swapaxes(0, 1)
+    np.testing.assert_allclose(mirrored, plain * [1, -1, -1], atol=1e-7)
+    assert np.abs(plain[:, 1:]).max() > 1e-3  # it does turn
 
 
 def test_an_action_is_held_and_bounded():
@@ -91,7 +91,7 @@ def test_an_action_is_held_and_bounded():
     law = jax.jit(partial(networks.step, network, weights))
     memory, twists = PolicyState.init(network), []
     for seed in range(20):
-        memory, twist, _ = law(params, memory, seen_at(seed))
+        memory, twist, _ = law(params, memory, random_obs(seed))
         twists.append(np.array(twist))
     twists = np.array(twists).reshape(4, 5, 3)
     np.testing.assert_array_equal(twists, twists[:, :1].repeat(5, axis=1))
@@ -102,33 +102,33 @@ def test_an_action_is_held_and_bounded():
 
 
 def test_a_contact_that_is_lost_is_remembered_where_it_was():
-    """By hand: touched at (1, 0.1) in the world; then the base is at (0.5, 0.1), turned left."""
-    touch = seen_at(1).touch._replace(
+    """Touch at (1, 0.1) in the world; then the base is at (0.5, 0.1), turned left."""
+    touch = random_obs(1).touch._replace(
         p_world_robot=jnp.array([0.6, 0.0]), yaw=jnp.zeros(()), in_contact=jnp.array(True),
         p_robot_contact=jnp.array([0.4, 0.1]), p_world_target=jnp.array([1.0, 1.1]),
     )  # fmt: skip
-    told = seen_at(1)._replace(touch=touch)
-    felt = TouchState.initial().update(told)
-    np.testing.assert_allclose(felt.p_robot_contact(told), [0.4, 0.1], atol=1e-6)
+    obs = random_obs(1)._replace(touch=touch)
+    felt = TouchState.initial().update(obs)
+    np.testing.assert_allclose(felt.p_robot_contact(obs), [0.4, 0.1], atol=1e-6)
     away = touch._replace(
         p_world_robot=jnp.array([0.5, 0.1]), yaw=jnp.array(np.pi / 2), in_contact=jnp.array(False)
     )
-    later = told._replace(touch=away)
+    later = obs._replace(touch=away)
     felt = felt.update(later)
     np.testing.assert_allclose(felt.p_robot_contact(later), [0.0, -0.5], atol=1e-6)
     assert float(felt.time_since_contact) == pytest.approx(0.02)
-    numbers = features.compute_features(felt, jnp.zeros(3), later)[42:]
-    # Not touched, no line, but once; where it was; 1 m to the target, which lies ahead of it.
-    np.testing.assert_allclose(numbers[:3], [0, 0, 1])
-    np.testing.assert_allclose(numbers[4:6], [0, -0.5 / 0.36], atol=1e-6)
-    np.testing.assert_allclose(numbers[6:9], [1, 0, np.log(20) / np.log(60)], atol=1e-6)
+    values = features.compute_features(felt, jnp.zeros(3), later)[42:]
+    # No contact now, no line, contact earlier; its position; 1 m to the target ahead of it.
+    np.testing.assert_allclose(values[:3], [0, 0, 1])
+    np.testing.assert_allclose(values[4:6], [0, -0.5 / 0.36], atol=1e-6)
+    np.testing.assert_allclose(values[6:9], [1, 0, np.log(20) / np.log(60)], atol=1e-6)
 
 
 # --- files ---------------------------------------------------------------------------------
 
 
 def _registered(network, seed=0):
-    """Name and parameters of a policy by chance, registered by its file."""
+    """Register a random policy; return its law name and parameters."""
     policy = Policy(network, weights_of(network, seed))
     label, _, params = policies.build_law(policy)
     return label, params
@@ -143,8 +143,8 @@ def written(path, kind="gru", **changes):
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_law_of_a_file_is_the_one_that_was_written(kind, tmp_path, registries):
     policy = written(tmp_path / "policy.npz", kind, learned={"how": "by chance"})
-    found = policies.decode((tmp_path / "policy.npz").read_bytes(), "policy.npz")
-    assert (found.network, found.task, found.learned) == (
+    loaded = policies.decode((tmp_path / "policy.npz").read_bytes(), "policy.npz")
+    assert (loaded.network, loaded.task, loaded.learned) == (
         policy.network,
         policy.task,
         policy.learned,
@@ -153,47 +153,47 @@ def test_a_law_of_a_file_is_the_one_that_was_written(kind, tmp_path, registries)
     assert name.startswith(f"learned_{kind}_")
     law = registry.law_of(params)
     assert law.senses == "taxels"
-    before = jax.jit(partial(networks.step, policy.network, policy.weights))
-    told = law.init(params), PolicyState.init(policy.network)
+    reference = jax.jit(partial(networks.step, policy.network, policy.weights))
+    memories = law.init(params), PolicyState.init(policy.network)
     for seed in range(12):
-        (mine, twist, _), (own, theirs, _) = (
-            step(params, memory, seen_at(seed))
-            for step, memory in zip((jax.jit(law.step), before), told, strict=True)
+        (law_memory, twist, _), (reference_memory, reference_twist, _) = (
+            step(params, memory, random_obs(seed))
+            for step, memory in zip((jax.jit(law.step), reference), memories, strict=True)
         )
-        np.testing.assert_array_equal(np.array(twist), np.array(theirs))
-        told = mine, own
+        np.testing.assert_array_equal(np.array(twist), np.array(reference_twist))
+        memories = law_memory, reference_memory
     again = registry.params_to_json(params)
     assert again["file"] == str(tmp_path / "policy.npz")
     assert registry.params_from_json(json.loads(json.dumps(again))) == params
 
 
 def damaged(content, **changes):
-    """The content with other arrays, and a digest that fits them unless one is given."""
+    """Return the archive with changed arrays and, by default, their digest."""
     with np.load(io.BytesIO(content), allow_pickle=False) as file:
         arrays = {name: file[name] for name in file.files}
     about = json.loads(str(arrays["about"])) | changes.pop("about", {})
     arrays |= {"about": np.array(json.dumps(about))} | changes
     arrays.pop("digest")
     digest = np.array(policies._digest(arrays))
-    other = io.BytesIO()
-    np.savez(other, digest=digest, **arrays)
-    return other.getvalue()
+    archive = io.BytesIO()
+    np.savez(archive, digest=digest, **arrays)
+    return archive.getvalue()
 
 
-def spoilt(content):
-    """One bit of a weight is another, in an archive that is sound."""
+def with_changed_bit(content):
+    """Return a valid archive with a changed weight and the old digest."""
     with np.load(io.BytesIO(content), allow_pickle=False) as file:
         arrays = {name: file[name] for name in file.files}
     arrays["action.b"] = arrays["action.b"] + np.float32(1e-3)
-    other = io.BytesIO()
-    np.savez(other, **arrays)
-    return other.getvalue()
+    archive = io.BytesIO()
+    np.savez(archive, **arrays)
+    return archive.getvalue()
 
 
 def pickled(content):
-    other = io.BytesIO()
-    np.savez(other, about=np.array([{"a": 1}], object), digest=np.array(""))
-    return other.getvalue()
+    archive = io.BytesIO()
+    np.savez(archive, about=np.array([{"a": 1}], object), digest=np.array(""))
+    return archive.getvalue()
 
 
 BAD = {
@@ -201,7 +201,7 @@ BAD = {
     "empty": (lambda c: b"", "it is no readable policy"),
     "text": (lambda c: b"hello", "it is no readable policy"),
     "pickled": (pickled, "it is no readable policy"),
-    "bit": (spoilt, "is corrupt: its digest does not match"),
+    "bit": (with_changed_bit, "is corrupt: its digest does not match"),
     "version": (partial(damaged, about={"version": 7}), "its version is 7"),
     "format": (partial(damaged, about={"format": "other"}), "its format is other"),
     "network": (
@@ -237,10 +237,10 @@ def test_a_file_that_is_no_policy_gets_one_sentence(name, tmp_path):
 
 def test_commands_refuse_bad_policies_before_anything_compiles(tmp_path, capsys, compiled):
     (tmp_path / "bad.npz").write_bytes(b"hello")
-    said = refusal(capsys, "ladder", "--laws", tmp_path / "bad.npz", "--out", tmp_path / "run")
-    assert "no readable policy" in said
-    said = refusal(capsys, "sweep", "--laws", tmp_path / "none.npz", "--out", tmp_path / "run")
-    assert "cannot be read (No such file or directory)" in said
+    error = refusal(capsys, "ladder", "--laws", tmp_path / "bad.npz", "--out", tmp_path / "run")
+    assert "no readable policy" in error
+    error = refusal(capsys, "sweep", "--laws", tmp_path / "none.npz", "--out", tmp_path / "run")
+    assert "cannot be read (No such file or directory)" in error
     for options, words in {
         "--domain wid": "did you mean 'wide'",
         "--domain paper": "skin of a domain to learn in 'ideal'",
@@ -264,8 +264,8 @@ def test_a_run_of_a_policy_needs_its_file_as_it_was(tmp_path, registries):
     setting = Setting("fused", fidelity="fast")
     open_run(tmp_path / "run", Plan(CYLINDERS, 4, {name: params}, setting))
     assert load_plan(tmp_path / "run").laws == {name: params}
-    other = Policy(network_of("gru"), weights_of(network_of("gru"), seed=1))
-    path.write_bytes(policies.encode(other))
+    new_policy = Policy(network_of("gru"), weights_of(network_of("gru"), seed=1))
+    path.write_bytes(policies.encode(new_policy))
     with pytest.raises(InputError, match="has changed since the run"):
         load_plan(tmp_path / "run")
 
@@ -274,7 +274,7 @@ def test_a_run_of_a_policy_needs_its_file_as_it_was(tmp_path, registries):
 
 
 def steps_of(reward, value, next_value, done, terminated):
-    """Transitions of one world, of which advantages need these (T,)."""
+    """Return transitions of one world with the columns (T,) that advantages need."""
     blank = jnp.zeros((len(reward), 1))
     columns = [jnp.asarray(x)[:, None] for x in (value, next_value, reward, done, terminated)]
     return Transition(blank, blank, blank > 0, blank, blank, *columns)
@@ -287,7 +287,7 @@ def test_advantages_by_hand():
     alone. delta_2 = 0 + 0.5 * 1 - 2 = -1.5, and A_2 = -1.5 + 0.25 * 5 = -0.25. delta_1 =
     1 + 0.5 * 2 - 1 = 1, and A_1 = 1 + 0.25 * -0.25 = 0.9375.
     """
-    found = ppo.advantages(
+    advantages = ppo.advantages(
         steps_of(
             [1.0, 0.0, 2.0, 1.0],
             [1.0, 2.0, 1.0, 3.0],
@@ -298,52 +298,54 @@ def test_advantages_by_hand():
         0.5,
         0.5,
     )
-    np.testing.assert_allclose(found[:, 0], [0.9375, -0.25, 5.0, -2.0])
+    np.testing.assert_allclose(advantages[:, 0], [0.9375, -0.25, 5.0, -2.0])
 
 
 def test_the_surrogate_is_that_of_the_paper():
     ratio, advantage = jnp.array([1.0, 1.5, 0.5, 1.5, 0.5]), jnp.array([2.0, 1.0, 1.0, -1.0, -1.0])
-    found = ppo.surrogate(ratio, advantage, 0.2)
-    np.testing.assert_allclose(found, [2.0, 1.2, 0.5, -1.5, -0.8], rtol=1e-6)
+    surrogate = ppo.surrogate(ratio, advantage, 0.2)
+    np.testing.assert_allclose(surrogate, [2.0, 1.2, 0.5, -1.5, -0.8], rtol=1e-6)
 
 
 def batch(network, state, seed=0, steps=5, worlds=4):
-    """Transitions by chance, as the policy would have made them."""
+    """Return random transitions with actions of the policy."""
     rng = np.random.default_rng(seed)
     size, extra = features.feature_count(network.taxels), ppo.PRIVATE_SIGNS.size
-    numbers = jnp.asarray(rng.normal(size=(steps, worlds, size)), jnp.float32)
+    obs = jnp.asarray(rng.normal(size=(steps, worlds, size)), jnp.float32)
     private = jnp.asarray(rng.normal(size=(steps, worlds, extra)), jnp.float32)
     fresh = jnp.asarray(rng.uniform(size=(steps, worlds)) < 0.2)
     hidden = jnp.asarray(rng.normal(size=network.initial_hidden((worlds,)).shape), jnp.float32)
     zero = jnp.zeros((steps, worlds))
-    some = Transition(
-        numbers, private, fresh, jnp.zeros((steps, worlds, 3)), *[zero] * 4, *[fresh] * 2
+    transitions = Transition(
+        obs, private, fresh, jnp.zeros((steps, worlds, 3)), *[zero] * 4, *[fresh] * 2
     )
-    mean = ppo.means(network, state.weights["actor"], hidden, some)
+    mean = ppo.means(network, state.weights["actor"], hidden, transitions)
     action = mean + 0.5 * jnp.asarray(rng.normal(size=mean.shape), mean.dtype)
     log_prob = ppo.log_prob(action, mean, state.weights["log_std"])
-    return hidden, some._replace(action=action, log_prob=log_prob)
+    return hidden, transitions._replace(action=action, log_prob=log_prob)
 
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_the_loss_of_the_policy_that_acted(kind):
     """Ratios are 1: the surrogate is the mean advantage, nothing is clipped, nothing diverges."""
-    how, network = PPO(network=kind, width=6, ent_coef=0.0), network_of(kind)
-    state = TrainState.init(how, network, jax.random.PRNGKey(0))
-    hidden, some = batch(network, state)
+    config, network = PPO(network=kind, width=6, ent_coef=0.0), network_of(kind)
+    state = TrainState.init(config, network, jax.random.PRNGKey(0))
+    hidden, transitions = batch(network, state)
     advantage = jnp.arange(20.0).reshape(5, 4)
-    value = networks.critic(state.weights["critic"], ppo.critic_inputs(some.obs, some.private))
-    found, kl = ppo.loss(how, network, state.weights, hidden, some, advantage, value + 2)
-    assert float(found) == pytest.approx(0.5 * 2**2 - 9.5, rel=1e-5)
+    value = networks.critic(
+        state.weights["critic"], ppo.critic_inputs(transitions.obs, transitions.private)
+    )
+    loss, kl = ppo.loss(config, network, state.weights, hidden, transitions, advantage, value + 2)
+    assert float(loss) == pytest.approx(0.5 * 2**2 - 9.5, rel=1e-5)
     assert float(kl) == pytest.approx(0, abs=1e-6)
 
     def policy_alone(weights):
-        return ppo.loss(how, network, weights, hidden, some, advantage, value)[0]
+        return ppo.loss(config, network, weights, hidden, transitions, advantage, value)[0]
 
     # So its slope is that of the policy gradient, sum of advantages times log probabilities.
     def gradient(weights):
-        mean = ppo.means(network, weights["actor"], hidden, some)
-        return -jnp.mean(advantage * ppo.log_prob(some.action, mean, weights["log_std"]))
+        mean = ppo.means(network, weights["actor"], hidden, transitions)
+        return -jnp.mean(advantage * ppo.log_prob(transitions.action, mean, weights["log_std"]))
 
     slope, expected = jax.grad(policy_alone)(state.weights), jax.grad(gradient)(state.weights)
     for name in network.shapes:
@@ -351,57 +353,59 @@ def test_the_loss_of_the_policy_that_acted(kind):
 
 
 def test_the_value_of_a_mirrored_world_is_the_same():
-    how, network = PPO(network="mlp", width=6), network_of("mlp")
-    state = TrainState.init(how, network, jax.random.PRNGKey(0))
-    _, some = batch(network, state)
-    mirrored = ppo.critic_inputs(features.mirror(some.obs), ppo.PRIVATE_SIGNS * some.private)
-    pairs = ppo.critic_inputs(some.obs, some.private)
-    here, there = (networks.critic(state.weights["critic"], x) for x in (pairs, mirrored))
-    np.testing.assert_allclose(here, there, atol=1e-6)
-    assert np.std(here) > 0.01
+    config, network = PPO(network="mlp", width=6), network_of("mlp")
+    state = TrainState.init(config, network, jax.random.PRNGKey(0))
+    _, transitions = batch(network, state)
+    mirrored = ppo.critic_inputs(
+        features.mirror(transitions.obs), ppo.PRIVATE_SIGNS * transitions.private
+    )
+    pairs = ppo.critic_inputs(transitions.obs, transitions.private)
+    value, mirrored_value = (networks.critic(state.weights["critic"], x) for x in (pairs, mirrored))
+    np.testing.assert_allclose(value, mirrored_value, atol=1e-6)
+    assert np.std(value) > 0.01
 
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_what_is_best_in_one_step_is_learned(kind):
-    """Each action is worth less the farther it is from one that depends on what is seen."""
-    how = PPO(
+    """The reward of an action falls with its distance to a function of the observation."""
+    config = PPO(
         network=kind, width=6, update_epochs=4, num_minibatches=2, ent_coef=0.0,
         learning_rate=3e-3, target_kl=0.02,
     )  # fmt: skip
     network = network_of(kind)
-    state = TrainState.init(how, network, jax.random.PRNGKey(0))
+    state = TrainState.init(config, network, jax.random.PRNGKey(0))
 
-    def best(numbers):
-        ahead, left = 0.8 * jnp.sign(numbers[..., 0] + numbers[..., 41]), numbers[..., 47]
-        return jnp.stack([ahead, 0.5 * jnp.sign(left), 0 * left], axis=-1)
+    def best(obs):
+        forward, lateral = 0.8 * jnp.sign(obs[..., 0] + obs[..., 41]), obs[..., 47]
+        return jnp.stack([forward, 0.5 * jnp.sign(lateral), 0 * lateral], axis=-1)
 
     @jax.jit
-    def on(state, key):
+    def update(state, key):
         key_seen, key_act, key_pass = jax.random.split(key, 3)
         shape = (4, 64, features.feature_count(network.taxels))
-        numbers = (
+        obs = (
             jnp.zeros(shape).at[..., [0, 41, 47]].set(jax.random.normal(key_seen, (*shape[:2], 3)))
         )
         yes = jnp.ones(shape[:2], bool)
         blank = jnp.zeros((*shape[:2], ppo.PRIVATE_SIGNS.size))
         zero = jnp.zeros(shape[:2])
         hidden = network.initial_hidden((64,))
-        some = Transition(numbers, blank, yes, jnp.zeros((4, 64, 3)), *[zero] * 4, yes, yes)
-        mean = ppo.means(network, state.weights["actor"], hidden, some)
+        transitions = Transition(obs, blank, yes, jnp.zeros((4, 64, 3)), *[zero] * 4, yes, yes)
+        mean = ppo.means(network, state.weights["actor"], hidden, transitions)
         noise = jax.random.normal(key_act, mean.shape)
         action = mean + jnp.exp(state.weights["log_std"]) * noise
-        some = some._replace(
+        transitions = transitions._replace(
             action=action,
             log_prob=ppo.log_prob(action, mean, state.weights["log_std"]),
-            value=networks.critic(state.weights["critic"], ppo.critic_inputs(numbers, blank)),
-            reward=-jnp.sum((action - best(numbers)) ** 2, axis=-1),
+            value=networks.critic(state.weights["critic"], ppo.critic_inputs(obs, blank)),
+            reward=-jnp.sum((action - best(obs)) ** 2, axis=-1),
         )
-        wrong = jnp.mean(jnp.sum((mean - best(numbers)) ** 2, axis=-1))
-        return ppo.update_policy(how, network, state, key_pass, hidden, some)[0], wrong
+        wrong = jnp.mean(jnp.sum((mean - best(obs)) ** 2, axis=-1))
+        return ppo.update_policy(config, network, state, key_pass, hidden, transitions)[0], wrong
 
     wrong = []
     for key in jax.random.split(jax.random.PRNGKey(1), 150):
-        state, off = on(state, key)
+        state, off = update(state, key)
         wrong.append(float(off))
     assert wrong[0] == pytest.approx(0.8**2 + 0.5**2, rel=0.05)
     assert np.mean(wrong[-10:]) < 0.2 * wrong[0]
@@ -466,9 +470,9 @@ def test_the_curve_is_a_table_that_pandas_reads(learned):
 
 def test_a_folder_of_another_run_and_damaged_parts(learned, tmp_path):
     folder, _ = learned
-    other = replace(TINY["setting"], seed=1)
+    setting = replace(TINY["setting"], seed=1)
     with pytest.raises(InputError, match="holds another run"):
-        learn(CYLINDERS, **TINY | {"setting": other}, updates=4, out=folder)
+        learn(CYLINDERS, **TINY | {"setting": setting}, updates=4, out=folder)
     out = shutil.copytree(folder, tmp_path / "run")
     (part,) = (out / "parts").iterdir()
     part.write_bytes(part.read_bytes()[:-1])
@@ -478,18 +482,18 @@ def test_a_folder_of_another_run_and_damaged_parts(learned, tmp_path):
 
 
 def test_in_a_sweep_the_law_does_what_it_does_in_its_environment(learned, registries):
-    """The same worlds, the same actions, the same sensing: the same end."""
+    """Both have equal worlds, actions and sensing, and so equal outcomes."""
     name, params = registry.parse_law(str(learned[0] / "policy.npz"))
     setting = Setting("fused", fidelity="fast", rules=Rules(horizon=12.0), seed=5)
-    found = run_sweep({name: params}, CYLINDERS, worlds=4, setting=setting)
+    results = run_sweep({name: params}, CYLINDERS, worlds=4, setting=setting)
     policy = policies.decode((learned[0] / "policy.npz").read_bytes(), "policy")
     env = PushEnv("random_cylinder", CYLINDERS, setting=setting, worlds=4)
     run = jax.jit(partial(rollout.rollout, policy.network, env))
     states = run(env.table, policy.weights)
-    np.testing.assert_array_equal(states.data.steps * env.dt, np.float32(found.time[0]))
-    np.testing.assert_array_equal(states.data.success, found.success[0] > 0)
-    np.testing.assert_allclose(states.data.qpos[:, :3], found.base_pose[0], atol=2e-4)
-    assert np.ptp(found.base_pose.values[0], axis=0).max() > 1e-3  # they did not stand still
+    np.testing.assert_array_equal(states.data.steps * env.dt, np.float32(results.time[0]))
+    np.testing.assert_array_equal(states.data.success, results.success[0] > 0)
+    np.testing.assert_allclose(states.data.qpos[:, :3], results.base_pose[0], atol=2e-4)
+    assert np.ptp(results.base_pose.values[0], axis=0).max() > 1e-3  # they did not stand still
 
 
 def test_an_easier_world_has_its_target_nearer_and_more_ahead():
@@ -510,32 +514,40 @@ def test_rewards_of_what_the_law_is_not_told():
         weights=Reward(progress=0.0, no_contact=0.0, success=0.0, object=1.0, behind=0.0),
     )  # fmt: skip
     state = env.begin(jax.tree.map(lambda leaf: leaf[0], env.table), jnp.array(0))
-    before = state.data
-    by = jnp.array([0.01, -0.02])
-    after = before._replace(qpos=before.qpos.at[3:5].add(by))
-    nearer, together = env._gains(state.info["world"], before, after)
+    previous = state.data
+    shift = jnp.array([0.01, -0.02])
+    current = previous._replace(qpos=previous.qpos.at[3:5].add(shift))
+    nearer, together = env._gains(state.info["world"], previous, current)
     target = state.info["world"].p_world_target
-    far = [float(jnp.linalg.norm(target - s.qpos[3:5])) for s in (before, after)]
+    far = [float(jnp.linalg.norm(target - s.qpos[3:5])) for s in (previous, current)]
     assert float(nearer) == pytest.approx(far[0] - far[1], abs=1e-6)
 
     def cosine(s):
         ways = np.array([s.qpos[3:5] - s.qpos[:2], target - s.qpos[:2]])
         return ways[0] @ ways[1] / np.linalg.norm(ways, axis=1).prod()
 
-    assert float(together) == pytest.approx(cosine(after) - cosine(before), abs=1e-6)
+    assert float(together) == pytest.approx(cosine(current) - cosine(previous), abs=1e-6)
 
 
 def test_the_command_learns_and_the_ladder_takes_what_it_leaves(tmp_path, capsys, registries):
     out = tmp_path / "learn"
-    asked = ["--domain", "wide,objects=random_cylinder", "--network", "mlp"]
-    asked += ["--width", 4, "--num-envs", 4, "--drawn", 4, "--validation", 2, "--num-steps", 2]
-    asked += ["--num-minibatches", 1, "--minutes", 0, "--updates", 2, "--engine", "quasistatic"]
-    assert rps("learn", *asked, "--out", out) == 0
-    said = capsys.readouterr().out
-    assert "Compile" in said
+    options = ["--domain", "wide,objects=random_cylinder", "--network", "mlp"]
+    options += ["--width", 4, "--num-envs", 4, "--drawn", 4, "--validation", 2, "--num-steps", 2]
+    options += ["--num-minibatches", 1, "--minutes", 0, "--updates", 2, "--engine", "quasistatic"]
+    assert rps("learn", *options, "--out", out) == 0
+    output = capsys.readouterr().out
+    assert "Compile" in output
     assert (out / "curve.png").stat().st_size > 10_000
-    assert "success in validation" in said
-    asked = ["ladder", *asked[:2], "--worlds", 2, "--engine", "quasistatic", "--slots", 2]
-    asked += ["--laws", "pursuit", out / "policy.npz", "--workers", 1, "--out", tmp_path / "ladder"]
-    assert rps(*asked) == 0
+    assert "success in validation" in output
+    options = ["ladder", *options[:2], "--worlds", 2, "--engine", "quasistatic", "--slots", 2]
+    options += [
+        "--laws",
+        "pursuit",
+        out / "policy.npz",
+        "--workers",
+        1,
+        "--out",
+        tmp_path / "ladder",
+    ]
+    assert rps(*options) == 0
     assert "learned_mlp_" in capsys.readouterr().out

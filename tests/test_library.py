@@ -22,7 +22,7 @@ BRIEF = {"setting": rps_jax.Setting(rules=RULES), "slots": SLOTS}
 
 
 def identical(a, b):
-    """The same variables and coordinates, with the same types, labels and bits."""
+    """Assert that variables and coordinates have equal types, labels and bits."""
     xr.testing.assert_identical(a, b)
     for name in a.variables:
         assert a[name].dtype == b[name].dtype, name
@@ -38,22 +38,24 @@ def identical(a, b):
 )
 def test_a_sweep_in_memory_is_the_same_as_one_in_a_folder(engine, domain, tmp_path):
     setting = rps_jax.Setting(engine, rules=RULES, seed=3)
-    asked = {"worlds": 8, "setting": setting, "part": 4, "slots": SLOTS}
-    found = rps_jax.sweep(LAWS, domain, **asked)
-    assert found.success.dims == ("law", "world")
-    assert dict(found.sizes) == {"law": 2, "world": 8, "pose": 3, "object": len(domain.objects)}
-    identical(found, rps_jax.sweep(LAWS, domain, out=tmp_path, **asked))
-    identical(found, rps_jax.load(tmp_path))
-    identical(found, rps_jax.sweep(LAWS, domain, out=str(tmp_path), **asked))  # there is no more
+    options = {"worlds": 8, "setting": setting, "part": 4, "slots": SLOTS}
+    results = rps_jax.sweep(LAWS, domain, **options)
+    assert results.success.dims == ("law", "world")
+    assert dict(results.sizes) == {"law": 2, "world": 8, "pose": 3, "object": len(domain.objects)}
+    identical(results, rps_jax.sweep(LAWS, domain, out=tmp_path, **options))
+    identical(results, rps_jax.load(tmp_path))
+    identical(
+        results, rps_jax.sweep(LAWS, domain, out=str(tmp_path), **options)
+    )  # there is no more
 
 
 def test_what_was_drawn_is_a_coordinate_of_the_worlds(tmp_path):
-    found = rps_jax.sweep(LAWS, DRUMS, worlds=4, **BRIEF)
-    drawn = {name for name in found.coords if found[name].dims == ("world",)}
+    results = rps_jax.sweep(LAWS, DRUMS, worlds=4, **BRIEF)
+    drawn = {name for name in results.coords if results[name].dims == ("world",)}
     undrawn = {name for name in QUANTITIES if getattr(DOMAINS["wide"], name) is None}
     assert drawn == {"world", "which_object", *LABELS} - undrawn
-    assert all(found[name].dims[:2] == ("law", "world") for name in found)
-    heavy = found.where(found.mass > found.mass.median(), drop=True)
+    assert all(results[name].dims[:2] == ("law", "world") for name in results)
+    heavy = results.where(results.mass > results.mass.median(), drop=True)
     assert heavy.world.size == 2
 
 
@@ -73,12 +75,12 @@ def test_a_folder_without_results_is_refused(tmp_path):
 
 
 def test_a_world_of_a_sweep_is_replayed(run):
-    """Alone, in another program, which rounds otherwise."""
-    folder, found = run
+    """The replay is another program with one world, which rounds differently."""
+    folder, results = run
     again = rps_jax.replay(folder, 3, "slow")
-    there = found.sel(law="slow", world=3)
-    assert int(again.outcome.success) == int(there.success)
-    np.testing.assert_allclose(again.outcome.base_pose, there.base_pose, atol=1e-3)
+    expected = results.sel(law="slow", world=3)
+    assert int(again.outcome.success) == int(expected.success)
+    np.testing.assert_allclose(again.outcome.base_pose, expected.base_pose, atol=1e-3)
     assert "world 3" in again.title
     with pytest.raises(InputError, match="unknown law of the run 'fast': choose from paper, slow"):
         rps_jax.replay(folder, 3, "fast")
@@ -89,29 +91,29 @@ def test_a_world_of_a_sweep_is_replayed(run):
 @pytest.mark.filterwarnings("ignore:os.fork")  # by the reader of the film
 def test_a_push_is_plotted_and_filmed(tmp_path):
     setting = rps_jax.Setting("quasistatic", rules=rps_jax.Rules(horizon=3.0))
-    seen = rps_jax.push("cylinder", target=(1.0, 0.5), setting=setting)
-    assert seen.data.time[-1] == pytest.approx(3.0, abs=0.11)
-    assert seen.data.l.dims == ("time",)
-    figure = seen.plot()
+    trace = rps_jax.push("cylinder", target=(1.0, 0.5), setting=setting)
+    assert trace.data.time[-1] == pytest.approx(3.0, abs=0.11)
+    assert trace.data.l.dims == ("time",)
+    figure = trace.plot()
     assert len(figure.axes) >= 2
-    seen.plot(tmp_path / "push.png")
+    trace.plot(tmp_path / "push.png")
     assert (tmp_path / "push.png").stat().st_size > 10_000
-    assert seen.film(tmp_path / "push.mp4", 0.4) == tmp_path / "push.mp4"
+    assert trace.film(tmp_path / "push.mp4", 0.4) == tmp_path / "push.mp4"
     images = decode(tmp_path / "push.mp4")
     assert len(images) == 8
     assert np.abs(images[0].astype(int) - images[-1]).max() > 60
     with pytest.raises(InputError, match="film_length = 0 is not allowed"):
-        seen.film(tmp_path / "none.mp4", 0)
+        trace.film(tmp_path / "none.mp4", 0)
 
 
 # --- a table -------------------------------------------------------------------------------
 
 
 def test_a_table_is_what_the_command_writes(tmp_path):
-    asked = ["--objects", "box", "--laws", "rps", "aps", "--friction", "S2", "0.3,0.4"]
-    asked += ["--targets", 0.6, 0, 1, 1, "--engine", "mujoco", "--horizon", 3, "--mass", 5]
-    assert rps("table", *asked, "--out", tmp_path / "run") == 0
-    found = rps_jax.table(
+    options = ["--objects", "box", "--laws", "rps", "aps", "--friction", "S2", "0.3,0.4"]
+    options += ["--targets", 0.6, 0, 1, 1, "--engine", "mujoco", "--horizon", 3, "--mass", 5]
+    assert rps("table", *options, "--out", tmp_path / "run") == 0
+    results = rps_jax.table(
         objects=["box"],
         laws=["rps", "aps"],
         friction=["S2", (0.3, 0.4)],
@@ -119,30 +121,32 @@ def test_a_table_is_what_the_command_writes(tmp_path):
         setting=rps_jax.Setting("mujoco", rules=rps_jax.Rules(horizon=3.0)),
         mass=5.0,
     )
-    identical(found, files.read_results(tmp_path / "run"))
-    identical(found, rps_jax.load(tmp_path / "run"))
+    identical(results, files.read_results(tmp_path / "run"))
+    identical(results, rps_jax.load(tmp_path / "run"))
 
 
 # --- examples ------------------------------------------------------------------------------
 
-EVERY = {name: getattr(rps_jax, name) for name in rps_jax.__all__}
-EVERY |= {name: getattr(import_module(module), name) for module, name in addresses()}
-PUBLIC = [name for name, found in EVERY.items() if callable(found)]
+API = {name: getattr(rps_jax, name) for name in rps_jax.__all__}
+API |= {name: getattr(import_module(module), name) for module, name in addresses()}
+PUBLIC = [name for name, entry in API.items() if callable(entry)]
 OPTIONS = doctest.ELLIPSIS | doctest.IGNORE_EXCEPTION_DETAIL
 
 
 def examples(name):
     """The examples of a public function, or of a class and its methods."""
-    return [one for one in doctest.DocTestFinder().find(EVERY[name], name) if one.examples]
+    return [
+        example for example in doctest.DocTestFinder().find(API[name], name) if example.examples
+    ]
 
 
 def test_every_public_function_has_an_example():
-    functions = [name for name in PUBLIC if not inspect.isclass(EVERY[name])]
+    functions = [name for name in PUBLIC if not inspect.isclass(API[name])]
     assert {"sweep", "evaluate", "table", "push"} <= set(functions)
     assert [name for name in functions if not examples(name)] == []
 
 
-# Questions whose small runs take longest, which tests of their own ask, too.
+# Questions whose small runs take longest; other tests run them, too.
 LONG = {"hardware", "learn", "ladder", "regress", "ceiling", "score", "attack", "replay"}
 
 
@@ -156,7 +160,7 @@ LONG = {"hardware", "learn", "ladder", "regress", "ceiling", "score", "attack", 
 )
 def test_the_examples_of_docstrings_run(name, tmp_path, monkeypatch, registries):
     monkeypatch.chdir(tmp_path)
-    told = []
+    lines = []
     runner = doctest.DocTestRunner(optionflags=OPTIONS)
-    for one in examples(name):
-        assert runner.run(one, out=told.append).failed == 0, "".join(told)
+    for example in examples(name):
+        assert runner.run(example, out=lines.append).failed == 0, "".join(lines)

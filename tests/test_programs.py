@@ -1,4 +1,4 @@
-"""Traced programs that are kept between processes: used again, verified, dropped, bounded."""
+"""The cache of traced programs: reuse between processes, verification, eviction."""
 
 import os
 from dataclasses import replace
@@ -24,44 +24,44 @@ from rps_jax.trials.trial import Rules
 
 @pytest.fixture
 def cache(tmp_path):
-    """A cache of its own, and the number of tracings so far."""
-    before = jax.config.jax_compilation_cache_dir
+    """The folder of traced programs in a temporary cache."""
+    previous = jax.config.jax_compilation_cache_dir
     jax.config.update("jax_compilation_cache_dir", str(tmp_path))
     yield tmp_path / "traced"
-    jax.config.update("jax_compilation_cache_dir", before)
+    jax.config.update("jax_compilation_cache_dir", previous)
 
 
 @pytest.fixture
-def made():
-    """Compile x + a y, of n numbers, and tell how often that was traced."""
+def compiler():
+    """A function that compiles and runs x + a y for n values, and the list of its tracings."""
     traced = []
 
-    def make(n=3, factor=2.0, static=None):
+    def run(n=3, factor=2.0, static=None):
         def function(x, y):
             traced.append(n)
             return {"sum": x + factor * y}
 
         shape = jax.ShapeDtypeStruct((n,), jnp.float32)
         known = [factor] if static is None else [static]
-        given = (shape, shape)
-        program = programs.compile_function(function, given, law=rps.LAW, donate=0, static=known)
+        shapes = (shape, shape)
+        program = programs.compile_function(function, shapes, law=rps.LAW, donate=0, static=known)
         return np.asarray(program(jnp.ones(n), jnp.ones(n))["sum"]).tolist()
 
-    return make, traced
+    return run, traced
 
 
-def test_a_program_is_traced_once_for_all_processes(cache, made):
-    make, traced = made
-    assert make() == make() == [3.0] * 3
+def test_a_program_is_traced_once_for_all_processes(cache, compiler):
+    run, traced = compiler
+    assert run() == run() == [3.0] * 3
     assert len(traced) == 1
-    assert make(factor=3.0) == [4.0] * 3
-    assert make(n=2) == [3.0] * 2
+    assert run(factor=3.0) == [4.0] * 3
+    assert run(n=2) == [3.0] * 2
     assert len(traced) == 3
     assert len(list(cache.iterdir())) == 3
 
 
 def test_a_trial_that_is_followed_is_traced_once_for_all_processes(cache, monkeypatch):
-    """And what it returns is as named as if it had been traced."""
+    """A cached trial returns the same named tuples as a traced one."""
     traced, record = [], trial.record
     monkeypatch.setattr(trial, "record", lambda *a, **k: traced.append(1) or record(*a, **k))
     setting = Setting("quasistatic", rules=Rules(horizon=0.2))
@@ -90,33 +90,33 @@ def test_a_program_whose_results_cannot_be_named_is_not_kept(result, cache):
 
 
 @pytest.mark.parametrize("damage", ["cut", "flipped", "empty", "of another program"])
-def test_a_damaged_program_is_dropped_with_one_line(damage, cache, made):
-    make, traced = made
-    make()
-    (kept,) = cache.iterdir()
-    content = kept.read_bytes()
+def test_a_damaged_program_is_dropped_with_one_line(damage, cache, compiler):
+    run, traced = compiler
+    run()
+    (file,) = cache.iterdir()
+    content = file.read_bytes()
     if damage == "of another program":
-        make(n=2)
-        content = next(one for one in cache.iterdir() if one != kept).read_bytes()
+        run(n=2)
+        content = next(path for path in cache.iterdir() if path != file).read_bytes()
     elif damage == "flipped":
         content = content[:-1] + bytes([content[-1] ^ 1])
     else:
         content = content[: 100 * (damage == "cut")]
-    kept.write_bytes(content)
+    file.write_bytes(content)
     count = len(traced)
-    with pytest.warns(UserWarning, match="is dropped, and traced again: it") as told:
-        assert make() == [3.0] * 3
-    assert len(told) == 1
+    with pytest.warns(UserWarning, match="is dropped, and traced again: it") as warnings:
+        assert run() == [3.0] * 3
+    assert len(warnings) == 1
     assert len(traced) == count + 1
-    assert make() == [3.0] * 3  # what was traced again is kept again
+    assert run() == [3.0] * 3  # the new program is cached
     assert len(traced) == count + 1
 
 
-def test_what_says_not_all_that_a_program_depends_on_keeps_none(cache, made):
-    make, traced = made
+def test_what_says_not_all_that_a_program_depends_on_keeps_none(cache, compiler):
+    run, traced = compiler
     for static in (object(), np.arange(5000)):
-        make(static=static)
-        make(static=static)
+        run(static=static)
+        run(static=static)
     assert len(traced) == 4
     assert not cache.exists()
 
@@ -129,69 +129,69 @@ def test_a_cache_stays_where_it_was_when_its_process_goes_elsewhere(cache, tmp_p
 
 def test_every_law_of_the_package_is_known_again_by_its_functions_and_weights():
     laws = {name: registry.law_of(params) for name, params in registry.LAWS.items()}
-    said = {name: programs.identity(law) for name, law in laws.items()}
-    assert None not in said.values()
-    assert said["learned_gru"] != said["learned_mlp"]
-    assert said["rps"] == said["rps_tuned"] != said["rps_plus"]
+    identities = {name: programs.identity(law) for name, law in laws.items()}
+    assert None not in identities.values()
+    assert identities["learned_gru"] != identities["learned_mlp"]
+    assert identities["rps"] == identities["rps_tuned"] != identities["rps_plus"]
     gru = laws["learned_gru"]
     network, weights = gru.step.args
-    other = weights | {"first.b": weights["first.b"] + 1}
-    changed = replace(gru, step=partial(gru.step.func, network, other))
-    assert programs.identity(changed) != said["learned_gru"]
+    changed_weights = weights | {"first.b": weights["first.b"] + 1}
+    changed = replace(gru, step=partial(gru.step.func, network, changed_weights))
+    assert programs.identity(changed) != identities["learned_gru"]
     assert programs.identity(replace(gru, init=lambda params: None)) is None
 
 
 def test_a_model_of_mjx_is_known_again_by_its_numbers(cache):
-    """Its static arrays, which JAX names by their addresses, too."""
+    """This includes its static arrays, which JAX identifies by address."""
     setting = Setting("mjx")
     stages = [pushes.build([Case(name)], setting).stage for name in ("box", "box", "cylinder")]
-    said = [repr(programs._describe(jax.tree.structure(one))) for one in stages]
-    assert said[0] == said[1] != said[2]
-    assert programs._path_of(said[0]) is not None
+    descriptions = [repr(programs._describe(jax.tree.structure(stage))) for stage in stages]
+    assert descriptions[0] == descriptions[1] != descriptions[2]
+    assert programs._path_of(descriptions[0]) is not None
     model = stages[0].model
     changed = stages[0]._replace(model=model.replace(geom_bodyid=model.geom_bodyid + 1))
-    assert repr(programs._describe(jax.tree.structure(changed))) != said[0]
+    assert repr(programs._describe(jax.tree.structure(changed))) != descriptions[0]
 
 
-def test_programs_that_were_not_used_for_longest_go_first(cache, made, monkeypatch):
-    make, traced = made
-    make(n=1)
+def test_programs_that_were_not_used_for_longest_go_first(cache, compiler, monkeypatch):
+    run, traced = compiler
+    run(n=1)
     size = next(cache.iterdir()).stat().st_size
     monkeypatch.setattr(program_cache, "MAX_BYTES", int(2.5 * size))
     for n in (2, 3, 4):
-        make(n=n)
+        run(n=n)
     assert len(list(cache.iterdir())) == 2
     count = len(traced)
-    make(n=4)
+    run(n=4)
     assert len(traced) == count
-    make(n=1)
+    run(n=1)
     assert len(traced) == count + 1
 
 
 def test_a_few_trials_stay_on_processors(monkeypatch):
-    """Five hundred, where there is a C compiler; in C MuJoCo all."""
+    """At most 500 with a C compiler; any number in C MuJoCo."""
     monkeypatch.setattr(device, "find_compiler", lambda: "cc")
-    before = jax.config.jax_platforms
+    previous = jax.config.jax_platforms
     jax.config.update("jax_platforms", None)
     try:
-        few = Sweep("rps", worlds=500)
-        assert few.suits_processors()
+        sweep = Sweep("rps", worlds=500)
+        assert sweep.suits_processors()
         assert Push(setting=Setting("fused")).suits_processors()
-        assert not replace(few, worlds=501).suits_processors()
-        assert not replace(few, setting=Setting("mjx")).suits_processors()
-        assert replace(few, worlds=9000, setting=Setting("mujoco")).suits_processors()
+        assert not replace(sweep, worlds=501).suits_processors()
+        assert not replace(sweep, setting=Setting("mjx")).suits_processors()
+        assert replace(sweep, worlds=9000, setting=Setting("mujoco")).suits_processors()
         monkeypatch.setattr(device, "find_compiler", lambda: None)
-        assert not few.suits_processors()
+        assert not sweep.suits_processors()
         jax.config.update("jax_platforms", "cuda")  # asked for by name
         assert not Push().suits_processors()
     finally:
-        jax.config.update("jax_platforms", before)
+        jax.config.update("jax_platforms", previous)
 
 
-@pytest.mark.parametrize(("release", "machine", "asked"), [
+@pytest.mark.parametrize(("release", "machine", "needs_avx"), [
     ("0.11.2", "x86_64", False), ("0.12.0.1", "x86_64", True), ("0.13.1", "arm64", False),
 ])  # fmt: skip
-def test_a_jax_that_fuses_by_slot_is_asked_for_avx(release, machine, asked, monkeypatch):
+def test_a_jax_that_fuses_by_slot_is_asked_for_avx(release, machine, needs_avx, monkeypatch):
     monkeypatch.setenv("XLA_FLAGS", "--xla_of_ones_own")
     monkeypatch.setattr(device.metadata, "version", lambda _: release)
     monkeypatch.setattr(device.platform, "machine", lambda: machine)
@@ -199,4 +199,4 @@ def test_a_jax_that_fuses_by_slot_is_asked_for_avx(release, machine, asked, monk
         device.configure_xla()
         words = os.environ["XLA_FLAGS"].split()
         assert words[:2] == ["--xla_of_ones_own", "--xla_gpu_deterministic_ops=true"]
-        assert words[2:] == ["--xla_cpu_max_isa=AVX"] * asked
+        assert words[2:] == ["--xla_cpu_max_isa=AVX"] * needs_avx

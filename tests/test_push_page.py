@@ -1,4 +1,4 @@
-"""The page on which one pushes oneself does what Python does, twist by twist."""
+"""The interactive push page computes the same twists as Python."""
 
 import contextlib
 import os
@@ -20,12 +20,12 @@ from rps_jax.trials.setting import Setting
 from rps_jax.trials.stepper import Live
 
 MAKE = runpy.run_path(str(ROOT / "docs" / "push" / "make.py"))
-WHOLE = """
+WHOLE_PUSH = """
 const push = new Push({ law: arguments[0], shape: arguments[1], target: [-2, 0] });
 while (push.step()) {}
 return [push.trial.success, push.past.map((s) => [s.twist.v_x, s.twist.v_y, s.twist.omega])];
 """
-EACH = """
+SINGLE_STEPS = """
 const push = new Push({ law: arguments[0], target: [-2, 0] });
 return arguments[1].map(([trial, memory]) => {
   Object.assign(push, { trial, memory });
@@ -70,43 +70,46 @@ def python_push(law):
 
 
 def twists(live):
-    return np.array([np.stack(one.seen.twist) for one in live.past])
+    return np.array([np.stack(step.seen.twist) for step in live.past])
 
 
 @pytest.mark.parametrize("law", ["rps_plus", pytest.param("rps_tuned", marks=pytest.mark.slow)])
 def test_a_whole_push_has_the_twists_of_python(law, browser):
     with python_push(law) as live:
-        wanted = twists(live)
-    assert wanted.dtype == np.float64
-    success, found = browser.execute_script(WHOLE, law, "box")
+        expected = twists(live)
+    assert expected.dtype == np.float64
+    success, computed = browser.execute_script(WHOLE_PUSH, law, "box")
     assert success
-    assert len(found) == len(wanted) > 5000
-    np.testing.assert_allclose(found, wanted, rtol=0, atol=1e-5)
+    assert len(computed) == len(expected) > 5000
+    np.testing.assert_allclose(computed, expected, rtol=0, atol=1e-5)
 
 
 @pytest.mark.parametrize("law", ["rps", pytest.param("learned_gru", marks=pytest.mark.slow)])
-def test_from_every_state_of_a_push_comes_the_twist_of_python(law, browser):
-    """Where tan(gamma) is at its bound, the paper's law enlarges a difference fourfold a step.
+def test_each_state_of_a_push_gives_the_twist_of_python(law, browser):
+    """At the bound of tan(gamma), the paper's law amplifies a difference fourfold per step.
 
-    So its pushes part from the last bit of a sine; what a step does with a state does not.
+    So rounding lets whole pushes diverge, but single steps from equal states agree.
     """
     with python_push(law) as live:
-        wanted, every = twists(live), max(1, len(live.past) // 6000)
-        shown = range(0, len(live.past) - 1, every)
-        before = [live.past[i].before for i in shown]
-        own = named([one._replace(**MAKE["UNTRACED"]) for one in before])
-        states = list(zip(own, named([one.law_state for one in before]), strict=True))
-        after = np.array([live.past[i + 1].seen.qpos for i in shown])
-    found = np.concatenate(
-        [browser.execute_script(EACH, law, states[i : i + 500]) for i in range(0, len(states), 500)]
+        expected, stride = twists(live), max(1, len(live.past) // 6000)
+        shown = range(0, len(live.past) - 1, stride)
+        previous = [live.past[i].before for i in shown]
+        trials = named([step._replace(**MAKE["UNTRACED"]) for step in previous])
+        states = list(zip(trials, named([step.law_state for step in previous]), strict=True))
+        next_qpos = np.array([live.past[i + 1].seen.qpos for i in shown])
+    computed = np.concatenate(
+        [
+            browser.execute_script(SINGLE_STEPS, law, states[i : i + 500])
+            for i in range(0, len(states), 500)
+        ]
     )
-    np.testing.assert_allclose(found[:, :3], wanted[list(shown)], rtol=0, atol=1e-5)
-    np.testing.assert_allclose(found[:, 3:], after, rtol=0, atol=1e-7)
+    np.testing.assert_allclose(computed[:, :3], expected[list(shown)], rtol=0, atol=1e-5)
+    np.testing.assert_allclose(computed[:, 3:], next_qpos, rtol=0, atol=1e-7)
 
 
 def named(trees):
     """Leaves of pytrees by the names that the page gives them."""
-    names = [one.name for one in fields_of(trees[0])]
+    names = [field.name for field in fields_of(trees[0])]
     rows = [[np.asarray(x).tolist() for x in jax.tree.leaves(tree)] for tree in trees]
     finite = [[1e300 if x == np.inf else x for x in row] for row in rows]  # as JSON has them
     return [dict(zip(names, row, strict=True)) for row in finite]
@@ -114,7 +117,7 @@ def named(trees):
 
 @pytest.mark.parametrize("corners", [1, 4, 6])
 def test_an_object_is_borne_as_in_the_package(corners):
-    """The page computes centre of mass and arm anew when one slides what they depend on."""
+    """The page recomputes centre of mass and arm when a slider changes their inputs."""
     rng = np.random.default_rng(0)
     offset, bearing = rng.uniform(0, 0.4, 20), rng.uniform(-3, 3, 20)
     size = rng.uniform(0.1, 0.4, 20)
@@ -123,20 +126,20 @@ def test_an_object_is_borne_as_in_the_package(corners):
     else:
         vertices, radius = solid.rectangles(size, rng.uniform(0.1, 0.4, 20)), np.zeros(20)
         vertices = np.concatenate([vertices, vertices[:, -1:].repeat(corners - 4, 1)], axis=1)
-    one = np.ones(20)
-    solids = solid.build(vertices, radius, one, one, offset, bearing)
-    wanted = sliders(solids, one, np.array([0.3625, 0.29]))
+    unit = np.ones(20)
+    solids = solid.build(vertices, radius, unit, unit, offset, bearing)
+    expected = sliders(solids, unit, np.array([0.3625, 0.29]))
     with jax.enable_x64(True):
         outlines = MAKE["Outline"](vertices, radius, offset, bearing)
         com, arm = jax.vmap(MAKE["support"])(outlines)
-    np.testing.assert_allclose(com, wanted.p_object_com, atol=1e-12)
-    np.testing.assert_allclose(arm, wanted.arm, atol=1e-9)
+    np.testing.assert_allclose(com, expected.p_object_com, atol=1e-12)
+    np.testing.assert_allclose(arm, expected.arm, atol=1e-9)
 
 
 def test_the_recorded_push_stands_on_the_floor_and_is_seen_from_any_side(browser):
     """It ends at its target, upright; a drag turns the eye, and other pixels are drawn."""
-    ends = "const q = RECORDED.qpos.at(-1); return [q[3], q[4], q[5], q[7], q[8]]"
-    x, y, z, *tilt = browser.execute_script(ends)
+    final_pose = "const q = RECORDED.qpos.at(-1); return [q[3], q[4], q[5], q[7], q[8]]"
+    x, y, z, *tilt = browser.execute_script(final_pose)
     assert np.hypot(x + 2, y) < 0.2  # the contact is at the target, the middle beside it
     assert abs(z - 0.4) < 2e-3
     np.testing.assert_allclose(tilt, 0, atol=2e-3)

@@ -19,27 +19,30 @@ FOLDER = ROOT / "sweeps" / "real_pushes"
 
 
 @pytest.fixture(scope="module")
-def few():
-    """Ten pushes of every kind."""
+def sample():
+    """Ten pushes of each kind."""
     whole = pushes.read()
     return whole.groupby("kind").head(10).reset_index(drop=True)
 
 
 def on(feet, count=1, shift=0.0):
-    """A ground of such points under some objects, without an ellipsoid."""
+    """Return a ground with these points under `count` objects, without an ellipsoid."""
     at = np.repeat((feet - COM)[None], count, axis=0)
     return Ground(at, np.ones(at.shape[:2]), np.zeros(count), np.full(count, shift))
 
 
 def pushed(ground, ways, pose=(0.0, 0.0, 0.0), friction=0.5, scale=1.0):
-    """One push by fingers (F, 2) [m] that go a way (2,) [m], in the body's frame at the start."""
+    """Return pose and force of one push by fingers (F, 2) [m] along a vector (2,) [m].
+
+    Fingers and vector are in the body's frame at the start.
+    """
     start, way = np.array(ways[0], float), np.array(ways[1], float)
     if len(start) == 1:
         start = np.concatenate([start, start + 100.0])
     pose = np.array(pose, float)
     share = np.linspace(0, 1, STEPS + 1)[:, None, None]
     path = turned(np.full((STEPS + 1, 2), pose[2]), start + share * way) + pose[:2]
-    found = sliding.push(
+    result = sliding.push(
         scale * OUTLINE,
         scale * COM,
         ground._replace(at=scale * ground.at, arm=scale * ground.arm),
@@ -47,7 +50,7 @@ def pushed(ground, ways, pose=(0.0, 0.0, 0.0), friction=0.5, scale=1.0):
         (pose * [scale, scale, 1])[None],
         np.array([friction]),
     )
-    return found.pose[:, 0] * [1 / scale, 1 / scale, 1], found.force[:, 0]
+    return result.pose[:, 0] * [1 / scale, 1 / scale, 1], result.force[:, 0]
 
 
 UPWARDS = ([[0.025, -0.001], [0.075, -0.001]], (0.0, 0.02))  # two fingers about the centroid's x
@@ -78,26 +81,26 @@ def test_a_finger_stays_in_its_cone_and_outside():
     assert (np.abs(across[touching]) <= mu * along[touching] * (1 + 1e-6)).all()
     assert across[touching][-1] == pytest.approx(mu * along[touching][-1], rel=0.01)  # it slides
     finger = np.array([0.09, 0.018])
-    seen = turned(-pose[-1, 2], finger - pose[-1, :2])
-    gap, _ = sliding.nearest(OUTLINE, seen)
+    p_object_finger = turned(-pose[-1, 2], finger - pose[-1, :2])
+    gap, _ = sliding.nearest(OUTLINE, p_object_finger)
     assert abs(gap) < 3e-4
 
 
 def test_lengths_have_no_scale():
-    one, _ = pushed(on(FEET), ([[0.1, -0.001]], (0.004, 0.02)))
-    four, _ = pushed(on(FEET), ([[0.1, -0.001]], (0.004, 0.02)), scale=4.0)
-    assert abs(one[-1, 2]) > 0.05
-    np.testing.assert_allclose(four, one, atol=1e-6)
+    base, _ = pushed(on(FEET), ([[0.1, -0.001]], (0.004, 0.02)))
+    scaled, _ = pushed(on(FEET), ([[0.1, -0.001]], (0.004, 0.02)), scale=4.0)
+    assert abs(base[-1, 2]) > 0.05
+    np.testing.assert_allclose(scaled, base, atol=1e-6)
 
 
 def test_feet_move_with_the_pose():
-    """A push that is moved and turned ends moved and turned."""
-    one, _ = pushed(on(FEET), ([[0.1, -0.001]], (0.004, 0.02)))
-    there = (0.3, -0.2, 2.0)
-    other, _ = pushed(on(FEET), ([[0.1, -0.001]], (0.004, 0.02)), pose=there)
-    np.testing.assert_allclose(other[:, :2], turned(np.full(len(one), 2.0), one[:, :2]) + there[:2],
-                               atol=1e-6)  # fmt: skip
-    np.testing.assert_allclose(other[:, 2], one[:, 2] + 2.0, atol=1e-5)
+    """Moving and turning a push moves and turns its result."""
+    first, _ = pushed(on(FEET), ([[0.1, -0.001]], (0.004, 0.02)))
+    pose = (0.3, -0.2, 2.0)
+    second, _ = pushed(on(FEET), ([[0.1, -0.001]], (0.004, 0.02)), pose=pose)
+    expected = turned(np.full(len(first), 2.0), first[:, :2]) + pose[:2]
+    np.testing.assert_allclose(second[:, :2], expected, atol=1e-6)
+    np.testing.assert_allclose(second[:, 2], first[:, 2] + 2.0, atol=1e-5)
 
 
 def test_where_the_feet_stand_decides_how_far_it_turns():
@@ -140,26 +143,26 @@ def test_the_data_are_what_the_page_says():
         assert force["force"].shape == (force["id"].size, force["share_of_time"].size, 2)
         # The table's means are those of the second half of the way.
         late = force["force"][:, force["share_of_time"] >= 0.5].mean(axis=1)
-        told = table.set_index("id").loc[force["id"], ["force_wx", "force_wy"]].to_numpy()
-        assert np.median(np.linalg.norm(late - told, axis=1)) < 0.1
+        table_mean = table.set_index("id").loc[force["id"], ["force_wx", "force_wy"]].to_numpy()
+        assert np.median(np.linalg.norm(late - table_mean, axis=1)) < 0.1
 
 
-def test_fingers_begin_outside_and_end_where_the_object_was_pushed(few):
-    way = pushes.finger_paths(few, STEPS)
-    pre, post = pushes.initial_poses(few), pushes.measured(few)
+def test_fingers_begin_outside_and_end_where_the_object_was_pushed(sample):
+    way = pushes.finger_paths(sample, STEPS)
+    pre, post = pushes.initial_poses(sample), pushes.measured(sample)
     for pose, finger, low, high in ((pre, way[0], 2e-4, 5e-3), (post, way[-1], -2e-3, 6e-3)):
-        seen = turned(-pose[:, None, 2], finger - pose[:, None, :2])
-        gap = sliding.nearest(OUTLINE, seen)[0].min(axis=1)
+        p_object_finger = turned(-pose[:, None, 2], finger - pose[:, None, :2])
+        gap = sliding.nearest(OUTLINE, p_object_finger)[0].min(axis=1)
         assert (gap > low).all()
         assert (gap < high).all()
 
 
-def test_a_rigid_body_on_its_feet_is_nearest(few):
-    actual = pushes.measured(few)
+def test_a_rigid_body_on_its_feet_is_nearest(sample):
+    actual = pushes.measured(sample)
 
     def median(model):
-        found = predict(few, model, steps=STEPS)
-        pose = np.stack([found[f"post_{name}"].values for name in pushes.POSE], axis=1)
+        prediction = predict(sample, model, steps=STEPS)
+        pose = np.stack([prediction[f"post_{name}"].values for name in pushes.POSE], axis=1)
         return float(np.median(pushes.errors_of(pose, actual).both))
 
     feet = median("rigid_feet")
@@ -168,44 +171,46 @@ def test_a_rigid_body_on_its_feet_is_nearest(few):
     assert 3 * feet < median("with_pusher") < median("no_motion")
 
 
-def test_mujoco_with_stiff_fingers_comes_near_the_rigid_body(few):
-    some = few[few.support != pushes.FLAT].groupby("kind").head(2).reset_index(drop=True)
-    rigid = predict(some, "rigid_feet")
-    soft = predict(some, "mujoco_ours_stiff")
+def test_mujoco_with_stiff_fingers_comes_near_the_rigid_body(sample):
+    subset = sample[sample.support != pushes.FLAT].groupby("kind").head(2).reset_index(drop=True)
+    rigid = predict(subset, "rigid_feet")
+    soft = predict(subset, "mujoco_ours_stiff")
     for name, near in (("x", 2e-3), ("y", 2e-3), ("yaw", 0.03)):
         off = np.abs(rigid[f"post_{name}"] - soft[f"post_{name}"])
         assert float(off.median()) < near
     assert contact.KINDS["mujoco_ours"].scale == 4
 
 
-def test_a_prediction_takes_a_file_and_a_dataset_and_needs_no_ends(few, tmp_path):
-    kept = few.drop(columns=[name for name in few if name.startswith(("post_", "gap", "force"))])
-    kept.to_csv(tmp_path / "kept.csv", index=False)
-    first = predict(few, "ellipsoid", steps=10)
-    for table in (tmp_path / "kept.csv", str(tmp_path / "kept.csv"), kept, kept.to_xarray()):
+def test_a_prediction_takes_a_file_and_a_dataset_and_needs_no_ends(sample, tmp_path):
+    inputs = sample.drop(
+        columns=[name for name in sample if name.startswith(("post_", "gap", "force"))]
+    )
+    inputs.to_csv(tmp_path / "kept.csv", index=False)
+    first = predict(sample, "ellipsoid", steps=10)
+    for table in (tmp_path / "kept.csv", str(tmp_path / "kept.csv"), inputs, inputs.to_xarray()):
         again = predict(table, "ellipsoid", steps=10)
         np.testing.assert_allclose(again.post_yaw, first.post_yaw, rtol=1e-12)
-    assert list(first.id.values) == list(few.id)
+    assert list(first.id.values) == list(sample.id)
 
 
-def test_a_table_without_sense_is_refused(few, tmp_path, capsys):
+def test_a_table_without_sense_is_refused(sample, tmp_path, capsys):
     with pytest.raises(InputError, match="lack the column edge, which kind = two_point"):
-        predict(few.drop(columns="edge"))
+        predict(sample.drop(columns="edge"))
     with pytest.raises(InputError, match=r"pre_yaw = nan in row 0 is not allowed"):
-        predict(few.assign(pre_yaw=np.nan))
+        predict(sample.assign(pre_yaw=np.nan))
     with pytest.raises(InputError, match="support = round is not allowed"):
-        predict(few.assign(support="round"))
+        predict(sample.assign(support="round"))
     with pytest.raises(InputError, match="without a usable row"):
-        predict(few.assign(usable=0))
+        predict(sample.assign(usable=0))
     with pytest.raises(InputError, match="unknown model 'rigid'"):
-        predict(few, "rigid")
+        predict(sample, "rigid")
     assert "cannot be read" in refusal(capsys, FOLDER, "--pushes", str(tmp_path / "none.csv"))
 
 
 def test_errors_by_hand():
-    here = np.array([0.0, 0.0, 0.0])
+    measured = np.array([0.0, 0.0, 0.0])
     about = np.array([*(COM - turned(np.array(0.2), COM)), 0.2])  # turned about the centroid
-    off = pushes.errors_of(np.stack([about, np.array([0.003, 0.004, 0.0])]), here)
+    off = pushes.errors_of(np.stack([about, np.array([0.003, 0.004, 0.0])]), measured)
     np.testing.assert_allclose(off.place, [0, 5e-3], atol=1e-12)
     np.testing.assert_allclose(off.turn, [0.2, 0], atol=1e-12)
     # Over the area of the triangle, root of the mean square.
@@ -219,25 +224,27 @@ def test_errors_by_hand():
 
 def test_a_small_study_is_continued_and_tells_every_model(tmp_path):
     models = ("no_motion", "rigid_feet", "mujoco_ours")
-    asked = study.RealPushes(models=models, few=20, mujoco=1, out=tmp_path / "run", progress=False)
-    found = asked()
-    again = asked()
-    assert found.drop_attrs().identical(again.drop_attrs())
-    assert set(study.tables(found)) == {"models", "mujoco", "friction", "layouts", "forces"}
-    ran = np.isfinite(found.predicted.sel(model="mujoco_ours")).all("pose")
+    question = study.RealPushes(
+        models=models, few=20, mujoco=1, out=tmp_path / "run", progress=False
+    )
+    results = question()
+    again = question()
+    assert results.drop_attrs().identical(again.drop_attrs())
+    assert set(study.tables(results)) == {"models", "mujoco", "friction", "layouts", "forces"}
+    ran = np.isfinite(results.predicted.sel(model="mujoco_ours")).all("pose")
     assert ran.any()
-    assert not (found.fits & ran).any()
+    assert not (results.fits & ran).any()
     lines = (tmp_path / "run" / "predictions.csv").read_text().splitlines()
     assert lines[0] == "id,model,post_x,post_y,post_yaw"
-    assert len(lines) == 1 + int(np.isfinite(found.both).sum())
+    assert len(lines) == 1 + int(np.isfinite(results.both).sum())
 
 
 def test_a_layout_is_judged_with_the_friction_of_the_others():
-    """Of layout a 0.2 is best, of b 0.4; each is told the other's, and what its own would give."""
+    """Layout a fits best with 0.2, layout b with 0.4; each is evaluated with both values."""
     rows = {"a": [1.0, 3.0], "b": [4.0, 2.0]}  # [mm] at 0.2 and 0.4
     both = np.array([[rows["a"][i]] * 3 + [rows["b"][i]] * 3 for i in (0, 1)]) / 1e3
     off = (("fitted", "tried", "few"), both[None])
-    found = xr.Dataset(
+    results = xr.Dataset(
         {"few_both": off, "few_place": off, "few_turn": off},
         {
             "fitted": ["rigid_feet"],
@@ -246,8 +253,8 @@ def test_a_layout_is_judged_with_the_friction_of_the_others():
             "few_finger": ("few", ["point"] * 6),
         },
     )
-    told = list(study._layout_rows(found))
-    assert [(row[1], row[4], row[7][0], row[8]) for row in told] == [
+    layout_rows = list(study._layout_rows(results))
+    assert [(row[1], row[4], row[7][0], row[8]) for row in layout_rows] == [
         ("a", 0.4, 3.0, 1.0),
         ("b", 0.2, 4.0, 2.0),
     ]

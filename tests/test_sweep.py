@@ -1,4 +1,4 @@
-"""Sweeps over random worlds: a world's result is its own, and nothing that is done is lost."""
+"""Sweeps over random worlds: worlds are independent, and finished work is never lost."""
 
 import errno
 import json
@@ -52,71 +52,75 @@ from rps_jax.world.domain import LABELS, QUANTITIES, Range
 
 
 def outcomes(parts, setting=SHORT):
-    """What trials came to, by their numbers."""
-    found = {}
+    """Return the outcomes of trials by their indices."""
+    by_index = {}
 
-    def collect(numbers, ended):
-        for i, number in enumerate(numbers):
-            found[int(number)] = row(ended, i)
+    def collect(indices, ended):
+        for i, index in enumerate(indices):
+            by_index[int(index)] = row(ended, i)
 
     job = Job(LAW, sum(p.indices.size for p in parts), parts)
     batch.run([job], setting, slots=SLOTS, workers=1, collect=collect)
-    return found
+    return by_index
 
 
-def made(index):
-    """Worlds of the domain of boxes."""
+def box_worlds(index):
+    """Return worlds of the domain of boxes."""
     return drawn_worlds(BOXES, draws.draw(BOXES, 0, index), SHORT).with_params(PAPER)
 
 
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory):
-    """A run that nothing disturbed."""
+    """An undisturbed run."""
     return swept(tmp_path_factory.mktemp("whole"))
 
 
 def test_a_world_in_a_refilled_slot_ends_as_it_does_alone():
-    """Bit by bit, for one number of slots: whatever shares the batch, whenever it began."""
-    together = outcomes([made(np.arange(13)), made(np.arange(13, 20))])
+    """Bit for bit with a fixed number of slots, whatever shares the batch."""
+    together = outcomes([box_worlds(np.arange(13)), box_worlds(np.arange(13, 20))])
     assert len(together) == 20
-    assert len({float(one.time) for one in together.values()}) > 3  # they end at different times
+    assert (
+        len({float(outcome.time) for outcome in together.values()}) > 3
+    )  # they end at different times
     for index in (0, 9, 19):
-        padded = made(np.full(SLOTS, index))  # a batch of one program, of this world alone
+        padded = box_worlds(np.full(SLOTS, index))  # a batch of one program, of this world alone
         alone = outcomes([padded._replace(numbers=np.arange(SLOTS))])
         same(alone[0], together[index])
 
 
 @pytest.mark.parametrize("error", ["pose_latency", "command_delay"])
 def test_late_poses_and_late_commands_are_late_by_as_much(error):
-    """Of a base that is told to turn: what is believed, and done, is what was n steps before."""
+    """While the base turns, sensed poses or applied commands lag n steps behind."""
     steps, period = 3, SHORT.physics.control_period
     still = replace(BOXES, **{name: Range(0, 0) for name in domain.quantities_of("base")})
     late = replace(still, **{error: Range(steps * period, steps * period)})
     part = drawn_worlds(late, draws.draw(late, 0, [0]), SHORT).with_params(PAPER)
     inputs = row((part.worlds, part.params), 0)
-    now = jax.tree.map(jnp.asarray, trial.start(*inputs))
+    state = jax.tree.map(jnp.asarray, trial.start(*inputs))
     decide = jax.jit(partial(trial.decide, loop=trial.ControlLoop(SHORT.physics)))
-    told, done = [], []
+    commanded, applied = [], []
     for step in range(8):
-        now = now._replace(qpos=now.qpos.at[2].set(0.01 * step))  # turned by hand
-        now, twist, seen = decide(*inputs, now)
-        now = now._replace(steps=now.steps + 1)
-        told.append([float(x) for x in seen.twist])
-        done.append([float(x) for x in twist])
+        state = state._replace(qpos=state.qpos.at[2].set(0.01 * step))  # turned by hand
+        state, twist, snapshot = decide(*inputs, state)
+        state = state._replace(steps=state.steps + 1)
+        commanded.append([float(x) for x in snapshot.twist])
+        applied.append([float(x) for x in twist])
     if error == "command_delay":
-        np.testing.assert_allclose(done[steps:], told[:-steps], rtol=1e-6)
-        np.testing.assert_array_equal(done[:steps], 0.0)
+        np.testing.assert_allclose(applied[steps:], commanded[:-steps], rtol=1e-6)
+        np.testing.assert_array_equal(applied[:steps], 0.0)
     else:
-        np.testing.assert_allclose(done, told)
-        assert np.abs(np.array(told[: steps + 1]) - told[0]).max() == 0  # nothing seen yet
-        assert np.abs(np.array(told[steps + 1]) - told[0]).max() > 0
+        np.testing.assert_allclose(applied, commanded)
+        assert (
+            np.abs(np.array(commanded[: steps + 1]) - commanded[0]).max() == 0
+        )  # nothing seen yet
+        assert np.abs(np.array(commanded[steps + 1]) - commanded[0]).max() > 0
 
 
 @pytest.mark.slow
 def test_a_base_that_errs_by_nothing_is_perfect():
     nothing = {name: Range(0, 0) for name in domain.quantities_of("base")}
     perfect = replace(CYLINDERS, **nothing)
-    assert made(np.arange(2)).worlds.odometry.past.shape[1] > 1
+    assert box_worlds(np.arange(2)).worlds.odometry.past.shape[1] > 1
     drawn = draws.draw(perfect, 0, np.arange(6))
     part = drawn_worlds(perfect, drawn, SHORT).with_params(PAPER)
     assert part.worlds.odometry.past.shape == (6, 0)
@@ -135,8 +139,8 @@ def test_flat_boxes_that_nothing_touches_stay_where_they_are():
     flat = replace(BOXES, size=Range(0.25, 0.35), height=Range(0.3, 0.4), gap=Range(0.05, 0.05))
     still = PAPER._replace(v_approach=0.0)
     part = drawn_worlds(flat, draws.draw(flat, 0, np.arange(SLOTS)), SHORT).with_params(still)
-    found = outcomes([part])
-    pose = np.array([found[i].object_pose for i in range(SLOTS)])
+    ended = outcomes([part])
+    pose = np.array([ended[i].object_pose for i in range(SLOTS)])
     assert np.abs(pose[:, :2] - part.worlds.qpos[:, 3:5]).max() < 2e-3  # in 20 s
     assert np.abs(pose[:, 2] - planar.yaw_of_quaternion(part.worlds.qpos[:, 6:])).max() < 0.01
 
@@ -194,10 +198,10 @@ def test_two_devices_find_what_one_finds_and_never_talk(whole, tmp_path):
         merge([folder], out=tmp_path)
         results.append(files.read_results(tmp_path))
     # Another program rounds otherwise, and contact amplifies it.
-    two, one = results
-    np.testing.assert_array_equal(two.success, one.success)
-    np.testing.assert_allclose(two.min_distance, one.min_distance, atol=0.02)
-    assert np.median(np.abs(two.time - one.time)) < 0.1
+    double, single = results
+    np.testing.assert_array_equal(double.success, single.success)
+    np.testing.assert_allclose(double.min_distance, single.min_distance, atol=0.02)
+    assert np.median(np.abs(double.time - single.time)) < 0.1
 
 
 def test_results_hold_every_world_with_what_was_drawn(whole, tmp_path):
@@ -211,10 +215,10 @@ def test_results_hold_every_world_with_what_was_drawn(whole, tmp_path):
     undrawn = {name for name in QUANTITIES if getattr(BOXES, name) is None}
     assert undrawn == {*domain.quantities_of("robot"), "foam", "time_constant", "feet"}
     assert set(LABELS) == {*columns, *undrawn}
-    again = outcomes([made(np.arange(20))])
-    for i, one in again.items():
-        assert float(results.time.sel(law="rps")[i]) == one.time
-        assert int(results.success.sel(law="rps")[i]) == int(one.success)
+    again = outcomes([box_worlds(np.arange(20))])
+    for i, outcome in again.items():
+        assert float(results.time.sel(law="rps")[i]) == outcome.time
+        assert int(results.success.sel(law="rps")[i]) == int(outcome.success)
     json.dumps(load_plan(whole).configuration())
     assert load_plan(whole) == PLAN
 
@@ -236,7 +240,7 @@ def sweep_in_a_process(folder):
 
 
 def test_a_run_killed_six_times_ends_as_one_that_was_not(tmp_path, monkeypatch):
-    """SIGKILL at random moments, in turn of a start and of the work; then one may end."""
+    """SIGKILL hits start and work alternately at random moments; the last process ends."""
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join(sys.path))  # or the server finds no tests
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload(["test_sweep"])
@@ -246,11 +250,11 @@ def test_a_run_killed_six_times_ends_as_one_that_was_not(tmp_path, monkeypatch):
         return len(list(folder.glob("parts/*.npz")))
 
     for kill in range(7):
-        before = done()
+        previous = done()
         process = context.Process(target=sweep_in_a_process, args=(folder,))
         process.start()
         if kill < 6:
-            while kill % 2 and process.is_alive() and done() == before:
+            while kill % 2 and process.is_alive() and done() == previous:
                 time.sleep(0.01)  # until it is at work, however slow the machine
             process.join(dice.uniform(0.0, 0.5 if kill % 2 else 2.0))
             process.kill()
@@ -262,17 +266,17 @@ def test_a_run_killed_six_times_ends_as_one_that_was_not(tmp_path, monkeypatch):
 
 
 def ends_in_one_sentence_and_is_continued(folder, whole, capsys, monkeypatch, *words):
-    """What was done stays, alone, and is not run again; then all is as if nothing had happened."""
+    """Check the error, that finished parts are kept and not repeated, and the final results."""
     assert running.exit_code(lambda: swept(folder)) == 2
     error = one_sentence(capsys.readouterr().err)
     assert all(word in error for word in words)
     monkeypatch.undo()
-    kept = parts_of(folder)
-    assert 0 < len(kept) < len(PLAN.chunks)
-    assert kept.items() <= parts_of(whole).items()
+    stored = parts_of(folder)
+    assert 0 < len(stored) < len(PLAN.chunks)
+    assert stored.items() <= parts_of(whole).items()
     finished = []
     swept(folder, callback=lambda progress: finished.append(progress.finished))
-    assert finished[0] == sum(PLAN.chunks[int(name[:7])].size for name in kept)
+    assert finished[0] == sum(PLAN.chunks[int(name[:7])].size for name in stored)
     assert parts_of(folder) == parts_of(whole)
 
 
@@ -292,10 +296,10 @@ def test_a_full_disk_loses_nothing(whole, tmp_path, capsys, monkeypatch):
 def test_a_device_out_of_memory_loses_nothing(whole, tmp_path, capsys, monkeypatch):
     program = jax.stages.Compiled.__call__
 
-    def starved(*given, **options):
+    def starved(*args, **options):
         if list(tmp_path.glob("parts/[0-9]*")):
             raise jax.errors.JaxRuntimeError("RESOURCE_EXHAUSTED: Out of memory.")
-        return program(*given, **options)
+        return program(*args, **options)
 
     monkeypatch.setattr(jax.stages.Compiled, "__call__", starved)
     words = ("out of memory", "--slots", "is kept")
@@ -305,30 +309,28 @@ def test_a_device_out_of_memory_loses_nothing(whole, tmp_path, capsys, monkeypat
 def test_a_corrupt_part_is_set_aside_and_done_again_alone(whole, tmp_path):
     folder = shutil.copytree(whole, tmp_path / "run")
     victim = sorted(folder.glob("parts/*.npz"))[2]
-    others = {
-        path: path.stat().st_mtime_ns for path in folder.glob("parts/*.npz") if path != victim
-    }
+    times = {path: path.stat().st_mtime_ns for path in folder.glob("parts/*.npz") if path != victim}
     content = bytearray(victim.read_bytes())
     content[len(content) // 2] ^= 1
     victim.write_bytes(content)
     finished = []
     swept(folder, callback=lambda progress: finished.append(progress.finished))
     assert finished[0] == PLAN.num_trials - PLAN.chunks[2].size
-    assert {path: path.stat().st_mtime_ns for path in others} == others
-    aside = victim.with_suffix(".npz.corrupt")
-    assert aside.read_bytes() == bytes(content)
-    aside.unlink()
+    assert {path: path.stat().st_mtime_ns for path in times} == times
+    corrupt = victim.with_suffix(".npz.corrupt")
+    assert corrupt.read_bytes() == bytes(content)
+    corrupt.unlink()
     assert parts_of(folder) == parts_of(whole)
 
 
 def test_a_part_of_an_older_version_is_named(whole, tmp_path):
     folder = shutil.copytree(whole, tmp_path / "run")
     victim = sorted(folder.glob("parts/*.npz"))[0]
-    kept = files.decode_arrays(victim.read_bytes())
-    del kept["tipped"]
-    older = files.encode_results(xr.Dataset({name: xr.Variable((), 0) for name in kept}))
+    columns = files.decode_arrays(victim.read_bytes())
+    del columns["tipped"]
+    older = files.encode_results(xr.Dataset({name: xr.Variable((), 0) for name in columns}))
     for content, lacks in (
-        (files.encode_arrays(**kept), "lacks tipped"),
+        (files.encode_arrays(**columns), "lacks tipped"),
         (older, "is a NetCDF file"),
     ):
         victim.unlink()
@@ -340,11 +342,11 @@ def test_a_part_of_an_older_version_is_named(whole, tmp_path):
 def test_a_run_with_the_removed_column_overflows_is_read(whole, tmp_path):
     folder = shutil.copytree(whole, tmp_path / "run")
     expected = merge([folder], out=folder)
-    for number, chunk in enumerate(sorted(folder.glob("parts/*.npz"))):
+    for index, chunk in enumerate(sorted(folder.glob("parts/*.npz"))):
         columns = files.decode_arrays(chunk.read_bytes())
         chunk.unlink()
         older = columns | {"overflows": np.zeros(columns["trial"].size, np.int32)}
-        execution.store_chunk(folder, number, files.encode_arrays(**older))
+        execution.store_chunk(folder, index, files.encode_arrays(**older))
     xr.testing.assert_identical(merge([folder], out=folder), expected)
 
 
@@ -367,16 +369,16 @@ def test_shards_merge_to_the_whole(whole, tmp_path):
     merge([whole], out=tmp_path / "direct")
     together = [files.read_results(f) for f in (tmp_path, tmp_path / "direct")]
     xr.testing.assert_identical(*together)
-    other = replace(PLAN, setting=replace(SHORT, seed=5))
-    open_run(tmp_path / "other", other)
+    other_plan = replace(PLAN, setting=replace(SHORT, seed=5))
+    open_run(tmp_path / "other", other_plan)
     with pytest.raises(InputError, match="seed = 0 there, 5 asked for"):
         merge([folders[0], tmp_path / "other"], out=tmp_path)
 
 
 def test_another_configuration_is_refused_with_what_differs(whole):
-    other = replace(PLAN, worlds=30, domain=replace(BOXES, mass=Range(1, 2)))
+    changed_plan = replace(PLAN, worlds=30, domain=replace(BOXES, mass=Range(1, 2)))
     with pytest.raises(InputError, match=r"domain.mass = .*there, .* asked for; worlds = 20 there"):
-        open_run(whole, other)
+        open_run(whole, changed_plan)
 
 
 def test_sweep_merge_and_replay_on_the_command_line(tmp_path, capsys):
@@ -397,11 +399,11 @@ def test_sweep_merge_and_replay_on_the_command_line(tmp_path, capsys):
     for folder, name in product(("run", "there"), ("report.html", "report.md", "success.png")):
         assert (tmp_path / folder / name).exists()
     assert load_plan(tmp_path / "there") == load_plan(run)
-    other = open_run(tmp_path / "other", PLAN)
-    error = refusal(capsys, "merge", run, "--out", other)
+    other_run = open_run(tmp_path / "other", PLAN)
+    error = refusal(capsys, "merge", run, "--out", other_run)
     assert "other holds another run (domain.objects = " in error
-    assert not (other / "results.nc").exists()
+    assert not (other_run / "results.nc").exists()
     assert rps("replay", run, 4, "--law", "rps,tuned", "--film-length", 0.1) == 0
-    seen = files.read_dataset(run / "replay-4" / "results.nc")
+    replayed = files.read_dataset(run / "replay-4" / "results.nc")
     # Followed alone, in another batch than in the sweep.
-    assert float(seen.outcome_time) == pytest.approx(float(results.time[1, 4]), abs=0.5)
+    assert float(replayed.outcome_time) == pytest.approx(float(results.time[1, 4]), abs=0.5)

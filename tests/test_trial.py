@@ -62,8 +62,8 @@ def test_a_short_push_reaches_a_near_target(outcomes):
     assert (outcomes.time[:2] < 24).all()
 
 
-def test_a_gpu_that_seldom_asks_who_still_runs_finds_the_same(monkeypatch):
-    """As it would be traced there: 40 steps, in which trials end by their horizon, or do not."""
+def test_rare_termination_checks_on_a_gpu_do_not_change_results(monkeypatch):
+    """Trace 40 steps for the GPU; some trials reach their horizon within them."""
     setting = Setting(engine="quasistatic")
     _, worlds, stage, params = pushes.build([case(), case(AHEAD)], setting)
     start = trial.start_all(worlds, params, np.ones(2, bool))
@@ -106,10 +106,10 @@ def test_the_last_trials_of_jobs_end_alike_side_by_side(monkeypatch, most):
 
 def test_a_base_may_turn_as_often_as_it_likes_and_not_go_as_far():
     part = pushes.build([case()], FUSED)
-    now = trial.start(*jax.tree.map(lambda leaf: jnp.asarray(leaf)[0], part[1::2]))
+    state = trial.start(*jax.tree.map(lambda leaf: jnp.asarray(leaf)[0], part[1::2]))
     for i, value, diverges in ((2, 500.0, False), (2, np.nan, True), (0, 101.0, True)):
-        driven = Driven(trial.motion(now)._replace(qpos=now.qpos.at[i].set(value)))
-        assert bool(trial.settle(now, now, driven).diverged) == diverges
+        driven = Driven(trial.motion(state)._replace(qpos=state.qpos.at[i].set(value)))
+        assert bool(trial.settle(state, state, driven).diverged) == diverges
 
 
 def test_a_shove_happens_once_however_its_time_is_rounded():
@@ -120,13 +120,15 @@ def test_a_shove_happens_once_however_its_time_is_rounded():
 
     def moved(time, period, steps):
         shoved = world._replace(shift=Shift(time, jnp.array([0.1, 0.0])))
-        after = trial.shifted(shoved, start._replace(steps=steps), period)
-        return after.qpos[x] - start.qpos[x]
+        result = trial.shifted(shoved, start._replace(steps=steps), period)
+        return result.qpos[x] - start.qpos[x]
 
-    every = jax.jit(jax.vmap(jax.vmap(moved, (None, None, 0)), (0, None, None)), static_argnums=1)
+    moved_by_all = jax.jit(
+        jax.vmap(jax.vmap(moved, (None, None, 0)), (0, None, None)), static_argnums=1
+    )
     times = np.concatenate([np.arange(0, 10, 0.01), [np.inf]]).astype(np.float32)
     for period in (0.005, 0.02, 0.05):
-        total = np.asarray(every(times, period, np.arange(2100))).sum(axis=1)
+        total = np.asarray(moved_by_all(times, period, np.arange(2100))).sum(axis=1)
         np.testing.assert_allclose(total[:-1], 0.1, atol=1e-4)
         assert total[-1] == 0
 
@@ -169,11 +171,11 @@ def advanced():
     broken = worlds._replace(qpos=worlds.qpos.at[1, 4].set(jnp.nan))
     live = jnp.ones(SLOTS, bool)
 
-    def after(some):
-        trials = trial.start_all(some, params, live)
-        return advance(stage, some, params, trials, ControlLoop(preset()), 20)
+    def run(subset):
+        trials = trial.start_all(subset, params, live)
+        return advance(stage, subset, params, trials, ControlLoop(preset()), 20)
 
-    return after(worlds), after(broken)
+    return run(worlds), run(broken)
 
 
 def test_a_diverged_world_freezes_and_leaves_the_others_bit_unchanged(advanced):
@@ -196,12 +198,12 @@ def test_an_object_that_leans_too_far_has_fallen_over_and_ends_its_trial():
 
     def observed(**rules):
         observe = partial(trial.observe, physics=preset(), **rules)
-        return jax.vmap(lambda *one: observe(*one)[0])(worlds, params, trials)
+        return jax.vmap(lambda *arrays: observe(*arrays)[0])(worlds, params, trials)
 
-    seen = observed()
-    assert seen.tipped.tolist() == seen.done.tolist() == [False, False, True, True]
-    np.testing.assert_array_equal(seen.tipped, seen.tilt > Rules().max_tilt)
-    assert not seen.success.any()
+    ended = observed()
+    assert ended.tipped.tolist() == ended.done.tolist() == [False, False, True, True]
+    np.testing.assert_array_equal(ended.tipped, ended.tilt > Rules().max_tilt)
+    assert not ended.success.any()
     assert not observed(rules=Rules(max_tilt=3)).tipped.any()
 
 
@@ -216,9 +218,9 @@ def test_the_way_of_the_base_is_its_speed_times_time(outcomes, advanced):
 def test_padding_never_moves_and_a_finished_batch_stops_at_once():
     stage, worlds, params = world_batch(SLOTS)
     trials = trial.start_all(worlds, params, jnp.zeros(SLOTS, bool))
-    after = advance(stage, worlds, params, trials, ControlLoop(preset()), 20)
-    np.testing.assert_array_equal(after.qpos, worlds.qpos)
-    assert (np.asarray(after.steps) == 0).all()
+    stepped = advance(stage, worlds, params, trials, ControlLoop(preset()), 20)
+    np.testing.assert_array_equal(stepped.qpos, worlds.qpos)
+    assert (np.asarray(stepped.steps) == 0).all()
 
 
 def test_before_the_first_touch_the_base_creeps_and_nothing_counts_as_lost(advanced):
@@ -229,20 +231,22 @@ def test_before_the_first_touch_the_base_creeps_and_nothing_counts_as_lost(advan
 
 
 @pytest.mark.parametrize("engine", ["fused", "mujoco"])
-def test_the_trace_of_a_trial_tells_the_same_story_as_its_outcome(engine):
+def test_the_trace_of_a_trial_agrees_with_its_outcome(engine):
     setting = replace(FUSED, engine=engine, rules=Rules(horizon=24.0))
     (trace,) = pushes.record_cases([case(skin=CapacitiveSkin())], setting, interval=0.1)
-    seen, outcome = trace.snapshots, trace.outcome
+    snapshots, outcome = trace.snapshots, trace.outcome
     assert outcome.success
-    assert np.allclose(np.diff(seen.time), 0.1, atol=1e-4)
-    assert outcome.time == pytest.approx(seen.time[-1], abs=0.1)
-    touching = seen.reading.contact_type > 0
-    assert seen.details.distance[touching].min() == pytest.approx(outcome.min_distance, abs=0.002)
-    speed = np.hypot(seen.twist.v_x, seen.twist.v_y)
+    assert np.allclose(np.diff(snapshots.time), 0.1, atol=1e-4)
+    assert outcome.time == pytest.approx(snapshots.time[-1], abs=0.1)
+    touching = snapshots.reading.contact_type > 0
+    assert snapshots.details.distance[touching].min() == pytest.approx(
+        outcome.min_distance, abs=0.002
+    )
+    speed = np.hypot(snapshots.twist.v_x, snapshots.twist.v_y)
     assert speed.max() <= 0.05 * (1 + 1e-5)
     # The base is where its commanded twist takes it.
-    travelled = np.trapezoid(seen.twist.v_x, seen.time)
-    assert seen.qpos[-1, 0] == pytest.approx(travelled, abs=0.005)
+    travelled = np.trapezoid(snapshots.twist.v_x, snapshots.time)
+    assert snapshots.qpos[-1, 0] == pytest.approx(travelled, abs=0.005)
 
 
 @pytest.mark.parametrize(

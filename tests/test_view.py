@@ -40,28 +40,28 @@ PERIOD = SETTING.physics.control_period
 
 
 @pytest.fixture(scope="module")
-def one():
+def shared_push():
     return Live.of_case(CASE, SETTING)
 
 
 @pytest.fixture
-def live(one):
-    one.reset()
-    return one
+def live(shared_push):
+    shared_push.reset()
+    return shared_push
 
 
 def p_world_contact(live):
-    """Where the object was last felt (2,) [m]."""
+    """Return the last contact point (2,) [m]."""
     return live.past[-1].p_world_contact
 
 
-def p_robot_object(seen):
-    """Where the object is (2,) [m], in the robot's frame."""
-    c, s = math.cos(seen.qpos[2]), math.sin(seen.qpos[2])
-    return np.array([[c, s], [-s, c]]) @ (seen.qpos[3:5] - seen.qpos[:2])
+def p_robot_object(snapshot):
+    """Return the position of the object (2,) [m] in the robot's frame."""
+    c, s = math.cos(snapshot.qpos[2]), math.sin(snapshot.qpos[2])
+    return np.array([[c, s], [-s, c]]) @ (snapshot.qpos[3:5] - snapshot.qpos[:2])
 
 
-OWN = """
+CUSTOM_LAW = """
 from typing import NamedTuple
 
 import rps_jax
@@ -85,10 +85,10 @@ rps_jax.register_law("ahead", Law(lambda params: (), step), Ahead())
     "law", ["rps,K_h=0.3", "rps,tuned.json", "mine.py:Ahead,v=0.04", "policy.npz"]
 )
 def test_every_kind_of_law_is_shown_live(law, tmp_path, monkeypatch, registries):
-    """As the page asks for it: by name with changes, tuned, of a file of one's own, and learned."""
+    """Laws are given by name with changes, as tuned parameters, as a user's file, or learned."""
     monkeypatch.chdir(tmp_path)
     (tmp_path / "tuned.json").write_text(json.dumps({"L": 0.3}))
-    (tmp_path / "mine.py").write_text(OWN)
+    (tmp_path / "mine.py").write_text(CUSTOM_LAW)
     shutil.copy(Path(learned.__file__).parent / "learned_mlp.npz", tmp_path / "policy.npz")
     request = viewer.PushRequest("cylinder", "S1", law, (0.6, 0.0))
     shown = viewer.View(law=law, setting=replace(SETTING, engine="quasistatic"))
@@ -204,11 +204,11 @@ FLAGS = (
 REQUEST = viewer.PushRequest("cylinder", "S1", "rps", (0.0, 2.0))
 
 
-def make(asked):
-    friction = scene.FRICTION.get(asked.friction)
+def make(request):
+    friction = scene.FRICTION.get(request.friction)
     if friction is None:
-        raise InputError(f"unknown friction set '{asked.friction}': choose from S1, S2.")
-    case = Case(asked.object, friction, asked.target)
+        raise InputError(f"unknown friction set '{request.friction}': choose from S1, S2.")
+    case = Case(request.object, friction, request.target)
     long = replace(SETTING, rules=Rules())
     return viewer.Push(Live.of_case(case, long), pushes.scene_of(case, long.physics), "A drum")
 
@@ -235,7 +235,7 @@ def browser(tmp_path):
 
 
 def picture(browser):
-    """What the browser shows, (height, width, 3) uint8."""
+    """Return a screenshot of the browser (height, width, 3) uint8."""
     return np.asarray(Image.open(io.BytesIO(browser.get_screenshot_as_png())))[..., :3]
 
 
@@ -247,11 +247,11 @@ def test_the_page_plays_a_push_and_says_what_is_wrong(page, browser):
     def text():
         return browser.find_element(By.TAG_NAME, "body").text
 
-    def until(met):
-        """Have the page go on, at a pace at which a processor can draw it, until this is so."""
-        began = time.monotonic()
-        while not met():
-            assert time.monotonic() - began < 90, text()
+    def until(condition):
+        """Advance the page, slowly enough for rendering on a CPU, until a condition holds."""
+        start_time = time.monotonic()
+        while not condition():
+            assert time.monotonic() - start_time < 90, text()
             page.tick(0.1)
             time.sleep(0.2)
 
@@ -278,29 +278,29 @@ def test_the_page_plays_a_push_and_says_what_is_wrong(page, browser):
     until(lambda: "unknown friction set 'S3': choose from S1, S2." in text())
 
 
-# --- who is let in -------------------------------------------------------------------------
+# --- access control ------------------------------------------------------------------------
 
 
 def connected(page, **options):
-    """A websocket to the page, as its own script opens it unless something else is said."""
+    """Open a websocket to the page, by default as the page's own script does."""
     address = f"127.0.0.1:{page._server.get_port()}"
-    usual = {"origin": f"http://{address}", "subprotocols": [f"viser-v{viser.__version__}"]}
-    return connect(f"ws://{address}", **usual | options)
+    defaults = {"origin": f"http://{address}", "subprotocols": [f"viser-v{viser.__version__}"]}
+    return connect(f"ws://{address}", **defaults | options)
 
 
-def said(page, *messages):
-    """Send messages to the page, and wait until it has looked at them."""
+def send_messages(page, *messages):
+    """Send messages to the page, and wait until it has handled them."""
     with connected(page) as socket_:
         for message in (CAMERA, *messages):
             raw = message if isinstance(message, bytes | str) else msgspec.msgpack.encode(message)
             socket_.send(raw)
-        before = page._distance.value
-        after = 0.3 if before != 0.3 else 0.2
-        socket_.send(msgspec.msgpack.encode(value(page._distance, after)))
+        distance = page._distance.value
+        new_distance = 0.3 if distance != 0.3 else 0.2
+        socket_.send(msgspec.msgpack.encode(value(page._distance, new_distance)))
         deadline = time.monotonic() + 10
-        while page._distance.value != after and time.monotonic() < deadline:
+        while page._distance.value != new_distance and time.monotonic() < deadline:
             time.sleep(0.01)
-        assert page._distance.value == after  # the connection is still good
+        assert page._distance.value == new_distance  # the connection is still good
 
 
 def value(control, new):
@@ -334,9 +334,9 @@ def test_it_is_served_under_names_of_this_machine_alone(page, host, status):
 
 
 def test_only_what_the_controls_offer_comes_through(page, capfd):
-    before = page.request
+    request = page.request
     infinite, huge = float("inf"), 1e300
-    said(
+    send_messages(
         page,
         value(page._law, "/some/path/evil.py:P"),
         value(page._law, ["rps"]),
@@ -357,14 +357,14 @@ def test_only_what_the_controls_offer_comes_through(page, capfd):
         {"type": "Nothing"},
         b"\xc1", b"", "a text", b"\x91" * 100_000,
     )  # fmt: skip
-    assert page.request == before
+    assert page.request == request
     assert page._time.value == 0.0
     assert page._speed.value == 5.0
     assert page._server._share_tunnel is None
     error = capfd.readouterr().err
     assert error == "rps view: a message that the page does not send was dropped.\n"
-    said(page, value(page._law, "nps"), value(page._target, [1.0, 2.0]))
-    assert page.request == before._replace(law="nps", target=(1.0, 2.0))
+    send_messages(page, value(page._law, "nps"), value(page._target, [1.0, 2.0]))
+    assert page.request == request._replace(law="nps", target=(1.0, 2.0))
 
 
 def test_a_viser_that_is_not_guarded_is_not_served(monkeypatch):
@@ -374,8 +374,8 @@ def test_a_viser_that_is_not_guarded_is_not_served(monkeypatch):
 
 
 def test_a_port_that_is_taken_is_one_sentence(capsys):
-    with socket.create_server(("127.0.0.1", 0)) as taken:
-        port = taken.getsockname()[1]
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        port = server.getsockname()[1]
         error = refusal(capsys, "view", "--port", port)
     assert f"port = {port} cannot be served on (Address already in use)" in error
 
