@@ -1,4 +1,4 @@
-"""All commands and flags of `rps`, with metavars, defaults and help: a record that shows changes.
+"""The record of all commands and flags of `rps`, with metavars, defaults and help.
 
     python tests/command_line.py        # write tests/command_line.json anew
 
@@ -50,10 +50,10 @@ def flags_of(command: str) -> Flags:
         if names_ in ("-h,", "--help"):
             continue
         text = " ".join(rest)
-        found = _DEFAULT.search(text)
+        match = _DEFAULT.search(text)
         flags[names_.rstrip(",")] = {
             "metavar": metavar,
-            "default": found["default"] if found else None,
+            "default": match["default"] if match else None,
             "help": _DEFAULT.sub("", text),
         }
     return flags

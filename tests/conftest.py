@@ -23,7 +23,7 @@ def pytest_configure(config):
     rendering.choose_gl()
     device.configure_xla()
     cache = config.rootpath / ".jax_cache"
-    os.environ.setdefault("RPS_CACHE", str(cache))  # of commands, also in processes of their own
+    os.environ.setdefault("RPS_CACHE", str(cache))  # of commands, also in subprocesses
     jax.config.update("jax_compilation_cache_dir", os.environ["RPS_CACHE"])
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
 
@@ -44,17 +44,17 @@ def pytest_collection_modifyitems(items):
 
 @pytest.fixture
 def compiled():
-    """How long [s] each compilation of this test took; the list grows as the test goes on."""
+    """Durations [s] of the compilations of this test so far."""
     from jax import monitoring
 
-    took = []
+    durations = []
 
     def note(event, duration, **_):
         if event == "/jax/core/compile/backend_compile_duration":
-            took.append(duration)
+            durations.append(duration)
 
     monitoring.register_event_duration_secs_listener(note)
-    yield took
+    yield durations
     monitoring.unregister_event_duration_listener(note)
 
 
@@ -71,7 +71,7 @@ def optimised():
 
 @pytest.fixture
 def registries():
-    """What a test registers is forgotten after it."""
+    """Restore the registries of objects and laws after a test."""
     from helpers import temporary_names
 
     with temporary_names():

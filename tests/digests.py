@@ -54,7 +54,7 @@ RUNS = {
     "export_js": "export js --law rps",
     "export_onnx": "export onnx --law rps_tuned",
 }
-_NUMBER = re.compile(r"(?<![\w.])[-+]?\d+(?:\.\d+)?(?:e[-+]?\d+)?")
+_FLOAT = re.compile(r"(?<![\w.])[-+]?\d+(?:\.\d+)?(?:e[-+]?\d+)?")
 # Lines of a report with times, versions or the command.
 _VOLATILE = re.compile(r"compile|commit|jax |python|version|\bs of\b| run |seconds|minute", re.I)
 
@@ -86,12 +86,12 @@ def folder_digests(out: Path) -> dict[str, str]:
             digests |= {f"{name}:{key}": value for key, value in dataset_digests(path).items()}
         elif path.name == "report.md":
             lines = [line for line in path.read_text().splitlines() if not _VOLATILE.search(line)]
-            digests[name] = digest(" ".join(_NUMBER.findall("\n".join(lines))).encode())
+            digests[name] = digest(" ".join(_FLOAT.findall("\n".join(lines))).encode())
         elif path.suffix in (".h", ".mjs", ".onnx"):
             content = path.read_bytes()
             if path.suffix != ".onnx":  # numbers and operators, without names and comments
                 text = re.sub(r"//.*|/\*.*?\*/", "", content.decode(), flags=re.DOTALL)
-                content = " ".join(_NUMBER.findall(text)).encode()
+                content = " ".join(_FLOAT.findall(text)).encode()
             digests[name] = digest(content)
     return digests
 
@@ -104,7 +104,7 @@ def record(pattern: str, folder: Path) -> dict[str, dict[str, str]]:
     for name, command in RUNS.items():
         if pattern not in name and f"{{{pattern}" not in command:
             continue
-        outs = {other: str(folder / other) for other in RUNS}
+        outs = {run: str(folder / run) for run in RUNS}
         words = [word.format(**outs) for word in shlex.split(command)]
         start, text = time.perf_counter(), io.StringIO()
         with contextlib.redirect_stdout(text), contextlib.redirect_stderr(text):

@@ -1,4 +1,4 @@
-"""What several files of tests share: commands, small trials and sweeps, shapes and comparisons."""
+"""Helpers of several test files: commands, small trials and sweeps, shapes and comparisons."""
 
 import ast
 import contextlib
@@ -116,19 +116,19 @@ def swept(folder: Path, plan: Plan = PLAN, **options: Any) -> Path:
 
 
 def parts_of(folder: Path) -> dict[str, bytes]:
-    """The files of the parts in a run folder, by name."""
+    """Return the contents of the parts in a run folder, by file name."""
     return {path.name: path.read_bytes() for path in (folder / "parts").iterdir()}
 
 
 @contextlib.contextmanager
 def temporary_names() -> Iterator[None]:
-    """Objects and laws that are registered meanwhile are forgotten afterwards."""
+    """Restore the registries of objects and laws at the end of the block."""
     tables = (objects.FAMILIES, objects.REGISTERED, registry.LAWS, registry._LAWS_BY_CLASS)
-    before = [dict(table) for table in tables]
+    saved = [dict(table) for table in tables]
     try:
         yield
     finally:
-        for table, content in zip(tables, before, strict=True):
+        for table, content in zip(tables, saved, strict=True):
             table.clear()
             table.update(content)
 
@@ -140,13 +140,13 @@ SETTLED = 1e3  # [s] a period after which a skin's low-pass filter has forgotten
 
 
 def box(x: Any, y: Any, half: float = 0.2, yaw: Any = 0.0) -> Footprint:
-    """A square of this half width [m] about (x, y) [m]."""
+    """Return a square of half width `half` [m] about (x, y) [m]."""
     return fp.place(fp.rectangle(half, half), jnp.array([x, y]), jnp.float32(yaw))
 
 
 @jax.jit
 def place_before_the_front(shape: Footprint, yaw: Any, y: Any, gap: Any) -> Footprint:
-    """`shape` turned by `yaw`, its origin at `y`, its nearest point `gap` before the front."""
+    """Return `shape` turned by `yaw`, with its origin at `y` and `gap` to the front face."""
     turned = fp.place(shape, jnp.zeros(2), yaw)
     x = FRONT + gap + fp.extent(turned, jnp.array([-1.0, 0.0]))
     return fp.place(turned, jnp.stack([x, jnp.asarray(y, x.dtype)]), 0.0)
@@ -156,7 +156,7 @@ def place_before_the_front(shape: Footprint, yaw: Any, y: Any, gap: Any) -> Foot
 
 
 def imported(path: Path) -> Iterator[str]:
-    """Names of the package's modules that a script imports."""
+    """Yield the names of the package's modules that a script imports."""
     for node in ast.walk(ast.parse(path.read_text())):
         if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("rps_jax"):
             yield str(node.module)
@@ -165,28 +165,28 @@ def imported(path: Path) -> Iterator[str]:
 
 
 def addresses() -> Iterator[tuple[str, str]]:
-    """Modules and names below the top that the table of public names has."""
+    """Yield module and name of each entry below the top level in the table of public names."""
     for line in (ROOT / "rps_jax" / "README.md").read_text().splitlines():
-        if found := re.match(r"\| `(rps_jax\.[\w.]+)` \| (.*?) \|", line):
-            yield from ((found[1], name) for name in re.findall(r"`(\w+)`", found[2]))
+        if match := re.match(r"\| `(rps_jax\.[\w.]+)` \| (.*?) \|", line):
+            yield from ((match[1], name) for name in re.findall(r"`(\w+)`", match[2]))
 
 
 # --- comparisons ---------------------------------------------------------------------------
 
 
 def row(tree: Any, i: Any) -> Any:
-    """One row, or a slice of them, of every leaf."""
+    """Return a row or a slice of rows of every leaf."""
     return jax.tree.map(lambda leaf: leaf[i], tree)
 
 
 def same(a: Any, b: Any) -> None:
-    """Asserts that two trees are equal bit by bit."""
+    """Assert that two trees are equal bit for bit."""
     for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True):
         np.testing.assert_array_equal(x, y)
 
 
 def decode(path: Path) -> np.ndarray:
-    """All images of a video (count, height, width, 3); its reader forks, of which JAX warns."""
+    """Return the images of a video (count, height, width, 3); JAX warns of the reader's fork."""
     reader = imageio_ffmpeg.read_frames(str(path))
     width, height = next(reader)["size"]
     return np.array([np.frombuffer(f, np.uint8).reshape(height, width, 3) for f in reader])

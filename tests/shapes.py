@@ -25,28 +25,28 @@ CONF = BeartypeConf(is_pep484_tower=True)  # a whole number is a float
 
 
 def install():
-    """Check the calls of `MODULES`, which must not have been imported yet."""
+    """Check the calls of `MODULES`; call this before they are imported."""
     jaxtyping.install_import_hook(MODULES, "shapes.checked")
 
 
 def checked(function):
-    """A function whose calls are checked; jaxtyping hands in one that does nothing else."""
+    """Return a function whose calls are checked; jaxtyping calls this decorator."""
     inner, signature = beartype(conf=CONF)(function), inspect.signature(function)
-    typed = {name for name, one in signature.parameters.items() if one.annotation is not Any}
+    typed = {name for name, item in signature.parameters.items() if item.annotation is not Any}
 
     @functools.wraps(function)
     def call(*args, **kwargs):
         for name, value in signature.bind(*args, **kwargs).arguments.items():
-            for one in value if type(value) is tuple else (value,):
+            for item in value if type(value) is tuple else (value,):
                 with jaxtyping.jaxtyped("context"):  # `*B` is of one record
-                    look(one if name in typed else None)
+                    look(item if name in typed else None)
         return inner(*args, **kwargs)
 
     return call
 
 
 def look(value: Any) -> None:
-    """Raises TypeError if a record in a value has an array of another shape than it says."""
+    """Raise TypeError if an array of a record in `value` has another shape than annotated."""
     if not isinstance(value, tuple):
         return
     hints = shapes_of(type(value))

@@ -25,23 +25,25 @@ def staged(
     engine: str, scenes: Sequence[Scene], physics: Physics, robot: Robot = Robot()
 ) -> tuple[Any, Any]:
     """Stage and fields of worlds in scenes of one shape family."""
-    pairs = [[one.physics.pair(i) for i in range(one.physics.npair)] for one in scenes]
-    slide = [{pair.name.partition("_")[0]: pair.friction[0] for pair in some} for some in pairs]
-    friction = Friction(*(np.array([one[name] for one in slide]) for name in ("ground", "base")))
-    solids = solid.stack([one.solid for one in scenes])
+    pairs = [[loaded.physics.pair(i) for i in range(loaded.physics.npair)] for loaded in scenes]
+    slide = [{pair.name.partition("_")[0]: pair.friction[0] for pair in world} for world in pairs]
+    friction = Friction(
+        *(np.array([world[name] for world in slide]) for name in ("ground", "base"))
+    )
+    solids = solid.stack([loaded.solid for loaded in scenes])
     return engines.get(engine).stage(scenes[0].family, solids, friction, physics, robot)
 
 
 def recompiled(engine: str, scenes: Sequence[Scene]) -> Any:
     """Fields of worlds by what MuJoCo compiled for each, to compare with those of a stage."""
-    models = [one.physics for one in scenes]
+    models = [loaded.physics for loaded in scenes]
     if engine == "mjx":
         return jax.device_get(mjx_engine.stack(models)[1])
     if engine == "quasistatic":
         half = np.array([model.geom("base").size[:2] for model in models])
         friction = np.array([model.pair("base_object").friction[0] for model in models])
-        return sliders(solid.stack([one.solid for one in scenes]), friction, half)
-    bodies = [body(one.physics, one.solid.vertices) for one in scenes]
+        return sliders(solid.stack([loaded.solid for loaded in scenes]), friction, half)
+    bodies = [body(loaded.physics, loaded.solid.vertices) for loaded in scenes]
     return jax.tree.map(lambda *leaves: np.stack(leaves), *bodies)
 
 
@@ -86,11 +88,11 @@ def simulate(
     qvel: np.ndarray | None = None,
 ) -> Recording:
     """Step worlds from positions (n, 10) and velocities (n, 9) with a constant twist (n, 3)."""
-    found, count = engines.get(engine), len(qpos)
+    implementation, count = engines.get(engine), len(qpos)
     qvel = np.zeros((count, 9)) if qvel is None else qvel
     twist = np.broadcast_to(np.asarray(twist, float), (count, 3))
-    if not found.traced:
-        batch = found.stepper(stage, qpos, 2, robots)
+    if not implementation.traced:
+        batch = implementation.stepper(stage, qpos, 2, robots)
         batch.qvel[:] = qvel
         states = [(batch.qpos.copy(), batch.qvel.copy(), batch.force.copy())]
         for _ in range(periods):
@@ -104,7 +106,7 @@ def simulate(
     )
     motion = Motion(qpos, qvel, 0 * qvel, None if robots is None else jnp.zeros((count, 3)))
     twists = jnp.broadcast_to(jnp.asarray(twist), (periods, count, 3))
-    run = partial(drive, stage, physics=physics, force=found.computes_force)
+    run = partial(drive, stage, physics=physics, force=implementation.computes_force)
     return jax.tree.map(
         lambda x: np.asarray(x, float), jax.jit(run)(fields, motion, twists, robots=robots)
     )
@@ -128,5 +130,5 @@ def push_object(
     stage, fields = staged(engine, [loaded], physics, robot)
     robots = jax.tree.map(lambda x: np.asarray(x, float)[None], robot) if robot.driven else None
     periods = round(seconds / physics.control_period)
-    found = simulate(engine, stage, fields, start, twist, physics, periods, robots)
-    return Recording(*(x if x is None else x[:, 0] for x in found))
+    recording = simulate(engine, stage, fields, start, twist, physics, periods, robots)
+    return Recording(*(x if x is None else x[:, 0] for x in recording))

@@ -1,5 +1,5 @@
-"""Bad input on the command line: exit code 2 and a sentence that names field, value and what is
-allowed, before anything compiles."""
+"""Bad input on the command line: exit code 2 and a sentence with field, value and allowed values,
+before anything compiles."""
 
 import json
 import re
@@ -27,7 +27,7 @@ def unlike(option, value, *choices):
 
 
 ESTIMATORS = ("reverse", "evolution")
-# What is asked for, and what the answer says of it.
+# Patterns of errors by the arguments of a command.
 TABLE = {
     "--out run": "out = run holds another run .* choose another folder",
     "--objects bx": "unknown object 'bx': choose from box, cylinder, .*did you mean 'box'",
@@ -348,7 +348,7 @@ CHANGED_MANIFESTS = {
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """What the cases speak of: files of every kind of badness, and one run of three worlds."""
+    """Inputs of the cases: invalid files of all kinds, and one run of three worlds."""
     root = tmp_path_factory.mktemp("bad")
     (root / "file").touch()
     (root / "text.json").write_text("mass = 3")
@@ -378,9 +378,9 @@ def test_bad_input_is_one_sentence_before_anything_compiles(
     case, folder, compiled, capsys, monkeypatch
 ):
     monkeypatch.chdir(folder)
-    began = time.process_time()
+    start_time = time.process_time()
     assert rps(*case.split()) == 2
-    assert time.process_time() - began < 2.0
+    assert time.process_time() - start_time < 2.0
     assert not compiled
     error = capsys.readouterr().err
     if error.startswith("rps: error: "):

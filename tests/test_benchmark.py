@@ -1,4 +1,4 @@
-"""A speed is of what was timed, and is compared with C MuJoCo in the closed loop."""
+"""Benchmarks: timed programs, profiles, and speeds relative to C MuJoCo in closed loop."""
 
 import os
 import subprocess
@@ -45,16 +45,16 @@ def test_a_program_is_timed_and_compared_with_c_in_the_closed_loop():
     assert first[-1] == ""
 
 
-def test_a_profile_charges_the_functions_that_asked():
-    found = costs.measure("quasistatic", "cylinder", 4, steps=5)
-    assert found.step > 0
-    assert sum(cost.share for cost in found.costs) == pytest.approx(1.0)
-    assert found.timed == pytest.approx(sum(cost.time for cost in found.costs))
-    wheres = [cost.where for cost in found.costs]
+def test_a_profile_assigns_time_to_the_calling_functions():
+    profile = costs.measure("quasistatic", "cylinder", 4, steps=5)
+    assert profile.step > 0
+    assert sum(cost.share for cost in profile.costs) == pytest.approx(1.0)
+    assert profile.timed == pytest.approx(sum(cost.time for cost in profile.costs))
+    wheres = [cost.where for cost in profile.costs]
     assert len(set(wheres)) == len(wheres)
     for file in ("engines/quasistatic.py", "control/laws/rps.py", "trials/trial.py"):
         assert any(where.startswith(file) for where in wheres)
-    assert len(costs.table([found], count=3)) == 1 + 3
+    assert len(costs.table([profile], count=3)) == 1 + 3
 
 
 def test_an_instruction_comes_from_the_innermost_function():
@@ -96,8 +96,8 @@ ENTRY %main (a: f32[]) -> f32[] {
     }
 
 
-def test_what_nsight_counts_becomes_a_row():
-    """Of the last launch that its table holds, after what the program itself printed."""
+def test_nsight_counters_become_a_row():
+    """The row is that of the last launch; output of the program before the table is skipped."""
     names = ["ID", *kernel._COUNTERS]
     units = ["", "ns", *[""] * (len(names) - 2)]
     waits = ["5.0", "1.6", "1.1", "0.5", "0.4", "0.0"]
@@ -106,8 +106,8 @@ def test_what_nsight_counts_becomes_a_row():
         ["1", "67,000,000", "2,000,000,000", "2,000", "251", *waits],
     ]
     lines = [",".join(f'"{x}"' for x in row) for row in (names, units, *launches)]
-    found = kernel.counts("\n".join(["==PROF== Connected", "success", *lines]))
-    whole = found.expand_dims(family=["box"])
+    counts = kernel.counts("\n".join(["==PROF== Connected", "success", *lines]))
+    whole = counts.expand_dims(family=["box"])
     (row,) = kernel.Kernel(families=("box",)).table(whole)
     assert row == [
         *("box", "16,384", "134 µs", "2,000", "251", "5.0"),
@@ -122,12 +122,12 @@ def test_every_measurement_is_of_an_engine_or_of_c():
 
 
 @pytest.mark.slow
-def test_levers_are_timed_beside_the_program_as_it_is(monkeypatch):
-    some = ("no physics: law, skin, rules", "four times the worlds", "state not donated")
-    every = levers.levers_of("quasistatic", "cylinder")
-    monkeypatch.setattr(levers, "levers_of", lambda *_: {name: every[name] for name in some})
+def test_levers_are_timed_against_the_unchanged_program(monkeypatch):
+    names = ("no physics: law, skin, rules", "four times the worlds", "state not donated")
+    all_levers = levers.levers_of("quasistatic", "cylinder")
+    monkeypatch.setattr(levers, "levers_of", lambda *_: {name: all_levers[name] for name in names})
     gains = list(levers.measure("quasistatic", "cylinder", 2, simulated=0.1, goes=1))
-    assert [gain.lever for gain in gains] == [levers.BASELINE, *some]
+    assert [gain.lever for gain in gains] == [levers.BASELINE, *names]
     assert [gain.worlds for gain in gains] == [2, 2, 8, 2]
     assert all(0 < gain.times < np.inf for gain in gains)
     assert len(levers.table(gains)) == 1 + len(gains)
@@ -154,20 +154,20 @@ def test_without_physics_the_base_goes_and_the_object_stays():
 
 
 def test_a_program_is_traced_anew_for_each_lever():
-    """Since what MJX has for all may have changed, though no argument shows it."""
-    asked = []
+    """A lever may change global state of MJX, which no argument shows."""
+    calls = []
 
-    class Told(NamedTuple):
+    class RecordingStage(NamedTuple):
         def drive(self, *args):
-            asked.append(args)
+            calls.append(args)
             return Quasistatic().drive(*args)
 
     setting = programs.BATCHED["quasistatic"]
     counts = []
     for _ in range(2):
-        options = {"simulated": 0.1, "stage": lambda _: Told()}
+        options = {"simulated": 0.1, "stage": lambda _: RecordingStage()}
         programs.traced("quasistatic", setting, "cylinder", 2, **options)
-        counts.append(len(asked))
+        counts.append(len(calls))
     assert counts[1] == 2 * counts[0] > 0
 
 
@@ -176,7 +176,7 @@ def test_a_box_found_as_a_prism_is_where_mjx_finds_it():
     model, blank = mjx.put_model(at.physics), mjx.make_data(at.physics)
     starts = [scene.initial_qpos(at, -0.001, yaw) for yaw in (0.0, 0.3)]
 
-    def found(collide):
+    def contacts_of(collide):
         @jax.jit
         @jax.vmap
         def contacts(qpos):
@@ -190,34 +190,37 @@ def test_a_box_found_as_a_prism_is_where_mjx_finds_it():
         both = np.arange(len(starts))
         return contact.dist[:, robot][both, least], contact.frame[:, robot][both, least, 0]
 
-    ours, theirs = found(mjx_colliders.collision), found(mjx.collision)
+    ours, theirs = contacts_of(mjx_colliders.collision), contacts_of(mjx.collision)
     assert ours.dist.shape == theirs.dist.shape == (2, 8)
-    for mine, other in zip(deepest(ours), deepest(theirs), strict=True):
-        np.testing.assert_allclose(mine, other, atol=1e-6)
+    for mine, reference in zip(deepest(ours), deepest(theirs), strict=True):
+        np.testing.assert_allclose(mine, reference, atol=1e-6)
 
 
-def test_whole_commands_are_timed_twice_with_so_many_gpus(monkeypatch):
-    seen = []
+def test_whole_commands_are_timed_twice_per_gpu_count(monkeypatch):
+    launches = []
 
     class Process:
         pid, kill = 0, print
 
         def __init__(self, words, env, stdout, stderr):
             assert "JAX_PLATFORMS" not in env
-            seen.append((words[2:6], env["RPS_CACHE"], env["CUDA_VISIBLE_DEVICES"]))
+            launches.append((words[2:6], env["RPS_CACHE"], env["CUDA_VISIBLE_DEVICES"]))
             stdout.write("compile 1.5 s, run 2.0 s (1234 simulated s per s)")
 
     used = SimpleNamespace(ru_maxrss=2**20)  # KiB
     monkeypatch.setattr(subprocess, "Popen", Process)
     monkeypatch.setattr(os, "wait4", lambda pid, options: (pid, 0, used))
     monkeypatch.setenv("JAX_PLATFORMS", "cpu")  # of the process that times them
-    found = commands.commands(("push --seed 1",), (1, 2))
-    assert found.command.values.tolist() == ["`rps push --seed 1`, one GPU",
-                                             "`rps push --seed 1`, 2 GPUs"]  # fmt: skip
-    assert [gpus for *_, gpus in seen] == ["0", "0", "0,1", "0,1"]
-    assert [seen[0][1] == seen[1][1], seen[1][1] == seen[2][1]] == [True, False]  # an empty cache
-    assert seen[0][0] == ["rps_jax", "push", "--seed", "1"]
-    assert commands.table(found)[1][3:] == ["1.5 s", "2.0 s", "1,234", "1.1 GB", "1.1 GB"]
+    results = commands.commands(("push --seed 1",), (1, 2))
+    assert results.command.values.tolist() == ["`rps push --seed 1`, one GPU",
+                                               "`rps push --seed 1`, 2 GPUs"]  # fmt: skip
+    assert [gpus for *_, gpus in launches] == ["0", "0", "0,1", "0,1"]
+    assert [launches[0][1] == launches[1][1], launches[1][1] == launches[2][1]] == [
+        True,
+        False,
+    ]  # an empty cache
+    assert launches[0][0] == ["rps_jax", "push", "--seed", "1"]
+    assert commands.table(results)[1][3:] == ["1.5 s", "2.0 s", "1,234", "1.1 GB", "1.1 GB"]
 
 
 def test_steps_on_a_robot_are_told_as_the_example_tells_them(monkeypatch):

@@ -30,7 +30,7 @@ SMALL = [
 
 @pytest.fixture(scope="module")
 def runs(tmp_path_factory):
-    """The same small table, run twice."""
+    """Folders of two runs of one small table."""
     folders = [tmp_path_factory.mktemp("table") / name for name in ("first", "second")]
     for folder in folders:
         assert rps(*SMALL, "--out", folder) == 0
@@ -61,11 +61,11 @@ def test_the_same_command_gives_the_same_results_bit_for_bit(runs):
 
 
 def test_another_run_is_not_written_over_it_unasked(runs, capsys):
-    before = (runs[0] / "results.nc").read_bytes()
-    said = refusal(capsys, *SMALL, "--seed", 1, "--out", runs[0])
-    assert "holds another run (setting.seed = 0 there, 1 asked for)" in said
-    assert "--overwrite" in said
-    assert (runs[0] / "results.nc").read_bytes() == before
+    content = (runs[0] / "results.nc").read_bytes()
+    error = refusal(capsys, *SMALL, "--seed", 1, "--out", runs[0])
+    assert "holds another run (setting.seed = 0 there, 1 asked for)" in error
+    assert "--overwrite" in error
+    assert (runs[0] / "results.nc").read_bytes() == content
 
 
 def test_a_push_draws_and_films_a_trial(tmp_path, capsys):
@@ -101,8 +101,8 @@ def test_the_doctor_names_versions_device_cache_rendering_and_ffmpeg(capsys):
         assert word in printed
 
 
-def test_commands_flags_and_defaults_are_those_of_the_record():
-    """What changes on purpose is recorded anew: `python tests/command_line.py`."""
+def test_commands_flags_and_defaults_equal_the_record():
+    """`python tests/command_line.py` updates the record after an intended change."""
 
     def defaults(commands):
         return {
@@ -143,9 +143,9 @@ def test_the_papers_totals_and_targets():
     assert np.abs(paper.TARGETS).max() == 2
 
 
-def test_a_quick_run_makes_small_only_what_was_not_asked_for():
-    asked = TuneES(quick=True, worlds=7, tuned=("logistic",))
-    quick, small = asked.with_quick_values(), asked.quick_values()
+def test_quick_values_replace_defaults_but_no_explicit_value():
+    question = TuneES(quick=True, worlds=7, tuned=("logistic",))
+    quick, small = question.with_quick_values(), question.quick_values()
     assert (quick.worlds, quick.tuned) == (7, ("logistic",))
     assert quick.population == small["population"] < TuneES().population
     assert quick.setting.engine == small["setting.engine"]
@@ -214,8 +214,8 @@ def test_a_question_of_ones_own_is_one_file(tmp_path, capsys):
 
 
 def test_a_command_is_the_call_of_its_question(tmp_path):
-    asked = ("--laws", "rps", "rps,K_h=0.3", "--worlds", 4, "--domain", "prisms", *BRIEF)
-    assert rps("sweep", *asked, "--out", tmp_path) == 0
+    options = ("--laws", "rps", "rps,K_h=0.3", "--worlds", 4, "--domain", "prisms", *BRIEF)
+    assert rps("sweep", *options, "--out", tmp_path) == 0
     setting = rps_jax.Setting("quasistatic", rules=rps_jax.Rules(horizon=2.0))
     called = rps_jax.sweep(["rps", "rps,K_h=0.3"], "prisms", 4, setting=setting)
     xr.testing.assert_identical(rps_jax.load(tmp_path), called)
@@ -252,7 +252,7 @@ def test_an_interrupt_that_the_garbage_collector_swallows_comes_again(capsys):
         for _ in range(500):
             time.sleep(0.01)
 
-    began = time.monotonic()
+    start_time = time.monotonic()
     assert running.exit_code(action) == 130
-    assert time.monotonic() - began < 4
+    assert time.monotonic() - start_time < 4
     assert capsys.readouterr().err.endswith("rps: interrupted.\n")

@@ -34,7 +34,7 @@ SWEEP = [
 def test_a_task_has_parts_of_one_kind_and_every_part_one_task():
     kinds = [list(range(0, 20)), list(range(20, 27))]
     tasks = list(cluster._divide(kinds, 3))
-    assert [number for task in tasks for number in task] == list(range(27))
+    assert [index for task in tasks for index in task] == list(range(27))
     assert all(set(task) <= set(kinds[0]) or set(task) <= set(kinds[1]) for task in tasks)
     assert len(tasks) == 10 + 7  # four of each worker and kind, at most
 
@@ -136,8 +136,8 @@ def test_what_ends_a_worker_ends_the_run_as_itself(tmp_path, two_workers):
 
 
 def test_a_worker_with_other_software_is_refused(tmp_path, two_workers, monkeypatch):
-    here = device.collect_environment()
-    monkeypatch.setattr(device, "collect_environment", lambda: here | {"commit": "another"})
+    environment = device.collect_environment()
+    monkeypatch.setattr(device, "collect_environment", lambda: environment | {"commit": "another"})
     with pytest.raises(
         InputError, match=r"other software \(commit = .* there, .another. asked for"
     ):

@@ -85,8 +85,8 @@ def test_objects_take_turns():
 def test_the_paper_domain_is_the_papers_grid(engine):
     chosen, setting = DOMAINS["paper"], Setting(engine=engine)
     assert chosen.combinations == 144
-    for number, name in enumerate(PAPER_OBJECTS):
-        index = np.flatnonzero(chosen.object_of(np.arange(144)) == number)
+    for kind, name in enumerate(PAPER_OBJECTS):
+        index = np.flatnonzero(chosen.object_of(np.arange(144)) == kind)
         part = drawn_worlds(chosen, draws.draw(chosen, 0, index), setting)
         cases = [Case(name, f, t) for f in FRICTION.values() for t in paper.TARGETS]
         worlds = pushes.build(cases, setting).worlds

@@ -1,4 +1,4 @@
-"""An environment is the same trial, with somebody else deciding."""
+"""The environment for reinforcement learning steps trials as the control loop does."""
 
 from dataclasses import replace
 
@@ -26,7 +26,7 @@ AHEAD, BACK = jnp.array([1.0, 0.0, 0.0]), jnp.array([-1.0, 0.0, 0.0])
 PERIOD = FAST.control_period
 
 
-def made(**options):
+def build_env(**options):
     setting = Setting("fused", FAST, rules=Rules(horizon=20.0))
     return PushEnv("random_cylinder", NEAR, setting=setting, worlds=6, **options)
 
@@ -34,19 +34,21 @@ def made(**options):
 def programs(push):
     """`reset` of many keys, and STEPS steps of many worlds, (STEPS, n, ...), compiled."""
 
-    def one(state, actions):
+    def scan_step(state, actions):
         state = jax.vmap(push.step)(state, actions)
         return state, state
 
-    steps = jax.jit(lambda state, actions: jax.lax.scan(one, state, length=STEPS, xs=actions)[1])
+    steps = jax.jit(
+        lambda state, actions: jax.lax.scan(scan_step, state, length=STEPS, xs=actions)[1]
+    )
     return jax.jit(jax.vmap(push.reset)), steps
 
 
 class Pushing:
-    """An environment, a batch at its start, and how it goes on."""
+    """An environment with a batch of initial states and a compiled rollout."""
 
     def __init__(self):
-        self.env = made()
+        self.env = build_env()
         self.reset, self._steps = programs(self.env)
         self.start = self.reset(jax.random.split(jax.random.key(0), COUNT))
 
@@ -77,21 +79,23 @@ def test_the_spaces_are_those_of_the_skin_the_target_and_the_twist(pushing):
     assert push.xml_path.endswith("cylinder.xml")
     assert push.mj_model.nq == push.mjx_model.nq == 10
     assert push.unwrapped is push
-    assert PushEnv.setting.engine == "fused"  # unless another is asked for
+    assert PushEnv.setting.engine == "fused"  # the default
 
 
-def test_step_gives_back_what_reset_gave_so_that_a_loop_can_scan(pushing):
+def test_step_keeps_the_structure_of_the_state_so_that_scan_works(pushing):
     push, state = pushing.env, pushing.start
-    one = jax.tree.map(lambda leaf: leaf[0], state)
-    after = jax.eval_shape(push.step, one, AHEAD)
-    assert jax.tree.structure(after) == jax.tree.structure(one)
-    for a, b in zip(jax.tree.leaves(after), jax.tree.leaves(one), strict=True):
+    world_state = jax.tree.map(lambda leaf: leaf[0], state)
+    next_state = jax.eval_shape(push.step, world_state, AHEAD)
+    assert jax.tree.structure(next_state) == jax.tree.structure(world_state)
+    for a, b in zip(jax.tree.leaves(next_state), jax.tree.leaves(world_state), strict=True):
         assert (a.shape, a.dtype) == (b.shape, b.dtype)
-    # What a wrapper notes is kept.
-    noted = one.replace(info=one.info | {"steps": jnp.zeros(())}, metrics=one.metrics | {"x": 0.0})
-    kept = jax.eval_shape(push.step, noted, AHEAD)
-    assert "steps" in kept.info
-    assert "x" in kept.metrics
+    # Entries that a wrapper adds stay.
+    noted = world_state.replace(
+        info=world_state.info | {"steps": jnp.zeros(())}, metrics=world_state.metrics | {"x": 0.0}
+    )
+    result = jax.eval_shape(push.step, noted, AHEAD)
+    assert "steps" in result.info
+    assert "x" in result.metrics
 
 
 def test_a_key_decides_on_world_and_noise(pushing):
@@ -99,8 +103,8 @@ def test_a_key_decides_on_world_and_noise(pushing):
     np.testing.assert_array_equal(twice.obs[0], twice.obs[1])
     assert len({bytes(np.asarray(row)) for row in twice.obs}) == 3
     batches = jax.random.split(jax.random.key(4), (15, COUNT))
-    found = [pushing.reset(keys).info["index"] for keys in batches]
-    assert set(np.ravel(found)) == set(range(6))
+    indices = [pushing.reset(keys).info["index"] for keys in batches]
+    assert set(np.ravel(indices)) == set(range(6))
 
 
 def test_worlds_are_those_of_the_domain(pushing):
@@ -113,49 +117,51 @@ def test_worlds_are_those_of_the_domain(pushing):
 
 
 def test_an_action_is_a_share_of_the_greatest_twist():
-    push = made(params=RPSParams(v_max=0.04, omega_max=0.2))
+    push = build_env(params=RPSParams(v_max=0.04, omega_max=0.2))
     np.testing.assert_allclose(push.twist(jnp.array([0.5, -0.5, 0.25])), [0.02, -0.02, 0.05])
     np.testing.assert_allclose(push.twist(jnp.array([3.0, 4.0, -9.0])), [0.024, 0.032, -0.2])
 
 
-def test_a_push_earns_what_it_brings_nearer_less_the_time_without_contact(pushing):
-    start, seen = pushing.start, pushing.go(pushing.start, AHEAD, times=14)
-    won = np.flatnonzero(seen.data.success[-1])
-    assert won.size >= 2, "targets are ahead: most arrive"
-    touch = seen.metrics["in_contact"] > 0
-    for i in won:
-        end = int(np.argmax(seen.done[:, i]))
-        felt = seen.data.law_state[:, i]
+def test_the_return_is_progress_minus_the_cost_of_time_without_contact(pushing):
+    start, states = pushing.start, pushing.go(pushing.start, AHEAD, times=14)
+    succeeded = np.flatnonzero(states.data.success[-1])
+    assert succeeded.size >= 2, "targets are ahead: most arrive"
+    touch = states.metrics["in_contact"] > 0
+    for i in succeeded:
+        end = int(np.argmax(states.done[:, i]))
+        felt = states.data.law_state[:, i]
         gained = felt[np.argmax(touch[:, i])] - felt[end]
         without = PERIOD * (~touch[: end + 1, i]).sum()
-        assert seen.reward[:, i].sum() == pytest.approx(gained - 0.05 * without + 1, abs=1e-4)
+        assert states.reward[:, i].sum() == pytest.approx(gained - 0.05 * without + 1, abs=1e-4)
         assert felt[end] < pushing.env.params.d_success
         # From then on nothing moves and nothing is earned.
-        assert (seen.done[end:, i] == 1).all()
-        assert (seen.reward[end + 1 :, i] == 0).all()
-        np.testing.assert_array_equal(seen.data.qpos[-1, i], seen.data.qpos[end, i])
-        # The base went straight on at v_max, and this is what it was told and felt.
-        x = seen.data.qpos[:, i, 0]
+        assert (states.done[end:, i] == 1).all()
+        assert (states.reward[end + 1 :, i] == 0).all()
+        np.testing.assert_array_equal(states.data.qpos[-1, i], states.data.qpos[end, i])
+        # The base went straight ahead at v_max; observations agree with that.
+        x = states.data.qpos[:, i, 0]
         assert x[end] == pytest.approx(0.05 * PERIOD * (end + 1), rel=1e-3)
-        np.testing.assert_allclose(seen.obs[:, i, 42], start.obs[i, 42] - x, atol=1e-5)
-        assert seen.obs[end, i, 15:27].max() > 0.25  # taxels of the front, by the skin's threshold
+        np.testing.assert_allclose(states.obs[:, i, 42], start.obs[i, 42] - x, atol=1e-5)
+        assert (
+            states.obs[end, i, 15:27].max() > 0.25
+        )  # taxels of the front, by the skin's threshold
 
 
 def test_lost_contact_costs_and_counts_again_from_where_it_was_lost(pushing):
-    there = last(pushing.go(pushing.start, AHEAD, times=2))
-    assert (there.metrics["in_contact"] == 1).all()
-    away = pushing.go(there, BACK)
-    gone = away.metrics["in_contact"] == 0
-    assert gone[-1].all()
-    np.testing.assert_allclose(away.reward[gone], -0.05 * PERIOD, rtol=1e-5)
+    touching = last(pushing.go(pushing.start, AHEAD, times=2))
+    assert (touching.metrics["in_contact"] == 1).all()
+    away = pushing.go(touching, BACK)
+    no_contact = away.metrics["in_contact"] == 0
+    assert no_contact[-1].all()
+    np.testing.assert_allclose(away.reward[no_contact], -0.05 * PERIOD, rtol=1e-5)
     again = pushing.go(last(away), AHEAD, times=2)
     progress = np.concatenate([away.metrics["progress"], again.metrics["progress"]]).sum(axis=0)
-    lasting = there.data.law_state - last(again).data.law_state
+    lasting = touching.data.law_state - last(again).data.law_state
     np.testing.assert_allclose(progress, lasting, atol=1e-5)
 
 
 def test_the_rules_end_a_trial_and_its_start_can_be_put_back(pushing):
-    """As mujoco_playground's wrapper does: data and observation of the start where it is done."""
+    """Like the auto-reset wrapper of mujoco_playground, which restores data and observation."""
     start = pushing.start
     late = start.replace(data=start.data._replace(steps=start.data.steps + 999))
     over = last(pushing.go(late, AHEAD))
@@ -163,24 +169,24 @@ def test_the_rules_end_a_trial_and_its_start_can_be_put_back(pushing):
     assert not over.data.success.any()
     assert (over.data.steps == 1000).all()
     back = over.replace(data=start.data, obs=start.obs, done=0 * over.done)
-    fresh, usual = (pushing.go(state, AHEAD) for state in (back, start))
-    np.testing.assert_array_equal(fresh.data.qpos, usual.data.qpos)
-    np.testing.assert_array_equal(fresh.reward, usual.reward)
-    assert (fresh.done == 0).all()
+    restarted, reference = (pushing.go(state, AHEAD) for state in (back, start))
+    np.testing.assert_array_equal(restarted.data.qpos, reference.data.qpos)
+    np.testing.assert_array_equal(restarted.reward, reference.reward)
+    assert (restarted.done == 0).all()
 
 
-def test_an_action_that_is_no_number_ends_a_world_and_no_other(pushing):
-    spoilt = jnp.tile(AHEAD, (COUNT, 1)).at[1].set(jnp.nan)
-    after = pushing.go(pushing.start, spoilt)
-    for states in (jax.tree.map(lambda leaf: leaf[0], after), last(after)):
+def test_a_nan_action_ends_only_its_world(pushing):
+    actions = jnp.tile(AHEAD, (COUNT, 1)).at[1].set(jnp.nan)
+    trajectory = pushing.go(pushing.start, actions)
+    for states in (jax.tree.map(lambda leaf: leaf[0], trajectory), last(trajectory)):
         assert states.done.tolist() == [0, 1, 0, 0]
         assert states.metrics["diverged"].tolist() == [0, 1, 0, 0]
-    assert (after.reward[:, 1] == 0).all()
-    assert np.isfinite(after.obs).all()
+    assert (trajectory.reward[:, 1] == 0).all()
+    assert np.isfinite(trajectory.obs).all()
 
 
 def test_it_moves_as_a_trial_that_is_driven_by_the_same_twist(pushing):
-    """A law that always says the same, in the loop of all other trials."""
+    """A law with a constant twist, in the control loop of trials."""
     push, state, action = pushing.env, pushing.start, jnp.array([0.8, 0.2, 0.3])
     mine = last(pushing.go(state, action))
     constant = push.twist(action)

@@ -28,12 +28,12 @@ SHORT: Any = {"setting": BRIEF, "slots": 6}
 
 
 def seeded(seed):
-    """The same conditions, in other worlds."""
+    """Return the keyword arguments with another seed."""
     return SHORT | {"setting": replace(BRIEF, seed=seed)}
 
 
 def paper(count, **changes):
-    """The paper's parameters for so many candidates, some of them changed."""
+    """Return the paper's parameters for `count` candidates, with changes."""
     same = jax.tree.map(lambda value: np.full(count, value), RPSParams.paper())
     return same._replace(**changes)
 
@@ -46,33 +46,33 @@ def test_no_two_splits_share_a_seed():
 class TestEvaluate:
     def test_results_are_labelled_as_those_of_a_sweep(self):
         both = replace(CYLINDERS, objects=("random_cylinder", "cylinder"))
-        found = evaluate(paper(2), both, 3, split="test", **seeded(4))
-        assert dict(found.sizes) == {"candidate": 2, "world": 3, "pose": 3}
-        assert found.object.values.tolist() == ["random_cylinder", "cylinder", "random_cylinder"]
+        results = evaluate(paper(2), both, 3, split="test", **seeded(4))
+        assert dict(results.sizes) == {"candidate": 2, "world": 3, "pose": 3}
+        assert results.object.values.tolist() == ["random_cylinder", "cylinder", "random_cylinder"]
         for index in range(3):
             drawn = draws.table(draws.draw(both, seed_of(4, "test"), [index]))
             for name, ((value,), unit) in drawn.items():
-                assert found[name].values[index] == value
-                assert found[name].attrs["units"] == unit
-        assert found.time.attrs["units"] == "s"
-        assert found.success.dtype == np.int8
-        expected = Objective().score(0.0, found.time, found.contact_lost_time, 0.0, BRIEF.rules)
-        away = np.where(np.isfinite(found.min_distance), found.min_distance, found.distance)
+                assert results[name].values[index] == value
+                assert results[name].attrs["units"] == unit
+        assert results.time.attrs["units"] == "s"
+        assert results.success.dtype == np.int8
+        expected = Objective().score(0.0, results.time, results.contact_lost_time, 0.0, BRIEF.rules)
+        away = np.where(np.isfinite(results.min_distance), results.min_distance, results.distance)
         missed = 0.5 * np.minimum(away, 1.0)
-        assert (found.success == 0).all()
-        np.testing.assert_allclose(found.score, expected + missed, rtol=1e-5)
+        assert (results.success == 0).all()
+        np.testing.assert_allclose(results.score, expected + missed, rtol=1e-5)
 
     def test_another_call_of_the_same_shape_compiles_nothing(self, compiled):
-        one = evaluate(paper(3), CYLINDERS, 4, **SHORT)
-        before = len(compiled)
+        first = evaluate(paper(3), CYLINDERS, 4, **SHORT)
+        count = len(compiled)
         L = np.array([0.1, 0.2, 0.4])
-        other = evaluate(paper(3, L=L), CYLINDERS, 4, split="validate", **seeded(7))
-        assert len(compiled) == before
-        assert (one.score != other.score).any()
+        second = evaluate(paper(3, L=L), CYLINDERS, 4, split="validate", **seeded(7))
+        assert len(compiled) == count
+        assert (first.score != second.score).any()
 
     def test_candidates_differ_by_their_parameters_alone(self):
-        found = evaluate(paper(3, v_approach=np.array([0.01, 0.05, 0.01])), CYLINDERS, 4, **SHORT)
-        first, faster, again = found.transpose("candidate", ...).path_length.values
+        results = evaluate(paper(3, v_approach=np.array([0.01, 0.05, 0.01])), CYLINDERS, 4, **SHORT)
+        first, faster, again = results.transpose("candidate", ...).path_length.values
         np.testing.assert_array_equal(first, again)
         assert (first != faster).any()
 
@@ -85,11 +85,11 @@ class TestEvaluate:
 
     def test_candidates_are_named_one_by_one_or_alone(self):
         alone, several = room.candidates("rps"), room.candidates(["rps", "rps,K_h=0.3"])
-        for one in (alone, room.candidates(RPSParams.paper())):
-            assert {np.shape(leaf) for leaf in one} == {(1,)}
+        for single in (alone, room.candidates(RPSParams.paper())):
+            assert {np.shape(leaf) for leaf in single} == {(1,)}
         np.testing.assert_allclose(several.K_h, [*alone.K_h, 0.3])
-        given = paper(3)
-        assert room.candidates(given) is given
+        params = paper(3)
+        assert room.candidates(params) is params
         with pytest.raises(InputError, match="2 classes"):
             room.candidates(["rps", "pursuit"])
 
@@ -111,15 +111,15 @@ class TestEvaluate:
         ],
     )
     def test_bad_input_is_told_before_anything_compiles(self, bad, why, compiled):
-        before = len(compiled)
+        count = len(compiled)
         with pytest.raises(InputError, match=why) as caught:
             evaluate(**{"law": paper(3), "worlds": 4} | SHORT | bad)
         assert "\n" not in str(caught.value)
-        assert len(compiled) == before
+        assert len(compiled) == count
 
 
 class Nested(NamedTuple):
-    """Of a law that drives ahead: a pytree within a pytree, and a leaf with further axes."""
+    """Parameters of a law that drives ahead: a nested pytree and a leaf with more axes."""
 
     gains: dict[str, Any]
     curve: Any  # (3,)
@@ -128,18 +128,18 @@ class Nested(NamedTuple):
 
 @pytest.fixture
 def nested():
-    """The law is forgotten after the test."""
+    """Register a law with nested parameters for one test."""
     tables = registry.LAWS, registry._LAWS_BY_CLASS
-    before = [dict(table) for table in tables]
+    saved = [dict(table) for table in tables]
 
     def step(params, state, observation):
         v = params.gains["v"] * jnp.sum(params.curve)
         return state, Twist(v, 0 * v, 0 * v), Details.from_obs(observation)
 
-    own = Law(lambda params: (), step, check=lambda params: params)
-    registry.register_law("nested", own, Nested({"v": 0.01}, np.ones(3)))
+    law = Law(lambda params: (), step, check=lambda params: params)
+    registry.register_law("nested", law, Nested({"v": 0.01}, np.ones(3)))
     yield
-    for table, content in zip(tables, before, strict=True):
+    for table, content in zip(tables, saved, strict=True):
         table.clear()
         table.update(content)
 
@@ -148,9 +148,9 @@ def test_any_registered_law_with_nested_parameters(nested):
     curve = np.array([[1, 0, 0], [0, 0, 2], [0, 0, 0]])
     params = Nested({"v": np.full(3, 0.01)}, curve, np.full(3, 0.05))
     prompt = replace(CYLINDERS, velocity_error=Range(0, 0), command_delay=Range(0, 0))
-    found = evaluate(params, prompt, 2, **SHORT)
+    results = evaluate(params, prompt, 2, **SHORT)
     expected = np.array([[0.08], [0.16], [0.0]])  # [m] in 8 s
-    np.testing.assert_allclose(found.path_length, expected + np.zeros((3, 2)), rtol=0.01)
+    np.testing.assert_allclose(results.path_length, expected + np.zeros((3, 2)), rtol=0.01)
 
 
 class TestSeveralAsks:
@@ -159,15 +159,15 @@ class TestSeveralAsks:
         hostile = replace(DOMAINS["hostile"], objects=("random_cylinder",))
         asks = [Candidates(faster, 3, np.arange(3)), Candidates(params, 3, np.arange(3))]
         where = [CYLINDERS, hostile], BRIEF
-        (one, two), _ = room.score_candidates(asks, *where, Objective(), slots=6)
-        assert one.score.shape == (2, 6)
-        np.testing.assert_array_equal(one.score[0], two.score[0])
-        np.testing.assert_array_equal(two.score[0], two.score[1])
-        assert (one.score[1] != one.score[0]).any()
+        (first, second), _ = room.score_candidates(asks, *where, Objective(), slots=6)
+        assert first.score.shape == (2, 6)
+        np.testing.assert_array_equal(first.score[0], second.score[0])
+        np.testing.assert_array_equal(second.score[0], second.score[1])
+        assert (first.score[1] != first.score[0]).any()
         (alone,), _ = room.score_candidates(
             [Candidates(paper(3), 3, np.arange(1, 2))], *where, Objective(), slots=6
         )
-        np.testing.assert_allclose(alone.score[0], two.score[0, [1, 4]], rtol=1e-4)
+        np.testing.assert_allclose(alone.score[0], second.score[0, [1, 4]], rtol=1e-4)
 
     def test_scores_are_those_of_the_first_version(self):
         """The last digits depend on the processor, and on the flags of XLA."""

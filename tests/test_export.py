@@ -36,7 +36,7 @@ LAWS = [
     *("rps", "nps", "rps_plus", "aps", "pursuit", "dipole", "force_push", "force_push_published"),
     *("learned_mlp", "learned_gru"),
 ]
-OWN = '''"""A law that uses all that can be exported beyond arithmetic."""
+CUSTOM_LAW = '''"""A law that uses all that can be exported beyond arithmetic."""
 
 from typing import Any, NamedTuple
 
@@ -90,9 +90,9 @@ register_law("own", Law(init, step), OwnParams())
 
 
 @pytest.fixture
-def own(tmp_path, registries):
+def custom_law(tmp_path, registries):
     path = tmp_path / "own.py"
-    path.write_text(OWN)
+    path.write_text(CUSTOM_LAW)
     return f"{path}:OwnParams"
 
 
@@ -154,17 +154,19 @@ def test_the_folder_compiles_without_a_warning_and_runs(name, compiler, tmp_path
 
 
 @pytest.mark.parametrize("name", ["rps_plus", "learned_mlp", "force_push_published", "own"])
-def test_what_is_not_finite_gives_a_zero_twist_and_nothing_undefined(name, tmp_path, own):
-    exported = program.program(own if name == "own" else name)
+def test_non_finite_inputs_give_a_zero_twist_without_undefined_behaviour(
+    name, tmp_path, custom_law
+):
+    exported = program.program(custom_law if name == "own" else name)
     for compiler in COMPILERS:
         result = fuzzed(exported, compiler, "float", 20_000, tmp_path)
         assert result.fault == 0, result
         assert result.taken > 0 < result.refused
 
 
-def test_a_law_of_a_users_file_is_exported(own, tmp_path):
+def test_a_law_of_a_users_file_is_exported(custom_law, tmp_path):
     for precision in ("float", "double"):
-        result = agreement(own, precision, 5_000, tmp_path)
+        result = agreement(custom_law, precision, 5_000, tmp_path)
         assert (result.inputs, result.unexplained, result.flips) == (5_000, 0, 0)
 
 
@@ -183,11 +185,11 @@ def test_the_skin_in_c_does_what_it_does_in_jax(robot, tmp_path):
         active = rng.random((worlds, count)) < rng.choice([0.0, 0.02, 0.1], (worlds, 1))
         taxels = (active * rng.uniform(0, 2, active.shape)).astype(np.float32)
         period = rng.uniform(0.001, 0.1, worlds).astype(np.float32)
-        after, reading = read(signal, alive, taxels, period)
+        next_state, reading = read(signal, alive, taxels, period)
         contact, code = native.touch(mine, taxels, period)
         assert not code.any()
-        np.testing.assert_allclose(mine["signal"], after.signal, rtol=1e-6, atol=1e-6)
-        near = (np.abs(np.asarray(after.signal) - 0.25) < 1e-5).any(-1)  # of the threshold
+        np.testing.assert_allclose(mine["signal"], next_state.signal, rtol=1e-6, atol=1e-6)
+        near = (np.abs(np.asarray(next_state.signal) - 0.25) < 1e-5).any(-1)  # of the threshold
         assert near.mean() < 0.05
         same = ~near
         np.testing.assert_array_equal(contact["contact_type"][same], reading.contact_type[same])
@@ -195,9 +197,11 @@ def test_the_skin_in_c_does_what_it_does_in_jax(robot, tmp_path):
         np.testing.assert_allclose(
             contact["p_robot_contact"][same], reading.p_robot_contact[same], atol=1e-6
         )
-        np.testing.assert_allclose(contact["signal"], np.where(alive, after.signal, 0), atol=1e-6)
+        np.testing.assert_allclose(
+            contact["signal"], np.where(alive, next_state.signal, 0), atol=1e-6
+        )
         kinds |= set(contact["contact_type"].tolist())
-        signal, mine["signal"] = np.asarray(after.signal), after.signal
+        signal, mine["signal"] = np.asarray(next_state.signal), next_state.signal
     assert kinds == {0, 1, 2}
 
 
@@ -227,7 +231,7 @@ def test_an_operation_that_cannot_be_written_is_named(tmp_path, capsys, registri
         ("sort", "jnp.sort(seen.p_robot_contact)[0]"),
     ):
         path = tmp_path / f"{operation}.py"
-        head, _, rest = OWN.partition("    place = ")
+        head, _, rest = CUSTOM_LAW.partition("    place = ")
         rest = rest[rest.index("    return (") :].replace(
             "trace, memory.count", "memory.trace, 0 * memory.count"
         )
@@ -282,14 +286,14 @@ console.log(JSON.stringify({ twists, odd, felt: felt.contact }));
 
 @pytest.mark.skipif(shutil.which("node") is None, reason="Node.js is not there")
 @pytest.mark.parametrize("name", ["rps_plus", "learned_mlp", "own"])
-def test_javascript_does_what_c_does(name, tmp_path, own):
-    exported = program.program(own if name == "own" else name)
+def test_javascript_does_what_c_does(name, tmp_path, custom_law):
+    exported = program.program(custom_law if name == "own" else name)
     native = Native(exported, tmp_path, "double")
     leaves = observations(exported, np.random.default_rng(0), 300, np.float64)
-    seen = native.filled("observation", leaves, 300)
+    obs = native.filled("observation", leaves, 300)
     memory = native.begin(1)
-    expected = np.concatenate([native.step(memory, seen[i : i + 1])[0] for i in range(300)])
-    names = [one.name for one in exported.groups["observation"]]
+    expected = np.concatenate([native.step(memory, obs[i : i + 1])[0] for i in range(300)])
+    names = [field.name for field in exported.groups["observation"]]
     rows = [dict(zip(names, (x[i].tolist() for x in leaves), strict=True)) for i in range(300)]
     (tmp_path / "seen.json").write_text(json.dumps(rows))
     (tmp_path / "law.mjs").write_text(js.module(exported, "law"))
@@ -313,22 +317,22 @@ def test_onnx_does_what_c_does(name, tmp_path):
     count, exported = 200, program.program(name)
     model = onnx_model.models(exported, "law", count)["law.onnx"]
     session = runtime.InferenceSession(model, providers=["CPUExecutionProvider"])
-    about = {one.key: one.value for one in onnx.load_from_string(model).metadata_props}
+    about = {entry.key: entry.value for entry in onnx.load_from_string(model).metadata_props}
     assert json.loads(about["units"])["yaw"] == "[rad] heading of the robot in the world"
     native, rng = Native(exported, tmp_path, "float"), np.random.default_rng(0)
     mine, start = native.begin(count), json.loads(about["memory_at_the_start"])
-    types = {one.name: one.type for one in session.get_inputs()}
-    of = {"tensor(float)": np.float32, "tensor(bool)": bool, "tensor(int32)": np.int32}
+    types = {entry.name: entry.type for entry in session.get_inputs()}
+    dtypes = {"tensor(float)": np.float32, "tensor(bool)": bool, "tensor(int32)": np.int32}
     memory = {
-        key: np.broadcast_to(np.array(value, of[types[key]]), (count, *np.shape(value)))
+        key: np.broadcast_to(np.array(value, dtypes[types[key]]), (count, *np.shape(value)))
         for key, value in start.items()
     }
-    names, fields = [one.name for one in session.get_outputs()], exported.groups["observation"]
+    names, fields = [entry.name for entry in session.get_outputs()], exported.groups["observation"]
     differences = []
     for _ in range(20):
         leaves = observations(exported, rng, count, np.float32)
-        given = dict(zip((one.name for one in fields), leaves, strict=True))
-        known = {key: value for key, value in (given | memory).items() if key in types}
+        inputs = dict(zip((entry.name for entry in fields), leaves, strict=True))
+        known = {key: value for key, value in (inputs | memory).items() if key in types}
         result = dict(zip(names, session.run(None, known), strict=True))
         twist, _ = native.step(mine, native.filled("observation", leaves, count))
         theirs = np.stack([result[key] for key in ("v_x", "v_y", "omega")], -1)

@@ -1,4 +1,4 @@
-"""Many trials side by side: a film of the right size, whose tiles move until their trial ends."""
+"""Films of several trials in a grid: size, rows, labels, and tiles that stop with their trial."""
 
 import dataclasses
 import tracemalloc
@@ -28,8 +28,8 @@ FPS = 12
 def table(folder):
     """A run of `rps table` over two targets, as far as a film reads it."""
     targets = [(0.6, 0.0), (2.0, 2.0)]
-    asked = Table(objects=("box",), targets=targets, setting=Setting(ENGINE))
-    run_folder.claim(folder, asked.configuration())
+    question = Table(objects=("box",), targets=targets, setting=Setting(ENGINE))
+    run_folder.claim(folder, question.configuration())
 
 
 def plan_of(*names):
@@ -96,8 +96,8 @@ def test_worlds_are_filmed_by_their_indices(tmp_path):
 
 
 def test_several_laws_have_a_row_each_and_a_world_a_column(tmp_path):
-    one = plan_of("random_box", "random_cylinder")
-    plan = dataclasses.replace(one, laws={"one": RPSParams.paper(), "two": RPSParams.nps()})
+    base_plan = plan_of("random_box", "random_cylinder")
+    plan = dataclasses.replace(base_plan, laws={"one": RPSParams.paper(), "two": RPSParams.nps()})
     takes = film.of_sweep(tmp_path, plan, ["two", "one"], "first", (2, 3))
     assert film._in_grid_order([take.labels for take in takes], takes) == [
         *(f"two, world {i}" for i in range(3)),
@@ -110,19 +110,19 @@ def test_several_laws_have_a_row_each_and_a_world_a_column(tmp_path):
         film.rows_of(plan, ["three"], (1, 3))
 
 
-def test_a_trial_that_has_ended_is_told_and_not_drawn_again(tmp_path):
+def test_a_finished_trial_is_labelled_and_not_drawn_again(tmp_path):
     table(tmp_path)
     takes, setting = Film(tmp_path, "1x2").takes()
     (take,) = takes
-    ((ended, first), *_, (_, before), (over, last)) = [
+    ((ended, first), *_, (_, previous), (over, last)) = [
         shots for shots, _ in zip(film._shots(take, setting, 50), range(20), strict=False)
     ]
     assert not ended
     assert [shot.label for shot in first] == ["(0.6, 0) m, 0 s", "(2, 2) m, 0 s"]
     assert not over
     assert last[0].label.startswith("(0.6, 0) m, reached at ")
-    assert last[0] is before[0]
-    assert last[1] is not before[1]
+    assert last[0] is previous[0]
+    assert last[1] is not previous[1]
 
 
 def test_the_memory_of_a_film_does_not_grow_with_its_length(tmp_path):
@@ -135,9 +135,9 @@ def test_the_memory_of_a_film_does_not_grow_with_its_length(tmp_path):
         tracemalloc.start()
         frames = ([shot] for _ in range(count))
         video.render_grid([tile], frames, tmp_path / "x.mp4", shape=(1, 1), size=(320, 180))
-        found = tracemalloc.get_traced_memory()[1]
+        peak_bytes = tracemalloc.get_traced_memory()[1]
         tracemalloc.stop()
-        return found
+        return peak_bytes
 
     peak(1)
     assert peak(60) < peak(3) + 320 * 180 * 3 * 10  # ten pictures

@@ -13,9 +13,9 @@ from sweeps.force_push_grid.study import ForcePushGrid
 
 
 def test_the_grid_is_that_of_their_script():
-    every = grid.cells()
-    assert every.angle.size == 3**5 == 243
-    assert len(set(zip(*every, strict=True))) == 243
+    cells = grid.cells()
+    assert cells.angle.size == 3**5 == 243
+    assert len(set(zip(*cells, strict=True))) == 243
     assert check_finite_leaves(grid.PARAMS) is grid.PARAMS
 
 
@@ -30,16 +30,16 @@ def test_the_moments_of_inertia_by_hand():
 
 
 def test_the_pusher_starts_behind_the_point_that_it_will_meet():
-    every = grid.cells()
+    cells = grid.cells()
     for slider in grid.SLIDERS:
-        qpos = grid.starts(slider, every)
+        qpos = grid.starts(slider, cells)
         away = qpos[:, :2] + (0.5, 0.0) - qpos[:, 3:5]  # from the middle to the point of contact
         if slider == "cylinder":
             np.testing.assert_allclose(np.hypot(*away.T), 0.5)
             continue
-        c, s = np.cos(every.angle), np.sin(every.angle)
+        c, s = np.cos(cells.angle), np.sin(cells.angle)
         np.testing.assert_allclose(c * away[:, 0] + s * away[:, 1], -0.5)
-        np.testing.assert_allclose(-s * away[:, 0] + c * away[:, 1], every.contact, atol=1e-12)
+        np.testing.assert_allclose(-s * away[:, 0] + c * away[:, 1], cells.contact, atol=1e-12)
     yaw = 2 * np.arctan2(qpos[:, 9], qpos[:, 6])
     np.testing.assert_allclose(np.unique(yaw.round(9)), np.round((-math.pi / 8, 0, math.pi / 8), 9))
 
@@ -47,26 +47,26 @@ def test_the_pusher_starts_behind_the_point_that_it_will_meet():
 def test_their_law_brings_every_box_back_to_the_path_and_the_open_loop_loses_most(
     tmp_path, monkeypatch
 ):
-    """In 60 s, 6 m of path, from up to 0.4 m beside it."""
-    asked = ForcePushGrid(sliders=("box",), duration=60.0, out=tmp_path)
-    found = asked()
-    theirs, alone = (found.sel(law=law, slider="box") for law in grid.LAWS)
+    """Boxes start up to 0.4 m off the path and follow it for 6 m in 60 s."""
+    question = ForcePushGrid(sliders=("box",), duration=60.0, out=tmp_path)
+    results = question()
+    theirs, alone = (results.sel(law=law, slider="box") for law in grid.LAWS)
     assert int(theirs.success.sum()) == 243
     assert int(alone.success.sum()) < 30
     assert float(theirs.completion.min()) > 0.75
     assert float(abs(theirs.deviation).max()) < 1.0 < float(theirs.apart.max()) < 1.2
     assert float(alone.completion.median()) < 0.3
-    _, row, _ = grid.table(found)
+    _, row, _ = grid.table(results)
     assert row[:4] == ["force_push", "box", "243 of 243", "81, 81, 81"]
     monkeypatch.setattr(grid, "run_grid", lambda *_, **__: pytest.fail("run again"))
-    again = asked()  # read, not run
-    np.testing.assert_array_equal(again.completion, found.completion)
+    again = question()  # read, not run
+    np.testing.assert_array_equal(again.completion, results.completion)
     with pytest.raises(InputError, match=r"duration = 60\.0 there, 50\.0 asked for"):
-        replace(asked, duration=50.0)()
+        replace(question, duration=50.0)()
 
 
 @pytest.mark.parametrize(
-    ("given", "words"),
+    ("options", "words"),
     [
         ({"laws": ("none",)}, "unknown law 'none'"),
         ({"sliders": ("prism",)}, "unknown slider 'prism'"),
@@ -75,6 +75,6 @@ def test_their_law_brings_every_box_back_to_the_path_and_the_open_loop_loses_mos
         ({"engine": "mujoco"}, "JAX must trace it"),
     ],
 )
-def test_what_the_grid_cannot_run_is_refused(given, words):
+def test_what_the_grid_cannot_run_is_refused(options, words):
     with pytest.raises(InputError, match=words):
-        ForcePushGrid(**given)()
+        ForcePushGrid(**options)()

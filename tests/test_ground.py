@@ -21,27 +21,27 @@ DRY = Rounding(slip=1e-5, depth=1e-7)
 def blocks(half_x, half_y, offset=0.0, bearing=0.0):
     """Boxes, one for each half length and width [m]; the load moves the centre of mass."""
     half_x, half_y = np.broadcast_arrays(np.atleast_1d(half_x), half_y)
-    ones = np.ones(len(half_x))
+    unit = np.ones(len(half_x))
     outline = solid.rectangles(half_x, half_y)
-    return solid.build(outline, 0 * ones, 0.8 * ones, 20 * ones, offset * ones, bearing * ones)
+    return solid.build(outline, 0 * unit, 0.8 * unit, 20 * unit, offset * unit, bearing * unit)
 
 
 def drums(count=1, radius=0.25):
-    ones = np.ones(count)
+    unit = np.ones(count)
     return solid.build(
-        np.zeros((count, 1, 2)), radius * ones, 0.7 * ones, 25 * ones, 0 * ones, 0 * ones
+        np.zeros((count, 1, 2)), radius * unit, 0.7 * unit, 25 * unit, 0 * unit, 0 * unit
     )
 
 
 def pushed(solids, robot=MU_ROBOT, height=0.0):
-    ones = np.ones(solids.mass.size)
-    return Pushed(solids, MU * ones, robot * ones, height * ones)
+    unit = np.ones(solids.mass.size)
+    return Pushed(solids, MU * unit, robot * unit, height * unit)
 
 
 def poses_at_front(solids, y=0.0, yaw=0.0):
     """Poses of solids that touch the base's front."""
-    ones = np.ones(solids.mass.size)
-    return np.column_stack([solid.extent(solids, yaw * ones), y * ones, yaw * ones])
+    unit = np.ones(solids.mass.size)
+    return np.column_stack([solid.extent(solids, yaw * unit), y * unit, yaw * unit])
 
 
 def first_step(target, pose, direction=(1.0, 0.0), rounding=DRY):
@@ -141,7 +141,7 @@ def test_the_edges_of_the_cone_and_the_push_vote_on_the_sense_of_turning():
 
 
 def test_pushes_mirror_balance_and_converge():
-    """Mirrored pushes end mirrored; the base does the work of friction; steps hardly matter."""
+    """Mirrored pushes end mirrored; the base does the work of friction; steps have converged."""
     solids = blocks([0.2, 0.2, 0.3, 0.3], [0.2, 0.2, 0.3, 0.3])
     sign = np.array([1, -1, 1, -1])
     target = pushed(solids, height=0.2)

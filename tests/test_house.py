@@ -40,31 +40,33 @@ def test_each_private_interface_has_a_test_that_notices_a_change():
 
 
 def documented() -> dict[str, tuple[list[str], dict[str, bool]]]:
-    """The bases of each class of the package, and whether each of its methods says what it does."""
-    found = {}
+    """Return, by class, its bases and whether each of its methods has a docstring."""
+    classes = {}
     for path in PACKAGE.rglob("*.py"):
         for node in ast.walk(ast.parse(path.read_text())):
             if isinstance(node, ast.ClassDef):
                 plain = [getattr(base, "value", base) for base in node.bases]
                 bases = [getattr(base, "attr", getattr(base, "id", "")) for base in plain]
                 bases += [getattr(base, "id", "") for base in node.bases]
-                methods = [one for one in node.body if isinstance(one, ast.FunctionDef)]
-                said = {one.name: ast.get_docstring(one) is not None for one in methods}
-                found[node.name] = bases, said
-    return found
+                methods = [method for method in node.body if isinstance(method, ast.FunctionDef)]
+                has_docstring = {
+                    method.name: ast.get_docstring(method) is not None for method in methods
+                }
+                classes[node.name] = bases, has_docstring
+    return classes
 
 
 def test_a_public_method_says_what_it_does_or_inherits_it():
-    every = documented()
+    classes = documented()
 
     def says(name: str, method: str) -> bool:
-        bases, said = every.get(name, ([], {}))
-        return said.get(method, False) or any(says(base, method) for base in bases)
+        bases, has_docstring = classes.get(name, ([], {}))
+        return has_docstring.get(method, False) or any(says(base, method) for base in bases)
 
     public = [
         (name, method)
-        for name, (_, said) in every.items()
-        for method in said
+        for name, (_, has_docstring) in classes.items()
+        for method in has_docstring
         if not name.startswith("_") and not method.startswith("_")
     ]
     assert len(public) > 300
@@ -92,8 +94,8 @@ def test_there_are_forty_public_names_and_all_are_in_the_table():
 
 def test_every_public_name_is_there():
     for name in rps_jax.__all__:
-        found = getattr(rps_jax, name)
-        assert found.__doc__ or not callable(found)
+        entry = getattr(rps_jax, name)
+        assert entry.__doc__ or not callable(entry)
 
 
 DUMMY = '''"""The fused engine under another name."""
@@ -102,7 +104,7 @@ from rps_jax.engines.fused import Fused
 
 
 class Dummy(Fused):
-    """An engine of one's own."""
+    """A custom engine."""
 
     name = "dummy"
 
@@ -142,7 +144,7 @@ for ask in (lambda: rps_jax.sweep("strait", "wide", 1), lambda: rps_jax.attack("
 
 @pytest.fixture
 def copied(tmp_path):
-    """Run Python on a copy of the package, to which something was added."""
+    """A function that runs Python on an extended copy of the package."""
     shutil.copytree(PACKAGE, tmp_path / "rps_jax", ignore=shutil.ignore_patterns("__pycache__"))
     shutil.copytree(ROOT / "mjcf", tmp_path / "mjcf")
 
@@ -151,11 +153,11 @@ def copied(tmp_path):
             [sys.executable, *arguments],
             os.environ | {"PYTHONPATH": str(tmp_path)},
         )
-        found = subprocess.run(
+        done = subprocess.run(
             command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False
         )
-        assert found.returncode == 0, found.stderr
-        return found.stdout
+        assert done.returncode == 0, done.stderr
+        return done.stdout
 
     return run
 
@@ -165,19 +167,19 @@ def test_a_law_is_one_file_and_a_quantity_one_declaration(copied, tmp_path):
     laws, domain = tmp_path / "rps_jax" / "control" / "laws", tmp_path / "rps_jax/world/domain.py"
     law = (laws / "pursuit.py").read_text().replace("PursuitParams", "StraightParams")
     (laws / "straight.py").write_text(law.replace('"pursuit"', '"straight"'))
-    text, after = domain.read_text(), "    def __post_init__(self) -> None:\n"
-    domain.write_text(text.replace(after, QUANTITY + after, 1))
+    text, anchor = domain.read_text(), "    def __post_init__(self) -> None:\n"
+    domain.write_text(text.replace(anchor, QUANTITY + anchor, 1))
     assert copied("-c", EVERYWHERE).count("straight") == 4
 
 
-def test_an_engine_of_ones_own_is_one_file_and_one_line(copied, tmp_path):
+def test_a_custom_engine_is_one_file_and_one_line(copied, tmp_path):
     """It then works from Python and on the command line, which lists it."""
     (tmp_path / "rps_jax" / "engines" / "dummy.py").write_text(DUMMY)
     registry = tmp_path / "rps_jax" / "engines" / "__init__.py"
-    before = registry.read_text()
+    source = registry.read_text()
     registry.write_text(
-        before.replace('    "quasistatic",\n', '    "quasistatic",\n    "dummy",\n')
+        source.replace('    "quasistatic",\n', '    "quasistatic",\n    "dummy",\n')
     )
-    assert len(registry.read_text().splitlines()) == len(before.splitlines()) + 1
+    assert len(registry.read_text().splitlines()) == len(source.splitlines()) + 1
     assert copied("-c", SWEEP).split() == [str(tmp_path / "rps_jax" / "__init__.py"), "1"]
     assert "quasistatic,dummy}" in re.sub(r"\s", "", copied("-m", "rps_jax", "sweep", "--help"))

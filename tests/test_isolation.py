@@ -3,7 +3,7 @@
 import subprocess
 import sys
 
-OTHERS = """
+NEIGHBOUR = """
 import contextlib, io
 with contextlib.redirect_stdout(io.StringIO()):
     from mujoco import mjx
@@ -18,9 +18,9 @@ def others():
     data = jax.jit(mjx.step)(mjx.put_model(model), mjx.make_data(model))
     return np.concatenate([data.qpos, data.qvel]).tobytes().hex()
 """
-ALONE = OTHERS + "print(others())"
-BESIDE = (
-    OTHERS
+ALONE = NEIGHBOUR + "print(others())"
+TOGETHER = (
+    NEIGHBOUR
     + """
 before = dict(collision_driver._COLLISION_FUNC)
 import rps_jax
@@ -33,12 +33,12 @@ print(others())
 )
 
 
-def test_somebody_elses_cylinder_falls_as_if_we_were_not_there():
-    """Bit by bit, after a cylinder of ours was stepped by MJX in the same process."""
+def test_a_cylinder_of_another_program_falls_unchanged():
+    """Bit for bit, after this package stepped a cylinder with MJX in the same process."""
 
-    def said(code):
+    def output_of(code):
         done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
         assert done.returncode == 0, done.stderr
         return done.stdout.split()[-1]
 
-    assert said(BESIDE) == said(ALONE)
+    assert output_of(TOGETHER) == output_of(ALONE)

@@ -176,12 +176,15 @@ void run(int n, const law_x *reals, const law_i *integers, law_out *out) {{
     subprocess.run([COMPILER, *flags, str(source), "-lm", "-o", str(library)], check=True)
     x, i = inputs(real)
     kinds = {"f": real, "i": np.int32, "b": np.int32}
-    fields = [(one.name, kinds[one.kind], one.shape) for one in run.outputs["out"] if one.size]
+    fields = [
+        (field.name, kinds[field.kind], field.shape) for field in run.outputs["out"] if field.size
+    ]
     out = np.zeros(len(x), np.dtype(fields, align=True))
     pointers = [np.ascontiguousarray(v).ctypes.data_as(ctypes.c_void_p) for v in (x, i, out)]
     ctypes.CDLL(str(library)).run(len(x), *pointers)
     return [
-        out[one.name] if one.size else np.zeros((len(x), *one.shape)) for one in run.outputs["out"]
+        out[field.name] if field.size else np.zeros((len(x), *field.shape))
+        for field in run.outputs["out"]
     ]
 
 
@@ -208,11 +211,11 @@ def run_js(names, real, folder):
     )
     values = {"NaN": np.nan, "Infinity": np.inf, "-Infinity": -np.inf}
 
-    def number(v):
-        return [number(one) for one in v] if isinstance(v, list) else values.get(v, v)
+    def to_float(v):
+        return [to_float(entry) for entry in v] if isinstance(v, list) else values.get(v, v)
 
     columns = zip(*json.loads(process.stdout), strict=True)
-    return [np.array([number(v) for v in column], float) for column in columns]
+    return [np.array([to_float(v) for v in column], float) for column in columns]
 
 
 def onnx_graph(names):
@@ -227,16 +230,16 @@ def run_onnx(names, real, folder):
     target, arguments, run, values = onnx_graph(names)
     fields = run.outputs["out"]
     pairs = [
-        (Tensor(one.name, one.shape, one.kind), value)
-        for one, value in zip(fields, values, strict=True)
-        if one.size
+        (Tensor(field.name, field.shape, field.kind), value)
+        for field, value in zip(fields, values, strict=True)
+        if field.size
     ]
     model = target.model("run", arguments, pairs).SerializeToString()
     session = runtime.InferenceSession(model, providers=["CPUExecutionProvider"])
     rows = [session.run(None, {"x": a, "i": b}) for a, b in zip(*inputs(real), strict=True)]
     columns = iter(np.stack(column) for column in zip(*rows, strict=True))
     count = len(rows)
-    return [next(columns) if one.size else np.zeros((count, *one.shape)) for one in fields]
+    return [next(columns) if field.size else np.zeros((count, *field.shape)) for field in fields]
 
 
 def run_simd(names, real, folder):

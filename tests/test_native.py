@@ -127,8 +127,8 @@ def test_a_drive_is_compiled_and_its_derivative_is_xlas(monkeypatch):
 
 
 def test_without_a_compiler_batches_run_side_by_side_in_one_loop(monkeypatch):
-    made = (batch(shape, count=2) for shape in ("box", "prism"))
-    stages, inputs, loops = zip(*made, strict=True)
+    batches = (batch(shape, count=2) for shape in ("box", "prism"))
+    stages, inputs, loops = zip(*batches, strict=True)
     trials = tuple(start_trials(subset, loops[0]) for subset in inputs)
     monkeypatch.setenv("RPS_COMPILER", "none")
     run = jax.make_jaxpr(lambda w, p, t: trial.advance(stages, w, p, t, loops[0], 3))

@@ -34,8 +34,8 @@ def test_a_drawn_world_is_the_same_world_at_its_point_bit_for_bit(name):
     np.testing.assert_array_equal(
         domain.object_of(at.cases(domain, np.arange(293))), object_indices
     )
-    for number in np.unique(object_indices):
-        rows = np.flatnonzero(object_indices == number)
+    for kind in np.unique(object_indices):
+        rows = np.flatnonzero(object_indices == kind)
         drawn, again = used(draws.draw(domain, 5, index[rows])), used(at.draw(domain, rows))
         for a, b in zip(drawn, again._replace(indices=index[rows], cases=drawn.cases), strict=True):
             assert jax.tree.all(jax.tree.map(np.array_equal, a, b))
@@ -55,7 +55,7 @@ def test_every_coordinate_of_a_domain_changes_some_world(name):
 def _leaves(domain, u):
     at = points.check_points(domain, u)
     object_indices = domain.object_of(at.cases(domain, np.arange(len(u))))
-    groups = [np.flatnonzero(object_indices == number) for number in np.unique(object_indices)]
+    groups = [np.flatnonzero(object_indices == kind) for kind in np.unique(object_indices)]
     drawn = [used(at.draw(domain, index)) for index in groups]
     return np.concatenate([np.ravel(leaf) for leaf in jax.tree.leaves(drawn)])
 

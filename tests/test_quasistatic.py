@@ -195,9 +195,9 @@ CASES = {
     **{f"sliding {i}": push for i, push in enumerate(SLIDING)},
 }
 MOVE = (2.0, -1.0, 2.5)  # [m, m, rad]
-HERE = CASES["here"]
-CASES["there"] = HERE._replace(
-    base=MOVE, pose=(*(turn(MOVE[2], HERE.pose[:2]) + MOVE[:2]), HERE.pose[2] + MOVE[2])
+BASE_CASE = CASES["here"]
+CASES["there"] = BASE_CASE._replace(
+    base=MOVE, pose=(*(turn(MOVE[2], BASE_CASE.pose[:2]) + MOVE[:2]), BASE_CASE.pose[2] + MOVE[2])
 )
 _rng = np.random.default_rng(1)
 for _i in range(24):  # flat on the face
@@ -389,9 +389,9 @@ def test_newtons_method_finds_the_minimum_by_its_derivatives():
     stage, dt = Quasistatic(), 0.01
     with jax.enable_x64(True):
         problem, v = jax.tree.map(lambda x: jnp.asarray(x, float), some_problems())
-        of = partial(cost, stage)
-        gradient = jax.vmap(jax.grad(of, argnums=1), (0, 0, None))
-        hessian = jax.vmap(jax.hessian(of, argnums=1), (0, 0, None))
+        cost_of_stage = partial(cost, stage)
+        gradient = jax.vmap(jax.grad(cost_of_stage, argnums=1), (0, 0, None))
+        hessian = jax.vmap(jax.hessian(cost_of_stage, argnums=1), (0, 0, None))
 
         @jax.jit
         def both(v):  # as written, and by differentiation
@@ -425,7 +425,7 @@ def moved_both_ways(inputs, seed):
     rows = [(0.0, 0)] + [(e, part) for part in range(3) for e in (1e-6, -1e-6)]
     stacked = []
     for part, (nominal, way) in enumerate(zip(inputs, ways, strict=True)):
-        steps = np.array([e if part == of else 0.0 for e, of in rows])
+        steps = np.array([e if part == moved_part else 0.0 for e, moved_part in rows])
         move = lambda x, d, s=steps: x + s.reshape(-1, *(1,) * x.ndim) * d  # noqa: E731
         stacked.append(jax.tree.map(move, nominal, way))
     return stacked, ways

@@ -49,9 +49,11 @@ def test_taxels_stand_where_their_boards_are():
     np.testing.assert_allclose(
         shell.taxels()[:, 0], [[0.5, 0.05], [0.5, -0.05], [0.5, -0.15]], atol=1e-7
     )
-    left, right = Robot(0.5, 0.2, (Boards("left", 1, 0.1), Boards("right", 1, 0.1))).shell.rows()
-    np.testing.assert_allclose(left.start, [-0.15, 0.2], atol=1e-7)
-    np.testing.assert_allclose(right.start, [0.15, -0.2], atol=1e-7)
+    left_board, right_board = Robot(
+        0.5, 0.2, (Boards("left", 1, 0.1), Boards("right", 1, 0.1))
+    ).shell.rows()
+    np.testing.assert_allclose(left_board.start, [-0.15, 0.2], atol=1e-7)
+    np.testing.assert_allclose(right_board.start, [0.15, -0.2], atol=1e-7)
 
 
 @pytest.mark.parametrize("boards", [BOARDS, FRONT_ONLY, ROBOTS["ridgeback"].boards])
@@ -75,8 +77,8 @@ def test_boards_at_the_papers_pitch_feel_as_the_papers():
     for sensor in (IdealSkin(), CapacitiveSkin(), SmoothSkin()):
         for y in (0.0, 0.13, -0.33, 0.391):
             expected = read(sensor, box(0.46, y))
-            found = read(sensor.on(Robot(boards=sides).shell), box(0.46, y))
-            for a, b in zip(expected, found, strict=True):
+            reading = read(sensor.on(Robot(boards=sides).shell), box(0.46, y))
+            for a, b in zip(expected, reading, strict=True):
                 np.testing.assert_allclose(a, b, atol=1e-5)
 
 
@@ -95,7 +97,7 @@ def test_nothing_is_felt_where_no_board_is(sensor):
 
 
 def test_a_corner_must_press_harder_on_coarser_taxels():
-    """The mean capacitance hardly changes for a corner a tenth as long as the taxel."""
+    """A corner a tenth as long as the taxel changes the mean capacitance very little."""
     corner = fp.place(
         fp.rectangle(0.1, 0.1), jnp.array([0.3625 + 0.1 * np.sqrt(2), 0.0]), jnp.asarray(np.pi / 4)
     )

@@ -1,4 +1,4 @@
-"""The site: every page finds its tab, links lead on, and what is wrong with it is told."""
+"""The site: tabs of all pages, links, equations, and reports of errors."""
 
 import re
 import runpy
@@ -15,8 +15,8 @@ class Files:
     src_uris = ("notebooks/03_paper.md",)
 
 
-def test_every_study_and_notebook_stands_in_one_tab():
-    pages = [page for tab in HOOKS["nav"]() for one in tab.values() for page in one]
+def test_every_study_and_notebook_is_in_one_tab():
+    pages = [page for tab in HOOKS["nav"]() for entries in tab.values() for page in entries]
     texts = [page for page in pages if isinstance(page, str)]
     assert len(texts) == len(set(texts))
     studies = {f"sweeps/{path.parent.name}/README.md" for path in ROOT.glob("sweeps/*/README.md")}
@@ -27,7 +27,7 @@ def test_every_study_and_notebook_stands_in_one_tab():
 
 
 @pytest.mark.parametrize(
-    ("link", "page", "there"),
+    ("link", "page", "expected"),
     [
         ("sweeps/table/README.md", "README.md", "sweeps/table/README.md"),
         ("engines/mjx.py", "rps_jax/README.md", "../reference/engines.md#rps_jax.engines.mjx"),
@@ -39,8 +39,8 @@ def test_every_study_and_notebook_stands_in_one_tab():
         ("results/table.json", "sweeps/table/README.md", "results/table.json"),
     ],
 )  # fmt: skip
-def test_a_link_of_the_repository_leads_on_in_the_site(link, page, there):
-    assert HOOKS["site_link"](link, page, Files) == there
+def test_a_link_of_the_repository_works_in_the_site(link, page, expected):
+    assert HOOKS["site_link"](link, page, Files) == expected
 
 
 def test_a_notebook_keeps_its_words_code_tables_and_pictures():
@@ -56,10 +56,10 @@ def test_a_notebook_keeps_its_words_code_tables_and_pictures():
 
 def test_an_equation_becomes_mathml():
     html = r'<p><span class="arithmatex">\(v^\* &lt; 1\)</span></p>'
-    found = HOOKS["on_page_content"](html, None, None, None)
-    assert "<math" in found
-    assert "<mo>&#x0002A;</mo>" in found
-    assert "\\" not in found
+    output = HOOKS["on_page_content"](html, None, None, None)
+    assert "<math" in output
+    assert "<mo>&#x0002A;</mo>" in output
+    assert "\\" not in output
 
 
 def test_dead_links_and_loads_from_other_hosts_are_told(tmp_path):

@@ -99,11 +99,11 @@ def test_there_are_42_taxels_on_14_boards_of_three_electrodes():
 
 
 def test_15_taxels_lie_on_each_side_and_12_on_the_front():
-    left, front, right = np.split(TAXELS, [15, 27])
-    np.testing.assert_allclose(left[:, 1], SIDE)
-    np.testing.assert_allclose(front[:, 0], FRONT)
-    np.testing.assert_allclose(right[:, 1], -SIDE)
-    for face in (left, front, right):
+    left_face, front_face, right_face = np.split(TAXELS, [15, 27])
+    np.testing.assert_allclose(left_face[:, 1], SIDE)
+    np.testing.assert_allclose(front_face[:, 0], FRONT)
+    np.testing.assert_allclose(right_face[:, 1], -SIDE)
+    for face in (left_face, front_face, right_face):
         assert (np.abs(face) <= np.array([FRONT, SIDE]) + 1e-7).all()
 
 
@@ -120,10 +120,10 @@ def test_the_taxels_of_every_face_have_the_pitch_of_48_3_mm_and_fill_it():
 
 
 def test_the_strip_runs_from_left_rear_across_the_front_to_right_rear():
-    left, front, right = np.split(TAXELS, [15, 27])
-    assert (np.diff(left[:, 0]) > 0).all()
-    assert (np.diff(front[:, 1]) < 0).all()
-    assert (np.diff(right[:, 0]) < 0).all()
+    left_face, front_face, right_face = np.split(TAXELS, [15, 27])
+    assert (np.diff(left_face[:, 0]) > 0).all()
+    assert (np.diff(front_face[:, 1]) < 0).all()
+    assert (np.diff(right_face[:, 0]) < 0).all()
 
 
 def test_the_strip_is_continuous_around_the_corners():
@@ -410,13 +410,13 @@ FLUSH_TAXELS = slice(19, 23)  # the four about the middle of the front
 def signals(gap: float, period: float, steps: int, sensor=CAPACITIVE):
     """The signal of a taxel (steps,) after a flush box appears at `gap`, and the readings."""
     state, shape = sensor.init(jax.random.key(0)), box(FRONT + 0.2 + gap, 0.0)
-    seen, touch = [], []
+    values, touch = [], []
     for _ in range(steps):
         state, reading = sense_one(sensor, state, shape, period)
         np.testing.assert_allclose(state.signal[FLUSH_TAXELS], state.signal[20], rtol=1e-5)
-        seen.append(float(state.signal[20]))
+        values.append(float(state.signal[20]))
         touch.append(bool(reading.in_contact))
-    return np.array(seen), touch
+    return np.array(values), touch
 
 
 @pytest.mark.parametrize(
@@ -437,9 +437,9 @@ def test_the_capacitance_is_inverse_to_the_gap_the_object_leaves(gap, change):
 
 def test_the_signal_follows_a_step_with_the_time_constant():
     # 5 mm of compression: change 1. After t it has grown to 1 - exp(-t / 50 ms).
-    seen, _ = signals(0.005, 0.01, 10)
-    np.testing.assert_allclose(seen[[4, 9]], [0.6321206, 0.8646647], rtol=1e-4)
-    np.testing.assert_allclose(seen, 1 - np.exp(-np.arange(1, 11) / 5), rtol=1e-4)
+    values, _ = signals(0.005, 0.01, 10)
+    np.testing.assert_allclose(values[[4, 9]], [0.6321206, 0.8646647], rtol=1e-4)
+    np.testing.assert_allclose(values, 1 - np.exp(-np.arange(1, 11) / 5), rtol=1e-4)
 
 
 def test_the_step_response_does_not_depend_on_the_period():

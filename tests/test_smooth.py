@@ -560,7 +560,7 @@ def test_a_skin_that_is_not_warm_is_refused(value):
         SmoothSkin(IdealSkin(tolerance=-1.0)).check()
 
 
-# Whole trials in C MuJoCo, which needs no compilation
+# Whole trials in C MuJoCo, without compilation
 
 
 def push(case: Case, law, horizon: float):
@@ -594,7 +594,7 @@ def test_without_heat_a_smooth_trial_is_the_hard_one(name):
 
 @pytest.mark.parametrize("law", [rps.LAW, registry.smooth_law(rps.LAW)], ids=["hard", "smooth"])
 def test_with_a_warm_skin_a_push_arrives(law):
-    """With both laws; a hard law reads whether there is contact."""
+    """Both laws succeed; the hard law reads the binary contact."""
     case = Case("box", FRICTION["S1"], (0.7, 0.05), skin=SmoothSkin())
     ended = push(case, law, 30.0)
     assert ended.success

@@ -62,8 +62,8 @@ def folder(tmp_path_factory):
 def test_a_study_labels_its_conditions_and_compares_them(folder):
     results = conditions.run_conditions(CONDITIONS, GRID, folder)
     assert results.success.dims == ("condition", *DIMS)
-    won = results.success.sum(DIMS).values
-    np.testing.assert_array_equal(won, [2, 0, 2])
+    successes = results.success.sum(DIMS).values
+    np.testing.assert_array_equal(successes, [2, 0, 2])
     rows = conditions.condition_rows(results, "default")
     assert [row[0] for row in rows] == ["reading", "the defaults", "slow", "thin skin"]
     assert rows[1][1:3] == ["2", "2 of 2"]
@@ -72,8 +72,8 @@ def test_a_study_labels_its_conditions_and_compares_them(folder):
 
 def test_a_study_continues_and_redoes_alone_what_is_corrupt(folder, monkeypatch):
     parts = Checkpoints(folder)
-    before, others = dict(parts.items()), parts.paths()
-    thin = others.pop("thin")
+    stored, rest = dict(parts.items()), parts.paths()
+    thin = rest.pop("thin")
     thin.write_bytes(b"torn")
     ran = []
     run = pushes.run
@@ -86,16 +86,16 @@ def test_a_study_continues_and_redoes_alone_what_is_corrupt(folder, monkeypatch)
     conditions.run_conditions(CONDITIONS, GRID, folder)
     assert ran == CONDITIONS["thin"].cases(GRID)
     again = [
-        files.decode_results(content["thin"], "thin") for content in (before, dict(parts.items()))
+        files.decode_results(content["thin"], "thin") for content in (stored, dict(parts.items()))
     ]
     xr.testing.assert_identical(*(results.drop_attrs() for results in again))
-    assert others.items() <= parts.paths().items()
+    assert rest.items() <= parts.paths().items()
 
 
 def test_a_study_refuses_a_folder_of_other_conditions(folder):
-    other = {"slow": Condition("slow", SHORT, params={"v_max": 0.002})}
+    changed = {"slow": Condition("slow", SHORT, params={"v_max": 0.002})}
     with pytest.raises(errors.InputError, match=r"slow.* was run with other options"):
-        conditions.run_conditions(other, GRID, folder)
+        conditions.run_conditions(changed, GRID, folder)
 
 
 def test_c_mujoco_driven_by_periods_matches_c_mujoco_driven_by_steps():
@@ -149,37 +149,42 @@ def test_the_hardware_experiments_cover_friction_targets_and_shoves():
 
 
 def test_a_setup_has_one_robot_and_a_friction_for_each_object():
-    asked = reproduce.Reproduce(setups=4, setting=rps_jax.Setting("quasistatic"))
-    every = points.names(asked.ranges)
-    u = asked.plan.points.u.reshape(4, 2, 8, -1)
+    question = reproduce.Reproduce(setups=4, setting=rps_jax.Setting("quasistatic"))
+    columns = points.names(question.ranges)
+    u = question.plan.points.u.reshape(4, 2, 8, -1)
     for name in ("foam", "robot_lag", "command_delay"):
-        column = u[..., every.index(name)]
+        column = u[..., columns.index(name)]
         assert (np.ptp(column, axis=(1, 2)) == 0).all()
         assert np.ptp(column) > 0
-    mu = u[..., every.index("friction_robot")]
+    mu = u[..., columns.index("friction_robot")]
     assert (np.ptp(mu, axis=2) == 0).all()
     assert (mu[:, 0, 0] != mu[:, 1, 0]).all()
-    assert (np.ptp(u[..., every.index("yaw")], axis=2) > 0).all()
-    cases = asked.plan.points.cases(asked.ranges, np.arange(64))
-    np.testing.assert_array_equal(asked.ranges.object_of(cases), np.tile(np.repeat([0, 1], 8), 4))
+    assert (np.ptp(u[..., columns.index("yaw")], axis=2) > 0).all()
+    cases = question.plan.points.cases(question.ranges, np.arange(64))
+    np.testing.assert_array_equal(
+        question.ranges.object_of(cases), np.tile(np.repeat([0, 1], 8), 4)
+    )
     np.testing.assert_array_equal(cases % 8, np.tile(np.arange(8), 8))
 
 
 def test_the_nearest_setups_are_those_that_give_all_of_the_papers_numbers():
-    told = [paper.HARDWARE_RESULTS[name] for name in paper.HARDWARE_OBJECTS]
+    reference = [paper.HARDWARE_RESULTS[name] for name in paper.HARDWARE_OBJECTS]
     off = np.arange(101.0)
-    found = xr.Dataset(
+    setups = xr.Dataset(
         {
-            "D": (("setup", "object"), [[t.mean_abs_l + 0.001 * i for t in told] for i in off]),
-            "time": (("setup", "object"), [[t.time for t in told]] * 101),
+            "D": (
+                ("setup", "object"),
+                [[t.mean_abs_l + 0.001 * i for t in reference] for i in off],
+            ),
+            "time": (("setup", "object"), [[t.time for t in reference]] * 101),
             "success": (("setup", "object"), np.full((101, 2), 8)),
             "off": ("setup", off),
             "drawn": (("setup", "quantity"), off[:, None]),
         },
         {"object": ["box", "cylinder"], "quantity": ["foam"]},
     )
-    assert list(reproduce.nearest(found.isel(setup=slice(None, None, -1))).off) == [0, 1, 2, 3, 4]
-    results, quantities = reproduce.tables(found).values()
+    assert list(reproduce.nearest(setups.isel(setup=slice(None, None, -1))).off) == [0, 1, 2, 3, 4]
+    results, quantities = reproduce.tables(setups).values()
     assert results[1] == ["D, box", "0.032 m", "0.082 m [0.037, 0.127]", "0.034 m [0.032, 0.036]",
                           "0.032 m"]  # fmt: skip
     assert quantities[1][2:] == ["2 [0.2, 3.8]", "+1.00", "+1.00", *quantities[1][5:]]

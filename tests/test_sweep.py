@@ -353,11 +353,11 @@ def test_a_run_with_the_removed_column_overflows_is_read(whole, tmp_path):
 def test_the_report_of_one_world_says_how_to_replay_its_failure(whole, tmp_path):
     folder = shutil.copytree(whole, tmp_path / "a run")
     results = merge([folder], out=folder)
-    one = results.isel(world=[0])
-    one.success[:] = [[1], [0]]
-    text = str(sweep.plan_sections(load_plan(folder), one, folder))
+    world = results.isel(world=[0])
+    world.success[:] = [[1], [0]]
+    text = str(sweep.plan_sections(load_plan(folder), world, folder))
     assert f"rps replay '{folder}' 0 --law nps" in text  # the law that fails
-    assert tables.influence_table(one, "rps")[1:] == []
+    assert tables.influence_table(world, "rps")[1:] == []
 
 
 def test_shards_merge_to_the_whole(whole, tmp_path):

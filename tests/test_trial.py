@@ -82,26 +82,26 @@ def test_rare_termination_checks_on_a_gpu_do_not_change_results(monkeypatch):
     chex.assert_trees_all_close(seldom, run("cpu"), atol=1e-6)
 
 
-@pytest.mark.parametrize("most", [1, 3, SLOTS])
-def test_the_last_trials_of_jobs_end_alike_side_by_side(monkeypatch, most):
-    """On a GPU; here of two families, and one trial, some that have not begun, or all."""
+@pytest.mark.parametrize("limit", [1, 3, SLOTS])
+def test_the_last_trials_of_jobs_end_alike_side_by_side(monkeypatch, limit):
+    """Merged batches of a GPU: two shape families, and at most 1, 3 or all trials suspended."""
     rules = Rules(horizon=60.0)
-    some = [case((0.6 + 0.05 * k, 0.05 * k)) for k in range(6)] + [case(AHEAD)]
-    some += [case((0.6, 0.1 * k), name="cylinder") for k in range(3)]
-    alone, _ = pushes.run(some, replace(FUSED, rules=rules), slots=SLOTS, workers=1)
+    cases = [case((0.6 + 0.05 * k, 0.05 * k)) for k in range(6)] + [case(AHEAD)]
+    cases += [case((0.6, 0.1 * k), name="cylinder") for k in range(3)]
+    alone, _ = pushes.run(cases, replace(FUSED, rules=rules), slots=SLOTS, workers=1)
     ran, plain = [], batch._Worker._compiled
-    monkeypatch.setattr(batch, "_max_suspended", lambda: most)
+    monkeypatch.setattr(batch, "_max_suspended", lambda: limit)
     monkeypatch.setattr(
         batch._Worker,
         "_compiled",
         lambda self, program: ran.append(program.slots) or plain(self, program),
     )
-    found, _ = pushes.run(some, replace(FUSED, rules=rules), slots=SLOTS, workers=2)
+    results, _ = pushes.run(cases, replace(FUSED, rules=rules), slots=SLOTS, workers=2)
     assert len(ran[-1]) == 2
     assert alone.success.sum() > 0
     for name in ("success", "time"):
-        np.testing.assert_array_equal(getattr(found, name), getattr(alone, name))
-    np.testing.assert_allclose(found.object_pose, alone.object_pose, atol=1e-3)  # other shapes
+        np.testing.assert_array_equal(getattr(results, name), getattr(alone, name))
+    np.testing.assert_allclose(results.object_pose, alone.object_pose, atol=1e-3)  # other shapes
 
 
 def test_a_base_may_turn_as_often_as_it_likes_and_not_go_as_far():

@@ -246,7 +246,7 @@ def evolution(generations=6, **options):
 
 
 def descents(generations=6):
-    """Return descents by antithetic steps, which need no derivatives of worlds."""
+    """Return descents by antithetic steps; worlds need no derivatives."""
     calls = TuneGrad("rps", estimator="evolution", steps=5, starts=2, pairs=3, **SMALL)
     tuner = calls.tuner
     tuner.generations = generations

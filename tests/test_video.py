@@ -25,15 +25,15 @@ def box() -> scene.Scene:
     return scene.load("box")
 
 
-def drive(of: scene.Scene, count: int = 5) -> list[np.ndarray]:
+def drive(loaded: scene.Scene, count: int = 5) -> list[np.ndarray]:
     """The base and the object before it, 0.2 m further forward in each frame."""
-    frames = np.tile(scene.initial_qpos(of), (count, 1))
+    frames = np.tile(scene.initial_qpos(loaded), (count, 1))
     frames[:, [0, 3]] += 0.2 * np.arange(count)[:, None]
     return list(frames)
 
 
 def decode(path: Path) -> np.ndarray:
-    """All images of a video (count, height, width, 3)."""
+    """Return the images of a video (count, height, width, 3)."""
     reader = imageio_ffmpeg.read_frames(str(path))
     width, height = next(reader)["size"]
     return np.array([np.frombuffer(f, np.uint8).reshape(height, width, 3) for f in reader])
@@ -83,9 +83,9 @@ def test_the_contact_point_leaves_a_path_with_gaps(box: scene.Scene, tmp_path: P
 
     nothing = (np.nan, np.nan)
     blank = last_image([nothing] * 6)
-    ends = [(1.0, 1.0), (1.0, 0.5), (1.0, -0.5), (1.0, -1.0), nothing]
-    whole = last_image([*ends, nothing])
-    gap = last_image([*ends[:2], nothing, *ends[2:]])
+    points = [(1.0, 1.0), (1.0, 0.5), (1.0, -0.5), (1.0, -1.0), nothing]
+    whole = last_image([*points, nothing])
+    gap = last_image([*points[:2], nothing, *points[2:]])
     middle = 240  # px: the column of y = 0
     assert middle in changed(blank, whole)[:, 1]
     assert middle not in changed(blank, gap)[:, 1]
@@ -94,21 +94,21 @@ def test_the_contact_point_leaves_a_path_with_gaps(box: scene.Scene, tmp_path: P
 
 @pytest.mark.parametrize("camera", ["above", "oblique"])
 def test_an_image_drawn_anew_in_part_is_the_whole_image(box: scene.Scene, camera: str) -> None:
-    thing = {"p_world_target": (1.0, 1.0), "size": (480, 270), "camera": camera}
+    options = {"p_world_target": (1.0, 1.0), "size": (480, 270), "camera": camera}
     frames = np.tile(scene.initial_qpos(box), (6, 1))
     frames[:, 3:5] += [(0.1 * i, 0.12 * i) for i in range(5)] + [(30, 30)]  # past the flag, away
-    for drawn, qpos in zip(video.images(box, frames, **thing), frames, strict=True):
-        assert len(changed(drawn, video.snapshot(box, qpos, **thing))) < 6
+    for drawn, qpos in zip(video.images(box, frames, **options), frames, strict=True):
+        assert len(changed(drawn, video.snapshot(box, qpos, **options))) < 6
 
 
 def test_a_trail_is_drawn_alike_in_parts_and_as_a_whole(box: scene.Scene) -> None:
-    thing = {"p_world_target": FAR, "size": (960, 540), "camera": "oblique"}
+    options = {"p_world_target": FAR, "size": (960, 540), "camera": "oblique"}
     frames = np.tile(scene.initial_qpos(box), (90, 1))
     frames[:, [0, 3]] += np.linspace(0, 1, 90)[:, None]
     frames[:, [1, 4]] += np.linspace(0, -1, 90)[:, None]
     far = frames.copy()
     far[:-1, 3:5] = (-2.9, -2.9)  # behind the trail, so that all of it is drawn anew at last
-    parts, whole = (video.images(box, some, **thing)[-1] for some in (frames, far))
+    parts, whole = (video.images(box, poses, **options)[-1] for poses in (frames, far))
     assert len(changed(parts, whole)) < 6
 
 
@@ -137,9 +137,9 @@ def test_both_cameras_see_targets_on_all_sides(box: scene.Scene, camera: str) ->
 def test_the_capsule_that_stands_in_for_a_drum_is_not_drawn() -> None:
     drum = scene.load("cylinder")
     qpos = scene.initial_qpos(drum)
-    before = video.snapshot(drum, qpos, p_world_target=FAR, size=SMALL)
+    image = video.snapshot(drum, qpos, p_world_target=FAR, size=SMALL)
     drum.model.geom("object_side").size = [1.0, 1.0, 0.0]
-    assert np.array_equal(before, video.snapshot(drum, qpos, p_world_target=FAR, size=SMALL))
+    assert np.array_equal(image, video.snapshot(drum, qpos, p_world_target=FAR, size=SMALL))
 
 
 def test_a_path_that_cannot_be_written_is_one_sentence(box: scene.Scene, tmp_path: Path) -> None:
@@ -204,10 +204,10 @@ def test_a_machine_that_cannot_draw_is_told_how_to_mend_it() -> None:
     code = "from rps_jax.world import video; print(video.check()[0])"
     environment = os.environ | {"MUJOCO_GL": "disable"}
     command = [sys.executable, "-c", code]
-    told = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
-    assert "ok=False" in told.stdout
-    assert "apt install libegl1" in told.stdout
-    assert told.stderr == ""
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
+    assert "ok=False" in done.stdout
+    assert "apt install libegl1" in done.stdout
+    assert done.stderr == ""
 
 
 def test_importing_the_module_changes_nothing() -> None:
@@ -229,5 +229,5 @@ def test_without_a_display_it_can_draw_where_mujoco_was_imported_before() -> Non
     code = "import mujoco; from rps_jax.world import video; print(video.check()[0].ok)"
     environment = {k: v for k, v in os.environ.items() if k not in ("MUJOCO_GL", "DISPLAY")}
     command = [sys.executable, "-c", code]
-    told = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
-    assert told.stdout == "True\n"
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
+    assert done.stdout == "True\n"

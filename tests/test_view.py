@@ -104,12 +104,12 @@ def test_every_kind_of_law_is_shown_live(law, tmp_path, monkeypatch, registries)
 
 @pytest.mark.slow
 def test_a_push_that_is_left_alone_ends_as_any_other_trial(live):
-    found, _ = pushes.run([CASE], SETTING, slots=1, workers=1)
+    results, _ = pushes.run([CASE], SETTING, slots=1, workers=1)
     live.step(2 * round(SETTING.rules.horizon / PERIOD))
     assert live.done
     for name, value in live.outcome._asdict().items():
-        np.testing.assert_allclose(value, getattr(found, name)[0], atol=1e-5, err_msg=name)
-    assert live.past[-1].snapshot.time == pytest.approx(float(found.time[0]), abs=1e-4)
+        np.testing.assert_allclose(value, getattr(results, name)[0], atol=1e-5, err_msg=name)
+    assert live.past[-1].snapshot.time == pytest.approx(float(results.time[0]), abs=1e-4)
 
 
 def test_a_target_that_is_dragged_is_the_one_that_counts(live):
@@ -134,12 +134,12 @@ def test_a_target_that_is_dragged_is_the_one_that_counts(live):
 def test_a_shove_moves_the_object_once_in_the_frame_of_the_robot(live):
     live.set_target((0.0, 3.0))
     live.step(250)
-    before = p_robot_object(live.past[-1].snapshot)
+    previous = p_robot_object(live.past[-1].snapshot)
     assert abs(live.past[-1].snapshot.qpos[2]) > 0.05  # turned, so that the frames differ
     live.shove((0.3, -0.2))
     live.step(1)
     np.testing.assert_allclose(
-        p_robot_object(live.past[-1].snapshot) - before, (0.3, -0.2), atol=3e-3
+        p_robot_object(live.past[-1].snapshot) - previous, (0.3, -0.2), atol=3e-3
     )
     shoved = live.past[-1].snapshot.qpos[3:5]
     live.step(2)
