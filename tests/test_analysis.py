@@ -135,7 +135,7 @@ def test_a_validated_law_has_two_decimals_above_99_percent():
     assert "99.37 %" in section.lines[-1]
 
 
-def test_the_quantity_that_decides_comes_first():
+def test_the_decisive_quantity_is_listed_first():
     """Heavy objects fail, whatever their friction; no other quantity varies."""
     index = np.arange(400)
     drawn = {"mass": index * 1.0, "friction_ground": index % 7 * 1.0}

@@ -29,7 +29,7 @@ def recorded(tmp_path_factory):
 
 
 @pytest.mark.parametrize("law", ["rps_plus", "learned_mlp", "aps"])
-def test_simulation_to_bag_to_law_gives_every_twist_back(law, tmp_path, recorded):
+def test_a_law_reproduces_every_twist_from_the_bag_of_a_simulation(law, tmp_path, recorded):
     path = recorded[0]
     if law != "rps_plus":
         path = tmp_path / "push.mcap"
@@ -41,7 +41,7 @@ def test_simulation_to_bag_to_law_gives_every_twist_back(law, tmp_path, recorded
     assert float(np.abs(results.v_x).max()) > 0.005
 
 
-def test_a_law_that_senses_force_gives_its_twists_back(tmp_path):
+def test_a_law_that_senses_force_reproduces_its_twists(tmp_path):
     path = tmp_path / "push.mcap"
     setting = rps_jax.Setting("fused", rules=rps_jax.Rules(horizon=10.0))
     push("box", target=(1.5, 0.2), law="force_push_published", bag=path, setting=setting)
@@ -52,7 +52,7 @@ def test_a_law_that_senses_force_gives_its_twists_back(tmp_path):
 
 
 @pytest.mark.parametrize("law", ["learned_gru", "learned_mlp"])
-def test_a_law_that_observes_its_last_twist_gives_its_twists_back(tmp_path, law):
+def test_a_law_that_observes_its_last_twist_reproduces_its_twists(tmp_path, law):
     path = tmp_path / "push.mcap"
     push("cylinder", target=(-1.0, 0.5), law=law, bag=path, setting=BRIEF)
     results = shadow(path, law)
@@ -71,7 +71,7 @@ def test_a_bag_does_not_change_the_trial(recorded):
     np.testing.assert_allclose(read["twist"][::5, 0], trace.data.v_x, atol=1e-7)
 
 
-def test_another_law_commands_otherwise(recorded):
+def test_another_law_gives_other_twists(recorded):
     results = shadow(recorded[0], "rps_plus,law.v_approach=0.02")
     assert float(np.abs(results.v_x[1] - results.v_x[0]).max()) == pytest.approx(0.01, abs=1e-4)
 
@@ -138,7 +138,7 @@ def test_a_bag_stores_pose_period_and_contact(tmp_path):
     assert "signal" not in columns
 
 
-def test_odd_files_are_refused_in_one_sentence(tmp_path, recorded):
+def test_invalid_files_are_refused_in_one_sentence(tmp_path, recorded):
     content = recorded[0].read_bytes()
     path = tmp_path / "odd.mcap"
     for odd in (b"", b"no bag", content[: len(content) // 2], content[:8] + content[200:]):

@@ -133,7 +133,7 @@ def test_levers_are_timed_against_the_unchanged_program(monkeypatch):
     assert len(levers.table(gains)) == 1 + len(gains)
 
 
-def test_an_engine_has_the_levers_that_it_knows():
+def test_levers_depend_on_the_engine():
     of_mjx, of_fused = (levers.levers_of(f"{name} standard", "box") for name in ("mjx", "fused"))
     assert set(of_fused) < set(of_mjx)
     assert "4 solver iterations" in of_fused
@@ -142,7 +142,7 @@ def test_an_engine_has_the_levers_that_it_knows():
     assert set(of_mjx) - set(of_cylinders) == {"MJX's own box collider"}
 
 
-def test_without_physics_the_base_goes_and_the_object_stays():
+def test_without_physics_the_base_moves_and_the_object_stays():
     _, worlds, _, params = pushes.build(
         [Case("box", FRICTION["S1"], (2.0, 0.0), gap=0)], Setting(engine="mjx")
     )
@@ -153,7 +153,7 @@ def test_without_physics_the_base_goes_and_the_object_stays():
     np.testing.assert_allclose(moved, [0.05 * 0.02, *[0] * 9], atol=1e-9)
 
 
-def test_a_program_is_traced_anew_for_each_lever():
+def test_a_program_is_retraced_for_each_lever():
     """A lever may change global state of MJX, which no argument shows."""
     calls = []
 
@@ -171,7 +171,7 @@ def test_a_program_is_traced_anew_for_each_lever():
     assert counts[1] == 2 * counts[0] > 0
 
 
-def test_a_box_found_as_a_prism_is_where_mjx_finds_it():
+def test_contacts_of_a_box_as_a_prism_equal_those_of_mjx():
     at = scene.load("box")
     model, blank = mjx.put_model(at.physics), mjx.make_data(at.physics)
     starts = [scene.initial_qpos(at, -0.001, yaw) for yaw in (0.0, 0.3)]
@@ -223,7 +223,7 @@ def test_whole_commands_are_timed_twice_per_gpu_count(monkeypatch):
     assert commands.table(results)[1][3:] == ["1.5 s", "2.0 s", "1,234", "1.1 GB", "1.1 GB"]
 
 
-def test_steps_on_a_robot_are_told_as_the_example_tells_them(monkeypatch):
+def test_step_times_on_a_robot_are_parsed_from_the_examples_output(monkeypatch):
     printed = "500 steps: median 146 us, 99.9th percentile 2512 us, worst 9041 us; "
     printed += "0.60% took longer than 1 ms"
     ended = subprocess.CompletedProcess([], 0, printed, "")

@@ -1,4 +1,4 @@
-"""The command line as a user meets it: whole runs, repeatable files, and teaching errors."""
+"""The command line: whole runs, repeatable files, and helpful errors."""
 
 import gc
 import json
@@ -82,7 +82,7 @@ def test_a_push_draws_and_films_a_trial(tmp_path, capsys):
     assert (out / "push.mp4").stat().st_size > 1_000
 
 
-def test_a_push_that_cannot_be_filmed_says_how_and_does_the_rest(tmp_path, capsys, monkeypatch):
+def test_a_push_without_ffmpeg_explains_the_fix_and_does_the_rest(tmp_path, capsys, monkeypatch):
     monkeypatch.setenv("IMAGEIO_FFMPEG_EXE", "/bin/false")
     out = tmp_path / "push"
     arguments = ("--engine", "fused", "--horizon", 18, "--out", out)
@@ -152,7 +152,7 @@ def test_quick_values_replace_defaults_but_no_explicit_value():
     assert TuneES().with_quick_values() == TuneES()
 
 
-def test_what_was_said_stays_in_a_quick_run_though_it_equals_its_default():
+def test_a_quick_run_keeps_an_explicit_value_that_equals_the_default():
     words = ["--quick", "--engine", "fused", "--worlds=512", "--horizon", "300.0"]
     assert (TuneES().setting.engine, TuneES().worlds) == ("fused", 512)
     quick = flags.parse(TuneES, "tune es", words)[0]
@@ -164,7 +164,7 @@ def test_what_was_said_stays_in_a_quick_run_though_it_equals_its_default():
         flags.parse(TuneES, "tune es", [robot[0], *robot[3:]])[0].validate()
 
 
-def test_files_of_the_same_name_are_told_apart_by_their_folders(tmp_path):
+def test_files_of_equal_names_are_distinguished_by_their_folders(tmp_path):
     texts = []
     for folder, gain in {"es": 0.3, "grad": 0.4}.items():
         path = tmp_path / folder / "tuned.json"
@@ -202,7 +202,7 @@ crowd = call_of(Crowd)
 BRIEF = ("--engine", "quasistatic", "--horizon", 2)
 
 
-def test_a_question_of_ones_own_is_one_file(tmp_path, capsys):
+def test_a_custom_question_is_one_file(tmp_path, capsys):
     path = tmp_path / "my_study.py"
     path.write_text(STUDY)
     assert rps(path, "--worlds", 3, *BRIEF, "--law", "rps", "--out", tmp_path / "run") == 0
@@ -221,8 +221,8 @@ def test_a_command_is_the_call_of_its_question(tmp_path):
     xr.testing.assert_identical(rps_jax.load(tmp_path), called)
 
 
-def test_a_run_that_is_stopped_says_so_in_one_line(tmp_path):
-    """At any moment: here while programs are compiled, in threads that know nothing of it."""
+def test_an_interrupted_run_prints_one_line(tmp_path):
+    """The interrupt may come at any time; here it comes while threads compile programs."""
     command = [sys.executable, "-m", "rps_jax", "sweep", "--worlds", "64", *map(str, BRIEF)]
     command += ["--domain", "wide,objects=random_cylinder"]
     process = subprocess.Popen(
@@ -241,7 +241,7 @@ def test_a_run_that_is_stopped_says_so_in_one_line(tmp_path):
     assert "Traceback" not in error
 
 
-def test_an_interrupt_that_the_garbage_collector_swallows_comes_again(capsys):
+def test_an_interrupt_during_garbage_collection_is_raised_again(capsys):
     def swallowed(phase, _):
         gc.callbacks.remove(swallowed)
         raise KeyboardInterrupt

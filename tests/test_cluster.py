@@ -1,4 +1,4 @@
-"""Sweeps through Ray: whoever runs a part and whoever dies, results are those of one process."""
+"""Sweeps on Ray: results equal those of one process, even if workers die."""
 
 import json
 import os
@@ -31,7 +31,7 @@ SWEEP = [
 # --- by hand -------------------------------------------------------------------------------
 
 
-def test_a_task_has_parts_of_one_kind_and_every_part_one_task():
+def test_a_task_has_parts_of_one_family_and_each_part_has_one_task():
     kinds = [list(range(0, 20)), list(range(20, 27))]
     tasks = list(cluster._divide(kinds, 3))
     assert [index for task in tasks for index in task] == list(range(27))
@@ -88,7 +88,7 @@ def test_without_a_cluster_a_sweep_ends_in_one_sentence(
 
 @pytest.fixture(scope="module")
 def two_workers():
-    """Ray, until the end of the module."""
+    """Two workers of a local Ray cluster."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("RAY_worker_niceness", "0")  # or other tests starve them
         with cluster.connected("local", num_cpus=2, object_store_memory=100 * 2**20) as ray:
@@ -102,7 +102,7 @@ def opened(folder):
 
 
 @pytest.mark.slow
-def test_a_worker_killed_at_work_changes_nothing(domain, tmp_path, two_workers, monkeypatch):
+def test_killing_a_worker_does_not_change_results(domain, tmp_path, two_workers, monkeypatch):
     """SIGKILL after one of its tasks; the parts are those of one process without Ray."""
     out, plan = opened(tmp_path / "run")
     use_cache()
@@ -127,7 +127,7 @@ def test_a_worker_killed_at_work_changes_nothing(domain, tmp_path, two_workers, 
     assert files.read_results(out).success.shape == (2, 20)
 
 
-def test_what_ends_a_worker_ends_the_run_as_itself(tmp_path, two_workers):
+def test_an_error_of_a_worker_ends_the_run_unchanged(tmp_path, two_workers):
     def prepare():
         raise jax.errors.JaxRuntimeError("RESOURCE_EXHAUSTED: Out of memory")
 

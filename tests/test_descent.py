@@ -37,7 +37,7 @@ def score(distance, contact, arrive=1e-5):
 
 
 class TestSoftScore:
-    def test_cold_it_is_the_hard_score_of_a_success(self):
+    def test_at_low_temperature_the_score_is_the_hard_score(self):
         # 1 m at 0.1 m/s in steps of 20 ms: nearer than d_success = 5 cm after 9.5 s = 475 steps.
         distance = 1.0 - 0.1 * 0.02 * np.arange(600)
         expected = OBJECTIVE.score(1.0, 9.5, 0.0, 0.0, SETTING.rules)
@@ -54,7 +54,7 @@ class TestSoftScore:
         expected = OBJECTIVE.score(1.0, 10.0 + 6.0, 0.0, 0.0, SETTING.rules)
         assert score(np.full(500, 0.3), contact) == pytest.approx(float(expected), rel=1e-5)
 
-    def test_it_has_a_slope_where_the_hard_one_jumps(self):
+    def test_the_soft_score_has_a_slope_where_the_hard_score_jumps(self):
         def at(d):
             question = snapshots(d * jnp.ones(5), jnp.ones(5))
             return descent.soft_score(question, RPSParams(), SETTING, OBJECTIVE, 0.005)
@@ -106,7 +106,7 @@ def test_antithetic_steps_find_the_slope_of_the_objective():
     assert (errors < 4).all()
 
 
-def test_windows_begin_where_their_trials_are_by_then(monkeypatch):
+def test_windows_start_at_the_states_of_their_trials(monkeypatch):
     """Trials are replaced by counts of their steps of 20 ms."""
 
     monkeypatch.setattr(descent, "start_all", lambda *arguments, law: jnp.zeros(arguments[-1].size))

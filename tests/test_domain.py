@@ -1,4 +1,4 @@
-"""Random worlds: each is what its address says, and what MuJoCo would compile."""
+"""Random worlds: each depends only on its seed and index, and equals MuJoCo's compilation."""
 
 import dataclasses
 import json
@@ -35,7 +35,7 @@ def drawn(name, count=COUNT, seed=3, **changes):
     return draws.draw(replace(WIDE, objects=(name,), **changes), seed, np.arange(count))
 
 
-def test_a_world_is_the_same_alone_as_among_others():
+def test_a_world_is_equal_alone_and_among_others():
     """The order of the requested worlds does not matter either."""
     worlds_again = draws.draw(WIDE, 7, np.arange(1, 3000, 3))
     for i in (0, 17, 999):
@@ -73,7 +73,7 @@ def test_everything_lies_in_its_range_and_fills_it(name):
             assert abs(at.mean() - 0.5) < 5 * 0.29 / math.sqrt(values.size), quantity
 
 
-def test_objects_take_turns():
+def test_objects_alternate_by_index():
     objects = WIDE.object_of(np.arange(9))
     assert objects.tolist() == [0, 1, 2] * 3
     assert [WIDE.family_of(i) for i in range(3)] == ["box", "cylinder", "prism"]
@@ -145,7 +145,7 @@ def test_models_of_a_family_differ_in_nothing_but_these_fields():
 
 @pytest.mark.parametrize("name", list(RANDOM))
 def test_mass_properties_are_those_that_mujoco_finds(name):
-    """For a solid of even density with a small load in it."""
+    """The solid has uniform density and a small load in it."""
     worlds = drawn(name, 6, seed=1)
     for i in range(6):
         row = jax.tree.map(lambda leaf, i=i: leaf[i], worlds.solid)
@@ -175,7 +175,7 @@ def _reach(row, bearing):
 
 
 def _even(spec, row):
-    """The geom of a solid of even density."""
+    """Return the geom of a solid of uniform density."""
     half = row.height / 2
     if len(row.vertices) == 1:
         return {"type": mujoco.mjtGeom.mjGEOM_CYLINDER, "size": [row.radius, half, 0]}
@@ -213,7 +213,7 @@ def test_a_square_prism_has_a_boxs_mass_properties():
     )
 
 
-def test_a_load_moves_the_centre_of_mass_by_the_share_that_is_asked_for():
+def test_a_load_moves_the_centre_of_mass_by_the_requested_share():
     worlds = drawn("random_prism", 50, com_offset=Range(0.3, 0.3))
     np.testing.assert_allclose(draws.table(worlds)["com_offset"][0], 0.3)
 
@@ -251,7 +251,7 @@ def test_a_domain_survives_json():
     assert domain.from_json({"mass": [3, 10, False]}).mass == Range(3, 10)
 
 
-def test_what_a_domain_does_not_draw_is_known_and_not_told_as_drawn():
+def test_undrawn_quantities_are_constant_and_not_labelled_as_drawn():
     assert not DOMAINS["wide"].idle
     assert {"mass", "com_offset", "friction_robot", "bearing", "noise"} < DOMAINS["paper"].idle
     assert not {"gap", "yaw", "pose_noise"} & DOMAINS["paper"].idle

@@ -32,7 +32,7 @@ def build_env(**options):
 
 
 def programs(push):
-    """`reset` of many keys, and STEPS steps of many worlds, (STEPS, n, ...), compiled."""
+    """Return compiled `reset` of many keys and STEPS steps of many worlds (STEPS, n, ...)."""
 
     def scan_step(state, actions):
         state = jax.vmap(push.step)(state, actions)
@@ -53,7 +53,7 @@ class Pushing:
         self.start = self.reset(jax.random.split(jax.random.key(0), COUNT))
 
     def go(self, state, actions, times=1):
-        """States (times * STEPS, COUNT, ...) under actions (COUNT, 3), or (3,) for all."""
+        """Return states (times * STEPS, COUNT, ...) under actions (COUNT, 3), or (3,) for all."""
         actions = jnp.broadcast_to(actions, (STEPS, COUNT, 3))
         parts = []
         for _ in range(times):
@@ -98,7 +98,7 @@ def test_step_keeps_the_structure_of_the_state_so_that_scan_works(pushing):
     assert "x" in result.metrics
 
 
-def test_a_key_decides_on_world_and_noise(pushing):
+def test_a_key_determines_world_and_noise(pushing):
     twice = pushing.reset(jax.vmap(jax.random.key)(jnp.array([1, 1, 2, 3])))
     np.testing.assert_array_equal(twice.obs[0], twice.obs[1])
     assert len({bytes(np.asarray(row)) for row in twice.obs}) == 3
@@ -134,7 +134,7 @@ def test_the_return_is_progress_minus_the_cost_of_time_without_contact(pushing):
         without = PERIOD * (~touch[: end + 1, i]).sum()
         assert states.reward[:, i].sum() == pytest.approx(gained - 0.05 * without + 1, abs=1e-4)
         assert felt[end] < pushing.env.params.d_success
-        # From then on nothing moves and nothing is earned.
+        # After the end nothing moves and the reward is 0.
         assert (states.done[end:, i] == 1).all()
         assert (states.reward[end + 1 :, i] == 0).all()
         np.testing.assert_array_equal(states.data.qpos[-1, i], states.data.qpos[end, i])
@@ -147,7 +147,7 @@ def test_the_return_is_progress_minus_the_cost_of_time_without_contact(pushing):
         )  # taxels of the front, by the skin's threshold
 
 
-def test_lost_contact_costs_and_counts_again_from_where_it_was_lost(pushing):
+def test_lost_contact_costs_and_progress_resumes_where_it_was_lost(pushing):
     touching = last(pushing.go(pushing.start, AHEAD, times=2))
     assert (touching.metrics["in_contact"] == 1).all()
     away = pushing.go(touching, BACK)
@@ -185,7 +185,7 @@ def test_a_nan_action_ends_only_its_world(pushing):
     assert np.isfinite(trajectory.obs).all()
 
 
-def test_it_moves_as_a_trial_that_is_driven_by_the_same_twist(pushing):
+def test_a_step_equals_a_trial_with_the_same_twist(pushing):
     """A law with a constant twist, in the control loop of trials."""
     push, state, action = pushing.env, pushing.start, jnp.array([0.8, 0.2, 0.3])
     mine = last(pushing.go(state, action))
@@ -208,8 +208,8 @@ def test_it_moves_as_a_trial_that_is_driven_by_the_same_twist(pushing):
     np.testing.assert_array_equal(sensed_more, mine.metrics["in_contact"])
 
 
-def test_a_batch_is_driven_as_one_and_not_world_by_world():
-    """On a GPU that is one kernel for all."""
+def test_a_batch_is_driven_as_a_whole():
+    """On a GPU, one kernel steps all worlds."""
     sizes = []
 
     class Stage:
@@ -249,6 +249,6 @@ def test_states_are_drawn_each_in_its_own_world(pushing):
         ({"weights": Reward(success=float("nan"))}, "success = nan"),
     ],
 )
-def test_environments_that_mean_nothing_are_refused(options, message):
+def test_invalid_environments_are_refused(options, message):
     with pytest.raises(InputError, match=message):
         PushEnv(**options)

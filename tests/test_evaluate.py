@@ -70,20 +70,20 @@ class TestEvaluate:
         assert len(compiled) == count
         assert (first.score != second.score).any()
 
-    def test_candidates_differ_by_their_parameters_alone(self):
+    def test_candidates_differ_only_in_their_parameters(self):
         results = evaluate(paper(3, v_approach=np.array([0.01, 0.05, 0.01])), CYLINDERS, 4, **SHORT)
         first, faster, again = results.transpose("candidate", ...).path_length.values
         np.testing.assert_array_equal(first, again)
         assert (first != faster).any()
 
-    def test_splits_and_seeds_have_worlds_of_their_own(self):
+    def test_splits_and_seeds_have_different_worlds(self):
         masses = [
             evaluate(paper(1), CYLINDERS, 4, split=split, **seeded(seed)).mass.values
             for seed, split in ((0, "tune"), (0, "test"), (1, "tune"))
         ]
         assert len(np.unique(masses)) == 12
 
-    def test_candidates_are_named_one_by_one_or_alone(self):
+    def test_candidates_are_given_as_a_list_or_as_one_law(self):
         alone, several = room.candidates("rps"), room.candidates(["rps", "rps,K_h=0.3"])
         for single in (alone, room.candidates(RPSParams.paper())):
             assert {np.shape(leaf) for leaf in single} == {(1,)}
@@ -110,7 +110,7 @@ class TestEvaluate:
             ({"slots": 0}, "slots = 0"),
         ],
     )
-    def test_bad_input_is_told_before_anything_compiles(self, bad, why, compiled):
+    def test_bad_input_is_refused_before_anything_compiles(self, bad, why, compiled):
         count = len(compiled)
         with pytest.raises(InputError, match=why) as caught:
             evaluate(**{"law": paper(3), "worlds": 4} | SHORT | bad)
@@ -154,7 +154,7 @@ def test_any_registered_law_with_nested_parameters(nested):
 
 
 class TestSeveralAsks:
-    def test_every_candidate_meets_the_same_worlds_whatever_shares_its_batch(self):
+    def test_candidates_have_equal_worlds_in_any_batch(self):
         faster, params = paper(2, v_approach=np.array([0.01, 0.05])), paper(2)
         hostile = replace(DOMAINS["hostile"], objects=("random_cylinder",))
         asks = [Candidates(faster, 3, np.arange(3)), Candidates(params, 3, np.arange(3))]

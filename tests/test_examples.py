@@ -57,7 +57,7 @@ def test_the_short_examples_are_short(name):
 # --- custom objects ----------------------------------------------------------------------
 
 
-def test_a_hexagon_of_ones_own_is_pushed(capsys):
+def test_a_custom_hexagon_is_pushed(capsys):
     # C MuJoCo compiles least; the other engines are compared below.
     outcome = example("custom_object")["main"](horizon=8.0, engine="mujoco").squeeze()
     assert "[0 0]" in capsys.readouterr().out
@@ -87,7 +87,7 @@ def test_a_hexagon_has_the_mass_of_its_geoms_and_its_registered_outline(hexagon)
     np.testing.assert_allclose(heavy.inertia, 2 * body.inertia, rtol=1e-6)
 
 
-def test_every_engine_has_the_same_hexagon(hexagon):
+def test_all_engines_have_an_equal_hexagon(hexagon):
     solids, friction = scene.solid_of(hexagon), Friction(np.array([0.3]), np.array([0.35]))
     physics = Setting(engine="mjx").physics
     for engine in ("fused", "mjx"):

@@ -107,13 +107,13 @@ def compiled(compiler, source, *options):
 
 
 @pytest.mark.parametrize("name", [name for name in LAWS if name not in ("nps", "learned_gru")])
-def test_a_law_in_c_does_what_it_does_in_jax(name, tmp_path):
+def test_a_law_in_c_agrees_with_jax(name, tmp_path):
     result = agreement(name, "double", 10_000, tmp_path)
     assert (result.inputs, result.unexplained) == (10_000, 0)
     assert result.beyond == result.flips <= 10
 
 
-def test_a_law_in_c_does_what_it_does_in_jax_in_float(tmp_path):
+def test_a_law_in_c_agrees_with_jax_in_float(tmp_path):
     """Differences beyond the tolerance are only where JAX's own twist is as uncertain."""
     result = agreement("rps_plus", "float", 20_000, tmp_path)
     assert (result.inputs, result.unexplained) == (20_000, 0)
@@ -122,13 +122,13 @@ def test_a_law_in_c_does_what_it_does_in_jax_in_float(tmp_path):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", LAWS)
-def test_a_law_in_c_does_what_it_does_in_jax_for_many_inputs(name, tmp_path):
+def test_a_law_in_c_agrees_with_jax_for_many_inputs(name, tmp_path):
     for precision in ("float", "double"):
         assert agreement(name, precision, 500_000, tmp_path).unexplained == 0
 
 
-def test_a_fault_in_c_is_found(tmp_path, monkeypatch):
-    """A constant that is another one in its eighth digit."""
+def test_a_fault_in_c_is_detected(tmp_path, monkeypatch):
+    """The fault is a constant with another eighth digit."""
     right, header = "params->law_K_v * v", c.header(program.program("rps_plus"), "law")
     assert right in header
     wrong = header.replace(right, f"(law_real)1.0000001 * {right}")
@@ -171,7 +171,7 @@ def test_a_law_of_a_users_file_is_exported(custom_law, tmp_path):
 
 
 @pytest.mark.parametrize("robot", ["ridgeback"])
-def test_the_skin_in_c_does_what_it_does_in_jax(robot, tmp_path):
+def test_the_skin_in_c_agrees_with_jax(robot, tmp_path):
     native = Native(program.program("rps", robot), tmp_path, "float")
     skin = SKINS["capacitive"].on(robots.parse_robot(robot).shell)
     count, rng = skin.shell.count, np.random.default_rng(0)
@@ -207,7 +207,7 @@ def test_the_skin_in_c_does_what_it_does_in_jax(robot, tmp_path):
 
 @pytest.mark.parametrize("name", ["rps_plus", pytest.param("learned_gru", marks=pytest.mark.slow)])
 def test_a_whole_trial_step_by_step(name, tmp_path):
-    """C remembers by itself; observations are those of the trial in JAX."""
+    """The C law keeps its memory; observations are those of the trial in JAX."""
     case = Case("box", "S1", (-1.0, 0.5), law=name)
     setting = Setting("quasistatic", rules=Rules(horizon=20.0))
     trials = recorded([case], setting)
@@ -222,10 +222,10 @@ def test_a_whole_trial_step_by_step(name, tmp_path):
     assert np.median(errors) < 1e-6
 
 
-# --- what cannot be exported, and the command ----------------------------------------------
+# --- unsupported operations, and the command -----------------------------------------------
 
 
-def test_an_operation_that_cannot_be_written_is_named(tmp_path, capsys, registries):
+def test_an_unsupported_operation_is_named(tmp_path, capsys, registries):
     for operation, code in (
         ("while", "jax.lax.while_loop(lambda x: x < 1, lambda x: x + l * l + 0.1, l)"),
         ("sort", "jnp.sort(seen.p_robot_contact)[0]"),
@@ -286,7 +286,7 @@ console.log(JSON.stringify({ twists, odd, felt: felt.contact }));
 
 @pytest.mark.skipif(shutil.which("node") is None, reason="Node.js is not there")
 @pytest.mark.parametrize("name", ["rps_plus", "learned_mlp", "own"])
-def test_javascript_does_what_c_does(name, tmp_path, custom_law):
+def test_javascript_agrees_with_c(name, tmp_path, custom_law):
     exported = program.program(custom_law if name == "own" else name)
     native = Native(exported, tmp_path, "double")
     leaves = observations(exported, np.random.default_rng(0), 300, np.float64)
@@ -312,7 +312,7 @@ def test_javascript_does_what_c_does(name, tmp_path, custom_law):
 
 
 @pytest.mark.parametrize("name", ["rps_plus", "learned_mlp", "aps", "force_push_published"])
-def test_onnx_does_what_c_does(name, tmp_path):
+def test_onnx_agrees_with_c(name, tmp_path):
     onnx, runtime = pytest.importorskip("onnx"), pytest.importorskip("onnxruntime")
     count, exported = 200, program.program(name)
     model = onnx_model.models(exported, "law", count)["law.onnx"]
@@ -343,7 +343,7 @@ def test_onnx_does_what_c_does(name, tmp_path):
     assert np.median(differences) < 1e-7
 
 
-def test_the_command_says_what_onnx_lacks(tmp_path, capsys, monkeypatch):
+def test_the_command_names_missing_packages_of_onnx(tmp_path, capsys, monkeypatch):
     monkeypatch.setitem(sys.modules, "onnx", None)
     error = refusal(capsys, "export", "onnx", "--law", "rps", "--out", tmp_path)
     assert "pip install 'rps_jax[export]'" in error

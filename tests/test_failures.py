@@ -105,7 +105,7 @@ def test_subset_simulation_is_unbiased_and_its_interval_covers():
     assert np.mean(variation) == pytest.approx(p.std() / 0.01, rel=0.35)
 
 
-def test_simulations_side_by_side_equal_separate_ones():
+def test_concurrent_simulations_equal_separate_ones():
     score, kinds = normal_severity(0.01, 6)
     options, seeds = Rare(particles=200, groups=4, share=0.5), range(3)
     requests = []
@@ -122,7 +122,7 @@ def test_simulations_side_by_side_equal_separate_ones():
     assert len(requests) == max(len(x.levels) for x in separate)
 
 
-def test_one_in_a_hundred_thousand_takes_a_twentieth_of_the_worlds():
+def test_a_failure_probability_of_1e_5_needs_a_twentieth_of_the_worlds():
     p, *_, trials = estimates(1e-5, 18, Rare(particles=18_000, groups=20), 8)
     assert p.std(ddof=1) / 1e-5 <= 0.2
     assert np.mean(p) == pytest.approx(1e-5, rel=0.15)

@@ -1,4 +1,4 @@
-"""Faults of every class that `fuzz.py` throws: nothing ends in a traceback, or hangs."""
+"""Faults of all classes of `fuzz.py`: no command ends in a traceback or hangs."""
 
 import fuzz
 import pytest
@@ -10,7 +10,7 @@ SHARE = {"values": 60, "laws": 1000, "edits": 6, "damages": 12}
 
 @pytest.fixture
 def undrawn(monkeypatch):
-    """Figures of reports are made, but not rendered, which would take most of the time."""
+    """Skip the rendering of figures, which would take most of the time."""
 
     def png(picture):
         picture.draw()
@@ -20,7 +20,7 @@ def undrawn(monkeypatch):
 
 
 @pytest.mark.parametrize("name", SHARE)
-def test_faults_are_told_in_one_sentence(name, registries, undrawn):
+def test_faults_are_reported_in_one_sentence(name, registries, undrawn):
     run, _ = fuzz.CLASSES[name]
     bad: list[str] = []
     counts = run(SHARE[name], 1, bad.append)

@@ -36,7 +36,7 @@ TWIST = (0.05, 0.0, 0.03)
 
 @pytest.fixture(scope="module", autouse=True)
 def stands(tmp_path_factory):
-    """A box on feet, a box on its corners, and one on feet that are its corners."""
+    """A box on feet, a box on its corners, and a box whose feet are at its corners."""
     path = tmp_path_factory.mktemp("feet") / "wedge.xml"
     path.write_text(XML)
     corners = solid.rectangles(np.array([0.2]), np.array([0.3]))[0]
@@ -49,7 +49,7 @@ def stands(tmp_path_factory):
 
 
 def start(name):
-    """A scene, and where it begins: the base at the object, off its middle."""
+    """Return a scene and its initial positions, with the base at the object, off its middle."""
     loaded = scene.load(name, FINE, FRICTION)
     qpos = scene.initial_qpos(loaded, -0.0005, 0.2)
     qpos[4:6] += 0.1, -0.0005  # sunk, so that rounding does not decide what touches
@@ -57,7 +57,7 @@ def start(name):
 
 
 def in_c(name, steps):
-    """Positions (10,) after steps at TWIST in C MuJoCo."""
+    """Return positions (10,) after steps at TWIST in C MuJoCo."""
     loaded, qpos = start(name)
     data = mujoco.MjData(loaded.physics)
     data.qpos[:] = qpos
@@ -69,7 +69,7 @@ def in_c(name, steps):
 
 
 def driven(engine, names, steps):
-    """Positions (n, 10) after steps at TWIST in an engine."""
+    """Return positions (n, 10) after steps at TWIST in an engine."""
     scenes, qpos = zip(*map(start, names), strict=True)
     stage, fields = staged(engine, scenes, FINE)
     return simulate(engine, stage, fields, np.array(qpos), TWIST, FINE, steps).qpos[-1]
@@ -79,7 +79,7 @@ Y = 4  # of the object, along the base's front, on which it comes to lie
 
 
 @pytest.mark.parametrize("engine", ["fused", "mjx"])
-def test_feet_decide_where_an_object_ends_and_engines_end_where_c_mujoco_does(engine):
+def test_feet_change_the_final_pose_and_engines_agree_with_c_mujoco(engine):
     feet, corners = in_c("on_feet", 300), in_c("on_corners", 300)
     assert feet[Y] - corners[Y] > 0.01
     qpos = driven(engine, ["on_feet", "on_both"], 300)
@@ -87,7 +87,7 @@ def test_feet_decide_where_an_object_ends_and_engines_end_where_c_mujoco_does(en
     np.testing.assert_allclose(qpos[1, :6], corners[:6], atol=3e-3)
 
 
-def test_quasistatic_ends_nearer_to_c_mujoco_with_the_same_feet():
+def test_quasistatic_is_nearer_to_c_mujoco_with_equal_feet():
     feet, corners = in_c("on_feet", 300), in_c("on_corners", 300)
     qpos = driven("quasistatic", ["on_feet", "on_both"], 300)
     assert qpos[0, Y] - qpos[1, Y] > 0.005
@@ -95,7 +95,7 @@ def test_quasistatic_ends_nearer_to_c_mujoco_with_the_same_feet():
         assert abs(final[Y] - expected[Y]) < abs(final[Y] - wrong[Y])
 
 
-def test_a_scene_gives_its_feet_back():
+def test_a_scene_returns_its_feet():
     row = scene.solid_of(scene.load("on_feet", FINE, FRICTION))
     np.testing.assert_array_equal(row.feet[0, :3], np.column_stack([FEET, np.ones(3)]))
     np.testing.assert_array_equal(row.feet[0, 3:, 2], 0)
@@ -120,7 +120,7 @@ def test_the_arm_of_friction_is_that_of_the_feet():
         assert share == pytest.approx(expected, abs=1e-6)
 
 
-def test_the_rigid_solver_stands_on_feet():
+def test_the_rigid_solver_supports_feet():
     row = scene.solid_of(scene.load("on_feet", FINE, FRICTION))
     feet = rigid.supports(row, np.zeros(1), np.zeros((1, 2)))
     np.testing.assert_allclose(feet[0, :3], FEET, atol=1e-9)
@@ -148,7 +148,7 @@ def test_feet_without_sense_are_refused(stands, feet, message):
 
 
 def drawn_on_feet(name, count=4):
-    """Worlds with drawn feet, and with those of the same worlds without."""
+    """Return worlds with drawn feet, and the same worlds without feet."""
     changes = f"wide,objects={name},gap=0,lateral=-0.05:0.05,height=0.3:0.4,friction_ground=0.1:0.4"
     ranges = [domains.parse_domain(changes), domains.parse_domain(f"{changes},feet=0.5:0.9")]
     plain, on_feet = (draws.draw(domain, 3, np.arange(count)) for domain in ranges)
@@ -221,7 +221,7 @@ def test_quasistatic_slides_on_drawn_feet():
     assert (np.asarray(sliders.arm) < solid.friction_arm(plain.solid)).all()
 
 
-def test_feet_are_drawn_for_random_objects_alone():
+def test_feet_are_drawn_only_for_random_objects():
     with pytest.raises(InputError, match="only random objects stand on drawn feet"):
         domains.parse_domain("wide,objects=box,feet=0.5:0.9")
     ranges = domains.parse_domain("wide,feet=0.5:0.9")

@@ -26,26 +26,26 @@ FPS = 12
 
 
 def table(folder):
-    """A run of `rps table` over two targets, as far as a film reads it."""
+    """Write the part of a run of `rps table` over two targets that a film reads."""
     targets = [(0.6, 0.0), (2.0, 2.0)]
     question = Table(objects=("box",), targets=targets, setting=Setting(ENGINE))
     run_folder.claim(folder, question.configuration())
 
 
 def plan_of(*names):
-    """Two worlds of each of these objects."""
+    """Return a plan of two worlds per object."""
     domain = dataclasses.replace(DOMAINS["wide"], objects=names)
     setting = Setting(rules=Rules(horizon=20.0), engine=ENGINE)
     return Plan(domain, 2 * len(names), {"rps": RPSParams.paper()}, setting)
 
 
 def a_sweep(folder):
-    """A run of `rps sweep`, as far as a film reads it."""
+    """Write the part of a run of `rps sweep` that a film reads."""
     open_run(folder, plan_of("random_cylinder"))
 
 
 def tiles(images, rows, columns):
-    """The tiles of images, (count, rows, columns, height, width, 3)."""
+    """Return the tiles of images, (count, rows, columns, height, width, 3)."""
     count, height, width, _ = images.shape
     cut = images.reshape(count, rows, height // rows, columns, width // columns, 3)
     return cut.swapaxes(2, 3).astype(int)

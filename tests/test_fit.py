@@ -21,7 +21,7 @@ HEAD = "time,x,y,yaw,contact_type,contact_x,contact_y,v_x,v_y,omega,target_x,tar
 
 
 def rows_of(count=400, interval=0.02):
-    """A base that drives ahead at 0.05 m/s with a contact at its front."""
+    """Return rows of a base that drives ahead at 0.05 m/s with a contact at its front."""
     time = interval * np.arange(count)
     rows = np.zeros((count, 12))
     rows[:, 0], rows[:, 1], rows[:, 7] = time, 0.05 * time, 0.05
@@ -79,7 +79,7 @@ WRONG = {
 
 
 @pytest.mark.parametrize("message", WRONG)
-def test_what_is_no_log_of_this_robot_is_refused_before_anything_compiles(
+def test_logs_of_other_robots_are_refused_before_anything_compiles(
     message, tmp_path, compiled, capsys
 ):
     path = written(tmp_path / "log.csv", *WRONG[message](rows_of(), HEAD))
@@ -104,7 +104,7 @@ def test_what_cannot_be_fitted_is_refused(arguments, message, tmp_path, capsys, 
 
 
 def bagged(path, rows, **changes):
-    """The rows of a table as a bag."""
+    """Write the rows of a table as a bag."""
     steps = [
         bag.Step(
             row[0], row[1:4], row[10:12], int(row[4]), row[5:7], row[7:10],
@@ -147,7 +147,7 @@ def test_bags_that_are_no_log_are_refused_before_anything_compiles(tmp_path, com
     assert not (tmp_path / "run").exists()
 
 
-def test_traces_and_odometry_are_not_mixed_and_something_must_be_given(tmp_path):
+def test_traces_and_odometry_are_exclusive_and_one_is_required(tmp_path):
     with pytest.raises(InputError, match="give at least one"):
         rps_jax.fit(())
     brief = rps_jax.Setting("quasistatic", rules=rps_jax.Rules(horizon=7.0))
@@ -163,8 +163,8 @@ def test_traces_and_odometry_are_not_mixed_and_something_must_be_given(tmp_path)
     assert (x, y, yaw) == pytest.approx((0.3625 + 0.02 + 0.25, 0.0, 0.0), abs=0.02)
 
 
-def test_contacts_are_made_of_taxels():
-    """Two neighbours of the front are a line between them; one is a point; none is no contact."""
+def test_contacts_are_computed_from_taxels():
+    """Two adjacent front taxels give a line; a single taxel gives a point."""
     signal = np.zeros((3, SHELL.count))
     front = np.flatnonzero(np.isclose(np.asarray(SHELL.taxels()[:, 0, 0]), 0.3625))
     signal[0, front[5:7]], signal[1, front[2]] = 1.0, 1.0
@@ -176,7 +176,7 @@ def test_contacts_are_made_of_taxels():
 
 
 def a_log(delay=0, share=1.0, count=500):
-    """A base that carries out a share of a changing command, so many rows later."""
+    """Return rows of a base that applies a share of a changing command, delayed by some rows."""
     time = 0.02 * np.arange(count)
     twist = np.zeros((1, count, 3))
     twist[0, :, 0] = 0.03 + 0.02 * np.sin(time)
@@ -197,7 +197,7 @@ def test_delay_and_slip_are_read_off_the_base():
     assert -later / share == pytest.approx(0.2, abs=0.02)
 
 
-def test_a_log_in_the_mirror_has_its_target_on_the_other_side():
+def test_a_mirrored_log_has_a_mirrored_target():
     log = a_log()
     original, mirrored = (logs.statistics(x, 0.02) for x in (log, logs.mirror(log)))
     assert (
@@ -210,7 +210,7 @@ def test_a_log_in_the_mirror_has_its_target_on_the_other_side():
 
 @pytest.fixture(scope="module")
 def toy():
-    """Networks that learned x = u_0 + noise of 0.1, and know nothing of u_1."""
+    """Return networks trained on x = u_0 + noise of 0.1, independent of u_1."""
     rng = np.random.default_rng(0)
     u = rng.random((3000, 2))
     x = np.stack([u[:, :1] + 0.1 * rng.standard_normal((3000, 1)) for _ in range(2)], 1)
@@ -229,7 +229,7 @@ def test_four_observations_halve_the_width(toy):
     assert result[:, 0].std() == pytest.approx(0.05, rel=0.3)
 
 
-def test_a_fitted_domain_keeps_what_is_undetermined_and_is_read_by_every_command(tmp_path):
+def test_a_fitted_domain_keeps_undetermined_ranges_and_all_commands_read_it(tmp_path):
     wide = domains.parse_domain("wide")
     u = np.random.default_rng(1).random((4000, len(fit.coordinates(wide))))
     at = {name: i for i, name in enumerate(fit.coordinates(wide))}
@@ -247,7 +247,7 @@ def test_a_fitted_domain_keeps_what_is_undetermined_and_is_read_by_every_command
 
 
 def test_a_log_is_fitted_from_the_shell(tmp_path, capsys, optimised):
-    """And the fitted domain is one that a sweep takes."""
+    """A sweep accepts the fitted domain."""
     log = written(tmp_path / "log.csv", rows_of())
     ask = ["fit", log, "--domain", "wide,objects=random_box", "--worlds", 96, "--window", 5]
     assert rps(*ask, "--physics", "default,timestep=0.01", "--out", tmp_path / "run") == 0
@@ -264,7 +264,7 @@ def test_a_log_is_fitted_from_the_shell(tmp_path, capsys, optimised):
     np.testing.assert_allclose(both[1]["median"], both[0]["median"], rtol=0.05, atol=1e-3)
 
 
-def test_the_table_of_bags_counts_intervals_that_hold_the_truth_and_ends_that_moved():
+def test_the_table_of_bags_counts_intervals_with_the_truth_and_moved_bounds():
     rank = [[[0.5, 0.01], [0.5, 0.5]], [[0.5, 0.5], [0.5, 0.5]]]  # (source, log, quantity)
     low = np.zeros((2, 2, 2))
     low[0, 1, 1] = -0.03

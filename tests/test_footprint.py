@@ -263,7 +263,7 @@ def test_a_line_that_touches_a_circle_crosses_it_in_a_point():
     assert (low, high) == (1.0, 1.0)
 
 
-def test_a_line_that_stays_clear_has_an_empty_interval():
+def test_a_line_without_crossing_has_an_empty_interval():
     for shape in (fp.rectangle(0.3, 0.2), fp.circle(0.2)):
         origin, along = jnp.array([0.0, 0.26]), jnp.array([1.0, 0.0])
         assert tuple(map(float, fp.crossing(shape, origin, along, 0.05))) == (math.inf, -math.inf)
@@ -422,6 +422,6 @@ STAR = [[math.sin(4 * math.pi * i / 5), -math.cos(4 * math.pi * i / 5)] for i in
         ("empty", []),
     ],
 )
-def test_polygon_rejects_what_is_no_convex_counter_clockwise_outline(fault, vertices):
+def test_polygon_rejects_outlines_that_are_not_convex_and_counter_clockwise(fault, vertices):
     with pytest.raises(ValueError, match="vertices must"):
         fp.polygon(vertices)

@@ -31,7 +31,7 @@ S1, SLIPPERY = FRICTION["S1"], Friction(1e-4, 0.35)
 
 @pytest.mark.parametrize("engine", ["fused", "mjx", "mujoco"])
 def test_a_box_pushed_straight_ahead_pushes_back_with_the_friction_of_its_weight(engine):
-    """Within some per cent: sliding friction of MuJoCo's soft ground lifts what slides."""
+    """They agree within some per cent: MuJoCo's soft friction lifts a sliding object."""
     steady = push_object(engine).force[50:].mean(axis=0)
     np.testing.assert_allclose(steady, (-0.3 * WEIGHT, 0.0, 0.0), atol=0.05 * 0.3 * WEIGHT)
 
@@ -70,7 +70,7 @@ def test_the_fused_engine_tells_the_force_of_c_mujoco():
     np.testing.assert_allclose(force, expected, atol=0.03 * size)
 
 
-def test_who_does_not_ask_is_told_no_force():
+def test_force_is_computed_only_on_request():
     at = scene.load("box", STANDARD, S1)
     stage, fields = staged("fused", [at], STANDARD)
     still = jnp.zeros((1, 9))
@@ -102,7 +102,7 @@ def test_a_load_cell_follows_a_step_with_its_time_constant():
     np.testing.assert_allclose(readings, share[:, None] * (-30.0, 10.0), rtol=1e-5)
 
 
-def test_a_load_cell_tells_nothing_below_its_threshold():
+def test_a_load_cell_reads_zero_below_its_threshold():
     readings = read_cell(LoadCell(noise=0.0, threshold=5.0), [(-3.0, 4.2)] * 20)
     size = np.hypot(*((1 - np.exp(-0.4 * np.arange(1, 21)))[:, None] * (-3.0, 4.2)).T)
     np.testing.assert_array_equal(np.hypot(*readings.T) > 0, size >= 5)
@@ -120,14 +120,14 @@ def test_the_noise_of_a_load_cell_is_filtered_too():
 
 
 @pytest.mark.parametrize("name", ["noise", "time_constant", "threshold"])
-def test_a_load_cell_refuses_what_no_sensor_has(name):
+def test_a_load_cell_refuses_invalid_parameters(name):
     with pytest.raises(InputError, match=name):
         LoadCell(**{name: -1.0}).check()
 
 
 @pytest.mark.parametrize("engine", ["fused", "mujoco"])
-def test_a_law_is_told_the_force_of_the_push_it_makes(engine):
-    """Straight ahead, the law reads the force that slides the box of 10 kg."""
+def test_a_law_observes_the_force_of_its_push(engine):
+    """Straight ahead, the law reads the force that slides a box of 10 kg."""
     gains = PublishedForcePushParams(k_theta=-1.0, k_y=0.0)
     case = Case("box", FRICTION["S1"], (1.6, 0.0), gains, gap=0.0, mass=10.0)
     setting = Setting(engine=engine, rules=Rules(horizon=4.0))

@@ -1,4 +1,4 @@
-"""Force Push on its authors' ground: their grid, and what their law makes of it."""
+"""Force Push in the experiment of its authors: their grid and the results of their law."""
 
 import math
 from dataclasses import replace
@@ -12,7 +12,7 @@ from sweeps.force_push_grid import grid
 from sweeps.force_push_grid.study import ForcePushGrid
 
 
-def test_the_grid_is_that_of_their_script():
+def test_the_grid_equals_that_of_the_authors_script():
     cells = grid.cells()
     assert cells.angle.size == 3**5 == 243
     assert len(set(zip(*cells, strict=True))) == 243
@@ -20,7 +20,7 @@ def test_the_grid_is_that_of_their_script():
 
 
 def test_the_moments_of_inertia_by_hand():
-    """An even plate of 1 kg and 1 m: 1/6 and 1/8 kg m^2; at the edge: 1/2 and 1/4."""
+    """A uniform plate of 1 kg and 1 m has 1/6 and 1/8 kg m^2; at the edge 1/2 and 1/4."""
     box, drum = grid.moments("box"), grid.moments("cylinder")
     np.testing.assert_allclose(box[:, 2], (1 / 12, 1 / 6, 1 / 2))
     np.testing.assert_allclose(drum[:, 2], (1 / 16, 1 / 8, 1 / 4))
@@ -29,7 +29,7 @@ def test_the_moments_of_inertia_by_hand():
     np.testing.assert_allclose(drum[2, :2], (6 * 0.5**2 + 0.12**2) / 12)
 
 
-def test_the_pusher_starts_behind_the_point_that_it_will_meet():
+def test_the_pusher_starts_behind_its_contact_point():
     cells = grid.cells()
     for slider in grid.SLIDERS:
         qpos = grid.starts(slider, cells)
@@ -44,9 +44,7 @@ def test_the_pusher_starts_behind_the_point_that_it_will_meet():
     np.testing.assert_allclose(np.unique(yaw.round(9)), np.round((-math.pi / 8, 0, math.pi / 8), 9))
 
 
-def test_their_law_brings_every_box_back_to_the_path_and_the_open_loop_loses_most(
-    tmp_path, monkeypatch
-):
+def test_the_law_returns_all_boxes_to_the_path_and_open_loop_loses_most(tmp_path, monkeypatch):
     """Boxes start up to 0.4 m off the path and follow it for 6 m in 60 s."""
     question = ForcePushGrid(sliders=("box",), duration=60.0, out=tmp_path)
     results = question()
@@ -75,6 +73,6 @@ def test_their_law_brings_every_box_back_to_the_path_and_the_open_loop_loses_mos
         ({"engine": "mujoco"}, "JAX must trace it"),
     ],
 )
-def test_what_the_grid_cannot_run_is_refused(options, words):
+def test_invalid_options_of_the_grid_are_refused(options, words):
     with pytest.raises(InputError, match=words):
         ForcePushGrid(**options)()

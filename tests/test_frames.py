@@ -1,4 +1,4 @@
-"""Planar geometry: right values where others overflow, finite derivatives where others are NaN."""
+"""Planar geometry: correct values without overflow, and finite derivatives without NaN."""
 
 from __future__ import annotations
 
@@ -262,7 +262,7 @@ def test_the_yaw_of_a_body_on_its_nose_is_finite_with_finite_derivatives():
     assert np.isfinite(gradient).all()
 
 
-def test_tilt_is_the_angle_of_the_vertical_and_differentiable_where_it_is_none():
+def test_tilt_is_the_angle_to_the_vertical_and_differentiable_at_zero():
     half = np.float32(0.3)
     lean = np.array([np.cos(half), np.sin(half) * 0.6, np.sin(half) * 0.8, 0.0], np.float32)
     turned = np.array([np.cos(half), 0.0, 0.0, np.sin(half)], np.float32)

@@ -1,4 +1,4 @@
-"""The fused engine computes what C MuJoCo computes, written out."""
+"""The fused engine agrees with C MuJoCo."""
 
 import functools
 from dataclasses import replace
@@ -58,7 +58,7 @@ def in_c(model, qpos, steps):
 
 @functools.cache
 def program(family, physics):
-    """Push worlds of a family for some steps: compiled once for each cone."""
+    """Return a function that pushes worlds of a family, compiled once for each cone."""
 
     @jax.jit
     def run(body, state, steps):
@@ -78,7 +78,7 @@ def drive(name, body, physics, qpos, steps):
 
 @pytest.mark.parametrize("cone", ["elliptic", "pyramidal"])
 @pytest.mark.parametrize(("name", "yaw", "offset"), STARTS)
-def test_a_step_ends_where_c_mujoco_ends_it(name, yaw, offset, cone):
+def test_a_step_agrees_with_c_mujoco(name, yaw, offset, cone):
     physics = replace(FINE, cone=cone)
     loaded, body, qpos = start(name, yaw, offset, physics)
     expected = in_c(loaded.physics, qpos, 1)
@@ -91,7 +91,7 @@ def test_a_step_ends_where_c_mujoco_ends_it(name, yaw, offset, cone):
 
 
 @pytest.mark.parametrize(("name", "yaw", "offset"), [STARTS[1], STARTS[3], STARTS[4]])
-def test_a_push_of_three_seconds_ends_where_c_mujoco_ends_it(name, yaw, offset):
+def test_a_push_of_three_seconds_agrees_with_c_mujoco(name, yaw, offset):
     """C MuJoCo drops one of two contacts of a tilted edge now and then, which rocks the object."""
     loaded, body, qpos = start(name, yaw, offset)
     expected, _ = in_c(loaded.physics, qpos, 300)
@@ -132,7 +132,7 @@ def test_a_contacts_force_and_stiffness_are_derivatives_of_its_cost(cone):
 
 @pytest.mark.parametrize("name", ["box", "cylinder"])
 @pytest.mark.parametrize("degrees", [0, 5, 10, 20, 40])
-def test_an_object_that_leans_away_is_touched_where_it_is(name, degrees):
+def test_the_contact_of_a_leaning_object_is_at_its_lower_edge(name, degrees):
     """Its rear lower edge 5 mm before the base, at any lean; below that edge there is nothing."""
     loaded = scene.load(name)
     size = loaded.physics.geom("object").size

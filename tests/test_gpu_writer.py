@@ -78,7 +78,7 @@ class Emulated:
 
 
 @pytest.mark.parametrize("threads", [1, 4, 32])
-def test_operations_are_what_jax_says(threads, tmp_path):
+def test_operations_agree_with_jax(threads, tmp_path):
     def all_of(x):
         return [function(x) for function in OPERATIONS.values()]
 
@@ -94,7 +94,7 @@ def test_operations_are_what_jax_says(threads, tmp_path):
 @pytest.mark.parametrize("skin", ["capacitive", "ideal"])
 @pytest.mark.parametrize("shape", ["box", "cylinder", "prism"])
 def test_a_control_step_is_the_processors(shape, skin, tmp_path):
-    """Whichever worlds a warp has side by side."""
+    """This holds for any combination of worlds in a warp."""
     stage, inputs, loop, pushing = in_a_push(shape, skin)
 
     def world_step(world, params, state):
@@ -126,8 +126,8 @@ def test_a_control_period_is_the_processors(tmp_path):
     np.testing.assert_allclose(computed.motion.qvel, expected.motion.qvel, rtol=1e-3, atol=1e-4)
 
 
-def test_what_threads_share_has_an_end(tmp_path):
-    """48 KiB of a block: more is refused, and XLA compiles."""
+def test_shared_memory_is_bounded(tmp_path):
+    """A block has 48 KiB: larger functions are refused, and XLA compiles them."""
 
     def world_step(x):
         return jax.lax.dynamic_slice(x * jnp.arange(3000.0), (x.astype(int),), (2,))

@@ -71,7 +71,7 @@ def repeat(name, n, seed=1) -> Estimate:
 
 
 @every_estimator
-def test_the_gradient_of_a_quadratic_is_found_without_bias_and_within_its_interval(name):
+def test_the_gradient_of_a_quadratic_is_unbiased_and_within_its_interval(name):
     for n in (32, 512):
         estimate = repeat(name, n)
         error = estimate.gradient - STIFF * THETA
@@ -113,8 +113,8 @@ def test_evolution_has_the_gradient_of_the_smoothed_score():
     assert (estimate.variance < 0.05**2 * 9).all()
 
 
-def test_only_evolution_sees_what_jumps():
-    """A world is won if the first parameter, 0.5, passes a hurdle uniform on [-1, 2]."""
+def test_only_evolution_estimates_gradients_across_jumps():
+    """A trial succeeds if the first parameter, 0.5, exceeds a threshold uniform on [-1, 2]."""
 
     def wins(thetas, hurdles):
         return (thetas[:, 0] > hurdles).astype(thetas.dtype)
@@ -177,7 +177,7 @@ def test_a_sample_beyond_the_bound_is_scaled_down_to_it_by_hand():
     np.testing.assert_array_equal(nothing.gradient, [0.0, 0.0])
 
 
-def test_an_estimate_of_nothing_is_zero_with_infinite_variance():
+def test_an_empty_estimate_is_zero_with_infinite_variance():
     estimate = gradients.estimate(jnp.array([[jnp.nan, 1.0], [jnp.nan, jnp.nan]]))
     np.testing.assert_array_equal(estimate.gradient, [0.0, 1.0])
     np.testing.assert_array_equal(estimate.variance, [np.inf, np.inf])
@@ -196,7 +196,7 @@ def test_a_combination_weighs_by_inverse_variance_by_hand():
 
 
 @pytest.mark.parametrize(("sure", "lost"), [(1.0, np.inf), (0.0, np.inf), (0.0, 0.0)])
-def test_what_knows_nothing_has_no_weight(sure, lost):
+def test_an_estimate_of_infinite_variance_has_no_weight(sure, lost):
     a, b = known([2.0], [sure]), known([2.0 if lost == 0 else 7.0], [lost])
     for both in (estimators.combine(a, b), estimators.combine(b, a)):
         assert both.gradient == 2.0

@@ -19,7 +19,7 @@ DRY = Rounding(slip=1e-5, depth=1e-7)
 
 
 def blocks(half_x, half_y, offset=0.0, bearing=0.0):
-    """Boxes, one for each half length and width [m]; the load moves the centre of mass."""
+    """Return boxes by half length and width [m]; the load moves the centre of mass."""
     half_x, half_y = np.broadcast_arrays(np.atleast_1d(half_x), half_y)
     unit = np.ones(len(half_x))
     outline = solid.rectangles(half_x, half_y)
@@ -39,13 +39,13 @@ def pushed(solids, robot=MU_ROBOT, height=0.0):
 
 
 def poses_at_front(solids, y=0.0, yaw=0.0):
-    """Poses of solids that touch the base's front."""
+    """Return poses of solids that touch the base's front."""
     unit = np.ones(solids.mass.size)
     return np.column_stack([solid.extent(solids, yaw * unit), y * unit, yaw * unit])
 
 
 def first_step(target, pose, direction=(1.0, 0.0), rounding=DRY):
-    """The first step of a push."""
+    """Return the first step of a push."""
     touching = rigid.contacts(target.solids, pose)
     pose = pose - np.array([1.0, 0, 0]) * touching.gap.min(axis=1)[:, None]  # so that it touches
     start = np.zeros((len(pose), 3)), np.zeros((len(pose), 2))
@@ -115,7 +115,7 @@ def test_an_object_slides_along_the_base_beyond_the_cone_of_friction():
         np.testing.assert_allclose(step.force[0, 1] / step.force[0, 0], share, rtol=1e-3)
 
 
-def test_the_edges_of_the_cone_and_the_push_vote_on_the_sense_of_turning():
+def test_cone_edges_and_push_direction_decide_the_sense_of_rotation():
     """Mason: the sense is that in which most of three lines pass the centre of friction.
 
     They are the two edges of the contact's cone and the line in which the base moves there.
@@ -156,7 +156,7 @@ def test_pushes_mirror_balance_and_converge():
     assert np.abs(coarse.pose[-1] - softer.pose[-1])[:, :2].max() < 5e-4
 
 
-def test_a_steady_lift_of_what_slides_hardly_moves_the_end():
+def test_a_constant_lift_of_a_sliding_object_barely_changes_its_final_pose():
     """It moves load between the diagonals of four points, and none between three points."""
     for name, bound in (("box", 1e-3), ("cylinder", 1e-9)):
         target = pushes.targets()[name]
@@ -178,7 +178,7 @@ def test_a_box_touches_with_its_corners_and_at_the_ends_of_the_front():
     assert shifted.gap[0, -2] == 1.0  # the other end meets nothing
 
 
-def test_a_push_in_mujoco_ends_where_a_rigid_object_does():
+def test_a_push_in_mujoco_agrees_with_the_rigid_limit():
     """On this project's ground, at 5 cm/s, pushed at the lower edge of the base."""
     box = pushes.targets()["box"]
     measured = pushes.in_mujoco(box, 0.08, 0.05, grounds.GROUNDS["standard"].physics)
@@ -192,7 +192,7 @@ def test_a_push_in_mujoco_ends_where_a_rigid_object_does():
     assert measured.tilt < 5e-3
 
 
-def test_a_study_is_labelled_kept_and_refuses_what_was_run_otherwise(tmp_path, monkeypatch):
+def test_a_study_is_labelled_and_cached_and_refuses_other_options(tmp_path, monkeypatch):
     tiny = grounds.GROUNDS["fast"]
     kinds = {"a": tiny, "b": grounds.GROUNDS["standard"]}
     monkeypatch.setattr(grounds, "GROUNDS", {k: _at(v, 0.2) for k, v in kinds.items()})

@@ -1,4 +1,4 @@
-"""The environment of Gymnasium is a `PushEnv` whose actions last, alone or many at once."""
+"""The Gymnasium environment: a `PushEnv` with held actions, single or vectorised."""
 
 import importlib
 import sys
@@ -38,7 +38,7 @@ def vector():
 
 @pytest.mark.filterwarnings("ignore:.*A Box observation space (min|max)imum value is")
 @pytest.mark.filterwarnings("error:.*WARN")
-def test_gymnasium_finds_nothing_wrong(single):
+def test_the_checker_of_gymnasium_passes(single):
     check_env(single.unwrapped, skip_render_check=True)
     assert single.observation_space.shape == (44,)
     assert single.action_space == gymnasium.spaces.Box(-1, 1, (3,), np.float32)
@@ -76,7 +76,7 @@ def test_a_seed_decides_on_worlds_and_noise(single, vector):
 
 
 def to_the_end(envs):
-    """Steps until a trial arrives."""
+    """Step until a trial succeeds."""
     envs.reset(seed=0)
     for _ in range(20):
         obs, rewards, terminated, truncated, infos = envs.step(AHEAD)
@@ -85,7 +85,7 @@ def to_the_end(envs):
     raise AssertionError("targets are ahead")
 
 
-def test_who_arrives_is_terminated_and_begins_anew_in_the_next_step(vector):
+def test_a_success_terminates_and_resets_in_the_next_step(vector):
     assert vector.metadata["autoreset_mode"] is AutoresetMode.NEXT_STEP
     _, rewards, ended, truncated, infos = to_the_end(vector)
     assert infos["is_success"][ended].all()
@@ -103,7 +103,7 @@ def test_who_arrives_is_terminated_and_begins_anew_in_the_next_step(vector):
     assert (vector.step(AHEAD)[4]["time"][ended] == 1).all()
 
 
-def test_or_at_once_where_that_is_asked_for(vector):
+def test_autoreset_in_the_same_step_is_optional(vector):
     _, rewards, ended, *_ = to_the_end(vector)
     envs = make_vector(autoreset_mode="SameStep")
     for name in ("_start", "_act", "_select"):  # whose programs are compiled
@@ -129,7 +129,7 @@ def test_who_runs_out_of_time_is_truncated(vector):
     assert not infos["is_success"].any()
 
 
-def test_images_are_drawn_where_they_are_asked_for(single):
+def test_images_are_rendered_on_request(single):
     single.reset(seed=0)
     assert single.unwrapped.render() is None
     drawn = gymnasium.make("rps_jax/Push-v0", render_mode="rgb_array", **HOW)
@@ -156,7 +156,7 @@ def test_what_means_nothing_is_refused(single, vector):
         single.unwrapped.step([np.nan, 0, 0])
 
 
-def test_without_gymnasium_it_says_what_to_install(monkeypatch):
+def test_without_gymnasium_the_error_names_the_package(monkeypatch):
     monkeypatch.setitem(sys.modules, "gymnasium", None)
     monkeypatch.delitem(sys.modules, "rps_jax.trials.gym")
     with pytest.raises(InputError, match=r"run pip install 'rps_jax\[gym\]'"):

@@ -16,7 +16,7 @@ PACKAGE = ROOT / "rps_jax"
 ROOMS = sorted(path.parent for path in PACKAGE.glob("*/__init__.py"))
 
 
-def test_nothing_stands_beside_the_rooms():
+def test_the_package_has_no_files_beside_its_rooms():
     files = {path.name for path in PACKAGE.iterdir() if path.is_file()}
     assert files == {
         *("__init__.py", "__init__.pyi", "__main__.py"),
@@ -56,7 +56,7 @@ def documented() -> dict[str, tuple[list[str], dict[str, bool]]]:
     return classes
 
 
-def test_a_public_method_says_what_it_does_or_inherits_it():
+def test_a_public_method_has_or_inherits_a_docstring():
     classes = documented()
 
     def says(name: str, method: str) -> bool:
@@ -82,7 +82,7 @@ def test_the_test_command_of_the_readme_is_that_of_ci():
 @pytest.mark.parametrize(
     "path", sorted((ROOT / "notebooks").glob("examples/*.py")), ids=lambda path: path.stem
 )
-def test_examples_import_what_the_table_of_public_names_has(path):
+def test_examples_import_only_public_names(path):
     assert set(imported(path)) <= {"rps_jax", *dict(addresses())}
 
 

@@ -1,4 +1,4 @@
-"""Using this package changes MJX for nobody else in the process."""
+"""The package does not change MJX for other code in the process."""
 
 import subprocess
 import sys

@@ -64,7 +64,7 @@ def test_a_line_varies_one_parameter_within_its_bounds_and_no_other():
     assert (np.asarray(grid.l_mr) <= np.asarray(grid.l_cr)).all()
 
 
-def test_candidates_begin_with_the_sets_and_without_spread_lie_between_two_of_them():
+def test_candidates_start_with_the_sets_and_without_spread_interpolate_two_sets():
     result = candidates.cloud(list(SETS.values()), FULL, 30, 0.0, seed=3)
     space = Space(FULL)
     z = space.vector(result)
@@ -111,7 +111,7 @@ def test_each_parameter_alone_is_labelled_and_from_worlds_for_validation(pretend
     assert result.attrs["worlds"] == 8
 
 
-def test_the_front_is_chosen_in_worlds_for_validation_and_measured_in_those_for_testing(pretended):
+def test_the_front_is_chosen_by_validation_and_measured_by_test_worlds(pretended):
     result = candidates.front(SETS, Problem(), candidates=6, worlds=8)
     assert [ask.seed for ask in pretended] == [seed_of(0, s) for s in ("validate", "test")]
     params = [jax.tree.map(np.asarray, ask.params) for ask in pretended]

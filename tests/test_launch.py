@@ -62,7 +62,7 @@ def launched(folder, fails="nothing"):
     return json.loads(done.stdout)
 
 
-def test_kernels_run_beside_each_other_and_what_follows_waits_for_all(folder):
+def test_kernels_run_concurrently_and_later_work_waits_for_all(folder):
     ((error, first), (_, second)), *results = launched(folder)
     assert error == ""
     np.testing.assert_array_equal(results[0], 3 * np.arange(2))
@@ -96,7 +96,7 @@ def test_kernels_run_beside_each_other_and_what_follows_waits_for_all(folder):
     ("event", "a kernel could not be launched"),
     ("launch", "a kernel could not be launched"),
 ])  # fmt: skip
-def test_a_failure_is_told_and_leaves_nothing_open(fails, error, folder):
+def test_a_failure_is_reported_and_releases_resources(fails, error, folder):
     for message, notes in launched(folder, fails)[0]:
         assert message == error
         for kind in ("stream", "event"):
@@ -106,7 +106,7 @@ def test_a_failure_is_told_and_leaves_nothing_open(fails, error, folder):
         assert ("pop" in notes) == any(line.startswith("push") for line in notes)
 
 
-def test_xla_knows_the_version_of_the_interface(folder):
-    """Else it refuses to register the function."""
+def test_xla_accepts_the_version_of_the_interface(folder):
+    """XLA refuses to register a function with another version."""
     function = getattr(ctypes.CDLL(str(folder / "launcher.so")), NAME)
     jax.ffi.register_ffi_target(NAME, jax.ffi.pycapsule(function), platform="cpu")

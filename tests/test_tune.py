@@ -45,7 +45,7 @@ class TestSpace:
         vectors = self.vectors / 2
         np.testing.assert_allclose(FULL.vector(FULL.params(vectors)), vectors, atol=2e-3)
 
-    def test_what_is_written_is_the_whole_law(self):
+    def test_the_written_file_has_the_whole_law(self):
         """Fixed parameters are written if they differ from the preset."""
         paper, tuned = RPSParams.paper(), RPSParams.tuned()
         narrow = Space(("l_cr",))
@@ -70,7 +70,7 @@ class TestSpace:
         vector = Space(("eta", "beta")).vector(RPSParams.paper())
         np.testing.assert_allclose(vector, [0.0, np.log(0.11 / 0.18)], atol=1e-6)
 
-    def test_what_is_not_tuned_stays(self):
+    def test_parameters_that_are_not_tuned_stay(self):
         params = Space(("L",)).params(jnp.array([1.7]))
         paper = RPSParams.paper()
         assert all(
@@ -177,7 +177,7 @@ class TestEvolution:
     def test_a_value_that_is_not_a_number_ranks_worst(self):
         assert self.minimise(sphere, 60, bad=2, population=16)[-1] < 1e-3
 
-    def test_without_any_value_it_goes_on(self):
+    def test_a_search_continues_after_a_generation_without_finite_values(self):
         assert np.isfinite(self.minimise(sphere, 3, bad=7, population=8)).all()
         first = search(population=8)
         metrics = {"values": np.full(8, np.nan), "mean": first.mean, "validation": np.nan}
@@ -197,7 +197,7 @@ class TestEvolution:
         np.testing.assert_allclose(away.std(axis=0), 0.3, rtol=0.05)
         np.testing.assert_allclose(away.mean(axis=0), 0.0, atol=0.02)
 
-    def test_a_stalled_search_begins_again_elsewhere_and_keeps_the_best(self):
+    def test_a_stalled_search_restarts_elsewhere_and_keeps_the_best(self):
         first = search(population=8, patience=2)
         for value in (1.0, 2.0, 3.0):
             metrics = {"values": np.zeros(8), "mean": np.full(4, value), "validation": value}
@@ -215,8 +215,8 @@ class TestEvolution:
                 TuneES("rps", **bad).validate()
 
     def test_quick_tunes_few_parameters_of_rps_and_all_of_other_laws(self):
-        few = TuneES("rps", quick=True).with_quick_values()
-        assert few.tuned == ("K_h", "K_v", "l_cr", "d_th")
+        quick = TuneES("rps", quick=True).with_quick_values()
+        assert quick.tuned == ("K_h", "K_v", "l_cr", "d_th")
         assert TuneES("pursuit", quick=True).with_quick_values().tuned == ("full",)
 
     def test_algorithms_of_several_parameters_are_refused_for_one(self):
@@ -301,7 +301,7 @@ class TestRuns:
         assert parts == whole
 
     @pytest.mark.parametrize("tuner", [evolution, descents])
-    def test_a_damaged_generation_alone_is_tried_again(self, tmp_path, pretended, tuner):
+    def test_only_a_damaged_generation_is_repeated(self, tmp_path, pretended, tuner):
         whole = tuned(tmp_path, tuner())
         log = (tmp_path / "log.jsonl").read_text()
         (third,) = (tmp_path / "parts").glob("000002*")
@@ -321,7 +321,7 @@ class TestRuns:
         with pytest.raises(InputError, match="its generation 1 differs from the one"):
             tuned(tmp_path / "one", evolution(3))
 
-    def test_what_is_done_stays_when_less_is_asked_for(self, tmp_path, pretended):
+    def test_finished_generations_stay_when_fewer_are_requested(self, tmp_path, pretended):
         whole = tuned(tmp_path, evolution(6))
         assert tuned(tmp_path, evolution(2)) == whole
         assert len(read_log(tmp_path)) == 6
@@ -336,7 +336,7 @@ class TestRuns:
                 assert curve[name].tolist() == [line[name] for line in log]
             assert curve["params.K_h"].tolist() == [line["params"]["K_h"] for line in log]
 
-    def test_it_ends_when_its_budget_is_spent_and_goes_on_with_more(self, tmp_path, pretended):
+    def test_a_search_ends_with_its_budget_and_resumes_with_more(self, tmp_path, pretended):
         for budget, done in ((2.5, 3), (4.0, 4), (0.0, 6)):  # 1 s a generation
             tuned(tmp_path, evolution(budget=budget))
             assert len(read_log(tmp_path)) == done
