@@ -90,7 +90,7 @@ def folder_digests(out: Path) -> dict[str, str]:
         elif path.suffix in (".h", ".mjs", ".onnx"):
             content = path.read_bytes()
             if path.suffix != ".onnx":  # numbers and operators, without names and comments
-                text = re.sub(r"//.*|/\*.*?\*/", "", content.decode(), flags=re.DOTALL)
+                text = re.sub(r"//[^\n]*|/\*.*?\*/", "", content.decode(), flags=re.DOTALL)
                 content = " ".join(_FLOAT.findall(text)).encode()
             digests[name] = digest(content)
     return digests
