@@ -64,7 +64,7 @@ def never_stepping() -> Iterator[None]:
     def stop(*_: Any, **__: Any) -> None:
         raise Accepted
 
-    starts = ((trial, "start_all"), (rollout, "begin"), (film, "_shots"))
+    starts = ((trial, "start_all"), (rollout, "start"), (film, "_shots"))
     originals = [(module, name, getattr(module, name)) for module, name in starts]
     for module, name, _ in originals:
         setattr(module, name, stop)
