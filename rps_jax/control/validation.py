@@ -98,9 +98,13 @@ def _check_traced(
     if invalid := [leaf for leaf in jax.tree.leaves(state) if not _is_array(leaf)]:
         raise traced_init.error(_describe(invalid[0]), "a pytree of arrays, the law's state")
     results = traced_step(params, state, observation_shapes(senses))
-    parts = results if isinstance(results, tuple) else ()
-    is_twist = len(parts) == 3 and isinstance(parts[1], tuple) and len(parts[1]) == 3
-    if not (is_twist and isinstance(parts[2], Details)):
+    parts: list[object] = list(results) if isinstance(results, tuple) else []
+    if not (
+        len(parts) == 3
+        and isinstance(parts[1], tuple)
+        and len(parts[1]) == 3
+        and isinstance(parts[2], Details)
+    ):
         actual = ", ".join(map(_describe, parts)) or _describe(results)
         raise traced_step.error(actual, "state, Twist, Details, such as Details.from_obs(obs)")
     scalars = [("a Twist", "iuf", item) for item in Twist(*parts[1])._asdict().items()]

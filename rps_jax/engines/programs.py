@@ -18,16 +18,18 @@ import os
 from collections.abc import Callable, Mapping, Sequence
 from importlib import metadata
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax
 import numpy as np
 from jax import export
-from jax.tree_util import PyTreeDef
 
 from rps_jax.control.base import Law
 from rps_jax.engines import native
 from rps_jax.record import cache
+
+if TYPE_CHECKING:
+    from jaxlib._jax import pytree  # pyright rejects the alias jax.tree_util.PyTreeDef
 
 
 def compile_function(
@@ -56,7 +58,7 @@ def compile_function(
     sizes = [jax.tree.structure(argument).num_leaves for argument in arguments]
     first = sum(sizes[:donate])
     donated = tuple(range(first, first + sizes[donate]))
-    structures: list[PyTreeDef] = []  # of the results, once traced
+    structures: list[pytree.PyTreeDef] = []  # of the results, once traced
 
     def flat(*inputs: Any) -> list[Any]:
         results, structure = jax.tree.flatten(function(*jax.tree.unflatten(tree, inputs)))
@@ -81,7 +83,7 @@ def compile_function(
     return lambda *inputs: jax.tree.unflatten(structure, program(*jax.tree.leaves(inputs)))
 
 
-def _describe(structure: PyTreeDef) -> object:
+def _describe(structure: pytree.PyTreeDef) -> object:
     """Return the content of the structure of a pytree, with a digest of each static array."""
     data = structure.node_data()
     node = data and (data[0], _digests(data[1]))
@@ -100,7 +102,7 @@ def _digests(data: object) -> object:
     return data
 
 
-def _encode(structure: PyTreeDef) -> bytes:
+def _encode(structure: pytree.PyTreeDef) -> bytes:
     """Return the structure of a pytree as JSON, which `_decode` reads.
 
     Raises:
@@ -112,7 +114,7 @@ def _encode(structure: PyTreeDef) -> bytes:
     return text.encode()
 
 
-def _decode(text: str | bytes) -> PyTreeDef:
+def _decode(text: str | bytes) -> pytree.PyTreeDef:
     return jax.tree.structure(_from_json(json.loads(text)))
 
 
@@ -195,10 +197,10 @@ def _path_of(inputs: str) -> Path | None:
     return Path(folder) / "traced" / key
 
 
-def _read(path: Path, leaves: Sequence[Any]) -> tuple[PyTreeDef, export.Exported] | None:
+def _read(path: Path, leaves: Sequence[Any]) -> tuple[pytree.PyTreeDef, export.Exported] | None:
     """Return a cached program and the structure of its results, if it fits these arguments."""
 
-    def parse(body: bytes) -> tuple[PyTreeDef, export.Exported]:
+    def parse(body: bytes) -> tuple[pytree.PyTreeDef, export.Exported]:
         head, _, program = body.partition(b"\n")
         exported = export.deserialize(bytearray(program))
         if [(x.shape, x.dtype) for x in exported.in_avals] != [(x.shape, x.dtype) for x in leaves]:

@@ -71,7 +71,9 @@ class CWriter(ScalarWriter):
         kind = kind_of(array.dtype)
 
         def text(value: np.ndarray) -> str:
-            return self.listed(map(text, value)) if value.ndim else literal_of(value, kind, "")
+            if value.ndim:
+                return self.listed(map(text, value))
+            return literal_of(value.item(), kind, "")
 
         sized = sized_name(name, array.shape)
         return f"static {self.declaration(kind, sized)} = {text(array)};"

@@ -350,9 +350,9 @@ class SimdNodes(Target):
 
 
 class Result(NamedTuple):
-    """A result with at least one number, and its index among all results."""
+    """A result with at least one number, and its position among all results."""
 
-    index: int
+    position: int
     value: Value  # `Array` or a constant
     size: int
     kind: str

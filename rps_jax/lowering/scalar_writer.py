@@ -60,7 +60,7 @@ class ScalarWriter(Writer):
         )
         self._matrices = target.matrices
         self.body = self.lines(conditional(roots), roots, set())
-        known = {result.index: result.value for result in values}
+        known = {result.position: result.value for result in values}
         self.outputs = [Output(*x, known.get(i, ())) for i, x in enumerate(outputs)]
 
     # --- what a language defines ---

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, cast
 
 import jax
 import jax.numpy as jnp
@@ -19,6 +19,7 @@ from jax.extend.core import ClosedJaxpr, Jaxpr, JaxprEqn, Literal
 from rps_jax.lowering.target import (
     Body,
     Target,
+    Typed,
     UnsupportedError,
     Value,
     is_constant,
@@ -80,7 +81,7 @@ def _walk(closed: ClosedJaxpr | Jaxpr, arguments: Sequence[Value], target: Targe
 
 def _results(eqn: JaxprEqn, values: list[Value], target: Target) -> Sequence[Value]:
     """Return the results of one equation."""
-    name, params, outs = eqn.primitive.name, eqn.params, [var.aval for var in eqn.outvars]
+    name, params, outs = eqn.primitive.name, eqn.params, _types_of_results(eqn)
     if name in _IDENTITIES:
         return values
     if all(map(is_constant, values)):
@@ -123,6 +124,11 @@ def _results(eqn: JaxprEqn, values: list[Value], target: Target) -> Sequence[Val
     return [target.emit(name, values, params, outs[0])]
 
 
+def _types_of_results(eqn: JaxprEqn) -> list[Typed]:
+    """Return the shapes and dtypes of the results of an equation."""
+    return [cast(Typed, var.aval) for var in eqn.outvars]
+
+
 def _with_consts(closed: ClosedJaxpr, consts: Sequence[Value], target: Target) -> Body:
     """Return a function from the carry of a loop to the results of a jaxpr."""
     return lambda carry: _walk(closed, [*consts, *carry], target)
@@ -160,8 +166,8 @@ def _moved(eqn: JaxprEqn, values: list[Value], sources: list[int], target: Targe
     moved = _moved_by_numpy(eqn, indices)
     moved = _bind(eqn, indices) if moved is None else moved
     return [
-        target.moved([values[i] for i in sources], np.asarray(x), out.aval)
-        for x, out in zip(moved, eqn.outvars, strict=True)
+        target.moved([values[i] for i in sources], np.asarray(x), out)
+        for x, out in zip(moved, _types_of_results(eqn), strict=True)
     ]
 
 
