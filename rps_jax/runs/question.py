@@ -25,7 +25,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from operator import attrgetter
 from pathlib import Path
-from typing import Any, ClassVar, Generic, Literal, ParamSpec, Self, TypeVar
+from typing import TYPE_CHECKING, Any, ClassVar, Generic, Literal, ParamSpec, Self, TypeVar
 
 import jax
 import numpy as np
@@ -46,9 +46,11 @@ from rps_jax.trials.setting import Setting
 from rps_jax.world import domain as domains
 from rps_jax.world.domain import Domain, DomainLike
 
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
+
 P = ParamSpec("P")
-D = TypeVar("D")  # a dataclass
-D = TypeVar("D")  # a dataclass
+D = TypeVar("D", bound="DataclassInstance")
 T = TypeVar("T", covariant=True)
 Split = Literal["tune", "validate", "test"]
 _OLD_NAMES = {
@@ -256,7 +258,8 @@ class Question(Command[T]):
     def execute(self, callback: ProgressCallback) -> T:
         """Answer the question, and store the results in the run folder if there is one."""
         if self.STORES_ITSELF:
-            return self.answer(self.create_run(self.out and Path(self.out), callback))
+            out = None if self.out is None else Path(self.out)
+            return self.answer(self.create_run(out, callback))
         with self.open_folder() as out:
             answer = self.answer(self.create_run(out, callback))
             results = answer if isinstance(answer, xr.Dataset) else getattr(answer, "data", None)
