@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from rps_jax import errors
+from rps_jax.geometry.arrays import Number
 
 _ODOMETRY, _FORCE = 7, 11  # folded into a world's key; the skin splits it into fewer
 
@@ -25,11 +26,11 @@ class Odometry(NamedTuple):
     remembered steps, more than the longest latency or delay; with K = 0 the base is perfect.
     """
 
-    pose_noise: float | jax.Array = 0.0  # () [m] standard deviation of each position reading
-    yaw_noise: float | jax.Array = 0.0  # () [rad] standard deviation of each heading reading
-    pose_latency: float | jax.Array = 0.0  # () [s] age of the pose that the law observes
-    command_delay: float | jax.Array = 0.0  # () [s] between a command and its execution
-    velocity_error: float | jax.Array = 0.0  # (3,) [1] of each component of the twist
+    pose_noise: Number = 0.0  # () [m] standard deviation of each position reading
+    yaw_noise: Number = 0.0  # () [rad] standard deviation of each heading reading
+    pose_latency: Number = 0.0  # () [s] age of the pose that the law observes
+    command_delay: Number = 0.0  # () [s] between a command and its execution
+    velocity_error: Number = 0.0  # (3,) [1] of each component of the twist
     past: np.ndarray | jax.Array = np.zeros(0)  # (K,)
 
 
@@ -63,7 +64,7 @@ def delay_twist(
     return twists, delayed * (1 + odometry.velocity_error)
 
 
-def _steps_of(time: float | jax.Array, period: float) -> jax.Array:
+def _steps_of(time: Number, period: float) -> jax.Array:
     return jnp.round(time / period).astype(jnp.int32)
 
 

@@ -93,7 +93,8 @@ def evaluate(
     request = Candidates(_checked(params), seed_of(setting.seed, split), np.arange(count), at)
     cache.use_cache_if_requested()
     is_shown = is_interactive() if progress is None else progress
-    with Bar("evaluate", request.count * count, shown=is_shown and report_to is None) as bar:
+    num_trials = request.num_candidates * count
+    with Bar("evaluate", num_trials, shown=is_shown and report_to is None) as bar:
         options = BatchOptions(callback=report_to or bar, slots=slots, workers=workers)
         (scored,), _ = score_candidates([request], [ranges], setting, objective, **options)
     variables: dict[str, Any] = {

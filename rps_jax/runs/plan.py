@@ -211,8 +211,11 @@ def load_plan(folder: Path) -> Plan:
 
 def setting_of(record: Mapping[str, Any]) -> Setting:
     """Read a setting as manifests have it; `question.setting_as_json` writes it."""
-    fields = record["physics"].items()
-    physics = Physics(**{k: tuple(v) if isinstance(v, list) else v for k, v in fields})
+    values: dict[str, Any] = {
+        name: tuple(value) if isinstance(value, list) else value
+        for name, value in record["physics"].items()
+    }
+    physics = Physics(**values)
     return Setting(record["engine"], physics, rules=Rules(**record["rules"]), seed=record["seed"])
 
 

@@ -156,7 +156,7 @@ class Hardware(LawQuestion[xr.Dataset]):
 
     def _trace_paths(self, run: Run) -> xr.Dataset:
         """Return the paths of Fig. 7: all objects and targets, at the middle friction."""
-        by_object = []
+        by_object: list[xr.Dataset] = []
         for name in HARDWARE_OBJECTS:
             cases = [replace(self.base, object=name, target=target) for target in self.targets]
             trajectories = pushes.record_cases(
@@ -303,8 +303,8 @@ def shift_figure(results: xr.Dataset) -> Figure:
     successes, trials = counts(results)
     size = 100 * results["shift"].values
     for i, name in enumerate(map(str, results.object.values)):
-        style = {"color": OBJECT_COLOURS[name], "label": words(name)}
-        success_rates(ax, size, successes[i], trials[i], **style)
+        color, label = OBJECT_COLOURS[name], words(name)
+        success_rates(ax, size, successes[i], trials[i], color=color, label=label)
     ax.set_ylim(-3, 103)
     ax.legend(fontsize=8)
     return figure

@@ -290,7 +290,7 @@ def interactions(
     axes = figure.subplots(count - 1, count - 1, squeeze=False)
     bins = [len(choices[name]) if name in choices else _BINS for name in names]
     index = np.minimum((u * bins).astype(int), np.asarray(bins) - 1)
-    rates = {}
+    rates: dict[tuple[int, int], np.ndarray] = {}
     for i, j in combinations(range(count), 2):
         cell, size = index[:, j] * bins[i] + index[:, i], bins[i] * bins[j]
         trials = np.maximum(np.bincount(cell, minlength=size), 1)

@@ -24,7 +24,7 @@ import time
 from collections.abc import Callable, Hashable, Iterable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, as_completed
 from functools import partial
-from typing import Any, NamedTuple, TypedDict, TypeVar, Unpack
+from typing import TYPE_CHECKING, Any, NamedTuple, TypedDict, TypeVar, Unpack
 
 import jax
 import jax.numpy as jnp
@@ -40,6 +40,9 @@ from rps_jax.trials.progress import Progress, ProgressCallback, Timing, no_progr
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import ControlLoop, Outcome, Rules, Trial, World
 from rps_jax.world.physics import Physics
+
+if TYPE_CHECKING:
+    from jaxlib._jax import pytree  # pyright rejects the alias jax.tree_util.PyTreeDef
 
 SEGMENT = 10.0  # [s] of simulated time in one call of a program; then slots are refilled
 _MAX_SUSPENDED = 8192  # trials of a job per GPU
@@ -384,7 +387,7 @@ def _compile_advance(
     physics: Physics,
     law: Law,
     sharding: NamedSharding | None,
-    structure: jax.tree_util.PyTreeDef,
+    structure: pytree.PyTreeDef,
     leaves: tuple[jax.ShapeDtypeStruct, ...],
 ) -> _Advance:
     """Compile `trial.advance` by one segment for arguments of these shapes; cached."""
@@ -474,7 +477,7 @@ class _Slots:
 
     def arguments(self) -> tuple[Inputs, Trial, jax.Array, jax.Array]:
         """Return the arguments of the program for the next segment, in which fresh trials start."""
-        fresh, live = self._program.put((self._fresh.copy(), self.live.copy()))
+        fresh, live = self._program.put(jax.tree.map(np.copy, (self._fresh, self.live)))
         self._fresh[:] = False
         return self.inputs, self.trials, fresh, live
 

@@ -45,7 +45,7 @@ class Candidates(NamedTuple):
     per_world: bool = False  # whether a candidate has different parameters in each world
 
     @property
-    def count(self) -> int:
+    def num_candidates(self) -> int:
         """Number of candidates, P."""
         return jax.tree.leaves(self.params)[0].shape[0]
 
@@ -90,11 +90,11 @@ def rollout(
     for request in requests:
         first, width = sum(sizes), len(domains) * request.worlds.size
         distances.append(np.empty(width))
-        sizes.append(request.count * width)
+        sizes.append(request.num_candidates * width)
         params = _params_per_world(request, width)
         for worlds, columns, distance in world_batches(request, domains, setting):
             distances[-1][columns] = distance
-            trials = first + width * np.arange(request.count)[:, None] + columns
+            trials = first + width * np.arange(request.num_candidates)[:, None] + columns
             chosen = jax.tree.map(lambda leaf, at=columns: leaf[:, at], params)
             key = _shape_key(worlds.worlds, 1), _shape_key(chosen, 2)
             groups.setdefault(key, []).append(worlds._replace(indices=trials, params=chosen))

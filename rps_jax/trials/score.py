@@ -26,10 +26,9 @@ import xarray as xr
 from numpy.typing import ArrayLike
 
 from rps_jax.analysis import statistics
+from rps_jax.geometry.arrays import Number
 from rps_jax.record.options import check_fields, option
 from rps_jax.trials.trial import Outcome, Rules
-
-Values = jax.Array | np.ndarray
 
 _STILL = 0.002  # [rad] tilt without meaning: half of all pushes tilt their object by more
 
@@ -58,19 +57,17 @@ class Objective:
 
     def score(
         self,
-        success: Values,  # (...) [1] 0 or 1, or between for a softened trial
-        time: Values,  # (...) [s] until the trial's end
-        lost: Values,  # (...) [s] without contact
-        missed: Values,  # (...) [m] least distance to the target
+        success: Number,  # (...) [1] 0 or 1, or between for a softened trial
+        time: Number,  # (...) [s] until the trial's end
+        lost: Number,  # (...) [s] without contact
+        missed: Number,  # (...) [m] least distance to the target
         rules: Rules,
     ) -> jax.Array:
         """Return scores (...) [1] of trials, from about 0 to 2; lower is better."""
         failed = 1 + self.miss * jnp.minimum(missed, 1.0)
-        return (
-            self.time * time / rules.horizon
-            + self.lost * lost / max(float(rules.max_lost), 1e-6)
-            + (1 - success) * failed
-        )
+        duration = self.time * time / rules.horizon
+        contact_loss = self.lost * lost / max(float(rules.max_lost), 1e-6)
+        return jnp.add(duration + contact_loss, (1 - success) * failed)
 
     def scores(self, outcome: Outcome, distance: np.ndarray, rules: Rules) -> np.ndarray:
         """Return scores (...) [1] of outcomes (...) on the host.

@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from rps_jax import errors
 from rps_jax.control import soft
@@ -78,9 +79,9 @@ class ControlLoop:
 class Shift(NamedTuple):
     """The object is moved by a hand during the push, as in the paper's video."""
 
-    time: float | Float[Array, "*B"] = jnp.inf  # [s]
+    time: float | Float[Array | np.ndarray, "*B"] = jnp.inf  # [s]
     # [m] how far, in the robot frame
-    p_robot: tuple[float, float] | Float[Array, "*B 2"] = (0.0, 0.0)
+    p_robot: tuple[float, float] | Float[Array | np.ndarray, "*B 2"] = (0.0, 0.0)
 
 
 class World(NamedTuple):
@@ -435,7 +436,7 @@ def advance(
         """Advance one world."""
         world_loop = dataclasses.replace(loop, rules=rules)
 
-        def step(carry: tuple[jax.Array, Trial]) -> tuple[jax.Array, Trial]:
+        def step(carry: tuple[int | jax.Array, Trial]) -> tuple[int | jax.Array, Trial]:
             count, trial = carry
             return count + 1, control_step(
                 stage, world, params, trial, world_loop, lambda f, *_: f

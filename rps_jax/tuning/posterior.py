@@ -8,7 +8,7 @@ autoregressive in bins.)
 """
 
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import jax
 import jax.numpy as jnp
@@ -117,7 +117,8 @@ def train(u: np.ndarray, statistics: np.ndarray, seed: int = 0) -> Posterior:
             rows, key = step
             grad = jax.grad(_loss)(params, inputs[rows], targets[rows], key)
             change, state = optimiser.update(grad, state, params)
-            return (optax.apply_updates(params, change), state), None
+            params = cast(Params, optax.apply_updates(params, change))
+            return (params, state), None
 
         shuffled = jax.random.permutation(key, size)[: steps * _BATCH].reshape(steps, -1)
         keys = jax.random.split(key, steps)

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 
 from rps_jax import errors
 from rps_jax.control import registry
-from rps_jax.control.base import Bound, LawParams
+from rps_jax.control.base import Bound, LawParams, Leaf
 from rps_jax.control.laws.rps import BOUNDS, RPSParams
 
 SUBSETS = {"logistic": ("eta", "zeta", "beta", "k"), "full": tuple(BOUNDS)}  # of RPS
@@ -58,7 +58,7 @@ class Space:
         values = registry.named_leaves(params)
         return jnp.stack([self._coordinate(values, name) for name in self.names], axis=-1)
 
-    def _coordinate(self, values: Mapping[str, jax.Array], name: str) -> jax.Array:
+    def _coordinate(self, values: Mapping[str, Leaf], name: str) -> jax.Array:
         low, high, log, _ = bound = self._bounds[name]
         value = jnp.asarray(_share(bound, values, name), float)
         if log:
@@ -96,7 +96,7 @@ class Space:
         return {n: x for n, x in values.items() if n in self.names or x != defaults[n]}
 
 
-def _share(bound: Bound, values: Mapping[str, jax.Array], name: str) -> jax.Array:
+def _share(bound: Bound, values: Mapping[str, Leaf], name: str) -> Leaf:
     """Return a parameter, or its ratio to the parameter that bounds it."""
     value = values[name]
     return value / values[bound.relative_to] if bound.relative_to else value

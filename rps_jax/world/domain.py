@@ -342,12 +342,13 @@ def _range(default: Range | None, values: object) -> Range:
         values = [values, values]
     if not isinstance(values, list | tuple):
         raise TypeError("no list")
-    low, high, *log = values
-    if len(log) > 1 or not all(isinstance(flag, bool) for flag in log):
+    low, high, *flags = values
+    if len(flags) > 1 or not all(isinstance(flag, bool) for flag in flags):
         raise ValueError("more than low, high, and whether uniform in the logarithm")
     if isinstance(low, str) or isinstance(high, str):
         raise TypeError("texts")
-    return Range(float(low), float(high), *(log or [default is not None and default.log]))
+    log = bool(flags[0]) if flags else default is not None and default.log
+    return Range(float(low), float(high), log)
 
 
 # Readers of the JSON of fields that are no ranges, and their formats for the error.
