@@ -1,4 +1,4 @@
-"""Faults of many classes, thrown at the command line as a stranger or an enemy would.
+"""Faults of many classes, injected into the command line.
 
     python tests/fuzz.py                  # every class, as many cases as the published table has
     python tests/fuzz.py values --most 500
@@ -193,7 +193,7 @@ def furnish(folder: Path) -> None:
 
 
 def small_run(folder: Path, **changes: Any) -> None:
-    """A run folder of a sweep of few short trials."""
+    """Write the run folder of a sweep of few short trials."""
     import rps_jax
 
     drums = rps_jax.Domain(("random_cylinder",))
@@ -204,7 +204,7 @@ def small_run(folder: Path, **changes: Any) -> None:
 
 
 def encrypted() -> bytes:
-    """An archive whose only member claims to be encrypted."""
+    """Return an archive whose only member claims to be encrypted."""
     import zipfile
 
     content = io.BytesIO()
@@ -217,7 +217,7 @@ def encrypted() -> bytes:
 
 
 def commands() -> list[tuple[str, ...]]:
-    """Every command, as words."""
+    """Return all commands as words."""
     from rps_jax.app.cli import names
 
     return [tuple(name.split()) for name in names.known()]
@@ -647,7 +647,7 @@ def damages(path: Path, rng: random.Random, limit: int) -> Iterator[Edit]:
 
 @functools.cache
 def _furnished(learned: bool) -> tuple[Path, dict[str, list[tuple[str, ...]]]]:
-    """A folder with small runs, until this process ends, and the commands that read them."""
+    """Return a temporary folder with small runs, and the commands that read them."""
     home = Path(tempfile.mkdtemp())
     atexit.register(shutil.rmtree, home, ignore_errors=True)
     with contextlib.chdir(home):
@@ -655,7 +655,7 @@ def _furnished(learned: bool) -> tuple[Path, dict[str, list[tuple[str, ...]]]]:
 
 
 def furnish_runs(folder: Path, learned: bool) -> dict[str, list[tuple[str, ...]]]:
-    """Small runs of several kinds, and the commands that read each of them.
+    """Write small runs of several kinds, and return the commands that read each of them.
 
     A law is `learned` if it is worth the minute that this takes.
     """
@@ -701,12 +701,12 @@ LEARN = (
 
 
 def run_edits(limit: int, seed: int, tell: Callable[[str], None]) -> Counter[str]:
-    """Edited run folders, each read by commands that stop where worlds are stepped."""
+    """Run commands on edited run folders up to the first step of a world."""
     return _run_folders(limit, seed, tell, (json_edits, dataset_edits, archive_edits))
 
 
 def run_damages(limit: int, seed: int, tell: Callable[[str], None]) -> Counter[str]:
-    """Damaged run folders, each read by commands that stop where worlds are stepped."""
+    """Run commands on damaged run folders up to the first step of a world."""
     return _run_folders(limit, seed, tell, (damages,))
 
 

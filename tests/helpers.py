@@ -39,19 +39,19 @@ PAPER = RPSParams.paper()
 
 
 def rps(*arguments: Any) -> int:
-    """Exit code of a command."""
+    """Run a command and return its exit code."""
     return cli.main([str(a) for a in arguments])
 
 
 def refusal(capsys, *arguments: Any) -> str:
-    """The one sentence in which a command refuses its input, on the error stream."""
+    """Return the single-sentence error with which a command refuses its input."""
     capsys.readouterr()
     assert rps(*arguments) == 2
     return one_sentence(capsys.readouterr().err)
 
 
 def one_sentence(error: str) -> str:
-    """The error, which must be one sentence of `rps`."""
+    """Assert that an error is one sentence of `rps`, and return it."""
     assert error.startswith("rps: error: ")
     assert error.count("\n") == 1
     assert error.endswith(".\n")
@@ -59,7 +59,7 @@ def one_sentence(error: str) -> str:
 
 
 def read_log(folder: Path) -> list[dict[str, Any]]:
-    """The lines of a tuner's log, one for each generation."""
+    """Return the lines of a tuner's log, one per generation."""
     return [json.loads(line) for line in (folder / "log.jsonl").read_text().splitlines()]
 
 
@@ -72,7 +72,7 @@ FAST = preset(fidelity="fast")
 def advance(
     stage: Any, worlds: Any, params: Any, trials: Trial, loop: ControlLoop, steps: int
 ) -> Trial:
-    """Up to so many control steps of one batch of worlds."""
+    """Step one batch of worlds by up to `steps` control steps."""
     return trial.advance((stage,), (worlds,), (params,), (trials,), loop, steps)[0]
 
 
@@ -103,13 +103,13 @@ PLAN = Plan(BOXES, 20, {"rps": registry.LAWS["rps"], "nps": registry.LAWS["nps"]
 def case(
     target: tuple[float, float], name: str = "box", friction: str = "S1", **changes: Any
 ) -> Case:
-    """A trial of the law; changes are fields of `Case` or of the law's parameters."""
+    """Return a case of the law; changes are fields of `Case` or of the law's parameters."""
     of_case = {k: changes.pop(k) for k in list(changes) if k in Case.__dataclass_fields__}
     return Case(name, friction, target, PAPER._replace(**changes), **of_case)
 
 
 def swept(folder: Path, plan: Plan = PLAN, **options: Any) -> Path:
-    """A run folder with all parts of a plan, or of one of its shards."""
+    """Run a plan or one of its shards, and return the run folder."""
     open_run(folder, plan)
     execution.run_missing(folder, plan, slots=SLOTS, **options)
     return folder

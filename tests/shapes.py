@@ -1,4 +1,4 @@
-"""The checker of shapes and types, which the tests put between the calls of some modules.
+"""The checker of shapes and types that the tests add to the calls of some modules.
 
 beartype looks into arguments and results, and `checked` into the fields of the records among
 them, too. A program is traced once and runs many times, and so is a call checked once.
@@ -60,7 +60,7 @@ def look(value: Any) -> None:
 
 @functools.cache
 def shapes_of(kind: type) -> dict[str, Any]:
-    """Types of the fields of a class of records that say a shape."""
+    """Return the types of the fields that a record class annotates with a shape."""
     if not kind.__module__.startswith("rps_jax."):
         return {}
     hints = typing.get_type_hints(kind)

@@ -24,7 +24,7 @@ from rps_jax.world.scene import FRICTION, Friction, Scene
 def staged(
     engine: str, scenes: Sequence[Scene], physics: Physics, robot: Robot = Robot()
 ) -> tuple[Any, Any]:
-    """Stage and fields of worlds in scenes of one shape family."""
+    """Return stage and fields of worlds in scenes of one shape family."""
     pairs = [[loaded.physics.pair(i) for i in range(loaded.physics.npair)] for loaded in scenes]
     slide = [{pair.name.partition("_")[0]: pair.friction[0] for pair in world} for world in pairs]
     friction = Friction(
@@ -35,7 +35,7 @@ def staged(
 
 
 def recompiled(engine: str, scenes: Sequence[Scene]) -> Any:
-    """Fields of worlds by what MuJoCo compiled for each, to compare with those of a stage."""
+    """Return the fields of worlds compiled by MuJoCo, to compare with those of a stage."""
     models = [loaded.physics for loaded in scenes]
     if engine == "mjx":
         return jax.device_get(mjx_engine.stack(models)[1])

@@ -68,7 +68,7 @@ def random_obs(seed, mirror=False):
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_in_a_mirrored_world_the_law_does_the_mirrored_thing(kind):
+def test_a_mirrored_observation_gives_the_mirrored_twist(kind):
     """This holds for random weights and over several steps, including the memory."""
     network = network_of(kind)
     _, params = _registered(network)
@@ -101,7 +101,7 @@ def test_an_action_is_held_and_bounded():
     assert np.abs(twists[..., 2]).max() <= 0.15 + 1e-7
 
 
-def test_a_contact_that_is_lost_is_remembered_where_it_was():
+def test_the_position_of_a_lost_contact_is_remembered():
     """Touch at (1, 0.1) in the world; then the base is at (0.5, 0.1), turned left."""
     touch = random_obs(1).touch._replace(
         p_world_robot=jnp.array([0.6, 0.0]), yaw=jnp.zeros(()), in_contact=jnp.array(True),
@@ -141,7 +141,7 @@ def written(path, kind="gru", **changes):
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_a_law_of_a_file_is_the_one_that_was_written(kind, tmp_path, registries):
+def test_a_law_loaded_from_a_file_equals_the_saved_law(kind, tmp_path, registries):
     policy = written(tmp_path / "policy.npz", kind, learned={"how": "by chance"})
     loaded = policies.decode((tmp_path / "policy.npz").read_bytes(), "policy.npz")
     assert (loaded.network, loaded.task, loaded.learned) == (
@@ -225,7 +225,7 @@ BAD = {
 
 
 @pytest.mark.parametrize("name", BAD)
-def test_a_file_that_is_no_policy_gets_one_sentence(name, tmp_path):
+def test_an_invalid_policy_file_is_refused_in_one_sentence(name, tmp_path):
     written(tmp_path / "policy.npz")
     spoil, words = BAD[name]
     path = tmp_path / "policy.npz"
@@ -257,7 +257,7 @@ def test_commands_refuse_bad_policies_before_anything_compiles(tmp_path, capsys,
     assert sum(compiled) < 5.0
 
 
-def test_a_run_of_a_policy_needs_its_file_as_it_was(tmp_path, registries):
+def test_a_run_of_a_policy_needs_its_unchanged_file(tmp_path, registries):
     path = tmp_path / "policy.npz"
     written(path)
     name, params = registry.parse_law(str(path))
@@ -352,7 +352,7 @@ def test_the_loss_of_the_policy_that_acted(kind):
         np.testing.assert_allclose(slope["actor"][name], expected["actor"][name], atol=2e-5)
 
 
-def test_the_value_of_a_mirrored_world_is_the_same():
+def test_a_mirrored_world_has_an_equal_value():
     config, network = PPO(network="mlp", width=6), network_of("mlp")
     state = TrainState.init(config, network, jax.random.PRNGKey(0))
     _, transitions = batch(network, state)
@@ -366,7 +366,7 @@ def test_the_value_of_a_mirrored_world_is_the_same():
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_what_is_best_in_one_step_is_learned(kind):
+def test_the_best_action_of_one_step_is_learned(kind):
     """The reward of an action falls with its distance to a function of the observation."""
     config = PPO(
         network=kind, width=6, update_epochs=4, num_minibatches=2, ent_coef=0.0,
@@ -427,7 +427,7 @@ def learned(tmp_path_factory):
     return folder, learn(CYLINDERS, **TINY, updates=4, out=folder)
 
 
-def test_a_run_that_is_killed_and_continued_learns_the_same(learned, tmp_path):
+def test_a_killed_and_resumed_run_equals_an_uninterrupted_one(learned, tmp_path):
     folder, whole = learned
     out = tmp_path / "parts"
 
@@ -435,7 +435,7 @@ def test_a_run_that_is_killed_and_continued_learns_the_same(learned, tmp_path):
         raise KeyboardInterrupt
 
     learn(CYLINDERS, **TINY, updates=2, out=out)
-    with pytest.raises(KeyboardInterrupt):  # in the third update and before it is kept
+    with pytest.raises(KeyboardInterrupt):  # in the third update, before its checkpoint
         learn(CYLINDERS, **TINY, updates=9, out=out, report_to=kill)
     again = learn(CYLINDERS, **TINY, updates=4, out=out)
     for name in ("ended", "reward", "value", "kl", "learning_rate", "spread", "simulated"):
@@ -445,7 +445,7 @@ def test_a_run_that_is_killed_and_continued_learns_the_same(learned, tmp_path):
         np.testing.assert_array_equal(mine.weights[name], theirs.weights[name])
 
 
-def test_what_a_run_leaves(learned):
+def test_the_results_of_a_run(learned):
     folder, curve = learned
     assert curve.sizes == {"update": 4}
     assert curve.simulated.values.tolist() == pytest.approx([2.4, 4.8, 7.2, 9.6])
@@ -476,12 +476,12 @@ def test_a_folder_of_another_run_and_damaged_parts(learned, tmp_path):
     out = shutil.copytree(folder, tmp_path / "run")
     (part,) = (out / "parts").iterdir()
     part.write_bytes(part.read_bytes()[:-1])
-    curve = learn(CYLINDERS, **TINY, updates=1, out=out)  # learned anew
+    curve = learn(CYLINDERS, **TINY, updates=1, out=out)  # learned again
     assert curve.sizes == {"update": 1}
     assert len(list((out / "parts").glob("*.corrupt"))) == 1
 
 
-def test_in_a_sweep_the_law_does_what_it_does_in_its_environment(learned, registries):
+def test_a_sweep_agrees_with_the_environment(learned, registries):
     """Both have equal worlds, actions and sensing, and so equal outcomes."""
     name, params = registry.parse_law(str(learned[0] / "policy.npz"))
     setting = Setting("fused", fidelity="fast", rules=Rules(horizon=12.0), seed=5)
@@ -506,8 +506,8 @@ def test_an_easier_world_has_its_target_nearer_and_more_ahead():
     np.testing.assert_array_equal(rollout.ease(world, jnp.array(1.0)).p_world_target, [0.0, 2.0])
 
 
-def test_rewards_of_what_the_law_is_not_told():
-    """Straight on behind an object: it comes nearer by what the base moves, and stays ahead."""
+def test_rewards_of_privileged_quantities():
+    """The rewards are the changes of distance to the target and of the alignment of the base."""
     env = PushEnv(
         "random_cylinder", CYLINDERS, worlds=3,
         setting=Setting("fused", fidelity="fast"),
@@ -529,7 +529,7 @@ def test_rewards_of_what_the_law_is_not_told():
     assert float(together) == pytest.approx(cosine(current) - cosine(previous), abs=1e-6)
 
 
-def test_the_command_learns_and_the_ladder_takes_what_it_leaves(tmp_path, capsys, registries):
+def test_the_ladder_runs_the_policy_of_the_command(tmp_path, capsys, registries):
     out = tmp_path / "learn"
     options = ["--domain", "wide,objects=random_cylinder", "--network", "mlp"]
     options += ["--width", 4, "--num-envs", 4, "--drawn", 4, "--validation", 2, "--num-steps", 2]

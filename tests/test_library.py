@@ -46,10 +46,10 @@ def test_a_sweep_in_memory_is_the_same_as_one_in_a_folder(engine, domain, tmp_pa
     identical(results, rps_jax.load(tmp_path))
     identical(
         results, rps_jax.sweep(LAWS, domain, out=str(tmp_path), **options)
-    )  # there is no more
+    )  # already complete
 
 
-def test_what_was_drawn_is_a_coordinate_of_the_worlds(tmp_path):
+def test_drawn_quantities_are_coordinates_of_the_worlds(tmp_path):
     results = rps_jax.sweep(LAWS, DRUMS, worlds=4, **BRIEF)
     drawn = {name for name in results.coords if results[name].dims == ("world",)}
     undrawn = {name for name in QUANTITIES if getattr(DOMAINS["wide"], name) is None}
@@ -109,7 +109,7 @@ def test_a_push_is_plotted_and_filmed(tmp_path):
 # --- a table -------------------------------------------------------------------------------
 
 
-def test_a_table_is_what_the_command_writes(tmp_path):
+def test_a_table_equals_that_of_the_command(tmp_path):
     options = ["--objects", "box", "--laws", "rps", "aps", "--friction", "S2", "0.3,0.4"]
     options += ["--targets", 0.6, 0, 1, 1, "--engine", "mujoco", "--horizon", 3, "--mass", 5]
     assert rps("table", *options, "--out", tmp_path / "run") == 0

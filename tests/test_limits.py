@@ -33,7 +33,7 @@ def test_losses_and_gains_of_single_worlds_are_pooled():
     assert crossing(VALUE, lost, 0.1, harms=1) == 31
 
 
-def test_there_is_no_crossing_where_nothing_is_lost():
+def test_there_is_no_crossing_without_losses():
     assert math.isnan(crossing(VALUE, np.zeros(40, int), 0.01, harms=1))
 
 

@@ -299,7 +299,7 @@ def test_operations_are_those_of_jax(name, tmp_path):
 
 
 def test_the_languages_spell_the_operations_of_the_headers():
-    """Beside those of unsigned numbers, of bits and of random numbers, which no law needs."""
+    """Excluded are operations on unsigned integers, bits and random numbers; no law needs them."""
     extra = {"erf_inv_f", "to_int", "any"}
     names = {
         name

@@ -34,7 +34,7 @@ def cache(tmp_path):
 
 
 def batch(shape, skin="capacitive", count=21, law="rps_tuned", domain="wide", **drawn):
-    """Stage, (worlds, params) and loop of random objects, each at another place."""
+    """Return stage, (worlds, params) and loop of random objects at different positions."""
     _, params = registry.resolve_law(law)
     domain = replace(DOMAINS[domain], objects=(f"random_{shape}",), skin=skin, **drawn)
     part = drawn_worlds(domain, draws.draw(domain, 3, np.arange(count)), SETTING)
@@ -47,12 +47,12 @@ def batch(shape, skin="capacitive", count=21, law="rps_tuned", domain="wide", **
 
 
 def advance(stage, loop, steps):
-    """The function of (worlds, params) and trials that steps them."""
+    """Return the function of (worlds, params) and trials that steps them."""
     return lambda w, p, t: trial.advance((stage,), (w,), (p,), (t,), loop, steps)[0]
 
 
 def advanced(stage, inputs, trials, loop, steps):
-    """Trials after subset control steps."""
+    """Return trials after `steps` control steps of a batch."""
     return jax.device_get(jax.jit(advance(stage, loop, steps))(*inputs, trials))
 
 
@@ -61,7 +61,7 @@ def start_trials(inputs, loop):
 
 
 def in_a_push(*arguments, **drawn):
-    """Those of `batch`, and trials in the middle of a push, after 8 s."""
+    """Return the values of `batch`, and trials in the middle of a push, after 8 s."""
     stage, inputs, loop = batch(*arguments, **drawn)
     step, pushing = jax.jit(advance(stage, loop, 1)), start_trials(inputs, loop)
     for _ in range(400):  # a program of one step, which the tests compile anyway
@@ -76,7 +76,7 @@ def same(actual, desired):
 
 
 def close(actual, desired, warm, rest):
-    """Trials, whose accelerations [m/s^2] the solver leaves to 1e-4, and all else."""
+    """Assert that trials agree; accelerations [m/s^2] to the solver's tolerance of 1e-4."""
     np.testing.assert_allclose(actual.warmstart, desired.warmstart, atol=warm)
     for a, b in zip(*(jax.tree.leaves(x._replace(warmstart=0)) for x in (actual, desired)),
                     strict=True):  # fmt: skip
@@ -85,7 +85,7 @@ def close(actual, desired, warm, rest):
 
 @pytest.mark.parametrize("skin", ["capacitive", "ideal"])
 @pytest.mark.parametrize("shape", ["box", "cylinder", "prism"])
-def test_a_control_step_ends_where_xla_ends_it(shape, skin, monkeypatch):
+def test_a_control_step_agrees_with_xla(shape, skin, monkeypatch):
     stage, inputs, loop, pushing = in_a_push(shape, skin)
     computed = advanced(stage, inputs, pushing, loop, 1)
     monkeypatch.setenv("RPS_COMPILER", "none")
@@ -126,7 +126,7 @@ def test_a_drive_is_compiled_and_its_derivative_is_xlas(monkeypatch):
     same(computed, slope())
 
 
-def test_without_a_compiler_batches_run_side_by_side_in_one_loop(monkeypatch):
+def test_without_a_compiler_batches_share_one_loop(monkeypatch):
     batches = (batch(shape, count=2) for shape in ("box", "prism"))
     stages, inputs, loops = zip(*batches, strict=True)
     trials = tuple(start_trials(subset, loops[0]) for subset in inputs)
@@ -136,7 +136,7 @@ def test_without_a_compiler_batches_run_side_by_side_in_one_loop(monkeypatch):
     assert primitives.count("while") == 1
 
 
-def test_a_compiler_that_fails_is_told_once_and_xla_compiles(monkeypatch, tmp_path, cache):
+def test_a_failing_compiler_warns_once_and_xla_compiles(monkeypatch, tmp_path, cache):
     broken = tmp_path / "broken"
     script = 'case "$*" in *-dM*) exit 0;; esac\necho it is broken >&2\nexit 1\n'
     broken.write_text(f"#!/bin/sh\n{script}")
@@ -149,14 +149,14 @@ def test_a_compiler_that_fails_is_told_once_and_xla_compiles(monkeypatch, tmp_pa
     assert results == [[3.0] * 2, [3.0] * 3]
 
 
-def test_operations_that_cannot_be_read_are_told_and_xla_steps(monkeypatch, cache):
+def test_unsupported_operations_warn_and_xla_compiles(monkeypatch, cache):
     monkeypatch.setattr(nodes, "walk", lambda *_: {}["num_consts"])
     run = native.batched(lambda x: 2 * x, lambda x: 3 * x)
     with pytest.warns(UserWarning, match="the code cannot be printed, so XLA compiles: KeyError"):
         assert jax.jit(run)(jnp.ones(2)).tolist() == [3.0, 3.0]
 
 
-def test_a_gpu_without_a_compiler_is_told(monkeypatch):
+def test_a_gpu_without_a_compiler_warns(monkeypatch):
     monkeypatch.setattr(native, "target", lambda: None)
     assert not native.is_available()  # a processor without a compiler is common
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
@@ -233,7 +233,7 @@ OPERATIONS = {
 
 
 @pytest.mark.parametrize("name", OPERATIONS)
-def test_an_operation_is_what_jax_says(name):
+def test_an_operation_agrees_with_jax(name):
     x, function = jnp.arange(19.0), OPERATIONS[name]
     run = native.batched(function, lambda _: pytest.fail("it was not compiled"))
     for a, b in zip(*map(jax.tree.leaves, (jax.jit(run)(x), jax.vmap(function)(x))), strict=True):

@@ -1,4 +1,4 @@
-"""Physics whose answer is known by hand: a base that pushes, and objects left to themselves.
+"""Physics with analytical solutions: pushes by the base, and objects at rest or sliding.
 
 Each law is derived where it is tested. The engine `mujoco` is C MuJoCo with the reference physics,
 `mjx` and `fused` have the standard physics, in float32; worlds are seen every control period.
@@ -43,7 +43,7 @@ SECONDS = 2.5
 
 
 class World(NamedTuple):
-    """An object before the base, and what moves them."""
+    """An object in front of the base, and their initial and commanded motion."""
 
     friction: Friction = FRICTION["S1"]
     push: tuple[float, float] = (0.0, 0.0)  # [m/s] of the base
@@ -91,7 +91,7 @@ def starts(worlds, physics):
 
 
 def in_engine(engine, worlds, physics=STANDARD, seconds=SECONDS):
-    """Films of worlds of one shape family."""
+    """Return films of worlds of one shape family."""
     scenes, qpos, qvel, twist = starts(worlds, physics)
     stage, fields = staged(engine, scenes, physics)
     periods = round(seconds / physics.control_period)
@@ -146,7 +146,7 @@ IN_ALL = pytest.mark.parametrize("all_films", ["mjx", "fused", "mujoco"], indire
 
 
 @IN_ALL
-def test_a_box_pushed_through_its_centre_keeps_its_heading_and_goes_as_far_as_the_base(all_films):
+def test_a_box_pushed_through_its_centre_keeps_its_heading_and_follows_the_base(all_films):
     film = all_films["centre"]
     assert film.qpos[-1, 0] == pytest.approx(0.05 * SECONDS, abs=1e-4)
     assert film.moved[:2] == pytest.approx([0.05 * SECONDS, 0.0], abs=1e-3)
@@ -156,7 +156,7 @@ def test_a_box_pushed_through_its_centre_keeps_its_heading_and_goes_as_far_as_th
 @pytest.mark.parametrize("physics", [STANDARD, REFERENCE], ids=["standard", "reference"])
 @pytest.mark.parametrize("robot", [0.02, 0.35])
 @pytest.mark.parametrize("ground", [0.3, 0.2, 0.05])
-def test_a_steady_push_takes_the_force_mu_m_g_and_the_work_of_friction(ground, robot, physics):
+def test_a_steady_push_needs_the_force_mu_m_g_and_the_work_of_friction(ground, robot, physics):
     """The base loses the momentum that the push takes, and is set anew every period.
 
     0.3 x 20 kg x 9.81 m/s^2 = 58.9 N. The face may bear mu_robot F of the weight, either way:
@@ -183,7 +183,7 @@ def test_a_box_pushed_at_the_papers_speed_stays_on_the_ground(friction):
 
 
 @pytest.mark.parametrize("name", OBJECTS)
-def test_an_object_left_alone_creeps_less_than_a_millimetre_in_a_minute(name):
+def test_an_object_at_rest_creeps_less_than_a_millimetre_in_a_minute(name):
     calm = replace(STANDARD, control_period=1.0)
     (film,) = in_c([World(gap=1.0, name=name)], calm, seconds=60.0)
     assert film.way < 1e-3
@@ -191,7 +191,7 @@ def test_an_object_left_alone_creeps_less_than_a_millimetre_in_a_minute(name):
 
 
 @pytest.mark.parametrize("name", MASS)
-def test_the_fused_engine_lets_nothing_creep_in_float32(name):
+def test_nothing_creeps_in_the_fused_engine_in_float32(name):
     calm = replace(STANDARD, control_period=1.0)
     (film,) = in_engine("fused", [World(gap=1.0, name=name)], calm, seconds=60.0)
     assert film.way < 1e-5
@@ -200,15 +200,15 @@ def test_the_fused_engine_lets_nothing_creep_in_float32(name):
 
 @IN_ALL
 @pytest.mark.parametrize("name", MASS)
-def test_an_object_left_alone_creeps_less_than_half_a_millimetre_a_second(all_films, name):
+def test_an_object_at_rest_creeps_less_than_half_a_millimetre_a_second(all_films, name):
     """Float32 noise in MJX moves it by up to 0.2 mm/s; tests above hold the others to more."""
     assert all_films[f"resting {name}"].way < 0.5e-3 * SECONDS
 
 
 def loses_energy(film, name):
-    """Never more than at the start, with the fall onto the ground; the planar part only falls.
+    """Whether the energy never exceeds the initial one and its planar part only falls.
 
-    But for what rocking lends it, below 1 %.
+    Rocking may return less than 1 % to the planar part.
     """
     inertia = scene.load(name).physics.body("object").inertia
     squares = np.hstack([MASS[name] * film.qvel[:, 3:6] ** 2, inertia * film.qvel[:, 6:] ** 2]) / 2
@@ -265,7 +265,7 @@ def test_an_object_stands_on_equally_loaded_points_all_equally_far_from_its_midd
     assert data.contact.pos.mean(axis=0)[:2] == pytest.approx(middle[:2], abs=1e-3)
 
 
-def test_mjx_lets_a_nearly_upright_cylinder_touch_with_its_rim_alone():
+def test_a_nearly_upright_cylinder_touches_only_with_its_rim_in_mjx():
     """A rim of radius R, tilted, lies within R times the tilt of the plane of its middle."""
     loaded = scene.load("cylinder")
     model, data = mjx.put_model(loaded.physics), mjx.make_data(loaded.physics)
@@ -350,7 +350,7 @@ def centre(twist):
 
 @IN_ALL
 @pytest.mark.parametrize(("yaw", "direction"), NEAR + FAR)
-def test_a_box_pushed_at_a_corner_turns_about_the_centre_that_friction_says(
+def test_a_box_pushed_at_a_corner_turns_about_the_centre_given_by_friction(
     all_films, yaw, direction
 ):
     """A corner of the box sticks to the face, at 1 cm/s.
@@ -376,7 +376,7 @@ def test_a_box_pushed_at_a_corner_turns_about_the_centre_that_friction_says(
 
 @pytest.mark.parametrize("friction", FRICTION)
 @pytest.mark.parametrize("yaw", [10, 20])
-def test_ten_centimetres_of_an_off_centre_push_end_alike_at_1_and_at_5_cm_a_second(yaw, friction):
+def test_an_off_centre_push_of_10_cm_ends_equally_at_1_and_5_cm_a_second(yaw, friction):
     """Quasi-static: at 5 cm/s the box slides v^2 / (2 mu g) = 0.4 mm by itself."""
     slow = World(FRICTION[friction], (0.01, 0.0), yaw=math.radians(yaw))
     (a,), (b,) = in_c([slow], seconds=10.0), in_c([slow._replace(push=(0.05, 0.0))], seconds=2.0)
@@ -408,7 +408,7 @@ def test_with_the_pyramid_a_trial_turned_by_45_degrees_ends_elsewhere_but_not_by
 
 
 @pytest.mark.parametrize("name", MASS)
-def test_on_the_pyramid_an_object_slides_farther_along_the_diagonal_by_the_root_of_two(name):
+def test_pyramidal_friction_slides_farther_along_the_diagonal_by_the_root_of_two(name):
     """The pyramid's edges hold mu N along the axes, and between them only mu N / sqrt(2)."""
     still = World(Friction(0.1, 0.35), gap=1.0, name=name)
     thrown = [still._replace(thrown=(*polar(0.5, degrees), 0.0)) for degrees in (0, 45)]
@@ -416,10 +416,8 @@ def test_on_the_pyramid_an_object_slides_farther_along_the_diagonal_by_the_root_
     assert diagonal.way / ahead.way == pytest.approx(math.sqrt(2), rel=0.03)
 
 
-def test_a_world_that_runs_away_in_c_mujoco_ends_diverged_and_prints_nothing(
-    capfd, tmp_path, monkeypatch
-):
-    """MuJoCo by itself would put it back to its start and go on."""
+def test_a_diverging_world_in_c_mujoco_is_marked_and_prints_nothing(capfd, tmp_path, monkeypatch):
+    """MuJoCo alone would reset the world and continue."""
     monkeypatch.chdir(tmp_path)
     params = RPSParams.paper()._replace(v_approach=1e11)
     setting = Setting(physics=STANDARD, rules=Rules(horizon=0.1), engine="mujoco")

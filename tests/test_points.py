@@ -27,7 +27,7 @@ def used(drawn):
 
 
 @pytest.mark.parametrize("name", DOMAINS)
-def test_a_drawn_world_is_the_same_world_at_its_point_bit_for_bit(name):
+def test_a_drawn_world_equals_the_world_at_its_point_bit_for_bit(name):
     domain, index = DOMAINS[name], np.arange(7, 300)
     at = points.check_points(domain, points.points_of(name, index, seed=5))
     object_indices = domain.object_of(index)
@@ -60,7 +60,7 @@ def _leaves(domain, u):
     return np.concatenate([np.ravel(leaf) for leaf in jax.tree.leaves(drawn)])
 
 
-def test_a_quantity_is_where_its_range_says():
+def test_a_coordinate_maps_to_the_range_of_its_quantity():
     u = points.points_of("wide", [0, 1, 2])
     names = points.names(DOMAINS["wide"])
     u[:, names.index("mass")] = 0.5  # evenly in the logarithm from 3 to 60 kg
@@ -91,7 +91,7 @@ def test_sweeps_and_evaluations_take_points_as_they_take_drawn_worlds(tmp_path):
     tried = rps_jax.evaluate(params, CYLINDERS, points=reversed_, **SWEPT)
     np.testing.assert_allclose(tried.mass, drawn.mass.values[::-1], rtol=1e-6)
     np.testing.assert_allclose(tried.time[0], drawn.time[0, ::-1], atol=0.5)
-    # A folder of other points, and one whose points were damaged.
+    # A folder of other points, and a folder with damaged points.
     with pytest.raises(InputError, match="holds another run"):
         rps_jax.sweep("rps", CYLINDERS, points=u[::-1], out=folder, **SWEPT)
     shutil.copy(folder / "points.nc", tmp_path / "good.nc")
@@ -104,7 +104,7 @@ def test_sweeps_and_evaluations_take_points_as_they_take_drawn_worlds(tmp_path):
     assert (folder / "points.nc").read_bytes() == (tmp_path / "good.nc").read_bytes()
 
 
-def test_objects_need_not_come_in_turn(tmp_path):
+def test_objects_may_come_in_any_order(tmp_path):
     both = replace(CYLINDERS, objects=("random_box", "random_cylinder"))
     u = points.points_of(both, np.arange(5))
     u[:, 0] = [0.9, 0.9, 0.9, 0.9, 0.1]  # one box among cylinders
@@ -158,7 +158,7 @@ def test_the_command_sweeps_points_and_can_be_continued(tmp_path, capsys):
     assert objects == [0, 1, 2]
 
 
-def test_a_quantity_that_the_domain_does_not_draw_is_told_from_an_unknown_one():
+def test_undrawn_and_unknown_quantities_have_different_errors():
     domain = replace(DOMAINS["wide"], mass=Range(5, 5))
     with pytest.raises(InputError, match="axes = mass is not allowed: this domain does not draw"):
         points.check_drawn("axes", "mass", domain)

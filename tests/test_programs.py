@@ -60,7 +60,7 @@ def test_a_program_is_traced_once_for_all_processes(cache, compiler):
     assert len(list(cache.iterdir())) == 3
 
 
-def test_a_trial_that_is_followed_is_traced_once_for_all_processes(cache, monkeypatch):
+def test_a_recorded_trial_is_traced_once_for_all_processes(cache, monkeypatch):
     """A cached trial returns the same named tuples as a traced one."""
     traced, record = [], trial.record
     monkeypatch.setattr(trial, "record", lambda *a, **k: traced.append(1) or record(*a, **k))
@@ -75,7 +75,7 @@ def test_a_trial_that_is_followed_is_traced_once_for_all_processes(cache, monkey
 @pytest.mark.parametrize("result", [
     lambda x: NamedTuple("Made", [("own", Any)])(x), lambda x: [x],
 ])  # fmt: skip
-def test_a_program_whose_results_cannot_be_named_is_not_kept(result, cache):
+def test_a_program_with_results_of_unknown_type_is_not_cached(result, cache):
     shape, traced = jax.ShapeDtypeStruct((3,), jnp.float32), []
 
     def function(x):
@@ -112,7 +112,7 @@ def test_a_damaged_program_is_dropped_with_one_line(damage, cache, compiler):
     assert len(traced) == count + 1
 
 
-def test_what_says_not_all_that_a_program_depends_on_keeps_none(cache, compiler):
+def test_programs_with_unidentified_dependencies_are_not_cached(cache, compiler):
     run, traced = compiler
     for static in (object(), np.arange(5000)):
         run(static=static)
@@ -121,13 +121,13 @@ def test_what_says_not_all_that_a_program_depends_on_keeps_none(cache, compiler)
     assert not cache.exists()
 
 
-def test_a_cache_stays_where_it_was_when_its_process_goes_elsewhere(cache, tmp_path, monkeypatch):
+def test_a_cache_keeps_its_folder_when_the_process_changes_directory(cache, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert program_cache.use_cache("programs") == tmp_path / "programs"
     assert jax.config.jax_compilation_cache_dir == str(tmp_path / "programs")
 
 
-def test_every_law_of_the_package_is_known_again_by_its_functions_and_weights():
+def test_every_law_of_the_package_is_identified_by_functions_and_weights():
     laws = {name: registry.law_of(params) for name, params in registry.LAWS.items()}
     identities = {name: programs.identity(law) for name, law in laws.items()}
     assert None not in identities.values()
@@ -141,7 +141,7 @@ def test_every_law_of_the_package_is_known_again_by_its_functions_and_weights():
     assert programs.identity(replace(gru, init=lambda params: None)) is None
 
 
-def test_a_model_of_mjx_is_known_again_by_its_numbers(cache):
+def test_a_model_of_mjx_is_identified_by_its_values(cache):
     """This includes its static arrays, which JAX identifies by address."""
     setting = Setting("mjx")
     stages = [pushes.build([Case(name)], setting).stage for name in ("box", "box", "cylinder")]
@@ -153,7 +153,7 @@ def test_a_model_of_mjx_is_known_again_by_its_numbers(cache):
     assert repr(programs._describe(jax.tree.structure(changed))) != descriptions[0]
 
 
-def test_programs_that_were_not_used_for_longest_go_first(cache, compiler, monkeypatch):
+def test_least_recently_used_programs_are_evicted_first(cache, compiler, monkeypatch):
     run, traced = compiler
     run(n=1)
     size = next(cache.iterdir()).stat().st_size
@@ -168,7 +168,7 @@ def test_programs_that_were_not_used_for_longest_go_first(cache, compiler, monke
     assert len(traced) == count + 1
 
 
-def test_a_few_trials_stay_on_processors(monkeypatch):
+def test_small_sweeps_run_on_the_cpu(monkeypatch):
     """At most 500 with a C compiler; any number in C MuJoCo."""
     monkeypatch.setattr(device, "find_compiler", lambda: "cc")
     previous = jax.config.jax_platforms
@@ -191,7 +191,9 @@ def test_a_few_trials_stay_on_processors(monkeypatch):
 @pytest.mark.parametrize(("release", "machine", "needs_avx"), [
     ("0.11.2", "x86_64", False), ("0.12.0.1", "x86_64", True), ("0.13.1", "arm64", False),
 ])  # fmt: skip
-def test_a_jax_that_fuses_by_slot_is_asked_for_avx(release, machine, needs_avx, monkeypatch):
+def test_jax_versions_with_fusion_by_slot_get_the_avx_flag(
+    release, machine, needs_avx, monkeypatch
+):
     monkeypatch.setenv("XLA_FLAGS", "--xla_of_ones_own")
     monkeypatch.setattr(device.metadata, "version", lambda _: release)
     monkeypatch.setattr(device.platform, "machine", lambda: machine)

@@ -55,7 +55,7 @@ def browser(tmp_path_factory):
         browser.get(page.as_uri())
         yield browser
         resources = "return performance.getEntriesByType('resource').length"
-        assert browser.execute_script(resources) == 0  # it asks nobody for anything
+        assert browser.execute_script(resources) == 0  # the page loads nothing
         assert not browser.get_log("browser")
 
 
@@ -108,7 +108,7 @@ def test_each_state_of_a_push_gives_the_twist_of_python(law, browser):
 
 
 def named(trees):
-    """Leaves of pytrees by the names that the page gives them."""
+    """Return the leaves of pytrees by their names on the page."""
     names = [field.name for field in fields_of(trees[0])]
     rows = [[np.asarray(x).tolist() for x in jax.tree.leaves(tree)] for tree in trees]
     finite = [[1e300 if x == np.inf else x for x in row] for row in rows]  # as JSON has them
@@ -116,7 +116,7 @@ def named(trees):
 
 
 @pytest.mark.parametrize("corners", [1, 4, 6])
-def test_an_object_is_borne_as_in_the_package(corners):
+def test_the_support_of_an_object_equals_that_of_the_package(corners):
     """The page recomputes centre of mass and arm when a slider changes their inputs."""
     rng = np.random.default_rng(0)
     offset, bearing = rng.uniform(0, 0.4, 20), rng.uniform(-3, 3, 20)
@@ -136,11 +136,13 @@ def test_an_object_is_borne_as_in_the_package(corners):
     np.testing.assert_allclose(arm, expected.arm, atol=1e-9)
 
 
-def test_the_recorded_push_stands_on_the_floor_and_is_seen_from_any_side(browser):
-    """It ends at its target, upright; a drag turns the eye, and other pixels are drawn."""
+def test_the_recorded_push_is_upright_and_visible_from_any_side(browser):
+    """It ends at its target, upright; turning the camera changes the picture."""
     final_pose = "const q = RECORDED.qpos.at(-1); return [q[3], q[4], q[5], q[7], q[8]]"
     x, y, z, *tilt = browser.execute_script(final_pose)
-    assert np.hypot(x + 2, y) < 0.2  # the contact is at the target, the middle beside it
+    assert (
+        np.hypot(x + 2, y) < 0.2
+    )  # the contact is at the target, the middle of the object next to it
     assert abs(z - 0.4) < 2e-3
     np.testing.assert_allclose(tilt, 0, atol=2e-3)
     look = """

@@ -1,4 +1,4 @@
-"""The quasi-static model against motions and derivatives that are known by other means.
+"""The quasi-static model against analytical motions and finite differences.
 
 The motions are those of a point that pushes a slider with an ellipsoidal limit surface (Lynch,
 Maekawa and Tanie 1992): what sticks moves with the base, what slides pushes along an edge of the
@@ -83,7 +83,7 @@ def positions(fields, qpos, twists, physics):
 
 
 def film(pushes):
-    """Films of pushes whose outlines have one number of corners."""
+    """Return films of pushes of outlines with equal numbers of corners."""
     with jax.enable_x64(True):
         rows = lambda name: np.array([getattr(p, name) for p in pushes], float)  # noqa: E731
         base = np.tile([FRONT, SIDE], (len(pushes), 1))
@@ -125,12 +125,12 @@ def on_disc(push, **changes):
 
 
 def twist_of(force, r, arm):
-    """Twist (3,), but for its size, of an object pushed with a force (2,) at r (2,)."""
+    """Return the twist (3,) of an object pushed with a force (2,) at r (2,), up to its scale."""
     return np.array([*force, (r[0] * force[1] - r[1] * force[0]) / arm**2])
 
 
 def stuck(r, v, arm):
-    """Twist (3,) of an object whose point r from its centre moves at v (2,)."""
+    """Return the twist (3,) of an object whose point at r from its centre moves at v (2,)."""
     (x, y), square = r, arm**2
     v_x = ((square + x * x) * v[0] + x * y * v[1]) / (square + x * x + y * y)
     v_y = (x * y * v[0] + (square + y * y) * v[1]) / (square + x * x + y * y)
@@ -138,7 +138,7 @@ def stuck(r, v, arm):
 
 
 def pushed(r, n, v, arm, friction):
-    """Twist (3,) of an object pushed at r by a point of velocity v, and whether it slides.
+    """Return the twist (3,) of an object pushed at r by a point of velocity v; whether it slides.
 
     The normal n points to the object. If sticking takes a force outside the friction cone, the
     force is along the cone's edge and the object keeps up with the pusher along n alone.
@@ -215,7 +215,7 @@ def test_a_box_pushed_through_its_centre_moves_as_the_base_does():
     np.testing.assert_allclose(boxes()["centre"].moved, [0.05 * STEPS * PERIOD, 0, 0], atol=2e-4)
 
 
-def test_the_base_moves_as_it_is_told():
+def test_the_base_moves_at_its_commanded_twist():
     twist = CASES["here"].twist
     base = boxes()["here"].base
     assert base[-1, 2] == pytest.approx(twist[2] * STEPS * PERIOD)
@@ -224,12 +224,12 @@ def test_the_base_moves_as_it_is_told():
     np.testing.assert_allclose(back, np.tile(twist[:2], (STEPS, 1)) * PERIOD, atol=1e-12)
 
 
-def test_an_object_that_nothing_touches_does_not_move_at_all():
+def test_an_object_without_contact_does_not_move():
     assert np.abs(boxes()["apart"].moved).max() < 1e-12
 
 
 @pytest.mark.parametrize("i", range(len(STICKING)))
-def test_a_corner_that_sticks_is_carried_along_as_lynch_has_it(i):
+def test_a_sticking_corner_moves_as_in_lynch(i):
     pose, slid = expected(STICKING[i])
     assert slid == {False}
     recorded = boxes()[f"sticking {i}"]
@@ -290,13 +290,13 @@ def test_a_flat_contact_holds_if_and_only_if_forces_within_its_cones_can():
     assert held.count(False) > 4
 
 
-def test_left_and_right_are_alike():
+def test_mirrored_pushes_are_mirrored():
     a, b = boxes()["mirror"], boxes()["mirrored"]
     np.testing.assert_allclose(a.moved, b.moved * [1, -1, -1], atol=1e-9)
 
 
 def test_twice_the_speed_is_the_same_path_in_half_the_time():
-    """But for the length of a step, which is twice as long."""
+    """Only the length of a step doubles."""
     a, b = boxes()["once"], boxes()["twice"]
     assert np.hypot(*a.moved[:2]) > 0.03
     np.testing.assert_allclose(a.object_pose[::2], b.object_pose[: STEPS // 2 + 1], atol=5e-4)
@@ -385,7 +385,7 @@ def cost(stage, problem, v, dt):
     return total
 
 
-def test_newtons_method_finds_the_minimum_by_its_derivatives():
+def test_newtons_method_has_the_correct_derivatives_and_finds_the_minimum():
     stage, dt = Quasistatic(), 0.01
     with jax.enable_x64(True):
         problem, v = jax.tree.map(lambda x: jnp.asarray(x, float), some_problems())
@@ -503,13 +503,13 @@ def test_derivatives_of_the_closed_loop_are_those_of_finite_differences(name):
 # --- the stage ------------------------------------------------------------------------------
 
 
-def test_the_arms_of_a_square_on_its_corners_and_of_a_disc_on_its_rim_are_the_known_ones():
+def test_the_friction_arms_of_a_square_and_a_disc_are_the_known_values():
     box, disc = (scene.solid_of(scene.load(name)) for name in ("box", "cylinder"))
     assert solid.friction_arm(box) == pytest.approx([ARM["box"]])
     assert solid.friction_arm(disc) == pytest.approx([ARM["cylinder"]])
 
 
-def test_feet_bear_what_holds_the_centre_of_mass_and_none_pulls():
+def test_feet_balance_the_centre_of_mass_without_pulling():
     """On four corners, half way to an edge: 3/8 and 1/8 each; at an edge: half and nothing."""
 
     def arm(x):
@@ -534,7 +534,7 @@ def test_every_scene_has_a_slider(name):
     np.testing.assert_allclose(slider.p_object_com[0], com, atol=1e-5)
 
 
-def test_the_papers_grid_ends_as_in_the_other_engines(optimised):
+def test_the_papers_grid_agrees_with_the_other_engines(optimised):
     """RPS 144 of 144; NPS 25, as on converged C MuJoCo and on the fused engine."""
     cases = [
         Case(name, FRICTION[friction], target, registry.LAWS[law])

@@ -64,7 +64,7 @@ def test_two_fingers_through_the_centre_of_friction_translate(friction):
     assert force[-1] == pytest.approx([0.0, 1.0], abs=2e-3)  # the friction mu m g
 
 
-def test_a_finger_aside_turns_the_object_and_pushes_less_than_it_weighs():
+def test_an_off_centre_finger_turns_the_object_with_less_than_its_weight():
     pose, force = pushed(on(FEET), ([[0.1, -0.001]], (0.0, 0.02)))
     assert pose[-1, 2] > 0.05
     assert 0.1 < np.linalg.norm(force[-1]) < 0.95
@@ -103,7 +103,7 @@ def test_feet_move_with_the_pose():
     np.testing.assert_allclose(second[:, 2], first[:, 2] + 2.0, atol=1e-5)
 
 
-def test_where_the_feet_stand_decides_how_far_it_turns():
+def test_positions_of_feet_change_the_rotation():
     way = ([[0.1, -0.001]], (0.0, 0.02))
     near, far = (COM + share * (OUTLINE - COM) for share in (0.2, 1.0))
     assert pushed(on(near), way)[0][-1, 2] > 1.2 * pushed(on(far), way)[0][-1, 2]
@@ -127,7 +127,7 @@ def test_nearest_is_the_edge_or_the_corner():
                                atol=1e-12)  # fmt: skip
 
 
-def test_the_data_are_what_the_page_says():
+def test_the_data_agree_with_their_page():
     table = pushes.read()
     assert len(table) == 1271
     assert table.id.is_unique
@@ -147,7 +147,7 @@ def test_the_data_are_what_the_page_says():
         assert np.median(np.linalg.norm(late - table_mean, axis=1)) < 0.1
 
 
-def test_fingers_begin_outside_and_end_where_the_object_was_pushed(sample):
+def test_fingers_start_outside_and_end_at_the_pushed_object(sample):
     way = pushes.finger_paths(sample, STEPS)
     pre, post = pushes.initial_poses(sample), pushes.measured(sample)
     for pose, finger, low, high in ((pre, way[0], 2e-4, 5e-3), (post, way[-1], -2e-3, 6e-3)):
@@ -181,7 +181,7 @@ def test_mujoco_with_stiff_fingers_comes_near_the_rigid_body(sample):
     assert contact.KINDS["mujoco_ours"].scale == 4
 
 
-def test_a_prediction_takes_a_file_and_a_dataset_and_needs_no_ends(sample, tmp_path):
+def test_a_prediction_accepts_files_and_datasets_without_final_poses(sample, tmp_path):
     inputs = sample.drop(
         columns=[name for name in sample if name.startswith(("post_", "gap", "force"))]
     )
@@ -193,7 +193,7 @@ def test_a_prediction_takes_a_file_and_a_dataset_and_needs_no_ends(sample, tmp_p
     assert list(first.id.values) == list(sample.id)
 
 
-def test_a_table_without_sense_is_refused(sample, tmp_path, capsys):
+def test_an_invalid_table_is_refused(sample, tmp_path, capsys):
     with pytest.raises(InputError, match="lack the column edge, which kind = two_point"):
         predict(sample.drop(columns="edge"))
     with pytest.raises(InputError, match=r"pre_yaw = nan in row 0 is not allowed"):
@@ -222,7 +222,7 @@ def test_errors_by_hand():
     assert off.both[1] == pytest.approx(5e-3)
 
 
-def test_a_small_study_is_continued_and_tells_every_model(tmp_path):
+def test_a_small_study_resumes_and_lists_every_model(tmp_path):
     models = ("no_motion", "rigid_feet", "mujoco_ours")
     question = study.RealPushes(
         models=models, few=20, mujoco=1, out=tmp_path / "run", progress=False

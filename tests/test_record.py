@@ -205,7 +205,7 @@ def test_a_part_is_named_by_its_number_and_digest(tmp_path):
 
 
 @pytest.mark.skipif(not shutil.which("sha256sum"), reason="there is no sha256sum")
-def test_sha256sum_checks_what_was_written(sound):
+def test_sha256sum_verifies_the_files(sound):
     check = ["sha256sum", "-c", *(path.name for path in sound.glob("*.sha256"))]
     done = subprocess.run(check, cwd=sound, capture_output=True, text=True, check=True)
     assert set(done.stdout.split("\n")[:-1]) == {
@@ -266,7 +266,7 @@ def test_a_write_killed_at_any_moment_leaves_the_old_file_or_the_new(tmp_path, m
 
 
 def test_a_killed_replacement_leaves_the_old_or_the_new_part(tmp_path, monkeypatch):
-    """Whenever the process is killed."""
+    """The process is killed at each of its calls that change the disk."""
     parts, contents = Checkpoints(tmp_path), set()
 
     def check():

@@ -67,7 +67,7 @@ def with_force(observation, force=(-20.0, 0.0)):
     return ForceObservation(observation, jnp.array(force))
 
 
-def test_a_twist_gives_a_point_of_the_base_its_velocity():
+def test_a_twist_from_the_velocity_of_a_point_of_the_base():
     twist = Twist.from_point_velocity(
         jnp.array([0.36, 0.1]), jnp.array([0.01, 0.05]), jnp.asarray(0.15)
     )

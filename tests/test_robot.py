@@ -1,4 +1,4 @@
-"""Robots that exist: what a twist becomes, how a base with limits pushes, and when it stalls."""
+"""Models of real robots: tracking of twists, pushes with limited force, and stalls."""
 
 import math
 from dataclasses import replace
@@ -32,7 +32,7 @@ AHEAD = (0.05, 0.0, 0.0)
 
 
 def reference_velocities(robot, twist, steps):
-    """Velocities (steps, 3) at which the drive of a base at rest aims, at one commanded twist."""
+    """Return reference velocities (steps, 3) of the drive of a base at rest, at one twist."""
     aim, velocities = jnp.zeros(3), []
     for _ in range(steps):
         aim = drive.aim(robot, aim, jnp.asarray(twist, float), PERIOD)
@@ -88,7 +88,7 @@ def test_the_force_is_bounded_in_its_direction_by_drive_traction_and_rolling():
         assert force[2] == pytest.approx(robot.turn_max)
 
 
-def test_the_servo_meets_its_twist_with_one_overshoot_and_forgets_a_stall():
+def test_the_servo_overshoots_once_and_recovers_from_a_stall():
     """Alone, it is a double pole at 2 pi 5 Hz; after a stall its integral is the limit's."""
     robot, dt = Robot(mass=100.0, force_max=200.0), 0.01
     v, integral = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
@@ -109,7 +109,7 @@ WEIGHT = 0.3 * 20 * GRAVITY  # [N] that it takes to slide the box under S1: 58.9
 
 
 @pytest.mark.parametrize("engine", ["fused", "mujoco"])
-def test_a_base_pushes_what_its_force_can_slide_and_stalls_before_what_it_cannot(engine):
+def test_a_base_stalls_if_its_force_cannot_slide_the_object(engine):
     strong, weak = (push_object(engine, Robot(force_max=f * WEIGHT), 4.0) for f in (1.1, 0.9))
     assert strong.qvel[-1, 0] == pytest.approx(0.05, rel=0.01)
     assert abs(weak.qvel[-1, 0]) < 2e-3  # MuJoCo's friction creeps
@@ -151,7 +151,7 @@ def test_worlds_by_template_equal_recompiled_ones(engine):
 # --- trials --------------------------------------------------------------------------------
 
 
-def test_a_trial_whose_base_stalls_says_so():
+def test_a_stalled_base_is_reported_in_the_outcome():
     weak, strong = Robot(force_max=0.8 * WEIGHT), Robot(force_max=3 * WEIGHT, lag=0.1)
     setting = replace(SHORT, rules=Rules(horizon=20.0))
     cases = [
@@ -165,7 +165,7 @@ def test_a_trial_whose_base_stalls_says_so():
     assert not outcomes[1].stalled[0]
 
 
-def test_random_robots_are_drawn_last_and_change_no_other_number():
+def test_random_robots_are_drawn_last_and_change_no_other_draw():
     index = np.arange(0, 30, 3)
     wide, real = (draws.draw(DOMAINS[name], 5, index) for name in ("wide", "real"))
     limits = {
@@ -189,7 +189,7 @@ def test_random_robots_are_drawn_last_and_change_no_other_number():
     assert again.lag is None
 
 
-def test_a_domain_with_robots_goes_through_json():
+def test_a_domain_with_robots_survives_a_json_round_trip():
     import dataclasses
     import json
 
@@ -226,12 +226,12 @@ def test_robots_are_named_in_the_library_and_in_files(tmp_path):
         ({"speed": 1}, "unknown robot quantity 'speed'"),
     ],
 )
-def test_numbers_that_no_robot_has_are_one_sentence(changes, message):
+def test_invalid_robots_are_refused_in_one_sentence(changes, message):
     with pytest.raises(InputError, match=message.replace("(", r"\(")):
         parse_robot(changes)
 
 
-def test_commands_refuse_robots_that_they_cannot_step(capsys, tmp_path):
+def test_commands_refuse_unsupported_robots(capsys, tmp_path):
     assert "did you mean 'kairos'" in refusal(capsys, "push", "--robot", "kairo")
     message = refusal(
         capsys, "table", "--robot", "kairos", "--engine", "quasistatic", "--out", tmp_path / "t"
@@ -244,7 +244,7 @@ def test_commands_refuse_robots_that_they_cannot_step(capsys, tmp_path):
     assert "engine = quasistatic is not allowed" in message
 
 
-def test_an_ideal_robot_is_the_base_as_it_was():
+def test_an_ideal_robot_equals_the_default_base():
     setting = Setting(physics=SHORT.physics, rules=Rules(horizon=3.0), engine="fused")
     plain = pushes.run([Case("box", FRICTION["S1"], (1.0, 0.5), PAPER)], setting)[0]
     named = pushes.run(

@@ -1,4 +1,4 @@
-"""The checker of shapes, which tests add to calls, reports wrong shapes at their call."""
+"""The shape checker of the tests reports a wrong shape at its call."""
 
 import jax
 import jax.numpy as jnp
@@ -39,7 +39,7 @@ def chain(error):
         ({"period": jnp.zeros(2)}, "period"),
     ],
 )
-def test_a_law_is_given_no_observation_of_another_shape_or_kind(change, field):
+def test_a_law_refuses_observations_of_another_shape_or_type(change, field):
     state = RPSState.init(PAPER)
     rps.step(PAPER, state, OBSERVATION)
     with pytest.raises(TypeCheckError, match="typechecking parameter 'obs'") as caught:
@@ -47,7 +47,7 @@ def test_a_law_is_given_no_observation_of_another_shape_or_kind(change, field):
     assert f"Observation.{field} is " in " ".join(chain(caught.value))
 
 
-def test_batched_worlds_are_single_ones_to_a_law():
+def test_a_law_sees_batched_worlds_as_single_worlds():
     """`jax.vmap` hides the axis; without it the law refuses the batch."""
     batch = jax.tree.map(lambda x: jnp.stack([jnp.asarray(x)] * 3), OBSERVATION)
     assert jax.vmap(rps.displacement)(batch).shape == (3, 2)

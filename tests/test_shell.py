@@ -1,4 +1,4 @@
-"""The shell: bases of any size, and boards anywhere on them; skin, law and engines go along."""
+"""The shell: bases of any size with boards at any position, in skin, law and engines."""
 
 import json
 from dataclasses import replace
@@ -42,7 +42,7 @@ def box(x, y, half=0.1):
     return fp.place(fp.rectangle(half, half), jnp.array([x, y]), jnp.zeros(()))
 
 
-def test_taxels_stand_where_their_boards_are():
+def test_taxels_lie_on_their_boards():
     shell = Robot(0.5, 0.2, (Boards("front", 1, 0.1, middle=0.05),)).shell
     assert shell.count == 3
     # The strip runs to the right across the front: 5 cm along it is at y = -0.05.
@@ -71,7 +71,7 @@ def test_taxels_are_sampled_a_centimetre_apart():
     assert Robot(boards=(Boards("front", 4, 0.012),)).shell.samples == 2
 
 
-def test_boards_at_the_papers_pitch_feel_as_the_papers():
+def test_boards_at_the_papers_pitch_give_the_papers_readings():
     pitch = 0.58 / 12
     sides = Boards("left", 5, pitch), Boards("front", 4, pitch), Boards("right", 5, pitch)
     for sensor in (IdealSkin(), CapacitiveSkin(), SmoothSkin()):
@@ -83,7 +83,7 @@ def test_boards_at_the_papers_pitch_feel_as_the_papers():
 
 
 @pytest.mark.parametrize("sensor", [IdealSkin(), CapacitiveSkin()])
-def test_nothing_is_felt_where_no_board_is(sensor):
+def test_nothing_is_felt_without_a_board(sensor):
     worn = sensor.on(Robot(boards=FRONT_ONLY).shell)  # which covers |y| < 0.15
     assert int(read(sensor, box(0.46, 0.26)).contact_type) == LINE
     assert int(read(worn, box(0.46, 0.26)).contact_type) == NONE
@@ -145,8 +145,8 @@ def test_worlds_by_template_equal_recompiled_ones(engine):
         np.testing.assert_allclose(ours, compiled, rtol=2e-5, atol=2e-6)
 
 
-def test_a_sweep_pushes_with_the_base_that_it_is_given():
-    """A base is as wide as its boards: a narrow one loses objects that the usual one holds."""
+def test_a_sweep_uses_the_base_of_its_robot():
+    """A base is as wide as its boards: a narrow base loses objects that the default one keeps."""
     domain = replace(DOMAINS["wide"], objects=("random_cylinder",))
     setting = Setting(rules=Rules(horizon=20.0))
     wide, narrow, same = (
@@ -158,7 +158,7 @@ def test_a_sweep_pushes_with_the_base_that_it_is_given():
     np.testing.assert_array_equal(same.base_pose, wide.base_pose)
 
 
-def test_presets_wear_as_many_boards_as_they_have_room_for():
+def test_presets_have_as_many_boards_as_fit():
     for name, (side, front) in {"ridgeback": (6, 5), "mpo_500": (6, 4)}.items():
         assert [row.count for row in ROBOTS[name].boards] == [side, front, side]
         ROBOTS[name].check()
@@ -236,7 +236,7 @@ def test_speeds_ahead_and_sideways_are_bounded_with_the_direction_kept():
     np.testing.assert_allclose(ahead, (0.2, 0.1, 0.0), rtol=1e-6)
 
 
-def test_a_shell_says_how_wide_it_is():
+def test_the_half_width_of_a_shell():
     assert Shell().half == (0.3625, 0.29)
     assert Robot(half_width=0.29).shell.half_width is None  # known to the compiler
     assert Robot(half_width=0.3).shell.half == (0.3625, 0.3)

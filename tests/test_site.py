@@ -62,7 +62,7 @@ def test_an_equation_becomes_mathml():
     assert "\\" not in output
 
 
-def test_dead_links_and_loads_from_other_hosts_are_told(tmp_path):
+def test_dead_links_and_loads_from_other_hosts_are_reported(tmp_path):
     (tmp_path / "a").mkdir()
     good = '<a href="https://example.org">x</a> <a href="../b.html#c">b</a> <img src="c.png">'
     (tmp_path / "a" / "good.html").write_text(good)

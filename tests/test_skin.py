@@ -68,7 +68,7 @@ def ball(x: float, y: float, radius: float = 0.25) -> Footprint:
 
 
 def read(sensor, footprint: Footprint) -> tuple[int, float, float]:
-    """(contact type, x, y) of a settled reading."""
+    """Return (contact type, x, y) of a settled reading."""
     _, reading = sense_one(sensor, sensor.init(jax.random.key(0)), footprint, SETTLED)
     assert bool(reading.in_contact) == (reading.contact_type != NONE)
     return int(reading.contact_type), *map(float, reading.p_robot_contact)
@@ -183,7 +183,7 @@ def test_a_contact_longer_than_one_taxel_is_a_line():
 
 
 def test_a_tilted_corner_is_felt_as_far_as_the_tolerance_reaches():
-    """Along both of its sides."""
+    """Both sides of the corner are within the tolerance."""
     # The corner (-h, h) of a box turned by the angle of (4, 3) is at (-1.4, 0.2) h. From it one
     # side leaves along (4, 3) / 5, above, and one along (3, -4) / 5. Shifted outward by 6 mm they
     # meet the front 6 / 0.8 = 7.5 mm above and 6 / 0.6 = 10 mm below the corner.
@@ -238,7 +238,7 @@ def test_an_object_is_felt_up_to_the_tolerance_and_not_beyond(shape, tolerance):
     assert read(sensor, SHAPES[shape](tolerance + 1e-5)) == (NONE, 0.0, 0.0)
 
 
-def test_an_object_beside_the_end_of_a_face_is_felt_only_if_near_the_face():
+def test_an_object_past_the_end_of_a_face_is_felt_only_near_it():
     # In line with the front, but 7 mm past the corner at y = 0.29; then 5 mm.
     assert read(IDEAL, box(FRONT + 0.2, SIDE + 0.207))[0] == NONE
     assert read(IDEAL, box(FRONT + 0.2, SIDE + 0.205))[0] == POINT
@@ -360,7 +360,7 @@ def test_check_names_the_parameter_that_no_skin_can_have(sensor, value):
     ("name", "value"),
     [("foam", 0.0), ("time_constant", 0.0), ("max_compression", 1.0), ("dead_share", 1.1)],
 )
-def test_check_rejects_what_would_divide_by_zero_or_is_no_share(name, value):
+def test_check_rejects_divisions_by_zero_and_invalid_shares(name, value):
     with pytest.raises(errors.InputError, match=rf"\b{name} = "):
         CAPACITIVE._replace(**{name: value}).check()
 
@@ -384,7 +384,7 @@ def test_one_taxel_is_a_point_contact_at_its_position():
 
 @property_test
 @hypothesis.given(st.sets(st.integers(0, 41), min_size=2))
-def test_several_taxels_are_a_line_at_the_mean_of_the_two_extreme_ones(active):
+def test_several_taxels_give_a_line_at_the_mean_of_the_outermost_two(active):
     reading = active_taxels(np.isin(np.arange(42), list(active)))
     assert reading.contact_type == LINE
     expected = (TAXELS[min(active)] + TAXELS[max(active)]) / 2
@@ -461,7 +461,7 @@ def test_touch_begins_when_the_signal_passes_the_threshold():
 
 
 def test_a_flush_box_is_felt_where_the_signal_exceeds_the_threshold():
-    """Once the low-pass filter has settled."""
+    """The low-pass filter has settled."""
     # 10 mm / gap - 1 > 0.25: a gap below 8 mm. And with threshold 1: below 5 mm.
     for threshold, gap in [(0.25, 0.008), (1.0, 0.005)]:
         sensor = CAPACITIVE._replace(threshold=threshold)
@@ -486,7 +486,7 @@ QUIET = box(9.0, 0.0)
 
 @jax.jit
 def long_record(sensor, key):
-    """The signals (LONG, 42) of a sensor that feels nothing, every 20 ms."""
+    """The signals (LONG, 42) of a sensor without contact, every 20 ms."""
 
     def scan(state, _):
         state, _ = sensor.sense(state, QUIET, 0.02)
@@ -521,7 +521,7 @@ def test_without_noise_a_sensor_that_feels_nothing_is_silent():
 
 @jax.jit
 def batch_of(sensor):
-    """500 sensors of one make."""
+    """Return 500 sensors with equal parameters."""
     return jax.vmap(sensor.init)(jax.random.split(jax.random.key(3), 500))
 
 
@@ -543,7 +543,7 @@ def test_a_signal_is_proportional_to_the_gain():
     np.testing.assert_allclose(scaled.signal, gain * plain.signal, rtol=1e-6)
 
 
-def test_the_share_of_dead_taxels_is_as_asked():
+def test_the_share_of_dead_taxels_is_as_requested():
     for share in (0.0, 0.3, 1.0):
         alive = np.asarray(batch_of(CAPACITIVE._replace(dead_share=share)).alive)
         assert alive.mean() == pytest.approx(1 - share, abs=0.01)

@@ -1,4 +1,4 @@
-"""The smooth law and skin share properties with the hard ones, to which they converge."""
+"""The smooth law and skin converge to the hard ones and share their properties."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def times(factor: float, temperatures: Temperatures = WARM) -> Temperatures:
 
 
 def observe(d, l=0.0, in_contact=1.0) -> Observation:  # noqa: E741
-    """A robot at the origin, its contact at lateral location `l` and `d` from the target."""
+    """Return an observation: robot at the origin, contact at offset `l`, `d` to the target."""
     target = jnp.asarray((FRONT + d[0], l + d[1]), float)
     contact = jnp.asarray((FRONT, l), float)
     weight, period = jnp.asarray(in_contact, float), jnp.asarray(PERIOD)
@@ -115,7 +115,7 @@ def clear(params, state, observation, details, margin: float) -> np.ndarray:
 
 
 def flat_numbers(results) -> np.ndarray:
-    """(n, ...) of all that a step returns, bools as 0 and 1."""
+    """Return all results of a step as (n, ...), with bools as 0 and 1."""
     leaves = [np.asarray(x, float).reshape(WORLDS, -1) for x in jax.tree.leaves(results)]
     return np.concatenate(leaves, axis=1)
 
@@ -134,7 +134,7 @@ def test_without_heat_the_smooth_law_is_the_law_away_from_its_switches(seed):
 
 @property_test
 @hypothesis.given(seeds)
-def test_each_switch_comes_the_nearer_to_the_laws_the_colder_it_is(seed):
+def test_each_switch_converges_to_the_laws_with_its_temperature(seed):
     params, state, observation = random_worlds(seed)
     params = params._replace(zeta=0 * params.zeta, k=0 * params.k)  # a_r is eta / 2, but for them
     observation = observation._replace(in_contact=jnp.ones(WORLDS))
@@ -155,7 +155,7 @@ def test_each_switch_comes_the_nearer_to_the_laws_the_colder_it_is(seed):
 
 @property_test
 @hypothesis.given(seeds)
-def test_the_whole_law_comes_nearer_as_all_temperatures_fall(seed):
+def test_the_whole_law_converges_as_all_temperatures_fall(seed):
     worlds = random_worlds(seed)
     exact = flat_numbers(hard(*worlds)[:2])
     gaps = [
@@ -209,7 +209,7 @@ def test_the_realignment_state_keeps_its_memory(side):
         assert way[-1] > 0.99
 
 
-def test_sgn_has_the_derivative_of_a_tanh_where_the_law_has_none():
+def test_the_smooth_sgn_has_the_derivative_of_a_tanh_at_zero():
     # Beside l = 0, a_r = 10 / (1 + e^7.2) tanh(l / 0.01) and e^7.2 = 1339.43: 0.746 per metre.
     slope = jax.jit(jax.grad(rps.adaptive_rate, argnums=1))
     assert slope(PAPER, 0.0, 1.0, WARM) == pytest.approx(0.746027, rel=1e-3)
@@ -235,7 +235,7 @@ def test_the_smooth_speed_is_still_v_star_split_by_the_slope(seed):
 
 
 def test_the_weight_of_a_contact_mixes_pushing_with_going_ahead():
-    """And where the contact is with where it was last."""
+    """The weight also mixes the current contact point with the last one."""
     start = state_with()._replace(p_robot_contact=jnp.array([FRONT, -0.10]))
     observation = observe((2.0, 0.0), l=0.10, in_contact=0.25)
     state, twist, details = one_step(start, observation)
@@ -248,7 +248,7 @@ def test_the_weight_of_a_contact_mixes_pushing_with_going_ahead():
     assert state.touched == 1.0
 
 
-def test_what_was_touched_most_is_remembered():
+def test_the_largest_contact_weight_is_remembered():
     state = RPSState.init(PAPER, WARM)
     for weight in (0.2, 0.7, 0.1):
         state, _, _ = one_step(state, observe((1.0, 0.0), in_contact=weight))
@@ -424,7 +424,7 @@ LIMITS = [
 @property_test
 @hypothesis.given(seeds)
 def test_without_heat_the_smooth_skin_is_the_skin(sensor, dull, keen, seed):
-    """Also around corners, and with dead taxels within a contact."""
+    """This includes corners, and dead taxels within a contact."""
     shapes, key = random_shapes(seed), jax.random.key(seed % 2**31)
     exact, less, more = (sense_all(s, shapes, key) for s in (sensor, dull, keen))
     cold = sense_all(SmoothSkin(sensor, 1e-6), shapes, key)
@@ -442,7 +442,7 @@ def test_without_heat_the_smooth_skin_is_the_skin(sensor, dull, keen, seed):
 @pytest.mark.parametrize("sensor", [IdealSkin(), IMPERFECT], ids=["ideal", "capacitive"])
 @property_test
 @hypothesis.given(seeds)
-def test_the_skin_comes_nearer_as_its_temperature_falls(sensor, seed):
+def test_the_skin_converges_as_its_temperature_falls(sensor, seed):
     warm = 0.03 if isinstance(sensor, CapacitiveSkin) else 1e-3
     shapes, key = random_shapes(seed), jax.random.key(seed % 2**31)
     exact = sense_all(sensor, shapes, key)
@@ -564,7 +564,7 @@ def test_a_skin_that_is_not_warm_is_refused(value):
 
 
 def push(case: Case, law, horizon: float):
-    """The trial of a case after `horizon` [s], or at its end."""
+    """Return the trial of a case after `horizon` [s], or at its end."""
     setting = Setting(engine="mujoco", rules=Rules(horizon=horizon))
     _, worlds, models, params = pushes.build([case], setting)
     states = []

@@ -42,7 +42,7 @@ CONDITIONS = {
 }
 
 
-def test_a_condition_changes_rps_wherever_it_is_part_of_a_law():
+def test_a_condition_changes_rps_also_within_other_laws():
     condition = Condition("slow", SHORT, params={"v_max": 0.001})
     grid = GRID._replace(laws=("rps", "rps_plus", "aps", "pursuit"))
     rps, plus, aps, pursuit = (case.params for case in condition.cases(grid)[:: len(NEAR)])
@@ -70,7 +70,7 @@ def test_a_study_labels_its_conditions_and_compares_them(folder):
     assert rows[2][-1].startswith("+0 -2")
 
 
-def test_a_study_continues_and_redoes_alone_what_is_corrupt(folder, monkeypatch):
+def test_a_study_resumes_and_repeats_only_corrupt_parts(folder, monkeypatch):
     parts = Checkpoints(folder)
     stored, rest = dict(parts.items()), parts.paths()
     thin = rest.pop("thin")
@@ -167,7 +167,7 @@ def test_a_setup_has_one_robot_and_a_friction_for_each_object():
     np.testing.assert_array_equal(cases % 8, np.tile(np.arange(8), 8))
 
 
-def test_the_nearest_setups_are_those_that_give_all_of_the_papers_numbers():
+def test_the_nearest_setups_reproduce_all_of_the_papers_numbers():
     reference = [paper.HARDWARE_RESULTS[name] for name in paper.HARDWARE_OBJECTS]
     off = np.arange(101.0)
     setups = xr.Dataset(

@@ -75,7 +75,7 @@ def whole(tmp_path_factory):
     return swept(tmp_path_factory.mktemp("whole"))
 
 
-def test_a_world_in_a_refilled_slot_ends_as_it_does_alone():
+def test_a_world_in_a_refilled_slot_ends_as_alone():
     """Bit for bit with a fixed number of slots, whatever shares the batch."""
     together = outcomes([box_worlds(np.arange(13)), box_worlds(np.arange(13, 20))])
     assert len(together) == 20
@@ -89,7 +89,7 @@ def test_a_world_in_a_refilled_slot_ends_as_it_does_alone():
 
 
 @pytest.mark.parametrize("error", ["pose_latency", "command_delay"])
-def test_late_poses_and_late_commands_are_late_by_as_much(error):
+def test_latency_of_poses_and_commands_is_exact(error):
     """While the base turns, sensed poses or applied commands lag n steps behind."""
     steps, period = 3, SHORT.physics.control_period
     still = replace(BOXES, **{name: Range(0, 0) for name in domain.quantities_of("base")})
@@ -117,7 +117,7 @@ def test_late_poses_and_late_commands_are_late_by_as_much(error):
 
 
 @pytest.mark.slow
-def test_a_base_that_errs_by_nothing_is_perfect():
+def test_a_base_without_errors_is_perfect():
     nothing = {name: Range(0, 0) for name in domain.quantities_of("base")}
     perfect = replace(CYLINDERS, **nothing)
     assert box_worlds(np.arange(2)).worlds.odometry.past.shape[1] > 1
@@ -134,8 +134,8 @@ def test_a_base_that_errs_by_nothing_is_perfect():
             np.testing.assert_allclose(mine, theirs, atol=1e-4)
 
 
-def test_flat_boxes_that_nothing_touches_stay_where_they_are():
-    """Even in the long steps of `fast`, in which stiffer ground would shake them away."""
+def test_flat_boxes_without_contact_do_not_move():
+    """This holds for the long steps of `fast`; stiffer ground would shake the boxes away."""
     flat = replace(BOXES, size=Range(0.25, 0.35), height=Range(0.3, 0.4), gap=Range(0.05, 0.05))
     still = PAPER._replace(v_approach=0.0)
     part = drawn_worlds(flat, draws.draw(flat, 0, np.arange(SLOTS)), SHORT).with_params(still)
@@ -180,7 +180,7 @@ for program in programs:
 """
 
 
-def test_two_devices_find_what_one_finds_and_never_talk(whole, tmp_path):
+def test_two_devices_agree_with_one_and_never_communicate(whole, tmp_path):
     environment = os.environ | {
         "XLA_FLAGS": f"{os.environ.get('XLA_FLAGS', '')} --xla_force_host_platform_device_count=2",
         "PYTHONPATH": os.pathsep.join(sys.path),
@@ -204,7 +204,7 @@ def test_two_devices_find_what_one_finds_and_never_talk(whole, tmp_path):
     assert np.median(np.abs(double.time - single.time)) < 0.1
 
 
-def test_results_hold_every_world_with_what_was_drawn(whole, tmp_path):
+def test_results_hold_every_world_with_its_drawn_quantities(whole, tmp_path):
     merge([whole], out=tmp_path)
     results = files.read_results(tmp_path)
     assert dict(results.sizes) == {"law": 2, "world": 20, "pose": 3, "object": 1}
@@ -239,7 +239,7 @@ def sweep_in_a_process(folder):
     swept(folder, KILLED)
 
 
-def test_a_run_killed_six_times_ends_as_one_that_was_not(tmp_path, monkeypatch):
+def test_a_run_killed_six_times_equals_an_undisturbed_one(tmp_path, monkeypatch):
     """SIGKILL hits start and work alternately at random moments; the last process ends."""
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join(sys.path))  # or the server finds no tests
     context = multiprocessing.get_context("forkserver")
@@ -306,7 +306,7 @@ def test_a_device_out_of_memory_loses_nothing(whole, tmp_path, capsys, monkeypat
     ends_in_one_sentence_and_is_continued(tmp_path, whole, capsys, monkeypatch, *words)
 
 
-def test_a_corrupt_part_is_set_aside_and_done_again_alone(whole, tmp_path):
+def test_only_a_corrupt_part_is_set_aside_and_repeated(whole, tmp_path):
     folder = shutil.copytree(whole, tmp_path / "run")
     victim = sorted(folder.glob("parts/*.npz"))[2]
     times = {path: path.stat().st_mtime_ns for path in folder.glob("parts/*.npz") if path != victim}
@@ -350,7 +350,7 @@ def test_a_run_with_the_removed_column_overflows_is_read(whole, tmp_path):
     xr.testing.assert_identical(merge([folder], out=folder), expected)
 
 
-def test_the_report_of_one_world_says_how_to_replay_its_failure(whole, tmp_path):
+def test_the_report_of_one_world_has_the_command_that_replays_its_failure(whole, tmp_path):
     folder = shutil.copytree(whole, tmp_path / "a run")
     results = merge([folder], out=folder)
     world = results.isel(world=[0])
@@ -375,7 +375,7 @@ def test_shards_merge_to_the_whole(whole, tmp_path):
         merge([folders[0], tmp_path / "other"], out=tmp_path)
 
 
-def test_another_configuration_is_refused_with_what_differs(whole):
+def test_another_configuration_is_refused_with_its_differences(whole):
     changed_plan = replace(PLAN, worlds=30, domain=replace(BOXES, mass=Range(1, 2)))
     with pytest.raises(InputError, match=r"domain.mass = .*there, .* asked for; worlds = 20 there"):
         open_run(whole, changed_plan)

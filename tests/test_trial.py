@@ -1,4 +1,4 @@
-"""Trials end as the rules say, worlds do not touch each other, and a short push arrives."""
+"""Trials: rules that end them, independence of worlds, and a short push."""
 
 from dataclasses import replace
 from functools import partial
@@ -83,7 +83,7 @@ def test_rare_termination_checks_on_a_gpu_do_not_change_results(monkeypatch):
 
 
 @pytest.mark.parametrize("limit", [1, 3, SLOTS])
-def test_the_last_trials_of_jobs_end_alike_side_by_side(monkeypatch, limit):
+def test_suspended_trials_end_alike_in_merged_batches(monkeypatch, limit):
     """Merged batches of a GPU: two shape families, and at most 1, 3 or all trials suspended."""
     rules = Rules(horizon=60.0)
     cases = [case((0.6 + 0.05 * k, 0.05 * k)) for k in range(6)] + [case(AHEAD)]
@@ -104,7 +104,7 @@ def test_the_last_trials_of_jobs_end_alike_side_by_side(monkeypatch, limit):
     np.testing.assert_allclose(results.object_pose, alone.object_pose, atol=1e-3)  # other shapes
 
 
-def test_a_base_may_turn_as_often_as_it_likes_and_not_go_as_far():
+def test_yaw_is_unbounded_and_position_is_bounded():
     part = pushes.build([case()], FUSED)
     state = trial.start(*jax.tree.map(lambda leaf: jnp.asarray(leaf)[0], part[1::2]))
     for i, value, diverges in ((2, 500.0, False), (2, np.nan, True), (0, 101.0, True)):
@@ -166,7 +166,7 @@ def world_batch(count):
 
 @pytest.fixture(scope="module")
 def advanced():
-    """Three healthy worlds beside one whose object starts as NaN, after 0.4 s."""
+    """Trials after 0.4 s: four valid worlds, and the same with a NaN object in one."""
     stage, worlds, params = world_batch(SLOTS)
     broken = worlds._replace(qpos=worlds.qpos.at[1, 4].set(jnp.nan))
     live = jnp.ones(SLOTS, bool)
@@ -178,7 +178,7 @@ def advanced():
     return run(worlds), run(broken)
 
 
-def test_a_diverged_world_freezes_and_leaves_the_others_bit_unchanged(advanced):
+def test_a_diverged_world_freezes_and_others_are_unchanged_bit_for_bit(advanced):
     healthy, mixed = advanced
     np.testing.assert_array_equal(mixed.diverged, [False, True, False, False])
     assert mixed.steps[1] == 0
@@ -189,7 +189,7 @@ def test_a_diverged_world_freezes_and_leaves_the_others_bit_unchanged(advanced):
     assert (np.asarray(healthy.steps) == 20).all()
 
 
-def test_an_object_that_leans_too_far_has_fallen_over_and_ends_its_trial():
+def test_an_object_that_tilts_too_far_ends_its_trial():
     _, worlds, params = world_batch(SLOTS)
     half = np.radians([0.0, 44.0, 46.0, -120.0]) / 2  # about the object's x axis
     qpos = worlds.qpos.at[:, 6].set(np.cos(half)).at[:, 7].set(np.sin(half))
@@ -207,7 +207,7 @@ def test_an_object_that_leans_too_far_has_fallen_over_and_ends_its_trial():
     assert not observed(rules=Rules(max_tilt=3)).tipped.any()
 
 
-def test_the_way_of_the_base_is_its_speed_times_time(outcomes, advanced):
+def test_the_path_length_of_the_base_is_its_speed_times_time(outcomes, advanced):
     # 0.4 s at 1 cm/s before the first touch; then at no more than v_max.
     np.testing.assert_allclose(advanced[0].path_length, 0.004, rtol=1e-3)
     ahead = outcomes.base_pose[2, :2]
@@ -223,7 +223,7 @@ def test_padding_never_moves_and_a_finished_batch_stops_at_once():
     assert (np.asarray(stepped.steps) == 0).all()
 
 
-def test_before_the_first_touch_the_base_creeps_and_nothing_counts_as_lost(advanced):
+def test_before_the_first_touch_the_base_creeps_without_lost_contact(advanced):
     healthy, _ = advanced
     assert float(healthy.qpos[0, 0]) == pytest.approx(0.4 * 0.01, rel=1e-4)
     assert int(healthy.lost_steps[0]) == 0
@@ -266,7 +266,7 @@ def test_the_trace_of_a_trial_agrees_with_its_outcome(engine):
         ({"shift": Shift(3.0, (0.0, float("inf")))}, "shift y"),
     ],
 )
-def test_a_case_that_means_nothing_is_refused(changes, field):
+def test_an_invalid_case_is_refused(changes, field):
     with pytest.raises(errors.InputError, match=field):
         case(**changes)
 
@@ -280,6 +280,6 @@ def test_a_case_that_means_nothing_is_refused(changes, field):
         (lambda: Setting(seed=-1, engine="mjx"), "seed"),
     ],
 )
-def test_settings_that_mean_nothing_are_refused(make, field):
+def test_invalid_settings_are_refused(make, field):
     with pytest.raises(errors.InputError, match=field):
         make()

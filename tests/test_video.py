@@ -26,7 +26,7 @@ def box() -> scene.Scene:
 
 
 def drive(loaded: scene.Scene, count: int = 5) -> list[np.ndarray]:
-    """The base and the object before it, 0.2 m further forward in each frame."""
+    """Return frames in which base and object move ahead by 0.2 m per frame."""
     frames = np.tile(scene.initial_qpos(loaded), (count, 1))
     frames[:, [0, 3]] += 0.2 * np.arange(count)[:, None]
     return list(frames)
@@ -40,12 +40,12 @@ def decode(path: Path) -> np.ndarray:
 
 
 def changed(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Rows and columns (n, 2) of the pixels in which two images differ plainly."""
+    """Return rows and columns (n, 2) of the pixels in which two images differ clearly."""
     return np.argwhere(np.abs(a.astype(int) - b).max(axis=-1) > 60)
 
 
 def red(image: np.ndarray) -> np.ndarray:
-    """Rows and columns (n, 2) of the pixels as red as the flag."""
+    """Return rows and columns (n, 2) of the pixels with the red of the flag."""
     r, g, _ = np.moveaxis(image.astype(int), -1, 0)
     return np.argwhere(r - g > 100)
 
@@ -93,7 +93,7 @@ def test_the_contact_point_leaves_a_path_with_gaps(box: scene.Scene, tmp_path: P
 
 
 @pytest.mark.parametrize("camera", ["above", "oblique"])
-def test_an_image_drawn_anew_in_part_is_the_whole_image(box: scene.Scene, camera: str) -> None:
+def test_a_partially_redrawn_image_equals_the_whole_image(box: scene.Scene, camera: str) -> None:
     options = {"p_world_target": (1.0, 1.0), "size": (480, 270), "camera": camera}
     frames = np.tile(scene.initial_qpos(box), (6, 1))
     frames[:, 3:5] += [(0.1 * i, 0.12 * i) for i in range(5)] + [(30, 30)]  # past the flag, away
@@ -101,7 +101,7 @@ def test_an_image_drawn_anew_in_part_is_the_whole_image(box: scene.Scene, camera
         assert len(changed(drawn, video.snapshot(box, qpos, **options))) < 6
 
 
-def test_a_trail_is_drawn_alike_in_parts_and_as_a_whole(box: scene.Scene) -> None:
+def test_a_trail_drawn_in_parts_equals_one_drawn_at_once(box: scene.Scene) -> None:
     options = {"p_world_target": FAR, "size": (960, 540), "camera": "oblique"}
     frames = np.tile(scene.initial_qpos(box), (90, 1))
     frames[:, [0, 3]] += np.linspace(0, 1, 90)[:, None]
@@ -134,7 +134,7 @@ def test_both_cameras_see_targets_on_all_sides(box: scene.Scene, camera: str) ->
         assert columns.max() < 319
 
 
-def test_the_capsule_that_stands_in_for_a_drum_is_not_drawn() -> None:
+def test_the_collision_capsule_of_a_drum_is_not_drawn() -> None:
     drum = scene.load("cylinder")
     qpos = scene.initial_qpos(drum)
     image = video.snapshot(drum, qpos, p_world_target=FAR, size=SMALL)
@@ -142,14 +142,14 @@ def test_the_capsule_that_stands_in_for_a_drum_is_not_drawn() -> None:
     assert np.array_equal(image, video.snapshot(drum, qpos, p_world_target=FAR, size=SMALL))
 
 
-def test_a_path_that_cannot_be_written_is_one_sentence(box: scene.Scene, tmp_path: Path) -> None:
+def test_an_unwritable_path_is_refused_in_one_sentence(box: scene.Scene, tmp_path: Path) -> None:
     for path in (tmp_path / "missing" / "push.mp4", tmp_path):
         with pytest.raises(video.VideoError, match="could not be written") as caught:
             video.render(box, drive(box), path, p_world_target=FAR, size=SMALL)
         assert_one_sentence(caught.value)
 
 
-def test_an_unfinished_video_leaves_the_old_file_alone(box: scene.Scene, tmp_path: Path) -> None:
+def test_an_unfinished_video_does_not_change_the_old_file(box: scene.Scene, tmp_path: Path) -> None:
     path = tmp_path / "push.mp4"
     path.write_bytes(b"old")
 
@@ -200,7 +200,7 @@ def test_this_machine_can_draw_and_encode() -> None:
     assert [(c.name, c.ok) for c in video.check()] == [("rendering", True), ("ffmpeg", True)]
 
 
-def test_a_machine_that_cannot_draw_is_told_how_to_mend_it() -> None:
+def test_without_rendering_the_check_names_the_fix() -> None:
     code = "from rps_jax.world import video; print(video.check()[0])"
     environment = os.environ | {"MUJOCO_GL": "disable"}
     command = [sys.executable, "-c", code]
@@ -218,14 +218,14 @@ def test_importing_the_module_changes_nothing() -> None:
     subprocess.run([sys.executable, "-c", code], check=True)
 
 
-def test_a_choice_of_gl_already_made_is_kept(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_existing_choice_of_gl_is_respected(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("MUJOCO_GL", "osmesa")
     rendering.choose_gl.__wrapped__()
     assert os.environ["MUJOCO_GL"] == "osmesa"
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="elsewhere MuJoCo needs no choice of GL")
-def test_without_a_display_it_can_draw_where_mujoco_was_imported_before() -> None:
+def test_rendering_works_without_a_display_after_importing_mujoco() -> None:
     code = "import mujoco; from rps_jax.world import video; print(video.check()[0].ok)"
     environment = {k: v for k, v in os.environ.items() if k not in ("MUJOCO_GL", "DISPLAY")}
     command = [sys.executable, "-c", code]

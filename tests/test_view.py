@@ -1,4 +1,4 @@
-"""A push in the browser: the trial that can be disturbed, and the page as Chromium shows it."""
+"""A push in the browser: the interactive trial, and the page in Chromium."""
 
 import contextlib
 import http.client
@@ -103,7 +103,7 @@ def test_every_kind_of_law_is_shown_live(law, tmp_path, monkeypatch, registries)
 
 
 @pytest.mark.slow
-def test_a_push_that_is_left_alone_ends_as_any_other_trial(live):
+def test_an_undisturbed_push_ends_like_any_other_trial(live):
     results, _ = pushes.run([CASE], SETTING, slots=1, workers=1)
     live.step(2 * round(SETTING.rules.horizon / PERIOD))
     assert live.done
@@ -112,8 +112,8 @@ def test_a_push_that_is_left_alone_ends_as_any_other_trial(live):
     assert live.past[-1].snapshot.time == pytest.approx(float(results.time[0]), abs=1e-4)
 
 
-def test_a_target_that_is_dragged_is_the_one_that_counts(live):
-    """Dragged to the contact it is reached at once; dragged away it is pushed to."""
+def test_a_dragged_target_is_the_current_target(live):
+    """A target dragged to the contact is reached at once; one dragged away is not."""
     live.set_target((0.0, 3.0))
     live.step(150)
     assert not live.done
@@ -147,7 +147,7 @@ def test_a_shove_moves_the_object_once_in_the_frame_of_the_robot(live):
 
 
 def test_a_shove_after_the_end_happens_once(live):
-    """However often the target is dragged afterwards."""
+    """Dragging the target afterwards does not repeat it."""
     live.set_target((0.0, 3.0))
     live.step(150)
     live.set_target(tuple(p_world_contact(live)))
@@ -163,7 +163,7 @@ def test_a_shove_after_the_end_happens_once(live):
     assert math.dist(live.past[-1].snapshot.qpos[3:5], shoved) < 3e-3
 
 
-def test_going_back_forgets_what_came_after(live):
+def test_rewinding_discards_later_states(live):
     live.step(60)
     last = live.past[-1]
     live.rewind(20)
@@ -175,7 +175,7 @@ def test_going_back_forgets_what_came_after(live):
     np.testing.assert_array_equal(last.snapshot.qpos, live.past[-1].snapshot.qpos)
 
 
-def test_the_foam_gives_way_only_where_the_object_is_felt(live):
+def test_the_foam_is_compressed_only_at_the_contact(live):
     live.step(1)
     assert not live.past[0].compression.any()  # 2 cm before the robot
     live.step(150)
@@ -187,7 +187,7 @@ def test_the_foam_gives_way_only_where_the_object_is_felt(live):
 
 
 @pytest.mark.parametrize("wrong", [(math.nan, 0.0), (0.0, 99.0)])
-def test_a_disturbance_that_means_nothing_is_refused(live, wrong):
+def test_an_invalid_disturbance_is_refused(live, wrong):
     with pytest.raises(InputError, match="target"):
         live.set_target(wrong)
     with pytest.raises(InputError, match="shove"):
@@ -243,7 +243,7 @@ def button(browser, name):
     return browser.find_element(By.XPATH, f"//button[normalize-space()='{name}']")
 
 
-def test_the_page_plays_a_push_and_says_what_is_wrong(page, browser):
+def test_the_page_plays_a_push_and_shows_errors(page, browser):
     def text():
         return browser.find_element(By.TAG_NAME, "body").text
 
@@ -315,7 +315,7 @@ CAMERA = {
 
 
 @pytest.mark.parametrize("origin", ["https://evil.example", "http://127.0.0.1:1", "null", None])
-def test_no_other_page_can_drive_it(page, origin):
+def test_other_pages_cannot_control_it(page, origin):
     with pytest.raises(InvalidStatus, match="403"):
         connected(page, origin=origin)
     connected(page).close()
@@ -325,15 +325,15 @@ def test_no_other_page_can_drive_it(page, origin):
     ("host", "status"),
     [("{}", 200), ("localhost:{1}", 200), ("rebound.example", 403), ("10.0.0.1:{1}", 403)],
 )
-def test_it_is_served_under_names_of_this_machine_alone(page, host, status):
-    """A name of another site that was pointed here (DNS rebinding) is not one."""
+def test_the_page_is_served_only_under_names_of_this_machine(page, host, status):
+    """Names of other sites that resolve to this machine (DNS rebinding) are refused."""
     port = page._server.get_port()
     line = http.client.HTTPConnection("127.0.0.1", port)
     line.request("GET", "/", headers={"Host": host.format(f"127.0.0.1:{port}", port)})
     assert line.getresponse().status == status
 
 
-def test_only_what_the_controls_offer_comes_through(page, capfd):
+def test_only_valid_values_of_controls_are_accepted(page, capfd):
     request = page.request
     infinite, huge = float("inf"), 1e300
     send_messages(
@@ -367,19 +367,19 @@ def test_only_what_the_controls_offer_comes_through(page, capfd):
     assert page.request == request._replace(law="nps", target=(1.0, 2.0))
 
 
-def test_a_viser_that_is_not_guarded_is_not_served(monkeypatch):
+def test_an_unguarded_viser_is_not_served(monkeypatch):
     monkeypatch.setattr(gate.Gate, "guarding", lambda self: contextlib.nullcontext())
     with pytest.raises(InputError, match="this version of viser answers other pages"):
         viewer.open_page("127.0.0.1", 0, REQUEST, make)
 
 
-def test_a_port_that_is_taken_is_one_sentence(capsys):
+def test_a_used_port_is_refused_in_one_sentence(capsys):
     with socket.create_server(("127.0.0.1", 0)) as server:
         port = server.getsockname()[1]
         error = refusal(capsys, "view", "--port", port)
     assert f"port = {port} cannot be served on (Address already in use)" in error
 
 
-def test_without_viser_the_command_says_how_to_install_it(capsys, monkeypatch):
+def test_without_viser_the_error_names_the_package(capsys, monkeypatch):
     monkeypatch.setitem(sys.modules, "viser", None)
     assert "viser is not installed: run pip install 'rps_jax[viz]'." in refusal(capsys, "view")
