@@ -28,7 +28,7 @@ def pytest_configure(config):
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
 
 
-# Files with the most work, which start first: the last file to start leaves a processor idle.
+# Slow files start first; a slow file at the end would leave processors idle.
 LONGEST = (
     *("failures", "learning", "native", "export", "ladder", "rivals", "gpu_writer", "smooth"),
     *("bags", "examples", "sweep", "shell", "trial", "robot", "video", "points", "faults"),

@@ -1,6 +1,6 @@
 """Faults of many classes, injected into the command line.
 
-    python tests/fuzz.py                  # every class, as many cases as the published table has
+    python tests/fuzz.py                  # all classes, with the case counts of the published table
     python tests/fuzz.py values --most 500
 
 Nothing may end in a traceback, hang for more than 10 s, or give a wrong result.
@@ -238,13 +238,13 @@ def values(seed: int = 0) -> Iterator[Case]:
         for option in options(command)
         for needs in (NEEDS.get(command[0], ()),)
         for value in VALUES
-        if not (option == "--out" and value in ("/", "..", "~"))  # which may be written
+        if not (option == "--out" and value in ("/", "..", "~"))  # these may be writable
     ]
     random.Random(seed).shuffle(cases)
     yield from cases
 
 
-# What a command needs beside the option that is tried.
+# Required arguments of a command besides the tested option.
 NEEDS = {
     "replay": ("run", "0"),
     "film": ("run",),

@@ -1,6 +1,6 @@
 """Faults that need separate processes: kills, full disks, signals, pipes, locales, neighbours.
 
-    python tests/fuzz_process.py            # all of them: some twenty minutes on two cores
+    python tests/fuzz_process.py            # all classes, about twenty minutes on two cores
     python tests/fuzz_process.py kills --most 14
 
 A killed command is repeated with the same arguments until it ends. Its results must then equal
@@ -87,7 +87,10 @@ KILLED: dict[str, tuple[str, ...]] = {
         *("--num-minibatches", "1"),
     ),
 }
-_CLOCKS = ("compile", "run")  # of a tuner's generation; others say "wall clock"
+_CLOCKS = (
+    "compile",
+    "run",
+)  # of a tuner's generation; other clocks have "wall clock" in their long name
 
 
 def start(*words: str, **how: Any) -> subprocess.Popen[str]:

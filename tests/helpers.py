@@ -76,9 +76,9 @@ def advance(
     return trial.advance((stage,), (worlds,), (params,), (trials,), loop, steps)[0]
 
 
-# The fused engine, which compiles soonest of those that solve for contact.
+# The fused engine compiles fastest among the engines with contact dynamics.
 SHORT = Setting("fused", FAST, rules=Rules(horizon=20.0))
-# Targets ahead, so near that a push of a few seconds arrives; a perfect base.
+# Near targets ahead, reached within a few seconds, and a perfect base.
 NEAR = replace(
     DOMAINS["wide"],
     distance=Range(0.7, 0.72),
@@ -88,7 +88,7 @@ NEAR = replace(
     gap=Range(0.02, 0.02),
     **{name: Range(0, 0) for name in domain.quantities_of("base")},
 )
-SLOTS = 8  # of all sweeps of this setting, so that they share their programs
+SLOTS = 8  # equal in all sweeps, so that they share their programs
 BOXES = replace(
     DOMAINS["wide"],
     objects=("random_box",),
@@ -104,8 +104,8 @@ def case(
     target: tuple[float, float], name: str = "box", friction: str = "S1", **changes: Any
 ) -> Case:
     """Return a case of the law; changes are fields of `Case` or of the law's parameters."""
-    of_case = {k: changes.pop(k) for k in list(changes) if k in Case.__dataclass_fields__}
-    return Case(name, friction, target, PAPER._replace(**changes), **of_case)
+    fields = {k: changes.pop(k) for k in list(changes) if k in Case.__dataclass_fields__}
+    return Case(name, friction, target, PAPER._replace(**changes), **fields)
 
 
 def swept(folder: Path, plan: Plan = PLAN, **options: Any) -> Path:

@@ -385,7 +385,7 @@ def test_bad_input_is_one_sentence_before_anything_compiles(
     error = capsys.readouterr().err
     if error.startswith("rps: error: "):
         one_sentence(error)
-    else:  # it is tyro's own, in a frame
+    else:  # an error of tyro, in a frame
         error = " ".join(re.sub("[│╭╮╰╯─]", " ", error).split())
     assert re.search(CASES[case], error)
     assert not list(folder.rglob("*.nc"))

@@ -28,12 +28,12 @@ def observe(robot, yaw=0.0, obj=(0.0, 0.0), target=(2.0, 0.0), r_object=0.2):
 
 
 def twist_at(angle, distance=0.6, params=PLAIN, state=START, **world):
-    """Twist of a robot at this angle [rad] about the object, facing it; target along x."""
+    """Return the twist of a robot at an angle [rad] about the object, facing it; target along x."""
     position = distance * np.array([np.cos(angle), np.sin(angle)])
     return aps_step(params, state, observe(position, angle + np.pi, **world))[1]
 
 
-def in_world(twist, yaw):
+def world_velocity(twist, yaw):
     c, s = np.cos(yaw), np.sin(yaw)
     return np.array([c * twist.v_x - s * twist.v_y, s * twist.v_x + c * twist.v_y])
 
@@ -72,7 +72,7 @@ def test_behind_the_object_it_pushes_straight_at_the_target():
 
 @pytest.mark.parametrize("angle", [0.3, 1.2, 2.0, 2.9, -0.3, -1.2, -2.0, -2.9])
 def test_it_orbits_to_the_far_side_of_the_object_on_the_shorter_arc(angle):
-    v = in_world(twist_at(angle), angle + np.pi)
+    v = world_velocity(twist_at(angle), angle + np.pi)
     around = v @ [-np.sin(angle), np.cos(angle)]  # counter-clockwise about the object
     assert np.sign(around) == np.sign(angle)
     towards = -v @ [np.cos(angle), np.sin(angle)]

@@ -121,7 +121,7 @@ def test_killing_a_worker_does_not_change_results(domain, tmp_path, two_workers,
     assert rps(*SWEEP, "--domain", domain, "--out", out, "--ray", "local") == 0
     assert killed
     workers = json.loads((out / "environment.json").read_text())["workers"]
-    assert {worker["pid"] for worker in workers} - set(killed)  # another went on
+    assert {worker["pid"] for worker in workers} - set(killed)  # another worker continued
     assert len(parts_of(plain)) == 6
     assert parts_of(out) == parts_of(plain)
     assert files.read_results(out).success.shape == (2, 20)

@@ -66,7 +66,7 @@ def test_everything_lies_in_its_range_and_fills_it(name):
         values = columns[quantity][0]
         low, high, log = getattr(chosen, quantity)
         if name == "hardware" and quantity in ("mass", "size", "height", "com_offset"):
-            continue  # these are the objects' own
+            continue  # these belong to the objects
         assert low - 1e-9 <= values.min() <= values.max() <= high + 1e-9, quantity
         if high > low:
             at = np.log(values / low) / np.log(high / low) if log else (values - low) / (high - low)

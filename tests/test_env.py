@@ -203,7 +203,7 @@ def test_a_step_equals_a_trial_with_the_same_twist(pushing):
     np.testing.assert_array_equal(mine.data.steps, STEPS)
     np.testing.assert_allclose(mine.data.qpos, theirs.qpos, atol=2e-5)
     assert (theirs.contact_steps > 0).all()
-    # An environment has sensed once more: what follows the last step.
+    # The environment has one more reading, after the last step.
     sensed_more = mine.data.contact_steps - theirs.contact_steps
     np.testing.assert_array_equal(sensed_more, mine.metrics["in_contact"])
 
@@ -222,7 +222,7 @@ def test_a_batch_is_driven_as_a_whole():
     together = jax.vmap(drive, (0, 0, None))(batch, batch, jnp.array(2.0))
     np.testing.assert_array_equal(together[0], batch)
     np.testing.assert_array_equal(together[2], np.full(5, 2.0))
-    assert sizes == [5] or sizes == [1, 5]  # the first when it is traced
+    assert sizes == [5] or sizes == [1, 5]  # size 1 occurs only while tracing
 
 
 def test_states_are_drawn_each_in_its_own_world(pushing):
@@ -234,7 +234,7 @@ def test_states_are_drawn_each_in_its_own_world(pushing):
     images = push.render(states, 60, 80)
     assert [image.shape for image in images] == [(60, 80, 3)] * 2
     assert (abs(images[0].astype(int) - images[1]) > 20).any()
-    again = push.render(states[1], 60, 80)  # rendering itself may differ by a shade
+    again = push.render(states[1], 60, 80)  # rendering is not exactly repeatable
     np.testing.assert_allclose(again.astype(int), images[1].astype(int), atol=2)
 
 

@@ -35,7 +35,7 @@ TWIST = (0.05, 0.0, 0.03)
 
 
 @pytest.fixture(scope="module", autouse=True)
-def stands(tmp_path_factory):
+def registered_boxes(tmp_path_factory):
     """A box on feet, a box on its corners, and a box whose feet are at its corners."""
     path = tmp_path_factory.mktemp("feet") / "wedge.xml"
     path.write_text(XML)
@@ -56,7 +56,7 @@ def start(name):
     return loaded, qpos
 
 
-def in_c(name, steps):
+def step_in_c(name, steps):
     """Return positions (10,) after steps at TWIST in C MuJoCo."""
     loaded, qpos = start(name)
     data = mujoco.MjData(loaded.physics)
@@ -80,7 +80,7 @@ Y = 4  # of the object, along the base's front, on which it comes to lie
 
 @pytest.mark.parametrize("engine", ["fused", "mjx"])
 def test_feet_change_the_final_pose_and_engines_agree_with_c_mujoco(engine):
-    feet, corners = in_c("on_feet", 300), in_c("on_corners", 300)
+    feet, corners = step_in_c("on_feet", 300), step_in_c("on_corners", 300)
     assert feet[Y] - corners[Y] > 0.01
     qpos = driven(engine, ["on_feet", "on_both"], 300)
     np.testing.assert_allclose(qpos[0], feet, atol=2e-3)
@@ -88,7 +88,7 @@ def test_feet_change_the_final_pose_and_engines_agree_with_c_mujoco(engine):
 
 
 def test_quasistatic_is_nearer_to_c_mujoco_with_equal_feet():
-    feet, corners = in_c("on_feet", 300), in_c("on_corners", 300)
+    feet, corners = step_in_c("on_feet", 300), step_in_c("on_corners", 300)
     qpos = driven("quasistatic", ["on_feet", "on_both"], 300)
     assert qpos[0, Y] - qpos[1, Y] > 0.005
     for final, expected, wrong in ((qpos[0], feet, corners), (qpos[1], corners, feet)):
@@ -138,9 +138,9 @@ def test_the_rigid_solver_supports_feet():
         (FEET * np.nan, "must be finite"),
     ],
 )
-def test_feet_without_sense_are_refused(stands, feet, message):
+def test_feet_without_sense_are_refused(registered_boxes, feet, message):
     with pytest.raises(InputError, match=message):
-        objects.register_object("wrong", stands, feet=feet)
+        objects.register_object("wrong", registered_boxes, feet=feet)
     assert "wrong" not in objects.REGISTERED
 
 
@@ -156,7 +156,7 @@ def drawn_on_feet(name, count=4):
 
 
 def stepped(engine, family, drawn, steps):
-    """Positions (n, 10) of drawn worlds after steps at TWIST in a traced engine, or in C."""
+    """Return positions (n, 10) of drawn worlds after steps at TWIST in an engine."""
     stage, fields = engines.get(engine).stage(family, drawn.solid, drawn.friction, FINE, Robot())
     qpos = starts(drawn)
     qpos[:, [3, 5]] -= 0.0005

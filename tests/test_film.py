@@ -39,7 +39,7 @@ def plan_of(*names):
     return Plan(domain, 2 * len(names), {"rps": RPSParams.paper()}, setting)
 
 
-def a_sweep(folder):
+def write_sweep(folder):
     """Write the part of a run of `rps sweep` that a film reads."""
     open_run(folder, plan_of("random_cylinder"))
 
@@ -55,7 +55,7 @@ def differ(a, b):
     return (np.abs(a - b).max(axis=-1) > 60).sum() > 20
 
 
-@pytest.mark.parametrize("make", [table, pytest.param(a_sweep, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("make", [table, pytest.param(write_sweep, marks=pytest.mark.slow)])
 def test_a_film_shows_each_trial_in_its_tile_and_holds_the_end(make, tmp_path):
     make(tmp_path)
     out = tmp_path / "two.mp4"

@@ -43,7 +43,7 @@ def without(name):
     return change
 
 
-def put(column, value, where: Any = slice(None)):
+def set_column(column, value, where: Any = slice(None)):
     def change(rows, head):
         rows[where, head.split(",").index(column)] = value
         return rows, head
@@ -63,17 +63,17 @@ WRONG = {
     "lacks the column omega": without("omega"),
     "lacks the column contact_y": without("contact_y"),
     "is empty: give a header": lambda rows, head: (rows[:0], head),
-    "has no number for pose in row 7": put("yaw", np.nan, 7),
+    "has no number for pose in row 7": set_column("yaw", np.nan, 7),
     "has a gap of 2 s at": lambda r, h: (np.delete(r, np.s_[100:199], 0), h),
-    "its time must rise": put("time", 0.0, 9),
+    "its time must rise": set_column("time", 0.0, 9),
     r"has a row every 20 s: give the time in seconds": scaled("time", 1e3),
     "lasts 1.9 s: it must last 5 s": lambda rows, head: (rows[:95], head),
     r"twist up to 50: write v_x and v_y \[m/s\]": scaled("v_x", 1e3),
     "a pose that jumps": scaled("x", 1e3),
-    "a pose that jumps by 6.28": put("yaw", 2 * np.pi, slice(200, None)),
-    "has no contact": put("contact_type", 0),
-    r"up to \(0.480, 0.050\) m, and the robot ends at": put("contact_x", 0.48),
-    r"target is 20.\d+ m from its start": put("target_x", 20.0),
+    "a pose that jumps by 6.28": set_column("yaw", 2 * np.pi, slice(200, None)),
+    "has no contact": set_column("contact_type", 0),
+    r"up to \(0.480, 0.050\) m, and the robot ends at": set_column("contact_x", 0.48),
+    r"target is 20.\d+ m from its start": set_column("target_x", 20.0),
     r"has 1 taxels, and the robot 42": lambda r, h: (r, h.replace("contact_type", "taxel_0")),
 }
 
@@ -175,7 +175,7 @@ def test_contacts_are_computed_from_taxels():
     np.testing.assert_allclose(result["p_robot_contact"][1], [0.3625, 3.5 * pitch], atol=1e-6)
 
 
-def a_log(delay=0, share=1.0, count=500):
+def build_log(delay=0, share=1.0, count=500):
     """Return rows of a base that applies a share of a changing command, delayed by some rows."""
     time = 0.02 * np.arange(count)
     twist = np.zeros((1, count, 3))
@@ -191,14 +191,14 @@ def a_log(delay=0, share=1.0, count=500):
 
 def test_delay_and_slip_are_read_off_the_base():
     """The motion is (1 - slip) (command - delay times the change of the command)."""
-    result = logs.statistics(a_log(delay=10, share=0.9), 0.02)
+    result = logs.statistics(build_log(delay=10, share=0.9), 0.02)
     share, later = (float(result[f"base/follow_100_0_{i}"][0]) for i in range(2))
     assert share == pytest.approx(0.9, abs=0.01)
     assert -later / share == pytest.approx(0.2, abs=0.02)
 
 
 def test_a_mirrored_log_has_a_mirrored_target():
-    log = a_log()
+    log = build_log()
     original, mirrored = (logs.statistics(x, 0.02) for x in (log, logs.mirror(log)))
     assert (
         original["base/target_2"] == -mirrored["base/target_2"] == pytest.approx(5**-0.5, rel=1e-3)

@@ -45,7 +45,7 @@ def start(name, yaw, offset, physics=FINE, gap=-0.0005):
     return loaded, jax.tree.map(lambda x: jnp.asarray(x, float)[None], body), qpos
 
 
-def in_c(model, qpos, steps):
+def step_in_c(model, qpos, steps):
     """Positions (10,) and velocities (9,) after `steps` steps at TWIST."""
     data = mujoco.MjData(model)
     data.qpos[:] = qpos
@@ -81,7 +81,7 @@ def drive(name, body, physics, qpos, steps):
 def test_a_step_agrees_with_c_mujoco(name, yaw, offset, cone):
     physics = replace(FINE, cone=cone)
     loaded, body, qpos = start(name, yaw, offset, physics)
-    expected = in_c(loaded.physics, qpos, 1)
+    expected = step_in_c(loaded.physics, qpos, 1)
     pose, velocity, _ = drive(name, body, physics, qpos, 1)
     # C MuJoCo finds one contact of the cylinder with the base, of which the fused engine has two.
     near, slow = (5e-4, 0.1) if (name, offset) == ("cylinder", 0.08) else (1e-6, 1e-4)
@@ -94,7 +94,7 @@ def test_a_step_agrees_with_c_mujoco(name, yaw, offset, cone):
 def test_a_push_of_three_seconds_agrees_with_c_mujoco(name, yaw, offset):
     """C MuJoCo drops one of two contacts of a tilted edge now and then, which rocks the object."""
     loaded, body, qpos = start(name, yaw, offset)
-    expected, _ = in_c(loaded.physics, qpos, 300)
+    expected, _ = step_in_c(loaded.physics, qpos, 300)
     pose, _, _ = drive(name, body, FINE, qpos, 300)
     assert np.hypot(*(expected - qpos)[3:5]) > 0.1
     np.testing.assert_allclose(pose, expected, atol=2e-3)

@@ -21,7 +21,7 @@ def test_each_failure_has_one_mode():
     modes = gallery.failure_modes(outcomes(), 150.0).tolist()
     far = "timeout far from the target"
     assert modes == ["", "timeout near the target", far, "never touched"]
-    # A fall has precedence over lost contact; a success is a success whatever else happened.
+    # A fall has precedence over lost contact, and a success over all failure modes.
     changes = {"tipped": [1, 1, 0, 0], "contact_lost_time": [0, 200, 200, 0]}
     fallen = gallery.failure_modes(outcomes(**changes), 150.0).tolist()
     assert fallen == ["", "fell over", "lost contact", "never touched"]

@@ -184,24 +184,26 @@ def test_an_empty_estimate_is_zero_with_infinite_variance():
     np.testing.assert_array_equal(estimate.finite, [0.0, 0.5])
 
 
-def known(gradient, variance) -> Estimate:
+def estimate_of(gradient, variance) -> Estimate:
     return Estimate(*(jnp.asarray(x, float) for x in (gradient, variance, np.ones_like(gradient))))
 
 
 def test_a_combination_weighs_by_inverse_variance_by_hand():
     # Weights 1/1 and 1/3: (1 * 0 + 1/3 * 4) / (4/3) = 1, variance 1 / (4/3).
-    both = estimators.combine(known([0.0, 2.0], [1.0, 0.0]), known([4.0, 9.0], [3.0, 1.0]))
+    both = estimators.combine(
+        estimate_of([0.0, 2.0], [1.0, 0.0]), estimate_of([4.0, 9.0], [3.0, 1.0])
+    )
     np.testing.assert_allclose(both.gradient, [1.0, 2.0])
     np.testing.assert_allclose(both.variance, [0.75, 0.0])
 
 
 @pytest.mark.parametrize(("sure", "lost"), [(1.0, np.inf), (0.0, np.inf), (0.0, 0.0)])
 def test_an_estimate_of_infinite_variance_has_no_weight(sure, lost):
-    a, b = known([2.0], [sure]), known([2.0 if lost == 0 else 7.0], [lost])
+    a, b = estimate_of([2.0], [sure]), estimate_of([2.0 if lost == 0 else 7.0], [lost])
     for both in (estimators.combine(a, b), estimators.combine(b, a)):
         assert both.gradient == 2.0
         assert both.variance == sure
-    nothing = estimators.combine(known([0.0], [np.inf]), known([0.0], [np.inf]))
+    nothing = estimators.combine(estimate_of([0.0], [np.inf]), estimate_of([0.0], [np.inf]))
     assert nothing.variance == np.inf
     assert nothing.gradient == 0
 
@@ -209,7 +211,7 @@ def test_an_estimate_of_infinite_variance_has_no_weight(sure, lost):
 @hypothesis.settings(max_examples=30, deadline=None)
 @hypothesis.given(st.lists(st.floats(0, 1e6), min_size=4, max_size=4))
 def test_a_combination_claims_to_be_no_worse_than_either_and_is_symmetric(variances):
-    a, b = known([1.0, -1.0], variances[:2]), known([3.0, 5.0], variances[2:])
+    a, b = estimate_of([1.0, -1.0], variances[:2]), estimate_of([3.0, 5.0], variances[2:])
     both, again = estimators.combine(a, b), estimators.combine(b, a)
     least = np.minimum(a.variance, b.variance)
     assert (both.variance <= least * (1 + 1e-6)).all()

@@ -72,10 +72,10 @@ def test_a_seed_decides_on_worlds_and_noise(single, vector):
             np.testing.assert_array_equal(a, b)
         assert not np.array_equal(runs[0][0], runs[2][0])
     start, _ = vector.reset(seed=5)
-    assert len(np.unique(start, axis=0)) == COUNT  # each world its own
+    assert len(np.unique(start, axis=0)) == COUNT  # the worlds differ
 
 
-def to_the_end(envs):
+def step_until_success(envs):
     """Step until a trial succeeds."""
     envs.reset(seed=0)
     for _ in range(20):
@@ -87,7 +87,7 @@ def to_the_end(envs):
 
 def test_a_success_terminates_and_resets_in_the_next_step(vector):
     assert vector.metadata["autoreset_mode"] is AutoresetMode.NEXT_STEP
-    _, rewards, ended, truncated, infos = to_the_end(vector)
+    _, rewards, ended, truncated, infos = step_until_success(vector)
     assert infos["is_success"][ended].all()
     assert not truncated[ended].any()
     assert (rewards[ended] > 0.5).all()  # the success, which is worth 1, less what contact costs
@@ -104,12 +104,12 @@ def test_a_success_terminates_and_resets_in_the_next_step(vector):
 
 
 def test_autoreset_in_the_same_step_is_optional(vector):
-    _, rewards, ended, *_ = to_the_end(vector)
+    _, rewards, ended, *_ = step_until_success(vector)
     envs = make_vector(autoreset_mode="SameStep")
     for name in ("_start", "_act", "_select"):  # whose programs are compiled
         setattr(envs.unwrapped, name, getattr(vector.unwrapped, name))
     assert envs.metadata["autoreset_mode"] is AutoresetMode.SAME_STEP
-    obs, same, terminated, _, infos = to_the_end(envs)
+    obs, same, terminated, _, infos = step_until_success(envs)
     np.testing.assert_array_equal(terminated, ended)
     np.testing.assert_array_equal(same, rewards)
     np.testing.assert_array_equal(infos["_final_obs"], ended)

@@ -102,7 +102,7 @@ def test_a_failure_is_reported_and_releases_resources(fails, error, folder):
         for kind in ("stream", "event"):
             created = sum(line.startswith(f"{kind} ") for line in notes)
             ended = sum(line.startswith(f"end {kind} ") for line in notes)
-            assert created - ended == (fails == kind)  # what failed to be created is not ended
+            assert created - ended == (fails == kind)  # a failed creation needs no release
         assert ("pop" in notes) == any(line.startswith("push") for line in notes)
 
 

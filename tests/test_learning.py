@@ -227,9 +227,9 @@ BAD = {
 @pytest.mark.parametrize("name", BAD)
 def test_an_invalid_policy_file_is_refused_in_one_sentence(name, tmp_path):
     written(tmp_path / "policy.npz")
-    spoil, words = BAD[name]
+    damage, words = BAD[name]
     path = tmp_path / "policy.npz"
-    path.write_bytes(spoil(path.read_bytes()))
+    path.write_bytes(damage(path.read_bytes()))
     with pytest.raises(InputError, match=words) as error:
         registry.parse_law(str(path))
     assert "\n" not in str(error.value)
@@ -386,11 +386,13 @@ def test_the_best_action_of_one_step_is_learned(kind):
         obs = (
             jnp.zeros(shape).at[..., [0, 41, 47]].set(jax.random.normal(key_seen, (*shape[:2], 3)))
         )
-        yes = jnp.ones(shape[:2], bool)
+        flags = jnp.ones(shape[:2], bool)
         blank = jnp.zeros((*shape[:2], ppo.PRIVATE_SIGNS.size))
         zero = jnp.zeros(shape[:2])
         hidden = network.initial_hidden((64,))
-        transitions = Transition(obs, blank, yes, jnp.zeros((4, 64, 3)), *[zero] * 4, yes, yes)
+        transitions = Transition(
+            obs, blank, flags, jnp.zeros((4, 64, 3)), *[zero] * 4, flags, flags
+        )
         mean = ppo.means(network, state.weights["actor"], hidden, transitions)
         noise = jax.random.normal(key_act, mean.shape)
         action = mean + jnp.exp(state.weights["log_std"]) * noise
@@ -405,8 +407,8 @@ def test_the_best_action_of_one_step_is_learned(kind):
 
     wrong = []
     for key in jax.random.split(jax.random.PRNGKey(1), 150):
-        state, off = update(state, key)
-        wrong.append(float(off))
+        state, error = update(state, key)
+        wrong.append(float(error))
     assert wrong[0] == pytest.approx(0.8**2 + 0.5**2, rel=0.05)
     assert np.mean(wrong[-10:]) < 0.2 * wrong[0]
 

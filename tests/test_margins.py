@@ -14,7 +14,7 @@ COUNT = 1_000_000
 
 
 def states(seed, params):
-    """Contacts in the critical region, on any object, and targets anywhere."""
+    """Return random contacts in the critical region, on any object, with any targets."""
     random = np.random.default_rng(seed)
     side = random.choice([-1.0, 1.0], COUNT)
     l = side * random.uniform(float(params.l_cr) + 1e-4, 0.29, COUNT)  # noqa: E741

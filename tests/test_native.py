@@ -60,7 +60,7 @@ def start_trials(inputs, loop):
     return trial.start_all(*inputs, jnp.ones(len(inputs[0].qpos), bool), loop.law)
 
 
-def in_a_push(*arguments, **drawn):
+def build_push(*arguments, **drawn):
     """Return the values of `batch`, and trials in the middle of a push, after 8 s."""
     stage, inputs, loop = batch(*arguments, **drawn)
     step, pushing = jax.jit(advance(stage, loop, 1)), start_trials(inputs, loop)
@@ -86,7 +86,7 @@ def close(actual, desired, warm, rest):
 @pytest.mark.parametrize("skin", ["capacitive", "ideal"])
 @pytest.mark.parametrize("shape", ["box", "cylinder", "prism"])
 def test_a_control_step_agrees_with_xla(shape, skin, monkeypatch):
-    stage, inputs, loop, pushing = in_a_push(shape, skin)
+    stage, inputs, loop, pushing = build_push(shape, skin)
     computed = advanced(stage, inputs, pushing, loop, 1)
     monkeypatch.setenv("RPS_COMPILER", "none")
     expected = advanced(stage, inputs, pushing, loop, 1)

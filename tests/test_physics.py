@@ -90,7 +90,7 @@ def starts(worlds, physics):
     return scenes, qpos, qvel, np.array([(*w.push, 0.0) for w in worlds])
 
 
-def in_engine(engine, worlds, physics=STANDARD, seconds=SECONDS):
+def films_in_engine(engine, worlds, physics=STANDARD, seconds=SECONDS):
     """Return films of worlds of one shape family."""
     scenes, qpos, qvel, twist = starts(worlds, physics)
     stage, fields = staged(engine, scenes, physics)
@@ -99,8 +99,8 @@ def in_engine(engine, worlds, physics=STANDARD, seconds=SECONDS):
     return [Film(recording.qpos[:, i], recording.qvel[:, i], physics) for i in range(len(worlds))]
 
 
-def in_c(worlds, physics=REFERENCE, seconds=SECONDS):
-    return in_engine("mujoco", worlds, physics, seconds)
+def films_in_c(worlds, physics=REFERENCE, seconds=SECONDS):
+    return films_in_engine("mujoco", worlds, physics, seconds)
 
 
 def polar(length, degrees):
@@ -131,7 +131,7 @@ def films(engine):
     names = [[n for n in ALL if ALL[n].name == name] for name in MASS]
     with ThreadPoolExecutor(2) as pool:  # MJX compiles both families at once
         physics = REFERENCE if engine == "mujoco" else STANDARD
-        run = functools.partial(in_engine, engine, physics=physics)
+        run = functools.partial(films_in_engine, engine, physics=physics)
         boxes, cylinders = pool.map(run, [[ALL[n] for n in group] for group in names])
     return dict(zip(names[0] + names[1], boxes + cylinders, strict=True))
 
@@ -165,7 +165,7 @@ def test_a_steady_push_needs_the_force_mu_m_g_and_the_work_of_friction(ground, r
     when speed is given at once.
     """
     speed = 0.05
-    (film,) = in_c([World(Friction(ground, robot), (speed, 0.0))], physics)
+    (film,) = films_in_c([World(Friction(ground, robot), (speed, 0.0))], physics)
     force = BASE * (speed - film.qvel[1:, 0]) / physics.control_period
     weight, borne = ground * MASS["box"] * G, ground * robot / (1 - ground * robot)
     steady = force[len(force) // 2 :]
@@ -178,14 +178,14 @@ def test_a_steady_push_needs_the_force_mu_m_g_and_the_work_of_friction(ground, r
 @pytest.mark.parametrize("friction", FRICTION)
 def test_a_box_pushed_at_the_papers_speed_stays_on_the_ground(friction):
     """MuJoCo's cone lifts what slides; on its own, stiffer ground a box hops from 1 cm/s on."""
-    (film,) = in_c([World(FRICTION[friction], (0.05, 0.0))], STANDARD)
+    (film,) = films_in_c([World(FRICTION[friction], (0.05, 0.0))], STANDARD)
     assert film.qvel[25:, 5].std() < 1e-3
 
 
 @pytest.mark.parametrize("name", OBJECTS)
 def test_an_object_at_rest_creeps_less_than_a_millimetre_in_a_minute(name):
     calm = replace(STANDARD, control_period=1.0)
-    (film,) = in_c([World(gap=1.0, name=name)], calm, seconds=60.0)
+    (film,) = films_in_c([World(gap=1.0, name=name)], calm, seconds=60.0)
     assert film.way < 1e-3
     assert abs(film.moved[2]) < math.radians(0.1)
 
@@ -193,7 +193,7 @@ def test_an_object_at_rest_creeps_less_than_a_millimetre_in_a_minute(name):
 @pytest.mark.parametrize("name", MASS)
 def test_nothing_creeps_in_the_fused_engine_in_float32(name):
     calm = replace(STANDARD, control_period=1.0)
-    (film,) = in_engine("fused", [World(gap=1.0, name=name)], calm, seconds=60.0)
+    (film,) = films_in_engine("fused", [World(gap=1.0, name=name)], calm, seconds=60.0)
     assert film.way < 1e-5
     assert abs(film.moved[2]) < 1e-6
 
@@ -379,7 +379,10 @@ def test_a_box_pushed_at_a_corner_turns_about_the_centre_given_by_friction(
 def test_an_off_centre_push_of_10_cm_ends_equally_at_1_and_5_cm_a_second(yaw, friction):
     """Quasi-static: at 5 cm/s the box slides v^2 / (2 mu g) = 0.4 mm by itself."""
     slow = World(FRICTION[friction], (0.01, 0.0), yaw=math.radians(yaw))
-    (a,), (b,) = in_c([slow], seconds=10.0), in_c([slow._replace(push=(0.05, 0.0))], seconds=2.0)
+    (a,), (b,) = (
+        films_in_c([slow], seconds=10.0),
+        films_in_c([slow._replace(push=(0.05, 0.0))], seconds=2.0),
+    )
     assert abs(a.moved[2]) > math.radians(5)
     assert np.hypot(*(a.moved - b.moved)[:2]) < 2e-3
     assert abs(a.moved[2] - b.moved[2]) < math.radians(0.5)
@@ -412,7 +415,7 @@ def test_pyramidal_friction_slides_farther_along_the_diagonal_by_the_root_of_two
     """The pyramid's edges hold mu N along the axes, and between them only mu N / sqrt(2)."""
     still = World(Friction(0.1, 0.35), gap=1.0, name=name)
     thrown = [still._replace(thrown=(*polar(0.5, degrees), 0.0)) for degrees in (0, 45)]
-    ahead, diagonal = in_c(thrown, preset("paper_gazebo"))
+    ahead, diagonal = films_in_c(thrown, preset("paper_gazebo"))
     assert diagonal.way / ahead.way == pytest.approx(math.sqrt(2), rel=0.03)
 
 

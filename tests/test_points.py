@@ -17,12 +17,12 @@ from rps_jax.world import draws, points
 from rps_jax.world.domain import DOMAINS, Range, quantities_of
 
 SWEPT = {"setting": SHORT, "slots": SLOTS}
-# Quantities that a world has in its solid, friction, target and robot, unless these are given.
+# Quantities that the solid, friction, target and robot of a world contain.
 SHOWN = (*quantities_of("object", "robot"), "distance", "bearing")
 
 
-def used(drawn):
-    """Return a draw without the values that are in its solid, friction, target and robot."""
+def without_drawn_values(drawn):
+    """Return a draw without the values that its solid, friction, target and robot contain."""
     return drawn._replace(values={k: v for k, v in drawn.values.items() if k not in SHOWN})
 
 
@@ -36,7 +36,10 @@ def test_a_drawn_world_equals_the_world_at_its_point_bit_for_bit(name):
     )
     for kind in np.unique(object_indices):
         rows = np.flatnonzero(object_indices == kind)
-        drawn, again = used(draws.draw(domain, 5, index[rows])), used(at.draw(domain, rows))
+        drawn, again = (
+            without_drawn_values(draws.draw(domain, 5, index[rows])),
+            without_drawn_values(at.draw(domain, rows)),
+        )
         for a, b in zip(drawn, again._replace(indices=index[rows], cases=drawn.cases), strict=True):
             assert jax.tree.all(jax.tree.map(np.array_equal, a, b))
 
@@ -56,7 +59,7 @@ def _leaves(domain, u):
     at = points.check_points(domain, u)
     object_indices = domain.object_of(at.cases(domain, np.arange(len(u))))
     groups = [np.flatnonzero(object_indices == kind) for kind in np.unique(object_indices)]
-    drawn = [used(at.draw(domain, index)) for index in groups]
+    drawn = [without_drawn_values(at.draw(domain, index)) for index in groups]
     return np.concatenate([np.ravel(leaf) for leaf in jax.tree.leaves(drawn)])
 
 

@@ -94,8 +94,10 @@ def test_each_state_of_a_push_gives_the_twist_of_python(law, browser):
         expected, stride = twists(live), max(1, len(live.past) // 6000)
         shown = range(0, len(live.past) - 1, stride)
         previous = [live.past[i].before for i in shown]
-        trials = named([step._replace(**MAKE["UNTRACED"]) for step in previous])
-        states = list(zip(trials, named([step.law_state for step in previous]), strict=True))
+        trials = leaves_by_name([step._replace(**MAKE["UNTRACED"]) for step in previous])
+        states = list(
+            zip(trials, leaves_by_name([step.law_state for step in previous]), strict=True)
+        )
         next_qpos = np.array([live.past[i + 1].seen.qpos for i in shown])
     computed = np.concatenate(
         [
@@ -107,7 +109,7 @@ def test_each_state_of_a_push_gives_the_twist_of_python(law, browser):
     np.testing.assert_allclose(computed[:, 3:], next_qpos, rtol=0, atol=1e-7)
 
 
-def named(trees):
+def leaves_by_name(trees):
     """Return the leaves of pytrees by their names on the page."""
     names = [field.name for field in fields_of(trees[0])]
     rows = [[np.asarray(x).tolist() for x in jax.tree.leaves(tree)] for tree in trees]

@@ -25,7 +25,7 @@ def sample():
     return whole.groupby("kind").head(10).reset_index(drop=True)
 
 
-def on(feet, count=1, shift=0.0):
+def ground_on(feet, count=1, shift=0.0):
     """Return a ground with these points under `count` objects, without an ellipsoid."""
     at = np.repeat((feet - COM)[None], count, axis=0)
     return Ground(at, np.ones(at.shape[:2]), np.zeros(count), np.full(count, shift))
@@ -59,20 +59,20 @@ UPWARDS = ([[0.025, -0.001], [0.075, -0.001]], (0.0, 0.02))  # two fingers about
 @pytest.mark.parametrize("friction", [0.05, 0.5])
 def test_two_fingers_through_the_centre_of_friction_translate(friction):
     """The feet bear a third each, and fingers at equal distances hold it straight."""
-    pose, force = pushed(on(FEET), UPWARDS, friction=friction)
+    pose, force = pushed(ground_on(FEET), UPWARDS, friction=friction)
     assert pose[-1] == pytest.approx([0.0, 0.019, 0.0], abs=2e-5)
     assert force[-1] == pytest.approx([0.0, 1.0], abs=2e-3)  # the friction mu m g
 
 
 def test_an_off_centre_finger_turns_the_object_with_less_than_its_weight():
-    pose, force = pushed(on(FEET), ([[0.1, -0.001]], (0.0, 0.02)))
+    pose, force = pushed(ground_on(FEET), ([[0.1, -0.001]], (0.0, 0.02)))
     assert pose[-1, 2] > 0.05
     assert 0.1 < np.linalg.norm(force[-1]) < 0.95
 
 
 def test_a_finger_stays_in_its_cone_and_outside():
     mu, way = 0.3, ([[0.07, -0.002]], (0.02, 0.02))
-    pose, force = pushed(on(FEET), way, friction=mu)
+    pose, force = pushed(ground_on(FEET), way, friction=mu)
     normal = turned(pose[:-1, 2], np.array([0.0, 1.0]))
     tangent = turned(pose[:-1, 2], np.array([1.0, 0.0]))
     along, across = np.sum(force * normal, 1), np.sum(force * tangent, 1)
@@ -87,17 +87,17 @@ def test_a_finger_stays_in_its_cone_and_outside():
 
 
 def test_lengths_have_no_scale():
-    base, _ = pushed(on(FEET), ([[0.1, -0.001]], (0.004, 0.02)))
-    scaled, _ = pushed(on(FEET), ([[0.1, -0.001]], (0.004, 0.02)), scale=4.0)
+    base, _ = pushed(ground_on(FEET), ([[0.1, -0.001]], (0.004, 0.02)))
+    scaled, _ = pushed(ground_on(FEET), ([[0.1, -0.001]], (0.004, 0.02)), scale=4.0)
     assert abs(base[-1, 2]) > 0.05
     np.testing.assert_allclose(scaled, base, atol=1e-6)
 
 
 def test_feet_move_with_the_pose():
     """Moving and turning a push moves and turns its result."""
-    first, _ = pushed(on(FEET), ([[0.1, -0.001]], (0.004, 0.02)))
+    first, _ = pushed(ground_on(FEET), ([[0.1, -0.001]], (0.004, 0.02)))
     pose = (0.3, -0.2, 2.0)
-    second, _ = pushed(on(FEET), ([[0.1, -0.001]], (0.004, 0.02)), pose=pose)
+    second, _ = pushed(ground_on(FEET), ([[0.1, -0.001]], (0.004, 0.02)), pose=pose)
     expected = turned(np.full(len(first), 2.0), first[:, :2]) + pose[:2]
     np.testing.assert_allclose(second[:, :2], expected, atol=1e-6)
     np.testing.assert_allclose(second[:, 2], first[:, 2] + 2.0, atol=1e-5)
@@ -106,7 +106,7 @@ def test_feet_move_with_the_pose():
 def test_positions_of_feet_change_the_rotation():
     way = ([[0.1, -0.001]], (0.0, 0.02))
     near, far = (COM + share * (OUTLINE - COM) for share in (0.2, 1.0))
-    assert pushed(on(near), way)[0][-1, 2] > 1.2 * pushed(on(far), way)[0][-1, 2]
+    assert pushed(ground_on(near), way)[0][-1, 2] > 1.2 * pushed(ground_on(far), way)[0][-1, 2]
 
 
 def test_feet_bear_the_weight_about_its_centre():

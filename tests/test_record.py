@@ -51,7 +51,7 @@ def flipped(share, bit):
     return flip
 
 
-def blank(share, size):
+def overwritten(share, size):
     """Overwrite a block with zeros, or with ones where it is zero already."""
 
     def fill(content):
@@ -67,8 +67,8 @@ SHARES = (0, 0.001, 0.01, 0.1, 0.2, 0.35, 0.5, 0.65, 0.8, 0.9, 0.97, 0.999)
 DAMAGE = {
     **{f"cut at {share}": truncated(share) for share in SHARES},
     **{f"bit {i % 8} at {share}": flipped(share, i % 8) for i, share in enumerate(SHARES)},
-    **{f"block at {share}": blank(share, 64) for share in SHARES},
-    **{f"byte at {share}": blank(share, 1) for share in SHARES[::2]},
+    **{f"block at {share}": overwritten(share, 64) for share in SHARES},
+    **{f"byte at {share}": overwritten(share, 1) for share in SHARES[::2]},
     "all zeros": lambda content: bytes(len(content)),
     "one byte more": lambda content: content + b"\0",
     "twice": lambda content: content * 2,
@@ -307,7 +307,7 @@ def test_two_processes_may_not_share_a_run_but_may_share_its_shards(tmp_path):
         with run_folder.lock(tmp_path, 2, 2):
             refused(tmp_path, 1, 2)
         refused(tmp_path)
-        refused(tmp_path, 2, 3)  # which has parts of both
+        refused(tmp_path, 2, 3)  # shard 2 of 3 has parts of both
     with run_folder.lock(tmp_path, 1, 3):
         pass
 
@@ -368,7 +368,7 @@ def test_previous_environments_of_a_run_are_kept(tmp_path):
     }
     provenance.write_environment(tmp_path, previous)
     provenance.write_environment(tmp_path, current)
-    provenance.write_environment(tmp_path, current | {"processors": 99})  # of a cluster that grows
+    provenance.write_environment(tmp_path, current | {"processors": 99})  # as in a growing cluster
     provenance.write_environment(tmp_path, current)
     provenance.write_environment(tmp_path, current | {"time": "later"})  # the same command again
     assert provenance.read_environment(tmp_path) == current | {

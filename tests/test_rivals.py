@@ -47,7 +47,7 @@ RIVALS = {"guided": GuidedParams()} | {
 
 
 def step_once(law, params, observation):
-    """State, twist and details after a law's first step."""
+    """Return state, twist and details after a law's first step."""
     return law.step(params, law.init(params), observation)
 
 
@@ -63,7 +63,7 @@ def with_pose(observation, p_object=(1.0, 0.0), radius=0.2):
 
 
 def with_force(observation, force=(-20.0, 0.0)):
-    """Observation with the force of the object on the base, in the base's frame."""
+    """Return an observation with the force of the object on the base, in the base's frame."""
     return ForceObservation(observation, jnp.array(force))
 
 
@@ -203,7 +203,7 @@ def test_the_published_force_push_turns_to_face_along_its_path():
 
 
 def step_rps(params, observation):
-    """First step of the law within RPS+."""
+    """Return the first step of the law within RPS+."""
     return rps.step_with_details(params.law, RPSState.init(params.law), observation)
 
 
@@ -308,14 +308,14 @@ def test_the_dipole_aims_along_its_path_and_plans_a_new_one_behind_the_target():
 
 
 def with_taxels(observation):
-    """Observation with the signal of 42 taxels in a row, at the contact point."""
+    """Return an observation with the signal of 42 taxels in a row, at the contact point."""
     along = jnp.linspace(-0.5, 0.5, 42)
     signal = 0.3 * jnp.exp(-(((along - observation.p_robot_contact[1]) / 0.05) ** 2))
     return TaxelObservation(observation, signal, jnp.asarray(False))
 
 
 def twist_of(name, touch, p_object, force=(-20.0, 5.0)):
-    """Twist (3,) of a law's second step."""
+    """Return the twist (3,) of a law's second step."""
     params = RIVALS[name]
     law = registry.law_of(params)
     observation = {

@@ -1,4 +1,4 @@
-"""The scenes are the paper's, and MJX steps them as C MuJoCo does."""
+"""The scenes agree with the paper, and MJX steps them like C MuJoCo."""
 
 import jax
 import jax.numpy as jnp

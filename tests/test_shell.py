@@ -38,7 +38,7 @@ def read(sensor, footprint):
 
 
 def box(x, y, half=0.1):
-    """A square object with its middle at x, y [m] in the robot's frame."""
+    """Return a square object with its middle at x, y [m] in the robot's frame."""
     return fp.place(fp.rectangle(half, half), jnp.array([x, y]), jnp.zeros(()))
 
 

@@ -74,7 +74,7 @@ def read(sensor, footprint: Footprint) -> tuple[int, float, float]:
     return int(reading.contact_type), *map(float, reading.p_robot_contact)
 
 
-def about(kind: int, x: float, y: float, abs=1e-6):
+def approx_reading(kind: int, x: float, y: float, abs=1e-6):
     return kind, pytest.approx(x, abs=abs), pytest.approx(y, abs=abs)
 
 
@@ -151,7 +151,7 @@ def test_the_samples_of_a_taxel_are_spread_evenly_about_its_middle():
 @pytest.mark.parametrize("y", [0.0, 0.05, -0.07])
 @pytest.mark.parametrize("gap", [0.0, 0.004, -0.003])
 def test_a_flush_box_is_a_line_contact_at_its_middle(y, gap):
-    assert read(IDEAL, box(FRONT + 0.2 + gap, y)) == about(LINE, FRONT, y)
+    assert read(IDEAL, box(FRONT + 0.2 + gap, y)) == approx_reading(LINE, FRONT, y)
 
 
 def test_a_box_at_45_degrees_is_a_point_contact_at_its_corner():
@@ -159,7 +159,7 @@ def test_a_box_at_45_degrees_is_a_point_contact_at_its_corner():
     for y in (0.0, 0.1, -0.2):
         for gap in (0.0, 0.004):
             got = read(IDEAL, box(x + gap, y, yaw=math.pi / 4))
-            assert got == about(POINT, FRONT, y)
+            assert got == approx_reading(POINT, FRONT, y)
 
 
 @pytest.mark.parametrize(
@@ -171,7 +171,7 @@ def test_a_box_at_45_degrees_is_a_point_contact_at_its_corner():
 )
 def test_a_circle_touches_beside_its_middle(gap, kind):
     for y in (0.0, 0.12, -0.2):
-        assert read(IDEAL, ball(FRONT + 0.25 + gap, y)) == about(kind, FRONT, y)
+        assert read(IDEAL, ball(FRONT + 0.25 + gap, y)) == approx_reading(kind, FRONT, y)
 
 
 def test_a_contact_longer_than_one_taxel_is_a_line():
@@ -188,21 +188,21 @@ def test_a_tilted_corner_is_felt_as_far_as_the_tolerance_reaches():
     # side leaves along (4, 3) / 5, above, and one along (3, -4) / 5. Shifted outward by 6 mm they
     # meet the front 6 / 0.8 = 7.5 mm above and 6 / 0.6 = 10 mm below the corner.
     shape = box(FRONT + 1.4 * 0.2, -0.1 - 0.2 * 0.2, yaw=math.atan2(3, 4))
-    assert read(IDEAL, shape) == about(POINT, FRONT, -0.1 - 0.00125)
+    assert read(IDEAL, shape) == approx_reading(POINT, FRONT, -0.1 - 0.00125)
 
 
 def test_a_contact_around_the_corner_ends_on_the_side_and_on_the_front():
     # A flush box over y = 0.05 ... 0.45: the left face is within 6 mm of it from x = FRONT - 6 mm,
     # the front down to y = 0.05 - 6 mm.
     expected = (FRONT - 0.003, 0.5 * (SIDE + 0.044))
-    assert read(IDEAL, box(FRONT + 0.2, 0.25)) == about(LINE, *expected)
-    assert read(IDEAL, box(FRONT + 0.2, -0.25)) == about(LINE, expected[0], -expected[1])
+    assert read(IDEAL, box(FRONT + 0.2, 0.25)) == approx_reading(LINE, *expected)
+    assert read(IDEAL, box(FRONT + 0.2, -0.25)) == approx_reading(LINE, expected[0], -expected[1])
 
 
 @pytest.mark.parametrize("x", [0.0, 0.1, -0.15])
 def test_a_flush_box_beside_the_base_touches_its_side(x):
     for side in (1, -1):
-        assert read(IDEAL, box(x, side * (SIDE + 0.2))) == about(LINE, x, side * SIDE)
+        assert read(IDEAL, box(x, side * (SIDE + 0.2))) == approx_reading(LINE, x, side * SIDE)
         # A box of half width 0.2 covers 8 whole taxels and some of two more.
         kind, got_x, got_y = read(CAPACITIVE, box(x, side * (SIDE + 0.2)))
         assert (kind, got_y) == (LINE, pytest.approx(side * SIDE))
@@ -212,7 +212,7 @@ def test_a_flush_box_beside_the_base_touches_its_side(x):
 def test_an_object_that_overhangs_the_rear_touches_only_the_side():
     # Over x = -0.5625 ... -0.1625: from the end at -0.3625 to 6 mm beyond -0.1625.
     for side in (1, -1):
-        expected = about(LINE, 0.5 * (-FRONT - 0.1565), side * SIDE)
+        expected = approx_reading(LINE, 0.5 * (-FRONT - 0.1565), side * SIDE)
         assert read(IDEAL, box(-FRONT, side * (SIDE + 0.2))) == expected
 
 
@@ -401,7 +401,7 @@ def test_no_taxel_is_no_contact():
 def test_a_small_object_pressed_onto_one_taxel_is_felt_there():
     for i, (x, y) in enumerate(TAXELS[15:27]):
         got = read(CAPACITIVE, ball(x + 0.01, y, radius=0.015))
-        assert got == about(POINT, *TAXELS[15 + i])
+        assert got == approx_reading(POINT, *TAXELS[15 + i])
 
 
 FLUSH_TAXELS = slice(19, 23)  # the four about the middle of the front
@@ -465,7 +465,7 @@ def test_a_flush_box_is_felt_where_the_signal_exceeds_the_threshold():
     # 10 mm / gap - 1 > 0.25: a gap below 8 mm. And with threshold 1: below 5 mm.
     for threshold, gap in [(0.25, 0.008), (1.0, 0.005)]:
         sensor = CAPACITIVE._replace(threshold=threshold)
-        assert read(sensor, box(FRONT + 0.2 + gap - 1e-5, 0.0)) == about(LINE, FRONT, 0.0)
+        assert read(sensor, box(FRONT + 0.2 + gap - 1e-5, 0.0)) == approx_reading(LINE, FRONT, 0.0)
         assert read(sensor, box(FRONT + 0.2 + gap + 1e-5, 0.0)) == (NONE, 0.0, 0.0)
 
 

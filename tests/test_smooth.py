@@ -376,12 +376,12 @@ def sense_all(sensor, shapes: Footprint, key):
 
 
 def box(pose) -> Footprint:
-    """A box of half width 0.2 m at (x, y, yaw)."""
+    """Return a box of half width 0.2 m at (x, y, yaw)."""
     return fp.place(fp.rectangle(0.2, 0.2), pose[:2], pose[2])
 
 
 def read(skin, poses):
-    """Readings of boxes at up to 128 poses (n, 3)."""
+    """Return readings of boxes at up to 128 poses (n, 3)."""
     n = len(poses)
     shapes = jax.vmap(box)(jnp.asarray(np.resize(poses, (SHAPES, 3)), jnp.float32))
     return jax.tree.map(lambda x: np.asarray(x)[:n], sense_all(skin, shapes, jax.random.key(0)))
@@ -400,7 +400,7 @@ def place_before_the_front(shape: Footprint, yaw, y, gap) -> Footprint:
 
 
 def random_shapes(seed: int) -> Footprint:
-    """Boxes and circles near the front, any yaw, some flush, some around its corners."""
+    """Return boxes and circles near the front at any yaw, some flush, some around its corners."""
     rng = np.random.default_rng(seed)
     yaw = rng.choice([0.0, 1.0], SHAPES, p=[0.3, 0.7]) * rng.uniform(-4, 4, SHAPES)
     where = (yaw, rng.uniform(-0.35, 0.35, SHAPES), rng.uniform(-0.001, 0.02, SHAPES))

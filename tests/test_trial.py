@@ -25,7 +25,7 @@ from rps_jax.world.scene import FRICTION
 NEAR = (0.7, 0.0)  # [m] 0.32 m ahead of the front face
 AHEAD = (2.0, 0.0)
 SLOTS = 4
-FUSED = Setting(engine="fused")  # which compiles sooner; the rules know no engine
+FUSED = Setting(engine="fused")  # compiles fast; the rules are independent of the engine
 SHORT = replace(FUSED, rules=Rules(horizon=24.0, max_lost=5.0))
 
 
