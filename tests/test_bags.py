@@ -231,7 +231,7 @@ def test_oversized_content_is_refused_before_decompression(tmp_path, monkeypatch
     assert "bytes has another size" in error_of(path)
     path.write_bytes(magic + header + struct.pack("<BQ", 5, 2**40) + bytes(1000))
     assert "bomb.mcap" in error_of(path)
-    monkeypatch.setattr(bag, "_MOST_NUMBERS", 2000)
+    monkeypatch.setattr(bag, "_MAX_NUMBERS", 2000)
     bag.read(bag.write(path, steps(12), {}))  # 12 times 11 numbers in 6 fields
     rows = steps(12, signal=np.zeros(500))
     assert "more than 2000 numbers" in error_of(bag.write(path, rows, {}))

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from test_native import OPERATIONS, advanced, close, in_a_push, same
+from test_native import OPERATIONS, advanced, build_push, close, same
 
 from rps_jax.engines.base import ControlPeriod
 from rps_jax.errors import InputError
@@ -95,7 +95,7 @@ def test_operations_agree_with_jax(threads, tmp_path):
 @pytest.mark.parametrize("shape", ["box", "cylinder", "prism"])
 def test_a_control_step_is_the_processors(shape, skin, tmp_path):
     """This holds for any combination of worlds in a warp."""
-    stage, inputs, loop, pushing = in_a_push(shape, skin)
+    stage, inputs, loop, pushing = build_push(shape, skin)
 
     def world_step(world, params, state):
         return trial.control_step(stage, world, params, state, loop, lambda f, *_: f)[0]
@@ -110,7 +110,7 @@ def test_a_control_step_is_the_processors(shape, skin, tmp_path):
 
 def test_a_control_period_is_the_processors(tmp_path):
     """Bases have a limited force and objects have feet; the contact force is compared."""
-    stage, (worlds, _), loop, trials = in_a_push("prism", domain="real", feet=Range(0.3, 1.0))
+    stage, (worlds, _), loop, trials = build_push("prism", domain="real", feet=Range(0.3, 1.0))
     pushing = trial.motion(trials)
     twists = trial.Twist(*(np.full(21, x, np.float32) for x in (0.05, 0.01, 0.05)))
 
