@@ -217,7 +217,7 @@ def test_a_batch_is_driven_as_a_whole():
             sizes.append(jnp.shape(fields)[0])
             return fields + 0 * period.twists, motion, period.twists
 
-    drive = env.one_of_many(Stage(), Setting(engine="mjx"))  # type: ignore[arg-type]
+    drive = env.world_driver(Stage(), Setting(engine="mjx"))  # type: ignore[arg-type]
     batch = jnp.arange(5.0)
     together = jax.vmap(drive, (0, 0, None))(batch, batch, jnp.array(2.0))
     np.testing.assert_array_equal(together[0], batch)

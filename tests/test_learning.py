@@ -519,7 +519,7 @@ def test_rewards_of_privileged_quantities():
     previous = state.data
     shift = jnp.array([0.01, -0.02])
     current = previous._replace(qpos=previous.qpos.at[3:5].add(shift))
-    nearer, together = env._gains(state.info["world"], previous, current)
+    nearer, together = env._true_state_terms(state.info["world"], previous, current)
     target = state.info["world"].p_world_target
     far = [float(jnp.linalg.norm(target - s.qpos[3:5])) for s in (previous, current)]
     assert float(nearer) == pytest.approx(far[0] - far[1], abs=1e-6)

@@ -246,7 +246,7 @@ def test_an_operation_agrees_with_jax(name):
 def test_the_loop_of_an_equation_is_compiled_as_a_whole(law, skin, request, monkeypatch):
     if skin == "ideal":  # its text is enough: each law is compiled with the other skin
         request.getfixturevalue("cache")
-        monkeypatch.setattr(native, "_binary", lambda text, name: b"")
+        monkeypatch.setattr(native, "_library", lambda text, name: b"")
         monkeypatch.setattr(native, "_register", lambda name, body: True)
     stage, inputs, loop = batch("box", skin, 2, law)
     primitives = str(jax.make_jaxpr(advance(stage, loop, 3))(*inputs, start_trials(inputs, loop)))
