@@ -131,7 +131,7 @@ def test_a_validated_law_has_two_decimals_above_99_percent():
         {"compile": 1.0, "run": 2.0},
     )
     (section,) = learn.Learn().report(curve, Run(None, no_progress))
-    assert "of 99.37 % in validation" in section.text
+    assert "validation success of 99.37 %" in section.text
     assert "99.37 %" in section.lines[-1]
 
 

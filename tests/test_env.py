@@ -194,12 +194,13 @@ def test_a_step_equals_a_trial_with_the_same_twist(pushing):
         lambda params: (), lambda params, state, obs: (state, constant, Details.from_obs(obs))
     )
     worlds = state.info["world"]
-    trials = trial.start_all(worlds, (), np.ones(mine.done.size, bool), law=dull)
+    params = jax.tree.map(lambda x: jnp.full(mine.done.shape, x), push.params)
+    trials = trial.start_all(worlds, params, np.ones(mine.done.size, bool), law=dull)
     loop = trial.ControlLoop(FAST, push.setting.rules, dull)
     alone = replace(NEAR, objects=(push.object,))
     drawn = draws.draw(alone, 0, np.arange(1))
     stage = drawn_worlds(alone, drawn, push.setting).stage
-    theirs = advance(stage, worlds, trials, loop, STEPS)
+    theirs = advance(stage, worlds, params, trials, loop, STEPS)
     np.testing.assert_array_equal(mine.data.steps, STEPS)
     np.testing.assert_allclose(mine.data.qpos, theirs.qpos, atol=2e-5)
     assert (theirs.contact_steps > 0).all()

@@ -236,4 +236,4 @@ def test_a_file_of_one_law_is_named_without_its_class(tmp_path, registries):
 def test_the_command_refuses_an_unknown_law(capsys):
     assert "unknown law 'rsp'" in refusal(capsys, "ladder", "--laws", "rsp")
     sentence = refusal(capsys, "tune", "es", "--law", "aps")
-    assert "it has no bounds to tune within" in sentence
+    assert "its parameters have no bounds" in sentence

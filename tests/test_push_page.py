@@ -70,7 +70,7 @@ def python_push(law):
 
 
 def twists(live):
-    return np.array([np.stack(step.seen.twist) for step in live.past])
+    return np.array([np.stack(step.snapshot.twist) for step in live.past])
 
 
 @pytest.mark.parametrize("law", ["rps_plus", pytest.param("rps_tuned", marks=pytest.mark.slow)])
@@ -93,12 +93,12 @@ def test_each_state_of_a_push_gives_the_twist_of_python(law, browser):
     with python_push(law) as live:
         expected, stride = twists(live), max(1, len(live.past) // 6000)
         shown = range(0, len(live.past) - 1, stride)
-        previous = [live.past[i].before for i in shown]
+        previous = [live.past[i].trial for i in shown]
         trials = leaves_by_name([step._replace(**MAKE["UNTRACED"]) for step in previous])
         states = list(
             zip(trials, leaves_by_name([step.law_state for step in previous]), strict=True)
         )
-        next_qpos = np.array([live.past[i + 1].seen.qpos for i in shown])
+        next_qpos = np.array([live.past[i + 1].snapshot.qpos for i in shown])
     computed = np.concatenate(
         [
             browser.execute_script(SINGLE_STEPS, law, states[i : i + 500])

@@ -670,6 +670,6 @@ def test_only_rps_and_rps_plus_have_a_smooth_form():
     smooth = [registry.smooth_law(law) for law in (rps.LAW, rps_plus.LAW)]
     assert [law.smooth for law in smooth] == [True, True]
     assert smooth[0] != smooth[1]
-    words = "this law has no smooth form.*: choose rps, rps_tuned, nps, rps_plus"
+    words = "this law has no smooth form.* choose rps, rps_tuned, nps, rps_plus"
     with pytest.raises(errors.InputError, match=words):
         registry.smooth_law(registry.law_of(PursuitParams()))

@@ -84,7 +84,7 @@ def test_a_world_in_a_refilled_slot_ends_as_alone():
     )  # they end at different times
     for index in (0, 9, 19):
         padded = box_worlds(np.full(SLOTS, index))  # a batch of one program, of this world alone
-        alone = outcomes([padded._replace(numbers=np.arange(SLOTS))])
+        alone = outcomes([padded._replace(indices=np.arange(SLOTS))])
         same(alone[0], together[index])
 
 
@@ -289,7 +289,7 @@ def test_a_full_disk_loses_nothing(whole, tmp_path, capsys, monkeypatch):
         fsync(file)
 
     monkeypatch.setattr(os, "fsync", full)
-    words = (str(tmp_path), "No space left on device", "same command again", "is kept")
+    words = (str(tmp_path), "No space left on device", "same command again", "are stored")
     ends_in_one_sentence_and_is_continued(tmp_path, whole, capsys, monkeypatch, *words)
 
 
@@ -302,7 +302,7 @@ def test_a_device_out_of_memory_loses_nothing(whole, tmp_path, capsys, monkeypat
         return program(*args, **options)
 
     monkeypatch.setattr(jax.stages.Compiled, "__call__", starved)
-    words = ("out of memory", "--slots", "is kept")
+    words = ("out of memory", "--slots", "are stored")
     ends_in_one_sentence_and_is_continued(tmp_path, whole, capsys, monkeypatch, *words)
 
 

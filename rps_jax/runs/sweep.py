@@ -33,6 +33,7 @@ from rps_jax.runs.question import (
     call_of,
     with_coordinates,
 )
+from rps_jax.trials.progress import ProgressCallback
 from rps_jax.world import points
 from rps_jax.world.points import Points
 
@@ -213,6 +214,10 @@ class Sweep(SweepOptions, SweepQuestion):
             outcomes = with_coordinates(gathered)
         if self.models:
             outcomes = model_panel.add_models(outcomes, plan, run)
+        return outcomes
+
+    def execute(self, callback: ProgressCallback) -> xr.Dataset:
+        outcomes = super().execute(callback)
         if self.table is not None:
             results.write_table(outcomes, Path(self.table))
         return outcomes
