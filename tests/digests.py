@@ -71,7 +71,7 @@ def dataset_digests(path: Path) -> dict[str, str]:
             f"{group.path.strip('/')}/{name}": digest(np.ascontiguousarray(values).tobytes())
             for group in tree.subtree
             for name, values in ((str(k), v.values) for k, v in group.variables.items())
-            if values.dtype.kind in "biuf" and name not in ("compile", "run")  # wall times
+            if values.dtype.kind in "biuf" and name not in WALL_TIMES
         }
 
 

@@ -62,12 +62,12 @@ class Objective:
         lost: Number,  # (...) [s] without contact
         missed: Number,  # (...) [m] least distance to the target
         rules: Rules,
-    ) -> jax.Array:
+    ) -> Number:
         """Return scores (...) [1] of trials, from about 0 to 2; lower is better."""
         failed = 1 + self.miss * jnp.minimum(missed, 1.0)
         duration = self.time * time / rules.horizon
         contact_loss = self.lost * lost / max(float(rules.max_lost), 1e-6)
-        return jnp.add(duration + contact_loss, (1 - success) * failed)
+        return duration + contact_loss + (1 - success) * failed
 
     def scores(self, outcome: Outcome, distance: np.ndarray, rules: Rules) -> np.ndarray:
         """Return scores (...) [1] of outcomes (...) on the host.

@@ -143,13 +143,14 @@ def soft_score(
     arrival = contact * jax.nn.sigmoid((params.d_success - distance) / arrive)
     under_way = jnp.cumprod(1 - arrival)
     touched = jax.lax.cummax(contact)
-    return objective.score(
+    score = objective.score(
         1.0,
         period * jnp.sum(under_way) + under_way[-1] * distance[-1] / params.v_max,
         period * jnp.sum(under_way * touched * (1 - contact)),
         0.0,
         setting.rules,
     )
+    return jnp.asarray(score)
 
 
 class Windows(NamedTuple):
