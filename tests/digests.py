@@ -54,6 +54,7 @@ RUNS = {
     "export_js": "export js --law rps",
     "export_onnx": "export onnx --law rps_tuned",
 }
+WALL_TIMES = ("compile", "run", "differentiate")  # variables of results
 _FLOAT = re.compile(r"(?<![\w.])[-+]?\d+(?:\.\d+)?(?:e[-+]?\d+)?")
 # Lines of a report with times, versions or the command.
 _VOLATILE = re.compile(r"compile|commit|jax |python|version|\bs of\b| run |seconds|minute", re.I)
