@@ -283,3 +283,13 @@ def test_only_the_fused_engine_calls_compiled_functions(engine):
     inputs = jax.tree.map(jnp.asarray, (part.worlds, part.params))
     run = jax.make_jaxpr(advance(part.stage, loop, 1))
     assert ("rps_native" in str(run(*inputs, start_trials(inputs, loop)))) == (engine == "fused")
+
+
+def test_another_compiler_shares_no_cached_function(tmp_path, monkeypatch):
+    """Its flags may differ, and with them the last bits of results."""
+    default = native.target()
+    wrapper = tmp_path / "cc"
+    wrapper.write_text('#!/bin/sh\nexec cc "$@" -O1\n')
+    wrapper.chmod(0o755)
+    monkeypatch.setenv("RPS_COMPILER", str(wrapper))
+    assert native.target() not in (None, default)

@@ -65,11 +65,11 @@ def is_available() -> bool:
 
 @functools.cache
 def _macros(compiler: str) -> str | None:
-    """Return a digest of the compiler's predefined macros for this processor; None: it fails."""
+    """Return a digest of the compiler, its flags and macros for this processor; None: it fails."""
     command = [compiler, *_FLAGS, "-dM", "-E", "-x", "c", os.devnull]
     with contextlib.suppress(OSError, subprocess.SubprocessError):
         macros = subprocess.run(command, capture_output=True, check=True, timeout=60).stdout
-        return hashlib.sha256(macros).hexdigest()
+        return hashlib.sha256(repr((compiler, _FLAGS)).encode() + macros).hexdigest()
     return None
 
 
