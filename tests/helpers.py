@@ -18,6 +18,7 @@ import numpy as np
 from rps_jax.app import cli
 from rps_jax.control import registry
 from rps_jax.control.laws.rps import RPSParams
+from rps_jax.control.observation import Observation
 from rps_jax.geometry import footprint as fp
 from rps_jax.geometry.footprint import Footprint
 from rps_jax.robot.shell import HALF_LENGTH, HALF_WIDTH
@@ -38,9 +39,10 @@ PAPER = RPSParams.paper()
 # --- the command line ----------------------------------------------------------------------
 
 
-def rps(*arguments: Any) -> int:
-    """Run a command and return its exit code."""
-    return cli.main([str(a) for a in arguments])
+def rps(first: Any, *rest: Any) -> int:
+    """Run a command and return its exit code; a first argument may be several words of text."""
+    words = first.split() if isinstance(first, str) else [first]
+    return cli.main([str(word) for word in (*words, *rest)])
 
 
 def refusal(capsys, *arguments: Any) -> str:
@@ -118,6 +120,18 @@ def swept(folder: Path, plan: Plan = PLAN, **options: Any) -> Path:
 def parts_of(folder: Path) -> dict[str, bytes]:
     """Return the contents of the parts in a run folder, by file name."""
     return {path.name: path.read_bytes() for path in (folder / "parts").iterdir()}
+
+
+def moved(
+    touch: Observation, turn: float = 0.0, shift: Any = 0.0, mirror: bool = False
+) -> Observation:
+    """Return an observation of the world that is mirrored, turned [rad] and shifted [m]."""
+    side, (c, s) = jnp.array([1.0, -1.0 if mirror else 1.0]), (np.cos(turn), np.sin(turn))
+    place = lambda p: (p * side) @ jnp.array([[c, s], [-s, c]]) + jnp.asarray(shift)  # noqa: E731
+    return touch._replace(
+        p_world_robot=place(touch.p_world_robot), yaw=side[1] * touch.yaw + turn,
+        p_robot_contact=touch.p_robot_contact * side, p_world_target=place(touch.p_world_target),
+    )  # fmt: skip
 
 
 @contextlib.contextmanager

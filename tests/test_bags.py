@@ -1,6 +1,7 @@
 """Bags: valid ROS 2 files, exact replay of every twist, and refusal of invalid files."""
 
 import json
+import math
 import struct
 import sys
 
@@ -19,6 +20,8 @@ from rps_jax.runs.push import push
 
 pytest.importorskip("mcap_ros2")
 BRIEF = rps_jax.Setting("quasistatic", rules=rps_jax.Rules(horizon=6.0))
+FUSED = rps_jax.Setting("fused", rules=rps_jax.Rules(horizon=10.0))
+TWIST = ("v_x", "v_y", "omega")
 
 
 @pytest.fixture(scope="module")
@@ -28,35 +31,21 @@ def recorded(tmp_path_factory):
     return path, trace
 
 
-@pytest.mark.parametrize("law", ["rps_plus", "learned_mlp", "aps"])
+LAWS = ("rps_plus", "learned_mlp", "learned_gru", "aps", "force_push_published")
+
+
+@pytest.mark.parametrize("law", LAWS)
 def test_a_law_reproduces_every_twist_from_the_bag_of_a_simulation(law, tmp_path, recorded):
-    path = recorded[0]
-    if law != "rps_plus":
-        path = tmp_path / "push.mcap"
+    """Also a law that senses force, or observes its last twist."""
+    path = recorded[0] if law == "rps_plus" else tmp_path / "push.mcap"
+    if law == "force_push_published":
+        push("box", target=(1.5, 0.2), law=law, bag=path, setting=FUSED)
+        assert np.abs(bag.read(path)["f_robot"]).max() > 1
+    elif law != "rps_plus":
         push("cylinder", target=(-1.0, 0.5), law=law, bag=path, setting=BRIEF)
     results = shadow(path, law)
-    assert results.sizes == {"source": 2, "time": 301}
-    for name in ("v_x", "v_y", "omega"):
-        np.testing.assert_allclose(results[name][1], results[name][0], atol=1e-6)
-    assert float(np.abs(results.v_x).max()) > 0.005
-
-
-def test_a_law_that_senses_force_reproduces_its_twists(tmp_path):
-    path = tmp_path / "push.mcap"
-    setting = rps_jax.Setting("fused", rules=rps_jax.Rules(horizon=10.0))
-    push("box", target=(1.5, 0.2), law="force_push_published", bag=path, setting=setting)
-    results = shadow(path, "force_push_published")
-    for name in ("v_x", "v_y", "omega"):
-        np.testing.assert_allclose(results[name][1], results[name][0], atol=1e-6)
-    assert np.abs(bag.read(path)["f_robot"]).max() > 1
-
-
-@pytest.mark.parametrize("law", ["learned_gru", "learned_mlp"])
-def test_a_law_that_observes_its_last_twist_reproduces_its_twists(tmp_path, law):
-    path = tmp_path / "push.mcap"
-    push("cylinder", target=(-1.0, 0.5), law=law, bag=path, setting=BRIEF)
-    results = shadow(path, law)
-    for name in ("v_x", "v_y", "omega"):
+    assert results.sizes == {"source": 2, "time": 501 if law == "force_push_published" else 301}
+    for name in TWIST:
         np.testing.assert_allclose(results[name][1], results[name][0], atol=1e-6)
     assert float(np.abs(results.v_x).max()) > 0.005
 
@@ -98,16 +87,14 @@ def test_a_third_party_reader_opens_the_bag(recorded):
     np.testing.assert_allclose(pose, trace.trajectory.snapshots.qpos[50, :2], atol=1e-7)
 
 
-def test_the_commands_write_and_shadow_a_bag(tmp_path, capsys, recorded):
-    arguments = ["--worlds", 2, "--laws", "rps_plus", "--engine", "quasistatic", "--horizon", 3]
-    run = tmp_path / "sweep"
-    assert rps("sweep", *arguments, "--slots", SLOTS, "--out", run) == 0
-    path = tmp_path / "world.mcap"
-    assert rps("replay", run, 1, "--bag", path, "--no-video", "--out", tmp_path / "replay") == 0
+def test_the_commands_write_and_shadow_a_bag(tmp_path, capsys):
+    options = f"--laws rps_plus --engine quasistatic --horizon 3 --slots {SLOTS}"
+    run, path, out = tmp_path / "sweep", tmp_path / "world.mcap", tmp_path / "shadow"
+    assert rps(f"sweep --worlds 2 {options} --out", run) == 0
+    assert rps(f"replay {run} 1 --bag {path} --no-video --out", tmp_path / "replay") == 0
     mine = tmp_path / "mine.json"
     mine.write_text(json.dumps({"d_near": 0.3}))
-    out = tmp_path / "shadow"
-    assert rps("shadow", path, "--law", f"rps_plus,{mine}", "--out", out) == 0
+    assert rps(f"shadow {path} --law rps_plus,{mine} --out", out) == 0
     output = capsys.readouterr().out
     assert "151 commands in 3.0 s" in output
     assert "omega [rad/s]" in output
@@ -145,12 +132,12 @@ def test_invalid_files_are_refused_in_one_sentence(tmp_path, recorded):
         path.write_bytes(odd)
         assert "odd.mcap" in error_of(path)
     assert "cannot be read" in error_of(tmp_path)  # a folder
-    bag.write(path, steps(1), {})
-    assert "at least two" in error_of(path)
-    bag.write(path, steps(pose=(float("nan"), 0, 0)), {})
-    assert "pose is not finite" in error_of(path)
-    bag.write(path, [], {})
-    assert "no messages on /odom, /target, /cmd_vel, /contact or /taxels" in error_of(path)
+    for rows, words in (
+        (steps(1), "at least two"),
+        (steps(pose=(float("nan"), 0, 0)), "pose is not finite"),
+        ([], "no messages on /odom, /target, /cmd_vel, /contact or /taxels"),
+    ):
+        assert words in error_of(bag.write(path, rows, {}))
 
 
 def test_damage_anywhere_is_refused_or_read(tmp_path):
@@ -169,10 +156,11 @@ def test_damage_anywhere_is_refused_or_read(tmp_path):
     assert refused > 20
 
 
-def without_contacts(path, steps, monkeypatch):
-    """Write a bag as a robot records it, with unfiltered taxels and no contacts."""
+def without_contacts(path, steps, monkeypatch, until=math.inf):
+    """Write a bag with unfiltered taxels and with contacts only after some time [s]."""
     whole = bag._messages
-    monkeypatch.setattr(bag, "_messages", lambda s: (m for m in whole(s) if m[0] != "/contact"))
+    kept = lambda s: (m for m in whole(s) if m[0] != "/contact" or m[1] > until * 1e9)  # noqa: E731
+    monkeypatch.setattr(bag, "_messages", kept)
     written = bag.write(path, steps, {})
     monkeypatch.undo()
     return written
@@ -189,21 +177,19 @@ def test_the_skin_feels_the_taxels_of_a_bag_without_contacts(tmp_path, capsys, m
     p_robot_contact = [0.3625, 0.29 - 0.58 * 5.5 / 12]  # the sixth of the front's twelve
     np.testing.assert_allclose(columns["p_robot_contact"][2:], [p_robot_contact] * 7, atol=1e-6)
     np.testing.assert_allclose(columns["signal"][1, 20], 0.4 * (1 - np.exp(-0.8)), rtol=1e-5)
-    twists = np.stack([shadow(path, "rps")[name][1] for name in ("v_x", "v_y", "omega")], -1)
+    alone = shadow(path, "rps")
     touched = steps(9, signal=signal, p_robot_contact=p_robot_contact)
     touched = [step._replace(contact_type=int(i > 1)) for i, step in enumerate(touched)]
     same = shadow(bag.write(tmp_path / "b.mcap", touched, {}), "rps")
-    np.testing.assert_allclose(twists[:, 0], same.v_x[1], atol=1e-6)
-    np.testing.assert_allclose(twists[:, 1], same.v_y[1], atol=1e-6)
+    np.testing.assert_allclose(alone.v_x[1], same.v_x[1], atol=1e-6)
+    np.testing.assert_allclose(alone.v_y[1], same.v_y[1], atol=1e-6)
     error = refusal(capsys, "shadow", path, "--robot", "ridgeback", "--out", tmp_path / "run")
     assert "has 42 taxels, and the robot 51: name the log's robot by --robot" in error
 
 
 def test_steps_begin_with_the_first_contact(tmp_path, monkeypatch):
-    signal, whole = np.zeros(42), bag._messages
-    late = lambda s: (m for m in whole(s) if m[0] != "/contact" or m[1] > 0.05e9)  # noqa: E731
-    monkeypatch.setattr(bag, "_messages", late)
-    columns = bag.read(bag.write(tmp_path / "a.mcap", steps(6, signal=signal), {}))
+    rows = steps(6, signal=np.zeros(42))
+    columns = bag.read(without_contacts(tmp_path / "a.mcap", rows, monkeypatch, until=0.05))
     np.testing.assert_allclose(columns["time"], [0.06, 0.08, 0.1])
     assert columns["contact_type"].tolist() == [1, 1, 1]
 

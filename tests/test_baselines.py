@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from helpers import moved
 
 from rps_jax import errors
 from rps_jax.control.laws import aps
@@ -85,46 +86,29 @@ def test_from_afar_it_drives_straight_at_the_object(angle):
     assert (twist.v_x, twist.v_y) == pytest.approx((0.05, 0.0), abs=1e-6)
 
 
-def mirrored(observation):
-    flip = jnp.array([1.0, -1.0])
-    touch = observation.touch
-    touch = touch._replace(
-        p_world_robot=touch.p_world_robot * flip,
-        yaw=-touch.yaw,
-        p_world_target=touch.p_world_target * flip,
-    )
-    return observation._replace(touch=touch, p_world_object=observation.p_world_object * flip)
+def in_world(observation, **changes):
+    """Return an observation in a mirrored, turned or shifted world."""
+    touch = observation.touch._replace(p_world_target=observation.p_world_object)
+    p_world_object = moved(touch, **changes).p_world_target
+    return PoseObservation(moved(observation.touch, **changes), p_world_object, observation[2])
 
 
-def test_left_and_right_are_mirror_images_over_several_steps():
+def test_the_law_depends_on_neither_the_side_nor_the_frame():
+    """Compare twists over several steps, of which it learns."""
     rng = np.random.default_rng(0)
-    state, mirrored_state = START, START
+    frame = {"turn": 0.8, "shift": np.array([3.0, -2.0])}
+    states = [START] * 3
     for _ in range(5):
         robot, obj = rng.normal(size=2), 0.3 * rng.normal(size=2)
         facing = np.arctan2(*(obj - robot)[::-1])
         at = observe(robot, facing + 0.1 * rng.normal(), obj, (1.5, 0.7))
-        state, a, _ = aps_step(APS, state, at)
-        mirrored_state, b, _ = aps_step(APS, mirrored_state, mirrored(at))
-        assert np.hypot(a.v_x, a.v_y) > 0.005
-        np.testing.assert_allclose(np.stack(a), np.stack(b) * [1, -1, -1], atol=1e-4)
-
-
-def test_the_law_does_not_depend_on_the_world_frame():
-    at = observe((-0.5, 0.2), 0.1, (0.05, 0.0), (1.0, 1.0))
-    turn, shift = 0.8, np.array([3.0, -2.0])
-    c, s = np.cos(turn), np.sin(turn)
-
-    def moved(p):
-        return jnp.asarray(np.array([[c, -s], [s, c]]) @ np.asarray(p) + shift)
-
-    touch = at.touch._replace(
-        p_world_robot=moved(at.touch.p_world_robot),
-        yaw=at.touch.yaw + turn,
-        p_world_target=moved(at.touch.p_world_target),
-    )
-    elsewhere = at._replace(touch=touch, p_world_object=moved(at.p_world_object))
-    twists = [np.stack(aps_step(APS, START, x)[1]) for x in (at, elsewhere)]
-    np.testing.assert_allclose(*twists, atol=1e-5)
+        worlds = at, in_world(at, mirror=True), in_world(at, **frame)
+        steps = [aps_step(APS, state, world) for state, world in zip(states, worlds, strict=True)]
+        states = [state for state, *_ in steps]
+        plain, mirrored, elsewhere = (np.stack(twist) for _, twist, _ in steps)
+        assert np.hypot(*plain[:2]) > 0.005
+        np.testing.assert_allclose(mirrored, plain * [1, -1, -1], atol=1e-4)
+        np.testing.assert_allclose(elsewhere, plain, atol=1e-4)
 
 
 def test_a_motion_error_is_learned_and_compensated():
@@ -169,11 +153,8 @@ def test_it_turns_on_the_spot_until_it_faces_the_object():
 
 
 def test_it_reaches_targets_ahead_only_if_it_aims_beyond_them():
-    def case(params):
-        return Case("box", "S1", (1.0, 0.0), params)
-
-    setting = Setting(engine="mujoco", rules=Rules(horizon=60.0))
-    outcome, _ = pushes.run([case(APS), case(PLAIN)], setting)
+    cases = [Case("box", "S1", (1.0, 0.0), params) for params in (APS, PLAIN)]
+    outcome, _ = pushes.run(cases, Setting(engine="mujoco", rules=Rules(horizon=60.0)))
     np.testing.assert_array_equal(outcome.success, [True, False])
     # As published, the object's centre reaches the target, half a side (0.2 m) beyond the contact.
     assert outcome.min_distance[1] == pytest.approx(0.2, abs=0.01)
