@@ -157,15 +157,15 @@ class TestSeveralAsks:
     def test_candidates_have_equal_worlds_in_any_batch(self):
         faster, params = paper(2, v_approach=np.array([0.01, 0.05])), paper(2)
         hostile = replace(DOMAINS["hostile"], objects=("random_cylinder",))
-        asks = [Candidates(faster, 3, np.arange(3)), Candidates(params, 3, np.arange(3))]
-        where = [CYLINDERS, hostile], BRIEF
-        (first, second), _ = room.score_candidates(asks, *where, Objective(), slots=6)
+        domains = [CYLINDERS, hostile]
+        asks = [Candidates(each, domains, 3, np.arange(3)) for each in (faster, params)]
+        (first, second), _ = room.score_candidates(asks, BRIEF, Objective(), slots=6)
         assert first.score.shape == (2, 6)
         np.testing.assert_array_equal(first.score[0], second.score[0])
         np.testing.assert_array_equal(second.score[0], second.score[1])
         assert (first.score[1] != first.score[0]).any()
         (alone,), _ = room.score_candidates(
-            [Candidates(paper(3), 3, np.arange(1, 2))], *where, Objective(), slots=6
+            [Candidates(paper(3), domains, 3, np.arange(1, 2))], BRIEF, Objective(), slots=6
         )
         np.testing.assert_allclose(alone.score[0], second.score[0, [1, 4]], rtol=1e-4)
 
@@ -176,8 +176,8 @@ class TestSeveralAsks:
         params = space.params(away + np.asarray(space.vector(space.base)))
         near = replace(CYLINDERS, distance=Range(0.7, 0.9), gap=Range(0, 0))
         setting = Setting(rules=Rules(horizon=20.0), engine="fused")
-        ask = Candidates(params, 1, np.arange(6))
-        (answer,), _ = room.score_candidates([ask], [near], setting, Objective())
+        ask = Candidates(params, [near], 1, np.arange(6))
+        (answer,), _ = room.score_candidates([ask], setting, Objective())
         expected = [
             [1.5613247156, 1.6000000238, 1.3565973043, 1.5677981377, 1.3648988008, 1.6000000238],
             [1.5611727238, 1.6000000238, 1.3189700842, 1.5676416159, 1.3648886681, 1.6000000238],

@@ -36,7 +36,6 @@ from helpers import (
 
 from rps_jax.analysis import tables
 from rps_jax.app.cli import running
-from rps_jax.control.laws.rps import LAW
 from rps_jax.errors import InputError
 from rps_jax.geometry import planar
 from rps_jax.record import cache, files
@@ -59,7 +58,7 @@ def outcomes(parts, setting=SHORT):
         for i, index in enumerate(indices):
             by_index[int(index)] = row(ended, i)
 
-    job = Job(LAW, sum(p.indices.size for p in parts), parts)
+    job = Job("rps", sum(p.indices.size for p in parts), parts)
     batch.run([job], setting, slots=SLOTS, workers=1, collect=collect)
     return by_index
 

@@ -29,9 +29,12 @@ from rps_jax.engines.device import Device
 from rps_jax.errors import InputError
 from rps_jax.record import cache, provenance
 from rps_jax.record import folder as run_folder
-from rps_jax.runs import execution, results
-from rps_jax.runs.plan import Plan, Shard
+from rps_jax.runs import execution
+from rps_jax.runs.plan import Plan, Shard, chunks_by_key
+from rps_jax.runs.results import Results
+from rps_jax.trials.batch import BatchOptions
 from rps_jax.trials.progress import Progress, ProgressCallback, no_progress
+from rps_jax.trials.rollout import rollout
 
 PATIENCE = 10.0  # [s] to reach a cluster
 RETRIES = 16  # of a task
@@ -45,7 +48,7 @@ Environment = dict[str, Any]  # JSON record of versions, devices and host
 
 def _work(
     plan: Plan,
-    numbers: Sequence[int],
+    chunks: Sequence[int],
     software: Environment,
     prepare: Callable[[], object],
     slots: int | None,
@@ -62,14 +65,9 @@ def _work(
             "on all hosts."
         )
     contents, progress = dict[int, bytes](), [Progress(0, 0.0)]
-    execution.run_chunks(
-        plan,
-        {plan.program_key(numbers[0]): numbers},
-        lambda number, chunk: contents.update({number: results.encoded(chunk)}),
-        callback=progress.append,
-        slots=slots,
-        workers=threads,
-    )
+    options = BatchOptions(callback=progress.append, slots=slots, workers=threads)
+    results = Results(plan, chunks, contents.__setitem__)
+    rollout([results], plan.setting, results.collect, **options)
     return contents, progress[-1], environment
 
 
@@ -157,8 +155,8 @@ def run_on_cluster(
         task = ray.remote(num_cpus=threads, num_gpus=int(gpu), **options)(_work)
         bare_plan = ray.put(dataclasses.replace(plan))  # without its cached properties
         shared = _software(environment), prepare, slots, threads
-        shares = _divide(missing.values(), count)
-        waiting = [task.remote(bare_plan, numbers, *shared) for numbers in shares]
+        shares = _divide(chunks_by_key(plan, missing).values(), count)
+        waiting = [task.remote(bare_plan, chunks, *shared) for chunks in shares]
         with _one_sentence_errors(ray, waiting):
             while waiting:
                 (ended,), waiting[:] = ray.wait(waiting)
@@ -173,11 +171,11 @@ def run_on_cluster(
                 callback(total)
 
 
-def _divide(chunks: Iterable[Sequence[int]], workers: int) -> Iterator[Sequence[int]]:
+def _divide(groups: Iterable[Sequence[int]], workers: int) -> Iterator[Sequence[int]]:
     """Divide the chunks of each program into equal shares, one for each task."""
-    for numbers in chunks:
-        size = math.ceil(len(numbers) / (workers * _TASKS))
-        yield from (numbers[i : i + size] for i in range(0, len(numbers), size))
+    for chunks in groups:
+        size = math.ceil(len(chunks) / (workers * _TASKS))
+        yield from (chunks[i : i + size] for i in range(0, len(chunks), size))
 
 
 @contextlib.contextmanager

@@ -3,6 +3,7 @@
 Worlds for tuning, validation and testing have different seeds.
 """
 
+import math
 from collections.abc import Sequence
 from functools import partial
 from typing import Any, NamedTuple, Unpack
@@ -23,12 +24,12 @@ from rps_jax.trials import batch
 from rps_jax.trials.batch import BatchOptions
 from rps_jax.trials.progress import Bar, ProgressCallback, Timing, is_interactive
 from rps_jax.trials.results import variable
-from rps_jax.trials.rollout import Candidates, rollout
+from rps_jax.trials.rollout import Candidates, outcomes
 from rps_jax.trials.score import Objective
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import Outcome
 from rps_jax.world import points as points_
-from rps_jax.world.domain import Domain, DomainLike, parse_domain
+from rps_jax.world.domain import DomainLike, parse_domain
 
 
 def evaluate(
@@ -90,19 +91,20 @@ def evaluate(
     errors.check_count("worlds", count, at_most=10_000_000)
     errors.check_count("seed", setting.seed, at_least=0, at_most=2**30)
     setting.check_here(ranges.weakest, [params])
-    request = Candidates(_checked(params), seed_of(setting.seed, split), np.arange(count), at)
+    params, seed = _checked(params), seed_of(setting.seed, split)
+    request = Candidates(params, [ranges], seed, np.arange(count), at)
     cache.use_cache_if_requested()
     is_shown = is_interactive() if progress is None else progress
-    num_trials = request.num_candidates * count
-    with Bar("evaluate", num_trials, shown=is_shown and report_to is None) as bar:
+    with Bar("evaluate", math.prod(request.shape), shown=is_shown and report_to is None) as bar:
         options = BatchOptions(callback=report_to or bar, slots=slots, workers=workers)
-        (scored,), _ = score_candidates([request], [ranges], setting, objective, **options)
+        (scored,), _ = score_candidates([request], setting, objective, **options)
     variables: dict[str, Any] = {
         "score": (("candidate", "world"), scored.score, {"units": "1", "long_name": "objective"})
     }
     for name, values in scored.outcome._asdict().items():
         variables[name] = variable(name, ("candidate", "world"), values)
-    drawn = points_.drawn_columns(ranges, request.object_of(ranges), partial(request.draw, ranges))
+    objects = ranges.object_of(points_.cases(ranges, at, request.worlds))
+    drawn = points_.drawn_columns(ranges, objects, partial(points_.draw, ranges, seed, at))
     return xr.Dataset(variables, {"pose": ["x", "y", "yaw"], "world": request.worlds} | drawn)
 
 
@@ -189,14 +191,13 @@ class CandidateScores(NamedTuple):
 
 def score_candidates(
     requests: Sequence[Candidates],
-    domains: Sequence[Domain],
     setting: Setting,
     objective: Objective,
     **options: Unpack[BatchOptions],
 ) -> tuple[list[CandidateScores], Timing]:
-    """Score every candidate in every world of its request, as `rollout` runs them."""
-    rollouts, timing = rollout(requests, domains, setting, **options)
+    """Score every candidate in every world of its request, as `outcomes` runs them."""
+    results, timing = outcomes(requests, setting, **options)
     return [
-        CandidateScores(outcome, objective.scores(outcome, distance, setting.rules))
-        for outcome, distance in rollouts
+        CandidateScores(outcome, objective.scores(outcome, request.distances, setting.rules))
+        for request, outcome in zip(requests, results, strict=True)
     ], timing

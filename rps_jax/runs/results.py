@@ -1,11 +1,14 @@
 """Results of a plan: outcomes collected into chunks, chunks joined into a labelled dataset, tables.
 
-`Collector` fills chunks with the outcomes of trials as they end, `dataset` joins chunks, `gather`
-does so for the chunks of run folders and writes `results.nc`, and `load` reads it.
+A chunk is a NumPy archive of the columns of its trials, which is much faster to write than NetCDF.
+`Results` runs chunks, inserts stored ones and returns the dataset, and `load` reads `results.nc`.
 """
 
+import functools
 import importlib.util
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -16,41 +19,22 @@ import xarray as xr
 from rps_jax.errors import InputError
 from rps_jax.record import files
 from rps_jax.record.checkpoint import Checkpoints
-from rps_jax.runs.plan import Plan
+from rps_jax.runs.plan import Plan, chunks_by_key, draw
 from rps_jax.runs.question import with_coordinates
+from rps_jax.trials.batch import Job, WorldBatch
 from rps_jax.trials.results import UNITS, variable
+from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import Outcome
+from rps_jax.trials.worlds import drawn_worlds
+from rps_jax.world import draws
 from rps_jax.world.domain import LABELS, unit_of
 
-ResultChunk = Mapping[str, np.ndarray]  # columns of a chunk's trials, with their indices `trial`
-StoreChunk = Callable[[int, ResultChunk], object]  # called with the number of a chunk
-Columns = Mapping[str, tuple[np.ndarray, str]]  # drawn quantities: values (n,) and unit, by name
+StoreChunk = Callable[[int, bytes], object]  # called with the number of a chunk and its content
 # Types of an outcome's columns; the rest are float32.
 _TYPES: dict[str, type] = dict.fromkeys(("success", "tipped", "diverged", "stalled"), np.int8)
 _REMOVED = "overflows"  # column of a version with the engine warp
 _HDF5 = b"\x89HDF"  # with which a NetCDF file begins
-
-
-def encoded(chunk: ResultChunk) -> bytes:
-    """Encode a chunk as a NumPy archive, which is much faster to write than NetCDF."""
-    return files.encode_arrays(**chunk)
-
-
-def decoded(number: int, content: bytes) -> ResultChunk:
-    """Decode a chunk; raise InputError if it is damaged, or of another version."""
-    try:
-        columns = files.decode_arrays(content)
-    except ValueError as error:
-        if content.startswith(_HDF5):
-            raise _of_another_version(number, "it is a NetCDF file") from error
-        raise files.CorruptFileError(f"part {number}", error) from error
-    return {name: values for name, values in columns.items() if name != _REMOVED}
-
-
-def _of_another_version(number: int, why: str) -> InputError:
-    return InputError(
-        f"part {number} of the run was written by another version ({why}): use that version."
-    )
+_PREFETCH = 16384  # worlds of one program that are built before they are needed, about
 
 
 def name_of(chunk: int) -> str:
@@ -58,132 +42,173 @@ def name_of(chunk: int) -> str:
     return f"{chunk:07d}"
 
 
-class Collector:
-    """Outcomes of trials that end in any order, collected into complete chunks."""
+def _of_another_version(chunk: int, why: str) -> InputError:
+    return InputError(
+        f"part {chunk} of the run was written by another version ({why}): use that version."
+    )
 
-    def __init__(self, plan: Plan, store: StoreChunk):
-        """Collect for the chunks of a plan; each is passed to `store` when it is complete."""
-        self._store, self._chunks = store, plan.chunks
-        self._chunk_of = np.empty(plan.num_trials, np.int32)  # of each trial
-        for number, trials in plan.chunks.items():
-            self._chunk_of[trials] = number
-        self._open: dict[int, dict[str, np.ndarray]] = {}  # columns of incomplete chunks
-        self._missing = {number: trials.size for number, trials in plan.chunks.items()}
-        self.drawn: dict[int, Columns] = {}  # drawn quantities to store with a chunk
+
+class Results:
+    """Results of a plan, which fill as trials end or as stored chunks are inserted.
+
+    It is the request of a rollout of some chunks, and collects their outcomes. The number of slots
+    depends on the whole plan alone. So a chunk has the same bits whoever runs it, and whichever
+    other chunks run beside it.
+    """
+
+    def __init__(self, plan: Plan, chunks: Sequence[int] = (), store: StoreChunk | None = None):
+        """Prepare to run chunks; each is passed to `store` when it is complete."""
+        self.plan, self._chunks, self._store = plan, chunks, store
+        self.shape = len(plan.laws), plan.worlds
+        self._outcomes = {name: self._empty(name) for name in UNITS}  # (law, world, ...)
+        self._drawn: dict[str, np.ndarray] = {}  # (world,) drawn quantities
+        self._running = {number: plan.chunks[number].size for number in chunks}  # trials
+
+    def _empty(self, name: str) -> np.ndarray:
+        """Return an empty column of outcomes; its memory is claimed when it is filled."""
+        axes = (3,) if name.endswith("_pose") else ()
+        return np.zeros((*self.shape, *axes), _TYPES.get(name, np.float32))
+
+    @functools.cached_property
+    def _chunk_of(self) -> np.ndarray:
+        """Number of the chunk of each trial."""
+        chunk_of = np.empty(self.plan.num_trials, np.int32)
+        for number, trials in self.plan.chunks.items():
+            chunk_of[trials] = number
+        return chunk_of
+
+    # --- a rollout -------------------------------------------------------------------------
+
+    def jobs(self, setting: Setting) -> Iterator[Job]:
+        """Yield the chunks to run; their worlds are built chunk by chunk."""
+        ahead = max(1, _PREFETCH // self.plan.part)
+        for key, chunks in chunks_by_key(self.plan, self._chunks).items():
+            batches = _prefetch(map(self._build, chunks), ahead)
+            yield Job(key, self.plan.trials_by_key[key], batches)
+
+    def _build(self, chunk: int) -> WorldBatch:
+        """Build the worlds of a chunk; those of the first law record the drawn quantities."""
+        law, worlds = np.divmod(self.plan.chunks[chunk], self.plan.worlds)
+        drawn = draw(self.plan, worlds)
+        if law[0] == 0:
+            for name, (values, _) in draws.table(drawn).items():
+                self._put_drawn(name, worlds, values)
+        batch = drawn_worlds(self.plan.domain, drawn, self.plan.setting)
+        params = list(self.plan.laws.values())[law[0]]
+        return batch._replace(indices=self.plan.chunks[chunk]).with_params(params)
+
+    def _put_drawn(self, name: str, worlds: np.ndarray, values: np.ndarray) -> None:
+        self._drawn.setdefault(name, np.zeros(self.plan.worlds, np.float32))[worlds] = values
 
     def collect(self, indices: np.ndarray, outcomes: Outcome) -> None:
         """Add the outcomes of trials, and store the chunks that are complete with them."""
-        chunk_of = self._chunk_of[indices]
-        for number in map(int, np.unique(chunk_of)):
-            members = chunk_of == number
-            trials = self._chunks[number]
-            columns = self._open.setdefault(number, {})
-            at = np.searchsorted(trials, indices[members])
-            for name, leaf in outcomes._asdict().items():
-                if name not in columns:
-                    shape = trials.size, *leaf.shape[1:]
-                    columns[name] = np.empty(shape, _TYPES.get(name, np.float32))
-                columns[name][at] = leaf[members]
-            self._missing[number] -= at.size
-            if not self._missing[number]:
-                drawn = self.drawn.pop(number, {}).items()
-                quantities = {name: values.astype(np.float32) for name, (values, _) in drawn}
-                self._store(number, {"trial": trials, **self._open.pop(number), **quantities})
+        at = np.unravel_index(indices, self.shape)
+        for name, leaf in outcomes._asdict().items():
+            self._outcomes[name][at] = leaf
+        for chunk in self._chunk_of[indices].tolist():
+            self._running[chunk] -= 1
+            if not self._running[chunk] and self._store is not None:
+                self._store(chunk, files.encode_arrays(**self._columns(chunk)))
 
+    def _columns(self, chunk: int) -> dict[str, np.ndarray]:
+        """Return the columns of a chunk to store."""
+        trials = self.plan.chunks[chunk]
+        law, worlds = at = np.unravel_index(trials, self.shape)
+        drawn = self._drawn if law[0] == 0 else {}
+        outcomes = {name: column[at] for name, column in self._outcomes.items()}
+        return {"trial": trials, **outcomes, **{name: x[worlds] for name, x in drawn.items()}}
 
-def gather(
-    plan: Plan,
-    folders: Sequence[Path],
-    out: Path,
-    chunks: dict[int, ResultChunk] | None = None,
-) -> xr.Dataset:
-    """Join all chunks of a plan, and write them as `results.nc` into the folder `out`.
+    # --- stored chunks ---------------------------------------------------------------------
 
-    The `chunks` that are in memory are not read from `folders`; they are removed one by one, so
-    that memory does not hold all results twice.
+    def read(self, folder: Path, chunks: Sequence[int]) -> list[int]:
+        """Insert those of some chunks that a run folder holds; return the numbers of the rest."""
+        missing = dict(zip(map(name_of, chunks), chunks, strict=True))
+        for name, content in Checkpoints(folder).items(missing):
+            self._insert(missing.pop(name), content)
+        return list(missing.values())
 
-    Raises:
-      InputError: chunks are missing.
-    """
-    chunks = chunks or {}
-    missing = {name_of(n): n for n in plan.chunks if n not in chunks}
+    def read_all(self, folders: Sequence[Path]) -> xr.Dataset:
+        """Insert the chunks that were not run, from run folders, and return the dataset.
 
-    def all_chunks() -> Iterator[tuple[int, ResultChunk]]:
-        for number in list(chunks):
-            yield number, chunks.pop(number)
+        Raises:
+          InputError: chunks are missing.
+        """
+        missing = [number for number in self.plan.chunks if number not in self._running]
         for folder in folders:
-            for name, content in Checkpoints(folder).items(missing):
-                number = missing.pop(name)
-                yield number, decoded(number, content)
+            missing = self.read(folder, missing)
+        if missing:
+            raise InputError(
+                f"run = {', '.join(map(str, folders))} lacks {len(missing)} of "
+                f"{len(self.plan.chunks)} parts: run the same command again, or give the folders "
+                "of all shards."
+            )
+        return self.dataset()
 
-    results = dataset(plan, all_chunks())
-    if missing:
-        raise InputError(
-            f"run = {', '.join(map(str, folders))} lacks {len(missing)} of {len(plan.chunks)} "
-            "parts: run the same command again, or give the folders of all shards."
-        )
-    files.write_results(out / "results.nc", results)
-    return results
-
-
-def dataset(plan: Plan, chunks: Iterable[tuple[int, ResultChunk]]) -> xr.Dataset:
-    """Return chunks as one dataset: outcomes (law, world), and drawn quantities (world)."""
-    worlds = np.arange(plan.worlds)
-    attrs = {"units": "1", "long_name": "index of the object in the coordinate object"}
-    objects = plan.object_of(worlds).astype(np.int16)
-    columns = {"which_object": xr.Variable("world", objects, attrs)}
-    for name in UNITS:
-        shape = (len(plan.laws), plan.worlds, 3)[: 3 if name.endswith("pose") else 2]
-        values = np.zeros(shape, _TYPES.get(name, np.float32))
-        columns[name] = variable(name, ("law", "world"), values)
-    for number, chunk in chunks:
-        law, _ = plan.law_and_object(number)
-        _check_chunk(plan, number, chunk)
-        world = plan.chunks[number] % plan.worlds
+    def _insert(self, chunk: int, content: bytes) -> None:
+        """Insert a stored chunk; raise InputError if it is damaged, or of another version."""
+        at = law, worlds = np.unravel_index(self.plan.chunks[chunk], self.shape)
+        columns = _decode(chunk, content)
+        columns.pop(_REMOVED, None)
+        drawn = set(columns) - {"trial", *UNITS}
+        if missing := {"trial", *UNITS, *(() if law[0] or drawn else ("drawn",))} - set(columns):
+            raise _of_another_version(chunk, f"it lacks {', '.join(sorted(missing))}")
+        for name, values in columns.items():
+            shape = worlds.shape + (self._outcomes[name].shape[2:] if name in UNITS else ())
+            if values.shape != shape or values.dtype.kind not in "biuf":
+                raise files.CorruptFileError(f"part {chunk}", f"{name} is not numbers of {shape}")
+        if not np.array_equal(columns["trial"], self.plan.chunks[chunk]):
+            raise files.CorruptFileError(f"part {chunk}", "it holds other trials")
         for name in UNITS:
-            columns[name].values[law, world] = chunk[name]
-        for name in _drawn_names(chunk):
-            if name not in columns:
-                columns[name] = _quantity_column(name, plan.worlds)
-            columns[name].values[world] = chunk[name]
-    for column in columns.values():
-        column.encoding["_FillValue"] = None  # every number is a result
-    labels = {
-        "law": (list(plan.laws), "what decides"),
-        "object": (list(plan.domain.objects), "name of the object"),
-        "world": (worlds, "index of the world"),
-    }
-    coordinates = {
-        name: xr.Variable(name, values, {"long_name": meaning})
-        for name, (values, meaning) in labels.items()
-    }
-    return xr.Dataset(columns, coordinates)
+            self._outcomes[name][at] = columns[name]
+        for name in columns:
+            if name in drawn:
+                self._put_drawn(name, worlds, columns[name])
+
+    # --- the dataset -----------------------------------------------------------------------
+
+    def dataset(self) -> xr.Dataset:
+        """Return outcomes (law, world) and drawn quantities (world)."""
+        worlds = np.arange(self.plan.worlds)
+        attrs = {"units": "1", "long_name": "index of the object in the coordinate object"}
+        objects = self.plan.object_of(worlds).astype(np.int16)
+        columns = {"which_object": xr.Variable("world", objects, attrs)}
+        for name, values in self._outcomes.items():
+            columns[name] = variable(name, ("law", "world"), values)
+        for name, values in self._drawn.items():
+            label = LABELS.get(name, name.replace("_", " "))
+            attrs = {"units": unit_of(name), "long_name": label}
+            columns[name] = xr.Variable("world", values, attrs)
+        for column in columns.values():
+            column.encoding["_FillValue"] = None  # every number is a result
+        labels = {
+            "law": (list(self.plan.laws), "what decides"),
+            "object": (list(self.plan.domain.objects), "name of the object"),
+            "world": (worlds, "index of the world"),
+        }
+        coordinates = {
+            name: xr.Variable(name, values, {"long_name": meaning})
+            for name, (values, meaning) in labels.items()
+        }
+        return xr.Dataset(columns, coordinates)
 
 
-def _drawn_names(chunk: ResultChunk) -> list[str]:
-    """Return the names of the drawn quantities that are stored with a chunk."""
-    return [name for name in chunk if name not in ("trial", *UNITS)]
+def _decode(chunk: int, content: bytes) -> dict[str, np.ndarray]:
+    """Return the columns of a stored chunk."""
+    try:
+        return files.decode_arrays(content)
+    except ValueError as error:
+        if content.startswith(_HDF5):
+            raise _of_another_version(chunk, "it is a NetCDF file") from error
+        raise files.CorruptFileError(f"part {chunk}", error) from error
 
 
-def _check_chunk(plan: Plan, number: int, chunk: ResultChunk) -> None:
-    """Raise InputError unless a chunk has all columns of its trials, and nothing but numbers."""
-    trials, drawn = plan.chunks[number], _drawn_names(chunk)
-    law, _ = plan.law_and_object(number)
-    missing = {"trial", *UNITS} - set(chunk) | ({"drawn"} if not (law or drawn) else set())
-    if missing:
-        raise _of_another_version(number, f"it lacks {', '.join(sorted(missing))}")
-    for name, values in chunk.items():
-        shape = (trials.size, 3) if name.endswith("_pose") and name in UNITS else (trials.size,)
-        if values.shape != shape or values.dtype.kind not in "biuf":
-            raise files.CorruptFileError(f"part {number}", f"{name} is not numbers of {shape}")
-    if not np.array_equal(chunk["trial"], trials):
-        raise files.CorruptFileError(f"part {number}", "it holds other trials")
-
-
-def _quantity_column(name: str, worlds: int) -> xr.Variable:
-    """Return an empty column of a drawn quantity."""
-    attrs = {"units": unit_of(name), "long_name": LABELS.get(name, name.replace("_", " "))}
-    return xr.Variable("world", np.zeros(worlds, np.float32), attrs)
+def _prefetch(batches: Iterator[WorldBatch], count: int) -> Iterator[WorldBatch]:
+    """Build up to `count` batches ahead in a thread, while earlier ones run."""
+    with ThreadPoolExecutor(1) as builder:
+        queue = deque(builder.submit(next, batches, None) for _ in range(count))
+        while (worlds := queue.popleft().result()) is not None:
+            queue.append(builder.submit(next, batches, None))
+            yield worlds
 
 
 def long_table(results: xr.Dataset) -> pd.DataFrame:

@@ -21,8 +21,8 @@ from rps_jax.errors import InputError
 from rps_jax.record import files, provenance
 from rps_jax.record import folder as run_folder
 from rps_jax.record.options import option
-from rps_jax.runs import cluster, model_panel, results
-from rps_jax.runs.execution import run_in_folder, run_missing, run_plan, shard_results
+from rps_jax.runs import cluster, model_panel
+from rps_jax.runs.execution import run_missing, run_plan, write_dataset
 from rps_jax.runs.plan import Plan, Shard, load_plan, open_run, shard_chunks
 from rps_jax.runs.question import (
     DomainQuestion,
@@ -31,8 +31,8 @@ from rps_jax.runs.question import (
     Run,
     SimulationQuestion,
     call_of,
-    with_coordinates,
 )
+from rps_jax.runs.results import Results, check_table, write_table
 from rps_jax.trials.progress import ProgressCallback
 from rps_jax.world import points
 from rps_jax.world.points import Points
@@ -187,7 +187,7 @@ class Sweep(SweepOptions, SweepQuestion):
         if self.table is not None:
             if sharded:
                 raise InputError("table is not allowed with a shard: it needs all worlds.")
-            results.check_table(Path(self.table))
+            check_table(Path(self.table))
         if self.models and (self.ray or sharded):
             raise InputError("models is not allowed with ray or a shard: run it in one process.")
         if self.out is None and (self.ray or sharded):
@@ -203,23 +203,15 @@ class Sweep(SweepOptions, SweepQuestion):
 
     def answer(self, run: Run) -> xr.Dataset:
         """Run the plan; of a single shard, return its own trials (row)."""
-        plan, shard, options = self.plan, self.parsed_shard, run.batch_options
-        if run.folder is None or not (self.ray or shard.of > 1):
-            outcomes = run_plan(plan, run.folder, **options)
-        else:
-            by = cluster.on_cluster(self.ray, self.ray_device) if self.ray else run_missing
-            gathered = run_in_folder(run.folder, plan, shard, by=by, **options)
-            if gathered is None:
-                return shard_results(run.folder, plan, shard)
-            outcomes = with_coordinates(gathered)
-        if self.models:
-            outcomes = model_panel.add_models(outcomes, plan, run)
-        return outcomes
+        execute = cluster.on_cluster(self.ray, self.ray_device) if self.ray else run_missing
+        options = run.batch_options
+        outcomes = run_plan(self.plan, run.folder, self.parsed_shard, execute=execute, **options)
+        return model_panel.add_models(outcomes, self.plan, run) if self.models else outcomes
 
     def execute(self, callback: ProgressCallback) -> xr.Dataset:
         outcomes = super().execute(callback)
         if self.table is not None:
-            results.write_table(outcomes, Path(self.table))
+            write_table(outcomes, Path(self.table))
         return outcomes
 
     def report(self, results: xr.Dataset, run: Run) -> Sequence[Section]:
@@ -278,10 +270,10 @@ class Merge(Question[xr.Dataset]):
                     f"run = {folder} has another plan than {first} "
                     f"({run_folder.describe_difference(manifest, other)}): merge shards of one run."
                 )
-        merged = results.gather(self.plan, folders, open_run(out, self.plan))
+        merged = write_dataset(Results(self.plan), folders, open_run(out, self.plan))
         for folder in folders:
             provenance.write_environment(out, provenance.read_environment(folder))
-        return with_coordinates(merged)
+        return merged
 
     def intro(self, results: xr.Dataset) -> str:
         return describe_plan(self.plan)

@@ -166,7 +166,7 @@ class Attack(DomainQuestion[xr.Dataset], LawQuestion[xr.Dataset]):
             at = points.check_points(self.ranges, results.u.values[: self.worst])
             plan = Plan(self.ranges, len(at.u), {self.label: self.params}, self.setting, points=at)
             assert run.folder is not None
-            execution.run_in_folder(run.folder / "worlds", plan, **run.batch_options)
+            execution.run_plan(plan, run.folder / "worlds", **run.batch_options)
 
     def intro(self, results: xr.Dataset) -> str:
         return (

@@ -36,7 +36,7 @@ from rps_jax.runs.plan import Plan, load_plan
 from rps_jax.runs.question import DomainQuestion, Run, call_of, count_true, seed_of
 from rps_jax.trials import score
 from rps_jax.trials.progress import SequentialProgress
-from rps_jax.trials.rollout import Candidates, rollout
+from rps_jax.trials.rollout import Candidates, outcomes
 from rps_jax.trials.trial import Outcome
 
 
@@ -208,9 +208,10 @@ class Ceiling(DomainQuestion[xr.Dataset]):
             partial(np.full, offsets.shape[:2]), (RPSParams.tuned(), float(steps))
         )
         params = GuidedParams(law, offsets, hold)
-        request = Candidates(params, plan.setting.seed, worlds, plan.points, per_world=True)
-        ((outcome, _),), _ = rollout(
-            [request], [plan.domain], plan.setting, capacity=lambda _: slots, **run.batch_options
+        seed, domains = plan.setting.seed, [plan.domain]
+        request = Candidates(params, domains, seed, worlds, plan.points, per_world=True)
+        (outcome,), _ = outcomes(
+            [request], plan.setting, capacity=lambda _: slots, **run.batch_options
         )
         return jax.tree.map(lambda x: np.swapaxes(x, 0, 1).reshape(-1, *x.shape[2:]), outcome)
 

@@ -14,7 +14,7 @@ from rps_jax.runs.evaluate import stack
 from rps_jax.runs.question import Run
 from rps_jax.trials import score
 from rps_jax.trials.progress import SequentialProgress, no_progress
-from rps_jax.trials.rollout import Candidates, rollout
+from rps_jax.trials.rollout import Candidates, outcomes
 from rps_jax.trials.setting import Setting
 from rps_jax.world import points
 from rps_jax.world.domain import Domain
@@ -67,12 +67,11 @@ class Probe:
 
     def _simulate(self, at: Points) -> xr.Dataset:
         start_time, rules = time.perf_counter(), self.setting.rules
-        request = Candidates(stack([self.params]), 0, np.arange(len(at.u)), at)
-        ((outcome, distance),), _ = rollout(
-            [request], [self.domain], self.setting, capacity=_capacity, **self.run.batch_options
-        )
+        request = Candidates(stack([self.params]), [self.domain], 0, np.arange(len(at.u)), at)
+        options = self.run.batch_options
+        (outcome,), _ = outcomes([request], self.setting, capacity=_capacity, **options)
         trials = {name: np.asarray(getattr(outcome, name)[0], float) for name in _STORED}
-        trials["left"] = statistics.miss_distance(outcome.min_distance[0], distance)
+        trials["left"] = statistics.miss_distance(outcome.min_distance[0], request.distances)
         graded = (trials[x] for x in ("success", "time", "left", "contact_lost_time", "tilt"))
         trials["severity"] = score.severity(*graded, rules=rules)
         variables = {name: ("world", values) for name, values in trials.items()}

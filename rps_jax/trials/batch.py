@@ -24,7 +24,7 @@ import time
 from collections.abc import Callable, Hashable, Iterable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, as_completed
 from functools import partial
-from typing import TYPE_CHECKING, Any, NamedTuple, TypedDict, TypeVar, Unpack
+from typing import TYPE_CHECKING, Any, NamedTuple, TypedDict, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -33,6 +33,7 @@ from jax.sharding import AxisType, NamedSharding
 from jax.sharding import PartitionSpec as P
 
 from rps_jax import engines, errors
+from rps_jax.control import registry
 from rps_jax.control.base import Law, LawParams
 from rps_jax.engines import programs
 from rps_jax.trials import host, trial
@@ -87,9 +88,14 @@ Inputs = tuple[World, LawParams]
 class Job(NamedTuple):
     """Trials that one compiled program can step."""
 
-    law: Law
+    program: Hashable  # key of the program; jobs with equal keys can be joined
     num_trials: int  # at most; there are no more slots than that
-    batches: Iterable[WorldBatch]  # of one stage, if JAX traces the engine
+    batches: Iterable[WorldBatch]  # of one law, and of one stage if JAX traces the engine
+
+    def shifted(self, first: int) -> Job:
+        """Return the job with indices of trials that count from `first`."""
+        batches = (batch._replace(indices=first + batch.indices) for batch in self.batches)
+        return self._replace(batches=batches)
 
 
 Collect = Callable[[np.ndarray, Outcome], object]  # indices (m,) of trials and their outcomes
@@ -153,26 +159,6 @@ def run(
     _run_in_threads(tasks, count, monitor)
     total = time.perf_counter() - start_time
     return Timing(monitor.compile, total - monitor.compile, monitor.simulated)
-
-
-def run_all(
-    jobs: Sequence[Job], setting: Setting, count: int, **options: Unpack[BatchOptions]
-) -> tuple[Outcome, Timing]:
-    """Run every trial of every job, of indices 0 to `count` - 1, and return all outcomes.
-
-    Returns:
-      Outcomes as numpy arrays (count, ...), and the timing.
-    """
-    columns: dict[str, np.ndarray] = {}
-
-    def collect(indices: np.ndarray, outcome: Outcome) -> None:
-        for name, leaf in outcome._asdict().items():
-            if name not in columns:
-                columns[name] = np.empty((count, *leaf.shape[1:]), leaf.dtype)
-            columns[name][indices] = leaf
-
-    timing = run(jobs, setting, collect=collect, **options)
-    return Outcome(**columns), timing  # pyright: ignore[reportArgumentType]
 
 
 def rows(tree: Tree, index: Any) -> Tree:
@@ -239,7 +225,8 @@ def _run_on_host(job: Job, setting: Setting, threads: int, monitor: _Monitor) ->
 
         if monitor.stop:
             return
-        loop = ControlLoop(setting.physics, setting.rules, job.law)
+        law = registry.law_of(batch.params)
+        loop = ControlLoop(setting.physics, setting.rules, law)
         engine, inputs = engines.get(setting.engine), (batch.stage, *batch.inputs)
         host.run(engine, *inputs, loop, threads=max(1, threads), callback=add)
 
@@ -259,9 +246,9 @@ class _TrialQueue:
     """Trials of a job that wait for a slot, and its suspended trials; workers share it."""
 
     def __init__(self, job: Job):
-        self.law, self.num_trials = job.law, job.num_trials
-        self._batches = iter(job.batches)
+        self.num_trials, self._batches = job.num_trials, iter(job.batches)
         self.example: WorldBatch = next(self._batches)  # for its stage and its shapes
+        self.law = registry.law_of(self.example.params)
         self._waiting: WorldBatch | None = self.example  # rest of the current batch
         self._lock = threading.Lock()
         self.suspended: list[_Suspended] = []

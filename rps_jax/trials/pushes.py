@@ -2,10 +2,10 @@
 
 import math
 import time
-from collections.abc import Callable, Hashable, Sequence
+from collections.abc import Callable, Hashable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, Unpack
+from typing import Any, NamedTuple, Unpack
 
 import jax
 import jax.numpy as jnp
@@ -20,10 +20,11 @@ from rps_jax.geometry import solid
 from rps_jax.geometry.footprint import Footprint
 from rps_jax.robot.base import Odometry
 from rps_jax.robot.shell import Shell
-from rps_jax.trials import batch, host, trial, worlds
+from rps_jax.trials import host, trial, worlds
 from rps_jax.trials.batch import SEGMENT, BatchOptions, Job, WorldBatch, rows
 from rps_jax.trials.case import Case
 from rps_jax.trials.progress import Progress, ProgressCallback, Timing, no_progress
+from rps_jax.trials.rollout import outcomes
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import ControlLoop, Outcome, Shift, Snapshot, Trial
 from rps_jax.world import scene
@@ -131,30 +132,44 @@ def _stack(trees: Sequence[Any], dtype: Any = float) -> Any:
     return jax.tree.map(lambda *leaves: np.array([np.asarray(x) for x in leaves], dtype), *trees)
 
 
+class Cases(NamedTuple):
+    """Request of named cases, in any mixture of objects, frictions, targets and parameters."""
+
+    cases: Sequence[Case]
+
+    @property
+    def shape(self) -> tuple[int]:
+        """Shape of the outcomes, in the order of the cases."""
+        return (len(self.cases),)
+
+    def jobs(self, setting: Setting) -> Iterator[Job]:
+        """Yield the cases of each kind."""
+        # Without reaction most trials lose the object and run to the horizon. They start first, so
+        # that few slots are idle at the end.
+        params = [case.params for case in self.cases]
+        order = [float(p.reactive) if isinstance(p, RPSParams) else 0.0 for p in params]
+        groups: dict[Hashable, list[int]] = {}
+        for i in np.argsort(order, kind="stable").tolist():
+            groups.setdefault(kind(self.cases[i]), []).append(i)
+        for program, indices in groups.items():
+            worlds = build([self.cases[i] for i in indices], setting, indices)
+            yield Job(program, len(indices), [worlds])
+
+
 def run(
     cases: Sequence[Case],
     setting: Setting = Setting(engine="mjx"),
     **options: Unpack[BatchOptions],
 ) -> tuple[Outcome, Timing]:
-    """Run every case to its end, in any mixture of objects, frictions, targets and parameters.
+    """Run every case to its end, by `rollout` with its options.
 
-    The options are those of `batch.run`. Results are bit-identical for equal slots on one kind of
-    device, whatever shares the batch.
+    Results are bit-identical for equal slots on one kind of device, whatever shares the batch.
 
     Returns:
       Outcomes as numpy arrays (len(cases), ...), in the order of `cases`; and the timing.
     """
-    # Without reaction most trials lose the object and run to the horizon. They start first, so that
-    # few slots are idle at the end.
-    order = [float(c.params.reactive) if isinstance(c.params, RPSParams) else 0.0 for c in cases]
-    jobs, groups = [], dict[Hashable, list[int]]()
-    for i in np.argsort(order, kind="stable").tolist():
-        groups.setdefault(kind(cases[i]), []).append(i)
-    for indices in groups.values():
-        members = [cases[i] for i in indices]
-        built = build(members, setting, indices)
-        jobs.append(Job(registry.law_of(members[0].params), len(members), [built]))
-    return batch.run_all(jobs, setting, len(cases), **options)
+    (outcome,), timing = outcomes([Cases(cases)], setting, **options)
+    return outcome, timing
 
 
 def record_cases(

@@ -1,30 +1,35 @@
-"""Rollouts: candidates of one law in the worlds of domains, and the outcomes of all trials.
+"""Rollouts: the one way to run laws in worlds and to collect the outcomes of the trials.
 
-This is the one way to draw worlds, run a law in them and collect the outcomes in memory. A request,
-`Candidates`, holds law parameters with leaves (P, ...) and says which W worlds of a domain each of
-the P candidates meets: those of a seed by their indices, or those at points of the unit cube.
+A `Request` has the worlds of its trials, by the program that steps them. There are three kinds:
+named cases (`pushes.Cases`), the chunks of a sweep (`runs.results.Results`), and here `Candidates`:
+law parameters with leaves (P, ...) in random worlds.
 
-    request = Candidates(stack(["rps", "rps,L=0.2"]), seed=3, worlds=np.arange(100))
-    (result,), timing = rollout([request], [domain], setting)
-    result.outcome.success    # (2, 100)
-    result.distance           # (100,) [m] from the start to the target
+    request = Candidates(stack(["rps", "rps,L=0.2"]), [domain], seed=3, worlds=np.arange(100))
+    (outcome,), timing = outcomes([request], setting)
+    outcome.success      # (2, 100)
+    request.distances    # (100,) [m] from the start to the target
 
-A probe is one candidate at given points: `Candidates(stack([params]), 0, np.arange(n), points)`.
+A probe is one candidate at given points: `Candidates(params, [domain], 0, np.arange(n), points)`.
 `capacity` then rounds the number of trials up, so that few programs serve many numbers of points. A
 planner sets `per_world` and gives leaves (P, W, ...), its own parameters for each world.
 """
 
-from collections.abc import Callable, Hashable, Iterator, Sequence
-from typing import NamedTuple, Unpack
+from __future__ import annotations
+
+import functools
+import itertools
+import math
+from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import Protocol, Unpack
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from rps_jax.control import registry
 from rps_jax.control.base import LawParams
 from rps_jax.trials import batch
-from rps_jax.trials.batch import BatchOptions, Job, WorldBatch, rows
+from rps_jax.trials.batch import BatchOptions, Collect, Job, WorldBatch, rows
 from rps_jax.trials.progress import Timing
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import Outcome
@@ -35,130 +40,169 @@ from rps_jax.world.draws import Draw
 from rps_jax.world.points import Points
 
 
-class Candidates(NamedTuple):
-    """Parameters of one law, and the worlds that each candidate meets."""
-
-    params: LawParams  # leaves (P, ...); (P, D * W, ...) with `per_world`
-    seed: int  # of the worlds
-    worlds: np.ndarray  # (W,) indices of the worlds, in each of the D domains
-    points: Points | None = None  # of the unit cube at which the worlds lie; None: drawn worlds
-    per_world: bool = False  # whether a candidate has different parameters in each world
+class Request(Protocol):
+    """Trials to run."""
 
     @property
-    def num_candidates(self) -> int:
-        """Number of candidates, P."""
-        return jax.tree.leaves(self.params)[0].shape[0]
+    def shape(self) -> tuple[int, ...]:
+        """Shape of the outcomes, in which the index of a trial counts in row-major order."""
+        ...
 
-    def object_of(self, domain: Domain) -> np.ndarray:
-        """Return the indices (W,) of the worlds' objects in the domain."""
-        return domain.object_of(points_.cases(domain, self.points, self.worlds))
-
-    def draw(self, domain: Domain, rows: np.ndarray) -> Draw:
-        """Draw the worlds at positions `rows` of `worlds`, which must have the same object."""
-        return points_.draw(domain, self.seed, self.points, self.worlds[rows])
+    def jobs(self, setting: Setting) -> Iterable[Job]:
+        """Return the worlds and law parameters of the trials, by the program that steps them."""
+        ...
 
 
-class Rollout(NamedTuple):
-    """Outcomes of all candidates of a request in all their worlds."""
+class RolloutOptions(BatchOptions, total=False):
+    """Keyword arguments of `rollout`."""
 
-    outcome: Outcome  # leaves (P, D * W, ...), on the host
-    distance: np.ndarray  # (D * W,) [m] from the start to the target
+    capacity: Callable[[int], int]
 
 
 def rollout(
-    requests: Sequence[Candidates],
-    domains: Sequence[Domain],
+    requests: Sequence[Request],
     setting: Setting,
+    collect: Collect,
     *,
     capacity: Callable[[int], int] = lambda trials: trials,
     **options: Unpack[BatchOptions],
-) -> tuple[list[Rollout], Timing]:
-    """Run every candidate in every world of its request; one batch for each shape family.
+) -> Timing:
+    """Run every trial of every request to its end.
 
     Args:
-      requests: candidates and their worlds; requests of one law share batches.
-      domains: the worlds of a request are drawn from each of these.
+      requests: their trials share programs. The indices of the trials of a request follow those of
+        the previous request.
       setting: engine, physics and rules.
+      collect: called with trials that ended, in any order, by one thread at a time.
       capacity: number of trials that a program has slots for, by the number of its trials.
       options: slots, workers and callback, as of `batch.run`.
 
     Returns:
-      The outcomes of each request, and where the time went.
+      Where the time went.
     """
-    groups: dict[Hashable, list[WorldBatch]] = {}
-    distances, sizes = [], []
-    for request in requests:
-        first, width = sum(sizes), len(domains) * request.worlds.size
-        distances.append(np.empty(width))
-        sizes.append(request.num_candidates * width)
-        params = _params_per_world(request, width)
-        for worlds, columns, distance in world_batches(request, domains, setting):
-            distances[-1][columns] = distance
-            trials = first + width * np.arange(request.num_candidates)[:, None] + columns
-            chosen = jax.tree.map(lambda leaf, at=columns: leaf[:, at], params)
-            key = _shape_key(worlds.worlds, 1), _shape_key(chosen, 2)
-            groups.setdefault(key, []).append(worlds._replace(indices=trials, params=chosen))
-    jobs = [_job(group, capacity) for group in groups.values()]
-    outcome, timing = batch.run_all(jobs, setting, sum(sizes), **options)
-    results = []
-    for distance, end, size in zip(distances, np.cumsum(sizes), sizes, strict=True):
-        trials = np.arange(end - size, end).reshape(-1, distance.size)
-        results.append(Rollout(rows(outcome, trials), distance))
-    return results, timing
+    groups: dict[Hashable, list[Job]] = {}
+    for request, first in zip(requests, _first_trials(requests), strict=False):
+        for job in request.jobs(setting):
+            groups.setdefault(job.program, []).append(job.shifted(first))
+    jobs = []
+    for program, group in groups.items():
+        trials = capacity(sum(job.num_trials for job in group))
+        batches = itertools.chain.from_iterable(job.batches for job in group)
+        jobs.append(Job(program, trials, batches))
+    return batch.run(jobs, setting, collect=collect, **options)
 
 
-def world_batches(
-    request: Candidates, domains: Sequence[Domain], setting: Setting
-) -> Iterator[tuple[WorldBatch, np.ndarray, np.ndarray]]:
-    """Yield the worlds of a request by domain and object, without law parameters.
+def outcomes(
+    requests: Sequence[Request],
+    setting: Setting,
+    **options: Unpack[RolloutOptions],
+) -> tuple[list[Outcome], Timing]:
+    """Run every trial of every request by `rollout`, and collect the outcomes in arrays.
 
-    Beside each batch (n,) come the positions (n,) of its worlds among all D * W of the request, and
-    the distances (n,) [m] from the start to the target.
+    Returns:
+      The outcomes of each request, on the host with leaves (*shape, ...); and where the time went.
     """
-    # Odometry of equal length in all domains lets their worlds share a batch.
-    history = max(remembered_steps(d, setting.physics.control_period) for d in domains)
-    for number, domain in enumerate(domains):
-        objects = request.object_of(domain)
-        for index in np.unique(objects):
-            at = np.flatnonzero(objects == index)
-            drawn = request.draw(domain, at)
+    columns: dict[str, np.ndarray] = {}
+    *firsts, count = _first_trials(requests)
+
+    def collect(indices: np.ndarray, ended: Outcome) -> None:
+        for name, leaf in ended._asdict().items():
+            if name not in columns:
+                columns[name] = np.empty((count, *leaf.shape[1:]), leaf.dtype)
+            columns[name][indices] = leaf
+
+    timing = rollout(requests, setting, collect, **options)
+    whole = Outcome(**columns)  # pyright: ignore[reportArgumentType]
+    trials = (
+        first + np.arange(math.prod(request.shape)).reshape(request.shape)
+        for first, request in zip(firsts, requests, strict=True)
+    )
+    return [rows(whole, index) for index in trials], timing
+
+
+def _first_trials(requests: Sequence[Request]) -> list[int]:
+    """Return the index of the first trial of each request, and the number of all trials."""
+    return np.cumsum([0, *(math.prod(request.shape) for request in requests)]).tolist()
+
+
+@dataclass(frozen=True, eq=False)
+class Candidates:
+    """Parameters of one law, and the W worlds of each of D domains that the P candidates meet."""
+
+    params: LawParams  # leaves (P, ...); (P, D * W, ...) with `per_world`
+    domains: Sequence[Domain]
+    seed: int  # of the worlds
+    worlds: np.ndarray  # (W,) indices of the worlds, in each of the domains
+    points: Points | None = None  # of the unit cube at which the worlds lie; None: drawn worlds
+    per_world: bool = False  # whether a candidate has different parameters in each world
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Shape (P, D * W) of the outcomes."""
+        num_candidates = jax.tree.leaves(self.params)[0].shape[0]
+        return num_candidates, len(self.domains) * self.worlds.size
+
+    @functools.cached_property
+    def draws(self) -> list[tuple[np.ndarray, Domain, Draw]]:
+        """Worlds by domain and object: positions (n,) among all D * W, domain and draw."""
+        draws = []
+        for number, domain in enumerate(self.domains):
+            objects = domain.object_of(points_.cases(domain, self.points, self.worlds))
+            for index in np.unique(objects):
+                at = np.flatnonzero(objects == index)
+                drawn = points_.draw(domain, self.seed, self.points, self.worlds[at])
+                draws.append((number * self.worlds.size + at, domain, drawn))
+        return draws
+
+    @property
+    def distances(self) -> np.ndarray:
+        """Distances (D * W,) [m] from the start to the target."""
+        distances = np.empty(self.shape[1])
+        for columns, _, drawn in self.draws:
+            distances[columns] = np.linalg.norm(drawn.p_world_target, axis=1)
+        return distances
+
+    def batches(self, setting: Setting) -> Iterator[WorldBatch]:
+        """Yield the worlds by domain and object, without law parameters.
+
+        The indices (n,) of a batch are the positions of its worlds among all D * W.
+        """
+        # Odometry of equal length in all domains lets their worlds share a batch.
+        period = setting.physics.control_period
+        history = max(remembered_steps(domain, period) for domain in self.domains)
+        for columns, domain, drawn in self.draws:
             batch_ = drawn_worlds(domain, drawn, setting)
             odometry = batch_.worlds.odometry
-            past = np.zeros((at.size, history), odometry.past.dtype)
+            past = np.zeros((columns.size, history), odometry.past.dtype)
             worlds = batch_.worlds._replace(odometry=odometry._replace(past=past))
-            distance = np.linalg.norm(drawn.p_world_target, axis=1)
-            yield batch_._replace(worlds=worlds), number * request.worlds.size + at, distance
+            yield batch_._replace(indices=columns, worlds=worlds)
 
+    def jobs(self, setting: Setting) -> Iterator[Job]:
+        """Yield the worlds of each domain and object, candidate after candidate."""
+        num_candidates, width = self.shape
+        params = self._params_per_world()
+        for batch_ in self.batches(setting):
+            chosen = jax.tree.map(lambda leaf, at=batch_.indices: leaf[:, at], params)
+            program = _shape_key(batch_.worlds, 1), _shape_key(chosen, 2)
+            batches = [
+                batch_._replace(indices=width * i + batch_.indices, params=rows(chosen, i))
+                for i in range(num_candidates)
+            ]
+            yield Job(program, num_candidates * batch_.indices.size, batches)
 
-def _params_per_world(request: Candidates, width: int) -> LawParams:
-    """Return the law parameters with leaves (P, `width`, ...), as views on the host."""
+    def _params_per_world(self) -> LawParams:
+        """Return the law parameters with leaves (P, D * W, ...), as views on the host."""
 
-    def expand(leaf: np.ndarray) -> np.ndarray:
-        leaf = np.asarray(leaf, jnp.result_type(float))
-        if request.per_world:
-            return leaf
-        return np.broadcast_to(leaf[:, None], (len(leaf), width, *leaf.shape[1:]))
+        def expand(leaf: np.ndarray) -> np.ndarray:
+            leaf = np.asarray(leaf, jnp.result_type(float))
+            if self.per_world:
+                return leaf
+            return np.broadcast_to(leaf[:, None], (*self.shape, *leaf.shape[1:]))
 
-    return jax.tree.map(expand, jax.device_get(request.params))
+        return jax.tree.map(expand, jax.device_get(self.params))
 
 
 def _shape_key(tree: object, batch_dims: int) -> Hashable:
     """Return the structure of a pytree and the shapes of its leaves without batch dimensions."""
     leaves, structure = jax.tree.flatten(tree)
     return structure, *(np.shape(leaf)[batch_dims:] for leaf in leaves)
-
-
-def _job(group: Sequence[WorldBatch], capacity: Callable[[int], int]) -> Job:
-    """Return the job of worlds of one shape family, candidate after candidate.
-
-    A batch of n worlds has the indices (P, n) of its trials, and parameters (P, n, ...).
-    """
-
-    def batches() -> Iterator[WorldBatch]:
-        for worlds in group:
-            for candidate, trials in enumerate(worlds.indices):
-                params = rows(worlds.params, candidate)
-                yield worlds._replace(indices=trials, params=params)
-
-    trials = sum(worlds.indices.size for worlds in group)
-    return Job(registry.law_of(group[0].params), capacity(trials), batches())

@@ -24,7 +24,6 @@ from rps_jax.engines.base import Stage
 from rps_jax.record.options import option
 from rps_jax.robot.skin import CapacitiveSkin, SmoothSkin
 from rps_jax.runs.question import call_of
-from rps_jax.trials import rollout
 from rps_jax.trials.score import Objective
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import ControlLoop, Snapshot, Trial, World, control_step, start_all
@@ -234,11 +233,11 @@ def window_gradients(
     ask = problem.ask(windows.space.base, seed, step)
     random = np.random.default_rng((seed, step))
     estimates, counts = [], []
-    for part, column, _ in rollout.world_batches(ask, problem.domains, setting):
-        starts = jnp.asarray(random.uniform(size=column.size))
-        worlds = soften_skins(part.worlds), starts
-        estimates.append(_family_gradients(thetas, part.stage, worlds, windows=windows))
-        counts.append(column.size)
+    for batch in ask.batches(setting):
+        count = batch.indices.size
+        worlds = soften_skins(batch.worlds), jnp.asarray(random.uniform(size=count))
+        estimates.append(_family_gradients(thetas, batch.stage, worlds, windows=windows))
+        counts.append(count)
     shares = [count / sum(counts) for count in counts]
     zero = jnp.zeros(())
     mean = Estimate(

@@ -63,11 +63,12 @@ class Problem:
     def ask(self, params: LawParams, seed: int, generation: int) -> Candidates:
         """Return candidates with leaves (P,) and the worlds of a generation."""
         worlds = generation * self.worlds + np.arange(self.worlds)
-        return Candidates(params, seed_of(seed, "tune"), worlds)
+        return Candidates(params, self.domains, seed_of(seed, "tune"), worlds)
 
     def validate(self, params: LawParams, seed: int) -> Candidates:
         """Return candidates with leaves (P,) and the worlds for validation."""
-        return Candidates(params, seed_of(seed, "validate"), np.arange(self.validation))
+        worlds = np.arange(self.validation)
+        return Candidates(params, self.domains, seed_of(seed, "validate"), worlds)
 
 
 class Tuner(ABC):
@@ -313,7 +314,7 @@ def _try_generation(tuner: Tuner, generation: int, run: Run) -> Generation:
 
     def score_candidates(candidates: list[Candidates]) -> list[CandidateScores]:
         scores, timing = evaluate.score_candidates(
-            candidates, problem.domains, problem.setting, problem.objective, **run.batch_options
+            candidates, problem.setting, problem.objective, **run.batch_options
         )
         for name in times:
             times[name] += getattr(timing, name)

@@ -51,10 +51,11 @@ def _run_candidates(
     params: Any, problem: Problem, splits: Sequence[Split], seed: int, count: int, **run: Any
 ) -> list[Outcome]:
     """Return the outcomes (P, D * W) of candidates in the worlds of each split."""
-    asks = [Candidates(params, seed_of(seed, split), np.arange(count)) for split in splits]
-    answers, _ = evaluate.score_candidates(
-        asks, problem.domains, problem.setting, problem.objective, **run
-    )
+    asks = [
+        Candidates(params, problem.domains, seed_of(seed, split), np.arange(count))
+        for split in splits
+    ]
+    answers, _ = evaluate.score_candidates(asks, problem.setting, problem.objective, **run)
     return [answer.outcome for answer in answers]
 
 

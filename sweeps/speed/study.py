@@ -24,19 +24,15 @@ import xarray as xr
 from rps_jax import engines, errors
 from rps_jax.analysis.figures.style import Figure, words
 from rps_jax.analysis.report import Picture, Section
-from rps_jax.control.laws import rps
-from rps_jax.control.laws.rps import RPSParams
 from rps_jax.engines import device
 from rps_jax.record.options import option
+from rps_jax.runs.evaluate import stack
 from rps_jax.runs.question import Run, call_of
 from rps_jax.trials import host
-from rps_jax.trials.batch import Job
-from rps_jax.trials.batch import run as run_batch
 from rps_jax.trials.progress import Progress
+from rps_jax.trials.rollout import Candidates, outcomes
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import ControlLoop, Rules
-from rps_jax.trials.worlds import drawn_worlds
-from rps_jax.world import draws
 from rps_jax.world.domain import DOMAINS
 from rps_jax.world.physics import preset
 from rps_jax.world.scene import JOINTS
@@ -296,10 +292,8 @@ def refilling(slots: int, rounds: int = 4) -> Refilling:
     def timed(groups: np.ndarray) -> tuple[float, float]:
         timings = []
         for group in groups:
-            drawn = draws.draw(boxes, 0, group)
-            part = drawn_worlds(boxes, drawn, setting).with_params(RPSParams.paper())
-            job = Job(rps.LAW, group.size, [part])
-            timings.append(run_batch([job], setting, slots=slots, collect=lambda *_: None))
+            request = Candidates(stack(["rps"]), [boxes], 0, group)
+            timings.append(outcomes([request], setting, slots=slots)[1])
         wall = sum(t.run for t in timings)
         return sum(t.simulated for t in timings) / wall, groups.size / wall
 
