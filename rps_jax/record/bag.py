@@ -38,45 +38,6 @@ Floats = Sequence[float] | np.ndarray
 _MAX_BYTES = 64 * 2**20  # of a record, and of an unpacked chunk
 _MAX_NUMBERS = 2**28  # of all steps; each field counts 8 more for its Python object
 _MARKER_PERIOD = 1.0  # [s] between two target markers
-_FIELDS = {
-    "std_msgs/Header": "builtin_interfaces/Time stamp\nstring frame_id",
-    "std_msgs/ColorRGBA": "float32 r\nfloat32 g\nfloat32 b\nfloat32 a",
-    "std_msgs/MultiArrayDimension": "string label\nuint32 size\nuint32 stride",
-    "std_msgs/MultiArrayLayout": "std_msgs/MultiArrayDimension[] dim\nuint32 data_offset",
-    "std_msgs/Float32MultiArray": "std_msgs/MultiArrayLayout layout\nfloat32[] data",
-    "builtin_interfaces/Time": "int32 sec\nuint32 nanosec",
-    "builtin_interfaces/Duration": "int32 sec\nuint32 nanosec",
-    "geometry_msgs/Point": "float64 x\nfloat64 y\nfloat64 z",
-    "geometry_msgs/Point32": "float32 x\nfloat32 y\nfloat32 z",
-    "geometry_msgs/Vector3": "float64 x\nfloat64 y\nfloat64 z",
-    "geometry_msgs/Quaternion": "float64 x 0\nfloat64 y 0\nfloat64 z 0\nfloat64 w 1",
-    "geometry_msgs/Pose": "geometry_msgs/Point position\ngeometry_msgs/Quaternion orientation",
-    "geometry_msgs/Twist": "geometry_msgs/Vector3 linear\ngeometry_msgs/Vector3 angular",
-    "geometry_msgs/Wrench": "geometry_msgs/Vector3 force\ngeometry_msgs/Vector3 torque",
-    "geometry_msgs/Polygon": "geometry_msgs/Point32[] points",
-    "geometry_msgs/Transform": "geometry_msgs/Vector3 translation\n"
-    "geometry_msgs/Quaternion rotation",
-    "geometry_msgs/PoseWithCovariance": "geometry_msgs/Pose pose\nfloat64[36] covariance",
-    "geometry_msgs/TwistWithCovariance": "geometry_msgs/Twist twist\nfloat64[36] covariance",
-    "geometry_msgs/PointStamped": "std_msgs/Header header\ngeometry_msgs/Point point",
-    "geometry_msgs/TwistStamped": "std_msgs/Header header\ngeometry_msgs/Twist twist",
-    "geometry_msgs/WrenchStamped": "std_msgs/Header header\ngeometry_msgs/Wrench wrench",
-    "geometry_msgs/PolygonStamped": "std_msgs/Header header\ngeometry_msgs/Polygon polygon",
-    "geometry_msgs/TransformStamped": "std_msgs/Header header\nstring child_frame_id\n"
-    "geometry_msgs/Transform transform",
-    "tf2_msgs/TFMessage": "geometry_msgs/TransformStamped[] transforms",
-    "nav_msgs/Odometry": "std_msgs/Header header\nstring child_frame_id\n"
-    "geometry_msgs/PoseWithCovariance pose\ngeometry_msgs/TwistWithCovariance twist",
-    "sensor_msgs/CompressedImage": "std_msgs/Header header\nstring format\nuint8[] data",
-    "visualization_msgs/UVCoordinate": "float32 u\nfloat32 v",
-    "visualization_msgs/MeshFile": "string filename\nuint8[] data",
-    "visualization_msgs/Marker": "std_msgs/Header header\nstring ns\nint32 id\nint32 type\n"
-    "int32 action\ngeometry_msgs/Pose pose\ngeometry_msgs/Vector3 scale\nstd_msgs/ColorRGBA color\n"
-    "builtin_interfaces/Duration lifetime\nbool frame_locked\ngeometry_msgs/Point[] points\n"
-    "std_msgs/ColorRGBA[] colors\nstring texture_resource\nsensor_msgs/CompressedImage texture\n"
-    "visualization_msgs/UVCoordinate[] uv_coordinates\nstring text\nstring mesh_resource\n"
-    "visualization_msgs/MeshFile mesh_file\nbool mesh_use_embedded_materials",
-}
 TOPICS = {
     "/odom": "nav_msgs/Odometry",
     "/target": "geometry_msgs/PointStamped",
@@ -113,19 +74,7 @@ _require = partial(errors.require, extra="bags")
 
 def check() -> None:
     """Raise InputError unless the packages of the extra `bags` are installed."""
-    _require("mcap_ros2.writer")
-
-
-def _definition(kind: str) -> str:
-    """Return a message definition with those of its parts, in the format of bags."""
-    definitions, kinds = [], [kind]
-    for name in kinds:
-        for line in _FIELDS[name].splitlines():
-            inner = line.split()[0].split("[")[0]
-            if inner in _FIELDS and inner not in kinds:
-                kinds.append(inner)
-        definitions.append((f"MSG: {name}\n" if name != kind else "") + _FIELDS[name] + "\n")
-    return ("=" * 80 + "\n").join(definitions)
+    _ = _require("mcap_ros2.writer"), _require("rosbags.typesys")
 
 
 # --- writing -------------------------------------------------------------------------------
@@ -133,15 +82,19 @@ def _definition(kind: str) -> str:
 
 def write(path: Path, steps: Iterable[Step], metadata: Mapping[str, str]) -> Path:
     """Write a bag atomically."""
-    module = _require("mcap_ros2.writer")
+    module, typesys = _require("mcap_ros2.writer"), _require("rosbags.typesys")
+    definitions = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
 
     def fill(partial: Path) -> None:
         with open(partial, "wb") as file, module.Writer(file) as writer:
-            names = {kind: kind.replace("/", "/msg/") for kind in TOPICS.values()}
-            kinds = {k: writer.register_msgdef(names[k], _definition(k)) for k in names}
+            schemas = {}
+            for kind in dict.fromkeys(TOPICS.values()):
+                name = kind.replace("/", "/msg/")
+                text, _ = definitions.generate_msgdef(name, ros_version=2)
+                schemas[kind] = writer.register_msgdef(name, text)
             writer.add_metadata("rps_jax", dict(metadata))
             for topic, time, message in _messages(steps):
-                writer.write_message(topic, kinds[TOPICS[topic]], message, time, time)
+                writer.write_message(topic, schemas[TOPICS[topic]], message, time, time)
 
     return files.write_atomically(path, fill)
 
@@ -216,8 +169,9 @@ def _frame(header: Message, child: str, x: float, y: float, yaw: float) -> Messa
 
 def _cylinder(header: Message, name: str, center: Floats, width: float) -> Message:
     """Return a marker of type 3."""
+    pose = {"position": _xyz(*center), "orientation": _yaw(0)}
     return {
-        **{"header": header, "ns": name, "type": 3, "pose": {"position": _xyz(*center)}},
+        **{"header": header, "ns": name, "type": 3, "pose": pose},
         "scale": {"x": width, "y": width, "z": 0.01},
         "color": {"r": 0.1, "g": 0.6, "b": 0.2, "a": 0.8},
     }
@@ -264,14 +218,11 @@ def read(path: Path) -> dict[str, np.ndarray]:
             raise ValueError("its commands are not at least two, one after the other")
     except InputError:
         raise
-    except (OSError, MemoryError, RecursionError) as error:
-        reason = getattr(error, "strerror", None) or type(error).__name__
-        raise InputError(f"bag = {path} cannot be read ({reason}): give an MCAP file.") from error
     except Exception as error:  # of any kind, by the readers of a damaged file
-        reason = " ".join(str(error).split())[:200].rstrip(".") or type(error).__name__
+        text = getattr(error, "strerror", None) or " ".join(str(error).split())[:200].rstrip(".")
         raise InputError(
-            f"bag = {path} is not allowed ({reason}): give an MCAP file with the topics "
-            f"{', '.join(_REQUIRED)}, and {' or '.join(_TOUCH_TOPICS)}."
+            f"bag = {path} cannot be read ({text or type(error).__name__}): give an MCAP file with "
+            f"the topics {', '.join(_REQUIRED)}, and {' or '.join(_TOUCH_TOPICS)}."
         ) from error
     steps["pose"][:, 2] = np.unwrap(steps["pose"][:, 2])
     steps["period"] = np.concatenate([[np.median(periods)], periods])

@@ -55,7 +55,6 @@ PURPOSE = {
     "cmaes": "the evolution of `rps tune es`, in NumPy",
     "filelock": "one process at a time in a run folder",
     "tyro": "the command line, from typed options",
-    "docstring-parser": "the help of options, from docstrings of fields; tyro needs it too",
     "markdown": "`report.html` from `report.md`",
     "jaxtyping": "shapes in the types of functions and records",
 }
@@ -64,7 +63,7 @@ EXTRAS = {
     "cluster": "`rps sweep --ray` (ray)",
     "viz": "`rps view` (viser)",
     "export": "`rps export onnx` (onnx, and onnxruntime to run the exported file)",
-    "bags": "`rps push --bag` and `rps shadow` (mcap-ros2-support)",
+    "bags": "`rps push --bag` and `rps shadow` (mcap-ros2-support, rosbags)",
     "failures": "`rps sensitivity` (SALib) and `rps attack` (ribs, which brings numba and "
     "scikit-learn)",
     "gym": "`rps_jax/Push-v0` of Gymnasium",
