@@ -310,13 +310,7 @@ def _unique_labels(labels: Sequence[str], laws: Sequence[LawLike]) -> Iterator[s
 
 def _read(path: Path) -> bytes:
     """Read the file of a law."""
-    try:
-        return files.read_regular(path, "policy" if path.suffix == ".npz" else "python")
-    except OSError as error:
-        raise InputError(
-            f"law = {path} cannot be read ({error.strerror}): give FILE.py:CLASS or a policy's "
-            "FILE.npz."
-        ) from error
+    return files.read_regular(path, "policy" if path.suffix == ".npz" else "python")
 
 
 def run_file(path: Path, name: str) -> ModuleType:

@@ -94,10 +94,10 @@ def _part_name(path: Path) -> str:
 
 def _valid_content(path: Path) -> bytes | None:
     """Return the content of a file; rename a damaged one and return None."""
+    with contextlib.suppress(InputError):  # a pipe or the like counts as damaged
+        content = files.read_regular(path, "part")
+        if files.sha256(content)[:_DIGITS] == path.stem.rpartition("-")[2]:
+            return content
     with contextlib.suppress(FileNotFoundError):  # another process has renamed it
-        with contextlib.suppress(InputError):  # a pipe or the like counts as damaged
-            content = files.read_regular(path, "part")
-            if files.sha256(content)[:_DIGITS] == path.stem.rpartition("-")[2]:
-                return content
         path.replace(path.with_name(f"{path.name}.corrupt"))
     return None

@@ -15,7 +15,7 @@ import json
 import os
 import stat
 import zipfile
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
@@ -27,24 +27,21 @@ from numpy.typing import ArrayLike
 from rps_jax.errors import InputError
 
 FileKind = Literal["json", "python", "xml", "policy", "part", "results"]
-MAX_BYTES: dict[FileKind, int] = {
-    "json": 2**26,
-    "python": 2**22,
-    "xml": 2**24,
-    "policy": 2**28,
-    "part": 2**33,
-    "results": 2**37,
+_MAX_PART = 2**33  # [bytes]
+_KINDS: dict[FileKind, tuple[int, str]] = {  # greatest size [bytes], and a description
+    "json": (2**26, "a JSON file"),
+    "python": (2**22, "FILE.py:CLASS"),
+    "xml": (2**24, "an MJCF file"),
+    "policy": (2**28, "a policy's FILE.npz"),
+    "part": (_MAX_PART, "the folder of a run"),
+    "results": (2**37, "a file of results"),
 }
 JsonObject = dict[str, Any]  # parsed JSON has values of any type
 _STRUCTURE = "structure"  # attribute of a NetCDF file
-_MAX_DEPTH = 32  # levels of nested JSON
-_FILE_TYPES = {
-    stat.S_IFDIR: "a folder",
-    stat.S_IFIFO: "a pipe",
-    stat.S_IFSOCK: "a socket",
-    stat.S_IFCHR: "a device",
-    stat.S_IFBLK: "a device",
-}
+
+
+class MissingFileError(InputError):
+    """A file that does not exist."""
 
 
 class CorruptFileError(InputError):
@@ -125,28 +122,29 @@ def read_regular(path: Path, kind: FileKind = "results") -> bytes:
     """Read a regular file of bounded size; nothing else is opened, so that nothing blocks.
 
     Raises:
-      OSError: it does not exist, or cannot be read.
-      InputError: it is a folder, a pipe or a device, or larger than files of its kind are.
+      MissingFileError: it does not exist.
+      InputError: it cannot be read, is no regular file, or is larger than files of its kind are.
     """
+    max_bytes, description = _KINDS[kind]
     try:
         status = os.stat(path)
-    except ValueError as error:
-        raise InputError(f"{str(path)!r} is no path ({error}).") from error
-    if not stat.S_ISREG(status.st_mode):
-        file_type = _FILE_TYPES.get(stat.S_IFMT(status.st_mode), "no regular file")
-        raise InputError(f"{path} cannot be read (it is {file_type}): give a regular file.")
-    if status.st_size > MAX_BYTES[kind]:
-        raise InputError(
-            f"{path} is too large: a {kind} file has at most {MAX_BYTES[kind] / 2**20:.0f} MiB."
-        )
-    with open(path, "rb") as file:
-        return file.read(status.st_size or 2**16)  # some files of the system have no size
+        if not stat.S_ISREG(status.st_mode):
+            raise ValueError("it is no regular file")
+        if status.st_size > max_bytes:
+            raise ValueError(f"it has more than {max_bytes / 2**20:.0f} MiB")
+        with open(path, "rb") as file:
+            return file.read(status.st_size or 2**16)  # some files of the system have no size
+    except (OSError, ValueError) as error:
+        is_missing = isinstance(error, FileNotFoundError | NotADirectoryError)
+        error_type = MissingFileError if is_missing else InputError
+        reason = getattr(error, "strerror", error)
+        raise error_type(f"{path} cannot be read ({reason}): give {description}.") from error
 
 
 def read_checked(path: Path, kind: FileKind = "results") -> bytes:
     """Read a file, and compare its checksum if it has one."""
     content, checksum = read_regular(path, kind), checksum_path(path)
-    with contextlib.suppress(FileNotFoundError):  # there is no checksum
+    with contextlib.suppress(MissingFileError):  # there is no checksum
         if read_regular(checksum, "json").split(b" ")[0] != sha256(content).encode():
             if read_regular(path, kind) != content:  # another process has just replaced it
                 return read_checked(path, kind)
@@ -156,67 +154,43 @@ def read_checked(path: Path, kind: FileKind = "results") -> bytes:
     return content
 
 
-def parse_json(content: bytes | str) -> Any:
-    """Parse JSON; ValueError if it is not JSON, or nested deeper than people write."""
+def parse_json(content: bytes | str) -> JsonObject:
+    """Parse a JSON object; ValueError if it is none."""
     try:
         value = json.loads(content)
     except RecursionError as error:
         raise ValueError("it is nested too deeply") from error
-    level: list[object] = [value]
-    for _ in range(_MAX_DEPTH):
-        level = [inner for outer in level for inner in _children(outer)]
-    if level:
-        raise ValueError("it is nested too deeply")
+    if not isinstance(value, dict):
+        raise ValueError("it holds no names with values")
     return value
-
-
-def _children(value: object) -> Iterable[object]:
-    if isinstance(value, dict):
-        return value.values()
-    return value if isinstance(value, list) else ()
 
 
 def read_json(path: Path) -> JsonObject:
     """Read a JSON object from a file that a user wrote; InputError if it is none."""
+    content = read_regular(path, "json")
     try:
-        content = parse_json(read_regular(path, "json"))
-    except OSError as error:
-        raise InputError(f"{path} cannot be read ({error.strerror}): give a JSON file.") from error
-    except InputError:
-        raise
+        return parse_json(content)
     except ValueError as error:
-        raise InputError(f"{path} is not JSON ({error}).") from error
-    if not isinstance(content, dict):
-        raise InputError(f'{path} holds no names with values: write {{"name": value}}.')
-    return content
+        raise InputError(f'{path} is no JSON object ({error}): write {{"name": value}}.') from error
 
 
 def read_checked_json(path: Path) -> JsonObject:
     """Read a JSON object of a run folder; InputError if it is missing or corrupt."""
     try:
-        content = parse_json(read_checked(path, "json"))
-    except (FileNotFoundError, NotADirectoryError) as error:
+        content = read_checked(path, "json")
+    except MissingFileError as error:
         raise InputError(
             f"run = {path.parent} holds no {path.name}: give the folder of a run."
         ) from error
-    except InputError:
-        raise
+    try:
+        return parse_json(content)
     except ValueError as error:
         raise CorruptFileError(path, error) from error
-    if not isinstance(content, dict):
-        raise CorruptFileError(path, "it holds no names with values")
-    return content
 
 
 def read_dataset(path: Path) -> xr.Dataset:
     """Read labelled results from a file; InputError if it is missing or corrupt."""
-    try:
-        content = read_checked(path)
-    except OSError as error:
-        raise InputError(
-            f"{path} cannot be read ({error.strerror}): give a file of results."
-        ) from error
-    return decode_results(content, path)
+    return decode_results(read_checked(path), path)
 
 
 def read_results(folder: Path) -> xr.Dataset:
@@ -287,28 +261,18 @@ def check_columns(
     for name, expected in dims.items():
         if name not in results.variables:
             raise CorruptFileError(source, f"it lacks {name}")
-        column = results[name]
-        if column.dims != tuple(expected):
-            raise CorruptFileError(
-                source, f"{name} has the dimensions {column.dims}, not {tuple(expected)}"
-            )
-        if column.dtype.kind not in "biuf":
-            raise CorruptFileError(source, f"{name} holds {column.dtype}, not numbers")
-        for dim in expected:
-            if dim in sizes and column.sizes[dim] != sizes[dim]:
-                raise CorruptFileError(
-                    source, f"{dim} has the length {column.sizes[dim]}, not {sizes[dim]}"
-                )
+        column = results.variables[name]
+        lengths = {dim: sizes.get(dim, column.sizes.get(dim)) for dim in expected}
+        if column.dtype.kind not in "biuf" or [*column.sizes.items()] != [*lengths.items()]:
+            holds = f"{name} holds {column.dtype} of {dict(column.sizes)}"
+            raise CorruptFileError(source, f"{holds}, not numbers of {lengths}")
     return results
 
 
 def check_like(results: xr.Dataset, template: xr.Dataset, source: object) -> xr.Dataset:
     """Return the results of a source if they have the variables and coordinates of a template."""
     if differing := sorted(map(str, {*template.variables} ^ {*results.variables})):
-        name = differing[0]
-        raise CorruptFileError(
-            source, f"it {'holds' if name in results.variables else 'lacks'} {name}"
-        )
+        raise CorruptFileError(source, f"it lacks {differing[0]}, or should not hold it")
     dims = {
         str(name): list(map(str, variable.dims))
         for name, variable in template.variables.items()
@@ -336,7 +300,7 @@ def decode_arrays(content: bytes) -> dict[str, np.ndarray]:
     """
     try:
         with zipfile.ZipFile(io.BytesIO(content)) as archive:
-            if sum(member.file_size for member in archive.infolist()) > MAX_BYTES["part"]:
+            if sum(member.file_size for member in archive.infolist()) > _MAX_PART:
                 raise ValueError("it claims to hold more than such files do")
         with np.load(io.BytesIO(content), allow_pickle=False) as file:
             return {name: file[name] for name in file.files}

@@ -68,12 +68,7 @@ def parse_object(text: str) -> str:
     path = Path(text).absolute()
     name = path.stem if path.stem not in _BUILT_IN else str(path)
     if REGISTERED.get(name, (None,))[0] != path:
-        try:
-            files.read_regular(path, "xml")
-        except OSError as error:
-            raise InputError(
-                f"object = {text} cannot be read ({error.strerror}): give an MJCF file."
-            ) from error
+        files.read_regular(path, "xml")
         register_object(name, path)
     return name
 
