@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -81,10 +81,7 @@ class Drawing:
         )
         self._base = world.add_frame(f"{_ROOT}/base", show_axes=False)
         self._object = world.add_frame(f"{_ROOT}/object", show_axes=False)
-        for i, (body, colour, vertices, faces) in enumerate(meshes(scene.model)):
-            world.add_mesh_simple(
-                f"{_ROOT}/{body}/{i}", vertices, faces, color=colour, flat_shading=True
-            )
+        _add_geoms(world, scene.model)
         self._taxels = _add_taxels(world, f"{_ROOT}/base/taxels", scene.shell)
         self._contact = world.add_icosphere(
             f"{_ROOT}/base/contact", rendering.CONTACT_RADIUS, color=_rgb(rendering.CONTACT_RGBA)
@@ -178,46 +175,32 @@ def _add_taxels(world: Any, name: str, shell: Shell) -> Any:
     )
 
 
-def meshes(
-    model: mujoco.MjModel,
-) -> Iterator[tuple[str, tuple[int, int, int], np.ndarray, np.ndarray]]:
-    """Yield the visible meshes of a model: body, RGB, vertices (V, 3) [m] and faces (F, 3).
-
-    Each is of one colour, in the frame of its body.
-    """
-    from trimesh import transformations, util  # comes with viser
-
-    parts: dict[tuple[str, tuple[int, int, int]], list[Any]] = {}
+def _add_geoms(world: Any, model: mujoco.MjModel) -> None:
+    """Add the visible geoms of a model in the frames of their bodies."""
     for i in range(model.ngeom):
         geom = model.geom(i)
-        body = model.body(int(geom.bodyid[0])).name
         if geom.group[0] > 2 or geom.type[0] == mujoco.mjtGeom.mjGEOM_PLANE:
             continue  # MuJoCo hides these groups, and the page has another ground
-        transform = transformations.quaternion_matrix(geom.quat)
-        transform[:3, 3] = geom.pos
-        placed = _mesh_of(model, geom).apply_transform(transform)
-        parts.setdefault((body, _colour_of(model, geom)), []).append(placed)
-    for (body, colour), solids in parts.items():
-        whole: Any = util.concatenate(solids)
-        yield body, colour, whole.vertices.astype(np.float32), whole.faces.astype(np.uint32)
+        name = f"{_ROOT}/{model.body(int(geom.bodyid[0])).name}/{i}"
+        style = {"color": _colour_of(model, geom), "flat_shading": True}
+        vertices, faces = _mesh_of(model, geom)
+        world.add_mesh_simple(name, vertices, faces, position=geom.pos, wxyz=geom.quat, **style)
 
 
-def _mesh_of(model: mujoco.MjModel, geom: Any) -> Any:
-    """Return a geom in its frame, for trimesh."""
-    from trimesh import Trimesh
-
+def _mesh_of(model: mujoco.MjModel, geom: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Return vertices (V, 3) [m] and faces (F, 3) of a geom in its frame."""
     if geom.type[0] != mujoco.mjtGeom.mjGEOM_MESH:
-        return _solid_of(geom.type[0], geom.size)
+        solid = _solid_of(geom.type[0], geom.size)
+        return np.asarray(solid.vertices), np.asarray(solid.faces)
     mesh = model.mesh(int(geom.dataid[0]))
-    first_vertex, first_face = int(mesh.vertadr[0]), int(mesh.faceadr[0])
-    vertices = model.mesh_vert[first_vertex : first_vertex + int(mesh.vertnum[0])]
-    faces = model.mesh_face[first_face : first_face + int(mesh.facenum[0])]
-    return Trimesh(vertices, faces, process=False)
+    vertices = slice(mesh.vertadr[0], mesh.vertadr[0] + mesh.vertnum[0])
+    faces = slice(mesh.faceadr[0], mesh.faceadr[0] + mesh.facenum[0])
+    return model.mesh_vert[vertices], model.mesh_face[faces]
 
 
 def _solid_of(kind: int, size: np.ndarray) -> Any:
     """Return a primitive of MuJoCo, for trimesh."""
-    from trimesh import creation
+    from trimesh import creation  # comes with viser
 
     if kind == mujoco.mjtGeom.mjGEOM_BOX:
         return creation.box(extents=2 * size)

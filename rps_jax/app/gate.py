@@ -17,19 +17,24 @@ import math
 import socket
 import sys
 import threading
-import types
 import warnings
 from collections.abc import Callable, Iterator, Mapping
+from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
+from unittest import mock
+from urllib.parse import urlsplit
+
+import jax
+import numpy as np
 
 from rps_jax.errors import InputError
 
 if TYPE_CHECKING:
     from viser import GuiInputHandle
 
-_SIZES = {"wxyz": 4, "position": 3, "look_at": 3, "up_direction": 3}  # of a message's tuples
 _MAX_NUMBER = 1e6  # [1] in a message
 _MAX_LENGTH = 200  # characters of a text
+_ALL_ADDRESSES = ("0.0.0.0", "", "::")
 _SUBSTITUTING = threading.Lock()
 
 Rule = Callable[[Any], bool]  # whether the controls of the page can send a message
@@ -43,8 +48,6 @@ class Gate:
         self._host = host.strip("[]").lower()
         self._rules: Mapping[str, Rule] = {}
         self.verbose = False  # whether refusals are printed
-        self._log = logging.Logger("rps view")
-        self._log.addHandler(_OneLine(logging.ERROR))
 
     def allow(self, rules: Mapping[str, Rule]) -> None:
         """Accept messages of these types if their rules return true."""
@@ -58,20 +61,17 @@ class Gate:
         module alone.
         """
         import viser.infra._infra as module
+        from websockets import datastructures, exceptions
         from websockets.asyncio.server import serve
 
-        _infra: Any = module
-        guarded = functools.partial(self._serve, serve)
-        server = types.SimpleNamespace(serve=guarded)
-        names = {"asyncio": types.SimpleNamespace(server=server)}
-        with _SUBSTITUTING:
-            original: Any = _infra.websockets
-            unchanged = {n: getattr(original, n) for n in ("exceptions", "datastructures")}
-            _infra.websockets = types.SimpleNamespace(**names, **unchanged)
-            try:
-                yield
-            finally:
-                _infra.websockets = original
+        server = SimpleNamespace(serve=functools.partial(self._serve, serve))
+        guarded = SimpleNamespace(
+            asyncio=SimpleNamespace(server=server),
+            datastructures=datastructures,
+            exceptions=exceptions,
+        )
+        with _SUBSTITUTING, mock.patch.object(module, "websockets", guarded):
+            yield
 
     def _serve(self, serve: Callable[..., Any], *arguments: Any, **options: Any) -> Any:
         """Create a server that checks every request and every message."""
@@ -100,7 +100,8 @@ class Gate:
             return answer(connection, request)
 
         options |= {"process_request": process_request, "create_connection": Connection}
-        return serve(*arguments, **options, logger=self._log)
+        silent = logging.Logger("rps view", logging.CRITICAL)  # of malformed requests
+        return serve(*arguments, **options, logger=silent)
 
     def refuses(self, headers: Any) -> bool:
         """Return whether a request has another host, or comes from another page."""
@@ -116,16 +117,14 @@ class Gate:
 
         An address cannot be pointed elsewhere; a name must be one by which the page is served.
         """
-        name = host.rpartition(":")[0] if host.rpartition(":")[2].isdecimal() else host
-        name = name.strip("[]").lower()
+        known, serves_all = {"localhost", self._host}, self._host in _ALL_ADDRESSES
+        if serves_all:
+            known |= {socket.gethostname().lower(), socket.getfqdn().lower()}
         try:
-            address = ipaddress.ip_address(name)
+            name = urlsplit(f"//{host}").hostname or ""
+            return name in known or ipaddress.ip_address(name).is_loopback or serves_all
         except ValueError:
-            known = {"localhost", self._host}
-            if not _loopback(self._host):
-                known |= {socket.gethostname().lower(), socket.getfqdn().lower()}
-            return name in known
-        return address.is_loopback or not _loopback(self._host)
+            return False
 
     def accepts(self, raw: Any) -> bool:
         """Return whether the controls of the page can send a message."""
@@ -133,84 +132,46 @@ class Gate:
 
         try:
             with warnings.catch_warnings():
-                warnings.simplefilter("error")  # viser warns of fields of other types
+                warnings.simplefilter("error")  # viser warns of fields of other lengths
                 message = Message.deserialize(raw)
+            is_bounded = all(map(_is_bounded, jax.tree.leaves(vars(message))))
+            return is_bounded and self._rules[type(message).__name__](message)
         except Exception:  # of any kind, by viser on malformed messages
             return False
-        rule = self._rules.get(type(message).__name__)
-        return rule is not None and _has_valid_fields(message.__dict__) and rule(message)
 
     def report(self, refusal: str) -> None:
         """Print a refusal on the error stream, in one line."""
         if self.verbose:
-            self._log.error(refusal)
+            print(f"rps view: {refusal}.", file=sys.stderr, flush=True)
 
 
-class _OneLine(logging.Handler):
-    """A handler that prints the first line of a record, without a traceback."""
-
-    def emit(self, record: logging.LogRecord) -> None:
-        print(f"rps view: {record.getMessage().splitlines()[0]}.", file=sys.stderr, flush=True)
-
-
-def _loopback(host: str) -> bool:
-    try:
-        return ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        return host == "localhost"
+def _is_bounded(leaf: object) -> bool:
+    """Return whether a part of a message is a short text or a bounded number."""
+    if isinstance(leaf, str):
+        return len(leaf) <= _MAX_LENGTH
+    return isinstance(leaf, int | float) and math.isfinite(leaf) and abs(leaf) <= _MAX_NUMBER
 
 
-def _has_valid_fields(values: Mapping[str, Any]) -> bool:
-    """Return whether fields are short texts and bounded finite numbers, of the right length."""
-    for name, value in values.items():
-        if name in _SIZES and not (isinstance(value, tuple | list) and len(value) == _SIZES[name]):
-            return False
-        if not _bounded(value, 3):
-            return False
-    return True
-
-
-def _bounded(value: Any, depth: int) -> bool:
-    if isinstance(value, str):
-        return len(value) <= _MAX_LENGTH
-    if isinstance(value, bool | None):
-        return True
-    if isinstance(value, int | float):
-        return math.isfinite(value) and abs(value) <= _MAX_NUMBER
-    if isinstance(value, dict):
-        value = [*value.keys(), *value.values()]
-    if isinstance(value, tuple | list):
-        return depth > 0 and len(value) <= 64 and all(_bounded(item, depth - 1) for item in value)
-    return False
-
-
-def accepts_update(control: GuiInputHandle[Any], updates: object) -> bool:
+def accepts_update(control: GuiInputHandle[Any], updates: Mapping[str, Any]) -> bool:
     """Return whether a control can have this update: an offered value, or a number in bounds."""
-    if not isinstance(updates, dict) or set(updates) != {"value"}:
+    if set(updates) != {"value"}:
         return False
-    new, current, properties = updates["value"], control.value, control._impl.props
+    properties = control._impl.props
     if (choices := getattr(properties, "options", None)) is not None:
-        return new in choices
-    if isinstance(current, bool | str) or isinstance(new, bool):
-        return type(new) is type(current)
-    if isinstance(current, tuple):
-        values = list(new) if isinstance(new, tuple | list) else []
-        return len(values) == len(current) and all(_in_bounds(x, properties) for x in values)
-    return _in_bounds(new, properties)
-
-
-def _in_bounds(value: object, properties: object) -> bool:
-    """Return whether a value is a number within the bounds of a control, if it has any."""
-    if isinstance(value, bool) or not isinstance(value, int | float):
-        return False
-    low, high = getattr(properties, "min", None), getattr(properties, "max", None)
-    is_above = value >= (low if isinstance(low, int | float) else -_MAX_NUMBER)
-    return is_above and value <= (high if isinstance(high, int | float) else _MAX_NUMBER)
+        return updates["value"] in choices
+    new, current = np.asarray(updates["value"]), np.asarray(control.value)
+    kinds = {array.dtype.kind.replace("i", "f") for array in (new, current)}
+    low, high = (getattr(properties, name, None) for name in ("min", "max"))
+    return (
+        (len(kinds), new.shape) == (1, current.shape)
+        and (low is None or bool(np.all(new >= low)))
+        and (high is None or bool(np.all(new <= high)))
+    )
 
 
 def check_guarded(gate: Gate, host: str, port: int) -> None:
     """Send requests of strangers; InputError if this version of viser answers them."""
-    address = "127.0.0.1" if host in ("0.0.0.0", "", "::") else host
+    address = "127.0.0.1" if host in _ALL_ADDRESSES else host
     for name in ("Host: rebound.example\r\n", f"Host: {address}\r\nOrigin: http://a.example\r\n"):
         with socket.create_connection((address, port), timeout=5) as stranger:
             stranger.sendall(f"GET / HTTP/1.1\r\n{name}Connection: close\r\n\r\n".encode())

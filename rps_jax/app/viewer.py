@@ -29,12 +29,12 @@ from rps_jax.control.registry import LawLike
 from rps_jax.errors import InputError
 from rps_jax.record.options import option
 from rps_jax.runs.plan import Plan, build_batch, scene_of, world_title
-from rps_jax.runs.push import Push as PushQuestion
 from rps_jax.runs.push import another_engine, case_options, select_law
 from rps_jax.runs.question import Action, call_of
 from rps_jax.trials import pushes
 from rps_jax.trials.case import Case, label_of
 from rps_jax.trials.progress import Bar, ProgressCallback
+from rps_jax.trials.setting import Setting
 from rps_jax.trials.stepper import CHUNK, Live
 from rps_jax.world import objects
 from rps_jax.world.scene import Scene
@@ -62,7 +62,7 @@ class Push(NamedTuple):
 
 
 @dataclass(frozen=True)
-class View(Action[Any], PushQuestion):
+class View(Action[None], Case):
     """Push in the browser: watch, drag the target, shove the object, push again."""
 
     law: LawLike | None = None
@@ -77,25 +77,18 @@ class View(Action[Any], PushQuestion):
     """Address to serve the page on; by default to this machine alone."""
     port: int = option(8080, 0, 65535, kw_only=True)
     """Port to serve the page on; 0 takes any that is free."""
+    setting: Setting = field(default=Setting(), kw_only=True)
     out: Path | str | None = option(None, kw_only=True, hidden=True)
-    quick: bool = option(False, kw_only=True, hidden=True)
-    slots: int | None = option(None, kw_only=True, hidden=True)
-    workers: int | None = option(None, kw_only=True, hidden=True)
 
-    @property
-    def _law_of_options(self) -> LawLike:
-        """The law of the options' push."""
-        return self.law if self.law is not None and self.run is None else "rps"
+    def __post_init__(self) -> None:
+        """Defer the checks of `Case` to `check`."""
 
     @property
     def case(self) -> Case:
-        """The options' push."""
-        fields: dict[str, Any] = {
-            field.name: getattr(self, field.name) for field in dataclasses.fields(Case)
-        }
-        fields |= case_options(self, self.setting)
-        fields["law"] = self._law_of_options
-        return Case(**fields)
+        """The options' push; its law is `rps` if the options name a run."""
+        fields = {f.name: getattr(self, f.name) for f in dataclasses.fields(Case)}
+        law = "rps" if self.law is None or self.run is not None else self.law
+        return Case(**fields | case_options(self, self.setting) | {"law": law})
 
     def note(self) -> str:
         """Whether another engine than the run's is shown."""
@@ -103,16 +96,17 @@ class View(Action[Any], PushQuestion):
 
     def check(self) -> None:
         """Check the push, or the world."""
-        super().check()
+        self.setting.check_here(self.case.base, [self.case.params])
         engines.get(self.setting.engine).check_traced()
         if self.run is not None:
-            self._chosen()
+            self._chosen(self.run)
 
-    def _chosen(self) -> tuple[Plan, str]:
+    def num_trials(self) -> int:
+        return 1
+
+    def _chosen(self, run: str | Path) -> tuple[Plan, str]:
         """The plan and the law of a run that is shown."""
-        return select_law(
-            Path(str(self.run)), self.world, None if self.law is None else str(self.law)
-        )
+        return select_law(Path(run), self.world, None if self.law is None else str(self.law))
 
     def progress_bar(self) -> Bar:
         """Return no bar: the page shows the trial."""
@@ -120,12 +114,11 @@ class View(Action[Any], PushQuestion):
 
     def perform(self, callback: ProgressCallback) -> None:
         """Serve the page until it is ended."""
-        law = self._law_of_options if isinstance(self._law_of_options, str) else "rps"
-        friction = self.friction if isinstance(self.friction, str) else label_of(self.friction)
-        request = PushRequest(self.object, friction, law, self.target)
+        law = self.case.law if isinstance(self.case.law, str) else "rps"
+        request = PushRequest(self.object, label_of(self.friction), law, self.target)
         first = partial(self.push_of, request)
         if self.run is not None:
-            first = partial(_in_world, *self._chosen(), self.world)
+            first = partial(_in_world, *self._chosen(self.run), self.world)
         page = open_page(self.host, self.port, request, self.push_of)
         print(f"page: {page.url} (Ctrl-C ends it)", flush=True)
         try:
@@ -139,12 +132,9 @@ class View(Action[Any], PushQuestion):
     def push_of(self, request: PushRequest) -> Push:
         """The push that the page asks for."""
         case = dataclasses.replace(self.case, **request._asdict())
-        title = (
-            f"{case.object_name.replace('_', ' ')}, friction ground {case.contact.ground:g}, robot "
-            f"{case.contact.robot:g}, {request.law}"
-        )
+        title = case.title.replace("$\\mu$", "friction")
         scene = pushes.scene_of(case, self.setting.physics)
-        return Push(Live.of_case(case, self.setting), scene, title)
+        return Push(Live.of_case(case, self.setting), scene, f"{title}, {request.law}")
 
 
 view = call_of(View)
@@ -191,20 +181,17 @@ class Page:
         self._pending: Future[Push] | None = None
         self._push: Push | None = None
         self._drawing: Drawing | None = None
-        self._drawn: tuple[int, int] | None = (
-            None  # index of the moment on the page, and number of moments
-        )
+        self._drawn = (0, 0)  # index of the moment on the page, and number of moments
         self._cursor = 0.0  # index of the moment to show, with the fraction of the next
         self._playing, self._error = True, ""
         self._panel_due = 0.0  # [s] of the next update of the panel
         furnish(server)
-        inputs = {control._impl.uuid: control for control in self._add_controls(request)}
+        self._add_controls(request)
+        inputs = server.gui._gui_input_handle_from_uuid
         gate.allow(
             {
                 "ViewerCameraMessage": lambda message: True,
-                "GuiUpdateMessage": lambda message: (
-                    message.uuid in inputs and accepts_update(inputs[message.uuid], message.updates)
-                ),
+                "GuiUpdateMessage": lambda m: accepts_update(inputs[m.uuid], m.updates),
                 **dict.fromkeys(_DRAGGING, lambda message: message.name == TARGET),
             }
         )
@@ -229,24 +216,22 @@ class Page:
     def run(self) -> None:
         """Serve the page until `close` is called."""
         last = time.perf_counter()
-        while not self._closed.is_set():
-            start = time.perf_counter()
-            self.tick(start - last)
-            last = start
-            self._closed.wait(_TICK - (time.perf_counter() - start))
+        while not self._closed.wait(last + _TICK - time.perf_counter()):
+            time_now = time.perf_counter()
+            self.tick(time_now - last)
+            last = time_now
 
     def tick(self, elapsed: float) -> None:
         """Handle requests, simulate and draw, after `elapsed` [s] since the last tick."""
-        with contextlib.suppress(queue.Empty):
-            while True:
-                try:
-                    self._requests.get_nowait()()
-                except InputError as error:
-                    self._error = str(error)
+        while not self._requests.empty():
+            try:
+                self._requests.get()()
+            except InputError as error:
+                self._error = str(error)
         self._show_built()
-        if self._push is not None:
+        if self._push is not None and self._drawing is not None:
             self._advance(self._push.live, elapsed)
-            self._show(self._push)
+            self._show(self._push.live, self._drawing)
         if (time_now := time.perf_counter()) >= self._panel_due:
             self._panel_due = time_now + _PANEL_TICK
             self._update_panel()
@@ -269,7 +254,7 @@ class Page:
         except InputError as error:
             self._error = str(error)
             return
-        self._cursor, self._drawn, self._playing = 0.0, None, True
+        self._cursor, self._drawn, self._playing = 0.0, (0, 0), True
         with self._server.atomic():
             self._drawing = Drawing(self._server, self._push.scene)
             self._connect(self._drawing.target.on_update, self._drag)
@@ -286,30 +271,24 @@ class Page:
             and time.perf_counter() < until
         ):
             live.step(min(ahead, CHUNK))
-        last = len(live.past) - 1
-        if int(self._cursor) > last:
-            self._cursor = float(last)
+        if self._cursor >= len(live.past):
+            self._cursor = float(len(live.past) - 1)
             self._playing = not live.done
 
-    def _show(self, push: Push) -> None:
+    def _show(self, live: Live, drawing: Drawing) -> None:
         """Draw the moment at the cursor, unless the page shows it."""
-        past = push.live.past
-        index = min(int(self._cursor), len(past) - 1)
-        if self._drawing is None:
-            return
+        past, index, last = live.past, int(self._cursor), len(live.past) - 1
         with self._server.atomic():
             if self._drawn != (index, len(past)):
-                self._drawing.show(past, index)
+                drawing.show(past, index)
                 self._drawn = index, len(past)
-            newest = index == len(past) - 1
-            self._drawing.place_target(
-                push.live.p_world_target if newest else past[index].worlds.p_world_target[0]
-            )
+            target = past[index].worlds.p_world_target[0]
+            drawing.place_target(live.p_world_target if index == last else target)
 
     def _update_panel(self) -> None:
         """Update the texts and buttons of the panel."""
         lines = []
-        if self._push is not None and self._push.live.past:
+        if self._push is not None:
             live = self._push.live
             lines += [f"**{self._push.title}**", self._state_text(live)]
             self._time.max = max(live.period, (len(live.past) - 1) * live.period)
@@ -323,16 +302,22 @@ class Page:
         self._play.label = "Pause" if self._playing else "Play"
 
     def _state_text(self, live: Live) -> str:
-        index = min(int(self._cursor), len(live.past) - 1)
+        index = int(self._cursor)
         moment = live.past[index].snapshot
-        words = [f"{index * live.period:.1f} s"]
-        words.append(f"{float(moment.details.distance):.2f} m to the target")
-        words.append(_CONTACTS[int(moment.reading.contact_type)])
+        words = [
+            f"{index * live.period:.1f} s",
+            f"{float(moment.details.distance):.2f} m to the target",
+            _CONTACTS[int(moment.reading.contact_type)],
+        ]
         if moment.details.realigning:
             words.append("realigning")
-        if live.done and index == len(live.past) - 1:
+        if self._is_over(live):
             words.append(f"**{_outcome_text(live)}**")
         return ", ".join(words)
+
+    def _is_over(self, live: Live) -> bool:
+        """Return whether the page shows the end of a trial."""
+        return live.done and int(self._cursor) == len(live.past) - 1
 
     # --- requests of the browser ---
 
@@ -345,8 +330,8 @@ class Page:
 
         register(note)
 
-    def _add_controls(self, request: PushRequest) -> tuple[Any, ...]:
-        """Build the panel, and return its controls."""
+    def _add_controls(self, request: PushRequest) -> None:
+        """Build the panel."""
         gui = self._server.gui
         self._status = gui.add_markdown("")
         with gui.add_folder("Time"):
@@ -355,61 +340,42 @@ class Page:
             self._speed = gui.add_slider("speed", 1.0, 20.0, 1.0, 5.0, hint="times real time")
         with gui.add_folder("Shove the object"):
             self._distance = gui.add_slider("by [m]", 0.01, 0.5, 0.01, 0.15)
-            self._direction = gui.add_slider(
-                "towards [deg]", -180.0, 180.0, 5.0, 90.0, hint="0: ahead, 90: left of the robot"
-            )
+            hint = "0: ahead, 90: left of the robot"
+            self._direction = gui.add_slider("towards [deg]", -180.0, 180.0, 5.0, 90.0, hint=hint)
             shove = gui.add_button("Shove")
         with gui.add_folder("Another push"):
-            self._object = gui.add_dropdown(
-                "object", tuple(objects.OBJECTS), initial_value=request.object
-            )
-            self._friction = gui.add_text(
-                "friction", request.friction, hint="S1, S2 or ground,robot (as 0.25,0.4)"
-            )
-            laws = tuple(dict.fromkeys((*registry.LAWS, request.law)))
-            self._law = gui.add_dropdown("law", laws, initial_value=request.law)
+            names, laws = tuple(objects.OBJECTS), dict.fromkeys((*registry.LAWS, request.law))
+            self._object = gui.add_dropdown("object", names, initial_value=request.object)
+            hint = "S1, S2 or ground,robot (as 0.25,0.4)"
+            self._friction = gui.add_text("friction", request.friction, hint=hint)
+            self._law = gui.add_dropdown("law", tuple(laws), initial_value=request.law)
             self._target = gui.add_vector2("target [m]", request.target, step=0.1)
             self._again = gui.add_button("Push", color=(13, 148, 141))
         self._connect(self._play.on_click, self._toggle)
         self._connect(self._time.on_update, self._seek)
         self._connect(shove.on_click, self._shove)
         self._connect(self._again.on_click, self._push_again)
-        shown = (
-            self._play,
-            self._time,
-            self._speed,
-            self._distance,
-            self._direction,
-            shove,
-            self._again,
-        )
-        return *shown, self._object, self._friction, self._law, self._target
 
-    def _toggle(self, event: Any) -> None:
+    def _toggle(self, _: Any) -> None:
         """Play or pause; restart a finished push."""
-        del event
         self._playing = not self._playing
-        if self._playing and self._push is not None:
-            live = self._push.live
-            if live.done and int(self._cursor) == len(live.past) - 1:
-                self._cursor = 0.0
+        if self._playing and self._push is not None and self._is_over(self._push.live):
+            self._cursor = 0.0
 
     def _seek(self, event: Any) -> None:
         """Pause at another moment."""
         if self._push is not None:
             self._playing = False
-            self._cursor = round(event.target.value / self._push.live.period)
+            index = round(event.target.value / self._push.live.period)
+            self._cursor = float(min(index, len(self._push.live.past) - 1))
 
-    def _push_again(self, event: Any) -> None:
-        del event
+    def _push_again(self, _: Any) -> None:
         self.start(partial(self._build_push, self.request))
 
-    def _shove(self, event: Any) -> None:
-        del event
+    def _shove(self, _: Any) -> None:
         distance, angle = self._distance.value, math.radians(self._direction.value)
-        self._disturb(
-            lambda live: live.shove((distance * math.cos(angle), distance * math.sin(angle)))
-        )
+        offset = distance * math.cos(angle), distance * math.sin(angle)
+        self._disturb(lambda live: live.shove(offset))
 
     def _drag(self, event: Any) -> None:
         x, y, _ = event.target.position
