@@ -57,13 +57,8 @@ def check_number(
     Raises:
       InputError: the value is NaN, not a number, or out of bounds.
     """
-    bounds = []
-    if above > -math.inf:
-        bounds.append(f"above {above:g}")
-    if at_least > -math.inf:
-        bounds.append(f"at least {at_least:g}")
-    if at_most < math.inf:
-        bounds.append(f"at most {at_most:g}")
+    limits = {"above": above, "at least": at_least, "at most": at_most}
+    bounds = [f"{words} {limit:g}" for words, limit in limits.items() if math.isfinite(limit)]
     allowed = " and ".join(["a number", *bounds]) + (f" [{unit}]" if unit else "")
     try:
         refused = (isinstance(value, str) and not text) or "complex" in type(value).__name__

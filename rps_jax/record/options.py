@@ -16,7 +16,7 @@ import numpy as np
 
 from rps_jax import errors
 
-_BOUNDS = "bounds"
+HIDDEN, POSITIONAL, _BOUNDS = "hidden", "positional", "bounds"  # metadata of fields
 
 
 def option(
@@ -37,20 +37,10 @@ def option(
     bounds = {"at_least": at_least, "at_most": at_most, "above": above, "unit": unit}
     metadata = {
         _BOUNDS: {name: bound for name, bound in bounds.items() if bound is not None},
-        "hidden": hidden,
-        "positional": positional,
+        HIDDEN: hidden,
+        POSITIONAL: positional,
     }
     return dataclasses.field(default=default, metadata=metadata, kw_only=kw_only)
-
-
-def is_hidden(field: dataclasses.Field[object]) -> bool:
-    """Return whether the command line does not offer a field."""
-    return field.metadata.get("hidden", False)
-
-
-def is_positional(field: dataclasses.Field[object]) -> bool:
-    """Return whether the command line has a field without a flag."""
-    return field.metadata.get("positional", False)
 
 
 @functools.cache

@@ -15,9 +15,8 @@ from functools import partial
 from pathlib import Path
 from typing import Annotated, TypeVar, get_args, get_origin
 
-import docstring_parser
 import tyro
-from tyro import _errors
+from tyro import _docstrings, _errors
 from tyro.constructors import (
     ConstructorRegistry,
     PrimitiveConstructorSpec,
@@ -32,7 +31,7 @@ from rps_jax.errors import InputError, check_name
 from rps_jax.record import options
 from rps_jax.record.options import option
 from rps_jax.runs.push import FILM_LENGTH, TraceQuestion
-from rps_jax.runs.question import Action, Command, SimulationQuestion
+from rps_jax.runs.question import Command, SimulationQuestion
 from rps_jax.trials.setting import PhysicsField, Setting
 from rps_jax.trials.trial import Rules
 
@@ -43,18 +42,14 @@ _NUMBER_NOUNS = {int: "a whole number", float: "a number"}
 _LAST = [field.name for field in dataclasses.fields(SimulationQuestion)]  # in the help
 
 
+@dataclass(frozen=True)
 class Session:
     """Options of the command line alone, at their defaults. Subclasses offer some as flags."""
 
-    device: Device = "auto"
-    overwrite: bool = False
-    video: bool = True
-    film_length: float = FILM_LENGTH
-
-
-@dataclass(frozen=True)
-class NoSession(Session):
-    """No options."""
+    device: Device = option("auto", hidden=True)
+    overwrite: bool = option(False, hidden=True)
+    video: bool = option(True, hidden=True)
+    film_length: float = option(FILM_LENGTH, hidden=True)
 
 
 @dataclass(frozen=True)
@@ -87,11 +82,11 @@ class FilmSession(FolderSession):
 
 def session_type(question_type: type) -> type[Session]:
     """Return the type of the options that a command has beside those of its question."""
-    if not issubclass(question_type, SimulationQuestion | TraceQuestion):
-        return NoSession
-    if issubclass(question_type, Action):
-        return DeviceSession
-    return FilmSession if issubclass(question_type, TraceQuestion) else FolderSession
+    if issubclass(question_type, TraceQuestion):
+        return FilmSession
+    if issubclass(question_type, SimulationQuestion):
+        return FolderSession
+    return DeviceSession if hasattr(question_type, "setting") else Session
 
 
 def parse(question_type: type[Q], command: str, words: Sequence[str]) -> tuple[Q, Session]:
@@ -188,25 +183,26 @@ def _fields(info: StructTypeInfo) -> StructConstructorSpec | None:
     """Offer the fields of a dataclass, without the hidden ones."""
     if not dataclasses.is_dataclass(info.type):
         return None
-    types_, docs = options.field_types(info.type), _field_docs(info.type)
+    types_ = options.field_types(info.type)
     specs = []
     for field in _offered(info.type):
         default = vars(info.default)[field.name]  # as it was given: a property may convert it
         marks: list[object] = [_NO_PREFIX] if types_[field.name] in (Setting, Rules) else []
-        if options.is_positional(field):
+        if field.metadata.get(options.POSITIONAL):
             marks = [tyro.conf.Positional, tyro.conf.arg(metavar=field.name.upper())]
             default = tyro.MISSING if default == "" else default
         kind = str if types_[field.name] is PhysicsField else types_[field.name]
         if get_origin(kind) is Sequence:
             kind = tuple[get_args(kind)[0], ...]
         marked = typing.cast(type, Annotated[(kind, *marks)] if marks else kind)
-        specs.append(StructFieldSpec(field.name, marked, default, docs.get(field.name)))
+        text = partial(_docstrings.get_field_docstring, info.type, field.name, info.markers)
+        specs.append(StructFieldSpec(field.name, marked, default, text))
     return StructConstructorSpec(info.type, tuple(specs))
 
 
 def _offered(kind: type) -> list[dataclasses.Field[object]]:
     """Return the fields that are flags: those of the command first, then the shared ones."""
-    shown = [f for f in dataclasses.fields(kind) if f.init and not options.is_hidden(f)]
+    shown = [f for f in dataclasses.fields(kind) if not f.metadata.get(options.HIDDEN)]
     return sorted(shown, key=lambda field: field.name in _LAST)
 
 
@@ -217,13 +213,3 @@ def _flag_names(kind: type) -> Iterator[str]:
             yield from _flag_names(Setting)
         else:
             yield f"--{field.name.replace('_', '-')}"
-
-
-def _field_docs(kind: type) -> dict[str, str]:
-    """Return the strings below the fields of a dataclass and its bases."""
-    return {
-        field.arg_name: " ".join((field.description or "").split())
-        for base in reversed(kind.__mro__)
-        if dataclasses.is_dataclass(base)
-        for field in docstring_parser.parse_from_object(base).params
-    }

@@ -7,6 +7,7 @@ question, or `study.py` of a folder.
 import ast
 import functools
 import importlib
+import re
 import sys
 import textwrap
 from pathlib import Path
@@ -25,6 +26,7 @@ _HEADINGS = {  # of the help, by the rooms that define commands
     "app": "look",
 }
 _REPLACED = {"compare": "rps ladder --domain DOMAIN ..."}  # removed commands
+_DEFINITION = re.compile(r"^(\w+) = call_of\((\w+)\)$", re.MULTILINE)
 _PACKAGE = Path(__file__).parents[2]
 
 
@@ -43,28 +45,15 @@ def known() -> dict[str, Command]:
     commands = {}
     for room in _HEADINGS:
         for path in sorted((_PACKAGE / room).glob("*.py")):
-            if "call_of(" in (text := path.read_text(encoding="utf-8")):
-                for name, (class_name, summary) in _definitions(text).items():
-                    module = f"rps_jax.{room}.{path.stem}"
+            text = path.read_text(encoding="utf-8")
+            if definitions := _DEFINITION.findall(text):
+                classes = (node for node in ast.parse(text).body if isinstance(node, ast.ClassDef))
+                docs = {node.name: ast.get_docstring(node) or "" for node in classes}
+                module = f"rps_jax.{room}.{path.stem}"
+                for name, class_name in definitions:
+                    summary = docs[class_name].partition("\n")[0]
                     commands[name.replace("_", " ")] = Command(room, module, class_name, summary)
     return commands
-
-
-def _definitions(text: str) -> dict[str, tuple[str, str]]:
-    """Return the class of each `name = call_of(Class)` in a file, and its summary, by name."""
-    classes, summaries = {}, {}
-    for node in ast.parse(text).body:
-        match node:
-            case ast.ClassDef(name=class_name):
-                summaries[class_name] = (ast.get_docstring(node) or "").partition("\n")[0]
-            case ast.Assign(
-                targets=[ast.Name(id=name)],
-                value=ast.Call(func=ast.Name(id="call_of"), args=[ast.Name(id=class_name)]),
-            ):
-                classes[name] = class_name
-    return {
-        name: (class_name, summaries.get(class_name, "")) for name, class_name in classes.items()
-    }
 
 
 def overview() -> str:
@@ -112,8 +101,8 @@ def question_type(name: str) -> "type[Question[object]]":
     path = Path(name)
     path = path / "study.py" if path.is_dir() else path
     try:
-        definitions = _definitions(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, SyntaxError) as error:
+        definitions = _DEFINITION.findall(path.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError) as error:
         reason = getattr(error, "strerror", None) or "it is no Python text"
         raise InputError(
             f"study = {path} cannot be read ({reason}): give a file, or a folder with study.py."
@@ -123,8 +112,7 @@ def question_type(name: str) -> "type[Question[object]]":
             f"study = {path} defines {len(definitions)} commands: write `name = call_of(Class)` "
             "once."
         )
-    ((class_name, _),) = definitions.values()
-    return getattr(_import_file(path.resolve()), class_name)
+    return getattr(_import_file(path.resolve()), definitions[0][1])
 
 
 def _import_file(path: Path) -> ModuleType:
@@ -137,11 +125,5 @@ def _import_file(path: Path) -> ModuleType:
     sys.path.insert(0, str(root))  # as Python does for a script
     if root == path.parent:
         return registry.run_file(path, f"_rps_jax_study_{path.stem}")
-    try:
-        return importlib.import_module(".".join(path.relative_to(root).with_suffix("").parts))
-    except InputError:
-        raise
-    except Exception as error:  # of any kind, in the user's code
-        raise InputError(
-            f"{path} cannot be run ({type(error).__name__}: {error}): correct the file."
-        ) from error
+    name = ".".join(path.relative_to(root).with_suffix("").parts)
+    return sys.modules.get(name) or registry.run_file(path, name)

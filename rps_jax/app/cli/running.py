@@ -12,17 +12,15 @@ import os
 import signal
 import sys
 import threading
-import time
-from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from rps_jax.errors import InputError
 
 if TYPE_CHECKING:
-    from numpy.typing import ArrayLike
-
     from rps_jax.app.cli.flags import Session
     from rps_jax.runs.push import Trace
     from rps_jax.runs.question import Command, Question
@@ -51,16 +49,12 @@ def exit_code(command: Callable[[], object]) -> int:
         full = ": make room, then run the same command again; finished parts are stored"
         hint = full if error.errno in _DISK_FULL else ""
         return _print_error(f"{error.filename or 'output'}: {error.strerror or error}{hint}.")
-    except RuntimeError as error:
-        if "RESOURCE_EXHAUSTED" not in str(error):
+    except (RuntimeError, MemoryError) as error:
+        if isinstance(error, RuntimeError) and "RESOURCE_EXHAUSTED" not in str(error):
             raise
         return _print_error(
-            "the device is out of memory: step fewer worlds at once with --slots; finished parts "
+            "out of memory: run fewer worlds, or step fewer at once with --slots; finished parts "
             "are stored."
-        )
-    except MemoryError:
-        return _print_error(
-            "this machine is out of memory: run fewer worlds; finished parts are stored."
         )
     except KeyboardInterrupt:
         print("rps: interrupted.", file=sys.stderr)
@@ -125,7 +119,7 @@ def execute(command: Command[object], session: Session) -> None:
     from rps_jax.engines import device
     from rps_jax.record import cache, folder
     from rps_jax.runs.push import Trace
-    from rps_jax.runs.question import Action, Question, timing_line
+    from rps_jax.runs.question import Question, timing_line
 
     if command.out is None:
         command = dataclasses.replace(command, out=command.default_folder)
@@ -148,18 +142,18 @@ def execute(command: Command[object], session: Session) -> None:
         results = command.execute(bar)
         timed = bar.timing.simulated > 0 and bar.over != "clock"
         timing = timing_line(bar.timing, device.device_name()) if timed else ""
-        if isinstance(command, Action) or not isinstance(command, Question):
+        if not isinstance(command, Question):
             if results is not None:
                 print(f"{command.name}: {results}")
             return
         if session.video and isinstance(results, Trace):
-            film = _Film(results, out, session.film_length)
+            film = _start_film(results, out / "push.mp4", session.film_length)
         report = _write_report(command, results, bar)
-    print(report.read_text(encoding="utf-8"))
+    tqdm.write(report.read_text(encoding="utf-8"))
     if timing:
-        print(timing)
-    if film is not None:
-        film.finish()
+        tqdm.write(timing)
+    if film is not None and isinstance(results, Trace):
+        _print_film(film, results, out / "stills.png")
     if getattr(command, "film", False) and (out / "worlds").is_dir():
         from rps_jax.app.film import Film
 
@@ -187,37 +181,21 @@ def _write_report(question: Question[object], results: object, bar: Bar) -> Path
     return write_report(out, question.title, "\n\n".join(filter(None, intro)), sections)
 
 
-class _Film:
-    """Stills and film of one trial; the film is drawn while the report is written."""
+def _start_film(trace: Trace, path: Path, seconds: float) -> Future[Path]:
+    """Draw the film of a trial in another thread, with a bar, while the report is written."""
+    from tqdm import tqdm
 
-    def __init__(self, trace: Trace, out: Path, seconds: float):
-        self._trace, self._out = trace, out
-        self._total, self._drawn = 0, 0
-        pool = ThreadPoolExecutor(1)
-        self._path = pool.submit(trace.film, out / "push.mp4", seconds, watch=self._watch)
-        pool.shutdown(wait=False)
+    watch = partial(tqdm, unit="frame", desc="film")
+    return ThreadPoolExecutor(1).submit(trace.film, path, seconds, watch=watch)
 
-    def _watch(self, frames: Iterable[ArrayLike]) -> Iterator[ArrayLike]:
-        frames = list(frames)
-        self._total = len(frames)
-        for self._drawn, frame in enumerate(frames):
-            _raise_interrupts()
-            yield frame
 
-    def finish(self) -> None:
-        """Draw the stills, and wait for the film with a bar."""
-        from tqdm import tqdm
+def _print_film(film: Future[Path], trace: Trace, stills: Path) -> None:
+    """Draw the stills of a trial, and wait for its film."""
+    from rps_jax.analysis.report import save
+    from rps_jax.world import video
 
-        from rps_jax.analysis.report import save
-        from rps_jax.world import video
-
-        try:
-            save(self._trace.stills(), self._out / "stills.png")
-            with tqdm(unit="frame", desc="film") as bar:
-                while not self._path.done():
-                    bar.total, bar.n = self._total, self._drawn
-                    bar.refresh()
-                    time.sleep(0.1)
-            print(f"film: {self._path.result()}")
-        except video.VideoError as error:
-            print(f"no film: {error}")
+    try:
+        save(trace.stills(), stills)
+        print(f"film: {film.result()}")
+    except video.VideoError as error:
+        print(f"no film: {error}")
