@@ -255,15 +255,11 @@ def test_the_command_writes_a_folder_with_the_chosen_parameters(tmp_path, capsys
     assert rps("export", "c", *arguments, "--out", tmp_path / "c") == 0
     assert str(tmp_path / "c" / "mine.h") in capsys.readouterr().out
     names = {path.name for path in (tmp_path / "c").iterdir()}
-    assert names == {"mine.h", "main.c", "CMakeLists.txt"}
+    assert names == {"mine.h", "main.c"}
     header = (tmp_path / "c" / "mine.h").read_text()
     assert "(mine_real)0.37, /* press */" in header
     assert "#define MINE_TAXELS 51" in header
     assert "mine_real yaw; /* [rad] heading of the robot in the world */" in header
-    if shutil.which("cmake"):
-        for command in (["-B", "build"], ["--build", "build"]):
-            subprocess.run(["cmake", *command], cwd=tmp_path / "c", check=True, capture_output=True)
-        assert (tmp_path / "c" / "build" / "mine_example").exists()
 
 
 # --- JavaScript and ONNX -------------------------------------------------------------------

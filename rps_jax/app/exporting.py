@@ -69,7 +69,7 @@ class ExportC(Export):
     """Write a law and a skin as one C99 header, with an example that measures itself."""
 
     def texts(self) -> Mapping[str, str | bytes]:
-        """Return the header, the example and the CMake file."""
+        """Return the header and the example."""
         from rps_jax.app.export import folder
 
         return folder.files(self.program, self.named)

@@ -5,9 +5,10 @@ Neither trajectories nor images are stored, so memory does not grow with the fil
 
 from __future__ import annotations
 
+import itertools
 import math
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, NamedTuple, TypeVar
@@ -35,7 +36,6 @@ from rps_jax.world import video
 from rps_jax.world.scene import Scene
 from rps_jax.world.video import Shot, Tile
 
-_MAX_SIDE = 12  # rows, and columns
 _FILM_SIZE = (1920, 1080)  # [px] that the grid is fitted into
 _LENGTH = 40  # [s] of a film at the default speed, at most
 _FREEZE = 1.0  # [s] that the end is held
@@ -85,8 +85,7 @@ class Film(Action[Path]):
 
     def note(self) -> str:
         """Whether another engine than the run's is filmed."""
-        sweep = "laws" in folder.read_manifest(Path(self.run)) and not self._of_table
-        return another_engine(Path(self.run)) if sweep else ""
+        return "" if self._of_table else another_engine(Path(self.run))
 
     @property
     def _of_table(self) -> bool:
@@ -94,16 +93,14 @@ class Film(Action[Path]):
 
     def check(self) -> None:
         """Check the grid, the file and the selected trials."""
+        self.takes()
         out = Path(self.out or self.default_folder)
         if out.is_dir():
             raise InputError(f"out = {out} is a folder: name a file, as {out / 'film.mp4'}.")
-        _ = self.shape
-        folder.read_manifest(Path(self.run))
         folder.ensure_writable(out.parent)
         for check in video.check():
             if not check.ok:
                 raise InputError(check.fix)
-        self.takes()
 
     def progress_bar(self) -> Bar:
         """A bar over simulated time."""
@@ -118,12 +115,11 @@ class Film(Action[Path]):
         takes, setting = self.takes()
         seconds, out = self._length(setting), Path(self.out or self.default_folder)
         speed = self.speed or float(max(1, math.ceil(seconds / _LENGTH)))
-        of_takes = [list(map(Tile, take.scenes, take.part.worlds.p_world_target)) for take in takes]
+        tiles = [map(Tile, take.scenes, take.part.worlds.p_world_target) for take in takes]
         frames = _frames(takes, setting, speed, seconds, callback)
-        size = _tile_size(self.shape)
-        grid = {"shape": self.shape, "size": size, "fps": _FPS, "camera": self.camera}
+        grid = {"shape": self.shape, "size": _tile_size(self.shape), "camera": self.camera}
         try:
-            video.render_grid(_in_grid_order(of_takes, takes), frames, out, **grid)
+            video.render_grid(_in_grid_order(tiles, takes), frames, out, fps=_FPS, **grid)
         except video.VideoError as error:
             raise InputError(str(error)) from error
         return out
@@ -142,12 +138,8 @@ class Film(Action[Path]):
         errors.check_name("object of the run", self.object, table.objects)
         errors.check_name("friction of the run", self.friction, map(str, table.friction))
         errors.check_name("law of the run", law, table.chosen)
-        cases = [
-            case
-            for case in table.cases
-            if (case.object, case.friction) == (self.object, self.friction)
-            and case.law is table.chosen[law]
-        ]
+        key = self.object, self.friction, id(table.chosen[law])
+        cases = [c for c in table.cases if (c.object, c.friction, id(c.law)) == key]
         return of_cases(cases[: shape[0] * shape[1]], table.setting), table.setting
 
 
@@ -166,13 +158,12 @@ class Take(NamedTuple):
 
 def shape_of(grid: str) -> tuple[int, int]:
     """Return rows and columns of a grid, written as 4x6."""
-    match = re.fullmatch(r"(\d{1,9})x(\d{1,9})", grid)
-    if not match or not all(1 <= int(n) <= _MAX_SIDE for n in match.groups()):
+    match = re.fullmatch(r"([1-9]|1[0-2])x([1-9]|1[0-2])", grid)
+    if match is None:
         raise InputError(
-            f"grid = {grid} is not allowed: write ROWSxCOLUMNS, as 4x6, each from 1 to {_MAX_SIDE}."
+            f"grid = {grid} is not allowed: write ROWSxCOLUMNS, as 4x6, each from 1 to 12."
         )
-    rows_, columns = map(int, match.groups())
-    return rows_, columns
+    return int(match[1]), int(match[2])
 
 
 def of_cases(cases: Sequence[Case], setting: Setting) -> list[Take]:
@@ -245,10 +236,10 @@ def _tile_size(shape: tuple[int, int]) -> tuple[int, int]:
     return 2 * int(8 * unit), 2 * int(4.5 * unit)
 
 
-def _in_grid_order(items: Sequence[Sequence[T]], takes: Sequence[Take]) -> list[T]:
+def _in_grid_order(items: Iterable[Iterable[T]], takes: Sequence[Take]) -> list[T]:
     """Return the items of all takes, one per trial, in the order of the grid."""
     tiles = [tile for take in takes for tile in take.tiles]
-    flat = [item for items_of_take in items for item in items_of_take]
+    flat = list(itertools.chain.from_iterable(items))
     return [flat[i] for i in np.argsort(tiles)]
 
 
@@ -280,26 +271,21 @@ def _frames(
 def _shots(take: Take, setting: Setting, interval: int) -> Iterator[tuple[bool, list[Shot]]]:
     """Yield whether all trials of a take have ended, and their tiles, at each interval."""
     part = jax.device_put(take.part)
-    trials = trial.start_all(
-        part.worlds, part.params, np.ones(len(take.labels), bool), law=take.law
-    )
+    ended = np.zeros(len(take.labels), bool)
+    trials = trial.start_all(part.worlds, part.params, ~ended, law=take.law)
     advance = pushes.recorder(part, trials, setting, take.law, steps=interval, stride=interval)
     shots: list[Shot] = []
-    ended = np.zeros(len(take.labels), bool)
     while True:
         done, success, steps = jax.device_get((trials.done, trials.success, trials.steps))
         trials, snapshots, _ = advance(trials)
         moment = rows(jax.device_get(snapshots), 0)
         contacts = np.asarray(trial.p_world_contact(moment))
         time = steps * setting.physics.control_period
-        shots = [
-            shots[i]  # unchanged, and so not drawn again
-            if ended[i]
-            else Shot(
-                moment.qpos[i], contacts[i], f"{label}, {_status(done[i], success[i], time[i])}"
-            )
-            for i, label in enumerate(take.labels)
-        ]
+        states = map(_status, done, success, time)
+        texts = [f"{label}, {state}" for label, state in zip(take.labels, states, strict=True)]
+        fresh = map(Shot, moment.qpos, contacts, texts)
+        # An unchanged shot is not drawn again.
+        shots = [shots[i] if ended[i] else shot for i, shot in enumerate(fresh)]
         ended = done
         yield bool(done.all()), shots
 

@@ -10,7 +10,7 @@ from matplotlib import patches
 from matplotlib.axes import Axes
 from matplotlib.collections import PathCollection
 
-from rps_jax.analysis.figures.style import SHADES, Figure, base_patch, shade, words
+from rps_jax.analysis.figures.style import SHADES, Figure, base_patch, shade, tiles, words
 from rps_jax.control.laws import rps
 from rps_jax.control.laws.rps import RPSParams
 from rps_jax.robot import shell, skin
@@ -115,12 +115,9 @@ def _path(ax: Axes, trace: xr.Dataset) -> None:
 
 def stills(images: Sequence[np.ndarray], titles: Sequence[str]) -> Figure:
     """Draw Figs. 1 and 4: images (height, width, 3) with their titles, three in a row."""
-    rows = -(-len(images) // 3)
-    figure = Figure(figsize=(12, 2.3 * rows), layout="constrained")
-    axes = figure.subplots(rows, 3, squeeze=False).ravel()
-    for ax in axes:
+    figure, axes = tiles(len(images), 3, (4, 2.3), (0, 0))
+    for ax, image, title in zip(axes.ravel(), images, titles, strict=False):
         ax.axis("off")
-    for ax, image, title in zip(axes, images, titles, strict=False):
         ax.imshow(image)
         ax.set_title(words(title), fontsize=9)
     return figure

@@ -1,24 +1,21 @@
-"""The folder of a law in C: the header, an example that measures itself, and a CMake file."""
+"""The folder of a law in C: the header, and an example that measures itself."""
 
 from __future__ import annotations
 
 from rps_jax.app.export import c
 from rps_jax.app.export.program import Program
 
-# How the example fills what laws of each kind observe extra touch.
-_EXTRA = {
-    "touch": "",
-    "taxels": "      seen.line = contact.line;\n"
-    "      for (int k = 0; k < {P}_TAXELS; k++) seen.signal[k] = contact.signal[k];\n",
-    "force": "      seen.f_robot[0] = -20; /* [N] of the object on the base */\n",
-    "pose": "      seen.p_world_object[0] = seen.p_world_robot[0] + 0.6f;\n"
-    "      seen.p_world_object[1] = seen.p_world_robot[1];\n"
-    "      seen.r_object = 0.25f; /* [m] */\n",
-}
+# How the example fills the signals of laws that observe them.
+_SIGNALS = """\
+      seen.line = contact.line;
+      for (int k = 0; k < {P}_TAXELS; k++) seen.signal[k] = contact.signal[k];
+"""
 
 _EXAMPLE = """\
 /* Drives a stand-in of a robot that always feels an object left of the middle of its front, and
-   prints how long skin and law took. Put your drivers in its place. */
+   prints how long skin and law took. Put your drivers in its place.
+
+     cc -std=c99 -O2 main.c -lm -o example */
 
 #define _POSIX_C_SOURCE 199309L
 
@@ -61,7 +58,7 @@ int main(void) {{
       seen.in_contact = contact.in_contact;
       seen.p_robot_contact[0] = contact.p_robot_contact[0];
       seen.p_robot_contact[1] = contact.p_robot_contact[1];
-{extra}      code = {p}_step(&params, &memory, &seen, &twist);
+{signals}      code = {p}_step(&params, &memory, &seen, &twist);
     }}
     clock_gettime(CLOCK_MONOTONIC, &ended);
     took[i] = 1e6 * (double)(ended.tv_sec - began.tv_sec)
@@ -85,30 +82,12 @@ int main(void) {{
 }}
 """
 
-_CMAKE = """\
-cmake_minimum_required(VERSION 3.10)
-project({p} C)
-set(CMAKE_C_STANDARD 99)
-if(NOT CMAKE_BUILD_TYPE)
-  set(CMAKE_BUILD_TYPE Release)
-endif()
-
-add_library({p} INTERFACE)
-target_include_directories({p} INTERFACE ${{CMAKE_CURRENT_SOURCE_DIR}})
-target_link_libraries({p} INTERFACE m)
-
-add_executable({p}_example main.c)
-target_compile_options({p}_example PRIVATE -Wall -Wextra -pedantic)
-target_link_libraries({p}_example PRIVATE {p})
-"""
-
 
 def files(program: Program, prefix: str) -> dict[str, str]:
     """Return the texts of the files, by name."""
     names = {"p": prefix, "P": prefix.upper()}
-    extra = _EXTRA[program.senses].format(**names)
+    signals = _SIGNALS.format(**names) if program.senses == "taxels" else ""
     return {
         f"{prefix}.h": c.header(program, prefix),
-        "main.c": _EXAMPLE.format(**names, extra=extra),
-        "CMakeLists.txt": _CMAKE.format(**names),
+        "main.c": _EXAMPLE.format(**names, signals=signals),
     }

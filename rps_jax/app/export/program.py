@@ -58,12 +58,6 @@ class Scan(NamedTuple):
     period: Leaf  # [s] since the last step
 
 
-class Filtered(NamedTuple):
-    """Part of the state of a skin that a scan changes."""
-
-    signal: Leaf  # (T,) [1] filtered, of each taxel
-
-
 class Contact(NamedTuple):
     """Contact that a skin detects."""
 
@@ -103,14 +97,14 @@ def program(law: registry.LawLike, robot: Any = "ideal", skin: Any = "capacitive
         memory, twist, _ = functions.step(params, memory, observation)
         return memory, Twist(*twist)
 
-    def skin_step(skin_params: SkinParams, skin: Skin, scan: Scan) -> tuple[Filtered, Contact]:
+    def skin_step(skin_params: SkinParams, skin: Skin, scan: Scan) -> tuple[Pytree, Contact]:
         scaled = sensor._replace(**skin_params._asdict())
         key: Any = jax.ShapeDtypeStruct((2,), np.uint32)  # of simulated noise
         state = skins.SkinState(key, skin.signal, skin.signal, skin.alive)
         state, reading = scaled.read(state, scan.taxels, scan.period)
         signal = jnp.where(skin.alive, state.signal, 0.0)
         touch = (reading.contact_type, reading.p_robot_contact, reading.in_contact)
-        return Filtered(state.signal), Contact(*touch, reading.contact_type == LINE, signal)
+        return {"signal": state.signal}, Contact(*touch, reading.contact_type == LINE, signal)
 
     values = SkinParams(*(np.asarray(float(getattr(sensor, x))) for x in SkinParams._fields))
     skin_inputs = {
@@ -119,15 +113,15 @@ def program(law: registry.LawLike, robot: Any = "ideal", skin: Any = "capacitive
         "scan": Scan(taxels, _REAL),
     }
     inputs = {"params": shapes, "memory": memory, "observation": observation}
-    init = routine("init", lambda params: (functions.init(params),), {"params": shapes},
-                   ("memory",))  # fmt: skip
+    start_step = lambda params: (functions.init(params),)  # noqa: E731
+    init = routine("init", start_step, {"params": shapes}, ("memory",))
     law_step = routine("step", step, inputs, ("memory", "twist"))
     touch = routine("skin_step", skin_step, skin_inputs, ("filtered", "contact"))
     groups = {**law_step.inputs, **law_step.outputs, **touch.inputs, **touch.outputs}
-    for name, tree, start_values in (
-        *(("params", shapes, params), ("memory", memory, start)),
-        ("skin_params", skin_inputs["skin_params"], values),
-    ):
-        groups[name] = fields_of(tree, start_values)
+    groups |= {
+        "params": fields_of(shapes, params),
+        "memory": fields_of(memory, start),
+        "skin_params": fields_of(skin_inputs["skin_params"], values),
+    }
     name = robot if isinstance(robot, str) else "custom"
     return Program(label, name, functions.senses, groups, init, law_step, touch)
