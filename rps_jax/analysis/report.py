@@ -57,14 +57,9 @@ class Section(NamedTuple):
     picture: Picture | None = None
 
     def _repr_markdown_(self) -> str:
-        """Return the text and the table, for Jupyter."""
-        return "\n\n".join(self.lines)
-
-    @property
-    def lines(self) -> list[str]:
-        """Heading, text and table as Markdown."""
-        table = [tables.markdown(self.table)] if self.table else []
-        return [f"## {self.title}", *([self.text] if self.text else []), *table]
+        """Return heading, text and table as Markdown, also for Jupyter."""
+        table = tables.markdown(self.table) if self.table else ""
+        return "\n\n".join(filter(None, (f"## {self.title}", self.text, table)))
 
 
 def write_report(folder: Path, title: str, intro: str, sections: Sequence[Section]) -> Path:
@@ -73,7 +68,7 @@ def write_report(folder: Path, title: str, intro: str, sections: Sequence[Sectio
 
     texts, pictures = [f"# {title}", intro], {}
     for section in sections:
-        texts += section.lines
+        texts.append(section._repr_markdown_())
         if section.picture:
             name = f"{section.picture.name}.png"
             pictures[name] = section.picture.png()

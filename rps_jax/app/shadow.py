@@ -104,20 +104,14 @@ def shadowed(law: Law, params: LawParams, recorded: dict[str, np.ndarray]) -> np
     values |= {"in_contact": contact_type > 0, "line": contact_type == 2}
     values |= {"p_world_target": recorded["target"]}
 
-    def fill(shapes: Any) -> Any:  # a NamedTuple of any type, of arrays and of others
-        """Return observations (N, ...) of the bag."""
-        fields = {}
-        for name, shape in shapes._asdict().items():
-            if hasattr(shape, "_fields"):
-                fields[name] = fill(shape)
-            elif name in values:
-                fields[name] = jnp.asarray(values[name], shape.dtype)
-            else:
-                raise InputError(
-                    f"the bag has no {name}, which the law senses ({law.senses}): record it, or "
-                    "choose another law."
-                )
-        return type(shapes)(**fields)
+    def value_of(path: Sequence[Any], shape: jax.ShapeDtypeStruct) -> jax.Array:
+        """Return the values (N, ...) of a field of the observation."""
+        if (name := path[-1].name) not in values:
+            raise InputError(
+                f"the bag has no {name}, which the law senses ({law.senses}): record it, or choose "
+                "another law."
+            )
+        return jnp.asarray(values[name], shape.dtype)
 
     @jax.jit
     def run(params: LawParams, observations: Any) -> jax.Array:
@@ -132,7 +126,8 @@ def shadowed(law: Law, params: LawParams, recorded: dict[str, np.ndarray]) -> np
 
     sent = jnp.asarray(np.pad(recorded["twist"][:-1], ((1, 0), (0, 0))), float)
     params = jax.tree.map(lambda x: jnp.asarray(x, float), params)
-    return np.asarray(run(params, fill(validation.observation_shapes(law.senses))))
+    shapes = validation.observation_shapes(law.senses)
+    return np.asarray(run(params, jax.tree_util.tree_map_with_path(value_of, shapes)))
 
 
 def figure(results: xr.Dataset) -> Figure:

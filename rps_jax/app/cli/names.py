@@ -67,15 +67,12 @@ def overview() -> str:
         "Pushing unknown objects by touch: the Reactive Pushing Strategy in MuJoCo.",
     ]
     width = max(map(len, known())) + 2
-    indent = " " * (width + 2)
     for room, heading in _HEADINGS.items():
+        commands = {name: known()[name].summary for name in known() if known()[name].room == room}
+        texts = (f"  {name:<{width}}{summary}" for name, summary in commands.items())
+        indent = " " * (width + 2)
         lines += ["", f"{heading}:"]
-        for name, command in known().items():
-            if command.room == room:
-                text = textwrap.fill(
-                    command.summary, 100, initial_indent=indent, subsequent_indent=indent
-                )
-                lines.append(f"  {name.ljust(width)}{text.lstrip()}")
+        lines += [textwrap.fill(text, 100, subsequent_indent=indent) for text in texts]
     return "\n".join(lines)
 
 

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
 from rps_jax import __version__
 from rps_jax.app.export.program import Program
 from rps_jax.lowering.c import HELPERS, literal, statements, struct
-from rps_jax.lowering.routine import Field, Group
+from rps_jax.lowering.routine import Field, Group, Routine
 
 # Placeholders in capitals are lines that are printed for a law.
 _HEADER = """\
@@ -74,6 +74,7 @@ static inline int {p}_step(const {p}_params *params, {p}_memory *memory,
   {p}_twist result;
 {STEP}
 {STEP_RESULT}
+{STEP_MEMORY}
   *memory = next;
   *twist = result;
   return {P}_OK;
@@ -105,7 +106,7 @@ static inline int {p}_skin_step(const {p}_skin_params *params, {p}_skin *skin,
 """
 
 
-def _initialiser(prefix: str, name: str, group: Group) -> str:
+def _initialiser(prefix: str, name: str, groups: Mapping[str, Group]) -> str:
     """Return the macro of the initial values of a group."""
 
     def text(value: np.ndarray) -> str:
@@ -113,12 +114,12 @@ def _initialiser(prefix: str, name: str, group: Group) -> str:
             return "{" + ", ".join(map(text, value)) + "}"
         return literal(prefix, value.item(), "f")
 
-    lines = [f"  {text(np.asarray(field.value))}, /* {field.name} */ \\" for field in group]
-    head = f"#define {prefix.upper()}_{name} {{ \\"
-    return "\n".join([head, *(lines or ["  0 \\"]), "}", ""])
+    lines = [f"  {text(np.asarray(field.value))}, /* {field.name} */ \\" for field in groups[name]]
+    head = f"#define {prefix.upper()}_{name.upper()} {{ \\"
+    return "\n".join([head, *(lines or ["  0 \\"]), "}\n"])
 
 
-def _checks(fields: Sequence[Field], prefix: str, statement: str, kinds: str = "f") -> str:
+def _for_each(fields: Sequence[Field], prefix: str, statement: str, kinds: str = "f") -> str:
     """Return a statement about each number of the fields of some kinds."""
     lines = []
     for field in fields:
@@ -133,37 +134,31 @@ def _checks(fields: Sequence[Field], prefix: str, statement: str, kinds: str = "
 
 def header(program: Program, prefix: str) -> str:
     """Return the whole header."""
-    p, upper, groups = prefix, prefix.upper(), program.groups
-    bad_input, bad_result = f"return {upper}_BAD_INPUT;", f"return {upper}_BAD_RESULT;"
-    odd, tables = "if (!isfinite({})) ", dict[str, str]()
-    structs = ("params", "memory", "observation", "twist", "skin_params", "skin", "contact")
-    law = {"params": "params->", "memory": "memory->", "observation": "observation->"}
+    p, upper, groups, tables = prefix, prefix.upper(), program.groups, dict[str, str]()
+    law = {name: f"{name}->" for name in ("params", "memory", "observation")}
     skin = {"skin_params": "params->", "skin": "skin->", "scan": ""}
+    structs = ("params", "memory", "observation", "twist", "skin_params", "skin", "contact")
+
+    def body(routine: Routine, inputs: Mapping[str, str], **outputs: str) -> str:
+        return statements(routine, inputs, outputs, tables, p)
+
+    def checks(name: str, owner: str, code: str, condition: str = "!isfinite({0})") -> str:
+        return _for_each(groups[name], owner, f"if ({condition}) return {upper}_{code};")
+
     lines = {
-        "INIT": statements(program.init, law, {"memory": "memory->"}, tables, p),
-        "STEP": statements(program.step, law, {"memory": "next.", "twist": "result."}, tables, p),
-        "SKIN": statements(
-            program.skin_step, skin, {"filtered": "next.", "contact": "result."}, tables, p
-        ),
-        "STEP_CHECKED": _checks(groups["observation"], "observation->", odd + bad_input),
-        "STEP_RESULT": "\n".join(
-            [
-                _checks(groups["twist"], "result.", odd + bad_result),
-                _checks(groups["memory"], "next.", "if ({0} != {0}) " + bad_result),
-            ]
-        ),
-        "NO_CONTACT": _checks(groups["contact"], "contact->", "{} = 0;", "fib"),
-        "SKIN_CHECKED": _checks(groups["scan"], "", odd + bad_input),
-        "SKIN_RESULT": _checks(groups["skin"], "next.", odd + bad_result),
+        "INIT": body(program.init, law, memory="memory->"),
+        "STEP": body(program.step, law, memory="next.", twist="result."),
+        "SKIN": body(program.skin_step, skin, filtered="next.", contact="result."),
+        "STEP_CHECKED": checks("observation", "observation->", "BAD_INPUT"),
+        "STEP_RESULT": checks("twist", "result.", "BAD_RESULT"),
+        "STEP_MEMORY": checks("memory", "next.", "BAD_RESULT", "{0} != {0}"),
+        "NO_CONTACT": _for_each(groups["contact"], "contact->", "{} = 0;", "fib"),
+        "SKIN_CHECKED": checks("scan", "", "BAD_INPUT"),
+        "SKIN_RESULT": checks("skin", "next.", "BAD_RESULT"),
         "STRUCTS": "\n".join(struct(p, name, groups[name]) for name in structs),
-        "INITIALISERS": "\n".join(
-            _initialiser(p, name.upper(), groups[name]) for name in ("params", "skin_params")
-        ),
+        "INITIALISERS": _initialiser(p, "params", groups) + _initialiser(p, "skin_params", groups),
+        "TABLES": "\n".join([*tables.values(), ""] if tables else []),
+        "HELPERS": HELPERS.format(p=p, P=upper),
     }
-    return _HEADER.format(
-        **lines,
-        HELPERS=HELPERS.format(p=p, P=upper),
-        TABLES="\n".join([*tables.values(), ""] if tables else []),
-        **{"label": program.label, "robot": program.robot, "version": __version__},
-        **{"p": p, "P": upper, "taxels": program.taxels},
-    )
+    about = {"label": program.label, "robot": program.robot, "version": __version__}
+    return _HEADER.format(**lines, **about, p=p, P=upper, taxels=program.taxels)
