@@ -1,7 +1,7 @@
 """The viewer: a push in the browser, which users can rewind, disturb and start again.
 
-viser serves the page. The thread of `Page.run` owns the simulation and the drawing; requests of
-browsers wait for it in a queue.
+viser serves the page. The thread of `Page.run` builds and simulates pushes and draws them; requests
+of browsers wait for it in a queue.
 """
 
 from __future__ import annotations
@@ -15,7 +15,6 @@ import socket
 import threading
 import time
 from collections.abc import Callable
-from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -44,12 +43,9 @@ if TYPE_CHECKING:
 
 _TICK = 0.04  # [s] between two frames
 _PANEL_TICK = 0.25  # [s] between two updates of the panel, which browsers are slow to lay out
+_MAX_ELAPSED = 0.5  # [s] between two ticks, also if a push was built in the first
 _BUDGET = 0.15  # [s] of simulation between two updates of the page
-_DRAGGING = (
-    "TransformControlsUpdateMessage",
-    "TransformControlsDragStartMessage",
-    "TransformControlsDragEndMessage",
-)
+_DRAGGING = [f"TransformControls{event}Message" for event in ("Update", "DragStart", "DragEnd")]
 _CONTACTS = ("no contact", "point contact", "line contact")
 
 
@@ -172,15 +168,13 @@ class Page:
     ) -> None:
         """Create a page without a push, whose panel shows a `request`.
 
-        Another thread calls `build`, which may raise InputError.
+        `build` may raise InputError.
         """
         self._server, self._build_push = server, build
         self._requests: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
         self._closed = threading.Event()
-        self._builder = ThreadPoolExecutor(1)
-        self._pending: Future[Push] | None = None
         self._push: Push | None = None
-        self._drawing: Drawing | None = None
+        self._drawing: Drawing  # of the push
         self._drawn = (0, 0)  # index of the moment on the page, and number of moments
         self._cursor = 0.0  # index of the moment to show, with the fraction of the next
         self._playing, self._error = True, ""
@@ -208,17 +202,19 @@ class Page:
         return PushRequest(self._object.value, self._friction.value, self._law.value, (x, y))
 
     def start(self, build: Callable[[], Push]) -> None:
-        """Build another push, and show it when it is ready."""
-        if self._pending is None:
-            self._error = ""
-            self._pending = self._builder.submit(_build_and_step, build)
+        """Have `run` build another push and show it."""
+        self._again.disabled = True
+        self._status.content = (
+            "The push is being prepared; the first of a shape takes some seconds."
+        )
+        self._requests.put(partial(self._show_built, build))
 
     def run(self) -> None:
         """Serve the page until `close` is called."""
         last = time.perf_counter()
         while not self._closed.wait(last + _TICK - time.perf_counter()):
             time_now = time.perf_counter()
-            self.tick(time_now - last)
+            self.tick(min(time_now - last, _MAX_ELAPSED))
             last = time_now
 
     def tick(self, elapsed: float) -> None:
@@ -228,10 +224,9 @@ class Page:
                 self._requests.get()()
             except InputError as error:
                 self._error = str(error)
-        self._show_built()
-        if self._push is not None and self._drawing is not None:
+        if self._push is not None:
             self._advance(self._push.live, elapsed)
-            self._show(self._push.live, self._drawing)
+            self._show(self._push.live)
         if (time_now := time.perf_counter()) >= self._panel_due:
             self._panel_due = time_now + _PANEL_TICK
             self._update_panel()
@@ -239,24 +234,18 @@ class Page:
     def close(self) -> None:
         """End `run`, and the server."""
         self._closed.set()
-        self._builder.shutdown(wait=False, cancel_futures=True)
         self._server.stop()
 
     # --- simulation and drawing ---
 
-    def _show_built(self) -> None:
-        """Show the push that was built, if it is ready."""
-        if self._pending is None or not self._pending.done():
-            return
-        finished, self._pending = self._pending, None
-        try:
-            self._push = finished.result()
-        except InputError as error:
-            self._error = str(error)
-            return
+    def _show_built(self, build: Callable[[], Push]) -> None:
+        """Build a push and step it once, which compiles its program; then show it."""
+        push = build()
+        push.live.step()
+        self._push, self._error = push, ""
         self._cursor, self._drawn, self._playing = 0.0, (0, 0), True
         with self._server.atomic():
-            self._drawing = Drawing(self._server, self._push.scene)
+            self._drawing = Drawing(self._server, push.scene)
             self._connect(self._drawing.target.on_update, self._drag)
 
     def _advance(self, live: Live, elapsed: float) -> None:
@@ -275,15 +264,15 @@ class Page:
             self._cursor = float(len(live.past) - 1)
             self._playing = not live.done
 
-    def _show(self, live: Live, drawing: Drawing) -> None:
+    def _show(self, live: Live) -> None:
         """Draw the moment at the cursor, unless the page shows it."""
         past, index, last = live.past, int(self._cursor), len(live.past) - 1
         with self._server.atomic():
             if self._drawn != (index, len(past)):
-                drawing.show(past, index)
+                self._drawing.show(past, index)
                 self._drawn = index, len(past)
             target = past[index].worlds.p_world_target[0]
-            drawing.place_target(live.p_world_target if index == last else target)
+            self._drawing.place_target(live.p_world_target if index == last else target)
 
     def _update_panel(self) -> None:
         """Update the texts and buttons of the panel."""
@@ -293,12 +282,10 @@ class Page:
             lines += [f"**{self._push.title}**", self._state_text(live)]
             self._time.max = max(live.period, (len(live.past) - 1) * live.period)
             self._time.value = int(self._cursor) * live.period
-        if self._pending is not None:
-            lines.append("The push is being prepared; the first of a shape takes some seconds.")
         if self._error:
             lines.append(f"**Not possible:** {self._error}")
         self._status.content = "\n\n".join(lines)
-        self._again.disabled = self._pending is not None
+        self._again.disabled = False
         self._play.label = "Pause" if self._playing else "Play"
 
     def _state_text(self, live: Live) -> str:
@@ -379,7 +366,7 @@ class Page:
 
     def _drag(self, event: Any) -> None:
         x, y, _ = event.target.position
-        if self._drawing is not None and event.target is self._drawing.target:
+        if event.target is self._drawing.target:
             self._drawing.held = event.phase != "end"
             self._disturb(lambda live: live.set_target((float(x), float(y))))
 
@@ -390,13 +377,6 @@ class Page:
             self._push.live.rewind(int(self._cursor))
             act(self._push.live)
             self._playing = True
-
-
-def _build_and_step(build: Callable[[], Push]) -> Push:
-    """Build a push and step it once, which compiles its program."""
-    push = build()
-    push.live.step()
-    return push
 
 
 def _outcome_text(live: Live) -> str:
