@@ -17,16 +17,8 @@ _HEADER = """\
 
    C99 without allocation; it needs math.h alone. Numbers are float, or double if {P}_DOUBLE is
    defined. Frames: the world, and the robot (origin at the middle of the base, x forward, y left).
-
-     {p}_params params = {P}_PARAMS;              the chosen parameters
-     {p}_memory memory;
-     {p}_init(&params, &memory);
-     {p}_step(&params, &memory, &observation, &twist);   once in each control period
-
-     {p}_skin_params skin_params = {P}_SKIN_PARAMS;
-     {p}_skin skin;
-     {p}_skin_init(&skin);
-     {p}_skin_step(&skin_params, &skin, taxels, period, &contact);   once for each scan
+   Call {p}_init once and {p}_step in each control period, and {p}_skin_init once and
+   {p}_skin_step for each scan of the taxels, as the example main.c does.
 
    Taxels are in the order of the strip: left side from the rear, front from left to right, right
    side from the front. One whose `alive` is 0 is ignored, but must be finite. A step returns
