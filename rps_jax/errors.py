@@ -93,9 +93,13 @@ def check_name(kind: str, name: str, known: Iterable[str]) -> str:
     known = list(known)
     if name in known:
         return name
-    near = difflib.get_close_matches(str(name), known, n=1)
-    hint = f" (did you mean '{near[0]}'?)" if near else ""
-    raise InputError(f"unknown {kind} '{name}': choose from {', '.join(known)}{hint}.")
+    raise InputError(f"unknown {kind} '{name}': choose from {', '.join(known)}{near(name, known)}.")
+
+
+def near(name: object, known: Sequence[str]) -> str:
+    """Return a hint at the known name that is most similar to an unknown one, if any is."""
+    matches = difflib.get_close_matches(str(name), known, n=1)
+    return f" (did you mean '{matches[0]}'?)" if matches else ""
 
 
 def check_each_once(

@@ -16,7 +16,6 @@ import logging
 import math
 import socket
 import sys
-import threading
 import warnings
 from collections.abc import Callable, Iterator, Mapping
 from types import SimpleNamespace
@@ -35,7 +34,6 @@ if TYPE_CHECKING:
 _MAX_NUMBER = 1e6  # [1] in a message
 _MAX_LENGTH = 200  # characters of a text
 _ALL_ADDRESSES = ("0.0.0.0", "", "::")
-_SUBSTITUTING = threading.Lock()
 
 Rule = Callable[[Any], bool]  # whether the controls of the page can send a message
 
@@ -47,7 +45,6 @@ class Gate:
         """Create a gate for a page on `host` that accepts no messages yet."""
         self._host = host.strip("[]").lower()
         self._rules: Mapping[str, Rule] = {}
-        self.verbose = False  # whether refusals are printed
 
     def allow(self, rules: Mapping[str, Rule]) -> None:
         """Accept messages of these types if their rules return true."""
@@ -70,7 +67,7 @@ class Gate:
             datastructures=datastructures,
             exceptions=exceptions,
         )
-        with _SUBSTITUTING, mock.patch.object(module, "websockets", guarded):
+        with mock.patch.object(module, "websockets", guarded):
             yield
 
     def _serve(self, serve: Callable[..., Any], *arguments: Any, **options: Any) -> Any:
@@ -140,8 +137,8 @@ class Gate:
             return False
 
     def report(self, refusal: str) -> None:
-        """Print a refusal on the error stream, in one line."""
-        if self.verbose:
+        """Print a refusal on the error stream, in one line, once there is a page."""
+        if self._rules:
             print(f"rps view: {refusal}.", file=sys.stderr, flush=True)
 
 
@@ -169,7 +166,7 @@ def accepts_update(control: GuiInputHandle[Any], updates: Mapping[str, Any]) -> 
     )
 
 
-def check_guarded(gate: Gate, host: str, port: int) -> None:
+def check_guarded(host: str, port: int) -> None:
     """Send requests of strangers; InputError if this version of viser answers them."""
     address = "127.0.0.1" if host in _ALL_ADDRESSES else host
     for name in ("Host: rebound.example\r\n", f"Host: {address}\r\nOrigin: http://a.example\r\n"):
@@ -180,4 +177,3 @@ def check_guarded(gate: Gate, host: str, port: int) -> None:
                     "this version of viser answers other pages: install the version in "
                     "constraints.txt."
                 )
-    gate.verbose = True

@@ -405,7 +405,7 @@ def open_page(
     with contextlib.redirect_stdout(io.StringIO()), gate.guarding():  # it prints a panel
         server = viser.ViserServer(host, port, verbose=False)
     try:
-        check_guarded(gate, host, server.get_port())
+        check_guarded(host, server.get_port())
     except BaseException:
         server.stop()
         raise

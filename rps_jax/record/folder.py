@@ -20,23 +20,19 @@ _SHORT.maxlevel = 1
 
 
 def remove_run(folder: Path) -> None:
-    """Remove the run of a folder, and nothing else; InputError if it is in use."""
-    for inner in sorted(folder.rglob(MANIFEST)):  # runs in its folders, as of models
-        if inner.parent != folder:
-            remove_run(inner.parent)
-    if not (folder / MANIFEST).exists():
-        return
-    ensure_writable(folder)
-    with lock(folder):
-        try:
-            shutil.rmtree(folder / "parts", ignore_errors=True)
-            for name in (MANIFEST, "results.nc", "points.nc", "environment.json"):
-                for path in (folder / name, folder / f"{name}.sha256"):
-                    path.unlink(missing_ok=True)
-        except OSError as error:
-            raise InputError(
-                f"out = {folder} cannot be removed ({error.strerror}): choose another folder."
-            ) from error
+    """Remove the runs in a folder, and nothing else; InputError if one is in use."""
+    for manifest in sorted(folder.rglob(MANIFEST)):  # it may hold others, as of models
+        run = ensure_writable(manifest.parent)
+        with lock(run):
+            try:
+                shutil.rmtree(run / "parts", ignore_errors=True)
+                for name in (MANIFEST, "results.nc", "points.nc", "environment.json"):
+                    for path in (run / name, run / f"{name}.sha256"):
+                        path.unlink(missing_ok=True)
+            except OSError as error:
+                raise InputError(
+                    f"out = {run} cannot be removed ({error.strerror}): choose another folder."
+                ) from error
 
 
 def ensure_writable(folder: Path) -> Path:

@@ -1,5 +1,6 @@
 """Provenance of a run: command, versions, device and commit, in `environment.json`."""
 
+import contextlib
 import importlib.metadata
 import platform
 import shlex
@@ -111,12 +112,9 @@ def git_commit() -> str | None:
     """Return the git commit of the checkout of this code, marked if changed; None elsewhere."""
     root = Path(__file__).resolve().parents[2]
     words = ("describe", "--always", "--exclude=*", "--abbrev=40", "--dirty=-changed")
-    try:
-        if not (root / ".git").exists():
-            return None
-        command = ["git", "-C", str(root), *words]
-        return (
-            subprocess.check_output(command, stderr=subprocess.DEVNULL, timeout=10).decode().strip()
-        )
-    except (OSError, subprocess.SubprocessError):
-        return None
+    command = ["git", "-C", str(root), *words]
+    with contextlib.suppress(OSError, subprocess.SubprocessError):
+        if (root / ".git").exists():
+            output = subprocess.check_output(command, stderr=subprocess.DEVNULL, timeout=10)
+            return output.decode().strip()
+    return None

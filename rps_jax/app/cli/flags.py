@@ -6,7 +6,6 @@ without a prefix.
 """
 
 import dataclasses
-import difflib
 import types
 import typing
 from collections.abc import Iterator, Sequence
@@ -27,7 +26,7 @@ from tyro.constructors import (
 )
 
 from rps_jax.engines.device import Device
-from rps_jax.errors import InputError, check_name
+from rps_jax.errors import InputError, check_name, near
 from rps_jax.record import options
 from rps_jax.record.options import option
 from rps_jax.runs.push import FILM_LENGTH, TraceQuestion
@@ -126,9 +125,7 @@ def _sentence(event: _errors.ParseErrorEvent, command: str, known: Sequence[str]
     hint = f"`rps {command} --help` lists the options"
     match event:
         case _errors.UnrecognizedArgs(tokens=[token, *_]):
-            near = difflib.get_close_matches(token.partition("=")[0], known, n=1)
-            guess = f" (did you mean '{near[0]}'?)" if near else ""
-            return f"unknown option '{token}'{guess}: {hint}."
+            return f"unknown option '{token}'{near(token.partition('=')[0], known)}: {hint}."
         case _errors.MissingArgs(missing_arguments=[missing, *_]):
             return f"{missing.arg.field.intern_name} is missing: {hint}."
         case _errors.BadValue(argument=argument):
