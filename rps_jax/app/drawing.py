@@ -26,7 +26,7 @@ TARGET = f"{_ROOT}/target"  # the control by which a hand moves the target
 _SIDES = 48  # facets of a cylinder
 _CAMERA = ((-2.7, -4.6, 3.7), (0.25, 0.1, 0.0))  # [m] its position, and the point that it looks at
 _FIELD = 0.75  # [rad] of view, upright
-_GROUND, _CELL, _METRE = (226, 226, 223), (198, 198, 196), (158, 158, 156)  # RGB
+_GROUND = (226, 226, 223)  # RGB
 _SKIN, _PRESSED = np.array([13, 168, 161]), np.array([255, 176, 0])  # RGB, from none to all foam
 _TWIST = (228, 88, 20)  # RGB
 _TAXEL = (0.022, 0.125, 0.2925)  # [m] depth, height, and height above the ground of its middle
@@ -48,10 +48,6 @@ def furnish(server: ViserServer) -> None:
     server.scene.add_grid(
         "/ground",
         infinite_grid=True,
-        cell_size=0.5,
-        section_size=1.0,
-        cell_color=_CELL,
-        section_color=_METRE,
         plane_color=_GROUND,
         plane_opacity=1.0,
         shadow_opacity=0.35,
@@ -91,13 +87,9 @@ class Drawing:
         self._velocity = world.add_arrows(f"{_ROOT}/base/velocity", nowhere, _TWIST, **shape)
         line = partial(world.add_line_segments, points=nowhere)
         self._turn = line(f"{_ROOT}/base/turn", colors=_TWIST, thickness=0.022)
-        self._paths = {
-            name: line(f"{_ROOT}/{name}", colors=_rgb(rgba), thickness=0.025, position=(0, 0, z))
-            for name, rgba, z in (
-                ("base_path", rendering.BASE_RGBA, 0.006),
-                ("contact_path", rendering.CONTACT_RGBA, 0.012),
-            )
-        }
+        path = partial(line, thickness=0.025)
+        self._base_path = path(f"{_ROOT}/base_path", colors=_rgb(rendering.BASE_RGBA))
+        self._contact_path = path(f"{_ROOT}/contact_path", colors=_rgb(rendering.CONTACT_RGBA))
 
     def place_target(self, p_world_target: ArrayLike) -> None:
         """Put the target at (2,) [m], unless a user drags it."""
@@ -111,10 +103,8 @@ class Drawing:
         x, y, yaw = map(float, moment.snapshot.qpos[:3])
         self._base.position = (x, y, 0.0)
         self._base.wxyz = (math.cos(yaw / 2), 0.0, 0.0, math.sin(yaw / 2))
-        self._object.position, self._object.wxyz = (
-            moment.snapshot.qpos[3:6],
-            moment.snapshot.qpos[6:10],
-        )
+        self._object.position = moment.snapshot.qpos[3:6]
+        self._object.wxyz = moment.snapshot.qpos[6:10]
         colour = _SKIN + moment.compression[:, None] * (_PRESSED - _SKIN)
         self._taxels.batched_colors = np.round(colour).astype(np.uint8)
         touching = int(moment.snapshot.reading.contact_type) != NONE
@@ -124,8 +114,8 @@ class Drawing:
             self._contact.position = (*felt, rendering.CONTACT_HEIGHT + 0.03)
         self._show_twist(*map(float, moment.snapshot.twist))
         way = [past[i] for i in (*range(0, index, _PATH_STEP), index)]
-        self._paths["base_path"].points = _joined(np.array([m.snapshot.qpos[:2] for m in way]))
-        self._paths["contact_path"].points = _joined(np.array([m.p_world_contact for m in way]))
+        self._base_path.points = _joined([m.snapshot.qpos[:2] for m in way], 0.006)
+        self._contact_path.points = _joined([m.p_world_contact for m in way], 0.012)
 
     def _show_twist(self, v_x: float, v_y: float, omega: float) -> None:
         """An arrow from the middle of the base, and an arc about it from its heading."""
@@ -143,10 +133,10 @@ class Drawing:
             self._turn.points = np.stack([arc[:-1], arc[1:]], axis=1)
 
 
-def _joined(points: np.ndarray) -> np.ndarray:
-    """Return lines (m, 2, 3) along points (n, 2) [m] on the ground, with gaps at NaN."""
-    flat = np.column_stack([points, np.zeros(len(points))])
-    lines = np.stack([flat[:-1], flat[1:]], axis=1)
+def _joined(points: Sequence[ArrayLike], height: float) -> np.ndarray:
+    """Return lines (m, 2, 3) [m] along points (n, 2) at a height, with gaps at NaN."""
+    raised = np.column_stack([np.array(points), np.full(len(points), height)])
+    lines = np.stack([raised[:-1], raised[1:]], axis=1)
     lines = lines[np.isfinite(lines).all(axis=(1, 2))]
     return lines if len(lines) else np.zeros((1, 2, 3))
 
