@@ -7,8 +7,8 @@ from collections.abc import Iterable, Mapping
 
 import numpy as np
 
-from rps_jax.lowering import spelling
 from rps_jax.lowering.nodes import Node
+from rps_jax.lowering.operations import spelled
 from rps_jax.lowering.routine import Group, Routine
 from rps_jax.lowering.scalar_writer import ScalarWriter
 from rps_jax.lowering.target import kind_of
@@ -17,13 +17,9 @@ from rps_jax.lowering.writer import literal as literal_of
 _TYPES = {"f": "{p}_real", "i": "int", "b": "int"}
 # `{p}` is the prefix of all names, `{P}` the same in capitals.
 HELPERS = """\
-/* As in JAX, NaN propagates and integer arithmetic wraps around. */
+/* As in JAX, NaN propagates. */
 static inline {p}_real {p}_max({p}_real a, {p}_real b) {{ return a >= b || a != a ? a : b; }}
 static inline {p}_real {p}_min({p}_real a, {p}_real b) {{ return a <= b || a != a ? a : b; }}
-static inline {p}_real {p}_sign({p}_real x) {{
-  return x > 0 ? ({p}_real)1 : x < 0 ? ({p}_real)-1 : x;
-}}
-static inline {p}_real {p}_logistic({p}_real x) {{ return 1 / (1 + {P}_F(exp)(-x)); }}
 /* Lambert's fraction near zero, which is exact to a rounding and avoids a call of tanh. */
 static inline {p}_real {p}_tanh({p}_real x) {{
   const {p}_real a = {P}_F(fabs)(x), s = x * x;
@@ -32,14 +28,6 @@ static inline {p}_real {p}_tanh({p}_real x) {{
          / (135135 + s * (62370 + s * (3150 + s * 28)));
   return {P}_F(copysign)(1 - 2 / (1 + {P}_F(exp)(2 * a)), x);
 }}
-static inline int {p}_int({p}_real x) {{
-  return x != x ? 0 : x >= ({p}_real)2147483648.0 ? 2147483647
-       : x <= ({p}_real)-2147483648.0 ? -2147483647 - 1 : (int)x;
-}}
-static inline int {p}_idiv(int a, int b) {{
-  return b == 0 ? -1 : b == -1 ? (int)(0u - (unsigned)a) : a / b;
-}}
-static inline int {p}_irem(int a, int b) {{ return b == 0 ? a : b == -1 ? 0 : a % b; }}
 """
 
 
@@ -47,7 +35,7 @@ class CWriter(ScalarWriter):
     """Printer of one routine as statements of C99."""
 
     compiler = "the C exporter"
-    spelling = spelling.C
+    spelling = spelled("c")
     flag = "({} != 0)"  # C takes any number but 0 for true
     alias = "{head} = &{corner};"
     pointer = "*"

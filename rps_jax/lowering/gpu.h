@@ -40,15 +40,11 @@ WITH_NAN(min)
 
 #define EACH(name) FUNCTION V name##_f(V x) { return name##f(x); }
 #define EACH_OF_TWO(name, of) FUNCTION V name##_f(V x, V y) { return of(x, y); }
-EACH(sqrt)
 EACH(rsqrt)
 FUNCTION V f_of_i(I x) { return (V)x; }
 FUNCTION V f_of_u(U x) { return (V)x; }
-FUNCTION V f_of_b(I x) { return x ? 1.0f : 0.0f; }
-FUNCTION I i_of_b(I x) { return x; }
 FUNCTION I not_b(I x) { return !x; }
-FUNCTION I to_int(V x) { return (I)x; }
-FUNCTION U u_of_f(V x) { return !(x > 0) ? 0u : x < 4294967296.0f ? (U)x : 4294967295u; }
+FUNCTION I truncate_f(V x) { return (I)x; }
 FUNCTION V bits_f_of_i(I x) { return __int_as_float(x); }
 FUNCTION I bits_i_of_f(V x) { return __float_as_int(x); }
 

@@ -14,7 +14,6 @@ import numpy as np
 from jax.extend.core import ClosedJaxpr
 
 from rps_jax.lowering.nodes import (
-    GPU_HEADER,
     INITIAL,
     Array,
     LoopNode,
@@ -25,8 +24,9 @@ from rps_jax.lowering.nodes import (
     reached,
     results,
 )
+from rps_jax.lowering.operations import GPU_HEADER, TYPES, defined
 from rps_jax.lowering.target import Params, TooLargeError, Typed, Value, size_of
-from rps_jax.lowering.writer import STORED, TYPES, SimdWriter, literal
+from rps_jax.lowering.writer import STORED, SimdWriter, literal
 
 WARP = 32
 _INLINE = ("input", "move", "take")  # operations of which a thread computes only its own elements
@@ -63,6 +63,8 @@ extern "C" __global__ void __launch_bounds__(32) step(const __grid_constant__ Ar
 
 class GpuNodes(SimdNodes):
     """Target that builds the graph of a function for several threads per world."""
+
+    operations = defined(GPU_HEADER)
 
     def __init__(self) -> None:
         super().__init__()

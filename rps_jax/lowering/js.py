@@ -9,7 +9,7 @@ from collections.abc import Iterable, Mapping
 
 import numpy as np
 
-from rps_jax.lowering import spelling
+from rps_jax.lowering.operations import spelled
 from rps_jax.lowering.routine import Group, Routine
 from rps_jax.lowering.scalar_writer import ScalarWriter
 
@@ -17,8 +17,6 @@ HELPERS = """\
 const finite = (x) => (Array.isArray(x) ? x.every(finite) : Number.isFinite(Number(x)));
 const nan = (x) => (Array.isArray(x) ? x.some(nan) : Number.isNaN(Number(x)));
 const rint = (x) => (Math.abs(x % 1) === 0.5 ? 2 * Math.round(x / 2) : Math.round(x));
-const clamped = (x) => Math.min(2147483647, Math.max(-2147483648, x));
-const int = (x) => (Number.isNaN(x) ? 0 : Math.trunc(clamped(x)));
 const unpacked = (text, Kind, rows) => {
   const all = new Kind(Uint8Array.from(atob(text), (c) => c.charCodeAt(0)).buffer);
   const columns = all.length / rows;
@@ -31,7 +29,7 @@ class JsWriter(ScalarWriter):
     """Printer of one routine as statements of JavaScript."""
 
     compiler = "the JavaScript exporter"
-    spelling = spelling.JAVASCRIPT
+    spelling = spelled("js")
     index = "let"
     flag = "Boolean({})"
     alias = "{head} = {name}.flat(Infinity);"

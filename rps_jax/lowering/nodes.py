@@ -10,15 +10,14 @@ from __future__ import annotations
 
 import functools
 import itertools
-import re
 from collections.abc import Hashable, Iterable, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 from jax.extend.core import ClosedJaxpr
 
+from rps_jax.lowering.operations import SIMD_HEADER, defined
 from rps_jax.lowering.target import (
     REDUCTIONS,
     Body,
@@ -30,23 +29,11 @@ from rps_jax.lowering.target import (
     Value,
     is_constant,
     kind_of,
+    operation_of,
     size_of,
 )
 from rps_jax.lowering.walk import walk
 
-_FOLDER = Path(__file__).parent
-_OPERATIONS = (_FOLDER / "operations.h").read_text()
-XLA_CALL = (_FOLDER / "xla_call.h").read_text()
-SIMD_HEADER = XLA_CALL + (_FOLDER / "simd.h").read_text() + _OPERATIONS
-GPU_HEADER = (_FOLDER / "gpu.h").read_text() + _OPERATIONS
-# Kinds of numbers for owners each macro of the headers defines an operation.
-_MACROS = {"INFIX": "fiu", "COMPARE": "fiub", "BITS": "iub", "EACH": "f", "EACH_OF_TWO": "f"}
-OPERATIONS = frozenset(re.findall(r"^FUNCTION \w+ (\w+)\(", SIMD_HEADER, re.M)) | {
-    f"{name}_{kind}"
-    for macro, kinds in _MACROS.items()
-    for name in re.findall(rf"^{macro}\((\w+)", SIMD_HEADER, re.M)
-    for kind in kinds
-}
 # Initial value of a reduction, by its operation and kind.
 INITIAL = {
     **{("add", "f"): 0.0, ("add", "i"): 0, ("max", "f"): -np.inf, ("min", "f"): np.inf},
@@ -131,7 +118,7 @@ class SimdNodes(Target):
 
     compiler = "the native compiler"
     kinds = "fibu"
-    operations = OPERATIONS
+    operations = defined(SIMD_HEADER)
     max_products = 256  # multiplications in one product of matrices
 
     def __init__(self) -> None:
@@ -194,25 +181,16 @@ class SimdNodes(Target):
 
     def apply(self, name: str, values: Sequence[Value], params: Params, out: Typed) -> Value:
         """Apply a primitive element by element, or as a reduction, a product or a slice."""
-        kind, first = self.kind(out.dtype, name), self.kind(values[0].dtype, name)
+        kind = self.kind(out.dtype, name)
         if name in REDUCTIONS:
             return self._reduced(REDUCTIONS[name], values[0], params["axes"], kind, out)
         if name == "dynamic_slice":
             return self._slice(values[0], values[1:], params["slice_sizes"], kind)
         if name == "dot_general":
             return self._product(values[0], values[1], params["dimension_numbers"], out)
+        op = operation_of(name, values, params, out)
         if name == "select_n":
-            op, values = f"choose_{kind}", [values[0], values[2], values[1]]
-        elif name == "convert_element_type":
-            if first == kind:
-                return values[0]
-            op = f"{kind}_of_{first}"
-        elif name == "bitcast_convert_type":
-            op = f"bits_{kind}_of_{first}"
-        elif name == "round" and int(params["rounding_method"]) == 1:
-            op = "rint_f"
-        else:
-            op = f"{name}_{first}"
+            values = [values[0], values[2], values[1]]
         if op not in self.operations:
             raise UnsupportedError(name)
         return self._elementwise(op, values, kind, out.shape)
@@ -242,7 +220,7 @@ class SimdNodes(Target):
         rows = indices.reshape(-1, *out.shape)
         result = self.moved([value], rows[0], out)
         for row in rows[1:]:
-            result = self.emit(binary, [result, self.moved([value], row, out)], {}, out)
+            result = self.apply(binary, [result, self.moved([value], row, out)], {}, out)
         return result
 
     def _product(self, lhs: Value, rhs: Value, dimensions: Any, out: Typed) -> Value:
@@ -269,8 +247,8 @@ class SimdNodes(Target):
                     self._at(rows_of, row_indices[batch, :, k], template),
                     self._at(scalar_of, repeated, template),
                 ]
-                term = self.emit("mul", pair, {}, template)
-                total = term if total is None else self.emit("add", [total, term], {}, template)
+                term = self.apply("mul", pair, {}, template)
+                total = term if total is None else self.apply("add", [total, term], {}, template)
             parts.append(np.zeros_like(template) if total is None else total)
         indices = np.arange(size_of(out.shape)).reshape(*scalar_indices.shape[:2], sizes[long])
         if long == 0:  # the rows of the left factor come first

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import jax
 
-from rps_jax.lowering.nodes import XLA_CALL
+from rps_jax.lowering.operations import XLA_CALL
 
 # Quotients and square roots within two roundings, and zero for numbers below 1e-38.
 FLAGS = ("--prec-div=false", "--prec-sqrt=false", "--ftz=true")

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from rps_jax import errors
+from rps_jax.lowering.operations import spelled
 from rps_jax.lowering.target import (
     REDUCTIONS,
     Params,
@@ -17,24 +18,12 @@ from rps_jax.lowering.target import (
     UnsupportedError,
     Value,
     kind_of,
+    operation_of,
     size_of,
 )
 
 _OPSET, _FORMAT = 18, 9  # versions of the operators and of the file
 _DTYPES = {"f": np.float32, "i": np.int32, "b": np.bool_}
-_NAMES = {
-    **{name: name.capitalize() for name in ("add", "sub", "mul", "div", "max", "min", "neg")},
-    **{name: name.capitalize() for name in ("abs", "sqrt", "exp", "log", "sin", "cos", "tan")},
-    **{name: name.capitalize() for name in ("asin", "acos", "atan", "sinh", "cosh", "tanh")},
-    **{name: name.capitalize() for name in ("asinh", "acosh", "atanh", "sign", "floor", "ceil")},
-    **{name: name.capitalize() for name in ("erf", "pow", "and", "or", "xor", "not")},
-    "logistic": "Sigmoid",
-    "lt": "Less",
-    "le": "LessOrEqual",
-    "gt": "Greater",
-    "ge": "GreaterOrEqual",
-    "eq": "Equal",
-}
 _REDUCED = {"add": "ReduceSum", "mul": "ReduceProd", "max": "ReduceMax", "min": "ReduceMin"}
 
 
@@ -56,6 +45,7 @@ class Graph(Target):
     """Target that builds a graph of ONNX."""
 
     compiler = "the ONNX exporter"
+    operations = spelled("onnx")
 
     def __init__(self) -> None:
         """Build a graph without nodes.
@@ -118,70 +108,21 @@ class Graph(Target):
         return self.reshaped(whole, indices.shape)
 
     def apply(self, name: str, values: Sequence[Value], params: Params, out: Typed) -> Tensor:
-        """Apply a primitive."""
         x, shape, kind = [self.tensor(value) for value in values], out.shape, kind_of(out.dtype)
-
-        def make(op: str, *inputs: Tensor, to: str = kind, **attributes: object) -> Tensor:
-            return self.node(op, inputs, shape, to, **attributes)
-
-        def scalar(value: float) -> Tensor:
-            return self.constant(np.asarray(value, _DTYPES[x[0].kind]), x[0].kind)
-
-        if name in ("div", "rem") and kind == "i":
-            return self._divided(name, x[0], x[1], out)
-        if name in ("and", "or", "xor", "not") and kind == "i":
-            return make(f"Bitwise{name.capitalize()}", *x)
-        if name in _NAMES:
-            return make(_NAMES[name], *x)
-        if name == "ne":
-            return make("Not", make("Equal", *x))
-        if name == "select_n":
-            if kind != "b":
-                return make("Where", x[0], x[2], x[1])
-            yes, no = make("And", x[0], x[2]), make("And", make("Not", x[0]), x[1])
-            return make("Or", yes, no)
-        if name == "convert_element_type":
-            return (
-                self._integer(x[0]) if (x[0].kind, kind) == ("f", "i") else self._cast(x[0], kind)
-            )
-        if name == "rem":
-            return make("Mod", *x, fmod=1)
-        if name == "rsqrt":
-            return make("Reciprocal", make("Sqrt", x[0]))
-        if name == "square":
-            return make("Mul", x[0], x[0])
-        if name == "round" and int(params["rounding_method"]) == 1:
-            return make("Round", x[0])
-        if name == "is_finite":
-            special = make("Or", make("IsInf", x[0], to="b"), make("IsNaN", x[0], to="b"), to="b")
-            return make("Not", special)
-        if name == "atan2":
-            y, at = self._unit_if_infinite(x, out)
-            zero, pi = scalar(0), scalar(np.pi)
-            upright = make("Mul", make("Sign", y), scalar(np.pi / 2))
-            behind = make("Where", make("Less", y, zero, to="b"), make("Neg", pi), pi)
-            turn = make("Where", make("Less", at, zero, to="b"), behind, zero)
-            angle = make("Add", make("Atan", make("Div", y, at)), turn)
-            return make("Where", make("Equal", at, zero, to="b"), upright, angle)
         if name in REDUCTIONS:
             return self._reduced(REDUCTIONS[name], x[0], params["axes"], shape, kind)
-        if name == "exp2":
-            return make("Pow", scalar(2), x[0])
         if name == "dynamic_slice":
             return self._slice(x[0], values[1:], params["slice_sizes"], out)
         if name == "dot_general":
-            return make("Einsum", *x, equation=_equation(x, params["dimension_numbers"]))
-        raise UnsupportedError(name)
-
-    def _unit_if_infinite(self, x: Sequence[Tensor], out: Typed) -> list[Tensor]:
-        """Replace two numbers by their signs where both are infinite: their angle is the same."""
-        infinite = [self.node("IsInf", [y], y.shape, "b") for y in x]
-        both = self.node("And", infinite, out.shape, "b")
-        signs = [self.node("Sign", [y], y.shape, "f") for y in x]
-        return [
-            self.node("Where", [both, sign, y], out.shape, "f")
-            for sign, y in zip(signs, x, strict=True)
-        ]
+            equation = _equation(x, params["dimension_numbers"])
+            return self.node("Einsum", x, shape, kind, equation=equation)
+        operator = self.operations.get(operation_of(name, x, params, out))
+        if operator is None:
+            raise UnsupportedError(name)
+        if name == "select_n":
+            x = [x[0], x[2], x[1]]
+        attributes = {"Mod": {"fmod": 1}, "Cast": {"to": self._type(kind)}}
+        return self.node(operator, x, shape, kind, **attributes.get(operator, {}))
 
     def _slice(
         self, x: Tensor, starts: Sequence[Value], sizes: Sequence[int], out: Typed
@@ -193,33 +134,6 @@ class Graph(Target):
         flat = self.reshaped(x, (size_of(x.shape),))
         window = self.node("Gather", [flat, indices], (size,), x.kind, axis=0)
         return self.reshaped(window, out.shape)
-
-    def _divided(self, name: str, x: Tensor, y: Tensor, out: Typed) -> Value:
-        """Divide integers as JAX does: by 0 the quotient is -1 and the remainder the dividend."""
-        zero, unit = np.zeros((), np.int32), np.ones((), np.int32)
-        flag = np.empty(out.shape, bool)
-        by_zero = self.apply("eq", [y, zero], {}, flag)
-        by_minus_one = self.apply("eq", [y, -unit], {}, flag)
-        divisor = self.apply("select_n", [by_zero, y, unit], {}, out)
-        divisor = self.apply("select_n", [by_minus_one, divisor, unit], {}, out)
-        quotient = self.node("Div", [x, divisor], out.shape, "i")
-        if name == "div":
-            negative = self.apply("neg", [x], {}, out)
-            quotient = self.apply("select_n", [by_minus_one, quotient, negative], {}, out)
-            return self.apply("select_n", [by_zero, quotient, -unit], {}, out)
-        whole = self.apply("mul", [quotient, divisor], {}, out)
-        return self.apply("select_n", [by_zero, self.apply("sub", [x, whole], {}, out), x], {}, out)
-
-    def _integer(self, x: Tensor) -> Tensor:
-        """Convert reals to integers as JAX does: NaN to 0, and saturating."""
-        flag, integer = np.empty(x.shape, bool), np.empty(x.shape, np.int32)
-        low, high = np.float32(-(2**31)), np.float32(2**31 - 128)
-        is_number = self.apply("eq", [x, x], {}, flag)
-        y = self.apply("select_n", [is_number, np.float32(0), x], {}, x)
-        y = self.apply("max", [y, low], {}, x)
-        y = self._cast(self.apply("min", [y, high], {}, x), "i")
-        above = self.apply("gt", [x, high], {}, flag)
-        return self.apply("select_n", [above, y, np.int32(2**31 - 1)], {}, integer)
 
     def _cast(self, x: Tensor, kind: str) -> Tensor:
         return self.node("Cast", [x], x.shape, kind, to=self._type(kind))

@@ -1,65 +1,10 @@
-/* Operations of JAX on numbers of several worlds, named by the primitive and the kind of its first
-   operand; `simd.h` and `gpu.h` define the types. */
+/* Operations of JAX on numbers of several worlds that `operations.py` does not define; `simd.h` and
+   `gpu.h` define the types. */
 
-#define INFIX(name, sign) \
-  FUNCTION V name##_f(V a, V b) { return a sign b; } \
-  FUNCTION I name##_i(I a, I b) { return (I)((U)a sign (U)b); } \
-  FUNCTION U name##_u(U a, U b) { return a sign b; }
-#define COMPARE(name, sign) \
-  FUNCTION I name##_f(V a, V b) { return a sign b; } \
-  FUNCTION I name##_i(I a, I b) { return a sign b; } \
-  FUNCTION I name##_u(U a, U b) { return a sign b; } \
-  FUNCTION I name##_b(I a, I b) { return a sign b; }
-#define BITS(name, sign) \
-  FUNCTION I name##_b(I a, I b) { return a sign b; } \
-  FUNCTION I name##_i(I a, I b) { return a sign b; } \
-  FUNCTION U name##_u(U a, U b) { return a sign b; }
-INFIX(add, +)
-INFIX(sub, -)
-INFIX(mul, *)
-COMPARE(eq, ==)
-COMPARE(ne, !=)
-COMPARE(lt, <)
-COMPARE(le, <=)
-COMPARE(gt, >)
-COMPARE(ge, >=)
-BITS(and, &)
-BITS(or, |)
-BITS(xor, ^)
 FUNCTION I not_i(I x) { return ~x; }
-EACH(exp)
-EACH(log)
-EACH(sin)
-EACH(cos)
-EACH(tan)
-EACH(asin)
-EACH(acos)
-EACH(atan)
-EACH(sinh)
-EACH(cosh)
-EACH(tanh)
-EACH(asinh)
-EACH(acosh)
-EACH(atanh)
-EACH(log1p)
-EACH(expm1)
-EACH(floor)
-EACH(ceil)
-EACH(round)
-EACH(rint)
-EACH(exp2)
-EACH(cbrt)
-EACH(erf)
-EACH_OF_TWO(atan2, atan2f)
-EACH_OF_TWO(pow, powf)
-EACH_OF_TWO(rem, fmodf)
-
 FUNCTION I choose_b(I m, I a, I b) { return choose_i(m, a, b); }
 FUNCTION I i_of_u(U x) { return (I)x; }
 FUNCTION U u_of_i(I x) { return (U)x; }
-FUNCTION U u_of_b(I x) { return (U)i_of_b(x); }
-FUNCTION I b_of_f(V x) { return x != 0.0f; }
-FUNCTION I b_of_i(I x) { return x != 0; }
 FUNCTION V bits_f_of_u(U x) { return bits_f_of_i((I)x); }
 FUNCTION U bits_u_of_f(V x) { return (U)bits_i_of_f(x); }
 FUNCTION V neg_f(V x) { return -x; }
@@ -71,29 +16,9 @@ FUNCTION V div_f(V a, V b) { return a / b; }
 FUNCTION V max_f(V a, V b) { return choose_f((a >= b) | (a != a), a, b); }
 FUNCTION V min_f(V a, V b) { return choose_f((a <= b) | (a != a), a, b); }
 #endif
-FUNCTION V square_f(V x) { return x * x; }
-FUNCTION V logistic_f(V x) { return 1.0f / (1.0f + exp_f(-x)); }
-FUNCTION I is_finite_f(V x) { return abs_f(x) < INFINITY; }
-FUNCTION V sign_f(V x) {
-  return choose_f(x > 0.0f, all_f(1.0f), choose_f(x < 0.0f, all_f(-1.0f), x));
-}
-/* As in JAX, integer arithmetic wraps around. */
 FUNCTION I max_i(I a, I b) { return choose_i(a > b, a, b); }
 FUNCTION I min_i(I a, I b) { return choose_i(a < b, a, b); }
-FUNCTION I abs_i(I x) { return max_i(x, neg_i(x)); }
-FUNCTION I sign_i(I x) { return i_of_b(x > 0) - i_of_b(x < 0); }
-FUNCTION I div_i(I a, I b) {
-  I special = (b == 0) | (b == -1), result = a / choose_i(special, all_i(1), b);
-  return choose_i(b == 0, all_i(-1), choose_i(special, neg_i(a), result));
-}
-FUNCTION I rem_i(I a, I b) {
-  return choose_i(b == 0, a, a % choose_i((b == 0) | (b == -1), all_i(1), b));
-}
-FUNCTION I i_of_f(V x) {
-  V clamped = choose_f(x == x, x, all_f(0.0f));
-  clamped = min_f(max_f(clamped, all_f(-2147483648.0f)), all_f(2147483520.0f));
-  return choose_i(x >= 2147483648.0f, all_i(2147483647), to_int(clamped));
-}
+FUNCTION I quotient_i(I a, I b) { return a / b; }
 FUNCTION U shift_right_logical_u(U x, U by) {
   return choose_u(by < 32u, x >> (by & 31u), all_u(0u));
 }

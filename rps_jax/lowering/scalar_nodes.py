@@ -99,10 +99,12 @@ class ScalarNodes(SimdNodes):
             a, b = (self._stacked(part) for part in (rows[0][:half], rows[0][half:]))
             p, q = matrix.reshape(2, half, columns) / 2
             even, odd = (
-                self._times_matrix(self._rows(self.emit(name, [a, b], {}, template), _row(half)), m)
+                self._times_matrix(
+                    self._rows(self.apply(name, [a, b], {}, template), _row(half)), m
+                )
                 for name, m in (("add", p + q), ("sub", p - q))
             )
-            halves = [self.emit(name, [even, odd], {}, outs) for name in ("add", "sub")]
+            halves = [self.apply(name, [even, odd], {}, outs) for name in ("add", "sub")]
             return self.moved(halves, np.arange(2 * columns), outs)
         key = matrix.tobytes()
         self.matrices.setdefault(key, matrix)

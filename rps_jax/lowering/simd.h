@@ -39,20 +39,10 @@ FUNCTION U choose_u(I m, U a, U b) { return ((U)m & a) | (~(U)m & b); }
     for (int l = 0; l < LANES; l++) result[l] = of(x[l], y[l]); \
     return result; \
   }
-EACH(sqrt)
-FUNCTION V rsqrt_f(V x) { return 1.0f / sqrt_f(x); }
 FUNCTION V f_of_i(I x) { return __builtin_convertvector(x, V); }
 FUNCTION V f_of_u(U x) { return __builtin_convertvector(x, V); }
-FUNCTION V f_of_b(I x) { return (V)(x & (I)all_f(1.0f)); }
-FUNCTION I i_of_b(I x) { return -x; }
 FUNCTION I not_b(I x) { return ~x; }
-FUNCTION I to_int(V x) { return __builtin_convertvector(x, I); }
-FUNCTION U u_of_f(V x) {
-  U result;
-  for (int l = 0; l < LANES; l++)
-    result[l] = !(x[l] > 0) ? 0u : x[l] < 4294967296.0f ? (uint32_t)x[l] : 4294967295u;
-  return result;
-}
+FUNCTION I truncate_f(V x) { return __builtin_convertvector(x, I); }
 FUNCTION V bits_f_of_i(I x) { return (V)x; }
 FUNCTION I bits_i_of_f(V x) { return (I)x; }
 

@@ -1,8 +1,8 @@
-"""Base class of all back ends: the meaning of compound primitives, and the errors."""
+"""Base class of all back ends, the names of operations, and the errors."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from typing import Any, Protocol, TypeAlias
 
 import jax
@@ -15,13 +15,11 @@ Value: TypeAlias = Any
 Params: TypeAlias = Mapping[str, Any]  # static parameters of a primitive
 Body: TypeAlias = Callable[[Sequence[Value]], list[Value]]  # of a loop, from its carry
 
-# Binary operation that each reduction and each cumulative operation repeats.
-_BINARY = {"sum": "add", "prod": "mul", "max": "max", "min": "min", "and": "and", "or": "or"}
-REDUCTIONS = {f"reduce_{name}": binary for name, binary in _BINARY.items()}
-CUMULATIVE = {f"cum{name}": binary for name, binary in _BINARY.items()}
-_BOOL = np.dtype(bool)
-# What `gather` returns for an index out of bounds.
-_FILL = {"f": np.nan, "i": -(2**31), "u": 2**32 - 1, "b": True}
+# Binary operation that each reduction repeats.
+REDUCTIONS = {
+    **{"reduce_sum": "add", "reduce_prod": "mul", "reduce_max": "max", "reduce_min": "min"},
+    **{"reduce_and": "and", "reduce_or": "or"},
+}
 
 
 class Typed(Protocol):
@@ -57,6 +55,7 @@ class Target:
     """Back end of a jaxpr: subclasses implement `moved` and `apply`."""
 
     compiler = "the compiler"  # name in errors
+    operations: Collection[str] = ()  # that it spells; others are compounds
     kinds = "fib"  # kinds of numbers that it supports, see `kind_of`
 
     # --- what each back end implements ---
@@ -66,7 +65,7 @@ class Target:
         raise NotImplementedError
 
     def apply(self, name: str, values: Sequence[Value], params: Params, out: Typed) -> Value:
-        """Apply a primitive that is not compound; `out` is the type of the result."""
+        """Apply a primitive; `out` is the type of the result."""
         raise NotImplementedError
 
     def for_loop(self, body: Body, carry: Sequence[Value], length: int) -> list[Value] | None:
@@ -76,109 +75,6 @@ class Target:
     def while_loop(self, condition: Body, body: Body, carry: Sequence[Value]) -> list[Value]:
         """Emit a loop that runs while its condition holds."""
         raise UnsupportedError("while")
-
-    # --- compound primitives ---
-
-    def emit(self, name: str, values: Sequence[Value], params: Params, out: Typed) -> Value:
-        """Apply a primitive; a compound one is written with simpler primitives."""
-        if not size_of(out.shape):
-            return np.zeros(out.shape, out.dtype)
-        if name == "clamp":
-            low, x, high = values
-            return self.emit("min", [self.emit("max", [x, low], {}, out), high], {}, out)
-        if name == "integer_pow":
-            return self._power(values[0], params["y"], out)
-        if name in ("argmax", "argmin"):
-            return self._argument(name, values[0], params["axes"][0], out)
-        if name in CUMULATIVE:
-            return self._cumulative(CUMULATIVE[name], values[0], params, out)
-        if name == "gather":
-            return self._gathered(values[0], values[1], params, out)
-        if name == "select_n" and (len(values) > 3 or kind_of(values[0].dtype) != "b"):
-            return self._selected(values[0], values[1:], out)
-        if name == "square" and kind_of(out.dtype) != "f":
-            return self.emit("mul", [values[0], values[0]], {}, out)
-        return self.apply(name, values, params, out)
-
-    def _power(self, x: Value, exponent: int, out: Typed) -> Value:
-        """Compute an integer power by repeated squaring, as XLA does."""
-        result, square, remaining = None, x, abs(exponent)
-        while remaining:
-            if remaining & 1:
-                result = square if result is None else self.emit("mul", [result, square], {}, out)
-            remaining >>= 1
-            square = self.emit("mul", [square, square], {}, out) if remaining else square
-        unit = np.ones(out.shape, out.dtype)
-        result = unit if result is None else result
-        return self.emit("div", [unit, result], {}, out) if exponent < 0 else result
-
-    def _argument(self, name: str, value: Value, axis: int, out: Typed) -> Value:
-        """Compute the first index of the maximum or minimum along an axis, or of a NaN."""
-        rows = np.moveaxis(_indices(value), axis, 0)
-        template, flag = np.empty(out.shape, value.dtype), np.empty(out.shape, bool)
-        best, index = self.moved([value], rows[0], value), np.zeros(out.shape, out.dtype)
-        for k, row in enumerate(rows[1:], 1):
-            x = self.moved([value], row, value)
-            better = self.emit("gt" if name == "argmax" else "lt", [x, best], {}, flag)
-            if kind_of(value.dtype) == "f":
-                is_number = self.emit("eq", [best, best], {}, flag)
-                nan = self.emit("and", [self.emit("ne", [x, x], {}, flag), is_number], {}, flag)
-                better = self.emit("or", [better, nan], {}, flag)
-            best = self.emit("select_n", [better, best, x], {}, template)
-            at = np.full(out.shape, k, out.dtype)
-            index = self.emit("select_n", [better, index, at], {}, out)
-        return index
-
-    def _cumulative(self, binary: str, value: Value, params: Params, out: Typed) -> Value:
-        """Apply a binary operation cumulatively along an axis."""
-        rows = np.moveaxis(_indices(value), params["axis"], 0)
-        template = np.empty(rows.shape[1:], out.dtype)
-        order = range(len(rows))
-        totals: list[Value] = [None] * len(rows)
-        total = None
-        for k in reversed(order) if params["reverse"] else order:
-            row = self.moved([value], rows[k], template)
-            total = row if total is None else self.emit(binary, [total, row], {}, template)
-            totals[k] = total
-        return self.moved(totals, np.moveaxis(np.arange(rows.size).reshape(rows.shape), 0,
-                                              params["axis"]), out)  # fmt: skip
-
-    def _selected(self, index: Value, cases: Sequence[Value], out: Typed) -> Value:
-        """Select one of several cases by an integer."""
-        result, flag = cases[-1], np.empty(np.shape(index), bool)
-        for k in reversed(range(len(cases) - 1)):
-            below = self.emit("le", [index, np.asarray(k, index.dtype)], {}, flag)
-            result = self.emit("select_n", [below, result, cases[k]], {}, out)
-        return result
-
-    def _gathered(self, value: Value, indices: Value, params: Params, out: Typed) -> Value:
-        """Gather slices at indices that are known at run time."""
-        axes, sizes = params["dimension_numbers"], params["slice_sizes"]
-        if axes.operand_batching_dims:
-            raise UnsupportedError("gather in a batch")
-        shape, index = np.shape(value), jax.ShapeDtypeStruct((), indices.dtype)
-        block, flag = np.empty(sizes, out.dtype), np.empty((), bool)
-        zero, blocks = np.zeros((), indices.dtype), []
-        for row in _indices(indices).reshape(-1, np.shape(indices)[-1]):
-            starts, inside = [zero] * len(shape), []
-            for at, axis in zip(row, axes.start_index_map, strict=True):
-                starts[axis] = start = self.moved([indices], np.asarray(at), index)
-                last = np.asarray(shape[axis] - sizes[axis], indices.dtype)
-                inside += [self.emit("ge", [start, zero], {}, flag),
-                           self.emit("le", [start, last], {}, flag)]  # fmt: skip
-            part = self.emit("dynamic_slice", [value, *starts], {"slice_sizes": sizes}, block)
-            if "FILL" in str(params["mode"]).upper() and inside:
-                all_inside = inside[0]
-                for condition in inside[1:]:
-                    all_inside = self.emit("and", [all_inside, condition], {}, flag)
-                fill = np.full(sizes, _FILL[kind_of(out.dtype)], out.dtype)
-                part = self.emit("select_n", [all_inside, fill, part], {}, block)
-            blocks.append(part)
-        rest = [i for i in range(len(out.shape)) if i not in axes.offset_dims]
-        positions = np.arange(len(blocks) * size_of(sizes)).reshape(len(blocks), *sizes)
-        positions = np.squeeze(positions, tuple(1 + i for i in axes.collapsed_slice_dims))
-        positions = positions.reshape((*np.shape(indices)[:-1], *positions.shape[1:]))
-        return self.moved(blocks, np.moveaxis(positions, range(len(rest)), rest), out)
 
     def windows(
         self, shape: Sequence[int], starts: Sequence[Value], sizes: Sequence[int]
@@ -191,16 +87,30 @@ class Target:
         for start, count in zip(starts, windows.shape, strict=False):
             clamped: Value = zero
             if count > 1:
-                clamped = self.emit("max", [start, zero], {}, zero)
-                clamped = self.emit("min", [clamped, np.asarray(count - 1, np.int32)], {}, zero)
-            index = self.emit("mul", [index, np.asarray(count, np.int32)], {}, zero)
-            index = self.emit("add", [index, clamped], {}, zero)
+                clamped = self.apply("max", [start, zero], {}, zero)
+                clamped = self.apply("min", [clamped, np.asarray(count - 1, np.int32)], {}, zero)
+            index = self.apply("mul", [index, np.asarray(count, np.int32)], {}, zero)
+            index = self.apply("add", [index, clamped], {}, zero)
         return index, windows.reshape(-1, size_of(sizes))
 
 
 def size_of(shape: Sequence[int]) -> int:
     """Return the number of elements of a shape."""
     return int(np.prod(shape, dtype=int))
+
+
+def operation_of(name: str, operands: Sequence[Typed], params: Params, out: Typed) -> str:
+    """Return the name of an operation: the primitive and the kind of its first operand."""
+    kind, first = (kind_of(x.dtype, name) for x in (out, operands[0]))
+    if name == "select_n" and first == "b":
+        return f"choose_{kind}"
+    if name == "convert_element_type":
+        return f"{kind}_of_{first}"
+    if name == "bitcast_convert_type":
+        return f"bits_{kind}_of_{first}"
+    if name == "round" and int(params["rounding_method"]) == 1:
+        return "rint_f"
+    return f"{name}_{first}"
 
 
 def is_constant(value: Value) -> bool:
@@ -218,8 +128,3 @@ def kind_of(dtype: object, name: str = "", kinds: str = "fibu") -> str:
     if kind not in kinds:
         raise UnsupportedError(f"{name} of {dtype}".strip())
     return kind
-
-
-def _indices(value: Value) -> np.ndarray:
-    """Return the flat index of each number of a value, in its shape."""
-    return np.arange(size_of(np.shape(value))).reshape(np.shape(value))

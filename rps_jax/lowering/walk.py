@@ -9,21 +9,24 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable, Sequence
-from typing import Any, cast
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.extend.core import ClosedJaxpr, Jaxpr, JaxprEqn, Literal
 
+from rps_jax.lowering.compounds import COMPOUNDS
 from rps_jax.lowering.target import (
     Body,
+    Params,
     Target,
     Typed,
     UnsupportedError,
     Value,
     is_constant,
     kind_of,
+    operation_of,
     size_of,
 )
 
@@ -81,7 +84,8 @@ def _walk(closed: ClosedJaxpr | Jaxpr, arguments: Sequence[Value], target: Targe
 
 def _results(eqn: JaxprEqn, values: list[Value], target: Target) -> Sequence[Value]:
     """Return the results of one equation."""
-    name, params, outs = eqn.primitive.name, eqn.params, _types_of_results(eqn)
+    name, params, types = eqn.primitive.name, eqn.params, _types(eqn.invars)
+    outs = _types(eqn.outvars)
     if name in _IDENTITIES:
         return values
     if all(map(is_constant, values)):
@@ -95,7 +99,9 @@ def _results(eqn: JaxprEqn, values: list[Value], target: Target) -> Sequence[Val
     if name == "cond":
         branches = [_walk(branch, values[1:], target) for branch in params["branches"]]
         return [
-            target.emit("select_n", [values[0], *cases], {}, out)
+            _apply(
+                "select_n", [values[0], *cases], [types[0], *[out] * len(cases)], {}, out, target
+            )
             for *cases, out in zip(*branches, outs, strict=True)
         ]
     if name == "scan":
@@ -118,15 +124,39 @@ def _results(eqn: JaxprEqn, values: list[Value], target: Target) -> Sequence[Val
     if name == "scatter-add" and is_constant(values[1]) and params["unique_indices"]:
         return [_scatter_add(eqn, values, target)]
     if name == "threefry2x32":  # one operation for each of its two results
-        return [target.emit(f"{name}_{i}", values, params, out) for i, out in enumerate(outs)]
+        return [target.apply(f"{name}_{i}", values, params, out) for i, out in enumerate(outs)]
     if len(outs) != 1:
         raise UnsupportedError(name)
-    return [target.emit(name, values, params, outs[0])]
+    return [_apply(name, values, types, params, outs[0], target)]
 
 
-def _types_of_results(eqn: JaxprEqn) -> list[Typed]:
-    """Return the shapes and dtypes of the results of an equation."""
-    return [cast(Typed, var.aval) for var in eqn.outvars]
+def _apply(
+    name: str, values: Sequence[Value], types: Sequence[Typed], params: Params, out: Typed,
+    target: Target,
+) -> Value:  # fmt: skip
+    """Apply a primitive: by the target if it spells the operation, else as a compound."""
+    operation = operation_of(name, types, params, out)
+    if not size_of(out.shape):
+        return np.zeros(out.shape, out.dtype)
+    if name == "convert_element_type" and types[0].dtype.kind == out.dtype.kind:
+        return values[0]
+    if operation not in target.operations and (operation in COMPOUNDS or name in COMPOUNDS):
+        function = functools.partial(COMPOUNDS.get(operation) or COMPOUNDS[name], **params)
+        return _expanded(function, values, types, target)[0]
+    return target.apply(name, values, params, out)
+
+
+def _expanded(
+    function: Callable[..., Any], values: Sequence[Value], types: Sequence[Typed], target: Target
+) -> Sequence[Value]:
+    """Return the results of a function of JAX of values."""
+    shapes = [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in types]
+    return _walk(jax.make_jaxpr(function)(*shapes), values, target)
+
+
+def _types(atoms: Sequence[Any]) -> list[Typed]:
+    """Return the shapes and dtypes of operands or results of an equation."""
+    return [atom.aval for atom in atoms]
 
 
 def _with_consts(closed: ClosedJaxpr, consts: Sequence[Value], target: Target) -> Body:
@@ -152,8 +182,7 @@ def _random(eqn: JaxprEqn, values: list[Value], target: Target) -> Sequence[Valu
     values = [np.asarray(jax.random.key_data(x)) if _is_key(x) else x for x in values]
     key: Any = eqn.invars[0].aval
     algorithm = getattr(key.dtype._impl, _RANDOM[name])
-    shapes = [jax.ShapeDtypeStruct(np.shape(x), x.dtype) for x in values]
-    return _walk(jax.make_jaxpr(functools.partial(algorithm, **params))(*shapes), values, target)
+    return _expanded(functools.partial(algorithm, **params), values, values, target)
 
 
 def _moved(eqn: JaxprEqn, values: list[Value], sources: list[int], target: Target) -> list[Value]:
@@ -167,7 +196,7 @@ def _moved(eqn: JaxprEqn, values: list[Value], sources: list[int], target: Targe
     moved = _bind(eqn, indices) if moved is None else moved
     return [
         target.moved([values[i] for i in sources], np.asarray(x), out)
-        for x, out in zip(moved, _types_of_results(eqn), strict=True)
+        for x, out in zip(moved, _types(eqn.outvars), strict=True)
     ]
 
 
@@ -206,7 +235,7 @@ def _scatter_add(eqn: JaxprEqn, values: list[Value], target: Target) -> Value:
     zeros = jnp.zeros(np.shape(array), out.dtype)
     (indices,) = _bind(eqn, [zeros, at, tags])
     more = target.moved([np.zeros(1, out.dtype), updates], np.asarray(indices, int), out)
-    return target.emit("add", [array, more], {}, out)
+    return _apply("add", [array, more], [out, out], {}, out, target)
 
 
 def _scan(eqn: JaxprEqn, values: list[Value], target: Target) -> list[Value]:

@@ -14,7 +14,6 @@ from jax.extend.core import ClosedJaxpr
 
 from rps_jax.lowering.nodes import (
     INITIAL,
-    SIMD_HEADER,
     Array,
     LoopNode,
     Node,
@@ -22,10 +21,10 @@ from rps_jax.lowering.nodes import (
     reached,
     results,
 )
+from rps_jax.lowering.operations import SIMD_HEADER, TYPES
 from rps_jax.lowering.target import Typed, Value, kind_of, size_of
 
 HANDLER = "rps_native"  # placeholder of the name by which XLA calls the function
-TYPES = {"f": "V", "i": "I", "u": "U", "b": "I"}  # of a vector
 STORED = {"f": "float", "i": "int", "u": "unsigned", "b": "unsigned char"}  # of a number of a world
 # Placeholders in capitals are lines that are printed for a function.
 _FUNCTION = """\
