@@ -14,7 +14,7 @@ from test_native import OPERATIONS, advanced, build_push, close, same
 from rps_jax.engines.base import ControlPeriod
 from rps_jax.errors import InputError
 from rps_jax.geometry import vectors
-from rps_jax.lowering import gpu_writer
+from rps_jax.lowering.gpu_writer import GpuWriter
 from rps_jax.trials import trial
 from rps_jax.world.domain import Range
 
@@ -57,7 +57,7 @@ class Emulated:
             closed, computed = jax.make_jaxpr(function, return_shape=True)(*example)
         self.outs, self.structure = jax.tree.flatten(computed)
         self.threads, shapes = threads, [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in leaves]
-        self.text = gpu_writer.source(closed, shapes, self.outs, True, threads)
+        self.text = GpuWriter(threads).source(closed, shapes, self.outs, True)
         source, binary = folder / "step.cpp", folder / "step.so"
         source.write_text(f'#include "{Path(__file__).with_name("warp.h")}"\n{self.text}{_RUN}')
         flags = ["-O1", "-march=native", "-w", "-shared", "-fPIC", "-Wl,-Bsymbolic"]

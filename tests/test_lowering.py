@@ -14,11 +14,13 @@ from jax import lax
 from test_gpu_writer import Emulated
 
 from rps_jax.engines import device, native
-from rps_jax.lowering import c, gpu_writer, js, operations, walk, writer
+from rps_jax.lowering import c, js, operations, walk
+from rps_jax.lowering.gpu_writer import GpuWriter
 from rps_jax.lowering.nodes import SimdNodes
 from rps_jax.lowering.onnx import Graph, Tensor
 from rps_jax.lowering.routine import routine
 from rps_jax.lowering.target import UnsupportedError
+from rps_jax.lowering.writer import SimdWriter
 
 REALS = [0.0, -0.0, 0.5, -1.5, 2.5, 7.0, 1e30, -1e30, np.inf, -np.inf, np.nan]
 BOUNDS = [2147483520.0, -2147483520.0, 2147483648.0, -2147483648.0, -2147483904.0, 3e9]
@@ -259,8 +261,8 @@ def run_gpu(names, real, folder):
 
 # Name of each back end, precision, function that raises for a case, and function that runs cases.
 BACK_ENDS = {
-    "simd": (np.float32, lambda names: writer.source(*jaxpr(names)), run_simd),
-    "gpu": (np.float32, lambda names: gpu_writer.source(*jaxpr(names), False, 4), run_gpu),
+    "simd": (np.float32, lambda names: SimdWriter().source(*jaxpr(names)), run_simd),
+    "gpu": (np.float32, lambda names: GpuWriter(4).source(*jaxpr(names)), run_gpu),
     "c float": (np.float32, lambda names: c_statements(names, {}), run_c),
     "c double": (np.float64, lambda names: c_statements(names, {}), run_c),
     "js": (np.float64, lambda names: js.function("run", traced(names), {}), run_js),

@@ -214,6 +214,9 @@ OPERATIONS = {
     ),
     "rows": lambda x: (x * jnp.arange(6.0).reshape(2, 3)).sum(axis=0).max(),
     "a table": lambda x: jnp.concatenate([x * jnp.array([1.0, -2.0, 3.0]), x[None]])[::-1],
+    "a slice of many": lambda x: jnp.concatenate(
+        [x * jnp.arange(20.0), jnp.full(20, 5.0), x[None]]
+    )[15:35],
     "whole numbers": lambda x: (x.astype(int) // 3, x.astype(int) % 3, -x.astype(int) // 0),
     "choices": lambda x: jnp.where((x > 3) & ~(x > 5), jnp.maximum(x, jnp.nan), jnp.sign(x)),
     "functions": lambda x: (jnp.sin(x), jnp.arctan2(x, 2), jnp.exp(-x), x**3, jax.lax.rsqrt(x)),

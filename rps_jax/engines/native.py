@@ -30,8 +30,10 @@ import jax.numpy as jnp
 
 from rps_jax.engines import device
 from rps_jax.geometry import vectors
-from rps_jax.lowering import gpu_writer, nvrtc, writer
-from rps_jax.lowering.target import TooLargeError, UnsupportedError, size_of
+from rps_jax.lowering import nvrtc
+from rps_jax.lowering.gpu_writer import WARP, GpuWriter
+from rps_jax.lowering.target import TooLargeError, UnsupportedError, first_array
+from rps_jax.lowering.writer import HANDLER, SimdWriter
 from rps_jax.record import cache
 
 Pytree: TypeAlias = Any  # of arrays; functions of this module take any
@@ -166,10 +168,14 @@ class _Function:
 def _compiled(functions: Sequence[_Function]) -> str | None:
     """Compile functions, or load them from the cache; return their name in XLA, or None."""
     on_gpu = jax.default_backend() == "gpu"
-    source = functools.partial(gpu_writer.source, threads=_THREADS) if on_gpu else writer.source
     try:
         with jax.ensure_compile_time_eval():
-            texts = [source(x.jaxpr, x.inputs, x.results, x.is_sorted) for x in functions]
+            texts = [
+                (GpuWriter(_THREADS) if on_gpu else SimdWriter()).source(
+                    x.jaxpr, x.inputs, x.results, x.is_sorted
+                )
+                for x in functions
+            ]
     except UnsupportedError as error:
         _warn_once(f"{error} XLA compiles this law, which is some ten times slower.")
         return None
@@ -186,7 +192,7 @@ def _compiled(functions: Sequence[_Function]) -> str | None:
             return name
         try:
             body = _kernels(name, texts, functions) if on_gpu else _library(
-                texts[0].replace(writer.HANDLER, name), name)  # fmt: skip
+                texts[0].replace(HANDLER, name), name)  # fmt: skip
         except RuntimeError as error:
             compiler, reason = error.args
             warnings.warn(f"{compiler} fails, so XLA compiles: {reason}", stacklevel=2)
@@ -226,16 +232,12 @@ def _kernels(name: str, texts: Sequence[str], functions: Sequence[_Function]) ->
     Raises:
       RuntimeError: the compiler that fails, and its first message.
     """
-    shapes = []
-    for function in functions:
-        sizes = [size_of(x.shape) for x in function.inputs]
-        sized = next(i for i, size in enumerate(sizes) if size)
-        shapes.append((len(function.leaves), len(function.results), sized, sizes[sized]))
+    shapes = [(len(x.leaves), len(x.results), *first_array(x.inputs)) for x in functions]
     with tempfile.TemporaryDirectory() as folder:
         paths = [Path(folder) / f"{k}.cubin" for k in range(len(texts))]
         for path, image in zip(paths, nvrtc.images(texts), strict=True):
             path.write_bytes(image)
-        return _library(nvrtc.launcher(name, paths, shapes, gpu_writer.WARP // _THREADS), name)
+        return _library(nvrtc.launcher(name, paths, shapes, WARP // _THREADS), name)
 
 
 def loaded_names() -> list[str]:

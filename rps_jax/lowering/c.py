@@ -7,14 +7,12 @@ from collections.abc import Iterable, Mapping
 
 import numpy as np
 
-from rps_jax.lowering.nodes import Node
 from rps_jax.lowering.operations import spelled
 from rps_jax.lowering.routine import Group, Routine
 from rps_jax.lowering.scalar_writer import ScalarWriter
 from rps_jax.lowering.target import kind_of
 from rps_jax.lowering.writer import literal as literal_of
 
-_TYPES = {"f": "{p}_real", "i": "int", "b": "int"}
 # `{p}` is the prefix of all names, `{P}` the same in capitals.
 HELPERS = """\
 /* As in JAX, NaN propagates. */
@@ -40,9 +38,9 @@ class CWriter(ScalarWriter):
     alias = "{head} = &{corner};"
     pointer = "*"
 
-    def declaration(self, kind: str, name: str, size: int = 1, constant: bool = True) -> str:
-        kind = _TYPES[kind].format(p=self.prefix)
-        return f"{'const ' * constant}{kind} {name}{'' if size == 1 else f'[{size}]'}"
+    @property
+    def types(self) -> dict[str, str]:
+        return types(self.prefix)
 
     def literal(self, value: float, kind: str) -> str:
         return literal(self.prefix, value, kind)
@@ -67,6 +65,11 @@ class CWriter(ScalarWriter):
         return f"static {self.declaration(kind, sized)} = {text(array)};"
 
 
+def types(prefix: str) -> dict[str, str]:
+    """Return the types of numbers."""
+    return {"f": f"{prefix}_real", "i": "int", "b": "int"}
+
+
 def literal(prefix: str, value: float, kind: str) -> str:
     """Return a constant of C."""
     if kind == "b":
@@ -83,7 +86,7 @@ def sized_name(name: str, sizes: Iterable[int]) -> str:
 def struct(prefix: str, name: str, group: Group) -> str:
     """Return the type of a group."""
     lines = [
-        f"  {_TYPES[field.kind].format(p=prefix)} {sized_name(field.name, field.shape)};"
+        f"  {types(prefix)[field.kind]} {sized_name(field.name, field.shape)};"
         + (f" /* {field.about} */" if field.about else "")
         for field in group
         if field.size
@@ -110,11 +113,11 @@ def statements(
     for group, field, value in writer.outputs:
         name = f"{outputs[group]}{field.name}"
         if len(field.shape) == 1 and field.size > 1:
-            text = writer.read(value, Node(0, "end", (value,), field.kind, field.size), set())
-            lines.append(f"for (int i = 0; i < {field.size}; i++) {name}[i] = {text};")
+            line = f"  {name}[i] = {writer.value(value, field.kind, field.size)};"
+            lines += writer.elements(field.size, [line])
         else:
             lines += [
-                f"{sized_name(name, index)} = {writer.at(value, i)};"
+                f"{sized_name(name, index)} = {writer.operand(value, i)};"
                 for i, index in enumerate(np.ndindex(field.shape))
             ]
     for group, fields in routine.outputs.items():

@@ -14,19 +14,17 @@ import numpy as np
 from jax.extend.core import ClosedJaxpr
 
 from rps_jax.lowering.nodes import (
-    INITIAL,
     Array,
     LoopNode,
     Node,
     Result,
     SimdNodes,
     flat,
-    reached,
-    results,
+    view_of,
 )
 from rps_jax.lowering.operations import GPU_HEADER, TYPES, defined
 from rps_jax.lowering.target import Params, TooLargeError, Typed, Value, size_of
-from rps_jax.lowering.writer import STORED, SimdWriter, literal
+from rps_jax.lowering.writer import STORED, SimdWriter
 
 WARP = 32
 _INLINE = ("input", "move", "take")  # operations of which a thread computes only its own elements
@@ -51,11 +49,11 @@ struct Arguments {{
 }};
 
 extern "C" __global__ void __launch_bounds__(32) step(const __grid_constant__ Arguments a) {{
-  __shared__ unsigned shared[{SHARED} * WORLDS];
+  __shared__ unsigned shared[SHARED * WORLDS];
   const int thread = threadIdx.x % THREADS, world = threadIdx.x / THREADS;
-  const long long index = (long long)blockIdx.x * WORLDS + world;
-  const bool exists = index < a.worlds;
-  const long long at = {WORLD};
+  const long long number = (long long)blockIdx.x * WORLDS + world;
+  const bool exists = number < a.worlds;
+  const long long index = exists ? number : a.worlds - 1, at = {WORLD};
 {LINES}
 }}
 """
@@ -70,27 +68,22 @@ class GpuNodes(SimdNodes):
         super().__init__()
         self._gathers: dict[Hashable, Array] = {}
 
-    def moved(self, values: Sequence[Value], indices: np.ndarray, template: Typed) -> Value:
-        """Gather scalars; scalars that the same operation computes become one array operation."""
-        gathered = super().moved(values, indices, template)
-        if not isinstance(gathered, Array) or gathered.node.op != "move":
-            return gathered
-        node, scalars = gathered.node, tuple(map(_source, gathered.node.args))
-        if node.size > WARP:
-            return self._gathered_numbers(scalars, node.kind)._replace(shape=gathered.shape)
-        return gathered._replace(node=self.node("move", scalars, node.kind, node.size))
+    def gathered(self, scalars: Sequence[Value], kind: str, shape: tuple[int, ...]) -> Array:
+        """Gather scalars; many that the same operation computes become one array operation."""
+        scalars = tuple(map(_source, scalars))
+        if len(scalars) <= WARP:
+            return super().gathered(scalars, kind, shape)
+        return self._gathered_numbers(scalars, kind)._replace(shape=shape)
 
     def _gathered_numbers(self, scalars: tuple[Value, ...], kind: str) -> Value:
         """Return scalars as one operand."""
-        first, size = scalars[0], len(scalars)
+        size = len(scalars)
         if not any(isinstance(a, Array) for a in scalars):
             return flat(np.asarray(scalars), size)
+        if view := view_of(scalars, (size,)):
+            return view
         if not all(isinstance(a, Array) for a in scalars):
-            return Array(self.node("move", scalars, kind, size), 0, 1, (size,))
-        if all(a.node is first.node for a in scalars):
-            for step in (0, 1):
-                if all(a.first == first.first + step * i for i, a in enumerate(scalars)):
-                    return Array(first.node, first.first, step, (size,))
+            return super().gathered(scalars, kind, (size,))
         key = tuple((a.node.id, a.first) for a in scalars)
         if key not in self._gathers:
             self._gathers[key] = self._vectorised(scalars, kind)
@@ -101,7 +94,7 @@ class GpuNodes(SimdNodes):
         first, size, nodes = scalars[0].node, len(scalars), {a.node for a in scalars}
         operations = {(x.op, len(x.args), x.extra) for x in nodes}
         if len(operations) > 1 or any(x.is_single or x.op.startswith("fold") for x in nodes):
-            return Array(self.node("move", scalars, kind, size), 0, 1, (size,))
+            return super().gathered(scalars, kind, (size,))
         args = [
             self._gathered_numbers(
                 tuple(_operand(a, j) for a in scalars), self.kind(template.dtype, "a move")
@@ -155,17 +148,32 @@ class GpuWriter(SimdWriter):
     """Printer of nodes as CUDA for several threads per world."""
 
     table_type = "static __device__ const"
+    header, function, inputs = GPU_HEADER, _KERNEL, "a.inputs"
+    nodes = GpuNodes
 
-    def __init__(self, threads: int, shared: set[Node]) -> None:
-        """`shared` are arrays that a thread reads where another has written."""
+    def __init__(self, threads: int) -> None:
+        """Print the code of so many threads per world."""
         super().__init__()
         self._threads, self._worlds = threads, WARP // threads
-        self._shared = {node for node in shared if node.width > threads}
+        self._shared: set[Node] = set()  # arrays that a thread reads where another has written
         self._names = itertools.count()
         self._pending: list[str] = []  # statements that the next statement needs
         self._broadcasts: dict[tuple[int, int], str] = {}
         self._offsets: dict[Node, int] = {}  # in shared memory
-        self.shared_size = 1  # numbers of a world in shared memory, at most
+        self._shared_size = 1  # numbers of a world in shared memory, at most
+
+    def source(
+        self, closed: ClosedJaxpr, shapes: Sequence[Typed], outs: Sequence[Typed],
+        sorted_worlds: bool = False,
+    ) -> str:  # fmt: skip
+        text = super().source(closed, shapes, outs, sorted_worlds)
+        if 4 * self._shared_size * self._worlds > _MAX_SHARED:
+            raise TooLargeError("the arrays of a world exceed the shared memory of a block.")
+        return f"#define THREADS {self._threads}\n#define SHARED {self._shared_size}\n{text}"
+
+    def prepare(self, nodes: Iterable[Node], returned: Iterable[Result]) -> None:
+        shared = _shared_arrays(nodes, returned)
+        self._shared = {node for node in shared if node.width > self._threads}
 
     # --- where numbers are stored ---
 
@@ -177,8 +185,7 @@ class GpuWriter(SimdWriter):
         """Whether a thread stores one number of a node."""
         return node.width == 1 or self._turns(node.size) == 1
 
-    def _declared(self, node: Node) -> str:
-        """Return the declaration of a node that is assigned later."""
+    def declared(self, node: Node) -> str:
         kind = TYPES[node.kind]
         if self._is_scalar(node):
             return f"{kind} {node.name};"
@@ -190,15 +197,14 @@ class GpuWriter(SimdWriter):
                 break
             first = offset + neighbour.size
         self._offsets[node] = first
-        self.shared_size = max(self.shared_size, first + node.size)
+        self._shared_size = max(self._shared_size, first + node.size)
         return f"{kind} *const {node.name} = ({kind} *)shared + {first * self._worlds} + world;"
 
     def release(self, nodes: Iterable[Node]) -> None:
         for node in nodes:
             self._offsets.pop(node, None)
 
-    def _element(self, node: Node) -> str:
-        """Return the element `i` of an array, which the thread stores."""
+    def element(self, node: Node) -> str:
         if self._is_scalar(node):
             return node.name
         return f"{node.name}[i * WORLDS]" if node in self._shared else f"{node.name}[s]"
@@ -224,17 +230,12 @@ class GpuWriter(SimdWriter):
         return self._broadcasts[key]
 
     def read(self, a: Value, node: Node, fused: set[Node]) -> str:
-        if not isinstance(a, Array):
-            return self.constant(a)
-        if a.node in fused and node.is_in_step(a):
-            return f"e{a.node.id}"
-        if a.node.width == 1:
-            return a.node.name
-        if not a.step or node.size == 1:
-            return self._broadcast(a.node, a.first)
-        if node.is_in_step(a):
-            return self._element(a.node)
-        return self.item(a.node, f"{a.step} * i + {a.first}")
+        if isinstance(a, Array) and a.node.width > 1 and a.node not in fused:
+            if not a.step or node.size == 1:
+                return self._broadcast(a.node, a.first)
+            if node.is_in_step(a):
+                return self.element(a.node)
+        return super().read(a, node, fused)
 
     # --- statements ---
 
@@ -244,7 +245,7 @@ class GpuWriter(SimdWriter):
     def is_single(self, node: Node) -> bool:
         return node.is_single and not (node.size > 1 and node.op in _INLINE)
 
-    def _element_loop(self, size: int, lines: Sequence[str]) -> list[str]:
+    def elements(self, size: int, lines: Sequence[str]) -> list[str]:
         """Return a loop over the elements `i` of a thread; `s` counts its iterations."""
         turns, index = self._turns(size), "s * THREADS + thread"
         divisible = size % self._threads == 0
@@ -261,46 +262,37 @@ class GpuWriter(SimdWriter):
             return [*pending, "__syncwarp();", *lines, "__syncwarp();"]
         return [*pending, *lines]
 
-    def together(self, group: Sequence[Node], stored: set[Node]) -> list[str]:
-        head, lines, tail, fused = [], [], [], set(group)
-        size = group[0].size
-        inside = "" if size % self._threads == 0 else f"s * THREADS + thread < {size} ? "
-        for node in group:
-            kind, name = TYPES[node.kind], node.name
-            needed, text = self._element_text(node, fused)
-            if node.op.startswith("fold"):
-                op, start = node.op[5:], literal(INITIAL[node.op[5:-2], node.kind], node.kind)
-                head.append(f"{kind} {name} = {start};")
-                if inside and "(" in text:  # all threads take part in a shuffle
-                    lines.append(f"  const {kind} e{node.id} = {text};")
-                    text = f"e{node.id}"
-                text = f"{inside}{text} : {start}" if inside else text
-                lines.append(f"  {name} = {op}({name}, {text});")
-                if op != "add_f":  # which has a separate node, `_SUM`
-                    tail.append(f"{name} = {op[:-2]}_over_threads_{node.kind}({name});")
-                continue
-            lines += [*needed, f"  const {kind} e{node.id} = {text};"]
-            if node in stored:
-                head.append(self._declared(node))
-                lines.append(f"  {self._element(node)} = e{node.id};")
-        return self.statement([*head, *self._element_loop(size, lines), *tail], stored)
+    def _guard(self, size: int) -> str:
+        """Return the condition that a thread has an element `i`; empty if it always has."""
+        return f"s * THREADS + thread < {size}" if size % self._threads else ""
 
-    def _element_text(self, node: Node, fused: set[Node]) -> tuple[list[str], str]:
-        """Return statements, and the expression of element `i` of a node."""
+    def fold(self, node: Node, text: str) -> list[str]:
+        lines, guard = [], self._guard(node.size)
+        if guard and "(" in text:  # all threads take part in a shuffle
+            lines.append(f"  {self.declaration(node.kind, f'e{node.id}')} = {text};")
+            text = f"e{node.id}"
+        return [*lines, *super().fold(node, f"{guard} ? {text} : {self.initial(node)}"
+                                      if guard else text)]  # fmt: skip
+
+    def fold_end(self, node: Node) -> list[str]:
+        if node.op == "fold add_f":  # which has a separate node, `_SUM`
+            return []
+        return [f"{node.name} = {node.op[5:-2]}_over_threads_{node.kind}({node.name});"]
+
+    def element_text(self, node: Node, fused: set[Node]) -> tuple[list[str], str]:
         size, at = node.size, "i" if node.size > 1 else "0"
         if node.op == "input":
             stored = f"((const {STORED[node.kind]} *)a.inputs[{node.extra}])[at * {size} + {at}]"
             return [], f"{stored} != 0" if node.kind == "b" else stored
         if node.op == "take":
             index, source = node.args
-            row = self.read(index, Node(0, "row", (), "i", 1), set())
-            at = f"{self.table(np.array(node.extra))}[{row} * {size} + {at}]"
-            return [], self.item(source.node, at)
+            row, table = self.value(index, "i", 1), self.table(np.array(node.extra))
+            return [], self.item(source.node, f"{table}[{row} * {size} + {at}]")
         if node.op == "move" and size > 1:
             return self._gather(node)
         if node.op == "move":
             return [], self.read(node.args[0], node, set())
-        return [], self._expression(node, fused)
+        return super().element_text(node, fused)
 
     def _gather(self, node: Node) -> tuple[list[str], str]:
         """Return statements, and the expression of element `i` of a gather."""
@@ -314,7 +306,7 @@ class GpuWriter(SimdWriter):
             inside = set(indices)  # elsewhere any valid index will do
             args = [node.args[i if i in inside else indices[0]] for i in range(node.size)]
             if source is None:
-                texts.append(self.constant(np.asarray(args)))
+                texts.append(self.operand(np.asarray(args), "i"))
             else:
                 texts.append(self.item(source, self._integers([a.first for a in args])))
         if len(texts) == 1:
@@ -339,11 +331,10 @@ class GpuWriter(SimdWriter):
         return f"{self.table(np.array(scalars, np.int32))}[i]"
 
     def single(self, node: Node) -> list[str]:
-        kind, name = TYPES[node.kind], node.name
         if node.op == "part":
-            star = "" if self._is_scalar(node) else "*const "
-            return [f"{kind} {star}{name} = {node.extra.name};"]
-        return self.statement([f"const {kind} {name} = {self._element_text(node, set())[1]};"])
+            return []
+        declared = self.declaration(node.kind, node.name)
+        return self.statement([f"{declared} = {self.element_text(node, set())[1]};"])
 
     def loop(self, loop: LoopNode) -> list[str]:
         broadcasts, self._broadcasts = self._broadcasts, dict(self._broadcasts)
@@ -353,25 +344,15 @@ class GpuWriter(SimdWriter):
         self._broadcasts = broadcasts
         return lines
 
-    def assign(
-        self, node: Node, value: Value, declare: bool = False, masked: bool = False
-    ) -> list[str]:
-        text = self.read(value, Node(0, "set", (value,), node.kind, node.size), set())
-        text = f"choose_{node.kind}(goes, {text}, {self._element(node)})" if masked else text
-        line = f"{self._element(node)} = {text};"
-        lines = [line] if node.size == 1 else self._element_loop(node.size, [f"  {line}"])
-        return self.statement([*([self._declared(node)] if declare else []), *lines], [node])
-
     def end(self, result: Result) -> list[str]:
-        """Return the statements that store a result."""
-        index, a, size, kind = result
-        text = self.read(a, Node(0, "end", (a,), kind, size), set())
-        stored = f"(({STORED[kind]} *)a.outputs[{index}])[at * {size} + i]"
+        position, a, size, kind = result
+        stored = f"(({STORED[kind]} *)a.outputs[{position}])[at * {size} + i]"
+        guard = f" && {self._guard(size)}" if self._guard(size) else ""
         lines = [
-            f"  const {TYPES[kind]} e = {text};",
-            f"  if (exists && s * THREADS + thread < {size}) {stored} = e;",
+            f"  {self.declaration(kind, 'e')} = {self.value(a, kind, size)};",
+            f"  if (exists{guard}) {stored} = e;",
         ]
-        return self.statement(self._element_loop(size, lines))
+        return self.statement(self.elements(size, lines))
 
 
 def _shared_arrays(nodes: Iterable[Node], roots: Iterable[Result]) -> set[Node]:
@@ -406,43 +387,3 @@ def _shared_arrays(nodes: Iterable[Node], roots: Iterable[Result]) -> set[Node]:
         if part in shared or carried in shared:
             shared |= {part, carried}
     return shared
-
-
-def source(
-    closed: ClosedJaxpr,
-    shapes: Sequence[Typed],
-    outs: Sequence[Typed],
-    sorted_worlds: bool,
-    threads: int,
-) -> str:
-    """Return the CUDA of a closed jaxpr: the kernel `step`.
-
-    Args:
-      closed: the function of one world.
-      shapes: types of its arguments.
-      outs: types of its results.
-      sorted_worlds: whether one more argument has the order of the worlds.
-      threads: that compute a world.
-
-    Raises:
-      UnsupportedError: it has an operation that is not in the headers.
-      TooLargeError: it needs too much shared memory.
-    """
-    returned, roots = results(closed, shapes, outs, GpuNodes())
-    nodes = reached(roots)
-    writer = GpuWriter(threads, _shared_arrays(nodes, returned))
-    lines = writer.lines(nodes, roots, set())
-    for result in returned:
-        lines += writer.end(result)
-    if 4 * writer.shared_size * (WARP // threads) > _MAX_SHARED:
-        raise TooLargeError("the arrays of a world exceed the shared memory of a block.")
-    last = "exists ? index : a.worlds - 1"
-    fill = {
-        "TABLES": "\n".join(writer.tables.values()),
-        "LINES": "\n".join(f"  {line}" for line in lines),
-        "INPUTS": len(shapes) + sorted_worlds,
-        "OUTPUTS": len(outs),
-        "SHARED": writer.shared_size,
-        "WORLD": f"((const int *)a.inputs[{len(shapes)}])[{last}]" if sorted_worlds else last,
-    }
-    return f"#define THREADS {threads}\n{GPU_HEADER}{_KERNEL.format(**fill)}"

@@ -9,6 +9,7 @@ from collections.abc import Iterable, Mapping
 
 import numpy as np
 
+from rps_jax.lowering.nodes import Node
 from rps_jax.lowering.operations import spelled
 from rps_jax.lowering.routine import Group, Routine
 from rps_jax.lowering.scalar_writer import ScalarWriter
@@ -37,8 +38,8 @@ class JsWriter(ScalarWriter):
     def declaration(self, kind: str, name: str, size: int = 1, constant: bool = True) -> str:
         return f"{'const' if constant or size > 1 else 'let'} {name}"
 
-    def empty(self, kind: str, name: str, size: int) -> str:
-        return f"const {name} = Array({size});"
+    def declared(self, node: Node) -> str:
+        return f"const {node.name} = Array({node.size});" if node.size > 1 else f"let {node.name};"
 
     def literal(self, value: float, kind: str) -> str:
         return text_of(np.asarray(value).item())
@@ -70,7 +71,7 @@ def statements(routine: Routine, groups: Mapping[str, str], tables: dict[str, st
     writer = JsWriter(routine, groups, tables)
     lines = list(writer.body)
     for group, field, value in writer.outputs:
-        names = [writer.at(value, i) for i in range(field.size)]
+        names = [writer.operand(value, i) for i in range(field.size)]
         array = np.array(names, object).reshape(field.shape).tolist()
         lines.append(f"const result_{group}_{field.name} = {_nested(array)};")
     return "\n".join(f"  {line}" for line in lines)

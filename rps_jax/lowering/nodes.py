@@ -58,8 +58,8 @@ class Node:
 
     @property
     def name(self) -> str:
-        """Variable in the printed code."""
-        return f"v{self.id}"
+        """Variable in the printed code; a part of a loop's results is that of its carry."""
+        return self.extra.name if self.op == "part" else f"v{self.id}"
 
     @property
     def needed(self) -> Iterable[Node]:
@@ -169,15 +169,12 @@ class SimdNodes(Target):
         if all(not isinstance(x, Array) for x in sources):
             dtype = None if isinstance(template, Array) else template.dtype
             return np.asarray(sources, dtype).reshape(indices.shape)
-        first, second = sources[0], sources[min(1, len(sources) - 1)]
-        if all(isinstance(s, Array) and s.node is first.node for s in sources):
-            firsts = np.array([s.first for s in sources])
-            step = second.first - first.first
-            if step in (0, 1) and (firsts == first.first + step * np.arange(len(firsts))).all():
-                step = step if len(firsts) > 1 else 1
-                return Array(first.node, first.first, step, indices.shape)
-        node = self.node("move", sources, self.kind(template.dtype, "move"), flat_indices.size)
-        return Array(node, 0, 1, indices.shape)
+        kind = self.kind(template.dtype, "move")
+        return view_of(sources, indices.shape) or self.gathered(sources, kind, indices.shape)
+
+    def gathered(self, scalars: Sequence[Value], kind: str, shape: tuple[int, ...]) -> Array:
+        """Return scalars of several nodes as an array."""
+        return Array(self.node("move", scalars, kind, len(scalars)), 0, 1, shape)
 
     def apply(self, name: str, values: Sequence[Value], params: Params, out: Typed) -> Value:
         """Apply a primitive element by element, or as a reduction, a product or a slice."""
@@ -372,6 +369,17 @@ def element(value: Value, index: int) -> Value:
     if isinstance(value, Array):
         return Array(value.node, value.first + value.step * index, 1, ())
     return np.asarray(value).reshape(-1)[index]
+
+
+def view_of(scalars: Sequence[Value], shape: tuple[int, ...]) -> Array | None:
+    """Return scalars as a view of their node if they are consecutive or equal there."""
+    first = scalars[0]
+    if all(isinstance(a, Array) and a.node is first.node for a in scalars):
+        offsets = np.array([a.first - first.first for a in scalars])
+        for step in (1, 0):
+            if (offsets == step * np.arange(len(offsets))).all():
+                return Array(first.node, first.first, step, shape)
+    return None
 
 
 def flat(value: Value, size: int) -> Value:

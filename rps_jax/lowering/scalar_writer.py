@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import functools
 import hashlib
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import ClassVar, NamedTuple
 
 import numpy as np
 
-from rps_jax.lowering.nodes import Array, LoopNode, Node, results
+from rps_jax.lowering.nodes import LoopNode, Node, results
 from rps_jax.lowering.routine import Field, Routine
 from rps_jax.lowering.scalar_nodes import ScalarNodes, conditional
-from rps_jax.lowering.target import Value, kind_of
+from rps_jax.lowering.target import Value
 from rps_jax.lowering.writer import Writer
 
 _UNROLLED = 4  # elements of an array that is printed without a loop, at most
@@ -65,14 +65,6 @@ class ScalarWriter(Writer):
 
     # --- what a language defines ---
 
-    def literal(self, value: float, kind: str) -> str:
-        """Return a constant."""
-        raise NotImplementedError
-
-    def listed(self, texts: Iterable[str]) -> str:
-        """Return an array of these elements."""
-        raise NotImplementedError
-
     def zeros(self, size: int) -> str:
         """Return an array of zeros."""
         raise NotImplementedError
@@ -83,12 +75,10 @@ class ScalarWriter(Writer):
 
     # --- expressions ---
 
-    def constant(self, value: Value) -> str:
-        array = np.asarray(value).reshape(-1)
-        return self.at(array, 0) if array.size == 1 else f"{self.table(array)}[i]"
+    def number(self, text: str, kind: str) -> str:
+        return f"({text})" if "-" in text.split("e")[0] else text
 
     def table(self, array: np.ndarray) -> str:
-        """Return the name of a table of constants."""
         digest = hashlib.sha256(array.dtype.str.encode() + array.tobytes()).hexdigest()[:8]
         name = f"{self.prefix}_w_{digest}"
         if name not in self.tables:
@@ -98,17 +88,7 @@ class ScalarWriter(Writer):
     def call(self, op: str, operands: Sequence[str]) -> str:
         return self.spelling[op].format(*operands, p=self.prefix, P=self.prefix.upper())
 
-    def at(self, a: Value, index: int) -> str:
-        """Return an element of an operand."""
-        if isinstance(a, Array):
-            return self.item(a.node, a.first + a.step * index)
-        array = np.asarray(a).reshape(-1)
-        text = self.literal(array[index if array.size > 1 else 0], kind_of(array.dtype))
-        return f"({text})" if "-" in text.split("e")[0] else text
-
     def item(self, node: Node, index: int | str) -> str:
-        if node.op == "part":
-            return self.item(node.extra, index)
         if node.op != "input":
             return super().item(node, index)
         name, field = self._inputs[node.extra]
@@ -128,24 +108,17 @@ class ScalarWriter(Writer):
         for node in group:
             if node.op.startswith("fold"):
                 pair = functools.partial(self._pair, node.op[5:])
-                text = functools.reduce(pair, (self.at(node.args[0], k) for k in range(size)))
+                text = functools.reduce(pair, (self.operand(node.args[0], k) for k in range(size)))
                 lines.append(f"{self.declaration(node.kind, node.name)} = {text};")
             else:
-                rows = [[self.at(a, k) for a in node.args] for k in range(size)]
-                lines.append(self._array(node, [self.call(node.op, row) for row in rows]))
+                rows = [[self.operand(a, k) for a in node.args] for k in range(size)]
+                lines.append(self.array(node, [self.call(node.op, row) for row in rows]))
         return lines
 
     def _pair(self, op: str, lhs: str, rhs: str) -> str:
         return f"({self.call(op, [lhs, rhs])})"
 
-    def _array(self, node: Node, elements: Sequence[str]) -> str:
-        """Return the declaration of a node with its elements."""
-        text = elements[0] if node.size == 1 else self.listed(elements)
-        return f"{self.declaration(node.kind, node.name, node.size)} = {text};"
-
     def single(self, node: Node) -> list[str]:
-        if node.op == "part":
-            return []
         if node.op == "input":
             name, field = self._inputs[node.extra]
             if node.size == 1 or len(field.shape) == 1:
@@ -155,15 +128,13 @@ class ScalarWriter(Writer):
             return [self.alias.format(head=head, name=name, corner=corner)]
         if node.op == "product":
             return self._product(node)
-        if node.op == "move":
-            return [self._array(node, [self.at(a, 0) for a in node.args])]
         if node.op == "take":
             index, source = node.args
-            row, table = self.at(index, 0), np.array(node.extra)
-            return [self._array(node, [
+            row, table = self.operand(index, 0), np.array(node.extra)
+            return [self.array(node, [
                 self.item(source.node, self._entry(table[:, k], row)) for k in range(node.size)
             ])]  # fmt: skip
-        return [self._array(node, [self.call(node.op, [self.at(a, 0) for a in node.args])])]
+        return super().single(node)
 
     def _entry(self, column: np.ndarray, row: str) -> str:
         """Return the entry of a column of indices in a row."""
@@ -176,7 +147,7 @@ class ScalarWriter(Writer):
     def head(self, loop: LoopNode) -> str:
         if loop.op != "if":
             return super().head(loop)
-        return f"if ({'' if loop.extra else '!'}{self.at(loop.condition, 0)}) {{"
+        return f"if ({'' if loop.extra else '!'}{self.operand(loop.condition, 0)}) {{"
 
     def _product(self, node: Node) -> list[str]:
         """Return a product of rows with a matrix, which is padded with zeros."""
@@ -184,7 +155,7 @@ class ScalarWriter(Writer):
         inputs, columns = matrix.shape
         padded = inputs + -inputs % _ROWS
         table = self.table(np.pad(matrix, ((0, padded - inputs), (0, 0))))
-        items = [self.at(a, 0) for a in node.args]
+        items = [self.operand(a, 0) for a in node.args]
         zeros = [self.literal(0.0, "f")] * (padded - inputs)
         rows = [[*items[i : i + inputs], *zeros] for i in range(0, len(items), inputs)]
         flat = [text for row in rows for text in row]

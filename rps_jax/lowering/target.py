@@ -99,6 +99,12 @@ def size_of(shape: Sequence[int]) -> int:
     return int(np.prod(shape, dtype=int))
 
 
+def first_array(types: Sequence[Typed]) -> tuple[int, int]:
+    """Return the index and the size of the first array that has numbers."""
+    sizes = [size_of(x.shape) for x in types]
+    return next((i, size) for i, size in enumerate(sizes) if size)
+
+
 def operation_of(name: str, operands: Sequence[Typed], params: Params, out: Typed) -> str:
     """Return the name of an operation: the primitive and the kind of its first operand."""
     kind, first = (kind_of(x.dtype, name) for x in (out, operands[0]))

@@ -6,8 +6,9 @@ prints vectors with a lane for each world; `gpu_writer` and `scalar_writer` have
 
 from __future__ import annotations
 
+import itertools
 import math
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 
 import numpy as np
 from jax.extend.core import ClosedJaxpr
@@ -17,12 +18,13 @@ from rps_jax.lowering.nodes import (
     Array,
     LoopNode,
     Node,
+    Result,
     SimdNodes,
     reached,
     results,
 )
 from rps_jax.lowering.operations import SIMD_HEADER, TYPES
-from rps_jax.lowering.target import Typed, Value, kind_of, size_of
+from rps_jax.lowering.target import Typed, Value, first_array, kind_of
 
 HANDLER = "rps_native"  # placeholder of the name by which XLA calls the function
 STORED = {"f": "float", "i": "int", "u": "unsigned", "b": "unsigned char"}  # of a number of a world
@@ -55,6 +57,7 @@ class Writer:
     """Printer of nodes as statements, in an order in which few loops are needed."""
 
     index = "int"  # type of a loop's index
+    types: Mapping[str, str] = TYPES  # of variables
 
     def __init__(self) -> None:
         self.tables: dict[str, str] = {}  # declarations of constants before the function
@@ -63,27 +66,31 @@ class Writer:
 
     def declaration(self, kind: str, name: str, size: int = 1, constant: bool = True) -> str:
         """Return the left side of a declaration."""
+        return f"{'const ' * constant}{self.types[kind]} {name}{'' if size == 1 else f'[{size}]'}"
+
+    def declared(self, node: Node) -> str:
+        """Return the declaration of a node that is assigned later."""
+        return f"{self.declaration(node.kind, node.name, node.size, constant=False)};"
+
+    def literal(self, value: float, kind: str) -> str:
+        """Return a constant."""
+        return literal(value, kind)
+
+    def number(self, text: str, kind: str) -> str:
+        """Return a constant, or an element of a table, as an operand."""
         raise NotImplementedError
 
-    def empty(self, kind: str, name: str, size: int) -> str:
-        """Return the declaration of an array without values."""
-        return f"{self.declaration(kind, name, size, constant=False)};"
-
-    def constant(self, value: Value) -> str:
-        """Return a constant, or element `i` of a table of constants."""
+    def table(self, array: np.ndarray) -> str:
+        """Return the name of a table of constants."""
         raise NotImplementedError
 
-    def initial(self, node: Node) -> str:
-        """Return the initial value of a reduction."""
-        return self.constant(np.asarray(INITIAL[node.op[5:-2], node.kind]))
+    def listed(self, texts: Iterable[str]) -> str:
+        """Return an array of these elements."""
+        return "{" + ", ".join(texts) + "}"
 
     def call(self, op: str, operands: Sequence[str]) -> str:
         """Return the expression of an operation."""
         return f"{op}({', '.join(operands)})"
-
-    def single(self, node: Node) -> list[str]:
-        """Return the statements of a node that is not computed in a loop over its elements."""
-        raise NotImplementedError
 
     # --- order ---
 
@@ -92,35 +99,25 @@ class Writer:
     ) -> list[str]:
         """Return the statements of nodes; `used_after` are read by later statements."""
         waiting, computed, groups = list(nodes), set(computed), []
+        used_after, lines = set(used_after), list[str]()
         while waiting:
-            group = self._next(waiting, computed)
-            computed |= set(group)
+            groups.append(self._next(waiting, computed))
+            computed |= set(groups[-1])
             waiting = [node for node in waiting if node not in computed]
-            groups.append(group)
-        lines, used_after = [], set(used_after)
-        users: dict[Node, set[int]] = {}
-        for i, group in enumerate(groups):
-            for node in group:
-                for operand in node.needed:
-                    users.setdefault(operand, set()).add(i)
-        last: dict[int, list[Node]] = {}
-        for i, group in enumerate(groups):
-            for node in group:
-                if node not in used_after:
-                    last.setdefault(max(users.get(node, {i})), []).append(node)
+        # The last group that reads a node.
+        last = {x: i for i, group in enumerate(groups) for n in group for x in (n, *n.needed)}
+        unused: dict[int, list[Node]] = {}
+        for node in itertools.chain(*groups):
+            if node not in used_after:
+                unused.setdefault(last[node], []).append(node)
         for i, group in enumerate(groups):
             if self.is_single(group[0]):
                 for node in group:
                     lines += self.loop(node) if isinstance(node, LoopNode) else self.single(node)
             else:
-                whole = set().union(*(node.whole for node in group))
-                stored = {
-                    node
-                    for node in group
-                    if node in used_after or node in whole or users.get(node, set()) - {i}
-                }
-                lines += self.together(group, stored)
-            self.release(last.get(i, ()))
+                stored = used_after.union(*(node.whole for node in group))
+                lines += self.together(group, {n for n in group if n in stored or last[n] > i})
+            self.release(unused.get(i, ()))
         return lines
 
     def is_single(self, node: Node) -> bool:
@@ -134,8 +131,8 @@ class Writer:
     def release(self, nodes: Iterable[Node]) -> None:
         """Note that no later statement reads these nodes."""
 
-    def statement(self, lines: Sequence[str]) -> list[str]:
-        """Return statements, after those that their operands need."""
+    def statement(self, lines: Sequence[str], written: Iterable[Node] = ()) -> list[str]:
+        """Return statements that write nodes, after those that their operands need."""
         return list(lines)
 
     def _next(self, waiting: Sequence[Node], computed: set[Node]) -> list[Node]:
@@ -146,39 +143,63 @@ class Writer:
             for node in waiting:
                 group = "single" if self.is_single(node) else "together"
                 group = "loop" if isinstance(node, LoopNode) else group
-                if group != kind:
-                    continue
                 whole = computed if group == "together" else ready
-                if node.whole <= whole and set(node.needed) <= ready:
-                    groups.setdefault(node.size if group == "together" else 0, []).append(node)
+                if group == kind and node.whole <= whole and set(node.needed) <= ready:
+                    if kind == "loop":
+                        return [node]
+                    groups.setdefault(node.size if kind == "together" else 0, []).append(node)
                     ready.add(node)
-                    if group == "loop":
-                        break
             if groups:
                 return groups[self.first_size(groups)]
         raise AssertionError("nodes wait for one another")
 
     # --- statements ---
 
+    def single(self, node: Node) -> list[str]:
+        """Return the statements of a node that is not computed in a loop over its elements."""
+        if node.op == "part":  # a name of a carried node
+            return []
+        texts = [self.operand(a, 0) for a in node.args]
+        return [self.array(node, texts if node.op == "move" else [self.call(node.op, texts)])]
+
+    def array(self, node: Node, elements: Sequence[str]) -> str:
+        """Return the declaration of a node with its elements."""
+        text = elements[0] if node.size == 1 else self.listed(elements)
+        return f"{self.declaration(node.kind, node.name, node.size)} = {text};"
+
     def together(self, group: Sequence[Node], stored: set[Node]) -> list[str]:
         """Return one loop over the elements of nodes."""
-        head, lines, fused = [], [], set(group)
+        head, lines, tail, fused = [], [], [], set(group)
         for node in group:
-            text = self._expression(node, fused)
+            needed, text = self.element_text(node, fused)
+            lines += needed
             if node.op.startswith("fold"):
+                lines += self.fold(node, text)
                 declared = self.declaration(node.kind, node.name, constant=False)
                 head.append(f"{declared} = {self.initial(node)};")
-                lines.append(f"  {node.name} = {self.call(node.op[5:], [node.name, text])};")
+                tail += self.fold_end(node)
                 continue
             lines.append(f"  {self.declaration(node.kind, f'e{node.id}')} = {text};")
             if node in stored:
-                head.append(self.empty(node.kind, node.name, node.size))
-                lines.append(f"  {node.name}[i] = e{node.id};")
-        return [*head, self.loop_head(group[0].size), *lines, "}"]
+                head.append(self.declared(node))
+                lines.append(f"  {self.element(node)} = e{node.id};")
+        return self.statement([*head, *self.elements(group[0].size, lines), *tail], stored)
 
-    def loop_head(self, size: int) -> str:
-        """Return the first line of a loop over elements."""
-        return f"for ({self.index} i = 0; i < {size}; i++) {{"
+    def elements(self, size: int, lines: Sequence[str]) -> list[str]:
+        """Return a loop over elements `i`."""
+        return [f"for ({self.index} i = 0; i < {size}; i++) {{", *lines, "}"]
+
+    def initial(self, node: Node) -> str:
+        """Return the initial value of a reduction."""
+        return self.operand(np.asarray(INITIAL[node.op[5:-2], node.kind]), 0)
+
+    def fold(self, node: Node, text: str) -> list[str]:
+        """Return the statements that add the element `i` to a reduction."""
+        return [f"  {node.name} = {self.call(node.op[5:], [node.name, text])};"]
+
+    def fold_end(self, node: Node) -> list[str]:
+        """Return the statements that complete a reduction after its loop."""
+        return []
 
     def loop(self, loop: LoopNode) -> list[str]:
         """Return the statements of a loop, or of a block that runs under a condition."""
@@ -188,14 +209,14 @@ class Writer:
                 lines += self.assign(node, start, declare=True)
         results = [a.node for a in (*loop.results, loop.condition) if isinstance(a, Array)]
         computed = {*loop.free, *loop.carried, *(n for n in results if n not in loop.inner)}
+        rest = list(loop.inner)
         if loop.op == "while":
             condition = [n for n in reached([loop.condition.node]) if n in loop.inner]
             body += self.lines(condition, loop.inner, computed)
-            body += self.leave(loop)
+            holds = f"{self.declaration('b', 'goes')} = {self.value(loop.condition, 'b', 1)};"
+            body += self.statement([holds, "if (!any(goes)) break;"])
             computed |= set(condition)
             rest = [n for n in loop.inner if n not in set(condition)]
-        else:
-            rest = list(loop.inner)
         body += self.lines(rest, results, computed)
         for node, result in zip(loop.carried, loop.results, strict=True):
             if node.size and not (isinstance(result, Array) and result.node is node):
@@ -208,22 +229,16 @@ class Writer:
             return "for (;;) {"
         return f"for ({self.index} turn = 0; turn < {loop.length}; turn++) {{"
 
-    def leave(self, loop: LoopNode) -> list[str]:
-        """Return the statements that leave a `while` loop."""
-        raise NotImplementedError
-
     def assign(
         self, node: Node, value: Value, declare: bool = False, masked: bool = False
     ) -> list[str]:
         """Return the statements that assign a carried node, in the lanes that go on if masked."""
-        text = self.read(value, Node(0, "set", (value,), node.kind, node.size), set())
-        at = "" if node.size == 1 else "[i]"
-        text = f"choose_{node.kind}(goes, {text}, {node.name}{at})" if masked else text
-        if node.size == 1:
-            declared = self.declaration(node.kind, node.name, constant=False)
-            return [f"{declared if declare else node.name} = {text};"]
-        head = [self.empty(node.kind, node.name, node.size)] if declare else []
-        return [*head, f"{self.loop_head(node.size)[:-2]} {node.name}[i] = {text};"]
+        text = self.value(value, node.kind, node.size)
+        if masked:
+            text = self.call(f"choose_{node.kind}", ["goes", text, self.element(node)])
+        line = f"{self.element(node)} = {text};"
+        lines = [line] if node.size == 1 else self.elements(node.size, [f"  {line}"])
+        return self.statement([*([self.declared(node)] if declare else []), *lines], [node])
 
     # --- expressions ---
 
@@ -231,40 +246,50 @@ class Writer:
         """Return an element of a node."""
         return node.name if node.width == 1 else f"{node.name}[{index}]"
 
+    def element(self, node: Node) -> str:
+        """Return the element of a node that a loop over elements stores."""
+        return self.item(node, "i")
+
+    def operand(self, a: Value, index: int | str) -> str:
+        """Return an element of an operand, at a constant index or at the index `i` of a loop."""
+        if isinstance(a, Array):
+            if not a.step:
+                return self.item(a.node, a.first)
+            if isinstance(index, int):
+                return self.item(a.node, a.first + index)
+            return self.item(a.node, f"i + {a.first}" if a.first else "i")
+        array = np.asarray(a).reshape(-1)
+        kind, at = kind_of(array.dtype), index if array.size > 1 else 0
+        text = self.literal(array[at], kind) if isinstance(at, int) else f"{self.table(array)}[i]"
+        return self.number(text, kind)
+
     def read(self, a: Value, node: Node, fused: set[Node]) -> str:
         """Return an operand of a node; nodes in `fused` are computed in the same loop."""
-        if not isinstance(a, Array):
-            return self.constant(a)
-        if a.node.width == 1:
-            return self.item(a.node, 0)
-        if a.node in fused and node.is_in_step(a):
+        if isinstance(a, Array) and a.node in fused and node.is_in_step(a):
             return f"e{a.node.id}"
-        if not a.step or node.size == 1 or node.op in ("move", "take"):
-            return self.item(a.node, a.first)
-        return self.item(a.node, f"i + {a.first}" if a.first else "i")
+        return self.operand(a, 0 if node.size == 1 or node.op in ("move", "take") else "i")
 
-    def _expression(self, node: Node, fused: set[Node]) -> str:
+    def value(self, a: Value, kind: str, size: int) -> str:
+        """Return a value, or its element `i`, where it is assigned."""
+        return self.read(a, Node(0, "set", (a,), kind, size), set())
+
+    def element_text(self, node: Node, fused: set[Node]) -> tuple[list[str], str]:
+        """Return statements, and the expression of element `i` of a node."""
         operands = [self.read(a, node, fused) for a in node.args]
-        return operands[0] if node.op.startswith("fold") else self.call(node.op, operands)
+        return [], operands[0] if node.op.startswith("fold") else self.call(node.op, operands)
 
 
 class SimdWriter(Writer):
     """Printer of nodes as C with a vector lane for each world."""
 
     table_type = "static const"
+    header, function, inputs = SIMD_HEADER, _FUNCTION, "inputs"
+    nodes = SimdNodes
 
-    def declaration(self, kind: str, name: str, size: int = 1, constant: bool = True) -> str:
-        return f"{'const ' * constant}{TYPES[kind]} {name}{'' if size == 1 else f'[{size}]'}"
-
-    def constant(self, value: Value) -> str:
-        array = np.asarray(value).reshape(-1)
-        kind = kind_of(array.dtype)
-        if array.size == 1:
-            return f"all_{kind}({literal(array[0], kind)})"
-        return f"all_{kind}({self.table(array)}[i])"
+    def number(self, text: str, kind: str) -> str:
+        return f"all_{kind}({text})"
 
     def table(self, array: np.ndarray) -> str:
-        """Return the name of a table of constants."""
         key = f"{array.dtype.str}{array.tobytes()}"
         kind = kind_of(array.dtype)
         if key not in self.tables:
@@ -274,41 +299,63 @@ class SimdWriter(Writer):
             self.tables[key] = f"{self.table_type} {stored} {name}[{array.size}] = {{{texts}}};"
         return self.tables[key].split("[")[0].split()[-1]
 
-    def leave(self, loop: LoopNode) -> list[str]:
-        holds = self.read(loop.condition, Node(0, "goes", (), "b", 1), set())
-        return self.statement([f"const I goes = {holds};", "if (!any(goes)) break;"])
-
     def single(self, node: Node) -> list[str]:
-        kind, name, size = TYPES[node.kind], node.name, node.size
-        if node.op == "part":
-            if size == 1:
-                return [f"const {kind} {name} = {node.extra.name};"]
-            return [f"const {kind} *const {name} = {node.extra.name};"]
-        declared = self.declaration(node.kind, name, size, constant=False)
-        at = "" if size == 1 else "[i]"
+        at = f"* {node.size} + i]"
         if node.op == "input":
-            stored = f"((const {STORED[node.kind]} *)inputs[{node.extra}])[at[l] * {size} + i]"
-            stored = f"-(int){stored}" if node.kind == "b" else stored
-            return [
-                f"{declared};",
-                f"for (int i = 0; i < {size}; i++)",
-                f"  for (int l = 0; l < LANES; l++) {name}{at}[l] = {stored};",
-            ]
-        if node.op == "take":
+            text = f"((const {STORED[node.kind]} *)inputs[{node.extra}])[at[l] {at}"
+            text = f"-(int){text}" if node.kind == "b" else text
+        elif node.op == "take":
             index, source = node.args
-            row, table = self.read(index, node, set()), self.table(np.array(node.extra))
-            return [
-                f"{declared};",
-                f"for (int i = 0; i < {size}; i++)",
-                "  for (int l = 0; l < LANES; l++)",
-                f"    {name}{at}[l] = {source.node.name}[{table}[{row}[l] * {size} + i]][l];",
-            ]
-        if node.op == "move":
-            reads = [self.read(a, node, set()) for a in node.args]
-            if size == 1:
-                return [f"const {declared} = {reads[0]};"]
-            return [f"{declared};", *(f"{name}[{i}] = {x};" for i, x in enumerate(reads))]
-        return [f"const {declared} = {self._expression(node, set())};"]
+            row, table = self.value(index, "i", 1), self.table(np.array(node.extra))
+            text = f"{source.node.name}[{table}[{row}[l] {at}][l]"
+        else:
+            return super().single(node)
+        line = f"  for (int l = 0; l < LANES; l++) {self.element(node)}[l] = {text};"
+        return [self.declared(node), *self.elements(node.size, [line])]
+
+    def end(self, result: Result) -> list[str]:
+        """Return the statements that store a result."""
+        position, a, size, kind = result
+        stored, truth = STORED[kind], " != 0" * (kind == "b")
+        return self.elements(size, [
+            f"  {self.declaration(kind, 'e')} = {self.value(a, kind, size)};",
+            "  for (int l = 0; l < LANES && first + l < worlds; l++)",
+            f"    (({stored} *)outputs[{position}])[at[l] * {size} + i] = e[l]{truth};",
+        ])  # fmt: skip
+
+    def source(
+        self, closed: ClosedJaxpr, shapes: Sequence[Typed], outs: Sequence[Typed],
+        sorted_worlds: bool = False,
+    ) -> str:  # fmt: skip
+        """Return the function of a closed jaxpr that runs all worlds: `HANDLER`, or `step` of CUDA.
+
+        Args:
+          closed: the function of one world.
+          shapes: types of its arguments.
+          outs: types of its results.
+          sorted_worlds: whether one more argument has the order of the worlds.
+
+        Raises:
+          UnsupportedError: it has an operation that is not in the headers.
+          TooLargeError: a kernel needs too much shared memory.
+        """
+        returned, roots = results(closed, shapes, outs, self.nodes())
+        nodes, (sized, size) = reached(roots), first_array(shapes)
+        self.prepare(nodes, returned)
+        lines = self.lines(nodes, roots, set())
+        for result in returned:
+            lines += self.end(result)
+        order = f"((const int *){self.inputs}[{len(shapes)}])[index]"
+        return self.header + self.function.format(
+            TABLES="\n".join(self.tables.values()),
+            LINES="\n".join(f"  {line}" for line in lines),
+            WORLD=order if sorted_worlds else "index",
+            INPUTS=len(shapes) + sorted_worlds,
+            **{"OUTPUTS": len(outs), "NAME": HANDLER, "SIZED": sized, "SIZE": size},
+        )
+
+    def prepare(self, nodes: Iterable[Node], returned: Iterable[Result]) -> None:
+        """Choose where arrays are stored."""
 
 
 def literal(value: float, kind: str, suffix: str = "f") -> str:
@@ -325,43 +372,3 @@ def literal(value: float, kind: str, suffix: str = "f") -> str:
     if kind == "u":
         return f"{integer}u"
     return str(integer) if integer > -(2**31) else "-2147483647 - 1"
-
-
-def source(
-    closed: ClosedJaxpr, shapes: Sequence[Typed], outs: Sequence[Typed], sorted_worlds: bool = False
-) -> str:
-    """Return the C of a closed jaxpr: the function `HANDLER` that XLA calls.
-
-    Args:
-      closed: the function of one world.
-      shapes: types of its arguments.
-      outs: types of its results.
-      sorted_worlds: whether one more argument has the order of the worlds.
-
-    Raises:
-      UnsupportedError: it has an operation that is not in the headers.
-    """
-    (returned, roots), writer = results(closed, shapes, outs, SimdNodes()), SimdWriter()
-    lines = writer.lines(reached(roots), roots, set())
-    for index, a, size, kind in returned:
-        text = writer.read(a, Node(0, "end", (a,), kind, size), set())
-        stored, truth = STORED[kind], " != 0" * (kind == "b")
-        lines += [
-            f"for (int i = 0; i < {size}; i++) {{",
-            f"  const {TYPES[kind]} e = {text};",
-            "  for (int l = 0; l < LANES && first + l < worlds; l++)",
-            f"    (({stored} *)outputs[{index}])[at[l] * {size} + i] = e[l]{truth};",
-            "}",
-        ]
-    sized = next(i for i, x in enumerate(shapes) if size_of(x.shape))
-    fill = {
-        "TABLES": "\n".join(writer.tables.values()),
-        "LINES": "\n".join(f"  {line}" for line in lines),
-        "NAME": HANDLER,
-        "INPUTS": len(shapes) + sorted_worlds,
-        "OUTPUTS": len(outs),
-        "WORLD": f"((const int *)inputs[{len(shapes)}])[index]" if sorted_worlds else "index",
-        "SIZED": sized,
-        "SIZE": size_of(shapes[sized].shape),
-    }
-    return SIMD_HEADER + _FUNCTION.format(**fill)
