@@ -2,7 +2,6 @@
 
 import ast
 import contextlib
-import json
 import re
 from collections.abc import Iterator
 from dataclasses import replace
@@ -14,6 +13,7 @@ import imageio_ffmpeg
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pandas as pd
 
 from rps_jax.app import cli
 from rps_jax.control import registry
@@ -60,9 +60,9 @@ def one_sentence(error: str) -> str:
     return error
 
 
-def read_log(folder: Path) -> list[dict[str, Any]]:
-    """Return the lines of a tuner's log, one per generation."""
-    return [json.loads(line) for line in (folder / "log.jsonl").read_text().splitlines()]
+def read_curve(folder: Path) -> pd.DataFrame:
+    """Return the table of a tuner's generations."""
+    return pd.read_csv(folder / "curve.csv", index_col="generation")
 
 
 # --- trials and sweeps ---------------------------------------------------------------------

@@ -6,6 +6,7 @@ from types import SimpleNamespace
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pandas as pd
 import pytest
 
 from rps_jax.app import cli
@@ -114,8 +115,8 @@ def test_windows_start_at_the_states_of_their_trials(monkeypatch):
     monkeypatch.setattr(gradients, "window", lambda *_, **__: lambda thetas, starts: starts[1])
     late = jnp.array([0.0, 0.5, 1.0])
     for within, steps in ((10.0, [0, 250, 500]), (0.0, [0, 0, 0])):
-        windows = TuneGrad("rps", tuned=("L", "K_h"), within=within, setting=SETTING).windows
-        scores = descent.window_scores(windows, None)
+        question = TuneGrad("rps", tuned=("L", "K_h"), within=within, setting=SETTING)
+        scores = descent.window_scores(question, None)
         np.testing.assert_array_equal(scores(jnp.zeros((3, 2)), (None, late)), steps)
 
 
@@ -134,12 +135,11 @@ class TestRuns:
     @pytest.mark.slow
     def test_the_command_line_and_a_run_of_another_kind(self, tmp_path, capsys):
         assert cli.main(self.arguments(tmp_path, 2)) == 0
-        log = [json.loads(line) for line in (tmp_path / "log.jsonl").read_text().splitlines()]
-        assert len(log) == 3
-        for line in log[:2]:
-            assert line["finite"] == 1.0
-            assert np.isfinite([line["gradient"], line["gradient_error"]]).all()
-        assert log[1]["params"] != log[0]["params"] or log[0]["gradient"] == 0
+        curve = pd.read_csv(tmp_path / "curve.csv")
+        assert len(curve) == 3
+        assert (curve.finite[:2] == 1.0).all()
+        assert np.isfinite(curve[["gradient", "gradient_error"]][:2]).all(axis=None)
+        assert curve["params.L"][1] != curve["params.L"][0] or curve.gradient[0] == 0
         assert set(json.loads((tmp_path / "tuned.json").read_text())) == {"L", "K_h", "v_lost"}
         capsys.readouterr()
         assert cli.main(self.arguments(tmp_path, 3)) == 2

@@ -5,16 +5,16 @@ import numpy as np
 import pytest
 
 from rps_jax.control.laws.rps import BOUNDS, RPSParams
-from rps_jax.runs import evaluate
-from rps_jax.runs.evaluate import CandidateScores
 from rps_jax.runs.question import seed_of
+from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import Outcome
-from rps_jax.tuning.run import Problem
 from rps_jax.tuning.space import SUBSETS, Space
+from rps_jax.world.domain import DOMAINS
 from sweeps.landscape import candidates
 from sweeps.landscape.candidates import Aims
 
 FULL = SUBSETS["full"]
+WIDE = ((DOMAINS["wide"],), Setting())
 SETS = {"paper": RPSParams.paper(), "tuned": RPSParams.tuned()}
 
 
@@ -84,24 +84,22 @@ def pretended(monkeypatch):
     """Trials that succeed by the seed of their worlds, and take 100 s times L."""
     calls = []
 
-    def score_candidates(asks, *_, **__):
+    def run_all(asks, *_, **__):
         answers = []
         for ask in asks:
             calls.append(ask)
             L = np.asarray(ask.params.L)[:, None]
             success = np.broadcast_to((ask.seed + ask.worlds) % 4 > 0, (L.size, ask.worlds.size))
-            outcome = outcomes(
-                success=success, time=100 * L + 0 * success, path_length=5 + 0 * success
-            )
-            answers.append(CandidateScores(outcome, 0 * success))
+            time, path_length = 100 * L + 0 * success, 5 + 0 * success
+            answers.append(outcomes(success=success, time=time, path_length=path_length))
         return answers, None
 
-    monkeypatch.setattr(evaluate, "score_candidates", score_candidates)
+    monkeypatch.setattr(candidates, "outcomes", run_all)
     return calls
 
 
 def test_each_parameter_alone_is_labelled_and_from_worlds_for_validation(pretended):
-    result = candidates.alone(SETS, Problem(), names=("L", "K_h"), count=3, worlds=8)
+    result = candidates.alone(SETS, *WIDE, names=("L", "K_h"), count=3, worlds=8)
     assert dict(result.sizes) == {"set": 2, "parameter": 2, "step": 3}
     assert [ask.seed for ask in pretended] == [seed_of(0, "validate")]
     first = result.sel(set="paper", parameter="L")
@@ -112,7 +110,7 @@ def test_each_parameter_alone_is_labelled_and_from_worlds_for_validation(pretend
 
 
 def test_the_front_is_chosen_by_validation_and_measured_by_test_worlds(pretended):
-    result = candidates.front(SETS, Problem(), candidates=6, worlds=8)
+    result = candidates.front(SETS, *WIDE, candidates=6, worlds=8)
     assert [ask.seed for ask in pretended] == [seed_of(0, s) for s in ("validate", "test")]
     params = [jax.tree.map(np.asarray, ask.params) for ask in pretended]
     jax.tree.map(np.testing.assert_array_equal, *params)

@@ -5,9 +5,8 @@ from typing import get_args
 
 import jax.numpy as jnp
 import numpy as np
-import pandas as pd
 import pytest
-from helpers import read_log, refusal
+from helpers import read_curve, refusal
 from helpers import rps as command
 
 from rps_jax.control.laws import rps
@@ -161,7 +160,8 @@ class TestEvolution:
             candidates = first.propose()
             values = function(candidates)
             values[:bad] = np.nan
-            first.update(candidates, {"values": values, "mean": first.mean, "validation": np.inf})
+            results = {"vectors": candidates, "values": values, "center": first.mean}
+            first.update(results | {"validation": np.inf})
             result.append(np.nanmin(values))
         return np.array(result)
 
@@ -180,8 +180,8 @@ class TestEvolution:
     def test_a_search_continues_after_a_generation_without_finite_values(self):
         assert np.isfinite(self.minimise(sphere, 3, bad=7, population=8)).all()
         first = search(population=8)
-        metrics = {"values": np.full(8, np.nan), "mean": first.mean, "validation": np.nan}
-        first.update(first.propose(), metrics)
+        results = {"values": np.full(8, np.nan), "center": first.mean, "validation": np.nan}
+        first.update(results | {"vectors": first.propose()})
         assert np.isfinite(first.propose()).all()
 
     def test_the_seed_makes_the_proposals(self):
@@ -200,8 +200,8 @@ class TestEvolution:
     def test_a_stalled_search_restarts_elsewhere_and_keeps_the_best(self):
         first = search(population=8, patience=2)
         for value in (1.0, 2.0, 3.0):
-            metrics = {"values": np.zeros(8), "mean": np.full(4, value), "validation": value}
-            first.update(first.propose(), metrics)
+            results = {"values": np.zeros(8), "center": np.full(4, value), "validation": value}
+            first.update(results | {"vectors": first.propose()})
         assert first.restarts == 1
         assert first.best.tolist() == [1.0] * 4
         assert np.abs(first.mean - first.base).max() > 0.3
@@ -284,18 +284,18 @@ class TestRuns:
             assert tuned(folder, tuner()) == whole
             rounds = 1 if tuner is evolution else 2  # the last step of a descent only validates
             assert len(pretended) - calls == rounds * (6 - done) - (rounds - 1)
-            for name in ("log.jsonl", "tuned.json", "curve.csv"):
+            for name in ("tuned.json", "curve.csv"):
                 first, second = (
                     (tmp_path / run / name).read_text() for run in ("whole", f"{done}")
                 )
                 assert first == second
-        assert len(read_log(tmp_path / "whole")) == 6
+        assert len(read_curve(tmp_path / "whole")) == 6
 
     @pytest.mark.parametrize("algorithm", get_args(Algorithm))
     def test_every_algorithm_is_continued_over_restarts(self, tmp_path, pretended, algorithm):
         options = {"algorithm": algorithm, "patience": 1}
         whole = tuned(tmp_path / "whole", evolution(12, **options))
-        assert read_log(tmp_path / "whole")[-1]["restarts"] > 0
+        assert read_curve(tmp_path / "whole").restarts.iloc[-1] > 0
         for generations in (5, 12):
             parts = tuned(tmp_path / "parts", evolution(generations, **options))
         assert parts == whole
@@ -303,13 +303,13 @@ class TestRuns:
     @pytest.mark.parametrize("tuner", [evolution, descents])
     def test_only_a_damaged_generation_is_repeated(self, tmp_path, pretended, tuner):
         whole = tuned(tmp_path, tuner())
-        log = (tmp_path / "log.jsonl").read_text()
+        curve = (tmp_path / "curve.csv").read_text()
         (third,) = (tmp_path / "parts").glob("000002*")
         third.write_bytes(third.read_bytes()[:-100])
         calls = len(pretended)
         assert tuned(tmp_path, tuner()) == whole
         assert len(pretended) == calls + (1 if tuner is evolution else 2)
-        assert (tmp_path / "log.jsonl").read_text() == log
+        assert (tmp_path / "curve.csv").read_text() == curve
 
     def test_generations_that_the_seed_does_not_propose_are_refused(self, tmp_path, pretended):
         tuned(tmp_path / "one", evolution(3))
@@ -324,22 +324,21 @@ class TestRuns:
     def test_finished_generations_stay_when_fewer_are_requested(self, tmp_path, pretended):
         whole = tuned(tmp_path, evolution(6))
         assert tuned(tmp_path, evolution(2)) == whole
-        assert len(read_log(tmp_path)) == 6
+        assert len(read_curve(tmp_path)) == 6
 
     def test_the_curve_is_a_table_that_grows_with_the_run(self, tmp_path, pretended):
         for done in (2, 6):
-            tuned(tmp_path, evolution(done))
-            log = read_log(tmp_path)
-            curve = pd.read_csv(tmp_path / "curve.csv", index_col="generation")
+            results = run.tune(Run(tmp_path, no_progress), evolution(done))
+            curve = read_curve(tmp_path)
             assert curve.index.tolist() == list(range(done))
             for name in ("validation_success", "simulated"):
-                assert curve[name].tolist() == [line[name] for line in log]
-            assert curve["params.K_h"].tolist() == [line["params"]["K_h"] for line in log]
+                assert curve[name].tolist() == results[name].values.tolist()
+            assert curve["params.K_h"].tolist() == results.params.values[:, 1].tolist()
 
     def test_a_search_ends_with_its_budget_and_resumes_with_more(self, tmp_path, pretended):
         for budget, done in ((2.5, 3), (4.0, 4), (0.0, 6)):  # 1 s a generation
             tuned(tmp_path, evolution(budget=budget))
-            assert len(read_log(tmp_path)) == done
+            assert len(read_curve(tmp_path)) == done
 
     def test_it_finds_the_place_and_writes_it_down(self, tmp_path, pretended):
         tuned(tmp_path, evolution(20))

@@ -9,8 +9,10 @@ from __future__ import annotations
 
 import functools
 import time
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar, Literal, NamedTuple
+from functools import partial
+from typing import Any, ClassVar, Literal
 
 import jax
 import jax.numpy as jnp
@@ -29,8 +31,7 @@ from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import ControlLoop, Snapshot, Trial, World, control_step, start_all
 from rps_jax.tuning import gradients
 from rps_jax.tuning.gradients import Estimate
-from rps_jax.tuning.run import LogLine, Metrics, Problem, ScoreCandidates, Tuner, Tuning, finite
-from rps_jax.tuning.space import Space
+from rps_jax.tuning.run import Results, ScoreCandidates, Tuner, Tuning
 from rps_jax.world.physics import preset
 
 Estimator = Literal["reverse", "evolution"]
@@ -106,11 +107,20 @@ class TuneGrad(Tuning):
     def tuner(self) -> DescentTuner:
         return DescentTuner(self)
 
-    @property
-    def windows(self) -> Windows:
-        """Options of the differentiated windows."""
-        options = self.world_clip, self.window, self.within, self.arrive
-        return Windows(self.space, self.problem, *options)
+    @functools.cached_property
+    def family_gradients(self) -> Callable[..., Estimate]:
+        """Function of thetas (S, p), stage and worlds (n, ...) of one shape family.
+
+        It returns estimates (S, p) from all these worlds; the worlds are pairs, as `window_scores`
+        takes them.
+        """
+
+        def estimates(thetas: jax.Array, stage: Stage, worlds: tuple[World, jax.Array]) -> Estimate:
+            scores = window_scores(self, stage)
+            estimate = partial(gradients.reverse, scores, worlds=worlds, clip=self.world_clip)
+            return jax.vmap(estimate)(thetas)
+
+        return jax.jit(estimates)
 
     @functools.cached_property
     def rule(self) -> optax.GradientTransformation:
@@ -152,17 +162,6 @@ def soft_score(
     return jnp.asarray(score)
 
 
-class Windows(NamedTuple):
-    """Options of the differentiated windows of softened trials; static."""
-
-    space: Space
-    problem: Problem
-    world_clip: float  # [1]
-    window: float  # [s]
-    within: float  # [s]
-    arrive: float  # [m]
-
-
 def soften_skins(worlds: World) -> World:
     """Return worlds (n, ...) with smooth skins."""
     sensor = worlds.skin
@@ -172,37 +171,37 @@ def soften_skins(worlds: World) -> World:
     return worlds._replace(skin=SmoothSkin(sensor, temperatures))
 
 
-def window_scores(windows: Windows, stage: Stage) -> gradients.Scores:
+def window_scores(options: TuneGrad, stage: Stage) -> gradients.Scores:
     """Return the scores of windows of softened trials, a function as `gradients` defines it.
 
     A world is a pair (World, start), where `start` is the share of `within` at which its window
     starts. The same parameters drive the trial up to the window, without derivatives.
     """
-    space, problem = windows.space, windows.problem
+    space, setting = options.space, options.setting
     law = registry.smooth_law(registry.law_of(space.base))
-    setting, loop = problem.setting, ControlLoop(preset(fidelity="fast"), law=law)
+    loop = ControlLoop(preset(fidelity="fast"), law=law)
 
     def cost(snapshots: Snapshot) -> jax.Array:
-        return soft_score(snapshots, space.base, setting, problem.objective, windows.arrive)
+        return soft_score(snapshots, space.base, setting, options.objective, options.arrive)
 
     def count_steps(seconds: float) -> int:
         return round(seconds / setting.physics.control_period)
 
-    steps = max(1, count_steps(windows.window))
+    steps = max(1, count_steps(options.window))
     score = gradients.window(stage, space.params, cost, loop, steps)
 
     def run_to_start(thetas: jax.Array, worlds: World, start: jax.Array) -> Trial:
         params = jax.vmap(space.params)(thetas)
         trials = start_all(worlds, params, jnp.ones(len(start), bool), law=law)
-        if not windows.within:
+        if not options.within:
             return trials
 
         def step(i: jax.Array, trials: Trial) -> Trial:
             next_trials, _ = control_step(stage, worlds, params, trials, loop)
-            is_before = i < start * count_steps(windows.within)
+            is_before = i < start * count_steps(options.within)
             return jax.vmap(soft.tree_where)(is_before, next_trials, trials)
 
-        return jax.lax.fori_loop(0, count_steps(windows.within), step, trials)
+        return jax.lax.fori_loop(0, count_steps(options.within), step, trials)
 
     def scores(thetas: jax.Array, worlds: tuple[World, jax.Array]) -> jax.Array:
         trials = run_to_start(jax.lax.stop_gradient(thetas), *worlds)
@@ -211,56 +210,43 @@ def window_scores(windows: Windows, stage: Stage) -> gradients.Scores:
     return scores
 
 
-@functools.partial(jax.jit, static_argnames="windows")
-def _family_gradients(
-    thetas: jax.Array, stage: Stage, worlds: tuple[World, jax.Array], *, windows: Windows
-) -> Estimate:
-    """Return estimates (S, p) at thetas (S, p), from all worlds (n, ...) of one shape family."""
-    scores, clip = window_scores(windows, stage), windows.world_clip
-    return jax.vmap(lambda theta: gradients.reverse(scores, theta, worlds, clip=clip))(thetas)
-
-
-def window_gradients(
-    thetas: jax.Array, windows: Windows, seed: int, step: int
-) -> tuple[Estimate, float]:
+def window_gradients(thetas: jax.Array, options: TuneGrad, step: int) -> tuple[Estimate, float]:
     """Return estimates (S, p) from the windows of one step, and the simulated time [s].
 
     The time includes the trials up to each window, but not the steps in which a world waits for
     windows that start later.
     """
-    problem = windows.problem
-    setting = replace(problem.setting, engine="quasistatic")
-    ask = problem.ask(windows.space.base, seed, step)
-    random = np.random.default_rng((seed, step))
+    setting = replace(options.setting, engine="quasistatic")
+    candidates = options.candidates(options.space.base, step)
+    random = np.random.default_rng((setting.seed, step))
     estimates, counts = [], []
-    for batch in ask.batches(setting):
+    for batch in candidates.batches(setting):
         count = batch.indices.size
         worlds = soften_skins(batch.worlds), jnp.asarray(random.uniform(size=count))
-        estimates.append(_family_gradients(thetas, batch.stage, worlds, windows=windows))
+        estimates.append(options.family_gradients(thetas, batch.stage, worlds))
         counts.append(count)
     shares = [count / sum(counts) for count in counts]
-    zero = jnp.zeros(())
-    mean = Estimate(
-        sum((e.gradient * share for e, share in zip(estimates, shares, strict=True)), zero),
-        sum((e.variance * share**2 for e, share in zip(estimates, shares, strict=True)), zero),
-        sum((e.finite * share for e, share in zip(estimates, shares, strict=True)), zero),
-    )
-    return mean, len(thetas) * sum(counts) * (windows.window + windows.within / 2)
+
+    def total(name: str, power: int = 1) -> jax.Array:
+        parts = (getattr(x, name) * y**power for x, y in zip(estimates, shares, strict=True))
+        return sum(parts, jnp.zeros(()))
+
+    mean = Estimate(total("gradient"), total("variance", 2), total("finite"))
+    return mean, len(thetas) * sum(counts) * (options.window + options.within / 2)
 
 
 def evolution_gradients(
-    thetas: jax.Array, descent: TuneGrad, step: int, score_candidates: ScoreCandidates
+    thetas: jax.Array, options: TuneGrad, step: int, score_candidates: ScoreCandidates
 ) -> Estimate:
     """Return estimates (S, p) from antithetic candidates of the original law in the same worlds."""
-    problem = descent.problem
-    key = jax.random.fold_in(jax.random.key(descent.setting.seed), step)
+    key = jax.random.fold_in(jax.random.key(options.setting.seed), step)
     count, p = thetas.shape
-    steps = jax.random.normal(key, (count, descent.pairs, p), thetas.dtype)
-    offsets = jnp.concatenate([steps, -steps], axis=1) * descent.sigma
-    params = descent.space.params((thetas[:, None] + offsets).reshape(-1, p))
-    (answer,) = score_candidates([problem.ask(params, descent.setting.seed, step)])
-    values = problem.objective.value(answer.score).reshape(count, 2, descent.pairs)
-    slopes = (values[:, 0] - values[:, 1])[..., None] * steps / (2 * descent.sigma)
+    steps = jax.random.normal(key, (count, options.pairs, p), thetas.dtype)
+    offsets = jnp.concatenate([steps, -steps], axis=1) * options.sigma
+    params = options.space.params((thetas[:, None] + offsets).reshape(-1, p))
+    (answer,) = score_candidates([options.candidates(params, step)])
+    values = options.objective.value(answer.score).reshape(count, 2, options.pairs)
+    slopes = (values[:, 0] - values[:, 1])[..., None] * steps / (2 * options.sigma)
     return jax.vmap(gradients.estimate)(slopes)
 
 
@@ -273,6 +259,8 @@ class DescentTuner(Tuner):
     Before every step all descents are tried in the worlds for validation.
     """
 
+    DIMS: ClassVar = {"validations": ("candidate",), "gradients": ("candidate", "parameter")}
+
     def __init__(self, descent: TuneGrad):
         """Raise InputError if the law has no derivatives and the estimator needs them."""
         super().__init__(descent, descent.steps + 1)
@@ -284,7 +272,7 @@ class DescentTuner(Tuner):
         """Start at the base parameters of the space, and at random vectors near them."""
         super().start()
         descent, base = self.descent, self.space.vector(self.space.base)
-        key = jax.random.key(self.seed)
+        key = jax.random.key(descent.setting.seed)
         offsets = jax.random.normal(key, (descent.starts, base.size), base.dtype).at[0].set(0.0)
         self.thetas = base + descent.spread * offsets  # (S, p)
         self._base_value: float | None = None  # validation of the base parameters
@@ -293,62 +281,53 @@ class DescentTuner(Tuner):
     def propose(self) -> np.ndarray:
         return np.asarray(self.thetas)
 
-    def shapes(self, vectors: np.ndarray, generation: int) -> dict[str, tuple[int, ...]]:
-        """Return the shapes of the validations and, except after the last step, of gradients."""
-        shapes = {"validation": vectors.shape[:1]}
-        return shapes | ({"gradient": vectors.shape} if generation < self.descent.steps else {})
-
     def judge(
         self, vectors: np.ndarray, generation: int, score_candidates: ScoreCandidates
-    ) -> tuple[Metrics, LogLine]:
-        """Return validations (S,) and, except after the last step, gradients (S, p)."""
-        (answer,) = score_candidates([self.problem.validate(self.space.params(vectors), self.seed)])
-        values = self.problem.objective.value(answer.score)
+    ) -> Results:
+        """Validate all vectors (S, p) and estimate their gradients: NaN after the last step."""
+        (answer,) = score_candidates(
+            [self.descent.validation_candidates(self.space.params(vectors))]
+        )
+        values = self.descent.objective.value(answer.score)
         first = int(jnp.nanargmin(values))
-        base = float(values[0]) if self._base_value is None else self._base_value
-        metrics = {"validation": np.asarray(values)}
-        line = {
-            "validation": finite(values[first]),
-            "validation_success": float(answer.outcome.success[first].mean()),
-            "mean": finite(jnp.nanmean(values)),
-            "spread": finite(jnp.nanstd(values)),
-            "best": finite(values[first]),
-            "base": finite(base),
-            "params": self.space.changed_values(vectors[first]),
+        results = {
+            "validations": values,
+            "params": vectors[first],
+            "validation": values[first],
+            "validation_success": answer.outcome.success[first].mean(),
+            "mean": jnp.nanmean(values),
+            "spread": jnp.nanstd(values),
+            "best": values[first],
+            "base": values[0] if self._base_value is None else self._base_value,
         }
         if generation == self.descent.steps:
-            return metrics, line
-        estimate, times = self._estimate(jnp.asarray(vectors), generation, score_candidates)
-        metrics["gradient"] = np.asarray(estimate.gradient)
-        return metrics, line | times | {
-            "gradient": finite(jnp.linalg.norm(estimate.gradient, axis=1).mean()),
-            "gradient_error": finite(jnp.sqrt(jnp.sum(estimate.variance, axis=1)).mean()),
-            "finite": float(estimate.finite.mean()),
+            names = ("gradient", "gradient_error", "finite", "differentiate")
+            return results | dict.fromkeys(names, np.nan) | {"gradients": 0 * vectors + np.nan}
+        thetas, simulated, wall = jnp.asarray(vectors), 0.0, 0.0
+        if self.descent.estimator == "evolution":
+            estimate = evolution_gradients(thetas, self.descent, generation, score_candidates)
+        else:
+            start_time = time.perf_counter()
+            estimate, simulated = jax.block_until_ready(
+                window_gradients(thetas, self.descent, generation)
+            )
+            wall = time.perf_counter() - start_time
+        return results | {
+            "gradients": estimate.gradient,
+            "gradient": jnp.linalg.norm(estimate.gradient, axis=1).mean(),
+            "gradient_error": jnp.sqrt(jnp.sum(estimate.variance, axis=1)).mean(),
+            "finite": estimate.finite.mean(),
+            "simulated": simulated,
+            "differentiate": wall,
         }
 
-    def _estimate(
-        self, thetas: jax.Array, step: int, score_candidates: ScoreCandidates
-    ) -> tuple[Estimate, dict[str, float]]:
-        """Return estimates (S, p), and the simulated time and wall clock [s] of derivatives."""
-        if self.descent.estimator == "evolution":
-            times = {"simulated": 0.0, "differentiate": 0.0}
-            return evolution_gradients(thetas, self.descent, step, score_candidates), times
-        start_time = time.perf_counter()
-        estimate, simulated = jax.block_until_ready(
-            window_gradients(thetas, self.descent.windows, self.seed, step)
-        )
-        wall = time.perf_counter() - start_time
-        return estimate, {"simulated": simulated, "differentiate": wall}
-
-    def update(self, vectors: np.ndarray, metrics: Metrics) -> None:
+    def update(self, results: Mapping[str, np.ndarray]) -> None:
         """Record the best validation, and make a step along the gradients."""
-        values = metrics["validation"]
-        first = int(jnp.nanargmin(values))
+        vectors, values = results["vectors"], results["validations"]
+        first = int(np.nanargmin(values))
         if self._base_value is None:
             self._base_value = float(values[0])
         self.record_best(vectors[first], float(values[first]))
-        if "gradient" in metrics:
-            thetas = jnp.asarray(vectors)
-            gradient = jnp.asarray(metrics["gradient"])
-            changes, self._state = jax.vmap(self.descent.rule.update)(gradient, self._state, thetas)
-            self.thetas = jnp.asarray(optax.apply_updates(thetas, changes))
+        thetas, gradient = jnp.asarray(vectors), jnp.asarray(results["gradients"])
+        changes, self._state = jax.vmap(self.descent.rule.update)(gradient, self._state, thetas)
+        self.thetas = jnp.asarray(optax.apply_updates(thetas, changes))

@@ -6,7 +6,7 @@ All candidates of a generation meet the same worlds; every generation has other 
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, ClassVar, Literal
@@ -17,7 +17,7 @@ import numpy as np
 from rps_jax import errors
 from rps_jax.record.options import option
 from rps_jax.runs.question import call_of
-from rps_jax.tuning.run import LogLine, Metrics, ScoreCandidates, Tuner, Tuning, finite
+from rps_jax.tuning.run import Results, ScoreCandidates, Tuner, Tuning
 
 Algorithm = Literal["cma", "lra_cma", "sep_cma", "xnes"]
 Strategy = cmaes.CMA | cmaes.SepCMA | cmaes.XNES
@@ -79,6 +79,8 @@ tune_es = call_of(TuneES)
 class EvolutionTuner(Tuner):
     """Search by an evolution strategy of the package cmaes, with restarts."""
 
+    DIMS: ClassVar = {"values": ("candidate",), "center": ("parameter",)}
+
     def __init__(self, evolution: TuneES):
         super().__init__(evolution, evolution.generations)
         if len(self.space.names) < 2 and evolution.algorithm in ("sep_cma", "xnes"):
@@ -108,47 +110,41 @@ class EvolutionTuner(Tuner):
     def propose(self) -> np.ndarray:
         return np.stack([self._strategy.ask() for _ in range(self.evolution.population)])
 
-    def shapes(self, vectors: np.ndarray, generation: int) -> dict[str, tuple[int, ...]]:
-        return {"values": vectors.shape[:1], "mean": vectors.shape[1:], "validation": ()}
-
     def judge(
         self, vectors: np.ndarray, generation: int, score_candidates: ScoreCandidates
-    ) -> tuple[Metrics, LogLine]:
-        space, problem, seed = self.space, self.problem, self.seed
-        mean = self.mean
+    ) -> Results:
+        space, tuning, center = self.space, self.tuning, self.mean
         candidates, base, check = score_candidates(
             [
-                problem.ask(space.params(vectors), seed, generation),
-                problem.ask(space.params(self.base[None]), seed, generation),
-                problem.validate(space.params(mean[None]), seed),
+                tuning.candidates(space.params(vectors), generation),
+                tuning.candidates(space.params(self.base[None]), generation),
+                tuning.validation_candidates(space.params(center[None])),
             ]
         )
-        values = np.asarray(problem.objective.value(candidates.score))
-        validation = float(problem.objective.value(check.score)[0])
+        values, base_value, validation = (
+            np.asarray(tuning.objective.value(x.score)) for x in (candidates, base, check)
+        )
         distances = np.mean((vectors - self.base) ** 2, axis=-1)
-        metrics = {
+        return {
             "values": values + self.evolution.prior * distances,
-            "mean": mean,
-            "validation": np.array(validation),
-        }
-        return metrics, {
-            "best": finite(np.nanmin(values)),
-            "mean": finite(np.nanmean(values)),
-            "spread": finite(np.nanstd(values)),
-            "not_finite": int(np.isnan(values).sum()),
-            "base": finite(problem.objective.value(base.score)[0]),
-            "validation": finite(validation),
-            "validation_success": float(check.outcome.success.mean()),
+            "center": center,
+            "params": center,
+            "best": np.nanmin(values),
+            "mean": np.nanmean(values),
+            "spread": np.nanstd(values),
+            "not_finite": np.isnan(values).sum(),
+            "base": base_value[0],
+            "validation": validation[0],
+            "validation_success": check.outcome.success.mean(),
             "restarts": self.restarts,
-            "params": space.changed_values(mean),
         }
 
-    def update(self, vectors: np.ndarray, metrics: Metrics) -> None:
-        values = metrics["values"]
+    def update(self, results: Mapping[str, np.ndarray]) -> None:
+        vectors, values = results["vectors"], results["values"]
         worst = np.max(values[~np.isnan(values)], initial=-np.inf)
         ranked = np.where(np.isnan(values), worst + 1.0, values)
         self._strategy.tell([(x, float(value)) for x, value in zip(vectors, ranked, strict=True)])
-        is_best = self.record_best(metrics["mean"], float(metrics["validation"]))
+        is_best = self.record_best(results["center"], float(results["validation"]))
         self.generations_since_best = 0 if is_best else self.generations_since_best + 1
         patience = self.evolution.patience
         if patience and self.generations_since_best >= patience:

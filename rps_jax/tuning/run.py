@@ -1,24 +1,22 @@
 """Base of the tuning commands: their common options, the interface of a search, and its loop.
 
-`Problem` holds the worlds and the objective. `Tuner` is the interface of a search, such as an
-evolution or a gradient descent. `Tuning` holds the options and the report of `TuneES` and
-`TuneGrad`. `tune` runs a tuner and checkpoints every generation, so a killed run resumes.
+`Tuning` holds the options and the report of `TuneES` and `TuneGrad`, and the worlds in which
+candidates are tried. `Tuner` is the interface of a search, such as an evolution or a gradient
+descent. `tune` runs a tuner and checkpoints every generation, so a killed run resumes.
 """
 
 from __future__ import annotations
 
 import functools
-import json
-import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, ClassVar, NamedTuple, SupportsFloat
+from typing import Any, ClassVar
 
+import jax
 import numpy as np
-import pandas as pd
 import xarray as xr
 
 from rps_jax import errors
@@ -32,56 +30,33 @@ from rps_jax.record.options import option
 from rps_jax.runs import evaluate
 from rps_jax.runs.evaluate import Candidates, CandidateScores
 from rps_jax.runs.question import LawQuestion, Run, seed_of
-from rps_jax.runs.run import StepFormat
 from rps_jax.trials.progress import Bar, Progress
 from rps_jax.trials.score import Objective
-from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import Rules
 from rps_jax.tuning.space import Space, expand_subsets
-from rps_jax.world.domain import DOMAINS, Domain, DomainLike, parse_domain
+from rps_jax.world.domain import Domain, DomainLike, parse_domain
 
 TUNED = "tuned.json"  # file of a run folder: the parameters with the best validation
 UNITS = {"compile": "s", "run": "s", "simulated": "s", "differentiate": "s"}
 
-Metrics = dict[str, np.ndarray]  # results of a generation's trials, by name
-LogLine = dict[str, Any]  # line of `log.jsonl`: numbers or None by name, and `params` by name
-ScoreCandidates = Callable[
-    [list[Candidates]], list[CandidateScores]
-]  # runs candidates in the worlds of a problem
-
-
-@dataclass(frozen=True)
-class Problem:
-    """Worlds in which candidates are tried, and the objective that is minimised there."""
-
-    domains: tuple[Domain, ...] = (DOMAINS["wide"],)
-    worlds: int = 512  # of a generation, in each domain
-    validation: int = 512  # worlds for validation, in each domain
-    setting: Setting = Setting()
-    objective: Objective = Objective()
-
-    def ask(self, params: LawParams, seed: int, generation: int) -> Candidates:
-        """Return candidates with leaves (P,) and the worlds of a generation."""
-        worlds = generation * self.worlds + np.arange(self.worlds)
-        return Candidates(params, self.domains, seed_of(seed, "tune"), worlds)
-
-    def validate(self, params: LawParams, seed: int) -> Candidates:
-        """Return candidates with leaves (P,) and the worlds for validation."""
-        worlds = np.arange(self.validation)
-        return Candidates(params, self.domains, seed_of(seed, "validate"), worlds)
+Results = Mapping[str, np.ndarray | jax.Array | float]  # of a generation, by name
+# Runs candidates in the worlds of a tuning.
+ScoreCandidates = Callable[[list[Candidates]], list[CandidateScores]]
 
 
 class Tuner(ABC):
     """Search for the vector (p,) of parameters with the least objective, in generations.
 
-    Its state depends on nothing but the vectors (P, p) of all generations and their metrics, so a
-    resumed run restores the state from these.
+    Its state depends on nothing but the results of all generations, so a resumed run restores the
+    state from these.
     """
 
+    # Dimensions of those results of a generation that serve the search alone, beside `vectors`.
+    DIMS: ClassVar[Mapping[str, tuple[str, ...]]]
+
     def __init__(self, tuning: Tuning, generations: int):
-        self.space, self.problem = tuning.space, tuning.problem
-        self.generations, self.budget = generations, tuning.budget  # maximum; [s] simulated
-        self.seed = tuning.setting.seed
+        self.tuning, self.space = tuning, tuning.space
+        self.generations, self.seed = generations, tuning.setting.seed  # maximum
 
     def start(self) -> None:
         """Start, or restart, the search at the base parameters of the space."""
@@ -93,18 +68,18 @@ class Tuner(ABC):
         """Return the vectors (P, p) of the next generation."""
 
     @abstractmethod
-    def shapes(self, vectors: np.ndarray, generation: int) -> dict[str, tuple[int, ...]]:
-        """Return the shapes of the metrics of a generation."""
-
-    @abstractmethod
     def judge(
         self, vectors: np.ndarray, generation: int, score_candidates: ScoreCandidates
-    ) -> tuple[Metrics, LogLine]:
-        """Try the vectors of a generation in worlds; return their metrics and the log's line."""
+    ) -> Results:
+        """Try the vectors of a generation in worlds; return results by name.
+
+        The results are numbers, the vector `params` (p,) of the generation, and the arrays of
+        `DIMS`.
+        """
 
     @abstractmethod
-    def update(self, vectors: np.ndarray, metrics: Metrics) -> None:
-        """Advance the search by the metrics of a generation."""
+    def update(self, results: Mapping[str, np.ndarray]) -> None:
+        """Advance the search by the results of a generation, with its `vectors`."""
 
     def record_best(self, vector: np.ndarray, value: float) -> bool:
         """Store a vector if its validation is the best so far; return whether it is."""
@@ -159,11 +134,21 @@ class Tuning(LawQuestion[xr.Dataset]):
         return Space(expand_subsets(self.tuned, self.params), self.params)
 
     @functools.cached_property
-    def problem(self) -> Problem:
-        """Worlds in which candidates are tried, and the objective."""
+    def domains(self) -> tuple[Domain, ...]:
+        """Domains of the worlds in which candidates are tried."""
         ranges = tuple(replace(d, objects=self.objects) for d in parse_domains(self.domain))
         errors.check_each_once("domain", ranges)
-        return Problem(ranges, self.worlds, self.validation, self.setting, self.objective)
+        return ranges
+
+    def candidates(self, params: LawParams, generation: int) -> Candidates:
+        """Return candidates with leaves (P,) and the worlds of a generation."""
+        worlds = generation * self.worlds + np.arange(self.worlds)
+        return Candidates(params, self.domains, seed_of(self.setting.seed, "tune"), worlds)
+
+    def validation_candidates(self, params: LawParams) -> Candidates:
+        """Return candidates with leaves (P,) and the worlds for validation."""
+        seed = seed_of(self.setting.seed, "validate")
+        return Candidates(params, self.domains, seed, np.arange(self.validation))
 
     @functools.cached_property
     def tuner(self) -> Tuner:
@@ -183,13 +168,13 @@ class Tuning(LawQuestion[xr.Dataset]):
                 f"law = {self.label} is not allowed: its parameters have no bounds; choose from "
                 f"{', '.join(names)}."
             )
-        for domain in self.problem.domains:
+        for domain in self.domains:
             self.setting.check_here(domain.weakest, [self.space.base])
         _ = self.tuner
 
     def fields_as_json(self) -> dict[str, Any]:
         """Fields as JSON, with the names of all tuned parameters and the ranges of all domains."""
-        ranges = [asdict(domain) for domain in self.problem.domains]
+        ranges = [asdict(domain) for domain in self.domains]
         return super().fields_as_json() | {"tuned": self.space.names, "domain": ranges}
 
     def progress_bar(self) -> Bar:
@@ -197,7 +182,7 @@ class Tuning(LawQuestion[xr.Dataset]):
         return Bar(name, count, "generations", shown=self.shows_progress)
 
     def answer(self, run: Run) -> xr.Dataset:
-        return label_log(tune(run, self.tuner), self.tuner)
+        return tune(run, self.tuner)
 
     def intro(self, results: xr.Dataset) -> str:
         names = ", ".join(self.space.names)
@@ -230,153 +215,103 @@ class Tuning(LawQuestion[xr.Dataset]):
         return [Section("Results", text, rows, picture)]
 
 
-def parse_domains(domain: DomainLike | Sequence[DomainLike]) -> tuple[Domain, ...]:
-    """Return one or several domains by their names, files or ranges."""
-    several = [domain] if isinstance(domain, str | Domain) else domain
-    return tuple(map(parse_domain, several))
-
-
-def label_log(log: Sequence[LogLine], tuner: Tuner) -> xr.Dataset:
-    """Return the log (generation), with the parameters of all generations and the tuned ones."""
-    names = list(tuner.space.names)
-    frame = pd.DataFrame(log).drop(columns=["generation", "params"]).astype(float)
-    columns: dict[str, Any] = {
-        str(key): ("generation", values.to_numpy(), {"units": UNITS.get(str(key), "1")})
-        for key, values in frame.items()
-    }
-    params = [[line["params"][name] for name in names] for line in log]
-    columns["params"] = (("generation", "parameter"), np.array(params, float))
-    best = registry.named_leaves(tuner.space.params(tuner.best))
-    columns["tuned"] = ("parameter", np.array([float(best[name]) for name in names]))
-    return xr.Dataset(columns, {"generation": np.arange(len(log)), "parameter": names})
-
-
-class Generation(NamedTuple):
-    """Vectors of a generation with their metrics and its line of the log; one checkpoint."""
-
-    vectors: np.ndarray  # (P, p)
-    metrics: Metrics
-    line: LogLine
-    is_new: bool = True  # computed in this process, not restored
-
-    def encode(self) -> bytes:
-        """Return the content of the checkpoint."""
-        arrays = {f"metric_{key}": value for key, value in self.metrics.items()}
-        line = np.array(json.dumps(self.line))
-        return files.encode_arrays(vectors=self.vectors, line=line, **arrays)
-
-
-def tune(run: Run, tuner: Tuner) -> list[LogLine]:
-    """Run a tuner to its end, in a run folder or in memory, and return its log.
+def tune(run: Run, tuner: Tuner) -> xr.Dataset:
+    """Run a tuner to its end, in a run folder or in memory, and return its results.
 
     Every generation is a checkpoint. A resumed tuner proposes the same vectors again and reads
-    their metrics from the checkpoints; a damaged checkpoint is computed again. In a line of the
-    log, `compile` and `run` [s] are the wall clock of the trials, and `simulated` [s] is the total
-    simulated time of the generation.
+    their results from the checkpoints; a damaged checkpoint is computed again. `compile` and `run`
+    [s] are the wall clock of a generation's trials, and `simulated` [s] is its total simulated
+    time.
 
     Raises:
       InputError: the folder has generations that this tuner does not propose.
     """
     tuner.start()
-    log: list[LogLine] = []
-    simulated = 0.0
+    log: list[xr.Dataset] = []
+    simulated, vectors = 0.0, tuner.propose()
 
     def report(progress: Progress) -> None:
         total = simulated + progress.simulated
         run.callback(replace(progress, simulated=total, rounds=len(log)))
 
     def proceed(generation: int) -> bool:
-        return generation < tuner.generations and not 0 < tuner.budget <= simulated
+        return generation < tuner.generations and not 0 < tuner.tuning.budget <= simulated
 
-    def compute(generation: int) -> Generation:
-        return _try_generation(tuner, generation, run._replace(callback=report))
-
-    def restore(path: Path, content: bytes) -> Generation:
-        return _restore(tuner, len(log), path, content)
-
-    form = StepFormat(lambda _, generation: generation.encode(), restore, ".npz")
-    for generation in run.steps(compute, proceed, form=form):
-        tuner.update(generation.vectors, generation.metrics)
-        log.append(generation.line)
-        simulated += generation.line["simulated"]
-        run.callback(Progress(0, simulated, rounds=len(log)))
-        if generation.is_new and run.folder is not None:
+    def compute(generation: int) -> xr.Dataset:
+        if log:
             _write(run.folder, tuner, log)
-    if run.folder is not None:
-        _write(run.folder, tuner, log)
-    return log
+        return _try_vectors(tuner, vectors, generation, run._replace(callback=report))
+
+    for generation in run.steps(compute, proceed):
+        _check_generation(generation, tuner, vectors, run.folder, len(log))
+        tuner.update({str(name): variable.values for name, variable in generation.items()})
+        log.append(generation.drop_vars(["vectors", *tuner.DIMS]))
+        simulated += float(generation.simulated)
+        run.callback(Progress(0, simulated, rounds=len(log)))
+        vectors = tuner.propose()
+    return _write(run.folder, tuner, log)
 
 
-def _try_generation(tuner: Tuner, generation: int, run: Run) -> Generation:
-    """Propose and try the vectors of a generation."""
+def _try_vectors(tuner: Tuner, vectors: np.ndarray, generation: int, run: Run) -> xr.Dataset:
+    """Try the vectors of a generation, and return its results."""
     times = dict.fromkeys(("simulated", "compile", "run"), 0.0)  # [s]
-    problem = tuner.problem
+    tuning = tuner.tuning
 
     def score_candidates(candidates: list[Candidates]) -> list[CandidateScores]:
         scores, timing = evaluate.score_candidates(
-            candidates, problem.setting, problem.objective, **run.batch_options
+            candidates, tuning.setting, tuning.objective, **run.batch_options
         )
         for name in times:
             times[name] += getattr(timing, name)
         return scores
 
-    vectors = tuner.propose()
-    metrics, line = tuner.judge(vectors, generation, score_candidates)
-    times["simulated"] += line.pop("simulated", 0.0)
-    return Generation(vectors, metrics, {"generation": generation} | line | times)
+    results = dict(tuner.judge(vectors, generation, score_candidates)) | {"vectors": vectors}
+    times["simulated"] += float(results.pop("simulated", 0.0))
+    values = tuner.space.changed_values(results["params"])
+    results |= times | {"params": np.array([values[name] for name in tuner.space.names])}
+    dims = _dims(tuner)
+    variables = {
+        name: (dims.get(name, ()), np.asarray(value, float), {"units": UNITS.get(name, "1")})
+        for name, value in results.items()
+    }
+    return xr.Dataset(variables, {"parameter": list(tuner.space.names)})
 
 
-def finite(value: SupportsFloat) -> float | None:
-    """Return a number for JSON: None if it is not finite."""
-    return float(value) if math.isfinite(value) else None
+def _dims(tuner: Tuner) -> dict[str, tuple[str, ...]]:
+    """Return the dimensions of all arrays of a generation."""
+    return {"vectors": ("candidate", "parameter"), "params": ("parameter",), **tuner.DIMS}
 
 
-def _write(folder: Path, tuner: Tuner, log: Sequence[LogLine]) -> None:
-    """Write the tuned parameters, and the log as JSON lines and as a table."""
-    files.write_json(folder / TUNED, tuner.space.changed_values(tuner.best))
-    files.write_text(folder / "log.jsonl", "".join(json.dumps(line) + "\n" for line in log))
-    rows = [line | {f"params.{k}": v for k, v in line["params"].items()} for line in log]
-    columns = [{key: row[key] for key in row if key != "params"} for row in rows]
-    files.write_csv(folder / "curve.csv", columns)
-
-
-def _check_line(line: object, names: Sequence[str]) -> None:
-    """Raise ValueError or KeyError unless this is a line of a log with these parameters."""
-    if not (isinstance(line, dict) and isinstance(line["params"], dict)):
-        raise ValueError("its line has no names with values")
-    values = {name: value for name, value in line.items() if name != "params"} | line["params"]
-    for name, value in values.items():
-        if value is not None:
-            errors.check_number(f"{name} of its line", value)
-    for name in ("simulated", "compile", "run", "validation", "validation_success", *names):
-        if values[name] is None and name != "validation":
-            raise ValueError(f"its line has no {name}")
-
-
-def _restore(tuner: Tuner, generation: int, path: Path, content: bytes) -> Generation:
-    """Return a generation from its checkpoint; the tuner proposes it again for comparison."""
-    proposal = tuner.propose()
-    try:
-        arrays = files.decode_arrays(content)
-        line = files.parse_json(str(arrays.pop("line")))
-        _check_line(line, tuner.space.names)
-    except (ValueError, KeyError) as error:
-        raise files.CorruptFileError(path, error) from error
-    vectors = arrays.pop("vectors", np.empty(0))
-    metrics = {name.removeprefix("metric_"): values for name, values in arrays.items()}
-    shapes = {name: values.shape for name, values in metrics.items() if values.dtype.kind == "f"}
-    if shapes != tuner.shapes(proposal, generation):
-        raise files.CorruptFileError(path, "its arrays are not of this search")
+def _check_generation(
+    generation: xr.Dataset, tuner: Tuner, vectors: np.ndarray, folder: Path | None, index: int
+) -> None:
+    """Raise InputError unless these are results of the proposed vectors."""
+    sizes = dict(zip(("candidate", "parameter"), vectors.shape, strict=True))
+    files.check_columns(generation, folder or "generation", _dims(tuner), sizes)
     # The tolerance allows for other rounding on another machine; the search uses the vectors that
     # were tried.
-    if (
-        vectors.dtype.kind != "f"
-        or vectors.shape != proposal.shape
-        or not np.allclose(vectors, proposal, rtol=1e-4, atol=1e-4)
-    ):
+    if not np.allclose(generation.vectors, vectors, rtol=1e-4, atol=1e-4, equal_nan=True):
         raise errors.InputError(
-            f"run = {path.parent.parent} cannot be resumed: its generation {generation} differs "
-            "from the one that this search proposes; another version wrote it. Choose another "
-            "folder."
+            f"run = {folder} cannot be resumed: its generation {index} differs from the one that "
+            "this search proposes; another version wrote it. Choose another folder."
         )
-    return Generation(vectors, metrics, line, is_new=False)
+
+
+def _write(folder: Path | None, tuner: Tuner, log: Sequence[xr.Dataset]) -> xr.Dataset:
+    """Return the results (generation); write them as a table, and the tuned parameters."""
+    results = xr.concat(log, "generation").assign_coords(generation=np.arange(len(log)))
+    assert isinstance(results, xr.Dataset)
+    best = registry.named_leaves(tuner.space.params(tuner.best))
+    results["tuned"] = ("parameter", [float(best[name]) for name in tuner.space.names])
+    if folder is not None:
+        files.write_json(folder / TUNED, tuner.space.changed_values(tuner.best))
+        params = results.params.to_pandas().add_prefix("params.")
+        table = results.drop_dims("parameter").to_dataframe().join(params)
+        files.write_text(folder / "curve.csv", table.to_csv(lineterminator="\n"))
+    return results
+
+
+def parse_domains(domain: DomainLike | Sequence[DomainLike]) -> tuple[Domain, ...]:
+    """Return one or several domains by their names, files or ranges."""
+    several = [domain] if isinstance(domain, str | Domain) else domain
+    return tuple(map(parse_domain, several))

@@ -12,13 +12,13 @@ import xarray as xr
 
 from rps_jax.analysis import tables
 from rps_jax.control.laws.rps import RPSParams
-from rps_jax.runs import evaluate
-from rps_jax.runs.evaluate import Candidates
 from rps_jax.runs.question import Split, seed_of
 from rps_jax.trials.progress import ProgressCallback, no_progress
+from rps_jax.trials.rollout import Candidates, outcomes
+from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import Outcome
-from rps_jax.tuning.run import Problem
 from rps_jax.tuning.space import SUBSETS, Space
+from rps_jax.world.domain import Domain
 
 _EDGE = 0.03  # distance of varied parameters from their bounds, as a share of the range
 
@@ -48,15 +48,17 @@ def aims(outcome: Outcome) -> Aims:
 
 
 def _run_candidates(
-    params: Any, problem: Problem, splits: Sequence[Split], seed: int, count: int, **run: Any
+    params: Any,
+    domains: Sequence[Domain],
+    setting: Setting,
+    splits: Sequence[Split],
+    count: int,
+    **run: Any,
 ) -> list[Outcome]:
     """Return the outcomes (P, D * W) of candidates in the worlds of each split."""
-    asks = [
-        Candidates(params, problem.domains, seed_of(seed, split), np.arange(count))
-        for split in splits
-    ]
-    answers, _ = evaluate.score_candidates(asks, problem.setting, problem.objective, **run)
-    return [answer.outcome for answer in answers]
+    seeds = [seed_of(setting.seed, split) for split in splits]
+    requests = [Candidates(params, domains, seed, np.arange(count)) for seed in seeds]
+    return outcomes(requests, setting, **run)[0]
 
 
 # --- one parameter at a time ---------------------------------------------------------------
@@ -71,12 +73,12 @@ def lines(base: RPSParams, names: Sequence[str], count: int) -> RPSParams:
 
 def alone(
     sets: dict[str, RPSParams],
-    problem: Problem,
+    domains: Sequence[Domain],
+    setting: Setting,
     *,
     names: Sequence[str] = SUBSETS["full"],
     count: int = 9,
     worlds: int = 1000,
-    seed: int = 0,
     callback: ProgressCallback = no_progress,
     **shape: Any,
 ) -> xr.Dataset:
@@ -90,7 +92,7 @@ def alone(
     )
     params = jax.tree.map(lambda leaf: leaf.reshape(-1), grid)
     (outcome,) = _run_candidates(
-        params, problem, ("validate",), seed, worlds, callback=callback, **shape
+        params, domains, setting, ("validate",), worlds, callback=callback, **shape
     )
     dims = ("set", "parameter", "step")
     columns: dict[str, Any] = {
@@ -146,13 +148,13 @@ def undominated(values: Aims) -> np.ndarray:
 
 def front(
     sets: dict[str, RPSParams],
-    problem: Problem,
+    domains: Sequence[Domain],
+    setting: Setting,
     *,
     names: Sequence[str] = SUBSETS["full"],
     candidates: int = 256,
     spread: float = 0.5,
     worlds: int = 1000,
-    seed: int = 0,
     callback: ProgressCallback = no_progress,
     **shape: Any,
 ) -> xr.Dataset:
@@ -161,9 +163,9 @@ def front(
     The selection uses validation worlds. The objectives (candidate,) are then measured in test
     worlds, so that the selection does not bias them.
     """
-    params = cloud(list(sets.values()), names, candidates, spread, seed)
+    params = cloud(list(sets.values()), names, candidates, spread, setting.seed)
     validated, tested = _run_candidates(
-        params, problem, ("validate", "test"), seed, worlds, callback=callback, **shape
+        params, domains, setting, ("validate", "test"), worlds, callback=callback, **shape
     )
     chosen = undominated(aims(validated))
     labels = [*sets, *(f"{i}" for i in range(candidates))]

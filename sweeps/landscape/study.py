@@ -23,9 +23,8 @@ from rps_jax.control.laws.rps import BOUNDS, RPSParams
 from rps_jax.record.options import option
 from rps_jax.runs.question import MultiLawQuestion, Run, call_of
 from rps_jax.trials.progress import SequentialProgress
-from rps_jax.tuning.run import Problem
+from rps_jax.tuning.run import parse_domains
 from rps_jax.tuning.space import SUBSETS
-from rps_jax.world import domain as domains
 from rps_jax.world.domain import Domain, DomainLike
 from sweeps.landscape import candidates
 
@@ -54,11 +53,9 @@ class Landscape(MultiLawQuestion[xr.DataTree]):
     """Standard deviation of the candidates, in units of the bounded map [1]."""
 
     @cached_property
-    def problem(self) -> Problem:
-        """Worlds of all candidates."""
-        is_single = isinstance(self.domain, str | Domain)
-        domain_list: list[Any] = [self.domain] if is_single else list(self.domain)
-        return Problem(tuple(domains.parse_domain(x) for x in domain_list), setting=self.setting)
+    def domains(self) -> tuple[Domain, ...]:
+        """Domains of all candidates."""
+        return parse_domains(self.domain)
 
     def check(self) -> None:
         """Check that the laws are RPS with parameters."""
@@ -69,7 +66,7 @@ class Landscape(MultiLawQuestion[xr.DataTree]):
     @property
     def _shares(self) -> tuple[int, int]:
         """Numbers of trials of both parts."""
-        per_candidate = len(self.problem.domains) * self.worlds
+        per_candidate = len(self.domains) * self.worlds
         varied = len(self.chosen) * len(SUBSETS["full"]) * self.values
         return varied * per_candidate, 2 * (self.candidates + len(self.chosen)) * per_candidate
 
@@ -79,19 +76,15 @@ class Landscape(MultiLawQuestion[xr.DataTree]):
 
     def answer(self, run: Run) -> xr.DataTree:
         """Vary each parameter, then run the candidates."""
-        progress, seed = SequentialProgress(run.callback), self.setting.seed
-        common = {
-            "worlds": self.worlds,
-            "seed": seed,
-            **run._replace(callback=progress).batch_options,
-        }
-        sets, problem = self.chosen, self.problem
+        progress = SequentialProgress(run.callback)
+        common = {"worlds": self.worlds, **run._replace(callback=progress).batch_options}
+        worlds = self.chosen, self.domains, self.setting
         first, _ = self._shares
-        alone = partial(candidates.alone, sets, problem, count=self.values, **common)
+        alone = partial(candidates.alone, *worlds, count=self.values, **common)
         results = {"alone": run.checkpoint("alone", alone)}
         progress.finish(first)
         options = {"candidates": self.candidates, "spread": self.spread}
-        front = partial(candidates.front, sets, problem, **options, **common)
+        front = partial(candidates.front, *worlds, **options, **common)
         results["front"] = run.checkpoint("front", front)
         return xr.DataTree.from_dict(results)
 
