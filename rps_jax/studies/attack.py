@@ -12,7 +12,7 @@ import shlex
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property, partial
+from functools import partial
 from itertools import combinations
 from pathlib import Path
 from typing import Any, ClassVar, Literal
@@ -24,7 +24,7 @@ from scipy import stats
 
 from rps_jax import errors
 from rps_jax.analysis import statistics, tables
-from rps_jax.analysis.figures.style import Figure, axis_label, panel, words
+from rps_jax.analysis.figures.style import Figure, axis_label, panel, tiles, words
 from rps_jax.analysis.report import Picture, Section
 from rps_jax.engines import device
 from rps_jax.errors import InputError
@@ -45,7 +45,6 @@ from rps_jax.runs.question import (
 from rps_jax.studies.probe import Probe
 from rps_jax.trials.progress import Bar, set_phase
 from rps_jax.world import points
-from rps_jax.world.domain import Domain
 
 Algorithm = Literal["cma_me", "cma_mae", "line", "mixed"]
 # [1] shares of the time after which the search ends, and the check of elites.
@@ -57,6 +56,7 @@ _AXIS_SCALE = 4.0  # [1] step size along the archive's axes over that along othe
 _NEAR_MISSES = 0.1  # [1] share of the first worlds that the emitters' archives accept
 _MIN_FAILURES = 12  # failing cells of an object from which on only failures are accepted
 _DRAWN_AT_ONCE = 4096
+_FIELDS = dict.fromkeys(("success", "time", "left"), ((), float))  # of an archive's elites
 
 
 @dataclass(frozen=True)
@@ -230,81 +230,59 @@ def _coarse_to_fine(total: int, count: int) -> np.ndarray:
     return np.array(list(dict.fromkeys(int(i) for stride in strides for i in stride)))
 
 
-def _grid_archive(dimensions: int, cells: int, **options: Any) -> Any:
-    """Return a pyribs archive with three axes from 0 to 1; pyribs is optional, hence `Any`."""
+def _grid_archive(dimensions: int, dims: Sequence[int], **options: Any) -> Any:
+    """Return a pyribs archive with axes from 0 to 1; pyribs is optional, hence `Any`."""
     archives = errors.require("ribs.archives", "failures")
-    return archives.GridArchive(
-        solution_dim=dimensions, dims=[cells] * 3, ranges=[(0, 1)] * 3, **options
-    )
-
-
-class _Archive:
-    """Severest trial of each cell: one pyribs archive for each object, over points `u`."""
-
-    FIELDS: ClassVar[tuple[str, ...]] = ("success", "time", "left")
-
-    def __init__(self, domain: Domain, options: Attack):
-        names = points.names(domain)
-        self.axes = [names.index(name) for name in options.axes]
-        self.shape = (len(domain.objects), *(options.cells,) * 3)
-        fields = dict.fromkeys(self.FIELDS, ((), float))
-        self.grids = [
-            _grid_archive(len(names), options.cells, extra_fields=fields) for _ in domain.objects
-        ]
-
-    def add(self, objects: np.ndarray, trials: xr.Dataset, objective: np.ndarray) -> None:
-        """Add trials (n,) whose worlds have these objects (n,), given by their index."""
-        for k, grid in enumerate(self.grids):
-            rows = objects == k
-            u = trials.u.values[rows]
-            fields = {name: trials[name].values[rows] for name in self.FIELDS}
-            grid.add(u, objective[rows], u[:, self.axes], **fields)
-
-    def elites(self, k: int) -> dict[str, np.ndarray]:
-        """Return the elites (n,) of one object, in the order of their cells."""
-        elites = self.grids[k].data()
-        order = np.argsort(elites["index"])
-        return {name: values[order] for name, values in elites.items()}
-
-    @property
-    def failing(self) -> np.ndarray:
-        """Number (objects,) of the cells that hold a failure."""
-        return np.array([count_true(grid.data("success") == 0) for grid in self.grids])
+    ranges = [(0, 1)] * len(dims)
+    return archives.GridArchive(solution_dim=dimensions, dims=dims, ranges=ranges, **options)
 
 
 class _Search:
-    """Search for the failures of one law."""
+    """Search for the failures of one law.
+
+    Its archives hold the severest trial of each cell of objects and axes, over points `u`.
+    """
 
     def __init__(self, probe: Probe, options: Attack, seed: int):
         self.probe, self.options, self.seed = probe, options, seed
         self.domain = probe.domain
         quantities = points.coordinates(self.domain)
+        names = [x.name for x in quantities]
         self.q, self.objects = len(quantities), len(self.domain.objects)
+        self.cells = (options.cells,) * 3
+        self.axes = [names.index(name) for name in options.axes]
         # Emitters vary ranges and choices, except the object: each object has its own emitters.
         self.varied = [
             i for i, x in enumerate(quantities)
             if x.kind == "range" or (x.kind == "choice" and x.name != "object")
         ]  # fmt: skip
+        self.varied_axes = [self.varied.index(axis) for axis in self.axes]
+        self.scale = np.ones(len(self.varied))  # [1] of the emitters' steps, by quantity
+        self.scale[self.varied_axes] = _AXIS_SCALE
         self.noise = np.array([i for i, x in enumerate(quantities) if x.kind == "noise"])
-        self.object_column = next((i for i, x in enumerate(quantities) if x.name == "object"), None)
+        self.object_column = names.index("object") if "object" in names else None
         self.rng = np.random.Generator(np.random.Philox(key=seed))
 
     def run(self, has_time: Callable[[], bool]) -> xr.Dataset:
         """Try drawn worlds, then generations of emitters while there is time."""
         options, probe = self.options, self.probe
         set_phase(probe.run.callback, "drawn worlds")
-        drawn = _Archive(self.domain, options)
+        drawn, archive = (
+            _grid_archive(self.q, (self.objects, *self.cells), extra_fields=_FIELDS)
+            for _ in range(2)
+        )
         for first in range(0, options.drawn, _DRAWN_AT_ONCE):
             count = -(-min(_DRAWN_AT_ONCE, options.drawn - first) // self.objects)
             self._try(self.rng.random((self.objects, count, len(self.varied))), drawn)
         attributes = {
             "drawn_trials": probe.trials,
-            "drawn_failing": int(drawn.failing.sum()),
+            "drawn_failing": int(self._count_failing(drawn).sum()),
             "drawn_simulated": probe.simulated,
         }
-        archive, history = _Archive(self.domain, options), []
-        schedulers: dict[int, Any] = {}  # by object
-        thresholds: dict[int, float] = {}  # severities from which on the emitters accept a world
+        history: list[tuple[int, int, float]] = []  # failing cells, trials, simulated time
+        schedulers: list[Any] = [None] * self.objects
+        # Severities from which on the emitters accept a world.
+        thresholds = np.zeros(self.objects)
         set_phase(probe.run.callback, "search")
         for generation in range(options.generations):
             if generation and not has_time():
@@ -312,36 +290,34 @@ class _Search:
             if generation == 0:
                 v = self.rng.random((self.objects, options.batch, len(self.varied)))
             else:
-                v = stats.norm.cdf(self._scale * np.stack([x.ask() for x in schedulers.values()]))
+                v = stats.norm.cdf(self.scale * np.stack([x.ask() for x in schedulers]))
             objective = self._try(v, archive).reshape(self.objects, options.batch)
-            failing = archive.failing
-            for k in range(self.objects):
+            failing = self._count_failing(archive)
+            for k, enough in enumerate(failing >= _MIN_FAILURES):
                 if generation:
-                    schedulers[k].tell(objective[k], v[k][:, self._axes])
-                enough = failing[k] >= _MIN_FAILURES
-                if k not in schedulers or (enough and thresholds[k] < 1):
-                    near = float(np.quantile(objective[k], 1 - _NEAR_MISSES))
+                    schedulers[k].tell(objective[k], v[k][:, self.varied_axes])
+                if generation == 0 or (enough and thresholds[k] < 1):
+                    near = np.quantile(objective[k], 1 - _NEAR_MISSES)
                     thresholds[k] = 1.0 if enough else min(1.0, near)
-                    schedulers[k] = self._scheduler(k, archive, thresholds[k])
+                    schedulers[k] = self._scheduler(k, archive, float(thresholds[k]))
             trials = probe.trials - attributes["drawn_trials"]
             simulated = probe.simulated - attributes["drawn_simulated"]
             history.append((int(failing.sum()), trials, simulated))
-        return self._labelled(archive, history, attributes)
+        return self._labelled(archive, history).assign_attrs(attributes)
 
-    @cached_property
-    def _axes(self) -> list[int]:
-        """Indices of the archive's axes among the varied quantities."""
-        names = [points.names(self.domain)[i] for i in self.varied]
-        return [names.index(name) for name in self.options.axes]
+    def _elites(self, archive: Any) -> dict[str, np.ndarray]:
+        """Return the elites (n,) in the order of their cells, with the index of their object."""
+        elites = archive.data()
+        order = np.argsort(elites["index"])
+        objects = elites["index"] // np.prod(self.cells)
+        return {name: x[order] for name, x in (elites | {"which_object": objects}).items()}
 
-    @cached_property
-    def _scale(self) -> np.ndarray:
-        """Scale (varied,) [1] of the emitters' steps, by quantity."""
-        scale = np.ones(len(self.varied))
-        scale[self._axes] = _AXIS_SCALE
-        return scale
+    def _count_failing(self, archive: Any) -> np.ndarray:
+        """Return the number of the cells that hold a failure, by object (objects,)."""
+        elites = self._elites(archive)
+        return np.bincount(elites["which_object"], elites["success"] == 0, self.objects)
 
-    def _try(self, v: np.ndarray, archive: _Archive) -> np.ndarray:
+    def _try(self, v: np.ndarray, archive: Any) -> np.ndarray:
         """Try worlds at varied quantities `v` (objects, n, varied), and add them to an archive.
 
         Returns:
@@ -350,9 +326,9 @@ class _Search:
         count = v.shape[0] * v.shape[1]
         u = self.rng.random((count, self.q))
         u[:, self.varied] = np.clip(v.reshape(count, -1), _EDGE, 1 - _EDGE)
-        objects = np.repeat(np.arange(self.objects), v.shape[1])
+        objects = (np.repeat(np.arange(self.objects), v.shape[1]) + 0.5) / self.objects
         if self.object_column is not None:
-            u[:, self.object_column] = (objects + 0.5) / self.objects
+            u[:, self.object_column] = objects
         trials = self.probe(u)
         # The first repetition removes most accidental failures; the others run together.
         for times in (min(1, self.options.repeats - 1), self.options.repeats - 2):
@@ -363,7 +339,9 @@ class _Search:
         if self.options.aim == "time":
             failed = trials.success.values == 0
             objective = trials.time.values / float(self.probe.setting.rules.horizon) + failed
-        archive.add(objects, trials, objective)
+        fields = {name: trials[name].values for name in _FIELDS}
+        u = trials.u.values
+        archive.add(u, objective, np.column_stack([objects, u[:, self.axes]]), **fields)
         return objective
 
     def _repeat(self, trials: xr.Dataset, rows: np.ndarray, times: int) -> None:
@@ -377,16 +355,16 @@ class _Search:
             for name, values in trials.items():
                 values.values[rows[milder]] = trial[name].values[milder]
 
-    def _scheduler(self, k: int, archive: _Archive, threshold: float) -> Any:
+    def _scheduler(self, k: int, archive: Any, threshold: float) -> Any:
         """Return pyribs' scheduler of new emitters for object `k`.
 
         Their archive starts with the elites whose severity reaches the threshold.
         """
         emitters = errors.require("ribs.emitters", "failures")
-        options, elites = self.options, archive.elites(k)
-        accepted = elites["objective"] >= threshold
+        options, elites = self.options, self._elites(archive)
+        accepted = (elites["which_object"] == k) & (elites["objective"] >= threshold)
         v, objective = elites["solution"][accepted][:, self.varied], elites["objective"][accepted]
-        z = stats.norm.ppf(np.clip(v, _EDGE, 1 - _EDGE)) / self._scale
+        z = stats.norm.ppf(np.clip(v, _EDGE, 1 - _EDGE)) / self.scale
         if options.algorithm == "cma_me":
             thresholds = {}
             cma = {"ranker": "2imp", "selection_rule": "filter", "restart_rule": "no_improvement"}
@@ -398,8 +376,8 @@ class _Search:
             "line": partial(emitters.IsoLineEmitter, **line),
             "cma": partial(emitters.EvolutionStrategyEmitter, sigma0=_CMA_SIGMA, **cma),
         }
-        grid = _grid_archive(len(z[0]), options.cells, seed=self.seed + k, **thresholds)
-        grid.add(z, objective, v[:, self._axes])
+        grid = _grid_archive(len(self.varied), self.cells, seed=self.seed + k, **thresholds)
+        grid.add(z, objective, v[:, self.varied_axes])
         order = np.argsort(-objective, kind="stable")
         sources = []
         for i, (kind, size) in enumerate(_emitter_sizes(options.batch, options.algorithm)):
@@ -407,46 +385,39 @@ class _Search:
             sources.append(kinds[kind](grid, x0=start, seed=seed, batch_size=size))
         return errors.require("ribs.schedulers", "failures").Scheduler(grid, sources)
 
-    def _labelled(
-        self,
-        archive: _Archive,
-        history: Sequence[tuple[int, int, float]],
-        attributes: Mapping[str, Any],
-    ) -> xr.Dataset:
+    def _labelled(self, archive: Any, history: Sequence[tuple[int, int, float]]) -> xr.Dataset:
         """Return the archive and the history of the search with names and units."""
         axes, quantities = self.options.axes, {x.name: x for x in points.coordinates(self.domain)}
-        by_object = [archive.elites(k) for k in range(self.objects)]
-        elites = {name: np.concatenate([x[name] for x in by_object]) for name in by_object[0]}
-        objects = np.repeat(np.arange(self.objects), [len(x["index"]) for x in by_object])
-        margin = np.full((self.objects, np.prod(archive.shape[1:])), np.nan)
-        margin[objects, elites["index"]] = elites["objective"] - 1
+        elites = self._elites(archive)
+        elites |= {"u": elites["solution"], "severity": elites["objective"]}
+        margin = np.full((self.objects, *self.cells), np.nan)
+        margin.flat[elites["index"]] = elites["objective"] - 1
         failed = np.flatnonzero(elites["success"] == 0)
         failed = failed[np.argsort(-elites["objective"][failed], kind="stable")]
-        columns = {
-            "severity": elites["objective"],
-            "time": elites["time"],
-            "left": elites["left"],
-            "which_object": objects,
-        }
+        names = ("u", "severity", "time", "left", "which_object")
         sums = zip(("failing", "trials", "simulated"), zip(*history, strict=True), strict=True)
         middles = (np.arange(self.options.cells) + 0.5) / self.options.cells
         return xr.Dataset(
             {
-                "margin": (("object", *axes), margin.reshape(archive.shape)),
-                "u": (("elite", "quantity"), elites["solution"][failed]),
-                **{name: ("elite", values[failed]) for name, values in columns.items()},
+                "margin": (("object", *axes), margin),
+                **{
+                    name: (("elite", "quantity")[: elites[name].ndim], elites[name][failed])
+                    for name in names
+                },
                 **{name: ("generation", list(values)) for name, values in sums},
             },
             {
                 "object": list(self.domain.objects),
                 "quantity": list(quantities),
                 **{
-                    name: (name, x.range.at(middles), {"units": x.unit})
-                    for name, x in quantities.items()
-                    if name in axes
+                    name: (
+                        name,
+                        quantities[name].range.at(middles),
+                        {"units": quantities[name].unit},
+                    )
+                    for name in axes
                 },
             },
-            attributes,
         )
 
 
@@ -487,9 +458,8 @@ def archive_figure(results: xr.Dataset, quantities: Sequence[str], title: str) -
     """
     pairs = list(combinations(quantities, 2))
     objects = [str(name) for name in results.object.values]
-    size = 1.5 + 3.4 * len(pairs), 1.2 + 2.7 * len(objects)
-    figure = Figure(figsize=size, layout="constrained")
-    axes = figure.subplots(len(objects), len(pairs), squeeze=False)
+    count = len(objects) * len(pairs)
+    figure, axes = tiles(count, len(pairs), (3.4, 2.7), (1.5, 1.2))
     norm = TwoSlopeNorm(0, -1, max(0.3, float(np.nanquantile(results.margin, 0.98))))
     image = None
     for row, name in enumerate(objects):
