@@ -191,7 +191,7 @@ def load_plan(folder: Path) -> Plan:
         plan = Plan(
             domain.from_json(record["domain"]),
             record["worlds"],
-            {name: registry.params_from_json(law) for name, law in record["laws"].items()},
+            {name: registry.params_from_json(law) for name, law in dict(record["laws"]).items()},
             setting_of(record),
             record["part"],
         )
@@ -213,7 +213,7 @@ def setting_of(record: Mapping[str, Any]) -> Setting:
     """Read a setting as manifests have it; `question.setting_as_json` writes it."""
     values: dict[str, Any] = {
         name: tuple(value) if isinstance(value, list) else value
-        for name, value in record["physics"].items()
+        for name, value in dict(record["physics"]).items()
     }
     physics = Physics(**values)
     return Setting(record["engine"], physics, rules=Rules(**record["rules"]), seed=record["seed"])

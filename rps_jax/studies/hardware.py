@@ -7,10 +7,12 @@ plausible range is run.
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
-from typing import Any, ClassVar, Literal
+from itertools import product
+from typing import ClassVar, Literal
 
 import numpy as np
 import xarray as xr
+from numpy.typing import ArrayLike
 
 from rps_jax.analysis import statistics
 from rps_jax.analysis.figures.style import (
@@ -27,10 +29,11 @@ from rps_jax.record.options import option
 from rps_jax.robot.robot import RobotLike
 from rps_jax.robot.skin import SkinLike
 from rps_jax.runs.question import LawQuestion, Run, call_of, name_or_custom
+from rps_jax.studies.table import Table
 from rps_jax.trials import pushes
 from rps_jax.trials.case import Case
 from rps_jax.trials.progress import SequentialProgress
-from rps_jax.trials.results import outcome_dataset, trace_dataset
+from rps_jax.trials.results import trace_dataset
 from rps_jax.trials.trial import Shift
 from rps_jax.world.paper import (
     HARDWARE_GROUND,
@@ -84,109 +87,89 @@ class Hardware(LawQuestion[xr.Dataset]):
     shift_time: float = option(30.0, 0, 300, unit="s")
     """Time of the shove after the start [s]."""
 
-    @cached_property
-    def base(self) -> Case:
-        """Case from which all trials differ in object, friction, target or shove."""
-        target = HARDWARE_LAYOUTS[self.layout][0]
-        return Case(
-            HARDWARE_OBJECTS[0], MIDDLE, target, self.params, skin=self.skin, robot=self.robot
-        )
-
     @property
     def targets(self) -> tuple[tuple[float, float], ...]:
         """Eight targets [m]."""
         return HARDWARE_LAYOUTS[self.layout]
 
+    @cached_property
+    def table(self) -> Table:
+        """Trials under all frictions."""
+        law, pairs = {self.label: self.params}, tuple(frictions().values())
+        world = {"skin": self.skin, "robot": self.robot, "setting": self.setting}
+        return Table(law, HARDWARE_OBJECTS, pairs, self.targets, **world)
+
+    @property
+    def counts(self) -> tuple[int, int, int]:
+        """Number of trials under all frictions, with shoves, and for the paths."""
+        tasks = len(HARDWARE_OBJECTS) * len(self.targets)
+        return tasks * len(frictions()), tasks * 2 * len(self.shifts), tasks
+
     def check(self) -> None:
-        self.setting.check_here(self.base.base, [self.params])
+        self.table.check()
 
     def num_trials(self) -> int | None:
-        trials = len(HARDWARE_OBJECTS) * len(self.targets)
-        return trials * (len(frictions()) + 2 * len(self.shifts) + 1)
+        return sum(self.counts)
 
     def answer(self, run: Run) -> xr.Dataset:
         progress = SequentialProgress(run.callback)
         run = run._replace(callback=progress)
-        parts = {"hardware": self._push, "shifted": self._shove, "paths": self._trace_paths}
+        parts = {"hardware": self.table.run_cases, "shifted": self._shove, "paths": self._trace}
         results = []
-        for name, compute in parts.items():
+        for (name, compute), count in zip(parts.items(), self.counts, strict=True):
             results.append(run.checkpoint(name, partial(compute, run)))
-            progress.finish(results[-1].attrs.pop("trials"))
+            progress.finish(count)
         merged = xr.merge(results, combine_attrs="drop")
         assert isinstance(merged, xr.Dataset)
         return merged
 
-    def _cases(self, variations: Sequence[Mapping[str, Any]]) -> list[Case]:
-        """Return the cases of all objects, variations and targets, targets fastest."""
-        return [
-            replace(self.base, object=name, target=target, **changes)
-            for name in HARDWARE_OBJECTS
-            for changes in variations
-            for target in self.targets
-        ]
-
-    def _push(self, run: Run) -> xr.Dataset:
-        """Return outcomes over objects, friction and targets."""
-        cases = self._cases([{"friction": friction} for friction in frictions().values()])
-        outcome, _ = pushes.run(cases, self.setting, **run.batch_options)
-        labels = [self.label], HARDWARE_OBJECTS, tuple(frictions()), self.targets
-        return outcome_dataset(outcome, *labels).assign_attrs(trials=len(cases))
+    def _cases(self, name: str, shift: Shift = Shift()) -> list[Case]:
+        """Return the cases of all targets at the middle friction."""
+        base = replace(self.table.cases[0], object=name, friction=MIDDLE, shift=shift)
+        return [replace(base, target=target) for target in self.targets]
 
     def _shove(self, run: Run) -> xr.Dataset:
         """Return the success after the object is shoved along the front of the robot."""
-        sides = (1.0, -1.0)
-        shoves = [(0.0, side * size) for size in self.shifts for side in sides]
-        cases = self._cases([{"shift": Shift(self.shift_time, shove)} for shove in shoves])
+        shoves = product(HARDWARE_OBJECTS, self.shifts, (1.0, -1.0))
+        cases = [
+            case
+            for name, size, side in shoves
+            for case in self._cases(name, Shift(self.shift_time, (0.0, side * size)))
+        ]
         outcome, _ = pushes.run(cases, self.setting, **run.batch_options)
-        sizes = (len(HARDWARE_OBJECTS), len(self.shifts), len(sides), len(self.targets))
         dims = ("object", "shift", "side", "target")
         # A trial that ends before the shove is not counted.
-        counted = outcome.time > self.shift_time
-        columns = {
-            "recovered": (outcome.success, "the target is reached after the shove"),
-            "counted": (counted, "the trial was under way when the object was shoved"),
-        }
-        variables = {
-            name: (dims, values.astype(np.int8).reshape(sizes), _attrs("1", meaning))
-            for name, (values, meaning) in columns.items()
-        }
-        shift = ("shift", list(self.shifts), _attrs("m", "length of the shove"))
-        coords = {"object": list(HARDWARE_OBJECTS), "shift": shift, "side": ["left", "right"]}
-        return xr.Dataset(variables, coords, {"trials": len(cases)})
+        recovered, counted = (
+            values.astype(np.int8).reshape(len(HARDWARE_OBJECTS), len(self.shifts), 2, -1)
+            for values in (outcome.success, outcome.time > self.shift_time)
+        )
+        return _labelled(
+            recovered=(dims, recovered, "1", "the target is reached after the shove"),
+            counted=(dims, counted, "1", "the trial was under way when the object was shoved"),
+            shift=("shift", list(self.shifts), "m", "length of the shove"),
+        ).assign_coords(side=["left", "right"])
 
-    def _trace_paths(self, run: Run) -> xr.Dataset:
+    def _trace(self, run: Run) -> xr.Dataset:
         """Return the paths of Fig. 7: all objects and targets, at the middle friction."""
         by_object: list[xr.Dataset] = []
         for name in HARDWARE_OBJECTS:
-            cases = [replace(self.base, object=name, target=target) for target in self.targets]
             trajectories = pushes.record_cases(
-                cases, self.setting, interval=0.5, callback=run.callback
+                self._cases(name), self.setting, interval=0.5, callback=run.callback
             )
             traces = [trace_dataset(x)[list(_TRACED)] for x in trajectories]
             by_object.append(xr.concat(traces, "target", join="outer"))
         traces = xr.concat(by_object, "object", join="outer")  # NaN after the end of a trial
-        base, contact, success = (traces[name].values for name in _TRACED)
+        base, contact, success = (traces[name].values.astype(float) for name in _TRACED)
         dims = ("object", "target", "path_time", "axis")
-        half = np.asarray(self.base.base.shell.half, float)
+        half = np.asarray(self.table.cases[0].base.shell.half, float)
         time = 0.5 * np.arange(1, traces.sizes["time"] + 1)
-        return xr.Dataset(
-            {
-                "base_path": (dims, base[..., :2].astype(float), _attrs("m", "path of the base")),
-                "contact_path": (
-                    dims, contact.astype(float), _attrs("m", "path of the contact point")
-                ),
-                "path_success": (
-                    dims[:2], success.astype(int), _attrs("1", "the target of Fig. 7 is reached")
-                ),
-                "half": ("axis", half, _attrs("m", "half length and half width of the base")),
-            },
-            {
-                "object": list(HARDWARE_OBJECTS),
-                "path_time": ("path_time", time, _attrs("s", "time after the start")),
-                "axis": ["x", "y"],
-            },
-            {"trials": success.size},
-        )  # fmt: skip
+        return _labelled(
+            base_path=(dims, base[..., :2], "m", "path of the base"),
+            contact_path=(dims, contact, "m", "path of the contact point"),
+            path_success=(dims[:2], success.astype(int), "1", "the target of Fig. 7 is reached"),
+            half=("axis", half, "m", "half length and half width of the base"),
+            path_time=("path_time", time, "s", "time after the start"),
+        ).assign_coords(axis=["x", "y"])
 
     def intro(self, results: xr.Dataset) -> str:
         ground, robot = HARDWARE_GROUND, HARDWARE_ROBOT
@@ -221,8 +204,13 @@ class Hardware(LawQuestion[xr.Dataset]):
 hardware = call_of(Hardware)
 
 
-def _attrs(unit: str, meaning: str) -> dict[str, str]:
-    return {"units": unit, "long_name": meaning}
+def _labelled(**columns: tuple[Sequence[str], ArrayLike, str, str]) -> xr.Dataset:
+    """Return a dataset from dimensions, values, unit and meaning of its columns, by name."""
+    variables = {
+        name: xr.Variable(dims, values, {"units": unit, "long_name": meaning})
+        for name, (dims, values, unit, meaning) in columns.items()
+    }
+    return xr.Dataset(variables, {"object": list(HARDWARE_OBJECTS)})
 
 
 def table(results: xr.Dataset) -> list[list[str]]:

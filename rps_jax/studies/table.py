@@ -76,9 +76,10 @@ class Table(TrialOptions, MultiLawQuestion[xr.Dataset]):
         return len(self.cases)
 
     def answer(self, run: Run) -> xr.Dataset:
-        return run.checkpoint("table", partial(self._run, run))
+        return run.checkpoint("table", partial(self.run_cases, run))
 
-    def _run(self, run: Run) -> xr.Dataset:
+    def run_cases(self, run: Run) -> xr.Dataset:
+        """Run all cases, and return their outcomes."""
         outcome, _ = pushes.run(self.cases, self.setting, **run.batch_options)
         objects = [Path(name).stem if name.endswith(".xml") else name for name in self.objects]
         frictions = [label_of(friction) for friction in self.friction]
@@ -116,12 +117,12 @@ def table_of(folder: Path) -> Table:
     try:
         manifest = run_folder.read_manifest(folder)
         setting = setting_of(manifest["setting"])
-        laws = {name: registry.params_from_json(law) for name, law in manifest["laws"].items()}
+        laws = {k: registry.params_from_json(law) for k, law in dict(manifest["laws"]).items()}
         pairs = {name: _tuples(manifest[name]) for name in ("objects", "friction", "targets")}
         sensing = {field.name: manifest[field.name] for field in dataclasses.fields(TrialOptions)}
         if manifest["question"] != "table":
             raise KeyError("question")
-    except (LookupError, TypeError, AttributeError, ValueError) as error:
+    except (LookupError, TypeError, ValueError) as error:
         raise files.CorruptFileError(folder / run_folder.MANIFEST, error) from error
     if any(isinstance(sensing[name], dict) for name in ("robot", "skin")):
         raise errors.InputError(f"run = {folder} has a custom robot or skin: film it from Python.")
