@@ -5,40 +5,17 @@ from __future__ import annotations
 import itertools
 import warnings
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
-from typing import Any, Generic, NamedTuple, TypeVar
+from typing import Any, NamedTuple
 
 import xarray as xr
 
-from rps_jax.record import files
 from rps_jax.record.checkpoint import Checkpoints
 from rps_jax.trials.batch import BatchOptions
 from rps_jax.trials.progress import ProgressCallback
 
-S = TypeVar("S")
 _OLD_NAMES = {"part": "checkpoint", "parts": "checkpoints", "report": "callback"}
-
-
-class StepFormat(NamedTuple, Generic[S]):
-    """File format of the results of a loop's steps."""
-
-    encode: Callable[[str, S], bytes]  # name of the step, result -> content
-    decode: Callable[[Path, bytes], S]  # path and content -> result; raises InputError
-    suffix: str
-
-
-def _encode_step(name: str, results: xr.Dataset) -> bytes:
-    return files.encode_results(results.assign_attrs(part=name))
-
-
-def _decode_step(path: Path, content: bytes) -> xr.Dataset:
-    results = files.decode_results(content, path, signed=True)
-    if not path.name.startswith(f"{results.attrs.pop('part', None)}-"):
-        raise files.CorruptFileError(path, "it holds another part")
-    return results
-
-
-DATASETS = StepFormat(_encode_step, _decode_step, ".nc")
 
 
 class Run(NamedTuple):
@@ -72,34 +49,24 @@ class Run(NamedTuple):
 
     def steps(
         self,
-        compute: Callable[[int], S],
+        compute: Callable[[int], xr.Dataset],
         proceed: Callable[[int], bool],
         *,
         name: str = "{:06d}",
-        form: StepFormat[S] = DATASETS,
-    ) -> Iterator[S]:
+    ) -> Iterator[xr.Dataset]:
         """Yield the results of the steps 0, 1, ... of a loop, in this order.
 
         Args:
           compute: returns the result of a step by its index.
           proceed: whether a step is computed if the folder lacks it; if not, the loop ends.
           name: name of a step's checkpoint, with its index.
-          form: how a result is stored; by default as a labelled dataset.
         """
-        stored = self.checkpoints
-        finished = {} if stored is None else stored.paths()
+        finished = {} if self.checkpoints is None else self.checkpoints.paths()
         for index in itertools.count():
             key = name.format(index)
-            content = None if stored is None or key not in finished else stored.get(key)
-            if content is not None:
-                yield form.decode(finished[key], content)
-            elif proceed(index):
-                result = compute(index)
-                if stored is not None:
-                    stored.put(key, form.encode(key, result), form.suffix)
-                yield result
-            else:
+            if key not in finished and not proceed(index):
                 return
+            yield self.checkpoint(key, partial(compute, index))
 
     @property
     def batch_options(self) -> BatchOptions:
