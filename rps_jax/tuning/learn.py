@@ -4,7 +4,6 @@
 """
 
 import functools
-import json
 import time
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -42,6 +41,7 @@ from rps_jax.tuning.rollout import RunnerState
 from rps_jax.tuning.run import parse_domains
 from rps_jax.world.domain import Domain, DomainLike
 
+_CHECKPOINT = "learner"
 _VALIDATION_RATIO = 10  # learning time between two validations, as a multiple of their time
 Metrics = dict[str, float]  # results of an update, by name
 Tables = list[World]  # worlds of each environment, leaves (worlds, ...)
@@ -170,7 +170,7 @@ class Learn(PPO, SimulationQuestion[xr.Dataset]):
 
     def answer(self, run: Run) -> xr.Dataset:
         assert run.folder is not None
-        learner = _Learner(run.folder, self, run.callback, time.perf_counter())
+        learner = _Learner(run.folder, self, run.callback)
         return learner.run(60 * self.minutes, self.updates, 60 * self.every)
 
     def intro(self, results: xr.Dataset) -> str:
@@ -192,15 +192,9 @@ class Learn(PPO, SimulationQuestion[xr.Dataset]):
         rows = [["update", "wall clock", "success in validation", "mean time", "curriculum"]]
         for update, rate in zip(validated["update"].values, validated.values, strict=True):
             row = results.sel(update=update)
-            rows.append(
-                [
-                    str(update),
-                    f"{float(row.time) / 60:.1f} min",
-                    f"{tables.percent(rate)} %",
-                    f"{float(row.validation_time):.0f} s",
-                    f"{100 * float(row.level):.0f} %",
-                ]
-            )
+            wall, level = f"{row.time / 60:.1f} min", f"{100 * row.level:.0f} %"
+            rate, mean = f"{tables.percent(rate)} %", f"{row.validation_time:.0f} s"
+            rows.append([str(update), wall, rate, mean, level])
         return [
             Section("Learning curve", text, rows, Picture("curve", partial(figure_of, results)))
         ]
@@ -209,33 +203,21 @@ class Learn(PPO, SimulationQuestion[xr.Dataset]):
 learn = call_of(Learn)
 
 
-def _validate_note(note: Any) -> dict[str, Any]:
-    """Return the JSON part of a checkpoint; raise an error if it is malformed."""
-    for name in ("spent", "compile", "best"):
-        errors.check_number(name, note[name])
-    for metrics in note["curve"]:
-        for name in UNITS:
-            if not isinstance(metrics[name], float | int):
-                raise ValueError(f"{name} = {metrics[name]!r} is not a number")
-    return note
-
-
 class _Learner:
     """State of a learning run, with its compiled programs and its checkpoints."""
 
-    def __init__(self, folder: Path, options: Learn, callback: ProgressCallback, start_time: float):
+    def __init__(self, folder: Path, options: Learn, callback: ProgressCallback):
         self.folder, self.options, self.callback = folder, options, callback
-        self._start_time, self._previous_time = start_time, 0.0  # [s]
+        self._start_time = time.perf_counter()  # [s]
         self._envs = options.environments()
         self._validation_envs = options.environments("validate")
         self._tables = [env.table for env in self._envs]
         self.network = rollout.network_of(options, self._envs)
-        self.curve: list[Metrics] = []
-        self.best: Weights | None = None  # of the law with the best validation so far
-        self.best_rate, self.compile, self._num_checkpoints = -1.0, 0.0, 0
         start = self._compile()
         # A copy: no two leaves may share memory, which updates write to.
         self.runner: RunnerState = jax.tree.map(jnp.copy, start(self._tables))
+        self.best = jax.device_get(self.runner.train.ema)
+        self.best_rate, self.curve = -1.0, list[Metrics]()
         self._restore()
 
     def _compile(self) -> Callable[[Tables], RunnerState]:
@@ -247,23 +229,22 @@ class _Learner:
         update = partial(rollout.update, options, self.network, envs)
         evaluate = partial(rollout.evaluate_policy, self.network, self._validation_envs)
         runner = jax.eval_shape(start, tables)
+        programs = (
+            (jax.jit(update, donate_argnums=1), tables, runner),
+            (jax.jit(evaluate), self._validation_tables, runner.train.ema),
+            (jax.jit(start), tables),
+        )
         with ThreadPoolExecutor(3) as pool:
-            futures = [
-                pool.submit(lambda f, *shapes: f.lower(*shapes).compile(), *call)
-                for call in (
-                    (jax.jit(update, donate_argnums=1), tables, runner),
-                    (jax.jit(evaluate), self._validation_tables, runner.train.ema),
-                    (jax.jit(start), tables),
-                )
-            ]
-            self._update, self._evaluate, compiled_start = (f.result() for f in futures)
-        self.compile += time.perf_counter() - start_time
+            self._update, self._evaluate, compiled_start = pool.map(
+                lambda program: program[0].lower(*program[1:]).compile(), programs
+            )
+        self.compile = time.perf_counter() - start_time
         return compiled_start
 
     @property
     def elapsed(self) -> float:
         """Wall clock [s] of all processes of this run."""
-        return self._previous_time + time.perf_counter() - self._start_time
+        return time.perf_counter() - self._start_time
 
     def run(self, seconds: float, updates: int, interval: float) -> xr.Dataset:
         """Learn until the time limit or the number of updates, with 0 for no limit."""
@@ -284,28 +265,21 @@ class _Learner:
                 last_checkpoint = self.elapsed
         if self.curve and np.isnan(self.curve[-1]["validation"]):
             self._validate()
-        self.checkpoint()
-        variables = {}
-        for name, (unit, description) in UNITS.items():
-            values = [metrics[name] for metrics in self.curve]
-            variables[name] = ("update", values, {"units": unit, "long_name": description})
-        times = {"compile": self.compile, "run": self.elapsed - self.compile}
-        return xr.Dataset(variables, {"update": np.arange(len(self.curve)) + 1}, times)
+        return self.checkpoint()
 
     def _record(self, metrics: Metrics) -> None:
         """Add an update to the curve, and report the progress."""
-        ended = max(metrics["ended"], 1.0)
+        options, ended = self.options, metrics["ended"] or float("nan")
+        steps = options.num_envs * len(self._envs) * options.num_steps
         simulated = self.curve[-1]["simulated"] if self.curve else 0.0
-        options = self.options
-        worlds = options.num_envs * len(self._envs)
-        metrics["success"] = metrics.pop("succeeded") / ended if metrics["ended"] else float("nan")
-        metrics["earned"] = metrics["earned"] / ended if metrics["ended"] else float("nan")
-        metrics["simulated"] = simulated + worlds * options.num_steps * options.hold
+        metrics["success"] = metrics["succeeded"] / ended
+        metrics["earned"] /= ended
+        metrics["simulated"] = simulated + steps * options.hold
         metrics["time"] = self.elapsed
         metrics["validation"] = metrics["validation_time"] = float("nan")
         self.curve.append({name: metrics[name] for name in UNITS})
-        ended = int(sum(metrics["ended"] for metrics in self.curve))
-        self.callback(Progress(ended, self.curve[-1]["simulated"], self.compile, len(self.curve)))
+        total = int(sum(metrics["ended"] for metrics in self.curve))
+        self.callback(Progress(total, metrics["simulated"], self.compile, len(self.curve)))
 
     def _validate(self) -> float:
         """Validate the law; return the wall clock of the validation [s]."""
@@ -323,64 +297,65 @@ class _Learner:
 
     def policy(self) -> Policy:
         """Return the law with the best validation, or the latest law before any validation."""
-        environment = device.collect_environment()
+        environment, validated = device.collect_environment(), self.best_rate >= 0
         provenance = {
-            "success_in_validation": self.best_rate if self.best else None,
+            "success_in_validation": self.best_rate if validated else None,
             "updates": len(self.curve),
             "simulated": self.curve[-1]["simulated"] if self.curve else 0.0,
             "seconds": round(self.elapsed, 1),
             "how": {option.name: getattr(self.options, option.name) for option in fields(PPO)},
             **{name: environment[name] for name in ("command", "commit", "device", "packages")},
         }
-        actor = self.best or jax.device_get(self.runner.train.ema)
+        actor = self.best if validated else jax.device_get(self.runner.train.ema)
         return Policy(self.network, actor, learned=provenance)
 
-    def checkpoint(self) -> None:
-        """Write the checkpoint, the law and the curve; two checkpoint files alternate."""
-        leaves = jax.device_get(jax.tree.leaves(self.runner))
-        arrays: dict[str, Any] = {f"leaf_{i:04d}": leaf for i, leaf in enumerate(leaves)}
-        for name, weight in (self.best or {}).items():
-            arrays[f"best_{name}"] = weight
-        note = {"curve": self.curve, "spent": self.elapsed, "compile": self.compile}
-        arrays["note"] = np.array(json.dumps(note | {"best": self.best_rate}))
-        self._num_checkpoints += 1
-        Checkpoints(self.folder).put(
-            f"learner-{self._num_checkpoints % 2}", files.encode_arrays(**arrays), ".npz"
-        )
+    @property
+    def _state(self) -> tuple[RunnerState, Weights, np.ndarray, np.ndarray]:
+        """Runner, best weights, best rate with both times, and curve (updates, metrics)."""
+        rows = [list(metrics.values()) for metrics in self.curve]
+        numbers = np.array([self.best_rate, self.compile, self.elapsed])
+        return self.runner, self.best, numbers, np.array(rows, float).reshape(-1, len(UNITS))
+
+    def checkpoint(self) -> xr.Dataset:
+        """Write the checkpoint, the law and the curve, and return the curve."""
+        state = jax.device_get(self._state)
+        leaves = {f"leaf_{i:04d}": leaf for i, leaf in enumerate(jax.tree.leaves(state))}
+        Checkpoints(self.folder).put(_CHECKPOINT, files.encode_arrays(**leaves), ".npz")
         files.write_bytes(self.folder / "policy.npz", policies.encode(self.policy()))
-        rows = [{"update": i + 1} | metrics for i, metrics in enumerate(self.curve)]
-        files.write_csv(self.folder / "curve.csv", rows)
+        variables = {
+            name: ("update", values, {"units": unit, "long_name": meaning})
+            for (name, (unit, meaning)), values in zip(UNITS.items(), state[-1].T, strict=True)
+        }
+        times = {"compile": self.compile, "run": self.elapsed - self.compile}
+        curve = xr.Dataset(variables, {"update": np.arange(len(self.curve)) + 1}, times)
+        table = curve.to_dataframe().to_csv(lineterminator="\n")
+        files.write_text(self.folder / "curve.csv", table)
+        return curve
 
     def _restore(self) -> None:
-        """Restore the latest checkpoint, if there is one."""
-        checkpoints = []
-        for name, content in Checkpoints(self.folder).items():
-            path = Checkpoints(self.folder).folder / name
-            try:
-                arrays = files.decode_arrays(content)
-                note = _validate_note(files.parse_json(str(arrays.pop("note"))))
-            except (ValueError, KeyError, TypeError) as error:
-                raise files.CorruptFileError(path, error) from error
-            checkpoints.append((len(note["curve"]), note["spent"], name, note, arrays))
-        if not checkpoints:
+        """Restore the checkpoint, if there is one."""
+        content = Checkpoints(self.folder).get(_CHECKPOINT)
+        if content is None:
             return
-        *_, name, note, arrays = max(checkpoints, key=lambda checkpoint: checkpoint[:2])
-        best = {k.removeprefix("best_"): v for k, v in arrays.items() if k.startswith("best_")}
-        leaves = [arrays[key] for key in sorted(arrays) if key.startswith("leaf_")]
-        expected = jax.tree.leaves(self.runner)
-        shapes = {key: value.shape for key, value in best.items()}
-        if [(x.shape, x.dtype) for x in leaves] != [(x.shape, x.dtype) for x in expected] or (
-            best and shapes != self.network.shapes
-        ):
+        try:
+            arrays = files.decode_arrays(content)
+        except ValueError as error:
+            raise files.CorruptFileError(self.folder / "parts", error) from error
+        expected, structure = jax.tree.flatten(self._state)
+        leaves = [arrays[key] for key in sorted(arrays)]
+        columns = leaves[-1].shape[1:] if leaves else ()  # of the curve, of any number of updates
+        kinds = ([(x.shape, x.dtype) for x in several[:-1]] for several in (leaves, expected))
+        if columns != (len(UNITS),) or next(kinds) != next(kinds):
             raise errors.InputError(
                 f"run = {self.folder} cannot be resumed: another version wrote it; choose another "
                 "folder."
             )
-        leaves = [jax.device_put(leaf) for leaf in leaves]
-        self.runner = jax.tree.unflatten(jax.tree.structure(self.runner), leaves)
-        self.curve, self._previous_time = note["curve"], note["spent"]
-        self.compile += note["compile"]
-        self.best_rate, self.best, self._num_checkpoints = note["best"], best or None, int(name[-1])
+        runner, self.best, numbers, curve = jax.tree.unflatten(structure, leaves)
+        self.runner = jax.device_put(runner)
+        self.best_rate, compile_time, elapsed = numbers.tolist()
+        self.compile += compile_time
+        self._start_time -= elapsed
+        self.curve = [dict(zip(UNITS, row, strict=True)) for row in curve.tolist()]
 
 
 def figure_of(curve: xr.Dataset) -> Figure:
