@@ -199,7 +199,7 @@ def test_delay_and_slip_are_read_off_the_base():
 
 def test_a_mirrored_log_has_a_mirrored_target():
     log = build_log()
-    original, mirrored = (logs.statistics(x, 0.02) for x in (log, logs.mirror(log)))
+    original, mirrored = (logs.statistics(x, 0.02).iloc[0] for x in (log, logs.mirror(log)))
     assert (
         original["base/target_2"] == -mirrored["base/target_2"] == pytest.approx(5**-0.5, rel=1e-3)
     )

@@ -23,6 +23,7 @@ from typing import Any, ClassVar
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pandas as pd
 import xarray as xr
 
 from rps_jax import engines
@@ -58,7 +59,7 @@ from rps_jax.tuning import posterior
 from rps_jax.tuning.logs import Log, RawLog
 from rps_jax.world import domain as domains
 from rps_jax.world import draws, points
-from rps_jax.world.domain import QUANTITIES, VELOCITY_ERRORS, Domain, Range
+from rps_jax.world.domain import QUANTITIES, VELOCITY_ERRORS, Domain, Range, unit_of
 from rps_jax.world.draws import Draw
 
 _BATCH = 64  # worlds of one object that are stepped at once
@@ -139,8 +140,8 @@ class Fit(LawQuestion[Fitted], DomainQuestion[Fitted], LogsQuestion):
         interval = max(logs_.row_interval(log, period) for log in self.raw_logs)
         shortest = min(map(logs_.duration, self.raw_logs))
         window = interval * math.floor(min(self.window, shortest) / interval + 1e-6)
-        return Bank(self.ranges, registry.law_of(self.params), self.params, self.setting, window,
-                    interval, self.raw_logs[0].exact)  # fmt: skip
+        exact = self.raw_logs[0].exact
+        return Bank(self.ranges, self.params, self.setting, window, interval, exact)
 
     @cached_property
     def observed(self) -> tuple[list[Log], list[str]]:
@@ -152,7 +153,7 @@ class Fit(LawQuestion[Fitted], DomainQuestion[Fitted], LogsQuestion):
 
     def check(self) -> None:
         self.check_engine([self.params])
-        check_law(self.label, self.bank.law, self.setting)
+        check_law(self.label, registry.law_of(self.params), self.setting)
         if len({raw.exact for raw in self.raw_logs}) > 1:
             raise InputError(
                 "logs of traces and of a robot's odometry are not allowed together: fit them "
@@ -185,9 +186,7 @@ class Fit(LawQuestion[Fitted], DomainQuestion[Fitted], LogsQuestion):
         simulated = self.bank.worlds(self.worlds, run)
         logs, fields = self.observed
         names = statistic_names(simulated, fields)
-        x = np.concatenate(
-            [matrix(logs_.statistics(log, self.bank.interval), names) for log in logs]
-        )
+        x = pd.concat([logs_.statistics(log, self.bank.interval) for log in logs])[names].to_numpy()
         set_phase(run.callback, "learn")
         bank = simulated.sel(statistic=names).statistics.values
         networks = posterior.train(simulated.u.values, bank, self.setting.seed)
@@ -243,7 +242,6 @@ class Bank:
     """Simulated worlds of a domain and the statistics of their logs."""
 
     domain: Domain
-    law: Law
     params: LawParams
     setting: Setting
     window: float  # [s]
@@ -276,10 +274,7 @@ class Bank:
         ) as pool:
             statistics = list(pool.map(self.statistics, drawn))
         order = np.argsort(np.concatenate(groups))
-        names = list(statistics[0][0])
-        ways = [
-            np.concatenate([matrix(pair[i], names) for pair in statistics])[order] for i in (0, 1)
-        ]
+        ways = [pd.concat(frames).iloc[order] for frames in zip(*statistics, strict=True)]
         cube = points.points_of(self.domain, index, seed)
         columns = [points.names(self.domain).index(name) for name in coordinates(self.domain)]
         return xr.Dataset(
@@ -287,10 +282,10 @@ class Bank:
                 "u": (("world", "quantity"), cube[:, columns]),
                 "statistics": (("world", "way", "statistic"), np.float32(np.stack(ways, 1))),
             },
-            {"quantity": list(coordinates(self.domain)), "statistic": names},
+            {"quantity": list(coordinates(self.domain)), "statistic": list(ways[0])},
         )
 
-    def statistics(self, drawn: Draw) -> tuple[dict[str, np.ndarray], ...]:
+    def statistics(self, drawn: Draw) -> tuple[pd.DataFrame, ...]:
         """Return statistics of worlds (n,) of one object, and of their mirror images."""
         log = self.logs(drawn)
         return tuple(logs_.statistics(x, self.interval) for x in (log, logs_.mirror(log)))
@@ -303,7 +298,9 @@ class Bank:
         worlds, params = rows((part.worlds, part.params), repeated)
         period = self.setting.physics.control_period
         row_steps = max(1, round(self.interval / period))
-        loop = ControlLoop(self.setting.physics, self.setting.rules, _observing(self.law))
+        loop = ControlLoop(
+            self.setting.physics, self.setting.rules, _observing(registry.law_of(self.params))
+        )
         rows_ = _simulate_logs(
             part.stage, worlds, params, loop,
             rows=round(self.window / self.interval), row_steps=row_steps,
@@ -392,11 +389,6 @@ def statistic_names(bank: xr.Dataset, fields: Sequence[str]) -> list[str]:
     return [n for n in map(str, bank.statistic.values) if n.split("/")[0] in ("base", *fields)]
 
 
-def matrix(statistics: Mapping[str, np.ndarray], names: Sequence[str]) -> np.ndarray:
-    """Return statistics (B, F) in the order of their names."""
-    return np.stack([statistics[name] for name in names], -1)
-
-
 def values_of(domain: Domain, u: np.ndarray) -> dict[str, np.ndarray]:
     """Return quantities (n,) of points (n, D) in their units, and the derived quantities."""
     values = {}
@@ -412,31 +404,31 @@ def values_of(domain: Domain, u: np.ndarray) -> dict[str, np.ndarray]:
 
 def summary(domain: Domain, u: np.ndarray) -> xr.Dataset:
     """Return the posterior of its points (n, D), as `Fit` describes it."""
-    prior = values_of(domain, np.random.default_rng(0).random((20_000, u.shape[1])))
-    values = values_of(domain, u)
+    values, prior = (
+        pd.DataFrame(values_of(domain, points))
+        for points in (u, np.random.default_rng(0).random((20_000, u.shape[1])))
+    )
     ranks = [np.searchsorted(np.sort(prior[k]), v) / 20_000 for k, v in values.items()]
     rank = np.stack(ranks, -1)  # (n, quantities) quantile of the prior
     low, high = np.quantile(rank, [0.05, 0.95], axis=0)
-    units = {k: QUANTITIES[k].unit if k in QUANTITIES else "1" for k in values}
-    units |= {k: unit for k, (unit, *_) in DERIVED.items() if k in values}
     columns: dict[str, Any] = {
-        "sample": (("draw", "quantity"), np.stack(list(values.values()), -1)),
+        "sample": (("draw", "quantity"), values.to_numpy()),
         "undetermined": ("quantity", ((high - low) >= 0.9 * UNDETERMINED).astype(np.int8)),
         "shrinkage": ("quantity", 1 - (high - low) / 0.9),
         "correlation": (("quantity", "other"), np.nan_to_num(np.corrcoef(rank.T))),
     }
     for prefix, source in (("", values), ("prior_", prior)):
-        quantiles = np.quantile(np.stack(list(source.values()), -1), [0.05, 0.5, 0.95], axis=0)
+        quantiles = np.quantile(source, [0.05, 0.5, 0.95], axis=0)
         for name, row in zip(("low", "median", "high"), quantiles, strict=True):
             columns[prefix + name] = ("quantity", row)
-    objects = np.zeros(len(u), int)
+    count, objects = len(domain.objects), np.zeros(len(u), int)
     if "object" in coordinates(domain):
-        objects = np.floor(u[:, 0] * len(domain.objects)).astype(int)
-    share = np.bincount(objects, minlength=len(domain.objects)) / len(u)
-    columns["probability"] = ("object", share)
+        objects = np.floor(u[:, 0] * count).astype(int)
+    columns["probability"] = ("object", np.bincount(objects, minlength=count) / len(u))
     names = list(values)
+    units = [DERIVED[name][0] if name in DERIVED else unit_of(name) for name in names]
     coords = {"quantity": names, "other": names, "object": list(domain.objects)}
-    return xr.Dataset(columns, coords | {"unit": ("quantity", [units[k] for k in names])})
+    return xr.Dataset(columns, coords | {"unit": ("quantity", units)})
 
 
 def fitted_domain(domain: Domain, data: xr.Dataset) -> Domain:
@@ -445,21 +437,22 @@ def fitted_domain(domain: Domain, data: xr.Dataset) -> Domain:
     All three errors of the velocity share one range. Objects with a probability below 5 % are
     removed.
     """
-    determined = data.isel(quantity=np.flatnonzero(data.undetermined.values == 0))
+    determined = data.isel(quantity=data.undetermined.values == 0)
     intervals = {
-        str(name): (float(determined.low[i]), float(determined.high[i]))
-        for i, name in enumerate(determined.quantity.values)
+        str(name): (float(low), float(high))
+        for name, low, high in zip(
+            determined.quantity.values, determined.low, determined.high, strict=True
+        )
     }
     changes: dict[str, Any] = {
         name: Range(*interval, getattr(domain, name).log)
         for name, interval in intervals.items()
         if name in QUANTITIES
     }
-    if all(name in intervals for name in VELOCITY_ERRORS):
+    if intervals.keys() >= {*VELOCITY_ERRORS}:
         low, high = zip(*(intervals[name] for name in VELOCITY_ERRORS), strict=True)
         changes["velocity_error"] = Range(min(low), max(high))
-    likely = data.probability.values >= 0.05
-    objects = tuple(o for o, is_likely in zip(domain.objects, likely, strict=True) if is_likely)
+    objects = tuple(map(str, data.object.values[data.probability.values >= 0.05]))
     return dataclasses.replace(domain, objects=objects, **changes)
 
 

@@ -16,13 +16,15 @@ bag, which `rps push --bag` writes or a robot records (`record.bag` lists the to
     force_x, force_y                 [N] of the object on the base, if known, in the robot frame
 """
 
-import re
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
+import pandas as pd
 import xarray as xr
 
 from rps_jax.errors import InputError
@@ -82,18 +84,19 @@ def read(source: Trace | str | Path, shell: Shell) -> RawLog:
     Raises:
       InputError: the log cannot be read, lacks a column, or is not of this robot.
     """
-    name = f"log = {'a trace' if isinstance(source, Trace) else source}"
+    path = None if isinstance(source, Trace) else Path(source)
+    name = f"log = {path or 'a trace'}"
     if isinstance(source, Trace):
         log = _from_trace(source.data, name)
-    elif Path(source).is_dir():
-        log = _from_trace(files.read_results(Path(source)), name)
-    elif Path(source).suffix == ".mcap" and Path(source).is_file():
+    elif path.is_dir():
+        log = _from_trace(files.read_results(path), name)
+    elif path.suffix == ".mcap" and path.is_file():
         bag.check()
-        steps = with_contacts(bag.read(Path(source)), shell, f"bag = {source}")
+        steps = with_contacts(bag.read(path), shell, f"bag = {source}")
         known = (*COLUMNS, "signal")
         log = RawLog({k: np.asarray(v, float) for k, v in steps.items() if k in known}, False)
-    elif Path(source).suffix == ".csv" and Path(source).is_file():
-        log = _from_table(Path(source), name)
+    elif path.suffix == ".csv" and path.is_file():
+        log = _from_table(path, name)
     else:
         raise InputError(
             f"{name} is not allowed: give a trace, a run folder of rps push, FILE.csv or FILE.mcap."
@@ -127,45 +130,42 @@ def _from_trace(data: xr.Dataset, name: str) -> RawLog:
 
 def _from_table(path: Path, name: str) -> RawLog:
     """Return the log of a table."""
-    text = path.read_text(encoding="utf-8", errors="replace").strip().splitlines()
-    if len(text) < 2:
-        raise InputError(f"{name} is empty: give a header and at least two rows.")
-    header = [title.strip() for title in text[0].split(",")]
-    index = {title: i for i, title in enumerate(header)}
-    taxels = sorted(
-        (title for title in index if re.fullmatch(r"taxel_\d+", title)), key=lambda n: int(n[6:])
-    )
-    needed = [k for k in COLUMNS if k not in OPTIONAL and not (taxels and k in _TOUCH)]
-    if missing := [title for k in needed for title in COLUMNS[k] if title not in index]:
-        raise InputError(f"{name} lacks the column {missing[0]}: `rps fit --help` lists them.")
     try:
-        rows = np.array([[float(cell or "nan") for cell in row.split(",")] for row in text[1:]])
+        table = pd.read_csv(
+            path, dtype=float, index_col=False, skipinitialspace=True,
+            encoding_errors="replace", float_precision="round_trip",
+        )  # fmt: skip
     except ValueError as error:
         raise InputError(
-            f"{name} is not allowed ({error}): write numbers in every cell."
+            f"{name} is not allowed ({error}): write a header, and numbers in every cell."
         ) from error
+    table.columns = table.columns.str.strip()
+    taxels = sorted(table.filter(regex=r"^taxel_\d+$"), key=lambda title: int(title[6:]))
+    needed = [k for k in COLUMNS if k not in OPTIONAL and not (taxels and k in _TOUCH)]
+    if missing := [title for k in needed for title in COLUMNS[k] if title not in table]:
+        raise InputError(f"{name} lacks the column {missing[0]}: `rps fit --help` lists them.")
     columns = {
-        key: rows[:, [index[title] for title in titles]]
+        key: table[list(titles)].to_numpy().squeeze()
         for key, titles in COLUMNS.items()
-        if all(title in index for title in titles)
+        if {*titles} <= {*table}
     }
-    columns |= {k: columns[k][:, 0] for k in ("time", "contact_type") if k in columns}
     if taxels:
-        columns["signal"] = rows[:, [index[title] for title in taxels]]
+        columns["signal"] = table[taxels].to_numpy()
     return RawLog(columns, False)
 
 
 def _contacts(signal: np.ndarray, shell: Shell) -> dict[str, np.ndarray]:
-    """Return the contacts of filtered taxels (N, T), by the rule of the simulated skin."""
-    active, middles = signal > CapacitiveSkin().threshold, np.asarray(shell.taxels()[:, 0])
-    first, last = active.argmax(1), active.shape[1] - 1 - active[:, ::-1].argmax(1)
-    kind = np.minimum(active.sum(1), 2)
-    p_robot = np.where(kind[:, None] > 0, (middles[first] + middles[last]) / 2, 0.0)
-    return {"contact_type": kind.astype(float), "p_robot_contact": p_robot}
+    """Return the contacts of taxels (N, T), which are filtered already."""
+    skin = CapacitiveSkin(time_constant=1e-9, shell=shell)
+    read = partial(skin.read, skin.init(jax.random.PRNGKey(0)), period=1.0)
+    reading = jax.vmap(lambda raw: read(raw)[1])(jnp.asarray(signal))
+    return {name: np.asarray(values, float) for name, values in reading._asdict().items()}
 
 
 def _check(columns: dict[str, np.ndarray], name: str, shell: Shell) -> None:
     """Raise InputError for a log that is not of this robot or not in these units."""
+    if np.size(columns["time"]) < 2:
+        raise InputError(f"{name} is empty: give a header and at least two rows.")
     for key, values in columns.items():
         if len(bad := np.argwhere(~np.isfinite(values))):
             raise InputError(
@@ -176,8 +176,8 @@ def _check(columns: dict[str, np.ndarray], name: str, shell: Shell) -> None:
         raise InputError(f"{name} has a target that moves: cut the log where it does.")
     columns["target"] = targets[0]
     time, steps = columns["time"], np.diff(columns["time"])
-    if len(time) < 2 or (steps <= 0).any():
-        raise InputError(f"{name} is not allowed: its time must rise, over at least two rows.")
+    if (steps <= 0).any():
+        raise InputError(f"{name} is not allowed: its time must rise.")
     interval = float(np.median(steps))
     if interval > _SLOWEST:
         raise InputError(
@@ -247,8 +247,8 @@ def mirror(log: Log) -> Log:
     return log._replace(**fields, signal=signal)
 
 
-def statistics(log: Log, interval: float) -> dict[str, np.ndarray]:
-    """Return summary statistics (B,) of pushes, by name; NaN where one is undefined.
+def statistics(log: Log, interval: float) -> pd.DataFrame:
+    """Return summary statistics of pushes, a row for each; NaN where one is undefined.
 
     A name starts with the optional field that the statistic needs, `object_pose/`, `f_robot/` or
     `signal/`; the names of all others start with `base/`.
@@ -335,7 +335,7 @@ def statistics(log: Log, interval: float) -> dict[str, np.ndarray]:
         highest = np.sort(np.where(valid[..., None], log.signal, 0.0), -1)[..., -4:]
         put("highest", _blocks(np.arcsinh(highest[..., -1:]), touch), "signal")
         put("reach", _quantiles(highest[..., -1], touch), "signal")
-    return columns
+    return pd.DataFrame(columns)
 
 
 def _rotate(angle: np.ndarray, v: np.ndarray) -> np.ndarray:

@@ -62,8 +62,8 @@ class Bagged(Study[xr.Dataset], DomainQuestion[xr.Dataset], LawQuestion[xr.Datas
 
     def answer(self, run: Run) -> xr.Dataset:
         """Train on the worlds, and fit the bags and the logs (source, log)."""
-        law, period = registry.law_of(self.params), self.setting.physics.control_period
-        bank = fit.Bank(self.ranges, law, self.params, self.setting, self.window, period)
+        period = self.setting.physics.control_period
+        bank = fit.Bank(self.ranges, self.params, self.setting, self.window, period)
         training = bank.worlds(self.worlds, run)
         names = fit.statistic_names(training, _FIELDS)
         test = bank.worlds(self.logs, run, "test")
@@ -103,7 +103,7 @@ class Bagged(Study[xr.Dataset], DomainQuestion[xr.Dataset], LawQuestion[xr.Datas
                 rps_jax.replay(run=run, world=world, bag=path)
                 raw = logs.read(path, self.ranges.robot.shell)
                 log = logs.resample(raw, bank.interval, bank.window)
-                rows.append(fit.matrix(logs.statistics(log, bank.interval), names)[0])
+                rows.append(logs.statistics(log, bank.interval)[names].values[0])
         return xr.Dataset({"statistics": (("log", "statistic"), np.stack(rows))})
 
     def report(self, results: Any, run: Run) -> Sequence[Section]:

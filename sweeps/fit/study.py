@@ -73,8 +73,8 @@ class Coverage(Study[xr.Dataset], DomainQuestion[xr.Dataset], LawQuestion[xr.Dat
     @cached_property
     def bank(self) -> fit.Bank:
         """Simulated worlds, with a row of the log in each control step."""
-        law, period = registry.law_of(self.params), self.setting.physics.control_period
-        return fit.Bank(self.ranges, law, self.params, self.setting, self.window, period)
+        period = self.setting.physics.control_period
+        return fit.Bank(self.ranges, self.params, self.setting, self.window, period)
 
     @cached_property
     def _networks(self) -> dict[tuple[str, ...], posterior.Posterior]:
@@ -140,7 +140,7 @@ class Coverage(Study[xr.Dataset], DomainQuestion[xr.Dataset], LawQuestion[xr.Dat
                     new = draws.random_numbers(seed, rows + (push + 1) * 1_000_000)
                     uniform[:, task] = new[:, task]
                     draw = draws.draw_at(self.ranges, rows, uniform)
-                    values[rows, push] = fit.matrix(self.bank.statistics(draw)[0], names)
+                    values[rows, push] = self.bank.statistics(draw)[0][names]
             return xr.Dataset({"statistics": (("log", "more", "statistic"), values)})
 
         return run.checkpoint("again", compute).statistics.values
