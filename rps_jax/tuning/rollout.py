@@ -9,7 +9,7 @@ up to the targets of the domain.
 
 from collections.abc import Sequence
 from functools import partial
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -29,6 +29,7 @@ from rps_jax.trials.trial import World
 from rps_jax.tuning import ppo as ppo_
 from rps_jax.tuning.ppo import PPO, TrainState, Transition
 
+T = TypeVar("T")
 ActCarry = tuple[State, TouchState, jax.Array]  # states, touch states, rewards (N,)
 
 
@@ -39,6 +40,9 @@ class EnvBatch(NamedTuple):
     memory: PolicyState
     first: jax.Array  # (N,) bool: the trial has just started
     earned: jax.Array  # (N,) [1] rewards of the trial so far
+
+
+Carry = tuple[tuple[EnvBatch, ...], jax.Array]  # batches and key, between two actions
 
 
 class EpisodeStats(NamedTuple):
@@ -102,28 +106,33 @@ def ease(world: World, level: jax.Array) -> World:
     return world._replace(p_world_target=jnp.where(level < 1, target, world.p_world_target))
 
 
+def _start(network: Network, env: PushEnv, worlds: World, index: jax.Array) -> EnvBatch:
+    """Return worlds (N, ...) of these indices (N,) at their start, after the first observation."""
+
+    def start_world(world: World, index: jax.Array) -> tuple[State, PolicyState]:
+        state = env.begin(world, index)
+        memory = PolicyState.init(network, state.obs.dtype)
+        touch_state = memory.touch_state.update(state.info["observation"])
+        return state, memory._replace(touch_state=touch_state)
+
+    states, memory = jax.vmap(start_world)(worlds, index)
+    return EnvBatch(states, memory, jnp.ones(index.size, bool), jnp.zeros(index.size))
+
+
 def _restart(
     network: Network, env: PushEnv, table: World, level: jax.Array, key: jax.Array, count: int
 ) -> EnvBatch:
     """Return random worlds at their start; one in five has a random lower level, below level 1."""
 
-    def start_world(key: jax.Array) -> tuple[State, PolicyState]:
+    def draw_world(key: jax.Array) -> tuple[World, jax.Array]:
         index_key, noise_key, level_key = jax.random.split(key, 3)
         index = jax.random.randint(index_key, (), 0, env.worlds)
         u = jax.random.uniform(level_key)
         world_level = jnp.where((u < 0.2) & (level < 1), 5 * u, 1.0) * level
         world = ease(rows(table, index), world_level)
-        state = env.begin(world._replace(key=jax.random.key_data(noise_key)), index)
-        return state, _first_state(network, state)
+        return world._replace(key=jax.random.key_data(noise_key)), index
 
-    states, memory = jax.vmap(start_world)(jax.random.split(key, count))
-    return EnvBatch(states, memory, jnp.ones(count, bool), jnp.zeros(count))
-
-
-def _first_state(network: Network, state: State) -> PolicyState:
-    """Return the state of the law after its first observation."""
-    memory = PolicyState.init(network, state.obs.dtype)
-    return memory._replace(touch_state=memory.touch_state.update(state.info["observation"]))
+    return _start(network, env, *jax.vmap(draw_world)(jax.random.split(key, count)))
 
 
 def _private(env: PushEnv, state: State) -> jax.Array:
@@ -149,15 +158,14 @@ def act(
 ) -> tuple[EnvBatch, jax.Array]:
     """Execute an action (N, 3) in each world; return the batch and the rewards (N,)."""
     bounded = features.clip_action(action)
-    touch_state = jax.vmap(type(batch.memory.touch_state).mark_decision)(
+    touch_state = jax.vmap(TouchState.mark_decision)(
         batch.memory.touch_state, batch.states.info["observation"]
     )
-    update = jax.vmap(type(touch_state).update)
 
     def step(carry: ActCarry, _: None) -> tuple[ActCarry, None]:
         states, touch_state, reward = carry
         states = jax.vmap(env.step)(states, bounded)
-        touch_state = update(touch_state, states.info["observation"])
+        touch_state = jax.vmap(TouchState.update)(touch_state, states.info["observation"])
         return (states, touch_state, reward + states.reward), None
 
     carry = batch.states, touch_state, jnp.zeros_like(batch.earned)
@@ -185,62 +193,9 @@ def _episode_stats(env: PushEnv, batch: EnvBatch) -> tuple[EpisodeStats, jax.Arr
     return stats, data.done & (data.success | data.tipped | data.diverged)
 
 
-def _take_action(
-    ppo: PPO,
-    network: Network,
-    envs: Sequence[PushEnv],
-    tables: Sequence[World],
-    runner: RunnerState,
-    carry: tuple[tuple[EnvBatch, ...], jax.Array],
-    _: None,
-) -> tuple[tuple[tuple[EnvBatch, ...], jax.Array], tuple[Transition, EpisodeStats]]:
-    """Take one action in all worlds; return its transition and statistics of ended trials."""
-    batches, key = carry
-    key, noise_key, *start_keys = jax.random.split(key, 2 + len(envs))
-    weights, count = runner.train.weights, ppo.num_envs
-
-    def join(parts: Sequence[jax.Array]) -> jax.Array:
-        return jnp.concatenate(list(parts))
-
-    inputs = [_inputs(env, batch) for env, batch in zip(envs, batches, strict=True)]
-    obs, private = (join(parts) for parts in zip(*inputs, strict=True))
-    previous_hidden = join([batch.memory.hidden for batch in batches])
-    first = join([batch.first for batch in batches])
-    hidden, mean = network.apply(weights["actor"], previous_hidden, obs)
-    noise = jax.random.normal(noise_key, mean.shape, mean.dtype)
-    action = mean + jnp.exp(weights["log_std"]) * noise
-    next_batches, next_inputs, rewards = [], [], []
-    for i, (env, batch) in enumerate(zip(envs, batches, strict=True)):
-        worlds = slice(i * count, (i + 1) * count)
-        batch, reward = act(env, network, batch, hidden[worlds], action[worlds])
-        next_batches.append(batch)
-        next_inputs.append(_inputs(env, batch))
-        rewards.append(reward)
-    pairs = ppo_.critic_inputs(*(join(parts) for parts in zip(*next_inputs, strict=True)))
-    verdicts = [_episode_stats(env, batch) for env, batch in zip(envs, next_batches, strict=True)]
-    stats, terminated = jax.tree.map(lambda *parts: join(parts), *verdicts)
-    select = jax.vmap(soft.tree_where)
-    restarted = tuple(
-        select(
-            batch.states.data.done,
-            _restart(network, env, table, runner.level, start_key, count),
-            batch,
-        )
-        for env, table, start_key, batch in zip(envs, tables, start_keys, next_batches, strict=True)
-    )
-    steps = Transition(
-        obs,
-        private,
-        first,
-        action,
-        ppo_.log_prob(action, mean, weights["log_std"]),
-        networks.critic(weights["critic"], ppo_.critic_inputs(obs, private)),
-        networks.critic(weights["critic"], pairs),
-        join(rewards),
-        stats.ended,
-        terminated,
-    )
-    return (restarted, key), (steps, jax.tree.map(jnp.sum, stats))
+def _join(parts: Sequence[T]) -> T:
+    """Concatenate the leaves of pytrees."""
+    return jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *parts)
 
 
 def update(
@@ -255,9 +210,44 @@ def update(
     Each of `envs` has one shape of object and one domain. Their worlds, `tables`, are inputs and
     not constants of the program.
     """
+
+    def take_action(carry: Carry, _: None) -> tuple[Carry, tuple[Transition, EpisodeStats]]:
+        """Take one action in all worlds; return its transition and statistics of ended trials."""
+        batches, key = carry
+        key, noise_key, *start_keys = jax.random.split(key, 2 + len(envs))
+        weights, count = runner.train.weights, ppo.num_envs
+        inputs = [
+            (*_inputs(env, batch), batch.memory.hidden, batch.first)
+            for env, batch in zip(envs, batches, strict=True)
+        ]
+        obs, private, previous_hidden, first = _join(inputs)
+        hidden, mean = network.apply(weights["actor"], previous_hidden, obs)
+        noise = jax.random.normal(noise_key, mean.shape, mean.dtype)
+        action = mean + jnp.exp(weights["log_std"]) * noise
+        restarted, results = [], []
+        for i, (env, table, batch) in enumerate(zip(envs, tables, batches, strict=True)):
+            worlds = slice(i * count, (i + 1) * count)
+            batch, reward = act(env, network, batch, hidden[worlds], action[worlds])
+            results.append((_inputs(env, batch), reward, *_episode_stats(env, batch)))
+            start = _restart(network, env, table, runner.level, start_keys[i], count)
+            restarted.append(jax.vmap(soft.tree_where)(batch.states.data.done, start, batch))
+        next_inputs, reward, stats, terminated = _join(results)
+        steps = Transition(
+            obs,
+            private,
+            first,
+            action,
+            ppo_.log_prob(action, mean, weights["log_std"]),
+            networks.critic(weights["critic"], ppo_.critic_inputs(obs, private)),
+            networks.critic(weights["critic"], ppo_.critic_inputs(*next_inputs)),
+            reward,
+            stats.ended,
+            terminated,
+        )
+        return (tuple(restarted), key), (steps, jax.tree.map(jnp.sum, stats))
+
     hidden = jnp.concatenate([batch.memory.hidden for batch in runner.batches])
     key, action_key, update_key = jax.random.split(runner.key, 3)
-    take_action = partial(_take_action, ppo, network, envs, tables, runner)
     carry = runner.batches, action_key
     (batches, _), (steps, step_stats) = jax.lax.scan(take_action, carry, length=ppo.num_steps)
     stats = jax.tree.map(jnp.sum, step_stats)
@@ -288,13 +278,7 @@ def _raise_level(ppo: PPO, runner: RunnerState, stats: EpisodeStats) -> RunnerSt
 
 def rollout(network: Network, env: PushEnv, table: World, actor: Weights) -> State:
     """Push by the policy without noise in all worlds of an environment; return the last states."""
-
-    def start_world(index: jax.Array) -> tuple[State, PolicyState]:
-        state = env.begin(rows(table, index), index)
-        return state, _first_state(network, state)
-
-    states, memory = jax.vmap(start_world)(jnp.arange(env.worlds))
-    batch = EnvBatch(states, memory, jnp.ones(env.worlds, bool), jnp.zeros(env.worlds))
+    batch = _start(network, env, table, jnp.arange(env.worlds))
 
     def step(batch: EnvBatch) -> EnvBatch:
         obs, _ = _inputs(env, batch)
