@@ -31,7 +31,6 @@ from rps_jax.record.options import option
 from rps_jax.runs.question import DomainQuestion, LawQuestion, Run, call_of, name_or_custom, seed_of
 from rps_jax.studies.probe import Probe
 from rps_jax.world import points
-from rps_jax.world.domain import Domain
 
 Severity = Callable[[np.ndarray], np.ndarray]  # of points (n, q), (n,)
 _EDGE = 1e-9  # least distance of a coordinate to the ends of its range
@@ -224,7 +223,20 @@ class Rare(DomainQuestion[xr.Dataset], LawQuestion[xr.Dataset]):
         kinds = [quantity.kind for quantity in points.coordinates(domain)]
         seeds = seed_of(seed, "tune") * 10_000 + np.arange(self.repetitions)
         simulations = [subset_simulation(kinds, self, int(i)) for i in seeds]
-        return _labelled(domain, run_together(lambda u: probe(u).severity.values, simulations))
+        results = run_together(lambda u: probe(u).severity.values, simulations)
+        estimates, p_groups, levels, u, severity = zip(*results, strict=True)
+        columns = zip(Estimate._fields, zip(*estimates, strict=True), strict=True)
+        depths = list(zip_longest(*levels, fillvalue=np.nan))
+        return xr.Dataset(
+            {
+                **{name: ("repetition", list(values)) for name, values in columns},
+                "p_group": (("repetition", "group"), np.stack(p_groups)),
+                "level": (("repetition", "depth"), np.array(depths).T),
+                "u": (("failure", "quantity"), np.concatenate(u)),
+                "severity": ("failure", np.concatenate(severity)),
+            },
+            {"quantity": list(points.names(domain))},
+        )
 
     def intro(self, results: xr.Dataset) -> str:
         event = "a failure is a trial that does not reach its target."
@@ -245,25 +257,6 @@ class Rare(DomainQuestion[xr.Dataset], LawQuestion[xr.Dataset]):
 rare = call_of(Rare)
 
 
-def _labelled(domain: Domain, results: Sequence[Result]) -> xr.Dataset:
-    """Return the results of all repetitions with names."""
-    estimates = {
-        name: ("repetition", [getattr(result.estimate, name) for result in results])
-        for name in Estimate._fields
-    }
-    levels = list(zip_longest(*(result.levels for result in results), fillvalue=np.nan))
-    return xr.Dataset(
-        {
-            **estimates,
-            "p_group": (("repetition", "group"), np.stack([x.p_group for x in results])),
-            "level": (("repetition", "depth"), np.array(levels).T),
-            "u": (("failure", "quantity"), np.concatenate([x.u for x in results])),
-            "severity": ("failure", np.concatenate([x.severity for x in results])),
-        },
-        {"quantity": list(points.names(domain))},
-    )
-
-
 def worlds_needed(p: float, variation: float) -> float:
     """Return the number of drawn worlds with this coefficient of variation of `p`."""
     return (1 - p) / (p * variation**2) if p > 0 else float("inf")
@@ -272,9 +265,9 @@ def worlds_needed(p: float, variation: float) -> float:
 def estimate_table(results: xr.Dataset) -> list[list[str]]:
     """Return a row for each repetition, and one for all of them together."""
     rows = [["", "probability of failure", "95 %", "variation", "worlds", "share of drawn worlds"]]
-    for i in range(results.sizes["repetition"]):
-        *values, trials = (float(results[name][i]) for name in Estimate._fields)
-        rows.append(estimate_row(f"splitting, {i + 1}", Estimate(*values, trials=int(trials))))
+    columns = (results[name].values.tolist() for name in Estimate._fields)
+    for i, values in enumerate(zip(*columns, strict=True), start=1):
+        rows.append(estimate_row(f"splitting, {i}", Estimate(*values)))
     if results.sizes["repetition"] > 1:
         combined = combine(results.p.values, int(results.trials.sum()))
         rows.append(estimate_row("splitting, all", combined))

@@ -17,7 +17,6 @@ from typing import ClassVar
 
 import numpy as np
 import xarray as xr
-from matplotlib.axis import Axis
 
 from rps_jax import errors
 from rps_jax.analysis import statistics
@@ -148,12 +147,9 @@ class Sensitivity(PlanQuestion, DomainQuestion[xr.Dataset], LawQuestion[xr.Datas
     def report(self, results: xr.Dataset, run: Run) -> Sequence[Section]:
         labels = {name: factor_words(name) for name in rank_factors(results)}
         first_five = [name for name in labels if name in results.quantity.values][:5]
-        failed = results.success.values == 0
-        law_and_domain = f"{self.label}, {name_or_custom(self.domain)}"
-        title = f"{law_and_domain}: failures over pairs, {failed.size:,} worlds"
         objects = [name.removeprefix("random_") for name in self.ranges.objects]
-        u, names = results.u.sel(quantity=first_five).values, [labels[name] for name in first_five]
-        pairs = partial(interactions, u, failed, names, {factor_words("object"): objects}, title)
+        title = f"{self.label}, {name_or_custom(self.domain)}: failures over pairs"
+        pairs = partial(interactions, results, {x: labels[x] for x in first_five}, objects, title)
         text = (
             "The first-order index is the share of the variance that a factor explains alone; the "
             "total index includes all its interactions. Noise and the corners of prisms are one "
@@ -180,17 +176,16 @@ def analyze(options: Sensitivity, sweep: xr.Dataset) -> xr.Dataset:
         "time": trials.time.values.astype(float),
         "left": statistics.distance_left(trials),
     }
-    shape = (len(OUTPUTS), len(options.factors))
-    columns = {name: np.zeros(shape) for name in _INDICES}
-    for i, name in enumerate(OUTPUTS):
-        if np.ptp(outputs[name]) == 0:
-            continue  # without variance all indices are 0
-        indices = compute(
-            options.problem, outputs[name], calc_second_order=False, num_resamples=200,
-            seed=options.design_seed + 1,
-        )  # fmt: skip
-        for column, key in _INDICES.items():
-            columns[column][i] = indices[key]
+    columns: dict[str, list[np.ndarray]] = {name: [] for name in _INDICES}
+    for values in outputs.values():
+        indices = {}
+        if np.ptp(values) > 0:  # without variance all indices are 0
+            indices = compute(
+                options.problem, values, calc_second_order=False, num_resamples=200,
+                seed=options.design_seed + 1,
+            )  # fmt: skip
+        for name, key in _INDICES.items():
+            columns[name].append(indices.get(key, np.zeros(len(options.factors))))
     return xr.Dataset(
         {
             **{name: (("output", "factor"), values) for name, values in columns.items()},
@@ -275,50 +270,37 @@ def indices_figure(results: xr.Dataset, labels: Mapping[str, str]) -> Figure:
 
 
 def interactions(
-    u: np.ndarray,
-    failed: np.ndarray,
-    names: Sequence[str],
-    choices: Mapping[str, Sequence[str]],
-    title: str,
+    results: xr.Dataset, labels: Mapping[str, str], objects: Sequence[str], title: str
 ) -> Figure:
-    """Draw failures (n,) at points `u` (n, k) over each pair of quantities.
-
-    Ranges have equal bins. A quantity that is no range has its `choices`, by its name in words.
-    """
-    count = len(names)
-    figure = Figure(figsize=(1.5 + 2 * (count - 1), 1.6 + 1.8 * (count - 1)), layout="constrained")
-    axes = figure.subplots(count - 1, count - 1, squeeze=False)
-    bins = [len(choices[name]) if name in choices else _BINS for name in names]
-    index = np.minimum((u * bins).astype(int), np.asarray(bins) - 1)
-    rates: dict[tuple[int, int], np.ndarray] = {}
-    for i, j in combinations(range(count), 2):
-        cell, size = index[:, j] * bins[i] + index[:, i], bins[i] * bins[j]
-        trials = np.maximum(np.bincount(cell, minlength=size), 1)
-        failures = np.bincount(cell, failed, minlength=size)
-        rates[i, j] = (100 * failures / trials).reshape(bins[j], bins[i])
+    """Draw the failures over each pair of labelled quantities; ranges have equal bins."""
+    last = len(labels) - 1
+    figure = Figure(figsize=(1.5 + 2 * last, 1.6 + 1.8 * last), layout="constrained")
+    axes = figure.subplots(last, last, squeeze=False)
+    ticks = {name: objects if name == "object" else () for name in labels}
+    bins = {name: len(ticks[name]) or _BINS for name in labels}
+    rates = {}
+    for x, y in combinations(labels, 2):
+        u, shape = results.u.sel(quantity=[y, x]).values, (bins[y], bins[x])
+        histogram = partial(np.histogramdd, u, shape, [(0, 1)] * 2)
+        failures, _ = histogram(weights=results.success.values == 0)
+        rates[x, y] = 100 * failures / np.maximum(histogram()[0], 1)
     highest = max(float(rate.max()) for rate in rates.values()) or 1.0
-    image = None
-    for ax in axes[np.triu_indices(count - 1, 1)]:
+    image, order = None, list(labels)
+    for ax in axes[np.triu_indices(last, 1)]:
         ax.axis("off")
-    for (i, j), rate in rates.items():
-        ax = axes[j - 1, i]
+    for (x, y), rate in rates.items():
+        ax = axes[order.index(y) - 1, order.index(x)]
         image = ax.imshow(rate, origin="lower", vmin=0, vmax=highest, cmap="magma_r", aspect="auto")
-        for (y, x), value in np.ndenumerate(rate):
+        for (row, column), value in np.ndenumerate(rate):
             ink = "white" if value > 0.55 * highest else "black"
-            ax.text(x, y, f"{value:.0f}", ha="center", va="center", fontsize=7, color=ink)
-        _label(ax.xaxis, names[i], choices, shown=j == count - 1)
-        _label(ax.yaxis, names[j], choices, shown=i == 0)
+            ax.text(column, row, f"{value:.0f}", ha="center", va="center", fontsize=7, color=ink)
+        for axis, name, shown in ((ax.xaxis, x, y == order[-1]), (ax.yaxis, y, x == order[0])):
+            axis.set_ticks(
+                range(len(ticks[name]) * shown), ticks[name] if shown else (), fontsize=7
+            )
+            axis.set_label_text(labels[name].replace(" of the ", "\nof the ") * shown, fontsize=8)
     if image is not None:
         figure.colorbar(image, ax=axes, label="failures [%]", shrink=0.6)
-    figure.suptitle(
-        f"{title}\neach range from its low end (left, bottom) to its high end", fontsize=10
-    )
+    ends = "each range from its low end (left, bottom) to its high end"
+    figure.suptitle(f"{title}, {results.sizes['world']:,} worlds\n{ends}", fontsize=10)
     return figure
-
-
-def _label(axis: Axis, name: str, choices: Mapping[str, Sequence[str]], *, shown: bool) -> None:
-    """Label an axis with a quantity, and its cells with the quantity's choices, if shown."""
-    ticks = choices.get(name, ()) if shown else ()
-    axis.set_ticks(range(len(ticks)), ticks, fontsize=7)
-    if shown:
-        axis.set_label_text(name.replace(" of the ", "\nof the "), fontsize=8)
