@@ -36,6 +36,7 @@ from rps_jax.runs.plan import Plan, load_plan
 from rps_jax.runs.question import DomainQuestion, Run, call_of, count_true, seed_of
 from rps_jax.trials import score
 from rps_jax.trials.progress import SequentialProgress
+from rps_jax.trials.results import labelled
 from rps_jax.trials.rollout import Candidates, outcomes
 from rps_jax.trials.trial import Outcome
 
@@ -235,22 +236,18 @@ ceiling = call_of(Ceiling)
 
 def _initial_state(worlds: np.ndarray) -> xr.Dataset:
     """Return the state of the search before its first round: no plan, of unknown cost."""
-    count = worlds.size
-    columns = {
-        "solved": (np.zeros(count, np.int8), "1", "a plan succeeds"),
-        "alone": (np.zeros(count, np.int8), "1", "the law succeeds without a plan"),
-        "time": (np.full(count, np.nan), "s", "time of the best plan"),
-        "cost": (np.full(count, np.inf), "1", "S of the best plan"),
-        "rounds": (np.zeros(count, int), "1", "number of rounds"),
-        "trials": (np.zeros(count, int), "1", "number of trials"),
-    }
-    variables = {
-        name: xr.Variable("world", values, {"units": unit, "long_name": meaning})
-        for name, (values, unit, meaning) in columns.items()
-    }
-    for name, meaning in (("offsets", "best plan, G1"), ("mean", "plan of M2")):
-        dims, zeros = ("world", "knot", "axis"), np.zeros((count, KNOTS, 3))
-        variables[name] = xr.Variable(dims, zeros, {"units": "1", "long_name": meaning})
+    count, dims = worlds.size, ("world", "knot", "axis")
+    plans = np.zeros((2, count, KNOTS, 3))
+    variables = labelled(
+        solved=("world", np.zeros(count, np.int8), "1", "a plan succeeds"),
+        alone=("world", np.zeros(count, np.int8), "1", "the law succeeds without a plan"),
+        time=("world", np.full(count, np.nan), "s", "time of the best plan"),
+        cost=("world", np.full(count, np.inf), "1", "S of the best plan"),
+        rounds=("world", np.zeros(count, int), "1", "number of rounds"),
+        trials=("world", np.zeros(count, int), "1", "number of trials"),
+        offsets=(dims, plans[0], "1", "best plan, G1"),
+        mean=(dims, plans[1], "1", "plan of M2"),
+    )
     return xr.Dataset(variables, {"world": worlds, "axis": ["v_x", "v_y", "omega"]})
 
 

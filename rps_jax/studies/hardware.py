@@ -12,7 +12,6 @@ from typing import ClassVar, Literal
 
 import numpy as np
 import xarray as xr
-from numpy.typing import ArrayLike
 
 from rps_jax.analysis import statistics
 from rps_jax.analysis.figures.style import (
@@ -33,7 +32,7 @@ from rps_jax.studies.table import Table
 from rps_jax.trials import pushes
 from rps_jax.trials.case import Case
 from rps_jax.trials.progress import SequentialProgress
-from rps_jax.trials.results import trace_dataset
+from rps_jax.trials.results import labelled, trace_dataset
 from rps_jax.trials.trial import Shift
 from rps_jax.world.paper import (
     HARDWARE_GROUND,
@@ -140,14 +139,15 @@ class Hardware(LawQuestion[xr.Dataset]):
         dims = ("object", "shift", "side", "target")
         # A trial that ends before the shove is not counted.
         recovered, counted = (
-            values.astype(np.int8).reshape(len(HARDWARE_OBJECTS), len(self.shifts), 2, -1)
+            values.reshape(len(HARDWARE_OBJECTS), len(self.shifts), 2, -1)
             for values in (outcome.success, outcome.time > self.shift_time)
         )
-        return _labelled(
+        variables = labelled(
             recovered=(dims, recovered, "1", "the target is reached after the shove"),
             counted=(dims, counted, "1", "the trial was under way when the object was shoved"),
             shift=("shift", list(self.shifts), "m", "length of the shove"),
-        ).assign_coords(side=["left", "right"])
+        )
+        return xr.Dataset(variables, {"object": list(HARDWARE_OBJECTS), "side": ["left", "right"]})
 
     def _trace(self, run: Run) -> xr.Dataset:
         """Return the paths of Fig. 7: all objects and targets, at the middle friction."""
@@ -163,13 +163,14 @@ class Hardware(LawQuestion[xr.Dataset]):
         dims = ("object", "target", "path_time", "axis")
         half = np.asarray(self.table.cases[0].base.shell.half, float)
         time = 0.5 * np.arange(1, traces.sizes["time"] + 1)
-        return _labelled(
+        variables = labelled(
             base_path=(dims, base[..., :2], "m", "path of the base"),
             contact_path=(dims, contact, "m", "path of the contact point"),
             path_success=(dims[:2], success.astype(int), "1", "the target of Fig. 7 is reached"),
             half=("axis", half, "m", "half length and half width of the base"),
             path_time=("path_time", time, "s", "time after the start"),
-        ).assign_coords(axis=["x", "y"])
+        )
+        return xr.Dataset(variables, {"object": list(HARDWARE_OBJECTS), "axis": ["x", "y"]})
 
     def intro(self, results: xr.Dataset) -> str:
         ground, robot = HARDWARE_GROUND, HARDWARE_ROBOT
@@ -202,15 +203,6 @@ class Hardware(LawQuestion[xr.Dataset]):
 
 
 hardware = call_of(Hardware)
-
-
-def _labelled(**columns: tuple[Sequence[str], ArrayLike, str, str]) -> xr.Dataset:
-    """Return a dataset from dimensions, values, unit and meaning of its columns, by name."""
-    variables = {
-        name: xr.Variable(dims, values, {"units": unit, "long_name": meaning})
-        for name, (dims, values, unit, meaning) in columns.items()
-    }
-    return xr.Dataset(variables, {"object": list(HARDWARE_OBJECTS)})
 
 
 def table(results: xr.Dataset) -> list[list[str]]:

@@ -55,6 +55,14 @@ def outcome_dataset(
     )
 
 
+def labelled(**columns: tuple[str | Sequence[str], ArrayLike, str, str]) -> dict[str, xr.Variable]:
+    """Return variables by name, from their dimensions, values, unit and meaning."""
+    return {
+        name: xr.Variable(dims, _plain(values), {"units": unit, "long_name": meaning})
+        for name, (dims, values, unit, meaning) in columns.items()
+    }
+
+
 def variable(name: str, dims: Sequence[str], values: np.ndarray) -> xr.Variable:
     """Return one field of outcomes with its unit; poses (..., 3) have one more dimension."""
     unit, meaning = UNITS[name]

@@ -33,6 +33,7 @@ from rps_jax.record.options import option
 from rps_jax.runs.question import Run, SimulationQuestion, Split, call_of, seed_of
 from rps_jax.trials.env import SHAPED_REWARD, PushEnv
 from rps_jax.trials.progress import Bar, Progress, ProgressCallback
+from rps_jax.trials.results import labelled
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import Rules, World
 from rps_jax.tuning import rollout
@@ -322,10 +323,8 @@ class _Learner:
         leaves = {f"leaf_{i:04d}": leaf for i, leaf in enumerate(jax.tree.leaves(state))}
         Checkpoints(self.folder).put(_CHECKPOINT, files.encode_arrays(**leaves), ".npz")
         files.write_bytes(self.folder / "policy.npz", policies.encode(self.policy()))
-        variables = {
-            name: ("update", values, {"units": unit, "long_name": meaning})
-            for (name, (unit, meaning)), values in zip(UNITS.items(), state[-1].T, strict=True)
-        }
+        columns = zip(UNITS, state[-1].T, strict=True)
+        variables = labelled(**{name: ("update", x, *UNITS[name]) for name, x in columns})
         times = {"compile": self.compile, "run": self.elapsed - self.compile}
         curve = xr.Dataset(variables, {"update": np.arange(len(self.curve)) + 1}, times)
         table = curve.to_dataframe().to_csv(lineterminator="\n")
