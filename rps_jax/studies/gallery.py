@@ -57,27 +57,27 @@ def failure_modes(trials: xr.Dataset, max_lost: float) -> np.ndarray:
 
 
 def common_quantities(
-    trials: xr.Dataset, mask: np.ndarray, count: int = 4
+    trials: xr.Dataset, worlds: np.ndarray, count: int = 4
 ) -> list[tuple[str, float, float]]:
     """Return the drawn quantities in which some worlds differ most from all worlds.
 
-    The effect size is the probability that a masked world has more of the quantity than another
+    The effect size is the probability that one of them has more of the quantity than another
     world (the statistic of Mann and Whitney), less one half. Effects below 0.1 are left out.
 
     Returns:
-      Names of quantities, with their medians over the masked worlds and over all worlds.
+      Names of quantities, with their medians over these worlds and over all worlds.
     """
     rows = []
     for name in statistics.varied_quantities(trials):
         values = trials[name].values.astype(float)
-        masked = values[mask & np.isfinite(values)]
-        if masked.size < 3:
+        some = values[worlds]
+        some = some[np.isfinite(some)]
+        if some.size < 3:
             continue
-        more = stats.mannwhitneyu(masked, np.nan_to_num(values, nan=np.inf)).statistic
-        effect = abs(more / (masked.size * values.size) - 0.5)
-        rows.append((effect, name, float(np.median(masked)), float(np.nanmedian(values))))
-    rows = sorted(rows, reverse=True)[:count]
-    return [(name, masked, overall) for effect, name, masked, overall in rows if effect >= 0.1]
+        more = stats.mannwhitneyu(some, np.nan_to_num(values, nan=np.inf)).statistic
+        effect = abs(more / (some.size * values.size) - 0.5)
+        rows.append((effect, (name, float(np.median(some)), float(np.nanmedian(values)))))
+    return [medians for effect, medians in sorted(rows, reverse=True)[:count] if effect >= 0.1]
 
 
 @dataclass(frozen=True)
@@ -136,22 +136,20 @@ class Gallery(Question[xr.Dataset]):
 
     def report(self, results: xr.Dataset, run: Run) -> Sequence[Section]:
         plan, law = self.plan_and_law
-        masks = {mode: results.kind.values == mode for mode in MECHANISMS}
-        worlds = {mode: np.flatnonzero(mask) for mode, mask in masks.items() if mask.any()}
-        plotted = {mode: indices[: self.each] for mode, indices in worlds.items()}
+        worlds = {mode: np.flatnonzero(results.kind.values == mode) for mode in MECHANISMS}
+        plotted = {mode: indices[: self.each] for mode, indices in worlds.items() if indices.size}
         all_plotted = np.concatenate([np.zeros(0, int), *plotted.values()])
         traces = _simulate(plan, law, all_plotted, SequentialProgress(run.callback))
         sections = []
         for mode, indices in plotted.items():
             labels = [
-                f"world {i}, "
-                + (f"{distance:.2f} m left" if np.isfinite(distance) else "untouched")
-                for i, distance in zip(indices, results.min_distance.values[indices], strict=True)
+                f"world {i}, " + (f"{left:.2f} m left" if np.isfinite(left) else "untouched")
+                for i, left in zip(indices, results.min_distance.values[indices], strict=True)
             ]
             total, size = worlds[mode].size, results.sizes["world"]
             title = f"{law}: {mode}, {len(labels)} of {total} in {size} worlds"
             draw = functools.partial(maps_figure, [traces[int(i)] for i in indices], labels, title)
-            text = _text(self.run, law, results, masks[mode], mode)
+            text = _text(self.run, law, results, worlds[mode], mode)
             picture = Picture(mode.replace(" ", "_"), draw)
             sections.append(Section(f"{mode}: {total} of {size}", text, (), picture))
         return sections
@@ -160,15 +158,14 @@ class Gallery(Question[xr.Dataset]):
 gallery = call_of(Gallery)
 
 
-def _text(run: str | Path, law: str, trials: xr.Dataset, mask: np.ndarray, mode: str) -> str:
+def _text(run: str | Path, law: str, trials: xr.Dataset, worlds: np.ndarray, mode: str) -> str:
     """Return the sentences about a failure mode: mechanism, common quantities, replay command."""
     parts = []
-    for name, masked, overall in common_quantities(trials, mask):
+    for name, some, overall in common_quantities(trials, worlds):
         unit = trials[name].attrs.get("units", "1").replace("1", "")
-        parts.append(f"{LABELS[name]} {masked:.2g} {unit}".rstrip() + f" (all: {overall:.2g})")
+        parts.append(f"{LABELS[name]} {some:.2g} {unit}".rstrip() + f" (all: {overall:.2g})")
     common = f" Medians: {', '.join(parts)}." if parts else ""
-    world = int(np.flatnonzero(mask)[0])
-    command = f"rps replay {shlex.quote(str(run))} {world} --law {shlex.quote(law)}"
+    command = f"rps replay {shlex.quote(str(run))} {worlds[0]} --law {shlex.quote(law)}"
     return f"{MECHANISMS[mode]}{common} Example: `{command}`."
 
 
@@ -180,13 +177,14 @@ def _simulate(
     objects = plan.domain.object_of(worlds)
     for k in np.unique(objects):
         rows = worlds[objects == k]
-        part = build_batch(plan, list(plan.laws).index(law), rows)
-        law_functions = registry.law_of(plan.laws[law])
-        followed = pushes.record_batch(
-            part, law_functions, plan.setting, interval=0.5, callback=progress
+        batch = build_batch(plan, list(plan.laws).index(law), rows)
+        functions, options = (
+            registry.law_of(plan.laws[law]),
+            {"interval": 0.5, "callback": progress},
         )
+        trajectories = pushes.record_batch(batch, functions, plan.setting, **options)
         progress.finish(rows.size)
-        traces |= dict(zip(rows.tolist(), map(trace_dataset, followed), strict=True))
+        traces |= dict(zip(rows.tolist(), map(trace_dataset, trajectories), strict=True))
     return traces
 
 
@@ -205,10 +203,9 @@ def maps_figure(traces: Sequence[xr.Dataset], labels: Sequence[str], title: str)
 def _draw_map(ax: Axes, trace: xr.Dataset) -> None:
     qpos, touching = trace.qpos.values, trace.contact_type.values[:, None] != 0
     base, object_ = qpos[:, :3], qpos[:, 3:5]
-    ax.plot(*np.where(touching, base[:, :2], np.nan).T, color="C0", lw=0.8, label="base, contact")
-    ax.plot(
-        *np.where(touching, np.nan, base[:, :2]).T, color="C3", lw=0.8, label="base, no contact"
-    )
+    for mask, colour, label in ((touching, "C0", "contact"), (~touching, "C3", "no contact")):
+        path = np.where(mask, base[:, :2], np.nan)
+        ax.plot(*path.T, color=colour, lw=0.8, label=f"base, {label}")
     ax.plot(*object_.T, color="C1", lw=1.2, label="object")
     half = (float(trace.half_length), float(trace.half_width))
     for i in np.linspace(0, len(base) - 1, 10).astype(int):

@@ -10,7 +10,6 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
-from pathlib import Path
 from typing import Any, ClassVar, get_args
 
 import numpy as np
@@ -113,16 +112,13 @@ class Ladder(SweepOptions, MultiLawQuestion[xr.Dataset | xr.DataTree]):
     def sweeps(self) -> dict[str, _TestSweep]:
         """Sweep of each domain, by the name of the domain."""
         domains = [self.domain] if isinstance(self.domain, str | Domain) else list(self.domain)
-        labels = [
-            domain if isinstance(domain, str) else f"domain_{i}" for i, domain in enumerate(domains)
-        ]
+        labels = [x if isinstance(x, str) else f"domain_{i}" for i, x in enumerate(domains)]
         errors.check_each_once("domain", domains, labels)
-        fields = [*dataclasses.fields(SweepOptions), *dataclasses.fields(MultiLawQuestion)]
-        shared = {f.name: getattr(self, f.name) for f in fields if f.name != "laws"}
-        shared |= {"robot": self.robot, "part": self.part}
+        names = {f.name for f in dataclasses.fields(_TestSweep)} - {"laws", "domain"}
+        shared = {name: getattr(self, name) for name in names}
         sweeps = {}
         for label, domain in zip(labels, domains, strict=True):
-            sweep = _TestSweep(self.chosen, domain, self.worlds, **shared)
+            sweep = _TestSweep(self.chosen, domain, **shared)
             if len(domains) > 1 and self.worlds is not None and sweep.ranges.targets:
                 sweep = replace(sweep, worlds=min(self.worlds, sweep.ranges.combinations))
             sweeps[label.replace("/", "_")] = sweep
@@ -156,9 +152,7 @@ class Ladder(SweepOptions, MultiLawQuestion[xr.Dataset | xr.DataTree]):
         progress = SequentialProgress(run.callback)
         results = {}
         for name, sweep in self.sweeps.items():
-            results[name] = sweep.answer(
-                run._replace(callback=progress, folder=_subfolder(run, name))
-            )
+            results[name] = sweep.answer(_run_of(run._replace(callback=progress), name))
             progress.finish(sweep.plan.num_trials)
         return xr.DataTree.from_dict(results)
 
@@ -175,8 +169,7 @@ class Ladder(SweepOptions, MultiLawQuestion[xr.Dataset | xr.DataTree]):
             return self.sections(self.single, results, run)
         sections = []
         for name, sweep in self.sweeps.items():
-            run_in_domain = run._replace(folder=_subfolder(run, name))
-            for section in self.sections(sweep, results[name].to_dataset(), run_in_domain):
+            for section in self.sections(sweep, results[name].to_dataset(), _run_of(run, name)):
                 picture = section.picture
                 if picture:  # pictures of all domains are in one folder
                     picture = picture._replace(name=f"{picture.name}_{_file_name(name)}")
@@ -192,8 +185,9 @@ class Ladder(SweepOptions, MultiLawQuestion[xr.Dataset | xr.DataTree]):
 ladder = call_of(Ladder)
 
 
-def _subfolder(run: Run, name: str) -> Path | None:
-    return run.folder and run.folder / _file_name(name)
+def _run_of(run: Run, domain: str) -> Run:
+    """Return the run of one domain, in a subfolder."""
+    return run._replace(folder=run.folder and run.folder / _file_name(domain))
 
 
 def _file_name(domain: str) -> str:
@@ -279,30 +273,24 @@ def _comparison(results: xr.Dataset) -> list[Section]:
     return sections
 
 
-def _senses_by_law(results: xr.Dataset) -> dict[str, str]:
-    return dict(zip(map(str, results.law.values), map(str, results.senses.values), strict=True))
-
-
 def _solved_failures(results: xr.Dataset) -> str:
     """Count in a sentence the reference's failures in which other laws succeed, by senses."""
-    failed = results.success.sel(law=REFERENCE).values == 0
-    senses = _senses_by_law(results)
+    failed = results.success.sel(law=REFERENCE) == 0
+    others = results.success.drop_sel(law=REFERENCE) > 0
     counts = []
-    for kind in dict.fromkeys(senses.values()):
-        laws = [name for name in senses if senses[name] == kind and name != REFERENCE]
-        if laws:
-            solved = (results.success.sel(law=laws).values > 0).any(axis=0)
-            count = int((solved & failed).sum())
+    for kind in dict.fromkeys(results.senses.values.tolist()):
+        laws = others[others.senses.values == kind]
+        if laws.size:
+            count = int((laws.any("law") & failed).sum())
             counts.append(f"another law that senses {kind} succeeds in {count}")
-    solved = (results.success.values > 0).any(axis=0)
-    counts.append(f"no law succeeds in {int((~solved).sum())}")
-    worlds = f"{failed.sum()} worlds" if failed.sum() != 1 else "one world"
+    counts.append(f"no law succeeds in {int((failed & ~others.any('law')).sum())}")
+    worlds = f"{int(failed.sum())} worlds" if failed.sum() != 1 else "one world"
     return f"Of the {worlds} in which {REFERENCE} fails, {', '.join(counts)}."
 
 
 def draw_ladder(results: xr.Dataset) -> Figure:
     """Draw the success of each law, grouped by senses, with Wilson's 95 % intervals."""
-    senses = _senses_by_law(results)
+    senses = dict(zip(results.law.values.tolist(), results.senses.values.tolist(), strict=True))
     kinds = [kind for kind in get_args(Senses) if kind in senses.values()]
     colours = {kind: f"C{i}" for i, kind in enumerate(get_args(Senses))}
     rates = {law: float(results.success.sel(law=law).mean()) for law in senses}
