@@ -425,7 +425,7 @@ def summary(domain: Domain, u: np.ndarray) -> xr.Dataset:
     if "object" in coordinates(domain):
         objects = np.floor(u[:, 0] * count).astype(int)
     columns["probability"] = ("object", np.bincount(objects, minlength=count) / len(u))
-    names = list(values)
+    names = list(map(str, values))
     units = [DERIVED[name][0] if name in DERIVED else unit_of(name) for name in names]
     coords = {"quantity": names, "other": names, "object": list(domain.objects)}
     return xr.Dataset(columns, coords | {"unit": ("quantity", units)})

@@ -84,8 +84,8 @@ def read(source: Trace | str | Path, shell: Shell) -> RawLog:
     Raises:
       InputError: the log cannot be read, lacks a column, or is not of this robot.
     """
-    path = None if isinstance(source, Trace) else Path(source)
-    name = f"log = {path or 'a trace'}"
+    path = Path("a trace" if isinstance(source, Trace) else source)
+    name = f"log = {path}"
     if isinstance(source, Trace):
         log = _from_trace(source.data, name)
     elif path.is_dir():
@@ -140,7 +140,7 @@ def _from_table(path: Path, name: str) -> RawLog:
             f"{name} is not allowed ({error}): write a header, and numbers in every cell."
         ) from error
     table.columns = table.columns.str.strip()
-    taxels = sorted(table.filter(regex=r"^taxel_\d+$"), key=lambda title: int(title[6:]))
+    taxels = sorted(map(str, table.filter(regex=r"^taxel_\d+$")), key=lambda title: int(title[6:]))
     needed = [k for k in COLUMNS if k not in OPTIONAL and not (taxels and k in _TOUCH)]
     if missing := [title for k in needed for title in COLUMNS[k] if title not in table]:
         raise InputError(f"{name} lacks the column {missing[0]}: `rps fit --help` lists them.")
