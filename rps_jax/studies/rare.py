@@ -16,7 +16,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Generator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
 from itertools import zip_longest
 from typing import ClassVar, NamedTuple
 
@@ -25,8 +24,7 @@ import xarray as xr
 from scipy import stats
 
 from rps_jax import errors
-from rps_jax.analysis.figures.style import Figure, panel
-from rps_jax.analysis.report import Picture, Section
+from rps_jax.analysis.report import Section
 from rps_jax.record.options import option
 from rps_jax.runs.question import DomainQuestion, LawQuestion, Run, call_of, name_or_custom, seed_of
 from rps_jax.studies.probe import Probe
@@ -250,8 +248,7 @@ class Rare(DomainQuestion[xr.Dataset], LawQuestion[xr.Dataset]):
             "worlds over the number of drawn worlds with the same coefficient of variation. The "
             "intervals do not cover failures that no group has reached."
         )
-        picture = Picture("rare", partial(draw_estimates, results))
-        return [Section("Probability of failure", text, estimate_table(results), picture)]
+        return [Section("Probability of failure", text, estimate_table(results))]
 
 
 rare = call_of(Rare)
@@ -279,16 +276,3 @@ def estimate_row(name: str, estimate: Estimate) -> list[str]:
     p, low, high, variation, trials = estimate
     ratio = f"{100 * trials / worlds_needed(p, variation):.2g} %" if 0 < p < 1 else ""
     return [name, f"{p:.3g}", f"[{low:.2g}, {high:.2g}]", f"{variation:.2f}", f"{trials:,}", ratio]
-
-
-def draw_estimates(results: xr.Dataset) -> Figure:
-    """Draw the estimates of all repetitions with their intervals."""
-    figure, ax = panel((6.5, 3.4), "repetition", "probability of failure [1]")
-    p = results.p.values
-    reach = np.abs(np.stack([p - results.low.values, results.high.values - p]))
-    repetition = 1 + np.arange(p.size)
-    ax.errorbar(repetition, p, reach, fmt="o", ms=4, capsize=2, color="C3", label="splitting")
-    if (p > 0).all():
-        ax.set_yscale("log")
-    ax.legend(fontsize=8)
-    return figure

@@ -16,13 +16,13 @@ import numpy as np
 import xarray as xr
 
 from rps_jax.analysis import statistics
-from rps_jax.analysis.figures.style import Figure
+from rps_jax.analysis.figures.style import Figure, panel
 from rps_jax.analysis.report import Picture, Section
 from rps_jax.record.options import option
 from rps_jax.runs import execution
 from rps_jax.runs.plan import Plan
 from rps_jax.runs.question import Run, call_of, count_true, seed_of
-from rps_jax.studies.rare import Estimate, Rare, draw_estimates, estimate_row, estimate_table
+from rps_jax.studies.rare import Estimate, Rare, estimate_row, estimate_table
 from rps_jax.trials.progress import set_phase
 from rps_jax.trials.score import severity_of
 
@@ -94,8 +94,13 @@ def of_drawn(failures: int, trials: int) -> Estimate:
 
 def figure(results: xr.Dataset, against: Estimate) -> Figure:
     """Plot the estimates of all repetitions with their intervals, and those of drawn worlds."""
-    picture = draw_estimates(results)
-    (ax,) = picture.axes
+    picture, ax = panel((6.5, 3.4), "repetition", "probability of failure [1]")
+    p = results.p.values
+    reach = np.abs(np.stack([p - results.low.values, results.high.values - p]))
+    repetition = 1 + np.arange(p.size)
+    ax.errorbar(repetition, p, reach, fmt="o", ms=4, capsize=2, color="C3", label="splitting")
+    if (p > 0).all():
+        ax.set_yscale("log")
     ax.axhspan(against.low, against.high, color="C0", alpha=0.2, lw=0)
     ax.axhline(against.p, color="C0", label="drawn worlds")
     ax.legend(fontsize=8)
