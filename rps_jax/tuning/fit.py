@@ -221,9 +221,8 @@ class Fit(LawQuestion[Fitted], DomainQuestion[Fitted], LogsQuestion):
                 "domain's worlds: the logs are not of this domain, law or robot, and this fit is "
                 "invalid."
             )
-        pairs = [["object", "probability"]]
-        share = data.probability.to_series()
-        pairs += [[str(name), f"{value:.2f}"] for name, value in share.items()]
+        share = data.probability.to_series().items()
+        pairs = [["object", "probability"], *([str(name), f"{value:.2f}"] for name, value in share)]
         return [
             Section("Quantities", text, table(data), Picture("marginals", results.plot)),
             Section("Objects", "", pairs),
@@ -265,16 +264,14 @@ class Bank:
 
     def _simulate(self, index: np.ndarray, split: Split, run: Run) -> xr.Dataset:
         """Return coordinates and statistics of the worlds with these indices."""
-        objects = self.domain.object_of(index)
-        seed = seed_of(self.setting.seed, split)
+        objects, seed = self.domain.object_of(index), seed_of(self.setting.seed, split)
         groups = [index[objects == i] for i in np.unique(objects)]
         drawn = [draws.draw(self.domain, seed, group) for group in groups]
-        with ThreadPoolExecutor(
-            run.workers or engines.get(self.setting.engine).workers("cpu")
-        ) as pool:
-            statistics = list(pool.map(self.statistics, drawn))
+        workers = run.workers or engines.get(self.setting.engine).workers("cpu")
+        with ThreadPoolExecutor(workers) as pool:
+            pairs = zip(*pool.map(self.statistics, drawn), strict=True)
         order = np.argsort(np.concatenate(groups))
-        ways = [pd.concat(frames).iloc[order] for frames in zip(*statistics, strict=True)]
+        ways = [pd.concat(frames).iloc[order] for frames in pairs]
         cube = points.points_of(self.domain, index, seed)
         columns = [points.names(self.domain).index(name) for name in coordinates(self.domain)]
         return xr.Dataset(
@@ -301,10 +298,10 @@ class Bank:
         loop = ControlLoop(
             self.setting.physics, self.setting.rules, _observing(registry.law_of(self.params))
         )
+        count_rows = round(self.window / self.interval)
         rows_ = _simulate_logs(
-            part.stage, worlds, params, loop,
-            rows=round(self.window / self.interval), row_steps=row_steps,
-        )  # fmt: skip
+            part.stage, worlds, params, loop, rows=count_rows, row_steps=row_steps
+        )
         columns = {k: np.swapaxes(np.asarray(x, float), 0, 1)[:count] for k, x in rows_.items()}
         true_pose, valid = columns.pop("true_pose"), columns.pop("done") < 0.5
         if self.exact:

@@ -27,6 +27,7 @@ _NEXT_WEIGHT = 0.6
 _PATIENCE = 8  # epochs without a better density before training stops
 
 Params = dict[str, Any]  # weights of a network: arrays, and tuples of arrays, by name
+Carry = tuple[Params, optax.OptState]  # of training: weights, and state of their optimiser
 
 
 class Posterior(NamedTuple):
@@ -94,47 +95,40 @@ def train(u: np.ndarray, statistics: np.ndarray, seed: int = 0) -> Posterior:
     untrained = Posterior(np.nan_to_num(mean), np.nan_to_num(scale, nan=1.0), {})
     x = untrained.inputs(flat).reshape(count, ways, features).astype(np.float32)
     order, held_out = rng.permutation(count), max(2, count // 10)
-    validation = (
-        jnp.asarray(x[order[:held_out]].reshape(-1, features)),
-        jnp.asarray(np.repeat(u[order[:held_out]], ways, 0)),
+    validation, (inputs, targets) = (
+        (
+            jnp.asarray(x[rows].reshape(-1, features)),
+            jnp.asarray(np.repeat(u[rows], ways, 0), jnp.float32),
+        )
+        for rows in (order[:held_out], order[held_out:])
     )
-    inputs = x[order[held_out:]].reshape(-1, features)
-    targets = np.repeat(u[order[held_out:]], ways, 0)
     size, steps = len(inputs), max(1, len(inputs) // _BATCH)
     schedule = optax.cosine_decay_schedule(2e-3, _EPOCHS * steps, 0.02)
     optimiser = optax.adamw(schedule, weight_decay=1e-2)
     init = partial(_init, features=features, size=u.shape[-1])
-    inputs, targets = jnp.asarray(inputs), jnp.asarray(targets, jnp.float32)
 
     @jax.jit
-    def epoch(
-        params: Params, state: optax.OptState, key: jax.Array
-    ) -> tuple[Params, optax.OptState, jax.Array]:
-        def update(
-            carry: tuple[Params, optax.OptState], step: tuple[jax.Array, jax.Array]
-        ) -> tuple[tuple[Params, optax.OptState], None]:
-            params, state = carry
-            rows, key = step
+    def epoch(carry: Carry, key: jax.Array) -> tuple[Carry, jax.Array]:
+        def update(carry: Carry, step: tuple[jax.Array, jax.Array]) -> tuple[Carry, None]:
+            (params, state), (rows, key) = carry, step
             grad = jax.grad(_loss)(params, inputs[rows], targets[rows], key)
             change, state = optimiser.update(grad, state, params)
-            params = cast(Params, optax.apply_updates(params, change))
-            return (params, state), None
+            return (cast(Params, optax.apply_updates(params, change)), state), None
 
         shuffled = jax.random.permutation(key, size)[: steps * _BATCH].reshape(steps, -1)
-        keys = jax.random.split(key, steps)
-        (params, state), _ = jax.lax.scan(update, (params, state), (shuffled, keys))
-        return params, state, _loss(params, *validation)
+        carry, _ = jax.lax.scan(update, carry, (shuffled, jax.random.split(key, steps)))
+        return carry, _loss(carry[0], *validation)
 
     members = []
     for member in range(_MEMBERS):
         key = jax.random.PRNGKey(seed * _MEMBERS + member)
-        params = best = init(key)
-        state, least, stalled = optimiser.init(params), np.inf, 0
+        best = init(key)
+        carry, least, stalled = (best, optimiser.init(best)), np.inf, 0
         for index in range(_EPOCHS):
-            params, state, loss = epoch(params, state, jax.random.fold_in(key, index))
+            carry, loss = epoch(carry, jax.random.fold_in(key, index))
             stalled += 1
             if float(loss) < least:
-                best, least, stalled = params, float(loss), 0
+                best, least, stalled = carry[0], float(loss), 0
             if stalled >= _PATIENCE:
                 break
         members.append(best)
