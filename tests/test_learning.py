@@ -244,7 +244,7 @@ def test_commands_refuse_bad_policies_before_anything_compiles(tmp_path, capsys,
     for options, words in {
         "--domain wid": "did you mean 'wide'",
         "--domain paper": "skin of a domain to learn in 'ideal'",
-        "--hold 0.001": "hold = 0.001 s is not allowed",
+        "--hold 0.001": "hold = 0.001 is not allowed",
         "--minutes 0": "minutes = 0 is not allowed without updates",
         "--domain wide,objects=ball": "unknown domain object 'ball'",
         "--num-envs 1 --num-minibatches 4": "num_minibatches = 4 is not allowed: there are only 3",

@@ -94,24 +94,20 @@ regress = call_of(Regress)
 
 def success_table(results: xr.Dataset) -> list[list[str]]:
     """Return a row for each law: its gains and losses against each law of the file."""
-    known = {
-        str(law): results.known_success.sel(known=law).values > 0 for law in results.known.values
-    }
-    against = (f"against {law}" for law in known)
+    known, laws = results.known_success > 0, results.success > 0
+    against = (f"against {law}" for law in known.known.values)
     rows = [["", "successes", *against, "successes where all of them fail"]]
-    for law, success in known.items():
-        count = f"{int(success.sum())} of {success.size}"
-        rows.append([f"{law} (file)", count, *[""] * len(known), ""])
-    any_known = np.any(list(known.values()), axis=0)
-    for law in map(str, results.law.values):
-        success = results.success.sel(law=law).values > 0
-        cells = [
-            f"+{int((success & ~earlier).sum())} -{int((~success & earlier).sum())}"
-            for earlier in known.values()
-        ]
-        unique = str(int((success & ~any_known).sum()))
-        rows.append([law, f"{int(success.sum())} of {success.size}", *cells, unique])
+    for law, success in zip(known.known.values, known.values, strict=True):
+        rows.append([f"{law} (file)", _count(success), *[""] * (len(known) + 1)])
+    for law, success in zip(laws.law.values, laws.values, strict=True):
+        gains = [f"+{(success & ~x).sum()} -{(~success & x).sum()}" for x in known.values]
+        unique = str((success & ~known.values.any(axis=0)).sum())
+        rows.append([str(law), _count(success), *gains, unique])
     return rows
+
+
+def _count(success: np.ndarray) -> str:
+    return f"{success.sum()} of {success.size}"
 
 
 def changes(results: xr.Dataset, law: str, against: str, rules: Rules = Rules()) -> list[list[str]]:

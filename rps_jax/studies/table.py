@@ -118,15 +118,16 @@ def table_of(folder: Path) -> Table:
         manifest = run_folder.read_manifest(folder)
         setting = setting_of(manifest["setting"])
         laws = {k: registry.params_from_json(law) for k, law in dict(manifest["laws"]).items()}
-        pairs = {name: _tuples(manifest[name]) for name in ("objects", "friction", "targets")}
-        sensing = {field.name: manifest[field.name] for field in dataclasses.fields(TrialOptions)}
+        options = (field.name for field in dataclasses.fields(TrialOptions))
+        names = ("objects", "friction", "targets", *options)
+        values = {name: _tuples(manifest[name]) for name in names}
         if manifest["question"] != "table":
             raise KeyError("question")
     except (LookupError, TypeError, ValueError) as error:
         raise files.CorruptFileError(folder / run_folder.MANIFEST, error) from error
-    if any(isinstance(sensing[name], dict) for name in ("robot", "skin")):
+    if any(isinstance(values[name], dict) for name in ("robot", "skin")):
         raise errors.InputError(f"run = {folder} has a custom robot or skin: film it from Python.")
-    return Table(laws, **pairs, **sensing, setting=setting)
+    return Table(laws, **values, setting=setting)
 
 
 def _tuples(value: Any) -> Any:

@@ -20,7 +20,7 @@ from matplotlib.axes import Axes
 
 from rps_jax import engines, errors
 from rps_jax.analysis import tables
-from rps_jax.analysis.figures.style import Figure
+from rps_jax.analysis.figures.style import Figure, tiles
 from rps_jax.analysis.report import Picture, Section
 from rps_jax.control.laws.rps import RPSParams
 from rps_jax.control.learned import policy as policies
@@ -143,11 +143,7 @@ class Learn(PPO, SimulationQuestion[xr.Dataset]):
                 "worlds; raise num_envs."
             )
         period = self.setting.physics.control_period
-        if self.hold < 0.999 * period:
-            raise errors.InputError(
-                f"hold = {self.hold:g} s is not allowed: it must be at least one control period, "
-                f"{period:g} s."
-            )
+        errors.check_number("hold", self.hold, at_least=0.999 * period, unit="s")
 
     def fields_as_json(self) -> dict[str, Any]:
         """Fields as JSON, with domains by their ranges."""
@@ -362,40 +358,37 @@ def figure_of(curve: xr.Dataset) -> Figure:
 
     Thin lines are single updates; thick lines are means over 1/40 of the run.
     """
-    figure = Figure(figsize=(10, 5.6), layout="constrained")
-    axes = figure.subplots(2, 2)
-    minutes, simulated = curve.time.values / 60, curve.simulated.values / 3600
+    figure, axes = tiles(4, 2, (5, 2.8), (0, 0))
+    clocks = (
+        (curve.time.values / 60, "wall clock, with compilation [min]"),
+        (curve.simulated.values / 3600, "simulated time, summed over worlds [h]"),
+    )
     width = max(1, curve.sizes["update"] // 40)
 
     def draw(ax: Axes, x: np.ndarray, name: str, scale: float, colour: str, label: str) -> None:
-        values = scale * curve[name].values
-        mean = curve[name].rolling(update=width, min_periods=1, center=True).mean().values
+        values = scale * curve[name]
+        mean = values.rolling(update=width, min_periods=1, center=True).mean()
         ax.plot(x, values, color=colour, lw=0.6, alpha=0.35)
-        ax.plot(x, scale * mean, color=colour, lw=1.6, label=label)
+        ax.plot(x, mean, color=colour, lw=1.6, label=label)
 
     validated = np.isfinite(curve.validation.values)
-    clocks = (
-        (minutes, "wall clock, with compilation [min]"),
-        (simulated, "simulated time, summed over worlds [h]"),
-    )
     for ax, (x, label) in zip(axes[0], clocks, strict=True):
         draw(ax, x, "success", 100, "C0", "trials that ended, with noise, at the dotted level")
         ax.plot(x, 100 * curve.level, "k:", lw=1, label="level of the curriculum")
+        validation = 100 * curve.validation.values[validated]
         ax.plot(
-            x[validated], 100 * curve.validation.values[validated], "C3o-", ms=4,
-            label="validation: the domain itself, no noise",
-        )  # fmt: skip
+            x[validated], validation, "C3o-", ms=4, label="validation: the domain itself, no noise"
+        )
         ax.set(xlabel=label, ylabel="success, level [%]", ylim=(-3, 103))
-        ax.grid(alpha=0.3)
-    axes[0, 0].legend(fontsize=7, loc="lower right")
+    (minutes, wall), (simulated, label) = clocks
     draw(axes[1, 0], minutes, "earned", 1, "C2", "rewards of a trial")
-    axes[1, 0].set(xlabel=clocks[0][1], ylabel="rewards of a trial that ended [1]")
-    axes[1, 0].grid(alpha=0.3)
+    axes[1, 0].set(xlabel=wall, ylabel="rewards of a trial that ended [1]")
     ax = axes[1, 1]
     ax.plot(simulated, curve.spread, label="standard deviation of the actions")
     ax.plot(simulated, 100 * curve.learning_rate, label="100 learning rates")
     ax.plot(simulated, curve.touching, label="share of decisions in contact")
-    ax.set(xlabel=clocks[1][1], ylabel="[1]")
-    ax.grid(alpha=0.3)
-    ax.legend(fontsize=7)
+    ax.set(xlabel=label, ylabel="[1]")
+    for ax in axes.flat:
+        ax.grid(alpha=0.3)
+        ax.legend(fontsize=7)
     return figure

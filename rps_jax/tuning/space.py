@@ -42,12 +42,8 @@ class Space:
         for name in self.names:
             bound = self._bounds[errors.check_name("tuned parameter", name, self._bounds)]
             share = _share(bound, values, name)
-            errors.check_finite(f"{name}, to be tuned", share, above=bound.low)
-            if share >= bound.high:
-                raise errors.InputError(
-                    f"{name}, to be tuned = {share:g} is not allowed: it must be below "
-                    f"{bound.high:g}."
-                )
+            below = math.nextafter(bound.high, -math.inf)
+            errors.check_finite(f"{name}, to be tuned", share, above=bound.low, at_most=below)
 
     @property
     def _bounds(self) -> dict[str, Bound]:
