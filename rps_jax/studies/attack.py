@@ -19,6 +19,7 @@ from typing import Any, ClassVar, Literal
 
 import numpy as np
 import xarray as xr
+from matplotlib.cm import ScalarMappable
 from matplotlib.colors import TwoSlopeNorm
 from scipy import stats
 
@@ -389,34 +390,28 @@ class _Search:
         """Return the archive and the history of the search with names and units."""
         axes, quantities = self.options.axes, {x.name: x for x in points.coordinates(self.domain)}
         elites = self._elites(archive)
-        elites |= {"u": elites["solution"], "severity": elites["objective"]}
         margin = np.full((self.objects, *self.cells), np.nan)
         margin.flat[elites["index"]] = elites["objective"] - 1
         failed = np.flatnonzero(elites["success"] == 0)
         failed = failed[np.argsort(-elites["objective"][failed], kind="stable")]
-        names = ("u", "severity", "time", "left", "which_object")
         sums = zip(("failing", "trials", "simulated"), zip(*history, strict=True), strict=True)
         middles = (np.arange(self.options.cells) + 0.5) / self.options.cells
+        ranges = {name: quantities[name] for name in axes}
         return xr.Dataset(
             {
                 "margin": (("object", *axes), margin),
+                "u": (("elite", "quantity"), elites["solution"][failed]),
+                "severity": ("elite", elites["objective"][failed]),
                 **{
-                    name: (("elite", "quantity")[: elites[name].ndim], elites[name][failed])
-                    for name in names
+                    name: ("elite", elites[name][failed])
+                    for name in ("time", "left", "which_object")
                 },
                 **{name: ("generation", list(values)) for name, values in sums},
             },
             {
                 "object": list(self.domain.objects),
                 "quantity": list(quantities),
-                **{
-                    name: (
-                        name,
-                        quantities[name].range.at(middles),
-                        {"units": quantities[name].unit},
-                    )
-                    for name in axes
-                },
+                **{k: (k, x.range.at(middles), {"units": x.unit}) for k, x in ranges.items()},
             },
         )
 
@@ -424,10 +419,9 @@ class _Search:
 def _emitter_sizes(batch: int, algorithm: Algorithm) -> list[tuple[str, int]]:
     """Return kind and batch size of the emitters of a batch; a CMA emitter has about 24 worlds."""
     line = {"line": batch, "mixed": batch // 2}.get(algorithm, 0)
-    rest = batch - line
-    count = max(1, round(rest / 24)) if rest else 0
-    sizes = [rest // count + (i < rest % count) for i in range(count)]
-    return [("line", line)] * bool(line) + [("cma", size) for size in sizes]
+    rest = np.arange(batch - line)
+    parts = np.array_split(rest, max(1, round(rest.size / 24))) if rest.size else []
+    return [("line", line)] * bool(line) + [("cma", part.size) for part in parts]
 
 
 def yields(results: xr.Dataset) -> dict[str, float]:
@@ -456,17 +450,14 @@ def archive_figure(results: xr.Dataset, quantities: Sequence[str], title: str) -
 
     A cell shows the severest trial over the third quantity; a dot marks a failure.
     """
-    pairs = list(combinations(quantities, 2))
-    objects = [str(name) for name in results.object.values]
-    count = len(objects) * len(pairs)
-    figure, axes = tiles(count, len(pairs), (3.4, 2.7), (1.5, 1.2))
+    pairs, objects = list(combinations(quantities, 2)), results.object.values.tolist()
+    figure, axes = tiles(len(objects) * len(pairs), len(pairs), (3.4, 2.7), (1.5, 1.2))
     norm = TwoSlopeNorm(0, -1, max(0.3, float(np.nanquantile(results.margin, 0.98))))
-    image = None
     for row, name in enumerate(objects):
         for ax, (x, y) in zip(axes[row], pairs, strict=True):
             (third,) = set(quantities) - {x, y}
             worst = results.margin.isel(object=row).max(third).transpose(y, x)
-            image = ax.imshow(worst, origin="lower", norm=norm, cmap="RdBu_r", aspect="auto")
+            ax.imshow(worst, origin="lower", norm=norm, cmap="RdBu_r", aspect="auto")
             ys, xs = np.nonzero(worst.values >= 0)
             ax.plot(xs, ys, "k.", ms=2)
             for axis, label in ((ax.xaxis, x), (ax.yaxis, y)):
@@ -476,8 +467,8 @@ def archive_figure(results: xr.Dataset, quantities: Sequence[str], title: str) -
                 axis.set_label_text(axis_label(label, results[label].attrs["units"]), fontsize=8)
             ax.set_facecolor("0.9")
             ax.set_title(words(name), fontsize=9)
-    if image is not None:
-        figure.colorbar(image, ax=axes, label="margin: severity - 1 [1; m beyond 0]", shrink=0.7)
+    colours, label = ScalarMappable(norm, "RdBu_r"), "margin: severity - 1 [1; m beyond 0]"
+    figure.colorbar(colours, ax=axes, label=label, shrink=0.7)
     figure.suptitle(title, fontsize=10)
     return figure
 

@@ -17,6 +17,8 @@ from typing import ClassVar
 
 import numpy as np
 import xarray as xr
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import Normalize
 
 from rps_jax import errors
 from rps_jax.analysis import statistics
@@ -285,12 +287,12 @@ def interactions(
         failures, _ = histogram(weights=results.success.values == 0)
         rates[x, y] = 100 * failures / np.maximum(histogram()[0], 1)
     highest = max(float(rate.max()) for rate in rates.values()) or 1.0
-    image, order = None, list(labels)
+    norm, order = Normalize(0, highest), list(labels)
     for ax in axes[np.triu_indices(last, 1)]:
         ax.axis("off")
     for (x, y), rate in rates.items():
         ax = axes[order.index(y) - 1, order.index(x)]
-        image = ax.imshow(rate, origin="lower", vmin=0, vmax=highest, cmap="magma_r", aspect="auto")
+        ax.imshow(rate, origin="lower", norm=norm, cmap="magma_r", aspect="auto")
         for (row, column), value in np.ndenumerate(rate):
             ink = "white" if value > 0.55 * highest else "black"
             ax.text(column, row, f"{value:.0f}", ha="center", va="center", fontsize=7, color=ink)
@@ -299,8 +301,7 @@ def interactions(
                 range(len(ticks[name]) * shown), ticks[name] if shown else (), fontsize=7
             )
             axis.set_label_text(labels[name].replace(" of the ", "\nof the ") * shown, fontsize=8)
-    if image is not None:
-        figure.colorbar(image, ax=axes, label="failures [%]", shrink=0.6)
+    figure.colorbar(ScalarMappable(norm, "magma_r"), ax=axes, label="failures [%]", shrink=0.6)
     ends = "each range from its low end (left, bottom) to its high end"
     figure.suptitle(f"{title}, {results.sizes['world']:,} worlds\n{ends}", fontsize=10)
     return figure
