@@ -20,6 +20,7 @@ from rps_jax.analysis.figures.style import (
     base_patch,
     panel,
     success_rates,
+    tiles,
     words,
 )
 from rps_jax.analysis.report import Picture, Section
@@ -252,9 +253,8 @@ def counts(results: xr.Dataset) -> tuple[np.ndarray, np.ndarray]:
 def paths_figure(results: xr.Dataset) -> Figure:
     """Draw Fig. 7: the paths of the base to all targets, and the last contact points."""
     names = list(map(str, results.object.values))
-    figure = Figure(figsize=(5.2 * len(names), 5), layout="constrained")
-    axes = figure.subplots(1, len(names), squeeze=False, sharey=True)[0]
-    for ax, name in zip(axes, names, strict=True):
+    figure, axes = tiles(len(names), len(names), (5.2, 5), (0, 0), sharey=True)
+    for ax, name in zip(axes[0], names, strict=True):
         trials = results.sel(object=name)
         ax.add_patch(base_patch(np.zeros(3), tuple(results.half.values), fill=True))
         for target in range(results.sizes["target"]):
@@ -268,7 +268,7 @@ def paths_figure(results: xr.Dataset) -> Figure:
         ax.set(xlabel="x [m]", aspect="equal")
         ax.set_title(f"{words(name)}: {successes} of {results.sizes['target']}", fontsize=10)
         ax.grid(alpha=0.3)
-    axes[0].set_ylabel("y [m]")
+    axes[0, 0].set_ylabel("y [m]")
     figure.suptitle(
         f"friction ground {MIDDLE.ground:g}, robot {MIDDLE.robot:g}; lines: base; stars: targets; "
         "circles: last contact point",

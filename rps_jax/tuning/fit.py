@@ -335,13 +335,7 @@ def _observing(law: Law[Any, Any, Any]) -> Law[Any, Any, Any]:
 
 @partial(jax.jit, static_argnames=("rows", "row_steps"))
 def _simulate_logs(
-    stage: Stage,
-    worlds: World,
-    params: LawParams,
-    loop: ControlLoop,
-    *,
-    rows: int,
-    row_steps: int,
+    stage: Stage, worlds: World, params: LawParams, loop: ControlLoop, *, rows: int, row_steps: int
 ) -> dict[str, jax.Array]:
     """Return the logs of a batch, (rows, B, ...), with one row every `row_steps` control steps."""
     control_step = partial(trial.control_step, stage, worlds, params, loop=loop)

@@ -24,6 +24,7 @@ from rps_jax.record.options import option
 
 PRIVATE_SIGNS = np.array([1, -1, 1, 1, 1], np.float32)  # of `private` inputs in the mirror image
 _LOG_STD = (-2.5, 0.5)  # bounds on the log standard deviation of an action
+Pair = tuple[jax.Array, jax.Array]
 UpdateCarry = tuple[Weights, optax.OptState, jax.Array]  # weights, optimiser, learning rate
 
 
@@ -122,9 +123,7 @@ def advantages(steps: Transition, gamma: float, gae_lambda: float) -> jax.Array:
     next_value = jnp.where(steps.terminated, 0.0, steps.next_value)
     delta = steps.reward + gamma * next_value - steps.value
 
-    def backward(
-        later: jax.Array, step: tuple[jax.Array, jax.Array]
-    ) -> tuple[jax.Array, jax.Array]:
+    def backward(later: jax.Array, step: Pair) -> Pair:
         delta, done = step
         advantage = delta + gamma * gae_lambda * jnp.where(done, 0.0, later)
         return advantage, advantage
@@ -156,7 +155,7 @@ def means(network: Network, actor: Weights, hidden: jax.Array, steps: Transition
     if network.kind == "mlp":
         return network.apply(actor, hidden[None], steps.obs)[1]
 
-    def apply(hidden: jax.Array, step: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
+    def apply(hidden: jax.Array, step: Pair) -> Pair:
         obs, first = step
         hidden = jnp.where(first[:, None, None], 0.0, hidden)
         return network.apply(actor, hidden, obs)

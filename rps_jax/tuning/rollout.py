@@ -232,18 +232,11 @@ def update(
             start = _restart(network, env, table, runner.level, start_keys[i], count)
             restarted.append(jax.vmap(soft.tree_where)(batch.states.data.done, start, batch))
         next_inputs, reward, stats, terminated = _join(results)
-        steps = Transition(
-            obs,
-            private,
-            first,
-            action,
-            ppo_.log_prob(action, mean, weights["log_std"]),
-            networks.critic(weights["critic"], ppo_.critic_inputs(obs, private)),
-            networks.critic(weights["critic"], ppo_.critic_inputs(*next_inputs)),
-            reward,
-            stats.ended,
-            terminated,
-        )
+        pairs = (ppo_.critic_inputs(*x) for x in ((obs, private), next_inputs))
+        value, next_value = (networks.critic(weights["critic"], x) for x in pairs)
+        log_prob = ppo_.log_prob(action, mean, weights["log_std"])
+        decision = obs, private, first, action, log_prob, value
+        steps = Transition(*decision, next_value, reward, stats.ended, terminated)
         return (tuple(restarted), key), (steps, jax.tree.map(jnp.sum, stats))
 
     hidden = jnp.concatenate([batch.memory.hidden for batch in runner.batches])
