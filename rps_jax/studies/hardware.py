@@ -7,7 +7,7 @@ plausible range is run.
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
-from itertools import product
+from itertools import product, starmap
 from typing import ClassVar, Literal
 
 import numpy as np
@@ -45,12 +45,8 @@ from rps_jax.world.paper import (
 from rps_jax.world.scene import Friction
 
 MIDDLE = Friction(0.35, 0.5)  # friction of the paths and of the shove
+_FRICTIONS = tuple(starmap(Friction, product(HARDWARE_GROUND, HARDWARE_ROBOT)))
 _TRACED = ("qpos", "p_world_contact", "outcome_success")  # variables of a trial over time
-
-
-def frictions() -> dict[str, Friction]:
-    """Return the range of friction, labelled ground,robot."""
-    return {f"{g:g},{r:g}": Friction(g, r) for g in HARDWARE_GROUND for r in HARDWARE_ROBOT}
 
 
 @dataclass(frozen=True)
@@ -95,15 +91,15 @@ class Hardware(LawQuestion[xr.Dataset]):
     @cached_property
     def table(self) -> Table:
         """Trials under all frictions."""
-        law, pairs = {self.label: self.params}, tuple(frictions().values())
+        law = {self.label: self.params}
         world = {"skin": self.skin, "robot": self.robot, "setting": self.setting}
-        return Table(law, HARDWARE_OBJECTS, pairs, self.targets, **world)
+        return Table(law, HARDWARE_OBJECTS, _FRICTIONS, self.targets, **world)
 
     @property
     def counts(self) -> tuple[int, int, int]:
         """Number of trials under all frictions, with shoves, and for the paths."""
         tasks = len(HARDWARE_OBJECTS) * len(self.targets)
-        return tasks * len(frictions()), tasks * 2 * len(self.shifts), tasks
+        return tasks * len(_FRICTIONS), tasks * 2 * len(self.shifts), tasks
 
     def check(self) -> None:
         self.table.check()
