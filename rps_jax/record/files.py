@@ -89,9 +89,9 @@ def write_bytes(path: Path, content: bytes, *, checked: bool = False) -> Path:
     return path
 
 
-def write_csv(path: Path, rows: Sequence[Mapping[str, object]]) -> Path:
-    """Write a table, whose header has the names of all rows; None and NaN are empty cells."""
-    return write_text(path, pd.DataFrame(list(rows)).to_csv(index=False, lineterminator="\n"))
+def write_csv(path: Path, table: pd.DataFrame) -> Path:
+    """Write a table with its index; NaN is an empty cell."""
+    return write_text(path, table.to_csv(lineterminator="\n"))
 
 
 def write_json(path: Path, content: object, *, checked: bool = False) -> Path:
@@ -266,22 +266,6 @@ def check_columns(
         if column.dtype.kind not in "biuf" or [*column.sizes.items()] != [*lengths.items()]:
             holds = f"{name} holds {column.dtype} of {dict(column.sizes)}"
             raise CorruptFileError(source, f"{holds}, not numbers of {lengths}")
-    return results
-
-
-def check_like(results: xr.Dataset, template: xr.Dataset, source: object) -> xr.Dataset:
-    """Return the results of a source if they have the variables and coordinates of a template."""
-    if differing := sorted(map(str, {*template.variables} ^ {*results.variables})):
-        raise CorruptFileError(source, f"it lacks {differing[0]}, or should not hold it")
-    dims = {
-        str(name): list(map(str, variable.dims))
-        for name, variable in template.variables.items()
-        if variable.dtype.kind in "biuf"
-    }
-    check_columns(results, source, dims, template.sizes)
-    for name in template.coords:
-        if not np.array_equal(results[name].values, template[name].values):
-            raise CorruptFileError(source, f"{name} is of another run")
     return results
 
 

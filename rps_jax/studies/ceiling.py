@@ -145,7 +145,8 @@ class Ceiling(DomainQuestion[xr.Dataset]):
             name="round-{:04d}",
         )
         for result in rounds:
-            files.check_like(result, start, run.folder or "round")
+            dims = {str(name): tuple(map(str, start[name].dims)) for name in start}
+            files.check_columns(result, run.folder or "round", dims, start.sizes)
             progress.finish(unsolved().size * self.samples)
             state = result
         return state

@@ -323,8 +323,7 @@ class _Learner:
         variables = labelled(**{name: ("update", x, *UNITS[name]) for name, x in columns})
         times = {"compile": self.compile, "run": self.elapsed - self.compile}
         curve = xr.Dataset(variables, {"update": np.arange(len(self.curve)) + 1}, times)
-        table = curve.to_dataframe().to_csv(lineterminator="\n")
-        files.write_text(self.folder / "curve.csv", table)
+        files.write_csv(self.folder / "curve.csv", curve.to_dataframe())
         return curve
 
     def _restore(self) -> None:

@@ -307,7 +307,7 @@ def _write(folder: Path | None, tuner: Tuner, log: Sequence[xr.Dataset]) -> xr.D
         files.write_json(folder / TUNED, tuner.space.changed_values(tuner.best))
         params = results.params.to_pandas().add_prefix("params.")
         table = results.drop_dims("parameter").to_dataframe().join(params)
-        files.write_text(folder / "curve.csv", table.to_csv(lineterminator="\n"))
+        files.write_csv(folder / "curve.csv", table)
     return results
 
 
