@@ -132,9 +132,8 @@ def _from_table(path: Path, name: str) -> RawLog:
     """Return the log of a table."""
     try:
         table = pd.read_csv(
-            path, dtype=float, index_col=False, skipinitialspace=True,
-            encoding_errors="replace", float_precision="round_trip",
-        )  # fmt: skip
+            path, dtype=float, index_col=False, skipinitialspace=True, encoding_errors="replace"
+        )
     except ValueError as error:
         raise InputError(
             f"{name} is not allowed ({error}): write a header, and numbers in every cell."
