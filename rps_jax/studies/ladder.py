@@ -25,7 +25,6 @@ from rps_jax.control.registry import LawLike, LawsLike
 from rps_jax.errors import InputError
 from rps_jax.record.options import option
 from rps_jax.robot.robot import RobotLike
-from rps_jax.runs.plan import Plan
 from rps_jax.runs.question import MultiLawQuestion, Run, call_of, name_or_custom, seed_of
 from rps_jax.runs.sweep import Sweep, SweepOptions
 from rps_jax.trials.progress import ProgressCallback, SequentialProgress
@@ -47,12 +46,6 @@ def _senses(params: LawParams) -> Senses:
 @dataclass(frozen=True)
 class _TestSweep(Sweep):
     """Sweep over the test worlds of one domain, labelled with what each law senses."""
-
-    @cached_property
-    def plan(self) -> Plan:
-        plan = super().plan
-        seed = seed_of(self.setting.seed, "test")
-        return replace(plan, setting=replace(plan.setting, seed=seed))
 
     def answer(self, run: Run) -> xr.Dataset:
         results = super().answer(run)
@@ -115,7 +108,8 @@ class Ladder(SweepOptions, MultiLawQuestion[xr.Dataset | xr.DataTree]):
         labels = [x if isinstance(x, str) else f"domain_{i}" for i, x in enumerate(domains)]
         errors.check_each_once("domain", domains, labels)
         names = {f.name for f in dataclasses.fields(_TestSweep)} - {"laws", "domain"}
-        shared = {name: getattr(self, name) for name in names}
+        setting = replace(self.setting, seed=seed_of(self.setting.seed, "test"))
+        shared = {name: getattr(self, name) for name in names} | {"setting": setting}
         sweeps = {}
         for label, domain in zip(labels, domains, strict=True):
             sweep = _TestSweep(self.chosen, domain, **shared)
@@ -235,7 +229,7 @@ class Score(Ladder, _ScoredLaw):
         sections = super().sections(sweep, results, run)
         if "row" in results.dims:
             return sections
-        header, row = score_row(sweep, results)
+        header, row = score_row(sweep, results, self.setting.seed)
         lines = (header, ["---"] * len(header), row)
         table = "\n".join(f"    | {' | '.join(line)} |" for line in lines)
         return [Section("Score", f"For a Markdown table:\n\n{table}"), *sections]
@@ -244,14 +238,14 @@ class Score(Ladder, _ScoredLaw):
 score = call_of(Score)
 
 
-def score_row(sweep: Sweep, results: xr.Dataset) -> list[list[str]]:
+def score_row(sweep: Sweep, results: xr.Dataset, seed: int) -> list[list[str]]:
     """Return a header and the row of the first law: rates of all laws, median time and worlds."""
     successes = results.success.values > 0
     rates = [tables.share(int(success.sum()), success.size) for success in successes]
     law, *rest = map(str, results.law.values)
     times = results.time.values[0][successes[0]]
     median = f"{np.median(times):.1f} s" if times.size else "-"
-    source = f"seed {sweep.setting.seed}" if sweep.points is None else "given points"
+    source = f"seed {seed}" if sweep.points is None else "given points"
     worlds = f"{successes.shape[1]:,} test worlds of {name_or_custom(sweep.domain)}, {source}"
     header = ["law", "success", "median time", *rest, "worlds"]
     return [header, [law, rates[0], median, *rates[1:], f"{worlds}, {sweep.setting.engine}"]]
