@@ -10,7 +10,7 @@ quantiles of ranges and choices. Noise and corners of prisms are random in every
 
 import shlex
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import combinations
@@ -128,22 +128,16 @@ class Attack(DomainQuestion[xr.Dataset], LawQuestion[xr.Dataset]):
 
     def answer(self, run: Run) -> xr.Dataset:
         """Search, then try elites again until the time is over."""
-        start_time = time.perf_counter()
-
-        def has_time(share: float) -> bool:
-            return time.perf_counter() - start_time < share * 60 * self.minutes
-
+        start_time, total = time.perf_counter(), 60 * self.minutes
         probe = Probe(self.ranges, self.params, self.setting, run)
         search = _Search(probe, self, seed_of(self.setting.seed, "tune"))
-        results = search.run(partial(has_time, _SEARCH_UNTIL))
-        results = self._check_elites(results, run, partial(has_time, _CHECK_UNTIL))
+        results = search.run(start_time + _SEARCH_UNTIL * total)
+        results = self._check_elites(results, run, start_time + _CHECK_UNTIL * total)
         if run.folder is not None:
             self._store_worst(results, run)
         return results
 
-    def _check_elites(
-        self, results: xr.Dataset, run: Run, has_time: Callable[[], bool]
-    ) -> xr.Dataset:
+    def _check_elites(self, results: xr.Dataset, run: Run, deadline: float) -> xr.Dataset:
         """Try elites again in converged C MuJoCo, evenly from the worst to the least severe."""
         count = results.sizes["elite"]
         failed = np.full(count, np.nan)
@@ -154,7 +148,7 @@ class Attack(DomainQuestion[xr.Dataset], LawQuestion[xr.Dataset]):
         probe = Probe(self.ranges, self.params, setting, run._replace(folder=folder))
         batch = max(1, run.workers or device.count_processors())
         for first in range(0, len(order), batch):
-            if not has_time():
+            if time.perf_counter() >= deadline:
                 break
             rows = order[first : first + batch]
             failed[rows] = probe(results.u.values[rows]).success.values == 0
@@ -264,8 +258,8 @@ class _Search:
         self.object_column = names.index("object") if "object" in names else None
         self.rng = np.random.Generator(np.random.Philox(key=seed))
 
-    def run(self, has_time: Callable[[], bool]) -> xr.Dataset:
-        """Try drawn worlds, then generations of emitters while there is time."""
+    def run(self, deadline: float) -> xr.Dataset:
+        """Try drawn worlds, then generations of emitters until the deadline [s]."""
         options, probe = self.options, self.probe
         set_phase(probe.run.callback, "drawn worlds")
         drawn, archive = (
@@ -286,7 +280,7 @@ class _Search:
         thresholds = np.zeros(self.objects)
         set_phase(probe.run.callback, "search")
         for generation in range(options.generations):
-            if generation and not has_time():
+            if generation and time.perf_counter() >= deadline:
                 break
             if generation == 0:
                 v = self.rng.random((self.objects, options.batch, len(self.varied)))
