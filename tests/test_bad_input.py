@@ -204,8 +204,6 @@ TUNE = {
     "es --tuned mass": "unknown tuned parameter 'mass': choose from eta",
     "es --tuned L L": "tuned = .* is not allowed: name each once",
     "es --law rps,L.json": "L = -1.0 is not allowed: it must be a number and above 0",
-    "es --algorithm CMA_ES": "unknown algorithm 'CMA_ES': choose from cma, lra_cma",
-    "es --algorithm xnes --tuned L": "algorithm = xnes is not allowed for one parameter",
     "es --population 2": "population = 2 is not allowed: .* from 4 to",
     "es --generations 0": "generations = 0 is not allowed",
     "es --spread nan": "spread = nan is not allowed",

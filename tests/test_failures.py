@@ -191,12 +191,11 @@ def synthetic(monkeypatch):
 SMALL = {"generations": 12, "batch": 32, "drawn": 600, "cells": 8, "repeats": 1, "check_again": 0}
 
 
-@pytest.mark.parametrize("algorithm", ["mixed", "cma_mae", "line", "cma_me"])
-def test_an_attack_fills_many_more_cells_than_drawn_worlds(synthetic, algorithm):
-    results = rps_jax.attack("rps", "wide", **SMALL, algorithm=algorithm)
+def test_an_attack_fills_many_more_cells_than_drawn_worlds(synthetic):
+    results = rps_jax.attack("rps", "wide", **SMALL)
     assert results.margin.sizes == {"object": 3, "size": 8, "com_offset": 8, "friction_robot": 8}
     assert results.failing[-1] == (results.margin >= 0).sum() == results.sizes["elite"]
-    assert attack.yields(results)["times"] > (1 if algorithm in ("cma_me", "line") else 4)
+    assert attack.yields(results)["times"] > 4
     assert (np.diff(results.severity) <= 0).all()
     worlds = points.worlds_at("wide", results.u)
     elite = results.isel(elite=0)

@@ -1,9 +1,9 @@
 """Search for diverse failures with quality-diversity optimisation (pyribs).
 
 An archive divides the ranges of three drawn quantities into cells, separately for each object of
-the domain, and keeps the severest trial of each cell. Emitters propose worlds: CMA-ME and CMA-MAE
-(Fontaine and Nikolaidis, 2020 and 2023) move towards improvements of the archive, and the line
-operator (Vassiliades and Mouret, 2018) mixes elites. The archives of the emitters accept near
+the domain, and keeps the severest trial of each cell. Emitters propose worlds: CMA-MAE (Fontaine
+and Nikolaidis, 2023) moves towards improvements of the archive, and the line operator (Vassiliades
+and Mouret, 2018) mixes elites. The archives of the emitters accept near
 misses and failures, and failures alone as soon as there are enough. Emitters vary the normal
 quantiles of ranges and choices. Noise and corners of prisms are random in every world.
 """
@@ -15,7 +15,7 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import combinations
 from pathlib import Path
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar
 
 import numpy as np
 import xarray as xr
@@ -47,12 +47,12 @@ from rps_jax.studies.probe import Probe
 from rps_jax.trials.progress import Bar, set_phase
 from rps_jax.world import points
 
-Algorithm = Literal["cma_me", "cma_mae", "line", "mixed"]
 # [1] shares of the time after which the search ends, and the check of elites.
 _SEARCH_UNTIL, _CHECK_UNTIL = 0.6, 0.8
 _EDGE = 1e-6  # least distance of a coordinate to the ends of its range
 _LEARNING_RATE = 0.1  # [1] of the thresholds of CMA-MAE's archive
 _ISO_SIGMA, _LINE_SIGMA, _CMA_SIGMA = 0.2, 0.1, 0.3  # [1] step sizes in normal quantiles
+_CMA_BATCH = 24  # worlds of an emitter of CMA-MAE, about
 _AXIS_SCALE = 4.0  # [1] step size along the archive's axes over that along other quantities
 _NEAR_MISSES = 0.1  # [1] share of the first worlds that the emitters' archives accept
 _MIN_FAILURES = 12  # failing cells of an object from which on only failures are accepted
@@ -73,7 +73,7 @@ class Attack(DomainQuestion[xr.Dataset], LawQuestion[xr.Dataset]):
     Example:
       >>> import rps_jax
       >>> drums, rules = rps_jax.Domain(("random_cylinder",)), rps_jax.Rules(horizon=1.0)
-      >>> small = {"cells": 2, "algorithm": "line", "batch": 8, "generations": 1, "drawn": 8}
+      >>> small = {"cells": 2, "batch": 8, "generations": 1, "drawn": 8}
       >>> setting = rps_jax.Setting("quasistatic", rules=rules)
       >>> results = rps_jax.attack("rps", drums, **small, check_again=0, setting=setting)
       >>> results.margin.dims
@@ -88,12 +88,6 @@ class Attack(DomainQuestion[xr.Dataset], LawQuestion[xr.Dataset]):
     """Three drawn quantities whose ranges the cells of the archive divide."""
     cells: int = option(10, 2, 100)
     """Number of cells along each axis, for each object."""
-    aim: Literal["distance", "time"] = "distance"
-    """What is maximised: distance (severity, which grows with the distance left) or time (slow
-    successes count, too)."""
-    algorithm: Algorithm = "mixed"
-    """How worlds are proposed: cma_me, cma_mae, line (mixtures of elites), or mixed (half line,
-    half cma_mae)."""
     batch: int = option(96, 8, 1_000_000)
     """Number of worlds of a generation, for each object."""
     generations: int = option(1000, 1, 1_000_000)
@@ -331,9 +325,6 @@ class _Search:
             if rows.size and times > 0:
                 self._repeat(trials, rows, times)
         objective = trials.severity.values
-        if self.options.aim == "time":
-            failed = trials.success.values == 0
-            objective = trials.time.values / float(self.probe.setting.rules.horizon) + failed
         fields = {name: trials[name].values for name in _FIELDS}
         u = trials.u.values
         archive.add(u, objective, np.column_stack([objects, u[:, self.axes]]), **fields)
@@ -360,24 +351,22 @@ class _Search:
         accepted = (elites["which_object"] == k) & (elites["objective"] >= threshold)
         v, objective = elites["solution"][accepted][:, self.varied], elites["objective"][accepted]
         z = stats.norm.ppf(np.clip(v, _EDGE, 1 - _EDGE)) / self.scale
-        if options.algorithm == "cma_me":
-            thresholds = {}
-            cma = {"ranker": "2imp", "selection_rule": "filter", "restart_rule": "no_improvement"}
-        else:
-            thresholds = {"learning_rate": _LEARNING_RATE, "threshold_min": threshold}
-            cma = {"ranker": "imp", "selection_rule": "mu", "restart_rule": "basic"}
-        line = {"iso_sigma": _ISO_SIGMA, "line_sigma": _LINE_SIGMA}
-        kinds = {
-            "line": partial(emitters.IsoLineEmitter, **line),
-            "cma": partial(emitters.EvolutionStrategyEmitter, sigma0=_CMA_SIGMA, **cma),
-        }
-        grid = _grid_archive(len(self.varied), self.cells, seed=self.seed + k, **thresholds)
+        grid = _grid_archive(
+            len(self.varied), self.cells, seed=self.seed + k,
+            learning_rate=_LEARNING_RATE, threshold_min=threshold,
+        )  # fmt: skip
         grid.add(z, objective, v[:, self.varied_axes])
         order = np.argsort(-objective, kind="stable")
-        sources = []
-        for i, (kind, size) in enumerate(_emitter_sizes(options.batch, options.algorithm)):
-            start, seed = z[order[i % len(z)]], int(self.rng.integers(2**31))
-            sources.append(kinds[kind](grid, x0=start, seed=seed, batch_size=size))
+        rules = {"ranker": "imp", "selection_rule": "mu", "restart_rule": "basic"}
+        cma = partial(emitters.EvolutionStrategyEmitter, sigma0=_CMA_SIGMA, **rules)
+        line = partial(emitters.IsoLineEmitter, iso_sigma=_ISO_SIGMA, line_sigma=_LINE_SIGMA)
+        rest = np.arange(options.batch // 2, options.batch)
+        parts = np.array_split(rest, max(1, round(rest.size / _CMA_BATCH)))
+        kinds = [(line, options.batch // 2), *((cma, part.size) for part in parts)]
+        sources = [
+            kind(grid, x0=z[order[i % len(z)]], seed=int(self.rng.integers(2**31)), batch_size=size)
+            for i, (kind, size) in enumerate(kinds)
+        ]
         return errors.require("ribs.schedulers", "failures").Scheduler(grid, sources)
 
     def _labelled(self, archive: Any, history: Sequence[tuple[int, int, float]]) -> xr.Dataset:
@@ -408,14 +397,6 @@ class _Search:
                 **{k: (k, x.range.at(middles), {"units": x.unit}) for k, x in ranges.items()},
             },
         )
-
-
-def _emitter_sizes(batch: int, algorithm: Algorithm) -> list[tuple[str, int]]:
-    """Return kind and batch size of the emitters of a batch; a CMA emitter has about 24 worlds."""
-    line = {"line": batch, "mixed": batch // 2}.get(algorithm, 0)
-    rest = np.arange(batch - line)
-    parts = np.array_split(rest, max(1, round(rest.size / 24))) if rest.size else []
-    return [("line", line)] * bool(line) + [("cma", part.size) for part in parts]
 
 
 def yields(results: xr.Dataset) -> dict[str, float]:

@@ -1,4 +1,4 @@
-"""Tune a law by an evolution strategy: a distribution of candidates moves towards better values.
+"""Tune a law by CMA-ES: a normal distribution of candidates moves towards better values.
 
 All candidates of a generation meet the same worlds; every generation has other worlds.
 """
@@ -6,27 +6,16 @@ All candidates of a generation meet the same worlds; every generation has other 
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import partial
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar
 
 import cmaes
 import numpy as np
 
-from rps_jax import errors
 from rps_jax.record.options import option
 from rps_jax.runs.question import call_of
 from rps_jax.tuning.run import Results, ScoreCandidates, Tuner, Tuning
-
-Algorithm = Literal["cma", "lra_cma", "sep_cma", "xnes"]
-Strategy = cmaes.CMA | cmaes.SepCMA | cmaes.XNES
-_STRATEGIES: dict[Algorithm, Callable[..., Strategy]] = {
-    "cma": cmaes.CMA,
-    "lra_cma": partial(cmaes.CMA, lr_adapt=True),
-    "sep_cma": cmaes.SepCMA,
-    "xnes": cmaes.XNES,
-}
 
 
 @dataclass(frozen=True)
@@ -51,9 +40,6 @@ class TuneES(Tuning):
         "worlds": 32, "population": 12, "generations": 8, "spread": 1.0,
     }  # fmt: skip
 
-    algorithm: Algorithm = "cma"
-    """cma adapts a full covariance; lra_cma also adapts its learning rates to noisy scores;
-    sep_cma adapts a diagonal covariance; xnes follows the natural gradient."""
     population: int = option(64, 4, 100_000)
     """Number of candidates in a generation."""
     generations: int = option(50, 1, 1_000_000)
@@ -77,16 +63,12 @@ tune_es = call_of(TuneES)
 
 
 class EvolutionTuner(Tuner):
-    """Search by an evolution strategy of the package cmaes, with restarts."""
+    """Search by CMA-ES of the package cmaes, with restarts."""
 
     DIMS: ClassVar = {"values": ("candidate",), "center": ("parameter",)}
 
     def __init__(self, evolution: TuneES):
         super().__init__(evolution, evolution.generations)
-        if len(self.space.names) < 2 and evolution.algorithm in ("sep_cma", "xnes"):
-            raise errors.InputError(
-                f"algorithm = {evolution.algorithm} is not allowed for one parameter: choose cma."
-            )
         self.evolution = evolution
 
     def start(self) -> None:
@@ -94,18 +76,16 @@ class EvolutionTuner(Tuner):
         self.generations_since_best = self.restarts = 0
         self._strategy = self._strategy_at(self.base)
 
-    def _strategy_at(self, mean: np.ndarray) -> Strategy:
+    def _strategy_at(self, mean: np.ndarray) -> cmaes.CMA:
         """Return a new strategy about a mean (p,)."""
         seed = np.random.SeedSequence((self.seed, self.restarts)).generate_state(1)[0]
-        options = self.evolution
-        return _STRATEGIES[options.algorithm](
-            mean.copy(), options.spread, population_size=options.population, seed=int(seed)
-        )
+        population, spread = self.evolution.population, self.evolution.spread
+        return cmaes.CMA(mean.copy(), spread, population_size=population, seed=int(seed))
 
     @property
     def mean(self) -> np.ndarray:
         """Mean (p,) of the distribution of candidates."""
-        return self._strategy._mean.copy()  # XNES has no public name for it
+        return self._strategy.mean.copy()
 
     def propose(self) -> np.ndarray:
         return np.stack([self._strategy.ask() for _ in range(self.evolution.population)])
