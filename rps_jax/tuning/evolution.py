@@ -43,16 +43,13 @@ class TuneES(Tuning):
     population: int = option(64, 4, 100_000)
     """Number of candidates in a generation."""
     generations: int = option(50, 1, 1_000_000)
-    """Number of generations, counted over all restarts."""
+    """Number of generations."""
     spread: float = option(0.5, above=0, at_most=10)
     """Standard deviation of the first generation about the start, in units of the bounded map
     [1]."""
     prior: float = option(0.002, 0)
     """Cost of a mean squared distance of 1 between the vectors of a candidate and of the start
     [1]; it keeps the search where the bounded map is steep."""
-    patience: int = option(0, 0, 1_000_000)
-    """Number of generations without a better validation after which the search restarts at random
-    parameters; 0 means never."""
 
     @functools.cached_property
     def tuner(self) -> EvolutionTuner:
@@ -63,7 +60,7 @@ tune_es = call_of(TuneES)
 
 
 class EvolutionTuner(Tuner):
-    """Search by CMA-ES of the package cmaes, with restarts."""
+    """Search by CMA-ES of the package cmaes."""
 
     DIMS: ClassVar = {"values": ("candidate",), "center": ("parameter",)}
 
@@ -73,14 +70,9 @@ class EvolutionTuner(Tuner):
 
     def start(self) -> None:
         super().start()
-        self.generations_since_best = self.restarts = 0
-        self._strategy = self._strategy_at(self.base)
-
-    def _strategy_at(self, mean: np.ndarray) -> cmaes.CMA:
-        """Return a new strategy about a mean (p,)."""
-        seed = np.random.SeedSequence((self.seed, self.restarts)).generate_state(1)[0]
+        seed = np.random.SeedSequence((self.seed, 0)).generate_state(1)[0]
         population, spread = self.evolution.population, self.evolution.spread
-        return cmaes.CMA(mean.copy(), spread, population_size=population, seed=int(seed))
+        self._strategy = cmaes.CMA(self.base, spread, population_size=population, seed=int(seed))
 
     @property
     def mean(self) -> np.ndarray:
@@ -116,7 +108,6 @@ class EvolutionTuner(Tuner):
             "base": base_value[0],
             "validation": validation[0],
             "validation_success": check.outcome.success.mean(),
-            "restarts": self.restarts,
         }
 
     def update(self, results: Mapping[str, np.ndarray]) -> None:
@@ -124,10 +115,4 @@ class EvolutionTuner(Tuner):
         worst = np.max(values[~np.isnan(values)], initial=-np.inf)
         ranked = np.where(np.isnan(values), worst + 1.0, values)
         self._strategy.tell([(x, float(value)) for x, value in zip(vectors, ranked, strict=True)])
-        is_best = self.record_best(results["center"], float(results["validation"]))
-        self.generations_since_best = 0 if is_best else self.generations_since_best + 1
-        patience = self.evolution.patience
-        if patience and self.generations_since_best >= patience:
-            self.generations_since_best, self.restarts = 0, self.restarts + 1
-            random = np.random.default_rng((self.seed + 1, self.restarts))
-            self._strategy = self._strategy_at(random.standard_normal(self.base.size))
+        self.record_best(results["center"], float(results["validation"]))

@@ -81,11 +81,10 @@ class Tuner(ABC):
     def update(self, results: Mapping[str, np.ndarray]) -> None:
         """Advance the search by the results of a generation, with its `vectors`."""
 
-    def record_best(self, vector: np.ndarray, value: float) -> bool:
-        """Store a vector if its validation is the best so far; return whether it is."""
-        if better := value < self.best_value:
+    def record_best(self, vector: np.ndarray, value: float) -> None:
+        """Store a vector if its validation is the best so far."""
+        if value < self.best_value:
             self.best, self.best_value = vector, value
-        return better
 
 
 @dataclass(frozen=True)
