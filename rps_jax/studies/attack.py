@@ -135,7 +135,9 @@ class Attack(DomainQuestion[xr.Dataset], LawQuestion[xr.Dataset]):
         """Try elites again in converged C MuJoCo, evenly from the worst to the least severe."""
         count = results.sizes["elite"]
         failed = np.full(count, np.nan)
-        order = _coarse_to_fine(count, min(self.check_again, count))
+        even = np.linspace(0, count - 1, min(self.check_again, count)).round().astype(int)
+        # In a random order, so that those before the deadline are even, too.
+        order = np.random.default_rng(0).permutation(even)
         set_phase(run.callback, "check in C MuJoCo")
         setting = replace(self.setting, engine="mujoco", physics="default", fidelity="reference")
         folder = run.folder and run.folder / "check"
@@ -208,15 +210,6 @@ class Attack(DomainQuestion[xr.Dataset], LawQuestion[xr.Dataset]):
 
 
 attack = call_of(Attack)
-
-
-def _coarse_to_fine(total: int, count: int) -> np.ndarray:
-    """Return `count` even indices from 0 to total - 1, ordered so that each prefix is even, too."""
-    if not count:
-        return np.zeros(0, int)
-    even = np.unique(np.linspace(0, total - 1, count).round().astype(int))
-    strides = [even[:: 2**k] for k in range(int(np.log2(len(even))), -1, -1)]
-    return np.array(list(dict.fromkeys(int(i) for stride in strides for i in stride)))
 
 
 def _grid_archive(dimensions: int, dims: Sequence[int], **options: Any) -> Any:
