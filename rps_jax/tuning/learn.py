@@ -62,10 +62,7 @@ UNITS = {
     "kl": ("1", "mean KL divergence between the acting policy and the updated ones"),
     "learning_rate": ("1", "learning rate"),
     "spread": ("1", "standard deviation of the actions"),
-    "validation": (
-        "1",
-        "success rate in the worlds for validation, without noise; NaN between validations",
-    ),
+    "validation": ("1", "success rate in worlds for validation, without noise; NaN between them"),
     "validation_time": ("s", "mean time of these successes"),
 }
 
