@@ -226,27 +226,26 @@ def tune(run: Run, tuner: Tuner) -> xr.Dataset:
       InputError: the folder has generations that this tuner does not propose.
     """
     tuner.start()
-    log: list[xr.Dataset] = []
-    simulated, vectors = 0.0, tuner.propose()
+    log, count, simulated, vectors = xr.Dataset(), 0, 0.0, tuner.propose()
 
     def report(progress: Progress) -> None:
-        total = simulated + progress.simulated
-        run.callback(replace(progress, simulated=total, rounds=len(log)))
+        run.callback(replace(progress, simulated=simulated + progress.simulated, rounds=count))
 
     def proceed(generation: int) -> bool:
         return generation < tuner.generations and not 0 < tuner.tuning.budget <= simulated
 
     def compute(generation: int) -> xr.Dataset:
-        if log:
+        if generation:
             _write(run.folder, tuner, log)
         return _try_vectors(tuner, vectors, generation, run._replace(callback=report))
 
-    for generation in run.steps(compute, proceed):
-        _check_generation(generation, tuner, vectors, run.folder, len(log))
-        tuner.update({str(name): variable.values for name, variable in generation.items()})
-        log.append(generation.drop_vars(["vectors", *tuner.DIMS]))
-        simulated += float(generation.simulated)
-        run.callback(Progress(0, simulated, rounds=len(log)))
+    for results in run.steps(compute, proceed):
+        _check_generation(results, tuner, vectors, run.folder, count)
+        tuner.update({str(name): variable.values for name, variable in results.items()})
+        row = results.drop_vars(["vectors", *tuner.DIMS]).expand_dims(generation=[count])
+        log = xr.concat([log, row], "generation") if count else row
+        count, simulated = count + 1, simulated + float(results.simulated)
+        report(Progress(0, 0.0))
         vectors = tuner.propose()
     return _write(run.folder, tuner, log)
 
@@ -296,18 +295,17 @@ def _check_generation(
         )
 
 
-def _write(folder: Path | None, tuner: Tuner, log: Sequence[xr.Dataset]) -> xr.Dataset:
-    """Return the results (generation); write them as a table, and the tuned parameters."""
-    results = xr.concat(log, "generation").assign_coords(generation=np.arange(len(log)))
-    assert isinstance(results, xr.Dataset)
+def _write(folder: Path | None, tuner: Tuner, log: xr.Dataset) -> xr.Dataset:
+    """Return the log (generation) with the tuned parameters, and write both."""
     best = registry.named_leaves(tuner.space.params(tuner.best))
-    results["tuned"] = ("parameter", [float(best[name]) for name in tuner.space.names])
+    tuned = [float(best[name]) for name in tuner.space.names]
     if folder is not None:
         files.write_json(folder / TUNED, tuner.space.changed_values(tuner.best))
-        params = results.params.to_pandas().add_prefix("params.")
-        table = results.drop_dims("parameter").to_dataframe().join(params)
-        files.write_csv(folder / "curve.csv", table)
-    return results
+        params = log.params.to_pandas().add_prefix("params.")
+        files.write_csv(
+            folder / "curve.csv", log.drop_dims("parameter").to_dataframe().join(params)
+        )
+    return log.assign(tuned=("parameter", tuned))
 
 
 def parse_domains(domain: DomainLike | Sequence[DomainLike]) -> tuple[Domain, ...]:
