@@ -96,7 +96,7 @@ class Hardware(LawQuestion[xr.Dataset]):
         return Table(law, HARDWARE_OBJECTS, _FRICTIONS, self.targets, **world)
 
     @property
-    def counts(self) -> tuple[int, int, int]:
+    def trial_counts(self) -> tuple[int, int, int]:
         """Number of trials under all frictions, with shoves, and for the paths."""
         tasks = len(HARDWARE_OBJECTS) * len(self.targets)
         return tasks * len(_FRICTIONS), tasks * 2 * len(self.shifts), tasks
@@ -105,14 +105,14 @@ class Hardware(LawQuestion[xr.Dataset]):
         self.table.check()
 
     def num_trials(self) -> int | None:
-        return sum(self.counts)
+        return sum(self.trial_counts)
 
     def answer(self, run: Run) -> xr.Dataset:
         progress = SequentialProgress(run.callback)
         run = run._replace(callback=progress)
         parts = {"hardware": self.table.run_cases, "shifted": self._shove, "paths": self._trace}
         results = []
-        for (name, compute), count in zip(parts.items(), self.counts, strict=True):
+        for (name, compute), count in zip(parts.items(), self.trial_counts, strict=True):
             results.append(run.checkpoint(name, partial(compute, run)))
             progress.finish(count)
         merged = xr.merge(results, combine_attrs="drop")

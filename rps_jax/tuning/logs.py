@@ -16,6 +16,7 @@ bag, which `rps push --bag` writes or a robot records (`record.bag` lists the to
     force_x, force_y                 [N] of the object on the base, if known, in the robot frame
 """
 
+from collections.abc import Iterator
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
@@ -106,7 +107,9 @@ def read(source: Trace | str | Path, shell: Shell) -> RawLog:
         check_taxels(columns["signal"], shell, name)
     if "contact_type" not in columns:
         columns |= _contacts(columns["signal"], shell)
-    _check(columns, name, shell)
+    for fault in _faults(columns, shell):
+        raise InputError(f"{name} {fault}.")
+    columns["target"] = np.atleast_2d(columns["target"])[0]
     return log
 
 
@@ -161,52 +164,41 @@ def _contacts(signal: np.ndarray, shell: Shell) -> dict[str, np.ndarray]:
     return {name: np.asarray(values, float) for name, values in reading._asdict().items()}
 
 
-def _check(columns: dict[str, np.ndarray], name: str, shell: Shell) -> None:
-    """Raise InputError for a log that is not of this robot or not in these units."""
+def _faults(columns: dict[str, np.ndarray], shell: Shell) -> Iterator[str]:
+    """Yield why a log is not of this robot, or not in these units."""
     if np.size(columns["time"]) < 2:
-        raise InputError(f"{name} is empty: give a header and at least two rows.")
+        yield "is empty: give a header and at least two rows"
     for key, values in columns.items():
         if len(bad := np.argwhere(~np.isfinite(values))):
-            raise InputError(
-                f"{name} has no number for {key} in row {bad[0][0]}: fill or remove the row."
-            )
-    targets = np.atleast_2d(columns["target"])
-    if np.ptp(targets, axis=0).max() > _STILL:
-        raise InputError(f"{name} has a target that moves: cut the log where it does.")
-    columns["target"] = targets[0]
+            yield f"has no number for {key} in row {bad[0][0]}: fill or remove the row"
+    if np.ptp(np.atleast_2d(columns["target"]), axis=0).max() > _STILL:
+        yield "has a target that moves: cut the log where it does"
     time, steps = columns["time"], np.diff(columns["time"])
     if (steps <= 0).any():
-        raise InputError(f"{name} is not allowed: its time must rise.")
-    interval = float(np.median(steps))
+        yield "is not allowed: its time must rise"
+    interval, worst = float(np.median(steps)), float(steps.max())
     if interval > _SLOWEST:
-        raise InputError(
-            f"{name} has a row every {interval:g} s: give the time in seconds, and a row at "
-            f"least every {_SLOWEST} s."
-        )
-    if (worst := float(steps.max())) > max(5 * interval, _SLOWEST):
-        start = float(time[steps.argmax()])
-        raise InputError(f"{name} has a gap of {worst:.2g} s at {start:.2f} s: cut the log there.")
+        yield f"has a row every {interval:g} s: give the time in seconds, a row every {_SLOWEST} s"
+    if worst > max(5 * interval, _SLOWEST):
+        yield f"has a gap of {worst:.2g} s at {time[steps.argmax()]:.2f} s: cut the log there"
     if time[-1] - time[0] < _SHORTEST:
-        raise InputError(f"{name} lasts {time[-1] - time[0]:.1f} s: it must last {_SHORTEST:g} s.")
+        yield f"lasts {time[-1] - time[0]:.1f} s: it must last {_SHORTEST:g} s"
     for key, (limit, units) in _LIMITS.items():
         if key in columns and (abs(columns[key]) > limit).any():
-            raise InputError(f"{name} has {key} up to {abs(columns[key]).max():g}: write {units}.")
+            yield f"has {key} up to {abs(columns[key]).max():g}: write {units}"
     moved = np.abs(np.diff(columns["pose"], axis=0)).max(0)
     if (moved > np.array([0.5, 0.5, 1.0])).any():
-        raise InputError(
-            f"{name} has a pose that jumps by {moved.max():.3g} between two rows: write x and y "
-            "[m] and an unbroken yaw [rad]."
-        )
+        yield f"has a pose that jumps by {moved.max():.3g}: write x, y [m] and unbroken yaw [rad]"
     in_contact = columns["contact_type"] > 0
     if not in_contact.any():
-        raise InputError(f"{name} has no contact, so it has no information: log a push.")
+        yield "has no contact, so it has no information: log a push"
     reach, half = np.abs(columns["p_robot_contact"][in_contact]), np.array(shell.half, float)
     inside = np.median(np.max(reach - half, axis=-1))
     if (reach > half + 0.03).any() or inside < -0.05:
-        x, y = reach.max(0)
-        raise InputError(
-            f"{name} has contacts up to ({x:.3f}, {y:.3f}) m, and the robot ends at ({half[0]:.3f},"
-            f" {half[1]:.3f}) m: it is of another robot, or not in metres; see --robot."
+        (x, y), (length, width) = reach.max(0), half
+        yield (
+            f"has contacts up to ({x:.3f}, {y:.3f}) m, and the robot ends at ({length:.3f}, "
+            f"{width:.3f}) m: it is of another robot, or not in metres; see --robot"
         )
 
 
