@@ -85,8 +85,18 @@ class Fitted:
     domain: Domain  # with the 90 % intervals of all determined quantities as ranges
 
     def plot(self) -> Figure:
-        """Draw each quantity's posterior over its prior."""
-        return marginals(self.data)
+        """Draw each quantity's posterior (blue) over the 90 % interval of its prior (grey)."""
+        names = list(map(str, self.data.quantity.values))
+        figure, axes = tiles(len(names), 4, (3, 1.9), (0, 0))
+        for ax, name in zip(axes.ravel(), names, strict=False):
+            column = self.data.sel(quantity=name)
+            ax.axvspan(float(column.prior_low), float(column.prior_high), color="0.88")
+            flat = bool(column.undetermined)
+            ax.hist(column["sample"], 40, density=True, color="0.6" if flat else "C0")
+            ax.set_title(words(name) + (" (undetermined)" if flat else ""), fontsize=8)
+            ax.set(yticks=[], xlabel=f"[{column.unit.values}]")
+            ax.tick_params(labelsize=7)
+        return figure
 
 
 @dataclass(frozen=True)
@@ -252,15 +262,13 @@ class Bank:
 
         The ways are the world itself and its mirror image.
         """
-        size, chunks = _BATCH * len(self.domain.objects), []
+        size, chunks = _BATCH * len(self.domain.objects), list[xr.Dataset]()
         for first in range(0, count, size):
             index = np.arange(first, min(first + size, count))
             compute = partial(self._simulate, index, split, run)
             chunks.append(run.checkpoint(f"{split}-{first:07d}", compute))
             run.callback(Progress(int(index[-1]) + 1, (index[-1] + 1) * self.window))
-        worlds = xr.concat(chunks, "world")
-        assert isinstance(worlds, xr.Dataset)
-        return worlds
+        return xr.concat(chunks, "world")
 
     def _simulate(self, index: np.ndarray, split: Split, run: Run) -> xr.Dataset:
         """Return coordinates and statistics of the worlds with these indices."""
@@ -293,15 +301,13 @@ class Bank:
         part = drawn_worlds(self.domain, drawn, self.setting).with_params(self.params)
         repeated = np.resize(np.arange(count), max(count, _BATCH))
         worlds, params = rows((part.worlds, part.params), repeated)
-        period = self.setting.physics.control_period
-        row_steps = max(1, round(self.interval / period))
-        loop = ControlLoop(
-            self.setting.physics, self.setting.rules, _observing(registry.law_of(self.params))
-        )
-        count_rows = round(self.window / self.interval)
-        rows_ = _simulate_logs(
-            part.stage, worlds, params, loop, rows=count_rows, row_steps=row_steps
-        )
+        physics, law = self.setting.physics, _observing(registry.law_of(self.params))
+        loop = ControlLoop(physics, self.setting.rules, law)
+        sizes = {
+            "rows": round(self.window / self.interval),
+            "row_steps": max(1, round(self.interval / physics.control_period)),
+        }
+        rows_ = _simulate_logs(part.stage, worlds, params, loop, **sizes)
         columns = {k: np.swapaxes(np.asarray(x, float), 0, 1)[:count] for k, x in rows_.items()}
         true_pose, valid = columns.pop("true_pose"), columns.pop("done") < 0.5
         if self.exact:
@@ -382,11 +388,9 @@ def statistic_names(bank: xr.Dataset, fields: Sequence[str]) -> list[str]:
 
 def values_of(domain: Domain, u: np.ndarray) -> dict[str, np.ndarray]:
     """Return quantities (n,) of points (n, D) in their units, and the derived quantities."""
-    values = {}
-    for name, column in zip(coordinates(domain), u.T, strict=True):
-        if name != "object":
-            field = "velocity_error" if name in VELOCITY_ERRORS else name
-            values[name] = getattr(domain, field).at(column)
+    ranges = {x.name: x.range for x in points.coordinates(domain) if x.kind == "range"}
+    columns = zip(coordinates(domain), u.T, strict=True)
+    values = {name: ranges[name].at(column) for name, column in columns if name in ranges}
     for name, (_, inputs, function) in DERIVED.items():
         if all(key in values for key in inputs):
             values[name] = function(*(values[key] for key in inputs))
@@ -428,21 +432,15 @@ def fitted_domain(domain: Domain, data: xr.Dataset) -> Domain:
     All three errors of the velocity share one range. Objects with a probability below 5 % are
     removed.
     """
-    determined = data.isel(quantity=data.undetermined.values == 0)
-    intervals = {
-        str(name): (float(low), float(high))
-        for name, low, high in zip(
-            determined.quantity.values, determined.low, determined.high, strict=True
-        )
-    }
+    intervals = data[["low", "high"]].isel(quantity=data.undetermined.values == 0).to_dataframe()
     changes: dict[str, Any] = {
-        name: Range(*interval, getattr(domain, name).log)
-        for name, interval in intervals.items()
+        str(name): Range(float(row.low), float(row.high), getattr(domain, str(name)).log)
+        for name, row in intervals.iterrows()
         if name in QUANTITIES
     }
-    if intervals.keys() >= {*VELOCITY_ERRORS}:
-        low, high = zip(*(intervals[name] for name in VELOCITY_ERRORS), strict=True)
-        changes["velocity_error"] = Range(min(low), max(high))
+    errors = intervals.reindex(VELOCITY_ERRORS)
+    if errors.low.notna().all():
+        changes["velocity_error"] = Range(float(errors.low.min()), float(errors.high.max()))
     objects = tuple(map(str, data.object.values[data.probability.values >= 0.05]))
     return dataclasses.replace(domain, objects=objects, **changes)
 
@@ -476,18 +474,3 @@ def correlations(data: xr.Dataset) -> list[list[str]]:
              if not DERIVED.keys() & {names[i], names[j]}]  # fmt: skip
     rows = [[words(names[i]), words(names[j]), f"{correlation[i, j]:.2f}"] for i, j in pairs]
     return [["", "", "correlation"], *rows]
-
-
-def marginals(data: xr.Dataset) -> Figure:
-    """Draw each quantity's posterior (blue) over the 90 % interval of its prior (grey)."""
-    names = [str(q) for q in data.quantity.values]
-    figure, axes = tiles(len(names), 4, (3, 1.9), (0, 0))
-    for ax, name in zip(axes.ravel(), names, strict=False):
-        column = data.sel(quantity=name)
-        ax.axvspan(float(column.prior_low), float(column.prior_high), color="0.88")
-        flat = bool(column.undetermined)
-        ax.hist(column["sample"], 40, density=True, color="0.6" if flat else "C0")
-        ax.set_title(words(name) + (" (undetermined)" if flat else ""), fontsize=8)
-        ax.set(yticks=[], xlabel=f"[{column.unit.values}]")
-        ax.tick_params(labelsize=7)
-    return figure

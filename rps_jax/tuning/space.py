@@ -18,10 +18,9 @@ SUBSETS = {"logistic": ("eta", "zeta", "beta", "k"), "full": tuple(BOUNDS)}  # o
 
 def expand_subsets(names: Sequence[str], base: LawParams = RPSParams()) -> tuple[str, ...]:
     """Replace the names of subsets by their members; `full` means all parameters with bounds."""
+    subsets = {"full": tuple(dict(registry.law_of(base).bounds))}
     if isinstance(base, RPSParams):
-        subsets = SUBSETS
-    else:
-        subsets = {"full": tuple(dict(registry.law_of(base).bounds))}
+        subsets |= SUBSETS
     return tuple(name for text in names for name in subsets.get(text, (text,)))
 
 
