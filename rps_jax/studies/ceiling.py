@@ -270,17 +270,14 @@ def failed_worlds(results: xr.Dataset, laws: Sequence[str]) -> np.ndarray:
 
 def solved_table(ceiling: xr.Dataset, sweep: xr.Dataset, laws: Sequence[str]) -> list[list[str]]:
     """Return a row for each object: who solves the worlds of a sweep in which some laws fail."""
-    tried = np.intersect1d(failed_worlds(sweep, laws), ceiling.world.values)
-    by_planner = np.zeros(sweep.sizes["world"], bool)
-    by_planner[ceiling.world.values] = ceiling.solved.values > 0
-    by_law = (sweep.success.values > 0).any(axis=0)
-    groups = statistics.worlds_by_object(sweep) | {"all": np.ones_like(by_planner)}
+    count, worlds = sweep.sizes["world"], ceiling.world.values
+    failed = np.isin(np.arange(count), np.intersect1d(failed_worlds(sweep, laws), worlds))
+    planner = np.isin(np.arange(count), worlds[ceiling.solved.values > 0])
+    law = (sweep.success.values > 0).any(axis=0)
+    masks = (failed, failed & planner, failed & law & ~planner, failed & ~law & ~planner)
     table = [["object", "failed worlds", "solved by the planner", "only by another law", "by none"]]
-    for name, mask in groups.items():
-        worlds = tried[mask[tried]]
-        planner, law = by_planner[worlds], by_law[worlds]
-        counts = worlds.size, planner.sum(), (law & ~planner).sum(), (~planner & ~law).sum()
-        table.append([name, *(f"{int(n):,}" for n in counts)])
+    for name, group in (statistics.worlds_by_object(sweep) | {"all": True}).items():
+        table.append([name, *(f"{count_true(mask & group):,}" for mask in masks)])
     return table
 
 
