@@ -25,7 +25,14 @@ from rps_jax.control.registry import LawLike, LawsLike
 from rps_jax.errors import InputError
 from rps_jax.record.options import option
 from rps_jax.robot.robot import RobotLike
-from rps_jax.runs.question import MultiLawQuestion, Run, call_of, name_or_custom, seed_of
+from rps_jax.runs.question import (
+    MultiLawQuestion,
+    Run,
+    call_of,
+    count_true,
+    name_or_custom,
+    seed_of,
+)
 from rps_jax.runs.sweep import Sweep, SweepOptions
 from rps_jax.trials.progress import ProgressCallback, SequentialProgress
 from rps_jax.world.domain import Domain, DomainLike
@@ -285,25 +292,22 @@ def _solved_failures(results: xr.Dataset) -> str:
 def draw_ladder(results: xr.Dataset) -> Figure:
     """Draw the success of each law, grouped by senses, with Wilson's 95 % intervals."""
     senses = dict(zip(results.law.values.tolist(), results.senses.values.tolist(), strict=True))
-    kinds = [kind for kind in get_args(Senses) if kind in senses.values()]
-    colours = {kind: f"C{i}" for i, kind in enumerate(get_args(Senses))}
-    rates = {law: float(results.success.sel(law=law).mean()) for law in senses}
-    order = sorted(rates, key=lambda law: (-kinds.index(senses[law]), rates[law]))
+    kinds, total = get_args(Senses), results.sizes["world"]
+    counts = {law: count_true(results.success.sel(law=law).values > 0) for law in senses}
+    order = sorted(senses, key=lambda law: (-kinds.index(senses[law]), counts[law]))
+    above = {"xytext": (0, 6), "textcoords": "offset points", "ha": "center", "fontsize": 8}
     figure, ax = panel((7, 1.2 + 0.34 * len(order)), "success [%]", "")
     ax.grid(visible=False, axis="y")
     for y, law in enumerate(order):
-        successes = results.success.sel(law=law).values > 0
-        low, high = statistics.wilson(int(successes.sum()), successes.size)
-        ax.plot([100 * low, 100 * high], [y, y], color=colours[senses[law]], lw=3, alpha=0.4)
-        ax.plot(100 * rates[law], y, "o", color=colours[senses[law]])
-        label = tables.percent(int(successes.sum()), successes.size)
-        above = {"xytext": (0, 6), "textcoords": "offset points", "ha": "center"}
-        ax.annotate(label, (100 * rates[law], y), fontsize=8, **above)
-    for kind in kinds:
-        ax.plot([], [], "o", color=colours[kind], label=f"senses {kind}")
+        colour, rate = f"C{kinds.index(senses[law])}", 100 * counts[law] / total
+        low, high = statistics.wilson(counts[law], total)
+        ax.plot([100 * low, 100 * high], [y, y], color=colour, lw=3, alpha=0.4)
+        ax.plot(rate, y, "o", color=colour)
+        ax.annotate(tables.percent(counts[law], total), (rate, y), **above)
+    for kind in sorted(set(senses.values()), key=kinds.index):
+        ax.plot([], [], "o", color=f"C{kinds.index(kind)}", label=f"senses {kind}")
     ax.set_yticks(range(len(order)), order)
-    ax.set_ylim(-0.6, len(order) - 0.3)
-    ax.set_xlim(-3, 103)
-    ax.set_title(f"{results.sizes['world']:,} worlds, the same for all laws", fontsize=10)
+    ax.set(xlim=(-3, 103), ylim=(-0.6, len(order) - 0.3))
+    ax.set_title(f"{total:,} worlds, the same for all laws", fontsize=10)
     ax.legend(fontsize=8, loc="best")
     return figure
