@@ -218,7 +218,7 @@ class TestEvolution:
 # --- runs ----------------------------------------------------------------------------------
 
 
-def pretend(asks, domains, setting, objective, **_):
+def pretend(asks, setting, objective, **_):
     """Score candidates by the distance of L and K_h from a point, instead of worlds."""
     answers = []
     for ask in asks:
