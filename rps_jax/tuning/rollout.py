@@ -278,18 +278,15 @@ def rollout(network: Network, env: PushEnv, table: World, actor: Weights) -> Sta
         hidden, mean = network.apply(actor, batch.memory.hidden, obs)
         return act(env, network, batch, hidden, mean)[0]
 
-    def any_running(batch: EnvBatch) -> jax.Array:
-        return ~jnp.all(batch.states.data.done)
-
-    return jax.lax.while_loop(any_running, step, batch).states
+    return jax.lax.while_loop(lambda batch: ~jnp.all(batch.states.data.done), step, batch).states
 
 
 def evaluate_policy(
     network: Network, envs: Sequence[PushEnv], tables: Sequence[World], actor: Weights
 ) -> tuple[jax.Array, jax.Array]:
     """Return success (N,) bool and time (N,) [s] of the law in all worlds of all environments."""
-    trials = [
-        rollout(network, env, table, actor).data for env, table in zip(envs, tables, strict=True)
-    ]
-    steps = [data.steps * env.dt for data, env in zip(trials, envs, strict=True)]
-    return jnp.concatenate([data.success for data in trials]), jnp.concatenate(steps)
+    results = []
+    for env, table in zip(envs, tables, strict=True):
+        data = rollout(network, env, table, actor).data
+        results.append((data.success, data.steps * env.dt))
+    return _join(results)
