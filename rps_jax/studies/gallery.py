@@ -70,13 +70,13 @@ def common_quantities(
     rows = []
     for name in statistics.varied_quantities(trials):
         values = trials[name].values.astype(float)
-        some = values[worlds]
-        some = some[np.isfinite(some)]
-        if some.size < 3:
+        sample = values[worlds]
+        sample = sample[np.isfinite(sample)]
+        if sample.size < 3:
             continue
-        more = stats.mannwhitneyu(some, np.nan_to_num(values, nan=np.inf)).statistic
-        effect = abs(more / (some.size * values.size) - 0.5)
-        rows.append((effect, (name, float(np.median(some)), float(np.nanmedian(values)))))
+        more = stats.mannwhitneyu(sample, np.nan_to_num(values, nan=np.inf)).statistic
+        effect = abs(more / (sample.size * values.size) - 0.5)
+        rows.append((effect, (name, float(np.median(sample)), float(np.nanmedian(values)))))
     return [medians for effect, medians in sorted(rows, reverse=True)[:count] if effect >= 0.1]
 
 
@@ -143,8 +143,9 @@ class Gallery(Question[xr.Dataset]):
         sections = []
         for mode, indices in plotted.items():
             labels = [
-                f"world {i}, " + (f"{left:.2f} m left" if np.isfinite(left) else "untouched")
-                for i, left in zip(indices, results.min_distance.values[indices], strict=True)
+                f"world {i}, "
+                + (f"{distance:.2f} m left" if np.isfinite(distance) else "untouched")
+                for i, distance in zip(indices, results.min_distance.values[indices], strict=True)
             ]
             total, size = worlds[mode].size, results.sizes["world"]
             title = f"{law}: {mode}, {len(labels)} of {total} in {size} worlds"
@@ -161,9 +162,9 @@ gallery = call_of(Gallery)
 def _text(run: str | Path, law: str, trials: xr.Dataset, worlds: np.ndarray, mode: str) -> str:
     """Return the sentences about a failure mode: mechanism, common quantities, replay command."""
     parts = []
-    for name, some, overall in common_quantities(trials, worlds):
+    for name, sample, overall in common_quantities(trials, worlds):
         unit = trials[name].attrs.get("units", "1").replace("1", "")
-        parts.append(f"{LABELS[name]} {some:.2g} {unit}".rstrip() + f" (all: {overall:.2g})")
+        parts.append(f"{LABELS[name]} {sample:.2g} {unit}".rstrip() + f" (all: {overall:.2g})")
     common = f" Medians: {', '.join(parts)}." if parts else ""
     command = f"rps replay {shlex.quote(str(run))} {worlds[0]} --law {shlex.quote(law)}"
     return f"{MECHANISMS[mode]}{common} Example: `{command}`."

@@ -277,14 +277,14 @@ def _comparison(results: xr.Dataset) -> list[Section]:
 def _solved_failures(results: xr.Dataset) -> str:
     """Count in a sentence the reference's failures in which other laws succeed, by senses."""
     failed = results.success.sel(law=REFERENCE) == 0
-    others = results.success.drop_sel(law=REFERENCE) > 0
+    rivals = results.success.drop_sel(law=REFERENCE) > 0
     counts = []
     for kind in dict.fromkeys(results.senses.values.tolist()):
-        laws = others[others.senses.values == kind]
+        laws = rivals[rivals.senses.values == kind]
         if laws.size:
             count = int((laws.any("law") & failed).sum())
             counts.append(f"another law that senses {kind} succeeds in {count}")
-    counts.append(f"no law succeeds in {int((failed & ~others.any('law')).sum())}")
+    counts.append(f"no law succeeds in {int((failed & ~rivals.any('law')).sum())}")
     worlds = f"{int(failed.sum())} worlds" if failed.sum() != 1 else "one world"
     return f"Of the {worlds} in which {REFERENCE} fails, {', '.join(counts)}."
 

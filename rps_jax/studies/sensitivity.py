@@ -302,6 +302,6 @@ def interactions(
             )
             axis.set_label_text(labels[name].replace(" of the ", "\nof the ") * shown, fontsize=8)
     figure.colorbar(ScalarMappable(norm, "magma_r"), ax=axes, label="failures [%]", shrink=0.6)
-    ends = "each range from its low end (left, bottom) to its high end"
-    figure.suptitle(f"{title}, {results.sizes['world']:,} worlds\n{ends}", fontsize=10)
+    note = "each range from its low end (left, bottom) to its high end"
+    figure.suptitle(f"{title}, {results.sizes['world']:,} worlds\n{note}", fontsize=10)
     return figure

@@ -307,8 +307,8 @@ class _Learner:
     def _state(self) -> tuple[RunnerState, Weights, np.ndarray, np.ndarray]:
         """Runner, best weights, best rate with both times, and curve (updates, metrics)."""
         rows = [list(metrics.values()) for metrics in self.curve]
-        numbers = np.array([self.best_rate, self.compile, self.elapsed])
-        return self.runner, self.best, numbers, np.array(rows, float).reshape(-1, len(UNITS))
+        scalars = np.array([self.best_rate, self.compile, self.elapsed])
+        return self.runner, self.best, scalars, np.array(rows, float).reshape(-1, len(UNITS))
 
     def checkpoint(self) -> xr.Dataset:
         """Write the checkpoint, the law and the curve, and return the curve."""
@@ -341,9 +341,9 @@ class _Learner:
                 f"run = {self.folder} cannot be resumed: another version wrote it; choose another "
                 "folder."
             )
-        runner, self.best, numbers, curve = jax.tree.unflatten(structure, leaves)
+        runner, self.best, scalars, curve = jax.tree.unflatten(structure, leaves)
         self.runner = jax.device_put(runner)
-        self.best_rate, compile_time, elapsed = numbers.tolist()
+        self.best_rate, compile_time, elapsed = scalars.tolist()
         self.compile += compile_time
         self._start_time -= elapsed
         self.curve = [dict(zip(UNITS, row, strict=True)) for row in curve.tolist()]
