@@ -139,7 +139,7 @@ def test_bags_that_are_no_log_are_refused_before_anything_compiles(tmp_path, com
         "lasts 1.9 s: it must last 5 s": lambda: bagged(path, rows[:95]),
         "no messages on /odom": lambda: bag.write(path, [], {}),
         "give an MCAP file": lambda: path.write_bytes(b"no bag"),
-        "is not allowed": lambda: path.write_bytes(bagged(path, rows).read_bytes()[:20_000]),
+        "cannot be read": lambda: path.write_bytes(bagged(path, rows).read_bytes()[:20_000]),
     }.items():
         make()
         assert message in refusal(capsys, "fit", path, "--out", tmp_path / "run")
