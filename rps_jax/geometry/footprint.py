@@ -95,7 +95,10 @@ def signed_distance(footprint: Footprint, point: Float[Array, "*P 2"]) -> Float[
         ahead = along[i] / length2[i]
         t = jnp.clip(x * ahead[0] + y * ahead[1], 0.0, 1.0)
         away_x, away_y = x - t * along[i, 0], y - t * along[i, 1]
-        nearest = jnp.minimum(nearest, away_x * away_x + away_y * away_y)
+        square = away_x * away_x + away_y * away_y
+        # The derivative of `jnp.minimum` is zero if the compiler computes the operands twice with
+        # different rounding, so that neither equals the minimum.
+        nearest = jnp.where(nearest <= square, nearest, square)
         repeated = (along[i, 0] == 0) & (along[i, 1] == 0)
         inside &= repeated | (along[i, 0] * y - along[i, 1] * x > 0)
     nearest = planar.safe_sqrt(nearest)
