@@ -33,6 +33,11 @@ def _readable(sentence: str) -> str:
     return "".join(plain)
 
 
+def not_allowed(name: str, value: object, rule: str) -> InputError:
+    """Return the error of a value that breaks a rule, which also says how to fix it."""
+    return InputError(f"{name} = {value} is not allowed: {rule}.")
+
+
 def check_number(
     name: str,
     value: Any,
@@ -66,7 +71,7 @@ def check_number(
     except (TypeError, ValueError, OverflowError):
         scalar = math.nan
     if math.isnan(scalar) or not (above < scalar and at_least <= scalar <= at_most):
-        raise InputError(f"{name} = {value} is not allowed: it must be {allowed}.")
+        raise not_allowed(name, value, f"it must be {allowed}")
     return scalar
 
 
@@ -74,17 +79,15 @@ def check_finite(name: str, value: Any, **bounds: Any) -> float:
     """Return a value as a float if it is a finite number within bounds: see `check_number`."""
     scalar = check_number(name, value, **bounds)
     if math.isinf(scalar):
-        raise InputError(f"{name} = {value} is not allowed: it must be finite.")
+        raise not_allowed(name, value, "it must be finite")
     return scalar
 
 
 def check_count(name: str, value: object, *, at_least: int = 1, at_most: int) -> int:
     """Return a value if it is a whole number within bounds, or raise InputError."""
     if not (isinstance(value, numbers.Integral) and at_least <= int(value) <= at_most):
-        raise InputError(
-            f"{name} = {value} is not allowed: it must be a whole number from {at_least} to "
-            f"{at_most}."
-        )
+        rule = f"it must be a whole number from {at_least} to {at_most}"
+        raise not_allowed(name, value, rule)
     return int(value)
 
 
@@ -107,7 +110,7 @@ def check_each_once(
 ) -> None:
     """Raise InputError if there is no value, or if a value (or its label) is repeated."""
     if not values or len(set(values if labels is None else labels)) < len(values):
-        raise InputError(f"{field} = {values} is not allowed: name each once, at least one.")
+        raise not_allowed(field, values, "name each once, at least one")
 
 
 def require(module: str, extra: str) -> ModuleType:
