@@ -11,7 +11,7 @@ import importlib.util
 import pkgutil
 import sys
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
@@ -26,6 +26,7 @@ from rps_jax.control.base import Law, LawParams, Params, Senses, Smoothing, name
 from rps_jax.control.learned import policy
 from rps_jax.errors import InputError
 from rps_jax.record import files
+from rps_jax.record.options import parse_changes
 
 # Both are `Any` for the command line, which reads a text; a program may pass parameters.
 LawLike = str | Any  # text that names a law, or parameters of its class
@@ -187,24 +188,12 @@ def parse_law(text: str) -> tuple[str, LawParams]:
     Raises:
       InputError: the law, file, class or parameter does not exist, or a value is not allowed.
     """
-    head, *changes = str(text).split(",")
-    label, params = _parse_head(head)
-    for change in changes:
-        name, equals, value = change.partition("=")
-        if equals:
-            values = {name: errors.check_number(f"{head} {name}", value, text=True)}
-        elif change.endswith(".json"):
-            values = {
-                key: errors.check_number(f"{change} {key}", x)
-                for key, x in files.read_json(Path(change)).items()
-            }
-        else:
-            raise InputError(
-                f"law = {text} is not allowed: write changes as name=value or file.json."
-            )
-        params = replace_leaves(params, values)
-        label += f",{change if equals else Path(change).stem}"
-    return label, params
+    label, params = _parse_head(str(text).partition(",")[0])
+    head, changes = parse_changes("law", str(text))
+    values = {name: errors.check_number(f"{head} {name}", x) for name, x in changes.items()}
+    words = str(text).split(",")[1:]
+    label = ",".join([label, *(Path(x).stem if x.endswith(".json") else x for x in words)])
+    return label, replace_leaves(params, values)
 
 
 def _parse_head(text: str) -> tuple[str, LawParams]:
@@ -236,12 +225,13 @@ def _find_registered(module: str, kind: str) -> tuple[str, LawParams] | None:
 
     Without a class name, the module must define the class of exactly one law.
     """
-    if kind:
-        classes = {getattr(sys.modules.get(module), kind, None)}
-    else:
-        classes = {type(params) for params in LAWS.values() if type(params).__module__ == module}
-    matches = ((name, params) for name, params in LAWS.items() if type(params) in classes)
-    return next(matches, None) if len(classes) == 1 else None
+    required = getattr(sys.modules.get(module), kind, None) if kind else None
+    matches = [
+        (name, params)
+        for name, params in LAWS.items()
+        if (type(params) is required if kind else type(params).__module__ == module)
+    ]
+    return matches[0] if len({type(params) for _, params in matches}) == 1 else None
 
 
 def _load_policy(path: Path) -> tuple[str, LawParams]:
@@ -270,15 +260,9 @@ def resolve_law(law: LawLike, index: int = 0) -> tuple[str, LawParams]:
     law_of(law)
     presets = {name: params for name, params in LAWS.items() if type(params) is type(law)}
     for name, params in presets.items():
-        if _is_equal(params, law):
+        if leaves_to_json(params) == leaves_to_json(law):
             return name, law
     return f"{next(iter(presets), type(law).__name__)}_{index + 1}", law
-
-
-def _is_equal(params: LawParams, preset: LawParams) -> bool:
-    """Whether parameters of one class are equal."""
-    a, b = named_leaves(params), named_leaves(preset)
-    return list(a) == list(b) and all(np.array_equal(a[name], b[name]) for name in a)
 
 
 def resolve_laws(laws: LawsLike) -> dict[str, LawParams]:
@@ -293,19 +277,16 @@ def resolve_laws(laws: LawsLike) -> dict[str, LawParams]:
         is_single = isinstance(laws, str) or type(laws) in _LAWS_BY_CLASS
         items = list(laws) if isinstance(laws, Sequence) and not is_single else [laws]
         pairs = [resolve_law(law, index) for index, law in enumerate(items)]
-        labels = list(_unique_labels([label for label, _ in pairs], items))
+        counts = Counter(label for label, _ in pairs)
+        labels = [
+            law if counts[label] > 1 and isinstance(law, str) else label
+            for (label, _), law in zip(pairs, items, strict=True)
+        ]
         errors.check_each_once("laws", items, labels)
         resolved = dict(zip(labels, (params for _, params in pairs), strict=True))
     if not resolved:
         raise InputError(f"laws = {laws} is not allowed: name at least one law.")
     return {label: check_params(params) for label, params in resolved.items()}
-
-
-def _unique_labels(labels: Sequence[str], laws: Sequence[LawLike]) -> Iterator[str]:
-    """Yield the labels; the whole text of a law whose label occurs twice."""
-    counts = Counter(labels)
-    for label, law in zip(labels, laws, strict=True):
-        yield law if counts[label] > 1 and isinstance(law, str) else label
 
 
 def _read(path: Path) -> bytes:

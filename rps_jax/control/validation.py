@@ -11,7 +11,7 @@ import linecache
 import traceback
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -69,21 +69,17 @@ def check_law(init: Function, step: Function, senses: Senses, params: LawParams)
     if (getattr(_unwrap(step), "__module__", None) or "").startswith("rps_jax."):
         return
     for name, value in named_leaves(params, is_leaf=lambda x: x is None).items():
-        if fault := _leaf_fault(value):
-            raise InputError(f"params.{name} = {value!r} is not allowed: it is {fault}.")
+        try:
+            kind = np.asarray(value).dtype.kind
+        except ValueError:  # a ragged list
+            kind = ""
+        if kind not in tuple("biuf"):
+            raise InputError(
+                f"params.{name} = {value!r} is not allowed: it must be a real number, or an array "
+                "of these."
+            )
     leaves, tree = jax.tree.flatten(params)
     _check_traced(init, step, senses, tree, tuple(np.shape(leaf) for leaf in leaves))
-
-
-def _leaf_fault(value: object) -> str:
-    """Describe why a value is no parameter; empty if it is one."""
-    try:
-        kind = np.asarray(value).dtype.kind
-    except ValueError:
-        return "a ragged list, and must be numbers of one shape"
-    if kind == "c":
-        return "complex, and must be real"
-    return "" if kind in "biuf" else "not a number"
 
 
 @functools.lru_cache(maxsize=256)
@@ -93,128 +89,75 @@ def _check_traced(
     """Trace both functions of a law, and compare their results with what a trial needs."""
     dtype = jnp.result_type(float)
     params = jax.tree.unflatten(tree, [jax.ShapeDtypeStruct(shape, dtype) for shape in shapes])
-    traced_init, traced_step = _Traced("init", init), _Traced("step", step)
-    state = traced_init(params)
-    if invalid := [leaf for leaf in jax.tree.leaves(state) if not _is_array(leaf)]:
-        raise traced_init.error(_describe(invalid[0]), "a pytree of arrays, the law's state")
-    results = traced_step(params, state, observation_shapes(senses))
-    parts: list[object] = list(results) if isinstance(results, tuple) else []
-    if not (
-        len(parts) == 3
-        and isinstance(parts[1], tuple)
-        and len(parts[1]) == 3
-        and isinstance(parts[2], Details)
-    ):
-        actual = ", ".join(map(_describe, parts)) or _describe(results)
-        raise traced_step.error(actual, "state, Twist, Details, such as Details.from_obs(obs)")
-    scalars = [("a Twist", "iuf", item) for item in Twist(*parts[1])._asdict().items()]
-    scalars += [("Details", "biuf", item) for item in parts[2]._asdict().items()]
-    for group, kinds, (name, leaf) in scalars:
-        if fault := _scalar_fault(leaf, kinds):
-            raise traced_step.error(f"{group} whose {name} is {fault}", "a real scalar")
-    if difference := _difference(state, parts[0]):
-        raise traced_step.error(f"a state {difference}", "the shapes and types that init returned")
+    state = _trace("init", init, params)
+    results: Any = _trace("step", step, params, state, observation_shapes(senses))
+
+    def check(fault: str, expected: str) -> None:
+        if fault:
+            raise InputError(
+                f"step of the law in {_definition(step)} returns {fault}: return {expected}."
+            )
+
+    is_triple = isinstance(results, tuple) and len(results) == 3
+    next_state, twist, details = results if is_triple else (None, None, None)
+    is_valid = isinstance(twist, tuple) and len(twist) == 3 and isinstance(details, Details)
+    values = ", ".join(map(_describe, results if is_triple else [results]))
+    check("" if is_valid else values, "state, Twist, Details, such as Details.from_obs(obs)")
+    for group, kinds, fields in (("a Twist", "iuf", Twist(*twist)), ("Details", "biuf", details)):
+        for name, leaf in fields._asdict().items():
+            dtype = getattr(leaf, "dtype", None)
+            is_scalar = np.shape(leaf) == () and getattr(dtype, "kind", "") in tuple(kinds)
+            check(
+                "" if is_scalar else f"{group} whose {name} is {_describe(leaf)}", "a real scalar"
+            )
+    check(_difference(state, next_state), "the shapes and types that init returned")
 
 
-class _Traced(NamedTuple):
-    """Function of a law, called on abstract values."""
-
-    name: str
-    function: Function
-
-    def __call__(self, *args: object) -> object:
-        """Return the abstract results; those that JAX cannot hold are returned unchanged."""
-        invalid: list[object] = []
-
-        def run(*args: object) -> object:
-            results = self.function(*args)
-            if all(map(_is_array, jax.tree.leaves(results))):
-                return results
-            invalid.append(results)
-            return None
-
-        try:
-            shapes = jax.eval_shape(run, *args)
-        except InputError:
-            raise
-        except (Exception, SystemExit) as error:  # any error of the user's function
-            fault = next((t for kind, t in _TRACER_ERRORS.items() if isinstance(error, kind)), "")
-            if not fault:
-                reason = " ".join(str(error).split())[:300].rstrip(".")
-                fault = f"raises {type(error).__name__}" + (f" ({reason})" if reason else "")
-            line = _line_of(error) or _definition(self.function)
-            raise InputError(f"{self.name} of the law in {line} {fault}.") from error
-        return invalid[0] if invalid else shapes
-
-    def error(self, actual: str, expected: str) -> InputError:
-        """Return the error of a wrong result."""
-        line = _definition(self.function)
-        return InputError(f"{self.name} of the law in {line} returns {actual}: return {expected}.")
-
-
-def _is_array(leaf: object) -> bool:
-    """Whether JAX can hold a value."""
-    if isinstance(leaf, str | bytes | type):
-        return False
+def _trace(name: str, function: Function, *args: object) -> object:
+    """Return the abstract results of a function of a law."""
     try:
-        return np.dtype(jnp.result_type(leaf)).kind in "biufc"
-    except (TypeError, ValueError):  # a key of jax.random, or no array
-        dtype = getattr(leaf, "dtype", None)
-        return dtype is not None and jnp.issubdtype(dtype, jax.dtypes.extended)
+        return jax.eval_shape(function, *args)
+    except InputError:
+        raise
+    except (Exception, SystemExit) as error:  # any error of the user's function
+        fault = next((t for kind, t in _TRACER_ERRORS.items() if isinstance(error, kind)), "")
+        if not fault:
+            reason = " ".join(str(error).split())[:300].rstrip(".")
+            fault = f"raises {type(error).__name__}" + (f" ({reason})" if reason else "")
+        line = _line_of(error) or _definition(function)
+        raise InputError(f"{name} of the law in {line} {fault}.") from error
 
 
 def _describe(value: Any) -> str:
     """Describe a value in a few words."""
-    if value is None:
-        return "None"
-    if type(value) is tuple:
-        return f"{len(value)} values"
-    if hasattr(value, "shape") and _is_array(value):
-        return f"an array {tuple(value.shape)}"
-    name = type(value).__name__
-    return f"{'an' if name[0].lower() in 'aeiou' else 'a'} {name}"
-
-
-def _scalar_fault(leaf: Any, kinds: str) -> str:
-    """Describe why a leaf is no scalar of these kinds of type; empty if it is one."""
-    if leaf is None or not _is_array(leaf) or np.shape(leaf) != ():
-        return _describe(leaf)
-    dtype = jnp.result_type(leaf)
-    return "" if getattr(dtype, "kind", "") in tuple(kinds) else f"of type {dtype}"
+    if isinstance(value, jax.ShapeDtypeStruct):
+        return f"{value.dtype} {value.shape}"
+    return "None" if value is None else f"a {type(value).__name__}"
 
 
 def _difference(state: object, next_state: object) -> str:
     """Describe how a state differs from the initial one; empty if it does not."""
     if jax.tree.structure(state) != jax.tree.structure(next_state):
-        return "of another structure"
-    initial: dict[str, Any] = dict(named_leaves(state))
-    for (name, old), new in zip(initial.items(), jax.tree.leaves(next_state), strict=True):
-        subject = f"whose {name}" if name else "that"
-        if not _is_array(new):
-            return f"{subject} is {_describe(new)}"
-        shape, dtype = np.shape(new), jnp.result_type(new)
-        if old.shape != shape:
-            return f"{subject} has shape {shape}, and {old.shape} in init"
-        if old.dtype != dtype:
-            return f"{subject} is {dtype}, and {old.dtype} in init"
+        return "a state of another structure"
+    for (name, old), new in zip(
+        named_leaves(state).items(), jax.tree.leaves(next_state), strict=True
+    ):
+        if _describe(old) != _describe(new):
+            return f"a state whose {name} is {_describe(new)}, and {_describe(old)} in init"
     return ""
 
 
-def _unwrap(function: object) -> object:
-    """Return the function inside nested `functools.partial` objects."""
+def _unwrap(function: Any) -> Any:
+    """Return the function inside nested `functools.partial` objects and decorators."""
     while isinstance(function, functools.partial):
         function = function.func
-    return function
+    return inspect.unwrap(function)
 
 
 def _definition(function: Function) -> str:
     """Return the file and the first line of a function."""
-    inner: Any = _unwrap(function)
-    try:
-        file, (_, line) = inspect.getsourcefile(inner), inspect.getsourcelines(inner)
-    except (OSError, TypeError):
-        return getattr(inner, "__module__", None) or repr(inner)
-    return f"{file}, line {line},"
+    code = getattr(_unwrap(function), "__code__", None)
+    return f"{code.co_filename}, line {code.co_firstlineno}," if code else repr(function)
 
 
 def _line_of(error: BaseException) -> str:

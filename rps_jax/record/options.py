@@ -15,6 +15,7 @@ from typing import Any, Literal, get_args, get_origin
 import numpy as np
 
 from rps_jax import errors
+from rps_jax.record import files
 
 HIDDEN, POSITIONAL, _BOUNDS = "hidden", "positional", "bounds"  # metadata of fields
 
@@ -108,17 +109,20 @@ def to_json(value: Any) -> Any:
 
 
 def parse_changes(kind: str, text: str) -> tuple[str, dict[str, Any]]:
-    """Return the name and the changes of a text `NAME,FIELD=VALUE,...`.
+    """Return the name and the changes of a text `NAME,FIELD=VALUE,FILE.json,...`.
 
-    A value is a number, a text, or several of these between colons, as 3:10. Errors name the `kind`
-    of the text.
+    A value is a number, a text, or several of these between colons, as 3:10. A file holds fields
+    with values. Errors name the `kind` of the text.
     """
     name, *assignments = text.split(",")
-    changes: dict[str, float | str | list[float | str]] = {}
+    changes: dict[str, Any] = {}
     for assignment in assignments:
         field, equals, value = assignment.partition("=")
+        if not equals and field.endswith(".json"):
+            changes |= files.read_json(Path(field))
+            continue
         if not (field and equals):
-            raise errors.InputError(f"{kind} = {text} is not allowed: write changes as name=value.")
+            raise errors.not_allowed(kind, text, "write changes as name=value or file.json")
         values = [_number_or_text(word) for word in value.split(":")]
         changes[field] = values if len(values) > 1 else values[0]
     return name, changes
