@@ -131,7 +131,7 @@ SWEEP = {
     "--laws npss": "unknown law 'npss': .*did you mean 'nps'",
     "--laws rps rps,K_h=0.3 rps": "laws = .* is not allowed: name each once",
     "--laws rps,L.json": "L = -1.0 is not allowed",
-    "--laws rps,L_word.json": "L_word.json L = x is not allowed: it must be a number",
+    "--laws rps,L_word.json": "rps L = x is not allowed: it must be a number",
     "--laws rps,list.json": "list.json is no JSON object .it holds no names with values",
     "--laws rps,.": "law = rps,. is not allowed: write changes as name=value or file.json",
     "--laws rps,good.json rps,good.json": "laws = .* is not allowed: name each once",
