@@ -194,11 +194,11 @@ FRONT = Boards("front", 2, 0.05)
             {"boards": (replace(FRONT, middle=0.2),)},
             "from 0.34 to 0.64 m of the front .* ends at 0.58",
         ),
-        ({"boards": (FRONT, replace(FRONT, middle=0.1))}, "so they overlap"),
-        ({"boards": (Boards("front", 2), FRONT)}, "so they overlap"),
+        ({"boards": (FRONT, replace(FRONT, middle=0.1))}, "overlap the previous row"),
+        ({"boards": (Boards("front", 2), FRONT)}, "overlap the previous row"),
         ({"boards": (Boards("right", 2), FRONT)}, "in the order left, front, right"),
-        ({"boards": (Boards("front", 2, middle=0.1),)}, "is not allowed without a pitch"),
-        ({"v_max": (1.0, 0.0)}, "cannot move sideways cannot follow the law, which needs v_y"),
+        ({"boards": (Boards("front", 2, middle=0.1),)}, "without a pitch"),
+        ({"v_max": (1.0, 0.0)}, "robot v_max = 0.0 is not allowed"),
         ({"v_max": (1.0, 0.5, 0.2)}, "give one number, or two"),
         ({"bandwidth": 0.0}, "robot bandwidth = 0.0 is not allowed"),
     ],
@@ -214,7 +214,7 @@ def test_commands_refuse_them_in_one_sentence(capsys, tmp_path):
         ('{"boards": [{"side": "front", "count": 9, "pitch": 0.05}]}', "they leave the base"),
         ('{"boards": [{"count": 9}]}', "write each row as"),
         ('{"boards": [{"side": "front", "count": 1, "width": 1}]}', "quantity 'width'"),
-        ('{"v_max": [1.0, 0.0]}', "cannot move sideways"),
+        ('{"v_max": [1.0, 0.0]}', "robot v_max = 0.0 is not allowed"),
     ):
         mine.write_text(text)
         assert message in refusal(capsys, "sweep", "--robot", str(mine))

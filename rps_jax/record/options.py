@@ -35,7 +35,7 @@ def option(
 
     The command line has a `positional` field without a flag, and does not offer a `hidden` one.
     """
-    bounds = {"at_least": at_least, "at_most": at_most, "above": above, "unit": unit}
+    bounds = {"at_least": at_least, "at_most": at_most, "above": above, "unit": unit or None}
     metadata = {
         _BOUNDS: {name: bound for name, bound in bounds.items() if bound is not None},
         HIDDEN: hidden,
@@ -50,15 +50,17 @@ def field_types(kind: type) -> dict[str, Any]:
     return typing.get_type_hints(kind)
 
 
-def check_fields(record: object) -> None:
-    """Check the fields of a dataclass by their types and bounds.
+def check_fields(record: object, prefix: str = "") -> None:
+    """Check the fields of a dataclass by their types and bounds; errors name them after a prefix.
 
     Integers are `int`, finite numbers `float`, and closed choices `Literal`, or one of these and
-    `None`. Fields of other types are not checked.
+    `None`. Fields of other types are checked by their bounds, if these are declared, number by
+    number; their default is always allowed.
     """
     types_ = field_types(type(record))
     for field in dataclasses.fields(typing.cast(Any, record)):
-        _check(field.name, getattr(record, field.name), types_[field.name], field.metadata)
+        if (value := getattr(record, field.name)) is not field.default:
+            _check(f"{prefix}{field.name}", value, types_[field.name], field.metadata)
 
 
 def _check(name: str, value: Any, kind: object, metadata: Mapping[str, Any]) -> None:
@@ -80,6 +82,9 @@ def _check(name: str, value: Any, kind: object, metadata: Mapping[str, Any]) -> 
     elif get_origin(kind) is tuple and bounds is not None:
         for item in value if isinstance(value, tuple | list) else (value,):
             _check(name, item, get_args(kind)[0], metadata)
+    elif bounds:
+        for number in np.ravel(np.asarray(value, object)):
+            errors.check_finite(name, number, **bounds)
 
 
 def to_json(value: Any) -> Any:

@@ -16,15 +16,15 @@ import jax.numpy as jnp
 import numpy as np
 
 from rps_jax import errors
-from rps_jax.errors import InputError
 from rps_jax.geometry.solid import GRAVITY
 from rps_jax.record import files
-from rps_jax.record.options import parse_changes
+from rps_jax.record.options import check_fields, option, parse_changes
 from rps_jax.robot.shell import BOARDS, HALF_LENGTH, HALF_WIDTH, Boards, Shell
 
 # A number or an array of a batch, on the host or traced. `Any`: NumPy's, JAX's and Python's numbers
 # have no common type with arithmetic.
 Number: TypeAlias = Any
+_POSITIVE = 1e-3  # lower bound of limits that would stop the base
 
 
 @dataclass(frozen=True)
@@ -37,18 +37,21 @@ class Robot:
     half_length: Number = HALF_LENGTH  # () [m]
     half_width: Number = HALF_WIDTH  # () [m]
     boards: tuple[Boards, ...] = BOARDS  # of the skin
-    mass: Number = 130.0  # () [kg] of the whole robot; used if the force is limited
-    # () [m/s] maximum speed in any direction, or (2,) forward and sideways
-    v_max: Number = None
-    omega_max: Number = None  # () [rad/s] maximum turning rate
-    lag: Number = None  # () [s] time constant with which the base follows a twist
-    acceleration_max: Number = None  # (2,) [m/s^2, rad/s^2] maximum acceleration
-    force_max: Number = None  # () [N] of the drive, in any direction
-    torque_max: Number = None  # () [N m] of the drive about the vertical
-    bandwidth: Number = 5.0  # () [Hz] of the drive's velocity servo; used if the force is limited
-    traction: Number = None  # () [1] friction coefficient of the wheels; bounds force and torque
-    resistance: Number = None  # () [1] rolling resistance over the weight
-    slip: Number = None  # () [1] share of the velocity that the wheels lose
+    # () of the whole robot; used if the force is limited
+    mass: Number = option(130.0, above=0, at_most=1e4, unit="kg")
+    # () maximum speed in any direction, or (2,) forward and sideways
+    v_max: Number = option(None, _POSITIVE, 10, unit="m/s")
+    omega_max: Number = option(None, _POSITIVE, 20, unit="rad/s")  # () maximum turning rate
+    lag: Number = option(None, 0, 5, unit="s")  # () time constant with which it follows a twist
+    acceleration_max: Number = option(None, _POSITIVE, 100)  # (2,) [m/s^2, rad/s^2] maximum
+    force_max: Number = option(None, 0, 1e5, unit="N")  # () of the drive, in any direction
+    torque_max: Number = option(None, _POSITIVE, 1e5, unit="N m")  # () about the vertical
+    # () of the drive's velocity servo; used if the force is limited
+    bandwidth: Number = option(5.0, 0.1, 100, unit="Hz")
+    # () [1] friction coefficient of the wheels; bounds force and torque
+    traction: Number = option(None, _POSITIVE, 5)
+    resistance: Number = option(None, 0, 1)  # () [1] rolling resistance over the weight
+    slip: Number = option(None, 0, 0.5)  # () [1] share of the velocity that the wheels lose
 
     @property
     def driven(self) -> bool:
@@ -105,37 +108,19 @@ class Robot:
 
     def check(self) -> None:
         """Raise InputError for numbers that no robot has; each is one number, or None."""
+        check_fields(self, "robot ")
         Shell(self.half_length, self.half_width, self.boards).check()
-        errors.check_finite("robot mass", self.mass, above=0, at_most=1e4, unit="kg")
         if np.size(self.v_max) > 2:
-            raise InputError(
-                f"robot v_max = {self.v_max} is not allowed: give one number, or two, forward and "
-                "sideways [m/s]."
-            )
-        if np.size(self.v_max) == 2 and self.v_max[1] == 0:
-            raise InputError(
-                f"robot v_max = {self.v_max} is not allowed: a base that cannot move sideways "
-                "cannot follow the law, which needs v_y."
-            )
-        for name, (low, high, unit) in _BOUNDS.items():
-            value = getattr(self, name)
-            if value is not None:
-                for scalar in np.atleast_1d(np.asarray(value, object)):
-                    errors.check_finite(
-                        f"robot {name}", scalar, at_least=low, at_most=high, unit=unit
-                    )
+            rule = "give one number, or two, forward and sideways [m/s]"
+            raise errors.not_allowed("robot v_max", self.v_max, rule)
         if self.acceleration_max is not None and np.size(self.acceleration_max) != 2:
-            raise InputError(
-                f"robot acceleration_max = {self.acceleration_max} is not allowed: give two "
-                "numbers, [m/s^2, rad/s^2]."
-            )
+            rule = "give two numbers, [m/s^2, rad/s^2]"
+            raise errors.not_allowed("robot acceleration_max", self.acceleration_max, rule)
         if self.push_max is not None and self.push_max <= 0:
-            raise InputError(
-                f"robot force_max = {self.force_max} N and traction = {self.traction} are not "
-                "allowed: rolling resistance takes "
-                f"{(self.resistance or 0) * self.mass * GRAVITY:.0f} N, so that no force is left "
-                "to push with."
-            )
+            rolling = (self.resistance or 0) * self.mass * GRAVITY
+            rule = f"rolling resistance takes {rolling:.0f} N, so that no force is left to push"
+            limits = f"{self.force_max} N and robot traction = {self.traction}"
+            raise errors.not_allowed("robot force_max", limits, rule)
 
 
 def _minimum(a: Number, b: Number) -> Number:
@@ -151,19 +136,6 @@ _AIM_LIMITS = ("v_max", "omega_max", "lag", "acceleration_max", "slip")
 _NOT_LIMITS = ("half_length", "half_width", "boards", "mass", "bandwidth", "resistance")
 LIMITS = tuple(name for name in _FIELDS if name not in _NOT_LIMITS)
 jax.tree_util.register_dataclass(Robot, data_fields=_FIELDS, meta_fields=[])
-_POSITIVE = 1e-3  # lower bound of limits that would stop the base
-_BOUNDS = {
-    "v_max": (_POSITIVE, 10, "m/s"),
-    "omega_max": (_POSITIVE, 20, "rad/s"),
-    "lag": (0, 5, "s"),
-    "acceleration_max": (_POSITIVE, 100, "1"),
-    "bandwidth": (0.1, 100, "Hz"),
-    "force_max": (0, 1e5, "N"),
-    "torque_max": (_POSITIVE, 1e5, "N m"),
-    "traction": (_POSITIVE, 5, "1"),
-    "resistance": (0, 1, "1"),
-    "slip": (0, 0.5, "1"),
-}
 
 
 def _covered(length: float, width: float) -> tuple[Boards, ...]:
@@ -239,27 +211,22 @@ def parse_robot(robot: RobotLike) -> Robot:
             values["boards"] = _parse_boards(values["boards"])
         robot = Robot(**values)
     if not isinstance(robot, Robot):
-        raise InputError(
-            f'robot = {robot!r} is not allowed: write names with numbers, as {{"force_max": 300}}.'
-        )
+        rule = 'write names with numbers, as {"force_max": 300}'
+        raise errors.not_allowed("robot", repr(robot), rule)
     robot.check()
     return robot
 
 
 def _parse_boards(rows: object) -> tuple[Boards, ...]:
     """Return rows of boards from mappings of names to numbers."""
-    known = [field.name for field in dataclasses.fields(Boards)]
     boards = []
     for row in rows if isinstance(rows, tuple) else (rows,):
-        if isinstance(row, Boards):
-            boards.append(row)
-            continue
-        if not isinstance(row, Mapping) or not {"side", "count"} <= set(row):
-            raise InputError(
-                f"robot boards = {row} are not allowed: write each row as "
-                '{"side": "front", "count": 4, "pitch": 0.048}.'
-            )
-        for name in row:
-            errors.check_name("robot boards' quantity", name, known)
-        boards.append(Boards(**row))
+        if isinstance(row, Mapping) and {"side", "count"} <= set(row):
+            for name in row:
+                errors.check_name("robot boards' quantity", name, Boards.__dataclass_fields__)
+            row = Boards(**row)
+        if not isinstance(row, Boards):
+            rule = 'write each row as {"side": "front", "count": 4, "pitch": 0.048}'
+            raise errors.not_allowed("robot boards", row, rule)
+        boards.append(row)
     return tuple(boards)

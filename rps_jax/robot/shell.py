@@ -7,7 +7,6 @@ right side. A field of None has the paper's value.
 
 from __future__ import annotations
 
-import itertools
 import math
 from dataclasses import dataclass, field
 from typing import Literal, NamedTuple
@@ -19,6 +18,7 @@ import numpy as np
 from rps_jax import errors
 from rps_jax.errors import InputError
 from rps_jax.geometry.arrays import Number
+from rps_jax.record.options import check_fields, option
 
 HALF_LENGTH = 0.3625  # [m] of the paper's base: 15 taxels of 48.3 mm make 0.725 m
 HALF_WIDTH = 0.29  # [m] of the paper's base: l_cr + 5 cm, Sec. III-A
@@ -27,19 +27,19 @@ SIDES: tuple[Side, ...] = ("left", "front", "right")  # in the order of the stri
 _ALONG = {"left": (1.0, 0.0), "front": (0.0, -1.0), "right": (-1.0, 0.0)}
 _ROUNDING = 1e-9  # [m]
 _SPACING = 0.01  # [m] maximum, between two sample points of a taxel
-_STATIC = {"static": True}  # metadata of a field that is no leaf of the pytree
 
 
-@jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Boards:
     """A row of equal boards on one side, end to end; each taxel is an electrode of a board."""
 
-    side: Side = field(metadata=_STATIC)
-    count: int = field(metadata=_STATIC)  # boards
-    pitch: Number | None = None  # () [m] of the taxels; None: the row covers the whole side
-    middle: Number | None = None  # () [m] along the strip, from the middle of the side; None: 0
-    electrodes: int = field(default=3, metadata=_STATIC)  # on each board
+    side: Side
+    count: int = option(at_least=1, at_most=100)  # boards
+    # () of the taxels; None: the row covers the whole side
+    pitch: Number | None = option(None, 0.002, 1, unit="m")
+    # () along the strip, from the middle of the side; None: 0
+    middle: Number | None = option(None, -4, 4, unit="m")
+    electrodes: int = option(3, 1, 100)  # on each board
 
     @property
     def taxels(self) -> int:
@@ -47,6 +47,9 @@ class Boards:
         return self.count * self.electrodes
 
 
+jax.tree_util.register_dataclass(
+    Boards, data_fields=["pitch", "middle"], meta_fields=["side", "count", "electrodes"]
+)
 BOARDS = (Boards("left", 5), Boards("front", 4), Boards("right", 5))  # 14 boards, Sec. II-B
 
 
@@ -64,11 +67,12 @@ class Row(NamedTuple):
 class Shell:
     """Outline of a base, a rectangle about its origin, and its boards in the strip's order."""
 
-    half_length: Number = HALF_LENGTH  # () [m]
-    half_width: Number | None = None  # () [m]; None: the paper's, constant in compiled programs
+    half_length: Number = option(HALF_LENGTH, 0.1, 2, unit="m")  # ()
+    # (); None: the paper's, constant in compiled programs
+    half_width: Number | None = option(None, 0.1, 2, unit="m")
     boards: tuple[Boards, ...] = BOARDS
     # Sample points of each taxel for the compression of foam; 1 cm apart they resolve a corner.
-    samples: int = field(default=5, metadata=_STATIC)
+    samples: int = field(default=5, metadata={"static": True})
 
     @classmethod
     def of(cls, half_length: Number, half_width: Number, boards: tuple[Boards, ...]) -> Shell:
@@ -102,12 +106,9 @@ class Shell:
         for boards in self.boards:
             along, side = np.array(_ALONG[boards.side]), sides[boards.side]
             start, offset = jnp.stack(corners[boards.side]), offsets[boards.side]
-            if boards.pitch is None:
-                rows.append(Row(start, along, side, offset))
-                continue
-            length = boards.taxels * boards.pitch
-            gap = (side - length) / 2 + (0.0 if boards.middle is None else boards.middle)
-            rows.append(Row(start + gap * along, along, length, offset + gap))
+            gap, length = _span(boards, side)
+            shifted = start if boards.pitch is None else start + gap * along
+            rows.append(Row(shifted, along, length, offset + gap))
         return rows
 
     def taxels(self, samples: int = 1) -> jax.Array:
@@ -130,61 +131,39 @@ class Shell:
 
     def check(self) -> None:
         """Raise InputError for a base without size, or boards that overlap or leave it."""
-        x, y = self.half
-        for name, value in (("half_length", x), ("half_width", y)):
-            errors.check_finite(f"robot {name}", value, at_least=0.1, at_most=2, unit="m")
+        check_fields(self, "robot ")
         if not self.boards:
-            raise InputError("robot boards = () is not allowed: name at least one row.")
-        for row in self.boards:
-            _check(row)
-        used = [row.side for row in self.boards]
-        if used != sorted(used, key=SIDES.index):
-            raise InputError(
-                f"robot boards on {', '.join(used)} are not allowed: name the rows in the order "
-                "left, front, right."
-            )
-        sides = _lengths(x, y)
-        for row in self.boards:
-            first, last = _interval(row, sides[row.side])
-            if first < -_ROUNDING or last > sides[row.side] + _ROUNDING:
+            raise errors.not_allowed("robot boards", (), "name at least one row")
+        for boards in self.boards:
+            check_fields(boards, "robot boards' ")
+            if boards.pitch is None and boards.middle:
+                rule = "without a pitch a row covers the whole side"
+                raise errors.not_allowed("robot boards' middle", boards.middle, rule)
+        sides, previous = _lengths(*self.half), (0, 0.0)  # side and end [m] of the row before
+        for boards in self.boards:
+            first, length = _span(boards, sides[boards.side])
+            last, end = first + length, sides[boards.side]
+            if first < -_ROUNDING or last > end + _ROUNDING:
                 raise InputError(
-                    f"robot boards from {first:g} to {last:g} m of the {row.side} side are not "
-                    f"allowed: they leave the base, whose side ends at {sides[row.side]:g} m."
+                    f"robot boards from {first:g} to {last:g} m of the {boards.side} side are not "
+                    f"allowed: they leave the base, whose side ends at {end:g} m."
                 )
-        for row, follower in itertools.pairwise(self.boards):
-            if row.side == follower.side:
-                side = sides[row.side]
-                last, first = _interval(row, side)[1], _interval(follower, side)[0]
-                if first < last - _ROUNDING:
-                    raise InputError(
-                        f"robot boards on the {row.side} side are not allowed: a row ends at "
-                        f"{last:g} m and the following begins at {first:g} m, so they overlap."
-                    )
+            if (SIDES.index(boards.side), first + _ROUNDING) < previous:
+                raise InputError(
+                    f"robot boards on the {boards.side} side are not allowed: they overlap the "
+                    "previous row, or are not in the order left, front, right."
+                )
+            previous = SIDES.index(boards.side), last
+
+
+def _span(row: Boards, side: Number) -> tuple[Number, Number]:
+    """Return the start of a row on its side of length `side` [m], and its length [m]."""
+    if row.pitch is None:
+        return 0.0, side
+    length = row.taxels * row.pitch
+    return (side - length) / 2 + (0.0 if row.middle is None else row.middle), length
 
 
 def _lengths(x: Number, y: Number) -> dict[Side, Number]:
     """Return the lengths [m] of the sides of a base of half length x and half width y [m]."""
     return {"left": 2 * x, "front": 2 * y, "right": 2 * x}
-
-
-def _interval(row: Boards, side: Number) -> tuple[Number, Number]:
-    """Return the start and end [m] of a row on its side of length `side` [m]."""
-    if row.pitch is None:
-        return 0.0, side
-    length, middle = row.taxels * row.pitch, side / 2 + (row.middle or 0.0)
-    return middle - length / 2, middle + length / 2
-
-
-def _check(row: Boards) -> None:
-    errors.check_name("robot boards' side", row.side, SIDES)
-    for name in ("count", "electrodes"):
-        errors.check_count(f"robot boards' {name}", getattr(row, name), at_most=100)
-    if row.pitch is not None:
-        errors.check_finite("robot boards' pitch", row.pitch, at_least=0.002, at_most=1, unit="m")
-    if row.middle is not None:
-        errors.check_finite("robot boards' middle", row.middle, unit="m")
-        if row.pitch is None and row.middle != 0:
-            raise InputError(
-                f"robot boards' middle = {row.middle:g} m is not allowed without a pitch: such a "
-                "row covers the whole side."
-            )
