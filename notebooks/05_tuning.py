@@ -29,7 +29,7 @@ from IPython.display import Markdown
 import rps_jax
 from rps_jax import RPSParams
 from rps_jax.analysis import figures, tables
-from rps_jax.robot.skin import SmoothSkin
+from rps_jax.robot.skin import IdealSkin
 from rps_jax.trials.case import Case
 from rps_jax.tuning.space import Space
 from sweeps.gradients import estimators
@@ -155,7 +155,9 @@ drawing.paired(results)
 names = ("L", "K_h", "K_v", "beta")
 space = Space(names)
 targets = rps_jax.load("runs/table")[["target_x", "target_y"]].to_dataframe().to_numpy()
-cases = [Case("box", "S1", target, gap=0.004, skin=SmoothSkin()) for target in targets]
+cases = [
+    Case("box", "S1", target, gap=0.004, skin=IdealSkin(temperature=0.001)) for target in targets
+]
 horizons = (1.0, 3.0, 10.0)  # [s]
 distances, starts = estimators.distances(cases, space.params, horizons)  # at all three times
 theta, key = space.vector(RPSParams.paper()), jax.random.key(0)

@@ -173,7 +173,7 @@ def test_a_law_of_a_users_file_is_exported(custom_law, tmp_path):
 @pytest.mark.parametrize("robot", ["ridgeback"])
 def test_the_skin_in_c_agrees_with_jax(robot, tmp_path):
     native = Native(program.program("rps", robot), tmp_path, "float")
-    skin = SKINS["capacitive"].on(robots.parse_robot(robot).shell)
+    skin = SKINS["capacitive"]._replace(shell=robots.parse_robot(robot).shell)
     count, rng = skin.shell.count, np.random.default_rng(0)
     state, worlds = skin.init(jax.random.PRNGKey(0)), 400
     alive = rng.random((worlds, count)) > 0.1

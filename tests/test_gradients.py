@@ -16,7 +16,7 @@ from rps_jax import engines, errors
 from rps_jax.control import registry
 from rps_jax.control.laws import rps
 from rps_jax.control.laws.rps import RPSParams
-from rps_jax.robot.skin import SmoothSkin
+from rps_jax.robot.skin import IdealSkin
 from rps_jax.trials import pushes, trial
 from rps_jax.trials.case import Case
 from rps_jax.trials.setting import Setting
@@ -250,7 +250,7 @@ def test_mjx_must_have_a_pyramidal_cone():
 def test_the_derivative_of_a_window_of_fused_trials_is_its_finite_difference():
     """A cylinder rolls along the base, in float32; one program gives scores and derivatives."""
     targets = ((1.0, -1.5), (2.0, 0.5), (-1.5, 1.0))
-    skin, setting = SmoothSkin(), Setting(engine="fused")
+    skin, setting = IdealSkin(temperature=0.001), Setting(engine="fused")
     cases = [Case("cylinder", "S1", t, skin=skin, gap=0.004) for t in targets]
     _, worlds, stage, params = pushes.build(cases, setting)
     law = registry.smooth_law(rps.LAW)

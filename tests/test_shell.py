@@ -18,7 +18,7 @@ from rps_jax.geometry import footprint as fp
 from rps_jax.robot import robot
 from rps_jax.robot.robot import ROBOTS, Robot
 from rps_jax.robot.shell import BOARDS, Boards, Shell
-from rps_jax.robot.skin import LINE, NONE, CapacitiveSkin, IdealSkin, SmoothSkin
+from rps_jax.robot.skin import LINE, NONE, CapacitiveSkin, IdealSkin
 from rps_jax.trials import pushes
 from rps_jax.trials.pushes import Case
 from rps_jax.trials.setting import Setting
@@ -74,24 +74,24 @@ def test_taxels_are_sampled_a_centimetre_apart():
 def test_boards_at_the_papers_pitch_give_the_papers_readings():
     pitch = 0.58 / 12
     sides = Boards("left", 5, pitch), Boards("front", 4, pitch), Boards("right", 5, pitch)
-    for sensor in (IdealSkin(), CapacitiveSkin(), SmoothSkin()):
+    for sensor in (IdealSkin(), CapacitiveSkin(), IdealSkin(temperature=0.001)):
         for y in (0.0, 0.13, -0.33, 0.391):
             expected = read(sensor, box(0.46, y))
-            reading = read(sensor.on(Robot(boards=sides).shell), box(0.46, y))
+            reading = read(sensor._replace(shell=Robot(boards=sides).shell), box(0.46, y))
             for a, b in zip(expected, reading, strict=True):
                 np.testing.assert_allclose(a, b, atol=1e-5)
 
 
 @pytest.mark.parametrize("sensor", [IdealSkin(), CapacitiveSkin()])
 def test_nothing_is_felt_without_a_board(sensor):
-    worn = sensor.on(Robot(boards=FRONT_ONLY).shell)  # which covers |y| < 0.15
+    worn = sensor._replace(shell=Robot(boards=FRONT_ONLY).shell)  # which covers |y| < 0.15
     assert int(read(sensor, box(0.46, 0.26)).contact_type) == LINE
     assert int(read(worn, box(0.46, 0.26)).contact_type) == NONE
     half = read(worn, box(0.46, 0.15))  # of an object from 0.05 to 0.25
     assert int(half.contact_type) == LINE
     np.testing.assert_allclose(half.p_robot_contact, [0.3625, 0.10], atol=0.006)
     smooth = read(
-        SmoothSkin(worn, 0.0005 if isinstance(worn, IdealSkin) else 0.01), box(0.46, 0.15)
+        worn._replace(temperature=0.0005 if isinstance(worn, IdealSkin) else 0.01), box(0.46, 0.15)
     )
     np.testing.assert_allclose(smooth.p_robot_contact, half.p_robot_contact, atol=0.006)
 
@@ -103,7 +103,7 @@ def test_a_corner_must_press_harder_on_coarser_taxels():
     )
     felt = []
     for count in (8, 4, 1):
-        worn = CapacitiveSkin().on(Robot(boards=(Boards("front", count),)).shell)
+        worn = CapacitiveSkin(shell=Robot(boards=(Boards("front", count),)).shell)
         state, reading = worn.sense(worn.init(jax.random.key(0)), corner, SETTLED)
         felt.append(float(state.signal.max()))
     assert felt == sorted(felt, reverse=True)

@@ -24,7 +24,7 @@ from rps_jax.control.observation import Observation
 from rps_jax.geometry import footprint as fp
 from rps_jax.geometry.footprint import Footprint
 from rps_jax.robot.shell import HALF_LENGTH, HALF_WIDTH
-from rps_jax.robot.skin import NONE, CapacitiveSkin, IdealSkin, SmoothSkin
+from rps_jax.robot.skin import NONE, CapacitiveSkin, IdealSkin
 from rps_jax.trials import host, pushes
 from rps_jax.trials.pushes import Case
 from rps_jax.trials.setting import Setting
@@ -364,7 +364,10 @@ def test_a_temperature_that_is_no_positive_length_is_refused(name, value):
 SETTLED = 1e3  # [s] a period after which the low-pass filter has forgotten its past
 SHAPES = 128  # read at once
 IMPERFECT = CapacitiveSkin(gain_spread=0.2, dead_share=0.2)
-SENSORS = {"ideal": SmoothSkin(IdealSkin(), 1e-3), "capacitive": SmoothSkin(CapacitiveSkin(), 0.03)}
+SENSORS = {
+    "ideal": IdealSkin(temperature=1e-3),
+    "capacitive": CapacitiveSkin(temperature=0.03),
+}
 both_sensors = pytest.mark.parametrize("skin", SENSORS.values(), ids=SENSORS)
 
 
@@ -427,7 +430,7 @@ def test_without_heat_the_smooth_skin_is_the_skin(sensor, dull, keen, seed):
     """This includes corners, and dead taxels within a contact."""
     shapes, key = random_shapes(seed), jax.random.key(seed % 2**31)
     exact, less, more = (sense_all(s, shapes, key) for s in (sensor, dull, keen))
-    cold = sense_all(SmoothSkin(sensor, 1e-6), shapes, key)
+    cold = sense_all(sensor._replace(temperature=1e-6), shapes, key)
     sure = np.asarray(less.in_contact == more.in_contact)
     assert sure.mean() > 0.7
     np.testing.assert_allclose(cold.in_contact[sure], exact.in_contact[sure], atol=1e-6)
@@ -449,7 +452,7 @@ def test_the_skin_converges_as_its_temperature_falls(sensor, seed):
     felt = np.asarray(exact.in_contact)
     far, weight = [], []
     for factor in (2.0, 0.5, 0.125):
-        got = sense_all(SmoothSkin(sensor, factor * warm), shapes, key)
+        got = sense_all(sensor._replace(temperature=factor * warm), shapes, key)
         far.append(np.abs(got.p_robot_contact - exact.p_robot_contact)[felt].mean())
         weight.append(np.abs(got.in_contact - exact.in_contact).mean())
     assert (np.diff(weight) < 0).all()
@@ -460,7 +463,7 @@ def test_the_skin_converges_as_its_temperature_falls(sensor, seed):
 @both_sensors
 def test_a_contact_grows_as_the_object_nears_and_is_half_at_the_threshold(skin):
     # The ideal threshold is 6 mm; foam of 10 mm has 1.25 times its capacitance at 8 mm.
-    threshold = 0.006 if isinstance(skin.sensor, IdealSkin) else 0.008
+    threshold = 0.006 if isinstance(skin, IdealSkin) else 0.008
     gaps = np.append(np.linspace(0.03, -0.001, 63), threshold)
     reading = read(skin, [flush(gap, 0.05) for gap in gaps])
     weight = reading.in_contact[:-1]
@@ -552,9 +555,9 @@ def test_the_derivatives_of_a_smooth_reading_agree_with_finite_differences(skin)
 @pytest.mark.parametrize("value", [0.0, -1.0, math.nan, math.inf])
 def test_a_skin_that_is_not_warm_is_refused(value):
     with pytest.raises(errors.InputError, match="temperature"):
-        SmoothSkin(temperature=value).check()
+        IdealSkin(temperature=value).check()
     with pytest.raises(errors.InputError, match="tolerance"):
-        SmoothSkin(IdealSkin(tolerance=-1.0)).check()
+        IdealSkin(tolerance=-1.0, temperature=0.001).check()
 
 
 # Whole trials in C MuJoCo, without compilation
@@ -579,7 +582,7 @@ def push(case: Case, law, horizon: float):
 def test_without_heat_a_smooth_trial_is_the_hard_one(name):
     """The push starts before the first touch and turns towards a target at the side."""
     case = Case(name, FRICTION["S1"], (1.0, -1.5), gap=0.005)
-    cold = replace(case, skin=SmoothSkin(IdealSkin(), 1e-6))
+    cold = replace(case, skin=IdealSkin(temperature=1e-6))
     exact = push(case, rps.LAW, 10.0)
     got = push(cold, registry.smooth_law(rps.LAW, COLD), 10.0)
     assert abs(exact.qpos[2]) > 0.2  # it turned
@@ -592,7 +595,7 @@ def test_without_heat_a_smooth_trial_is_the_hard_one(name):
 @pytest.mark.parametrize("law", [rps.LAW, registry.smooth_law(rps.LAW)], ids=["hard", "smooth"])
 def test_with_a_warm_skin_a_push_arrives(law):
     """Both laws succeed; the hard law reads the binary contact."""
-    case = Case("box", FRICTION["S1"], (0.7, 0.05), skin=SmoothSkin())
+    case = Case("box", FRICTION["S1"], (0.7, 0.05), skin=IdealSkin(temperature=0.001))
     ended = push(case, law, 30.0)
     assert ended.success
     assert ended.min_distance < 0.05

@@ -103,9 +103,9 @@ def check_params(params: Params) -> Params:
 def smooth_law(law: Law, temperatures: Smoothing | None = None) -> Law:
     """Return the smooth form of a law, for derivatives of its actions.
 
-    With a `SmoothSkin`, the twist of a snapshot is a smooth function of the parameters, and so are
-    the contact in `reading` and `details`. Outcomes stay discrete. By default the `temperatures`
-    (widths of the switches) are those of the law.
+    If the skin has a temperature, the twist of a snapshot is a smooth function of the parameters,
+    and so are the contact in `reading` and `details`. Outcomes stay discrete. By default the
+    `temperatures` (widths of the switches) are those of the law.
     """
     if law.temperatures is None:
         names = [name for name, params in LAWS.items() if law_of(params).temperatures is not None]

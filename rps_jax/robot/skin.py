@@ -7,11 +7,16 @@ positions of a contact are the first and the last along the shell's strip.
     sensor.init(key) -> state
     sensor.sense(state, footprint, period) -> (state, Reading)
 
-`SmoothSkin` makes either sensor smooth: its reading has a contact weight from 0 to 1.
+With a `temperature` a sensor is smooth: its reading has a contact weight from 0 to 1. As the
+temperature goes to zero, the reading tends to that without a temperature. The temperature has the
+unit of the threshold: [m] for an ideal sensor, for which 0.001 is a good value; [1], a relative
+change of capacitance, for a capacitive one, for which 0.03 is a good value. It must be well below
+the threshold, or the skin senses contact without an object.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Any, Literal, NamedTuple
 
 import jax
@@ -21,10 +26,10 @@ import numpy as np
 from rps_jax import errors
 from rps_jax.geometry import footprint as fp
 from rps_jax.geometry import planar
-from rps_jax.geometry.arrays import Array, Bool, Float, Int, Scalar
+from rps_jax.geometry.arrays import Array, Bool, Float, Int, Number, Scalar
 from rps_jax.geometry.footprint import Footprint
 from rps_jax.record.options import parse_changes
-from rps_jax.robot.shell import HALF_WIDTH, Shell
+from rps_jax.robot.shell import HALF_WIDTH, Row, Shell
 
 _NODES = 16  # points on each row of boards of the smooth ideal sensor
 _REACH = 8.0  # [1] temperatures beyond the tolerance at which the points end: weight 3e-4
@@ -73,6 +78,7 @@ class IdealSkin(NamedTuple):
     tolerance: float | jax.Array = 0.006  # [m]
     point_length: float | jax.Array = 2 * HALF_WIDTH / 12  # [m] one taxel: longest POINT contact
     shell: Shell = Shell()  # outline and boards; in a trial, the robot's
+    temperature: Number | None = None  # [m]
 
     def check(self) -> None:
         """Raise InputError for fields that are no lengths."""
@@ -80,11 +86,7 @@ class IdealSkin(NamedTuple):
             errors.check_finite(
                 f"skin {name}", getattr(self, name), at_least=0, at_most=0.1, unit="m"
             )
-        self.shell.check()
-
-    def on(self, shell: Shell) -> IdealSkin:
-        """Return this sensor on another shell."""
-        return self._replace(shell=shell)
+        _check(self)
 
     def init(self, key: Array) -> SkinState:
         """Return the empty state."""
@@ -92,16 +94,14 @@ class IdealSkin(NamedTuple):
 
     def sense(
         self, state: SkinState, footprint: Footprint, period: Scalar
-    ) -> tuple[SkinState, Reading]:
+    ) -> tuple[SkinState, Reading | SmoothReading]:
         """Return the middle between the two ends of the contact interval; the period is unused."""
         del period
-        dtype = footprint.vertices.dtype
+        if self.temperature is not None:
+            return state, self._smooth_reading(footprint, self.temperature)
         hits, positions = [], []  # of both ends of each row's interval, in strip order
-        for row in self.shell.rows():
-            start, along = jnp.asarray(row.start, dtype), jnp.asarray(row.along, dtype)
-            low, high = fp.crossing(footprint, start, along, self.tolerance)
-            hit = (low <= high) & (high >= 0) & (low <= row.length)
-            for s in (low, high):
+        for row, start, along, *ends, hit in self._crossings(footprint, self.tolerance):
+            for s in ends:
                 s = jnp.clip(s, 0.0, row.length)
                 positions.append(jnp.concatenate([start + s * along, row.offset + s[None]]))
                 hits.append(hit)
@@ -110,18 +110,27 @@ class IdealSkin(NamedTuple):
         kind = jnp.where(last[2] - first[2] > self.point_length, LINE, POINT)
         return state, _reading(jnp.where(jnp.any(hits), kind, NONE), first[:2], last[:2])
 
-    def sense_smoothly(
-        self, state: SkinState, footprint: Footprint, period: Scalar, temperature: Scalar
-    ) -> tuple[SkinState, SmoothReading]:
+    def _crossings(
+        self, footprint: Footprint, tolerance: Scalar
+    ) -> Iterator[tuple[Row, Array, Array, Array, Array, Array]]:
+        """Yield each row of boards, its start and direction, and its interval within `tolerance`.
+
+        The interval has two ends [m] along the row, and a flag: whether it meets the row.
+        """
+        dtype = footprint.vertices.dtype
+        for row in self.shell.rows():
+            start, along = jnp.asarray(row.start, dtype), jnp.asarray(row.along, dtype)
+            low, high = fp.crossing(footprint, start, along, tolerance)
+            yield row, start, along, low, high, (low <= high) & (high >= 0) & (low <= row.length)
+
+    def _smooth_reading(self, footprint: Footprint, temperature: Number) -> SmoothReading:
         """Return the reading of points whose activity is a sigmoid.
 
-        The activity of a point at signed distance x is sigmoid((tolerance - x) / temperature), with
-        a temperature in [m]. The contact is one run along the strip, also around a corner: its mean
-        is the middle of its two ends, its total activity their distance. The points lie where
-        `footprint.crossing` finds a face near enough and move with the object, so that a few
-        suffice. As the temperature falls, the reading tends to that of `sense`.
+        The activity of a point at signed distance x is sigmoid((tolerance - x) / temperature). The
+        contact is one run along the strip, also around a corner: its mean is the middle of its two
+        ends, its total activity their distance. The points lie where `footprint.crossing` finds a
+        face near enough and move with the object, so that a few suffice.
         """
-        del period
         s, share = self._nodes(footprint, self.tolerance + _REACH * temperature)
         distance = fp.signed_distance(footprint, self.shell.on_strip(s))
         excess = (self.tolerance - distance) / temperature
@@ -130,7 +139,7 @@ class IdealSkin(NamedTuple):
         length = jnp.sum(share * jax.nn.sigmoid(excess))
         first, last = self.shell.on_strip(middle + length * jnp.array([-0.5, 0.5], s.dtype))
         kind = jnp.where(length > self.point_length, LINE, POINT)
-        return state, _smooth_reading(planar.greatest(excess), kind, first, last)
+        return _smooth_reading(planar.greatest(excess), kind, first, last)
 
     def _nodes(self, footprint: Footprint, tolerance: Scalar) -> tuple[jax.Array, jax.Array]:
         """Return points (N,) [m] of the strip within `tolerance` of a footprint, and their lengths.
@@ -139,11 +148,7 @@ class IdealSkin(NamedTuple):
         """
         middles = (np.arange(_NODES) + 0.5) / _NODES
         nodes, shares = [], []
-        for row in self.shell.rows():
-            dtype = footprint.vertices.dtype
-            start, along = jnp.asarray(row.start, dtype), jnp.asarray(row.along, dtype)
-            low, high = fp.crossing(footprint, start, along, tolerance)
-            near = (low <= high) & (high >= 0) & (low <= row.length)
+        for row, _, _, low, high, near in self._crossings(footprint, tolerance):
             low = jnp.where(near, jnp.clip(low, 0.0, row.length), 0.0)
             high = jnp.where(near, jnp.clip(high, 0.0, row.length), row.length)
             nodes.append(row.offset + low + (high - low) * middles)
@@ -167,6 +172,7 @@ class CapacitiveSkin(NamedTuple):
     gain_spread: float | jax.Array = 0.0  # [1] standard deviation of the taxels' gains about 1
     dead_share: float | jax.Array = 0.0  # [1] probability that a taxel is dead
     shell: Shell = Shell()  # outline and boards; in a trial, the robot's
+    temperature: Number | None = None  # [1]
 
     def check(self) -> None:
         """Raise InputError for foam, filter or imperfections that no skin can have."""
@@ -176,11 +182,7 @@ class CapacitiveSkin(NamedTuple):
         for name in ("threshold", "noise", "gain_spread"):
             errors.check_finite(f"skin {name}", getattr(self, name), at_least=0)
         errors.check_finite("skin dead_share", self.dead_share, at_least=0, at_most=1)
-        self.shell.check()
-
-    def on(self, shell: Shell) -> CapacitiveSkin:
-        """Return this sensor on another shell."""
-        return self._replace(shell=shell)
+        _check(self)
 
     def init(self, key: Array) -> SkinState:
         """Draw the gain of each taxel, and whether it is dead."""
@@ -228,65 +230,30 @@ class CapacitiveSkin(NamedTuple):
 
     def sense(
         self, state: SkinState, footprint: Footprint, period: Scalar
-    ) -> tuple[SkinState, Reading]:
+    ) -> tuple[SkinState, Reading | SmoothReading]:
         """Return the reading of one scan of all taxels."""
-        return self.read(*self._scan(state, footprint), period)
+        state, raw = self._scan(state, footprint)
+        if self.temperature is None:
+            return self.read(state, raw, period)
+        state = self._filtered(state, raw, period)
+        return state, self._smooth_reading(state, self.temperature)
 
-    def sense_smoothly(
-        self, state: SkinState, footprint: Footprint, period: Scalar, temperature: Scalar
-    ) -> tuple[SkinState, SmoothReading]:
+    def _smooth_reading(self, state: SkinState, temperature: Number) -> SmoothReading:
         """Return the reading of taxels whose activity is a sigmoid.
 
-        The activity of a taxel is sigmoid((signal - threshold) / temperature), with a temperature
-        in [1]. It serves as the probability of being active: the two ends of the contact are the
-        expected first and last active taxels. As the temperature falls they tend to those of
-        `sense`, also if dead taxels interrupt a contact.
+        The activity of a taxel is sigmoid((signal - threshold) / temperature). It serves as the
+        probability of being active: the two ends of the contact are the expected first and last
+        active taxels. As the temperature falls they tend to those of `read`, also if dead taxels
+        interrupt a contact.
         """
-        state = self._filtered(*self._scan(state, footprint), period)
         excess = jnp.where(state.alive, (state.signal - self.threshold) / temperature, _NEVER)
         middles = jnp.asarray(self.shell.taxels()[:, 0], excess.dtype)
         first, last = _first(excess) @ middles, _first(excess[::-1]) @ middles[::-1]
         kind = jnp.clip(jnp.sum(excess > 0), POINT, LINE)
-        return state, _smooth_reading(planar.greatest(excess), kind, first, last)
+        return _smooth_reading(planar.greatest(excess), kind, first, last)
 
 
-class SmoothSkin(NamedTuple):
-    """A sensor with a soft threshold. As the temperature goes to zero it tends to the sensor.
-
-    The temperature has the threshold's unit: [m] for an ideal sensor; [1], a relative change of
-    capacitance, for a capacitive one, for which 0.03 is a good value. It must be well below the
-    threshold, or the skin senses contact without an object.
-    """
-
-    sensor: IdealSkin | CapacitiveSkin = IdealSkin()
-    temperature: float | jax.Array = 0.001
-
-    @property
-    def shell(self) -> Shell:
-        """Shell of the sensor."""
-        return self.sensor.shell
-
-    def on(self, shell: Shell) -> SmoothSkin:
-        """Return this sensor on another shell."""
-        return self._replace(sensor=self.sensor.on(shell))
-
-    def check(self) -> None:
-        """Raise InputError for an invalid sensor or temperature."""
-        self.sensor.check()
-        errors.check_finite("skin temperature", self.temperature, above=0, at_most=1)
-
-    def init(self, key: Array) -> SkinState:
-        """Return the state of the sensor before its first reading."""
-        return self.sensor.init(key)
-
-    def sense(
-        self, state: SkinState, footprint: Footprint, period: Scalar
-    ) -> tuple[SkinState, SmoothReading]:
-        """Return a smooth reading, by the rule of the sensor."""
-        return self.sensor.sense_smoothly(state, footprint, period, self.temperature)
-
-
-Skin = IdealSkin | CapacitiveSkin | SmoothSkin  # a pytree of parameters with two pure functions
+Skin = IdealSkin | CapacitiveSkin  # a pytree of parameters with two pure functions
 
 
 def signals(skin: Skin, state: SkinState, footprint: Footprint) -> Float[Array, " T"]:
@@ -299,6 +266,13 @@ def signals(skin: Skin, state: SkinState, footprint: Footprint) -> Float[Array, 
         return jnp.where(state.alive, state.signal, 0.0)
     perfect = CapacitiveSkin(shell=skin.shell)
     return perfect._scan(perfect.init(state.key), footprint)[1]
+
+
+def _check(skin: Skin) -> None:
+    """Raise InputError for an invalid shell or temperature."""
+    skin.shell.check()
+    if skin.temperature is not None:
+        errors.check_finite("skin temperature", skin.temperature, above=0, at_most=1)
 
 
 def check_taxels(signal: np.ndarray, shell: Shell, source: str) -> None:
@@ -356,7 +330,7 @@ def parse_skin(skin: SkinLike) -> Any:
         return skin
     name, changes = parse_changes("skin", skin)
     preset: Any = SKINS[errors.check_name("skin", name, SKINS)]  # pyright: ignore
-    known = [field for field in preset._fields if field != "shell"]  # the robot has the shell
+    known = [field for field in preset._fields if field not in ("shell", "temperature")]
     for field, value in changes.items():
         errors.check_name(f"number of the skin {name}", field, known)
         errors.check_number(f"skin {field}", value)

@@ -100,7 +100,7 @@ class Case(TrialOptions):
     @cached_property
     def sensor(self) -> Skin:
         """The skin on the robot."""
-        return skins.parse_skin(self.skin or "ideal").on(self.base.shell)
+        return skins.parse_skin(self.skin or "ideal")._replace(shell=self.base.shell)
 
     @property
     def title(self) -> str:

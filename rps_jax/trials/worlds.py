@@ -84,7 +84,7 @@ def _skin(domain: Domain, drawn: Draw) -> Skin:
     sensor = IdealSkin() if domain.skin == "ideal" else CapacitiveSkin()
     repeated: Any = jax.tree.map(lambda x: np.full(drawn.indices.size, x, float), sensor)
     quantities = {} if domain.skin == "ideal" else _drawn(drawn, "skin")
-    return repeated.on(drawn.robot.shell)._replace(**quantities)
+    return repeated._replace(shell=drawn.robot.shell, **quantities)
 
 
 def starts(drawn: Draw) -> np.ndarray:

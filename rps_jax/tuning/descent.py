@@ -23,7 +23,7 @@ from rps_jax.control import registry, soft
 from rps_jax.control.base import LawParams
 from rps_jax.engines.base import Stage
 from rps_jax.record.options import option
-from rps_jax.robot.skin import CapacitiveSkin, SmoothSkin
+from rps_jax.robot.skin import CapacitiveSkin
 from rps_jax.runs.question import call_of
 from rps_jax.trials.score import Objective
 from rps_jax.trials.setting import Setting
@@ -155,10 +155,9 @@ def soft_score(
 def soften_skins(worlds: World) -> World:
     """Return worlds (n, ...) with smooth skins."""
     sensor = worlds.skin
-    assert not isinstance(sensor, SmoothSkin)
     temperature = 0.03 if isinstance(sensor, CapacitiveSkin) else 0.001
     temperatures = jnp.full(len(worlds.key), temperature)
-    return worlds._replace(skin=SmoothSkin(sensor, temperatures))
+    return worlds._replace(skin=sensor._replace(temperature=temperatures))
 
 
 def window_scores(options: TuneGrad, stage: Stage) -> gradients.Scores:

@@ -10,7 +10,7 @@ after several times. Derivatives of chaotic worlds may be finite and meaningless
 variance is large.
 
 `reverse` differentiates the scores, so they must be smooth: use `registry.smooth_law` with a
-`skin.SmoothSkin`. Derivatives miss all jumps of a score.
+a skin with a temperature. Derivatives miss all jumps of a score.
 """
 
 from collections.abc import Callable

@@ -196,7 +196,7 @@ def worlds(
     world: Any = {
         "fields": fields,
         "footprint": Footprint(solids.vertices, solids.radius),  # type: ignore[arg-type]
-        "skin": same(IdealSkin().on(_ROBOT.shell)),
+        "skin": same(IdealSkin(shell=_ROBOT.shell)),
         "p_world_target": np.tile([90.0, 0.0], (count, 1)),  # never reached
         "shift": same(Shift(p_robot=jnp.zeros(2))),
         "qpos": starts(slider, grid),

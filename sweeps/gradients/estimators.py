@@ -115,12 +115,12 @@ def distances(
 
     Example:
       >>> from rps_jax import RPSParams
-      >>> from rps_jax.robot.skin import SmoothSkin
+      >>> from rps_jax.robot.skin import IdealSkin
       >>> from rps_jax.trials.case import Case
       >>> from rps_jax.tuning.space import Space
       >>> from sweeps.gradients import estimators
       >>> space = Space(("K_h", "L"))
-      >>> ahead = Case("box", "S1", (1.0, 1.0), skin=SmoothSkin(), gap=0.0)
+      >>> ahead = Case("box", "S1", (1.0, 1.0), skin=IdealSkin(temperature=0.001), gap=0.0)
       >>> scores, worlds = estimators.distances([ahead], space.params, [0.2, 0.4])
       >>> estimate = estimators.forward(scores, space.vector(RPSParams.paper()), worlds)
       >>> estimate.gradient.shape

@@ -77,7 +77,7 @@ def program(law: registry.LawLike, robot: Any = "ideal", skin: Any = "capacitive
     label, params = registry.resolve_law(law)
     params = registry.check_params(params)
     functions, base = registry.law_of(params), robots.parse_robot(robot)
-    sensor = skins.parse_skin(skin).on(base.shell)
+    sensor = skins.parse_skin(skin)._replace(shell=base.shell)
     if not isinstance(sensor, CapacitiveSkin) or not sensor.shell.count:
         raise InputError(
             f"skin = {skin} is not allowed: name one with taxels, as capacitive, on a robot with "
