@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from rps_jax import errors
-from rps_jax.errors import InputError
 from rps_jax.record import files
 from rps_jax.record.options import parse_changes
 from rps_jax.robot.robot import Robot, RobotLike, parse_robot
@@ -134,40 +134,28 @@ class Domain:
             scene.check_contact(friction, None)
         errors.check_name("domain skin", self.skin, ("ideal", "capacitive"))
         if self.feet is not None and not set(self.objects) <= set(RANDOM):
-            raise InputError(
-                f"domain feet are not allowed with objects = {self.objects}: only random objects "
-                "stand on drawn feet."
-            )
+            objects = f"{self.feet} with objects = {self.objects}"
+            raise errors.not_allowed("domain feet", objects, "only random objects have drawn feet")
         self.robot.check()
         for target in self.targets:
             scene.check_target(target, self.robot.shell)
         for name, quantity in QUANTITIES.items():
             if (interval := getattr(self, name)) is None:
                 continue
+            field = f"domain {name}"
             if not isinstance(interval, Range):
-                raise InputError(
-                    f"domain {name} = {interval!r} is not allowed: give a Range, as Range(3, 10)."
-                )
+                raise errors.not_allowed(field, interval, "give a Range, as Range(3, 10)")
             low, high, log = interval
+            bounds = {"at_least": quantity.low, "at_most": quantity.high, "unit": quantity.unit}
             for side, value in (("low", low), ("high", high)):
-                errors.check_finite(
-                    f"domain {name} ({side})",
-                    value,
-                    at_least=quantity.low,
-                    at_most=quantity.high,
-                    unit=quantity.unit,
-                )
+                errors.check_finite(f"{field} ({side})", value, **bounds)
             if low > high or (log and low <= 0):
-                raise InputError(
-                    f"domain {name} = {low:g} to {high:g} is not allowed: low must not exceed high"
-                    f"{', and be above 0' if log else ''}."
-                )
+                rule = "low must not exceed high" + (", and be above 0" if log else "")
+                raise errors.not_allowed(field, f"{low:g} to {high:g}", rule)
         reach = math.hypot(*self.robot.shell.half)
         if not self.targets and self.distance.low <= reach:
-            raise InputError(
-                f"domain distance (low) = {self.distance.low:g} m is not allowed: targets must lie "
-                f"outside the robot, which reaches {reach:.2f} m."
-            )
+            rule = f"targets must lie outside the robot, which reaches {reach:.2f} m"
+            raise errors.not_allowed("domain distance (low)", f"{self.distance.low:g} m", rule)
 
     @property
     def weakest(self) -> Robot:
@@ -178,11 +166,20 @@ class Domain:
     @property
     def combinations(self) -> int:
         """Number of combinations of objects, frictions and targets."""
-        return len(self.objects) * max(1, len(self.frictions)) * max(1, len(self.targets))
+        return math.prod(self.counts)
 
-    def object_of(self, index: np.ndarray) -> np.ndarray:
+    @property
+    def counts(self) -> tuple[int, int, int]:
+        """Number of objects, frictions and targets of the lists; 1 for an empty list."""
+        return len(self.objects), max(1, len(self.frictions)), max(1, len(self.targets))
+
+    def choices(self, index: ArrayLike) -> tuple[np.ndarray, ...]:
+        """Return the positions in the lists of object, friction and target of worlds `index`."""
+        return np.unravel_index(np.asarray(index) % self.combinations, self.counts)
+
+    def object_of(self, index: ArrayLike) -> np.ndarray:
         """Return the position in `objects` of the objects of the worlds `index`."""
-        return index // (self.combinations // len(self.objects)) % len(self.objects)
+        return self.choices(index)[0]
 
     @property
     def idle(self) -> frozenset[str]:
@@ -206,7 +203,7 @@ class Domain:
 
     def family_of(self, index: int) -> str:
         """Return the shape family of the object of one world."""
-        return self.families[int(self.object_of(np.asarray(index)))]
+        return self.families[int(self.object_of(index))]
 
 
 RANDOM = {"random_box": "box", "random_cylinder": "cylinder", "random_prism": "prism"}
@@ -315,19 +312,16 @@ def parse_domain(domain: DomainLike, robot: RobotLike | None = None) -> Domain:
     if isinstance(domain, Domain):
         return domain
     if not isinstance(domain, str):
-        raise InputError(f"domain = {domain!r} is not allowed: give a name or a Domain.")
+        raise errors.not_allowed("domain", domain, "give a name or a Domain")
     head, changes = parse_changes("domain", domain)
     if head.endswith(".json"):
         base = from_json(files.read_json(Path(head)))
     else:
         base = DOMAINS[errors.check_name("domain", head, DOMAINS)]
     for name in changes:
-        errors.check_name("domain quantity", name, [item.name for item in fields(Domain)])
         if name in base.idle:
-            raise InputError(
-                f"domain = {domain} is not allowed: its objects, frictions, targets or skin leave "
-                f"no {name} to draw."
-            )
+            rule = f"its objects, frictions, targets or skin leave no {name} to draw"
+            raise errors.not_allowed("domain", domain, rule)
     return replace(base, **_from_json(changes, base))
 
 
@@ -387,5 +381,5 @@ def _from_json(values: Mapping[str, Any], base: Domain) -> dict[str, Any]:
         try:
             parsed[name] = read(value)
         except (TypeError, ValueError, OverflowError) as error:
-            raise InputError(f"domain {name} = {value} is not allowed: write {form}.") from error
+            raise errors.not_allowed(f"domain {name}", value, f"write {form}") from error
     return parsed

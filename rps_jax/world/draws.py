@@ -151,13 +151,12 @@ def _robots(robot: Robot, at: dict[str, np.ndarray], count: int) -> Robot:
 def _friction(domain: Domain, index: np.ndarray, at: dict[str, np.ndarray]) -> Friction:
     if not domain.frictions:
         return Friction(at["friction_ground"], at["friction_robot"])
-    rows = index // max(1, len(domain.targets)) % len(domain.frictions)
-    return Friction(*np.array(domain.frictions)[rows].T)
+    return Friction(*np.array(domain.frictions)[domain.choices(index)[1]].T)
 
 
 def _targets(domain: Domain, index: np.ndarray, at: dict[str, np.ndarray]) -> np.ndarray:
     if domain.targets:
-        return np.array(domain.targets)[index % len(domain.targets)]
+        return np.array(domain.targets)[domain.choices(index)[2]]
     along = np.stack([np.cos(at["bearing"]), np.sin(at["bearing"])], axis=-1)
     return at["distance"][:, None] * along
 

@@ -37,6 +37,7 @@ from rps_jax.world.draws import Draw
 
 CoordinateKind = Literal["range", "choice", "shape", "noise"]
 FILE = "points.nc"  # in a run folder whose worlds are points
+_CHOICES = ("object", "friction", "target")  # from the lists of a domain
 _OF_PRISMS = ("sides", "turn", *(f"corner_{i}" for i in range(SIDES)))
 _OF_FEET = ("feet_number", "feet_turn")
 _TURN = Range(0, 2 * np.pi)
@@ -61,7 +62,7 @@ def coordinates(domain: Domain) -> tuple[Coordinate, ...]:
 
 
 def _coordinates(domain: Domain) -> Iterator[Coordinate]:
-    for name, count in zip(("object", "friction", "target"), _counts(domain), strict=True):
+    for name, count in zip(_CHOICES, domain.counts, strict=True):
         if count > 1:
             yield Coordinate(name, "choice", Range(0, count), "1")
     random = set(domain.objects) & set(RANDOM)
@@ -91,10 +92,8 @@ def check_drawn(field: str, name: str, domain: Domain) -> str:
     drawn = names(domain, "range")
     known = (*QUANTITIES, *VELOCITY_ERRORS, "com_bearing")
     if name in known and name not in drawn:
-        raise InputError(
-            f"{field} = {name} is not allowed: this domain does not draw it; it draws "
-            f"{', '.join(drawn)}."
-        )
+        rule = f"this domain does not draw it; it draws {', '.join(drawn)}"
+        raise errors.not_allowed(field, name, rule)
     return errors.check_name(field, name, drawn)
 
 
@@ -115,11 +114,12 @@ class Points:
     def cases(self, domain: Domain, index: Any) -> np.ndarray:
         """Return indices of the domain with the object, friction and target of the worlds."""
         rows = dict(zip(names(domain), self.u[np.asarray(index)].T, strict=True))
-        indices = np.zeros(np.shape(index), np.int64)
-        for name, count in zip(("object", "friction", "target"), _counts(domain), strict=True):
-            choice = np.floor(rows[name] * count).astype(np.int64) if name in rows else 0
-            indices = indices * count + choice
-        return indices
+        nothing = np.zeros(np.shape(index))
+        choices = [
+            np.floor(rows.get(name, nothing) * count).astype(np.int64)
+            for name, count in zip(_CHOICES, domain.counts, strict=True)
+        ]
+        return np.ravel_multi_index(choices, domain.counts)
 
     def draw(self, domain: Domain, index: Any) -> Draw:
         """Return the worlds `index` (n,), all of one object of the domain."""
@@ -149,11 +149,6 @@ class Points:
         return points
 
 
-def _counts(domain: Domain) -> tuple[int, int, int]:
-    """Return the number of objects, frictions and targets of the lists; 1 for an empty list."""
-    return len(domain.objects), max(1, len(domain.frictions)), max(1, len(domain.targets))
-
-
 def check_points(domain: Domain, u: Any) -> Points:
     """Return the points of an array (n, q) or of a dataset of `worlds_at`; or InputError."""
     expected = names(domain)
@@ -161,31 +156,20 @@ def check_points(domain: Domain, u: Any) -> Points:
         if "u" not in u or "quantity" not in u.coords:
             raise InputError("points are not allowed: the dataset has no u (world, quantity).")
         theirs = tuple(map(str, u.quantity.values))
-        if theirs != expected or (
-            "domain" in u.attrs and not _is_json_of(u.attrs["domain"], domain)
-        ):
-            raise InputError(
-                "points are not allowed: they are of another domain; give that domain."
-            )
+        text = u.attrs.get("domain")
+        if theirs != expected or not (text is None or _is_json_of(text, domain)):
+            raise InputError("points are not allowed: they are of another domain; give it.")
         u = u.u.values
     try:
         values = np.array(u, float)
     except (TypeError, ValueError) as error:
-        raise InputError(
-            f"u = {u!r} is not allowed: give an array (n, {len(expected)})."
-        ) from error
+        raise errors.not_allowed("u", u, f"give an array (n, {len(expected)})") from error
     if values.ndim != 2 or values.shape[1] != len(expected) or not len(values):
-        raise InputError(
-            f"u of shape {values.shape} is not allowed: it must be (n, {len(expected)}), a row for "
-            f"each world and a column for each of {', '.join(expected)}."
-        )
-    outside = np.argwhere(~((values >= 0) & (values < 1)))
-    if len(outside):
-        row, column = outside[0]
-        raise InputError(
-            f"u[{row}, {column}] = {values[row, column]} ({expected[column]}) is not allowed: it "
-            "must be at least 0 and below 1."
-        )
+        rule = f"it must be (n, {len(expected)}), with the columns {', '.join(expected)}"
+        raise errors.not_allowed("shape of u", values.shape, rule)
+    for row, column in np.argwhere(~((values >= 0) & (values < 1))):
+        value = f"{values[row, column]} ({expected[column]})"
+        raise errors.not_allowed(f"u[{row}, {column}]", value, "it must be at least 0 and below 1")
     errors.check_count("points", len(values), at_most=_MAX_POINTS)
     return Points(values)
 
@@ -210,12 +194,8 @@ def points_of(domain: Domain | str, index: ArrayLike, seed: int = 0) -> np.ndarr
     index = np.atleast_1d(np.asarray(index, np.int64))
     uniform = draws.random_numbers(seed, index)
     by_name = {name: uniform[:, column] for name, column in draws.USES.items()}
-    objects, frictions, targets = _counts(domain)
-    of_lists = {
-        "object": (domain.object_of(index) + 0.5) / objects,
-        "friction": (index // targets % frictions + 0.5) / frictions,
-        "target": (index % targets + 0.5) / targets,
-    }
+    positions = zip(_CHOICES, domain.choices(index), domain.counts, strict=True)
+    of_lists = {name: (choice + 0.5) / count for name, choice, count in positions}
     return np.stack([(by_name | of_lists)[name] for name in names(domain)], axis=-1)
 
 
