@@ -163,8 +163,8 @@ BAD_FILES = {
         _body(root).find("geom").attrib.pop("name"),
     ),
     "joints of .* no other body a joint": _with_a_hinge,
-    "bodies within the body object": _with_a_lid,
-    "from 0 to 0.8 m .* in the middle of its height": lambda root: (
+    "no other body within it": _with_a_lid,
+    "0 to 0.8 m is not allowed: .* in the middle of its height": lambda root: (
         _body(root).find("geom").set("pos", "0 0 0.4")
     ),
     "height = 0.02": lambda root: _body(root).find("geom").set("size", "0.2 0.2 0.01"),
@@ -202,9 +202,9 @@ def test_an_invalid_footprint_is_rejected(footprint, message):
 
 def test_names_of_the_package_cannot_be_registered():
     for name in ("box", "prism"):
-        with pytest.raises(InputError, match=f"object name '{name}' is not allowed"):
+        with pytest.raises(InputError, match=f"name of an object = {name} is not allowed"):
             objects.register_object(name, BOX)
-    with pytest.raises(InputError, match="law name 'rps' is not allowed"):
+    with pytest.raises(InputError, match="name of a law = rps is not allowed"):
         registry.register_law("rps", rps.LAW, RPSParams())
     with pytest.raises(InputError, match=r"MuJoCo cannot compile .*nowhere.xml"):
         objects.register_object("mine", "nowhere.xml")

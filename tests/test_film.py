@@ -156,5 +156,7 @@ def test_more_trials_than_places_are_refused(tmp_path):
     table(tmp_path)
     takes, _ = Film(tmp_path, "1x2").takes()
     tiles = [video.Tile(scene, (1.0, 1.0)) for scene in takes[0].scenes]
-    with pytest.raises(InputError, match="grid = 1x1 is not allowed for 2 trials"):
+    with pytest.raises(
+        InputError, match="grid = 1x1 is not allowed: it must have room for all 2 trials"
+    ):
         video.render_grid(tiles, [], tmp_path / "x.mp4", shape=(1, 1), size=(320, 180))

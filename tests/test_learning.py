@@ -197,12 +197,12 @@ def pickled(content):
 
 
 BAD = {
-    "truncated": (lambda c: c[: len(c) // 2], "it is no readable policy"),
-    "empty": (lambda c: b"", "it is no readable policy"),
-    "text": (lambda c: b"hello", "it is no readable policy"),
-    "pickled": (pickled, "it is no readable policy"),
-    "bit": (with_changed_bit, "is corrupt: its digest does not match"),
-    "version": (partial(damaged, about={"version": 7}), "its version is 7"),
+    "truncated": (lambda c: c[: len(c) // 2], "give a file that `rps learn` wrote"),
+    "empty": (lambda c: b"", "give a file that `rps learn` wrote"),
+    "text": (lambda c: b"hello", "give a file that `rps learn` wrote"),
+    "pickled": (pickled, "give a file that `rps learn` wrote"),
+    "bit": (with_changed_bit, "its digest does not match"),
+    "version": (partial(damaged, about={"version": 7}), "version 7"),
     "format": (partial(damaged, about={"format": "other"}), "its format is other"),
     "network": (
         partial(damaged, about={"network": network_of("mlp")._asdict()}),
@@ -220,7 +220,7 @@ BAD = {
         partial(damaged, **{"action.b": np.full(3, np.nan, np.float32)}),
         "action.b must hold finite numbers of 32 bits",
     ),
-    "task": (partial(damaged, about={"task": {"v_max": 1.0}}), "must have d_success, v_max"),
+    "task": (partial(damaged, about={"task": {"v_max": 1.0}}), "d_success"),
 }
 
 
@@ -238,7 +238,7 @@ def test_an_invalid_policy_file_is_refused_in_one_sentence(name, tmp_path):
 def test_commands_refuse_bad_policies_before_anything_compiles(tmp_path, capsys, compiled):
     (tmp_path / "bad.npz").write_bytes(b"hello")
     error = refusal(capsys, "ladder", "--laws", tmp_path / "bad.npz", "--out", tmp_path / "run")
-    assert "no readable policy" in error
+    assert "give a file that `rps learn` wrote" in error
     error = refusal(capsys, "sweep", "--laws", tmp_path / "none.npz", "--out", tmp_path / "run")
     assert "cannot be read (No such file or directory)" in error
     for options, words in {

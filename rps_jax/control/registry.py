@@ -147,27 +147,23 @@ def register_law(name: str, law: Law, params: LawParams) -> None:
       >>> register_law("ahead", Law(lambda params: (), step), Ahead())
     """
     if not isinstance(name, str) or not isinstance(law, Law):
-        raise InputError(f"law {name!r} = {law!r} is not allowed: pass a name and a Law.")
+        raise errors.not_allowed(f"law {name!r}", repr(law), "pass a name and a Law")
     errors.check_name(f"senses of law '{name}'", law.senses, get_args(Senses))
     if name in PACKAGE_LAWS:
-        names = ", ".join(PACKAGE_LAWS)
-        raise InputError(f"law name '{name}' is not allowed: the package has the laws {names}.")
+        rule = f"the package has the laws {', '.join(PACKAGE_LAWS)}"
+        raise errors.not_allowed("name of a law", name, rule)
     kind, leaves = type(params), jax.tree.leaves(params)
     is_custom = kind not in (dict, list, tuple) and leaves != [params]
     is_numeric = all(np.issubdtype(np.asarray(leaf).dtype, np.number) for leaf in leaves)
     if not (is_custom and is_numeric and isinstance(params, LawParams)):
-        raise InputError(
-            f"params = {params} of law '{name}' is not allowed: pass a pytree of numbers of a "
-            "custom class, such as a NamedTuple, with a field or property d_success [m]."
-        )
+        rule = "pass a pytree of numbers of a custom class with a field or property d_success [m]"
+        raise errors.not_allowed(f"params of law '{name}'", params, rule)
     errors.check_finite(f"d_success of law '{name}'", params.d_success, above=0, unit="m")
     law.check(params)
     for label, known in (_HIDDEN | LAWS).items():
         if label != name and type(known).__name__ == kind.__name__ and law_of(known) != law:
-            raise InputError(
-                f"params of law '{name}' are not allowed: the law '{label}' has a class of the "
-                f"same name {kind.__name__}; rename one of them."
-            )
+            rule = f"the law '{label}' has a class of the same name {kind.__name__}; rename one"
+            raise errors.not_allowed(f"class of params of law '{name}'", kind, rule)
     previous = _table(name).get(name)
     _table(name)[name], _LAWS_BY_CLASS[kind] = params, law
     if previous is not None and type(previous) not in map(type, (_HIDDEN | LAWS).values()):
@@ -212,10 +208,8 @@ def _parse_head(text: str) -> tuple[str, LawParams]:
         law = _find_registered(module, kind)
     if law is None:
         needed = f"the class {kind}" if kind else "one class of parameters (or use FILE.py:CLASS)"
-        raise InputError(
-            f"law = {text} is not allowed: {path} must define {needed} and call "
-            "rps_jax.register_law with an instance of it."
-        )
+        rule = f"{path} must define {needed} and call rps_jax.register_law with an instance of it"
+        raise errors.not_allowed("law", text, rule)
     _SOURCES[type(law[1])] = {"file": str(Path(path).resolve()), "digest": digest}
     return law
 
@@ -285,7 +279,7 @@ def resolve_laws(laws: LawsLike) -> dict[str, LawParams]:
         errors.check_each_once("laws", items, labels)
         resolved = dict(zip(labels, (params for _, params in pairs), strict=True))
     if not resolved:
-        raise InputError(f"laws = {laws} is not allowed: name at least one law.")
+        raise errors.not_allowed("laws", laws, "name at least one law")
     return {label: check_params(params) for label, params in resolved.items()}
 
 
@@ -340,9 +334,8 @@ def params_from_json(values: Mapping[str, Any]) -> LawParams:
     params = known[errors.check_name("class of parameters", str(kind), known)]
     names = named_leaves(params)
     if set(leaves) != set(names):
-        raise InputError(
-            f"parameters of {kind} are {', '.join(names)}, and not {', '.join(leaves)}."
-        )
+        rule = f"they are {', '.join(names)}"
+        raise errors.not_allowed(f"parameters of {kind}", ", ".join(leaves), rule)
     arrays = {
         name: np.asarray(x, float) if np.ndim(x) else errors.check_number(name, x)
         for name, x in leaves.items()

@@ -27,7 +27,7 @@ from rps_jax.control.observation import (
     TaxelObservation,
     Twist,
 )
-from rps_jax.errors import InputError
+from rps_jax.errors import InputError, not_allowed
 
 Function = Callable[..., object]
 _PACKAGE = str(Path(__file__).resolve().parent.parent)
@@ -74,10 +74,8 @@ def check_law(init: Function, step: Function, senses: Senses, params: LawParams)
         except ValueError:  # a ragged list
             kind = ""
         if kind not in tuple("biuf"):
-            raise InputError(
-                f"params.{name} = {value!r} is not allowed: it must be a real number, or an array "
-                "of these."
-            )
+            rule = "it must be a real number, or an array of these"
+            raise not_allowed(f"params.{name}", repr(value), rule)
     leaves, tree = jax.tree.flatten(params)
     _check_traced(init, step, senses, tree, tuple(np.shape(leaf) for leaf in leaves))
 

@@ -5,6 +5,7 @@ use the upright solid over the footprint, in all engines.
 """
 
 import math
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -125,9 +126,8 @@ def register_object(
       'crate'
     """
     if name in _BUILT_IN:
-        raise InputError(
-            f"object name '{name}' is not allowed: {', '.join(_BUILT_IN)} exist already."
-        )
+        rule = f"{', '.join(_BUILT_IN)} exist already"
+        raise errors.not_allowed("name of an object", name, rule)
     path = Path(path).absolute()
     label = f"object '{name}'"
     model = _compiled(label, path)
@@ -168,14 +168,11 @@ def _compiled(label: str, path: Path) -> mujoco.MjModel:
     joint, body = model.joint("object"), model.body("object")
     free = joint.type[0] == mujoco.mjtJoint.mjJNT_FREE and joint.bodyid[0] == body.id
     if not free or joint.qposadr[0] != 3 or model.nq != 10:
-        raise InputError(
-            f"{label}: the joints of {path} are not allowed: give the body object a free joint, "
-            "and no other body a joint."
-        )
+        rule = "give the body object a free joint, and no other body a joint"
+        raise errors.not_allowed(f"{label}: joints", path, rule)
     if not math.isclose(model.body_subtreemass[body.id], body.mass[0]):
-        raise InputError(
-            f"{label}: bodies within the body object of {path} are not allowed: give it all geoms."
-        )
+        rule = "give the body object all geoms, and no other body within it"
+        raise errors.not_allowed(f"{label}: bodies", path, rule)
     return model
 
 
@@ -192,10 +189,8 @@ def _geom_outline(label: str, model: mujoco.MjModel) -> Footprint:
     centred = np.allclose(geom.pos[:2], 0) and np.allclose(geom.quat, _UPRIGHT)
     if centred and (outline := outline_of(geom)) is not None:
         return outline
-    raise InputError(
-        f"{label}: footprint = None is not allowed: the geom object is not an upright box or "
-        "cylinder about the body's origin, so give the outline."
-    )
+    rule = "the geom object is no upright box or cylinder about the origin, so give the outline"
+    raise errors.not_allowed(f"{label}: footprint", None, rule)
 
 
 def _outline(label: str, footprint: Footprint) -> tuple[str, np.ndarray, float]:
@@ -204,19 +199,16 @@ def _outline(label: str, footprint: Footprint) -> tuple[str, np.ndarray, float]:
     if vertices.shape == (1, 2) and not vertices.any():
         errors.check_finite(f"{label}: radius of the footprint", radius, at_least=0.02, at_most=2)
         return "cylinder", vertices, radius
+    field, value = f"{label}: footprint", f"{vertices.tolist()} with radius {radius:g} m"
     if radius or not 3 <= len(vertices) <= SIDES:
-        raise InputError(
-            f"{label}: footprint = {vertices.tolist()} with radius {radius:g} m is not allowed: "
-            f"give a circle about the origin, or a polygon of 3 to {SIDES} corners with radius 0."
-        )
+        rule = f"give a circle about the origin, or a polygon of 3 to {SIDES} corners with radius 0"
+        raise errors.not_allowed(field, value, rule)
     fp.polygon(vertices)  # raises unless it is convex
     reach = np.linalg.norm(vertices, axis=1).max()
     errors.check_finite(f"{label}: reach of the footprint", reach, at_least=0.02, at_most=2)
     ahead = np.roll(vertices, -1, axis=0)
     if (vertices[:, 0] * ahead[:, 1] <= vertices[:, 1] * ahead[:, 0]).any():
-        raise InputError(
-            f"{label}: footprint = {vertices.tolist()} is not allowed: the origin must be inside."
-        )
+        raise errors.not_allowed(field, value, "the origin must be inside")
     half = np.abs(vertices[0])
     if len(vertices) == 4 and np.allclose(np.abs(vertices), half):
         return "box", solid.rectangles(*half[:, None])[0], 0.0
@@ -227,15 +219,15 @@ def _feet(label: str, feet: np.ndarray, com: np.ndarray) -> np.ndarray:
     """Return feet (SIDES, 3) [m, m, 1]; missing ones have a weight of 0."""
     if feet.ndim == 2 and feet.shape[1] == 2:
         feet = np.column_stack([feet, np.ones(len(feet))])
-    prefix = f"{label}: feet = {feet.tolist()} is not allowed:"
+    refuse = partial(errors.not_allowed, f"{label}: feet", feet.tolist())
     if feet.ndim != 2 or feet.shape[1] != 3 or not 3 <= len(feet) <= SIDES:
-        raise InputError(f"{prefix} give 3 to {SIDES} rows of x, y [m] and, if you like, a weight.")
+        raise refuse(f"give 3 to {SIDES} rows of x, y [m] and, if you like, a weight")
     if not np.isfinite(feet).all() or (feet[:, 2] <= 0).any():
-        raise InputError(f"{prefix} all numbers must be finite, and weights positive.")
+        raise refuse("all numbers must be finite, and weights positive")
     bearing = np.linspace(0, 2 * np.pi, 360)
     reach = (feet[:, :2] - com) @ np.stack([np.cos(bearing), np.sin(bearing)])
     if reach.max(axis=0).min() <= 0:
-        raise InputError(f"{prefix} the centre of mass must be between them, or it tips over.")
+        raise refuse("the centre of mass must be between them, or it tips over")
     missing = np.repeat(feet[-1:] * [1, 1, 0], SIDES - len(feet), axis=0)
     return np.concatenate([feet, missing])
 
@@ -254,8 +246,6 @@ def _height(label: str, model: mujoco.MjModel) -> float:
     z = points @ turn.reshape(3, 3)[2] + geom.pos[2]
     low, high = float(z.min()), float(z.max())
     if abs(low + high) > 1e-3:
-        raise InputError(
-            f"{label}: its geom object reaches from {low:g} to {high:g} m above the body's origin, "
-            "which is not allowed: the origin must be in the middle of its height."
-        )
+        rule = "the body's origin must be in the middle of its height"
+        raise errors.not_allowed(f"{label}: z of its geom object", f"{low:g} to {high:g} m", rule)
     return errors.check_finite(f"{label}: height", high - low, at_least=0.1, at_most=3, unit="m")

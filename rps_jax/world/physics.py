@@ -35,10 +35,8 @@ class Physics:
         check_fields(self)
         steps = self.control_period / self.timestep
         if steps < 0.5 or not math.isclose(steps, round(steps), rel_tol=1e-6):
-            raise errors.InputError(
-                f"control_period = {self.control_period:g} s is not allowed: it must be a "
-                f"multiple of timestep = {self.timestep:g} s."
-            )
+            rule = f"it must be a multiple of timestep = {self.timestep:g} s"
+            raise errors.not_allowed("control_period", f"{self.control_period:g} s", rule)
 
     @property
     def substeps(self) -> int:
@@ -90,7 +88,7 @@ def parse_physics(physics: PhysicsLike, fidelity: Fidelity = "standard") -> Phys
     if isinstance(physics, Physics):
         return physics
     if not isinstance(physics, str):
-        raise errors.InputError(f"physics = {physics!r} is not allowed: give a name or a Physics.")
+        raise errors.not_allowed("physics", repr(physics), "give a name or a Physics")
     name, changes = parse_changes("physics", physics)
     errors.check_name("physics", name, PHYSICS)
     base = preset(name, fidelity)  # pyright: ignore[reportArgumentType]

@@ -233,9 +233,7 @@ def _checked(name: str, values: ArrayLike, length: int) -> np.ndarray:
     """Return a copy (length,) of finite values; InputError for others."""
     array = np.array(values, float)
     if array.shape != (length,) or not np.isfinite(array).all():
-        raise errors.InputError(
-            f"{name} = {array} is not allowed: it must be {length} finite numbers."
-        )
+        raise errors.not_allowed(name, array, f"it must be {length} finite numbers")
     return array
 
 

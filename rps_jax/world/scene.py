@@ -292,10 +292,9 @@ def check_target(p_world_target: tuple[float, float], shell: Shell = Shell()) ->
     )
     half_x, half_y = shell.half
     if abs(x) <= half_x and abs(y) <= half_y:
-        raise errors.InputError(
-            f"target = ({x:g}, {y:g}) m is not allowed: it must lie outside the robot, which "
-            f"covers |x| <= {half_x:g} m and |y| <= {half_y:g} m."
-        )
+        covered = f"|x| <= {half_x:g} m and |y| <= {half_y:g} m"
+        rule = f"it must lie outside the robot, which covers {covered}"
+        raise errors.not_allowed("target", f"({x:g}, {y:g}) m", rule)
 
 
 def _set_robot(spec: mujoco.MjSpec, robot: Robot) -> None:

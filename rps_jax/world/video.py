@@ -124,7 +124,7 @@ def render(
     contacts = itertools.repeat(NO_CONTACT) if none else p_world_contacts
     pairs = zip(frames, contacts, strict=not none)
     if (first := next(pairs, None)) is None:
-        raise errors.InputError("frames = [] is not allowed: a video needs at least one frame.")
+        raise errors.not_allowed("frames", [], "a video needs at least one frame")
     shots = ([Shot(*pair, "")] for pair in itertools.chain([first], pairs))
     tile = Tile(scene, p_world_target)
     render_grid([tile], shots, path, shape=(1, 1), size=size, fps=fps, camera=camera)
@@ -154,13 +154,11 @@ def render_grid(
     """
     errors.check_finite("fps", fps, above=0, at_most=1000)
     if any(n % 2 for n in size):
-        raise errors.InputError(f"size = {size} is not allowed: H.264 needs two even numbers.")
+        raise errors.not_allowed("size", size, "H.264 needs two even numbers")
     (rows, columns), (width, height) = shape, size
     if not 0 < len(tiles) <= rows * columns:
-        raise errors.InputError(
-            f"grid = {rows}x{columns} is not allowed for {len(tiles)} trials: it must have room "
-            "for all, and at least one."
-        )
+        rule = f"it must have room for all {len(tiles)} trials, and at least one"
+        raise errors.not_allowed("grid", f"{rows}x{columns}", rule)
     whole = np.full((rows * height, columns * width, 3), _EMPTY, np.uint8)
     cells = whole.reshape(rows, height, columns, width, 3).swapaxes(1, 2)
     with (

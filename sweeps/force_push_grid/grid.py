@@ -30,6 +30,7 @@ import xarray as xr
 from rps_jax import engines
 from rps_jax.control.base import Law
 from rps_jax.control.laws import force_push_published as force_push
+from rps_jax.control.laws.force_push import steer
 from rps_jax.control.laws.force_push_published import PublishedForcePushParams
 from rps_jax.control.observation import Details, ForceObservation, Twist
 from rps_jax.engines import EngineName
@@ -95,14 +96,14 @@ def build_law(law: LawName = "force_push", duration: float = DURATION) -> Law:
         params: PublishedForcePushParams, state: FollowingState, observation: ForceObservation
     ) -> tuple[FollowingState, Twist, Details]:
         touch = observation.touch
-        period = touch.period
+        period, zero = touch.period, jnp.zeros_like(touch.yaw)
         f_world = -planar.rotate(touch.yaw, observation.f_robot)
         felt = planar.norm(f_world) >= params.f_min
         pushed = state.pushed | felt
-        zero = jnp.zeros_like(touch.yaw)
         offset = touch.p_world_robot[1]
         if law == "force_push":
-            theta_p = force_push.steer(params, state.theta_p, f_world, zero, offset, period)
+            theta_f, limit = planar.wrap(planar.direction(f_world)), params.converge * period
+            theta_p = steer(params, state.theta_p, theta_f, offset, limit, felt)
         else:
             theta_p = -params.k_y * offset
         theta_p = jnp.where(pushed, theta_p, 0.0)

@@ -121,6 +121,20 @@ def init(params: ForcePushParams) -> ForcePushState:
     return ForcePushState(Path.initial(zero.dtype), zero, zero, jnp.zeros(2, zero.dtype))
 
 
+def steer(
+    params: Any,  # of either law
+    theta_p: jax.Array,  # () [rad] at the last step
+    theta_f: jax.Array,  # () [rad] angle of the force from the path
+    offset: jax.Array,  # () [m] of the contact, to the path's left
+    limit: jax.Array,  # () [rad] bound on the change of theta_p without contact
+    in_contact: jax.Array,
+) -> jax.Array:
+    """Return the angle () [rad] of the push from the path."""
+    pushed = (1 + params.k_theta) * theta_f + params.k_y * offset
+    back = theta_p + jnp.clip(planar.wrap(-params.k_y * offset - theta_p), -limit, limit)
+    return planar.wrap(jnp.where(in_contact, pushed, back))
+
+
 def step(
     params: ForcePushParams, state: ForcePushState, obs: Observation
 ) -> tuple[ForcePushState, Twist, Details]:
@@ -133,11 +147,7 @@ def step(
     l_mean = jnp.where(state.path.touched, l_mean, contact[1])
     drifted = jnp.stack([jnp.asarray(params.drift, contact.dtype), contact[1] - l_mean])
     theta_f = planar.wrap(obs.yaw - theta_d) + planar.direction(drifted)
-    pushed = (1 + params.k_theta) * theta_f + params.k_y * offset
-    back = planar.wrap(-params.k_y * offset - state.theta_p)
-    recovered = state.theta_p + jnp.clip(back, -params.converge, params.converge)
-    theta_p = planar.wrap(jnp.where(obs.in_contact, pushed, recovered))
-
+    theta_p = steer(params, state.theta_p, theta_f, offset, params.converge, obs.in_contact)
     angle = planar.wrap(theta_d + theta_p - obs.yaw)
     angle = jnp.clip(angle, -jnp.asarray(params.angle_max), params.angle_max)
     v_contact = params.v_max * jnp.stack([jnp.cos(angle), jnp.sin(angle)])

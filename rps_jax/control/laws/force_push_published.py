@@ -5,7 +5,7 @@ with one point along a path. With theta_d the direction of the path, theta_f the
 contact force on the object from it and Delta the offset of the contact to the left of the path,
 the point moves at the angle
 
-    theta_p = (1 + k_theta) theta_f + k_y Delta        (`steer`)
+    theta_p = (1 + k_theta) theta_f + k_y Delta        (`force_push.steer`)
 
 from the path. A force below f_min counts as no contact; then theta_p tends to -k_y Delta, back to
 the path, at a bounded rate. An admittance reduces the velocity by k_f times the force above f_max
@@ -27,6 +27,7 @@ import jax
 import jax.numpy as jnp
 
 from rps_jax.control.base import Bound, Law, check_signs, document_fields
+from rps_jax.control.laws import force_push
 from rps_jax.control.laws.force_push import Path
 from rps_jax.control.observation import Details, ForceObservation, Twist
 from rps_jax.geometry import planar
@@ -52,9 +53,7 @@ class PublishedForcePushParams(NamedTuple):
 
 
 BOUNDS = {
-    "k_theta": Bound(-2, 4),  # [1]
-    "k_y": Bound(-2, 2),  # [rad/m]
-    "k_omega": Bound(0.005, 2, log=True),  # [1/s]
+    **{name: force_push.BOUNDS[name] for name in ("k_theta", "k_y", "k_omega")},
     "converge": Bound(0.1, 100, log=True),  # [rad/s]
     "f_min": Bound(0.1, 20, log=True),  # [N]
     "f_max": Bound(10, 1000, log=True),  # [N]
@@ -79,22 +78,6 @@ def init(params: PublishedForcePushParams) -> PublishedForcePushState:
     return PublishedForcePushState(Path.initial(zero.dtype), zero, jnp.zeros((), bool))
 
 
-def steer(
-    params: PublishedForcePushParams,
-    theta_p: jax.Array,  # () [rad] at the last step
-    f_world: jax.Array,  # (2,) [N] of the base on the object
-    theta_d: jax.Array,  # () [rad] the path's direction in the world
-    offset: jax.Array,  # () [m] of the contact, to the path's left
-    period: float | jax.Array,  # () [s] since the last step
-) -> jax.Array:
-    """Return the angle () [rad] of the push from the path."""
-    theta_f = planar.wrap(planar.direction(f_world) - theta_d)
-    pushed = (1 + params.k_theta) * theta_f + params.k_y * offset
-    limit = params.converge * period
-    back = theta_p + jnp.clip(planar.wrap(-params.k_y * offset - theta_p), -limit, limit)
-    return planar.wrap(jnp.where(planar.norm(f_world) >= params.f_min, pushed, back))
-
-
 def yield_to_force(
     params: PublishedForcePushParams, v_world: jax.Array, f_world: jax.Array
 ) -> jax.Array:
@@ -112,18 +95,18 @@ def step(
     touch = obs.touch
     path, filled, offset = state.path.update(touch)
     f_world = -planar.rotate(touch.yaw, obs.f_robot)  # on the object
-    pushed = path.touched & (state.pushed | (planar.norm(f_world) >= params.f_min))
-    theta_p = steer(params, state.theta_p, f_world, path.theta_d, offset, touch.period)
+    in_contact = planar.norm(f_world) >= params.f_min
+    pushed = path.touched & (state.pushed | in_contact)
+    theta_f = planar.wrap(planar.direction(f_world) - path.theta_d)
+    limit = params.converge * touch.period
+    theta_p = force_push.steer(params, state.theta_p, theta_f, offset, limit, in_contact)
     theta_p = jnp.where(pushed, theta_p, 0.0)
     angle = path.theta_d + theta_p
     v_world = params.v_max * jnp.stack([jnp.cos(angle), jnp.sin(angle)])
     v_robot = planar.rotate(-touch.yaw, yield_to_force(params, v_world, f_world))
-    state = PublishedForcePushState(path, theta_p, pushed)
-    return (
-        state,
-        path.twist(params, v_robot, touch.yaw),
-        Details.from_obs(filled)._replace(gamma=theta_p),
-    )
+    twist = path.twist(params, v_robot, touch.yaw)
+    details = Details.from_obs(filled)._replace(gamma=theta_p)
+    return PublishedForcePushState(path, theta_p, pushed), twist, details
 
 
 LAW = Law(init, step, "force", check=check, bounds=tuple(BOUNDS.items()))

@@ -52,9 +52,7 @@ def check(params: GuidedParams) -> GuidedParams:
     errors.check_finite("guided.hold", params.hold, at_least=1)
     shape = np.shape(params.offsets)
     if len(shape) != 2 or shape[1] != 3 or not shape[0]:
-        raise errors.InputError(
-            f"guided.offsets of shape {shape} are not allowed: pass (J, 3), J at least 1."
-        )
+        raise errors.not_allowed("shape of guided.offsets", shape, "pass (J, 3), J at least 1")
     if not np.isfinite(np.asarray(params.offsets)).all():
         raise errors.InputError("guided.offsets are not allowed: each must be a finite number.")
     return params

@@ -17,7 +17,6 @@ from rps_jax import errors
 from rps_jax.control.base import Law
 from rps_jax.control.learned import network as networks
 from rps_jax.control.learned.network import LearnedParams, Network, Weights
-from rps_jax.errors import InputError
 from rps_jax.record import files
 
 FORMAT, VERSION = "rps_jax policy", 1
@@ -57,31 +56,23 @@ def decode(content: bytes, source: Path | str) -> Policy:
     """Return the policy of a file's content; InputError names the `source` of invalid content."""
     try:
         arrays = files.decode_arrays(content)
-        digest = str(arrays.pop("digest"))
-        about = files.parse_json(str(arrays["about"]))
-        if about["format"] != FORMAT:
-            raise ValueError(f"its format is {about['format']}")
+        digest, current = str(arrays.pop("digest")), _digest(arrays)
+        about = files.parse_json(str(arrays.pop("about")))
+        if about["format"] != FORMAT or about["version"] != VERSION:
+            raise ValueError(f"its format is {about['format']}, version {about['version']}")
+        if digest != current:
+            raise ValueError("its digest does not match")
+        network = Network(*(about["network"][name] for name in Network._fields)).check()
+        _check_weights(network, arrays)
+        task = {
+            name: errors.check_finite(f"policy {name}", about["task"][name], above=0, at_most=100)
+            for name in LearnedParams._fields
+        }
+        return Policy(network, arrays, LearnedParams(**task), dict(about["learned"]))
     except (ValueError, KeyError, TypeError) as error:
         reason = " ".join(str(error).split()).strip("'\".")
-        fault = f"it is no readable policy ({reason}); give a file that `rps learn` wrote"
-        raise _error(source, fault) from error
-    if (version := about.get("version")) != VERSION:
-        raise _error(source, f"its version is {version}, and this package reads {VERSION}")
-    if digest != _digest(arrays):
-        raise InputError(f"policy = {source} is corrupt: its digest does not match; restore it.")
-    del arrays["about"]
-    learned = about.get("learned")
-    if not isinstance(learned, dict):
-        raise _error(source, f"its record of learning is {learned!r}, and must be a JSON object")
-    task = {
-        name: errors.check_finite(f"policy {name}", value, above=0, at_most=100)
-        for name, value in _section("task", LearnedParams._fields, about, source).items()
-    }
-    return Policy(_decode_network(about, arrays, source), arrays, LearnedParams(**task), learned)
-
-
-def _error(source: Path | str, fault: str) -> InputError:
-    return InputError(f"policy = {source} is not allowed: {fault}.")
+        rule = "give a file that `rps learn` wrote"
+        raise errors.not_allowed("policy", f"{source} ({reason})", rule) from error
 
 
 def _digest(arrays: Mapping[str, np.ndarray]) -> str:
@@ -94,28 +85,15 @@ def _digest(arrays: Mapping[str, np.ndarray]) -> str:
     return sha256.hexdigest()
 
 
-def _decode_network(about: Mapping[str, Any], weights: Weights, source: Path | str) -> Network:
-    """Return the network of a file, whose weights must have its shapes and be finite."""
-    network = Network(**_section("network", Network._fields, about, source)).check()
+def _check_weights(network: Network, weights: Weights) -> None:
+    """Raise ValueError unless weights are finite and have the shapes of a network."""
     shapes = {name: array.shape for name, array in weights.items()}
     for name in (*shapes, *network.shapes):
         shape, expected = shapes.get(name), network.shapes.get(name)
         if shape != expected:
-            raise _error(source, f"its {name} has the shape {shape}, and its network {expected}")
-    for name, array in weights.items():
-        if array.dtype != np.float32 or not np.isfinite(array).all():
-            raise _error(source, f"its {name} must hold finite numbers of 32 bits")
-    return network
-
-
-def _section(
-    key: str, fields: tuple[str, ...], about: Mapping[str, Any], source: Path | str
-) -> dict[str, Any]:
-    """Return a section of a file's JSON, which must have these fields."""
-    section = about.get(key)
-    if not isinstance(section, dict) or set(section) != set(fields):
-        raise _error(source, f"its {key} is {section}, and must have {', '.join(fields)}")
-    return {name: section[name] for name in fields}
+            raise ValueError(f"its {name} has the shape {shape}, and its network {expected}")
+        if weights[name].dtype != np.float32 or not np.isfinite(weights[name]).all():
+            raise ValueError(f"its {name} must hold finite numbers of 32 bits")
 
 
 def check(params: LearnedParams) -> LearnedParams:
