@@ -138,8 +138,8 @@ def test_a_law_observes_the_force_of_its_push(engine):
     _, worlds, stage, params = pushes.build([case], setting)
     law = registry.law_of(gains)
     trials = trial.start_all(worlds, params, np.ones(1, bool), law=law)
-    how = {"physics": setting.physics, "law": law, "steps": 200}
-    trials, _ = trial.record(stage, worlds, params, trials, **how)
+    loop = trial.ControlLoop(setting.physics, law=law)
+    trials, _ = trial.record(stage, worlds, params, trials, loop, steps=200)
     np.testing.assert_allclose(trials.load.wrench[0, 0], -0.3 * 10 * GRAVITY, rtol=0.1)
     np.testing.assert_allclose(trials.load.signal[0, 0], -0.3 * 10 * GRAVITY, rtol=0.1)
 

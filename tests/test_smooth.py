@@ -567,15 +567,9 @@ def push(case: Case, law, horizon: float):
     """Return the trial of a case after `horizon` [s], or at its end."""
     setting = Setting(engine="mujoco", rules=Rules(horizon=horizon))
     _, worlds, models, params = pushes.build([case], setting)
-    states = []
-
-    def report(ended, trials, simulated):
-        states.append(trials)
-        return True
-
     loop = ControlLoop(setting.physics, setting.rules, law)
-    host.run(engines.get("mujoco"), models, worlds, params, loop, threads=1, callback=report)
-    return jax.tree.map(lambda x: np.asarray(x)[0], states[-1])
+    *_, (trials, _) = host.run(engines.get("mujoco"), models, worlds, params, loop, threads=1)
+    return jax.tree.map(lambda x: np.asarray(x)[0], trials)
 
 
 @pytest.mark.parametrize("name", ["box", "cylinder"])

@@ -197,8 +197,8 @@ def test_an_object_that_tilts_too_far_ends_its_trial():
     trials = trial.start_all(worlds, params, jnp.ones(SLOTS, bool))
 
     def observed(**rules):
-        observe = partial(trial.observe, physics=preset(), **rules)
-        return jax.vmap(lambda *arrays: observe(*arrays)[0])(worlds, params, trials)
+        loop = trial.ControlLoop(preset(), **rules)
+        return jax.vmap(lambda *arrays: trial.observe(*arrays, loop)[0])(worlds, params, trials)
 
     ended = observed()
     assert ended.tipped.tolist() == ended.done.tolist() == [False, False, True, True]

@@ -46,6 +46,7 @@ if TYPE_CHECKING:
     from jaxlib._jax import pytree  # pyright rejects the alias jax.tree_util.PyTreeDef
 
 SEGMENT = 10.0  # [s] of simulated time in one call of a program; then slots are refilled
+_REPORT_STEPS = 500  # control steps between two reports of an engine outside of JAX
 _MAX_SUSPENDED = 8192  # trials of a job per GPU
 _MAX_SIDE_BY_SIDE = 4  # jobs in one program; more would take long to compile
 
@@ -213,22 +214,22 @@ class _Monitor:
 
 def _run_on_host(job: Job, setting: Setting, threads: int, monitor: _Monitor) -> None:
     """Run the trials of a job with an engine that JAX does not trace, batch by batch."""
-    period = setting.physics.control_period
+    engine, period = engines.get(setting.engine), setting.physics.control_period
     for batch in job.batches:
-
-        def add(
-            ended: np.ndarray, trials: Trial, simulated: float, batch: WorldBatch = batch
-        ) -> bool:
+        loop = ControlLoop(setting.physics, setting.rules, registry.law_of(batch.params))
+        steps = host.run(engine, batch.stage, *batch.inputs, loop, max(1, threads))
+        reported, previous = np.zeros(batch.indices.size, bool), 0
+        for index, (trials, _) in enumerate(steps, 1):
+            done = np.asarray(trials.done)
+            if index % _REPORT_STEPS and not done.all():
+                continue
+            ended, total = np.flatnonzero(done & ~reported), int(np.asarray(trials.steps).sum())
             outcomes = jax.device_get(trial.outcome(trials, period))
+            simulated = (total - previous) * period
             monitor.add(batch.indices[ended], rows(outcomes, ended), simulated)
-            return not monitor.stop
-
-        if monitor.stop:
-            return
-        law = registry.law_of(batch.params)
-        loop = ControlLoop(setting.physics, setting.rules, law)
-        engine, inputs = engines.get(setting.engine), (batch.stage, *batch.inputs)
-        host.run(engine, *inputs, loop, threads=max(1, threads), callback=add)
+            reported, previous = done, total
+            if monitor.stop:
+                return
 
 
 # --- engines in JAX ------------------------------------------------------------------------

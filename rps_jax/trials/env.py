@@ -36,7 +36,7 @@ from rps_jax.robot.robot import Robot
 from rps_jax.trials import trial
 from rps_jax.trials.batch import WorldBatch, rows
 from rps_jax.trials.setting import Setting
-from rps_jax.trials.trial import Measurement, Trial, World
+from rps_jax.trials.trial import ControlLoop, Measurement, Trial, World
 from rps_jax.trials.worlds import drawn_scene, drawn_worlds
 from rps_jax.world import domain, draws, objects, video
 from rps_jax.world.domain import DOMAINS, Domain
@@ -198,8 +198,8 @@ class PushEnv:
 
     def _observe(self, world: World, previous: Trial) -> tuple[Trial, Measurement]:
         """Sense and judge, unless the trial has ended; `law_state` is the last distance felt."""
-        physics, rules = self.setting.physics, self.setting.rules
-        judged, measured = trial.observe(world, self.params, previous, physics=physics, rules=rules)
+        loop = ControlLoop(self.setting.physics, self.setting.rules)
+        judged, measured = trial.observe(world, self.params, previous, loop)
         distance = jnp.where(measured.reading.in_contact, measured.distance, previous.law_state)
         judged = judged._replace(law_state=distance)
         frozen = jax.tree.map(lambda a, b: jnp.where(previous.done, a, b), previous, judged)

@@ -17,16 +17,14 @@ from rps_jax.control.base import Law, LawParams
 from rps_jax.control.laws.rps import RPSParams
 from rps_jax.engines import device, programs
 from rps_jax.geometry import solid
-from rps_jax.geometry.footprint import Footprint
 from rps_jax.robot.base import Odometry
-from rps_jax.robot.shell import Shell
 from rps_jax.trials import host, trial, worlds
 from rps_jax.trials.batch import SEGMENT, BatchOptions, Job, WorldBatch, rows
 from rps_jax.trials.case import Case
 from rps_jax.trials.progress import Progress, ProgressCallback, Timing, no_progress
 from rps_jax.trials.rollout import outcomes
 from rps_jax.trials.setting import Setting
-from rps_jax.trials.trial import ControlLoop, Outcome, Shift, Snapshot, Trial
+from rps_jax.trials.trial import ControlLoop, Outcome, Shift, Snapshot, Trial, World
 from rps_jax.world import scene
 from rps_jax.world.objects import FAMILIES
 from rps_jax.world.physics import Physics
@@ -39,11 +37,14 @@ class Trajectory:
 
     snapshots: Snapshot
     outcome: Outcome  # without a leading axis
-    timing: Timing  # of all trials in the batch
-    p_world_target: tuple[float, float]  # [m]
+    world: World  # likewise
     params: LawParams
-    half: tuple[float, float]  # [m] half length and half width of the base
-    outline: np.ndarray  # (N, 2) [m] of the object in its own frame, closed
+
+    @property
+    def p_world_target(self) -> tuple[float, float]:
+        """Target [m] in the world."""
+        x, y = self.world.p_world_target
+        return float(x), float(y)
 
 
 def scene_of(case: Case, physics: Physics) -> Scene:
@@ -193,18 +194,31 @@ def record_batch(
     callback: ProgressCallback = no_progress,
 ) -> list[Trajectory]:
     """Run trials of one stage to their ends, with a snapshot every `interval` [s]."""
+    stride = max(1, round(interval / setting.physics.control_period))
+    record = _record if engines.get(setting.engine).traced else _record_on_host
+    snapshots, outcomes = record(worlds, law, setting, stride, callback)
+    return [
+        Trajectory(
+            rows(snapshots, (~snapshots.done[:, i], i)),  # until the end of the trial
+            rows(outcomes, i),
+            rows(worlds.worlds, i),
+            rows(worlds.params, i),
+        )
+        for i in range(worlds.indices.size)
+    ]
+
+
+def _record(
+    worlds: WorldBatch, law: Law, setting: Setting, stride: int, callback: ProgressCallback
+) -> tuple[Snapshot, Outcome]:
+    """Run trials; return snapshots (T, B, ...) after every `stride` control steps and outcomes."""
     period = setting.physics.control_period
-    stride = max(1, round(interval / period))
-    if not engines.get(setting.engine).traced:
-        return _trajectories(worlds, *_record_on_host(worlds, law, setting, stride, callback))
     steps = stride * max(1, round(SEGMENT / (stride * period)))
     worlds = jax.device_put(worlds)
     trials = trial.start_all(*worlds.inputs, np.ones(worlds.indices.size, bool), law=law)
     start_time = time.perf_counter()
     record = recorder(worlds, trials, setting, law, steps=steps, stride=stride)
-    compiled_at = time.perf_counter()
-    compile_time = compiled_at - start_time
-    segments = []
+    compile_time, segments = time.perf_counter() - start_time, []
     while True:
         trials, snapshots, outcomes = record(trials)
         done, steps_done, snapshots, outcomes = jax.device_get(
@@ -213,11 +227,27 @@ def record_batch(
         segments.append(snapshots)
         callback(Progress(int(done.sum()), float(steps_done.sum()) * period, compile_time))
         if done.all():
-            break
-    snapshots = jax.tree.map(lambda *arrays: np.concatenate(arrays), *segments)
-    run_time = time.perf_counter() - compiled_at
-    timing = Timing(compile_time, run_time, float(np.sum(outcomes.time)))
-    return _trajectories(worlds, snapshots, outcomes, timing)
+            return jax.tree.map(lambda *arrays: np.concatenate(arrays), *segments), outcomes
+
+
+def _record_on_host(
+    worlds: WorldBatch, law: Law, setting: Setting, stride: int, callback: ProgressCallback
+) -> tuple[Snapshot, Outcome]:
+    """Run trials with an engine outside of JAX, as `_record` does with other engines."""
+    period, start_time, compile_time = setting.physics.control_period, time.perf_counter(), 0.0
+    loop = ControlLoop(setting.physics, setting.rules, law)
+    threads = 1 if worlds.indices.size == 1 else device.count_processors()
+    steps = host.run(engines.get(setting.engine), worlds.stage, *worlds.inputs, loop, threads)
+    snapshots, trials = list[Snapshot](), None
+    for step, (trials, snapshot) in enumerate(steps):
+        compile_time = compile_time or time.perf_counter() - start_time  # of the first step
+        if step % stride == 0:
+            snapshots.append(jax.device_get(snapshot))
+            finished, total = int(np.sum(trials.done)), float(np.sum(trials.steps)) * period
+            callback(Progress(finished, total, compile_time))
+    assert trials is not None
+    outcomes = jax.device_get(trial.outcome(trials, period))
+    return jax.tree.map(lambda *leaves: np.stack(leaves), *snapshots), outcomes
 
 
 def recorder(
@@ -231,9 +261,8 @@ def recorder(
 
     def record(*arguments: Any) -> tuple[Trial, Snapshot, Outcome]:
         *state, rules = arguments
-        after, snapshots = trial.record(
-            *state, rules=rules, physics=physics, law=law, steps=steps, stride=stride
-        )
+        loop = ControlLoop(physics, rules, law)
+        after, snapshots = trial.record(*state, loop, steps=steps, stride=stride)
         return after, snapshots, trial.outcome(after, physics.control_period)
 
     fixed = worlds.stage, *worlds.inputs
@@ -241,70 +270,3 @@ def recorder(
     static = (physics, steps, stride)
     program = programs.compile_function(record, arguments, law=law, donate=3, static=static)
     return lambda trials: program(*fixed, trials, setting.rules)
-
-
-def _record_on_host(
-    worlds: WorldBatch, law: Law, setting: Setting, stride: int, callback: ProgressCallback
-) -> tuple[Snapshot, Outcome, Timing]:
-    """Run trials with an engine outside of JAX; return snapshots (T, B, ...), outcomes, timing."""
-    snapshots: list[Snapshot] = []
-    total, start_time, compile_time = 0.0, time.perf_counter(), 0.0
-
-    def watch(step: int, snapshot: Snapshot) -> None:
-        nonlocal compile_time
-        compile_time = compile_time or time.perf_counter() - start_time  # of the first step
-        if step % stride == 0:
-            snapshots.append(jax.device_get(snapshot))
-
-    def report(_: np.ndarray, trials: Trial, simulated: float) -> bool:
-        nonlocal total
-        total += simulated
-        callback(Progress(int(np.asarray(trials.done).sum()), total, compile_time))
-        return True
-
-    trials = host.run(
-        engines.get(setting.engine),
-        worlds.stage,
-        *worlds.inputs,
-        ControlLoop(setting.physics, setting.rules, law),
-        threads=1 if worlds.indices.size == 1 else device.count_processors(),
-        callback=report,
-        watch=watch,
-    )
-    outcomes = jax.device_get(trial.outcome(trials, setting.physics.control_period))
-    run_time = time.perf_counter() - start_time - compile_time
-    timing = Timing(compile_time, run_time, float(np.sum(outcomes.time)))
-    return jax.tree.map(lambda *leaves: np.stack(leaves), *snapshots), outcomes, timing
-
-
-def _trajectories(
-    worlds: WorldBatch, snapshots: Snapshot, outcomes: Outcome, timing: Timing
-) -> list[Trajectory]:
-    """Return snapshots (T, B, ...) trial by trial, each until its end."""
-    targets = worlds.worlds.p_world_target
-    return [
-        Trajectory(
-            rows(snapshots, (~snapshots.done[:, i], i)),
-            rows(outcomes, i),
-            timing,
-            (float(targets[i][0]), float(targets[i][1])),
-            rows(worlds.params, i),
-            _half(rows(worlds.worlds.skin.shell, i)),
-            _outline(rows(worlds.worlds.footprint, i)),
-        )
-        for i in range(worlds.indices.size)
-    ]
-
-
-def _outline(shape: Footprint) -> np.ndarray:
-    """Return the outline (N, 2) [m] of a footprint, closed; of a circle a polygon."""
-    corners, radius = np.asarray(shape.vertices, float), float(shape.radius)
-    if radius > 0:
-        angle = np.linspace(0, 2 * np.pi, 49)
-        return corners[:1] + radius * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
-    return np.concatenate([corners, corners[:1]])
-
-
-def _half(shell: Shell) -> tuple[float, float]:
-    x, y = shell.half
-    return float(x), float(y)

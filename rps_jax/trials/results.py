@@ -7,6 +7,7 @@ import xarray as xr
 from numpy.typing import ArrayLike
 
 from rps_jax.control.laws.rps import RPSParams
+from rps_jax.geometry.footprint import Footprint
 from rps_jax.trials import trial
 from rps_jax.trials.pushes import Trajectory
 from rps_jax.trials.trial import Outcome
@@ -78,7 +79,7 @@ def _plain(values: ArrayLike) -> np.ndarray:
 
 def trace_dataset(trajectory: Trajectory) -> xr.Dataset:
     """Return one trial over time (time, ...), with its outcome, target and thresholds."""
-    snapshots = trajectory.snapshots
+    snapshots, world = trajectory.snapshots, trajectory.world
 
     def over_time(values: ArrayLike, unit: str, *dims: str) -> xr.Variable:
         return xr.Variable(("time", *dims), _plain(values), {"units": unit})
@@ -104,9 +105,18 @@ def trace_dataset(trajectory: Trajectory) -> xr.Dataset:
     )
     for name in ("d_success", *(("l_cr",) if isinstance(trajectory.params, RPSParams) else ())):
         variables[name] = xr.Variable((), _plain(getattr(trajectory.params, name)), {"units": "m"})
-    for name, value in zip(("half_length", "half_width"), trajectory.half, strict=True):
+    for name, value in zip(("half_length", "half_width"), world.skin.shell.half, strict=True):
         attrs = {"units": "m", "long_name": f"{name.replace('_', ' ')} of the base"}
-        variables[name] = xr.Variable((), value, attrs)
+        variables[name] = xr.Variable((), float(value), attrs)
     attrs = {"units": "m", "long_name": "outline of the object in its own frame"}
-    variables["outline"] = xr.Variable(("corner", "axis"), trajectory.outline, attrs)
+    variables["outline"] = xr.Variable(("corner", "axis"), _outline(world.footprint), attrs)
     return xr.Dataset(variables, coords={"time": ("time", snapshots.time, {"units": "s"})})
+
+
+def _outline(shape: Footprint) -> np.ndarray:
+    """Return the outline (N, 2) [m] of a footprint, closed; of a circle a polygon."""
+    corners, radius = np.asarray(shape.vertices, float), float(shape.radius)
+    if radius > 0:
+        angle = np.linspace(0, 2 * np.pi, 49)
+        return corners[:1] + radius * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+    return np.concatenate([corners, corners[:1]])

@@ -242,13 +242,13 @@ class Measurement(NamedTuple):
 
 
 def observe(
-    world: World, params: LawParams, trial: Trial, *, physics: Physics, rules: Rules = Rules()
+    world: World, params: LawParams, trial: Trial, loop: ControlLoop
 ) -> tuple[Trial, Measurement]:
     """Sense, and judge by the rules: the first half of `decide`.
 
     The rules use the true pose of the base; the law gets the pose that the odometry estimates.
     """
-    period = physics.control_period
+    period, rules = loop.physics.control_period, loop.rules
     time = trial.steps * period
     trial = shifted(world, trial, period)
     skin, reading, observation = sense(world, trial, period)
@@ -305,7 +305,7 @@ def decide(
     Returns the trial before its physics steps, the twist that the base executes, and a snapshot.
     """
     period, law = loop.physics.control_period, loop.law
-    judged, measured = observe(world, params, trial, physics=loop.physics, rules=loop.rules)
+    judged, measured = observe(world, params, trial, loop)
     obs: Any = measured.observation
     if not law.smooth:
         obs = obs._replace(in_contact=measured.reading.contact_type != NONE)
@@ -493,21 +493,18 @@ def _advance_in_xla(
     return jax.lax.while_loop(any_runs, body, (0, trials))[1]
 
 
-@partial(jax.jit, static_argnames=("physics", "law", "steps", "stride"), donate_argnames="trials")
+@partial(jax.jit, static_argnames=("steps", "stride"), donate_argnames="trials")
 def record(
     stage: Stage,
     worlds: World,
     params: LawParams,
     trials: Trial,
+    loop: ControlLoop,
     *,
-    physics: Physics,
-    rules: Rules = Rules(),
-    law: Law = rps.LAW,
     steps: int,
     stride: int = 1,
 ) -> tuple[Trial, Snapshot]:
     """Run `steps` control steps of a batch; return also snapshots (steps // stride, B, ...)."""
-    loop = ControlLoop(physics, rules, law)
 
     def body(trials, _):
         return control_step(stage, worlds, params, trials, loop)

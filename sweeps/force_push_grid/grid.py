@@ -43,7 +43,7 @@ from rps_jax.robot.shell import Boards
 from rps_jax.robot.skin import IdealSkin
 from rps_jax.trials import trial
 from rps_jax.trials.progress import Progress, ProgressCallback, no_progress
-from rps_jax.trials.trial import Rules, Shift, World
+from rps_jax.trials.trial import ControlLoop, Rules, Shift, World
 from rps_jax.world.physics import Physics
 from rps_jax.world.scene import JOINTS, Friction
 
@@ -240,15 +240,12 @@ def run_grid(
     stage, *inputs = worlds(slider, grid, engine, params, physics)
     period, count = physics.control_period, grid.angle.size
     horizon = duration + 2 * _BEHIND / float(params.v_max)
-    rules = Rules(horizon=2 * horizon, max_lost=1e6)
+    loop = ControlLoop(physics, Rules(horizon=2 * horizon, max_lost=1e6), law)
     trials = trial.start_all(*inputs, np.ones(count, bool), law=law)
     apart, steps, start_time = np.zeros(count), 0, time.perf_counter()
     waited = 0.0
     while steps * period < horizon:
-        options = {"physics": physics, "rules": rules, "law": law}
-        trials, snapshots = trial.record(
-            stage, *inputs, trials, **options, steps=_SEGMENT, stride=_LOOK
-        )
+        trials, snapshots = trial.record(stage, *inputs, trials, loop, steps=_SEGMENT, stride=_LOOK)
         away = np.asarray(snapshots.qpos[..., 3:5] - snapshots.qpos[..., :2])
         apart = np.maximum(apart, np.hypot(*np.moveaxis(away, -1, 0)).max(axis=0))
         if steps == 0:

@@ -10,6 +10,7 @@ from __future__ import annotations
 import dataclasses
 import re
 import time
+from collections import deque
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
@@ -253,9 +254,7 @@ def in_c(name: str, family: str, simulated: float = 2.0) -> Measurement:
         loop = ControlLoop(physics, Rules(horizon=simulated))
 
         def once() -> None:
-            host.run(
-                engine, stage, batch, part.params, loop, threads=threads, callback=lambda *_: True
-            )
+            deque(host.run(engine, stage, batch, part.params, loop, threads), maxlen=0)
 
     else:
         stepper = engine.stepper(stage, np.asarray(batch.qpos, float), threads)
