@@ -7,9 +7,9 @@ batch by batch when slots become free, so that memory does not grow with the num
 - `_TrialQueue`: the trials of a job that wait for a slot, and its suspended trials.
 - `_Program`: a compiled program for the slots of one queue, or of several queues side by side.
 - `_Slots`: the trials in the slots of one queue, on one worker.
-- `_Worker`: a host thread that runs programs, one after another, until no trial is left.
-- `_Schedule`: the order of the programs.
 - `_Monitor`: what all workers report to: finished trials, progress and the signal to stop.
+
+`_schedule` orders the programs, and each worker, a host thread, runs them one after another.
 
 A GPU steps a few thousand worlds in hardly less time than a few. When no trial of a job waits and
 few of its trials still run, a worker there suspends these trials and takes the next job. At the end
@@ -21,6 +21,7 @@ from __future__ import annotations
 import functools
 import threading
 import time
+from collections import Counter
 from collections.abc import Callable, Hashable, Iterable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, as_completed
 from functools import partial
@@ -150,12 +151,11 @@ def run(
         count = max(1, min(workers, len(jobs)))
         tasks = [partial(_run_on_host, job, setting, workers // count, monitor) for job in jobs]
     else:
-        schedule = _Schedule([_TrialQueue(job) for job in jobs], setting, slots, workers)
-        tasks = [partial(_Worker(schedule, monitor).work, index) for index in range(workers)]
-        if (
-            backend != "cpu"
-        ):  # the processor is idle: compile all programs at once, first used first
-            tasks += [program.compiled for program in (*schedule.single, *schedule.joint)]
+        queues = [_TrialQueue(job) for job in jobs]
+        single, joint = _schedule(queues, setting, slots, workers)
+        tasks = [partial(_work, single, joint, monitor, index) for index in range(workers)]
+        if backend != "cpu":  # an idle processor: compile all programs at once, first used first
+            tasks += [program.compiled for program in (*single, *joint)]
         count = len(tasks)
     _run_in_threads(tasks, count, monitor)
     total = time.perf_counter() - start_time
@@ -190,6 +190,7 @@ class _Monitor:
         self.compile = 0.0  # [s] that the worker who waited longest had no program
         self.stop = False  # set when one worker fails or the user interrupts
         self._finished = 0  # trials
+        self._waits: Counter[int] = Counter()  # [s] for compilation, by thread
         self._collect, self._callback = collect, callback
         self._lock = threading.Lock()
 
@@ -203,9 +204,10 @@ class _Monitor:
             self._callback(Progress(self._finished, self.simulated, self.compile))
 
     def add_compile_time(self, seconds: float) -> None:
-        """Record how long [s] one worker had no program."""
+        """Add a time [s] for which the worker of this thread had no program."""
         with self._lock:
-            self.compile = max(self.compile, seconds)
+            self._waits[threading.get_ident()] += seconds
+            self.compile = max(self._waits.values())
             self._callback(Progress(self._finished, self.simulated, self.compile))
 
 
@@ -272,27 +274,30 @@ class _TrialQueue:
         return taken
 
 
-class _Schedule:
-    """Order of the programs: first one for each queue, then those for suspended trials."""
+def _schedule(
+    queues: Sequence[_TrialQueue], setting: Setting, slots: int, workers: int
+) -> tuple[list[_Program], list[_Program]]:
+    """Return the programs to run first, one for each long queue until few of its trials run.
 
-    def __init__(self, queues: Sequence[_TrialQueue], setting: Setting, slots: int, workers: int):
-        devices, self.max_suspended = jax.device_count(), _max_suspended()
-        self.single: list[_Program] = []  # each for one queue, until few of its trials run
-        self.joint: list[_Program] = []  # for suspended trials and short queues, side by side
-        groups: dict[Hashable, list[tuple[_TrialQueue, int]]] = {}
-        side_by_side = engines.get(setting.engine).side_by_side
-        for index, queue in enumerate(queues):
-            per_device = -(-queue.num_trials // devices)
-            width = devices * min(slots, per_device)
-            if width > self.max_suspended:
-                self.single.append(_Program([queue], [width], setting))
-                width = min(devices * per_device, workers * self.max_suspended)
-            if width:
-                groups.setdefault(queue.law if side_by_side else index, []).append((queue, width))
-        for group in groups.values():
-            for i in range(0, len(group), _MAX_SIDE_BY_SIDE):
-                members, widths = zip(*group[i : i + _MAX_SIDE_BY_SIDE], strict=True)
-                self.joint.append(_Program(members, widths, setting))
+    Return also the programs to run then, for suspended trials and short queues, side by side.
+    """
+    devices, max_suspended = jax.device_count(), _max_suspended()
+    single, joint = list[_Program](), list[_Program]()
+    groups: dict[Hashable, list[tuple[_TrialQueue, int]]] = {}
+    side_by_side = engines.get(setting.engine).side_by_side
+    for index, queue in enumerate(queues):
+        per_device = -(-queue.num_trials // devices)
+        width = devices * min(slots, per_device)
+        if width > max_suspended:
+            single.append(_Program([queue], [width], setting))
+            width = min(devices * per_device, workers * max_suspended)
+        if width:
+            groups.setdefault(queue.law if side_by_side else index, []).append((queue, width))
+    for group in groups.values():
+        for i in range(0, len(group), _MAX_SIDE_BY_SIDE):
+            members, widths = zip(*group[i : i + _MAX_SIDE_BY_SIDE], strict=True)
+            joint.append(_Program(members, widths, setting))
+    return single, joint
 
 
 def _max_suspended() -> int:
@@ -313,14 +318,12 @@ class _Program:
             self.sharding = NamedSharding(mesh, P("worlds"))
         self._lock = threading.Lock()
         self._compiled: _Advance | None = None
-        self.compiled_at = 0.0  # [s] of `time.perf_counter`
 
     def compiled(self) -> _Advance:
         """Return the compiled function; the first caller compiles it and others wait."""
         with self._lock:
             if self._compiled is None:
                 self._compiled = self._compile()
-                self.compiled_at = time.perf_counter()
             return self._compiled
 
     def put(self, tree: Tree) -> Tree:
@@ -362,7 +365,7 @@ class _Program:
 class _Segment(NamedTuple):
     """State of the slots of one queue after a segment."""
 
-    steps: Any  # (slots,) int: control steps of each trial since its start
+    steps: Any  # (slots,) int: control steps of each trial in this segment
     done: Any  # (slots,) bool
     outcome: Outcome  # (slots, ...)
 
@@ -398,7 +401,8 @@ def _compile_advance(
         after = trial.advance(stages, worlds, params, current, loop, steps)
         # Outcomes are in the same program: another one would wait for other workers' segments.
         return after, tuple(
-            _Segment(t.steps, t.done, trial.outcome(t, physics.control_period)) for t in after
+            _Segment(b.steps - a.steps, b.done, trial.outcome(b, physics.control_period))
+            for a, b in zip(current, after, strict=True)
         )
 
     if sharding is not None:  # each device runs its own worlds and waits for no other
@@ -431,35 +435,27 @@ class _Slots:
         self._queue, self._program = queue, program
         self._indices = np.zeros(slots, np.int64)  # of the trials in the run
         self.live = np.zeros(slots, bool)  # whether a slot holds a trial that has not ended
-        self._steps = np.zeros(slots, int)  # of each trial at the end of the last segment
         self._fresh = np.ones(slots, bool)  # whether a trial starts with the next segment
         example = queue.example.inputs
         self._host = jax.tree.map(lambda leaf: np.repeat(leaf[:1], slots, axis=0), example)
         shapes = program.trial_shapes[index]
-        self.trials = program.put(jax.tree.map(lambda x: np.zeros(x.shape, x.dtype), shapes))
-        if not (suspended := queue.suspended if resume else ()):
-            self.inputs = self._fill(np.arange(slots), queue.take(slots))
-            return
-        batches, states, fresh = zip(*suspended, strict=True)
+        trials, end = jax.tree.map(lambda x: np.zeros(x.shape, x.dtype), shapes), 0
+        suspended = queue.suspended if resume else []
+        for batch, states, fresh in suspended:
+            at = slice(end, end := end + batch.indices.size)
+            _write(trials, at, states)
+            self._fresh[at] = fresh
+        self.trials = program.put(trials)
+        batches = [batch for batch, *_ in suspended] or queue.take(slots)
         self.inputs = self._fill(np.arange(slots), batches)
-        trials = jax.tree.map(lambda *leaves: np.concatenate(leaves), *states)
-        # Slots without a trial hold a copy of one, marked as done.
-        source = np.resize(np.arange(len(trials.steps)), slots)
-        trials, self._fresh = rows(trials, source), self.live & np.concatenate(fresh)[source]
-        self._steps = trials.steps.copy()
-        self.trials = program.put(trials._replace(done=~self.live))
 
     def _fill(self, at: np.ndarray, batches: Sequence[WorldBatch]) -> Inputs:
         """Fill the first of the slots `at` with trials; return the inputs of all slots."""
-        ends = np.cumsum([0, *(batch.indices.size for batch in batches)])
-        at = at[: ends[-1]]
-        for batch, slots in zip(batches, np.split(at, ends[1:-1]) if batches else (), strict=True):
-            self._indices[slots] = batch.indices
-            for target, source in zip(
-                jax.tree.leaves(self._host), jax.tree.leaves(batch.inputs), strict=True
-            ):
-                target[slots] = source
-        self.live[at], self._steps[at] = True, 0
+        end = 0
+        for batch in batches:
+            slots = at[end : (end := end + batch.indices.size)]
+            self._indices[slots], self.live[slots] = batch.indices, True
+            _write(self._host, slots, batch.inputs)
         # A copy: the device may otherwise share the host's memory, which the next call changes.
         return self._program.put(jax.tree.map(np.copy, self._host))
 
@@ -474,9 +470,7 @@ class _Slots:
         steps, done, outcomes = segment
         at = np.flatnonzero(done & self.live)
         period = self._program.setting.physics.control_period
-        simulated = float((steps - self._steps)[self.live].sum()) * period
-        ended = self._indices[at], rows(outcomes, at), simulated
-        self._steps = steps.copy()
+        ended = self._indices[at], rows(outcomes, at), float(steps.sum()) * period
         self.live[at] = False
         if taken := self._queue.take(at.size):
             self.inputs = self._fill(at, taken)
@@ -492,66 +486,60 @@ class _Slots:
             self._queue.suspended.append(_Suspended(batch, trials, self._fresh[at]))
 
 
-class _Worker:
-    """Host thread that runs programs, one after another."""
+def _write(tree: Tree, index: Any, values: Tree) -> None:
+    """Write the rows `index` of every leaf."""
+    for target, source in zip(jax.tree.leaves(tree), jax.tree.leaves(values), strict=True):
+        target[index] = source
 
-    def __init__(self, schedule: _Schedule, monitor: _Monitor):
-        self._schedule, self._monitor = schedule, monitor
-        self._waited = 0.0  # [s] for compilation
 
-    def work(self, index: int) -> None:
-        """Run until no trial waits or runs; `index` is the worker's."""
-        single, joint = self._schedule.single, self._schedule.joint
-        first = index % max(1, len(single))
-        for program in single[first:] + single[:first]:
-            self._run(program, self._schedule.max_suspended)
-        self._monitor.queues_empty.wait()
-        for program in joint[index :: self._monitor.queues_empty.parties]:
-            self._run(program, 0)
+def _work(
+    single: Sequence[_Program], joint: Sequence[_Program], monitor: _Monitor, index: int
+) -> None:
+    """Run programs on one worker until no trial waits or runs; `index` is the worker's."""
+    first = index % max(1, len(single))
+    for program in (*single[first:], *single[:first]):
+        _run(program, _max_suspended(), monitor)
+    monitor.queues_empty.wait()
+    for program in joint[index :: monitor.queues_empty.parties]:
+        _run(program, 0, monitor)
 
-    def _compiled(self, program: _Program) -> _Advance:
-        start_time = time.perf_counter()
-        advance = program.compiled()
-        self._waited += max(0.0, program.compiled_at - start_time)
-        self._monitor.add_compile_time(self._waited)
-        return advance
 
-    def _run(self, program: _Program, max_suspended: int) -> None:
-        """Run segments until no trial waits and at most `max_suspended` run; suspend these."""
-        if self._monitor.stop:
-            return
-        resume = not max_suspended
-        queues = [_Slots(program, index, resume) for index in range(len(program.queues))]
-        if not any(slots.live.any() for slots in queues):
-            return
-        advance, stages, rules = self._compiled(program), program.stages, program.setting.rules
-        with ThreadPoolExecutor(1) as reporter:  # reports a segment while the next one runs
-            reports: list[Future[None]] = []
-            unread: tuple[_Segment, ...] | None = None  # segment whose results are still on the GPU
+def _run(program: _Program, max_suspended: int, monitor: _Monitor) -> None:
+    """Run segments until no trial waits and at most `max_suspended` run; suspend these."""
+    if monitor.stop:
+        return
+    resume = not max_suspended
+    queues = [_Slots(program, index, resume) for index in range(len(program.queues))]
+    if not any(slots.live.any() for slots in queues):
+        return
+    start_time = time.perf_counter()
+    advance, stages, rules = program.compiled(), program.stages, program.setting.rules
+    monitor.add_compile_time(time.perf_counter() - start_time)
+    with ThreadPoolExecutor(1) as reporter:  # reports a segment while the next one runs
+        reports: list[Future[None]] = []
+        unread: tuple[_Segment, ...] | None = None  # segment whose results are still on the GPU
 
-            def read(segments: tuple[_Segment, ...]) -> list[Future[None]]:
-                segments = jax.device_get(segments)
-                ended = [slots.refill(s) for slots, s in zip(queues, segments, strict=True)]
-                _wait(reports)
-                return [reporter.submit(self._monitor.add, *args) for args in ended]
-
-            while sum(slots.live.sum() for slots in queues) > max_suspended:
-                if self._monitor.stop:
-                    break
-                arguments = zip(*(slots.arguments() for slots in queues), strict=True)
-                after, segments = advance(stages, *arguments, rules)
-                for slots, trials in zip(queues, after, strict=True):
-                    slots.trials = trials
-                # Where no trial waits for a slot, a GPU runs the next segment while the host reads.
-                overlap = _max_suspended() and all(queue.is_empty for queue in program.queues)
-                segments, unread = (unread, segments) if overlap else (segments, None)
-                if segments is not None:
-                    reports = read(segments)
-            if unread is not None:
-                reports = read(unread)
+        def read(segments: tuple[_Segment, ...]) -> list[Future[None]]:
+            segments = jax.device_get(segments)
+            ended = [slots.refill(s) for slots, s in zip(queues, segments, strict=True)]
             _wait(reports)
-        for slots in queues:
-            slots.suspend()
+            return [reporter.submit(monitor.add, *args) for args in ended]
+
+        while not monitor.stop and sum(slots.live.sum() for slots in queues) > max_suspended:
+            arguments = zip(*(slots.arguments() for slots in queues), strict=True)
+            after, segments = advance(stages, *arguments, rules)
+            for slots, trials in zip(queues, after, strict=True):
+                slots.trials = trials
+            # Where no trial waits for a slot, a GPU runs the next segment while the host reads.
+            overlap = _max_suspended() and all(queue.is_empty for queue in program.queues)
+            segments, unread = (unread, segments) if overlap else (segments, None)
+            if segments is not None:
+                reports = read(segments)
+        if unread is not None:
+            reports = read(unread)
+        _wait(reports)
+    for slots in queues:
+        slots.suspend()
 
 
 def _wait(futures: Iterable[Future[None]]) -> None:
