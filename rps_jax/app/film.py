@@ -211,7 +211,7 @@ def of_sweep(
             columns = np.flatnonzero(of_object == object_index)
             worlds = index[columns].tolist()
             tiles = (row * shape[1] + columns).tolist()
-            part = build_batch(plan, list(plan.laws).index(law), index[columns])
+            part = build_batch(plan, law, index[columns])
             scenes = [scene_of(plan, i) for i in worlds]
             labels = [f"{prefix}world {i}" for i in worlds]
             takes.append(Take(tiles, part, registry.law_of(plan.laws[law]), scenes, labels))

@@ -147,7 +147,7 @@ class PushRequest(NamedTuple):
 
 def _in_world(plan: Plan, law: str, index: int) -> Push:
     """A world of a sweep."""
-    part = build_batch(plan, list(plan.laws).index(law), [index])
+    part = build_batch(plan, law, [index])
     live = Live(part, registry.law_of(plan.laws[law]), plan.setting)
     title = world_title(plan, index).replace("$\\mu$", "friction")
     return Push(live, scene_of(plan, index), f"{title}, {law}")

@@ -29,12 +29,10 @@ from rps_jax.record import files, provenance
 from rps_jax.record import folder as run_folder
 from rps_jax.trials.batch import WorldBatch
 from rps_jax.trials.setting import Setting
-from rps_jax.trials.trial import Rules
 from rps_jax.trials.worlds import drawn_scene, drawn_worlds
 from rps_jax.world import domain, draws, points
 from rps_jax.world.domain import Domain
 from rps_jax.world.draws import Draw
-from rps_jax.world.physics import Physics
 from rps_jax.world.points import Points
 from rps_jax.world.scene import Scene
 
@@ -121,12 +119,8 @@ class Plan:
             "domain": dataclasses.asdict(self.domain),
             "worlds": self.worlds,
             "laws": {name: registry.params_to_json(params) for name, params in self.laws.items()},
-            "physics": dataclasses.asdict(self.setting.physics),
-            "rules": registry.leaves_to_json(self.setting.rules),
-            "seed": self.setting.seed,
-            "engine": self.setting.engine,
             "part": self.part,
-        }
+        } | self.setting.to_json()
         if self.points is not None:
             record["points"] = self.points.digest
         return record
@@ -189,13 +183,13 @@ def load_plan(folder: Path) -> Plan:
         raise InputError(f"run = {folder} does not hold a sweep: give the folder of `rps sweep`.")
     try:
         plan = Plan(
-            domain.from_json(record["domain"]),
+            domain.from_json(dict(record["domain"])),
             record["worlds"],
             {name: registry.params_from_json(law) for name, law in dict(record["laws"]).items()},
-            setting_of(record),
+            Setting.from_json(record),
             record["part"],
         )
-    except (LookupError, TypeError, AttributeError, ValueError, ArithmeticError) as error:
+    except (LookupError, TypeError, ValueError, ArithmeticError) as error:
         raise files.CorruptFileError(folder / run_folder.MANIFEST, error) from error
     if "points" in record:
         plan = dataclasses.replace(plan, points=Points.read(folder, str(record["points"])))
@@ -207,16 +201,6 @@ def load_plan(folder: Path) -> Plan:
             f"{provenance.package_version(folder)}: use that one."
         )
     return plan
-
-
-def setting_of(record: Mapping[str, Any]) -> Setting:
-    """Read a setting as manifests have it; `question.setting_as_json` writes it."""
-    values: dict[str, Any] = {
-        name: tuple(value) if isinstance(value, list) else value
-        for name, value in dict(record["physics"]).items()
-    }
-    physics = Physics(**values)
-    return Setting(record["engine"], physics, rules=Rules(**record["rules"]), seed=record["seed"])
 
 
 def draw(plan: Plan, index: ArrayLike) -> Draw:
@@ -240,7 +224,6 @@ def world_title(plan: Plan, index: int) -> str:
     )
 
 
-def build_batch(plan: Plan, law: int, index: ArrayLike) -> WorldBatch:
+def build_batch(plan: Plan, law: str, index: ArrayLike) -> WorldBatch:
     """Build worlds of one object, by their indices, with the parameters of a law."""
-    batch = drawn_worlds(plan.domain, draw(plan, index), plan.setting)
-    return batch.with_params(list(plan.laws.values())[law])
+    return drawn_worlds(plan.domain, draw(plan, index), plan.setting).with_params(plan.laws[law])

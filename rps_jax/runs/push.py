@@ -326,7 +326,7 @@ class Replay(TraceQuestion):
 
     def answer(self, run: Run) -> Trace:
         plan, name = self._chosen
-        world = build_batch(plan, list(plan.laws).index(name), [self.world])
+        world = build_batch(plan, name, [self.world])
         law = registry.law_of(plan.laws[name])
         trajectory = self.record(world, law, plan.setting, run)
         title = f"{world_title(plan, self.world)}, {name}"

@@ -176,13 +176,6 @@ class Command(Generic[T]):
                     command = _replace_field(command, name, value)
         return command
 
-    def quick_defaults(self) -> Self:
-        """Return the command with all options at their defaults, except for those of `quick`."""
-        command = type(self)()
-        for name, value in self.quick_values().items():
-            command = _replace_field(command, name, value)
-        return command
-
     def progress_bar(self) -> Bar:
         """Return a bar over the trials."""
         return Bar(self.name, self.num_trials(), shown=self.shows_progress)
@@ -296,17 +289,7 @@ class Question(Command[T]):
             return {k: registry.params_to_json(v) for k, v in self.chosen.items()}
         if name == "domain" and isinstance(value, str | Domain):
             return dataclasses.asdict(domains.parse_domain(value))
-        return setting_as_json(value) if name == "setting" else options.to_json(value)
-
-
-def setting_as_json(setting: Setting) -> dict[str, Any]:
-    """Return a setting as manifests have it; `plan.setting_of` reads it."""
-    return {
-        "engine": setting.engine,
-        "physics": dataclasses.asdict(setting.physics),
-        "rules": registry.leaves_to_json(setting.rules),
-        "seed": setting.seed,
-    }
+        return value.to_json() if isinstance(value, Setting) else options.to_json(value)
 
 
 # --- base classes with shared options ------------------------------------------------------

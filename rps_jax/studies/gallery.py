@@ -178,7 +178,7 @@ def _simulate(
     objects = plan.domain.object_of(worlds)
     for k in np.unique(objects):
         rows = worlds[objects == k]
-        batch = build_batch(plan, list(plan.laws).index(law), rows)
+        batch = build_batch(plan, law, rows)
         functions, options = (
             registry.law_of(plan.laws[law]),
             {"interval": 0.5, "callback": progress},

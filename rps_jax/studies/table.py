@@ -16,12 +16,12 @@ from rps_jax.control import registry
 from rps_jax.control.registry import LawsLike
 from rps_jax.record import files
 from rps_jax.record import folder as run_folder
-from rps_jax.runs.plan import setting_of
 from rps_jax.runs.push import case_options
 from rps_jax.runs.question import MultiLawQuestion, Run, call_of
 from rps_jax.trials import pushes
 from rps_jax.trials.case import Case, FrictionLike, TrialOptions, label_of
 from rps_jax.trials.results import outcome_dataset
+from rps_jax.trials.setting import Setting
 from rps_jax.world import paper
 from rps_jax.world.objects import PAPER_OBJECTS
 
@@ -116,7 +116,7 @@ def table_of(folder: Path) -> Table:
     """
     try:
         manifest = run_folder.read_manifest(folder)
-        setting = setting_of(manifest["setting"])
+        setting = Setting.from_json(manifest["setting"])
         laws = {k: registry.params_from_json(law) for k, law in dict(manifest["laws"]).items()}
         options = (field.name for field in dataclasses.fields(TrialOptions))
         names = ("objects", "friction", "targets", *options)

@@ -7,7 +7,7 @@ from rps_jax import errors
 from rps_jax.control import registry
 from rps_jax.control.base import LawParams
 from rps_jax.control.registry import LawLike
-from rps_jax.record.options import option
+from rps_jax.record.options import check_fields, option
 from rps_jax.robot import robot as robots
 from rps_jax.robot import skin as skins
 from rps_jax.robot.robot import Robot, RobotLike
@@ -29,7 +29,7 @@ class TrialOptions:
     """The skin: ideal is the paper's simulated contact sensor under foam, thin is one without foam,
     capacitive has 42 taxels, and hardware adds noise and unequal gains to these. Changes follow, as
     capacitive,foam=0.01. By default the physics chooses between ideal and thin."""
-    gap: float = 0.02
+    gap: float = option(0.02, 0, 1, unit="m")
     """Distance between base and object at the start [m]; left open by the paper."""
     rear: Side = "near"
     """Side of the nonuniform box on which its load stands, seen from the robot; left open by the
@@ -67,9 +67,7 @@ class Case(TrialOptions):
         registry.check_params(self.params)
         scene.check_contact(self.contact, self.mass)
         skins.parse_skin(self.skin or "ideal")
-        errors.check_finite("gap", self.gap, at_least=0, at_most=1, unit="m")
-        errors.check_name("rear", self.rear, scene.SIDES)
-        errors.check_finite("bearing", self.bearing, at_least=-10, at_most=10, unit="rad")
+        check_fields(self)
         errors.check_number("shift time", self.shift.time, at_least=0, unit="s")
         for axis, value in zip("xy", self.shift.p_robot, strict=True):
             errors.check_finite(f"shift {axis}", value, at_least=-5, at_most=5, unit="m")

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping
+from dataclasses import asdict, dataclass
+from typing import Any
 
 from rps_jax import engines, errors
 from rps_jax.control import registry
@@ -72,3 +73,22 @@ class Setting:
     def physics_name(self) -> str:
         """Name of the physics by its friction: `default`, or `paper_gazebo` for a pyramid."""
         return "default" if self.physics.cone == "elliptic" else "paper_gazebo"
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the setting as manifests have it; `from_json` reads it."""
+        return {
+            "engine": self.engine,
+            "physics": asdict(self.physics),
+            "rules": registry.leaves_to_json(self.rules),
+            "seed": self.seed,
+        }
+
+    @classmethod
+    def from_json(cls, record: Mapping[str, Any]) -> Setting:
+        """Return the setting of a record with the fields of `to_json`."""
+        values: dict[str, Any] = {
+            name: tuple(value) if isinstance(value, list) else value
+            for name, value in dict(record["physics"]).items()
+        }
+        rules = Rules(**record["rules"])
+        return cls(record["engine"], Physics(**values), rules=rules, seed=record["seed"])

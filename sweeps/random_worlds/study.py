@@ -22,7 +22,7 @@ from rps_jax.control import registry
 from rps_jax.record.options import option
 from rps_jax.runs import execution, model_panel
 from rps_jax.runs.plan import Plan
-from rps_jax.runs.question import Run, call_of, setting_as_json
+from rps_jax.runs.question import Run, call_of
 from rps_jax.trials.setting import Setting
 from rps_jax.world import domain as domains
 from sweeps.study_base import Table, TrialStudy
@@ -67,7 +67,7 @@ class RandomWorlds(TrialStudy[xr.Dataset]):
 
     def configuration(self) -> dict[str, Any]:
         """Return the options as JSON; the names of the parts have domain, model and size."""
-        return {**super().configuration(), "setting": setting_as_json(self.setting)}
+        return {**super().configuration(), "setting": self.setting.to_json()}
 
     def answer(self, run: Run) -> xr.Dataset:
         """Run the models that are missing in each domain."""
