@@ -95,13 +95,9 @@ class Plan:
                     chunks[first + block] = law * self.worlds + members
         return chunks
 
-    def law_and_object(self, chunk: int) -> tuple[int, int]:
-        """Return the indices of the law and the object of a chunk."""
-        return divmod(chunk // self.max_chunks, len(self.domain.objects))
-
     def program_key(self, chunk: int) -> ProgramKey:
         """Return the key of the program that runs a chunk."""
-        law, which = self.law_and_object(chunk)
+        law, which = divmod(chunk // self.max_chunks, len(self.domain.objects))
         params = list(self.laws.values())[law]
         return which, type(params), *map(np.shape, jax.tree.leaves(params))
 

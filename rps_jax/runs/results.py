@@ -211,39 +211,6 @@ def _prefetch(batches: Iterator[WorldBatch], count: int) -> Iterator[WorldBatch]
             yield worlds
 
 
-def long_table(results: xr.Dataset) -> pd.DataFrame:
-    """Return one row for each law and world of a sweep: its outcomes and drawn quantities.
-
-    Columns are law, world, object, the outcomes (poses as base_x, base_y [m], base_yaw [rad], and
-    so on) and the drawn quantities. `attrs["columns"]` holds the unit and the meaning of each.
-    """
-    axes = {"x": "m", "y": "m", "yaw": "rad"}
-    flat = results.reset_coords().drop_vars(["which_object", "object", "pose"], errors="ignore")
-    objects = results.object.values[results.which_object.values]
-    columns: dict[str, Any] = {"object": ("world", objects, {"long_name": "name of the object"})}
-    for name in map(str, flat.data_vars):
-        values = flat[name]
-        if values.dims == ("law", "world", "pose"):
-            body = name.removesuffix("_pose")
-            for i, (axis, unit) in enumerate(axes.items()):
-                attrs = {
-                    "units": unit,
-                    "long_name": f"{axis} of the {body} in the world at the end",
-                }
-                columns[f"{body}_{axis}"] = (("law", "world"), values.values[..., i], attrs)
-        elif set(values.dims) <= {"law", "world"}:
-            columns[name] = values
-    labels = {name: (name, results[name].values, results[name].attrs) for name in ("law", "world")}
-    whole = xr.Dataset(columns, labels)
-    frame = whole.to_dataframe(dim_order=["law", "world"]).reset_index()
-    attrs = {str(name): whole[name].attrs for name in frame.columns}
-    frame.attrs["columns"] = {
-        name: [attr.get("units", ""), attr.get("long_name", name.replace("_", " "))]
-        for name, attr in attrs.items()
-    }
-    return frame
-
-
 def check_table(path: Path) -> None:
     """Raise InputError unless a table can be written there: .csv, or .parquet with pyarrow."""
     if path.suffix not in (".csv", ".parquet"):
@@ -258,14 +225,36 @@ def check_table(path: Path) -> None:
 
 
 def write_table(results: xr.Dataset, path: Path) -> None:
-    """Write `long_table` as CSV or Parquet, and NAME.columns.csv with units and meanings."""
-    frame = long_table(results)
-    rows = [[name, *words] for name, words in frame.attrs.pop("columns").items()]
+    """Write one row for each law and world of a sweep, as CSV or Parquet.
+
+    Columns are law, world, object, the outcomes (poses as base_x, base_y [m], base_yaw [rad], and
+    so on) and the drawn quantities. NAME.columns.csv has the unit and the meaning of each.
+    """
+    flat = results.reset_coords().drop_vars(["which_object", "object", "pose"], errors="ignore")
+    objects = results.object.values[results.which_object.values]
+    columns: dict[str, Any] = {"object": ("world", objects, {"long_name": "name of the object"})}
+    for name, values in ((str(name), values) for name, values in flat.items()):
+        if values.dims == ("law", "world", "pose"):
+            body = name.removesuffix("_pose")
+            for i, (axis, unit) in enumerate({"x": "m", "y": "m", "yaw": "rad"}.items()):
+                meaning = f"{axis} of the {body} in the world at the end"
+                attrs = {"units": unit, "long_name": meaning}
+                columns[f"{body}_{axis}"] = (("law", "world"), values.values[..., i], attrs)
+        elif set(values.dims) <= {"law", "world"}:
+            columns[name] = values
+    labels = {name: (name, results[name].values, results[name].attrs) for name in ("law", "world")}
+    whole = xr.Dataset(columns, labels)
+    frame = whole.to_dataframe(dim_order=["law", "world"]).reset_index()
+    attrs = {str(name): whole[name].attrs for name in frame.columns}
+    rows = [
+        [name, attr.get("units", ""), attr.get("long_name", name.replace("_", " "))]
+        for name, attr in attrs.items()
+    ]
     header = pd.DataFrame(rows, columns=["column", "unit", "meaning"])
     write = frame.to_parquet if path.suffix == ".parquet" else frame.to_csv
     files.write_atomically(path, lambda partial: write(partial, index=False))
-    columns = path.with_suffix(".columns.csv")
-    files.write_atomically(columns, lambda partial: header.to_csv(partial, index=False))
+    columns_path = path.with_suffix(".columns.csv")
+    files.write_atomically(columns_path, lambda partial: header.to_csv(partial, index=False))
 
 
 def load(run: str | Path) -> xr.Dataset:

@@ -59,15 +59,6 @@ def scene_of(case: Case, physics: Physics) -> Scene:
     )
 
 
-def _scenes(cases: Sequence[Case], physics: Physics) -> tuple[list[Scene], np.ndarray]:
-    """Return the different scenes of cases, and the index (len(cases),) of each case's scene."""
-    keys = [(c.object_name, c.mass, c.rear, c.base) for c in cases]
-    different = dict(zip(keys, cases, strict=True))
-    order = {key: i for i, key in enumerate(different)}
-    scenes = [scene_of(case, physics) for case in different.values()]
-    return scenes, np.array([order[key] for key in keys])
-
-
 def _start_of(case: Case, at: Scene) -> tuple[np.ndarray, np.ndarray]:
     """Return start (10,) and target (2,) of a case, both turned by its bearing."""
     qpos = scene.initial_qpos(at, case.gap)
@@ -92,16 +83,18 @@ def build(
     for case in cases:
         engine.check_robot(case.base)
         engine.check_senses(registry.law_of(case.params).senses)
-    scenes, scene_indices = _scenes(cases, setting.physics)
-    solids = solid.stack([x.rounded_solid if engine.traced else x.solid for x in scenes])
-    starts = [_start_of(case, scenes[i]) for case, i in zip(cases, scene_indices, strict=True)]
+    keys = [(case.object_name, case.mass, case.rear, case.base) for case in cases]
+    different = dict(zip(keys, cases, strict=True))
+    scenes = {key: scene_of(case, setting.physics) for key, case in different.items()}
+    solids = [x.rounded_solid if engine.traced else x.solid for x in map(scenes.get, keys)]
+    starts = [_start_of(case, scenes[key]) for case, key in zip(cases, keys, strict=True)]
     qpos, targets = (np.array(column) for column in zip(*starts, strict=True))
     trials = np.arange(len(cases)) if indices is None else np.asarray(indices)
     root = jax.random.PRNGKey(setting.seed)
     batch = worlds.build(
         trials,
         FAMILIES[cases[0].object_name],
-        rows(solids, scene_indices),
+        solid.stack(solids),
         Friction(*np.array([case.contact for case in cases], float).T),
         _stack([case.base for case in cases]),
         setting,
