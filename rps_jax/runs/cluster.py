@@ -220,11 +220,9 @@ def _prepare(device: Device, x64: bool) -> None:
 
 def _count_workers(hosts: Sequence[Environment], num_cpus: int, num_gpus: int) -> int:
     """Return how many workers with such claims fit on the hosts of a cluster."""
-    count = 0
-    for host in hosts:
-        resources = host["Resources"] if host["Alive"] else {}
-        fitting = resources.get("CPU", 0) // num_cpus
-        count += int(min(fitting, resources.get("GPU", 0) // num_gpus) if num_gpus else fitting)
+    claims = {"CPU": num_cpus} | ({"GPU": num_gpus} if num_gpus else {})
+    resources = [host["Resources"] for host in hosts if host["Alive"]]
+    count = sum(int(min(r.get(name, 0) // n for name, n in claims.items())) for r in resources)
     if not count:
         with_gpu = " beside a GPU" if num_gpus else ""
         raise InputError(

@@ -131,7 +131,7 @@ class Trace:
         """
         from rps_jax.world import video
 
-        check_length(seconds)
+        errors.check_finite("film_length", seconds, above=0, at_most=600, unit="s")
         snapshots = self.trajectory.snapshots
         shown = _evenly_spaced(len(snapshots.time), round(seconds * fps))
         video.render(
@@ -144,11 +144,6 @@ class Trace:
             size=size,
         )
         return Path(path)
-
-
-def check_length(seconds: float) -> None:
-    """Raise InputError unless a film may have this length [s]."""
-    errors.check_finite("film_length", seconds, above=0, at_most=600, unit="s")
 
 
 @dataclass(frozen=True)
@@ -360,7 +355,7 @@ def select_law(run: Path, world: int, law: str | None = None) -> tuple[Plan, str
 
 def another_engine(run: Path) -> str:
     """Return a note if worlds of a sweep are recorded with another engine than the sweep's."""
-    sweep_engine, engine = load_plan(run).setting.engine, select_law(run, 0)[0].setting.engine
-    if sweep_engine == engine:
+    engine = load_plan(run).setting.engine
+    if engines.get(engine).traced:
         return ""
-    return f"Trials of the engine {sweep_engine} cannot be recorded: this is the engine {engine}."
+    return f"Trials of the engine {engine} cannot be recorded: this is the engine fused."

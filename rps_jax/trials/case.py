@@ -115,22 +115,16 @@ def friction_of(friction: FrictionLike) -> Friction:
     Raises:
       InputError: the text is not valid.
     """
-    if not isinstance(friction, str):
-        if not isinstance(friction, tuple | list) or len(friction) != 2:
-            raise errors.InputError(
-                f"friction = {friction!r} is not allowed: give a set's name, or ground and robot."
-            )
-        return Friction(*friction)
-    if "," not in friction:
+    if isinstance(friction, str) and "," not in friction:
         return FRICTION[errors.check_name("friction set", friction, FRICTION)]
-    parts = friction.split(",")
-    if len(parts) != 2:
+    values = friction.split(",") if isinstance(friction, str) else friction
+    if not isinstance(values, tuple | list) or len(values) != 2:
         raise errors.InputError(
-            f"friction '{friction}' is not allowed: write S1, S2 or ground,robot."
+            f"friction = {friction!r} is not allowed: write S1, S2 or ground,robot."
         )
     ground, robot = (
         errors.check_finite(f"friction {name}", value, above=0, at_most=10, text=True)
-        for name, value in zip(("ground", "robot"), parts, strict=True)
+        for name, value in zip(("ground", "robot"), values, strict=True)
     )
     return Friction(ground, robot)
 

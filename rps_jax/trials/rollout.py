@@ -180,29 +180,22 @@ class Candidates:
     def jobs(self, setting: Setting) -> Iterator[Job]:
         """Yield the worlds of each domain and object, candidate after candidate."""
         num_candidates, width = self.shape
-        params = self._params_per_world()
-        for batch_ in self.batches(setting):
-            chosen = jax.tree.map(lambda leaf, at=batch_.indices: leaf[:, at], params)
-            program = _shape_key(batch_.worlds, 1), _shape_key(chosen, 2)
-            batches = [
-                batch_._replace(indices=width * i + batch_.indices, params=rows(chosen, i))
-                for i in range(num_candidates)
-            ]
-            yield Job(program, num_candidates * batch_.indices.size, batches)
+        params, dtype = jax.device_get(self.params), jnp.result_type(float)
 
-    def _params_per_world(self) -> LawParams:
-        """Return the law parameters with leaves (P, D * W, ...), as views on the host."""
+        def candidate(worlds: WorldBatch, i: int) -> WorldBatch:
+            trials = worlds._replace(indices=width * i + worlds.indices)
+            if not self.per_world:
+                return trials.with_params(rows(params, i))
+            chosen = rows(params, (i, worlds.indices))
+            return trials._replace(params=jax.tree.map(lambda x: np.asarray(x, dtype), chosen))
 
-        def expand(leaf: np.ndarray) -> np.ndarray:
-            leaf = np.asarray(leaf, jnp.result_type(float))
-            if self.per_world:
-                return leaf
-            return np.broadcast_to(leaf[:, None], (*self.shape, *leaf.shape[1:]))
-
-        return jax.tree.map(expand, jax.device_get(self.params))
+        for worlds in self.batches(setting):
+            batches = [candidate(worlds, i) for i in range(num_candidates)]
+            program = _shape_key(batches[0].inputs)
+            yield Job(program, num_candidates * worlds.indices.size, batches)
 
 
-def _shape_key(tree: object, batch_dims: int) -> Hashable:
-    """Return the structure of a pytree and the shapes of its leaves without batch dimensions."""
+def _shape_key(tree: object) -> Hashable:
+    """Return the structure of a pytree and the shapes of its leaves without their first axis."""
     leaves, structure = jax.tree.flatten(tree)
-    return structure, *(np.shape(leaf)[batch_dims:] for leaf in leaves)
+    return structure, *(np.shape(leaf)[1:] for leaf in leaves)
