@@ -89,12 +89,10 @@ def test_suspended_trials_end_alike_in_merged_batches(monkeypatch, limit):
     cases = [case((0.6 + 0.05 * k, 0.05 * k)) for k in range(6)] + [case(AHEAD)]
     cases += [case((0.6, 0.1 * k), name="cylinder") for k in range(3)]
     alone, _ = pushes.run(cases, replace(FUSED, rules=rules), slots=SLOTS, workers=1)
-    ran, plain = [], batch._Worker._compiled
+    ran, plain = [], batch._Program.compiled
     monkeypatch.setattr(batch, "_max_suspended", lambda: limit)
     monkeypatch.setattr(
-        batch._Worker,
-        "_compiled",
-        lambda self, program: ran.append(program.slots) or plain(self, program),
+        batch._Program, "compiled", lambda self: ran.append(self.slots) or plain(self)
     )
     results, _ = pushes.run(cases, replace(FUSED, rules=rules), slots=SLOTS, workers=2)
     assert len(ran[-1]) == 2

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import itertools
 import json
 import math
 import re
@@ -144,8 +145,7 @@ class Shard:
 
 def shard_chunks(plan: Plan, shard: Shard) -> dict[int, np.ndarray]:
     """Return the chunks of one shard, every `of`-th: indices of their trials, by their numbers."""
-    chunks = enumerate(plan.chunks.items())
-    return {n: trials for i, (n, trials) in chunks if i % shard.of == shard.number - 1}
+    return dict(itertools.islice(plan.chunks.items(), shard.number - 1, None, shard.of))
 
 
 def chunks_by_key(plan: Plan, numbers: Iterable[int]) -> dict[ProgramKey, list[int]]:

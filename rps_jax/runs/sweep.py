@@ -218,20 +218,15 @@ class Sweep(SweepOptions, SweepQuestion):
         if "row" in results.dims:
             text = f"When all shards are done: `rps merge {shlex.quote(str(self.out))} --out ...`."
             return [Section(f"Shard {self.shard}", text)]
-        first, *rest = super().report(results, run)
-        return [first, *model_sections(results), *rest]
-
-
-def model_sections(results: xr.Dataset) -> list[Section]:
-    """Return the section on rates by physics model, if the sweep ran several."""
-    if "model_success" not in results:
-        return []
-    text = (
-        "The same worlds on other grounds, friction cones and steps that measurements do not rule "
-        "out. The interval of a rate is the effect of other worlds; its range over the models is "
-        "the effect of another simulation."
-    )
-    return [Section("Models", text, tables.models_table(results))]
+        sections = list(super().report(results, run))
+        if "model_success" in results:
+            text = (
+                "The same worlds on other grounds, friction cones and steps that measurements do "
+                "not rule out. The interval of a rate is the effect of other worlds; its range "
+                "over the models is the effect of another simulation."
+            )
+            sections.insert(1, Section("Models", text, tables.models_table(results)))
+        return sections
 
 
 sweep = call_of(Sweep)

@@ -79,14 +79,13 @@ def build(
     (setting.seed, index) is the key of the imperfections of the skin of a world; by default the
     indices count from 0.
     """
-    engine = engines.get(setting.engine)
     for case in cases:
-        engine.check_robot(case.base)
-        engine.check_senses(registry.law_of(case.params).senses)
+        setting.check_here(case.base, [case.params])
     keys = [(case.object_name, case.mass, case.rear, case.base) for case in cases]
     different = dict(zip(keys, cases, strict=True))
     scenes = {key: scene_of(case, setting.physics) for key, case in different.items()}
-    solids = [x.rounded_solid if engine.traced else x.solid for x in map(scenes.get, keys)]
+    traced = engines.get(setting.engine).traced
+    solids = {key: x.rounded_solid if traced else x.solid for key, x in scenes.items()}
     starts = [_start_of(case, scenes[key]) for case, key in zip(cases, keys, strict=True)]
     qpos, targets = (np.array(column) for column in zip(*starts, strict=True))
     trials = np.arange(len(cases)) if indices is None else np.asarray(indices)
@@ -94,7 +93,7 @@ def build(
     batch = worlds.build(
         trials,
         FAMILIES[cases[0].object_name],
-        solid.stack(solids),
+        solid.stack([solids[key] for key in keys]),
         Friction(*np.array([case.contact for case in cases], float).T),
         _stack([case.base for case in cases]),
         setting,
