@@ -97,7 +97,8 @@ def parse(question_type: type[Q], command: str, words: Sequence[str]) -> tuple[Q
     """
     question, session = _parse(question_type(), command, words)
     if getattr(question, "quick", False):
-        defaults = dataclasses.replace(question_type(quick=True).with_quick_values(), quick=False)
+        quick = dataclasses.replace(question_type(), quick=True).with_quick_values()
+        defaults = dataclasses.replace(quick, quick=False)
         question, session = _parse(defaults, command, words)
     options.check_fields(session)
     return question, session
