@@ -331,35 +331,24 @@ class _Program:
         return jax.device_put(tree, self.sharding)
 
     def _compile(self) -> _Advance:
-        inputs = tuple(
-            self._shapes(slots, queue.example.inputs)
-            for queue, slots in zip(self.queues, self.slots, strict=True)
-        )
+        inputs, trials = zip(*map(self.shapes, range(len(self.queues))), strict=True)
         masks = tuple(jax.ShapeDtypeStruct((n,), bool, sharding=self.sharding) for n in self.slots)
         stages, rules = jax.eval_shape(lambda: (self.stages, self.setting.rules))
-        arguments = (stages, inputs, self.trial_shapes, masks, masks, rules)
+        arguments = (stages, inputs, trials, masks, masks, rules)
         leaves, structure = jax.tree.flatten(arguments)
         physics = self.setting.physics
         return _compile_advance(physics, self.law, self.sharding, structure, tuple(leaves))
 
-    @functools.cached_property
-    def trial_shapes(self) -> tuple[Trial, ...]:
-        """Shapes of the trials (slots, ...) of each queue."""
-        start, shapes = partial(trial.start_all, law=self.law), []
-        for queue, slots in zip(self.queues, self.slots, strict=True):
-            inputs = self._shapes(1, queue.example.inputs)
-            trials = jax.eval_shape(start, *inputs, jax.ShapeDtypeStruct((1,), bool))
-            shapes.append(self._shapes(slots, trials))
-        return tuple(shapes)
-
-    def _shapes(self, slots: int, tree: Tree) -> Tree:
-        """Return the shapes of a pytree with leaves (n, ...) for another number of slots."""
+    def shapes(self, index: int) -> tuple[Inputs, Trial]:
+        """Return the shapes of the inputs and trials (slots, ...) of a queue."""
+        single = rows(self.queues[index].example.inputs, slice(1))
+        started = jax.eval_shape(partial(trial.start_all, law=self.law), *single, np.ones(1, bool))
 
         def shape(leaf: jax.Array) -> jax.ShapeDtypeStruct:
-            size = slots, *leaf.shape[1:]
+            size = self.slots[index], *leaf.shape[1:]
             return jax.ShapeDtypeStruct(size, leaf.dtype, sharding=self.sharding)
 
-        return jax.tree.map(shape, tree)
+        return jax.tree.map(shape, (single, started))
 
 
 class _Segment(NamedTuple):
@@ -438,7 +427,7 @@ class _Slots:
         self._fresh = np.ones(slots, bool)  # whether a trial starts with the next segment
         example = queue.example.inputs
         self._host = jax.tree.map(lambda leaf: np.repeat(leaf[:1], slots, axis=0), example)
-        shapes = program.trial_shapes[index]
+        _, shapes = program.shapes(index)
         trials, end = jax.tree.map(lambda x: np.zeros(x.shape, x.dtype), shapes), 0
         suspended = queue.suspended if resume else []
         for batch, states, fresh in suspended:
