@@ -29,11 +29,12 @@ from rps_jax.record.bag import Step
 from rps_jax.record.options import option
 from rps_jax.runs.plan import Plan, build_batch, load_plan, scene_of, world_title
 from rps_jax.runs.question import Question, Run, SimulationQuestion, call_of
-from rps_jax.trials import pushes, results
+from rps_jax.trials import pushes
 from rps_jax.trials.batch import WorldBatch
 from rps_jax.trials.case import Case, TrialOptions
 from rps_jax.trials.progress import Bar
 from rps_jax.trials.pushes import Trajectory
+from rps_jax.trials.results import trace_dataset
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import Outcome, object_pose, p_world_contact
 from rps_jax.world import paper
@@ -78,7 +79,7 @@ class Trace:
     @property
     def data(self) -> xr.Dataset:
         """The trial over time: variables (time, ...), its outcome as scalars."""
-        return results.trace_dataset(self.trajectory)
+        return trace_dataset(self.trajectory)
 
     def plot(self, path: str | Path | None = None) -> Figure:
         """Draw the trial as Fig. 6 of the paper does; with a path it is written there, too."""
