@@ -1,8 +1,10 @@
 """Set-up of all tests: processor, fast compilation, offscreen rendering, checked shapes, cache."""
 
+import functools
 import os
 from pathlib import Path
 
+import docstring_parser
 import pytest
 import shapes
 
@@ -15,6 +17,8 @@ if os.name == "posix":
 
 def pytest_configure(config):
     shapes.install()
+    # Each command reads the same docstrings again, which takes most of the time of a refusal.
+    docstring_parser.parse_from_object = functools.cache(docstring_parser.parse_from_object)
     import jax
 
     from rps_jax.engines import device

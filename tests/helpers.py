@@ -3,22 +3,28 @@
 import ast
 import contextlib
 import re
-from collections.abc import Iterator
+import subprocess
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
+import hypothesis
 import imageio_ffmpeg
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pandas as pd
+import pytest
+import xarray as xr
+from hypothesis import strategies
 
 from rps_jax.app import cli
 from rps_jax.control import registry
 from rps_jax.control.laws.rps import RPSParams
 from rps_jax.control.observation import Observation
+from rps_jax.errors import InputError
 from rps_jax.geometry import footprint as fp
 from rps_jax.geometry.footprint import Footprint
 from rps_jax.robot.shell import HALF_LENGTH, HALF_WIDTH
@@ -29,7 +35,7 @@ from rps_jax.trials.case import Case
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import ControlLoop, Rules, Trial
 from rps_jax.world import domain, objects
-from rps_jax.world.domain import DOMAINS, Range
+from rps_jax.world.domain import Range, parse_domain
 from rps_jax.world.physics import preset
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -60,9 +66,37 @@ def one_sentence(error: str) -> str:
     return error
 
 
+def refusals(call: Callable[..., object], *cases: tuple[Any, str]) -> Callable[..., None]:
+    """Return a test of a call's errors by its arguments, which are a tuple or keywords."""
+
+    @pytest.mark.parametrize(("arguments", "message"), cases)
+    def test(arguments: Any, message: str) -> None:
+        with pytest.raises(InputError, match=message):
+            call(**arguments) if isinstance(arguments, dict) else call(*arguments)
+
+    return test
+
+
+def output_of(*command: Any, **options: Any) -> str:
+    """Return what a process prints; an error fails the test."""
+    words = [str(word) for word in command]
+    done = subprocess.run(words, capture_output=True, text=True, check=False, **options)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
 def read_curve(folder: Path) -> pd.DataFrame:
     """Return the table of a tuner's generations."""
     return pd.read_csv(folder / "curve.csv", index_col="generation")
+
+
+SEEDS = strategies.integers(0, 2**32 - 1)
+
+
+def property_test(*arguments: strategies.SearchStrategy, examples: int = 100) -> Callable[..., Any]:
+    """Return a decorator that runs a test for random arguments."""
+    settings = hypothesis.settings(max_examples=examples, deadline=None)
+    return lambda test: settings(hypothesis.given(*arguments)(test))
 
 
 # --- trials and sweeps ---------------------------------------------------------------------
@@ -81,23 +115,11 @@ def advance(
 # The fused engine compiles fastest among the engines with contact dynamics.
 SHORT = Setting("fused", FAST, rules=Rules(horizon=20.0))
 # Near targets ahead, reached within a few seconds, and a perfect base.
-NEAR = replace(
-    DOMAINS["wide"],
-    distance=Range(0.7, 0.72),
-    bearing=Range(-0.1, 0.1),
-    lateral=Range(-0.03, 0.03),
-    com_offset=Range(0, 0),
-    gap=Range(0.02, 0.02),
-    **{name: Range(0, 0) for name in domain.quantities_of("base")},
-)
+_NEAR = "distance=0.7:0.72,bearing=-0.1:0.1,lateral=-0.03:0.03,com_offset=0:0,gap=0.02:0.02"
+_PERFECT = {name: Range(0, 0) for name in domain.quantities_of("base")}
+NEAR = replace(parse_domain(f"wide,{_NEAR}"), **_PERFECT)
 SLOTS = 8  # equal in all sweeps, so that they share their programs
-BOXES = replace(
-    DOMAINS["wide"],
-    objects=("random_box",),
-    distance=Range(0.7, 0.8),
-    bearing=Range(-0.5, 0.5),
-    gap=Range(0, 0.01),
-)
+BOXES = parse_domain("wide,objects=random_box,distance=0.7:0.8,bearing=-0.5:0.5,gap=0:0.01")
 CYLINDERS = replace(BOXES, objects=("random_cylinder",))
 PLAN = Plan(BOXES, 20, {"rps": registry.LAWS["rps"], "nps": registry.LAWS["nps"]}, SHORT, part=7)
 
@@ -117,9 +139,26 @@ def swept(folder: Path, plan: Plan = PLAN, **options: Any) -> Path:
     return folder
 
 
+def results_of(laws: Sequence[str] = ("law",), **columns: Any) -> xr.Dataset:
+    """Return results as of a sweep, from columns by law and world or by world."""
+    arrays = {name: np.asarray(values) for name, values in columns.items()}
+    dims = ("law", "world")
+    variables = {name: (dims[-array.ndim :], array) for name, array in arrays.items()}
+    return xr.Dataset(variables, {"law": list(laws)})
+
+
 def parts_of(folder: Path) -> dict[str, bytes]:
     """Return the contents of the parts in a run folder, by file name."""
     return {path.name: path.read_bytes() for path in (folder / "parts").iterdir()}
+
+
+def observation(
+    robot: Any, yaw: Any, contact: Any, in_contact: Any, target: Any, period: Any = 0.02
+) -> Observation:
+    """Return an observation of touch from numbers."""
+    arrays = (jnp.asarray(x, float) for x in (robot, yaw, contact, target, period))
+    robot, yaw, contact, target, period = arrays
+    return Observation(robot, yaw, contact, jnp.asarray(in_contact), target, period)
 
 
 def moved(
@@ -193,10 +232,11 @@ def row(tree: Any, i: Any) -> Any:
     return jax.tree.map(lambda leaf: leaf[i], tree)
 
 
-def same(a: Any, b: Any) -> None:
-    """Assert that two trees are equal bit for bit."""
+def same(a: Any, b: Any, **tolerances: float) -> None:
+    """Assert that two trees are equal, bit for bit or within tolerances."""
+    check = np.testing.assert_allclose if tolerances else np.testing.assert_array_equal
     for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True):
-        np.testing.assert_array_equal(x, y)
+        check(x, y, **tolerances)
 
 
 def decode(path: Path) -> np.ndarray:

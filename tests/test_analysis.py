@@ -5,6 +5,7 @@ import itertools
 import numpy as np
 import pytest
 import xarray as xr
+from helpers import results_of
 from scipy import stats
 
 from rps_jax.analysis import figures, report, statistics, tables
@@ -54,27 +55,23 @@ def test_ascending_order_equals_a_stable_sort():
 
 
 def test_statistics_and_tables_of_a_sweep_by_hand():
-    dims, inf = ("law", "world"), np.inf
-    results = xr.Dataset(
-        {
-            "success": (dims, [[1, 0, 0, 0], [1, 1, 0, 0]]),
-            "diverged": (dims, [[0, 0, 0, 1], [0, 0, 0, 0]]),
-            "tipped": (dims, [[0, 0, 0, 0], [0, 0, 0, 1]]),
-            "time": (dims, [[50.0, 300, 200, 9], [70, 80, 300, 300]]),
-            "min_distance": (dims, [[0.04, 0.5, inf, 1], [0.04, 0.04, 1, 2]]),
-            "contact_lost_time": (dims, [[0.0, 0, 0, 0], [0, 0, 151, 0]]),
-            "path_length": (dims, [[2.0, 9, 9, 9], [3, 4, 9, 9]]),
-            "which_object": ("world", [0, 0, 1, 1]),
-            "distance": ("world", [1.0, 2.0, 3.0, 1.0]),
-        },
-        coords={"law": ["a", "b"], "object": ["box", "drum"], "world": range(4)},
-    )
+    results = results_of(
+        "ab",
+        success=[[1, 0, 0, 0], [1, 1, 0, 0]],
+        diverged=[[0, 0, 0, 1], [0, 0, 0, 0]],
+        tipped=[[0, 0, 0, 0], [0, 0, 0, 1]],
+        time=[[50.0, 300, 200, 9], [70, 80, 300, 300]],
+        min_distance=[[0.04, 0.5, np.inf, 1], [0.04, 0.04, 1, 2]],
+        contact_lost_time=[[0.0, 0, 0, 0], [0, 0, 151, 0]],
+        path_length=[[2.0, 9, 9, 9], [3, 4, 9, 9]],
+        which_object=[0, 0, 1, 1],
+        distance=[1.0, 2.0, 3.0, 1.0],
+    ).assign_coords(object=["box", "drum"], world=range(4))
     first, second = (results.sel(law=law) for law in "ab")
-    modes = [*statistics.FAILURES, ""]
-    assert [modes[k] for k in statistics.failure_modes(first, 150)] == [
-        "", "timeout", "never touched", "diverged"]  # fmt: skip
-    assert [statistics.FAILURES[k] for k in statistics.failure_modes(second, 150)[2:]] == [
-        "lost contact", "fell over"]  # fmt: skip
+    names = np.array([*statistics.FAILURES, ""])
+    modes = [names[statistics.failure_modes(trials, 150)].tolist() for trials in (first, second)]
+    assert modes[0] == ["", "timeout", "never touched", "diverged"]
+    assert modes[1] == ["", "", "lost contact", "fell over"]
     assert statistics.distance_left(first).tolist() == [0.04, 0.5, 3.0, 1.0]
     assert statistics.cvar(np.arange(100.0)) == pytest.approx(97.0)  # mean of 95 .. 99
     assert statistics.cvar(np.array([1.0, 3.0])) == 3.0
@@ -93,11 +90,11 @@ def test_statistics_and_tables_of_a_sweep_by_hand():
 
 def random_worlds(success, **drawn):
     """Results of laws (laws, worlds) in which only the given quantities differ between worlds."""
-    count = success.shape[1]
-    columns = {name: ("world", np.zeros(count), {"units": "1"}) for name in LABELS}
-    columns |= {name: ("world", values, {"units": "kg"}) for name, values in drawn.items()}
-    columns["success"] = (("law", "world"), success.astype(np.int8))
-    return xr.Dataset(columns, coords={"law": list("ab")[: len(success)]})
+    columns = {name: np.zeros(success.shape[1]) for name in LABELS} | drawn
+    results = results_of("ab"[: len(success)], success=success.astype(np.int8), **columns)
+    for name in LABELS:
+        results[name].attrs["units"] = "kg"
+    return results
 
 
 def test_rates_of_more_than_99_percent_have_two_decimals():

@@ -4,12 +4,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import moved
+from helpers import moved, observation, refusals
 
-from rps_jax import errors
 from rps_jax.control.laws import aps
 from rps_jax.control.laws.aps import APSParams, APSState
-from rps_jax.control.observation import Observation, PoseObservation
+from rps_jax.control.observation import PoseObservation
 from rps_jax.trials import pushes
 from rps_jax.trials.case import Case
 from rps_jax.trials.setting import Setting
@@ -22,9 +21,7 @@ aps_step = jax.jit(aps.step)
 
 
 def observe(robot, yaw=0.0, obj=(0.0, 0.0), target=(2.0, 0.0), r_object=0.2):
-    touch = Observation(
-        jnp.array(robot), jnp.array(yaw), jnp.zeros(2), jnp.array(False), jnp.array(target), 0.02
-    )
+    touch = observation(robot, yaw, (0.0, 0.0), False, target)
     return PoseObservation(touch, jnp.array(obj), jnp.array(r_object))
 
 
@@ -127,12 +124,8 @@ def test_a_motion_error_is_learned_and_compensated():
 
 
 def test_alpha_is_learned_only_when_the_error_decreases():
-    learnt = START._replace(
-        started=jnp.array(True),
-        alpha=jnp.array(3.0),
-        gamma=jnp.array(0.4),
-        gamma_count=jnp.array(5.0),
-    )
+    values = {"started": True, "alpha": 3.0, "gamma": 0.4, "gamma_count": 5.0}
+    learnt = START._replace(**jax.tree.map(jnp.array, values))
     better, _, _ = aps_step(PLAIN, learnt, observe((-0.6, 0.0), obj=(0.02, 0.0)))  # gamma = 0
     # m = pi + (3 - pi) / 101; the variance's update by hand.
     mean = np.pi + (3.0 - np.pi) / 101
@@ -160,8 +153,8 @@ def test_it_reaches_targets_ahead_only_if_it_aims_beyond_them():
     assert outcome.min_distance[1] == pytest.approx(0.2, abs=0.01)
 
 
-@pytest.mark.parametrize("name", APSParams._fields)
-@pytest.mark.parametrize("value", [float("nan"), -0.1, float("inf")])
-def test_invalid_parameters_are_refused_by_name(name, value):
-    with pytest.raises(errors.InputError, match=rf"aps\.{name} = "):
-        aps.check(APS._replace(**{name: value}))
+BAD = [float("nan"), -0.1, float("inf")]
+test_invalid_parameters_are_refused_by_name = refusals(
+    aps.check,
+    *(((APS._replace(**{n: x}),), rf"aps\.{n} = ") for n in APSParams._fields for x in BAD),
+)

@@ -143,9 +143,8 @@ def test_levers_depend_on_the_engine():
 
 
 def test_without_physics_the_base_moves_and_the_object_stays():
-    _, worlds, _, params = pushes.build(
-        [Case("box", FRICTION["S1"], (2.0, 0.0), gap=0)], Setting(engine="mjx")
-    )
+    cases = [Case("box", FRICTION["S1"], (2.0, 0.0), gap=0)]
+    _, worlds, _, params = pushes.build(cases, Setting(engine="mjx"))
     start = trial.motion(trial.start_all(worlds, params, np.ones(1, bool)))
     twists = Twist(*(np.full(1, x) for x in (0.05, 0.0, 0.0)))
     driven = levers.Unmoved().drive(worlds.fields, start, ControlPeriod(twists, preset()))
@@ -162,10 +161,10 @@ def test_a_program_is_retraced_for_each_lever():
             calls.append(args)
             return Quasistatic().drive(*args)
 
-    setting = programs.BATCHED["quasistatic"]
     counts = []
     for _ in range(2):
         options = {"simulated": 0.1, "stage": lambda _: RecordingStage()}
+        setting = programs.BATCHED["quasistatic"]
         programs.traced("quasistatic", setting, "cylinder", 2, **options)
         counts.append(len(calls))
     assert counts[1] == 2 * counts[0] > 0
@@ -212,14 +211,12 @@ def test_whole_commands_are_timed_twice_per_gpu_count(monkeypatch):
     monkeypatch.setattr(os, "wait4", lambda pid, options: (pid, 0, used))
     monkeypatch.setenv("JAX_PLATFORMS", "cpu")  # of the process that times them
     results = commands.commands(("push --seed 1",), (1, 2))
-    assert results.command.values.tolist() == ["`rps push --seed 1`, one GPU",
-                                               "`rps push --seed 1`, 2 GPUs"]  # fmt: skip
-    assert [gpus for *_, gpus in launches] == ["0", "0", "0,1", "0,1"]
-    assert [launches[0][1] == launches[1][1], launches[1][1] == launches[2][1]] == [
-        True,
-        False,
-    ]  # an empty cache
-    assert launches[0][0] == ["rps_jax", "push", "--seed", "1"]
+    names = [f"`rps push --seed 1`, {gpus}" for gpus in ("one GPU", "2 GPUs")]
+    assert results.command.values.tolist() == names
+    words, caches, gpus = zip(*launches, strict=True)
+    assert gpus == ("0", "0", "0,1", "0,1")
+    assert caches[0] == caches[1] != caches[2]  # an empty cache
+    assert words[0] == ["rps_jax", "push", "--seed", "1"]
     assert commands.table(results)[1][3:] == ["1.5 s", "2.0 s", "1,234", "1.1 GB", "1.1 GB"]
 
 

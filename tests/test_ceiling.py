@@ -1,16 +1,16 @@
 """The ceiling: plans around the law, their search, and their outcomes."""
 
 from dataclasses import replace
+from functools import partial
 
-import jax.numpy as jnp
 import numpy as np
 import pytest
 import xarray as xr
-from helpers import CYLINDERS, refusal
+from helpers import CYLINDERS, observation, refusal, refusals
 from helpers import rps as command
 
 import rps_jax
-from rps_jax import InputError, Observation, RPSParams, Rules, Setting
+from rps_jax import InputError, RPSParams, Rules, Setting
 from rps_jax.control.laws import guided, rps
 from rps_jax.control.laws.guided import GuidedParams
 from rps_jax.control.laws.rps import RPSState
@@ -27,8 +27,7 @@ SMALL = Ceiling(CYLINDERS, **SIZES)
 
 
 def observe(touched=True):
-    contact, target = jnp.array([0.4, 0.1]), jnp.array([2.0, 0.5])
-    return Observation(jnp.zeros(2), jnp.zeros(()), contact, jnp.asarray(touched), target)
+    return observation((0.0, 0.0), 0.0, (0.4, 0.1), touched, (2.0, 0.5))
 
 
 def test_without_offsets_a_guided_law_equals_the_law():
@@ -58,10 +57,13 @@ def test_offsets_are_added_in_turn_and_bounded():
     assert twists[4] == unguided
 
 
-@pytest.mark.parametrize("offsets", [np.zeros(3), np.zeros((0, 3)), np.full((2, 3), np.inf)])
-def test_invalid_plans_are_refused(offsets):
-    with pytest.raises(InputError, match="offsets"):
-        guided.check(GuidedParams(offsets=offsets))
+test_invalid_plans_are_refused = refusals(
+    lambda offsets: guided.check(GuidedParams(offsets=offsets)),
+    *(
+        ((offsets,), "offsets")
+        for offsets in (np.zeros(3), np.zeros((0, 3)), np.full((2, 3), np.inf))
+    ),
+)
 
 
 def test_costs_by_hand():
@@ -123,17 +125,10 @@ def test_a_search_resumes_and_its_plans_succeed_in_a_sweep(tmp_path):
         np.testing.assert_allclose(float(trial.time), float(search.time), atol=0.021)
 
 
-@pytest.mark.parametrize(
-    ("options", "words"),
-    [
-        ({"sample": 0}, "sample = 0"),
-        ({"sample": -1}, "sample = -1"),
-        ({"samples": 2}, "samples = 2"),
-    ],
+test_searches_without_worlds_or_perturbations_are_refused = refusals(
+    partial(rps_jax.ceiling, CYLINDERS),
+    *(({name: n}, f"{name} = {n}") for name, n in (("sample", 0), ("sample", -1), ("samples", 2))),
 )
-def test_searches_without_worlds_or_perturbations_are_refused(options, words):
-    with pytest.raises(InputError, match=words):
-        rps_jax.ceiling(CYLINDERS, **options)
 
 
 def test_the_first_worlds_and_common_failures_are_tried(monkeypatch):
@@ -152,15 +147,14 @@ def test_the_first_worlds_and_common_failures_are_tried(monkeypatch):
 
 
 def test_the_command_tries_the_failures_of_a_law(tmp_path, capsys):
-    run = tmp_path / "run"
-    ladder = ["ladder", "--domain", "paper", "--worlds", 6, "--engine", "quasistatic"]
-    ladder += ["--laws", "rps_tuned", "pursuit", "--slots", 6, "--workers", 1, "--out", run]
-    assert command(*ladder) == 0
+    options = "--slots 6 --workers 1"
+    ladder = "ladder --domain paper --worlds 6 --engine quasistatic --laws rps_tuned pursuit"
+    assert command(f"{ladder} {options} --out", tmp_path) == 0
     capsys.readouterr()
-    small = ["--sample", 2, "--samples", 3, "--rounds", 1, "--slots", 6, "--workers", 1]
-    assert command("ceiling", run, "--lost-by", "pursuit", *small) == 0
+    search = f"ceiling {tmp_path} --sample 2 --samples 3 --rounds 1 {options} --lost-by"
+    assert command(search, "pursuit") == 0
     text = capsys.readouterr().out
     assert "A planner that knows the world" in text
     assert "of the first 2 worlds" in text
-    assert (run / "ceiling" / "results.nc").exists()
-    assert "unknown law of the run 'rsp'" in refusal(capsys, "ceiling", run, "--lost-by", "rsp")
+    assert (tmp_path / "ceiling" / "results.nc").exists()
+    assert "unknown law of the run 'rsp'" in refusal(capsys, search, "rsp")

@@ -13,7 +13,6 @@ import pytest
 import xarray as xr
 from helpers import refusal, rps
 
-import rps_jax
 from rps_jax.app.cli import flags, running
 from rps_jax.control import registry
 from rps_jax.errors import InputError
@@ -22,10 +21,8 @@ from rps_jax.trials.results import DIMS
 from rps_jax.tuning.evolution import TuneES
 from rps_jax.world import paper
 
-SMALL = [
-    *("table", "--targets", "0.6", "0", "0.62", "0.03", "--horizon", "18", "--slots", "4"),
-    *("--objects", "box", "nonuniform_box", "--workers", "1", "--laws", "rps", "nps"),
-]
+SMALL = "table --targets 0.6 0 0.62 0.03 --horizon 18 --slots 4 --workers 1 --laws rps nps"
+SMALL += " --objects box nonuniform_box --out"
 
 
 @pytest.fixture(scope="module")
@@ -33,7 +30,7 @@ def runs(tmp_path_factory):
     """Folders of two runs of one small table."""
     folders = [tmp_path_factory.mktemp("table") / name for name in ("first", "second")]
     for folder in folders:
-        assert rps(*SMALL, "--out", folder) == 0
+        assert rps(SMALL, folder) == 0
     return folders
 
 
@@ -62,36 +59,35 @@ def test_the_same_command_gives_the_same_results_bit_for_bit(runs):
 
 def test_another_run_is_not_written_over_it_unasked(runs, capsys):
     content = (runs[0] / "results.nc").read_bytes()
-    error = refusal(capsys, *SMALL, "--seed", 1, "--out", runs[0])
+    error = refusal(capsys, SMALL, runs[0], "--seed", 1)
     assert "holds another run (setting.seed = 0 there, 1 asked for)" in error
     assert "--overwrite" in error
     assert (runs[0] / "results.nc").read_bytes() == content
 
 
+PUSH = "push --target 0.6 0 --engine fused --horizon 18 --film-length 0.4 --out"
+
+
 def test_a_push_draws_and_films_a_trial(tmp_path, capsys):
-    out = tmp_path / "push"
-    arguments = ("--target", 0.6, 0, "--horizon", 18, "--film-length", 0.4, "--out", out)
-    assert rps("push", *arguments) == 0
+    assert rps(PUSH, tmp_path) == 0
     printed = capsys.readouterr().out
     assert "reached at" in printed
     assert "Stepped by the engine fused." in printed
-    trace = xr.load_dataset(out / "results.nc", engine="h5netcdf")
+    trace = xr.load_dataset(tmp_path / "results.nc", engine="h5netcdf")
     assert trace.sizes["time"] > 100
     assert int(trace.outcome_success) == 1
-    assert (out / "trial.png").stat().st_size > 10_000
-    assert (out / "push.mp4").stat().st_size > 1_000
+    assert (tmp_path / "trial.png").stat().st_size > 10_000
+    assert (tmp_path / "push.mp4").stat().st_size > 1_000
 
 
 def test_a_push_without_ffmpeg_explains_the_fix_and_does_the_rest(tmp_path, capsys, monkeypatch):
     monkeypatch.setenv("IMAGEIO_FFMPEG_EXE", "/bin/false")
-    out = tmp_path / "push"
-    arguments = ("--engine", "fused", "--horizon", 18, "--out", out)
-    assert rps("push", "--target", 0.6, 0, *arguments) == 0
+    assert rps(PUSH, tmp_path) == 0
     printed = capsys.readouterr().out
     assert "no film: " in printed
     assert "pip install imageio-ffmpeg" in printed
-    assert (out / "trial.png").exists()
-    assert not (out / "push.mp4").exists()
+    assert (tmp_path / "trial.png").exists()
+    assert not (tmp_path / "push.mp4").exists()
 
 
 def test_the_doctor_names_versions_device_cache_rendering_and_ffmpeg(capsys):
@@ -128,9 +124,8 @@ assert not jax.config.jax_compilation_cache_dir and not jax.config.jax_enable_x6
 
 
 def test_importing_sets_no_flags_prints_nothing_and_touches_no_device(tmp_path):
-    done = subprocess.run(
-        [sys.executable, "-c", IMPORT], capture_output=True, text=True, check=False, cwd=tmp_path
-    )
+    command = [sys.executable, "-c", IMPORT]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=tmp_path)
     assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
     assert list(tmp_path.iterdir()) == []
 
@@ -143,25 +138,23 @@ def test_the_papers_totals_and_targets():
     assert np.abs(paper.TARGETS).max() == 2
 
 
-def test_quick_values_replace_defaults_but_no_explicit_value():
-    question = TuneES(quick=True, worlds=7, tuned=("logistic",))
-    quick, small = question.with_quick_values(), question.quick_values()
-    assert (quick.worlds, quick.tuned) == (7, ("logistic",))
-    assert quick.population == small["population"] < TuneES().population
-    assert quick.setting.engine == small["setting.engine"]
-    assert TuneES().with_quick_values() == TuneES()
-
-
 def test_a_quick_run_keeps_an_explicit_value_that_equals_the_default():
     words = ["--quick", "--engine", "fused", "--worlds=512", "--horizon", "300.0"]
-    assert (TuneES().setting.engine, TuneES().worlds) == ("fused", 512)
-    quick = flags.parse(TuneES, "tune es", words)[0]
-    assert quick.setting == TuneES().setting
+    default = TuneES()
+    assert (default.setting.engine, default.worlds) == ("fused", 512)
+    quick, small = flags.parse(TuneES, "tune es", words)[0], default.quick_values()
+    assert quick.setting == default.setting
     assert (quick.worlds, quick.validation) == (512, TuneES.QUICK["validation"])
-    robot = [*words[:3], "--domain", "real,robot=ridgeback"]
-    flags.parse(TuneES, "tune es", robot)[0].validate()
-    with pytest.raises(InputError, match="engine = quasistatic"):
-        flags.parse(TuneES, "tune es", [robot[0], *robot[3:]])[0].validate()
+    assert quick.population == small["population"] < default.population
+    robot = ["--domain", "real,robot=ridgeback"]
+    flags.parse(TuneES, "tune es", [*words[:3], *robot])[0].validate()
+    with pytest.raises(InputError, match=f"engine = {small['setting.engine']}"):
+        flags.parse(TuneES, "tune es", ["--quick", *robot])[0].validate()
+    # From Python a value that equals the default is no explicit one.
+    called = TuneES(quick=True, worlds=7, tuned=("logistic",)).with_quick_values()
+    assert (called.worlds, called.tuned, called.population) == (7, ("logistic",), quick.population)
+    assert called.setting.engine == small["setting.engine"]
+    assert default.with_quick_values() == default
 
 
 def test_files_of_equal_names_are_distinguished_by_their_folders(tmp_path):
@@ -199,13 +192,13 @@ class Crowd(LawQuestion[xr.Dataset]):
 
 crowd = call_of(Crowd)
 """
-BRIEF = ("--engine", "quasistatic", "--horizon", 2)
+BRIEF = "--engine quasistatic --horizon 2"
 
 
 def test_a_custom_question_is_one_file(tmp_path, capsys):
     path = tmp_path / "my_study.py"
     path.write_text(STUDY)
-    assert rps(path, "--worlds", 3, *BRIEF, "--law", "rps", "--out", tmp_path / "run") == 0
+    assert rps(f"{path} --worlds 3 {BRIEF} --law rps --out", tmp_path / "run") == 0
     assert "0 of 3 were won" in capsys.readouterr().out
     assert files.read_results(tmp_path / "run").sizes["world"] == 3
     assert "worlds = 0 is not allowed" in refusal(capsys, path, "--worlds", 0)
@@ -213,21 +206,11 @@ def test_a_custom_question_is_one_file(tmp_path, capsys):
     assert "Number of drums." in capsys.readouterr().out
 
 
-def test_a_command_is_the_call_of_its_question(tmp_path):
-    options = ("--laws", "rps", "rps,K_h=0.3", "--worlds", 4, "--domain", "prisms", *BRIEF)
-    assert rps("sweep", *options, "--out", tmp_path) == 0
-    setting = rps_jax.Setting("quasistatic", rules=rps_jax.Rules(horizon=2.0))
-    called = rps_jax.sweep(["rps", "rps,K_h=0.3"], "prisms", 4, setting=setting)
-    xr.testing.assert_identical(rps_jax.load(tmp_path), called)
-
-
 def test_an_interrupted_run_prints_one_line(tmp_path):
     """The interrupt may come at any time; here it comes while threads compile programs."""
-    command = [sys.executable, "-m", "rps_jax", "sweep", "--worlds", "64", *map(str, BRIEF)]
-    command += ["--domain", "wide,objects=random_cylinder"]
-    process = subprocess.Popen(
-        [*command, "--out", tmp_path / "run"], stderr=subprocess.PIPE, stdout=subprocess.PIPE
-    )
+    command = f"-m rps_jax sweep --worlds 64 --domain wide,objects=random_cylinder {BRIEF} --out"
+    command = [sys.executable, *command.split(), str(tmp_path / "run")]
+    process = subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.PIPE)
     deadline = time.monotonic() + 120
     while not (tmp_path / "run" / "manifest.json").exists():
         assert process.poll() is None

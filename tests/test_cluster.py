@@ -22,10 +22,8 @@ from rps_jax.world.domain import from_json
 
 NEAR = {"objects": ["random_cylinder"], "distance": [0.7, 0.8], "bearing": [-0.5, 0.5]}
 OF_NEAR = replace(PLAN, domain=from_json(NEAR))
-SWEEP = [
-    *("sweep", "--fidelity", "fast", "--horizon", 20, "--worlds", 20),
-    *("--laws", "rps", "nps", "--part", 7, "--slots", SLOTS),
-]
+SWEEP = "sweep --fidelity fast --horizon 20 --worlds 20 --laws rps nps --part 7"
+SWEEP += f" --slots {SLOTS} --domain"
 
 
 # --- by hand -------------------------------------------------------------------------------
@@ -68,16 +66,13 @@ def closed_port():
 
 
 @pytest.mark.parametrize("wrong", ["closed", "auto", "what", "missing"])
-def test_without_a_cluster_a_sweep_ends_in_one_sentence(
-    wrong, domain, tmp_path, capsys, monkeypatch
-):
+def test_without_a_cluster_a_sweep_is_refused(wrong, domain, tmp_path, capsys, monkeypatch):
     nobody = f"127.0.0.1:{closed_port()}"
     address = {"closed": nobody, "missing": "local"}.get(wrong, wrong)
     monkeypatch.setenv("RAY_ADDRESS", nobody)
     if wrong == "missing":
         monkeypatch.setitem(sys.modules, "ray", None)
-    out = tmp_path / "run"
-    assert rps(*SWEEP, "--domain", domain, "--ray", address, "--out", out) == 2
+    assert rps(f"{SWEEP} {domain} --ray {address} --out", tmp_path / "run") == 2
     error = one_sentence(capsys.readouterr().err.splitlines(keepends=True)[-1])  # after its bar
     message = "pip install 'rps_jax[cluster]'" if wrong == "missing" else f"ray = {address}"
     assert message in error
@@ -96,54 +91,52 @@ def two_workers():
         assert not ray.is_initialized()
 
 
-def opened(folder):
+@pytest.fixture
+def opened(tmp_path):
     """A run folder with the plan of `SWEEP` in it, and the plan."""
-    return open_run(folder, OF_NEAR), OF_NEAR
+    return open_run(tmp_path / "run", OF_NEAR), OF_NEAR
 
 
 @pytest.mark.slow
-def test_killing_a_worker_does_not_change_results(domain, tmp_path, two_workers, monkeypatch):
+def test_killing_a_worker_changes_nothing(domain, opened, tmp_path, two_workers, monkeypatch):
     """SIGKILL after one of its tasks; the parts are those of one process without Ray."""
-    out, plan = opened(tmp_path / "run")
+    out, plan = opened
     use_cache()
     plain = swept(tmp_path / "plain", plan)
     killed = []
 
+    def workers():
+        environment = json.loads((out / "environment.json").read_text())
+        return [worker["pid"] for worker in environment.get("workers", ())]
+
     def killing(bar, progress):
         assert bar._total == plan.num_trials
-        environment = json.loads((out / "environment.json").read_text())
-        pids = [worker["pid"] for worker in environment.get("workers", ())]
         if 0 < progress.finished < plan.num_trials and not killed:
-            killed.append(pids[0])
-            os.kill(pids[0], signal.SIGKILL)
+            killed.append(workers()[0])
+            os.kill(killed[0], signal.SIGKILL)
 
     monkeypatch.setattr(Bar, "__call__", killing)
-    assert rps(*SWEEP, "--domain", domain, "--out", out, "--ray", "local") == 0
+    assert rps(f"{SWEEP} {domain} --ray local --out", out) == 0
     assert killed
-    workers = json.loads((out / "environment.json").read_text())["workers"]
-    assert {worker["pid"] for worker in workers} - set(killed)  # another worker continued
+    assert set(workers()) - set(killed)  # another worker continued
     assert len(parts_of(plain)) == 6
     assert parts_of(out) == parts_of(plain)
     assert files.read_results(out).success.shape == (2, 20)
 
 
-def test_an_error_of_a_worker_ends_the_run_unchanged(tmp_path, two_workers):
+def test_an_error_of_a_worker_ends_the_run_unchanged(opened, two_workers):
     def prepare():
         raise jax.errors.JaxRuntimeError("RESOURCE_EXHAUSTED: Out of memory")
 
     with pytest.raises(RuntimeError, match="RESOURCE_EXHAUSTED: Out of memory"):
-        cluster.run_on_cluster(*opened(tmp_path), address="local", prepare=prepare)
+        cluster.run_on_cluster(*opened, address="local", prepare=prepare)
 
 
-def test_a_worker_with_other_software_is_refused(tmp_path, two_workers, monkeypatch):
-    environment = device.collect_environment()
-    monkeypatch.setattr(device, "collect_environment", lambda: environment | {"commit": "another"})
-    with pytest.raises(
-        InputError, match=r"other software \(commit = .* there, .another. asked for"
-    ):
-        cluster.run_on_cluster(*opened(tmp_path), address="local", prepare=int)
-
-
-def test_a_cluster_without_room_for_a_worker_is_refused(tmp_path, two_workers):
+def test_workers_with_other_software_or_without_room_are_refused(opened, two_workers, monkeypatch):
     with pytest.raises(InputError, match=r"workers = 3 .* so many processors"):
-        cluster.run_on_cluster(*opened(tmp_path), address="local", prepare=int, workers=3)
+        cluster.run_on_cluster(*opened, address="local", prepare=int, workers=3)
+    environment = device.collect_environment() | {"commit": "another"}
+    monkeypatch.setattr(device, "collect_environment", lambda: environment)
+    message = r"other software \(commit = .* there, .another. asked for"
+    with pytest.raises(InputError, match=message):
+        cluster.run_on_cluster(*opened, address="local", prepare=int)

@@ -6,10 +6,9 @@ from types import SimpleNamespace
 import jax
 import jax.numpy as jnp
 import numpy as np
-import pandas as pd
 import pytest
+from helpers import read_curve, refusal, rps
 
-from rps_jax.app import cli
 from rps_jax.control.laws.rps import RPSParams
 from rps_jax.errors import InputError
 from rps_jax.runs.evaluate import CandidateScores
@@ -32,9 +31,8 @@ def snapshots(distance, contact):
 
 
 def score(distance, contact, arrive=1e-5):
-    return float(
-        descent.soft_score(snapshots(distance, contact), RPSParams(), SETTING, OBJECTIVE, arrive)
-    )
+    shots = snapshots(distance, contact)
+    return float(descent.soft_score(shots, RPSParams(), SETTING, OBJECTIVE, arrive))
 
 
 class TestSoftScore:
@@ -44,16 +42,13 @@ class TestSoftScore:
         expected = OBJECTIVE.score(1.0, 9.5, 0.0, 0.0, SETTING.rules)
         assert score(distance, np.ones(600)) == pytest.approx(float(expected), abs=1e-3)
 
-    def test_the_way_that_is_left_costs_the_time_of_driving_it(self):
+    @pytest.mark.parametrize(("contact", "lost"), [((1.0, 0.0), 5.0), ((0.0, 1.0), 0.0)])
+    def test_the_way_that_is_left_costs_the_time_of_driving_it(self, contact, lost):
+        """Time before the first touch is not lost."""
         # 5 s in contact, then 5 s without; the last 30 cm take 6 s at v_max = 0.05 m/s.
-        contact = np.repeat([1.0, 0.0], 250)
-        expected = OBJECTIVE.score(1.0, 10.0 + 6.0, 5.0, 0.0, SETTING.rules)
-        assert score(np.full(500, 0.3), contact) == pytest.approx(float(expected), rel=1e-5)
-
-    def test_time_before_the_first_touch_is_not_lost(self):
-        contact = np.repeat([0.0, 1.0], 250)
-        expected = OBJECTIVE.score(1.0, 10.0 + 6.0, 0.0, 0.0, SETTING.rules)
-        assert score(np.full(500, 0.3), contact) == pytest.approx(float(expected), rel=1e-5)
+        expected = OBJECTIVE.score(1.0, 10.0 + 6.0, lost, 0.0, SETTING.rules)
+        actual = score(np.full(500, 0.3), np.repeat(contact, 250))
+        assert actual == pytest.approx(float(expected), rel=1e-5)
 
     def test_the_soft_score_has_a_slope_where_the_hard_score_jumps(self):
         def at(d):
@@ -65,15 +60,6 @@ class TestSoftScore:
 
 
 class TestDescent:
-    def test_bad_options_are_refused(self):
-        for bad in (
-            {"estimator": "backprop"}, {"optimiser": "sgdd"}, {"clip": 0.0}, {"pairs": 0},
-            {"within": -1.0}, {"budget": float("nan")},
-        ):  # fmt: skip
-            (name,) = bad
-            with pytest.raises(InputError, match=name):
-                TuneGrad("rps", **bad).validate()
-
     def test_the_first_start_is_the_base(self):
         question = TuneGrad("rps", starts=3)
         tuner = question.tuner
@@ -120,27 +106,18 @@ def test_windows_start_at_the_states_of_their_trials(monkeypatch):
         np.testing.assert_array_equal(scores(jnp.zeros((3, 2)), (None, late)), steps)
 
 
-class TestRuns:
-    """Cylinders on the quasi-static model, to compile few programs."""
+# Cylinders on the quasi-static model, to compile few programs.
+RUN = "tune grad --engine quasistatic --estimator reverse --objects random_cylinder --worlds 2 "
+RUN += "--validation 2 --starts 2 --horizon 5 --window 1 --within 2 --tuned L K_h v_lost --slots 4"
 
-    def arguments(self, folder, steps):
-        return [
-            *("tune", "grad", "--engine", "quasistatic", "--estimator", "reverse"),
-            *("--objects", "random_cylinder", "--worlds", "2", "--validation", "2"),
-            *("--starts", "2", "--steps", str(steps), "--horizon", "5"),
-            *("--window", "1", "--within", "2"),
-            *("--tuned", "L", "K_h", "v_lost", "--slots", "4", "--out", str(folder)),
-        ]
 
-    @pytest.mark.slow
-    def test_the_command_line_and_a_run_of_another_kind(self, tmp_path, capsys):
-        assert cli.main(self.arguments(tmp_path, 2)) == 0
-        curve = pd.read_csv(tmp_path / "curve.csv")
-        assert len(curve) == 3
-        assert (curve.finite[:2] == 1.0).all()
-        assert np.isfinite(curve[["gradient", "gradient_error"]][:2]).all(axis=None)
-        assert curve["params.L"][1] != curve["params.L"][0] or curve.gradient[0] == 0
-        assert set(json.loads((tmp_path / "tuned.json").read_text())) == {"L", "K_h", "v_lost"}
-        capsys.readouterr()
-        assert cli.main(self.arguments(tmp_path, 3)) == 2
-        assert "steps = 2 there, 3 asked for" in capsys.readouterr().err
+@pytest.mark.slow
+def test_the_command_line_and_a_run_of_another_kind(tmp_path, capsys):
+    assert rps(f"{RUN} --steps 2 --out", tmp_path) == 0
+    curve = read_curve(tmp_path).reset_index()
+    assert len(curve) == 3
+    assert (curve.finite[:2] == 1.0).all()
+    assert np.isfinite(curve[["gradient", "gradient_error"]][:2]).all(axis=None)
+    assert curve["params.L"][1] != curve["params.L"][0] or curve.gradient[0] == 0
+    assert set(json.loads((tmp_path / "tuned.json").read_text())) == {"L", "K_h", "v_lost"}
+    assert "steps = 2 there, 3 asked for" in refusal(capsys, f"{RUN} --steps 3 --out", tmp_path)

@@ -1,17 +1,17 @@
 """The environment for reinforcement learning steps trials as the control loop does."""
 
 from dataclasses import replace
+from functools import partial
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import FAST, NEAR, advance
+from helpers import FAST, NEAR, advance, refusals, row
 
 from rps_jax.control.base import Law
 from rps_jax.control.laws.rps import RPSParams
 from rps_jax.control.observation import Details
-from rps_jax.errors import InputError
 from rps_jax.robot.shell import Shell
 from rps_jax.trials import env, trial
 from rps_jax.trials.env import PushEnv, Reward
@@ -31,26 +31,20 @@ def build_env(**options):
     return PushEnv("random_cylinder", NEAR, setting=setting, worlds=6, **options)
 
 
-def programs(push):
-    """Return compiled `reset` of many keys and STEPS steps of many worlds (STEPS, n, ...)."""
-
-    def scan_step(state, actions):
-        state = jax.vmap(push.step)(state, actions)
-        return state, state
-
-    steps = jax.jit(
-        lambda state, actions: jax.lax.scan(scan_step, state, length=STEPS, xs=actions)[1]
-    )
-    return jax.jit(jax.vmap(push.reset)), steps
-
-
 class Pushing:
     """An environment with a batch of initial states and a compiled rollout."""
 
     def __init__(self):
         self.env = build_env()
-        self.reset, self._steps = programs(self.env)
+        self.reset = jax.jit(jax.vmap(self.env.reset))
         self.start = self.reset(jax.random.split(jax.random.key(0), COUNT))
+
+        def scan_step(state, actions):
+            state = jax.vmap(self.env.step)(state, actions)
+            return state, state
+
+        scan = partial(jax.lax.scan, scan_step, length=STEPS)
+        self._steps = jax.jit(lambda state, actions: scan(state, xs=actions)[1])
 
     def go(self, state, actions, times=1):
         """Return states (times * STEPS, COUNT, ...) under actions (COUNT, 3), or (3,) for all."""
@@ -63,7 +57,7 @@ class Pushing:
 
 
 def last(states):
-    return jax.tree.map(lambda leaf: leaf[-1], states)
+    return row(states, -1)
 
 
 @pytest.fixture(scope="module")
@@ -84,7 +78,7 @@ def test_the_spaces_are_those_of_the_skin_the_target_and_the_twist(pushing):
 
 def test_step_keeps_the_structure_of_the_state_so_that_scan_works(pushing):
     push, state = pushing.env, pushing.start
-    world_state = jax.tree.map(lambda leaf: leaf[0], state)
+    world_state = row(state, 0)
     next_state = jax.eval_shape(push.step, world_state, AHEAD)
     assert jax.tree.structure(next_state) == jax.tree.structure(world_state)
     for a, b in zip(jax.tree.leaves(next_state), jax.tree.leaves(world_state), strict=True):
@@ -142,9 +136,7 @@ def test_the_return_is_progress_minus_the_cost_of_time_without_contact(pushing):
         x = states.data.qpos[:, i, 0]
         assert x[end] == pytest.approx(0.05 * PERIOD * (end + 1), rel=1e-3)
         np.testing.assert_allclose(states.obs[:, i, 42], start.obs[i, 42] - x, atol=1e-5)
-        assert (
-            states.obs[end, i, 15:27].max() > 0.25
-        )  # taxels of the front, by the skin's threshold
+        assert states.obs[end, i, 15:27].max() > 0.25  # the skin's threshold, of front taxels
 
 
 def test_lost_contact_costs_and_progress_resumes_where_it_was_lost(pushing):
@@ -178,7 +170,7 @@ def test_the_rules_end_a_trial_and_its_start_can_be_put_back(pushing):
 def test_a_nan_action_ends_only_its_world(pushing):
     actions = jnp.tile(AHEAD, (COUNT, 1)).at[1].set(jnp.nan)
     trajectory = pushing.go(pushing.start, actions)
-    for states in (jax.tree.map(lambda leaf: leaf[0], trajectory), last(trajectory)):
+    for states in (row(trajectory, 0), last(trajectory)):
         assert states.done.tolist() == [0, 1, 0, 0]
         assert states.metrics["diverged"].tolist() == [0, 1, 0, 0]
     assert (trajectory.reward[:, 1] == 0).all()
@@ -231,7 +223,7 @@ def test_states_are_drawn_each_in_its_own_world(pushing):
     index = np.asarray(state.info["index"])
     different = [0, int(np.argmax(index != index[0]))]
     assert index[different[0]] != index[different[1]]
-    states = [jax.tree.map(lambda leaf, i=i: leaf[i], state) for i in different]
+    states = [row(state, i) for i in different]
     images = push.render(states, 60, 80)
     assert [image.shape for image in images] == [(60, 80, 3)] * 2
     assert (abs(images[0].astype(int) - images[1]) > 20).any()
@@ -239,17 +231,12 @@ def test_states_are_drawn_each_in_its_own_world(pushing):
     np.testing.assert_allclose(again.astype(int), images[1].astype(int), atol=2)
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"object": "ball"}, "unknown domain object 'ball'"),
-        ({"worlds": 0}, "worlds = 0"),
-        ({"setting": Setting(engine="mujoco")}, "engine = mujoco is not allowed"),
-        ({"domain": DOMAINS["paper"]}, "skin of an environment 'ideal': choose from capacitive"),
-        ({"params": RPSParams(v_max=-1.0)}, "v_max = -1.0"),
-        ({"weights": Reward(success=float("nan"))}, "success = nan"),
-    ],
+test_invalid_environments_are_refused = refusals(
+    PushEnv,
+    ({"object": "ball"}, "unknown domain object 'ball'"),
+    ({"worlds": 0}, "worlds = 0"),
+    ({"setting": Setting(engine="mujoco")}, "engine = mujoco is not allowed"),
+    ({"domain": DOMAINS["paper"]}, "skin of an environment 'ideal': choose from capacitive"),
+    ({"params": RPSParams(v_max=-1.0)}, "v_max = -1.0"),
+    ({"weights": Reward(success=float("nan"))}, "success = nan"),
 )
-def test_invalid_environments_are_refused(options, message):
-    with pytest.raises(InputError, match=message):
-        PushEnv(**options)

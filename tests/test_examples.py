@@ -3,6 +3,7 @@
 import runpy
 import time
 import xml.etree.ElementTree as ET
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -10,19 +11,20 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from helpers import observation, refusal, refusals, rps, same
 from staging import recompiled
 
 from rps_jax import engines
-from rps_jax.app import cli
 from rps_jax.control import registry
 from rps_jax.control.base import Law
-from rps_jax.control.laws import rps
+from rps_jax.control.laws import rps as rps_law
 from rps_jax.control.laws.rps import RPSParams, RPSState, step
-from rps_jax.control.observation import Details, Observation, Twist
+from rps_jax.control.observation import Details, Twist
+from rps_jax.control.registry import register_law
 from rps_jax.errors import InputError
 from rps_jax.geometry.footprint import Footprint, circle, polygon, rectangle
 from rps_jax.record import files
-from rps_jax.robot.skin import POINT, CapacitiveSkin
+from rps_jax.robot.skin import CapacitiveSkin
 from rps_jax.runs.plan import Plan, load_plan, open_run, scene_of
 from rps_jax.trials import pushes
 from rps_jax.trials.case import Case
@@ -34,7 +36,7 @@ from rps_jax.world.scene import FRICTION, Friction
 from sweeps.speed import robot as on_a_robot
 
 EXAMPLES = Path(__file__).parents[1] / "notebooks" / "examples"
-BOX, CYLINDER = (objects.mjcf_folder() / f"{name}.xml" for name in ("box", "cylinder"))
+BOX = objects.mjcf_folder() / "box.xml"
 
 
 def example(name):
@@ -95,14 +97,13 @@ def test_all_engines_have_an_equal_hexagon(hexagon):
         _, drawn = engines.get(engine).stage("prism", solids, friction, physics)
         if engine == "mjx":
             assert set(alone) == set(drawn)
-        for a, b in zip(jax.tree.leaves(alone), jax.tree.leaves(drawn), strict=True):
-            np.testing.assert_allclose(a, b, rtol=3e-6, atol=3e-6)
+        same(alone, drawn, rtol=3e-6, atol=3e-6)
 
 
-@pytest.mark.parametrize(("name", "path"), [("box", BOX), ("cylinder", CYLINDER)])
-def test_a_registered_object_of_the_paper_gives_an_equal_world(name, path):
+@pytest.mark.parametrize("name", ["box", "cylinder"])
+def test_a_registered_object_of_the_paper_gives_an_equal_world(name):
     """Both can share a batch."""
-    objects.register_object("mine", path)
+    objects.register_object("mine", objects.mjcf_folder() / f"{name}.xml")
     cases = [Case(n, FRICTION["S2"], (2.0, 1.0), mass=m) for n in (name, "mine") for m in (None, 9)]
     for engine in ("fused", "mjx"):
         worlds = pushes.build(cases, Setting(engine=engine)).worlds
@@ -123,17 +124,12 @@ def test_a_custom_object_can_be_in_a_domain(hexagon):
     assert scene_of(plan, 3).model.ngeom == hexagon.model.ngeom
 
 
-def changed(tmp_path, change):
-    """Write the box's file with a change of its tree, and return the path."""
-    tree = ET.parse(BOX)
-    change(tree.getroot())
-    path = tmp_path / "mine.xml"
-    tree.write(path)
-    return path
-
-
 def _body(root):
     return root.find("worldbody/body")
+
+
+def _geom(root):
+    return _body(root).find("geom")
 
 
 def _without_base(root):
@@ -142,6 +138,11 @@ def _without_base(root):
         for item in root.findall(tag):
             item.attrib.pop("class")
     root.remove(root.find("contact"))
+
+
+def _without_a_name(root):
+    root.remove(root.find("contact"))
+    _geom(root).attrib.pop("name")
 
 
 def _with_a_hinge(root):
@@ -158,56 +159,62 @@ BAD_FILES = {
     "MuJoCo cannot compile .*mine.xml": lambda root: _body(root).append(ET.Element("wheel")),
     "lacks the body 'base': include base.xml": _without_base,
     "lacks the joint 'object'": lambda root: _body(root).find("freejoint").attrib.pop("name"),
-    "lacks the geom 'object'": lambda root: (
-        root.remove(root.find("contact")),
-        _body(root).find("geom").attrib.pop("name"),
-    ),
+    "lacks the geom 'object'": _without_a_name,
     "joints of .* no other body a joint": _with_a_hinge,
     "no other body within it": _with_a_lid,
-    "0 to 0.8 m is not allowed: .* in the middle of its height": lambda root: (
-        _body(root).find("geom").set("pos", "0 0 0.4")
-    ),
-    "height = 0.02": lambda root: _body(root).find("geom").set("size", "0.2 0.2 0.01"),
-    "footprint = None is not allowed": lambda root: _body(root).find("geom").set("euler", "0 0 1"),
+    "0 to 0.8 m is .* in the middle of its height": lambda r: _geom(r).set("pos", "0 0 0.4"),
+    "height = 0.02": lambda root: _geom(root).set("size", "0.2 0.2 0.01"),
+    "footprint = None is not allowed": lambda root: _geom(root).set("euler", "0 0 1"),
 }
 
 
 @pytest.mark.parametrize("message", BAD_FILES)
 def test_an_invalid_object_file_is_rejected_with_the_reason(message, tmp_path):
-    path = changed(tmp_path, BAD_FILES[message])
+    tree, path = ET.parse(BOX), tmp_path / "mine.xml"
+    BAD_FILES[message](tree.getroot())
+    tree.write(path)
     with pytest.raises(InputError, match=f"object 'mine': .*{message}"):
         objects.register_object("mine", path)
     assert "mine" not in objects.OBJECTS
 
 
+class Ahead(NamedTuple):
+    v: float = 0.05  # [m/s]
+    d_success: float = 0.05  # [m]
+
+
+NO_LAW = Law(lambda params: (), lambda *_: None)
 SQUARE = [[0.1, 0.1], [-0.1, 0.1], [-0.1, -0.1], [0.1, -0.1]]
 
 
-@pytest.mark.parametrize(
-    ("footprint", "message"),
-    [
-        (circle(-0.1), "radius of the footprint = -0.1"),
-        (Footprint(jnp.array([[0.1, 0.0]]), jnp.array(0.2)), "a circle about the origin"),
-        (Footprint(jnp.array(SQUARE), jnp.array(0.05)), "with radius 0.05 m is not allowed"),
-        (Footprint(jnp.array(SQUARE[::-1]), jnp.array(0.0)), "counter-clockwise"),
-        (polygon(np.array(SQUARE) + 0.2), "the origin must be inside"),
-        (polygon(0.2 * np.array([[np.cos(a), np.sin(a)] for a in np.arange(9) * 0.69])), "3 to 8"),
-        (rectangle(5.0, 5.0), "reach of the footprint"),
-    ],
+test_an_invalid_footprint_is_rejected = refusals(
+    partial(objects.register_object, "mine", BOX),
+    ((circle(-0.1),), "radius of the footprint = -0.1"),
+    ((Footprint(jnp.array([[0.1, 0.0]]), jnp.array(0.2)),), "a circle about the origin"),
+    ((Footprint(jnp.array(SQUARE), jnp.array(0.05)),), "with radius 0.05 m is not allowed"),
+    ((Footprint(jnp.array(SQUARE[::-1]), jnp.array(0.0)),), "counter-clockwise"),
+    ((polygon(np.array(SQUARE) + 0.2),), "the origin must be inside"),
+    ((polygon(0.2 * np.array([[np.cos(a), np.sin(a)] for a in np.arange(9) * 0.69])),), "3 to 8"),
+    ((rectangle(5.0, 5.0),), "reach of the footprint"),
 )
-def test_an_invalid_footprint_is_rejected(footprint, message):
-    with pytest.raises(InputError, match=message):
-        objects.register_object("mine", BOX, footprint)
 
 
-def test_names_of_the_package_cannot_be_registered():
-    for name in ("box", "prism"):
-        with pytest.raises(InputError, match=f"name of an object = {name} is not allowed"):
-            objects.register_object(name, BOX)
-    with pytest.raises(InputError, match="name of a law = rps is not allowed"):
-        registry.register_law("rps", rps.LAW, RPSParams())
-    with pytest.raises(InputError, match=r"MuJoCo cannot compile .*nowhere.xml"):
-        objects.register_object("mine", "nowhere.xml")
+test_invalid_objects_are_rejected = refusals(
+    objects.register_object,
+    (("box", BOX), "name of an object = box is not allowed"),
+    (("prism", BOX), "name of an object = prism is not allowed"),
+    (("mine", "nowhere.xml"), r"MuJoCo cannot compile .*nowhere.xml"),
+)
+test_invalid_laws_are_rejected = refusals(
+    register_law,
+    (("rps", rps_law.LAW, RPSParams()), "name of a law = rps is not allowed"),
+    (("p", NO_LAW, Ahead(v=float("nan"))), "v = nan is not allowed"),
+    (("p", NO_LAW, (1.0, 2.0)), "a field or property d_success"),
+    (("p", NO_LAW, RPSParams()), "the law 'rps' has a class of the same name RPSParams"),
+)
+test_params_of_no_law_are_rejected = refusals(
+    Case, (("box", FRICTION["S1"], (2.0, 0.0), Ahead()), "params of class Ahead belong to no law")
+)
 
 
 # --- custom laws ---------------------------------------------------------------------------
@@ -241,43 +248,26 @@ def test_a_custom_optimiser_needs_only_evaluate(capsys):
 def test_the_command_line_accepts_registered_names(tmp_path, capsys, hexagon):
     example("custom_law")  # registers p_control
     out = tmp_path / "table"
-    command = ["table", "--objects", "hexagon", "--laws", "p_control", "--friction", "S1"]
-    command += ["--targets", "2", "0", "--horizon", "4", "--engine", "mujoco", "--out", str(out)]
-    command[command.index("p_control")] = "p_control,v=0.02"
-    assert cli.main(command) == 0
+    command = "table --objects hexagon --friction S1 --targets 2 0 --horizon 4 --engine mujoco"
+    assert rps(f"{command} --laws p_control,v=0.02 --out", out) == 0
     assert "P_CONTROL" in capsys.readouterr().out
     results = files.read_results(out)
     assert results.object.values.tolist() == ["hexagon"]
     assert float(results.base_pose[0, 0, 0, 0, 0]) == pytest.approx(0.08, abs=0.002)
-    command[command.index("p_control,v=0.02")] = "p_control,w=1"
-    assert cli.main(command) == 2
-    assert "choose from v, gains.l" in capsys.readouterr().err
-
-
-def test_a_plan_is_loaded_with_its_registered_law(tmp_path):
-    kind = example("custom_law")["PParams"]
-    plan = Plan(Domain(), 3, {"p": kind(v=0.03)})
-    open_run(tmp_path, plan)
-    assert load_plan(tmp_path) == plan
-    registry.LAWS.pop("p_control")
-    with pytest.raises(InputError, match="unknown class of parameters 'PParams'"):
-        load_plan(tmp_path)
+    assert "choose from v, gains.l" in refusal(capsys, f"{command} --laws p_control,w=1")
 
 
 LAW = EXAMPLES / "custom_law.py"
 
 
 def test_commands_accept_a_law_of_a_file(tmp_path, capsys):
-    name = f"{LAW}:PParams"
-    short = ["--horizon", "0.5", "--engine", "mujoco"]
-    table = ["table", "--objects", "box", "--friction", "S1", "--targets", "2", "0", *short]
-    assert cli.main([*table, "--laws", "rps", name, "--out", str(tmp_path / "table")]) == 0
+    name, short = f"{LAW}:PParams", "--horizon 0.5 --engine mujoco"
+    table = f"table --objects box --friction S1 --targets 2 0 {short} --laws rps {name}"
+    assert rps(f"{table} --out", tmp_path / "table") == 0
     assert files.read_results(tmp_path / "table").law.values.tolist() == ["rps", "p_control"]
-    sweep = ["sweep", "--worlds", "2", "--laws", name, "--out", str(tmp_path / "sweep")]
-    assert cli.main([*sweep, *short]) == 0
+    assert rps(f"sweep --worlds 2 --laws {name} {short} --out", tmp_path / "sweep") == 0
     plan = load_plan(tmp_path / "sweep")
     assert registry.leaves_to_json(plan.laws["p_control"])["gains.heading"] == 0.1
-    capsys.readouterr()
 
 
 def test_a_run_detects_that_the_file_of_its_law_has_changed(tmp_path):
@@ -313,13 +303,12 @@ def test_a_file_is_run_again_if_another_law_has_taken_its_name():
 )
 def test_a_file_without_a_law_is_rejected_in_one_sentence(content, message, tmp_path):
     law = tmp_path / "mine.py"
-    if content is not None:
-        law.write_text(content)
+    _ = content is None or law.write_text(content)
     with pytest.raises(InputError, match=message):
         registry.parse_law(f"{law}:PParams")
 
 
-def test_nested_array_parameters_are_stored_and_loaded(tmp_path):
+def test_a_plan_is_loaded_with_its_registered_law_and_nested_parameters(tmp_path):
     names = example("custom_law")
     weights = names["PParams"](gains=names["Gains"](np.ones((2, 3)), np.arange(2.0)))
 
@@ -332,7 +321,10 @@ def test_nested_array_parameters_are_stored_and_loaded(tmp_path):
     open_run(tmp_path, plan)
     params = load_plan(tmp_path).laws["p"]
     assert jax.tree.map(np.shape, params) == jax.tree.map(np.shape, weights)
-    np.testing.assert_array_equal(params.gains.l, weights.gains.l)
+    same(params, plan.laws["p"])
+    registry.LAWS.pop("p_control")
+    with pytest.raises(InputError, match="unknown class of parameters 'PParams'"):
+        load_plan(tmp_path)
 
 
 def test_a_law_registered_again_replaces_the_old_one():
@@ -340,30 +332,14 @@ def test_a_law_registered_again_replaces_the_old_one():
     kinds = [example("custom_law")["PParams"] for _ in range(2)]
     assert kinds[0] not in registry._LAWS_BY_CLASS
     assert type(registry.LAWS["p_control"]) is kinds[1]
-    registry.register_law("slow", rps.LAW, RPSParams(v_max=0.01))
-    assert registry.law_of(registry.LAWS["slow"]) is rps.LAW
+    registry.register_law("slow", rps_law.LAW, RPSParams(v_max=0.01))
+    assert registry.law_of(registry.LAWS["slow"]) is rps_law.LAW
 
 
-class Ahead(NamedTuple):
-    v: float = 0.05  # [m/s]
-    d_success: float = 0.05  # [m]
-
-
-def test_invalid_params_of_a_custom_law_are_rejected():
-    law = Law(lambda params: (), lambda *_: None)
-    with pytest.raises(InputError, match="v = nan is not allowed"):
-        registry.register_law("p", law, Ahead(v=float("nan")))
-    with pytest.raises(InputError, match=r"a field or property d_success"):
-        registry.register_law("p", law, (1.0, 2.0))
-    with pytest.raises(InputError, match="the law 'rps' has a class of the same name RPSParams"):
-        registry.register_law("p", law, RPSParams())
-    with pytest.raises(InputError, match="params of class Ahead belong to no law"):
-        Case("box", FRICTION["S1"], (2.0, 0.0), Ahead())
-    details = Details.from_obs(
-        Observation(jnp.zeros(2), 0.0, jnp.array([0.3, 0.1]), jnp.array(True), jnp.ones(2))
-    )
-    assert float(details.l) == pytest.approx(0.1)
-    assert float(details.distance) == pytest.approx(np.hypot(0.7, 0.9))
+def test_details_of_an_observation_by_hand():
+    obs = observation((0.0, 0.0), 0.0, (0.3, 0.1), True, (1.0, 1.0))
+    details = Details.from_obs(obs)
+    assert (details.l, details.distance) == pytest.approx((0.1, np.hypot(0.7, 0.9)))
 
 
 # --- a policy and a robot ------------------------------------------------------------------
@@ -391,12 +367,10 @@ def test_the_law_runs_on_a_robot_without_compilation_in_the_loop(compiled, capsy
         robot.command(np.asarray(twist))
     assert len(compiled) == count
     # Taxels 17 to 20, left of the centre, are in contact after the filter's delay.
-    offset = 0.29 - 0.58 * (1.5 + 4.5) / 2 / 12
-    obs = Observation(
-        jnp.zeros(2), jnp.zeros(()), jnp.array([0.3625, offset]), jnp.array(True), jnp.array(target)
-    )
+    contact = [0.3625, 0.29 - 0.58 * (1.5 + 4.5) / 2 / 12]
+    obs = observation((0.0, 0.0), 0.0, contact, True, target)
     _, expected = step(RPSParams.paper(), RPSState.init(RPSParams.paper()), obs)
-    np.testing.assert_allclose(states[1].p_robot_contact, [0.3625, offset], atol=1e-6)
+    np.testing.assert_allclose(states[1].p_robot_contact, contact, atol=1e-6)
     assert float(expected.v_y) > 0.01
     np.testing.assert_allclose(np.asarray(twist)[:2], [expected.v_x, expected.v_y], atol=2e-3)
     latency = names["main"](names["Options"](seconds=0.3))
@@ -428,14 +402,3 @@ def test_skin_and_law_on_a_robot_observe_the_time_since_the_last_step(monkeypatc
     names["run"](SlowRobot(), np.zeros(2, np.float32), 0.02)
     assert commands[0] < 0.01
     assert min(commands[1:]) > 0.01
-
-
-def test_a_skin_reads_taxels_of_a_robot():
-    skin = CapacitiveSkin(time_constant=1e-6)
-    state = skin.init(jax.random.PRNGKey(0))
-    for taxel, point in ((0, (-0.3625 + 0.725 / 30, 0.29)), (41, (-0.3625 + 0.725 / 30, -0.29))):
-        _, reading = skin.read(state, jnp.zeros(42).at[taxel].set(0.3), 0.01)
-        assert int(reading.contact_type) == POINT
-        np.testing.assert_allclose(reading.p_robot_contact, point, atol=1e-6)
-    _, reading = skin.read(state, jnp.full(42, 0.2), 0.01)
-    assert not bool(reading.in_contact)

@@ -1,20 +1,19 @@
 """Objects on custom feet in the engines."""
 
-import jax
-import mujoco
 import numpy as np
 import pytest
-from staging import simulate, staged
+from helpers import same
+from staging import FINE, simulate, staged, step_in_c
 
 from rps_jax import engines
 from rps_jax.errors import InputError
-from rps_jax.geometry import solid
+from rps_jax.geometry import footprint, solid
+from rps_jax.geometry.footprint import Footprint
 from rps_jax.geometry.solid import SIDES
 from rps_jax.robot.robot import Robot
 from rps_jax.trials.worlds import starts
 from rps_jax.world import domain as domains
 from rps_jax.world import draws, objects, points, scene
-from rps_jax.world.physics import Physics
 from rps_jax.world.scene import Friction
 from sweeps.ground import rigid
 
@@ -29,7 +28,7 @@ XML = """
   </worldbody>
 </mujoco>"""
 FEET = np.array([[0.1, 0.1], [-0.15, 0.05], [0.05, -0.2]])
-FINE = Physics(timestep=0.01, control_period=0.01, iterations=30, ls_iterations=20)
+LOADS = np.linalg.solve(np.vstack([FEET.T, np.ones(3)]), [0, 0, 1])  # [1] shares of the weight
 FRICTION = Friction(0.3, 0.4)
 TWIST = (0.05, 0.0, 0.03)
 
@@ -56,16 +55,10 @@ def start(name):
     return loaded, qpos
 
 
-def step_in_c(name, steps):
-    """Return positions (10,) after steps at TWIST in C MuJoCo."""
+def pushed_in_c(name):
+    """Return positions (10,) after 3 s at TWIST in C MuJoCo."""
     loaded, qpos = start(name)
-    data = mujoco.MjData(loaded.physics)
-    data.qpos[:] = qpos
-    for _ in range(steps):
-        c, s = np.cos(data.qpos[2]), np.sin(data.qpos[2])
-        data.qvel[:3] = c * TWIST[0] - s * TWIST[1], s * TWIST[0] + c * TWIST[1], TWIST[2]
-        mujoco.mj_step(loaded.physics, data)
-    return data.qpos.copy()
+    return step_in_c(loaded.physics, qpos, TWIST, 300).qpos
 
 
 def driven(engine, names, steps):
@@ -80,7 +73,7 @@ Y = 4  # of the object, along the base's front, on which it comes to lie
 
 @pytest.mark.parametrize("engine", ["fused", "mjx"])
 def test_feet_change_the_final_pose_and_engines_agree_with_c_mujoco(engine):
-    feet, corners = step_in_c("on_feet", 300), step_in_c("on_corners", 300)
+    feet, corners = (pushed_in_c(name) for name in ("on_feet", "on_corners"))
     assert feet[Y] - corners[Y] > 0.01
     qpos = driven(engine, ["on_feet", "on_both"], 300)
     np.testing.assert_allclose(qpos[0], feet, atol=2e-3)
@@ -88,7 +81,7 @@ def test_feet_change_the_final_pose_and_engines_agree_with_c_mujoco(engine):
 
 
 def test_quasistatic_is_nearer_to_c_mujoco_with_equal_feet():
-    feet, corners = step_in_c("on_feet", 300), step_in_c("on_corners", 300)
+    feet, corners = (pushed_in_c(name) for name in ("on_feet", "on_corners"))
     qpos = driven("quasistatic", ["on_feet", "on_both"], 300)
     assert qpos[0, Y] - qpos[1, Y] > 0.005
     for final, expected, wrong in ((qpos[0], feet, corners), (qpos[1], corners, feet)):
@@ -105,9 +98,8 @@ def test_a_scene_returns_its_feet():
 
 def test_the_arm_of_friction_is_that_of_the_feet():
     row = scene.solid_of(scene.load("on_feet", FINE, FRICTION))
-    loads = np.linalg.solve(np.vstack([FEET.T, np.ones(3)]), [0, 0, 1])
     arm = solid.friction_arm(row)[0]
-    assert arm == pytest.approx(loads @ np.linalg.norm(FEET, axis=1), rel=1e-4)
+    assert arm == pytest.approx(LOADS @ np.linalg.norm(FEET, axis=1), rel=1e-4)
     names = ("on_both", "on_corners")
     both, corners = (scene.solid_of(scene.load(name, FINE, FRICTION)) for name in names)
     assert solid.friction_arm(both) == pytest.approx(solid.friction_arm(corners))
@@ -125,8 +117,7 @@ def test_the_rigid_solver_supports_feet():
     feet = rigid.supports(row, np.zeros(1), np.zeros((1, 2)))
     np.testing.assert_allclose(feet[0, :3], FEET, atol=1e-9)
     load = rigid.borne(feet, np.zeros((1, 2)), np.zeros((1, 1)), row.feet[..., 2])
-    expected = np.linalg.solve(np.vstack([FEET.T, np.ones(3)]), [0, 0, 1])
-    np.testing.assert_allclose(load[0], [*expected, *np.zeros(SIDES - 3)], atol=1e-9)
+    np.testing.assert_allclose(load[0], [*LOADS, *np.zeros(SIDES - 3)], atol=1e-9)
 
 
 @pytest.mark.parametrize(
@@ -167,31 +158,19 @@ def stepped(engine, family, drawn, steps):
 def test_drawn_feet_change_nothing_else_and_bear_the_object(name):
     plain, drawn, _ = drawn_on_feet(name, 64)
     assert plain.solid.feet is None
-    rest = [jax.tree.leaves(x._replace(solid=None, values=None)) for x in (plain, drawn)]
-    for a, b in zip(*rest, strict=True):
-        np.testing.assert_array_equal(a, b)
+    same(*(x._replace(solid=None, values=None) for x in (plain, drawn)))
     np.testing.assert_array_equal(plain.solid.mass, drawn.solid.mass)
     assert set(drawn.values) - set(plain.values) == {"feet"}
     feet, com = drawn.solid.feet, drawn.solid.p_object_com[:, :2]
     assert set(feet[..., 2].sum(axis=1)) == {3.0, 4.0}
-    for share, row, middle, outline, radius in zip(
-        drawn.values["feet"], feet, com, drawn.solid.vertices, drawn.solid.radius, strict=True
-    ):
-        for foot in row[row[:, 2] > 0, :2]:
-            # Stretched by the share, a foot lies on the outline.
-            edge = middle + (foot - middle) / share
-            if radius:
-                assert np.hypot(*edge) == pytest.approx(radius)
-                continue
-            along = np.roll(outline, -1, axis=0) - outline
-            away = edge - outline
-            away = along[:, 0] * away[:, 1] - along[:, 1] * away[:, 0]
-            away = away[np.hypot(*along.T) > 0]
-            assert np.abs(away).min() < 1e-9
-            assert away.min() > -1e-9
-        bearing = np.linspace(0, 2 * np.pi, 90)
-        reach = (row[:, :2] - middle) @ np.stack([np.cos(bearing), np.sin(bearing)])
-        assert reach.max(axis=0).min() > 0
+    bearing = np.linspace(0, 2 * np.pi, 90)
+    for i, share in enumerate(drawn.values["feet"]):
+        reach = feet[i, :, :2] - com[i]
+        # Stretched by the share, a foot lies on the outline.
+        edge = com[i] + reach[feet[i, :, 2] > 0] / share
+        outline = Footprint(drawn.solid.vertices[i], drawn.solid.radius[i])
+        np.testing.assert_allclose(footprint.signed_distance(outline, edge), 0, atol=1e-6)
+        assert (reach @ [np.cos(bearing), np.sin(bearing)]).max(axis=0).min() > 0
 
 
 @pytest.mark.parametrize(
@@ -209,9 +188,8 @@ def test_objects_on_drawn_feet_end_where_those_of_c_mujoco_do(engine, name):
 
 def test_quasistatic_slides_on_drawn_feet():
     plain, drawn, family = drawn_on_feet("random_prism")
-    _, sliders = engines.get("quasistatic").stage(
-        family, drawn.solid, drawn.friction, FINE, Robot()
-    )
+    arguments = family, drawn.solid, drawn.friction, FINE, Robot()
+    _, sliders = engines.get("quasistatic").stage(*arguments)
     three = drawn.solid.feet[..., 2].sum(axis=1) == 3
     assert three.any()
     for i in np.flatnonzero(three):
@@ -224,10 +202,9 @@ def test_quasistatic_slides_on_drawn_feet():
 def test_feet_are_drawn_only_for_random_objects():
     with pytest.raises(InputError, match="only random objects stand on drawn feet"):
         domains.parse_domain("wide,objects=box,feet=0.5:0.9")
-    ranges = domains.parse_domain("wide,feet=0.5:0.9")
-    assert {"feet", "feet_number", "feet_turn"} == set(points.names(ranges)) - set(
-        points.names(domains.parse_domain("wide"))
-    )
+    ranges, plain = (domains.parse_domain(f"wide{feet}") for feet in (",feet=0.5:0.9", ""))
+    names = {"feet", "feet_number", "feet_turn"}
+    assert set(points.names(ranges)) - set(points.names(plain)) == names
     u = points.points_of(ranges, np.arange(6), 1)
     again = points.check_points(ranges, u).draw(ranges, np.array([0, 3]))
     drawn = draws.draw(ranges, 1, np.array([0, 3]))

@@ -55,12 +55,15 @@ def differ(a, b):
     return (np.abs(a - b).max(axis=-1) > 60).sum() > 20
 
 
+def in_order(takes, name="labels"):
+    return film._in_grid_order([getattr(take, name) for take in takes], takes)
+
+
 @pytest.mark.parametrize("make", [table, pytest.param(write_sweep, marks=pytest.mark.slow)])
 def test_a_film_shows_each_trial_in_its_tile_and_holds_the_end(make, tmp_path):
     make(tmp_path)
     out = tmp_path / "two.mp4"
-    arguments = ["--grid", "2x4", "--seconds", 2, "--speed", 4.8, "--out", out]
-    assert rps("film", tmp_path, *arguments) == 0
+    assert rps(f"film {tmp_path} --grid 2x4 --seconds 2 --speed 4.8 --out {out}") == 0
     images = decode(out)
     # 20 control steps of 0.02 s a frame: at 0, 0.4, ... 2 s, and the last for a second more.
     assert images.shape == (6 + FPS, 2 * 270, 4 * 480, 3)
@@ -77,19 +80,15 @@ def test_worlds_of_several_objects_keep_their_order(tmp_path):
     plan = plan_of("random_cylinder", "random_box")
     takes = film.of_sweep(tmp_path, plan, ["rps"], "first", (1, 3))
     assert [list(take.tiles) for take in takes] == [[0, 2], [1]]
-    assert film._in_grid_order([take.labels for take in takes], takes) == [
-        f"world {i}" for i in range(3)
-    ]
-    assert [scene.family for scene in film._in_grid_order([t.scenes for t in takes], takes)] == [
-        *("cylinder", "box", "cylinder")
-    ]
+    assert in_order(takes) == [f"world {i}" for i in range(3)]
+    families = [scene.family for scene in in_order(takes, "scenes")]
+    assert families == ["cylinder", "box", "cylinder"]
 
 
 def test_worlds_are_filmed_by_their_indices(tmp_path):
     plan = plan_of("random_cylinder", "random_box")
-    chosen = film.worlds_of(plan, (2, 1))
-    takes = film.of_sweep(tmp_path, plan, ["rps"], chosen, (1, 3))
-    assert film._in_grid_order([take.labels for take in takes], takes) == ["world 2", "world 1"]
+    takes = film.of_sweep(tmp_path, plan, ["rps"], film.worlds_of(plan, (2, 1)), (1, 3))
+    assert in_order(takes) == ["world 2", "world 1"]
     for wrong in ((1, 1), (-1,), (plan.worlds,)):
         with pytest.raises(InputError, match="worlds"):
             film.worlds_of(plan, wrong)
@@ -99,10 +98,7 @@ def test_several_laws_have_a_row_each_and_a_world_a_column(tmp_path):
     base_plan = plan_of("random_box", "random_cylinder")
     plan = dataclasses.replace(base_plan, laws={"one": RPSParams.paper(), "two": RPSParams.nps()})
     takes = film.of_sweep(tmp_path, plan, ["two", "one"], "first", (2, 3))
-    assert film._in_grid_order([take.labels for take in takes], takes) == [
-        *(f"two, world {i}" for i in range(3)),
-        *(f"one, world {i}" for i in range(3)),
-    ]
+    assert in_order(takes) == [f"{law}, world {i}" for law in ("two", "one") for i in range(3)]
     film.rows_of(plan, ["two", "one"], (2, 3))
     with pytest.raises(InputError, match="each has a row"):
         film.rows_of(plan, ["two", "one"], (3, 2))

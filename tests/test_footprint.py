@@ -4,20 +4,16 @@ from __future__ import annotations
 
 import math
 
-import hypothesis
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from hypothesis import strategies as st
+from helpers import SEEDS, property_test, refusals
 from scipy.spatial import ConvexHull, cKDTree
 
 from rps_jax.geometry import footprint as fp
 from rps_jax.geometry import planar
 from rps_jax.geometry.footprint import Footprint
-
-property_test = hypothesis.settings(max_examples=100, deadline=None)
-seeds = st.integers(0, 2**32 - 1)
 
 BATCH, POINTS = 8, 128
 # One program for each number of vertices: the shapes below are always (BATCH, ...).
@@ -78,65 +74,36 @@ def brute_force_distance(vertices: np.ndarray, radius: float, points: np.ndarray
 # Golden values
 
 
-@pytest.mark.parametrize(
-    ("point", "expected"),
-    [
-        ((0.0, 0.0), -0.2),  # the centre: the nearer side
-        ((0.25, 0.0), -0.05),
-        ((0.3, 0.1), 0.0),  # on a side
-        ((0.3, 0.2), 0.0),  # on a corner
-        ((0.5, 0.1), 0.2),
-        ((0.0, -0.9), 0.7),
-        ((0.6, 0.6), 0.5),  # off a corner: 3-4-5
-        ((-0.6, -0.6), 0.5),
-    ],
-)
-def test_the_distance_to_a_rectangle_by_hand(point, expected):
-    distance = fp.signed_distance(fp.rectangle(0.3, 0.2), jnp.array(point))
-    assert distance == pytest.approx(expected, abs=1e-7)
+BOX, BALL = fp.rectangle(0.3, 0.2), fp.circle(0.25)
+SQUARE = np.float32([[1, -1], [1, 1], [-1, 1], [-1, -1]])
+DISTANCES = {
+    # The centre: to the nearer side; on a side, on a corner, and off a corner: 3-4-5.
+    "box": (BOX, {(0, 0): -0.2, (0.25, 0): -0.05, (0.3, 0.1): 0, (0.3, 0.2): 0, (0.5, 0.1): 0.2,
+                  (0, -0.9): 0.7, (0.6, 0.6): 0.5, (-0.6, -0.6): 0.5}),
+    "circle": (BALL, {(0, 0): -0.25, (0.1, 0): -0.15, (0, -0.25): 0, (0.3, 0.4): 0.25}),
+    "box with a radius": (BOX._replace(radius=jnp.float32(0.1)),
+                          {(0, 0): -0.3, (0.5, 0): 0.1, (0.6, 0.6): 0.4}),
+    "stadium": (Footprint(jnp.array([[-0.3, 0.0], [0.3, 0.0]]), jnp.float32(0.1)),
+                {(0, 0): -0.1, (0.2, 0.3): 0.2, (0.6, 0.4): 0.4}),
+    # A prism and a circle are filled up to one number of corners by repeated ones.
+    "square": (Footprint(jnp.array(0.2 * SQUARE[[0, 1, 2, 3, 3, 3, 3, 3]]), jnp.float32(0)),
+               {(0, 0): -0.2, (0.19, 0): -0.01, (0.3, 0.1): 0.1, (-0.25, -0.25): 0.05 * 2**0.5}),
+    "point": (Footprint(jnp.zeros((4, 2)), jnp.float32(0.1)), {(0, 0): -0.1, (0.3, 0.4): 0.4}),
+}  # fmt: skip
 
 
-def test_the_distance_to_a_circle_by_hand():
-    points = jnp.array([[0.0, 0.0], [0.1, 0.0], [0.0, -0.25], [0.3, 0.4]])
-    distance = fp.signed_distance(fp.circle(0.25), points)
-    np.testing.assert_allclose(distance, [-0.25, -0.15, 0.0, 0.25], atol=1e-7)
-
-
-def test_a_radius_rounds_a_polygon_from_outside():
-    rounded = fp.rectangle(0.3, 0.2)._replace(radius=jnp.float32(0.1))
-    points = jnp.array([[0.0, 0.0], [0.5, 0.0], [0.6, 0.6]])
-    np.testing.assert_allclose(fp.signed_distance(rounded, points), [-0.3, 0.1, 0.4], atol=1e-7)
-
-
-def test_two_vertices_and_a_radius_are_a_stadium():
-    stadium = Footprint(jnp.array([[-0.3, 0.0], [0.3, 0.0]]), jnp.float32(0.1))
-    points = jnp.array([[0.0, 0.0], [0.2, 0.3], [0.6, 0.4]])
-    np.testing.assert_allclose(fp.signed_distance(stadium, points), [-0.1, 0.2, 0.4], atol=1e-7)
-    low, high = fp.crossing(stadium, jnp.array([0.0, 0.06]), jnp.array([1.0, 0.0]), 0.0)
-    np.testing.assert_allclose([low, high], [-0.38, 0.38], atol=1e-6)  # 6-8-10 at each end
-
-
-def test_a_repeated_corner_changes_no_distance():
-    """Prisms are filled up to one number of corners by such points."""
-    square = jnp.array([[0.2, -0.2], [0.2, 0.2], [-0.2, 0.2], [-0.2, -0.2]])
-    filled = jnp.concatenate([square, jnp.tile(square[-1], (4, 1))])
-    points = jnp.array([[0.0, 0.0], [0.19, 0.0], [0.3, 0.1], [-0.25, -0.25]])
-    distances_of = [
-        fp.signed_distance(Footprint(v, jnp.array(0.0)), points) for v in (square, filled)
-    ]
-    np.testing.assert_allclose(distances_of[0], [-0.2, -0.01, 0.1, 0.05 * 2**0.5], atol=1e-6)
-    np.testing.assert_array_equal(*distances_of)
-    point = Footprint(jnp.zeros((4, 2)), jnp.array(0.1))  # a circle, filled up in the same way
-    np.testing.assert_allclose(
-        fp.signed_distance(point, points), [-0.1, 0.09, 0.2162278, 0.2535534], rtol=1e-5
-    )
+@pytest.mark.parametrize("shape", DISTANCES)
+def test_the_distance_by_hand(shape):
+    outline, expected = DISTANCES[shape]
+    distance = fp.signed_distance(outline, jnp.array(list(expected), float))
+    np.testing.assert_allclose(distance, list(expected.values()), atol=1e-6)
 
 
 def test_place_turns_and_then_moves():
-    placed = fp.place(fp.rectangle(0.3, 0.2), jnp.array([1.0, 2.0]), jnp.float32(math.pi / 2))
+    placed = fp.place(BOX, jnp.array([1.0, 2.0]), jnp.float32(math.pi / 2))
     expected = [[0.8, 2.3], [0.8, 1.7], [1.2, 1.7], [1.2, 2.3]]
     np.testing.assert_allclose(placed.vertices, expected, atol=1e-6)
-    assert fp.place(fp.circle(0.25), jnp.ones(2), 1.0).radius == 0.25
+    assert fp.place(BALL, jnp.ones(2), 1.0).radius == 0.25
 
 
 # Signed distance
@@ -159,8 +126,7 @@ def test_the_signed_distance_agrees_with_brute_force(kind):
 
 
 @every_kind
-@property_test
-@hypothesis.given(seeds)
+@property_test(SEEDS)
 def test_the_signed_distance_does_not_depend_on_the_frame(kind, seed):
     rng = np.random.default_rng(seed)
     footprints = KINDS[kind](rng)
@@ -217,58 +183,46 @@ def test_derivatives_are_finite_on_an_exact_corner_side_and_centre():
 
 # Crossing
 
-PAST_THE_CORNER = (0.3 + 0.05 * math.sqrt(0.5), 0.2 + 0.05 * math.sqrt(0.5))
 DIAGONAL = (math.sqrt(0.5), -math.sqrt(0.5))
+PAST_THE_CORNER = (0.3 + 0.05 * math.sqrt(0.5), 0.2 + 0.05 * math.sqrt(0.5))
+X_AXIS, NOTHING = (1.0, 0.0), (math.inf, -math.inf)
 
 
 @pytest.mark.parametrize(
-    ("origin", "along", "tolerance", "expected"),
+    ("shape", "origin", "along", "tolerance", "expected"),
     [
         # Through the middle of a box 0.6 by 0.4, along x.
-        ((-1.0, 0.0), (1.0, 0.0), 0.0, (0.7, 1.3)),
-        ((-1.0, 0.0), (1.0, 0.0), 0.05, (0.65, 1.35)),
-        ((1.0, 0.0), (-1.0, 0.0), 0.0, (0.7, 1.3)),
+        (BOX, (-1.0, 0.0), X_AXIS, 0.0, (0.7, 1.3)),
+        (BOX, (-1.0, 0.0), X_AXIS, 0.05, (0.65, 1.35)),
+        (BOX, (1.0, 0.0), (-1.0, 0.0), 0.0, (0.7, 1.3)),
         # Through the middle, along y, from inside.
-        ((0.1, 0.0), (0.0, 1.0), 0.0, (-0.2, 0.2)),
+        (BOX, (0.1, 0.0), (0.0, 1.0), 0.0, (-0.2, 0.2)),
         # Beside the upper side by 0.03: the tolerance 0.05 rounds the corners, 3-4-5.
-        ((0.0, 0.23), (1.0, 0.0), 0.05, (-0.34, 0.34)),
+        (BOX, (0.0, 0.23), X_AXIS, 0.05, (-0.34, 0.34)),
         # The 3-4-5 direction through the centre leaves by the upper and lower sides.
-        ((0.0, 0.0), (0.6, 0.8), 0.0, (-0.25, 0.25)),
+        (BOX, (0.0, 0.0), (0.6, 0.8), 0.0, (-0.25, 0.25)),
         # Past the corner (0.3, 0.2) at 0.05: its arc, half a chord of sqrt(0.06^2 - 0.05^2).
-        (PAST_THE_CORNER, DIAGONAL, 0.06, (-0.0331662, 0.0331662)),
+        (BOX, PAST_THE_CORNER, DIAGONAL, 0.06, (-0.0331662, 0.0331662)),
         # The same at 0.13: the shifted sides, 0.13 sqrt(2) - 0.05 away.
-        (PAST_THE_CORNER, DIAGONAL, 0.13, (-0.1338478, 0.1338478)),
+        (BOX, PAST_THE_CORNER, DIAGONAL, 0.13, (-0.1338478, 0.1338478)),
+        # Along a side it is the whole side.
+        (fp.rectangle(0.25, 0.125), (0.0, 0.125), X_AXIS, 0.0, (-0.25, 0.25)),
+        (fp.rectangle(0.25, 0.125), (0.0, 0.125), (-1.0, 0.0), 0.0, (-0.25, 0.25)),
+        (fp.rectangle(0.25, 0.125), (0.0, -0.125), X_AXIS, 0.0, (-0.25, 0.25)),
+        # 0.2 off the centre of a circle of radius 0.25: half a chord is 0.15.
+        (BALL, (-1.0, 0.2), X_AXIS, 0.0, (0.85, 1.15)),
+        # A line that touches a circle crosses it in a point.
+        (BALL, (-1.0, 0.375), X_AXIS, 0.125, (1.0, 1.0)),
+        (DISTANCES["stadium"][0], (0.0, 0.06), X_AXIS, 0.0, (-0.38, 0.38)),  # 6-8-10 at each end
+        # A line without a crossing has an empty interval.
+        (BOX, (0.0, 0.26), X_AXIS, 0.05, NOTHING),
+        (BALL, (0.0, 0.31), X_AXIS, 0.05, NOTHING),
+        (BOX, (0.0, 0.26), X_AXIS, 0.07, (-0.3360555, 0.3360555)),  # sqrt(0.07^2 - 0.06^2)
     ],
 )
-def test_the_crossing_of_a_box_by_hand(origin, along, tolerance, expected):
-    got = fp.crossing(fp.rectangle(0.3, 0.2), jnp.array(origin), jnp.array(along), tolerance)
+def test_the_crossing_by_hand(shape, origin, along, tolerance, expected):
+    got = fp.crossing(shape, jnp.array(origin), jnp.array(along), tolerance)
     np.testing.assert_allclose(got, expected, atol=1e-6)
-
-
-def test_the_crossing_along_a_side_is_the_whole_side():
-    box = fp.rectangle(0.25, 0.125)
-    for y, along in [(0.125, 1.0), (0.125, -1.0), (-0.125, 1.0)]:
-        got = fp.crossing(box, jnp.array([0.0, y]), jnp.array([along, 0.0]), 0.0)
-        np.testing.assert_allclose(got, [-0.25, 0.25], atol=1e-7)
-
-
-def test_the_crossing_of_a_circle_is_a_chord():
-    # 0.2 off the centre of a circle of radius 0.25: half a chord is 0.15.
-    low, high = fp.crossing(fp.circle(0.25), jnp.array([-1.0, 0.2]), jnp.array([1.0, 0.0]), 0.0)
-    np.testing.assert_allclose([low, high], [0.85, 1.15], rtol=1e-6)
-
-
-def test_a_line_that_touches_a_circle_crosses_it_in_a_point():
-    low, high = fp.crossing(fp.circle(0.25), jnp.array([-1.0, 0.375]), jnp.array([1.0, 0.0]), 0.125)
-    assert (low, high) == (1.0, 1.0)
-
-
-def test_a_line_without_crossing_has_an_empty_interval():
-    for shape in (fp.rectangle(0.3, 0.2), fp.circle(0.2)):
-        origin, along = jnp.array([0.0, 0.26]), jnp.array([1.0, 0.0])
-        assert tuple(map(float, fp.crossing(shape, origin, along, 0.05))) == (math.inf, -math.inf)
-        low, high = fp.crossing(shape, origin, along, 0.07)
-        assert low < high
 
 
 def random_lines(rng, footprints: Footprint) -> tuple[np.ndarray, np.ndarray]:
@@ -288,44 +242,26 @@ def random_lines(rng, footprints: Footprint) -> tuple[np.ndarray, np.ndarray]:
 
 
 @every_kind
-@property_test
-@hypothesis.given(seeds)
+@property_test(SEEDS)
 def test_a_crossing_holds_exactly_the_points_within_the_tolerance(kind, seed):
+    """Its ends are at the tolerance."""
     rng = np.random.default_rng(seed)
     footprints = KINDS[kind](rng)
     origin, along = random_lines(rng, footprints)
     tolerance = rng.choice([0.0, 0.006, 0.1], BATCH).astype(np.float32)
     low, high = (np.asarray(v)[:, None] for v in crossings(footprints, origin, along, tolerance))
     hit = low <= high
-    # Samples along the line, and its points just within and just beyond the ends.
-    s = np.linspace(-2.5, 2.5, POINTS - 4) * np.ones((BATCH, 1))
+    # Samples along the line, its ends, and its points just within and just beyond them.
+    s = np.linspace(-2.5, 2.5, POINTS - 6) * np.ones((BATCH, 1))
     edges = np.where(hit, np.concatenate([low, high], axis=1), 0)
     inward = np.array([2e-3, -2e-3])
-    s = np.concatenate([s, edges + inward, edges - inward], axis=1)
+    s = np.concatenate([s, edges, edges + inward, edges - inward], axis=1)
     points = np.float32(origin[:, None] + s[..., None] * along[:, None])
     margin = np.asarray(distances(footprints, points)) - tolerance[:, None]
     within = (low <= s) & (s <= high)
     assert (margin[within] < 2e-6).all()
     assert (margin[~within] > -2e-6).all()
-
-
-@every_kind
-def test_the_ends_of_a_crossing_are_at_the_tolerance(kind):
-    rng = np.random.default_rng(3)
-    hits = []
-    for _ in range(50):
-        footprints = KINDS[kind](rng)
-        origin, along = random_lines(rng, footprints)
-        tolerance = rng.choice([0.0, 0.006, 0.1], BATCH).astype(np.float32)
-        low, high = map(np.asarray, crossings(footprints, origin, along, tolerance))
-        hit = low <= high
-        s = np.where(hit, [low, high], 0)
-        points = origin[:, None] + s.T[..., None] * along[:, None]
-        points = np.resize(points.swapaxes(0, 1), (POINTS, BATCH, 2)).swapaxes(0, 1)
-        distance = distances(footprints, np.float32(points))[hit, :2]
-        np.testing.assert_allclose(distance, np.tile(tolerance[hit][:, None], 2), atol=2e-6)
-        hits.append(hit.mean())
-    assert 0.2 < np.mean(hits) < 0.95
+    assert (np.abs(margin[hit[:, 0], -6:-4]) < 2e-6).all()
 
 
 def test_derivatives_of_a_crossing_are_finite_if_the_line_only_grazes():
@@ -350,11 +286,11 @@ def test_derivatives_of_a_crossing_are_finite_if_the_line_only_grazes():
 @pytest.mark.parametrize(
     ("shape", "along", "expected"),
     [
-        (fp.rectangle(0.3, 0.2), (1.0, 0.0), 0.3),
-        (fp.rectangle(0.3, 0.2), (0.0, -1.0), 0.2),
-        (fp.rectangle(0.3, 0.2), (-0.6, 0.8), 0.34),  # 0.6 * 0.3 + 0.8 * 0.2
-        (fp.circle(0.25), (0.6, 0.8), 0.25),
-        (fp.place(fp.circle(0.25), jnp.array([1.0, 2.0]), 0.3), (0.6, 0.8), 2.45),
+        (BOX, X_AXIS, 0.3),
+        (BOX, (0.0, -1.0), 0.2),
+        (BOX, (-0.6, 0.8), 0.34),  # 0.6 * 0.3 + 0.8 * 0.2
+        (BALL, (0.6, 0.8), 0.25),
+        (fp.place(BALL, jnp.array([1.0, 2.0]), 0.3), (0.6, 0.8), 2.45),
     ],
 )
 def test_the_extent_by_hand(shape, along, expected):
@@ -381,47 +317,40 @@ def test_the_extent_is_the_furthest_point_of_the_outline(kind):
 
 
 def test_outlines_are_counter_clockwise_and_of_the_given_size():
-    box = fp.rectangle(0.3, 0.2)
-    x, y = np.asarray(box.vertices, float).T
+    x, y = np.asarray(BOX.vertices, float).T
     area = 0.5 * (x * np.roll(y, -1) - np.roll(x, -1) * y).sum()
     assert area == pytest.approx(0.6 * 0.4)
-    assert box.radius == 0
-    ball = fp.circle(0.25)
-    np.testing.assert_array_equal(ball.vertices, [[0, 0]])
-    assert ball.radius == 0.25
-
-
-def test_polygon_keeps_its_vertices():
+    assert (BOX.radius, BALL.radius) == (0, 0.25)
+    np.testing.assert_array_equal(BALL.vertices, [[0, 0]])
     triangle = [[0.0, 0.0], [1.0, 0.0], [0.25, 0.5]]
     built = fp.polygon(triangle)
     np.testing.assert_array_equal(built.vertices, triangle)
     assert built.radius == 0
 
 
-SQUARE = [[0, 0], [1, 0], [1, 1], [0, 1]]
-STAR = [[math.sin(4 * math.pi * i / 5), -math.cos(4 * math.pi * i / 5)] for i in range(5)]
+STAR_ANGLES = 4 * math.pi * np.arange(5) / 5
+STAR = np.stack([np.sin(STAR_ANGLES), -np.cos(STAR_ANGLES)], -1)
 
 
-@pytest.mark.parametrize(
-    ("fault", "vertices"),
-    [
-        ("clockwise", SQUARE[::-1]),
-        ("not convex", [[0, 0], [1, 0], [0.2, 0.2], [0, 1]]),
-        ("crossing itself", [[0, 0], [1, 1], [1, 0], [0, 1]]),
-        ("a star, always turning left but twice around", STAR),
-        ("a star the other way around", STAR[::-1]),
-        ("twice around a square", SQUARE + SQUARE),
-        ("three in a line", [[0, 0], [0.5, 0], [1, 0], [1, 1]]),
-        ("a repeated vertex", [[0, 0], [1, 0], [1, 0], [1, 1]]),
-        ("all in a line", [[0, 0], [1, 0], [2, 0]]),
-        ("NaN", [[0, 0], [1, 0], [math.nan, 1]]),
-        ("infinite", [[0, 0], [math.inf, 0], [1, 1]]),
-        ("two vertices", [[0, 0], [1, 0]]),
-        ("three coordinates", [[0, 0, 0], [1, 0, 0], [1, 1, 0]]),
-        ("flat", [0, 0, 1, 0, 1, 1]),
-        ("empty", []),
-    ],
+FAULTS = {
+    "clockwise": SQUARE[::-1],
+    "not convex": [[0, 0], [1, 0], [0.2, 0.2], [0, 1]],
+    "crossing itself": [[0, 0], [1, 1], [1, 0], [0, 1]],
+    "a star, always turning left but twice around": STAR,
+    "a star the other way around": STAR[::-1],
+    "twice around a square": np.tile(SQUARE, (2, 1)),
+    "three in a line": [[0, 0], [0.5, 0], [1, 0], [1, 1]],
+    "a repeated vertex": [[0, 0], [1, 0], [1, 0], [1, 1]],
+    "all in a line": [[0, 0], [1, 0], [2, 0]],
+    "NaN": [[0, 0], [1, 0], [math.nan, 1]],
+    "infinite": [[0, 0], [math.inf, 0], [1, 1]],
+    "two vertices": [[0, 0], [1, 0]],
+    "three coordinates": [[0, 0, 0], [1, 0, 0], [1, 1, 0]],
+    "flat": [0, 0, 1, 0, 1, 1],
+    "empty": [],
+}
+
+
+test_polygon_rejects_outlines_that_are_not_convex_and_counter_clockwise = refusals(
+    fp.polygon, *(((vertices,), "vertices must") for vertices in FAULTS.values())
 )
-def test_polygon_rejects_outlines_that_are_not_convex_and_counter_clockwise(fault, vertices):
-    with pytest.raises(ValueError, match="vertices must"):
-        fp.polygon(vertices)

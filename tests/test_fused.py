@@ -1,6 +1,5 @@
 """The fused engine agrees with C MuJoCo."""
 
-import functools
 from dataclasses import replace
 
 import jax
@@ -8,19 +7,18 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
+from helpers import row
+from staging import FINE, simulate, staged, step_in_c
 
-from rps_jax.control.observation import Twist
-from rps_jax.engines.base import ControlPeriod, Motion
+from rps_jax.engines.base import Motion
 from rps_jax.engines.fused import contacts, newton
 from rps_jax.engines.fused import step as fused
 from rps_jax.geometry import vectors
 from rps_jax.world import scene
-from rps_jax.world.objects import FAMILIES
 from rps_jax.world.physics import Physics
 from rps_jax.world.scene import Friction
 
 TWIST = (0.05, 0.01, 0.05)  # [m/s, m/s, rad/s]
-FINE = Physics(timestep=0.01, control_period=0.01, iterations=30, ls_iterations=20)
 # Object, yaw [rad] and lateral offset [m]: flat on the face, corner first, the base's corner first.
 STARTS = (
     ("box", 0.0, 0.0),
@@ -32,72 +30,44 @@ STARTS = (
 )
 
 
-def start(name, yaw, offset, physics=FINE, gap=-0.0005):
+def start(name, yaw, offset, physics=FINE):
     loaded = scene.load(name, physics, Friction(0.3, 0.4))
-    qpos = scene.initial_qpos(loaded, gap, yaw)
+    qpos = scene.initial_qpos(loaded, -0.0005, yaw)
     qpos[4:6] += offset, -0.0005  # sunk, so that rounding does not decide what touches
     qpos[:3] = 0.1, -0.2, 0.5  # and all of it turned
     c, s = np.cos(0.5), np.sin(0.5)
     qpos[3:5] = qpos[:2] + np.array([[c, -s], [s, c]]) @ qpos[3:5]
     half = (yaw + 0.5) / 2
     qpos[6:] = np.cos(half), 0.0, 0.0, np.sin(half)
-    body = fused.body(loaded.physics, np.asarray(loaded.footprint.vertices))
-    return loaded, jax.tree.map(lambda x: jnp.asarray(x, float)[None], body), qpos
+    return loaded, qpos
 
 
-def step_in_c(model, qpos, steps):
-    """Positions (10,) and velocities (9,) after `steps` steps at TWIST."""
-    data = mujoco.MjData(model)
-    data.qpos[:] = qpos
-    for _ in range(steps):
-        c, s = np.cos(data.qpos[2]), np.sin(data.qpos[2])
-        data.qvel[:3] = c * TWIST[0] - s * TWIST[1], s * TWIST[0] + c * TWIST[1], TWIST[2]
-        mujoco.mj_step(model, data)
-    return data.qpos, data.qvel
-
-
-@functools.cache
-def program(family, physics):
-    """Return a function that pushes worlds of a family, compiled once for each cone."""
-
-    @jax.jit
-    def run(body, state, steps):
-        twist = Twist(*(jnp.full(state[0].shape[0], x) for x in TWIST))
-        period = ControlPeriod(twist, physics)
-        push = lambda _, motion: fused.drive(body, motion, period).motion  # noqa: E731
-        return jax.lax.fori_loop(0, steps, push, Motion(*state))
-
-    return run
-
-
-def drive(name, body, physics, qpos, steps):
-    state = jnp.asarray(qpos, float)[None], jnp.zeros((1, 9)), jnp.zeros((1, 9))
-    motion = program(FAMILIES[name], physics)(body, state, steps)
-    return [np.asarray(x[0], float) for x in motion[:3]]
+def pushed(loaded, qpos, steps, physics=FINE):
+    """Return position and velocity after steps at TWIST in the fused engine, and in C MuJoCo."""
+    stage, fields = staged("fused", [loaded], physics)
+    end = row(simulate("fused", stage, fields, qpos[None], TWIST, physics, steps)[:2], (-1, 0))
+    return *end, step_in_c(loaded.physics, qpos, TWIST, steps)
 
 
 @pytest.mark.parametrize("cone", ["elliptic", "pyramidal"])
 @pytest.mark.parametrize(("name", "yaw", "offset"), STARTS)
 def test_a_step_agrees_with_c_mujoco(name, yaw, offset, cone):
     physics = replace(FINE, cone=cone)
-    loaded, body, qpos = start(name, yaw, offset, physics)
-    expected = step_in_c(loaded.physics, qpos, 1)
-    pose, velocity, _ = drive(name, body, physics, qpos, 1)
+    pose, velocity, expected = pushed(*start(name, yaw, offset, physics), 1, physics)
     # C MuJoCo finds one contact of the cylinder with the base, of which the fused engine has two.
     near, slow = (5e-4, 0.1) if (name, offset) == ("cylinder", 0.08) else (1e-6, 1e-4)
-    np.testing.assert_allclose(pose, expected[0], atol=near)
-    np.testing.assert_allclose(velocity[:3], expected[1][:3], atol=1e-3)
-    np.testing.assert_allclose(velocity[3:], expected[1][3:], atol=slow)
+    np.testing.assert_allclose(pose, expected.qpos, atol=near)
+    np.testing.assert_allclose(velocity[:3], expected.qvel[:3], atol=1e-3)
+    np.testing.assert_allclose(velocity[3:], expected.qvel[3:], atol=slow)
 
 
 @pytest.mark.parametrize(("name", "yaw", "offset"), [STARTS[1], STARTS[3], STARTS[4]])
 def test_a_push_of_three_seconds_agrees_with_c_mujoco(name, yaw, offset):
     """C MuJoCo drops one of two contacts of a tilted edge now and then, which rocks the object."""
-    loaded, body, qpos = start(name, yaw, offset)
-    expected, _ = step_in_c(loaded.physics, qpos, 300)
-    pose, _, _ = drive(name, body, FINE, qpos, 300)
-    assert np.hypot(*(expected - qpos)[3:5]) > 0.1
-    np.testing.assert_allclose(pose, expected, atol=2e-3)
+    loaded, qpos = start(name, yaw, offset)
+    pose, _, expected = pushed(loaded, qpos, 300)
+    assert np.hypot(*(expected.qpos - qpos)[3:5]) > 0.1
+    np.testing.assert_allclose(pose, expected.qpos, atol=2e-3)
 
 
 @pytest.mark.parametrize("cone", ["elliptic", "pyramidal"])

@@ -5,11 +5,11 @@ from __future__ import annotations
 import functools
 import math
 
-import hypothesis
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from helpers import property_test
 from hypothesis import strategies as st
 
 from rps_jax import engines, errors
@@ -40,15 +40,12 @@ def some_worlds(key, n=32):
     return SPREAD * jax.random.normal(key, (n, 3))
 
 
+smoothed = functools.partial(estimators.evolution, sigma=0.2, pairs=2)
 ESTIMATORS = {
-    "forward": lambda scores, key, worlds: estimators.forward(scores, THETA, worlds),
-    "reverse": lambda scores, key, worlds: gradients.reverse(scores, THETA, worlds),
-    "differences": lambda scores, key, worlds: estimators.differences(
-        scores, THETA, worlds, step=0.1
-    ),
-    "evolution": lambda scores, key, worlds: estimators.evolution(
-        scores, THETA, worlds, key, sigma=0.2, pairs=2
-    ),
+    "forward": lambda scores, _, worlds: estimators.forward(scores, THETA, worlds),
+    "reverse": lambda scores, _, worlds: gradients.reverse(scores, THETA, worlds),
+    "differences": lambda scores, _, w: estimators.differences(scores, THETA, w, step=0.1),
+    "evolution": lambda scores, key, worlds: smoothed(scores, THETA, worlds, key),
 }
 every_estimator = pytest.mark.parametrize("name", ESTIMATORS)
 
@@ -72,22 +69,18 @@ def repeat(name, n, seed=1) -> Estimate:
 
 @every_estimator
 def test_the_gradient_of_a_quadratic_is_unbiased_and_within_its_interval(name):
+    """The variance is that of repeated estimates, and falls as one over n."""
     for n in (32, 512):
         estimate = repeat(name, n)
         error = estimate.gradient - STIFF * THETA
         of_the_mean = error.std(axis=0) / math.sqrt(REPEATS)
         assert (np.abs(error.mean(axis=0)) < 3.5 * of_the_mean).all()
         assert (estimate.finite == 1).all()
+        np.testing.assert_allclose(estimate.variance.mean(0), estimate.gradient.var(0), rtol=0.3)
     within = np.abs(error) < 1.96 * np.sqrt(estimate.variance)
     assert (np.abs(within.mean(axis=0) - 0.95) < 0.04).all()
-
-
-@every_estimator
-def test_the_variance_is_that_of_repeated_estimates_and_falls_as_one_over_n(name):
-    small, large = repeat(name, 32), repeat(name, 512)
-    for estimate in (small, large):
-        np.testing.assert_allclose(estimate.variance.mean(0), estimate.gradient.var(0), rtol=0.3)
-    np.testing.assert_allclose(small.variance.mean(0) / large.variance.mean(0), 16, rtol=0.15)
+    share = repeat(name, 32).variance.mean(0) / estimate.variance.mean(0)
+    np.testing.assert_allclose(share, 16, rtol=0.15)
 
 
 def test_all_but_evolution_are_the_derivatives_in_each_world():
@@ -188,28 +181,26 @@ def estimate_of(gradient, variance) -> Estimate:
     return Estimate(*(jnp.asarray(x, float) for x in (gradient, variance, np.ones_like(gradient))))
 
 
-def test_a_combination_weighs_by_inverse_variance_by_hand():
-    # Weights 1/1 and 1/3: (1 * 0 + 1/3 * 4) / (4/3) = 1, variance 1 / (4/3).
-    both = estimators.combine(
-        estimate_of([0.0, 2.0], [1.0, 0.0]), estimate_of([4.0, 9.0], [3.0, 1.0])
-    )
-    np.testing.assert_allclose(both.gradient, [1.0, 2.0])
-    np.testing.assert_allclose(both.variance, [0.75, 0.0])
+@pytest.mark.parametrize(
+    ("a", "b", "expected"),
+    [
+        # Gradient and variance. Weights 1/1 and 1/3: (1 * 0 + 1/3 * 4) / (4/3) = 1.
+        ((0.0, 1.0), (4.0, 3.0), (1.0, 0.75)),
+        ((2.0, 0.0), (9.0, 1.0), (2.0, 0.0)),
+        # An infinite variance has no weight.
+        ((2.0, 1.0), (7.0, np.inf), (2.0, 1.0)),
+        ((2.0, 0.0), (7.0, np.inf), (2.0, 0.0)),
+        ((2.0, 0.0), (2.0, 0.0), (2.0, 0.0)),
+        ((0.0, np.inf), (0.0, np.inf), (0.0, np.inf)),
+    ],
+)
+def test_a_combination_weighs_by_inverse_variance_by_hand(a, b, expected):
+    for pair in ((a, b), (b, a)):
+        both = estimators.combine(*(estimate_of([x], [variance]) for x, variance in pair))
+        assert (both.gradient, both.variance) == expected
 
 
-@pytest.mark.parametrize(("sure", "lost"), [(1.0, np.inf), (0.0, np.inf), (0.0, 0.0)])
-def test_an_estimate_of_infinite_variance_has_no_weight(sure, lost):
-    a, b = estimate_of([2.0], [sure]), estimate_of([2.0 if lost == 0 else 7.0], [lost])
-    for both in (estimators.combine(a, b), estimators.combine(b, a)):
-        assert both.gradient == 2.0
-        assert both.variance == sure
-    nothing = estimators.combine(estimate_of([0.0], [np.inf]), estimate_of([0.0], [np.inf]))
-    assert nothing.variance == np.inf
-    assert nothing.gradient == 0
-
-
-@hypothesis.settings(max_examples=30, deadline=None)
-@hypothesis.given(st.lists(st.floats(0, 1e6), min_size=4, max_size=4))
+@property_test(st.lists(st.floats(0, 1e6), min_size=4, max_size=4), examples=30)
 def test_a_combination_claims_to_be_no_worse_than_either_and_is_symmetric(variances):
     a, b = estimate_of([1.0, -1.0], variances[:2]), estimate_of([3.0, 5.0], variances[2:])
     both, again = estimators.combine(a, b), estimators.combine(b, a)

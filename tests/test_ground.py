@@ -1,6 +1,7 @@
 """The rigid limit agrees with solutions by hand; the study of grounds measures pushes."""
 
 import math
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -193,34 +194,21 @@ def test_a_push_in_mujoco_agrees_with_the_rigid_limit():
 
 
 def test_a_study_is_labelled_and_cached_and_refuses_other_options(tmp_path, monkeypatch):
-    tiny = grounds.GROUNDS["fast"]
-    kinds = {"a": tiny, "b": grounds.GROUNDS["standard"]}
-    monkeypatch.setattr(grounds, "GROUNDS", {k: _at(v, 0.2) for k, v in kinds.items()})
+    kinds = {name: replace(grounds.GROUNDS[name], speeds=(0.2,)) for name in ("fast", "standard")}
+    monkeypatch.setattr(grounds, "GROUNDS", kinds)
     monkeypatch.setattr(grounds, "HEIGHTS", (0.06, 0.34))
     options = {"objects": ("box",), "offsets": (0.05, 0.12), "steps": 50}
     progress = []
-    results = grounds.run(("a", "b"), tmp_path, **options, callback=progress.append)
-    friction = len(grounds.FRICTIONS)
-    sizes = {
-        "ground": 2,
-        "object": 1,
-        "offset": 2,
-        "speed": 1,
-        "at_height": 2,
-        "friction": friction,
-    }
-    assert dict(results.sizes) == sizes
+    results = grounds.run(tuple(kinds), tmp_path, **options, callback=progress.append)
+    sizes = {"ground": 2, "object": 1, "offset": 2, "speed": 1, "at_height": 2}
+    assert dict(results.sizes) == sizes | {"friction": len(grounds.FRICTIONS)}
     assert progress[-1].finished == 4
     assert np.isfinite(results.error).all()
     monkeypatch.setattr(pushes, "in_mujoco", None)  # nothing is run again
-    xr.testing.assert_equal(results, grounds.run(("a", "b"), tmp_path, **options))
+    xr.testing.assert_equal(results, grounds.run(tuple(kinds), tmp_path, **options))
     header, first, *rows = grounds.table(results, (0.2,))
     assert header[0] == "ground"
     assert first[0] == "rigid object"
     assert [row[0] for row in rows] == [kind.what for kind in kinds.values()]
     with pytest.raises(InputError, match="run with other options"):
-        grounds.run(("a",), tmp_path, objects=("cylinder",), offsets=(0.05,))
-
-
-def _at(kind, speed):
-    return grounds.Kind(kind.what, kind.physics, (speed,))
+        grounds.run(("fast",), tmp_path, objects=("cylinder",), offsets=(0.05,))

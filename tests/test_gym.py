@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode
-from helpers import NEAR
+from helpers import NEAR, refusals, row, same
 
 from rps_jax.errors import InputError
 from rps_jax.trials import gym
@@ -18,6 +18,7 @@ from rps_jax.trials.trial import Rules
 
 HOW = {"object": "random_cylinder", "domain": NEAR, "worlds": 6, "hold": 1.0}
 HOW |= {"setting": Setting("fused", fidelity="fast", rules=Rules(horizon=20.0))}
+DISABLED = {"autoreset_mode": AutoresetMode.DISABLED}
 COUNT = 4
 AHEAD = np.tile(np.float32([1.0, 0.0, 0.0]), (COUNT, 1))
 
@@ -48,7 +49,7 @@ def test_the_checker_of_gymnasium_passes(single):
 def test_a_step_is_an_action_of_push_env_held(single):
     obs, info = single.reset(seed=3)
     push, worlds = single.unwrapped.push_env, single.unwrapped._vector
-    state = jax.tree.map(lambda leaf: leaf[0], worlds._state)
+    state = row(worlds._state, 0)
     assert int(state.info["index"]) == info["world"]
     np.testing.assert_array_equal(obs, state.obs)
     step, total = jax.jit(push.step), 0.0
@@ -68,8 +69,7 @@ def test_a_seed_decides_on_worlds_and_noise(single, vector):
         for seed in (5, 5, 6):
             start, _ = env.reset(seed=seed)
             runs.append((start, *env.step(action)[:2]))
-        for a, b in zip(runs[0], runs[1], strict=True):
-            np.testing.assert_array_equal(a, b)
+        same(runs[0], runs[1])
         assert not np.array_equal(runs[0][0], runs[2][0])
     start, _ = vector.reset(seed=5)
     assert len(np.unique(start, axis=0)) == COUNT  # the worlds differ
@@ -139,15 +139,19 @@ def test_images_are_rendered_on_request(single):
     assert image.std() > 10
 
 
-def test_what_means_nothing_is_refused(single, vector):
-    with pytest.raises(InputError, match=r"hold = 0.001 is not allowed"):
-        gym.GymPush(hold=0.001)
-    with pytest.raises(InputError, match="num_envs = 0 is not allowed"):
-        gym.GymPushVector(0)
-    with pytest.raises(InputError, match="unknown autoreset_mode 'Disabled'"):
-        gym.GymPushVector(2, autoreset_mode=AutoresetMode.DISABLED)
-    with pytest.raises(InputError, match="unknown domain 'wild'"):
-        gym.GymPush(domain="wild")
+test_invalid_options_of_one_environment_are_refused = refusals(
+    gym.GymPush,
+    ({"hold": 0.001}, r"hold = 0.001 is not allowed"),
+    ({"domain": "wild"}, "unknown domain 'wild'"),
+)
+test_invalid_options_of_several_environments_are_refused = refusals(
+    gym.GymPushVector,
+    ({"num_envs": 0}, "num_envs = 0 is not allowed"),
+    ({"num_envs": 2} | DISABLED, "unknown autoreset_mode 'Disabled'"),
+)
+
+
+def test_invalid_actions_are_refused(single, vector):
     vector.reset(seed=0)
     with pytest.raises(InputError, match=r"action = of shape \(3,\) is not allowed"):
         vector.step(AHEAD[0])

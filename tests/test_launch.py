@@ -3,13 +3,13 @@
 import ctypes
 import json
 import os
-import subprocess
 import sys
 from pathlib import Path
 
 import jax
 import numpy as np
 import pytest
+from helpers import output_of
 
 from rps_jax.engines import device, native
 from rps_jax.lowering import nvrtc
@@ -50,16 +50,14 @@ def folder(tmp_path_factory):
     (folder / "launcher.so").write_bytes(native._library(text, NAME))
     words = [str(COMPILER), "-O1", "-w", "-shared", "-fPIC", "-Wl,-soname,libcuda.so.1"]
     words += [f"-I{jax.ffi.include_dir()}", str(Path(__file__).with_name("launch.c"))]
-    subprocess.run([*words, "-o", str(folder / "libcuda.so.1")], check=True)
+    output_of(*words, "-o", folder / "libcuda.so.1")
     return folder
 
 
 def launched(folder, fails="nothing"):
     """Return the errors and the driver's logs of two calls, and the results of both kernels."""
-    words = [sys.executable, "-c", RUN, str(folder), fails]
     environment = os.environ | {"LD_LIBRARY_PATH": str(folder)}
-    done = subprocess.run(words, capture_output=True, text=True, env=environment, check=True)
-    return json.loads(done.stdout)
+    return json.loads(output_of(sys.executable, "-c", RUN, folder, fails, env=environment))
 
 
 def test_kernels_run_concurrently_and_later_work_waits_for_all(folder):
@@ -69,22 +67,12 @@ def test_kernels_run_concurrently_and_later_work_waits_for_all(folder):
     np.testing.assert_array_equal(results[1], 5 * np.arange(20))
     loaded = ["load 3", "kernel step", "load 5", "kernel step"]
     assert first == [
-        *loaded,
-        "context",
-        "push 7",
-        "event 201",
-        "record 201 on 7",
+        *(*loaded, "context", "push 7", "event 201", "record 201 on 7"),
         "launch 3 on 7: 1 of 32",  # 8 worlds in a block of 32 threads
-        "stream 101",
-        "event 202",
-        "await 201 on 101",  # earlier work of XLA's stream comes first
-        "launch 5 on 101: 3 of 32",
-        "record 202 on 101",
-        "await 202 on 7",
-        "end event 202",
-        "end stream 101",
-        "end event 201",
-        "pop",
+        # Earlier work of XLA's stream comes first.
+        *("stream 101", "event 202", "await 201 on 101", "launch 5 on 101: 3 of 32"),
+        *("record 202 on 101", "await 202 on 7"),
+        *("end event 202", "end stream 101", "end event 201", "pop"),
     ]
     assert [line.split()[0] for line in second] == [line.split()[0] for line in first[4:]]
 

@@ -10,13 +10,12 @@ from __future__ import annotations
 import math
 
 import chex
-import hypothesis
 import hypothesis.extra.numpy as hnp
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import moved
+from helpers import SEEDS, moved, observation, property_test, row
 from hypothesis import strategies as st
 from jax.flatten_util import ravel_pytree
 
@@ -33,7 +32,6 @@ UNBOUNDED = PAPER._replace(**FREE)
 SCALED, CLIPPED = {"saturate_first": 1.0}, {"clip_each": 1.0}
 SIGNED, LOST = {"zeta": 3.0, "sgn_0": 1.0}, {"v_lost": 0.05, "keep_contact": 1.0}
 
-property_test = hypothesis.settings(max_examples=100, deadline=None)
 details_of = jax.jit(rps.step_with_details)
 batch_details = jax.jit(jax.vmap(rps.step_with_details))
 
@@ -42,26 +40,20 @@ def observe(d, l=0.0, robot=(0.0, 0.0), yaw=0.0, in_contact=True) -> Observation
     """Return a contact with offset `l` and displacement `d` to the target, by Eq. 4."""
     c, s = math.cos(yaw), math.sin(yaw)
     contact = (robot[0] + c * FRONT - s * l, robot[1] + s * FRONT + c * l)
-    return Observation(
-        p_world_robot=jnp.asarray(robot, float),
-        yaw=jnp.asarray(yaw, float),
-        p_robot_contact=jnp.asarray((FRONT, l), float),
-        in_contact=jnp.asarray(in_contact),
-        p_world_target=jnp.asarray((contact[0] + d[0], contact[1] + d[1]), float),
-        period=jnp.asarray(PERIOD),
-    )
+    target = (contact[0] + d[0], contact[1] + d[1])
+    return observation(robot, yaw, (FRONT, l), in_contact, target)
 
 
 def state_with(l_th: float) -> RPSState:
     return RPSState.init(PAPER)._replace(l_th=jnp.asarray(l_th, float))
 
 
-def numbers(twist) -> tuple[float, ...]:
+def floats(twist) -> tuple[float, ...]:
     return tuple(map(float, twist))
 
 
 def twist_of(params, observation, l_th=0.24) -> tuple[float, ...]:
-    return numbers(rps.step(params, state_with(l_th), observation)[1])
+    return floats(rps.step(params, state_with(l_th), observation)[1])
 
 
 def random_worlds(seed: int, n: int = 256, dtype=np.float32):
@@ -86,11 +78,9 @@ def random_params(seed: int, n: int, dtype=np.float32) -> RPSParams:
     rng = np.random.default_rng(seed)
     factor = rng.uniform(0.7, 1.3, (len(PAPER), n))
     params = RPSParams(*(np.asarray(value * f) for value, f in zip(PAPER, factor, strict=True)))
-    params = params._replace(
-        zeta=rng.uniform(0, 1, n),
-        gamma_max=rng.uniform(1.0, 1.56, n),
-        reactive=np.resize([1.0, 0.0, 1.0], n),
-    )
+    zeta, gamma_max = rng.uniform(0, 1, n), rng.uniform(1.0, 1.56, n)
+    reactive = np.resize([1.0, 0.0, 1.0], n)
+    params = params._replace(zeta=zeta, gamma_max=gamma_max, reactive=reactive)
     return jax.tree.map(lambda v: jnp.asarray(v, dtype), params)
 
 
@@ -187,14 +177,8 @@ def test_eq_3_makes_the_speed_proportional_to_the_distance():
 def test_eq_4_points_from_the_contact_to_the_target_in_the_world():
     # At yaw 90 degrees the robot's x is the world's y, and its y the world's -x:
     # the contact (0.3, 0.1) of a robot at (2, -1) is at (2 - 0.1, -1 + 0.3).
-    observation = Observation(
-        jnp.array([2.0, -1.0]),
-        jnp.array(math.pi / 2),
-        jnp.array([0.3, 0.1]),
-        jnp.array(True),
-        jnp.array([3.0, 3.0]),
-    )
-    np.testing.assert_allclose(displacement(observation), [1.1, 3.7], rtol=1e-6)
+    obs = observation((2.0, -1.0), math.pi / 2, (0.3, 0.1), True, (3.0, 3.0))
+    np.testing.assert_allclose(displacement(obs), [1.1, 3.7], rtol=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -337,15 +321,14 @@ def test_realignment_starts_above_l_cr_and_lasts_until_l_mr(side):
 @pytest.mark.parametrize(("l", "l_th"), [(0.2, 0.15), (0.1, 0.15), (0.28, 0.24), (0.0, 0.24)])
 def test_at_the_target_the_robot_stops_and_the_threshold_is_unchanged(l, l_th):  # noqa: E741
     state, twist, details = details_of(PAPER, state_with(l_th), observe((0.03, -0.039), l))
-    assert numbers(twist) == (0.0, 0.0, 0.0)
+    assert floats(twist) == (0.0, 0.0, 0.0)
     assert state.l_th == jnp.float32(l_th)
     assert not details.realigning
 
 
 def test_the_target_is_reached_strictly_within_d_success():
     def at(distance):  # exactly representable: the contact is at the origin
-        zero = jnp.zeros(2)
-        return Observation(zero, zero[0], zero, jnp.array(True), jnp.array([distance, 0.0]))
+        return observation((0.0, 0.0), 0.0, (0.0, 0.0), True, (distance, 0.0))
 
     d_success = np.float32(0.05)
     assert twist_of(PAPER, at(d_success))[0] == pytest.approx(0.005)
@@ -360,7 +343,7 @@ def test_without_contact_the_robot_moves_ahead_and_the_threshold_is_unchanged(l_
         observation = observe((1.0, 2.0), in_contact=False)
         observation = observation._replace(p_robot_contact=jnp.array(location))
         state, twist, details = details_of(params, start, observation)
-        assert numbers(twist) == (pytest.approx(0.01), 0.0, 0.0)
+        assert floats(twist) == (pytest.approx(0.01), 0.0, 0.0)
         assert state.l_th == jnp.float32(l_th)
         assert not details.realigning
         chex.assert_tree_all_finite((state, details))
@@ -379,8 +362,7 @@ def test_the_state_has_the_last_contact_and_whether_there_was_one():
 # Laws
 
 
-@property_test
-@hypothesis.given(st.integers(0, 2**32 - 1))
+@property_test(SEEDS)
 def test_nps_never_moves_laterally_and_never_realigns(seed):
     state, observation = random_worlds(seed)
     nps = random_params(seed, 256)._replace(reactive=jnp.zeros(256))
@@ -391,8 +373,7 @@ def test_nps_never_moves_laterally_and_never_realigns(seed):
     np.testing.assert_array_equal(new.l_th, np.where(arrived, state.l_th, nps.l_cr))
 
 
-@property_test
-@hypothesis.given(st.integers(0, 2**32 - 1))
+@property_test(SEEDS)
 def test_a_mirrored_world_gives_the_mirrored_twist(seed):
     state, observation = random_worlds(seed)
     params = random_params(seed, 256)
@@ -410,8 +391,7 @@ def test_a_mirrored_world_gives_the_mirrored_twist(seed):
     np.testing.assert_array_equal(new_m.l_th, new.l_th)
 
 
-@property_test
-@hypothesis.given(st.integers(0, 2**32 - 1), st.floats(-10, 10), st.floats(-50, 50))
+@property_test(SEEDS, st.floats(-10, 10), st.floats(-50, 50))
 def test_the_twist_does_not_depend_on_the_worlds_origin_and_axes(seed, turn, shift):
     with jax.enable_x64(True):
         state, observation = random_worlds(seed, dtype=np.float64)
@@ -429,8 +409,7 @@ def any_finite_floats(rng, shape) -> np.ndarray:
     return np.where(np.isfinite(x) & (rng.random(shape) < 0.7), x, special)
 
 
-@property_test
-@hypothesis.given(st.integers(0, 2**32 - 1))
+@property_test(SEEDS)
 def test_for_any_finite_input_the_twist_is_finite_and_within_bounds(seed):
     rng = np.random.default_rng(seed)
     x = any_finite_floats(rng, (256, 9))
@@ -448,8 +427,7 @@ def test_for_any_finite_input_the_twist_is_finite_and_within_bounds(seed):
     assert (twist.v_x >= 0).all()
 
 
-@property_test
-@hypothesis.given(st.floats(-100, 100), st.floats(-100, 100), st.floats(-100, 100))
+@property_test(st.floats(-100, 100), st.floats(-100, 100), st.floats(-100, 100))
 def test_saturation_keeps_the_direction_and_allowed_twists(v_x, v_y, omega):
     v_x, v_y, omega = map(np.float32, (v_x, v_y, omega))
     out = rps.saturate(PAPER, Twist(v_x, v_y, omega))
@@ -504,10 +482,9 @@ def singular_worlds() -> list[tuple[RPSParams, Observation]]:
                 (params, observe((0.0, 1.0), l)),
                 (params, observe((1e6, -1e6), l, robot=(-1e6, 1e6), yaw=1e6)),
             ]
-    zero = jnp.zeros(2)
     for yaw in (0.0, math.pi, -math.pi):  # exactly, at the origin
-        obs = Observation(zero, jnp.float32(yaw), zero, jnp.array(True), zero)
-        worlds += [(PAPER, obs), (PAPER, obs._replace(p_world_target=jnp.array([1.0, 0.0])))]
+        for target in ((0.0, 0.0), (1.0, 0.0)):
+            worlds += [(PAPER, observation((0.0, 0.0), yaw, (0.0, 0.0), True, target))]
     return worlds
 
 
@@ -522,10 +499,9 @@ def test_derivatives_are_finite_at_every_singular_point():
             chex.assert_tree_all_finite(jacobian(x, np.full(256, l_th, np.float32)))
 
 
-@property_test
-@hypothesis.given(
+@property_test(
     hnp.arrays(np.float32, (256, 7), elements=st.floats(-1e6, 1e6, width=32)),
-    st.integers(0, 2**32 - 1),
+    SEEDS,
 )
 def test_derivatives_are_finite_for_any_sensible_input(x, seed):
     params = np.stack(random_params(seed, 256), axis=1)
@@ -577,9 +553,7 @@ def test_a_batch_over_every_leaf_equals_a_loop_over_worlds():
     state, observation = random_worlds(4, n)
     observation = observation._replace(in_contact=jnp.arange(n) % 5 > 0)
     batch = jax.jit(jax.vmap(rps.step))(params, state, observation)
-    one_by_one = [
-        rps.step(*jax.tree.map(lambda v, i=i: v[i], (params, state, observation))) for i in range(n)
-    ]
+    one_by_one = [rps.step(*row((params, state, observation), i)) for i in range(n)]
     loop = jax.tree.map(lambda *v: jnp.stack(v), *one_by_one)
     chex.assert_trees_all_close(batch, loop, rtol=1e-5, atol=1e-5)
 
@@ -613,8 +587,7 @@ def test_a_step_preserves_the_dtypes_of_the_state(x64, in_contact):
 
 
 def test_float32_stays_float32_where_float64_is_enabled():
-    start, observation = (jax.tree.map(lambda v: v[0], w) for w in random_worlds(8, 1))
-    params = jax.tree.map(lambda v: v[0], random_params(8, 1))
+    params, (start, observation) = row((random_params(8, 1), random_worlds(8, 1)), 0)
     with jax.enable_x64(True):
         new, twist = rps.step(params, start, observation)
         assert new.l_th.dtype == new.p_robot_contact.dtype == jnp.float32

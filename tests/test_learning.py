@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import pandas as pd
 import pytest
-from helpers import CYLINDERS, refusal, rps
+from helpers import CYLINDERS, moved, row, rps, same
 
 from rps_jax import InputError, learn
 from rps_jax import sweep as run_sweep
@@ -49,19 +49,19 @@ def weights_of(network, seed=0):
 def random_obs(seed, mirror=False):
     """Return a random observation, or its mirror image."""
     rng = np.random.default_rng(seed)
-    side = np.array([1, -1 if mirror else 1])
     yaw, signal = rng.uniform(-3, 3), rng.uniform(0, 2, 42)
-    touch = Observation(
-        side * rng.uniform(-1, 1, 2),
-        side[1] * yaw,
-        side * np.array([0.36, rng.uniform(-0.2, 0.2)]),
-        np.asarray(seed % 3 > 0),
-        side * rng.uniform(-2, 2, 2),
-        0.02,
-    )
-    signal = signal[::-1] if mirror else signal
-    obs = TaxelObservation(touch, signal, np.asarray(seed % 2 > 0))
+    robot, lateral, target = rng.uniform(-1, 1, 2), rng.uniform(-0.2, 0.2), rng.uniform(-2, 2, 2)
+    touching, contact = np.asarray(seed % 3 > 0), np.array([0.36, lateral])
+    touch = moved(Observation(robot, yaw, contact, touching, target, 0.02), mirror=mirror)
+    obs = TaxelObservation(touch, signal[::-1] if mirror else signal, np.asarray(seed % 2 > 0))
     return jax.tree.map(jnp.asarray, obs)
+
+
+def law_of(network, scale=1.0):
+    """Return the step of a policy with random weights, and its parameters."""
+    weights = {name: scale * weight for name, weight in weights_of(network).items()}
+    _, _, params = policies.build_law(Policy(network, weights_of(network)))
+    return partial(jax.jit(partial(networks.step, network, weights)), params)
 
 
 # --- network -------------------------------------------------------------------------------
@@ -70,14 +70,11 @@ def random_obs(seed, mirror=False):
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_mirrored_observation_gives_the_mirrored_twist(kind):
     """This holds for random weights and over several steps, including the memory."""
-    network = network_of(kind)
-    _, params = _registered(network)
-    law = jax.jit(partial(networks.step, network, weights_of(network)))
-    memories = [PolicyState.init(network)] * 2
+    law, memories = law_of(network_of(kind)), [PolicyState.init(network_of(kind))] * 2
     twists = []
     for seed in range(12):
         for i, mirror in enumerate((False, True)):
-            memories[i], twist, _ = law(params, memories[i], random_obs(seed, mirror))
+            memories[i], twist, _ = law(memories[i], random_obs(seed, mirror))
             twists.append(np.array(twist))
     plain, mirrored = np.array(twists).reshape(12, 2, 3).swapaxes(0, 1)
     np.testing.assert_allclose(mirrored, plain * [1, -1, -1], atol=1e-7)
@@ -85,13 +82,10 @@ def test_a_mirrored_observation_gives_the_mirrored_twist(kind):
 
 
 def test_an_action_is_held_and_bounded():
-    network = network_of("mlp")
-    _, params = _registered(network)
-    weights = {name: 30 * weight for name, weight in weights_of(network).items()}
-    law = jax.jit(partial(networks.step, network, weights))
-    memory, twists = PolicyState.init(network), []
+    law, memory = law_of(network_of("mlp"), scale=30), PolicyState.init(network_of("mlp"))
+    twists = []
     for seed in range(20):
-        memory, twist, _ = law(params, memory, random_obs(seed))
+        memory, twist, _ = law(memory, random_obs(seed))
         twists.append(np.array(twist))
     twists = np.array(twists).reshape(4, 5, 3)
     np.testing.assert_array_equal(twists, twists[:, :1].repeat(5, axis=1))
@@ -127,13 +121,6 @@ def test_the_position_of_a_lost_contact_is_remembered():
 # --- files ---------------------------------------------------------------------------------
 
 
-def _registered(network, seed=0):
-    """Register a random policy; return its law name and parameters."""
-    policy = Policy(network, weights_of(network, seed))
-    label, _, params = policies.build_law(policy)
-    return label, params
-
-
 def written(path, kind="gru", **changes):
     policy = Policy(network_of(kind), weights_of(network_of(kind)), **changes)
     path.write_bytes(policies.encode(policy))
@@ -142,52 +129,34 @@ def written(path, kind="gru", **changes):
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_law_loaded_from_a_file_equals_the_saved_law(kind, tmp_path, registries):
-    policy = written(tmp_path / "policy.npz", kind, learned={"how": "by chance"})
-    loaded = policies.decode((tmp_path / "policy.npz").read_bytes(), "policy.npz")
-    assert (loaded.network, loaded.task, loaded.learned) == (
-        policy.network,
-        policy.task,
-        policy.learned,
-    )
-    name, params = registry.parse_law(str(tmp_path / "policy.npz"))
+    path = tmp_path / "policy.npz"
+    policy = written(path, kind, learned={"how": "by chance"})
+    loaded = policies.decode(path.read_bytes(), "policy.npz")
+    assert loaded._replace(weights={}) == policy._replace(weights={})
+    name, params = registry.parse_law(str(path))
     assert name.startswith(f"learned_{kind}_")
     law = registry.law_of(params)
     assert law.senses == "taxels"
-    reference = jax.jit(partial(networks.step, policy.network, policy.weights))
-    memories = law.init(params), PolicyState.init(policy.network)
+    step = jax.jit(law.step)
+    reference_step = jax.jit(partial(networks.step, policy.network, policy.weights))
+    memory, reference = law.init(params), PolicyState.init(policy.network)
     for seed in range(12):
-        (law_memory, twist, _), (reference_memory, reference_twist, _) = (
-            step(params, memory, random_obs(seed))
-            for step, memory in zip((jax.jit(law.step), reference), memories, strict=True)
-        )
-        np.testing.assert_array_equal(np.array(twist), np.array(reference_twist))
-        memories = law_memory, reference_memory
+        memory, twist, _ = step(params, memory, random_obs(seed))
+        reference, expected, _ = reference_step(params, reference, random_obs(seed))
+        np.testing.assert_array_equal(np.array(twist), np.array(expected))
     again = registry.params_to_json(params)
-    assert again["file"] == str(tmp_path / "policy.npz")
+    assert again["file"] == str(path)
     assert registry.params_from_json(json.loads(json.dumps(again))) == params
 
 
-def damaged(content, **changes):
-    """Return the archive with changed arrays and, by default, their digest."""
+def repacked(content, about=(), has_old_digest=False, **changes):
+    """Return a policy's file with another description and other arrays."""
     with np.load(io.BytesIO(content), allow_pickle=False) as file:
-        arrays = {name: file[name] for name in file.files}
-    about = json.loads(str(arrays["about"])) | changes.pop("about", {})
-    arrays |= {"about": np.array(json.dumps(about))} | changes
-    arrays.pop("digest")
-    digest = np.array(policies._digest(arrays))
-    archive = io.BytesIO()
-    np.savez(archive, digest=digest, **arrays)
-    return archive.getvalue()
-
-
-def with_changed_bit(content):
-    """Return a valid archive with a changed weight and the old digest."""
-    with np.load(io.BytesIO(content), allow_pickle=False) as file:
-        arrays = {name: file[name] for name in file.files}
-    arrays["action.b"] = arrays["action.b"] + np.float32(1e-3)
-    archive = io.BytesIO()
-    np.savez(archive, **arrays)
-    return archive.getvalue()
+        arrays = dict(file)
+    digest, described = arrays.pop("digest"), json.loads(str(arrays["about"])) | dict(about)
+    arrays |= {"about": np.array(json.dumps(described))} | changes
+    digest = digest if has_old_digest else policies._digest(arrays)
+    return files.encode_arrays(digest=np.array(digest), **arrays)
 
 
 def pickled(content):
@@ -196,31 +165,30 @@ def pickled(content):
     return archive.getvalue()
 
 
+def about(**changes):
+    """Return a change of a policy's description."""
+    return partial(repacked, about=changes)
+
+
+def network_as(kind, **changes):
+    return about(network=network_of("mlp")._asdict() | {"kind": kind} | changes)
+
+
+BIAS, NAN = ({"action.b": np.full(3, value, np.float32)} for value in (1e-3, np.nan))
+UNREADABLE = "give a file that `rps learn` wrote"
 BAD = {
-    "truncated": (lambda c: c[: len(c) // 2], "give a file that `rps learn` wrote"),
-    "empty": (lambda c: b"", "give a file that `rps learn` wrote"),
-    "text": (lambda c: b"hello", "give a file that `rps learn` wrote"),
-    "pickled": (pickled, "give a file that `rps learn` wrote"),
-    "bit": (with_changed_bit, "its digest does not match"),
-    "version": (partial(damaged, about={"version": 7}), "version 7"),
-    "format": (partial(damaged, about={"format": "other"}), "its format is other"),
-    "network": (
-        partial(damaged, about={"network": network_of("mlp")._asdict()}),
-        "memory.gates.w has the shape .*, and its network None",
-    ),
-    "kind": (
-        partial(damaged, about={"network": network_of("mlp", width=0)._asdict() | {"kind": "cnn"}}),
-        "unknown network 'cnn': choose from mlp, gru",
-    ),
-    "width": (
-        partial(damaged, about={"network": network_of("gru", width=7)._asdict()}),
-        "has the shape .* and its network ",
-    ),
-    "nan": (
-        partial(damaged, **{"action.b": np.full(3, np.nan, np.float32)}),
-        "action.b must hold finite numbers of 32 bits",
-    ),
-    "task": (partial(damaged, about={"task": {"v_max": 1.0}}), "d_success"),
+    "truncated": (lambda c: c[: len(c) // 2], UNREADABLE),
+    "empty": (lambda c: b"", UNREADABLE),
+    "text": (lambda c: b"hello", UNREADABLE),
+    "pickled": (pickled, UNREADABLE),
+    "bit": (partial(repacked, has_old_digest=True, **BIAS), "its digest does not match"),
+    "version": (about(version=7), "version 7"),
+    "format": (about(format="other"), "its format is other"),
+    "network": (network_as("mlp"), "memory.gates.w has the shape .*, and its network None"),
+    "kind": (network_as("cnn", width=0), "unknown network 'cnn': choose from mlp, gru"),
+    "width": (network_as("gru", width=7), "has the shape .* and its network "),
+    "nan": (partial(repacked, **NAN), "action.b must hold finite numbers of 32 bits"),
+    "task": (about(task={"v_max": 1.0}), "d_success"),
 }
 
 
@@ -233,28 +201,6 @@ def test_an_invalid_policy_file_is_refused_in_one_sentence(name, tmp_path):
     with pytest.raises(InputError, match=words) as error:
         registry.parse_law(str(path))
     assert "\n" not in str(error.value)
-
-
-def test_commands_refuse_bad_policies_before_anything_compiles(tmp_path, capsys, compiled):
-    (tmp_path / "bad.npz").write_bytes(b"hello")
-    error = refusal(capsys, "ladder", "--laws", tmp_path / "bad.npz", "--out", tmp_path / "run")
-    assert "give a file that `rps learn` wrote" in error
-    error = refusal(capsys, "sweep", "--laws", tmp_path / "none.npz", "--out", tmp_path / "run")
-    assert "cannot be read (No such file or directory)" in error
-    for options, words in {
-        "--domain wid": "did you mean 'wide'",
-        "--domain paper": "skin of a domain to learn in 'ideal'",
-        "--hold 0.001": "hold = 0.001 is not allowed",
-        "--minutes 0": "minutes = 0 is not allowed without updates",
-        "--domain wide,objects=ball": "unknown domain object 'ball'",
-        "--num-envs 1 --num-minibatches 4": "num_minibatches = 4 is not allowed: there are only 3",
-        "--ent-coef nan": "ent_coef = nan",
-        "--engine mujoco": "engine = mujoco is not allowed",
-    }.items():
-        out = tmp_path / "learn"
-        assert words in refusal(capsys, "learn", *options.split(), "--out", out), options
-        assert not (out / "parts").exists()
-    assert sum(compiled) < 5.0
 
 
 def test_a_run_of_a_policy_needs_its_unchanged_file(tmp_path, registries):
@@ -273,11 +219,11 @@ def test_a_run_of_a_policy_needs_its_unchanged_file(tmp_path, registries):
 # --- the algorithm -------------------------------------------------------------------------
 
 
-def steps_of(reward, value, next_value, done, terminated):
-    """Return transitions of one world with the columns (T,) that advantages need."""
-    blank = jnp.zeros((len(reward), 1))
-    columns = [jnp.asarray(x)[:, None] for x in (value, next_value, reward, done, terminated)]
-    return Transition(blank, blank, blank > 0, blank, blank, *columns)
+def transitions_of(obs, private, flags, **columns):
+    """Return transitions (T, n) of observations; the columns that are not given are zero."""
+    zero = jnp.zeros(flags.shape)
+    blank = Transition(obs, private, flags, jnp.zeros((*flags.shape, 3)), *[zero] * 4, flags, flags)
+    return blank._replace(**columns)
 
 
 def test_advantages_by_hand():
@@ -287,17 +233,12 @@ def test_advantages_by_hand():
     alone. delta_2 = 0 + 0.5 * 1 - 2 = -1.5, and A_2 = -1.5 + 0.25 * 5 = -0.25. delta_1 =
     1 + 0.5 * 2 - 1 = 1, and A_1 = 1 + 0.25 * -0.25 = 0.9375.
     """
-    advantages = ppo.advantages(
-        steps_of(
-            [1.0, 0.0, 2.0, 1.0],
-            [1.0, 2.0, 1.0, 3.0],
-            [2.0, 1.0, 8.0, 9.0],
-            [False, False, True, True],
-            [False, False, False, True],
-        ),
-        0.5,
-        0.5,
-    )
+    columns = {"reward": [1.0, 0.0, 2.0, 1.0], "value": [1.0, 2.0, 1.0, 3.0],
+               "next_value": [2.0, 1.0, 8.0, 9.0], "done": [False, False, True, True],
+               "terminated": [False, False, False, True]}  # fmt: skip
+    blank = jnp.zeros((4, 1))
+    columns = {name: jnp.array(values)[:, None] for name, values in columns.items()}
+    advantages = ppo.advantages(transitions_of(blank, blank, blank > 0, **columns), 0.5, 0.5)
     np.testing.assert_allclose(advantages[:, 0], [0.9375, -0.25, 5.0, -2.0])
 
 
@@ -315,10 +256,7 @@ def batch(network, state, seed=0, steps=5, worlds=4):
     private = jnp.asarray(rng.normal(size=(steps, worlds, extra)), jnp.float32)
     fresh = jnp.asarray(rng.uniform(size=(steps, worlds)) < 0.2)
     hidden = jnp.asarray(rng.normal(size=network.initial_hidden((worlds,)).shape), jnp.float32)
-    zero = jnp.zeros((steps, worlds))
-    transitions = Transition(
-        obs, private, fresh, jnp.zeros((steps, worlds, 3)), *[zero] * 4, *[fresh] * 2
-    )
+    transitions = transitions_of(obs, private, fresh)
     mean = ppo.means(network, state.weights["actor"], hidden, transitions)
     action = mean + 0.5 * jnp.asarray(rng.normal(size=mean.shape), mean.dtype)
     log_prob = ppo.log_prob(action, mean, state.weights["log_std"])
@@ -355,12 +293,12 @@ def test_the_loss_of_the_policy_that_acted(kind):
 def test_a_mirrored_world_has_an_equal_value():
     config, network = PPO(network="mlp", width=6), network_of("mlp")
     state = TrainState.init(config, network, jax.random.PRNGKey(0))
-    _, transitions = batch(network, state)
-    mirrored = ppo.critic_inputs(
-        features.mirror(transitions.obs), ppo.PRIVATE_SIGNS * transitions.private
+    _, rows = batch(network, state)
+    mirrored = features.mirror(rows.obs), ppo.PRIVATE_SIGNS * rows.private
+    value, mirrored_value = (
+        networks.critic(state.weights["critic"], ppo.critic_inputs(*pair))
+        for pair in ((rows.obs, rows.private), mirrored)
     )
-    pairs = ppo.critic_inputs(transitions.obs, transitions.private)
-    value, mirrored_value = (networks.critic(state.weights["critic"], x) for x in (pairs, mirrored))
     np.testing.assert_allclose(value, mirrored_value, atol=1e-6)
     assert np.std(value) > 0.01
 
@@ -368,12 +306,11 @@ def test_a_mirrored_world_has_an_equal_value():
 @pytest.mark.parametrize("kind", KINDS)
 def test_the_best_action_of_one_step_is_learned(kind):
     """The reward of an action falls with its distance to a function of the observation."""
-    config = PPO(
-        network=kind, width=6, update_epochs=4, num_minibatches=2, ent_coef=0.0,
-        learning_rate=3e-3, target_kl=0.02,
-    )  # fmt: skip
-    network = network_of(kind)
+    options = {"update_epochs": 4, "num_minibatches": 2, "learning_rate": 3e-3, "target_kl": 0.02}
+    config, network = PPO(network=kind, width=6, ent_coef=0.0, **options), network_of(kind)
     state = TrainState.init(config, network, jax.random.PRNGKey(0))
+    flags, private = jnp.ones((4, 64), bool), jnp.zeros((4, 64, ppo.PRIVATE_SIGNS.size))
+    blank = jnp.zeros((4, 64, features.feature_count(network.taxels)))
 
     def best(obs):
         forward, lateral = 0.8 * jnp.sign(obs[..., 0] + obs[..., 41]), obs[..., 47]
@@ -382,24 +319,16 @@ def test_the_best_action_of_one_step_is_learned(kind):
     @jax.jit
     def update(state, key):
         key_seen, key_act, key_pass = jax.random.split(key, 3)
-        shape = (4, 64, features.feature_count(network.taxels))
-        obs = (
-            jnp.zeros(shape).at[..., [0, 41, 47]].set(jax.random.normal(key_seen, (*shape[:2], 3)))
-        )
-        flags = jnp.ones(shape[:2], bool)
-        blank = jnp.zeros((*shape[:2], ppo.PRIVATE_SIGNS.size))
-        zero = jnp.zeros(shape[:2])
+        obs = blank.at[..., [0, 41, 47]].set(jax.random.normal(key_seen, (4, 64, 3)))
         hidden = network.initial_hidden((64,))
-        transitions = Transition(
-            obs, blank, flags, jnp.zeros((4, 64, 3)), *[zero] * 4, flags, flags
-        )
+        transitions = transitions_of(obs, private, flags)
         mean = ppo.means(network, state.weights["actor"], hidden, transitions)
         noise = jax.random.normal(key_act, mean.shape)
         action = mean + jnp.exp(state.weights["log_std"]) * noise
         transitions = transitions._replace(
             action=action,
             log_prob=ppo.log_prob(action, mean, state.weights["log_std"]),
-            value=networks.critic(state.weights["critic"], ppo.critic_inputs(obs, blank)),
+            value=networks.critic(state.weights["critic"], ppo.critic_inputs(obs, private)),
             reward=-jnp.sum((action - best(obs)) ** 2, axis=-1),
         )
         wrong = jnp.mean(jnp.sum((mean - best(obs)) ** 2, axis=-1))
@@ -431,37 +360,33 @@ def learned(tmp_path_factory):
 
 def test_a_killed_and_resumed_run_equals_an_uninterrupted_one(learned, tmp_path):
     folder, whole = learned
-    out = tmp_path / "parts"
+    out, rounds = tmp_path / "parts", []
+    options = TINY | {"every": 1e-6, "out": out}  # a checkpoint after each update
 
-    def kill(progress):
-        raise KeyboardInterrupt
+    def kill(progress):  # in the third update, before its checkpoint
+        if progress.rounds == 3:
+            raise KeyboardInterrupt
 
-    learn(CYLINDERS, **TINY, updates=2, out=out)
-    with pytest.raises(KeyboardInterrupt):  # in the third update, before its checkpoint
-        learn(CYLINDERS, **TINY, updates=9, out=out, report_to=kill)
-    again = learn(CYLINDERS, **TINY, updates=4, out=out)
+    with pytest.raises(KeyboardInterrupt):
+        learn(CYLINDERS, **options, updates=9, report_to=kill)
+    again = learn(CYLINDERS, **options, updates=4, report_to=lambda x: rounds.append(x.rounds))
+    assert rounds == [3, 4]
     for name in ("ended", "reward", "value", "kl", "learning_rate", "spread", "simulated"):
         np.testing.assert_array_equal(again[name], whole[name], err_msg=name)
     mine, theirs = (policies.decode((f / "policy.npz").read_bytes(), f) for f in (out, folder))
-    for name in mine.weights:
-        np.testing.assert_array_equal(mine.weights[name], theirs.weights[name])
+    same(mine.weights, theirs.weights)
 
 
-def test_the_results_of_a_run(learned):
+def test_the_results_of_a_run_and_their_table(learned):
     folder, curve = learned
     assert curve.sizes == {"update": 4}
     assert curve.simulated.values.tolist() == pytest.approx([2.4, 4.8, 7.2, 9.6])
-    assert np.isfinite(curve.validation.values[-1])
     assert np.isfinite(curve.reward).all()
     assert (curve.spread.values > 0).all()
     assert files.read_results(folder).identical(curve)
     policy = policies.decode((folder / "policy.npz").read_bytes(), folder)
     assert policy.network == Network("gru", 6, 42, 0.1)
     assert policy.learned["updates"] == 4
-
-
-def test_the_curve_is_a_table_that_pandas_reads(learned):
-    folder, curve = learned
     table = pd.read_csv(folder / "curve.csv", index_col="update")
     assert table.index.tolist() == curve["update"].values.tolist() == [1, 2, 3, 4]
     assert list(table) == list(UNITS)
@@ -500,9 +425,7 @@ def test_a_sweep_agrees_with_the_environment(learned, registries):
 
 def test_an_easier_world_has_its_target_nearer_and_more_ahead():
     env = PushEnv("random_cylinder", CYLINDERS, setting=Setting(engine="fused"), worlds=3)
-    world = jax.tree.map(lambda leaf: leaf[0], env.table)._replace(
-        p_world_target=jnp.array([0.0, 2.0])
-    )
+    world = row(env.table, 0)._replace(p_world_target=jnp.array([0.0, 2.0]))
     half = rollout.ease(world, jnp.array(0.5)).p_world_target
     np.testing.assert_allclose(half, 1.4 * np.array([1, 1]) / np.sqrt(2), rtol=1e-6)
     np.testing.assert_array_equal(rollout.ease(world, jnp.array(1.0)).p_world_target, [0.0, 2.0])
@@ -515,7 +438,7 @@ def test_rewards_of_privileged_quantities():
         setting=Setting("fused", fidelity="fast"),
         weights=Reward(progress=0.0, no_contact=0.0, success=0.0, object=1.0, behind=0.0),
     )  # fmt: skip
-    state = env.begin(jax.tree.map(lambda leaf: leaf[0], env.table), jnp.array(0))
+    state = env.begin(row(env.table, 0), jnp.array(0))
     previous = state.data
     shift = jnp.array([0.01, -0.02])
     current = previous._replace(qpos=previous.qpos.at[3:5].add(shift))
@@ -531,25 +454,20 @@ def test_rewards_of_privileged_quantities():
     assert float(together) == pytest.approx(cosine(current) - cosine(previous), abs=1e-6)
 
 
-def test_the_ladder_runs_the_policy_of_the_command(tmp_path, capsys, registries):
+def test_the_ladder_runs_the_policy_of_the_command(learned, tmp_path, capsys, registries):
+    """The command learns the policy of the call."""
     out = tmp_path / "learn"
-    options = ["--domain", "wide,objects=random_cylinder", "--network", "mlp"]
-    options += ["--width", 4, "--num-envs", 4, "--drawn", 4, "--validation", 2, "--num-steps", 2]
-    options += ["--num-minibatches", 1, "--minutes", 0, "--updates", 2, "--engine", "quasistatic"]
-    assert rps("learn", *options, "--out", out) == 0
+    values = {name: value for name, value in TINY.items() if name != "setting"}
+    options = " ".join(f"--{name.replace('_', '-')} {value}" for name, value in values.items())
+    drums = "wide,objects=random_cylinder,distance=0.7:0.8,bearing=-0.5:0.5,gap=0:0.01"
+    setting = f"--domain {drums} --engine quasistatic --fidelity fast --horizon 4"
+    assert rps(f"learn {setting} --max-lost 30 {options} --updates 4 --out", out) == 0
     output = capsys.readouterr().out
     assert "Compile" in output
     assert (out / "curve.png").stat().st_size > 10_000
     assert "success in validation" in output
-    options = ["ladder", *options[:2], "--worlds", 2, "--engine", "quasistatic", "--slots", 2]
-    options += [
-        "--laws",
-        "pursuit",
-        out / "policy.npz",
-        "--workers",
-        1,
-        "--out",
-        tmp_path / "ladder",
-    ]
-    assert rps(*options) == 0
-    assert "learned_mlp_" in capsys.readouterr().out
+    mine, theirs = (policies.decode((f / "policy.npz").read_bytes(), f) for f in (out, learned[0]))
+    same(mine.weights, theirs.weights)
+    options = f"--worlds 2 --slots 2 --workers 1 --laws pursuit {out / 'policy.npz'}"
+    assert rps(f"ladder {setting} {options} --out", tmp_path / "ladder") == 0
+    assert "learned_gru_" in capsys.readouterr().out

@@ -3,11 +3,8 @@
 import math
 
 import numpy as np
-import pytest
-import xarray as xr
-from helpers import PAPER
+from helpers import PAPER, refusals, results_of
 
-from rps_jax.errors import InputError
 from rps_jax.robot.robot import Robot
 from rps_jax.trials.progress import Progress
 from rps_jax.trials.setting import Setting
@@ -24,28 +21,17 @@ def test_a_crossing_is_where_losses_begin():
     assert crossing(VALUE, lost, 0.1, harms=1) == 31
     assert crossing(VALUE, lost[::-1], 0.1, harms=-1) == 10
     assert crossing(VALUE[::-1], lost[::-1], 0.1, harms=1) == 31  # in any order
-
-
-def test_losses_and_gains_of_single_worlds_are_pooled():
-    """A loss at 11 and the gain at 12 that follows cancel; those from 31 on do not."""
-    lost = (VALUE > 30).astype(int)
+    assert math.isnan(crossing(VALUE, np.zeros(40, int), 0.01, harms=1))
+    # A loss at 11 and the gain at 12 that follows cancel; those from 31 on do not.
     lost[10], lost[11] = 1, -1
     assert crossing(VALUE, lost, 0.1, harms=1) == 31
 
 
-def test_there_is_no_crossing_without_losses():
-    assert math.isnan(crossing(VALUE, np.zeros(40, int), 0.01, harms=1))
-
-
 def test_a_bootstrap_interval_holds_the_crossing():
-    rng = np.random.default_rng(1)
-    value = rng.uniform(0, 1, 400)
+    value = np.random.default_rng(1).uniform(0, 1, 400)
     success = (value < 0.5).astype(np.int8)[None]
-    results = xr.Dataset(
-        {"success": (("law", "case"), success), "usual": (("law", "case"), np.ones_like(success))},
-        {"law": ["rps"], "value": ("case", value)},
-        {"harms": 1},
-    )
+    results = results_of(["rps"], success=success, usual=np.ones_like(success), value=value)
+    results = results.rename(world="case").assign_attrs(harms=1)
     at, low, high = limits.crossings(results, 0.1)["rps"]
     assert low <= at <= high
     assert 0.49 < low < high < 0.52
@@ -59,14 +45,8 @@ def test_every_robot_meets_the_worlds_of_the_ideal_one(monkeypatch):
     }
     monkeypatch.setattr(limits, "LIMITS", kinds)
     progress: list[Progress] = []
-    study = Limits(
-        {"rps": PAPER},
-        Domain(("random_cylinder",)),
-        tuple(kinds),
-        3,
-        setting=Setting(seed=0, rules=Rules(horizon=6.0)),
-        report_to=progress.append,
-    )
+    options = {"setting": Setting(seed=0, rules=Rules(horizon=6.0)), "report_to": progress.append}
+    study = Limits({"rps": PAPER}, Domain(("random_cylinder",)), tuple(kinds), 3, **options)
     results = study()
     assert progress[-1].finished == study.num_trials() == 9
     rows = results["half_width"]
@@ -83,6 +63,6 @@ def test_a_bounded_acceleration_makes_ramps_of_the_laws_turns():
     assert float(np.abs(np.diff(turns.done)).max()) <= 0.2 * 0.02 + 1e-4  # [rad/s] in a step
 
 
-def test_an_unknown_limit_is_named():
-    with pytest.raises(InputError, match="did you mean 'lag'"):
-        Limits({"rps": PAPER}, limits=("leg",), worlds=1)()
+test_an_unknown_limit_is_named = refusals(
+    Limits({"rps": PAPER}, limits=("leg",), worlds=1), ((), "did you mean 'lag'")
+)
