@@ -81,12 +81,12 @@ def test_step_keeps_the_structure_of_the_state_so_that_scan_works(pushing):
     world_state = row(state, 0)
     next_state = jax.eval_shape(push.step, world_state, AHEAD)
     assert jax.tree.structure(next_state) == jax.tree.structure(world_state)
-    for a, b in zip(jax.tree.leaves(next_state), jax.tree.leaves(world_state), strict=True):
-        assert (a.shape, a.dtype) == (b.shape, b.dtype)
+    states = (jax.tree.leaves(x) for x in (next_state, world_state))
+    kinds = [[(leaf.shape, leaf.dtype) for leaf in leaves] for leaves in states]
+    assert kinds[0] == kinds[1]
     # Entries that a wrapper adds stay.
-    noted = world_state.replace(
-        info=world_state.info | {"steps": jnp.zeros(())}, metrics=world_state.metrics | {"x": 0.0}
-    )
+    info, metrics = world_state.info | {"steps": jnp.zeros(())}, world_state.metrics | {"x": 0.0}
+    noted = world_state.replace(info=info, metrics=metrics)
     result = jax.eval_shape(push.step, noted, AHEAD)
     assert "steps" in result.info
     assert "x" in result.metrics

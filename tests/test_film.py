@@ -2,6 +2,7 @@
 
 import dataclasses
 import tracemalloc
+from itertools import islice
 
 import numpy as np
 import pytest
@@ -110,9 +111,7 @@ def test_a_finished_trial_is_labelled_and_not_drawn_again(tmp_path):
     table(tmp_path)
     takes, setting = Film(tmp_path, "1x2").takes()
     (take,) = takes
-    ((ended, first), *_, (_, previous), (over, last)) = [
-        shots for shots, _ in zip(film._shots(take, setting, 50), range(20), strict=False)
-    ]
+    ((ended, first), *_, (_, previous), (over, last)) = islice(film._shots(take, setting, 50), 20)
     assert not ended
     assert [shot.label for shot in first] == ["(0.6, 0) m, 0 s", "(2, 2) m, 0 s"]
     assert not over

@@ -59,9 +59,8 @@ def test_on_ground_without_friction_a_push_is_the_momentum_that_the_box_gains(en
 
 def test_the_fused_engine_tells_the_force_of_c_mujoco():
     """Over a push of a corner that turns, step by step and in the mean."""
-    fused, mujoco = (
-        push_object(engine, twist=TURNING, yaw=0.3, lateral=0.05) for engine in ("fused", "mujoco")
-    )
+    start = {"yaw": 0.3, "lateral": 0.05}
+    fused, mujoco = (push_object(x, twist=TURNING, **start) for x in ("fused", "mujoco"))
     np.testing.assert_allclose(fused.qpos[-1], mujoco.qpos[-1], atol=2e-3)
     force, expected = (recording.force[25:].mean(axis=0) for recording in (fused, mujoco))
     size = np.hypot(*expected[:2])

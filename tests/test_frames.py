@@ -159,9 +159,8 @@ def test_the_derivative_of_direction_is_across_and_inverse_to_the_length():
     for scale in (1.0, 1e-30, 1e-20, 1e20, 1e30):
         v = np.float32(scale) * np.float32([[3, 4], [-4, 3], [-5, 0], [0, -5]])
         gradient = np.float64(direction_and_gradient(v)[1]) * scale
-        np.testing.assert_allclose(
-            gradient, [[-0.16, 0.12], [-0.12, -0.16], [0, -0.2], [0.2, 0]], rtol=1e-5, atol=1e-9
-        )
+        expected = [[-0.16, 0.12], [-0.12, -0.16], [0, -0.2], [0.2, 0]]
+        np.testing.assert_allclose(gradient, expected, rtol=1e-5, atol=1e-9)
 
 
 def test_direction_is_zero_with_zero_derivative_at_zero():
