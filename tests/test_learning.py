@@ -255,7 +255,9 @@ def batch(network, state, seed=0, steps=5, worlds=4):
     obs = jnp.asarray(rng.normal(size=(steps, worlds, size)), jnp.float32)
     private = jnp.asarray(rng.normal(size=(steps, worlds, extra)), jnp.float32)
     fresh = jnp.asarray(rng.uniform(size=(steps, worlds)) < 0.2)
-    hidden = jnp.asarray(rng.normal(size=network.initial_hidden((worlds,)).shape), jnp.float32)
+    hidden = jnp.asarray(
+        rng.normal(size=(worlds, *PolicyState.init(network).hidden.shape)), jnp.float32
+    )
     transitions = transitions_of(obs, private, fresh)
     mean = ppo.means(network, state.weights["actor"], hidden, transitions)
     action = mean + 0.5 * jnp.asarray(rng.normal(size=mean.shape), mean.dtype)
@@ -320,7 +322,7 @@ def test_the_best_action_of_one_step_is_learned(kind):
     def update(state, key):
         key_seen, key_act, key_pass = jax.random.split(key, 3)
         obs = blank.at[..., [0, 41, 47]].set(jax.random.normal(key_seen, (4, 64, 3)))
-        hidden = network.initial_hidden((64,))
+        hidden = jnp.zeros((64, *PolicyState.init(network).hidden.shape))
         transitions = transitions_of(obs, private, flags)
         mean = ppo.means(network, state.weights["actor"], hidden, transitions)
         noise = jax.random.normal(key_act, mean.shape)

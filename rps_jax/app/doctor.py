@@ -30,7 +30,7 @@ doctor = call_of(Doctor)
 
 def report(cache: Path) -> str:
     """Return versions, devices, folders and the checks of rendering, one line each."""
-    checks = [_check_cache(cache), *video.check()]
+    fixes = {"cache": _check_cache(cache), **video.check()}
     environment = device.collect_environment()
     hardware = environment["device"]
     rows = {
@@ -43,7 +43,7 @@ def report(cache: Path) -> str:
         "kernels": _kernels(hardware["platform"]),
         "commit": environment["commit"] or "not in a checkout",
         "cached in": str(cache),
-        **{check.name: "ok" if check.ok else f"FAILS: {check.fix}" for check in checks},
+        **{name: f"FAILS: {fix}" if fix else "ok" for name, fix in fixes.items()},
     }
     return "\n".join(f"{name:<12}{text}" for name, text in rows.items())
 
@@ -55,11 +55,10 @@ def _kernels(platform: str) -> str:
     return f"by NVRTC {target}" if target else "none: XLA steps the fused engine, many times slower"
 
 
-def _check_cache(folder: Path) -> video.Check:
-    """Return whether the folder of the cache can be written."""
+def _check_cache(folder: Path) -> str:
+    """Return how to fix a cache that cannot be written; an empty text if it can."""
     try:
         run_folder.ensure_writable(folder)
     except InputError:
-        fix = f"{folder} cannot be written: set RPS_CACHE to a writable folder"
-        return video.Check("cache", False, fix)
-    return video.Check("cache", True, "")
+        return f"{folder} cannot be written: set RPS_CACHE to a writable folder"
+    return ""

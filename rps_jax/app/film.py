@@ -98,9 +98,9 @@ class Film(Action[Path]):
         if out.is_dir():
             raise InputError(f"out = {out} is a folder: name a file, as {out / 'film.mp4'}.")
         folder.ensure_writable(out.parent)
-        for check in video.check():
-            if not check.ok:
-                raise InputError(check.fix)
+        for fix in video.check().values():
+            if fix:
+                raise InputError(fix)
 
     def progress_bar(self) -> Bar:
         """A bar over simulated time."""

@@ -13,23 +13,16 @@ from jax.typing import ArrayLike
 T = TypeVar("T")
 
 
-def greater(x: jax.Array, threshold: ArrayLike, temperature: ArrayLike | None) -> jax.Array:
+def greater(x: ArrayLike, threshold: ArrayLike, temperature: ArrayLike | None) -> jax.Array:
     """Return `x > threshold`, or its sigmoid of width `temperature`."""
     if temperature is None:
-        return x > threshold
-    return jax.nn.sigmoid((x - threshold) / temperature)
+        return jnp.greater(x, threshold)
+    return jax.nn.sigmoid(jnp.subtract(x, threshold) / temperature)
 
 
 def greater_equal(x: jax.Array, threshold: ArrayLike, temperature: ArrayLike | None) -> jax.Array:
     """Return `x >= threshold`, or its sigmoid of width `temperature`."""
     return x >= threshold if temperature is None else greater(x, threshold, temperature)
-
-
-def less(x: jax.Array, threshold: ArrayLike, temperature: ArrayLike | None) -> jax.Array:
-    """Return `x < threshold`, or its sigmoid of width `temperature`."""
-    if temperature is None:
-        return x < threshold
-    return jax.nn.sigmoid((threshold - x) / temperature)
 
 
 def not_(condition: jax.Array) -> jax.Array:

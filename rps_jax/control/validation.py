@@ -34,14 +34,11 @@ _PACKAGE = str(Path(__file__).resolve().parent.parent)
 _TAXELS = 42  # of the paper's skin
 # Operations that JAX cannot trace, with what to write instead.
 _TRACER_ERRORS: dict[type[Exception], str] = {
-    jax.errors.TracerBoolConversionError: "branches on a traced value: write "
-    "jnp.where(condition, x, y)",
+    jax.errors.TracerBoolConversionError: "branches on a traced value: write jnp.where(c, x, y)",
     jax.errors.TracerArrayConversionError: "passes a traced value to NumPy: use jax.numpy",
-    jax.errors.TracerIntegerConversionError: "uses a traced value as an index or a length: index "
-    "with jnp.take or jnp.where",
+    jax.errors.TracerIntegerConversionError: "uses a traced index or length: write jnp.take",
     jax.errors.NonConcreteBooleanIndexError: "indexes with a traced condition: write jnp.where",
-    jax.errors.ConcretizationTypeError: "converts a traced value to a Python number: keep it a "
-    "jax.Array",
+    jax.errors.ConcretizationTypeError: "converts a traced value to a number: keep a jax.Array",
 }
 
 
@@ -51,13 +48,13 @@ def observation_shapes(senses: Senses) -> AnyObservation:
     shape: Callable[..., Any] = lambda *sizes: jax.ShapeDtypeStruct(sizes, dtype)  # noqa: E731
     flag: Any = jax.ShapeDtypeStruct((), bool)
     touch = Observation(shape(2), shape(), shape(2), flag, shape(2), shape())
-    if senses == "taxels":
-        return TaxelObservation(touch, shape(_TAXELS), flag)
-    if senses == "force":
-        return ForceObservation(touch, shape(2))
-    if senses == "pose":
-        return PoseObservation(touch, shape(2), shape())
-    return touch
+    observations: dict[Senses, AnyObservation] = {
+        "touch": touch,
+        "taxels": TaxelObservation(touch, shape(_TAXELS), flag),
+        "force": ForceObservation(touch, shape(2)),
+        "pose": PoseObservation(touch, shape(2), shape()),
+    }
+    return observations[senses]
 
 
 def check_law(init: Function, step: Function, senses: Senses, params: LawParams) -> None:

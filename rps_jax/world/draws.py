@@ -4,8 +4,8 @@ An address gives the same world in any batch and on any device: the bits come fr
 generator, and the quantities are computed from them on the host in double precision.
 """
 
-from dataclasses import fields, replace
-from typing import Any, NamedTuple
+from dataclasses import replace
+from typing import NamedTuple
 
 import jax
 import numpy as np
@@ -137,15 +137,12 @@ def _robots(robot: Robot, at: dict[str, np.ndarray], count: int) -> Robot:
     if (linear := limits.get("acceleration_max")) is not None:
         limits["acceleration_max"] = np.stack([linear, linear / robot.arm], axis=-1)
 
-    def repeat(value: Any) -> np.ndarray:
-        return np.repeat(np.asarray(value, float)[None], count, axis=0)
-
-    fixed = {
-        f.name: repeat(value)
-        for f in fields(robot)
-        if f.name not in (*limits, "boards") and (value := getattr(robot, f.name)) is not None
+    several = {
+        name: np.asarray(values, float)
+        for name in ("v_max", "acceleration_max")
+        if (values := getattr(robot, name)) is not None
     }
-    return replace(robot, boards=jax.tree.map(repeat, robot.boards), **fixed, **limits)
+    return replace(scene.repeat_robot(replace(robot, **several), count), **limits)
 
 
 def _friction(domain: Domain, index: np.ndarray, at: dict[str, np.ndarray]) -> Friction:

@@ -7,7 +7,7 @@ numbers in [0, 1), of which a domain reads only some. A search for worlds moves 
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
@@ -40,7 +40,6 @@ FILE = "points.nc"  # in a run folder whose worlds are points
 _CHOICES = ("object", "friction", "target")  # from the lists of a domain
 _OF_PRISMS = ("sides", "turn", *(f"corner_{i}" for i in range(SIDES)))
 _OF_FEET = ("feet_number", "feet_turn")
-_TURN = Range(0, 2 * np.pi)
 _MAX_POINTS = 100_000_000
 
 
@@ -58,28 +57,27 @@ def coordinates(domain: Domain) -> tuple[Coordinate, ...]:
 
     Unused ranges and ranges of a single value are no coordinates.
     """
-    return tuple(_coordinates(domain))
-
-
-def _coordinates(domain: Domain) -> Iterator[Coordinate]:
-    for name, count in zip(_CHOICES, domain.counts, strict=True):
-        if count > 1:
-            yield Coordinate(name, "choice", Range(0, count), "1")
+    labels = [
+        Coordinate(name, "choice", Range(0, count), "1")
+        for name, count in zip(_CHOICES, domain.counts, strict=True)
+        if count > 1
+    ]
     random = set(domain.objects) & set(RANDOM)
     idle = set(domain.idle) | ({"aspect"} if random == {"random_cylinder"} else set())
     for name in draws.USES:
         if name in (*_OF_PRISMS, *_OF_FEET):
             if domain.feet is not None if name in _OF_FEET else "random_prism" in random:
-                yield Coordinate(name, "shape", Range(0, 1), "1")
+                labels.append(Coordinate(name, "shape", Range(0, 1), "1"))
         elif name == "com_bearing":
             if random and domain.com_offset.high > 0:
-                yield Coordinate(name, "range", _TURN, "rad")
+                labels.append(Coordinate(name, "range", Range(0, 2 * np.pi), "rad"))
         elif name.startswith("key_"):
-            yield Coordinate(name, "noise", Range(0, 1), "1")
+            labels.append(Coordinate(name, "noise", Range(0, 1), "1"))
         else:
             interval = getattr(domain, "velocity_error" if name in VELOCITY_ERRORS else name)
             if name not in idle and interval is not None and interval.low < interval.high:
-                yield Coordinate(name, "range", interval, unit_of(name))
+                labels.append(Coordinate(name, "range", interval, unit_of(name)))
+    return tuple(labels)
 
 
 def names(domain: Domain, *kinds: CoordinateKind) -> tuple[str, ...]:

@@ -4,7 +4,7 @@ The stripped model holds only the three geoms that touch. C MuJoCo and MJX both 
 """
 
 import math
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple, get_args
 
 import jax
 import jax.numpy as jnp
@@ -22,7 +22,6 @@ from rps_jax.world.objects import FAMILIES, OBJECTS, SHAPES, path_of
 from rps_jax.world.physics import PHYSICS, Physics
 
 Side = Literal["near", "far"]
-SIDES = ("near", "far")
 # Offset [m] of inertial frames: without it MuJoCo compiles centred bodies to another structure,
 # which cannot be batched with the rest.
 OFF_CENTRE = 1e-6
@@ -86,11 +85,17 @@ def load(
       InputError: unknown name, or friction or mass that is not a positive finite number.
     """
     errors.check_name("object", name, OBJECTS)
-    errors.check_name("rear", rear, SIDES)
+    errors.check_name("rear", rear, get_args(Side))
     check_contact(friction, mass)
-    if name in objects.REGISTERED:
-        return _load_registered(name, physics, friction, mass, robot)
     spec = objects.read(path_of(name))
+    if name in objects.REGISTERED:  # its contacts are those of its solid
+        single = objects.REGISTERED[name].solid
+        if mass is not None:
+            inertia = single.inertia * mass / single.mass
+            single = single._replace(mass=np.asarray(mass), inertia=inertia)
+        upright = compile_solid(FAMILIES[name], single, physics, friction, robot=robot)
+        _set_robot(spec, robot)
+        return upright._replace(name=name, model=spec.compile())
     for geom in spec.geoms:
         if geom.name == "load" and rear == "far":
             geom.pos[0] = -geom.pos[0]
@@ -117,24 +122,6 @@ def _solid_of_model(model: mujoco.MjModel, family: str) -> Solid:
         inertia=body.inertia.copy(),
         q_object_body=body.iquat.copy(),
     )
-
-
-def _load_registered(
-    name: str,
-    physics: Physics,
-    friction: Friction,
-    mass: float | None,
-    robot: Robot,
-) -> Scene:
-    """Compile the full model of a registered object, and the physics of its solid."""
-    single = objects.REGISTERED[name].solid
-    if mass is not None:
-        inertia = single.inertia * mass / single.mass
-        single = single._replace(mass=np.asarray(mass), inertia=inertia)
-    spec = objects.read(path_of(name))
-    _set_robot(spec, robot)
-    upright = compile_solid(FAMILIES[name], single, physics, friction, robot=robot)
-    return upright._replace(name=name, model=spec.compile())
 
 
 def compile_solid(
@@ -176,12 +163,9 @@ def compile_row(
     friction: Friction,
     physics: Physics,
     i: int,
-    robots: Robot | None = None,
+    robots: Robot | None = None,  # None: the ideal robot
 ) -> Scene:
-    """Compile a scene with row i of solids (n, ...), friction (n,) and robots (n,).
-
-    Without robots, the robot is ideal.
-    """
+    """Compile a scene with row i of solids (n, ...), friction (n,) and robots (n,)."""
     single, pair, robot = jax.tree.map(lambda leaf: leaf[i], (solids, friction, robots))
     friction = Friction(float(pair.ground), float(pair.robot))
     return compile_solid(family, single, physics, friction, robot=robot or Robot())
@@ -255,10 +239,7 @@ def foot_positions(solids: Solid) -> np.ndarray:
 
 
 def _compile(
-    spec: mujoco.MjSpec,
-    physics: Physics,
-    friction: Friction,
-    robot: Robot,
+    spec: mujoco.MjSpec, physics: Physics, friction: Friction, robot: Robot
 ) -> tuple[mujoco.MjModel, mujoco.MjModel]:
     """Compile the full model and the stripped one."""
     _set_robot(spec, robot)

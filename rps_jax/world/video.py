@@ -46,17 +46,16 @@ class Shot(NamedTuple):
     label: str
 
 
-class Check(NamedTuple):
-    """Result of a check of this machine."""
-
-    name: str
-    ok: bool
-    fix: str  # one sentence; empty if `ok`
-
-
-def check() -> list[Check]:
-    """Check that this machine can draw and encode; never raises VideoError."""
-    return [_attempt("rendering", check_rendering), _attempt("ffmpeg", _try_encoding)]
+def check() -> dict[str, str]:
+    """Return how to fix drawing and encoding on this machine; an empty text if they work."""
+    fixes = {}
+    for name, attempt in (("rendering", check_rendering), ("ffmpeg", _try_encoding)):
+        try:
+            attempt()
+            fixes[name] = ""
+        except VideoError as error:
+            fixes[name] = str(error)
+    return fixes
 
 
 def snapshot(
@@ -226,14 +225,6 @@ def _encoder(path: Path, size: tuple[int, int], fps: int) -> Iterator[Callable[[
     finally:
         with contextlib.suppress(OSError):
             part.unlink()
-
-
-def _attempt(name: str, action: Callable[[], None]) -> Check:
-    try:
-        action()
-    except VideoError as error:
-        return Check(name, False, str(error))
-    return Check(name, True, "")
 
 
 def _try_encoding() -> None:

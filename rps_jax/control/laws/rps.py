@@ -256,7 +256,7 @@ def _push(
     omega = turning_speed / params.L * jnp.tan(gamma)  # Eq. 9 or 6
     twist = saturate(params, Twist(v_x, v_y, omega))
 
-    arrived = soft.less(distance, params.d_success, temps.arrive)
+    arrived = soft.greater(params.d_success, distance, temps.arrive)
     twist = jax.tree.map(lambda v: soft.where(arrived, 0.0, v), twist)
     l_th = soft.where(arrived, l_th, soft.where(realigning, params.l_mr, params.l_cr))
     realigning = soft.and_(realigning, soft.not_(arrived))

@@ -127,7 +127,7 @@ def search(
     """
     temps = temperatures or rps.HARD
     angle, v_max = planar.direction(p_robot_last), jnp.asarray(params.law.v_max)
-    faces = soft.less(jnp.abs(angle), FACING, temperatures and _FACING_WIDTH)
+    faces = soft.greater(FACING, jnp.abs(angle), temperatures and _FACING_WIDTH)
     ahead = soft.where(faces, params.ahead * v_max, 0.0)
     far = soft.greater(planar.norm(p_robot_last), REACH, temps.d_th)
     side = jnp.sign(l) if temperatures is None else jnp.tanh(l / temps.sgn)
@@ -158,7 +158,7 @@ def step(
 
     is_kept = soft.and_(law_state.touched, jnp.asarray(params.law.keep_contact) > 0)
     pushing = soft.or_(touching, is_kept)
-    near = soft.and_(pushing, soft.less(details.distance, params.d_near, temps.d_th))  # P1
+    near = soft.and_(pushing, soft.greater(params.d_near, details.distance, temps.d_th))  # P1
     is_away = soft.greater_equal(details.distance, params.law.d_success, temps.arrive)
     p_robot_last = planar.rotate(-obs.yaw, p_world_last - obs.p_world_robot)
     for condition, action in (

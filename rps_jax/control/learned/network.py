@@ -54,12 +54,6 @@ class Network(NamedTuple):
         """Return random weights, with a mean action near zero."""
         return init_weights(self.shapes, key, small=("action",))
 
-    def initial_hidden(
-        self, batch: tuple[int, ...] = (), dtype: jax.typing.DTypeLike = float
-    ) -> jax.Array:
-        """Return the initial hidden state (..., 2, H); H = 0 for an MLP."""
-        return jnp.zeros((*batch, 2, self.width if self.kind == "gru" else 0), dtype)
-
     def apply(
         self, weights: Weights, hidden: jax.Array, inputs: jax.Array
     ) -> tuple[jax.Array, jax.Array]:
@@ -143,7 +137,7 @@ class PolicyState(NamedTuple):
     """State of a learned law between two control steps."""
 
     touch_state: TouchState
-    hidden: jax.Array  # (2, H) of the network
+    hidden: jax.Array  # (2, H) of the network; H = 0 for an MLP
     action: jax.Array  # (3,) [1] the current one
     waiting: jax.Array  # () [s] until the next decision
 
@@ -151,7 +145,7 @@ class PolicyState(NamedTuple):
     def init(cls, network: Network, dtype: jax.typing.DTypeLike = float) -> PolicyState:
         """Return the state before the first observation."""
         zero = jnp.zeros((), dtype)
-        hidden = network.initial_hidden(dtype=dtype)
+        hidden = jnp.zeros((2, network.width if network.kind == "gru" else 0), dtype)
         return cls(TouchState.initial(dtype), hidden, jnp.zeros(3, dtype), zero)
 
     def due(self, obs: TaxelObservation) -> jax.Array:
