@@ -17,7 +17,7 @@ the threshold, or the skin senses contact without an object.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -310,9 +310,8 @@ def with_contacts(steps: dict[str, np.ndarray], shell: Shell, source: str) -> di
     return steps | dict(zip(names, map(np.asarray, columns), strict=True))
 
 
-SkinName = Literal["ideal", "thin", "capacitive", "hardware"]
 # "thin" chatters between the corners of a box, as a rigid contact sensor.
-SKINS: dict[SkinName, Skin] = {
+SKINS: dict[str, Skin] = {
     "ideal": IdealSkin(),
     "thin": IdealSkin(tolerance=0.001),
     "capacitive": CapacitiveSkin(),
@@ -329,7 +328,7 @@ def parse_skin(skin: SkinLike) -> Any:
         skin.check()
         return skin
     name, changes = parse_changes("skin", skin)
-    preset: Any = SKINS[errors.check_name("skin", name, SKINS)]  # pyright: ignore
+    preset: Any = SKINS[errors.check_name("skin", name, SKINS)]
     known = [field for field in preset._fields if field not in ("shell", "temperature")]
     for field, value in changes.items():
         errors.check_name(f"number of the skin {name}", field, known)

@@ -326,21 +326,18 @@ def parse_domain(domain: DomainLike, robot: RobotLike | None = None) -> Domain:
 
 
 def _names(values: object) -> tuple[str, ...]:
-    if not isinstance(values, list | tuple) or not all(isinstance(name, str) for name in values):
-        raise TypeError("one name, not a list")
-    return tuple(values)
+    names = [values] if isinstance(values, str) else values
+    if not isinstance(names, list | tuple) or not all(isinstance(name, str) for name in names):
+        raise TypeError("no names")
+    return tuple(names)
 
 
 def _range(default: Range | None, values: object) -> Range:
-    if isinstance(values, float | int) and not isinstance(values, bool):
-        values = [values, values]
-    if not isinstance(values, list | tuple):
-        raise TypeError("no list")
-    low, high, *flags = values
+    low, high, *flags = values if isinstance(values, list | tuple) else (values, values)
     if len(flags) > 1 or not all(isinstance(flag, bool) for flag in flags):
         raise ValueError("more than low, high, and whether uniform in the logarithm")
-    if isinstance(low, str) or isinstance(high, str):
-        raise TypeError("texts")
+    if isinstance(low, str | bool) or isinstance(high, str | bool):
+        raise TypeError("no numbers")
     log = bool(flags[0]) if flags else default is not None and default.log
     return Range(float(low), float(high), log)
 
@@ -374,8 +371,6 @@ def _from_json(values: Mapping[str, Any], base: Domain) -> dict[str, Any]:
         errors.check_name("domain quantity", name, known)
         if value is None and name in QUANTITIES and known[name].default is None:
             continue
-        if name == "objects" and isinstance(value, str):
-            value = [value]  # of a text with one name
         ranged = partial(_range, getattr(base, name))
         read, form = _FORMS.get(name, (ranged, "low and high, as [0.1, 0.5]"))
         try:

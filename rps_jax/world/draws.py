@@ -176,19 +176,12 @@ def table(drawn: Draw) -> dict[str, tuple[np.ndarray, str]]:
     }
     columns = {}
     for name, quantity in QUANTITIES.items():
+        values = derived.get(name, drawn.values.get(name))
         if quantity.owner == "robot":
-            values = _limit(drawn.robot, quantity.sets)
-        else:
-            values = derived.get(name, drawn.values.get(name))
-        if quantity.label and values is not None:
-            columns[name] = values
+            values = getattr(drawn.robot, quantity.sets)
+        if quantity.label and values is not None:  # the first number of a limit with several
+            columns[name] = values.reshape(len(values), -1)[:, 0]
     columns["corners"] = solid.corners(shape)
     for name, values in zip(VELOCITY_ERRORS, drawn.velocity_error.T, strict=True):
         columns[name] = values
     return {name: (values, unit_of(name)) for name, values in columns.items()}
-
-
-def _limit(robots: Robot, name: str) -> np.ndarray | None:
-    """Return a limit of robots (n,), or None; the first number of a limit with several."""
-    values = getattr(robots, name)
-    return None if values is None else values.reshape(len(values), -1)[:, 0]

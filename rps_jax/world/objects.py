@@ -7,7 +7,7 @@ use the upright solid over the footprint, in all engines.
 import math
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import mujoco
 import numpy as np
@@ -176,19 +176,14 @@ def _compiled(label: str, path: Path) -> mujoco.MjModel:
     return model
 
 
-def outline_of(geom: Any) -> Footprint | None:
-    """Return the outline of a box or a cylinder; None for another geom."""
-    if geom.type[0] == mujoco.mjtGeom.mjGEOM_BOX:
-        return fp.rectangle(geom.size[0], geom.size[1])
-    return fp.circle(geom.size[0]) if geom.type[0] == mujoco.mjtGeom.mjGEOM_CYLINDER else None
-
-
 def _geom_outline(label: str, model: mujoco.MjModel) -> Footprint:
     """Return the outline of the geom `object`, or raise InputError."""
     geom = model.geom("object")
     centred = np.allclose(geom.pos[:2], 0) and np.allclose(geom.quat, _UPRIGHT)
-    if centred and (outline := outline_of(geom)) is not None:
-        return outline
+    if centred and geom.type[0] == mujoco.mjtGeom.mjGEOM_BOX:
+        return fp.rectangle(geom.size[0], geom.size[1])
+    if centred and geom.type[0] == mujoco.mjtGeom.mjGEOM_CYLINDER:
+        return fp.circle(geom.size[0])
     rule = "the geom object is no upright box or cylinder about the origin, so give the outline"
     raise errors.not_allowed(f"{label}: footprint", None, rule)
 

@@ -99,7 +99,4 @@ def parse_physics(physics: PhysicsLike, fidelity: Fidelity = "standard") -> Phys
             changes[field] = int(value) if value == int(value) else value
         elif isinstance(value, list):
             changes[field] = tuple(value)
-    try:
-        return replace(base, **changes)
-    except TypeError as error:
-        raise errors.InputError(f"physics = {physics} is not allowed ({error}).") from error
+    return replace(base, **changes)

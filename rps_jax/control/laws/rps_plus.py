@@ -28,6 +28,7 @@ parameters. RPS+ has the observations of RPS. Its state adds the position of the
 world, and the number of control steps since.
 """
 
+import math
 from typing import NamedTuple
 
 import jax
@@ -92,10 +93,9 @@ BOUNDS = {f"law.{name}": bound for name, bound in rps.BOUNDS.items() if not boun
 def check(params: RPSPlusParams) -> RPSPlusParams:
     """Return the parameters if they are scalars in range; otherwise raise InputError."""
     rps.check(params.law)
-    errors.check_finite("rps_plus.d_near", params.d_near, at_least=0)
-    errors.check_finite("rps_plus.n_lost", params.n_lost, at_least=0)
-    for name in ("press", "ahead", "aside"):
-        errors.check_finite(f"rps_plus.{name}", getattr(params, name), at_least=0, at_most=1)
+    for name in ("d_near", "n_lost", "press", "ahead", "aside"):
+        at_most = math.inf if name in ("d_near", "n_lost") else 1
+        errors.check_finite(f"rps_plus.{name}", getattr(params, name), at_least=0, at_most=at_most)
     return params
 
 

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from rps_jax import errors
-from rps_jax.control.base import Law
+from rps_jax.control.base import Law, check_signs
 from rps_jax.control.learned import network as networks
 from rps_jax.control.learned.network import LearnedParams, Network, Weights
 from rps_jax.record import files
@@ -96,11 +96,7 @@ def _check_weights(network: Network, weights: Weights) -> None:
             raise ValueError(f"its {name} must hold finite numbers of 32 bits")
 
 
-def check(params: LearnedParams) -> LearnedParams:
-    """Return the parameters if they are positive and finite; otherwise raise InputError."""
-    for name, value in params._asdict().items():
-        errors.check_finite(f"learned.{name}", value, above=0)
-    return params
+check = partial(check_signs, "learned", LearnedParams._fields)
 
 
 def build_law(policy: Policy) -> tuple[str, Law, LearnedParams]:
