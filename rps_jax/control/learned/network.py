@@ -153,18 +153,6 @@ class PolicyState(NamedTuple):
         return self.waiting < 0.5 * obs.touch.period
 
 
-def decide(
-    network: Network, weights: Weights, state: PolicyState, obs: TaxelObservation
-) -> tuple[PolicyState, jax.Array]:
-    """Return the state after a decision, and the mean action (3,) [1], which may exceed 1.
-
-    `state` is already updated with `obs`; its action is still the last one.
-    """
-    inputs = features.compute_features(state.touch_state, state.action, obs)
-    hidden, mean = network.apply(weights, state.hidden, inputs)
-    return state._replace(touch_state=state.touch_state.mark_decision(obs), hidden=hidden), mean
-
-
 class LearnedParams(NamedTuple):
     """Parameters of a learned law. The weights are no parameters, but constants of the program."""
 
@@ -203,15 +191,17 @@ def step(
       InputError: the skin and the network have different numbers of taxels.
     """
     if obs.signal.shape[-1] != network.taxels:
-        raise errors.InputError(
-            f"the skin has {obs.signal.shape[-1]} taxels, and the law was learned with "
-            f"{network.taxels}: choose a robot with the same boards."
-        )
+        rule = f"the law was learned with {network.taxels}: choose a robot with the same boards"
+        raise errors.not_allowed("number of taxels", obs.signal.shape[-1], rule)
     state = state._replace(touch_state=state.touch_state.update(obs))
     due = state.due(obs)
-    decided, mean = decide(network, weights, state, obs)
-    decided = decided._replace(
-        action=features.clip_action(mean), waiting=jnp.full_like(state.waiting, network.hold)
+    inputs = features.compute_features(state.touch_state, state.action, obs)
+    hidden, mean = network.apply(weights, state.hidden, inputs)
+    decided = PolicyState(
+        state.touch_state.mark_decision(obs),
+        hidden,
+        features.clip_action(mean),
+        jnp.full_like(state.waiting, network.hold),
     )
     state = jax.tree.map(partial(jnp.where, due), decided, state)
     twist = Twist(*(_twist_bounds(params) * state.action))
