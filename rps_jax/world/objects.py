@@ -33,9 +33,9 @@ OBJECTS = FAMILIES.keys()  # grows with registered objects
 PAPER_OBJECTS = ("box", "cylinder", "nonuniform_box")  # Fig. 4, in the order of Table II
 _BUILT_IN = tuple({**FAMILIES, **dict.fromkeys(SHAPES)})
 _REQUIRED = {
-    mujoco.mjtObj.mjOBJ_BODY: ("base", "object", "target"),
-    mujoco.mjtObj.mjOBJ_JOINT: ("base_x", "base_y", "base_yaw", "object"),
-    mujoco.mjtObj.mjOBJ_GEOM: ("ground", "base", "object", "skin_front", "skin_left", "skin_right"),
+    "body": ("base", "object", "target"),
+    "joint": ("base_x", "base_y", "base_yaw", "object"),
+    "geom": ("ground", "base", "object", "skin_front", "skin_left", "skin_right"),
 }
 _UPRIGHT = (1.0, 0.0, 0.0, 0.0)
 
@@ -153,18 +153,17 @@ def register_object(
 def _compiled(label: str, path: Path) -> mujoco.MjModel:
     """Compile the model of a file, or raise InputError if it lacks a required element."""
     try:
-        model = read(path).compile()
+        spec = read(path)
+        model = spec.compile()
     except ValueError as error:
         reason = " ".join(str(error).split())
         raise InputError(f"{label}: MuJoCo cannot compile {path} ({reason}).") from error
-    for kind, names in _REQUIRED.items():
-        for required in names:
-            if mujoco.mj_name2id(model, kind, required) < 0:
-                kind_name = kind.name.removeprefix("mjOBJ_").lower()
-                raise InputError(
-                    f"{label}: {path} lacks the {kind_name} '{required}': include base.xml, and "
-                    "give the body, its free joint and one geom the name object."
-                )
+    for kind, elements in (("body", spec.bodies), ("joint", spec.joints), ("geom", spec.geoms)):
+        if missing := sorted(set(_REQUIRED[kind]) - {element.name for element in elements}):
+            raise InputError(
+                f"{label}: {path} lacks the {kind} '{missing[0]}': include base.xml, and give the "
+                "body, its free joint and one geom the name object."
+            )
     joint, body = model.joint("object"), model.body("object")
     free = joint.type[0] == mujoco.mjtJoint.mjJNT_FREE and joint.bodyid[0] == body.id
     if not free or joint.qposadr[0] != 3 or model.nq != 10:
