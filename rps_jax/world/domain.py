@@ -240,13 +240,9 @@ def _constant(value: float) -> Range:
     return Range(value, value)
 
 
-PERFECT: dict[str, Any] = {
-    **dict.fromkeys(
-        ("noise", "gain_spread", "dead_share", "pose_noise", "yaw_noise", "pose_latency"),
-        _constant(0),
-    ),
-    **dict.fromkeys(("command_delay", "velocity_error", "lateral", "yaw"), _constant(0)),
-}
+PERFECT: dict[str, Any] = dict.fromkeys(
+    ("noise", "gain_spread", "dead_share", "lateral", "yaw", *quantities_of("base")), _constant(0)
+)
 _HARDWARE: dict[str, Any] = PERFECT | {"noise": _constant(0.05), "gain_spread": _constant(0.1)}
 DOMAINS = {
     "paper": Domain(
