@@ -98,7 +98,7 @@ def test_a_partially_redrawn_image_equals_the_whole_image(box: scene.Scene, came
     frames = np.tile(scene.initial_qpos(box), (6, 1))
     frames[:, 3:5] += [(0.1 * i, 0.12 * i) for i in range(5)] + [(30, 30)]  # past the flag, away
     for drawn, qpos in zip(video.images(box, frames, **options), frames, strict=True):
-        assert len(changed(drawn, video.snapshot(box, qpos, **options))) < 6
+        assert len(changed(drawn, video.images(box, [qpos], **options)[0])) < 6
 
 
 def test_a_trail_drawn_in_parts_equals_one_drawn_at_once(box: scene.Scene) -> None:
@@ -114,7 +114,7 @@ def test_a_trail_drawn_in_parts_equals_one_drawn_at_once(box: scene.Scene) -> No
 
 def test_above_is_a_map_with_x_up_and_y_left(box: scene.Scene) -> None:
     qpos = scene.initial_qpos(box)
-    image = video.snapshot(box, qpos, p_world_target=(1.5, 2.0), size=(320, 180), camera="above")
+    (image,) = video.images(box, [qpos], p_world_target=(1.5, 2.0), size=(320, 180), camera="above")
     metre = 180 / 6  # px
     row, column = np.median(red(image), axis=0)
     assert row == pytest.approx(90 - 1.5 * metre, abs=3)
@@ -125,7 +125,7 @@ def test_above_is_a_map_with_x_up_and_y_left(box: scene.Scene) -> None:
 def test_both_cameras_see_targets_on_all_sides(box: scene.Scene, camera: str) -> None:
     qpos = scene.initial_qpos(box)
     for target in itertools.product((-2.5, 2.5), repeat=2):
-        image = video.snapshot(box, qpos, p_world_target=target, size=(320, 180), camera=camera)
+        (image,) = video.images(box, [qpos], p_world_target=target, size=(320, 180), camera=camera)
         rows, columns = red(image).T
         assert len(rows) > 5
         assert rows.min() > 0
@@ -137,9 +137,9 @@ def test_both_cameras_see_targets_on_all_sides(box: scene.Scene, camera: str) ->
 def test_the_collision_capsule_of_a_drum_is_not_drawn() -> None:
     drum = scene.load("cylinder")
     qpos = scene.initial_qpos(drum)
-    image = video.snapshot(drum, qpos, p_world_target=FAR, size=SMALL)
+    (image,) = video.images(drum, [qpos], p_world_target=FAR, size=SMALL)
     drum.model.geom("object_side").size = [1.0, 1.0, 0.0]
-    assert np.array_equal(image, video.snapshot(drum, qpos, p_world_target=FAR, size=SMALL))
+    assert np.array_equal(image, video.images(drum, [qpos], p_world_target=FAR, size=SMALL)[0])
 
 
 def test_an_unwritable_path_is_refused_in_one_sentence(box: scene.Scene, tmp_path: Path) -> None:

@@ -112,7 +112,7 @@ def _objects() -> Section:
         for name in PAPER_OBJECTS:
             loaded = scene.load(name)
             qpos = scene.initial_qpos(loaded)
-            images.append(video.snapshot(loaded, qpos, p_world_target=np.array([2, 0])))
+            images += video.images(loaded, [qpos], p_world_target=np.array([2, 0]))
     except video.VideoError as error:
         return Section("Fig. 4: the objects", f"Not drawn: {error}")
     picture = Picture("objects", partial(figures.stills, images, PAPER_OBJECTS))

@@ -41,7 +41,7 @@ _FIX_FFMPEG = "ffmpeg was not found or does not run: run `pip install imageio-ff
 class Shot(NamedTuple):
     """Content of a tile in one frame."""
 
-    qpos: ArrayLike  # (10,) as for `snapshot`
+    qpos: ArrayLike  # (10,) as for `images`
     p_world_contact: ArrayLike  # (2,) [m], NaN without contact
     label: str
 
@@ -58,31 +58,6 @@ def check() -> dict[str, str]:
     return fixes
 
 
-def snapshot(
-    scene: Scene,
-    qpos: ArrayLike,
-    *,
-    p_world_target: ArrayLike,
-    size: tuple[int, int] = SIZE,
-    camera: str = "oblique",
-) -> np.ndarray:
-    """Return an RGB image (height, width, 3) uint8.
-
-    Args:
-      scene: of `scene.load`.
-      qpos: (10,) base x, y [m], yaw [rad]; object position [m] and quaternion, in the world.
-      p_world_target: (2,) [m] of the flag.
-      size: width and height [px].
-      camera: name of a camera of the scene: oblique or above.
-
-    Raises:
-      InputError: a qpos, target, size or camera that cannot be used.
-      VideoError: this machine cannot draw.
-    """
-    (image,) = images(scene, [qpos], p_world_target=p_world_target, size=size, camera=camera)
-    return image
-
-
 def images(
     scene: Scene,
     frames: Iterable[ArrayLike],
@@ -91,7 +66,20 @@ def images(
     size: tuple[int, int] = SIZE,
     camera: str = "oblique",
 ) -> list[np.ndarray]:
-    """Return images as of `snapshot`, each with the path of the base until then."""
+    """Return RGB images (height, width, 3) uint8, each with the path of the base until then.
+
+    Args:
+      scene: of `scene.load`.
+      frames: qpos (10,): base x, y [m], yaw [rad]; object position [m] and quaternion, in the
+        world.
+      p_world_target: (2,) [m] of the flag.
+      size: width and height [px].
+      camera: name of a camera of the scene: oblique or above.
+
+    Raises:
+      InputError: a qpos, target, size or camera that cannot be used.
+      VideoError: this machine cannot draw.
+    """
     with open_renderers([Tile(scene, p_world_target)], size, camera) as (renderer,):
         return [renderer.draw(qpos, NO_CONTACT) for qpos in frames]
 
@@ -112,7 +100,7 @@ def render(
     Frames are drawn and encoded one by one as they come, so memory does not grow with them. The
     file appears at `path` when it is complete, and a file already there stays until then.
 
-    Frames are qpos (10,) as for `snapshot`, at least one, with contact points (2,) [m], NaN
+    Frames are qpos (10,) as for `images`, at least one, with contact points (2,) [m], NaN
     without contact, of as many; the rest is as for `render_grid`.
 
     Raises:
