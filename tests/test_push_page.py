@@ -30,7 +30,7 @@ const push = new Push({ law: arguments[0], target: [-2, 0] });
 return arguments[1].map(([trial, memory]) => {
   Object.assign(push, { trial, memory });
   push.step();
-  const { twist } = push.seen;
+  const { twist } = push.sample;
   return [twist.v_x, twist.v_y, twist.omega, ...push.trial.qpos];
 });
 """

@@ -128,24 +128,24 @@ def family_routines(family: str) -> list[Routine]:
     live = {**dict.fromkeys(constants), "fields": None}
     blank = {name: getattr(start, name) for name in UNTRACED}
 
-    def sense(world: Any, params: Any, told: Any) -> Any:
+    def sense(world: Any, params: Any, state: Any) -> Any:
         full = world._replace(**constants)
-        told, seen = trial.observe(
-            full, params, told._replace(**blank), physics=physics, rules=SETTING.rules
+        state, sensing = trial.observe(
+            full, params, state._replace(**blank), physics=physics, rules=SETTING.rules
         )
-        placed = trial.outline(full, told.qpos)
-        touch = seen.observation._replace(in_contact=seen.reading.contact_type != NONE)
-        taxels = features.taxel_observation(touch, seen.reading, full.skin, told.skin, placed)
-        return told._replace(**UNTRACED), taxels, {"contact_type": seen.reading.contact_type}
+        outline = trial.outline(full, state.qpos)
+        touch = sensing.observation._replace(in_contact=sensing.reading.contact_type != NONE)
+        taxels = features.taxel_observation(touch, sensing.reading, full.skin, state.skin, outline)
+        return state._replace(**UNTRACED), taxels, {"contact_type": sensing.reading.contact_type}
 
-    def drive(fields: Any, before: Any, told: Any, twist: Any) -> Any:
+    def drive(fields: Any, previous: Any, state: Any, twist: Any) -> Any:
         # Without noise the key is unused; JavaScript has no number for it.
         untraced = blank | {"skin": start.skin._replace(key=jnp.zeros(2))}
-        before, told = before._replace(**untraced), told._replace(**untraced)
-        arguments = fields, trial.motion(told), ControlPeriod(twist, physics)
+        previous, state = previous._replace(**untraced), state._replace(**untraced)
+        arguments = fields, trial.motion(state), ControlPeriod(twist, physics)
         batch = jax.tree.map(lambda x: jnp.asarray(x)[None], arguments)
         driven = jax.tree.map(lambda x: x[0], stage.drive(*batch))
-        return (trial.settle(before, told, driven)._replace(**UNTRACED),)
+        return (trial.settle(previous, state, driven)._replace(**UNTRACED),)
 
     shape = _shapes(start._replace(**UNTRACED))
     twist = Twist(*(jnp.zeros(()),) * 3)
@@ -155,12 +155,12 @@ def family_routines(family: str) -> list[Routine]:
         "params": _shapes(Arrival()),
         "trial": shape,
     }
-    drive_shapes = {"fields": _shapes(world.fields), "before": shape, "told": shape}
+    drive_shapes = {"fields": _shapes(world.fields), "previous": shape, "state": shape}
     return [
         routine(
-            f"borne_{family}", lambda o: (support(o),), {"outline": _shapes(outline)}, ["made"]
+            f"support_{family}", lambda o: (support(o),), {"outline": _shapes(outline)}, ["support"]
         ),
-        routine(f"sense_{family}", sense, sense_shapes, ["told", "observation", "reading"]),
+        routine(f"sense_{family}", sense, sense_shapes, ["sensed", "observation", "reading"]),
         routine(f"drive_{family}", drive, {**drive_shapes, "twist": _shapes(twist)}, ["trial"]),
     ]
 
