@@ -1,7 +1,6 @@
 """Studies of failures: severity, rare events, attacks, Sobol indices and regression worlds."""
 
 import sys
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -22,8 +21,8 @@ from rps_jax.trials.score import severity
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import Rules
 from rps_jax.world import points
-from rps_jax.world.domain import DOMAINS, Range
-from sweeps.failures import picked, study
+from rps_jax.world.domain import DOMAINS
+from sweeps.failures import study
 from sweeps.failures.drawn import of_drawn
 
 RULES = Rules(horizon=10.0, max_lost=5.0)
@@ -370,15 +369,6 @@ def test_gains_and_losses_by_hand():
         ["1", "random box", "succeeds", "fails, 25 cm off"],
         ["2", "random prism", "fails, 10 cm off", "succeeds"],
     ]
-
-
-def test_picked_worlds_are_far_from_each_other():
-    domain = replace(DOMAINS["prisms"], mass=Range(3, 60))
-    u = points.points_of(domain, np.arange(100))
-    doubled = np.concatenate([u, u])
-    indices = picked.select(domain, doubled, np.ones((2, 200)), 100, np.array([7]))
-    assert indices[0] == 7
-    assert len(set(indices % 100)) == 100  # none of them twice
 
 
 def test_the_command_of_regress_reports_known_laws(tmp_path, capsys):
