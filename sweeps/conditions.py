@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Unpack
 
 import jax
 import numpy as np
@@ -22,14 +22,17 @@ from rps_jax.control.laws.rps import RPSParams
 from rps_jax.errors import InputError
 from rps_jax.record import files
 from rps_jax.record.checkpoint import Checkpoints
+from rps_jax.runs.question import Run
 from rps_jax.trials import pushes
+from rps_jax.trials.batch import BatchSize, rows
 from rps_jax.trials.case import Case
-from rps_jax.trials.progress import Progress, ProgressCallback, no_progress
+from rps_jax.trials.progress import Progress, ProgressCallback, SequentialProgress, no_progress
 from rps_jax.trials.results import outcome_dataset
 from rps_jax.trials.setting import Setting
 from rps_jax.world import paper
 from rps_jax.world.objects import PAPER_OBJECTS
 from rps_jax.world.scene import FRICTION, Friction
+from sweeps.study_base import TrialStudy, load_part
 
 # Number of trials per call: more keep the device busier, fewer are lost when the run is killed.
 _TRIALS_AT_ONCE = {"cpu": 600, "gpu": 100_000}
@@ -93,9 +96,8 @@ def run_conditions(
     grid: Grid,
     folder: Path | None,
     *,
-    slots: int | None = None,
-    workers: int | None = None,
     callback: ProgressCallback = no_progress,
+    **size: Unpack[BatchSize],
 ) -> xr.Dataset:
     """Return outcomes (condition, law, object, friction, target).
 
@@ -106,67 +108,45 @@ def run_conditions(
       InputError: the folder has a condition of the same name with other options.
     """
     parts = None if folder is None else Checkpoints(folder)
-    parts_of = {name: parts and _load(parts, name, c, grid) for name, c in conditions.items()}
-    missing = [name for name, results in parts_of.items() if results is None]
-    finished, simulated = grid.size * (len(parts_of) - len(missing)), 0.0
-    callback(Progress(finished, simulated))
-    for chunk in _chunks(missing, conditions, grid):
+    options = {name: _fingerprint(condition, grid) for name, condition in conditions.items()}
+    stored = {name: load_part(parts, name, options[name]) for name in conditions}
+    done = {name: results for name, results in stored.items() if results is not None}
+    progress = SequentialProgress(callback)
+    progress.finish(grid.size * len(done))
+    progress(Progress(0, 0.0))
+    for chunk in _chunks([name for name in conditions if name not in done], conditions, grid):
         cases = [case for name in chunk for case in conditions[name].cases(grid)]
-
-        def report_progress(progress: Progress, previous=(finished, simulated)) -> None:
-            callback(Progress(previous[0] + progress.finished, previous[1] + progress.simulated))
-
-        outcome, timing = pushes.run(
-            cases,
-            conditions[chunk[0]].setting,
-            slots=slots,
-            workers=workers,
-            callback=report_progress,
-        )
-        finished, simulated = finished + len(cases), simulated + timing.simulated
+        setting = conditions[chunk[0]].setting
+        outcome, timing = pushes.run(cases, setting, callback=progress, **size)
+        progress.finish(len(cases))
         for i, name in enumerate(chunk):
-            rows = slice(i * grid.size, (i + 1) * grid.size)
-            part = type(outcome)(*(values[rows] for values in outcome))
+            part = rows(outcome, slice(i * grid.size, (i + 1) * grid.size))
             results = outcome_dataset(
                 part, grid.laws, grid.objects, tuple(grid.friction), grid.targets
             )
             share = grid.size / len(cases)  # of the time of the whole call
             results.attrs = {
-                "run_as": _fingerprint(conditions[name], grid),
+                "run_as": options[name],
                 "run_time": timing.run * share,
                 "simulated": timing.simulated * share,
             }
             if parts is not None:
                 parts.put(name, files.encode_results(results))
-            parts_of[name] = results
-    done = {name: results for name, results in parts_of.items() if results is not None}
+            done[name] = results
+    chosen = [done[name] for name in conditions]
     joined = xr.concat(
-        [results.drop_attrs(deep=False) for results in done.values()],
-        xr.DataArray(list(done), dims="condition", name="condition"),
+        [results.drop_attrs(deep=False) for results in chosen],
+        xr.DataArray(list(conditions), dims="condition", name="condition"),
     )
-    for attribute in ("run_time", "simulated"):
-        values = [results.attrs[attribute] for results in done.values()]
-        joined = joined.assign_coords({attribute: ("condition", values)})
-    return joined.assign_coords(what=("condition", [conditions[name].what for name in done]))
+    for name in ("run_time", "simulated"):
+        joined.coords[name] = "condition", [results.attrs[name] for results in chosen]
+    return joined.assign_coords(what=("condition", [c.what for c in conditions.values()]))
 
 
 def _fingerprint(condition: Condition, grid: Grid) -> str:
     """Return everything that the outcomes depend on, as text."""
     plain = replace(condition, what="", params=dict(condition.params), case=dict(condition.case))
     return f"{plain!r} {grid._replace(friction=dict(grid.friction))!r}"
-
-
-def _load(parts: Checkpoints, name: str, condition: Condition, grid: Grid) -> xr.Dataset | None:
-    """Return the results of a condition if it is finished."""
-    if (content := parts.get(name)) is None:
-        return None
-    results = files.decode_results(content, parts.folder / name, signed=True)
-    if results.attrs.get("run_as") != _fingerprint(condition, grid):
-        raise InputError(
-            f"{parts.folder / name}-*.nc was run with other options: choose another folder, or "
-            "delete the file to run the condition again."
-        )
-    return results
 
 
 def _chunks(
@@ -196,20 +176,15 @@ def condition_rows(results: xr.Dataset, baseline: str, law: str = "rps") -> list
     q = np.ones(len(names))
     q[compared] = statistics.false_discovery([comparisons[i].p for i in compared])
     objects = [str(o) for o in part.object.values]
-    header = ["reading", *objects, "all", "95 %", "median time", "against the first"]
-    table = [header]
+    table = [["reading", *objects, "all", "95 %", "median time", "against the first"]]
     for i, name in enumerate(names):
         outcomes = part.sel(condition=name)
         succeeded = outcomes.success.values.astype(bool)
         counts = outcomes.success.sum("target").transpose("object", "friction").values.astype(int)
         low, high = statistics.wilson(int(succeeded.sum()), succeeded.size)
         time = outcomes.time.values[succeeded]
-        difference = (
-            ""
-            if name == baseline
-            else f"+{comparisons[i].gained} -{comparisons[i].lost}, q = {q[i]:.2g}"
-            + (" *" if q[i] < 0.05 else "")
-        )
+        c, star = comparisons[i], " *" if q[i] < 0.05 else ""
+        difference = f"+{c.gained} -{c.lost}, q = {q[i]:.2g}{star}" if name != baseline else ""
         table.append(
             [
                 str(outcomes.what.values),
@@ -221,3 +196,32 @@ def condition_rows(results: xr.Dataset, baseline: str, law: str = "rps") -> list
             ]
         )
     return table
+
+
+@dataclass(frozen=True, kw_only=True)
+class ConditionStudy(TrialStudy[xr.Dataset]):
+    """Base class of studies that run the paper's trials under several conditions.
+
+    The results hold outcomes (condition, law, object, friction, target).
+    """
+
+    targets: tuple[tuple[float, float], ...] = paper.TARGETS
+    """Targets X Y [m], one pair after the other; by default the paper's 24."""
+
+    @property
+    def chosen(self) -> dict[str, Condition]:
+        """Conditions by name."""
+        raise NotImplementedError
+
+    @property
+    def grid(self) -> Grid:
+        """Trials of each condition."""
+        raise NotImplementedError
+
+    def num_trials(self) -> int | None:
+        """Return the number of trials."""
+        return len(self.chosen) * self.grid.size
+
+    def answer(self, run: Run) -> xr.Dataset:
+        """Run the conditions that are missing."""
+        return run_conditions(self.chosen, self.grid, run.folder, **run.batch_options)

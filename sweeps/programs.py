@@ -18,7 +18,6 @@ import numpy as np
 from rps_jax import engines
 from rps_jax.control.base import LawParams
 from rps_jax.control.laws.rps import RPSParams
-from rps_jax.engines import device
 from rps_jax.trials import pushes, trial
 from rps_jax.trials.batch import WorldBatch, rows
 from rps_jax.trials.case import Case
@@ -151,8 +150,3 @@ def side_by_side(
             wait(jobs)
             for job in jobs:
                 yield job.result()
-
-
-def machine() -> str:
-    """Return a sentence with the device of the measurement."""
-    return f"On {jax.devices()[0].device_kind}, {device.count_processors()} processors."

@@ -21,6 +21,7 @@ import json
 import os
 import re
 import sys
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -36,11 +37,8 @@ def data_files(root: Path = SWEEPS) -> dict[str, Path]:
     """Return the data files of all tables by name; raises ValueError if a name occurs twice."""
     paths: dict[str, Path] = {}
     for path in sorted(root.glob("**/results/*.json")):
-        if path.stem in paths:
-            raise ValueError(
-                f"{path} and {paths[path.stem]} have the same name: rename one of them."
-            )
-        paths[path.stem] = path
+        if (other := paths.setdefault(path.stem, path)) != path:
+            raise ValueError(f"{path} and {other} have the same name: rename one of them.")
     return paths
 
 
@@ -49,10 +47,8 @@ def load(name: str, root: Path = SWEEPS) -> dict[str, Any]:
     path = path_of(name, root)
     try:
         data = json.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise ValueError(f"{path} cannot be read: {error.strerror}.") from error
-    except json.JSONDecodeError as error:
-        raise ValueError(f"{path} is not JSON: {error}.") from error
+    except (OSError, json.JSONDecodeError) as error:
+        raise ValueError(f"{path} cannot be read as JSON: {error}.") from error
     if any(isinstance(cell, dict) for row in data.get("rows", ()) for cell in row):
         data = dict.fromkeys(KEYS) | data
     missing = [key for key in KEYS if key not in data]
@@ -60,9 +56,7 @@ def load(name: str, root: Path = SWEEPS) -> dict[str, Any]:
         raise ValueError(f"{path} lacks {', '.join(missing)}.")
     for row in data["rows"]:
         if len(row) != len(data["columns"]):
-            raise ValueError(
-                f"{path}: the number of cells of row {row[:2]} is not the number of columns."
-            )
+            raise ValueError(f"{path}: row {row[:2]} does not have a cell for each column.")
     return data
 
 
@@ -82,7 +76,7 @@ def table(data: dict[str, Any], root: Path = SWEEPS) -> str:
         texts = []
         for cell, column, above in zip(row, data["columns"], previous, strict=True):
             merged = column.get("merge") and cell == above
-            texts.append("" if merged else _text(cell, column, root))
+            texts.append("" if merged else text(cell, column, root))
         lines.append(texts)
         previous = row
     lines.insert(1, ["---"] * len(data["columns"]))
@@ -94,7 +88,8 @@ def _escaped(text: str) -> str:
     return re.sub(r"(?<!\\)\|", r"\|", text)
 
 
-def _text(cell: Any, column: dict[str, Any], root: Path) -> str:
+def text(cell: Any, column: Mapping[str, Any], root: Path = SWEEPS) -> str:
+    """Return the text of a cell in the format of its column."""
     if cell is None:
         return ""
     if isinstance(cell, str):
@@ -102,8 +97,8 @@ def _text(cell: Any, column: dict[str, Any], root: Path) -> str:
     if isinstance(cell, dict):
         return _cited(cell, root)
     first, *rest = cell if isinstance(cell, list) else [cell]
-    text = column.get("format", "{}").format(first)
-    return text + column.get("rest", "").format(*rest) if rest else text
+    shown = column.get("format", "{}").format(first)
+    return shown + column.get("rest", "").format(*rest) if rest else shown
 
 
 def _cited(cell: dict[str, Any], root: Path) -> str:
@@ -116,7 +111,7 @@ def _cited(cell: dict[str, Any], root: Path) -> str:
     if len(rows) != 1 or column not in names[first_column:]:
         raise ValueError(f"{cell} does not name one cell of {cell['from']}.json.")
     i = names.index(column, first_column)
-    return _text(rows[0][i], data["columns"][i], root)
+    return text(rows[0][i], data["columns"][i], root)
 
 
 def caption(data: dict[str, Any], link: str) -> str:
@@ -175,11 +170,11 @@ def main(arguments: list[str]) -> int:
         for name in data_files():
             table(load(name))
         for page in pages():
-            text = render(page)
-            if text != page.read_text(encoding="utf-8"):
+            rendered = render(page)
+            if rendered != page.read_text(encoding="utf-8"):
                 stale.append(page)
                 if not arguments:
-                    page.write_text(text, encoding="utf-8")
+                    page.write_text(rendered, encoding="utf-8")
     except ValueError as error:
         print(f"render_tables: error: {error}", file=sys.stderr)
         return 1

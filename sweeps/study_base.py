@@ -1,8 +1,9 @@
 """Base classes of this project's studies, and the data files of their tables.
 
-A subclass of `Study` names its tables in `published_tables`. With the option `--machine` they are
-written to `results/NAME.json` in the folder of the study, and `render_tables.py` shows them on the
-pages. A data file has a digest of everything that its numbers depend on.
+A subclass of `Study` declares the parts of its results and its tables. Each table is a section of
+the report. With the option `--machine`, tables that have a name are written to `results/NAME.json`
+in the folder of the study, and `render_tables.py` shows them on the pages. A data file has a digest
+of everything that its numbers depend on.
 """
 
 from __future__ import annotations
@@ -12,32 +13,53 @@ import dataclasses
 import hashlib
 import inspect
 import json
+import os
+import platform
 import re
 import shlex
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar, NamedTuple, TypeVar
 
+import jax
+import numpy as np
+import xarray as xr
+
+from rps_jax import errors
+from rps_jax.analysis.report import Picture, Section
 from rps_jax.app.cli import flags, names
 from rps_jax.control import registry
+from rps_jax.engines import device
 from rps_jax.errors import InputError
 from rps_jax.record import files, provenance
-from rps_jax.runs.question import Question, TrialQuestion
-from rps_jax.trials.progress import ProgressCallback
+from rps_jax.record.checkpoint import Checkpoints
+from rps_jax.runs import execution
+from rps_jax.runs.plan import Plan
+from rps_jax.runs.question import Question, Run, TrialQuestion
+from rps_jax.trials.progress import Progress, ProgressCallback, SequentialProgress, no_progress
 from rps_jax.world.domain import DOMAINS, QUANTITIES
+from sweeps import render_tables
 
 T = TypeVar("T", covariant=True)
+Rows = list[list[str]]
 _PACKAGES = ("rps_jax", "jax", "mujoco", "mujoco-mjx")  # whose versions a data file has
 
 
+# --- tables ---------------------------------------------------------------------------------
+
+
 class Table(NamedTuple):
-    """A table to publish."""
+    """A table of a study: a section of its report, and a data file if it has a name."""
 
     rows: Sequence[Sequence[Any]]  # the first has the names of the columns
     note: str = ""  # explains the numbers to their reader
     columns: Sequence[Mapping[str, Any]] = ()  # formats, by default none; rows then have no header
     merge: str | None = None  # name of the column that shows repeated texts once
+    name: str = ""  # of the data file
+    title: str = ""  # of the section; by default from the name
+    text: str = ""  # of the section; by default the note
+    picture: Picture | None = None  # of the section
 
     def columns_and_rows(self) -> tuple[list[Mapping[str, Any]], list[Sequence[Any]]]:
         """Return columns and rows as a data file has them."""
@@ -48,6 +70,36 @@ class Table(NamedTuple):
             {"name": name} | ({"merge": True} if name == self.merge else {}) for name in header
         ], rows
 
+    @property
+    def section(self) -> Section:
+        """Section of the report."""
+        title = self.title or self.name.replace("_", " ").capitalize()
+        rows = self.rows
+        if self.columns:
+            cells = [zip(row, self.columns, strict=True) for row in rows]
+            texts = [[render_tables.text(*cell) for cell in row] for row in cells]
+            rows = [[column["name"] for column in self.columns], *texts]
+        return Section(title, self.text or self.note, rows, self.picture)
+
+
+def records(results: xr.Dataset, *dims: str) -> Iterator[dict[str, Any]]:
+    """Yield the scalars of a dataset at each index of some dimensions, the last one fastest."""
+    for index in np.ndindex(*(results.sizes[dim] for dim in dims)):
+        row = results.isel(dict(zip(dims, index, strict=True)))
+        yield {str(name): value.item() for name, value in row.variables.items() if not value.ndim}
+
+
+def text_table(columns: Mapping[str, str], rows: Iterable[Mapping[str, Any]]) -> Rows:
+    """Return a header and a row of texts for each record.
+
+    `columns` has the format of each column, such as "{rate:,.0f} s". A cell with NaN is empty.
+    """
+    texts = [[form.format(**row) for form in columns.values()] for row in rows]
+    return [list(columns), *(["" if re.search(r"\bnan\b", x) else x for x in row] for row in texts)]
+
+
+# --- studies --------------------------------------------------------------------------------
+
 
 @dataclass(frozen=True, kw_only=True)
 class Study(Question[T]):
@@ -56,23 +108,53 @@ class Study(Question[T]):
     machine: str = ""
     """Machine that runs the study, in words; with it the tables are published."""
 
+    CHOICES: ClassVar[Mapping[str, Collection[str]]] = {}  # known names of fields
+    DIMENSION: ClassVar[str] = ""  # along which the parts are joined
     GROWS: ClassVar[tuple[str, ...]] = ()  # options that may change when a run is continued
     RESULTS: ClassVar[str] = "results"  # folder of the data files, relative to the study's folder
+
+    # --- for subclasses to override --------------------------------------------------------
+
+    def parts(self, run: Run) -> Mapping[Any, Callable[[], xr.Dataset]]:
+        """Return the function that computes each part of the results, by its coordinate."""
+        return {}
+
+    def report_tables(self, results: Any) -> Sequence[Table]:
+        """Return the tables of the report."""
+        return ()
+
+    def publish(self, results: Any, run_folder: Path) -> None:
+        """Write the data files of the tables that have a name."""
+        for table in self.report_tables(results):
+            path = self.folder / self.RESULTS / f"{table.name}.json"
+            if table.name:
+                write_table(path, [provenance.read_environment(run_folder)], self.machine, table)
+
+    # --- as questions ----------------------------------------------------------------------
+
+    def check(self) -> None:
+        """Check the names."""
+        for field, known in self.CHOICES.items():
+            value = getattr(self, field)
+            for name in [value] if isinstance(value, str) else value:
+                errors.check_name(field, name, known)
+
+    def num_trials(self) -> int | None:
+        """Return the number of parts."""
+        return len(self.parts(Run(None, no_progress))) or None
 
     def configuration(self) -> dict[str, Any]:
         """Return everything that the parts of the run depend on, as JSON."""
         options = super().configuration()
         return {k: v for k, v in options.items() if k not in (*self.GROWS, "machine")}
 
-    def published_tables(self, results: Any) -> Mapping[str, Table]:
-        """Return the tables to publish, by the name of their data file."""
-        return {}
+    def answer(self, run: Run) -> Any:
+        """Compute the parts that are missing, and join them."""
+        return run_parts(run, self.DIMENSION, self.parts(run))
 
-    def publish(self, results: Any, run_folder: Path) -> None:
-        """Write the data files of all tables."""
-        for name, table in self.published_tables(results).items():
-            path = self.folder / self.RESULTS / f"{name}.json"
-            write_table(path, [provenance.read_environment(run_folder)], self.machine, table)
+    def report(self, results: Any, run: Run) -> Sequence[Section]:
+        """Return a section for each table."""
+        return [table.section for table in self.report_tables(results)]
 
     @property
     def folder(self) -> Path:
@@ -90,6 +172,95 @@ class Study(Question[T]):
 @dataclass(frozen=True, kw_only=True)
 class TrialStudy(Study[T], TrialQuestion[T]):
     """Base class of studies that run trials with several settings."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SpeedStudy(Study[T]):
+    """Base class of studies that measure this machine."""
+
+    def intro(self, results: Any) -> str:
+        """Return the device of the measurement."""
+        return f"On {machine()}."
+
+
+def machine() -> str:
+    """Return a description of the device of this process."""
+    used, count = jax.devices()[0], device.count_processors()
+    if used.platform != "cpu":
+        return f"one {used.device_kind} and {count} processors"
+    model = platform.processor() or platform.machine()
+    cpuinfo = Path("/proc/cpuinfo")
+    for line in cpuinfo.read_text().splitlines() if cpuinfo.exists() else ():
+        if line.startswith("model name"):
+            model = line.partition(":")[2].strip()
+            break
+    return f"{count} of {os.cpu_count()} processors, {model}"
+
+
+def part_name(*labels: object) -> str:
+    """Return the name of a part of a run folder."""
+    return re.sub(r"\W+", "_", "_".join(map(str, labels)))
+
+
+def stored_parts(run: Run) -> Collection[str]:
+    """Return the names of the parts that the run folder has."""
+    return () if run.checkpoints is None else run.checkpoints.paths()
+
+
+def run_parts(
+    run: Run, dim: str, parts: Mapping[Any, Callable[[], xr.Dataset]], trials: int = 1
+) -> xr.Dataset:
+    """Compute the parts that the run folder lacks, and join all of them along a dimension.
+
+    Each part counts as a number of `trials` in the progress.
+    """
+    computed = []
+    for label, compute in parts.items():
+        computed.append(run.checkpoint(part_name(label), compute))
+        run.callback(Progress(trials * len(computed), 0.0))
+    return xr.concat(computed, xr.IndexVariable(dim, list(parts)))
+
+
+def load_part(parts: Checkpoints | None, name: str, options: str) -> xr.Dataset | None:
+    """Return the results of a part if they are stored.
+
+    Raises:
+      InputError: their attribute `run_as` differs from the options.
+    """
+    if parts is None or (content := parts.get(name)) is None:
+        return None
+    results = files.decode_results(content, parts.folder / name, signed=True)
+    if results.attrs.get("run_as") != options:
+        raise InputError(
+            f"{parts.folder / name}-*.nc was run with other options: choose another folder, or "
+            "delete the file to run the part again."
+        )
+    return results
+
+
+def load_or_compute(
+    parts: Checkpoints | None, name: str, options: str, compute: Callable[[], xr.Dataset]
+) -> xr.Dataset:
+    """Return a part that is stored with the same options, or compute and store it."""
+    if (results := load_part(parts, name, options)) is None:
+        results = compute().assign_attrs(run_as=options)
+        if parts is not None:
+            parts.put(name, files.encode_results(results))
+    return results.drop_attrs(deep=False)
+
+
+def run_plans(run: Run, plans: Mapping[str, Plan]) -> dict[str, xr.Dataset]:
+    """Run what the run folder lacks of several plans; return their results."""
+    progress, results = SequentialProgress(run.callback), {}
+    options = run._replace(callback=progress).batch_options
+    for name, plan in plans.items():
+        folder = None if run.folder is None else run.folder / part_name(name)
+        results[name] = execution.run_plan(plan, folder, **options)
+        progress.finish(plan.num_trials)
+    return results
+
+
+# --- data files -----------------------------------------------------------------------------
 
 
 def write_table(path: Path, runs: Sequence[Mapping[str, Any]], device: str, table: Table) -> Path:
@@ -138,7 +309,7 @@ def digest(commands: Sequence[Sequence[str]]) -> str:
             raise InputError(
                 f"command = {program} is not allowed: only `rps NAME` or `rps PATH` has a digest."
             )
-        if _reads_folder(_split_folder(words)[0]):  # the command that made the folder has a digest
+        if _reads_folder(split_folder(words)[0]):  # the command that made the folder has a digest
             configurations.append(words)
             continue
         name, rest = names.split(words)
@@ -163,7 +334,7 @@ def _expanded(value: Any) -> Any:
     return value
 
 
-def _split_folder(command: Sequence[str]) -> tuple[list[str], str]:
+def split_folder(command: Sequence[str]) -> tuple[list[str], str]:
     """Return the words of a command without its run folder, and the run folder."""
     if "--out" not in command:
         return list(command), ""
@@ -178,6 +349,6 @@ def _reads_folder(words: Sequence[str], folder: str = "runs") -> bool:
 
 def _without_unread_folder(command: Sequence[str], commands: Sequence[Sequence[str]]) -> list[str]:
     """Return the words of a command, without its run folder unless another command reads it."""
-    words, folder = _split_folder(command)
-    is_read = folder and any(_reads_folder(_split_folder(c)[0], folder) for c in commands)
+    words, folder = split_folder(command)
+    is_read = folder and any(_reads_folder(split_folder(c)[0], folder) for c in commands)
     return list(command) if is_read else words

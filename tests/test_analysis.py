@@ -18,7 +18,6 @@ from rps_jax.tuning import learn
 from rps_jax.world.domain import LABELS
 from sweeps.ambiguities.study import tolerance_curve
 from sweeps.landscape.study import parameters_figure
-from sweeps.levers.study import levers_figure
 from sweeps.speed.study import throughput
 
 
@@ -229,16 +228,12 @@ def test_rates_are_drawn_in_percent_by_object(drawn):
     assert ax.lines[0].get_xydata().tolist() == [[10.0, 75.0], [40.0, 0.0]]
 
 
-def test_speeds_are_drawn_by_batch_and_gains_from_1_on(drawn):
+def test_speeds_are_drawn_by_batch(drawn):
     rows = [("box", "fast", 64, 100.0), ("box", "fast", 512, 300.0), ("box", "C", 8, 50.0)]
     (ax,) = drawn(throughput, rows, {"C"}).axes
     fast, level = ax.lines
     assert fast.get_xydata().tolist() == [[64, 100.0], [512, 300.0]]
     assert list(level.get_ydata()) == [50.0, 50.0]
-    gains = {"default": 1.0, "long steps": 2.5, "short steps": 0.4}
-    (ax,) = drawn(levers_figure, gains, "MJX").axes
-    assert [bar.get_x() + bar.get_width() for bar in ax.patches] == [1.0, 2.5, 0.4]
-    assert [label.get_text() for label in ax.get_yticklabels()][1] == "long steps"
 
 
 def test_a_parameter_with_log_bounds_has_a_log_axis(drawn):

@@ -2,7 +2,6 @@
 
 import os
 import subprocess
-from dataclasses import replace
 from types import SimpleNamespace
 from typing import NamedTuple
 
@@ -10,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import xarray as xr
 
 from rps_jax.control.observation import Twist
 from rps_jax.engines import mjx_colliders
@@ -38,8 +38,9 @@ def test_a_program_is_timed_and_compared_with_c_in_the_closed_loop():
     assert 0 < speed.rate < np.inf
     assert speed.memory > 2 * 40  # bytes: two worlds, of more than ten numbers each
 
-    in_c = replace(speed, name="C in closed loop", rate=2.0, memory=np.nan)
-    header, first, second = speeds.table([in_c, replace(speed, rate=5.0)])
+    in_c = speed._replace(name="C in closed loop", rate=2.0, memory=np.nan)
+    both = [xr.Dataset(row._asdict()) for row in (in_c, speed._replace(rate=5.0))]
+    header, first, second = speeds.table(xr.concat(both, "measurement"))
     ratio = header.index("against C in closed loop")
     assert (first[ratio], second[ratio]) == ("1", "2.5")
     assert first[-1] == ""
@@ -108,7 +109,8 @@ def test_nsight_counters_become_a_row():
     lines = [",".join(f'"{x}"' for x in row) for row in (names, units, *launches)]
     counts = kernel.counts("\n".join(["==PROF== Connected", "success", *lines]))
     whole = counts.expand_dims(family=["box"])
-    (row,) = kernel.Kernel(families=("box",)).table(whole)
+    (table,) = kernel.Kernel(families=("box",)).report_tables(whole)
+    _, row = table.rows
     assert row == [
         *("box", "16,384", "134 µs", "2,000", "251", "5.0"),
         *("1.6", "1.1", "0.5", "0.4", "0.0", "1.4"),
@@ -126,11 +128,13 @@ def test_levers_are_timed_against_the_unchanged_program(monkeypatch):
     names = ("no physics: law, skin, rules", "four times the worlds", "state not donated")
     all_levers = levers.levers_of("quasistatic", "cylinder")
     monkeypatch.setattr(levers, "levers_of", lambda *_: {name: all_levers[name] for name in names})
-    gains = list(levers.measure("quasistatic", "cylinder", 2, simulated=0.1, goes=1))
-    assert [gain.lever for gain in gains] == [levers.BASELINE, *names]
-    assert [gain.worlds for gain in gains] == [2, 2, 8, 2]
-    assert all(0 < gain.times < np.inf for gain in gains)
-    assert len(levers.table(gains)) == 1 + len(gains)
+    study = levers.Levers("quasistatic", "cylinder", 4, simulated=0.1, goes=1)
+    gains = study()
+    assert gains.lever.values.tolist() == [levers.BASELINE, *names]
+    assert gains.worlds.values.tolist() == [4, 4, 16, 4]
+    assert ((gains.times > 0) & (gains.times < np.inf)).all()
+    (table,) = study.report_tables(gains)
+    assert len(table.rows) == 1 + gains.sizes["lever"]
 
 
 def test_levers_depend_on_the_engine():
@@ -210,14 +214,16 @@ def test_whole_commands_are_timed_twice_per_gpu_count(monkeypatch):
     monkeypatch.setattr(subprocess, "Popen", Process)
     monkeypatch.setattr(os, "wait4", lambda pid, options: (pid, 0, used))
     monkeypatch.setenv("JAX_PLATFORMS", "cpu")  # of the process that times them
-    results = commands.commands(("push --seed 1",), (1, 2))
+    study = commands.Commands(("push --seed 1",), (1, 2))
+    results = study()
     names = [f"`rps push --seed 1`, {gpus}" for gpus in ("one GPU", "2 GPUs")]
     assert results.command.values.tolist() == names
     words, caches, gpus = zip(*launches, strict=True)
     assert gpus == ("0", "0", "0,1", "0,1")
     assert caches[0] == caches[1] != caches[2]  # an empty cache
     assert words[0] == ["rps_jax", "push", "--seed", "1"]
-    assert commands.table(results)[1][3:] == ["1.5 s", "2.0 s", "1,234", "1.1 GB", "1.1 GB"]
+    (table,) = study.report_tables(results)
+    assert table.rows[2][3:] == ["1.5 s", "2.0 s", "1,234", "1.1 GB", "1.1 GB"]
 
 
 def test_step_times_on_a_robot_are_parsed_from_the_examples_output(monkeypatch):
@@ -225,5 +231,5 @@ def test_step_times_on_a_robot_are_parsed_from_the_examples_output(monkeypatch):
     printed += "0.60% took longer than 1 ms"
     ended = subprocess.CompletedProcess([], 0, printed, "")
     monkeypatch.setattr(subprocess, "run", lambda *_, **how: ended)
-    rows = robot.table(robot.on_a_robot(1))
-    assert rows == [["1", "146 µs", "2.5 ms", "9.0 ms", "0.6 %"]]
+    (table,) = robot.OnARobot().report_tables(robot.on_a_robot(1))
+    assert table.rows[1:] == [["1", "146 µs", "2.5 ms", "9.0 ms", "0.6 %"]]

@@ -189,10 +189,10 @@ def test_a_whole_trial_step_by_step(name, tmp_path):
     setting = Setting("quasistatic", rules=Rules(horizon=20.0))
     trials = recorded([case], setting)
     assert len(trials[0][0]) > 900
-    (errors,) = trial_errors(name, "double", trials, tmp_path).own
+    (errors,) = trial_errors(name, "double", trials, tmp_path).free
     assert errors.max() < 1e-12
     result = trial_errors(name, "float", trials, tmp_path)
-    (errors,), (from_memory,) = result.own, result.told
+    (errors,), (from_memory,) = result.free, result.synchronised
     assert np.quantile(from_memory, 0.999) < 1e-5  # given JAX's memory, all steps agree
     # A step differs where a switch flips in one of the two; it must not last.
     assert np.mean(errors > 2e-5) < 0.01

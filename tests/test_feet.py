@@ -116,7 +116,7 @@ def test_the_rigid_solver_supports_feet():
     row = scene.solid_of(scene.load("on_feet", FINE, FRICTION))
     feet = rigid.supports(row, np.zeros(1), np.zeros((1, 2)))
     np.testing.assert_allclose(feet[0, :3], FEET, atol=1e-9)
-    load = rigid.borne(feet, np.zeros((1, 2)), np.zeros((1, 1)), row.feet[..., 2])
+    load = rigid.supported_load(feet, np.zeros((1, 2)), np.zeros((1, 1)), row.feet[..., 2])
     np.testing.assert_allclose(load[0], [*LOADS, *np.zeros(SIDES - 3)], atol=1e-9)
 
 

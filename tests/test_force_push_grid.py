@@ -66,8 +66,8 @@ def test_the_law_returns_all_boxes_to_the_path_and_open_loop_loses_most(tmp_path
 
 test_invalid_options_of_the_grid_are_refused = refusals(
     lambda **options: ForcePushGrid(**options)(),
-    ({"laws": ("none",)}, "unknown law 'none'"),
-    ({"sliders": ("prism",)}, "unknown slider 'prism'"),
+    ({"laws": ("none",)}, "unknown laws 'none'"),
+    ({"sliders": ("prism",)}, "unknown sliders 'prism'"),
     ({"duration": 0.0}, "duration"),
     ({"engine": "quasistatic"}, "senses the contact's force"),
     ({"engine": "mujoco"}, "JAX must trace it"),

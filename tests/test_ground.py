@@ -75,7 +75,7 @@ def test_the_push_shifts_the_load_ahead_by_its_moment():
 
 def test_points_that_would_have_to_pull_lift_off():
     feet = blocks(0.2, 0.2).vertices
-    load = rigid.borne(feet, np.array([[0.12, 0.12]]), np.zeros((1, 1)))
+    load = rigid.supported_load(feet, np.array([[0.12, 0.12]]), np.zeros((1, 1)))
     assert load[0, 2] == 0  # the corner behind
     np.testing.assert_allclose(load.sum(), 1)
     np.testing.assert_allclose(load[0] @ feet[0], [0.12, 0.12])

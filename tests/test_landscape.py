@@ -6,15 +6,13 @@ import pytest
 
 from rps_jax.control.laws.rps import BOUNDS, RPSParams
 from rps_jax.runs.question import seed_of
-from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import Outcome
 from rps_jax.tuning.space import SUBSETS, Space
-from rps_jax.world.domain import DOMAINS
-from sweeps.landscape import candidates
+from sweeps.landscape import candidates, study
 from sweeps.landscape.candidates import Aims
+from sweeps.landscape.study import Landscape
 
 FULL = SUBSETS["full"]
-WIDE = ((DOMAINS["wide"],), Setting())
 SETS = {"paper": RPSParams.paper(), "tuned": RPSParams.tuned()}
 
 
@@ -94,13 +92,13 @@ def pretended(monkeypatch):
             answers.append(outcomes(success=success, time=time, path_length=path_length))
         return answers, None
 
-    monkeypatch.setattr(candidates, "outcomes", run_all)
+    monkeypatch.setattr(study, "outcomes", run_all)
     return calls
 
 
 def test_each_parameter_alone_is_labelled_and_from_worlds_for_validation(pretended):
-    result = candidates.alone(SETS, *WIDE, names=("L", "K_h"), count=3, worlds=8)
-    assert dict(result.sizes) == {"set": 2, "parameter": 2, "step": 3}
+    result = Landscape(SETS, values=3, worlds=8).vary_each()
+    assert dict(result.sizes) == {"set": 2, "parameter": len(FULL), "step": 3}
     assert [ask.seed for ask in pretended] == [seed_of(0, "validate")]
     first = result.sel(set="paper", parameter="L")
     np.testing.assert_allclose(first.time, 100 * first.value, rtol=1e-5)
@@ -110,7 +108,7 @@ def test_each_parameter_alone_is_labelled_and_from_worlds_for_validation(pretend
 
 
 def test_the_front_is_chosen_by_validation_and_measured_by_test_worlds(pretended):
-    result = candidates.front(SETS, *WIDE, candidates=6, worlds=8)
+    result = Landscape(SETS, candidates=6, worlds=8).select_front()
     assert [ask.seed for ask in pretended] == [seed_of(0, s) for s in ("validate", "test")]
     params = [jax.tree.map(np.asarray, ask.params) for ask in pretended]
     jax.tree.map(np.testing.assert_array_equal, *params)

@@ -61,7 +61,7 @@ def test_a_table_follows_its_data_and_those_it_cites(tmp_path):
     assert "(one/results/one.json)" in text
     with pytest.raises(ValueError, match=r"does not name one cell of one\.json"):
         rendered([["a", 1.5]])
-    with pytest.raises(ValueError, match="is not the number of columns"):
+    with pytest.raises(ValueError, match="does not have a cell for each column"):
         rendered([["a"]])
     (tmp_path / "results").mkdir()
     (tmp_path / "results" / "one.json").write_text("{}")

@@ -69,7 +69,7 @@ def test_failed_recipes_are_named_and_the_others_are_run(recipe_folder, capsys):
     words = (SWEEPS / "publish", "--only", "*", "--needs", "cpu", "--machine", "a core")
     assert rps(*words, "--out", recipe_folder / "run") == 2
     output = capsys.readouterr()
-    assert "1 of the files could not be made: broken." in output.err
+    assert "1 of the files could not be computed: broken." in output.err
     assert "unknown law 'none'" in output.out
     first, second = (json.loads((recipe_folder / f"study/results/{n}.json").read_text())
                      for n in ("first", "second"))  # fmt: skip

@@ -112,7 +112,7 @@ def test_positions_of_feet_change_the_rotation():
 def test_feet_bear_the_weight_about_its_centre():
     at = np.array([[[0.1, 0.0], [-0.1, 0.1], [-0.1, -0.1], [0.0, 0.02]]])
     weight, centre = np.array([[1.0, 2.0, 1.0, 0.5]]), np.array([[0.01, 0.02]])
-    load = sliding.borne(at, weight, centre)
+    load = sliding.supported_load(at, weight, centre)
     assert load.sum() == pytest.approx(1)
     assert (load >= 0).all()
     np.testing.assert_allclose(np.einsum("bs,bsi->bi", load, at), centre, atol=1e-12)

@@ -11,7 +11,6 @@ import math
 from dataclasses import replace
 from typing import Any
 
-import numpy as np
 import xarray as xr
 from scipy import stats
 
@@ -33,12 +32,12 @@ def _setting(physics: Physics = _CONVERGED, **changes: Any) -> Setting:
     return Setting(physics=replace(physics, **changes), engine="fused")
 
 
-def _params(words: str, **params: float) -> Condition:
-    return Condition(words, _setting(), params=params)
+def _params(label: str, **params: float) -> Condition:
+    return Condition(label, _setting(), params=params)
 
 
-def _case(words: str, **case: Any) -> Condition:
-    return Condition(words, _setting(), case=case)
+def _case(label: str, **case: Any) -> Condition:
+    return Condition(label, _setting(), case=case)
 
 
 READINGS = {
@@ -75,11 +74,10 @@ QUICK_READINGS = (DEFAULT, "tangent_as_printed", "drive_on_loss", "tolerance_1mm
 _THIN = {"skin": IdealSkin(0.001)}
 
 
-def _gazebo(
-    words: str, tolerance: float = 0.001, bearing: float = 0.0, **changes: Any
-) -> Condition:
-    case = {"skin": IdealSkin(tolerance), "bearing": bearing}
-    return Condition(words, _setting(_GAZEBO, **changes), case=case)
+def _gazebo(label: str, tolerance: float = 0.001, bearing: float = 0.0, **more: Any) -> Condition:
+    """Return a condition of Gazebo's physics; `params` are of the law, the rest of the physics."""
+    params, case = more.pop("params", {}), {"skin": IdealSkin(tolerance), "bearing": bearing}
+    return Condition(label, _setting(_GAZEBO, **more), params, case)
 
 
 # Ingredients of Gazebo: all together, then one by one.
@@ -92,9 +90,7 @@ GAZEBO = {
     "gazebo_turned": _gazebo("`paper_gazebo` turned by 45 degrees", bearing=math.pi / 4),
     "thin_half": _gazebo("pyramid, skin 0.5 mm", 0.0005),
     "thin_3mm": _gazebo("pyramid, skin 3 mm", 0.003),
-    "gazebo_drive": replace(
-        _gazebo("`paper_gazebo`, 0.05 m/s after a loss"), params={"v_lost": 0.05}
-    ),
+    "gazebo_drive": _gazebo("`paper_gazebo`, 0.05 m/s after a loss", params={"v_lost": 0.05}),
     "gazebo_2ms": _gazebo("`paper_gazebo` in steps of 2 ms", timestep=0.002),
     "gazebo_5ms": _gazebo("`paper_gazebo` in steps of 5 ms", timestep=0.005),
 }
@@ -111,12 +107,10 @@ ON_LOSS = {
 
 def curve(tolerances: tuple[float, ...] = TOLERANCES) -> dict[str, Condition]:
     """Return conditions over skin tolerance [mm] and behaviour on loss of contact."""
+    fused = Setting(engine="fused")
     return {
         f"{loss}_{mm:g}mm": Condition(
-            f"{mm:g} mm, {words}",
-            Setting(engine="fused"),
-            params=params,
-            case={"skin": IdealSkin(mm / 1000)},
+            f"{mm:g} mm, {words}", fused, params, {"skin": IdealSkin(mm / 1000)}
         )
         for loss, (words, params) in ON_LOSS.items()
         for mm in tolerances
@@ -133,21 +127,14 @@ def by_tolerance(results: xr.Dataset, tolerances: tuple[float, ...]) -> xr.Datas
         "won": trials.success.sum(("friction", "target")),
         "lost": trials.contact_lost_time.mean(("friction", "target")),
     }
-    dims = ("loss", "tolerance", "object")
-    variables = {}
-    for name, values in measures.items():
-        by_loss = [
-            values.sel(condition=[f"{loss}_{mm:g}mm" for mm in tolerances]).values
-            for loss in ON_LOSS
-        ]
-        variables[name] = (dims, np.stack(by_loss))
-    coords = {
-        "loss": list(ON_LOSS),
-        "what": ("loss", [words for words, _ in ON_LOSS.values()]),
-        "tolerance": list(tolerances),
-        "object": trials.object,
-    }
-    return xr.Dataset(variables, coords)
+    by_loss = [
+        xr.Dataset(measures)
+        .sel(condition=[f"{loss}_{mm:g}mm" for mm in tolerances])
+        .rename(condition="tolerance")
+        .assign_coords(tolerance=list(tolerances), what=words)
+        for loss, (words, _) in ON_LOSS.items()
+    ]
+    return xr.concat(by_loss, xr.IndexVariable("loss", list(ON_LOSS)))
 
 
 def cells(results: xr.Dataset, condition: str = "paper_gazebo") -> list[list[str]]:
@@ -164,14 +151,10 @@ def cells(results: xr.Dataset, condition: str = "paper_gazebo") -> list[list[str
         theirs = paper.TABLE_II[str(law), str(name), str(friction)]
         low, high = statistics.wilson(theirs, in_paper)
         table = [[ours, trials - ours], [theirs, in_paper - theirs]]
-        rows.append(
-            [
-                f"{str(law).upper()} {name} {friction}",
-                f"{ours} of {trials}",
-                f"{theirs} of {in_paper}",
-                f"{in_paper * low:.1f}-{in_paper * high:.1f}",
-                "yes" if low <= ours / trials <= high else "no",
-                f"{stats.fisher_exact(table).pvalue:.2g}",
-            ]
-        )
+        rows.append([
+            f"{str(law).upper()} {name} {friction}", f"{ours} of {trials}",
+            f"{theirs} of {in_paper}", f"{in_paper * low:.1f}-{in_paper * high:.1f}",
+            "yes" if low <= ours / trials <= high else "no",
+            f"{stats.fisher_exact(table).pvalue:.2g}",
+        ])  # fmt: skip
     return rows

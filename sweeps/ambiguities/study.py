@@ -18,18 +18,18 @@ import xarray as xr
 
 from rps_jax import errors
 from rps_jax.analysis.figures.style import OBJECT_COLOURS, Figure, success_rates, words
-from rps_jax.analysis.report import Picture, Section
+from rps_jax.analysis.report import Picture
 from rps_jax.control import registry
-from rps_jax.runs.question import Run, call_of
+from rps_jax.runs.question import call_of
 from rps_jax.world import paper
 from rps_jax.world.objects import PAPER_OBJECTS
 from sweeps.ambiguities import readings
-from sweeps.conditions import Condition, Grid, condition_rows, run_conditions
-from sweeps.study_base import TrialStudy
+from sweeps.conditions import Condition, ConditionStudy, Grid, condition_rows
+from sweeps.study_base import Table
 
 
 @dataclass(frozen=True)
-class Ambiguities(TrialStudy[xr.Dataset]):
+class Ambiguities(ConditionStudy):
     """Run the paper's trials under one reading of its open details at a time.
 
     The result has the outcomes (condition, law, object, friction, target).
@@ -46,8 +46,6 @@ class Ambiguities(TrialStudy[xr.Dataset]):
     """Whether to run the ingredients of the paper's simulator instead, with all three laws."""
     curve: bool = False
     """Whether to run skin tolerances and behaviours on loss of contact instead."""
-    targets: tuple[tuple[float, float], ...] = paper.TARGETS
-    """Targets X Y [m], one pair after the other; by default the paper's 24."""
 
     def quick_values(self) -> Mapping[str, Any]:
         """Few targets and readings."""
@@ -63,10 +61,11 @@ class Ambiguities(TrialStudy[xr.Dataset]):
         return readings.curve() if self.curve else known
 
     @property
-    def names(self) -> tuple[str, ...]:
-        """Names of the selected readings, the defaults first."""
-        names = self.readings or tuple(name for name in self.known if name not in self.refused)
-        return names if self.curve else tuple(dict.fromkeys([readings.DEFAULT, *names]))
+    def chosen(self) -> dict[str, Condition]:
+        """Selected readings, the defaults first."""
+        names = self.readings or [name for name in self.known if name not in self.refused]
+        first = [] if self.curve else [readings.DEFAULT]
+        return {name: self.known[name] for name in (*first, *names)}
 
     @property
     def refused(self) -> tuple[str, ...]:
@@ -90,18 +89,9 @@ class Ambiguities(TrialStudy[xr.Dataset]):
         for name in self.grid.laws:
             errors.check_name("law", name, registry.LAWS)
 
-    def num_trials(self) -> int | None:
-        """Number of trials."""
-        return len(self.names) * self.grid.size
-
-    def answer(self, run: Run) -> xr.Dataset:
-        """Run the missing readings."""
-        conditions = {name: self.known[name] for name in self.names}
-        return run_conditions(conditions, self.grid, run.folder, **run.batch_options)
-
     def intro(self, results: xr.Dataset) -> str:
         """Trials, tests and left-out readings."""
-        without = [self.known[name].what for name in self.refused if name not in self.names]
+        without = [self.known[name].what for name in self.refused if name not in self.chosen]
         left_out = (
             f" Left out, because the law refuses it: {', '.join(without)}." if without else ""
         )
@@ -110,21 +100,22 @@ class Ambiguities(TrialStudy[xr.Dataset]):
             f"exact test, false discoveries held at 5 %.{left_out}"
         )
 
-    def report(self, results: xr.Dataset, run: Run) -> Sequence[Section]:
-        """Successes under each reading, the cells of Table II, and the curve over tolerances."""
-        names, laws = self.names, self.grid.laws
-        sections = [
-            Section(f"Readings, {law.upper()}", "", condition_rows(results, names[0], law))
+    def report_tables(self, results: xr.Dataset) -> Sequence[Table]:
+        """Return successes under each reading, the cells of Table II, and the tolerance curve."""
+        names, laws = list(self.chosen), self.grid.laws
+        tables = [
+            Table(condition_rows(results, names[0], law), title=f"Readings, {law.upper()}")
             for law in laws
         ]
         if self.gazebo and "paper_gazebo" in names and set(laws) <= set(paper.LAWS):
-            sections.append(Section("Cells of Table II", "", readings.cells(results)))
+            tables.append(Table(readings.cells(results), title="Cells of Table II"))
         if self.curve and not self.readings and "rps" in laws:
             curve = readings.by_tolerance(results, readings.TOLERANCES)
             trials = self.grid.size // len(PAPER_OBJECTS)
             picture = Picture("tolerance", partial(tolerance_curve, curve, trials))
-            sections.append(Section("Success over the skin's tolerance", "", (), picture))
-        return sections
+            title = "Success over the skin's tolerance"
+            tables.append(Table((), title=title, picture=picture))
+        return tables
 
 
 ambiguities = call_of(Ambiguities)

@@ -11,25 +11,21 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import xarray as xr
 
-from rps_jax import errors
 from rps_jax.analysis import statistics
-from rps_jax.analysis.report import Section
 from rps_jax.control import registry
 from rps_jax.control.registry import LawLike
 from rps_jax.record.options import option
-from rps_jax.runs import execution
 from rps_jax.runs.plan import Plan
 from rps_jax.runs.question import Run, call_of
-from rps_jax.trials.progress import SequentialProgress
 from rps_jax.trials.setting import Setting
 from rps_jax.world import domain as domains
 from rps_jax.world.domain import DomainLike, Range
 from rps_jax.world.physics import preset
-from sweeps.study_base import TrialStudy
+from sweeps.study_base import Rows, Table, TrialStudy, run_plans
 
 _CONVERGED = Setting(physics=preset(fidelity="reference"), engine="mujoco")
 
@@ -67,11 +63,12 @@ class Engines(TrialStudy[xr.DataTree]):
     """
 
     TITLE: ClassVar[str] = "Do the engines agree in random worlds?"
-    QUICK: ClassVar[Mapping[str, Any]] = {
+    QUICK: ClassVar[Mapping[str, object]] = {
         "worlds": 16,
         "objects": ("random_cylinder",),
         "engines": ("C, standard", "fused, standard"),
     }
+    CHOICES: ClassVar = {"engines": ENGINES}
     GROWS: ClassVar[tuple[str, ...]] = ("engines",)
 
     law: LawLike = "rps"
@@ -97,13 +94,10 @@ class Engines(TrialStudy[xr.DataTree]):
         label, params = registry.resolve_law(self.law)
         low, high, log = ranges.gap
         moved = replace(ranges, gap=Range(low + _MOVED, high + _MOVED, log))
+        plan = Plan(ranges, self.worlds, {label: params}, _CONVERGED, self.part)
         return {
-            name: Plan(
-                moved if name.endswith("moved") else ranges,
-                self.worlds,
-                {label: params},
-                ENGINES[name],
-                self.part,
+            name: replace(
+                plan, domain=moved if name.endswith("moved") else ranges, setting=ENGINES[name]
             )
             for name in self.engines or ENGINES
         }
@@ -111,8 +105,6 @@ class Engines(TrialStudy[xr.DataTree]):
     def check(self) -> None:
         """Check the names, and that the engines can step these worlds here."""
         super().check()
-        for name in self.engines:
-            errors.check_name("engines", name, ENGINES)
         for plan in self.plans.values():
             plan.check_here()
 
@@ -122,29 +114,24 @@ class Engines(TrialStudy[xr.DataTree]):
 
     def answer(self, run: Run) -> xr.DataTree:
         """Run the missing trials of each engine."""
-        progress, results = SequentialProgress(run.callback), {}
-        shape = run._replace(callback=progress).batch_options
-        for name, plan in self.plans.items():
-            folder = None if run.folder is None else run.folder / name.replace(", ", "_")
-            results[name] = execution.run_plan(plan, folder, **shape).isel(law=0)
-            progress.finish(plan.num_trials)
-        return xr.DataTree.from_dict(results)
+        results = run_plans(run, self.plans)
+        return xr.DataTree.from_dict({name: part.isel(law=0) for name, part in results.items()})
 
     def intro(self, results: xr.DataTree) -> str:
         """Describe the worlds."""
         return f"{self.worlds} worlds, equal in all engines. Intervals: Wilson 95 %."
 
-    def report(self, results: xr.DataTree, run: Run) -> Sequence[Section]:
-        """Outcomes equal to those of the first engine."""
+    def report_tables(self, results: xr.DataTree) -> Sequence[Table]:
+        """Return the outcomes equal to those of the first engine."""
         by_engine = {name: results[name].to_dataset() for name in self.plans}
-        return [Section("Equal outcomes", "", agreement_table(by_engine))]
+        return [Table(agreement_table(by_engine), title="Equal outcomes")]
 
 
 engines = call_of(Engines)
 
 
-def agreement_table(results: Mapping[str, xr.Dataset]) -> list[list[str]]:
-    """Header and one row for each engine: success, and outcomes equal to the first's, by object.
+def agreement_table(results: Mapping[str, xr.Dataset]) -> Rows:
+    """Return a header and a row per engine: success, and outcomes equal to the first's, by object.
 
     The results are those of one law in the same worlds.
     """
@@ -156,14 +143,11 @@ def agreement_table(results: Mapping[str, xr.Dataset]) -> list[list[str]]:
         same = succeeded == (base.success.values > 0)
         c = statistics.compare(base.success, dataset.success)
         low, high = c.equal_interval
-        rows.append(
-            [
-                name,
-                *(f"{succeeded[mask].sum()} of {mask.sum()}" for mask in groups.values()),
-                f"{100 * c.equal:.1f} %",
-                f"{100 * low:.0f}-{100 * high:.0f} %",
-                *(f"{same[mask].sum()} of {mask.sum()}" for mask in groups.values()),
-                f"+{c.gained} -{c.lost}",
-            ]
+        counts, equal = (
+            [f"{mask[group].sum()} of {group.sum()}" for group in groups.values()]
+            for mask in (succeeded, same)
         )
+        interval = f"{100 * low:.0f}-{100 * high:.0f} %"
+        difference = f"+{c.gained} -{c.lost}"
+        rows.append([name, *counts, f"{100 * c.equal:.1f} %", interval, *equal, difference])
     return rows

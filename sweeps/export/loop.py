@@ -48,14 +48,14 @@ def in_the_loop(name: str, folder: Path) -> Any:
     law, native = registry.law_of(params), Native(program.program(name), folder, "float")
 
     def call_native(state: Any, obs: Any) -> Any:
-        shape = np.shape(jax.tree.leaves(obs)[0])[:-1]
-        count, filled = int(np.prod(shape)), native.filled
-        flat = [
+        shape = np.shape(obs[0])[:-1]
+        count = int(np.prod(shape))
+        flat_state, flat_obs = (
             [np.asarray(x).reshape(count, *np.shape(x)[len(shape) :]) for x in group]
             for group in (state, obs)
-        ]
-        native_state = filled("memory", flat[0], count)
-        twist, _ = native.step(native_state, filled("observation", flat[1], count))
+        )
+        native_state = native.filled("memory", flat_state, count)
+        twist, _ = native.step(native_state, native.filled("observation", flat_obs, count))
         next_state = [
             np.asarray(native_state[f.name]).reshape(np.shape(x)).astype(x.dtype) if f.size else x
             for f, x in zip(native.program.groups["memory"], state, strict=True)
@@ -63,18 +63,17 @@ def in_the_loop(name: str, folder: Path) -> Any:
         return next_state, twist.reshape(*shape, 3)
 
     def step(_: Any, state: Any, obs: Any) -> Any:
-        tree = jax.tree.structure(state)
-        shapes = [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in jax.tree.leaves(state)]
-        out = (shapes, jax.ShapeDtypeStruct((3,), np.float32))
-        next_state, twist = jax.pure_callback(
-            call_native, out, jax.tree.leaves(state), jax.tree.leaves(obs),
-            vmap_method="broadcast_all",
-        )  # fmt: skip
-        return (
-            jax.tree.unflatten(tree, next_state),
-            Twist(*twist),
-            Details.from_obs(getattr(obs, "touch", obs)),
+        leaves, tree = jax.tree.flatten(state)
+        shapes = [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in leaves]
+        out, inputs = (
+            (shapes, jax.ShapeDtypeStruct((3,), np.float32)),
+            (leaves, jax.tree.leaves(obs)),
         )
+        next_state, twist = jax.pure_callback(
+            call_native, out, *inputs, vmap_method="broadcast_all"
+        )
+        details = Details.from_obs(getattr(obs, "touch", obs))
+        return jax.tree.unflatten(tree, next_state), Twist(*twist), details
 
     return _registered(f"{identifier(label)}_in_c", law, step, params)
 
@@ -117,16 +116,14 @@ def _compare(name: str, folder: Path, run: Any, roundings: Sequence[int]) -> Out
     """Return the outcomes of `run`, a function of the parameters of a law."""
     laws = [registry.resolve_law(name)[1], in_the_loop(name, folder)]
     outcomes = [run(p) for p in [*laws, *(nudged(name, n) for n in roundings)]]
-    succeeded = [np.asarray(outcome.success).astype(bool).ravel() for outcome in outcomes]
+    succeeded = np.array([np.asarray(outcome.success).ravel() for outcome in outcomes], bool)
     times = [np.asarray(outcome.time).ravel() for outcome in outcomes[:2]]
-    both_succeeded = succeeded[0] & succeeded[1]
-    difference = np.abs(times[0] - times[1])[both_succeeded]
-    counts = [int(outcome.sum()) for outcome in succeeded]
-    alike = [int((succeeded[0] == outcome).sum()) for outcome in succeeded]
-    quantile = float(np.quantile(difference, 0.99)) if both_succeeded.any() else 0.0
-    return Outcomes(
-        succeeded[0].size, counts[0], counts[1], min(counts[2:]), alike[1], min(alike[2:]), quantile
-    )
+    both = succeeded[0] & succeeded[1]
+    apart = float(np.quantile(np.abs(times[0] - times[1])[both], 0.99)) if both.any() else 0.0
+    in_jax, in_c, *nudged_counts = map(int, succeeded.sum(axis=1))
+    _, alike, *nudged_alike = map(int, (succeeded == succeeded[0]).sum(axis=1))
+    trials = succeeded.shape[1]
+    return Outcomes(trials, in_jax, in_c, min(nudged_counts), alike, min(nudged_alike), apart)
 
 
 def papers_trials(name: str, setting: Setting, folder: Path) -> Outcomes:

@@ -17,7 +17,8 @@ import re
 import shutil
 import subprocess
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -32,34 +33,39 @@ from rps_jax.control.base import Law
 from rps_jax.lowering.routine import Group
 
 Precision = Literal["float", "double"]
+Result = tuple[np.ndarray, np.ndarray]  # twists (n, 3) and memories (n,) of steps
 Form = Literal["float", "double", "onnx"]  # C in either precision, or ONNX in float
 REAL: dict[str, Any] = {"float": np.float32, "double": np.float64, "onnx": np.float32}
 TOLERANCE = {"float": 1e-6, "double": 1e-12, "onnx": 1e-6}
-FLAGS = ("-std=c99", "-O2", "-Wall", "-Wextra", "-Werror", "-pedantic", "-fPIC", "-shared")
+STRICT = ("-Wall", "-Wextra", "-Werror", "-pedantic")
 STEPS = 100  # number of steps of each world
 JUMP = 1e-3  # [1] larger differences are flips
 
 DRIVER = """
-#include "{p}.h"
-void begin(int n, const {p}_params *params, {p}_memory *memory);
-void steps(int n, const {p}_params *params, {p}_memory *memory, const {p}_observation *seen,
-           {p}_twist *twist, int *code);
-void touches(int n, {p}_skin *skin, const {p}_real *taxels, const {p}_real *period,
-             {p}_contact *contact, int *code);
-void begin(int n, const {p}_params *params, {p}_memory *memory) {{
-  for (int i = 0; i < n; i++) {p}_init(params, memory + i);
-}}
-void steps(int n, const {p}_params *params, {p}_memory *memory, const {p}_observation *seen,
-           {p}_twist *twist, int *code) {{
-  for (int i = 0; i < n; i++) code[i] = {p}_step(params, memory + i, seen + i, twist + i);
-}}
-void touches(int n, {p}_skin *skin, const {p}_real *taxels, const {p}_real *period,
-             {p}_contact *contact, int *code) {{
-  const {p}_skin_params params = {P}_SKIN_PARAMS;
+#include "law.h"
+void begin(int n, const law_params *params, law_memory *memory) {
+  for (int i = 0; i < n; i++) law_init(params, memory + i);
+}
+void steps(int n, const law_params *params, law_memory *memory, const law_observation *obs,
+           law_twist *twist, int *code) {
+  for (int i = 0; i < n; i++) code[i] = law_step(params, memory + i, obs + i, twist + i);
+}
+void touches(int n, law_skin *skin, const law_real *taxels, const law_real *period,
+             law_contact *contact, int *code) {
+  const law_skin_params params = LAW_SKIN_PARAMS;
   for (int i = 0; i < n; i++)
-    code[i] = {p}_skin_step(&params, skin + i, taxels + i * {P}_TAXELS, period[i], contact + i);
-}}
+    code[i] = law_skin_step(&params, skin + i, taxels + i * LAW_TAXELS, period[i], contact + i);
+}
 """
+
+
+def compiled(compiler: str, source: Path, precision: Precision, *flags: str) -> Path:
+    """Compile a C file next to it, and return the binary."""
+    binary = source.with_suffix(".so")
+    double = ["-DLAW_DOUBLE"] if precision == "double" else []
+    words = [compiler, "-std=c99", *flags, *double, str(source), "-lm", "-o", str(binary)]
+    subprocess.run(words, check=True)
+    return binary
 
 
 class Structs:
@@ -96,14 +102,11 @@ class Native(Structs):
     def __init__(self, exported: Program, path: Path, precision: Precision, compiler: str = "gcc"):
         """Compile the law in a folder."""
         super().__init__(exported, precision)
-        p = "law"
         folder = Path(tempfile.mkdtemp(dir=path))  # a library is loaded once from one path
-        (folder / "law.h").write_text(c.header(exported, p))
-        (folder / "driver.c").write_text(DRIVER.format(p=p, P=p.upper()))
-        library = folder / f"{compiler}_{precision}.so"
-        double = ["-DLAW_DOUBLE"] if precision == "double" else []
-        command = [compiler, *FLAGS, *double, str(folder / "driver.c"), "-lm", "-o", str(library)]
-        subprocess.run(command, check=True)
+        (folder / "law.h").write_text(c.header(exported, "law"))
+        driver = folder / "driver.c"
+        driver.write_text(DRIVER)
+        library = compiled(compiler, driver, precision, "-O2", *STRICT, "-fPIC", "-shared")
         self._library = ctypes.CDLL(str(library))
         self.params = self.struct("params", 1)
         for field in exported.groups["params"]:
@@ -147,9 +150,8 @@ class Onnx(Structs):
         model = onnx_model.models(exported, "law", count)["law.onnx"]
         assert isinstance(model, bytes)
         self.session = onnxruntime.InferenceSession(model, providers=["CPUExecutionProvider"])
-        self.about = {
-            entry.key: entry.value for entry in onnx.load_from_string(model).metadata_props
-        }
+        metadata = onnx.load_from_string(model).metadata_props
+        self.about = {entry.key: entry.value for entry in metadata}
         types = {"tensor(float)": np.float32, "tensor(bool)": np.bool_, "tensor(int32)": np.int32}
         self._types = {entry.name: types[entry.type] for entry in self.session.get_inputs()}
         self._names = [entry.name for entry in self.session.get_outputs()]
@@ -250,26 +252,40 @@ def agreement(name: str, form: Form, inputs: int, path: Path, seed: int = 0) -> 
                 )
                 if code.any():
                     raise AssertionError(f"{name}: codes {np.unique(code)}")
-                jax_twist = np.stack(jax.tree.leaves(twist), -1)
-                error = (np.abs(native_twist - jax_twist) / scale).max(-1)
-                error = np.maximum(
-                    error,
-                    _distance(native_memory, native.filled("memory", next_memory, worlds)),
-                )
+                result = _result(native, next_memory, twist)
+                error = _difference((native_twist, native_memory), result, scale)
                 spread = np.zeros(worlds)
                 if exact is not None:
                     exact_twist = exact(memory, leaves)
-                    spread = (np.abs(exact_twist - jax_twist) / scale).max(-1)
+                    spread = (np.abs(exact_twist - result[0]) / scale).max(-1)
                     off = (np.abs(exact_twist - native_twist) / scale).max(-1) > TOLERANCE[form]
                     tally = tally._replace(
                         off=tally.off + int(off.sum()),
                         off_in_jax=tally.off_in_jax + int((spread > TOLERANCE[form]).sum()),
                     )
-                tally = _classify(
-                    tally, error, native, step, memory, leaves, jax_twist, scale, rng, spread
-                )
+
+                def moved(inputs: Any = (memory, leaves), result: Result = result) -> np.ndarray:
+                    """Return the change of JAX's result after a rounding of its inputs."""
+                    rounded = jax.tree.map(partial(_rounded, rng), inputs)
+                    return _difference(result, _result(native, *step(*rounded)), scale)
+
+                tally = _classify(tally, error, spread, moved)
                 memory = next_memory
     return tally
+
+
+def _result(structs: Structs, memory: Any, twist: Any) -> Result:
+    """Return twists (n, 3) and memories as structs from results of JAX."""
+    twists = np.stack(jax.device_get(jax.tree.leaves(twist)), -1)
+    return twists, structs.filled("memory", memory, len(twists))
+
+
+def _rounded(rng: np.random.Generator, x: Any) -> np.ndarray:
+    """Return an input with relative changes of a few roundings."""
+    x = np.asarray(x)
+    if x.dtype.kind != "f":
+        return x
+    return (x * (1 + 4 * np.finfo(x.dtype).eps * rng.uniform(-1, 1, x.shape))).astype(x.dtype)
 
 
 def _exact(law: Any, params: Any, obs_tree: Any) -> Any:
@@ -292,44 +308,29 @@ def _exact(law: Any, params: Any, obs_tree: Any) -> Any:
 
 
 def _classify(
-    tally: Agreement, error: np.ndarray, native: Structs, step: Any, memory: Any, leaves: Any,
-    jax_twist: np.ndarray, scale: np.ndarray, rng: np.random.Generator, spread: np.ndarray,
-) -> Agreement:  # fmt: skip
-    """Return the tally after one batch with error `spread` of JAX."""
+    tally: Agreement, error: np.ndarray, spread: np.ndarray, moved: Callable[[], np.ndarray]
+) -> Agreement:
+    """Return the tally after a batch with errors (n,), of which JAX itself has a `spread` (n,)."""
     beyond = error > TOLERANCE[tally.form]
-    tally = tally._replace(
-        inputs=tally.inputs + error.size,
-        greatest=max(tally.greatest, float(error.max(initial=0))),
-        beyond=tally.beyond + int(beyond.sum()),
-    )
-    rounding = 4 * np.finfo(native.real).eps
-
-    def perturb(x: Any) -> Any:
-        x = np.asarray(x)
-        if x.dtype.kind != "f":
-            return x
-        return (x * (1 + rounding * rng.uniform(-1, 1, x.shape))).astype(x.dtype)
-
-    jax_memory = None
     for _ in range(40):
         if not (beyond & (error > 4 * spread)).any():
             break
-        if jax_memory is None:
-            jax_memory = native.filled("memory", step(memory, leaves)[0], error.size)
-        moved_memory, twist = jax.device_get(step(*jax.tree.map(perturb, (memory, leaves))))
-        difference = (np.abs(np.stack(jax.tree.leaves(twist), -1) - jax_twist) / scale).max(-1)
-        difference = np.maximum(
-            difference,
-            _distance(jax_memory, native.filled("memory", moved_memory, error.size)),
-        )
-        spread = np.maximum(spread, difference)
+        spread = np.maximum(spread, moved())
     explained = beyond & (error <= 4 * spread)
     flips = explained & (error > JUMP)
     return tally._replace(
+        inputs=tally.inputs + error.size,
+        greatest=max(tally.greatest, float(error.max(initial=0))),
+        beyond=tally.beyond + int(beyond.sum()),
         flips=tally.flips + int(flips.sum()),
         ill=tally.ill + int((explained & ~flips).sum()),
         unexplained=tally.unexplained + int((beyond & ~explained).sum()),
     )
+
+
+def _difference(a: Result, b: Result, scale: np.ndarray) -> np.ndarray:
+    """Return the largest difference (n,) of two results, twists (n, 3) and memories (n,)."""
+    return np.maximum((np.abs(a[0] - b[0]) / scale).max(-1), _distance(a[1], b[1]))
 
 
 def _distance(a: np.ndarray, b: np.ndarray) -> np.ndarray:
@@ -351,8 +352,8 @@ def scale_of(params: Any) -> np.ndarray:
 class TrialErrors(NamedTuple):
     """Errors (T,) of the twists over whole trials, by trial."""
 
-    own: list[np.ndarray]  # each law keeps its memory from the first to the last step
-    told: list[np.ndarray]  # C or ONNX gets the memory of JAX before each step
+    free: list[np.ndarray]  # each law has its own state from the first to the last step
+    synchronised: list[np.ndarray]  # C or ONNX gets the state of JAX before each step
     in_jax: list[np.ndarray]  # JAX in float32 compared with JAX in float64
 
 
@@ -360,18 +361,15 @@ def trial_errors(name: str, form: Form, trials: Sequence[Any], path: Path) -> Tr
     """Return errors of the twists over whole trials, with observations of `loop.recorded`."""
     law_params = registry.resolve_law(name)[1]
     law, exported, real = registry.law_of(law_params), program.program(name), REAL[form]
-    native, longest = (
-        build_law(form, exported, path, len(trials)),
-        max(len(trial[0]) for trial in trials),
-    )
+    native = build_law(form, exported, path, len(trials))
+    longest = max(len(trial[0]) for trial in trials)
     fields, scale = exported.groups["observation"], scale_of(law_params)
 
     def padded(leaves: Any) -> list[np.ndarray]:
         """Return leaves (longest, ...), padded with the last row."""
         rows = np.minimum(np.arange(longest), len(leaves[0]) - 1)
-        kinds = [real if trial.kind == "f" else np.asarray(x).dtype
-                 for trial, x in zip(fields, leaves, strict=True)]  # fmt: skip
-        return [np.asarray(x)[rows].astype(kind) for x, kind in zip(leaves, kinds, strict=True)]
+        padded = [np.asarray(leaf)[rows] for leaf in leaves]
+        return [x.astype(real) if f.kind == "f" else x for f, x in zip(fields, padded, strict=True)]
 
     obs = [np.stack(columns, 1) for columns in zip(*map(padded, trials), strict=True)]
     memories, jax_twists = _in_jax(law, law_params, obs, real)
@@ -387,9 +385,8 @@ def trial_errors(name: str, form: Form, trials: Sequence[Any], path: Path) -> Tr
         error = (np.abs(np.asarray(twists) - reference) / scale).max(-1)
         return [error[: len(trial[0]), i] for i, trial in enumerate(trials)]
 
-    return TrialErrors(
-        errors(free, jax_twists), errors(synchronised, jax_twists), errors(jax_twists, exact)
-    )
+    pairs = (free, jax_twists), (synchronised, jax_twists), (jax_twists, exact)
+    return TrialErrors(*(errors(*pair) for pair in pairs))
 
 
 def _in_jax(law: Law, params: Any, obs: Sequence[Any], real: Any) -> tuple[list[Any], np.ndarray]:
@@ -421,9 +418,7 @@ def latency(name: str, precision: Precision, path: Path, runs: int = 5) -> np.nd
     exported, build = program.program(name), Path(tempfile.mkdtemp(dir=path))
     for file, text in folder.files(exported, "law").items():
         (build / file).write_text(text, encoding="utf-8")
-    double = ["-DLAW_DOUBLE"] if precision == "double" else []
-    source, binary = str(build / "main.c"), str(build / "main")
-    subprocess.run(["gcc", "-std=c99", "-O2", *double, source, "-lm", "-o", binary], check=True)
+    binary = compiled("gcc", build / "main.c", precision, "-O2")
     one_core = ["taskset", "-c", str(max(os.sched_getaffinity(0)))] * bool(shutil.which("taskset"))
     times = []
     for _ in range(runs):
@@ -454,20 +449,20 @@ int main(void) {
   law_init(&params, &memory);
   law_skin_init(&skin);
   for (int i = 0; i < INPUTS; i++) {
-    law_observation seen;
+    law_observation obs;
     law_twist twist;
     law_contact contact;
-    law_real taxels[LAW_TAXELS], numbers[sizeof seen / sizeof(law_real)];
+    law_real taxels[LAW_TAXELS], numbers[sizeof obs / sizeof(law_real)];
     law_memory before = memory;
     int bad = 0;
     for (unsigned k = 0; k < sizeof numbers / sizeof numbers[0]; k++) numbers[k] = odd();
-    memcpy(&seen, numbers, sizeof numbers); /* flags of any bits, too */
-    int code = law_step(&params, &memory, &seen, &twist);
+    memcpy(&obs, numbers, sizeof numbers); /* flags of any bits, too */
+    int code = law_step(&params, &memory, &obs, &twist);
     codes[code]++;
     if (!isfinite(twist.v_x) || !isfinite(twist.v_y) || !isfinite(twist.omega)) return 2;
     if (code && (twist.v_x != 0 || twist.v_y != 0 || twist.omega != 0)) return 3;
     if (code && memcmp(&before, &memory, sizeof memory)) return 4;
-    if (!isfinite(seen.yaw) && code != LAW_BAD_INPUT) return 5;
+    if (!isfinite(obs.yaw) && code != LAW_BAD_INPUT) return 5;
     if (rand() % 50 == 0) memset(&memory, rand() % 256, sizeof memory);
     for (int k = 0; k < LAW_TAXELS; k++) bad |= !isfinite(taxels[k] = rand() % 20 ? 1 : odd());
     law_real period = rand() % 9 ? (law_real)0.01 : odd();
@@ -500,11 +495,8 @@ def fuzzed(
     build = Path(tempfile.mkdtemp(dir=path))
     (build / "law.h").write_text(c.header(exported, "law"))
     (build / "fuzz.c").write_text(FUZZ)
-    double = ["-DLAW_DOUBLE"] if precision == "double" else []
-    source, binary = str(build / "fuzz.c"), str(build / "fuzz")
-    strict = [flag for flag in FLAGS if flag not in ("-O2", "-fPIC", "-shared")]
-    options = [*strict, *SANE, *double, f"-DINPUTS={inputs}"]
-    subprocess.run([compiler, *options, source, "-lm", "-o", binary], check=True)
+    options = (*STRICT, *SANE, f"-DINPUTS={inputs}")
+    binary = compiled(compiler, build / "fuzz.c", precision, *options)
     process = subprocess.run([binary], capture_output=True, text=True)
     codes = [int(x) for x in process.stdout.split()] or [0, 0, 0]
     return Fuzzed(process.returncode, codes[0], codes[1], codes[2], process.stderr)

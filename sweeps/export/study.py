@@ -12,9 +12,11 @@ from __future__ import annotations
 import os
 import shutil
 import tempfile
-from collections.abc import Callable, Mapping, Sequence
+from collections import namedtuple
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
+from itertools import product
 from pathlib import Path
 from typing import Any, ClassVar, Literal
 
@@ -22,19 +24,17 @@ import jax
 import numpy as np
 import xarray as xr
 
-from rps_jax.analysis.report import Section
 from rps_jax.app.export import program
 from rps_jax.control.learned import policy
 from rps_jax.errors import InputError
 from rps_jax.record.options import option
 from rps_jax.runs.question import Run, call_of
 from rps_jax.trials.case import Case
-from rps_jax.trials.progress import Progress
 from rps_jax.trials.setting import Setting
 from rps_jax.world import paper
 from rps_jax.world.objects import PAPER_OBJECTS
 from sweeps.export import loop, native
-from sweeps.study_base import Study, Table
+from sweeps.study_base import Study, Table, records, run_parts, text_table
 
 TableName = Literal["inputs", "trials", "paper", "worlds", "bags", "odd", "speed"]
 _TABLES: tuple[TableName, ...] = ("speed", "inputs", "trials", "paper", "worlds", "bags", "odd")
@@ -43,13 +43,16 @@ _PRECISIONS: tuple[native.Precision, ...] = ("double", "float")
 _WORDS = {"double": "C, double", "float": "C, float", "onnx": "ONNX, float"}
 
 
+_Trials = namedtuple("_Trials", "trials steps greatest told beyond parted in_jax")
+
+
 @dataclass(frozen=True)
 class Export(Study[xr.Dataset]):
     """Compare exported laws with those in JAX, and time them."""
 
     TITLE: ClassVar[str] = "Laws in C and ONNX beside those in JAX"
     GROWS: ClassVar[tuple[str, ...]] = ("laws", "tables", "in_worlds")
-    QUICK: ClassVar[Mapping[str, Any]] = {
+    QUICK: ClassVar[Mapping[str, object]] = {
         "laws": ("rps_plus",),
         **{"inputs": 20_000, "states": 20_000, "worlds": 4, "bags": 1},
     }
@@ -83,21 +86,14 @@ class Export(Study[xr.Dataset]):
 
     def answer(self, run: Run) -> xr.Dataset:
         """Compute the tables that are missing, law by law."""
-        by_table: list[xr.Dataset] = []
+        by_table = []
         for table in self.tables:
             compute = getattr(self, f"_{table}")
-            rows = []
-            laws = [x for x in self.laws if table != "worlds" or x in self.in_worlds]
-            for law in laws:
-                rows.append(run.checkpoint(f"{table}-{law}", partial(self._compute, compute, law)))
-                run.callback(Progress(len(rows), 0.0))
-            if rows:
-                joined = xr.concat(rows, "law")
-                assert isinstance(joined, xr.Dataset)
-                by_table.append(joined.assign_coords(law=laws))
-        results = xr.merge(by_table, join="outer").reindex(law=list(self.laws))
-        assert isinstance(results, xr.Dataset)
-        return results
+            laws = [law for law in self.laws if table != "worlds" or law in self.in_worlds]
+            parts = {f"{table}-{law}": partial(self._compute, compute, law) for law in laws}
+            if parts:
+                by_table.append(run_parts(run, "law", parts).assign_coords(law=laws))
+        return xr.merge(by_table, join="outer").reindex(law=list(self.laws))
 
     def _compute(self, compute: Callable[[str, Path], xr.Dataset], law: str) -> xr.Dataset:
         with tempfile.TemporaryDirectory() as folder:
@@ -108,12 +104,11 @@ class Export(Study[xr.Dataset]):
     # --- the tables of one law ---
 
     def _inputs(self, law: str, folder: Path) -> xr.Dataset:
-        rows = []
-        for form in _FORMS:
-            is_slow = form == "onnx" or law in policy.SHIPPED
-            rows.append(
-                native.agreement(law, form, self.states if is_slow else self.inputs, folder)
-            )
+        counts = {
+            form: self.states if form == "onnx" or law in policy.SHIPPED else self.inputs
+            for form in _FORMS
+        }
+        rows = [native.agreement(law, form, count, folder) for form, count in counts.items()]
         return _columns("inputs", rows, "form", _FORMS, but=("law", "form"))
 
     def _trials(self, law: str, folder: Path) -> xr.Dataset:
@@ -124,19 +119,14 @@ class Export(Study[xr.Dataset]):
         trials = [trial for group in cases for trial in loop.recorded(group, Setting("fused"))]
         rows = []
         for form in _FORMS:
-            errors = native.trial_errors(law, form, trials, folder)
-            free, synchronised, in_jax = map(np.concatenate, errors)
-            rows.append(
-                (len(trials), free.size, free.max(), synchronised.max(),
-                 (free > native.TOLERANCE[form]).sum(), (free > native.JUMP).sum(),
-                 (in_jax > native.JUMP).sum())
-            )  # fmt: skip
-        names = ("trials", "steps", "greatest", "told", "beyond", "parted", "in_jax")
-        columns = zip(names, np.transpose(rows), strict=True)
-        return xr.Dataset(
-            {f"trials_{name}": ("form", values) for name, values in columns},
-            {"form": list(_FORMS)},
-        )
+            errors = map(np.concatenate, native.trial_errors(law, form, trials, folder))
+            free, synchronised, in_jax = errors
+            parted = [(x > native.JUMP).sum() for x in (free, in_jax)]
+            beyond = (free > native.TOLERANCE[form]).sum()
+            rows.append(_Trials(
+                len(trials), free.size, free.max(), synchronised.max(), beyond, *parted
+            ))  # fmt: skip
+        return _columns("trials", rows, "form", _FORMS)
 
     def _paper(self, law: str, folder: Path) -> xr.Dataset:
         return _columns("paper", [loop.papers_trials(law, Setting("fused"), folder)])
@@ -162,24 +152,18 @@ class Export(Study[xr.Dataset]):
 
     def _speed(self, law: str, folder: Path) -> xr.Dataset:
         times = [native.latency(law, precision, folder) for precision in _PRECISIONS]
-        return xr.Dataset(
-            {
-                "speed_latency": (("precision", "of", "share"), times, {"units": "us"}),
-                "speed_load": os.getloadavg()[0],
-            },
-            {"precision": list(_PRECISIONS), "share": [0.5, 0.999]},
-        )
+        latency = ("precision", "of", "share"), times, {"units": "us"}
+        coords = {"precision": list(_PRECISIONS), "share": [0.5, 0.999]}
+        return xr.Dataset({"speed_latency": latency, "speed_load": os.getloadavg()[0]}, coords)
 
-    def published_tables(self, results: xr.Dataset) -> Mapping[str, Table]:
+    def report_tables(self, results: xr.Dataset) -> Sequence[Table]:
         """Return all tables."""
-        return {
-            f"export_{name}": Table(rows, note)
-            for name, (_, note, rows) in tables(results, self).items()
-        }
-
-    def report(self, results: Any, run: Run) -> Sequence[Section]:
-        """Return one section per table."""
-        return [Section(title, note, rows) for title, note, rows in tables(results, self).values()]
+        functions = {
+            "speed": _speed_table, "inputs": _input_table, "trials": _trial_table,
+            "paper": _paper_table, "worlds": partial(_world_table, self.domain),
+            "bags": partial(_bag_table, self.domain), "odd": _odd_table,
+        }  # fmt: skip
+        return [functions[name](results)._replace(name=f"export_{name}") for name in self.tables]
 
 
 export = call_of(Export)
@@ -199,135 +183,125 @@ def _columns(
     )
 
 
-def _share(part: Any, whole: Any) -> str:
+def _share(part: float, whole: float) -> str:
     """Format a count as a share, with two significant digits."""
-    part, whole = int(part), int(whole)
-    return "0" if part == 0 else f"{100 * part / whole:.2g} %"
+    return f"{100 * part / whole:.2g} %" if part else "0"
 
 
-def tables(results: xr.Dataset, study: Export) -> dict[str, tuple[str, str, list[list[str]]]]:
-    """Return title, note, header and rows of each table, by name."""
-    functions = {
-        "speed": _speed_rows, "inputs": _input_rows, "trials": _trial_rows, "paper": _paper_rows,
-        "worlds": partial(_world_rows, study.domain), "bags": partial(_bag_rows, study.domain),
-        "odd": _odd_rows,
-    }  # fmt: skip
-    return {name: functions[name](results) for name in study.tables}
-
-
-def _rows_of(results: xr.Dataset, table: TableName, dim: str) -> list[tuple[str, str, Any]]:
-    """Return law, coordinate along `dim` and values of each row of a table."""
+def _records(results: xr.Dataset, table: TableName, *dims: str) -> Iterator[dict[str, Any]]:
+    """Yield the values of a table for each law and index of some dimensions."""
     prefix = f"{table}_"
-    selected = results[[name for name in map(str, results) if name.startswith(prefix)]]
-    selected = selected.rename({name: str(name).removeprefix(prefix) for name in selected})
-    return [
-        (str(law), str(name), selected.sel({"law": law, dim: name}))
-        for law in results.law.values
-        for name in results[dim].values
-    ]
+    names = {x: x.removeprefix(prefix) for x in map(str, results) if x.startswith(prefix)}
+    selected = results[list(names)].rename(names)
+    yield from records(selected.dropna("law", how="all"), "law", *dims)
 
 
-def _input_rows(results: xr.Dataset) -> tuple[str, str, list[list[str]]]:
+def _input_table(results: xr.Dataset) -> Table:
     rows = [
         ["law", "form", "inputs", "greatest difference", "beyond the goal", "flips", "unexplained",
          "beyond 1e-6 of float64", "JAX's float32 is"],
     ]  # fmt: skip
-    for law, form, row in _rows_of(results, "inputs", "form"):
-        shares = ["", ""] if form == "double" else [_share(row.off, row.inputs),
-                                                  _share(row.off_in_jax, row.inputs)]  # fmt: skip
-        rows.append(
-            [law, _WORDS[form], f"{int(row.inputs):,}", f"{float(row.greatest):.1e}",
-             _share(row.beyond, row.inputs), f"{int(row.flips)}", f"{int(row.unexplained)}",
-             *shares]
-        )  # fmt: skip
+    for row in _records(results, "inputs", "form"):
+        beyond, *in_float = (
+            _share(row[name], row["inputs"]) for name in ("beyond", "off", "off_in_jax")
+        )
+        rows.append([
+            row["law"], _WORDS[row["form"]], f"{row['inputs']:,.0f}", f"{row['greatest']:.1e}",
+            beyond, f"{row['flips']:.0f}", f"{row['unexplained']:.0f}",
+            *(in_float if row["form"] != "double" else ["", ""]),
+        ])  # fmt: skip
     note = (
         "The goal is 1e-12 in double and 1e-6 in float. Differences are shares of the greatest "
         "speed and turning rate, or of the memory."
     )
-    return "Chance inputs", note, rows
+    return Table(rows, note, title="Random inputs")
 
 
-def _trial_rows(results: xr.Dataset) -> tuple[str, str, list[list[str]]]:
+def _trial_table(results: xr.Dataset) -> Table:
     rows = [["law", "form", "steps", "greatest difference", "from JAX's memory",
              "steps beyond the goal", "beyond 1e-3", "JAX's float32 is"]]  # fmt: skip
-    for law, form, row in _rows_of(results, "trials", "form"):
-        in_jax = "" if form == "double" else _share(row.in_jax, row.steps)
-        rows.append(
-            [law, _WORDS[form], f"{int(row.steps):,}", f"{float(row.greatest):.1e}",
-             f"{float(row.told):.1e}", _share(row.beyond, row.steps),
-             _share(row.parted, row.steps), in_jax]
-        )  # fmt: skip
+    for row in _records(results, "trials", "form"):
+        *shares, in_jax = (
+            _share(row[name], row["steps"]) for name in ("beyond", "parted", "in_jax")
+        )
+        rows.append([
+            row["law"], _WORDS[row["form"]], f"{row['steps']:,.0f}", f"{row['greatest']:.1e}",
+            f"{row['told']:.1e}", *shares, in_jax if row["form"] != "double" else "",
+        ])  # fmt: skip
     note = (
         f"{int(results.trials_trials.max())} trials of each law. Each law remembers by itself from "
         "the first step to the last; from JAX's memory, it is given that before each step. JAX's "
         "float32 is compared with JAX's float64."
     )
-    return "Whole trials", note, rows
+    return Table(rows, note, title="Whole trials")
 
 
-def _end_rows(results: xr.Dataset, table: TableName) -> list[list[str]]:
-    rows = [["law", "succeed with JAX", "with C in the loop", "with JAX, roundings off",
-             "C ends alike", "roundings off end alike", "99 % of times are within"]]  # fmt: skip
-    counts = ("in_jax", "in_c", "nudged", "alike", "nudged_alike")
-    for law in map(str, results.law.values):
-        row = {
-            name: float(results[f"{table}_{name}"].sel(law=law)) for name in loop.Outcomes._fields
-        }
-        if np.isfinite(row["trials"]):
-            cells = [f"{row[name]:.0f} of {row['trials']:.0f}" for name in counts]
-            rows.append([law, *cells, f"{row['apart']:.2g} s"])
-    return rows
+_ENDS = {
+    "law": "{law}",
+    "succeed with JAX": "{in_jax:.0f} of {trials:.0f}",
+    "with C in the loop": "{in_c:.0f} of {trials:.0f}",
+    "with JAX, roundings off": "{nudged:.0f} of {trials:.0f}",
+    "C ends alike": "{alike:.0f} of {trials:.0f}",
+    "roundings off end alike": "{nudged_alike:.0f} of {trials:.0f}",
+    "99 % of times are within": "{apart:.2g} s",
+}
 
 
-def _paper_rows(results: xr.Dataset) -> tuple[str, str, list[list[str]]]:
+def _paper_table(results: xr.Dataset) -> Table:
     note = (
         "Fused engine, float. Roundings off: every twist is greater or less by 1, 2, 4 or 8 parts "
         "in 2^23, and the least of these eight is told. Times are those of trials in which JAX and "
         "C both succeed."
     )
-    return "The paper's trials", note, _end_rows(results, "paper")
+    rows = text_table(_ENDS, _records(results, "paper"))
+    return Table(rows, note, title="The paper's trials")
 
 
-def _world_rows(domain: str, results: xr.Dataset) -> tuple[str, str, list[list[str]]]:
+def _world_table(domain: str, results: xr.Dataset) -> Table:
     note = f"The same worlds of `{domain}` for both; one rounding off; fused engine, float."
-    return "Random worlds", note, _end_rows(results, "worlds")
+    return Table(text_table(_ENDS, _records(results, "worlds")), note, title="Random worlds")
 
 
-def _bag_rows(domain: str, results: xr.Dataset) -> tuple[str, str, list[list[str]]]:
-    rows = [["law", "bags", "commands", "greatest difference", "beyond 1e-6",
-             "greatest in m/s and rad/s", "read otherwise by rosbags"]]  # fmt: skip
-    for law in map(str, results.law.values):
-        row = {name: float(results[f"bags_{name}"].sel(law=law)) for name in loop.Bags._fields}
-        counts = [f"{row[name]:,.0f}" for name in ("bags", "commands")]
-        beyond, strange = (f"{row[name]:.0f}" for name in ("beyond", "strange"))
-        shares = f"{row['greatest']:.1e}", beyond, f"{row['plain']:.1e}"
-        rows.append([law, *counts, *shares, strange])
+_BAGS = {
+    "law": "{law}",
+    "bags": "{bags:,.0f}",
+    "commands": "{commands:,.0f}",
+    "greatest difference": "{greatest:.1e}",
+    "beyond 1e-6": "{beyond:.0f}",
+    "greatest in m/s and rad/s": "{plain:.1e}",
+    "read otherwise by rosbags": "{strange:.0f}",
+}
+
+
+def _bag_table(domain: str, results: xr.Dataset) -> Table:
     note = (
         f"Worlds of `{domain}`, fused engine. Each law is fed its own bag. The goal is 1e-6, of "
         "differences as shares of the greatest speed and turning rate."
     )
-    return "Bags", note, rows
+    return Table(text_table(_BAGS, _records(results, "bags")), note, title="Bags")
 
 
-def _odd_rows(results: xr.Dataset) -> tuple[str, str, list[list[str]]]:
+def _odd_table(results: xr.Dataset) -> Table:
     rows = [["law", "compiler", "inputs", "refused (not finite)", "no finite twist", "faults"]]
-    for law, compiler, row in _rows_of(results, "odd", "compiler"):
+    for row in _records(results, "odd", "compiler"):
         counts = [int(row[name]) for name in ("taken", "refused", "no_result")]
-        rows.append([law, compiler, *(f"{n:,}" for n in (sum(counts), *counts[1:])), "0"])
+        cells = [f"{n:,}" for n in (sum(counts), *counts[1:])]
+        rows.append([row["law"], row["compiler"], *cells, "0"])
     note = "A fault would have ended the run without a table. Both precisions are counted together."
-    return "Odd inputs", note, rows
+    return Table(rows, note, title="Odd inputs")
 
 
-def _speed_rows(results: xr.Dataset) -> tuple[str, str, list[list[str]]]:
+def _speed_table(results: xr.Dataset) -> Table:
     rows = [["law", "form", "median", "99.9th percentile", "of five runs, from", "to"]]
-    for law, precision, row in _rows_of(results, "speed", "precision"):
-        median, slow = (np.sort(row.latency.sel(share=share).values) for share in (0.5, 0.999))
+    for law, precision in product(results.law.values, results.precision.values):
+        latency = results.speed_latency.sel(law=law, precision=precision)
+        median, slow = (np.sort(latency.sel(share=share).values) for share in (0.5, 0.999))
         middle = len(slow) // 2
         texts = [f"{x:.2f} us" for x in (median[middle], slow[middle], slow[0], slow[-1])]
-        rows.append([law, _WORDS[precision], *texts])
+        rows.append([str(law), _WORDS[str(precision)], *texts])
     load = float(results.speed_load.max())
     note = (
         "gcc -O2, 200,000 steps of skin and law in a run, on one core; the median of five runs. "
         f"The load of the machine was {load:.1f} at most."
     )
-    return "Speed", note, rows
+    return Table(rows, note, title="Speed")

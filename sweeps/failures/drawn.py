@@ -19,12 +19,12 @@ from rps_jax.analysis import statistics
 from rps_jax.analysis.figures.style import Figure, panel
 from rps_jax.analysis.report import Picture, Section
 from rps_jax.record.options import option
-from rps_jax.runs import execution
 from rps_jax.runs.plan import Plan
 from rps_jax.runs.question import Run, call_of, count_true, seed_of
 from rps_jax.studies.rare import Estimate, Rare, estimate_row, estimate_table
 from rps_jax.trials.progress import set_phase
 from rps_jax.trials.score import severity_of
+from sweeps.study_base import run_plans
 
 
 @dataclass(frozen=True)
@@ -51,21 +51,16 @@ class Drawn(Rare):
         seeded = replace(self.setting, seed=seed_of(self.setting.seed, "tune"))
         plan = Plan(self.ranges, self.brute, {"law": self.params}, seeded, 4096)
         set_phase(run.callback, "drawn worlds")
-        folder = None if run.folder is None else run.folder / "drawn"
-        results = execution.run_plan(plan, folder, **run.batch_options)
+        results = run_plans(run, {"drawn": plan})["drawn"]
         failed = severity_of(results.sel(law="law"), self.setting.rules) >= self.level
-        drawn_estimate = of_drawn(count_true(failed), failed.size)._asdict()
-        return estimates.assign(
-            {f"drawn_{name}": ((), value) for name, value in drawn_estimate.items()}
-        )
+        estimate = of_drawn(count_true(failed), failed.size)._asdict()
+        return estimates.assign({f"drawn_{name}": value for name, value in estimate.items()})
 
     def report(self, results: xr.Dataset, run: Run) -> Sequence[Section]:
         """Return a section that compares the estimates with drawn worlds."""
         (section,) = super().report(results, run)
-        p, low, high, variation, trials = (
-            float(results[f"drawn_{name}"]) for name in Estimate._fields
-        )
-        against = Estimate(p, low, high, variation, int(trials))
+        values = (float(results[f"drawn_{name}"]) for name in Estimate._fields)
+        against = Estimate(*values)._replace(trials=int(results.drawn_trials))
         text = f"{section.text} Those of drawn worlds are by Clopper and Pearson."
         if against.p:
             off = 100 * (float(results.p.mean()) / against.p - 1)

@@ -33,9 +33,8 @@ class Cost(Sensitivity):
 
     def report(self, results: xr.Dataset, run: Run) -> Sequence[Section]:
         """Return sections with the effect of the quantity and the indices."""
-        section = Section(
-            f"Does {self.quantity} cost anything", cost_sentence(results, self.quantity)
-        )
+        text = cost_sentence(results, self.quantity)
+        section = Section(f"Does {self.quantity} cost anything", text)
         return [section, *super().report(results, run)]
 
 
@@ -51,19 +50,17 @@ def difference(results: xr.Dataset, name: str) -> tuple[float, float, float]:
     success = results.success.values
     high, low = at >= 2 / 3, at < 1 / 3
     blocks = np.arange(success.size) // (success.size // results.attrs["base"])
-    sums = np.stack(
-        [
-            np.bincount(blocks, w, results.attrs["base"])
-            for w in (high * success, high, low * success, low)
-        ]
-    )
+    counts = (high * success, high, low * success, low)
+    sums = np.stack([np.bincount(blocks, x, results.attrs["base"]) for x in counts])
     rng = np.random.default_rng(0)
     drawn = rng.integers(0, sums.shape[1], (_RESAMPLES, sums.shape[1]))
-    a, b, c, d = sums[:, drawn].sum(axis=2)
-    spread = a / np.maximum(b, 1) - c / np.maximum(d, 1)
-    a, b, c, d = sums.sum(axis=1)
-    interval = np.quantile(spread, [0.025, 0.975])
-    return float(a / max(b, 1) - c / max(d, 1)), float(interval[0]), float(interval[1])
+
+    def rise(sums: np.ndarray) -> np.ndarray:
+        won_high, in_high, won_low, in_low = sums
+        return won_high / np.maximum(in_high, 1) - won_low / np.maximum(in_low, 1)
+
+    interval = np.quantile(rise(sums[:, drawn].sum(axis=2)), [0.025, 0.975])
+    return float(rise(sums.sum(axis=1))), float(interval[0]), float(interval[1])
 
 
 def cost_sentence(results: xr.Dataset, name: str = "mass") -> str:
@@ -81,9 +78,7 @@ def cost_sentence(results: xr.Dataset, name: str = "mass") -> str:
         return f"More {name} costs success: {values}."
     if low > 0:
         return f"More {name} helps: {values}."
-    if (
-        float(index.total - index.total_reach) > _SMALL_INDEX
-        and count_failing_points(results) >= MIN_FAILING_POINTS
-    ):
+    matters = float(index.total - index.total_reach) > _SMALL_INDEX
+    if matters and count_failing_points(results) >= MIN_FAILING_POINTS:
         return f"On average {name} costs nothing, but together with others it matters: {values}."
     return f"No cost of {name} is seen in {results.sizes['world']:,} worlds: {values}."

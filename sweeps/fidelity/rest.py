@@ -8,13 +8,13 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import product
 from typing import Any, ClassVar
 
 import numpy as np
 import xarray as xr
 
 from rps_jax import engines
-from rps_jax.analysis.report import Section
 from rps_jax.record.options import option
 from rps_jax.robot.robot import Robot
 from rps_jax.runs.question import Run, call_of
@@ -23,7 +23,7 @@ from rps_jax.trials.worlds import starts
 from rps_jax.world import domain as domains
 from rps_jax.world import draws
 from rps_jax.world.physics import Physics, preset
-from sweeps.study_base import Study, Table
+from sweeps.study_base import Rows, Study, Table
 
 DOMAINS = ("wide", "hostile", "hostile,friction_ground=0.05:0.1,com_offset=0.5:0.7")
 _AWAY = 5.0  # [m] stands the base
@@ -39,7 +39,7 @@ class Rest(Study[xr.Dataset]):
     """Leave random objects alone, and tell how far they have moved (domain, step, world) [m]."""
 
     TITLE: ClassVar[str] = "Do objects at rest stay?"
-    QUICK: ClassVar[Mapping[str, Any]] = {"worlds": 9, "seconds": 1.0}
+    QUICK: ClassVar[Mapping[str, object]] = {"worlds": 9, "seconds": 1.0}
 
     worlds: int = option(150, 3, 100_000)
     """Number of worlds of each domain."""
@@ -56,22 +56,20 @@ class Rest(Study[xr.Dataset]):
 
     def answer(self, run: Run) -> xr.Dataset:
         """Step the worlds that are missing."""
-        parts, done = [], 0
-        for i, name in enumerate(DOMAINS):
-            for step in STEPS:
-                make = partial(self._moved, domains.parse_domain(name), STEPS[step])
-                part = run.checkpoint(f"{i}-{STEPS[step].timestep:g}", make)
-                parts.append(part.expand_dims(domain=[name], step=[step]))
-                done += self.worlds
-                run.callback(Progress(done, done * self.seconds))
-        whole = xr.combine_by_coords(parts, combine_attrs="drop")
-        assert isinstance(whole, xr.Dataset)
-        whole = whole.sel(domain=list(DOMAINS), step=list(STEPS))
-        return whole
+        parts = []
+        for i, step in product(range(len(DOMAINS)), STEPS):
+            compute = partial(self._moved, domains.parse_domain(DOMAINS[i]), STEPS[step])
+            part = run.checkpoint(f"{i}-{STEPS[step].timestep:g}", compute)
+            parts.append(part.expand_dims(domain=[DOMAINS[i]], step=[step]))
+            run.callback(
+                Progress(len(parts) * self.worlds, len(parts) * self.worlds * self.seconds)
+            )
+        whole: Any = xr.combine_by_coords(parts, combine_attrs="drop")
+        return whole.sel(domain=list(DOMAINS), step=list(STEPS))
 
-    def published_tables(self, results: xr.Dataset) -> Mapping[str, Table]:
-        """Return the counts of objects that moved."""
-        return {"rest": Table(table(results), merge="domain")}
+    def report_tables(self, results: xr.Dataset) -> Sequence[Table]:
+        """Return the counts of moved objects, by domain, step and shape."""
+        return [Table(table(results), merge="domain", name="rest", title="Objects that wander off")]
 
     def _moved(self, ranges: domains.Domain, physics: Physics) -> xr.Dataset:
         index, c = np.arange(self.worlds), engines.get("mujoco")
@@ -97,24 +95,17 @@ class Rest(Study[xr.Dataset]):
             f"{100 * _FAR:g} cm away after {self.seconds:g} s, in C MuJoCo on the package's ground."
         )
 
-    def report(self, results: xr.Dataset, run: Run) -> Sequence[Section]:
-        """Return the counts of moved objects, by domain, step and shape."""
-        return [Section("Objects that wander off", "", table(results))]
-
 
 rest = call_of(Rest)
 
 
-def table(results: xr.Dataset) -> list[list[str]]:
-    """Header and one row for each domain and step."""
+def table(results: xr.Dataset) -> Rows:
+    """Return a header and one row per domain and step."""
     families = list(dict.fromkeys(map(str, results.family.values)))
     rows = [["domain", "step", *(f"moved, {name}" for name in families), "the farthest"]]
-    for name in map(str, results.domain.values):
-        for step in map(str, results.step.values):
-            moved = results.moved.sel(domain=name, step=step)
-            by_family = [moved.values[results.family.values == name] for name in families]
-            counts = [
-                f"{int((distances > _FAR).sum())} of {distances.size}" for distances in by_family
-            ]
-            rows.append([f"`{name}`", step, *counts, f"{100 * float(moved.max()):.1f} cm"])
+    for domain, step in product(map(str, results.domain.values), map(str, results.step.values)):
+        moved = results.moved.sel(domain=domain, step=step)
+        by_family = [moved.values[results.family.values == name] for name in families]
+        counts = [f"{int((x > _FAR).sum())} of {x.size}" for x in by_family]
+        rows.append([f"`{domain}`", step, *counts, f"{100 * float(moved.max()):.1f} cm"])
     return rows

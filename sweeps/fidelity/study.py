@@ -8,6 +8,7 @@ trial, and positions of the object after the first 5 s.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -16,26 +17,27 @@ from typing import Any, ClassVar
 import numpy as np
 import xarray as xr
 
-from rps_jax import errors
 from rps_jax.analysis import statistics
-from rps_jax.analysis.report import Section
 from rps_jax.engines import EngineName
 from rps_jax.runs.question import Run, call_of
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import Rules
 from rps_jax.world import paper
 from rps_jax.world.physics import MUJOCO_GROUND, Physics, preset
-from sweeps.conditions import Condition, Grid, run_conditions
-from sweeps.study_base import TrialStudy
+from sweeps.conditions import Condition, ConditionStudy, Grid, run_conditions
+from sweeps.study_base import Rows, Table
 
 REFERENCE = "reference"
 _EARLY = 5.0  # [s] after which the object's place is compared
 
 
-def _condition(engine: EngineName, base: Physics, label: str, **changes: Any) -> Condition:
-    return Condition(label, Setting(physics=replace(base, **changes), engine=engine))
+def _condition(
+    engine: EngineName, base: Physics, label: str, params: Mapping[str, float] = {}, **changes: Any
+) -> Condition:
+    return Condition(label, Setting(physics=replace(base, **changes), engine=engine), params)
 
 
+_FAST = preset(fidelity="fast")
 _c = partial(_condition, "mujoco", preset(fidelity="reference"))
 _mjx = partial(_condition, "mjx", preset())
 _fused = partial(_condition, "fused", preset())
@@ -51,15 +53,13 @@ IN_C = {
 # MJX in float32, whose cost grows with its iterations.
 IN_MJX = {
     "standard": _mjx("MJX `standard`"),
-    "fast": Condition("MJX `fast`", Setting(physics=preset(fidelity="fast"), engine="mjx")),
+    "fast": _condition("mjx", _FAST, "MJX `fast`"),
     "mjx_20ms_4_6": _mjx("MJX, 20 ms, 4/6", timestep=0.02, iterations=4, ls_iterations=6),
 }
 # The fused engine, in float32: first the defaults, then changes of the physics.
 IN_FUSED = {
     "fused_standard": _fused("fused, `standard`"),
-    "fused_fast": Condition(
-        "fused, `fast`", Setting(physics=preset(fidelity="fast"), engine="fused")
-    ),
+    "fused_fast": _condition("fused", _FAST, "fused, `fast`"),
     "fused_20ms_4_6": _fused("fused, 20 ms, 4/6", timestep=0.02, iterations=4, ls_iterations=6),
     "fused_5ms": _fused("fused, 5 ms", timestep=0.005),
     "impratio_1": _fused("fused, impratio 1", impratio=1.0),
@@ -70,10 +70,8 @@ IN_FUSED = {
     "period_5ms": _fused("fused, control period 5 ms", control_period=0.005, timestep=0.005),
     "period_10ms": _fused("fused, control period 10 ms", control_period=0.01),
     "period_50ms": _fused("fused, control period 50 ms", control_period=0.05),
-    "drive_on_loss": replace(_fused("fused, 0.05 m/s after a loss"), params={"v_lost": 0.05}),
-    "keep_on_loss": replace(
-        _fused("fused, last contact kept on loss"), params={"keep_contact": 1.0}
-    ),
+    "drive_on_loss": _fused("fused, 0.05 m/s after a loss", {"v_lost": 0.05}),
+    "keep_on_loss": _fused("fused, last contact kept on loss", {"keep_contact": 1.0}),
 }
 # Without inertia, in the plane.
 QUASISTATIC = {
@@ -85,7 +83,7 @@ QUICK = (REFERENCE, "fused_standard", "fused_fast")
 
 
 @dataclass(frozen=True)
-class Fidelity(TrialStudy[xr.Dataset]):
+class Fidelity(ConditionStudy):
     """Tell how finely the physics must be solved: the paper's trials against converged C MuJoCo.
 
     The answer holds outcomes (condition, law, object, friction, target), and `early_error` [m]: how
@@ -93,43 +91,29 @@ class Fidelity(TrialStudy[xr.Dataset]):
     """
 
     TITLE: ClassVar[str] = "Is the physics converged?"
-    QUICK: ClassVar[Mapping[str, Any]] = {"conditions": QUICK, "targets": paper.FEW_TARGETS}
+    QUICK: ClassVar[Mapping[str, object]] = {"conditions": QUICK, "targets": paper.FEW_TARGETS}
+    CHOICES: ClassVar = {"conditions": CONDITIONS}
     GROWS: ClassVar[tuple[str, ...]] = ("conditions",)
 
     conditions: tuple[str, ...] = tuple(CONDITIONS)
     """Names of the settings, the reference always among them; by default all."""
-    targets: tuple[tuple[float, float], ...] = paper.TARGETS
-    """Targets X Y [m], one pair after the other; by default the paper's 24."""
 
     @property
-    def names(self) -> tuple[str, ...]:
-        """Names of the settings, with the reference."""
-        return tuple(dict.fromkeys([REFERENCE, *self.conditions]))
+    def chosen(self) -> dict[str, Condition]:
+        """Settings by name, the reference first."""
+        return {name: CONDITIONS[name] for name in (REFERENCE, *self.conditions)}
 
     @property
     def grid(self) -> Grid:
         """Grid of the trials."""
         return Grid(laws=paper.LAWS, targets=self.targets)
 
-    def check(self) -> None:
-        """Check the names, and that their engines work here."""
-        super().check()
-        for name in self.conditions:
-            errors.check_name("condition", name, CONDITIONS)
-
-    def num_trials(self) -> int | None:
-        """Return the number of trials, without the short ones."""
-        return len(self.names) * self.grid.size
-
     def answer(self, run: Run) -> xr.Dataset:
-        """Run the settings that are missing."""
-        chosen = {name: CONDITIONS[name] for name in self.names}
-        results = run_conditions(chosen, self.grid, run.folder, **run.batch_options)
-        short = {name: _early(condition) for name, condition in chosen.items()}
+        """Run the settings that are missing, and the first seconds of RPS with each of them."""
+        results = super().answer(run)
+        short = {name: _early(condition) for name, condition in self.chosen.items()}
         of_rps = self.grid._replace(laws=("rps",))
         folder = None if run.folder is None else run.folder / "early"
-        if folder is not None:
-            folder.mkdir(exist_ok=True)
         early = run_conditions(short, of_rps, folder, slots=run.slots, workers=run.workers)
         position = early.object_pose.sel(law="rps", pose=["x", "y"])
         squares = ((position - position.sel(condition=REFERENCE)) ** 2).sum("pose")
@@ -143,11 +127,11 @@ class Fidelity(TrialStudy[xr.Dataset]):
             "steps of 1 ms."
         )
 
-    def report(self, results: xr.Dataset, run: Run) -> Sequence[Section]:
-        """Successes, equal outcomes and costs of each setting."""
+    def report_tables(self, results: xr.Dataset) -> Sequence[Table]:
+        """Return successes, equal outcomes and costs of each setting."""
         return [
-            Section("Settings of the solver against C MuJoCo", "", table(results)),
-            Section("Equal outcomes by law", "", by_law(results)),
+            Table(table(results), title="Settings of the solver against C MuJoCo"),
+            Table(by_law(results), title="Equal outcomes by law"),
         ]
 
 
@@ -159,41 +143,34 @@ def _early(condition: Condition) -> Condition:
     return replace(condition, setting=setting)
 
 
-def table(results: xr.Dataset) -> list[list[str]]:
-    """Header and one row for each condition.
+def table(results: xr.Dataset) -> Rows:
+    """Return a header and one row per condition.
 
     The cost is wall clock for a simulated second of one world while the trials ran.
     """
     base = results.success.sel(condition=REFERENCE)
-    objects = [str(o) for o in results.object.values]
-    laws = [str(s) for s in results.law.values]
-    header = ["setting", *(f"{s.upper()} {o}" for s in laws for o in objects)]
-    header += ["equal outcomes", "95 %", "+/-", "McNemar p", "5 s error: median, 95 %", "cost"]
-    rows = [header]
+    columns = list(itertools.product(map(str, results.law.values), map(str, results.object.values)))
+    rows = [["setting", *(f"{law.upper()} {name}" for law, name in columns), "equal outcomes",
+             "95 %", "+/-", "McNemar p", "5 s error: median, 95 %", "cost"]]  # fmt: skip
     for name in map(str, results.condition.values):
         condition = results.sel(condition=name)
         counts = condition.success.sum(("friction", "target"))
         c = statistics.compare(base, condition.success)
         low, high = c.equal_interval
-        median, worst = np.quantile(condition.early_error.values, (0.5, 0.95))
+        median, worst = 1000 * np.quantile(condition.early_error.values, (0.5, 0.95))
         cost = float(condition.run_time) / float(condition.simulated)
-        rows.append(
-            [
-                str(condition.what.values),
-                *(str(int(counts.sel(law=s, object=o))) for s in laws for o in objects),
-                f"{100 * c.equal:.1f} %",
-                f"{100 * low:.0f}-{100 * high:.0f} %",
-                f"+{c.gained} -{c.lost}",
-                f"{c.p:.2g}",
-                f"{1000 * median:.1f}, {1000 * worst:.1f} mm",
-                f"{1000 * cost:.3g} ms",
-            ]
-        )
+        rows.append([
+            str(condition.what.values),
+            *(str(int(counts.sel(law=law, object=name))) for law, name in columns),
+            f"{100 * c.equal:.1f} %", f"{100 * low:.0f}-{100 * high:.0f} %",
+            f"+{c.gained} -{c.lost}", f"{c.p:.2g}", f"{median:.1f}, {worst:.1f} mm",
+            f"{1000 * cost:.3g} ms",
+        ])  # fmt: skip
     return rows
 
 
-def by_law(results: xr.Dataset) -> list[list[str]]:
-    """Header and one row for each condition: share of equal outcomes for each law."""
+def by_law(results: xr.Dataset) -> Rows:
+    """Return a header and one row per condition: share of equal outcomes with each law."""
     base = results.success.sel(condition=REFERENCE)
     laws = [str(s) for s in results.law.values]
     rows = [["setting", *(s.upper() for s in laws)]]

@@ -11,25 +11,23 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 import xarray as xr
 
 import rps_jax
-from rps_jax.analysis.report import Section
-from rps_jax.control import registry
 from rps_jax.control.registry import LawLike
 from rps_jax.record import bag
 from rps_jax.record.options import option
-from rps_jax.runs.question import DomainQuestion, LawQuestion, Run, call_of, seed_of
-from rps_jax.tuning import fit, logs, posterior
+from rps_jax.runs.question import Run, call_of, seed_of
+from rps_jax.tuning import fit, logs
 from rps_jax.world import domain as domains
-from sweeps.fit.study import compare_with_truth, within
-from sweeps.study_base import Study, Table
+from sweeps.fit.study import FitStudy, within
+from sweeps.study_base import Rows, Table
 
 _SOURCES = ("bag", "the log itself")
 _FIELDS = ("signal",)  # optional fields of bags
@@ -37,11 +35,11 @@ _TOLERANCE = 0.02  # [1] of the interval's width, within which two limits are eq
 
 
 @dataclass(frozen=True)
-class Bagged(Study[xr.Dataset], DomainQuestion[xr.Dataset], LawQuestion[xr.Dataset]):
+class Bagged(FitStudy):
     """Compare the coverage of intervals fitted to bags with that of fits to logs."""
 
     TITLE: ClassVar[str] = "Worlds fitted to bags"
-    QUICK: ClassVar[Mapping[str, Any]] = {"worlds": 192, "logs": 2, "window": 6.0}
+    QUICK: ClassVar[Mapping[str, object]] = {"worlds": 192, "logs": 2, "window": 6.0}
 
     domain: domains.DomainLike = "real"
     """Ranges from which worlds are drawn, by name or as a JSON file; changes follow."""
@@ -52,42 +50,28 @@ class Bagged(Study[xr.Dataset], DomainQuestion[xr.Dataset], LawQuestion[xr.Datas
     """Number of worlds that are recorded and fitted."""
     window: float = option(20.0, 5, 300, unit="s", kw_only=True)
     """Length of a log [s]."""
-    setting: rps_jax.Setting = field(default=rps_jax.Setting("fused"), kw_only=True)
 
     def check(self) -> None:
         """Check the law and the engine, and that bags can be written."""
         bag.check()
-        self.check_engine([self.params])
-        fit.check_law(self.label, registry.law_of(self.params), self.setting)
+        super().check()
 
     def answer(self, run: Run) -> xr.Dataset:
         """Train on the worlds, and fit the bags and the logs (source, log)."""
-        period = self.setting.physics.control_period
-        bank = fit.Bank(self.ranges, self.params, self.setting, self.window, period)
-        training = bank.worlds(self.worlds, run)
+        training = self.bank.worlds(self.worlds, run)
         names = fit.statistic_names(training, _FIELDS)
-        test = bank.worlds(self.logs, run, "test")
-        bags = run.checkpoint("bags", partial(self._bags, bank, names))
-        inputs = training.sel(statistic=names)
-        networks = posterior.train(inputs.u.values, inputs.statistics.values, self.setting.seed)
-        logs_x = test.sel(statistic=names).statistics.values[:, 0]
-        fits = [
-            xr.concat(
-                [
-                    compare_with_truth(self.ranges, networks, x[i : i + 1], test, i)
-                    for i in range(self.logs)
-                ],
-                "log",
-            )
-            for x in (bags.statistics.values, logs_x)
-        ]
-        return xr.concat(fits, "source").drop_vars("unit").assign_coords(source=list(_SOURCES))
+        test = self.bank.worlds(self.logs, run, "test")
+        bags = run.checkpoint("bags", partial(self._bags, names))
+        networks = self.train(training, names)
+        logs = test.sel(statistic=names).statistics.values[:, 0]
+        fits = [self.compare(networks, x[:, None], test) for x in (bags.statistics.values, logs)]
+        return xr.concat(fits, xr.IndexVariable("source", list(_SOURCES)))
 
-    def published_tables(self, results: xr.Dataset) -> Mapping[str, Table]:
+    def report_tables(self, results: xr.Dataset) -> Sequence[Table]:
         """Return the coverage of bags and logs."""
-        return {"fit_bags": Table(table(results))}
+        return [Table(table(results), name="fit_bags", title="Coverage of bags")]
 
-    def _bags(self, bank: fit.Bank, names: Sequence[str]) -> xr.Dataset:
+    def _bags(self, names: Sequence[str]) -> xr.Dataset:
         """Return statistics (log, F) of the bags of the test worlds."""
         setting = rps_jax.Setting(
             self.setting.engine, self.setting.physics, self.setting.fidelity,
@@ -102,19 +86,15 @@ class Bagged(Study[xr.Dataset], DomainQuestion[xr.Dataset], LawQuestion[xr.Datas
                 path = Path(folder) / f"{world}.mcap"
                 rps_jax.replay(run=run, world=world, bag=path)
                 raw = logs.read(path, self.ranges.robot.shell)
-                log = logs.resample(raw, bank.interval, bank.window)
-                rows.append(logs.statistics(log, bank.interval)[names].values[0])
+                log = logs.resample(raw, self.bank.interval, self.window)
+                rows.append(logs.statistics(log, self.bank.interval)[names].values[0])
         return xr.Dataset({"statistics": (("log", "statistic"), np.stack(rows))})
-
-    def report(self, results: Any, run: Run) -> Sequence[Section]:
-        """Return one row for bags, and one for the logs."""
-        return [Section("Coverage of bags", "", table(results))]
 
 
 bagged = call_of(Bagged)
 
 
-def table(results: xr.Dataset) -> list[list[str]]:
+def table(results: xr.Dataset) -> Rows:
     """Return header and rows of the table of the page."""
     logs = results.sel(source=_SOURCES[1])
     errors = [abs(results[k] - logs[k]) / (logs.high - logs.low) for k in ("low", "high")]

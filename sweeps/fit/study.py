@@ -14,14 +14,14 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property, partial
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 import xarray as xr
 
 import rps_jax
 from rps_jax.analysis.figures.style import Figure
-from rps_jax.analysis.report import Picture, Section, save
+from rps_jax.analysis.report import Picture, save
 from rps_jax.control import registry
 from rps_jax.control.registry import LawLike
 from rps_jax.record.options import option
@@ -30,7 +30,7 @@ from rps_jax.trials.progress import Progress, no_progress, set_phase
 from rps_jax.tuning import fit, posterior
 from rps_jax.world import domain as domains
 from rps_jax.world import draws, points
-from sweeps.study_base import Study, Table
+from sweeps.study_base import Rows, Study, Table
 
 KINDS: dict[str, tuple[str, ...]] = {  # optional fields of each kind of log
     "touch": (),
@@ -45,29 +45,15 @@ _TASK = (*domains.quantities_of("task"), "key_0", "key_1")
 
 
 @dataclass(frozen=True)
-class Coverage(Study[xr.Dataset], DomainQuestion[xr.Dataset], LawQuestion[xr.Dataset]):
-    """Measure the coverage of fitted intervals, and the value of a fit for predictions."""
+class FitStudy(Study[xr.Dataset], DomainQuestion[xr.Dataset], LawQuestion[xr.Dataset]):
+    """Base class of studies that fit logs of test worlds, whose true values are known."""
 
-    TITLE: ClassVar[str] = "Worlds fitted to logs"
-    QUICK: ClassVar[Mapping[str, Any]] = {
-        "worlds": 960, "logs": 48, "window": 20.0, "worth": 2, "tasks": 8,
-    }  # fmt: skip
-
-    domain: domains.DomainLike = (
-        "wide,robot_lag=0:0.4,robot_slip=0:0.1,foam=0.005:0.02,time_constant=0.02:0.15"
-    )
-    """Ranges from which worlds are drawn, by name or as a JSON file; changes follow."""
-    law: LawLike = "rps"
     worlds: int = option(8064, 192, 1_000_000, kw_only=True)
     """Number of worlds for training."""
     logs: int = option(240, 24, 10_000, kw_only=True)
     """Number of worlds whose logs are fitted."""
     window: float = option(30.0, 5, 300, unit="s", kw_only=True)
     """Length of a log [s]."""
-    worth: int = option(16, 0, 1000, kw_only=True)
-    """Number of worlds in which success and time are predicted."""
-    tasks: int = option(32, 8, 1000, kw_only=True)
-    """Number of pushes in each of these worlds."""
     setting: rps_jax.Setting = field(default=rps_jax.Setting("fused"), kw_only=True)
 
     @cached_property
@@ -76,15 +62,59 @@ class Coverage(Study[xr.Dataset], DomainQuestion[xr.Dataset], LawQuestion[xr.Dat
         period = self.setting.physics.control_period
         return fit.Bank(self.ranges, self.params, self.setting, self.window, period)
 
-    @cached_property
-    def _networks(self) -> dict[tuple[str, ...], posterior.Posterior]:
-        """Trained networks, by the names of their statistics."""
-        return {}
-
     def check(self) -> None:
         """Check the law and the engine."""
         self.check_engine([self.params])
         fit.check_law(self.label, registry.law_of(self.params), self.setting)
+
+    def train(self, training: xr.Dataset, names: Sequence[str]) -> posterior.Posterior:
+        """Return networks for some statistics of the logs."""
+        bank = training.sel(statistic=names)
+        return posterior.train(bank.u.values, bank.statistics.values, self.setting.seed)
+
+    def compare(
+        self, networks: posterior.Posterior, statistics: np.ndarray, test: xr.Dataset
+    ) -> xr.Dataset:
+        """Return the fits to statistics (log, N, F) of the test worlds, with the true values."""
+        fits = []
+        for log, x in enumerate(statistics):
+            fitted = fit.summary(self.ranges, posterior.sample(networks, x, fit.SAMPLES, log))
+            values = fit.values_of(self.ranges, test.u.values[log : log + 1])
+            truth = np.array([values[str(name)][0] for name in fitted.quantity.values])
+            probability = fitted.probability.isel(object=self.ranges.object_of(np.array(log)))
+            columns = {
+                "truth": ("quantity", truth),
+                "rank": ("quantity", (fitted["sample"].values < truth).mean(0)),
+                **fitted[["shrinkage", "undetermined", "low", "high"]],
+                "object_told": probability.drop_vars("object"),
+            }
+            fits.append(xr.Dataset(columns))
+        return xr.concat(fits, "log").drop_vars("unit")
+
+
+@dataclass(frozen=True)
+class Coverage(FitStudy):
+    """Measure the coverage of fitted intervals, and the value of a fit for predictions."""
+
+    TITLE: ClassVar[str] = "Worlds fitted to logs"
+    QUICK: ClassVar[Mapping[str, object]] = {
+        "worlds": 960, "logs": 48, "window": 20.0, "worth": 2, "tasks": 8,
+    }  # fmt: skip
+
+    domain: domains.DomainLike = (
+        "wide,robot_lag=0:0.4,robot_slip=0:0.1,foam=0.005:0.02,time_constant=0.02:0.15"
+    )
+    """Ranges from which worlds are drawn, by name or as a JSON file; changes follow."""
+    law: LawLike = "rps"
+    worth: int = option(16, 0, 1000, kw_only=True)
+    """Number of worlds in which success and time are predicted."""
+    tasks: int = option(32, 8, 1000, kw_only=True)
+    """Number of pushes in each of these worlds."""
+
+    @cached_property
+    def _networks(self) -> dict[tuple[str, ...], posterior.Posterior]:
+        """Trained networks, by the names of their statistics."""
+        return {}
 
     def num_trials(self) -> int | None:
         """Number of simulated logs."""
@@ -109,9 +139,7 @@ class Coverage(Study[xr.Dataset], DomainQuestion[xr.Dataset], LawQuestion[xr.Dat
         names = fit.statistic_names(training, KINDS.get(kind, ()))
         if tuple(names) not in self._networks:
             set_phase(run.callback, f"learn from {kind}")
-            bank = training.sel(statistic=names)
-            networks = posterior.train(bank.u.values, bank.statistics.values, self.setting.seed)
-            self._networks[tuple(names)] = networks
+            self._networks[tuple(names)] = self.train(training, names)
         return self._networks[tuple(names)], names
 
     def _fit_logs(self, kind: str, training: xr.Dataset, test: xr.Dataset, run: Run) -> xr.Dataset:
@@ -120,11 +148,8 @@ class Coverage(Study[xr.Dataset], DomainQuestion[xr.Dataset], LawQuestion[xr.Dat
         x = test.sel(statistic=names).statistics.values[:, :1]
         if kind == FOUR:
             x = np.concatenate([x, self._more_pushes(names, run)], 1)
-        fits = []
-        for log in range(self.logs):
-            fits.append(compare_with_truth(self.ranges, networks, x[log], test, log))
-            run.callback(Progress(self.worlds, 0.0))
-        return xr.concat(fits, "log").drop_vars("unit")
+        run.callback(Progress(self.worlds, 0.0))
+        return self.compare(networks, x, test)
 
     def _more_pushes(self, names: list[str], run: Run) -> np.ndarray:
         """Return statistics (log, 3, F) of three more pushes in each test world."""
@@ -173,13 +198,9 @@ class Coverage(Study[xr.Dataset], DomainQuestion[xr.Dataset], LawQuestion[xr.Dat
             u[:, task] = free
             samples = posterior.sample(networks, x[world], fit.SAMPLES, int(world))
             fitted = fit.fitted_domain(self.ranges, fit.summary(self.ranges, samples))
-            predictions.append(
-                [
-                    summarise(rps_jax.sweep(_LAWS, self.ranges, points=u, **options)),
-                    prior,
-                    summarise(rps_jax.sweep(_LAWS, fitted, self.tasks, **options)),
-                ]
-            )
+            truth = summarise(rps_jax.sweep(_LAWS, self.ranges, points=u, **options))
+            prediction = summarise(rps_jax.sweep(_LAWS, fitted, self.tasks, **options))
+            predictions.append([truth, prior, prediction])
             run.callback(Progress(self.worlds + int(world), 0.0))
         labels = {"source": ["truth", "domain", "fit"], "law": list(_LAWS)}
         shape = ("world", "source", "law")
@@ -189,62 +210,24 @@ class Coverage(Study[xr.Dataset], DomainQuestion[xr.Dataset], LawQuestion[xr.Dat
 
     # --- report ---
 
-    def published_tables(self, results: xr.Dataset) -> Mapping[str, Table]:
-        """Return all tables."""
-        return {f"fit_{name}": Table(rows) for name, rows in tables(results).items()}
+    def report_tables(self, results: xr.Dataset) -> Sequence[Table]:
+        """Return coverage by kind of log and by quantity, and the errors of predictions."""
+        picture = Picture("coverage", partial(figure, results))
+        text = "Coverage, and share of logs that determine it."
+        error = "Mean error of the prediction."
+        return [
+            Table(coverage_rows(results), name="fit_coverage", title="Coverage", picture=picture),
+            Table(quantity_rows(results), name="fit_quantities", title="By quantity", text=text),
+            Table(worth_rows(results), name="fit_worth", title="Worth", text=error),
+        ]
 
     def publish(self, results: xr.Dataset, run_folder: Path) -> None:
         """Write the data files and the figure."""
         super().publish(results, run_folder)
         save(figure(results), self.folder / "coverage.png")
 
-    def report(self, results: xr.Dataset, run: Run) -> Sequence[Section]:
-        """Return coverage by kind of log and by quantity, and the errors of predictions."""
-        rows = tables(results)
-        return [
-            Section(
-                "Coverage", "", rows["coverage"], Picture("coverage", partial(figure, results))
-            ),
-            Section(
-                "By quantity", "Coverage, and share of logs that determine it.", rows["quantities"]
-            ),
-            Section("Worth", "Mean error of the prediction.", rows["worth"]),
-        ]
-
 
 coverage = call_of(Coverage)
-
-
-def compare_with_truth(
-    ranges: domains.Domain, networks: posterior.Posterior, x: np.ndarray, test: xr.Dataset, log: int
-) -> xr.Dataset:
-    """Return the fit to statistics (N, F) of a test world, with the true values."""
-    fitted = fit.summary(ranges, posterior.sample(networks, x, fit.SAMPLES, log))
-    values = fit.values_of(ranges, test.u.values[log : log + 1])
-    truth = np.array([values[str(name)][0] for name in fitted.quantity.values])
-    probability = fitted.probability.isel(object=ranges.object_of(np.array(log)))
-    return xr.Dataset(
-        {
-            "truth": ("quantity", truth),
-            "rank": ("quantity", (fitted["sample"].values < truth).mean(0)),
-            "shrinkage": fitted.shrinkage, "undetermined": fitted.undetermined,
-            "low": fitted.low, "high": fitted.high,
-            "object_told": probability.drop_vars("object"),
-        }
-    )  # fmt: skip
-
-
-def tables(results: xr.Dataset) -> dict[str, list[list[str]]]:
-    """Return header and rows of each table of the page."""
-    first = ["log", "90 % intervals hold the truth", "those of told quantities",
-             "least, greatest of a quantity", "told", "right object's probability"]  # fmt: skip
-    worth = ["law", "success, from the domain", "success, from the fit", "time, from the domain",
-             "time, from the fit"]  # fmt: skip
-    return {
-        "coverage": [first, *coverage_rows(results)],
-        "quantities": [["quantity", *map(str, results.kind.values)], *quantity_rows(results)],
-        "worth": [worth, *worth_rows(results)],
-    }
 
 
 def within(fits: xr.Dataset) -> xr.DataArray:
@@ -252,9 +235,10 @@ def within(fits: xr.Dataset) -> xr.DataArray:
     return (fits["rank"] >= 0.05) & (fits["rank"] <= 0.95)
 
 
-def coverage_rows(results: xr.Dataset) -> list[list[str]]:
-    """Return one row for each kind of log."""
-    rows = []
+def coverage_rows(results: xr.Dataset) -> Rows:
+    """Return a header and one row for each kind of log."""
+    rows = [["log", "90 % intervals hold the truth", "those of told quantities",
+             "least, greatest of a quantity", "told", "right object's probability"]]  # fmt: skip
     for kind in map(str, results.kind.values):
         fits = results.sel(kind=kind)
         covered, determined = within(fits), fits.undetermined == 0
@@ -267,29 +251,34 @@ def coverage_rows(results: xr.Dataset) -> list[list[str]]:
     return rows
 
 
-def quantity_rows(results: xr.Dataset) -> list[list[str]]:
-    """Return one row for each quantity: coverage and share of determined logs, by kind of log."""
-    rows = []
+def quantity_rows(results: xr.Dataset) -> Rows:
+    """Return a header and one row for each quantity.
+
+    A cell has the coverage and the share of determined logs of a kind of log.
+    """
+    rows = [["quantity", *map(str, results.kind.values)]]
     for name in map(str, results.quantity.values):
         fits = results.sel(quantity=name)
         covered, determined = within(fits).mean("log"), (fits.undetermined == 0).mean("log")
-        cells = [f"{100 * float(c):.0f} %, {100 * float(d):.0f} %"
-                 for c, d in zip(covered, determined, strict=True)]  # fmt: skip
+        pairs = zip(covered, determined, strict=True)
+        cells = [f"{100 * float(c):.0f} %, {100 * float(d):.0f} %" for c, d in pairs]
         rows.append([fit.words(name), *cells])
     return rows
 
 
-def worth_rows(results: xr.Dataset) -> list[list[str]]:
-    """Return one row for each law: mean absolute error of the predictions."""
+def worth_rows(results: xr.Dataset) -> Rows:
+    """Return a header and one row for each law: mean absolute error of the predictions."""
+    rows = [["law", "success, from the domain", "success, from the fit", "time, from the domain",
+             "time, from the fit"]]  # fmt: skip
     if "won" not in results:
-        return []
+        return rows
     truth = results.sel(source="truth")
     error = abs(results.drop_sel(source="truth") - truth).mean("world")
-    return [
-        [str(law), *(f"{100 * float(v):.1f} points" for v in error.won.sel(law=law)),
-         *(f"{float(v):.1f} s" for v in error.duration.sel(law=law))]
-        for law in results.law.values
-    ]  # fmt: skip
+    for law in results.law.values:
+        success = [f"{100 * float(v):.1f} points" for v in error.won.sel(law=law)]
+        time = [f"{float(v):.1f} s" for v in error.duration.sel(law=law)]
+        rows.append([str(law), *success, *time])
+    return rows
 
 
 def figure(results: xr.Dataset) -> Figure:

@@ -19,7 +19,6 @@ from __future__ import annotations
 import itertools
 import math
 import time
-from collections.abc import Sequence
 from typing import Any, Literal, NamedTuple, get_args
 
 import jax
@@ -27,7 +26,6 @@ import jax.numpy as jnp
 import numpy as np
 import xarray as xr
 
-from rps_jax import engines
 from rps_jax.control.base import Law
 from rps_jax.control.laws import force_push_published as force_push
 from rps_jax.control.laws.force_push import steer
@@ -35,17 +33,20 @@ from rps_jax.control.laws.force_push_published import PublishedForcePushParams
 from rps_jax.control.observation import Details, ForceObservation, Twist
 from rps_jax.engines import EngineName
 from rps_jax.geometry import planar, solid
-from rps_jax.geometry.footprint import Footprint
 from rps_jax.geometry.solid import Solid
 from rps_jax.robot.base import LoadCell, Odometry
 from rps_jax.robot.robot import Robot
 from rps_jax.robot.shell import Boards
 from rps_jax.robot.skin import IdealSkin
 from rps_jax.trials import trial
+from rps_jax.trials.batch import WorldBatch
 from rps_jax.trials.progress import Progress, ProgressCallback, no_progress
-from rps_jax.trials.trial import ControlLoop, Rules, Shift, World
+from rps_jax.trials.setting import Setting
+from rps_jax.trials.trial import ControlLoop, Rules, Shift
+from rps_jax.trials.worlds import build
 from rps_jax.world.physics import Physics
 from rps_jax.world.scene import JOINTS, Friction
+from sweeps.study_base import Rows
 
 SliderName = Literal["box", "cylinder"]
 SLIDERS: tuple[SliderName, ...] = get_args(SliderName)
@@ -59,6 +60,7 @@ LATERALS = (-0.4, 0.0, 0.4)  # [m] of the slider's middle, left of the path
 ANGLES = (-math.pi / 8, 0.0, math.pi / 8)  # [rad] of the slider, counter-clockwise
 CONTACTS = (-0.4, 0.0, 0.4)  # [m] along the slider's side, from its middle
 DIMS = ("inertia", "friction", "lateral", "angle", "contact")
+_VALUES = (INERTIAS, FRICTIONS, LATERALS, ANGLES, CONTACTS)
 DURATION = 300.0  # [s] from the first contact
 GROUND = 0.25  # [1] friction of the slider with the ground
 PHYSICS = Physics(timestep=0.005, control_period=0.01)
@@ -145,7 +147,7 @@ class Cells(NamedTuple):
 
 def cells() -> Cells:
     """Return all combinations."""
-    combinations = itertools.product(range(len(INERTIAS)), FRICTIONS, LATERALS, ANGLES, CONTACTS)
+    combinations = itertools.product(range(len(INERTIAS)), *_VALUES[1:])
     columns = (np.array(column) for column in zip(*combinations, strict=True))
     return Cells(*columns)
 
@@ -174,8 +176,8 @@ def worlds(
     engine: EngineName,
     params: PublishedForcePushParams = PARAMS,
     physics: Physics = PHYSICS,
-) -> tuple[Any, World, PublishedForcePushParams]:
-    """Return stage, worlds and law parameters of cells of the grid, on the host."""
+) -> WorldBatch:
+    """Return the worlds of cells of the grid, on the host."""
     count = grid.angle.size
     half = np.full(count, _HALF)
     box = slider == "box"
@@ -189,24 +191,25 @@ def worlds(
         q_object_body=np.tile([1.0, 0.0, 0.0, 0.0], (count, 1)),
     )
     friction = Friction(np.full(count, GROUND), np.maximum(grid.friction, _LEAST_FRICTION))
-    stage, fields = engines.get(engine).stage(slider, solids, friction, physics, _ROBOT)
 
-    def same(tree: Any) -> Any:
+    def repeated(tree: Any) -> Any:
         return jax.tree.map(lambda x: np.repeat(np.asarray(x, float)[None], count, axis=0), tree)
 
-    world: Any = {
-        "fields": fields,
-        "footprint": Footprint(solids.vertices, solids.radius),  # type: ignore[arg-type]
-        "skin": same(IdealSkin(shell=_ROBOT.shell)),
-        "p_world_target": np.tile([90.0, 0.0], (count, 1)),  # never reached
-        "shift": same(Shift(p_robot=jnp.zeros(2))),
-        "qpos": starts(slider, grid),
-        "odometry": same(Odometry()),
-    }
-    dtype = jnp.zeros(()).dtype
-    narrow = jax.tree.map(lambda x: np.asarray(x, dtype), world)
-    built = World(**narrow, key=np.zeros((count, 2), np.uint32))  # type: ignore[arg-type]
-    return stage, built, jax.tree.map(lambda x: np.asarray(x, dtype), same(params))
+    built = build(
+        np.arange(count),
+        slider,
+        solids,
+        friction,
+        _ROBOT,
+        Setting(engine, physics),
+        skin=repeated(IdealSkin(shell=_ROBOT.shell)),
+        p_world_target=np.tile([90.0, 0.0], (count, 1)),  # never reached
+        shift=repeated(Shift(p_robot=jnp.zeros(2))),
+        qpos=starts(slider, grid),
+        odometry=repeated(Odometry()),
+        key=np.zeros((count, 2), np.uint32),
+    )
+    return built.with_params(params)
 
 
 def run_grid(
@@ -237,19 +240,18 @@ def run_grid(
       along the path that was made good, of an ideal pusher's.
     """
     grid, law = cells(), build_law(name, duration)
-    stage, *inputs = worlds(slider, grid, engine, params, physics)
+    batch = worlds(slider, grid, engine, params, physics)
     period, count = physics.control_period, grid.angle.size
     horizon = duration + 2 * _BEHIND / float(params.v_max)
     loop = ControlLoop(physics, Rules(horizon=2 * horizon, max_lost=1e6), law)
-    trials = trial.start_all(*inputs, np.ones(count, bool), law=law)
-    apart, steps, start_time = np.zeros(count), 0, time.perf_counter()
-    waited = 0.0
+    trials = trial.start_all(*batch.inputs, np.ones(count, bool), law=law)
+    apart, steps, start_time, waited = np.zeros(count), 0, time.perf_counter(), 0.0
     while steps * period < horizon:
-        trials, snapshots = trial.record(stage, *inputs, trials, loop, steps=_SEGMENT, stride=_LOOK)
+        inputs = batch.stage, *batch.inputs, trials, loop
+        trials, snapshots = trial.record(*inputs, steps=_SEGMENT, stride=_LOOK)
         away = np.asarray(snapshots.qpos[..., 3:5] - snapshots.qpos[..., :2])
         apart = np.maximum(apart, np.hypot(*np.moveaxis(away, -1, 0)).max(axis=0))
-        if steps == 0:
-            waited += time.perf_counter() - start_time
+        waited = waited or time.perf_counter() - start_time  # of the first segment
         steps += _SEGMENT
         callback(Progress(0, steps * period * count, waited))
     state: FollowingState = jax.device_get(trials.law_state)
@@ -257,43 +259,34 @@ def run_grid(
     path_length = float(params.v_max) * duration
     failed = (apart > _MAX_DISTANCE) | (state.longest > _SILENT) | ~state.pushed
     failed |= np.asarray(trials.tipped | trials.diverged)
+    completion = 1 - np.hypot(end[:, 0] - path_length, end[:, 1]) / path_length
     columns = {
-        "success": (~failed).astype(np.int8),
-        "silent": state.longest.astype(float),
-        "apart": apart,
-        "deviation": end[:, 1],
-        "completion": 1 - np.hypot(end[:, 0] - path_length, end[:, 1]) / path_length,
+        "success": ((~failed).astype(np.int8), "1"),
+        "silent": (state.longest.astype(float), "s"),
+        "apart": (apart, "m"),
+        "deviation": (end[:, 1], "m"),
+        "completion": (completion, "1"),
     }
-    shape = (len(INERTIAS), len(FRICTIONS), len(LATERALS), len(ANGLES), len(CONTACTS))
-    values: dict[str, Sequence[Any]] = dict(
-        zip(DIMS, (INERTIAS, FRICTIONS, LATERALS, ANGLES, CONTACTS), strict=True)
-    )
-    units = {"silent": "s", "apart": "m", "deviation": "m"}
-    results = xr.Dataset(
-        {
-            name: (DIMS, column.reshape(shape), {"units": units.get(name, "1")})
-            for name, column in columns.items()
-        },
-        {name: list(value) for name, value in values.items()},
+    coords = dict(zip(DIMS, map(list, _VALUES), strict=True))
+    shape = [len(values) for values in _VALUES]
+    return xr.Dataset(
+        {name: (DIMS, x.reshape(shape), {"units": unit}) for name, (x, unit) in columns.items()},
+        coords,
         {"engine": engine, "duration": duration},
     )
-    return results
 
 
-def table(results: xr.Dataset) -> list[list[str]]:
+def table(results: xr.Dataset) -> Rows:
     """Return a header and one row per law and slider: successes, completion, deviation."""
     rows = [["law", "slider", "success", "by contact friction", "completion", "deviation"]]
     for law, slider in itertools.product(results.law.values, results.slider.values):
         outcomes = results.sel(law=law, slider=slider)
         deviation, completion = np.abs(outcomes.deviation.values), 100 * outcomes.completion.values
-        rows.append(
-            [
-                str(law),
-                str(slider),
-                f"{int(outcomes.success.sum())} of {outcomes.success.size}",
-                ", ".join(str(int(outcomes.success.sel(friction=mu).sum())) for mu in FRICTIONS),
-                f"{np.median(completion):.1f} % (least {completion.min():.1f})",
-                f"{np.median(deviation):.2f} m (most {deviation.max():.2f})",
-            ]
-        )
+        by_friction = [str(int(outcomes.success.sel(friction=mu).sum())) for mu in FRICTIONS]
+        rows.append([
+            str(law), str(slider), f"{int(outcomes.success.sum())} of {outcomes.success.size}",
+            ", ".join(by_friction),
+            f"{np.median(completion):.1f} % (least {completion.min():.1f})",
+            f"{np.median(deviation):.2f} m (most {deviation.max():.2f})",
+        ])  # fmt: skip
     return rows

@@ -11,19 +11,18 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import xarray as xr
 
 from rps_jax import engines, errors
-from rps_jax.analysis.report import Section
 from rps_jax.control.laws import force_push_published
 from rps_jax.engines import EngineName
 from rps_jax.record.options import option
 from rps_jax.runs.question import Run, call_of
 from rps_jax.trials.progress import SequentialProgress
 from sweeps.force_push_grid import grid
-from sweeps.study_base import Study
+from sweeps.study_base import Study, Table
 
 
 @dataclass(frozen=True)
@@ -35,7 +34,8 @@ class ForcePushGrid(Study[xr.Dataset]):
     """
 
     TITLE: ClassVar[str] = "Force Push on its authors' ground"
-    QUICK: ClassVar[Mapping[str, Any]] = {"duration": 60.0, "sliders": ("box",)}
+    QUICK: ClassVar[Mapping[str, object]] = {"duration": 60.0, "sliders": ("box",)}
+    CHOICES: ClassVar = {"laws": grid.LAWS, "sliders": grid.SLIDERS}
     GROWS: ClassVar[tuple[str, ...]] = ("laws", "sliders")
 
     laws: tuple[grid.LawName, ...] = grid.LAWS
@@ -51,12 +51,9 @@ class ForcePushGrid(Study[xr.Dataset]):
 
     def check(self) -> None:
         """Check the names, and that the engine supports these pushes."""
+        super().check()
         errors.check_each_once("laws", self.laws)
-        for law in self.laws:
-            errors.check_name("law", law, grid.LAWS)
         errors.check_each_once("sliders", self.sliders)
-        for slider in self.sliders:
-            errors.check_name("slider", slider, grid.SLIDERS)
         force_push_published.check(grid.PARAMS)
         engine = engines.get(self.engine)
         engine.check_senses("force")
@@ -73,14 +70,12 @@ class ForcePushGrid(Study[xr.Dataset]):
         for law in self.laws:
             of_law = []
             for slider in self.sliders:
-                push = partial(
-                    grid.run_grid, law, slider, self.engine, self.duration, callback=progress
-                )
+                inputs = law, slider, self.engine, self.duration
+                push = partial(grid.run_grid, *inputs, callback=progress)
                 of_law.append(run.checkpoint(f"{law}_{slider}", push))
                 progress.finish(of_law[-1].success.size)
             by_law.append(xr.concat(of_law, xr.IndexVariable("slider", list(self.sliders))))
-        results: Any = xr.concat(by_law, xr.IndexVariable("law", list(self.laws)))
-        return results
+        return xr.concat(by_law, xr.IndexVariable("law", list(self.laws)))
 
     def intro(self, results: xr.Dataset) -> str:
         """Return a description of the grid."""
@@ -89,9 +84,9 @@ class ForcePushGrid(Study[xr.Dataset]):
             f"on, engine {self.engine}."
         )
 
-    def report(self, results: xr.Dataset, run: Run) -> Sequence[Section]:
-        """Return a section with the successes by the authors' criterion."""
-        return [Section("Pushes that succeed", "", grid.table(results))]
+    def report_tables(self, results: xr.Dataset) -> Sequence[Table]:
+        """Return the successes by the authors' criterion."""
+        return [Table(grid.table(results), title="Pushes that succeed")]
 
 
 force_push_grid = call_of(ForcePushGrid)

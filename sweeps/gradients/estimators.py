@@ -11,12 +11,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from rps_jax.control import registry
-from rps_jax.control.base import LawParams
+from rps_jax.control.base import Law, LawParams
 from rps_jax.trials import pushes, trial
 from rps_jax.trials.case import Case
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import ControlLoop, Snapshot
 from rps_jax.tuning.gradients import Estimate, Scores, estimate, per_world, window
+from rps_jax.world.physics import Physics
 
 
 def forward(scores: Scores, theta: jax.Array, worlds: Any, *, clip: float = jnp.inf) -> Estimate:
@@ -129,14 +130,24 @@ def distances(
     part = pushes.build(cases, setting)
     law = registry.smooth_law(registry.law_of(cases[0].params))
     at = np.round(np.asarray(horizons) / setting.physics.control_period).astype(int)
-
-    def remaining(snapshots: Snapshot) -> jax.Array:
-        return snapshots.details.distance[at]
-
-    loop = ControlLoop(setting.physics, law=law)
-    scores = jax.jit(window(part.stage, params_of, remaining, loop, int(at[-1]) + 1))
+    scores = jax.jit(distances_at(at, part.stage, params_of, setting.physics, law))
     start = trial.start_all(part.worlds, part.params, np.ones(len(cases), bool), law=law)
     return scores, (part.worlds, start)
+
+
+def distances_at(
+    steps: np.ndarray,
+    stage: Any,
+    params_of: Callable[[jax.Array], LawParams],
+    physics: Physics,
+    law: Law,
+) -> Scores:
+    """Return the scores (n, H) [m] of started trials: distances after the control steps (H,)."""
+
+    def remaining(snapshots: Snapshot) -> jax.Array:
+        return snapshots.details.distance[steps]
+
+    return window(stage, params_of, remaining, ControlLoop(physics, law=law), int(steps[-1]) + 1)
 
 
 def _repeat(worlds: Any, times: int) -> Any:

@@ -21,8 +21,8 @@ import numpy as np
 import xarray as xr
 
 from rps_jax import errors
-from rps_jax.analysis.figures.style import Figure
-from rps_jax.analysis.report import Picture, Section
+from rps_jax.analysis.figures.style import Figure, tiles
+from rps_jax.analysis.report import Picture
 from rps_jax.control import registry
 from rps_jax.control.laws import rps
 from rps_jax.control.laws.rps import RPSParams
@@ -32,16 +32,16 @@ from rps_jax.runs.question import Run, Split, call_of, seed_of
 from rps_jax.trials import trial
 from rps_jax.trials.progress import Progress, set_phase
 from rps_jax.trials.setting import Setting
-from rps_jax.trials.trial import Snapshot, World
+from rps_jax.trials.trial import World
 from rps_jax.trials.worlds import drawn_worlds
 from rps_jax.tuning.descent import soften_skins
-from rps_jax.tuning.gradients import Estimate, Scores, reverse, window
+from rps_jax.tuning.gradients import Estimate, Scores, reverse
 from rps_jax.tuning.space import Space, expand_subsets
 from rps_jax.world import domain as domains
 from rps_jax.world import draws
 from rps_jax.world.domain import RANDOM, DomainLike
 from sweeps.gradients import estimators
-from sweeps.study_base import Study
+from sweeps.study_base import Rows, Study, Table
 
 TRUTH = "truth"
 # clipped is reverse with a bound on each world's gradient; combined, of reverse and evolution.
@@ -57,12 +57,13 @@ class Gradients(Study[xr.Dataset]):
     """
 
     TITLE: ClassVar[str] = "Gradients against finite differences"
-    QUICK: ClassVar[Mapping[str, Any]] = {
+    QUICK: ClassVar = {
         "horizons": (0.5, 2.0, 8.0),
         "worlds": 8,
         "truth": 64,
         "engine": "quasistatic",
     }
+    CHOICES: ClassVar = {"estimators": ESTIMATORS, "object": RANDOM}
     GROWS: ClassVar[tuple[str, ...]] = ("estimators",)
 
     estimators: tuple[str, ...] = ESTIMATORS
@@ -108,9 +109,7 @@ class Gradients(Study[xr.Dataset]):
 
     def check(self) -> None:
         """Check the names and that the horizons increase."""
-        for name in self.estimators:
-            errors.check_name("estimator", name, ESTIMATORS)
-        errors.check_name("object", self.object, RANDOM)
+        super().check()
         if not self.horizons or list(self.horizons) != sorted(set(self.horizons)):
             raise errors.InputError(
                 f"horizons = {self.horizons} is not allowed: give one or more, in increasing order."
@@ -145,10 +144,10 @@ class Gradients(Study[xr.Dataset]):
             f"{self.truth:,} worlds."
         )
 
-    def report(self, results: xr.Dataset, run: Run) -> Sequence[Section]:
+    def report_tables(self, results: xr.Dataset) -> Sequence[Table]:
         """Return cosine, bias and error of each estimator."""
         picture = Picture("gradients", partial(figure_of, results))
-        return [Section("Estimators against the truth", "", table(results), picture)]
+        return [Table(table(results), title="Estimators against the truth", picture=picture)]
 
 
 gradients = call_of(Gradients)
@@ -165,15 +164,9 @@ def _stage_and_worlds(study: Gradients, engine: EngineName, split: Split, count:
 
 def _distances(study: Gradients, stage: Any, physics: Any, smooth: bool) -> Scores:
     """Return scores (n, H) [m]: the distances at the horizons."""
-    period = physics.control_period
-    at = np.array([round(time / period) - 1 for time in study.horizons])
+    at = np.round(np.array(study.horizons) / physics.control_period).astype(int) - 1
     law = registry.smooth_law(rps.LAW) if smooth else rps.LAW
-
-    def remaining(snapshots: Snapshot) -> jax.Array:
-        return snapshots.details.distance[at]
-
-    loop = trial.ControlLoop(physics, law=law)
-    score = window(stage, study.space.params, remaining, loop, int(at[-1]) + 1)
+    score = estimators.distances_at(at, stage, study.space.params, physics, law)
 
     def scores(thetas: jax.Array, worlds: World) -> jax.Array:
         live, params = jnp.ones(thetas.shape[0], bool), jax.vmap(lambda _: RPSParams())(thetas)
@@ -243,32 +236,28 @@ def compare(estimates: Mapping[str, xr.Dataset], names: Sequence[str]) -> xr.Dat
     true = estimates[TRUTH].isel(repeat=0)
     norm = _norm(true.gradient)
     doubt = np.sqrt(true.variance.sum("parameter")) / norm
-    rows: list[xr.Dataset] = []
+    rows = []
     for name in names:
         estimate = estimates[name]
         product = (estimate.gradient * true.gradient).sum("parameter")
         cosine = product / (_norm(estimate.gradient) * norm)
-        rows.append(
-            xr.Dataset(
-                {
-                    "cosine": cosine.mean("repeat"),
-                    "least_cosine": cosine.min("repeat"),
-                    "greatest_cosine": cosine.max("repeat"),
-                    "bias": _norm(estimate.gradient.mean("repeat") - true.gradient) / norm,
-                    "error": np.sqrt(estimate.variance.sum("parameter").mean("repeat")) / norm,
-                    "finite": estimate.finite.mean(("repeat", "parameter")),
-                }
-            ).expand_dims(estimator=[name])
-        )
-    comparison = xr.concat(rows, "estimator")
-    return comparison.assign(doubt=doubt)
+        row = {
+            "cosine": cosine.mean("repeat"),
+            "least_cosine": cosine.min("repeat"),
+            "greatest_cosine": cosine.max("repeat"),
+            "bias": _norm(estimate.gradient.mean("repeat") - true.gradient) / norm,
+            "error": np.sqrt(estimate.variance.sum("parameter").mean("repeat")) / norm,
+            "finite": estimate.finite.mean(("repeat", "parameter")),
+        }
+        rows.append(xr.Dataset(row))
+    return xr.concat(rows, xr.IndexVariable("estimator", list(names))).assign(doubt=doubt)
 
 
 def _norm(gradient: xr.DataArray) -> xr.DataArray:
     return (gradient**2).sum("parameter") ** 0.5
 
 
-def table(results: xr.Dataset) -> list[list[str]]:
+def table(results: xr.Dataset) -> Rows:
     """Return rows of cosine, bias, error and finite share of each estimator at all horizons."""
     rows = [["estimator", "", *(f"{time:g} s" for time in results.horizon.values)]]
     for name in map(str, results.estimator.values):
@@ -291,27 +280,23 @@ def figure_of(results: xr.Dataset) -> Figure:
         "error": "standard error / norm of the truth [1]",
         "finite": "share of finite derivatives [1]",
     }
-    figure = Figure(figsize=(10, 6.5), layout="constrained")
+    figure, axes = tiles(4, 2, (5, 3.25), (0, 0), sharex=True)
     x = results.horizon.values
-    for ax, (field, label) in zip(
-        figure.subplots(2, 2, sharex=True).ravel(), panels.items(), strict=True
-    ):
+    for ax, (field, label) in zip(axes.ravel(), panels.items(), strict=True):
         for i, name in enumerate(map(str, results.estimator.values)):
-            curve = results.sel(estimator=name)
-            ax.plot(x, curve[field], "o-", ms=4, color=f"C{i}", label=name)
+            curve, colour = results.sel(estimator=name), f"C{i}"
+            ax.plot(x, curve[field], "o-", ms=4, color=colour, label=name)
             if field == "cosine":
-                ax.fill_between(
-                    x, curve.least_cosine, curve.greatest_cosine, color=f"C{i}", alpha=0.12, lw=0
-                )
+                low, high = curve.least_cosine, curve.greatest_cosine
+                ax.fill_between(x, low, high, color=colour, alpha=0.12, lw=0)
         if field in ("bias", "error"):
             ax.plot(x, results.doubt, "k--", lw=1, label="standard error of the truth")
             ax.set_yscale("log")
-        if field == "finite":
-            ax.set_ylim(-0.04, 1.04)
         ax.set(xscale="log", ylabel=label, xticks=x, xticklabels=[f"{t:g}" for t in x])
         ax.minorticks_off()
         ax.grid(alpha=0.3)
         if field in ("cosine", "bias"):
             ax.legend(fontsize=8)
+    axes[1, 1].set_ylim(-0.04, 1.04)
     figure.supxlabel("horizon [s]", fontsize=10)
     return figure

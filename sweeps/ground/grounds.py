@@ -3,21 +3,22 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import xarray as xr
 
-from rps_jax.errors import InputError
 from rps_jax.record.checkpoint import Checkpoints
-from rps_jax.trials.progress import Progress, ProgressCallback, no_progress
+from rps_jax.trials.progress import Progress, ProgressCallback, SequentialProgress, no_progress
 from rps_jax.world.physics import MUJOCO_GROUND, Physics, preset
 from rps_jax.world.scene import FRICTION
 from sweeps.ground import pushes
 from sweeps.ground.pushes import DISTANCE, OFFSETS, SPEEDS, STEPS, Pushes
+from sweeps.study_base import Rows, load_or_compute, records, text_table
 
 HEIGHTS = (0.06, 0.13, 0.2, 0.27, 0.34)  # [m] from the lower edge of the base to its upper one
 # [1] of a rigid object with the base: the scenes' own, and less, as where a hop has used it up.
@@ -38,17 +39,21 @@ class Kind:
 
 
 def _on(base: Physics, label: str, speeds: tuple[float, ...] = SPEEDS, **changes: Any) -> Kind:
-    return Kind(label, replace(base, **changes), speeds)
+    """Return a kind of ground by its changes to a base; `solref` is that of the ground."""
+    solref = changes.pop("solref", base.ground_solref)
+    return Kind(label, replace(base, ground_solref=solref, **changes), speeds)
 
 
 _C = preset(fidelity="reference")
+_FAST = preset(fidelity="fast")
 _DEFAULT = replace(_C, **MUJOCO_GROUND)
+_SLOW = (0.002, *SPEEDS)
 # In C MuJoCo, converged, in steps of 1 ms.
 CONVERGED = {
-    "ours": _on(_C, "ours, 1 ms", (0.002, *SPEEDS)),
-    "mujocos": _on(_DEFAULT, "MuJoCo's own, 1 ms", (0.002, *SPEEDS)),
+    "ours": _on(_C, "ours, 1 ms", speeds=_SLOW),
+    "mujocos": _on(_DEFAULT, "MuJoCo's own, 1 ms", speeds=_SLOW),
     "stiff": _on(
-        _C, "time constant 4 ms, impedance 0.95", ground_solref=(0.004, 1.0), ground_impedance=0.95
+        _C, "time constant 4 ms, impedance 0.95", solref=(0.004, 1.0), ground_impedance=0.95
     ),
     "impratio_1": _on(_C, "ours, impratio 1", impratio=1.0),
     "impratio_100": _on(_C, "ours, impratio 100", impratio=100.0),
@@ -61,36 +66,28 @@ CONVERGED = {
 STEPPED = {
     "ours_5ms": _on(_C, "ours, 5 ms", timestep=0.005),
     "standard": _on(preset(), "ours, standard: 10 ms"),
-    "fast": _on(preset(fidelity="fast"), "ours, fast: 20 ms, impedance 0.5"),
+    "fast": _on(_FAST, "ours, fast: 20 ms, impedance 0.5"),
     "mujocos_5ms": _on(_DEFAULT, "MuJoCo's own, 5 ms", timestep=0.005),
     "mujocos_10ms": _on(_DEFAULT, "MuJoCo's own, 10 ms", timestep=0.01),
 }
 # Ever stiffer: first with damping that grows along, then with hops that last as long as ours.
 STIFFER = {
-    "critical_10": _on(
-        _DEFAULT, "MuJoCo's own, time constant 10 ms", timestep=5e-4, ground_solref=(0.01, 1.0)
-    ),
-    "critical_5": _on(
-        _DEFAULT, "MuJoCo's own, time constant 5 ms", timestep=2.5e-4, ground_solref=(0.005, 1.0)
-    ),
-    "critical_2": _on(
-        _DEFAULT, "MuJoCo's own, time constant 2 ms", timestep=1e-4, ground_solref=(0.002, 1.0)
-    ),
-    "damping_01": _on(
-        _C, "ours, damping ratio 0.1: 9 times as stiff", timestep=5e-4, ground_solref=(0.1, 0.1)
-    ),
-    "damping_003": _on(
-        _C, "ours, damping ratio 0.03: 100 times as stiff", timestep=1e-4, ground_solref=(0.1, 0.03)
-    ),
-}
+    f"critical_{1000 * constant:g}": _on(
+        _DEFAULT, f"MuJoCo's own, time constant {1000 * constant:g} ms",
+        timestep=timestep, solref=(constant, 1.0),
+    )
+    for constant, timestep in ((0.01, 5e-4), (0.005, 2.5e-4), (0.002, 1e-4))
+} | {
+    f"damping_{name}": _on(_C, f"ours, damping ratio {ratio}: {times} times as stiff",
+                           timestep=timestep, solref=(0.1, ratio))
+    for name, ratio, times, timestep in (("01", 0.1, 9, 5e-4), ("003", 0.03, 100, 1e-4))
+}  # fmt: skip
 # Lifted less by MuJoCo's cones: the lower the impedance, the deeper an object rests.
-_LOW = {"ground_solref": (0.1, 0.2), "ground_impedance": 0.3}
+_LOW = {"solref": (0.1, 0.2), "ground_impedance": 0.3}
 LOWER = {
     "lower": _on(_C, "(0.1 s, 0.2), impedance 0.3", **_LOW),
     "lower_10ms": _on(preset(), "(0.1 s, 0.2), impedance 0.3, 10 ms", **_LOW),
-    "lower_20ms": _on(
-        preset(fidelity="fast"), "(0.1 s, 0.4), impedance 0.5, 20 ms", ground_solref=(0.1, 0.4)
-    ),
+    "lower_20ms": _on(_FAST, "(0.1 s, 0.4), impedance 0.5, 20 ms", solref=(0.1, 0.4)),
 }
 GROUNDS = CONVERGED | STEPPED | STIFFER | LOWER
 QUICK = ("ours", "mujocos", "standard")
@@ -121,35 +118,25 @@ def run(
       InputError: the folder holds a ground of the same name that was run otherwise.
     """
     parts = None if folder is None else Checkpoints(folder)
-    finished, simulated = 0, 0.0
-
-    def on_push(pushed: int, seconds: float) -> None:
-        nonlocal finished, simulated
-        finished, simulated = finished + pushed, simulated + seconds
-        callback(Progress(finished, simulated))
-
-    options = f"{tuple(objects)} {tuple(offsets)}"
-    limit = _part(
+    progress, options, datasets = (
+        SequentialProgress(callback),
+        f"{tuple(objects)} {tuple(offsets)}",
+        [],
+    )
+    limit = load_or_compute(
         parts,
         LIMIT,
         f"{options} {HEIGHTS} {FRICTIONS} {steps}",
-        lambda: _limit(objects, offsets, steps),
+        partial(_limit, objects, offsets, steps),
     )
-    datasets = []
     for name in names:
-        ground = GROUNDS[name]
-        previous = finished
-        dataset = _part(
-            parts,
-            name,
-            f"{options} {replace(ground, what='')!r}{'' if worlds is None else f' {worlds}'}",
-            lambda ground=ground: _pushes(ground, objects, offsets, worlds, on_push),
-        )
-        on_push(previous + _count(ground, objects, offsets, worlds) - finished, 0.0)
-        datasets.append(dataset.drop_attrs(deep=False))
-    whole = xr.concat(
-        datasets, xr.DataArray(list(names), dims="ground", name="ground"), join="outer"
-    )
+        cases = list(itertools.product(objects, offsets, GROUNDS[name].speeds))
+        run_as = f"{options} {replace(GROUNDS[name], what='')!r}" + (f" {worlds}" if worlds else "")
+        compute = partial(_pushes, GROUNDS[name].physics, cases, worlds, progress)
+        datasets.append(load_or_compute(parts, name, run_as, compute))
+        progress.finish(len(cases[:worlds]))
+        progress(Progress(0, 0.0))
+    whole = xr.concat(datasets, xr.IndexVariable("ground", list(names)), join="outer")
     whole = whole.assign_coords(what=("ground", [GROUNDS[name].what for name in names]))
     whole = whole.assign({f"limit_{name}": limit[name] for name in _LIMIT_FIELDS})
     at = whole.height.clip(min(HEIGHTS), max(HEIGHTS)).fillna(HEIGHTS[0])
@@ -170,106 +157,88 @@ def as_if(results: xr.Dataset) -> xr.DataArray:
 
 
 def count(names: Sequence[str], worlds: int | None = None) -> int:
-    """Pushes of these grounds, of all objects at all offsets."""
-    return sum(_count(GROUNDS[name], OBJECTS, OFFSETS, worlds) for name in names)
-
-
-def _count(
-    ground: Kind, objects: Sequence[str], offsets: Sequence[float], worlds: int | None
-) -> int:
-    total = len(objects) * len(offsets) * len(ground.speeds)
-    return total if worlds is None else min(worlds, total)
-
-
-def _part(
-    parts: Checkpoints | None, name: str, run_as: str, make: Callable[[], xr.Dataset]
-) -> xr.Dataset:
-    """A part that was run so, or is now."""
-    if parts is None:
-        return make()
-    results = parts.load_or_compute(name, lambda: make().assign_attrs(run_as=run_as))
-    if results.attrs.get("run_as") != run_as:
-        raise InputError(
-            f"{parts.folder / name}-*.nc was run with other options: choose another folder, or "
-            "delete it to run again."
-        )
-    return results
+    """Return the number of pushes on these grounds, of all objects at all offsets."""
+    pushes_on = [len(OBJECTS) * len(OFFSETS) * len(GROUNDS[name].speeds) for name in names]
+    return sum(min(total, worlds or total) for total in pushes_on)
 
 
 def _pushes(
-    ground: Kind,
-    objects: Sequence[str],
-    offsets: Sequence[float],
+    physics: Physics,
+    cases: Sequence[tuple[str, float, float]],
     worlds: int | None,
-    on_push: Callable[[int, float], None],
+    callback: ProgressCallback,
 ) -> xr.Dataset:
-    targets, results = pushes.targets(), []
-    for name, offset, speed in itertools.product(objects, offsets, ground.speeds):
-        if len(results) == worlds:
-            break
-        results.append(pushes.in_mujoco(targets[name], offset, speed, ground.physics))
-        on_push(1, DISTANCE / speed)
-    missing = len(objects) * len(offsets) * len(ground.speeds) - len(results)
-    results += [pushes.NOTHING] * missing
-    shape = (len(objects), len(offsets), len(ground.speeds))
-    columns = {
-        name: (_DIMS, np.reshape([getattr(result, name) for result in results], shape))
-        for name in Pushes._fields
+    """Return the pushes (object, offset, speed) of cases in this order; NaN after the first few."""
+    targets, results, simulated = pushes.targets(), [], 0.0
+    for name, offset, speed in cases[:worlds]:
+        results.append(pushes.in_mujoco(targets[name], offset, speed, physics))
+        simulated += DISTANCE / speed
+        callback(Progress(len(results), simulated))
+    results += [pushes.NOTHING] * (len(cases) - len(results))
+    coords = {
+        dim: list(dict.fromkeys(x)) for dim, x in zip(_DIMS, zip(*cases, strict=True), strict=True)
     }
-    coords = {"object": list(objects), "offset": list(offsets), "speed": list(ground.speeds)}
-    return xr.Dataset(columns, coords)
+    return _dataset(Pushes._fields, results, coords)
 
 
 def _limit(objects: Sequence[str], offsets: Sequence[float], steps: int) -> xr.Dataset:
+    """Return the rigid limit (object, offset, at_height, friction)."""
     targets = pushes.targets()
     grid = np.meshgrid(offsets, HEIGHTS, FRICTIONS, indexing="ij")
     values = [axis.ravel() for axis in grid]
     results = [pushes.in_the_limit(targets[name], *values, steps=steps) for name in objects]
+    coords = {"object": objects, "offset": offsets, "at_height": HEIGHTS, "friction": FRICTIONS}
+    return _dataset(_LIMIT_FIELDS, results, coords)
+
+
+def _dataset(
+    names: Sequence[str], results: Sequence[Pushes], coords: Mapping[str, Sequence[Any]]
+) -> xr.Dataset:
+    """Return fields of pushes along the dimensions of some coordinates, the last one fastest."""
+    shape = [len(values) for values in coords.values()]
     columns = {
-        name: (
-            ("object", "offset", "at_height", "friction"),
-            np.reshape(
-                [getattr(result, name) for result in results], (len(results), *grid[0].shape)
-            ),
-        )
-        for name in _LIMIT_FIELDS
+        name: (tuple(coords), np.reshape([getattr(x, name) for x in results], shape))
+        for name in names
     }
-    coords = {"object": list(objects), "offset": list(offsets)}
-    return xr.Dataset(columns, coords | {"at_height": list(HEIGHTS), "friction": list(FRICTIONS)})
+    return xr.Dataset(columns, {dim: list(values) for dim, values in coords.items()})
 
 
-def table(results: xr.Dataset, speeds: Sequence[float] = SPEEDS) -> list[list[str]]:
-    """Header and a row for each ground.
+_AT_SPEED = {
+    "error": "{error:.1f} mm",
+    "push over mu m g": "{force:.3f}",
+    "spread": "{spread:.1f} %",
+    "as if of friction": "{friction:.2f}",
+}
+
+
+def table(results: xr.Dataset, speeds: Sequence[float] = SPEEDS) -> Rows:
+    """Return a header and a row per ground.
 
     The error is the root of the mean square over objects and offsets; force, spread and height are
     means, hop and tilt the largest.
     """
-    header = ["ground"]
-    for speed in speeds:
-        at = f"{100 * speed:g} cm/s"
-        header += [f"error, {at}", f"push over mu m g, {at}", f"spread, {at}"]
-        header += [f"as if of friction, {at}"]
-    header += ["height of the push", "largest hop", "largest tilt", "aloft"]
-    dry = results.sel(friction=FRICTIONS[0])
+    header = [f"{name}, {100 * speed:g} cm/s" for speed in speeds for name in _AT_SPEED]
+    dry, over = results.sel(friction=FRICTIONS[0]), ["object", "offset"]
     force, spread = (float(dry[f"limit_{name}"].mean()) for name in ("force", "spread"))
     rigid = ["0", f"{force:.3f}", f"{100 * spread:.1f} %", f"{FRICTIONS[0]:g}"] * len(speeds)
-    rows = [header, ["rigid object", *rigid, "all", "0", "0", "0"]]
-    friction = as_if(results)
+    rows = [
+        ["ground", *header, "height of the push", "largest hop", "largest tilt", "aloft"],
+        ["rigid object", *rigid, "all", "0", "0", "0"],
+    ]
+    chosen = results.sel(speed=list(speeds))
+    at_speed = xr.Dataset({
+        "error": 1000 * np.sqrt((chosen.error**2).mean(over)), "force": chosen.force.mean(over),
+        "spread": 100 * chosen.spread.mean(over), "friction": as_if(chosen),
+    })  # fmt: skip
     for name in map(str, results.ground.values):
-        ground = results.sel(ground=name)
-        row = [str(ground.what.values)]
-        for speed in speeds:
-            at = ground.sel(speed=speed)
-            error = float(np.sqrt((at.error**2).mean()))
-            row += [f"{1000 * error:.1f} mm", f"{float(at.force.mean()):.3f}"]
-            row += [f"{100 * float(at.spread.mean()):.1f} %"]
-            row += [f"{float(friction.sel(ground=name, speed=speed)):.2f}"]
-        chosen = ground.sel(speed=list(speeds))
-        row += [
-            f"{100 * float(chosen.height.min()):.0f} to {100 * float(chosen.height.max()):.0f} cm",
-            f"{1000 * float(chosen.hop.max()):.2f} mm",
-            f"{1000 * float(chosen.tilt.max()):.1f} mrad",
-            f"{100 * float(chosen.aloft.max()):.0f} %",
-        ]
-        rows.append(row)
+        ground = chosen.sel(ground=name)
+        _, *cells = text_table(_AT_SPEED, records(at_speed.sel(ground=name), "speed"))
+        rows.append([
+            str(ground.what.values),
+            *itertools.chain(*cells),
+            f"{100 * float(ground.height.min()):.0f} to {100 * float(ground.height.max()):.0f} cm",
+            f"{1000 * float(ground.hop.max()):.2f} mm",
+            f"{1000 * float(ground.tilt.max()):.1f} mrad",
+            f"{100 * float(ground.aloft.max()):.0f} %",
+        ])  # fmt: skip
     return rows

@@ -125,7 +125,8 @@ def in_mujoco(target: Target, offset: float, speed: float, physics: Physics) -> 
     x, y, yaw = start_of(target, offset)
     free = JOINTS.object
     data.qpos[:] = scene.initial_qpos(chosen)
-    data.qpos[free] = [x + shell.HALF_LENGTH, y, height / 2, *_upright(yaw)]
+    quaternion = [math.cos(yaw / 2), 0.0, 0.0, math.sin(yaw / 2)]
+    data.qpos[free] = [x + shell.HALF_LENGTH, y, height / 2, *quaternion]
     for _ in range(round(_SETTLE / dt)):
         data.qvel[JOINTS.base] = 0.0
         mujoco.mj_step(model, data)
@@ -146,7 +147,7 @@ def in_mujoco(target: Target, offset: float, speed: float, physics: Physics) -> 
         way[i] = c * qpos[0] + s * qpos[1]
         rise[i], upright[i] = qpos[5], 1 - 2 * (qpos[7] ** 2 + qpos[8] ** 2)
         if i % interval == 0:
-            samples.append((*_contact_forces(model, data), _yaw(qpos)))
+            samples.append((*_contact_forces(model, data), 2 * math.atan2(qpos[9], qpos[6])))
             if not abs(qpos[5]) < height:
                 return NOTHING  # it diverged
     weight = float(target.solid.mass[0]) * GRAVITY
@@ -168,16 +169,6 @@ def in_mujoco(target: Target, offset: float, speed: float, physics: Physics) -> 
         sink=height / 2 - stood,
     )
     return Pushes(*(np.asarray(value, float) for value in result))
-
-
-def _upright(yaw: float) -> tuple[float, float, float, float]:
-    """Return the quaternion of a turn about the vertical by `yaw` [rad]."""
-    return math.cos(yaw / 2), 0.0, 0.0, math.sin(yaw / 2)
-
-
-def _yaw(qpos: np.ndarray) -> float:
-    """Return the yaw of the object [rad]."""
-    return 2 * math.atan2(qpos[9], qpos[6])
 
 
 def _contact_forces(
@@ -226,6 +217,7 @@ def in_the_limit(
     way = rigid.push(pushed, pose, DISTANCE, steps, direction=target.direction, rounding=rounding)
     push = way.force @ np.array(target.direction) / ground
     late = push[steps // 2 :]
+    none = dict.fromkeys(("borne", "aloft", "hop", "tilt", "sink"), np.zeros(count))
     return Pushes(
         lateral=way.pose[-1, :, 1],
         yaw=way.pose[-1, :, 2],
@@ -233,9 +225,5 @@ def in_the_limit(
         spread=late.std(axis=0) / late.mean(axis=0),
         work=push.mean(axis=0),
         height=height,
-        borne=np.zeros(count),
-        aloft=np.zeros(count),
-        hop=np.zeros(count),
-        tilt=np.zeros(count),
-        sink=np.zeros(count),
+        **none,
     )

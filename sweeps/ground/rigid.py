@@ -115,20 +115,13 @@ def push(
         solution = solve(pushed, pose, u, step, twist, force, rounding)
         twist, force = solution.twist, solution.force
         # The centre of mass moves on a line, and the origin about it.
-        com = _turned(pose[:, 2], pushed.solids.p_object_com[:, :2])
-        yaw = pose[:, 2] + step * twist[:, 2]
-        arm = com - _turned(yaw, pushed.solids.p_object_com[:, :2])
-        moved = pose[:, :2] + step * (twist[:, :2] - u) + arm
-        pose = np.column_stack([moved, yaw])
+        p_object_com, yaw = pushed.solids.p_object_com[:, :2], pose[:, 2] + step * twist[:, 2]
+        arm = _turned(pose[:, 2], p_object_com) - _turned(yaw, p_object_com)
+        pose = np.column_stack([pose[:, :2] + step * (twist[:, :2] - u) + arm, yaw])
         poses.append(pose)
         solutions.append(solution)
-    return Way(
-        pose=np.stack(poses),
-        force=np.stack([solution.force for solution in solutions]),
-        loads=np.stack([solution.loads for solution in solutions]),
-        power=np.stack([solution.power for solution in solutions]),
-        rounds=max(solution.rounds for solution in solutions),
-    )
+    _, force, loads, power, rounds = map(np.stack, zip(*solutions, strict=True))
+    return Way(np.stack(poses), force, loads, power, int(rounds.max()))
 
 
 def solve(
@@ -142,36 +135,27 @@ def solve(
 ) -> Solution:
     """Return the solution for objects (B,) at poses (B, 3), from a first guess."""
     touching, mu = contacts(pushed.solids, pose), pushed.friction_ground[:, None]
-    mu_robot = pushed.friction_robot[:, None]
-    tangent = np.stack([-touching.normal[..., 1], touching.normal[..., 0]], axis=-1)
-    pressed, loads, lifted = (
-        np.zeros(touching.gap.shape),
-        np.zeros((1, 1)),
-        np.zeros((len(pose), 1)),
-    )
-    rounds = 0
-    while True:
+    mu_robot, tangent = pushed.friction_robot[:, None], _across(touching.normal)
+    stiffness = 1.0 if pushed.solids.feet is None else pushed.solids.feet[..., 2]
+    pressed, loads, lifted = np.zeros(touching.gap.shape), np.zeros((1, 1)), np.zeros((1, 1))
+    for rounds in range(1, ROUNDS + 1):
         pressure = pushed.height[:, None] * force
         feet = supports(pushed.solids, pose[:, 2], pressure)
         count = feet.shape[1]
-        weight = 1.0 if pushed.solids.feet is None else pushed.solids.feet[..., 2]
-        previous, loads = loads, borne(feet, pressure, lifted, weight)
+        previous, loads = loads, supported_load(feet, pressure, lifted, stiffness)
         problem = _problem(feet, touching, u, step)
         weights = np.concatenate([mu * loads, mu_robot * pressed], axis=1)
-        twist = minimise(problem, weights, twist, rounding, first=rounds == 0)
+        twist = minimise(problem, weights, twist, rounding, first=rounds == 1)
         slid, speed, slip = _slides(problem, twist, rounding)
         pushing = np.maximum(-_gaps(problem, twist), 0.0) / rounding.depth
-        rubbing = -(weights / np.maximum(speed, slip))[..., None] * slid
-        force = np.sum(
-            pushing[..., None] * touching.normal + rubbing[:, count:, :1] * tangent, axis=1
-        )
+        rubbing = (-(weights / np.maximum(speed, slip))[..., None] * slid)[:, count:, :1]
+        force = np.sum(pushing[..., None] * touching.normal + rubbing * tangent, axis=1)
         lifted = rounding.lift * speed[:, :count] / count
         changed = max(np.abs(pushing - pressed).max(), np.abs(loads - previous).max())
-        pressed, rounds = pushing, rounds + 1
-        if changed < _CLOSE or rounds == ROUNDS:
+        pressed = pushing
+        if changed < _CLOSE:
             break
-    power = np.sum(weights * speed, axis=1)
-    return Solution(twist, force, loads, power, rounds)
+    return Solution(twist, force, loads, np.sum(weights * speed, axis=1), rounds)
 
 
 # --- support points and contacts -------------------------------------------------------------
@@ -195,7 +179,7 @@ def supports(solids: Solid, yaw: np.ndarray, pressure: np.ndarray) -> np.ndarray
     return rim - com[:, None]
 
 
-def borne(
+def supported_load(
     feet: np.ndarray, pressure: np.ndarray, lifted: np.ndarray, weight: np.ndarray | float = 1.0
 ) -> np.ndarray:
     """Return loads (B, S) [m g] of springs that only push, with sum 1 and moment `pressure`.
@@ -245,17 +229,12 @@ def contacts(solids: Solid, pose: np.ndarray) -> Contacts:
     offset = edges[:, None] - corners[:, None]  # (B, 2, N, 2)
     beyond = np.sum(offset * out[:, None], axis=-1)
     nearest_side = np.argmax(beyond, axis=2)
-    of_side = np.take_along_axis
-    along_side = of_side(np.sum(offset * unit[:, None], axis=-1), nearest_side[..., None], 2)[
-        ..., 0
-    ]
-    side = of_side(out, nearest_side[..., None], 1)
-    exists = (
-        (along_side >= 0)
-        & (along_side <= of_side(length, nearest_side, 1))
-        & (side[..., 0] < -_FACING)
-    )
-    end_gap = np.where(exists, of_side(beyond, nearest_side[..., None], 2)[..., 0], _FAR)
+    of_side, at_ends = np.take_along_axis, nearest_side[..., None]
+    along_side = of_side(np.sum(offset * unit[:, None], axis=-1), at_ends, 2)[..., 0]
+    side = of_side(out, at_ends, 1)
+    exists = (along_side >= 0) & (along_side <= of_side(length, nearest_side, 1))
+    exists &= side[..., 0] < -_FACING
+    end_gap = np.where(exists, of_side(beyond, at_ends, 2)[..., 0], _FAR)
     return Contacts(
         np.concatenate([ahead, -side], axis=1),
         np.concatenate([corners, np.broadcast_to(edges, (len(pose), 2, 2))], axis=1) - centre,
@@ -266,15 +245,13 @@ def contacts(solids: Solid, pose: np.ndarray) -> Contacts:
 def _problem(feet: np.ndarray, touching: Contacts, u: np.ndarray, step: float) -> Problem:
     """Return the kinematics of points and contacts for a base that moves at u (2,)."""
     normal = touching.normal
-    tangent = np.stack([-normal[..., 1], normal[..., 0]], axis=-1)
+    tangent = _across(normal)
     along = _of_twist(tangent, touching.at)
     zero = np.zeros((*feet.shape[:2], 1))
-    unit = zero + 1.0
-    rows_x = np.concatenate([unit, zero, -feet[..., 1:]], axis=-1)
-    rows_y = np.concatenate([zero, unit, feet[..., :1]], axis=-1)
-    rows = np.concatenate(
-        [np.stack([rows_x, rows_y], axis=2), np.stack([along, 0 * along], axis=2)], axis=1
-    )
+    rows_x = np.concatenate([zero + 1, zero, -feet[..., 1:]], axis=-1)
+    rows_y = np.concatenate([zero, zero + 1, feet[..., :1]], axis=-1)
+    of_feet, of_contacts = np.stack([rows_x, rows_y], axis=2), np.stack([along, 0 * along], axis=2)
+    rows = np.concatenate([of_feet, of_contacts], axis=1)
     base = np.zeros(rows.shape[:3])
     base[:, feet.shape[1] :, 0] = tangent @ u
     return Problem(rows, base, _of_twist(normal, touching.at), normal @ u, touching.gap, step)
@@ -292,9 +269,8 @@ def minimise(
     starts with a wide slip.
     """
     for rounder in (100.0, 10.0, 1.0) if first else (1.0,):
-        soft = rounding._replace(
-            slip=rounder * rounding.slip, slip_base=rounder * rounding.slip_base
-        )
+        slip, slip_base = rounder * rounding.slip, rounder * rounding.slip_base
+        soft = rounding._replace(slip=slip, slip_base=slip_base)
         for _ in range(60):
             gradient, *hessians = _derivatives(problem, weights, twist, soft)
             if np.abs(gradient).max() < _BALANCED:
@@ -317,14 +293,10 @@ def _slides(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return sliding (B, K, 2), its speed (B, K), and the speed (K,) of dry friction."""
     slid = np.einsum("bkij,bj->bki", problem.rows, twist) - problem.base
-    return slid, np.linalg.norm(slid, axis=-1), _slip(problem, rounding)
-
-
-def _slip(problem: Problem, rounding: Rounding) -> np.ndarray:
-    """Return the sliding speed (K,) above which friction is dry."""
     contacts = problem.gap.shape[1]
-    points = problem.rows.shape[1] - contacts
-    return np.repeat([rounding.slip, rounding.slip_base], [points, contacts])
+    counts = [slid.shape[1] - contacts, contacts]
+    slip = np.repeat([rounding.slip, rounding.slip_base], counts)
+    return slid, np.linalg.norm(slid, axis=-1), slip
 
 
 def _gaps(problem: Problem, twist: np.ndarray) -> np.ndarray:
@@ -370,6 +342,11 @@ def _turned(yaw: np.ndarray, vector: np.ndarray) -> np.ndarray:
     c, s = np.cos(yaw)[..., None], np.sin(yaw)[..., None]
     x, y = vector[..., :1], vector[..., 1:]
     return np.concatenate([c * x - s * y, s * x + c * y], axis=-1)
+
+
+def _across(vector: np.ndarray) -> np.ndarray:
+    """Return vectors (..., 2) turned by a right angle, counter-clockwise."""
+    return np.stack([-vector[..., 1], vector[..., 0]], axis=-1)
 
 
 def _of_twist(direction: np.ndarray, at: np.ndarray) -> np.ndarray:

@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 import xarray as xr
@@ -19,11 +19,11 @@ from matplotlib.lines import Line2D
 
 from rps_jax import errors
 from rps_jax.analysis.figures.style import Figure, words
-from rps_jax.analysis.report import Picture, Section
+from rps_jax.analysis.report import Picture
 from rps_jax.record.options import option
 from rps_jax.runs.question import Run, call_of
 from sweeps.ground import grounds
-from sweeps.study_base import Study
+from sweeps.study_base import Study, Table
 
 
 @dataclass(frozen=True)
@@ -35,7 +35,8 @@ class Ground(Study[xr.Dataset]):
     """
 
     TITLE: ClassVar[str] = "Which ground is dry friction?"
-    QUICK: ClassVar[Mapping[str, Any]] = {"grounds": grounds.QUICK}
+    QUICK: ClassVar[Mapping[str, object]] = {"grounds": grounds.QUICK}
+    CHOICES: ClassVar = {"grounds": grounds.GROUNDS}
     GROWS: ClassVar[tuple[str, ...]] = ("grounds",)
 
     grounds: tuple[str, ...] = tuple(grounds.GROUNDS)
@@ -48,9 +49,8 @@ class Ground(Study[xr.Dataset]):
 
     def check(self) -> None:
         """Check the names."""
+        super().check()
         errors.check_each_once("grounds", self.grounds)
-        for name in self.grounds:
-            errors.check_name("ground", name, grounds.GROUNDS)
 
     def num_trials(self) -> int | None:
         """Return the number of pushes."""
@@ -68,10 +68,11 @@ class Ground(Study[xr.Dataset]):
             "object ends from where a rigid one ends."
         )
 
-    def report(self, results: xr.Dataset, run: Run) -> Sequence[Section]:
-        """Errors, forces and hops of each ground."""
+    def report_tables(self, results: xr.Dataset) -> Sequence[Table]:
+        """Return errors, forces and hops of each ground."""
         picture = Picture("ground", partial(figure_of, results, grounds.DRAWN))
-        return [Section("Grounds beside a rigid object", "", grounds.table(results), picture)]
+        title = "Grounds beside a rigid object"
+        return [Table(grounds.table(results), title=title, picture=picture)]
 
 
 ground = call_of(Ground)
@@ -84,46 +85,42 @@ def figure_of(results: xr.Dataset, names: Collection[str]) -> Figure:
     `limit_lateral` [m], by (object, offset, at_height, friction), of which the first is the own.
     """
     chosen = [name for name in map(str, results.ground.values) if name in names]
-    objects = list(map(str, results.object.values))
     figure = Figure(figsize=(11, 7), layout="constrained")
     above, below = figure.subplots(2, 3)
-    speeds = results.speed.values
-    for ax, target in zip(above, objects, strict=False):
+    speeds, marks = results.speed.values, "vos^D"
+    for ax, target in zip(above, map(str, results.object.values), strict=False):
         dataset = results.sel(object=target)
         for offset in results.offset.values:
             line = 1000 * dataset.limit_lateral.sel(offset=offset).isel(friction=0)
             ax.plot(100 * results.at_height, line, "k-", lw=1)
         for i, name in enumerate(chosen):
-            for speed, marker in zip(speeds, "vos^D", strict=False):
+            for speed, mark in zip(speeds, marks, strict=False):
                 at = dataset.sel(ground=name, speed=speed)
-                style = {"color": f"C{i}", "marker": marker, "ls": "none", "ms": 5}
-                ax.plot(100 * at.height, 1000 * at.lateral, mfc="none", **style)
+                style = {"color": f"C{i}", "marker": mark, "ls": "none", "ms": 5, "mfc": "none"}
+                ax.plot(100 * at.height, 1000 * at.lateral, **style)
         ax.set(title=words(target), xlabel="height of the push [cm]")
         ax.grid(alpha=0.3)
     above[0].set_ylabel("end, along the base's front [mm]")
+    over = ("object", "offset")
     panels = {
-        "error": "from the rigid object's end [mm]",
-        "spread": "spread of the push force [%]",
-        "hop": "largest hop [mm]",
+        "from the rigid object's end [mm]": 1000 * np.sqrt((results.error**2).mean(over)),
+        "spread of the push force [%]": 100 * results.spread.mean(over),
+        "largest hop [mm]": 1000 * results.hop.max(over),
     }
-    for ax, (field, label) in zip(below, panels.items(), strict=True):
+    for ax, (ylabel, values) in zip(below, panels.items(), strict=True):
         for i, name in enumerate(chosen):
-            dataset, over = results[field].sel(ground=name), ("object", "offset")
-            value = dataset.max(over) if field == "hop" else dataset.mean(over)
-            if field == "error":
-                value = np.sqrt((dataset**2).mean(over))
-            factor = 100 if field == "spread" else 1000
-            label = str(results.what.sel(ground=name).values)
-            ax.plot(100 * speeds, factor * value, "o-", ms=4, color=f"C{i}", label=label)
-        ax.set(xscale="log", yscale="log", xlabel="speed of the base [cm/s]", ylabel=label)
+            at = values.sel(ground=name)
+            ax.plot(100 * speeds, at, "o-", ms=4, color=f"C{i}", label=str(at.what.item()))
+        ax.set(xscale="log", yscale="log", xlabel="speed of the base [cm/s]", ylabel=ylabel)
         ax.set_xticks(100 * speeds, [f"{100 * speed:g}" for speed in speeds])
         ax.minorticks_off()
         ax.grid(alpha=0.3)
-    marks = [
-        Line2D([], [], color="0.3", marker=marker, ls="none", mfc="none", label=f"{100 * v:g} cm/s")
-        for v, marker in zip(speeds, "vos^D", strict=False)
-    ]
-    rigid = Line2D([], [], color="k", lw=1, label="rigid object, at three offsets")
-    handles = [rigid, *marks, *below[0].get_legend_handles_labels()[0]]
+    style = {"color": "0.3", "ls": "none", "mfc": "none"}
+    handles = [
+        Line2D([], [], color="k", lw=1, label="rigid object, at three offsets"),
+        *(Line2D([], [], marker=mark, label=f"{100 * speed:g} cm/s", **style)
+          for mark, speed in zip(marks, speeds, strict=False)),
+        *below[0].get_legend_handles_labels()[0],
+    ]  # fmt: skip
     figure.legend(handles=handles, loc="outside lower center", ncols=4, fontsize=8)
     return figure

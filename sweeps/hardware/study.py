@@ -18,12 +18,11 @@ from typing import ClassVar
 
 import numpy as np
 import xarray as xr
+from scipy import stats
 
-from rps_jax.analysis.report import Section
 from rps_jax.control import registry
 from rps_jax.control.registry import LawLike
 from rps_jax.record.options import option
-from rps_jax.runs import execution
 from rps_jax.runs.plan import Plan
 from rps_jax.runs.question import Run, call_of
 from rps_jax.trials.setting import Setting
@@ -31,7 +30,7 @@ from rps_jax.tuning import fit
 from rps_jax.world import domain as domains
 from rps_jax.world import paper, points
 from rps_jax.world.domain import Domain
-from sweeps.study_base import Table, TrialStudy
+from sweeps.study_base import Rows, Table, TrialStudy, run_plans
 
 RANGES = (
     "hardware,friction_ground=0.1:0.8,friction_robot=0.15:1.2,lateral=-0.05:0.05,yaw=-0.2:0.2,"
@@ -103,8 +102,7 @@ class Reproduce(TrialStudy[xr.Dataset]):
 
     def answer(self, run: Run) -> xr.Dataset:
         """Push, and compute the means of each setup."""
-        folder = None if run.folder is None else run.folder / "pushes"
-        trials = execution.run_plan(self.plan, folder, **run.batch_options).isel(law=0)
+        trials = run_plans(run, {"pushes": self.plan})["pushes"].isel(law=0)
         success = trials.success.values.reshape(self.shape) > 0
         count = np.where(success.any(2), success.sum(2), np.nan)
         dims, squares, means = ("setup", "object"), np.zeros(self.setups), {}
@@ -113,28 +111,27 @@ class Reproduce(TrialStudy[xr.Dataset]):
             means[name] = np.nansum(values, 2) / count
             in_paper = [getattr(paper.HARDWARE_RESULTS[key], column) for key in _SHORT]
             squares += np.sum(((means[name] - in_paper) / TOLERANCE[name]) ** 2, 1)
-        columns = {}
+        drawn = {}
         for name in points.names(self.ranges, "range"):
-            if name in _BY_PUSH:
-                continue
-            values, words = self._drawn(name), fit.words(name)
-            if name in _BY_OBJECT:
-                columns |= {f"{words}, {o}": values[:, i] for i, o in enumerate(_SHORT.values())}
-            else:
-                columns[words] = values[:, 0]
-        return xr.Dataset(
-            {
-                "success": (dims, success.sum(2)),
-                **{name: (dims, values) for name, values in means.items()},
-                "off": ("setup", np.where(success.all((1, 2)), np.sqrt(squares / 4), np.inf)),
-                "drawn": (("setup", "quantity"), np.stack(list(columns.values()), 1)),
-            },
-            {"object": list(_SHORT.values()), "quantity": list(columns)},
-        )
+            if name not in _BY_PUSH:
+                values, words = self._drawn(name), fit.words(name)
+                by_object = {f"{words}, {o}": values[:, i] for i, o in enumerate(_SHORT.values())}
+                drawn |= by_object if name in _BY_OBJECT else {words: values[:, 0]}
+        off = np.where(success.all((1, 2)), np.sqrt(squares / 4), np.inf)
+        columns = {
+            "success": (dims, success.sum(2)),
+            **{name: (dims, values) for name, values in means.items()},
+            "off": ("setup", off),
+            "drawn": (("setup", "quantity"), np.stack(list(drawn.values()), 1)),
+        }
+        return xr.Dataset(columns, {"object": list(_SHORT.values()), "quantity": list(drawn)})
 
-    def published_tables(self, results: xr.Dataset) -> Mapping[str, Table]:
-        """Return both tables."""
-        return {f"hardware_{name}": Table(rows) for name, rows in tables(results).items()}
+    def report_tables(self, results: xr.Dataset) -> Sequence[Table]:
+        """Return the results, and the quantities of the setups nearest to the paper."""
+        return [
+            Table(rows, name=f"hardware_{name}", title=name.capitalize())
+            for name, rows in tables(results).items()
+        ]
 
     def _drawn(self, name: str) -> np.ndarray:
         """Return a quantity (setup, object) in its unit."""
@@ -151,10 +148,6 @@ class Reproduce(TrialStudy[xr.Dataset]):
             f"{TOLERANCE['time']:g} s; all sixteen pushes must succeed."
         )
 
-    def report(self, results: xr.Dataset, run: Run) -> Sequence[Section]:
-        """Results, and quantities of the setups nearest to the paper."""
-        return [Section(name.capitalize(), "", rows) for name, rows in tables(results).items()]
-
 
 reproduce = call_of(Reproduce)
 
@@ -165,7 +158,7 @@ def nearest(results: xr.Dataset) -> xr.Dataset:
     return results.isel(setup=order[: max(4, results.sizes["setup"] // 20)])
 
 
-def tables(results: xr.Dataset) -> dict[str, list[list[str]]]:
+def tables(results: xr.Dataset) -> dict[str, Rows]:
     """Return header and rows of both tables of the page."""
     near = nearest(results)
     best = results.isel(setup=int(np.argmin(results.off.values)))
@@ -187,7 +180,7 @@ def tables(results: xr.Dataset) -> dict[str, list[list[str]]]:
     for quantity in map(str, results.quantity.values):
         values = results.drawn.sel(quantity=quantity).values
         ranks = [
-            _rank_correlation(values, results[mean].sel(object=name).values) for mean, name in pairs
+            _correlation(values, results[mean].sel(object=name).values) for mean, name in pairs
         ]
         drawn_from = f"{values.min():.2g} to {values.max():.2g}"
         near_range = _range(near.drawn.sel(quantity=quantity).values, "{:.2g}")
@@ -204,7 +197,6 @@ def _share(successes: np.ndarray) -> str:
     return f"{100 * np.mean(successes == len(paper.HARDWARE_LAYOUTS['circle'])):.0f} %"
 
 
-def _rank_correlation(a: np.ndarray, b: np.ndarray) -> str:
-    finite = np.isfinite(b)
-    ranks = [np.argsort(np.argsort(values[finite])) for values in (a, b)]
-    return f"{float(np.asarray(np.corrcoef(ranks)).flat[1]):+.2f}"
+def _correlation(a: np.ndarray, b: np.ndarray) -> str:
+    """Return the rank correlation of the finite pairs."""
+    return f"{stats.spearmanr(a, b, nan_policy='omit').statistic:+.2f}"

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -12,13 +13,9 @@ import xarray as xr
 
 from rps_jax.analysis import tables
 from rps_jax.control.laws.rps import RPSParams
-from rps_jax.runs.question import Split, seed_of
-from rps_jax.trials.progress import ProgressCallback, no_progress
-from rps_jax.trials.rollout import Candidates, outcomes
-from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import Outcome
-from rps_jax.tuning.space import SUBSETS, Space
-from rps_jax.world.domain import Domain
+from rps_jax.tuning.space import Space
+from sweeps.study_base import records
 
 _EDGE = 0.03  # distance of varied parameters from their bounds, as a share of the range
 
@@ -34,31 +31,10 @@ class Aims(NamedTuple):
 def aims(outcome: Outcome) -> Aims:
     """Return the objectives of candidates from their outcomes (P, W)."""
     success = np.asarray(outcome.success) > 0
-    with np.errstate(all="ignore"):
-        medians = [
-            np.array(
-                [
-                    np.median(x[mask]) if mask.any() else np.nan
-                    for x, mask in zip(rows, success, strict=True)
-                ]
-            )
-            for rows in np.asarray((outcome.time, outcome.path_length), float)
-        ]
+    measured = np.asarray((outcome.time, outcome.path_length), float)
+    with warnings.catch_warnings(action="ignore"):  # the median of no success is NaN
+        medians = np.nanmedian(np.where(success, measured, np.nan), axis=2)
     return Aims(success.mean(axis=1), *medians)
-
-
-def _run_candidates(
-    params: Any,
-    domains: Sequence[Domain],
-    setting: Setting,
-    splits: Sequence[Split],
-    count: int,
-    **run: Any,
-) -> list[Outcome]:
-    """Return the outcomes (P, D * W) of candidates in the worlds of each split."""
-    seeds = [seed_of(setting.seed, split) for split in splits]
-    requests = [Candidates(params, domains, seed, np.arange(count)) for seed in seeds]
-    return outcomes(requests, setting, **run)[0]
 
 
 # --- one parameter at a time ---------------------------------------------------------------
@@ -69,42 +45,6 @@ def lines(base: RPSParams, names: Sequence[str], count: int) -> RPSParams:
     u = jax.scipy.special.logit(jnp.linspace(_EDGE, 1 - _EDGE, count))
     varied = [Space((name,), base).params(u[:, None]) for name in names]
     return jax.tree.map(lambda *x: jnp.stack(x), *varied)
-
-
-def alone(
-    sets: dict[str, RPSParams],
-    domains: Sequence[Domain],
-    setting: Setting,
-    *,
-    names: Sequence[str] = SUBSETS["full"],
-    count: int = 9,
-    worlds: int = 1000,
-    callback: ProgressCallback = no_progress,
-    **shape: Any,
-) -> xr.Dataset:
-    """Compute success, time and path length over each parameter alone, in validation worlds.
-
-    Return labelled results (set, parameter, step), with the parameter's `value` at each step.
-    """
-    shape_of = (len(sets), len(names), count)
-    grid = jax.tree.map(
-        lambda *x: jnp.stack(x), *(lines(base, names, count) for base in sets.values())
-    )
-    params = jax.tree.map(lambda leaf: leaf.reshape(-1), grid)
-    (outcome,) = _run_candidates(
-        params, domains, setting, ("validate",), worlds, callback=callback, **shape
-    )
-    dims = ("set", "parameter", "step")
-    columns: dict[str, Any] = {
-        name: (dims, values.reshape(shape_of)) for name, values in aims(outcome)._asdict().items()
-    }
-    varied = [np.asarray(getattr(grid, name))[:, i] for i, name in enumerate(names)]
-    columns["value"] = (dims, np.stack(varied, axis=1))
-    return xr.Dataset(
-        columns,
-        {"set": list(sets), "parameter": list(names)},
-        {"worlds": outcome.success.shape[1]},
-    )
 
 
 # --- several aims at once ------------------------------------------------------------------
@@ -146,50 +86,15 @@ def undominated(values: Aims) -> np.ndarray:
     return np.asarray(known & ~(no_worse & better).any(axis=0))
 
 
-def front(
-    sets: dict[str, RPSParams],
-    domains: Sequence[Domain],
-    setting: Setting,
-    *,
-    names: Sequence[str] = SUBSETS["full"],
-    candidates: int = 256,
-    spread: float = 0.5,
-    worlds: int = 1000,
-    callback: ProgressCallback = no_progress,
-    **shape: Any,
-) -> xr.Dataset:
-    """Run candidates between and around sets of parameters, and select the Pareto-optimal ones.
-
-    The selection uses validation worlds. The objectives (candidate,) are then measured in test
-    worlds, so that the selection does not bias them.
-    """
-    params = cloud(list(sets.values()), names, candidates, spread, setting.seed)
-    validated, tested = _run_candidates(
-        params, domains, setting, ("validate", "test"), worlds, callback=callback, **shape
-    )
-    chosen = undominated(aims(validated))
-    labels = [*sets, *(f"{i}" for i in range(candidates))]
-    columns: dict[str, Any] = {k: ("candidate", v) for k, v in aims(tested)._asdict().items()}
-    columns["front"] = ("candidate", chosen)
-    columns |= {name: ("candidate", np.asarray(getattr(params, name))) for name in names}
-    return xr.Dataset(columns, {"candidate": labels}, {"worlds": tested.success.shape[1]})
-
-
 def front_table(results: xr.Dataset) -> list[list[str]]:
     """Return a header and one row per Pareto-optimal candidate and set, by success."""
     rows = [["", "success", "median time", "median way", "on the front"]]
-    labels = [str(label) for label in results.candidate.values]
-    named = np.array([not label.isdigit() for label in labels])
-    shown = np.flatnonzero(results.front.values | named)
-    for i in shown[np.argsort(-results.success.values[shown], kind="stable")]:
-        row = results.isel(candidate=int(i))
-        rows.append(
-            [
-                labels[i],
-                f"{tables.percent(float(row.success))} %",
-                f"{float(row.time):.1f} s",
-                f"{float(row.path):.2f} m",
-                "yes" if bool(row.front) else "no",
-            ]
-        )
+    named = ~results.candidate.str.isdigit()
+    shown = results.isel(candidate=np.flatnonzero(results.front | named))
+    ordered = shown.isel(candidate=np.argsort(-shown.success.values, kind="stable"))
+    for row in records(ordered, "candidate"):
+        rows.append([
+            row["candidate"], f"{tables.percent(row['success'])} %", f"{row['time']:.1f} s",
+            f"{row['path']:.2f} m", "yes" if row["front"] else "no",
+        ])  # fmt: skip
     return rows

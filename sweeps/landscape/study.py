@@ -11,22 +11,26 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
-from typing import Any, ClassVar
+from typing import ClassVar, Unpack
 
+import jax
 import numpy as np
 import xarray as xr
 
 from rps_jax import errors
-from rps_jax.analysis.figures.style import Figure, success_rates
+from rps_jax.analysis.figures.style import Figure, success_rates, tiles
 from rps_jax.analysis.report import Picture, Section
 from rps_jax.control.laws.rps import BOUNDS, RPSParams
 from rps_jax.record.options import option
-from rps_jax.runs.question import MultiLawQuestion, Run, call_of
+from rps_jax.runs.question import MultiLawQuestion, Run, Split, call_of, seed_of
+from rps_jax.trials.batch import BatchOptions
 from rps_jax.trials.progress import SequentialProgress
+from rps_jax.trials.rollout import Candidates, outcomes
+from rps_jax.trials.trial import Outcome
 from rps_jax.tuning.run import parse_domains
 from rps_jax.tuning.space import SUBSETS
 from rps_jax.world.domain import Domain, DomainLike
-from sweeps.landscape import candidates
+from sweeps.landscape.candidates import aims, cloud, front_table, lines, undominated
 
 
 @dataclass(frozen=True)
@@ -38,7 +42,7 @@ class Landscape(MultiLawQuestion[xr.DataTree]):
     """
 
     TITLE: ClassVar[str] = "Effect of each parameter"
-    QUICK: ClassVar[Mapping[str, Any]] = {"worlds": 32, "values": 3, "candidates": 16}
+    QUICK: ClassVar[Mapping[str, object]] = {"worlds": 32, "values": 3, "candidates": 16}
 
     domain: Sequence[DomainLike] = ("wide",)
     """Domains: paper, hardware, wide, real, prisms or hostile, or JSON files of ranges; changes
@@ -76,17 +80,59 @@ class Landscape(MultiLawQuestion[xr.DataTree]):
 
     def answer(self, run: Run) -> xr.DataTree:
         """Vary each parameter, then run the candidates."""
-        progress = SequentialProgress(run.callback)
-        common = {"worlds": self.worlds, **run._replace(callback=progress).batch_options}
-        worlds = self.chosen, self.domains, self.setting
-        first, _ = self._shares
-        alone = partial(candidates.alone, *worlds, count=self.values, **common)
-        results = {"alone": run.checkpoint("alone", alone)}
-        progress.finish(first)
-        options = {"candidates": self.candidates, "spread": self.spread}
-        front = partial(candidates.front, *worlds, **options, **common)
-        results["front"] = run.checkpoint("front", front)
+        progress, results = SequentialProgress(run.callback), {}
+        options = run._replace(callback=progress).batch_options
+        parts = (("alone", self.vary_each), ("front", self.select_front))
+        for (name, compute), share in zip(parts, self._shares, strict=True):
+            results[name] = run.checkpoint(name, partial(compute, **options))
+            progress.finish(share)
         return xr.DataTree.from_dict(results)
+
+    def _outcomes(
+        self, params: RPSParams, *splits: Split, **options: Unpack[BatchOptions]
+    ) -> list[Outcome]:
+        """Return the outcomes (P, D * W) of candidates (P,) in the worlds of each split."""
+        seeds, worlds = [seed_of(self.setting.seed, x) for x in splits], np.arange(self.worlds)
+        requests = [Candidates(params, self.domains, seed, worlds) for seed in seeds]
+        return outcomes(requests, self.setting, **options)[0]
+
+    def vary_each(self, **options: Unpack[BatchOptions]) -> xr.Dataset:
+        """Compute success, time and path length over each parameter alone, in validation worlds.
+
+        Return labelled results (set, parameter, step), with the parameter's `value` at each step.
+        """
+        names, dims = SUBSETS["full"], ("set", "parameter", "step")
+        by_set = [lines(base, names, self.values) for base in self.chosen.values()]
+        grid = jax.tree.map(lambda *x: np.stack(x), *by_set)
+        (outcome,) = self._outcomes(jax.tree.map(np.ravel, grid), "validate", **options)
+        varied = [np.asarray(getattr(grid, name))[:, i] for i, name in enumerate(names)]
+        shape = (len(by_set), len(names), self.values)
+        columns = {k: (dims, v.reshape(shape)) for k, v in aims(outcome)._asdict().items()}
+        return xr.Dataset(
+            columns | {"value": (dims, np.stack(varied, axis=1))},
+            {"set": list(self.chosen), "parameter": list(names)},
+            {"worlds": outcome.success.shape[1]},
+        )
+
+    def select_front(self, **options: Unpack[BatchOptions]) -> xr.Dataset:
+        """Run candidates between and around the sets, and select the Pareto-optimal ones.
+
+        The selection uses validation worlds. The objectives (candidate,) are then measured in test
+        worlds, so that the selection does not bias them.
+        """
+        names, sets = SUBSETS["full"], list(self.chosen.values())
+        params = cloud(sets, names, self.candidates, self.spread, self.setting.seed)
+        validated, tested = self._outcomes(params, "validate", "test", **options)
+        columns = {
+            **aims(tested)._asdict(),
+            "front": undominated(aims(validated)),
+            **{name: np.asarray(getattr(params, name)) for name in names},
+        }
+        return xr.Dataset(
+            {name: ("candidate", values) for name, values in columns.items()},
+            {"candidate": [*self.chosen, *map(str, range(self.candidates))]},
+            {"worlds": tested.success.shape[1]},
+        )
 
     def intro(self, results: xr.DataTree) -> str:
         """Return a description of the worlds."""
@@ -97,41 +143,13 @@ class Landscape(MultiLawQuestion[xr.DataTree]):
         alone, front = (results[name].to_dataset() for name in ("alone", "front"))
         log = [name for name, bound in BOUNDS.items() if bound.log]
         lines = Picture("landscape", partial(parameters_figure, alone, log))
-        trade = Picture("front", partial(front_figure, front))
         return [
             Section("Success against each parameter", "", (), lines),
-            Section("Success, time and way", "", candidates.front_table(front), trade),
+            Section("Success, time and way", "", front_table(front)),
         ]
 
 
 landscape = call_of(Landscape)
-
-
-def front_figure(results: xr.Dataset) -> Figure:
-    """Plot success over time and over path length, and mark Pareto-optimal candidates."""
-    figure = Figure(figsize=(10, 4), layout="constrained")
-    labels = [str(label) for label in results.candidate.values]
-    for ax, (field, label) in zip(
-        figure.subplots(1, 2, sharey=True),
-        {
-            "time": "median time of a success [s]",
-            "path": "median path length of the base [m]",
-        }.items(),
-        strict=True,
-    ):
-        x, y = results[field].values, 100 * results.success.values
-        ax.plot(x, y, ".", color="0.75", label="candidates")
-        chosen = results.front.values
-        ax.plot(x[chosen], y[chosen], "o", ms=5, color="C0", label="Pareto-optimal")
-        for i, name in enumerate(labels):
-            if not name.isdigit():
-                ax.plot(x[i], y[i], "*", ms=12, color="C3")
-                ax.annotate(name, (x[i], y[i]), (6, -10), textcoords="offset points", fontsize=9)
-        ax.set_xlabel(label)
-        ax.grid(alpha=0.3)
-    figure.axes[0].set_ylabel("success [%]")
-    figure.axes[0].legend(fontsize=8, loc="lower right")
-    return figure
 
 
 def parameters_figure(results: xr.Dataset, log: Collection[str]) -> Figure:
@@ -140,30 +158,19 @@ def parameters_figure(results: xr.Dataset, log: Collection[str]) -> Figure:
     Intervals are Wilson's, of 95 %.
     """
     names = list(map(str, results.parameter.values))
-    rows = -(-len(names) // 4)
-    figure = Figure(figsize=(12, 2.5 * rows), layout="constrained")
-    axes = figure.subplots(rows, 4, squeeze=False, sharey=True).ravel()
-    for ax in axes[len(names) :]:
-        ax.axis("off")
+    figure, axes = tiles(len(names), 4, (3, 2.5), (0, 0), sharey=True)
     worlds = int(results.attrs["worlds"])
-    for ax, name in zip(axes, names, strict=False):
+    for ax, name in zip(axes.ravel(), names, strict=False):
         for i, label in enumerate(map(str, results.set.values)):
             line = results.sel(set=label, parameter=name)
             successes = np.round(line.success.values * worlds).astype(int)
-            success_rates(
-                ax,
-                line.value.values,
-                successes,
-                np.full(successes.size, worlds),
-                curve=i,
-                color=f"C{i}",
-                label=label,
-            )
+            counts = line.value.values, successes, np.full(successes.size, worlds)
+            success_rates(ax, *counts, curve=i, color=f"C{i}", label=label)
         ax.set_xlabel(name, fontsize=9)
         ax.grid(alpha=0.3)
         if name in log:
             ax.set_xscale("log")
-    for ax in axes[::4]:
+    for ax in axes[:, 0]:
         ax.set_ylabel("success [%]")
-    axes[0].legend(fontsize=8)
+    axes[0, 0].legend(fontsize=8)
     return figure

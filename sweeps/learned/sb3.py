@@ -14,32 +14,31 @@ import importlib
 import importlib.metadata
 import importlib.util
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
-from itertools import product
 from typing import Any, ClassVar
 
 import numpy as np
 import xarray as xr
-from matplotlib.figure import Figure
 
 from rps_jax import errors
 from rps_jax.analysis import statistics, tables
-from rps_jax.analysis.report import Picture, Section
+from rps_jax.analysis.figures.style import Figure, panel
+from rps_jax.analysis.report import Picture
 from rps_jax.record.options import option
 from rps_jax.runs.question import Run, call_of
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import Rules
 from rps_jax.world import domain as domains
-from sweeps.study_base import Study, Table
+from sweeps.study_base import Rows, Study, Table, records
 
 _VARIABLES = {
-    "time": ("s", "wall clock since learning began"),
-    "steps": ("1", "steps of all worlds"),
-    "episodes": ("1", "trials that ended since the previous row"),
-    "reward": ("1", "mean sum of the rewards of these"),
-    "success": ("1", "share of these that succeeded"),
+    "time": {"units": "s", "long_name": "wall clock since learning began"},
+    "steps": {"units": "1", "long_name": "steps of all worlds"},
+    "episodes": {"units": "1", "long_name": "trials that ended since the previous row"},
+    "reward": {"units": "1", "long_name": "mean sum of the rewards of these"},
+    "success": {"units": "1", "long_name": "share of these that succeeded"},
 }
 
 
@@ -51,6 +50,7 @@ class SB3(Study[xr.Dataset]):
     """
 
     TITLE: ClassVar[str] = "PPO of Stable-Baselines3"
+    DIMENSION: ClassVar[str] = "envs"
 
     domain: str = "wide,distance=0.7:1,bearing=-0.3:0.3"
     """Ranges from which worlds are drawn."""
@@ -77,33 +77,29 @@ class SB3(Study[xr.Dataset]):
                     f"{name} is not installed: run pip install gymnasium stable-baselines3."
                 )
 
-    def answer(self, run: Run) -> xr.Dataset:
-        """Learn with each number of worlds."""
-        curves = [run.checkpoint(f"curve_{n}", partial(self._learned, n)) for n in self.num_envs]
-        results = xr.concat(curves, xr.IndexVariable("envs", list(self.num_envs)))
-        return results
+    def parts(self, run: Run) -> Mapping[int, Callable[[], xr.Dataset]]:
+        """Return the function that learns with each number of worlds."""
+        return {n: partial(self._learned, n) for n in self.num_envs}
 
-    def published_tables(self, results: xr.Dataset) -> Mapping[str, Table]:
+    def report_tables(self, results: xr.Dataset) -> Sequence[Table]:
         """Return the learning curves."""
         names = ("stable-baselines3", "torch", "gymnasium")
         versions = ", ".join(f"{name} {importlib.metadata.version(name)}" for name in names)
         note = f"{versions}; one run with one seed, with noise in the actions."
-        return {"sb3": Table(table(results), note, merge="worlds")}
+        picture = Picture("sb3", partial(figure_of, results))
+        return [Table(table(results), note, (), "worlds", "sb3", "Curve", picture=picture)]
 
     def _learned(self, count: int) -> xr.Dataset:
         names = ("", ".common.vec_env", ".common.callbacks")
-        modules: list[Any] = [
-            importlib.import_module(f"stable_baselines3{suffix}") for suffix in names
-        ]
-        sb3, vec, back = modules
-        gymnasium: Any = importlib.import_module("gymnasium")
+        sb3, vec, back = (importlib.import_module(f"stable_baselines3{name}") for name in names)
+        gymnasium = importlib.import_module("gymnasium")
         name = "rps_jax.trials.gym:rps_jax/Push-v0"
-        options_ = {"object": self.object, "domain": self.domain, "setting": self.setting}
-        options_ |= {"hold": self.hold}
+        fields = ("object", "domain", "setting", "hold")
+        options = {field: getattr(self, field) for field in fields}
         if count == 1:
-            worlds = gymnasium.make(name, **options_)
+            worlds = gymnasium.make(name, **options)
         else:
-            envs = gymnasium.make_vec(name, num_envs=count, autoreset_mode="SameStep", **options_)
+            envs = gymnasium.make_vec(name, num_envs=count, autoreset_mode="SameStep", **options)
             worlds = vec.VecMonitor(batched(vec.VecEnv, envs))
         options = {"n_steps": max(32, 512 // count), "batch_size": max(64, 8 * count)}
         options |= {"n_epochs": 10, "learning_rate": 1e-3, "policy_kwargs": {"log_std_init": -0.7}}
@@ -127,17 +123,8 @@ class SB3(Study[xr.Dataset]):
                 return len(curve) < rows
 
         model.learn(10**9, callback=Curve())
-        values = np.array(curve)
-        return xr.Dataset(
-            {
-                name: ("row", values[:, i], {"units": unit, "long_name": words})
-                for i, (name, (unit, words)) in enumerate(_VARIABLES.items())
-            }
-        )
-
-    def report(self, results: xr.Dataset, run: Run) -> Sequence[Section]:
-        """Return a section with the curves."""
-        return [Section("Curve", "", table(results), Picture("sb3", partial(figure_of, results)))]
+        columns = zip(_VARIABLES.items(), np.transpose(curve), strict=True)
+        return xr.Dataset({name: ("row", values, about) for (name, about), values in columns})
 
 
 sb3 = call_of(SB3)
@@ -187,49 +174,31 @@ def batched(base: Any, envs: Any) -> Any:
     return Batched()
 
 
-def table(results: xr.Dataset) -> list[list[str]]:
+def table(results: xr.Dataset) -> Rows:
     """Return header and rows of the curve."""
-    rows = [
-        ["worlds", "wall clock", "steps of all worlds", "trials that ended", "reward of these",
-         "success"]
-    ]  # fmt: skip
-    for count, i in product(results.envs.values, range(results.sizes["row"])):
-        row = results.sel(envs=count).isel(row=i)
-        trials = int(row.episodes)
-        rows.append(
-            [
-                f"{count:,}",
-                f"{float(row.time):.0f} s",
-                f"{int(row.steps):,}",
-                f"{trials:,}",
-                f"{float(row.reward):.2f}" if trials else "-",
-                tables.share(round(float(row.success) * trials) if trials else 0, trials),
-            ]
-        )
+    rows = [["worlds", "wall clock", "steps of all worlds", "trials that ended",
+             "reward of these", "success"]]  # fmt: skip
+    for row in records(results, "envs", "row"):
+        trials = int(row["episodes"])
+        successes = round(row["success"] * trials) if trials else 0
+        rows.append([
+            f"{row['envs']:,}", f"{row['time']:.0f} s", f"{int(row['steps']):,}", f"{trials:,}",
+            f"{row['reward']:.2f}" if trials else "-", tables.share(successes, trials),
+        ])  # fmt: skip
     return rows
 
 
 def figure_of(results: xr.Dataset) -> Figure:
     """Plot success over wall clock, with Wilson 95 % limits."""
-    figure = Figure(figsize=(6, 3.2), layout="constrained")
-    ax = figure.subplots()
+    figure, ax = panel((6, 3.2), "wall clock [s]", "success [%]")
     for i, count in enumerate(results.envs.values):
         curve = results.sel(envs=count)
         rows = np.flatnonzero(curve.episodes.values > 0)
-        trials = curve.episodes.values[rows].astype(int)
+        time, trials = curve.time[rows], curve.episodes.values[rows].astype(int)
         successes = np.rint(curve.success.values[rows] * trials).astype(int)
         limits = [statistics.wilson(int(w), int(n)) for w, n in zip(successes, trials, strict=True)]
-        ax.plot(
-            curve.time[rows],
-            100 * successes / trials,
-            "o-",
-            color=f"C{i}",
-            label=f"{count} at once",
-        )
-        ax.fill_between(
-            curve.time[rows], *100 * np.transpose(limits), color=f"C{i}", alpha=0.2, lw=0
-        )
-    ax.set(xlabel="wall clock [s]", ylabel="success [%]", ylim=(0, 100))
-    ax.grid(alpha=0.3)
+        ax.plot(time, 100 * successes / trials, "o-", color=f"C{i}", label=f"{count} at once")
+        ax.fill_between(time, *100 * np.transpose(limits), color=f"C{i}", alpha=0.2, lw=0)
+    ax.set_ylim(0, 100)
     ax.legend(title="worlds")
     return figure

@@ -19,7 +19,7 @@ import xarray as xr
 
 from rps_jax import errors
 from rps_jax.analysis import statistics
-from rps_jax.analysis.report import Picture, Section
+from rps_jax.analysis.report import Picture
 from rps_jax.record import files, provenance
 from rps_jax.record import folder as run_folder
 from rps_jax.record.options import option
@@ -73,6 +73,10 @@ class Learned(Study[list[list[Any]]]):
                 f"device = {self.device} is not allowed: give one for all runs, or one for each."
             )
 
+    def num_trials(self) -> int | None:
+        """Return the number of runs."""
+        return len(self.runs)
+
     def answer(self, run: Run) -> list[list[Any]]:
         """Collect the rows, and publish them."""
         folders = [Path(folder) for folder in self.runs]
@@ -82,30 +86,23 @@ class Learned(Study[list[list[Any]]]):
             "without noise in the actions; of each run the law that did best there, which "
             "flatters it. The interval is Wilson's."
         )
-        write_table(
-            RESULTS / "learned.json",
-            [provenance.read_environment(folder) for folder in folders],
-            "; ".join(dict.fromkeys(self.devices)),
-            Table(rows, note, COLUMNS),
-        )
+        runs = [provenance.read_environment(folder) for folder in folders]
+        device = "; ".join(dict.fromkeys(self.devices))
+        write_table(RESULTS / "learned.json", runs, device, Table(rows, note, COLUMNS))
         return rows
 
     def intro(self, results: list[list[Any]]) -> str:
         """Return the location of the rows."""
         return f"{len(results)} rows of `results/learned.json`; now render the tables."
 
-    def report(self, results: list[list[Any]], run: Run) -> Sequence[Section]:
-        """Return a section with the curve of each run."""
-        return [
-            Section(
-                str(folder),
-                picture=Picture(
-                    f"learned_{cells[0].strip('`')}",
-                    partial(learn.figure_of, curve_of(Path(folder))),
-                ),
-            )
-            for folder, cells in zip(self.runs, results, strict=True)
-        ]
+    def report_tables(self, results: list[list[Any]]) -> Sequence[Table]:
+        """Return the curve of each run."""
+        tables = []
+        for folder, (network, *_) in zip(self.runs, results, strict=True):
+            draw = partial(learn.figure_of, curve_of(Path(folder)))
+            picture = Picture(f"learned_{network.strip('`')}", draw)
+            tables.append(Table((), title=str(folder), picture=picture))
+        return tables
 
 
 learned = call_of(Learned)
@@ -122,9 +119,8 @@ def row(folder: Path, device: str) -> list[Any]:
     judged = curve.dropna("update", subset=["validation"])
     rates = judged.validation.values
     best = judged.isel(update=len(rates) - 1 - int(np.argmax(rates[::-1])))
-    objects = [
-        name.removeprefix("random_") for domain in manifest["domain"] for name in domain["objects"]
-    ]
+    names = [name for domain in manifest["domain"] for name in domain["objects"]]
+    objects = [name.removeprefix("random_") for name in names]
     tried, rate = manifest["validation"] * len(objects), float(best.validation)
     interval = statistics.wilson(round(rate * tried), tried)
     return [

@@ -12,7 +12,6 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
-from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
@@ -21,22 +20,22 @@ from scipy import optimize
 
 from rps_jax import errors
 from rps_jax.analysis import statistics, tables
-from rps_jax.analysis.figures.style import Figure, success_rates
+from rps_jax.analysis.figures.style import Figure, success_rates, tiles
 from rps_jax.analysis.report import Picture, Section
 from rps_jax.control.base import LawParams
 from rps_jax.geometry.solid import GRAVITY
 from rps_jax.record.options import option
 from rps_jax.robot.robot import Robot
 from rps_jax.robot.shell import BOARDS, HALF_WIDTH
-from rps_jax.runs import execution
+from rps_jax.runs.plan import Plan
 from rps_jax.runs.question import MultiLawQuestion, Run, call_of
 from rps_jax.runs.sweep import Sweep
 from rps_jax.trials import pushes
 from rps_jax.trials.case import Case
-from rps_jax.trials.progress import SequentialProgress
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import Rules
 from rps_jax.world.domain import Domain, DomainLike, Range, parse_domain
+from sweeps.study_base import Rows, run_plans
 
 LOSSES = (0.01, 0.10)  # [1] of success, whose limits are looked for
 _RESAMPLES = 200  # of a bootstrap
@@ -56,9 +55,19 @@ class Limit:
     label: str  # with its unit
     drawn: Mapping[str, Range] = field(default_factory=dict)  # ranges of a domain
     robots: Mapping[float, Robot] = field(default_factory=dict)  # or each value's robot
-    value: Callable[[xr.Dataset], np.ndarray] = lambda results: np.zeros(0)  # (n,) of drawn worlds
+    value: Callable[[xr.Dataset], xr.DataArray] | None = (
+        None  # of drawn worlds; by default as drawn
+    )
     harms: int = 0  # 1: the more the worse, -1: the less the worse, 0: neither
-    log: bool = False
+
+    @property
+    def log(self) -> bool:
+        """Whether the values are drawn on a logarithmic scale."""
+        return any(interval.log for interval in self.drawn.values())
+
+    def values(self, results: xr.Dataset) -> np.ndarray:
+        """Return the values (n,) in drawn worlds."""
+        return np.asarray(self.value(results) if self.value else results[next(iter(self.drawn))])
 
 
 def _with_front(count: int) -> Robot:
@@ -72,19 +81,12 @@ LIMITS = {
     "force": Limit(
         "greatest force over the object's friction with the ground [1]",
         {"robot_force": Range(10, 1000, log=True)},
-        value=lambda f: (f.robot_force / (f.friction_ground * f.mass * GRAVITY)).values,
+        value=lambda drawn: drawn.robot_force / (drawn.friction_ground * drawn.mass * GRAVITY),
         harms=-1,
-        log=True,
     ),
-    "lag": Limit(
-        "lag [s]", {"robot_lag": Range(0, 2)}, value=lambda f: f.robot_lag.values, harms=1
-    ),
+    "lag": Limit("lag [s]", {"robot_lag": Range(0, 2)}, harms=1),
     "acceleration": Limit(
-        "greatest acceleration [m/s²]",
-        {"robot_acceleration": Range(0.005, 1, log=True)},
-        value=lambda f: f.robot_acceleration.values,
-        harms=-1,
-        log=True,
+        "greatest acceleration [m/s²]", {"robot_acceleration": Range(0.005, 1, log=True)}, harms=-1
     ),
     "half_width": Limit(
         "half width of the base [m]",
@@ -107,7 +109,7 @@ class Limits(MultiLawQuestion[xr.DataTree]):
     """
 
     TITLE: ClassVar[str] = "What each limit costs"
-    QUICK: ClassVar[Mapping[str, Any]] = {"worlds": 64}
+    QUICK: ClassVar = {"worlds": 64}
 
     domain: DomainLike = "wide"
     """The worlds: paper, hardware, wide, prisms or hostile, or a JSON file of ranges; changes
@@ -123,12 +125,11 @@ class Limits(MultiLawQuestion[xr.DataTree]):
         errors.check_each_once("limits", self.limits)
         for name in self.limits:
             errors.check_name("limit", name, LIMITS)
-        self._sweep("ideal", parse_domain(self.domain)).check()
+        self._plan(parse_domain(self.domain)).check_here()
 
     def num_trials(self) -> int | None:
         """Return the number of trials."""
-        robots = 1 + sum(max(1, len(LIMITS[name].robots)) for name in self.limits)
-        return len(self.chosen) * self.worlds * robots
+        return sum(plan.num_trials for plan in self.plans.values())
 
     def configuration(self) -> dict[str, Any]:
         """Return the inputs of the parts of the answer; later calls may add limits."""
@@ -136,43 +137,40 @@ class Limits(MultiLawQuestion[xr.DataTree]):
         del configuration["limits"]
         return configuration
 
-    def _sweep(self, part: str, ranges: Domain, robot: Robot | None = None) -> Sweep:
-        """Return a sweep in its own folder."""
-        return Sweep(
-            self.chosen,
-            ranges,
-            self.worlds,
-            robot=robot,
-            setting=self.setting,
-            out=None if self.out is None else Path(self.out) / part,
-        )
+    def _plan(self, ranges: Domain, robot: Robot | None = None) -> Plan:
+        """Return the sweep of a robot."""
+        options = {"robot": robot, "setting": self.setting}
+        return Sweep(self.chosen, ranges, self.worlds, **options).plan
 
-    def answer(self, run: Run) -> xr.DataTree:
-        """Sweep with the ideal base and with every robot."""
-        base, progress = parse_domain(self.domain), SequentialProgress(run.callback)
-        shape = run._replace(callback=progress).batch_options
-
-        def sweep(part: str, ranges: Domain, robot: Robot | None = None) -> xr.Dataset:
-            folder = None if run.folder is None else run.folder / part
-            dataset = execution.run_plan(self._sweep(part, ranges, robot).plan, folder, **shape)
-            progress.finish(len(self.chosen) * self.worlds)
-            return dataset
-
-        ideal, results = sweep("ideal", base), {}
+    @property
+    def plans(self) -> dict[str, Plan]:
+        """Sweep with the ideal base, and the sweeps of each limit: LIMIT, or LIMIT_INDEX."""
+        base = parse_domain(self.domain)
+        plans = {"ideal": self._plan(base)}
         for name in self.limits:
             limit = LIMITS[name]
             if limit.drawn:
-                parts = [sweep(name, replace(base, **limit.drawn))]
-                values = limit.value(parts[0])
-            else:
-                robots = limit.robots.values()
-                parts = [sweep(f"{name}_{i}", base, robot) for i, robot in enumerate(robots)]
-                values = np.repeat([float(value) for value in limit.robots], self.worlds)
+                plans[name] = self._plan(replace(base, **limit.drawn))
+            for i, robot in enumerate(limit.robots.values()):
+                plans[f"{name}_{i}"] = self._plan(base, robot)
+        return plans
+
+    def answer(self, run: Run) -> xr.DataTree:
+        """Sweep with the ideal base and with every robot."""
+        by_part = run_plans(run, self.plans)
+        results, ideal = {}, by_part["ideal"].success.values
+        for name in self.limits:
+            limit = LIMITS[name]
+            keys = [name] if limit.drawn else [f"{name}_{i}" for i in range(len(limit.robots))]
+            parts = [by_part[key] for key in keys]
+            values = (
+                limit.values(parts[0]) if limit.drawn else np.repeat([*limit.robots], self.worlds)
+            )
             success = np.concatenate([part.success.values for part in parts], axis=1)
             results[name] = xr.Dataset(
                 {
                     "success": (("law", "case"), success),
-                    "usual": (("law", "case"), np.tile(ideal.success.values, (1, len(parts)))),
+                    "usual": (("law", "case"), np.tile(ideal, (1, len(parts)))),
                 },
                 {
                     "law": list(self.chosen),
@@ -237,16 +235,15 @@ def crossings(results: xr.Dataset, level: float, seed: int = 0) -> dict[str, tup
     return intervals
 
 
-def losses(results: Mapping[str, xr.Dataset]) -> list[list[str]]:
+def losses(results: Mapping[str, xr.Dataset]) -> Rows:
     """Return a header and a row for each drawn limit and law: its limits for `LOSSES`."""
     rows = [["limit", "law", "ideal base", *(f"{100 * x:g} points lost at" for x in LOSSES)]]
-    for name in (name for name in results if LIMITS[name].drawn):
-        dataset, at = results[name], [crossings(results[name], level) for level in LOSSES]
-        for law in map(str, dataset.law.values):
+    for name, dataset in results.items():
+        at = [crossings(dataset, level) for level in LOSSES] if LIMITS[name].drawn else []
+        for law in at[0] if at else ():
             ideal = f"{tables.percent(float(dataset.usual.sel(law=law).mean()))} %"
-            rows.append(
-                [LIMITS[name].label, law, ideal, *(_interval_text(*by_law[law]) for by_law in at)]
-            )
+            limits = [_interval_text(*by_law[law]) for by_law in at]
+            rows.append([LIMITS[name].label, law, ideal, *limits])
     return rows
 
 
@@ -254,7 +251,7 @@ def _interval_text(at: float, low: float, high: float) -> str:
     return "nowhere" if math.isnan(at) else f"{at:.2g} [{low:.2g}, {high:.2g}]"
 
 
-def successes(results: Mapping[str, xr.Dataset]) -> list[list[str]]:
+def successes(results: Mapping[str, xr.Dataset]) -> Rows:
     """Return a header and a row for each size and pitch, with the success of each law."""
     laws = [str(law) for dataset in list(results.values())[:1] for law in dataset.law.values]
     rows = [["quantity", "value", *laws]]
@@ -287,62 +284,48 @@ def turning(
       `asked` and `done` (robot, time) [rad/s]: the law's twist, and the base's own.
     """
     rows = []
+    setting = Setting("fused", rules=Rules(horizon=seconds))
+    period = setting.physics.control_period
     for robot in robots.values():
         case = Case(object, "S1", target, params, robot=robot)
-        setting = Setting("fused", rules=Rules(horizon=seconds))
-        period = setting.physics.control_period
         (trace,) = pushes.record_cases([case], setting, interval=period)
-        snapshots = trace.snapshots
+        snapshots, time = trace.snapshots, np.asarray(trace.snapshots.time)[:-1]
         turns = np.diff(np.asarray(snapshots.qpos)[:, 2]) / period
-        rows.append(
-            [np.asarray(snapshots.twist.omega)[:-1], turns, np.asarray(snapshots.time)[:-1]]
-        )
-    commanded, done, time = (np.stack(columns) for columns in zip(*rows, strict=True))
-    return xr.Dataset(
-        {"asked": (("robot", "time"), commanded), "done": (("robot", "time"), done)},
-        {"robot": list(robots), "time": time[0]},
-    )
+        values = {"asked": np.asarray(snapshots.twist.omega)[:-1], "done": turns}
+        rows.append(xr.Dataset({k: ("time", v) for k, v in values.items()}, {"time": time}))
+    return xr.concat(rows, xr.IndexVariable("robot", list(robots)))
 
 
 def figure_of(results: Mapping[str, xr.Dataset]) -> Figure:
     """Draw success over each limit of a robot, with 95 % intervals; dashed: the ideal base."""
-    columns = min(3, len(results))
-    rows = -(-len(results) // columns)
-    figure = Figure(figsize=(4 * columns, 3.2 * rows), layout="constrained")
-    axes = figure.subplots(rows, columns, squeeze=False, sharey=True).ravel()
-    for ax in axes[len(results) :]:
-        ax.axis("off")
-    for ax, dataset in zip(axes, results.values(), strict=False):
+    figure, axes = tiles(len(results), 3, (4, 3.2), (0, 0), sharey=True)
+    for ax, dataset in zip(axes.ravel(), results.values(), strict=False):
         for i, law in enumerate(map(str, dataset.law.values)):
-            binned = statistics.bins(
-                dataset.value.values, dataset.success.sel(law=law).values > 0, 12
-            )
+            success = dataset.success.sel(law=law).values > 0
+            binned = statistics.bins(dataset.value.values, success, 12)
             success_rates(ax, *binned, curve=i, color=f"C{i}", label=law)
             ideal = 100 * float(dataset.usual.sel(law=law).mean())
             ax.axhline(ideal, color=f"C{i}", lw=0.8, ls="--")
         ax.set_xlabel(dataset.value.attrs["long_name"], fontsize=9)
         ax.set_xscale("log" if dataset.attrs["log"] else "linear")
         ax.grid(alpha=0.3)
-    for ax in axes[::columns]:
+    for ax in axes[:, 0]:
         ax.set_ylabel("success [%]")
-    axes[0].legend(fontsize=8)
+    axes[0, 0].legend(fontsize=8)
     return figure
 
 
 def turning_figure(results: xr.Dataset) -> Figure:
     """Draw the turning rate that a law asks for, and what each robot makes of it, over time."""
     names = list(map(str, results.robot.values))
-    figure = Figure(figsize=(8, 1.7 * len(names)), layout="constrained")
-    axes = figure.subplots(len(names), 1, squeeze=False, sharex=True, sharey=True)[:, 0]
-    for ax, name in zip(axes, names, strict=True):
-        dataset = results.sel(robot=name)
-        ax.step(
-            dataset.time, dataset.asked, color="0.7", lw=1, where="post", label="asked by the law"
-        )
-        ax.plot(dataset.time, dataset.done, color="C0", lw=1.2, label="of the base")
+    figure, axes = tiles(len(names), 1, (8, 1.7), (0, 0), sharex=True, sharey=True)
+    for ax, name in zip(axes[:, 0], names, strict=True):
+        rates, ask = results.sel(robot=name), {"color": "0.7", "lw": 1, "where": "post"}
+        ax.step(rates.time, rates.asked, label="asked by the law", **ask)
+        ax.plot(rates.time, rates.done, color="C0", lw=1.2, label="of the base")
         ax.set_title(name, fontsize=9, loc="left")
         ax.set_ylabel(r"$\omega$ [rad/s]")
         ax.grid(alpha=0.3)
-    axes[-1].set_xlabel("time [s]")
-    axes[0].legend(fontsize=8, loc="lower right")
+    axes[-1, 0].set_xlabel("time [s]")
+    axes[0, 0].legend(fontsize=8, loc="lower right")
     return figure

@@ -13,7 +13,7 @@ import dataclasses
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import xarray as xr
 
@@ -40,7 +40,7 @@ class Mends(SweepQuestion):
     """
 
     TITLE: ClassVar[str] = "Mends of the tuned law"
-    QUICK: ClassVar[Mapping[str, Any]] = {"worlds": 32}
+    QUICK: ClassVar[Mapping[str, object]] = {"worlds": 32}
 
     laws: LawsLike = ()
     """Additions, by their names in the table; by default all. The addition of comparison is always

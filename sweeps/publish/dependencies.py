@@ -27,12 +27,9 @@ import xarray as xr
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
-from rps_jax import errors
-from rps_jax.analysis.report import Section
 from rps_jax.errors import InputError
 from rps_jax.runs.question import Run, call_of
-from rps_jax.trials.progress import Progress
-from sweeps.study_base import Study, Table
+from sweeps.study_base import Rows, Study, Table, run_parts
 
 ROOT = Path(__file__).parents[2]
 PACKAGE = "rps-jax"
@@ -83,16 +80,12 @@ class Dependencies(Study[xr.Dataset]):
     """
 
     TITLE: ClassVar[str] = "Packages of the dependencies"
+    CHOICES: ClassVar = {"extras": EXTRAS}
     GROWS: ClassVar[tuple[str, ...]] = ("extras",)
     RESULTS: ClassVar[str] = "../results"
 
     extras: tuple[str, ...] = tuple(EXTRAS)
     """Extras to measure; by default all."""
-
-    def check(self) -> None:
-        """Check the names of the extras."""
-        for name in self.extras:
-            errors.check_name("extra", name, EXTRAS)
 
     def num_trials(self) -> int | None:
         """Return the number of environments."""
@@ -102,24 +95,14 @@ class Dependencies(Study[xr.Dataset]):
         """Measure the environments that are missing."""
         with tempfile.TemporaryDirectory() as folder:
             environment = Path(folder) / "environment"
-            parts = {"": run.checkpoint("core", partial(_core, environment))}
-            for name in self.extras:
-                run.callback(Progress(len(parts), 0.0))
-                parts[name] = run.checkpoint(name, partial(_extra, environment, name))
-            run.callback(Progress(len(parts), 0.0))
-        index = xr.IndexVariable("installed", list(parts))
-        results: Any = xr.concat(
-            list(parts.values()), index, join="outer", fill_value={"size": 0.0}
-        )
-        return results
+            parts = {"core": partial(_core, environment)}
+            parts |= {name: partial(_extra, environment, name) for name in self.extras}
+            results = run_parts(run, "installed", parts)
+        return results.fillna({"size": 0.0})
 
-    def published_tables(self, results: xr.Dataset) -> Mapping[str, Table]:
+    def report_tables(self, results: xr.Dataset) -> Sequence[Table]:
         """Return both tables."""
-        return {name: Table(rows, _NOTE) for name, rows in tables(results).items()}
-
-    def report(self, results: xr.Dataset, run: Run) -> Sequence[Section]:
-        """Return both tables."""
-        return [Section(name.capitalize(), "", rows) for name, rows in tables(results).items()]
+        return [Table(rows, _NOTE, name=name) for name, rows in tables(results).items()]
 
 
 dependencies = call_of(Dependencies)
@@ -135,18 +118,21 @@ def declared() -> dict[str, Any]:
     return tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
 
 
-def tables(results: xr.Dataset) -> dict[str, list[list[str]]]:
+def tables(results: xr.Dataset) -> dict[str, Rows]:
     """Return header and rows of both tables, by name."""
-    core = results.sel(installed="").isel(package=results["size"].sel(installed="").values > 0)
+    core = results.sel(installed="core")
     extras = [["extra", "what it is for", "packages", "size"]]
     for name in map(str, results.installed.values[1:]):
         sizes = results["size"].sel(installed=name).values
         size = f"{sizes.sum() / 1e6:,.0f} MB"
         extras.append([name, EXTRAS[name], str(int((sizes > 0).sum())), size])
-    return {"dependencies": _core_table(core), "extras": extras}
+    return {
+        "dependencies": _core_table(core.isel(package=core["size"].values > 0)),
+        "extras": extras,
+    }
 
 
-def _core_table(core: xr.Dataset) -> list[list[str]]:
+def _core_table(core: xr.Dataset) -> Rows:
     """Return a header, one row per dependency, and their sum."""
     names = [canonicalize_name(Requirement(text).name) for text in declared()["dependencies"]]
     sizes = dict(zip(map(str, core.package.values), core["size"].values / 1e6, strict=True))
@@ -207,15 +193,9 @@ def _pip(environment: Path, *words: str) -> None:
     Raises:
       InputError: pip failed.
     """
-    command = [
-        environment / ("Scripts" if os.name == "nt" else "bin") / "python",
-        "-m",
-        "pip",
-        *words,
-    ]
-    process = subprocess.run(
-        [*command, "-c", str(ROOT / "constraints.txt")], capture_output=True, text=True, check=False
-    )
+    python = environment / ("Scripts" if os.name == "nt" else "bin") / "python"
+    command = [python, "-m", "pip", *words, "-c", str(ROOT / "constraints.txt")]
+    process = subprocess.run(command, capture_output=True, text=True, check=False)
     if process.returncode:
         raise InputError(f"pip {words[0]} failed: {' '.join(process.stderr.strip().split()[-40:])}")
 

@@ -23,7 +23,6 @@ class Recipe(NamedTuple):
     section: str | Callable[[Any], Rows] = ""
     labels: tuple[str, ...] = ()  # first cell of the rows of each command
     columns: tuple[str, ...] = ()  # names of the columns to show; by default all
-    note: str = ""
     folder: str = ""  # folder of `sweeps` for a new file
 
     @property
@@ -33,6 +32,13 @@ class Recipe(NamedTuple):
             return "cpu"
         cores = self.two_cores
         return "gpu" if cores is None or cores > min(60, 3 * self.one_gpu) else "cpu"
+
+
+def recipe(
+    *commands: str, cores: float | None = None, gpu: float | None = None, **table: Any
+) -> Recipe:
+    """Return a recipe with the minutes that its commands take on two cores and on one GPU."""
+    return Recipe(commands, cores, gpu, **table)
 
 
 def _each(command: str, *names: str) -> tuple[str, ...]:
@@ -68,332 +74,269 @@ _REAL = "rps sweep --domain real --worlds 4096 --seed 11 --laws rps rps_tuned"
 _RACE = "--tuned K_h K_v L beta l_cr d_th --horizon 150 --validation 256 --seed 5"
 _DESCENT = f"rps tune grad {_RACE} --starts 2 --worlds 512 --steps 20 --learning-rate 0.2"
 _RACERS = " ".join(f"rps,runs/{name}/tuned.json" for name in ("evolution", "gradient", "hybrid"))
-_GROUNDS = ("error", "push over mu m g")
+_EQUAL = ("equal outcomes", "95 %", "+/-", "McNemar p")
+_SOLVER = ("setting", *_EQUAL, "5 s error: median, 95 %", "cost")
+_AT_SPEEDS = [f"{x}, {cm} cm/s" for cm in (1, 5, 20) for x in ("error", "push over mu m g")]
 _RIVALS = ("rps", "pursuit", "dipole", "force_push", "force_push_published")
 _SWEPT = "sweep --laws rps_tuned --domain wide"
 _GRADIENTS = "rps sweeps/gradients --worlds 32 --estimators"
 
 # In order of importance, which is the order of computation.
 RECIPES: dict[str, Recipe] = {
-    "headline": Recipe((f"rps sweeps/random_worlds {_MACHINE}",), None, 30),
-    "models": Recipe((f"rps sweeps/random_worlds {_MACHINE}",), None, 30),
-    "million": Recipe((f"rps sweeps/random_worlds/million.py {_MACHINE}",), None, 9),
-    "rest": Recipe((f"rps sweeps/fidelity/rest.py {_MACHINE}",), 5, None),
-    "hardware_[qr]*": Recipe((f"rps sweeps/hardware {_MACHINE}",), None, 20),
-    "feet": Recipe(
-        (
-            "rps sweep --domain wide --laws rps rps_tuned rps_plus --worlds 400",
-            "rps sweep --domain wide,feet=0.5:0.9 --laws rps rps_tuned rps_plus --worlds 400",
+    "headline": recipe(f"rps sweeps/random_worlds {_MACHINE}", gpu=30),
+    "models": recipe(f"rps sweeps/random_worlds {_MACHINE}", gpu=30),
+    "million": recipe(f"rps sweeps/random_worlds/million.py {_MACHINE}", gpu=9),
+    "rest": recipe(f"rps sweeps/fidelity/rest.py {_MACHINE}", cores=5),
+    "hardware_[qr]*": recipe(f"rps sweeps/hardware {_MACHINE}", gpu=20),
+    "feet": recipe(
+        "rps sweep --domain wide --laws rps rps_tuned rps_plus --worlds 400",
+        "rps sweep --domain wide,feet=0.5:0.9 --laws rps rps_tuned rps_plus --worlds 400",
+        cores=10,
+        section="Success",
+        labels=("corners and rims", "three or four feet"),
+        columns=_RATES,
+    ),
+    "table": recipe("rps table", cores=1, section="Table II*"),
+    "table_mjx": recipe("rps table --engine mjx", cores=4, section="Table II*", folder="table"),
+    "grid": recipe(
+        "rps table --laws rps rps_tuned rps_plus learned_gru",
+        cores=3,
+        gpu=1,
+        section="Table II*",
+        folder="table",
+    ),
+    "hardware": recipe(
+        "rps hardware --engine fused", cores=4, gpu=2, section="Hardware experiments"
+    ),
+    "shoves": recipe(
+        "rps hardware --engine fused", cores=4, gpu=2, section="The object shoved aside"
+    ),
+    "real_pushes_*": recipe(f"rps sweeps/real_pushes {_MACHINE}", cores=15),
+    "ladder": recipe(
+        *_LADDERS, gpu=6, section="Against rps_tuned*", labels=_WIDE, columns=_AGAINST
+    ),
+    "bearings": recipe(*_LADDERS[:1], gpu=3, section=rows.by_bearing),
+    "ceiling": recipe(
+        *_LADDERS,
+        *_each("rps ceiling runs/ladder_{} --samples 32 --rounds 6", *_WIDE),
+        gpu=20,
+        section="A planner that knows the world",
+        labels=("", "", *_WIDE),
+    ),
+    "plus": recipe(
+        *tuple(_PLUS.values()), gpu=12, section=rows.plus_beside_tuned, labels=tuple(_PLUS)
+    ),
+    "tuned": recipe(
+        "rps ladder --laws rps rps_tuned --domain wide hostile real --worlds 10000 --seed 4",
+        gpu=4,
+        section=rows.comparison,
+    ),
+    "random_worlds": recipe(
+        "rps sweep --domain wide --worlds 36000 --laws rps nps aps",
+        gpu=4,
+        section="Success",
+        columns=_RATES,
+    ),
+    "robots": recipe(
+        *_each(
+            "rps sweep --domain wide --worlds 4096 --seed 11 --laws rps rps_tuned --robot {}",
+            *_ROBOTS,
         ),
-        10,
-        None,
-        "Success",
-        ("corners and rims", "three or four feet"),
-        _RATES,
+        _REAL,
+        gpu=5,
+        section="Success",
+        labels=(*_ROBOTS, "drawn (real)"),
+        columns=("", "all", "median time"),
     ),
-    "table": Recipe(("rps table",), 1, None, "Table II*"),
-    "table_mjx": Recipe(("rps table --engine mjx",), 4, None, "Table II*", folder="table"),
-    "grid": Recipe(
-        ("rps table --laws rps rps_tuned rps_plus learned_gru",), 3, 1, "Table II*", folder="table"
+    "real": recipe(_REAL, gpu=1, section=rows.by_robot),
+    "limits": recipe(
+        "rps sweeps/limits --limits force lag acceleration --worlds 4096",
+        gpu=3,
+        section="Success over each limit",
     ),
-    "hardware": Recipe(("rps hardware --engine fused",), 4, 2, "Hardware experiments"),
-    "shoves": Recipe(("rps hardware --engine fused",), 4, 2, "The object shoved aside"),
-    "real_pushes_*": Recipe((f"rps sweeps/real_pushes {_MACHINE}",), 15, None),
-    "ladder": Recipe(_LADDERS, None, 6, "Against rps_tuned*", _WIDE, _AGAINST),
-    "bearings": Recipe(_LADDERS[:1], None, 3, rows.by_bearing),
-    "ceiling": Recipe(
-        (*_LADDERS, *_each("rps ceiling runs/ladder_{} --samples 32 --rounds 6", *_WIDE)),
-        None,
-        20,
-        "A planner that knows the world",
-        ("", "", *_WIDE),
+    "sizes": recipe(
+        "rps sweeps/limits --limits half_width pitch --worlds 2048",
+        gpu=4,
+        section="Success at each size",
     ),
-    "plus": Recipe(tuple(_PLUS.values()), None, 12, rows.plus_beside_tuned, tuple(_PLUS)),
-    "tuned": Recipe(
-        ("rps ladder --laws rps rps_tuned --domain wide hostile real --worlds 10000 --seed 4",),
-        None,
-        4,
-        rows.comparison,
+    "sensitivity": recipe(
+        "rps sensitivity --law rps_tuned --domain hostile --worlds 16384",
+        "rps sensitivity --law rps_plus --domain hostile --worlds 16384",
+        "rps sensitivity --law rps_tuned --domain real --worlds 16384",
+        gpu=4,
+        section=rows.largest_indices,
+        labels=("rps_tuned, hostile", "rps_plus, hostile", "rps_tuned, real"),
     ),
-    "random_worlds": Recipe(
-        ("rps sweep --domain wide --worlds 36000 --laws rps nps aps",),
-        None,
-        4,
-        "Success",
-        (),
-        _RATES,
+    "rare": recipe(
+        "rps sweeps/failures/drawn.py --law rps --domain wide,distance=1:1.2 --engine "
+        "quasistatic --horizon 100 --beyond 0.3 --particles 200 --groups 5 --repetitions 20 "
+        "--brute 2000",
+        cores=5,
+        section=rows.rare_failures,
     ),
-    "robots": Recipe(
-        (
-            *_each(
-                "rps sweep --domain wide --worlds 4096 --seed 11 --laws rps rps_tuned --robot {}",
-                *_ROBOTS,
-            ),
-            _REAL,
-        ),
-        None,
-        5,
-        "Success",
-        (*_ROBOTS, "drawn (real)"),
-        ("", "all", "median time"),
+    "rare_million": recipe(
+        "rps rare --law rps_plus --domain wide --particles 1000 --groups 10 --share 0.5 "
+        "--repetitions 20",
+        gpu=3,
+        section=rows.rare_failures,
     ),
-    "real": Recipe((_REAL,), None, 1, rows.by_robot),
-    "limits": Recipe(
-        ("rps sweeps/limits --limits force lag acceleration --worlds 4096",),
-        None,
-        3,
-        "Success over each limit",
+    "attack": recipe(
+        "rps attack --law rps_tuned --domain wide --minutes 3.5 --batch 64 --repeats 3 "
+        "--drawn 600 --check-again 8",
+        "rps attack --law rps_plus --domain wide --minutes 13 --batch 128 --repeats 2 "
+        "--drawn 256 --check-again 24",
+        "rps attack --law rps_plus --domain wide --axes height size friction_ground "
+        "--minutes 5 --batch 96 --repeats 2 --drawn 64 --check-again 12",
+        cores=30,
+        section=rows.attack_table,
+        labels=("rps_tuned", "rps_plus", "rps_plus, three axes"),
     ),
-    "sizes": Recipe(
-        ("rps sweeps/limits --limits half_width pitch --worlds 2048",),
-        None,
-        4,
-        "Success at each size",
+    "regression": recipe(
+        "rps regress --laws rps rps_tuned rps_plus learned_gru", cores=3, gpu=1, section="Wins"
     ),
-    "sensitivity": Recipe(
-        (
-            "rps sensitivity --law rps_tuned --domain hostile --worlds 16384",
-            "rps sensitivity --law rps_plus --domain hostile --worlds 16384",
-            "rps sensitivity --law rps_tuned --domain real --worlds 16384",
-        ),
-        None,
-        4,
-        rows.largest_indices,
-        ("rps_tuned, hostile", "rps_plus, hostile", "rps_tuned, real"),
+    "readings": recipe("rps sweeps/ambiguities", cores=15, gpu=4, section="Readings, *"),
+    "readings_plus": recipe(
+        "rps sweeps/ambiguities --laws rps_plus",
+        "rps sweeps/ambiguities --gazebo --laws rps_plus --readings paper_gazebo pyramid thin",
+        cores=15,
+        gpu=4,
+        section="Readings, *",
     ),
-    "rare": Recipe(
-        (
-            "rps sweeps/failures/drawn.py --law rps --domain wide,distance=1:1.2 --engine "
-            "quasistatic --horizon 100 --beyond 0.3 --particles 200 --groups 5 --repetitions 20 "
-            "--brute 2000",
-        ),
-        5,
-        None,
-        rows.rare_failures,
+    "gazebo": recipe(
+        "rps sweeps/ambiguities --gazebo --readings paper_gazebo",
+        cores=12,
+        gpu=2,
+        section="Cells of Table II",
     ),
-    "rare_million": Recipe(
-        (
-            "rps rare --law rps_plus --domain wide --particles 1000 --groups 10 --share 0.5 "
-            "--repetitions 20",
-        ),
-        None,
-        3,
-        rows.rare_failures,
-    ),
-    "attack": Recipe(
-        (
-            "rps attack --law rps_tuned --domain wide --minutes 3.5 --batch 64 --repeats 3 "
-            "--drawn 600 --check-again 8",
-            "rps attack --law rps_plus --domain wide --minutes 13 --batch 128 --repeats 2 "
-            "--drawn 256 --check-again 24",
-            "rps attack --law rps_plus --domain wide --axes height size friction_ground "
-            "--minutes 5 --batch 96 --repeats 2 --drawn 64 --check-again 12",
-        ),
-        30,
-        None,
-        rows.attack_table,
-        ("rps_tuned", "rps_plus", "rps_plus, three axes"),
-    ),
-    "regression": Recipe(("rps regress --laws rps rps_tuned rps_plus learned_gru",), 3, 1, "Wins"),
-    "readings": Recipe(("rps sweeps/ambiguities",), 15, 4, "Readings, *"),
-    "readings_plus": Recipe(
-        (
-            "rps sweeps/ambiguities --laws rps_plus",
-            "rps sweeps/ambiguities --gazebo --laws rps_plus --readings paper_gazebo pyramid thin",
-        ),
-        15,
-        4,
-        "Readings, *",
-    ),
-    "gazebo": Recipe(
-        ("rps sweeps/ambiguities --gazebo --readings paper_gazebo",), 12, 2, "Cells of Table II"
-    ),
-    "gazebo_parts": Recipe(
-        ("rps sweeps/ambiguities --gazebo --laws rps --readings paper_gazebo pyramid thin",),
-        8,
-        None,
-        "Readings, *",
+    "gazebo_parts": recipe(
+        "rps sweeps/ambiguities --gazebo --laws rps --readings paper_gazebo pyramid thin",
+        cores=8,
+        section="Readings, *",
         folder="ambiguities",
     ),
-    "fidelity": Recipe(
-        ("rps sweeps/fidelity",),
-        60,
-        10,
-        "Settings of the solver*",
-        (),
-        (
-            "setting",
-            "equal outcomes",
-            "95 %",
-            "+/-",
-            "McNemar p",
-            "5 s error: median, 95 %",
-            "cost",
+    "fidelity": recipe(
+        "rps sweeps/fidelity",
+        cores=60,
+        gpu=10,
+        section="Settings of the solver*",
+        columns=_SOLVER,
+    ),
+    "engines_ideal": recipe(
+        f"rps sweeps/engines --domain {_IDEAL} --worlds 240 --engines 'C, reference' "
+        "'C, reference, moved' 'fused, standard' 'fused, 5 ms' 'C, standard' 'MJX, standard'",
+        cores=25,
+        gpu=4,
+        section="Equal outcomes",
+    ),
+    "engines_wide": recipe(
+        "rps sweeps/engines --domain wide --worlds 240 --engines 'C, reference' "
+        "'C, reference, moved' 'C, standard' 'fused, standard' 'fused, 5 ms' 'fused, fast' "
+        "'MJX, standard' quasistatic",
+        cores=25,
+        gpu=4,
+        section="Equal outcomes",
+    ),
+    "ground": recipe(
+        "rps sweeps/ground",
+        cores=30,
+        section="Grounds beside a rigid object",
+        columns=("ground", *_AT_SPEEDS, "height of the push", "largest hop", "aloft"),
+    ),
+    "force_push_grid": recipe("rps sweeps/force_push_grid", cores=4, section="Pushes that succeed"),
+    "mends": recipe(
+        *_each("rps sweeps/mends --domain {} --worlds 4096 --seed 80", *_WIDE[::-1]),
+        gpu=6,
+        section="Against*",
+        labels=_WIDE[::-1],
+        columns=("", "success", "against P1, P2 outside the Realignment State", "p (Holm)"),
+    ),
+    "rivals_tuned": recipe(
+        *_each(
+            "rps tune es --law {0} --domain wide hostile --worlds 16 --population 12 "
+            "--generations 200 --budget 400000 --validation 64 --out runs/tuned_{0}",
+            *_RIVALS,
         ),
+        "rps ladder --domain wide --worlds 1000 --seed 10 --laws "
+        + " ".join(f"{law} {law},runs/tuned_{law}/tuned.json" for law in _RIVALS),
+        gpu=10,
+        section=rows.default_beside_tuned,
     ),
-    "engines_ideal": Recipe(
-        (
-            f"rps sweeps/engines --domain {_IDEAL} --worlds 240 --engines 'C, reference' "
-            "'C, reference, moved' 'fused, standard' 'fused, 5 ms' 'C, standard' 'MJX, standard'",
-        ),
-        25,
-        4,
-        "Equal outcomes",
+    "race": recipe(
+        f"rps tune es {_RACE} --population 16 --worlds 64 --budget 2.4e6 --out runs/evolution",
+        f"{_DESCENT} --budget 2.4e6 --out runs/gradient",
+        f"{_DESCENT} --budget 1.2e6 --out runs/half",
+        f"rps tune es {_RACE} --law rps,runs/half/tuned.json --spread 0.2 --prior 0.01 "
+        "--population 16 --worlds 64 --budget 1.2e6 --out runs/hybrid",
+        f"rps ladder --laws rps {_RACERS} --domain paper wide hostile --worlds 1000 --seed 3",
+        gpu=15,
+        section=rows.comparison,
     ),
-    "engines_wide": Recipe(
-        (
-            "rps sweeps/engines --domain wide --worlds 240 --engines 'C, reference' "
-            "'C, reference, moved' 'C, standard' 'fused, standard' 'fused, 5 ms' 'fused, fast' "
-            "'MJX, standard' quasistatic",
-        ),
-        25,
-        4,
-        "Equal outcomes",
+    "gradients": recipe(
+        f"{_GRADIENTS} reverse clipped evolution combined",
+        f"{_GRADIENTS} reverse clipped evolution combined --object random_cylinder",
+        f"{_GRADIENTS} forward --horizons 0.5 2 8 30",
+        gpu=30,
+        section=rows.cosines,
+        labels=("boxes", "cylinders", "boxes"),
     ),
-    "ground": Recipe(
-        ("rps sweeps/ground",),
-        30,
-        None,
-        "Grounds beside a rigid object",
-        (),
-        (
-            "ground",
-            *(f"{column}, {speed} cm/s" for speed in (1, 5, 20) for column in _GROUNDS),
-            "height of the push",
-            "largest hop",
-            "aloft",
-        ),
+    "robot": recipe(f"rps sweeps/speed/robot.py {_MACHINE}", cores=1),
+    "dependencies": recipe(f"rps sweeps/publish/dependencies.py {_MACHINE}", cores=15),
+    "extras": recipe(f"rps sweeps/publish/dependencies.py {_MACHINE}", cores=15),
+    "fit_*": recipe(f"rps sweeps/fit {_MACHINE}", f"rps sweeps/fit/bags.py {_MACHINE}", cores=20),
+    "export_*": recipe(
+        f"rps sweeps/export --tables speed {_MACHINE}",
+        f"rps sweeps/export --tables trials paper worlds bags odd {_MACHINE}",
+        f"rps sweeps/export --tables inputs {_MACHINE}",
+        cores=60,
     ),
-    "force_push_grid": Recipe(("rps sweeps/force_push_grid",), 4, None, "Pushes that succeed"),
-    "mends": Recipe(
-        _each("rps sweeps/mends --domain {} --worlds 4096 --seed 80", *_WIDE[::-1]),
-        None,
-        6,
-        "Against*",
-        _WIDE[::-1],
-        ("", "success", "against P1, P2 outside the Realignment State", "p (Holm)"),
-    ),
-    "rivals_tuned": Recipe(
-        (
-            *_each(
-                "rps tune es --law {0} --domain wide hostile --worlds 16 --population 12 "
-                "--generations 200 --budget 400000 --validation 64 --out runs/tuned_{0}",
-                *_RIVALS,
-            ),
-            "rps ladder --domain wide --worlds 1000 --seed 10 --laws "
-            + " ".join(f"{law} {law},runs/tuned_{law}/tuned.json" for law in _RIVALS),
-        ),
-        None,
-        10,
-        rows.default_beside_tuned,
-    ),
-    "race": Recipe(
-        (
-            f"rps tune es {_RACE} --population 16 --worlds 64 --budget 2.4e6 --out runs/evolution",
-            f"{_DESCENT} --budget 2.4e6 --out runs/gradient",
-            f"{_DESCENT} --budget 1.2e6 --out runs/half",
-            f"rps tune es {_RACE} --law rps,runs/half/tuned.json --spread 0.2 --prior 0.01 "
-            "--population 16 --worlds 64 --budget 1.2e6 --out runs/hybrid",
-            f"rps ladder --laws rps {_RACERS} --domain paper wide hostile --worlds 1000 --seed 3",
-        ),
-        None,
-        15,
-        rows.comparison,
-    ),
-    "gradients": Recipe(
-        (
-            f"{_GRADIENTS} reverse clipped evolution combined",
-            f"{_GRADIENTS} reverse clipped evolution combined --object random_cylinder",
-            f"{_GRADIENTS} forward --horizons 0.5 2 8 30",
-        ),
-        None,
-        30,
-        rows.cosines,
-        ("boxes", "cylinders", "boxes"),
-    ),
-    "robot": Recipe((f"rps sweeps/speed/robot.py {_MACHINE}",), 1, None),
-    "dependencies": Recipe((f"rps sweeps/publish/dependencies.py {_MACHINE}",), 15, None),
-    "extras": Recipe((f"rps sweeps/publish/dependencies.py {_MACHINE}",), 15, None),
-    "fit_*": Recipe((f"rps sweeps/fit {_MACHINE}", f"rps sweeps/fit/bags.py {_MACHINE}"), 20, None),
-    "export_*": Recipe(
-        (
-            f"rps sweeps/export --tables speed {_MACHINE}",
-            f"rps sweeps/export --tables trials paper worlds bags odd {_MACHINE}",
-            f"rps sweeps/export --tables inputs {_MACHINE}",
-        ),
-        60,
-        None,
-    ),
-    "sb3": Recipe((f"rps sweeps/learned/sb3.py {_MACHINE}",), 3, None),
+    "sb3": recipe(f"rps sweeps/learned/sb3.py {_MACHINE}", cores=3),
     # --- speed, with nothing else running ---
-    "speed": Recipe(
-        (
-            "rps sweeps/speed --names 'C in closed loop' 'fused standard' 'fused fast' quasistatic "
-            "--worlds 64 4096 262144 --at-once 16 --refill 0",
-        ),
-        None,
-        6,
-        rows.speeds,
+    "speed": recipe(
+        "rps sweeps/speed --names 'C in closed loop' 'fused standard' 'fused fast' quasistatic "
+        "--worlds 64 4096 262144 --at-once 16 --refill 0",
+        gpu=6,
+        section=rows.speeds,
     ),
-    "speed_cores": Recipe(
-        (
-            "rps sweeps/speed --names 'fused standard' 'C in closed loop' 'C, mj_step alone' "
-            "'mjx standard' --worlds 24 64 --refill 0",
-        ),
-        3,
-        None,
-        rows.speeds,
+    "speed_cores": recipe(
+        "rps sweeps/speed --names 'fused standard' 'C in closed loop' 'C, mj_step alone' "
+        "'mjx standard' --worlds 24 64 --refill 0",
+        cores=3,
+        section=rows.speeds,
     ),
-    "commands": Recipe((f"rps sweeps/speed/commands.py {_MACHINE}",), 14, None),
-    "compilers": Recipe((f"rps sweeps/speed/compilers.py {_MACHINE}",), 5, None),
-    "compilers_gpu": Recipe(
-        (
-            f"rps sweeps/speed/compilers.py --against cpu --worlds 4000 --file compilers_gpu "
-            f"{_MACHINE}",
-        ),
-        None,
-        2,
+    "commands": recipe(f"rps sweeps/speed/commands.py {_MACHINE}", cores=14),
+    "compilers": recipe(f"rps sweeps/speed/compilers.py {_MACHINE}", cores=5),
+    "compilers_gpu": recipe(
+        f"rps sweeps/speed/compilers.py --against cpu --worlds 4000 --file compilers_gpu "
+        f"{_MACHINE}",
+        gpu=2,
     ),
-    "kernel": Recipe((f"rps sweeps/speed/kernel.py {_MACHINE}",), None, 3),
-    "commands_gpu": Recipe(
-        (
-            "rps sweeps/speed/commands.py --commands "
-            + " ".join(f"'{_SWEPT} --worlds {n}'" for n in (1000, 10_000, 262_144))
-            + f" --gpus 1 --warm 1000 10000 --file commands_gpu {_MACHINE}",
-        ),
-        None,
-        8,
+    "kernel": recipe(f"rps sweeps/speed/kernel.py {_MACHINE}", gpu=3),
+    "commands_gpu": recipe(
+        "rps sweeps/speed/commands.py --commands "
+        + " ".join(f"'{_SWEPT} --worlds {n}'" for n in (1000, 10_000, 262_144))
+        + f" --gpus 1 --warm 1000 10000 --file commands_gpu {_MACHINE}",
+        gpu=8,
     ),
-    "gpus": Recipe(
-        (
-            f"rps sweeps/speed/commands.py --file gpus --gpus 1 2 --commands '{_SWEPT} "
-            f"--worlds 262144' {_MACHINE}",
-        ),
-        None,
-        6,
+    "gpus": recipe(
+        f"rps sweeps/speed/commands.py --file gpus --gpus 1 2 --commands '{_SWEPT} "
+        f"--worlds 262144' {_MACHINE}",
+        gpu=6,
         folder="speed",
     ),
     # After `python sweeps/speed/peers.py peers`.
-    "arena": Recipe((f"rps sweeps/speed/arena.py --peers peers {_MACHINE}",), None, 5),
-    "costs": Recipe(
-        (
-            "rps sweeps/speed/costs.py --names 'fused standard' 'mjx standard' --families box "
-            "prism --most 3",
-        ),
-        4,
-        None,
-        "Functions",
+    "arena": recipe(f"rps sweeps/speed/arena.py --peers peers {_MACHINE}", gpu=5),
+    "costs": recipe(
+        "rps sweeps/speed/costs.py --names 'fused standard' 'mjx standard' --families box "
+        "prism --most 3",
+        cores=4,
+        section="Functions",
     ),
-    "levers": Recipe(
-        (
-            "rps sweeps/levers --program 'fused standard' --worlds 65536 --at-once 16",
-            "rps sweeps/levers --program 'mjx standard' --worlds 4096 --simulated 1 --goes 3",
-        ),
-        None,
-        8,
-        "*, box",
-        (),
-        ("what", "lever", "worlds", "simulated s/s", "times"),
+    "levers": recipe(
+        "rps sweeps/levers --program 'fused standard' --worlds 65536 --at-once 16",
+        "rps sweeps/levers --program 'mjx standard' --worlds 4096 --simulated 1 --goes 3",
+        gpu=8,
+        section="*, box",
+        columns=("what", "lever", "worlds", "simulated s/s", "times"),
     ),
 }
 

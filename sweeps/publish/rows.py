@@ -14,8 +14,8 @@ from rps_jax.robot.robot import Robot
 from rps_jax.studies import rare, sensitivity
 from rps_jax.studies.attack import yields
 from rps_jax.trials.trial import Rules
+from sweeps.study_base import Rows, records
 
-Rows = list[list[str]]
 _MAX_LOST = float(Rules().max_lost)  # [s] in all published commands
 
 
@@ -51,19 +51,16 @@ def attack_table(results: xr.Dataset) -> Rows:
 
 def cosines(results: xr.Dataset) -> Rows:
     """Return a header and one row per estimator: its cosine with the true gradient, by horizon."""
-    all_horizons = (0.5, 2.0, 8.0, 30.0, 100.0, 300.0)
-    horizons = set(results.horizon.values.tolist())
+    horizons = (0.5, 2.0, 8.0, 30.0, 100.0, 300.0)
+    shown = results.reindex(horizon=list(horizons))
 
     def cells(values: xr.DataArray) -> list[str]:
-        return [
-            f"{values.sel(horizon=t).item():.2f}" if t in horizons else "" for t in all_horizons
-        ]
+        return ["" if np.isnan(value) else f"{value:.2f}" for value in values.values]
 
-    rows = [["estimator", *(f"{horizon:g} s" for horizon in all_horizons)]]
-    for name in results.estimator.values:
-        rows.append([str(name), *cells(results.cosine.sel(estimator=name))])
-    if horizons == set(all_horizons):
-        rows.append(["standard error of the truth, as a share of it", *cells(results.doubt)])
+    rows = [["estimator", *(f"{horizon:g} s" for horizon in horizons)]]
+    rows += [[str(c.estimator.item()), *cells(c)] for c in shown.cosine.transpose("estimator", ...)]
+    if results.sizes["horizon"] == len(horizons):
+        rows.append(["standard error of the truth, as a share of it", *cells(shown.doubt)])
     return rows
 
 
@@ -103,17 +100,14 @@ def _outcome_row(results: xr.Dataset, law: int, base: int) -> list[str]:
     kinds = statistics.failure_modes(outcomes, _MAX_LOST)
     counts = [int((kinds == statistics.FAILURES.index(kind)).sum()) for kind in _FAILURES]
     compared = statistics.compare(results.success[base], results.success[law])
+    difference = [f"+{compared.gained} -{compared.lost}", f"{compared.p:.2g}"]
     return [
         _run_or_law(str(outcomes.law.item())),
         tables.share(int(succeeded.sum()), succeeded.size),
         ", ".join(tables.percent(succeeded[mask].sum(), mask.sum()) for mask in masks),
         f"{np.median(time[succeeded]):.1f} s" if succeeded.any() else "-",
         ", ".join(map(str, counts)),
-        *(
-            ["", ""]
-            if law == base
-            else [f"+{compared.gained} -{compared.lost}", f"{compared.p:.2g}"]
-        ),
+        *(difference if law != base else ["", ""]),
     ]
 
 
@@ -146,12 +140,9 @@ def speeds(results: xr.Dataset) -> Rows:
     """Return a header and one row per engine and batch: simulated s per wall-clock s, by object."""
     families = list(dict.fromkeys(map(str, results.family.values)))
     rate_of = {
-        (str(name), int(worlds), str(family)): float(rate)
-        for name, worlds, family, rate in zip(
-            results["name"].values, results.worlds.values, results.family.values,
-            results.rate.values, strict=True,
-        )
-    }  # fmt: skip
+        (row["name"], row["worlds"], row["family"]): row["rate"]
+        for row in records(results, "measurement")
+    }
     in_c = {f: rate for (name, _, f), rate in rate_of.items() if name == "C in closed loop"}
     rows = [["engine", "worlds", *families, "against C in closed loop"]]
     for name, worlds in dict.fromkeys((name, worlds) for name, worlds, _ in rate_of):

@@ -12,33 +12,39 @@ import fnmatch
 import hashlib
 import itertools
 import json
-import os
-import platform
 import re
 import shlex
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar, Literal
 
-import jax
 import xarray as xr
 
 import rps_jax
 from rps_jax.analysis.report import Section
 from rps_jax.app.cli import flags, names
-from rps_jax.engines import device
 from rps_jax.errors import InputError
 from rps_jax.record import provenance
 from rps_jax.runs.question import Run, call_of
 from sweeps.publish.recipes import HISTORY, RECIPES, Recipe
-from sweeps.publish.rows import Rows
-from sweeps.study_base import Study, Table, digest, write_table
+from sweeps.study_base import (
+    Rows,
+    Study,
+    Table,
+    digest,
+    machine,
+    records,
+    split_folder,
+    text_table,
+    write_table,
+)
 
 _SWEEPS = Path(__file__).parents[1]
 CURRENT = "of today's code"
+_KEYS = ("version", "date", "state", "computed on", "two cores", "one H100")
 
 
 @dataclass(frozen=True)
@@ -65,17 +71,17 @@ class Publish(Study[xr.Dataset]):
             if not fnmatch.filter(known, pattern):
                 raise InputError(f"only = {pattern} is not allowed: no data file has such a name.")
 
+    def num_trials(self) -> int | None:
+        """Return the number of recipes to run."""
+        return None
+
     def answer(self, run: Run) -> xr.Dataset:
         """Compute selected data files again, and return the state of all data files."""
         if self.only:
             self._compute_again(run)
-        states = {path.stem: _description(path) for path in published()}
-        keys = next(iter(states.values()))
-        results = xr.Dataset(
-            {key: ("file", [state[key] for state in states.values()]) for key in keys},
-            {"file": list(states)},
-        )
-        stale = [name for name, state in states.items() if state["state"].startswith("stale")]
+        states = [xr.Dataset(_description(path), {"file": path.stem}) for path in published()]
+        results = xr.concat(states, "file")
+        stale = results.file[results.state.str.startswith("stale")].values.tolist()
         if self.check_digests and stale:
             raise InputError(
                 f"published numbers are stale: the inputs of {', '.join(stale)} have changed; "
@@ -100,25 +106,22 @@ class Publish(Study[xr.Dataset]):
             print(f"{name}: {state}, {time.perf_counter() - start:.0f} s", flush=True)
         if failed:
             raise InputError(
-                f"{len(failed)} of the files could not be made: {', '.join(failed)}. The others "
-                "are complete; the same command continues."
+                f"{len(failed)} of the files could not be computed: {', '.join(failed)}. The "
+                "others are complete; the same command continues."
             )
 
-    def report(self, results: xr.Dataset, run: Run) -> Sequence[Section]:
-        """Return a section with one row per data file, current ones last."""
-        keys = ("version", "date", "state", "made", "two cores", "one H100")
-        rows = [["file", *keys]]
+    def report_tables(self, results: xr.Dataset) -> Sequence[Table]:
+        """Return a row per data file, current ones last."""
         ordered = results.sortby("state", ascending=False)
-        for name in ordered.file.values:
-            state = ordered.sel(file=name)
-            rows.append([str(name), *(str(state[key].item()) for key in keys)])
+        columns = {name: f"{{{name}}}" for name in ("file", *_KEYS)}
         current = int((results.state == CURRENT).sum())
         text = (
             f"{current} of {results.sizes['file']} data files are of rps_jax {rps_jax.__version__} "
             "and none of their inputs has changed since. A file without a digest is older than the "
             "digests: only its command and its commit tell its inputs."
         )
-        return [Section("Data files", text, rows)]
+        rows = text_table(columns, records(ordered, "file"))
+        return [Table(rows, title="Data files", text=text)]
 
 
 publish = call_of(Publish)
@@ -133,47 +136,38 @@ def _description(path: Path) -> dict[str, str]:
     """Return version, date, device, command, state and duration of a data file, in words."""
     data = json.loads(path.read_text())
     recipe = next((r for name, r in RECIPES.items() if fnmatch.fnmatch(path.stem, name)), None)
-    duration = {"made": "", "two cores": "", "one H100": ""}
-    if recipe is not None:
-        minutes = (recipe.two_cores, recipe.one_gpu)
-        cores, gpu = ("" if t is None else f"{t:g} min" for t in minutes)
-        duration = {"made": f"on {recipe.device}", "two cores": cores, "one H100": gpu}
-    if "command" not in data:
-        cells = [cell for row in data["rows"] for cell in row if isinstance(cell, dict)]
-        state = f"cites {', '.join(sorted({cell['from'] for cell in cells}))}"
-        return (
-            dict.fromkeys(("version", "date", "device", "command"), "")
-            | duration
-            | {"state": state}
-        )
-    commands = data["command"] if isinstance(data["command"], list) else [data["command"]]
-    version = str(data["versions"]["rps_jax"])
-    if path.stem in HISTORY:
-        state = f"history: {HISTORY[path.stem]}"
-    else:
-        state = _state(data.get("digest"), commands, version)
+    minutes = (recipe.two_cores, recipe.one_gpu) if recipe else (None, None)
+    cores, gpu = ("" if t is None else f"{t:g} min" for t in minutes)
+    commands = data.get("command", ())
     return {
-        "version": version,
-        "date": str(data["date"] or ""),
-        "device": str(data["device"] or ""),
-        "command": "; ".join(commands),
-        **duration,
-        "state": state,
+        "version": str(data.get("versions", {}).get("rps_jax", "")),
+        "date": str(data.get("date") or ""),
+        "device": str(data.get("device") or ""),
+        "command": commands if isinstance(commands, str) else "; ".join(commands),
+        "computed on": recipe.device if recipe else "",
+        "two cores": cores,
+        "one H100": gpu,
+        "state": _state(path.stem, data),
     }
 
 
-def _state(stored: str | None, commands: Sequence[str], version: str) -> str:
-    if stored is None:
-        return f"made by {version}, without a digest"
+def _state(name: str, data: Mapping[str, Any]) -> str:
+    """Return whether a data file is up to date."""
+    if "command" not in data:
+        sources = {cell["from"] for row in data["rows"] for cell in row if isinstance(cell, dict)}
+        return f"cites {', '.join(sorted(sources))}"
+    if name in HISTORY:
+        return f"history: {HISTORY[name]}"
+    version = str(data["versions"]["rps_jax"])
+    if "digest" not in data:
+        return f"computed by {version}, without a digest"
     try:
-        current = digest([shlex.split(command) for command in commands])
+        current = digest([shlex.split(command) for command in data["command"]])
     except (InputError, SystemExit) as error:
         return f"stale: its command does not exist today ({error})"
-    if current != stored:
+    if current != data["digest"]:
         return "stale: its laws, domains, physics or seeds have changed"
-    return (
-        CURRENT if version == rps_jax.__version__ else f"made by {version}, nothing changed since"
-    )
+    return CURRENT if version == rps_jax.__version__ else f"computed by {version}, still current"
 
 
 # --- computing data files again -------------------------------------------------------------
@@ -199,16 +193,14 @@ def run_recipe(name: str, recipe: Recipe, runs: Path, device: str) -> None:
         columns, rows = joined(tables, recipe.columns)
         existing = next((path for path in published() if path.stem == name), None)
         path = existing or _SWEEPS / recipe.folder / "results" / f"{name}.json"
-        write_table(path, runs_behind, device, Table(rows, recipe.note, columns))
+        write_table(path, runs_behind, device, Table(rows, columns=columns))
 
 
 def _run_command(words: list[str], runs: Path) -> tuple[Sequence[Section], Any, dict[str, Any]]:
     """Run a command; return the sections of its report, its results and its provenance."""
-    i = words.index("--out") if "--out" in words else None
-    folder = f"runs/{_folder_name(words)}" if i is None else words[i + 1]
-    options = words[1:] if i is None else [*words[1:i], *words[i + 2 :]]
+    (_, *options), folder = split_folder(words)
     name, options = names.split([re.sub(r"\bruns/", f"{runs}/", word) for word in options])
-    out = runs / Path(folder).name
+    out = runs / Path(folder or _folder_name(words)).name
     options += ["--out", str(out)]
     question, _ = flags.parse(names.question_type(name), name, options)
     question.validate()
@@ -252,20 +244,6 @@ def joined(
     column_names = [*[""] * has_labels, *(header[i] or next(unnamed) for i in shown)]
     merged = {"merge": True}
     return [{"name": name, **({} if i else merged)} for i, name in enumerate(column_names)], rows
-
-
-def machine() -> str:
-    """Return a description of the device of this process."""
-    used, count = jax.devices()[0], device.count_processors()
-    if used.platform != "cpu":
-        return f"one {used.device_kind} and {count} processors"
-    model = platform.processor() or platform.machine()
-    cpuinfo = Path("/proc/cpuinfo")
-    for line in cpuinfo.read_text().splitlines() if cpuinfo.exists() else ():
-        if line.startswith("model name"):
-            model = line.partition(":")[2].strip()
-            break
-    return f"{count} of {os.cpu_count()} processors, {model}"
 
 
 def _match(name: str, pattern: str) -> bool:

@@ -10,26 +10,24 @@ quantities again from the seed and the index of a world. More laws can be added 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 import xarray as xr
 
 from rps_jax.analysis import statistics, tables
-from rps_jax.analysis.report import Section
 from rps_jax.control import registry
 from rps_jax.record import files
 from rps_jax.record.options import option
-from rps_jax.runs import execution
 from rps_jax.runs.plan import Plan
 from rps_jax.runs.question import Run, call_of, seed_of
 from rps_jax.trials.setting import Setting
 from rps_jax.world import domain as domains
-from sweeps.study_base import Table, TrialStudy
+from sweeps.study_base import Rows, Table, TrialStudy, run_parts, run_plans
 
 ENDS = ("success", *statistics.FAILURES)  # `how` is an index into these
 UNTOUCHED = 65_535  # `missed` of an object that was never touched
@@ -49,7 +47,7 @@ class Million(TrialStudy[xr.Dataset]):
     """
 
     TITLE: ClassVar[str] = "A million outcomes"
-    QUICK: ClassVar[dict[str, Any]] = {"worlds": 64}
+    QUICK: ClassVar = {"worlds": 64}
     GROWS: ClassVar[tuple[str, ...]] = ("laws",)
 
     laws: tuple[str, ...] = ("rps_tuned", "rps_plus", "learned_gru")
@@ -76,8 +74,8 @@ class Million(TrialStudy[xr.Dataset]):
 
     def answer(self, run: Run) -> xr.Dataset:
         """Run the laws that are missing."""
-        laws = [run.checkpoint(law, partial(self._outcomes, law, run)) for law in self.laws]
-        results = xr.concat(laws, xr.IndexVariable("law", list(self.laws)))
+        parts = {law: partial(self._outcomes, law, run) for law in self.laws}
+        results = run_parts(run, "law", parts, self.worlds)
         for name, long_name in _LONG_NAMES.items():
             results[name].attrs["long_name"] = long_name
         ranges, seed = domains.parse_domain(self.domain), self.test_setting.seed
@@ -90,9 +88,9 @@ class Million(TrialStudy[xr.Dataset]):
         }
         return results
 
-    def published_tables(self, results: xr.Dataset) -> Mapping[str, Table]:
-        """Return the rates of the laws."""
-        return {"million": Table([HEADER, *table(results)])}
+    def report_tables(self, results: xr.Dataset) -> Sequence[Table]:
+        """Return the ends of each law's trials."""
+        return [Table(table(results), name="million", title="Ends")]
 
     def publish(self, results: xr.Dataset, run_folder: Path) -> None:
         """Write the data file of the table, and all outcomes."""
@@ -103,8 +101,8 @@ class Million(TrialStudy[xr.Dataset]):
         """Return the outcomes of one law in compact types."""
         laws = registry.resolve_laws([law])
         plan = Plan(domains.parse_domain(self.domain), self.worlds, laws, self.test_setting, 16_384)
-        folder = None if run.folder is None else run.folder / f"sweep_{law}"
-        outcomes = execution.run_plan(plan, folder, **run.batch_options).isel(law=0)
+        (outcomes,) = run_plans(run, {f"sweep_{law}": plan}).values()
+        outcomes = outcomes.isel(law=0)
         how = 1 + statistics.failure_modes(outcomes, float(self.setting.rules.max_lost))
         steps = np.rint(outcomes.time.values / self.setting.physics.control_period)
         distance = outcomes.min_distance.values
@@ -119,14 +117,8 @@ class Million(TrialStudy[xr.Dataset]):
             }
         )
 
-    def report(self, results: xr.Dataset, run: Run) -> Sequence[Section]:
-        """Return a section with the ends of each law's trials."""
-        return [Section("Ends", "", [HEADER, *table(results)])]
-
 
 million = call_of(Million)
-
-HEADER = ["law", "success", *statistics.FAILURES, "median time of a success"]
 
 
 def packed(results: xr.Dataset) -> xr.Dataset:
@@ -136,16 +128,14 @@ def packed(results: xr.Dataset) -> xr.Dataset:
     return results
 
 
-def table(results: xr.Dataset) -> list[list[str]]:
-    """Return one row per law: its rate, its failures by kind, its median time."""
-    rows = []
+def table(results: xr.Dataset) -> Rows:
+    """Return a header and a row per law: its rate, its failures by kind, its median time."""
+    rows = [["law", "success", *statistics.FAILURES, "median time of a success"]]
     for law in map(str, results.law.values):
         how = results.how.sel(law=law).values
         counts = np.bincount(how, minlength=len(ENDS))
-        steps = results.steps.sel(law=law).values[how == 0]
-        median = (
-            f"{np.median(steps) * results.attrs['control_period']:.1f} s" if steps.size else "-"
-        )
+        steps, period = results.steps.sel(law=law).values[how == 0], results.attrs["control_period"]
+        median = f"{np.median(steps) * period:.1f} s" if steps.size else "-"
         share = tables.share(int(counts[0]), how.size)
         rows.append([law, share, *(f"{int(n):,}" for n in counts[1:]), median])
     return rows

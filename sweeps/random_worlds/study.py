@@ -8,16 +8,17 @@ The first worlds of each domain are also run with a panel of models and in C MuJ
 from __future__ import annotations
 
 import fnmatch
-from collections.abc import Mapping, Sequence
+import re
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
+from itertools import chain, product
 from typing import Any, ClassVar
 
 import numpy as np
 import xarray as xr
 
 from rps_jax.analysis import tables
-from rps_jax.analysis.report import Section
 from rps_jax.control import registry
 from rps_jax.record.options import option
 from rps_jax.runs import execution, model_panel
@@ -25,7 +26,7 @@ from rps_jax.runs.plan import Plan
 from rps_jax.runs.question import Run, call_of
 from rps_jax.trials.setting import Setting
 from rps_jax.world import domain as domains
-from sweeps.study_base import Table, TrialStudy
+from sweeps.study_base import Rows, Table, TrialStudy, stored_parts
 
 IN_C = "C MuJoCo, this ground, 10 ms"
 
@@ -39,7 +40,7 @@ class RandomWorlds(TrialStudy[xr.Dataset]):
     """
 
     TITLE: ClassVar[str] = "Four laws in random worlds"
-    QUICK: ClassVar[dict[str, Any]] = {"worlds": 24, "panel": 0, "in_c": 0}
+    QUICK: ClassVar[Mapping[str, object]] = {"worlds": 24, "panel": 0, "in_c": 0}
     GROWS: ClassVar[tuple[str, ...]] = ("domains", "panel", "in_c", "only", "run_missing")
 
     laws: tuple[str, ...] = ("rps", "rps_tuned", "rps_plus", "learned_gru")
@@ -71,32 +72,16 @@ class RandomWorlds(TrialStudy[xr.Dataset]):
 
     def answer(self, run: Run) -> xr.Dataset:
         """Run the models that are missing in each domain."""
-        parts = []
+        stored, parts = stored_parts(run), []
         for name in self.domains:
             for model, plan in self.plans(name).items():
-                safe = "".join(c if c.isalnum() else "_" for c in f"{name} {model}")
-                part_name = f"{safe}-{plan.worlds}"
-                if (
-                    not self.run_missing
-                    and run.checkpoints is not None
-                    and not run.checkpoints.get(part_name)
-                ):
-                    continue
-                part = run.checkpoint(part_name, partial(_outcomes, plan, run))
-                parts.append(part.expand_dims(domain=[name], model=[model]))
-        results = xr.combine_by_coords(parts, join="outer", combine_attrs="drop")
-        assert isinstance(results, xr.Dataset)
+                part_name = re.sub(r"[\W_]", "_", f"{name} {model}") + f"-{plan.worlds}"
+                if self.run_missing or part_name in stored:
+                    part = run.checkpoint(part_name, partial(_outcomes, plan, run))
+                    parts.append(part.expand_dims(domain=[name], model=[model]))
+        results: Any = xr.combine_by_coords(parts, join="outer", combine_attrs="drop")
         names = list(dict.fromkeys(str(part.model.item()) for part in parts))
         return results.sel(law=list(self.laws), domain=list(self.domains), model=names)
-
-    def published_tables(self, results: xr.Dataset) -> Mapping[str, Table]:
-        """Return the rates, and the rates with each model of the panel."""
-        if self.only:
-            return {}
-        published = {"headline": Table(rate_table(results), merge="domain")}
-        if results.sizes["model"] > 1:
-            published["models"] = Table(panel_table(results), merge="domain")
-        return published
 
     def plans(self, name: str) -> dict[str, Plan]:
         """Return the plan of each model in a domain, the default model first."""
@@ -105,46 +90,40 @@ class RandomWorlds(TrialStudy[xr.Dataset]):
         plans = {model_panel.OWN: plan}
         if self.panel:
             small = replace(plan, worlds=min(self.panel, self.worlds))
-            plans |= {
-                k: v for k, v in model_panel.model_plans(small).items() if k != model_panel.OWN
-            }
+            plans = model_panel.model_plans(small) | plans
         if self.in_c:
             in_c = replace(plan.setting, engine="mujoco")
             plans[IN_C] = replace(plan, worlds=min(self.in_c, self.worlds), setting=in_c)
-        return {k: v for k, v in plans.items() if not self.only or _matches(k, self.only)}
+        selected = [fnmatch.filter(plans, pattern) for pattern in self.only or ("*",)]
+        return {name: plan for name, plan in plans.items() if name in chain(*selected)}
 
-    def report(self, results: xr.Dataset, run: Run) -> Sequence[Section]:
-        """Return sections with rates, their range over the models, and times."""
+    def report_tables(self, results: xr.Dataset) -> Sequence[Table]:
+        """Return the rates, and the rates with each model of the panel."""
         text = (
             f"{self.worlds:,} worlds of seed {self.setting.seed}, the same for all laws. "
             "Intervals: Wilson 95 %."
         )
-        if model_panel.OWN not in results.model:
-            return [Section("Models", text, panel_table(results))]
-        if results.sizes["model"] == 1:
-            return [Section("Success", text, rate_table(results))]
-        text += (
-            " Over the models: least and greatest rate of a panel of grounds, friction cones, time "
-            "steps and engines, each in the first of these worlds."
-        )
-        return [
-            Section("Success", text, rate_table(results)),
-            Section("Models", "", panel_table(results)),
-        ]
+        has_panel = results.sizes["model"] > 1
+        tables = []
+        if model_panel.OWN in results.model:
+            over = (
+                " Over the models: least and greatest rate of a panel of grounds, friction cones, "
+                "time steps and engines, each in the first of these worlds."
+            )
+            text += over * has_panel
+            tables.append(Table(rate_table(results), name="headline", title="Success", text=text))
+        if has_panel or not tables:
+            tables.append(Table(panel_table(results), name="models", title="Models"))
+        unpublished = {"name": ""} if self.only else {}
+        return [table._replace(merge="domain", **unpublished) for table in tables]
 
 
 random_worlds = call_of(RandomWorlds)
 
 
-def _matches(name: str, patterns: Sequence[str]) -> bool:
-    return any(fnmatch.fnmatch(name, pattern) for pattern in patterns)
-
-
 def _outcomes(plan: Plan, run: Run) -> xr.Dataset:
     """Return success (law, world) and the time of each trial [s]."""
-    results = execution.run_plan(
-        plan, None, callback=run.callback, slots=run.slots, workers=run.workers
-    )
+    results = execution.run_plan(plan, None, **run.batch_options)
     results = results[["success", "time"]].reset_coords(drop=True)
     return results.assign(success=results.success.astype(np.float32))
 
@@ -162,42 +141,41 @@ def rates(results: xr.Dataset, domain: str, law: str) -> dict[str, tuple[int, in
     }
 
 
-def rate_table(results: xr.Dataset) -> list[list[Any]]:
+def rate_table(results: xr.Dataset) -> Rows:
     """Return a header and one row per domain and law, without columns that are empty."""
-    rows = [
-        _rate_row(results, str(domain), str(law))
-        for domain in results.domain.values
-        for law in results.law.values
-    ]
+    rows = [_rate_row(results, *pair) for pair in _domains_and_laws(results)]
     names = [name for name in rows[0] if any(row[name] for row in rows)]
     return [names, *([row[name] for name in names] for row in rows)]
+
+
+def _domains_and_laws(results: xr.Dataset) -> Iterator[tuple[str, str]]:
+    return product(map(str, results.domain.values), map(str, results.law.values))
 
 
 def _rate_row(results: xr.Dataset, domain: str, law: str) -> dict[str, str]:
     by_model = rates(results, domain, law)
     default = results.sel(domain=domain, law=law, model=model_panel.OWN)
-    shares = [successes / trials for successes, trials in by_model.values()]
     median = float(default.time.where(default.success == 1).median())
     return {
         "domain": domain,
         "law": law,
         "success": tables.share(*by_model[model_panel.OWN]),
-        "over the models": tables.rate_range(shares) if len(shares) > 1 else "",
+        "over the models": _rate_range(by_model) if len(by_model) > 1 else "",
         "in C MuJoCo": tables.share(*by_model[IN_C]) if IN_C in by_model else "",
         "median time of a success": f"{median:.1f} s" if np.isfinite(median) else "-",
     }
 
 
-def panel_table(results: xr.Dataset) -> list[list[str]]:
+def _rate_range(by_model: Mapping[str, tuple[int, int]]) -> str:
+    return tables.rate_range([successes / trials for successes, trials in by_model.values()])
+
+
+def panel_table(results: xr.Dataset) -> Rows:
     """Return a header and one row per domain and law: its rate with each model, and their range."""
     names = [str(name) for name in results.model.values]
     rows = [["domain", "law", *names, "over these models"]]
-    for domain in results.domain.values:
-        for law in results.law.values:
-            by_model = rates(results, domain, law)
-            cells = [tables.share(*by_model[name]) if name in by_model else "" for name in names]
-            spread = tables.rate_range(
-                [successes / trials for successes, trials in by_model.values()]
-            )
-            rows.append([str(domain), str(law), *cells, spread])
+    for domain, law in _domains_and_laws(results):
+        by_model = rates(results, domain, law)
+        cells = [tables.share(*by_model[name]) if name in by_model else "" for name in names]
+        rows.append([domain, law, *cells, _rate_range(by_model)])
     return rows

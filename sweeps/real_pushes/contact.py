@@ -30,6 +30,7 @@ _SOFT = (0.9, 0.95)  # MuJoCo's default impedance
 class Condition:
     """Physics, scale and speed of pushes."""
 
+    label: str
     physics: Physics
     scale: float = 4.0  # of all lengths
     speed: float = 0.05  # [m/s] of the faster finger, at this scale
@@ -39,16 +40,20 @@ _OURS = preset("default", "reference")  # converged, in steps of 1 ms
 _MUJOCO_GROUND = replace(_OURS, **MUJOCO_GROUND)
 _LIGHT = replace(_OURS, ground_solref=(0.1, 0.2), ground_impedance=0.3)
 _DEFAULT = replace(_MUJOCO_GROUND, cone="pyramidal", impratio=1.0, base_solref=(0.02, 1.0))
+_STIFF = {"base_solref": (0.005, 1.0)}
+_TRUE_SIZE = {"scale": 1.0, "speed": 0.0025}
 KINDS = {
-    "mujoco_ours": Condition(_OURS),
-    "mujoco_ours_stiff": Condition(replace(_OURS, base_solref=(0.005, 1.0))),
-    "mujoco_ground": Condition(_MUJOCO_GROUND),
-    "mujoco_default": Condition(_DEFAULT),
-    "mujoco_light": Condition(_LIGHT),
-    "mujoco_light_stiff": Condition(replace(_LIGHT, base_solref=(0.005, 1.0))),
-    "mujoco_ours_true_size": Condition(_OURS, 1.0, 0.0025),
-    "mujoco_light_true_size": Condition(_LIGHT, 1.0, 0.0025),
-    "mujoco_ground_true_size": Condition(_MUJOCO_GROUND, 1.0, 0.0025),
+    "mujoco_ours": Condition("C MuJoCo with feet, our ground", _OURS),
+    "mujoco_ours_stiff": Condition("our ground, stiff fingers", replace(_OURS, **_STIFF)),
+    "mujoco_ground": Condition("MuJoCo's ground, our cone and impratio", _MUJOCO_GROUND),
+    "mujoco_default": Condition("MuJoCo's full default", _DEFAULT),
+    "mujoco_light": Condition("ground of (0.1 s, 0.2), impedance 0.3", _LIGHT),
+    "mujoco_light_stiff": Condition("that ground, stiff fingers", replace(_LIGHT, **_STIFF)),
+    "mujoco_ours_true_size": Condition("our ground, true size, 2.5 mm/s", _OURS, **_TRUE_SIZE),
+    "mujoco_light_true_size": Condition("that ground, true size, 2.5 mm/s", _LIGHT, **_TRUE_SIZE),
+    "mujoco_ground_true_size": Condition(
+        "MuJoCo's ground, true size, 2.5 mm/s", _MUJOCO_GROUND, **_TRUE_SIZE
+    ),
 }
 
 
@@ -74,26 +79,18 @@ def _push_once(
     ball = _ball_offsets(start, path) * k
     # A missing finger is far away, but near enough for accurate floats.
     at = np.where(np.abs(path) > 100, 50.0, k * path + ball)
+    half = start[2] / 2
     data.qpos[:4] = at[0].ravel()
-    data.qpos[4:] = [
-        *(k * start[:2]),
-        0.0,
-        np.cos(start[2] / 2),
-        0.0,
-        0.0,
-        np.sin(start[2] / 2),
-    ]
+    data.qpos[4:] = [*(k * start[:2]), 0.0, np.cos(half), 0.0, 0.0, np.sin(half)]
     for _ in range(round(_SETTLE / dt)):
         data.qvel[:4] = 0.0
         mujoco.mj_step(model, data)
     steps = int(np.ceil((along[-1] / condition.speed + _RISE / 2) / dt))
     time = dt * np.arange(1, steps + 1)
-    travelled = condition.speed * np.where(
-        time < _RISE, time * time / (2 * _RISE), time - _RISE / 2
-    )
-    positions = np.stack(
-        [np.interp(travelled, along, coordinate) for coordinate in at.reshape(len(at), 4).T], axis=1
-    )
+    rising = time * time / (2 * _RISE)
+    travelled = condition.speed * np.where(time < _RISE, rising, time - _RISE / 2)
+    coordinates = at.reshape(len(at), 4).T
+    positions = np.stack([np.interp(travelled, along, x) for x in coordinates], axis=1)
     for goal in positions:
         data.qvel[:4] = (goal - data.qpos[:4]) / dt
         mujoco.mj_step(model, data)
@@ -122,9 +119,8 @@ def _model(support: str, ground: float, friction: float, condition: Condition) -
     feet = [k * np.array([*foot, 0.0]) for foot in pushes.feet_of(support)]
     is_default = physics == _DEFAULT
     soft = f"{_SOFT[0]} {_SOFT[1]}" if is_default else ""
-    touch = f'solref="{physics.base_solref[0]} {physics.base_solref[1]}"' + (
-        f' solimp="{soft}"' if is_default else ""
-    )
+    touch = f'solref="{physics.base_solref[0]} {physics.base_solref[1]}"'
+    touch += f' solimp="{soft}"' if is_default else ""
     impedance = soft if is_default else f"{physics.ground_impedance} {physics.ground_impedance}"
     floor = f'solref="{physics.ground_solref[0]} {physics.ground_solref[1]}" solimp="{impedance}"'
     spheres = "".join(

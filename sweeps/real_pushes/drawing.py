@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -25,6 +24,12 @@ _DRAWN = {
 }
 _FINGERS = ("point", "two-point")
 _STEPS = 60
+# Outlines of a push: before, measured, predicted.
+_STYLES = (
+    {"color": "0.65", "lw": 1},
+    {"color": "k", "lw": 2.2},
+    {"color": "C3", "lw": 1.3, "ls": "--"},
+)
 
 
 def figure(results: xr.Dataset, table: pd.DataFrame, words: Mapping[str, str]) -> Figure:
@@ -36,40 +41,33 @@ def figure(results: xr.Dataset, table: pd.DataFrame, words: Mapping[str, str]) -
       words: labels of the models.
     """
     picture = Figure(figsize=(12.5, 9.2), layout="constrained", dpi=100)
-    halves: Any = picture.subfigures(2, 1, height_ratios=(1.45, 1))
-    above, below = halves
+    above, below = picture.subfigures(2, 1, height_ratios=(1.45, 1))
     panels = above.subplots(2, len(_SHARES))
-    is_test = ~results.fits.values
-    on_three_feet = np.array([", three feet" in str(group) for group in results.group.values])
+    judged = ~results.fits.values & results.group.str.contains(", three feet").values
     paths = pushes.finger_paths(table, _STEPS)
     best = results.sel(model="rigid_feet")
     for row, finger in zip(panels, _FINGERS, strict=True):
-        is_finite = np.isfinite(best.both.values)
-        rows = np.flatnonzero(
-            is_test & on_three_feet & is_finite & (results.finger.values == finger)
-        )
+        mask = judged & (results.finger.values == finger) & np.isfinite(best.both.values)
+        rows = np.flatnonzero(mask)
         order = rows[np.argsort(best.both.values[rows])]
         for ax, share in zip(row, _SHARES, strict=True):
             ax.set_axis_off()
             if order.size:
                 i = order[int(share * (order.size - 1))]
                 _push(ax, best.isel(push=i), table.iloc[i], paths[:, i])
-                ax.set_title(
-                    f"{finger} push, {1e3 * float(best.both[i]):.1f} mm off\n"
-                    f"(better than {100 * (1 - share):.0f} % of all)",
-                    fontsize=8,
-                )
+                off = f"{finger} push, {1e3 * float(best.both[i]):.1f} mm off"
+                rank = f"(better than {100 * (1 - share):.0f} % of all)"
+                ax.set_title(f"{off}\n{rank}", fontsize=8)
+    labels = ("before the push", "measured after it", "predicted: rigid body on its feet")
     lines = [
-        Line2D([], [], color="0.65", lw=1, label="before the push"),
-        Line2D([], [], color="k", lw=2.2, label="measured after it"),
-        Line2D([], [], color="C3", lw=1.3, ls="--", label="predicted: rigid body on its feet"),
+        *(Line2D([], [], label=x, **style) for x, style in zip(labels, _STYLES, strict=True)),
         Line2D([], [], color="C0", lw=1.5, marker=">", ms=4, label="path of the finger(s)"),
         Line2D([], [], color="0.4", marker="o", ls="none", ms=4, label="feet, before"),
     ]
     above.legend(handles=lines, loc="outside lower center", ncols=5, fontsize=9)
     names = [name for name in _DRAWN if name in results.model]
     for ax, finger in zip(below.subplots(1, 2), _FINGERS, strict=True):
-        rows = is_test & on_three_feet & (results.finger.values == finger)
+        rows = judged & (results.finger.values == finger)
         for name in names:
             off = np.sort(1e3 * results.both.sel(model=name).values[rows])
             off = off[np.isfinite(off)]
@@ -77,14 +75,9 @@ def figure(results: xr.Dataset, table: pd.DataFrame, words: Mapping[str, str]) -
                 share = 100 * (np.arange(off.size) + 1) / off.size
                 ax.plot(off, share, color=_DRAWN[name], lw=1.6, label=words[name])
         ax.axvspan(0.3, 0.8, color="0.93", lw=0)
-        ax.set(
-            xscale="log",
-            xlim=(0.3, 60),
-            ylim=(0, 100),
-            xlabel="distance of the predicted from the measured end, over the whole body [mm]",
-            ylabel="pushes that are nearer [%]",
-            title=f"{finger} pushes on three feet",
-        )
+        ax.set(xscale="log", xlim=(0.3, 60), ylim=(0, 100), ylabel="pushes that are nearer [%]")
+        ax.set_xlabel("distance of the predicted from the measured end, over the whole body [mm]")
+        ax.set_title(f"{finger} pushes on three feet")
         ax.set_xticks([0.3, 1, 3, 10, 30], ["0.3", "1", "3", "10", "30"])
         ax.grid(alpha=0.3)
         ax.text(0.33, 93, "a push repeats\nno better", fontsize=8, va="top", color="0.4")
@@ -108,20 +101,15 @@ def _push(ax: Axes, push: xr.Dataset, row: pd.Series, path: np.ndarray) -> None:
     def outline(pose: np.ndarray, corners: np.ndarray = pushes.OUTLINE) -> np.ndarray:
         return to_figure(pose[:2] + turned(np.full(len(corners), pose[2]), corners))
 
-    for pose, style in (
-        (pre, {"color": "0.65", "lw": 1}),
-        (push.measured.values, {"color": "k", "lw": 2.2}),
-        (push.predicted.values, {"color": "C3", "lw": 1.3, "ls": "--"}),
-    ):
-        shape = outline(pose)
+    for pose, style in zip((pre, push.measured, push.predicted), _STYLES, strict=True):
+        shape = outline(np.asarray(pose))
         ax.plot(*np.concatenate([shape, shape[:1]]).T, **style)
     if row.support != pushes.FLAT:
         ax.plot(*outline(pre, pushes.feet_of(row.support)).T, "o", color="0.4", ms=3.5)
     for finger in np.moveaxis(fingers, 1, 0):
         line = to_figure(finger)
         ax.plot(*line.T, color="C0", lw=1.5)
-        ax.annotate(
-            "", line[-1], line[-6], arrowprops={"arrowstyle": "-|>", "color": "C0", "lw": 1.5}
-        )
+        arrow = {"arrowstyle": "-|>", "color": "C0", "lw": 1.5}
+        ax.annotate("", line[-1], line[-6], arrowprops=arrow)
     ax.set_aspect("equal")
     ax.margins(0.03)

@@ -31,7 +31,6 @@ GROUND = {"hardboard": 0.28, "plywood": 0.34}  # [1] friction by the authors' co
 FLAT = "patch"  # the support of a flat object
 UNKNOWN = "unknown_3pts"  # three feet at unknown positions; the default is assumed
 DEFAULT_FEET = "30_90_30_30_30_90"
-KINDS = ("point", "two_point_rotation", "two_point_translation")
 _ALONG = np.array([[1, 0], [-np.sqrt(0.5), np.sqrt(0.5)], [0, -1]])  # the edges 0, 1, 2
 _CELLS = 9  # of a flat object's grid, along each leg
 _FAR = 1e3  # [m] where a finger is that is not there
@@ -73,7 +72,7 @@ def read(table: PushTable | None = None) -> pd.DataFrame:
         raise InputError("pushes without a usable row are not allowed: give at least one push.")
     _require(pushes, ("kind", "support", *(f"pre_{name}" for name in POSE)), "all")
     for kind in pd.unique(pushes.kind):
-        errors.check_name("kind of push", kind, KINDS)
+        errors.check_name("kind of push", kind, _NEEDED)
         _require(chosen(pushes, pushes.kind == kind), _NEEDED[kind], kind)
     for name in pd.unique(pushes.support):
         feet_of(name)
@@ -102,9 +101,7 @@ def _require(table: pd.DataFrame, names: tuple[str, ...], kind: str) -> None:
 
 def measured(table: pd.DataFrame) -> np.ndarray:
     """Return measured poses (n, 3) [m, m, rad] after the pushes; NaN where unknown."""
-    return np.stack(
-        [np.asarray(table[f"post_{p}"], float) if f"post_{p}" in table
-         else np.full(len(table), np.nan) for p in POSE], axis=1)  # fmt: skip
+    return np.asarray(table.reindex(columns=[f"post_{p}" for p in POSE]), float)
 
 
 def initial_poses(table: pd.DataFrame) -> np.ndarray:
@@ -140,14 +137,11 @@ def feet_of(support: str) -> np.ndarray:
     if support == FLAT:
         x, y = np.meshgrid(*[(np.arange(_CELLS) + 0.5) / _CELLS * 0.15] * 2)
         return np.stack([x, y], axis=-1)[x + y < 0.15 - 1e-9]
-    x = y = np.zeros(0)
+    words = (DEFAULT_FEET if support == UNKNOWN else support).split("_")
     try:
-        coordinates = (
-            np.array((DEFAULT_FEET if support == UNKNOWN else support).split("_"), float) / 1000
-        )
-        x, y = coordinates.reshape(2, -1)
+        x, y = np.array(words, float).reshape(2, -1) / 1000
     except ValueError:
-        pass  # reported below
+        x = y = np.zeros(0)
     if x.size < 3:
         raise InputError(
             f"support = {support} is not allowed: give {FLAT}, {UNKNOWN} or three x and three y in "
@@ -172,7 +166,7 @@ def grounds(table: pd.DataFrame, *, on: str) -> Ground:
     surface = table.surface if "surface" in table else [""] * count
     shift = np.array([GROUND.get(name, GROUND["hardboard"]) * PUSHED_AT for name in surface])
     if on == "ellipsoid":
-        load = sliding.borne(at, weight, np.zeros((count, 2)))
+        load = sliding.supported_load(at, weight, np.zeros((count, 2)))
         arm = np.sum(load * np.linalg.norm(at, axis=-1), axis=1)
         return Ground(np.zeros((count, 1, 2)), np.ones((count, 1)), arm, zero)
     return Ground(at, weight, zero, shift)
@@ -234,21 +228,10 @@ def slide(table: pd.DataFrame, friction: np.ndarray, *, on: str, steps: int) -> 
     for rows in (flat, ~flat):  # of equally many feet
         if rows.any():
             part = chosen(table, rows)
-            motion = sliding.push(
-                OUTLINE,
-                COM,
-                grounds(part, on=on),
-                finger_paths(part, steps),
-                initial_poses(part),
-                friction[rows],
-            )
+            inputs = finger_paths(part, steps), initial_poses(part), friction[rows]
+            motion = sliding.push(OUTLINE, COM, grounds(part, on=on), *inputs)
             pose[rows], force[rows] = motion.pose[-1], motion.force[steps // 2 :].mean(axis=0)
     return Motion(pose, force)
-
-
-def no_motion(table: pd.DataFrame) -> np.ndarray:
-    """Return the poses (n, 3) before the push."""
-    return initial_poses(table)
 
 
 def with_pusher(table: pd.DataFrame, steps: int) -> np.ndarray:
@@ -260,12 +243,11 @@ def with_pusher(table: pd.DataFrame, steps: int) -> np.ndarray:
     first = np.where(meets.any(axis=0), meets.argmax(axis=0), gap.argmin(axis=0))
     start, end = path[first, np.arange(len(table))], path[-1]
     double = np.asarray(table.kind == "two_point_rotation")
-    span = [
-        np.where(double[:, None], points[:, 1] - points[:, 0], [1.0, 0.0])
+    directions = [
+        np.arctan2(*np.where(double[:, None], points[:, 1] - points[:, 0], [1.0, 0.0])[:, ::-1].T)
         for points in (start, end)
     ]
-    turn = np.arctan2(*(span[1][:, ::-1]).T) - np.arctan2(*(span[0][:, ::-1]).T)
-    turn = angle(turn)
+    turn = angle(directions[1] - directions[0])
     moved = end[:, 0] + turned(turn, pre[:, :2] - start[:, 0])
     return np.column_stack([moved, pre[:, 2] + turn])
 

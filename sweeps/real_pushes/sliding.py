@@ -89,10 +89,8 @@ def push(
     for start, end in itertools.pairwise(ways):
         displacement = end - start
         length = np.maximum(np.linalg.norm(displacement, axis=-1).max(axis=1), 1e-9)
-        step, normal, tangent = _step(
-            outline, com, ground, start, displacement, length, pose, force
-        )
-        step = step._replace(friction=friction[:, None])
+        fingers = start, displacement, length
+        step, normal, tangent = _step(outline, com, ground, fingers, pose, force, friction)
         twist = _solve(step, twist)
         pushing, rubbing = _forces(step, twist)
         force = np.sum(pushing[..., None] * normal + rubbing[..., None] * tangent, axis=1)
@@ -135,7 +133,7 @@ def nearest(outline: np.ndarray, point: np.ndarray) -> tuple[np.ndarray, np.ndar
     return np.where(corner, close, far), normal
 
 
-def borne(at: np.ndarray, weight: np.ndarray, centre: np.ndarray) -> np.ndarray:
+def supported_load(at: np.ndarray, weight: np.ndarray, centre: np.ndarray) -> np.ndarray:
     """Return loads (B, S) [1] of springs at (B, S, 2) that only push.
 
     Their sum is 1 and their centre is at (B, 2) [m]. If this is impossible, as for an object that
@@ -160,25 +158,21 @@ def _step(
     outline: np.ndarray,
     com: np.ndarray,
     ground: Ground,
-    finger: np.ndarray,
-    displacement: np.ndarray,
-    length: np.ndarray,
+    fingers: tuple[np.ndarray, np.ndarray, np.ndarray],
     pose: np.ndarray,
     force: np.ndarray,
+    friction: np.ndarray,
 ) -> tuple[_Step, np.ndarray, np.ndarray]:
     """Return the problem of one step, and normals (B, F, 2) towards the objects and tangents."""
+    finger, displacement, length = fingers
     yaw, scale = pose[:, 2], length[:, None]
     at = turned(yaw[:, None], ground.at)
     zero, ones = np.zeros(at.shape[:2]), np.ones(at.shape[:2])
     arm = np.broadcast_to(ground.arm[:, None], at.shape[:2])
-    slide = np.stack(
-        [
-            np.stack([ones, zero, -at[..., 1] / _ARM], axis=-1),
-            np.stack([zero, ones, at[..., 0] / _ARM], axis=-1),
-            np.stack([zero, zero, arm / _ARM], axis=-1),
-        ],
-        axis=-2,
-    )
+    rows = [
+        [ones, zero, -at[..., 1] / _ARM], [zero, ones, at[..., 0] / _ARM], [zero, zero, arm / _ARM]
+    ]  # fmt: skip
+    slide = np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
     finger_in_body = turned(-yaw[:, None], finger - pose[:, None, :2])
     gap, outward = nearest(outline, finger_in_body)
     normal = -turned(yaw[:, None], outward)
@@ -190,20 +184,17 @@ def _step(
         return np.concatenate([direction, moment[..., None] / _ARM], axis=-1)
 
     centre = ground.shift[:, None] * force
-    return (
-        _Step(
-            slide,
-            borne(at, ground.weight, centre) if at.shape[1] > 1 else ones,
-            row(normal),
-            row(tangent),
-            np.sum(displacement * normal, axis=-1) / scale,
-            np.sum(displacement * tangent, axis=-1) / scale,
-            gap / scale,
-            ones[:, :1],
-        ),
-        normal,
-        tangent,
+    step = _Step(
+        slide,
+        supported_load(at, ground.weight, centre) if at.shape[1] > 1 else ones,
+        row(normal),
+        row(tangent),
+        np.sum(displacement * normal, axis=-1) / scale,
+        np.sum(displacement * tangent, axis=-1) / scale,
+        gap / scale,
+        friction[:, None],
     )
+    return step, normal, tangent
 
 
 # --- the convex problem ---------------------------------------------------------------------
@@ -253,9 +244,8 @@ def _derivatives(
     # contacts that may close in the step
     addition = less + np.sum(((room >= 0) & (room < _NEAR))[..., None, None] * wall, axis=1)
     bend = pushing * step.friction * slip**2 / round_**3
-    hessian += np.sum(
-        bend[..., None, None] * step.a_t[..., :, None] * step.a_t[..., None, :], axis=1
-    )
+    bent = bend[..., None, None] * step.a_t[..., :, None] * step.a_t[..., None, :]
+    hessian += np.sum(bent, axis=1)
     return gradient, hessian + 1e-7 * np.eye(3), addition
 
 

@@ -13,62 +13,38 @@ other. Pushes of a file in the same columns are all judged, with the friction of
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
+from itertools import product
 from pathlib import Path
-from typing import Any, ClassVar, Literal, get_args
+from typing import Any, ClassVar
 
 import numpy as np
 import pandas as pd
 import xarray as xr
 
 from rps_jax import errors
-from rps_jax.analysis.report import Picture, Section, save
+from rps_jax.analysis.report import Picture, save
 from rps_jax.record import files
 from rps_jax.record.options import option
 from rps_jax.runs.question import Run, call_of
-from rps_jax.trials.progress import Progress
 from sweeps.real_pushes import contact, pushes
 from sweeps.real_pushes.drawing import figure
 from sweeps.real_pushes.pushes import Errors
-from sweeps.study_base import Study, Table
+from sweeps.study_base import Study, Table, run_parts
 
-Model = Literal[
-    "no_motion",
-    "with_pusher",
-    "ellipsoid",
-    "rigid_feet",
-    "rigid_corners",
-    "mujoco_ours",
-    "mujoco_ours_stiff",
-    "mujoco_ground",
-    "mujoco_default",
-    "mujoco_light",
-    "mujoco_light_stiff",
-    "mujoco_ours_true_size",
-    "mujoco_light_true_size",
-    "mujoco_ground_true_size",
-]
 WORDS: Mapping[str, str] = {
     "no_motion": "no motion",
     "with_pusher": "moves with the pusher",
     "ellipsoid": "ellipsoid limit surface",
     "rigid_feet": "rigid, on its feet",
     "rigid_corners": "rigid, on the corners of its outline",
-    "mujoco_ours": "C MuJoCo with feet, our ground",
-    "mujoco_ours_stiff": "our ground, stiff fingers",
-    "mujoco_ground": "MuJoCo's ground, our cone and impratio",
-    "mujoco_default": "MuJoCo's full default",
-    "mujoco_light": "ground of (0.1 s, 0.2), impedance 0.3",
-    "mujoco_light_stiff": "that ground, stiff fingers",
-    "mujoco_ours_true_size": "our ground, true size, 2.5 mm/s",
-    "mujoco_light_true_size": "that ground, true size, 2.5 mm/s",
-    "mujoco_ground_true_size": "MuJoCo's ground, true size, 2.5 mm/s",
-}
-FITTED = ("ellipsoid", "rigid_feet", "rigid_corners")  # each has a separately fitted friction
+    **{name: condition.label for name, condition in contact.KINDS.items()},
+}  # models
 SLIDING = {"ellipsoid": "ellipsoid", "rigid_feet": "feet", "rigid_corners": "corners"}
-MUJOCOS = tuple(name for name in get_args(Model) if name.startswith("mujoco"))
+FITTED = tuple(SLIDING)  # each has a separately fitted friction
+MUJOCOS = tuple(contact.KINDS)
 FINGERS = ("point", "two-point")
 # Friction at the fingers, as fitted for `rigid_feet` (results/real_pushes_friction.json).
 FRICTION = {"point": 0.5, "two-point": 0.35}
@@ -82,21 +58,21 @@ GROUPS = (
     "two-point, support in doubt",
 )
 _SHOWN = {  # models in the table; all of the others
-    GROUPS[1]: ("ellipsoid", "rigid_feet", "rigid_corners"),
+    GROUPS[1]: FITTED,
     GROUPS[2]: ("rigid_feet",),
-    GROUPS[4]: ("ellipsoid", "rigid_feet", "rigid_corners"),
+    GROUPS[4]: FITTED,
     GROUPS[5]: ("rigid_feet",),
 }
 _FRICTIONS = tuple(round(0.05 * i, 2) for i in range(2, 18))  # frictions at the fingers
 _FIT = 100  # pushes with one finger, and with two each, that friction is fitted on
-_TOGETHER = 320  # pushes that are predicted as one part of the run
+_TOGETHER = 320  # pushes that are predicted in one batch
 _DRAWS = 2000  # of the bootstrap
 _SPLIT = 2015  # seed of the halves
 
 
 def predict(
     table: pushes.PushTable | None = None,
-    model: Model = "rigid_feet",
+    model: str = "rigid_feet",
     *,
     friction: Mapping[str, float] = FRICTION,
     steps: int = STEPS,
@@ -117,7 +93,7 @@ def predict(
     Raises:
       InputError: the table cannot be read or is incomplete, or the model is unknown.
     """
-    errors.check_name("model", model, get_args(Model))
+    errors.check_name("model", model, WORDS)
     read = pushes.read(table)
     pose = _predicted(read, model, friction, steps).pose
     data = {f"post_{name}": ("push", pose[:, i]) for i, name in enumerate(pushes.POSE)}
@@ -133,10 +109,12 @@ def _predicted(
         return pushes.slide(table, mu, on=SLIDING[model], steps=steps)
     nothing = np.full((len(table), 2), np.nan)
     if model == "no_motion":
-        return pushes.Motion(pushes.no_motion(table), nothing)
-    if model == "with_pusher":
-        return pushes.Motion(pushes.with_pusher(table, steps), nothing)
-    return pushes.Motion(contact.push(table, mu, contact.KINDS[model]), nothing)
+        pose = pushes.initial_poses(table)
+    elif model == "with_pusher":
+        pose = pushes.with_pusher(table, steps)
+    else:
+        pose = contact.push(table, mu, contact.KINDS[model])
+    return pushes.Motion(pose, nothing)
 
 
 def _ids(table: pd.DataFrame) -> np.ndarray:
@@ -169,11 +147,12 @@ class RealPushes(Study[xr.Dataset]):
     """
 
     TITLE: ClassVar[str] = "Does the physics predict real pushes?"
-    QUICK: ClassVar[Mapping[str, Any]] = {"few": 60, "mujoco": 6}
+    CHOICES: ClassVar = {"models": WORDS}
+    QUICK: ClassVar[Mapping[str, object]] = {"few": 60, "mujoco": 6}
 
     pushes: Path | None = None
     """CSV file of pushes to predict, with the columns of data/pushes.csv; by default that file."""
-    models: tuple[Model, ...] = get_args(Model)
+    models: tuple[str, ...] = tuple(WORDS)
     """Models to run; by default all."""
     mujoco: int = option(100, 0, 100_000)
     """Number of pushes on three feet that C MuJoCo predicts, with one finger and with two each."""
@@ -184,6 +163,7 @@ class RealPushes(Study[xr.Dataset]):
 
     def check(self) -> None:
         """Check the models and the table."""
+        super().check()
         errors.check_each_once("models", self.models)
         _ = self.table
 
@@ -197,14 +177,14 @@ class RealPushes(Study[xr.Dataset]):
         return whole.iloc[rows].reset_index(drop=True)
 
     def num_trials(self) -> int | None:
-        """Return the number of predictions, without those of the fit."""
-        return sum(int(self._rows(name).sum()) for name in self.models)
+        """Return the number of pushes of all models."""
+        return len(self.models) * len(self.table)
 
     @property
     def fits(self) -> np.ndarray:
         """Whether a push (n,) is in the half for the fit of friction."""
-        is_default_table = self.pushes is None
-        return halves_of(_ids(self.table)) if is_default_table else np.zeros(len(self.table), bool)
+        none = np.zeros(len(self.table), bool)
+        return halves_of(_ids(self.table)) if self.pushes is None else none
 
     def _rows(self, model: str) -> np.ndarray:
         """Return whether a model predicts a push (n,)."""
@@ -224,19 +204,9 @@ class RealPushes(Study[xr.Dataset]):
         table = self.table
         fit = self.fits.any() and set(self.models) & {*FITTED, *MUJOCOS}
         friction = self._fitted(run) if fit else None
-        done, by_model = 0, []
-        for model in self.models:
-            parts = []
-            for first in range(0, len(table), _TOGETHER):
-                rows = slice(first, first + _TOGETHER)
-                make = partial(self._predict_rows, model, friction, rows)
-                parts.append(run.checkpoint(f"{model}-{first}", make))
-                done += int(self._rows(model)[rows].sum())
-                run.callback(Progress(done, 0.0))
-            by_model.append(xr.concat(parts, "push"))
-        results = xr.concat(by_model, "model", join="override", coords="minimal", compat="override")
+        parts = {model: partial(self._predict, model, friction) for model in self.models}
+        results = run_parts(run, "model", parts, len(table))
         results = results.assign_coords(
-            model=list(self.models),
             pose=list(pushes.POSE),
             id=("push", _ids(table)),
             finger=("push", pushes.kind_of_finger(table).astype(str)),
@@ -247,12 +217,10 @@ class RealPushes(Study[xr.Dataset]):
         results["measured"] = (("push", "pose"), actual)
         if {"force_wx", "force_wy", "surface"} <= set(table):
             results["surface"] = ("push", table.surface.fillna("").to_numpy(str))
-            results["force_measured"] = (
-                ("push", "axis"),
-                table[["force_wx", "force_wy"]].to_numpy(),
-            )
-        off = pushes.errors_of(results.predicted.values, actual)
-        results.update({name: (("model", "push"), one) for name, one in off._asdict().items()})
+            force = table[["force_wx", "force_wy"]].to_numpy()
+            results["force_measured"] = (("push", "axis"), force)
+        off = pushes.errors_of(results.predicted.values, actual)._asdict()
+        results.update({name: (("model", "push"), values) for name, values in off.items()})
         if friction is not None:
             results = results.merge(friction)
         if run.folder is not None:
@@ -260,34 +228,32 @@ class RealPushes(Study[xr.Dataset]):
         return results
 
     def _fitted(self, run: Run) -> xr.Dataset:
-        """Median error `fit_error` [m] (fitted, finger_kind, tried), and the best friction.
+        """Return the error of each friction on few pushes, and the best `friction`.
 
-        And errors (fitted, tried, few) of pushes with each friction, for `layout_rows`.
+        The median error is `fit_error` [m] (fitted, finger_kind, tried). `_layout_rows` needs the
+        errors (fitted, tried, few) of pushes on each layout of feet.
         """
         whole, indices = self.table, np.arange(len(self.table))
-        finger, clear = pushes.kind_of_finger(whole), ~pushes.doubted(whole)
-        fitted_on, layouts = self.fits & clear, np.isin(groups_of(whole), (GROUPS[0], GROUPS[3]))
-        kinds = [[indices[fitted_on][finger[fitted_on] == name]] for name in FINGERS]
-        support = np.asarray(whole.support)
-        kinds += [
-            [np.flatnonzero(layouts & (finger == name) & (support == one))]
-            for name in FINGERS
-            for one in dict.fromkeys(support)
-        ]
-        few = [np.random.default_rng(_SPLIT).permutation(rows)[:_FIT] for (rows,) in kinds]
-        fits = np.isin(indices, np.concatenate(few[: len(FINGERS)]))
-        laid = np.isin(indices, np.concatenate(few[len(FINGERS) :]))
+        finger, support = pushes.kind_of_finger(whole), np.asarray(whole.support)
+        halves = self.fits & ~pushes.doubted(whole)
+        on_feet = np.isin(groups_of(whole), (GROUPS[0], GROUPS[3]))
+
+        def few(masks: Iterable[np.ndarray]) -> np.ndarray:
+            """Return whether a push is among the first few of a mask (n,), in random order."""
+            order = [np.random.default_rng(_SPLIT).permutation(np.flatnonzero(x)) for x in masks]
+            return np.isin(indices, np.concatenate([rows[:_FIT] for rows in order]))
+
+        of_finger = [finger == name for name in FINGERS]
+        fits = few(halves & mask for mask in of_finger)
+        laid = few(
+            on_feet & mask & (support == name)
+            for mask in of_finger
+            for name in dict.fromkeys(support)
+        )
         table = pushes.chosen(whole, fits | laid)
         needed = {"rigid_feet", *self.models} if set(MUJOCOS) & set(self.models) else self.models
         fitted = [name for name in FITTED if name in needed]
-        by_model = [
-            xr.concat(
-                [run.checkpoint(f"fit-{model}-{mu[0]:g}", partial(self._tried, table, model, mu))
-                 for mu in (_FRICTIONS[i : i + 4] for i in range(0, len(_FRICTIONS), 4))],
-                "tried",
-            )
-            for model in fitted
-        ]  # fmt: skip
+        by_model = [run.checkpoint(f"fit_{x}", partial(self._tried, table, x)) for x in fitted]
         off = xr.concat(by_model, "fitted").assign_coords(
             fitted=fitted,
             few_finger=("few", pushes.kind_of_finger(table).astype(str)),
@@ -295,33 +261,37 @@ class RealPushes(Study[xr.Dataset]):
         )
         rows = xr.DataArray(fits[fits | laid], dims="few")
         by_finger = [off.few_both.where(rows & (off.few_finger == name)) for name in FINGERS]
-        median = xr.concat([one.median("few") for one in by_finger], "finger_kind")
-        off["fit_error"] = median.assign_coords(finger_kind=list(FINGERS))
+        kinds = xr.IndexVariable("finger_kind", list(FINGERS))
+        off["fit_error"] = xr.concat([values.median("few") for values in by_finger], kinds)
         return off.assign(friction=off.fit_error.fillna(9.0).idxmin("tried"))
 
-    def _tried(self, table: pd.DataFrame, model: str, tried: Sequence[float]) -> xr.Dataset:
-        """Return errors (tried, few) of one model with some frictions."""
-        repeated = pd.concat([table] * len(tried), ignore_index=True)
-        mu = np.repeat(tried, len(table))
-        pose = pushes.slide(repeated, mu, on=SLIDING[model], steps=STEPS // 2).pose
-        pose = pose.reshape(len(tried), len(table), 3)
-        off = pushes.errors_of(pose, pushes.measured(table))._asdict()
-        errors_ = {f"few_{name}": (("tried", "few"), one) for name, one in off.items()}
-        return xr.Dataset(errors_, {"tried": list(tried)})
+    def _tried(self, table: pd.DataFrame, model: str) -> xr.Dataset:
+        """Return errors (tried, few) of one model with all frictions."""
+        errors_of, count = [], len(table)
+        for tried in (_FRICTIONS[i : i + 4] for i in range(0, len(_FRICTIONS), 4)):
+            repeated = pd.concat([table] * len(tried), ignore_index=True)
+            mu = np.repeat(tried, count)
+            pose = pushes.slide(repeated, mu, on=SLIDING[model], steps=STEPS // 2).pose
+            pose = pose.reshape(len(tried), count, 3)
+            errors_of.append(pushes.errors_of(pose, pushes.measured(table)))
+        off = Errors(*map(np.concatenate, zip(*errors_of, strict=True)))._asdict()
+        columns = {f"few_{name}": (("tried", "few"), values) for name, values in off.items()}
+        return xr.Dataset(columns, {"tried": list(_FRICTIONS)})
 
-    def _predict_rows(self, model: str, friction: xr.Dataset | None, chunk: slice) -> xr.Dataset:
-        """Return the predictions of one model for its pushes in a chunk."""
+    def _predict(self, model: str, friction: xr.Dataset | None) -> xr.Dataset:
+        """Return the predictions of one model."""
         chosen: Mapping[str, float] = FRICTION
-        if friction is not None:
-            fitted = model if model in FITTED else "rigid_feet"
-            of_model = friction.friction.sel(fitted=fitted) if fitted in friction.fitted else None
-            if of_model is not None:
-                chosen = {name: float(of_model.sel(finger_kind=name)) for name in FINGERS}
-        rows = self._rows(model)[chunk]
-        pose, force = np.full((len(rows), 3), np.nan), np.full((len(rows), 2), np.nan)
-        if rows.any():
-            part = pushes.chosen(self.table.iloc[chunk], rows)
-            pose[rows], force[rows] = _predicted(part, model, chosen)
+        fitted = model if model in FITTED else "rigid_feet"
+        if friction is not None and fitted in friction.fitted:
+            of_model = friction.friction.sel(fitted=fitted)
+            chosen = {name: float(of_model.sel(finger_kind=name)) for name in FINGERS}
+        count = len(self.table)
+        pose, force = np.full((count, 3), np.nan), np.full((count, 2), np.nan)
+        for first in range(0, count, _TOGETHER):
+            rows = np.flatnonzero(self._rows(model)[first : first + _TOGETHER]) + first
+            if rows.size:
+                part = self.table.iloc[rows].reset_index(drop=True)
+                pose[rows], force[rows] = _predicted(part, model, chosen)
         return xr.Dataset(
             {"predicted": (("push", "pose"), pose), "force": (("push", "axis"), force)}
         )
@@ -334,23 +304,13 @@ class RealPushes(Study[xr.Dataset]):
             "bootstrap over pushes in brackets, and the 90 % quantile."
         )
 
-    def report(self, results: xr.Dataset, run: Run) -> Sequence[Section]:
-        """Return sections with errors by model and the fitted friction."""
-        sections = [
-            Section(name.replace("_", " ").capitalize(), "", _texts(*columns_and_rows))
-            for name, columns_and_rows in tables(results).items()
-        ]
-        if sections and np.isfinite(results.both).any() and "rigid_feet" in self.models:
+    def report_tables(self, results: xr.Dataset) -> Sequence[Table]:
+        """Return errors by model and the fitted friction."""
+        by_name = list(tables(results).values())
+        if by_name and np.isfinite(results.both).any() and "rigid_feet" in self.models:
             draw = partial(figure, results, self.table, WORDS)
-            sections[0] = sections[0]._replace(picture=Picture("real_pushes", draw))
-        return sections
-
-    def published_tables(self, results: xr.Dataset) -> Mapping[str, Table]:
-        """Return all tables."""
-        return {
-            f"real_pushes_{name}": Table(rows, columns=columns)
-            for name, (columns, rows) in tables(results).items()
-        }
+            by_name[0] = by_name[0]._replace(picture=Picture("real_pushes", draw))
+        return by_name
 
     def publish(self, results: xr.Dataset, run_folder: Path) -> None:
         """Write the data files and the figure."""
@@ -366,12 +326,9 @@ real_pushes = call_of(RealPushes)
 
 def _csv(results: xr.Dataset) -> str:
     """Return one row per push and model with the predicted pose."""
-    rows = results.predicted.to_dataset("pose").rename(
-        {name: f"post_{name}" for name in pushes.POSE}
-    )
-    frame = rows[[f"post_{name}" for name in pushes.POSE]].to_dataframe().reset_index()
-    names = ["id", "model", *(f"post_{name}" for name in pushes.POSE)]
-    return frame[names].dropna().to_csv(index=False, lineterminator="\n")
+    poses = {f"post_{name}": results.predicted.sel(pose=name, drop=True) for name in pushes.POSE}
+    frame = xr.Dataset(poses).to_dataframe().reset_index()[["id", "model", *poses]]
+    return frame.dropna().to_csv(index=False, lineterminator="\n")
 
 
 def median_interval(values: np.ndarray) -> tuple[float, float, float]:
@@ -381,19 +338,49 @@ def median_interval(values: np.ndarray) -> tuple[float, float, float]:
     return float(np.median(values)), float(low), float(high)
 
 
+def _column(name: str, form: str = "{}", rest: str = "", **options: Any) -> dict[str, Any]:
+    """Return a column of a data file."""
+    formats = {"format": form, "rest": rest} if rest else {"format": form} if form != "{}" else {}
+    return {"name": name} | formats | options
+
+
+_INTERVAL = " [{:.2f}, {:.2f}]"
+_NUMBER = _column("number", "{:d}")
+_MEDIANS = {
+    "place": _column("place", "{:.2f} mm", _INTERVAL),
+    "turn": _column("turn", "{:.2f}°", _INTERVAL),
+    "both": _column("both", "{:.2f} mm", _INTERVAL),
+}
+_PUSHES, _MODEL = _column("pushes", merge=True), _column("model")
 _COLUMNS = [
-    {"name": "pushes", "merge": True},
-    {"name": "model"},
-    {"name": "number", "format": "{:d}"},
-    {"name": "place", "format": "{:.2f} mm", "rest": " [{:.2f}, {:.2f}]"},
-    {"name": "90 %", "format": "{:.1f} mm"},
-    {"name": "turn", "format": "{:.2f}°", "rest": " [{:.2f}, {:.2f}]"},
-    {"name": "90 %", "format": "{:.1f}°"},
-    {"name": "both", "format": "{:.2f} mm", "rest": " [{:.2f}, {:.2f}]"},
-    {"name": "90 %", "format": "{:.1f} mm"},
-]  # fmt: skip
-
-
+    *(_PUSHES, _MODEL, _NUMBER),
+    *(_MEDIANS["place"], _column("90 %", "{:.1f} mm")),
+    *(_MEDIANS["turn"], _column("90 %", "{:.1f}°")),
+    *(_MEDIANS["both"], _column("90 %", "{:.1f} mm")),
+]
+_FRICTION_COLUMNS = [
+    _column("pusher", merge=True),
+    _MODEL,
+    _column("friction", "{:.2f}"),
+    _column("both, half fitted on", "{:.2f} mm"),
+    _column("within 0.1 mm of it", "{:.2f}", " to {:.2f}"),
+    _column("both, other half", "{:.2f} mm", _INTERVAL),
+]
+_LAYOUT_COLUMNS = [
+    _PUSHES,
+    _column("feet that nothing was fitted on", merge=True),
+    *(_MODEL, _NUMBER),
+    _column("friction, fitted on other feet", "{:.2f}"),
+    *_MEDIANS.values(),
+    _column("both, fitted on these feet", "{:.2f} mm"),
+]
+_FORCE_COLUMNS = [
+    _column("point pushes"),
+    _NUMBER,
+    _column("angle of the force off the predicted", "{:.1f}°"),
+    _column("90 %", "{:.1f}°"),
+    _column("friction with the ground that the force tells", "{:.3f}", " [{:.3f}, {:.3f}]"),
+]
 _UNITS = (1e3, 180 / np.pi, 1e3)  # of errors in tables: mm, degrees, mm
 
 
@@ -416,70 +403,49 @@ def _errors(results: xr.Dataset, model: str, rows: np.ndarray) -> Errors:
     return Errors(*(value[is_measured] for value in values))
 
 
-def tables(results: xr.Dataset) -> dict[str, tuple[list[dict[str, Any]], list[list[Any]]]]:
-    """Return columns and rows of each table of the page, for pushes outside the fit."""
+def tables(results: xr.Dataset) -> dict[str, Table]:
+    """Return the tables of the page by name, for pushes outside the fit."""
     group, test = results.group.values, ~results.fits.values
     models = list(map(str, results.model.values))
     slow = [name for name in models if name in MUJOCOS]
     quick = [name for name in models if name not in MUJOCOS]
-    rows = []
-    for name in GROUPS:
-        for model in quick:
-            if model in _SHOWN.get(name, quick):
-                off = _errors(results, model, test & (group == name))
-                rows += [_row(name, model, off)] if off.both.size else []
-    published = {"models": (_COLUMNS, rows)}
+
+    def rows(groups: Sequence[str], shown: Sequence[str], mask: np.ndarray) -> Iterator[list[Any]]:
+        for name, model in product(groups, shown):
+            off = _errors(results, model, mask & (group == name))
+            if off.both.size and (model in slow or model in _SHOWN.get(name, quick)):
+                yield _row(name, model, off)
+
+    published = {"models": (_COLUMNS, rows(GROUPS, quick, test))}
     if slow:
         ran = np.isfinite(results.predicted.sel(model=slow[0]).values).all(axis=1)
-        rows = []
-        for name in (GROUPS[0], GROUPS[3]):
-            for model in [one for one in quick if one == "rigid_feet"] + slow:
-                off = _errors(results, model, ran & (group == name))
-                rows += [_row(name, model, off)] if off.both.size else []
-        published["mujoco"] = (_COLUMNS, rows)
+        shown = [name for name in quick if name == "rigid_feet"] + slow
+        published["mujoco"] = (_COLUMNS, rows((GROUPS[0], GROUPS[3]), shown, ran))
     if "friction" in results:
-        published["friction"] = _FRICTION_COLUMNS, list(_friction_rows(results))
-        published["layouts"] = _LAYOUT_COLUMNS, list(_layout_rows(results))
+        published["friction"] = _FRICTION_COLUMNS, _friction_rows(results)
+        published["layouts"] = _LAYOUT_COLUMNS, _layout_rows(results)
     if "force_measured" in results and "rigid_feet" in models:
-        published["forces"] = _FORCE_COLUMNS, list(_force_rows(results))
-    return {name: (columns, rows) for name, (columns, rows) in published.items() if rows}
-
-
-_FRICTION_COLUMNS = [
-    {"name": "pusher", "merge": True},
-    {"name": "model"},
-    {"name": "friction", "format": "{:.2f}"},
-    {"name": "both, half fitted on", "format": "{:.2f} mm"},
-    {"name": "within 0.1 mm of it", "format": "{:.2f}", "rest": " to {:.2f}"},
-    {"name": "both, other half", "format": "{:.2f} mm", "rest": " [{:.2f}, {:.2f}]"},
-]
+        published["forces"] = _FORCE_COLUMNS, _force_rows(results)
+    by_name = {
+        name: Table(list(values), "", columns, name=f"real_pushes_{name}", title=name.capitalize())
+        for name, (columns, values) in published.items()
+    }
+    return {name: table for name, table in by_name.items() if table.rows}
 
 
 def _friction_rows(results: xr.Dataset) -> Iterator[list[Any]]:
     finger, test = results.finger.values, ~results.fits.values
     clear = test & (results.group.values != GROUPS[5])
     tried = results.tried.values
-    for name in FINGERS:
-        for model in FITTED:
-            if model not in results.model or not (finger == name).any():
-                continue
+    for name, model in product(FINGERS, FITTED):
+        if model in results.model and (finger == name).any():
             off = 1e3 * results.fit_error.sel(fitted=model, finger_kind=name).values
             near = tried[off <= np.nanmin(off) + 0.1]
             mu = float(results.friction.sel(fitted=model, finger_kind=name))
-            told = _errors(results, model, clear & (finger == name)).both
+            other_half = _errors(results, model, clear & (finger == name)).both
             cells = [mu, float(np.nanmin(off)), [float(near.min()), float(near.max())],
-                     [1e3 * one for one in median_interval(told)]]  # fmt: skip
+                     [1e3 * x for x in median_interval(other_half)]]  # fmt: skip
             yield [name, WORDS[model], *_rounded(cells)]
-
-
-_LAYOUT_COLUMNS = [
-    {"name": "pushes", "merge": True},
-    {"name": "feet that nothing was fitted on", "merge": True},
-    *_COLUMNS[1:3],
-    {"name": "friction, fitted on other feet", "format": "{:.2f}"},
-    *(column for column in _COLUMNS[3:] if column["name"] != "90 %"),
-    {"name": "both, fitted on these feet", "format": "{:.2f} mm"},
-]
 
 
 def _layout_rows(results: xr.Dataset) -> Iterator[list[Any]]:
@@ -489,32 +455,15 @@ def _layout_rows(results: xr.Dataset) -> Iterator[list[Any]]:
         has_layout = (finger == name) & (support != "")
         for layout in dict.fromkeys(support[has_layout]):
             held_out, rest = has_layout & (support == layout), has_layout & (support != layout)
-            if not rest.any():
-                continue
-            for model in map(str, results.fitted.values):
-                off = [results[f"few_{one}"].sel(fitted=model).values for one in Errors._fields]
-                best, own_best = (int(np.median(off[2][:, rows], axis=1).argmin())
-                               for rows in (rest, held_out))  # fmt: skip
-                cells = [[unit * one for one in median_interval(values[best, held_out])]
+            for model in map(str, results.fitted.values) if rest.any() else ():
+                off = [results[f"few_{x}"].sel(fitted=model).values for x in Errors._fields]
+                medians = (np.median(off[2][:, rows], axis=1) for rows in (rest, held_out))
+                best, best_here = (int(values.argmin()) for values in medians)
+                mu, alone = float(results.tried[best]), 1e3 * np.median(off[2][best_here, held_out])
+                cells = [[unit * x for x in median_interval(values[best, held_out])]
                          for unit, values in zip(_UNITS, off, strict=True)]  # fmt: skip
-                mu, alone = float(results.tried[best]), 1e3 * np.median(off[2][own_best, held_out])
-                yield [
-                    name,
-                    layout,
-                    WORDS[model],
-                    int(held_out.sum()),
-                    *_rounded([mu, *cells, alone]),
-                ]
-
-
-_FORCE_COLUMNS = [
-    {"name": "point pushes"},
-    {"name": "number", "format": "{:d}"},
-    {"name": "angle of the force off the predicted", "format": "{:.1f}°"},
-    {"name": "90 %", "format": "{:.1f}°"},
-    {"name": "friction with the ground that the force tells", "format": "{:.3f}",
-     "rest": " [{:.3f}, {:.3f}]"},
-]  # fmt: skip
+                head = [name, layout, WORDS[model], int(held_out.sum())]
+                yield [*head, *_rounded([mu, *cells, alone])]
 
 
 def _force_rows(results: xr.Dataset) -> Iterator[list[Any]]:
@@ -525,32 +474,9 @@ def _force_rows(results: xr.Dataset) -> Iterator[list[Any]]:
     ratio = np.linalg.norm(real, axis=1) / (np.maximum(size, 1e-9) * pushes.MASS * 9.81)
     is_valid = np.isfinite(real).all(axis=1) & np.isfinite(predicted).all(axis=1) & (size > 0.05)
     is_valid &= ~results.fits.values
-    kinds = [(one, on) for one in GROUPS[:2] for on in pushes.GROUND]
-    for group, surface in kinds:
+    for group, surface in product(GROUPS[:2], pushes.GROUND):
         rows = is_valid & (results.group.values == group) & (results.surface.values == surface)
-        name = f"{group}, {surface}"
         if rows.any():
             degrees = np.degrees(np.abs(pushes.angle(off[rows])))
-            cells = [
-                np.median(degrees),
-                np.quantile(degrees, 0.9),
-                list(median_interval(ratio[rows])),
-            ]
-            yield [name, int(rows.sum()), *_rounded(cells)]
-
-
-def _texts(columns: list[dict[str, Any]], rows: list[list[Any]]) -> list[list[str]]:
-    """Return a table as texts, like on the pages."""
-
-    def text(cell: Any, column: dict[str, Any]) -> str:
-        if isinstance(cell, str):
-            return cell
-        first, *rest = cell if isinstance(cell, list) else [cell]
-        shown = column.get("format", "{}").format(first)
-        return shown + (column["rest"].format(*rest) if rest else "")
-
-    head = [column["name"] for column in columns]
-    return [
-        head,
-        *([text(c, k) for c, k in zip(row, columns, strict=True)] for row in rows),
-    ]
+            cells = [np.median(degrees), np.quantile(degrees, 0.9), [*median_interval(ratio[rows])]]
+            yield [f"{group}, {surface}", int(rows.sum()), *_rounded(cells)]

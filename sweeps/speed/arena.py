@@ -12,40 +12,43 @@ from __future__ import annotations
 
 import json
 import os
-import queue
-import re
 import subprocess
 import sys
 import tempfile
-import threading
 import time
 from collections.abc import Generator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import IO, Any, ClassVar
+from typing import Any, ClassVar
 
 import mujoco
 import numpy as np
 import xarray as xr
 
 from rps_jax import errors
-from rps_jax.analysis.report import Section
 from rps_jax.record.options import option
 from rps_jax.runs.question import Run, call_of
 from rps_jax.trials.progress import Progress
 from rps_jax.world import scene
 from rps_jax.world.physics import preset
-from sweeps import programs
 from sweeps.speed import racers
 from sweeps.speed.racers import ON_CORES, RACERS
-from sweeps.study_base import Study, Table
+from sweeps.study_base import Rows, SpeedStudy, Table, part_name, records, stored_parts, text_table
 
 _FOLDER = Path(__file__).parent
-_COLUMNS = (
-    *("engine", "version", "worlds", "simulated s/s", "fused over it"),
-    *("error, median", "error, largest", "turned, median", "ready after", "why not"),
-)
+_COLUMNS = {
+    "engine": "{engine}",
+    "version": "{version}",
+    "worlds": "{worlds:,}",
+    "simulated s/s": "{rate:,.0f}",
+    "fused over it": "{times}",
+    "error, median": "{error:.2g} mm",
+    "error, largest": "{largest:.2g} mm",
+    "turned, median": "{turned:.2g}°",
+    "ready after": "{ready:.0f} s",
+    "why not": "{why}",
+}
 # Engines that are not in the arena, and why.
 EXCLUDED = {
     "Brax 0.14.2": (
@@ -60,7 +63,7 @@ EXCLUDED = {
 
 
 @dataclass(frozen=True)
-class Arena(Study[xr.Dataset]):
+class Arena(SpeedStudy[xr.Dataset]):
     """Compare speed and error of engines on one scene with converged C MuJoCo.
 
     The results hold, by engine and number of worlds, simulated seconds per second of wall clock,
@@ -69,7 +72,8 @@ class Arena(Study[xr.Dataset]):
     """
 
     TITLE: ClassVar[str] = "Engines on one scene"
-    QUICK: ClassVar[Mapping[str, Any]] = {
+    CHOICES: ClassVar = {"names": RACERS}
+    QUICK: ClassVar[Mapping[str, object]] = {
         "names": ("C MuJoCo, rollout", "fused"),
         "worlds": (8,),
         "starts": 4,
@@ -95,10 +99,8 @@ class Arena(Study[xr.Dataset]):
 
     def check(self) -> None:
         """Check the names."""
-        if not self.names:
-            raise errors.InputError("names = () is not allowed: name at least one engine.")
-        for name in self.names:
-            errors.check_name("name", name, tuple(RACERS))
+        super().check()
+        errors.check_each_once("names", self.names)
 
     @property
     def races(self) -> list[tuple[str, int]]:
@@ -117,23 +119,20 @@ class Arena(Study[xr.Dataset]):
             (folder / "scene.xml").write_text(mjcf())
             np.save(folder / "starts.npy", initial_poses(self.starts))
             truth = run.checkpoint("converged", partial(self._converged, folder)).pose.values
-            missing = [
-                race
-                for race in self.races
-                if run.checkpoints is None or run.checkpoints.get(_part(race)) is None
-            ]
+            stored = stored_parts(run)
+            missing = [race for race in self.races if part_name(*race) not in stored]
             new_rows = self._raced(missing, folder, truth)
             rows: list[xr.Dataset] = []
             results: Any = xr.Dataset()
-            for i, race in enumerate(self.races):
-                row = next(new_rows) if race in missing else run.checkpoint(_part(race), xr.Dataset)
-                if race in missing and not row.why.item():  # failures are tried again
-                    run.checkpoint(_part(race), partial(xr.Dataset.copy, row))
+            for race in self.races:
+                row = next(new_rows) if race in missing else xr.Dataset()
+                if race not in missing or not row.why.item():  # failures are tried again
+                    row = run.checkpoint(part_name(*race), partial(xr.Dataset.copy, row))
                 rows.append(row)
                 results = xr.concat(rows, "row")
                 if self.machine and run.folder is not None:
                     self.publish(results, run.folder)
-                run.callback(Progress(i + 1, 0.0))
+                run.callback(Progress(len(rows), 0.0))
             new_rows.close()
         return results
 
@@ -158,26 +157,13 @@ class Arena(Study[xr.Dataset]):
             for process in processes:
                 process.end()
 
-    def published_tables(self, results: xr.Dataset) -> Mapping[str, Table]:
-        """Return the rows, with the reasons for excluded engines."""
+    def report_tables(self, results: xr.Dataset) -> Sequence[Table]:
+        """Return speeds and errors, with the reasons for excluded engines."""
         excluded = (f"Not in the arena: {name}, because {why}." for name, why in EXCLUDED.items())
-        return {"arena": Table([_COLUMNS, *table(results)], " ".join(excluded))}
-
-    def intro(self, results: xr.Dataset) -> str:
-        """Return the device of the measurement."""
-        return programs.machine()
-
-    def report(self, results: xr.Dataset, run: Run) -> Sequence[Section]:
-        """Return a section with speeds and errors."""
-        note = " ".join(f"{name} is not in the arena: {why}." for name, why in EXCLUDED.items())
-        return [Section("Engines on one scene", note, [list(_COLUMNS), *table(results)])]
+        return [Table(table(results), " ".join(excluded), name="arena", title=self.TITLE)]
 
 
 arena = call_of(Arena)
-
-
-def _part(race: tuple[str, int]) -> str:
-    return "_".join([re.sub(r"\W+", "_", race[0]), str(race[1])])
 
 
 # --- the scene -----------------------------------------------------------------------------
@@ -221,14 +207,17 @@ def mjcf() -> str:
             strict=False,
         )
     )
+    # Newton has another default of solreffriction.
+    numbers = ("friction", "solref", "solreffriction", "solimp")
     pairs = "".join(
         f'<pair geom1="{model.geom(int(model.pair_geom1[i])).name}" '
         f'geom2="{model.geom(int(model.pair_geom2[i])).name}" condim="{model.pair_dim[i]}" '
-        f'friction="{text(model.pair_friction[i])}" solref="{text(model.pair_solref[i])}" '
-        f'solreffriction="{text(model.pair_solreffriction[i])}" '  # Newton has another default
-        f'solimp="{text(model.pair_solimp[i])}"/>'
+        + " ".join(f'{x}="{text(getattr(model, f"pair_{x}")[i])}"' for x in numbers)
+        + "/>"
         for i in range(model.npair)
     )
+    names = ("timestep", "impratio", "iterations", "ls_iterations", "tolerance")
+    options = " ".join(f'{name}="{text(getattr(o, name))}"' for name in names)
     assert (o.integrator, o.solver, o.cone) == (
         mujoco.mjtIntegrator.mjINT_EULER,
         mujoco.mjtSolver.mjSOL_NEWTON,
@@ -236,9 +225,7 @@ def mjcf() -> str:
     )
     return (
         '<mujoco model="arena"><compiler angle="radian" autolimits="true"/>'
-        f'<option timestep="{o.timestep:g}" integrator="Euler" solver="Newton" cone="elliptic" '
-        f'impratio="{o.impratio:g}" iterations="{o.iterations}" '
-        f'ls_iterations="{o.ls_iterations}" tolerance="{o.tolerance:g}" jacobian="dense"/>'
+        f'<option integrator="Euler" solver="Newton" cone="elliptic" jacobian="dense" {options}/>'
         f"<worldbody>{geom('ground', 'plane')}"
         f'<body name="base">{joints}{inertial(base)}{geom("base", "box")}</body>'
         f'<body name="object" pos="{text(box.pos)}"><freejoint name="object"/>{inertial(box)}'
@@ -267,35 +254,34 @@ class _Process:
         """Start the process."""
         words = [name, str(folder), str(seconds), str(count)]
         self.name, self.count, self.failed, self.ready = name, count, "", np.nan
-        self._errors = folder / f"{_part((name, count))}.txt"
-        with self._errors.open("w") as file:
+        self._output = folder / f"{part_name(name, count)}.txt"
+        self._errors = self._output.with_suffix(".err")
+        with self._output.open("w") as output, self._errors.open("w") as errors_:
             self._child = subprocess.Popen(
                 [sys.executable, str(_FOLDER / "racers.py"), *words], env=environment, text=True,
-                stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=file,
+                stdin=subprocess.PIPE, stdout=output, stderr=errors_,
             )  # fmt: skip
-        assert self._child.stdout is not None
-        self._lines: queue.SimpleQueue[str | None] = queue.SimpleQueue()
-        threading.Thread(target=_read, args=(self._child.stdout, self._lines), daemon=True).start()
 
-    def _next_message(self, until: float) -> dict[str, Any] | None:
-        """Return the next message of the process, or None and set `failed`."""
+    def _message(self, index: int, until: float) -> dict[str, Any] | None:
+        """Wait for a message of the process; return None and set `failed` if there is none."""
         while True:
-            try:
-                line = self._lines.get(timeout=max(until - time.perf_counter(), 0.01))
-            except queue.Empty:
-                self.failed = "exceeded the time limit"
-                return None
-            if line is None:
-                self._child.wait()
+            ended = self._child.poll() is not None
+            lines = self._output.read_text().splitlines(keepends=True)
+            messages = [x for x in lines if x.startswith("{") and x.endswith("\n")]
+            if len(messages) > index:
+                return json.loads(messages[index])
+            if ended:
                 last = self._errors.read_text().strip().splitlines()[-1:]
                 self.failed = " ".join(last) or f"ended with {self._child.returncode}"
                 return None
-            if line.startswith("{"):
-                return json.loads(line)
+            if time.perf_counter() > until:
+                self.failed = "exceeded the time limit"
+                return None
+            time.sleep(0.05)
 
     def prepare(self, until: float) -> None:
         """Wait until the engine is ready."""
-        if (message := self._next_message(until)) is not None:
+        if (message := self._message(0, until)) is not None:
             self.ready = message["ready"]
         else:
             self.end()
@@ -306,7 +292,7 @@ class _Process:
         if not self.failed:
             assert self._child.stdin is not None
             print("go", file=self._child.stdin, flush=True)
-            output = self._next_message(until)
+            output = self._message(1, until)
         self.end()
         return _row(self, output or {"poses": []}, truth)
 
@@ -314,12 +300,6 @@ class _Process:
         """Kill the process if it is running."""
         self._child.kill()
         self._child.wait()
-
-
-def _read(stream: IO[str], lines: queue.SimpleQueue[str | None]) -> None:
-    for line in stream:
-        lines.put(line)
-    lines.put(None)
 
 
 def _row(process: _Process, output: Mapping[str, Any], truth: np.ndarray) -> xr.Dataset:
@@ -330,18 +310,12 @@ def _row(process: _Process, output: Mapping[str, Any], truth: np.ndarray) -> xr.
         true = truth[np.arange(len(poses)) % len(truth)]
         error = np.linalg.norm(poses[:, :2] - true[:, :2], axis=1)
         turned = np.abs((_yaw(poses) - _yaw(true) + np.pi) % (2 * np.pi) - np.pi)
-    values = {
-        "engine": process.name,
-        "version": output.get("version", ""),
-        "worlds": output.get("worlds", process.count),
-        "rate": output.get("rate", np.nan),
-        "error": np.median(error),
-        "largest": np.max(error),
-        "turned": np.median(turned),
-        "ready": process.ready,
-        "why": process.failed,
-    }
-    return xr.Dataset({name: ((), value) for name, value in values.items()})
+    default = {"version": "", "worlds": process.count, "rate": np.nan}
+    return xr.Dataset({
+        **{name: output.get(name, value) for name, value in default.items()},
+        "error": np.median(error), "largest": np.max(error), "turned": np.median(turned),
+        "engine": process.name, "ready": process.ready, "why": process.failed,
+    })  # fmt: skip
 
 
 def _yaw(poses: np.ndarray) -> np.ndarray:
@@ -358,27 +332,14 @@ def _times(ratio: float) -> str:
     return "" if np.isnan(ratio) else f"{ratio:,.0f}" if ratio >= 100 else f"{ratio:.3g}"
 
 
-def table(results: xr.Dataset) -> list[list[str]]:
-    """Return one row per engine and number of worlds, the slowest first and failures last."""
-    rows = [results.isel(row=i) for i in range(results.sizes["row"])]
-    fused = {int(r.worlds): float(r.rate) for r in rows if r.engine.item() == "fused"}
-    largest_rate = max(fused.values(), default=np.nan)
-
-    def cell(value: xr.DataArray, form: str, times: float = 1.0) -> str:
-        return "" if np.isnan(value) else form.format(times * float(value))
-
-    return [
-        [
-            str(r.engine.item()),
-            str(r.version.item()),
-            f"{int(r.worlds):,}",
-            cell(r.rate, "{:,.0f}"),
-            _times(fused.get(int(r.worlds), largest_rate) / float(r.rate)),
-            cell(r.error, "{:.2g} mm", 1000),
-            cell(r.largest, "{:.2g} mm", 1000),
-            cell(r.turned, "{:.2g}°", 180 / np.pi),
-            cell(r.ready, "{:.0f} s"),
-            str(r.why.item()),
-        ]
-        for r in sorted(rows, key=lambda r: np.nan_to_num(float(r.rate), nan=np.inf))
-    ]
+def table(results: xr.Dataset) -> Rows:
+    """Return a row per engine and number of worlds, the slowest first and failures last."""
+    order = np.argsort(results.rate.fillna(np.inf), kind="stable")
+    rows = list(records(results.isel(row=order), "row"))
+    fused = {row["worlds"]: row["rate"] for row in rows if row["engine"] == "fused"}
+    fastest = max(fused.values(), default=np.nan)
+    for row in rows:
+        row["times"] = _times(fused.get(row["worlds"], fastest) / row["rate"])
+        row["error"], row["largest"] = 1000 * row["error"], 1000 * row["largest"]
+        row["turned"] *= 180 / np.pi
+    return text_table(_COLUMNS, rows)

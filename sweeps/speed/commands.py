@@ -17,31 +17,34 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import xarray as xr
 
-from rps_jax.analysis.report import Section
 from rps_jax.errors import InputError
 from rps_jax.record.options import option
 from rps_jax.runs.question import Run, call_of
-from rps_jax.trials.progress import Progress
-from sweeps import programs
-from sweeps.study_base import Study, Table
+from sweeps.study_base import SpeedStudy, Table, records, text_table
 
 TIMING = re.compile(r"compile ([\d.]+) s, run ([\d.]+) s \((\d+) simulated s per s\)")
-_COLUMNS = (
-    *("command", "empty cache", "once more", "of it compile", "run", "simulated s/s"),
-    *("memory, empty cache", "memory, once more"),
-)
+_COLUMNS = {
+    "command": "{command}",
+    "empty cache": "{empty:.1f} s",
+    "once more": "{again:.1f} s",
+    "of it compile": "{compile:.1f} s",
+    "run": "{run:.1f} s",
+    "simulated s/s": "{rate:,.0f}",
+    "memory, empty cache": "{memory_empty:.1f} GB",
+    "memory, once more": "{memory_again:.1f} GB",
+}
 
 
 @dataclass(frozen=True)
-class Commands(Study[xr.Dataset]):
+class Commands(SpeedStudy[xr.Dataset]):
     """Time whole commands, with an empty and with a filled cache.
 
     The results hold, by command, the duration of both processes, their peak memory, and the times
@@ -49,6 +52,7 @@ class Commands(Study[xr.Dataset]):
     """
 
     TITLE: ClassVar[str] = "Duration of whole commands"
+    DIMENSION: ClassVar[str] = "command"
     GROWS: ClassVar[tuple[str, ...]] = ("commands", "warm", "gpus")
 
     commands: tuple[str, ...] = (
@@ -72,50 +76,26 @@ class Commands(Study[xr.Dataset]):
     file: str = "commands"
     """Name of the data file."""
 
-    def num_trials(self) -> int | None:
-        """Return the number of commands."""
-        return len(self.rows) + len(self.warm)
-
-    @property
-    def rows(self) -> list[tuple[str, int | None]]:
-        """Commands, each with its number of GPUs."""
-        return [(command, count) for command in self.commands for count in self.gpus or (None,)]
-
-    def answer(self, run: Run) -> xr.Dataset:
-        """Time the commands that are missing."""
-        parts = []
-        for i, (command, gpus) in enumerate(self.rows):
-            safe = re.sub(r"\W+", "_", command) + ("" if gpus is None else f"_{gpus}")
-            parts.append(run.checkpoint(safe, partial(timed, command, self.limit, gpus)))
-            run.callback(Progress(i + 1, 0.0))
+    def parts(self, run: Run) -> Mapping[str, Callable[[], xr.Dataset]]:
+        """Return the function that times each command with each number of GPUs."""
+        suffix = {None: "", 1: ", one GPU"} | {n: f", {n} GPUs" for n in self.gpus if n > 1}
+        parts = {
+            f"`rps {command}`{suffix[gpus]}": partial(timed, command, self.limit, gpus)
+            for command in self.commands
+            for gpus in self.gpus or (None,)
+        }
         gpus = max(self.gpus, default=None)
-        parts += [
-            run.checkpoint(f"warm_{n}", partial(_warm, n, self.limit, gpus)) for n in self.warm
-        ]
-        labels = [*_labels(self.rows), *(f"`{_call(n)}`, in one process" for n in self.warm)]
-        results: Any = xr.concat(parts, "command").assign_coords(command=labels)
-        return results
+        return parts | {
+            f"`{_call(n)}`, in one process": partial(_warm, n, self.limit, gpus) for n in self.warm
+        }
 
-    def published_tables(self, results: xr.Dataset) -> Mapping[str, Table]:
+    def report_tables(self, results: xr.Dataset) -> Sequence[Table]:
         """Return the times of the commands."""
-        return {self.file: Table([_COLUMNS, *table(results)])}
-
-    def intro(self, results: xr.Dataset) -> str:
-        """Return the device of the measurement."""
-        return programs.machine()
-
-    def report(self, results: xr.Dataset, run: Run) -> Sequence[Section]:
-        """Return a section with the durations of both processes."""
-        return [Section("Whole commands", "", [list(_COLUMNS), *table(results)])]
+        rows = text_table(_COLUMNS, records(results, "command"))
+        return [Table(rows, name=self.file, title="Whole commands")]
 
 
 commands = call_of(Commands)
-
-
-def _labels(rows: Sequence[tuple[str, int | None]]) -> list[str]:
-    """Return the labels of the rows: command and number of GPUs."""
-    suffix = {None: "", 1: ", one GPU"}
-    return [f"`rps {command}`{suffix.get(gpus, f', {gpus} GPUs')}" for command, gpus in rows]
 
 
 def timed(command: str, limit: float, gpus: int | None = None) -> xr.Dataset:
@@ -133,8 +113,11 @@ def timed(command: str, limit: float, gpus: int | None = None) -> xr.Dataset:
             seconds.append(time.perf_counter() - start)
             memory.append(peak)
     match = TIMING.search(output)
-    compile_, run, rate = map(float, match.groups()) if match else (float("nan"),) * 3
-    return _row(*seconds, compile_, run, rate, *memory)
+    compile_, run, rate = map(float, match.groups() if match else ("nan",) * 3)
+    return xr.Dataset({
+        "empty": seconds[0], "again": seconds[1], "compile": compile_, "run": run, "rate": rate,
+        "memory_empty": memory[0], "memory_again": memory[1],
+    })  # fmt: skip
 
 
 def _call(worlds: int) -> str:
@@ -154,7 +137,7 @@ def _warm(worlds: int, limit: float, gpus: int | None = None) -> xr.Dataset:
     with tempfile.TemporaryDirectory() as folder:
         output, peak = printed(["-c", code], _call(worlds), folder, limit, gpus)
     first, *_, last = map(float, output.split())
-    return _row(first, last, *(float("nan"),) * 3, peak)
+    return xr.Dataset({"empty": first, "again": last, "memory_empty": peak})
 
 
 def printed(
@@ -189,23 +172,3 @@ def printed(
         last = error_output.read_text().strip().splitlines()[-1:]
         raise InputError(f"commands = {label} failed: {' '.join(last)}")
     return output.read_text(), usage.ru_maxrss * 1024 / 1e9  # Linux reports KiB
-
-
-def _row(*values: float) -> xr.Dataset:
-    """Label durations of both runs, printed times (compile, run [s], rate) and peak memory."""
-    names = ("empty", "again", "compile", "run", "rate", "memory_empty", "memory_again")
-    padded = (*values, *(float("nan"),) * (len(names) - len(values)))
-    return xr.Dataset({name: ((), value) for name, value in zip(names, padded, strict=True)})
-
-
-def table(results: xr.Dataset) -> list[list[str]]:
-    """Return one row per command."""
-    rows = []
-    for command in map(str, results.command.values):
-        timing = results.sel(command=command)
-        cells = [f"{timing[name].item():.1f} s" for name in ("empty", "again", "compile", "run")]
-        rate = f"{timing.rate.item():,.0f}"
-        peaks = [f"{timing[f'memory_{name}'].item():.1f} GB" for name in ("empty", "again")]
-        shown = [cell.removeprefix("nan").removeprefix(" s") for cell in (*cells, rate)]
-        rows.append([command, *shown, *(cell.replace("nan GB", "") for cell in peaks)])
-    return rows

@@ -11,23 +11,21 @@ processors.
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, ClassVar, Literal
+from typing import ClassVar, Literal
 
+import numpy as np
 import xarray as xr
 
 import rps_jax
-from rps_jax.analysis.report import Section
 from rps_jax.errors import InputError
 from rps_jax.record.options import option
 from rps_jax.runs.question import Run, call_of
-from rps_jax.trials.progress import Progress
-from sweeps import programs
 from sweeps.speed.commands import TIMING, printed
-from sweeps.study_base import Study, Table
+from sweeps.study_base import SpeedStudy, Table, records, text_table
 
 _LIMIT = 3600.0  # [s] of a sweep
 # Comparisons: names of both, and environment and options of the second.
@@ -38,7 +36,7 @@ _PAIRS: dict[str, tuple[tuple[str, str], dict[str, str], str]] = {
 
 
 @dataclass(frozen=True)
-class Compilers(Study[xr.Dataset]):
+class Compilers(SpeedStudy[xr.Dataset]):
     """Compare sweeps with the native loop with sweeps by XLA, or on processors.
 
     The results hold, by skin, the share of equal outcomes, and the success rates and simulated
@@ -46,6 +44,7 @@ class Compilers(Study[xr.Dataset]):
     """
 
     TITLE: ClassVar[str] = "The loop compiled here, and by XLA"
+    DIMENSION: ClassVar[str] = "skin"
     GROWS: ClassVar[tuple[str, ...]] = ("skins", "file")
 
     law: str = "rps_tuned"
@@ -59,47 +58,25 @@ class Compilers(Study[xr.Dataset]):
     file: str = "compilers"
     """Name of the data file."""
 
-    def num_trials(self) -> int | None:
-        """Return the number of skins."""
-        return len(self.skins)
+    def parts(self, run: Run) -> Mapping[str, Callable[[], xr.Dataset]]:
+        """Return the function that compares both sweeps with each skin."""
+        return {skin: partial(self._compared, skin) for skin in self.skins}
 
-    def answer(self, run: Run) -> xr.Dataset:
-        """Run the sweeps that are missing."""
-        parts = []
-        for i, skin in enumerate(self.skins):
-            parts.append(run.checkpoint(skin, partial(self._compared, skin)))
-            run.callback(Progress(i + 1, 0.0))
-        results: Any = xr.concat(parts, "skin").assign_coords(skin=list(self.skins))
-        return results
-
-    def published_tables(self, results: xr.Dataset) -> Mapping[str, Table]:
-        """Return the comparison."""
-        return {self.file: Table([self._columns, *self.table(results)])}
-
-    def intro(self, results: xr.Dataset) -> str:
-        """Return the device of the comparison."""
-        return programs.machine()
-
-    def report(self, results: xr.Dataset, run: Run) -> Sequence[Section]:
-        """Return a section with outcomes and speeds of both."""
-        return [Section("Outcomes and speeds", "", [self._columns, *self.table(results)])]
-
-    @property
-    def _columns(self) -> list[str]:
-        names, *_ = _PAIRS[self.against]
-        return ["law", "skin", "worlds", "equal outcomes", *names, "simulated s/s"]
-
-    def table(self, results: xr.Dataset) -> list[list[str]]:
-        """Return one row per skin."""
-        rows = []
-        for skin in map(str, results.skin.values):
-            comparison = {name: leaf.item() for name, leaf in results.sel(skin=skin).items()}
-            rates = f"{comparison['rate_here']:,.0f} and {comparison['rate_other']:,.0f}"
-            rows.append([
-                self.law, skin, f"{self.worlds:,}", f"{100 * comparison['equal']:.1f} %",
-                f"{100 * comparison['here']:.1f} %", f"{100 * comparison['other']:.1f} %", rates,
-            ])  # fmt: skip
-        return rows
+    def report_tables(self, results: xr.Dataset) -> Sequence[Table]:
+        """Return outcomes and speeds of both."""
+        (first, second), *_ = _PAIRS[self.against]
+        columns = {
+            "law": self.law,
+            "skin": "{skin}",
+            "worlds": f"{self.worlds:,}",
+            "equal outcomes": "{equal:.1f} %",
+            first: "{here:.1f} %",
+            second: "{other:.1f} %",
+            "simulated s/s": "{rate_here:,.0f} and {rate_other:,.0f}",
+        }
+        percent = results.assign({name: 100 * results[name] for name in ("equal", "here", "other")})
+        rows = text_table(columns, records(percent, "skin"))
+        return [Table(rows, name=self.file, title="Outcomes and speeds")]
 
     def _compared(self, skin: str) -> xr.Dataset:
         """Return the comparison of both sweeps."""
@@ -108,14 +85,10 @@ class Compilers(Study[xr.Dataset]):
         with tempfile.TemporaryDirectory() as folder:
             first, rate_here = _swept(command, Path(folder), "here", {})
             second, rate_other = _swept(command + options, Path(folder), "other", environment)
-        values = {
-            "equal": float((first == second).mean()),
-            "here": float(first.mean()),
-            "other": float(second.mean()),
-            "rate_here": rate_here,
-            "rate_other": rate_other,
-        }
-        return xr.Dataset({name: ((), value) for name, value in values.items()})
+        return xr.Dataset({
+            "equal": np.mean(first == second), "here": np.mean(first), "other": np.mean(second),
+            "rate_here": rate_here, "rate_other": rate_other,
+        })  # fmt: skip
 
 
 compilers = call_of(Compilers)
@@ -123,7 +96,7 @@ compilers = call_of(Compilers)
 
 def _swept(
     command: str, folder: Path, name: str, environment: Mapping[str, str]
-) -> tuple[Any, float]:
+) -> tuple[np.ndarray, float]:
     """Return success (world) and simulated seconds per second of a sweep without compilation.
 
     Raises:

@@ -17,20 +17,19 @@ import time
 from collections import Counter, defaultdict
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from itertools import product
 from pathlib import Path
 from typing import Any, ClassVar, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
 
-from rps_jax import errors
-from rps_jax.analysis.report import Section
 from rps_jax.record.options import option
 from rps_jax.runs.question import Run, call_of
 from rps_jax.trials.progress import Progress
 from sweeps import programs
 from sweeps.programs import FAMILIES
-from sweeps.study_base import Study
+from sweeps.study_base import Rows, SpeedStudy, Table
 
 _ABOVE = re.compile(r".*(?:rps_jax|site-packages)/")  # prefix of a file name
 _INSTRUCTION = re.compile(r"^\s*(?:ROOT )?%([\w.\-]+) = .* ([\w\-]+)\(.*stack_frame_id=(\d+)", re.M)
@@ -59,13 +58,14 @@ class Profile(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Costs(Study[list[Profile]]):
+class Costs(SpeedStudy[list[Profile]]):
     """Profile a control step by the functions of this package.
 
     The results hold a profile of each program.
     """
 
     TITLE: ClassVar[str] = "Time of a control step by function"
+    CHOICES: ClassVar = {"families": FAMILIES, "names": programs.BATCHED}
 
     names: tuple[str, ...] = ("fused standard",)
     """Engines and fidelities, as those of `rps sweeps/speed`."""
@@ -78,13 +78,6 @@ class Costs(Study[list[Profile]]):
     most: int = option(12, 1, 1000)
     """Number of functions of each program in the table."""
 
-    def check(self) -> None:
-        """Check the names of the programs and of the families."""
-        for family in self.families:
-            errors.check_name("families", family, FAMILIES)
-        for name in self.names:
-            errors.check_name("names", name, programs.BATCHED)
-
     def num_trials(self) -> int | None:
         """Return the number of programs."""
         return len(self.names) * len(self.families)
@@ -94,10 +87,9 @@ class Costs(Study[list[Profile]]):
         profiles, compiler = [], os.environ.get("RPS_COMPILER")
         os.environ["RPS_COMPILER"] = "none"  # the profiler sees operations of XLA only
         try:
-            for name in self.names:
-                for family in self.families:
-                    profiles.append(measure(name, family, self.worlds, steps=self.steps))
-                    run.callback(Progress(len(profiles), 0.0))
+            for name, family in product(self.names, self.families):
+                profiles.append(measure(name, family, self.worlds, steps=self.steps))
+                run.callback(Progress(len(profiles), 0.0))
         finally:
             os.environ.pop("RPS_COMPILER")
             os.environ.update({} if compiler is None else {"RPS_COMPILER": compiler})
@@ -110,11 +102,11 @@ class Costs(Study[list[Profile]]):
             f"{1e6 * p.timed:,.0f} us in operations while the profiler ran."
             for p in results
         )
-        return f"{programs.machine()}\n\n{lines}"
+        return f"{super().intro(results)}\n\n{lines}"
 
-    def report(self, results: list[Profile], run: Run) -> Sequence[Section]:
-        """Return a section with the most expensive functions of each program."""
-        return [Section("Functions", "", table(results, self.most))]
+    def report_tables(self, results: list[Profile]) -> Sequence[Table]:
+        """Return the most expensive functions of each program."""
+        return [Table(table(results, self.most), title="Functions")]
 
 
 costs = call_of(Costs)
@@ -178,54 +170,34 @@ def sources(text: str) -> dict[str, str]:
 
     Nested calls count for the innermost function, instructions without a source for `ELSEWHERE`.
     """
-    files, functions = _names(text, "FileNames"), _names(text, "FunctionNames")
-    locations = {
-        location: (int(file), int(function))
-        for location, file, function in _rows(
-            text, "FileLocations", r"file_name_id=(\d+) function_name_id=(\d+)"
-        )
-    }
-    frames = {
-        frame: int(location)
-        for frame, location in _rows(text, "StackFrames", r"file_location_id=(\d+)")
-    }
+    files, functions = _rows(text, "FileNames", '"(.*)"'), _rows(text, "FunctionNames", '"(.*)"')
+    locations = _rows(text, "FileLocations", r"file_name_id=(\d+) function_name_id=(\d+)")
+    frames = _rows(text, "StackFrames", r"file_location_id=(\d+)")
     functions_of = {}
     for name, opcode, frame in _INSTRUCTION.findall(text):
         if opcode in _HOLLOW:
             continue
-        where = ELSEWHERE
-        if int(frame) in frames:
-            file, function = locations[frames[int(frame)]]
-            short = _ABOVE.sub("", files[file])
-            where = f"{short}: {functions[function].replace('.<locals>', '')}"
-        functions_of[name] = where
+        functions_of[name] = ELSEWHERE
+        if frame in frames:
+            file, function = locations[frames[frame][0]]
+            short, scope = _ABOVE.sub("", files[file][0]), functions[function][0]
+            functions_of[name] = f"{short}: {scope.replace('.<locals>', '')}"
     return functions_of
 
 
-def _section(text: str, title: str) -> list[str]:
-    lines = text.partition(f"\n{title}\n")[2].splitlines()
-    return lines[: lines.index("")] if "" in lines else lines
+def _rows(text: str, title: str, pattern: str) -> dict[str, list[str]]:
+    """Return the groups of a pattern in each row of a section, by the number of the row."""
+    section = text.partition(f"\n{title}\n")[2].partition("\n\n")[0]
+    rows = re.findall(rf"^(\d+) .*?{pattern}", section, re.MULTILINE)
+    return {number: groups for number, *groups in rows}
 
 
-def _names(text: str, title: str) -> dict[int, str]:
-    rows = (line.partition(" ") for line in _section(text, title))
-    return {int(i): name.strip('"') for i, _, name in rows}
-
-
-def _rows(text: str, title: str, pattern: str) -> Iterator[tuple[int, ...]]:
-    for line in _section(text, title):
-        i, _, rest = line.partition(" ")
-        if match := re.search(pattern, rest):
-            yield int(i), *(int(group) for group in match.groups())
-
-
-def table(profiles: Sequence[Profile], count: int = 12) -> list[list[str]]:
+def table(profiles: Sequence[Profile], count: int = 12) -> Rows:
     """Return a header and the most expensive functions of each program."""
     rows = [["what", "family", "worlds", "where", "us a control step", "share", "operations"]]
-    for p in profiles:
-        for c in p.costs[:count]:
-            rows.append(
-                [p.name, p.family, f"{p.worlds:,}", c.where, f"{1e6 * c.time:.1f}",
-                 f"{100 * c.share:.0f} %", f"{c.operations:.1f}"]
-            )  # fmt: skip
-    return rows
+    return rows + [
+        [p.name, p.family, f"{p.worlds:,}", c.where, f"{1e6 * c.time:.1f}",
+         f"{100 * c.share:.0f} %", f"{c.operations:.1f}"]
+        for p in profiles
+        for c in p.costs[:count]
+    ]  # fmt: skip

@@ -13,24 +13,21 @@ import shutil
 import subprocess
 import sys
 import tempfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, ClassVar, Literal
+from typing import ClassVar, Literal
 
 import xarray as xr
 
-from rps_jax.analysis.report import Section
 from rps_jax.errors import InputError
 from rps_jax.record.options import option
 from rps_jax.runs.question import Run, call_of
 from rps_jax.trials.batch import SEGMENT
-from rps_jax.trials.progress import Progress
 from rps_jax.trials.setting import Setting
-from sweeps import programs
 from sweeps.programs import FAMILIES
-from sweeps.study_base import Study, Table
+from sweeps.study_base import SpeedStudy, Table, records, text_table
 
 _STALLED = "smsp__average_warps_issue_stalled_{}_per_issue_active.ratio"
 # Counters: name of Nsight Compute, variable, description.
@@ -47,21 +44,31 @@ _COUNTERS = {
     _STALLED.format("branch_resolving"): ("branch", "of them for a branch"),
 }
 _WAITS = ("fetch", "latency", "shared", "memory", "branch")
-_COLUMNS = (
-    *("family", "worlds", "control step", "instructions of a warp in it", "registers"),
-    *("cycles between two", "for the instruction", "for its latency"),
-    *("for shared memory and roots", "for memory", "for branches", "other"),
-)
+_COLUMNS = {
+    "family": "{family}",
+    "worlds": "{worlds:,}",
+    "control step": "{step:.0f} µs",
+    "instructions of a warp in it": "{executed:,.0f}",
+    "registers": "{registers:.0f}",
+    "cycles between two": "{between:.1f}",
+    "for the instruction": "{fetch:.1f}",
+    "for its latency": "{latency:.1f}",
+    "for shared memory and roots": "{shared:.1f}",
+    "for memory": "{memory:.1f}",
+    "for branches": "{branch:.1f}",
+    "other": "{rest:.1f}",
+}
 
 
 @dataclass(frozen=True)
-class Kernel(Study[xr.Dataset]):
+class Kernel(SpeedStudy[xr.Dataset]):
     """Profile the kernel of a GPU: instructions, registers and stall reasons of its warps.
 
     The results hold the counters of Nsight Compute for 10 simulated seconds, by shape family.
     """
 
     TITLE: ClassVar[str] = "Stall reasons of the kernel"
+    DIMENSION: ClassVar[str] = "family"
     GROWS: ClassVar[tuple[str, ...]] = ("families",)
 
     law: str = "rps_tuned"
@@ -76,45 +83,20 @@ class Kernel(Study[xr.Dataset]):
         if shutil.which("ncu") is None:
             raise InputError("ncu is not installed: install NVIDIA's CUDA toolkit, which has it.")
 
-    def num_trials(self) -> int | None:
-        """Return the number of families."""
-        return len(self.families)
+    def parts(self, run: Run) -> Mapping[str, Callable[[], xr.Dataset]]:
+        """Return the function that profiles each family."""
+        return {family: partial(self._profiled, family) for family in self.families}
 
-    def answer(self, run: Run) -> xr.Dataset:
-        """Profile the families that are missing."""
-        parts = []
-        for i, family in enumerate(self.families):
-            parts.append(run.checkpoint(family, partial(self._profiled, family)))
-            run.callback(Progress(i + 1, 0.0))
-        results: Any = xr.concat(parts, "family").assign_coords(family=list(self.families))
-        return results
-
-    def published_tables(self, results: xr.Dataset) -> Mapping[str, Table]:
-        """Return the counts of each family."""
-        return {"kernel": Table([_COLUMNS, *self.table(results)])}
-
-    def intro(self, results: xr.Dataset) -> str:
-        """Return the device of the measurement."""
-        return programs.machine()
-
-    def report(self, results: xr.Dataset, run: Run) -> Sequence[Section]:
-        """Return a section with the stall reasons of each family."""
-        return [Section("Waits", "", [list(_COLUMNS), *self.table(results)])]
-
-    def table(self, results: xr.Dataset) -> list[list[str]]:
-        """Return one row per family."""
-        steps, rows = SEGMENT / Setting().physics.control_period, []
-        for family in map(str, results.family.values):
-            counts = {name: leaf.item() for name, leaf in results.sel(family=family).items()}
-            waits = [counts[name] for name in _WAITS]
-            rows.append([
-                family, f"{self.worlds:,}", f"{counts['time'] / steps / 1e3:.0f} µs",
-                f"{counts['instructions'] / counts['warps'] / steps:,.0f}",
-                f"{counts['registers']:.0f}",
-                f"{counts['between']:.1f}", *(f"{wait:.1f}" for wait in waits),
-                f"{counts['between'] - sum(waits):.1f}",
-            ])  # fmt: skip
-        return rows
+    def report_tables(self, results: xr.Dataset) -> Sequence[Table]:
+        """Return the stall reasons of each family."""
+        steps = SEGMENT / Setting().physics.control_period
+        counts = results.assign(
+            worlds=self.worlds,
+            step=results.time / steps / 1e3,
+            executed=results.instructions / results.warps / steps,
+            rest=results.between - sum(results[name] for name in _WAITS),
+        )
+        return [Table(text_table(_COLUMNS, records(counts, "family")), name="kernel")]
 
     def _profiled(self, family: str) -> xr.Dataset:
         """Profile one launch.

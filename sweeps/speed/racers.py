@@ -75,11 +75,8 @@ def rollout(task: Task) -> Racer:
         warmstart = np.zeros((worlds, model.nv))
         for _ in range(periods):
             state[:, 1 + nq :][:, BASE] = [SPEED, 0.0, 0.0]
-            states = np.asarray(
-                pool.rollout(
-                    model, datas, state, nstep=substeps, initial_warmstart=warmstart
-                )[0]
-            )  # fmt: skip
+            how = {"nstep": substeps, "initial_warmstart": warmstart}
+            states = np.asarray(pool.rollout(model, datas, state, **how)[0])
             velocity_change = states[:, -1, 1 + nq :] - states[:, -2, 1 + nq :]
             state, warmstart = states[:, -1], velocity_change / model.opt.timestep
         return state[:, 1:][:, OBJECT]
@@ -106,10 +103,7 @@ def single(task: Task) -> Racer:
     words = [sys.executable, __file__, "trial", str(task.scene.parent), str(task.seconds)]
 
     def trial(index: int) -> list[float]:
-        process = subprocess.run(
-            [*words, str(index)], stdout=subprocess.PIPE, text=True, check=True
-        )  # fmt: skip
-        return json.loads(process.stdout)
+        return json.loads(subprocess.check_output([*words, str(index)], text=True))
 
     def go() -> np.ndarray:
         from multiprocessing.pool import ThreadPool
@@ -176,10 +170,8 @@ def with_law(task: Task) -> Racer:
 
     from sweeps import programs
 
-    program = programs.traced(
-        "fused", programs.BATCHED["fused standard"], "box", len(task.qpos),
-        simulated=task.seconds, donated=False,
-    )()  # fmt: skip
+    setting, how = programs.BATCHED["fused standard"], {"simulated": task.seconds}
+    program = programs.traced("fused", setting, "box", len(task.qpos), donated=False, **how)()
 
     def go() -> np.ndarray:
         jax.block_until_ready(program.go(program.start))
@@ -238,9 +230,8 @@ def mujoco_warp(task: Task) -> Racer:
     host, worlds = _model(task), len(task.qpos)
     model = mjw.put_model(host)
     model.opt.warn_overflow = False
-    data = mjw.put_data(
-        host, mujoco.MjData(host), nworld=worlds, nconmax=CONTACTS, njmax=ROWS
-    )  # fmt: skip
+    sizes = {"nworld": worlds, "nconmax": CONTACTS, "njmax": ROWS}
+    data = mjw.put_data(host, mujoco.MjData(host), **sizes)
     command = _commanded()
     start = wp.array(task.qpos.astype(np.float32), dtype=float)
 
@@ -354,12 +345,8 @@ def race(name: str, folder: Path, seconds: float, count: int) -> None:
         poses = racer.go()
         times.append(time.perf_counter() - start)
     rate, count_poses = racer.worlds * seconds / min(times), min(len(starts), racer.worlds)
-    _say(
-        worlds=racer.worlds,
-        rate=rate,
-        version=_version(package),
-        poses=poses[:count_poses].tolist(),
-    )
+    final = poses[:count_poses].tolist()
+    _say(worlds=racer.worlds, rate=rate, version=_version(package), poses=final)
 
 
 if __name__ == "__main__":

@@ -10,30 +10,34 @@ from __future__ import annotations
 import re
 import subprocess
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import xarray as xr
 
-from rps_jax.analysis.report import Section
 from rps_jax.errors import InputError
 from rps_jax.record.options import option
 from rps_jax.runs.question import Run, call_of
-from rps_jax.trials.progress import Progress
-from sweeps.study_base import Study, Table
+from sweeps.study_base import Study, Table, records, text_table
 
 _ROOT = Path(__file__).parents[2]
 _EXAMPLE = "notebooks/examples/on_a_robot.py"
 PRINTED = re.compile(r"median (\d+) us, 99.9th percentile (\d+) us, worst (\d+) us; ([\d.]+)%")
 _VARIABLES = {
-    "median": ("us", "median time of a step"),
-    "slow": ("us", "99.9th percentile of the times"),
-    "worst": ("us", "longest time of a step"),
-    "late": ("%", "share of the steps that were longer than their period"),
+    "median": {"units": "us", "long_name": "median time of a step"},
+    "slow": {"units": "us", "long_name": "99.9th percentile of the times"},
+    "worst": {"units": "us", "long_name": "longest time of a step"},
+    "late": {"units": "%", "long_name": "share of the steps that were longer than their period"},
 }
-_COLUMNS = ("run", "median", "99.9th percentile", "worst", "steps of more than 1 ms")
+_COLUMNS = {
+    "run": "{number}",
+    "median": "{median:.0f} µs",
+    "99.9th percentile": "{slow:.1f} ms",
+    "worst": "{worst:.1f} ms",
+    "steps of more than 1 ms": "{late} %",
+}
 
 
 @dataclass(frozen=True)
@@ -44,6 +48,7 @@ class OnARobot(Study[xr.Dataset]):
     """
 
     TITLE: ClassVar[str] = "Time of a step on a robot"
+    DIMENSION: ClassVar[str] = "run"
     GROWS: ClassVar[tuple[str, ...]] = ("runs", "core")
     RESULTS: ClassVar[str] = "../results"
 
@@ -54,22 +59,16 @@ class OnARobot(Study[xr.Dataset]):
     core: int = option(0, 0, 4095)
     """Processor core of the process."""
 
-    def num_trials(self) -> int | None:
-        """Return the number of runs."""
-        return self.runs
+    def parts(self, run: Run) -> Mapping[int, Callable[[], xr.Dataset]]:
+        """Return the function that times each run."""
+        return dict.fromkeys(range(self.runs), self._timed)
 
-    def answer(self, run: Run) -> xr.Dataset:
-        """Time the runs that are missing."""
-        parts = []
-        for i in range(self.runs):
-            parts.append(run.checkpoint(f"run_{i}", self._timed))
-            run.callback(Progress(i + 1, 0.0))
-        results: Any = xr.concat(parts, "run")
-        return results
-
-    def published_tables(self, results: xr.Dataset) -> Mapping[str, Table]:
+    def report_tables(self, results: xr.Dataset) -> Sequence[Table]:
         """Return the times of each run."""
-        return {"robot": Table([_COLUMNS, *table(results)])}
+        shown = results.assign(
+            number=results.run + 1, slow=results.slow / 1000, worst=results.worst / 1000
+        )
+        return [Table(text_table(_COLUMNS, records(shown, "run")), name="robot", title="Steps")]
 
     def _timed(self) -> xr.Dataset:
         """Return the times that one run prints.
@@ -86,26 +85,7 @@ class OnARobot(Study[xr.Dataset]):
             last = process.stderr.strip().splitlines()[-1:]
             raise InputError(f"core = {self.core} is not allowed here: {' '.join(last)}")
         values = zip(_VARIABLES.items(), match.groups(), strict=True)
-        return xr.Dataset(
-            {
-                name: ((), float(value), {"units": unit, "long_name": arguments})
-                for (name, (unit, arguments)), value in values
-            }
-        )
-
-    def report(self, results: xr.Dataset, run: Run) -> Sequence[Section]:
-        """Return a section with the times of each run."""
-        return [Section("Steps", "", [list(_COLUMNS), *table(results)])]
+        return xr.Dataset({name: ((), float(value), about) for (name, about), value in values})
 
 
 on_a_robot = call_of(OnARobot)
-
-
-def table(results: xr.Dataset) -> list[list[str]]:
-    """Return one row per run."""
-    rows = []
-    for i in range(results.sizes["run"]):
-        times = {name: float(results[name][i]) for name in _VARIABLES}
-        slow, worst = (f"{times[name] / 1000:.1f} ms" for name in ("slow", "worst"))
-        rows.append([str(i + 1), f"{times['median']:.0f} µs", slow, worst, f"{times['late']} %"])
-    return rows

@@ -7,8 +7,6 @@
 
 from __future__ import annotations
 
-import dataclasses
-import re
 import time
 from collections import deque
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
@@ -24,13 +22,12 @@ import xarray as xr
 
 from rps_jax import engines, errors
 from rps_jax.analysis.figures.style import Figure, words
-from rps_jax.analysis.report import Picture, Section
+from rps_jax.analysis.report import Picture
 from rps_jax.engines import device
 from rps_jax.record.options import option
 from rps_jax.runs.evaluate import stack
 from rps_jax.runs.question import Run, call_of
 from rps_jax.trials import host
-from rps_jax.trials.progress import Progress
 from rps_jax.trials.rollout import Candidates, outcomes
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import ControlLoop, Rules
@@ -39,7 +36,16 @@ from rps_jax.world.physics import preset
 from rps_jax.world.scene import JOINTS
 from sweeps import programs
 from sweeps.programs import BATCHED, FAMILIES, Program
-from sweeps.study_base import Study
+from sweeps.study_base import (
+    Rows,
+    SpeedStudy,
+    Table,
+    part_name,
+    records,
+    run_parts,
+    stored_parts,
+    text_table,
+)
 
 _SPEED = 0.05  # [m/s] of a push in C MuJoCo without a law
 _SLOW = ("mjx",)  # engines whose batches are bounded
@@ -53,8 +59,7 @@ IN_C = {
 NAMES = (*BATCHED, *IN_C)
 
 
-@dataclass(frozen=True)
-class Measurement:
+class Measurement(NamedTuple):
     """Speed of one program."""
 
     name: str
@@ -70,14 +75,15 @@ class Measurement:
 
 
 @dataclass(frozen=True)
-class Speed(Study[xr.Dataset]):
+class Speed(SpeedStudy[xr.Dataset]):
     """Measure the speed of each engine on this machine, by shape family and batch size.
 
     The results hold simulated seconds per second of wall clock, `rate` [1], of each measurement.
     """
 
     TITLE: ClassVar[str] = "Speed"
-    QUICK: ClassVar[Mapping[str, Any]] = {
+    CHOICES: ClassVar = {"names": NAMES, "families": FAMILIES}
+    QUICK: ClassVar[Mapping[str, object]] = {
         "names": ("C in closed loop", "fused standard", "quasistatic"),
         "families": ("box",),
         "worlds": (64,),
@@ -113,10 +119,7 @@ class Speed(Study[xr.Dataset]):
 
     def check(self) -> None:
         """Check the names, and that there is a measurement."""
-        for name in self.names:
-            errors.check_name("name", name, NAMES)
-        for family in self.families:
-            errors.check_name("family", family, FAMILIES)
+        super().check()
         if not self.entries:
             raise errors.InputError(
                 f"names = {self.names} with worlds = {self.worlds} leave nothing to time: MJX "
@@ -129,58 +132,33 @@ class Speed(Study[xr.Dataset]):
 
     def answer(self, run: Run) -> xr.Dataset:
         """Make the measurements that are missing."""
-        if self.refill:
-            run.checkpoint("refilling", partial(_gain, self.refill, self.rounds))
-        missing = [
-            w
-            for w in self.entries
-            if run.checkpoints is None or run.checkpoints.get(_part(w)) is None
-        ]
-        done = len(self.entries) - len(missing)
+        stored, by_part = stored_parts(run), {part_name(*entry): entry for entry in self.entries}
+        missing = [entry for name, entry in by_part.items() if name not in stored]
         measurements = _measured(missing, self.at_once)
-        parts = []
-        for entry in self.entries:
-            parts.append(run.checkpoint(_part(entry), lambda: _labelled(next(measurements))))
-            done += entry in missing
-            run.callback(Progress(done, 0.0))
-        results: Any = xr.concat(parts, "measurement")
-        return results.drop_attrs()
+        parts = dict.fromkeys(by_part, lambda: xr.Dataset(next(measurements)._asdict()))
+        if not self.refill:
+            return run_parts(run, "measurement", parts)
+        gain = run.checkpoint("refilling", partial(refilling, self.refill, self.rounds))
+        return run_parts(run, "measurement", parts).merge(gain)
 
-    def intro(self, results: xr.Dataset) -> str:
-        """Return the device of the measurement."""
-        return programs.machine()
-
-    def report(self, results: xr.Dataset, run: Run) -> Sequence[Section]:
-        """Return sections with speeds beside C MuJoCo, and with the gain of refilled slots."""
-        names = [field.name for field in dataclasses.fields(Measurement)]
-        speeds = [
-            Measurement(**{name: row[name].item() for name in names})
-            for row in (results.isel(measurement=i) for i in range(results.sizes["measurement"]))
-        ]
-        points = [(s.family, s.name, s.worlds, s.rate) for s in speeds]
+    def report_tables(self, results: xr.Dataset) -> Sequence[Table]:
+        """Return speeds beside C MuJoCo, and the gain of refilled slots."""
+        fields = ("family", "name", "worlds", "rate")
+        points = [tuple(map(row.get, fields)) for row in records(results, "measurement")]
         picture = Picture("throughput", partial(throughput, points, tuple(IN_C)))
-        sections = [Section("Simulated seconds in a second", "", table(speeds), picture)]
-        if self.refill and run.checkpoints is not None:
-            gain = run.checkpoint("refilling", partial(_gain, self.refill, self.rounds))
-            sections.append(
-                Section("Refilled slots", _gain_sentence(gain, self.refill, self.rounds))
+        tables = [Table(table(results), title="Simulated seconds in a second", picture=picture)]
+        if "refilled" in results:
+            refilled, waiting = float(results.refilled), float(results.waiting)
+            text = (
+                f"{self.refill} slots a worker and {self.rounds} trials in each: {refilled:,.0f} "
+                f"simulated s/s, {float(results.trials):,.1f} trials/s; batches that wait for "
+                f"their slowest: {waiting:,.0f}; gain {refilled / waiting:.2f}."
             )
-        return sections
+            tables.append(Table((), title="Refilled slots", text=text))
+        return tables
 
 
 speed = call_of(Speed)
-
-
-def _part(entry: tuple[str, str, int]) -> str:
-    """Return the name of a measurement's part of the run folder."""
-    name, family, worlds = entry
-    return "_".join([re.sub(r"\W+", "_", name), family, str(worlds)])
-
-
-def _labelled(measurement: Measurement) -> xr.Dataset:
-    return xr.Dataset(
-        {name: ((), value) for name, value in dataclasses.asdict(measurement).items()}
-    )
 
 
 def _measured(entries: Sequence[tuple[str, str, int]], at_once: int) -> Iterator[Measurement]:
@@ -191,19 +169,6 @@ def _measured(entries: Sequence[tuple[str, str, int]], at_once: int) -> Iterator
     calls = [partial(programs.traced, n, BATCHED[n], *rest) for n, *rest in batched_]
     for program in programs.side_by_side(calls, at_once):
         yield batched(program)
-
-
-def _gain(slots: int, rounds: int) -> xr.Dataset:
-    return xr.Dataset({k: ((), v) for k, v in refilling(slots, rounds)._asdict().items()})
-
-
-def _gain_sentence(gain: xr.Dataset, slots: int, rounds: int) -> str:
-    refilled, waiting = float(gain.refilled), float(gain.waiting)
-    return (
-        f"{slots} slots a worker and {rounds} trials in each: {refilled:,.0f} simulated s/s, "
-        f"{float(gain.trials):,.1f} trials/s; batches that wait for their slowest: {waiting:,.0f}; "
-        f"gain {refilled / waiting:.2f}."
-    )
 
 
 def _best(action: Callable[[], Any], goes: int = 4, limit: float = 5.0) -> float:
@@ -267,26 +232,19 @@ def in_c(name: str, family: str, simulated: float = 2.0) -> Measurement:
     return Measurement(name, family, worlds, 0.0, rate, np.nan, contacts, *solver)
 
 
-class Refilling(NamedTuple):
-    """Gain of refilling the slots of finished trials."""
-
-    refilled: float  # simulated s per s of wall clock
-    waiting: float  # simulated s per s of batches that wait for their slowest trial
-    trials: float  # per s of wall clock, refilled
-
-
-def refilling(slots: int, rounds: int = 4) -> Refilling:
+def refilling(slots: int, rounds: int = 4) -> xr.Dataset:
     """Time trials of RPS with refilled slots, and in batches that wait for their slowest trial.
 
     Both run the same random boxes of the domain `wide`, `rounds` per slot.
+
+    Returns:
+      Simulated s per s of wall clock, `refilled` and of batches that wait, `waiting`; and `trials`
+      per s, refilled.
     """
     setting = BATCHED["fused standard"]
     boxes = replace(DOMAINS["wide"], objects=("random_box",))
-    count = (
-        slots
-        * engines.get(setting.engine).workers(jax.default_backend())
-        * len(jax.local_devices())
-    )
+    workers = engines.get(setting.engine).workers(jax.default_backend())
+    count = slots * workers * len(jax.local_devices())
 
     def timed(groups: np.ndarray) -> tuple[float, float]:
         timings = []
@@ -299,23 +257,32 @@ def refilling(slots: int, rounds: int = 4) -> Refilling:
     indices = np.arange(rounds * count)
     timed(indices[None, :count])  # compiles
     refilled, trials = timed(indices[None])
-    return Refilling(refilled, timed(indices.reshape(rounds, count))[0], trials)
+    waiting, _ = timed(indices.reshape(rounds, count))
+    return xr.Dataset({"refilled": refilled, "waiting": waiting, "trials": trials})
 
 
-def table(speeds: list[Measurement]) -> list[list[str]]:
+_COLUMNS = {
+    "what": "{name}",
+    "family": "{family}",
+    "worlds": "{worlds}",
+    "dt": "{dt:g} ms",
+    "iterations": "{iterations}/{ls_iterations}",
+    "contacts": "{contacts}",
+    "compile": "{compile:.1f} s",
+    "simulated s/s": "{rate:,.0f}",
+    "against C in closed loop": "{ratio:.3g}",
+    "memory": "{memory:,.1f} MiB",
+}
+
+
+def table(results: xr.Dataset) -> Rows:
     """Return a header and one row per measurement, compared with C MuJoCo in closed loop."""
-    base = {s.family: s.rate for s in speeds if s.name == "C in closed loop"}
-    rows = [["what", "family", "worlds", "dt", "iterations", "contacts", "compile", "simulated s/s",
-             "against C in closed loop", "memory"]]  # fmt: skip
-    for s in speeds:
-        memory = "" if np.isnan(s.memory) else f"{s.memory / 2**20:,.1f} MiB"
-        ratio = f"{s.rate / base[s.family]:.3g}" if s.family in base else ""
-        solver = f"{s.iterations}/{s.ls_iterations}"
-        rows.append(
-            [s.name, s.family, f"{s.worlds}", f"{1000 * s.timestep:g} ms", solver,
-             f"{s.contacts}", f"{s.compile:.1f} s", f"{s.rate:,.0f}", ratio, memory]
-        )  # fmt: skip
-    return rows
+    rows = list(records(results, "measurement"))
+    base = {row["family"]: row["rate"] for row in rows if row["name"] == "C in closed loop"}
+    for row in rows:
+        row["dt"], row["memory"] = 1000 * row["timestep"], row["memory"] / 2**20
+        row["ratio"] = row["rate"] / base.get(row["family"], np.nan)
+    return text_table(_COLUMNS, rows)
 
 
 def throughput(speeds: Iterable[tuple[str, str, int, float]], steady: Collection[str]) -> Figure:
