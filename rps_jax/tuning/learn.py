@@ -5,7 +5,7 @@
 
 import functools
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, field, fields, replace
 from functools import partial
@@ -35,7 +35,7 @@ from rps_jax.trials.env import SHAPED_REWARD, PushEnv
 from rps_jax.trials.progress import Bar, Progress, ProgressCallback
 from rps_jax.trials.results import labelled
 from rps_jax.trials.setting import Setting
-from rps_jax.trials.trial import Rules, World
+from rps_jax.trials.trial import Rules
 from rps_jax.tuning import rollout
 from rps_jax.tuning.ppo import PPO
 from rps_jax.tuning.rollout import RunnerState
@@ -45,7 +45,6 @@ from rps_jax.world.domain import Domain, DomainLike
 _CHECKPOINT = "learner"
 _VALIDATION_RATIO = 10  # learning time between two validations, as a multiple of their time
 Metrics = dict[str, float]  # results of an update, by name
-Tables = list[World]  # worlds of each environment, leaves (worlds, ...)
 
 UNITS = {
     "time": ("s", "wall clock since the start of the run, with compilation"),
@@ -201,39 +200,34 @@ class _Learner:
     """State of a learning run, with its compiled programs and its checkpoints."""
 
     def __init__(self, folder: Path, options: Learn, callback: ProgressCallback):
+        """Compile all programs concurrently, and start or resume the run."""
         self.folder, self.options, self.callback = folder, options, callback
         self._start_time = time.perf_counter()  # [s]
-        self._envs = options.environments()
-        self._validation_envs = options.environments("validate")
-        self._tables = [env.table for env in self._envs]
-        self.network = rollout.network_of(options, self._envs)
-        start = self._compile()
-        # A copy: no two leaves may share memory, which updates write to.
-        self.runner: RunnerState = jax.tree.map(jnp.copy, start(self._tables))
-        self.best = jax.device_get(self.runner.train.ema)
-        self.best_rate, self.curve = -1.0, list[Metrics]()
-        self._restore()
-
-    def _compile(self) -> Callable[[Tables], RunnerState]:
-        """Compile all programs concurrently; return the one that starts the run."""
-        start_time, envs, options = time.perf_counter(), self._envs, self.options
-        tables = self._tables
-        self._validation_tables = [env.table for env in self._validation_envs]
-        start = partial(rollout.start, options, self.network, envs, seed=options.setting.seed)
-        update = partial(rollout.update, options, self.network, envs)
-        evaluate = partial(rollout.evaluate_policy, self.network, self._validation_envs)
-        runner = jax.eval_shape(start, tables)
+        envs, validation_envs = (options.environments(split) for split in ("tune", "validate"))
+        self._num_worlds = options.num_envs * len(envs)
+        self._tables = tables = [env.table for env in envs]
+        self.network = network = rollout.network_of(options, envs)
+        compile_start = time.perf_counter()
+        self._validation_tables = [env.table for env in validation_envs]
+        start = partial(rollout.start, options, network, envs, seed=options.setting.seed)
+        update = partial(rollout.update, options, network, envs)
+        evaluate = partial(rollout.evaluate_policy, network, validation_envs)
+        shapes = jax.eval_shape(start, tables)
         programs = (
-            (jax.jit(update, donate_argnums=1), tables, runner),
-            (jax.jit(evaluate), self._validation_tables, runner.train.ema),
+            (jax.jit(update, donate_argnums=1), tables, shapes),
+            (jax.jit(evaluate), self._validation_tables, shapes.train.ema),
             (jax.jit(start), tables),
         )
         with ThreadPoolExecutor(3) as pool:
             self._update, self._evaluate, compiled_start = pool.map(
                 lambda program: program[0].lower(*program[1:]).compile(), programs
             )
-        self.compile = time.perf_counter() - start_time
-        return compiled_start
+        self.compile = time.perf_counter() - compile_start
+        # A copy: no two leaves may share memory, which updates write to.
+        self.runner: RunnerState = jax.tree.map(jnp.copy, compiled_start(tables))
+        self.best = jax.device_get(self.runner.train.ema)
+        self.best_rate, self.curve = -1.0, list[Metrics]()
+        self._restore()
 
     @property
     def elapsed(self) -> float:
@@ -264,7 +258,7 @@ class _Learner:
     def _record(self, metrics: Metrics) -> None:
         """Add an update to the curve, and report the progress."""
         options, ended = self.options, metrics["ended"] or float("nan")
-        steps = options.num_envs * len(self._envs) * options.num_steps
+        steps = self._num_worlds * options.num_steps
         simulated = self.curve[-1]["simulated"] if self.curve else 0.0
         metrics["success"] = metrics["succeeded"] / ended
         metrics["earned"] /= ended
