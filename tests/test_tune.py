@@ -145,22 +145,20 @@ def rosenbrock(x):
 
 
 def search(size=4, **options):
-    """Return an evolution about the paper's parameters."""
-    first = TuneES("rps", tuned=SUBSETS["full"][:size], **options).tuner
-    first.start()
-    return first
+    """Return an evolution about the paper's parameters, and its first proposal."""
+    question = TuneES("rps", tuned=SUBSETS["full"][:size], **options)
+    first = question.search()
+    return question, first, next(first)
 
 
 class TestEvolution:
     def minimise(self, function, generations, bad=0, **options):
         """Return the least value of every generation; the first `bad` candidates have none."""
-        first, result = search(**options), []
+        (_, first, proposal), result = search(**options), []
         for _ in range(generations):
-            candidates = first.propose()
-            values = function(candidates)
+            values = function(proposal["vectors"])
             values[:bad] = np.nan
-            results = {"vectors": candidates, "values": values, "center": first.mean}
-            first.update(results | {"validation": np.inf})
+            proposal = first.send(proposal | {"values": values})
             result.append(np.nanmin(values))
         return np.array(result)
 
@@ -175,30 +173,21 @@ class TestEvolution:
 
     def test_a_search_continues_after_a_generation_without_finite_values(self):
         assert np.isfinite(self.minimise(sphere, 3, bad=7, population=8)).all()
-        first = search(population=8)
-        results = {"values": np.full(8, np.nan), "center": first.mean, "validation": np.nan}
-        first.update(results | {"vectors": first.propose()})
-        assert np.isfinite(first.propose()).all()
+        _, first, proposal = search(population=8)
+        assert np.isfinite(first.send(proposal | {"values": np.full(8, np.nan)})["vectors"]).all()
 
     def test_the_seed_makes_the_proposals(self):
         first, same, second = (
-            search(population=8, setting=Setting(seed=seed)).propose() for seed in (0, 0, 1)
+            search(population=8, setting=Setting(seed=seed))[2]["vectors"] for seed in (0, 0, 1)
         )
         np.testing.assert_array_equal(first, same)
         assert (first != second).all()
 
     def test_the_first_generation_spreads_about_the_start(self):
-        first = search(population=4000, spread=0.3)
-        away = first.propose() - first.base
+        question, _, proposal = search(population=4000, spread=0.3)
+        away = proposal["vectors"] - question.base
         np.testing.assert_allclose(away.std(axis=0), 0.3, rtol=0.05)
         np.testing.assert_allclose(away.mean(axis=0), 0.0, atol=0.02)
-
-    def test_a_search_keeps_the_best(self):
-        first = search(population=8)
-        for value in (1.0, 2.0, 3.0):
-            results = {"values": np.zeros(8), "center": np.full(4, value), "validation": value}
-            first.update(results | {"vectors": first.propose()})
-        assert first.best.tolist() == [1.0] * 4
 
     def test_bad_options_are_refused(self):
         for bad in ({"population": 3}, {"spread": 0.0}, {"generations": 0}, {"prior": -1.0}):
@@ -212,7 +201,7 @@ class TestEvolution:
         assert TuneES("pursuit", quick=True).with_quick_values().tuned == ("full",)
 
     def test_one_parameter_is_enough(self):
-        assert np.isfinite(search(1).propose()).all()
+        assert np.isfinite(search(1)[2]["vectors"]).all()
 
 
 # --- runs ----------------------------------------------------------------------------------
@@ -232,20 +221,17 @@ SMALL = {"tuned": ("L", "K_h"), "worlds": 4, "validation": 4}
 
 
 def evolution(generations=6, **options):
-    return TuneES("rps", population=8, generations=generations, **SMALL, **options).tuner
+    return TuneES("rps", population=8, **SMALL, **options), generations
 
 
 def descents(generations=6):
     """Return descents by antithetic steps; worlds need no derivatives."""
-    calls = TuneGrad("rps", estimator="evolution", steps=5, starts=2, pairs=3, **SMALL)
-    tuner = calls.tuner
-    tuner.generations = generations
-    return tuner
+    options = {"estimator": "evolution", "steps": 5, "starts": 2, "pairs": 3}
+    return TuneGrad("rps", **options, **SMALL), generations
 
 
-def tuned(folder, tuner):
-    run.tune(Run(folder, no_progress), tuner)
-    return tuner.best.tolist()
+def tuned(folder, search):
+    return run.tune(Run(folder, no_progress), *search).tuned.values.tolist()
 
 
 @pytest.fixture
@@ -309,12 +295,14 @@ class TestRuns:
 
     def test_the_curve_is_a_table_that_grows_with_the_run(self, tmp_path, pretended):
         for done in (2, 6):
-            results = run.tune(Run(tmp_path, no_progress), evolution(done))
+            results = run.tune(Run(tmp_path, no_progress), *evolution(done))
             curve = read_curve(tmp_path)
             assert curve.index.tolist() == list(range(done))
             for name in ("validation_success", "simulated"):
                 assert curve[name].tolist() == results[name].values.tolist()
             assert curve["params.K_h"].tolist() == results.params.values[:, 1].tolist()
+            best = results.params.isel(generation=results.validation.argmin())
+            np.testing.assert_allclose(results.tuned, best, rtol=1e-5)
 
     def test_a_search_ends_with_its_budget_and_resumes_with_more(self, tmp_path, pretended):
         for budget, done in ((2.5, 3), (4.0, 4), (0.0, 6)):  # 1 s a generation

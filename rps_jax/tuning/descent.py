@@ -30,7 +30,7 @@ from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import ControlLoop, Snapshot, Trial, World, control_step, start_all
 from rps_jax.tuning import gradients
 from rps_jax.tuning.gradients import Estimate
-from rps_jax.tuning.run import Results, ScoreCandidates, Tuner, Tuning
+from rps_jax.tuning.run import Results, ScoreCandidates, Search, Tuning
 from rps_jax.world.physics import preset
 
 Estimator = Literal["reverse", "evolution"]
@@ -55,6 +55,9 @@ class TuneGrad(Tuning):
       {'generation': 2, 'parameter': 1}
     """
 
+    DIMS: ClassVar[dict[str, tuple[str, ...]]] = Tuning.DIMS | {
+        "validations": ("candidate",), "gradients": ("candidate", "parameter"),
+    }  # fmt: skip
     QUICK: ClassVar[dict[str, Any]] = Tuning.QUICK | {
         "steps": 8, "starts": 1, "learning_rate": 0.3,
     }  # fmt: skip
@@ -93,9 +96,68 @@ class TuneGrad(Tuning):
     pairs: int = option(8, 1, 1_000_000)
     """Number of antithetic pairs for each descent."""
 
-    @functools.cached_property
-    def tuner(self) -> DescentTuner:
-        return DescentTuner(self)
+    @property
+    def num_generations(self) -> int:
+        return self.steps + 1
+
+    def check(self) -> None:
+        """Check the common options, and that the law has derivatives if they are needed."""
+        super().check()
+        if self.estimator != "evolution":
+            registry.smooth_law(registry.law_of(self.params))
+
+    def search(self) -> Search:
+        """Search by concurrent gradient descents, from the start and random vectors near it.
+
+        The value `base` is the validation of the start.
+        """
+        start, key = self.space.vector(self.space.base), jax.random.key(self.setting.seed)
+        offsets = jax.random.normal(key, (self.starts, start.size), start.dtype).at[0].set(0.0)
+        thetas = start + self.spread * offsets  # (S, p)
+        state, base = jax.vmap(self.rule.init)(thetas), np.array(np.nan)
+        while True:
+            results = yield {"vectors": np.asarray(thetas), "base": base}
+            base, gradient = results["base"], jnp.asarray(results["gradients"])
+            thetas = jnp.asarray(results["vectors"])
+            changes, state = jax.vmap(self.rule.update)(gradient, state, thetas)
+            thetas = jnp.asarray(optax.apply_updates(thetas, changes))
+
+    def judge(
+        self, proposal: Mapping[str, np.ndarray], generation: int, score_candidates: ScoreCandidates
+    ) -> Results:
+        """Validate all vectors (S, p) and estimate their gradients: NaN after the last step."""
+        vectors = proposal["vectors"]
+        (answer,) = score_candidates([self.validation_candidates(self.space.params(vectors))])
+        values = self.objective.value(answer.score)
+        first = int(jnp.nanargmin(values))
+        results = {
+            "validations": values,
+            "center": vectors[first],
+            "validation": values[first],
+            "validation_success": answer.outcome.success[first].mean(),
+            "mean": jnp.nanmean(values),
+            "spread": jnp.nanstd(values),
+            "best": values[first],
+            "base": proposal["base"] if generation else values[0],
+        }
+        if generation == self.steps:
+            names = ("gradient", "gradient_error", "finite", "differentiate")
+            return results | dict.fromkeys(names, np.nan) | {"gradients": 0 * vectors + np.nan}
+        thetas, simulated, wall = jnp.asarray(vectors), 0.0, 0.0
+        if self.estimator == "evolution":
+            estimate = evolution_gradients(thetas, self, generation, score_candidates)
+        else:
+            start_time = time.perf_counter()
+            estimate, simulated = jax.block_until_ready(window_gradients(thetas, self, generation))
+            wall = time.perf_counter() - start_time
+        return results | {
+            "gradients": estimate.gradient,
+            "gradient": jnp.linalg.norm(estimate.gradient, axis=1).mean(),
+            "gradient_error": jnp.sqrt(jnp.sum(estimate.variance, axis=1)).mean(),
+            "finite": estimate.finite.mean(),
+            "simulated": simulated,
+            "differentiate": wall,
+        }
 
     @functools.cached_property
     def family_gradients(self) -> Callable[..., Estimate]:
@@ -237,86 +299,3 @@ def evolution_gradients(
     values = options.objective.value(answer.score).reshape(count, 2, options.pairs)
     slopes = (values[:, 0] - values[:, 1])[..., None] * steps / (2 * options.sigma)
     return jax.vmap(gradients.estimate)(slopes)
-
-
-# --- the descent ---------------------------------------------------------------------------
-
-
-class DescentTuner(Tuner):
-    """Search by several concurrent gradient descents.
-
-    Before every step all descents are tried in the worlds for validation.
-    """
-
-    DIMS: ClassVar = {"validations": ("candidate",), "gradients": ("candidate", "parameter")}
-
-    def __init__(self, descent: TuneGrad):
-        """Raise InputError if the law has no derivatives and the estimator needs them."""
-        super().__init__(descent, descent.steps + 1)
-        self.descent = descent
-        if descent.estimator != "evolution":
-            registry.smooth_law(registry.law_of(self.space.base))
-
-    def start(self) -> None:
-        """Start at the base parameters of the space, and at random vectors near them."""
-        super().start()
-        descent, base = self.descent, self.space.vector(self.space.base)
-        key = jax.random.key(descent.setting.seed)
-        offsets = jax.random.normal(key, (descent.starts, base.size), base.dtype).at[0].set(0.0)
-        self.thetas = base + descent.spread * offsets  # (S, p)
-        self._base_value: float | None = None  # validation of the base parameters
-        self._state = jax.vmap(descent.rule.init)(self.thetas)
-
-    def propose(self) -> np.ndarray:
-        return np.asarray(self.thetas)
-
-    def judge(
-        self, vectors: np.ndarray, generation: int, score_candidates: ScoreCandidates
-    ) -> Results:
-        """Validate all vectors (S, p) and estimate their gradients: NaN after the last step."""
-        (answer,) = score_candidates(
-            [self.descent.validation_candidates(self.space.params(vectors))]
-        )
-        values = self.descent.objective.value(answer.score)
-        first = int(jnp.nanargmin(values))
-        results = {
-            "validations": values,
-            "params": vectors[first],
-            "validation": values[first],
-            "validation_success": answer.outcome.success[first].mean(),
-            "mean": jnp.nanmean(values),
-            "spread": jnp.nanstd(values),
-            "best": values[first],
-            "base": values[0] if self._base_value is None else self._base_value,
-        }
-        if generation == self.descent.steps:
-            names = ("gradient", "gradient_error", "finite", "differentiate")
-            return results | dict.fromkeys(names, np.nan) | {"gradients": 0 * vectors + np.nan}
-        thetas, simulated, wall = jnp.asarray(vectors), 0.0, 0.0
-        if self.descent.estimator == "evolution":
-            estimate = evolution_gradients(thetas, self.descent, generation, score_candidates)
-        else:
-            start_time = time.perf_counter()
-            estimate, simulated = jax.block_until_ready(
-                window_gradients(thetas, self.descent, generation)
-            )
-            wall = time.perf_counter() - start_time
-        return results | {
-            "gradients": estimate.gradient,
-            "gradient": jnp.linalg.norm(estimate.gradient, axis=1).mean(),
-            "gradient_error": jnp.sqrt(jnp.sum(estimate.variance, axis=1)).mean(),
-            "finite": estimate.finite.mean(),
-            "simulated": simulated,
-            "differentiate": wall,
-        }
-
-    def update(self, results: Mapping[str, np.ndarray]) -> None:
-        """Record the best validation, and make a step along the gradients."""
-        vectors, values = results["vectors"], results["validations"]
-        first = int(np.nanargmin(values))
-        if self._base_value is None:
-            self._base_value = float(values[0])
-        self.record_best(vectors[first], float(values[first]))
-        thetas, gradient = jnp.asarray(vectors), jnp.asarray(results["gradients"])
-        changes, self._state = jax.vmap(self.descent.rule.update)(gradient, self._state, thetas)
-        self.thetas = jnp.asarray(optax.apply_updates(thetas, changes))

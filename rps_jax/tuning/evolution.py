@@ -5,7 +5,6 @@ All candidates of a generation meet the same worlds; every generation has other 
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar
@@ -15,7 +14,7 @@ import numpy as np
 
 from rps_jax.record.options import option
 from rps_jax.runs.question import call_of
-from rps_jax.tuning.run import Results, ScoreCandidates, Tuner, Tuning
+from rps_jax.tuning.run import Results, ScoreCandidates, Search, Tuning
 
 
 @dataclass(frozen=True)
@@ -36,6 +35,7 @@ class TuneES(Tuning):
       {'generation': 1, 'parameter': 2}
     """
 
+    DIMS: ClassVar[dict[str, tuple[str, ...]]] = Tuning.DIMS | {"values": ("candidate",)}
     QUICK: ClassVar[dict[str, Any]] = Tuning.QUICK | {
         "worlds": 32, "population": 12, "generations": 8, "spread": 1.0,
     }  # fmt: skip
@@ -51,56 +51,41 @@ class TuneES(Tuning):
     """Cost of a mean squared distance of 1 between the vectors of a candidate and of the start
     [1]; it keeps the search where the bounded map is steep."""
 
-    @functools.cached_property
-    def tuner(self) -> EvolutionTuner:
-        return EvolutionTuner(self)
-
-
-tune_es = call_of(TuneES)
-
-
-class EvolutionTuner(Tuner):
-    """Search by CMA-ES of the package cmaes."""
-
-    DIMS: ClassVar = {"values": ("candidate",), "center": ("parameter",)}
-
-    def __init__(self, evolution: TuneES):
-        super().__init__(evolution, evolution.generations)
-        self.evolution = evolution
-
-    def start(self) -> None:
-        super().start()
-        seed = np.random.SeedSequence((self.seed, 0)).generate_state(1)[0]
-        population, spread = self.evolution.population, self.evolution.spread
-        self._strategy = cmaes.CMA(self.base, spread, population_size=population, seed=int(seed))
-
     @property
-    def mean(self) -> np.ndarray:
-        """Mean (p,) of the distribution of candidates."""
-        return self._strategy.mean.copy()
+    def num_generations(self) -> int:
+        return self.generations
 
-    def propose(self) -> np.ndarray:
-        return np.stack([self._strategy.ask() for _ in range(self.evolution.population)])
+    def search(self) -> Search:
+        """Search by CMA-ES of the package cmaes; `center` is the mean of the candidates."""
+        seed = np.random.SeedSequence((self.setting.seed, 0)).generate_state(1)[0]
+        strategy = cmaes.CMA(
+            self.base, self.spread, population_size=self.population, seed=int(seed)
+        )
+        while True:
+            vectors = np.stack([strategy.ask() for _ in range(self.population)])
+            results = yield {"vectors": vectors, "center": strategy.mean.copy()}
+            vectors, values = results["vectors"], results["values"]
+            worst = np.max(values[~np.isnan(values)], initial=-np.inf)
+            ranked = np.where(np.isnan(values), worst + 1.0, values)
+            strategy.tell([(x, float(value)) for x, value in zip(vectors, ranked, strict=True)])
 
     def judge(
-        self, vectors: np.ndarray, generation: int, score_candidates: ScoreCandidates
+        self, proposal: Mapping[str, np.ndarray], generation: int, score_candidates: ScoreCandidates
     ) -> Results:
-        space, tuning, center = self.space, self.tuning, self.mean
+        vectors, space = proposal["vectors"], self.space
         candidates, base, check = score_candidates(
             [
-                tuning.candidates(space.params(vectors), generation),
-                tuning.candidates(space.params(self.base[None]), generation),
-                tuning.validation_candidates(space.params(center[None])),
+                self.candidates(space.params(vectors), generation),
+                self.candidates(space.params(self.base[None]), generation),
+                self.validation_candidates(space.params(proposal["center"][None])),
             ]
         )
         values, base_value, validation = (
-            np.asarray(tuning.objective.value(x.score)) for x in (candidates, base, check)
+            np.asarray(self.objective.value(x.score)) for x in (candidates, base, check)
         )
         distances = np.mean((vectors - self.base) ** 2, axis=-1)
         return {
-            "values": values + self.evolution.prior * distances,
-            "center": center,
-            "params": center,
+            "values": values + self.prior * distances,
             "best": np.nanmin(values),
             "mean": float(np.nanmean(values)),
             "spread": float(np.nanstd(values)),
@@ -110,9 +95,5 @@ class EvolutionTuner(Tuner):
             "validation_success": check.outcome.success.mean(),
         }
 
-    def update(self, results: Mapping[str, np.ndarray]) -> None:
-        vectors, values = results["vectors"], results["values"]
-        worst = np.max(values[~np.isnan(values)], initial=-np.inf)
-        ranked = np.where(np.isnan(values), worst + 1.0, values)
-        self._strategy.tell([(x, float(value)) for x, value in zip(vectors, ranked, strict=True)])
-        self.record_best(results["center"], float(results["validation"]))
+
+tune_es = call_of(TuneES)

@@ -1,15 +1,14 @@
-"""Base of the tuning commands: their common options, the interface of a search, and its loop.
+"""Base of the tuning commands: their common options and report, and the loop of a search.
 
 `Tuning` holds the options and the report of `TuneES` and `TuneGrad`, and the worlds in which
-candidates are tried. `Tuner` is the interface of a search, such as an evolution or a gradient
-descent. `tune` runs a tuner and checkpoints every generation, so a killed run resumes.
+candidates are tried. Its `search` proposes vectors of parameters, and `judge` tries them. `tune`
+runs a search and checkpoints every generation, so a killed run resumes.
 """
 
 from __future__ import annotations
 
 import functools
-from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Generator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -42,49 +41,8 @@ UNITS = {"compile": "s", "run": "s", "simulated": "s", "differentiate": "s"}
 Results = Mapping[str, np.ndarray | jax.Array | float]  # of a generation, by name
 # Runs candidates in the worlds of a tuning.
 ScoreCandidates = Callable[[list[Candidates]], list[CandidateScores]]
-
-
-class Tuner(ABC):
-    """Search for the vector (p,) of parameters with the least objective, in generations.
-
-    Its state depends on nothing but the results of all generations, so a resumed run restores the
-    state from these.
-    """
-
-    # Dimensions of those results of a generation that serve the search alone, beside `vectors`.
-    DIMS: ClassVar[Mapping[str, tuple[str, ...]]]
-
-    def __init__(self, tuning: Tuning, generations: int):
-        self.tuning, self.space = tuning, tuning.space
-        self.generations, self.seed = generations, tuning.setting.seed  # maximum
-
-    def start(self) -> None:
-        """Start, or restart, the search at the base parameters of the space."""
-        self.base = self.best = np.asarray(self.space.vector(self.space.base), float)  # (p,)
-        self.best_value = np.inf  # [1] validation of `best`
-
-    @abstractmethod
-    def propose(self) -> np.ndarray:
-        """Return the vectors (P, p) of the next generation."""
-
-    @abstractmethod
-    def judge(
-        self, vectors: np.ndarray, generation: int, score_candidates: ScoreCandidates
-    ) -> Results:
-        """Try the vectors of a generation in worlds; return results by name.
-
-        The results are numbers, the vector `params` (p,) of the generation, and the arrays of
-        `DIMS`.
-        """
-
-    @abstractmethod
-    def update(self, results: Mapping[str, np.ndarray]) -> None:
-        """Advance the search by the results of a generation, with its `vectors`."""
-
-    def record_best(self, vector: np.ndarray, value: float) -> None:
-        """Store a vector if its validation is the best so far."""
-        if value < self.best_value:
-            self.best, self.best_value = vector, value
+# Yields a proposal for each generation, and receives the results of its trials.
+Search = Generator[dict[str, np.ndarray], Mapping[str, np.ndarray], None]
 
 
 @dataclass(frozen=True)
@@ -92,6 +50,12 @@ class Tuning(LawQuestion[xr.Dataset]):
     """Base of the questions for better parameters of a law."""
 
     IGNORED_FIELDS: ClassVar[tuple[str, ...]] = ("budget", "generations")
+    # Dimensions of those results of a generation that are arrays.
+    DIMS: ClassVar[dict[str, tuple[str, ...]]] = {
+        "vectors": ("candidate", "parameter"),
+        "center": ("parameter",),
+        "params": ("parameter",),
+    }
     QUICK: ClassVar[dict[str, Any]] = {
         # The few parameters that matter most, since few trials cannot determine more; cylinders on
         # the quasi-static model, which compile and run fastest.
@@ -150,9 +114,35 @@ class Tuning(LawQuestion[xr.Dataset]):
         return Candidates(params, self.domains, seed, np.arange(self.validation))
 
     @functools.cached_property
-    def tuner(self) -> Tuner:
-        """Search of this command."""
+    def base(self) -> np.ndarray:
+        """Vector (p,) of the initial parameters."""
+        return np.asarray(self.space.vector(self.space.base), float)
+
+    # --- for subclasses to override --------------------------------------------------------
+
+    @property
+    def num_generations(self) -> int:
+        """Maximum number of generations."""
         raise NotImplementedError
+
+    def search(self) -> Search:
+        """Search for the vector (p,) of parameters with the least objective, in generations.
+
+        A proposal has the `vectors` (P, p) of the next generation. The search depends on nothing
+        but the results of all generations, so a resumed run repeats it from these.
+        """
+        raise NotImplementedError
+
+    def judge(
+        self, proposal: Mapping[str, np.ndarray], generation: int, score_candidates: ScoreCandidates
+    ) -> Results:
+        """Try a proposal in worlds; return numbers and the arrays of `DIMS` except `params`.
+
+        The vector `center` (p,) has the `validation` of the generation.
+        """
+        raise NotImplementedError
+
+    # ---------------------------------------------------------------------------------------
 
     def quick_values(self) -> Mapping[str, Any]:
         """Values of `quick`; its choice of parameters is for RPS alone."""
@@ -169,7 +159,6 @@ class Tuning(LawQuestion[xr.Dataset]):
             )
         for domain in self.domains:
             self.setting.check_here(domain.weakest, [self.space.base])
-        _ = self.tuner
 
     def fields_as_json(self) -> dict[str, Any]:
         """Fields as JSON, with the names of all tuned parameters and the ranges of all domains."""
@@ -177,11 +166,11 @@ class Tuning(LawQuestion[xr.Dataset]):
         return super().fields_as_json() | {"tuned": self.space.names, "domain": ranges}
 
     def progress_bar(self) -> Bar:
-        name, count = self.name.replace("_", " "), self.tuner.generations
-        return Bar(name, count, "generations", shown=self.shows_progress)
+        name = self.name.replace("_", " ")
+        return Bar(name, self.num_generations, "generations", shown=self.shows_progress)
 
     def answer(self, run: Run) -> xr.Dataset:
-        return tune(run, self.tuner)
+        return tune(run, self, self.num_generations)
 
     def intro(self, results: xr.Dataset) -> str:
         names = ", ".join(self.space.names)
@@ -214,46 +203,49 @@ class Tuning(LawQuestion[xr.Dataset]):
         return [Section("Results", text, rows, picture)]
 
 
-def tune(run: Run, tuner: Tuner) -> xr.Dataset:
-    """Run a tuner to its end, in a run folder or in memory, and return its results.
+def tune(run: Run, tuning: Tuning, generations: int) -> xr.Dataset:
+    """Run a search to its end, in a run folder or in memory, and return its results.
 
-    Every generation is a checkpoint. A resumed tuner proposes the same vectors again and reads
+    Every generation is a checkpoint. A resumed search proposes the same vectors again and reads
     their results from the checkpoints; a damaged checkpoint is computed again. `compile` and `run`
     [s] are the wall clock of a generation's trials, and `simulated` [s] is its total simulated
     time.
 
     Raises:
-      InputError: the folder has generations that this tuner does not propose.
+      InputError: the folder has generations that this search does not propose.
     """
-    tuner.start()
-    log, count, simulated, vectors = xr.Dataset(), 0, 0.0, tuner.propose()
+    search = tuning.search()
+    proposal, best, least = next(search), tuning.base, np.inf  # `best` has the least validation
+    log, count, simulated = xr.Dataset(), 0, 0.0
 
     def report(progress: Progress) -> None:
         run.callback(replace(progress, simulated=simulated + progress.simulated, rounds=count))
 
     def proceed(generation: int) -> bool:
-        return generation < tuner.generations and not 0 < tuner.tuning.budget <= simulated
+        return generation < generations and not 0 < tuning.budget <= simulated
 
     def compute(generation: int) -> xr.Dataset:
         if generation:
-            _write(run.folder, tuner, log)
-        return _try_vectors(tuner, vectors, generation, run._replace(callback=report))
+            _write(run.folder, tuning, best, log)
+        return _try_proposal(tuning, proposal, generation, run._replace(callback=report))
 
     for results in run.steps(compute, proceed):
-        _check_generation(results, tuner, vectors, run.folder, count)
-        tuner.update({str(name): variable.values for name, variable in results.items()})
-        row = results.drop_vars(["vectors", *tuner.DIMS]).expand_dims(generation=[count])
+        _check_generation(results, tuning, proposal["vectors"], run.folder, count)
+        if results.validation < least:
+            best, least = results.center.values, float(results.validation)
+        row = results.drop_vars(set(tuning.DIMS) - {"params"}).expand_dims(generation=[count])
         log = xr.concat([log, row], "generation") if count else row
         count, simulated = count + 1, simulated + float(results.simulated)
         report(Progress(0, 0.0))
-        vectors = tuner.propose()
-    return _write(run.folder, tuner, log)
+        proposal = search.send({str(name): x.values for name, x in results.items()})
+    return _write(run.folder, tuning, best, log)
 
 
-def _try_vectors(tuner: Tuner, vectors: np.ndarray, generation: int, run: Run) -> xr.Dataset:
-    """Try the vectors of a generation, and return its results."""
+def _try_proposal(
+    tuning: Tuning, proposal: Mapping[str, np.ndarray], generation: int, run: Run
+) -> xr.Dataset:
+    """Try the proposal of a generation, and return its results."""
     times = dict.fromkeys(("simulated", "compile", "run"), 0.0)  # [s]
-    tuning = tuner.tuning
 
     def score_candidates(candidates: list[Candidates]) -> list[CandidateScores]:
         scores, timing = evaluate.score_candidates(
@@ -263,49 +255,41 @@ def _try_vectors(tuner: Tuner, vectors: np.ndarray, generation: int, run: Run) -
             times[name] += getattr(timing, name)
         return scores
 
-    results = dict(tuner.judge(vectors, generation, score_candidates)) | {"vectors": vectors}
+    results = {**proposal, **tuning.judge(proposal, generation, score_candidates)}
     times["simulated"] += float(results.pop("simulated", 0.0))
-    values = tuner.space.changed_values(results["params"])
-    results |= times | {"params": np.array([values[name] for name in tuner.space.names])}
-    dims = _dims(tuner)
+    values = tuning.space.changed_values(results["center"])
+    results |= times | {"params": np.array([values[name] for name in tuning.space.names])}
     variables = {
-        name: (dims.get(name, ()), np.asarray(value, float), {"units": UNITS.get(name, "1")})
-        for name, value in results.items()
+        name: (tuning.DIMS.get(name, ()), np.asarray(x, float), {"units": UNITS.get(name, "1")})
+        for name, x in results.items()
     }
-    return xr.Dataset(variables, {"parameter": list(tuner.space.names)})
-
-
-def _dims(tuner: Tuner) -> dict[str, tuple[str, ...]]:
-    """Return the dimensions of all arrays of a generation."""
-    return {"vectors": ("candidate", "parameter"), "params": ("parameter",), **tuner.DIMS}
+    return xr.Dataset(variables, {"parameter": list(tuning.space.names)})
 
 
 def _check_generation(
-    generation: xr.Dataset, tuner: Tuner, vectors: np.ndarray, folder: Path | None, index: int
+    results: xr.Dataset, tuning: Tuning, vectors: np.ndarray, folder: Path | None, index: int
 ) -> None:
     """Raise InputError unless these are results of the proposed vectors."""
     sizes = dict(zip(("candidate", "parameter"), vectors.shape, strict=True))
-    files.check_columns(generation, folder or "generation", _dims(tuner), sizes)
+    files.check_columns(results, folder or "generation", tuning.DIMS, sizes)
     # The tolerance allows for other rounding on another machine; the search uses the vectors that
     # were tried.
-    if not np.allclose(generation.vectors, vectors, rtol=1e-4, atol=1e-4, equal_nan=True):
+    if not np.allclose(results.vectors, vectors, rtol=1e-4, atol=1e-4, equal_nan=True):
         raise errors.InputError(
             f"run = {folder} cannot be resumed: its generation {index} differs from the one that "
             "this search proposes; another version wrote it. Choose another folder."
         )
 
 
-def _write(folder: Path | None, tuner: Tuner, log: xr.Dataset) -> xr.Dataset:
-    """Return the log (generation) with the tuned parameters, and write both."""
-    best = registry.named_leaves(tuner.space.params(tuner.best))
-    tuned = [float(best[name]) for name in tuner.space.names]
+def _write(folder: Path | None, tuning: Tuning, best: np.ndarray, log: xr.Dataset) -> xr.Dataset:
+    """Return the log (generation) with the best parameters, and write both."""
+    params = registry.named_leaves(tuning.space.params(best))
     if folder is not None:
-        files.write_json(folder / TUNED, tuner.space.changed_values(tuner.best))
-        params = log.params.to_pandas().add_prefix("params.")
-        files.write_csv(
-            folder / "curve.csv", log.drop_dims("parameter").to_dataframe().join(params)
-        )
-    return log.assign(tuned=("parameter", tuned))
+        files.write_json(folder / TUNED, tuning.space.changed_values(best))
+        columns = log.params.to_pandas().add_prefix("params.")
+        table = log.drop_dims("parameter").to_dataframe().join(columns)
+        files.write_csv(folder / "curve.csv", table)
+    return log.assign(tuned=("parameter", [float(params[x]) for x in tuning.space.names]))
 
 
 def parse_domains(domain: DomainLike | Sequence[DomainLike]) -> tuple[Domain, ...]:
