@@ -13,6 +13,7 @@ import rps_jax
 from rps_jax.errors import InputError
 from rps_jax.record import bag
 from rps_jax.robot.robot import Robot
+from rps_jax.robot.skin import with_contacts
 from rps_jax.tuning import fit, logs, posterior
 from rps_jax.world import domain as domains
 from sweeps.fit import bags
@@ -149,7 +150,8 @@ def test_contacts_are_computed_from_taxels():
     signal = np.zeros((3, SHELL.count))
     front = np.flatnonzero(np.isclose(np.asarray(SHELL.taxels()[:, 0, 0]), 0.3625))
     signal[0, front[5:7]], signal[1, front[2]] = 1.0, 1.0
-    result = logs._contacts(signal, SHELL)
+    scans = {"signal": signal, "period": np.full(3, np.inf)}
+    result = with_contacts(scans, SHELL, "log")
     assert result["contact_type"].tolist() == [2, 1, 0]
     pitch = 0.58 / 12  # twelve taxels along the front
     np.testing.assert_allclose(result["p_robot_contact"][0], [0.3625, 0.0], atol=1e-6)

@@ -17,12 +17,10 @@ bag, which `rps push --bag` writes or a robot records (`record.bag` lists the to
 """
 
 from collections.abc import Iterator
-from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pandas as pd
@@ -32,7 +30,7 @@ from rps_jax.errors import InputError
 from rps_jax.geometry import planar
 from rps_jax.record import bag, files
 from rps_jax.robot.shell import Shell
-from rps_jax.robot.skin import CapacitiveSkin, check_taxels, with_contacts
+from rps_jax.robot.skin import check_taxels, with_contacts
 from rps_jax.runs.push import Trace
 from rps_jax.world.scene import JOINTS
 
@@ -105,8 +103,10 @@ def read(source: Trace | str | Path, shell: Shell) -> RawLog:
     columns = log.columns
     if "signal" in columns:
         check_taxels(columns["signal"], shell, name)
-    if "contact_type" not in columns:
-        columns |= _contacts(columns["signal"], shell)
+    if "contact_type" not in columns:  # of taxels that are filtered already
+        scans = {"signal": columns["signal"], "period": np.full(len(columns["signal"]), np.inf)}
+        contacts = with_contacts(scans, shell, name)
+        columns |= {key: np.asarray(contacts[key], float) for key in _TOUCH}
     for fault in _faults(columns, shell):
         raise InputError(f"{name} {fault}.")
     columns["target"] = np.atleast_2d(columns["target"])[0]
@@ -154,14 +154,6 @@ def _from_table(path: Path, name: str) -> RawLog:
     if taxels:
         columns["signal"] = table[taxels].to_numpy()
     return RawLog(columns, False)
-
-
-def _contacts(signal: np.ndarray, shell: Shell) -> dict[str, np.ndarray]:
-    """Return the contacts of taxels (N, T), which are filtered already."""
-    skin = CapacitiveSkin(time_constant=1e-9, shell=shell)
-    read = partial(skin.read, skin.init(jax.random.PRNGKey(0)), period=1.0)
-    reading = jax.vmap(lambda raw: read(raw)[1])(jnp.asarray(signal))
-    return {name: np.asarray(values, float) for name, values in reading._asdict().items()}
 
 
 def _faults(columns: dict[str, np.ndarray], shell: Shell) -> Iterator[str]:
