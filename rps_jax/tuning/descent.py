@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import functools
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, ClassVar, Literal
@@ -30,7 +30,7 @@ from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import ControlLoop, Snapshot, Trial, World, control_step, start_all
 from rps_jax.tuning import gradients
 from rps_jax.tuning.gradients import Estimate
-from rps_jax.tuning.run import Results, ScoreCandidates, Search, Tuning
+from rps_jax.tuning.run import Proposal, Results, ScoreCandidates, Search, Tuning
 from rps_jax.world.physics import preset
 
 Estimator = Literal["reverse", "evolution"]
@@ -122,12 +122,10 @@ class TuneGrad(Tuning):
             changes, state = jax.vmap(self.rule.update)(gradient, state, thetas)
             thetas = jnp.asarray(optax.apply_updates(thetas, changes))
 
-    def judge(
-        self, proposal: Mapping[str, np.ndarray], generation: int, score_candidates: ScoreCandidates
-    ) -> Results:
+    def judge(self, proposal: Proposal, generation: int, score: ScoreCandidates) -> Results:
         """Validate all vectors (S, p) and estimate their gradients: NaN after the last step."""
         vectors = proposal["vectors"]
-        (answer,) = score_candidates([self.validation_candidates(self.space.params(vectors))])
+        (answer,) = score([self.validation_candidates(self.space.params(vectors))])
         values = self.objective.value(answer.score)
         first = int(jnp.nanargmin(values))
         results = {
@@ -145,7 +143,7 @@ class TuneGrad(Tuning):
             return results | dict.fromkeys(names, np.nan) | {"gradients": 0 * vectors + np.nan}
         thetas, simulated, wall = jnp.asarray(vectors), 0.0, 0.0
         if self.estimator == "evolution":
-            estimate = evolution_gradients(thetas, self, generation, score_candidates)
+            estimate = evolution_gradients(thetas, self, generation, score)
         else:
             start_time = time.perf_counter()
             estimate, simulated = jax.block_until_ready(window_gradients(thetas, self, generation))
@@ -287,7 +285,7 @@ def window_gradients(thetas: jax.Array, options: TuneGrad, step: int) -> tuple[E
 
 
 def evolution_gradients(
-    thetas: jax.Array, options: TuneGrad, step: int, score_candidates: ScoreCandidates
+    thetas: jax.Array, options: TuneGrad, step: int, score: ScoreCandidates
 ) -> Estimate:
     """Return estimates (S, p) from antithetic candidates of the original law in the same worlds."""
     key = jax.random.fold_in(jax.random.key(options.setting.seed), step)
@@ -295,7 +293,7 @@ def evolution_gradients(
     steps = jax.random.normal(key, (count, options.pairs, p), thetas.dtype)
     offsets = jnp.concatenate([steps, -steps], axis=1) * options.sigma
     params = options.space.params((thetas[:, None] + offsets).reshape(-1, p))
-    (answer,) = score_candidates([options.candidates(params, step)])
+    (answer,) = score([options.candidates(params, step)])
     values = options.objective.value(answer.score).reshape(count, 2, options.pairs)
     slopes = (values[:, 0] - values[:, 1])[..., None] * steps / (2 * options.sigma)
     return jax.vmap(gradients.estimate)(slopes)

@@ -5,7 +5,6 @@ All candidates of a generation meet the same worlds; every generation has other 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -14,7 +13,7 @@ import numpy as np
 
 from rps_jax.record.options import option
 from rps_jax.runs.question import call_of
-from rps_jax.tuning.run import Results, ScoreCandidates, Search, Tuning
+from rps_jax.tuning.run import Proposal, Results, ScoreCandidates, Search, Tuning
 
 
 @dataclass(frozen=True)
@@ -69,11 +68,9 @@ class TuneES(Tuning):
             ranked = np.where(np.isnan(values), worst + 1.0, values)
             strategy.tell([(x, float(value)) for x, value in zip(vectors, ranked, strict=True)])
 
-    def judge(
-        self, proposal: Mapping[str, np.ndarray], generation: int, score_candidates: ScoreCandidates
-    ) -> Results:
+    def judge(self, proposal: Proposal, generation: int, score: ScoreCandidates) -> Results:
         vectors, space = proposal["vectors"], self.space
-        candidates, base, check = score_candidates(
+        candidates, base, check = score(
             [
                 self.candidates(space.params(vectors), generation),
                 self.candidates(space.params(self.base[None]), generation),

@@ -39,10 +39,11 @@ TUNED = "tuned.json"  # file of a run folder: the parameters with the best valid
 UNITS = {"compile": "s", "run": "s", "simulated": "s", "differentiate": "s"}
 
 Results = Mapping[str, np.ndarray | jax.Array | float]  # of a generation, by name
+Proposal = Mapping[str, np.ndarray]  # arrays by name, `vectors` (P, p) among them
 # Runs candidates in the worlds of a tuning.
 ScoreCandidates = Callable[[list[Candidates]], list[CandidateScores]]
 # Yields a proposal for each generation, and receives the results of its trials.
-Search = Generator[dict[str, np.ndarray], Mapping[str, np.ndarray], None]
+Search = Generator[Proposal, Mapping[str, np.ndarray], None]
 
 
 @dataclass(frozen=True)
@@ -133,9 +134,7 @@ class Tuning(LawQuestion[xr.Dataset]):
         """
         raise NotImplementedError
 
-    def judge(
-        self, proposal: Mapping[str, np.ndarray], generation: int, score_candidates: ScoreCandidates
-    ) -> Results:
+    def judge(self, proposal: Proposal, generation: int, score: ScoreCandidates) -> Results:
         """Try a proposal in worlds; return numbers and the arrays of `DIMS` except `params`.
 
         The vector `center` (p,) has the `validation` of the generation.
@@ -241,13 +240,11 @@ def tune(run: Run, tuning: Tuning, generations: int) -> xr.Dataset:
     return _write(run.folder, tuning, best, log)
 
 
-def _try_proposal(
-    tuning: Tuning, proposal: Mapping[str, np.ndarray], generation: int, run: Run
-) -> xr.Dataset:
+def _try_proposal(tuning: Tuning, proposal: Proposal, generation: int, run: Run) -> xr.Dataset:
     """Try the proposal of a generation, and return its results."""
     times = dict.fromkeys(("simulated", "compile", "run"), 0.0)  # [s]
 
-    def score_candidates(candidates: list[Candidates]) -> list[CandidateScores]:
+    def score(candidates: list[Candidates]) -> list[CandidateScores]:
         scores, timing = evaluate.score_candidates(
             candidates, tuning.setting, tuning.objective, **run.batch_options
         )
@@ -255,7 +252,7 @@ def _try_proposal(
             times[name] += getattr(timing, name)
         return scores
 
-    results = {**proposal, **tuning.judge(proposal, generation, score_candidates)}
+    results = {**proposal, **tuning.judge(proposal, generation, score)}
     times["simulated"] += float(results.pop("simulated", 0.0))
     values = tuning.space.changed_values(results["center"])
     results |= times | {"params": np.array([values[name] for name in tuning.space.names])}
