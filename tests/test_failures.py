@@ -59,7 +59,7 @@ def test_a_probe_agrees_with_a_sweep_and_resumes(tmp_path, monkeypatch):
     np.testing.assert_allclose(probe.simulated, trials.time.sum())
     monkeypatch.setattr(Probe, "_simulate", None)  # a resumed probe runs no trial
     xr.testing.assert_identical(probe_in(tmp_path)(u), trials)
-    with pytest.raises(InputError, match="differs from this search from step 0 on"):
+    with pytest.raises(InputError, match="step 0 is of another search"):
         probe_in(tmp_path)(u[::-1])
 
 

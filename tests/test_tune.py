@@ -285,7 +285,7 @@ class TestRuns:
             path.unlink()
         (foreign,) = (tmp_path / "other" / "parts").glob("000001*")
         foreign.rename(tmp_path / "one" / "parts" / foreign.name)
-        with pytest.raises(InputError, match="its generation 1 differs from the one"):
+        with pytest.raises(InputError, match="generation 1 is of another search"):
             tuned(tmp_path / "one", evolution(3))
 
     def test_finished_generations_stay_when_fewer_are_requested(self, tmp_path, pretended):

@@ -8,7 +8,6 @@ import xarray as xr
 
 from rps_jax.analysis import statistics
 from rps_jax.control.base import LawParams
-from rps_jax.errors import InputError
 from rps_jax.record import files
 from rps_jax.runs.evaluate import stack
 from rps_jax.runs.question import Run
@@ -55,10 +54,8 @@ class Probe:
             columns = {"u": ("world", "quantity")} | dict.fromkeys(_RESULTS, ("world",))
             files.check_columns(results, self.run.folder, columns, {"world": len(at.u)})
         if not np.array_equal(results.u.values, at.u):
-            raise InputError(
-                f"run = {self.run.folder} differs from this search from step {self.calls} on: use "
-                "the version and the device that created it, or choose another folder."
-            )
+            reason = f"step {self.calls} is of another search, version or device"
+            raise files.CorruptFileError(self.run.folder, reason)
         self.calls += 1
         self.trials += len(at.u)
         self.simulated += float(results.time.sum())

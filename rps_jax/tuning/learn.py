@@ -331,10 +331,7 @@ class _Learner:
         columns = leaves[-1].shape[1:] if leaves else ()  # of the curve, of any number of updates
         kinds = ([(x.shape, x.dtype) for x in several[:-1]] for several in (leaves, expected))
         if columns != (len(UNITS),) or next(kinds) != next(kinds):
-            raise errors.InputError(
-                f"run = {self.folder} cannot be resumed: another version wrote it; choose another "
-                "folder."
-            )
+            raise files.CorruptFileError(self.folder / "parts", "another version wrote it")
         runner, self.best, scalars, curve = jax.tree.unflatten(structure, leaves)
         self.runner = jax.device_put(runner)
         self.best_rate, compile_time, elapsed = scalars.tolist()

@@ -272,10 +272,7 @@ def _check_generation(
     # The tolerance allows for other rounding on another machine; the search uses the vectors that
     # were tried.
     if not np.allclose(results.vectors, vectors, rtol=1e-4, atol=1e-4, equal_nan=True):
-        raise errors.InputError(
-            f"run = {folder} cannot be resumed: its generation {index} differs from the one that "
-            "this search proposes; another version wrote it. Choose another folder."
-        )
+        raise files.CorruptFileError(folder, f"generation {index} is of another search or version")
 
 
 def _write(folder: Path | None, tuning: Tuning, best: np.ndarray, log: xr.Dataset) -> xr.Dataset:
