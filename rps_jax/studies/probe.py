@@ -21,7 +21,6 @@ from rps_jax.world.points import Points
 
 _SLOTS = 64  # least size of a program
 _STORED = ("success", "time", "contact_lost_time", "tilt")
-_RESULTS = ("success", "time", "left", "severity")
 
 
 @dataclass
@@ -50,10 +49,7 @@ class Probe:
         """Return outcomes and `severity` (world) at points `u` (n, q)."""
         at = points.check_points(self.domain, u)
         results = self.run.checkpoint(f"{self.calls:06d}", lambda: self._simulate(at))
-        if self.run.folder is not None:
-            columns = {"u": ("world", "quantity")} | dict.fromkeys(_RESULTS, ("world",))
-            files.check_columns(results, self.run.folder, columns, {"world": len(at.u)})
-        if not np.array_equal(results.u.values, at.u):
+        if not ("u" in results and np.array_equal(results.u, at.u)):
             reason = f"step {self.calls} is of another search, version or device"
             raise files.CorruptFileError(self.run.folder, reason)
         self.calls += 1
