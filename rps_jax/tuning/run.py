@@ -229,7 +229,9 @@ def tune(run: Run, tuning: Tuning, generations: int) -> xr.Dataset:
         return _try_proposal(tuning, proposal, generation, run._replace(callback=report))
 
     for results in run.steps(compute, proceed):
-        _check_generation(results, tuning, proposal["vectors"], run.folder, count)
+        if not _is_of_proposal(results, proposal["vectors"]):
+            reason = f"generation {count} is of another search or version"
+            raise files.CorruptFileError(run.folder, reason)
         if results.validation < least:
             best, least = results.center.values, float(results.validation)
         row = results.drop_vars(set(tuning.DIMS) - {"params"}).expand_dims(generation=[count])
@@ -263,16 +265,15 @@ def _try_proposal(tuning: Tuning, proposal: Proposal, generation: int, run: Run)
     return xr.Dataset(variables, {"parameter": list(tuning.space.names)})
 
 
-def _check_generation(
-    results: xr.Dataset, tuning: Tuning, vectors: np.ndarray, folder: Path | None, index: int
-) -> None:
-    """Raise InputError unless these are results of the proposed vectors."""
-    sizes = dict(zip(("candidate", "parameter"), vectors.shape, strict=True))
-    files.check_columns(results, folder or "generation", tuning.DIMS, sizes)
-    # The tolerance allows for other rounding on another machine; the search uses the vectors that
-    # were tried.
-    if not np.allclose(results.vectors, vectors, rtol=1e-4, atol=1e-4, equal_nan=True):
-        raise files.CorruptFileError(folder, f"generation {index} is of another search or version")
+def _is_of_proposal(results: xr.Dataset, vectors: np.ndarray) -> bool:
+    """Return whether these are results of the proposed vectors.
+
+    The tolerance allows for other rounding on another machine; the search uses the vectors that
+    were tried.
+    """
+    if "vectors" not in results or results.vectors.shape != vectors.shape:
+        return False
+    return np.allclose(results.vectors, vectors, rtol=1e-4, atol=1e-4, equal_nan=True)
 
 
 def _write(folder: Path | None, tuning: Tuning, best: np.ndarray, log: xr.Dataset) -> xr.Dataset:
