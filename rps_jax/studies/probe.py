@@ -1,5 +1,6 @@
 """Probe: outcomes of one law at points of a domain's unit cube, call after call."""
 
+import math
 import time
 from dataclasses import dataclass, field
 
@@ -19,7 +20,7 @@ from rps_jax.world import points
 from rps_jax.world.domain import Domain
 from rps_jax.world.points import Points
 
-_SLOTS = 64  # least size of a program
+_SLOTS = 64  # least size of a program, a power of four
 _STORED = ("success", "time", "contact_lost_time", "tilt")
 
 
@@ -74,7 +75,4 @@ class Probe:
 
 def _capacity(trials: int) -> int:
     """Return the size of the program for some trials: a power of four, so that few compile."""
-    size = _SLOTS
-    while size < trials:
-        size *= 4
-    return size
+    return 4 ** math.ceil(math.log2(max(trials, _SLOTS)) / 2)

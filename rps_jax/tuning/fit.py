@@ -147,8 +147,10 @@ class Fit(LawQuestion[Fitted], DomainQuestion[Fitted], LogsQuestion):
     def bank(self) -> Bank:
         """Simulated worlds with which the logs are compared."""
         period = self.setting.physics.control_period
-        interval = max(logs_.row_interval(log, period) for log in self.raw_logs)
-        shortest = min(map(logs_.duration, self.raw_logs))
+        times = [raw.columns["time"] for raw in self.raw_logs]
+        slowest = max(float(np.median(np.diff(time))) for time in times)
+        interval = period * max(1, math.ceil(slowest / period - 0.05))
+        shortest = min(float(time[-1] - time[0]) for time in times)
         window = interval * math.floor(min(self.window, shortest) / interval + 1e-6)
         exact = self.raw_logs[0].exact
         return Bank(self.ranges, self.params, self.setting, window, interval, exact)

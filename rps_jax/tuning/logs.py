@@ -203,18 +203,6 @@ def resample(raw: RawLog, interval: float, window: float) -> Log:
     return Log(valid=(grid <= time[-1] + 1e-6)[None], target=columns["target"][None], **rows)
 
 
-def row_interval(raw: RawLog, period: float) -> float:
-    """Return the interval [s] of a log's rows, as a multiple of the control period [s]."""
-    interval = float(np.median(np.diff(raw.columns["time"])))
-    return period * max(1, int(np.ceil(interval / period - 0.05)))
-
-
-def duration(raw: RawLog) -> float:
-    """Return the duration [s] of a log."""
-    time = raw.columns["time"]
-    return float(time[-1] - time[0])
-
-
 # --- summary statistics --------------------------------------------------------------------
 
 _BLOCKS = 10
