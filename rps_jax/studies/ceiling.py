@@ -114,9 +114,7 @@ class Ceiling(DomainQuestion[xr.Dataset]):
 
     def check(self) -> None:
         if not self.world_indices.size:
-            raise errors.InputError(
-                f"sample = {self.sample} is not allowed: no world would be tried."
-            )
+            raise errors.not_allowed("sample", self.sample, "no world would be tried")
         replace(self, domain=self.plan.domain, setting=self.plan.setting, run=None).check_engine()
 
     def num_trials(self) -> int | None:

@@ -24,7 +24,6 @@ from rps_jax import errors
 from rps_jax.analysis import statistics
 from rps_jax.analysis.figures.style import Figure
 from rps_jax.analysis.report import Picture, Section
-from rps_jax.errors import InputError
 from rps_jax.record import files
 from rps_jax.record.options import option
 from rps_jax.runs.plan import Plan
@@ -101,10 +100,8 @@ class Sensitivity(PlanQuestion, DomainQuestion[xr.Dataset], LawQuestion[xr.Datas
         """Number N of base points, a power of 2; Saltelli's design has N (factors + 2) worlds."""
         count = len(self.factors)
         if self.worlds < 4 * (count + 2):
-            raise InputError(
-                f"worlds = {self.worlds} is not allowed: {count} quantities need at least "
-                f"{4 * (count + 2)}."
-            )
+            rule = f"{count} quantities need at least {4 * (count + 2)}"
+            raise errors.not_allowed("worlds", self.worlds, rule)
         return 2 ** int(np.log2(self.worlds / (count + 2)))
 
     @property

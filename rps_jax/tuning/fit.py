@@ -26,7 +26,7 @@ import numpy as np
 import pandas as pd
 import xarray as xr
 
-from rps_jax import engines
+from rps_jax import engines, errors
 from rps_jax.analysis.figures.style import Figure, quantity, tiles
 from rps_jax.analysis.report import Picture, Section
 from rps_jax.control import registry
@@ -322,10 +322,8 @@ def check_law(label: str, law: Law, setting: Setting) -> None:
     engines.get(setting.engine).check_traced()
     engines.get(setting.engine).check_senses("force")
     if law.senses != "touch":
-        raise InputError(
-            f"law = {label} is not allowed: it senses {law.senses}; fit needs a law that senses "
-            "touch, as rps or rps_plus."
-        )
+        rule = f"it senses {law.senses}; fit needs a law that senses touch, as rps or rps_plus"
+        raise errors.not_allowed("law", label, rule)
 
 
 @cache
@@ -440,9 +438,9 @@ def fitted_domain(domain: Domain, data: xr.Dataset) -> Domain:
         for name, row in intervals.iterrows()
         if name in QUANTITIES
     }
-    errors = intervals.reindex(VELOCITY_ERRORS)
-    if errors.low.notna().all():
-        changes["velocity_error"] = Range(float(errors.low.min()), float(errors.high.max()))
+    velocity = intervals.reindex(VELOCITY_ERRORS)
+    if velocity.low.notna().all():
+        changes["velocity_error"] = Range(float(velocity.low.min()), float(velocity.high.max()))
     objects = tuple(map(str, data.object.values[data.probability.values >= 0.05]))
     return dataclasses.replace(domain, objects=objects, **changes)
 

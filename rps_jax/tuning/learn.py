@@ -134,10 +134,8 @@ class Learn(PPO, SimulationQuestion[xr.Dataset]):
         engines.get(self.setting.engine).check_traced()
         count = self.num_envs * sum(len(domain.objects) for domain in self.domains)
         if self.num_minibatches > count:
-            raise errors.InputError(
-                f"num_minibatches = {self.num_minibatches} is not allowed: there are only {count} "
-                "worlds; raise num_envs."
-            )
+            rule = f"there are only {count} worlds; raise num_envs"
+            raise errors.not_allowed("num_minibatches", self.num_minibatches, rule)
         period = self.setting.physics.control_period
         errors.check_number("hold", self.hold, at_least=0.999 * period, unit="s")
 

@@ -152,10 +152,8 @@ class Tuning(LawQuestion[xr.Dataset]):
         errors.check_count("seed", self.setting.seed, at_least=0, at_most=2**30)
         if not registry.law_of(self.params).bounds:
             names = [n for n, params in registry.LAWS.items() if registry.law_of(params).bounds]
-            raise errors.InputError(
-                f"law = {self.label} is not allowed: its parameters have no bounds; choose from "
-                f"{', '.join(names)}."
-            )
+            rule = f"its parameters have no bounds; choose from {', '.join(names)}"
+            raise errors.not_allowed("law", self.label, rule)
         for domain in self.domains:
             self.setting.check_here(domain.weakest, [self.space.base])
 
