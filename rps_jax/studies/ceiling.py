@@ -123,10 +123,8 @@ class Ceiling(DomainQuestion[xr.Dataset]):
 
     def configuration(self) -> dict[str, Any]:
         search = {name: getattr(self, name) for name in _SEARCH_OPTIONS}
-        return {
-            "ceiling": self.plan.configuration(),
-            "worlds": self.world_indices.tolist(),
-        } | search
+        worlds = self.world_indices.tolist()
+        return {"ceiling": self.plan.configuration(), "worlds": worlds} | search
 
     def answer(self, run: Run) -> xr.Dataset:
         """Search plans round by round; a resumed run loads its finished rounds."""
