@@ -114,7 +114,7 @@ def test_a_validated_law_has_two_decimals_above_99_percent():
     curve = xr.Dataset(columns, {"update": [7]}, {"compile": 1.0, "run": 2.0})
     (section,) = learn.Learn().report(curve, Run(None, no_progress))
     assert "validation success of 99.37 %" in section.text
-    assert "99.37 %" in section.lines[-1]
+    assert "99.37 %" in section.table[-1]
 
 
 def test_the_decisive_quantity_is_listed_first():
