@@ -16,6 +16,7 @@ import numpy as np
 import pandas as pd
 import xarray as xr
 
+from rps_jax import errors
 from rps_jax.errors import InputError
 from rps_jax.record import files
 from rps_jax.record.checkpoint import Checkpoints
@@ -216,10 +217,8 @@ def check_table(path: Path) -> None:
     if path.suffix not in (".csv", ".parquet"):
         raise InputError(f"table = {path} is not allowed: name a file NAME.csv or NAME.parquet.")
     if path.suffix == ".parquet" and not importlib.util.find_spec("pyarrow"):
-        raise InputError(
-            f"table = {path} needs pyarrow, which is not installed: run pip install pyarrow, or "
-            "name a .csv file."
-        )
+        rule = "it needs pyarrow: run pip install pyarrow, or name a .csv file"
+        raise errors.not_allowed("table", path, rule)
     if not path.parent.is_dir():
         raise InputError(f"table = {path} is not allowed: {path.parent} is not a folder.")
 
