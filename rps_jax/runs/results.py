@@ -63,7 +63,7 @@ class Results:
         self.shape = len(plan.laws), plan.worlds
         self._outcomes = {name: self._empty(name) for name in UNITS}  # (law, world, ...)
         self._drawn: dict[str, np.ndarray] = {}  # (world,) drawn quantities
-        self._running = {number: plan.chunks[number].size for number in chunks}  # trials
+        self._running = {chunk: plan.chunks[chunk].size for chunk in chunks}  # trials
 
     def _empty(self, name: str) -> np.ndarray:
         """Return an empty column of outcomes; its memory is claimed when it is filled."""
@@ -74,7 +74,7 @@ class Results:
     def _chunk_of(self) -> np.ndarray:
         """Number of the chunk of each trial."""
         chunk_of = np.empty(self.plan.num_trials, np.int32)
-        for number, trials in self.plan.chunks.items():
+        for chunk, trials in self.plan.chunks.items():
             chunk_of[trials] = number
         return chunk_of
 
@@ -134,7 +134,7 @@ class Results:
         Raises:
           InputError: chunks are missing.
         """
-        missing = [number for number in self.plan.chunks if number not in self._running]
+        missing = [chunk for chunk in self.plan.chunks if chunk not in self._running]
         for folder in folders:
             missing = self.read(folder, missing)
         if missing:
