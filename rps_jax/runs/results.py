@@ -75,7 +75,7 @@ class Results:
         """Number of the chunk of each trial."""
         chunk_of = np.empty(self.plan.num_trials, np.int32)
         for chunk, trials in self.plan.chunks.items():
-            chunk_of[trials] = number
+            chunk_of[trials] = chunk
         return chunk_of
 
     # --- a rollout -------------------------------------------------------------------------
