@@ -13,9 +13,10 @@ from rps_jax import engines
 from rps_jax.control.observation import Twist
 from rps_jax.engines import mjx as mjx_engine
 from rps_jax.engines.base import ControlPeriod, Motion
-from rps_jax.engines.fused.step import body
+from rps_jax.engines.fused.contacts import Body
 from rps_jax.engines.quasistatic import sliders
 from rps_jax.geometry import solid
+from rps_jax.geometry import vectors as sp
 from rps_jax.robot.robot import Robot
 from rps_jax.world import scene
 from rps_jax.world.physics import Physics, preset
@@ -39,13 +40,50 @@ def recompiled(engine: str, scenes: Sequence[Scene]) -> Any:
     """Return the fields of worlds compiled by MuJoCo, to compare with those of a stage."""
     models = [loaded.physics for loaded in scenes]
     if engine == "mjx":
-        return jax.device_get(mjx_engine.stack(models)[1])
+        return stack(models)[1]
     if engine == "quasistatic":
         half = np.array([model.geom("base").size[:2] for model in models])
         friction = np.array([model.pair("base_object").friction[0] for model in models])
         return sliders(solid.stack([loaded.solid for loaded in scenes]), friction, half)
     bodies = [body(loaded.physics, loaded.solid.vertices) for loaded in scenes]
     return jax.tree.map(lambda *leaves: np.stack(leaves), *bodies)
+
+
+def stack(models: Sequence[mujoco.MjModel]) -> tuple[Any, dict[str, np.ndarray]]:
+    """Return an MJX model and the fields (n, ...) of models that differ in nothing else."""
+    trees = [mjx_engine.put(model) for model in models]
+    rows: Any = [mjx_engine.fields_of(tree) for tree in trees]
+    for tree in trees:
+        jax.tree.map(np.testing.assert_array_equal, mjx_engine.apply(tree, rows[0]), trees[0])
+    return trees[0], {name: np.stack([row[name] for row in rows]) for name in rows[0]}
+
+
+def body(model: mujoco.MjModel, vertices: np.ndarray) -> Body:
+    """Return the body of a physics model and the vertices (N, 2) [m] of its footprint."""
+    object_body, base = model.body("object"), model.body("base")
+    geom, front = model.geom("object"), model.geom("base")
+    frame = sp.matrix(object_body.iquat)
+    round_ = len(vertices) == 1
+    half = object_body.pos[2]  # a scene starts with its object on the ground
+    bottom = np.column_stack([vertices, np.full(len(vertices), -half)])
+    pairs = [model.pair(i) for i in range(model.npair)]
+    friction = {pair.name.partition("_")[0]: pair.friction[0] for pair in pairs}
+    return Body(
+        mass=object_body.mass[0],
+        inertia=object_body.inertia.copy(),
+        p_object_com=object_body.ipos.copy(),
+        q_object_body=object_body.iquat.copy(),
+        vertices=np.array([sp.to_body(frame, v) for v in bottom - object_body.ipos]),
+        radius=geom.size[0] if round_ else 0.0,
+        height=2 * half,
+        up=np.array(sp.to_body(frame, (0.0, 0.0, 1.0))),
+        friction_ground=friction["ground"],
+        friction_robot=friction["base"],
+        invweight=model.body_invweight0[object_body.id, 0],
+        base_invweight=model.body_invweight0[base.id, 0],
+        base_half=front.size[:2].copy(),
+        base_z=front.pos[2] + front.size[2] * np.array([-1.0, 1.0]),
+    )
 
 
 class Recording(NamedTuple):

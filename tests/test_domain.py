@@ -11,13 +11,14 @@ import mujoco
 import numpy as np
 import pytest
 from helpers import refusals, row, same
+from staging import body, stack
 
 from rps_jax import engines
 from rps_jax.engines import mjx as mjx_engine
-from rps_jax.engines.fused import step as fused
 from rps_jax.engines.mjx_colliders import mjx
 from rps_jax.geometry import solid
 from rps_jax.geometry.footprint import polygon
+from rps_jax.robot.robot import Robot
 from rps_jax.trials import pushes
 from rps_jax.trials.case import Case
 from rps_jax.trials.setting import Setting
@@ -108,9 +109,9 @@ def compiled_rows(worlds, family, count=COUNT):
 @pytest.mark.parametrize("name", ["random_box", "random_cylinder"])
 def test_fused_bodies_equal_those_of_recompiled_models(name):
     worlds, family = drawn(name), RANDOM[name]
-    _, bodies = engines.get("fused").stage(family, worlds.solid, worlds.friction, preset())
+    _, bodies = engines.get("fused").stage(family, worlds.solid, worlds.friction, preset(), Robot())
     for i, loaded in enumerate(compiled_rows(worlds, family)):
-        compiled = fused.body(loaded.physics, np.asarray(loaded.footprint.vertices, float))
+        compiled = body(loaded.physics, np.asarray(loaded.footprint.vertices, float))
         for field, a, b in zip(compiled._fields, bodies, compiled, strict=True):
             if b is None:  # these solids have no custom feet
                 assert a is None
@@ -121,7 +122,7 @@ def test_fused_bodies_equal_those_of_recompiled_models(name):
 @pytest.mark.parametrize("name", list(RANDOM))
 def test_applied_domain_equals_the_recompiled_model_in_every_field(name):
     worlds, family = drawn(name), RANDOM[name]
-    _, fields = engines.get("mjx").stage(family, worlds.solid, worlds.friction, preset())
+    _, fields = engines.get("mjx").stage(family, worlds.solid, worlds.friction, preset(), Robot())
     assert set(fields) <= set(mjx_engine.FIELDS)
     models = [loaded.physics for loaded in compiled_rows(worlds, family)]
     for i, model in enumerate(models):
@@ -137,7 +138,7 @@ def test_applied_domain_equals_the_recompiled_model_in_every_field(name):
             scale = np.abs(theirs).max() + 1e-12
             np.testing.assert_allclose(mine / scale, theirs / scale, atol=1e-6, err_msg=field)
     if family != "prism":  # whose meshes differ, and are not read; the rest differs in no field
-        mjx_engine.stack(models[:2])
+        stack(models[:2])
 
 
 @pytest.mark.parametrize("name", list(RANDOM))

@@ -24,6 +24,7 @@ from rps_jax.control.registry import register_law
 from rps_jax.errors import InputError
 from rps_jax.geometry.footprint import Footprint, circle, polygon, rectangle
 from rps_jax.record import files
+from rps_jax.robot.robot import Robot
 from rps_jax.robot.skin import CapacitiveSkin
 from rps_jax.runs.plan import Plan, load_plan, open_run, scene_of
 from rps_jax.trials import pushes
@@ -90,7 +91,7 @@ def test_all_engines_have_an_equal_hexagon(hexagon):
     physics = Setting(engine="mjx").physics
     for engine in ("fused", "mjx"):
         alone = recompiled(engine, [hexagon])
-        _, drawn = engines.get(engine).stage("prism", solids, friction, physics)
+        _, drawn = engines.get(engine).stage("prism", solids, friction, physics, Robot())
         if engine == "mjx":
             assert set(alone) == set(drawn)
         same(alone, drawn, rtol=3e-6, atol=3e-6)

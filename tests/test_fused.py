@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from helpers import row
 from staging import FINE, simulate, staged, step_in_c
+from staging import body as body_of
 
 from rps_jax.engines.base import Motion
 from rps_jax.engines.fused import contacts, newton
@@ -117,7 +118,7 @@ def test_the_contact_of_a_leaning_object_is_at_its_lower_edge(name, degrees):
     mujoco.mj_forward(loaded.physics, data)
     base, object_ = (loaded.physics.geom(g).id for g in ("base", "object"))
     true = mujoco.mj_geomDistance(loaded.physics, data, base, object_, 1.0, None)
-    body = fused.body(loaded.physics, np.asarray(loaded.footprint.vertices))
+    body = body_of(loaded.physics, np.asarray(loaded.footprint.vertices))
     body = jax.tree.map(lambda leaf: jnp.asarray(leaf, float)[None], body)
     still = jnp.zeros((1, 9))
     state = fused.enter(body, Motion(jnp.asarray(qpos, float)[None], still, still))

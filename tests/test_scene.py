@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
+from staging import stack
 
 from rps_jax import errors
 from rps_jax.engines import mjx as mjx_engine
@@ -65,7 +66,7 @@ FAMILY_OBJECTS = [
 )
 def test_mjx_agrees_with_c_mujoco_at_one_step_and_over_0_4_seconds(names):
     scenes = [load(name, friction=f) for name in names for f in FRICTION.values()]
-    model, fields = mjx_engine.stack([s.physics for s in scenes])
+    model, fields = stack([s.physics for s in scenes])
     data = mjx.make_data(scenes[0].physics)
     # Where capsule and face are exactly parallel, MJX reports both ends of the line of contact
     # and C MuJoCo one: the first step of a cylinder is compared before it touches.
@@ -166,11 +167,11 @@ def test_a_stack_holds_every_field_of_each_recompiled_model():
             ("hardware_box", FRICTION["S2"], 7.0),
         )
     ]
-    model, fields = mjx_engine.stack([s.physics for s in scenes])
+    model, fields = stack([s.physics for s in scenes])
     assert set(fields) == set(mjx_engine.FIELDS)
     for i, loaded in enumerate(scenes):
         applied = mjx_engine.apply(model, {name: values[i] for name, values in fields.items()})
-        alone, _ = mjx_engine.stack([loaded.physics])  # recompiled by itself
+        alone, _ = stack([loaded.physics])  # recompiled by itself
         jax.tree.map(np.testing.assert_array_equal, applied, alone)
 
 

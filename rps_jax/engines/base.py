@@ -152,12 +152,7 @@ class Engine(abc.ABC):
 
     @abc.abstractmethod
     def stage(
-        self,
-        family: str,
-        solids: Solid,
-        friction: Friction,
-        physics: Physics,
-        robots: Robot = Robot(),
+        self, family: str, solids: Solid, friction: Friction, physics: Physics, robots: Robot
     ) -> tuple[Any, Any]:
         """Return the stage, and fields (n, ...) on the host, of worlds of one shape family.
 

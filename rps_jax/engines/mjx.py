@@ -1,12 +1,12 @@
 """The engine MJX: MuJoCo's equations in JAX, for any scene.
 
 All objects of one shape family compile to the same MJX structure, so that one program steps a
-batch of them: `stack` collects the fields that differ, `apply` sets those of one world.
+batch of them: `fields_of` returns the fields that differ, `apply` sets those of one world.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, NamedTuple
@@ -152,18 +152,13 @@ class MJX(Engine):
             )
 
     def stage(
-        self,
-        family: str,
-        solids: Solid,
-        friction: Friction,
-        physics: Physics,
-        robots: Robot = Robot(),
+        self, family: str, solids: Solid, friction: Friction, physics: Physics, robots: Robot
     ) -> tuple[MJXStage, dict[str, np.ndarray]]:
         """Return the stage of the first of the worlds, and fields (n, ...) of all."""
         robots = scene.repeat_robot(robots, solids.mass.size)
         template = scene.compile_row(family, solids, friction, physics, 0, robots)
-        model, fields = stack([template.physics])
-        fields = mjx_fields(family, solids, friction, template, jax.device_get(fields))
+        model = put(template.physics)
+        fields = mjx_fields(family, solids, friction, template, fields_of(model))
         _size_bases(fields, template.physics, robots)
         if robots.driven:
             _weigh_bases(fields, template.physics, robots)
@@ -201,33 +196,18 @@ def put(model: mujoco.MjModel) -> mjx.Model:
     return on_device
 
 
-def stack(models: Sequence[mujoco.MjModel]) -> tuple[mjx.Model, dict[str, jax.Array]]:
-    """Return one MJX model for all, on the device, and the varying fields: name -> (n, ...).
+def fields_of(model: mjx.Model) -> dict[str, np.ndarray]:
+    """Return `FIELDS` of a model, which include all constants that MuJoCo derives from a mass.
 
-    The fields are always `FIELDS`, so that the numbers of a world do not depend on the batch. They
-    are copied from compiled models, so that they include all constants that MuJoCo derives from a
-    mass, a size or a friction.
-
-    Raises:
-      ValueError: the models differ in anything but `FIELDS`.
+    They are always the same fields, so that the numbers of a world do not depend on the batch.
     """
-    trees: list[Any] = [put(m) for m in models]
-    leaves, structures = zip(*map(jax.tree_util.tree_flatten_with_path, trees), strict=True)
-    if any(s != structures[0] for s in structures):
-        raise ValueError("models of different structure cannot be stacked")
-    fields = {}
-    for columns in zip(*leaves, strict=True):
-        name = jax.tree_util.keystr(columns[0][0])
-        values = [np.asarray(leaf) for _, leaf in columns]
-        if name in FIELDS:
-            fields[name] = jnp.stack(values)
-        elif any(not np.array_equal(v, values[0]) for v in values):
-            raise ValueError(f"models that differ in {name} cannot be stacked")
-    return trees[0], fields
+    leaves = jax.tree_util.tree_flatten_with_path(model)[0]
+    named = ((jax.tree_util.keystr(path), leaf) for path, leaf in leaves)
+    return {name: np.asarray(leaf) for name, leaf in named if name in FIELDS}
 
 
 def apply(model: mjx.Model, fields: dict[str, jax.Array]) -> mjx.Model:
-    """Return the model with the fields of one world, named as by `stack`."""
+    """Return the model with the fields of one world, named as by `fields_of`."""
     return jax.tree_util.tree_map_with_path(
         lambda path, leaf: fields.get(jax.tree_util.keystr(path), leaf), model
     )
@@ -236,9 +216,9 @@ def apply(model: mjx.Model, fields: dict[str, jax.Array]) -> mjx.Model:
 def mjx_fields(
     family: str, solids: Solid, friction: Friction, template: Scene, fields: dict[str, np.ndarray]
 ) -> dict[str, np.ndarray]:
-    """Return fields (n, ...) for solids, from those (1, ...) of a scene with another solid."""
+    """Return fields (n, ...) for solids, from those (...) of a scene with another solid."""
     count = solids.mass.size
-    new = {name: np.repeat(np.asarray(row, float), count, axis=0) for name, row in fields.items()}
+    new = {name: np.repeat(np.asarray(x, float)[None], count, axis=0) for name, x in fields.items()}
     model = template.physics
     body, mass = model.body("object").id, solids.mass
     com = solids.p_object_com + OFF_CENTRE

@@ -155,12 +155,7 @@ class MuJoCo(Engine):
         return True
 
     def stage(
-        self,
-        family: str,
-        solids: Solid,
-        friction: Friction,
-        physics: Physics,
-        robots: Robot = Robot(),
+        self, family: str, solids: Solid, friction: Friction, physics: Physics, robots: Robot
     ) -> tuple[list[mujoco.MjModel], dict[str, np.ndarray]]:
         """Return the models of the worlds; equal worlds share one."""
         count, models = solids.mass.size, dict[bytes, mujoco.MjModel]()

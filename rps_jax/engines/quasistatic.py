@@ -271,12 +271,7 @@ class QuasistaticEngine(Engine):
     computes_force = False  # only the direction of the force is known, not its size
 
     def stage(
-        self,
-        family: str,
-        solids: Solid,
-        friction: Friction,
-        physics: Physics,
-        robots: Robot = Robot(),
+        self, family: str, solids: Solid, friction: Friction, physics: Physics, robots: Robot
     ) -> tuple[Quasistatic, Slider]:
         """Return the stage, and the sliders (n, ...) of the worlds; bases follow every twist."""
         assert not robots.driven, "checked by check_robot"

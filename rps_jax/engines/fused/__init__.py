@@ -6,14 +6,13 @@
 from __future__ import annotations
 
 import functools
-from typing import NamedTuple
 
 import numpy as np
 
 from rps_jax.engines import device
-from rps_jax.engines.base import ControlPeriod, Driven, Engine, Motion
-from rps_jax.engines.fused import step
+from rps_jax.engines.base import Engine
 from rps_jax.engines.fused.contacts import Body
+from rps_jax.engines.fused.step import FusedStage
 from rps_jax.geometry import solid
 from rps_jax.geometry.solid import Solid
 from rps_jax.robot.robot import Robot
@@ -24,16 +23,6 @@ from rps_jax.world.scene import OFF_CENTRE, Friction
 _MAX_ON_PROCESSORS = 500  # trials that processors finish sooner than a GPU
 
 
-class FusedStage(NamedTuple):
-    """Stage of the fused engine, whose worlds share nothing."""
-
-    native = True
-
-    def drive(self, fields: Body, motion: Motion, period: ControlPeriod) -> Driven:
-        """Step a batch for one control period."""
-        return step.drive(fields, motion, period)
-
-
 class Fused(Engine):
     """MJX's equations, specialised to these scenes: the fastest engine on every device."""
 
@@ -42,18 +31,38 @@ class Fused(Engine):
     modes = ("forward",)
 
     def stage(
-        self,
-        family: str,
-        solids: Solid,
-        friction: Friction,
-        physics: Physics,
-        robots: Robot = Robot(),
+        self, family: str, solids: Solid, friction: Friction, physics: Physics, robots: Robot
     ) -> tuple[FusedStage, Body]:
         """Return the stage, and the bodies (n, ...) of the worlds."""
-        bodies = bodies_of(solids, friction, _template(physics))
-        bodies = bodies._replace(base_half=scene.base_half(robots, solids.mass.size))
+        com, axes = solids.p_object_com + OFF_CENTRE, solid.axes(solids)
+        base_invweight, base_z = _base(physics)
         if robots.driven:
-            bodies = bodies._replace(base_invweight=scene.base_invweight(robots))
+            base_invweight = scene.base_invweight(robots)
+
+        def lower(points: np.ndarray) -> np.ndarray:
+            """Return points (n, N, 2) of the lower face in the body's frame."""
+            z = np.broadcast_to(-solids.height[:, None, None] / 2, (*points.shape[:2], 1))
+            return (np.concatenate([points, z], axis=-1) - com[:, None]) @ axes
+
+        bodies = Body(
+            mass=solids.mass,
+            inertia=solids.inertia,
+            p_object_com=com,
+            q_object_body=solids.q_object_body,
+            vertices=lower(solids.vertices),
+            radius=solids.radius,
+            height=solids.height,
+            up=axes[:, 2],
+            friction_ground=friction.ground,
+            friction_robot=friction.robot,
+            invweight=1 / solids.mass,
+            base_invweight=np.broadcast_to(base_invweight, solids.mass.size),
+            base_half=scene.base_half(robots, solids.mass.size),
+            base_z=np.broadcast_to(base_z, (solids.mass.size, 2)),
+        )
+        if solids.feet is not None:
+            feet = lower(solids.feet[..., :2])
+            bodies = bodies._replace(feet=feet, bears=np.sign(solids.feet[..., 2:]))
         return FusedStage(), bodies
 
     def slots(self, backend: str) -> int:
@@ -71,54 +80,12 @@ class Fused(Engine):
 
 
 @functools.cache
-def _template(physics: Physics) -> Body:
-    """Return a body whose constants of the base are used."""
-    box = scene.load("box", physics)
-    return step.body(box.physics, box.solid.vertices)
-
-
-def _on_feet(bodies: Body, solids: Solid) -> Body:
-    """Return bodies (n, ...) that stand on the feet of solids, if these have feet."""
-    if solids.feet is None:
-        return bodies
-    low = np.broadcast_to(-solids.height[:, None, None] / 2, (*solids.feet.shape[:2], 1))
-    feet = np.concatenate([solids.feet[..., :2], low], axis=-1)
-    feet = (feet - bodies.p_object_com[:, None, :]) @ solid.axes(solids)
-    return bodies._replace(feet=feet, bears=np.sign(solids.feet[..., 2:]))
-
-
-def bodies_of(solids: Solid, friction: Friction, template: Body) -> Body:
-    """Return the bodies of solids, with the base of `template`."""
-    com = solids.p_object_com + OFF_CENTRE
-    corners = np.concatenate(
-        [
-            solids.vertices,
-            np.broadcast_to(-solids.height[:, None, None] / 2, (*solids.vertices.shape[:2], 1)),
-        ],
-        axis=-1,
-    )
-    axes = solid.axes(solids)
-    invweight, half, z = (
-        np.broadcast_to(x, (solids.mass.size, *np.shape(x)))
-        for x in (template.base_invweight, template.base_half, template.base_z)
-    )
-    bodies = Body(
-        mass=solids.mass,
-        inertia=solids.inertia,
-        p_object_com=com,
-        q_object_body=solids.q_object_body,
-        vertices=(corners - com[:, None, :]) @ axes,
-        radius=solids.radius,
-        height=solids.height,
-        up=axes[:, 2],
-        friction_ground=friction.ground,
-        friction_robot=friction.robot,
-        invweight=1 / solids.mass,
-        base_invweight=invweight,
-        base_half=half,
-        base_z=z,
-    )
-    return _on_feet(bodies, solids)
+def _base(physics: Physics) -> tuple[float, np.ndarray]:
+    """Return the inverse weight [1/kg] of the base, and the heights (2,) [m] of its edges."""
+    model = scene.load("box", physics).physics
+    body, geom = model.body("base"), model.geom("base")
+    z = geom.pos[2] + geom.size[2] * np.array([-1.0, 1.0])
+    return model.body_invweight0[body.id, 0], z
 
 
 ENGINE = Fused()

@@ -10,12 +10,10 @@ a compiler can keep a whole world in registers.
 from __future__ import annotations
 
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import mujoco
-import numpy as np
 
 from rps_jax.engines import native
 from rps_jax.engines.base import ControlPeriod, Driven, Motion
@@ -28,34 +26,6 @@ from rps_jax.robot import drive as drives
 from rps_jax.robot.robot import Robot
 from rps_jax.world.physics import Physics
 from rps_jax.world.scene import JOINTS
-
-
-def body(model: mujoco.MjModel, vertices: np.ndarray) -> Body:
-    """Return the body of a physics model and the vertices (N, 2) [m] of its footprint."""
-    object_body, base = model.body("object"), model.body("base")
-    geom, front = model.geom("object"), model.geom("base")
-    frame = sp.matrix(object_body.iquat)
-    round_ = len(vertices) == 1
-    half = object_body.pos[2]  # a scene starts with its object on the ground
-    bottom = np.column_stack([vertices, np.full(len(vertices), -half)])
-    pairs = [model.pair(i) for i in range(model.npair)]
-    friction = {pair.name.partition("_")[0]: pair.friction[0] for pair in pairs}
-    return Body(
-        mass=object_body.mass[0],
-        inertia=object_body.inertia.copy(),
-        p_object_com=object_body.ipos.copy(),
-        q_object_body=object_body.iquat.copy(),
-        vertices=np.array([sp.to_body(frame, v) for v in bottom - object_body.ipos]),
-        radius=geom.size[0] if round_ else 0.0,
-        height=2 * half,
-        up=np.array(sp.to_body(frame, (0.0, 0.0, 1.0))),
-        friction_ground=friction["ground"],
-        friction_robot=friction["base"],
-        invweight=model.body_invweight0[object_body.id, 0],
-        base_invweight=model.body_invweight0[base.id, 0],
-        base_half=front.size[:2].copy(),
-        base_z=front.pos[2] + front.size[2] * np.array([-1.0, 1.0]),
-    )
 
 
 def _split(array: Entries, at: slice = slice(None)) -> Entries:
@@ -157,15 +127,20 @@ def step(
     return State(base, p, q, v, w, a, alpha, driven, felt)  # type: ignore[arg-type]
 
 
-def drive(body: Body, motion: Motion, period: ControlPeriod) -> Driven:
-    """Step a batch of worlds (B,) for one control period.
+class FusedStage(NamedTuple):
+    """Stage of the fused engine, whose worlds share nothing."""
 
-    It is a function of C, or a kernel on an NVIDIA GPU, where they can be compiled; elsewhere, and
-    where it is differentiated, XLA compiles it.
-    """
-    steps = partial(_drive, physics=period.physics, force=period.force)
-    run = native.batched(steps, steps) if motion.qpos.ndim == 2 else steps
-    return run(body, motion, period.twists, period.robot)
+    native = True
+
+    def drive(self, fields: Body, motion: Motion, period: ControlPeriod) -> Driven:
+        """Step a batch of worlds (B,) for one control period.
+
+        It is a function of C, or a kernel on an NVIDIA GPU, where they can be compiled; elsewhere,
+        and where it is differentiated, XLA compiles it.
+        """
+        steps = partial(_drive, physics=period.physics, force=period.force)
+        run = native.batched(steps, steps) if motion.qpos.ndim == 2 else steps
+        return run(fields, motion, period.twists, period.robot)
 
 
 def _drive(
