@@ -12,16 +12,17 @@ Reference: MuJoCo documentation, "Computation: Constraint model" and "Solver".
 
 from __future__ import annotations
 
+import operator
 from collections.abc import Callable, Sequence
-from functools import partial
+from functools import partial, reduce
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 
-from rps_jax.engines.fused.contacts import Body, Contact, State
+from rps_jax.engines.fused.contacts import Body, Contact, Point, State
 from rps_jax.geometry import vectors as sp
-from rps_jax.geometry.arrays import Entries, Number
+from rps_jax.geometry.arrays import Number
 from rps_jax.geometry.solid import GRAVITY
 from rps_jax.geometry.vectors import Vec
 from rps_jax.world.physics import Physics
@@ -89,22 +90,22 @@ def _pyramid(contact: Contact, x: Vec, physics: Physics) -> tuple[Vec, tuple[Num
 
 
 class Base(NamedTuple):
-    """Base that its drive pushes, in the world's axes: x, y and about the vertical."""
+    """Base that its drive pushes, in the world's axes; zeros of one that follows every twist."""
 
-    inertia: Vec  # [kg, kg, kg m^2]
-    force: Vec  # [N, N, N m] of the drive
-    a: Vec  # [m/s^2, m/s^2, rad/s^2] last acceleration, the first guess
+    inertia: Vec = (0.0, 0.0, 0.0)  # [kg, kg, kg m^2]
+    force: Vec = (0.0, 0.0, 0.0)  # [N, N, N m] of the drive, about the vertical the last
 
 
-def _rows(contact: Contact, a: Vec, alpha: Vec, b: Vec | None) -> Vec:
+def _rows(contact: Contact, x: Sequence[Vec]) -> Vec:
     """Return J times accelerations: those of a contact's point along n, t, s.
 
-    The acceleration `b` of a base, at and about its origin, is subtracted.
+    The acceleration of a base, at and about its origin, is subtracted.
     """
+    a, alpha, *base = x
     u = sp.add(a, sp.cross(alpha, contact.r))
-    if b is not None and contact.arm is not None:
-        x, y = contact.arm
-        u = sp.sub(u, (b[0] - b[2] * y, b[1] + b[2] * x, 0.0))
+    if base and contact.arm is not None:
+        (b_x, b_y, turn), (arm_x, arm_y) = *base, contact.arm
+        u = sp.sub(u, (b_x - turn * arm_y, b_y + turn * arm_x, 0.0))
     return sp.dot(contact.n, u), sp.dot(contact.t, u), sp.dot(contact.s, u)
 
 
@@ -133,8 +134,8 @@ def accelerations(
     m: Sequence[Vec],
     contacts: list[Contact],
     physics: Physics,
-    base: Base | None = None,
-) -> tuple[Vec, Vec, Vec | None]:
+    base: Base = Base(),
+) -> list[Vec]:
     """Return the minimum of MuJoCo's convex cost.
 
     Newton's method with an exact line search finds it from the last accelerations. The solver ends
@@ -150,72 +151,64 @@ def accelerations(
     torque = sp.cross((i[0] * w[0], i[1] * w[1], i[2] * w[2]), w)  # - w x (I w)
     free = sp.to_world(m, (torque[0] / i[0], torque[1] / i[1], torque[2] / i[2]))
 
-    def gauss(a: Vec, alpha: Vec) -> tuple[Vec, Vec]:
-        """Return M (a - free accelerations)."""
+    def gauss(x: Sequence[Vec]) -> list[Vec]:
+        """Return M (x - free accelerations)."""
+        a, alpha, *b = x
         linear = sp.scale(body.mass, (a[0], a[1], a[2] + GRAVITY))
-        return linear, sp.to_world(i_w, sp.sub(alpha, free))
+        angular = sp.to_world(i_w, sp.sub(alpha, free))
+        return [linear, angular, *(sp.sub(_times(base.inertia, y), base.force) for y in b)]
 
-    def gradient(a: Vec, alpha: Vec, b: Vec | None):
-        linear, angular = gauss(a, alpha)
-        size = 6 if base is None else 9
-        h: list[list[Number]] = [[0.0] * size for _ in range(size)]
-        on_base: Entries = ()
-        if base is not None:
-            on_base = _imbalance(base, b)
-            for row in range(3):
-                h[6 + row][6 + row] = base.inertia[row]
+    def gradient(x: Sequence[Vec]) -> tuple[list[Number], list[list[Number]]]:
+        g = gauss(x)
+        h: list[list[Number]] = [[0.0] * 3 * len(x) for _ in range(3 * len(x))]
         for row in range(3):
+            if len(x) > 2:
+                h[6 + row][6 + row] = base.inertia[row]
             h[row][row] = body.mass
             for column in range(row + 1):
                 h[3 + row][3 + column] = i_w[row][column]
         for c in contacts:
-            x = sp.add(_rows(c, a, alpha, b), c.bias)
-            force, k = contact_force(c, x, physics)
+            force, k = contact_force(c, sp.add(_rows(c, x), c.bias), physics)
             f = sp.combine(force, (c.n, c.t, c.s))
-            linear = sp.sub(linear, _sums(f))
-            angular = sp.sub(angular, _sums(sp.cross(c.r, f)))
-            if base is not None and c.arm is not None:
-                on_base = sp.add(on_base, _sums(_on_base(c.arm, f)))
+            g[:2] = sp.sub(g[0], _sums(f)), sp.sub(g[1], _sums(sp.cross(c.r, f)))
+            if c.arm is not None:
+                g[2] = sp.add(g[2], _sums(_on_base(c.arm, f)))
             _stiffen(h, c, k)
-        return (*linear, *angular, *on_base), h
+        return [entry for block in g for entry in block], h
 
     def improve(carry):
-        count, a, alpha, b, active, _ = carry
-        g, h = gradient(a, alpha, b)
-        step = _solve(h, [-x for x in g])
-        d, delta = (step[0], step[1], step[2]), (step[3], step[4], step[5])
-        e: Entries = None if base is None else (step[6], step[7], step[8])
-        linear, angular = gauss(a, alpha)
-        slope = sp.dot(linear, d) + sp.dot(angular, delta)
-        bend = body.mass * sp.dot(d, d) + sp.dot(delta, sp.to_world(i_w, delta))
-        if base is not None:
-            slope = slope + sp.dot(_imbalance(base, b), e)
-            bend = bend + sp.dot(base.inertia, tuple(x * x for x in e))
-        lines = [
-            (c, sp.add(_rows(c, a, alpha, b), c.bias), _rows(c, d, delta, e)) for c in contacts
-        ]
+        count, x, active, _ = carry
+        g, h = gradient(x)
+        step = _solve(h, [-entry for entry in g])
+        d: list[Vec] = [(step[i], step[i + 1], step[i + 2]) for i in range(0, len(step), 3)]
+        slope = reduce(operator.add, map(sp.dot, gauss(x), d))
+        bend = body.mass * sp.dot(d[0], d[0]) + sp.dot(d[1], sp.to_world(i_w, d[1]))
+        for e in d[2:]:
+            bend = bend + sp.dot(base.inertia, _times(e, e))
+        lines = [(c, sp.add(_rows(c, x), c.bias), _rows(c, d)) for c in contacts]
         # Inner product of step and gradient: twice the decrease of a quadratic cost.
         gain = -sp.dot(step, g)
-        x = _line_search(lines, slope, bend, active * gain, physics)
+        length = _line_search(lines, slope, bend, active * gain, physics)
         continues = gain > 2 * body.mass * _TOLERANCE**2
         # A converged world stays while others continue, so that its result does not depend on them.
-        move = jnp.where(active > 0, jnp.where(continues, x, jnp.minimum(x, 1.0)), 0.0)
-        a, alpha = sp.add(a, sp.scale(move, d)), sp.add(alpha, sp.scale(move, delta))
-        b = None if base is None else sp.add(b, sp.scale(move, e))
+        move = jnp.where(continues, length, jnp.minimum(length, 1.0))
+        move = jnp.where(active > 0, move, 0.0)
+        x = [sp.add(y, sp.scale(move, e)) for y, e in zip(x, d, strict=True)]
         active = jnp.where(continues, active, 0.0)
-        return count + 1, a, alpha, b, active, _any(active)
+        return count + 1, x, active, _any(active)
 
     active = jnp.ones_like(body.mass)
-    start = (0, state.a, state.alpha, base and base.a, active, _any(active))
-    _, a, alpha, b, _, _ = jax.lax.while_loop(
-        lambda carry: (carry[0] < physics.iterations) & carry[5], improve, start
-    )
-    return a, alpha, b
+    start = [state.a, state.alpha, *([] if state.driven is None else [state.driven.a])]
+    return jax.lax.while_loop(
+        lambda carry: (carry[0] < physics.iterations) & carry[3],
+        improve,
+        (0, start, active, _any(active)),
+    )[1]
 
 
-def _imbalance(base: Base, b: Entries) -> Vec:
-    """Return M (b - free accelerations) of a base."""
-    return sp.sub(tuple(m * x for m, x in zip(base.inertia, b, strict=True)), base.force)
+def _times(a: Vec, b: Vec) -> Vec:
+    """Return the products of entries."""
+    return a[0] * b[0], a[1] * b[1], a[2] * b[2]
 
 
 def _on_base(arm: tuple[Number, Number], f: Vec) -> Vec:
@@ -224,33 +217,22 @@ def _on_base(arm: tuple[Number, Number], f: Vec) -> Vec:
 
 
 def wrench_on_base(
-    contact: Contact,
-    arm: tuple[Number, Number],
-    a: Vec,
-    alpha: Vec,
-    b: Vec | None,
-    turn: tuple[Number, Number],
-    physics: Physics,
+    contact: Contact, arm: tuple[Number, Number], x: Sequence[Vec], turn: Point, physics: Physics
 ) -> Vec:
     """Return the wrench of the object on the base [N, N, N m], about its origin, in its frame.
 
     Args:
       contact: contacts of the object with the base.
       arm: (C, ...) [m] to the contacts from the base's origin, in the world's axes.
-      a: [m/s^2] solution for the acceleration of the object's centre of mass.
-      alpha: [rad/s^2] solution for its angular acceleration.
-      b: solution for a base with a limited force; else None.
+      x: solution for the accelerations.
       turn: cosine and sine of the base's heading.
       physics: with the friction cone.
     """
-    force, _ = contact_force(contact, sp.add(_rows(contact, a, alpha, b), contact.bias), physics)
-    x, y, torque = _sums(_on_base(arm, sp.combine(force, (contact.n, contact.t, contact.s))))
+    force, _ = contact_force(contact, sp.add(_rows(contact, x), contact.bias), physics)
+    f_x, f_y, torque = _sums(_on_base(arm, sp.combine(force, (contact.n, contact.t, contact.s))))
     c, s = turn
-    return (
-        -(c * x + s * y),
-        -(c * y - s * x),
-        -torque,
-    )  # minus: the contacts' force is on the object
+    # Minus: the contacts' force is on the object.
+    return -(c * f_x + s * f_y), -(c * f_y - s * f_x), -torque
 
 
 def _sums(vector: Vec) -> Vec:

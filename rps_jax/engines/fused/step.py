@@ -10,7 +10,7 @@ a compiler can keep a whole world in registers.
 from __future__ import annotations
 
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -88,33 +88,31 @@ def step(
     """
     m, dt, driven = sp.matrix(state.q), physics.timestep, state.driven
     contacts = [on_ground(body, state, m, physics), on_base(body, state, m, twist, physics)]
-    if robot is None or driven is None:
-        a, alpha, _ = accelerations(body, state, m, contacts, physics)
-    else:
-        turn = jnp.cos(state.base[2]), jnp.sin(state.base[2])
+    turn = jnp.cos(state.base[2]), jnp.sin(state.base[2])
+    base = Base()
+    if robot is not None and driven is not None:
         force, integral = drives.push(robot, driven.integral, twist, driven.v, turn, dt)
-        base = Base((robot.mass, robot.mass, robot.inertia), force, driven.a)
-        b: Any
-        a, alpha, b = accelerations(body, state, m, contacts, physics, base)
-        driven = DrivenBase(sp.add(driven.v, sp.scale(dt, b)), b, integral)
+        base = Base((robot.mass, robot.mass, robot.inertia), force)
+        driven = driven._replace(integral=integral)
+    x = accelerations(body, state, m, contacts, physics, base)
+    a, alpha, *b = x
+    if driven is not None:
+        driven = driven._replace(v=sp.add(driven.v, sp.scale(dt, b[0])), a=b[0])
     felt = state.felt
     if felt is not None:
         offset = (state.p[0] - state.base[0], state.p[1] - state.base[1])
         arm = (contacts[1].r[0] + offset[0], contacts[1].r[1] + offset[1])
-        turn = jnp.cos(state.base[2]), jnp.sin(state.base[2])
-        b = None if driven is None else driven.a
-        felt = sp.add(felt, wrench_on_base(contacts[1], arm, a, alpha, b, turn, physics))
+        felt = sp.add(felt, wrench_on_base(contacts[1], arm, x, turn, physics))
     v = sp.add(state.v, sp.scale(dt, a))
     w = sp.add(state.w, sp.scale(dt, sp.to_body(m, alpha)))
     angle = sp.scale(dt, w)
     half = 0.5 * sp.norm(angle)
     # Taylor series: the angles of one step are small.
     sinc = 0.5 * (1 - half * half / 6)
-    turn = (1 - half * half / 2 + half**4 / 24, *sp.scale(sinc, angle))
-    q = sp.times(state.q, turn)
+    q = sp.times(state.q, (1 - half * half / 2 + half**4 / 24, *sp.scale(sinc, angle)))
     length = jax.lax.rsqrt(sp.dot(q, q))
     if driven is None:
-        c, s = jnp.cos(state.base[2]), jnp.sin(state.base[2])
+        c, s = turn
         base = (
             state.base[0] + dt * (c * twist[0] - s * twist[1]),
             state.base[1] + dt * (s * twist[0] + c * twist[1]),
