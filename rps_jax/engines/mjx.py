@@ -37,7 +37,7 @@ from rps_jax.robot import drive as drives
 from rps_jax.robot.robot import Robot
 from rps_jax.world import scene
 from rps_jax.world.physics import Physics
-from rps_jax.world.scene import JOINTS, OFF_CENTRE, Friction, Scene
+from rps_jax.world.scene import JOINTS, OFF_CENTRE, Friction
 
 # Fields that differ between objects of one shape family, as paths into an MJX model.
 FIELDS = (
@@ -156,13 +156,10 @@ class MJX(Engine):
     ) -> tuple[MJXStage, dict[str, np.ndarray]]:
         """Return the stage of the first of the worlds, and fields (n, ...) of all."""
         robots = scene.repeat_robot(robots, solids.mass.size)
-        template = scene.compile_row(family, solids, friction, physics, 0, robots)
-        model = put(template.physics)
-        fields = mjx_fields(family, solids, friction, template, fields_of(model))
-        _size_bases(fields, template.physics, robots)
-        if robots.driven:
-            _weigh_bases(fields, template.physics, robots)
-        return MJXStage(model, mjx.make_data(template.physics)), fields
+        template = scene.compile_row(family, solids, friction, physics, 0, robots).physics
+        model = put(template)
+        fields = mjx_fields(family, solids, friction, robots, template, fields_of(model))
+        return MJXStage(model, mjx.make_data(template)), fields
 
     def slots(self, backend: str) -> int:
         """Return the number of worlds that one worker steps at once: few for small CPU caches."""
@@ -214,12 +211,12 @@ def apply(model: mjx.Model, fields: dict[str, jax.Array]) -> mjx.Model:
 
 
 def mjx_fields(
-    family: str, solids: Solid, friction: Friction, template: Scene, fields: dict[str, np.ndarray]
-) -> dict[str, np.ndarray]:
-    """Return fields (n, ...) for solids, from those (...) of a scene with another solid."""
+    family: str, solids: Solid, friction: Friction, robots: Robot, model: mujoco.MjModel,
+    fields: dict[str, np.ndarray],
+) -> dict[str, np.ndarray]:  # fmt: skip
+    """Return fields (n, ...) of worlds, from those (...) of a model of the first."""
     count = solids.mass.size
     new = {name: np.repeat(np.asarray(x, float)[None], count, axis=0) for name, x in fields.items()}
-    model = template.physics
     body, mass = model.body("object").id, solids.mass
     com = solids.p_object_com + OFF_CENTRE
     turn = solid.axes(solids)
@@ -230,7 +227,6 @@ def mjx_fields(
     new[".qpos0"][:, z] = new[".qpos_spring"][:, z] = solids.height / 2
     new[".body_ipos"][:, body], new[".body_iquat"][:, body] = com, solids.q_object_body
     new[".body_mass"][:, body] = new[".body_subtreemass"][:, body] = mass
-    new[".body_subtreemass"][:, 0] = new[".body_mass"].sum(axis=1)
     new[".body_inertia"][:, body] = solids.inertia
     spin = np.mean(1 / solids.inertia, axis=1)
     new[".body_invweight0"][:, body] = np.stack([1 / mass, spin], axis=-1)
@@ -241,8 +237,11 @@ def mjx_fields(
     about = moments - mass[:, None, None] * (arm @ arm)
     new[".dof_M0"][:, 3:6] = mass[:, None]
     new[".dof_M0"][:, 6:9] = np.diagonal(about, axis1=1, axis2=2)
+    if robots.driven:
+        _weigh_bases(new, model, robots)
+    new[".body_subtreemass"][:, 0] = new[".body_mass"].sum(axis=1)
     new[".stat.meaninertia"] = new[".dof_M0"].mean(axis=1)
-    _size_geoms(family, solids, template, new)
+    _size_geoms(family, solids, robots, model, new)
     if solids.feet is not None:
         new[OUTLINE] = solids.vertices
     robot = np.array([model.pair(i).name == "base_object" for i in range(model.npair)])
@@ -252,45 +251,33 @@ def mjx_fields(
     return new
 
 
-def _size_bases(fields: dict[str, np.ndarray], model: mujoco.MjModel, robots: Robot) -> None:
-    """Set size, bounding box and radius of the bases of robots (n,)."""
-    geom = model.geom("base").id
-    size = fields[".geom_size"][:, geom]
-    size[:, :2] = scene.base_half(robots, len(size))
-    box = np.concatenate([0 * size, size], axis=-1)
-    fields[".geom_aabb"][:, geom] = box.reshape(fields[".geom_aabb"][:, geom].shape)
-    fields[".geom_rbound"][:, geom] = np.linalg.norm(size, axis=1)
-
-
-def _weigh_bases(fields: dict[str, np.ndarray], model: mujoco.MjModel, robots: Robot) -> None:
+def _weigh_bases(new: dict[str, np.ndarray], model: mujoco.MjModel, robots: Robot) -> None:
     """Set the masses of bases (n,) with a limited force, and the derived constants."""
     base = model.body("base").id
     mass, inertia = np.asarray(robots.mass, float), np.asarray(robots.inertia, float)
-    fields[".body_mass"][:, base] = fields[".body_subtreemass"][:, base] = mass
-    fields[".body_subtreemass"][:, 0] = fields[".body_mass"].sum(axis=1)
-    fields[".body_inertia"][:, base] = inertia[:, None]
-    fields[".body_invweight0"][:, base] = np.stack(
-        [scene.base_invweight(robots), 1 / (3 * inertia)], axis=-1
-    )
+    new[".body_mass"][:, base] = new[".body_subtreemass"][:, base] = mass
+    new[".body_inertia"][:, base] = inertia[:, None]
+    invweight = np.stack([scene.base_invweight(robots), 1 / (3 * inertia)], axis=-1)
+    new[".body_invweight0"][:, base] = invweight
     weights = np.stack([mass, mass, inertia], axis=-1)
-    fields[".dof_M0"][:, :3], fields[".dof_invweight0"][:, :3] = weights, 1 / weights
-    fields[".stat.meaninertia"] = fields[".dof_M0"].mean(axis=1)
+    new[".dof_M0"][:, :3], new[".dof_invweight0"][:, :3] = weights, 1 / weights
 
 
-def _size_geoms(family: str, solids: Solid, template: Scene, new: dict[str, np.ndarray]) -> None:
-    """Set sizes, bounding boxes and radii of the object's geoms."""
-    model, half = template.physics, solids.height / 2
-    for name, size in scene.geom_sizes(family, solids).items():
-        geom = model.geom(name).id
-        new[".geom_size"][:, geom] = size
-        box = size if family == "box" else size[:, [0, 0, 1]]
-        bound = np.linalg.norm(size[:, :3] if family == "box" else size[:, :2], axis=1)
+def _size_geoms(
+    family: str, solids: Solid, robots: Robot, model: mujoco.MjModel, new: dict[str, np.ndarray]
+) -> None:
+    """Set sizes, bounding boxes and radii of the geoms of bases and objects."""
+    half, base = solids.height / 2, new[".geom_size"][:, model.geom("base").id].copy()
+    base[:, :2] = scene.base_half(robots, len(base))
+    for name, size in {"base": base, **scene.geom_sizes(family, solids)}.items():
+        geom, is_box = model.geom(name).id, name == "base" or family == "box"
+        box = size if is_box else size[:, [0, 0, 1]]
+        bound = np.linalg.norm(size[:, :3] if is_box else size[:, :2], axis=1)
         if name == "object_side":  # a capsule reaches farther up by its radius
             box, bound = box + [0, 0, 1] * size[:, :1], half + solids.radius
-        new[".geom_aabb"][:, geom] = np.concatenate([0 * box, box], axis=-1).reshape(
-            new[".geom_aabb"][:, geom].shape
-        )
-        new[".geom_rbound"][:, geom] = bound
+        new[".geom_size"][:, geom], new[".geom_rbound"][:, geom] = size, bound
+        aabb = new[".geom_aabb"][:, geom]
+        aabb[:] = np.concatenate([0 * box, box], axis=-1).reshape(aabb.shape)
     if family == "prism" or solids.feet is not None:
         for i, at in enumerate(scene.foot_positions(solids).swapaxes(0, 1)):
             new[".geom_pos"][:, model.geom(f"foot_{i}").id] = at

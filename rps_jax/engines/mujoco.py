@@ -83,20 +83,14 @@ class Batch:
         if self._robots is not None:
             self._push(rows, twist, substeps)
             return
-        models = [self.models[i] for i in rows]
-        state = self.state[rows]
-        nq = self.qpos.shape[1]
+        state, warmstart, nq = self.state[rows], self.warmstart[rows], self.qpos.shape[1]
         v_x, v_y, omega = twist.T
         yaw = state[:, 1 + JOINTS.base.start + 2] + omega * (substeps * self._timestep / 2)
         c, s = np.cos(yaw), np.sin(yaw)
         state[:, 1 + nq :][:, JOINTS.base] = np.stack(
             [c * v_x - s * v_y, s * v_x + c * v_y, omega], axis=1
         )
-        warmstart = self.warmstart[rows]
-        states, _ = self._pool.rollout(
-            models, self._data, state, nstep=substeps, initial_warmstart=warmstart
-        )
-        states = np.asarray(states)
+        states = self._rollout(rows, state, warmstart, nstep=substeps)
         previous = states[:, -2] if substeps > 1 else state
         # By Euler's rule, the last change of velocity is the acceleration: the next first guess.
         change = states[:, -1, 1 + nq :] - previous[:, 1 + nq :]
@@ -108,7 +102,7 @@ class Batch:
 
     def _push(self, rows: np.ndarray, twist: np.ndarray, substeps: int) -> None:
         """Step the worlds `rows` with their bases pushed by their drives towards `twist`."""
-        models, dt = [self.models[i] for i in rows], self._timestep
+        dt = self._timestep
         robots = jax.tree.map(lambda leaf: np.asarray(leaf, float)[rows], self._robots)
         assert self.integral is not None
         state, warmstart = self.state[rows], self.warmstart[rows]
@@ -120,16 +114,7 @@ class Batch:
             turn, base = (np.cos(yaw), np.sin(yaw)), tuple(qvel[:, JOINTS.base].T)
             force, integral = drives.push(robots, integral, tuple(twist.T), base, turn, dt, np)
             applied[:, 0, JOINTS.base] = np.stack(force, axis=1)
-            states, _ = self._pool.rollout(
-                models,
-                self._data,
-                state,
-                applied,
-                control_spec=int(mujoco.mjtState.mjSTATE_QFRC_APPLIED),
-                nstep=1,
-                initial_warmstart=warmstart,
-            )
-            following = np.asarray(states)[:, -1]
+            following = self._rollout(rows, state, warmstart, control=applied, nstep=1)[:, -1]
             warmstart = (following[:, 1 + nq :] - qvel) / dt
             contact = self._inertia[rows] * warmstart[:, JOINTS.base] - np.stack(force, axis=1)
             wrench += _in_base(contact, turn) / substeps
@@ -137,6 +122,14 @@ class Batch:
         self.state[rows], self.warmstart[rows] = state, warmstart
         self.integral[rows] = np.stack(integral, axis=1)
         self.force[rows] = wrench
+
+    def _rollout(
+        self, rows: np.ndarray, state: np.ndarray, warmstart: np.ndarray, **options: Any
+    ) -> np.ndarray:
+        """Return the states (n, steps, ...) of the worlds `rows`; `control` are forces."""
+        models, forces = [self.models[i] for i in rows], mujoco.mjtState.mjSTATE_QFRC_APPLIED
+        options |= {"control_spec": int(forces), "initial_warmstart": warmstart}
+        return np.asarray(self._pool.rollout(models, self._data, state, **options)[0])
 
     def close(self) -> None:
         """Stop the threads, and restore MuJoCo's warnings."""

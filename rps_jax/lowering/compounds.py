@@ -145,7 +145,7 @@ def _gather(
         for start, axis in zip(row, axes.start_index_map, strict=True):
             starts[axis] = start
             inside += [start >= 0, start <= x.shape[axis] - slice_sizes[axis]]
-        (block,) = [lax.dynamic_slice_p.bind(x, *starts, slice_sizes=slice_sizes)]
+        block = lax.dynamic_slice_p.bind(x, *starts, slice_sizes=slice_sizes)
         if "FILL" in str(mode).upper() and inside:
             fill = _FILL[x.dtype.kind]
             block = jnp.where(functools.reduce(operator.and_, inside), block, fill)
@@ -154,6 +154,16 @@ def _gather(
     result = stacked.reshape(*indices.shape[:-1], *stacked.shape[1:])
     rest = [i for i in range(result.ndim) if i not in axes.offset_dims]
     return jnp.moveaxis(result, range(len(rest)), rest)
+
+
+def _scatter_add(
+    x: jax.Array, indices: jax.Array, updates: jax.Array, unique_indices: bool, **params: Any
+) -> jax.Array:
+    """Add updates at indices: the sum of the array and of updates or zeros."""
+    if not unique_indices:
+        raise UnsupportedError("scatter-add")
+    params |= {"unique_indices": True, "update_jaxpr": None, "update_consts": ()}
+    return x + lax.scatter_p.bind(jnp.zeros_like(x), indices, updates, **params)
 
 
 # Functions by the name of an operation (see `target.operation_of`), or of a primitive of any kind.
@@ -186,4 +196,5 @@ COMPOUNDS: dict[str, Function] = {
     "cummax": _cumulative(lax.max),
     "cummin": _cumulative(lax.min),
     "gather": _gather,
+    "scatter-add": _scatter_add,
 }  # fmt: skip

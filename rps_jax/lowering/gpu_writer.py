@@ -207,13 +207,13 @@ class GpuWriter(SimdWriter):
     def element(self, node: Node) -> str:
         if self._is_scalar(node):
             return node.name
-        return f"{node.name}[i * WORLDS]" if node in self._shared else f"{node.name}[s]"
+        return f"{node.name}[i * WORLDS]" if node.stored in self._shared else f"{node.name}[s]"
 
     def item(self, node: Node, index: int | str) -> str:
         """Return an element that any thread may store."""
         if node.width == 1:
             return node.name
-        if node in self._shared:
+        if node.stored in self._shared:
             return f"{node.name}[({index}) * WORLDS]"
         if not self._is_scalar(node):
             raise AssertionError(f"{node.name} is not in shared memory")
@@ -221,7 +221,7 @@ class GpuWriter(SimdWriter):
 
     def _broadcast(self, node: Node, index: int) -> str:
         """Return an element at a constant index, in all threads."""
-        if node.width == 1 or node in self._shared:
+        if node.width == 1 or node.stored in self._shared:
             return self.item(node, index)
         key = node.id, index
         if key not in self._broadcasts:
@@ -258,7 +258,7 @@ class GpuWriter(SimdWriter):
     def statement(self, lines: Sequence[str], written: Iterable[Node] = ()) -> list[str]:
         """Return statements after those that they need, with barriers around shared writes."""
         pending, self._pending = self._pending, []
-        if any(node in self._shared for node in written):
+        if any(node.stored in self._shared for node in written):
             return [*pending, "__syncwarp();", *lines, "__syncwarp();"]
         return [*pending, *lines]
 
@@ -358,18 +358,15 @@ class GpuWriter(SimdWriter):
 def _shared_arrays(nodes: Iterable[Node], roots: Iterable[Result]) -> set[Node]:
     """Return the arrays that a thread reads where another has written."""
     shared: set[Node] = set()
-    parts: list[tuple[Node, Node]] = []
 
     def read(a: Value, size: int, in_step: bool = True) -> None:
         if not isinstance(a, Array) or a.node.width == 1:
             return
         if not (in_step and a.step == 1 and a.first == 0 and a.node.width == size):
-            shared.add(a.node)
+            shared.add(a.node.stored)
 
     def visit(group: Iterable[Node]) -> None:
         for node in group:
-            if node.op == "part":
-                parts.append((node, node.extra))
             if isinstance(node, LoopNode):
                 for carried, *values in zip(node.carried, node.args, node.results, strict=True):
                     for a in values:
@@ -383,7 +380,4 @@ def _shared_arrays(nodes: Iterable[Node], roots: Iterable[Result]) -> set[Node]:
     visit(nodes)
     for result in roots:
         read(result.value, result.size)
-    for part, carried in parts:
-        if part in shared or carried in shared:
-            shared |= {part, carried}
     return shared

@@ -12,7 +12,7 @@ import functools
 import itertools
 from collections.abc import Hashable, Iterable, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 from jax.extend.core import ClosedJaxpr
@@ -58,8 +58,13 @@ class Node:
 
     @property
     def name(self) -> str:
-        """Variable in the printed code; a part of a loop's results is that of its carry."""
-        return self.extra.name if self.op == "part" else f"v{self.id}"
+        """Variable in the printed code."""
+        return f"v{self.stored.id}"
+
+    @property
+    def stored(self) -> Node:
+        """Node that stores it: a part of a loop's results is stored in the loop's carry."""
+        return self.extra if self.op == "part" else self
 
     @property
     def needed(self) -> Iterable[Node]:
@@ -111,6 +116,9 @@ class Array(NamedTuple):
     def dtype(self) -> np.dtype:
         """Type of the numbers in JAX."""
         return np.dtype(_DTYPES[self.node.kind])
+
+
+Factor: TypeAlias = tuple[Value, np.ndarray]  # a value and its flat indices (batch, rows, summed)
 
 
 class SimdNodes(Target):
@@ -221,36 +229,37 @@ class SimdNodes(Target):
         return result
 
     def _product(self, lhs: Value, rhs: Value, dimensions: Any, out: Typed) -> Value:
-        """Multiply matrices: sums over the rows of one, elementwise over those of the other."""
+        """Multiply matrices."""
         (lhs_sum, rhs_sum), (lhs_batch, rhs_batch) = dimensions
-        sides = [
+        sides: list[Factor] = [
             (lhs, matrix_indices(lhs, lhs_batch, lhs_sum)),
             (rhs, matrix_indices(rhs, rhs_batch, rhs_sum)),
         ]
-        sizes = [indices.shape[1] for _, indices in sides]
+        rows = [indices.shape[1] for _, indices in sides]
         if size_of(out.shape) * sides[0][1].shape[2] > self.max_products:
             raise TooLargeError("XLA compiles large products of matrices to faster code.")
         # Elementwise over the constant matrix, else over the longer one.
         constant = [is_constant(value) for value, _ in sides]
-        long = constant.index(True) if any(constant) else int(sizes[1] > sizes[0])
-        (rows_of, row_indices), (scalar_of, scalar_indices) = sides[long], sides[1 - long]
-        template = np.empty(sizes[long], out.dtype)
-        parts = []
-        for batch, row in np.ndindex(*scalar_indices.shape[:2]):
-            total = None
-            for k in range(scalar_indices.shape[2]):
-                repeated = np.full(template.shape, scalar_indices[batch, row, k])
-                pair = [
-                    self._at(rows_of, row_indices[batch, :, k], template),
-                    self._at(scalar_of, repeated, template),
-                ]
-                term = self.apply("mul", pair, {}, template)
-                total = term if total is None else self.apply("add", [total, term], {}, template)
-            parts.append(np.zeros_like(template) if total is None else total)
-        indices = np.arange(size_of(out.shape)).reshape(*scalar_indices.shape[:2], sizes[long])
+        long = constant.index(True) if any(constant) else int(rows[1] > rows[0])
+        parts = self.products(sides[long], sides[1 - long], out.dtype)
+        indices = np.arange(size_of(out.shape)).reshape(-1, rows[1 - long], rows[long])
         if long == 0:  # the rows of the left factor come first
             indices = indices.swapaxes(1, 2)
         return self.moved(parts, indices.reshape(out.shape), out)
+
+    def products(self, long: Factor, other: Factor, dtype: np.dtype) -> list[Value]:
+        """Return the product of a matrix with each row of another, elementwise over its rows."""
+        (_, indices), (_, other_indices) = long, other
+        template, parts = np.empty(indices.shape[1], dtype), []
+        for batch, row in np.ndindex(*other_indices.shape[:2]):
+            total = None
+            for k, index in enumerate(other_indices[batch, row]):
+                at = indices[batch, :, k], np.full(template.shape, index)
+                pair = [self._at(x[0], i, template) for x, i in zip((long, other), at, strict=True)]
+                term = self.apply("mul", pair, {}, template)
+                total = term if total is None else self.apply("add", [total, term], {}, template)
+            parts.append(np.zeros_like(template) if total is None else total)
+        return parts
 
     def _at(self, value: Value, indices: np.ndarray, template: Typed) -> Value:
         """Return numbers of a value at constant indices."""

@@ -9,29 +9,26 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Collection, Sequence
-from typing import Any
 
 import numpy as np
 
 from rps_jax.lowering.nodes import (
     Array,
+    Factor,
     LoopNode,
     Node,
     SimdNodes,
     element,
     flat,
     key_of,
-    matrix_indices,
     reached,
 )
 from rps_jax.lowering.target import (
     Body,
-    Typed,
     UnsupportedError,
     Value,
     is_constant,
     kind_of,
-    size_of,
 )
 
 _LARGE = 256  # weights of a matrix from which on a product is a loop over its rows
@@ -63,24 +60,14 @@ class ScalarNodes(SimdNodes):
         """Refuse a loop whose length is unknown: a control step has a deadline."""
         raise UnsupportedError("while")
 
-    def _product(self, lhs: Value, rhs: Value, dimensions: Any, out: Typed) -> Value:
-        (lhs_sum, rhs_sum), (lhs_batch, rhs_batch) = dimensions
-        rows = matrix_indices(lhs, lhs_batch, lhs_sum)
-        columns = matrix_indices(rhs, rhs_batch, rhs_sum)
-        shape = (rows.shape[1], columns.shape[1])
-        if lhs_batch or kind_of(out.dtype) != "f":
-            return super()._product(lhs, rhs, dimensions, out)
-        if is_constant(rhs) and columns.size >= _LARGE:
-            matrix = np.reshape(rhs, -1)[columns[0]].T
-            product = self._times_matrix(self._rows(lhs, rows[0]), matrix)
-            indices = np.arange(size_of(shape))
-        elif is_constant(lhs) and rows.size >= _LARGE:
-            matrix = np.reshape(lhs, -1)[rows[0]].T
-            product = self._times_matrix(self._rows(rhs, columns[0]), matrix)
-            indices = np.arange(size_of(shape)).reshape(shape[::-1]).T
-        else:
-            return super()._product(lhs, rhs, dimensions, out)
-        return self.moved([product], indices.reshape(out.shape), out)
+    def products(self, long: Factor, other: Factor, dtype: np.dtype) -> list[Value]:
+        matrix, indices = long
+        is_large = is_constant(matrix) and len(indices) == 1 and indices.size >= _LARGE
+        if not is_large or dtype.kind != "f":
+            return super().products(long, other, dtype)
+        value, rows = other
+        columns = np.reshape(matrix, -1)[indices[0]].T
+        return [self._times_matrix(self._rows(value, rows[0]), columns)]
 
     def _rows(self, value: Value, indices: np.ndarray) -> list[list[Value]]:
         return [[self.source(value, int(i)) for i in row] for row in indices]

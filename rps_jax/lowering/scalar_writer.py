@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import hashlib
 from collections.abc import Mapping, Sequence
 from typing import ClassVar, NamedTuple
 
@@ -69,21 +68,10 @@ class ScalarWriter(Writer):
         """Return an array of zeros."""
         raise NotImplementedError
 
-    def packed(self, name: str, array: np.ndarray) -> str:
-        """Return the declaration of a table of constants."""
-        raise NotImplementedError
-
     # --- expressions ---
 
     def number(self, text: str, kind: str) -> str:
         return f"({text})" if "-" in text.split("e")[0] else text
-
-    def table(self, array: np.ndarray) -> str:
-        digest = hashlib.sha256(array.dtype.str.encode() + array.tobytes()).hexdigest()[:8]
-        name = f"{self.prefix}_w_{digest}"
-        if name not in self.tables:
-            self.tables[name] = self.packed(name, array)
-        return name
 
     def call(self, op: str, operands: Sequence[str]) -> str:
         return self.spelling[op].format(*operands, p=self.prefix, P=self.prefix.upper())

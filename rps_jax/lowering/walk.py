@@ -121,8 +121,6 @@ def _results(eqn: JaxprEqn, values: list[Value], target: Target) -> Sequence[Val
         sources = [0, 2] if name == "scatter" else list(range(count))
         if all(is_constant(v) for i, v in enumerate(values) if i not in sources):
             return _moved(eqn, values, sources, target)
-    if name == "scatter-add" and is_constant(values[1]) and params["unique_indices"]:
-        return [_scatter_add(eqn, values, target)]
     if name == "threefry2x32":  # one operation for each of its two results
         return [target.apply(f"{name}_{i}", values, params, out) for i, out in enumerate(outs)]
     if len(outs) != 1:
@@ -224,18 +222,6 @@ def _moved_by_numpy(eqn: JaxprEqn, arrays: list[Value]) -> list[np.ndarray] | No
     if name == "split":
         return np.split(arrays[0], np.cumsum(params["sizes"])[:-1], params["axis"])
     return None
-
-
-def _scatter_add(eqn: JaxprEqn, values: list[Value], target: Target) -> Value:
-    """Add updates at constant indices: the sum of the array and of updates or zeros."""
-    array, at, updates = values
-    out: Any = eqn.outvars[0].aval
-    shape = np.shape(updates)
-    tags = jnp.asarray(1 + np.arange(size_of(shape)).reshape(shape), out.dtype)
-    zeros = jnp.zeros(np.shape(array), out.dtype)
-    (indices,) = _bind(eqn, [zeros, at, tags])
-    more = target.moved([np.zeros(1, out.dtype), updates], np.asarray(indices, int), out)
-    return _apply("add", [array, more], [out, out], {}, out, target)
 
 
 def _scan(eqn: JaxprEqn, values: list[Value], target: Target) -> list[Value]:

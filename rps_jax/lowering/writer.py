@@ -6,6 +6,7 @@ prints vectors with a lane for each world; `gpu_writer` and `scalar_writer` have
 
 from __future__ import annotations
 
+import hashlib
 import itertools
 import math
 from collections.abc import Collection, Iterable, Mapping, Sequence
@@ -58,9 +59,10 @@ class Writer:
 
     index = "int"  # type of a loop's index
     types: Mapping[str, str] = TYPES  # of variables
+    prefix = ""  # of all names
 
     def __init__(self) -> None:
-        self.tables: dict[str, str] = {}  # declarations of constants before the function
+        self.tables: dict[str, str] = {}  # declarations of constants before the function, by name
 
     # --- what a language defines ---
 
@@ -80,9 +82,17 @@ class Writer:
         """Return a constant, or an element of a table, as an operand."""
         raise NotImplementedError
 
+    def packed(self, name: str, array: np.ndarray) -> str:
+        """Return the declaration of a table of constants."""
+        raise NotImplementedError
+
     def table(self, array: np.ndarray) -> str:
         """Return the name of a table of constants."""
-        raise NotImplementedError
+        digest = hashlib.sha256(array.dtype.str.encode() + array.tobytes()).hexdigest()[:8]
+        name = f"{self.prefix}_w_{digest}"
+        if name not in self.tables:
+            self.tables[name] = self.packed(name, array)
+        return name
 
     def listed(self, texts: Iterable[str]) -> str:
         """Return an array of these elements."""
@@ -289,15 +299,11 @@ class SimdWriter(Writer):
     def number(self, text: str, kind: str) -> str:
         return f"all_{kind}({text})"
 
-    def table(self, array: np.ndarray) -> str:
-        key = f"{array.dtype.str}{array.tobytes()}"
+    def packed(self, name: str, array: np.ndarray) -> str:
         kind = kind_of(array.dtype)
-        if key not in self.tables:
-            texts = ", ".join(literal(x, kind) for x in array.reshape(-1))
-            stored = "int" if kind == "b" else STORED[kind]
-            name = f"t{len(self.tables)}"
-            self.tables[key] = f"{self.table_type} {stored} {name}[{array.size}] = {{{texts}}};"
-        return self.tables[key].split("[")[0].split()[-1]
+        texts = self.listed(literal(x, kind) for x in array.reshape(-1))
+        stored = "int" if kind == "b" else STORED[kind]
+        return f"{self.table_type} {stored} {name}[{array.size}] = {texts};"
 
     def single(self, node: Node) -> list[str]:
         at = f"* {node.size} + i]"

@@ -212,15 +212,19 @@ def meetings(
         return x + slope[0] * rise, y + slope[1] * rise
 
     def on_object(
-        z: Number, normal: Point, surface: Point, distance: Number
-    ) -> tuple[Number, Number]:
-        """Return heights and distances, with points below the lower face moved up to it."""
+        z: Number, normal: Point, point: Point, distance: Number, depth: Number
+    ) -> tuple[Number, Point, Point, Number]:
+        """Return contacts whose points below the lower face are moved up to it.
+
+        The object's surface is `depth` [m] along the normal from the points.
+        """
         middle, face = in_base((0.0, 0.0, 0.0)), sp.dot(body.up, feet)
         face = sp.greatest(face) if isinstance(body.vertices, Corners) else face
+        surface = (point[0] + depth * normal[0], point[1] + depth * normal[1])
         away = (surface[0] - middle[0], surface[1] - middle[1])
         above = up[2] * (sp.dot(slope, away) + z - middle[2]) - face
         rise = jnp.clip(-above * up[2], 0.0, high - z)
-        return z + rise, distance + sp.dot(slope, normal) * rise
+        return z + rise, normal, point, distance + sp.dot(slope, normal) * rise
 
     if not isinstance(body.vertices, Corners):
         z = jnp.where(_index(2, body.radius) == 0, low, high)
@@ -231,9 +235,7 @@ def meetings(
         wider = body.radius * (jnp.sqrt(1 + lean * lean) - 1)
         point = (point[0] - 0.5 * wider * normal[0], point[1] - 0.5 * wider * normal[1])
         distance = distance - wider
-        surface = (point[0] + 0.5 * distance * normal[0], point[1] + 0.5 * distance * normal[1])
-        z, distance = on_object(z, normal, surface, distance)
-        return z, normal, point, distance
+        return on_object(z, normal, point, distance, 0.5 * distance)
     middle = 0.5 * (low + high)
     corners, ahead = (outline(foot, middle) for foot in (body.vertices.at, body.vertices.ahead))
     normal, points, distances = polygon_and_rectangle(corners, ahead, body.base_half)
@@ -243,10 +245,8 @@ def meetings(
     point = tuple(jnp.where(first, a, b) for a, b in zip(*points, strict=True))
     gap = jnp.where(first, *distances)
     distance = gap + sp.dot(slope, normal) * (z - middle)
-    half = distance - 0.5 * gap  # from the point, which is midway at the middle height
-    surface = (point[0] + half * normal[0], point[1] + half * normal[1])
-    z, distance = on_object(z, normal, surface, distance)
-    return z, normal, point, distance  # type: ignore[return-value]
+    # The point is midway at the middle height.
+    return on_object(z, normal, point, distance, distance - 0.5 * gap)  # type: ignore[arg-type]
 
 
 def circle_and_rectangle(
