@@ -46,7 +46,6 @@ _NO_COMPILER = (
 )
 _PLATFORMS = {"cpu": "cpu", "gpu": "CUDA"}
 _TRACING: ContextVar[bool] = ContextVar("rps_jax_traces_one_world", default=False)
-_warned: set[str] = set()
 _libraries: dict[str, ctypes.CDLL] = {}
 _locks: defaultdict[str, threading.RLock] = defaultdict(threading.RLock)
 
@@ -202,11 +201,10 @@ def _compiled(functions: Sequence[_Function]) -> str | None:
     return name
 
 
+@functools.cache
 def _warn_once(message: str) -> None:
     """Warn of a slow program, once in a process."""
-    if message not in _warned:
-        _warned.add(message)
-        warnings.warn(message, stacklevel=2)
+    warnings.warn(message, stacklevel=2)
 
 
 def _library(text: str, name: str) -> bytes:

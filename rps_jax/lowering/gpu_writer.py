@@ -14,6 +14,7 @@ import numpy as np
 from jax.extend.core import ClosedJaxpr
 
 from rps_jax.lowering.nodes import (
+    INITIAL,
     Array,
     LoopNode,
     Node,
@@ -33,14 +34,6 @@ _MAX_SHARED = 48 * 1024  # bytes of a block
 _UNROLLED = 4  # iterations of a loop over the elements of a thread that are unrolled
 _KERNEL = """\
 
-FOLD(max, f, V)
-FOLD(min, f, V)
-FOLD(add, i, I)
-FOLD(max, i, I)
-FOLD(min, i, I)
-FOLD(and, b, I)
-FOLD(or, b, I)
-
 {TABLES}
 struct Arguments {{
   const void *inputs[{INPUTS}];
@@ -57,6 +50,8 @@ extern "C" __global__ void __launch_bounds__(32) step(const __grid_constant__ Ar
 {LINES}
 }}
 """
+# Reductions over threads; sums of reals are `_SUM`.
+_FOLDS = "\n".join(f"FOLD({name}, {kind}, {TYPES[kind]})" for name, kind in [*INITIAL][1:])
 
 
 class GpuNodes(SimdNodes):
@@ -148,7 +143,7 @@ class GpuWriter(SimdWriter):
     """Printer of nodes as CUDA for several threads per world."""
 
     table_type = "static __device__ const"
-    header, function, inputs = GPU_HEADER, _KERNEL, "a.inputs"
+    header, function, inputs = f"{GPU_HEADER}\n{_FOLDS}\n", _KERNEL, "a.inputs"
     nodes = GpuNodes
 
     def __init__(self, threads: int) -> None:

@@ -44,7 +44,6 @@ class ScalarNodes(SimdNodes):
         """Errors name the compiler; `operations` are those that the language spells."""
         super().__init__()
         self.compiler, self.operations = compiler, frozenset(operations)
-        self.matrices: dict[bytes, np.ndarray] = {}
 
     def kind(self, dtype: object, name: str) -> str:
         return kind_of(dtype, name, self.kinds)
@@ -82,29 +81,18 @@ class ScalarNodes(SimdNodes):
         columns, (half, odd) = matrix.shape[1], divmod(matrix.shape[0], 2)
         keys = [list(map(key_of, row)) for row in rows]
         if len(rows) == 2 and not odd and keys[0] == keys[1][half:] + keys[1][:half]:
-            template, outs = np.empty(half), np.empty(columns)
-            a, b = (self._stacked(part) for part in (rows[0][:half], rows[0][half:]))
+            template, at = np.empty(half), np.arange(half)
+            pair = [self.moved(part, at, template) for part in (rows[0][:half], rows[0][half:])]
             p, q = matrix.reshape(2, half, columns) / 2
-            even, odd = (
-                self._times_matrix(
-                    self._rows(self.apply(name, [a, b], {}, template), _row(half)), m
-                )
-                for name, m in (("add", p + q), ("sub", p - q))
-            )
-            halves = [self.apply(name, [even, odd], {}, outs) for name in ("add", "sub")]
-            return self.moved(halves, np.arange(2 * columns), outs)
-        key = matrix.tobytes()
-        self.matrices.setdefault(key, matrix)
-        size = len(rows) * columns
-        node = self.node("product", list(itertools.chain(*rows)), "f", size, key)
+            products = []
+            for name, part in (("add", p + q), ("sub", p - q)):
+                row = self._rows(self.apply(name, pair, {}, template), at[None])
+                products.append(self._times_matrix(row, part))
+            halves = [self.apply(x, products, {}, np.empty(columns)) for x in ("add", "sub")]
+            return self.moved(halves, np.arange(2 * columns), np.empty(0))
+        size, extra = len(rows) * columns, (matrix.shape, matrix.tobytes())
+        node = self.node("product", list(itertools.chain(*rows)), "f", size, extra)
         return Array(node, 0, 1, (size,))
-
-    def _stacked(self, scalars: Sequence[Value]) -> Value:
-        return self.moved(scalars, np.arange(len(scalars)), np.empty(0))
-
-
-def _row(size: int) -> np.ndarray:
-    return np.arange(size)[None]
 
 
 def conditional(roots: Sequence[Node]) -> list[Node]:

@@ -4,28 +4,19 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Mapping, Sequence
-from typing import ClassVar, NamedTuple
+from typing import ClassVar
 
 import numpy as np
 
 from rps_jax.lowering.nodes import LoopNode, Node, results
-from rps_jax.lowering.routine import Field, Routine
+from rps_jax.lowering.routine import Routine
 from rps_jax.lowering.scalar_nodes import ScalarNodes, conditional
-from rps_jax.lowering.target import Value
 from rps_jax.lowering.writer import Writer
 
 _UNROLLED = 4  # elements of an array that is printed without a loop, at most
 # Rows of a matrix that one iteration multiplies. Compilers vectorise the loop over the columns, and
 # load and store a sum once for all rows.
 _ROWS = 8
-
-
-class Output(NamedTuple):
-    """A field that a routine returns, and its value."""
-
-    group: str
-    field: Field
-    value: Value
 
 
 class ScalarWriter(Writer):
@@ -57,10 +48,10 @@ class ScalarWriter(Writer):
         values, roots = results(
             routine.jaxpr, [x.type for _, x in fields], [x.type for _, x in outputs], target
         )
-        self._matrices = target.matrices
         self.body = self.lines(conditional(roots), roots, set())
         known = {result.position: result.value for result in values}
-        self.outputs = [Output(*x, known.get(i, ())) for i, x in enumerate(outputs)]
+        # Group, field and value of each result.
+        self.outputs = [(*x, known.get(i, ())) for i, x in enumerate(outputs)]
 
     # --- what a language defines ---
 
@@ -139,8 +130,8 @@ class ScalarWriter(Writer):
 
     def _product(self, node: Node) -> list[str]:
         """Return a product of rows with a matrix, which is padded with zeros."""
-        n, matrix = node.id, self._matrices[node.extra]
-        inputs, columns = matrix.shape
+        n, ((inputs, columns), content) = node.id, node.extra
+        matrix = np.frombuffer(content).reshape(inputs, columns)
         padded = inputs + -inputs % _ROWS
         table = self.table(np.pad(matrix, ((0, padded - inputs), (0, 0))))
         items = [self.operand(a, 0) for a in node.args]
