@@ -293,15 +293,12 @@ class SimdNodes(Target):
     def _loop(
         self, condition: Body | None, body: Body, carry: Sequence[Value], length: int | None
     ) -> list[Value]:
-        carried = [
-            Node(next(self._numbers), "carried", (), self.kind(x.dtype, "a loop"),
-                 size_of(np.shape(x)))
-            for x in carry
-        ]  # fmt: skip
-        current: list[Value] = [
-            Array(node, 0, 1, np.shape(x)) if node.size else x
-            for node, x in zip(carried, carry, strict=True)
-        ]
+        carried, current = list[Node](), list[Value]()
+        for x in carry:
+            kind, shape = self.kind(x.dtype, "a loop"), np.shape(x)
+            node = Node(next(self._numbers), "carried", (), kind, size_of(shape))
+            carried.append(node)
+            current.append(Array(node, 0, 1, shape) if node.size else x)
         self._known.append({})
         (holds,) = condition(current) if condition else (None,)
         results = []
@@ -309,8 +306,7 @@ class SimdNodes(Target):
             value = flat(value, node.size) if node.size else value
             if isinstance(value, Array) and value.node in carried and value.node is not node:
                 copies = [element(value, i) for i in range(node.size)]
-                copy = self.node("move", copies, node.kind, node.size)
-                value = Array(copy, 0, 1, value.shape)
+                value = Array(self.node("move", copies, node.kind, node.size), 0, 1, value.shape)
             results.append(value)
         self._known.pop()
         holds = None if holds is None else flat(holds, 1)

@@ -98,10 +98,9 @@ def _results(eqn: JaxprEqn, values: list[Value], target: Target) -> Sequence[Val
         kind_of(out.dtype, name, target.kinds)
     if name == "cond":
         branches = [_walk(branch, values[1:], target) for branch in params["branches"]]
+        count = len(branches)
         return [
-            _apply(
-                "select_n", [values[0], *cases], [types[0], *[out] * len(cases)], {}, out, target
-            )
+            _apply("select_n", [values[0], *cases], [types[0], *[out] * count], {}, out, target)
             for *cases, out in zip(*branches, outs, strict=True)
         ]
     if name == "scan":
