@@ -1,6 +1,6 @@
 """Engines, which step worlds. Each is one object, `ENGINE` of the module of its name.
 
-A new engine is one file in this folder and one line below.
+A new engine is one file in this folder and one name below.
 """
 
 from __future__ import annotations
@@ -13,12 +13,7 @@ from rps_jax import errors
 if TYPE_CHECKING:
     from rps_jax.engines.base import Engine
 
-EngineName = Literal[
-    "mjx",
-    "fused",
-    "mujoco",
-    "quasistatic",
-]
+EngineName = Literal["mjx", "fused", "mujoco", "quasistatic"]
 ENGINES: tuple[EngineName, ...] = get_args(EngineName)
 
 

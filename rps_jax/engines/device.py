@@ -102,11 +102,7 @@ def collect_environment() -> dict[str, Any]:
     used = jax.devices()[0]
     return provenance.collect_environment(
         processors=count_processors(),
-        device={
-            "platform": used.platform,
-            "kind": used.device_kind,
-            "count": jax.device_count(),
-        },
+        device={"platform": used.platform, "kind": used.device_kind, "count": jax.device_count()},
         x64=bool(jax.config.jax_enable_x64),
         compiler=_compiler_version() if used.platform in ("cpu", "gpu") else None,
     )

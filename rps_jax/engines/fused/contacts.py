@@ -33,9 +33,7 @@ class Body(NamedTuple):
     inertia: Entries  # (3,) [kg m^2] principal moments
     p_object_com: Entries  # (3,) [m] centre of mass in the object's frame
     q_object_body: Entries  # (4,) principal axes in the object's frame
-    vertices: (
-        Entries  # (N, 3) [m] of the lower face; a cylinder's centre; after `spread`: `Corners`
-    )
+    vertices: Entries  # (N, 3) [m] of the lower face, or a cylinder's centre; later `Corners`
     radius: Number  # () [m] of a cylinder; 0 of a prism
     height: Number  # () [m]
     up: Entries  # (3,) unit vector along the height

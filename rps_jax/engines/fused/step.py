@@ -39,6 +39,10 @@ def enter(body: Body, motion: Motion, robot: Robot | None = None, force: bool = 
     com, axes = _split(body.p_object_com), _split(body.q_object_body)
     m = sp.matrix(free[3:])
     v = sp.add(_split(qvel, slice(3, 6)), sp.to_world(m, sp.cross(spin, com)))
+    driven = None
+    if robot is not None:
+        v_base, a_base = (_split(x, JOINTS.base) for x in (qvel, warmstart))
+        driven = DrivenBase(v_base, a_base, _split(integral))
     return State(
         base=_split(qpos, JOINTS.base),
         p=sp.add(free[:3], sp.to_world(m, com)),
@@ -47,11 +51,7 @@ def enter(body: Body, motion: Motion, robot: Robot | None = None, force: bool = 
         w=sp.to_body(sp.matrix(axes), spin),
         a=_split(warmstart, slice(3, 6)),
         alpha=_split(warmstart, slice(6, 9)),
-        driven=None
-        if robot is None
-        else DrivenBase(
-            _split(qvel, JOINTS.base), _split(warmstart, JOINTS.base), _split(integral)
-        ),
+        driven=driven,
         felt=_split(jnp.zeros_like(qpos[..., JOINTS.base])) if force else None,
     )
 
