@@ -236,7 +236,7 @@ def test_commands_refuse_unsupported_robots(capsys, tmp_path):
     message = refusal(
         capsys, "table", "--robot", "kairos", "--engine", "quasistatic", "--out", tmp_path / "t"
     )
-    assert "engine = quasistatic is not allowed for a robot with a limited force" in message
+    assert "engine = quasistatic is not allowed: a robot with a limited force" in message
     message = refusal(
         capsys,
         *("sweep", "--domain", "real", "--engine", "quasistatic", "--out", tmp_path / "s"),

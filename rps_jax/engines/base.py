@@ -109,46 +109,35 @@ class Engine(abc.ABC):
     forces: ClassVar[bool] = True  # contact can slow and stop a base with a limited force
     computes_force: ClassVar[bool] = True  # it computes the force of a contact
 
+    def _refused(self, rule: str) -> errors.InputError:
+        return errors.not_allowed("engine", self.name, rule)
+
     def check_physics(self, physics: Physics) -> None:
         """Raise InputError unless the engine supports the physics."""
         if physics.cone not in self.cones:
-            raise errors.InputError(
-                f"cone = {physics.cone} is not allowed with the engine {self.name}: it must be "
-                f"{' or '.join(self.cones)}."
-            )
+            rule = f"with the engine {self.name} it must be {' or '.join(self.cones)}"
+            raise errors.not_allowed("cone", physics.cone, rule)
 
     def check_robot(self, robot: Robot) -> None:
         """Raise InputError unless the engine can step the base of the robot."""
         if robot.driven and not self.forces:
-            raise errors.InputError(
-                f"engine = {self.name} is not allowed for a robot with a limited force: its base "
-                "follows every twist; choose fused, mjx or mujoco."
-            )
+            raise self._refused("a robot with a limited force needs fused, mjx or mujoco")
 
     def check_senses(self, senses: str) -> None:
         """Raise InputError unless the engine computes the quantities that a law senses."""
         if senses == "force" and not self.computes_force:
-            raise errors.InputError(
-                f"engine = {self.name} is not allowed for a law that senses the contact's "
-                "force, which it does not compute: choose fused, mjx or mujoco."
-            )
+            raise self._refused("a law that senses the contact's force needs fused, mjx or mujoco")
 
     def check_traced(self) -> None:
         """Raise InputError unless JAX traces the steps."""
         if not self.traced:
-            raise errors.InputError(
-                f"engine = {self.name} is not allowed: JAX must trace it; choose fused, mjx or "
-                "quasistatic."
-            )
+            raise self._refused("JAX must trace it; choose fused, mjx or quasistatic")
 
     def check_derivatives(self, mode: Mode, physics: Physics) -> None:
         """Raise InputError unless a trial can be differentiated in this mode."""
         if mode not in self.modes:
             known = " and ".join(self.modes) or "no"
-            raise errors.InputError(
-                f"engine = {self.name} is not allowed in {mode}-mode differentiation: it supports "
-                f"{known} mode."
-            )
+            raise self._refused(f"{mode}-mode differentiation is missing, it has {known} mode")
 
     @abc.abstractmethod
     def stage(

@@ -48,16 +48,14 @@ def choose(name: Device) -> None:
     """
     import jax
 
+    platforms = jax.config.jax_platforms
     if name == "auto":
         try:
             jax.devices()
         except (RuntimeError, AssertionError) as error:  # JAX raises either
-            raise InputError(
-                f"JAX_PLATFORMS = {jax.config.jax_platforms} is not available: name an available "
-                "device, or none."
-            ) from error
+            message = f"JAX_PLATFORMS = {platforms} is not available: name another, or none."
+            raise InputError(message) from error
         return
-    platforms = jax.config.jax_platforms
     jax.config.update("jax_platforms", "cuda" if name == "gpu" else "cpu")
     with contextlib.suppress(RuntimeError, AssertionError):  # JAX raises either
         if jax.default_backend() == ("cpu" if name == "xla" else name):

@@ -146,10 +146,8 @@ class MJX(Engine):
         """Raise InputError unless a trial can be differentiated in this mode."""
         super().check_derivatives(mode, physics)
         if physics.cone == "elliptic":
-            raise errors.InputError(
-                "cone = elliptic is not allowed: MJX's elliptic cone has no finite derivatives, so "
-                "it must be pyramidal (or the engine fused)."
-            )
+            rule = "MJX has no finite derivatives for it; choose pyramidal, or the engine fused"
+            raise errors.not_allowed("cone", physics.cone, rule)
 
     def stage(
         self, family: str, solids: Solid, friction: Friction, physics: Physics, robots: Robot
