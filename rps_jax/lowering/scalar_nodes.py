@@ -103,38 +103,31 @@ def conditional(roots: Sequence[Node]) -> list[Node]:
     nodes = reached(roots)
     if not any(node.op == "product" for node in nodes):
         return nodes
-    conditions = {
-        (a.node, a.first): a
-        for node in nodes
-        if node.op.startswith("choose") and isinstance(a := node.args[0], Array)
-        if a.step == 0 or node.size == 1
-    }
-    for (condition, first), side in itertools.product(conditions, (1, 2)):
-        if _move_into_block(nodes, roots, conditions[condition, first], side):
+    conditions = dict.fromkeys(filter(None, map(_condition, nodes)))
+    for condition, side in itertools.product(conditions, (1, 2)):
+        if _move_into_block(nodes, roots, condition, side):
             return reached(roots)
     return nodes
 
 
+def _condition(node: Node) -> tuple[Node, int] | None:
+    """Return the node and the index of the number by which a node chooses an operand."""
+    a = node.args[0] if node.op.startswith("choose") else None
+    return (a.node, a.first) if isinstance(a, Array) and (not a.step or node.size == 1) else None
+
+
 def _move_into_block(
-    nodes: Sequence[Node], roots: Sequence[Node], condition: Array, side: int
+    nodes: Sequence[Node], roots: Sequence[Node], condition: tuple[Node, int], side: int
 ) -> bool:
     """Move nodes that matter on one side of a condition into a block, if a product is there."""
-
-    def is_choice(node: Node) -> bool:
-        a = node.args[0] if node.op.startswith("choose") else None
-        return (
-            isinstance(a, Array)
-            and (a.node, a.first) == (condition.node, condition.first)
-            and (a.step == 0 or node.size == 1)
-        )
-
     always: set[Node] = set()
     waiting = list(roots)
     while waiting:
         node = waiting.pop()
         if node not in always:
             always.add(node)
-            args = (node.args[0], node.args[3 - side]) if is_choice(node) else node.args
+            is_choice = _condition(node) == condition
+            args = (node.args[0], node.args[3 - side]) if is_choice else node.args
             waiting += [a.node for a in args if isinstance(a, Array)] + list(node.free)
     block = [node for node in nodes if node not in always and node.op != "input"]
     inside = set(block)
@@ -142,21 +135,20 @@ def _move_into_block(
         return False
     choices = [
         node for node in nodes
-        if node in always and is_choice(node)
+        if node in always and _condition(node) == condition
         if isinstance(a := node.args[side], Array) and a.node in inside
     ]  # fmt: skip
     needed = {x for node in block for x in node.needed} - inside
     starts = tuple(node.args[3 - side] for node in choices)
-    needed |= {a.node for a in (*starts, condition) if isinstance(a, Array)}
+    needed |= {condition[0], *(a.node for a in starts if isinstance(a, Array))}
     if set(reached(needed)) & set(choices):
         return False
     ids = itertools.count(max(node.id for node in nodes) + 1)
     carried = tuple(Node(next(ids), "carried", (), n.kind, n.size) for n in choices)
     results = tuple(flat(node.args[side], node.size) for node in choices)
-    holds = condition._replace(shape=(1,))
     loop = LoopNode(
-        next(ids), "if", starts, "f", 0, side == 1, tuple(needed), carried, results, holds,
-        inner=tuple(block),
+        next(ids), "if", starts, "f", 0, side == 1, tuple(needed), carried, results,
+        condition=Array(*condition, 1, (1,)), inner=tuple(block),
     )  # fmt: skip
     for node, carry in zip(choices, carried, strict=True):
         node.op, node.args, node.extra, node.free = "part", (), carry, (loop,)
