@@ -38,9 +38,8 @@ class CWriter(ScalarWriter):
     alias = "{head} = &{corner};"
     pointer = "*"
 
-    @property
-    def types(self) -> dict[str, str]:
-        return types(self.prefix)
+    def type_of(self, kind: str) -> str:
+        return type_of(kind, self.prefix)
 
     def literal(self, value: float, kind: str) -> str:
         return literal(self.prefix, value, kind)
@@ -65,9 +64,9 @@ class CWriter(ScalarWriter):
         return f"static {self.declaration(kind, sized)} = {text(array)};"
 
 
-def types(prefix: str) -> dict[str, str]:
-    """Return the types of numbers."""
-    return {"f": f"{prefix}_real", "i": "int", "b": "int"}
+def type_of(kind: str, prefix: str) -> str:
+    """Return the type of a number."""
+    return f"{prefix}_real" if kind == "f" else "int"
 
 
 def literal(prefix: str, value: float, kind: str) -> str:
@@ -86,7 +85,7 @@ def sized_name(name: str, sizes: Iterable[int]) -> str:
 def struct(prefix: str, name: str, group: Group) -> str:
     """Return the type of a group."""
     lines = [
-        f"  {types(prefix)[field.kind]} {sized_name(field.name, field.shape)};"
+        f"  {type_of(field.kind, prefix)} {sized_name(field.name, field.shape)};"
         + (f" /* {field.about} */" if field.about else "")
         for field in group
         if field.size

@@ -10,7 +10,7 @@ import functools
 import itertools
 import operator
 from collections.abc import Callable, Sequence
-from typing import Any, TypeAlias
+from typing import TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -26,7 +26,7 @@ _BOUND = 2.0**31  # above all integers
 _FILL = {"f": np.nan, "i": -(2**31), "u": 2**32 - 1, "b": True}
 
 
-def _primitive(name: str, dtype: Any = None) -> Function:
+def _primitive(name: str, dtype: np.dtype | None = None) -> Function:
     """Return an operation that only targets implement."""
 
     def result(*types: jax.core.ShapedArray) -> jax.core.ShapedArray:
@@ -72,6 +72,11 @@ def _integer(x: jax.Array, **_: object) -> jax.Array:
     return jnp.where(x >= _BOUND, 2**31 - 1, jnp.where(x < -_BOUND, -(2**31), whole))
 
 
+def _number(x: jax.Array, new_dtype: np.dtype, **_: object) -> jax.Array:
+    """Convert bools to numbers."""
+    return jnp.where(x, new_dtype.type(1), new_dtype.type(0))
+
+
 def _unsigned(x: jax.Array, **_: object) -> jax.Array:
     """Convert reals to unsigned integers: NaN to 0."""
     low = _integer(jnp.where(x >= _BOUND, x - _BOUND, jnp.maximum(x, 0))).astype(np.uint32)
@@ -109,7 +114,7 @@ def _select(index: jax.Array, *cases: jax.Array) -> jax.Array:
 def _argument(is_better: Function) -> Function:
     """Return the function of the first index of the best number along an axis, or of a NaN."""
 
-    def argument(x: jax.Array, axes: Sequence[int], index_dtype: Any) -> jax.Array:
+    def argument(x: jax.Array, axes: Sequence[int], index_dtype: np.dtype) -> jax.Array:
         first, *rows = jnp.moveaxis(x, axes[0], 0)
         best, index = first, jnp.zeros(first.shape, index_dtype)
         for k, row in enumerate(rows, 1):
@@ -134,8 +139,9 @@ def _cumulative(binary: Function) -> Function:
 
 
 def _gather(
-    x: jax.Array, indices: jax.Array, dimension_numbers: Any, slice_sizes: Any, mode: Any, **_: Any
-) -> jax.Array:
+    x: jax.Array, indices: jax.Array, dimension_numbers: lax.GatherDimensionNumbers,
+    slice_sizes: Sequence[int], mode: object, **_: object,
+) -> jax.Array:  # fmt: skip
     """Gather slices at indices that are known at run time."""
     axes, blocks = dimension_numbers, []
     if axes.operand_batching_dims:
@@ -157,7 +163,7 @@ def _gather(
 
 
 def _scatter_add(
-    x: jax.Array, indices: jax.Array, updates: jax.Array, unique_indices: bool, **params: Any
+    x: jax.Array, indices: jax.Array, updates: jax.Array, unique_indices: bool, **params: object
 ) -> jax.Array:
     """Add updates at indices: the sum of the array and of updates or zeros."""
     if not unique_indices:
@@ -185,8 +191,7 @@ COMPOUNDS: dict[str, Function] = {
     "i_of_f": _integer,
     "u_of_f": _unsigned,
     **dict.fromkeys(("b_of_f", "b_of_i"), lambda x, **_: x != 0),
-    **{f"{kind}_of_b": lambda x, new_dtype, **_: jnp.where(x, *np.array([1, 0], new_dtype))
-       for kind in "fiu"},
+    **dict.fromkeys(("f_of_b", "i_of_b", "u_of_b"), _number),
     "choose_b": lambda flag, no, yes: (flag & yes) | (~flag & no),
     "select_n": _select,
     "argmax": _argument(lax.gt),

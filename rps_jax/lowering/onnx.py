@@ -24,6 +24,7 @@ from rps_jax.lowering.target import (
 
 _OPSET, _FORMAT = 18, 9  # versions of the operators and of the file
 _DTYPES = {"f": np.float32, "i": np.int32, "b": np.bool_}
+_OPERATORS = spelled("onnx")
 _REDUCED = {"add": "ReduceSum", "mul": "ReduceProd", "max": "ReduceMax", "min": "ReduceMin"}
 
 
@@ -45,7 +46,7 @@ class Graph(Target):
     """Target that builds a graph of ONNX."""
 
     compiler = "the ONNX exporter"
-    operations = spelled("onnx")
+    operations = _OPERATORS
 
     def __init__(self) -> None:
         """Build a graph without nodes.
@@ -116,7 +117,7 @@ class Graph(Target):
         if name == "dot_general":
             equation = _equation(x, params["dimension_numbers"])
             return self.node("Einsum", x, shape, kind, equation=equation)
-        operator = self.operations.get(operation_of(name, x, params, out))
+        operator = _OPERATORS.get(operation_of(name, x, params, out))
         if operator is None:
             raise UnsupportedError(name)
         if name == "select_n":

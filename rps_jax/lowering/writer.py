@@ -9,7 +9,7 @@ from __future__ import annotations
 import hashlib
 import itertools
 import math
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Sequence
 
 import numpy as np
 from jax.extend.core import ClosedJaxpr
@@ -58,7 +58,6 @@ class Writer:
     """Printer of nodes as statements, in an order in which few loops are needed."""
 
     index = "int"  # type of a loop's index
-    types: Mapping[str, str] = TYPES  # of variables
     prefix = ""  # of all names
 
     def __init__(self) -> None:
@@ -66,9 +65,13 @@ class Writer:
 
     # --- what a language defines ---
 
+    def type_of(self, kind: str) -> str:
+        """Return the type of a variable."""
+        return TYPES[kind]
+
     def declaration(self, kind: str, name: str, size: int = 1, constant: bool = True) -> str:
         """Return the left side of a declaration."""
-        return f"{'const ' * constant}{self.types[kind]} {name}{'' if size == 1 else f'[{size}]'}"
+        return f"{'const ' * constant}{self.type_of(kind)} {name}{'' if size == 1 else f'[{size}]'}"
 
     def declared(self, node: Node) -> str:
         """Return the declaration of a node that is assigned later."""

@@ -12,7 +12,6 @@ Reference: MuJoCo documentation, "Computation: Constraint model" and "Solver".
 
 from __future__ import annotations
 
-import operator
 from collections.abc import Callable, Sequence
 from functools import partial, reduce
 from typing import NamedTuple
@@ -160,7 +159,7 @@ def accelerations(
 
     def gradient(x: Sequence[Vec]) -> tuple[list[Number], list[list[Number]]]:
         g = gauss(x)
-        h: list[list[Number]] = [[0.0] * 3 * len(x) for _ in range(3 * len(x))]
+        h: list[list[Number]] = [[0.0] * (3 * len(x)) for _ in range(3 * len(x))]
         for row in range(3):
             if len(x) > 2:
                 h[6 + row][6 + row] = base.inertia[row]
@@ -181,7 +180,7 @@ def accelerations(
         g, h = gradient(x)
         step = _solve(h, [-entry for entry in g])
         d: list[Vec] = [(step[i], step[i + 1], step[i + 2]) for i in range(0, len(step), 3)]
-        slope = reduce(operator.add, map(sp.dot, gauss(x), d))
+        slope = reduce(sp.plus, map(sp.dot, gauss(x), d))
         bend = body.mass * sp.dot(d[0], d[0]) + sp.dot(d[1], sp.to_world(i_w, d[1]))
         for e in d[2:]:
             bend = bend + sp.dot(base.inertia, _times(e, e))
