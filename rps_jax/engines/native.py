@@ -167,14 +167,10 @@ class _Function:
 def _compiled(functions: Sequence[_Function]) -> str | None:
     """Compile functions, or load them from the cache; return their name in XLA, or None."""
     on_gpu = jax.default_backend() == "gpu"
+    printer = functools.partial(GpuWriter, _THREADS) if on_gpu else SimdWriter
     try:
         with jax.ensure_compile_time_eval():
-            texts = [
-                (GpuWriter(_THREADS) if on_gpu else SimdWriter()).source(
-                    x.jaxpr, x.inputs, x.results, x.is_sorted
-                )
-                for x in functions
-            ]
+            texts = [printer().source(x.jaxpr, x.inputs, x.results, x.is_sorted) for x in functions]
     except UnsupportedError as error:
         _warn_once(f"{error} XLA compiles this law, which is some ten times slower.")
         return None

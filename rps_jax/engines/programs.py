@@ -55,9 +55,7 @@ def compile_function(
     if (law_name := identity(law)) is None:
         return compile_lowered(jax.jit(function, donate_argnums=donate).lower(*arguments))
     leaves, tree = jax.tree.flatten(jax.eval_shape(lambda *inputs: inputs, *arguments))
-    sizes = [jax.tree.structure(argument).num_leaves for argument in arguments]
-    first = sum(sizes[:donate])
-    donated = tuple(range(first, first + sizes[donate]))
+    donated = tuple(jax.tree.leaves(jax.tree.unflatten(tree, range(len(leaves)))[donate]))
     structures: list[pytree.PyTreeDef] = []  # of the results, once traced
 
     def flat(*inputs: Any) -> list[Any]:
