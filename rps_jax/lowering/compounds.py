@@ -72,7 +72,7 @@ def _integer(x: jax.Array, **_: object) -> jax.Array:
     return jnp.where(x >= _BOUND, 2**31 - 1, jnp.where(x < -_BOUND, -(2**31), whole))
 
 
-def _number(x: jax.Array, new_dtype: np.dtype, **_: object) -> jax.Array:
+def _of_bool(x: jax.Array, new_dtype: np.dtype, **_: object) -> jax.Array:
     """Convert bools to numbers."""
     return jnp.where(x, new_dtype.type(1), new_dtype.type(0))
 
@@ -191,7 +191,7 @@ COMPOUNDS: dict[str, Function] = {
     "i_of_f": _integer,
     "u_of_f": _unsigned,
     **dict.fromkeys(("b_of_f", "b_of_i"), lambda x, **_: x != 0),
-    **dict.fromkeys(("f_of_b", "i_of_b", "u_of_b"), _number),
+    **dict.fromkeys(("f_of_b", "i_of_b", "u_of_b"), _of_bool),
     "choose_b": lambda flag, no, yes: (flag & yes) | (~flag & no),
     "select_n": _select,
     "argmax": _argument(lax.gt),

@@ -247,15 +247,16 @@ class SimdNodes(Target):
             indices = indices.swapaxes(1, 2)
         return self.moved(parts, indices.reshape(out.shape), out)
 
-    def products(self, long: Factor, other: Factor, dtype: np.dtype) -> list[Value]:
+    def products(self, matrix: Factor, rows: Factor, dtype: np.dtype) -> list[Value]:
         """Return the product of a matrix with each row of another, elementwise over its rows."""
-        (_, indices), (_, other_indices) = long, other
+        (_, indices), (_, row_indices) = matrix, rows
         template, parts = np.empty(indices.shape[1], dtype), []
-        for batch, row in np.ndindex(*other_indices.shape[:2]):
+        for batch, row in np.ndindex(*row_indices.shape[:2]):
             total = None
-            for k, index in enumerate(other_indices[batch, row]):
+            for k, index in enumerate(row_indices[batch, row]):
                 at = indices[batch, :, k], np.full(template.shape, index)
-                pair = [self._at(x[0], i, template) for x, i in zip((long, other), at, strict=True)]
+                factors = zip((matrix, rows), at, strict=True)
+                pair = [self._at(factor[0], i, template) for factor, i in factors]
                 term = self.apply("mul", pair, {}, template)
                 total = term if total is None else self.apply("add", [total, term], {}, template)
             parts.append(np.zeros_like(template) if total is None else total)

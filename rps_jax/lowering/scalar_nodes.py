@@ -59,14 +59,13 @@ class ScalarNodes(SimdNodes):
         """Refuse a loop whose length is unknown: a control step has a deadline."""
         raise UnsupportedError("while")
 
-    def products(self, long: Factor, other: Factor, dtype: np.dtype) -> list[Value]:
-        matrix, indices = long
-        is_large = is_constant(matrix) and len(indices) == 1 and indices.size >= _LARGE
+    def products(self, matrix: Factor, rows: Factor, dtype: np.dtype) -> list[Value]:
+        (weights, indices), (value, row_indices) = matrix, rows
+        is_large = is_constant(weights) and len(indices) == 1 and indices.size >= _LARGE
         if not is_large or dtype.kind != "f":
-            return super().products(long, other, dtype)
-        value, rows = other
-        columns = np.reshape(matrix, -1)[indices[0]].T
-        return [self._times_matrix(self._rows(value, rows[0]), columns)]
+            return super().products(matrix, rows, dtype)
+        columns = np.reshape(weights, -1)[indices[0]].T
+        return [self._times_matrix(self._rows(value, row_indices[0]), columns)]
 
     def _rows(self, value: Value, indices: np.ndarray) -> list[list[Value]]:
         return [[self.source(value, int(i)) for i in row] for row in indices]

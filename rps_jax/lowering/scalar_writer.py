@@ -61,7 +61,7 @@ class ScalarWriter(Writer):
 
     # --- expressions ---
 
-    def number(self, text: str, kind: str) -> str:
+    def constant(self, text: str, kind: str) -> str:
         return f"({text})" if "-" in text.split("e")[0] else text
 
     def call(self, op: str, operands: Sequence[str]) -> str:

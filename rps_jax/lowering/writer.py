@@ -81,7 +81,7 @@ class Writer:
         """Return a constant."""
         return literal(value, kind)
 
-    def number(self, text: str, kind: str) -> str:
+    def constant(self, text: str, kind: str) -> str:
         """Return a constant, or an element of a table, as an operand."""
         raise NotImplementedError
 
@@ -274,7 +274,7 @@ class Writer:
         array = np.asarray(a).reshape(-1)
         kind, at = kind_of(array.dtype), index if array.size > 1 else 0
         text = self.literal(array[at], kind) if isinstance(at, int) else f"{self.table(array)}[i]"
-        return self.number(text, kind)
+        return self.constant(text, kind)
 
     def read(self, a: Value, node: Node, fused: set[Node]) -> str:
         """Return an operand of a node; nodes in `fused` are computed in the same loop."""
@@ -299,7 +299,7 @@ class SimdWriter(Writer):
     header, function, inputs = SIMD_HEADER, _FUNCTION, "inputs"
     nodes = SimdNodes
 
-    def number(self, text: str, kind: str) -> str:
+    def constant(self, text: str, kind: str) -> str:
         return f"all_{kind}({text})"
 
     def packed(self, name: str, array: np.ndarray) -> str:
