@@ -7,7 +7,7 @@ use the upright solid over the footprint, in all engines.
 import math
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
@@ -136,18 +136,15 @@ def register_object(
     if feet is not None:
         family, vertices = "cylinder" if radius else "prism", solid.padded(vertices)
         feet = _feet(label, np.asarray(feet, float), body.ipos[:2])
-    single = Solid(
-        vertices=vertices,
-        radius=np.asarray(radius),
-        height=np.asarray(_height(label, model)),
-        mass=body.mass[0],
-        p_object_com=body.ipos.copy(),
-        inertia=body.inertia.copy(),
-        q_object_body=body.iquat.copy(),
-        feet=feet,
-    )
-    REGISTERED[name] = Registered(path, single)
+    single = solid_of_body(body, vertices, radius, _height(label, model))
+    REGISTERED[name] = Registered(path, single._replace(feet=feet))
     FAMILIES[name] = family
+
+
+def solid_of_body(body: Any, vertices: np.ndarray, radius: float, height: float) -> Solid:
+    """Return an upright solid (leaves without a leading axis) with the mass of a compiled body."""
+    inertial = body.ipos.copy(), body.inertia.copy(), body.iquat.copy()
+    return Solid(vertices, np.asarray(radius), np.asarray(height), body.mass[0], *inertial)
 
 
 def _compiled(label: str, path: Path) -> mujoco.MjModel:

@@ -259,16 +259,13 @@ def drawn_columns(
 
 def _labelled(domain: Domain, u: np.ndarray) -> xr.Dataset:
     """Return points with the names, ranges, units and kinds of their coordinates."""
-    labels = coordinates(domain)
-    columns: dict[str, Any] = {
-        "low": [item.range.low for item in labels],
-        "high": [item.range.high for item in labels],
-        "log": np.array([item.range.log for item in labels], np.int8),
-        "unit": [item.unit for item in labels],
-        "kind": [item.kind for item in labels],
+    quantities, kinds, ranges, units = map(list, zip(*coordinates(domain), strict=True))
+    low, high, log = map(list, zip(*ranges, strict=True))
+    columns = {"low": low, "high": high, "log": np.array(log, np.int8), "unit": units}
+    coords: dict[str, Any] = {
+        name: ("quantity", values) for name, values in (columns | {"kind": kinds}).items()
     }
-    coords = {name: ("quantity", values) for name, values in columns.items()}
-    coords |= {"quantity": [item.name for item in labels], "world": np.arange(len(u))}
+    coords |= {"quantity": quantities, "world": np.arange(len(u))}
     text = {"units": "1", "long_name": "point of the unit cube"}
     return xr.Dataset(
         {"u": (("world", "quantity"), u, text)}, coords, {"domain": json.dumps(asdict(domain))}

@@ -105,23 +105,11 @@ def load(
         for geom in geoms:
             geom.mass *= mass / total
     model, stripped = _compile(spec, physics, friction, robot)
-    single = _solid_of_model(model, FAMILIES[name])
+    size, body = model.geom("object").size, model.body("object")
+    is_box = FAMILIES[name] == "box"
+    vertices = solid.rectangles(size[:1], size[1:2])[0] if is_box else np.zeros((1, 2))
+    single = objects.solid_of_body(body, vertices, 0.0 if is_box else size[0], 2 * body.pos[2])
     return Scene(name, FAMILIES[name], model, stripped, single, robot.shell)
-
-
-def _solid_of_model(model: mujoco.MjModel, family: str) -> Solid:
-    """Return the solid of a compiled box or cylinder that stands on its corners or rim."""
-    body, size = model.body("object"), model.geom("object").size
-    box = family == "box"
-    return Solid(
-        vertices=solid.rectangles(size[:1], size[1:2])[0] if box else np.zeros((1, 2)),
-        radius=np.asarray(0.0 if box else size[0]),
-        height=2 * body.pos[2],
-        mass=body.mass[0],
-        p_object_com=body.ipos.copy(),
-        inertia=body.inertia.copy(),
-        q_object_body=body.iquat.copy(),
-    )
 
 
 def compile_solid(

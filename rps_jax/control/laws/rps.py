@@ -178,10 +178,9 @@ def adaptive_rate(
     params: RPSParams,
     l: Float[Array, "*B"],  # noqa: E741
     distance: Float[Array, "*B"],
-    temperatures: Temperatures | None = None,
+    temps: Temperatures = HARD,
 ) -> Float[Array, "*B"]:
     """Compute Eq. 5: the adaptive rate a_r [1] from contact offset l [m] and ||d|| [m]."""
-    temps = temperatures or HARD
     logistic = jax.nn.sigmoid((jnp.abs(l) - params.beta) * params.k)
     a_r = (params.zeta + (params.eta - params.zeta) * logistic) * _sgn(params, l, temps.sgn)
     far = soft.greater(distance, params.d_th, temps.d_th)
@@ -229,7 +228,7 @@ def saturate(params: RPSParams, twist: Twist) -> Twist:
 
 
 def _push(
-    params: RPSParams, l_th: jax.Array, obs: Observation, temperatures: Temperatures | None
+    params: RPSParams, l_th: jax.Array, obs: Observation, temps: Temperatures
 ) -> tuple[jax.Array, Twist, Details]:
     """Compute one pass of Algorithm 1's control loop, in contact."""
     l = obs.p_robot_contact[..., 1]  # noqa: E741
@@ -238,14 +237,13 @@ def _push(
     v_star = params.K_v * distance  # Eq. 3
     gamma = steering_angle(params, d, obs.yaw)
 
-    temps = temperatures or HARD
     realigning = soft.and_(
         soft.greater(jnp.abs(l), l_th, temps.realign), jnp.asarray(params.reactive) > 0
     )  # Algorithm 1: enter or leave the Realignment State
     a_r = soft.where(
         realigning,
         params.a_r_max * _sgn(params, l, temps.sgn),
-        adaptive_rate(params, l, distance, temperatures),
+        adaptive_rate(params, l, distance, temps),
     )
     v_x, v_y = linear_velocity(v_star, a_r)  # Eqs. 1-2
     bounded = saturate(params, Twist(v_x, v_y, jnp.zeros_like(v_x)))
@@ -274,7 +272,7 @@ def step_with_details(
     # Without contact the contact point is undefined; the last one keeps every branch finite.
     contact = soft.where(in_contact, obs.p_robot_contact, state.p_robot_contact)
     filled = obs._replace(p_robot_contact=contact)
-    l_th, push, details = _push(params, state.l_th, filled, temperatures)
+    l_th, push, details = _push(params, state.l_th, filled, temps)
     is_kept = soft.and_(state.touched, jnp.asarray(params.keep_contact) > 0)
     # Only a current contact arrives: the last contact near the target must not stop the robot.
     is_away = soft.greater_equal(details.distance, params.d_success, temps.arrive)

@@ -119,18 +119,18 @@ def search(
     params: RPSPlusParams,
     p_robot_last: jax.Array,
     l: jax.Array,  # noqa: E741
-    temperatures: Temperatures | None = None,
+    temps: Temperatures = rps.HARD,
 ) -> Twist:
     """Compute P3: the twist back to the last contact, `p_robot_last` (2,) [m] in the robot frame.
 
     `l` () [m] is the contact offset there.
     """
-    temps = temperatures or rps.HARD
     angle, v_max = planar.direction(p_robot_last), jnp.asarray(params.law.v_max)
-    faces = soft.greater(FACING, jnp.abs(angle), temperatures and _FACING_WIDTH)
+    is_hard = temps.sgn is None
+    faces = soft.greater(FACING, jnp.abs(angle), None if is_hard else _FACING_WIDTH)
     ahead = soft.where(faces, params.ahead * v_max, 0.0)
     far = soft.greater(planar.norm(p_robot_last), REACH, temps.d_th)
-    side = jnp.sign(l) if temperatures is None else jnp.tanh(l / temps.sgn)
+    side = jnp.sign(l) if is_hard else jnp.tanh(l / temps.sgn)
     turning = soft.where(far, angle, 0.0)
     return rps.saturate(params.law, Twist(ahead, params.aside * v_max * side, turning))
 
@@ -165,7 +165,7 @@ def step(
         (soft.and_(near, is_away), translation(params, d, obs.yaw)),
         (
             soft.greater(steps_lost, params.n_lost, temperatures and _LOST_WIDTH),
-            search(params, p_robot_last, contact[1], temperatures),
+            search(params, p_robot_last, contact[1], temps),
         ),
     ):
         twist = soft.tree_where(condition, action, twist)
