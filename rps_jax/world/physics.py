@@ -90,13 +90,12 @@ def parse_physics(physics: PhysicsLike, fidelity: Fidelity = "standard") -> Phys
     if not isinstance(physics, str):
         raise errors.not_allowed("physics", repr(physics), "give a name or a Physics")
     name, changes = parse_changes("physics", physics)
-    errors.check_name("physics", name, PHYSICS)
     base = preset(name, fidelity)  # pyright: ignore[reportArgumentType]
     known = [field.name for field in fields(Physics)]
     for field, value in changes.items():
         errors.check_name("field of physics", field, known)
-        if isinstance(getattr(base, field), int) and isinstance(value, float):
-            changes[field] = int(value) if value == int(value) else value
-        elif isinstance(value, list):
+        if isinstance(value, list):
             changes[field] = tuple(value)
+        elif isinstance(getattr(base, field), int) and value in range(2**31):
+            changes[field] = int(value)
     return replace(base, **changes)
