@@ -30,6 +30,7 @@ from rps_jax.app.export import c, folder, onnx_model, program
 from rps_jax.app.export.program import Program
 from rps_jax.control import registry, validation
 from rps_jax.control.base import Law
+from rps_jax.control.observation import Twist
 from rps_jax.lowering.routine import Group
 
 Precision = Literal["float", "double"]
@@ -229,18 +230,9 @@ def agreement(name: str, form: Form, inputs: int, path: Path, seed: int = 0) -> 
     native = build_law(form, exported, path, worlds)
     with jax.enable_x64(form == "double"):
         params = jax.tree.map(lambda x: jnp.asarray(x, real), params)
-        obs_tree = jax.tree.structure(validation.observation_shapes(law.senses))
-
-        def step(memory: Any, leaves: Any) -> Any:
-            memory, twist, _ = law.step(params, memory, jax.tree.unflatten(obs_tree, leaves))
-            return memory, twist
-
-        step = jax.jit(jax.vmap(step))
-        exact = None if form == "double" else _exact(law, params, obs_tree)
+        step, initial = _in_jax(law, params, real, worlds)
+        step, exact = jax.jit(step), None if form == "double" else _exact(law, params)
         rng, tally, scale = np.random.default_rng(seed), Agreement(label, form), scale_of(params)
-        initial = jax.tree.map(
-            lambda x: np.broadcast_to(np.asarray(x), (worlds, *np.shape(x))), law.init(params)
-        )
         while tally.inputs < inputs:
             memory = initial
             for _ in range(STEPS):
@@ -288,20 +280,37 @@ def _rounded(rng: np.random.Generator, x: Any) -> np.ndarray:
     return (x * (1 + 4 * np.finfo(x.dtype).eps * rng.uniform(-1, 1, x.shape))).astype(x.dtype)
 
 
-def _exact(law: Any, params: Any, obs_tree: Any) -> Any:
-    """Return the function of twists (n, 3) in float64 for inputs in float32."""
+def _in_jax(law: Law, params: Any, real: type, count: int) -> tuple[Callable[..., Any], Any]:
+    """Return the step of a law with numbers of a type, batched, and `count` initial memories.
 
-    def step(params: Any, memory: Any, leaves: Any) -> Any:
-        return law.step(params, memory, jax.tree.unflatten(obs_tree, leaves))[1]
+    The step takes memories and the leaves of observations, and returns memories and twists.
+    """
+    params = jax.tree.map(lambda x: jnp.asarray(x, real), params)
+    tree = jax.tree.structure(validation.observation_shapes(law.senses))
 
-    compiled = jax.jit(jax.vmap(step, in_axes=(None, 0, 0)))
+    def step(memory: Any, leaves: Any) -> tuple[Any, Twist]:
+        memory, twist, _ = law.step(params, memory, jax.tree.unflatten(tree, leaves))
+        return memory, twist
+
+    initial = jax.tree.map(
+        lambda x: np.broadcast_to(np.asarray(x), (count, *np.shape(x))), law.init(params)
+    )
+    return jax.vmap(step), initial
+
+
+def _exact(law: Law, params: Any) -> Callable[[Any, Any], np.ndarray]:
+    """Return the function of twists (n, 3) in float64 for parameters and inputs in float32."""
+
+    def wide(x: Any) -> np.ndarray:
+        return np.asarray(x, np.float64) if np.asarray(x).dtype.kind == "f" else np.asarray(x)
+
+    rounded = jax.tree.map(lambda x: np.asarray(x, np.float32), params)
+    with jax.enable_x64(True):
+        step = jax.jit(_in_jax(law, rounded, np.float64, 1)[0])
 
     def twist(memory: Any, leaves: Any) -> np.ndarray:
-        def wide(x: Any) -> Any:
-            return np.asarray(x, np.float64) if np.asarray(x).dtype.kind == "f" else x
-
         with jax.enable_x64(True):
-            twists = compiled(*jax.tree.map(wide, (params, memory, leaves)))
+            _, twists = step(*jax.tree.map(wide, (memory, leaves)))
             return np.stack(jax.device_get(jax.tree.leaves(twists)), -1)
 
     return twist
@@ -372,14 +381,14 @@ def trial_errors(name: str, form: Form, trials: Sequence[Any], path: Path) -> Tr
         return [x.astype(real) if f.kind == "f" else x for f, x in zip(fields, padded, strict=True)]
 
     obs = [np.stack(columns, 1) for columns in zip(*map(padded, trials), strict=True)]
-    memories, jax_twists = _in_jax(law, law_params, obs, real)
+    memories, jax_twists = _trace(law, law_params, obs, real)
     state, free, synchronised = native.begin(len(trials)), [], []
     for i in range(longest):
         rows = native.filled("observation", [x[i] for x in obs], len(trials))
         free.append(native.step(state, rows)[0])
         jax_state = native.filled("memory", [x[i] for x in memories], len(trials))
         synchronised.append(native.step(jax_state, rows)[0])
-    exact = jax_twists if form == "double" else _in_jax(law, law_params, obs, np.float64)[1]
+    exact = jax_twists if form == "double" else _trace(law, law_params, obs, np.float64)[1]
 
     def errors(twists: Any, reference: np.ndarray) -> list[np.ndarray]:
         error = (np.abs(np.asarray(twists) - reference) / scale).max(-1)
@@ -389,24 +398,17 @@ def trial_errors(name: str, form: Form, trials: Sequence[Any], path: Path) -> Tr
     return TrialErrors(*(errors(*pair) for pair in pairs))
 
 
-def _in_jax(law: Law, params: Any, obs: Sequence[Any], real: Any) -> tuple[list[Any], np.ndarray]:
+def _trace(law: Law, params: Any, obs: Sequence[Any], real: Any) -> tuple[list[Any], np.ndarray]:
     """Return memories before each step and twists (T, n, 3) for observations (T, n, ...)."""
     with jax.enable_x64(real == np.float64):
-        converted = jax.tree.map(lambda x: jnp.asarray(x, real), params)
-        tree = jax.tree.structure(validation.observation_shapes(law.senses))
+        step, initial = _in_jax(law, params, real, obs[0].shape[1])
         inputs = [x.astype(real) if x.dtype.kind == "f" else x for x in obs]
 
-        def step(memory: Any, leaves: Any) -> Any:
-            next_memory, twist, _ = law.step(converted, memory, jax.tree.unflatten(tree, leaves))
-            return next_memory, (memory, jnp.stack([jnp.asarray(x, real) for x in twist]))
+        def scanned(memory: Any, leaves: Any) -> Any:
+            next_memory, twist = step(memory, leaves)
+            return next_memory, (memory, jnp.stack([jnp.asarray(x, real) for x in twist], -1))
 
-        count = obs[0].shape[1]
-        initial = jax.tree.map(
-            lambda x: jnp.broadcast_to(x, (count, *jnp.shape(x))), law.init(converted)
-        )
-        memories, twists = jax.jit(lambda m, x: jax.lax.scan(jax.vmap(step), m, x)[1])(
-            initial, inputs
-        )
+        memories, twists = jax.jit(lambda m, x: jax.lax.scan(scanned, m, x)[1])(initial, inputs)
         return [np.asarray(x) for x in jax.tree.leaves(memories)], np.asarray(twists)
 
 
