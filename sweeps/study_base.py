@@ -124,11 +124,13 @@ class Study(Question[T]):
         return ()
 
     def publish(self, results: Any, run_folder: Path) -> None:
-        """Write the data files of the tables that have a name."""
-        for table in self.report_tables(results):
+        """Write the data files and the pictures of the tables that have a name."""
+        runs = [provenance.read_environment(run_folder)]
+        for table in filter(lambda table: table.name, self.report_tables(results)):
             path = self.folder / self.RESULTS / f"{table.name}.json"
-            if table.name:
-                write_table(path, [provenance.read_environment(run_folder)], self.machine, table)
+            write_table(path, runs, self.machine, table)
+            if table.picture:
+                files.write_bytes(self.folder / f"{table.picture.name}.png", table.picture.png())
 
     # --- as questions ----------------------------------------------------------------------
 

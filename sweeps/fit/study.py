@@ -13,7 +13,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property, partial
-from pathlib import Path
 from typing import ClassVar
 
 import numpy as np
@@ -21,7 +20,7 @@ import xarray as xr
 
 import rps_jax
 from rps_jax.analysis.figures.style import Figure
-from rps_jax.analysis.report import Picture, save
+from rps_jax.analysis.report import Picture
 from rps_jax.control import registry
 from rps_jax.control.registry import LawLike
 from rps_jax.record.options import option
@@ -220,11 +219,6 @@ class Coverage(FitStudy):
             Table(quantity_rows(results), name="fit_quantities", title="By quantity", text=text),
             Table(worth_rows(results), name="fit_worth", title="Worth", text=error),
         ]
-
-    def publish(self, results: xr.Dataset, run_folder: Path) -> None:
-        """Write the data files and the figure."""
-        super().publish(results, run_folder)
-        save(figure(results), self.folder / "coverage.png")
 
 
 coverage = call_of(Coverage)

@@ -27,7 +27,6 @@ from rps_jax.runs.question import Run, call_of
 from rps_jax.tuning import learn
 from sweeps.study_base import Study, Table, write_table
 
-RESULTS = Path(__file__).parent / "results"
 COLUMNS = (
     {"name": "network"},
     {"name": "version"},
@@ -66,16 +65,10 @@ class Learned(Study[list[list[Any]]]):
     def check(self) -> None:
         """Check that there are runs, and a device for each of them."""
         errors.check_each_once("runs", self.runs)
-        if not self.runs:
-            raise errors.InputError("runs = () is not allowed: name at least one run folder.")
         if len(self.devices) != len(self.runs):
             raise errors.InputError(
                 f"device = {self.device} is not allowed: give one for all runs, or one for each."
             )
-
-    def num_trials(self) -> int | None:
-        """Return the number of runs."""
-        return len(self.runs)
 
     def answer(self, run: Run) -> list[list[Any]]:
         """Collect the rows, and publish them."""
@@ -88,7 +81,8 @@ class Learned(Study[list[list[Any]]]):
         )
         runs = [provenance.read_environment(folder) for folder in folders]
         device = "; ".join(dict.fromkeys(self.devices))
-        write_table(RESULTS / "learned.json", runs, device, Table(rows, note, COLUMNS))
+        path = self.folder / self.RESULTS / "learned.json"
+        write_table(path, runs, device, Table(rows, note, COLUMNS))
         return rows
 
     def intro(self, results: list[list[Any]]) -> str:

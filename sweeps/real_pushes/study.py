@@ -25,7 +25,7 @@ import pandas as pd
 import xarray as xr
 
 from rps_jax import errors
-from rps_jax.analysis.report import Picture, save
+from rps_jax.analysis.report import Picture
 from rps_jax.record import files
 from rps_jax.record.options import option
 from rps_jax.runs.question import Run, call_of
@@ -311,11 +311,6 @@ class RealPushes(Study[xr.Dataset]):
             draw = partial(figure, results, self.table, WORDS)
             by_name[0] = by_name[0]._replace(picture=Picture("real_pushes", draw))
         return by_name
-
-    def publish(self, results: xr.Dataset, run_folder: Path) -> None:
-        """Write the data files and the figure."""
-        super().publish(results, run_folder)
-        save(figure(results, self.table, WORDS), self.folder / "real_pushes.png")
 
 
 real_pushes = call_of(RealPushes)
