@@ -71,10 +71,6 @@ class Publish(Study[xr.Dataset]):
             if not fnmatch.filter(known, pattern):
                 raise InputError(f"only = {pattern} is not allowed: no data file has such a name.")
 
-    def num_trials(self) -> int | None:
-        """Return the number of recipes to run."""
-        return None
-
     def answer(self, run: Run) -> xr.Dataset:
         """Compute selected data files again, and return the state of all data files."""
         if self.only:
