@@ -45,7 +45,7 @@ def _each(command: str, *names: str) -> tuple[str, ...]:
     return tuple(command.format(name) for name in names)
 
 
-_WIDE, _ALL = ("wide", "hostile"), ("wide", "real", "hostile")
+_WIDE = ("wide", "hostile")
 _LADDERS = _each("rps ladder --domain {0} --worlds 10000 --seed 10 --out runs/ladder_{0}", *_WIDE)
 _AGAINST = ("", "success", "against rps_tuned", "p (Holm)")
 _OBJECTS = ("random_box", "random_cylinder", "random_prism")
