@@ -308,9 +308,8 @@ def digest(commands: Sequence[Sequence[str]]) -> str:
     configurations: list[Any] = []
     for program, *words in commands:
         if program != "rps":
-            raise InputError(
-                f"command = {program} is not allowed: only `rps NAME` or `rps PATH` has a digest."
-            )
+            rule = "only `rps NAME` or `rps PATH` has a digest"
+            raise errors.not_allowed("command", program, rule)
         if _reads_folder(split_folder(words)[0]):  # the command that made the folder has a digest
             configurations.append(words)
             continue

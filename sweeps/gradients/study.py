@@ -111,9 +111,8 @@ class Gradients(Study[xr.Dataset]):
         """Check the names and that the horizons increase."""
         super().check()
         if not self.horizons or list(self.horizons) != sorted(set(self.horizons)):
-            raise errors.InputError(
-                f"horizons = {self.horizons} is not allowed: give one or more, in increasing order."
-            )
+            rule = "give one or more, in increasing order"
+            raise errors.not_allowed("horizons", self.horizons, rule)
         _ = self.space
 
     @property

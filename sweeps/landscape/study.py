@@ -65,7 +65,7 @@ class Landscape(MultiLawQuestion[xr.DataTree]):
         """Check that the laws are RPS with parameters."""
         for label, params in self.chosen.items():
             if not isinstance(params, RPSParams):
-                raise errors.InputError(f"law = {label} is not allowed: give parameters of rps.")
+                raise errors.not_allowed("law", label, "give parameters of rps")
 
     @property
     def _shares(self) -> tuple[int, int]:

@@ -66,9 +66,8 @@ class Learned(Study[list[list[Any]]]):
         """Check that there are runs, and a device for each of them."""
         errors.check_each_once("runs", self.runs)
         if len(self.devices) != len(self.runs):
-            raise errors.InputError(
-                f"device = {self.device} is not allowed: give one for all runs, or one for each."
-            )
+            rule = "give one for all runs, or one for each"
+            raise errors.not_allowed("device", self.device, rule)
 
     def answer(self, run: Run) -> list[list[Any]]:
         """Collect the rows, and publish them."""

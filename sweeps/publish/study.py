@@ -24,6 +24,7 @@ from typing import Any, ClassVar, Literal
 import xarray as xr
 
 import rps_jax
+from rps_jax import errors
 from rps_jax.analysis.report import Section
 from rps_jax.app.cli import flags, names
 from rps_jax.errors import InputError
@@ -69,7 +70,7 @@ class Publish(Study[xr.Dataset]):
         known = [*(path.stem for path in published()), *RECIPES]
         for pattern in self.only:
             if not fnmatch.filter(known, pattern):
-                raise InputError(f"only = {pattern} is not allowed: no data file has such a name.")
+                raise errors.not_allowed("only", pattern, "no data file has such a name")
 
     def answer(self, run: Run) -> xr.Dataset:
         """Compute selected data files again, and return the state of all data files."""
@@ -225,7 +226,7 @@ def joined(
       InputError: there is no table, or the headers differ.
     """
     if not tables:
-        raise InputError("table = None is not allowed: no section of the report has that title.")
+        raise errors.not_allowed("table", None, "no section of the report has that title")
     (_, (header, *_)), has_labels = tables[0], any(label for label, _ in tables)
     shown = [i for i, column in enumerate(header) if not columns or column in columns]
     rows: Rows = []

@@ -143,10 +143,8 @@ def feet_of(support: str) -> np.ndarray:
     except ValueError:
         x = y = np.zeros(0)
     if x.size < 3:
-        raise InputError(
-            f"support = {support} is not allowed: give {FLAT}, {UNKNOWN} or three x and three y in "
-            f"mm, as {DEFAULT_FEET}."
-        )
+        rule = f"give {FLAT}, {UNKNOWN} or three x and three y in mm, as {DEFAULT_FEET}"
+        raise errors.not_allowed("support", support, rule)
     return np.stack([x, y], axis=1)
 
 
