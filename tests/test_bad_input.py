@@ -293,7 +293,7 @@ COMMANDS = {
     "export c --law rps": {"--skin ideal": "name one with taxels", "--prefix 2": "prefix = 2 is"},
     "shadow": {"none.mcap": "give an MCAP file"},
     "fit": {"none.csv": "give a trace, a run folder of rps push, FILE.csv or FILE.mcap"},
-    "compare": {"--domain wide": "unknown command 'compare': use `rps ladder --domain DOMAIN ...`"},
+    "compare": {"--domain wide": "unknown command 'compare': choose from "},
     "doctor": {"--loudly": "--loudly"},
     "puhs": {"": "puhs"},
 }

@@ -178,9 +178,8 @@ def difference_table(results: xr.Dataset) -> list[list[str]]:
     rows = [["second against first", "gained", "lost", "difference", "McNemar p"]]
     for first, second in combinations(map(str, results.law.values), 2):
         a, b = results.success.sel(law=first), results.success.sel(law=second)
-        c = statistics.compare(a, b)
-        counts = str(c.gained), str(c.lost)
-        rows.append([f"{second} against {first}", *counts, _difference(c, a.size), _p(c.p)])
+        c, pair = statistics.compare(a, b), f"{second} against {first}"
+        rows.append([pair, str(c.gained), str(c.lost), _difference(c, a.size), _p(c.p)])
     return rows
 
 
@@ -189,26 +188,21 @@ def against_table(results: xr.Dataset, reference: str) -> list[list[str]]:
 
     The p-values of McNemar's exact test are adjusted for the number of tests (Holm).
     """
-    base = results.success.sel(law=reference)
-    names = [str(law) for law in results.law.values]
-    names.sort(key=lambda law: -float(results.success.sel(law=law).mean()))
-    by_law = {
-        law: statistics.compare(base, results.success.sel(law=law))
-        for law in names
-        if law != reference
+    by_law = {str(law): results.success.sel(law=law) for law in results.law.values}
+    base = by_law[reference]
+    comparisons = {
+        law: statistics.compare(base, x) for law, x in by_law.items() if law != reference
     }
-    p = statistics.holm([comparison.p for comparison in by_law.values()])
-    adjusted = dict(zip(by_law, p, strict=True))
-    failures = int((base.values == 0).sum())
-    gained = f"successes in the {failures} failures of {reference}"
+    adjusted = statistics.holm([comparison.p for comparison in comparisons.values()])
+    p = dict(zip(comparisons, map(_p, adjusted), strict=True))
+    gained = f"successes in the {int((base.values == 0).sum())} failures of {reference}"
     rows = [["", "success", f"against {reference}", "p (Holm)", gained]]
-    for law in names:
+    for law, success in sorted(by_law.items(), key=lambda item: -float(item[1].mean())):
         cells = ["", "", ""]
-        if law != reference:
-            c = by_law[law]
+        if c := comparisons.get(law):
             difference = f"{_difference(c, base.size)} (+{c.gained} -{c.lost})"
-            cells = [difference, _p(adjusted[law]), str(c.gained)]
-        rows.append([law, _rate(results.success.sel(law=law).values > 0), *cells])
+            cells = [difference, p[law], str(c.gained)]
+        rows.append([law, _rate(success.values > 0), *cells])
     return rows
 
 

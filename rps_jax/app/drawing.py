@@ -143,14 +143,14 @@ def _joined(points: Sequence[ArrayLike], height: float) -> np.ndarray:
 
 def _add_taxels(world: Any, name: str, shell: Shell) -> Any:
     """Add a tile for each taxel, along the rim of the base."""
-    middles = np.asarray(shell.taxels())[:, 0]
     depth, height, z = _TAXEL
-    rows, counts = shell.rows(), [board.taxels for board in shell.boards]
-    along = np.repeat([row.along for row in rows], counts, axis=0)
-    length = np.repeat([float(row.length) for row in rows], counts) / np.repeat(counts, counts)
+    quarters = np.asarray(shell.taxels(2))  # (T, 2, 2) [m] at 1/4 and 3/4 of each taxel
+    along = 2 * (quarters[:, 1] - quarters[:, 0])
     inward = np.stack([along[:, 1], -along[:, 0]], axis=-1)  # the strip runs clockwise
-    centers = np.column_stack([middles + (depth / 2 - 0.004) * inward, np.full(len(middles), z)])
-    sizes = np.abs(along) * 0.92 * length[:, None] + np.abs(inward) * depth
+    inward /= np.linalg.norm(along, axis=-1, keepdims=True)
+    middles = quarters.mean(axis=1) + (depth / 2 - 0.004) * inward
+    centers = np.column_stack([middles, np.full(len(middles), z)])
+    sizes = 0.92 * np.abs(along) + depth * np.abs(inward)
     box = _solid_of(mujoco.mjtGeom.mjGEOM_BOX, np.full(3, 0.5))
     return world.add_batched_meshes_simple(
         name,

@@ -44,11 +44,7 @@ class Gate:
     def __init__(self, host: str) -> None:
         """Create a gate for a page on `host` that accepts no messages yet."""
         self._host = host.strip("[]").lower()
-        self._rules: Mapping[str, Rule] = {}
-
-    def allow(self, rules: Mapping[str, Rule]) -> None:
-        """Accept messages of these types if their rules return true."""
-        self._rules = rules
+        self.rules: Mapping[str, Rule] = {}  # of the accepted messages, by type
 
     @contextlib.contextmanager
     def guarding(self) -> Iterator[None]:
@@ -132,13 +128,13 @@ class Gate:
                 warnings.simplefilter("error")  # viser warns of fields of other lengths
                 message = Message.deserialize(raw)
             is_bounded = all(map(_is_bounded, jax.tree.leaves(vars(message))))
-            return is_bounded and self._rules[type(message).__name__](message)
+            return is_bounded and self.rules[type(message).__name__](message)
         except Exception:  # of any kind, by viser on malformed messages
             return False
 
     def report(self, refusal: str) -> None:
         """Print a refusal on the error stream, in one line, once there is a page."""
-        if self._rules:
+        if self.rules:
             print(f"rps view: {refusal}.", file=sys.stderr, flush=True)
 
 

@@ -182,13 +182,11 @@ class Page:
         furnish(server)
         self._add_controls(request)
         inputs = server.gui._gui_input_handle_from_uuid
-        gate.allow(
-            {
-                "ViewerCameraMessage": lambda message: True,
-                "GuiUpdateMessage": lambda m: accepts_update(inputs[m.uuid], m.updates),
-                **dict.fromkeys(_DRAGGING, lambda message: message.name == TARGET),
-            }
-        )
+        gate.rules = {
+            "ViewerCameraMessage": lambda message: True,
+            "GuiUpdateMessage": lambda m: accepts_update(inputs[m.uuid], m.updates),
+            **dict.fromkeys(_DRAGGING, lambda message: message.name == TARGET),
+        }
 
     @property
     def url(self) -> str:

@@ -266,13 +266,10 @@ def _decoded(file: Any) -> Iterator[tuple[str, int, Any]]:
 
 def _unpacked(chunk: Any) -> Any:
     """Return a chunk without compression, of bounded size."""
-    if chunk.compression == "zstd":
-        reader = _require("zstandard").ZstdDecompressor().stream_reader(io.BytesIO(chunk.data))
-        data = reader.read(_MAX_BYTES + 1)
-    elif chunk.compression == "lz4":
-        data = _require("lz4.frame").LZ4FrameDecompressor().decompress(chunk.data, _MAX_BYTES + 1)
-    else:
+    if (name := {"zstd": "zstandard", "lz4": "lz4.frame"}.get(chunk.compression)) is None:
         return chunk
+    with _require(name).open(io.BytesIO(chunk.data)) as stream:
+        data = stream.read(_MAX_BYTES + 1)
     if len(data) > _MAX_BYTES or len(data) != chunk.uncompressed_size:
         raise ValueError(f"a chunk of {chunk.uncompressed_size} bytes has another size")
     return dataclasses.replace(chunk, data=data, compression="")

@@ -25,7 +25,6 @@ _HEADINGS = {  # of the help, by the rooms that define commands
     "tuning": "tune and learn",
     "app": "look",
 }
-_REPLACED = {"compare": "rps ladder --domain DOMAIN ..."}  # removed commands
 _DEFINITION = re.compile(r"^(\w+) = call_of\((\w+)\)$", re.MULTILINE)
 _PACKAGE = Path(__file__).parents[2]
 
@@ -85,8 +84,6 @@ def split(words: list[str]) -> tuple[str, list[str]]:
     first = words[0]
     if first.endswith(".py") or "/" in first or Path(first).is_dir():
         return first, words[1:]
-    if first in _REPLACED:
-        raise InputError(f"unknown command '{first}': use `{_REPLACED[first]}`.")
     name = " ".join(words[:2]) if first in ("tune", "export") else first
     return check_name("command", name, known()), []  # which raises
 
