@@ -88,11 +88,11 @@ def test_worlds_of_several_objects_keep_their_order(tmp_path):
 
 def test_worlds_are_filmed_by_their_indices(tmp_path):
     plan = plan_of("random_cylinder", "random_box")
-    takes = film.of_sweep(tmp_path, plan, ["rps"], film.worlds_of(plan, (2, 1)), (1, 3))
+    takes = film.of_sweep(tmp_path, plan, ["rps"], (2, 1), (1, 3))
     assert in_order(takes) == ["world 2", "world 1"]
     for wrong in ((1, 1), (-1,), (plan.worlds,)):
         with pytest.raises(InputError, match="worlds"):
-            film.worlds_of(plan, wrong)
+            film.of_sweep(tmp_path, plan, ["rps"], wrong, (1, 3))
 
 
 def test_several_laws_have_a_row_each_and_a_world_a_column(tmp_path):
@@ -100,11 +100,10 @@ def test_several_laws_have_a_row_each_and_a_world_a_column(tmp_path):
     plan = dataclasses.replace(base_plan, laws={"one": RPSParams.paper(), "two": RPSParams.nps()})
     takes = film.of_sweep(tmp_path, plan, ["two", "one"], "first", (2, 3))
     assert in_order(takes) == [f"{law}, world {i}" for law in ("two", "one") for i in range(3)]
-    film.rows_of(plan, ["two", "one"], (2, 3))
     with pytest.raises(InputError, match="each has a row"):
-        film.rows_of(plan, ["two", "one"], (3, 2))
+        film.of_sweep(tmp_path, plan, ["two", "one"], "first", (3, 2))
     with pytest.raises(InputError, match="unknown law 'three'"):
-        film.rows_of(plan, ["three"], (1, 3))
+        film.of_sweep(tmp_path, plan, ["three"], "first", (1, 3))
 
 
 def test_a_finished_trial_is_labelled_and_not_drawn_again(tmp_path):

@@ -129,9 +129,7 @@ class Film(Action[Path]):
         run, shape = Path(self.run), self.shape
         if not self._of_table:
             plan, law = select_law(run, 0, self.law)
-            if self.laws:
-                rows_of(plan, self.laws, shape)
-            selection = worlds_of(plan, self.worlds) if self.worlds else self.which
+            selection = self.worlds or self.which
             return of_sweep(run, plan, self.laws or (law,), selection, shape), plan.setting
         table = table_of(run)
         law = self.law or next(iter(table.chosen))
@@ -175,14 +173,6 @@ def of_cases(cases: Sequence[Case], setting: Setting) -> list[Take]:
     return [Take(range(len(cases)), part, law, [scene] * len(cases), labels)]
 
 
-def worlds_of(plan: Plan, worlds: Sequence[int]) -> Sequence[int]:
-    """Return the indices if the plan has these worlds; otherwise raise InputError."""
-    errors.check_each_once("worlds", worlds)
-    for world in worlds:
-        errors.check_count("worlds", world, at_least=0, at_most=plan.worlds - 1)
-    return worlds
-
-
 def of_sweep(
     run: Path,
     plan: Plan,
@@ -193,9 +183,22 @@ def of_sweep(
     """Return the takes of worlds of a sweep, with a row of the grid for each of several laws.
 
     The `selection` is `first`, `hardest` (as in the report of the sweep), or indices.
+
+    Raises:
+      InputError: the plan has not these laws and worlds, or the grid no row for each law.
     """
+    errors.check_each_once("laws", laws)
+    for law in laws:
+        errors.check_name("law", law, plan.laws)
+    if len(laws) not in (1, shape[0]):
+        raise InputError(
+            f"grid = {shape[0]}x{shape[1]} is not allowed with {len(laws)} laws: each has a row."
+        )
     count = shape[0] * shape[1] if len(laws) == 1 else shape[1]
     if not isinstance(selection, str):
+        errors.check_each_once("worlds", selection)
+        for world in selection:
+            errors.check_count("worlds", world, at_least=0, at_most=plan.worlds - 1)
         index = np.asarray(selection[:count], int)
     elif selection == "first":
         index = np.arange(min(count, plan.worlds))
@@ -216,17 +219,6 @@ def of_sweep(
             labels = [f"{prefix}world {i}" for i in worlds]
             takes.append(Take(tiles, part, registry.law_of(plan.laws[law]), scenes, labels))
     return takes
-
-
-def rows_of(plan: Plan, laws: Sequence[str], shape: tuple[int, int]) -> None:
-    """Raise InputError unless the plan has these laws, and the grid has a row for each."""
-    errors.check_each_once("laws", laws)
-    for law in laws:
-        errors.check_name("law", law, plan.laws)
-    if len(laws) != shape[0]:
-        raise InputError(
-            f"grid = {shape[0]}x{shape[1]} is not allowed with {len(laws)} laws: each has a row."
-        )
 
 
 def _tile_size(shape: tuple[int, int]) -> tuple[int, int]:
