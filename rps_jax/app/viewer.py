@@ -128,9 +128,8 @@ class View(Action[None], Case):
     def push_of(self, request: PushRequest) -> Push:
         """The push that the page asks for."""
         case = dataclasses.replace(self.case, **request._asdict())
-        title = case.title.replace("$\\mu$", "friction")
-        scene = pushes.scene_of(case, self.setting.physics)
-        return Push(Live.of_case(case, self.setting), scene, f"{title}, {request.law}")
+        live, scene = Live.of_case(case, self.setting), pushes.scene_of(case, self.setting.physics)
+        return Push(live, scene, f"{case.title}, {request.law}")
 
 
 view = call_of(View)
@@ -149,8 +148,7 @@ def _in_world(plan: Plan, law: str, index: int) -> Push:
     """A world of a sweep."""
     part = build_batch(plan, law, [index])
     live = Live(part, registry.law_of(plan.laws[law]), plan.setting)
-    title = world_title(plan, index).replace("$\\mu$", "friction")
-    return Push(live, scene_of(plan, index), f"{title}, {law}")
+    return Push(live, scene_of(plan, index), f"{world_title(plan, index)}, {law}")
 
 
 # --- the page ------------------------------------------------------------------------------

@@ -215,7 +215,7 @@ def world_title(plan: Plan, index: int) -> str:
     name = plan.domain.objects[int(plan.object_of(np.asarray(index)))].replace("_", " ")
     value = {key: float(values[0]) for key, (values, _) in drawn.items()}
     return (
-        f"world {index}: {name}, {value['mass']:.1f} kg, $\\mu$ ground "
+        f"world {index}: {name}, {value['mass']:.1f} kg, friction ground "
         f"{value['friction_ground']:.2f}, robot {value['friction_robot']:.2f}"
     )
 

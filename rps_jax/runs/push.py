@@ -58,8 +58,7 @@ class Trace:
     engine: str
 
     def __repr__(self) -> str:
-        title = self.title.replace("$\\mu$", "friction")
-        return f"<Trace of {title}: {self.summary}>"
+        return f"<Trace of {self.title}: {self.summary}>"
 
     @property
     def summary(self) -> str:
@@ -251,7 +250,7 @@ class Push(Case, TraceQuestion, SimulationQuestion[Trace]):
 
     @property
     def title(self) -> str:
-        return self.case.title.replace("$\\mu$", "friction")
+        return self.case.title
 
     @property
     def case(self) -> Case:

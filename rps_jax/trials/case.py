@@ -104,7 +104,7 @@ class Case(TrialOptions):
     def title(self) -> str:
         """Object and friction, in words."""
         return (
-            f"{self.object_name.replace('_', ' ')}, $\\mu$ ground {self.contact.ground:g}, "
+            f"{self.object_name.replace('_', ' ')}, friction ground {self.contact.ground:g}, "
             f"robot {self.contact.robot:g}"
         )
 
