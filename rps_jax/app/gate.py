@@ -8,7 +8,6 @@ the page can send.
 
 from __future__ import annotations
 
-import contextlib
 import functools
 import http
 import ipaddress
@@ -17,8 +16,8 @@ import math
 import socket
 import sys
 import warnings
-from collections.abc import Callable, Iterator, Mapping
-from types import SimpleNamespace
+from collections.abc import Callable, Mapping
+from contextlib import AbstractContextManager
 from typing import TYPE_CHECKING, Any
 from unittest import mock
 from urllib.parse import urlsplit
@@ -46,25 +45,14 @@ class Gate:
         self._host = host.strip("[]").lower()
         self.rules: Mapping[str, Rule] = {}  # of the accepted messages, by type
 
-    @contextlib.contextmanager
-    def guarding(self) -> Iterator[None]:
-        """Filter the traffic of viser servers that are created in this context.
+    def guarding(self) -> AbstractContextManager[object]:
+        """Filter the traffic of servers that viser creates in this context.
 
-        viser has no option for this, so the function that creates its server is replaced, in its
-        module alone.
+        viser has no option for this, so the function that creates a server is replaced.
         """
-        import viser.infra._infra as module
-        from websockets import datastructures, exceptions
-        from websockets.asyncio.server import serve
+        from websockets.asyncio import server
 
-        server = SimpleNamespace(serve=functools.partial(self._serve, serve))
-        guarded = SimpleNamespace(
-            asyncio=SimpleNamespace(server=server),
-            datastructures=datastructures,
-            exceptions=exceptions,
-        )
-        with mock.patch.object(module, "websockets", guarded):
-            yield
+        return mock.patch.object(server, "serve", functools.partial(self._serve, server.serve))
 
     def _serve(self, serve: Callable[..., Any], *arguments: Any, **options: Any) -> Any:
         """Create a server that checks every request and every message."""
