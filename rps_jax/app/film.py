@@ -29,7 +29,6 @@ from rps_jax.runs.question import Action, call_of
 from rps_jax.studies.table import table_of
 from rps_jax.trials import pushes, trial
 from rps_jax.trials.batch import WorldBatch, rows
-from rps_jax.trials.case import Case
 from rps_jax.trials.progress import Bar, Progress, ProgressCallback
 from rps_jax.trials.setting import Setting
 from rps_jax.world import video
@@ -118,10 +117,7 @@ class Film(Action[Path]):
         tiles = [map(Tile, take.scenes, take.part.worlds.p_world_target) for take in takes]
         frames = _frames(takes, setting, speed, seconds, callback)
         grid = {"shape": self.shape, "size": _tile_size(self.shape), "camera": self.camera}
-        try:
-            video.render_grid(_in_grid_order(tiles, takes), frames, out, fps=_FPS, **grid)
-        except video.VideoError as error:
-            raise InputError(str(error)) from error
+        video.render_grid(_in_grid_order(tiles, takes), frames, out, fps=_FPS, **grid)
         return out
 
     def takes(self) -> tuple[list[Take], Setting]:
@@ -138,7 +134,11 @@ class Film(Action[Path]):
         errors.check_name("law of the run", law, table.chosen)
         key = self.object, self.friction, id(table.chosen[law])
         cases = [c for c in table.cases if (c.object, c.friction, id(c.law)) == key]
-        return of_cases(cases[: shape[0] * shape[1]], table.setting), table.setting
+        cases, setting = cases[: shape[0] * shape[1]], table.setting
+        scenes = [pushes.scene_of(cases[0], setting.physics)] * len(cases)
+        labels = [f"({x:g}, {y:g}) m" for x, y in (case.target for case in cases)]
+        tiles, part = range(len(cases)), pushes.build(cases, setting)
+        return [Take(tiles, part, registry.law_of(cases[0].params), scenes, labels)], setting
 
 
 film = call_of(Film)
@@ -162,15 +162,6 @@ def shape_of(grid: str) -> tuple[int, int]:
             f"grid = {grid} is not allowed: write ROWSxCOLUMNS, as 4x6, each from 1 to 12."
         )
     return int(match[1]), int(match[2])
-
-
-def of_cases(cases: Sequence[Case], setting: Setting) -> list[Take]:
-    """Return the take of cases of one object, labelled by their targets."""
-    part = pushes.build(cases, setting)
-    scene = pushes.scene_of(cases[0], setting.physics)
-    labels = [f"({x:g}, {y:g}) m" for x, y in (case.target for case in cases)]
-    law = registry.law_of(cases[0].params)
-    return [Take(range(len(cases)), part, law, [scene] * len(cases), labels)]
 
 
 def of_sweep(

@@ -51,7 +51,7 @@ _FIX_GL = (
 )
 
 
-class VideoError(RuntimeError):
+class VideoError(errors.InputError):
     """Failure to draw or encode: one sentence with its fix."""
 
 

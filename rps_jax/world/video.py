@@ -209,7 +209,7 @@ def _encoder(path: Path, size: tuple[int, int], fps: int) -> Iterator[Callable[[
             "written to and has space left; if it does, run `pip install imageio-ffmpeg`."
         ) from error
     except RuntimeError as error:
-        raise error if isinstance(error, VideoError) else VideoError(_FIX_FFMPEG) from error
+        raise VideoError(_FIX_FFMPEG) from error
     finally:
         with contextlib.suppress(OSError):
             part.unlink()
