@@ -10,7 +10,15 @@ from matplotlib import patches
 from matplotlib.axes import Axes
 from matplotlib.collections import PathCollection
 
-from rps_jax.analysis.figures.style import SHADES, Figure, base_patch, shade, tiles, words
+from rps_jax.analysis.figures.style import (
+    SHADES,
+    Figure,
+    base_patch,
+    panel,
+    shade,
+    tiles,
+    words,
+)
 from rps_jax.control.laws import rps
 from rps_jax.control.laws.rps import RPSParams
 from rps_jax.robot import shell, skin
@@ -21,15 +29,13 @@ def profile(params: RPSParams) -> Figure:
     l = jnp.linspace(-shell.HALF_WIDTH, shell.HALF_WIDTH, 401)  # noqa: E741
     far = jnp.asarray(2 * params.d_th)
     a_r = jax.vmap(lambda l: rps.adaptive_rate(params, l, far))(l)  # noqa: E741
-    figure = Figure(figsize=(5.5, 3.2), layout="constrained")
-    ax = figure.subplots()
+    figure, ax = panel((5.5, 3.2), "contact offset $l$ [m]", "adaptive rate $a_r$ [1]")
     ax.plot(l, a_r, color="C0")
     for side in (-1, 1):
         ax.axvspan(
             side * float(params.l_cr), side * shell.HALF_WIDTH, color=SHADES["realigning"], lw=0
         )
         ax.axvline(side * float(params.beta), color="0.6", lw=0.7, ls="--")
-    ax.set(xlabel="contact offset $l$ [m]", ylabel="adaptive rate $a_r$ [1]")
     ax.set_title("Eq. 5; dashed: $\\pm\\beta$; shaded: critical region", fontsize=9)
     return figure
 
@@ -82,11 +88,6 @@ def one_trial(trace: xr.Dataset, title: str) -> Figure:
     return figure
 
 
-def _half(trace: xr.Dataset) -> tuple[float, float]:
-    """Return the half length and half width of the base [m]."""
-    return float(trace.half_length), float(trace.half_width)
-
-
 def _object(trace: xr.Dataset, index: int) -> np.ndarray:
     """Return the outline (N, 2) [m] of the object in the world at one time step."""
     x, y, w, _, _, z = trace.qpos.values[index, [3, 4, 6, 7, 8, 9]]
@@ -98,10 +99,11 @@ def _object(trace: xr.Dataset, index: int) -> np.ndarray:
 def _path(ax: Axes, trace: xr.Dataset) -> None:
     """Draw the left column of Fig. 6: the paths of the base and of the contact point."""
     pose, target = trace.qpos.values[:, :3], trace.p_world_target.values
+    half = float(trace.half_length), float(trace.half_width)
     ax.plot(*pose[:, :2].T, color="0.35", label="base")
     ax.plot(*trace.p_world_contact.values.T, ".", ms=1.5, color="C0", label="contact point")
     for index in np.linspace(0, len(pose) - 1, 7).astype(int):
-        ax.add_patch(base_patch(pose[index], _half(trace), fill=False))
+        ax.add_patch(base_patch(pose[index], half, fill=False))
         last = index == len(pose) - 1
         name = "object" if last else None
         shown = {"fc": "#e8c39e", "ec": "#8a5a2b", "alpha": 0.9 if last else 0.35}
@@ -131,8 +133,8 @@ def min_distance(results: xr.Dataset) -> Figure:
     """
     laws, objects = (list(map(str, results[dim].values)) for dim in ("law", "object"))
     columns = [*objects, "all"] if len(objects) > 1 else objects
-    figure = Figure(figsize=(0.9 + 2.6 * len(columns), 0.9 + 2.5 * len(laws)), layout="constrained")
-    axes = figure.subplots(len(laws), len(columns), squeeze=False, sharex=True, sharey=True)
+    count, size = len(laws) * len(columns), (2.6, 2.5)
+    figure, axes = tiles(count, len(columns), size, (0.9, 0.9), sharex=True, sharey=True)
     image = None
     for row, law in zip(axes, laws, strict=True):
         for ax, column in zip(row, columns, strict=True):
