@@ -13,7 +13,6 @@ import signal
 import sys
 import threading
 from collections.abc import Callable, Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -134,7 +133,6 @@ def execute(command: Command[object], session: Session) -> None:
     if session.overwrite:
         folder.remove_run(out)
     tqdm.set_lock(threading.RLock())  # of this process alone: no semaphore is left if it is stopped
-    film = None
     with command.progress_bar() as bar:
         _raise_interrupts()
         importlib.import_module("scipy.special")  # JAX does, too: in two threads they could meet
@@ -146,14 +144,12 @@ def execute(command: Command[object], session: Session) -> None:
             if results is not None:
                 print(f"{command.name}: {results}")
             return
-        if session.video and isinstance(results, Trace):
-            film = _start_film(results, out / "push.mp4", session.film_length)
         report = _write_report(command, results, bar)
-    tqdm.write(report.read_text(encoding="utf-8"))
+    print(report.read_text(encoding="utf-8"))
     if timing:
-        tqdm.write(timing)
-    if film is not None and isinstance(results, Trace):
-        _print_film(film, results, out / "stills.png")
+        print(timing)
+    if session.video and isinstance(results, Trace):
+        _write_film(results, out, session.film_length)
     if getattr(command, "film", False) and (out / "worlds").is_dir():
         from rps_jax.app.film import Film
 
@@ -181,21 +177,16 @@ def _write_report(question: Question[object], results: object, bar: Bar) -> Path
     return write_report(out, question.title, "\n\n".join(filter(None, intro)), sections)
 
 
-def _start_film(trace: Trace, path: Path, seconds: float) -> Future[Path]:
-    """Draw the film of a trial in another thread, with a bar, while the report is written."""
+def _write_film(trace: Trace, out: Path, seconds: float) -> None:
+    """Write stills and the film of a trial to its run folder, with a bar."""
     from tqdm import tqdm
 
-    watch = partial(tqdm, unit="frame", desc="film")
-    return ThreadPoolExecutor(1).submit(trace.film, path, seconds, watch=watch)
-
-
-def _print_film(film: Future[Path], trace: Trace, stills: Path) -> None:
-    """Draw the stills of a trial, and wait for its film."""
     from rps_jax.analysis.report import save
     from rps_jax.world import video
 
     try:
-        save(trace.stills(), stills)
-        print(f"film: {film.result()}")
+        save(trace.stills(), out / "stills.png")
+        watch = partial(tqdm, unit="frame", desc="film")
+        print(f"film: {trace.film(out / 'push.mp4', seconds, watch=watch)}")
     except video.VideoError as error:
         print(f"no film: {error}")
