@@ -189,32 +189,30 @@ def read(path: Path) -> dict[str, np.ndarray]:
     Raises:
       InputError: the file is no bag, is damaged or too large, or lacks a topic.
     """
-    columns: dict[str, list[Any]] = {}
+    rows: list[dict[str, Any]] = []
     latest: dict[str, Any] = {}
     size = 0
     try:
         with open(path, "rb") as file:
             for topic, time, message in _decoded(file):
                 if topic == "/contact" and topic not in latest:
-                    columns.clear()  # earlier steps have none
+                    rows.clear()  # earlier steps have none
                 latest[topic] = message
                 if topic == "/cmd_vel" and not _missing(latest):
-                    for name, value in _observed(1e-9 * time, latest).items():
-                        columns.setdefault(name, []).append(value)
-                        size += 8 + np.size(value)
+                    rows.append(_observed(1e-9 * time, latest))
+                    size += sum(8 + np.size(value) for value in rows[-1].values())
                     if size > _MAX_NUMBERS:
                         raise ValueError(f"it has more than {_MAX_NUMBERS} numbers")
         if missing := _missing(latest):
             raise ValueError(f"it has no messages on {', '.join(missing)}")
-        if not columns:
+        if not rows:
             raise ValueError("it has no command after its observations")
-        count = len(columns["time"])
-        steps = {k: np.array(v) for k, v in columns.items() if len(v) == count}
+        steps = {name: np.array([row[name] for row in rows]) for name in rows[0]}
         for name, values in steps.items():
             if not np.isfinite(values).all():
                 raise ValueError(f"its {name} is not finite")
         periods = np.diff(steps["time"])
-        if count < 2 or (periods <= 0).any():
+        if len(rows) < 2 or (periods <= 0).any():
             raise ValueError("its commands are not at least two, one after the other")
     except InputError:
         raise
@@ -277,26 +275,27 @@ def _unpacked(chunk: Any) -> Any:
 
 def _observed(time: float, latest: Mapping[str, Any]) -> dict[str, Any]:
     """Return the fields of `Step` in the latest messages."""
-    pose, target = latest["/odom"].pose.pose, latest["/target"].point
-    position, rotation = pose.position, pose.orientation
-    twist = latest["/cmd_vel"].twist
+    pose, twist = latest["/odom"].pose.pose, latest["/cmd_vel"].twist
+    yaw = 2 * math.atan2(pose.orientation.z, pose.orientation.w)
     fields: dict[str, Any] = {
         "time": time,
-        "pose": (position.x, position.y, 2 * math.atan2(rotation.z, rotation.w)),
-        "target": (target.x, target.y),
-        "twist": (twist.linear.x, twist.linear.y, twist.angular.z),
+        "pose": (*_xy(pose.position), yaw),
+        "target": _xy(latest["/target"].point),
+        "twist": (*_xy(twist.linear), twist.angular.z),
     }
     if "/contact" in latest:
         points = latest["/contact"].polygon.points
         fields["contact_type"] = min(len(points), 2)
-        fields["p_robot_contact"] = (points[0].x, points[0].y) if points else (0.0, 0.0)
+        fields["p_robot_contact"] = _xy(points[0]) if points else (0.0, 0.0)
     if "/taxels" in latest:
         fields["signal"] = np.array(latest["/taxels"].data, np.float32)
     if "/force" in latest:
-        force = latest["/force"].wrench.force
-        fields["f_robot"] = (force.x, force.y)
+        fields["f_robot"] = _xy(latest["/force"].wrench.force)
     if "/object" in latest:
-        marker = latest["/object"]
-        fields["p_world_object"] = (marker.pose.position.x, marker.pose.position.y)
-        fields["r_object"] = 0.5 * marker.scale.x
+        fields["p_world_object"] = _xy(latest["/object"].pose.position)
+        fields["r_object"] = 0.5 * latest["/object"].scale.x
     return fields
+
+
+def _xy(vector: Any) -> tuple[float, float]:
+    return vector.x, vector.y
