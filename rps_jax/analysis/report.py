@@ -44,8 +44,7 @@ class Picture(NamedTuple):
             drawn.savefig(file, dpi=150, metadata={"Software": None})
         return file.getvalue()
 
-    def _repr_png_(self) -> bytes:
-        return self.png()
+    _repr_png_ = png  # for Jupyter
 
 
 class Section(NamedTuple):

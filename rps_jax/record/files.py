@@ -30,7 +30,7 @@ FileKind = Literal["json", "python", "xml", "policy", "part", "results"]
 _MAX_PART = 2**33  # [bytes]
 _KINDS: dict[FileKind, tuple[int, str]] = {  # greatest size [bytes], and a description
     "json": (2**26, "a JSON file"),
-    "python": (2**22, "FILE.py:CLASS"),
+    "python": (2**22, "a Python file"),
     "xml": (2**24, "an MJCF file"),
     "policy": (2**28, "a policy's FILE.npz"),
     "part": (_MAX_PART, "the folder of a run"),

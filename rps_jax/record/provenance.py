@@ -95,10 +95,9 @@ def describe(folder: Path) -> str:
 def package_version(folder: Path) -> str:
     """Return the version of this package that last continued a run, in words."""
     try:
-        version = read_environment(folder)["packages"]["rps_jax"]
+        return f"rps_jax {read_environment(folder)['packages']['rps_jax']}"
     except (InputError, KeyError, TypeError):
-        version = None
-    return f"rps_jax {version}" if isinstance(version, str) else "a version that it does not name"
+        return "a version that it does not name"
 
 
 def _version(package: str) -> str | None:

@@ -90,17 +90,14 @@ def split(words: list[str]) -> tuple[str, list[str]]:
 
 def question_type(name: str) -> "type[Question[object]]":
     """Return the class of a command, by its name or its path."""
+    from rps_jax.record import files
+
     if name in known():
         return getattr(importlib.import_module(known()[name].module), known()[name].class_name)
     path = Path(name)
     path = path / "study.py" if path.is_dir() else path
-    try:
-        definitions = _DEFINITION.findall(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError) as error:
-        reason = getattr(error, "strerror", None) or "it is no Python text"
-        raise InputError(
-            f"study = {path} cannot be read ({reason}): give a file, or a folder with study.py."
-        ) from error
+    text = files.read_regular(path, "python").decode(errors="replace")
+    definitions = _DEFINITION.findall(text)
     if len(definitions) != 1:
         raise InputError(
             f"study = {path} defines {len(definitions)} commands: write `name = call_of(Class)` "
