@@ -32,7 +32,7 @@ from rps_jax.runs.push import another_engine, case_options, select_law
 from rps_jax.runs.question import Action, call_of
 from rps_jax.trials import pushes
 from rps_jax.trials.case import Case, label_of
-from rps_jax.trials.progress import Bar, ProgressCallback
+from rps_jax.trials.progress import ProgressCallback
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.stepper import CHUNK, Live
 from rps_jax.world import objects
@@ -75,6 +75,7 @@ class View(Action[None], Case):
     """Port to serve the page on; 0 takes any that is free."""
     setting: Setting = field(default=Setting(), kw_only=True)
     out: Path | str | None = option(None, kw_only=True, hidden=True)
+    progress: bool | None = option(False, kw_only=True, hidden=True)
 
     def __post_init__(self) -> None:
         """Defer the checks of `Case` to `check`."""
@@ -103,10 +104,6 @@ class View(Action[None], Case):
     def _chosen(self, run: str | Path) -> tuple[Plan, str]:
         """The plan and the law of a run that is shown."""
         return select_law(Path(run), self.world, None if self.law is None else str(self.law))
-
-    def progress_bar(self) -> Bar:
-        """Return no bar: the page shows the trial."""
-        return Bar(self.name, shown=False)
 
     def perform(self, callback: ProgressCallback) -> None:
         """Serve the page until it is ended."""
