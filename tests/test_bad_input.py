@@ -215,7 +215,6 @@ COMMANDS = {
         "--port -1": "port = -1 is not allowed: it must be a whole number from 0 to 65535",
         "--port 65536": "port = 65536 is not allowed",
         "--port http": "http",
-        "--host 203.0.113.1": "host = 203.0.113.1, port = 8080 cannot be served on .*: choose",
         "--out x": "--out",
     },
     "film": {

@@ -215,7 +215,7 @@ def make(request):
 
 @pytest.fixture
 def page():
-    page = viewer.open_page("127.0.0.1", 0, REQUEST, make)
+    page = viewer.open_page(0, REQUEST, make)
     yield page
     page.close()
 
@@ -370,7 +370,7 @@ def test_only_valid_values_of_controls_are_accepted(page, capfd):
 def test_an_unguarded_viser_is_not_served(monkeypatch):
     monkeypatch.setattr(gate.Gate, "guarding", lambda self: contextlib.nullcontext())
     with pytest.raises(InputError, match="this version of viser answers other pages"):
-        viewer.open_page("127.0.0.1", 0, REQUEST, make)
+        viewer.open_page(0, REQUEST, make)
 
 
 def test_a_used_port_is_refused_in_one_sentence(capsys):

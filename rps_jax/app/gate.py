@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
 _MAX_NUMBER = 1e6  # [1] in a message
 _MAX_LENGTH = 200  # characters of a text
-_ALL_ADDRESSES = ("0.0.0.0", "", "::")
+HOST = "127.0.0.1"  # of the page, which is served to this machine alone
 
 Rule = Callable[[Any], bool]  # whether the controls of the page can send a message
 
@@ -40,9 +40,8 @@ Rule = Callable[[Any], bool]  # whether the controls of the page can send a mess
 class Gate:
     """Filter of connections by host and origin, and of messages by the controls of the page."""
 
-    def __init__(self, host: str) -> None:
-        """Create a gate for a page on `host` that accepts no messages yet."""
-        self._host = host.strip("[]").lower()
+    def __init__(self) -> None:
+        """Create a gate that accepts no messages yet."""
         self.rules: Mapping[str, Rule] = {}  # of the accepted messages, by type
 
     def guarding(self) -> AbstractContextManager[object]:
@@ -87,25 +86,11 @@ class Gate:
     def refuses(self, headers: Any) -> bool:
         """Return whether a request has another host, or comes from another page."""
         hosts, origins = headers.get_all("Host"), headers.get_all("Origin")
-        if len(hosts) != 1 or not self._is_host(hosts[0]):
+        if len(hosts) != 1 or not _is_this_machine(hosts[0]):
             return True
         same = [origin.lower() for origin in origins] == [f"http://{hosts[0].lower()}"]
         upgrade = any("websocket" in value.lower() for value in headers.get_all("Upgrade"))
         return (upgrade or bool(origins)) and not same
-
-    def _is_host(self, host: str) -> bool:
-        """Return whether a Host header names this machine.
-
-        An address cannot be pointed elsewhere; a name must be one by which the page is served.
-        """
-        known, serves_all = {"localhost", self._host}, self._host in _ALL_ADDRESSES
-        if serves_all:
-            known |= {socket.gethostname().lower(), socket.getfqdn().lower()}
-        try:
-            name = urlsplit(f"//{host}").hostname or ""
-            return name in known or ipaddress.ip_address(name).is_loopback or serves_all
-        except ValueError:
-            return False
 
     def accepts(self, raw: Any) -> bool:
         """Return whether the controls of the page can send a message."""
@@ -124,6 +109,15 @@ class Gate:
         """Print a refusal on the error stream, in one line, once there is a page."""
         if self.rules:
             print(f"rps view: {refusal}.", file=sys.stderr, flush=True)
+
+
+def _is_this_machine(host: str) -> bool:
+    """Return whether a Host header is a loopback address, which cannot be pointed elsewhere."""
+    try:
+        name = urlsplit(f"//{host}").hostname or ""
+        return name == "localhost" or ipaddress.ip_address(name).is_loopback
+    except ValueError:
+        return False
 
 
 def _is_bounded(leaf: object) -> bool:
@@ -150,11 +144,10 @@ def accepts_update(control: GuiInputHandle[Any], updates: Mapping[str, Any]) -> 
     )
 
 
-def check_guarded(host: str, port: int) -> None:
+def check_guarded(port: int) -> None:
     """Send requests of strangers; InputError if this version of viser answers them."""
-    address = "127.0.0.1" if host in _ALL_ADDRESSES else host
-    for name in ("Host: rebound.example\r\n", f"Host: {address}\r\nOrigin: http://a.example\r\n"):
-        with socket.create_connection((address, port), timeout=5) as stranger:
+    for name in ("Host: rebound.example\r\n", f"Host: {HOST}\r\nOrigin: http://a.example\r\n"):
+        with socket.create_connection((HOST, port), timeout=5) as stranger:
             stranger.sendall(f"GET / HTTP/1.1\r\n{name}Connection: close\r\n\r\n".encode())
             if b" 403 " not in stranger.recv(64):
                 raise InputError(

@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from rps_jax import engines, errors
 from rps_jax.app.drawing import TARGET, Drawing, furnish
-from rps_jax.app.gate import Gate, accepts_update, check_guarded
+from rps_jax.app.gate import HOST, Gate, accepts_update, check_guarded
 from rps_jax.control import registry
 from rps_jax.control.registry import LawLike
 from rps_jax.errors import InputError
@@ -69,8 +69,6 @@ class View(Action[None], Case):
     """Run folder of a sweep, to begin with one of its worlds; by default the options' push."""
     world: int = option(0, 0, positional=True, kw_only=True)
     """Index of the world in the sweep."""
-    host: str = field(default="127.0.0.1", kw_only=True)
-    """Address to serve the page on; by default to this machine alone."""
     port: int = option(8080, 0, 65535, kw_only=True)
     """Port to serve the page on; 0 takes any that is free."""
     setting: Setting = field(default=Setting(), kw_only=True)
@@ -112,7 +110,7 @@ class View(Action[None], Case):
         first = partial(self.push_of, request)
         if self.run is not None:
             first = partial(_in_world, *self._chosen(self.run), self.world)
-        page = open_page(self.host, self.port, request, self.push_of)
+        page = open_page(self.port, request, self.push_of)
         print(f"page: {page.url} (Ctrl-C ends it)", flush=True)
         try:
             page.start(first)
@@ -186,7 +184,7 @@ class Page:
     @property
     def url(self) -> str:
         """URL of the page."""
-        return f"http://{self._server.get_host()}:{self._server.get_port()}"
+        return f"http://{HOST}:{self._server.get_port()}"
 
     @property
     def request(self) -> PushRequest:
@@ -381,24 +379,21 @@ def _outcome_text(live: Live) -> str:
     return "the physics ran away" if outcome.diverged else "not reached in time"
 
 
-def open_page(
-    host: str, port: int, request: PushRequest, build: Callable[[PushRequest], Push]
-) -> Page:
-    """Serve a page; InputError if viser is missing, or cannot serve at this address."""
-    viser = errors.require("viser", "viz")
+def open_page(port: int, request: PushRequest, build: Callable[[PushRequest], Push]) -> Page:
+    """Serve a page; InputError if viser is missing, or the port cannot be used."""
+    viser, gate = errors.require("viser", "viz"), Gate()
     try:
-        with socket.create_server((host, port)):  # viser would quietly take another port
+        with socket.create_server((HOST, port)):  # viser would quietly take another port
             pass
-    except (OSError, ValueError) as error:  # ValueError: a name that no encoding knows
-        reason = (getattr(error, "strerror", None) or str(error)).partition(" (")[0]
+    except OSError as error:
+        reason = str(error.strerror).partition(" (")[0]
         raise InputError(
-            f"host = {host}, port = {port} cannot be served on ({reason}): choose another port."
+            f"port = {port} cannot be served on ({reason}): choose another port."
         ) from error
-    gate = Gate(host)
     with contextlib.redirect_stdout(io.StringIO()), gate.guarding():  # it prints a panel
-        server = viser.ViserServer(host, port, verbose=False)
+        server = viser.ViserServer(HOST, port, verbose=False)
     try:
-        check_guarded(host, server.get_port())
+        check_guarded(server.get_port())
     except BaseException:
         server.stop()
         raise
