@@ -21,16 +21,13 @@ def search(results: xr.Dataset) -> Figure:
     ax.plot(generation, results.base.values, "k--", lw=1, label="start, same worlds")
     ax.set(xlabel="generation", ylabel="objective [1]")
     ax.legend(fontsize=8)
-    ax = figure.add_subplot(grid[0, 2:])
-    ax.plot(generation, results.validation.values, "C2", label="objective")
-    ax.margins(y=0.3)  # room for the legends
-    ax.set(xlabel="generation", ylabel="mean on validation worlds [1]")
-    ax.legend(loc="upper left", fontsize=8)
-    twin = ax.twinx()
-    twin.plot(generation, 100 * results.validation_success.values, "C3", label="success")
-    twin.margins(y=0.3)
-    twin.set_ylabel("success [%]")
-    twin.legend(loc="upper right", fontsize=8)
+    for column, values, label in (
+        (2, results.validation.values, "mean on validation worlds [1]"),
+        (3, 100 * results.validation_success.values, "success on validation worlds [%]"),
+    ):
+        ax = figure.add_subplot(grid[0, column])
+        ax.plot(generation, values, "C2")
+        ax.set(xlabel="generation", ylabel=label)
     for i, name in enumerate(names):
         ax = figure.add_subplot(grid[1 + i // columns, i % columns])
         ax.plot(generation, results.params.values[:, i])

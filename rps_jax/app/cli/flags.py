@@ -52,19 +52,13 @@ class Session:
 
 
 @dataclass(frozen=True)
-class DeviceSession(Session):
-    """Options of commands that step worlds."""
+class FolderSession(Session):
+    """Options of commands that write a run folder."""
 
     device: Device = "auto"
     """Where the worlds are stepped: auto takes the GPU if JAX finds one, and processors for a few
     trials, which they have ended before a GPU has begun. On a processor the fused engine is
     compiled by the machine's C compiler if it has one, with xla by XLA alone."""
-
-
-@dataclass(frozen=True)
-class FolderSession(DeviceSession):
-    """Options of commands that write a run folder."""
-
     overwrite: bool = False
     """Whether a run that the folder already holds is removed first."""
 
@@ -83,9 +77,7 @@ def session_type(question_type: type) -> type[Session]:
     """Return the type of the options that a command has beside those of its question."""
     if issubclass(question_type, TraceQuestion):
         return FilmSession
-    if issubclass(question_type, SimulationQuestion):
-        return FolderSession
-    return DeviceSession if hasattr(question_type, "setting") else Session
+    return FolderSession if issubclass(question_type, SimulationQuestion) else Session
 
 
 def parse(question_type: type[Q], command: str, words: Sequence[str]) -> tuple[Q, Session]:
