@@ -47,9 +47,7 @@ class Export(Action[Path]):
 
     def check(self) -> None:
         if self.prefix and identifier(self.prefix) != self.prefix:
-            raise InputError(
-                f"prefix = {self.prefix} is not allowed: it must be a name of C, as my_law."
-            )
+            raise InputError(f"prefix = {self.prefix} is not allowed: write a C name, as my_law.")
         _ = self.program
         folder.ensure_writable(Path(self.out or self.default_folder))
 

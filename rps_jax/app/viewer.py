@@ -139,6 +139,9 @@ class PushRequest(NamedTuple):
     target: tuple[float, float]  # [m]
 
 
+Builder = Callable[[PushRequest], Push]
+
+
 def _in_world(plan: Plan, law: str, index: int) -> Push:
     """A world of a sweep."""
     part = build_batch(plan, law, [index])
@@ -153,11 +156,7 @@ class Page:
     """The panel, the clock and what the browser asks for."""
 
     def __init__(
-        self,
-        server: ViserServer,
-        gate: Gate,
-        request: PushRequest,
-        build: Callable[[PushRequest], Push],
+        self, server: ViserServer, gate: Gate, request: PushRequest, build: Builder
     ) -> None:
         """Create a page without a push, whose panel shows a `request`.
 
@@ -290,7 +289,7 @@ class Page:
         if moment.details.realigning:
             words.append("realigning")
         if self._is_over(live):
-            words.append(f"**{_outcome_text(live)}**")
+            words.append("**reached**" if live.outcome.success else "**not reached**")
         return ", ".join(words)
 
     def _is_over(self, live: Live) -> bool:
@@ -370,16 +369,7 @@ class Page:
             self._playing = True
 
 
-def _outcome_text(live: Live) -> str:
-    outcome = live.outcome
-    if outcome.success:
-        return "reached"
-    if outcome.tipped:
-        return "the object fell over"
-    return "the physics ran away" if outcome.diverged else "not reached in time"
-
-
-def open_page(port: int, request: PushRequest, build: Callable[[PushRequest], Push]) -> Page:
+def open_page(port: int, request: PushRequest, build: Builder) -> Page:
     """Serve a page; InputError if viser is missing, or the port cannot be used."""
     viser, gate = errors.require("viser", "viz"), Gate()
     try:
@@ -387,9 +377,7 @@ def open_page(port: int, request: PushRequest, build: Callable[[PushRequest], Pu
             pass
     except OSError as error:
         reason = str(error.strerror).partition(" (")[0]
-        raise InputError(
-            f"port = {port} cannot be served on ({reason}): choose another port."
-        ) from error
+        raise InputError(f"port = {port} cannot be served on ({reason}): use another.") from error
     with contextlib.redirect_stdout(io.StringIO()), gate.guarding():  # it prints a panel
         server = viser.ViserServer(HOST, port, verbose=False)
     try:

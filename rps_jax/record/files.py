@@ -242,9 +242,7 @@ def decode_results(content: bytes, source: object, *, signed: bool = False) -> x
         raise CorruptFileError(source, error) from error
     structure = results.attrs.pop(_STRUCTURE, None)
     if structure != _structure(results) and (signed or structure is not None):
-        raise CorruptFileError(
-            source, "its names, sizes, types or units are not those that were written"
-        )
+        raise CorruptFileError(source, "its names, sizes, types or units were changed")
     return results
 
 

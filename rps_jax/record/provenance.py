@@ -15,10 +15,7 @@ from rps_jax.record import folder as run_folder
 from rps_jax.record.files import JsonObject
 
 ENVIRONMENT = "environment.json"
-_PACKAGES = (
-    *("rps_jax", "jax", "jaxlib", "mujoco", "mujoco-mjx"),
-    *("numpy", "scipy", "xarray"),
-)
+_PACKAGES = ("rps_jax", "jax", "jaxlib", "mujoco", "mujoco-mjx", "numpy", "scipy", "xarray")
 
 
 def collect_environment(**device: object) -> JsonObject:
