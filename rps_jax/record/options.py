@@ -5,7 +5,6 @@ The command line, the checks and the manifests of runs are derived from these de
 
 import dataclasses
 import functools
-import numbers
 import types
 import typing
 from collections.abc import Mapping
@@ -89,25 +88,22 @@ def _check(name: str, value: Any, kind: object, metadata: Mapping[str, Any]) -> 
 
 def to_json(value: Any) -> Any:
     """Return a value as JSON: dataclasses and named tuples by their fields, arrays as lists."""
-    if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        return {f.name: to_json(getattr(value, f.name)) for f in dataclasses.fields(value)}
-    if hasattr(value, "_asdict"):
+    if dataclasses.is_dataclass(value):
+        value = {field.name: getattr(value, field.name) for field in dataclasses.fields(value)}
+    elif hasattr(value, "_asdict"):
         value = value._asdict()
     if isinstance(value, Mapping):
         return {str(name): to_json(item) for name, item in value.items()}
-    if isinstance(value, Path):
-        return str(value)
-    if isinstance(value, str | bool | None):
-        return value
-    if isinstance(value, numbers.Integral):
-        return int(value)
-    if isinstance(value, numbers.Real) or getattr(value, "ndim", None) == 0:
-        return float(np.asarray(value))
     if isinstance(value, tuple | list):
         return [to_json(item) for item in value]
-    if hasattr(value, "tolist"):
-        return to_json(np.asarray(value).tolist())
-    raise TypeError(f"{type(value).__name__} cannot be written as JSON")
+    if isinstance(value, Path):
+        return str(value)
+    if isinstance(value, str | None):
+        return value
+    numbers = np.asarray(value)
+    if numbers.dtype.kind not in "biuf":
+        raise TypeError(f"{type(value).__name__} cannot be written as JSON")
+    return numbers.tolist()
 
 
 # --- texts with changes --------------------------------------------------------------------

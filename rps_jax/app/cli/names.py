@@ -32,7 +32,6 @@ _PACKAGE = Path(__file__).parents[2]
 class Command(NamedTuple):
     """A command of the package."""
 
-    room: str
     module: str
     class_name: str
     summary: str  # first line of the class's docstring
@@ -51,7 +50,7 @@ def known() -> dict[str, Command]:
                 module = f"rps_jax.{room}.{path.stem}"
                 for name, class_name in definitions:
                     summary = docs[class_name].partition("\n")[0]
-                    commands[name.replace("_", " ")] = Command(room, module, class_name, summary)
+                    commands[name.replace("_", " ")] = Command(module, class_name, summary)
     return commands
 
 
@@ -67,8 +66,8 @@ def overview() -> str:
     ]
     width = max(map(len, known())) + 2
     for room, heading in _HEADINGS.items():
-        commands = {name: known()[name].summary for name in known() if known()[name].room == room}
-        texts = (f"  {name:<{width}}{summary}" for name, summary in commands.items())
+        commands = {n: c for n, c in known().items() if c.module.startswith(f"rps_jax.{room}.")}
+        texts = (f"  {name:<{width}}{command.summary}" for name, command in commands.items())
         indent = " " * (width + 2)
         lines += ["", f"{heading}:"]
         lines += [textwrap.fill(text, 100, subsequent_indent=indent) for text in texts]
