@@ -96,10 +96,11 @@ def check_name(kind: str, name: str, known: Iterable[str]) -> str:
     known = list(known)
     if name in known:
         return name
-    raise InputError(f"unknown {kind} '{name}': choose from {', '.join(known)}{near(name, known)}.")
+    hint = suggest(name, known)
+    raise InputError(f"unknown {kind} '{name}': choose from {', '.join(known)}{hint}.")
 
 
-def near(name: object, known: Sequence[str]) -> str:
+def suggest(name: object, known: Sequence[str]) -> str:
     """Return a hint at the known name that is most similar to an unknown one, if any is."""
     matches = difflib.get_close_matches(str(name), known, n=1)
     return f" (did you mean '{matches[0]}'?)" if matches else ""

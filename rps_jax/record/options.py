@@ -100,10 +100,10 @@ def to_json(value: Any) -> Any:
         return str(value)
     if isinstance(value, str | None):
         return value
-    numbers = np.asarray(value)
-    if numbers.dtype.kind not in "biuf":
+    array = np.asarray(value)
+    if array.dtype.kind not in "biuf":
         raise TypeError(f"{type(value).__name__} cannot be written as JSON")
-    return numbers.tolist()
+    return array.tolist()
 
 
 # --- texts with changes --------------------------------------------------------------------

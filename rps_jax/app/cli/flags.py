@@ -26,7 +26,7 @@ from tyro.constructors import (
 )
 
 from rps_jax.engines.device import Device
-from rps_jax.errors import InputError, check_name, near
+from rps_jax.errors import InputError, check_name, suggest
 from rps_jax.record import options
 from rps_jax.record.options import option
 from rps_jax.runs.push import FILM_LENGTH, TraceQuestion
@@ -119,7 +119,7 @@ def _sentence(event: _errors.ParseErrorEvent, command: str, known: Sequence[str]
     hint = f"`rps {command} --help` lists the options"
     match event:
         case _errors.UnrecognizedArgs(tokens=[token, *_]):
-            return f"unknown option '{token}'{near(token.partition('=')[0], known)}: {hint}."
+            return f"unknown option '{token}'{suggest(token.partition('=')[0], known)}: {hint}."
         case _errors.MissingArgs(missing_arguments=[missing, *_]):
             return f"{missing.arg.field.intern_name} is missing: {hint}."
         case _errors.BadValue(argument=argument):
