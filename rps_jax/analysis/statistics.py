@@ -151,13 +151,12 @@ def distance_left(trials: xr.Dataset) -> np.ndarray:
 
 def failure_modes(trials: xr.Dataset, max_lost: float) -> np.ndarray:
     """Return indices (world,) into `FAILURES` of the trials of one law, -1 for a success."""
-    stalled = "stalled" in trials
     return np.select(
         [
             trials.success.values > 0,
             trials.diverged.values > 0,
             trials.tipped.values > 0,
-            trials.stalled.values > 0 if stalled else np.zeros(trials.sizes["world"], bool),
+            trials.get("stalled", xr.zeros_like(trials.success)).values > 0,
             ~np.isfinite(trials.min_distance.values),
             trials.contact_lost_time.values > max_lost,
         ],
