@@ -100,7 +100,7 @@ def test_several_laws_have_a_row_each_and_a_world_a_column(tmp_path):
     plan = dataclasses.replace(base_plan, laws={"one": RPSParams.paper(), "two": RPSParams.nps()})
     takes = film.of_sweep(tmp_path, plan, ["two", "one"], "first", (2, 3))
     assert in_order(takes) == [f"{law}, world {i}" for law in ("two", "one") for i in range(3)]
-    with pytest.raises(InputError, match="each has a row"):
+    with pytest.raises(InputError, match="a row for each of 2 laws"):
         film.of_sweep(tmp_path, plan, ["two", "one"], "first", (3, 2))
     with pytest.raises(InputError, match="unknown law 'three'"):
         film.of_sweep(tmp_path, plan, ["three"], "first", (1, 3))

@@ -8,7 +8,7 @@ from pathlib import Path
 from rps_jax.app.export import program as programs
 from rps_jax.app.export.program import Program
 from rps_jax.control.registry import LawLike
-from rps_jax.errors import InputError
+from rps_jax.errors import not_allowed
 from rps_jax.lowering.routine import identifier
 from rps_jax.record import files, folder
 from rps_jax.record.options import option
@@ -47,7 +47,7 @@ class Export(Action[Path]):
 
     def check(self) -> None:
         if self.prefix and identifier(self.prefix) != self.prefix:
-            raise InputError(f"prefix = {self.prefix} is not allowed: write a C name, as my_law.")
+            raise not_allowed("prefix", self.prefix, "write a name of C, as my_law")
         _ = self.program
         folder.ensure_writable(Path(self.out or self.default_folder))
 

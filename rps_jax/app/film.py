@@ -158,9 +158,8 @@ def shape_of(grid: str) -> tuple[int, int]:
     """Return rows and columns of a grid, written as 4x6."""
     match = re.fullmatch(r"([1-9]|1[0-2])x([1-9]|1[0-2])", grid)
     if match is None:
-        raise InputError(
-            f"grid = {grid} is not allowed: write ROWSxCOLUMNS, as 4x6, each from 1 to 12."
-        )
+        rule = "write ROWSxCOLUMNS, as 4x6, each from 1 to 12"
+        raise errors.not_allowed("grid", grid, rule)
     return int(match[1]), int(match[2])
 
 
@@ -182,9 +181,8 @@ def of_sweep(
     for law in laws:
         errors.check_name("law", law, plan.laws)
     if len(laws) not in (1, shape[0]):
-        raise InputError(
-            f"grid = {shape[0]}x{shape[1]} is not allowed with {len(laws)} laws: each has a row."
-        )
+        grid = f"{shape[0]}x{shape[1]}"
+        raise errors.not_allowed("grid", grid, f"it must have a row for each of {len(laws)} laws")
     count = shape[0] * shape[1] if len(laws) == 1 else shape[1]
     if not isinstance(selection, str):
         errors.check_each_once("worlds", selection)
@@ -196,7 +194,7 @@ def of_sweep(
     else:
         index = statistics.hardest(files.read_results(run), count)
         if not index.size:
-            raise InputError("which = hardest is not allowed: no trial of this run failed.")
+            raise errors.not_allowed("which", selection, "no trial of this run failed")
     of_object = plan.object_of(index)
     takes = []
     for row, law in enumerate(laws):

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 import xarray as xr
 
+from rps_jax import errors
 from rps_jax.analysis.figures.style import Figure
 from rps_jax.analysis.report import Picture, Section
 from rps_jax.control import registry, validation
@@ -52,7 +53,7 @@ class Shadow(Question[xr.Dataset]):
         _ = self.params, robots.parse_robot(self.robot)
         bags.check()
         if not Path(self.file).is_file():
-            raise InputError(f"bag = {self.file} is not allowed: give an MCAP file.")
+            raise errors.not_allowed("bag", self.file, "give an MCAP file")
 
     def answer(self, run: Run) -> xr.Dataset:
         """Run the law over the bag."""

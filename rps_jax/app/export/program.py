@@ -10,7 +10,7 @@ import numpy as np
 
 from rps_jax.control import registry, validation
 from rps_jax.control.observation import TaxelObservation, Twist
-from rps_jax.errors import InputError
+from rps_jax.errors import not_allowed
 from rps_jax.lowering.routine import Group, Pytree, Routine, fields_of, routine
 from rps_jax.robot import robot as robots
 from rps_jax.robot import skin as skins
@@ -79,10 +79,8 @@ def program(law: registry.LawLike, robot: Any = "ideal", skin: Any = "capacitive
     functions, base = registry.law_of(params), robots.parse_robot(robot)
     sensor = skins.parse_skin(skin)._replace(shell=base.shell)
     if not isinstance(sensor, CapacitiveSkin) or not sensor.shell.count:
-        raise InputError(
-            f"skin = {skin} is not allowed: name one with taxels, as capacitive, on a robot with "
-            "boards."
-        )
+        rule = "name one with taxels, as capacitive, on a robot with boards"
+        raise not_allowed("skin", skin, rule)
     taxels = jax.ShapeDtypeStruct((sensor.shell.count,), np.float64)
     with jax.enable_x64(True):
         observation = validation.observation_shapes(functions.senses)
