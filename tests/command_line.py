@@ -11,6 +11,7 @@ import json
 import os
 import re
 from pathlib import Path
+from unittest import mock
 
 from rps_jax.app.cli import main as rps
 from rps_jax.app.cli import names
@@ -23,16 +24,9 @@ Flags = dict[str, dict[str, str | None]]
 
 def help_of(command: str) -> str:
     """Return the help text of one command, without boxes, in lines that are never wrapped."""
-    printed = io.StringIO()
-    columns = os.environ.get("COLUMNS")
-    os.environ["COLUMNS"] = "5000"
-    try:
-        with contextlib.redirect_stdout(printed):
-            assert rps([*command.split(), "--help"]) == 0
-    finally:
-        os.environ.pop("COLUMNS")
-        if columns is not None:
-            os.environ["COLUMNS"] = columns
+    printed, wide = io.StringIO(), mock.patch.dict(os.environ, COLUMNS="5000")
+    with wide, contextlib.redirect_stdout(printed):
+        assert rps([*command.split(), "--help"]) == 0
     return printed.getvalue()
 
 
@@ -46,16 +40,15 @@ def flags_of(command: str) -> Flags:
             entries[-1].append(line.strip())
     flags: Flags = {}
     for head, *rest in entries:
-        names_, _, metavar = head.partition(" ")
-        if names_ in ("-h,", "--help"):
-            continue
-        text = " ".join(rest)
-        match = _DEFAULT.search(text)
-        flags[names_.rstrip(",")] = {
-            "metavar": metavar,
-            "default": match["default"] if match else None,
-            "help": _DEFAULT.sub("", text),
-        }
+        name, _, metavar = head.partition(" ")
+        if name not in ("-h,", "--help"):
+            text = " ".join(rest)
+            match = _DEFAULT.search(text)
+            flags[name.rstrip(",")] = {
+                "metavar": metavar,
+                "default": match["default"] if match else None,
+                "help": _DEFAULT.sub("", text),
+            }
     return flags
 
 
@@ -68,9 +61,9 @@ def write_record() -> None:
     """Write the record, one flag a line."""
     commands = []
     for command, flags in all_flags().items():
-        lines = (
+        lines = [
             f"  {json.dumps(k)}: {json.dumps(v, ensure_ascii=False)}" for k, v in flags.items()
-        )
+        ]
         commands.append(f" {json.dumps(command)}: {{\n" + ",\n".join(lines) + "\n }")
     RECORD.write_text("{\n" + ",\n".join(commands) + "\n}\n")
 

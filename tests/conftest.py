@@ -1,10 +1,10 @@
 """Set-up of all tests: processor, fast compilation, offscreen rendering, checked shapes, cache."""
 
 import functools
+import inspect
 import os
 from pathlib import Path
 
-import docstring_parser
 import pytest
 import shapes
 
@@ -16,9 +16,9 @@ if os.name == "posix":
 
 
 def pytest_configure(config):
+    # Each command reads the help of its options anew from the sources of their classes.
+    inspect.getsource = functools.cache(inspect.getsource)
     shapes.install()
-    # Each command reads the same docstrings again, which takes most of the time of a refusal.
-    docstring_parser.parse_from_object = functools.cache(docstring_parser.parse_from_object)
     import jax
 
     from rps_jax.engines import device
@@ -34,10 +34,10 @@ def pytest_configure(config):
 
 # Slow files start first; a slow file at the end would leave processors idle.
 LONGEST = (
-    *("learning", "failures", "native", "rivals", "smooth", "cli", "examples", "library", "ladder"),
-    *("export", "sweep", "shell", "trial", "robot", "fit", "video", "points", "faults", "bags"),
-    *("ground", "force_push_grid", "feet", "house", "gpu_writer", "film", "footprint", "arena"),
-    *("force", "evaluate", "study", "quasistatic", "physics", "notebooks", "publish", "quality"),
+    *("failures", "learning", "native", "export", "ladder", "rivals", "gpu_writer", "smooth"),
+    *("bags", "examples", "sweep", "shell", "trial", "robot", "video", "points", "faults"),
+    *("force_push_grid", "film", "evaluate", "feet", "ground", "force", "library", "cli", "study"),
+    *("quasistatic", "fit", "physics", "notebooks", "publish", "quality", "limits", "isolation"),
 )
 
 

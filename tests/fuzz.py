@@ -14,7 +14,6 @@ import atexit
 import contextlib
 import functools
 import io
-import itertools
 import json
 import os
 import random
@@ -26,23 +25,18 @@ import time
 import traceback
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
+from unittest import mock
 
 PATIENCE = 10.0  # [s] after which a command hangs
-
-
-class Case(NamedTuple):
-    """Arguments of a command that has one fault."""
-
-    title: str
-    arguments: tuple[str, ...]
 
 
 class Attempt(NamedTuple):
     """Outcome of a command that was given a fault."""
 
-    how: str  # refused, accepted, told, traceback, hang
+    how: str  # refused, wordy, accepted, told, traceback, hang
     text: str
 
 
@@ -54,25 +48,16 @@ class Hang(BaseException):
     """Signal that a command exceeded its time limit."""
 
 
-@contextlib.contextmanager
-def never_stepping() -> Iterator[None]:
+def never_stepping() -> contextlib.ExitStack:
     """Stop commands before the first world is stepped or the first program is compiled."""
     from rps_jax.app import film
     from rps_jax.trials import trial
     from rps_jax.tuning import rollout
 
-    def stop(*_: Any, **__: Any) -> None:
-        raise Accepted
-
-    starts = ((trial, "start_all"), (rollout, "start"), (film, "_shots"))
-    originals = [(module, name, getattr(module, name)) for module, name in starts]
-    for module, name, _ in originals:
-        setattr(module, name, stop)
-    try:
-        yield
-    finally:
-        for module, name, function in originals:
-            setattr(module, name, function)
+    stack = contextlib.ExitStack()
+    for module, name in ((trial, "start_all"), (rollout, "start"), (film, "_shots")):
+        stack.enter_context(mock.patch.object(module, name, side_effect=Accepted))
+    return stack
 
 
 def attempt(arguments: Sequence[str], patience: float = PATIENCE) -> Attempt:
@@ -118,6 +103,27 @@ def _one_sentence(text: str) -> bool:
     return len(last) == 1 and text.rstrip().endswith(".") and len(last[0]) < 2000
 
 
+# A fault: its title, the command, and how else than refused the command may end.
+Fault = tuple[str, Sequence[str], Sequence[str]]
+
+
+def inject(
+    faults: Callable[[int, int], Iterator[Fault]], limit: int, seed: int, tell: Callable[[str], Any]
+) -> Counter[str]:
+    """Run commands with faults up to the first step of a world, and count how they end."""
+    counts: Counter[str] = Counter()
+    for title, command, allowed in faults(limit, seed):
+        with never_stepping():
+            result = attempt(command)
+        counts[result.how] += 1
+        if result.how not in ("refused", *allowed):
+            words = f"{result.how}: {title}: rps {' '.join(command)}"
+            tell(f"{words[:400]}\n{result.text[-1800:]}")
+        for leftover in ("merged", "runs"):
+            shutil.rmtree(leftover, ignore_errors=True)
+    return counts
+
+
 # --- bad values of options -----------------------------------------------------------------
 
 VALUES = (
@@ -128,63 +134,27 @@ VALUES = (
     *("1/" + "9" * 60, "S1,S2", "0.3,0.3,0.3", "0,0", "nan,nan", "rps", "rps,rps", "RPS", "aps "),
     *("nowhere.json", "nowhere.py:P", "nowhere.npz", ".json", ".py:", ".npz", ":", "..", "/", "."),
     *("/dev/null", "/dev/zero", "/dev/zero.json", "/proc/self/mem", "/etc/passwd", "~", "$HOME"),
-    *(
-        "list.json",
-        "null.json",
-        "deep.json",
-        "text.json",
-        "binary.json",
-        "empty.json",
-        "number.json",
-    ),
-    *("big.json", "pipe.json", "pipe.npz", "pipe.py:P", "folder.json", "pipe", "folder.npz"),
-    *("broken.py:P", "syntax.py:P", "text.npz", "encrypted.npz", "zip.npz", "exit.py:P"),
-    *(
-        "\N{SNOWMAN}",
-        "\N{PILE OF POO}" * 40,
-        "\u202eabc",
-        "\x1b[31m",
-        "a\nb",
-        "x" * 4000,
-        "-",
-        "--",
-    ),
-    *(
-        "a b",
-        "'",
-        '"',
-        "\\",
-        "%s",
-        "{0}",
-        "`id`",
-        ";ls",
-        "&&",
-        "*",
-        "?",
-        "\t",
-        "--help",
-        "-1.5",
-        "+5",
-    ),
+    *("list.json", "null.json", "deep.json", "text.json", "binary.json", "empty.json"),
+    *("number.json", "big.json", "pipe.json", "pipe.npz", "pipe.py:P", "folder.json", "pipe"),
+    *("folder.npz", "broken.py:P", "syntax.py:P", "text.npz", "encrypted.npz", "zip.npz"),
+    *("exit.py:P", "\N{SNOWMAN}", "\N{PILE OF POO}" * 40, "\u202eabc", "\x1b[31m", "a\nb"),
+    *("x" * 4000, "-", "--", "a b", "'", '"', "\\", "%s", "{0}", "`id`", ";ls", "&&", "*", "?"),
+    *("\t", "--help", "-1.5", "+5"),
 )
 
 
 def furnish(folder: Path) -> None:
     """Write the files that `VALUES` names."""
-    (folder / "list.json").write_text("[1, 2]")
-    (folder / "null.json").write_text("null")
-    (folder / "number.json").write_text("7")
-    (folder / "deep.json").write_text("[" * 100_000)
-    (folder / "text.json").write_text("a note")
-    (folder / "binary.json").write_bytes(bytes(range(256)))
-    (folder / "empty.json").write_text("")
-    (folder / "big.json").write_text('{"a": ' + "9" * 10_000 + "}")
-    (folder / "broken.py").write_text("raise RuntimeError('broken')\n")
-    (folder / "syntax.py").write_text("def :\n")
-    (folder / "exit.py").write_text("import sys\nsys.exit(3)\n")
-    (folder / "text.npz").write_text("a note")
-    (folder / "zip.npz").write_bytes(b"PK\x05\x06" + bytes(18))
-    (folder / "encrypted.npz").write_bytes(encrypted())
+    contents = {
+        "list.json": b"[1, 2]", "null.json": b"null", "number.json": b"7",
+        "deep.json": b"[" * 100_000, "text.json": b"a note", "binary.json": bytes(range(256)),
+        "empty.json": b"", "big.json": b'{"a": ' + b"9" * 10_000 + b"}",
+        "broken.py": b"raise RuntimeError('broken')\n", "syntax.py": b"def :\n",
+        "exit.py": b"import sys\nsys.exit(3)\n", "text.npz": b"a note",
+        "zip.npz": b"PK\x05\x06" + bytes(18), "encrypted.npz": encrypted(),
+    }  # fmt: skip
+    for name, content in contents.items():
+        (folder / name).write_bytes(content)
     for name in ("pipe", "pipe.json", "pipe.npz", "pipe.py"):
         os.mkfifo(folder / name)
     for name in ("folder.json", "folder.npz"):
@@ -216,32 +186,25 @@ def encrypted() -> bytes:
     return bytes(raw)
 
 
-def commands() -> list[tuple[str, ...]]:
-    """Return all commands as words."""
-    from rps_jax.app.cli import names
-
-    return [tuple(name.split()) for name in names.known()]
-
-
-def options(command: Sequence[str]) -> list[str]:
-    """Return the flags of a command."""
+def values(limit: int, seed: int) -> Iterator[Fault]:
+    """Yield some options of all commands with some values, in random order."""
     from command_line import flags_of
 
-    return [name for name in flags_of(" ".join(command)) if name.startswith("--")]
+    from rps_jax.app.cli import names
 
-
-def values(seed: int = 0) -> Iterator[Case]:
-    """Yield all options of all commands with all values, in random order."""
     cases = [
-        Case(f"{' '.join(command)} {option} {value[:30]!r}", (*command, *needs, option, value))
-        for command in commands()
-        for option in options(command)
-        for needs in (NEEDS.get(command[0], ()),)
+        (*name.split(), *NEEDS.get(name, ()), option, value)
+        for name in names.known()
+        for option in flags_of(name)
         for value in VALUES
+        if option.startswith("--")
         if not (option == "--out" and value in ("/", "..", "~"))  # these may be writable
     ]
     random.Random(seed).shuffle(cases)
-    yield from cases
+    with tempfile.TemporaryDirectory() as folder, contextlib.chdir(folder):
+        furnish(Path(folder))
+        for command in cases[:limit]:
+            yield "a value", command, ("accepted", "told")
 
 
 # Required arguments of a command besides the tested option.
@@ -284,33 +247,24 @@ DEFAULTS = {
     "returns": "memory, Twist(params.v, 0.0, 0.0), Details.from_obs(seen)",
     "register": "rps_jax.register_law('{name}', rps_jax.Law(init, step), {P}())",
 }  # fmt: skip
+MEMORY = "{}, Twist(0.0, 0.0, 0.0), Details.from_obs(seen)"
 TWIST = "memory, {}, Details.from_obs(seen)"
+DETAILS = "memory, Twist(0.0, 0.0, 0.0), {}"
+REGISTER = "rps_jax.register_law({}, rps_jax.Law({}), {})"
 _WRONG: dict[str, Sequence[str]] = {
     "returns": (
         *("None", "'text'", "memory", "(memory, Twist(0.0, 0.0, 0.0))", "1.0", "{}", "[]", "()"),
-        *(
-            "memory, Twist(0.0, 0.0, 0.0), Details.from_obs(seen), 1",
-            "iter(())",
-            "Twist(0.0, 0.0, 0.0)",
-        ),
-        *("memory, Twist(0.0, 0.0, 0.0), None", "memory, Twist(0.0, 0.0, 0.0), 'details'"),
-        *("memory, Twist(0.0, 0.0, 0.0), Details(0, 0, 0, 0, here)", "object()", "step", "seen"),
-        "memory, Twist(0.0, 0.0, 0.0), Details(None, None, None, None, None)",
+        *("iter(())", "Twist(0.0, 0.0, 0.0)", "object()", "step", "seen", "{'memory': memory}"),
         "[memory, Twist(0.0, 0.0, 0.0), Details.from_obs(seen)]",
-        "{'memory': memory}",
+        *map(DETAILS.format, ("None", "'details'", "Details(0, 0, 0, 0, here)")),
+        *map(DETAILS.format, ("Details.from_obs(seen), 1", "Details(*5 * [None])")),
         *map(TWIST.format, ("None", "'left'", "(0.0, 0.0)", "here", "0.0", "[0, 0, 0]", "{}")),
         *map(TWIST.format, ("Twist(here, 0.0, 0.0)", "Twist('a', 0.0, 0.0)", "Twist(None, 0, 0)")),
         *map(TWIST.format, ("Twist(1j, 0.0, 0.0)", "Twist(seen.in_contact, 0, 0)", "Twist")),
         *map(TWIST.format, ("Twist(0.0, 0.0, jnp.zeros(1))", "jnp.zeros(3)", "seen")),
-        "jnp.concatenate([memory, here]), Twist(0.0, 0.0, 0.0), Details.from_obs(seen)",
-        "memory[0], Twist(0.0, 0.0, 0.0), Details.from_obs(seen)",
-        "None, Twist(0.0, 0.0, 0.0), Details.from_obs(seen)",
-        "(memory, memory), Twist(0.0, 0.0, 0.0), Details.from_obs(seen)",
-        "'memory', Twist(0.0, 0.0, 0.0), Details.from_obs(seen)",
-        "memory > 0, Twist(0.0, 0.0, 0.0), Details.from_obs(seen)",
-        "memory * 1j, Twist(0.0, 0.0, 0.0), Details.from_obs(seen)",
-        "{'x': memory}, Twist(0.0, 0.0, 0.0), Details.from_obs(seen)",
-        "memory.astype(int), Twist(0.0, 0.0, 0.0), Details.from_obs(seen)",
+        *map(MEMORY.format, ("jnp.concatenate([memory, here])", "memory[0]", "None", "'memory'")),
+        *map(MEMORY.format, ("(memory, memory)", "memory > 0", "memory * 1j", "{'x': memory}")),
+        MEMORY.format("memory.astype(int)"),
     ),
     "body": (
         *("if seen.in_contact: pass", "while seen.yaw > 0: pass", "float(seen.yaw)", "1 / 0"),
@@ -325,107 +279,68 @@ _WRONG: dict[str, Sequence[str]] = {
         *("min(here)", "max(seen.yaw, 0.0)", "seen.in_contact and seen.yaw", "not seen.in_contact"),
         *("sorted(here)", "sum(here, 'a')", "here.astype('nothing')", "jnp.linalg.inv(here)"),
         *("jax.lax.scan(lambda c, x: (c, c, x), 0, here)", "jax.grad(lambda x: here)(1.0)"),
-        *(
-            "raise KeyboardInterrupt2",
-            "np.random.default_rng(seen.yaw)",
-            "jax.random.key(seen.yaw)",
-        ),
-        *("params.v = 3", "seen.yaw = 3", "(lambda: 1)(2)", "jnp.where(1, 2)", "f'{seen.yaw:.2f}'"),
+        *("raise KeyboardInterrupt2", "np.random.default_rng(seen.yaw)", "(lambda: 1)(2)"),
+        *("jax.random.key(seen.yaw)", "params.v = 3", "seen.yaw = 3", "jnp.where(1, 2)"),
         *("print(float(seen.yaw))", "here.at[9].nothing(1)", "jnp.concatenate([here, seen.yaw])"),
+        "f'{seen.yaw:.2f}'",
     ),
     "starts": (
         *("raise ValueError('no')", "1 / 0", "params.nothing", "if params.v > 0: pass", "nothing"),
-        *(
-            "float(params.v)",
-            "np.sin(params.v)",
-            "sys.exit(3)",
-            "assert False",
-            "jnp.zeros(params.v)",
-        ),
+        *("float(params.v)", "np.sin(params.v)", "sys.exit(3)", "assert False"),
+        "jnp.zeros(params.v)",
     ),
     "memory": (
-        *(
-            "'text'",
-            "object()",
-            "[1, 'a']",
-            "step",
-            "jnp.zeros",
-            "{'a': 'b'}",
-            "np.array([1, 'a'])",
-        ),
-        *("0", "np.zeros(2, int)", "[jnp.zeros(2)]", "None", "np.array([None])", "1j", "b'bytes'"),
+        *("'text'", "object()", "[1, 'a']", "step", "jnp.zeros", "{'a': 'b'}", "0", "None", "1j"),
+        *("np.array([1, 'a'])", "np.zeros(2, int)", "[jnp.zeros(2)]", "np.array([None])"),
+        "b'bytes'",
     ),
-    "field": (
-        *("gain: float = None", "gain: float = 1j", "gain: str = 'high'", "gain: list = [1, 'a']"),
-        *("gain: float = float('nan')", "gain: float = float('inf')", "gain: object = object()"),
-        *(
-            "gain: object = np.array([1, None])",
-            "gain: list = [[1, 2], [None]]",
-            "gain: object = len",
-        ),
-        *(
-            "gain: object = np.array(['a'])",
-            "gain: object = jnp.array([jnp.nan])",
-            "gain: bytes = b''",
-        ),
+    "field": tuple(
+        f"gain: {kind} = {value}"
+        for kind, defaults in {
+            "float": ("None", "1j", "float('nan')", "float('inf')"),
+            "str": ("'high'",),
+            "list": ("[1, 'a']", "[[1, 2], [None]]"),
+            "bytes": ("b''",),
+            "object": ("object()", "np.array([1, None])", "len", "np.array(['a'])",
+                       "jnp.array([jnp.nan])"),
+        }.items()
+        for value in defaults
     ),
     "takes": ("", "params", "params, memory", "params, memory, seen, more", "*, params", "**seen"),
     "takes_init": ("", "params, more", "*, params"),
     "head": ("def :", "raise RuntimeError('head')", "import nothing", "sys.exit(3)", "1 / 0", "P"),
     "register": (
-        *("", "rps_jax.register_law('{name}', rps_jax.Law(init, step), None)"),
-        "rps_jax.register_law('{name}', rps_jax.Law(init, step), 3.0)",
-        "rps_jax.register_law('{name}', rps_jax.Law(init, step), [1.0])",
-        "rps_jax.register_law('{name}', rps_jax.Law(init, step), {P})",
-        "rps_jax.register_law('{name}', None, {P}())",
-        "rps_jax.register_law('{name}', rps_jax.Law(None, None), {P}())",
-        "rps_jax.register_law('{name}', rps_jax.Law(init, 'step'), {P}())",
-        "rps_jax.register_law('{name}', rps_jax.Law(init, step, 'smell'), {P}())",
-        "rps_jax.register_law('{name}', rps_jax.Law(init, step, check=1), {P}())",
-        "rps_jax.register_law('{name}', rps_jax.Law(init, step, check=init), {P}())",
-        "rps_jax.register_law('rps', rps_jax.Law(init, step), {P}())",
-        "rps_jax.register_law(3, rps_jax.Law(init, step), {P}())",
-        "rps_jax.register_law('{name}', rps_jax.Law(init, step), rps_jax.RPSParams())",
-        "rps_jax.register_law('{name}')",
-        "{P}.d_success = None\nrps_jax.register_law('{name}', rps_jax.Law(init, step), {P}())",
+        *("", "rps_jax.register_law('{name}')", "rps_jax.register_law('{name}', None, {P}())"),
+        *(REGISTER.format("'{name}'", "init, step", params)
+          for params in ("None", "3.0", "[1.0]", "{P}", "rps_jax.RPSParams()")),
+        *(REGISTER.format("'{name}'", law, "{P}()")
+          for law in ("None, None", "init, 'step'", "init, step, 'smell'",
+                      "init, step, check=1", "init, step, check=init")),
+        *(REGISTER.format(name, "init, step", "{P}()") for name in ("'rps'", "3")),
+        "{P}.d_success = None\n" + REGISTER.format("'{name}'", "init, step", "{P}()"),
     ),
-}
+}  # fmt: skip
 # Fragments above that give a valid law.
 _VALID_LAWS = {
     *(f"memory: {value}" for value in ("0", "1j", "None", "[jnp.zeros(2)]", "np.zeros(2, int)")),
     "body: jax.random.key(seen.yaw)",
-    "register: rps_jax.register_law('{name}', rps_jax.Law(init, step, check=init), {P}())",
+    "register: " + REGISTER.format("'{name}'", "init, step, check=init", "{P}()"),
 }
 
 
-def wrong_laws() -> Iterator[tuple[str, str]]:
-    """Yield the fault of an invalid law and the text of its file."""
-    for index, (slot, fragment) in enumerate((k, v) for k, vs in _WRONG.items() for v in vs):
-        parts = {k: v.replace("{name}", f"wrong_{index}") for k, v in DEFAULTS.items()}
-        parts[slot] = fragment.replace("{name}", f"wrong_{index}")
-        text = LAW
-        for key, part in parts.items():
-            text = text.replace(f"{{{key}}}", part)
-        yield f"{slot}: {fragment}", text.replace("{P}", f"P{index}")
-
-
-def run_laws(limit: int, seed: int, tell: Callable[[str], None]) -> Counter[str]:
-    """Run sweeps of invalid laws up to the first step of a world."""
-    counts: Counter[str] = Counter()
-    with tempfile.TemporaryDirectory() as folder, contextlib.chdir(folder), never_stepping():
-        for index, (title, text) in enumerate(itertools.islice(wrong_laws(), limit)):
-            file = Path(f"law_{index}.py")
-            file.write_text(text)
-            result = attempt(("sweep", "--laws", f"{file}:P{index}", "--worlds", "8"))
-            how = "right" if result.how == "accepted" and title in _VALID_LAWS else result.how
-            counts[how] += 1
-            if how not in ("refused", "right") or LOUD:
-                tell(f"{how}: {title}\n{result.text[-1500:]}")
-            shutil.rmtree("runs", ignore_errors=True)
-    return counts
-
-
-LOUD = False
+def wrong_laws(limit: int, seed: int) -> Iterator[Fault]:
+    """Yield sweeps of invalid laws, in files of a temporary folder."""
+    fragments = [(slot, fragment) for slot, texts in _WRONG.items() for fragment in texts]
+    with tempfile.TemporaryDirectory() as folder, contextlib.chdir(folder):
+        for index, (slot, fragment) in enumerate(fragments[:limit]):
+            text = LAW
+            for key, part in (DEFAULTS | {slot: fragment}).items():
+                text = text.replace(f"{{{key}}}", part)
+            text = text.replace("{name}", f"wrong_{index}").replace("{P}", f"P{index}")
+            Path(f"law_{index}.py").write_text(text)
+            command = ("sweep", "--laws", f"law_{index}.py:P{index}", "--worlds", "8")
+            title = f"{slot}: {fragment}"
+            yield title, command, ("accepted",) * (title in _VALID_LAWS)
 
 
 # --- run folders that somebody edited or damaged ---------------------------------------------
@@ -436,12 +351,8 @@ ODD: tuple[Any, ...] = (
 )
 
 
-class Edit(NamedTuple):
-    """A change of one file of a run folder, consistent with its checksum unless it is damage."""
-
-    title: str
-    file: str
-    make: Callable[[Path], None]
+# The title of a change of a file in a run folder, and a function that makes it.
+Edit = tuple[str, Callable[[Path], Any]]
 
 
 def json_paths(tree: Any, at: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
@@ -455,8 +366,9 @@ def json_paths(tree: Any, at: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]
 
 def _changed(tree: Any, at: tuple[Any, ...], value: Any) -> Any:
     """Return a copy of a JSON tree with another value at a path; `...` deletes the value."""
-    tree = json.loads(json.dumps(tree))
-    parent = tree
+    if not at:
+        return value
+    parent = tree = json.loads(json.dumps(tree))
     for key in at[:-1]:
         parent = parent[key]
     if value is ...:
@@ -479,170 +391,156 @@ def _sign(path: Path) -> None:
         path.rename(path.with_name(f"{name}-{digest[:16]}{path.suffix}"))
 
 
-def json_edits(path: Path, rng: random.Random, limit: int) -> Iterator[Edit]:
-    """Yield replaced or deleted values of a JSON file."""
+def json_edits(path: Path, rng: random.Random) -> list[Edit]:
+    """Return edits that replace or delete values of a JSON file."""
     tree = json.loads(path.read_text())
-    candidates = [(at, value) for at in json_paths(tree) for value in (*ODD, ...)]
-    for at, value in rng.sample(candidates, min(limit, len(candidates))):
 
-        def make(file: Path, at: tuple[Any, ...] = at, value: Any = value) -> None:
-            file.write_text(json.dumps(_changed(tree, at, value)))
-            _sign(file)
+    def write(file: Path, at: tuple[Any, ...], value: Any) -> None:
+        file.write_text(json.dumps(_changed(tree, at, value)))
 
-        where = ".".join(map(str, at))
-        yield Edit(f"{where} = {'nothing' if value is ... else repr(value)[:40]}", path.name, make)
-    for value in (None, [], 7, "text", [{}]):
-
-        def whole(file: Path, value: Any = value) -> None:
-            file.write_text(json.dumps(value))
-            _sign(file)
-
-        yield Edit(f"the whole = {value!r}", path.name, whole)
+    candidates = [((), value) for value in (None, [], 7, "text", [{}])]
+    candidates += [(at, value) for at in json_paths(tree) for value in (*ODD, ...)]
+    return [
+        (f"{'.'.join(map(str, at))} = {value!r:.40}", partial(write, at=at, value=value))
+        for at, value in candidates
+    ]
 
 
-def dataset_edits(path: Path, rng: random.Random, limit: int) -> Iterator[Edit]:
-    """Yield other variables, shapes, types and units of a NetCDF file."""
+def _changes(dataset: Any, name: str) -> dict[str, Callable[[], Any]]:
+    """Return functions that build the dataset with one variable changed, by title."""
     import numpy as np
+
+    x, dims = dataset[name].values, dataset[name].dims
+
+    def column(values: Any, dims: Any = dims, **attrs: Any) -> Any:
+        return dataset.drop_vars(name).assign({name: (dims, values, dataset[name].attrs | attrs)})
+
+    changes: dict[str, Callable[[], Any]] = {
+        "is missing": lambda: dataset.drop_vars(name),
+        "another name": lambda: dataset.rename({name: f"{name}_"}),
+        "other units": lambda: column(x, units="furlong"),
+        "units are a number": lambda: column(x, units=7),
+        "texts": lambda: column(x.astype(str)),
+        "bytes": lambda: column(x.astype("S8")),
+    }
+    if x.dtype.kind in "fiu":
+        changes |= {
+            "NaN": lambda: column(np.full(x.shape, np.nan)),
+            "huge": lambda: column(np.full(x.shape, 1e300)),
+            "a number": lambda: column(1.0, ()),
+            "64 bits": lambda: column(x.astype(complex).real),
+            "complex": lambda: column(x.astype(complex)),
+        }
+    if dims:
+        changes |= {
+            "one row less": lambda: dataset.isel({dims[-1]: slice(1, None)}),
+            "another axis": lambda: column(x[None], ("more", *dims)),
+            "twice": lambda: column(np.concatenate([x, x]), ("more", *dims[1:])),
+        }
+    return {f"{name}: {title}": change for title, change in changes.items()}
+
+
+def dataset_edits(path: Path, rng: random.Random) -> list[Edit]:
+    """Return edits to other variables, shapes, types and units of a NetCDF file."""
     import xarray as xr
+
+    def write(file: Path, change: Callable[[], Any]) -> None:
+        try:
+            edited = change()
+            for variable in edited.variables.values():
+                variable.encoding = {}
+            content = bytes(edited.to_netcdf(engine="h5netcdf", invalid_netcdf=True))
+        except Exception:  # xarray cannot write this dataset
+            content = b"not written"
+        file.write_bytes(content)
 
     with xr.open_dataset(path, engine="h5netcdf") as lazy:
         dataset = lazy.load()
-
-    def column(name: str, values: Any, dims: Any = None, **attrs: Any) -> Any:
-        old = dataset[name]
-        new = (dims or old.dims, values, old.attrs | attrs)
-        return dataset.drop_vars(name).assign({name: new})
-
-    changes: list[tuple[str, Callable[[], Any]]] = []
+    changes: dict[str, Callable[[], Any]] = {
+        "nothing in it": xr.Dataset,
+        "another dataset": lambda: xr.Dataset({"a": ("b", [1, 2])}),
+    }
     for name in map(str, dataset.variables):
-        variable = dataset[name]
-
-        def change(title: str, edit: Callable[[Any, str], Any], name: str = name) -> None:
-            changes.append((f"{name}: {title}", lambda: edit(dataset[name], name)))
-
-        change("is missing", lambda variable, name: dataset.drop_vars(name))
-        change("other units", lambda variable, name: column(name, variable.values, units="furlong"))
-        change("units are a number", lambda variable, name: column(name, variable.values, units=7))
-        change("texts", lambda variable, name: column(name, variable.values.astype(str)))
-        change("bytes", lambda variable, name: column(name, variable.values.astype("S8")))
-        change("another name", lambda variable, name: dataset.rename({name: f"{name}_"}))
-        if variable.dtype.kind in "fiu":
-            change("NaN", lambda variable, name: column(name, np.full(variable.shape, np.nan)))
-            change("huge", lambda variable, name: column(name, np.full(variable.shape, 1e300)))
-            change("a number", lambda variable, name: column(name, 1.0, ()))
-            change(
-                "64 bits", lambda variable, name: column(name, variable.values.astype(complex).real)
-            )
-            change("complex", lambda variable, name: column(name, variable.values.astype(complex)))
-        if variable.ndim:
-            change(
-                "one row less",
-                lambda variable, name: dataset.isel({variable.dims[-1]: slice(1, None)}),
-            )
-            change(
-                "another axis",
-                lambda variable, name: column(
-                    name, variable.values[None], ("more", *variable.dims)
-                ),
-            )
-            change(
-                "twice",
-                lambda variable, name: column(
-                    name,
-                    np.concatenate([variable.values, variable.values]),
-                    ("more", *variable.dims[1:]),
-                ),
-            )
-    changes.append(("nothing in it", lambda: xr.Dataset()))
-    changes.append(("another dataset", lambda: xr.Dataset({"a": ("b", [1, 2])})))
-    for title, edit in rng.sample(changes, min(limit, len(changes))):
-
-        def write(file: Path, edit: Callable[[], Any] = edit) -> None:
-            try:
-                edited = edit()
-                for variable in edited.variables.values():
-                    variable.encoding = {}
-                content = bytes(edited.to_netcdf(engine="h5netcdf", invalid_netcdf=True))
-            except Exception:  # xarray cannot write this dataset
-                content = b"not written"
-            file.write_bytes(content)
-            _sign(file)
-
-        yield Edit(title, path.name, write)
+        changes |= _changes(dataset, name)
+    return [(title, partial(write, change=change)) for title, change in changes.items()]
 
 
-def archive_edits(path: Path, rng: random.Random, limit: int) -> Iterator[Edit]:
-    """Yield other arrays of a NumPy archive."""
+def archive_edits(path: Path, rng: random.Random) -> list[Edit]:
+    """Return edits to other arrays of a NumPy archive."""
     import numpy as np
 
     with np.load(path, allow_pickle=False) as file:
         arrays = {name: file[name] for name in file.files}
-    changes: list[tuple[str, dict[str, Any]]] = []
+    edits: list[Edit] = []
     for name, array in arrays.items():
-        less = {k: v for k, v in arrays.items() if k != name}
-        changes += [
-            (f"{name} is missing", less),
-            (f"{name}: texts", arrays | {name: array.astype(str)}),
-            (f"{name}: flat", arrays | {name: array.ravel()[:1]}),
-            (f"{name}: another axis", arrays | {name: array[None]}),
-            (f"{name}: pickles", arrays | {name: np.array([{"a": 1}], object)}),
-            (f"{name}: structured", arrays | {name: np.zeros(2, "i4,f4")}),
-        ]
+        contents: dict[str, Any] = {
+            "texts": array.astype(str),
+            "flat": array.ravel()[:1],
+            "another axis": array[None],
+            "pickles": np.array([{"a": 1}], object),
+            "structured": np.zeros(2, "i4,f4"),
+        }
         if array.dtype.kind in "fiu":
-            changes += [
-                (f"{name}: NaN", arrays | {name: np.full(array.shape, np.nan)}),
-                (f"{name}: other bits", arrays | {name: array.astype(np.float16)}),
-            ]
+            contents |= {"NaN": np.full(array.shape, np.nan), "bits": array.astype(np.float16)}
         if array.dtype.kind == "U":
-            try:
+            with contextlib.suppress(ValueError):
                 tree = json.loads(str(array))
-            except ValueError:
-                continue
-            candidates = [(at, value) for at in json_paths(tree) for value in (*ODD, ...)]
-            for at, value in rng.sample(candidates, min(40, len(candidates))):
-                encoded = json.dumps(_changed(tree, at, value))
-                changes.append(
-                    (f"{name}.{at} = {value!r}"[:80], arrays | {name: np.array(encoded)})
-                )
-    for title, content in rng.sample(changes, min(limit, len(changes))):
-
-        def write(file: Path, content: dict[str, Any] = content) -> None:
-            np.savez(file, **content)
-            _sign(file)
-
-        yield Edit(title, path.name, write)
+                candidates = [(at, value) for at in json_paths(tree) for value in (*ODD, ...)]
+                for at, value in rng.sample(candidates, min(40, len(candidates))):
+                    changed = np.array(json.dumps(_changed(tree, at, value)))
+                    contents[f"{at} = {value!r:.40}"] = changed
+        rest = {key: value for key, value in arrays.items() if key != name}
+        edits += [(f"{name} is missing", partial(np.savez, **rest))]
+        edits += [
+            (f"{name}: {title}", partial(np.savez, **arrays | {name: content}))
+            for title, content in contents.items()
+        ]
+    return edits
 
 
-def discard(*_: Any) -> None:
-    """Return None, so that a lambda can run several actions."""
-
-
-def damages(path: Path, rng: random.Random, limit: int) -> Iterator[Edit]:
-    """Yield corrupt contents, and folders, pipes and links in place of the file."""
+def damages(path: Path, rng: random.Random) -> list[Edit]:
+    """Return corrupt contents, and folders, pipes and links in place of the file."""
     content = path.read_bytes()
-
-    def bytes_(title: str, new: bytes) -> Edit:
-        return Edit(title, path.name, lambda file: discard(file.write_bytes(new)))
-
-    def instead(title: str, make: Callable[[Path], Any]) -> Edit:
-        return Edit(title, path.name, lambda file: discard(file.unlink(), make(file)))
-
     at = rng.randrange(max(1, len(content)))
     flipped = content[:at] + bytes([content[at] ^ 1 << rng.randrange(8)]) + content[at + 1 :]
-    edits = [
-        bytes_("empty", b""), bytes_(f"cut at {at}", content[:at]), bytes_("twice", content * 2),
-        bytes_(f"bit at {at}", flipped), bytes_("zeros", bytes(len(content))),
-        bytes_("random", rng.randbytes(len(content))), bytes_("HDF5 in name", b"\x89HDF\r\n\x1a\n"),
-        bytes_("zip in name", b"PK\x03\x04" + bytes(500)), bytes_("deep", b"[" * 100_000),
-        bytes_("text", b"a note\n"), bytes_("backwards", content[::-1]),
-        instead("is gone", lambda file: None), instead("a pipe", os.mkfifo),
-        instead("a folder", Path.mkdir),
-        instead("zeros for ever", lambda file: file.symlink_to("/dev/zero")),
-        instead("a circle", lambda file: file.symlink_to(file)),
-        instead("a link to nothing", lambda file: file.symlink_to("/nowhere")),
-        instead("memory", lambda file: file.symlink_to("/proc/self/mem")),
-    ]  # fmt: skip
-    yield from rng.sample(edits, min(limit, len(edits)))
+    contents = {
+        "empty": b"", f"cut at {at}": content[:at], "twice": content * 2, f"bit at {at}": flipped,
+        "zeros": bytes(len(content)), "random": rng.randbytes(len(content)),
+        "HDF5 in name": b"\x89HDF\r\n\x1a\n", "zip in name": b"PK\x03\x04" + bytes(500),
+        "deep": b"[" * 100_000, "text": b"a note\n", "backwards": content[::-1],
+    }  # fmt: skip
+    replacements = {
+        "is gone": lambda file: None, "a pipe": os.mkfifo, "a folder": Path.mkdir,
+        "zeros for ever": lambda file: file.symlink_to("/dev/zero"),
+        "a circle": lambda file: file.symlink_to(file),
+        "a link to nothing": lambda file: file.symlink_to("/nowhere"),
+        "memory": lambda file: file.symlink_to("/proc/self/mem"),
+    }  # fmt: skip
+    edits = [(title, partial(Path.write_bytes, data=new)) for title, new in contents.items()]
+    return edits + [(title, partial(_instead, make=make)) for title, make in replacements.items()]
+
+
+def _instead(file: Path, make: Callable[[Path], Any]) -> None:
+    """Put something else in place of a file."""
+    file.unlink()
+    make(file)
+
+
+SHORT = ("--engine", "quasistatic", "--horizon", "2")
+DRUMS = ("--domain", "wide,objects=random_cylinder")
+# Commands that make a run folder quickly.
+COMMANDS: dict[str, tuple[str, ...]] = {
+    "sweep": ("sweep", *SHORT, *DRUMS, "--laws", "rps", "nps", "--worlds", "24", "--part", "4"),
+    "tune": (
+        *("tune", "es", "--quick", *SHORT, *DRUMS, "--generations", "4", "--population", "4"),
+        *("--worlds", "2", "--validation", "2", "--tuned", "K_h", "L"),
+    ),
+    "learn": (
+        *("learn", "--quick", "--engine", "quasistatic", *DRUMS, "--updates", "3"),
+        *("--minutes", "0", "--num-envs", "4", "--drawn", "4", "--validation", "2"),
+        *("--width", "4", "--num-steps", "2", "--num-minibatches", "1"),
+    ),
+}
 
 
 @functools.cache
@@ -663,135 +561,84 @@ def furnish_runs(folder: Path, learned: bool) -> dict[str, list[tuple[str, ...]]
     from rps_jax.control.learned import policy
     from rps_jax.world import points
 
-    (folder / "drums.json").write_text('{"objects": ["random_cylinder"]}')
     drums = rps_jax.Domain(("random_cylinder",))
     at = points.worlds_at(drums, points.points_of(drums, range(12)))
     small_run(folder / "points", worlds=None, points=at)
     (folder / "policy").mkdir()
     shutil.copy(Path(policy.__file__).parent / "learned_mlp.npz", folder / "policy" / "policy.npz")
-    for command in (SWEEP, TUNE, LEARN)[: 3 if learned else 2]:
+    runs = {name: (*words, "--out", name) for name, words in COMMANDS.items()}
+    for command in [runs[name] for name in runs if learned or name != "learn"]:
         if (result := attempt(command, 300)).how != "told":
             raise RuntimeError(f"rps {' '.join(command)} made no run ({result.how}): {result.text}")
-    return {
+    reads = {
         "sweep": [
             ("merge", "sweep", "--out", "merged"), ("replay", "sweep", "0"), ("film", "sweep"),
             ("gallery", "sweep", "--each", "1"), ("view", "sweep", "0"),
-            ("ceiling", "sweep", "--lost-by", "rps", "--sample", "1"), SWEEP,
+            ("ceiling", "sweep", "--lost-by", "rps", "--sample", "1"), runs["sweep"],
         ],
         "points": [("merge", "points", "--out", "merged"), ("replay", "points", "0")],
-        "tune": [TUNE, ("push", "--law", "rps,tune/tuned.json")],
+        "tune": [runs["tune"], ("push", "--law", "rps,tune/tuned.json")],
         "policy": [("push", "--skin", "capacitive", "--law", "policy/policy.npz")],
-        **({"learn": [LEARN, ("export", "c", "--law", "learn/policy.npz")]} if learned else {}),
+        "learn": [runs["learn"], ("export", "c", "--law", "learn/policy.npz")],
     }  # fmt: skip
+    return {name: words for name, words in reads.items() if learned or name != "learn"}
 
 
-SWEEP = (
-    *("sweep", "--domain", "drums.json", "--laws", "rps", "nps", "--worlds", "12"),
-    *("--engine", "quasistatic", "--horizon", "2", "--part", "4", "--out", "sweep"),
-)
-TUNE = (
-    *("tune", "es", "--quick", "--generations", "2", "--population", "4", "--worlds", "2"),
-    *("--validation", "2", "--horizon", "2", "--out", "tune", "--tuned", "K_h", "L"),
-)
-LEARN = (
-    *("learn", "--quick", "--updates", "1", "--minutes", "0", "--num-envs", "4", "--drawn", "4"),
-    *("--validation", "2", "--width", "4", "--num-steps", "2", "--num-minibatches", "1"),
-    *("--out", "learn", "--engine", "quasistatic", "--domain", "wide,objects=random_cylinder"),
-)
-
-
-def run_edits(limit: int, seed: int, tell: Callable[[str], None]) -> Counter[str]:
-    """Run commands on edited run folders up to the first step of a world."""
-    return _run_folders(limit, seed, tell, (json_edits, dataset_edits, archive_edits))
-
-
-def run_damages(limit: int, seed: int, tell: Callable[[str], None]) -> Counter[str]:
-    """Run commands on damaged run folders up to the first step of a world."""
-    return _run_folders(limit, seed, tell, (damages,))
-
-
-def _run_folders(
-    limit: int, seed: int, tell: Callable[[str], None], kinds: Sequence[Callable[..., Any]]
-) -> Counter[str]:
-    counts: Counter[str] = Counter()
+def edited_folders(limit: int, seed: int, damaged: bool) -> Iterator[Fault]:
+    """Yield commands that read a run folder with one file damaged, or edited consistently."""
     rng = random.Random(seed)
     readers = {".json": json_edits, ".nc": dataset_edits, ".npz": archive_edits}
     home, reads = _furnished(learned=limit >= 100)
     with contextlib.chdir(home):
         candidates = []
-        for name in reads:
-            for path in sorted(Path(name).rglob("*")):
-                editor = damages if damages in kinds else readers.get(path.suffix)
-                if editor in kinds and editor and path.is_file() and not path.name.startswith("."):
-                    for edit in editor(path, rng, max(4, limit // 8)):
-                        candidates.append((name, path, edit))
-        with never_stepping():
-            for name, path, edit in rng.sample(candidates, min(limit, len(candidates))):
-                shutil.move(name, f"{name}.sound")
-                shutil.copytree(f"{name}.sound", name)
-                edit.make(path)
-                command = rng.choice(reads[name])
-                result = attempt(command)
-                counts[result.how] += 1
-                if result.how in ("traceback", "hang", "wordy") or LOUD:
-                    summary = f"{result.how}: {path}: {edit.title}: rps {' '.join(command)}"
-                    tell(f"{summary}\n{result.text[-1800:]}")
-                shutil.rmtree(name)
-                shutil.move(f"{name}.sound", name)
-                for leftover in ("merged", "runs"):
-                    shutil.rmtree(leftover, ignore_errors=True)
-    return counts
+        for path in (path for name in reads for path in sorted(Path(name).rglob("*"))):
+            editor = damages if damaged else readers.get(path.suffix)
+            if editor and path.is_file() and not path.name.startswith("."):
+                edits = editor(path, rng)
+                sample = rng.sample(edits, min(len(edits), max(4, limit // 8)))
+                candidates += [(path.parts[0], path, *edit) for edit in sample]
+        for name, path, title, make in rng.sample(candidates, min(limit, len(candidates))):
+            shutil.move(name, f"{name}.sound")
+            shutil.copytree(f"{name}.sound", name)
+            make(path)
+            if not damaged:
+                _sign(path)
+            yield f"{path}: {title}", rng.choice(reads[name]), ("accepted", "told")
+            shutil.rmtree(name)
+            shutil.move(f"{name}.sound", name)
 
 
 # --- the table -------------------------------------------------------------------------------
 
-
-def run_values(limit: int, seed: int, tell: Callable[[str], None]) -> Counter[str]:
-    """Run commands with bad values up to the first step of a world."""
-    counts: Counter[str] = Counter()
-    with tempfile.TemporaryDirectory() as folder, contextlib.chdir(folder):
-        furnish(Path(folder))
-        with never_stepping():
-            for case in itertools.islice(values(seed), limit):
-                result = attempt(case.arguments)
-                counts[result.how] += 1
-                if result.how in ("traceback", "hang", "wordy"):
-                    tell(f"{result.how}: rps {case.arguments}"[:400] + f"\n{result.text[-1500:]}")
-                for name in ("runs", "merged"):
-                    shutil.rmtree(name, ignore_errors=True)
-    return counts
-
-
 CLASSES = {
-    "values": (run_values, 6000),
-    "laws": (run_laws, 1000),
-    "edits": (run_edits, 800),
-    "damages": (run_damages, 500),
+    "values": (partial(inject, values), 6000),
+    "laws": (partial(inject, wrong_laws), 1000),
+    "edits": (partial(inject, partial(edited_folders, damaged=False)), 800),
+    "damages": (partial(inject, partial(edited_folders, damaged=True)), 500),
 }
 
 
-def main() -> int:
-    """Inject the faults, print failures and the table of outcomes."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("classes", nargs="*", default=list(CLASSES), metavar="CLASS")
+def main(classes: dict[str, tuple[Callable[..., Counter[str]], int]], description: str) -> int:
+    """Inject the faults of some classes, and print failures and the table of outcomes."""
+    parser = argparse.ArgumentParser(description=description)
+    parser.add_argument("classes", nargs="*", default=list(classes), metavar="CLASS")
     parser.add_argument("--most", type=int, help="cases of each class")
     parser.add_argument("--seed", type=int, default=0)
-    choice = parser.parse_args()
-    table = {}
+    choice, failures = parser.parse_args(), []
+
+    def tell(text: str) -> None:
+        failures.append(text)
+        print(text, flush=True)
+
     for name in choice.classes:
-        run, default = CLASSES[name]
+        run, default = classes[name]
         start_time = time.monotonic()
-        counts = run(choice.most or default, choice.seed, lambda text: print(text, flush=True))
-        table[name] = dict(counts) | {"seconds": round(time.monotonic() - start_time)}
-        print(json.dumps({name: table[name]}), flush=True)
-    bad = sum(
-        counts_of_class.get(how, 0)
-        for counts_of_class in table.values()
-        for how in ("traceback", "hang", "wordy")
-    )
-    return int(bad > 0)
+        counts = run(choice.most or default, choice.seed, tell)
+        seconds = {"seconds": round(time.monotonic() - start_time)}
+        print(json.dumps({name: counts | seconds}), flush=True)
+    return int(bool(failures))
 
 
 if __name__ == "__main__":
     os.environ.setdefault("JAX_PLATFORMS", "cpu")
-    sys.exit(main())
+    sys.exit(main(CLASSES, str(__doc__)))

@@ -9,8 +9,10 @@ those of an undisturbed command bit for bit, except for clocks.
 
 from __future__ import annotations
 
-import argparse
 import contextlib
+import dataclasses
+import gc
+import itertools
 import json
 import os
 import random
@@ -24,73 +26,23 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+from fuzz import COMMANDS, DRUMS, SHORT, main
+
 RPS = (sys.executable, "-m", "rps_jax")
 HOME = Path(__file__).parents[1]
-SHORT = ("--engine", "quasistatic", "--horizon", "2")
-DRUMS = ("--domain", "wide,objects=random_cylinder")
-SMALL = ("--laws", "rps", "nps", "--worlds", "24", "--part", "4")
-SWEEP = ("sweep", *SHORT, *DRUMS, *SMALL)
-KILLED: dict[str, tuple[str, ...]] = {
-    "sweep": SWEEP,
-    "ladder": (
-        "ladder",
-        *SHORT,
-        *DRUMS,
-        *SMALL,
-    ),
-    "table": (
-        "table",
-        *SHORT,
-        "--objects",
-        "cylinder",
-        "--friction",
-        "S1",
-    ),
+SWEEP = COMMANDS["sweep"]
+KILLED = COMMANDS | {
+    "ladder": ("ladder", *SWEEP[1:]),
+    "table": ("table", *SHORT, "--objects", "cylinder", "--friction", "S1"),
     "sensitivity": ("sensitivity", *SHORT, *DRUMS, "--worlds", "100"),
     "attack": (
         *("attack", *SHORT, *DRUMS, "--axes", "size", "mass", "friction_robot", "--cells", "3"),
-        *[
-            "--batch",
-            "8",
-            "--generations",
-            "4",
-            "--minutes",
-            "30",
-            "--drawn",
-            "8",
-            "--check-again",
-            "0",
-            "--repeats",
-            "1",
-        ],
-    ),
-    "tune": (
-        *("tune", "es", "--quick", *SHORT, *DRUMS, "--generations", "4", "--population", "4"),
-        *("--worlds", "2", "--validation", "2", "--tuned", "K_h", "L"),
-    ),
-    "learn": (
-        *("learn", "--quick", "--engine", "quasistatic", *DRUMS, "--updates", "3"),
-        *[
-            "--minutes",
-            "0",
-            "--num-envs",
-            "4",
-            "--drawn",
-            "4",
-            "--validation",
-            "2",
-            "--width",
-            "4",
-            "--num-steps",
-            "2",
-        ],
-        *("--num-minibatches", "1"),
+        *("--batch", "8", "--generations", "4", "--minutes", "30", "--drawn", "8"),
+        *("--check-again", "0", "--repeats", "1"),
     ),
 }
-_CLOCKS = (
-    "compile",
-    "run",
-)  # of a tuner's generation; other clocks have "wall clock" in their long name
+# Durations of a tuner's generation; other clocks have "wall clock" in their long name.
+_CLOCKS = ("compile", "run")
 
 
 def start(*words: str, **how: Any) -> subprocess.Popen[str]:
@@ -111,6 +63,11 @@ def ended(process: subprocess.Popen[str], patience: float = 300.0) -> tuple[int,
     return process.returncode, (out or "") + (err or "")
 
 
+def run(*words: str, **how: Any) -> tuple[int, str]:
+    """Return exit code and output of a command."""
+    return ended(start(*words, **how))
+
+
 def payload(folder: Path) -> dict[str, Any]:
     """Return all variables and arrays of a run folder except clocks, by file and name."""
     import numpy as np
@@ -122,20 +79,10 @@ def payload(folder: Path) -> dict[str, Any]:
         if path.suffix == ".nc" and path.parent == folder:
             with xr.open_dataset(path, engine="h5netcdf") as data:
                 for key, variable in data.variables.items():
-                    if key not in _CLOCKS and "wall clock" not in variable.attrs.get(
-                        "long_name", ""
-                    ):
-                        contents[f"{name}:{key}"] = (
-                            variable.dims,
-                            str(variable.dtype),
-                            variable.values.tobytes(),
-                        )
-                        if variable.dtype == object:
-                            contents[f"{name}:{key}"] = (
-                                variable.dims,
-                                "text",
-                                tuple(variable.values.ravel()),
-                            )
+                    x, clock = variable.values, variable.attrs.get("long_name", "")
+                    if key not in _CLOCKS and "wall clock" not in clock:
+                        content = tuple(x.ravel()) if x.dtype == object else x.tobytes()
+                        contents[f"{name}:{key}"] = variable.dims, str(x.dtype), content
         elif path.name in ("policy.npz", "elites.npz"):
             with np.load(path, allow_pickle=False) as archive:
                 for key in archive.files:
@@ -158,9 +105,9 @@ def run_kills(limit: int, seed: int, tell: Callable[[str], None]) -> Counter[str
     with tempfile.TemporaryDirectory() as home:
         for index, (name, words) in enumerate(KILLED.items()):
             kills = limit // len(KILLED) + (index < limit % len(KILLED))
-            ended(start(*words, "--out", f"{home}/warm-{name}"))  # compiles
+            run(*words, "--out", f"{home}/warm-{name}")  # compiles
             start_time = time.monotonic()
-            code, text = ended(start(*words, "--out", f"{home}/{name}"))
+            code, text = run(*words, "--out", f"{home}/{name}")
             whole = time.monotonic() - start_time
             if code or fault(text):
                 counts["traceback"] += 1
@@ -180,7 +127,7 @@ def run_kills(limit: int, seed: int, tell: Callable[[str], None]) -> Counter[str
                     counts["killed" if process.wait() < 0 else "ended before"] += 1
                     process.communicate()
                     done += 1
-                code, text = ended(start(*words, "--out", str(out)))
+                code, text = run(*words, "--out", str(out))
                 again = payload(out)
                 if code or fault(text) or again.keys() != right.keys():
                     counts["traceback" if fault(text) else "wrong"] += 1
@@ -224,94 +171,69 @@ def limited(kilobytes: int) -> Callable[[], None]:
 
 def machine(home: Path) -> Iterator[tuple[str, str, int, str]]:
     """Yield faults of the machine: title, expected exit code, exit code and output."""
-    sound = home / "sound"
-    ended(start(*SWEEP, "--out", str(sound)))
-    right = payload(sound)
+    run(*SWEEP, "--out", f"{home}/sound")
+    right = payload(home / "sound")
 
-    def same(folder: Path) -> str:
-        return "" if payload(folder) == right else "Traceback (most recent): a wrong result"
+    def swept(name: str, **how: Any) -> tuple[int, str]:
+        return run(*SWEEP, f"--out={home / name}", **how)
+
+    def checked(name: str, **how: Any) -> tuple[int, str]:
+        """Run the sweep, and add to its output whether its results are wrong."""
+        code, text = swept(name, **how)
+        is_right = payload(home / name) == right
+        return code, text + "Traceback (most recent): a wrong result" * (not is_right)
 
     for size in (1, 4, 16):
-        out = home / f"full-{size}"
-        code, text = ended(start(*SWEEP, "--out", str(out), preexec_fn=limited(size)))
-        yield f"files of {size} kB at most", "2", code, text
-        code, text = ended(start(*SWEEP, "--out", str(out)))
-        yield f"after files of {size} kB at most", "0", code, text + same(out)
+        folder = f"full-{size}"
+        yield f"files of {size} kB at most", "2", *swept(folder, preexec_fn=limited(size))
+        yield f"after files of {size} kB at most", "0", *checked(folder)
     try:
         for size in (0.05, 0.2):
             with small_disk(size) as disk:
-                code, text = ended(start(*SWEEP, "--out", str(disk / "run")))
-                yield f"a disk of {size} MB", "2", code, text
+                yield f"a disk of {size} MB", "2", *run(*SWEEP, "--out", f"{disk}/run")
     except PermissionError as error:
         print(f"left out: {error}")
-    for title, temporary in (
-        ("no temporary folder", "/nowhere"),
-        ("temporary is a file", __file__),
-    ):
-        out = home / title
-        code, text = ended(start(*SWEEP, "--out", str(out), env={"TMPDIR": temporary}))
-        yield title, "0", code, text + same(out)
-    for title, cache in (("no cache", "/dev/null/x"), ("the cache is a file", __file__)):
-        out = home / title
-        code, text = ended(start(*SWEEP, "--out", str(out), env={"RPS_CACHE": cache}))
-        yield title, "0 or 2", code, text
-    code, text = ended(start(*SWEEP, "--out", str(out), env={"HOME": "/nowhere"}))
-    yield "no home", "0 or 2", code, text
-    out = home / "two"
-    both = [start(*SWEEP, "--out", str(out)) for _ in range(2)]
-    codes = [ended(process) for process in both]
-    yield "two processes: one does it", "0", min(codes)[0], min(codes)[1] + same(out)
-    yield "two processes: the second is refused", "0 or 2", max(codes)[0], max(codes)[1]
+    for title, folder in (("no temporary folder", "/nowhere"), ("temporary is a file", __file__)):
+        yield title, "0", *checked(title, env={"TMPDIR": folder})
+    for title, folder in (("no cache", "/dev/null/x"), ("the cache is a file", __file__)):
+        yield title, "0 or 2", *swept(title, env={"RPS_CACHE": folder})
+    yield "no home", "0 or 2", *swept("the cache is a file", env={"HOME": "/nowhere"})
+    both = [start(*SWEEP, "--out", f"{home}/two") for _ in range(2)]
+    first, second = sorted(ended(process) for process in both)
+    yield "two processes: one does it", "0", *first
+    yield "two processes: the second is refused", "0 or 2", *second
+    yield "two processes: their result", "0", *checked("two")
     for when in (0.5, 1.5, 3.0, 4.5, 6.0):
-        out = home / f"interrupt-{when}"
-        process = start(*SWEEP, "--worlds", "20000", "--part", "64", "--out", str(out))
+        large = ("--worlds", "20000", "--part", "64", "--out", f"{home}/interrupt-{when}")
+        process = start(*SWEEP, *large)
         time.sleep(when)
         process.send_signal(signal.SIGINT)
-        code, text = ended(process, 10)
-        yield f"Ctrl-C after {when} s", "130" if when > 0.5 else "130 or -2", code, text
+        expected = "130" if when > 0.5 else "130 or -2"
+        yield f"Ctrl-C after {when} s", expected, *ended(process, 10)
     for words in (("--help",), ("sweep", "--help"), ("doctor",), (*SWEEP, "--out", f"{home}/pipe")):
         process = start(*words, stdout=subprocess.PIPE)
         process.stdout.close()  # type: ignore[union-attr]
         process.stdout = None
-        code, text = ended(process)
-        yield f"closed pipe: {words[0]} {words[1:2]}", "0 or 1 or 141", code, text
+        yield f"closed pipe: {words[0]} {words[1:2]}", "0 or 1 or 141", *ended(process)
     for locale in ({"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"},
                    {"LC_ALL": "POSIX", "PYTHONIOENCODING": "ascii"}):  # fmt: skip
-        out = home / f"locale-{len(locale)}-\N{SNOWMAN}"
-        code, text = ended(start(*SWEEP, "--out", str(out), env=locale, errors="replace"))
-        yield f"locale {locale}", "0", code, text
-        code, text = ended(start("sweep", "--help", env=locale, errors="replace"))
-        yield f"help, locale {locale}", "0", code, text
-    odd = (
-        "a b",
-        "\N{SNOWMAN}",
-        "-",
-        "--out",
-        "%s{0}",
-        "a'b\"c",
-        "new\nline",
-        "x" * 200,
-        "..a",
-        "~",
-    )
-    for name in odd:
-        out = home / "odd" / name
-        code, text = ended(start(*SWEEP, f"--out={out}", env={"RPS_CACHE": str(home / name)}))
-        yield f"path {name[:20]!r}", "0", code, text + same(out)
-    (home / "seen").mkdir(mode=0o500)
-    code, text = ended(start(*SWEEP, "--out", "/proc/run"))
-    yield "a folder where nothing can be made", "2", code, text
-    code, text = ended(start("doctor", stdin=subprocess.DEVNULL, cwd="/proc"))
-    yield "doctor where nothing can be written", "0", code, text
+        how = {"env": locale, "errors": "replace"}
+        yield f"locale {locale}", "0", *swept(f"locale-{len(locale)}-\N{SNOWMAN}", **how)
+        yield f"help, locale {locale}", "0", *run("sweep", "--help", **how)
+    odd = ("a b", "\N{SNOWMAN}", "-", "--out", "%s{0}", "a'b\"c", "new\nline")
+    for name in (*odd, "x" * 200, "..a", "~"):
+        cache = {"RPS_CACHE": str(home / name)}
+        yield f"path {name[:20]!r}", "0", *checked(f"odd/{name}", env=cache)
+    yield "a folder where nothing can be made", "2", *run(*SWEEP, "--out", "/proc/run")
+    where = {"stdin": subprocess.DEVNULL, "cwd": "/proc"}
+    yield "doctor where nothing can be written", "0", *run("doctor", **where)
 
 
 def run_machine(limit: int, seed: int, tell: Callable[[str], None]) -> Counter[str]:
     """Check faults of the machine: disks, folders, signals, pipes, locales and paths."""
     counts: Counter[str] = Counter()
     with tempfile.TemporaryDirectory() as home:
-        for index, (title, expected, code, text) in enumerate(machine(Path(home))):
-            if index >= limit:
-                break
+        for title, expected, code, text in itertools.islice(machine(Path(home)), limit):
             good = str(code) in expected.split(" or ") and not fault(text)
             counts["held" if good else "traceback" if fault(text) else "wrong code"] += 1
             if not good:
@@ -321,53 +243,27 @@ def run_machine(limit: int, seed: int, tell: Callable[[str], None]) -> Counter[s
 
 def run_memory(num_calls: int, seed: int, tell: Callable[[str], None]) -> Counter[str]:
     """Check that memory does not grow after the fifth call of `evaluate` in a process."""
-    program = f"""
-import dataclasses, gc, rps_jax
-drums = rps_jax.Domain(("random_cylinder",))
-setting = rps_jax.Setting("quasistatic", rules=rps_jax.Rules(horizon=2.0))
-def now():
-    gc.collect()
-    return int(open("/proc/self/statm").read().split()[1]) * 4096 / 2**20
-for call in range({num_calls}):
-    seeded = dataclasses.replace(setting, seed=call)
-    rps_jax.evaluate(rps_jax.RPSParams.paper(), drums, worlds=16, setting=seeded)
-    if call in (4, {num_calls - 1}):
-        print(f"{{now():.1f}}")
-"""
-    words = [sys.executable, "-c", program]
-    done = subprocess.run(words, capture_output=True, text=True, env=os.environ | {
-        "JAX_PLATFORMS": "cpu", "PYTHONPATH": str(HOME)})  # fmt: skip
-    if done.returncode:
-        tell(done.stderr[-2000:])
-        return Counter(traceback=1)
-    fifth, last = map(float, done.stdout.split())
-    print(f"memory after call 5: {fifth} MB, after call {num_calls}: {last} MB")
+    import rps_jax
+
+    drums = rps_jax.Domain(("random_cylinder",))
+    setting = rps_jax.Setting("quasistatic", rules=rps_jax.Rules(horizon=2.0))
+    used = []  # [MB]
+    for call in range(num_calls):
+        seeded = dataclasses.replace(setting, seed=call)
+        rps_jax.evaluate(rps_jax.RPSParams.paper(), drums, worlds=16, setting=seeded)
+        gc.collect()
+        used.append(int(Path("/proc/self/statm").read_text().split()[1]) * 4096 / 2**20)
+    fifth, last = used[4], used[-1]
+    print(f"memory after call 5: {fifth:.1f} MB, after call {num_calls}: {last:.1f} MB")
     grown = last > fifth + 8.0
     if grown:
-        tell(f"memory grew from {fifth} to {last} MB")
+        tell(f"memory grew from {fifth:.1f} to {last:.1f} MB")
     return Counter({"grown" if grown else "held": 1})
 
 
 CLASSES = {"kills": (run_kills, 100), "machine": (run_machine, 1000), "memory": (run_memory, 50)}
 
 
-def main() -> int:
-    """Inject the faults, print failures and the table of outcomes."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("classes", nargs="*", default=list(CLASSES), metavar="CLASS")
-    parser.add_argument("--most", type=int, help="cases of each class")
-    parser.add_argument("--seed", type=int, default=0)
-    options = parser.parse_args()
-    bad = 0
-    for name in options.classes:
-        run, default = CLASSES[name]
-        start_time = time.monotonic()
-        counts = run(options.most or default, options.seed, lambda text: print(text, flush=True))
-        seconds = {"seconds": round(time.monotonic() - start_time)}
-        print(json.dumps({name: dict(counts) | seconds}), flush=True)
-        bad += sum(counts[how] for how in ("traceback", "wrong", "wrong code", "grown"))
-    return int(bad > 0)
-
-
 if __name__ == "__main__":
-    sys.exit(main())
+    os.environ.setdefault("JAX_PLATFORMS", "cpu")
+    sys.exit(main(CLASSES, str(__doc__)))

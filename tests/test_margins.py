@@ -71,21 +71,18 @@ def test_without_t4_a_contact_may_move_outwards():
 def test_the_drift_by_hand():
     """A point ahead of the centre of friction: A = 1 along x and 1 + r^2 / c^2 across."""
 
-    def margin(v_y, mu):
-        touch = margins.Touch(
-            np.array([0.36, 0.1]), np.array([-0.3, 0.0]), np.array(0.3), np.array(mu)
-        )
-        return float(margins.drift(np.array([0.02, v_y, 0.0]), touch))
+    def margin(v_x, v_y, mu):
+        contact, arm = np.array([0.36, 0.1]), np.array([-0.3, 0.0])
+        touch = margins.Touch(contact, arm, np.array(0.3), np.array(mu))
+        return float(margins.drift(np.array([v_x, v_y, 0.0]), touch))
 
     # Sticking needs a force of slope (v_y / 2) / v_x: at mu = 0.5 up to v_y = v_x.
-    assert margin(0.019, 0.5) == 0.0
+    assert margin(0.02, 0.019, 0.5) == 0.0
     # Beyond, it slips: w_y = 2 mu w_x = 0.02, and the base goes on at 0.05.
-    np.testing.assert_allclose(margin(0.05, 0.5), 0.02 - 0.05)
+    np.testing.assert_allclose(margin(0.02, 0.05, 0.5), 0.02 - 0.05)
     # Without friction the point is only pushed ahead.
-    np.testing.assert_allclose(margin(0.05, 0.0), -0.05)
-    assert np.isnan(margins.drift(np.array([-0.02, 0.0, 0.0]), margins.Touch(
-        np.array([0.36, 0.1]), np.array([-0.3, 0.0]), np.array(0.3), np.array(0.5)
-    )))  # fmt: skip
+    np.testing.assert_allclose(margin(0.02, 0.05, 0.0), -0.05)
+    assert np.isnan(margin(-0.02, 0.0, 0.5))
 
 
 def test_the_cone_of_motions_by_hand():

@@ -34,19 +34,18 @@ def outputs(notebook):
 
 def printed(notebook):
     """Return the tables and lines that a notebook prints."""
-    return [
-        value for _, kind, value in outputs(notebook) if kind in ("text/markdown", "text/plain")
-    ]
+    shown = ("text/markdown", "text/plain")
+    return [value for _, kind, value in outputs(notebook) if kind in shown]
 
 
 def test_there_are_six_notebooks():
     assert [name[:2] for name in TEXTS] == ["01", "02", "03", "04", "05", "06"]
 
 
-@pytest.mark.parametrize("path", TEXTS.values(), ids=lambda path: path.stem)
-def test_notebooks_import_only_public_names(path):
-    assert "rps_jax" in imported(path)
-    assert set(imported(path)) <= {"rps_jax", *dict(addresses())}
+@all_notebooks
+def test_notebooks_import_only_public_names(name):
+    assert "rps_jax" in imported(TEXTS[name])
+    assert set(imported(TEXTS[name])) <= {"rps_jax", *dict(addresses())}
 
 
 @all_notebooks

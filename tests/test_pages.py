@@ -35,75 +35,75 @@ def test_every_table_is_on_a_page():
     assert shown == set(TABLES["data_files"]())
 
 
-def test_a_table_follows_its_data_and_those_it_cites(tmp_path):
-    columns = [
-        {"name": "what", "merge": True},
-        {"name": "rate", "format": "{:.1f} %", "rest": " [{}]"},
-    ]
-    table = dict.fromkeys(TABLES["KEYS"], "") | {"device": "a core", "columns": columns}
-    citation = {"from": "one", "row": ["a", 1.0], "column": "rate"}
-    derived = {"columns": columns, "rows": [["b", citation]]}  # without a command
-    page = tmp_path / "page.md"
-    page.write_text("<!-- table: one -->\n<!-- end -->\n<!-- table: two -->\n<!-- end -->\n")
+@pytest.fixture
+def rendered(tmp_path):
+    """Function that renders a page beside data files with columns and rows."""
 
-    def rendered(rows):
-        for name, data in (("one", table | {"rows": rows}), ("two", derived)):
+    def render(text, **tables):
+        for name, data in tables.items():
             folder = tmp_path / name / "results"
             folder.mkdir(parents=True, exist_ok=True)
             (folder / f"{name}.json").write_text(json.dumps(data))
-        return TABLES["render"](page, tmp_path)
+        (tmp_path / "page.md").write_text(text)
+        return TABLES["render"](tmp_path / "page.md", tmp_path)
 
-    text = rendered([["a", 1.0], ["a", [2.26, 3]]])
-    assert "| a | 1.0 % |\n|  | 2.3 % [3] |\n" in text
-    assert "| b | 1.0 % |" in text
-    assert "[from which table](two/results/two.json)" in text
-    assert "Device: a core" in text
-    assert "(one/results/one.json)" in text
+    return render
+
+
+def table(columns, rows):
+    return dict.fromkeys(TABLES["KEYS"], "") | {"columns": columns, "rows": rows}
+
+
+def test_a_table_follows_its_data_and_those_it_cites(rendered, tmp_path):
+    columns = [{"name": "what", "merge": True},
+               {"name": "rate", "format": "{:.1f} %", "rest": " [{}]"}]  # fmt: skip
+    citation = {"from": "one", "row": ["a", 1.0], "column": "rate"}
+    derived = {"columns": columns, "rows": [["b", citation]]}  # without a command
+
+    def page(rows):
+        one = table(columns, rows) | {"device": "a core"}
+        text = "<!-- table: one -->\n<!-- end -->\n<!-- table: two -->\n<!-- end -->\n"
+        return rendered(text, one=one, two=derived)
+
+    text = page([["a", 1.0], ["a", [2.26, 3]]])
+    for part in (
+        "| a | 1.0 % |\n|  | 2.3 % [3] |\n", "| b | 1.0 % |", "Device: a core",
+        "[from which table](two/results/two.json)", "(one/results/one.json)",
+    ):  # fmt: skip
+        assert part in text
     with pytest.raises(ValueError, match=r"does not name one cell of one\.json"):
-        rendered([["a", 1.5]])
+        page([["a", 1.5]])
     with pytest.raises(ValueError, match="does not have a cell for each column"):
-        rendered([["a"]])
+        page([["a"]])
     (tmp_path / "results").mkdir()
     (tmp_path / "results" / "one.json").write_text("{}")
     with pytest.raises(ValueError, match=r"one\.json and .*one\.json have the same name"):
-        rendered([["a", 1.0]])
+        page([["a", 1.0]])
 
 
-def test_a_number_in_a_sentence_follows_its_data(tmp_path):
-    columns = [{"name": "domain", "merge": True}, {"name": "law"}, {"name": "rate"}]
-    rows = [["wide", "rps", "93.1 % [92.6, 93.6]"], ["wide", "nps", "16.7 %"]]
-    data = dict.fromkeys(TABLES["KEYS"], "") | {"columns": columns, "rows": rows}
-    (tmp_path / "results").mkdir()
-    (tmp_path / "results" / "one.json").write_text(json.dumps(data))
-    page = tmp_path / "page.md"
-    cell = "<!-- cell: one | wide | {} | rate -->{}<!-- end -->"
-    page.write_text(f"It wins {cell.format('rps', '9 %')},\nand NPS {cell.format('nps', '')}.")
-    rendered = TABLES["render"](page, tmp_path)
-    assert (
-        rendered
-        == f"It wins {cell.format('rps', '93.1 %')},\nand NPS {cell.format('nps', '16.7 %')}."
-    )
-    columns += [{"name": name} for name in ("time", "90 %", "way", "90 %")]
-    rows[:] = [[*row, "9 s", "11 s", "2 m [1, 3]", "4 m"] for row in rows]
-    (tmp_path / "results" / "one.json").write_text(json.dumps(data))
-    twice = "<!-- cell: one | wide | nps | {} -->{}<!-- end -->"
-    page.write_text(f"{twice.format('90 %', '')} and {twice.format('way / 90 %', '')}")
-    rendered = TABLES["render"](page, tmp_path)
-    assert rendered == f"{twice.format('90 %', '11 s')} and {twice.format('way / 90 %', '4 m')}"
+def test_a_number_in_a_sentence_follows_its_data(rendered):
+    columns = [{"name": "domain", "merge": True}]
+    columns += [{"name": x} for x in ("law", "rate", "time", "90 %", "way", "90 %")]
+    rest = ("9 s", "11 s", "2 m [1, 3]", "4 m")
+    rows = [["wide", "rps", "93.1 % [92.6, 93.6]", *rest], ["wide", "nps", "16.7 %", *rest]]
+
+    def sentence(*numbers, cells=("rps | rate", "nps | rate", "nps | 90 %", "nps | way / 90 %")):
+        filled = [f"<!-- cell: one | wide | {at} -->{x}<!-- end -->"
+                  for at, x in zip(cells, numbers, strict=True)]  # fmt: skip
+        return f"It wins {', and '.join(filled)}."
+
+    text = rendered(sentence("9 %", "", "", ""), one=table(columns, rows))
+    assert text == sentence("93.1 %", "16.7 %", "11 s", "4 m")
+    with pytest.raises(ValueError, match="does not name one cell"):
+        rendered(sentence("", cells=["none | rate"]))
     text = "".join(page.read_text() for page in PAGES)
     assert "<!-- cell: headline" in text
     assert not re.search(r"^\s*<!-- cell", text, re.MULTILINE)  # it would start a paragraph
-    page.write_text(cell.format("none", ""))
-    with pytest.raises(ValueError, match="does not name one cell"):
-        TABLES["render"](page, tmp_path)
 
 
 @pytest.mark.parametrize("page", PAGES, ids=relative)
 def test_links_have_targets(page):
-    links = re.findall(r"\]\(([^)\s]+)\)", page.read_text())
-    for link in links:
-        if link.startswith("https://"):
-            continue
+    for link in re.findall(r"\]\(((?!https://)[^)\s]+)\)", page.read_text()):
         path, _, anchor = link.partition("#")
         target = page.parent / path if path else page
         assert target.exists(), link

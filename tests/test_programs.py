@@ -36,16 +36,16 @@ def compiler():
     """A function that compiles and runs x + a y for n values, and the list of its tracings."""
     traced = []
 
-    def run(n=3, factor=2.0, static=None):
+    def run(n=3, factor=2.0, static=None, result=lambda x: {"sum": x}):
         def function(x, y):
             traced.append(n)
-            return {"sum": x + factor * y}
+            return result(x + factor * y)
 
-        shape = jax.ShapeDtypeStruct((n,), jnp.float32)
+        shapes = 2 * [jax.ShapeDtypeStruct((n,), jnp.float32)]
         known = [factor] if static is None else [static]
-        shapes = (shape, shape)
         program = programs.compile_function(function, shapes, law=rps.LAW, donate=0, static=known)
-        return np.asarray(program(jnp.ones(n), jnp.ones(n))["sum"]).tolist()
+        (leaf,) = jax.tree.leaves(program(jnp.ones(n), jnp.ones(n)))
+        return np.asarray(leaf).tolist()
 
     return run, traced
 
@@ -72,16 +72,10 @@ def test_a_recorded_trial_is_traced_once_for_all_processes(cache, monkeypatch):
     np.testing.assert_array_equal(first.snapshots.qpos, again.snapshots.qpos)
 
 
-def test_a_program_with_results_of_unknown_type_is_not_cached(cache):
-    shape, traced = jax.ShapeDtypeStruct((3,), jnp.float32), []
-
-    def function(x):
-        traced.append(1)
-        return NamedTuple("Made", [("own", Any)])(x)
-
+def test_a_program_with_results_of_unknown_type_is_not_cached(cache, compiler):
+    run, traced = compiler
     for _ in range(2):
-        program = programs.compile_function(function, [shape], law=rps.LAW, donate=0, static=[])
-        assert jax.tree.leaves(program(jnp.ones(3)))[0].tolist() == [1.0] * 3
+        assert run(result=lambda x: NamedTuple("Made", [("own", Any)])(x)) == [3.0] * 3
     assert len(traced) == 2
     assert not cache.exists()
 
@@ -92,14 +86,11 @@ def test_a_damaged_program_is_dropped_with_one_line(damage, cache, compiler):
     run()
     (file,) = cache.iterdir()
     content = file.read_bytes()
-    if damage == "of another program":
-        run(n=2)
-        content = next(path for path in cache.iterdir() if path != file).read_bytes()
-    elif damage == "flipped":
-        content = content[:-1] + bytes([content[-1] ^ 1])
-    else:
-        content = content[: 100 * (damage == "cut")]
-    file.write_bytes(content)
+    run(n=2)
+    (other,) = {*cache.iterdir()} - {file}
+    contents = {"cut": content[:100], "empty": b"", "of another program": other.read_bytes(),
+                "flipped": content[:-1] + bytes([content[-1] ^ 1])}  # fmt: skip
+    file.write_bytes(contents[damage])
     count = len(traced)
     with pytest.warns(UserWarning, match="is dropped, and traced again: it") as warnings:
         assert run() == [3.0] * 3
@@ -188,9 +179,7 @@ def test_small_sweeps_run_on_the_cpu(monkeypatch):
 @pytest.mark.parametrize(("release", "machine", "needs_avx"), [
     ("0.11.2", "x86_64", False), ("0.12.0.1", "x86_64", True), ("0.13.1", "arm64", False),
 ])  # fmt: skip
-def test_jax_versions_with_fusion_by_slot_get_the_avx_flag(
-    release, machine, needs_avx, monkeypatch
-):
+def test_jax_with_fusion_by_slot_gets_the_avx_flag(release, machine, needs_avx, monkeypatch):
     monkeypatch.setenv("XLA_FLAGS", "--xla_of_ones_own")
     monkeypatch.setattr(device.metadata, "version", lambda _: release)
     monkeypatch.setattr(device.platform, "machine", lambda: machine)

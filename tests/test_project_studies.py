@@ -11,69 +11,61 @@ from helpers import ROOT, refusal
 from rps_jax.app.cli import flags, names
 from rps_jax.control import registry
 from rps_jax.control.learned import policy
+from sweeps.publish.recipes import RECIPES
 from sweeps.publish.study import published as data_files
-from sweeps.study_base import Table, digest, write_table
+from sweeps.study_base import _PACKAGES, Table, _reads_folder, digest, split_folder, write_table
 
 SWEEPS = ROOT / "sweeps"
 FOLDERS = sorted(path.parent for path in SWEEPS.glob("*/README.md"))
 STUDIES = sorted(path.parent for path in SWEEPS.glob("*/study.py"))
 
-REFUSED = [
-    ("gradients", "--object box", "unknown object 'box'"),
-    ("gradients", "--horizons 2 1", r"horizons = \(2\.0, 1\.0\) is not allowed"),
-    ("gradients", "--estimators backward", "unknown estimators 'backward'"),
-    ("gradients", "--tuned v_max", "unknown tuned parameter 'v_max'"),
-    ("landscape", "--candidates 1", "candidates = 1 is not allowed"),
-    ("landscape", "--laws rps,tund.json", r"tund\.json cannot be read"),
-    ("landscape", "--laws pursuit", "law = pursuit is not allowed"),
-    ("landscape", "--domain wyde", "unknown domain 'wyde'"),
-    ("speed", "--families cone", "cone"),
-    ("speed", "--names fast", "unknown names 'fast'"),
-    ("speed", "--refill -1", "refill = -1 is not allowed"),
-    ("speed", "--at-once 0", "at_once = 0 is not allowed"),
-    ("speed", "--mujocos -4", "mujocos = -4 is not allowed"),
-    ("speed", "--names 'mjx fast' --worlds 65536", "leave nothing to time"),
-    ("speed/costs.py", "--names mjx", "unknown names 'mjx'"),
-    ("levers", "--program mjx", "unknown program 'mjx'"),
-    ("levers", "--family cone", "cone"),
-    ("levers", "--worlds 1", "worlds = 1 is not allowed"),
-    ("levers", "--simulated nan", "simulated = nan is not allowed"),
-    ("engines", "--objects cone", "unknown domain object 'cone'"),
-    ("engines", "--domain wyde", "unknown domain 'wyde'"),
-    ("engines", "--engines fast", "unknown engines 'fast'"),
-    ("fidelity", "--conditions fine", "unknown conditions 'fine'"),
-    ("ambiguities", "--gazebo --curve", "gazebo and curve are not allowed together"),
-    ("ambiguities", "--readings none", "unknown reading 'none'"),
-    ("limits", "--limits leg", "did you mean 'lag'"),
-    ("mends", "--laws none", "unknown mend 'none'"),
-    ("ground", "--grounds our", "did you mean 'ours'"),
-    ("ground", "--worlds 0", "worlds = 0 is not allowed"),
-    ("learned", "run run", "runs"),
-    ("force_push_grid", "--duration 0", "duration"),
-    ("hardware", "--setups 1", "setups = 1 is not allowed"),
-    ("hardware", "--domain wyde", "unknown domain 'wyde'"),
-    ("random_worlds", "--domains wyde", "unknown domain 'wyde'"),
-    ("random_worlds", "--laws none", "unknown law 'none'"),
-    ("publish", "--only nothing", "no data file has such a name"),
-    ("real_pushes", "--pushes none.csv", r"pushes = none\.csv cannot be read"),
-    ("real_pushes", "--models rigid", "unknown models 'rigid'"),
-    ("real_pushes", "--mujoco -1", "mujoco = -1 is not allowed"),
-    ("fit", "--logs 1", "logs = 1 is not allowed"),
-    ("fit", "--law aps", "fit needs a law that senses touch"),
-    ("fit/bags.py", "--logs 0", "logs = 0 is not allowed"),
-    ("fit/bags.py", "--law aps", "fit needs a law that senses touch"),
-    ("export", "--laws nune", "unknown law 'nune'"),
-    ("export", "--tables sped", "sped"),
-    ("export", "--inputs 0", "inputs = 0 is not allowed"),
+# Options of studies whose value is out of bounds, or is none of their choices.
+OUT_OF_BOUNDS = [
+    *("landscape --candidates 1", "speed --refill -1", "speed --at-once 0", "speed --mujocos -4"),
+    *("levers --worlds 1", "levers --simulated nan", "ground --worlds 0", "hardware --setups 1"),
+    *("real_pushes --mujoco -1", "fit --logs 1", "fit/bags.py --logs 0", "export --inputs 0"),
 ]
+UNKNOWN = [
+    *("gradients --object box", "gradients --estimators backward", "gradients --tuned v_max"),
+    *("landscape --domain wyde", "engines --domain wyde", "hardware --domain wyde"),
+    *("random_worlds --domains wyde", "random_worlds --laws none", "export --laws nune"),
+    *("speed --names fast", "speed/costs.py --names mjx", "levers --program mjx"),
+    *("engines --objects cone", "engines --engines fast", "fidelity --conditions fine"),
+    *("ambiguities --readings none", "real_pushes --models rigid"),
+]
+REFUSED = [
+    ("gradients --horizons 2 1", r"horizons = \(2\.0, 1\.0\) is not allowed"),
+    ("landscape --laws rps,tund.json", r"tund\.json cannot be read"),
+    ("landscape --laws pursuit", "law = pursuit is not allowed"),
+    ("speed --families cone", "cone"),
+    ("speed --names 'mjx fast' --worlds 65536", "leave nothing to time"),
+    ("levers --family cone", "cone"),
+    ("ambiguities --gazebo --curve", "gazebo and curve are not allowed together"),
+    ("limits --limits leg", "did you mean 'lag'"),
+    ("mends --laws none", "unknown mend 'none'"),
+    ("ground --grounds our", "did you mean 'ours'"),
+    ("learned run run", "runs"),
+    ("force_push_grid --duration 0", "duration"),
+    ("publish --only nothing", "no data file has such a name"),
+    ("real_pushes --pushes none.csv", r"pushes = none\.csv cannot be read"),
+    ("fit --law aps", "fit needs a law that senses touch"),
+    ("fit/bags.py --law aps", "fit needs a law that senses touch"),
+    ("export --tables sped", "sped"),
+]
+for line in OUT_OF_BOUNDS + UNKNOWN:
+    _, option, value = line.split()
+    name = option.strip("-").replace("-", "_")
+    unknown = rf"unknown [\w ]*{name.rstrip('s')}[\w ]* '{value}'"
+    REFUSED.append((line, unknown if line in UNKNOWN else f"{name} = {value} is not allowed"))
 
 
-@pytest.mark.parametrize(("study", "options", "message"), REFUSED)
+@pytest.mark.parametrize(("line", "message"), REFUSED)
 def test_a_study_refuses_invalid_options_before_it_compiles(
-    study, options, message, tmp_path, compiled, capsys, monkeypatch
+    line, message, tmp_path, compiled, capsys, monkeypatch
 ):
     monkeypatch.chdir(tmp_path)
-    assert re.search(message, refusal(capsys, SWEEPS / study, *shlex.split(options)))
+    study, *options = shlex.split(line)
+    assert re.search(message, refusal(capsys, SWEEPS / study, *options))
     assert not compiled
     assert not list(tmp_path.iterdir())
 
@@ -95,44 +87,60 @@ def test_a_folder_has_a_page_that_starts_with_the_result(folder):
     assert f"({folder.name}/README.md)" in (SWEEPS / "README.md").read_text()
 
 
+def words_of(line):
+    """Return the words of a command without its run folder."""
+    return tuple(split_folder(shlex.split(line.replace("\\\n", " "), comments=True))[0])
+
+
 def published():
-    """Yield the commands of `rps` in all data files, except those with placeholders."""
+    """Yield the commands of `rps` in all data files, and whether their digest parses them."""
     for path in sorted(SWEEPS.glob("**/results/*.json")):
-        commands = json.loads(path.read_text()).get(
-            "command", []
-        )  # a table that cites others has none
+        data = json.loads(path.read_text())
+        commands = data.get("command", [])  # a table that cites others has none
         for line in [commands] if isinstance(commands, str) else commands:
             if line.startswith("rps ") and not re.search(r"\$C|[A-Z]{3,}|\.\.\.", line):
-                yield pytest.param(line, id=f"{path.stem}: {line[:60]}")
+                words = words_of(line)
+                yield words, "digest" in data and not _reads_folder(words)
 
 
-@pytest.mark.parametrize("line", list(published()))
-def test_a_published_command_exists(line, monkeypatch):
-    """Only its options are checked; files that it names may not exist."""
+RECIPE_COMMANDS = [words_of(x) for recipe in RECIPES.values() for x in recipe.commands]
+PUBLISHED = dict.fromkeys((x for x in RECIPE_COMMANDS if x[0] == "rps"), False) | dict(published())
+
+
+@pytest.mark.parametrize("words", [x for x in sorted(PUBLISHED) if not PUBLISHED[x]], ids=" ".join)
+def test_a_published_command_exists(words, monkeypatch):
+    """Only its options are checked; files that it names may not exist.
+
+    Below, digests parse the other commands.
+    """
     monkeypatch.chdir(ROOT)
-    _, *words = shlex.split(line.replace("\\\n", " "), comments=True)
-    name, rest = names.split(words)
+    name, rest = names.split(words[1:])
     question, _ = flags.parse(names.question_type(name), name, rest)
     assert question.name
 
 
 def test_commands_are_published():
-    assert len(list(published())) > 50
+    assert len(PUBLISHED) > 50
 
 
-def test_a_published_command_has_no_local_path(tmp_path):
-    run = {
-        "command": ["rps", "sweep", "--out", "/somewhere/of mine", "--worlds", "3"],
-        "packages": dict.fromkeys(("rps_jax", "jax", "mujoco", "mujoco-mjx")),
-        "commit": None,
-        "time": "2026-01-01T00:00:00",
-    }
-    path = write_table(tmp_path / "results" / "x.json", [run], "", Table([["what"]]))
-    data = json.loads(path.read_text())
-    assert data["command"] == ["rps sweep --worlds 3"]
-    assert data["digest"] == digest([["rps", "sweep", "--worlds", "3"]])
-    script = [run | {"command": ["python", "mine.py"]}]  # has no digest
-    assert "digest" not in json.loads(write_table(path, script, "", Table([["what"]])).read_text())
+def stored(folder, *commands):
+    """Return the data file of runs of some commands."""
+    signed = {"packages": dict.fromkeys(_PACKAGES, "1"), "commit": None, "time": "2026-01-01"}
+    runs = [signed | {"command": shlex.split(line)} for line in commands]
+    path = write_table(folder / "results" / "x.json", runs, "a core", Table([["x"]]))
+    return json.loads(path.read_text())
+
+
+def test_a_data_file_has_its_commands_without_local_paths_and_their_digest(tmp_path):
+    """Run folders that other commands read stay."""
+    tuned = "rps tune es --worlds 16 --law pursuit --out runs/tuned"
+    ladder = "rps ladder --worlds 9 --laws pursuit pursuit,runs/tuned/tuned.json"
+    data = stored(tmp_path, tuned, f"{ladder} --out '/somewhere/of mine'")
+    assert data["command"] == [tuned, ladder]
+    assert data["digest"] == digest([shlex.split(line) for line in (tuned, ladder)])
+    changed = tuned.replace("16", "17"), ladder
+    assert data["digest"] != digest([shlex.split(line) for line in changed])
+    assert "digest" not in stored(tmp_path, "python mine.py")
     for path in SWEEPS.rglob("results/*.json"):
         assert "--out /" not in path.read_text(), path
 
@@ -147,9 +155,8 @@ def test_a_digest_changes_with_laws_domains_and_options():
 
 def test_no_published_number_is_stale(monkeypatch):
     """A ladder runs all registered laws, so the laws of other tests are removed first."""
-    monkeypatch.setattr(
-        registry, "LAWS", {name: registry.LAWS[name] for name in registry.PACKAGE_LAWS}
-    )
+    laws = {name: registry.LAWS[name] for name in registry.PACKAGE_LAWS}
+    monkeypatch.setattr(registry, "LAWS", laws)
     for path in data_files():
         data = json.loads(path.read_text())
         if "digest" in data:

@@ -1,16 +1,13 @@
 """The interactive push page computes the same twists as Python."""
 
 import contextlib
-import os
 import runpy
-import shutil
 
+import chromium
 import jax
 import numpy as np
 import pytest
 from helpers import ROOT
-from selenium import webdriver
-from selenium.webdriver.chrome.service import Service
 
 from rps_jax.engines.quasistatic import sliders
 from rps_jax.geometry import solid
@@ -38,20 +35,11 @@ return arguments[1].map(([trial, memory]) => {
 
 @pytest.fixture(scope="module")
 def browser(tmp_path_factory):
-    binary, driver = shutil.which("chromium"), shutil.which("chromedriver")
-    if not (binary and driver):
-        lacking = "there is no Chromium: run `apt-get install -y chromium chromium-driver`"
-        (pytest.fail if os.environ.get("CI") == "true" else pytest.skip)(lacking)
     folder = tmp_path_factory.mktemp("push")
     page = folder / "push.html"
     page.write_text(MAKE["page"]())
     assert page.stat().st_size < 3e6
-    options = webdriver.ChromeOptions()
-    options.binary_location = binary
-    options.set_capability("goog:loggingPrefs", {"browser": "ALL"})
-    for flag in ("--headless=new", "--no-sandbox", "--disable-gpu", f"--user-data-dir={folder}/p"):
-        options.add_argument(flag)
-    with webdriver.Chrome(options=options, service=Service(driver)) as browser:
+    with chromium.opened(folder / "profile", "--headless=new") as browser:
         browser.get(page.as_uri())
         yield browser
         resources = "return performance.getEntriesByType('resource').length"
@@ -95,16 +83,11 @@ def test_each_state_of_a_push_gives_the_twist_of_python(law, browser):
         shown = range(0, len(live.past) - 1, stride)
         previous = [live.past[i].trial for i in shown]
         trials = leaves_by_name([step._replace(**MAKE["UNTRACED"]) for step in previous])
-        states = list(
-            zip(trials, leaves_by_name([step.law_state for step in previous]), strict=True)
-        )
+        memories = leaves_by_name([step.law_state for step in previous])
+        states = list(zip(trials, memories, strict=True))
         next_qpos = np.array([live.past[i + 1].snapshot.qpos for i in shown])
-    computed = np.concatenate(
-        [
-            browser.execute_script(SINGLE_STEPS, law, states[i : i + 500])
-            for i in range(0, len(states), 500)
-        ]
-    )
+    batches = [states[i : i + 500] for i in range(0, len(states), 500)]
+    computed = np.concatenate([browser.execute_script(SINGLE_STEPS, law, x) for x in batches])
     np.testing.assert_allclose(computed[:, :3], expected[list(shown)], rtol=0, atol=1e-5)
     np.testing.assert_allclose(computed[:, 3:], next_qpos, rtol=0, atol=1e-7)
 
@@ -142,9 +125,7 @@ def test_the_recorded_push_is_upright_and_visible_from_any_side(browser):
     """It ends at its target, upright; turning the camera changes the picture."""
     final_pose = "const q = RECORDED.qpos.at(-1); return [q[3], q[4], q[5], q[7], q[8]]"
     x, y, z, *tilt = browser.execute_script(final_pose)
-    assert (
-        np.hypot(x + 2, y) < 0.2
-    )  # the contact is at the target, the middle of the object next to it
+    assert np.hypot(x + 2, y) < 0.2  # the contact is at the target, the middle next to it
     assert abs(z - 0.4) < 2e-3
     np.testing.assert_allclose(tilt, 0, atol=2e-3)
     look = """

@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 import xarray as xr
-from helpers import ROOT, refusal
+from helpers import ROOT
 
 from rps_jax.errors import InputError
 from sweeps.real_pushes import contact, pushes, sliding, study
@@ -31,26 +31,23 @@ def ground_on(feet, count=1, shift=0.0):
     return Ground(at, np.ones(at.shape[:2]), np.zeros(count), np.full(count, shift))
 
 
-def pushed(ground, ways, pose=(0.0, 0.0, 0.0), friction=0.5, scale=1.0):
+def pushed(ways, ground=None, pose=(0.0, 0.0, 0.0), friction=0.5, scale=1.0):
     """Return pose and force of one push by fingers (F, 2) [m] along a vector (2,) [m].
 
     Fingers and vector are in the body's frame at the start.
     """
-    start, way = np.array(ways[0], float), np.array(ways[1], float)
+    start, way, pose = (np.array(x, float) for x in (*ways, pose))
     if len(start) == 1:
         start = np.concatenate([start, start + 100.0])
-    pose = np.array(pose, float)
     share = np.linspace(0, 1, STEPS + 1)[:, None, None]
     path = turned(np.full((STEPS + 1, 2), pose[2]), start + share * way) + pose[:2]
-    result = sliding.push(
-        scale * OUTLINE,
-        scale * COM,
-        ground._replace(at=scale * ground.at, arm=scale * ground.arm),
-        scale * path[:, None],
-        (pose * [scale, scale, 1])[None],
-        np.array([friction]),
-    )
-    return result.pose[:, 0] * [1 / scale, 1 / scale, 1], result.force[:, 0]
+    ground = ground_on(FEET) if ground is None else ground
+    ground = ground._replace(at=scale * ground.at, arm=scale * ground.arm)
+    unit = np.array([scale, scale, 1])
+    fingers, first = scale * path[:, None], (pose * unit)[None]
+    shape = scale * OUTLINE, scale * COM
+    result = sliding.push(*shape, ground, fingers, first, np.array([friction]))
+    return result.pose[:, 0] / unit, result.force[:, 0]
 
 
 UPWARDS = ([[0.025, -0.001], [0.075, -0.001]], (0.0, 0.02))  # two fingers about the centroid's x
@@ -59,45 +56,45 @@ UPWARDS = ([[0.025, -0.001], [0.075, -0.001]], (0.0, 0.02))  # two fingers about
 @pytest.mark.parametrize("friction", [0.05, 0.5])
 def test_two_fingers_through_the_centre_of_friction_translate(friction):
     """The feet bear a third each, and fingers at equal distances hold it straight."""
-    pose, force = pushed(ground_on(FEET), UPWARDS, friction=friction)
+    pose, force = pushed(UPWARDS, friction=friction)
     assert pose[-1] == pytest.approx([0.0, 0.019, 0.0], abs=2e-5)
     assert force[-1] == pytest.approx([0.0, 1.0], abs=2e-3)  # the friction mu m g
 
 
 def test_an_off_centre_finger_turns_the_object_with_less_than_its_weight():
-    pose, force = pushed(ground_on(FEET), ([[0.1, -0.001]], (0.0, 0.02)))
+    pose, force = pushed(([[0.1, -0.001]], (0.0, 0.02)))
     assert pose[-1, 2] > 0.05
     assert 0.1 < np.linalg.norm(force[-1]) < 0.95
 
 
 def test_a_finger_stays_in_its_cone_and_outside():
     mu, way = 0.3, ([[0.07, -0.002]], (0.02, 0.02))
-    pose, force = pushed(ground_on(FEET), way, friction=mu)
-    normal = turned(pose[:-1, 2], np.array([0.0, 1.0]))
-    tangent = turned(pose[:-1, 2], np.array([1.0, 0.0]))
-    along, across = np.sum(force * normal, 1), np.sum(force * tangent, 1)
+    pose, force = pushed(way, friction=mu)
+    along, across = (
+        np.sum(force * turned(pose[:-1, 2], np.array(axis)), 1) for axis in ([0.0, 1.0], [1.0, 0.0])
+    )
     touching = along > 1e-6
     assert touching.sum() > STEPS / 2
     assert (np.abs(across[touching]) <= mu * along[touching] * (1 + 1e-6)).all()
     assert across[touching][-1] == pytest.approx(mu * along[touching][-1], rel=0.01)  # it slides
-    finger = np.array([0.09, 0.018])
-    p_object_finger = turned(-pose[-1, 2], finger - pose[-1, :2])
+    p_object_finger = turned(-pose[-1, 2], np.array([0.09, 0.018]) - pose[-1, :2])
     gap, _ = sliding.nearest(OUTLINE, p_object_finger)
     assert abs(gap) < 3e-4
 
 
+SIDEWAYS = ([[0.1, -0.001]], (0.004, 0.02))
+
+
 def test_lengths_have_no_scale():
-    base, _ = pushed(ground_on(FEET), ([[0.1, -0.001]], (0.004, 0.02)))
-    scaled, _ = pushed(ground_on(FEET), ([[0.1, -0.001]], (0.004, 0.02)), scale=4.0)
+    (base, _), (scaled, _) = (pushed(SIDEWAYS, scale=x) for x in (1.0, 4.0))
     assert abs(base[-1, 2]) > 0.05
     np.testing.assert_allclose(scaled, base, atol=1e-6)
 
 
 def test_feet_move_with_the_pose():
     """Moving and turning a push moves and turns its result."""
-    first, _ = pushed(ground_on(FEET), ([[0.1, -0.001]], (0.004, 0.02)))
     pose = (0.3, -0.2, 2.0)
-    second, _ = pushed(ground_on(FEET), ([[0.1, -0.001]], (0.004, 0.02)), pose=pose)
+    first, second = (pushed(SIDEWAYS, pose=x)[0] for x in ((0, 0, 0), pose))
     expected = turned(np.full(len(first), 2.0), first[:, :2]) + pose[:2]
     np.testing.assert_allclose(second[:, :2], expected, atol=1e-6)
     np.testing.assert_allclose(second[:, 2], first[:, 2] + 2.0, atol=1e-5)
@@ -106,7 +103,7 @@ def test_feet_move_with_the_pose():
 def test_positions_of_feet_change_the_rotation():
     way = ([[0.1, -0.001]], (0.0, 0.02))
     near, far = (COM + share * (OUTLINE - COM) for share in (0.2, 1.0))
-    assert pushed(ground_on(near), way)[0][-1, 2] > 1.2 * pushed(ground_on(far), way)[0][-1, 2]
+    assert pushed(way, ground_on(near))[0][-1, 2] > 1.2 * pushed(way, ground_on(far))[0][-1, 2]
 
 
 def test_feet_bear_the_weight_about_its_centre():
@@ -182,29 +179,26 @@ def test_mujoco_with_stiff_fingers_comes_near_the_rigid_body(sample):
 
 
 def test_a_prediction_accepts_files_and_datasets_without_final_poses(sample, tmp_path):
-    inputs = sample.drop(
-        columns=[name for name in sample if name.startswith(("post_", "gap", "force"))]
-    )
-    inputs.to_csv(tmp_path / "kept.csv", index=False)
+    names = [name for name in sample if name.startswith(("post_", "gap", "force"))]
+    inputs, path = sample.drop(columns=names), tmp_path / "kept.csv"
+    inputs.to_csv(path, index=False)
     first = predict(sample, "ellipsoid", steps=10)
-    for table in (tmp_path / "kept.csv", str(tmp_path / "kept.csv"), inputs, inputs.to_xarray()):
+    for table in (path, str(path), inputs, inputs.to_xarray()):
         again = predict(table, "ellipsoid", steps=10)
         np.testing.assert_allclose(again.post_yaw, first.post_yaw, rtol=1e-12)
     assert list(first.id.values) == list(sample.id)
 
 
-def test_an_invalid_table_is_refused(sample, tmp_path, capsys):
-    with pytest.raises(InputError, match="lack the column edge, which kind = two_point"):
-        predict(sample.drop(columns="edge"))
-    with pytest.raises(InputError, match=r"pre_yaw = nan in row 0 is not allowed"):
-        predict(sample.assign(pre_yaw=np.nan))
-    with pytest.raises(InputError, match="support = round is not allowed"):
-        predict(sample.assign(support="round"))
-    with pytest.raises(InputError, match="without a usable row"):
-        predict(sample.assign(usable=0))
-    with pytest.raises(InputError, match="unknown model 'rigid'"):
-        predict(sample, "rigid")
-    assert "cannot be read" in refusal(capsys, FOLDER, "--pushes", str(tmp_path / "none.csv"))
+def test_an_invalid_table_is_refused(sample):
+    for table, model, message in (
+        (sample.drop(columns="edge"), "rigid_feet", "lack the column edge, which kind = two_point"),
+        (sample.assign(pre_yaw=np.nan), "rigid_feet", "pre_yaw = nan in row 0 is not allowed"),
+        (sample.assign(support="round"), "rigid_feet", "support = round is not allowed"),
+        (sample.assign(usable=0), "rigid_feet", "without a usable row"),
+        (sample, "rigid", "unknown model 'rigid'"),
+    ):
+        with pytest.raises(InputError, match=message):
+            predict(table, model)
 
 
 def test_errors_by_hand():
@@ -224,9 +218,8 @@ def test_errors_by_hand():
 
 def test_a_small_study_resumes_and_lists_every_model(tmp_path):
     models = ("no_motion", "rigid_feet", "mujoco_ours")
-    question = study.RealPushes(
-        models=models, few=20, mujoco=1, out=tmp_path / "run", progress=False
-    )
+    options = {"out": tmp_path / "run", "progress": False}
+    question = study.RealPushes(models=models, few=10, mujoco=1, **options)
     results = question()
     again = question()
     assert results.drop_attrs().identical(again.drop_attrs())
@@ -241,23 +234,13 @@ def test_a_small_study_resumes_and_lists_every_model(tmp_path):
 
 def test_a_layout_is_judged_with_the_friction_of_the_others():
     """Layout a fits best with 0.2, layout b with 0.4; each is evaluated with both values."""
-    rows = {"a": [1.0, 3.0], "b": [4.0, 2.0]}  # [mm] at 0.2 and 0.4
-    both = np.array([[rows["a"][i]] * 3 + [rows["b"][i]] * 3 for i in (0, 1)]) / 1e3
+    both = np.repeat([[1.0, 4.0], [3.0, 2.0]], 3, axis=1) / 1e3  # [m] at 0.2 and 0.4
     off = (("fitted", "tried", "few"), both[None])
-    results = xr.Dataset(
-        {"few_both": off, "few_place": off, "few_turn": off},
-        {
-            "fitted": ["rigid_feet"],
-            "tried": [0.2, 0.4],
-            "few_support": ("few", list("aaabbb")),
-            "few_finger": ("few", ["point"] * 6),
-        },
-    )
-    layout_rows = list(study._layout_rows(results))
-    assert [(row[1], row[4], row[7][0], row[8]) for row in layout_rows] == [
-        ("a", 0.4, 3.0, 1.0),
-        ("b", 0.2, 4.0, 2.0),
-    ]
+    labels = {"fitted": ["rigid_feet"], "tried": [0.2, 0.4], "few_support": ("few", list("aaabbb")),
+              "few_finger": ("few", ["point"] * 6)}  # fmt: skip
+    results = xr.Dataset({"few_both": off, "few_place": off, "few_turn": off}, labels)
+    judged = [(row[1], row[4], row[7][0], row[8]) for row in study._layout_rows(results)]
+    assert judged == [("a", 0.4, 3.0, 1.0), ("b", 0.2, 4.0, 2.0)]
 
 
 def test_the_published_friction_is_that_of_predictions():

@@ -1,14 +1,18 @@
 """Files of a run: atomic writes, detection of damage, and locks."""
 
+import contextlib
 import hashlib
 import io
+import itertools
 import os
+import re
 import shutil
 import subprocess
 import sys
 import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -23,10 +27,8 @@ from rps_jax.record import files, provenance
 from rps_jax.record import folder as run_folder
 from rps_jax.record.checkpoint import Checkpoints
 
-RESULTS = xr.Dataset(
-    {"time": (("law", "world"), np.linspace(0, 1, 200, dtype=np.float32).reshape(2, 100))},
-    {"law": ["rps", "nps"]},
-)
+TIMES = np.linspace(0, 1, 200, dtype=np.float32).reshape(2, 100)
+RESULTS = xr.Dataset({"time": (("law", "world"), TIMES)}, {"law": ["rps", "nps"]})
 
 
 def state(generation):
@@ -39,36 +41,32 @@ def state(generation):
 # --- damage --------------------------------------------------------------------------------
 
 
-def truncated(share):
-    return lambda content: content[: int(share * len(content))]
+def truncated(content, at):
+    return content[:at]
 
 
-def flipped(share, bit):
-    def flip(content):
-        at = int(share * len(content))
-        return content[:at] + bytes([content[at] ^ 1 << bit]) + content[at + 1 :]
-
-    return flip
+def flipped(content, at):
+    return content[:at] + bytes([content[at] ^ 1 << at % 8]) + content[at + 1 :]
 
 
-def overwritten(share, size):
+def overwritten(content, at, size=64):
     """Overwrite a block with zeros, or with ones where it is zero already."""
+    block = content[at : at + size]
+    fills = (bytes(len(block)), b"\xff" * len(block))
+    return content[:at] + next(f for f in fills if f != block) + content[at + size :]
 
-    def fill(content):
-        at = int(share * len(content))
-        block = content[at : at + size]
-        fills = (bytes(len(block)), b"\xff" * len(block))
-        return content[:at] + next(f for f in fills if f != block) + content[at + size :]
 
-    return fill
+def at_share(damage, share):
+    """Return the function that damages a content at a share of its length."""
+    return lambda content: damage(content, int(share * len(content)))
 
 
 SHARES = (0, 0.001, 0.01, 0.1, 0.2, 0.35, 0.5, 0.65, 0.8, 0.9, 0.97, 0.999)
 DAMAGE = {
-    **{f"cut at {share}": truncated(share) for share in SHARES},
-    **{f"bit {i % 8} at {share}": flipped(share, i % 8) for i, share in enumerate(SHARES)},
-    **{f"block at {share}": overwritten(share, 64) for share in SHARES},
-    **{f"byte at {share}": overwritten(share, 1) for share in SHARES[::2]},
+    **{f"cut at {share}": at_share(truncated, share) for share in SHARES},
+    **{f"bit at {share}": at_share(flipped, share) for share in SHARES},
+    **{f"block at {share}": at_share(overwritten, share) for share in SHARES},
+    **{f"byte at {x}": at_share(partial(overwritten, size=1), x) for x in SHARES[::2]},
     "all zeros": lambda content: bytes(len(content)),
     "one byte more": lambda content: content + b"\0",
     "twice": lambda content: content * 2,
@@ -105,13 +103,23 @@ def folder(sound, tmp_path, monkeypatch):
     return shutil.copytree(sound, tmp_path / "run")
 
 
-def reports_corruption(path, read, *arguments):
-    with pytest.raises(InputError) as caught:
-        read(*arguments)
-    message = str(caught.value)
-    assert message.startswith(f"{path} is corrupt")
-    assert message.endswith(".")
-    assert "\n" not in message
+def start_later(folder):
+    provenance.write_environment(folder, {"time": "later"})
+
+
+# The checked files of a run folder, and their readers.
+READERS = {
+    "results.nc": [files.read_results],
+    "manifest.json": [run_folder.read_manifest, lambda f: run_folder.claim(f, {"worlds": 300})],
+    "environment.json": [provenance.describe, start_later],
+}
+
+
+def reports_corruption(path):
+    for read in READERS[path.name]:
+        with pytest.raises(InputError) as caught:
+            read(path.parent)
+        assert re.fullmatch(rf"{re.escape(str(path))} is corrupt.*\.", str(caught.value))
 
 
 @pytest.mark.parametrize("damage", DAMAGE)
@@ -127,21 +135,11 @@ def test_damage_is_detected_before_reading_and_other_files_survive(damage, folde
         assert dict(parts.items()) == rest
         parts.put(name, contents[name], path.suffix)
     assert dict(parts.items()) == contents
-    for name, *readers in (
-        ("results.nc", files.read_results),
-        ("manifest.json", run_folder.read_manifest, lambda f: run_folder.claim(f, {"worlds": 300})),
-        (
-            "environment.json",
-            provenance.describe,
-            lambda f: provenance.write_environment(f, {"time": "later"}),
-        ),
-    ):
-        path = folder / name
+    for path in map(folder.joinpath, READERS):
         content = path.read_bytes()
         damaged = DAMAGE[damage](content)
         path.write_bytes(damaged)
-        for read in readers:
-            reports_corruption(path, read, folder)
+        reports_corruption(path)
         assert path.read_bytes() == damaged  # the damaged file stays
         path.write_bytes(content)
     assert time.perf_counter() - start_time < 1.0
@@ -154,21 +152,19 @@ def test_a_wrong_digest_is_damage_too(folder):
     assert list(Checkpoints(folder).paths()) == ["0000000", "0000002", "state"]
     for digest in ("0" * 64, "", "\N{SNOWMAN}"):
         files.checksum_path(folder / "results.nc").write_text(f"{digest}  results.nc\n")
-        reports_corruption(folder / "results.nc", files.read_results, folder)
+        reports_corruption(folder / "results.nc")
 
 
-@pytest.mark.parametrize(
-    "content", [b"", b"torn", b"\xff\xfe", b"[1]", b"[" * 100_000, b"{'a': 1}"]
-)
+INVALID_JSON = [b"", b"torn", b"\xff\xfe", b"[1]", b"[" * 100_000, b"{'a': 1}"]
+
+
+@pytest.mark.parametrize("content", INVALID_JSON)
 def test_invalid_json_without_checksum_is_reported(content, folder):
     """Older versions wrote no checksums."""
-    for name, read in (
-        ("manifest.json", run_folder.read_manifest),
-        ("environment.json", provenance.describe),
-    ):
-        files.checksum_path(folder / name).unlink()
-        (folder / name).write_bytes(content)
-        reports_corruption(folder / name, read, folder)
+    for path in (folder / "manifest.json", folder / "environment.json"):
+        files.checksum_path(path).unlink()
+        path.write_bytes(content)
+        reports_corruption(path)
 
 
 def test_a_file_without_checksum_is_read(sound, tmp_path):
@@ -178,39 +174,32 @@ def test_a_file_without_checksum_is_read(sound, tmp_path):
         path.unlink()
     xr.testing.assert_identical(files.read_results(folder), RESULTS)
     assert run_folder.read_manifest(folder) == {"worlds": 300, "seed": 0}
-    provenance.write_environment(folder, {"time": "later"})
-    assert provenance.read_environment(folder)["before"] == [
-        {"command": ["rps", "sweep"], "time": "now"}
-    ]
+    start_later(folder)
+    (previous,) = provenance.read_environment(folder)["before"]
+    assert previous == {"command": ["rps", "sweep"], "time": "now"}
     (folder / "results.nc").write_bytes(b"torn")
-    reports_corruption(folder / "results.nc", files.read_results, folder)
+    reports_corruption(folder / "results.nc")
 
 
 def test_a_part_is_named_by_its_number_and_digest(tmp_path):
     """The name is stable, so that a sweep of another version can be resumed."""
     content = files.encode_results(RESULTS.assign_attrs(part="0000012"))
     digest = hashlib.sha256(content).hexdigest()[:16]
-    (tmp_path / "parts").mkdir()
-    (tmp_path / "parts" / f"0000012-{digest}.nc").write_bytes(content)
-    assert dict(Checkpoints(tmp_path).items()) == {"0000012": content}
-    assert Checkpoints(tmp_path).put("0000012", content) == Checkpoints(tmp_path).paths()["0000012"]
-    results = Checkpoints(tmp_path).load_or_compute(
-        "0000012", lambda: pytest.fail("it was made again")
-    )
-    xr.testing.assert_identical(results, RESULTS)
-    xr.testing.assert_identical(
-        Checkpoints(tmp_path).load_or_compute("other", lambda: RESULTS), RESULTS
-    )
-    assert list(Checkpoints(tmp_path).paths()) == ["0000012", "other"]
+    parts, again = Checkpoints(tmp_path), lambda: pytest.fail("it was made again")
+    parts.folder.mkdir()
+    (parts.folder / f"0000012-{digest}.nc").write_bytes(content)
+    assert dict(parts.items()) == {"0000012": content}
+    assert parts.put("0000012", content) == parts.paths()["0000012"]
+    xr.testing.assert_identical(parts.load_or_compute("0000012", again), RESULTS)
+    xr.testing.assert_identical(parts.load_or_compute("other", lambda: RESULTS), RESULTS)
+    assert list(parts.paths()) == ["0000012", "other"]
 
 
 @pytest.mark.skipif(not shutil.which("sha256sum"), reason="there is no sha256sum")
 def test_sha256sum_verifies_the_files(sound):
     check = ["sha256sum", "-c", *(path.name for path in sound.glob("*.sha256"))]
     done = subprocess.run(check, cwd=sound, capture_output=True, text=True, check=True)
-    assert set(done.stdout.split("\n")[:-1]) == {
-        f"{name}: OK" for name in ("results.nc", "manifest.json", "environment.json")
-    }
+    assert set(done.stdout.splitlines()) == {f"{name}: OK" for name in READERS}
 
 
 # --- kills ---------------------------------------------------------------------------------
@@ -220,64 +209,55 @@ class Killed(BaseException):
     """Simulated SIGKILL, which no `except Exception` catches."""
 
 
-def killed_everywhere(monkeypatch, act, check):
-    """Call `act`, killed before its first, second, ... call that changes the disk."""
+def contents_after_kills(monkeypatch, read, write):
+    """Return what is read after writes of `new` over `old`, killed at each change of the disk."""
     owners = ((os, "replace"), (os, "fsync"), (Path, "unlink"), (Path, "write_bytes"))
-    for kill in range(100):
-        calls_left = [kill]
+    contents = []
+    while len(contents) < 100:
+        write(b"old")
+        calls = itertools.count()
 
-        def dies(call, calls_left=calls_left):
+        def dies(call, calls=calls):
             def called(*arguments, **options):
-                calls_left[0] -= 1
-                if calls_left[0] < 0:
+                if next(calls) >= len(contents):
                     raise Killed
                 return call(*arguments, **options)
 
             return called
 
-        with monkeypatch.context() as patch:
+        with monkeypatch.context() as patch, contextlib.suppress(Killed):
             for owner, name in owners:
                 patch.setattr(owner, name, dies(getattr(owner, name)))
-            try:
-                act()
-            except Killed:
-                pass
-            else:
-                return kill
-        check()
+            write(b"new")
+            return contents
+        contents.append(read())
     raise AssertionError("it never ends")
 
 
 def test_a_write_killed_at_any_moment_leaves_the_old_file_or_the_new(tmp_path, monkeypatch):
-    path, contents = tmp_path / "results.nc", set()
+    path = tmp_path / "results.nc"
+    checksum = files.checksum_path(path)
 
-    def check():
-        contents.add(files.read_checked(path))
-        if files.checksum_path(path).exists():
-            stated = files.checksum_path(path).read_text().split()[0]
+    def read():
+        if checksum.exists():
+            stated = checksum.read_text().split()[0]
             assert stated == hashlib.sha256(path.read_bytes()).hexdigest()
-        files.write_bytes(path, b"old", checked=True)
+        return files.read_checked(path)
 
-    files.write_bytes(path, b"old", checked=True)
-    write = lambda: files.write_bytes(path, b"new", checked=True)  # noqa: E731
-    assert killed_everywhere(monkeypatch, write, check) > 6
-    assert contents == {b"old", b"new"}
-    assert files.checksum_path(path).exists()
+    write = partial(files.write_bytes, path, checked=True)
+    contents = contents_after_kills(monkeypatch, read, write)
+    assert len(contents) > 6
+    assert set(contents) == {b"old", b"new"}
+    assert checksum.exists()
 
 
 def test_a_killed_replacement_leaves_the_old_or_the_new_part(tmp_path, monkeypatch):
-    """The process is killed at each of its calls that change the disk."""
-    parts, contents = Checkpoints(tmp_path), set()
-
-    def check():
-        contents.add(parts.get("state"))
-        parts.put("state", state(1), ".npz")
-
-    parts.put("state", state(1), ".npz")
+    parts = Checkpoints(tmp_path)
     parts.put("state-of-another", b"other")
-    put = lambda: parts.put("state", state(2), ".npz")  # noqa: E731
-    assert killed_everywhere(monkeypatch, put, check) > 3
-    assert contents == {state(1), state(2)}
+    write = lambda content: parts.put("state", content, ".npz")  # noqa: E731
+    contents = contents_after_kills(monkeypatch, lambda: parts.get("state"), write)
+    assert len(contents) > 3
+    assert set(contents) == {b"old", b"new"}
     assert len(list(parts.folder.glob("[!.]*"))) == 2
 
 
@@ -326,9 +306,8 @@ with run_folder.lock(Path(sys.argv[1])):
 
 def test_a_killed_process_releases_its_lock_and_the_record_needs_no_jax(tmp_path):
     command = [sys.executable, "-c", _HOLDER, str(tmp_path)]
-    with subprocess.Popen(
-        command, cwd=ROOT, stdin=subprocess.PIPE, stdout=subprocess.PIPE
-    ) as holder:
+    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE}
+    with subprocess.Popen(command, cwd=ROOT, **pipes) as holder:
         assert holder.stdout.readline() == b"held\n"
         refused(tmp_path)
         holder.kill()
@@ -361,25 +340,17 @@ def test_concurrent_starts_of_a_run_agree_or_are_refused(tmp_path):
 
 def test_previous_environments_of_a_run_are_kept(tmp_path):
     current = device.collect_environment()
-    previous = current | {
-        "commit": "abc",
-        "device": current["device"] | {"kind": "H200"},
-        "time": "then",
-    }
-    provenance.write_environment(tmp_path, previous)
-    provenance.write_environment(tmp_path, current)
-    provenance.write_environment(tmp_path, current | {"processors": 99})  # as in a growing cluster
-    provenance.write_environment(tmp_path, current)
-    provenance.write_environment(tmp_path, current | {"time": "later"})  # the same command again
-    assert provenance.read_environment(tmp_path) == current | {
-        "time": "later",
-        "before": [previous],
-    }
+    previous = current | {"commit": "abc", "time": "then"}
+    previous["device"] = current["device"] | {"kind": "H200"}
+    grown = current | {"processors": 99}  # as in a growing cluster
+    last = current | {"time": "later"}  # the same command again
+    for environment in (previous, current, grown, current, last):
+        provenance.write_environment(tmp_path, environment)
+    assert provenance.read_environment(tmp_path) == last | {"before": [previous]}
     text = provenance.describe(tmp_path)
     assert text.index("later") < text.index("before that by") < text.index("commit abc, then, on H")
     (tmp_path / provenance.ENVIRONMENT).write_text("{}")
-    with pytest.raises(InputError, match=r"environment\.json is corrupt"):
-        provenance.describe(tmp_path)
+    reports_corruption(tmp_path / provenance.ENVIRONMENT)
 
 
 def test_paths_that_are_not_utf8_keep_their_bytes(tmp_path):

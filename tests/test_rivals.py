@@ -5,7 +5,7 @@ import math
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import same
+from helpers import moved, same
 
 from rps_jax.control import registry
 from rps_jax.control.laws import (
@@ -32,6 +32,7 @@ from rps_jax.control.observation import (
     Twist,
 )
 from rps_jax.errors import InputError
+from rps_jax.geometry import planar
 from rps_jax.trials import pushes
 from rps_jax.trials.pushes import Case
 from rps_jax.trials.setting import Setting
@@ -44,6 +45,23 @@ RIVALS = {"guided": GuidedParams()} | {
     for name in registry.PACKAGE_LAWS
     if not isinstance(registry.LAWS[name], RPSParams | APSParams)
 }
+
+
+def follow(law, params, *script, state=None):
+    """Step a law through observations, and return its last state.
+
+    Each row of the script is an observation, the expected twist, and the expected angle gamma
+    [rad] of the push; both may be left out.
+    """
+    state = law.init(params) if state is None else state
+    for observation, *expected in script:
+        twist, gamma = (*expected, None, None)[:2]
+        state, *outputs = law.step(params, state, observation)
+        if twist is not None:
+            np.testing.assert_allclose(outputs[0], twist, atol=1e-6)
+        if gamma is not None:
+            assert float(outputs[1].gamma) == pytest.approx(gamma, abs=1e-6)
+    return state
 
 
 def step_once(law, params, observation):
@@ -68,117 +86,89 @@ def with_force(observation, force=(-20.0, 0.0)):
 
 
 def test_a_twist_from_the_velocity_of_a_point_of_the_base():
-    twist = Twist.from_point_velocity(
-        jnp.array([0.36, 0.1]), jnp.array([0.01, 0.05]), jnp.asarray(0.15)
-    )
+    p, v = jnp.array([0.36, 0.1]), jnp.array([0.01, 0.05])
+    twist = Twist.from_point_velocity(p, v, jnp.asarray(0.15))
     np.testing.assert_allclose(twist, [0.01 + 0.015, 0.05 - 0.054, 0.15], rtol=1e-5)
     bounded = Twist(*map(jnp.asarray, (0.06, -0.08, -0.3))).saturate(0.05, 0.15)
     np.testing.assert_allclose(bounded, [0.03, -0.04, -0.15], rtol=1e-6)
 
 
-@pytest.mark.parametrize(
-    ("observation", "expected"),
-    [
-        (observe((0.36, 0.1), (2.36, 0.1)), (0.05, 0.0, 0.0)),
-        (observe((0.36, 0.1), (0.42, 0.1)), (0.03, 0.0, 0.0)),  # K_v d of 6 cm
-        # Sideways: 0.05 (press, 1), less the contact's velocity of turning at the bound.
-        (observe((0.36, 0.1), (0.36, 1.1)), (0.01 + 0.015, 0.05 - 0.054, 0.15)),
-        (observe(touching=False), (0.01, 0.0, 0.0)),
-    ],
-)
+@pytest.mark.parametrize(("observation", "expected"), [
+    (observe((0.36, 0.1), (2.36, 0.1)), (0.05, 0.0, 0.0)),
+    (observe((0.36, 0.1), (0.42, 0.1)), (0.03, 0.0, 0.0)),  # K_v d of 6 cm
+    # Sideways: 0.05 (press, 1), less the contact's velocity of turning at the bound.
+    (observe((0.36, 0.1), (0.36, 1.1)), (0.01 + 0.015, 0.05 - 0.054, 0.15)),
+    (observe(touching=False), (0.01, 0.0, 0.0)),
+])  # fmt: skip
 def test_pursuit_moves_the_contact_straight_to_the_target(observation, expected):
-    _, twist, _ = pursuit.step(PursuitParams(), (), observation)
-    np.testing.assert_allclose(twist, expected, atol=1e-7)
+    follow(pursuit, PursuitParams(), (observation, expected))
+
+
+AT_PATH = observe((0.36, 0.12), (2.36, 0.12))
+OUTSIDE = observe((0.36, 0.22), (2.36, 0.12))  # 10 cm to the left of the path
 
 
 def test_force_push_steers_by_the_drift_of_the_contact():
-    params, step = ForcePushParams(), force_push.step
-    start = force_push.init(params)
-    _, twist, _ = step(params, start, observe(touching=False))
-    np.testing.assert_allclose(twist, (0.01, 0.0, 0.0), atol=1e-7)
-
-    # The path starts at the first contact: no offset, no drift, and the base faces along it.
-    state, twist, details = step(params, start, observe((0.36, 0.12), (2.36, 0.12)))
-    assert float(details.gamma) == pytest.approx(0.0, abs=1e-6)
-    np.testing.assert_allclose(twist, (0.05, 0.0, 0.0), atol=1e-6)
-
-    # A drift of 10 cm over lambda = 10 cm is 45 degrees. 10 cm to the left of the path the push
-    # points farther out, which turns the object back in.
-    state, _, details = step(params, state, observe((0.36, 0.22), (2.36, 0.12)))
+    # A drift of 10 cm over lambda = 10 cm is 45 degrees. To the left of the path the push points
+    # farther out, which turns the object back in.
     angle = 1.3 * math.pi / 4 + 0.5 * 0.1
-    assert float(details.gamma) == pytest.approx(angle, abs=1e-6)
-
-    # After a loss of contact: back towards the path, 0.1 rad per step.
     lost = observe((0.36, 0.22), (2.36, 0.12), touching=False)
-    state, _, details = step(params, state, lost)
-    assert float(details.gamma) == pytest.approx(angle - 0.1, abs=1e-6)
-    for _ in range(20):
-        state, _, details = step(params, state, lost)
-    assert float(details.gamma) == pytest.approx(-0.5 * 0.1, abs=1e-6)
+    follow(
+        force_push, ForcePushParams(),
+        (observe(touching=False), (0.01, 0.0, 0.0)),
+        # The path starts at the first contact: no offset, no drift, and the base faces along it.
+        (AT_PATH, (0.05, 0.0, 0.0), 0.0),
+        (OUTSIDE, None, angle),
+        # After a loss of contact: back towards the path, 0.1 rad per step.
+        (lost, None, angle - 0.1),
+        *19 * [(lost,)],
+        (lost, None, -0.5 * 0.1),
+    )  # fmt: skip
 
 
 def test_force_push_forgets_a_drift_over_the_length_lambda():
     params = ForcePushParams(k_y=0.0)
-    state, _, _ = step_once(force_push, params, observe((0.36, 0.0)))
-    _, _, details = force_push.step(params, state, observe((0.36, 0.1), robot=(0.1, 0.0)))
-    drift = 0.1 * math.exp(-1)  # [m] after one lambda
-    assert float(details.gamma) == pytest.approx(1.3 * math.atan2(drift, 0.1), abs=1e-6)
+    state = follow(force_push, params, (observe((0.36, 0.0)),))
+    drift = 1.3 * math.atan2(0.1 * math.exp(-1), 0.1)  # after one lambda
+    follow(force_push, params, (observe((0.36, 0.1), robot=(0.1, 0.0)), None, drift), state=state)
     # A base that faces 0.2 rad to the left of the path feels the force in this direction.
-    _, _, details = force_push.step(params, state, observe((0.36, 0.0), yaw=0.2))
-    assert float(details.gamma) == pytest.approx(1.3 * 0.2, abs=1e-6)
+    follow(force_push, params, (observe((0.36, 0.0), yaw=0.2), None, 1.3 * 0.2), state=state)
 
 
 def test_force_push_plans_a_new_path_behind_the_target():
-    params = ForcePushParams()
-    state, _, _ = step_once(force_push, params, observe())
-    assert float(state.path.theta_d) == 0
-    state, _, _ = force_push.step(params, state, observe(robot=(1.9, 0.0)))
-    assert float(state.path.theta_d) == 0  # 10 cm before the target
-    state, _, _ = force_push.step(params, state, observe(robot=(2.1, 0.0)))
-    assert abs(float(state.path.theta_d)) == pytest.approx(math.pi)
+    params, state = ForcePushParams(), None
+    for x, angle in ((0.0, 0.0), (1.9, 0.0), (2.1, math.pi)):  # the last is behind it
+        state = follow(force_push, params, (observe(robot=(x, 0.0)),), state=state)
+        assert abs(float(state.path.theta_d)) == pytest.approx(angle)
     np.testing.assert_allclose(state.path.p_world_start, (2.46, 0.0), atol=1e-6)
 
 
 def test_the_published_force_push_steers_by_the_angle_of_the_force():
     """theta_p = 1.3 theta_f + 0.5 Delta, and the contact moves at 0.05 m/s along it."""
-    params, step = PublishedForcePushParams(), force_push_published.step
-    start = force_push_published.init(params)
-    _, twist, _ = step(params, start, with_force(observe(touching=False)))
-    np.testing.assert_allclose(twist, (0.01, 0.0, 0.0), atol=1e-7)
-
-    # Contact without force: along the path.
-    at = observe((0.36, 0.12), (2.36, 0.12))
-    state, twist, _ = step(params, start, with_force(at, (0.0, 0.9)))
-    np.testing.assert_allclose(twist, (0.05, 0.0, 0.0), atol=1e-7)
-
-    # The object pushes back along (-4, -3): the base pushes it 36.87 degrees to the left.
-    state, twist, details = step(params, state, with_force(at, (-16.0, -12.0)))
     angle = 1.3 * math.atan2(3, 4)
-    assert float(details.gamma) == pytest.approx(angle, abs=1e-6)
-    np.testing.assert_allclose(
-        twist, (0.05 * math.cos(angle), 0.05 * math.sin(angle), 0.0), atol=1e-6
-    )
-
-    # 10 cm to the left of the path the push points farther out.
-    outside = observe((0.36, 0.22), (2.36, 0.12))
-    state, _, details = step(params, state, with_force(outside, (-16.0, -12.0)))
-    assert float(details.gamma) == pytest.approx(angle + 0.05, abs=1e-6)
-
-    # Without force: back to -0.5 Delta, at 10 rad/s.
-    state, _, details = step(params, state, with_force(outside, (0.0, 0.0)))
-    assert float(details.gamma) == pytest.approx(angle + 0.05 - 0.2, abs=1e-6)
-    for _ in range(10):
-        state, _, details = step(params, state, with_force(outside, (-0.6, 0.6)))
-    assert float(details.gamma) == pytest.approx(-0.05, abs=1e-6)
+    along = (0.05 * math.cos(angle), 0.05 * math.sin(angle), 0.0)
+    follow(
+        force_push_published, PublishedForcePushParams(),
+        (with_force(observe(touching=False)), (0.01, 0.0, 0.0)),
+        # Contact without force: along the path.
+        (with_force(AT_PATH, (0.0, 0.9)), (0.05, 0.0, 0.0)),
+        # The object pushes back along (-4, -3): the base pushes it 36.87 degrees to the left.
+        (with_force(AT_PATH, (-16.0, -12.0)), along, angle),
+        (with_force(OUTSIDE, (-16.0, -12.0)), None, angle + 0.05),
+        # Without force: back to -0.5 Delta, at 10 rad/s.
+        (with_force(OUTSIDE, (0.0, 0.0)), None, angle + 0.05 - 0.2),
+        *9 * [(with_force(OUTSIDE, (-0.6, 0.6)),)],
+        (with_force(OUTSIDE, (-0.6, 0.6)), None, -0.05),
+    )  # fmt: skip
 
 
 def test_the_published_force_push_yields_to_a_large_force():
     """It yields to 20 of 70 N: 0.0015 * 20 = 0.03 m/s. At 90 N it moves back at 0.01 m/s."""
-    params, step = PublishedForcePushParams(), force_push_published.step
-    state, _, _ = step_once(force_push_published, params, with_force(observe()))
+    params = PublishedForcePushParams()
+    state = follow(force_push_published, params, (with_force(observe()),))
     for force, speed in ((50.0, 0.05), (70.0, 0.02), (90.0, -0.01), (1e4, -0.05)):
-        _, twist, _ = step(params, state, with_force(observe(), (-force, 0.0)))
-        np.testing.assert_allclose(twist, (speed, 0.0, 0.0), atol=1e-6)
+        pressed = with_force(observe(), (-force, 0.0))
+        follow(force_push_published, params, (pressed, (speed, 0.0, 0.0)), state=state)
     v = force_push_published.yield_to_force(params, jnp.array([0.03, 0.0]), jnp.array([0.0, 70.0]))
     np.testing.assert_allclose(v, (0.03, -0.03), atol=1e-6)
 
@@ -186,19 +176,17 @@ def test_the_published_force_push_yields_to_a_large_force():
 def test_the_published_force_push_turns_to_face_along_its_path():
     # It yields by 0.01 m/s of its 0.2, so that its angular velocity stays within the bound.
     params = PublishedForcePushParams(v_max=0.2, f_max=0.0, k_f=0.0005)
-    step = force_push_published.step
-    state, _, _ = step_once(force_push_published, params, with_force(observe()))
     turned = observe((0.36, 0.0), (2.36, 0.0), yaw=0.1)
-    _, twist, details = step(params, state, with_force(turned, (-20.0, 0.0)))
     # The force on the object has the base's heading, 0.1 rad; the contact has moved with it.
-    offset = 0.36 * math.sin(0.1)
-    angle = 1.3 * 0.1 + 0.5 * offset
-    assert float(details.gamma) == pytest.approx(angle, abs=1e-6)
+    angle = 1.3 * 0.1 + 0.5 * 0.36 * math.sin(0.1)
     forward, sideways = 0.2 * math.cos(angle - 0.1) - 0.01, 0.2 * math.sin(angle - 0.1)
-    np.testing.assert_allclose(twist, (forward, sideways + 0.1 * 0.36, -0.1), atol=1e-6)
-    # 10 cm past the target a new path leads back.
-    past = observe((0.36, 0.0), (0.26, 0.0))
-    state, _, _ = step(params, state, with_force(past))
+    state = follow(
+        force_push_published, params,
+        (with_force(observe()),),
+        (with_force(turned, (-20.0, 0.0)), (forward, sideways + 0.1 * 0.36, -0.1), angle),
+        # 10 cm past the target a new path leads back.
+        (with_force(observe((0.36, 0.0), (0.26, 0.0))),),
+    )  # fmt: skip
     assert abs(float(state.path.theta_d)) == pytest.approx(math.pi)
 
 
@@ -207,19 +195,18 @@ def step_rps(params, observation):
     return rps.step_with_details(params.law, RPSState.init(params.law), observation)
 
 
-@pytest.mark.parametrize(
-    ("target", "expected"),
-    [
-        ((0.46, 0.05), (0.03, 0.0)),  # 10 cm ahead: K_v d
-        ((0.36, 0.15), (0.2 * 0.03, 0.03)),  # sideways, pressing
-        ((0.26, 0.05), (0.2 * 0.03, 0.0)),  # straight back, where a skin cannot pull
-        ((0.36 + 0.06, 0.05 + 0.08), (0.018, 0.024)),  # to the left, 3-4-5
-    ],
-)
-def test_rps_plus_translates_near_its_target(target, expected):
+@pytest.mark.parametrize(("contact", "target", "expected"), [
+    ((0.36, 0.05), (0.46, 0.05), (0.03, 0.0, 0.0)),  # 10 cm ahead: K_v d
+    ((0.36, 0.05), (0.36, 0.15), (0.2 * 0.03, 0.03, 0.0)),  # sideways, pressing
+    ((0.36, 0.05), (0.26, 0.05), (0.2 * 0.03, 0.0, 0.0)),  # back, where a skin cannot pull
+    ((0.36, 0.05), (0.42, 0.13), (0.018, 0.024, 0.0)),  # to the left, 3-4-5
+    ((0.36, 0.28), (0.46, 0.28), (0.03, 0.0, 0.0)),  # even while it realigns
+])  # fmt: skip
+def test_rps_plus_translates_near_its_target(contact, target, expected):
     params = RPSPlusParams(RPSParams.tuned()._replace(K_v=0.3))
-    _, twist, _ = step_once(rps_plus, params, observe((0.36, 0.05), target))
-    np.testing.assert_allclose(twist, (*expected, 0.0), atol=1e-6)
+    _, twist, details = step_once(rps_plus, params, observe(contact, target))
+    np.testing.assert_allclose(twist, expected, atol=1e-6)
+    assert bool(details.realigning) == (contact[1] > 0.24)
 
 
 def test_rps_plus_equals_the_tuned_law_elsewhere():
@@ -238,17 +225,10 @@ def test_rps_plus_equals_the_tuned_law_elsewhere():
     same(step_once(rps_plus, never, near)[1], step_rps(params, near)[1])
 
 
-def test_rps_plus_translates_near_its_target_even_while_it_realigns():
-    params = RPSPlusParams(RPSParams.tuned()._replace(K_v=0.3))
-    _, twist, details = step_once(rps_plus, params, observe((0.36, 0.28), (0.46, 0.28)))
-    assert bool(details.realigning)
-    np.testing.assert_allclose(twist, (0.03, 0.0, 0.0), atol=1e-6)
-
-
 def test_rps_plus_searches_at_its_last_contact():
     """P3 with v_max = 0.05 m/s: ahead 0.035, sideways 0.025, and at most 0.15 rad/s."""
     params = RPSPlusParams(n_lost=3)
-    state, _, _ = step_once(rps_plus, params, observe((0.36, -0.2), (3.0, 0.0)))
+    state = follow(rps_plus, params, (observe((0.36, -0.2), (3.0, 0.0)),))
     np.testing.assert_allclose(state.p_world_contact, (0.36, -0.2), atol=1e-6)
     lost = observe(target=(3.0, 0.0), touching=False)
     for n in (1, 2, 3):
@@ -256,55 +236,49 @@ def test_rps_plus_searches_at_its_last_contact():
         state, twist, _ = rps_plus.step(params, state, lost)
         assert int(state.steps_lost) == n
         same(twist, expected)
-    # The bearing atan2(-0.2, 0.36), 0.41 m away, is off the front: it moves only to the right.
-    state, twist, _ = rps_plus.step(params, state, lost)
-    np.testing.assert_allclose(twist, (0.0, -0.025, 0.0), atol=1e-6)
-    # From 0.5 m behind, the bearing is -0.23 rad: ahead, to the right, and turning right.
     behind = observe(robot=(-0.5, 0.0), target=(3.0, 0.0), touching=False)
-    state, twist, _ = rps_plus.step(params, state, behind)
-    np.testing.assert_allclose(twist, (0.035, -0.025, -0.15), atol=1e-6)
-    # A new contact ends the search.
-    state, _, _ = rps_plus.step(params, state, observe((0.36, 0.0), (3.0, 0.0)))
+    state = follow(
+        rps_plus, params,
+        # The bearing atan2(-0.2, 0.36), 0.41 m away, is off the front: it moves only to the right.
+        (lost, (0.0, -0.025, 0.0)),
+        # From 0.5 m behind, the bearing is -0.23 rad: ahead, to the right, and turning right.
+        (behind, (0.035, -0.025, -0.15)),
+        (observe((0.36, 0.0), (3.0, 0.0)),),  # a new contact ends the search
+        state=state,
+    )  # fmt: skip
     assert int(state.steps_lost) == 0
 
 
 def test_rps_plus_does_not_search_before_its_first_contact():
     params = RPSPlusParams(n_lost=0)
-    state = rps_plus.init(params)
-    for _ in range(3):
-        state, twist, _ = rps_plus.step(params, state, observe(touching=False))
-    assert int(state.steps_lost) == 0
-    np.testing.assert_allclose(twist, (params.law.v_approach, 0.0, 0.0), atol=1e-7)
+    ahead = observe(touching=False), (params.law.v_approach, 0.0, 0.0)
+    assert int(follow(rps_plus, params, *3 * [ahead]).steps_lost) == 0
 
 
-@pytest.mark.parametrize(
-    ("robot", "yaw", "expected"),
-    [
-        ((0.0, 0.0), 0.0, (0.05, 0.0, 0.0)),  # behind the object: straight ahead
-        ((1.0, -1.0), math.pi / 2, (0.0, 0.05, 0.0)),  # beside it: to the robot's left
-        ((2.0, 0.0), math.pi, (-0.05, 0.0, 0.0)),  # in front of it: away from it, with the field
-        ((0.0, 0.0), 0.4, (0.05 * math.cos(0.4), -0.05 * math.sin(0.4), -0.15)),
-    ],
-)
+@pytest.mark.parametrize(("robot", "yaw", "expected"), [
+    ((0.0, 0.0), 0.0, (0.05, 0.0, 0.0)),  # behind the object: straight ahead
+    ((1.0, -1.0), math.pi / 2, (0.0, 0.05, 0.0)),  # beside it: to the robot's left
+    ((2.0, 0.0), math.pi, (-0.05, 0.0, 0.0)),  # in front of it: away from it, with the field
+    ((0.0, 0.0), 0.4, (0.05 * math.cos(0.4), -0.05 * math.sin(0.4), -0.15)),
+])  # fmt: skip
 def test_the_dipole_leads_around_the_object(robot, yaw, expected):
-    observation = with_pose(observe(target=(3.0, 0.0), robot=robot, yaw=yaw, touching=False))
-    _, twist, _ = step_once(dipole, DipoleParams(), observation)
-    np.testing.assert_allclose(twist, expected, atol=1e-6)
+    observation = observe(target=(3.0, 0.0), robot=robot, yaw=yaw, touching=False)
+    follow(dipole, DipoleParams(), (with_pose(observation), expected))
 
 
 def test_the_dipole_aims_along_its_path_and_plans_a_new_one_behind_the_target():
-    params = DipoleParams()
-    state, _, _ = step_once(dipole, params, with_pose(observe(target=(3.0, 0.0))))
-    np.testing.assert_allclose(state.p_world_start, (1.0, 0.0))
     # An object 1 m to the left of the path: the aim is 1 m ahead of its foot, 45 degrees to the
     # right. The robot behind it on this line drives along it.
     off_path = with_pose(observe(target=(3.0, 0.0), robot=(0.5, 1.5), yaw=-math.pi / 4), (1.0, 1.0))
-    state, twist, _ = dipole.step(params, state, off_path)
-    np.testing.assert_allclose(twist, (0.05, 0.0, 0.0), atol=1e-6)
-    np.testing.assert_allclose(state.p_world_start, (1.0, 0.0))
-    for x, start in ((3.39, 1.0), (3.41, 3.41)):  # two radii of 0.2 m past the target
-        state, _, _ = dipole.step(params, state, with_pose(observe(target=(3.0, 0.0)), (x, 0.0)))
-        assert float(state.p_world_start[0]) == pytest.approx(start)
+    params, state = DipoleParams(), None
+    for observation, twist, start in (
+        (with_pose(observe(target=(3.0, 0.0))), None, 1.0),
+        (off_path, (0.05, 0.0, 0.0), 1.0),
+        (with_pose(observe(target=(3.0, 0.0)), (3.39, 0.0)), None, 1.0),
+        (with_pose(observe(target=(3.0, 0.0)), (3.41, 0.0)), None, 3.41),  # two radii past it
+    ):
+        state = follow(dipole, params, (observation, twist), state=state)
+        np.testing.assert_allclose(state.p_world_start, (start, 0.0), atol=1e-6)
 
 
 def with_taxels(observation):
@@ -335,17 +309,14 @@ def test_a_law_is_symmetric_and_does_not_depend_on_the_frame(name):
         contact, robot, target, p_object = rng.uniform(-1, 1, (4, 2))
         contact = np.array([0.36, 0.3 * contact[1]])
         yaw, turn = rng.uniform(-3, 3, 2)
-        plain = twist_of(name, observe(contact, 2 * target, robot, yaw), p_object)
-        mirror = observe(contact * flip, 2 * target * flip, robot * flip, -yaw)
-        mirrored = twist_of(name, mirror, p_object * flip, (-20.0, -5.0))
+        touch = observe(contact, 2 * target, robot, yaw)
+        plain = twist_of(name, touch, p_object)
+        mirrored = twist_of(name, moved(touch, mirror=True), p_object * flip, (-20.0, -5.0))
         np.testing.assert_allclose(mirrored, plain * [1, -1, -1], atol=1e-5)
-        c, s = math.cos(turn), math.sin(turn)
-
-        def moved(point, c=c, s=s):
-            return np.array([[c, -s], [s, c]]) @ point + [0.3, -0.7]
-
-        elsewhere = observe(contact, moved(2 * target), moved(robot), yaw + turn)
-        np.testing.assert_allclose(twist_of(name, elsewhere, moved(p_object)), plain, atol=1e-5)
+        shift = jnp.array([0.3, -0.7])
+        p_object = planar.rotate(jnp.asarray(turn), jnp.asarray(p_object)) + shift
+        elsewhere = twist_of(name, moved(touch, turn, shift), p_object)
+        np.testing.assert_allclose(elsewhere, plain, atol=1e-5)
 
 
 @pytest.mark.parametrize("name", RIVALS)

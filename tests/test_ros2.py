@@ -6,6 +6,7 @@ import runpy
 import shutil
 import subprocess
 import xml.etree.ElementTree as ET
+from functools import partial
 
 import numpy as np
 import pytest
@@ -64,32 +65,31 @@ def python():
     return PYTHON["Controller"]()
 
 
-@pytest.fixture(params=["c++", "python"])
+def driven_in_python(controller, events):
+    controller.reset()
+    commands = []
+    for topic, *values in events:
+        if topic == "skin":
+            controller.skin(values[0], values[1:])
+        elif (command := getattr(controller, topic)(*values)) is not None:
+            commands.append(command)
+    return np.array([command[:3] for command in commands]), [c.status for c in commands]
+
+
+def driven_in_cpp(binary, events):
+    text = "".join(f"{topic} {' '.join(map(repr, map(float, x)))}\n" for topic, *x in events)
+    done = subprocess.run([str(binary)], input=text, capture_output=True, text=True, check=True)
+    rows = [line.split(" ", 3) for line in done.stdout.splitlines()]
+    return np.array([row[:3] for row in rows], float), [row[3] for row in rows]
+
+
+DRIVEN = {"binary": driven_in_cpp, "python": driven_in_python}
+
+
+@pytest.fixture(params=DRIVEN)
 def driven(request):
     """Function from events to the commands (n, 3) and statuses of a controller, one per tick."""
-    if request.param == "c++":
-        request.getfixturevalue("binary")
-
-    def in_python(events):
-        controller, commands = request.getfixturevalue("python"), []
-        controller.reset()
-        for topic, *values in events:
-            if topic == "skin":
-                controller.skin(values[0], values[1:])
-            elif (command := getattr(controller, topic)(*values)) is not None:
-                commands.append(command)
-        return np.array([command[:3] for command in commands]), [
-            command.status for command in commands
-        ]
-
-    def in_cpp(events):
-        text = "".join(f"{topic} {' '.join(map(repr, map(float, x)))}\n" for topic, *x in events)
-        run = [str(request.getfixturevalue("binary"))]
-        output = subprocess.run(run, input=text, capture_output=True, text=True, check=True).stdout
-        rows = [line.split(" ", 3) for line in output.splitlines()]
-        return np.array([row[:3] for row in rows], float), [row[3] for row in rows]
-
-    return in_cpp if request.param == "c++" else in_python
+    return partial(DRIVEN[request.param], request.getfixturevalue(request.param))
 
 
 def events(seconds=2.0, silent="", since=1.0, odd=None, taxels=FELT):
@@ -151,7 +151,7 @@ def test_a_stopped_clock_commands_zero(driven):
     assert not twists[-1].any()
 
 
-def test_cpp_and_python_agree_on_a_recorded_bag(binary, tmp_path, request, python):
+def test_cpp_and_python_agree_on_a_recorded_bag(binary, tmp_path, python):
     pytest.importorskip("mcap_ros2")
     path = tmp_path / "push.mcap"
     setting = rps_jax.Setting("quasistatic", rules=rps_jax.Rules(horizon=10.0))
@@ -161,18 +161,9 @@ def test_cpp_and_python_agree_on_a_recorded_bag(binary, tmp_path, request, pytho
     for i, time in enumerate(read["time"]):
         messages += [("odometry", time, *read["pose"][i]), ("target", time, *read["target"][i])]
         messages += [("skin", time, *read["signal"][i]), ("tick", time)]
-    text = "".join(f"{topic} {' '.join(map(repr, map(float, x)))}\n" for topic, *x in messages)
-    done = subprocess.run([str(binary)], input=text, capture_output=True, text=True, check=True)
-    cpp = np.array([line.split(" ")[:3] for line in done.stdout.splitlines()], float)
-    python.reset()
-    python_twists = []
-    for topic, time, *values in messages:
-        if topic == "skin":
-            python.skin(time, values)
-        elif (command := getattr(python, topic)(time, *values)) is not None:
-            python_twists.append(command[:3])
-    difference = np.abs(cpp - np.array(python_twists)).max(-1)
-    assert np.mean(difference > 1e-5) < 0.01
+    cpp, _ = driven_in_cpp(binary, messages)
+    python_twists, _ = driven_in_python(python, messages)
+    assert np.mean(np.abs(cpp - python_twists).max(-1) > 1e-5) < 0.01
     # The bag's law felt contact at once, and these through foam, a filter and bounds.
     near = np.abs(cpp - read["twist"])[:, :2].max(-1)
     assert np.mean(near < 0.02) > 0.8
@@ -182,31 +173,27 @@ def test_cpp_and_python_agree_on_a_recorded_bag(binary, tmp_path, request, pytho
 
 
 def test_the_nodes_name_the_same_topics_and_parameters():
-    cpp, python = (FOLDER / "src/push_node.cpp").read_text(), FOLDER / "scripts/push_node.py"
-    text = python.read_text()
-    ast.parse(text)
+    cpp, python, config, cmake = (
+        (FOLDER / path).read_text()
+        for path in ("src/push_node.cpp", "scripts/push_node.py", "config/push.yaml",
+                     "CMakeLists.txt")
+    )  # fmt: skip
+    ast.parse(python)
     for topic in ("odom", "taxels", "target", "cmd_vel"):
         assert f'"{topic}"' in cpp
-        assert f'"{topic}"' in text
+        assert f'"{topic}"' in python
+    limits = vars(PYTHON["Limits"]())
     ranges = dict(re.findall(r'number\("(\w+)", "[^"]*", ([\d., ]+)\)', cpp))
-    declared = runpy_parameters(text)
+    declared = runpy_parameters(python)
     for name, (about, smallest, largest) in declared.items():
-        default = getattr(PYTHON["Limits"](), name)
-        assert ranges[name].split(", ") == [str(x) for x in (default, smallest, largest)]
+        assert ranges[name].split(", ") == [str(x) for x in (limits[name], smallest, largest)]
         assert about in cpp
-    defaults = dict(
-        re.findall(r"^    (\w+): ([\d.]+)", (FOLDER / "config/push.yaml").read_text(), re.M)
-    )
-    assert {name: float(x) for name, x in defaults.items()} == vars(PYTHON["Limits"]())
+    defaults = dict(re.findall(r"^    (\w+): ([\d.]+)", config, re.M))
+    assert {name: float(x) for name, x in defaults.items()} == limits
     assert set(declared) == set(defaults)
-    package = ET.parse(FOLDER / "package.xml").getroot()
-    needed = {package_name.text for package_name in package.findall("depend")}
-    required = re.findall(
-        r"find_package\((\w+) REQUIRED\)", (FOLDER / "CMakeLists.txt").read_text()
-    )
-    assert needed == {
-        package_name for package_name in required if not package_name.startswith("ament")
-    }
+    needed = {tag.text for tag in ET.parse(FOLDER / "package.xml").getroot().findall("depend")}
+    required = re.findall(r"find_package\((\w+) REQUIRED\)", cmake)
+    assert needed == {name for name in required if not name.startswith("ament")}
 
 
 def runpy_parameters(text):

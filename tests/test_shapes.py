@@ -28,22 +28,23 @@ def chain(error):
     return [str(error), *(chain(error.__context__) if error.__context__ else [])]
 
 
-@pytest.mark.parametrize(
-    ("change", "field"),
-    [
-        ({"p_world_robot": jnp.zeros(3)}, "p_world_robot"),
-        ({"yaw": jnp.zeros(1)}, "yaw"),
-        ({"p_robot_contact": jnp.zeros((1, 2))}, "p_robot_contact"),
-        ({"in_contact": jnp.zeros((), int)}, "in_contact"),
-        ({"p_world_target": np.zeros(2, int)}, "p_world_target"),
-        ({"period": jnp.zeros(2)}, "period"),
-    ],
-)
-def test_a_law_refuses_observations_of_another_shape_or_type(change, field):
+# Fields of an observation with values of another shape or type.
+WRONG = {
+    "p_world_robot": jnp.zeros(3),
+    "yaw": jnp.zeros(1),
+    "p_robot_contact": jnp.zeros((1, 2)),
+    "in_contact": jnp.zeros((), int),
+    "p_world_target": np.zeros(2, int),
+    "period": jnp.zeros(2),
+}
+
+
+@pytest.mark.parametrize("field", WRONG)
+def test_a_law_refuses_observations_of_another_shape_or_type(field):
     state = RPSState.init(PAPER)
     rps.step(PAPER, state, OBSERVATION)
     with pytest.raises(TypeCheckError, match="typechecking parameter 'obs'") as caught:
-        rps.step(PAPER, state, OBSERVATION._replace(**change))
+        rps.step(PAPER, state, OBSERVATION._replace(**{field: WRONG[field]}))
     assert f"Observation.{field} is " in " ".join(chain(caught.value))
 
 
@@ -55,19 +56,19 @@ def test_a_law_sees_batched_worlds_as_single_worlds():
         rps.displacement(batch)
 
 
-@pytest.mark.parametrize(
-    "call",
-    [
-        lambda: planar.rotate(jnp.zeros(2), jnp.zeros((3, 2))),
-        lambda: planar.direction(jnp.zeros(3)),
-        lambda: planar.greatest(jnp.zeros((2, 2))),
-        lambda: fp.place(fp.circle(0.1), jnp.zeros(3), jnp.zeros(())),
-        lambda: fp.extent(fp.Footprint(jnp.zeros((4, 3)), jnp.zeros(())), jnp.zeros(2)),
-        lambda: rps.saturate(PAPER, Twist(jnp.zeros(2), jnp.zeros(3), jnp.zeros(2))),
-        lambda: trial.object_pose(jnp.zeros(9)),
-        lambda: IdealSkin().sense(TWO_OF_THREE, fp.circle(0.1), 0.02),
-    ],
-)
+CALLS = [
+    lambda: planar.rotate(jnp.zeros(2), jnp.zeros((3, 2))),
+    lambda: planar.direction(jnp.zeros(3)),
+    lambda: planar.greatest(jnp.zeros((2, 2))),
+    lambda: fp.place(fp.circle(0.1), jnp.zeros(3), jnp.zeros(())),
+    lambda: fp.extent(fp.Footprint(jnp.zeros((4, 3)), jnp.zeros(())), jnp.zeros(2)),
+    lambda: rps.saturate(PAPER, Twist(jnp.zeros(2), jnp.zeros(3), jnp.zeros(2))),
+    lambda: trial.object_pose(jnp.zeros(9)),
+    lambda: IdealSkin().sense(TWO_OF_THREE, fp.circle(0.1), 0.02),
+]
+
+
+@pytest.mark.parametrize("call", CALLS)
 def test_functions_refuse_arrays_that_do_not_go_together(call):
     with pytest.raises(TypeCheckError, match="whilst checking the parameters"):
         call()

@@ -26,19 +26,19 @@ def test_every_study_and_notebook_is_in_one_tab():
     assert set(texts) <= known
 
 
-@pytest.mark.parametrize(
-    ("link", "page", "expected"),
-    [
-        ("sweeps/table/README.md", "README.md", "sweeps/table/README.md"),
-        ("engines/mjx.py", "rps_jax/README.md", "../reference/engines.md#rps_jax.engines.mjx"),
-        ("push/page.html", "docs/gallery.md", "../push.html"),
-        ("rps_jax/record", "README.md", "reference/record.md"),
-        ("notebooks/03_paper.ipynb", "README.md", "notebooks/03_paper.md"),
-        ("../notebooks/03_paper.py", "rps_jax/README.md", "../notebooks/03_paper.md"),
-        ("../study_base.py", "sweeps/table/README.md", "../study_base.py.md"),
-        ("results/table.json", "sweeps/table/README.md", "results/table.json"),
-    ],
-)  # fmt: skip
+LINKS = [
+    ("sweeps/table/README.md", "README.md", "sweeps/table/README.md"),
+    ("engines/mjx.py", "rps_jax/README.md", "../reference/engines.md#rps_jax.engines.mjx"),
+    ("push/page.html", "docs/gallery.md", "../push.html"),
+    ("rps_jax/record", "README.md", "reference/record.md"),
+    ("notebooks/03_paper.ipynb", "README.md", "notebooks/03_paper.md"),
+    ("../notebooks/03_paper.py", "rps_jax/README.md", "../notebooks/03_paper.md"),
+    ("../study_base.py", "sweeps/table/README.md", "../study_base.py.md"),
+    ("results/table.json", "sweeps/table/README.md", "results/table.json"),
+]
+
+
+@pytest.mark.parametrize(("link", "page", "expected"), LINKS)
 def test_a_link_of_the_repository_works_in_the_site(link, page, expected):
     assert HOOKS["site_link"](link, page, Files) == expected
 
@@ -69,9 +69,8 @@ def test_dead_links_and_loads_from_other_hosts_are_reported(tmp_path):
     (tmp_path / "a" / "c.png").write_bytes(b"")
     (tmp_path / "b.html").write_text("<p>b</p>")
     assert HOOKS["faults"](tmp_path) == []
-    (tmp_path / "b.html").write_text(
-        '<a href="gone.html">x</a> <script src="https://example.org/x.js"></script>'
-    )
+    bad = '<a href="gone.html">x</a> <script src="https://example.org/x.js"></script>'
+    (tmp_path / "b.html").write_text(bad)
     (tmp_path / "x.css").write_text("a { background: url(//example.org/y.png) }")
     assert HOOKS["faults"](tmp_path) == [
         "b.html loads https://example.org/x.js from another host",

@@ -75,20 +75,13 @@ def test_a_study_resumes_and_repeats_only_corrupt_parts(folder, monkeypatch):
     stored, rest = dict(parts.items()), parts.paths()
     thin = rest.pop("thin")
     thin.write_bytes(b"torn")
-    ran = []
-    run = pushes.run
-
-    def counted(cases, *args, **options):
-        ran.extend(cases)
-        return run(cases, *args, **options)
-
+    ran, run = [], pushes.run
+    counted = lambda cases, *args, **how: ran.extend(cases) or run(cases, *args, **how)  # noqa: E731
     monkeypatch.setattr(pushes, "run", counted)
     conditions.run_conditions(CONDITIONS, GRID, folder)
     assert ran == CONDITIONS["thin"].cases(GRID)
-    again = [
-        files.decode_results(content["thin"], "thin") for content in (stored, dict(parts.items()))
-    ]
-    xr.testing.assert_identical(*(results.drop_attrs() for results in again))
+    decode = lambda content: files.decode_results(content["thin"], "thin").drop_attrs()  # noqa: E731
+    xr.testing.assert_identical(decode(stored), decode(dict(parts.items())))
     assert rest.items() <= parts.paths().items()
 
 
@@ -161,23 +154,20 @@ def test_a_setup_has_one_robot_and_a_friction_for_each_object():
     assert (mu[:, 0, 0] != mu[:, 1, 0]).all()
     assert (np.ptp(u[..., columns.index("yaw")], axis=2) > 0).all()
     cases = question.plan.points.cases(question.ranges, np.arange(64))
-    np.testing.assert_array_equal(
-        question.ranges.object_of(cases), np.tile(np.repeat([0, 1], 8), 4)
-    )
+    object_indices = np.tile(np.repeat([0, 1], 8), 4)
+    np.testing.assert_array_equal(question.ranges.object_of(cases), object_indices)
     np.testing.assert_array_equal(cases % 8, np.tile(np.arange(8), 8))
 
 
 def test_the_nearest_setups_reproduce_all_of_the_papers_numbers():
     reference = [paper.HARDWARE_RESULTS[name] for name in paper.HARDWARE_OBJECTS]
     off = np.arange(101.0)
+    by_object, setup = ("setup", "object"), np.ones((101, 1))
     setups = xr.Dataset(
         {
-            "D": (
-                ("setup", "object"),
-                [[t.mean_abs_l + 0.001 * i for t in reference] for i in off],
-            ),
-            "time": (("setup", "object"), [[t.time for t in reference]] * 101),
-            "success": (("setup", "object"), np.full((101, 2), 8)),
+            "D": (by_object, [t.mean_abs_l for t in reference] + 0.001 * off[:, None]),
+            "time": (by_object, [t.time for t in reference] * setup),
+            "success": (by_object, np.full((101, 2), 8)),
             "off": ("setup", off),
             "drawn": (("setup", "quantity"), off[:, None]),
         },
@@ -208,18 +198,10 @@ def test_every_condition_is_a_study_that_could_run():
 
 
 def test_the_cells_of_table_ii_are_judged_by_their_intervals():
-    shape = (1, 3, 3, 2, 24)
-    success = np.ones(shape, np.int8)
-    success[:, 1:] = 0
-    results = xr.Dataset(
-        {"success": (("condition", *DIMS), success)},
-        coords={
-            "condition": ["paper_gazebo"],
-            "law": list(paper.LAWS),
-            "object": list(PAPER_OBJECTS),
-            "friction": ["S1", "S2"],
-        },
-    )
+    success = np.repeat([[1], [0], [0]], 3 * 2 * 24, axis=1).reshape(1, 3, 3, 2, 24)
+    labels = {"condition": ["paper_gazebo"], "law": list(paper.LAWS), "friction": ["S1", "S2"],
+              "object": list(PAPER_OBJECTS)}  # fmt: skip
+    results = xr.Dataset({"success": (("condition", *DIMS), success)}, labels)
     rows = {row[0]: row for row in readings.cells(results)[1:]}
     # Of 24: the paper's 24 gives 20.7-24, its 19 14.3-21.8, its 0 0-3.3, its 2 0.6-6.2.
     assert rows["RPS box S2"][3:5] == ["20.7-24.0", "yes"]
@@ -236,13 +218,10 @@ def test_the_tolerance_curve_sums_each_behaviour_and_tolerance():
     shape = (6, 1, 3, 2, 24)
     success = np.zeros(shape, np.int8)
     success[names.index("drive_6mm"), 0, 1] = 1
-    results = xr.Dataset(
-        {
-            "success": (("condition", *DIMS), success),
-            "contact_lost_time": (("condition", *DIMS), np.full(shape, 2.0)),
-        },
-        coords={"condition": names, "law": ["rps"], "object": list(PAPER_OBJECTS)},
-    )
+    dims = ("condition", *DIMS)
+    outcomes = {"success": (dims, success), "contact_lost_time": (dims, np.full(shape, 2.0))}
+    labels = {"condition": names, "law": ["rps"], "object": list(PAPER_OBJECTS)}
+    results = xr.Dataset(outcomes, labels)
     curve = readings.by_tolerance(results, (1, 6))
     assert curve.won.sum() == 48
     assert curve.won.sel({"loss": "drive", "tolerance": 6, "object": "cylinder"}) == 48

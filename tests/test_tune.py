@@ -5,7 +5,7 @@ import json
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import read_curve, refusal
+from helpers import PAPER, read_curve, refusal
 from helpers import rps as command
 
 from rps_jax.control.laws import rps
@@ -27,108 +27,85 @@ FULL = Space(SUBSETS["full"])
 RULES = Rules(horizon=300.0, max_lost=150.0)
 
 
-class TestSpace:
-    vectors = np.random.default_rng(0).uniform(-6, 6, (500, len(BOUNDS)))
-
-    def test_every_vector_is_parameters_within_their_bounds(self):
-        params = FULL.params(jnp.asarray(self.vectors))
-        for name, bound in BOUNDS.items():
-            value = np.asarray(getattr(params, name))
-            if bound.relative_to:
-                value = value / np.asarray(getattr(params, bound.relative_to))
-            assert (value >= bound.low - 1e-5 * abs(bound.low)).all()
-            assert (value <= bound.high * (1 + 1e-5)).all()
-
-    def test_there_and_back(self):
-        vectors = self.vectors / 2
-        np.testing.assert_allclose(FULL.vector(FULL.params(vectors)), vectors, atol=2e-3)
-
-    def test_the_written_file_has_the_whole_law(self):
-        """Fixed parameters are written if they differ from the preset."""
-        paper, tuned = RPSParams.paper(), RPSParams.tuned()
-        narrow = Space(("l_cr",))
-        low = narrow.params(narrow.vector(paper._replace(l_cr=0.12)))
-        written = narrow.changed_values(narrow.vector(low))
-        assert written == pytest.approx({"l_cr": 0.12, "l_mr": 0.12})
-        rps.check(paper._replace(**written))
-        second = Space(("eta",), tuned)
-        again = paper._replace(**second.changed_values(second.vector(tuned)))
-        np.testing.assert_allclose(again, tuned, rtol=1e-5)
-        assert set(narrow.changed_values(narrow.vector(paper))) == {"l_cr"}
-
-    def test_the_papers_parameters_come_back(self):
-        paper = RPSParams.paper()
-        back = FULL.params(FULL.vector(paper))
-        for name, value in paper._asdict().items():
-            np.testing.assert_allclose(getattr(back, name), value, rtol=1e-5, atol=1e-6)
-
-    def test_values_worked_out_by_hand(self):
-        # eta, between 1 and 100 in its logarithm: 10 lies in the middle, logit(1/2) = 0.
-        # beta, between 0.01 and 0.3: logit(0.11 / 0.29) = log(0.11 / 0.18).
-        vector = Space(("eta", "beta")).vector(RPSParams.paper())
-        np.testing.assert_allclose(vector, [0.0, np.log(0.11 / 0.18)], atol=1e-6)
-
-    def test_parameters_that_are_not_tuned_stay(self):
-        params = Space(("L",)).params(jnp.array([1.7]))
-        paper = RPSParams.paper()
-        assert all(
-            float(value) == pytest.approx(float(getattr(paper, name)))
-            for name, value in params._asdict().items()
-            if name != "L"
-        )
-
-    def test_the_middle_region_never_reaches_beyond_the_critical_one(self):
-        params = Space(("l_cr",)).params(jnp.array([[-8.0], [8.0]]))
-        assert (params.l_mr <= params.l_cr).all()
-
-    @pytest.mark.parametrize("names", [(), ("L", "L"), ("mass",), ("v_max",)])
-    def test_names_are_checked(self, names):
-        with pytest.raises(InputError):
-            Space(names)
-
-    def test_a_base_on_a_bound_is_refused(self):
-        with pytest.raises(InputError, match="gamma_max"):
-            Space(("gamma_max",), RPSParams(gamma_max=np.inf))
+VECTORS = np.random.default_rng(0).uniform(-6, 6, (500, len(BOUNDS)))
 
 
-class TestObjective:
-    def test_values_worked_out_by_hand(self):
-        o = Objective(time=0.3, lost=0.1, miss=0.5)
-        # A success after 60 of 300 s, 15 of 150 s without contact: 0.3 / 5 + 0.1 / 10.
-        assert float(o.score(1.0, 60.0, 15.0, 0.04, RULES)) == pytest.approx(0.07)
-        # A failure at the horizon, 20 cm off: 0.3 + 1 + 0.5 * 0.2.
-        assert float(o.score(0.0, 300.0, 0.0, 0.2, RULES)) == pytest.approx(1.4)
+def test_every_vector_is_parameters_within_their_bounds():
+    params = FULL.params(jnp.asarray(VECTORS))
+    for name, bound in BOUNDS.items():
+        value = np.asarray(getattr(params, name))
+        if bound.relative_to:
+            value = value / np.asarray(getattr(params, bound.relative_to))
+        assert (value >= bound.low - 1e-5 * abs(bound.low)).all()
+        assert (value <= bound.high * (1 + 1e-5)).all()
 
-    def test_a_failure_is_never_better_than_a_success(self):
-        o = Objective()
-        slowest = o.score(1.0, 300.0, 150.0, 0.05, RULES)
-        assert float(slowest) < float(o.score(0.0, 0.0, 0.0, 0.0, RULES))
 
-    def test_sooner_and_nearer_is_better(self):
-        time, missed = np.meshgrid(np.linspace(0, 300, 20), np.linspace(0, 0.9, 20))
-        scores = Objective().score(0.0, time, 0.0, missed, RULES)
-        assert (np.diff(scores, axis=0) > 0).all()
-        assert (np.diff(scores, axis=1) > 0).all()
+def test_vectors_and_the_papers_parameters_go_there_and_back():
+    vectors = VECTORS / 2
+    np.testing.assert_allclose(FULL.vector(FULL.params(vectors)), vectors, atol=2e-3)
+    back = FULL.params(FULL.vector(PAPER))
+    np.testing.assert_allclose(back, PAPER, rtol=1e-5, atol=1e-6)
 
-    def test_risk(self):
-        scores = jnp.arange(20.0)
-        assert float(Objective().value(scores)) == pytest.approx(9.5)
-        assert float(Objective(risk="cvar", tail=0.1).value(scores)) == pytest.approx(18.5)
 
-    def test_a_trial_without_contact_missed_by_the_whole_way(self):
-        never, near = np.array([np.inf]), np.array([0.2])
-        zero = np.zeros(1)
-        outcome = Outcome(zero, zero, never, *[zero] * 9)
-        for least, missed in ((never, 0.5), (near, 0.2)):
-            result = Objective().scores(
-                outcome._replace(min_distance=least), np.full(1, 0.5), RULES
-            )
-            assert result == pytest.approx(1 + 0.5 * missed)
+def test_the_written_file_has_the_whole_law():
+    """Fixed parameters are written if they differ from the preset."""
+    narrow, tuned = Space(("l_cr",)), RPSParams.tuned()
+    low = narrow.params(narrow.vector(PAPER._replace(l_cr=0.12)))
+    written = narrow.changed_values(narrow.vector(low))
+    assert written == pytest.approx({"l_cr": 0.12, "l_mr": 0.12})
+    rps.check(PAPER._replace(**written))
+    second = Space(("eta",), tuned)
+    again = PAPER._replace(**second.changed_values(second.vector(tuned)))
+    np.testing.assert_allclose(again, tuned, rtol=1e-5)
+    assert set(narrow.changed_values(narrow.vector(PAPER))) == {"l_cr"}
 
-    def test_bad_weights_are_refused(self):
-        for bad in ({"risk": "worst"}, {"time": -1.0}, {"tail": 0.0}, {"miss": np.nan}):
-            with pytest.raises(InputError):
-                Objective(**bad)
+
+def test_a_vector_worked_out_by_hand():
+    # eta, between 1 and 100 in its logarithm: 10 lies in the middle, logit(1/2) = 0.
+    # beta, between 0.01 and 0.3: logit(0.11 / 0.29) = log(0.11 / 0.18).
+    vector = Space(("eta", "beta")).vector(PAPER)
+    np.testing.assert_allclose(vector, [0.0, np.log(0.11 / 0.18)], atol=1e-6)
+
+
+def test_parameters_that_are_not_tuned_stay():
+    params = Space(("L",)).params(jnp.array([1.7]))
+    np.testing.assert_allclose(params._replace(L=PAPER.L), PAPER, rtol=1e-6)
+    assert params.L != PAPER.L
+
+
+def test_scores_worked_out_by_hand():
+    o = Objective(time=0.3, lost=0.1, miss=0.5)
+    # A success after 60 of 300 s, 15 of 150 s without contact: 0.3 / 5 + 0.1 / 10.
+    assert float(o.score(1.0, 60.0, 15.0, 0.04, RULES)) == pytest.approx(0.07)
+    # A failure at the horizon, 20 cm off: 0.3 + 1 + 0.5 * 0.2.
+    assert float(o.score(0.0, 300.0, 0.0, 0.2, RULES)) == pytest.approx(1.4)
+
+
+def test_a_failure_is_never_better_than_a_success():
+    o = Objective()
+    slowest = o.score(1.0, 300.0, 150.0, 0.05, RULES)
+    assert float(slowest) < float(o.score(0.0, 0.0, 0.0, 0.0, RULES))
+
+
+def test_sooner_and_nearer_is_better():
+    time, missed = np.meshgrid(np.linspace(0, 300, 20), np.linspace(0, 0.9, 20))
+    scores = Objective().score(0.0, time, 0.0, missed, RULES)
+    assert (np.diff(scores, axis=0) > 0).all()
+    assert (np.diff(scores, axis=1) > 0).all()
+
+
+def test_risk():
+    scores = jnp.arange(20.0)
+    assert float(Objective().value(scores)) == pytest.approx(9.5)
+    assert float(Objective(risk="cvar", tail=0.1).value(scores)) == pytest.approx(18.5)
+
+
+def test_a_trial_without_contact_missed_by_the_whole_way():
+    zero = np.zeros(1)
+    for least, missed in ((np.inf, 0.5), (0.2, 0.2)):
+        outcome = Outcome(zero, zero, np.full(1, least), *[zero] * 9)
+        result = Objective().scores(outcome, np.full(1, 0.5), RULES)
+        assert result == pytest.approx(1 + 0.5 * missed)
 
 
 def sphere(x):
@@ -144,6 +121,9 @@ def rosenbrock(x):
     return np.sum(100 * (b - a**2) ** 2 + (1 - a) ** 2, axis=-1)
 
 
+MINIMISED = {sphere: 60, ellipsoid: 120, rosenbrock: 400}  # generations of a search
+
+
 def search(size=4, **options):
     """Return an evolution about the paper's parameters, and its first proposal."""
     question = TuneES("rps", tuned=SUBSETS["full"][:size], **options)
@@ -151,57 +131,54 @@ def search(size=4, **options):
     return question, first, next(first)
 
 
-class TestEvolution:
-    def minimise(self, function, generations, bad=0, **options):
-        """Return the least value of every generation; the first `bad` candidates have none."""
-        (_, first, proposal), result = search(**options), []
-        for _ in range(generations):
-            values = function(proposal["vectors"])
-            values[:bad] = np.nan
-            proposal = first.send(proposal | {"values": values})
-            result.append(np.nanmin(values))
-        return np.array(result)
+def minimise(function, generations, bad=0, **options):
+    """Return the least value of every generation; the first `bad` candidates have none."""
+    (_, first, proposal), result = search(**options), []
+    for _ in range(generations):
+        values = function(proposal["vectors"])
+        values[:bad] = np.nan
+        proposal = first.send(proposal | {"values": values})
+        result.append(np.nanmin(values))
+    return np.array(result)
 
-    @pytest.mark.parametrize(
-        ("function", "generations"), [(sphere, 60), (ellipsoid, 120), (rosenbrock, 400)]
-    )
-    def test_it_finds_a_minimum(self, function, generations):
-        assert self.minimise(function, generations, population=16)[-1] < 1e-2
 
-    def test_a_value_that_is_not_a_number_ranks_worst(self):
-        assert self.minimise(sphere, 60, bad=2, population=16)[-1] < 1e-3
+@pytest.mark.parametrize("function", MINIMISED)
+def test_it_finds_a_minimum(function):
+    assert minimise(function, MINIMISED[function], population=16)[-1] < 1e-2
 
-    def test_a_search_continues_after_a_generation_without_finite_values(self):
-        assert np.isfinite(self.minimise(sphere, 3, bad=7, population=8)).all()
-        _, first, proposal = search(population=8)
-        assert np.isfinite(first.send(proposal | {"values": np.full(8, np.nan)})["vectors"]).all()
 
-    def test_the_seed_makes_the_proposals(self):
-        first, same, second = (
-            search(population=8, setting=Setting(seed=seed))[2]["vectors"] for seed in (0, 0, 1)
-        )
-        np.testing.assert_array_equal(first, same)
-        assert (first != second).all()
+def test_a_value_that_is_not_a_number_ranks_worst():
+    assert minimise(sphere, 60, bad=2, population=16)[-1] < 1e-3
 
-    def test_the_first_generation_spreads_about_the_start(self):
-        question, _, proposal = search(population=4000, spread=0.3)
-        away = proposal["vectors"] - question.base
-        np.testing.assert_allclose(away.std(axis=0), 0.3, rtol=0.05)
-        np.testing.assert_allclose(away.mean(axis=0), 0.0, atol=0.02)
 
-    def test_bad_options_are_refused(self):
-        for bad in ({"population": 3}, {"spread": 0.0}, {"generations": 0}, {"prior": -1.0}):
-            (name,) = bad
-            with pytest.raises(InputError, match=name):
-                TuneES("rps", **bad).validate()
+def test_a_search_continues_after_a_generation_without_finite_values():
+    assert np.isfinite(minimise(sphere, 3, bad=7, population=8)).all()
+    _, first, proposal = search(population=8)
+    assert np.isfinite(first.send(proposal | {"values": np.full(8, np.nan)})["vectors"]).all()
 
-    def test_quick_tunes_few_parameters_of_rps_and_all_of_other_laws(self):
-        quick = TuneES("rps", quick=True).with_quick_values()
-        assert quick.tuned == ("K_h", "K_v", "l_cr", "d_th")
-        assert TuneES("pursuit", quick=True).with_quick_values().tuned == ("full",)
 
-    def test_one_parameter_is_enough(self):
-        assert np.isfinite(search(1)[2]["vectors"]).all()
+def test_the_seed_makes_the_proposals():
+    settings = (Setting(seed=seed) for seed in (0, 0, 1))
+    first, same, second = (search(population=8, setting=x)[2]["vectors"] for x in settings)
+    np.testing.assert_array_equal(first, same)
+    assert (first != second).all()
+
+
+def test_the_first_generation_spreads_about_the_start():
+    question, _, proposal = search(population=4000, spread=0.3)
+    away = proposal["vectors"] - question.base
+    np.testing.assert_allclose(away.std(axis=0), 0.3, rtol=0.05)
+    np.testing.assert_allclose(away.mean(axis=0), 0.0, atol=0.02)
+
+
+def test_quick_tunes_few_parameters_of_rps_and_all_of_other_laws():
+    quick = TuneES("rps", quick=True).with_quick_values()
+    assert quick.tuned == ("K_h", "K_v", "l_cr", "d_th")
+    assert TuneES("pursuit", quick=True).with_quick_values().tuned == ("full",)
+
+
+def test_one_parameter_is_enough():
+    assert np.isfinite(search(1)[2]["vectors"]).all()
 
 
 # --- runs ----------------------------------------------------------------------------------
@@ -239,103 +216,102 @@ def pretended(monkeypatch):
     """Arguments of the calls that run worlds, which return a formula instead."""
     calls = []
 
-    def score_candidates(*args, **kwargs):
-        calls.append(args)
-        return pretend(*args, **kwargs)
-
-    monkeypatch.setattr(evaluate, "score_candidates", score_candidates)
+    score = lambda *args, **how: calls.append(args) or pretend(*args, **how)  # noqa: E731
+    monkeypatch.setattr(evaluate, "score_candidates", score)
     return calls
 
 
-class TestRuns:
-    @pytest.mark.parametrize(
-        ("tuner", "killed"), [(evolution, range(1, 6)), (descents, (1, 5))], ids=["es", "grad"]
-    )
-    def test_a_continued_run_is_the_uninterrupted_one(self, tmp_path, pretended, tuner, killed):
-        whole = tuned(tmp_path / "whole", tuner())
-        for done in killed:
-            folder = tmp_path / f"{done}"
-            tuned(folder, tuner(done))
-            calls = len(pretended)
-            assert tuned(folder, tuner()) == whole
-            rounds = 1 if tuner is evolution else 2  # the last step of a descent only validates
-            assert len(pretended) - calls == rounds * (6 - done) - (rounds - 1)
-            for name in ("tuned.json", "curve.csv"):
-                first, second = (
-                    (tmp_path / run / name).read_text() for run in ("whole", f"{done}")
-                )
-                assert first == second
-        assert len(read_curve(tmp_path / "whole")) == 6
-
-    @pytest.mark.parametrize("tuner", [evolution, descents])
-    def test_only_a_damaged_generation_is_repeated(self, tmp_path, pretended, tuner):
-        whole = tuned(tmp_path, tuner())
-        curve = (tmp_path / "curve.csv").read_text()
-        (third,) = (tmp_path / "parts").glob("000002*")
-        third.write_bytes(third.read_bytes()[:-100])
+@pytest.mark.parametrize(("tuner", "killed"), [(evolution, range(1, 6)), (descents, (1, 5))])
+def test_a_continued_run_is_the_uninterrupted_one(tmp_path, pretended, tuner, killed):
+    whole = tuned(tmp_path / "whole", tuner())
+    for done in killed:
+        folder = tmp_path / f"{done}"
+        tuned(folder, tuner(done))
         calls = len(pretended)
-        assert tuned(tmp_path, tuner()) == whole
-        assert len(pretended) == calls + (1 if tuner is evolution else 2)
-        assert (tmp_path / "curve.csv").read_text() == curve
+        assert tuned(folder, tuner()) == whole
+        rounds = 1 if tuner is evolution else 2  # the last step of a descent only validates
+        assert len(pretended) - calls == rounds * (6 - done) - (rounds - 1)
+        for name in ("tuned.json", "curve.csv"):
+            assert (folder / name).read_text() == (tmp_path / "whole" / name).read_text()
+    assert len(read_curve(tmp_path / "whole")) == 6
 
-    def test_generations_that_the_seed_does_not_propose_are_refused(self, tmp_path, pretended):
+
+@pytest.mark.parametrize("tuner", [evolution, descents])
+def test_only_a_damaged_generation_is_repeated(tmp_path, pretended, tuner):
+    whole = tuned(tmp_path, tuner())
+    curve = (tmp_path / "curve.csv").read_text()
+    (third,) = (tmp_path / "parts").glob("000002*")
+    third.write_bytes(third.read_bytes()[:-100])
+    calls = len(pretended)
+    assert tuned(tmp_path, tuner()) == whole
+    assert len(pretended) == calls + (1 if tuner is evolution else 2)
+    assert (tmp_path / "curve.csv").read_text() == curve
+
+
+def test_generations_that_the_seed_does_not_propose_are_refused(tmp_path, pretended):
+    tuned(tmp_path / "one", evolution(3))
+    tuned(tmp_path / "other", evolution(3, setting=Setting(seed=1)))
+    for path in (tmp_path / "one" / "parts").glob("000001*"):
+        path.unlink()
+    (foreign,) = (tmp_path / "other" / "parts").glob("000001*")
+    foreign.rename(tmp_path / "one" / "parts" / foreign.name)
+    with pytest.raises(InputError, match="generation 1 is of another search"):
         tuned(tmp_path / "one", evolution(3))
-        tuned(tmp_path / "other", evolution(3, setting=Setting(seed=1)))
-        for path in (tmp_path / "one" / "parts").glob("000001*"):
-            path.unlink()
-        (foreign,) = (tmp_path / "other" / "parts").glob("000001*")
-        foreign.rename(tmp_path / "one" / "parts" / foreign.name)
-        with pytest.raises(InputError, match="generation 1 is of another search"):
-            tuned(tmp_path / "one", evolution(3))
 
-    def test_finished_generations_stay_when_fewer_are_requested(self, tmp_path, pretended):
-        whole = tuned(tmp_path, evolution(6))
-        assert tuned(tmp_path, evolution(2)) == whole
-        assert len(read_curve(tmp_path)) == 6
 
-    def test_the_curve_is_a_table_that_grows_with_the_run(self, tmp_path, pretended):
-        for done in (2, 6):
-            results = run.tune(Run(tmp_path, no_progress), *evolution(done))
-            curve = read_curve(tmp_path)
-            assert curve.index.tolist() == list(range(done))
-            for name in ("validation_success", "simulated"):
-                assert curve[name].tolist() == results[name].values.tolist()
-            assert curve["params.K_h"].tolist() == results.params.values[:, 1].tolist()
-            best = results.params.isel(generation=results.validation.argmin())
-            np.testing.assert_allclose(results.tuned, best, rtol=1e-5)
+def test_finished_generations_stay_when_fewer_are_requested(tmp_path, pretended):
+    whole = tuned(tmp_path, evolution(6))
+    assert tuned(tmp_path, evolution(2)) == whole
+    assert len(read_curve(tmp_path)) == 6
 
-    def test_a_search_ends_with_its_budget_and_resumes_with_more(self, tmp_path, pretended):
-        for budget, done in ((2.5, 3), (4.0, 4), (0.0, 6)):  # 1 s a generation
-            tuned(tmp_path, evolution(budget=budget))
-            assert len(read_curve(tmp_path)) == done
 
-    def test_it_finds_the_place_and_writes_it_down(self, tmp_path, pretended):
-        tuned(tmp_path, evolution(20))
-        result = json.loads((tmp_path / "tuned.json").read_text())
-        assert result == {"L": pytest.approx(0.4, abs=0.03), "K_h": pytest.approx(0.6, abs=0.03)}
+def test_the_curve_is_a_table_that_grows_with_the_run(tmp_path, pretended):
+    for done in (2, 6):
+        results = run.tune(Run(tmp_path, no_progress), *evolution(done))
+        curve = read_curve(tmp_path)
+        assert curve.index.tolist() == list(range(done))
+        for name in ("validation_success", "simulated"):
+            assert curve[name].tolist() == results[name].values.tolist()
+        assert curve["params.K_h"].tolist() == results.params.values[:, 1].tolist()
+        best = results.params.isel(generation=results.validation.argmin())
+        np.testing.assert_allclose(results.tuned, best, rtol=1e-5)
 
-    def test_another_configuration_is_refused_with_the_difference(self, tmp_path, pretended):
-        calls = SMALL | {"population": 8, "out": tmp_path}
-        first = TuneES("rps", **calls, generations=1)()
-        longer = TuneES("rps", **calls, generations=3)()  # of which the first is there
-        assert first.params.equals(longer.params[:1])
-        with pytest.raises(InputError, match=r"spread = 0.5 there, 0.4 asked for"):
-            TuneES("rps", **calls, spread=0.4)()
-        with pytest.raises(InputError, match="holds another run"):
-            TuneGrad("rps", **SMALL, estimator="evolution", out=tmp_path)()
 
-    def test_the_report_of_a_descent_tells_its_times_and_parameters(self, pretended):
-        calls = TuneGrad("rps", **SMALL, estimator="evolution", steps=2, starts=1, pairs=1)
-        (section,) = calls.report(calls(), Run(None, no_progress))
-        assert "after" in section.text
-        assert "gradients 0.0 s with their compilation" in section.text
-        assert [name for name, *_ in section.table[1:]] == ["L", "K_h"]
+def test_a_search_ends_with_its_budget_and_resumes_with_more(tmp_path, pretended):
+    for budget, done in ((2.5, 3), (4.0, 4), (0.0, 6)):  # 1 s a generation
+        tuned(tmp_path, evolution(budget=budget))
+        assert len(read_curve(tmp_path)) == done
+
+
+def test_it_finds_the_place_and_writes_it_down(tmp_path, pretended):
+    tuned(tmp_path, evolution(20))
+    result = json.loads((tmp_path / "tuned.json").read_text())
+    assert result == {"L": pytest.approx(0.4, abs=0.03), "K_h": pytest.approx(0.6, abs=0.03)}
+
+
+def test_another_configuration_is_refused_with_the_difference(tmp_path, pretended):
+    calls = SMALL | {"population": 8, "out": tmp_path}
+    first = TuneES("rps", **calls, generations=1)()
+    longer = TuneES("rps", **calls, generations=3)()  # of which the first is there
+    assert first.params.equals(longer.params[:1])
+    with pytest.raises(InputError, match=r"spread = 0.5 there, 0.4 asked for"):
+        TuneES("rps", **calls, spread=0.4)()
+    with pytest.raises(InputError, match="holds another run"):
+        TuneGrad("rps", **SMALL, estimator="evolution", out=tmp_path)()
+
+
+def test_the_report_of_a_descent_tells_its_times_and_parameters(pretended):
+    calls = TuneGrad("rps", **SMALL, estimator="evolution", steps=2, starts=1, pairs=1)
+    (section,) = calls.report(calls(), Run(None, no_progress))
+    assert "after" in section.text
+    assert "gradients 0.0 s with their compilation" in section.text
+    assert [name for name, *_ in section.table[1:]] == ["L", "K_h"]
 
 
 def test_the_command_line(tmp_path, capsys):
-    calls = ["tune", "es", "--engine", "quasistatic", "--objects", "random_cylinder"]
-    calls += ["--worlds", 2, "--validation", 2, "--population", 4, "--generations", 2]
-    calls += ["--horizon", 8, "--tuned", "L", "K_h", "--slots", 6, "--out", tmp_path / "run"]
+    words = "tune es --engine quasistatic --objects random_cylinder --worlds 2 --validation 2"
+    words += " --population 4 --generations 2 --horizon 8 --tuned L K_h --slots 6 --out"
+    calls = [*words.split(), tmp_path / "run"]
     assert command(*calls) == 0
     assert set(json.loads((tmp_path / "run" / "tuned.json").read_text())) == {"L", "K_h"}
     assert (tmp_path / "run" / "tuning.png").stat().st_size > 10_000

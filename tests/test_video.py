@@ -1,14 +1,15 @@
 """Pictures and videos: small, drawn from qpos alone."""
 
+import contextlib
 import itertools
 import os
+import re
 import subprocess
 import sys
-from pathlib import Path
 
-import imageio_ffmpeg
 import numpy as np
 import pytest
+from helpers import decode
 
 from rps_jax import errors
 from rps_jax.world import rendering, scene, video
@@ -18,46 +19,40 @@ pytestmark = pytest.mark.filterwarnings("ignore:os.fork")
 
 SMALL = (160, 120)  # [px]
 FAR = (50.0, 50.0)  # [m] a target out of sight
+PLAIN = {"p_world_target": FAR, "size": SMALL}
 
 
 @pytest.fixture(scope="module")
-def box() -> scene.Scene:
+def box():
     return scene.load("box")
 
 
-def drive(loaded: scene.Scene, count: int = 5) -> list[np.ndarray]:
+def drive(loaded, count=5):
     """Return frames in which base and object move ahead by 0.2 m per frame."""
     frames = np.tile(scene.initial_qpos(loaded), (count, 1))
     frames[:, [0, 3]] += 0.2 * np.arange(count)[:, None]
     return list(frames)
 
 
-def decode(path: Path) -> np.ndarray:
-    """Return the images of a video (count, height, width, 3)."""
-    reader = imageio_ffmpeg.read_frames(str(path))
-    width, height = next(reader)["size"]
-    return np.array([np.frombuffer(f, np.uint8).reshape(height, width, 3) for f in reader])
-
-
-def changed(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+def changed(a, b):
     """Return rows and columns (n, 2) of the pixels in which two images differ clearly."""
     return np.argwhere(np.abs(a.astype(int) - b).max(axis=-1) > 60)
 
 
-def red(image: np.ndarray) -> np.ndarray:
+def red(image):
     """Return rows and columns (n, 2) of the pixels with the red of the flag."""
     r, g, _ = np.moveaxis(image.astype(int), -1, 0)
     return np.argwhere(r - g > 100)
 
 
-def assert_one_sentence(error: Exception) -> None:
-    text = str(error)
-    assert text.endswith(".")
-    assert "\n" not in text
-    assert ". " not in text
+@contextlib.contextmanager
+def fails_in_one_sentence(words=""):
+    with pytest.raises(video.VideoError, match=words) as caught:
+        yield
+    assert re.fullmatch(r"((?!\. ).)*\.", str(caught.value))
 
 
-def test_a_video_holds_every_frame_of_a_moving_robot(box: scene.Scene, tmp_path: Path) -> None:
+def test_a_video_holds_every_frame_of_a_moving_robot(box, tmp_path):
     path = tmp_path / "push.mp4"
     video.render(box, iter(drive(box)), path, p_world_target=(2.0, 1.0), size=SMALL)
     images = decode(path)
@@ -67,18 +62,11 @@ def test_a_video_holds_every_frame_of_a_moving_robot(box: scene.Scene, tmp_path:
     assert os.listdir(tmp_path) == ["push.mp4"]
 
 
-def test_the_contact_point_leaves_a_path_with_gaps(box: scene.Scene, tmp_path: Path) -> None:
-    def last_image(contacts: list[tuple[float, float]]) -> np.ndarray:
-        path = tmp_path / "push.mp4"
-        video.render(
-            box,
-            [scene.initial_qpos(box)] * len(contacts),
-            path,
-            p_world_target=FAR,
-            size=(480, 360),
-            camera="above",
-            p_world_contacts=contacts,
-        )
+def test_the_contact_point_leaves_a_path_with_gaps(box, tmp_path):
+    def last_image(contacts):
+        path, frames = tmp_path / "push.mp4", [scene.initial_qpos(box)] * len(contacts)
+        options = {"p_world_target": FAR, "size": (480, 360), "camera": "above"}
+        video.render(box, frames, path, p_world_contacts=contacts, **options)
         return decode(path)[-1]
 
     nothing = (np.nan, np.nan)
@@ -93,7 +81,7 @@ def test_the_contact_point_leaves_a_path_with_gaps(box: scene.Scene, tmp_path: P
 
 
 @pytest.mark.parametrize("camera", ["above", "oblique"])
-def test_a_partially_redrawn_image_equals_the_whole_image(box: scene.Scene, camera: str) -> None:
+def test_a_partially_redrawn_image_equals_the_whole_image(box, camera):
     options = {"p_world_target": (1.0, 1.0), "size": (480, 270), "camera": camera}
     frames = np.tile(scene.initial_qpos(box), (6, 1))
     frames[:, 3:5] += [(0.1 * i, 0.12 * i) for i in range(5)] + [(30, 30)]  # past the flag, away
@@ -101,8 +89,8 @@ def test_a_partially_redrawn_image_equals_the_whole_image(box: scene.Scene, came
         assert len(changed(drawn, video.images(box, [qpos], **options)[0])) < 6
 
 
-def test_a_trail_drawn_in_parts_equals_one_drawn_at_once(box: scene.Scene) -> None:
-    options = {"p_world_target": FAR, "size": (960, 540), "camera": "oblique"}
+def test_a_trail_drawn_in_parts_equals_one_drawn_at_once(box):
+    options = {"p_world_target": FAR, "size": (480, 270), "camera": "oblique"}
     frames = np.tile(scene.initial_qpos(box), (90, 1))
     frames[:, [0, 3]] += np.linspace(0, 1, 90)[:, None]
     frames[:, [1, 4]] += np.linspace(0, -1, 90)[:, None]
@@ -112,7 +100,7 @@ def test_a_trail_drawn_in_parts_equals_one_drawn_at_once(box: scene.Scene) -> No
     assert len(changed(parts, whole)) < 6
 
 
-def test_above_is_a_map_with_x_up_and_y_left(box: scene.Scene) -> None:
+def test_above_is_a_map_with_x_up_and_y_left(box):
     qpos = scene.initial_qpos(box)
     (image,) = video.images(box, [qpos], p_world_target=(1.5, 2.0), size=(320, 180), camera="above")
     metre = 180 / 6  # px
@@ -122,34 +110,31 @@ def test_above_is_a_map_with_x_up_and_y_left(box: scene.Scene) -> None:
 
 
 @pytest.mark.parametrize("camera", ["above", "oblique"])
-def test_both_cameras_see_targets_on_all_sides(box: scene.Scene, camera: str) -> None:
+def test_both_cameras_see_targets_on_all_sides(box, camera):
     qpos = scene.initial_qpos(box)
     for target in itertools.product((-2.5, 2.5), repeat=2):
         (image,) = video.images(box, [qpos], p_world_target=target, size=(320, 180), camera=camera)
-        rows, columns = red(image).T
-        assert len(rows) > 5
-        assert rows.min() > 0
-        assert rows.max() < 179
-        assert columns.min() > 0
-        assert columns.max() < 319
+        pixels = red(image)
+        assert len(pixels) > 5
+        assert (pixels > 0).all()
+        assert (pixels < (179, 319)).all()
 
 
-def test_the_collision_capsule_of_a_drum_is_not_drawn() -> None:
+def test_the_collision_capsule_of_a_drum_is_not_drawn():
     drum = scene.load("cylinder")
     qpos = scene.initial_qpos(drum)
-    (image,) = video.images(drum, [qpos], p_world_target=FAR, size=SMALL)
+    (image,) = video.images(drum, [qpos], **PLAIN)
     drum.model.geom("object_side").size = [1.0, 1.0, 0.0]
-    assert np.array_equal(image, video.images(drum, [qpos], p_world_target=FAR, size=SMALL)[0])
+    assert np.array_equal(image, video.images(drum, [qpos], **PLAIN)[0])
 
 
-def test_an_unwritable_path_is_refused_in_one_sentence(box: scene.Scene, tmp_path: Path) -> None:
+def test_an_unwritable_path_is_refused_in_one_sentence(box, tmp_path):
     for path in (tmp_path / "missing" / "push.mp4", tmp_path):
-        with pytest.raises(video.VideoError, match="could not be written") as caught:
-            video.render(box, drive(box), path, p_world_target=FAR, size=SMALL)
-        assert_one_sentence(caught.value)
+        with fails_in_one_sentence("could not be written"):
+            video.render(box, drive(box), path, **PLAIN)
 
 
-def test_an_unfinished_video_does_not_change_the_old_file(box: scene.Scene, tmp_path: Path) -> None:
+def test_an_unfinished_video_does_not_change_the_old_file(box, tmp_path):
     path = tmp_path / "push.mp4"
     path.write_bytes(b"old")
 
@@ -158,77 +143,69 @@ def test_an_unfinished_video_does_not_change_the_old_file(box: scene.Scene, tmp_
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        video.render(box, broken(), path, p_world_target=FAR, size=SMALL)
+        video.render(box, broken(), path, **PLAIN)
     assert path.read_bytes() == b"old"
     assert os.listdir(tmp_path) == ["push.mp4"]
 
 
-def test_an_ffmpeg_that_fails_is_one_sentence(
-    box: scene.Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_ffmpeg_that_fails_is_one_sentence(box, tmp_path, monkeypatch):
     for program in ("/bin/false", "/no/such/program"):
         monkeypatch.setenv("IMAGEIO_FFMPEG_EXE", program)
-        with pytest.raises(video.VideoError) as caught:
-            video.render(box, drive(box), tmp_path / "push.mp4", p_world_target=FAR, size=SMALL)
-        assert_one_sentence(caught.value)
+        with fails_in_one_sentence():
+            video.render(box, drive(box), tmp_path / "push.mp4", **PLAIN)
         fixes = video.check()
         assert not fixes["rendering"]
         assert fixes["ffmpeg"]
 
 
-@pytest.mark.parametrize(
-    "change",
-    [
-        {"frames": []},
-        {"frames": [np.full(10, np.nan)]},
-        {"frames": [np.zeros(3)]},
-        {"p_world_target": (np.nan, 0.0)},
-        {"size": (161, 120)},
-        {"size": (8000, 120)},
-        {"camera": "abov"},
-        {"fps": 0},
-    ],
-)
-def test_input_that_cannot_be_drawn_is_refused(
-    box: scene.Scene, tmp_path: Path, change: dict
-) -> None:
-    good = {"frames": drive(box), "p_world_target": FAR, "size": SMALL}
+INVALID = [
+    *({"frames": frames} for frames in ([], [np.full(10, np.nan)], [np.zeros(3)])),
+    *({"size": size} for size in ((161, 120), (8000, 120))),
+    *({"p_world_target": (np.nan, 0.0)}, {"camera": "abov"}, {"fps": 0}),
+]
+
+
+@pytest.mark.parametrize("change", INVALID)
+def test_input_that_cannot_be_drawn_is_refused(box, tmp_path, change):
+    options = {"frames": drive(box)} | PLAIN | change
     with pytest.raises(errors.InputError):
-        video.render(box, path=tmp_path / "push.mp4", **(good | change))
+        video.render(box, path=tmp_path / "push.mp4", **options)
     assert not os.listdir(tmp_path)
 
 
-def test_this_machine_can_draw_and_encode() -> None:
+def test_this_machine_can_draw_and_encode():
     assert video.check() == {"rendering": "", "ffmpeg": ""}
 
 
-def test_without_rendering_the_check_names_the_fix() -> None:
-    code = "from rps_jax.world import video; print(video.check())"
-    environment = os.environ | {"MUJOCO_GL": "disable"}
+def python(code):
+    """Run code in another process."""
     command = [sys.executable, "-c", code]
-    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
+    return subprocess.run(command, capture_output=True, text=True, check=True)
+
+
+def test_without_rendering_the_check_names_the_fix(monkeypatch):
+    monkeypatch.setenv("MUJOCO_GL", "disable")
+    done = python("from rps_jax.world import video; print(video.check())")
     assert "apt install libegl1" in done.stdout
     assert done.stderr == ""
 
 
-def test_importing_the_module_changes_nothing() -> None:
-    code = (
+def test_importing_the_module_changes_nothing():
+    python(
         "import os, sys; before = dict(os.environ); import rps_jax.world.video; "
         "assert 'mujoco' not in sys.modules and before == dict(os.environ)"
     )
-    subprocess.run([sys.executable, "-c", code], check=True)
 
 
-def test_an_existing_choice_of_gl_is_respected(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_existing_choice_of_gl_is_respected(monkeypatch):
     monkeypatch.setenv("MUJOCO_GL", "osmesa")
     rendering.choose_gl.__wrapped__()
     assert os.environ["MUJOCO_GL"] == "osmesa"
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="elsewhere MuJoCo needs no choice of GL")
-def test_rendering_works_without_a_display_after_importing_mujoco() -> None:
+def test_rendering_works_without_a_display_after_importing_mujoco(monkeypatch):
+    for name in ("MUJOCO_GL", "DISPLAY"):
+        monkeypatch.delenv(name, raising=False)
     code = "import mujoco; from rps_jax.world import video; print(video.check())"
-    environment = {k: v for k, v in os.environ.items() if k not in ("MUJOCO_GL", "DISPLAY")}
-    command = [sys.executable, "-c", code]
-    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
-    assert done.stdout == "{'rendering': '', 'ffmpeg': ''}\n"
+    assert python(code).stdout == "{'rendering': '', 'ffmpeg': ''}\n"
