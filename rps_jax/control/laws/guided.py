@@ -21,6 +21,7 @@ from rps_jax.control.base import Law, document_fields
 from rps_jax.control.laws import rps
 from rps_jax.control.laws.rps import RPSParams, RPSState
 from rps_jax.control.observation import Details, Observation, Twist
+from rps_jax.geometry.arrays import Number
 
 KNOTS = 60  # default number of offsets
 
@@ -34,7 +35,7 @@ class GuidedParams(NamedTuple):
     hold: float | jax.Array = 250  # [1] control steps per offset: 5 s, so that 60 take 300 s
 
     @property
-    def d_success(self) -> float | jax.Array:
+    def d_success(self) -> Number:
         """Distance at which the target is reached [m]."""
         return self.law.d_success
 

@@ -41,7 +41,7 @@ from rps_jax.control.laws import rps
 from rps_jax.control.laws.rps import RPSParams, RPSState, Temperatures
 from rps_jax.control.observation import Details, Observation, Twist, displacement
 from rps_jax.geometry import planar
-from rps_jax.geometry.arrays import Scalar
+from rps_jax.geometry.arrays import Number, Scalar
 
 FACING = 0.3  # [rad] P3's facing
 REACH = 0.45  # [m] P3's reach: the base's front is 0.36 m ahead of its centre
@@ -62,7 +62,7 @@ class RPSPlusParams(NamedTuple):
     aside: float | jax.Array = 0.5  # [1] share of v_max to the side, P3
 
     @property
-    def d_success(self) -> float | jax.Array:
+    def d_success(self) -> Number:
         """Distance at which the target is reached [m]."""
         return self.law.d_success
 
