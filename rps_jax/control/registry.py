@@ -80,10 +80,8 @@ def law_of(params: LawParams | type) -> Law:
     kind = params if isinstance(params, type) else type(params)
     if kind not in _LAWS_BY_CLASS:
         known = ", ".join(known.__name__ for known in _LAWS_BY_CLASS)
-        raise InputError(
-            f"params of class {kind.__name__} belong to no law: use {known}, or register the law "
-            "with register_law."
-        )
+        fix = f"use {known}, or register the law with register_law"
+        raise InputError(f"params of class {kind.__name__} belong to no law: {fix}.")
     return _LAWS_BY_CLASS[kind]
 
 

@@ -16,7 +16,6 @@ import jax.numpy as jnp
 import numpy as np
 
 from rps_jax import errors
-from rps_jax.errors import InputError
 from rps_jax.geometry.arrays import Number
 from rps_jax.record.options import check_fields, option
 
@@ -143,16 +142,13 @@ class Shell:
         for boards in self.boards:
             first, length = _span(boards, sides[boards.side])
             last, end = first + length, sides[boards.side]
+            field = f"robot boards on the {boards.side} side"
             if first < -_ROUNDING or last > end + _ROUNDING:
-                raise InputError(
-                    f"robot boards from {first:g} to {last:g} m of the {boards.side} side are not "
-                    f"allowed: they leave the base, whose side ends at {end:g} m."
-                )
+                rule = f"they leave the base, whose side ends at {end:g} m"
+                raise errors.not_allowed(field, f"{first:g} to {last:g} m", rule)
             if (SIDES.index(boards.side), first + _ROUNDING) < previous:
-                raise InputError(
-                    f"robot boards on the {boards.side} side are not allowed: they overlap the "
-                    "previous row, or are not in the order left, front, right."
-                )
+                rule = "they overlap the previous row, or are not in the order left, front, right"
+                raise errors.not_allowed(field, f"{first:g} to {last:g} m", rule)
             previous = SIDES.index(boards.side), last
 
 

@@ -218,11 +218,7 @@ def quantities_of(*owners: Owner) -> tuple[str, ...]:
 
 
 # Labels of the three draws of the velocity error.
-VELOCITY_ERRORS = {
-    "v_x_error": "error of v_x",
-    "v_y_error": "error of v_y",
-    "omega_error": "error of omega",
-}
+VELOCITY_ERRORS = {f"{name}_error": f"error of {name}" for name in ("v_x", "v_y", "omega")}
 # Columns of a table of worlds, with their labels.
 LABELS: dict[str, str] = {
     **{name: quantity.label for name, quantity in QUANTITIES.items() if quantity.label},

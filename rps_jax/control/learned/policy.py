@@ -31,22 +31,17 @@ class Policy(NamedTuple):
     task: LearnedParams = LearnedParams()
     learned: Mapping[str, Any] = {}  # JSON: how the law was learned
 
-    @property
-    def about(self) -> dict[str, Any]:
-        """JSON header of the file, with everything except the weights."""
-        return {
-            "format": FORMAT,
-            "version": VERSION,
-            "network": self.network._asdict(),
-            "task": self.task._asdict(),
-            "learned": dict(self.learned),
-        }
-
 
 def encode(policy: Policy) -> bytes:
     """Return the content of a policy's file, a function of the policy alone."""
-    policy.network.check()
-    arrays = {"about": np.array(json.dumps(policy.about))}
+    about = {
+        "format": FORMAT,
+        "version": VERSION,
+        "network": policy.network.check()._asdict(),
+        "task": policy.task._asdict(),
+        "learned": dict(policy.learned),
+    }
+    arrays = {"about": np.array(json.dumps(about))}
     for name in policy.network.shapes:
         arrays[name] = np.asarray(policy.weights[name], np.float32)
     return files.encode_arrays(digest=np.array(_digest(arrays)), **arrays)
