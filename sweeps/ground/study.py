@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 import xarray as xr
@@ -115,7 +115,7 @@ def figure_of(results: xr.Dataset, names: Collection[str]) -> Figure:
         ax.set_xticks(100 * speeds, [f"{100 * speed:g}" for speed in speeds])
         ax.minorticks_off()
         ax.grid(alpha=0.3)
-    style = {"color": "0.3", "ls": "none", "mfc": "none"}
+    style: dict[str, Any] = {"color": "0.3", "ls": "none", "mfc": "none"}
     handles = [
         Line2D([], [], color="k", lw=1, label="rigid object, at three offsets"),
         *(Line2D([], [], marker=mark, label=f"{100 * speed:g} cm/s", **style)

@@ -139,8 +139,8 @@ class Limits(MultiLawQuestion[xr.DataTree]):
 
     def _plan(self, ranges: Domain, robot: Robot | None = None) -> Plan:
         """Return the sweep of a robot."""
-        options = {"robot": robot, "setting": self.setting}
-        return Sweep(self.chosen, ranges, self.worlds, **options).plan
+        sweep = Sweep(self.chosen, ranges, self.worlds, robot=robot, setting=self.setting)
+        return sweep.plan
 
     @property
     def plans(self) -> dict[str, Plan]:
@@ -320,8 +320,8 @@ def turning_figure(results: xr.Dataset) -> Figure:
     names = list(map(str, results.robot.values))
     figure, axes = tiles(len(names), 1, (8, 1.7), (0, 0), sharex=True, sharey=True)
     for ax, name in zip(axes[:, 0], names, strict=True):
-        rates, ask = results.sel(robot=name), {"color": "0.7", "lw": 1, "where": "post"}
-        ax.step(rates.time, rates.asked, label="asked by the law", **ask)
+        rates, label = results.sel(robot=name), "asked by the law"
+        ax.step(rates.time, rates.asked, color="0.7", lw=1, where="post", label=label)
         ax.plot(rates.time, rates.done, color="C0", lw=1.2, label="of the base")
         ax.set_title(name, fontsize=9, loc="left")
         ax.set_ylabel(r"$\omega$ [rad/s]")

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -25,7 +26,7 @@ _DRAWN = {
 _FINGERS = ("point", "two-point")
 _STEPS = 60
 # Outlines of a push: before, measured, predicted.
-_STYLES = (
+_STYLES: Sequence[Mapping[str, Any]] = (
     {"color": "0.65", "lw": 1},
     {"color": "k", "lw": 2.2},
     {"color": "C3", "lw": 1.3, "ls": "--"},

@@ -171,8 +171,9 @@ def with_law(task: Task) -> Racer:
 
     from sweeps import programs
 
-    setting, how = programs.BATCHED["fused standard"], {"simulated": task.seconds}
-    program = programs.traced("fused", setting, "box", len(task.qpos), donated=False, **how)()
+    setting, count = programs.BATCHED["fused standard"], len(task.qpos)
+    trace = functools.partial(programs.traced, simulated=task.seconds, donated=False)
+    program = trace("fused", setting, "box", count)()
 
     def go() -> np.ndarray:
         jax.block_until_ready(program.go(program.start))
