@@ -81,7 +81,7 @@ REFUSED = {
         ({"boards": (Boards("back", 2),)}, "unknown robot boards' side 'back'"),
         ({"boards": (Boards("front", 0),)}, "robot boards' count = 0 is not allowed"),
         ({"boards": (Boards("front", 5, 0.05),)}, "front side = .*: they leave the base"),
-        ({"boards": (Boards("front", 2, 0.05, 0.2),)}, "from 0.34 to 0.64 m .* ends at 0.58"),
+        ({"boards": (Boards("front", 2, 0.05, 0.2),)}, "= 0.34 to 0.64 m .* ends at 0.58"),
         ({"boards": (BOARDS, Boards("front", 2, 0.05, 0.1))}, "overlap the previous row"),
         ({"boards": (Boards("front", 2), BOARDS)}, "overlap the previous row"),
         ({"boards": (Boards("right", 2), BOARDS)}, "in the order left, front, right"),
