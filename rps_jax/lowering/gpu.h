@@ -60,7 +60,7 @@ OF_THREAD(f, V)
 OF_THREAD(i, I)
 OF_THREAD(u, U)
 OF_THREAD(b, I)
-FUNCTION V sum_over_threads_f(V x) {
+FUNCTION V add_over_threads_f(V x) {
   for (int by = THREADS / 2; by; by /= 2) x += __shfl_xor_sync(ALL, x, by);
   return x;
 }

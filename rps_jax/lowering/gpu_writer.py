@@ -25,11 +25,11 @@ from rps_jax.lowering.nodes import (
 )
 from rps_jax.lowering.operations import GPU_HEADER, TYPES, defined
 from rps_jax.lowering.target import Params, TooLargeError, Typed, Value, size_of
-from rps_jax.lowering.writer import STORED, SimdWriter
+from rps_jax.lowering.writer import STORED, SimdWriter, Writer
 
 WARP = 32
 _INLINE = ("input", "move", "take")  # operations of which a thread computes only its own elements
-_SUM = "sum_over_threads_f"  # sum of the partial sums of all threads of a world
+_SUM = "add_over_threads_f"  # sum of the partial sums of all threads of a world
 _MAX_SHARED = 48 * 1024  # bytes of a block
 _UNROLLED = 4  # iterations of a loop over the elements of a thread that are unrolled
 _KERNEL = """\
@@ -50,7 +50,7 @@ extern "C" __global__ void __launch_bounds__(32) step(const __grid_constant__ Ar
 {LINES}
 }}
 """
-# Reductions over threads; sums of reals are `_SUM`.
+# Reductions over threads; `gpu.h` has that of `_SUM`.
 _FOLDS = "\n".join(f"FOLD({name}, {kind}, {TYPES[kind]})" for name, kind in [*INITIAL][1:])
 
 
@@ -111,9 +111,10 @@ class GpuNodes(SimdNodes):
                     return super().apply(name, [lhs.args[0], both], params, out)
         result = super().apply(name, values, params, out)
         node = _node_of(result)
-        if node is None or node.op != "fold add_f":
+        if node is None or not node.op.startswith("fold"):
             return result
-        return Array(self.node(_SUM, [result], "f", 1), 0, 1, result.shape)
+        op = f"{node.op[5:-2]}_over_threads_{node.kind}"
+        return Array(self.node(op, [result], node.kind, 1), 0, 1, result.shape)
 
     def _sum(self, name: str, lhs: Node, rhs: Node, out: Typed) -> Array:
         partial = [x.args[0]._replace(shape=out.shape) for x in (lhs, rhs)]
@@ -145,6 +146,7 @@ class GpuWriter(SimdWriter):
     table_type = "static __device__ const"
     header, function, inputs = f"{GPU_HEADER}\n{_FOLDS}\n", _KERNEL, "a.inputs"
     nodes = GpuNodes
+    single = Writer.single  # a thread reads inputs as it needs them
 
     def __init__(self, threads: int) -> None:
         """Print the code of so many threads per world."""
@@ -269,11 +271,6 @@ class GpuWriter(SimdWriter):
         return [*lines, *super().fold(node, f"{guard} ? {text} : {self.initial(node)}"
                                       if guard else text)]  # fmt: skip
 
-    def fold_end(self, node: Node) -> list[str]:
-        if node.op == "fold add_f":  # which has a separate node, `_SUM`
-            return []
-        return [f"{node.name} = {node.op[5:-2]}_over_threads_{node.kind}({node.name});"]
-
     def element_text(self, node: Node, fused: set[Node]) -> tuple[list[str], str]:
         size, at = node.size, "i" if node.size > 1 else "0"
         if node.op == "input":
@@ -285,8 +282,6 @@ class GpuWriter(SimdWriter):
             return [], self.item(source.node, f"{table}[{row} * {size} + {at}]")
         if node.op == "move" and size > 1:
             return self._gather(node)
-        if node.op == "move":
-            return [], self.read(node.args[0], node, set())
         return super().element_text(node, fused)
 
     def _gather(self, node: Node) -> tuple[list[str], str]:
@@ -324,12 +319,6 @@ class GpuWriter(SimdWriter):
             packed = sum(x << (4 * i) for i, x in enumerate(scalars))
             return f"(int)({packed:#x}u >> (4 * i) & 15)"
         return f"{self.table(np.array(scalars, np.int32))}[i]"
-
-    def single(self, node: Node) -> list[str]:
-        if node.op == "part":
-            return []
-        declared = self.declaration(node.kind, node.name)
-        return self.statement([f"{declared} = {self.element_text(node, set())[1]};"])
 
     def loop(self, loop: LoopNode) -> list[str]:
         broadcasts, self._broadcasts = self._broadcasts, dict(self._broadcasts)

@@ -172,8 +172,9 @@ class Writer:
         """Return the statements of a node that is not computed in a loop over its elements."""
         if node.op == "part":  # a name of a carried node
             return []
-        texts = [self.operand(a, 0) for a in node.args]
-        return [self.array(node, texts if node.op == "move" else [self.call(node.op, texts)])]
+        if node.op == "move" and node.size > 1:
+            return [self.array(node, [self.operand(a, 0) for a in node.args])]
+        return self.statement([self.array(node, [self.element_text(node, set())[1]])])
 
     def array(self, node: Node, elements: Sequence[str]) -> str:
         """Return the declaration of a node with its elements."""
@@ -182,7 +183,7 @@ class Writer:
 
     def together(self, group: Sequence[Node], stored: set[Node]) -> list[str]:
         """Return one loop over the elements of nodes."""
-        head, lines, tail, fused = [], [], [], set(group)
+        head, lines, fused = [], [], set(group)
         for node in group:
             needed, text = self.element_text(node, fused)
             lines += needed
@@ -190,13 +191,12 @@ class Writer:
                 lines += self.fold(node, text)
                 declared = self.declaration(node.kind, node.name, constant=False)
                 head.append(f"{declared} = {self.initial(node)};")
-                tail += self.fold_end(node)
                 continue
             lines.append(f"  {self.declaration(node.kind, f'e{node.id}')} = {text};")
             if node in stored:
                 head.append(self.declared(node))
                 lines.append(f"  {self.element(node)} = e{node.id};")
-        return self.statement([*head, *self.elements(group[0].size, lines), *tail], stored)
+        return self.statement([*head, *self.elements(group[0].size, lines)], stored)
 
     def elements(self, size: int, lines: Sequence[str]) -> list[str]:
         """Return a loop over elements `i`."""
@@ -209,10 +209,6 @@ class Writer:
     def fold(self, node: Node, text: str) -> list[str]:
         """Return the statements that add the element `i` to a reduction."""
         return [f"  {node.name} = {self.call(node.op[5:], [node.name, text])};"]
-
-    def fold_end(self, node: Node) -> list[str]:
-        """Return the statements that complete a reduction after its loop."""
-        return []
 
     def loop(self, loop: LoopNode) -> list[str]:
         """Return the statements of a loop, or of a block that runs under a condition."""
@@ -289,7 +285,8 @@ class Writer:
     def element_text(self, node: Node, fused: set[Node]) -> tuple[list[str], str]:
         """Return statements, and the expression of element `i` of a node."""
         operands = [self.read(a, node, fused) for a in node.args]
-        return [], operands[0] if node.op.startswith("fold") else self.call(node.op, operands)
+        is_copy = node.op == "move" or node.op.startswith("fold")
+        return [], operands[0] if is_copy else self.call(node.op, operands)
 
 
 class SimdWriter(Writer):
