@@ -130,9 +130,8 @@ def family_routines(family: str) -> list[Routine]:
 
     def sense(world: Any, params: Any, state: Any) -> Any:
         full = world._replace(**constants)
-        state, sensing = trial.observe(
-            full, params, state._replace(**blank), physics=physics, rules=SETTING.rules
-        )
+        loop = trial.ControlLoop(physics, SETTING.rules)
+        state, sensing = trial.observe(full, params, state._replace(**blank), loop)
         outline = trial.outline(full, state.qpos)
         touch = sensing.observation._replace(in_contact=sensing.reading.contact_type != NONE)
         taxels = features.taxel_observation(touch, sensing.reading, full.skin, state.skin, outline)
