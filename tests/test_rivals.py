@@ -2,6 +2,7 @@
 
 import math
 
+import helpers
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -26,7 +27,6 @@ from rps_jax.control.laws.rps import RPSParams, RPSState
 from rps_jax.control.laws.rps_plus import RPSPlusParams
 from rps_jax.control.observation import (
     ForceObservation,
-    Observation,
     PoseObservation,
     TaxelObservation,
     Twist,
@@ -70,10 +70,7 @@ def step_once(law, params, observation):
 
 
 def observe(contact=(0.36, 0.0), target=(2.36, 0.0), robot=(0.0, 0.0), yaw=0.0, touching=True):
-    return Observation(
-        jnp.array(robot), jnp.asarray(yaw), jnp.array(contact), jnp.asarray(touching),
-        jnp.array(target), 0.02,
-    )  # fmt: skip
+    return helpers.observation(robot, yaw, contact, touching, target)
 
 
 def with_pose(observation, p_object=(1.0, 0.0), radius=0.2):

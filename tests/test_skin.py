@@ -9,12 +9,11 @@ import itertools
 import math
 
 import chex
-import hypothesis
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import FRONT, SETTLED, SIDE, box, place_before_the_front, row
+from helpers import FRONT, SEEDS, SETTLED, SIDE, box, place_before_the_front, property_test, row
 from hypothesis import strategies as st
 
 from rps_jax.geometry import footprint as fp
@@ -28,14 +27,10 @@ FACES = Shell().rows()
 TAXELS = np.asarray(Shell().taxels()[:, 0])  # (42, 2) [m] their middles
 TAXEL_SAMPLES = np.asarray(Shell().taxels(5))  # (42, 5, 2) [m]
 
-property_test = hypothesis.settings(max_examples=100, deadline=None)
 BATCH = 128  # of one batch
 
 
-def any_seed(test):
-    return property_test(hypothesis.given(st.integers(0, 2**32 - 1))(test))
-
-
+any_seed = property_test(SEEDS)
 IDEAL, CAPACITIVE = IdealSkin(), CapacitiveSkin()
 KEY = jax.random.key(0)
 
@@ -322,8 +317,7 @@ def active_taxels(active):
     return reading.contact_type, reading.p_robot_contact
 
 
-@property_test
-@hypothesis.given(st.sets(st.integers(0, 41), min_size=2))
+@property_test(st.sets(st.integers(0, 41), min_size=2))
 def test_several_taxels_give_a_line_at_the_mean_of_the_outermost_two(active):
     kind, contact = active_taxels(active)
     assert kind == LINE

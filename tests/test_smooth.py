@@ -8,15 +8,13 @@ from dataclasses import replace
 from functools import partial
 
 import chex
-import hypothesis
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 import test_law
-from helpers import FRONT, PAPER, SETTLED, SIDE, case, moved
+from helpers import FRONT, PAPER, SEEDS, SETTLED, SIDE, case, moved, property_test
 from helpers import box as box_at
-from hypothesis import strategies as st
 from jax.flatten_util import ravel_pytree
 from test_skin import BATCH, mirrored, random_shapes, sense_all
 
@@ -39,9 +37,7 @@ COLD = Temperatures(1e-6, 1e-6, 1e-6, 1e-6)
 WORLDS = 256
 
 
-def any_seed(test):
-    seeds = hypothesis.given(st.integers(0, 2**32 - 1))
-    return hypothesis.settings(max_examples=30, deadline=None)(seeds(test))
+any_seed = property_test(SEEDS, examples=30)
 
 
 # The law
