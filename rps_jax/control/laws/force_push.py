@@ -126,7 +126,7 @@ def steer(
     theta_p: jax.Array,  # () [rad] at the last step
     theta_f: jax.Array,  # () [rad] angle of the force from the path
     offset: jax.Array,  # () [m] of the contact, to the path's left
-    limit: jax.Array,  # () [rad] bound on the change of theta_p without contact
+    limit: Scalar,  # () [rad] bound on the change of theta_p without contact
     in_contact: jax.Array,
 ) -> jax.Array:
     """Return the angle () [rad] of the push from the path."""
