@@ -83,6 +83,13 @@ def check_finite(name: str, value: Any, **bounds: Any) -> float:
     return scalar
 
 
+def check_vector(name: str, values: Sequence[object], **bounds: float | str) -> list[float]:
+    """Return the finite numbers x and y within bounds: see `check_number`."""
+    return [
+        check_finite(f"{name} {axis}", v, **bounds) for axis, v in zip("xy", values, strict=True)
+    ]
+
+
 def check_count(name: str, value: object, *, at_least: int = 1, at_most: int) -> int:
     """Return a value if it is a whole number within bounds, or raise InputError."""
     if not (isinstance(value, numbers.Integral) and at_least <= int(value) <= at_most):

@@ -69,8 +69,7 @@ class Case(TrialOptions):
         skins.parse_skin(self.skin or "ideal")
         check_fields(self)
         errors.check_number("shift time", self.shift.time, at_least=0, unit="s")
-        for axis, value in zip("xy", self.shift.p_robot, strict=True):
-            errors.check_finite(f"shift {axis}", value, at_least=-5, at_most=5, unit="m")
+        errors.check_vector("shift", self.shift.p_robot, at_least=-5, at_most=5, unit="m")
         scene.check_target(self.target, self.base.shell)
 
     @cached_property

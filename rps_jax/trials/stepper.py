@@ -117,10 +117,7 @@ class Live:
         Raises:
           InputError: it is not finite, or out of bounds.
         """
-        target = [
-            errors.check_finite(f"target {axis}", value, at_least=-50, at_most=50, unit="m")
-            for axis, value in zip("xy", p_world_target, strict=True)
-        ]
+        target = errors.check_vector("target", p_world_target, at_least=-50, at_most=50, unit="m")
         dtype = self._worlds.p_world_target.dtype
         self._worlds = self._worlds._replace(p_world_target=np.array([target], dtype))
         self._continue(min_distance=np.full_like(self._trial.min_distance, np.inf))
@@ -131,10 +128,7 @@ class Live:
         Raises:
           InputError: it is not finite, or more than 5 m.
         """
-        offset = [
-            errors.check_finite(f"shove {axis}", value, at_least=-5, at_most=5, unit="m")
-            for axis, value in zip("xy", p_robot, strict=True)
-        ]
+        offset = errors.check_vector("shove", p_robot, at_least=-5, at_most=5, unit="m")
         time = self._trial.steps * self.period
         dtype = self._worlds.qpos.dtype
         shift = Shift(jnp.asarray(time, dtype), jnp.array([offset], dtype))

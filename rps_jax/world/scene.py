@@ -255,10 +255,7 @@ def check_contact(friction: Friction, mass: float | None) -> None:
 
 def check_target(p_world_target: tuple[float, float], shell: Shell = Shell()) -> None:
     """Raise InputError for a target [m] under the robot or more than 50 m away."""
-    x, y = (
-        errors.check_finite(f"target {axis}", value, at_least=-50, at_most=50, unit="m")
-        for axis, value in zip("xy", p_world_target, strict=True)
-    )
+    x, y = errors.check_vector("target", p_world_target, at_least=-50, at_most=50, unit="m")
     half_x, half_y = shell.half
     if abs(x) <= half_x and abs(y) <= half_y:
         covered = f"|x| <= {half_x:g} m and |y| <= {half_y:g} m"
