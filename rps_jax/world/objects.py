@@ -165,10 +165,10 @@ def _compiled(label: str, path: Path) -> mujoco.MjModel:
     free = joint.type[0] == mujoco.mjtJoint.mjJNT_FREE and joint.bodyid[0] == body.id
     if not free or joint.qposadr[0] != 3 or model.nq != 10:
         rule = "give the body object a free joint, and no other body a joint"
-        raise errors.not_allowed(f"{label}: joints", path, rule)
+        raise InputError(f"{label}: joints of {path} are not allowed: {rule}.")
     if not math.isclose(model.body_subtreemass[body.id], body.mass[0]):
         rule = "give the body object all geoms, and no other body within it"
-        raise errors.not_allowed(f"{label}: bodies", path, rule)
+        raise InputError(f"{label}: bodies of {path} are not allowed: {rule}.")
     return model
 
 
