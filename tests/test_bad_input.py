@@ -54,7 +54,10 @@ CORRUPT = {
     "worlds": ({"worlds": 2.5}, "worlds = 2.5 is not allowed: .* whole number"),
     "class": ({"laws": {"rps": {"law": "Lost"}}}, "unknown class of parameters 'Lost': choose"),
     "params": ({"laws": {"rps": WORD}}, "L = x is not allowed"),
-    "few": ({"laws": {"rps": {"law": "RPSParams", "L": 1}}}, "parameters of .* eta, .* and not L"),
+    "few": (
+        {"laws": {"rps": {"law": "RPSParams", "L": 1}}},
+        "parameters of .* = L is not allowed: they are eta, ",
+    ),
     "laws": ({"laws": []}, ""),
     "physics": ({"physics": {"timestep": -1}}, "timestep = -1 is not allowed"),
 }
