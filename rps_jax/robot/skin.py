@@ -100,8 +100,8 @@ class IdealSkin(NamedTuple):
         if self.temperature is not None:
             return state, self._smooth_reading(footprint, self.temperature)
         hits, positions = [], []  # of both ends of each row's interval, in strip order
-        for row, start, along, *ends, hit in self._crossings(footprint, self.tolerance):
-            for s in ends:
+        for row, start, along, low, high, hit in self._crossings(footprint, self.tolerance):
+            for s in (low, high):
                 s = jnp.clip(s, 0.0, row.length)
                 positions.append(jnp.concatenate([start + s * along, row.offset + s[None]]))
                 hits.append(hit)
