@@ -126,20 +126,17 @@ def main() -> int:
     arguments = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
         current = record(arguments.pattern, Path(folder))
+    expected = json.loads(arguments.file.read_text()) if arguments.file.exists() else {}
     if arguments.action == "record":
-        if arguments.file.exists():
-            current = json.loads(arguments.file.read_text()) | current
-        arguments.file.write_text(json.dumps(current, indent=1))
-        print(f"{sum(map(len, current.values()))} digests of {len(current)} runs")
+        arguments.file.write_text(json.dumps(expected | current, indent=1))
         return 0
-    expected = json.loads(arguments.file.read_text())
-    pairs = [(run, key) for run in current for key in current[run] | expected.get(run, {})]
-    changed = [
-        f"{run}: {key}"
-        for run, key in pairs
-        if current[run].get(key) != expected.get(run, {}).get(key)
-    ]
-    print("\n".join([*changed, f"{len(pairs) - len(changed)} of {len(pairs)} digests are equal"]))
+    changed, count = [], 0
+    for run, digests in current.items():
+        previous = expected.get(run, {})
+        keys = digests | previous
+        changed += [f"{run}: {key}" for key in keys if digests.get(key) != previous.get(key)]
+        count += len(keys)
+    print("\n".join([*changed, f"{count - len(changed)} of {count} digests are equal"]))
     return 1 if changed else 0
 
 

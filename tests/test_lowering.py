@@ -41,6 +41,7 @@ BINARY = {
     **{"min": jnp.minimum, "div": lax.div, "rem": lax.rem, "lt": jnp.less, "le": jnp.less_equal},
     **{"gt": jnp.greater, "ge": jnp.greater_equal, "eq": jnp.equal, "ne": jnp.not_equal},
 }
+MATRIX = np.arange(6.0).reshape(3, 2)
 BITS = {"and": jnp.bitwise_and, "or": jnp.bitwise_or, "xor": jnp.bitwise_xor}
 CASES = {
     **{f"{name} of a real": lambda x, i, f=f: f(x) for name, f in UNARY.items()},
@@ -48,33 +49,21 @@ CASES = {
     **{f"{name} of integers": lambda x, i, f=f: f(i[0], i[1:]) for name, f in BINARY.items()},
     **{f"{name} of integers": lambda x, i, f=f: f(i[0], i[1:]) for name, f in BITS.items()},
     **{f"{name} of bools": lambda x, i, f=f: f(x[0] > 0, x > 1) for name, f in BITS.items()},
-    "not of integers": lambda x, i: ~i,
-    "not of bools": lambda x, i: ~(x > 0),
-    "eq of bools": lambda x, i: (x > 0) == (i > 0),
-    "neg of integers": lambda x, i: -i,
-    "abs of integers": lambda x, i: jnp.abs(i),
-    "sign of integers": lambda x, i: jnp.sign(i),
-    "square of integers": lambda x, i: jnp.square(i),
+    "not and eq of bools": lambda x, i: (~(x > 0), (x > 0) == (i > 0)),
+    "signs of integers": lambda x, i: (~i, -i, jnp.abs(i), jnp.sign(i), jnp.square(i), i**3),
     "arctan2": lambda x, i: jnp.arctan2(x[0] + (x[0] == 0), x[1:] + (x[1:] == 0)),
     "arctan2 of zeros": lambda x, i: jnp.arctan2(x[0], x[1:]),
     "pow": lambda x, i: jnp.abs(x[0]) ** x[1:],
     "integer powers": lambda x, i: jnp.stack([x**0, x**3, x**-2]),
-    "integer powers of integers": lambda x, i: i**3,
-    "clamp": lambda x, i: lax.clamp(x[0], x[1], x[2]),
-    "clamp of integers": lambda x, i: lax.clamp(i[0], i[1], i[2]),
-    "where": lambda x, i: jnp.where(x > 1, x, i.astype(x.dtype)),
-    "where of bools": lambda x, i: jnp.where(x > 1, i > 0, x < 0),
+    "clamp": lambda x, i: (lax.clamp(x[0], x[1], x[2]), lax.clamp(i[0], i[1], i[2])),
+    "where": lambda x, i: (jnp.where(x > 1, x, i.astype(x.dtype)), jnp.where(x > 1, i > 0, x < 0)),
     "a choice of three": lambda x, i: lax.select_n(i % 3, x, -x, 2 * x),
     "a switch": lambda x, i: lax.switch(i[0], [lambda: x, lambda: -x, lambda: 2 * x]),
-    "int32 of a real": lambda x, i: x.astype(jnp.int32),
-    "real of an integer": lambda x, i: i.astype(x.dtype),
-    "real of a bool": lambda x, i: (x > 1).astype(x.dtype),
-    "integer of a bool": lambda x, i: (x > 1).astype(jnp.int32),
-    "bool of a real": lambda x, i: x.astype(bool),
-    "bool of an integer": lambda x, i: i.astype(bool),
-    "sums": lambda x, i: (x[:2].sum(), jnp.stack([x, x]).sum(0)),
+    "casts of a real": lambda x, i: (x.astype(jnp.int32), x.astype(bool)),
+    "casts of an integer": lambda x, i: (i.astype(x.dtype), i.astype(bool)),
+    "casts of a bool": lambda x, i: ((x > 1).astype(x.dtype), (x > 1).astype(jnp.int32)),
+    "sums and a product": lambda x, i: (x[:2].sum(), jnp.stack([x, x]).sum(0), x.prod()),
     "a sum of many": lambda x, i: (x[0] * jnp.arange(1.0, 8, dtype=x.dtype)).sum(),
-    "a product": lambda x, i: x.prod(),
     "extremes": lambda x, i: (x.max(), x.min(), i.max(), i.min()),
     # XLA itself drops some NaN in a reduction of a tile.
     "a maximum of many": lambda x, i: jnp.tile(jnp.where(x == x, x, 0), 4).max(),
@@ -92,17 +81,12 @@ CASES = {
     "a loop": lambda x, i: lax.fori_loop(0, 5, lambda k, y: 0.5 * y + k * x, x),
     "a swap in a loop": lambda x, i: lax.fori_loop(0, 3, lambda _, y: (y[1], y[0]), (x, -x)),
     "a scan": lambda x, i: lax.scan(lambda s, y: (0.5 * s + y, s), x[0], x)[1],
-    "a matrix": lambda x, i: (
-        jnp.where(jnp.isfinite(x), jnp.clip(x, -9, 9), 1)
-        @ jnp.arange(6.0, dtype=x.dtype).reshape(3, 2)
-    ),
+    "a matrix": lambda x, i: jnp.where(jnp.abs(x) < 9, x, 1) @ MATRIX.astype(x.dtype),
     "nothing": lambda x, i: (x[:0], x[:0].sum(), jnp.concatenate([x[:0], x]), i[:0] + 1),
 }
 # Cases that a back end refuses, with a sentence that names the operation.
-UNSUPPORTED = {
-    "js": {"erf of a real"},
-    "onnx": {"log1p of a real", "expm1 of a real", "cbrt of a real"},
-}
+ONNX_LACKS = {f"{name} of a real" for name in ("log1p", "expm1", "cbrt")}
+UNSUPPORTED = {"js": {"erf of a real"}, "onnx": ONNX_LACKS}
 # Cases in which a back end differs from JAX: ONNX has no sign of zero.
 DIFFERENT = {"onnx": {"arctan2 of zeros"}}
 COMPILER = device.find_compiler()
@@ -133,10 +117,8 @@ def all_results(names, x, i):
 
 def traced(names):
     """Return cases as a routine of `x` and `i`."""
-    shapes = {
-        "x": {"x": jax.ShapeDtypeStruct((3,), np.float64)},
-        "i": {"i": jax.ShapeDtypeStruct((3,), np.int32)},
-    }
+    kinds = {"x": np.float64, "i": np.int32}
+    shapes = {name: {name: jax.ShapeDtypeStruct((3,), kind)} for name, kind in kinds.items()}
     run = lambda x, i: (all_results(names, x["x"], i["i"]),)  # noqa: E731
     return routine("run", run, shapes, ["out"])
 
