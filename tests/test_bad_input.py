@@ -3,10 +3,11 @@ before anything compiles."""
 
 import json
 import re
+import sys
 import time
 
 import pytest
-from helpers import one_sentence, rps
+from helpers import one_sentence, refusal, rps
 
 from rps_jax.control import registry
 from rps_jax.control.laws.rps import RPSParams
@@ -358,3 +359,20 @@ def test_a_corrupt_results_file_is_named(tmp_path):
     (tmp_path / "results.nc").write_bytes(b"not a file of results")
     with pytest.raises(InputError, match=r"results\.nc is corrupt"):
         files.read_results(tmp_path)
+
+
+MISSING = {
+    "attack": ("ribs", "failures"),
+    "sensitivity": ("SALib.sample.sobol", "failures"),
+    "export onnx --law rps": ("onnx", "export"),
+    "push --no-video --bag push.mcap": ("mcap_ros2.writer", "bags"),
+}
+
+
+@pytest.mark.parametrize("command", MISSING)
+def test_a_missing_package_is_named(command, tmp_path, capsys, monkeypatch):
+    package, extra = MISSING[command]
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setitem(sys.modules, package, None)
+    hint = f"is not installed: run pip install 'rps_jax[{extra}]'"
+    assert hint in refusal(capsys, command)

@@ -3,7 +3,6 @@
 import json
 import re
 import shutil
-import sys
 
 import jax
 import numpy as np
@@ -213,12 +212,6 @@ def test_an_unsupported_operation_is_named(operation, code, tmp_path, capsys, re
     for kind, name in {"c": "C", "js": "JavaScript", "onnx": "ONNX"}.items():
         error = refusal(capsys, f"export {kind} --law {law} --out", tmp_path)
         assert f"operation `{operation}` is not supported by the {name} exporter" in error
-
-
-def test_the_command_names_missing_packages_of_onnx(tmp_path, capsys, monkeypatch):
-    monkeypatch.setitem(sys.modules, "onnx", None)
-    error = refusal(capsys, "export onnx --law rps --out", tmp_path)
-    assert "pip install 'rps_jax[export]'" in error
 
 
 def test_the_command_writes_a_folder_with_the_chosen_parameters(tmp_path, capsys):

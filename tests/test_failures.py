@@ -1,7 +1,5 @@
 """Studies of failures: severity, rare events, attacks, Sobol indices and regression worlds."""
 
-import sys
-
 import numpy as np
 import pytest
 import xarray as xr
@@ -196,13 +194,10 @@ def test_an_attack_fills_many_more_cells_than_drawn_worlds(synthetic):
     assert results.failing[-1] == (results.margin >= 0).sum() == results.sizes["elite"]
     assert attack.yields(results)["times"] > 4
     assert (np.diff(results.severity) <= 0).all()
-    worlds = points.worlds_at("wide", results.u)
-    elite = results.isel(elite=0)
-    cell = results.margin.isel(object=int(elite.which_object)).sel(
-        {axis: float(worlds[axis][0]) for axis in ("com_offset", "friction_robot")},
-        method="nearest",
-    )
-    assert float(elite.severity) - 1 in cell.values
+    worlds, elite = points.worlds_at("wide", results.u), results.isel(elite=0)
+    at = {axis: float(worlds[axis][0]) for axis in ("com_offset", "friction_robot")}
+    margin = results.margin.isel(object=int(elite.which_object))
+    assert float(elite.severity) - 1 in margin.sel(at, method="nearest").values
     assert {0, 1} <= set(results.which_object.values)
 
 
@@ -229,16 +224,6 @@ def test_an_elite_fails_whatever_the_noise(synthetic):
 
     once, often = (rps_jax.attack("rps", "wide", **SMALL | {"repeats": n}) for n in (1, 4))
     assert failure_rate(often) > failure_rate(once) + 0.02
-
-
-@pytest.mark.parametrize(
-    ("command", "module", "package"),
-    [("attack", "ribs", "ribs"), ("sensitivity", "SALib.sample.sobol", "SALib")],
-)
-def test_a_missing_package_is_named(command, module, package, tmp_path, capsys, monkeypatch):
-    monkeypatch.setitem(sys.modules, module, None)
-    sentence = refusal(capsys, command, "--out", tmp_path / "run")
-    assert f"{package} is not installed: run pip install 'rps_jax[failures]'" in sentence
 
 
 def test_the_command_searches_checks_lists_and_draws(tmp_path, capsys):
