@@ -34,10 +34,10 @@ def pytest_configure(config):
 
 # Slow files start first; a slow file at the end would leave processors idle.
 LONGEST = (
-    *("failures", "learning", "native", "export", "ladder", "rivals", "gpu_writer", "smooth"),
-    *("bags", "examples", "sweep", "shell", "trial", "robot", "video", "points", "faults"),
-    *("force_push_grid", "film", "evaluate", "feet", "ground", "force", "library", "cli", "study"),
-    *("quasistatic", "fit", "physics", "notebooks", "publish", "quality", "limits", "isolation"),
+    *("learning", "failures", "native", "rivals", "smooth", "cli", "examples", "library", "ladder"),
+    *("export", "sweep", "shell", "trial", "robot", "fit", "video", "points", "faults", "bags"),
+    *("ground", "force_push_grid", "feet", "house", "gpu_writer", "film", "footprint", "arena"),
+    *("force", "evaluate", "study", "quasistatic", "physics", "notebooks", "publish", "quality"),
 )
 
 
