@@ -157,7 +157,7 @@ BAD_FILES = {
     "lacks the body 'base': include base.xml": _without_base,
     "lacks the joint 'object'": lambda root: _body(root).find("freejoint").attrib.pop("name"),
     "lacks the geom 'object'": _without_a_name,
-    "joints of .* no other body a joint": _with_a_hinge,
+    "joints .* no other body a joint": _with_a_hinge,
     "no other body within it": _with_a_lid,
     "0 to 0.8 m is .* in the middle of its height": lambda r: _geom(r).set("pos", "0 0 0.4"),
     "height = 0.02": lambda root: _geom(root).set("size", "0.2 0.2 0.01"),
