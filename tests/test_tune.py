@@ -273,7 +273,7 @@ def test_the_curve_is_a_table_that_grows_with_the_run(tmp_path, pretended):
         for name in ("validation_success", "simulated"):
             assert curve[name].tolist() == results[name].values.tolist()
         assert curve["params.K_h"].tolist() == results.params.values[:, 1].tolist()
-        best = results.params.isel(generation=results.validation.argmin())
+        best = results.params.isel(generation=results.validation.argmin("generation"))
         np.testing.assert_allclose(results.tuned, best, rtol=1e-5)
 
 
