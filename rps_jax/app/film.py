@@ -92,14 +92,15 @@ class Film(Action[Path]):
 
     def check(self) -> None:
         """Check the grid, the file and the selected trials."""
-        self.takes()
         out = Path(self.out or self.default_folder)
         if out.is_dir():
             raise InputError(f"out = {out} is a folder: name a file, as {out / 'film.mp4'}.")
+        folder.read_manifest(Path(self.run))
         folder.ensure_writable(out.parent)
         for fix in video.check().values():
             if fix:
                 raise InputError(fix)
+        self.takes()
 
     def progress_bar(self) -> Bar:
         """A bar over simulated time."""
