@@ -225,10 +225,8 @@ def _count_workers(hosts: Sequence[Environment], num_cpus: int, num_gpus: int) -
     count = sum(int(min(r.get(name, 0) // n for name, n in claims.items())) for r in resources)
     if not count:
         with_gpu = " beside a GPU" if num_gpus else ""
-        raise InputError(
-            f"workers = {num_cpus} is not allowed: no host of the cluster has so many processors"
-            f"{with_gpu}."
-        )
+        rule = f"no host of the cluster has so many processors{with_gpu}"
+        raise errors.not_allowed("workers", num_cpus, rule)
     return count
 
 

@@ -156,10 +156,8 @@ def _checked(params: LawParams) -> LawParams:
     for path, leaf in registry.named_leaves(params).items():
         field, values = f"{name}.{path}", np.asarray(leaf)
         if values.dtype.kind not in "biuf" or not values.ndim or not len(values):
-            raise InputError(
-                f"{field} = {leaf} is not allowed: give an array of numbers, one for each "
-                "candidate."
-            )
+            rule = "give an array of numbers, one for each candidate"
+            raise errors.not_allowed(field, leaf, rule)
         if np.isnan(values).any():
             raise InputError(f"{field} of a candidate = nan is not allowed: it must be a number.")
         sizes[field] = len(values)

@@ -112,11 +112,11 @@ def _shard_dataset(results: Results, folder: Path, shard: Shard) -> xr.Dataset:
 def missing_chunks(folder: Path, plan: Plan, shard: Shard) -> tuple[list[int], int]:
     """Return the chunks of a shard that a run folder lacks, and the number of finished trials."""
     stored, chunks = Checkpoints(folder).paths(), shard_chunks(plan, shard)
-    missing = [number for number in chunks if name_of(number) not in stored]
-    sizes = {number: trials.size for number, trials in chunks.items()}
-    return missing, sum(sizes.values()) - sum(sizes[number] for number in missing)
+    missing = [chunk for chunk in chunks if name_of(chunk) not in stored]
+    sizes = {chunk: trials.size for chunk, trials in chunks.items()}
+    return missing, sum(sizes.values()) - sum(sizes[chunk] for chunk in missing)
 
 
-def store_chunk(folder: Path, number: int, content: bytes) -> Path:
+def store_chunk(folder: Path, chunk: int, content: bytes) -> Path:
     """Write the file of a chunk into a run folder, atomically."""
-    return Checkpoints(folder).put(name_of(number), content, ".npz", new=True)
+    return Checkpoints(folder).put(name_of(chunk), content, ".npz", new=True)

@@ -87,10 +87,10 @@ class Plan:
     def chunks(self) -> dict[int, np.ndarray]:
         """Indices of the trials of every chunk, by the chunk's number."""
         chunks, objects = {}, self.object_of(np.arange(self.worlds))
-        for which in range(len(self.domain.objects)):
-            worlds = np.flatnonzero(objects == which)
+        for object_index in range(len(self.domain.objects)):
+            worlds = np.flatnonzero(objects == object_index)
             for law in range(len(self.laws)):
-                first = (law * len(self.domain.objects) + which) * self.max_chunks
+                first = (law * len(self.domain.objects) + object_index) * self.max_chunks
                 for block in range(math.ceil(worlds.size / self.part)):
                     members = worlds[block * self.part : (block + 1) * self.part]
                     chunks[first + block] = law * self.worlds + members
@@ -98,9 +98,9 @@ class Plan:
 
     def program_key(self, chunk: int) -> ProgramKey:
         """Return the key of the program that runs a chunk."""
-        law, which = divmod(chunk // self.max_chunks, len(self.domain.objects))
+        law, object_index = divmod(chunk // self.max_chunks, len(self.domain.objects))
         params = list(self.laws.values())[law]
-        return which, type(params), *map(np.shape, jax.tree.leaves(params))
+        return object_index, type(params), *map(np.shape, jax.tree.leaves(params))
 
     @functools.cached_property
     def trials_by_key(self) -> Counter[ProgramKey]:

@@ -16,6 +16,7 @@ import numpy as np
 import pandas as pd
 import xarray as xr
 
+from rps_jax import errors
 from rps_jax.errors import InputError
 from rps_jax.record import files
 from rps_jax.record.checkpoint import Checkpoints
@@ -62,7 +63,7 @@ class Results:
         self.shape = len(plan.laws), plan.worlds
         self._outcomes = {name: self._empty(name) for name in UNITS}  # (law, world, ...)
         self._drawn: dict[str, np.ndarray] = {}  # (world,) drawn quantities
-        self._running = {number: plan.chunks[number].size for number in chunks}  # trials
+        self._running = {chunk: plan.chunks[chunk].size for chunk in chunks}  # trials
 
     def _empty(self, name: str) -> np.ndarray:
         """Return an empty column of outcomes; its memory is claimed when it is filled."""
@@ -73,8 +74,8 @@ class Results:
     def _chunk_of(self) -> np.ndarray:
         """Number of the chunk of each trial."""
         chunk_of = np.empty(self.plan.num_trials, np.int32)
-        for number, trials in self.plan.chunks.items():
-            chunk_of[trials] = number
+        for chunk, trials in self.plan.chunks.items():
+            chunk_of[trials] = chunk
         return chunk_of
 
     # --- a rollout -------------------------------------------------------------------------
@@ -133,7 +134,7 @@ class Results:
         Raises:
           InputError: chunks are missing.
         """
-        missing = [number for number in self.plan.chunks if number not in self._running]
+        missing = [chunk for chunk in self.plan.chunks if chunk not in self._running]
         for folder in folders:
             missing = self.read(folder, missing)
         if missing:
@@ -216,10 +217,8 @@ def check_table(path: Path) -> None:
     if path.suffix not in (".csv", ".parquet"):
         raise InputError(f"table = {path} is not allowed: name a file NAME.csv or NAME.parquet.")
     if path.suffix == ".parquet" and not importlib.util.find_spec("pyarrow"):
-        raise InputError(
-            f"table = {path} needs pyarrow, which is not installed: run pip install pyarrow, or "
-            "name a .csv file."
-        )
+        rule = "it needs pyarrow: run pip install pyarrow, or name a .csv file"
+        raise errors.not_allowed("table", path, rule)
     if not path.parent.is_dir():
         raise InputError(f"table = {path} is not allowed: {path.parent} is not a folder.")
 

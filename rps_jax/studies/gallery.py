@@ -175,7 +175,7 @@ def _simulate(
 ) -> Mapping[int, xr.Dataset]:
     """Return traces of trials of a law over time, by world; one batch for each object."""
     traces: dict[int, xr.Dataset] = {}
-    objects = plan.domain.object_of(worlds)
+    objects = plan.object_of(worlds)
     for k in np.unique(objects):
         rows = worlds[objects == k]
         batch = build_batch(plan, law, rows)

@@ -118,9 +118,7 @@ def friction_of(friction: FrictionLike) -> Friction:
         return FRICTION[errors.check_name("friction set", friction, FRICTION)]
     values = friction.split(",") if isinstance(friction, str) else friction
     if not isinstance(values, tuple | list) or len(values) != 2:
-        raise errors.InputError(
-            f"friction = {friction!r} is not allowed: write S1, S2 or ground,robot."
-        )
+        raise errors.not_allowed("friction", repr(friction), "write S1, S2 or ground,robot")
     ground, robot = (
         errors.check_finite(f"friction {name}", value, above=0, at_most=10, text=True)
         for name, value in zip(("ground", "robot"), values, strict=True)

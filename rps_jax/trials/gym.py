@@ -167,9 +167,7 @@ class GymPushVector(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         shape = (self.num_envs, self.push_env.action_size)
         if actions.shape != shape or not np.isfinite(actions).all():
             value = actions.tolist() if actions.shape == shape else f"of shape {actions.shape}"
-            raise errors.InputError(
-                f"action = {value} is not allowed: it must be finite, of shape {shape}."
-            )
+            raise errors.not_allowed("action", value, f"it must be finite, of shape {shape}")
         self._state, rewards = self._act(self._state, actions)
         return np.asarray(rewards, float)
 

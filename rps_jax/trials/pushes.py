@@ -37,7 +37,7 @@ class Trajectory:
 
     snapshots: Snapshot
     outcome: Outcome  # without a leading axis
-    world: World  # likewise
+    world: World  # without a leading axis
     params: LawParams
 
     @property

@@ -146,12 +146,12 @@ class Candidates:
     def draws(self) -> list[tuple[np.ndarray, Domain, Draw]]:
         """Worlds by domain and object: positions (n,) among all D * W, domain and draw."""
         draws = []
-        for number, domain in enumerate(self.domains):
+        for i, domain in enumerate(self.domains):
             objects = domain.object_of(points_.cases(domain, self.points, self.worlds))
             for index in np.unique(objects):
                 at = np.flatnonzero(objects == index)
                 drawn = points_.draw(domain, self.seed, self.points, self.worlds[at])
-                draws.append((number * self.worlds.size + at, domain, drawn))
+                draws.append((i * self.worlds.size + at, domain, drawn))
         return draws
 
     @property

@@ -211,27 +211,6 @@ def outline(world: World, qpos: Float[Array, "10"]) -> Footprint:
     return fp.place(world.footprint, p_robot_object, object_yaw - yaw)
 
 
-def sense(
-    world: World, trial: Trial, period: float
-) -> tuple[SkinState, Reading | SmoothReading, Observation]:
-    """Read the skin at the current positions; return its state, the reading and the observation.
-
-    `period` [s] is the control period.
-    """
-    p_world_robot, yaw = trial.qpos[:2], trial.qpos[2]
-    placed = outline(world, trial.qpos)
-    state, reading = world.skin.sense(trial.skin, placed, period)
-    observation = Observation(
-        p_world_robot,
-        yaw,
-        reading.p_robot_contact,
-        reading.in_contact,
-        world.p_world_target,
-        period,
-    )
-    return state, reading, observation
-
-
 class Measurement(NamedTuple):
     """Readings of skin and odometry in one control step."""
 
@@ -251,7 +230,9 @@ def observe(
     period, rules = loop.physics.control_period, loop.rules
     time = trial.steps * period
     trial = shifted(world, trial, period)
-    skin, reading, observation = sense(world, trial, period)
+    skin, reading = world.skin.sense(trial.skin, outline(world, trial.qpos), period)
+    touched = reading.p_robot_contact, reading.in_contact
+    observation = Observation(trial.qpos[:2], trial.qpos[2], *touched, world.p_world_target, period)
     distance = planar.norm(displacement(observation))
     pose = trial.qpos[JOINTS.base]
     poses, believed = base.observe_pose(
