@@ -321,7 +321,7 @@ def digest(commands: Sequence[Sequence[str]]) -> str:
         name, rest = names.split(words)
         question, _ = flags.parse(names.question_type(name), name, rest)
         options = question.configuration()
-        options |= _REMOVED_OPTIONS.get(options["question"], {})
+        options |= _REMOVED_OPTIONS.get(options.get("question", ""), {})
         configurations.append(_expanded(options))
     text = json.dumps(configurations, sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()[:16]
