@@ -83,7 +83,7 @@ def check_finite(name: str, value: Any, **bounds: Any) -> float:
     return scalar
 
 
-def check_vector(name: str, values: Sequence[object], **bounds: float | str) -> list[float]:
+def check_vector(name: str, values: Iterable[object], **bounds: float | str) -> list[float]:
     """Return the finite numbers x and y within bounds: see `check_number`."""
     return [
         check_finite(f"{name} {axis}", v, **bounds) for axis, v in zip("xy", values, strict=True)

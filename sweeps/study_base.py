@@ -221,7 +221,7 @@ def run_parts(
 
     Each part counts as a number of `trials` in the progress.
     """
-    computed = []
+    computed: list[xr.Dataset] = []
     for label, compute in parts.items():
         computed.append(run.checkpoint(part_name(label), compute))
         run.callback(Progress(trials * len(computed), 0.0))

@@ -18,7 +18,7 @@ import sys
 import warnings
 from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager
-from typing import TYPE_CHECKING, Any
+from typing import Any
 from unittest import mock
 from urllib.parse import urlsplit
 
@@ -26,9 +26,6 @@ import jax
 import numpy as np
 
 from rps_jax.errors import InputError
-
-if TYPE_CHECKING:
-    from viser import GuiInputHandle
 
 _MAX_NUMBER = 1e6  # [1] in a message
 _MAX_LENGTH = 200  # characters of a text
@@ -127,7 +124,7 @@ def _is_bounded(leaf: object) -> bool:
     return isinstance(leaf, int | float) and math.isfinite(leaf) and abs(leaf) <= _MAX_NUMBER
 
 
-def accepts_update(control: GuiInputHandle[Any], updates: Mapping[str, Any]) -> bool:
+def accepts_update(control: Any, updates: Mapping[str, Any]) -> bool:
     """Return whether a control can have this update: an offered value, or a number in bounds."""
     if set(updates) != {"value"}:
         return False

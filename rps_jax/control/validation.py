@@ -98,6 +98,8 @@ def _check_traced(
     is_valid = isinstance(twist, tuple) and len(twist) == 3 and isinstance(details, Details)
     values = ", ".join(map(_describe, results if is_triple else [results]))
     check("" if is_valid else values, "state, Twist, Details, such as Details.from_obs(obs)")
+    assert twist is not None
+    assert details is not None
     for group, kinds, fields in (("a Twist", "iuf", Twist(*twist)), ("Details", "biuf", details)):
         for name, leaf in fields._asdict().items():
             dtype = getattr(leaf, "dtype", None)

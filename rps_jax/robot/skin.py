@@ -111,7 +111,7 @@ class IdealSkin(NamedTuple):
         return state, _reading(jnp.where(jnp.any(hits), kind, NONE), first[:2], last[:2])
 
     def _crossings(
-        self, footprint: Footprint, tolerance: Scalar
+        self, footprint: Footprint, tolerance: Number
     ) -> Iterator[tuple[Row, Array, Array, Array, Array, Array]]:
         """Yield each row of boards, its start and direction, and its interval within `tolerance`.
 
@@ -141,7 +141,7 @@ class IdealSkin(NamedTuple):
         kind = jnp.where(length > self.point_length, LINE, POINT)
         return _smooth_reading(planar.greatest(excess), kind, first, last)
 
-    def _nodes(self, footprint: Footprint, tolerance: Scalar) -> tuple[jax.Array, jax.Array]:
+    def _nodes(self, footprint: Footprint, tolerance: Number) -> tuple[jax.Array, jax.Array]:
         """Return points (N,) [m] of the strip within `tolerance` of a footprint, and their lengths.
 
         A row of boards outside of the tolerance has points along its whole length.

@@ -116,7 +116,8 @@ class Ladder(SweepOptions, MultiLawQuestion[xr.Dataset | xr.DataTree]):
         errors.check_each_once("domain", domains, labels)
         names = {f.name for f in dataclasses.fields(_TestSweep)} - {"laws", "domain"}
         setting = replace(self.setting, seed=seed_of(self.setting.seed, "test"))
-        shared = {name: getattr(self, name) for name in names} | {"setting": setting}
+        shared: dict[str, Any] = {name: getattr(self, name) for name in names}
+        shared["setting"] = setting
         sweeps = {}
         for label, domain in zip(labels, domains, strict=True):
             sweep = _TestSweep(self.chosen, domain, **shared)

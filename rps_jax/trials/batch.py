@@ -21,7 +21,7 @@ from __future__ import annotations
 import functools
 import threading
 import time
-from collections import Counter
+from collections import defaultdict
 from collections.abc import Callable, Hashable, Iterable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, as_completed
 from functools import partial
@@ -190,7 +190,7 @@ class _Monitor:
         self.compile = 0.0  # [s] that the worker who waited longest had no program
         self.stop = False  # set when one worker fails or the user interrupts
         self._finished = 0  # trials
-        self._waits: Counter[int] = Counter()  # [s] for compilation, by thread
+        self._waits: defaultdict[int, float] = defaultdict(float)  # [s] for compilation, by thread
         self._collect, self._callback = collect, callback
         self._lock = threading.Lock()
 

@@ -324,7 +324,7 @@ def _names(values: object) -> tuple[str, ...]:
     return tuple(names)
 
 
-def _range(default: Range | None, values: object) -> Range:
+def _range(default: Range | None, values: Any) -> Range:
     low, high, *flags = values if isinstance(values, list | tuple) else (values, values)
     if len(flags) > 1 or not all(isinstance(flag, bool) for flag in flags):
         raise ValueError("more than low, high, and whether uniform in the logarithm")

@@ -117,7 +117,7 @@ class Points:
             np.floor(rows.get(name, nothing) * count).astype(np.int64)
             for name, count in zip(_CHOICES, domain.counts, strict=True)
         ]
-        return np.ravel_multi_index(choices, domain.counts)
+        return np.asarray(np.ravel_multi_index(choices, domain.counts))
 
     def draw(self, domain: Domain, index: Any) -> Draw:
         """Return the worlds `index` (n,), all of one object of the domain."""

@@ -104,7 +104,7 @@ class Export(Study[xr.Dataset]):
     # --- the tables of one law ---
 
     def _inputs(self, law: str, folder: Path) -> xr.Dataset:
-        counts = {
+        counts: dict[native.Form, int] = {
             form: self.states if form == "onnx" or law in policy.SHIPPED else self.inputs
             for form in _FORMS
         }

@@ -60,7 +60,7 @@ class Drawn(Rare):
         """Return a section that compares the estimates with drawn worlds."""
         (section,) = super().report(results, run)
         values = (float(results[f"drawn_{name}"]) for name in Estimate._fields)
-        against = Estimate(*values)._replace(trials=int(results.drawn_trials))
+        against = Estimate._make(values)._replace(trials=int(results.drawn_trials))
         text = f"{section.text} Those of drawn worlds are by Clopper and Pearson."
         if against.p:
             off = 100 * (float(results.p.mean()) / against.p - 1)

@@ -66,9 +66,10 @@ class ForcePushGrid(Study[xr.Dataset]):
 
     def answer(self, run: Run) -> xr.Dataset:
         """Run the laws and sliders that are missing."""
-        progress, by_law = SequentialProgress(run.callback), []
+        progress = SequentialProgress(run.callback)
+        by_law: list[xr.Dataset] = []
         for law in self.laws:
-            of_law = []
+            of_law: list[xr.Dataset] = []
             for slider in self.sliders:
                 inputs = law, slider, self.engine, self.duration
                 push = partial(grid.run_grid, *inputs, callback=progress)

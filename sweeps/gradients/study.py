@@ -235,7 +235,7 @@ def compare(estimates: Mapping[str, xr.Dataset], names: Sequence[str]) -> xr.Dat
     true = estimates[TRUTH].isel(repeat=0)
     norm = _norm(true.gradient)
     doubt = np.sqrt(true.variance.sum("parameter")) / norm
-    rows = []
+    rows: list[xr.Dataset] = []
     for name in names:
         estimate = estimates[name]
         product = (estimate.gradient * true.gradient).sum("parameter")

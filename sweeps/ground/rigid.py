@@ -138,7 +138,9 @@ def solve(
     mu_robot, tangent = pushed.friction_robot[:, None], _across(touching.normal)
     stiffness = 1.0 if pushed.solids.feet is None else pushed.solids.feet[..., 2]
     pressed, loads, lifted = np.zeros(touching.gap.shape), np.zeros((1, 1)), np.zeros((1, 1))
-    for rounds in range(1, ROUNDS + 1):
+    rounds = 0
+    while True:
+        rounds += 1
         pressure = pushed.height[:, None] * force
         feet = supports(pushed.solids, pose[:, 2], pressure)
         count = feet.shape[1]
@@ -153,9 +155,9 @@ def solve(
         lifted = rounding.lift * speed[:, :count] / count
         changed = max(np.abs(pushing - pressed).max(), np.abs(loads - previous).max())
         pressed = pushing
-        if changed < _CLOSE:
-            break
-    return Solution(twist, force, loads, np.sum(weights * speed, axis=1), rounds)
+        if changed < _CLOSE or rounds == ROUNDS:
+            power = np.sum(weights * speed, axis=1)
+            return Solution(twist, force, loads, power, rounds)
 
 
 # --- support points and contacts -------------------------------------------------------------

@@ -68,6 +68,11 @@ class Landscape(MultiLawQuestion[xr.DataTree]):
                 raise errors.not_allowed("law", label, "give parameters of rps")
 
     @property
+    def _sets(self) -> list[RPSParams]:
+        """Parameters of all laws."""
+        return [params for params in self.chosen.values() if isinstance(params, RPSParams)]
+
+    @property
     def _shares(self) -> tuple[int, int]:
         """Numbers of trials of both parts."""
         per_candidate = len(self.domains) * self.worlds
@@ -102,7 +107,7 @@ class Landscape(MultiLawQuestion[xr.DataTree]):
         Return labelled results (set, parameter, step), with the parameter's `value` at each step.
         """
         names, dims = SUBSETS["full"], ("set", "parameter", "step")
-        by_set = [lines(base, names, self.values) for base in self.chosen.values()]
+        by_set = [lines(base, names, self.values) for base in self._sets]
         grid = jax.tree.map(lambda *x: np.stack(x), *by_set)
         (outcome,) = self._outcomes(jax.tree.map(np.ravel, grid), "validate", **options)
         varied = [np.asarray(getattr(grid, name))[:, i] for i, name in enumerate(names)]
@@ -120,7 +125,7 @@ class Landscape(MultiLawQuestion[xr.DataTree]):
         The selection uses validation worlds. The objectives (candidate,) are then measured in test
         worlds, so that the selection does not bias them.
         """
-        names, sets = SUBSETS["full"], list(self.chosen.values())
+        names, sets = SUBSETS["full"], self._sets
         params = cloud(sets, names, self.candidates, self.spread, self.setting.seed)
         validated, tested = self._outcomes(params, "validate", "test", **options)
         columns = {

@@ -118,7 +118,7 @@ class Levers(SpeedStudy[xr.Dataset]):
     def answer(self, run: Run) -> xr.Dataset:
         """Time the program with each lever."""
         how = {"simulated": self.simulated, "goes": self.goes, "at_once": self.at_once}
-        gains = []
+        gains: list[xr.Dataset] = []
         for gain in measure(self.program, self.family, self.worlds, **how):
             gains.append(gain)
             run.callback(Progress(len(gains), 0.0))

@@ -283,7 +283,7 @@ def turning(
     Returns:
       `asked` and `done` (robot, time) [rad/s]: the law's twist, and the base's own.
     """
-    rows = []
+    rows: list[xr.Dataset] = []
     setting = Setting("fused", rules=Rules(horizon=seconds))
     period = setting.physics.control_period
     for robot in robots.values():

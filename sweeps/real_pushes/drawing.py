@@ -42,7 +42,8 @@ def figure(results: xr.Dataset, table: pd.DataFrame, words: Mapping[str, str]) -
       words: labels of the models.
     """
     picture = Figure(figsize=(12.5, 9.2), layout="constrained", dpi=100)
-    above, below = picture.subfigures(2, 1, height_ratios=(1.45, 1))
+    halves: Any = picture.subfigures(2, 1, height_ratios=(1.45, 1))
+    above, below = halves
     panels = above.subplots(2, len(_SHARES))
     judged = ~results.fits.values & results.group.str.contains(", three feet").values
     paths = pushes.finger_paths(table, _STEPS)

@@ -144,7 +144,7 @@ class Speed(SpeedStudy[xr.Dataset]):
     def report_tables(self, results: xr.Dataset) -> Sequence[Table]:
         """Return speeds beside C MuJoCo, and the gain of refilled slots."""
         fields = ("family", "name", "worlds", "rate")
-        points = [tuple(map(row.get, fields)) for row in records(results, "measurement")]
+        points: list[Any] = [tuple(map(row.get, fields)) for row in records(results, "measurement")]
         picture = Picture("throughput", partial(throughput, points, tuple(IN_C)))
         tables = [Table(table(results), title="Simulated seconds in a second", picture=picture)]
         if "refilled" in results:
