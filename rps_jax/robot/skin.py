@@ -26,7 +26,7 @@ import numpy as np
 from rps_jax import errors
 from rps_jax.geometry import footprint as fp
 from rps_jax.geometry import planar
-from rps_jax.geometry.arrays import Array, Bool, Float, Int, Number, Scalar
+from rps_jax.geometry.arrays import Array, Bool, Float, Int, Scalar
 from rps_jax.geometry.footprint import Footprint
 from rps_jax.record.options import parse_changes
 from rps_jax.robot.shell import HALF_WIDTH, Row, Shell
@@ -78,7 +78,7 @@ class IdealSkin(NamedTuple):
     tolerance: float | jax.Array = 0.006  # [m]
     point_length: float | jax.Array = 2 * HALF_WIDTH / 12  # [m] one taxel: longest POINT contact
     shell: Shell = Shell()  # outline and boards; in a trial, the robot's
-    temperature: Number | None = None  # [m]
+    temperature: Scalar | None = None  # [m]
 
     def check(self) -> None:
         """Raise InputError for fields that are no lengths."""
@@ -111,7 +111,7 @@ class IdealSkin(NamedTuple):
         return state, _reading(jnp.where(jnp.any(hits), kind, NONE), first[:2], last[:2])
 
     def _crossings(
-        self, footprint: Footprint, tolerance: Number
+        self, footprint: Footprint, tolerance: Scalar
     ) -> Iterator[tuple[Row, Array, Array, Array, Array, Array]]:
         """Yield each row of boards, its start and direction, and its interval within `tolerance`.
 
@@ -123,7 +123,7 @@ class IdealSkin(NamedTuple):
             low, high = fp.crossing(footprint, start, along, tolerance)
             yield row, start, along, low, high, (low <= high) & (high >= 0) & (low <= row.length)
 
-    def _smooth_reading(self, footprint: Footprint, temperature: Number) -> SmoothReading:
+    def _smooth_reading(self, footprint: Footprint, temperature: Scalar) -> SmoothReading:
         """Return the reading of points whose activity is a sigmoid.
 
         The activity of a point at signed distance x is sigmoid((tolerance - x) / temperature). The
@@ -141,7 +141,7 @@ class IdealSkin(NamedTuple):
         kind = jnp.where(length > self.point_length, LINE, POINT)
         return _smooth_reading(planar.greatest(excess), kind, first, last)
 
-    def _nodes(self, footprint: Footprint, tolerance: Number) -> tuple[jax.Array, jax.Array]:
+    def _nodes(self, footprint: Footprint, tolerance: Scalar) -> tuple[jax.Array, jax.Array]:
         """Return points (N,) [m] of the strip within `tolerance` of a footprint, and their lengths.
 
         A row of boards outside of the tolerance has points along its whole length.
@@ -172,7 +172,7 @@ class CapacitiveSkin(NamedTuple):
     gain_spread: float | jax.Array = 0.0  # [1] standard deviation of the taxels' gains about 1
     dead_share: float | jax.Array = 0.0  # [1] probability that a taxel is dead
     shell: Shell = Shell()  # outline and boards; in a trial, the robot's
-    temperature: Number | None = None  # [1]
+    temperature: Scalar | None = None  # [1]
 
     def check(self) -> None:
         """Raise InputError for foam, filter or imperfections that no skin can have."""
@@ -238,7 +238,7 @@ class CapacitiveSkin(NamedTuple):
         state = self._filtered(state, raw, period)
         return state, self._smooth_reading(state, self.temperature)
 
-    def _smooth_reading(self, state: SkinState, temperature: Number) -> SmoothReading:
+    def _smooth_reading(self, state: SkinState, temperature: Scalar) -> SmoothReading:
         """Return the reading of taxels whose activity is a sigmoid.
 
         The activity of a taxel is sigmoid((signal - threshold) / temperature). It serves as the
