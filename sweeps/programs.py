@@ -15,7 +15,6 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from rps_jax import engines
 from rps_jax.control.base import LawParams
 from rps_jax.control.laws.rps import RPSParams
 from rps_jax.trials import pushes, trial
@@ -72,8 +71,6 @@ class Program(NamedTuple):
     simulated: float
     compile: float  # [s]
     memory: float  # [bytes] of arguments, results and intermediate values
-    contacts: int
-    physics: Physics
     go: Callable[[Trial], Trial]
     start: Trial
     text: Callable[[], str | None]  # HLO of the compiled program, if available
@@ -126,13 +123,10 @@ def traced(
         analysis: Any = program.memory_analysis()
         parts = ("argument", "output", "temp")
         memory = sum(getattr(analysis, f"{part}_size_in_bytes") for part in parts)
-        corners = cases.worlds.footprint.vertices.shape[-2]  # 1 for a cylinder
-        contacts = engines.get(setting.engine).contacts(cases.stage, corners)
         go = partial(program, shared, batch, params)
         return Program(
-            name, family, worlds, simulated, duration, memory, contacts, physics, go, start,
-            program.as_text,
-        )  # fmt: skip
+            name, family, worlds, simulated, duration, memory, go, start, program.as_text
+        )
 
     return compile_program
 

@@ -168,10 +168,6 @@ class Engine(abc.ABC):
         """Return changes of the stage to be timed, by name: see `sweeps/levers`."""
         return {}
 
-    def contacts(self, stage: Any, corners: int) -> int:
-        """Return the number of candidate contacts in a world of an object with `corners`."""
-        return 3 + 2 if corners == 1 else corners + 4
-
     def stepper(
         self, stage: Any, qpos: np.ndarray, threads: int, robots: Robot | None = None
     ) -> Stepper:

@@ -172,10 +172,6 @@ class MJX(Engine):
             levers["MJX's own box collider"] = lambda stage: stage._replace(colliders=default)
         return levers
 
-    def contacts(self, stage: MJXStage, corners: int) -> int:
-        """Return the number of candidate contacts."""
-        return stage.data._impl.contact.dist.size  # pyright: ignore[reportAttributeAccessIssue]
-
 
 def _sparse(stage: MJXStage) -> MJXStage:
     """Return the stage with a sparse inertia matrix."""

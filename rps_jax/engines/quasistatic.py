@@ -22,7 +22,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -277,10 +277,6 @@ class QuasistaticEngine(Engine):
         assert not robots.driven, "checked by check_robot"
         half = scene.base_half(robots, solids.mass.size)
         return Quasistatic(), sliders(solids, friction.robot, half)
-
-    def contacts(self, stage: Any, corners: int) -> int:
-        """Return the number of candidate contacts."""
-        return min(corners, 2)
 
 
 ENGINE = QuasistaticEngine()

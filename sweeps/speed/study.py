@@ -16,7 +16,6 @@ from itertools import product
 from typing import Any, ClassVar, Literal, NamedTuple
 
 import jax
-import mujoco
 import numpy as np
 import xarray as xr
 
@@ -33,7 +32,6 @@ from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import ControlLoop, Rules
 from rps_jax.world.domain import DOMAINS
 from rps_jax.world.physics import preset
-from rps_jax.world.scene import JOINTS
 from sweeps import programs
 from sweeps.programs import BATCHED, FAMILIES, Program
 from sweeps.study_base import (
@@ -68,10 +66,6 @@ class Measurement(NamedTuple):
     compile: float  # [s] with tracing
     rate: float  # simulated s per s of wall clock
     memory: float  # [bytes] on the device; NaN for C
-    contacts: int  # contact points of a world: capacity of a program, largest number in C
-    timestep: float  # [s]
-    iterations: int  # largest number of the solver
-    ls_iterations: int  # largest number of its line search
 
 
 @dataclass(frozen=True)
@@ -181,17 +175,6 @@ def _best(action: Callable[[], Any], goes: int = 4, limit: float = 5.0) -> float
     return min(times)
 
 
-def _contacts_in_c(model: mujoco.MjModel, qpos: np.ndarray, seconds: float = 2.0) -> int:
-    """Return the largest number of contact points in C MuJoCo during a straight push."""
-    data, count = mujoco.MjData(model), 0
-    data.qpos[:] = qpos
-    for _ in range(round(seconds / model.opt.timestep)):
-        data.qvel[JOINTS.base] = [_SPEED, 0.0, 0.0]
-        mujoco.mj_step(model, data)
-        count = max(count, data.ncon)
-    return count
-
-
 def batched(program: Program) -> Measurement:
     """Time a program."""
     state = [program.start]
@@ -201,9 +184,9 @@ def batched(program: Program) -> Measurement:
 
     once()
     rate = program.worlds * program.simulated / _best(once)
-    name, family, worlds, _, compile_time, memory, contacts, physics, *_ = program
-    solver = physics.timestep, physics.iterations, physics.ls_iterations
-    return Measurement(name, family, worlds, compile_time, rate, memory, contacts, *solver)
+    return Measurement(
+        program.name, program.family, program.worlds, program.compile, rate, program.memory
+    )
 
 
 def in_c(name: str, family: str, simulated: float = 2.0) -> Measurement:
@@ -227,9 +210,7 @@ def in_c(name: str, family: str, simulated: float = 2.0) -> Measurement:
         once = partial(stepper.drive, np.arange(worlds), twist, round(simulated / physics.timestep))
     once()  # compiles the law
     rate = worlds * simulated / _best(once)
-    contacts = _contacts_in_c(stage[0], np.asarray(batch.qpos[0]))
-    solver = physics.timestep, physics.iterations, physics.ls_iterations
-    return Measurement(name, family, worlds, 0.0, rate, np.nan, contacts, *solver)
+    return Measurement(name, family, worlds, 0.0, rate, np.nan)
 
 
 def refilling(slots: int, rounds: int = 4) -> xr.Dataset:
@@ -265,9 +246,6 @@ _COLUMNS = {
     "what": "{name}",
     "family": "{family}",
     "worlds": "{worlds}",
-    "dt": "{dt:g} ms",
-    "iterations": "{iterations}/{ls_iterations}",
-    "contacts": "{contacts}",
     "compile": "{compile:.1f} s",
     "simulated s/s": "{rate:,.0f}",
     "against C in closed loop": "{ratio:.3g}",
@@ -280,7 +258,7 @@ def table(results: xr.Dataset) -> Rows:
     rows = list(records(results, "measurement"))
     base = {row["family"]: row["rate"] for row in rows if row["name"] == "C in closed loop"}
     for row in rows:
-        row["dt"], row["memory"] = 1000 * row["timestep"], row["memory"] / 2**20
+        row["memory"] /= 2**20
         row["ratio"] = row["rate"] / base.get(row["family"], np.nan)
     return text_table(_COLUMNS, rows)
 
