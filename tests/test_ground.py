@@ -186,11 +186,10 @@ def test_a_push_in_mujoco_agrees_with_the_rigid_limit():
     rigid_one = pushes.in_the_limit(box, [0.08], float(measured.height), steps=100)
     assert 0.059 < measured.height < 0.075
     assert abs(measured.lateral - rigid_one.lateral[0]) < 2e-3
-    np.testing.assert_allclose([measured.force, measured.work], [1, 0.95], atol=0.02)
+    np.testing.assert_allclose(measured.force, 1, atol=0.02)
     assert measured.spread < 0.02
     assert measured.aloft == 0
     assert 0 < measured.hop < 1e-3
-    assert measured.tilt < 5e-3
 
 
 def test_a_study_is_labelled_and_cached_and_refuses_other_options(tmp_path, monkeypatch):
@@ -201,7 +200,7 @@ def test_a_study_is_labelled_and_cached_and_refuses_other_options(tmp_path, monk
     progress = []
     results = grounds.run(tuple(kinds), tmp_path, **options, callback=progress.append)
     sizes = {"ground": 2, "object": 1, "offset": 2, "speed": 1, "at_height": 2}
-    assert dict(results.sizes) == sizes | {"friction": len(grounds.FRICTIONS)}
+    assert dict(results.sizes) == sizes
     assert progress[-1].finished == 4
     assert np.isfinite(results.error).all()
     monkeypatch.setattr(pushes, "in_mujoco", None)  # nothing is run again

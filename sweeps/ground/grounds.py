@@ -15,18 +15,15 @@ import xarray as xr
 from rps_jax.record.checkpoint import Checkpoints
 from rps_jax.trials.progress import Progress, ProgressCallback, SequentialProgress, no_progress
 from rps_jax.world.physics import MUJOCO_GROUND, Physics, preset
-from rps_jax.world.scene import FRICTION
 from sweeps.ground import pushes
 from sweeps.ground.pushes import DISTANCE, OFFSETS, SPEEDS, STEPS, Pushes
 from sweeps.study_base import Rows, load_or_compute, records, text_table
 
 HEIGHTS = (0.06, 0.13, 0.2, 0.27, 0.34)  # [m] from the lower edge of the base to its upper one
-# [1] of a rigid object with the base: the scenes' own, and less, as where a hop has used it up.
-FRICTIONS = (FRICTION["S1"].robot, 0.28, 0.2, 0.1, 0.001)
 OBJECTS = ("box", "box_60", "cylinder")
 LIMIT = "limit"  # name of the part that holds the rigid limit
 _DIMS = ("object", "offset", "speed")
-_LIMIT_FIELDS = ("lateral", "force", "spread")  # results of the rigid limit beside measured ones
+_LIMIT_FIELDS = ("lateral", "force")  # results of the rigid limit beside measured ones
 
 
 @dataclass(frozen=True)
@@ -109,10 +106,9 @@ def run(
     Without a folder all is kept in memory. On each ground the first `worlds` pushes are run, by
     default all; the others are NaN.
 
-    `limit_lateral` (object, offset, at_height, friction) [m] is where a rigid object ends that is
-    pushed at a height and has some friction with the base. `apart` (ground, object, offset, speed,
-    friction) [m] says how far from there an object ended that was pushed as high, and `error` [m]
-    is this for the friction that both have.
+    `limit_lateral` (object, offset, at_height) [m] is where a rigid object ends that is pushed at a
+    height. `error` (ground, object, offset, speed) [m] says how far from there an object ended that
+    was pushed as high.
 
     Raises:
       InputError: the folder holds a ground of the same name that was run otherwise.
@@ -126,7 +122,7 @@ def run(
     limit = load_or_compute(
         parts,
         LIMIT,
-        f"{options} {HEIGHTS} {FRICTIONS} {steps}",
+        f"{options} {HEIGHTS} {steps}",
         partial(_limit, objects, offsets, steps),
     )
     for name in names:
@@ -141,19 +137,8 @@ def run(
     whole = whole.assign({f"limit_{name}": limit[name] for name in _LIMIT_FIELDS})
     at = whole.height.clip(min(HEIGHTS), max(HEIGHTS)).fillna(HEIGHTS[0])
     expected = whole.limit_lateral.interp(at_height=at).drop_vars("at_height")
-    whole["apart"] = (whole.lateral - expected).transpose(*whole.lateral.dims, "friction")
-    whole["error"] = whole.apart.sel(friction=FRICTIONS[0]).drop_vars("friction")
+    whole["error"] = (whole.lateral - expected).transpose(*whole.lateral.dims)
     return whole
-
-
-def as_if(results: xr.Dataset) -> xr.DataArray:
-    """Friction with the base [1] of the rigid objects that end nearest, (ground, speed).
-
-    Between two of `FRICTIONS` the place of the end is taken for linear.
-    """
-    fine = np.linspace(min(FRICTIONS), max(FRICTIONS), 100)
-    distances = results.apart.sortby("friction").interp(friction=fine)
-    return (distances**2).mean(("object", "offset")).fillna(np.inf).idxmin("friction")
 
 
 def count(names: Sequence[str], worlds: int | None = None) -> int:
@@ -182,12 +167,12 @@ def _pushes(
 
 
 def _limit(objects: Sequence[str], offsets: Sequence[float], steps: int) -> xr.Dataset:
-    """Return the rigid limit (object, offset, at_height, friction)."""
+    """Return the rigid limit (object, offset, at_height)."""
     targets = pushes.targets()
-    grid = np.meshgrid(offsets, HEIGHTS, FRICTIONS, indexing="ij")
+    grid = np.meshgrid(offsets, HEIGHTS, indexing="ij")
     values = [axis.ravel() for axis in grid]
     results = [pushes.in_the_limit(targets[name], *values, steps=steps) for name in objects]
-    coords = {"object": objects, "offset": offsets, "at_height": HEIGHTS, "friction": FRICTIONS}
+    coords = {"object": objects, "offset": offsets, "at_height": HEIGHTS}
     return _dataset(_LIMIT_FIELDS, results, coords)
 
 
@@ -206,29 +191,24 @@ def _dataset(
 _AT_SPEED = {
     "error": "{error:.1f} mm",
     "push over mu m g": "{force:.3f}",
-    "spread": "{spread:.1f} %",
-    "as if of friction": "{friction:.2f}",
 }
 
 
 def table(results: xr.Dataset, speeds: Sequence[float] = SPEEDS) -> Rows:
     """Return a header and a row per ground.
 
-    The error is the root of the mean square over objects and offsets; force, spread and height are
-    means, hop and tilt the largest.
+    The error is the root of the mean square over objects and offsets; force and height are means,
+    the hop is the largest.
     """
     header = [f"{name}, {100 * speed:g} cm/s" for speed in speeds for name in _AT_SPEED]
-    dry, over = results.sel(friction=FRICTIONS[0]), ["object", "offset"]
-    force, spread = (float(dry[f"limit_{name}"].mean()) for name in ("force", "spread"))
-    rigid = ["0", f"{force:.3f}", f"{100 * spread:.1f} %", f"{FRICTIONS[0]:g}"] * len(speeds)
+    over, force = ["object", "offset"], float(results.limit_force.mean())
     rows = [
-        ["ground", *header, "height of the push", "largest hop", "largest tilt", "aloft"],
-        ["rigid object", *rigid, "all", "0", "0", "0"],
+        ["ground", *header, "height of the push", "largest hop", "aloft"],
+        ["rigid object", *["0", f"{force:.3f}"] * len(speeds), "all", "0", "0"],
     ]
     chosen = results.sel(speed=list(speeds))
     at_speed = xr.Dataset({
         "error": 1000 * np.sqrt((chosen.error**2).mean(over)), "force": chosen.force.mean(over),
-        "spread": 100 * chosen.spread.mean(over), "friction": as_if(chosen),
     })  # fmt: skip
     for name in map(str, results.ground.values):
         ground = chosen.sel(ground=name)
@@ -238,7 +218,6 @@ def table(results: xr.Dataset, speeds: Sequence[float] = SPEEDS) -> Rows:
             *itertools.chain(*cells),
             f"{100 * float(ground.height.min()):.0f} to {100 * float(ground.height.max()):.0f} cm",
             f"{1000 * float(ground.hop.max()):.2f} mm",
-            f"{1000 * float(ground.tilt.max()):.1f} mrad",
             f"{100 * float(ground.aloft.max()):.0f} %",
         ])  # fmt: skip
     return rows

@@ -57,16 +57,12 @@ class Pushes(NamedTuple):
     """Results of pushes (...); NaN for quantities that a rigid object lacks."""
 
     lateral: np.ndarray  # [m] of the object's middle to the left of the base's, at the end
-    yaw: np.ndarray  # [rad] of the object, at the end
     force: np.ndarray  # [1] push along the base's way over mu m g, mean of the second half
     spread: np.ndarray  # [1] its standard deviation from step to step over its mean
-    work: np.ndarray  # [1] of the base over that of mu m g along the whole way
     height: np.ndarray  # [m] above the ground at which the base pushes, mean over the turn
     borne: np.ndarray  # [1] share of the weight that the base's friction bears, mean
     aloft: np.ndarray  # [1] share of the time with less than a tenth of the weight on the ground
     hop: np.ndarray  # [m] highest rise of the object's middle from where it stood
-    tilt: np.ndarray  # [rad] largest lean
-    sink: np.ndarray  # [m] depth in the ground on which it stood
 
 
 NOTHING = Pushes(*np.full(len(Pushes._fields), np.nan))  # of a push that diverged, or did not run
@@ -134,7 +130,7 @@ def in_mujoco(target: Target, offset: float, speed: float, physics: Physics) -> 
     rising = speed / _RISE
     steps = round((DISTANCE / speed + rising / 2) / dt)
     force, way = np.zeros(steps), np.zeros(steps)
-    rise, upright = np.zeros(steps), np.zeros(steps)
+    rise = np.zeros(steps)
     interval = max(1, round(_SAMPLE / dt))
     samples = []
     qpos, qvel, constraint = data.qpos, data.qvel, data.qfrc_constraint
@@ -145,28 +141,23 @@ def in_mujoco(target: Target, offset: float, speed: float, physics: Physics) -> 
         mujoco.mj_step(model, data)
         force[i] = -c * constraint[0] - s * constraint[1]
         way[i] = c * qpos[0] + s * qpos[1]
-        rise[i], upright[i] = qpos[5], 1 - 2 * (qpos[7] ** 2 + qpos[8] ** 2)
+        rise[i] = qpos[5]
         if i % interval == 0:
             samples.append((*_contact_forces(model, data), 2 * math.atan2(qpos[9], qpos[6])))
             if not abs(qpos[5]) < height:
                 return NOTHING  # it diverged
     weight = float(target.solid.mass[0]) * GRAVITY
-    unit = friction * weight
-    late = force[way > DISTANCE / 2] / unit
+    late = force[way > DISTANCE / 2] / (friction * weight)
     ground, pushing, moment, carried, turned = np.array(samples).T
     turning = np.abs(np.diff(turned, append=turned[-1]))
     result = Pushes(
         lateral=qpos[4] - qpos[1],
-        yaw=turned[-1],
         force=late.mean(),
         spread=late.std() / late.mean(),
-        work=np.sum(force * np.diff(way, prepend=0.0)) / (unit * DISTANCE),
         height=np.sum(turning * moment) / max(np.sum(turning * pushing), 1e-9),
         borne=carried.mean() / weight,
         aloft=np.mean(ground < 0.1 * weight),
         hop=rise.max() - stood,
-        tilt=np.arccos(np.clip(upright.min(), -1, 1)),
-        sink=height / 2 - stood,
     )
     return Pushes(*(np.asarray(value, float) for value in result))
 
@@ -217,13 +208,11 @@ def in_the_limit(
     way = rigid.push(pushed, pose, DISTANCE, steps, direction=target.direction, rounding=rounding)
     push = way.force @ np.array(target.direction) / ground
     late = push[steps // 2 :]
-    none = dict.fromkeys(("borne", "aloft", "hop", "tilt", "sink"), np.zeros(count))
+    none = dict.fromkeys(("borne", "aloft", "hop"), np.zeros(count))
     return Pushes(
         lateral=way.pose[-1, :, 1],
-        yaw=way.pose[-1, :, 2],
         force=late.mean(axis=0),
         spread=late.std(axis=0) / late.mean(axis=0),
-        work=push.mean(axis=0),
         height=height,
         **none,
     )

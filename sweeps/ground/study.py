@@ -17,7 +17,6 @@ import numpy as np
 import xarray as xr
 from matplotlib.lines import Line2D
 
-from rps_jax import errors
 from rps_jax.analysis.figures.style import Figure, words
 from rps_jax.analysis.report import Picture
 from rps_jax.record.options import option
@@ -31,7 +30,7 @@ class Ground(Study[xr.Dataset]):
     """Compare grounds with dry friction, by pushes beside those of a rigid object.
 
     The answer holds pushes (ground, object, offset, speed) in C MuJoCo, the end positions of rigid
-    objects (object, offset, at_height, friction), and their distance from each push, `error` [m].
+    objects (object, offset, at_height), and their distance from each push, `error` [m].
     """
 
     TITLE: ClassVar[str] = "Which ground is dry friction?"
@@ -46,11 +45,6 @@ class Ground(Study[xr.Dataset]):
     all."""
     quick: bool = False
     """Whether to run only three of the grounds."""
-
-    def check(self) -> None:
-        """Check the names."""
-        super().check()
-        errors.check_each_once("grounds", self.grounds)
 
     def num_trials(self) -> int | None:
         """Return the number of pushes."""
@@ -91,7 +85,7 @@ def figure_of(results: xr.Dataset, names: Collection[str]) -> Figure:
     for ax, target in zip(above, map(str, results.object.values), strict=False):
         dataset = results.sel(object=target)
         for offset in results.offset.values:
-            line = 1000 * dataset.limit_lateral.sel(offset=offset).isel(friction=0)
+            line = 1000 * dataset.limit_lateral.sel(offset=offset)
             ax.plot(100 * results.at_height, line, "k-", lw=1)
         for i, name in enumerate(chosen):
             for speed, mark in zip(speeds, marks, strict=False):
