@@ -140,11 +140,14 @@ class Study(Question[T]):
     # --- as questions ----------------------------------------------------------------------
 
     def check(self) -> None:
-        """Check the names."""
+        """Check that the names exist, and that each occurs once."""
         for field, known in self.CHOICES.items():
             value = getattr(self, field)
-            for name in [value] if isinstance(value, str) else value:
+            values = [value] if isinstance(value, str) else value
+            for name in values:
                 errors.check_name(field, name, known)
+            if value != getattr(type(self)(), field):  # some defaults are empty: all names
+                errors.check_each_once(field, values)
 
     def num_trials(self) -> int | None:
         """Return the number of parts."""

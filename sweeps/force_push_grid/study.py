@@ -15,7 +15,7 @@ from typing import ClassVar
 
 import xarray as xr
 
-from rps_jax import engines, errors
+from rps_jax import engines
 from rps_jax.control.laws import force_push_published
 from rps_jax.engines import EngineName
 from rps_jax.record.options import option
@@ -52,8 +52,6 @@ class ForcePushGrid(Study[xr.Dataset]):
     def check(self) -> None:
         """Check the names, and that the engine supports these pushes."""
         super().check()
-        errors.check_each_once("laws", self.laws)
-        errors.check_each_once("sliders", self.sliders)
         force_push_published.check(grid.PARAMS)
         engine = engines.get(self.engine)
         engine.check_senses("force")

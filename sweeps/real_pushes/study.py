@@ -164,7 +164,6 @@ class RealPushes(Study[xr.Dataset]):
     def check(self) -> None:
         """Check the models and the table."""
         super().check()
-        errors.check_each_once("models", self.models)
         _ = self.table
 
     @cached_property

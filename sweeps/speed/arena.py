@@ -26,7 +26,6 @@ import mujoco
 import numpy as np
 import xarray as xr
 
-from rps_jax import errors
 from rps_jax.record.options import option
 from rps_jax.runs.question import Run, call_of
 from rps_jax.trials.progress import Progress
@@ -96,11 +95,6 @@ class Arena(SpeedStudy[xr.Dataset]):
     """Folder of the third-party packages, which `peers.py` installs."""
     limit: float = option(300.0, 1, 3600)
     """Time limit for an engine to compile, and time limit for it to run [s]."""
-
-    def check(self) -> None:
-        """Check the names."""
-        super().check()
-        errors.check_each_once("names", self.names)
 
     @property
     def races(self) -> list[tuple[str, int]]:
