@@ -16,7 +16,6 @@ from rps_jax.studies import hardware
 from rps_jax.trials.progress import no_progress
 from rps_jax.tuning import learn
 from rps_jax.world.domain import LABELS
-from sweeps.ambiguities.study import tolerance_curve
 from sweeps.landscape.study import parameters_figure
 from sweeps.speed.study import throughput
 
@@ -206,15 +205,7 @@ def test_a_path_is_drawn_with_its_target_and_its_last_contact(drawn):
     assert lines == [line, target, [[0.4, 0.2]], line, target]
 
 
-def test_rates_are_drawn_in_percent_by_object(drawn):
-    dims = ("loss", "tolerance", "object")
-    coords = {"loss": ["creep"], "what": ("loss", ["ahead"]), "tolerance": [1.0, 6.0]}
-    coords["object"] = ["box"]
-    curve = xr.Dataset({"won": (dims, [[[1], [4]]]), "lost": (dims, [[[5.0], [2.0]]])}, coords)
-    top, bottom = drawn(tolerance_curve, curve, 4).axes
-    assert top.get_title() == "on loss: ahead"
-    assert top.lines[0].get_ydata().tolist() == [25.0, 100.0]
-    assert bottom.lines[0].get_ydata().tolist() == [5.0, 2.0]
+def test_recovered_pushes_are_drawn_in_percent(drawn):
     dims = ("object", "shift", "side", "target")
     shoved = xr.Dataset(
         {

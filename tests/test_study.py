@@ -213,21 +213,6 @@ def test_the_cells_of_table_ii_are_judged_by_their_intervals():
     assert rows["RPS cylinder S1"][5] == "0.05"
 
 
-def test_the_tolerance_curve_sums_each_behaviour_and_tolerance():
-    names = list(readings.curve((1, 6)))
-    shape = (6, 1, 3, 2, 24)
-    success = np.zeros(shape, np.int8)
-    success[names.index("drive_6mm"), 0, 1] = 1
-    dims = ("condition", *DIMS)
-    outcomes = {"success": (dims, success), "contact_lost_time": (dims, np.full(shape, 2.0))}
-    labels = {"condition": names, "law": ["rps"], "object": list(PAPER_OBJECTS)}
-    results = xr.Dataset(outcomes, labels)
-    curve = readings.by_tolerance(results, (1, 6))
-    assert curve.won.sum() == 48
-    assert curve.won.sel({"loss": "drive", "tolerance": 6, "object": "cylinder"}) == 48
-    assert (curve.lost == 2.0).all()
-
-
 def test_the_papers_parameters_are_named_by_law():
     assert registry.LAWS["nps"] == RPSParams.nps()
     assert paper.LAWS == ("rps", "nps", "aps")

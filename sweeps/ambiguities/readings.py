@@ -117,26 +117,6 @@ def curve(tolerances: tuple[float, ...] = TOLERANCES) -> dict[str, Condition]:
     }
 
 
-def by_tolerance(results: xr.Dataset, tolerances: tuple[float, ...]) -> xr.Dataset:
-    """Return the RPS trials of `curve` by (loss, tolerance, object).
-
-    Variables are the number of successes, `won`, and the mean time without contact, `lost` [s].
-    """
-    trials = results.sel(law="rps")
-    measures = {
-        "won": trials.success.sum(("friction", "target")),
-        "lost": trials.contact_lost_time.mean(("friction", "target")),
-    }
-    by_loss = [
-        xr.Dataset(measures)
-        .sel(condition=[f"{loss}_{mm:g}mm" for mm in tolerances])
-        .rename(condition="tolerance")
-        .assign_coords(tolerance=list(tolerances), what=words)
-        for loss, (words, _) in ON_LOSS.items()
-    ]
-    return xr.concat(by_loss, xr.IndexVariable("loss", list(ON_LOSS)))
-
-
 def cells(results: xr.Dataset, condition: str = "paper_gazebo") -> list[list[str]]:
     """Return a row for each cell of Table II: ours beside the paper's with its Wilson interval.
 

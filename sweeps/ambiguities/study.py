@@ -10,19 +10,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
 from typing import Any, ClassVar
 
-import numpy as np
 import xarray as xr
 
 from rps_jax import errors
-from rps_jax.analysis.figures.style import OBJECT_COLOURS, Figure, success_rates, words
-from rps_jax.analysis.report import Picture
 from rps_jax.control import registry
 from rps_jax.runs.question import call_of
 from rps_jax.world import paper
-from rps_jax.world.objects import PAPER_OBJECTS
 from sweeps.ambiguities import readings
 from sweeps.conditions import Condition, ConditionStudy, Grid, condition_rows
 from sweeps.study_base import Table
@@ -101,7 +96,7 @@ class Ambiguities(ConditionStudy):
         )
 
     def report_tables(self, results: xr.Dataset) -> Sequence[Table]:
-        """Return successes under each reading, the cells of Table II, and the tolerance curve."""
+        """Return successes under each reading, and the cells of Table II."""
         names, laws = list(self.chosen), self.grid.laws
         tables = [
             Table(condition_rows(results, names[0], law), title=f"Readings, {law.upper()}")
@@ -109,41 +104,7 @@ class Ambiguities(ConditionStudy):
         ]
         if self.gazebo and "paper_gazebo" in names and set(laws) <= set(paper.LAWS):
             tables.append(Table(readings.cells(results), title="Cells of Table II"))
-        if self.curve and not self.readings and "rps" in laws:
-            curve = readings.by_tolerance(results, readings.TOLERANCES)
-            trials = self.grid.size // len(PAPER_OBJECTS)
-            picture = Picture("tolerance", partial(tolerance_curve, curve, trials))
-            title = "Success over the skin's tolerance"
-            tables.append(Table((), title=title, picture=picture))
         return tables
 
 
 ambiguities = call_of(Ambiguities)
-
-
-def tolerance_curve(curve: xr.Dataset, trials: int) -> Figure:
-    """Draw the success of RPS, and the time without contact, over skin tolerance.
-
-    Each column is a behaviour on loss of contact, whose label is `what`. The variables (loss,
-    tolerance, object) are the mean time `lost`, and the number `won` of successful trials.
-    """
-    columns = curve.sizes["loss"]
-    figure = Figure(figsize=(4 * columns, 5), layout="constrained")
-    axes = figure.subplots(2, columns, squeeze=False, sharex=True, sharey="row")
-    x = curve.tolerance.values
-    for (top, bottom), loss in zip(axes.T, map(str, curve.loss.values), strict=True):
-        for i, name in enumerate(map(str, curve.object.values)):
-            measures = curve.sel(loss=loss, object=name)
-            style: dict[str, Any] = {"color": OBJECT_COLOURS[name], "label": words(name)}
-            shifted = x + 0.15 * (i - 1)  # so that coinciding curves stay visible
-            success_rates(top, shifted, measures.won.values, np.full(len(x), trials), **style)
-            bottom.plot(shifted, measures.lost.values, "o-", ms=4, lw=1.2, **style)
-        top.set_title(f"on loss: {curve.what.sel(loss=loss).item()}", fontsize=9)
-        top.set_ylim(-3, 103)
-        bottom.set_xlabel("skin tolerance [mm]")
-        for ax in (top, bottom):
-            ax.grid(alpha=0.3)
-    axes[0, 0].set_ylabel("success [%]")
-    axes[1, 0].set_ylabel("mean time without contact [s]")
-    axes[0, -1].legend(fontsize=8)
-    return figure

@@ -9,15 +9,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import Any, ClassVar
 
 import numpy as np
 import xarray as xr
 
 from rps_jax.analysis import statistics
-from rps_jax.analysis.figures.style import Figure, panel
-from rps_jax.analysis.report import Picture, Section
+from rps_jax.analysis.report import Section
 from rps_jax.record.options import option
 from rps_jax.runs.plan import Plan
 from rps_jax.runs.question import Run, call_of, count_true, seed_of
@@ -72,8 +70,7 @@ class Drawn(Rare):
         else:
             text += " None of the drawn worlds fails."
         rows = [*estimate_table(results), [*estimate_row("drawn worlds", against)[:-1], ""]]
-        picture = Picture("rare", partial(figure, results, against))
-        return [section._replace(text=text, table=rows, picture=picture)]
+        return [section._replace(text=text, table=rows)]
 
 
 drawn = call_of(Drawn)
@@ -85,18 +82,3 @@ def of_drawn(failures: int, trials: int) -> Estimate:
     low, high = statistics.clopper_pearson(failures, trials)
     variation = np.sqrt((1 - p) / (p * trials)) if failures else float("inf")
     return Estimate(p, low, high, float(variation), trials)
-
-
-def figure(results: xr.Dataset, against: Estimate) -> Figure:
-    """Plot the estimates of all repetitions with their intervals, and those of drawn worlds."""
-    picture, ax = panel((6.5, 3.4), "repetition", "probability of failure [1]")
-    p = results.p.values
-    reach = np.abs(np.stack([p - results.low.values, results.high.values - p]))
-    repetition = 1 + np.arange(p.size)
-    ax.errorbar(repetition, p, reach, fmt="o", ms=4, capsize=2, color="C3", label="splitting")
-    if (p > 0).all():
-        ax.set_yscale("log")
-    ax.axhspan(against.low, against.high, color="C0", alpha=0.2, lw=0)
-    ax.axhline(against.p, color="C0", label="drawn worlds")
-    ax.legend(fontsize=8)
-    return picture

@@ -129,10 +129,7 @@ class Fidelity(ConditionStudy):
 
     def report_tables(self, results: xr.Dataset) -> Sequence[Table]:
         """Return successes, equal outcomes and costs of each setting."""
-        return [
-            Table(table(results), title="Settings of the solver against C MuJoCo"),
-            Table(by_law(results), title="Equal outcomes by law"),
-        ]
+        return [Table(table(results), title="Settings of the solver against C MuJoCo")]
 
 
 fidelity = call_of(Fidelity)
@@ -166,20 +163,4 @@ def table(results: xr.Dataset) -> Rows:
             f"+{c.gained} -{c.lost}", f"{c.p:.2g}", f"{median:.1f}, {worst:.1f} mm",
             f"{1000 * cost:.3g} ms",
         ])  # fmt: skip
-    return rows
-
-
-def by_law(results: xr.Dataset) -> Rows:
-    """Return a header and one row per condition: share of equal outcomes with each law."""
-    base = results.success.sel(condition=REFERENCE)
-    laws = [str(s) for s in results.law.values]
-    rows = [["setting", *(s.upper() for s in laws)]]
-    for name in map(str, results.condition.values):
-        success = results.success.sel(condition=name)
-        shares = []
-        for s in laws:
-            c = statistics.compare(base.sel(law=s), success.sel(law=s))
-            low, high = c.equal_interval
-            shares.append(f"{100 * c.equal:.1f} % ({100 * low:.0f}-{100 * high:.0f})")
-        rows.append([str(results.what.sel(condition=name).values), *shares])
     return rows

@@ -21,8 +21,6 @@ import numpy as np
 import xarray as xr
 
 from rps_jax import errors
-from rps_jax.analysis.figures.style import Figure, tiles
-from rps_jax.analysis.report import Picture
 from rps_jax.control import registry
 from rps_jax.control.laws import rps
 from rps_jax.control.laws.rps import RPSParams
@@ -145,8 +143,7 @@ class Gradients(Study[xr.Dataset]):
 
     def report_tables(self, results: xr.Dataset) -> Sequence[Table]:
         """Return cosine, bias and error of each estimator."""
-        picture = Picture("gradients", partial(figure_of, results))
-        return [Table(table(results), title="Estimators against the truth", picture=picture)]
+        return [Table(table(results), title="Estimators against the truth")]
 
 
 gradients = call_of(Gradients)
@@ -228,8 +225,8 @@ def _measure(study: Gradients, name: str, estimates: dict[str, xr.Dataset]) -> x
 def compare(estimates: Mapping[str, xr.Dataset], names: Sequence[str]) -> xr.Dataset:
     """Return the comparison of estimators with the truth, (estimator, horizon).
 
-    cosine: between one estimate and the truth, mean and range over the repeats; bias: of the mean
-    of the repeats; error: standard deviation of one estimate; finite: share of finite derivatives;
+    cosine: between one estimate and the truth, mean over the repeats; bias: of the mean of the
+    repeats; error: standard deviation of one estimate; finite: share of finite derivatives;
     doubt: standard error of the truth. Bias, error and doubt are relative to the truth's norm.
     """
     true = estimates[TRUTH].isel(repeat=0)
@@ -242,8 +239,6 @@ def compare(estimates: Mapping[str, xr.Dataset], names: Sequence[str]) -> xr.Dat
         cosine = product / (_norm(estimate.gradient) * norm)
         row = {
             "cosine": cosine.mean("repeat"),
-            "least_cosine": cosine.min("repeat"),
-            "greatest_cosine": cosine.max("repeat"),
             "bias": _norm(estimate.gradient.mean("repeat") - true.gradient) / norm,
             "error": np.sqrt(estimate.variance.sum("parameter").mean("repeat")) / norm,
             "finite": estimate.finite.mean(("repeat", "parameter")),
@@ -269,33 +264,3 @@ def table(results: xr.Dataset) -> Rows:
         ]
     rows.append(["truth", "standard error", *(f"{x:.2g}" for x in results.doubt.values)])
     return rows
-
-
-def figure_of(results: xr.Dataset) -> Figure:
-    """Draw estimators against the truth over the horizon: cosine, bias, error, finite share."""
-    panels = {
-        "cosine": "cosine to the truth [1]",
-        "bias": "bias / norm of the truth [1]",
-        "error": "standard error / norm of the truth [1]",
-        "finite": "share of finite derivatives [1]",
-    }
-    figure, axes = tiles(4, 2, (5, 3.25), (0, 0), sharex=True)
-    x = results.horizon.values
-    for ax, (field, label) in zip(axes.ravel(), panels.items(), strict=True):
-        for i, name in enumerate(map(str, results.estimator.values)):
-            curve, colour = results.sel(estimator=name), f"C{i}"
-            ax.plot(x, curve[field], "o-", ms=4, color=colour, label=name)
-            if field == "cosine":
-                low, high = curve.least_cosine, curve.greatest_cosine
-                ax.fill_between(x, low, high, color=colour, alpha=0.12, lw=0)
-        if field in ("bias", "error"):
-            ax.plot(x, results.doubt, "k--", lw=1, label="standard error of the truth")
-            ax.set_yscale("log")
-        ax.set(xscale="log", ylabel=label, xticks=x, xticklabels=[f"{t:g}" for t in x])
-        ax.minorticks_off()
-        ax.grid(alpha=0.3)
-        if field in ("cosine", "bias"):
-            ax.legend(fontsize=8)
-    axes[1, 1].set_ylim(-0.04, 1.04)
-    figure.supxlabel("horizon [s]", fontsize=10)
-    return figure
