@@ -5,7 +5,6 @@ The base starts at the object, and no trial ends while a program is timed.
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
 from dataclasses import replace
@@ -69,8 +68,6 @@ class Program(NamedTuple):
     family: str
     worlds: int
     simulated: float
-    compile: float  # [s]
-    memory: float  # [bytes] of arguments, results and intermediate values
     go: Callable[[Trial], Trial]
     start: Trial
     text: Callable[[], str | None]  # HLO of the compiled program, if available
@@ -105,7 +102,6 @@ def traced(
     batch, params = jax.device_put(rows((cases.worlds, cases.params), indices))
     start = trial.start_all(batch, params, np.ones(worlds, bool))
     shared, steps = stage(cases.stage), round(simulated / physics.control_period)
-    start_time = time.perf_counter()
 
     # A new function for each call: jax.jit caches the trace of a function by its arguments.
     def advance(stage: Any, worlds: World, params: LawParams, trials: Trial) -> Trial:
@@ -114,19 +110,11 @@ def traced(
 
     arguments = shared, batch, params, start
     lowered = jax.jit(advance, donate_argnums=3 if donated else ()).lower(*arguments)
-    tracing = time.perf_counter() - start_time
 
     def compile_program() -> Program:
-        start_time = time.perf_counter()
         program = lowered.compile(compiler_options=flags)
-        duration = tracing + time.perf_counter() - start_time
-        analysis: Any = program.memory_analysis()
-        parts = ("argument", "output", "temp")
-        memory = sum(getattr(analysis, f"{part}_size_in_bytes") for part in parts)
         go = partial(program, shared, batch, params)
-        return Program(
-            name, family, worlds, simulated, duration, memory, go, start, program.as_text
-        )
+        return Program(name, family, worlds, simulated, go, start, program.as_text)
 
     return compile_program
 

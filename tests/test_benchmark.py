@@ -32,18 +32,15 @@ from sweeps.speed import study as speeds
 def test_a_program_is_timed_and_compared_with_c_in_the_closed_loop():
     setting = programs.BATCHED["quasistatic"]
     program = programs.traced("quasistatic", setting, "cylinder", 2, simulated=0.1)()
-    assert program.compile > 0
     speed = speeds.batched(program)
     assert (speed.name, speed.family, speed.worlds) == ("quasistatic", "cylinder", 2)
     assert 0 < speed.rate < np.inf
-    assert speed.memory > 2 * 40  # bytes: two worlds, of more than ten numbers each
 
-    in_c = speed._replace(name="C in closed loop", rate=2.0, memory=np.nan)
+    in_c = speed._replace(name="C in closed loop", rate=2.0)
     both = [xr.Dataset(row._asdict()) for row in (in_c, speed._replace(rate=5.0))]
     header, first, second = speeds.table(xr.concat(both, "measurement"))
     ratio = header.index("against C in closed loop")
     assert (first[ratio], second[ratio]) == ("1", "2.5")
-    assert first[-1] == ""
 
 
 def test_a_profile_assigns_time_to_the_calling_functions():

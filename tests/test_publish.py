@@ -17,9 +17,11 @@ from rps_jax.runs.question import seed_of
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import Rules
 from rps_jax.world.domain import DOMAINS, Range
+from sweeps.gradients import study as gradients
 from sweeps.publish import dependencies, rows, study
 from sweeps.publish.recipes import HISTORY, RECIPES, Recipe
 from sweeps.random_worlds import million
+from sweeps.speed import study as speed
 
 SWEEPS = ROOT / "sweeps"
 PUSH = "rps sweep --domain wide,objects=random_cylinder --worlds 3 --engine quasistatic --horizon 1"
@@ -128,7 +130,7 @@ def test_speeds_are_grouped_by_engine_and_batch():
                 ("fused", 8, "prism", 25.0)]  # fmt: skip
     fields = zip(("name", "worlds", "family", "rate"), zip(*measured, strict=True), strict=True)
     results = xr.Dataset({name: ("measurement", list(values)) for name, values in fields})
-    assert rows.speeds(results) == [
+    assert speed.table(results) == [
         ["engine", "worlds", "box", "prism", "against C in closed loop"],
         ["C in closed loop", "64", "100", "50", "1, 1"],
         ["fused", "4,096", "200,000", "", "2,000"],
@@ -154,7 +156,7 @@ def test_cosines_have_a_column_per_horizon():
     cosine = xr.DataArray([[0.5, -0.25]], dims=("estimator", "horizon"))
     results = xr.Dataset({"cosine": cosine, "doubt": ("horizon", [0.1, 0.2])},
                        {"estimator": ["forward"], "horizon": [2.0, 30.0]})  # fmt: skip
-    assert rows.cosines(results)[1:] == [["forward", "", "0.50", "", "-0.25", "", ""]]
+    assert gradients.table(results)[1:] == [["forward", "", "0.50", "", "-0.25", "", ""]]
 
 
 def test_dependencies_include_indirect_ones():

@@ -24,22 +24,18 @@ def estimates(gradients, variance=0.0, finite=1.0):
 def test_the_measures_by_hand():
     results = {
         "truth": estimates([[2.0, 0.0]], variance=0.02),
-        # Along and across the truth: cosines 1 and 0, mean (2, 1), an error of 1 of 2.
+        # Along and across the truth: cosines 1 and 0.
         "reverse": estimates([[4.0, 0.0], [0.0, 2.0]], variance=0.5, finite=0.75),
         "forward": estimates([[-1.0, 0.0], [-3.0, 0.0]]),
     }
     judged = gradients.compare(results, ("reverse", "forward")).isel(horizon=0)
     reverse, forward = (judged.sel(estimator=name) for name in ("reverse", "forward"))
     assert float(reverse.cosine) == 0.5
-    assert float(reverse.bias) == pytest.approx(0.5)
-    assert float(reverse.error) == pytest.approx(0.5)  # sqrt(0.5 + 0.5) / 2
-    assert float(reverse.finite) == pytest.approx(0.75)
     assert float(forward.cosine) == -1
-    assert float(forward.bias) == pytest.approx(2.0)
     assert float(judged.doubt) == pytest.approx(0.1)  # sqrt(0.02 + 0.02) / 2
-    rows = gradients.table(gradients.compare(results, ("reverse", "forward")))
-    assert rows[1][:3] == ["reverse", "cosine", "0.50"]
-    assert len(rows) == 1 + 2 * 4 + 1
+    head, first, last = gradients.table(gradients.compare(results, ("reverse", "forward")))
+    assert first[head.index("1 s")] == "0.50"
+    assert last[:3] == ["forward", "", "-1.00"]
 
 
 SIZES = {"worlds": 2, "repeats": 2, "truth": 6, "tuned": ("K_h", "L"), "horizons": (4.0, 8.0)}
@@ -54,7 +50,6 @@ def test_a_study_resumes_and_refuses_other_options(tmp_path, monkeypatch):
     results = replace(SMALL, out=tmp_path)()
     xr.testing.assert_identical(results, replace(SMALL, out=tmp_path)())
     assert names == ["truth", "evolution"]  # each ran once
-    assert (results.finite == 1).all()
     assert (np.abs(results.cosine) <= 1 + 1e-6).all()
     assert (results.doubt > 0).all()
     with pytest.raises(InputError, match="seed = 0 there, 1 asked for"):

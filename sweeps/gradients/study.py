@@ -2,7 +2,7 @@
 
 The score is the distance from contact to target after a time, averaged over random worlds of one
 object. The reference (`truth`) is the gradient of the original law and skin by central differences
-in thousands of worlds. The smoothing of an estimator shows as bias.
+in thousands of worlds. An estimator that smooths scores is biased.
 
     rps sweeps/gradients --quick
 """
@@ -42,6 +42,7 @@ from sweeps.gradients import estimators
 from sweeps.study_base import Rows, Study, Table
 
 TRUTH = "truth"
+HORIZONS = (0.5, 2.0, 8.0, 30.0, 100.0, 300.0)  # [s]
 # clipped is reverse with a bound on each world's gradient; combined, of reverse and evolution.
 ESTIMATORS = ("reverse", "clipped", "forward", "evolution", "combined")
 
@@ -50,8 +51,8 @@ ESTIMATORS = ("reverse", "clipped", "forward", "evolution", "combined")
 class Gradients(Study[xr.Dataset]):
     """Compare gradient estimators with finite differences after several simulated times.
 
-    The answer has, by (estimator, horizon), the cosine to finite differences, bias, standard
-    error, and the share of finite derivatives.
+    The answer has the cosine to finite differences (estimator, horizon), and the standard error of
+    these (horizon).
     """
 
     TITLE: ClassVar[str] = "Gradients against finite differences"
@@ -73,7 +74,7 @@ class Gradients(Study[xr.Dataset]):
     """Object to push: random_box, random_cylinder or random_prism."""
     tuned: tuple[str, ...] = ("beta", "K_h", "K_v", "L")
     """Parameters to differentiate by: names, or logistic, or full."""
-    horizons: tuple[float, ...] = option((0.5, 2.0, 8.0, 30.0, 100.0, 300.0), 0.1, 300, unit="s")
+    horizons: tuple[float, ...] = option(HORIZONS, 0.1, 300, unit="s")
     """Times at which the distance is measured [s]."""
     worlds: int = option(64, 2, 1_000_000)
     """Number of worlds of one estimate."""
@@ -142,7 +143,7 @@ class Gradients(Study[xr.Dataset]):
         )
 
     def report_tables(self, results: xr.Dataset) -> Sequence[Table]:
-        """Return cosine, bias and error of each estimator."""
+        """Return the cosine of each estimator."""
         return [Table(table(results), title="Estimators against the truth")]
 
 
@@ -223,28 +224,20 @@ def _measure(study: Gradients, name: str, estimates: dict[str, xr.Dataset]) -> x
 
 
 def compare(estimates: Mapping[str, xr.Dataset], names: Sequence[str]) -> xr.Dataset:
-    """Return the comparison of estimators with the truth, (estimator, horizon).
+    """Return the comparison of estimators with the truth.
 
-    cosine: between one estimate and the truth, mean over the repeats; bias: of the mean of the
-    repeats; error: standard deviation of one estimate; finite: share of finite derivatives;
-    doubt: standard error of the truth. Bias, error and doubt are relative to the truth's norm.
+    `cosine` (estimator, horizon) is that of an estimate and the truth, the mean over the repeats;
+    `doubt` (horizon) is the standard error of the truth, relative to its norm.
     """
     true = estimates[TRUTH].isel(repeat=0)
-    norm = _norm(true.gradient)
-    doubt = np.sqrt(true.variance.sum("parameter")) / norm
-    rows: list[xr.Dataset] = []
+    norm, cosines = _norm(true.gradient), []
     for name in names:
-        estimate = estimates[name]
-        product = (estimate.gradient * true.gradient).sum("parameter")
-        cosine = product / (_norm(estimate.gradient) * norm)
-        row = {
-            "cosine": cosine.mean("repeat"),
-            "bias": _norm(estimate.gradient.mean("repeat") - true.gradient) / norm,
-            "error": np.sqrt(estimate.variance.sum("parameter").mean("repeat")) / norm,
-            "finite": estimate.finite.mean(("repeat", "parameter")),
-        }
-        rows.append(xr.Dataset(row))
-    return xr.concat(rows, xr.IndexVariable("estimator", list(names))).assign(doubt=doubt)
+        gradient = estimates[name].gradient
+        product = (gradient * true.gradient).sum("parameter")
+        cosines.append((product / (_norm(gradient) * norm)).mean("repeat"))
+    cosine = xr.concat(cosines, xr.IndexVariable("estimator", list(names)))
+    doubt = np.sqrt(true.variance.sum("parameter")) / norm
+    return xr.Dataset({"cosine": cosine, "doubt": doubt})
 
 
 def _norm(gradient: xr.DataArray) -> xr.DataArray:
@@ -252,15 +245,15 @@ def _norm(gradient: xr.DataArray) -> xr.DataArray:
 
 
 def table(results: xr.Dataset) -> Rows:
-    """Return rows of cosine, bias, error and finite share of each estimator at all horizons."""
-    rows = [["estimator", "", *(f"{time:g} s" for time in results.horizon.values)]]
-    for name in map(str, results.estimator.values):
-        row = results.sel(estimator=name)
-        rows += [
-            [name, "cosine", *(f"{x:.2f}" for x in row.cosine.values)],
-            ["", "bias", *(f"{x:.2g}" for x in row.bias.values)],
-            ["", "standard error", *(f"{x:.2g}" for x in row.error.values)],
-            ["", "finite", *(f"{100 * x:.3g} %" for x in row.finite.values)],
-        ]
-    rows.append(["truth", "standard error", *(f"{x:.2g}" for x in results.doubt.values)])
+    """Return a header and one row per estimator: its cosine with the true gradient, by horizon."""
+    horizons = sorted({*HORIZONS, *results.horizon.values})
+    shown = results.reindex(horizon=horizons)
+
+    def cells(values: xr.DataArray) -> list[str]:
+        return ["" if np.isnan(value) else f"{value:.2f}" for value in values.values]
+
+    rows = [["estimator", *(f"{horizon:g} s" for horizon in horizons)]]
+    rows += [[str(c.estimator.item()), *cells(c)] for c in shown.cosine.transpose("estimator", ...)]
+    if results.sizes["horizon"] == len(horizons):
+        rows.append(["standard error of the truth, as a share of it", *cells(shown.doubt)])
     return rows

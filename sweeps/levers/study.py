@@ -109,7 +109,7 @@ class Levers(SpeedStudy[xr.Dataset]):
     goes: int = option(5, 1, 1000)
     """Number of goes of each program."""
     at_once: int = option(1, 1, 1024)
-    """Programs compiled side by side; what compiling takes is that of a program alone only if 1."""
+    """Number of programs compiled at the same time."""
 
     def num_trials(self) -> int | None:
         """Return the number of programs."""
@@ -126,8 +126,7 @@ class Levers(SpeedStudy[xr.Dataset]):
 
     def report_tables(self, results: xr.Dataset) -> Sequence[Table]:
         """Return the gain of each lever."""
-        shown = results.assign(mebibytes=results.memory / 2**20)
-        rows = text_table(_COLUMNS, records(shown, "lever"))
+        rows = text_table(_COLUMNS, records(results, "lever"))
         return [Table(rows, title=f"{self.program}, {self.family}")]
 
 
@@ -151,7 +150,7 @@ def measure(
       worlds: their number, unless a lever changes it.
       simulated: [s] of each run.
       goes: runs of each program.
-      at_once: concurrent compilations; compile times are exact only if 1.
+      at_once: concurrent compilations.
     """
 
     def traced(lever: Lever) -> Callable[[], Program]:
@@ -182,10 +181,7 @@ def _gain(label: str, baseline: Program, p: Program, goes: int) -> xr.Dataset:
     rates = [(_rate(baseline), _rate(p)) for _ in range(goes + 1)][1:]
     values = {
         "name": p.name,
-        "family": p.family,
         "worlds": p.worlds,
-        "compile": p.compile,  # [s] with tracing
-        "memory": p.memory,  # [bytes]
         "rate": statistics.median(rate for _, rate in rates),  # simulated s per s of wall clock
         "times": statistics.median(rate / base_rate for base_rate, rate in rates),
     }
@@ -194,11 +190,8 @@ def _gain(label: str, baseline: Program, p: Program, goes: int) -> xr.Dataset:
 
 _COLUMNS = {
     "what": "{name}",
-    "family": "{family}",
     "lever": "{lever}",
     "worlds": "{worlds}",
     "simulated s/s": "{rate:,.0f}",
     "times": "{times:.2f}",
-    "compile": "{compile:.1f} s",
-    "memory": "{mebibytes:,.1f} MiB",
 }

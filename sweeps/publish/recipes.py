@@ -74,9 +74,6 @@ _REAL = "rps sweep --domain real --worlds 4096 --seed 11 --laws rps rps_tuned"
 _RACE = "--tuned K_h K_v L beta l_cr d_th --horizon 150 --validation 256 --seed 5"
 _DESCENT = f"rps tune grad {_RACE} --starts 2 --worlds 512 --steps 20 --learning-rate 0.2"
 _RACERS = " ".join(f"rps,runs/{name}/tuned.json" for name in ("evolution", "gradient", "hybrid"))
-_EQUAL = ("equal outcomes", "95 %", "+/-", "McNemar p")
-_SOLVER = ("setting", *_EQUAL, "5 s error: median, 95 %", "cost")
-_AT_SPEEDS = [f"{x}, {cm} cm/s" for cm in (1, 5, 20) for x in ("error", "push over mu m g")]
 _RIVALS = ("rps", "pursuit", "dipole", "force_push", "force_push_published")
 _SWEPT = "sweep --laws rps_tuned --domain wide"
 _GRADIENTS = "rps sweeps/gradients --worlds 32 --estimators"
@@ -219,7 +216,6 @@ RECIPES: dict[str, Recipe] = {
         cores=60,
         gpu=10,
         section="Settings of the solver*",
-        columns=_SOLVER,
     ),
     "engines_ideal": recipe(
         f"rps sweeps/engines --domain {_IDEAL} --worlds 240 --engines 'C, reference' "
@@ -240,7 +236,6 @@ RECIPES: dict[str, Recipe] = {
         "rps sweeps/ground",
         cores=30,
         section="Grounds beside a rigid object",
-        columns=("ground", *_AT_SPEEDS, "height of the push", "largest hop", "aloft"),
     ),
     "force_push_grid": recipe("rps sweeps/force_push_grid", cores=4, section="Pushes that succeed"),
     "mends": recipe(
@@ -276,7 +271,7 @@ RECIPES: dict[str, Recipe] = {
         f"{_GRADIENTS} reverse clipped evolution combined --object random_cylinder",
         f"{_GRADIENTS} forward --horizons 0.5 2 8 30",
         gpu=30,
-        section=rows.cosines,
+        section="Estimators against the truth",
         labels=("boxes", "cylinders", "boxes"),
     ),
     "robot": recipe(f"rps sweeps/speed/robot.py {_MACHINE}", cores=1),
@@ -295,13 +290,13 @@ RECIPES: dict[str, Recipe] = {
         "rps sweeps/speed --names 'C in closed loop' 'fused standard' 'fused fast' quasistatic "
         "--worlds 64 4096 262144 --at-once 16 --refill 0",
         gpu=6,
-        section=rows.speeds,
+        section="Simulated seconds in a second",
     ),
     "speed_cores": recipe(
         "rps sweeps/speed --names 'fused standard' 'C in closed loop' 'C, mj_step alone' "
         "'mjx standard' --worlds 24 64 --refill 0",
         cores=3,
-        section=rows.speeds,
+        section="Simulated seconds in a second",
     ),
     "commands": recipe(f"rps sweeps/speed/commands.py {_MACHINE}", cores=14),
     "compilers": recipe(f"rps sweeps/speed/compilers.py {_MACHINE}", cores=5),
@@ -336,7 +331,6 @@ RECIPES: dict[str, Recipe] = {
         "rps sweeps/levers --program 'mjx standard' --worlds 4096 --simulated 1 --goes 3",
         gpu=8,
         section="*, box",
-        columns=("what", "lever", "worlds", "simulated s/s", "times"),
     ),
 }
 

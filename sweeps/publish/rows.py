@@ -14,7 +14,7 @@ from rps_jax.robot.robot import Robot
 from rps_jax.studies import rare, sensitivity
 from rps_jax.studies.attack import yields
 from rps_jax.trials.trial import Rules
-from sweeps.study_base import Rows, records
+from sweeps.study_base import Rows
 
 _MAX_LOST = float(Rules().max_lost)  # [s] in all published commands
 
@@ -47,21 +47,6 @@ def attack_table(results: xr.Dataset) -> Rows:
          f"{results.attrs['drawn_simulated'] / 3600:.1f}", str(results.attrs["drawn_failing"]),
          f"{per_hour['drawn']:.2g}", ""],
     ]  # fmt: skip
-
-
-def cosines(results: xr.Dataset) -> Rows:
-    """Return a header and one row per estimator: its cosine with the true gradient, by horizon."""
-    horizons = (0.5, 2.0, 8.0, 30.0, 100.0, 300.0)
-    shown = results.reindex(horizon=list(horizons))
-
-    def cells(values: xr.DataArray) -> list[str]:
-        return ["" if np.isnan(value) else f"{value:.2f}" for value in values.values]
-
-    rows = [["estimator", *(f"{horizon:g} s" for horizon in horizons)]]
-    rows += [[str(c.estimator.item()), *cells(c)] for c in shown.cosine.transpose("estimator", ...)]
-    if results.sizes["horizon"] == len(horizons):
-        rows.append(["standard error of the truth, as a share of it", *cells(shown.doubt)])
-    return rows
 
 
 def comparison(results: object) -> Rows:
@@ -133,25 +118,6 @@ def default_beside_tuned(results: object) -> Rows:
     for law, pair, compared, p in zip(laws, pairs, comparisons, adjusted, strict=True):
         rates = [tables.share(int(s.sum()), s.size) for s in pair]
         rows.append([law, *rates, f"+{compared.gained} -{compared.lost}", f"{p:.2g}"])
-    return rows
-
-
-def speeds(results: xr.Dataset) -> Rows:
-    """Return a header and one row per engine and batch: simulated s per wall-clock s, by object."""
-    families = list(dict.fromkeys(map(str, results.family.values)))
-    rate_of = {
-        (row["name"], row["worlds"], row["family"]): row["rate"]
-        for row in records(results, "measurement")
-    }
-    in_c = {f: rate for (name, _, f), rate in rate_of.items() if name == "C in closed loop"}
-    rows = [["engine", "worlds", *families, "against C in closed loop"]]
-    for name, worlds in dict.fromkeys((name, worlds) for name, worlds, _ in rate_of):
-        rates = {f: rate_of[name, worlds, f] for f in families if (name, worlds, f) in rate_of}
-        cells = [f"{rates[f]:,.0f}" if f in rates else "" for f in families]
-        ratios = [f"{rate / in_c[f]:.3g}" for f, rate in rates.items() if f in in_c]
-        rows.append(
-            [name, f"{worlds:,}", *cells, ", ".join(f"{float(ratio):,g}" for ratio in ratios)]
-        )
     return rows
 
 

@@ -42,7 +42,6 @@ from sweeps.study_base import (
     records,
     run_parts,
     stored_parts,
-    text_table,
 )
 
 _SPEED = 0.05  # [m/s] of a push in C MuJoCo without a law
@@ -63,9 +62,7 @@ class Measurement(NamedTuple):
     name: str
     family: str
     worlds: int
-    compile: float  # [s] with tracing
     rate: float  # simulated s per s of wall clock
-    memory: float  # [bytes] on the device; NaN for C
 
 
 @dataclass(frozen=True)
@@ -94,7 +91,7 @@ class Speed(SpeedStudy[xr.Dataset]):
     mujocos: int = option(16384, 1, 10_000_000)
     """Largest batch of MJX."""
     at_once: int = option(1, 1, 1024)
-    """Number of programs compiled at the same time; compile times are valid for 1 only."""
+    """Number of programs compiled at the same time."""
     refill: int = option(64, 0, 1_000_000)
     """Slots per worker in the measurement of refilled slots; 0: no measurement."""
     rounds: int = option(4, 1, 1000)
@@ -184,9 +181,7 @@ def batched(program: Program) -> Measurement:
 
     once()
     rate = program.worlds * program.simulated / _best(once)
-    return Measurement(
-        program.name, program.family, program.worlds, program.compile, rate, program.memory
-    )
+    return Measurement(program.name, program.family, program.worlds, rate)
 
 
 def in_c(name: str, family: str, simulated: float = 2.0) -> Measurement:
@@ -210,7 +205,7 @@ def in_c(name: str, family: str, simulated: float = 2.0) -> Measurement:
         once = partial(stepper.drive, np.arange(worlds), twist, round(simulated / physics.timestep))
     once()  # compiles the law
     rate = worlds * simulated / _best(once)
-    return Measurement(name, family, worlds, 0.0, rate, np.nan)
+    return Measurement(name, family, worlds, rate)
 
 
 def refilling(slots: int, rounds: int = 4) -> xr.Dataset:
@@ -242,25 +237,23 @@ def refilling(slots: int, rounds: int = 4) -> xr.Dataset:
     return xr.Dataset({"refilled": refilled, "waiting": waiting, "trials": trials})
 
 
-_COLUMNS = {
-    "what": "{name}",
-    "family": "{family}",
-    "worlds": "{worlds}",
-    "compile": "{compile:.1f} s",
-    "simulated s/s": "{rate:,.0f}",
-    "against C in closed loop": "{ratio:.3g}",
-    "memory": "{memory:,.1f} MiB",
-}
-
-
 def table(results: xr.Dataset) -> Rows:
-    """Return a header and one row per measurement, compared with C MuJoCo in closed loop."""
-    rows = list(records(results, "measurement"))
-    base = {row["family"]: row["rate"] for row in rows if row["name"] == "C in closed loop"}
-    for row in rows:
-        row["memory"] /= 2**20
-        row["ratio"] = row["rate"] / base.get(row["family"], np.nan)
-    return text_table(_COLUMNS, rows)
+    """Return a header and one row per engine and batch: simulated s per wall-clock s, by object."""
+    families = list(dict.fromkeys(map(str, results.family.values)))
+    rate_of = {
+        (row["name"], row["worlds"], row["family"]): row["rate"]
+        for row in records(results, "measurement")
+    }
+    in_c = {f: rate for (name, _, f), rate in rate_of.items() if name == "C in closed loop"}
+    rows = [["engine", "worlds", *families, "against C in closed loop"]]
+    for name, worlds in dict.fromkeys((name, worlds) for name, worlds, _ in rate_of):
+        rates = {f: rate_of[name, worlds, f] for f in families if (name, worlds, f) in rate_of}
+        cells = [f"{rates[f]:,.0f}" if f in rates else "" for f in families]
+        ratios = [f"{rate / in_c[f]:.3g}" for f, rate in rates.items() if f in in_c]
+        rows.append(
+            [name, f"{worlds:,}", *cells, ", ".join(f"{float(ratio):,g}" for ratio in ratios)]
+        )
+    return rows
 
 
 def throughput(speeds: Iterable[tuple[str, str, int, float]], steady: Collection[str]) -> Figure:
