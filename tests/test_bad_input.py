@@ -17,7 +17,6 @@ from rps_jax.record import files, provenance
 from rps_jax.record.folder import claim
 from rps_jax.runs.plan import Plan, open_run
 from rps_jax.studies.rare import Rare
-from rps_jax.studies.table import Table
 from rps_jax.trials.setting import Setting
 from rps_jax.world.domain import DOMAINS
 
@@ -236,9 +235,6 @@ COMMANDS = {
         "run --out file/film.mp4": "out = file cannot be written",
         "done": "run = done does not hold a sweep: give the folder of",
         "file": "run = file holds no manifest.json",
-        "table --object cylinder": "unknown object of the run 'cylinder': choose from box",
-        "table --law aps": "unknown law of the run 'aps': choose from rps, nps",
-        "table --friction S2": "unknown friction of the run 'S2': choose from S1",
     },
     "tune": {
         "es --objects sphere": "unknown domain object 'sphere'",
@@ -319,7 +315,6 @@ def folder(tmp_path_factory):
     for name in ("folder.json", "bytes", "cut", "empty", "lacking"):
         (root / name).mkdir()
     claim(root / "done", Rare().configuration())
-    claim(root / "table", Table(["rps", "nps"], objects=["box"], friction=["S1"]).configuration())
     (root / "bytes" / "manifest.json").write_bytes(b"\xff\xfe\x00")
     for name, text in (("cut", '{"worlds": 3'), ("empty", "[]"), ("lacking", "{}")):
         (root / name / "manifest.json").write_text(text)

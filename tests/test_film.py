@@ -9,12 +9,9 @@ import pytest
 from helpers import decode, rps
 
 from rps_jax.app import film
-from rps_jax.app.film import Film
 from rps_jax.control.laws.rps import RPSParams
 from rps_jax.errors import InputError
-from rps_jax.record import folder as run_folder
 from rps_jax.runs.plan import Plan, open_run
-from rps_jax.studies.table import Table
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import Rules
 from rps_jax.world import video
@@ -26,23 +23,11 @@ ENGINE = "quasistatic"
 FPS = 12
 
 
-def table(folder):
-    """Write the part of a run of `rps table` over two targets that a film reads."""
-    targets = [(0.6, 0.0), (2.0, 2.0)]
-    question = Table(objects=("box",), targets=targets, setting=Setting(ENGINE))
-    run_folder.claim(folder, question.configuration())
-
-
 def plan_of(*names):
     """Return a plan of two worlds per object."""
     domain = dataclasses.replace(DOMAINS["wide"], objects=names)
     setting = Setting(rules=Rules(horizon=20.0), engine=ENGINE)
     return Plan(domain, 2 * len(names), {"rps": RPSParams.paper()}, setting)
-
-
-def write_sweep(folder):
-    """Write the part of a run of `rps sweep` that a film reads."""
-    open_run(folder, plan_of("random_cylinder"))
 
 
 def tiles(images, rows, columns):
@@ -60,9 +45,8 @@ def in_order(takes, name="labels"):
     return film._in_grid_order([getattr(take, name) for take in takes], takes)
 
 
-@pytest.mark.parametrize("make", [table, pytest.param(write_sweep, marks=pytest.mark.slow)])
-def test_a_film_shows_each_trial_in_its_tile_and_holds_the_end(make, tmp_path):
-    make(tmp_path)
+def test_a_film_shows_each_trial_in_its_tile_and_holds_the_end(tmp_path):
+    open_run(tmp_path, plan_of("random_cylinder"))
     out = tmp_path / "two.mp4"
     assert rps(f"film {tmp_path} --grid 2x4 --seconds 2 --speed 4.8 --out {out}") == 0
     images = decode(out)
@@ -107,23 +91,23 @@ def test_several_laws_have_a_row_each_and_a_world_a_column(tmp_path):
 
 
 def test_a_finished_trial_is_labelled_and_not_drawn_again(tmp_path):
-    table(tmp_path)
-    takes, setting = Film(tmp_path, "1x2").takes()
-    (take,) = takes
+    setting = Setting(rules=Rules(horizon=60.0), engine=ENGINE)
+    near = dataclasses.replace(DOMAINS["paper"], objects=("box",), targets=((0.6, 0.0), (2.0, 2.0)))
+    plan = Plan(near, 2, {"rps": RPSParams.paper()}, setting)
+    (take,) = film.of_sweep(tmp_path, plan, ["rps"], "first", (1, 2))
     ((ended, first), *_, (_, previous), (over, last)) = islice(film._shots(take, setting, 50), 20)
     assert not ended
-    assert [shot.label for shot in first] == ["(0.6, 0) m, 0 s", "(2, 2) m, 0 s"]
+    assert [shot.label for shot in first] == ["world 0, 0 s", "world 1, 0 s"]
     assert not over
-    assert last[0].label.startswith("(0.6, 0) m, reached at ")
+    assert last[0].label.startswith("world 0, reached at ")
     assert last[0] is previous[0]
     assert last[1] is not previous[1]
 
 
 def test_the_memory_of_a_film_does_not_grow_with_its_length(tmp_path):
-    table(tmp_path)
-    takes, _ = Film(tmp_path, "1x1").takes()
-    tile = video.Tile(takes[0].scenes[0], (1.0, 1.0))
-    shot = video.Shot(takes[0].part.worlds.qpos[0], np.zeros(2), "")
+    (take,) = film.of_sweep(tmp_path, plan_of("random_box"), ["rps"], "first", (1, 1))
+    tile = video.Tile(take.scenes[0], (1.0, 1.0))
+    shot = video.Shot(take.part.worlds.qpos[0], np.zeros(2), "")
 
     def peak(count):
         tracemalloc.start()
@@ -147,9 +131,8 @@ def test_tiles_are_as_large_as_fits(grid, size):
 
 
 def test_more_trials_than_places_are_refused(tmp_path):
-    table(tmp_path)
-    takes, _ = Film(tmp_path, "1x2").takes()
-    tiles = [video.Tile(scene, (1.0, 1.0)) for scene in takes[0].scenes]
+    (take,) = film.of_sweep(tmp_path, plan_of("random_box"), ["rps"], "first", (1, 2))
+    tiles = [video.Tile(scene, (1.0, 1.0)) for scene in take.scenes]
     with pytest.raises(
         InputError, match="grid = 1x1 is not allowed: it must have room for all 2 trials"
     ):

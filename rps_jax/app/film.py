@@ -26,7 +26,6 @@ from rps_jax.record.options import option
 from rps_jax.runs.plan import Plan, build_batch, scene_of
 from rps_jax.runs.push import another_engine, select_law
 from rps_jax.runs.question import Action, call_of
-from rps_jax.studies.table import table_of
 from rps_jax.trials import pushes, trial
 from rps_jax.trials.batch import WorldBatch, rows
 from rps_jax.trials.progress import Bar, Progress, ProgressCallback
@@ -44,16 +43,12 @@ _FPS = 12  # frames per second
 
 @dataclass(frozen=True)
 class Film(Action[Path]):
-    """Film many trials of a run side by side: the targets of a table, or worlds of a sweep."""
+    """Film many worlds of a sweep side by side."""
 
     run: str | Path = option("", positional=True)
-    """Run folder of `rps table` or `rps sweep`."""
+    """Run folder of `rps sweep`."""
     grid: str | None = None
     """Rows and columns of the film; by default 4x6, or with --laws a row for each and 3 columns."""
-    object: str = "box"
-    """Object to film, of a table."""
-    friction: str = "S1"
-    """Friction to film, of a table: S1, S2, or GROUND,ROBOT as there."""
     law: str | None = None
     """Which of the run's laws; by default the first."""
     laws: tuple[str, ...] = ()
@@ -84,11 +79,7 @@ class Film(Action[Path]):
 
     def note(self) -> str:
         """Whether another engine than the run's is filmed."""
-        return "" if self._of_table else another_engine(Path(self.run))
-
-    @property
-    def _of_table(self) -> bool:
-        return folder.read_manifest(Path(self.run)).get("question") == "table"
+        return another_engine(Path(self.run))
 
     def check(self) -> None:
         """Check the grid, the file and the selected trials."""
@@ -123,23 +114,10 @@ class Film(Action[Path]):
 
     def takes(self) -> tuple[list[Take], Setting]:
         """Return the trials to film, limited by the grid, and their setting."""
-        run, shape = Path(self.run), self.shape
-        if not self._of_table:
-            plan, law = select_law(run, 0, self.law)
-            selection = self.worlds or self.which
-            return of_sweep(run, plan, self.laws or (law,), selection, shape), plan.setting
-        table = table_of(run)
-        law = self.law or next(iter(table.chosen))
-        errors.check_name("object of the run", self.object, table.objects)
-        errors.check_name("friction of the run", self.friction, map(str, table.friction))
-        errors.check_name("law of the run", law, table.chosen)
-        key = self.object, self.friction, id(table.chosen[law])
-        cases = [c for c in table.cases if (c.object, c.friction, id(c.law)) == key]
-        cases, setting = cases[: shape[0] * shape[1]], table.setting
-        scenes = [pushes.scene_of(cases[0], setting.physics)] * len(cases)
-        labels = [f"({x:g}, {y:g}) m" for x, y in (case.target for case in cases)]
-        tiles, part = range(len(cases)), pushes.build(cases, setting)
-        return [Take(tiles, part, registry.law_of(cases[0].params), scenes, labels)], setting
+        run = Path(self.run)
+        plan, law = select_law(run, 0, self.law)
+        selection = self.worlds or self.which
+        return of_sweep(run, plan, self.laws or (law,), selection, self.shape), plan.setting
 
 
 film = call_of(Film)

@@ -1,27 +1,22 @@
 """The paper's Table II: all laws push all objects to all targets, under each friction."""
 
-import dataclasses
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import xarray as xr
 
 from rps_jax import errors
 from rps_jax.analysis import figures, tables
 from rps_jax.analysis.report import Picture, Section
-from rps_jax.control import registry
 from rps_jax.control.registry import LawsLike
-from rps_jax.record import files
-from rps_jax.record import folder as run_folder
 from rps_jax.runs.push import case_options
 from rps_jax.runs.question import MultiLawQuestion, Run, call_of
 from rps_jax.trials import pushes
 from rps_jax.trials.case import Case, FrictionLike, TrialOptions, label_of
 from rps_jax.trials.results import outcome_dataset
-from rps_jax.trials.setting import Setting
 from rps_jax.world import paper
 from rps_jax.world.objects import PAPER_OBJECTS
 
@@ -106,30 +101,3 @@ def sections(outcomes: xr.Dataset) -> list[Section]:
         Section("Table II: successes", text, tables.table_ii(outcomes)),
         Section("Fig. 5: least distance of contact to target", "", (), picture),
     ]
-
-
-def table_of(folder: Path) -> Table:
-    """Load the question of a run folder of `rps table`.
-
-    Raises:
-      InputError: the folder holds no table, or one with a custom robot or skin.
-    """
-    try:
-        manifest = run_folder.read_manifest(folder)
-        setting = Setting.from_json(manifest["setting"])
-        laws = {k: registry.params_from_json(law) for k, law in dict(manifest["laws"]).items()}
-        options = (field.name for field in dataclasses.fields(TrialOptions))
-        names = ("objects", "friction", "targets", *options)
-        values = {name: _tuples(manifest[name]) for name in names}
-        if manifest["question"] != "table":
-            raise KeyError("question")
-    except (LookupError, TypeError, ValueError) as error:
-        raise files.CorruptFileError(folder / run_folder.MANIFEST, error) from error
-    if any(isinstance(values[name], dict) for name in ("robot", "skin")):
-        raise errors.InputError(f"run = {folder} has a custom robot or skin: film it from Python.")
-    return Table(laws, **values, setting=setting)
-
-
-def _tuples(value: Any) -> Any:
-    """Convert lists of JSON to tuples."""
-    return tuple(map(_tuples, value)) if isinstance(value, list) else value
