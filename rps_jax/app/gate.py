@@ -29,6 +29,7 @@ from rps_jax.errors import InputError
 
 _MAX_NUMBER = 1e6  # [1] in a message
 _MAX_LENGTH = 200  # characters of a text
+_DROPPED = "rps view: a message that the page does not send was dropped."
 HOST = "127.0.0.1"  # of the page, which is served to this machine alone
 
 Rule = Callable[[Any], bool]  # whether the controls of the page can send a message
@@ -62,17 +63,14 @@ class Gate:
             reported = False
 
             async def recv(self, *arguments: Any, **options: Any) -> Any:
-                while True:
-                    raw = await super().recv(*arguments, **options)
-                    if gate.accepts(raw):
-                        return raw
-                    if not self.reported:
+                while not gate.accepts(raw := await super().recv(*arguments, **options)):
+                    if gate.rules and not self.reported:
                         self.reported = True
-                        gate.report("a message that the page does not send was dropped")
+                        print(_DROPPED, file=sys.stderr, flush=True)
+                return raw
 
         def process_request(connection: ServerConnection, request: Any) -> Any:
             if self.refuses(request.headers):
-                self.report("a request that is not the page's own was refused")
                 return connection.respond(http.HTTPStatus.FORBIDDEN, "This page is served alone.\n")
             return answer(connection, request)
 
@@ -101,11 +99,6 @@ class Gate:
             return is_bounded and self.rules[type(message).__name__](message)
         except Exception:  # of any kind, by viser on malformed messages
             return False
-
-    def report(self, refusal: str) -> None:
-        """Print a refusal on the error stream, in one line, once there is a page."""
-        if self.rules:
-            print(f"rps view: {refusal}.", file=sys.stderr, flush=True)
 
 
 def _is_this_machine(host: str) -> bool:
