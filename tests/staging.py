@@ -52,7 +52,8 @@ def recompiled(engine: str, scenes: Sequence[Scene]) -> Any:
 def stack(models: Sequence[mujoco.MjModel]) -> tuple[Any, dict[str, np.ndarray]]:
     """Return an MJX model and the fields (n, ...) of models that differ in nothing else."""
     trees = [mjx_engine.put(model) for model in models]
-    rows: Any = [mjx_engine.fields_of(tree) for tree in trees]
+    fields = [mjx_engine.fields_of(model) for model in models]
+    rows = [{k: np.asarray(v, np.float32) for k, v in row.items()} for row in fields]
     for tree in trees:
         jax.tree.map(np.testing.assert_array_equal, mjx_engine.apply(tree, rows[0]), trees[0])
     return trees[0], {name: np.stack([row[name] for row in rows]) for name in rows[0]}

@@ -8,7 +8,6 @@ trace (`traced = False`) steps worlds on the host, by its `stepper`.
 from __future__ import annotations
 
 import abc
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, ClassVar, Literal, NamedTuple, Protocol, runtime_checkable
@@ -105,7 +104,6 @@ class Engine(abc.ABC):
     traced: ClassVar[bool] = True  # JAX traces its steps: trials can be viewed and learned in
     side_by_side: ClassVar[bool] = False  # batches of several families fit one program of a GPU
     modes: ClassVar[tuple[Mode, ...]] = ()  # supported modes of differentiation
-    newton: ClassVar[bool] = True  # its solver uses the iterations of `Physics`
     forces: ClassVar[bool] = True  # contact can slow and stop a base with a limited force
     computes_force: ClassVar[bool] = True  # it computes the force of a contact
 
@@ -163,10 +161,6 @@ class Engine(abc.ABC):
     def suits_processors(self, trials: int | None) -> bool:
         """Whether processors finish this number of trials sooner than a GPU; None: unknown."""
         return False
-
-    def levers(self, family: str) -> dict[str, Callable[[Any], Any]]:
-        """Return changes of the stage to be timed, by name: see `sweeps/levers`."""
-        return {}
 
     def stepper(
         self, stage: Any, qpos: np.ndarray, threads: int, robots: Robot | None = None

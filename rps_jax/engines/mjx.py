@@ -6,9 +6,9 @@ batch of them: `fields_of` returns the fields that differ, `apply` sets those of
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
+from operator import attrgetter
 from typing import Any, NamedTuple
 
 import jax
@@ -22,7 +22,6 @@ from rps_jax.engines.base import ControlPeriod, Driven, Engine, Mode, Motion
 from rps_jax.engines.mjx_colliders import (
     BASE_PRISM,
     COLLIDERS,
-    GeomType,
     Pair,
     collision,
     constraint,
@@ -31,13 +30,14 @@ from rps_jax.engines.mjx_colliders import (
     smooth,
     solver,
 )
-from rps_jax.geometry import planar, solid
+from rps_jax.engines.mujoco import compile_rows
+from rps_jax.geometry import planar
 from rps_jax.geometry.solid import Solid
 from rps_jax.robot import drive as drives
 from rps_jax.robot.robot import Robot
 from rps_jax.world import scene
 from rps_jax.world.physics import Physics
-from rps_jax.world.scene import JOINTS, OFF_CENTRE, Friction
+from rps_jax.world.scene import JOINTS, Friction
 
 # Fields that differ between objects of one shape family, as paths into an MJX model.
 FIELDS = (
@@ -155,28 +155,15 @@ class MJX(Engine):
         """Return the stage of the first of the worlds, and fields (n, ...) of all."""
         robots = scene.repeat_robot(robots, solids.mass.size)
         template = scene.compile_row(family, solids, friction, physics, 0, robots).physics
-        model = put(template)
-        fields = mjx_fields(family, solids, friction, robots, template, fields_of(model))
-        return MJXStage(model, mjx.make_data(template)), fields
+        rows = compile_rows(family, solids, friction, physics, robots, fields_of)
+        fields = {name: np.stack([row[name] for row in rows]) for name in FIELDS}
+        if solids.feet is not None:
+            fields[OUTLINE] = solids.vertices
+        return MJXStage(put(template), mjx.make_data(template)), fields
 
     def slots(self, backend: str) -> int:
         """Return the number of worlds that one worker steps at once: few for small CPU caches."""
         return 24 if backend == "cpu" else 16384
-
-    def levers(self, family: str) -> dict[str, Callable[[MJXStage], MJXStage]]:
-        """Return other options of the model, and MJX's box collider."""
-        levers = {"sparse inertia matrix": _sparse}
-        boxes = GeomType.BOX, GeomType.BOX
-        if family == "box":
-            default = Colliders(frozenset(COLLIDERS) - {boxes})
-            levers["MJX's own box collider"] = lambda stage: stage._replace(colliders=default)
-        return levers
-
-
-def _sparse(stage: MJXStage) -> MJXStage:
-    """Return the stage with a sparse inertia matrix."""
-    model: Any = stage.model.tree_replace({"opt.jacobian": mjx.JacobianType.SPARSE})
-    return stage._replace(model=model, data=mjx.make_data(model))
 
 
 def put(model: mujoco.MjModel) -> mjx.Model:
@@ -187,14 +174,12 @@ def put(model: mujoco.MjModel) -> mjx.Model:
     return on_device
 
 
-def fields_of(model: mjx.Model) -> dict[str, np.ndarray]:
+def fields_of(model: mujoco.MjModel) -> dict[str, np.ndarray]:
     """Return `FIELDS` of a model, which include all constants that MuJoCo derives from a mass.
 
     They are always the same fields, so that the numbers of a world do not depend on the batch.
     """
-    leaves = jax.tree_util.tree_flatten_with_path(model)[0]
-    named = ((jax.tree_util.keystr(path), leaf) for path, leaf in leaves)
-    return {name: np.asarray(leaf) for name, leaf in named if name in FIELDS}
+    return {name: np.array(attrgetter(name[1:])(model), float) for name in FIELDS}
 
 
 def apply(model: mjx.Model, fields: dict[str, jax.Array]) -> mjx.Model:
@@ -202,87 +187,6 @@ def apply(model: mjx.Model, fields: dict[str, jax.Array]) -> mjx.Model:
     return jax.tree_util.tree_map_with_path(
         lambda path, leaf: fields.get(jax.tree_util.keystr(path), leaf), model
     )
-
-
-def mjx_fields(
-    family: str, solids: Solid, friction: Friction, robots: Robot, model: mujoco.MjModel,
-    fields: dict[str, np.ndarray],
-) -> dict[str, np.ndarray]:  # fmt: skip
-    """Return fields (n, ...) of worlds, from those (...) of a model of the first."""
-    count = solids.mass.size
-    new = {name: np.repeat(np.asarray(x, float)[None], count, axis=0) for name, x in fields.items()}
-    body, mass = model.body("object").id, solids.mass
-    com = solids.p_object_com + OFF_CENTRE
-    turn = solid.axes(solids)
-    moments = np.einsum("nij,nj,nkj->nik", turn, solids.inertia, turn)
-    inverse = np.einsum("nij,nj,nkj->nik", turn, 1 / solids.inertia, turn)
-    z = JOINTS.object.start + 2
-    new[".body_pos"][:, body, 2] = solids.height / 2
-    new[".qpos0"][:, z] = new[".qpos_spring"][:, z] = solids.height / 2
-    new[".body_ipos"][:, body], new[".body_iquat"][:, body] = com, solids.q_object_body
-    new[".body_mass"][:, body] = new[".body_subtreemass"][:, body] = mass
-    new[".body_inertia"][:, body] = solids.inertia
-    spin = np.mean(1 / solids.inertia, axis=1)
-    new[".body_invweight0"][:, body] = np.stack([1 / mass, spin], axis=-1)
-    # The free joint moves the object's origin; the spin moves it by the arm of the centre of mass.
-    arm = _skew(com)
-    shift = 1 / mass + np.trace(arm @ inverse @ arm.swapaxes(1, 2), axis1=1, axis2=2) / 3
-    new[".dof_invweight0"][:, 3:6], new[".dof_invweight0"][:, 6:9] = shift[:, None], spin[:, None]
-    about = moments - mass[:, None, None] * (arm @ arm)
-    new[".dof_M0"][:, 3:6] = mass[:, None]
-    new[".dof_M0"][:, 6:9] = np.diagonal(about, axis1=1, axis2=2)
-    if robots.driven:
-        _weigh_bases(new, model, robots)
-    new[".body_subtreemass"][:, 0] = new[".body_mass"].sum(axis=1)
-    new[".stat.meaninertia"] = new[".dof_M0"].mean(axis=1)
-    _size_geoms(family, solids, robots, model, new)
-    if solids.feet is not None:
-        new[OUTLINE] = solids.vertices
-    robot = np.array([model.pair(i).name == "base_object" for i in range(model.npair)])
-    new[".pair_friction"][:, :, :2] = np.where(
-        robot[:, None], friction.robot[:, None, None], friction.ground[:, None, None]
-    )
-    return new
-
-
-def _weigh_bases(new: dict[str, np.ndarray], model: mujoco.MjModel, robots: Robot) -> None:
-    """Set the masses of bases (n,) with a limited force, and the derived constants."""
-    base = model.body("base").id
-    mass, inertia = np.asarray(robots.mass, float), np.asarray(robots.inertia, float)
-    new[".body_mass"][:, base] = new[".body_subtreemass"][:, base] = mass
-    new[".body_inertia"][:, base] = inertia[:, None]
-    invweight = np.stack([scene.base_invweight(robots), 1 / (3 * inertia)], axis=-1)
-    new[".body_invweight0"][:, base] = invweight
-    weights = np.stack([mass, mass, inertia], axis=-1)
-    new[".dof_M0"][:, :3], new[".dof_invweight0"][:, :3] = weights, 1 / weights
-
-
-def _size_geoms(
-    family: str, solids: Solid, robots: Robot, model: mujoco.MjModel, new: dict[str, np.ndarray]
-) -> None:
-    """Set sizes, bounding boxes and radii of the geoms of bases and objects."""
-    half, base = solids.height / 2, new[".geom_size"][:, model.geom("base").id].copy()
-    base[:, :2] = scene.base_half(robots, len(base))
-    for name, size in {"base": base, **scene.geom_sizes(family, solids)}.items():
-        geom, is_box = model.geom(name).id, name == "base" or family == "box"
-        box = size if is_box else size[:, [0, 0, 1]]
-        bound = np.linalg.norm(size[:, :3] if is_box else size[:, :2], axis=1)
-        if name == "object_side":  # a capsule reaches farther up by its radius
-            box, bound = box + [0, 0, 1] * size[:, :1], half + solids.radius
-        new[".geom_size"][:, geom], new[".geom_rbound"][:, geom] = size, bound
-        aabb = new[".geom_aabb"][:, geom]
-        aabb[:] = np.concatenate([0 * box, box], axis=-1).reshape(aabb.shape)
-    if family == "prism" or solids.feet is not None:
-        for i, at in enumerate(scene.foot_positions(solids).swapaxes(0, 1)):
-            new[".geom_pos"][:, model.geom(f"foot_{i}").id] = at
-
-
-def _skew(v: np.ndarray) -> np.ndarray:
-    """Return matrices (n, 3, 3) of the cross products with v (n, 3)."""
-    x, y, z = v.T
-    zero = np.zeros_like(x)
-    rows = [zero, -z, y, z, zero, -x, -y, x, zero]
-    return np.stack(rows, axis=-1).reshape(-1, 3, 3)
 
 
 ENGINE = MJX()

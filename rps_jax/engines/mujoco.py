@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any, TypeVar
 
 import jax
 import mujoco
 import numpy as np
 from mujoco import rollout
 
+from rps_jax.engines import device
 from rps_jax.engines.base import Engine
 from rps_jax.geometry.solid import Solid
 from rps_jax.robot import drive as drives
@@ -19,6 +21,7 @@ from rps_jax.world import scene
 from rps_jax.world.physics import Physics
 from rps_jax.world.scene import JOINTS, Friction
 
+T = TypeVar("T")
 _STATE = mujoco.mjtState.mjSTATE_FULLPHYSICS
 
 
@@ -137,6 +140,32 @@ class Batch:
         self._pool.close()
 
 
+def compile_rows(
+    family: str,
+    solids: Solid,
+    friction: Friction,
+    physics: Physics,
+    robots: Robot,
+    read: Callable[[mujoco.MjModel], T] = lambda model: model,
+) -> list[T]:
+    """Compile the models of worlds (n, ...) in parallel, and return what `read` takes of each.
+
+    Equal worlds share one.
+    """
+    count = solids.mass.size
+    robots = scene.repeat_robot(robots, count)
+    leaves = [np.ascontiguousarray(x) for x in jax.tree.leaves((solids, friction, robots))]
+    keys = [b"".join(leaf[i].tobytes() for leaf in leaves) for i in range(count)]
+    distinct = {key: i for i, key in enumerate(keys)}
+
+    def compile_row(i: int) -> T:
+        return read(scene.compile_row(family, solids, friction, physics, i, robots).physics)
+
+    with ThreadPoolExecutor(device.count_processors()) as pool:
+        rows = dict(zip(distinct, pool.map(compile_row, distinct.values()), strict=True))
+    return [rows[key] for key in keys]
+
+
 class MuJoCo(Engine):
     """C MuJoCo on all processors; the stage is a list of models."""
 
@@ -151,15 +180,7 @@ class MuJoCo(Engine):
         self, family: str, solids: Solid, friction: Friction, physics: Physics, robots: Robot
     ) -> tuple[list[mujoco.MjModel], dict[str, np.ndarray]]:
         """Return the models of the worlds; equal worlds share one."""
-        count, models = solids.mass.size, dict[bytes, mujoco.MjModel]()
-        robots = scene.repeat_robot(robots, count)
-        leaves = [np.ascontiguousarray(x) for x in jax.tree.leaves((solids, friction, robots))]
-        keys = [b"".join(leaf[i].tobytes() for leaf in leaves) for i in range(count)]
-        for i, key in enumerate(keys):
-            if key not in models:
-                loaded = scene.compile_row(family, solids, friction, physics, i, robots)
-                models[key] = loaded.physics
-        return [models[key] for key in keys], {}
+        return compile_rows(family, solids, friction, physics, robots), {}
 
     def stepper(
         self, stage: Any, qpos: np.ndarray, threads: int, robots: Robot | None = None

@@ -266,7 +266,6 @@ class QuasistaticEngine(Engine):
     name = "quasistatic"
     cones = ("elliptic",)  # its friction is the same in all directions
     modes = ("forward", "reverse")
-    newton = False  # its solver has its own iterations
     forces = False
     computes_force = False  # only the direction of the force is known, not its size
 

@@ -18,8 +18,9 @@ import jax
 import jax.numpy as jnp
 import xarray as xr
 
-from rps_jax import engines
 from rps_jax.engines.base import ControlPeriod, Driven, Motion
+from rps_jax.engines.mjx import Colliders, MJXStage
+from rps_jax.engines.mjx_colliders import COLLIDERS, GeomType, mjx
 from rps_jax.record.options import option
 from rps_jax.runs.question import Run, call_of
 from rps_jax.trials.progress import Progress
@@ -79,11 +80,27 @@ _FLAGS = {
 }
 
 
+def _sparse(stage: MJXStage) -> MJXStage:
+    """Return the stage with a sparse inertia matrix."""
+    model: Any = stage.model.tree_replace({"opt.jacobian": mjx.JacobianType.SPARSE})
+    return stage._replace(model=model, data=mjx.make_data(model))
+
+
+def _without_box_collider(stage: MJXStage) -> MJXStage:
+    """Return the stage with MJX's collider of boxes."""
+    boxes = GeomType.BOX, GeomType.BOX
+    return stage._replace(colliders=Colliders(frozenset(COLLIDERS) - {boxes}))
+
+
 def levers_of(name: str, family: str) -> dict[str, Lever]:
     """Return the levers of a program of `programs.BATCHED` on this machine."""
-    engine = engines.get(programs.BATCHED[name].engine)
-    levers = _OF_ALL | (_OF_SOLVERS if engine.newton else {})
-    levers |= {label: Lever(stage=change) for label, change in engine.levers(family).items()}
+    engine = programs.BATCHED[name].engine
+    # The quasi-static engine has its own solver.
+    levers = _OF_ALL | (_OF_SOLVERS if engine != "quasistatic" else {})
+    if engine == "mjx":
+        levers |= {"sparse inertia matrix": Lever(stage=_sparse)}
+    if engine == "mjx" and family == "box":
+        levers |= {"MJX's own box collider": Lever(stage=_without_box_collider)}
     flags = _FLAGS.get(jax.default_backend(), {})
     return levers | {label: Lever(flags=values) for label, values in flags.items()}
 
