@@ -6,7 +6,17 @@ import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Generic, Literal, NamedTuple, Protocol, TypeVar, runtime_checkable
+from typing import (
+    Any,
+    Generic,
+    Literal,
+    NamedTuple,
+    Protocol,
+    TypeVar,
+    get_args,
+    get_type_hints,
+    runtime_checkable,
+)
 
 import jax
 import numpy as np
@@ -55,13 +65,20 @@ class Bound(NamedTuple):
 
 
 def document_fields(kind: type[T]) -> type[T]:
-    """Copy the comment after each field of a NamedTuple into its docstring, for `help`."""
+    """Copy the comment at each field of a NamedTuple into its docstring, for `help`."""
     with contextlib.suppress(OSError):  # there is no source
         source = Path(str(sys.modules[kind.__module__].__file__)).read_text("utf-8")
         body = source.partition(f"\nclass {kind.__name__}(")[2].partition("\n\n\n")[0]
-        for name, comment in re.findall(r"^    (\w+): .*?  # (.+)$", body, re.MULTILINE):
-            getattr(kind, name).__doc__ = comment
+        pattern = r"^(?:    # (.+)\n)?    (\w+): .*?(?:  # (.+))?$"
+        for above, name, behind in re.findall(pattern, body, re.MULTILINE):
+            getattr(kind, name).__doc__ = behind or above
     return kind
+
+
+def bounds_of(kind: type) -> dict[str, Bound]:
+    """Return the bounds in the annotations of parameters, by name."""
+    hints = get_type_hints(kind, include_extras=True).items()
+    return {name: x for name, hint in hints for x in get_args(hint) if isinstance(x, Bound)}
 
 
 def named_leaves(tree: object, is_leaf: Callable[[object], bool] | None = None) -> dict[str, Leaf]:

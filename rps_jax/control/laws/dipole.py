@@ -14,12 +14,12 @@ the target by `beyond` radii; the base turns to face the object.
 """
 
 from functools import partial
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import jax
 import jax.numpy as jnp
 
-from rps_jax.control.base import Bound, Law, check_signs, document_fields
+from rps_jax.control.base import Bound, Law, bounds_of, check_signs, document_fields
 from rps_jax.control.observation import Details, PoseObservation, Twist
 from rps_jax.geometry import planar
 
@@ -28,19 +28,15 @@ from rps_jax.geometry import planar
 class DipoleParams(NamedTuple):
     """Parameters of the dipole law; the lookahead is that of Heins and Schoellig."""
 
-    K_h: float | jax.Array = 1.0  # [1/s] turning rate over heading error
-    lookahead: float | jax.Array = 1.0  # [m] distance along the path from object to aim
-    beyond: float | jax.Array = 2.0  # [1] object radii after which a target is passed
+    # [1/s] turning rate over heading error
+    K_h: Annotated[float | jax.Array, Bound(0.02, 5, log=True)] = 1.0
+    # [m] distance along the path from object to aim
+    lookahead: Annotated[float | jax.Array, Bound(0.05, 3, log=True)] = 1.0
+    # [1] object radii after which a target is passed
+    beyond: Annotated[float | jax.Array, Bound(0, 5)] = 2.0
     v_max: float | jax.Array = 0.05  # [m/s] speed, the bound of RPS
     omega_max: float | jax.Array = 0.15  # [rad/s] bound on |omega|
     d_success: float | jax.Array = 0.05  # [m] target reached
-
-
-BOUNDS = {
-    "K_h": Bound(0.02, 5, log=True),  # [1/s]
-    "lookahead": Bound(0.05, 3, log=True),  # [m]
-    "beyond": Bound(0, 5),  # [1]
-}
 
 
 class DipoleState(NamedTuple):
@@ -86,5 +82,5 @@ def step(
     return DipoleState(start, jnp.ones_like(state.started)), twist, Details.from_obs(touch)
 
 
-LAW = Law(init, step, "pose", check=check, bounds=tuple(BOUNDS.items()))
+LAW = Law(init, step, "pose", check=check, bounds=tuple(bounds_of(DipoleParams).items()))
 PRESETS = {"dipole": DipoleParams()}

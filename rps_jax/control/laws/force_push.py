@@ -18,12 +18,12 @@ angle_max of the heading; the speed bound is that of RPS.
 from __future__ import annotations
 
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 
-from rps_jax.control.base import Bound, Law, check_signs, document_fields
+from rps_jax.control.base import Bound, Law, bounds_of, check_signs, document_fields
 from rps_jax.control.observation import Details, Observation, Twist, displacement
 from rps_jax.geometry import planar
 from rps_jax.geometry.arrays import Scalar
@@ -35,26 +35,21 @@ _POSITIVE = ("drift", "angle_max", "v_max", "omega_max", "d_success")
 class ForcePushParams(NamedTuple):
     """Parameters of Force Push; the gains are those of its authors' experiments."""
 
-    k_theta: float | jax.Array = 0.3  # [1] gain of the force's angle, beyond 1
-    k_y: float | jax.Array = 0.5  # [rad/m] gain of the path
-    k_omega: float | jax.Array = 1.0  # [1/s] gain of the heading
-    converge: float | jax.Array = 0.1  # [rad] largest change of theta_p in a step without contact
-    drift: float | jax.Array = 0.1  # [m] lambda, length of motion over which drift is estimated
-    angle_max: float | jax.Array = 1.2  # [rad] largest angle between push and heading
+    # [1] gain of the force's angle, beyond 1
+    k_theta: Annotated[float | jax.Array, Bound(-2, 4)] = 0.3
+    k_y: Annotated[float | jax.Array, Bound(-2, 2)] = 0.5  # [rad/m] gain of the path
+    # [1/s] gain of the heading
+    k_omega: Annotated[float | jax.Array, Bound(0.005, 2, log=True)] = 1.0
+    # [rad] largest change of theta_p in a step without contact
+    converge: Annotated[float | jax.Array, Bound(0.001, 1, log=True)] = 0.1
+    # [m] lambda, length of motion over which drift is estimated
+    drift: Annotated[float | jax.Array, Bound(0.01, 1, log=True)] = 0.1
+    # [rad] largest angle between push and heading
+    angle_max: Annotated[float | jax.Array, Bound(0.2, 1.57)] = 1.2
     v_max: float | jax.Array = 0.05  # [m/s] speed of the contact, and bound for the base
     omega_max: float | jax.Array = 0.15  # [rad/s] bound on |omega|
     v_approach: float | jax.Array = 0.01  # [m/s] forward speed before the first contact
     d_success: float | jax.Array = 0.05  # [m] target reached
-
-
-BOUNDS = {
-    "k_theta": Bound(-2, 4),  # [1]
-    "k_y": Bound(-2, 2),  # [rad/m]
-    "k_omega": Bound(0.005, 2, log=True),  # [1/s]
-    "converge": Bound(0.001, 1, log=True),  # [rad]
-    "drift": Bound(0.01, 1, log=True),  # [m]
-    "angle_max": Bound(0.2, 1.57),  # [rad]
-}
 
 
 class Path(NamedTuple):
@@ -157,5 +152,5 @@ def step(
     return state, twist, Details.from_obs(filled)._replace(gamma=theta_p)
 
 
-LAW = Law(init, step, check=check, bounds=tuple(BOUNDS.items()))
+LAW = Law(init, step, check=check, bounds=tuple(bounds_of(ForcePushParams).items()))
 PRESETS = {"force_push": ForcePushParams()}

@@ -21,12 +21,12 @@ The speed bound is that of RPS, half of theirs, and so is k_f. One step of ours 
 """
 
 from functools import partial
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import jax
 import jax.numpy as jnp
 
-from rps_jax.control.base import Bound, Law, check_signs, document_fields
+from rps_jax.control.base import Bound, Law, bounds_of, check_signs, document_fields
 from rps_jax.control.laws import force_push
 from rps_jax.control.laws.force_push import Path
 from rps_jax.control.observation import Details, ForceObservation, Twist
@@ -39,26 +39,24 @@ _POSITIVE = ("v_max", "omega_max", "d_success")
 class PublishedForcePushParams(NamedTuple):
     """Parameters of Force Push, as in its authors' experiments; f_min as in their simulations."""
 
-    k_theta: float | jax.Array = 0.3  # [1] gain of the force's angle, beyond 1
-    k_y: float | jax.Array = 0.5  # [rad/m] gain of the path; 0.1 in their simulations
-    k_omega: float | jax.Array = 1.0  # [1/s] gain of the heading
-    converge: float | jax.Array = 10.0  # [rad/s] largest rate of theta_p without a force
-    f_min: float | jax.Array = 1.0  # [N] least force of a contact; 5 N in their experiments
-    f_max: float | jax.Array = 50.0  # [N] above which the base yields
-    k_f: float | jax.Array = 0.0015  # [m/s/N] admittance; 0.003 at their speed of 0.1 m/s
+    # [1] gain of the force's angle, beyond 1
+    k_theta: Annotated[float | jax.Array, Bound(-2, 4)] = 0.3
+    # [rad/m] gain of the path; 0.1 in their simulations
+    k_y: Annotated[float | jax.Array, Bound(-2, 2)] = 0.5
+    # [1/s] gain of the heading
+    k_omega: Annotated[float | jax.Array, Bound(0.005, 2, log=True)] = 1.0
+    # [rad/s] largest rate of theta_p without a force
+    converge: Annotated[float | jax.Array, Bound(0.1, 100, log=True)] = 10.0
+    # [N] least force of a contact; 5 N in their experiments
+    f_min: Annotated[float | jax.Array, Bound(0.1, 20, log=True)] = 1.0
+    # [N] above which the base yields
+    f_max: Annotated[float | jax.Array, Bound(10, 1000, log=True)] = 50.0
+    # [m/s/N] admittance; 0.003 at their speed of 0.1 m/s
+    k_f: Annotated[float | jax.Array, Bound(1e-5, 0.02, log=True)] = 0.0015
     v_max: float | jax.Array = 0.05  # [m/s] speed of the contact, and bound for the base
     omega_max: float | jax.Array = 0.15  # [rad/s] bound on |omega|
     v_approach: float | jax.Array = 0.01  # [m/s] forward speed before the first contact
     d_success: float | jax.Array = 0.05  # [m] target reached
-
-
-BOUNDS = {
-    **{name: force_push.BOUNDS[name] for name in ("k_theta", "k_y", "k_omega")},
-    "converge": Bound(0.1, 100, log=True),  # [rad/s]
-    "f_min": Bound(0.1, 20, log=True),  # [N]
-    "f_max": Bound(10, 1000, log=True),  # [N]
-    "k_f": Bound(1e-5, 0.02, log=True),  # [m/s/N]
-}
 
 
 class PublishedForcePushState(NamedTuple):
@@ -109,5 +107,7 @@ def step(
     return PublishedForcePushState(path, theta_p, pushed), twist, details
 
 
-LAW = Law(init, step, "force", check=check, bounds=tuple(BOUNDS.items()))
+LAW = Law(
+    init, step, "force", check=check, bounds=tuple(bounds_of(PublishedForcePushParams).items())
+)
 PRESETS = {"force_push_published": PublishedForcePushParams()}

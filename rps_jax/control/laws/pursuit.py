@@ -7,12 +7,12 @@ Symbols are those of `rps`: C contact point, T target, d from C to T, e the head
 """
 
 from functools import partial
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import jax
 import jax.numpy as jnp
 
-from rps_jax.control.base import Bound, Law, check_signs, document_fields
+from rps_jax.control.base import Bound, Law, bounds_of, check_signs, document_fields
 from rps_jax.control.observation import Details, Observation, Twist, displacement
 from rps_jax.geometry import planar
 
@@ -21,20 +21,15 @@ from rps_jax.geometry import planar
 class PursuitParams(NamedTuple):
     """Parameters of pursuit; the bounds are those of RPS."""
 
-    K_v: float | jax.Array = 0.5  # [1/s] speed over distance
-    K_h: float | jax.Array = 1.0  # [1/s] turning rate over heading error
-    press: float | jax.Array = 0.2  # [1] least share of the speed that is forward
+    K_v: Annotated[float | jax.Array, Bound(0.02, 2, log=True)] = 0.5  # [1/s] speed over distance
+    # [1/s] turning rate over heading error
+    K_h: Annotated[float | jax.Array, Bound(0.005, 2, log=True)] = 1.0
+    # [1] least share of the speed that is forward
+    press: Annotated[float | jax.Array, Bound(0, 2)] = 0.2
     v_max: float | jax.Array = 0.05  # [m/s] bound on the speed
     omega_max: float | jax.Array = 0.15  # [rad/s] bound on |omega|
     v_approach: float | jax.Array = 0.01  # [m/s] forward speed without contact
     d_success: float | jax.Array = 0.05  # [m] target reached
-
-
-BOUNDS = {
-    "K_v": Bound(0.02, 2, log=True),  # [1/s]
-    "K_h": Bound(0.005, 2, log=True),  # [1/s]
-    "press": Bound(0, 2),  # [1]
-}
 
 
 _POSITIVE = ("K_v", "K_h", "v_max", "omega_max", "d_success")
@@ -69,5 +64,5 @@ def step(
     return state, twist, details._replace(gamma=error)
 
 
-LAW = Law(init, step, check=check, bounds=tuple(BOUNDS.items()))
+LAW = Law(init, step, check=check, bounds=tuple(bounds_of(PursuitParams).items()))
 PRESETS = {"pursuit": PursuitParams()}

@@ -11,7 +11,7 @@ alternatives (see `soft`), so that the law is smooth. Without them it is the pap
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -19,7 +19,7 @@ from jax.typing import ArrayLike
 
 from rps_jax import errors
 from rps_jax.control import soft
-from rps_jax.control.base import Bound, Law, check_signs, document_fields
+from rps_jax.control.base import Bound, Law, bounds_of, check_signs, document_fields
 from rps_jax.control.observation import Details, Observation, Twist, displacement
 from rps_jax.geometry import planar
 from rps_jax.geometry.arrays import Array, Bool, Float
@@ -32,24 +32,33 @@ class RPSParams(NamedTuple):
     The first block is given in the paper. The second is not; its defaults are ours.
     """
 
-    eta: float | jax.Array = 10.0  # [1] upper asymptote of the adaptive rate, Eq. 5
-    zeta: float | jax.Array = 0.0  # [1] lower asymptote, Eq. 5
-    beta: float | jax.Array = 0.12  # [m] inflection point of |l|, Eq. 5
-    k: float | jax.Array = 60.0  # [1/m] steepness, Eq. 5
-    K_h: float | jax.Array = 1.0  # [1] heading gain, Eq. 7
-    K_v: float | jax.Array = 0.1  # [1/s] velocity gain, Eq. 3
-    L: float | jax.Array = 0.2  # [m] turning length, Eqs. 6 and 9
-    l_cr: float | jax.Array = 0.24  # [m] start of the critical region
-    d_th: float | jax.Array = 0.5  # [m] no lateral motion nearer than this, Eq. 5
+    # [1] upper asymptote of the adaptive rate, Eq. 5
+    eta: Annotated[float | jax.Array, Bound(1, 100, log=True)] = 10.0
+    zeta: Annotated[float | jax.Array, Bound(-2, 5)] = 0.0  # [1] lower asymptote, Eq. 5
+    # [m] inflection point of |l|, Eq. 5
+    beta: Annotated[float | jax.Array, Bound(0.01, 0.3)] = 0.12
+    k: Annotated[float | jax.Array, Bound(5, 500, log=True)] = 60.0  # [1/m] steepness, Eq. 5
+    K_h: Annotated[float | jax.Array, Bound(0.1, 5, log=True)] = 1.0  # [1] heading gain, Eq. 7
+    K_v: Annotated[float | jax.Array, Bound(0.02, 2, log=True)] = 0.1  # [1/s] velocity gain, Eq. 3
+    # [m] turning length, Eqs. 6 and 9
+    L: Annotated[float | jax.Array, Bound(0.03, 1.5, log=True)] = 0.2
+    # [m] start of the critical region; the half width of the base is 0.29
+    l_cr: Annotated[float | jax.Array, Bound(0.1, 0.289)] = 0.24
+    # [m] no lateral motion nearer than this, Eq. 5
+    d_th: Annotated[float | jax.Array, Bound(0.02, 2, log=True)] = 0.5
     v_max: float | jax.Array = 0.05  # [m/s] bound on the norm of (v_x, v_y)
     omega_max: float | jax.Array = 0.15  # [rad/s] bound on |omega|
     d_success: float | jax.Array = 0.05  # [m] target reached, Algorithm 1
     v_approach: float | jax.Array = 0.01  # [m/s] forward speed without contact (Sec. III-B)
 
-    l_mr: float | jax.Array = 0.15  # [m] end of the middle region, where Realignment stops
-    a_r_max: float | jax.Array = 10.0  # [1] adaptive rate in Realignment; eta's value
-    gamma_max: float | jax.Array = 1.56  # [rad] bound on |gamma|; inf is the tangent as printed
-    v_lost: float | jax.Array = 0.01  # [m/s] forward speed after contact is lost
+    # [m] end of the middle region, where Realignment stops
+    l_mr: Annotated[float | jax.Array, Bound(0.02, 0.98, relative_to="l_cr")] = 0.15
+    # [1] adaptive rate in Realignment; eta's value
+    a_r_max: Annotated[float | jax.Array, Bound(1, 100, log=True)] = 10.0
+    # [rad] bound on |gamma|; inf is the tangent as printed
+    gamma_max: Annotated[float | jax.Array, Bound(0.5, 1.57)] = 1.56
+    # [m/s] forward speed after contact is lost
+    v_lost: Annotated[float | jax.Array, Bound(0.001, 0.05, log=True)] = 0.01
     sgn_0: float | jax.Array = 0.0  # [1] sgn(0), from 0 to 1
 
     # Switches, each 0 or 1.
@@ -96,21 +105,9 @@ class RPSParams(NamedTuple):
 
 
 # v_max, omega_max, v_approach and d_success belong to the robot and the task, not to the law.
-BOUNDS = {
-    "eta": Bound(1, 100, log=True),  # [1]
-    "zeta": Bound(-2, 5),  # [1]
-    "beta": Bound(0.01, 0.3),  # [m]
-    "k": Bound(5, 500, log=True),  # [1/m]
-    "K_h": Bound(0.1, 5, log=True),  # [1]
-    "K_v": Bound(0.02, 2, log=True),  # [1/s]
-    "L": Bound(0.03, 1.5, log=True),  # [m]
-    "l_cr": Bound(0.1, 0.289),  # [m] the half width of the base is 0.29
-    "l_mr": Bound(0.02, 0.98, relative_to="l_cr"),  # [1]
-    "a_r_max": Bound(1, 100, log=True),  # [1]
-    "d_th": Bound(0.02, 2, log=True),  # [m]
-    "gamma_max": Bound(0.5, 1.57),  # [rad]
-    "v_lost": Bound(0.001, 0.05, log=True),  # [m/s]
-}
+BOUNDS = bounds_of(RPSParams)
+for _name in ("d_th", "gamma_max", "v_lost"):  # last, in the order of published tunings
+    BOUNDS[_name] = BOUNDS.pop(_name)
 
 
 class Temperatures(NamedTuple):
@@ -122,7 +119,8 @@ class Temperatures(NamedTuple):
     """
 
     realign: float | jax.Array = 0.01  # Algorithm 1's |l| > l_th
-    d_th: float | jax.Array = 0.02  # Eq. 5's ||d|| > d_th
+    # Eq. 5's ||d|| > d_th
+    d_th: Annotated[float | jax.Array, Bound(0.02, 2, log=True)] = 0.02
     sgn: float | jax.Array = 0.01  # sgn(l)
     arrive: float | jax.Array = 0.002  # ||d|| < d_success
 

@@ -29,14 +29,14 @@ world, and the number of control steps since.
 """
 
 import math
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import jax
 import jax.numpy as jnp
 
 from rps_jax import errors
 from rps_jax.control import soft
-from rps_jax.control.base import Bound, Law, document_fields
+from rps_jax.control.base import Bound, Law, bounds_of, document_fields
 from rps_jax.control.laws import rps
 from rps_jax.control.laws.rps import RPSParams, RPSState, Temperatures
 from rps_jax.control.observation import Details, Observation, Twist, displacement
@@ -55,11 +55,15 @@ class RPSPlusParams(NamedTuple):
     """Parameters of RPS+: the tuned ones of RPS with a faster approach, and those of P1 to P3."""
 
     law: RPSParams = RPSParams.tuned()._replace(v_approach=0.03)  # of Eqs. 1-10
-    d_near: float | jax.Array = 0.25  # [m] distance within which the base translates, P1
-    press: float | jax.Array = 0.2  # [1] least share of the speed that is forward, P2
-    n_lost: float | jax.Array = 100  # [1] control steps without contact before P3: 2 s
-    ahead: float | jax.Array = 0.7  # [1] share of v_max towards the last contact, P3
-    aside: float | jax.Array = 0.5  # [1] share of v_max to the side, P3
+    # [m] distance within which the base translates, P1
+    d_near: Annotated[float | jax.Array, Bound(0.05, 1, log=True)] = 0.25
+    # [1] least share of the speed that is forward, P2
+    press: Annotated[float | jax.Array, Bound(0, 1)] = 0.2
+    # [1] control steps without contact before P3: 2 s
+    n_lost: Annotated[float | jax.Array, Bound(10, 2000, log=True)] = 100
+    # [1] share of v_max towards the last contact, P3
+    ahead: Annotated[float | jax.Array, Bound(0, 1)] = 0.7
+    aside: Annotated[float | jax.Array, Bound(0, 1)] = 0.5  # [1] share of v_max to the side, P3
 
     @property
     def d_success(self) -> Number:
@@ -80,14 +84,9 @@ class RPSPlusState(NamedTuple):
     steps_lost: jax.Array  # () int32 control steps since then; a float in the smooth law
 
 
-BOUNDS = {f"law.{name}": bound for name, bound in rps.BOUNDS.items() if not bound.relative_to} | {
-    "law.l_mr": rps.BOUNDS["l_mr"]._replace(relative_to="law.l_cr"),
-    "d_near": Bound(0.05, 1, log=True),  # [m]
-    "press": Bound(0, 1),  # [1]
-    "n_lost": Bound(10, 2000, log=True),  # [1]
-    "ahead": Bound(0, 1),  # [1]
-    "aside": Bound(0, 1),  # [1]
-}
+BOUNDS = {f"law.{name}": bound for name, bound in rps.BOUNDS.items() if not bound.relative_to}
+BOUNDS["law.l_mr"] = rps.BOUNDS["l_mr"]._replace(relative_to="law.l_cr")
+BOUNDS |= bounds_of(RPSPlusParams)
 
 
 def check(params: RPSPlusParams) -> RPSPlusParams:
