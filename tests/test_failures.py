@@ -158,7 +158,6 @@ def test_the_command_compares_subset_simulation_with_drawn_worlds(tmp_path, caps
     text = capsys.readouterr().out
     assert "| drawn worlds " in text
     assert "intervals hold the rate of the drawn worlds" in text
-    assert (tmp_path / "run" / "rare.png").stat().st_size > 5000
     assert "holds another run" in refusal(capsys, *command, "--seed", 1)
 
 
