@@ -13,7 +13,7 @@ import os
 import shutil
 import tempfile
 from collections import namedtuple
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from itertools import product
@@ -47,8 +47,11 @@ _Trials = namedtuple("_Trials", "trials steps greatest told beyond parted in_jax
 
 
 @dataclass(frozen=True)
-class Export(Study[xr.Dataset]):
-    """Compare exported laws with those in JAX, and time them."""
+class Export(Study[xr.DataTree]):
+    """Compare exported laws with those in JAX, and time them.
+
+    The answer is a tree with the values of each table by law.
+    """
 
     TITLE: ClassVar[str] = "Laws in C and ONNX beside those in JAX"
     GROWS: ClassVar[tuple[str, ...]] = ("laws", "tables", "in_worlds")
@@ -84,16 +87,16 @@ class Export(Study[xr.Dataset]):
         if shutil.which("gcc") is None:
             raise InputError("gcc is not installed: install it to compile the exported laws.")
 
-    def answer(self, run: Run) -> xr.Dataset:
+    def answer(self, run: Run) -> xr.DataTree:
         """Compute the tables that are missing, law by law."""
-        by_table = []
+        by_table = {}
         for table in self.tables:
             compute = getattr(self, f"_{table}")
             laws = [law for law in self.laws if table != "worlds" or law in self.in_worlds]
             parts = {f"{table}-{law}": partial(self._compute, compute, law) for law in laws}
             if parts:
-                by_table.append(run_parts(run, "law", parts).assign_coords(law=laws))
-        return xr.merge(by_table, join="outer").reindex(law=list(self.laws))
+                by_table[table] = run_parts(run, "law", parts).assign_coords(law=laws)
+        return xr.DataTree.from_dict(by_table)
 
     def _compute(self, compute: Callable[[str, Path], xr.Dataset], law: str) -> xr.Dataset:
         with tempfile.TemporaryDirectory() as folder:
@@ -109,7 +112,7 @@ class Export(Study[xr.Dataset]):
             for form in _FORMS
         }
         rows = [native.agreement(law, form, count, folder) for form, count in counts.items()]
-        return _columns("inputs", rows, "form", _FORMS, but=("law", "form"))
+        return _columns(rows, "form", _FORMS, but=("law", "form"))
 
     def _trials(self, law: str, folder: Path) -> xr.Dataset:
         cases = [
@@ -126,19 +129,19 @@ class Export(Study[xr.Dataset]):
             rows.append(_Trials(
                 len(trials), free.size, free.max(), synchronised.max(), beyond, *parted
             ))  # fmt: skip
-        return _columns("trials", rows, "form", _FORMS)
+        return _columns(rows, "form", _FORMS)
 
     def _paper(self, law: str, folder: Path) -> xr.Dataset:
-        return _columns("paper", [loop.papers_trials(law, Setting("fused"), folder)])
+        return _columns([loop.papers_trials(law, Setting("fused"), folder)])
 
     def _worlds(self, law: str, folder: Path) -> xr.Dataset:
         setting = Setting("fused")
         outcomes = loop.random_worlds(law, self.domain, self.worlds, setting, folder)
-        return _columns("worlds", [outcomes])
+        return _columns([outcomes])
 
     def _bags(self, law: str, folder: Path) -> xr.Dataset:
         bags = loop.bags(law, self.domain, self.bags, Setting("fused"), folder)
-        return _columns("bags", [bags])
+        return _columns([bags])
 
     def _odd(self, law: str, folder: Path) -> xr.Dataset:
         exported, compilers = program.program(law), native.COMPILERS
@@ -148,37 +151,39 @@ class Export(Study[xr.Dataset]):
             if faults := [result for result in results if result.fault]:
                 raise AssertionError(f"{law}, {compiler}: {faults}")
             rows.append(native.Fuzzed(*(a + b for a, b in zip(*results, strict=True))))
-        return _columns("odd", rows, "compiler", compilers, but=("said", "fault"))
+        return _columns(rows, "compiler", compilers, but=("said", "fault"))
 
     def _speed(self, law: str, folder: Path) -> xr.Dataset:
         times = [native.latency(law, precision, folder) for precision in _PRECISIONS]
         latency = ("precision", "of", "share"), times, {"units": "us"}
         coords = {"precision": list(_PRECISIONS), "share": [0.5, 0.999]}
-        return xr.Dataset({"speed_latency": latency, "speed_load": os.getloadavg()[0]}, coords)
+        return xr.Dataset({"latency": latency, "load": os.getloadavg()[0]}, coords)
 
-    def report_tables(self, results: xr.Dataset) -> Sequence[Table]:
+    def report_tables(self, results: xr.DataTree) -> Sequence[Table]:
         """Return all tables."""
         functions = {
             "speed": _speed_table, "inputs": _input_table, "trials": _trial_table,
             "paper": _paper_table, "worlds": partial(_world_table, self.domain),
             "bags": partial(_bag_table, self.domain), "odd": _odd_table,
         }  # fmt: skip
-        return [functions[name](results)._replace(name=f"export_{name}") for name in self.tables]
+        return [
+            functions[name](node.to_dataset())._replace(name=f"export_{name}")
+            for name, node in results.children.items()
+        ]
 
 
 export = call_of(Export)
 
 
 def _columns(
-    table: TableName, rows: Sequence[Any], dim: str = "", names: Sequence[str] = (),
-    but: Sequence[str] = (),
-) -> xr.Dataset:  # fmt: skip
+    rows: Sequence[Any], dim: str = "", names: Sequence[str] = (), but: Sequence[str] = ()
+) -> xr.Dataset:
     """Return the fields of named tuples as variables, along dimension `dim` if it has a name."""
     fields = [name for name in rows[0]._fields if name not in but]
     if not dim:
-        return xr.Dataset({f"{table}_{name}": float(getattr(rows[0], name)) for name in fields})
+        return xr.Dataset({name: float(getattr(rows[0], name)) for name in fields})
     return xr.Dataset(
-        {f"{table}_{n}": (dim, [float(getattr(row, n)) for row in rows]) for n in fields},
+        {n: (dim, [float(getattr(row, n)) for row in rows]) for n in fields},
         {dim: list(names)},
     )
 
@@ -188,20 +193,12 @@ def _share(part: float, whole: float) -> str:
     return f"{100 * part / whole:.2g} %" if part else "0"
 
 
-def _records(results: xr.Dataset, table: TableName, *dims: str) -> Iterator[dict[str, Any]]:
-    """Yield the values of a table for each law and index of some dimensions."""
-    prefix = f"{table}_"
-    names = {x: x.removeprefix(prefix) for x in map(str, results) if x.startswith(prefix)}
-    selected = results[list(names)].rename(names)
-    yield from records(selected.dropna("law", how="all"), "law", *dims)
-
-
 def _input_table(results: xr.Dataset) -> Table:
     rows = [
         ["law", "form", "inputs", "greatest difference", "beyond the goal", "flips", "unexplained",
          "beyond 1e-6 of float64", "JAX's float32 is"],
     ]  # fmt: skip
-    for row in _records(results, "inputs", "form"):
+    for row in records(results, "law", "form"):
         beyond, *in_float = (
             _share(row[name], row["inputs"]) for name in ("beyond", "off", "off_in_jax")
         )
@@ -220,7 +217,7 @@ def _input_table(results: xr.Dataset) -> Table:
 def _trial_table(results: xr.Dataset) -> Table:
     rows = [["law", "form", "steps", "greatest difference", "from JAX's memory",
              "steps beyond the goal", "beyond 1e-3", "JAX's float32 is"]]  # fmt: skip
-    for row in _records(results, "trials", "form"):
+    for row in records(results, "law", "form"):
         *shares, in_jax = (
             _share(row[name], row["steps"]) for name in ("beyond", "parted", "in_jax")
         )
@@ -229,7 +226,7 @@ def _trial_table(results: xr.Dataset) -> Table:
             f"{row['told']:.1e}", *shares, in_jax if row["form"] != "double" else "",
         ])  # fmt: skip
     note = (
-        f"{int(results.trials_trials.max())} trials of each law. Each law remembers by itself from "
+        f"{int(results.trials.max())} trials of each law. Each law remembers by itself from "
         "the first step to the last; from JAX's memory, it is given that before each step. JAX's "
         "float32 is compared with JAX's float64."
     )
@@ -253,13 +250,13 @@ def _paper_table(results: xr.Dataset) -> Table:
         "in 2^23, and the least of these eight is told. Times are those of trials in which JAX and "
         "C both succeed."
     )
-    rows = text_table(_ENDS, _records(results, "paper"))
+    rows = text_table(_ENDS, records(results, "law"))
     return Table(rows, note, title="The paper's trials")
 
 
 def _world_table(domain: str, results: xr.Dataset) -> Table:
     note = f"The same worlds of `{domain}` for both; one rounding off; fused engine, float."
-    return Table(text_table(_ENDS, _records(results, "worlds")), note, title="Random worlds")
+    return Table(text_table(_ENDS, records(results, "law")), note, title="Random worlds")
 
 
 _BAGS = {
@@ -278,12 +275,12 @@ def _bag_table(domain: str, results: xr.Dataset) -> Table:
         f"Worlds of `{domain}`, fused engine. Each law is fed its own bag. The goal is 1e-6, of "
         "differences as shares of the greatest speed and turning rate."
     )
-    return Table(text_table(_BAGS, _records(results, "bags")), note, title="Bags")
+    return Table(text_table(_BAGS, records(results, "law")), note, title="Bags")
 
 
 def _odd_table(results: xr.Dataset) -> Table:
     rows = [["law", "compiler", "inputs", "refused (not finite)", "no finite twist", "faults"]]
-    for row in _records(results, "odd", "compiler"):
+    for row in records(results, "law", "compiler"):
         counts = [int(row[name]) for name in ("taken", "refused", "no_result")]
         cells = [f"{n:,}" for n in (sum(counts), *counts[1:])]
         rows.append([row["law"], row["compiler"], *cells, "0"])
@@ -294,12 +291,12 @@ def _odd_table(results: xr.Dataset) -> Table:
 def _speed_table(results: xr.Dataset) -> Table:
     rows = [["law", "form", "median", "99.9th percentile", "of five runs, from", "to"]]
     for law, precision in product(results.law.values, results.precision.values):
-        latency = results.speed_latency.sel(law=law, precision=precision)
+        latency = results.latency.sel(law=law, precision=precision)
         median, slow = (np.sort(latency.sel(share=share).values) for share in (0.5, 0.999))
         middle = len(slow) // 2
         texts = [f"{x:.2f} us" for x in (median[middle], slow[middle], slow[0], slow[-1])]
         rows.append([str(law), _WORDS[str(precision)], *texts])
-    load = float(results.speed_load.max())
+    load = float(results["load"].max())  # `results.load` is a method
     note = (
         "gcc -O2, 200,000 steps of skin and law in a run, on one core; the median of five runs. "
         f"The load of the machine was {load:.1f} at most."
