@@ -46,11 +46,10 @@ def recipe_folder(tmp_path, monkeypatch):
     shutil.copytree(SWEEPS / "table" / "results", tmp_path / "study" / "results")
     recipes = {
         "first": Recipe((f"{PUSH} --laws rps --out runs/one",), 1, None, "Success", ("drums",),
-                        ("", "all"), folder="study"),
+                        ("", "all")),
         "broken": Recipe((f"{PUSH} --laws none",), 1, None, "Success"),
         "second": Recipe((f"{PUSH} --laws rps --out runs/one",), 1, None,
-                         lambda results: [["worlds"], [str(results.sizes["world"])]],
-                         folder="study"),
+                         lambda results: [["worlds"], [str(results.sizes["world"])]]),
     }  # fmt: skip
     monkeypatch.setattr(study, "RECIPES", recipes)
     monkeypatch.setattr(study, "_SWEEPS", tmp_path)
@@ -63,7 +62,7 @@ def test_failed_recipes_are_named_and_the_others_are_run(recipe_folder, capsys):
     output = capsys.readouterr()
     assert "1 of the files could not be computed: broken." in output.err
     assert "unknown law 'none'" in output.out
-    first, second = (json.loads((recipe_folder / f"study/results/{n}.json").read_text())
+    first, second = (json.loads((recipe_folder / f"results/{n}.json").read_text())
                      for n in ("first", "second"))  # fmt: skip
     assert [column["name"] for column in first["columns"]] == ["", "law", "all"]
     assert first["rows"][0][:2] == ["drums", "rps"]
@@ -176,7 +175,7 @@ def test_recipes_are_selected_by_device(recipe_folder, capsys):
     words = ("--only", "first", "--needs", "gpu", "--out", recipe_folder / "run")
     assert rps(SWEEPS / "publish", *words) == 0
     assert "Published numbers" in capsys.readouterr().out
-    assert not (recipe_folder / "study" / "results" / "first.json").exists()
+    assert not (recipe_folder / "results" / "first.json").exists()
 
 
 def test_the_code_of_the_page_reads_a_million_outcomes(tmp_path, monkeypatch, capsys):

@@ -23,7 +23,6 @@ class Recipe(NamedTuple):
     section: str | Callable[[Any], Rows] = ""
     labels: tuple[str, ...] = ()  # first cell of the rows of each command
     columns: tuple[str, ...] = ()  # names of the columns to show; by default all
-    folder: str = ""  # folder of `sweeps` for a new file
 
     @property
     def device(self) -> Literal["cpu", "gpu"]:
@@ -94,13 +93,12 @@ RECIPES: dict[str, Recipe] = {
         columns=_RATES,
     ),
     "table": recipe("rps table", cores=1, section="Table II*"),
-    "table_mjx": recipe("rps table --engine mjx", cores=4, section="Table II*", folder="table"),
+    "table_mjx": recipe("rps table --engine mjx", cores=4, section="Table II*"),
     "grid": recipe(
         "rps table --laws rps rps_tuned rps_plus learned_gru",
         cores=3,
         gpu=1,
         section="Table II*",
-        folder="table",
     ),
     "hardware": recipe(
         "rps hardware --engine fused", cores=4, gpu=2, section="Hardware experiments"
@@ -209,7 +207,6 @@ RECIPES: dict[str, Recipe] = {
         "rps sweeps/ambiguities --gazebo --laws rps --readings paper_gazebo pyramid thin",
         cores=8,
         section="Readings, *",
-        folder="ambiguities",
     ),
     "fidelity": recipe(
         "rps sweeps/fidelity",
@@ -316,7 +313,6 @@ RECIPES: dict[str, Recipe] = {
         f"rps sweeps/speed/commands.py --file gpus --gpus 1 2 --commands '{_SWEPT} "
         f"--worlds 262144' {_MACHINE}",
         gpu=6,
-        folder="speed",
     ),
     # After `python sweeps/speed/peers.py peers`.
     "arena": recipe(f"rps sweeps/speed/arena.py --peers peers {_MACHINE}", gpu=5),

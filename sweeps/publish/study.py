@@ -52,7 +52,7 @@ _KEYS = ("version", "date", "state", "computed on", "two cores", "one H100")
 class Publish(Study[xr.Dataset]):
     """Report whether published numbers are up to date, and compute selected ones again.
 
-    The results hold version, date, device, command, state and duration (file), in words.
+    The results hold version, date, state and duration (file), in words.
     """
 
     TITLE: ClassVar[str] = "Published numbers and their dependencies"
@@ -130,17 +130,14 @@ def published() -> list[Path]:
 
 
 def _description(path: Path) -> dict[str, str]:
-    """Return version, date, device, command, state and duration of a data file, in words."""
+    """Return version, date, state and duration of a data file, in words."""
     data = json.loads(path.read_text())
     recipe = next((r for name, r in RECIPES.items() if fnmatch.fnmatch(path.stem, name)), None)
     minutes = (recipe.two_cores, recipe.one_gpu) if recipe else (None, None)
     cores, gpu = ("" if t is None else f"{t:g} min" for t in minutes)
-    commands = data.get("command", ())
     return {
         "version": str(data.get("versions", {}).get("rps_jax", "")),
         "date": str(data.get("date") or ""),
-        "device": str(data.get("device") or ""),
-        "command": commands if isinstance(commands, str) else "; ".join(commands),
         "computed on": recipe.device if recipe else "",
         "two cores": cores,
         "one H100": gpu,
@@ -188,8 +185,8 @@ def run_recipe(name: str, recipe: Recipe, runs: Path, device: str) -> None:
                 tables.append((label or in_title, [list(row) for row in section.table]))
     if recipe.section:
         columns, rows = joined(tables, recipe.columns)
-        existing = next((path for path in published() if path.stem == name), None)
-        path = existing or _SWEEPS / recipe.folder / "results" / f"{name}.json"
+        paths = {path.stem: path for path in published()}
+        path = paths.get(name, _SWEEPS / "results" / f"{name}.json")
         write_table(path, runs_behind, device, Table(rows, columns=columns))
 
 
