@@ -23,11 +23,12 @@ from rps_jax.errors import InputError
 from rps_jax.record import files
 from rps_jax.record.checkpoint import Checkpoints
 from rps_jax.runs.question import Run
-from rps_jax.trials import pushes
-from rps_jax.trials.batch import BatchSize, rows
+from rps_jax.trials.batch import BatchSize
 from rps_jax.trials.case import Case
 from rps_jax.trials.progress import Progress, ProgressCallback, SequentialProgress, no_progress
+from rps_jax.trials.pushes import Cases
 from rps_jax.trials.results import outcome_dataset
+from rps_jax.trials.rollout import outcomes
 from rps_jax.trials.setting import Setting
 from rps_jax.world import paper
 from rps_jax.world.objects import PAPER_OBJECTS
@@ -115,16 +116,15 @@ def run_conditions(
     progress.finish(grid.size * len(done))
     progress(Progress(0, 0.0))
     for chunk in _chunks([name for name in conditions if name not in done], conditions, grid):
-        cases = [case for name in chunk for case in conditions[name].cases(grid)]
+        requests = [Cases(conditions[name].cases(grid)) for name in chunk]
         setting = conditions[chunk[0]].setting
-        outcome, timing = pushes.run(cases, setting, callback=progress, **size)
-        progress.finish(len(cases))
-        for i, name in enumerate(chunk):
-            part = rows(outcome, slice(i * grid.size, (i + 1) * grid.size))
+        by_condition, timing = outcomes(requests, setting, callback=progress, **size)
+        progress.finish(grid.size * len(chunk))
+        share = 1 / len(chunk)  # of the time of the whole call
+        for name, outcome in zip(chunk, by_condition, strict=True):
             results = outcome_dataset(
-                part, grid.laws, grid.objects, tuple(grid.friction), grid.targets
+                outcome, grid.laws, grid.objects, tuple(grid.friction), grid.targets
             )
-            share = grid.size / len(cases)  # of the time of the whole call
             results.attrs = {
                 "run_as": options[name],
                 "run_time": timing.run * share,
@@ -178,16 +178,16 @@ def condition_rows(results: xr.Dataset, baseline: str, law: str = "rps") -> list
     objects = [str(o) for o in part.object.values]
     table = [["reading", *objects, "all", "95 %", "median time", "against the first"]]
     for i, name in enumerate(names):
-        outcomes = part.sel(condition=name)
-        succeeded = outcomes.success.values.astype(bool)
-        counts = outcomes.success.sum("target").transpose("object", "friction").values.astype(int)
+        trials = part.sel(condition=name)
+        succeeded = trials.success.values.astype(bool)
+        counts = trials.success.sum("target").transpose("object", "friction").values.astype(int)
         low, high = statistics.wilson(int(succeeded.sum()), succeeded.size)
-        time = outcomes.time.values[succeeded]
+        time = trials.time.values[succeeded]
         c, star = comparisons[i], " *" if q[i] < 0.05 else ""
         difference = f"+{c.gained} -{c.lost}, q = {q[i]:.2g}{star}" if name != baseline else ""
         table.append(
             [
-                str(outcomes.what.values),
+                str(trials.what.values),
                 *(" ".join(map(str, row)) for row in counts),
                 f"{succeeded.sum()} of {succeeded.size}",
                 f"{100 * low:.0f}-{100 * high:.0f} %",

@@ -69,7 +69,6 @@ READINGS = {
     "gap_10cm": _case("initial gap 10 cm", gap=0.10),
     "sgn_0": _params("sgn(0) = 1 instead of 0", sgn_0=1.0),
 }
-QUICK_READINGS = (DEFAULT, "tangent_as_printed", "drive_on_loss", "tolerance_1mm", "capacitive")
 
 _THIN = {"skin": IdealSkin(0.001)}
 
@@ -94,10 +93,8 @@ GAZEBO = {
     "gazebo_2ms": _gazebo("`paper_gazebo` in steps of 2 ms", timestep=0.002),
     "gazebo_5ms": _gazebo("`paper_gazebo` in steps of 5 ms", timestep=0.005),
 }
-QUICK_GAZEBO = (DEFAULT, "paper_gazebo")
 
 TOLERANCES = (0.5, 1, 2, 3, 4, 5, 6, 8, 10, 12, 15)  # [mm] of the skin
-QUICK_TOLERANCES = (1, 3, 6, 10)
 ON_LOSS = {
     "creep": ("ahead at 0.01 m/s", {}),
     "drive": ("ahead at 0.05 m/s", {"v_lost": 0.05}),
@@ -105,7 +102,7 @@ ON_LOSS = {
 }
 
 
-def curve(tolerances: tuple[float, ...] = TOLERANCES) -> dict[str, Condition]:
+def curve() -> dict[str, Condition]:
     """Return conditions over skin tolerance [mm] and behaviour on loss of contact."""
     fused = Setting(engine="fused")
     return {
@@ -113,7 +110,7 @@ def curve(tolerances: tuple[float, ...] = TOLERANCES) -> dict[str, Condition]:
             f"{mm:g} mm, {words}", fused, params, {"skin": IdealSkin(mm / 1000)}
         )
         for loss, (words, params) in ON_LOSS.items()
-        for mm in tolerances
+        for mm in TOLERANCES
     }
 
 

@@ -31,6 +31,7 @@ class Ambiguities(ConditionStudy):
     """
 
     TITLE: ClassVar[str] = "What the paper leaves open"
+    QUICK: ClassVar[Mapping[str, Any]] = {"targets": paper.FEW_TARGETS}
     GROWS: ClassVar[tuple[str, ...]] = ("laws", "readings", "gazebo", "curve")
 
     laws: tuple[str, ...] = ()
@@ -41,13 +42,6 @@ class Ambiguities(ConditionStudy):
     """Whether to run the ingredients of the paper's simulator instead, with all three laws."""
     curve: bool = False
     """Whether to run skin tolerances and behaviours on loss of contact instead."""
-
-    def quick_values(self) -> Mapping[str, Any]:
-        """Few targets and readings."""
-        names = readings.QUICK_GAZEBO if self.gazebo else readings.QUICK_READINGS
-        if self.curve:
-            names = tuple(readings.curve(readings.QUICK_TOLERANCES))
-        return {"targets": paper.FEW_TARGETS, "readings": names}
 
     @property
     def known(self) -> dict[str, Condition]:

@@ -33,15 +33,14 @@ class Drawn(Rare):
     """
 
     TITLE: ClassVar[str] = "Rare failures, and drawn worlds"
+    IGNORED_FIELDS: ClassVar[tuple[str, ...]] = ("brute",)
 
     brute: int = option(1000, 1, 1_000_000_000)
     """Number of drawn worlds for the comparison."""
 
     def configuration(self) -> dict[str, Any]:
         """Return everything that the estimates depend on, without the drawn worlds."""
-        options = super().configuration() | {"question": "rare"}
-        del options["brute"]
-        return options
+        return super().configuration() | {"question": "rare"}
 
     def answer(self, run: Run) -> xr.Dataset:
         """Estimate, and sweep the drawn worlds in the subfolder `drawn`."""

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import ClassVar
@@ -73,10 +73,8 @@ class Bagged(FitStudy):
 
     def _bags(self, names: Sequence[str]) -> xr.Dataset:
         """Return statistics (log, F) of the bags of the test worlds."""
-        setting = rps_jax.Setting(
-            self.setting.engine, self.setting.physics, self.setting.fidelity,
-            self.setting.rules._replace(horizon=self.window), seed_of(self.setting.seed, "test"),
-        )  # fmt: skip
+        rules = self.setting.rules._replace(horizon=self.window)
+        setting = replace(self.setting, rules=rules, seed=seed_of(self.setting.seed, "test"))
         rows = []
         with tempfile.TemporaryDirectory() as folder:
             run = Path(folder) / "sweep"

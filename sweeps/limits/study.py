@@ -12,7 +12,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 import xarray as xr
@@ -109,6 +109,7 @@ class Limits(MultiLawQuestion[xr.DataTree]):
     """
 
     TITLE: ClassVar[str] = "What each limit costs"
+    IGNORED_FIELDS: ClassVar[tuple[str, ...]] = ("limits",)  # later calls may add limits
     QUICK: ClassVar = {"worlds": 64}
 
     domain: DomainLike = "wide"
@@ -130,12 +131,6 @@ class Limits(MultiLawQuestion[xr.DataTree]):
     def num_trials(self) -> int | None:
         """Return the number of trials."""
         return sum(plan.num_trials for plan in self.plans.values())
-
-    def configuration(self) -> dict[str, Any]:
-        """Return the inputs of the parts of the answer; later calls may add limits."""
-        configuration = super().configuration()
-        del configuration["limits"]
-        return configuration
 
     def _plan(self, ranges: Domain, robot: Robot | None = None) -> Plan:
         """Return the sweep of a robot."""

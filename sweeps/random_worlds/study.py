@@ -66,10 +66,6 @@ class RandomWorlds(TrialStudy[xr.Dataset]):
         for name in self.domains:
             domains.parse_domain(name)
 
-    def configuration(self) -> dict[str, Any]:
-        """Return the options as JSON; the names of the parts have domain, model and size."""
-        return {**super().configuration(), "setting": self.setting.to_json()}
-
     def answer(self, run: Run) -> xr.Dataset:
         """Run the models that are missing in each domain."""
         stored, parts = stored_parts(run), []
