@@ -14,6 +14,7 @@ from rps_jax.control.observation import Twist
 from rps_jax.engines import mjx as mjx_engine
 from rps_jax.engines.base import ControlPeriod, Motion
 from rps_jax.engines.fused.contacts import Body
+from rps_jax.engines.mujoco import Batch
 from rps_jax.engines.quasistatic import sliders
 from rps_jax.geometry import solid
 from rps_jax.geometry import vectors as sp
@@ -132,11 +133,11 @@ def simulate(
     qvel: np.ndarray | None = None,
 ) -> Recording:
     """Step worlds from positions (n, 10) and velocities (n, 9) with a constant twist (n, 3)."""
-    implementation, count = engines.get(engine), len(qpos)
+    count = len(qpos)
     qvel = np.zeros((count, 9)) if qvel is None else qvel
     twist = np.broadcast_to(np.asarray(twist, float), (count, 3))
-    if not implementation.traced:
-        batch = implementation.stepper(stage, qpos, 2, robots)
+    if not engines.get(engine).traced:
+        batch = Batch(stage, qpos, 2, robots)
         batch.qvel[:] = qvel
         states = [(batch.qpos.copy(), batch.qvel.copy(), batch.force.copy())]
         for _ in range(periods):
@@ -150,7 +151,7 @@ def simulate(
     )
     motion = Motion(qpos, qvel, 0 * qvel, None if robots is None else jnp.zeros((count, 3)))
     twists = jnp.broadcast_to(jnp.asarray(twist), (periods, count, 3))
-    force = implementation.computes_force
+    force = engines.get(engine).computes_force
     recording = _drive(stage, fields, motion, twists, physics, robots, force)
     return jax.tree.map(lambda x: np.asarray(x, float), recording)
 

@@ -18,7 +18,7 @@ from helpers import box as box_at
 from jax.flatten_util import ravel_pytree
 from test_skin import BATCH, mirrored, random_shapes, sense_all
 
-from rps_jax import engines, errors
+from rps_jax import errors
 from rps_jax.control import registry
 from rps_jax.control.laws import rps, rps_plus
 from rps_jax.control.laws.pursuit import PursuitParams
@@ -463,7 +463,7 @@ def push(case: Case, law, horizon: float):
     setting = Setting(engine="mujoco", rules=Rules(horizon=horizon))
     _, worlds, models, params = pushes.build([case], setting)
     loop = ControlLoop(setting.physics, setting.rules, law)
-    *_, (trials, _) = host.run(engines.get("mujoco"), models, worlds, params, loop, threads=1)
+    *_, (trials, _) = host.run(models, worlds, params, loop, threads=1)
     return jax.tree.map(lambda x: np.asarray(x)[0], trials)
 
 

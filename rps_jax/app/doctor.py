@@ -20,7 +20,7 @@ class Doctor(Action[None]):
 
     out: Path | str | None = option(None, kw_only=True, hidden=True)
 
-    def perform(self, callback: ProgressCallback) -> None:
+    def execute(self, callback: ProgressCallback) -> None:
         """Print the report."""
         print(report(cache.default_folder()))
 

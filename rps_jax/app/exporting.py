@@ -55,7 +55,7 @@ class Export(Action[Path]):
         """Return the contents of the files, by name."""
         raise NotImplementedError
 
-    def perform(self, callback: ProgressCallback) -> Path:
+    def execute(self, callback: ProgressCallback) -> Path:
         out, texts = Path(self.out or self.default_folder), self.texts()
         for name, text in texts.items():
             files.write_bytes(out / name, text if isinstance(text, bytes) else text.encode())

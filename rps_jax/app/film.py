@@ -101,7 +101,7 @@ class Film(Action[Path]):
         """Simulated time that is filmed, at most [s]."""
         return min(float(setting.rules.horizon), self.seconds or math.inf)
 
-    def perform(self, callback: ProgressCallback) -> Path:
+    def execute(self, callback: ProgressCallback) -> Path:
         """Run the trials again and film them."""
         takes, setting = self.takes()
         seconds, out = self._length(setting), Path(self.out or self.default_folder)

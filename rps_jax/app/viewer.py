@@ -104,7 +104,7 @@ class View(Action[None], Case):
         """The plan and the law of a run that is shown."""
         return select_law(Path(run), self.world, None if self.law is None else str(self.law))
 
-    def perform(self, callback: ProgressCallback) -> None:
+    def execute(self, callback: ProgressCallback) -> None:
         """Serve the page until it is ended."""
         law = self.case.law if isinstance(self.case.law, str) else "rps"
         request = PushRequest(self.object, label_of(self.friction), law, self.target)

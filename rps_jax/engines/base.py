@@ -2,7 +2,7 @@
 
 All worlds of a batch share the engine's stage; each world has a row of its fields, a pytree. JAX
 traces most engines: their stage drives a batch in a compiled program. An engine that JAX does not
-trace (`traced = False`) steps worlds on the host, by its `stepper`.
+trace (`traced = False`) steps worlds on the host: see `mujoco.Batch`.
 """
 
 from __future__ import annotations
@@ -13,7 +13,6 @@ from functools import partial
 from typing import Any, ClassVar, Literal, NamedTuple, Protocol, runtime_checkable
 
 import jax
-import numpy as np
 
 from rps_jax import errors
 from rps_jax.control.observation import Twist
@@ -72,27 +71,6 @@ class Stage(Protocol):
         A base is a velocity source at its twist. If its force is limited, it is a body that its
         drive pushes towards the twist: see `robot.drive.push`.
         """
-        ...
-
-
-class Stepper(Protocol):
-    """Worlds that are stepped on the host; its arrays are writable."""
-
-    qpos: Float[np.ndarray, "n 10"]  # see `Motion`
-    qvel: Float[np.ndarray, "n 9"]
-    warmstart: Float[np.ndarray, "n 9"]
-    integral: Float[np.ndarray, "n 3"] | None
-    force: Float[np.ndarray, "n 3"]  # of the last period, see `Driven`
-
-    def drive(self, rows: np.ndarray, twist: np.ndarray, substeps: int) -> None:
-        """Step the worlds `rows` (m,) with their bases at `twist` (m, 3), in the base's frame.
-
-        A base with a limited force is pushed towards its twist.
-        """
-        ...
-
-    def close(self) -> None:
-        """Stop the threads of the stepper."""
         ...
 
 
@@ -161,9 +139,3 @@ class Engine(abc.ABC):
     def suits_processors(self, trials: int | None) -> bool:
         """Whether processors finish this number of trials sooner than a GPU; None: unknown."""
         return False
-
-    def stepper(
-        self, stage: Any, qpos: np.ndarray, threads: int, robots: Robot | None = None
-    ) -> Stepper:
-        """Return worlds on the host at rest at positions (n, 10), if the engine is not traced."""
-        raise NotImplementedError(f"{self.name} is traced")

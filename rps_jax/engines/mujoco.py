@@ -182,11 +182,5 @@ class MuJoCo(Engine):
         """Return the models of the worlds; equal worlds share one."""
         return compile_rows(family, solids, friction, physics, robots), {}
 
-    def stepper(
-        self, stage: Any, qpos: np.ndarray, threads: int, robots: Robot | None = None
-    ) -> Batch:
-        """Return worlds on a pool of threads."""
-        return Batch(stage, qpos, threads, robots)
-
 
 ENGINE = MuJoCo()

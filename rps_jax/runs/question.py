@@ -5,7 +5,7 @@ strings below them their help, and `option` holds their bounds. There are two ki
 
 - `Question`: has an answer, labelled data. `answer(run)` computes it, step by step so that it can
   be resumed, and `report(results, run)` describes it in prose, tables and figures.
-- `Action`: does something else, such as write a film or serve a page; `perform(callback)` does it.
+- `Action`: does something else, such as write a film or serve a page; `execute(callback)` does it.
 
     results = rps_jax.Rare("rps_tuned", "wide")()   # or rps_jax.rare("rps_tuned", "wide")
     rps rare --law rps_tuned --domain wide          # from the shell
@@ -20,7 +20,6 @@ import contextlib
 import dataclasses
 import functools
 import re
-import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from operator import attrgetter
@@ -53,26 +52,11 @@ P = ParamSpec("P")
 D = TypeVar("D", bound="DataclassInstance")
 T = TypeVar("T", covariant=True)
 Split = Literal["tune", "validate", "test"]
-_OLD_NAMES = {
-    "OfLaw": "LawQuestion",
-    "OfLaws": "MultiLawQuestion",
-    "InDomain": "DomainQuestion",
-    "Pushes": "SimulationQuestion",
-}
 # Options that say how a run is executed; results do not depend on them.
 _EXECUTION_OPTIONS = (
     *("out", "bag", "slots", "workers", "quick"),
     *("progress", "report_to"),
 )
-
-
-def __getattr__(name: str) -> Any:
-    """Return a class by its name in version 0.3, with a warning."""
-    if name not in _OLD_NAMES:
-        raise AttributeError(f"module '{__name__}' has no attribute '{name}'")
-    new = _OLD_NAMES[name]
-    warnings.warn(f"{name} is now {new}", DeprecationWarning, stacklevel=2)
-    return globals()[new]
 
 
 def seed_of(seed: int, split: Split) -> int:
@@ -203,14 +187,10 @@ def _replace_field(record: D, name: str, value: object) -> D:
 
 @dataclass(frozen=True, kw_only=True)
 class Action(Command[T]):
-    """Command that has no report, such as one that writes a film or serves a page."""
+    """Command that has no report, such as one that writes a film or serves a page.
 
-    def perform(self, callback: ProgressCallback) -> T:
-        """Perform the action; a path that it returns is printed in the shell."""
-        raise NotImplementedError
-
-    def execute(self, callback: ProgressCallback) -> T:
-        return self.perform(callback)
+    The shell prints a path that `execute` returns.
+    """
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -59,7 +59,7 @@ class WorldBatch(NamedTuple):
 
     indices: np.ndarray  # (n,) indices of the trials in the run
     worlds: World  # leaves (n, ...), on the host
-    stage: Any  # a `Stage`, or what the `stepper` of an engine outside of JAX takes
+    stage: Any  # a `Stage`, or the models of an engine outside of JAX
     params: Any = ()  # `LawParams` with leaves (n, ...), on the host; () if not yet known
 
     def with_params(self, params: LawParams) -> WorldBatch:
@@ -216,10 +216,10 @@ class _Monitor:
 
 def _run_on_host(job: Job, setting: Setting, threads: int, monitor: _Monitor) -> None:
     """Run the trials of a job with an engine that JAX does not trace, batch by batch."""
-    engine, period = engines.get(setting.engine), setting.physics.control_period
+    period = setting.physics.control_period
     for batch in job.batches:
         loop = ControlLoop(setting.physics, setting.rules, registry.law_of(batch.params))
-        steps = host.run(engine, batch.stage, *batch.inputs, loop, max(1, threads))
+        steps = host.run(batch.stage, *batch.inputs, loop, max(1, threads))
         reported, previous = np.zeros(batch.indices.size, bool), 0
         for index, (trials, _) in enumerate(steps, 1):
             done = np.asarray(trials.done)

@@ -4,14 +4,16 @@ Sensing, laws and rules run in JAX, as in `trial`. The engine gets positions in 
 JAX and steps them in its own precision.
 """
 
-from collections.abc import Iterator
-from typing import Any
+import contextlib
+from collections.abc import Iterator, Sequence
 
 import jax
 import numpy as np
+from mujoco import MjModel
 
 from rps_jax.control.base import LawParams
-from rps_jax.engines.base import Driven, Engine, Motion
+from rps_jax.engines.base import Driven, Motion
+from rps_jax.engines.mujoco import Batch
 from rps_jax.trials import trial
 from rps_jax.trials.trial import ControlLoop, Snapshot, Trial, World
 
@@ -20,13 +22,12 @@ _settle = jax.jit(jax.vmap(trial.settle))
 
 
 def run(
-    engine: Engine, stage: Any, worlds: World, params: LawParams, loop: ControlLoop, threads: int
+    models: Sequence[MjModel], worlds: World, params: LawParams, loop: ControlLoop, threads: int
 ) -> Iterator[tuple[Trial, Snapshot]]:
     """Run a batch of worlds to their ends; yield trials and snapshots of each control step.
 
     Args:
-      engine: an engine that JAX does not trace.
-      stage: argument of the engine's `stepper`.
+      models: of the worlds, the stage of the engine.
       worlds: with leaves (n, ...).
       params: law parameters, likewise.
       loop: physics, rules and law.
@@ -35,22 +36,20 @@ def run(
     worlds, params = jax.device_put((worlds, params), jax.devices("cpu")[0])
     trials = trial.start_all(worlds, params, np.ones(len(worlds.qpos), bool), law=loop.law)
     dtype, robot = trials.qpos.dtype, trial.pushing(worlds)
-    stepper = engine.stepper(stage, np.asarray(trials.qpos, float), threads, robot)
-    try:
+    start = np.asarray(trials.qpos, float)
+    with contextlib.closing(Batch(models, start, threads, robot)) as batch:
         while not np.asarray(trials.done).all():
             decided, twist, snapshot = _decide(worlds, params, trials, loop)
             qpos = np.asarray(decided.qpos)
             running = np.flatnonzero(~np.asarray(decided.done))
             # Only a scripted shift moves the object outside of the engine.
             shifted = np.flatnonzero(np.any(qpos != np.asarray(trials.qpos), axis=1))
-            stepper.qpos[shifted] = qpos[shifted]
+            batch.qpos[shifted] = qpos[shifted]
             if running.size:
                 twists = np.stack(twist, axis=1)[running].astype(float)
-                stepper.drive(running, twists, loop.physics.substeps)
-            after = Motion(stepper.qpos, stepper.qvel, stepper.warmstart, stepper.integral)
+                batch.drive(running, twists, loop.physics.substeps)
+            after = Motion(batch.qpos, batch.qvel, batch.warmstart, batch.integral)
             motion = jax.tree.map(lambda x: x.astype(dtype), after)
-            force = stepper.force.astype(dtype) if loop.law.senses == "force" else None
+            force = batch.force.astype(dtype) if loop.law.senses == "force" else None
             trials = _settle(trials, decided, Driven(motion, force=force))
             yield trials, snapshot
-    finally:
-        stepper.close()

@@ -229,7 +229,7 @@ def _record_on_host(
     period, start_time, compile_time = setting.physics.control_period, time.perf_counter(), 0.0
     loop = ControlLoop(setting.physics, setting.rules, law)
     threads = 1 if worlds.indices.size == 1 else device.count_processors()
-    steps = host.run(engines.get(setting.engine), worlds.stage, *worlds.inputs, loop, threads)
+    steps = host.run(worlds.stage, *worlds.inputs, loop, threads)
     snapshots, trials = list[Snapshot](), None
     for step, (trials, snapshot) in enumerate(steps):
         compile_time = compile_time or time.perf_counter() - start_time  # of the first step

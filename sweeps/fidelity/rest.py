@@ -15,6 +15,7 @@ import numpy as np
 import xarray as xr
 
 from rps_jax import engines
+from rps_jax.engines.mujoco import Batch
 from rps_jax.record.options import option
 from rps_jax.robot.robot import Robot
 from rps_jax.runs.question import Run, call_of
@@ -81,7 +82,7 @@ class Rest(Study[xr.Dataset]):
             stage, _ = c.stage(ranges.families[i], drawn.solid, drawn.friction, physics, Robot())
             qpos = starts(drawn)
             qpos[:, 0] -= _AWAY
-            batch = c.stepper(stage, qpos, 1)
+            batch = Batch(stage, qpos, 1)
             still = np.zeros((rows.size, 3))
             batch.drive(np.arange(rows.size), still, round(self.seconds / physics.timestep))
             moved[rows] = np.linalg.norm(batch.qpos[:, 3:5] - qpos[:, 3:5], axis=1)

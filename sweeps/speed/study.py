@@ -23,6 +23,7 @@ from rps_jax import engines, errors
 from rps_jax.analysis.figures.style import Figure, words
 from rps_jax.analysis.report import Picture
 from rps_jax.engines import device
+from rps_jax.engines.mujoco import Batch
 from rps_jax.record.options import option
 from rps_jax.runs.evaluate import stack
 from rps_jax.runs.question import Run, call_of
@@ -190,17 +191,17 @@ def in_c(name: str, family: str, simulated: float = 2.0) -> Measurement:
     how = IN_C[name]
     threads = 1 if how == "serial" else device.count_processors()
     worlds = 1 if how == "serial" else 64 * threads
-    setting, engine = Setting(engine="mujoco", physics=physics), engines.get("mujoco")
+    setting = Setting(engine="mujoco", physics=physics)
     part = programs.timed_worlds(family, worlds, setting)
     stage, batch = part.stage, part.worlds
     if how != "open":
         loop = ControlLoop(physics, Rules(horizon=simulated))
 
         def once() -> None:
-            deque(host.run(engine, stage, batch, part.params, loop, threads), maxlen=0)
+            deque(host.run(stage, batch, part.params, loop, threads), maxlen=0)
 
     else:
-        stepper = engine.stepper(stage, np.asarray(batch.qpos, float), threads)
+        stepper = Batch(stage, np.asarray(batch.qpos, float), threads)
         twist = np.tile([_SPEED, 0.0, 0.0], (worlds, 1))
         once = partial(stepper.drive, np.arange(worlds), twist, round(simulated / physics.timestep))
     once()  # compiles the law
