@@ -107,7 +107,7 @@ class Command(Generic[T]):
     @property
     def default_folder(self) -> Path:
         """Run folder of the shell, if no other is named."""
-        return Path("runs") / self.name
+        return Path(getattr(self, "run", None) or "runs") / self.name
 
     # --- for subclasses to override --------------------------------------------------------
 

@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
+import pandas as pd
 import xarray as xr
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import TwoSlopeNorm
@@ -25,7 +26,7 @@ from scipy import stats
 
 from rps_jax import errors
 from rps_jax.analysis import statistics, tables
-from rps_jax.analysis.figures.style import Figure, axis_label, panel, tiles, words
+from rps_jax.analysis.figures.style import Figure, axis_label, tiles, words
 from rps_jax.analysis.report import Picture, Section
 from rps_jax.engines import device
 from rps_jax.errors import InputError
@@ -166,24 +167,19 @@ class Attack(DomainQuestion[xr.Dataset], LawQuestion[xr.Dataset]):
         )
 
     def report(self, results: xr.Dataset, run: Run) -> Sequence[Section]:
-        rates, cells = yields(results), results.margin.size
+        rates, attrs = yields(results), results.attrs
+        ratio = f"{rates['times']:.1f} times as many, " if attrs["drawn_failing"] else ""
         text = (
-            f"{int(results.failing[-1])} of {cells} cells hold a failure after "
+            f"{int(results.failing[-1])} of {results.margin.size} cells hold a failure after "
             f"{int(results.trials[-1]):,} trials and {float(results.simulated[-1]):,.0f} s of "
-            f"simulated time: {rates['search']:.2f} cells per hour. "
-            f"{results.attrs['drawn_trials']:,} trials of drawn worlds fill "
-            f"{results.attrs['drawn_failing']}: {rates['drawn']:.2f} per hour. "
+            f"simulated time: {rates['search']:.2f} cells per hour. {attrs['drawn_trials']:,} "
+            f"trials of drawn worlds fill {attrs['drawn_failing']}: {rates['drawn']:.2f} per hour. "
+            f"The search finds {ratio}at least {rates['times_low']:.1f} times (95 %)."
         )
-        ratio = f"{rates['times']:.1f} times as many, " if results.attrs["drawn_failing"] else ""
-        text += f"The search finds {ratio}at least {rates['times_low']:.1f} times (95 %)."
         title = f"{self.label}, {name_or_custom(self.domain)}: severest trial of each cell"
-        growth = Picture("search", partial(search_figure, results, rates["drawn"]))
         maps = Picture("archive", partial(archive_figure, results, self.axes, title))
         margin = "Severity less 1: above 0 a failure, by this many metres; below 0 a success."
-        sections = [
-            Section("Failing cells", text, (), growth),
-            Section("Margins", margin, (), maps),
-        ]
+        sections = [Section("Failing cells", text), Section("Margins", margin, (), maps)]
         checked = np.isfinite(results.again.values)
         if checked.any():
             failures, trials = count_true(results.again.values == 1), count_true(checked)
@@ -239,8 +235,8 @@ class _Search:
             if x.kind == "range" or (x.kind == "choice" and x.name != "object")
         ]  # fmt: skip
         self.varied_axes = [self.varied.index(axis) for axis in self.axes]
-        self.scale = np.ones(len(self.varied))  # [1] of the emitters' steps, by quantity
-        self.scale[self.varied_axes] = _AXIS_SCALE
+        # [1] of the emitters' steps, by quantity
+        self.scale = np.where(np.isin(self.varied, self.axes), _AXIS_SCALE, 1.0)
         self.noise = np.array([i for i, x in enumerate(quantities) if x.kind == "noise"])
         self.object_column = names.index("object") if "object" in names else None
         self.rng = np.random.Generator(np.random.Philox(key=seed))
@@ -261,7 +257,7 @@ class _Search:
             "drawn_failing": int(self._count_failing(drawn).sum()),
             "drawn_simulated": probe.simulated,
         }
-        history: list[tuple[int, int, float]] = []  # failing cells, trials, simulated time
+        history = list[dict[str, float]]()
         schedulers: list[Any] = [None] * self.objects
         # Severities from which on the emitters accept a world.
         thresholds = np.zeros(self.objects)
@@ -282,9 +278,12 @@ class _Search:
                     near = np.quantile(objective[k], 1 - _NEAR_MISSES)
                     thresholds[k] = 1.0 if enough else min(1.0, near)
                     schedulers[k] = self._scheduler(k, archive, float(thresholds[k]))
-            trials = probe.trials - attributes["drawn_trials"]
-            simulated = probe.simulated - attributes["drawn_simulated"]
-            history.append((int(failing.sum()), trials, simulated))
+            sums = {
+                "failing": int(failing.sum()),
+                "trials": probe.trials - attributes["drawn_trials"],
+                "simulated": probe.simulated - attributes["drawn_simulated"],
+            }
+            history.append(sums)
         return self._labelled(archive, history).assign_attrs(attributes)
 
     def _elites(self, archive: Any) -> dict[str, np.ndarray]:
@@ -362,7 +361,7 @@ class _Search:
         ]
         return errors.require("ribs.schedulers", "failures").Scheduler(grid, sources)
 
-    def _labelled(self, archive: Any, history: Sequence[tuple[int, int, float]]) -> xr.Dataset:
+    def _labelled(self, archive: Any, history: Sequence[Mapping[str, float]]) -> xr.Dataset:
         """Return the archive and the history of the search with names and units."""
         axes, quantities = self.options.axes, {x.name: x for x in points.coordinates(self.domain)}
         elites = self._elites(archive)
@@ -370,24 +369,21 @@ class _Search:
         margin.flat[elites["index"]] = elites["objective"] - 1
         failed = np.flatnonzero(elites["success"] == 0)
         failed = failed[np.argsort(-elites["objective"][failed], kind="stable")]
-        sums = zip(("failing", "trials", "simulated"), zip(*history, strict=True), strict=True)
+        worst = {name: x[failed] for name, x in elites.items()}
+        ranges = [quantities[name] for name in axes]
         middles = (np.arange(self.options.cells) + 0.5) / self.options.cells
-        ranges = {name: quantities[name] for name in axes}
         return xr.Dataset(
             {
                 "margin": (("object", *axes), margin),
-                "u": (("elite", "quantity"), elites["solution"][failed]),
-                "severity": ("elite", elites["objective"][failed]),
-                **{
-                    name: ("elite", elites[name][failed])
-                    for name in ("time", "left", "which_object")
-                },
-                **{name: ("generation", list(values)) for name, values in sums},
+                "u": (("elite", "quantity"), worst["solution"]),
+                "severity": ("elite", worst["objective"]),
+                **{name: ("elite", worst[name]) for name in ("time", "left", "which_object")},
+                **{name: ("generation", x) for name, x in pd.DataFrame(history).items()},
             },
             {
                 "object": list(self.domain.objects),
                 "quantity": list(quantities),
-                **{k: (k, x.range.at(middles), {"units": x.unit}) for k, x in ranges.items()},
+                **{x.name: (x.name, x.range.at(middles), {"units": x.unit}) for x in ranges},
             },
         )
 
@@ -438,14 +434,4 @@ def archive_figure(results: xr.Dataset, quantities: Sequence[str], title: str) -
     colours, label = ScalarMappable(norm, "RdBu_r"), "margin: severity - 1 [1; m beyond 0]"
     figure.colorbar(colours, ax=axes, label=label, shrink=0.7)
     figure.suptitle(title, fontsize=10)
-    return figure
-
-
-def search_figure(results: xr.Dataset, drawn: float) -> Figure:
-    """Draw failing cells over simulated time: of a search, and of `drawn` cells per hour."""
-    figure, ax = panel((5.5, 3.6), "simulated time [h]", "cells with a failure")
-    hours = results.simulated.values / 3600
-    ax.plot(hours, results.failing, "o-", ms=3, color="C3", label="search")
-    ax.plot(hours, drawn * hours, "--", color="C0", label="drawn worlds, no cell twice")
-    ax.legend(fontsize=8)
     return figure

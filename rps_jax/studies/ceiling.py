@@ -83,10 +83,6 @@ class Ceiling(DomainQuestion[xr.Dataset]):
     hold: float = option(5.0, above=0, unit="s")
     """Time between two knots of a plan [s]."""
 
-    @property
-    def default_folder(self) -> Path:
-        return super().default_folder if self.run is None else Path(self.run) / "ceiling"
-
     @functools.cached_property
     def results(self) -> xr.Dataset | None:
         """Outcomes (law, world) of the run, if there is one."""
@@ -151,12 +147,11 @@ class Ceiling(DomainQuestion[xr.Dataset]):
         """Return the state after round r, which tries the worlds at the indices `unsolved`."""
         worlds, best = state.world.values[unsolved], state.offsets.values[unsolved]
         horizon = float(self.plan.setting.rules.horizon)
-        noise = self.perturbations(
-            worlds, r, np.nan_to_num(state.time.values[unsolved], nan=horizon)
-        )
+        end = np.nan_to_num(state.time.values[unsolved], nan=horizon)
+        noise = self.perturbations(worlds, r, end)
         plans = best[:, None] + noise  # (W, K, J, 3)
         plans[:, 1] = state["mean"].values[unsolved]
-        outcome = self._simulate(worlds, plans, state.sizes["world"], run)
+        outcome = self._simulate(worlds, plans, run)
         shape = unsolved.size, self.samples
         cost = score.plan_costs(outcome, self.plan.setting.rules).reshape(shape)
         weights = _weights(cost, self.temperature)
@@ -192,14 +187,12 @@ class Ceiling(DomainQuestion[xr.Dataset]):
             noise[row, 2:, first : first + size[1]] = random.normal(scale=self.spread, size=size)
         return noise
 
-    def _simulate(
-        self, worlds: np.ndarray, plans: np.ndarray, max_worlds: int, run: Run
-    ) -> Outcome:
+    def _simulate(self, worlds: np.ndarray, plans: np.ndarray, run: Run) -> Outcome:
         """Return the outcomes, leaves (W * K, ...), of worlds (W,) under plans (W, K, J, 3).
 
-        The number of slots is that of `max_worlds` worlds, so all rounds share one program.
+        The number of slots is that of all worlds, so all rounds share one program.
         """
-        plan, slots = self.plan, max_worlds * self.samples
+        plan, slots = self.plan, self.world_indices.size * self.samples
         offsets = np.swapaxes(plans, 0, 1)  # (K, W, J, 3)
         steps = max(1, round(self.hold / plan.setting.physics.control_period))
         law, hold = jax.tree.map(

@@ -27,33 +27,14 @@ from rps_jax.world.domain import LABELS
 
 _COLUMNS = 6  # of maps
 NEAR = 0.2  # [m] least distance below which a timeout is near the target
-# Mechanism of each failure mode, as its maps show it.
-MECHANISMS = {
-    "never touched": "The skin never feels the object. It slides away on slippery ground before "
-    "the base arrives; or it creeps in the simulation, which objects of low friction do in steps "
-    "of 10 ms and not of 5 ms; or the taxels that touch it are dead.",
-    "lost contact": "The object slides off the base's front. The base does not see it and drives "
-    "on without it.",
-    "timeout near the target": "The base comes within reach and circles: it realigns or turns "
-    "round the contact point instead of moving it to the target.",
-    "timeout far from the target": "The base pushes to and fro at the ends of a wide face. Each "
-    "realignment slides along the whole face, and time runs out.",
-    "fell over": "A tall, narrow object on rough ground tips over the edge against which it is "
-    "pushed, often at the first push.",
-    "stalled": "The push needs more force than the base has.",
-    "diverged": "The physics became NaN or diverged: the simulation failed, not the law.",
-}
 
 
 def failure_modes(trials: xr.Dataset, max_lost: float) -> np.ndarray:
-    """Return the failure mode (world,) of the trials of one law, of `MECHANISMS`; "" if none."""
-    names = np.array([*statistics.FAILURES, ""], dtype=object)
-    modes = names[statistics.failure_modes(trials, max_lost)]
+    """Return the failure mode (world,) of the trials of one law; "" for a success."""
+    modes = np.array([*statistics.FAILURES, ""])[statistics.failure_modes(trials, max_lost)]
     near = trials.min_distance.values < NEAR
-    timeout = modes == "timeout"
-    modes[timeout & near] = "timeout near the target"
-    modes[timeout & ~near] = "timeout far from the target"
-    return modes.astype(str)
+    timeouts = np.where(near, "timeout near the target", "timeout far from the target")
+    return np.where(modes == "timeout", timeouts, modes)
 
 
 def common_quantities(
@@ -111,10 +92,6 @@ class Gallery(Question[xr.Dataset]):
         return f"Failures of {self.plan_and_law[1]}"
 
     @property
-    def default_folder(self) -> Path:
-        return Path(self.run) / "gallery"
-
-    @property
     def plan_and_law(self) -> tuple[Plan, str]:
         """Plan of the run, and name of the law."""
         return select_law(Path(self.run), 0, self.law)
@@ -136,38 +113,33 @@ class Gallery(Question[xr.Dataset]):
 
     def report(self, results: xr.Dataset, run: Run) -> Sequence[Section]:
         plan, law = self.plan_and_law
-        worlds = {mode: np.flatnonzero(results.kind.values == mode) for mode in MECHANISMS}
-        plotted = {mode: indices[: self.each] for mode, indices in worlds.items() if indices.size}
-        all_plotted = np.concatenate([np.zeros(0, int), *plotted.values()])
-        traces = _simulate(plan, law, all_plotted, SequentialProgress(run.callback))
-        sections = []
-        for mode, indices in plotted.items():
-            labels = [
-                f"world {i}, "
-                + (f"{distance:.2f} m left" if np.isfinite(distance) else "untouched")
-                for i, distance in zip(indices, results.min_distance.values[indices], strict=True)
-            ]
-            total, size = worlds[mode].size, results.sizes["world"]
-            title = f"{law}: {mode}, {len(labels)} of {total} in {size} worlds"
-            draw = functools.partial(maps_figure, [traces[int(i)] for i in indices], labels, title)
-            text = _text(self.run, law, results, worlds[mode], mode)
+        kinds, size, sections = results.kind.values, results.sizes["world"], []
+        worlds = {mode: np.flatnonzero(kinds == mode) for mode in sorted({*kinds.tolist()} - {""})}
+        all_plotted = [np.zeros(0, int), *(indices[: self.each] for indices in worlds.values())]
+        progress = SequentialProgress(run.callback)
+        traces = _simulate(plan, law, np.concatenate(all_plotted), progress)
+        for mode, indices in worlds.items():
+            plotted = {i: traces[i] for i in indices[: self.each].tolist()}
+            title = f"{law}: {mode}, {len(plotted)} of {indices.size} in {size} worlds"
+            text = _text(self.run, law, results, indices)
+            draw = functools.partial(maps_figure, plotted, title)
             picture = Picture(mode.replace(" ", "_"), draw)
-            sections.append(Section(f"{mode}: {total} of {size}", text, (), picture))
+            sections.append(Section(f"{mode}: {indices.size} of {size}", text, (), picture))
         return sections
 
 
 gallery = call_of(Gallery)
 
 
-def _text(run: str | Path, law: str, trials: xr.Dataset, worlds: np.ndarray, mode: str) -> str:
-    """Return the sentences about a failure mode: mechanism, common quantities, replay command."""
+def _text(run: str | Path, law: str, trials: xr.Dataset, worlds: np.ndarray) -> str:
+    """Return the sentences about the worlds of a mode: common quantities and replay command."""
     parts = []
     for name, sample, overall in common_quantities(trials, worlds):
         unit = trials[name].attrs.get("units", "1").replace("1", "")
         parts.append(f"{LABELS[name]} {sample:.2g} {unit}".rstrip() + f" (all: {overall:.2g})")
-    common = f" Medians: {', '.join(parts)}." if parts else ""
+    common = f"Medians: {', '.join(parts)}. " if parts else ""
     command = f"rps replay {shlex.quote(str(run))} {worlds[0]} --law {shlex.quote(law)}"
-    return f"{MECHANISMS[mode]}{common} Example: `{command}`."
+    return f"{common}Example: `{command}`."
 
 
 def _simulate(
@@ -175,26 +147,25 @@ def _simulate(
 ) -> Mapping[int, xr.Dataset]:
     """Return traces of trials of a law over time, by world; one batch for each object."""
     traces: dict[int, xr.Dataset] = {}
-    objects = plan.object_of(worlds)
+    objects, functions = plan.object_of(worlds), registry.law_of(plan.laws[law])
     for k in np.unique(objects):
         rows = worlds[objects == k]
-        batch = build_batch(plan, law, rows)
-        functions, options = (
-            registry.law_of(plan.laws[law]),
-            {"interval": 0.5, "callback": progress},
+        trajectories = pushes.record_batch(
+            build_batch(plan, law, rows), functions, plan.setting, interval=0.5, callback=progress
         )
-        trajectories = pushes.record_batch(batch, functions, plan.setting, **options)
         progress.finish(rows.size)
         traces |= dict(zip(rows.tolist(), map(trace_dataset, trajectories), strict=True))
     return traces
 
 
-def maps_figure(traces: Sequence[xr.Dataset], labels: Sequence[str], title: str) -> Figure:
-    """Draw a map of each trial: the paths of base and object, and the base at ten time steps."""
+def maps_figure(traces: Mapping[int, xr.Dataset], title: str) -> Figure:
+    """Draw a map of the trial of each world: paths of base and object, the base at ten times."""
     figure, axes = tiles(len(traces), _COLUMNS, (2.3, 2.4), (0.4, 0.9))
-    for ax, trace, label in zip(axes.ravel(), traces, labels, strict=False):
+    for ax, (world, trace) in zip(axes.ravel(), traces.items(), strict=False):
         _draw_map(ax, trace)
-        ax.set_title(label, fontsize=7)
+        distance = float(trace.outcome_min_distance)
+        left = f"{distance:.2f} m left" if np.isfinite(distance) else "untouched"
+        ax.set_title(f"world {world}, {left}", fontsize=7)
     handles, names = axes[0, 0].get_legend_handles_labels()
     figure.legend(handles, names, fontsize=8, loc="outside lower center", ncols=len(names))
     figure.suptitle(title, fontsize=10)

@@ -15,11 +15,8 @@ import xarray as xr
 
 from rps_jax.analysis import statistics
 from rps_jax.analysis.figures.style import (
-    OBJECT_COLOURS,
     Figure,
     base_patch,
-    panel,
-    success_rates,
     tiles,
     words,
 )
@@ -148,14 +145,15 @@ class Hardware(LawQuestion[xr.Dataset]):
 
     def _trace(self, run: Run) -> xr.Dataset:
         """Return the paths of Fig. 7: all objects and targets, at the middle friction."""
-        by_object: list[xr.Dataset] = []
-        for name in HARDWARE_OBJECTS:
-            trajectories = pushes.record_cases(
-                self._cases(name), self.setting, interval=0.5, callback=run.callback
-            )
-            traces = [trace_dataset(x)[list(_TRACED)] for x in trajectories]
-            by_object.append(xr.concat(traces, "target", join="outer"))
-        traces = xr.concat(by_object, "object", join="outer")  # NaN after the end of a trial
+        record = partial(
+            pushes.record_cases, setting=self.setting, interval=0.5, callback=run.callback
+        )
+        by_object = [
+            [trace_dataset(x)[list(_TRACED)] for x in record(self._cases(name))]
+            for name in HARDWARE_OBJECTS
+        ]
+        # NaN after the end of a trial.
+        traces = xr.combine_nested(by_object, ["object", "target"], join="outer")
         base, contact, success = (traces[name].values.astype(float) for name in _TRACED)
         dims = ("object", "target", "path_time", "axis")
         half = np.asarray(self.table.cases[0].base.shell.half, float)
@@ -191,11 +189,10 @@ class Hardware(LawQuestion[xr.Dataset]):
         )
         middle = f"Friction: ground {ground:g}, robot {robot:g}, the middle of the range."
         paths = Picture("paths", partial(paths_figure, results))
-        curve = Picture("shifted", partial(shift_figure, results))
         return [
             Section("Hardware experiments", text, table(results)),
             Section("Fig. 7: paths of the base", middle, (), paths),
-            Section("The object shoved aside", shove, shift_table(results), curve),
+            Section("The object shoved aside", shove, shift_table(results)),
         ]
 
 
@@ -208,9 +205,9 @@ def table(results: xr.Dataset) -> list[list[str]]:
     for name in map(str, results.object.values):
         trials = results.isel(law=0).sel(object=name)
         success = trials.success.values.astype(bool)
-        low, high = statistics.wilson(int(success.sum()), success.size)
+        successes = int(success.sum())
+        rate = [f"{successes} of {success.size}", _interval(successes, success.size)]
         in_paper = HARDWARE_RESULTS[name]
-        rate = [f"{success.sum()} of {success.size}", f"{100 * low:.0f}-{100 * high:.0f} %"]
         offset = [_spread(trials.mean_abs_l.where(success), 3, "m"), f"{in_paper.mean_abs_l:.3f} m"]
         time = [_spread(trials.time.where(success), 0, "s"), f"{in_paper.time:.0f} s"]
         rows.append([words(name), *rate, f"{in_paper.success} of 8", *offset, *time])
@@ -230,13 +227,17 @@ def shift_table(results: xr.Dataset) -> list[list[str]]:
     """Return a row for each shove length: successes of the trials still under way."""
     rows = [["shift", *(words(str(o)) for o in results.object.values)]]
     successes, trials = counts(results)
-    for i, size in enumerate(results["shift"].values):
-        cells = []
-        for n, total in zip(successes[:, i], trials[:, i], strict=True):
-            low, high = statistics.wilson(int(n), int(total))
-            cells.append(f"{n} of {total} ({100 * low:.0f}-{100 * high:.0f} %)")
+    columns = (results["shift"].values, successes.T, trials.T)
+    for size, *by_object in zip(*columns, strict=True):
+        pairs = zip(*(x.tolist() for x in by_object), strict=True)
+        cells = (f"{n} of {total} ({_interval(n, total)})" for n, total in pairs)
         rows.append([f"{100 * float(size):g} cm", *cells])
     return rows
+
+
+def _interval(successes: int, trials: int) -> str:
+    low, high = statistics.wilson(successes, trials)
+    return f"{100 * low:.0f}-{100 * high:.0f} %"
 
 
 def counts(results: xr.Dataset) -> tuple[np.ndarray, np.ndarray]:
@@ -270,17 +271,4 @@ def paths_figure(results: xr.Dataset) -> Figure:
         "circles: last contact point",
         fontsize=9,
     )
-    return figure
-
-
-def shift_figure(results: xr.Dataset) -> Figure:
-    """Draw success over the length of the shove, with Wilson 95 % intervals."""
-    figure, ax = panel((5.5, 3.4), "length of the shove [cm]", "success [%]")
-    successes, trials = counts(results)
-    size = 100 * results["shift"].values
-    for i, name in enumerate(map(str, results.object.values)):
-        color, label = OBJECT_COLOURS[name], words(name)
-        success_rates(ax, size, successes[i], trials[i], color=color, label=label)
-    ax.set_ylim(-3, 103)
-    ax.legend(fontsize=8)
     return figure

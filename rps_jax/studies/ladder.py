@@ -7,6 +7,7 @@ seed is one that no tuner uses.
 
 import dataclasses
 import re
+import textwrap
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
@@ -33,7 +34,7 @@ from rps_jax.runs.question import (
     name_or_custom,
     seed_of,
 )
-from rps_jax.runs.sweep import Sweep, SweepOptions
+from rps_jax.runs.sweep import Sweep, SweepOptions, describe_plan
 from rps_jax.trials.progress import ProgressCallback, SequentialProgress
 from rps_jax.world.domain import Domain, DomainLike
 
@@ -105,8 +106,7 @@ class Ladder(SweepOptions, MultiLawQuestion[xr.Dataset | xr.DataTree]):
 
     @cached_property
     def chosen(self) -> dict[str, LawParams]:
-        default = isinstance(self.laws, tuple) and not self.laws
-        return registry.resolve_laws(all_laws() if default else self.laws)
+        return registry.resolve_laws(all_laws() if self.laws == () else self.laws)
 
     @cached_property
     def sweeps(self) -> dict[str, _TestSweep]:
@@ -159,12 +159,8 @@ class Ladder(SweepOptions, MultiLawQuestion[xr.Dataset | xr.DataTree]):
         return xr.DataTree.from_dict(results)
 
     def intro(self, results: xr.Dataset | xr.DataTree) -> str:
-        if self.single and isinstance(results, xr.Dataset):
-            return self.single.intro(results)
-        return (
-            f"Seed {self.setting.seed} of the test worlds, engine {self.setting.engine}; all laws "
-            "meet the same worlds. Intervals: Wilson 95 %."
-        )
+        plans = (replace(sweep.plan, setting=self.setting) for sweep in self.sweeps.values())
+        return "\n\n".join(map(describe_plan, plans))
 
     def report(self, results: xr.Dataset | xr.DataTree, run: Run) -> Sequence[Section]:
         if self.single and isinstance(results, xr.Dataset):
@@ -172,11 +168,9 @@ class Ladder(SweepOptions, MultiLawQuestion[xr.Dataset | xr.DataTree]):
         sections = []
         for name, sweep in self.sweeps.items():
             for section in self.sections(sweep, results[name].to_dataset(), _run_of(run, name)):
-                picture = section.picture
-                if picture:  # pictures of all domains are in one folder
+                if picture := section.picture:  # pictures of all domains are in one folder
                     picture = picture._replace(name=f"{picture.name}_{_file_name(name)}")
-                title = f"{section.title}, {name}"
-                sections.append(section._replace(title=title, picture=picture))
+                sections.append(section._replace(title=f"{section.title}, {name}", picture=picture))
         return sections
 
     def sections(self, sweep: Sweep, results: xr.Dataset, run: Run) -> Sequence[Section]:
@@ -237,9 +231,8 @@ class Score(Ladder, _ScoredLaw):
         sections = super().sections(sweep, results, run)
         if "row" in results.dims:
             return sections
-        header, row = score_row(sweep, results, self.setting.seed)
-        lines = (header, ["---"] * len(header), row)
-        table = "\n".join(f"    | {' | '.join(line)} |" for line in lines)
+        rows = score_row(sweep, results, self.setting.seed)
+        table = textwrap.indent(tables.markdown(rows), "    ")
         return [Section("Score", f"For a Markdown table:\n\n{table}"), *sections]
 
 
@@ -271,23 +264,8 @@ def _comparison(results: xr.Dataset) -> list[Section]:
     if REFERENCE in results.law and results.sizes["law"] > 1:
         title = f"Against {REFERENCE}, world by world"
         rows = tables.against_table(results, REFERENCE)
-        sections.append(Section(title, _solved_failures(results), rows))
+        sections.append(Section(title, "", rows))
     return sections
-
-
-def _solved_failures(results: xr.Dataset) -> str:
-    """Count in a sentence the reference's failures in which other laws succeed, by senses."""
-    failed = results.success.sel(law=REFERENCE) == 0
-    rivals = results.success.drop_sel(law=REFERENCE) > 0
-    counts = []
-    for kind in dict.fromkeys(results.senses.values.tolist()):
-        laws = rivals[rivals.senses.values == kind]
-        if laws.size:
-            count = int((laws.any("law") & failed).sum())
-            counts.append(f"another law that senses {kind} succeeds in {count}")
-    counts.append(f"no law succeeds in {int((failed & ~rivals.any('law')).sum())}")
-    worlds = f"{int(failed.sum())} worlds" if failed.sum() != 1 else "one world"
-    return f"Of the {worlds} in which {REFERENCE} fails, {', '.join(counts)}."
 
 
 def draw_ladder(results: xr.Dataset) -> Figure:

@@ -262,8 +262,8 @@ def worlds_needed(p: float, variation: float) -> float:
 def estimate_table(results: xr.Dataset) -> list[list[str]]:
     """Return a row for each repetition, and one for all of them together."""
     rows = [["", "probability of failure", "95 %", "variation", "worlds", "share of drawn worlds"]]
-    columns = (results[name].values.tolist() for name in Estimate._fields)
-    for i, values in enumerate(zip(*columns, strict=True), start=1):
+    columns = results[list(Estimate._fields)].to_dataframe()
+    for i, values in enumerate(columns.itertuples(index=False), start=1):
         rows.append(estimate_row(f"splitting, {i}", Estimate(*values)))
     if results.sizes["repetition"] > 1:
         combined = combine(results.p.values, int(results.trials.sum()))

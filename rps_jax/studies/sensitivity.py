@@ -22,7 +22,7 @@ from matplotlib.colors import Normalize
 
 from rps_jax import errors
 from rps_jax.analysis import statistics
-from rps_jax.analysis.figures.style import Figure
+from rps_jax.analysis.figures.style import Figure, tiles
 from rps_jax.analysis.report import Picture, Section
 from rps_jax.record import files
 from rps_jax.record.options import option
@@ -79,16 +79,12 @@ class Sensitivity(PlanQuestion, DomainQuestion[xr.Dataset], LawQuestion[xr.Datas
 
     worlds: int = option(1024, 1, 100_000_000)
     """Maximum number of worlds: a power of two times the number of factors plus two."""
-    apart: bool = False
-    """Whether each number of the noise and of a prism's corners is a separate factor."""
 
     @functools.cached_property
     def groups(self) -> tuple[str, ...]:
         """Factor of each quantity (q,)."""
-        return tuple(
-            x.name if self.apart else _JOINT_FACTORS.get(x.kind, x.name)
-            for x in points.coordinates(self.ranges)
-        )
+        quantities = points.coordinates(self.ranges)
+        return tuple(_JOINT_FACTORS.get(x.kind, x.name) for x in quantities)
 
     @property
     def factors(self) -> tuple[str, ...]:
@@ -147,8 +143,7 @@ class Sensitivity(PlanQuestion, DomainQuestion[xr.Dataset], LawQuestion[xr.Datas
         labels = {name: factor_words(name) for name in rank_factors(results)}
         first_five = [name for name in labels if name in results.quantity.values][:5]
         objects = [name.removeprefix("random_") for name in self.ranges.objects]
-        title = f"{self.label}, {name_or_custom(self.domain)}: failures over pairs"
-        pairs = partial(interactions, results, {x: labels[x] for x in first_five}, objects, title)
+        pairs = partial(interactions, results, {x: labels[x] for x in first_five}, objects)
         text = (
             "The first-order index is the share of the variance that a factor explains alone; the "
             "total index includes all its interactions. Noise and the corners of prisms are one "
@@ -175,19 +170,16 @@ def analyze(options: Sensitivity, sweep: xr.Dataset) -> xr.Dataset:
         "time": trials.time.values.astype(float),
         "left": statistics.distance_left(trials),
     }
-    columns: dict[str, list[np.ndarray]] = {name: [] for name in _INDICES}
-    for values in outputs.values():
-        indices = {}
-        if np.ptp(values) > 0:  # without variance all indices are 0
-            indices = compute(
-                options.problem, values, calc_second_order=False, num_resamples=200,
-                seed=options.design_seed + 1,
-            )  # fmt: skip
-        for name, key in _INDICES.items():
-            columns[name].append(indices.get(key, np.zeros(len(options.factors))))
+    settings = {"calc_second_order": False, "num_resamples": 200, "seed": options.design_seed + 1}
+    constant = dict.fromkeys(_INDICES.values(), np.zeros(len(options.factors)))
+    indices = [
+        compute(options.problem, y, **settings) if np.ptp(y) > 0 else constant
+        for y in outputs.values()
+    ]
+    dims = ("output", "factor")
     return xr.Dataset(
         {
-            **{name: (("output", "factor"), values) for name, values in columns.items()},
+            **{name: (dims, [x[key] for x in indices]) for name, key in _INDICES.items()},
             "u": (("world", "quantity"), options.u()),
             **{name: ("world", values) for name, values in outputs.items()},
         },
@@ -208,13 +200,13 @@ def rank_factors(results: xr.Dataset, output: str = "success") -> list[str]:
 
 def index_table(results: xr.Dataset) -> list[list[str]]:
     """Return a row for each factor, by the total index for success."""
-    rows = [["", *(f"{output}: {order}" for output in OUTPUTS for order in ("first", "total"))]]
+    columns = [(output, order) for output in OUTPUTS for order in ("first", "total")]
+    rows = [["", *map(": ".join, columns)]]
     for factor in rank_factors(results):
         cells = []
-        for output in OUTPUTS:
+        for output, order in columns:
             index = results.sel(output=output, factor=factor)
-            cells += [f"{index.first:.2f} ± {index.first_reach:.2f}"]
-            cells += [f"{index.total:.2f} ± {index.total_reach:.2f}"]
+            cells.append(f"{index[order]:.2f} ± {index[f'{order}_reach']:.2f}")
         rows.append([factor_words(factor), *cells])
     return rows
 
@@ -268,37 +260,22 @@ def indices_figure(results: xr.Dataset, labels: Mapping[str, str]) -> Figure:
     return figure
 
 
-def interactions(
-    results: xr.Dataset, labels: Mapping[str, str], objects: Sequence[str], title: str
-) -> Figure:
+def interactions(results: xr.Dataset, labels: Mapping[str, str], objects: Sequence[str]) -> Figure:
     """Draw the failures over each pair of labelled quantities; ranges have equal bins."""
-    last = len(labels) - 1
-    figure = Figure(figsize=(1.5 + 2 * last, 1.6 + 1.8 * last), layout="constrained")
-    axes = figure.subplots(last, last, squeeze=False)
-    ticks = {name: objects if name == "object" else () for name in labels}
-    bins = {name: len(ticks[name]) or _BINS for name in labels}
-    rates = {}
-    for x, y in combinations(labels, 2):
-        u, shape = results.u.sel(quantity=[y, x]).values, (bins[y], bins[x])
-        histogram = partial(np.histogramdd, u, shape, [(0, 1)] * 2)
-        failures, _ = histogram(weights=results.success.values == 0)
-        rates[x, y] = 100 * failures / np.maximum(histogram()[0], 1)
-    highest = max(float(rate.max()) for rate in rates.values()) or 1.0
-    norm, order = Normalize(0, highest), list(labels)
-    for ax in axes[np.triu_indices(last, 1)]:
-        ax.axis("off")
-    for (x, y), rate in rates.items():
-        ax = axes[order.index(y) - 1, order.index(x)]
+    failed, rates = results.success.values == 0, {}
+    for names in combinations(labels, 2):
+        bins = [len(objects) if name == "object" else _BINS for name in names]
+        u = results.u.sel(quantity=list(names)).values.T
+        count = partial(np.histogram2d, *u, bins, [(0, 1)] * 2)
+        rates[names] = 100 * count(weights=failed)[0] / np.maximum(count()[0], 1)
+    norm = Normalize(0, max(float(rate.max()) for rate in rates.values()) or 1.0)
+    figure, axes = tiles(len(rates), 5, (2.5, 2.3), (1, 0.8))
+    for ax, (names, rate) in zip(axes.ravel(), rates.items(), strict=False):
         ax.imshow(rate, origin="lower", norm=norm, cmap="magma_r", aspect="auto")
-        for (row, column), value in np.ndenumerate(rate):
-            ink = "white" if value > 0.55 * highest else "black"
-            ax.text(column, row, f"{value:.0f}", ha="center", va="center", fontsize=7, color=ink)
-        for axis, name, shown in ((ax.xaxis, x, y == order[-1]), (ax.yaxis, y, x == order[0])):
-            axis.set_ticks(
-                range(len(ticks[name]) * shown), ticks[name] if shown else (), fontsize=7
-            )
-            axis.set_label_text(labels[name].replace(" of the ", "\nof the ") * shown, fontsize=8)
+        for axis, name in zip((ax.yaxis, ax.xaxis), names, strict=True):
+            ticks = objects if name == "object" else ()
+            axis.set_ticks(range(len(ticks)), ticks, fontsize=7)
+            axis.set_label_text(labels[name].replace(" of the ", "\nof the "), fontsize=8)
     figure.colorbar(ScalarMappable(norm, "magma_r"), ax=axes, label="failures [%]", shrink=0.6)
-    note = "each range from its low end (left, bottom) to its high end"
-    figure.suptitle(f"{title}, {results.sizes['world']:,} worlds\n{note}", fontsize=10)
+    figure.suptitle("each range from its low end (left, bottom) to its high end", fontsize=10)
     return figure

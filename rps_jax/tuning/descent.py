@@ -202,14 +202,10 @@ def soft_score(
     arrival = contact * jax.nn.sigmoid((params.d_success - distance) / arrive)
     under_way = jnp.cumprod(1 - arrival)
     touched = jax.lax.cummax(contact)
-    score = objective.score(
-        1.0,
-        period * jnp.sum(under_way) + under_way[-1] * distance[-1] / params.v_max,
-        period * jnp.sum(under_way * touched * (1 - contact)),
-        0.0,
-        setting.rules,
-    )
-    return jnp.asarray(score)
+    time_left = under_way[-1] * distance[-1] / params.v_max
+    time = period * jnp.sum(under_way) + time_left
+    lost = period * jnp.sum(under_way * touched * (1 - contact))
+    return jnp.asarray(objective.score(1.0, time, lost, 0.0, setting.rules))
 
 
 def soften_skins(worlds: World) -> World:
@@ -233,24 +229,20 @@ def window_scores(options: TuneGrad, stage: Stage) -> gradients.Scores:
     def cost(snapshots: Snapshot) -> jax.Array:
         return soft_score(snapshots, space.base, setting, options.objective, options.arrive)
 
-    def count_steps(seconds: float) -> int:
-        return round(seconds / setting.physics.control_period)
-
-    steps = max(1, count_steps(options.window))
-    score = gradients.window(stage, space.params, cost, loop, steps)
+    steps, first = (
+        round(x / setting.physics.control_period) for x in (options.window, options.within)
+    )
+    score = gradients.window(stage, space.params, cost, loop, max(1, steps))
 
     def run_to_start(thetas: jax.Array, worlds: World, start: jax.Array) -> Trial:
         params = jax.vmap(space.params)(thetas)
         trials = start_all(worlds, params, jnp.ones(len(start), bool), law=law)
-        if not options.within:
-            return trials
 
         def step(i: jax.Array, trials: Trial) -> Trial:
             next_trials, _ = control_step(stage, worlds, params, trials, loop)
-            is_before = i < start * count_steps(options.within)
-            return jax.vmap(soft.tree_where)(is_before, next_trials, trials)
+            return jax.vmap(soft.tree_where)(i < start * first, next_trials, trials)
 
-        return jax.lax.fori_loop(0, count_steps(options.within), step, trials)
+        return jax.lax.fori_loop(0, first, step, trials)
 
     def scores(thetas: jax.Array, worlds: tuple[World, jax.Array]) -> jax.Array:
         trials = run_to_start(jax.lax.stop_gradient(thetas), *worlds)
@@ -266,22 +258,17 @@ def window_gradients(thetas: jax.Array, options: TuneGrad, step: int) -> tuple[E
     windows that start later.
     """
     setting = replace(options.setting, engine="quasistatic")
-    candidates = options.candidates(options.space.base, step)
+    candidates = options.candidates(options.space.params(thetas), step)
     random = np.random.default_rng((setting.seed, step))
-    estimates, counts = [], []
+    total, estimates = candidates.shape[1], []
     for batch in candidates.batches(setting):
-        count = batch.indices.size
-        worlds = soften_skins(batch.worlds), jnp.asarray(random.uniform(size=count))
-        estimates.append(options.family_gradients(thetas, batch.stage, worlds))
-        counts.append(count)
-    shares = [count / sum(counts) for count in counts]
-
-    def total(name: str, power: int = 1) -> jax.Array:
-        parts = (getattr(x, name) * y**power for x, y in zip(estimates, shares, strict=True))
-        return sum(parts, jnp.zeros(()))
-
-    mean = Estimate(total("gradient"), total("variance", 2), total("finite"))
-    return mean, len(thetas) * sum(counts) * (options.window + options.within / 2)
+        share = batch.indices.size / total
+        worlds = soften_skins(batch.worlds), jnp.asarray(random.uniform(size=batch.indices.size))
+        x = options.family_gradients(thetas, batch.stage, worlds)
+        weighted = Estimate(share * x.gradient, share**2 * x.variance, share * x.finite)
+        estimates.append(weighted)
+    mean = jax.tree.map(lambda *leaves: sum(leaves), *estimates)
+    return mean, len(thetas) * total * (options.window + options.within / 2)
 
 
 def evolution_gradients(

@@ -70,16 +70,11 @@ class TuneES(Tuning):
 
     def judge(self, proposal: Proposal, generation: int, score: ScoreCandidates) -> Results:
         vectors, space = proposal["vectors"], self.space
-        candidates, base, check = score(
-            [
-                self.candidates(space.params(vectors), generation),
-                self.candidates(space.params(self.base[None]), generation),
-                self.validation_candidates(space.params(proposal["center"][None])),
-            ]
-        )
-        values, base_value, validation = (
-            np.asarray(self.objective.value(x.score)) for x in (candidates, base, check)
-        )
+        tried = self.candidates(space.params(np.vstack([vectors, self.base])), generation)
+        center = self.validation_candidates(space.params(proposal["center"][None]))
+        candidates, check = score([tried, center])
+        *values, base_value = np.asarray(self.objective.value(candidates.score))
+        (validation,) = np.asarray(self.objective.value(check.score))
         distances = np.mean((vectors - self.base) ** 2, axis=-1)
         return {
             "values": values + self.prior * distances,
@@ -87,8 +82,8 @@ class TuneES(Tuning):
             "mean": float(np.nanmean(values)),
             "spread": float(np.nanstd(values)),
             "not_finite": np.isnan(values).sum(),
-            "base": base_value[0],
-            "validation": validation[0],
+            "base": base_value,
+            "validation": validation,
             "validation_success": check.outcome.success.mean(),
         }
 

@@ -305,11 +305,9 @@ class Bank:
         worlds, params = rows((part.worlds, part.params), repeated)
         physics, law = self.setting.physics, _observing(registry.law_of(self.params))
         loop = ControlLoop(physics, self.setting.rules, law)
-        sizes = {
-            "rows": round(self.window / self.interval),
-            "row_steps": max(1, round(self.interval / physics.control_period)),
-        }
-        rows_ = _simulate_logs(part.stage, worlds, params, loop, **sizes)
+        num_rows = round(self.window / self.interval)
+        row_steps = max(1, round(self.interval / physics.control_period))
+        rows_ = _simulate_logs(part.stage, worlds, params, loop, rows=num_rows, row_steps=row_steps)
         columns = {k: np.swapaxes(np.asarray(x, float), 0, 1)[:count] for k, x in rows_.items()}
         true_pose, valid = columns.pop("true_pose"), columns.pop("done") < 0.5
         if self.exact:
@@ -399,10 +397,8 @@ def values_of(domain: Domain, u: np.ndarray) -> dict[str, np.ndarray]:
 
 def summary(domain: Domain, u: np.ndarray) -> xr.Dataset:
     """Return the posterior of its points (n, D), as `Fit` describes it."""
-    values, prior = (
-        pd.DataFrame(values_of(domain, points))
-        for points in (u, np.random.default_rng(0).random((20_000, u.shape[1])))
-    )
+    uniform = np.random.default_rng(0).random((20_000, u.shape[1]))
+    values, prior = (pd.DataFrame(values_of(domain, x)) for x in (u, uniform))
     ranks = [np.searchsorted(np.sort(prior[k]), v) / 20_000 for k, v in values.items()]
     rank = np.stack(ranks, -1)  # (n, quantities) quantile of the prior
     low, high = np.quantile(rank, [0.05, 0.95], axis=0)
@@ -456,13 +452,12 @@ def words(name: str) -> str:
 def table(data: xr.Dataset) -> list[list[str]]:
     """Return a header and one row for each quantity."""
     rows = [["quantity", "unit", "median", "90 %", "prior 90 %", "information"]]
-    for name in data.quantity.values:
-        row = data.sel(quantity=name)
-        ranges = [f"{float(row[low]):.3g} to {float(row[high]):.3g}"
-                  for low, high in (("low", "high"), ("prior_low", "prior_high"))]  # fmt: skip
-        gain = "undetermined" if row.undetermined else f"{float(row.shrinkage):.0%} narrower"
-        median = f"{float(row['median']):.3g}"
-        rows.append([words(str(name)), str(row.unit.values), median, *ranges, gain])
+    columns = ["median", "low", "high", "prior_low", "prior_high", "undetermined", "shrinkage"]
+    for name, row in data[columns].to_dataframe().iterrows():
+        interval = f"{row.low:.3g} to {row.high:.3g}"
+        prior = f"{row.prior_low:.3g} to {row.prior_high:.3g}"
+        gain = "undetermined" if row.undetermined else f"{row.shrinkage:.0%} narrower"
+        rows.append([words(str(name)), row.unit, f"{row['median']:.3g}", interval, prior, gain])
     return rows
 
 

@@ -161,8 +161,7 @@ class Learn(PPO, SimulationQuestion[xr.Dataset]):
 
     def answer(self, run: Run) -> xr.Dataset:
         assert run.folder is not None
-        learner = _Learner(run.folder, self, run.callback)
-        return learner.run(60 * self.minutes, self.updates, 60 * self.every)
+        return _Learner(run.folder, self, run.callback).run()
 
     def intro(self, results: xr.Dataset) -> str:
         return (
@@ -173,18 +172,17 @@ class Learn(PPO, SimulationQuestion[xr.Dataset]):
     def report(self, results: xr.Dataset, run: Run) -> Sequence[Section]:
         simulated = float(results.simulated[-1]) if results.sizes["update"] else 0.0
         seconds = results.attrs["run"]
-        validated = results.validation.dropna("update")
+        validated = results.to_dataframe().dropna(subset="validation")
         text = (
             f"Compile {results.attrs['compile']:.1f} s, run {seconds:.1f} s "
             f"({simulated / max(seconds, 1e-9):.0f} simulated s per s). "
             f"`{run.folder}/policy.npz` is the learned law, with a validation success of "
-            f"{tables.percent(float(np.max(validated.values, initial=0.0)))} %."
+            f"{tables.percent(max(validated.validation, default=0.0))} %."
         )
         rows = [["update", "wall clock", "success in validation", "mean time", "curriculum"]]
-        for update, rate in zip(validated["update"].values, validated.values, strict=True):
-            row = results.sel(update=update)
+        for update, row in validated.iterrows():
             wall, level = f"{row.time / 60:.1f} min", f"{100 * row.level:.0f} %"
-            rate, mean = f"{tables.percent(rate)} %", f"{row.validation_time:.0f} s"
+            rate, mean = f"{tables.percent(row.validation)} %", f"{row.validation_time:.0f} s"
             rows.append([str(update), wall, rate, mean, level])
         return [
             Section("Learning curve", text, rows, Picture("curve", partial(figure_of, results)))
@@ -232,8 +230,9 @@ class _Learner:
         """Wall clock [s] of all processes of this run."""
         return time.perf_counter() - self._start_time
 
-    def run(self, seconds: float, updates: int, interval: float) -> xr.Dataset:
+    def run(self) -> xr.Dataset:
         """Learn until the time limit or the number of updates, with 0 for no limit."""
+        seconds, updates = 60 * self.options.minutes, self.options.updates
         reserve = 0.0  # [s] for the last validation
         last_checkpoint = last_validation = self.elapsed
 
@@ -244,7 +243,7 @@ class _Learner:
         while not is_finished():
             self.runner, metrics = self._update(self._tables, self.runner)
             self._record({name: float(x) for name, x in jax.device_get(metrics).items()})
-            if self.elapsed - last_checkpoint > interval and not is_finished():
+            if self.elapsed - last_checkpoint > 60 * self.options.every and not is_finished():
                 if self.elapsed - last_validation > _VALIDATION_RATIO * reserve:
                     reserve, last_validation = self._validate(), self.elapsed
                 self.checkpoint()
@@ -320,16 +319,14 @@ class _Learner:
         content = Checkpoints(self.folder).get(_CHECKPOINT)
         if content is None:
             return
+        expected, structure = jax.tree.flatten(self._state)
         try:
-            arrays = files.decode_arrays(content)
+            leaves = [leaf for _, leaf in sorted(files.decode_arrays(content).items())]
+            kinds = [[(x.dtype, x.shape) for x in several[:-1]] for several in (leaves, expected)]
+            if kinds[0] != kinds[1] or leaves[-1].shape[1:] != (len(UNITS),):
+                raise ValueError("another version wrote it")
         except ValueError as error:
             raise files.CorruptFileError(self.folder / "parts", error) from error
-        expected, structure = jax.tree.flatten(self._state)
-        leaves = [arrays[key] for key in sorted(arrays)]
-        columns = leaves[-1].shape[1:] if leaves else ()  # of the curve, of any number of updates
-        kinds = ([(x.shape, x.dtype) for x in several[:-1]] for several in (leaves, expected))
-        if columns != (len(UNITS),) or next(kinds) != next(kinds):
-            raise files.CorruptFileError(self.folder / "parts", "another version wrote it")
         runner, self.best, scalars, curve = jax.tree.unflatten(structure, leaves)
         self.runner = jax.device_put(runner)
         self.best_rate, compile_time, elapsed = scalars.tolist()
@@ -345,35 +342,33 @@ def figure_of(curve: xr.Dataset) -> Figure:
     """
     figure, axes = tiles(4, 2, (5, 2.8), (0, 0))
     clocks = (
-        (curve.time.values / 60, "wall clock, with compilation [min]"),
-        (curve.simulated.values / 3600, "simulated time, summed over worlds [h]"),
+        (curve.time / 60, "wall clock, with compilation [min]"),
+        (curve.simulated / 3600, "simulated time, summed over worlds [h]"),
     )
     width = max(1, curve.sizes["update"] // 40)
 
-    def draw(ax: Axes, x: np.ndarray, name: str, scale: float, colour: str, label: str) -> None:
-        values = scale * curve[name]
+    def draw(ax: Axes, x: xr.DataArray, values: xr.DataArray, colour: str, label: str) -> None:
         mean = values.rolling(update=width, min_periods=1, center=True).mean()
         ax.plot(x, values, color=colour, lw=0.6, alpha=0.35)
         ax.plot(x, mean, color=colour, lw=1.6, label=label)
 
-    validated = np.isfinite(curve.validation.values)
-    for ax, (x, label) in zip(axes[0], clocks, strict=True):
-        draw(ax, x, "success", 100, "C0", "trials that ended, with noise, at the dotted level")
+    valid = curve.validation.notnull().values
+    for ax, (x, _) in zip(axes[0], clocks, strict=True):
+        label = "trials that ended, with noise, at the dotted level"
+        draw(ax, x, 100 * curve.success, "C0", label)
         ax.plot(x, 100 * curve.level, "k:", lw=1, label="level of the curriculum")
-        validation = 100 * curve.validation.values[validated]
-        ax.plot(
-            x[validated], validation, "C3o-", ms=4, label="validation: the domain itself, no noise"
-        )
-        ax.set(xlabel=label, ylabel="success, level [%]", ylim=(-3, 103))
-    (minutes, wall), (simulated, label) = clocks
-    draw(axes[1, 0], minutes, "earned", 1, "C2", "rewards of a trial")
-    axes[1, 0].set(xlabel=wall, ylabel="rewards of a trial that ended [1]")
-    ax = axes[1, 1]
-    ax.plot(simulated, curve.spread, label="standard deviation of the actions")
-    ax.plot(simulated, 100 * curve.learning_rate, label="100 learning rates")
-    ax.plot(simulated, curve.touching, label="share of decisions in contact")
-    ax.set(xlabel=label, ylabel="[1]")
-    for ax in axes.flat:
+        label = "validation: the domain itself, no noise"
+        ax.plot(x[valid], 100 * curve.validation[valid], "C3o-", ms=4, label=label)
+        ax.set(ylabel="success, level [%]", ylim=(-3, 103))
+    (minutes, _), (hours, _) = clocks
+    draw(axes[1, 0], minutes, curve.earned, "C2", "rewards of a trial")
+    axes[1, 0].set_ylabel("rewards of a trial that ended [1]")
+    axes[1, 1].plot(hours, curve.spread, label="standard deviation of the actions")
+    axes[1, 1].plot(hours, 100 * curve.learning_rate, label="100 learning rates")
+    axes[1, 1].plot(hours, curve.touching, label="share of decisions in contact")
+    axes[1, 1].set_ylabel("[1]")
+    for ax, (_, label) in zip(axes.flat, clocks * 2, strict=True):
+        ax.set_xlabel(label)
         ax.grid(alpha=0.3)
         ax.legend(fontsize=7)
     return figure

@@ -103,10 +103,9 @@ def read(source: Trace | str | Path, shell: Shell) -> RawLog:
     columns = log.columns
     if "signal" in columns:
         check_taxels(columns["signal"], shell, name)
-    if "contact_type" not in columns:  # of taxels that are filtered already
-        scans = {"signal": columns["signal"], "period": np.full(len(columns["signal"]), np.inf)}
-        contacts = with_contacts(scans, shell, name)
-        columns |= {key: np.asarray(contacts[key], float) for key in _TOUCH}
+    period = np.full(np.size(columns["time"]), np.inf)  # of taxels that are filtered already
+    contacts = with_contacts(columns | {"period": period}, shell, name)
+    columns |= {key: np.asarray(contacts[key], float) for key in _TOUCH}
     for fault in _faults(columns, shell):
         raise InputError(f"{name} {fault}.")
     columns["target"] = np.atleast_2d(columns["target"])[0]
@@ -211,7 +210,7 @@ _BLOCKS = 10
 def mirror(log: Log) -> Log:
     """Return the pushes mirrored at the robot's x axis, y to -y."""
     signs = np.array([1.0, -1.0, -1.0])
-    flip = {"pose": signs, "twist": signs, "object_pose": signs}
+    flip = dict.fromkeys(("pose", "twist", "object_pose"), signs)
     flip |= dict.fromkeys(("p_robot_contact", "target", "f_robot"), signs[:2])
     fields = {k: getattr(log, k) * sign for k, sign in flip.items() if getattr(log, k) is not None}
     signal = None if log.signal is None else log.signal[..., ::-1]
@@ -297,15 +296,14 @@ def statistics(log: Log, interval: float) -> pd.DataFrame:
         signal = np.where(valid[..., None], log.signal, np.nan)
         dead = np.all(np.nan_to_num(signal) == 0, axis=1)
         put("dead", dead.mean(-1), "signal")
-        level, quiet = np.nanmean(signal, 1), _jitter(log.signal, valid)
+        level = np.nanmean(signal, 1)
         still = ~dead & (np.nanmax(signal, 1) < 0.25)
-        put("quiet", _log(_mean(quiet[..., None], still)), "signal")
-        deviation = np.nanstd(signal, 1)
-        put("drift", _log(_mean(deviation[..., None], still)), "signal")
+        for name, noise in (("quiet", _jitter(log.signal, valid)), ("drift", np.nanstd(signal, 1))):
+            put(name, _log(_mean(noise[..., None], still)), "signal")
         put("level", np.sort(np.where(dead, -1, level), -1)[:, -8:], "signal")
-        highest = np.sort(np.where(valid[..., None], log.signal, 0.0), -1)[..., -4:]
-        put("highest", _blocks(np.arcsinh(highest[..., -1:]), touch), "signal")
-        put("reach", _quantiles(highest[..., -1], touch), "signal")
+        highest = np.where(valid[..., None], log.signal, 0.0).max(-1)
+        put("highest", _blocks(np.arcsinh(highest[..., None]), touch), "signal")
+        put("reach", _quantiles(highest, touch), "signal")
     return pd.DataFrame(columns)
 
 

@@ -95,13 +95,12 @@ def train(u: np.ndarray, statistics: np.ndarray, seed: int = 0) -> Posterior:
     untrained = Posterior(np.nan_to_num(mean), np.nan_to_num(scale, nan=1.0), {})
     x = untrained.inputs(flat).reshape(count, ways, features).astype(np.float32)
     order, held_out = rng.permutation(count), max(2, count // 10)
-    validation, (inputs, targets) = (
-        (
-            jnp.asarray(x[rows].reshape(-1, features)),
-            jnp.asarray(np.repeat(u[rows], ways, 0), jnp.float32),
-        )
-        for rows in (order[:held_out], order[held_out:])
-    )
+
+    def pairs(rows: np.ndarray) -> tuple[jax.Array, jax.Array]:
+        targets = jnp.asarray(np.repeat(u[rows], ways, 0), jnp.float32)
+        return jnp.asarray(x[rows].reshape(-1, features)), targets
+
+    validation, (inputs, targets) = pairs(order[:held_out]), pairs(order[held_out:])
     size, steps = len(inputs), max(1, len(inputs) // _BATCH)
     schedule = optax.cosine_decay_schedule(2e-3, _EPOCHS * steps, 0.02)
     optimiser = optax.adamw(schedule, weight_decay=1e-2)

@@ -43,17 +43,7 @@ class EnvBatch(NamedTuple):
 
 
 Carry = tuple[tuple[EnvBatch, ...], jax.Array]  # batches and key, between two actions
-
-
-class EpisodeStats(NamedTuple):
-    """Counts of ended trials and of actions in contact: of worlds (N,), or sums over them."""
-
-    ended: jax.Array  # () trials that ended
-    succeeded: jax.Array  # () trials that ended with success
-    tipped: jax.Array  # () trials that ended because the object fell over
-    lost: jax.Array  # () trials that ended without contact for too long
-    earned: jax.Array  # () [1] rewards of the trials that ended
-    touching: jax.Array  # () actions that ended in contact
+Stats = dict[str, jax.Array]  # counts of ended trials, of worlds (N,) or sums over them, by name
 
 
 class RunnerState(NamedTuple):
@@ -176,20 +166,20 @@ def act(
     return EnvBatch(states, memory, jnp.zeros_like(batch.first), earned), reward
 
 
-def _episode_stats(env: PushEnv, batch: EnvBatch) -> tuple[EpisodeStats, jax.Array]:
+def _episode_stats(env: PushEnv, batch: EnvBatch) -> tuple[Stats, jax.Array]:
     """Return statistics of the trials that have ended, and whether each is terminated (N,).
 
     A trial that reached a time limit, with or without contact, is truncated and not terminated.
     """
     data = batch.states.data
-    stats = EpisodeStats(
-        ended=data.done,
-        succeeded=data.success,
-        tipped=data.tipped,
-        lost=data.done & (data.lost_steps * env.dt > env.setting.rules.max_lost),
-        earned=jnp.where(data.done, batch.earned, 0.0),
-        touching=batch.states.metrics["in_contact"],
-    )
+    stats = {
+        "ended": data.done,
+        "succeeded": data.success,
+        "tipped": data.tipped,
+        "lost": data.done & (data.lost_steps * env.dt > env.setting.rules.max_lost),
+        "earned": jnp.where(data.done, batch.earned, 0.0),  # [1] rewards
+        "touching": batch.states.metrics["in_contact"],  # after an action
+    }
     return stats, data.done & (data.success | data.tipped | data.diverged)
 
 
@@ -211,7 +201,7 @@ def update(
     not constants of the program.
     """
 
-    def take_action(carry: Carry, _: None) -> tuple[Carry, tuple[Transition, EpisodeStats]]:
+    def take_action(carry: Carry, _: None) -> tuple[Carry, tuple[Transition, Stats]]:
         """Take one action in all worlds; return its transition and statistics of ended trials."""
         batches, key = carry
         key, noise_key, *start_keys = jax.random.split(key, 2 + len(envs))
@@ -236,7 +226,7 @@ def update(
         value, next_value = (networks.critic(weights["critic"], x) for x in pairs)
         log_prob = ppo_.log_prob(action, mean, weights["log_std"])
         decision = obs, private, first, action, log_prob, value
-        steps = Transition(*decision, next_value, reward, stats.ended, terminated)
+        steps = Transition(*decision, next_value, reward, stats["ended"], terminated)
         return (tuple(restarted), key), (steps, jax.tree.map(jnp.sum, stats))
 
     hidden = jnp.concatenate([batch.memory.hidden for batch in runner.batches])
@@ -246,8 +236,8 @@ def update(
     stats = jax.tree.map(jnp.sum, step_stats)
     train, kl = ppo_.update_policy(ppo, network, runner.train, update_key, hidden, steps)
     updated = runner._replace(train=train, key=key, batches=batches)
-    metrics = stats._asdict() | {
-        "touching": stats.touching / steps.reward.size,
+    metrics = stats | {
+        "touching": stats["touching"] / steps.reward.size,
         "level": runner.level,
         "reward": jnp.mean(steps.reward),
         "value": jnp.mean(steps.value),
@@ -258,10 +248,10 @@ def update(
     return _raise_level(ppo, updated, stats), metrics
 
 
-def _raise_level(ppo: PPO, runner: RunnerState, stats: EpisodeStats) -> RunnerState:
+def _raise_level(ppo: PPO, runner: RunnerState, stats: Stats) -> RunnerState:
     """Raise the level of the curriculum if enough trials succeed, and then halve their counts."""
-    ended = 0.9 * runner.ended + stats.ended
-    succeeded = 0.9 * runner.succeeded + stats.succeeded
+    ended = 0.9 * runner.ended + stats["ended"]
+    succeeded = 0.9 * runner.succeeded + stats["succeeded"]
     worlds = ppo.num_envs * len(runner.batches)
     up = (ended > 0.2 * worlds) & (succeeded > ppo.enough * ended) & (runner.level < 1)
     level = jnp.where(up, jnp.minimum(runner.level + 0.05, 1.0), runner.level)

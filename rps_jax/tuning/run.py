@@ -179,11 +179,11 @@ class Tuning(LawQuestion[xr.Dataset]):
     def report(self, results: xr.Dataset, run: Run) -> Sequence[Section]:
         best = int(results.validation.argmin("generation"))
         rates = [tables.percent(float(rate)) for rate in results.validation_success.values]
-        total = {name: float(results[name].sum()) for name in ("compile", "run", "simulated")}
+        names = ("compile", "run", "simulated", "differentiate")
+        total = {name: float(results[name].sum()) for name in names if name in results}
         gradients = ""
-        if "differentiate" in results:
-            seconds = float(results["differentiate"].sum())  # `results.differentiate` is a method
-            gradients = f", gradients {seconds:.1f} s with their compilation"
+        if "differentiate" in total:
+            gradients = f", gradients {total['differentiate']:.1f} s with their compilation"
         text = (
             f"Validation: objective {float(results.validation[0]):.4f} and success {rates[0]} % "
             f"at the start, {float(results.validation[best]):.4f} and {rates[best]} % after "

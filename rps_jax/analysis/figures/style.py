@@ -11,8 +11,6 @@ from rps_jax.analysis import statistics
 from rps_jax.robot import shell
 from rps_jax.world.domain import LABELS
 
-OBJECT_COLOURS = {"box": "C0", "cylinder": "C1", "nonuniform_box": "C2"}
-OBJECT_COLOURS |= {"hardware_box": "C0", "hardware_cylinder": "C1"}
 SHADES = {"realigning": "#bcd7f2", "lost": "#f8e3a1"}
 
 
