@@ -154,6 +154,7 @@ class Hardware(LawQuestion[xr.Dataset]):
         ]
         # NaN after the end of a trial.
         traces = xr.combine_nested(by_object, ["object", "target"], join="outer")
+        traces = traces.transpose("object", "target", ...)
         base, contact, success = (traces[name].values.astype(float) for name in _TRACED)
         dims = ("object", "target", "path_time", "axis")
         half = np.asarray(self.table.cases[0].base.shell.half, float)
