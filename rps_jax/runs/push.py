@@ -21,7 +21,7 @@ from numpy.typing import ArrayLike
 from rps_jax import engines, errors
 from rps_jax.analysis.report import Picture, Section
 from rps_jax.control import registry
-from rps_jax.control.base import Law, LawParams
+from rps_jax.control.base import Law, LawParams, Senses
 from rps_jax.control.observation import Twist
 from rps_jax.record import bag as bags
 from rps_jax.record import folder
@@ -190,10 +190,11 @@ class TraceQuestion(Question[Trace]):
         return [Section("The push", text, (), Picture("trial", results.plot))]
 
 
-def recorded_law(law: Law) -> Law:
+@functools.cache
+def recorded_law(law: Law, senses: Senses = "taxels") -> Law:
     """Return a law whose details are (details, observation), for the messages of a bag.
 
-    A law that senses touch observes taxels as well, so that the bag has them.
+    A law that senses touch observes what `senses` names as well, such as taxels.
     """
     is_touch = law.senses == "touch"
 
@@ -201,7 +202,7 @@ def recorded_law(law: Law) -> Law:
         state, twist, details = law.step(params, state, obs.touch if is_touch else obs)
         return state, twist, (details, obs)
 
-    return dataclasses.replace(law, step=step, senses="taxels" if is_touch else law.senses)
+    return dataclasses.replace(law, step=step, senses=senses if is_touch else law.senses)
 
 
 def bag_steps(trajectory: Trajectory, obs: Any, period: float) -> Iterator[Step]:

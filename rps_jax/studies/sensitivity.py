@@ -22,7 +22,7 @@ from matplotlib.colors import Normalize
 
 from rps_jax import errors
 from rps_jax.analysis import statistics
-from rps_jax.analysis.figures.style import Figure, tiles
+from rps_jax.analysis.figures.style import Figure, quantity, tiles
 from rps_jax.analysis.report import Picture, Section
 from rps_jax.record import files
 from rps_jax.record.options import option
@@ -38,7 +38,6 @@ from rps_jax.runs.question import (
 )
 from rps_jax.runs.sweep import PlanQuestion
 from rps_jax.world import points
-from rps_jax.world.domain import LABELS
 
 OUTPUTS = {
     "success": "success",
@@ -47,11 +46,6 @@ OUTPUTS = {
 }
 # Name of the factor that joins all quantities of a kind; the quantity "noise" is that of the skin.
 _JOINT_FACTORS = {"shape": "shape", "noise": "key"}
-_FACTOR_WORDS = {
-    "shape": "corners of prisms",
-    "key": "key of all noise",
-    "com_bearing": "bearing of the centre of mass",
-}
 MIN_FAILING_POINTS = 30  # base points with a failure that reliable indices need
 # SALib's names of the indices and of the half widths of their intervals.
 _INDICES = {"first": "S1", "first_reach": "S1_conf", "total": "ST", "total_reach": "ST_conf"}
@@ -140,7 +134,7 @@ class Sensitivity(PlanQuestion, DomainQuestion[xr.Dataset], LawQuestion[xr.Datas
         )
 
     def report(self, results: xr.Dataset, run: Run) -> Sequence[Section]:
-        labels = {name: factor_words(name) for name in rank_factors(results)}
+        labels = {name: quantity(name) for name in rank_factors(results)}
         first_five = [name for name in labels if name in results.quantity.values][:5]
         objects = [name.removeprefix("random_") for name in self.ranges.objects]
         pairs = partial(interactions, results, {x: labels[x] for x in first_five}, objects)
@@ -207,13 +201,8 @@ def index_table(results: xr.Dataset) -> list[list[str]]:
         for output, order in columns:
             index = results.sel(output=output, factor=factor)
             cells.append(f"{index[order]:.2f} ± {index[f'{order}_reach']:.2f}")
-        rows.append([factor_words(factor), *cells])
+        rows.append([quantity(factor), *cells])
     return rows
-
-
-def factor_words(name: str) -> str:
-    """Return the words for a factor."""
-    return LABELS.get(name) or _FACTOR_WORDS.get(name, name.replace("_", " "))
 
 
 def count_failing_points(results: xr.Dataset) -> int:

@@ -3,6 +3,7 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
+from itertools import product
 from pathlib import Path
 from typing import ClassVar
 
@@ -54,12 +55,10 @@ class Table(TrialOptions, MultiLawQuestion[xr.Dataset]):
         for name in ("objects", "friction"):
             errors.check_each_once(name, getattr(self, name))
         sensing = case_options(self, self.setting)
+        grid = product(self.chosen.values(), self.objects, self.friction, self.targets)
         return [
             Case(name, friction, target, params, **sensing)
-            for params in self.chosen.values()
-            for name in self.objects
-            for friction in self.friction
-            for target in self.targets
+            for params, name, friction, target in grid
         ]
 
     def check(self) -> None:

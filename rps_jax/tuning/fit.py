@@ -16,7 +16,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from functools import cache, cached_property, partial
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -31,14 +31,13 @@ from rps_jax.analysis.figures.style import Figure, quantity, tiles
 from rps_jax.analysis.report import Picture, Section
 from rps_jax.control import registry
 from rps_jax.control.base import Law, LawParams
-from rps_jax.control.observation import ForceObservation, Twist
 from rps_jax.control.registry import LawLike
 from rps_jax.engines.base import Stage
 from rps_jax.errors import InputError
 from rps_jax.geometry.solid import GRAVITY
 from rps_jax.record import files
 from rps_jax.record.options import option
-from rps_jax.runs.push import Trace
+from rps_jax.runs.push import Trace, recorded_law
 from rps_jax.runs.question import (
     DomainQuestion,
     LawQuestion,
@@ -73,8 +72,6 @@ DERIVED: dict[str, tuple[str, tuple[str, ...], Callable[..., np.ndarray]]] = {
     "loop_delay": ("s", _DELAYS, lambda a, b: a + b),
     "reaction_time": ("s", (*_DELAYS, "robot_lag"), lambda a, b, c: a + b + c),
 }
-_WORDS = {"ground_force": "friction force of the ground",
-          "loop_delay": "latency of the pose and delay of the command"}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -93,7 +90,7 @@ class Fitted:
             ax.axvspan(float(column.prior_low), float(column.prior_high), color="0.88")
             flat = bool(column.undetermined)
             ax.hist(column["sample"], 40, density=True, color="0.6" if flat else "C0")
-            ax.set_title(words(name) + (" (undetermined)" if flat else ""), fontsize=8)
+            ax.set_title(quantity(name) + (" (undetermined)" if flat else ""), fontsize=8)
             ax.set(yticks=[], xlabel=f"[{column.unit.values}]")
             ax.tick_params(labelsize=7)
         return figure
@@ -303,7 +300,7 @@ class Bank:
         part = drawn_worlds(self.domain, drawn, self.setting).with_params(self.params)
         repeated = np.resize(np.arange(count), max(count, _BATCH))
         worlds, params = rows((part.worlds, part.params), repeated)
-        physics, law = self.setting.physics, _observing(registry.law_of(self.params))
+        physics, law = self.setting.physics, recorded_law(registry.law_of(self.params), "force")
         loop = ControlLoop(physics, self.setting.rules, law)
         num_rows = round(self.window / self.interval)
         row_steps = max(1, round(self.interval / physics.control_period))
@@ -324,19 +321,6 @@ def check_law(label: str, law: Law, setting: Setting) -> None:
         raise errors.not_allowed("law", label, rule)
 
 
-@cache
-def _observing(law: Law[Any, Any, Any]) -> Law[Any, Any, Any]:
-    """Return the law with its observation and the contact's force as details."""
-
-    def step(
-        params: LawParams, state: object, obs: ForceObservation
-    ) -> tuple[object, Twist, ForceObservation]:
-        state, twist, _ = law.step(params, state, obs.touch)
-        return state, twist, obs
-
-    return dataclasses.replace(law, step=step, senses="force")
-
-
 @partial(jax.jit, static_argnames=("rows", "row_steps"))
 def _simulate_logs(
     stage: Stage, worlds: World, params: LawParams, loop: ControlLoop, *, rows: int, row_steps: int
@@ -347,16 +331,16 @@ def _simulate_logs(
     def row(trials: Trial, _: None) -> tuple[Trial, dict[str, jax.Array]]:
         trials, snapshot = control_step(trials)
         trials = jax.lax.fori_loop(1, row_steps, lambda _, t: control_step(t)[0], trials)
-        obs = snapshot.details.touch
+        obs = snapshot.details[1]  # of `recorded_law`
         p_world_object, yaw = jax.vmap(object_pose)(snapshot.qpos)
         columns = {
-            "pose": jnp.concatenate([obs.p_world_robot, obs.yaw[:, None]], -1),
+            "pose": jnp.concatenate([obs.touch.p_world_robot, obs.touch.yaw[:, None]], -1),
             "true_pose": snapshot.qpos[:, :3],
             "contact_type": snapshot.reading.contact_type,
             "p_robot_contact": snapshot.reading.p_robot_contact,
             "twist": jnp.stack([jnp.broadcast_to(x, yaw.shape) for x in snapshot.twist], -1),
             "object_pose": jnp.concatenate([p_world_object, yaw[:, None]], -1),
-            "f_robot": snapshot.details.f_robot,
+            "f_robot": obs.f_robot,
             "done": snapshot.done,
         }
         if trials.skin.signal.shape[-1]:
@@ -444,11 +428,6 @@ def fitted_domain(domain: Domain, data: xr.Dataset) -> Domain:
 # --- report --------------------------------------------------------------------------------
 
 
-def words(name: str) -> str:
-    """Return the description of a quantity or a derived quantity."""
-    return _WORDS.get(name) or quantity(name)
-
-
 def table(data: xr.Dataset) -> list[list[str]]:
     """Return a header and one row for each quantity."""
     rows = [["quantity", "unit", "median", "90 %", "prior 90 %", "information"]]
@@ -457,7 +436,7 @@ def table(data: xr.Dataset) -> list[list[str]]:
         interval = f"{row.low:.3g} to {row.high:.3g}"
         prior = f"{row.prior_low:.3g} to {row.prior_high:.3g}"
         gain = "undetermined" if row.undetermined else f"{row.shrinkage:.0%} narrower"
-        rows.append([words(str(name)), row.unit, f"{row['median']:.3g}", interval, prior, gain])
+        rows.append([quantity(str(name)), row.unit, f"{row['median']:.3g}", interval, prior, gain])
     return rows
 
 
@@ -467,5 +446,5 @@ def correlations(data: xr.Dataset) -> list[list[str]]:
     names = [str(q) for q in data.quantity.values]
     pairs = [(i, j) for i, j in np.argwhere(np.tril(abs(correlation), -1) > 0.5)
              if not DERIVED.keys() & {names[i], names[j]}]  # fmt: skip
-    rows = [[words(names[i]), words(names[j]), f"{correlation[i, j]:.2f}"] for i, j in pairs]
+    rows = [[quantity(names[i]), quantity(names[j]), f"{correlation[i, j]:.2f}"] for i, j in pairs]
     return [["", "", "correlation"], *rows]

@@ -19,7 +19,7 @@ import numpy as np
 import xarray as xr
 
 import rps_jax
-from rps_jax.analysis.figures.style import Figure
+from rps_jax.analysis.figures.style import Figure, quantity
 from rps_jax.analysis.report import Picture
 from rps_jax.control import registry
 from rps_jax.control.registry import LawLike
@@ -256,7 +256,7 @@ def quantity_rows(results: xr.Dataset) -> Rows:
         covered, determined = within(fits).mean("log"), (fits.undetermined == 0).mean("log")
         pairs = zip(covered, determined, strict=True)
         cells = [f"{100 * float(c):.0f} %, {100 * float(d):.0f} %" for c, d in pairs]
-        rows.append([fit.words(name), *cells])
+        rows.append([quantity(name), *cells])
     return rows
 
 
@@ -292,7 +292,7 @@ def figure(results: xr.Dataset) -> Figure:
     for i, kind in enumerate(map(str, results.kind.values)):
         right.plot(100 * shrink[i], np.arange(len(names)) + 0.1 * (i - 2.5), "o", ms=4, label=kind)
     right.axvline(100 * (1 - fit.UNDETERMINED), color="0.6", lw=1, ls=":")
-    right.set_yticks(range(len(names)), [fit.words(name) for name in names], fontsize=8)
+    right.set_yticks(range(len(names)), [quantity(name) for name in names], fontsize=8)
     right.set(xlabel="how much narrower than the prior's [%], mean over logs",
               title="What logs tell")  # fmt: skip
     right.grid(axis="y", alpha=0.3)

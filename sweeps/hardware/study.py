@@ -20,13 +20,13 @@ import numpy as np
 import xarray as xr
 from scipy import stats
 
+from rps_jax.analysis.figures import style
 from rps_jax.control import registry
 from rps_jax.control.registry import LawLike
 from rps_jax.record.options import option
 from rps_jax.runs.plan import Plan
 from rps_jax.runs.question import Run, call_of
 from rps_jax.trials.setting import Setting
-from rps_jax.tuning import fit
 from rps_jax.world import domain as domains
 from rps_jax.world import paper, points
 from rps_jax.world.domain import Domain
@@ -114,7 +114,7 @@ class Reproduce(TrialStudy[xr.Dataset]):
         drawn = {}
         for name in points.names(self.ranges, "range"):
             if name not in _BY_PUSH:
-                values, words = self._drawn(name), fit.words(name)
+                values, words = self._drawn(name), style.quantity(name)
                 by_object = {f"{words}, {o}": values[:, i] for i, o in enumerate(_SHORT.values())}
                 drawn |= by_object if name in _BY_OBJECT else {words: values[:, 0]}
         off = np.where(success.all((1, 2)), np.sqrt(squares / 4), np.inf)

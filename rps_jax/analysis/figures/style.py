@@ -23,14 +23,24 @@ class Figure(figure.Figure):
         return file.getvalue()
 
 
+# Words for joint factors and for functions of drawn quantities.
+_WORDS = {
+    "shape": "corners of prisms",
+    "key": "key of all noise",
+    "com_bearing": "bearing of the centre of mass",
+    "ground_force": "friction force of the ground",
+    "loop_delay": "latency of the pose and delay of the command",
+}
+
+
 def words(name: str) -> str:
     """Return a name with spaces for underscores."""
     return name.replace("_", " ")
 
 
 def quantity(name: str) -> str:
-    """Return the words for a drawn quantity."""
-    return LABELS.get(name) or words(name)
+    """Return the words for a drawn quantity, a joint factor or a derived quantity."""
+    return LABELS.get(name) or _WORDS.get(name) or words(name)
 
 
 def axis_label(name: str, units: str) -> str:
