@@ -115,9 +115,8 @@ class Ladder(SweepOptions, MultiLawQuestion[xr.Dataset | xr.DataTree]):
         labels = [x if isinstance(x, str) else f"domain_{i}" for i, x in enumerate(domains)]
         errors.check_each_once("domain", domains, labels)
         names = {f.name for f in dataclasses.fields(_TestSweep)} - {"laws", "domain"}
-        setting = replace(self.setting, seed=seed_of(self.setting.seed, "test"))
         shared: dict[str, Any] = {name: getattr(self, name) for name in names}
-        shared["setting"] = setting
+        shared["setting"] = replace(self.setting, seed=seed_of(self.setting.seed, "test"))
         sweeps = {}
         for label, domain in zip(labels, domains, strict=True):
             sweep = _TestSweep(self.chosen, domain, **shared)

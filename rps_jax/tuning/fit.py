@@ -357,10 +357,8 @@ def _simulate_logs(
 def coordinates(domain: Domain) -> tuple[str, ...]:
     """Return the coordinates of a domain's cube that are fitted: all but the task's and shapes."""
     task = {*domains.quantities_of("task"), "com_bearing", "friction", "target"}
-    return tuple(
-        coordinate.name for coordinate in points.coordinates(domain)
-        if coordinate.kind in ("range", "choice") and coordinate.name not in task
-    )  # fmt: skip
+    candidates = (x for x in points.coordinates(domain) if x.kind in ("range", "choice"))
+    return tuple(x.name for x in candidates if x.name not in task)
 
 
 def statistic_names(bank: xr.Dataset, fields: Sequence[str]) -> list[str]:
@@ -374,7 +372,7 @@ def values_of(domain: Domain, u: np.ndarray) -> dict[str, np.ndarray]:
     columns = zip(coordinates(domain), u.T, strict=True)
     values = {name: ranges[name].at(column) for name, column in columns if name in ranges}
     for name, (_, inputs, function) in DERIVED.items():
-        if all(key in values for key in inputs):
+        if values.keys() >= set(inputs):
             values[name] = function(*(values[key] for key in inputs))
     return values
 

@@ -27,6 +27,7 @@ _NEXT_WEIGHT = 0.6
 _PATIENCE = 8  # epochs without a better density before training stops
 
 Params = dict[str, Any]  # weights of a network: arrays, and tuples of arrays, by name
+Pair = tuple[jax.Array, jax.Array]
 Carry = tuple[Params, optax.OptState]  # of training: weights, and state of their optimiser
 
 
@@ -96,7 +97,7 @@ def train(u: np.ndarray, statistics: np.ndarray, seed: int = 0) -> Posterior:
     x = untrained.inputs(flat).reshape(count, ways, features).astype(np.float32)
     order, held_out = rng.permutation(count), max(2, count // 10)
 
-    def pairs(rows: np.ndarray) -> tuple[jax.Array, jax.Array]:
+    def pairs(rows: np.ndarray) -> Pair:
         targets = jnp.asarray(np.repeat(u[rows], ways, 0), jnp.float32)
         return jnp.asarray(x[rows].reshape(-1, features)), targets
 
@@ -108,7 +109,7 @@ def train(u: np.ndarray, statistics: np.ndarray, seed: int = 0) -> Posterior:
 
     @jax.jit
     def epoch(carry: Carry, key: jax.Array) -> tuple[Carry, jax.Array]:
-        def update(carry: Carry, step: tuple[jax.Array, jax.Array]) -> tuple[Carry, None]:
+        def update(carry: Carry, step: Pair) -> tuple[Carry, None]:
             (params, state), (rows, key) = carry, step
             grad = jax.grad(_loss)(params, inputs[rows], targets[rows], key)
             change, state = optimiser.update(grad, state, params)
@@ -152,9 +153,7 @@ def _draw(params: Params, x: jax.Array, key: jax.Array, count: int) -> jax.Array
     size = params["bias"].shape[1]
     previous = params["previous"] * _mask(size)
 
-    def draw_coordinate(
-        d: jax.Array, carry: tuple[jax.Array, jax.Array]
-    ) -> tuple[jax.Array, jax.Array]:
+    def draw_coordinate(d: jax.Array, carry: Pair) -> Pair:
         u, key = carry
         key, key_bin, key_value, key_rows = jax.random.split(key, 4)
         known = jnp.einsum("cj,ejh->ech", 2 * u - 1, previous[:, :, d]) + params["bias"][:, None, d]
