@@ -10,8 +10,9 @@ from __future__ import annotations
 
 import statistics
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, ClassVar, Literal, NamedTuple
 
 import jax
@@ -133,13 +134,30 @@ class Levers(SpeedStudy[xr.Dataset]):
         return 1 + len(levers_of(self.program, self.family))
 
     def answer(self, run: Run) -> xr.Dataset:
-        """Time the program with each lever."""
-        how = {"simulated": self.simulated, "goes": self.goes, "at_once": self.at_once}
+        """Time the program without a lever, then with each lever.
+
+        The baseline and the changed program alternate, `goes` times each, since the speed of a
+        shared machine varies; the gain is the median of the ratios.
+        """
+        levers = {BASELINE: Lever()} | levers_of(self.program, self.family)
+        calls = [partial(self._traced, lever) for lever in levers.values()]
         gains: list[xr.Dataset] = []
-        for gain in measure(self.program, self.family, self.worlds, **how):
-            gains.append(gain)
+        baseline = None
+        for label, program in zip(levers, programs.side_by_side(calls, self.at_once), strict=True):
+            baseline = baseline or program
+            gains.append(_gain(label, baseline, program, self.goes))
             run.callback(Progress(len(gains), 0.0))
         return xr.concat(gains, "lever")
+
+    def _traced(self, lever: Lever) -> Callable[[], Program]:
+        """Trace the program with a lever, and return the function that compiles it."""
+        setting = programs.BATCHED[self.program]
+        changed = replace(setting, physics=replace(setting.physics, **lever.physics))
+        count = max(1, round(self.worlds * lever.worlds))
+        how = {"stage": lever.stage, "donated": lever.donated, "flags": lever.flags}
+        return programs.traced(
+            self.program, changed, self.family, count, simulated=self.simulated, **how
+        )
 
     def report_tables(self, results: xr.Dataset) -> Sequence[Table]:
         """Return the gain of each lever."""
@@ -151,38 +169,6 @@ levers = call_of(Levers)
 
 
 BASELINE = "as it is"
-
-
-def measure(
-    name: str, family: str, worlds: int, *, simulated: float = 2.0, goes: int = 5, at_once: int = 1
-) -> Iterator[xr.Dataset]:
-    """Time a program of `programs.BATCHED` without a lever, then with each lever.
-
-    The baseline and the changed program alternate, `goes` times each, since the speed of a shared
-    machine varies; the gain is the median of the ratios.
-
-    Args:
-      name: of `programs.BATCHED`.
-      family: of its worlds.
-      worlds: their number, unless a lever changes it.
-      simulated: [s] of each run.
-      goes: runs of each program.
-      at_once: concurrent compilations.
-    """
-
-    def traced(lever: Lever) -> Callable[[], Program]:
-        setting = programs.BATCHED[name]
-        changed = replace(setting, physics=replace(setting.physics, **lever.physics))
-        count = max(1, round(worlds * lever.worlds))
-        how = {"stage": lever.stage, "donated": lever.donated, "flags": lever.flags}
-        return programs.traced(name, changed, family, count, simulated=simulated, **how)
-
-    levers = {BASELINE: Lever()} | levers_of(name, family)
-    calls = [lambda lever=lever: traced(lever) for lever in levers.values()]
-    baseline = None
-    for label, program in zip(levers, programs.side_by_side(calls, at_once), strict=True):
-        baseline = baseline or program
-        yield _gain(label, baseline, program, goes)
 
 
 def _rate(program: Program) -> float:
