@@ -46,6 +46,7 @@ Rows = list[list[str]]
 _PACKAGES = ("rps_jax", "jax", "mujoco", "mujoco-mjx")  # whose versions a data file has
 # Removed options by question, with the values that all later runs have; digests still cover them.
 _REMOVED_OPTIONS: Mapping[str, Mapping[str, Any]] = {
+    "ground": {"worlds": None},
     "attack": {"aim": "distance", "algorithm": "mixed"},
     "tune_es": {"algorithm": "cma", "patience": 0},
 }

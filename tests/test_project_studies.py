@@ -22,7 +22,7 @@ STUDIES = sorted(path.parent for path in SWEEPS.glob("*/study.py"))
 # Options of studies whose value is out of bounds, or is none of their choices.
 OUT_OF_BOUNDS = [
     *("landscape --candidates 1", "speed --refill -1", "speed --at-once 0", "speed --mujocos -4"),
-    *("levers --worlds 1", "levers --simulated nan", "ground --worlds 0", "hardware --setups 1"),
+    *("levers --worlds 1", "levers --simulated nan", "hardware --setups 1"),
     *("real_pushes --mujoco -1", "fit --logs 1", "fit/bags.py --logs 0", "export --inputs 0"),
 ]
 UNKNOWN = [

@@ -97,14 +97,12 @@ def run(
     *,
     objects: Sequence[str] = OBJECTS,
     offsets: Sequence[float] = OFFSETS,
-    worlds: int | None = None,
     steps: int = STEPS,
     callback: ProgressCallback = no_progress,
 ) -> xr.Dataset:
     """Pushes (ground, object, offset, speed) and the rigid limit's, run or found in `folder`.
 
-    Without a folder all is kept in memory. On each ground the first `worlds` pushes are run, by
-    default all; the others are NaN.
+    Without a folder all is kept in memory.
 
     `limit_lateral` (object, offset, at_height) [m] is where a rigid object ends that is pushed at a
     height. `error` (ground, object, offset, speed) [m] says how far from there an object ended that
@@ -127,10 +125,10 @@ def run(
     )
     for name in names:
         cases = list(itertools.product(objects, offsets, GROUNDS[name].speeds))
-        run_as = f"{options} {replace(GROUNDS[name], what='')!r}" + (f" {worlds}" if worlds else "")
-        compute = partial(_pushes, GROUNDS[name].physics, cases, worlds, progress)
+        run_as = f"{options} {replace(GROUNDS[name], what='')!r}"
+        compute = partial(_pushes, GROUNDS[name].physics, cases, progress)
         datasets.append(load_or_compute(parts, name, run_as, compute))
-        progress.finish(len(cases[:worlds]))
+        progress.finish(len(cases))
         progress(Progress(0, 0.0))
     whole = xr.concat(datasets, xr.IndexVariable("ground", list(names)), join="outer")
     whole = whole.assign_coords(what=("ground", [GROUNDS[name].what for name in names]))
@@ -141,25 +139,22 @@ def run(
     return whole
 
 
-def count(names: Sequence[str], worlds: int | None = None) -> int:
+def count(names: Sequence[str]) -> int:
     """Return the number of pushes on these grounds, of all objects at all offsets."""
-    pushes_on = [len(OBJECTS) * len(OFFSETS) * len(GROUNDS[name].speeds) for name in names]
-    return sum(min(total, worlds or total) for total in pushes_on)
+    return sum(len(OBJECTS) * len(OFFSETS) * len(GROUNDS[name].speeds) for name in names)
 
 
 def _pushes(
     physics: Physics,
     cases: Sequence[tuple[str, float, float]],
-    worlds: int | None,
     callback: ProgressCallback,
 ) -> xr.Dataset:
-    """Return the pushes (object, offset, speed) of cases in this order; NaN after the first few."""
+    """Return the pushes (object, offset, speed) of cases in this order."""
     targets, results, simulated = pushes.targets(), [], 0.0
-    for name, offset, speed in cases[:worlds]:
+    for name, offset, speed in cases:
         results.append(pushes.in_mujoco(targets[name], offset, speed, physics))
         simulated += DISTANCE / speed
         callback(Progress(len(results), simulated))
-    results += [pushes.NOTHING] * (len(cases) - len(results))
     coords = {
         dim: list(dict.fromkeys(x)) for dim, x in zip(_DIMS, zip(*cases, strict=True), strict=True)
     }

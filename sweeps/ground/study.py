@@ -19,7 +19,6 @@ from matplotlib.lines import Line2D
 
 from rps_jax.analysis.figures.style import Figure, words
 from rps_jax.analysis.report import Picture
-from rps_jax.record.options import option
 from rps_jax.runs.question import Run, call_of
 from sweeps.ground import grounds
 from sweeps.study_base import Study, Table
@@ -40,19 +39,16 @@ class Ground(Study[xr.Dataset]):
 
     grounds: tuple[str, ...] = tuple(grounds.GROUNDS)
     """Names of the grounds; by default all."""
-    worlds: int | None = option(None, 1, 10_000)
-    """Number of pushes on each ground: the first of all objects, offsets and speeds; by default
-    all."""
     quick: bool = False
     """Whether to run only three of the grounds."""
 
     def num_trials(self) -> int | None:
         """Return the number of pushes."""
-        return grounds.count(self.grounds, self.worlds)
+        return grounds.count(self.grounds)
 
     def answer(self, run: Run) -> xr.Dataset:
         """Push on the grounds that are missing."""
-        return grounds.run(self.grounds, run.folder, worlds=self.worlds, callback=run.callback)
+        return grounds.run(self.grounds, run.folder, callback=run.callback)
 
     def intro(self, results: xr.Dataset) -> str:
         """Describe the pushes."""
