@@ -1,7 +1,5 @@
 """Set-up of all tests: processor, fast compilation, offscreen rendering, checked shapes, cache."""
 
-import functools
-import inspect
 import os
 from pathlib import Path
 
@@ -16,8 +14,6 @@ if os.name == "posix":
 
 
 def pytest_configure(config):
-    # Each command reads the help of its options anew from the sources of their classes.
-    inspect.getsource = functools.cache(inspect.getsource)
     shapes.install()
     import jax
 

@@ -232,6 +232,22 @@ def row(tree: Any, i: Any) -> Any:
     return jax.tree.map(lambda leaf: leaf[i], tree)
 
 
+def flatten(tree: Any) -> np.ndarray:
+    """Return the leaves (n, ...) of a batch as vectors (n, D), the inverse of `unravel`."""
+    leaves = jax.tree.leaves(jax.tree.map(np.asarray, tree))
+    return np.concatenate([leaf.reshape(len(leaf), -1) for leaf in leaves], axis=1)
+
+
+def central_differences(function: Callable[..., Any], x: np.ndarray, h: float) -> Any:
+    """Return slopes of a batched function along each axis of x (n, D), and how much they bend."""
+    slopes, bends = [], []
+    for step in h * np.eye(x.shape[1]):
+        up, middle, down = (np.asarray(function(x + sign * step)) for sign in (1, 0, -1))
+        slopes.append((up - down) / (2 * h))
+        bends.append(np.abs(up - 2 * middle + down) / h)
+    return np.stack(slopes, -1), np.stack(bends, -1)
+
+
 def same(a: Any, b: Any, **tolerances: float) -> None:
     """Assert that two trees are equal, bit for bit or within tolerances."""
     check = np.testing.assert_allclose if tolerances else np.testing.assert_array_equal

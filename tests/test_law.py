@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import SEEDS, moved, observation, property_test, row
+from helpers import SEEDS, central_differences, flatten, moved, observation, property_test, row
 from hypothesis import strategies as st
 from jax.flatten_util import ravel_pytree
 
@@ -451,12 +451,6 @@ def twist_vector(x, l_th):
     return jnp.stack(rps.step_with_details(params, state, observation)[1])
 
 
-def flatten(params: RPSParams, observation: Observation) -> np.ndarray:
-    """Return vectors (n, 24), by the batched inverse of `unravel`."""
-    parts = [*params, *observation[:3], observation.p_world_target]
-    return np.concatenate([np.reshape(v, (len(v), -1)) for v in map(np.asarray, parts)], axis=1)
-
-
 batch_twist = jax.jit(jax.vmap(twist_vector))
 forward = jax.jit(jax.vmap(jax.jacfwd(twist_vector)))
 reverse = jax.jit(jax.vmap(jax.jacrev(twist_vector)))
@@ -491,7 +485,7 @@ def singular_worlds() -> list[tuple[RPSParams, Observation]]:
 def test_derivatives_are_finite_at_every_singular_point():
     worlds = singular_worlds()
     params, observation = jax.tree.map(lambda *v: np.stack([np.float32(u) for u in v]), *worlds)
-    x = flatten(params, observation).astype(np.float32)
+    x = flatten((params, observation[:3], observation.p_world_target)).astype(np.float32)
     assert len(x) <= 256
     x = np.resize(x, (256, x.shape[1]))  # the shape of the other tests
     for l_th in (0.24, 0.15):
@@ -515,17 +509,12 @@ def test_derivatives_agree_with_each_other_and_with_finite_differences():
     n, h = 256, 1e-6
     with jax.enable_x64(True):
         state, observation = random_worlds(1, n, np.float64)
-        x = flatten(random_params(2, n, np.float64), observation)
+        params = random_params(2, n, np.float64)
+        x = flatten((params, observation[:3], observation.p_world_target))
         l_th = np.asarray(state.l_th)
         ahead, back = np.asarray(forward(x, l_th)), np.asarray(reverse(x, l_th))
-        differences, one_sided = [], []
-        for i in range(x.shape[1]):
-            e = np.zeros(x.shape[1])
-            e[i] = h
-            up, middle, down = (np.asarray(batch_twist(x + a * e, l_th)) for a in (1, 0, -1))
-            differences.append((up - down) / (2 * h))
-            one_sided.append(np.abs(up - 2 * middle + down) / h)
-    differences, kink = np.stack(differences, -1), np.stack(one_sided, -1) > 1e-2
+        differences, bend = central_differences(lambda x: batch_twist(x, l_th), x, h)
+    kink = bend > 1e-2
     assert kink.mean() < 0.1
     np.testing.assert_allclose(ahead, back, rtol=1e-8, atol=1e-10)
     scale = 1 + np.abs(differences)

@@ -13,7 +13,18 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import test_law
-from helpers import FRONT, PAPER, SEEDS, SETTLED, SIDE, case, moved, property_test
+from helpers import (
+    FRONT,
+    PAPER,
+    SEEDS,
+    SETTLED,
+    SIDE,
+    case,
+    central_differences,
+    flatten,
+    moved,
+    property_test,
+)
 from helpers import box as box_at
 from jax.flatten_util import ravel_pytree
 from test_skin import BATCH, mirrored, random_shapes, sense_all
@@ -95,8 +106,7 @@ def clear(params, state, observation, details) -> np.ndarray:
 
 def flat_numbers(results) -> np.ndarray:
     """Return all results of a step as (n, ...), with bools as 0 and 1."""
-    leaves = [np.asarray(x, float).reshape(WORLDS, -1) for x in jax.tree.leaves(results)]
-    return np.concatenate(leaves, axis=1)
+    return flatten(results).astype(float)
 
 
 @any_seed
@@ -250,11 +260,6 @@ forward = jax.jit(jax.vmap(jax.jacfwd(after_one_step)))
 reverse = jax.jit(jax.vmap(jax.jacrev(after_one_step)))
 
 
-def flatten(params, state, observation, temperatures) -> np.ndarray:
-    parts = [*params, *state, *observation, *(np.full(WORLDS, value) for value in temperatures)]
-    return np.concatenate([np.reshape(x, (WORLDS, -1)) for x in map(np.asarray, parts)], axis=1)
-
-
 def test_derivatives_are_finite_on_surfaces_and_at_singular_points():
     distances = ((0.0, 0.0), (1e-30, 0.0), (0.05, 0.0), (0.5, 0.0), (-1.0, 0.0), (0.0, 1.0))
     offsets, weights = (0.0, 0.12, 0.15, -0.24, 0.29, -1e6), (0.0, 0.5, 1.0)
@@ -271,7 +276,8 @@ def test_derivatives_are_finite_on_surfaces_and_at_singular_points():
 def test_derivatives_are_finite_in_float32_whatever_the_temperature(seed):
     worlds = random_worlds(seed)
     for temperatures in (WARM, COLD):
-        chex.assert_tree_all_finite(reverse(flatten(*worlds, temperatures).astype(np.float32)))
+        heat = jax.tree.map(partial(np.full, WORLDS), temperatures)
+        chex.assert_tree_all_finite(reverse(flatten((*worlds, heat)).astype(np.float32)))
 
 
 def test_derivatives_agree_with_finite_differences():
@@ -280,16 +286,12 @@ def test_derivatives_agree_with_finite_differences():
         params, state, observation = random_worlds(1, np.float64)
         touched, weight = np.random.default_rng(2).uniform(0.05, 0.95, (2, WORLDS))
         state = state._replace(touched=touched)
-        x = flatten(params, state, observation._replace(in_contact=weight), WARM)
+        heat = jax.tree.map(partial(np.full, WORLDS), WARM)
+        x = flatten((params, state, observation._replace(in_contact=weight), heat))
         derivatives = np.asarray(forward(x))
-        differences, bend = [], []
-        for e in h * np.eye(x.shape[1]):
-            up, middle, down = (np.asarray(batch_step(x + a * e)) for a in (1, 0, -1))
-            differences.append((up - down) / (2 * h))
-            bend.append(np.abs(up - 2 * middle + down) / h)
-    differences = np.stack(differences, -1)
+        differences, bend = central_differences(batch_step, x, h)
     scale = 1 + np.abs(differences)
-    kink = np.stack(bend, -1) > 1e-4 * scale
+    kink = bend > 1e-4 * scale
     assert kink.mean() < 0.02  # of the bounds, and of the 0-or-1 parameters
     assert (np.abs(differences - derivatives) / scale)[~kink].max() < 1e-4
 

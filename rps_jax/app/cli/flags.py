@@ -6,6 +6,7 @@ without a prefix.
 """
 
 import dataclasses
+import functools
 import types
 import typing
 from collections.abc import Iterator, Sequence
@@ -169,6 +170,10 @@ def _texts(value: object) -> list[str]:
     return [*map(str, value)] if isinstance(value, tuple | list) else [str(value)]
 
 
+# tyro parses the source of a class for each of its fields.
+_field_docs = functools.cache(_docstrings.get_field_docstring)
+
+
 @_REGISTRY.struct_rule
 def _fields(info: StructTypeInfo) -> StructConstructorSpec | None:
     """Offer the fields of a dataclass, without the hidden ones."""
@@ -186,7 +191,7 @@ def _fields(info: StructTypeInfo) -> StructConstructorSpec | None:
         if get_origin(kind) is Sequence:
             kind = tuple[get_args(kind)[0], ...]
         marked = typing.cast(type, Annotated[(kind, *marks)] if marks else kind)
-        text = partial(_docstrings.get_field_docstring, info.type, field.name, info.markers)
+        text = partial(_field_docs, info.type, field.name, info.markers)
         specs.append(StructFieldSpec(field.name, marked, default, text))
     return StructConstructorSpec(info.type, tuple(specs))
 
