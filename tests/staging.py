@@ -165,7 +165,8 @@ def step_in_c(model: Any, qpos: np.ndarray, twist: Sequence[float], steps: int) 
     data = mujoco.MjData(model)
     data.qpos[:] = qpos
     for _ in range(steps):
-        c, s = np.cos(data.qpos[2]), np.sin(data.qpos[2])
+        heading = data.qpos[2] + twist[2] * model.opt.timestep / 2  # half way through the step
+        c, s = np.cos(heading), np.sin(heading)
         data.qvel[:3] = c * twist[0] - s * twist[1], s * twist[0] + c * twist[1], twist[2]
         mujoco.mj_step(model, data)
     return data

@@ -55,45 +55,6 @@ def test_a_profile_assigns_time_to_the_calling_functions():
     assert len(costs.table([profile], count=3)) == 1 + 3
 
 
-def test_an_instruction_comes_from_the_innermost_function():
-    text = """HloModule m
-
-FileNames
-1 "/somewhere/rps_jax/control/laws/rps.py"
-2 "/somewhere/rps_jax/trials/trial.py"
-3 "/somewhere/rps_jax/lib/site-packages/mujoco/mjx/_src/solver.py"
-
-FunctionNames
-1 "step"
-2 "decide.<locals>.think"
-
-FileLocations
-1 {file_name_id=2 function_name_id=2 line=1 end_line=1 column=1 end_column=2}
-2 {file_name_id=1 function_name_id=1 line=9 end_line=9 column=1 end_column=2}
-3 {file_name_id=3 function_name_id=1 line=3 end_line=3 column=1 end_column=2}
-
-StackFrames
-1 {file_location_id=1 parent_frame_id=1}
-2 {file_location_id=2 parent_frame_id=1}
-3 {file_location_id=3 parent_frame_id=1}
-
-ENTRY %main (a: f32[]) -> f32[] {
-  %a = f32[] parameter(0)
-  %add.1 = f32[] add(%a, %a), metadata={op_name="add" stack_frame_id=2}
-  %while.2 = f32[] while(%add.1), body=%b, metadata={op_name="w" stack_frame_id=1}
-  ROOT %mul.3 = f32[] multiply(%add.1, %a), metadata={op_name="mul" stack_frame_id=1}
-  %neg.4 = f32[] negate(%a), metadata={op_name="neg" stack_frame_id=7}
-  %abs.5 = f32[] abs(%a), metadata={op_name="abs" stack_frame_id=3}
-}
-"""
-    assert costs.sources(text) == {
-        "add.1": "control/laws/rps.py: step",
-        "mul.3": "trials/trial.py: decide.think",
-        "neg.4": costs.ELSEWHERE,
-        "abs.5": "mujoco/mjx/_src/solver.py: step",
-    }
-
-
 def test_nsight_counters_become_a_row():
     """The row is that of the last launch; output of the program before the table is skipped."""
     names = ["ID", *kernel._COUNTERS]

@@ -92,12 +92,9 @@ def test_operations_agree_with_jax(threads, tmp_path):
 
 
 PAIRS = [("box", "capacitive"), ("cylinder", "ideal"), ("prism", "ideal")]
-MORE = [("box", "ideal"), ("cylinder", "capacitive"), ("prism", "capacitive")]
 
 
-@pytest.mark.parametrize(
-    ("shape", "skin"), [*PAIRS, *(pytest.param(*pair, marks=pytest.mark.slow) for pair in MORE)]
-)
+@pytest.mark.parametrize(("shape", "skin"), PAIRS)
 def test_a_control_step_is_the_processors(shape, skin, tmp_path):
     """This holds for any combination of worlds in a warp."""
     stage, inputs, loop, pushing = build_push(shape, skin)

@@ -19,14 +19,6 @@ PACKAGE = ROOT / "rps_jax"
 ROOMS = sorted(path.parent for path in PACKAGE.glob("*/__init__.py"))
 
 
-def test_the_package_has_no_files_beside_its_rooms():
-    files = {path.name for path in PACKAGE.iterdir() if path.is_file()}
-    assert files == {
-        *("__init__.py", "__init__.pyi", "__main__.py"),
-        *("errors.py", "py.typed", "README.md"),
-    }
-
-
 @pytest.mark.parametrize("room", ROOMS, ids=lambda room: room.name)
 def test_a_room_has_a_docstring(room):
     assert ast.get_docstring(ast.parse((room / "__init__.py").read_text()))

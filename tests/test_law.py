@@ -21,7 +21,7 @@ from jax.flatten_util import ravel_pytree
 
 from rps_jax import errors
 from rps_jax.control.laws import rps
-from rps_jax.control.laws.rps import RPSParams, RPSState
+from rps_jax.control.laws.rps import RPSParams, RPSState, Temperatures
 from rps_jax.control.observation import Observation, Twist, displacement
 
 PAPER = RPSParams.paper()
@@ -565,11 +565,13 @@ def test_float64_agrees_with_float32():
 
 
 @pytest.mark.parametrize("x64", [False, True])
-@pytest.mark.parametrize("in_contact", [False, True])
-def test_a_step_preserves_the_dtypes_of_the_state(x64, in_contact):
+@pytest.mark.parametrize(
+    ("in_contact", "heat"), [(False, ()), (True, ()), (1.0, (Temperatures(),))]
+)
+def test_a_step_preserves_the_dtypes_of_the_state(x64, in_contact, heat):
     with jax.enable_x64(x64):
-        start = RPSState.init(PAPER)
-        new, twist = rps.step(PAPER, start, observe((1.0, 0.2), 0.1, in_contact=in_contact))
+        start = RPSState.init(PAPER, *heat)
+        new, twist = rps.step(PAPER, start, observe((1.0, 0.2), 0.1, in_contact=in_contact), *heat)
         kinds = [jax.tree.map(lambda v: (v.dtype, v.weak_type), s) for s in (start, new)]
         assert kinds[0] == kinds[1]
         assert {v.dtype for v in twist} == {jnp.zeros(()).dtype}

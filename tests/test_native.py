@@ -77,14 +77,7 @@ def close(actual, desired, warm, rest):
         np.testing.assert_allclose(a, b, rtol=1e-4, atol=rest)
 
 
-# Shapes and skins; further pairs of the same functions are slow.
-PAIRS = [
-    *[("box", "capacitive"), ("cylinder", "ideal"), ("prism", "capacitive")],
-    *(
-        pytest.param(*pair, marks=pytest.mark.slow)
-        for pair in (("box", "ideal"), ("cylinder", "capacitive"), ("prism", "ideal"))
-    ),
-]
+PAIRS = [("box", "capacitive"), ("cylinder", "ideal"), ("prism", "capacitive")]
 
 
 @pytest.mark.parametrize(("shape", "skin"), PAIRS)
@@ -96,9 +89,7 @@ def test_a_control_step_agrees_with_xla(shape, skin, monkeypatch):
     close(computed, expected, warm=2e-3, rest=2e-5)
 
 
-@pytest.mark.parametrize(
-    "shape", [pytest.param("box", marks=pytest.mark.slow), "cylinder", "prism"]
-)
+@pytest.mark.parametrize("shape", ["cylinder", "prism"])
 def test_the_bits_of_a_world_depend_on_no_other_world(shape):
     stage, inputs, loop = batch(shape)
     together = advanced(stage, inputs, start_trials(inputs, loop), loop, 300)

@@ -31,7 +31,7 @@ def ground_on(feet, count=1, shift=0.0):
     return Ground(at, np.ones(at.shape[:2]), np.zeros(count), np.full(count, shift))
 
 
-def pushed(ways, ground=None, pose=(0.0, 0.0, 0.0), friction=0.5, scale=1.0):
+def pushed(ways, ground=None, pose=(0.0, 0.0, 0.0), friction=0.5):
     """Return pose and force of one push by fingers (F, 2) [m] along a vector (2,) [m].
 
     Fingers and vector are in the body's frame at the start.
@@ -42,12 +42,8 @@ def pushed(ways, ground=None, pose=(0.0, 0.0, 0.0), friction=0.5, scale=1.0):
     share = np.linspace(0, 1, STEPS + 1)[:, None, None]
     path = turned(np.full((STEPS + 1, 2), pose[2]), start + share * way) + pose[:2]
     ground = ground_on(FEET) if ground is None else ground
-    ground = ground._replace(at=scale * ground.at, arm=scale * ground.arm)
-    unit = np.array([scale, scale, 1])
-    fingers, first = scale * path[:, None], (pose * unit)[None]
-    shape = scale * OUTLINE, scale * COM
-    result = sliding.push(*shape, ground, fingers, first, np.array([friction]))
-    return result.pose[:, 0] / unit, result.force[:, 0]
+    result = sliding.push(OUTLINE, COM, ground, path[:, None], pose[None], np.array([friction]))
+    return result.pose[:, 0], result.force[:, 0]
 
 
 UPWARDS = ([[0.025, -0.001], [0.075, -0.001]], (0.0, 0.02))  # two fingers about the centroid's x
@@ -85,12 +81,6 @@ def test_a_finger_stays_in_its_cone_and_outside():
 SIDEWAYS = ([[0.1, -0.001]], (0.004, 0.02))
 
 
-def test_lengths_have_no_scale():
-    (base, _), (scaled, _) = (pushed(SIDEWAYS, scale=x) for x in (1.0, 4.0))
-    assert abs(base[-1, 2]) > 0.05
-    np.testing.assert_allclose(scaled, base, atol=1e-6)
-
-
 def test_feet_move_with_the_pose():
     """Moving and turning a push moves and turns its result."""
     pose = (0.3, -0.2, 2.0)
@@ -98,12 +88,6 @@ def test_feet_move_with_the_pose():
     expected = turned(np.full(len(first), 2.0), first[:, :2]) + pose[:2]
     np.testing.assert_allclose(second[:, :2], expected, atol=1e-6)
     np.testing.assert_allclose(second[:, 2], first[:, 2] + 2.0, atol=1e-5)
-
-
-def test_positions_of_feet_change_the_rotation():
-    way = ([[0.1, -0.001]], (0.0, 0.02))
-    near, far = (COM + share * (OUTLINE - COM) for share in (0.2, 1.0))
-    assert pushed(way, ground_on(near))[0][-1, 2] > 1.2 * pushed(way, ground_on(far))[0][-1, 2]
 
 
 def test_feet_bear_the_weight_about_its_centre():

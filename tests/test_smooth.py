@@ -296,15 +296,6 @@ def test_derivatives_agree_with_finite_differences():
     assert (np.abs(differences - derivatives) / scale)[~kink].max() < 1e-4
 
 
-@pytest.mark.parametrize("x64", [False, True])
-def test_a_smooth_step_preserves_the_dtypes_of_the_state(x64):
-    with jax.enable_x64(x64):
-        state = RPSState.init(PAPER, WARM)
-        next_state, twist = rps.step(PAPER, state, observe((1.0, 0.2), 0.1), WARM)
-        assert jax.tree.map(lambda x: x.dtype, next_state) == jax.tree.map(lambda x: x.dtype, state)
-        assert {x.dtype for x in twist} == {jnp.zeros(()).dtype}
-
-
 # The skin
 
 NEAR = (-0.001, 0.02)  # [m] gaps

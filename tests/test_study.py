@@ -1,9 +1,9 @@
 """Studies, the C engine, hardware experiments and reports, at smoke size."""
 
-import mujoco
 import numpy as np
 import pytest
 import xarray as xr
+from staging import step_in_c
 
 import rps_jax
 from rps_jax import errors
@@ -97,16 +97,9 @@ def test_c_mujoco_driven_by_periods_matches_c_mujoco_driven_by_steps():
     qpos = scene.initial_qpos(at, gap=0.001)
     twist = np.array([[0.05, 0.02, 0.1]])
     batch = c_mujoco.Batch([at.physics], qpos[None], 1)
-    data = mujoco.MjData(at.physics)
-    data.qpos[:] = qpos
     for _ in range(100):
         batch.drive(np.array([0]), twist, physics.substeps)
-        for _ in range(physics.substeps):
-            v_x, v_y, omega = twist[0]
-            heading = data.qpos[2] + omega * physics.timestep / 2
-            c, s = np.cos(heading), np.sin(heading)
-            data.qvel[:3] = [c * v_x - s * v_y, s * v_x + c * v_y, omega]
-            mujoco.mj_step(at.physics, data)
+    data = step_in_c(at.physics, qpos, twist[0], 100 * physics.substeps)
     batch.close()
     np.testing.assert_allclose(batch.qpos[0, :3], data.qpos[:3], atol=1e-6)
     np.testing.assert_allclose(batch.qpos[0, 3:], data.qpos[3:], atol=2e-4)

@@ -112,16 +112,9 @@ def sphere(x):
     return np.sum((x - 0.7) ** 2, axis=-1)
 
 
-def ellipsoid(x):
-    return np.sum(10.0 ** (3 * np.arange(x.shape[-1]) / (x.shape[-1] - 1)) * x**2, axis=-1)
-
-
 def rosenbrock(x):
     a, b = x[..., :-1], x[..., 1:]
     return np.sum(100 * (b - a**2) ** 2 + (1 - a) ** 2, axis=-1)
-
-
-MINIMISED = {sphere: 60, ellipsoid: 120, rosenbrock: 400}  # generations of a search
 
 
 def search(size=4, **options):
@@ -142,9 +135,8 @@ def minimise(function, generations, bad=0, **options):
     return np.array(result)
 
 
-@pytest.mark.parametrize("function", MINIMISED)
-def test_it_finds_a_minimum(function):
-    assert minimise(function, MINIMISED[function], population=16)[-1] < 1e-2
+def test_it_finds_a_minimum():
+    assert minimise(rosenbrock, 400, population=16)[-1] < 1e-2
 
 
 def test_a_value_that_is_not_a_number_ranks_worst():

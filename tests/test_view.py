@@ -7,7 +7,6 @@ import json
 import math
 import shutil
 import socket
-import sys
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -341,8 +340,3 @@ def test_a_used_port_is_refused_in_one_sentence(capsys):
         port = server.getsockname()[1]
         error = refusal(capsys, "view", "--port", port)
     assert f"port = {port} cannot be served on (Address already in use)" in error
-
-
-def test_without_viser_the_error_names_the_package(capsys, monkeypatch):
-    monkeypatch.setitem(sys.modules, "viser", None)
-    assert "viser is not installed: run pip install 'rps_jax[viz]'." in refusal(capsys, "view")
