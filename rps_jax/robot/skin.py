@@ -78,7 +78,7 @@ class IdealSkin(NamedTuple):
     tolerance: float | jax.Array = 0.006  # [m]
     point_length: float | jax.Array = 2 * HALF_WIDTH / 12  # [m] one taxel: longest POINT contact
     shell: Shell = Shell()  # outline and boards; in a trial, the robot's
-    temperature: Scalar | None = None  # [m]
+    temperature: float | jax.Array | None = None  # [m]
 
     def check(self) -> None:
         """Raise InputError for fields that are no lengths."""
@@ -172,7 +172,7 @@ class CapacitiveSkin(NamedTuple):
     gain_spread: float | jax.Array = 0.0  # [1] standard deviation of the taxels' gains about 1
     dead_share: float | jax.Array = 0.0  # [1] probability that a taxel is dead
     shell: Shell = Shell()  # outline and boards; in a trial, the robot's
-    temperature: Scalar | None = None  # [1]
+    temperature: float | jax.Array | None = None  # [1]
 
     def check(self) -> None:
         """Raise InputError for foam, filter or imperfections that no skin can have."""
