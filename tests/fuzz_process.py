@@ -109,14 +109,11 @@ def run_kills(limit: int, seed: int, tell: Callable[[str], None]) -> Counter[str
             start_time = time.monotonic()
             code, text = run(*words, "--out", f"{home}/{name}")
             whole = time.monotonic() - start_time
-            if code or fault(text):
-                counts["traceback"] += 1
-                tell(f"{name}: code {code}: {text[-1500:]}")
-                continue
             right, done = payload(Path(home, name)), 0
-            if not right:
-                counts["wrong"] += 1
-                tell(f"{name}: holds nothing")
+            if code or fault(text) or not right:
+                counts["traceback" if fault(text) else "wrong"] += 1
+                tell(f"{name}: code {code}, {len(right)} contents: {text[-1500:]}")
+                continue
             while done < kills:
                 out = Path(home, f"{name}-{done}")
                 for _ in range(rng.randint(2, 6)):

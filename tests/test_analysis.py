@@ -16,7 +16,6 @@ from rps_jax.studies import hardware
 from rps_jax.trials.progress import no_progress
 from rps_jax.tuning import learn
 from rps_jax.world.domain import LABELS
-from sweeps.landscape.study import parameters_figure
 from sweeps.speed.study import throughput
 
 
@@ -225,18 +224,6 @@ def test_speeds_are_drawn_by_batch(drawn):
     fast, level = ax.lines
     assert fast.get_xydata().tolist() == [[64, 100.0], [512, 300.0]]
     assert list(level.get_ydata()) == [50.0, 50.0]
-
-
-def test_a_parameter_with_log_bounds_has_a_log_axis(drawn):
-    dims = ("set", "parameter", "step")
-    results = xr.Dataset(
-        {"success": (dims, [[[0.5, 1.0]] * 2]), "value": (dims, [[[1.0, 10.0], [0.0, 1.0]]])},
-        {"set": ["paper"], "parameter": ["k", "zeta"]},
-        {"worlds": 10},
-    )
-    k, zeta, *_ = drawn(parameters_figure, results, ["k"]).axes
-    assert (k.get_xscale(), zeta.get_xscale()) == ("log", "linear")
-    assert k.lines[0].get_xydata().tolist() == [[1.0, 50.0], [10.0, 100.0]]
 
 
 def test_a_report_is_one_self_contained_html_file(tmp_path):

@@ -143,7 +143,6 @@ COMMANDS = {
     },
     "hardware": {
         "--layout ring": unlike("--layout", "ring", "circle", "grid"),
-        "--mass 3": "unknown option '--mass'",  # each object of the hardware has the paper's
     },
     "sweep": {
         "--domain none.json": "none.json cannot be read .* give a JSON file",
@@ -193,7 +192,6 @@ COMMANDS = {
         "--port -1": "port = -1 is not allowed: it must be a whole number from 0 to 65535",
         "--port 65536": "port = 65536 is not allowed",
         "--port http": "http",
-        "--out x": "--out",
     },
     "film": {
         "": "run is missing: `rps film --help` lists the options",

@@ -3,7 +3,6 @@
 import os
 import subprocess
 from types import SimpleNamespace
-from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -15,7 +14,6 @@ from rps_jax.control.observation import Twist
 from rps_jax.engines import mjx_colliders
 from rps_jax.engines.base import ControlPeriod
 from rps_jax.engines.mjx_colliders import mjx
-from rps_jax.engines.quasistatic import Quasistatic
 from rps_jax.errors import InputError
 from rps_jax.trials import pushes, trial
 from rps_jax.trials.case import Case
@@ -77,10 +75,6 @@ def test_nsight_counters_become_a_row():
         kernel.counts("==ERROR== No kernels")
 
 
-def test_every_measurement_is_of_an_engine_or_of_c():
-    assert not set(programs.BATCHED) & set(speeds.IN_C)
-
-
 @pytest.mark.slow
 def test_levers_are_timed_against_the_unchanged_program(monkeypatch):
     names = ("no physics: law, skin, rules", "four times the worlds", "state not donated")
@@ -95,15 +89,6 @@ def test_levers_are_timed_against_the_unchanged_program(monkeypatch):
     assert len(table.rows) == 1 + gains.sizes["lever"]
 
 
-def test_levers_depend_on_the_engine():
-    of_mjx, of_fused = (levers.levers_of(f"{name} standard", "box") for name in ("mjx", "fused"))
-    assert set(of_fused) < set(of_mjx)
-    assert "4 solver iterations" in of_fused
-    assert "4 solver iterations" not in levers.levers_of("quasistatic", "box")
-    of_cylinders = levers.levers_of("mjx standard", "cylinder")
-    assert set(of_mjx) - set(of_cylinders) == {"MJX's own box collider"}
-
-
 def test_without_physics_the_base_moves_and_the_object_stays():
     cases = [Case("box", FRICTION["S1"], (2.0, 0.0), gap=0)]
     _, worlds, _, params = pushes.build(cases, Setting(engine="mjx"))
@@ -112,24 +97,6 @@ def test_without_physics_the_base_moves_and_the_object_stays():
     driven = levers.Unmoved().drive(worlds.fields, start, ControlPeriod(twists, preset()))
     moved = np.asarray(driven.motion.qpos - start.qpos)[0]
     np.testing.assert_allclose(moved, [0.05 * 0.02, *[0] * 9], atol=1e-9)
-
-
-def test_a_program_is_retraced_for_each_lever():
-    """A lever may change global state of MJX, which no argument shows."""
-    calls = []
-
-    class RecordingStage(NamedTuple):
-        def drive(self, *args):
-            calls.append(args)
-            return Quasistatic().drive(*args)
-
-    counts = []
-    for _ in range(2):
-        options = {"simulated": 0.1, "stage": lambda _: RecordingStage()}
-        setting = programs.BATCHED["quasistatic"]
-        programs.traced("quasistatic", setting, "cylinder", 2, **options)
-        counts.append(len(calls))
-    assert counts[1] == 2 * counts[0] > 0
 
 
 def test_contacts_of_a_box_as_a_prism_equal_those_of_mjx():

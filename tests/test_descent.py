@@ -35,46 +35,48 @@ def score(distance, contact, arrive=1e-5):
     return float(descent.soft_score(shots, RPSParams(), SETTING, OBJECTIVE, arrive))
 
 
-class TestSoftScore:
-    def test_at_low_temperature_the_score_is_the_hard_score(self):
-        # 1 m at 0.1 m/s in steps of 20 ms: nearer than d_success = 5 cm after 9.5 s = 475 steps.
-        distance = 1.0 - 0.1 * 0.02 * np.arange(600)
-        expected = OBJECTIVE.score(1.0, 9.5, 0.0, 0.0, SETTING.rules)
-        assert score(distance, np.ones(600)) == pytest.approx(float(expected), abs=1e-3)
-
-    @pytest.mark.parametrize(("contact", "lost"), [((1.0, 0.0), 5.0), ((0.0, 1.0), 0.0)])
-    def test_the_way_that_is_left_costs_the_time_of_driving_it(self, contact, lost):
-        """Time before the first touch is not lost."""
-        # 5 s in contact, then 5 s without; the last 30 cm take 6 s at v_max = 0.05 m/s.
-        expected = OBJECTIVE.score(1.0, 10.0 + 6.0, lost, 0.0, SETTING.rules)
-        actual = score(np.full(500, 0.3), np.repeat(contact, 250))
-        assert actual == pytest.approx(float(expected), rel=1e-5)
-
-    def test_the_soft_score_has_a_slope_where_the_hard_score_jumps(self):
-        def at(d):
-            question = snapshots(d * jnp.ones(5), jnp.ones(5))
-            return descent.soft_score(question, RPSParams(), SETTING, OBJECTIVE, 0.005)
-
-        slope = float(jax.grad(at)(0.05))
-        assert slope > 10 * OBJECTIVE.time / SETTING.rules.horizon  # [1/m] more than a way's own
+def test_at_low_temperature_the_score_is_the_hard_score():
+    # 1 m at 0.1 m/s in steps of 20 ms: nearer than d_success = 5 cm after 9.5 s = 475 steps.
+    distance = 1.0 - 0.1 * 0.02 * np.arange(600)
+    expected = OBJECTIVE.score(1.0, 9.5, 0.0, 0.0, SETTING.rules)
+    assert score(distance, np.ones(600)) == pytest.approx(float(expected), abs=1e-3)
 
 
-class TestDescent:
-    def test_the_first_start_is_the_base(self):
-        question = TuneGrad("rps", starts=3)
-        thetas = next(question.search())["vectors"]
-        np.testing.assert_array_equal(thetas[0], question.space.vector(question.space.base))
-        assert (np.abs(thetas[1:] - thetas[0]).max(axis=1) > 0.1).all()
+@pytest.mark.parametrize(("contact", "lost"), [((1.0, 0.0), 5.0), ((0.0, 1.0), 0.0)])
+def test_the_way_that_is_left_costs_the_time_of_driving_it(contact, lost):
+    """Time before the first touch is not lost."""
+    # 5 s in contact, then 5 s without; the last 30 cm take 6 s at v_max = 0.05 m/s.
+    expected = OBJECTIVE.score(1.0, 10.0 + 6.0, lost, 0.0, SETTING.rules)
+    actual = score(np.full(500, 0.3), np.repeat(contact, 250))
+    assert actual == pytest.approx(float(expected), rel=1e-5)
 
-    def test_a_law_without_a_smooth_form_is_refused(self):
-        with pytest.raises(InputError, match="no smooth form"):
-            TuneGrad("pursuit", tuned=("K_v",)).validate()
-        TuneGrad("pursuit", tuned=("K_v",), estimator="evolution").validate()
 
-    def test_steps_go_downhill_and_stay_within_the_clip(self):
-        rule = TuneGrad("rps", optimiser="sgd", learning_rate=0.5, clip=1.0, steps=10).rule
-        change, _ = rule.update(jnp.array([30.0, 40.0]), rule.init(jnp.zeros(2)), jnp.zeros(2))
-        np.testing.assert_allclose(change, [-0.3, -0.4], rtol=1e-6)
+def test_the_soft_score_has_a_slope_where_the_hard_score_jumps():
+    def at(d):
+        question = snapshots(d * jnp.ones(5), jnp.ones(5))
+        return descent.soft_score(question, RPSParams(), SETTING, OBJECTIVE, 0.005)
+
+    slope = float(jax.grad(at)(0.05))
+    assert slope > 10 * OBJECTIVE.time / SETTING.rules.horizon  # [1/m] more than a way's own
+
+
+def test_the_first_start_is_the_base():
+    question = TuneGrad("rps", starts=3)
+    thetas = next(question.search())["vectors"]
+    np.testing.assert_array_equal(thetas[0], question.space.vector(question.space.base))
+    assert (np.abs(thetas[1:] - thetas[0]).max(axis=1) > 0.1).all()
+
+
+def test_a_law_without_a_smooth_form_is_refused():
+    with pytest.raises(InputError, match="no smooth form"):
+        TuneGrad("pursuit", tuned=("K_v",)).validate()
+    TuneGrad("pursuit", tuned=("K_v",), estimator="evolution").validate()
+
+
+def test_steps_go_downhill_and_stay_within_the_clip():
+    rule = TuneGrad("rps", optimiser="sgd", learning_rate=0.5, clip=1.0, steps=10).rule
+    change, _ = rule.update(jnp.array([30.0, 40.0]), rule.init(jnp.zeros(2)), jnp.zeros(2))
+    np.testing.assert_allclose(change, [-0.3, -0.4], rtol=1e-6)
 
 
 def test_antithetic_steps_find_the_slope_of_the_objective():

@@ -43,72 +43,75 @@ def test_no_two_splits_share_a_seed():
     assert len(set(seeds)) == len(seeds)
 
 
-class TestEvaluate:
-    def test_results_are_labelled_as_those_of_a_sweep(self):
-        both = replace(CYLINDERS, objects=("random_cylinder", "cylinder"))
-        results = evaluate(paper(2), both, 3, split="test", **seeded(4))
-        assert dict(results.sizes) == {"candidate": 2, "world": 3, "pose": 3}
-        assert results.object.values.tolist() == ["random_cylinder", "cylinder", "random_cylinder"]
-        for index in range(3):
-            drawn = draws.table(draws.draw(both, seed_of(4, "test"), [index]))
-            for name, ((value,), unit) in drawn.items():
-                assert results[name].values[index] == value
-                assert results[name].attrs["units"] == unit
-        assert results.time.attrs["units"] == "s"
-        assert results.success.dtype == np.int8
-        expected = Objective().score(0.0, results.time, results.contact_lost_time, 0.0, BRIEF.rules)
-        away = np.where(np.isfinite(results.min_distance), results.min_distance, results.distance)
-        missed = 0.5 * np.minimum(away, 1.0)
-        assert (results.success == 0).all()
-        np.testing.assert_allclose(results.score, expected + missed, rtol=1e-5)
+def test_results_are_labelled_as_those_of_a_sweep():
+    both = replace(CYLINDERS, objects=("random_cylinder", "cylinder"))
+    results = evaluate(paper(2), both, 3, split="test", **seeded(4))
+    assert dict(results.sizes) == {"candidate": 2, "world": 3, "pose": 3}
+    assert results.object.values.tolist() == ["random_cylinder", "cylinder", "random_cylinder"]
+    for index in range(3):
+        drawn = draws.table(draws.draw(both, seed_of(4, "test"), [index]))
+        for name, ((value,), unit) in drawn.items():
+            assert results[name].values[index] == value
+            assert results[name].attrs["units"] == unit
+    assert results.time.attrs["units"] == "s"
+    assert results.success.dtype == np.int8
+    expected = Objective().score(0.0, results.time, results.contact_lost_time, 0.0, BRIEF.rules)
+    away = np.where(np.isfinite(results.min_distance), results.min_distance, results.distance)
+    missed = 0.5 * np.minimum(away, 1.0)
+    assert (results.success == 0).all()
+    np.testing.assert_allclose(results.score, expected + missed, rtol=1e-5)
 
-    def test_another_call_of_the_same_shape_compiles_nothing(self, compiled):
-        first = evaluate(paper(3), CYLINDERS, 4, **SHORT)
-        count = len(compiled)
-        L = np.array([0.1, 0.2, 0.4])
-        second = evaluate(paper(3, L=L), CYLINDERS, 4, split="validate", **seeded(7))
-        assert len(compiled) == count
-        assert (first.score != second.score).any()
 
-    def test_candidates_differ_only_in_their_parameters(self):
-        results = evaluate(paper(3, v_approach=np.array([0.01, 0.05, 0.01])), CYLINDERS, 4, **SHORT)
-        first, faster, again = results.transpose("candidate", ...).path_length.values
-        np.testing.assert_array_equal(first, again)
-        assert (first != faster).any()
+def test_another_call_of_the_same_shape_compiles_nothing(compiled):
+    first = evaluate(paper(3), CYLINDERS, 4, **SHORT)
+    count = len(compiled)
+    L = np.array([0.1, 0.2, 0.4])
+    second = evaluate(paper(3, L=L), CYLINDERS, 4, split="validate", **seeded(7))
+    assert len(compiled) == count
+    assert (first.score != second.score).any()
 
-    def test_candidates_are_given_as_a_list_or_as_one_law(self):
-        alone, several = room.candidates("rps"), room.candidates(["rps", "rps,K_h=0.3"])
-        for single in (alone, room.candidates(RPSParams.paper())):
-            assert {np.shape(leaf) for leaf in single} == {(1,)}
-        np.testing.assert_allclose(several.K_h, [*alone.K_h, 0.3])
-        params = paper(3)
-        assert room.candidates(params) is params
-        with pytest.raises(InputError, match="2 classes"):
-            room.candidates(["rps", "pursuit"])
 
-    @pytest.mark.parametrize(
-        ("bad", "why"),
-        [
-            ({"law": paper(0)}, "one for each candidate"),
-            ({"law": paper(3, L=np.ones(2))}, r"\.L of 2 are not allowed"),
-            ({"law": paper(3, L=np.array([1, np.nan, 1]))}, r"RPSParams\.L of a candidate"),
-            ({"law": paper(3, L=np.array([1, 1, np.inf]))}, r"candidate 2: rps\.L = inf"),
-            ({"law": paper(3, l_mr=np.array([0.1, 0.3, 0.1]))}, r"candidate 1: rps\.l_mr"),
-            ({"law": paper(2, L=np.array(["a", "b"]))}, "array of numbers"),
-            ({"law": (np.ones(3),)}, "belong to no law"),
-            ({"split": "train"}, "choose from tune, validate, test"),
-            ({"domain": "wild"}, "did you mean 'wide'"),
-            ({"worlds": 0}, "worlds = 0"),
-            (seeded(2**31), "seed = 2147483648"),
-            ({"slots": 0}, "slots = 0"),
-        ],
-    )
-    def test_bad_input_is_refused_before_anything_compiles(self, bad, why, compiled):
-        count = len(compiled)
-        with pytest.raises(InputError, match=why) as caught:
-            evaluate(**{"law": paper(3), "worlds": 4} | SHORT | bad)
-        assert "\n" not in str(caught.value)
-        assert len(compiled) == count
+def test_candidates_differ_only_in_their_parameters():
+    results = evaluate(paper(3, v_approach=np.array([0.01, 0.05, 0.01])), CYLINDERS, 4, **SHORT)
+    first, faster, again = results.transpose("candidate", ...).path_length.values
+    np.testing.assert_array_equal(first, again)
+    assert (first != faster).any()
+
+
+def test_candidates_are_given_as_a_list_or_as_one_law():
+    alone, several = room.candidates("rps"), room.candidates(["rps", "rps,K_h=0.3"])
+    for single in (alone, room.candidates(RPSParams.paper())):
+        assert {np.shape(leaf) for leaf in single} == {(1,)}
+    np.testing.assert_allclose(several.K_h, [*alone.K_h, 0.3])
+    params = paper(3)
+    assert room.candidates(params) is params
+    with pytest.raises(InputError, match="2 classes"):
+        room.candidates(["rps", "pursuit"])
+
+
+@pytest.mark.parametrize(
+    ("bad", "why"),
+    [
+        ({"law": paper(0)}, "one for each candidate"),
+        ({"law": paper(3, L=np.ones(2))}, r"\.L of 2 are not allowed"),
+        ({"law": paper(3, L=np.array([1, np.nan, 1]))}, r"RPSParams\.L of a candidate"),
+        ({"law": paper(3, L=np.array([1, 1, np.inf]))}, r"candidate 2: rps\.L = inf"),
+        ({"law": paper(3, l_mr=np.array([0.1, 0.3, 0.1]))}, r"candidate 1: rps\.l_mr"),
+        ({"law": paper(2, L=np.array(["a", "b"]))}, "array of numbers"),
+        ({"law": (np.ones(3),)}, "belong to no law"),
+        ({"split": "train"}, "choose from tune, validate, test"),
+        ({"domain": "wild"}, "did you mean 'wide'"),
+        ({"worlds": 0}, "worlds = 0"),
+        (seeded(2**31), "seed = 2147483648"),
+        ({"slots": 0}, "slots = 0"),
+    ],
+)
+def test_bad_input_is_refused_before_anything_compiles(bad, why, compiled):
+    count = len(compiled)
+    with pytest.raises(InputError, match=why) as caught:
+        evaluate(**{"law": paper(3), "worlds": 4} | SHORT | bad)
+    assert "\n" not in str(caught.value)
+    assert len(compiled) == count
 
 
 class Nested(NamedTuple):
@@ -140,34 +143,34 @@ def test_any_registered_law_with_nested_parameters(nested):
     np.testing.assert_allclose(results.path_length, expected + np.zeros((3, 2)), rtol=0.01)
 
 
-class TestSeveralAsks:
-    def test_candidates_have_equal_worlds_in_any_batch(self):
-        faster, params = paper(2, v_approach=np.array([0.01, 0.05])), paper(2)
-        hostile = replace(DOMAINS["hostile"], objects=("random_cylinder",))
-        domains = [CYLINDERS, hostile]
-        asks = [Candidates(each, domains, 3, np.arange(3)) for each in (faster, params)]
-        (first, second), _ = room.score_candidates(asks, BRIEF, Objective(), slots=6)
-        assert first.score.shape == (2, 6)
-        np.testing.assert_array_equal(first.score[0], second.score[0])
-        np.testing.assert_array_equal(second.score[0], second.score[1])
-        assert (first.score[1] != first.score[0]).any()
-        (alone,), _ = room.score_candidates(
-            [Candidates(paper(3), domains, 3, np.arange(1, 2))], BRIEF, Objective(), slots=6
-        )
-        np.testing.assert_allclose(alone.score[0], second.score[0, [1, 4]], rtol=1e-4)
+def test_candidates_have_equal_worlds_in_any_batch():
+    faster, params = paper(2, v_approach=np.array([0.01, 0.05])), paper(2)
+    hostile = replace(DOMAINS["hostile"], objects=("random_cylinder",))
+    domains = [CYLINDERS, hostile]
+    asks = [Candidates(each, domains, 3, np.arange(3)) for each in (faster, params)]
+    (first, second), _ = room.score_candidates(asks, BRIEF, Objective(), slots=6)
+    assert first.score.shape == (2, 6)
+    np.testing.assert_array_equal(first.score[0], second.score[0])
+    np.testing.assert_array_equal(second.score[0], second.score[1])
+    assert (first.score[1] != first.score[0]).any()
+    (alone,), _ = room.score_candidates(
+        [Candidates(paper(3), domains, 3, np.arange(1, 2))], BRIEF, Objective(), slots=6
+    )
+    np.testing.assert_allclose(alone.score[0], second.score[0, [1, 4]], rtol=1e-4)
 
-    def test_scores_are_those_of_the_first_version(self):
-        """The last digits depend on the processor, and on the flags of XLA."""
-        space = Space(("L", "K_h", "beta"))
-        away = np.array([[0, 0, 0], [0.5, -0.5, 0.3], [-0.7, 0.4, -0.2]], np.float32)
-        params = space.params(away + np.asarray(space.vector(space.base)))
-        near = replace(CYLINDERS, distance=Range(0.7, 0.9), gap=Range(0, 0))
-        setting = Setting(rules=Rules(horizon=20.0), engine="fused")
-        ask = Candidates(params, [near], 1, np.arange(6))
-        (answer,), _ = room.score_candidates([ask], setting, Objective())
-        expected = [
-            [1.5613247156, 1.6000000238, 1.3565973043, 1.5677981377, 1.3648988008, 1.6000000238],
-            [1.5611727238, 1.6000000238, 1.3189700842, 1.5676416159, 1.3648886681, 1.6000000238],
-            [1.5615780354, 1.6000000238, 1.3576272726, 1.5680555105, 1.3642046452, 1.6000000238],
-        ]
-        np.testing.assert_allclose(answer.score, expected, rtol=2e-3)
+
+def test_scores_are_those_of_the_first_version():
+    """The last digits depend on the processor, and on the flags of XLA."""
+    space = Space(("L", "K_h", "beta"))
+    away = np.array([[0, 0, 0], [0.5, -0.5, 0.3], [-0.7, 0.4, -0.2]], np.float32)
+    params = space.params(away + np.asarray(space.vector(space.base)))
+    near = replace(CYLINDERS, distance=Range(0.7, 0.9), gap=Range(0, 0))
+    setting = Setting(rules=Rules(horizon=20.0), engine="fused")
+    ask = Candidates(params, [near], 1, np.arange(6))
+    (answer,), _ = room.score_candidates([ask], setting, Objective())
+    expected = [
+        [1.5613247156, 1.6000000238, 1.3565973043, 1.5677981377, 1.3648988008, 1.6000000238],
+        [1.5611727238, 1.6000000238, 1.3189700842, 1.5676416159, 1.3648886681, 1.6000000238],
+        [1.5615780354, 1.6000000238, 1.3576272726, 1.5680555105, 1.3642046452, 1.6000000238],
+    ]
+    np.testing.assert_allclose(answer.score, expected, rtol=2e-3)

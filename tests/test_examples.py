@@ -1,8 +1,8 @@
 """Tests of the examples, and of the laws and objects that they register."""
 
+import re
 import runpy
 import time
-import xml.etree.ElementTree as ET
 from functools import partial
 from pathlib import Path
 from typing import NamedTuple
@@ -46,12 +46,6 @@ def example(name):
 
 
 pytestmark = pytest.mark.usefixtures("registries")
-
-
-def test_the_short_examples_are_short():
-    for name in ("custom_object", "custom_law", "custom_domain", "custom_optimiser"):
-        code = (EXAMPLES / f"{name}.py").read_text().split('"""\n', 2)[1]
-        assert len([line for line in code.splitlines() if line.strip()]) <= 40, name
 
 
 # --- custom objects ----------------------------------------------------------------------
@@ -121,55 +115,28 @@ def test_a_custom_object_can_be_in_a_domain(hexagon):
     assert scene_of(plan, 3).model.ngeom == hexagon.model.ngeom
 
 
-def _body(root):
-    return root.find("worldbody/body")
-
-
-def _geom(root):
-    return _body(root).find("geom")
-
-
-def _without_base(root):
-    root.remove(root.find("include"))
-    for tag in ("worldbody/body/geom", "contact/pair"):
-        for item in root.findall(tag):
-            item.attrib.pop("class")
-    root.remove(root.find("contact"))
-
-
-def _without_a_name(root):
-    root.remove(root.find("contact"))
-    _geom(root).attrib.pop("name")
-
-
-def _with_a_hinge(root):
-    inner = ET.SubElement(_body(root), "body")
-    ET.SubElement(inner, "joint")
-    ET.SubElement(inner, "geom", size="0.1", mass="1")
-
-
-def _with_a_lid(root):
-    ET.SubElement(ET.SubElement(_body(root), "body"), "geom", size="0.1", mass="1")
-
-
+# Patterns in the file of the box and their replacements, by the message.
+INNER = '<geom size="0.1" mass="1"/></body></body>'
 BAD_FILES = {
-    "MuJoCo cannot compile .*mine.xml": lambda root: _body(root).append(ET.Element("wheel")),
-    "lacks the body 'base': include base.xml": _without_base,
-    "lacks the joint 'object'": lambda root: _body(root).find("freejoint").attrib.pop("name"),
-    "lacks the geom 'object'": _without_a_name,
-    "joints .* no other body a joint": _with_a_hinge,
-    "no other body within it": _with_a_lid,
-    "0 to 0.8 m is .* in the middle of its height": lambda r: _geom(r).set("pos", "0 0 0.4"),
-    "height = 0.02": lambda root: _geom(root).set("size", "0.2 0.2 0.01"),
-    "footprint = None is not allowed": lambda root: _geom(root).set("euler", "0 0 1"),
+    "MuJoCo cannot compile .*mine.xml": ("</body>", "<wheel/></body>"),
+    "lacks the body 'base': include base.xml": (
+        '<include[^>]*>|class="object"|<contact>.*</contact>',
+        "",
+    ),
+    "lacks the joint 'object'": ("<freejoint[^>]*>", "<freejoint/>"),
+    "lacks the geom 'object'": ('(?<=<geom) name="object"|<contact>.*</contact>', ""),
+    "joints .* no other body a joint": ("</body>", f"<body><joint/>{INNER}"),
+    "no other body within it": ("</body>", f"<body>{INNER}"),
+    "0 to 0.8 m is .* in the middle of its height": ("<geom", '<geom pos="0 0 0.4"'),
+    "height = 0.02": ('(?<= size=)"[^"]*"', '"0.2 0.2 0.01"'),
+    "footprint = None is not allowed": ("<geom", '<geom euler="0 0 1"'),
 }
 
 
 @pytest.mark.parametrize("message", BAD_FILES)
 def test_an_invalid_object_file_is_rejected_with_the_reason(message, tmp_path):
-    tree, path = ET.parse(BOX), tmp_path / "mine.xml"
-    BAD_FILES[message](tree.getroot())
-    tree.write(path)
+    path = tmp_path / "mine.xml"
+    path.write_text(re.sub(*BAD_FILES[message], BOX.read_text(), flags=re.DOTALL))
     with pytest.raises(InputError, match=f"object 'mine': .*{message}"):
         objects.register_object("mine", path)
     assert "mine" not in objects.OBJECTS

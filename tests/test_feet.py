@@ -1,5 +1,7 @@
 """Objects on custom feet in the engines."""
 
+import re
+
 import numpy as np
 import pytest
 from helpers import same
@@ -17,16 +19,6 @@ from rps_jax.world import draws, objects, points, scene
 from rps_jax.world.scene import Friction
 from sweeps.ground import rigid
 
-XML = """
-<mujoco model="wedge">
-  <include file="base.xml"/>
-  <worldbody>
-    <body name="object">
-      <freejoint name="object"/>
-      <geom name="object" class="object" type="box" size="0.2 0.3 0.25" mass="12"/>
-    </body>
-  </worldbody>
-</mujoco>"""
 FEET = np.array([[0.1, 0.1], [-0.15, 0.05], [0.05, -0.2]])
 LOADS = np.linalg.solve(np.vstack([FEET.T, np.ones(3)]), [0, 0, 1])  # [1] shares of the weight
 FRICTION = Friction(0.3, 0.4)
@@ -37,7 +29,8 @@ TWIST = (0.05, 0.0, 0.03)
 def registered_boxes(tmp_path_factory):
     """A box on feet, a box on its corners, and a box whose feet are at its corners."""
     path = tmp_path_factory.mktemp("feet") / "wedge.xml"
-    path.write_text(XML)
+    box = (objects.mjcf_folder() / "box.xml").read_text().replace("0.20 0.20 0.40", "0.2 0.3 0.25")
+    path.write_text(re.sub('mass="20"', 'mass="12"', re.sub('pos="[^"]*"', "", box)))
     corners = solid.rectangles(np.array([0.2]), np.array([0.3]))[0]
     objects.register_object("on_feet", path, feet=FEET)
     objects.register_object("on_corners", path)

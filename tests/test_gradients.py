@@ -9,8 +9,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import property_test
-from hypothesis import strategies as st
 
 from rps_jax import engines, errors
 from rps_jax.control import registry
@@ -195,25 +193,6 @@ def test_a_combination_weighs_by_inverse_variance_by_hand(a, b, expected):
     for pair in ((a, b), (b, a)):
         both = estimators.combine(*(estimate_of([x], [variance]) for x, variance in pair))
         assert (both.gradient, both.variance) == expected
-
-
-@property_test(st.lists(st.floats(0, 1e6), min_size=4, max_size=4), examples=30)
-def test_a_combination_claims_to_be_no_worse_than_either_and_is_symmetric(variances):
-    a, b = estimate_of([1.0, -1.0], variances[:2]), estimate_of([3.0, 5.0], variances[2:])
-    both, again = estimators.combine(a, b), estimators.combine(b, a)
-    least = np.minimum(a.variance, b.variance)
-    assert (both.variance <= least * (1 + 1e-6)).all()
-    np.testing.assert_allclose(both.gradient, again.gradient, rtol=1e-5, atol=1e-5)
-    np.testing.assert_allclose(both.variance, again.variance, rtol=1e-5, atol=1e-30)
-
-
-def test_a_combination_is_nearer_to_the_truth_than_either():
-    """Combine the derivative and the smoothed differences of one score, in different worlds."""
-    a, b = repeat("forward", 32), repeat("evolution", 512, seed=2)
-    both = jax.vmap(estimators.combine)(a, b)
-    error = [np.mean((estimate.gradient - STIFF * THETA) ** 2) for estimate in (both, a, b)]
-    assert error[0] < 0.95 * min(error[1:])
-    np.testing.assert_allclose(both.variance.mean(), error[0], rtol=0.3)
 
 
 # Windows of trials

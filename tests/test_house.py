@@ -1,6 +1,5 @@
 """The package as a whole: its rooms, docstrings, public names and examples, and a custom engine."""
 
-import ast
 import inspect
 import os
 import pkgutil
@@ -16,12 +15,6 @@ from helpers import ROOT, addresses, imported, output_of
 import rps_jax
 
 PACKAGE = ROOT / "rps_jax"
-ROOMS = sorted(path.parent for path in PACKAGE.glob("*/__init__.py"))
-
-
-@pytest.mark.parametrize("room", ROOMS, ids=lambda room: room.name)
-def test_a_room_has_a_docstring(room):
-    assert ast.get_docstring(ast.parse((room / "__init__.py").read_text()))
 
 
 def test_each_private_interface_has_a_test_that_notices_a_change():

@@ -38,10 +38,6 @@ def printed(notebook):
     return [value for _, kind, value in outputs(notebook) if kind in shown]
 
 
-def test_there_are_six_notebooks():
-    assert [name[:2] for name in TEXTS] == ["01", "02", "03", "04", "05", "06"]
-
-
 @all_notebooks
 def test_notebooks_import_only_public_names(name):
     assert "rps_jax" in imported(TEXTS[name])

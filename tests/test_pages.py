@@ -3,11 +3,10 @@
 import json
 import re
 import runpy
-from pathlib import Path
 
 import pytest
+from helpers import ROOT
 
-ROOT = Path(__file__).parents[1]
 TABLES = runpy.run_path(str(ROOT / "sweeps" / "render_tables.py"))
 PAGES = TABLES["pages"]()
 TEXTS = sorted((ROOT / "notebooks").glob("[0-9]*.py"))

@@ -14,6 +14,7 @@ from sweeps.real_pushes.sliding import Ground
 from sweeps.real_pushes.study import predict
 
 FEET = np.array([[0.03, 0.03], [0.09, 0.03], [0.03, 0.09]])
+GROUND = Ground((FEET - COM)[None], np.ones((1, 3)), np.zeros(1), np.zeros(1))
 STEPS = 30
 FOLDER = ROOT / "sweeps" / "real_pushes"
 
@@ -25,13 +26,7 @@ def sample():
     return whole.groupby("kind").head(10).reset_index(drop=True)
 
 
-def ground_on(feet, count=1, shift=0.0):
-    """Return a ground with these points under `count` objects, without an ellipsoid."""
-    at = np.repeat((feet - COM)[None], count, axis=0)
-    return Ground(at, np.ones(at.shape[:2]), np.zeros(count), np.full(count, shift))
-
-
-def pushed(ways, ground=None, pose=(0.0, 0.0, 0.0), friction=0.5):
+def pushed(ways, pose=(0.0, 0.0, 0.0), friction=0.5):
     """Return pose and force of one push by fingers (F, 2) [m] along a vector (2,) [m].
 
     Fingers and vector are in the body's frame at the start.
@@ -41,8 +36,7 @@ def pushed(ways, ground=None, pose=(0.0, 0.0, 0.0), friction=0.5):
         start = np.concatenate([start, start + 100.0])
     share = np.linspace(0, 1, STEPS + 1)[:, None, None]
     path = turned(np.full((STEPS + 1, 2), pose[2]), start + share * way) + pose[:2]
-    ground = ground_on(FEET) if ground is None else ground
-    result = sliding.push(OUTLINE, COM, ground, path[:, None], pose[None], np.array([friction]))
+    result = sliding.push(OUTLINE, COM, GROUND, path[:, None], pose[None], np.array([friction]))
     return result.pose[:, 0], result.force[:, 0]
 
 

@@ -184,7 +184,7 @@ def test_the_nodes_name_the_same_topics_and_parameters():
         assert f'"{topic}"' in python
     limits = vars(PYTHON["Limits"]())
     ranges = dict(re.findall(r'number\("(\w+)", "[^"]*", ([\d., ]+)\)', cpp))
-    declared = runpy_parameters(python)
+    declared = ast.literal_eval(re.search(r"^PARAMETERS = (\{.*?^\})", python, re.M | re.S)[1])
     for name, (about, smallest, largest) in declared.items():
         assert ranges[name].split(", ") == [str(x) for x in (limits[name], smallest, largest)]
         assert about in cpp
@@ -194,11 +194,3 @@ def test_the_nodes_name_the_same_topics_and_parameters():
     needed = {tag.text for tag in ET.parse(FOLDER / "package.xml").getroot().findall("depend")}
     required = re.findall(r"find_package\((\w+) REQUIRED\)", cmake)
     assert needed == {name for name in required if not name.startswith("ament")}
-
-
-def runpy_parameters(text):
-    """The table of parameters in the text of a node."""
-    for node in ast.parse(text).body:
-        if isinstance(node, ast.Assign) and node.targets[0].id == "PARAMETERS":
-            return ast.literal_eval(node.value)
-    raise AssertionError

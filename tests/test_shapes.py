@@ -58,8 +58,6 @@ def test_a_law_sees_batched_worlds_as_single_worlds():
 
 CALLS = [
     lambda: planar.rotate(jnp.zeros(2), jnp.zeros((3, 2))),
-    lambda: planar.direction(jnp.zeros(3)),
-    lambda: planar.greatest(jnp.zeros((2, 2))),
     lambda: fp.place(fp.circle(0.1), jnp.zeros(3), jnp.zeros(())),
     lambda: fp.extent(fp.Footprint(jnp.zeros((4, 3)), jnp.zeros(())), jnp.zeros(2)),
     lambda: rps.saturate(PAPER, Twist(jnp.zeros(2), jnp.zeros(3), jnp.zeros(2))),

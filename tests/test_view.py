@@ -26,10 +26,8 @@ from rps_jax.app import gate, viewer
 from rps_jax.control import learned
 from rps_jax.errors import InputError
 from rps_jax.trials import pushes
-from rps_jax.trials.pushes import Case
 from rps_jax.trials.stepper import Live
 from rps_jax.trials.trial import Rules
-from rps_jax.world import scene
 
 SETTING = replace(SHORT, rules=Rules(horizon=12.0))
 CASE = case((0.6, 0.0), "cylinder")
@@ -174,15 +172,7 @@ FLAGS = (
     *("--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--window-size=800,640"),
 )
 REQUEST = viewer.PushRequest("cylinder", "S1", "rps", (0.0, 2.0))
-
-
-def make(request):
-    friction = scene.FRICTION.get(request.friction)
-    if friction is None:
-        raise InputError(f"unknown friction set '{request.friction}': choose from S1, S2.")
-    case = Case(request.object, friction, request.target)
-    long = replace(SETTING, rules=Rules())
-    return viewer.Push(Live.of_case(case, long), pushes.scene_of(case, long.physics), "A drum")
+make = viewer.View(setting=replace(SETTING, rules=Rules())).push_of
 
 
 @pytest.fixture
