@@ -141,9 +141,7 @@ COMMANDS = {
         "--colour red": "--colour",
         "--out /proc/nowhere/run": "out = /proc/nowhere/run cannot be written",
     },
-    "hardware": {
-        "--layout ring": unlike("--layout", "ring", "circle", "grid"),
-    },
+    "hardware": {"--layout ring": unlike("--layout", "ring", "circle", "grid")},
     "sweep": {
         "--domain none.json": "none.json cannot be read .* give a JSON file",
         "--domain folder.json": "folder.json cannot be read",

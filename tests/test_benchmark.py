@@ -3,6 +3,7 @@
 import os
 import subprocess
 from types import SimpleNamespace
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -14,6 +15,7 @@ from rps_jax.control.observation import Twist
 from rps_jax.engines import mjx_colliders
 from rps_jax.engines.base import ControlPeriod
 from rps_jax.engines.mjx_colliders import mjx
+from rps_jax.engines.quasistatic import Quasistatic
 from rps_jax.errors import InputError
 from rps_jax.trials import pushes, trial
 from rps_jax.trials.case import Case
@@ -97,6 +99,24 @@ def test_without_physics_the_base_moves_and_the_object_stays():
     driven = levers.Unmoved().drive(worlds.fields, start, ControlPeriod(twists, preset()))
     moved = np.asarray(driven.motion.qpos - start.qpos)[0]
     np.testing.assert_allclose(moved, [0.05 * 0.02, *[0] * 9], atol=1e-9)
+
+
+def test_a_program_is_retraced_for_each_lever():
+    """A lever may change global state of MJX, which no argument shows."""
+    calls = []
+
+    class RecordingStage(NamedTuple):
+        def drive(self, *args):
+            calls.append(args)
+            return Quasistatic().drive(*args)
+
+    counts = []
+    for _ in range(2):
+        options = {"simulated": 0.1, "stage": lambda _: RecordingStage()}
+        setting = programs.BATCHED["quasistatic"]
+        programs.traced("quasistatic", setting, "cylinder", 2, **options)
+        counts.append(len(calls))
+    assert counts[1] == 2 * counts[0] > 0
 
 
 def test_contacts_of_a_box_as_a_prism_equal_those_of_mjx():

@@ -157,18 +157,6 @@ def test_prisms_are_convex_of_three_to_eight_sides_and_centred():
     assert (solid.area(solids) > 0).all()
 
 
-def test_a_square_prism_has_a_boxs_mass_properties():
-    square = solid.rectangles(np.array([0.2]), np.array([0.3]))
-    rest = np.zeros(1), *(np.array([x]) for x in (0.6, 12.0, 0.0, 0.0))
-    row = solid.build(square, *rest)
-    axes = solid.axes(row)[0]
-    moments = np.diag(axes @ np.diag(row.inertia[0]) @ axes.T)
-    # m / 3 (a^2 + b^2) with half lengths of 0.2, 0.3 and 0.3 m.
-    np.testing.assert_allclose(moments, 12 / 3 * np.array([0.18, 0.13, 0.13]))
-    padded = np.concatenate([square, np.repeat(square[:, -1:], 4, axis=1)], axis=1)
-    assert solid.build(padded, *rest).inertia == pytest.approx(row.inertia)
-
-
 def test_a_load_moves_the_centre_of_mass_by_the_requested_share():
     worlds = drawn("random_prism", 50, com_offset=Range(0.3, 0.3))
     np.testing.assert_allclose(draws.table(worlds)["com_offset"][0], 0.3)

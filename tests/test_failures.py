@@ -61,15 +61,6 @@ def test_a_probe_agrees_with_a_sweep_and_resumes(tmp_path, monkeypatch):
         probe_in(tmp_path)(u[::-1])
 
 
-def test_a_damaged_step_runs_again(tmp_path):
-    u = points.points_of(CYLINDERS, np.arange(2))
-    trials = probe_in(tmp_path)(u)
-    (path,) = (tmp_path / "parts").iterdir()
-    path.write_bytes(path.read_bytes()[:-1])
-    np.testing.assert_array_equal(probe_in(tmp_path)(u).severity, trials.severity)
-    assert len(list((tmp_path / "parts").glob("*.corrupt"))) == 1
-
-
 # --- rare events ---------------------------------------------------------------------------
 
 

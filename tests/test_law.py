@@ -493,10 +493,7 @@ def test_derivatives_are_finite_at_every_singular_point():
             chex.assert_tree_all_finite(jacobian(x, np.full(256, l_th, np.float32)))
 
 
-@property_test(
-    hnp.arrays(np.float32, (256, 7), elements=st.floats(-1e6, 1e6, width=32)),
-    SEEDS,
-)
+@property_test(hnp.arrays(np.float32, (256, 7), elements=st.floats(-1e6, 1e6, width=32)), SEEDS)
 def test_derivatives_are_finite_for_any_sensible_input(x, seed):
     params = np.stack(random_params(seed, 256), axis=1)
     x = np.concatenate([params, x], axis=1)

@@ -15,7 +15,7 @@ from rps_jax.errors import InputError
 from rps_jax.record import files
 from rps_jax.runs.plan import load_plan
 from rps_jax.world import draws, points
-from rps_jax.world.domain import DOMAINS, Range, quantities_of
+from rps_jax.world.domain import DOMAINS, quantities_of
 
 SWEPT = {"setting": SHORT, "slots": SLOTS}
 # Quantities that the solid, friction, target and robot of a world contain.
@@ -153,12 +153,3 @@ def test_the_command_sweeps_points_and_can_be_continued(tmp_path, capsys):
     assert rps(*command) == 0
     objects = rps_jax.load(tmp_path / "r").which_object.values.tolist()
     assert objects == [0, 1, 0]
-
-
-def test_undrawn_and_unknown_quantities_have_different_errors():
-    domain = replace(DOMAINS["wide"], mass=Range(5, 5))
-    with pytest.raises(InputError, match="axes = mass is not allowed: this domain does not draw"):
-        points.check_drawn("axes", "mass", domain)
-    with pytest.raises(InputError, match=r"unknown axes 'masss'.*did you mean"):
-        points.check_drawn("axes", "masss", DOMAINS["wide"])
-    assert points.check_drawn("axes", "com_bearing", DOMAINS["wide"]) == "com_bearing"

@@ -115,7 +115,7 @@ REFUSED = {
     ],
     Objective: each(risk="worst", time=-1.0, tail=0.0, miss=NAN),
     then("validate", partial(TuneES, "rps")): [
-        *each(population=3, spread=0.0, generations=0, prior=-1.0),
+        *each(population=3, spread=0.0, generations=0, prior=-1.0)
     ],
     then("validate", Gradients): [
         *each(object="box", worlds=1, delta=0.0),

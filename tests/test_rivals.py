@@ -9,14 +9,7 @@ import pytest
 from helpers import moved, same
 
 from rps_jax.control import registry
-from rps_jax.control.laws import (
-    dipole,
-    force_push,
-    force_push_published,
-    pursuit,
-    rps,
-    rps_plus,
-)
+from rps_jax.control.laws import dipole, force_push, force_push_published, pursuit, rps, rps_plus
 from rps_jax.control.laws.aps import APSParams
 from rps_jax.control.laws.dipole import DipoleParams
 from rps_jax.control.laws.force_push import ForcePushParams
@@ -25,12 +18,7 @@ from rps_jax.control.laws.guided import GuidedParams
 from rps_jax.control.laws.pursuit import PursuitParams
 from rps_jax.control.laws.rps import RPSParams, RPSState
 from rps_jax.control.laws.rps_plus import RPSPlusParams
-from rps_jax.control.observation import (
-    ForceObservation,
-    PoseObservation,
-    TaxelObservation,
-    Twist,
-)
+from rps_jax.control.observation import ForceObservation, PoseObservation, TaxelObservation, Twist
 from rps_jax.errors import InputError
 from rps_jax.geometry import planar
 from rps_jax.trials import pushes
