@@ -147,7 +147,7 @@ def test_candidates_have_equal_worlds_in_any_batch():
     faster, params = paper(2, v_approach=np.array([0.01, 0.05])), paper(2)
     hostile = replace(DOMAINS["hostile"], objects=("random_cylinder",))
     domains = [CYLINDERS, hostile]
-    asks = [Candidates(each, domains, 3, np.arange(3)) for each in (faster, params)]
+    asks = [Candidates(x, domains, 3, np.arange(3)) for x in (faster, params)]
     (first, second), _ = room.score_candidates(asks, BRIEF, Objective(), slots=6)
     assert first.score.shape == (2, 6)
     np.testing.assert_array_equal(first.score[0], second.score[0])

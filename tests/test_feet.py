@@ -193,7 +193,7 @@ def test_quasistatic_slides_on_drawn_feet():
 
 
 def test_feet_are_drawn_only_for_random_objects():
-    with pytest.raises(InputError, match="only random objects stand on drawn feet"):
+    with pytest.raises(InputError, match="only random objects have drawn feet"):
         domains.parse_domain("wide,objects=box,feet=0.5:0.9")
     ranges, plain = (domains.parse_domain(f"wide{feet}") for feet in (",feet=0.5:0.9", ""))
     names = {"feet", "feet_number", "feet_turn"}
