@@ -127,6 +127,7 @@ COMMANDS = {
         "--mass -20": r"mass = -20.0 is not allowed: .* at least 0.001 and at most 10000 \[kg\]",
         "--mass heavy": "heavy",
         "--physics default,timestep=0": r"timestep = 0.0 is not allowed: .* at most 0.1 \[s\]",
+        "--physics default,ground_solref=0.1": "ground_solref = 0.1 .*: give 2 numbers",
         "--physics default,timestep=0.006": "control_period = 0.02 s .* a multiple of",
         "--physics default,control_period=5": "control_period = 5.0 is not allowed: .* at most 1",
         "--physics bullet": "unknown physics 'bullet': choose from default, paper_gazebo",

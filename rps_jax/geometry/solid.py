@@ -162,7 +162,7 @@ def friction_arm(solid: Solid) -> np.ndarray:
     load, under the points on which engines stand solids: the corners of a prism, or three points
     of a cylinder's rim, the first in the direction of the centre of mass.
     """
-    at, share = _feet(solid)
+    at, share = support(solid)
     com = solid.p_object_com[:, :2]
     rows = np.concatenate([np.ones((*share.shape, 1)), at - com[:, None]], axis=-1)
     bears = np.ones(share.shape, bool)
@@ -178,13 +178,16 @@ def friction_arm(solid: Solid) -> np.ndarray:
     return np.sum(load * np.linalg.norm(rows[..., 1:], axis=-1), axis=1)
 
 
-def _feet(solid: Solid) -> tuple[np.ndarray, np.ndarray]:
-    """Return the support points (n, N, 2) [m] of solids, and the weight (n, N) of each."""
+def support(solid: Solid) -> tuple[np.ndarray, np.ndarray]:
+    """Return the support points (..., N, 2) [m] of solids, and the weight (..., N) of each.
+
+    The solids (...) may be a single one, unless it is a cylinder without feet.
+    """
     if solid.feet is not None:
         return solid.feet[..., :2], solid.feet[..., 2]
     at = solid.vertices
-    if at.shape[1] > 1:
-        return at, np.any(at != np.roll(at, 1, axis=1), axis=2).astype(float)
+    if at.shape[-2] > 1:
+        return at, np.any(at != np.roll(at, 1, axis=-2), axis=-1).astype(float)
     x, y, _ = solid.p_object_com.T
     lean = np.arctan2(y, x)[:, None] + np.array([0, 2, 4]) * np.pi / 3
     rim = solid.radius[:, None, None] * np.stack([np.cos(lean), np.sin(lean)], axis=-1)
@@ -195,7 +198,7 @@ def standing(solid: Solid) -> Solid:
     """Return prisms with explicit feet: their corners, if they have no feet yet."""
     if solid.feet is not None:
         return solid
-    at, share = _feet(solid)
+    at, share = support(solid)
     return solid._replace(feet=np.concatenate([at, share[..., None]], axis=-1))
 
 

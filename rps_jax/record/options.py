@@ -35,11 +35,8 @@ def option(
     The command line has a `positional` field without a flag, and does not offer a `hidden` one.
     """
     bounds = {"at_least": at_least, "at_most": at_most, "above": above, "unit": unit or None}
-    metadata = {
-        _BOUNDS: {name: bound for name, bound in bounds.items() if bound is not None},
-        HIDDEN: hidden,
-        POSITIONAL: positional,
-    }
+    bounds = {name: bound for name, bound in bounds.items() if bound is not None}
+    metadata = {_BOUNDS: bounds, HIDDEN: hidden, POSITIONAL: positional}
     return dataclasses.field(default=default, metadata=metadata, kw_only=kw_only)
 
 
@@ -79,7 +76,10 @@ def _check(name: str, value: Any, kind: object, metadata: Mapping[str, Any]) -> 
     elif kind is float:
         errors.check_finite(name, value, **(bounds or {}))
     elif get_origin(kind) is tuple and bounds is not None:
-        for item in value if isinstance(value, tuple | list) else (value,):
+        items = value if isinstance(value, tuple | list) else (value,)
+        if Ellipsis not in get_args(kind) and len(items) != len(get_args(kind)):
+            raise errors.not_allowed(name, value, f"give {len(get_args(kind))} numbers")
+        for item in items:
             _check(name, item, get_args(kind)[0], metadata)
     elif bounds:
         for number in np.ravel(np.asarray(value, object)):

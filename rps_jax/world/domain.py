@@ -317,13 +317,6 @@ def parse_domain(domain: DomainLike, robot: RobotLike | None = None) -> Domain:
     return replace(base, **_from_json(changes, base))
 
 
-def _names(values: object) -> tuple[str, ...]:
-    names = [values] if isinstance(values, str) else values
-    if not isinstance(names, list | tuple) or not all(isinstance(name, str) for name in names):
-        raise TypeError("no names")
-    return tuple(names)
-
-
 def _range(default: Range | None, values: Any) -> Range:
     low, high, *flags = values if isinstance(values, list | tuple) else (values, values)
     if len(flags) > 1 or not all(isinstance(flag, bool) for flag in flags):
@@ -336,7 +329,10 @@ def _range(default: Range | None, values: Any) -> Range:
 
 # Readers of the JSON of fields that are no ranges, and their formats for the error.
 _FORMS: dict[str, tuple[Callable[[Any], Any], str]] = {
-    "objects": (_names, 'names, as ["random_box"]'),
+    "objects": (
+        lambda names: (names,) if isinstance(names, str) else tuple(map(str, names)),
+        'names, as ["random_box"]',
+    ),
     "frictions": (
         lambda pairs: tuple(Friction(*map(float, pair)) for pair in pairs),
         "pairs of ground and robot, as [[0.3, 0.35]]",

@@ -121,9 +121,14 @@ class SceneRenderer:
         self.contact_trail.add(contact)
         for trail in (self.base_trail, self.contact_trail):
             for a, b in trail.segments():
-                self._add_line(a, b, trail)
+                line = self._add_geom("mjGEOM_LINE", np.zeros(3), np.zeros(3), trail.rgba)
+                ends = ([*point, trail.height] for point in (a, b))
+                width = _TRAIL_WIDTH * self.renderer.height
+                self.mujoco.mjv_connector(line, line.type, width, *ends)
         if not np.isnan(contact).any():
-            self._add_marker(contact)
+            position, size = np.array([*contact, CONTACT_HEIGHT]), np.full(3, CONTACT_RADIUS)
+            marker = self._add_geom("mjGEOM_SPHERE", size, position, CONTACT_RGBA)
+            marker.emission = 1.0  # seen in the shadow of the object too
         self._draw_changes(np.where(np.isnan(contact), qpos[:2], contact))
         return self._image.copy()
 
@@ -173,18 +178,7 @@ class SceneRenderer:
             points = np.concatenate([points, points - ray * (points[:, 2:] / ray[..., 2:])])
         return points
 
-    def _add_line(self, a: np.ndarray, b: np.ndarray, trail: _Trail) -> None:
-        """Add a line on the ground, which is faster to draw than a solid."""
-        geom = self._new_geom("mjGEOM_LINE", np.zeros(3), np.zeros(3), trail.rgba)
-        points = ([*point, trail.height] for point in (a, b))
-        self.mujoco.mjv_connector(geom, geom.type, _TRAIL_WIDTH * self.renderer.height, *points)
-
-    def _add_marker(self, point: np.ndarray) -> None:
-        position, size = np.array([*point, CONTACT_HEIGHT]), np.full(3, CONTACT_RADIUS)
-        geom = self._new_geom("mjGEOM_SPHERE", size, position, CONTACT_RGBA)
-        geom.emission = 1.0  # seen in the shadow of the object too
-
-    def _new_geom(self, kind: str, size: np.ndarray, position: np.ndarray, rgba: Any) -> Any:
+    def _add_geom(self, kind: str, size: np.ndarray, position: np.ndarray, rgba: Any) -> Any:
         """Add a geom to this image, which has at most 10,000."""
         view = self.renderer.scene
         geom = view.geoms[view.ngeom]
@@ -210,23 +204,20 @@ def open_renderers(
 
     The MuJoCo renderers are closed at the end, since open ones warn when Python exits.
     """
-    targets = []
-    for scene, p_world_target in tiles:
-        model = scene.model
-        errors.check_name("camera", camera, [model.camera(i).name for i in range(model.ncam)])
-        targets.append(_checked("p_world_target", p_world_target, 2))
-        limits = (model.vis.global_.offwidth, model.vis.global_.offheight)
-        for n, limit in zip(size, limits, strict=True):
-            errors.check_finite("size", n, at_least=2, at_most=limit, unit="px")
     with contextlib.ExitStack() as stack:
         renderers: dict[int, Any] = {}
-        for scene, _ in tiles:
-            if id(scene.model) not in renderers:
-                renderers[id(scene.model)] = stack.enter_context(_renderer(scene.model, size))
-        yield [
-            SceneRenderer(renderers[id(scene.model)], scene, camera, target)
-            for (scene, _), target in zip(tiles, targets, strict=True)
-        ]
+        scene_renderers = []
+        for scene, p_world_target in tiles:
+            model = scene.model
+            errors.check_name("camera", camera, [model.camera(i).name for i in range(model.ncam)])
+            target = _checked("p_world_target", p_world_target, 2)
+            limits = (model.vis.global_.offwidth, model.vis.global_.offheight)
+            for n, limit in zip(size, limits, strict=True):
+                errors.check_finite("size", n, at_least=2, at_most=limit, unit="px")
+            if id(model) not in renderers:
+                renderers[id(model)] = stack.enter_context(_renderer(model, size))
+            scene_renderers.append(SceneRenderer(renderers[id(model)], scene, camera, target))
+        yield scene_renderers
 
 
 def _checked(name: str, values: ArrayLike, length: int) -> np.ndarray:

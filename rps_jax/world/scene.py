@@ -218,12 +218,9 @@ def foot_positions(solids: Solid) -> np.ndarray:
 
     The weights of feet are ignored.
     """
-    at = solids.vertices
-    unused = np.all(at == np.roll(at, 1, axis=-2), axis=-1)
-    if solids.feet is not None:
-        at, unused = solids.feet[..., :2], solids.feet[..., 2] == 0
+    at, weight = solid.support(solids)
     half = np.expand_dims(solids.height / 2, -1)
-    return np.concatenate([at, np.where(unused, half, -half)[..., None]], axis=-1)
+    return np.concatenate([at, np.where(weight == 0, half, -half)[..., None]], axis=-1)
 
 
 def _compile(

@@ -46,8 +46,7 @@ class DipoleState(NamedTuple):
     started: jax.Array  # () bool
 
 
-_POSITIVE = ("K_h", "lookahead", "v_max", "omega_max", "d_success")
-check = partial(check_signs, "dipole", _POSITIVE)
+check = partial(check_signs, "dipole", ("K_h", "lookahead", "v_max", "omega_max", "d_success"))
 
 
 def init(params: DipoleParams) -> DipoleState:

@@ -32,8 +32,7 @@ class PursuitParams(NamedTuple):
     d_success: float | jax.Array = 0.05  # [m] target reached
 
 
-_POSITIVE = ("K_v", "K_h", "v_max", "omega_max", "d_success")
-check = partial(check_signs, "pursuit", _POSITIVE)
+check = partial(check_signs, "pursuit", ("K_v", "K_h", "v_max", "omega_max", "d_success"))
 
 
 def init(params: PursuitParams) -> tuple[()]:
