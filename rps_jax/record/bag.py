@@ -19,8 +19,6 @@ Each topic has one message per control step, except `/tf` and the markers, which
 
 from __future__ import annotations
 
-import dataclasses
-import io
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import partial
@@ -236,41 +234,20 @@ def _missing(latest: Mapping[str, Any]) -> list[str]:
 
 def _decoded(file: Any) -> Iterator[tuple[str, int, Any]]:
     """Yield topics, times [ns] and messages of a file, chunk by chunk."""
-    stream, records = _require("mcap.stream_reader"), _require("mcap.records")
-    decoders = _require("mcap_ros2.decoder").DecoderFactory()
-    schemas: dict[int, Any] = {}
-    channels: dict[int, Any] = {}
-    reader = stream.StreamReader(file, emit_chunks=True, record_size_limit=_MAX_BYTES)
-    for outer in reader.records:
-        inside = isinstance(outer, records.Chunk)
-        for record in stream.breakup_chunk(_unpacked(outer)) if inside else [outer]:
-            if isinstance(record, records.Schema):
-                schemas[record.id] = record
-            elif isinstance(record, records.Channel):
-                channels[record.id] = record
-            elif isinstance(record, records.Message):
-                channel = channels[record.channel_id]
-                expected, schema = TOPICS.get(channel.topic), schemas.get(channel.schema_id)
-                kind = schema.name if schema else "no type"
-                if expected is None:
-                    continue
-                if kind.replace("/msg/", "/") != expected:
-                    raise ValueError(f"{channel.topic} has {kind[:60]} for {expected}")
-                decode = decoders.decoder_for(channel.message_encoding, schema)
-                if decode is None:
-                    raise ValueError(f"{channel.topic} is not encoded as ROS 2 does")
-                yield channel.topic, record.log_time, decode(record.data)
-
-
-def _unpacked(chunk: Any) -> Any:
-    """Return a chunk without compression, of bounded size."""
-    if (name := {"zstd": "zstandard", "lz4": "lz4.frame"}.get(chunk.compression)) is None:
-        return chunk
-    with _require(name).open(io.BytesIO(chunk.data)) as stream:
-        data = stream.read(_MAX_BYTES + 1)
-    if len(data) > _MAX_BYTES or len(data) != chunk.uncompressed_size:
-        raise ValueError(f"a chunk of {chunk.uncompressed_size} bytes has another size")
-    return dataclasses.replace(chunk, data=data, compression="")
+    stream, readers = _require("mcap.stream_reader"), _require("mcap.reader")
+    limit = {"record_size_limit": _MAX_BYTES}
+    for record in stream.StreamReader(file, emit_chunks=True, **limit).records:
+        if (size := getattr(record, "uncompressed_size", 0)) > _MAX_BYTES:
+            raise ValueError(f"it has a chunk of {size} bytes")
+    file.seek(0)
+    decoders = [_require("mcap_ros2.decoder").DecoderFactory()]
+    reader = readers.NonSeekingReader(file, decoder_factories=decoders, **limit)
+    # In the order of the file, without loading it whole.
+    for entry in reader.iter_decoded_messages([*TOPICS], log_time_order=False):
+        topic, kind = entry.channel.topic, entry.schema.name if entry.schema else "no type"
+        if kind.replace("/msg/", "/") != TOPICS[topic]:
+            raise ValueError(f"{topic} has {kind[:60]} for {TOPICS[topic]}")
+        yield topic, entry.message.log_time, entry.decoded_message
 
 
 def _observed(time: float, latest: Mapping[str, Any]) -> dict[str, Any]:
