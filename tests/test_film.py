@@ -112,7 +112,7 @@ def test_the_memory_of_a_film_does_not_grow_with_its_length(tmp_path):
     def peak(count):
         tracemalloc.start()
         frames = ([shot] for _ in range(count))
-        video.render_grid([tile], frames, tmp_path / "x.mp4", shape=(1, 1), size=(320, 180))
+        video.render([tile], frames, tmp_path / "x.mp4", shape=(1, 1), size=(320, 180))
         peak_bytes = tracemalloc.get_traced_memory()[1]
         tracemalloc.stop()
         return peak_bytes
@@ -136,4 +136,4 @@ def test_more_trials_than_places_are_refused(tmp_path):
     with pytest.raises(
         InputError, match="grid = 1x1 is not allowed: it must have room for all 2 trials"
     ):
-        video.render_grid(tiles, [], tmp_path / "x.mp4", shape=(1, 1), size=(320, 180))
+        video.render(tiles, [], tmp_path / "x.mp4", shape=(1, 1), size=(320, 180))

@@ -19,12 +19,20 @@ pytestmark = pytest.mark.filterwarnings("ignore:os.fork")
 
 SMALL = (160, 120)  # [px]
 FAR = (50.0, 50.0)  # [m] a target out of sight
+NOWHERE = (np.nan, np.nan)
 PLAIN = {"p_world_target": FAR, "size": SMALL}
 
 
 @pytest.fixture(scope="module")
 def box():
     return scene.load("box")
+
+
+def render(scene, frames, path, *, p_world_target, p_world_contacts=None, **options):
+    """Write a video of one trial."""
+    contacts = itertools.repeat(NOWHERE) if p_world_contacts is None else p_world_contacts
+    shots = ([video.Shot(*pair, "")] for pair in zip(frames, contacts, strict=False))
+    video.render([video.Tile(scene, p_world_target)], shots, path, **options)
 
 
 def drive(loaded, count=5):
@@ -54,7 +62,7 @@ def fails_in_one_sentence(words=""):
 
 def test_a_video_holds_every_frame_of_a_moving_robot(box, tmp_path):
     path = tmp_path / "push.mp4"
-    video.render(box, iter(drive(box)), path, p_world_target=(2.0, 1.0), size=SMALL)
+    render(box, iter(drive(box)), path, p_world_target=(2.0, 1.0), size=SMALL)
     images = decode(path)
     assert images.shape == (5, 120, 160, 3)
     assert all(image.std() > 10 for image in images)
@@ -66,10 +74,10 @@ def test_the_contact_point_leaves_a_path_with_gaps(box, tmp_path):
     def last_image(contacts):
         path, frames = tmp_path / "push.mp4", [scene.initial_qpos(box)] * len(contacts)
         options = {"p_world_target": FAR, "size": (480, 360), "camera": "above"}
-        video.render(box, frames, path, p_world_contacts=contacts, **options)
+        render(box, frames, path, p_world_contacts=contacts, **options)
         return decode(path)[-1]
 
-    nothing = (np.nan, np.nan)
+    nothing = NOWHERE
     blank = last_image([nothing] * 6)
     points = [(1.0, 1.0), (1.0, 0.5), (1.0, -0.5), (1.0, -1.0), nothing]
     whole = last_image([*points, nothing])
@@ -131,7 +139,7 @@ def test_the_collision_capsule_of_a_drum_is_not_drawn():
 def test_an_unwritable_path_is_refused_in_one_sentence(box, tmp_path):
     for path in (tmp_path / "missing" / "push.mp4", tmp_path):
         with fails_in_one_sentence("could not be written"):
-            video.render(box, drive(box), path, **PLAIN)
+            render(box, drive(box), path, **PLAIN)
 
 
 def test_an_unfinished_video_does_not_change_the_old_file(box, tmp_path):
@@ -143,7 +151,7 @@ def test_an_unfinished_video_does_not_change_the_old_file(box, tmp_path):
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        video.render(box, broken(), path, **PLAIN)
+        render(box, broken(), path, **PLAIN)
     assert path.read_bytes() == b"old"
     assert os.listdir(tmp_path) == ["push.mp4"]
 
@@ -152,7 +160,7 @@ def test_an_ffmpeg_that_fails_is_one_sentence(box, tmp_path, monkeypatch):
     for program in ("/bin/false", "/no/such/program"):
         monkeypatch.setenv("IMAGEIO_FFMPEG_EXE", program)
         with fails_in_one_sentence():
-            video.render(box, drive(box), tmp_path / "push.mp4", **PLAIN)
+            render(box, drive(box), tmp_path / "push.mp4", **PLAIN)
         fixes = video.check()
         assert not fixes["rendering"]
         assert fixes["ffmpeg"]
@@ -169,7 +177,7 @@ INVALID = [
 def test_input_that_cannot_be_drawn_is_refused(box, tmp_path, change):
     options = {"frames": drive(box)} | PLAIN | change
     with pytest.raises(errors.InputError):
-        video.render(box, path=tmp_path / "push.mp4", **options)
+        render(box, path=tmp_path / "push.mp4", **options)
     assert not os.listdir(tmp_path)
 
 

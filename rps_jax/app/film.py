@@ -109,7 +109,7 @@ class Film(Action[Path]):
         tiles = [map(Tile, take.scenes, take.part.worlds.p_world_target) for take in takes]
         frames = _frames(takes, setting, speed, seconds, callback)
         grid = {"shape": self.shape, "size": _tile_size(self.shape), "camera": self.camera}
-        video.render_grid(_in_grid_order(tiles, takes), frames, out, fps=_FPS, **grid)
+        video.render(_in_grid_order(tiles, takes), frames, out, fps=_FPS, **grid)
         return out
 
     def takes(self) -> tuple[list[Take], Setting]:

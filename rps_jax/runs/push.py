@@ -134,15 +134,11 @@ class Trace:
         errors.check_finite("film_length", seconds, above=0, at_most=600, unit="s")
         snapshots = self.trajectory.snapshots
         shown = _evenly_spaced(len(snapshots.time), round(seconds * fps))
-        video.render(
-            self.scene,
-            watch(snapshots.qpos[shown]),
-            Path(path),
-            p_world_target=np.array(self.trajectory.p_world_target),
-            p_world_contacts=np.asarray(p_world_contact(snapshots))[shown],
-            fps=fps,
-            size=size,
-        )
+        contacts = np.asarray(p_world_contact(snapshots))[shown]
+        pairs = zip(watch(snapshots.qpos[shown]), contacts, strict=True)
+        shots = ([video.Shot(qpos, contact, "")] for qpos, contact in pairs)
+        tile = video.Tile(self.scene, self.trajectory.p_world_target)
+        video.render([tile], shots, Path(path), fps=fps, size=size)
         return Path(path)
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import itertools
 import os
 import tempfile
 import warnings
@@ -85,49 +84,19 @@ def images(
 
 
 def render(
-    scene: Scene,
-    frames: Iterable[ArrayLike],
-    path: str | os.PathLike[str],
-    *,
-    p_world_target: ArrayLike,
-    fps: int = 30,
-    size: tuple[int, int] = SIZE,
-    camera: str = "oblique",
-    p_world_contacts: Iterable[ArrayLike] | None = None,
-) -> None:
-    """Write an MP4 (H.264, yuv420p) with the paths of the base and of the contact point.
-
-    Frames are drawn and encoded one by one as they come, so memory does not grow with them. The
-    file appears at `path` when it is complete, and a file already there stays until then.
-
-    Frames are qpos (10,) as for `images`, at least one, with contact points (2,) [m], NaN
-    without contact, of as many; the rest is as for `render_grid`.
-
-    Raises:
-      InputError: no frames, or a frame, target, rate, size or camera that cannot be used.
-      VideoError: this machine cannot draw or encode, or `path` cannot be written.
-    """
-    none = p_world_contacts is None
-    contacts = itertools.repeat(NO_CONTACT) if none else p_world_contacts
-    pairs = zip(frames, contacts, strict=not none)
-    if (first := next(pairs, None)) is None:
-        raise errors.not_allowed("frames", [], "a video needs at least one frame")
-    shots = ([Shot(*pair, "")] for pair in itertools.chain([first], pairs))
-    tile = Tile(scene, p_world_target)
-    render_grid([tile], shots, path, shape=(1, 1), size=size, fps=fps, camera=camera)
-
-
-def render_grid(
     tiles: Sequence[Tile],
     frames: Iterable[Sequence[Shot]],
     path: str | os.PathLike[str],
     *,
-    shape: tuple[int, int],
-    size: tuple[int, int],
+    shape: tuple[int, int] = (1, 1),
+    size: tuple[int, int] = SIZE,
     fps: int = 25,
     camera: str = "oblique",
 ) -> None:
-    """Write an MP4, as of `render`, of many trials side by side.
+    """Write an MP4 (H.264, yuv420p) of trials side by side, with paths of bases and contacts.
+
+    Frames are drawn and encoded one by one as they come, so memory does not grow with them. The
+    file appears at `path` when it is complete, and a file already there stays until then.
 
     Args:
       tiles: of the grid, row by row; it may have room for more.
@@ -138,6 +107,10 @@ def render_grid(
       size: width and height of a tile [px], even numbers.
       fps: frames per second of the video.
       camera: name of a camera of the scenes: oblique or above.
+
+    Raises:
+      InputError: no frames, or a shot, target, rate, size or camera that cannot be used.
+      VideoError: this machine cannot draw or encode, or `path` cannot be written.
     """
     errors.check_finite("fps", fps, above=0, at_most=1000)
     if any(n % 2 for n in size):
@@ -159,6 +132,8 @@ def render_grid(
                     cells[divmod(i, columns)] = _labelled(renderer, shot)
                     shown[i] = shot
             sink(whole)
+        if shown[0] is None:
+            raise errors.not_allowed("frames", [], "a video needs at least one frame")
 
 
 def _labelled(renderer: SceneRenderer, shot: Shot) -> np.ndarray:
