@@ -383,6 +383,19 @@ def test_newtons_method_has_the_correct_derivatives_and_finds_the_minimum():
 # --- derivatives ----------------------------------------------------------------------------
 
 
+def moved_both_ways(inputs, seed):
+    """Trees (7, ...) of `inputs` moved along a random direction in each of its three parts."""
+    rng = np.random.default_rng(seed)
+    ways = [jax.tree.map(lambda x: rng.normal(size=x.shape), part) for part in inputs]
+    rows = [(0.0, 0)] + [(e, part) for part in range(3) for e in (1e-6, -1e-6)]
+    stacked = []
+    for part, (nominal, way) in enumerate(zip(inputs, ways, strict=True)):
+        steps = np.array([e if part == moved_part else 0.0 for e, moved_part in rows])
+        move = lambda x, d, s=steps: x + s.reshape(-1, *(1,) * x.ndim) * d  # noqa: E731
+        stacked.append(jax.tree.map(move, nominal, way))
+    return stacked, ways
+
+
 def test_derivatives_of_a_push_are_those_of_finite_differences():
     """Derivatives of the final pose of a cylinder by its properties, start and push, in curves."""
     time = np.arange(50)[:, None] * PERIOD
@@ -390,23 +403,25 @@ def test_derivatives_of_a_push_are_those_of_finite_differences():
     parts = (0.01, 0.02), 0.2, 0.3, (FRONT, SIDE), np.zeros((1, 2)), RADIUS
     cylinder = Slider(*map(np.array, parts))
     pose = np.array([0, 0, 0, FRONT + RADIUS, 0, 0.2, 1, 0, 0, 0])
-    inputs, rng = (cylinder, pose, np.concatenate(waves, axis=1)), np.random.default_rng(1)
-    physics = Physics(timestep=PERIOD, control_period=PERIOD)
-
-    @jax.jit
-    def end(slider, start, twists):
-        qpos = positions(slider, start, twists.swapaxes(0, 1), physics)[-1, 0]
-        return qpos[3] + 2 * qpos[4] + 3 * qpos[9]
-
+    inputs = cylinder, pose, np.concatenate(waves, axis=1)
     with jax.enable_x64(True):
-        leaves, tree = jax.tree.flatten(jax.tree.map(lambda x: jnp.asarray(x, float)[None], inputs))
-        gradient = jax.jit(jax.grad(end, argnums=(0, 1, 2)))(*tree.unflatten(leaves))
-        for k, (leaf, slope) in enumerate(zip(leaves, jax.tree.leaves(gradient), strict=True)):
-            way = rng.normal(size=leaf.shape)
-            moved = ([*leaves[:k], leaf + e * way, *leaves[k + 1 :]] for e in (1e-6, -1e-6))
-            up, down = (float(end(*tree.unflatten(rows))) for rows in moved)
-            assert abs(np.vdot(slope, way)) > 1e-3
-            assert np.vdot(slope, way) == pytest.approx((up - down) / 2e-6, rel=1e-3)
+        moved, ways = moved_both_ways(inputs, 0)
+        physics = Physics(timestep=PERIOD, control_period=PERIOD)
+
+        @jax.jit
+        @partial(jax.value_and_grad, has_aux=True)
+        def end(inputs):
+            slider, start, twists = inputs
+            qpos = positions(slider, start, twists.swapaxes(0, 1), physics)[-1]
+            where = qpos[:, 3] + 2 * qpos[:, 4] + 3 * qpos[:, 9]
+            return where[0], where
+
+        (_, where), gradient = jax.device_get(end(jax.tree.map(jnp.asarray, moved)))
+    for part in range(3):
+        pairs = zip(jax.tree.leaves(gradient[part]), jax.tree.leaves(ways[part]), strict=True)
+        slope = sum(np.vdot(a[0], b) for a, b in pairs)
+        assert abs(slope) > 1e-3
+        assert slope == pytest.approx((where[1 + 2 * part] - where[2 + 2 * part]) / 2e-6, rel=1e-3)
 
 
 TUNED = ("K_h", "K_v", "L", "beta", "k", "eta", "v_max", "omega_max")
