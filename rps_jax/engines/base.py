@@ -102,7 +102,7 @@ class Engine(abc.ABC):
     def check_senses(self, senses: str) -> None:
         """Raise InputError unless the engine computes the quantities that a law senses."""
         if senses == "force" and not self.computes_force:
-            raise self._refused("a law that senses the contact's force needs fused, mjx or mujoco")
+            raise self._refused("it computes no contact force; choose fused, mjx or mujoco")
 
     def check_traced(self) -> None:
         """Raise InputError unless JAX traces the steps."""
