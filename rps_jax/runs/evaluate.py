@@ -23,7 +23,7 @@ from rps_jax.runs.question import Split, seed_of
 from rps_jax.trials import batch
 from rps_jax.trials.batch import BatchOptions
 from rps_jax.trials.progress import Bar, ProgressCallback, Timing, is_interactive
-from rps_jax.trials.results import variable
+from rps_jax.trials.results import labelled, variable
 from rps_jax.trials.rollout import Candidates, outcomes
 from rps_jax.trials.score import Objective
 from rps_jax.trials.setting import Setting
@@ -98,11 +98,10 @@ def evaluate(
     with Bar("evaluate", math.prod(request.shape), shown=is_shown and report_to is None) as bar:
         options = BatchOptions(callback=report_to or bar, slots=slots, workers=workers)
         (scored,), _ = score_candidates([request], setting, objective, **options)
-    variables: dict[str, Any] = {
-        "score": (("candidate", "world"), scored.score, {"units": "1", "long_name": "objective"})
-    }
+    dims = "candidate", "world"
+    variables = labelled(score=(dims, scored.score, "1", "objective"))
     for name, values in scored.outcome._asdict().items():
-        variables[name] = variable(name, ("candidate", "world"), values)
+        variables[name] = variable(name, dims, values)
     objects = ranges.object_of(points_.cases(ranges, at, request.worlds))
     drawn = points_.drawn_columns(ranges, objects, partial(points_.draw, ranges, seed, at))
     return xr.Dataset(variables, {"pose": ["x", "y", "yaw"], "world": request.worlds} | drawn)

@@ -12,7 +12,6 @@ import itertools
 import json
 import math
 import re
-from collections import Counter
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -101,14 +100,6 @@ class Plan:
         law, object_index = divmod(chunk // self.max_chunks, len(self.domain.objects))
         params = list(self.laws.values())[law]
         return object_index, type(params), *map(np.shape, jax.tree.leaves(params))
-
-    @functools.cached_property
-    def trials_by_key(self) -> Counter[ProgramKey]:
-        """Number of trials of each program."""
-        counts: Counter[ProgramKey] = Counter()
-        for number, trials in self.chunks.items():
-            counts[self.program_key(number)] += trials.size
-        return counts
 
     def configuration(self) -> dict[str, Any]:
         """Return everything that the results depend on, as JSON."""

@@ -53,10 +53,7 @@ D = TypeVar("D", bound="DataclassInstance")
 T = TypeVar("T", covariant=True)
 Split = Literal["tune", "validate", "test"]
 # Options that say how a run is executed; results do not depend on them.
-_EXECUTION_OPTIONS = (
-    *("out", "bag", "slots", "workers", "quick"),
-    *("progress", "report_to"),
-)
+_EXECUTION_OPTIONS = ("out", "bag", "slots", "workers", "quick", "progress", "report_to")
 
 
 def seed_of(seed: int, split: Split) -> int:
@@ -199,9 +196,8 @@ class Question(Command[T]):
 
     TITLE: ClassVar[str] = ""  # of the report
     IGNORED_FIELDS: ClassVar[tuple[str, ...]] = ()  # fields on which the answer does not depend
-    STORES_ITSELF: ClassVar[bool] = (
-        False  # whether `answer` opens the run folder and stores results
-    )
+    # Whether `answer` opens the run folder and stores results.
+    STORES_ITSELF: ClassVar[bool] = False
 
     @property
     def title(self) -> str:

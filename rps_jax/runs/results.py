@@ -10,7 +10,6 @@ from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -23,7 +22,7 @@ from rps_jax.record.checkpoint import Checkpoints
 from rps_jax.runs.plan import Plan, chunks_by_key, draw
 from rps_jax.runs.question import with_coordinates
 from rps_jax.trials.batch import Job, WorldBatch
-from rps_jax.trials.results import UNITS, variable
+from rps_jax.trials.results import UNITS, labelled, variable
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import Outcome
 from rps_jax.trials.worlds import drawn_worlds
@@ -34,7 +33,6 @@ StoreChunk = Callable[[int, bytes], object]  # called with the number of a chunk
 # Types of an outcome's columns; the rest are float32.
 _TYPES: dict[str, type] = dict.fromkeys(("success", "tipped", "diverged", "stalled"), np.int8)
 _REMOVED = "overflows"  # column of a version with the engine warp
-_HDF5 = b"\x89HDF"  # with which a NetCDF file begins
 _PREFETCH = 16384  # worlds of one program that are built before they are needed, about
 
 
@@ -83,9 +81,10 @@ class Results:
     def jobs(self, setting: Setting) -> Iterator[Job]:
         """Yield the chunks to run; their worlds are built chunk by chunk."""
         ahead = max(1, _PREFETCH // self.plan.part)
+        by_key = chunks_by_key(self.plan, self.plan.chunks)
         for key, chunks in chunks_by_key(self.plan, self._chunks).items():
-            batches = _prefetch(map(self._build, chunks), ahead)
-            yield Job(key, self.plan.trials_by_key[key], batches)
+            trials = sum(self.plan.chunks[chunk].size for chunk in by_key[key])
+            yield Job(key, trials, _prefetch(map(self._build, chunks), ahead))
 
     def _build(self, chunk: int) -> WorldBatch:
         """Build the worlds of a chunk; those of the first law record the drawn quantities."""
@@ -170,15 +169,14 @@ class Results:
     def dataset(self) -> xr.Dataset:
         """Return outcomes (law, world) and drawn quantities (world)."""
         worlds = np.arange(self.plan.worlds)
-        attrs = {"units": "1", "long_name": "index of the object in the coordinate object"}
         objects = self.plan.object_of(worlds).astype(np.int16)
-        columns = {"which_object": xr.Variable("world", objects, attrs)}
+        meaning = "index of the object in the coordinate object"
+        columns = labelled(which_object=("world", objects, "1", meaning))
         for name, values in self._outcomes.items():
             columns[name] = variable(name, ("law", "world"), values)
         for name, values in self._drawn.items():
             label = LABELS.get(name, name.replace("_", " "))
-            attrs = {"units": unit_of(name), "long_name": label}
-            columns[name] = xr.Variable("world", values, attrs)
+            columns |= labelled(**{name: ("world", values, unit_of(name), label)})
         for column in columns.values():
             column.encoding["_FillValue"] = None  # every number is a result
         labels = {
@@ -198,8 +196,6 @@ def _decode(chunk: int, content: bytes) -> dict[str, np.ndarray]:
     try:
         return files.decode_arrays(content)
     except ValueError as error:
-        if content.startswith(_HDF5):
-            raise _of_another_version(chunk, "it is a NetCDF file") from error
         raise files.CorruptFileError(f"part {chunk}", error) from error
 
 
@@ -231,16 +227,16 @@ def write_table(results: xr.Dataset, path: Path) -> None:
     """
     flat = results.reset_coords().drop_vars(["which_object", "object", "pose"], errors="ignore")
     objects = results.object.values[results.which_object.values]
-    columns: dict[str, Any] = {"object": ("world", objects, {"long_name": "name of the object"})}
+    columns = labelled(object=("world", objects, "", "name of the object"))
     for name, values in ((str(name), values) for name, values in flat.items()):
         if values.dims == ("law", "world", "pose"):
             body = name.removesuffix("_pose")
             for i, (axis, unit) in enumerate({"x": "m", "y": "m", "yaw": "rad"}.items()):
                 meaning = f"{axis} of the {body} in the world at the end"
-                attrs = {"units": unit, "long_name": meaning}
-                columns[f"{body}_{axis}"] = (("law", "world"), values.values[..., i], attrs)
+                column = ("law", "world"), values.values[..., i], unit, meaning
+                columns |= labelled(**{f"{body}_{axis}": column})
         elif set(values.dims) <= {"law", "world"}:
-            columns[name] = values
+            columns[name] = values.variable
     labels = {name: (name, results[name].values, results[name].attrs) for name in ("law", "world")}
     whole = xr.Dataset(columns, labels)
     frame = whole.to_dataframe(dim_order=["law", "world"]).reset_index()

@@ -137,14 +137,13 @@ class Bar:
             on_compiled, self.on_compiled = self.on_compiled, None
             on_compiled()
         note = f"{progress.simulated:.0f} s simulated"
-        if self.over == "trials":
-            self.move(progress.finished, note)
-        elif self.over == "simulated":
-            self.move(progress.simulated)
-        elif self.over == "clock":
-            self.move(min(self.elapsed, self._total or math.inf), f"{progress.finished} trials")
-        else:
-            self.move(progress.rounds, note)
+        trials, clock = progress.finished, min(self.elapsed, self._total or math.inf)
+        moves = {
+            "trials": (trials, note),
+            "simulated": (progress.simulated, ""),
+            "clock": (clock, f"{trials} trials"),
+        }
+        self.move(*moves.get(self.over, (progress.rounds, note)))
 
     def move(self, done: float, note: str = "") -> None:
         """Show the number of finished units, with a note."""
