@@ -122,9 +122,9 @@ class SceneRenderer:
         for trail in (self.base_trail, self.contact_trail):
             for a, b in trail.segments():
                 line = self._add_geom("mjGEOM_LINE", np.zeros(3), np.zeros(3), trail.rgba)
-                ends = ([*point, trail.height] for point in (a, b))
+                points = ([*point, trail.height] for point in (a, b))
                 width = _TRAIL_WIDTH * self.renderer.height
-                self.mujoco.mjv_connector(line, line.type, width, *ends)
+                self.mujoco.mjv_connector(line, line.type, width, *points)
         if not np.isnan(contact).any():
             position, size = np.array([*contact, CONTACT_HEIGHT]), np.full(3, CONTACT_RADIUS)
             marker = self._add_geom("mjGEOM_SPHERE", size, position, CONTACT_RGBA)
