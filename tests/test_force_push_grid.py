@@ -69,6 +69,6 @@ test_invalid_options_of_the_grid_are_refused = refusals(
     ({"laws": ("none",)}, "unknown laws 'none'"),
     ({"sliders": ("prism",)}, "unknown sliders 'prism'"),
     ({"duration": 0.0}, "duration"),
-    ({"engine": "quasistatic"}, "senses the contact's force"),
+    ({"engine": "quasistatic"}, "computes no contact force"),
     ({"engine": "mujoco"}, "JAX must trace it"),
 )
