@@ -68,11 +68,8 @@ class Regress(PlanQuestion, MultiLawQuestion[xr.Dataset]):
 
     def answer(self, run: Run) -> xr.Dataset:
         results = super().answer(run)
-        known = worlds().isel(world=slice(results.sizes["world"]))
-        return results.assign(
-            known_success=(("known", "world"), known.success.values),
-            known_severity=(("known", "world"), known.severity.values),
-        ).assign_coords(known=known.known.values)
+        known = worlds()[["success", "severity"]].isel(world=slice(results.sizes["world"]))
+        return results.merge(known.rename({name: f"known_{name}" for name in known}))
 
     def intro(self, results: xr.Dataset) -> str:
         return (

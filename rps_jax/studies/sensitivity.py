@@ -134,18 +134,16 @@ class Sensitivity(PlanQuestion, DomainQuestion[xr.Dataset], LawQuestion[xr.Datas
         )
 
     def report(self, results: xr.Dataset, run: Run) -> Sequence[Section]:
-        labels = {name: quantity(name) for name in rank_factors(results)}
-        first_five = [name for name in labels if name in results.quantity.values][:5]
+        names = [x for x in rank_factors(results) if x in results.quantity.values]
         objects = [name.removeprefix("random_") for name in self.ranges.objects]
-        pairs = partial(interactions, results, {x: labels[x] for x in first_five}, objects)
         text = (
             "The first-order index is the share of the variance that a factor explains alone; the "
             "total index includes all its interactions. Noise and the corners of prisms are one "
             "factor each. Intervals are bootstrapped, of 95 %. "
             f"{reliability(results)}"
         )
-        indices = Picture("sobol", partial(indices_figure, results, labels))
-        maps = Picture("interactions", pairs)
+        indices = Picture("sobol", partial(indices_figure, results))
+        maps = Picture("interactions", partial(interactions, results, names[:5], objects))
         return [
             Section("Sobol indices", text, index_table(results), indices),
             Section("Interactions of the first five", "", (), maps),
@@ -225,14 +223,14 @@ def reliability(results: xr.Dataset) -> str:
 _BINS = 4  # of each range of a map of interactions
 
 
-def indices_figure(results: xr.Dataset, labels: Mapping[str, str]) -> Figure:
-    """Draw the indices of first and total order with their intervals, the first label on top."""
-    labels = dict(list(labels.items())[::-1])
-    figure = Figure(figsize=(11, 1.4 + 0.24 * len(labels)), layout="constrained")
+def indices_figure(results: xr.Dataset) -> Figure:
+    """Draw the indices of first and total order with their intervals, the greatest on top."""
+    factors = rank_factors(results)[::-1]
+    figure = Figure(figsize=(11, 1.4 + 0.24 * len(factors)), layout="constrained")
     axes = figure.subplots(1, len(OUTPUTS), sharey=True)
-    y = np.arange(len(labels))
+    y = np.arange(len(factors))
     for ax, (output, words) in zip(axes, OUTPUTS.items(), strict=True):
-        indices = results.sel(output=output, factor=list(labels))
+        indices = results.sel(output=output, factor=factors)
         for order, shift, colour in (("total", 0.15, "C3"), ("first", -0.15, "C0")):
             ax.errorbar(
                 indices[order], y + shift, xerr=indices[f"{order}_reach"], fmt="o", ms=4,
@@ -243,16 +241,16 @@ def indices_figure(results: xr.Dataset, labels: Mapping[str, str]) -> Figure:
         ax.set_title(f"variance of {words}", fontsize=10)
         ax.set_xlabel("share of the variance [1]")
         ax.grid(axis="x", alpha=0.3)
-    axes[0].set_yticks(y, list(labels.values()), fontsize=8)
+    axes[0].set_yticks(y, list(map(quantity, factors)), fontsize=8)
     axes[-1].legend(fontsize=8, loc="lower right")
     figure.suptitle(f"Sobol indices with intervals of 95 %, {results.sizes['world']:,} worlds")
     return figure
 
 
-def interactions(results: xr.Dataset, labels: Mapping[str, str], objects: Sequence[str]) -> Figure:
-    """Draw the failures over each pair of labelled quantities; ranges have equal bins."""
+def interactions(results: xr.Dataset, quantities: Sequence[str], objects: Sequence[str]) -> Figure:
+    """Draw the failures over each pair of some quantities; ranges have equal bins."""
     failed, rates = results.success.values == 0, {}
-    for names in combinations(labels, 2):
+    for names in combinations(quantities, 2):
         bins = [len(objects) if name == "object" else _BINS for name in names]
         u = results.u.sel(quantity=list(names)).values.T
         count = partial(np.histogram2d, *u, bins, [(0, 1)] * 2)
@@ -264,7 +262,7 @@ def interactions(results: xr.Dataset, labels: Mapping[str, str], objects: Sequen
         for axis, name in zip((ax.yaxis, ax.xaxis), names, strict=True):
             ticks = objects if name == "object" else ()
             axis.set_ticks(range(len(ticks)), ticks, fontsize=7)
-            axis.set_label_text(labels[name].replace(" of the ", "\nof the "), fontsize=8)
+            axis.set_label_text(quantity(name).replace(" of the ", "\nof the "), fontsize=8)
     figure.colorbar(ScalarMappable(norm, "magma_r"), ax=axes, label="failures [%]", shrink=0.6)
     figure.suptitle("each range from its low end (left, bottom) to its high end", fontsize=10)
     return figure

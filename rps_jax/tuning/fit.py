@@ -164,10 +164,7 @@ class Fit(LawQuestion[Fitted], DomainQuestion[Fitted], LogsQuestion):
         self.check_engine([self.params])
         check_law(self.label, registry.law_of(self.params), self.setting)
         if len({raw.exact for raw in self.raw_logs}) > 1:
-            raise InputError(
-                "logs of traces and of a robot's odometry are not allowed together: fit them "
-                "separately."
-            )
+            raise InputError("logs of traces and of odometry are not allowed together: fit each.")
         for raw in self.raw_logs:
             start, target = raw.columns["pose"][0], raw.columns["target"]
             distance, far = float(np.linalg.norm(target - start[:2])), self.ranges.distance

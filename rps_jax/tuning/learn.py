@@ -16,6 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import xarray as xr
+from jax.stages import Lowered
 from matplotlib.axes import Axes
 
 from rps_jax import engines, errors
@@ -209,15 +210,13 @@ class _Learner:
         update = partial(rollout.update, options, network, envs)
         evaluate = partial(rollout.evaluate_policy, network, validation_envs)
         shapes = jax.eval_shape(start, tables)
-        programs = (
-            (jax.jit(update, donate_argnums=1), tables, shapes),
-            (jax.jit(evaluate), self._validation_tables, shapes.train.ema),
-            (jax.jit(start), tables),
+        lowered = (
+            jax.jit(update, donate_argnums=1).lower(tables, shapes),
+            jax.jit(evaluate).lower(self._validation_tables, shapes.train.ema),
+            jax.jit(start).lower(tables),
         )
         with ThreadPoolExecutor(3) as pool:
-            self._update, self._evaluate, compiled_start = pool.map(
-                lambda program: program[0].lower(*program[1:]).compile(), programs
-            )
+            self._update, self._evaluate, compiled_start = pool.map(Lowered.compile, lowered)
         self.compile = time.perf_counter() - compile_start
         # A copy: no two leaves may share memory, which updates write to.
         self.runner: RunnerState = jax.tree.map(jnp.copy, compiled_start(tables))

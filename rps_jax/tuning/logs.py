@@ -26,7 +26,7 @@ import numpy as np
 import pandas as pd
 import xarray as xr
 
-from rps_jax.errors import InputError
+from rps_jax.errors import InputError, not_allowed
 from rps_jax.geometry import planar
 from rps_jax.record import bag, files
 from rps_jax.robot.shell import Shell
@@ -97,9 +97,8 @@ def read(source: Trace | str | Path, shell: Shell) -> RawLog:
     elif path.suffix == ".csv" and path.is_file():
         log = _from_table(path, name)
     else:
-        raise InputError(
-            f"{name} is not allowed: give a trace, a run folder of rps push, FILE.csv or FILE.mcap."
-        )
+        rule = "give a trace, a run folder of rps push, FILE.csv or FILE.mcap"
+        raise not_allowed("log", path, rule)
     columns = log.columns
     if "signal" in columns:
         check_taxels(columns["signal"], shell, name)
