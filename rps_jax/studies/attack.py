@@ -176,8 +176,7 @@ class Attack(DomainQuestion[xr.Dataset], LawQuestion[xr.Dataset]):
             f"trials of drawn worlds fill {attrs['drawn_failing']}: {rates['drawn']:.2f} per hour. "
             f"The search finds {ratio}at least {rates['times_low']:.1f} times (95 %)."
         )
-        title = f"{self.label}, {name_or_custom(self.domain)}: severest trial of each cell"
-        maps = Picture("archive", partial(archive_figure, results, self.axes, title))
+        maps = Picture("archive", partial(archive_figure, results, self.axes))
         margin = "Severity less 1: above 0 a failure, by this many metres; below 0 a success."
         sections = [Section("Failing cells", text), Section("Margins", margin, (), maps)]
         checked = np.isfinite(results.again.values)
@@ -409,7 +408,7 @@ def yields(results: xr.Dataset) -> dict[str, float]:
 # --- figures -------------------------------------------------------------------------------
 
 
-def archive_figure(results: xr.Dataset, quantities: Sequence[str], title: str) -> Figure:
+def archive_figure(results: xr.Dataset, quantities: Sequence[str]) -> Figure:
     """Draw the margin of failures: a row for each object, a column for each pair of quantities.
 
     A cell shows the severest trial over the third quantity; a dot marks a failure.
@@ -433,5 +432,5 @@ def archive_figure(results: xr.Dataset, quantities: Sequence[str], title: str) -
             ax.set_title(words(name), fontsize=9)
     colours, label = ScalarMappable(norm, "RdBu_r"), "margin: severity - 1 [1; m beyond 0]"
     figure.colorbar(colours, ax=axes, label=label, shrink=0.7)
-    figure.suptitle(title, fontsize=10)
+    figure.suptitle("severest trial of each cell", fontsize=10)
     return figure

@@ -169,11 +169,10 @@ class Hardware(LawQuestion[xr.Dataset]):
         return xr.Dataset(variables, {"object": list(HARDWARE_OBJECTS), "axis": ["x", "y"]})
 
     def intro(self, results: xr.Dataset) -> str:
-        ground, robot = HARDWARE_GROUND, HARDWARE_ROBOT
         return (
             f"{self.label}, skin {name_or_custom(self.skin)}, engine {self.setting.engine}. "
-            f"The paper does not give the friction; all pairs of object-ground {ground} and "
-            f"object-robot {robot} are run."
+            f"The paper does not give the friction; all pairs of object-ground "
+            f"{HARDWARE_GROUND} and object-robot {HARDWARE_ROBOT} are run."
         )
 
     def report(self, results: xr.Dataset, run: Run) -> Sequence[Section]:

@@ -237,10 +237,10 @@ class Rare(DomainQuestion[xr.Dataset], LawQuestion[xr.Dataset]):
         )
 
     def intro(self, results: xr.Dataset) -> str:
-        event = "a failure is a trial that does not reach its target."
+        event = "does not reach its target"
         if self.beyond:
-            event = f"a failure misses the target by more than {self.beyond:g} m."
-        return f"{self.label} in the domain {name_or_custom(self.domain)}: {event}"
+            event = f"misses the target by more than {self.beyond:g} m"
+        return f"{self.label} in the domain {name_or_custom(self.domain)}: a failure {event}."
 
     def report(self, results: xr.Dataset, run: Run) -> Sequence[Section]:
         text = (

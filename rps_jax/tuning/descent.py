@@ -176,9 +176,8 @@ class TuneGrad(Tuning):
     def rule(self) -> optax.GradientTransformation:
         """Update rule of optax: clipped gradients, the optimiser, and a decaying learning rate."""
         rate = optax.cosine_decay_schedule(self.learning_rate, self.steps)
-        return optax.chain(
-            optax.clip_by_global_norm(self.clip), getattr(optax, self.optimiser)(rate)
-        )
+        optimiser = getattr(optax, self.optimiser)(rate)
+        return optax.chain(optax.clip_by_global_norm(self.clip), optimiser)
 
 
 tune_grad = call_of(TuneGrad)
@@ -229,9 +228,8 @@ def window_scores(options: TuneGrad, stage: Stage) -> gradients.Scores:
     def cost(snapshots: Snapshot) -> jax.Array:
         return soft_score(snapshots, space.base, setting, options.objective, options.arrive)
 
-    steps, first = (
-        round(x / setting.physics.control_period) for x in (options.window, options.within)
-    )
+    period = setting.physics.control_period
+    steps, first = round(options.window / period), round(options.within / period)
     score = gradients.window(stage, space.params, cost, loop, max(1, steps))
 
     def run_to_start(thetas: jax.Array, worlds: World, start: jax.Array) -> Trial:

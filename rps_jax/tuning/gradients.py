@@ -54,9 +54,8 @@ def estimate(samples: jax.Array, clip: float = jnp.inf) -> Estimate:
     mean = jnp.sum(samples, axis=0) / jnp.maximum(count, 1)
     squares = jnp.sum(jnp.where(is_finite, (samples - mean) ** 2, 0.0), axis=0)
     variance = squares / jnp.maximum(count - 1, 1) / jnp.maximum(count, 1)
-    return Estimate(
-        mean, jnp.where(count > 1, variance, jnp.inf), jnp.mean(is_finite, axis=0, dtype=mean.dtype)
-    )
+    finite = jnp.mean(is_finite, axis=0, dtype=mean.dtype)
+    return Estimate(mean, jnp.where(count > 1, variance, jnp.inf), finite)
 
 
 def reverse(scores: Scores, theta: jax.Array, worlds: Any, *, clip: float = jnp.inf) -> Estimate:

@@ -156,9 +156,8 @@ class Learn(PPO, SimulationQuestion[xr.Dataset]):
         ]
 
     def progress_bar(self) -> Bar:
-        if self.updates:
-            return Bar(self.name, self.updates, "updates", shown=self.shows_progress)
-        return Bar(self.name, 60 * self.minutes, "clock", shown=self.shows_progress)
+        limit = (self.updates, "updates") if self.updates else (60 * self.minutes, "clock")
+        return Bar(self.name, *limit, shown=self.shows_progress)
 
     def answer(self, run: Run) -> xr.Dataset:
         assert run.folder is not None

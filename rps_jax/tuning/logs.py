@@ -136,9 +136,8 @@ def _from_table(path: Path, name: str) -> RawLog:
             path, dtype=float, index_col=False, skipinitialspace=True, encoding_errors="replace"
         )
     except ValueError as error:
-        raise InputError(
-            f"{name} is not allowed ({error}): write a header, and numbers in every cell."
-        ) from error
+        rule = f"write a header, and numbers in every cell ({error})"
+        raise not_allowed("log", path, rule) from error
     table.columns = table.columns.str.strip()
     taxels = sorted(map(str, table.filter(regex=r"^taxel_\d+$")), key=lambda title: int(title[6:]))
     needed = [k for k in COLUMNS if k not in OPTIONAL and not (taxels and k in _TOUCH)]

@@ -61,9 +61,7 @@ def network_of(ppo: PPO, envs: Sequence[PushEnv]) -> Network:
     """Return the network for these environments; their skins must have equally many taxels."""
     counts = {env.observation_size - 2 for env in envs}
     if len(counts) > 1:
-        raise errors.InputError(
-            f"domains with skins of {sorted(counts)} taxels are not allowed: learn in one domain."
-        )
+        raise errors.not_allowed("taxels of the domains", sorted(counts), "learn in one domain")
     return Network(ppo.network, ppo.width, counts.pop(), ppo.hold).check()
 
 
