@@ -128,8 +128,7 @@ class Attack(DomainQuestion[xr.Dataset], LawQuestion[xr.Dataset]):
         search = _Search(probe, self, seed_of(self.setting.seed, "tune"))
         results = search.run(start_time + _SEARCH_UNTIL * total)
         results = self._check_elites(results, run, start_time + _CHECK_UNTIL * total)
-        if run.folder is not None:
-            self._store_worst(results, run)
+        self._store_worst(results, run)
         return results
 
     def _check_elites(self, results: xr.Dataset, run: Run, deadline: float) -> xr.Dataset:
@@ -152,12 +151,11 @@ class Attack(DomainQuestion[xr.Dataset], LawQuestion[xr.Dataset]):
         return results.assign(again=("elite", failed, {"units": "1"}))
 
     def _store_worst(self, results: xr.Dataset, run: Run) -> None:
-        """Store the worst elites as a sweep in the subfolder `worlds`."""
-        if results.sizes["elite"]:
+        """Store the worst elites as a sweep in the subfolder `worlds` of a run folder."""
+        if run.folder is not None and results.sizes["elite"]:
             set_phase(run.callback, "worst worlds")
             at = points.check_points(self.ranges, results.u.values[: self.worst])
             plan = Plan(self.ranges, len(at.u), {self.label: self.params}, self.setting, points=at)
-            assert run.folder is not None
             execution.run_plan(plan, run.folder / "worlds", **run.batch_options)
 
     def intro(self, results: xr.Dataset) -> str:

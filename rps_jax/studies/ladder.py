@@ -222,9 +222,8 @@ class Score(Ladder, _ScoredLaw):
     @cached_property
     def chosen(self) -> dict[str, LawParams]:
         label, params = registry.resolve_law(self.law)
-        reference = registry.resolve_laws(self.laws)
-        reference.pop(label, None)
-        return {label: registry.check_params(params)} | reference
+        scored = {label: registry.check_params(params)}
+        return scored | registry.resolve_laws(self.laws) | scored
 
     def sections(self, sweep: Sweep, results: xr.Dataset, run: Run) -> Sequence[Section]:
         sections = super().sections(sweep, results, run)

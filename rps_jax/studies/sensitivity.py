@@ -95,23 +95,17 @@ class Sensitivity(PlanQuestion, DomainQuestion[xr.Dataset], LawQuestion[xr.Datas
         return 2 ** int(np.log2(self.worlds / (count + 2)))
 
     @property
-    def design_seed(self) -> int:
-        """Seed of the design; the intervals use the next one."""
-        return seed_of(self.setting.seed, "tune")
-
-    @property
     def problem(self) -> dict[str, object]:
         """Problem in the format of SALib."""
-        names = list(points.names(self.ranges))
+        names, groups = list(points.names(self.ranges)), list(self.groups)
         bounds = [[0.0, 1.0]] * len(names)
-        return {
-            "num_vars": len(names), "names": names, "bounds": bounds, "groups": list(self.groups)
-        }  # fmt: skip
+        return {"num_vars": len(names), "names": names, "bounds": bounds, "groups": groups}
 
     def u(self) -> np.ndarray:
         """Return the points (worlds, q) of the design, block by block of one base point."""
         sample = errors.require("SALib.sample.sobol", "failures").sample
-        values = sample(self.problem, self.base, calc_second_order=False, seed=self.design_seed)
+        seed = seed_of(self.setting.seed, "tune")
+        values = sample(self.problem, self.base, calc_second_order=False, seed=seed)
         return np.clip(values, 0, np.nextafter(1, 0))
 
     @functools.cached_property
@@ -162,7 +156,8 @@ def analyze(options: Sensitivity, sweep: xr.Dataset) -> xr.Dataset:
         "time": trials.time.values.astype(float),
         "left": statistics.distance_left(trials),
     }
-    settings = {"calc_second_order": False, "num_resamples": 200, "seed": options.design_seed + 1}
+    seed = seed_of(options.setting.seed, "tune") + 1  # the design has the previous one
+    settings = {"calc_second_order": False, "num_resamples": 200, "seed": seed}
     constant = dict.fromkeys(_INDICES.values(), np.zeros(len(options.factors)))
     indices = [
         compute(options.problem, y, **settings) if np.ptp(y) > 0 else constant
@@ -212,10 +207,9 @@ def count_failing_points(results: xr.Dataset) -> int:
 def reliability(results: xr.Dataset) -> str:
     """Say in a sentence whether there are enough failures for reliable indices."""
     count = count_failing_points(results)
-    text = f"Trials fail at {count} of {results.attrs['base']} base points"
-    if count < MIN_FAILING_POINTS:
-        return f"{text}, too few for reliable indices of success: run more worlds."
-    return f"{text}."
+    few = ", too few for reliable indices of success: run more worlds"
+    end = few if count < MIN_FAILING_POINTS else ""
+    return f"Trials fail at {count} of {results.attrs['base']} base points{end}."
 
 
 # --- figures -------------------------------------------------------------------------------
