@@ -68,7 +68,8 @@ class Regress(PlanQuestion, MultiLawQuestion[xr.Dataset]):
 
     def answer(self, run: Run) -> xr.Dataset:
         results = super().answer(run)
-        known = worlds()[["success", "severity"]].isel(world=slice(results.sizes["world"]))
+        known = worlds()[["success", "severity"]].reset_coords(drop=True)
+        known = known.isel(world=slice(results.sizes["world"]))
         return results.merge(known.rename({name: f"known_{name}" for name in known}))
 
     def intro(self, results: xr.Dataset) -> str:
