@@ -201,8 +201,7 @@ def soft_score(
     arrival = contact * jax.nn.sigmoid((params.d_success - distance) / arrive)
     under_way = jnp.cumprod(1 - arrival)
     touched = jax.lax.cummax(contact)
-    time_left = under_way[-1] * distance[-1] / params.v_max
-    time = period * jnp.sum(under_way) + time_left
+    time = period * jnp.sum(under_way) + under_way[-1] * distance[-1] / params.v_max
     lost = period * jnp.sum(under_way * touched * (1 - contact))
     return jnp.asarray(objective.score(1.0, time, lost, 0.0, setting.rules))
 
