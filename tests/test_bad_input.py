@@ -45,6 +45,7 @@ DOMAIN_FILES = {
     "words": ({"mass": ["three", "four"]}, NO_RANGE),
     "vast": ({"mass": [3, 10**400]}, NO_RANGE),
     "four": ({"mass": [3, 60, True, 1]}, NO_RANGE),
+    "keys": ({"objects": {"random_box": 1}}, "names, as .*random_box"),
     "twice": ({"objects": ["random_box"] * 2}, "objects = .* is not allowed: name each once"),
 }
 PARAMS_FILES = {"L": {"L": -1}, "L_word": {"L": "x"}, "good": {"L": 0.3}}

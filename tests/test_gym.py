@@ -12,7 +12,9 @@ from gymnasium.vector import AutoresetMode
 from helpers import NEAR, refusals, row, same
 
 from rps_jax.errors import InputError
+from rps_jax.runs import question
 from rps_jax.trials import gym
+from rps_jax.trials.progress import no_progress
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import Rules
 
@@ -165,6 +167,13 @@ def test_without_gymnasium_the_error_names_the_package(monkeypatch):
     monkeypatch.delitem(sys.modules, "rps_jax.trials.gym")
     with pytest.raises(InputError, match=r"run pip install 'rps_jax\[gym\]'"):
         importlib.import_module("rps_jax.trials.gym")
+
+
+def test_previous_names_of_questions_and_runs_warn():
+    with pytest.warns(DeprecationWarning, match="OfLaw is now LawQuestion"):
+        assert question.OfLaw is question.LawQuestion
+    with pytest.warns(DeprecationWarning, match=r"Run\.report is now Run\.callback"):
+        assert question.Run(None, no_progress).report is no_progress
 
 
 def test_the_previous_module_name_warns_and_has_the_same_classes(monkeypatch):

@@ -20,6 +20,7 @@ import contextlib
 import dataclasses
 import functools
 import re
+import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from operator import attrgetter
@@ -52,8 +53,23 @@ P = ParamSpec("P")
 D = TypeVar("D", bound="DataclassInstance")
 T = TypeVar("T", covariant=True)
 Split = Literal["tune", "validate", "test"]
+_OLD_NAMES = {
+    "OfLaw": "LawQuestion",
+    "OfLaws": "MultiLawQuestion",
+    "InDomain": "DomainQuestion",
+    "Pushes": "SimulationQuestion",
+}
 # Options that say how a run is executed; results do not depend on them.
 _EXECUTION_OPTIONS = ("out", "bag", "slots", "workers", "quick", "progress", "report_to")
+
+
+def __getattr__(name: str) -> Any:
+    """Return a class by its name in version 0.3, with a warning."""
+    if name not in _OLD_NAMES:
+        raise AttributeError(f"module '{__name__}' has no attribute '{name}'")
+    new = _OLD_NAMES[name]
+    warnings.warn(f"{name} is now {new}", DeprecationWarning, stacklevel=2)
+    return globals()[new]
 
 
 def seed_of(seed: int, split: Split) -> int:

@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import itertools
+import warnings
 from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import xarray as xr
 
 from rps_jax.record.checkpoint import Checkpoints
 from rps_jax.trials.batch import BatchOptions
 from rps_jax.trials.progress import ProgressCallback
+
+_OLD_NAMES = {"part": "checkpoint", "parts": "checkpoints", "report": "callback"}
 
 
 class Run(NamedTuple):
@@ -69,3 +72,11 @@ class Run(NamedTuple):
     def batch_options(self) -> BatchOptions:
         """Slots, workers and callback, as keyword arguments of functions that run trials."""
         return BatchOptions(slots=self.slots, workers=self.workers, callback=self.callback)
+
+    def __getattr__(self, name: str) -> Any:
+        """Return an attribute by its name in version 0.3, with a warning."""
+        if name not in _OLD_NAMES:
+            raise AttributeError(f"'Run' object has no attribute '{name}'")
+        new = _OLD_NAMES[name]
+        warnings.warn(f"Run.{name} is now Run.{new}", DeprecationWarning, stacklevel=2)
+        return getattr(self, new)

@@ -19,6 +19,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 
 from rps_jax import engines, errors
@@ -28,6 +29,7 @@ from rps_jax.control.laws.rps import RPSParams
 from rps_jax.control.learned import features
 from rps_jax.control.observation import TaxelObservation, Twist
 from rps_jax.engines.base import ControlPeriod, Driven, Motion, Stage
+from rps_jax.engines.mjx_colliders import mjx
 from rps_jax.geometry import footprint as fp
 from rps_jax.geometry import planar
 from rps_jax.robot.robot import Robot
@@ -36,7 +38,7 @@ from rps_jax.trials.batch import WorldBatch, rows
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import ControlLoop, Measurement, Trial, World
 from rps_jax.trials.worlds import drawn_scene, drawn_worlds
-from rps_jax.world import domain, draws, video
+from rps_jax.world import domain, draws, objects, video
 from rps_jax.world.domain import DOMAINS, Domain
 from rps_jax.world.draws import Draw
 from rps_jax.world.scene import Scene
@@ -240,6 +242,22 @@ class PushEnv:
     def unwrapped(self) -> PushEnv:
         """This environment."""
         return self
+
+    @property
+    def xml_path(self) -> str:
+        """Path of the MJCF file of the object, or of the family of a random one."""
+        known = self.object in objects.OBJECTS
+        return str(objects.path_of(self.object if known else self._alone.family_of(0)))
+
+    @property
+    def mj_model(self) -> mujoco.MjModel:
+        """Model of world 0, with its visual geoms."""
+        return self._scene(0).model
+
+    @property
+    def mjx_model(self) -> mjx.Model:
+        """Collision model of world 0, which the engine `mjx` steps."""
+        return mjx.put_model(self._scene(0).physics)
 
     @functools.cached_property
     def _alone(self) -> Domain:

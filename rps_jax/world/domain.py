@@ -327,10 +327,17 @@ def _range(default: Range | None, values: Any) -> Range:
     return Range(float(low), float(high), log)
 
 
+def _names(values: object) -> tuple[str, ...]:
+    names = [values] if isinstance(values, str) else values
+    if not isinstance(names, list | tuple):
+        raise TypeError("no names")
+    return tuple(map(str, names))
+
+
 # Readers of the JSON of fields that are no ranges, and their formats for the error.
 _FORMS: dict[str, tuple[Callable[[Any], Any], str]] = {
     "objects": (
-        lambda names: (names,) if isinstance(names, str) else tuple(map(str, names)),
+        _names,
         'names, as ["random_box"]',
     ),
     "frictions": (
