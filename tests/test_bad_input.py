@@ -76,7 +76,7 @@ SHARED = {
     "sweep, tune es, ladder: --domain narrow": "unknown domain 'narrow': choose from paper, .*",
     "table, sweep: --laws": r"laws = \[\] is not allowed: name each once, at least one",
     "table, sweep: --laws rps rps": "laws = .* is not allowed: name each once",
-    "ladder --laws, tune es --law: force_push_published --engine quasistatic": "computes no contact force",
+    "ladder --laws, tune es --law: force_push_published --engine quasistatic": "no contact force",
     "sweep, ladder: --laws hello.npz": "give a file that `rps learn` wrote",
     "sweep, ladder: --laws none.npz": r"cannot be read \(No such file or directory\)",
     "sweep, ladder: --laws rps,lost.json": "lost.json cannot be read",
