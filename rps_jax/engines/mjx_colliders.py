@@ -101,8 +101,8 @@ def upright(model: Model, data: Data, base: int, prism: int, corners: jax.Array)
     )
     state: Any = SimpleNamespace(base=middle, p=data.xpos[body])
     m: Any = [tuple(row) for row in data.xmat[body]]
-    found: Any = meetings(solid, state, m, (turn[0], turn[1]))
-    z, normal, point, distance = found
+    contacts: Any = meetings(solid, state, m, (turn[0], turn[1]))
+    z, normal, point, distance = contacts
     back = jnp.array([[turn[0], turn[1]], [-turn[1], turn[0]]])
     n = jnp.stack(normal) @ back
     position = middle[:2] + jnp.stack(point, axis=-1) @ back

@@ -114,7 +114,7 @@ def _reach(address: str) -> None:
 
 
 def _last_line(error: BaseException) -> str:
-    """Return the last line of a message, which says what is wrong, without its full stop."""
+    """Return the last line of a message, which names the fault, without its full stop."""
     return (str(error).strip().splitlines() or [type(error).__name__])[-1].rstrip(".")
 
 

@@ -82,9 +82,9 @@ def run_plan(
         rollout([results], plan.setting, results.collect, **options)
         return with_coordinates(results.dataset())
     open_run(folder, plan)
-    with run_folder.lock(folder, shard.number, shard.of):
+    with run_folder.lock(folder, shard.index, shard.count):
         results = execute(folder, plan, shard=shard, **options) or Results(plan)
-        if shard.of > 1:
+        if shard.count > 1:
             return _shard_dataset(results, folder, shard)
         return write_dataset(results, [folder], folder)
 

@@ -22,7 +22,7 @@ from rps_jax.world.physics import MUJOCO_GROUND, preset
 _HALVED = replace(preset(), timestep=0.005)
 # Short steps for MuJoCo's default ground, on which sliding objects hop.
 _FINE = replace(preset(), timestep=0.002, **MUJOCO_GROUND)
-OWN = "as asked"  # label of the model that the sweep itself has
+REQUESTED = "as asked"  # label of the model that the sweep itself has
 
 MODELS = {
     "this ground, 10 ms": preset(),
@@ -38,7 +38,7 @@ ENGINES: dict[str, EngineName] = {"quasi-static": "quasistatic"}  # the rest: th
 
 def model_plans(plan: Plan) -> dict[str, Plan]:
     """Return a plan on every model that can step its worlds, its own model first."""
-    plans = {OWN: plan}
+    plans = {REQUESTED: plan}
     for name, physics in MODELS.items():
         engine = ENGINES.get(name, plan.setting.engine)
         with contextlib.suppress(InputError):  # the engine lacks such worlds, laws or physics
@@ -55,11 +55,11 @@ def add_models(results: xr.Dataset, plan: Plan, run: Run) -> xr.Dataset:
 
     The run on another model has its own folder in `models`. `models.nc` has all outcomes.
     """
-    by_model, progress = {OWN: results}, SequentialProgress(run.callback)
+    by_model, progress = {REQUESTED: results}, SequentialProgress(run.callback)
     options = run._replace(callback=progress).batch_options
     progress.finish(plan.num_trials)
     for name, model_plan in model_plans(plan).items():
-        if name != OWN:
+        if name != REQUESTED:
             safe = "".join(letter if letter.isalnum() else "_" for letter in name)
             folder = run.folder and run.folder / "models" / safe
             by_model[name] = run_plan(model_plan, folder, **options)

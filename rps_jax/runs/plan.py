@@ -116,10 +116,10 @@ class Plan:
 
 @dataclass(frozen=True)
 class Shard:
-    """One of `of` equal shares of a plan, to be run separately and merged."""
+    """Share of a plan: one of `count` equal shares, to be run separately and merged."""
 
-    number: int = 1  # from 1 to `of`
-    of: int = 1
+    index: int = 1  # from 1 to `count`
+    count: int = 1
 
     @classmethod
     def parse(cls, text: str) -> Shard:
@@ -130,20 +130,20 @@ class Shard:
         return cls(int(match[1]), int(match[2]))
 
     def __post_init__(self) -> None:
-        errors.check_count("shard", self.of, at_most=1_000_000)
-        errors.check_count("shard", self.number, at_most=self.of)
+        errors.check_count("shard", self.count, at_most=1_000_000)
+        errors.check_count("shard", self.index, at_most=self.count)
 
 
 def shard_chunks(plan: Plan, shard: Shard) -> dict[int, np.ndarray]:
-    """Return the chunks of one shard, every `of`-th: indices of their trials, by their numbers."""
-    return dict(itertools.islice(plan.chunks.items(), shard.number - 1, None, shard.of))
+    """Return the chunks of one shard, every `count`-th: indices of their trials, by chunk."""
+    return dict(itertools.islice(plan.chunks.items(), shard.index - 1, None, shard.count))
 
 
-def chunks_by_key(plan: Plan, numbers: Iterable[int]) -> dict[ProgramKey, list[int]]:
+def chunks_by_key(plan: Plan, chunks: Iterable[int]) -> dict[ProgramKey, list[int]]:
     """Return chunks by the program that runs them."""
     groups: dict[ProgramKey, list[int]] = {}
-    for number in numbers:
-        groups.setdefault(plan.program_key(number), []).append(number)
+    for chunk in chunks:
+        groups.setdefault(plan.program_key(chunk), []).append(chunk)
     return groups
 
 

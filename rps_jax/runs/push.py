@@ -50,7 +50,7 @@ FILM_LENGTH = 10.0  # [s] default, whatever the length of the trial
 
 @dataclass(frozen=True, repr=False)
 class Trace:
-    """One recorded trial, with its scene and its figures."""
+    """Recorded trial, with its scene and its figures."""
 
     trajectory: Trajectory  # arrays over time, (T, ...)
     scene: Scene

@@ -181,7 +181,7 @@ class Sweep(SweepOptions, SweepQuestion):
         return Shard.parse(self.shard)
 
     def check(self) -> None:
-        sharded = self.parsed_shard.of > 1
+        sharded = self.parsed_shard.count > 1
         if self.points is not None and self.worlds is not None:
             raise InputError("worlds is not allowed with points: there is one world at each point.")
         if self.table is not None:
@@ -260,10 +260,10 @@ class Merge(Question[xr.Dataset]):
         out = run_folder.ensure_writable(Path(str(self.out)))
         manifest = run_folder.read_manifest(first)
         for folder in rest:
-            if (other := run_folder.read_manifest(folder)) != manifest:
+            if (shard := run_folder.read_manifest(folder)) != manifest:
                 raise InputError(
                     f"run = {folder} has another plan than {first} "
-                    f"({run_folder.describe_difference(manifest, other)}): merge shards of one run."
+                    f"({run_folder.describe_difference(manifest, shard)}): merge shards of one run."
                 )
         merged = write_dataset(Results(self.plan), folders, open_run(out, self.plan))
         for folder in folders:

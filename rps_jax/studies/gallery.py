@@ -164,8 +164,8 @@ def maps_figure(traces: Mapping[int, xr.Dataset], title: str) -> Figure:
     for ax, (world, trace) in zip(axes.ravel(), traces.items(), strict=False):
         _draw_map(ax, trace)
         distance = float(trace.outcome_min_distance)
-        left = f"{distance:.2f} m left" if np.isfinite(distance) else "untouched"
-        ax.set_title(f"world {world}, {left}", fontsize=7)
+        miss = f"{distance:.2f} m left" if np.isfinite(distance) else "untouched"
+        ax.set_title(f"world {world}, {miss}", fontsize=7)
     handles, names = axes[0, 0].get_legend_handles_labels()
     figure.legend(handles, names, fontsize=8, loc="outside lower center", ncols=len(names))
     figure.suptitle(title, fontsize=10)

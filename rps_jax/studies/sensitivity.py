@@ -207,8 +207,8 @@ def count_failing_points(results: xr.Dataset) -> int:
 def reliability(results: xr.Dataset) -> str:
     """Say in a sentence whether there are enough failures for reliable indices."""
     count = count_failing_points(results)
-    few = ", too few for reliable indices of success: run more worlds"
-    end = few if count < MIN_FAILING_POINTS else ""
+    warning = ", too few for reliable indices of success: run more worlds"
+    end = warning if count < MIN_FAILING_POINTS else ""
     return f"Trials fail at {count} of {results.attrs['base']} base points{end}."
 
 

@@ -131,10 +131,10 @@ def run(
       jobs: trials by the program that steps them.
       setting: engine, physics and rules.
       slots: worlds that one worker steps at once on each device; by default as suits the engine.
-      workers: host threads that each step slots of their own, or the threads of an engine that JAX
+      workers: host threads, each with its slots, or the threads of an engine that JAX
         does not trace; by default as suits the engine.
       collect: called with trials that ended, in any order, by one thread at a time.
-      callback: called with the progress after every segment, likewise.
+      callback: called with the progress after every segment, by one thread at a time.
 
     Returns:
       The times of compilation and run, and the simulated time.
@@ -387,11 +387,11 @@ def _compile_advance(
         current = tuple(map(_select, fresh, started, trials))
         steps = max(1, round(SEGMENT / physics.control_period))
         loop = ControlLoop(physics, rules, law)
-        after = trial.advance(stages, worlds, params, current, loop, steps)
+        advanced = trial.advance(stages, worlds, params, current, loop, steps)
         # Outcomes are in the same program: another one would wait for other workers' segments.
-        return after, tuple(
+        return advanced, tuple(
             _Segment(b.steps - a.steps, b.done, trial.outcome(b, physics.control_period))
-            for a, b in zip(current, after, strict=True)
+            for a, b in zip(current, advanced, strict=True)
         )
 
     if sharding is not None:  # each device runs its own worlds and waits for no other
@@ -516,8 +516,8 @@ def _run(program: _Program, max_suspended: int, monitor: _Monitor) -> None:
 
         while not monitor.stop and sum(slots.live.sum() for slots in queues) > max_suspended:
             arguments = zip(*(slots.arguments() for slots in queues), strict=True)
-            after, segments = advance(stages, *arguments, rules)
-            for slots, trials in zip(queues, after, strict=True):
+            advanced, segments = advance(stages, *arguments, rules)
+            for slots, trials in zip(queues, advanced, strict=True):
                 slots.trials = trials
             # Where no trial waits for a slot, a GPU runs the next segment while the host reads.
             overlap = _max_suspended() and all(queue.is_empty for queue in program.queues)

@@ -42,7 +42,7 @@ class TrialOptions:
 
 @dataclass(frozen=True)
 class Case(TrialOptions):
-    """One trial to run: everything that may differ between worlds.
+    """Trial to run: everything that may differ between worlds.
 
     Raises:
       InputError: a name or value is not valid.

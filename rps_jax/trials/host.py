@@ -29,7 +29,7 @@ def run(
     Args:
       models: of the worlds, the stage of the engine.
       worlds: with leaves (n, ...).
-      params: law parameters, likewise.
+      params: law parameters, with leaves (n, ...).
       loop: physics, rules and law.
       threads: number of threads of the engine.
     """

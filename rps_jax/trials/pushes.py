@@ -33,7 +33,7 @@ from rps_jax.world.scene import JOINTS, Friction, Scene
 
 @dataclass(frozen=True)
 class Trajectory:
-    """One trial over time: snapshots at equal intervals, arrays (T, ...)."""
+    """Trial over time: snapshots at equal intervals, arrays (T, ...)."""
 
     snapshots: Snapshot
     outcome: Outcome  # without a leading axis
@@ -254,8 +254,8 @@ def recorder(
     def record(*arguments: Any) -> tuple[Trial, Snapshot, Outcome]:
         *state, rules = arguments
         loop = ControlLoop(physics, rules, law)
-        after, snapshots = trial.record(*state, loop, steps=steps, stride=stride)
-        return after, snapshots, trial.outcome(after, physics.control_period)
+        last, snapshots = trial.record(*state, loop, steps=steps, stride=stride)
+        return last, snapshots, trial.outcome(last, physics.control_period)
 
     fixed = worlds.stage, *worlds.inputs
     arguments = *fixed, trials, setting.rules

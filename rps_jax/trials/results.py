@@ -72,7 +72,7 @@ def variable(name: str, dims: Sequence[str], values: np.ndarray) -> xr.Variable:
 
 
 def _plain(values: ArrayLike) -> np.ndarray:
-    """Return an array that NetCDF can hold, which has no booleans."""
+    """Return an array for NetCDF, in which booleans are integers."""
     values = np.asarray(values)
     return values.astype(np.int8) if values.dtype == bool else values
 

@@ -39,7 +39,7 @@ class Moment(NamedTuple):
 
 
 class Live:
-    """One world that is stepped a control period at a time.
+    """World that is stepped a control period at a time.
 
     Changes take effect with the next step. A trial that has succeeded continues when its target
     moves or its object is shoved; one that has failed or diverged does not.
@@ -153,15 +153,15 @@ def _steps(
     """
 
     def step(trials: Trial) -> tuple[Trial, tuple[Trial, Snapshot, jax.Array, jax.Array]]:
-        after, snapshot = trial.control_step(stage, worlds, params, trials, loop)
+        stepped, snapshot = trial.control_step(stage, worlds, params, trials, loop)
         outlines = jax.vmap(trial.outline)(worlds, snapshot.qpos)
         compression = jax.vmap(_compression)(worlds.skin, outlines)
         contact = trial.p_world_contact(snapshot)
-        return after, rows((trials, snapshot, contact, compression), 0)
+        return stepped, rows((trials, snapshot, contact, compression), 0)
 
     def body(i: jax.Array, carry: tuple[Trial, Any]) -> tuple[Trial, Any]:
-        after, record = step(carry[0])
-        return after, jax.tree.map(lambda values, x: values.at[i].set(x), carry[1], record)
+        stepped, record = step(carry[0])
+        return stepped, jax.tree.map(lambda values, x: values.at[i].set(x), carry[1], record)
 
     shapes = jax.eval_shape(step, trials)[1]
     blank = jax.tree.map(lambda x: jnp.zeros((CHUNK, *x.shape), x.dtype), shapes)

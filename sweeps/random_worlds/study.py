@@ -83,7 +83,7 @@ class RandomWorlds(TrialStudy[xr.Dataset]):
         """Return the plan of each model in a domain, the default model first."""
         laws = registry.resolve_laws(self.laws)
         plan = Plan(domains.parse_domain(name), self.worlds, laws, self.setting, 4096)
-        plans = {model_panel.OWN: plan}
+        plans = {model_panel.REQUESTED: plan}
         if self.panel:
             small = replace(plan, worlds=min(self.panel, self.worlds))
             plans = model_panel.model_plans(small) | plans
@@ -101,7 +101,7 @@ class RandomWorlds(TrialStudy[xr.Dataset]):
         )
         has_panel = results.sizes["model"] > 1
         tables = []
-        if model_panel.OWN in results.model:
+        if model_panel.REQUESTED in results.model:
             over = (
                 " Over the models: least and greatest rate of a panel of grounds, friction cones, "
                 "time steps and engines, each in the first of these worlds."
@@ -150,12 +150,12 @@ def _domains_and_laws(results: xr.Dataset) -> Iterator[tuple[str, str]]:
 
 def _rate_row(results: xr.Dataset, domain: str, law: str) -> dict[str, str]:
     by_model = rates(results, domain, law)
-    default = results.sel(domain=domain, law=law, model=model_panel.OWN)
+    default = results.sel(domain=domain, law=law, model=model_panel.REQUESTED)
     median = float(default.time.where(default.success == 1).median())
     return {
         "domain": domain,
         "law": law,
-        "success": tables.share(*by_model[model_panel.OWN]),
+        "success": tables.share(*by_model[model_panel.REQUESTED]),
         "over the models": _rate_range(by_model) if len(by_model) > 1 else "",
         "in C MuJoCo": tables.share(*by_model[IN_C]) if IN_C in by_model else "",
         "median time of a success": f"{median:.1f} s" if np.isfinite(median) else "-",
