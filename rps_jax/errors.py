@@ -7,7 +7,8 @@ import importlib
 import math
 import numbers
 import re
-from collections.abc import Iterable, Sequence
+import warnings
+from collections.abc import Iterable, Mapping, Sequence
 from types import ModuleType
 from typing import Any
 
@@ -105,6 +106,15 @@ def check_name(kind: str, name: str, known: Iterable[str]) -> str:
         return name
     hint = suggest(name, known)
     raise InputError(f"unknown {kind} '{name}': choose from {', '.join(known)}{hint}.")
+
+
+def current_name(owner: str, prefix: str, name: str, old_names: Mapping[str, str]) -> str:
+    """Return the name that replaces an old one, with a warning; AttributeError if there is none."""
+    if name not in old_names:
+        raise AttributeError(f"{owner} has no attribute '{name}'")
+    message = f"{prefix}{name} is now {prefix}{old_names[name]}"
+    warnings.warn(message, DeprecationWarning, stacklevel=3)
+    return old_names[name]
 
 
 def suggest(name: object, known: Sequence[str]) -> str:

@@ -20,7 +20,6 @@ import contextlib
 import dataclasses
 import functools
 import re
-import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from operator import attrgetter
@@ -65,11 +64,7 @@ _EXECUTION_OPTIONS = ("out", "bag", "slots", "workers", "quick", "progress", "re
 
 def __getattr__(name: str) -> Any:
     """Return a class by its name in version 0.3, with a warning."""
-    if name not in _OLD_NAMES:
-        raise AttributeError(f"module '{__name__}' has no attribute '{name}'")
-    new = _OLD_NAMES[name]
-    warnings.warn(f"{name} is now {new}", DeprecationWarning, stacklevel=2)
-    return globals()[new]
+    return globals()[errors.current_name(f"module '{__name__}'", "", name, _OLD_NAMES)]
 
 
 def seed_of(seed: int, split: Split) -> int:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import warnings
 from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
@@ -11,6 +10,7 @@ from typing import Any, NamedTuple
 
 import xarray as xr
 
+from rps_jax import errors
 from rps_jax.record.checkpoint import Checkpoints
 from rps_jax.trials.batch import BatchOptions
 from rps_jax.trials.progress import ProgressCallback
@@ -75,8 +75,4 @@ class Run(NamedTuple):
 
     def __getattr__(self, name: str) -> Any:
         """Return an attribute by its name in version 0.3, with a warning."""
-        if name not in _OLD_NAMES:
-            raise AttributeError(f"'Run' object has no attribute '{name}'")
-        new = _OLD_NAMES[name]
-        warnings.warn(f"Run.{name} is now Run.{new}", DeprecationWarning, stacklevel=2)
-        return getattr(self, new)
+        return getattr(self, errors.current_name("'Run' object", "Run.", name, _OLD_NAMES))
