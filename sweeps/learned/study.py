@@ -1,6 +1,6 @@
 """Published table and learning curves of runs of `rps learn`.
 
-    rps sweeps/learned runs/mlp runs/gru --device "one H200"
+    rps sweeps/learned runs/mlp runs/gru --machine "one H200"
 
 writes `results/learned.json` of this folder, one row for each run, which
 `sweeps/render_tables.py` shows on its page.
@@ -40,57 +40,42 @@ COLUMNS = (
     {"name": "success in validation", "format": "{:.1f} %", "rest": " [{:.1f}, {:.1f}] of {:,}"},
     {"name": "time of a success", "format": "{:.0f} s"},
 )
+_NOTE = (
+    "Validation: worlds of the domain that no update has met, by the rules of the paper, "
+    "without noise in the actions; of each run the law that did best there, which "
+    "flatters it. The interval is Wilson's."
+)
 
 
 @dataclass(frozen=True)
 class Learned(Study[list[list[Any]]]):
-    """Publish runs of `rps learn`: a table with one row per run, and their learning curves.
+    """Compare runs of `rps learn`: a table with one row per run, and their learning curves.
 
     The results are the rows.
     """
 
     TITLE: ClassVar[str] = "A law learned from touch"
-    IGNORED_FIELDS: ClassVar[tuple[str, ...]] = ("device",)
 
     runs: tuple[str, ...] = option((), positional=True)
     """Run folders of `rps learn`."""
-    device: tuple[str, ...] = ("this machine",)
-    """Devices of the runs, in words: one for all, or one for each."""
-
-    @property
-    def devices(self) -> tuple[str, ...]:
-        """Device of each run."""
-        return self.device * (len(self.runs) if len(self.device) == 1 else 1)
 
     def check(self) -> None:
-        """Check that there are runs, and a device for each of them."""
+        """Check that there are runs, each once."""
         errors.check_each_once("runs", self.runs)
-        if len(self.devices) != len(self.runs):
-            rule = "give one for all runs, or one for each"
-            raise errors.not_allowed("device", self.device, rule)
 
     def answer(self, run: Run) -> list[list[Any]]:
-        """Collect the rows, and publish them."""
-        folders = [Path(folder) for folder in self.runs]
-        rows = [row(folder, device) for folder, device in zip(folders, self.devices, strict=True)]
-        note = (
-            "Validation: worlds of the domain that no update has met, by the rules of the paper, "
-            "without noise in the actions; of each run the law that did best there, which "
-            "flatters it. The interval is Wilson's."
-        )
-        runs = [provenance.read_environment(folder) for folder in folders]
-        device = "; ".join(dict.fromkeys(self.devices))
-        path = self.folder / self.RESULTS / "learned.json"
-        write_table(path, runs, device, Table(rows, note, COLUMNS))
-        return rows
+        """Collect the rows."""
+        return [row(Path(folder)) for folder in self.runs]
 
-    def intro(self, results: list[list[Any]]) -> str:
-        """Return the location of the rows."""
-        return f"{len(results)} rows of `results/learned.json`; now render the tables."
+    def publish(self, results: list[list[Any]], run_folder: Path) -> None:
+        """Write the data file, with the commands of the runs."""
+        runs = [provenance.read_environment(Path(folder)) for folder in self.runs]
+        path = self.folder / self.RESULTS / "learned.json"
+        write_table(path, runs, self.machine, Table(results, _NOTE, COLUMNS))
 
     def report_tables(self, results: list[list[Any]]) -> Sequence[Table]:
-        """Return the curve of each run."""
-        tables = []
+        """Return the rows, and the curve of each run."""
+        tables = [Table(results, _NOTE, COLUMNS, title="Runs")]
         for folder, (network, *_) in zip(self.runs, results, strict=True):
             draw = partial(learn.figure_of, curve_of(Path(folder)))
             picture = Picture(f"learned_{network.strip('`')}", draw)
@@ -106,9 +91,10 @@ def curve_of(folder: Path) -> xr.Dataset:
     return files.read_dataset(folder / "results.nc")
 
 
-def row(folder: Path, device: str) -> list[Any]:
+def row(folder: Path) -> list[Any]:
     """Return the row of a run, for the law with the best validation."""
     curve, manifest = curve_of(folder), run_folder.read_manifest(folder)
+    environment = provenance.read_environment(folder)
     judged = curve.dropna("update", subset=["validation"])
     rates = judged.validation.values
     best = judged.isel(update=len(rates) - 1 - int(np.argmax(rates[::-1])))
@@ -118,8 +104,8 @@ def row(folder: Path, device: str) -> list[Any]:
     interval = statistics.wilson(round(rate * tried), tried)
     return [
         f"`{manifest['network']}`",
-        provenance.read_environment(folder)["packages"]["rps_jax"],
-        device,
+        environment["packages"]["rps_jax"],
+        f"{environment['device']['kind']}, {environment['processors']} processors",
         ", ".join(dict.fromkeys(objects)),
         manifest["num_envs"] * len(objects),
         curve.sizes["update"],
