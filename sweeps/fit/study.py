@@ -105,7 +105,7 @@ class Coverage(FitStudy):
     )
     """Ranges from which worlds are drawn, by name or as a JSON file; changes follow."""
     law: LawLike = "rps"
-    worth: int = option(16, 0, 1000, kw_only=True)
+    worth: int = option(16, 1, 1000, kw_only=True)
     """Number of worlds in which success and time are predicted."""
     tasks: int = option(32, 8, 1000, kw_only=True)
     """Number of pushes in each of these worlds."""
@@ -173,8 +173,6 @@ class Coverage(FitStudy):
 
     def _predict(self, training: xr.Dataset, test: xr.Dataset, run: Run) -> xr.Dataset:
         """Return success rate and mean time: true, predicted from the domain, and from the fit."""
-        if not self.worth:
-            return xr.Dataset()
         networks, names = self._train("touch, object", training, run)
         x = test.sel(statistic=names).statistics.values[:, :1]
         columns = points.names(self.ranges)
@@ -264,8 +262,6 @@ def worth_rows(results: xr.Dataset) -> Rows:
     """Return a header and one row for each law: mean absolute error of the predictions."""
     rows = [["law", "success, from the domain", "success, from the fit", "time, from the domain",
              "time, from the fit"]]  # fmt: skip
-    if "won" not in results:
-        return rows
     truth = results.sel(source="truth")
     error = abs(results.drop_sel(source="truth") - truth).mean("world")
     for law in results.law.values:
