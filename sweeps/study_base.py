@@ -17,6 +17,7 @@ import os
 import platform
 import re
 import shlex
+import subprocess
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -47,6 +48,7 @@ _PACKAGES = ("rps_jax", "jax", "mujoco", "mujoco-mjx")  # whose versions a data 
 # Removed options by question, with the values that all later runs have; digests still cover them.
 _REMOVED_OPTIONS: Mapping[str, Mapping[str, Any]] = {
     "ground": {"worlds": None},
+    "speed": {"refill": 0, "rounds": 4},
     "attack": {"aim": "distance", "algorithm": "mixed"},
     "tune_es": {"algorithm": "cma", "patience": 0},
 }
@@ -181,6 +183,14 @@ class Study(Question[T]):
 
 
 @dataclass(frozen=True, kw_only=True)
+class QuickStudy(Study[T]):
+    """Base class of studies that have a small run."""
+
+    quick: bool = False
+    """Whether to make a small run of minutes on two cores; explicit options keep their values."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class TrialStudy(Study[T], TrialQuestion[T]):
     """Base class of studies that run trials with several settings."""
 
@@ -192,6 +202,19 @@ class SpeedStudy(Study[T]):
     def intro(self, results: Any) -> str:
         """Return the device of the measurement."""
         return f"On {machine()}."
+
+
+def run_process(words: Sequence[str | Path], problem: str, folder: Path | None = None) -> str:
+    """Run a process, by default in the current folder, and return what it prints.
+
+    Raises:
+      InputError: the process failed; the sentence starts with the `problem`.
+    """
+    process = subprocess.run(words, cwd=folder, capture_output=True, text=True, check=False)
+    if process.returncode:
+        last = (process.stderr or process.stdout).strip().splitlines()[-1:]
+        raise InputError(f"{problem}: {' '.join(last)}")
+    return process.stdout
 
 
 def machine() -> str:

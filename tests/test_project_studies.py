@@ -21,7 +21,7 @@ STUDIES = sorted(path.parent for path in SWEEPS.glob("*/study.py"))
 
 # Options of studies whose value is out of bounds, or is none of their choices.
 OUT_OF_BOUNDS = [
-    *("landscape --candidates 1", "speed --refill -1", "speed --at-once 0", "speed --mujocos -4"),
+    *("landscape --candidates 1", "speed --worlds 0", "speed --at-once 0"),
     *("levers --worlds 1", "levers --simulated nan", "hardware --setups 1"),
     *("real_pushes --mujoco -1", "fit --logs 1", "fit/bags.py --logs 0", "export --inputs 0"),
 ]
@@ -38,7 +38,6 @@ REFUSED = [
     ("landscape --laws rps,tund.json", r"tund\.json cannot be read"),
     ("landscape --laws pursuit", "law = pursuit is not allowed"),
     ("speed --families cone", "cone"),
-    ("speed --names 'mjx fast' --worlds 65536", "leave nothing to time"),
     ("levers --family cone", "cone"),
     ("ambiguities --gazebo --curve", "gazebo and curve are not allowed together"),
     ("limits --limits leg", "did you mean 'lag'"),

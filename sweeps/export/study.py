@@ -34,7 +34,7 @@ from rps_jax.trials.setting import Setting
 from rps_jax.world import paper
 from rps_jax.world.objects import PAPER_OBJECTS
 from sweeps.export import loop, native
-from sweeps.study_base import Study, Table, records, run_parts, text_table
+from sweeps.study_base import QuickStudy, Table, records, run_parts, text_table
 
 TableName = Literal["inputs", "trials", "paper", "worlds", "bags", "odd", "speed"]
 _TABLES: tuple[TableName, ...] = ("speed", "inputs", "trials", "paper", "worlds", "bags", "odd")
@@ -47,7 +47,7 @@ _Trials = namedtuple("_Trials", "trials steps greatest told beyond parted in_jax
 
 
 @dataclass(frozen=True)
-class Export(Study[xr.DataTree]):
+class Export(QuickStudy[xr.DataTree]):
     """Compare exported laws with those in JAX, and time them.
 
     The answer is a tree with the values of each table by law.
@@ -77,8 +77,6 @@ class Export(Study[xr.DataTree]):
     """Number of random worlds that are recorded as bags, for each law."""
     domain: str = "real"
     """Domain of these worlds."""
-    quick: bool = False
-    """Whether to make a small run of minutes on two cores; explicit options keep their values."""
 
     def check(self) -> None:
         """Check that the laws can be exported, and that a compiler is installed."""

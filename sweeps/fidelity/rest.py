@@ -24,7 +24,7 @@ from rps_jax.trials.worlds import starts
 from rps_jax.world import domain as domains
 from rps_jax.world import draws
 from rps_jax.world.physics import Physics, preset
-from sweeps.study_base import Rows, Study, Table
+from sweeps.study_base import QuickStudy, Rows, Table
 
 DOMAINS = ("wide", "hostile", "hostile,friction_ground=0.05:0.1,com_offset=0.5:0.7")
 _AWAY = 5.0  # [m] stands the base
@@ -36,7 +36,7 @@ STEPS: Mapping[str, Physics] = {
 
 
 @dataclass(frozen=True)
-class Rest(Study[xr.Dataset]):
+class Rest(QuickStudy[xr.Dataset]):
     """Leave random objects alone, and tell how far they have moved (domain, step, world) [m]."""
 
     TITLE: ClassVar[str] = "Do objects at rest stay?"
@@ -48,8 +48,6 @@ class Rest(Study[xr.Dataset]):
     """How long they are left alone [s]."""
     seed: int = option(1, 0, 2**32 - 1)
     """Seed of the worlds."""
-    quick: bool = False
-    """Whether to make a small run of seconds."""
 
     def num_trials(self) -> int | None:
         """Return the number of worlds."""

@@ -22,11 +22,11 @@ from rps_jax.record.options import option
 from rps_jax.runs.question import Run, call_of
 from rps_jax.trials.progress import SequentialProgress
 from sweeps.force_push_grid import grid
-from sweeps.study_base import Study, Table
+from sweeps.study_base import QuickStudy, Table
 
 
 @dataclass(frozen=True)
-class ForcePushGrid(Study[xr.Dataset]):
+class ForcePushGrid(QuickStudy[xr.Dataset]):
     """Push the sliders of Heins and Schoellig from every start of their grid, by their law.
 
     The results hold, over (law, slider, inertia, friction, lateral, angle, contact), `success` by
@@ -46,8 +46,6 @@ class ForcePushGrid(Study[xr.Dataset]):
     """Length of a push after its first contact [s]."""
     engine: EngineName = "fused"
     """Engine; it must give the contact force to a compiled program."""
-    quick: bool = False
-    """Whether to make a small run of minutes on two cores; explicit options keep their values."""
 
     def check(self) -> None:
         """Check the names, and that the engine supports these pushes."""

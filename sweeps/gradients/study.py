@@ -39,7 +39,7 @@ from rps_jax.world import domain as domains
 from rps_jax.world import draws
 from rps_jax.world.domain import RANDOM, DomainLike
 from sweeps.gradients import estimators
-from sweeps.study_base import Rows, Study, Table
+from sweeps.study_base import QuickStudy, Rows, Table
 
 TRUTH = "truth"
 HORIZONS = (0.5, 2.0, 8.0, 30.0, 100.0, 300.0)  # [s]
@@ -48,7 +48,7 @@ ESTIMATORS = ("reverse", "clipped", "forward", "evolution", "combined")
 
 
 @dataclass(frozen=True)
-class Gradients(Study[xr.Dataset]):
+class Gradients(QuickStudy[xr.Dataset]):
     """Compare gradient estimators with finite differences after several simulated times.
 
     The answer has the cosine to finite differences (estimator, horizon), and the standard error of
@@ -93,8 +93,6 @@ class Gradients(Study[xr.Dataset]):
     """Engine of the truth, of forward and of evolution; reverse uses the quasi-static engine."""
     seed: int = option(0, 0, 2**30)
     """Seed of the worlds."""
-    quick: bool = False
-    """Whether to make a small run of minutes; explicit options keep their values."""
 
     @functools.cached_property
     def space(self) -> Space:

@@ -21,11 +21,11 @@ from rps_jax.analysis.figures.style import Figure, words
 from rps_jax.analysis.report import Picture
 from rps_jax.runs.question import Run, call_of
 from sweeps.ground import grounds
-from sweeps.study_base import Study, Table
+from sweeps.study_base import QuickStudy, Table
 
 
 @dataclass(frozen=True)
-class Ground(Study[xr.Dataset]):
+class Ground(QuickStudy[xr.Dataset]):
     """Compare grounds with dry friction, by pushes beside those of a rigid object.
 
     The answer holds pushes (ground, object, offset, speed) in C MuJoCo, the end positions of rigid
@@ -39,8 +39,6 @@ class Ground(Study[xr.Dataset]):
 
     grounds: tuple[str, ...] = tuple(grounds.GROUNDS)
     """Names of the grounds; by default all."""
-    quick: bool = False
-    """Whether to run only three of the grounds."""
 
     def num_trials(self) -> int | None:
         """Return the number of pushes."""

@@ -12,7 +12,6 @@ import importlib.metadata
 import json
 import os
 import shutil
-import subprocess
 import sysconfig
 import tempfile
 import tomllib
@@ -27,9 +26,8 @@ import xarray as xr
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
-from rps_jax.errors import InputError
 from rps_jax.runs.question import Run, call_of
-from sweeps.study_base import Rows, Study, Table, run_parts
+from sweeps.study_base import Rows, Study, Table, run_parts, run_process
 
 ROOT = Path(__file__).parents[2]
 PACKAGE = "rps-jax"
@@ -195,9 +193,7 @@ def _pip(environment: Path, *words: str) -> None:
     """
     python = environment / ("Scripts" if os.name == "nt" else "bin") / "python"
     command = [python, "-m", "pip", *words, "-c", str(ROOT / "constraints.txt")]
-    process = subprocess.run(command, capture_output=True, text=True, check=False)
-    if process.returncode:
-        raise InputError(f"pip {words[0]} failed: {' '.join(process.stderr.strip().split()[-40:])}")
+    run_process(command, f"pip {words[0]} failed")
 
 
 def _packages(site: Path) -> xr.Dataset:

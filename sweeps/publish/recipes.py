@@ -285,13 +285,13 @@ RECIPES: dict[str, Recipe] = {
     # --- speed, with nothing else running ---
     "speed": recipe(
         "rps sweeps/speed --names 'C in closed loop' 'fused standard' 'fused fast' quasistatic "
-        "--worlds 64 4096 262144 --at-once 16 --refill 0",
+        "--worlds 64 4096 262144 --at-once 16",
         gpu=6,
         section="Simulated seconds in a second",
     ),
     "speed_cores": recipe(
         "rps sweeps/speed --names 'fused standard' 'C in closed loop' 'C, mj_step alone' "
-        "'mjx standard' --worlds 24 64 --refill 0",
+        "'mjx standard' --worlds 24 64",
         cores=3,
         section="Simulated seconds in a second",
     ),
@@ -314,7 +314,7 @@ RECIPES: dict[str, Recipe] = {
         f"--worlds 262144' {_MACHINE}",
         gpu=6,
     ),
-    # After `python sweeps/speed/peers.py peers`.
+    # After the installation of the third-party engines: see `speed/arena.py`.
     "arena": recipe(f"rps sweeps/speed/arena.py --peers peers {_MACHINE}", gpu=5),
     "costs": recipe(
         "rps sweeps/speed/costs.py --names 'fused standard' 'mjx standard' --families box "

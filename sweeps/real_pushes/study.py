@@ -32,7 +32,7 @@ from rps_jax.runs.question import Run, call_of
 from sweeps.real_pushes import contact, pushes
 from sweeps.real_pushes.drawing import figure
 from sweeps.real_pushes.pushes import Errors
-from sweeps.study_base import Study, Table, run_parts
+from sweeps.study_base import QuickStudy, Table, run_parts
 
 WORDS: Mapping[str, str] = {
     "no_motion": "no motion",
@@ -139,7 +139,7 @@ def halves_of(ids: np.ndarray) -> np.ndarray:
 
 
 @dataclass(frozen=True)
-class RealPushes(Study[xr.Dataset]):
+class RealPushes(QuickStudy[xr.Dataset]):
     """Predict the final poses of real pushes with several models, and compute their errors.
 
     The answer holds predicted poses `predicted` (model, push, pose) [m, m, rad], NaN where a model
@@ -158,8 +158,6 @@ class RealPushes(Study[xr.Dataset]):
     """Number of pushes on three feet that C MuJoCo predicts, with one finger and with two each."""
     few: int | None = option(None, 10, 100_000)
     """Number of pushes, evenly spaced in the table; by default all."""
-    quick: bool = False
-    """Whether to run only a few pushes, in less than a minute."""
 
     def check(self) -> None:
         """Check the models and the table."""

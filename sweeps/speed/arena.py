@@ -4,7 +4,8 @@ A base pushes a box straight ahead at a constant speed. Each engine runs in a se
 the same device. All processes compile at the same time; then they are timed in turn. The error of
 an engine is the distance of its final poses from those of C MuJoCo with small steps.
 
-    python sweeps/speed/peers.py peers
+    pip install --no-deps --target peers \
+        mujoco-warp==3.17.0 newton==1.8.0 warp-lang==1.18.0 absl-py etils
     rps sweeps/speed/arena.py --peers peers --machine "one NVIDIA H100"
 """
 
@@ -33,7 +34,16 @@ from rps_jax.world import scene
 from rps_jax.world.physics import preset
 from sweeps.speed import racers
 from sweeps.speed.racers import ON_CORES, RACERS
-from sweeps.study_base import Rows, SpeedStudy, Table, part_name, records, stored_parts, text_table
+from sweeps.study_base import (
+    QuickStudy,
+    Rows,
+    SpeedStudy,
+    Table,
+    part_name,
+    records,
+    stored_parts,
+    text_table,
+)
 
 _FOLDER = Path(__file__).parent
 _COLUMNS = {
@@ -62,7 +72,7 @@ EXCLUDED = {
 
 
 @dataclass(frozen=True)
-class Arena(SpeedStudy[xr.Dataset]):
+class Arena(SpeedStudy[xr.Dataset], QuickStudy[xr.Dataset]):
     """Compare speed and error of engines on one scene with converged C MuJoCo.
 
     The results hold, by engine and number of worlds, simulated seconds per second of wall clock,
@@ -92,7 +102,7 @@ class Arena(SpeedStudy[xr.Dataset]):
     step: float = option(1e-4, 1e-6, 1e-2, unit="s")
     """Time step of converged C MuJoCo [s]."""
     peers: Path | None = None
-    """Folder of the third-party packages, which `peers.py` installs."""
+    """Folder of the third-party packages, which `pip install --target` fills."""
     limit: float = option(300.0, 1, 3600)
     """Time limit for an engine to compile, and time limit for it to run [s]."""
 

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import csv
 import shutil
-import subprocess
 import sys
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
@@ -27,7 +26,7 @@ from rps_jax.runs.question import Run, call_of
 from rps_jax.trials.batch import SEGMENT
 from rps_jax.trials.setting import Setting
 from sweeps.programs import FAMILIES
-from sweeps.study_base import SpeedStudy, Table, records, text_table
+from sweeps.study_base import SpeedStudy, Table, records, run_process, text_table
 
 _STALLED = "smsp__average_warps_issue_stalled_{}_per_issue_active.ratio"
 # Counters: name of Nsight Compute, variable, description.
@@ -115,12 +114,7 @@ class Kernel(SpeedStudy[xr.Dataset]):
             )
             for i, profiler in enumerate(("", ncu)):
                 words = [sys.executable, *sweep.split(), "--out", f"{folder}/run_{i}"]
-                process = subprocess.run(
-                    [*profiler.split(), *words], capture_output=True, text=True
-                )
-                if process.returncode:
-                    last = (process.stderr or process.stdout).strip().splitlines()[-1:]
-                    raise InputError(f"families = {family} cannot be counted: {' '.join(last)}")
+                run_process([*profiler.split(), *words], f"families = {family} cannot be counted")
             return counts(log.read_text())
 
 

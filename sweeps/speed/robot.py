@@ -8,7 +8,6 @@ A separate process runs `notebooks/examples/on_a_robot.py`, which prints its mea
 from __future__ import annotations
 
 import re
-import subprocess
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -17,10 +16,9 @@ from typing import ClassVar
 
 import xarray as xr
 
-from rps_jax.errors import InputError
 from rps_jax.record.options import option
 from rps_jax.runs.question import Run, call_of
-from sweeps.study_base import Study, Table, records, text_table
+from sweeps.study_base import Study, Table, records, run_process, text_table
 
 _ROOT = Path(__file__).parents[2]
 _EXAMPLE = "notebooks/examples/on_a_robot.py"
@@ -77,13 +75,10 @@ class OnARobot(Study[xr.Dataset]):
           InputError: the run failed.
         """
         arguments = [_EXAMPLE, "--seconds", f"{self.seconds:g}", "--core", str(self.core)]
-        process = subprocess.run(
-            [sys.executable, *arguments], cwd=_ROOT, capture_output=True, text=True, check=False
-        )
-        match = PRINTED.search(process.stdout)
-        if process.returncode or not match:
-            last = process.stderr.strip().splitlines()[-1:]
-            raise InputError(f"core = {self.core} is not allowed here: {' '.join(last)}")
+        problem = f"core = {self.core} is not allowed here"
+        output = run_process([sys.executable, *arguments], problem, _ROOT)
+        match = PRINTED.search(output)
+        assert match is not None
         values = zip(_VARIABLES.items(), match.groups(), strict=True)
         return xr.Dataset({name: ((), float(value), about) for (name, about), value in values})
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 import time
 from collections import deque
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property, partial
 from itertools import product
 from typing import Any, ClassVar, Literal, NamedTuple
@@ -19,23 +19,20 @@ import jax
 import numpy as np
 import xarray as xr
 
-from rps_jax import engines, errors
 from rps_jax.analysis.figures.style import Figure, words
 from rps_jax.analysis.report import Picture
 from rps_jax.engines import device
 from rps_jax.engines.mujoco import Batch
 from rps_jax.record.options import option
-from rps_jax.runs.evaluate import stack
 from rps_jax.runs.question import Run, call_of
 from rps_jax.trials import host
-from rps_jax.trials.rollout import Candidates, outcomes
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import ControlLoop, Rules
-from rps_jax.world.domain import DOMAINS
 from rps_jax.world.physics import preset
 from sweeps import programs
 from sweeps.programs import BATCHED, FAMILIES, Program
 from sweeps.study_base import (
+    QuickStudy,
     Rows,
     SpeedStudy,
     Table,
@@ -46,7 +43,6 @@ from sweeps.study_base import (
 )
 
 _SPEED = 0.05  # [m/s] of a push in C MuJoCo without a law
-_SLOW = ("mjx",)  # engines whose batches are bounded
 # C MuJoCo on the processor: in the closed loop of a law, by MuJoCo's `rollout`, and one trial at a
 # time.
 IN_C = {
@@ -67,7 +63,7 @@ class Measurement(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Speed(SpeedStudy[xr.Dataset]):
+class Speed(SpeedStudy[xr.Dataset], QuickStudy[xr.Dataset]):
     """Measure the speed of each engine on this machine, by shape family and batch size.
 
     The results hold simulated seconds per second of wall clock, `rate` [1], of each measurement.
@@ -79,9 +75,8 @@ class Speed(SpeedStudy[xr.Dataset]):
         "names": ("C in closed loop", "fused standard", "quasistatic"),
         "families": ("box",),
         "worlds": (64,),
-        "refill": 0,
     }
-    GROWS: ClassVar[tuple[str, ...]] = ("names", "families", "worlds", "mujocos", "at_once")
+    GROWS: ClassVar[tuple[str, ...]] = ("names", "families", "worlds", "at_once")
 
     names: tuple[str, ...] = ()
     """Engines and fidelities; by default all."""
@@ -89,34 +84,15 @@ class Speed(SpeedStudy[xr.Dataset]):
     """Families of the objects: box, cylinder, prism."""
     worlds: tuple[int, ...] = option((64, 512), 1, 10_000_000)
     """Numbers of worlds of a batch."""
-    mujocos: int = option(16384, 1, 10_000_000)
-    """Largest batch of MJX."""
     at_once: int = option(1, 1, 1024)
     """Number of programs compiled at the same time."""
-    refill: int = option(64, 0, 1_000_000)
-    """Slots per worker in the measurement of refilled slots; 0: no measurement."""
-    rounds: int = option(4, 1, 1000)
-    """Number of trials per slot in that measurement."""
-    quick: bool = False
-    """Whether to make a small run of minutes; explicit options keep their values."""
 
     @cached_property
     def entries(self) -> Sequence[tuple[str, str, int]]:
         """Name, family and number of worlds (0 in C, which chooses it) of all measurements."""
         named = list(product(self.names or NAMES, self.families))
         in_c = [(*pair, 0) for pair in named if pair[0] in IN_C]
-        batched = [(*pair, n) for pair in named if pair[0] in BATCHED for n in self.worlds]
-        slow = [name for name, setting in BATCHED.items() if setting.engine in _SLOW]
-        return in_c + [b for b in batched if b[0] not in slow or b[2] <= self.mujocos]
-
-    def check(self) -> None:
-        """Check the names, and that there is a measurement."""
-        super().check()
-        if not self.entries:
-            raise errors.InputError(
-                f"names = {self.names} with worlds = {self.worlds} leave nothing to time: MJX "
-                f"is timed up to --mujocos {self.mujocos} worlds."
-            )
+        return in_c + [(*pair, n) for pair in named if pair[0] in BATCHED for n in self.worlds]
 
     def num_trials(self) -> int | None:
         """Return the number of measurements."""
@@ -128,26 +104,14 @@ class Speed(SpeedStudy[xr.Dataset]):
         missing = [entry for name, entry in by_part.items() if name not in stored]
         measurements = _measured(missing, self.at_once)
         parts = dict.fromkeys(by_part, lambda: xr.Dataset(next(measurements)._asdict()))
-        if not self.refill:
-            return run_parts(run, "measurement", parts)
-        gain = run.checkpoint("refilling", partial(refilling, self.refill, self.rounds))
-        return run_parts(run, "measurement", parts).merge(gain)
+        return run_parts(run, "measurement", parts)
 
     def report_tables(self, results: xr.Dataset) -> Sequence[Table]:
-        """Return speeds beside C MuJoCo, and the gain of refilled slots."""
+        """Return speeds beside C MuJoCo."""
         fields = ("family", "name", "worlds", "rate")
         points: list[Any] = [tuple(map(row.get, fields)) for row in records(results, "measurement")]
         picture = Picture("throughput", partial(throughput, points, tuple(IN_C)))
-        tables = [Table(table(results), title="Simulated seconds in a second", picture=picture)]
-        if "refilled" in results:
-            refilled, waiting = float(results.refilled), float(results.waiting)
-            text = (
-                f"{self.refill} slots a worker and {self.rounds} trials in each: {refilled:,.0f} "
-                f"simulated s/s, {float(results.trials):,.1f} trials/s; batches that wait for "
-                f"their slowest: {waiting:,.0f}; gain {refilled / waiting:.2f}."
-            )
-            tables.append(Table((), title="Refilled slots", text=text))
-        return tables
+        return [Table(table(results), title="Simulated seconds in a second", picture=picture)]
 
 
 speed = call_of(Speed)
@@ -207,35 +171,6 @@ def in_c(name: str, family: str, simulated: float = 2.0) -> Measurement:
     once()  # compiles the law
     rate = worlds * simulated / _best(once)
     return Measurement(name, family, worlds, rate)
-
-
-def refilling(slots: int, rounds: int = 4) -> xr.Dataset:
-    """Time trials of RPS with refilled slots, and in batches that wait for their slowest trial.
-
-    Both run the same random boxes of the domain `wide`, `rounds` per slot.
-
-    Returns:
-      Simulated s per s of wall clock, `refilled` and of batches that wait, `waiting`; and `trials`
-      per s, refilled.
-    """
-    setting = BATCHED["fused standard"]
-    boxes = replace(DOMAINS["wide"], objects=("random_box",))
-    workers = engines.get(setting.engine).workers(jax.default_backend())
-    count = slots * workers * len(jax.local_devices())
-
-    def timed(groups: np.ndarray) -> tuple[float, float]:
-        timings = []
-        for group in groups:
-            request = Candidates(stack(["rps"]), [boxes], 0, group)
-            timings.append(outcomes([request], setting, slots=slots)[1])
-        wall = sum(t.run for t in timings)
-        return sum(t.simulated for t in timings) / wall, groups.size / wall
-
-    indices = np.arange(rounds * count)
-    timed(indices[None, :count])  # compiles
-    refilled, trials = timed(indices[None])
-    waiting, _ = timed(indices.reshape(rounds, count))
-    return xr.Dataset({"refilled": refilled, "waiting": waiting, "trials": trials})
 
 
 def table(results: xr.Dataset) -> Rows:
