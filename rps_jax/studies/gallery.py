@@ -8,11 +8,11 @@ from pathlib import Path
 
 import numpy as np
 import xarray as xr
-from matplotlib.axes import Axes
 from scipy import stats
 
 from rps_jax.analysis import statistics
-from rps_jax.analysis.figures.style import Figure, base_patch, tiles
+from rps_jax.analysis.figures.paper import draw_path
+from rps_jax.analysis.figures.style import Figure, tiles
 from rps_jax.analysis.report import Picture, Section
 from rps_jax.control import registry
 from rps_jax.record import files
@@ -159,10 +159,11 @@ def _simulate(
 
 
 def maps_figure(traces: Mapping[int, xr.Dataset], title: str) -> Figure:
-    """Draw a map of the trial of each world: paths of base and object, the base at ten times."""
+    """Draw a map of the trial of each world."""
     figure, axes = tiles(len(traces), _COLUMNS, (2.3, 2.4), (0.4, 0.9))
     for ax, (world, trace) in zip(axes.ravel(), traces.items(), strict=False):
-        _draw_map(ax, trace)
+        draw_path(ax, trace)
+        ax.tick_params(labelsize=6)
         distance = float(trace.outcome_min_distance)
         miss = f"{distance:.2f} m left" if np.isfinite(distance) else "untouched"
         ax.set_title(f"world {world}, {miss}", fontsize=7)
@@ -170,21 +171,3 @@ def maps_figure(traces: Mapping[int, xr.Dataset], title: str) -> Figure:
     figure.legend(handles, names, fontsize=8, loc="outside lower center", ncols=len(names))
     figure.suptitle(title, fontsize=10)
     return figure
-
-
-def _draw_map(ax: Axes, trace: xr.Dataset) -> None:
-    qpos, touching = trace.qpos.values, trace.contact_type.values[:, None] != 0
-    base, object_ = qpos[:, :3], qpos[:, 3:5]
-    for mask, colour, label in ((touching, "C0", "contact"), (~touching, "C3", "no contact")):
-        path = np.where(mask, base[:, :2], np.nan)
-        ax.plot(*path.T, color=colour, lw=0.8, label=f"base, {label}")
-    ax.plot(*object_.T, color="C1", lw=1.2, label="object")
-    half = (float(trace.half_length), float(trace.half_width))
-    for i in np.linspace(0, len(base) - 1, 10).astype(int):
-        patch = base_patch(base[i], half, fill=i == len(base) - 1)
-        patch.set_alpha(0.5)
-        ax.add_patch(patch)
-    target = np.asarray(trace.p_world_target.values, float)
-    ax.plot(*target, "*", color="C2", ms=9, label="target")
-    ax.set_aspect("equal", adjustable="datalim")
-    ax.tick_params(labelsize=6)

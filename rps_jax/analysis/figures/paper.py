@@ -8,7 +8,8 @@ import numpy as np
 import xarray as xr
 from matplotlib import patches
 from matplotlib.axes import Axes
-from matplotlib.collections import PathCollection
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import Normalize
 
 from rps_jax.analysis.figures.style import (
     SHADES,
@@ -22,6 +23,8 @@ from rps_jax.analysis.figures.style import (
 from rps_jax.control.laws import rps
 from rps_jax.control.laws.rps import RPSParams
 from rps_jax.robot import shell, skin
+
+_SCALE, _COLOURS = Normalize(0, 2), "viridis_r"  # of the distance to the target [m], in Fig. 5
 
 
 def profile(params: RPSParams) -> Figure:
@@ -50,7 +53,9 @@ def one_trial(trace: xr.Dataset, title: str) -> Figure:
     time, touching = trace.time.values, trace.contact_type.values != skin.NONE
     figure = Figure(figsize=(11, 6), layout="constrained")
     grid = figure.add_gridspec(3, 2, width_ratios=(1.1, 1))
-    _path(figure.add_subplot(grid[:, 0]), trace)
+    path = figure.add_subplot(grid[:, 0], xlabel="x [m]", ylabel="y [m]")
+    draw_path(path, trace)
+    path.legend(fontsize=8)
 
     velocity = figure.add_subplot(grid[0, 1])
     velocity.plot(time, trace.v_x, label="$v_x$ [m/s]", color="C0")
@@ -96,8 +101,8 @@ def _object(trace: xr.Dataset, index: int) -> np.ndarray:
     return trace.outline.values @ turn.T + [x, y]
 
 
-def _path(ax: Axes, trace: xr.Dataset) -> None:
-    """Draw the left column of Fig. 6: the paths of the base and of the contact point."""
+def draw_path(ax: Axes, trace: xr.Dataset) -> None:
+    """Draw a trial as a map: paths of the base and of the contact point, and seven snapshots."""
     pose, target = trace.qpos.values[:, :3], trace.p_world_target.values
     half = float(trace.half_length), float(trace.half_width)
     ax.plot(*pose[:, :2].T, color="0.35", label="base")
@@ -110,9 +115,8 @@ def _path(ax: Axes, trace: xr.Dataset) -> None:
         ax.fill(*_object(trace, index).T, label=name, **shown)
     ax.plot(*target, "*", ms=14, color="C3", label="target")
     ax.add_patch(patches.Circle(target, float(trace.d_success), fill=False, color="C3"))
-    ax.set(xlabel="x [m]", ylabel="y [m]", aspect="equal")
+    ax.set_aspect("equal")
     ax.grid(alpha=0.3)
-    ax.legend(fontsize=8)
 
 
 def stills(images: Sequence[np.ndarray], titles: Sequence[str]) -> Figure:
@@ -135,12 +139,11 @@ def min_distance(results: xr.Dataset) -> Figure:
     columns = [*objects, "all"] if len(objects) > 1 else objects
     count, size = len(laws) * len(columns), (2.6, 2.5)
     figure, axes = tiles(count, len(columns), size, (0.9, 0.9), sharex=True, sharey=True)
-    image = None
     for row, law in zip(axes, laws, strict=True):
         for ax, column in zip(row, columns, strict=True):
             part = results.sel(law=law)
             part = part if column == "all" else part.sel(object=[column])
-            image = _map(ax, part)
+            _map(ax, part)
             successes, trials = int(part.success.sum()), part.success.size
             name = "all objects" if column == "all" else words(column)
             ax.set_title(f"{law.upper()}, {name}: {successes}/{trials}", fontsize=9)
@@ -148,22 +151,19 @@ def min_distance(results: xr.Dataset) -> Figure:
         ax.set_xlabel("x [m]")
     for ax in axes[:, 0]:
         ax.set_ylabel("y [m]")
-    assert image is not None
-    bar = figure.colorbar(image, ax=axes, shrink=0.8, extend="max")
-    bar.set_label("least distance of contact to target [m]")
+    colours, label = ScalarMappable(_SCALE, _COLOURS), "least distance of contact to target [m]"
+    figure.colorbar(colours, ax=axes, label=label, shrink=0.8, extend="max")
     return figure
 
 
-def _map(ax: Axes, part: xr.Dataset) -> PathCollection:
+def _map(ax: Axes, part: xr.Dataset) -> None:
     """Draw a coloured square and the count of successes at each target."""
     # A trial without contact has no least distance; it has the colour of the scale's far end.
     distance = part.min_distance.where(np.isfinite(part.min_distance), 3.0)
     distance = distance.mean(("object", "friction")).values
     count = part.success.sum(("object", "friction")).values
     x, y = part.target_x.values, part.target_y.values
-    image = ax.scatter(
-        x, y, c=distance, s=420, marker="s", cmap="viridis_r", vmin=0.0, vmax=2.0, linewidths=0
-    )
+    ax.scatter(x, y, c=distance, s=420, marker="s", cmap=_COLOURS, norm=_SCALE, linewidths=0)
     for i, successes in enumerate(count):
         colour = "white" if distance[i] > 1.0 else "black"
         ax.annotate(
@@ -176,4 +176,3 @@ def _map(ax: Axes, part: xr.Dataset) -> PathCollection:
         ylim=(y.min() - margin, y.max() + margin),
         aspect="equal",
     )
-    return image

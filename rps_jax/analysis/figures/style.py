@@ -107,10 +107,8 @@ def success_rates(
     pairs = zip(successes, trials, strict=True)
     low, high = 100 * np.array([statistics.wilson(int(n), int(m)) for n, m in pairs]).T
     errors = np.abs(np.stack([rate - low, high - rate]))
-    sheet = ax.get_figure(root=True)
-    assert sheet is not None
-    shift = transforms.ScaledTranslation(2.5 * curve / 72, 0, sheet.dpi_scale_trans)
     mark = "osD^v"[curve % 5]
     bars = ax.errorbar(x, rate, errors, capsize=2, marker=mark, ms=4, lw=1.2, **style)
+    shift = {"fig": ax.get_figure(root=True), "x": 2.5 * curve, "units": "points"}
     for artist in bars.get_children():
-        artist.set_transform(artist.get_transform() + shift)
+        artist.set_transform(transforms.offset_copy(artist.get_transform(), **shift))
