@@ -21,10 +21,11 @@
 
 # %%
 import drawing
+import pandas as pd
 from IPython.display import Markdown
 
 import rps_jax
-from rps_jax.analysis import figures, tables
+from rps_jax.analysis import figures, statistics, tables
 
 run = "runs/compare/wide"
 results = rps_jax.load(run)
@@ -71,17 +72,17 @@ figures.success_curves(results)
 # influence if q is below 0.05.
 
 # %%
-Markdown(tables.markdown(tables.influence_table(results, "paper")[:9]))
+pd.DataFrame(statistics.influences(results.sel(law=["paper"]))).head(8)
 
 # %% [markdown]
-# For the paper's parameters width matters: in the widest eighth, with a half width of about 31
-# cm, four in five trials succeed. The half width of the base is 29 cm. The number of corners
-# matters as well (0 for a cylinder). A run of 240,000 worlds (`sweeps/random_worlds`) finds more
-# influences, such as the centre of mass, dead taxels and friction at the robot. Here they are not
-# significant.
+# For the paper's parameters width (`size`) matters: in the widest eighth, with a half width of
+# about 31 cm, four in five trials succeed. The half width of the base is 29 cm. The number of
+# corners matters as well (0 for a cylinder). A run of 240,000 worlds (`sweeps/random_worlds`)
+# finds more influences, such as the centre of mass, dead taxels and friction at the robot. Here
+# they are not significant.
 
 # %%
-Markdown(tables.markdown(tables.influence_table(results, "tuned")[:4]))
+pd.DataFrame(statistics.influences(results.sel(law=["tuned"]))).head(3)
 
 # %% [markdown]
 # For the tuned parameters, 1000 worlds show no influence of any quantity: wide objects no longer

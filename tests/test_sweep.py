@@ -33,7 +33,7 @@ from helpers import (
     swept,
 )
 
-from rps_jax.analysis import tables
+from rps_jax.analysis import statistics
 from rps_jax.app.cli import running
 from rps_jax.errors import InputError
 from rps_jax.geometry import planar
@@ -327,7 +327,7 @@ def test_the_report_of_one_world_has_the_command_that_replays_its_failure(whole,
     world.success[:] = [[1], [0]]
     text = str(sweep.plan_sections(load_plan(folder), world, folder))
     assert f"rps replay '{folder}' 0 --law nps" in text  # the law that fails
-    assert tables.influence_table(world, "rps")[1:] == []
+    assert statistics.influences(world) == []
 
 
 def test_shards_merge_to_the_whole(whole, tmp_path):

@@ -11,7 +11,6 @@ from numpy.typing import ArrayLike
 from rps_jax.analysis import statistics
 from rps_jax.analysis.statistics import Comparison
 from rps_jax.world import paper
-from rps_jax.world.domain import LABELS
 
 
 def markdown(rows: Sequence[Sequence[str]]) -> str:
@@ -233,26 +232,3 @@ def _outcome(trial: xr.Dataset) -> str:
         return f"{float(trial.time):.0f} s"
     distance = float(trial.min_distance)
     return f"fails, {100 * distance:.0f} cm off" if np.isfinite(distance) else "never touches"
-
-
-def influence_table(results: xr.Dataset, law: str) -> list[list[str]]:
-    """Return a row for each varied quantity: the worst and the best bin of a law.
-
-    Rows are in the order of q, from a chi-squared test that all bins have the same rate. With
-    q < 0.05, false discoveries among the quantities are held at 5 % (Benjamini-Hochberg).
-    """
-    success = results.success.sel(law=law).values > 0
-    names = statistics.varied_quantities(results)
-    binned = [statistics.bins(results[name].values, success) for name in names]
-    q = statistics.false_discovery([statistics.equal_rates_p(b) for b in binned])
-    rows = [["", "worst bin, about", "success", "best bin, about", "success", "q"]]
-    for i in np.argsort(q, kind="stable"):
-        name, (middle, successes, trials) = names[i], binned[i]
-        order = np.argsort(successes / trials, kind="stable")
-        unit = results[name].attrs["units"]
-        cells = []
-        for n in (order[0], order[-1]):
-            value = f"{middle[n]:.3g} {unit}".removesuffix(" 1")
-            cells += [value, share(int(successes[n]), int(trials[n]))]
-        rows.append([LABELS[name], *cells, f"{q[i]:.2g}"])
-    return rows
