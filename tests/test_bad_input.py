@@ -214,8 +214,6 @@ COMMANDS = {
         "es --tuned L L": "tuned = .* is not allowed: name each once",
         "es --objective.risk worst": unlike("--objective.risk", "worst", "mean", "cvar"),
         "grad --estimator backprop": unlike("--estimator", "backprop", *ESTIMATORS),
-        "grad --optimiser sgdd": "unknown optimiser 'sgdd': choose from adabelief, adam, .*'sgd'",
-        "grad --optimiser lbfgs": "unknown optimiser 'lbfgs': choose from adabelief, adam",
         "grad --learning-rate 0": "learning_rate = 0.0 is not allowed",
         "grad --window -1": "window = -1.0 is not allowed",
         "grad --starts 0": "starts = 0 is not allowed",

@@ -1,6 +1,7 @@
 """Tuning: the bounded map, the objective, evolution, and resumed runs."""
 
 import json
+from unittest import mock
 
 import jax.numpy as jnp
 import numpy as np
@@ -18,7 +19,6 @@ from rps_jax.trials.progress import Timing, no_progress
 from rps_jax.trials.score import Objective
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import Outcome, Rules
-from rps_jax.tuning import run
 from rps_jax.tuning.descent import TuneGrad
 from rps_jax.tuning.evolution import TuneES
 from rps_jax.tuning.space import SUBSETS, Space
@@ -199,8 +199,15 @@ def descents(generations=6):
     return TuneGrad("rps", **options, **SMALL), generations
 
 
+def tune(folder, search):
+    """Return the results of a search that ends, or is killed, after some generations."""
+    question, generations = search
+    with mock.patch.object(type(question), "num_generations", generations):
+        return question.answer(Run(folder, no_progress))
+
+
 def tuned(folder, search):
-    return run.tune(Run(folder, no_progress), *search).tuned.values.tolist()
+    return tune(folder, search).tuned.values.tolist()
 
 
 @pytest.fixture
@@ -259,7 +266,7 @@ def test_finished_generations_stay_when_fewer_are_requested(tmp_path, pretended)
 
 def test_the_curve_is_a_table_that_grows_with_the_run(tmp_path, pretended):
     for done in (2, 6):
-        results = run.tune(Run(tmp_path, no_progress), *evolution(done))
+        results = tune(tmp_path, evolution(done))
         curve = read_curve(tmp_path)
         assert curve.index.tolist() == list(range(done))
         for name in ("validation_success", "simulated"):
@@ -296,7 +303,7 @@ def test_the_report_of_a_descent_tells_its_times_and_parameters(pretended):
     calls = TuneGrad("rps", **SMALL, estimator="evolution", steps=2, starts=1, pairs=1)
     (section,) = calls.report(calls(), Run(None, no_progress))
     assert "after" in section.text
-    assert "gradients 0.0 s with their compilation" in section.text
+    assert "differentiate 0.0 s" in section.text
     assert [name for name, *_ in section.table[1:]] == ["L", "K_h"]
 
 

@@ -34,9 +34,6 @@ from rps_jax.tuning.run import Proposal, Results, ScoreCandidates, Search, Tunin
 from rps_jax.world.physics import preset
 
 Estimator = Literal["reverse", "evolution"]
-Optimiser = Literal[
-    "adabelief", "adam", "adamw", "lion", "nadam", "radam", "rmsprop", "sgd", "yogi"
-]
 
 
 @dataclass(frozen=True)
@@ -55,9 +52,6 @@ class TuneGrad(Tuning):
       {'generation': 2, 'parameter': 1}
     """
 
-    DIMS: ClassVar[dict[str, tuple[str, ...]]] = Tuning.DIMS | {
-        "validations": ("candidate",), "gradients": ("candidate", "parameter"),
-    }  # fmt: skip
     QUICK: ClassVar[dict[str, Any]] = Tuning.QUICK | {
         "steps": 8, "starts": 1, "learning_rate": 0.3,
     }  # fmt: skip
@@ -68,8 +62,6 @@ class TuneGrad(Tuning):
     estimator: Estimator = "reverse"
     """reverse differentiates windows of trials on the quasi-static model; evolution takes
     antithetic steps in whole trials of the setting's engine."""
-    optimiser: Optimiser = "adam"
-    """Optimiser of optax."""
     learning_rate: float = option(0.1, above=0)
     """Learning rate of the first step, in units of the bounded map [1]; it decays to zero along a
     cosine."""
@@ -174,10 +166,9 @@ class TuneGrad(Tuning):
 
     @functools.cached_property
     def rule(self) -> optax.GradientTransformation:
-        """Update rule of optax: clipped gradients, the optimiser, and a decaying learning rate."""
+        """Update rule of optax: clipped gradients, Adam, and a decaying learning rate."""
         rate = optax.cosine_decay_schedule(self.learning_rate, self.steps)
-        optimiser = getattr(optax, self.optimiser)(rate)
-        return optax.chain(optax.clip_by_global_norm(self.clip), optimiser)
+        return optax.chain(optax.clip_by_global_norm(self.clip), optax.adam(rate))
 
 
 tune_grad = call_of(TuneGrad)
@@ -262,8 +253,7 @@ def window_gradients(thetas: jax.Array, options: TuneGrad, step: int) -> tuple[E
         share = batch.indices.size / total
         worlds = soften_skins(batch.worlds), jnp.asarray(random.uniform(size=batch.indices.size))
         x = options.family_gradients(thetas, batch.stage, worlds)
-        weighted = Estimate(share * x.gradient, share**2 * x.variance, share * x.finite)
-        estimates.append(weighted)
+        estimates.append(Estimate(share * x.gradient, share**2 * x.variance, share * x.finite))
     mean = jax.tree.map(lambda *leaves: sum(leaves), *estimates)
     return mean, len(thetas) * total * (options.window + options.within / 2)
 

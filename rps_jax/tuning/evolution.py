@@ -34,7 +34,6 @@ class TuneES(Tuning):
       {'generation': 1, 'parameter': 2}
     """
 
-    DIMS: ClassVar[dict[str, tuple[str, ...]]] = Tuning.DIMS | {"values": ("candidate",)}
     QUICK: ClassVar[dict[str, Any]] = Tuning.QUICK | {
         "worlds": 32, "population": 12, "generations": 8, "spread": 1.0,
     }  # fmt: skip

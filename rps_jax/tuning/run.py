@@ -1,8 +1,8 @@
 """Base of the tuning commands: their common options and report, and the loop of a search.
 
 `Tuning` holds the options and the report of `TuneES` and `TuneGrad`, and the worlds in which
-candidates are tried. Its `search` proposes vectors of parameters, and `judge` tries them. `tune`
-runs a search and checkpoints every generation, so a killed run resumes.
+candidates are tried. Its `search` proposes vectors of parameters, and `judge` tries them. `answer`
+runs the search and checkpoints every generation, so a killed run resumes.
 """
 
 from __future__ import annotations
@@ -37,6 +37,12 @@ from rps_jax.world.domain import Domain, DomainLike, parse_domain
 
 TUNED = "tuned.json"  # file of a run folder: the parameters with the best validation
 UNITS = {"compile": "s", "run": "s", "simulated": "s", "differentiate": "s"}
+# Dimensions of those results of a generation that are arrays.
+DIMS = {
+    **dict.fromkeys(("vectors", "gradients"), ("candidate", "parameter")),
+    **dict.fromkeys(("values", "validations"), ("candidate",)),
+    **dict.fromkeys(("center", "params"), ("parameter",)),
+}
 
 Results = Mapping[str, np.ndarray | jax.Array | float]  # of a generation, by name
 Proposal = Mapping[str, np.ndarray]  # arrays by name, `vectors` (P, p) among them
@@ -51,12 +57,6 @@ class Tuning(LawQuestion[xr.Dataset]):
     """Base of the questions for better parameters of a law."""
 
     IGNORED_FIELDS: ClassVar[tuple[str, ...]] = ("budget", "generations")
-    # Dimensions of those results of a generation that are arrays.
-    DIMS: ClassVar[dict[str, tuple[str, ...]]] = {
-        "vectors": ("candidate", "parameter"),
-        "center": ("parameter",),
-        "params": ("parameter",),
-    }
     QUICK: ClassVar[dict[str, Any]] = {
         # The few parameters that matter most, since few trials cannot determine more; cylinders on
         # the quasi-static model, which compile and run fastest.
@@ -167,7 +167,76 @@ class Tuning(LawQuestion[xr.Dataset]):
         return Bar(name, self.num_generations, "generations", shown=self.shows_progress)
 
     def answer(self, run: Run) -> xr.Dataset:
-        return tune(run, self, self.num_generations)
+        """Run a search to its end, and return its results.
+
+        Every generation is a checkpoint. A resumed search proposes the same vectors again and reads
+        their results from the checkpoints; a damaged checkpoint is computed again. `compile` and
+        `run` [s] are the wall clock of a generation's trials, and `simulated` [s] is its total
+        simulated time.
+
+        Raises:
+          InputError: the folder has generations that this search does not propose.
+        """
+        search = self.search()
+        proposal, best, least = next(search), self.base, np.inf  # `best` has the least validation
+        log, count, simulated = xr.Dataset(), 0, 0.0
+
+        def report(progress: Progress) -> None:
+            run.callback(replace(progress, simulated=simulated + progress.simulated, rounds=count))
+
+        def proceed(generation: int) -> bool:
+            return generation < self.num_generations and not 0 < self.budget <= simulated
+
+        def compute(generation: int) -> xr.Dataset:
+            if generation:
+                self._write(run.folder, best, log)
+            return self._try_proposal(proposal, generation, run._replace(callback=report))
+
+        for results in run.steps(compute, proceed):
+            if not _is_of_proposal(results, proposal["vectors"]):
+                reason = f"generation {count} is of another search or version"
+                raise files.CorruptFileError(run.folder, reason)
+            if results.validation < least:
+                best, least = results.center.values, float(results.validation)
+            row = results.drop_dims("candidate").drop_vars("center")
+            row = row.expand_dims(generation=[count])
+            log = xr.concat([log, row], "generation") if count else row
+            count, simulated = count + 1, simulated + float(results.simulated)
+            report(Progress(0, 0.0))
+            proposal = search.send({str(name): x.values for name, x in results.items()})
+        return self._write(run.folder, best, log)
+
+    def _try_proposal(self, proposal: Proposal, generation: int, run: Run) -> xr.Dataset:
+        """Try the proposal of a generation, and return its results."""
+        times = dict.fromkeys(("simulated", "compile", "run"), 0.0)  # [s]
+
+        def score(candidates: list[Candidates]) -> list[CandidateScores]:
+            scores, timing = evaluate.score_candidates(
+                candidates, self.setting, self.objective, **run.batch_options
+            )
+            for name in times:
+                times[name] += getattr(timing, name)
+            return scores
+
+        results = {**proposal, **self.judge(proposal, generation, score)}
+        times["simulated"] += float(results.pop("simulated", 0.0))
+        values = self.space.changed_values(results["center"])
+        results |= times | {"params": np.array([values[name] for name in self.space.names])}
+        variables = {
+            name: (DIMS.get(name, ()), np.asarray(x, float), {"units": UNITS.get(name, "1")})
+            for name, x in results.items()
+        }
+        return xr.Dataset(variables, {"parameter": list(self.space.names)})
+
+    def _write(self, folder: Path | None, best: np.ndarray, log: xr.Dataset) -> xr.Dataset:
+        """Return the log (generation) with the best parameters, and write both."""
+        params = registry.named_leaves(self.space.params(best))
+        if folder is not None:
+            files.write_json(folder / TUNED, self.space.changed_values(best))
+            columns = log.params.to_pandas().add_prefix("params.")
+            table = log.drop_dims("parameter").to_dataframe().join(columns)
+            files.write_csv(folder / "curve.csv", table)
+        return log.assign(tuned=("parameter", [float(params[x]) for x in self.space.names]))
 
     def intro(self, results: xr.Dataset) -> str:
         names = ", ".join(self.space.names)
@@ -179,16 +248,11 @@ class Tuning(LawQuestion[xr.Dataset]):
     def report(self, results: xr.Dataset, run: Run) -> Sequence[Section]:
         best = int(results.validation.argmin("generation"))
         rates = [tables.percent(float(rate)) for rate in results.validation_success.values]
-        names = ("compile", "run", "simulated", "differentiate")
-        total = {name: float(results[name].sum()) for name in names if name in results}
-        gradients = ""
-        if "differentiate" in total:
-            gradients = f", gradients {total['differentiate']:.1f} s with their compilation"
+        totals = (f"{x} {float(results[x].sum()):,.1f} s" for x in UNITS if x in results)
         text = (
             f"Validation: objective {float(results.validation[0]):.4f} and success {rates[0]} % "
             f"at the start, {float(results.validation[best]):.4f} and {rates[best]} % after "
-            f"{best} of {results.sizes['generation']}. Compile {total['compile']:.1f} s, run "
-            f"{total['run']:.1f} s{gradients}, {total['simulated']:.3g} s simulated."
+            f"{best} of {results.sizes['generation']}. Times: {', '.join(totals)}."
         )
         if run.folder is not None:
             text += f" The law with these parameters is `{self.label},{run.folder / TUNED}`."
@@ -200,69 +264,6 @@ class Tuning(LawQuestion[xr.Dataset]):
         return [Section("Results", text, rows, picture)]
 
 
-def tune(run: Run, tuning: Tuning, generations: int) -> xr.Dataset:
-    """Run a search to its end, in a run folder or in memory, and return its results.
-
-    Every generation is a checkpoint. A resumed search proposes the same vectors again and reads
-    their results from the checkpoints; a damaged checkpoint is computed again. `compile` and `run`
-    [s] are the wall clock of a generation's trials, and `simulated` [s] is its total simulated
-    time.
-
-    Raises:
-      InputError: the folder has generations that this search does not propose.
-    """
-    search = tuning.search()
-    proposal, best, least = next(search), tuning.base, np.inf  # `best` has the least validation
-    log, count, simulated = xr.Dataset(), 0, 0.0
-
-    def report(progress: Progress) -> None:
-        run.callback(replace(progress, simulated=simulated + progress.simulated, rounds=count))
-
-    def proceed(generation: int) -> bool:
-        return generation < generations and not 0 < tuning.budget <= simulated
-
-    def compute(generation: int) -> xr.Dataset:
-        if generation:
-            _write(run.folder, tuning, best, log)
-        return _try_proposal(tuning, proposal, generation, run._replace(callback=report))
-
-    for results in run.steps(compute, proceed):
-        if not _is_of_proposal(results, proposal["vectors"]):
-            reason = f"generation {count} is of another search or version"
-            raise files.CorruptFileError(run.folder, reason)
-        if results.validation < least:
-            best, least = results.center.values, float(results.validation)
-        row = results.drop_vars(set(tuning.DIMS) - {"params"}).expand_dims(generation=[count])
-        log = xr.concat([log, row], "generation") if count else row
-        count, simulated = count + 1, simulated + float(results.simulated)
-        report(Progress(0, 0.0))
-        proposal = search.send({str(name): x.values for name, x in results.items()})
-    return _write(run.folder, tuning, best, log)
-
-
-def _try_proposal(tuning: Tuning, proposal: Proposal, generation: int, run: Run) -> xr.Dataset:
-    """Try the proposal of a generation, and return its results."""
-    times = dict.fromkeys(("simulated", "compile", "run"), 0.0)  # [s]
-
-    def score(candidates: list[Candidates]) -> list[CandidateScores]:
-        scores, timing = evaluate.score_candidates(
-            candidates, tuning.setting, tuning.objective, **run.batch_options
-        )
-        for name in times:
-            times[name] += getattr(timing, name)
-        return scores
-
-    results = {**proposal, **tuning.judge(proposal, generation, score)}
-    times["simulated"] += float(results.pop("simulated", 0.0))
-    values = tuning.space.changed_values(results["center"])
-    results |= times | {"params": np.array([values[name] for name in tuning.space.names])}
-    variables = {
-        name: (tuning.DIMS.get(name, ()), np.asarray(x, float), {"units": UNITS.get(name, "1")})
-        for name, x in results.items()
-    }
-    return xr.Dataset(variables, {"parameter": list(tuning.space.names)})
-
-
 def _is_of_proposal(results: xr.Dataset, vectors: np.ndarray) -> bool:
     """Return whether these are results of the proposed vectors.
 
@@ -272,17 +273,6 @@ def _is_of_proposal(results: xr.Dataset, vectors: np.ndarray) -> bool:
     if "vectors" not in results or results.vectors.shape != vectors.shape:
         return False
     return np.allclose(results.vectors, vectors, rtol=1e-4, atol=1e-4, equal_nan=True)
-
-
-def _write(folder: Path | None, tuning: Tuning, best: np.ndarray, log: xr.Dataset) -> xr.Dataset:
-    """Return the log (generation) with the best parameters, and write both."""
-    params = registry.named_leaves(tuning.space.params(best))
-    if folder is not None:
-        files.write_json(folder / TUNED, tuning.space.changed_values(best))
-        columns = log.params.to_pandas().add_prefix("params.")
-        table = log.drop_dims("parameter").to_dataframe().join(columns)
-        files.write_csv(folder / "curve.csv", table)
-    return log.assign(tuned=("parameter", [float(params[x]) for x in tuning.space.names]))
 
 
 def parse_domains(domain: DomainLike | Sequence[DomainLike]) -> tuple[Domain, ...]:
