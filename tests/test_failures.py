@@ -164,7 +164,7 @@ def synthetic_trials(self, at):
     severe = severity(success, time, distance, *np.zeros((2, len(time))), self.setting.rules)
     columns = {"success": success * 1.0, "time": time, "left": distance, "severity": severe}
     variables = {name: ("world", values) for name, values in columns.items()}
-    return xr.Dataset({"u": (("world", "quantity"), at.u), **variables}, attrs={"wall": 0.1})
+    return xr.Dataset({"u": (("world", "quantity"), at.u), **variables})
 
 
 @pytest.fixture

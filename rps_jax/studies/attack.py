@@ -14,7 +14,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import combinations
-from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
@@ -30,7 +29,6 @@ from rps_jax.analysis.figures.style import Figure, axis_label, tiles, words
 from rps_jax.analysis.report import Picture, Section
 from rps_jax.engines import device
 from rps_jax.errors import InputError
-from rps_jax.record import files
 from rps_jax.record.options import option
 from rps_jax.runs import execution
 from rps_jax.runs.plan import Plan
@@ -42,8 +40,8 @@ from rps_jax.runs.question import (
     count_true,
     name_or_custom,
     seed_of,
-    with_coordinates,
 )
+from rps_jax.runs.results import load
 from rps_jax.studies.probe import Probe
 from rps_jax.trials.progress import Bar, set_phase
 from rps_jax.world import points
@@ -188,18 +186,16 @@ class Attack(DomainQuestion[xr.Dataset], LawQuestion[xr.Dataset]):
             )
             sections.append(Section("Failures in another engine", text))
         if run.folder is not None and results.sizes["elite"]:
-            sections.append(self._worst_section(run.folder / "worlds"))
+            folder = str(run.folder / "worlds")
+            worst = load(folder)
+            text = (
+                f"{count_true(worst.success.values == 0)} of {worst.sizes['world']} fail again in "
+                f"the same engine. `rps film {shlex.quote(folder)} --which hardest --grid 3x4` "
+                "films the worst."
+            )
+            rows = tables.hardest_table(worst, folder, self.worst)
+            sections.append(Section("The worst", text, rows))
         return sections
-
-    def _worst_section(self, folder: Path) -> Section:
-        """Return the table of the worst worlds, with the commands that show them."""
-        results = with_coordinates(files.read_results(folder))
-        failed = count_true(results.success.values == 0)
-        text = (
-            f"{failed} of {results.sizes['world']} fail again in the same engine. `rps film "
-            f"{shlex.quote(str(folder))} --which hardest --grid 3x4` films the worst."
-        )
-        return Section("The worst", text, tables.hardest_table(results, str(folder), self.worst))
 
 
 attack = call_of(Attack)

@@ -158,13 +158,12 @@ class Hardware(LawQuestion[xr.Dataset]):
         base, contact, success = (traces[name].values.astype(float) for name in _TRACED)
         dims = ("object", "target", "path_time", "axis")
         half = np.asarray(self.table.cases[0].base.shell.half, float)
-        time = 0.5 * np.arange(1, traces.sizes["time"] + 1)
         variables = labelled(
             base_path=(dims, base[..., :2], "m", "path of the base"),
             contact_path=(dims, contact, "m", "path of the contact point"),
             path_success=(dims[:2], success.astype(int), "1", "the target of Fig. 7 is reached"),
             half=("axis", half, "m", "half length and half width of the base"),
-            path_time=("path_time", time, "s", "time after the start"),
+            path_time=("path_time", traces.time.values, "s", "time after the start"),
         )
         return xr.Dataset(variables, {"object": list(HARDWARE_OBJECTS), "axis": ["x", "y"]})
 
@@ -226,9 +225,10 @@ def _spread(values: xr.DataArray, digits: int, unit: str) -> str:
 def shift_table(results: xr.Dataset) -> list[list[str]]:
     """Return a row for each shove length: successes of the trials still under way."""
     rows = [["shift", *(words(str(o)) for o in results.object.values)]]
-    successes, trials = counts(results)
-    columns = (results["shift"].values, successes.T, trials.T)
-    for size, *by_object in zip(*columns, strict=True):
+    counted = results.counted > 0
+    trials = (counted & (results.recovered > 0), counted)  # that recover, and under way at the time
+    counts = (x.sum(("side", "target")).values.T for x in trials)
+    for size, *by_object in zip(results["shift"].values, *counts, strict=True):
         pairs = zip(*(x.tolist() for x in by_object), strict=True)
         cells = (f"{n} of {total} ({_interval(n, total)})" for n, total in pairs)
         rows.append([f"{100 * float(size):g} cm", *cells])
@@ -238,13 +238,6 @@ def shift_table(results: xr.Dataset) -> list[list[str]]:
 def _interval(successes: int, trials: int) -> str:
     low, high = statistics.wilson(successes, trials)
     return f"{100 * low:.0f}-{100 * high:.0f} %"
-
-
-def counts(results: xr.Dataset) -> tuple[np.ndarray, np.ndarray]:
-    """Count trials (object, shift) that recover, and those under way at the shove."""
-    counted = results.counted > 0
-    dims = ("side", "target")
-    return (counted & (results.recovered > 0)).sum(dims).values, counted.sum(dims).values
 
 
 def paths_figure(results: xr.Dataset) -> Figure:

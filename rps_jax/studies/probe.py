@@ -1,7 +1,6 @@
 """Probe: outcomes of one law at points of a domain's unit cube, call after call."""
 
 import math
-import time
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -60,17 +59,15 @@ class Probe:
         return results
 
     def _simulate(self, at: Points) -> xr.Dataset:
-        start_time, rules = time.perf_counter(), self.setting.rules
         request = Candidates(stack([self.params]), [self.domain], 0, np.arange(len(at.u)), at)
         options = self.run.batch_options
         (outcome,), _ = outcomes([request], self.setting, capacity=_capacity, **options)
         trials = {name: np.asarray(getattr(outcome, name)[0], float) for name in _STORED}
         trials["left"] = statistics.miss_distance(outcome.min_distance[0], request.distances)
         graded = (trials[x] for x in ("success", "time", "left", "contact_lost_time", "tilt"))
-        trials["severity"] = score.severity(*graded, rules=rules)
+        trials["severity"] = score.severity(*graded, rules=self.setting.rules)
         variables = {name: ("world", values) for name, values in trials.items()}
-        wall = time.perf_counter() - start_time
-        return xr.Dataset({"u": (("world", "quantity"), at.u), **variables}, attrs={"wall": wall})
+        return xr.Dataset({"u": (("world", "quantity"), at.u), **variables})
 
 
 def _capacity(trials: int) -> int:

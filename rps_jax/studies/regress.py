@@ -96,16 +96,13 @@ def success_table(results: xr.Dataset) -> list[list[str]]:
     against = (f"against {law}" for law in known.known.values)
     rows = [["", "successes", *against, "successes where all of them fail"]]
     for law, success in zip(known.known.values, known.values, strict=True):
-        rows.append([f"{law} (file)", _count(success), *[""] * (len(known) + 1)])
+        count = f"{success.sum()} of {success.size}"
+        rows.append([f"{law} (file)", count, *[""] * (len(known) + 1)])
     for law, success in zip(laws.law.values, laws.values, strict=True):
         gains = [f"+{(success & ~x).sum()} -{(~success & x).sum()}" for x in known.values]
         unique = str((success & ~known.values.any(axis=0)).sum())
-        rows.append([str(law), _count(success), *gains, unique])
+        rows.append([str(law), f"{success.sum()} of {success.size}", *gains, unique])
     return rows
-
-
-def _count(success: np.ndarray) -> str:
-    return f"{success.sum()} of {success.size}"
 
 
 def changes(results: xr.Dataset, law: str, against: str, rules: Rules = Rules()) -> list[list[str]]:
