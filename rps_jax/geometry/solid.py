@@ -150,9 +150,7 @@ def extent(solid: Solid, yaw: np.ndarray) -> np.ndarray:
 
 def axes(solid: Solid) -> np.ndarray:
     """Return rotation matrices (n, 3, 3) from principal axes to the object's frame."""
-    w, x, y, z = solid.q_object_body.T
-    rows = vectors.matrix((w, x, y, z))
-    return np.stack([entry for row in rows for entry in row], axis=-1).reshape(-1, 3, 3)
+    return np.moveaxis(np.array(vectors.matrix(solid.q_object_body.T)), -1, 0)
 
 
 def friction_arm(solid: Solid) -> np.ndarray:

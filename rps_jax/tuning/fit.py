@@ -124,6 +124,7 @@ class Fit(LawQuestion[Fitted], DomainQuestion[Fitted], LogsQuestion):
     """
 
     TITLE: ClassVar[str] = "A domain fitted to logs"
+    IGNORED_FIELDS: ClassVar[tuple[str, ...]] = ("logs",)
     QUICK: ClassVar[Mapping[str, Any]] = {"worlds": 768, "window": 20.0}
 
     law: LawLike = "rps"
@@ -180,12 +181,8 @@ class Fit(LawQuestion[Fitted], DomainQuestion[Fitted], LogsQuestion):
 
     def fields_as_json(self) -> dict[str, Any]:
         """Fields as JSON; logs by the digests of their values."""
-        digests = []
-        for raw in self.raw_logs:
-            content = b"".join(np.ascontiguousarray(v).tobytes() for v in raw.columns.values())
-            digests.append(files.sha256(content))
-        without_logs = dataclasses.replace(self, logs=())
-        return super(Fit, without_logs).fields_as_json() | {"logs": digests}
+        contents = (b"".join(v.tobytes() for v in raw.columns.values()) for raw in self.raw_logs)
+        return super().fields_as_json() | {"logs": list(map(files.sha256, contents))}
 
     def answer(self, run: Run) -> Fitted:
         """Simulate the missing worlds, train the posterior, and sample it for the logs."""
