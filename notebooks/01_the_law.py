@@ -21,7 +21,7 @@
 import drawing
 
 from rps_jax import RPSParams
-from rps_jax.analysis import figures
+from rps_jax.analysis.figures.paper import profile
 
 paper = RPSParams.paper()
 
@@ -33,7 +33,7 @@ paper = RPSParams.paper()
 # contact.
 
 # %%
-figures.profile(paper)
+profile(paper)
 
 # %% [markdown]
 # The curve has three regimes. Within about 5 cm of the centre $a_r$ is nearly zero, and the base

@@ -19,7 +19,8 @@ import drawing
 from IPython.display import Markdown
 
 import rps_jax
-from rps_jax.analysis import figures, tables
+from rps_jax.analysis import tables
+from rps_jax.analysis.figures.paper import min_distance
 
 run = "runs/table"
 results = rps_jax.load(run)
@@ -50,7 +51,7 @@ print(tables.summary(results))
 # the smallest distance between contact and target, and the number counts successes.
 
 # %%
-figures.min_distance(results)
+min_distance(results)
 
 # %% [markdown]
 # - NPS reaches targets ahead: all but two of its successes are within 27 degrees of the initial

@@ -25,7 +25,8 @@ import pandas as pd
 from IPython.display import Markdown
 
 import rps_jax
-from rps_jax.analysis import figures, statistics, tables
+from rps_jax.analysis import statistics, tables
+from rps_jax.analysis.figures.sweeps import success_curves
 
 run = "runs/compare/wide"
 results = rps_jax.load(run)
@@ -64,7 +65,7 @@ drawing.failures(results, max_lost)
 # worlds. The lines below the panels explain the choice, and name the other quantities.
 
 # %%
-figures.success_curves(results)
+success_curves(results)
 
 # %% [markdown]
 # Most of these curves are flat within their intervals, and one dip in many curves may be chance.

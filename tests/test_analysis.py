@@ -8,7 +8,9 @@ import xarray as xr
 from helpers import results_of
 from scipy import stats
 
-from rps_jax.analysis import figures, report, statistics, tables
+from rps_jax.analysis import report, statistics, tables
+from rps_jax.analysis.figures.style import Figure
+from rps_jax.analysis.figures.sweeps import success_curves
 from rps_jax.analysis.report import Picture, Section
 from rps_jax.analysis.statistics import Bins
 from rps_jax.runs.question import Run
@@ -147,7 +149,7 @@ def test_the_figure_shows_the_influential_quantities_and_names_the_rest(drawn):
     influences = statistics.influences(results)
     assert [x.name for x in influences[:2]] == ["yaw", "mass"]
     assert [x.q < 0.05 for x in influences] == [True] * 2 + [False] * 6
-    figure = drawn(figures.success_curves, results)
+    figure = drawn(success_curves, results)
     titles = [ax.get_title() for ax in figure.axes]
     assert len(titles) == 2
     assert titles[0].startswith("spread 49.6 %, q = ")  # 1/4 (1 - 7/399), as a deviation
@@ -165,7 +167,7 @@ def test_coinciding_curves_are_all_visible(drawn):
     """Equal rates of two laws have different marks, side by side on the page."""
     success = np.arange(400) < 370
     results = random_worlds(np.stack([success, success]), mass=np.arange(400) * 1.0)
-    figure = drawn(figures.success_curves, results)
+    figure = drawn(success_curves, results)
     marks = [bars.lines[0] for bars in figure.axes[0].containers]
     low, high = figure.axes[0].get_xlim()
     assert low < 30 < 370 < high
@@ -217,7 +219,7 @@ def test_speeds_are_drawn_by_batch(drawn):
 
 
 def test_a_report_is_one_self_contained_html_file(tmp_path):
-    picture = Picture("dot", lambda: np.zeros((2, 3, 3), np.uint8))
+    picture = Picture("dot", lambda: Figure(figsize=(0.1, 0.1)))
     sections = [Section("Numbers", "in *words*", [["a", "b"], ["1", "2"]], picture)]
     path = report.write_report(tmp_path, "A <title>", "intro", sections)
     page = (tmp_path / "report.html").read_text()

@@ -9,8 +9,6 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
-import numpy as np
-
 from rps_jax.analysis import tables
 from rps_jax.record import files
 
@@ -31,17 +29,12 @@ class Picture(NamedTuple):
     """Figure of a report, drawn on demand."""
 
     name: str  # file name of the PNG without its suffix
-    draw: Callable[[], Figure | np.ndarray]  # or an image (height, width, 3) uint8
+    draw: Callable[[], Figure]
 
     def png(self) -> bytes:
         """Return the PNG file; equal figures have equal files."""
-        drawn, file = self.draw(), io.BytesIO()
-        if isinstance(drawn, np.ndarray):
-            from PIL import Image
-
-            Image.fromarray(drawn).save(file, "png")
-        else:
-            drawn.savefig(file, dpi=150, metadata={"Software": None})
+        file = io.BytesIO()
+        self.draw().savefig(file, dpi=150, metadata={"Software": None})
         return file.getvalue()
 
     _repr_png_ = png  # for Jupyter

@@ -82,10 +82,10 @@ class Trace:
 
     def plot(self, path: str | Path | None = None) -> Figure:
         """Draw the trial as Fig. 6 of the paper does; with a path it is written there, too."""
-        from rps_jax.analysis import figures
+        from rps_jax.analysis.figures.paper import one_trial
         from rps_jax.analysis.report import save
 
-        drawn = figures.one_trial(self.data, self.title)
+        drawn = one_trial(self.data, self.title)
         if path is not None:
             save(drawn, Path(path))
         return drawn
@@ -96,7 +96,7 @@ class Trace:
         Raises:
           VideoError: this machine cannot draw.
         """
-        from rps_jax.analysis import figures
+        from rps_jax.analysis.figures.paper import stills
         from rps_jax.world import rendering
 
         snapshots = self.trajectory.snapshots
@@ -105,7 +105,7 @@ class Trace:
         with rendering.open_renderers(tiles, _STILL, "oblique") as renderers:
             poses = zip(renderers, snapshots.qpos[shown], strict=True)
             images = [renderer.draw(qpos, rendering.NO_CONTACT) for renderer, qpos in poses]
-        return figures.stills(images, [f"{snapshots.time[i]:.0f} s" for i in shown])
+        return stills(images, [f"{snapshots.time[i]:.0f} s" for i in shown])
 
     def film(
         self,

@@ -7,13 +7,14 @@ import functools
 import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
 import xarray as xr
 
-from rps_jax.analysis import figures, statistics, tables
+from rps_jax.analysis import statistics, tables
 from rps_jax.analysis.report import Picture, Section
 from rps_jax.control.registry import LawsLike
 from rps_jax.engines.device import Device
@@ -108,7 +109,10 @@ def plan_sections(plan: Plan, results: xr.Dataset, folder: Path | None) -> list[
         rows = tables.difference_table(results)
         sections.append(Section("Differences, world by world", "", rows))
     if statistics.varied_quantities(results):
-        picture = Picture("success", lambda: figures.success_curves(results))
+        # Imported late: matplotlib takes half a second.
+        from rps_jax.analysis.figures.sweeps import success_curves
+
+        picture = Picture("success", partial(success_curves, results))
         sections.append(Section("Success against the drawn quantities", "", (), picture))
     text = "Worlds in which most laws fail, and the contact point stays farthest from the target."
     rows = tables.hardest_table(results, "RUN" if folder is None else str(folder))

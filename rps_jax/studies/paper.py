@@ -12,7 +12,7 @@ from typing import ClassVar
 import numpy as np
 import xarray as xr
 
-from rps_jax.analysis import figures
+from rps_jax.analysis.figures import paper as figures
 from rps_jax.analysis.report import Picture, Section
 from rps_jax.control.laws.rps import RPSParams
 from rps_jax.record import files

@@ -10,7 +10,8 @@ from typing import ClassVar
 import xarray as xr
 
 from rps_jax import errors
-from rps_jax.analysis import figures, tables
+from rps_jax.analysis import tables
+from rps_jax.analysis.figures.paper import min_distance
 from rps_jax.analysis.report import Picture, Section
 from rps_jax.control.registry import LawsLike
 from rps_jax.runs.push import case_options
@@ -95,7 +96,7 @@ table = call_of(Table)
 def sections(outcomes: xr.Dataset) -> list[Section]:
     """Return the sections with Table II beside the paper's, and Fig. 5."""
     text = "  \n".join(tables.summary(outcomes).splitlines())
-    picture = Picture("min_distance", partial(figures.min_distance, outcomes))
+    picture = Picture("min_distance", partial(min_distance, outcomes))
     return [
         Section("Table II: successes", text, tables.table_ii(outcomes)),
         Section("Fig. 5: least distance of contact to target", "", (), picture),

@@ -19,7 +19,8 @@ import numpy as np
 import xarray as xr
 
 from rps_jax import errors
-from rps_jax.analysis import figures, tables
+from rps_jax.analysis import tables
+from rps_jax.analysis.figures import tuning as figures
 from rps_jax.analysis.report import Picture, Section
 from rps_jax.control import registry
 from rps_jax.control.base import LawParams
