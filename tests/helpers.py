@@ -197,11 +197,16 @@ def box(x: Any, y: Any, half: float = 0.2, yaw: Any = 0.0) -> Footprint:
     return fp.place(fp.rectangle(half, half), jnp.array([x, y]), jnp.float32(yaw))
 
 
+def extent(footprint: Footprint, along: Any) -> jax.Array:
+    """Return the support function: the furthest reach [m] in the unit direction `along` (2,)."""
+    return jnp.max(footprint.vertices @ jnp.asarray(along)) + footprint.radius
+
+
 @jax.jit
 def place_before_the_front(shape: Footprint, yaw: Any, y: Any, gap: Any) -> Footprint:
     """Return `shape` turned by `yaw`, with its origin at `y` and `gap` to the front face."""
     turned = fp.place(shape, jnp.zeros(2), yaw)
-    x = FRONT + gap + fp.extent(turned, jnp.array([-1.0, 0.0]))
+    x = FRONT + gap + extent(turned, (-1.0, 0.0))
     return fp.place(turned, jnp.stack([x, jnp.asarray(y, x.dtype)]), 0.0)
 
 

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import SEEDS, property_test, refusals
+from helpers import SEEDS, extent, property_test, refusals
 from scipy.spatial import ConvexHull, cKDTree
 
 from rps_jax.geometry import footprint as fp
@@ -294,7 +294,7 @@ def test_derivatives_of_a_crossing_are_finite_if_the_line_only_grazes():
     ],
 )
 def test_the_extent_by_hand(shape, along, expected):
-    assert fp.extent(shape, jnp.array(along)) == pytest.approx(expected)
+    assert extent(shape, along) == pytest.approx(expected)
 
 
 @every_kind

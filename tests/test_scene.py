@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
+from helpers import extent
 from staging import simulate, stack, staged, step_in_c
 
 from rps_jax.engines import mjx as mjx_engine
@@ -72,7 +73,7 @@ def test_objects_have_the_papers_mass_and_size_and_stand_on_the_ground(name, mas
     loaded = load(name)
     assert loaded.physics.body("object").mass[0] == pytest.approx(mass)
     for axis, half in zip(np.eye(2), half_extents, strict=True):
-        assert float(fp.extent(loaded.footprint, jnp.asarray(axis))) == pytest.approx(half)
+        assert float(extent(loaded.footprint, axis)) == pytest.approx(half)
     geom = loaded.model.geom("object")
     half_height = geom.size[2] if geom.type[0] == mujoco.mjtGeom.mjGEOM_BOX else geom.size[1]
     assert loaded.model.body("object").pos[2] == pytest.approx(half_height)

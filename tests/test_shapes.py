@@ -59,7 +59,7 @@ def test_a_law_sees_batched_worlds_as_single_worlds():
 CALLS = [
     lambda: planar.rotate(jnp.zeros(2), jnp.zeros((3, 2))),
     lambda: fp.place(fp.circle(0.1), jnp.zeros(3), jnp.zeros(())),
-    lambda: fp.extent(fp.Footprint(jnp.zeros((4, 3)), jnp.zeros(())), jnp.zeros(2)),
+    lambda: fp.circumradius(fp.Footprint(jnp.zeros((4, 3)), jnp.zeros(()))),
     lambda: rps.saturate(PAPER, Twist(jnp.zeros(2), jnp.zeros(3), jnp.zeros(2))),
     lambda: trial.object_pose(jnp.zeros(9)),
     lambda: IdealSkin().sense(TWO_OF_THREE, fp.circle(0.1), 0.02),

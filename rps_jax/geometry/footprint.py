@@ -64,11 +64,6 @@ def place(footprint: Footprint, position: Float[Array, "2"], yaw: Scalar) -> Foo
     return footprint._replace(vertices=planar.rotate(yaw, footprint.vertices) + position)
 
 
-def extent(footprint: Footprint, along: Float[Array, "2"]) -> Float[Array, ""]:
-    """Return the support function: the furthest reach [m] in the unit direction `along`."""
-    return jnp.max(footprint.vertices @ along) + footprint.radius
-
-
 def circumradius(footprint: Footprint) -> Float[Array, ""]:
     """Return the greatest distance [m] of the outline from the object's origin."""
     return jnp.max(planar.norm(footprint.vertices)) + footprint.radius
