@@ -21,7 +21,7 @@
 import drawing
 
 from rps_jax import RPSParams
-from rps_jax.analysis.figures.paper import profile
+from rps_jax.analysis.figures import paper as figures
 
 paper = RPSParams.paper()
 
@@ -33,7 +33,7 @@ paper = RPSParams.paper()
 # contact.
 
 # %%
-profile(paper)
+figures.profile(paper)
 
 # %% [markdown]
 # The curve has three regimes. Within about 5 cm of the centre $a_r$ is nearly zero, and the base

@@ -20,7 +20,7 @@ from IPython.display import Markdown
 
 import rps_jax
 from rps_jax.analysis import tables
-from rps_jax.analysis.figures.paper import min_distance
+from rps_jax.analysis.figures import paper as figures
 
 run = "runs/table"
 results = rps_jax.load(run)
@@ -51,7 +51,7 @@ print(tables.summary(results))
 # the smallest distance between contact and target, and the number counts successes.
 
 # %%
-min_distance(results)
+figures.min_distance(results)
 
 # %% [markdown]
 # - NPS reaches targets ahead: all but two of its successes are within 27 degrees of the initial

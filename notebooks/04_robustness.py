@@ -26,7 +26,7 @@ from IPython.display import Markdown
 
 import rps_jax
 from rps_jax.analysis import statistics, tables
-from rps_jax.analysis.figures.sweeps import success_curves
+from rps_jax.analysis.figures import sweeps as figures
 
 run = "runs/compare/wide"
 results = rps_jax.load(run)
@@ -65,7 +65,7 @@ drawing.failures(results, max_lost)
 # worlds. The lines below the panels explain the choice, and name the other quantities.
 
 # %%
-success_curves(results)
+figures.success_curves(results)
 
 # %% [markdown]
 # Most of these curves are flat within their intervals, and one dip in many curves may be chance.

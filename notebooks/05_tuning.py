@@ -29,7 +29,7 @@ from IPython.display import Markdown
 import rps_jax
 from rps_jax import RPSParams
 from rps_jax.analysis import tables
-from rps_jax.analysis.figures.tuning import search
+from rps_jax.analysis.figures import tuning as figures
 from rps_jax.robot.skin import IdealSkin
 from rps_jax.trials.case import Case
 from rps_jax.tuning.space import Space
@@ -61,7 +61,7 @@ def labelled(log):
 # %%
 log = read_log("coarse")
 names = tuple(log[0]["params"])
-search(labelled(log))
+figures.search(labelled(log))
 
 # %% [markdown]
 # In seven generations the objective in the validation worlds halves, from 0.31 to 0.15, and
@@ -77,7 +77,7 @@ search(labelled(log))
 # compared with those above.
 
 # %%
-search(labelled(read_log("fine")))
+figures.search(labelled(read_log("fine")))
 
 # %% [markdown]
 # Validation falls from 0.164 to 0.117 at generation 7, whose mean we chose. The values jump from
@@ -93,7 +93,7 @@ search(labelled(read_log("fine")))
 # force (the domain `real`).
 
 # %%
-search(labelled(read_log("robots")))
+figures.search(labelled(read_log("robots")))
 
 # %% [markdown]
 # Validation falls from 0.100 to 0.085 in one generation, and success there rises from 94.3 to

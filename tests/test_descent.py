@@ -77,7 +77,7 @@ def test_a_law_without_a_smooth_form_is_refused():
 def test_steps_go_downhill_and_stay_within_the_clip():
     rule = TuneGrad("rps", learning_rate=0.5, clip=1.0, steps=10).rule
     change, state = rule.update(jnp.array([30.0, 40.0]), rule.init(jnp.zeros(2)), jnp.zeros(2))
-    np.testing.assert_allclose(change, [-0.5, -0.5], rtol=1e-6)  # the first step of Adam
+    np.testing.assert_allclose(change, [-0.5, -0.5], rtol=1e-4)  # the first step of Adam
     # Its first moment is a tenth of the clipped gradient.
     np.testing.assert_allclose(optax.tree.get(state, "mu"), [0.06, 0.08], rtol=1e-6)
 
