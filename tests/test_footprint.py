@@ -21,7 +21,7 @@ distances = jax.jit(jax.vmap(fp.signed_distance))  # (B, P) [m]
 slopes = jax.jit(jax.vmap(jax.vmap(jax.grad(fp.signed_distance, argnums=1), (None, 0))))
 shape_slopes = jax.jit(jax.vmap(jax.vmap(jax.grad(fp.signed_distance), (None, 0))))
 crossings = jax.jit(jax.vmap(fp.crossing))
-reaches = jax.jit(jax.vmap(fp.extent))
+reaches = jax.jit(jax.vmap(extent))
 
 
 def random_rectangles(rng) -> Footprint:

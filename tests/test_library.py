@@ -103,8 +103,10 @@ def test_a_table_equals_that_of_the_command(tmp_path):
 
 # --- examples ------------------------------------------------------------------------------
 
-API = {name: getattr(rps_jax, name) for name in rps_jax.__all__}
-API |= {name: getattr(import_module(module), name) for module, name in addresses()}
+API = {name: getattr(import_module(module), name) for module, name in addresses()}
+API |= {
+    name: getattr(rps_jax, name) for name in rps_jax.__all__
+}  # such as `paper`, before a module
 PUBLIC = [name for name, entry in API.items() if callable(entry)]
 OPTIONS = doctest.ELLIPSIS | doctest.IGNORE_EXCEPTION_DETAIL
 
