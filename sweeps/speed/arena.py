@@ -11,10 +11,7 @@ an engine is the distance of its final poses from those of C MuJoCo with small s
 
 from __future__ import annotations
 
-import json
-import os
-import subprocess
-import sys
+import multiprocessing
 import tempfile
 import time
 from collections.abc import Generator, Mapping, Sequence
@@ -45,7 +42,6 @@ from sweeps.study_base import (
     text_table,
 )
 
-_FOLDER = Path(__file__).parent
 _COLUMNS = {
     "engine": "{engine}",
     "version": "{version}",
@@ -149,8 +145,7 @@ class Arena(SpeedStudy[xr.Dataset], QuickStudy[xr.Dataset]):
         self, races: Sequence[tuple[str, int]], folder: Path, truth: np.ndarray
     ) -> Generator[xr.Dataset]:
         """Yield the rows: all engines are prepared first, and then timed in turn."""
-        environment = _environment(self.peers)
-        processes = [_Process(*race, folder, self.seconds, environment) for race in races]
+        processes = [_Process(*race, folder, self.seconds, self.peers) for race in races]
         try:
             until = time.perf_counter() + self.limit
             for process in processes:
@@ -240,52 +235,35 @@ def mjcf() -> str:
 # --- the processes -------------------------------------------------------------------------
 
 
-def _environment(peers: Path | None) -> dict[str, str]:
-    """Return the environment of an engine's process, with the third-party packages last."""
-    paths = [str(_FOLDER.parents[1]), os.environ.get("PYTHONPATH", ""), str(peers or "")]
-    return os.environ | {
-        "PYTHONPATH": os.pathsep.join(filter(None, paths)),
-        "XLA_PYTHON_CLIENT_PREALLOCATE": "false",
-    }
-
-
 class _Process:
     """The process of an engine."""
 
-    def __init__(
-        self, name: str, count: int, folder: Path, seconds: float, environment: Mapping[str, str]
-    ):
+    def __init__(self, name: str, count: int, folder: Path, seconds: float, peers: Path | None):
         """Start the process."""
-        words = [name, str(folder), str(seconds), str(count)]
         self.name, self.count, self.failed, self.ready = name, count, "", np.nan
-        self._output = folder / f"{part_name(name, count)}.txt"
-        self._errors = self._output.with_suffix(".err")
-        with self._output.open("w") as output, self._errors.open("w") as errors_:
-            self._child = subprocess.Popen(
-                [sys.executable, str(_FOLDER / "racers.py"), *words], env=environment, text=True,
-                stdin=subprocess.PIPE, stdout=output, stderr=errors_,
-            )  # fmt: skip
+        context = multiprocessing.get_context("spawn")
+        self._pipe, pipe = context.Pipe()
+        inputs = name, folder, seconds, count, peers, pipe
+        self._child = context.Process(target=racers.race, args=inputs, daemon=True)
+        self._child.start()
+        pipe.close()
 
-    def _message(self, index: int, until: float) -> dict[str, Any] | None:
+    def _message(self, until: float) -> dict[str, Any] | None:
         """Wait for a message of the process; return None and set `failed` if there is none."""
-        while True:
-            ended = self._child.poll() is not None
-            lines = self._output.read_text().splitlines(keepends=True)
-            messages = [x for x in lines if x.startswith("{") and x.endswith("\n")]
-            if len(messages) > index:
-                return json.loads(messages[index])
-            if ended:
-                last = self._errors.read_text().strip().splitlines()[-1:]
-                self.failed = " ".join(last) or f"ended with {self._child.returncode}"
-                return None
-            if time.perf_counter() > until:
-                self.failed = "exceeded the time limit"
-                return None
-            time.sleep(0.05)
+        try:
+            in_time = self._pipe.poll(max(0.0, until - time.perf_counter()))
+            message = self._pipe.recv() if in_time else "exceeded the time limit"
+        except EOFError:
+            self._child.join()
+            message = f"ended with {self._child.exitcode}"
+        if isinstance(message, str):
+            self.failed = message
+            return None
+        return message
 
     def prepare(self, until: float) -> None:
         """Wait until the engine is ready."""
-        if (message := self._message(0, until)) is not None:
+        if (message := self._message(until)) is not None:
             self.ready = message["ready"]
         else:
             self.end()
@@ -294,16 +272,15 @@ class _Process:
         """Run the engine and return its row."""
         output = None
         if not self.failed:
-            assert self._child.stdin is not None
-            print("go", file=self._child.stdin, flush=True)
-            output = self._message(1, until)
+            self._pipe.send("go")
+            output = self._message(until)
         self.end()
         return _row(self, output or {"poses": []}, truth)
 
     def end(self) -> None:
         """Kill the process if it is running."""
         self._child.kill()
-        self._child.wait()
+        self._child.join()
 
 
 def _row(process: _Process, output: Mapping[str, Any], truth: np.ndarray) -> xr.Dataset:

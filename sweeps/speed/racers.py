@@ -1,10 +1,10 @@
 """Process of the arena for a single engine, which steps all worlds as fast as possible.
 
-    python racers.py ENGINE FOLDER SECONDS WORLDS
+`race` is its function. `FOLDER` holds `scene.xml` and `starts.npy`.
 
-`FOLDER` holds `scene.xml` and `starts.npy`. The process compiles, prints `ready`, waits for
-a line, and then prints its speed and the final poses of the objects. It imports this project for
-the project's engines only, so that other engines can have a separate environment.
+    python racers.py FOLDER SECONDS INDEX
+
+runs one trial in C MuJoCo and prints the final pose of the object.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -100,7 +101,7 @@ def single(task: Task) -> Racer:
     """Start a process per trial, with one trial per core at a time."""
     cores = os.cpu_count() or 1
     worlds = min(len(task.qpos), 8 * cores)
-    words = [sys.executable, __file__, "trial", str(task.scene.parent), str(task.seconds)]
+    words = [sys.executable, __file__, str(task.scene.parent), str(task.seconds)]
 
     def trial(index: int) -> list[float]:
         return json.loads(subprocess.check_output([*words, str(index)], text=True))
@@ -317,10 +318,6 @@ RACERS: dict[str, tuple[Callable[[Task], Racer], str]] = {
 ON_CORES = ("one process a trial", "C MuJoCo, rollout")  # these choose the number of worlds
 
 
-def _say(**values: Any) -> None:
-    print(json.dumps(values), flush=True)
-
-
 def _version(package: str) -> str:
     """Return the version of a package, or "" if it runs from its sources."""
     try:
@@ -329,34 +326,40 @@ def _version(package: str) -> str:
         return ""
 
 
-def race(name: str, folder: Path, seconds: float, count: int) -> None:
-    """Prepare an engine for a number of worlds, wait for a line, and time it."""
-    prepare, package = RACERS[name]
-    start, starts = time.perf_counter(), np.load(folder / "starts.npy")
-    qpos = starts[np.arange(count) % len(starts)]
+def race(
+    name: str, folder: Path, seconds: float, count: int, peers: Path | None, pipe: Connection
+) -> None:
+    """Prepare an engine for a number of worlds, wait for a message, and time the engine.
+
+    The process sends a message when the engine is ready, and a message with the results. If the
+    engine fails, it sends the reason.
+    """
+    sys.path += [str(peers)] if peers else []
+    os.environ["XLA_PYTHON_CLIENT_PREALLOCATE"] = "false"
     try:
+        start, starts = time.perf_counter(), np.load(folder / "starts.npy")
+        qpos = starts[np.arange(count) % len(starts)]
+        prepare, package = RACERS[name]
         racer = prepare(Task(folder / "scene.xml", qpos, seconds))
+        racer.warm()
+        pipe.send({"ready": time.perf_counter() - start})
+        pipe.recv()
+        times, poses = [], np.empty(0)
+        while len(times) < _GOES and sum(times) < _ENOUGH:
+            start = time.perf_counter()
+            poses = racer.go()
+            times.append(time.perf_counter() - start)
+        rate, final = racer.worlds * seconds / min(times), poses[: min(len(starts), racer.worlds)]
+        version = _version(package)
+        pipe.send({"worlds": racer.worlds, "rate": rate, "version": version, "poses": final})
     except ModuleNotFoundError as error:
-        sys.exit(f"{error.name} is not installed")
-    racer.warm()
-    _say(ready=time.perf_counter() - start)
-    input()
-    times, poses = [], np.empty(0)
-    while len(times) < _GOES and sum(times) < _ENOUGH:
-        start = time.perf_counter()
-        poses = racer.go()
-        times.append(time.perf_counter() - start)
-    rate, count_poses = racer.worlds * seconds / min(times), min(len(starts), racer.worlds)
-    final = poses[:count_poses].tolist()
-    _say(worlds=racer.worlds, rate=rate, version=_version(package), poses=final)
+        pipe.send(f"{error.name} is not installed")
+    except Exception as error:  # the failure of one engine must not stop the others
+        pipe.send(f"{type(error).__name__}: {error}")
 
 
 if __name__ == "__main__":
-    name, folder, seconds, count = sys.argv[1:]
-    if name == "trial":
-        xml, starts = Path(folder) / "scene.xml", np.load(Path(folder) / "starts.npy")
-        task = Task(xml, starts, float(seconds))
-        pose = in_c(_model(task), starts[int(count) % len(starts)], task.seconds)
-        print(json.dumps(pose.tolist()))
-    else:
-        race(name, Path(folder), float(seconds), int(count))
+    folder, seconds, index = sys.argv[1:]
+    task = Task(Path(folder) / "scene.xml", np.load(Path(folder) / "starts.npy"), float(seconds))
+    pose = in_c(_model(task), task.qpos[int(index) % len(task.qpos)], task.seconds)
+    print(json.dumps(pose.tolist()))
