@@ -125,21 +125,14 @@ def run_conditions(
             results = outcome_dataset(
                 outcome, grid.laws, grid.objects, tuple(grid.friction), grid.targets
             )
-            results.attrs = {
-                "run_as": options[name],
-                "run_time": timing.run * share,
-                "simulated": timing.simulated * share,
-            }
+            costs = {"run_time": timing.run * share, "simulated": timing.simulated * share}
+            results = results.assign_coords(costs).assign_attrs(run_as=options[name])
             if parts is not None:
                 parts.put(name, files.encode_results(results))
             done[name] = results
-    chosen = [done[name] for name in conditions]
-    joined = xr.concat(
-        [results.drop_attrs(deep=False) for results in chosen],
-        xr.DataArray(list(conditions), dims="condition", name="condition"),
-    )
-    for name in ("run_time", "simulated"):
-        joined.coords[name] = "condition", [results.attrs[name] for results in chosen]
+    chosen = [done[name].drop_attrs(deep=False) for name in conditions]
+    index = xr.IndexVariable("condition", list(conditions))
+    joined = xr.concat(chosen, index, coords=["run_time", "simulated"])
     return joined.assign_coords(what=("condition", [c.what for c in conditions.values()]))
 
 

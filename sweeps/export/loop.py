@@ -65,10 +65,8 @@ def in_the_loop(name: str, folder: Path) -> Any:
     def step(_: Any, state: Any, obs: Any) -> Any:
         leaves, tree = jax.tree.flatten(state)
         shapes = [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in leaves]
-        out, inputs = (
-            (shapes, jax.ShapeDtypeStruct((3,), np.float32)),
-            (leaves, jax.tree.leaves(obs)),
-        )
+        out = shapes, jax.ShapeDtypeStruct((3,), np.float32)
+        inputs = leaves, jax.tree.leaves(obs)
         next_state, twist = jax.pure_callback(
             call_native, out, *inputs, vmap_method="broadcast_all"
         )

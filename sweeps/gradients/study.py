@@ -202,19 +202,16 @@ def repeats(study: Gradients, name: str) -> Iterator[Estimate]:
 
 def _measure(study: Gradients, name: str, estimates: dict[str, xr.Dataset]) -> xr.Dataset:
     """Return the repeated estimates of one estimator, or the truth."""
-    if name == TRUTH:
-        all_of = [truth(study)]
-    elif name == "combined":
+    if name == "combined":
         pair: Any = [
             Estimate(*(jnp.asarray(estimates[n][f].values) for f in Estimate._fields))
             for n in ("reverse", "evolution")
         ]
-        combined = jax.vmap(estimators.combine)(*pair)
-        all_of = [jax.tree.map(lambda leaf, r=r: leaf[r], combined) for r in range(study.repeats)]
+        leaves = jax.device_get(jax.vmap(estimators.combine)(*pair))
     else:
-        all_of = list(repeats(study, name))
+        all_of = [truth(study)] if name == TRUTH else repeats(study, name)
+        leaves = jax.tree.map(lambda *x: np.stack(x), *jax.device_get(list(all_of)))
     dims = ("repeat", "parameter", "horizon")
-    leaves = jax.tree.map(lambda *x: np.stack(x), *jax.device_get(all_of))
     return xr.Dataset(
         {field: (dims, leaf) for field, leaf in leaves._asdict().items()},
         {"parameter": list(study.space.names), "horizon": ("horizon", list(study.horizons))},

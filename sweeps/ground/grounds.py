@@ -112,17 +112,10 @@ def run(
       InputError: the folder holds a ground of the same name that was run otherwise.
     """
     parts = None if folder is None else Checkpoints(folder)
-    progress, options, datasets = (
-        SequentialProgress(callback),
-        f"{tuple(objects)} {tuple(offsets)}",
-        [],
-    )
-    limit = load_or_compute(
-        parts,
-        LIMIT,
-        f"{options} {HEIGHTS} {steps}",
-        partial(_limit, objects, offsets, steps),
-    )
+    progress, datasets = SequentialProgress(callback), []
+    options = f"{tuple(objects)} {tuple(offsets)}"
+    compute = partial(_limit, objects, offsets, steps)
+    limit = load_or_compute(parts, LIMIT, f"{options} {HEIGHTS} {steps}", compute)
     for name in names:
         cases = list(itertools.product(objects, offsets, GROUNDS[name].speeds))
         run_as = f"{options} {replace(GROUNDS[name], what='')!r}"
@@ -155,9 +148,8 @@ def _pushes(
         results.append(pushes.in_mujoco(targets[name], offset, speed, physics))
         simulated += DISTANCE / speed
         callback(Progress(len(results), simulated))
-    coords = {
-        dim: list(dict.fromkeys(x)) for dim, x in zip(_DIMS, zip(*cases, strict=True), strict=True)
-    }
+    columns = zip(_DIMS, zip(*cases, strict=True), strict=True)
+    coords = {dim: list(dict.fromkeys(values)) for dim, values in columns}
     return _dataset(Pushes._fields, results, coords)
 
 

@@ -15,7 +15,6 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
-import xarray as xr
 
 from rps_jax import errors
 from rps_jax.analysis import statistics
@@ -77,7 +76,7 @@ class Learned(Study[list[list[Any]]]):
         """Return the rows, and the curve of each run."""
         tables = [Table(results, _NOTE, COLUMNS, title="Runs")]
         for folder, (network, *_) in zip(self.runs, results, strict=True):
-            draw = partial(learn.figure_of, curve_of(Path(folder)))
+            draw = partial(learn.figure_of, files.read_results(Path(folder)))
             picture = Picture(f"learned_{network.strip('`')}", draw)
             tables.append(Table((), title=str(folder), picture=picture))
         return tables
@@ -86,14 +85,9 @@ class Learned(Study[list[list[Any]]]):
 learned = call_of(Learned)
 
 
-def curve_of(folder: Path) -> xr.Dataset:
-    """Return the values of a run after each update."""
-    return files.read_dataset(folder / "results.nc")
-
-
 def row(folder: Path) -> list[Any]:
     """Return the row of a run, for the law with the best validation."""
-    curve, manifest = curve_of(folder), run_folder.read_manifest(folder)
+    curve, manifest = files.read_results(folder), run_folder.read_manifest(folder)
     environment = provenance.read_environment(folder)
     judged = curve.dropna("update", subset=["validation"])
     rates = judged.validation.values

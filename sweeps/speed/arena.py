@@ -270,12 +270,12 @@ class _Process:
 
     def row(self, until: float, truth: np.ndarray) -> xr.Dataset:
         """Run the engine and return its row."""
-        output = None
+        output: dict[str, Any] = {"version": "", "worlds": self.count, "rate": np.nan, "poses": []}
         if not self.failed:
             self._pipe.send("go")
-            output = self._message(until)
+            output |= self._message(until) or {}
         self.end()
-        return _row(self, output or {"poses": []}, truth)
+        return _row(self, output, truth)
 
     def end(self) -> None:
         """Kill the process if it is running."""
@@ -291,9 +291,8 @@ def _row(process: _Process, output: Mapping[str, Any], truth: np.ndarray) -> xr.
         true = truth[np.arange(len(poses)) % len(truth)]
         error = np.linalg.norm(poses[:, :2] - true[:, :2], axis=1)
         turned = np.abs((_yaw(poses) - _yaw(true) + np.pi) % (2 * np.pi) - np.pi)
-    default = {"version": "", "worlds": process.count, "rate": np.nan}
     return xr.Dataset({
-        **{name: output.get(name, value) for name, value in default.items()},
+        **{name: output[name] for name in ("version", "worlds", "rate")},
         "error": np.median(error), "largest": np.max(error), "turned": np.median(turned),
         "engine": process.name, "ready": process.ready, "why": process.failed,
     })  # fmt: skip
