@@ -170,13 +170,7 @@ def starts(slider: SliderName, grid: Cells) -> np.ndarray:
     return qpos
 
 
-def worlds(
-    slider: SliderName,
-    grid: Cells,
-    engine: EngineName,
-    params: PublishedForcePushParams = PARAMS,
-    physics: Physics = PHYSICS,
-) -> WorldBatch:
+def worlds(slider: SliderName, grid: Cells, engine: EngineName) -> WorldBatch:
     """Return the worlds of cells of the grid, on the host."""
     count = grid.angle.size
     half = np.full(count, _HALF)
@@ -201,7 +195,7 @@ def worlds(
         solids,
         friction,
         _ROBOT,
-        Setting(engine, physics),
+        Setting(engine, PHYSICS),
         skin=repeated(IdealSkin(shell=_ROBOT.shell)),
         p_world_target=np.tile([90.0, 0.0], (count, 1)),  # never reached
         shift=repeated(Shift(p_robot=jnp.zeros(2))),
@@ -209,7 +203,7 @@ def worlds(
         odometry=repeated(Odometry()),
         key=np.zeros((count, 2), np.uint32),
     )
-    return built.with_params(params)
+    return built.with_params(PARAMS)
 
 
 def run_grid(
@@ -218,8 +212,6 @@ def run_grid(
     engine: EngineName = "fused",
     duration: float = DURATION,
     *,
-    params: PublishedForcePushParams = PARAMS,
-    physics: Physics = PHYSICS,
     callback: ProgressCallback = no_progress,
 ) -> xr.Dataset:
     """Run one law with a slider on the whole grid.
@@ -229,8 +221,6 @@ def run_grid(
       slider: box, cylinder.
       engine: what steps them, of those that tell the contact's force to a compiled program.
       duration: [s] from the first contact.
-      params: of the controller.
-      physics: of the worlds; its control period is the controller's.
       callback: called after every 10 s that were simulated.
 
     Returns:
@@ -240,10 +230,10 @@ def run_grid(
       along the path that was made good, of an ideal pusher's.
     """
     grid, law = cells(), build_law(name, duration)
-    batch = worlds(slider, grid, engine, params, physics)
-    period, count = physics.control_period, grid.angle.size
-    horizon = duration + 2 * _BEHIND / float(params.v_max)
-    loop = ControlLoop(physics, Rules(horizon=2 * horizon, max_lost=1e6), law)
+    batch = worlds(slider, grid, engine)
+    period, count = PHYSICS.control_period, grid.angle.size
+    horizon = duration + 2 * _BEHIND / float(PARAMS.v_max)
+    loop = ControlLoop(PHYSICS, Rules(horizon=2 * horizon, max_lost=1e6), law)
     trials = trial.start_all(*batch.inputs, np.ones(count, bool), law=law)
     apart, steps, start_time, waited = np.zeros(count), 0, time.perf_counter(), 0.0
     while steps * period < horizon:
@@ -256,7 +246,7 @@ def run_grid(
         callback(Progress(0, steps * period * count, waited))
     state: FollowingState = jax.device_get(trials.law_state)
     end = np.asarray(trials.qpos)[:, JOINTS.object][:, :2].astype(float)
-    path_length = float(params.v_max) * duration
+    path_length = float(PARAMS.v_max) * duration
     failed = (apart > _MAX_DISTANCE) | (state.longest > _SILENT) | ~state.pushed
     failed |= np.asarray(trials.tipped | trials.diverged)
     completion = 1 - np.hypot(end[:, 0] - path_length, end[:, 1]) / path_length

@@ -23,7 +23,7 @@ from rps_jax.geometry.solid import GRAVITY, Solid
 from rps_jax.robot import shell
 from rps_jax.world import scene
 from rps_jax.world.physics import Physics
-from rps_jax.world.scene import FRICTION, JOINTS, Friction, Scene
+from rps_jax.world.scene import FRICTION, JOINTS, Scene
 from sweeps.ground import rigid
 from sweeps.ground.rigid import Pushed, Rounding
 
@@ -81,10 +81,10 @@ def targets() -> dict[str, Target]:
     }
 
 
-def scene_of(target: Target, physics: Physics, friction: Friction = FRICTION["S1"]) -> Scene:
+def scene_of(target: Target, physics: Physics) -> Scene:
     """Compile the scene of pushes of an object."""
     single = jax.tree.map(lambda leaf: leaf[0], target.solid)
-    return scene.compile_solid(target.family, single, physics, friction)
+    return scene.compile_solid(target.family, single, physics)
 
 
 def start_of(target: Target, offset: float) -> np.ndarray:

@@ -258,22 +258,13 @@ def successes(results: Mapping[str, xr.Dataset]) -> Rows:
     return rows
 
 
-def turning(
-    robots: Mapping[str, Robot],
-    params: LawParams,
-    seconds: float = 10.0,
-    *,
-    object: str = "box",
-    target: tuple[float, float] = (-2.0, 0.0),
-) -> xr.Dataset:
+def turning(robots: Mapping[str, Robot], params: LawParams, seconds: float = 10.0) -> xr.Dataset:
     """Return commanded and executed turning rates of robots in the first seconds of one push.
 
     Args:
       robots: by name.
       params: of the law.
       seconds: from the start.
-      object: name of the pushed object.
-      target: of the push [m].
 
     Returns:
       `asked` and `done` (robot, time) [rad/s]: the law's twist, and the base's own.
@@ -282,7 +273,7 @@ def turning(
     setting = Setting("fused", rules=Rules(horizon=seconds))
     period = setting.physics.control_period
     for robot in robots.values():
-        case = Case(object, "S1", target, params, robot=robot)
+        case = Case("box", "S1", (-2.0, 0.0), params, robot=robot)
         (trace,) = pushes.record_cases([case], setting, interval=period)
         snapshots, time = trace.snapshots, np.asarray(trace.snapshots.time)[:-1]
         turns = np.diff(np.asarray(snapshots.qpos)[:, 2]) / period
