@@ -6,7 +6,6 @@ batch of them: `fields_of` returns the fields that differ, `apply` sets those of
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import partial
 from operator import attrgetter
 from typing import Any, NamedTuple
@@ -20,9 +19,6 @@ from rps_jax import errors
 from rps_jax.control.observation import Twist
 from rps_jax.engines.base import ControlPeriod, Driven, Engine, Mode, Motion
 from rps_jax.engines.mjx_colliders import (
-    BASE_PRISM,
-    COLLIDERS,
-    Pair,
     collision,
     constraint,
     forward,
@@ -51,20 +47,11 @@ FIELDS = (
 OUTLINE = "outline"
 
 
-@jax.tree_util.register_static
-@dataclass(frozen=True)
-class Colliders:
-    """Pairs of geoms with our colliders; other pairs have MJX's."""
-
-    pairs: frozenset[Pair] = frozenset(COLLIDERS)
-
-
 class MJXStage(NamedTuple):
     """Stage of MJX: the parts that all worlds of a batch share."""
 
     model: mjx.Model
     data: mjx.Data  # a template for the state of each world
-    colliders: Colliders = Colliders()
 
     def drive(self, fields: dict[str, jax.Array], motion: Motion, period: ControlPeriod) -> Driven:
         """Step a batch for one control period.
@@ -105,15 +92,13 @@ class MJXStage(NamedTuple):
             data, integral = data.replace(qfrc_applied=applied), jnp.stack(servo)
         data = data.replace(qpos=qpos, qvel=qvel, qacc_warmstart=warmstart)
         with jax.default_matmul_precision("float32"):  # GPUs would round products to TF32
-            data = step(model, data, self.colliders, fields.get(OUTLINE))
+            data = step(model, data, fields.get(OUTLINE))
         wrench = data.qfrc_constraint[JOINTS.base]  # of the contacts, without the drive
         wrench = wrench.at[:2].set(planar.rotate(-qpos[2], wrench[:2]))
         return Motion(data.qpos, data.qvel, data.qacc_warmstart, integral), wrench
 
 
-def step(
-    model: mjx.Model, data: mjx.Data, colliders: Colliders = Colliders(), outline: Any = None
-) -> mjx.Data:
+def step(model: mjx.Model, data: mjx.Data, outline: jax.Array | None = None) -> mjx.Data:
     """Compute one step by functions of MJX and our colliders, with a prism's outline (N, 2).
 
     Unused features are left out: tendons, actuators, sensors, springs, dampers, cameras and lights.
@@ -123,10 +108,7 @@ def step(
     data = smooth.com_pos(model, data)
     data = smooth.crb(model, data)
     data = smooth.factor_m(model, data)
-    ours = {pair: COLLIDERS[pair] for pair in colliders.pairs}
-    if outline is not None:
-        ours[BASE_PRISM] = partial(ours[BASE_PRISM], outline=outline)
-    data = collision(model, data, ours)
+    data = collision(model, data, outline)
     data = constraint.make_constraint(model, data)
     data = smooth.com_vel(model, data)
     data = smooth.rne(model, data)

@@ -16,8 +16,8 @@ from __future__ import annotations
 
 import contextlib
 import io
-from collections.abc import Mapping
-from types import MappingProxyType, SimpleNamespace
+from functools import partial
+from types import SimpleNamespace
 from typing import Any
 
 import jax
@@ -113,23 +113,26 @@ def upright(model: Model, data: Data, base: int, prism: int, corners: jax.Array)
 
 Pair = tuple[GeomType, GeomType]
 # Each has the number of points of MJX's collider of the pair, for which `Data` has space.
-BASE_PRISM = (GeomType.BOX, GeomType.MESH)
 COLLIDERS: dict[Pair, Any] = {
     (GeomType.PLANE, GeomType.CYLINDER): plane_cylinder,
     (GeomType.BOX, GeomType.BOX): _box_box,
-    BASE_PRISM: _box_prism,
+    (GeomType.BOX, GeomType.MESH): _box_prism,
 }
 
 
-def collision(
-    model: Model, data: Data, colliders: Mapping[Pair, Any] = MappingProxyType(COLLIDERS)
-) -> Data:
-    """Compute the contacts of a world as `mjx.collision` does, with these colliders first."""
+def collision(model: Model, data: Data, outline: jax.Array | None = None) -> Data:
+    """Compute the contacts of a world as `mjx.collision` does, with our colliders first.
+
+    The `outline` (N, 2) [m] is that of a prism; by default it has that of its feet.
+    """
     contacts = []
     for key, contact in collision_driver._contact_groups(model, data).items():
         pair: Any = key.types
         default = collision_driver._COLLISION_FUNC[pair]
-        distance, point, frame = colliders.get(pair, default)(model, data, key, contact.geom)
+        collide = COLLIDERS.get(pair, default)
+        if collide is _box_prism:
+            collide = partial(_box_prism, outline=outline)
+        distance, point, frame = collide(model, data, key, contact.geom)
         count = default.ncon
         contact = jax.tree.map(lambda x, n=count: jnp.repeat(x, n, axis=0), contact)
         contacts.append(contact.replace(dist=distance, pos=point, frame=frame))

@@ -14,13 +14,14 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, ClassVar, Literal, NamedTuple
+from unittest import mock
 
 import jax
 import jax.numpy as jnp
 import xarray as xr
 
 from rps_jax.engines.base import ControlPeriod, Driven, Motion
-from rps_jax.engines.mjx import Colliders, MJXStage
+from rps_jax.engines.mjx import MJXStage
 from rps_jax.engines.mjx_colliders import COLLIDERS, GeomType, mjx
 from rps_jax.record.options import option
 from rps_jax.runs.question import Run, call_of
@@ -87,10 +88,14 @@ def _sparse(stage: MJXStage) -> MJXStage:
     return stage._replace(model=model, data=mjx.make_data(model))
 
 
-def _without_box_collider(stage: MJXStage) -> MJXStage:
-    """Return the stage with MJX's collider of boxes."""
-    boxes = GeomType.BOX, GeomType.BOX
-    return stage._replace(colliders=Colliders(frozenset(COLLIDERS) - {boxes}))
+class _TheirBoxes(MJXStage):
+    """A stage with MJX's collider of boxes."""
+
+    def drive(self, fields: Any, motion: Motion, period: ControlPeriod) -> Driven:
+        """Step a batch for one control period."""
+        with mock.patch.dict(COLLIDERS):
+            del COLLIDERS[GeomType.BOX, GeomType.BOX]
+            return super().drive(fields, motion, period)
 
 
 def levers_of(name: str, family: str) -> dict[str, Lever]:
@@ -101,7 +106,7 @@ def levers_of(name: str, family: str) -> dict[str, Lever]:
     if engine == "mjx":
         levers |= {"sparse inertia matrix": Lever(stage=_sparse)}
     if engine == "mjx" and family == "box":
-        levers |= {"MJX's own box collider": Lever(stage=_without_box_collider)}
+        levers |= {"MJX's own box collider": Lever(stage=lambda stage: _TheirBoxes(*stage))}
     flags = _FLAGS.get(jax.default_backend(), {})
     return levers | {label: Lever(flags=values) for label, values in flags.items()}
 
