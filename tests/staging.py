@@ -15,7 +15,7 @@ from rps_jax.engines import mjx as mjx_engine
 from rps_jax.engines.base import ControlPeriod, Motion
 from rps_jax.engines.fused.contacts import Body
 from rps_jax.engines.mujoco import Batch
-from rps_jax.engines.quasistatic import sliders
+from rps_jax.engines.quasistatic import Slider
 from rps_jax.geometry import solid
 from rps_jax.geometry import vectors as sp
 from rps_jax.robot.robot import Robot
@@ -45,7 +45,10 @@ def recompiled(engine: str, scenes: Sequence[Scene]) -> Any:
     if engine == "quasistatic":
         half = np.array([model.geom("base").size[:2] for model in models])
         friction = np.array([model.pair("base_object").friction[0] for model in models])
-        return sliders(solid.stack([loaded.solid for loaded in scenes]), friction, half)
+        solids = solid.stack([loaded.solid for loaded in scenes])
+        arm = solid.friction_arm(solids)
+        com, outline = solids.p_object_com[:, :2], (solids.vertices, solids.radius)
+        return Slider(com, arm, friction, half, *outline)
     bodies = [body(loaded.physics, loaded.solid.vertices) for loaded in scenes]
     return jax.tree.map(lambda *leaves: np.stack(leaves), *bodies)
 

@@ -20,6 +20,7 @@ from staging import drive, staged
 
 from rps_jax.control import registry
 from rps_jax.control.laws.rps import RPSParams
+from rps_jax.engines import quasistatic
 from rps_jax.engines.base import Motion
 from rps_jax.engines.quasistatic import Contact, Problem, Quasistatic, Slider, solved
 from rps_jax.geometry import footprint as fp
@@ -336,15 +337,15 @@ def some_problems(count=500):
     return problem, (v_x - omega * p[1], v_y + omega * p[0], omega)
 
 
-def cost(stage, problem, v, dt):
+def cost(problem, v, dt):
     """Written-out cost that the twist of one object minimises."""
-    c, speed, depth = problem.arm, problem.speed, stage.depth
+    c, speed, depth = problem.arm, problem.speed, quasistatic.DEPTH
     total = (v[0] ** 2 + v[1] ** 2 + c**2 * v[2] ** 2) / (2 * speed)
     for contact in problem.contacts:
         n, r = contact.normal, contact.r
         u = jnp.stack([v[0] - v[2] * r[1], v[1] + v[2] * r[0]]) - jnp.stack(contact.v)
         v_n, v_t = u[0] * n[0] + u[1] * n[1], u[1] * n[0] - u[0] * n[1]
-        tiny = stage.slip * speed
+        tiny = quasistatic.SLIP * speed
         slide = jnp.sqrt(v_t**2 + tiny**2) - tiny
         inside = -(contact.gap + dt * (v_n - problem.friction * slide))
         x = jnp.maximum(inside / depth, -1.0)
@@ -354,17 +355,17 @@ def cost(stage, problem, v, dt):
 
 
 def test_newtons_method_has_the_correct_derivatives_and_finds_the_minimum():
-    stage, dt = Quasistatic(), 0.01
+    dt = 0.01
     with jax.enable_x64(True):
         problem, v = jax.tree.map(lambda x: jnp.asarray(x, float), some_problems())
         gradient, hessian = (
-            jax.vmap(derivative(partial(cost, stage), argnums=1), (0, 0, None))
+            jax.vmap(derivative(cost, argnums=1), (0, 0, None))
             for derivative in (jax.grad, jax.hessian)
         )
 
         @jax.jit
         def both(v):  # as written, and by differentiation
-            written = stage.derivatives(problem, v, stage.slip, dt)
+            written = quasistatic.derivatives(problem, v, quasistatic.SLIP, dt)
             return written, (gradient(problem, v, dt), hessian(problem, v, dt))
 
         (g, h), (g_true, h_true) = both(v)
@@ -373,7 +374,7 @@ def test_newtons_method_has_the_correct_derivatives_and_finds_the_minimum():
         np.testing.assert_allclose(np.stack(h), upper, rtol=1e-6, atol=1e-6)
         product = np.einsum("ij...,j...->i...", np.array(h_true), np.stack(solved(g, h)))
         np.testing.assert_allclose(product, g_true, atol=1e-6)
-        solution = jax.jit(partial(stage.solve, dt=dt))(problem, v)
+        solution = jax.jit(partial(quasistatic.solve, dt=dt))(problem, v)
         (step, matrix), _ = both(solution)
         short = np.abs(np.stack(solved(step, matrix)))[:2].max(axis=0) / problem.speed
     assert np.mean(short > 1e-3) < 0.03

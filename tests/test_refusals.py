@@ -9,7 +9,6 @@ from helpers import case
 from rps_jax.control import registry
 from rps_jax.control.laws import rps
 from rps_jax.control.laws.rps import RPSParams, Temperatures
-from rps_jax.engines.quasistatic import Quasistatic
 from rps_jax.errors import InputError
 from rps_jax.robot.robot import Robot, parse_robot
 from rps_jax.robot.shell import Boards
@@ -60,7 +59,6 @@ REFUSED = {
         *each(engine="ode", seed=-1),
         ({"physics": preset("paper_gazebo"), "engine": "quasistatic"}, "cone"),
     ],
-    Quasistatic: each(depth=0.0, slip=2.0, iterations=2),
     Physics: [
         *each(timestep=0.0, control_period=0.0, cone="square", impratio=-1.0, iterations=0),
         *(each(timestep=-0.01) + each(timestep=NAN)),

@@ -20,7 +20,6 @@ the implicit function theorem gives its derivatives.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import partial
 from typing import NamedTuple
 
@@ -28,7 +27,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from rps_jax import errors
 from rps_jax.engines.base import ControlPeriod, Driven, Engine, Motion
 from rps_jax.engines.fused.contacts import Point, circle_and_rectangle, polygon_and_rectangle
 from rps_jax.geometry import planar, solid
@@ -42,6 +40,9 @@ from rps_jax.world.physics import Physics
 from rps_jax.world.scene import JOINTS, Friction
 
 _MIN_SPEED = 1e-5  # [m/s] speed of a base at rest
+DEPTH = 1e-4  # [m] approximate penetration of a push
+SLIP = 0.01  # [1] share of the base's speed at which friction is 0.7 of its maximum
+_ITERATIONS = 10  # of Newton's method
 _SHARP = 3  # final steps of Newton's method with the final slip; earlier ones have a wider slip
 _ENTRIES = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))  # of a symmetric matrix
 
@@ -55,22 +56,6 @@ class Slider(NamedTuple):
     base_half: Entries  # (2,) [m] half length and width of the base
     vertices: Entries  # (N, 2) [m] of the outline, counter-clockwise, in the object's frame
     radius: Number  # () [m] of the outline
-
-
-def sliders(solids: Solid, friction_robot: np.ndarray, base_half: np.ndarray) -> Slider:
-    """Return the sliders of solids (n,), on the support points of the other engines.
-
-    The friction (n,) is that with the base, whose half length and width are (2,) or (n, 2) [m].
-    """
-    count = solids.mass.size
-    return Slider(
-        p_object_com=solids.p_object_com[:, :2],
-        arm=solid.friction_arm(solids),
-        friction_robot=np.broadcast_to(friction_robot, count),
-        base_half=np.broadcast_to(base_half, (count, 2)),
-        vertices=solids.vertices,
-        radius=solids.radius,
-    )
 
 
 class Contact(NamedTuple):
@@ -91,20 +76,8 @@ class Problem(NamedTuple):
     friction: Number  # [1]
 
 
-@jax.tree_util.register_static
-@dataclass(frozen=True)
-class Quasistatic:
-    """Stage of quasi-static worlds: smoothing of contacts and options of the solver."""
-
-    depth: float = 1e-4  # [m] approximate penetration of a push
-    slip: float = 0.01  # [1] share of the base's speed at which friction is 0.7 of its maximum
-    iterations: int = 10  # of Newton's method
-
-    def __post_init__(self) -> None:
-        """Raise InputError for invalid options."""
-        errors.check_finite("depth", self.depth, above=0, at_most=0.01, unit="m")
-        errors.check_finite("slip", self.slip, above=0, at_most=1)
-        errors.check_finite("iterations", self.iterations, at_least=_SHARP + 1)
+class Quasistatic(NamedTuple):
+    """Stage of quasi-static worlds, which share nothing."""
 
     def drive(self, fields: Slider, motion: Motion, period: ControlPeriod) -> Driven:
         """Step a batch for one control period, with constant height and tilt of the object.
@@ -120,7 +93,7 @@ class Quasistatic:
         sliders = fields._replace(base_half=tuple(fields.base_half.T), vertices=tuple(corners))
         poses = (tuple(qpos[:, JOINTS.base].T), (*p.T, yaw))
         twist = (period.twists.v_x, period.twists.v_y, period.twists.omega)
-        step = partial(self._step, sliders, twist, physics.timestep)
+        step = partial(_step, sliders, twist, physics.timestep)
         base, (x, y, angle) = jax.lax.fori_loop(0, physics.substeps, lambda _, s: step(s), poses)
         half = 0.5 * (angle - yaw)
         q = sp.times((jnp.cos(half), 0.0, 0.0, jnp.sin(half)), tuple(free[:, 3:].T))
@@ -134,77 +107,76 @@ class Quasistatic:
         velocity = jnp.concatenate([moved, spin], axis=-1)
         return Driven(Motion(end, velocity, motion.warmstart))
 
-    def _step(
-        self, slider: Slider, twist: Vec, dt: float, poses: tuple[Vec, Vec]
-    ) -> tuple[Vec, Vec]:
-        """Return the poses of base and object after dt [s] at `twist`.
 
-        A pose is x, y [m], yaw [rad] in the world, for the object of its centre of mass.
-        """
-        base, pushed = poses
-        c, s = jnp.cos(base[2]), jnp.sin(base[2])
-        offset = (pushed[0] - base[0], pushed[1] - base[1])
-        p = (c * offset[0] + s * offset[1], c * offset[1] - s * offset[0])
-        v_x, v_y, omega = twist
-        reach = sp.dot(slider.base_half, slider.base_half)
-        problem = Problem(
-            _contacts(slider, (*p, pushed[2] - base[2]), twist),
-            jnp.sqrt(v_x * v_x + v_y * v_y + reach * omega * omega + _MIN_SPEED**2),
-            slider.arm,
-            slider.friction_robot,
-        )
-        v = self.solve(problem, (v_x - omega * p[1], v_y + omega * p[0], omega), dt)
+def _step(slider: Slider, twist: Vec, dt: float, poses: tuple[Vec, Vec]) -> tuple[Vec, Vec]:
+    """Return the poses of base and object after dt [s] at `twist`.
 
-        def turned(u: Vec) -> Vec:
-            return c * u[0] - s * u[1], s * u[0] + c * u[1], u[2]
+    A pose is x, y [m], yaw [rad] in the world, for the object of its centre of mass.
+    """
+    base, pushed = poses
+    c, s = jnp.cos(base[2]), jnp.sin(base[2])
+    offset = (pushed[0] - base[0], pushed[1] - base[1])
+    p = (c * offset[0] + s * offset[1], c * offset[1] - s * offset[0])
+    v_x, v_y, omega = twist
+    reach = sp.dot(slider.base_half, slider.base_half)
+    problem = Problem(
+        _contacts(slider, (*p, pushed[2] - base[2]), twist),
+        jnp.sqrt(v_x * v_x + v_y * v_y + reach * omega * omega + _MIN_SPEED**2),
+        slider.arm,
+        slider.friction_robot,
+    )
+    v = solve(problem, (v_x - omega * p[1], v_y + omega * p[0], omega), dt)
 
-        return sp.add(base, sp.scale(dt, turned(twist))), sp.add(pushed, sp.scale(dt, turned(v)))
+    def turned(u: Vec) -> Vec:
+        return c * u[0] - s * u[1], s * u[0] + c * u[1], u[2]
 
-    def solve(self, problem: Problem, v: Vec, dt: float) -> Vec:
-        """Return the object's twist, from a first guess v, both in the base's frame.
+    return sp.add(base, sp.scale(dt, turned(twist))), sp.add(pushed, sp.scale(dt, turned(v)))
 
-        Newton's method starts with a wide slip of friction, so that no step overshoots. Only its
-        last step is differentiated, with a constant matrix: at the solution that gives the
-        derivatives of the implicit function.
-        """
-        fixed, v = jax.lax.stop_gradient((problem, v))
-        widening = self.iterations - _SHARP
 
-        def newton(i: jax.Array, v: Vec) -> Vec:
-            slip = self.slip ** jnp.minimum(i / widening, 1.0).astype(v[0].dtype)
-            gradient, hessian = self.derivatives(fixed, v, slip, dt)
-            return sp.sub(v, solved(gradient, hessian))
+def solve(problem: Problem, v: Vec, dt: float) -> Vec:
+    """Return the object's twist, from a first guess v, both in the base's frame.
 
-        v = jax.lax.stop_gradient(jax.lax.fori_loop(0, self.iterations, newton, v))
-        gradient, hessian = self.derivatives(problem, v, self.slip, dt)
-        return sp.sub(v, solved(gradient, jax.lax.stop_gradient(hessian)))
+    Newton's method starts with a wide slip of friction, so that no step overshoots. Only its
+    last step is differentiated, with a constant matrix: at the solution that gives the
+    derivatives of the implicit function.
+    """
+    fixed, v = jax.lax.stop_gradient((problem, v))
+    widening = _ITERATIONS - _SHARP
 
-    def derivatives(
-        self, problem: Problem, v: Vec, slip: Number, dt: float
-    ) -> tuple[Vec, list[Number]]:
-        """Return the gradient and the upper entries of the Hessian of the cost."""
-        tiny, friction = slip * problem.speed, problem.friction
-        stiff = 1 / problem.speed
-        inertia = (stiff, stiff, stiff * problem.arm * problem.arm)
-        gradient: Vec = (inertia[0] * v[0], inertia[1] * v[1], inertia[2] * v[2])
-        hessian: list[Number] = [inertia[i] if i == j else 0.0 for i, j in _ENTRIES]
-        for contact in problem.contacts:
-            n, r = contact.normal, contact.r
-            t = (-n[1], n[0])
-            u = (v[0] - v[2] * r[1] - contact.v[0], v[1] + v[2] * r[0] - contact.v[1])
-            v_t = sp.dot(t, u)
-            slide = jnp.sqrt(v_t * v_t + tiny * tiny)  # a smooth |v_t|
-            inside = -contact.gap - dt * (sp.dot(n, u) - friction * (slide - tiny))
-            force, stiffness = _spring(inside, self.depth)
-            along = _with_moment(t, r)
-            push = sp.sub(_with_moment(n, r), sp.scale(friction * v_t / slide, along))
-            gradient = sp.sub(gradient, sp.scale(force, push))
-            bend = force * friction * tiny * tiny / (slide * slide * slide)
-            hessian = [
-                h + dt * stiffness * push[i] * push[j] + bend * along[i] * along[j]
-                for h, (i, j) in zip(hessian, _ENTRIES, strict=True)
-            ]
-        return gradient, hessian
+    def newton(i: jax.Array, v: Vec) -> Vec:
+        slip = SLIP ** jnp.minimum(i / widening, 1.0).astype(v[0].dtype)
+        gradient, hessian = derivatives(fixed, v, slip, dt)
+        return sp.sub(v, solved(gradient, hessian))
+
+    v = jax.lax.stop_gradient(jax.lax.fori_loop(0, _ITERATIONS, newton, v))
+    gradient, hessian = derivatives(problem, v, SLIP, dt)
+    return sp.sub(v, solved(gradient, jax.lax.stop_gradient(hessian)))
+
+
+def derivatives(problem: Problem, v: Vec, slip: Number, dt: float) -> tuple[Vec, list[Number]]:
+    """Return the gradient and the upper entries of the Hessian of the cost."""
+    tiny, friction = slip * problem.speed, problem.friction
+    stiff = 1 / problem.speed
+    inertia = (stiff, stiff, stiff * problem.arm * problem.arm)
+    gradient: Vec = (inertia[0] * v[0], inertia[1] * v[1], inertia[2] * v[2])
+    hessian: list[Number] = [inertia[i] if i == j else 0.0 for i, j in _ENTRIES]
+    for contact in problem.contacts:
+        n, r = contact.normal, contact.r
+        t = (-n[1], n[0])
+        u = (v[0] - v[2] * r[1] - contact.v[0], v[1] + v[2] * r[0] - contact.v[1])
+        v_t = sp.dot(t, u)
+        slide = jnp.sqrt(v_t * v_t + tiny * tiny)  # a smooth |v_t|
+        inside = -contact.gap - dt * (sp.dot(n, u) - friction * (slide - tiny))
+        force, stiffness = _spring(inside)
+        along = _with_moment(t, r)
+        push = sp.sub(_with_moment(n, r), sp.scale(friction * v_t / slide, along))
+        gradient = sp.sub(gradient, sp.scale(force, push))
+        bend = force * friction * tiny * tiny / (slide * slide * slide)
+        hessian = [
+            h + dt * stiffness * push[i] * push[j] + bend * along[i] * along[j]
+            for h, (i, j) in zip(hessian, _ENTRIES, strict=True)
+        ]
+    return gradient, hessian
 
 
 def _contacts(slider: Slider, pose: Vec, twist: Vec) -> list[Contact]:
@@ -239,14 +211,14 @@ def _with_moment(direction: Point, r: Point) -> Vec:
     return (*direction, r[0] * direction[1] - r[1] * direction[0])
 
 
-def _spring(inside: Number, depth: float) -> tuple[Number, Number]:
+def _spring(inside: Number) -> tuple[Number, Number]:
     """Return force [1] and stiffness [1/m] of a contact `inside` [m] the base.
 
-    The force is zero up to -depth, a parabola up to depth, and has the slope 1 / depth beyond.
+    The force is zero up to -DEPTH, a parabola up to DEPTH, and has the slope 1 / DEPTH beyond.
     """
-    bent = jnp.clip(inside + depth, 0.0, 2 * depth)
-    force = bent * bent / (4 * depth) + jnp.maximum(inside - depth, 0.0)
-    return force / depth, bent / (2 * depth * depth)
+    bent = jnp.clip(inside + DEPTH, 0.0, 2 * DEPTH)
+    force = bent * bent / (4 * DEPTH) + jnp.maximum(inside - DEPTH, 0.0)
+    return force / DEPTH, bent / (2 * DEPTH * DEPTH)
 
 
 def solved(g: Vec, h: Sequence[Number]) -> Vec:
@@ -274,8 +246,15 @@ class QuasistaticEngine(Engine):
     ) -> tuple[Quasistatic, Slider]:
         """Return the stage, and the sliders (n, ...) of the worlds; bases follow every twist."""
         assert not robots.driven, "checked by check_robot"
-        half = scene.base_half(robots, solids.mass.size)
-        return Quasistatic(), sliders(solids, friction.robot, half)
+        count = solids.mass.size
+        return Quasistatic(), Slider(
+            p_object_com=solids.p_object_com[:, :2],
+            arm=solid.friction_arm(solids),
+            friction_robot=np.broadcast_to(friction.robot, count),
+            base_half=scene.base_half(robots, count),
+            vertices=solids.vertices,
+            radius=solids.radius,
+        )
 
 
 ENGINE = QuasistaticEngine()
