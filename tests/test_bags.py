@@ -95,7 +95,6 @@ def test_the_commands_write_and_shadow_a_bag(tmp_path, capsys):
     output = capsys.readouterr().out
     assert "151 commands in 3.0 s" in output
     assert "omega [rad/s]" in output
-    assert (out / "shadow.png").exists()
 
 
 # --- invalid files -------------------------------------------------------------------------

@@ -13,8 +13,7 @@ import numpy as np
 import xarray as xr
 
 from rps_jax import errors
-from rps_jax.analysis.figures.style import Figure
-from rps_jax.analysis.report import Picture, Section
+from rps_jax.analysis.report import Section
 from rps_jax.control import registry, validation
 from rps_jax.control.base import Law, LawParams
 from rps_jax.control.observation import Twist
@@ -84,8 +83,7 @@ class Shadow(Question[xr.Dataset]):
             f"differences between the twists of {results.attrs['law']} and the recorded ones, at "
             "the same observations."
         )
-        picture = Picture("shadow", lambda: figure(results))
-        return [Section("Differences from the recorded commands", text, rows, picture)]
+        return [Section("Differences from the recorded commands", text, rows)]
 
 
 shadow = call_of(Shadow)
@@ -129,16 +127,3 @@ def shadowed(law: Law, params: LawParams, recorded: dict[str, np.ndarray]) -> np
     params = jax.tree.map(lambda x: jnp.asarray(x, float), params)
     shapes = validation.observation_shapes(law.senses)
     return np.asarray(run(params, jax.tree_util.tree_map_with_path(value_of, shapes)))
-
-
-def figure(results: xr.Dataset) -> Figure:
-    """Draw the twists over time, one panel per component."""
-    chart = Figure(figsize=(9, 6), layout="constrained")
-    axes = chart.subplots(3, 1, sharex=True)
-    for ax, (name, unit) in zip(axes, _UNITS.items(), strict=True):
-        ax.plot(results.time, results[name].sel(source="commanded"), lw=2.5, color="0.7")
-        ax.plot(results.time, results[name].sel(source="law"), lw=1, color="C0")
-        ax.set_ylabel(f"{name} [{unit}]")
-    axes[0].legend(["commanded", results.attrs["law"]], loc="upper right")
-    axes[-1].set_xlabel("time [s]")
-    return chart
