@@ -31,7 +31,7 @@ _SKIN, _PRESSED = np.array([13, 168, 161]), np.array([255, 176, 0])  # RGB, from
 _TWIST = (228, 88, 20)  # RGB
 _TAXEL = (0.022, 0.125, 0.2925)  # [m] depth, height, and height above the ground of its middle
 _ARROW = 12.0  # [s] of the commanded velocity that an arrow shows
-_ARC = (10.0, 0.56, 0.40)  # [s] of turning that an arc shows, its radius and height [m]
+_SHOULDERS = np.array([[0.0, 0.3, 0.45], [0.0, -0.3, 0.45]])  # [m] left and right, beside the arm
 
 
 def furnish(server: ViserServer) -> None:
@@ -42,7 +42,7 @@ def furnish(server: ViserServer) -> None:
         brand_color=(8, 84, 80),
     )
     server.gui.main_panel.dock_right()
-    server.gui.set_panel_label("Reactive Pushing Law")
+    server.gui.set_panel_label("Reactive Pushing Strategy")
     server.initial_camera.position, server.initial_camera.look_at = _CAMERA
     server.initial_camera.fov = _FIELD
     server.scene.add_grid(
@@ -85,9 +85,7 @@ class Drawing:
         nowhere = np.zeros((1, 2, 3))
         shape: dict[str, Any] = {"shaft_radius": 0.016, "head_radius": 0.045, "head_length": 0.1}
         self._velocity = world.add_arrows(f"{_ROOT}/base/velocity", nowhere, _TWIST, **shape)
-        line = partial(world.add_line_segments, points=nowhere)
-        self._turn = line(f"{_ROOT}/base/turn", colors=_TWIST, thickness=0.022)
-        path = partial(line, thickness=0.025)
+        path = partial(world.add_line_segments, points=nowhere, thickness=0.025)
         self._base_path = path(f"{_ROOT}/base_path", colors=_rgb(rendering.BASE_RGBA))
         self._contact_path = path(f"{_ROOT}/contact_path", colors=_rgb(rendering.CONTACT_RGBA))
 
@@ -118,19 +116,10 @@ class Drawing:
         self._contact_path.points = _joined([m.p_world_contact for m in way], 0.012)
 
     def _show_twist(self, v_x: float, v_y: float, omega: float) -> None:
-        """An arrow from the middle of the base, and an arc about it from its heading."""
-        top = 0.95  # [m] above the arm
-        moves, turns = math.hypot(v_x, v_y) > 1e-3, abs(omega) > 1e-3
-        self._velocity.visible, self._turn.visible = moves, turns
-        if moves:
-            tip = [_ARROW * v_x, _ARROW * v_y, top]
-            self._velocity.points = np.array([[[0.0, 0.0, top], tip]])
-        if turns:
-            scale, radius, height = _ARC
-            angle = np.linspace(0.0, scale * omega, 24)
-            z = np.full_like(angle, height)
-            arc = np.stack([radius * np.cos(angle), radius * np.sin(angle), z], axis=-1)
-            self._turn.points = np.stack([arc[:-1], arc[1:]], axis=1)
+        """Show the velocities of the left and the right side of the base by arrows."""
+        velocities = np.array([[v_x - omega * y, v_y + omega * x, 0.0] for x, y, _ in _SHOULDERS])
+        self._velocity.points = np.stack([_SHOULDERS, _SHOULDERS + _ARROW * velocities], axis=1)
+        self._velocity.visible = bool(np.abs(velocities).max() > 1e-3)
 
 
 def _joined(points: Sequence[ArrayLike], height: float) -> np.ndarray:
