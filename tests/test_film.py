@@ -125,7 +125,7 @@ def test_the_memory_of_a_film_does_not_grow_with_its_length(tmp_path):
     ("grid", "size"), [("4x6", (320, 180)), ("1x1", (1920, 1080)), ("12x1", (160, 90))]
 )
 def test_tiles_are_as_large_as_fits(grid, size):
-    width, height = film._tile_size(film.shape_of(grid))
+    width, height = film._tile_size(film.Film(grid=grid).shape)
     assert (width, height) == pytest.approx(size, abs=2)
     assert width % 2 == height % 2 == 0
 

@@ -329,4 +329,4 @@ def test_a_used_port_is_refused_in_one_sentence(capsys):
     with socket.create_server(("127.0.0.1", 0)) as server:
         port = server.getsockname()[1]
         error = refusal(capsys, "view", "--port", port)
-    assert f"port = {port} cannot be served on (Address already in use)" in error
+    assert f"port = {port} cannot be served on: use another" in error

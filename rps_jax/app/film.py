@@ -75,7 +75,12 @@ class Film(Action[Path]):
     @property
     def shape(self) -> tuple[int, int]:
         """Rows and columns."""
-        return shape_of(self.grid or (f"{len(self.laws)}x3" if self.laws else "4x6"))
+        grid = self.grid or (f"{len(self.laws)}x3" if self.laws else "4x6")
+        match = re.fullmatch(r"([1-9]|1[0-2])x([1-9]|1[0-2])", grid)
+        if match is None:
+            rule = "write ROWSxCOLUMNS, as 4x6, each from 1 to 12"
+            raise errors.not_allowed("grid", grid, rule)
+        return int(match[1]), int(match[2])
 
     def note(self) -> str:
         """Whether another engine than the run's is filmed."""
@@ -131,15 +136,6 @@ class Take(NamedTuple):
     law: Law
     scenes: Sequence[Scene]
     labels: Sequence[str]
-
-
-def shape_of(grid: str) -> tuple[int, int]:
-    """Return rows and columns of a grid, written as 4x6."""
-    match = re.fullmatch(r"([1-9]|1[0-2])x([1-9]|1[0-2])", grid)
-    if match is None:
-        rule = "write ROWSxCOLUMNS, as 4x6, each from 1 to 12"
-        raise errors.not_allowed("grid", grid, rule)
-    return int(match[1]), int(match[2])
 
 
 def of_sweep(

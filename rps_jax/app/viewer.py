@@ -11,7 +11,6 @@ import dataclasses
 import io
 import math
 import queue
-import socket
 import threading
 import time
 from collections.abc import Callable
@@ -373,15 +372,11 @@ class Page:
 def open_page(port: int, request: PushRequest, build: Builder) -> Page:
     """Serve a page; InputError if viser is missing, or the port cannot be used."""
     viser, gate = errors.require("viser", "viz"), Gate()
-    try:
-        with socket.create_server((HOST, port)):  # viser would quietly take another port
-            pass
-    except OSError as error:
-        reason = str(error.strerror).partition(" (")[0]
-        raise InputError(f"port = {port} cannot be served on ({reason}): use another.") from error
     with contextlib.redirect_stdout(io.StringIO()), gate.guarding():  # it prints a panel
         server = viser.ViserServer(HOST, port, verbose=False)
     try:
+        if port not in (0, server.get_port()):  # viser takes another port if this one is used
+            raise InputError(f"port = {port} cannot be served on: use another.")
         check_guarded(server.get_port())
     except BaseException:
         server.stop()
