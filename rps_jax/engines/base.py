@@ -8,8 +8,7 @@ trace (`traced = False`) steps worlds on the host: see `mujoco.Batch`.
 from __future__ import annotations
 
 import abc
-from dataclasses import dataclass
-from functools import partial
+from dataclasses import dataclass, field
 from typing import Any, ClassVar, Literal, NamedTuple, Protocol, runtime_checkable
 
 import jax
@@ -37,19 +36,16 @@ class Motion(NamedTuple):
     integral: Float[Any, "*B 3"] | None = None  # [N, N, N m] of the drive, if its force is limited
 
 
-@partial(
-    jax.tree_util.register_dataclass,
-    data_fields=["twists", "robot"],
-    meta_fields=["physics", "force"],
-)
+@jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class ControlPeriod:
     """Input of a stage for one control period; a pytree of twists and robots, the rest static."""
 
     twists: Twist  # (B,) [m/s, m/s, rad/s] of the bases, in their own frames
-    physics: Physics
+    physics: Physics = field(metadata={"static": True})
     robot: Robot | None = None  # (B,) whose force is limited; None: bases follow every twist
-    force: bool = False  # whether `Driven.force` is computed
+    # Whether `Driven.force` is computed.
+    force: bool = field(default=False, metadata={"static": True})
 
 
 class Driven(NamedTuple):
