@@ -75,10 +75,10 @@ def document_fields(kind: type[T]) -> type[T]:
     return kind
 
 
-def bounds_of(kind: type) -> dict[str, Bound]:
-    """Return the bounds in the annotations of parameters, by name."""
+def bounds_of(kind: type) -> tuple[tuple[str, Bound], ...]:
+    """Return the names of parameters and the bounds in their annotations."""
     hints = get_type_hints(kind, include_extras=True).items()
-    return {name: x for name, hint in hints for x in get_args(hint) if isinstance(x, Bound)}
+    return tuple((name, x) for name, hint in hints for x in get_args(hint) if isinstance(x, Bound))
 
 
 def named_leaves(tree: object, is_leaf: Callable[[object], bool] | None = None) -> dict[str, Leaf]:

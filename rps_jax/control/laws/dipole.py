@@ -81,5 +81,5 @@ def step(
     return DipoleState(start, jnp.ones_like(state.started)), twist, Details.from_obs(touch)
 
 
-LAW = Law(init, step, "pose", check=check, bounds=tuple(bounds_of(DipoleParams).items()))
+LAW = Law(init, step, "pose", check=check, bounds=bounds_of(DipoleParams))
 PRESETS = {"dipole": DipoleParams()}

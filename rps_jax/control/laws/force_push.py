@@ -152,5 +152,5 @@ def step(
     return state, twist, Details.from_obs(filled)._replace(gamma=theta_p)
 
 
-LAW = Law(init, step, check=check, bounds=tuple(bounds_of(ForcePushParams).items()))
+LAW = Law(init, step, check=check, bounds=bounds_of(ForcePushParams))
 PRESETS = {"force_push": ForcePushParams()}

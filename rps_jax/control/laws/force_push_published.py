@@ -107,7 +107,5 @@ def step(
     return PublishedForcePushState(path, theta_p, pushed), twist, details
 
 
-LAW = Law(
-    init, step, "force", check=check, bounds=tuple(bounds_of(PublishedForcePushParams).items())
-)
+LAW = Law(init, step, "force", check=check, bounds=bounds_of(PublishedForcePushParams))
 PRESETS = {"force_push_published": PublishedForcePushParams()}

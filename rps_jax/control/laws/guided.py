@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from rps_jax import errors
-from rps_jax.control.base import Law, document_fields
+from rps_jax.control.base import Law, check_finite_leaves, document_fields
 from rps_jax.control.laws import rps
 from rps_jax.control.laws.rps import RPSParams, RPSState
 from rps_jax.control.observation import Details, Observation, Twist
@@ -54,8 +54,7 @@ def check(params: GuidedParams) -> GuidedParams:
     shape = np.shape(params.offsets)
     if len(shape) != 2 or shape[1] != 3 or not shape[0]:
         raise errors.not_allowed("shape of guided.offsets", shape, "pass (J, 3), J at least 1")
-    if not np.isfinite(np.asarray(params.offsets)).all():
-        raise errors.InputError("guided.offsets are not allowed: each must be a finite number.")
+    check_finite_leaves({"guided.offsets": np.asarray(params.offsets)})
     return params
 
 

@@ -63,5 +63,5 @@ def step(
     return state, twist, details._replace(gamma=error)
 
 
-LAW = Law(init, step, check=check, bounds=tuple(bounds_of(PursuitParams).items()))
+LAW = Law(init, step, check=check, bounds=bounds_of(PursuitParams))
 PRESETS = {"pursuit": PursuitParams()}

@@ -105,7 +105,7 @@ class RPSParams(NamedTuple):
 
 
 # v_max, omega_max, v_approach and d_success belong to the robot and the task, not to the law.
-BOUNDS = bounds_of(RPSParams)
+BOUNDS = dict(bounds_of(RPSParams))
 for _name in ("d_th", "gamma_max", "v_lost"):  # last, in the order of published tunings
     BOUNDS[_name] = BOUNDS.pop(_name)
 

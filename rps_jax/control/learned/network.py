@@ -104,10 +104,8 @@ def init_weights(
     keys = jax.random.split(key, len(shapes))
     for layer_key, (name, shape) in zip(keys, shapes.items(), strict=True):
         scale = (0.01 if name.split(".")[0] in small else 1.0) / math.sqrt(shape[0])
-        is_weight = name.endswith(".w")
-        weights[name] = (
-            scale * jax.random.normal(layer_key, shape) if is_weight else jnp.zeros(shape)
-        )
+        draw = jnp.zeros if name.endswith(".b") else partial(jax.random.normal, layer_key)
+        weights[name] = scale * draw(shape)
     return weights
 
 
