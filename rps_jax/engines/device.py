@@ -33,13 +33,6 @@ def configure_xla() -> None:
             os.environ["XLA_FLAGS"] = f"{flags_before} {flag}={value}".strip()
 
 
-def device_name() -> str:
-    """Return the name of the device on which JAX computes."""
-    import jax
-
-    return jax.devices()[0].device_kind
-
-
 def choose(name: Device) -> None:
     """Make JAX use a kind of device; `xla` is the processor without the C compiler.
 

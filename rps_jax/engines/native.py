@@ -46,7 +46,7 @@ _NO_COMPILER = (
 )
 _PLATFORMS = {"cpu": "cpu", "gpu": "CUDA"}
 _TRACING: ContextVar[bool] = ContextVar("rps_jax_traces_one_world", default=False)
-_libraries: dict[str, ctypes.CDLL] = {}
+libraries: dict[str, ctypes.CDLL] = {}  # of the functions that XLA can call, by name
 _locks: defaultdict[str, threading.RLock] = defaultdict(threading.RLock)
 
 
@@ -234,11 +234,6 @@ def _kernels(name: str, texts: Sequence[str], functions: Sequence[_Function]) ->
         return _library(nvrtc.launcher(name, paths, shapes, WARP // _THREADS), name)
 
 
-def loaded_names() -> list[str]:
-    """Return the names of all functions that XLA can call."""
-    return list(_libraries)
-
-
 def called_names(program: bytes) -> list[str]:
     """Return the names of the functions that a program calls."""
     return sorted({x.decode() for x in re.findall(rf"{_NAME}[0-9a-f]{{32}}".encode(), program)})
@@ -248,8 +243,8 @@ def load(name: str) -> bool:
     """Load a function from the cache and register it with XLA; return whether it is there."""
     with _locks[name]:
         path = _cache_path(name)
-        if name in _libraries or path is None:
-            return name in _libraries
+        if name in libraries or path is None:
+            return name in libraries
         return bool(cache.read(path, "compiled", functools.partial(_register, name)))
 
 
@@ -266,5 +261,5 @@ def _register(name: str, body: bytes) -> bool:
         library = ctypes.CDLL(str(path))
     function = jax.ffi.pycapsule(getattr(library, name))
     jax.ffi.register_ffi_target(name, function, platform=_PLATFORMS[jax.default_backend()])
-    _libraries[name] = library
+    libraries[name] = library
     return True

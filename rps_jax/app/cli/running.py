@@ -113,6 +113,7 @@ def _raise_interrupts() -> None:
 
 def execute(command: Command[object], session: Session) -> None:
     """Check a command and execute it; write and print the report of a question."""
+    import jax
     from tqdm import tqdm
 
     from rps_jax.engines import device
@@ -139,7 +140,7 @@ def execute(command: Command[object], session: Session) -> None:
         bar.on_compiled = _import_early
         results = command.execute(bar)
         timed = bar.timing.simulated > 0 and bar.over != "clock"
-        timing = timing_line(bar.timing, device.device_name()) if timed else ""
+        timing = timing_line(bar.timing, jax.devices()[0].device_kind) if timed else ""
         if not isinstance(command, Question):
             if results is not None:
                 print(f"{command.name}: {results}")
