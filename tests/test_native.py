@@ -25,11 +25,11 @@ pytestmark = pytest.mark.skipif(native.target() is None, reason="there is no C c
 @pytest.fixture
 def cache(tmp_path):
     """Return an empty cache folder; no compiled function is loaded."""
-    previous, loaded = jax.config.jax_compilation_cache_dir, dict(native._libraries)
+    previous, loaded = jax.config.jax_compilation_cache_dir, dict(native.libraries)
     jax.config.update("jax_compilation_cache_dir", str(tmp_path))
-    native._libraries.clear()
+    native.libraries.clear()
     yield tmp_path / "native"
-    native._libraries.update(loaded)
+    native.libraries.update(loaded)
     jax.config.update("jax_compilation_cache_dir", previous)
 
 
@@ -172,11 +172,11 @@ def test_a_damaged_function_is_dropped_with_one_line(damage, cache, monkeypatch)
     content = cached.read_bytes()
     changed = {"cut": content[:100], "empty": b"", "turned": content[:-1] + b"?"}
     cached.write_bytes(changed[damage])
-    native._libraries.clear()
+    native.libraries.clear()
     with pytest.warns(UserWarning, match="is dropped, and compiled again: its checksum") as caught:
         assert run() == expected
     assert len(caught) == 1
-    native._libraries.clear()
+    native.libraries.clear()
     assert run() == expected
     assert cached.read_bytes() == content
 
@@ -237,8 +237,8 @@ def test_the_loop_of_an_equation_is_compiled_as_a_whole(law, skin, request, monk
 FALLBACKS = {
     "large products, as of a learned law": (lambda x: jnp.ones((99, 3)) * x @ jnp.ones(3), []),
     "an unsupported operation": (lambda x: jnp.sort(jnp.stack([x, -x]))[0], [
-        "operation `sort` is not supported by the native compiler; use arithmetic, comparisons, "
-        "jnp.where and elementary functions. XLA compiles this law, which is some ten times slower."
+        "operation `sort` cannot be translated; use arithmetic, comparisons, jnp.where and "
+        "elementary functions. XLA compiles this law, which is some ten times slower."
     ]),
     "code that cannot be printed": (None, ["cannot be printed, so XLA compiles: KeyError"]),
 }  # fmt: skip

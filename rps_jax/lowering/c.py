@@ -32,11 +32,11 @@ static inline {p}_real {p}_tanh({p}_real x) {{
 class CWriter(ScalarWriter):
     """Printer of one routine as statements of C99."""
 
-    compiler = "the C exporter"
     spelling = spelled("c")
     flag = "({} != 0)"  # C takes any number but 0 for true
     alias = "{head} = &{corner};"
     pointer = "*"
+    zeros = "{{0}}"
 
     def type_of(self, kind: str) -> str:
         return type_of(kind, self.prefix)
@@ -48,9 +48,6 @@ class CWriter(ScalarWriter):
         text = " ".join(", ".join(texts).split())
         lines = textwrap.wrap(text, 92, break_long_words=False, break_on_hyphens=False)
         return "{" + (text if len(lines) < 2 else "\n    " + "\n    ".join(lines)) + "}"
-
-    def zeros(self, size: int) -> str:
-        return "{0}"
 
     def packed(self, name: str, array: np.ndarray) -> str:
         kind = kind_of(array.dtype)

@@ -22,7 +22,6 @@ FUNCTION I all_b(int x) { return x != 0; }
 FUNCTION int any(I m) { return __any_sync(ALL, m); }
 FUNCTION V choose_f(I m, V a, V b) { return m ? a : b; }
 FUNCTION I choose_i(I m, I a, I b) { return m ? a : b; }
-FUNCTION U choose_u(I m, U a, U b) { return m ? a : b; }
 
 /* Forms with fewer instructions: on a GPU, fetching them takes longer than executing them. */
 #if __CUDA_ARCH__ >= 800

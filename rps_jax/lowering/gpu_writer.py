@@ -212,8 +212,7 @@ class GpuWriter(SimdWriter):
             return node.name
         if node.stored in self._shared:
             return f"{node.name}[({index}) * WORLDS]"
-        if not self._is_scalar(node):
-            raise AssertionError(f"{node.name} is not in shared memory")
+        assert self._is_scalar(node), f"{node.name} is not in shared memory"
         return f"of_thread_{node.kind}({node.name}, {index})"
 
     def _broadcast(self, node: Node, index: int) -> str:

@@ -29,11 +29,11 @@ const unpacked = (text, Kind, rows) => {
 class JsWriter(ScalarWriter):
     """Printer of one routine as statements of JavaScript."""
 
-    compiler = "the JavaScript exporter"
     spelling = spelled("js")
     index = "let"
     flag = "Boolean({})"
     alias = "{head} = {name}.flat(Infinity);"
+    zeros = "Array({}).fill(0)"
 
     def declaration(self, kind: str, name: str, size: int = 1, constant: bool = True) -> str:
         return f"{'const' if constant or size > 1 else 'let'} {name}"
@@ -46,9 +46,6 @@ class JsWriter(ScalarWriter):
 
     def listed(self, texts: Iterable[str]) -> str:
         return f"[{', '.join(texts)}]"
-
-    def zeros(self, size: int) -> str:
-        return f"Array({size}).fill(0)"
 
     def packed(self, name: str, array: np.ndarray) -> str:
         """Return a table; a matrix is packed in as few bytes as are exact."""

@@ -124,7 +124,6 @@ Factor: TypeAlias = tuple[Value, np.ndarray]  # a value and its flat indices (ba
 class SimdNodes(Target):
     """Target that builds the graph of a function of one world; equal nodes are shared."""
 
-    compiler = "the native compiler"
     kinds = "fibu"
     operations = defined(SIMD_HEADER)
     max_products = 256  # multiplications in one product of matrices
@@ -256,17 +255,11 @@ class SimdNodes(Target):
             for k, index in enumerate(row_indices[batch, row]):
                 at = indices[batch, :, k], np.full(template.shape, index)
                 factors = zip((matrix, rows), at, strict=True)
-                pair = [self._at(factor[0], i, template) for factor, i in factors]
+                pair = [self.moved([factor[0]], i, template) for factor, i in factors]
                 term = self.apply("mul", pair, {}, template)
                 total = term if total is None else self.apply("add", [total, term], {}, template)
             parts.append(np.zeros_like(template) if total is None else total)
         return parts
-
-    def _at(self, value: Value, indices: np.ndarray, template: Typed) -> Value:
-        """Return numbers of a value at constant indices."""
-        if is_constant(value):
-            return np.reshape(value, -1)[indices]
-        return self.moved([value], indices, template)
 
     def _slice(self, value: Value, starts: Sequence[Value], sizes: Sequence[int], kind: str) -> Any:
         """Slice an array at an index that is known at run time, clamped to the array."""

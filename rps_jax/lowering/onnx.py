@@ -45,7 +45,6 @@ class Tensor(NamedTuple):
 class Graph(Target):
     """Target that builds a graph of ONNX."""
 
-    compiler = "the ONNX exporter"
     operations = _OPERATORS
 
     def __init__(self) -> None:

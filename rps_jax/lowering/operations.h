@@ -3,6 +3,7 @@
 
 FUNCTION I not_i(I x) { return ~x; }
 FUNCTION I choose_b(I m, I a, I b) { return choose_i(m, a, b); }
+FUNCTION U choose_u(I m, U a, U b) { return (U)choose_i(m, (I)a, (I)b); }
 FUNCTION I i_of_u(U x) { return (I)x; }
 FUNCTION U u_of_i(I x) { return (U)x; }
 FUNCTION V bits_f_of_u(U x) { return bits_f_of_i((I)x); }

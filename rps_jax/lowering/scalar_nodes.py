@@ -24,8 +24,7 @@ from rps_jax.lowering.nodes import (
     reached,
 )
 from rps_jax.lowering.target import (
-    Body,
-    UnsupportedError,
+    Target,
     Value,
     is_constant,
     kind_of,
@@ -40,10 +39,10 @@ class ScalarNodes(SimdNodes):
     kinds = "fib"
     max_products = 100_000
 
-    def __init__(self, compiler: str, operations: Collection[str]) -> None:
-        """Errors name the compiler; `operations` are those that the language spells."""
+    def __init__(self, operations: Collection[str]) -> None:
+        """Build a graph of the `operations` that the language spells."""
         super().__init__()
-        self.compiler, self.operations = compiler, frozenset(operations)
+        self.operations = frozenset(operations)
 
     def kind(self, dtype: object, name: str) -> str:
         return kind_of(dtype, name, self.kinds)
@@ -55,9 +54,8 @@ class ScalarNodes(SimdNodes):
             scalar = scalar.node.args[scalar.first]
         return scalar
 
-    def while_loop(self, condition: Body, body: Body, carry: Sequence[Value]) -> list[Value]:
-        """Refuse a loop whose length is unknown: a control step has a deadline."""
-        raise UnsupportedError("while")
+    # A control step has a deadline, so the length of each loop must be known.
+    while_loop = Target.while_loop
 
     def products(self, matrix: Factor, rows: Factor, dtype: np.dtype) -> list[Value]:
         (weights, indices), (value, row_indices) = matrix, rows

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Mapping, Sequence
 from typing import ClassVar
 
@@ -22,10 +21,10 @@ _ROWS = 8
 class ScalarWriter(Writer):
     """Printer of one routine; subclasses define the spelling of a language."""
 
-    compiler: ClassVar[str]  # name in errors
     spelling: ClassVar[Mapping[str, str]]  # of operations
     flag: ClassVar[str]  # of an input that is a bool
     alias: ClassVar[str]  # declaration of a flattened input array
+    zeros: ClassVar[str]  # array of zeros of a size
     pointer: ClassVar[str] = ""  # mark of a pointer in a declaration
 
     def __init__(
@@ -44,7 +43,7 @@ class ScalarWriter(Writer):
         fields = [(groups[group], x) for group, fields in routine.inputs.items() for x in fields]
         self._inputs = [(f"{text}{field.name}", field) for text, field in fields]
         outputs = [(group, x) for group, fields in routine.outputs.items() for x in fields]
-        target = ScalarNodes(self.compiler, self.spelling)
+        target = ScalarNodes(self.spelling)
         values, roots = results(
             routine.jaxpr, [x.type for _, x in fields], [x.type for _, x in outputs], target
         )
@@ -52,12 +51,6 @@ class ScalarWriter(Writer):
         known = {result.position: result.value for result in values}
         # Group, field and value of each result.
         self.outputs = [(*x, known.get(i, ())) for i, x in enumerate(outputs)]
-
-    # --- what a language defines ---
-
-    def zeros(self, size: int) -> str:
-        """Return an array of zeros."""
-        raise NotImplementedError
 
     # --- expressions ---
 
@@ -86,16 +79,14 @@ class ScalarWriter(Writer):
         lines = []
         for node in group:
             if node.op.startswith("fold"):
-                pair = functools.partial(self._pair, node.op[5:])
-                text = functools.reduce(pair, (self.operand(node.args[0], k) for k in range(size)))
+                text, *rest = [self.operand(node.args[0], k) for k in range(size)]
+                for item in rest:
+                    text = f"({self.call(node.op[5:], [text, item])})"
                 lines.append(f"{self.declaration(node.kind, node.name)} = {text};")
             else:
                 rows = [[self.operand(a, k) for a in node.args] for k in range(size)]
                 lines.append(self.array(node, [self.call(node.op, row) for row in rows]))
         return lines
-
-    def _pair(self, op: str, lhs: str, rhs: str) -> str:
-        return f"({self.call(op, [lhs, rhs])})"
 
     def single(self, node: Node) -> list[str]:
         if node.op == "input":
@@ -141,7 +132,7 @@ class ScalarWriter(Writer):
         lines = [
             f"{self.declaration('f', f'x{n}', len(flat))} = {self.listed(flat)};",
             f"{self.declaration('f', node.name, node.size, constant=False)} = "
-            f"{self.zeros(node.size)};",
+            f"{self.zeros.format(node.size)};",
             f"for ({self.index} i = 0; i < {padded}; i += {_ROWS}) {{",
             f"  for ({self.index} j = 0; j < {columns}; j++) {{",
         ]

@@ -25,20 +25,11 @@ FUNCTION int32_t any(I m) {
 }
 FUNCTION V choose_f(I m, V a, V b) { return (V)((m & (I)a) | (~m & (I)b)); }
 FUNCTION I choose_i(I m, I a, I b) { return (m & a) | (~m & b); }
-FUNCTION U choose_u(I m, U a, U b) { return ((U)m & a) | (~(U)m & b); }
 
-#define EACH(name) \
-  FUNCTION V name##_f(V x) { \
-    V result; \
-    for (int l = 0; l < LANES; l++) result[l] = name##f(x[l]); \
-    return result; \
-  }
-#define EACH_OF_TWO(name, of) \
-  FUNCTION V name##_f(V x, V y) { \
-    V result; \
-    for (int l = 0; l < LANES; l++) result[l] = of(x[l], y[l]); \
-    return result; \
-  }
+/* A vector whose lane `l` is a value. */
+#define BY_LANES(value) ({ V result; for (int l = 0; l < LANES; l++) result[l] = value; result; })
+#define EACH(name) FUNCTION V name##_f(V x) { return BY_LANES(name##f(x[l])); }
+#define EACH_OF_TWO(name, of) FUNCTION V name##_f(V x, V y) { return BY_LANES(of(x[l], y[l])); }
 FUNCTION V f_of_i(I x) { return __builtin_convertvector(x, V); }
 FUNCTION V f_of_u(U x) { return __builtin_convertvector(x, V); }
 FUNCTION I not_b(I x) { return ~x; }

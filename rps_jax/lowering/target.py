@@ -39,10 +39,9 @@ class Typed(Protocol):
 class UnsupportedError(InputError):
     """A primitive that a target cannot express."""
 
-    def __init__(self, operation: str, compiler: str = "the compiler") -> None:
-        self.operation = operation
+    def __init__(self, operation: str) -> None:
         super().__init__(
-            f"operation `{operation}` is not supported by {compiler}; "
+            f"operation `{operation}` cannot be translated; "
             "use arithmetic, comparisons, jnp.where and elementary functions."
         )
 
@@ -54,7 +53,6 @@ class TooLargeError(InputError):
 class Target:
     """Back end of a jaxpr: subclasses implement `moved` and `apply`."""
 
-    compiler = "the compiler"  # name in errors
     operations: Collection[str] = ()  # that it spells; others are compounds
     kinds = "fib"  # kinds of numbers that it supports, see `kind_of`
 

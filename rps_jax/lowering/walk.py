@@ -60,11 +60,8 @@ def traced(function: Callable[..., Any], *arguments: Any) -> tuple[ClosedJaxpr, 
 
 def walk(closed: ClosedJaxpr, arguments: Sequence[Value], target: Target) -> list[Value]:
     """Return the results of a closed jaxpr as values of a target."""
-    try:
-        with jax.enable_x64(True):
-            return _walk(closed, arguments, target)
-    except UnsupportedError as error:
-        raise UnsupportedError(error.operation, target.compiler) from None
+    with jax.enable_x64(True):
+        return _walk(closed, arguments, target)
 
 
 def _walk(closed: ClosedJaxpr | Jaxpr, arguments: Sequence[Value], target: Target) -> list[Value]:
