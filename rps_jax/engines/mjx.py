@@ -152,8 +152,7 @@ def put(model: mujoco.MjModel) -> mjx.Model:
     """Return a model on the device."""
     # MJX holds a static copy of the bounding radii for height fields, which would prevent stacking.
     unused: dict[str, Any] = {"_impl.geom_rbound_hfield": np.zeros(model.ngeom)}
-    on_device: Any = mjx.put_model(model).tree_replace(unused)
-    return on_device
+    return mjx.put_model(model).tree_replace(unused)  # pyright: ignore[reportReturnType]
 
 
 def fields_of(model: mujoco.MjModel) -> dict[str, np.ndarray]:
