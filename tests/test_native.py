@@ -247,7 +247,6 @@ FALLBACKS = {
 @pytest.mark.parametrize("name", FALLBACKS)
 def test_xla_compiles_other_functions_and_the_reason_is_named_once(name, monkeypatch, recwarn):
     function, reasons = FALLBACKS[name]
-    native._warn_once.cache_clear()
     if function is None:
         function = jnp.sin
         monkeypatch.setattr(nodes, "walk", lambda *_: {}["num_consts"])

@@ -172,7 +172,8 @@ def _compiled(functions: Sequence[_Function]) -> str | None:
         with jax.ensure_compile_time_eval():
             texts = [printer().source(x.jaxpr, x.inputs, x.results, x.is_sorted) for x in functions]
     except UnsupportedError as error:
-        _warn_once(f"{error} XLA compiles this law, which is some ten times slower.")
+        message = f"{error} XLA compiles this law, which is some ten times slower."
+        warnings.warn(message, stacklevel=2)
         return None
     except (TooLargeError, jax.errors.TracerArrayConversionError):
         return None  # XLA is faster, or the law holds a value that is being traced
@@ -195,12 +196,6 @@ def _compiled(functions: Sequence[_Function]) -> str | None:
         cache.write(_cache_path(name), body)
         _register(name, body)
     return name
-
-
-@functools.cache
-def _warn_once(message: str) -> None:
-    """Warn of a slow program, once in a process."""
-    warnings.warn(message, stacklevel=2)
 
 
 def _library(text: str, name: str) -> bytes:
