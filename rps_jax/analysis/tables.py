@@ -104,8 +104,7 @@ def success_table(results: xr.Dataset, max_lost: float) -> list[list[str]]:
 
 def _cvar(distance: np.ndarray) -> str:
     low, high = statistics.cvar_interval(distance)
-    known = np.isfinite(high)
-    interval = f"[{low:.2f}, {high:.2f}]" if known else "(too few worlds for an interval)"
+    interval = f"[{low:.2f}, {high:.2f}]" if high < np.inf else "(too few worlds for an interval)"
     return f"{statistics.cvar(distance):.2f} m {interval}"
 
 

@@ -211,7 +211,15 @@ class Ceiling(DomainQuestion[xr.Dataset]):
         return f"{results.sizes['world']} worlds of {source}, {int(results.trials.sum()):,} trials."
 
     def report(self, results: xr.Dataset, run: Run) -> Sequence[Section]:
-        text, table = _sample_text(results), []
+        worlds, table = results.world.values, []
+        sampled = np.flatnonzero(worlds == np.arange(worlds.size))  # consecutive from 0 on
+        solved, alone = (count_true(results[x].values[sampled] > 0) for x in ("solved", "alone"))
+        text = (
+            f"MPPI around the tuned law, which knows each world, solves {solved} of the first "
+            f"{sampled.size} worlds ({tables.share(solved, sampled.size)}); the law without a plan "
+            f"solves {alone} of them. This share is a lower bound: a world that the planner does "
+            "not solve may still be solvable."
+        )
         if self.results is not None:
             laws = " and ".join(self.lost_by)
             text = f"Worlds in which {laws} fail, and the first {self.sample} worlds. {text}"
@@ -268,16 +276,3 @@ def solved_table(ceiling: xr.Dataset, sweep: xr.Dataset, laws: Sequence[str]) ->
     for name, group in (statistics.worlds_by_object(sweep) | {"all": True}).items():
         table.append([name, *(f"{count_true(mask & group):,}" for mask in masks)])
     return table
-
-
-def _sample_text(results: xr.Dataset) -> str:
-    """Return the sentences about the first worlds."""
-    worlds = results.world.values
-    sampled = np.flatnonzero(worlds == np.arange(worlds.size))  # consecutive from 0 on
-    solved, alone = (count_true(results[name].values[sampled] > 0) for name in ("solved", "alone"))
-    return (
-        f"MPPI around the tuned law, which knows each world, solves {solved} of the first "
-        f"{sampled.size} worlds ({tables.share(solved, sampled.size)}); the law without a plan "
-        f"solves {alone} of them. This share is a lower bound: a world that the planner does not "
-        "solve may still be solvable."
-    )

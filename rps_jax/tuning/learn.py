@@ -352,8 +352,7 @@ def figure_of(curve: xr.Dataset) -> Figure:
 
     valid = curve.validation.notnull().values
     for ax, (x, _) in zip(axes[0], clocks, strict=True):
-        label = "trials that ended, with noise, at the dotted level"
-        draw(ax, x, 100 * curve.success, "C0", label)
+        draw(ax, x, 100 * curve.success, "C0", "trials that ended, with noise, at the dotted level")
         ax.plot(x, 100 * curve.level, "k:", lw=1, label="level of the curriculum")
         label = "validation: the domain itself, no noise"
         ax.plot(x[valid], 100 * curve.validation[valid], "C3o-", ms=4, label=label)

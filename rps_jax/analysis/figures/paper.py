@@ -170,9 +170,5 @@ def _map(ax: Axes, part: xr.Dataset) -> None:
             str(int(successes)), (x[i], y[i]), ha="center", va="center", fontsize=8, color=colour
         )
     ax.add_patch(base_patch(np.zeros(3), fill=True))
-    margin = 0.6
-    ax.set(
-        xlim=(x.min() - margin, x.max() + margin),
-        ylim=(y.min() - margin, y.max() + margin),
-        aspect="equal",
-    )
+    ax.margins(0.15)
+    ax.set_aspect("equal")
