@@ -1,9 +1,9 @@
 """Gallery of failures: maps of failed trials by failure mode, and what each mode has in common."""
 
-import functools
 import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -122,8 +122,7 @@ class Gallery(Question[xr.Dataset]):
             plotted = {i: traces[i] for i in indices[: self.each].tolist()}
             title = f"{law}: {mode}, {len(plotted)} of {indices.size} in {size} worlds"
             text = _text(self.run, law, results, indices)
-            draw = functools.partial(maps_figure, plotted, title)
-            picture = Picture(mode.replace(" ", "_"), draw)
+            picture = Picture(mode.replace(" ", "_"), partial(maps_figure, plotted, title))
             sections.append(Section(f"{mode}: {indices.size} of {size}", text, (), picture))
         return sections
 

@@ -184,9 +184,8 @@ class Learn(PPO, SimulationQuestion[xr.Dataset]):
             wall, level = f"{row.time / 60:.1f} min", f"{100 * row.level:.0f} %"
             rate, mean = f"{tables.percent(row.validation)} %", f"{row.validation_time:.0f} s"
             rows.append([str(update), wall, rate, mean, level])
-        return [
-            Section("Learning curve", text, rows, Picture("curve", partial(figure_of, results)))
-        ]
+        picture = Picture("curve", partial(figure_of, results))
+        return [Section("Learning curve", text, rows, picture)]
 
 
 learn = call_of(Learn)

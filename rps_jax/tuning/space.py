@@ -82,8 +82,7 @@ class Space:
 
         The preset is the first of the law; that of RPS has the paper's parameters.
         """
-        params_class = type(self.base)
-        preset = next(p for p in registry.LAWS.values() if type(p) is params_class)
+        preset = next(p for p in registry.LAWS.values() if type(p) is type(self.base))
         values, defaults = (
             {name: float(f"{float(value):.7g}") for name, value in leaves.items()}
             for leaves in map(registry.named_leaves, (self.params(vector), preset))
