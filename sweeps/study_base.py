@@ -51,6 +51,7 @@ _REMOVED_OPTIONS: Mapping[str, Mapping[str, Any]] = {
     "speed": {"refill": 0, "rounds": 4},
     "attack": {"aim": "distance", "algorithm": "mixed"},
     "tune_es": {"algorithm": "cma", "patience": 0},
+    "tune_grad": {"optimiser": "adam"},
 }
 
 
