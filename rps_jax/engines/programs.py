@@ -12,8 +12,9 @@ import contextlib
 import ctypes
 import functools
 import hashlib
+import importlib
+import json
 import os
-import pickle
 from collections.abc import Callable, Mapping, Sequence
 from importlib import metadata
 from pathlib import Path
@@ -72,9 +73,8 @@ def compile_function(
         safe = list(map(export.DisabledSafetyCheck.custom_call, [*native.libraries]))
         exported = export.export(jitted, disabled_checks=safe)(*leaves)
         (structure,) = structures
-        # Some results cannot be serialised.
-        with contextlib.suppress(pickle.PicklingError, ValueError, TypeError, AttributeError):
-            cache.write(path, pickle.dumps((structure, exported.serialize())))
+        with contextlib.suppress(ValueError, TypeError, AttributeError):  # cannot be serialised
+            cache.write(path, _encode(structure) + b"\n" + bytes(exported.serialize()))
     else:
         structure, exported = stored
     program = compile_lowered(jax.jit(exported.call, donate_argnums=donated).lower(*leaves))
@@ -98,6 +98,40 @@ def _digests(data: object) -> object:
     if isinstance(array, np.ndarray):
         return array.shape, str(array.dtype), hashlib.sha256(array.tobytes()).hexdigest()
     return data
+
+
+def _encode(structure: pytree.PyTreeDef) -> bytes:
+    """Return the structure of a pytree as JSON, which `_decode` reads.
+
+    Raises:
+      ValueError, TypeError, AttributeError: it has nodes that JSON cannot hold.
+    """
+    text = json.dumps(_to_json(structure.unflatten([0] * structure.num_leaves))).encode()
+    if _decode(text) != structure:
+        raise ValueError(f"{structure} cannot be cached")
+    return text
+
+
+def _decode(text: bytes) -> pytree.PyTreeDef:
+    return jax.tree.structure(_from_json(json.loads(text)))
+
+
+def _to_json(tree: object) -> object:
+    if isinstance(tree, dict):
+        return {key: _to_json(child) for key, child in tree.items()}
+    if isinstance(tree, tuple):
+        return [f"{type(tree).__module__}:{type(tree).__name__}", *map(_to_json, tree)]
+    return tree
+
+
+def _from_json(content: object) -> object:
+    if isinstance(content, dict):
+        return {key: _from_json(child) for key, child in content.items()}
+    if isinstance(content, list):
+        module, _, name = content[0].partition(":")
+        kind, children = getattr(importlib.import_module(module), name), content[1:]
+        return getattr(kind, "_make", kind)(map(_from_json, children))
+    return content
 
 
 def compile_lowered(lowered: jax.stages.Lowered) -> jax.stages.Compiled:
@@ -162,12 +196,12 @@ def _read(path: Path, leaves: Sequence[Any]) -> tuple[pytree.PyTreeDef, export.E
     """Return a cached program and the structure of its results, if it fits these arguments."""
 
     def parse(body: bytes) -> tuple[pytree.PyTreeDef, export.Exported]:
-        structure, program = pickle.loads(body)
-        exported = export.deserialize(program)
+        head, _, program = body.partition(b"\n")
+        exported = export.deserialize(bytearray(program))
         if [(x.shape, x.dtype) for x in exported.in_avals] != [(x.shape, x.dtype) for x in leaves]:
             raise ValueError("it has other shapes")
         if not all(map(native.load, native.called_names(exported.mlir_module_serialized))):
             raise ValueError("it needs a compiled function that is missing")
-        return structure, exported
+        return _decode(head), exported
 
     return cache.read(path, "traced", parse)
