@@ -81,8 +81,8 @@ def _walk(closed: ClosedJaxpr | Jaxpr, arguments: Sequence[Value], target: Targe
 
 def _results(eqn: JaxprEqn, values: list[Value], target: Target) -> Sequence[Value]:
     """Return the results of one equation."""
-    name, params, types = eqn.primitive.name, eqn.params, _types(eqn.invars)
-    outs = _types(eqn.outvars)
+    name, params = eqn.primitive.name, eqn.params
+    types, outs = [x.aval for x in eqn.invars], [x.aval for x in eqn.outvars]
     if name in _IDENTITIES:
         return values
     if all(map(is_constant, values)):
@@ -148,11 +148,6 @@ def _expanded(
     return _walk(jax.make_jaxpr(function)(*shapes), values, target)
 
 
-def _types(atoms: Sequence[Any]) -> list[Typed]:
-    """Return the shapes and dtypes of operands or results of an equation."""
-    return [atom.aval for atom in atoms]
-
-
 def _with_consts(closed: ClosedJaxpr, consts: Sequence[Value], target: Target) -> Body:
     """Return a function from the carry of a loop to the results of a jaxpr."""
     return lambda carry: _walk(closed, [*consts, *carry], target)
@@ -189,13 +184,13 @@ def _moved(eqn: JaxprEqn, values: list[Value], sources: list[int], target: Targe
     moved = _moved_by_numpy(eqn, indices)
     moved = _bind(eqn, indices) if moved is None else moved
     return [
-        target.moved([values[i] for i in sources], np.asarray(x), out)
-        for x, out in zip(moved, _types(eqn.outvars), strict=True)
+        target.moved([values[i] for i in sources], np.asarray(x), var.aval)
+        for x, var in zip(moved, eqn.outvars, strict=True)
     ]
 
 
 def _moved_by_numpy(eqn: JaxprEqn, arrays: list[Value]) -> list[np.ndarray] | None:
-    """Apply a primitive by NumPy, which is faster than a compilation by JAX; None: unknown."""
+    """Apply a primitive by NumPy, which is faster than a compilation by JAX; None: a rare one."""
     name, params, out = eqn.primitive.name, eqn.params, eqn.outvars[0].aval
     shape: tuple[int, ...] = out.shape
     if name == "broadcast_in_dim":
@@ -213,10 +208,6 @@ def _moved_by_numpy(eqn: JaxprEqn, arrays: list[Value]) -> list[np.ndarray] | No
     if name in ("concatenate", "stack"):
         axis = params.get("dimension", params.get("axis"))
         return [getattr(np, name)(arrays, axis)]
-    if name == "transpose":
-        return [np.transpose(arrays[0], params["permutation"])]
-    if name == "split":
-        return np.split(arrays[0], np.cumsum(params["sizes"])[:-1], params["axis"])
     return None
 
 
