@@ -105,8 +105,8 @@ def traced(
 
     # A new function for each call: jax.jit caches the trace of a function by its arguments.
     def advance(stage: Any, worlds: World, params: LawParams, trials: Trial) -> Trial:
-        batches = (stage,), (worlds,), (params,), (trials,)
-        return trial.advance(*batches, ControlLoop(physics), steps)[0]
+        batch = stage, worlds, params, trials
+        return trial.advance([batch], ControlLoop(physics), steps)[0]
 
     arguments = shared, batch, params, start
     lowered = jax.jit(advance, donate_argnums=3 if donated else ()).lower(*arguments)

@@ -109,7 +109,7 @@ def advance(
     stage: Any, worlds: Any, params: Any, trials: Trial, loop: ControlLoop, steps: int
 ) -> Trial:
     """Step one batch of worlds by up to `steps` control steps."""
-    return trial.advance((stage,), (worlds,), (params,), (trials,), loop, steps)[0]
+    return trial.advance([(stage, worlds, params, trials)], loop, steps)[0]
 
 
 # The fused engine compiles fastest among the engines with contact dynamics.

@@ -47,7 +47,7 @@ def batch(shape, skin="capacitive", count=21, law="rps_tuned", engine="fused", d
 
 def advance(stage, loop, steps):
     """Return the function of (worlds, params) and trials that steps them."""
-    return lambda w, p, t: trial.advance((stage,), (w,), (p,), (t,), loop, steps)[0]
+    return lambda w, p, t: trial.advance([(stage, w, p, t)], loop, steps)[0]
 
 
 def advanced(stage, inputs, trials, loop, steps):
@@ -127,7 +127,9 @@ def test_without_a_compiler_batches_share_one_loop(monkeypatch):
     stages, inputs, loops = zip(*batches, strict=True)
     trials = tuple(start_trials(subset, loops[0]) for subset in inputs)
     monkeypatch.setenv("RPS_COMPILER", "none")
-    run = jax.make_jaxpr(lambda w, p, t: trial.advance(stages, w, p, t, loops[0], 3))
+    run = jax.make_jaxpr(
+        lambda *leaves: trial.advance(list(zip(stages, *leaves, strict=True)), loops[0], 3)
+    )
     primitives = [eqn.primitive.name for eqn in run(*zip(*inputs, strict=True), trials).eqns]
     assert primitives.count("while") == 1
 

@@ -22,12 +22,6 @@ SWEPT = {"setting": SHORT, "slots": SLOTS}
 SHOWN = (*quantities_of("object", "robot"), "distance", "bearing")
 
 
-def by_object(domain, at, count):
-    """Yield the rows of the worlds of each object."""
-    object_indices = domain.object_of(at.cases(domain, np.arange(count)))
-    yield from (np.flatnonzero(object_indices == kind) for kind in np.unique(object_indices))
-
-
 def without_drawn_values(drawn):
     """Return a draw without the values that its solid, friction, target and robot contain."""
     return drawn._replace(values={k: v for k, v in drawn.values.items() if k not in SHOWN})
@@ -37,11 +31,11 @@ def without_drawn_values(drawn):
 def test_a_drawn_world_equals_the_world_at_its_point_bit_for_bit(name):
     domain, index = DOMAINS[name], np.arange(7, 300)
     at = points.check_points(domain, points.points_of(name, index, seed=5))
-    kinds = domain.object_of(at.cases(domain, np.arange(293)))
+    kinds = domain.object_of(points.cases(domain, at, np.arange(293)))
     np.testing.assert_array_equal(kinds, domain.object_of(index))
-    for rows in by_object(domain, at, 293):
+    for rows, again in points.draw_by_object(domain, 0, at, np.arange(293)):
         drawn = without_drawn_values(draws.draw(domain, 5, index[rows]))
-        again = without_drawn_values(at.draw(domain, rows))
+        again = without_drawn_values(again)
         same(drawn, again._replace(indices=index[rows], cases=drawn.cases))
 
 
@@ -58,7 +52,8 @@ def test_every_coordinate_of_a_domain_changes_some_world(name):
 
 def _leaves(domain, u):
     at = points.check_points(domain, u)
-    drawn = [without_drawn_values(at.draw(domain, x)) for x in by_object(domain, at, len(u))]
+    by_object = points.draw_by_object(domain, 0, at, np.arange(len(u)))
+    drawn = [without_drawn_values(drawn) for _, drawn in by_object]
     return np.concatenate([np.ravel(leaf) for leaf in jax.tree.leaves(drawn)])
 
 

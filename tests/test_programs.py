@@ -65,7 +65,8 @@ def test_a_recorded_trial_is_traced_once_for_all_processes(cache, monkeypatch):
     traced, record = [], trial.record
     monkeypatch.setattr(trial, "record", lambda *a, **k: traced.append(1) or record(*a, **k))
     setting = Setting("quasistatic", rules=Rules(horizon=0.2))
-    first, again = (pushes.record_cases([Case("box")], setting)[0] for _ in range(2))
+    worlds = pushes.build([Case("box")], setting)
+    first, again = (pushes.record_batch(worlds, setting)[0] for _ in range(2))
     assert len(traced) == 1
     assert jax.tree.structure(first.snapshots) == jax.tree.structure(again.snapshots)
     assert jax.tree.structure(first.outcome) == jax.tree.structure(again.outcome)

@@ -11,6 +11,7 @@ from helpers import ROOT
 
 from rps_jax.geometry import solid
 from rps_jax.lowering.routine import fields_of
+from rps_jax.trials import pushes
 from rps_jax.trials.case import Case
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.stepper import Live
@@ -50,7 +51,8 @@ def browser(tmp_path_factory):
 def python_push(law):
     """The paper's push to (-2, 0), in double precision."""
     with jax.enable_x64(True):
-        live = Live.of_case(Case("box", "S1", (-2.0, 0.0), law), Setting("quasistatic"))
+        setting = Setting("quasistatic")
+        live = Live(pushes.build([Case("box", "S1", (-2.0, 0.0), law)], setting), setting)
         live.step(20_000)
         assert live.done
         yield live

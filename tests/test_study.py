@@ -149,7 +149,7 @@ def test_a_setup_has_one_robot_and_a_friction_for_each_object():
     assert (np.ptp(mu, axis=2) == 0).all()
     assert (mu[:, 0, 0] != mu[:, 1, 0]).all()
     assert (np.ptp(u[..., columns.index("yaw")], axis=2) > 0).all()
-    cases = question.plan.points.cases(question.ranges, np.arange(64))
+    cases = points.cases(question.ranges, question.plan.points, np.arange(64))
     object_indices = np.tile(np.repeat([0, 1], 8), 4)
     np.testing.assert_array_equal(question.ranges.object_of(cases), object_indices)
     np.testing.assert_array_equal(cases % 8, np.tile(np.arange(8), 8))

@@ -216,7 +216,8 @@ def test_before_the_first_touch_the_base_creeps_without_lost_contact(advanced):
 @pytest.mark.parametrize("engine", ["fused", "mujoco"])
 def test_the_trace_of_a_trial_agrees_with_its_outcome(engine):
     setting = replace(FUSED, engine=engine, rules=Rules(horizon=24.0))
-    (trace,) = pushes.record_cases([case(NEAR, skin=CapacitiveSkin())], setting, interval=0.1)
+    worlds = pushes.build([case(NEAR, skin=CapacitiveSkin())], setting)
+    (trace,) = pushes.record_batch(worlds, setting, interval=0.1)
     snapshots, outcome = trace.snapshots, trace.outcome
     assert outcome.success
     assert np.allclose(np.diff(snapshots.time), 0.1, atol=1e-4)

@@ -36,7 +36,7 @@ PERIOD = SETTING.physics.control_period
 
 @pytest.fixture(scope="module")
 def shared_push():
-    return Live.of_case(CASE, SETTING)
+    return Live(pushes.build([CASE], SETTING), SETTING)
 
 
 @pytest.fixture

@@ -18,8 +18,6 @@ import numpy as np
 
 from rps_jax import errors
 from rps_jax.analysis import statistics
-from rps_jax.control import registry
-from rps_jax.control.base import Law
 from rps_jax.errors import InputError
 from rps_jax.record import files, folder
 from rps_jax.record.options import option
@@ -133,7 +131,6 @@ class Take(NamedTuple):
 
     tiles: Sequence[int]  # indices in the grid, row by row
     part: WorldBatch
-    law: Law
     scenes: Sequence[Scene]
     labels: Sequence[str]
 
@@ -181,7 +178,7 @@ def of_sweep(
             part = build_batch(plan, law, index[columns])
             scenes = [scene_of(plan, i) for i in worlds]
             labels = [f"{prefix}world {i}" for i in worlds]
-            takes.append(Take(tiles, part, registry.law_of(plan.laws[law]), scenes, labels))
+            takes.append(Take(tiles, part, scenes, labels))
     return takes
 
 
@@ -228,8 +225,9 @@ def _shots(take: Take, setting: Setting, interval: int) -> Iterator[tuple[bool, 
     """Yield whether all trials of a take have ended, and their tiles, at each interval."""
     part = jax.device_put(take.part)
     ended = np.zeros(len(take.labels), bool)
-    trials = trial.start_all(part.worlds, part.params, ~ended, law=take.law)
-    advance = pushes.recorder(part, trials, setting, take.law, steps=interval, stride=interval)
+    loop = trial.ControlLoop(setting.physics, setting.rules, take.part.law)
+    trials = trial.start_all(part.worlds, part.params, ~ended, law=loop.law)
+    advance = pushes.recorder(part, trials, loop, steps=interval, stride=interval)
     shots: list[Shot] = []
     while True:
         done, success, steps = jax.device_get((trials.done, trials.success, trials.steps))

@@ -123,7 +123,8 @@ class View(Action[None], Case):
     def push_of(self, request: PushRequest) -> Push:
         """The push that the page asks for."""
         case = dataclasses.replace(self.case, **request._asdict())
-        live, scene = Live.of_case(case, self.setting), pushes.scene_of(case, self.setting.physics)
+        live = Live(pushes.build([case], self.setting), self.setting)
+        scene = pushes.scene_of(case, self.setting.physics)
         return Push(live, scene, f"{case.title}, {request.law}")
 
 
@@ -144,8 +145,7 @@ Builder = Callable[[PushRequest], Push]
 
 def _in_world(plan: Plan, law: str, index: int) -> Push:
     """A world of a sweep."""
-    part = build_batch(plan, law, [index])
-    live = Live(part, registry.law_of(plan.laws[law]), plan.setting)
+    live = Live(build_batch(plan, law, [index]), plan.setting)
     return Push(live, scene_of(plan, index), f"{world_title(plan, index)}, {law}")
 
 

@@ -5,7 +5,6 @@ Worlds for tuning, validation and testing have different seeds.
 
 import math
 from collections.abc import Sequence
-from functools import partial
 from typing import Any, NamedTuple, Unpack
 
 import jax
@@ -102,8 +101,7 @@ def evaluate(
     variables = labelled(score=(dims, scored.score, "1", "objective"))
     for name, values in scored.outcome._asdict().items():
         variables[name] = variable(name, dims, values)
-    objects = ranges.object_of(points_.cases(ranges, at, request.worlds))
-    drawn = points_.drawn_columns(ranges, objects, partial(points_.draw, ranges, seed, at))
+    drawn = points_.drawn_columns(ranges, seed, at, request.worlds)
     return xr.Dataset(variables, {"pose": ["x", "y", "yaw"], "world": request.worlds} | drawn)
 
 

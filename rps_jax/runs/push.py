@@ -154,14 +154,12 @@ class TraceQuestion(Question[Trace]):
             bags.check()
             folder.ensure_writable(Path(self.bag).parent)
 
-    def record(self, world: WorldBatch, law: Law, setting: Setting, run: Run) -> Trajectory:
+    def record(self, world: WorldBatch, setting: Setting, run: Run) -> Trajectory:
         """Run a world and record it, and write its bag if one is named."""
         if self.bag is None:
-            return pushes.record_batch(world, law, setting, callback=run.callback)[0]
-        period = setting.physics.control_period
-        (fine,) = pushes.record_batch(
-            world, recorded_law(law), setting, interval=period, callback=run.callback
-        )
+            return pushes.record_batch(world, setting, callback=run.callback)[0]
+        period, law = setting.physics.control_period, recorded_law(world.law)
+        (fine,) = pushes.record_batch(world, setting, law, interval=period, callback=run.callback)
         details, observations = tuple(fine.snapshots.details)  # of `recorded_law`
         fine = dataclasses.replace(fine, snapshots=fine.snapshots._replace(details=details))
         attrs = {"law": json.dumps(registry.params_to_json(fine.params)), "period": str(period)}
@@ -246,10 +244,6 @@ class Push(Case, TraceQuestion, SimulationQuestion[Trace]):
         return float(self.setting.rules.horizon)
 
     @property
-    def title(self) -> str:
-        return self.case.title
-
-    @property
     def case(self) -> Case:
         """The trial."""
         fields = {f.name: getattr(self, f.name) for f in dataclasses.fields(Case)}
@@ -261,8 +255,7 @@ class Push(Case, TraceQuestion, SimulationQuestion[Trace]):
 
     def answer(self, run: Run) -> Trace:
         case, setting = self.case, self.setting
-        world = pushes.build([case], setting)
-        trajectory = self.record(world, registry.law_of(case.params), setting, run)
+        trajectory = self.record(pushes.build([case], setting), setting, run)
         scene = pushes.scene_of(case, setting.physics)
         return Trace(trajectory, scene, case.title, setting.engine)
 
@@ -319,8 +312,7 @@ class Replay(TraceQuestion):
     def answer(self, run: Run) -> Trace:
         plan, name = self._chosen
         world = build_batch(plan, name, [self.world])
-        law = registry.law_of(plan.laws[name])
-        trajectory = self.record(world, law, plan.setting, run)
+        trajectory = self.record(world, plan.setting, run)
         title = f"{world_title(plan, self.world)}, {name}"
         return Trace(trajectory, scene_of(plan, self.world), title, plan.setting.engine)
 

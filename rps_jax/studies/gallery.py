@@ -14,7 +14,6 @@ from rps_jax.analysis import statistics
 from rps_jax.analysis.figures.paper import draw_path
 from rps_jax.analysis.figures.style import Figure, tiles
 from rps_jax.analysis.report import Picture, Section
-from rps_jax.control import registry
 from rps_jax.record import files
 from rps_jax.record.options import option
 from rps_jax.runs.plan import Plan, build_batch
@@ -146,11 +145,11 @@ def _simulate(
 ) -> Mapping[int, xr.Dataset]:
     """Return traces of trials of a law over time, by world; one batch for each object."""
     traces: dict[int, xr.Dataset] = {}
-    objects, functions = plan.object_of(worlds), registry.law_of(plan.laws[law])
+    objects = plan.object_of(worlds)
     for k in np.unique(objects):
         rows = worlds[objects == k]
         trajectories = pushes.record_batch(
-            build_batch(plan, law, rows), functions, plan.setting, interval=0.5, callback=progress
+            build_batch(plan, law, rows), plan.setting, interval=0.5, callback=progress
         )
         progress.finish(rows.size)
         traces |= dict(zip(rows.tolist(), map(trace_dataset, trajectories), strict=True))

@@ -146,11 +146,11 @@ class Hardware(LawQuestion[xr.Dataset]):
     def _trace(self, run: Run) -> xr.Dataset:
         """Return the paths of Fig. 7: all objects and targets, at the middle friction."""
         record = partial(
-            pushes.record_cases, setting=self.setting, interval=0.5, callback=run.callback
+            pushes.record_batch, setting=self.setting, interval=0.5, callback=run.callback
         )
+        batches = [pushes.build(self._cases(name), self.setting) for name in HARDWARE_OBJECTS]
         by_object = [
-            [trace_dataset(x)[list(_TRACED)] for x in record(self._cases(name))]
-            for name in HARDWARE_OBJECTS
+            [trace_dataset(x)[list(_TRACED)] for x in record(worlds)] for worlds in batches
         ]
         # NaN after the end of a trial.
         traces = xr.combine_nested(by_object, ["object", "target"], join="outer")

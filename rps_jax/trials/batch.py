@@ -34,7 +34,7 @@ from jax.sharding import AxisType, NamedSharding
 from jax.sharding import PartitionSpec as P
 
 from rps_jax import engines, errors
-from rps_jax.control import registry
+from rps_jax.control import registry, soft
 from rps_jax.control.base import Law, LawParams
 from rps_jax.engines import programs
 from rps_jax.trials import host, trial
@@ -69,19 +69,23 @@ class WorldBatch(NamedTuple):
         return self._replace(params=same)
 
     @property
+    def law(self) -> Law:
+        """Law of the parameters."""
+        return registry.law_of(self.params)
+
+    @property
     def inputs(self) -> Inputs:
         """Inputs of the program, which differ from trial to trial."""
         return self.worlds, self.params
 
     def split(self, count: int) -> tuple[WorldBatch, WorldBatch | None]:
         """Return the first `count` trials, and the rest if there is one."""
-
-        def select(part: slice) -> WorldBatch:
-            worlds, params = rows(self.inputs, part)
-            return WorldBatch(self.indices[part], worlds, self.stage, params)
-
-        has_rest = self.indices.size > count
-        return select(slice(count)), select(slice(count, None)) if has_rest else None
+        arrays = self._replace(stage=None)
+        first, rest = (
+            rows(arrays, part)._replace(stage=self.stage)
+            for part in (slice(count), slice(count, None))
+        )
+        return first, rest if rest.indices.size else None
 
 
 Inputs = tuple[World, LawParams]
@@ -218,7 +222,7 @@ def _run_on_host(job: Job, setting: Setting, threads: int, monitor: _Monitor) ->
     """Run the trials of a job with an engine that JAX does not trace, batch by batch."""
     period = setting.physics.control_period
     for batch in job.batches:
-        loop = ControlLoop(setting.physics, setting.rules, registry.law_of(batch.params))
+        loop = ControlLoop(setting.physics, setting.rules, batch.law)
         steps = host.run(batch.stage, *batch.inputs, loop, max(1, threads))
         reported, previous = np.zeros(batch.indices.size, bool), 0
         for index, (trials, _) in enumerate(steps, 1):
@@ -251,7 +255,6 @@ class _TrialQueue:
     def __init__(self, job: Job):
         self.num_trials, self._batches = job.num_trials, iter(job.batches)
         self.example: WorldBatch = next(self._batches)  # for its stage and its shapes
-        self.law = registry.law_of(self.example.params)
         self._waiting: WorldBatch | None = self.example  # rest of the current batch
         self._lock = threading.Lock()
         self.suspended: list[_Suspended] = []
@@ -292,7 +295,8 @@ def _schedule(
             single.append(_Program([queue], [width], setting))
             width = min(devices * per_device, workers * max_suspended)
         if width:
-            groups.setdefault(queue.law if side_by_side else index, []).append((queue, width))
+            key = queue.example.law if side_by_side else index
+            groups.setdefault(key, []).append((queue, width))
     for group in groups.values():
         for i in range(0, len(group), _MAX_SIDE_BY_SIDE):
             members, widths = zip(*group[i : i + _MAX_SIDE_BY_SIDE], strict=True)
@@ -310,7 +314,7 @@ class _Program:
 
     def __init__(self, queues: Sequence[_TrialQueue], slots: Sequence[int], setting: Setting):
         self.queues, self.slots, self.setting = queues, slots, setting
-        self.law = queues[0].law
+        self.law = queues[0].example.law
         self.stages = tuple(queue.example.stage for queue in queues)
         self.sharding = None
         if jax.device_count() > 1:
@@ -380,14 +384,13 @@ def _compile_advance(
         live: tuple[jax.Array, ...],
         rules: Rules,
     ) -> tuple[tuple[Trial, ...], tuple[_Segment, ...]]:
-        worlds, params = zip(*inputs, strict=True)
-        started = [
-            trial.start_all(*args, law=law) for args in zip(worlds, params, live, strict=True)
-        ]
-        current = tuple(map(_select, fresh, started, trials))
+        pairs = zip(inputs, live, strict=True)
+        started = [trial.start_all(*leaves, mask, law=law) for leaves, mask in pairs]
+        current = tuple(map(jax.vmap(soft.tree_where), fresh, started, trials))
         steps = max(1, round(SEGMENT / physics.control_period))
         loop = ControlLoop(physics, rules, law)
-        advanced = trial.advance(stages, worlds, params, current, loop, steps)
+        batches = zip(stages, inputs, current, strict=True)
+        advanced = trial.advance([(stage, *x, state) for stage, x, state in batches], loop, steps)
         # Outcomes are in the same program: another one would wait for other workers' segments.
         return advanced, tuple(
             _Segment(b.steps - a.steps, b.done, trial.outcome(b, physics.control_period))
@@ -407,12 +410,6 @@ def _compile_advance(
         static = (physics, SEGMENT)
         return programs.compile_function(advance, arguments, law=law, donate=2, static=static)
     return programs.compile_lowered(jax.jit(advance, donate_argnums=2).lower(*arguments))
-
-
-def _select(mask: jax.Array, yes: Trial, no: Trial) -> Trial:
-    """Return the rows of `yes` where a mask (B,) holds, and those of `no` elsewhere."""
-    where = partial(jax.vmap(lambda m, a, b: jnp.where(m, a, b)), mask)
-    return jax.tree.map(where, yes, no)
 
 
 class _Slots:

@@ -1,9 +1,9 @@
-"""Named cases: their worlds, their outcomes (`run`), and their trajectories (`record_cases`)."""
+"""Named cases: their worlds, their outcomes (`run`), and their trajectories (`record_batch`)."""
 
 import math
 import time
 from collections.abc import Callable, Hashable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, NamedTuple, Unpack
 
@@ -12,7 +12,6 @@ import jax.numpy as jnp
 import numpy as np
 
 from rps_jax import engines
-from rps_jax.control import registry
 from rps_jax.control.base import Law, LawParams
 from rps_jax.control.laws.rps import RPSParams
 from rps_jax.engines import device, programs
@@ -49,14 +48,8 @@ class Trajectory:
 
 def scene_of(case: Case, physics: Physics) -> Scene:
     """Compile the scene of a case."""
-    return scene.load(
-        case.object_name,
-        physics,
-        case.contact,
-        rear=case.rear,
-        mass=case.mass,
-        robot=case.base,
-    )
+    options = {"rear": case.rear, "mass": case.mass, "robot": case.base}
+    return scene.load(case.object_name, physics, case.contact, **options)
 
 
 def _start_of(case: Case, at: Scene) -> tuple[np.ndarray, np.ndarray]:
@@ -165,30 +158,19 @@ def run(
     return outcome, timing
 
 
-def record_cases(
-    cases: Sequence[Case],
-    setting: Setting = Setting(engine="mjx"),
-    *,
-    interval: float = 0.1,
-    callback: ProgressCallback = no_progress,
-) -> list[Trajectory]:
-    """Run cases of one kind to their ends, with a snapshot every `interval` [s]."""
-    law = registry.law_of(cases[0].params)
-    return record_batch(build(cases, setting), law, setting, interval=interval, callback=callback)
-
-
 def record_batch(
     worlds: WorldBatch,
-    law: Law,
     setting: Setting,
+    law: Law | None = None,  # None: that of the law parameters
     *,
     interval: float = 0.1,
     callback: ProgressCallback = no_progress,
 ) -> list[Trajectory]:
     """Run trials of one stage to their ends, with a snapshot every `interval` [s]."""
+    loop = ControlLoop(setting.physics, setting.rules, law or worlds.law)
     stride = max(1, round(interval / setting.physics.control_period))
     record = _record if engines.get(setting.engine).traced else _record_on_host
-    snapshots, outcomes = record(worlds, law, setting, stride, callback)
+    snapshots, outcomes = record(worlds, loop, stride, callback)
     return [
         Trajectory(
             rows(snapshots, (~snapshots.done[:, i], i)),  # until the end of the trial
@@ -201,15 +183,15 @@ def record_batch(
 
 
 def _record(
-    worlds: WorldBatch, law: Law, setting: Setting, stride: int, callback: ProgressCallback
+    worlds: WorldBatch, loop: ControlLoop, stride: int, callback: ProgressCallback
 ) -> tuple[Snapshot, Outcome]:
     """Run trials; return snapshots (T, B, ...) after every `stride` control steps and outcomes."""
-    period = setting.physics.control_period
+    period = loop.physics.control_period
     steps = stride * max(1, round(SEGMENT / (stride * period)))
     worlds = jax.device_put(worlds)
-    trials = trial.start_all(*worlds.inputs, np.ones(worlds.indices.size, bool), law=law)
+    trials = trial.start_all(*worlds.inputs, np.ones(worlds.indices.size, bool), law=loop.law)
     start_time = time.perf_counter()
-    record = recorder(worlds, trials, setting, law, steps=steps, stride=stride)
+    record = recorder(worlds, trials, loop, steps=steps, stride=stride)
     compile_time, segments = time.perf_counter() - start_time, []
     while True:
         trials, snapshots, outcomes = record(trials)
@@ -223,11 +205,10 @@ def _record(
 
 
 def _record_on_host(
-    worlds: WorldBatch, law: Law, setting: Setting, stride: int, callback: ProgressCallback
+    worlds: WorldBatch, loop: ControlLoop, stride: int, callback: ProgressCallback
 ) -> tuple[Snapshot, Outcome]:
     """Run trials with an engine outside of JAX, as `_record` does with other engines."""
-    period, start_time, compile_time = setting.physics.control_period, time.perf_counter(), 0.0
-    loop = ControlLoop(setting.physics, setting.rules, law)
+    period, start_time, compile_time = loop.physics.control_period, time.perf_counter(), 0.0
     threads = 1 if worlds.indices.size == 1 else device.count_processors()
     steps = host.run(worlds.stage, *worlds.inputs, loop, threads)
     snapshots, trials = list[Snapshot](), None
@@ -243,22 +224,22 @@ def _record_on_host(
 
 
 def recorder(
-    worlds: WorldBatch, trials: Trial, setting: Setting, law: Law, *, steps: int, stride: int
+    worlds: WorldBatch, trials: Trial, loop: ControlLoop, *, steps: int, stride: int
 ) -> Callable[[Trial], tuple[Trial, Snapshot, Outcome]]:
     """Compile `trial.record` for a batch, or load it from the cache.
 
     The function returns trials after `steps` control steps, snapshots, and the outcomes so far.
     """
-    physics = setting.physics
 
     def record(*arguments: Any) -> tuple[Trial, Snapshot, Outcome]:
         *state, rules = arguments
-        loop = ControlLoop(physics, rules, law)
-        last, snapshots = trial.record(*state, loop, steps=steps, stride=stride)
-        return last, snapshots, trial.outcome(last, physics.control_period)
+        last, snapshots = trial.record(
+            *state, replace(loop, rules=rules), steps=steps, stride=stride
+        )
+        return last, snapshots, trial.outcome(last, loop.physics.control_period)
 
     fixed = worlds.stage, *worlds.inputs
-    arguments = *fixed, trials, setting.rules
-    static = (physics, steps, stride)
-    program = programs.compile_function(record, arguments, law=law, donate=3, static=static)
-    return lambda trials: program(*fixed, trials, setting.rules)
+    arguments = *fixed, trials, loop.rules
+    static = (loop.physics, steps, stride)
+    program = programs.compile_function(record, arguments, law=loop.law, donate=3, static=static)
+    return lambda trials: program(*fixed, trials, loop.rules)

@@ -145,14 +145,11 @@ class Candidates:
     @functools.cached_property
     def draws(self) -> list[tuple[np.ndarray, Domain, Draw]]:
         """Worlds by domain and object: positions (n,) among all D * W, domain and draw."""
-        draws = []
-        for i, domain in enumerate(self.domains):
-            objects = domain.object_of(points_.cases(domain, self.points, self.worlds))
-            for index in np.unique(objects):
-                at = np.flatnonzero(objects == index)
-                drawn = points_.draw(domain, self.seed, self.points, self.worlds[at])
-                draws.append((i * self.worlds.size + at, domain, drawn))
-        return draws
+        return [
+            (i * self.worlds.size + at, domain, drawn)
+            for i, domain in enumerate(self.domains)
+            for at, drawn in points_.draw_by_object(domain, self.seed, self.points, self.worlds)
+        ]
 
     @property
     def distances(self) -> np.ndarray:
@@ -169,13 +166,10 @@ class Candidates:
         """
         # Odometry of equal length in all domains lets their worlds share a batch.
         period = setting.physics.control_period
-        history = max(remembered_steps(domain, period) for domain in self.domains)
+        remembered = max(remembered_steps(domain, period) for domain in self.domains)
         for columns, domain, drawn in self.draws:
-            batch_ = drawn_worlds(domain, drawn, setting)
-            odometry = batch_.worlds.odometry
-            past = np.zeros((columns.size, history), odometry.past.dtype)
-            worlds = batch_.worlds._replace(odometry=odometry._replace(past=past))
-            yield batch_._replace(indices=columns, worlds=worlds)
+            worlds = drawn_worlds(domain, drawn, setting, remembered)
+            yield worlds._replace(indices=columns)
 
     def jobs(self, setting: Setting) -> Iterator[Job]:
         """Yield the worlds of each domain and object, candidate after candidate."""

@@ -1,6 +1,6 @@
 """Live trials: one world that is stepped on demand, disturbed and rewound, as in the viewer.
 
-live = Live.of_case(case, setting)
+live = Live(pushes.build([case], setting), setting)
 moment = live.step()
 live.set_target((1.0, 2.0))
 live.shove((0.0, 0.2))
@@ -15,13 +15,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from rps_jax import engines, errors
-from rps_jax.control import registry
-from rps_jax.control.base import Law, LawParams
+from rps_jax.control.base import LawParams
 from rps_jax.geometry.footprint import Footprint
 from rps_jax.robot.skin import CapacitiveSkin, Skin
-from rps_jax.trials import pushes, trial
+from rps_jax.trials import trial
 from rps_jax.trials.batch import WorldBatch, rows
-from rps_jax.trials.pushes import Case
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import ControlLoop, Outcome, Shift, Snapshot, Trial, World
 
@@ -48,18 +46,13 @@ class Live:
       InputError: an engine that JAX does not trace.
     """
 
-    def __init__(self, part: WorldBatch, law: Law, setting: Setting) -> None:
+    def __init__(self, part: WorldBatch, setting: Setting) -> None:
         engines.get(setting.engine).check_traced()
-        self._stage, self._loop = part.stage, ControlLoop(setting.physics, setting.rules, law)
+        self._stage, self._loop = part.stage, ControlLoop(setting.physics, setting.rules, part.law)
         self._first: World = rows(part.worlds, slice(1))
         self._params = rows(part.params, slice(1))
         self.past: list[Moment] = []
         self.reset()
-
-    @classmethod
-    def of_case(cls, case: Case, setting: Setting) -> Live:
-        """Return the live trial of a case."""
-        return cls(pushes.build([case], setting), registry.law_of(case.params), setting)
 
     # --- state ---
 

@@ -8,7 +8,7 @@ that has ended stays as it is, and a batch stops when all its trials have ended.
 
 import dataclasses
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, NamedTuple
@@ -398,20 +398,18 @@ def start_all(
 _MAX_UNCHECKED = 20  # control steps on a GPU before the host checks whether any trial runs
 
 
-def advance(
-    stages: tuple[Stage, ...],
-    worlds: tuple[World, ...],
-    params: tuple[LawParams, ...],
-    trials: tuple[Trial, ...],
-    loop: ControlLoop,
-    steps: int,
-) -> tuple[Trial, ...]:
+# Stage, worlds, law parameters and trials of a batch, with leaves (n, ...).
+Batch = tuple[Stage, World, LawParams, Trial]
+
+
+def advance(batches: Sequence[Batch], loop: ControlLoop, steps: int) -> tuple[Trial, ...]:
     """Run up to `steps` control steps of batches side by side; fewer if all trials end.
 
     Every batch has its own stage and shape family.
     """
+    stages = [stage for stage, *_ in batches]
     if not (all(getattr(stage, "native", False) for stage in stages) and native.is_available()):
-        return _advance_in_xla(stages, worlds, params, trials, loop, steps)
+        return _advance_in_xla(batches, loop, steps)
 
     def single(stage: Stage, world: World, params: LawParams, trial: Trial, rules: Any) -> Trial:
         """Advance one world."""
@@ -425,53 +423,46 @@ def advance(
 
         return jax.lax.while_loop(lambda c: (c[0] < steps) & ~c[1].done, step, (0, trial))[1]
 
-    def in_xla(*batches: Any) -> tuple[Trial, ...]:  # (worlds, params, trials, rules) of each
+    def in_xla(*inputs: Any) -> tuple[Trial, ...]:  # (worlds, params, trials, rules) of each
         """Advance all batches where the native compiler is not used."""
-        worlds, params, trials, rules = zip(*batches, strict=True)
-        shared = dataclasses.replace(loop, rules=jax.tree.map(lambda x: x[0], rules[0]))
-        return _advance_in_xla(stages, worlds, params, trials, shared, steps)
+        shared = dataclasses.replace(loop, rules=jax.tree.map(lambda x: x[0], inputs[0][-1]))
+        pairs = zip(stages, inputs, strict=True)
+        return _advance_in_xla([(stage, *values[:-1]) for stage, values in pairs], shared, steps)
 
     def phase(world: World, params: LawParams, trial: Trial, rules: Any) -> jax.Array:
         """Return 0 for trials that push, 1 for those before the first touch, above for ended."""
         return 2 * trial.done + (trial.contact_steps == 0)
 
-    batches = []
-    for batch in zip(worlds, params, trials, strict=True):
-        count = batch[-1].done.size
-        rules = jax.tree.map(lambda x, n=count: jnp.full(n, x, float), loop.rules)
-        batches.append((*batch, rules))
+    inputs = []
+    for _, *values, trials in batches:
+        rules = jax.tree.map(lambda x, n=trials.done.size: jnp.full(n, x, float), loop.rules)
+        inputs.append((*values, trials, rules))
     singles = [partial(single, stage) for stage in stages]
-    return tuple(native.concurrent(singles, in_xla, phase)(*batches))
+    return tuple(native.concurrent(singles, in_xla, phase)(*inputs))
 
 
-def _advance_in_xla(
-    stages: tuple[Stage, ...],
-    worlds: tuple[World, ...],
-    params: tuple[LawParams, ...],
-    trials: tuple[Trial, ...],
-    loop: ControlLoop,
-    steps: int,
-) -> tuple[Trial, ...]:
+def _advance_in_xla(batches: Sequence[Batch], loop: ControlLoop, steps: int) -> tuple[Trial, ...]:
     """Run `advance` as a program of XLA."""
 
     def any_runs(carry):
-        count, batches = carry
-        return (count < steps) & ~jnp.all(jnp.stack([jnp.all(batch.done) for batch in batches]))
+        count, trials = carry
+        return (count < steps) & ~jnp.all(jnp.stack([jnp.all(batch.done) for batch in trials]))
 
-    def step(_, batches):
-        arguments = zip(stages, worlds, params, batches, strict=True)
-        return tuple(control_step(*args, loop)[0] for args in arguments)
+    def step(_, trials):
+        pairs = zip(batches, trials, strict=True)
+        return tuple(control_step(*batch[:-1], current, loop)[0] for batch, current in pairs)
 
     # A GPU waits for the host at every check whether any trial runs.
     unchecked = 1 if jax.default_backend() == "cpu" else math.gcd(steps, _MAX_UNCHECKED)
 
     def body(carry):
-        count, batches = carry
+        count, trials = carry
         if unchecked > 1:
-            return count + unchecked, jax.lax.fori_loop(0, unchecked, step, batches)
-        return count + 1, step(0, batches)
+            return count + unchecked, jax.lax.fori_loop(0, unchecked, step, trials)
+        return count + 1, step(0, trials)
 
-    return jax.lax.while_loop(any_runs, body, (0, trials))[1]
+    started = tuple(batch[-1] for batch in batches)
+    return jax.lax.while_loop(any_runs, body, (0, started))[1]
 
 
 @partial(jax.jit, static_argnames=("steps", "stride"), donate_argnames="trials")

@@ -56,9 +56,17 @@ def build(
     return WorldBatch(indices, narrow, stage)
 
 
-def drawn_worlds(domain: Domain, drawn: Draw, setting: Setting) -> WorldBatch:
-    """Return the worlds of a draw, on the host, without law parameters."""
+def drawn_worlds(
+    domain: Domain, drawn: Draw, setting: Setting, remembered: int | None = None
+) -> WorldBatch:
+    """Return the worlds of a draw, on the host, without law parameters.
+
+    Their odometry remembers as many control steps as the domain needs, or `remembered`.
+    """
     count = drawn.indices.size
+    if remembered is None:
+        remembered = remembered_steps(domain, setting.physics.control_period)
+    odometry = _drawn(drawn, "base") | {"velocity_error": drawn.velocity_error}
     return build(
         drawn.indices,
         domain.family_of(drawn.cases[0]),
@@ -71,7 +79,7 @@ def drawn_worlds(domain: Domain, drawn: Draw, setting: Setting) -> WorldBatch:
         shift=Shift(np.full(count, np.inf), np.zeros((count, 2))),
         qpos=starts(drawn),
         key=drawn.key,
-        odometry=_odometry(domain, drawn, setting.physics.control_period),
+        odometry=Odometry(**odometry, past=np.zeros((count, remembered))),
     )
 
 
@@ -105,20 +113,12 @@ def remembered_steps(domain: Domain, period: float) -> int:
     return 1 + round(max(domain.pose_latency.high, domain.command_delay.high) / period)
 
 
-def _odometry(domain: Domain, drawn: Draw, period: float) -> Odometry:
-    past = np.zeros((drawn.indices.size, remembered_steps(domain, period)))
-    quantities = _drawn(drawn, "base") | {"velocity_error": drawn.velocity_error}
-    return Odometry(**quantities, past=past)
-
-
 def drawn_scene(domain: Domain, drawn: Draw, physics: Physics, i: int) -> Scene:
     """Compile the scene of row i of a draw, for pictures; named objects keep their visual geoms."""
     case = int(drawn.cases[i])
-    name = domain.objects[int(domain.object_of(drawn.cases[i]))]
+    name = domain.objects[int(domain.object_of(case))]
     if name in RANDOM:
-        robots = drawn.robot
-        return scene.compile_row(
-            domain.family_of(case), drawn.solid, drawn.friction, physics, i, robots
-        )
+        columns = drawn.solid, drawn.friction, physics, i, drawn.robot
+        return scene.compile_row(domain.family_of(case), *columns)
     ground, robot = (float(leaf[i]) for leaf in drawn.friction)
     return scene.load(name, physics, Friction(ground, robot), robot=domain.robot)

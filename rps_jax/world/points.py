@@ -7,9 +7,8 @@ numbers in [0, 1), of which a domain reads only some. A search for worlds moves 
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -109,26 +108,6 @@ class Points:
         """SHA-256 of the coordinates and their shape."""
         return files.sha256(repr(self.u.shape).encode() + np.ascontiguousarray(self.u).tobytes())
 
-    def cases(self, domain: Domain, index: Any) -> np.ndarray:
-        """Return indices of the domain with the object, friction and target of the worlds."""
-        rows = dict(zip(names(domain), self.u[np.asarray(index)].T, strict=True))
-        nothing = np.zeros(np.shape(index))
-        choices = [
-            np.floor(rows.get(name, nothing) * count).astype(np.int64)
-            for name, count in zip(_CHOICES, domain.counts, strict=True)
-        ]
-        return np.asarray(np.ravel_multi_index(choices, domain.counts))
-
-    def draw(self, domain: Domain, index: Any) -> Draw:
-        """Return the worlds `index` (n,), all of one object of the domain."""
-        index = np.asarray(index, np.int64)
-        cases = self.cases(domain, index)
-        uniform = np.full((index.size, draws.COLUMNS), 0.5)
-        pairs = [(i, draws.USES[x]) for i, x in enumerate(names(domain)) if x in draws.USES]
-        ours, theirs = (list(column) for column in zip(*pairs, strict=True))
-        uniform[:, theirs] = self.u[index][:, ours]
-        return draws.draw_at(domain, cases, uniform)._replace(indices=index)
-
     def write(self, folder: Path, domain: Domain) -> Path:
         """Write the points into a run folder."""
         return files.write_results(folder / FILE, _labelled(domain, self.u))
@@ -174,12 +153,37 @@ def check_points(domain: Domain, u: Any) -> Points:
 
 def cases(domain: Domain, points: Points | None, index: Any) -> np.ndarray:
     """Return indices with the object, friction and target of worlds, drawn ones or points."""
-    return np.asarray(index) if points is None else points.cases(domain, index)
+    if points is None:
+        return np.asarray(index)
+    rows = dict(zip(names(domain), points.u[np.asarray(index)].T, strict=True))
+    nothing = np.zeros(np.shape(index))
+    choices = [
+        np.floor(rows.get(name, nothing) * count).astype(np.int64)
+        for name, count in zip(_CHOICES, domain.counts, strict=True)
+    ]
+    return np.asarray(np.ravel_multi_index(choices, domain.counts))
 
 
 def draw(domain: Domain, seed: int, points: Points | None, index: Any) -> Draw:
-    """Return the worlds `index` of one object, drawn ones or points."""
-    return draws.draw(domain, seed, index) if points is None else points.draw(domain, index)
+    """Return the worlds `index` (n,) of one object, drawn ones or points."""
+    if points is None:
+        return draws.draw(domain, seed, index)
+    index = np.asarray(index, np.int64)
+    uniform = np.full((index.size, draws.COLUMNS), 0.5)
+    pairs = [(i, draws.USES[x]) for i, x in enumerate(names(domain)) if x in draws.USES]
+    ours, theirs = (list(column) for column in zip(*pairs, strict=True))
+    uniform[:, theirs] = points.u[index][:, ours]
+    return draws.draw_at(domain, cases(domain, points, index), uniform)._replace(indices=index)
+
+
+def draw_by_object(
+    domain: Domain, seed: int, points: Points | None, index: np.ndarray
+) -> Iterator[tuple[np.ndarray, Draw]]:
+    """Yield the worlds of each object: their positions in `index` (n,), and their draw."""
+    objects = domain.object_of(cases(domain, points, index))
+    for chosen in np.unique(objects):
+        at = np.flatnonzero(objects == chosen)
+        yield at, draw(domain, seed, points, index[at])
 
 
 def points_of(domain: Domain | str, index: ArrayLike, seed: int = 0) -> np.ndarray:
@@ -236,23 +240,19 @@ def worlds_at(
     """
     domain = parse_domain(domain, robot)
     points = check_points(domain, u)
-    objects = domain.object_of(points.cases(domain, np.arange(len(points.u))))
-    columns = drawn_columns(domain, objects, partial(points.draw, domain))
+    columns = drawn_columns(domain, 0, points, np.arange(len(points.u)))
     return _labelled(domain, points.u).assign_coords(columns)
 
 
 def drawn_columns(
-    domain: Domain, objects: np.ndarray, draw: Callable[[np.ndarray], Draw]
+    domain: Domain, seed: int, points: Points | None, index: np.ndarray
 ) -> dict[str, Any]:
-    """Return objects and drawn quantities of worlds as coordinates of a dataset.
-
-    `objects` (n,) are positions in the domain's objects; `draw` returns some worlds by their rows.
-    """
+    """Return objects and drawn quantities of worlds as coordinates of a dataset."""
+    objects = domain.object_of(cases(domain, points, index))
     columns: dict[str, Any] = {"object": ("world", np.array(domain.objects)[objects])}
-    for chosen in np.unique(objects):
-        rows = np.flatnonzero(objects == chosen)
-        for name, (values, unit) in draws.table(draw(rows)).items():
-            empty = ("world", np.empty(objects.size), {"units": unit})
+    for rows, drawn in draw_by_object(domain, seed, points, index):
+        for name, (values, unit) in draws.table(drawn).items():
+            empty = ("world", np.empty(index.size), {"units": unit})
             columns.setdefault(name, empty)[1][rows] = values
     return columns
 

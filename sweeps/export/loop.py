@@ -34,7 +34,7 @@ def recorded(cases: Sequence[Case], setting: Setting) -> list[Any]:
     law = registry.law_of(cases[0].params)
     worlds = pushes.build(cases, setting)
     period, trials = setting.physics.control_period, []
-    for trace in pushes.record_batch(worlds, recorded_law(law), setting, interval=period):
+    for trace in pushes.record_batch(worlds, setting, recorded_law(law), interval=period):
         snapshots = trace.snapshots
         observation = tuple(snapshots.details)[1]  # of `recorded_law`, with taxels
         leaves = jax.tree.leaves(observation.touch if law.senses == "touch" else observation)

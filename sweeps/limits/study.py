@@ -274,7 +274,7 @@ def turning(robots: Mapping[str, Robot], params: LawParams, seconds: float = 10.
     period = setting.physics.control_period
     for robot in robots.values():
         case = Case("box", "S1", (-2.0, 0.0), params, robot=robot)
-        (trace,) = pushes.record_cases([case], setting, interval=period)
+        (trace,) = pushes.record_batch(pushes.build([case], setting), setting, interval=period)
         snapshots, time = trace.snapshots, np.asarray(trace.snapshots.time)[:-1]
         turns = np.diff(np.asarray(snapshots.qpos)[:, 2]) / period
         values = {"asked": np.asarray(snapshots.twist.omega)[:-1], "done": turns}
