@@ -39,23 +39,12 @@ NONE, POINT, LINE = 0, 1, 2  # contact types, Fig. 6c
 
 
 class Reading(NamedTuple):
-    """Contact type and location that a skin measures."""
+    """Contact that a skin measures; that of a smooth skin has a weight from 0 to 1."""
 
-    contact_type: Int[Array, "*B"]  # NONE, POINT or LINE
-    p_robot_contact: Float[Array, "*B 2"]  # [m] contact location in the robot frame; 0 if NONE
-
-    @property
-    def in_contact(self) -> Bool[Array, "*B"]:
-        """Whether there is contact."""
-        return self.contact_type != NONE
-
-
-class SmoothReading(NamedTuple):
-    """Reading of a smooth skin, whose contact is a weight."""
-
-    contact_type: Int[Array, "*B"]  # NONE up to a weight of 1/2, else POINT or LINE
-    p_robot_contact: Float[Array, "*B 2"]  # [m] contact location in the robot frame, at any weight
-    in_contact: Float[Array, "*B"]  # [1] weight of the contact, from 0 to 1
+    contact_type: Int[Array, "*B"]  # NONE, also up to a weight of 1/2, POINT or LINE
+    # [m] contact location in the robot frame; 0 if NONE, but of a smooth skin at any weight
+    p_robot_contact: Float[Array, "*B 2"]
+    in_contact: Bool[Array, "*B"] | Float[Array, "*B"]  # whether there is contact, or the weight
 
 
 class SkinState(NamedTuple):
@@ -94,7 +83,7 @@ class IdealSkin(NamedTuple):
 
     def sense(
         self, state: SkinState, footprint: Footprint, period: Scalar
-    ) -> tuple[SkinState, Reading | SmoothReading]:
+    ) -> tuple[SkinState, Reading]:
         """Return the middle between the two ends of the contact interval; the period is unused."""
         del period
         if self.temperature is not None:
@@ -123,7 +112,7 @@ class IdealSkin(NamedTuple):
             low, high = fp.crossing(footprint, start, along, tolerance)
             yield row, start, along, low, high, (low <= high) & (high >= 0) & (low <= row.length)
 
-    def _smooth_reading(self, footprint: Footprint, temperature: Scalar) -> SmoothReading:
+    def _smooth_reading(self, footprint: Footprint, temperature: Scalar) -> Reading:
         """Return the reading of points whose activity is a sigmoid.
 
         The activity of a point at signed distance x is sigmoid((tolerance - x) / temperature). The
@@ -230,7 +219,7 @@ class CapacitiveSkin(NamedTuple):
 
     def sense(
         self, state: SkinState, footprint: Footprint, period: Scalar
-    ) -> tuple[SkinState, Reading | SmoothReading]:
+    ) -> tuple[SkinState, Reading]:
         """Return the reading of one scan of all taxels."""
         state, raw = self._scan(state, footprint)
         if self.temperature is None:
@@ -238,7 +227,7 @@ class CapacitiveSkin(NamedTuple):
         state = self._filtered(state, raw, period)
         return state, self._smooth_reading(state, self.temperature)
 
-    def _smooth_reading(self, state: SkinState, temperature: Scalar) -> SmoothReading:
+    def _smooth_reading(self, state: SkinState, temperature: Scalar) -> Reading:
         """Return the reading of taxels whose activity is a sigmoid.
 
         The activity of a taxel is sigmoid((signal - threshold) / temperature). It serves as the
@@ -362,13 +351,13 @@ def _extremes(active: jax.Array, values: jax.Array) -> tuple[jax.Array, jax.Arra
 def _reading(kind: jax.Array, first: jax.Array, last: jax.Array) -> Reading:
     """Return the reading of Sec. II-B: the location is the mean of the extreme positions."""
     location = jnp.where(kind == NONE, 0.0, 0.5 * (first + last))
-    return Reading(kind.astype(jnp.int32), location)
+    return Reading(kind.astype(jnp.int32), location, kind != NONE)
 
 
 def _smooth_reading(
     excess: jax.Array, kind: jax.Array, first: jax.Array, last: jax.Array
-) -> SmoothReading:
+) -> Reading:
     """Return a reading whose weight is the maximum activity: 1/2 at the threshold."""
     in_contact = jax.nn.sigmoid(excess)
     kind = jnp.where(excess > 0, kind, NONE)
-    return SmoothReading(kind.astype(jnp.int32), 0.5 * (first + last), in_contact)
+    return Reading(kind.astype(jnp.int32), 0.5 * (first + last), in_contact)

@@ -147,7 +147,11 @@ class Results:
     def _insert(self, chunk: int, content: bytes) -> None:
         """Insert a stored chunk; raise InputError if it is damaged, or of another version."""
         at = law, worlds = np.unravel_index(self.plan.chunks[chunk], self.shape)
-        columns = _decode(chunk, content)
+        source = f"part {chunk}"
+        try:
+            columns = files.decode_arrays(content)
+        except ValueError as error:
+            raise files.CorruptFileError(source, error) from error
         columns.pop(_REMOVED, None)
         drawn = set(columns) - {"trial", *UNITS}
         if missing := {"trial", *UNITS, *(() if law[0] or drawn else ("drawn",))} - set(columns):
@@ -155,9 +159,9 @@ class Results:
         for name, values in columns.items():
             shape = worlds.shape + (self._outcomes[name].shape[2:] if name in UNITS else ())
             if values.shape != shape or values.dtype.kind not in "biuf":
-                raise files.CorruptFileError(f"part {chunk}", f"{name} is not numbers of {shape}")
+                raise files.CorruptFileError(source, f"{name} is not numbers of {shape}")
         if not np.array_equal(columns["trial"], self.plan.chunks[chunk]):
-            raise files.CorruptFileError(f"part {chunk}", "it holds other trials")
+            raise files.CorruptFileError(source, "it holds other trials")
         for name in UNITS:
             self._outcomes[name][at] = columns[name]
         for name in columns:
@@ -189,14 +193,6 @@ class Results:
             for name, (values, meaning) in labels.items()
         }
         return xr.Dataset(columns, coordinates)
-
-
-def _decode(chunk: int, content: bytes) -> dict[str, np.ndarray]:
-    """Return the columns of a stored chunk."""
-    try:
-        return files.decode_arrays(content)
-    except ValueError as error:
-        raise files.CorruptFileError(f"part {chunk}", error) from error
 
 
 def _prefetch(batches: Iterator[WorldBatch], count: int) -> Iterator[WorldBatch]:

@@ -106,8 +106,7 @@ class Bar:
     def _open(self, phase: str) -> tqdm[NoReturn]:
         from tqdm import tqdm
 
-        smoothing = 0.05 if self.over == "simulated" else 0.3
-        interval = 0.1 if self.over == "simulated" else 0.5
+        interval, smoothing = (0.1, 0.05) if self.over == "simulated" else (0.5, 0.3)
         unit = "s" if self.over in ("simulated", "clock") else self.over.removesuffix("s")
         self._bar = tqdm(
             total=self._total,
@@ -143,10 +142,7 @@ class Bar:
             "simulated": (progress.simulated, ""),
             "clock": (clock, f"{trials} trials"),
         }
-        self.move(*moves.get(self.over, (progress.rounds, note)))
-
-    def move(self, done: float, note: str = "") -> None:
-        """Show the number of finished units, with a note."""
+        done, note = moves.get(self.over, (progress.rounds, note))
         bar = self._open(self._phase) if self._bar is None else self._bar
         bar.set_description(self._phase, refresh=False)
         if note:

@@ -93,9 +93,7 @@ def rollout(
 
 
 def outcomes(
-    requests: Sequence[Request],
-    setting: Setting,
-    **options: Unpack[RolloutOptions],
+    requests: Sequence[Request], setting: Setting, **options: Unpack[RolloutOptions]
 ) -> tuple[list[Outcome], Timing]:
     """Run every trial of every request by `rollout`, and collect the outcomes in arrays.
 

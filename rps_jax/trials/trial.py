@@ -40,7 +40,7 @@ from rps_jax.robot import base, drive
 from rps_jax.robot.base import Load, Odometry
 from rps_jax.robot.drive import Drive
 from rps_jax.robot.robot import Robot
-from rps_jax.robot.skin import NONE, Reading, Skin, SkinState, SmoothReading
+from rps_jax.robot.skin import NONE, Reading, Skin, SkinState
 from rps_jax.world.physics import Physics
 from rps_jax.world.scene import JOINTS
 
@@ -130,7 +130,7 @@ class Snapshot(NamedTuple):
 
     time: Float[Array, "*B"]  # [s]
     qpos: Float[Array, "*B 10"]  # as in `Trial`
-    reading: Reading | SmoothReading
+    reading: Reading
     twist: Twist  # [m/s, m/s, rad/s] commanded, robot frame
     details: Details
     done: Bool[Array, "*B"]  # the trial had ended
@@ -214,7 +214,7 @@ def outline(world: World, qpos: Float[Array, "10"]) -> Footprint:
 class Measurement(NamedTuple):
     """Readings of skin and odometry in one control step."""
 
-    reading: Reading | SmoothReading
+    reading: Reading
     observation: Observation  # at the pose that the odometry estimates
     # [m] contact point to target, at the true pose; without contact, that of the base
     distance: Float[Array, "*B"]

@@ -336,10 +336,7 @@ def _names(values: object) -> tuple[str, ...]:
 
 # Readers of the JSON of fields that are no ranges, and their formats for the error.
 _FORMS: dict[str, tuple[Callable[[Any], Any], str]] = {
-    "objects": (
-        _names,
-        'names, as ["random_box"]',
-    ),
+    "objects": (_names, 'names, as ["random_box"]'),
     "frictions": (
         lambda pairs: tuple(Friction(*map(float, pair)) for pair in pairs),
         "pairs of ground and robot, as [[0.3, 0.35]]",

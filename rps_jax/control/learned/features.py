@@ -19,7 +19,7 @@ from rps_jax.control.observation import Observation, TaxelObservation, Twist, di
 from rps_jax.geometry import planar
 from rps_jax.geometry.footprint import Footprint
 from rps_jax.robot import skin as skins
-from rps_jax.robot.skin import LINE, NONE, Reading, Skin, SkinState, SmoothReading
+from rps_jax.robot.skin import LINE, NONE, Reading, Skin, SkinState
 
 _BASE = 0.36  # [m] scale of positions on the base
 _NEAR, _FAR = 0.05, 3.0  # [m] distances that map to 0 and 1 on the logarithmic scale
@@ -30,7 +30,7 @@ _DRIFT = 0.01  # [m] tanh scale of the contact's motion on the base between two 
 
 def taxel_observation(
     touch: Observation,
-    reading: Reading | SmoothReading,
+    reading: Reading,
     skin: Skin,
     state: SkinState,
     footprint: Footprint,
