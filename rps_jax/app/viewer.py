@@ -80,10 +80,8 @@ class View(Action[None], Case):
     @property
     def case(self) -> Case:
         """The options' push; its law is `rps` if the options name a run."""
-        fields: dict[str, Any] = {f.name: getattr(self, f.name) for f in dataclasses.fields(Case)}
         law = "rps" if self.law is None or self.run is not None else self.law
-        fields |= case_options(self, self.setting)
-        return Case(**fields | dict[str, Any](law=law))
+        return Case(**case_options(self, self.setting, Case) | {"law": law})
 
     def note(self) -> str:
         """Whether another engine than the run's is shown."""

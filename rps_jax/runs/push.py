@@ -217,9 +217,11 @@ def bag_steps(trajectory: Trajectory, obs: Any, period: float) -> Iterator[Step]
         )
 
 
-def case_options(options: TrialOptions, setting: Setting) -> dict[str, Any]:
-    """Return the options of a trial as arguments of `Case`; the skin follows the physics."""
-    fields = {f.name: getattr(options, f.name) for f in dataclasses.fields(TrialOptions)}
+def case_options(
+    options: TrialOptions, setting: Setting, kind: type[TrialOptions] = TrialOptions
+) -> dict[str, Any]:
+    """Return fields of options as arguments of `Case`; the skin follows the physics."""
+    fields = {f.name: getattr(options, f.name) for f in dataclasses.fields(kind)}
     default = paper.SKIN.get(setting.physics_name, "ideal")
     return fields | {"skin": options.skin or default}
 
@@ -246,8 +248,7 @@ class Push(Case, TraceQuestion, SimulationQuestion[Trace]):
     @property
     def case(self) -> Case:
         """The trial."""
-        fields = {f.name: getattr(self, f.name) for f in dataclasses.fields(Case)}
-        return Case(**fields | case_options(self, self.setting))
+        return Case(**case_options(self, self.setting, Case))
 
     def check(self) -> None:
         super().check()

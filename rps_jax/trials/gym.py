@@ -20,6 +20,7 @@ import numpy as np
 
 from rps_jax import errors
 from rps_jax.control import soft
+from rps_jax.trials.batch import rows
 from rps_jax.trials.env import SHAPED_REWARD, PushEnv, State
 from rps_jax.world import domain as domains
 from rps_jax.world.domain import DomainLike
@@ -186,10 +187,7 @@ class GymPushVector(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
 
     def images(self) -> list[np.ndarray]:
         """Return an image (240, 320, 3) uint8 of each world."""
-        states = [
-            jax.tree.map(lambda leaf, i=i: leaf[i], self._state) for i in range(self.num_envs)
-        ]
-        return self.push_env.render(states)
+        return self.push_env.render([rows(self._state, i) for i in range(self.num_envs)])
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None

@@ -81,6 +81,7 @@ def build(
     solids = {key: x.rounded_solid if traced else x.solid for key, x in scenes.items()}
     starts = [_start_of(case, scenes[key]) for case, key in zip(cases, keys, strict=True)]
     qpos, targets = (np.array(column) for column in zip(*starts, strict=True))
+    shifts = zip(*(case.shift for case in cases), strict=True)
     trials = np.arange(len(cases)) if indices is None else np.asarray(indices)
     root = jax.random.PRNGKey(setting.seed)
     batch = worlds.build(
@@ -92,10 +93,7 @@ def build(
         setting,
         skin=_stack([case.sensor for case in cases]),
         p_world_target=targets,
-        shift=Shift(
-            np.array([case.shift.time for case in cases], float),
-            np.array([case.shift.p_robot for case in cases], float),
-        ),
+        shift=Shift(*(np.array(column, float) for column in shifts)),
         qpos=qpos,
         key=jax.device_get(jax.vmap(partial(jax.random.fold_in, root))(trials)),
         odometry=_stack([Odometry()] * len(cases)),
@@ -106,11 +104,8 @@ def build(
 
 def kind(case: Case) -> Hashable:
     """Return the key of the compiled program for a case: family, law, sensor and robot."""
-    return (
-        FAMILIES[case.object_name],
-        type(case.params),
-        jax.tree.structure((case.sensor, case.base)),
-    )
+    structure = jax.tree.structure((case.sensor, case.base))
+    return FAMILIES[case.object_name], type(case.params), structure
 
 
 def _stack(trees: Sequence[Any], dtype: Any = float) -> Any:
@@ -172,11 +167,9 @@ def record_batch(
     record = _record if engines.get(setting.engine).traced else _record_on_host
     snapshots, outcomes = record(worlds, loop, stride, callback)
     return [
+        # Snapshots until the end of the trial.
         Trajectory(
-            rows(snapshots, (~snapshots.done[:, i], i)),  # until the end of the trial
-            rows(outcomes, i),
-            rows(worlds.worlds, i),
-            rows(worlds.params, i),
+            rows(snapshots, (~snapshots.done[:, i], i)), *rows((outcomes, *worlds.inputs), i)
         )
         for i in range(worlds.indices.size)
     ]
