@@ -172,7 +172,11 @@ def test_a_damaged_function_is_dropped_with_one_line(damage, cache, monkeypatch)
     monkeypatch.setattr(jax.ffi, "register_ffi_target", lambda *_, **__: None)  # once a process
     (cached,) = cache.iterdir()
     content = cached.read_bytes()
-    changed = {"cut": content[:100], "empty": b"", "turned": content[:-1] + b"?"}
+    changed = {
+        "cut": content[:100],
+        "empty": b"",
+        "turned": content[:-1] + b"%c" % (content[-1] ^ 1),
+    }
     cached.write_bytes(changed[damage])
     native.libraries.clear()
     with pytest.warns(UserWarning, match="is dropped, and compiled again: its checksum") as caught:

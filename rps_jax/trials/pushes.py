@@ -166,11 +166,9 @@ def record_batch(
     stride = max(1, round(interval / setting.physics.control_period))
     record = _record if engines.get(setting.engine).traced else _record_on_host
     snapshots, outcomes = record(worlds, loop, stride, callback)
-    return [
-        # Snapshots until the end of the trial.
-        Trajectory(
-            rows(snapshots, (~snapshots.done[:, i], i)), *rows((outcomes, *worlds.inputs), i)
-        )
+    fields = outcomes, *worlds.inputs
+    return [  # with snapshots until the end of each trial
+        Trajectory(rows(snapshots, (~snapshots.done[:, i], i)), *rows(fields, i))
         for i in range(worlds.indices.size)
     ]
 
