@@ -29,16 +29,23 @@ BRIEF = Setting("quasistatic", rules=RULES)
 # --- severity ------------------------------------------------------------------------------
 
 
+def severity_of(success, time, missed, lost, tilt, rules=RULES):
+    """Return the severity of trials with these outcomes."""
+    outcomes = {"success": success, "time": time, "contact_lost_time": lost, "tilt": tilt}
+    return severity(outcomes, missed, rules)
+
+
 def test_severity_by_hand():
     still = [0.0, 0.002, 0.001]
-    success = severity([1, 1, 1], [5.0, 2.0, 10.0], [0.05] * 3, [0.0, 4.0, 0.0], still, RULES)
+    success = severity_of([1, 1, 1], [5.0, 2.0, 10.0], [0.05] * 3, [0.0, 4.0, 0.0], still)
     np.testing.assert_allclose(success, [0.5, 0.8, 1.0])
     assert (success < 1).all()  # also a success at the last moment
     # 2 mrad to pi / 4 is a factor of 392.7; its root is half way in the logarithm.
-    leaning = severity([1, 1], [1.0, 1.0], [0.05] * 2, [0.0] * 2, [0.002 * 392.7**0.5, 0.79], RULES)
+    tilt = [0.002 * 392.7**0.5, 0.79]
+    leaning = severity_of([1, 1], [1.0, 1.0], [0.05] * 2, [0.0] * 2, tilt)
     np.testing.assert_allclose(leaning, [0.5, 1.0], rtol=1e-4)
     assert (leaning < 1).all()
-    failed = severity([0, 0], [10.0, 3.0], [0.3, 0.0], [0.0, 5.0], [0.9, 0.0], RULES)
+    failed = severity_of([0, 0], [10.0, 3.0], [0.3, 0.0], [0.0, 5.0], [0.9, 0.0])
     np.testing.assert_allclose(failed, [1.3, 1.0])
 
 
@@ -161,7 +168,8 @@ def synthetic_trials(self, at):
     success = depth < 0
     time = np.where(success, 80 * np.exp(np.minimum(depth, 0)), 300.0)
     distance = np.where(success, 0.05, 0.05 + np.maximum(depth, 0))
-    severe = severity(success, time, distance, *np.zeros((2, len(time))), self.setting.rules)
+    still = np.zeros((2, len(time)))
+    severe = severity_of(success, time, distance, *still, self.setting.rules)
     columns = {"success": success * 1.0, "time": time, "left": distance, "severity": severe}
     variables = {name: ("world", values) for name, values in columns.items()}
     return xr.Dataset({"u": (("world", "quantity"), at.u), **variables})

@@ -64,8 +64,7 @@ class Probe:
         (outcome,), _ = outcomes([request], self.setting, capacity=_capacity, **options)
         trials = {name: np.asarray(getattr(outcome, name)[0], float) for name in _STORED}
         trials["left"] = statistics.miss_distance(outcome.min_distance[0], request.distances)
-        graded = (trials[x] for x in ("success", "time", "left", "contact_lost_time", "tilt"))
-        trials["severity"] = score.severity(*graded, rules=self.setting.rules)
+        trials["severity"] = score.severity(trials, trials["left"], self.setting.rules)
         variables = {name: ("world", values) for name, values in trials.items()}
         return xr.Dataset({"u": (("world", "quantity"), at.u), **variables})
 

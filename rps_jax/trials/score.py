@@ -16,6 +16,7 @@ failure that missed by more is farther from succeeding. Severity minus 1 is the 
 The planner of `rps ceiling` minimises `plan_costs`.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Literal
 
@@ -89,28 +90,26 @@ class Objective:
 
 
 def severity(
-    success: ArrayLike,  # (...) [1] 0 or 1
-    time: ArrayLike,  # (...) [s] until the trial's end
-    missed: ArrayLike,  # (...) [m] distance by which it missed the target
-    lost: ArrayLike,  # (...) [s] without contact
-    tilt: ArrayLike,  # (...) [rad] greatest tilt of the object
-    rules: Rules,
+    trials: Mapping[str, ArrayLike] | xr.Dataset, missed: ArrayLike, rules: Rules
 ) -> np.ndarray:
-    """Return the severity (...) [1] of trials: below 1 for a success, else at least 1."""
-    time, lost = np.asarray(time, float), np.asarray(lost, float)
+    """Return the severity (...) [1] of trials: below 1 for a success, else at least 1.
+
+    `trials` has variables of outcomes (...) by name; `missed` (...) [m] is the distance by which
+    each missed the target.
+    """
+    names = ("success", "time", "contact_lost_time", "tilt")
+    success, time, lost, tilt = (np.asarray(trials[name], float) for name in names)
     slow = np.maximum(time / rules.horizon, lost / max(float(rules.max_lost), 1e-6))
-    lean = np.log(np.maximum(np.asarray(tilt, float), _STILL) / _STILL)
+    lean = np.log(np.maximum(tilt, _STILL) / _STILL)
     lean /= np.log(max(float(rules.max_tilt) / _STILL, 2.0))
     succeeded = np.minimum(np.maximum(slow, lean), np.nextafter(1, 0))
-    return np.where(np.asarray(success) > 0, succeeded, 1 + np.asarray(missed, float))
+    return np.where(success > 0, succeeded, 1 + np.asarray(missed, float))
 
 
 def severity_of(results: xr.Dataset, rules: Rules) -> np.ndarray:
     """Return the severity (..., world) of the outcomes of a sweep."""
-    names = ("success", "time", "contact_lost_time", "tilt")
-    success, time, lost, tilt = (results[name].values for name in names)
     missed = statistics.miss_distance(results.min_distance.values, results.distance.values)
-    return severity(success, time, missed, lost, tilt, rules)
+    return severity(results, missed, rules)
 
 
 def plan_costs(outcome: Outcome, rules: Rules) -> np.ndarray:
