@@ -113,8 +113,7 @@ def missing_chunks(folder: Path, plan: Plan, shard: Shard) -> tuple[list[int], i
     """Return the chunks of a shard that a run folder lacks, and the number of finished trials."""
     stored, chunks = Checkpoints(folder).paths(), shard_chunks(plan, shard)
     missing = [chunk for chunk in chunks if name_of(chunk) not in stored]
-    sizes = {chunk: trials.size for chunk, trials in chunks.items()}
-    return missing, sum(sizes.values()) - sum(sizes[chunk] for chunk in missing)
+    return missing, sum(x.size for x in chunks.values()) - sum(chunks[i].size for i in missing)
 
 
 def store_chunk(folder: Path, chunk: int, content: bytes) -> Path:

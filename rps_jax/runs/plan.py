@@ -90,9 +90,8 @@ class Plan:
             worlds = np.flatnonzero(objects == object_index)
             for law in range(len(self.laws)):
                 first = (law * len(self.domain.objects) + object_index) * self.max_chunks
-                for block in range(math.ceil(worlds.size / self.part)):
-                    members = worlds[block * self.part : (block + 1) * self.part]
-                    chunks[first + block] = law * self.worlds + members
+                for block, i in enumerate(range(0, worlds.size, self.part)):
+                    chunks[first + block] = law * self.worlds + worlds[i : i + self.part]
         return chunks
 
     def program_key(self, chunk: int) -> ProgramKey:

@@ -222,8 +222,7 @@ def case_options(
 ) -> dict[str, Any]:
     """Return fields of options as arguments of `Case`; the skin follows the physics."""
     fields = {f.name: getattr(options, f.name) for f in dataclasses.fields(kind)}
-    default = paper.SKIN.get(setting.physics_name, "ideal")
-    return fields | {"skin": options.skin or default}
+    return fields | {"skin": options.skin or paper.SKIN[setting.physics.cone]}
 
 
 @dataclass(frozen=True)

@@ -69,11 +69,6 @@ class Setting:
         for params in laws:
             engine.check_senses(registry.law_of(params).senses)
 
-    @property
-    def physics_name(self) -> str:
-        """Name of the physics by its friction: `default`, or `paper_gazebo` for a pyramid."""
-        return "default" if self.physics.cone == "elliptic" else "paper_gazebo"
-
     def to_json(self) -> dict[str, Any]:
         """Return the setting as manifests have it; `from_json` reads it."""
         return {

@@ -11,7 +11,7 @@ TARGETS = tuple(
 FEW_TARGETS = ((2.0, 0.0), (1.0, 1.0), (0.0, -2.0), (-2.0, 1.0))  # a subset, for quick runs
 
 LAWS = ("rps", "nps", "aps")
-SKIN = {"default": "ideal", "paper_gazebo": "thin"}  # by physics
+SKIN = {"elliptic": "ideal", "pyramidal": "thin"}  # by the friction cone of the physics
 
 _SUCCESSES = {  # of 24, with box, cylinder and nonuniform_box, each under S1 and S2
     "rps": (23, 24, 19, 19, 19, 23),
