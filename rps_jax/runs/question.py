@@ -249,7 +249,8 @@ class Question(Command[T]):
 
     def create_run(self, out: Path | None, callback: ProgressCallback) -> Run:
         """Return the run folder and the resources of the run."""
-        return Run(out, callback)
+        size = getattr(self, "slots", None), getattr(self, "workers", None)
+        return Run(out, callback, *size)
 
     @contextlib.contextmanager
     def open_folder(self) -> Iterator[Path | None]:
@@ -292,9 +293,6 @@ class TrialQuestion(Question[T]):
     """Number of host threads that step worlds; by default as suits engine and device."""
     quick: bool = False
     """Whether to make a small run of minutes on two cores; explicit options keep their values."""
-
-    def create_run(self, out: Path | None, callback: ProgressCallback) -> Run:
-        return Run(out, callback, self.slots, self.workers)
 
 
 @dataclass(frozen=True, kw_only=True)
