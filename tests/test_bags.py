@@ -80,7 +80,7 @@ def test_a_third_party_reader_opens_the_bag(recorded):
     assert {len(messages[topic]) for topic in ("/odom", "/cmd_vel", "/taxels")} == {301}
     assert len(messages["/target_marker"]) == 7
     position = messages["/odom"][250].pose.pose.position
-    qpos = trace.trajectory.snapshots.qpos[50, :2]
+    qpos = trace.snapshots.qpos[50, :2]
     np.testing.assert_allclose((position.x, position.y), qpos, atol=1e-7)
 
 

@@ -36,7 +36,7 @@ from rps_jax.trials.progress import Bar
 from rps_jax.trials.pushes import Trajectory
 from rps_jax.trials.results import trace_dataset
 from rps_jax.trials.setting import Setting
-from rps_jax.trials.trial import Outcome, object_pose, p_world_contact
+from rps_jax.trials.trial import object_pose, p_world_contact
 from rps_jax.world import paper
 from rps_jax.world.scene import Scene
 
@@ -49,10 +49,9 @@ FILM_LENGTH = 10.0  # [s] default, whatever the length of the trial
 
 
 @dataclass(frozen=True, repr=False)
-class Trace:
+class Trace(Trajectory):
     """Recorded trial, with its scene and its figures."""
 
-    trajectory: Trajectory  # arrays over time, (T, ...)
     scene: Scene
     title: str
     engine: str
@@ -63,7 +62,7 @@ class Trace:
     @property
     def summary(self) -> str:
         """Outcome in words."""
-        outcome, (x, y) = self.outcome, self.trajectory.p_world_target
+        outcome, (x, y) = self.outcome, self.p_world_target
         return (
             f"target ({x:g}, {y:g}) m {'reached' if outcome.success else 'not reached'} at "
             f"{float(outcome.time):.1f} s, least distance {float(outcome.min_distance):.3f} m, "
@@ -71,14 +70,9 @@ class Trace:
         )
 
     @property
-    def outcome(self) -> Outcome:
-        """The result of the trial, without a leading axis."""
-        return self.trajectory.outcome
-
-    @property
     def data(self) -> xr.Dataset:
         """The trial over time: variables (time, ...), its outcome as scalars."""
-        return trace_dataset(self.trajectory)
+        return trace_dataset(self)
 
     def plot(self, path: str | Path | None = None) -> Figure:
         """Draw the trial as Fig. 6 of the paper does; with a path it is written there, too."""
@@ -99,13 +93,12 @@ class Trace:
         from rps_jax.analysis.figures.paper import stills
         from rps_jax.world import rendering
 
-        snapshots = self.trajectory.snapshots
-        shown = _evenly_spaced(len(snapshots.time), count)
-        tiles = [rendering.Tile(self.scene, self.trajectory.p_world_target)] * len(shown)
+        shown = _evenly_spaced(len(self.snapshots.time), count)
+        tiles = [rendering.Tile(self.scene, self.p_world_target)] * len(shown)
         with rendering.open_renderers(tiles, _STILL, "oblique") as renderers:
-            poses = zip(renderers, snapshots.qpos[shown], strict=True)
+            poses = zip(renderers, self.snapshots.qpos[shown], strict=True)
             images = [renderer.draw(qpos, rendering.NO_CONTACT) for renderer, qpos in poses]
-        return stills(images, [f"{snapshots.time[i]:.0f} s" for i in shown])
+        return stills(images, [f"{self.snapshots.time[i]:.0f} s" for i in shown])
 
     def film(
         self,
@@ -132,12 +125,11 @@ class Trace:
         from rps_jax.world import video
 
         errors.check_finite("film_length", seconds, above=0, at_most=600, unit="s")
-        snapshots = self.trajectory.snapshots
-        shown = _evenly_spaced(len(snapshots.time), round(seconds * fps))
-        contacts = np.asarray(p_world_contact(snapshots))[shown]
-        pairs = zip(watch(snapshots.qpos[shown]), contacts, strict=True)
+        shown = _evenly_spaced(len(self.snapshots.time), round(seconds * fps))
+        contacts = np.asarray(p_world_contact(self.snapshots))[shown]
+        pairs = zip(watch(self.snapshots.qpos[shown]), contacts, strict=True)
         shots = ([video.Shot(qpos, contact, "")] for qpos, contact in pairs)
-        tile = video.Tile(self.scene, self.trajectory.p_world_target)
+        tile = video.Tile(self.scene, self.p_world_target)
         video.render([tile], shots, Path(path), fps=fps, size=size)
         return Path(path)
 
@@ -257,7 +249,7 @@ class Push(Case, TraceQuestion, SimulationQuestion[Trace]):
         case, setting = self.case, self.setting
         trajectory = self.record(pushes.build([case], setting), setting, run)
         scene = pushes.scene_of(case, setting.physics)
-        return Trace(trajectory, scene, case.title, setting.engine)
+        return Trace(**vars(trajectory), scene=scene, title=case.title, engine=setting.engine)
 
 
 push = call_of(Push)
@@ -313,8 +305,8 @@ class Replay(TraceQuestion):
         plan, name = self._chosen
         world = build_batch(plan, name, [self.world])
         trajectory = self.record(world, plan.setting, run)
-        title = f"{world_title(plan, self.world)}, {name}"
-        return Trace(trajectory, scene_of(plan, self.world), title, plan.setting.engine)
+        scene, title = scene_of(plan, self.world), f"{world_title(plan, self.world)}, {name}"
+        return Trace(**vars(trajectory), scene=scene, title=title, engine=plan.setting.engine)
 
 
 replay = call_of(Replay)
