@@ -182,6 +182,5 @@ def table(drawn: Draw) -> dict[str, tuple[np.ndarray, str]]:
         if quantity.label and values is not None:  # the first number of a limit with several
             columns[name] = values.reshape(len(values), -1)[:, 0]
     columns["corners"] = solid.corners(shape)
-    for name, values in zip(VELOCITY_ERRORS, drawn.velocity_error.T, strict=True):
-        columns[name] = values
+    columns |= dict(zip(VELOCITY_ERRORS, drawn.velocity_error.T, strict=True))
     return {name: (values, unit_of(name)) for name, values in columns.items()}
