@@ -502,14 +502,14 @@ def _run(program: _Program, max_suspended: int, monitor: _Monitor) -> None:
     advance, stages, rules = program.compiled(), program.stages, program.setting.rules
     monitor.add_compile_time(time.perf_counter() - start_time)
     with ThreadPoolExecutor(1) as reporter:  # reports a segment while the next one runs
-        reports: list[Future[None]] = []
+        report: Future[object] = reporter.submit(int)  # of the last segment that was read
         unread: tuple[_Segment, ...] | None = None  # segment whose results are still on the GPU
 
-        def read(segments: tuple[_Segment, ...]) -> list[Future[None]]:
+        def read(segments: tuple[_Segment, ...]) -> Future[object]:
             segments = jax.device_get(segments)
             ended = [slots.refill(s) for slots, s in zip(queues, segments, strict=True)]
-            _wait(reports)
-            return [reporter.submit(monitor.add, *args) for args in ended]
+            report.result()
+            return reporter.submit(lambda: [monitor.add(*arguments) for arguments in ended])
 
         while not monitor.stop and sum(slots.live.sum() for slots in queues) > max_suspended:
             arguments = zip(*(slots.arguments() for slots in queues), strict=True)
@@ -520,15 +520,9 @@ def _run(program: _Program, max_suspended: int, monitor: _Monitor) -> None:
             overlap = _max_suspended() and all(queue.is_empty for queue in program.queues)
             segments, unread = (unread, segments) if overlap else (segments, None)
             if segments is not None:
-                reports = read(segments)
+                report = read(segments)
         if unread is not None:
-            reports = read(unread)
-        _wait(reports)
+            report = read(unread)
+        report.result()
     for slots in queues:
         slots.suspend()
-
-
-def _wait(futures: Iterable[Future[None]]) -> None:
-    """Wait for all futures, and raise the error of the first that failed."""
-    for future in futures:
-        future.result()
