@@ -2,7 +2,7 @@
 
 import doctest
 import inspect
-from importlib import import_module
+import pkgutil
 
 import numpy as np
 import pytest
@@ -103,7 +103,7 @@ def test_a_table_equals_that_of_the_command(tmp_path):
 
 # --- examples ------------------------------------------------------------------------------
 
-API = {name: getattr(import_module(module), name) for module, name in addresses()}
+API = {name: pkgutil.resolve_name(f"{module}.{name}") for module, name in addresses()}
 API |= {
     name: getattr(rps_jax, name) for name in rps_jax.__all__
 }  # such as `paper`, before a module
