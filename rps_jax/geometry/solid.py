@@ -150,7 +150,7 @@ def extent(solid: Solid, yaw: np.ndarray) -> np.ndarray:
 
 def axes(solid: Solid) -> np.ndarray:
     """Return rotation matrices (n, 3, 3) from principal axes to the object's frame."""
-    return np.moveaxis(np.array(vectors.matrix(solid.q_object_body.T)), -1, 0)
+    return np.moveaxis(np.array(vectors.matrix(list(solid.q_object_body.T))), -1, 0)
 
 
 def friction_arm(solid: Solid) -> np.ndarray:

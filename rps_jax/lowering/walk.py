@@ -82,7 +82,7 @@ def _walk(closed: ClosedJaxpr | Jaxpr, arguments: Sequence[Value], target: Targe
 def _results(eqn: JaxprEqn, values: list[Value], target: Target) -> Sequence[Value]:
     """Return the results of one equation."""
     name, params = eqn.primitive.name, eqn.params
-    types, outs = [x.aval for x in eqn.invars], [x.aval for x in eqn.outvars]
+    types, outs = _types(eqn.invars), _types(eqn.outvars)
     if name in _IDENTITIES:
         return values
     if all(map(is_constant, values)):
@@ -122,6 +122,11 @@ def _results(eqn: JaxprEqn, values: list[Value], target: Target) -> Sequence[Val
     if len(outs) != 1:
         raise UnsupportedError(name)
     return [_apply(name, values, types, params, outs[0], target)]
+
+
+def _types(atoms: Sequence[Any]) -> list[Typed]:
+    """Return the types of atoms of a jaxpr."""
+    return [atom.aval for atom in atoms]
 
 
 def _apply(
@@ -184,8 +189,8 @@ def _moved(eqn: JaxprEqn, values: list[Value], sources: list[int], target: Targe
     moved = _moved_by_numpy(eqn, indices)
     moved = _bind(eqn, indices) if moved is None else moved
     return [
-        target.moved([values[i] for i in sources], np.asarray(x), var.aval)
-        for x, var in zip(moved, eqn.outvars, strict=True)
+        target.moved([values[i] for i in sources], np.asarray(x), out)
+        for x, out in zip(moved, _types(eqn.outvars), strict=True)
     ]
 
 

@@ -187,6 +187,7 @@ class GymPushVector(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
 
     def images(self) -> list[np.ndarray]:
         """Return an image (240, 320, 3) uint8 of each world."""
+        assert self._state is not None, "reset comes first"
         return self.push_env.render([rows(self._state, i) for i in range(self.num_envs)])
 
     def reset(
