@@ -72,9 +72,13 @@ class Shadow(Question[xr.Dataset]):
     def report(self, results: Any, run: Run) -> Sequence[Section]:
         """Return the differences between the twists of the law and the recorded ones."""
         rows = [["", "root mean square", "greatest", "at time [s]"]]
+        is_nan = ~np.isfinite(results.to_array().sel(source="law")).all("variable").values
+        kept = results.isel(time=~is_nan)
         for name, unit in _UNITS.items():
-            error = np.abs(results[name].sel(source="law") - results[name].sel(source="commanded"))
-            worst, when = float(error.max()), float(results.time[int(np.argmax(error.values))])
+            error = np.abs(kept[name].sel(source="law") - kept[name].sel(source="commanded"))
+            if not error.size:
+                continue
+            worst, when = float(error.max()), float(kept.time[int(np.argmax(error.values))])
             mean = f"{float(np.sqrt(np.mean(error**2))):.2g}"
             rows.append([f"{name} [{unit}]", mean, f"{worst:.2g}", f"{when:.2f}"])
         start, end = float(results.time[0]), float(results.time[-1])
@@ -83,6 +87,12 @@ class Shadow(Question[xr.Dataset]):
             f"differences between the twists of {results.attrs['law']} and the recorded ones, at "
             "the same observations."
         )
+        if count := int(is_nan.sum()):
+            text += (
+                f" {results.attrs['law']} returned NaN or infinity at {count} of {is_nan.size} "
+                f"commands, first at {results.time.values[is_nan][0]:.2f} s; the table leaves "
+                "these out."
+            )
         return [Section("Differences from the recorded commands", text, rows)]
 
 

@@ -7,21 +7,19 @@ in `rps,K_h=0.3` or `pursuit,mine.json`.
 
 import functools
 import importlib
-import importlib.util
 import pkgutil
 import sys
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from types import ModuleType
 from typing import Any, get_args
 
 import jax
 import numpy as np
 
 from rps_jax import errors
-from rps_jax.control import laws, validation
+from rps_jax.control import laws, sources, validation
 from rps_jax.control.base import Law, LawParams, Params, Senses, Smoothing, named_leaves
 from rps_jax.control.learned import policy
 from rps_jax.errors import InputError
@@ -196,19 +194,18 @@ def _parse_head(text: str) -> tuple[str, LawParams]:
         return _load_policy(Path(text))
     path, _, kind = (text, "", "") if text.endswith(".py") else text.rpartition(":")
     if not path.endswith(".py"):
-        return text, LAWS[errors.check_name("law", text, LAWS)]
-    content = _read(Path(path))
-    digest = files.sha256(content)[:16]
-    module = f"_rps_jax_{Path(path).stem}_{digest}"
+        rule = f"choose from {', '.join(LAWS)}, or give FILE.py or policy.npz"
+        if text not in LAWS:
+            raise errors.not_allowed("law", text, rule)
+        return text, LAWS[text]
     # The file is run again if another law has taken its name since.
-    if (law := _find_registered(module, kind)) is None:
-        run_file(Path(path), module)
-        law = _find_registered(module, kind)
+    if (law := _find_registered(sources.load(Path(path)), kind)) is None:
+        law = _find_registered(sources.load(Path(path), again=True), kind)
     if law is None:
         needed = f"the class {kind}" if kind else "one class of parameters (or use FILE.py:CLASS)"
         rule = f"{path} must define {needed} and call rps_jax.register_law with an instance of it"
         raise errors.not_allowed("law", text, rule)
-    _SOURCES[type(law[1])] = {"file": str(Path(path).resolve()), "digest": digest}
+    _SOURCES[type(law[1])] = sources.describe(Path(path))
     return law
 
 
@@ -228,7 +225,7 @@ def _find_registered(module: str, kind: str) -> tuple[str, LawParams] | None:
 
 def _load_policy(path: Path) -> tuple[str, LawParams]:
     """Register the learned law of a file, and return its name and parameters."""
-    content = _read(path)
+    content = files.read_regular(path, "policy")
     name, law, params = policy.build_law(policy.decode(content, path))
     kind = type(params).__name__  # contains a digest, so that a copy is the law that is known
     name = next((known for known, p in LAWS.items() if type(p).__name__ == kind), name)
@@ -236,8 +233,7 @@ def _load_policy(path: Path) -> tuple[str, LawParams]:
         register_law(name, law, params)
     params = LAWS[name]
     if name not in PACKAGE_LAWS:  # a copy of a shipped policy stays a law of the package
-        source = {"file": str(path.resolve()), "digest": files.sha256(content)[:16]}
-        _SOURCES[type(params)] = source
+        _SOURCES[type(params)] = sources.describe(path)
     return name, params
 
 
@@ -281,29 +277,6 @@ def resolve_laws(laws: LawsLike) -> dict[str, LawParams]:
     return {label: check_params(params) for label, params in resolved.items()}
 
 
-def _read(path: Path) -> bytes:
-    """Read the file of a law."""
-    return files.read_regular(path, "policy" if path.suffix == ".npz" else "python")
-
-
-def run_file(path: Path, name: str) -> ModuleType:
-    """Run a user's Python file as a module of this name; any error becomes an InputError."""
-    spec = importlib.util.spec_from_file_location(name, path)
-    assert spec is not None
-    assert spec.loader is not None
-    module = sys.modules[name] = importlib.util.module_from_spec(spec)
-    try:
-        spec.loader.exec_module(module)
-    except (Exception, SystemExit) as error:  # any error of the user's file
-        del sys.modules[name]
-        if isinstance(error, InputError):
-            raise
-        raise InputError(
-            f"{path} cannot be run ({type(error).__name__}: {error}): correct the file."
-        ) from error
-    return module
-
-
 # --- laws in manifests ---------------------------------------------------------------------
 
 
@@ -316,18 +289,23 @@ def params_to_json(params: LawParams) -> dict[str, Any]:
     return {"law": kind.__name__} | _SOURCES.get(kind, {}) | leaves_to_json(params)
 
 
-def params_from_json(values: Mapping[str, Any]) -> LawParams:
+def params_from_json(values: Mapping[str, Any], run: Path | None = None) -> LawParams:
     """Return the parameters that `params_to_json` wrote.
 
+    A law whose file has changed is loaded from its copy in the folder of the run.
+
     Raises:
-      InputError: their class is unknown, the file of their law has changed, or names differ.
+      InputError: their class is unknown, the file of their law has changed and the run has no copy,
+        or names differ.
     """
     leaves = dict(values)
-    kind, file, digest = (leaves.pop(key, None) for key in ("law", "file", "digest"))
-    if file:  # its content is compared before it is run
-        if files.sha256(_read(Path(str(file))))[:16] != digest:
-            raise InputError(f"law = {file} has changed since the run: restore the file.")
-        parse_law(file if file.endswith(".npz") else f"{file}:{kind}")
+    kind = leaves.pop("law", None)
+    source = {key: leaves.pop(key) for key in ("file", "digest", "imports") if key in leaves}
+    if source:
+        file = str(sources.find(source, run))
+        _, law = parse_law(file if file.endswith(".npz") else f"{file}:{kind}")
+        if type(law) in _SOURCES:
+            _SOURCES[type(law)] = source
     known = {type(params).__name__: params for params in (_HIDDEN | LAWS).values()}
     params = known[errors.check_name("class of parameters", str(kind), known)]
     names = named_leaves(params)

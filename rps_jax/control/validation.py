@@ -1,13 +1,14 @@
 """Checks of a custom law before anything compiles, with errors of one sentence.
 
-`check_law` traces `init` and `step` with `jax.eval_shape`, which computes nothing, and compares
-the results with the types that a trial needs. Without it, a mistake in a law ends in a traceback
-through JAX.
+`check_law` traces `init` and `step` twice, which computes nothing. It compares the results with the
+types that a trial needs, and both traces with each other. Without it, a mistake in a law ends in a
+traceback through JAX, or a law that is not pure in results that depend on the compiler.
 """
 
 import functools
 import inspect
 import linecache
+import re
 import traceback
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -39,6 +40,7 @@ _TRACER_ERRORS: dict[type[Exception], str] = {
     jax.errors.TracerIntegerConversionError: "uses a traced index or length: write jnp.take",
     jax.errors.NonConcreteBooleanIndexError: "indexes with a traced condition: write jnp.where",
     jax.errors.ConcretizationTypeError: "converts a traced value to a number: keep a jax.Array",
+    jax.errors.UnexpectedTracerError: "reads a value of an earlier call: keep it in the state",
 }
 
 
@@ -111,9 +113,9 @@ def _check_traced(
 
 
 def _trace(name: str, function: Function, *args: object) -> object:
-    """Return the abstract results of a function of a law."""
+    """Return the abstract results of a function of a law, which must be pure."""
     try:
-        return jax.eval_shape(function, *args)
+        programs, results = zip(*(_program(function, args) for _ in range(2)), strict=True)
     except InputError:
         raise
     except (Exception, SystemExit) as error:  # any error of the user's function
@@ -123,6 +125,22 @@ def _trace(name: str, function: Function, *args: object) -> object:
             fault = f"raises {type(error).__name__}" + (f" ({reason})" if reason else "")
         line = _line_of(error) or _definition(function)
         raise InputError(f"{name} of the law in {line} {fault}.") from error
+    if programs[0] != programs[1]:
+        raise InputError(
+            f"{name} of the law in {_definition(function)} is not pure, since a second call "
+            "computes something else: keep what changes in the state, and a key of jax.random."
+        )
+    return results[0]
+
+
+def _program(function: Function, args: Sequence[object]) -> tuple[object, object]:
+    """Trace a function, and return its program without addresses, and its abstract results."""
+    # A function of its own, since JAX remembers the trace of a function.
+    traced, results = jax.make_jaxpr(lambda *x: function(*x), return_shape=True)(*args)
+    if any(isinstance(x, jax.core.Tracer) for x in traced.consts):
+        raise jax.errors.UnexpectedTracerError("a constant is traced")
+    constants = [(np.shape(x), np.asarray(x).tobytes()) for x in traced.consts]
+    return (re.sub("0x[0-9a-f]+", "", str(traced.jaxpr)), constants), results
 
 
 def _describe(value: Any) -> str:

@@ -5,7 +5,7 @@ import json
 import reprlib
 import shutil
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 from filelock import FileLock, Timeout
@@ -15,6 +15,7 @@ from rps_jax.record import files
 from rps_jax.record.files import JsonObject
 
 MANIFEST = "manifest.json"  # of a run that can be continued
+_SOURCES = "sources"  # folder of copies of the files that a configuration names
 _SHORT = reprlib.Repr()
 _SHORT.maxlevel = 1
 
@@ -25,7 +26,8 @@ def remove_run(folder: Path) -> None:
         run = ensure_writable(manifest.parent)
         with lock(run):
             try:
-                shutil.rmtree(run / "parts", ignore_errors=True)
+                for name in ("parts", _SOURCES):
+                    shutil.rmtree(run / name, ignore_errors=True)
                 for name in (MANIFEST, "results.nc", "points.nc", "environment.json"):
                     for path in (run / name, run / f"{name}.sha256"):
                         path.unlink(missing_ok=True)
@@ -54,6 +56,7 @@ def claim(folder: Path, configuration: JsonObject) -> Path:
     new = json.loads(json.dumps(configuration))
     with lock_briefly(folder):
         if not (folder / MANIFEST).exists():
+            _copy_sources(folder, configuration)
             files.write_json(folder / MANIFEST, new, checked=True)
         elif (stored := files.read_checked_json(folder / MANIFEST)) != new:
             raise InputError(
@@ -61,6 +64,25 @@ def claim(folder: Path, configuration: JsonObject) -> Path:
                 "another folder, ask for the same, or pass --overwrite."
             )
     return folder
+
+
+def sources(folder: Path, digest: str) -> Path:
+    """Return the folder in a run's folder with copies of a source file and of its imports."""
+    return folder / _SOURCES / digest
+
+
+def _copy_sources(folder: Path, value: object) -> None:
+    """Copy the files that a configuration names with their digests, and their imports."""
+    if not isinstance(value, Mapping):
+        return
+    if {"file", "digest"} <= value.keys():
+        file = Path(value["file"])
+        for name in (file.name, *value.get("imports", ())):
+            copy = sources(folder, value["digest"]) / name
+            copy.parent.mkdir(parents=True, exist_ok=True)
+            shutil.copyfile(file.parent / name, copy)
+    for item in value.values():
+        _copy_sources(folder, item)
 
 
 def lock_briefly(folder: Path) -> FileLock:

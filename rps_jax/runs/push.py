@@ -63,6 +63,9 @@ class Trace(Trajectory):
     def summary(self) -> str:
         """Outcome in words."""
         outcome, (x, y) = self.outcome, self.p_world_target
+        if outcome.diverged:
+            cause = "the law returned NaN" if outcome.nan_twist else "the physics ran away"
+            return f"diverged at {float(outcome.time):.2f} s, since {cause}"
         return (
             f"target ({x:g}, {y:g}) m {'reached' if outcome.success else 'not reached'} at "
             f"{float(outcome.time):.1f} s, least distance {float(outcome.min_distance):.3f} m, "

@@ -31,7 +31,8 @@ from rps_jax.world.domain import LABELS, unit_of
 
 StoreChunk = Callable[[int, bytes], object]  # called with the number of a chunk and its content
 # Types of an outcome's columns; the rest are float32.
-_TYPES: dict[str, type] = dict.fromkeys(("success", "tipped", "diverged", "stalled"), np.int8)
+_FLAGS = ("success", "tipped", "diverged", "nan_twist", "stalled")
+_TYPES: dict[str, type] = dict.fromkeys(_FLAGS, np.int8)
 _REMOVED = "overflows"  # column of a version with the engine warp
 _PREFETCH = 16384  # worlds of one program that are built before they are needed, about
 

@@ -21,6 +21,7 @@ from __future__ import annotations
 import functools
 import threading
 import time
+import warnings
 from collections import defaultdict
 from collections.abc import Callable, Hashable, Iterable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, as_completed
@@ -163,6 +164,7 @@ def run(
         count = len(tasks)
     _run_in_threads(tasks, count, monitor)
     total = time.perf_counter() - start_time
+    monitor.warn_of_nan_twists()
     return Timing(monitor.compile, total - monitor.compile, monitor.simulated)
 
 
@@ -193,7 +195,7 @@ class _Monitor:
         self.simulated = 0.0  # [s] summed over trials
         self.compile = 0.0  # [s] that the worker who waited longest had no program
         self.stop = False  # set when one worker fails or the user interrupts
-        self._finished = 0  # trials
+        self._finished = self._nan_twists = 0  # trials
         self._waits: defaultdict[int, float] = defaultdict(float)  # [s] for compilation, by thread
         self._collect, self._callback = collect, callback
         self._lock = threading.Lock()
@@ -204,8 +206,18 @@ class _Monitor:
             if indices.size:
                 self._collect(indices, outcomes)
             self._finished += indices.size
+            self._nan_twists += int(np.count_nonzero(outcomes.nan_twist))
             self.simulated += simulated
             self._callback(Progress(self._finished, self.simulated, self.compile))
+
+    def warn_of_nan_twists(self) -> None:
+        """Warn if a law returned a twist that is not finite."""
+        if self._nan_twists:
+            warnings.warn(
+                f"a law returned NaN or infinity in {self._nan_twists} of {self._finished} trials: "
+                "they ended as diverged",
+                stacklevel=4,
+            )
 
     def add_compile_time(self, seconds: float) -> None:
         """Add a time [s] for which the worker of this thread had no program."""

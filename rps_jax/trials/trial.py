@@ -7,6 +7,7 @@ that has ended stays as it is, and a batch stops when all its trials have ended.
 """
 
 import dataclasses
+import functools
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -121,6 +122,7 @@ class Trial(NamedTuple):
     tilt: Float[Array, "*B"]  # [rad] greatest tilt of the object so far
     tipped: Bool[Array, "*B"]  # the object has fallen over
     diverged: Bool[Array, "*B"]
+    nan_twist: Bool[Array, "*B"]  # the law returned a twist that is not finite
     drive: Drive | None = None  # of a robot with limits
     load: Load | None = None  # of a law that senses the contact's force
 
@@ -148,6 +150,7 @@ class Outcome(NamedTuple):
     tilt: Float[Array, "*B"]  # [rad] greatest tilt of the object
     tipped: Bool[Array, "*B"]  # the object has fallen over
     diverged: Bool[Array, "*B"]
+    nan_twist: Bool[Array, "*B"]  # it diverged since the law returned a twist that is not finite
     stalled: Bool[Array, "*B"]  # it ended with the base standing still against the object
     base_pose: Float[Array, "*B 3"]  # [m, m, rad] in the world, at the end
     object_pose: Float[Array, "*B 3"]  # [m, m, rad] of the object in the world, at the end
@@ -189,6 +192,7 @@ def start(world: World, params: LawParams, law: Law = rps.LAW) -> Trial:
         tilt=jnp.zeros_like(world.qpos[0]),
         tipped=false,
         diverged=false,
+        nan_twist=false,
         drive=None if world.robot is None else drive.init_drive(world.qpos),
         load=base.init_load(world.qpos) if law.senses == "force" else None,
     )
@@ -299,9 +303,11 @@ def decide(
         load, force = law.cell.read(judged.load, world.key, judged.steps, period)
         judged, obs = judged._replace(load=load), ForceObservation(obs, force)
     state, twist, details = law.step(params, trial.law_state, obs)
+    is_finite = functools.reduce(jnp.logical_and, map(jnp.isfinite, twist))
+    judged = judged._replace(law_state=state, nan_twist=~judged.done & ~is_finite)
     time, reading = trial.steps * period, measured.reading
     snapshot = Snapshot(time, judged.qpos, reading, twist, details, trial.done)
-    decided, twist = execute(world, judged._replace(law_state=state), twist, period)
+    decided, twist = execute(world, judged, twist, period)
     return decided, twist, snapshot
 
 
@@ -312,7 +318,8 @@ def settle(previous: Trial, decided: Trial, driven: Driven) -> Trial:
     """
     (qpos, qvel, warmstart, integral), force = driven
     sane = (
-        jnp.all(jnp.isfinite(qpos))
+        ~decided.nan_twist
+        & jnp.all(jnp.isfinite(qpos))
         & jnp.all(jnp.abs(qvel) < _MAX_SPEED)
         & jnp.all(jnp.abs(qpos.at[2].set(0.0)) < _MAX_DISTANCE)  # the base may turn without limit
     )
@@ -380,6 +387,7 @@ def outcome(trial: Trial, period: float) -> Outcome:
         tilt=trial.tilt,
         tipped=trial.tipped,
         diverged=trial.diverged,
+        nan_twist=trial.nan_twist,
         stalled=drive.has_stalled(trial.drive, period) & ~trial.success & ~trial.diverged,
         base_pose=trial.qpos[..., JOINTS.base],
         object_pose=pose.reshape(*trial.qpos.shape[:-1], 3),

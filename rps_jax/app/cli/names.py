@@ -107,13 +107,13 @@ def question_type(name: str) -> "type[Question[object]]":
 
 def _import_file(path: Path) -> ModuleType:
     """Import a file, as a module of its package if it is in one."""
-    from rps_jax.control import registry
+    from rps_jax.control import sources
 
     root = path.parent
     while (root / "__init__.py").exists():
         root = root.parent
     sys.path.insert(0, str(root))  # as Python does for a script
     if root == path.parent:
-        return registry.run_file(path, f"_rps_jax_study_{path.stem}")
+        return sources.run_file(path, f"_rps_jax_study_{path.stem}")
     name = ".".join(path.relative_to(root).with_suffix("").parts)
-    return sys.modules.get(name) or registry.run_file(path, name)
+    return sys.modules.get(name) or sources.run_file(path, name)

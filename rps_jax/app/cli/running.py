@@ -12,6 +12,7 @@ import os
 import signal
 import sys
 import threading
+import warnings
 from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
@@ -36,6 +37,7 @@ def exit_code(command: Callable[[], object]) -> int:
     for stream in (sys.stdout, sys.stderr):  # a terminal without UTF-8 shows `?`
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="replace")
+    warnings.formatwarning = lambda message, *_, **__: f"rps: warning: {message}\n"
     try:
         with _interruptible():
             command()
@@ -166,8 +168,11 @@ def _import_early() -> None:
 
 def _write_report(question: Question[object], results: object, bar: Bar) -> Path:
     """Write the report of the results, and return its path."""
+    import xarray as xr
+
     from rps_jax.analysis.report import write_report
     from rps_jax.record import provenance
+    from rps_jax.trials.results import nan_twists
 
     out = Path(str(question.out))
     bar.phase("report")
@@ -175,6 +180,9 @@ def _write_report(question: Question[object], results: object, bar: Bar) -> Path
     intro = [question.intro(results)]
     with contextlib.suppress(InputError):
         intro.append(provenance.describe(out))
+    if isinstance(results, xr.Dataset | xr.DataTree):
+        trees = xr.DataTree(results).subtree if isinstance(results, xr.Dataset) else results.subtree
+        intro += [nan_twists(node.to_dataset()) for node in trees]
     return write_report(out, question.title, "\n\n".join(filter(None, intro)), sections)
 
 
