@@ -158,6 +158,7 @@ def run(
     else:
         queues = [_TrialQueue(job) for job in jobs]
         single, joint = _schedule(queues, setting, slots, workers)
+        monitor.start(len(single) + len(joint))
         tasks = [partial(_work, single, joint, monitor, index) for index in range(workers)]
         if backend != "cpu":  # an idle processor: compile all programs at once, first used first
             tasks += [program.compiled for program in (*single, *joint)]
@@ -196,6 +197,8 @@ class _Monitor:
         self.compile = 0.0  # [s] that the worker who waited longest had no program
         self.stop = False  # set when one worker fails or the user interrupts
         self._finished = self._nan_twists = 0  # trials
+        self._compiled: set[_Program] = set()
+        self._programs = 0  # that the run needs
         self._waits: defaultdict[int, float] = defaultdict(float)  # [s] for compilation, by thread
         self._collect, self._callback = collect, callback
         self._lock = threading.Lock()
@@ -208,7 +211,7 @@ class _Monitor:
             self._finished += indices.size
             self._nan_twists += int(np.count_nonzero(outcomes.nan_twist))
             self.simulated += simulated
-            self._callback(Progress(self._finished, self.simulated, self.compile))
+            self._report()
 
     def warn_of_nan_twists(self) -> None:
         """Warn if a law returned a twist that is not finite."""
@@ -219,12 +222,22 @@ class _Monitor:
                 stacklevel=4,
             )
 
-    def add_compile_time(self, seconds: float) -> None:
-        """Add a time [s] for which the worker of this thread had no program."""
+    def start(self, programs: int) -> None:
+        """Report that a run starts, which needs this number of programs."""
+        self._programs = programs
+        self._report()
+
+    def _report(self) -> None:
+        counts = {"compiled": len(self._compiled), "programs": self._programs}
+        self._callback(Progress(self._finished, self.simulated, self.compile, **counts))
+
+    def add_compile_time(self, program: _Program, seconds: float) -> None:
+        """Add a time [s] for which the worker of this thread waited for a program."""
         with self._lock:
+            self._compiled.add(program)
             self._waits[threading.get_ident()] += seconds
             self.compile = max(self._waits.values())
-            self._callback(Progress(self._finished, self.simulated, self.compile))
+            self._report()
 
 
 # --- engines outside of JAX ----------------------------------------------------------------
@@ -512,7 +525,7 @@ def _run(program: _Program, max_suspended: int, monitor: _Monitor) -> None:
         return
     start_time = time.perf_counter()
     advance, stages, rules = program.compiled(), program.stages, program.setting.rules
-    monitor.add_compile_time(time.perf_counter() - start_time)
+    monitor.add_compile_time(program, time.perf_counter() - start_time)
     with ThreadPoolExecutor(1) as reporter:  # reports a segment while the next one runs
         report: Future[object] = reporter.submit(int)  # of the last segment that was read
         unread: tuple[_Segment, ...] | None = None  # segment whose results are still on the GPU

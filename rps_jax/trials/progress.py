@@ -21,6 +21,8 @@ class Progress:
     simulated: float  # [s] summed over trials, ended or running
     compile: float = 0.0  # [s] until the worker who waited longest had its programs
     rounds: int = 0  # generations or updates that are done
+    compiled: int = 0  # programs
+    programs: int = 0  # that the run needs, if it is known
 
 
 ProgressCallback = Callable[[Progress], object]
@@ -39,10 +41,11 @@ class SequentialProgress:
 
     def __call__(self, progress: Progress) -> None:
         previous = self._previous
-        self._current = Progress(
-            previous.finished + progress.finished,
-            previous.simulated + progress.simulated,
-            previous.compile + progress.compile,
+        self._current = replace(
+            progress,
+            finished=previous.finished + progress.finished,
+            simulated=previous.simulated + progress.simulated,
+            compile=previous.compile + progress.compile,
         )
         self._callback(self._current)
 
@@ -136,6 +139,8 @@ class Bar:
             on_compiled, self.on_compiled = self.on_compiled, None
             on_compiled()
         note = f"{progress.simulated:.0f} s simulated"
+        if progress.compiled < progress.programs:
+            note = f"{progress.compiled} of {progress.programs} programs compiled"
         trials, clock = progress.finished, min(self.elapsed, self._total or math.inf)
         moves = {
             "trials": (trials, note),
@@ -144,7 +149,8 @@ class Bar:
         }
         done, note = moves.get(self.over, (progress.rounds, note))
         bar = self._open(self._phase) if self._bar is None else self._bar
-        bar.set_description(self._phase, refresh=False)
+        starts = self._last.programs and not self._last.simulated
+        bar.set_description("compile" if starts else self._phase, refresh=False)
         if note:
             bar.set_postfix_str(note, refresh=False)
         bar.update(round(done - bar.n, 3))
