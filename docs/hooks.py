@@ -6,10 +6,16 @@ A link to a module leads to the reference, and a link to another file leads to t
 
 from __future__ import annotations
 
+import ast
 import base64
+import importlib
+import inspect
+import os
 import posixpath
 import re
 import runpy
+import subprocess
+import tomllib
 from functools import cache
 from html import unescape
 from pathlib import Path
@@ -21,16 +27,25 @@ from latex2mathml.converter import convert
 from mkdocs.exceptions import PluginError
 from mkdocs.structure.files import File
 
+import rps_jax
+
 ROOT = Path(__file__).parents[1]
 ROOMS = (
     *("record", "geometry", "robot", "control", "world", "lowering", "engines"),
     *("analysis", "trials", "runs", "tuning", "studies", "app"),
 )
 # Sections of a page that are separate pages: title of the section, by path.
-SECTIONS = {"rps_jax/law.md": "The law", "rps_jax/adding.md": "How to add ..."}
+SECTIONS = {"rps_jax/law.md": "The law", "rps_jax/adding.md": "How to add"}
 # Pages by tab; studies that no tab names are in `Studies`.
 TABS: dict[str, list[Any]] = {
-    "Start": ["README.md", {"Push it yourself": "push.html"}, "docs/gallery.md", "CHANGELOG.md"],
+    "Start": [
+        *("README.md", {"Push it yourself": "push.html"}, "docs/gallery.md"),
+        *("docs/not_supported.md", "CHANGELOG.md"),
+    ],
+    "Tutorials": [
+        *("notebooks/README.md", "notebooks/07_custom_law.md", "notebooks/08_analysis.md"),
+        "notebooks/09_gymnasium.md",
+    ],
     "The law": ["rps_jax/law.md", "notebooks/01_the_law.md", "notebooks/02_one_push.md"],
     "The paper": [
         *("notebooks/03_paper.md", "table", "hardware", "ambiguities"),
@@ -84,7 +99,7 @@ def texts() -> dict[str, str]:
         part = re.search(rf"^## {re.escape(title)}\n(.*?)(?=^## |\Z)", whole, re.M | re.S)
         assert part, f"{path}: no section {title}"
         raised = re.sub(r"^#(#+ )", r"\1", part[1], flags=re.M)
-        pages[path] = f"# {title.removesuffix(' ...')} {'anything' * ('...' in title)}\n{raised}"
+        pages[path] = f"# {title}\n{raised}"
     return pages
 
 
@@ -109,7 +124,7 @@ def site_link(link: str, page: str, files: Any) -> str:
     """Return a link of a page, relative to that page of the site."""
     path = posixpath.normpath(posixpath.join(posixpath.dirname(page), link))
     source = ROOT / path
-    if path == "docs/push/page.html":
+    if path in ("docs/push", "docs/push/README.md", "docs/push/page.html"):
         path = "push.html"
     elif path.startswith("rps_jax/") and (source.is_dir() or source.suffix == ".py"):
         parts = path.removesuffix(".py").removesuffix("/__init__").split("/")
@@ -163,6 +178,18 @@ def code(path: Path) -> str:
     return f"{head}# {path.name}\n\n```python\n{path.read_text('utf-8')}\n```\n"
 
 
+def about(path: Path) -> str:
+    """Return ": " and the first sentence of a Python file's docstring, else an empty text."""
+    text = ast.get_docstring(ast.parse(path.read_text("utf-8"))) if path.suffix == ".py" else None
+    return f": {first_sentence(text)}" if text else ""
+
+
+def first_sentence(docstring: str) -> str:
+    """Return the first paragraph of a docstring up to its first full stop."""
+    paragraph = " ".join(docstring.partition("\n\n")[0].split())
+    return re.split(r"(?<=[.:])\s", paragraph)[0].removesuffix(":").removesuffix(".") + "."
+
+
 def listing(path: Path) -> str:
     """Return a page that lists the files of a folder without one."""
     folders = [
@@ -171,29 +198,76 @@ def listing(path: Path) -> str:
         if (inner / "README.md").exists()
     ]
     suffixes = (".py", ".json", ".ipynb")
-    names = sorted({inner.name for inner in path.iterdir() if inner.suffix in suffixes})
-    links = [*(f"[{name}]({name})" for name in names), *folders]
+    files = sorted(inner for inner in path.iterdir() if inner.suffix in suffixes)
+    links = [*(f"[{file.name}]({file.name}){about(file)}" for file in files), *folders]
     return f"# {path.relative_to(ROOT)}\n\n" + "".join(f"- {link}\n" for link in links)
 
 
 def reference() -> dict[str, str]:
-    """Return pages of docstrings and signatures, one per subpackage."""
-    rows = [f"- [`rps_jax.{room}`]({room}.md)" for room in ROOMS]
-    names = "[table of all public names](../rps_jax/README.md#public-names)"
-    head = "Generated from docstrings and signatures. Users need the"
-    first = f"# Reference\n\n{head} {names}; all other modules, by subpackage:\n\n" + "\n".join(
-        rows
-    )
+    """Return an index with one sentence for each name, and pages of docstrings, one per subpackage."""
+    homes = {name: rps_jax._HOMES[name] for name in rps_jax.__all__}
+    names = [
+        f"| [`rps_jax.{name}`]({home.split('.')[1]}.md#{home}.{name}) | "
+        f"{first_sentence(inspect.getdoc(getattr(rps_jax, name)) or '')} |"
+        for name, home in homes.items()
+        if home.split(".")[1] in ROOMS
+    ]
+    modules = []
+    for room in ROOMS:
+        paths = sorted((ROOT / "rps_jax" / room).glob("[a-z]*.py"))
+        home = f"rps_jax.{room}"
+        head = first_sentence(inspect.getdoc(importlib.import_module(home)) or "")
+        modules += [f"| [`{home}`]({room}.md) | {head} |"]
+        modules += [
+            f"| [`{home}.{path.stem}`]({room}.md#{home}.{path.stem}) | {about(path)[2:]} |"
+            for path in paths
+        ]
+    index = [
+        "# Reference", "",
+        "This index and its pages are generated from docstrings and signatures. The "
+        "[table of public names](../rps_jax/README.md#public-names) groups the names by purpose.",
+        "", "## Public names", "", "| name | description |", "|---|---|", *names,
+        "", "## Modules", "",
+        "Names that the table of public names does not list may move between versions.",
+        "", "| module | description |", "|---|---|", *modules, "",
+    ]  # fmt: skip
     pages = {f"{room}.md": f"# rps_jax.{room}\n\n::: rps_jax.{room}\n" for room in ROOMS}
-    return {"README.md": first} | pages
+    return {"README.md": "\n".join(index)} | pages
 
 
 # --- hooks of mkdocs -----------------------------------------------------------------------
 
 
+def repository() -> str | None:
+    """Return the web address of the repository: of pyproject, GitHub's runner or git's `origin`."""
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
+    if url := project.get("urls", {}).get("Repository"):
+        return url
+    if name := os.environ.get("GITHUB_REPOSITORY"):
+        return f"{os.environ.get('GITHUB_SERVER_URL', 'https://github.com')}/{name}"
+    command = ["git", "-C", str(ROOT), "remote", "get-url", "origin"]
+    try:
+        origin = subprocess.run(command, capture_output=True, text=True, check=False).stdout
+    except FileNotFoundError:  # no git: a source distribution
+        return None
+    return web_address(origin.strip())
+
+
+def web_address(origin: str) -> str | None:
+    """Return the web address of a git remote, or None for a folder."""
+    remote = re.fullmatch(
+        r"(?:https?://|ssh://|git://)?(?:[^/@]+@)?([\w.-]+\.\w+)(?::\d+)?[:/](.+?)(?:\.git)?/?",
+        origin,
+    )
+    return f"https://{remote[1]}/{remote[2]}" if remote and not origin.startswith("/") else None
+
+
 def on_config(config: Any) -> Any:
-    """Set the tabs."""
+    """Set the tabs, the version and the link to the repository."""
     config.nav = nav()
+    config.site_name = f"rps_jax {rps_jax.__version__}"
+    config.copyright = f"rps_jax {rps_jax.__version__}, Apache-2.0"
+    config.repo_url = config.repo_url or repository()
     return config
 
 
@@ -213,7 +287,7 @@ def on_files(files: Any, config: Any) -> Any:
         add(f"notebooks/{path.stem}.md", text)
         for name, content in images.items():
             add(f"notebooks/{name}", content)
-    add("push.html", runpy.run_path(str(ROOT / "docs" / "push" / "make.py"))["page"]())
+    add("push.html", runpy.run_path(str(ROOT / "docs" / "push" / "make.py"))["page"]("index.html"))
     pages = [
         page for page in files.documentation_pages() if not page.src_uri.startswith("reference/")
     ]

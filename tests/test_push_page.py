@@ -37,7 +37,7 @@ return arguments[1].map(([trial, memory]) => {
 def browser(tmp_path_factory):
     folder = tmp_path_factory.mktemp("push")
     page = folder / "push.html"
-    page.write_text(MAKE["page"]())
+    page.write_text(MAKE["page"]("index.html"))
     assert page.stat().st_size < 3e6
     with chromium.opened(folder / "profile", "--headless=new") as browser:
         browser.get(page.as_uri())
@@ -133,3 +133,106 @@ def test_the_recorded_push_is_upright_and_visible_from_any_side(browser):
     return by("view").toDataURL();
     """
     assert browser.execute_script(look, 0.5) != browser.execute_script(look, 1.5)
+
+
+INSIDE = """
+const [x, y, , a, b] = push.trial.qpos, of = (p) => toScreen(v, p);
+return [[x, y], [a, b]].map(of).every(([p, q]) => p > 0 && p < v.w && q > 0 && q < v.h);
+"""
+
+
+@pytest.fixture
+def paused(browser):
+    """The page with a new push that is paused."""
+    browser.execute_script("if (playing) by('play').click(); by('restart').click()")
+    yield browser
+    browser.execute_script("by('play').click()")
+
+
+def test_the_view_follows_the_push_wherever_a_user_looks(paused):
+    for moved in ([0, 0], [3, -2], [-40, 40]):
+        for steps in (0, 1000, 3000):
+            run = "moved = arguments[0]; for (let i = 0; i < arguments[1]; i++) push.step();"
+            paused.execute_script(run + "drawScene(0)", moved, steps)
+            assert paused.execute_script(INSIDE), (moved, steps)
+        assert paused.execute_script("return by('follow').hidden") == (moved == [0, 0])
+    paused.execute_script("by('follow').click(); drawScene(0)")
+    assert paused.execute_script("return by('follow').hidden")
+
+
+def test_a_shove_shows_while_the_push_is_paused(paused):
+    state = "return [push.trial.qpos[3], push.trial.qpos[4], push.trial.steps]"
+    x, y, steps = paused.execute_script(state)
+    paused.execute_script("by('shove').click()")
+    x_shoved, y_shoved, next_steps = paused.execute_script(state)
+    assert np.hypot(x_shoved - x, y_shoved - y) > 0.1
+    assert next_steps == steps + 1
+
+
+LABELS = """
+const boxes = [], own = CanvasRenderingContext2D.prototype.fillText;
+CanvasRenderingContext2D.prototype.fillText = function (text, x, y) {
+  const w = this.measureText(text).width, left = this.textAlign === "right" ? x - w : x;
+  boxes.push([text, left, y - 9, left + w, y]);
+};
+try { (new Function(arguments[0]))(); } finally { CanvasRenderingContext2D.prototype.fillText = own; }
+return boxes;
+"""
+
+
+def labels(browser, draw):
+    """Return the labels that a drawing function writes, after a check that none overlap."""
+    boxes = browser.execute_script(LABELS, draw)
+    for i, (text, x0, y0, x1, y1) in enumerate(boxes):
+        for other, *box in boxes[:i]:
+            apart = x1 < box[0] or box[2] < x0 or y1 < box[1] or box[3] < y0
+            assert apart, (text, other)
+    return [text for text, *_ in boxes]
+
+
+@pytest.mark.parametrize("width", [360, 390, 768, 1280])
+def test_axis_labels_do_not_overlap(width, paused):
+    size = {"width": width, "height": 900, "deviceScaleFactor": 1, "mobile": False}
+    paused.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)
+    for x in (-0.3, -2, -19.75):
+        paused.execute_script(f"push.setTarget([{x}, {-x}]); fitted = null")
+        shown = labels(paused, "drawScene(0)")
+        assert {"x [m]", "y [m]"} < set(shown)
+        assert len(shown) >= 6
+    assert paused.execute_script("return document.documentElement.scrollWidth") <= width
+    for i in range(6):
+        labels(paused, f"drawPlot(PLOTS[{i}])")
+    paused.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})
+
+
+@pytest.mark.parametrize("omega", [3e-5, -4e-4, 0.012, 0.15])
+def test_a_small_turning_rate_has_a_scale(omega, paused):
+    script = "push.step(); push.past[0].twist.omega = arguments[0]"
+    paused.execute_script(script, omega)
+    *ticks, _, _ = labels(paused, "drawPlot(PLOTS[1])")  # then those of time
+    values = [float(tick) for tick in ticks]
+    assert len(set(values)) == len(values) >= 2
+    assert 0.3 * abs(omega) < max(abs(value) for value in values) < 4 * max(abs(omega), 1e-4)
+
+
+def test_a_link_leads_back_to_the_site(browser):
+    assert browser.execute_script("return document.links[0].getAttribute('href')") == "index.html"
+
+
+def test_the_template_says_how_to_build_the_page(tmp_path):
+    with chromium.opened(tmp_path, "--headless=new") as browser:
+        browser.get((ROOT / "docs" / "push" / "page.html").as_uri())
+        text = browser.execute_script("return document.body.textContent")
+    assert text.strip().endswith("python docs/push/make.py --open")
+
+
+@pytest.mark.parametrize(("args", "expected"), [
+    (["--help"], "--record"), (["--hlp"], "unrecognized"), (["page"], "must end with .html"),
+])  # fmt: skip
+def test_options_of_the_builder_write_no_page(args, expected, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("sys.argv", ["make.py", *args])
+    with pytest.raises(SystemExit):
+        MAKE["main"]()
+    assert expected in "".join(capsys.readouterr())
+    assert not list(tmp_path.iterdir())

@@ -1,4 +1,4 @@
-"""Write the page with an interactive push: python docs/push/make.py [FILE.html] [--record].
+"""Write the page with an interactive push, and open it: python docs/push/make.py --open.
 
 The laws, the skin, the rules of a trial and the quasi-static engine are traced from the functions
 of the package, and emitted as JavaScript as by `rps export js`. The order of the three calls of a
@@ -8,8 +8,11 @@ MuJoCo in 3-D; `--record` records it again.
 
 from __future__ import annotations
 
+import argparse
 import json
+import os
 import sys
+import webbrowser
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -248,15 +251,36 @@ def record(stride: int = 3) -> dict[str, Any]:
     return {"period": round(period, 4), "target": target, "boxes": boxes, "qpos": qpos.tolist()}
 
 
-def page() -> str:
-    """Return the page."""
-    return (HERE / "page.html").read_text("utf-8").replace("/* GENERATED */", scripts())
+def page(back: str) -> str:
+    """Return the page, with a link back to another page."""
+    text = (HERE / "page.html").read_text("utf-8").replace("<!-- BACK -->", back)
+    return text.replace("/* GENERATED */", scripts())
+
+
+def main() -> None:
+    """Write the page of the command line, and open or record it on request."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition(":")[0] + ".")
+    parser.add_argument(
+        "file", nargs="?", type=Path, default=Path("push.html"), help="default: push.html"
+    )
+    parser.add_argument("--open", action="store_true", help="open the page in the browser")
+    parser.add_argument("--record", action="store_true", help="record the 3-D push again")
+    options = parser.parse_args()
+    if options.file.suffix != ".html":
+        parser.error(f"file = {options.file}: its name must end with .html")
+    if options.record:
+        RECORDED.write_text(json.dumps(record(), separators=(",", ":")) + "\n", "utf-8")
+    path = options.file.resolve()
+    home = path.with_name("index.html")  # of the site, if the page lies in it
+    back = (
+        home.name if home.exists() else os.path.relpath(HERE.parents[1] / "README.md", path.parent)
+    )
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(page(back), "utf-8")
+    sys.stdout.write(f"{options.file}: {path.stat().st_size / 1e6:.2f} MB\n")
+    if options.open and not webbrowser.open(path.as_uri()):
+        sys.stdout.write(f"no browser was found: open {path.as_uri()}\n")
 
 
 if __name__ == "__main__":
-    words = [word for word in sys.argv[1:] if word != "--record"]
-    if "--record" in sys.argv:
-        RECORDED.write_text(json.dumps(record(), separators=(",", ":")) + "\n", "utf-8")
-    path = Path(words[0] if words else "push.html")
-    path.write_text(page(), "utf-8")
-    sys.stdout.write(f"{path}: {path.stat().st_size / 1e6:.2f} MB\n")
+    main()
