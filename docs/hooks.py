@@ -204,7 +204,7 @@ def listing(path: Path) -> str:
 
 
 def reference() -> dict[str, str]:
-    """Return an index with one sentence for each name, and pages of docstrings, one per subpackage."""
+    """Return an index with one sentence for each name, and a page for each subpackage."""
     homes = {name: rps_jax._HOMES[name] for name in rps_jax.__all__}
     names = [
         f"| [`rps_jax.{name}`]({home.split('.')[1]}.md#{home}.{name}) | "

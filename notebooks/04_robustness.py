@@ -21,6 +21,7 @@
 
 # %%
 import drawing
+import numpy as np
 import pandas as pd
 from IPython.display import Markdown
 
@@ -35,59 +36,104 @@ max_lost = rps_jax.Rules().max_lost  # [s] without contact; more ends a trial
 # %% [markdown]
 # ## Success, distance and time
 #
-# Intervals are Wilson 95 % intervals.
+# Intervals are Wilson 95 % intervals. The sentences below tables and figures are computed from the
+# same data.
 
 # %%
 Markdown(tables.markdown(tables.success_table(results, max_lost)))
 
+# %%
+laws = {str(law): results.sel(law=law) for law in results.law.values}
+groups = {drawing.words(name): mask for name, mask in statistics.worlds_by_object(results).items()}
+groups["all worlds"] = np.ones(results.sizes["world"], bool)
+failed = {law: part.success.values == 0 for law, part in laws.items()}
+lines = [f"{law} fails in {mask.sum()} of {mask.size} worlds" for law, mask in failed.items()]
+intervals = {
+    name: [statistics.wilson(int((~mask[rows]).sum()), rows.sum()) for mask in failed.values()]
+    for name, rows in groups.items()
+}
+apart = [
+    name for name, x in intervals.items() if max(low for low, _ in x) > min(high for _, high in x)
+]
+Markdown(
+    f"{'; '.join(lines)}. The intervals of the laws are disjoint for {drawing.listed(apart)}, and "
+    f"overlap for {drawing.listed(groups.keys() - apart)}. No tuner has used prisms."
+)
+
 # %% [markdown]
-# With the paper's parameters the law fails in one world of 14, with the tuned ones in 8 of 1000.
-# The two intervals are disjoint for all worlds, for boxes and for cylinders. For prisms, which no
-# tuner has used, they overlap.
-#
 # ## Failure modes
 
 # %%
 drawing.failures(results, max_lost)
 
+# %%
+lines = []
+for law, part in laws.items():
+    modes, distance = statistics.failure_modes(part, max_lost), statistics.distance_left(part)
+    for i, mode in enumerate(statistics.FAILURES):
+        left = 100 * distance[modes == i]  # [cm]
+        if left.size:
+            lines.append(
+                f"- {law}, {mode}: {left.size} worlds, at a median of "
+                f"{np.median(left):.0f} cm from the target; {(left < 30).sum()} within 30 cm, "
+                f"{(left > 100).sum()} beyond 1 m"
+            )
+Markdown("\n".join(lines))
+
 # %% [markdown]
-# The lower row separates two failure modes. With the paper's parameters, all but three of the
-# failures by *timeout* (green) end within 30 cm of their target, and more than half of them
-# within 10 cm: the base circles around the target and does not arrive. These boxes and prisms are
-# mostly wide; the cylinders have any width. Failures by *lost contact* (orange) end more than a
-# metre away in 10 of 16 cases, at any width. The tuned parameters use the last contact after a
-# loss, and do not fail in this way. Their eight timeouts end within 13 cm of the target, too few
-# for conclusions.
+# The distance separates the failure modes. In a *timeout* near the target the base circles around
+# the target and does not arrive; in a *lost contact* far from it the object was left behind. After
+# a loss, the tuned parameters move to the last contact.
 #
 # ## Influence of drawn quantities
 #
-# Success over the six most important drawn quantities, in eight bins with equal numbers of
-# worlds. The lines below the panels explain the choice, and name the other quantities.
+# Success over the most influential drawn quantities, in eight bins with equal numbers of worlds. A
+# quantity has a panel if its curve differs from a constant; the lines below the panels name the
+# others.
 
 # %%
 figures.success_curves(results)
 
+# %%
+influences = statistics.influences(results)
+clear = [drawing.quantity(x.name) for x in influences if x.q < 0.05]
+Markdown(
+    f"Of {len(influences)} drawn quantities, {len(clear)} have an influence (q < 0.05) in these "
+    f"{results.sizes['world']} worlds: {drawing.listed(clear)}."
+)
+
 # %% [markdown]
-# Most of these curves are flat within their intervals, and one dip in many curves may be chance.
-# Each curve is therefore tested, with a correction for the number of tests: 1000 worlds show an
-# influence if q is below 0.05.
+# One dip in many curves may be chance. Each curve is therefore tested, with a correction for the
+# number of tests: the worlds show an influence if q is below 0.05.
 
 # %%
 pd.DataFrame(statistics.influences(results.sel(law=["paper"]))).head(8)
 
-# %% [markdown]
-# For the paper's parameters width (`size`) matters: in the widest eighth, with a half width of
-# about 31 cm, four in five trials succeed. The half width of the base is 29 cm. The number of
-# corners matters as well (0 for a cylinder). A run of 240,000 worlds (`sweeps/random_worlds`)
-# finds more influences, such as the centre of mass, dead taxels and friction at the robot. Here
-# they are not significant.
-
 # %%
 pd.DataFrame(statistics.influences(results.sel(law=["tuned"]))).head(3)
 
+# %%
+lines = []
+for law, part in laws.items():
+    for x in statistics.influences(results.sel(law=[law])):
+        binned = statistics.bins(results[x.name].values, part.success.values > 0)
+        rates, unit = binned.successes / binned.trials, results[x.name].attrs["units"]
+        worst, best = (
+            f"{100 * rates[i]:.0f} % at about {binned.middle[i]:.3g} {unit}".removesuffix(" 1")
+            for i in (rates.argmin(), rates.argmax())
+        )
+        if x.q < 0.05:
+            lines.append(f"- {law}, {drawing.quantity(x.name)}: between {worst} and {best}")
+    if not lines or not lines[-1].startswith(f"- {law}"):
+        lines.append(f"- {law}: no quantity")
+Markdown(
+    "\n".join(["Quantities with q < 0.05, and success in their worst and best bin:", "", *lines])
+)
+
 # %% [markdown]
-# For the tuned parameters, 1000 worlds show no influence of any quantity: wide objects no longer
-# cause failures.
+# Zero corners mean a cylinder. The half width of the base is 29 cm. A run of 240,000 worlds
+# (`sweeps/random_worlds`) finds more influences, such as the centre of mass, dead taxels and
+# friction at the robot.
 #
 # ## The hardest worlds
 #
@@ -98,7 +144,16 @@ Markdown(tables.markdown(tables.hardest_table(results, run)))
 
 # %% [markdown]
 # The command in the last column replays a world, plots it as in `02_one_push` and films it; run
-# it in this folder. Both laws fail only in the first two worlds, where the tuned parameters bring
-# the object within 11 cm. In the others the paper's parameters lose the object far from its
-# target, which is mostly behind the robot (beyond 90 degrees). The tuned ones arrive in 84 to 231
-# s.
+# it in this folder.
+
+# %%
+hardest = results.isel(world=statistics.hardest(results))
+all_fail = (hardest.success == 0).all("law").values
+single = hardest.isel(world=~all_fail)
+behind = np.abs(np.degrees(single.bearing.values)) > 90
+arrivals = single.time.where(single.success == 1)
+Markdown(
+    f"All laws fail in {all_fail.sum()} of these {all_fail.size} worlds. In the others one law "
+    f"arrives, in {float(arrivals.min()):.0f} to {float(arrivals.max()):.0f} s; the target is "
+    f"behind the robot (beyond 90 degrees) in {behind.sum()} of {behind.size}."
+)

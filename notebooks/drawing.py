@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import jax
@@ -11,11 +11,20 @@ import numpy as np
 import xarray as xr
 
 from rps_jax.analysis import statistics
-from rps_jax.analysis.figures.style import SHADES, Figure, shade, words
+from rps_jax.analysis.figures.style import SHADES, Figure, shade
+from rps_jax.analysis.figures.style import quantity as quantity
+from rps_jax.analysis.figures.style import words as words
 from rps_jax.control.laws import rps
 from rps_jax.control.laws.rps import RPSParams, RPSState
 from rps_jax.control.observation import Details, Observation, Twist
 from rps_jax.robot import shell
+
+
+def listed(names: Iterable[str]) -> str:
+    """Return names in words, sorted: "a, b and c", or "none"."""
+    *rest, last = sorted(names) or ["none"]
+    return f"{', '.join(rest)} and {last}" if rest else last
+
 
 # --- the law: contacts on the front of a base at the origin -----------------------------------
 

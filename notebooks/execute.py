@@ -2,11 +2,14 @@
 
     python notebooks/execute.py [01_the_law ...]
 
+The tutorials run in an empty folder, since they need the package alone.
 The kernel is the running interpreter, independent of installed kernels. The files name no machine
 and no time, so that a difference is one of cells or results.
 """
 
+import argparse
 import sys
+import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -21,6 +24,7 @@ from rps_jax.world import rendering
 
 FOLDER = Path(__file__).resolve().parent
 TEXTS = tuple(sorted(FOLDER.glob("[0-9]*.py")))
+TUTORIALS = tuple(text for text in TEXTS if text.stem >= "07")
 KERNEL = {"name": "python3", "display_name": "Python 3", "language": "python"}
 
 
@@ -34,8 +38,10 @@ class ThisPython(AsyncKernelManager):
         return KernelSpec(argv=argv, display_name=KERNEL["display_name"], language="python")
 
 
-def execute(texts: Sequence[Path]) -> list[NotebookNode]:
-    """Execute texts and return notebooks with outputs; raise CellExecutionError if a cell fails.
+def execute(texts: Sequence[Path], folder: Path = FOLDER) -> list[NotebookNode]:
+    """Execute texts in a folder and return notebooks with outputs.
+
+    A cell that fails raises CellExecutionError.
 
     One kernel executes them all in sequence and deletes its names in between. Otherwise imports
     would take most of the time.
@@ -49,7 +55,7 @@ def execute(texts: Sequence[Path]) -> list[NotebookNode]:
         kernel_manager_class=ThisPython,
         timeout=600,
         record_timing=False,
-        resources={"metadata": {"path": str(FOLDER)}},
+        resources={"metadata": {"path": str(folder)}},
     ).execute()
     for notebook in notebooks:
         notebook.metadata = {"jupytext": {"formats": "ipynb,py:percent"}, "kernelspec": KERNEL}
@@ -70,13 +76,21 @@ def _set_ids(notebook: NotebookNode) -> None:
                     output.execution_count = count
 
 
-def main(names: list[str]) -> None:
-    """Execute the named notebooks, by default all."""
+def main() -> None:
+    """Execute the notebooks that the command line names, by default all."""
+    parser = argparse.ArgumentParser(description="Execute notebooks, and write their outputs.")
+    stems = [text.stem for text in TEXTS]
+    parser.add_argument("names", nargs="*", metavar="NAME", help=f"of {', '.join(stems)}")
+    names = parser.parse_args().names
+    if unknown := set(names) - set(stems):
+        parser.error(f"unknown notebook {', '.join(sorted(unknown))}: choose of {', '.join(stems)}")
     rendering.choose_gl()  # before the kernel imports MuJoCo for any of them
-    texts = [text for text in TEXTS if not names or text.stem in names]
-    for text, notebook in zip(texts, execute(texts), strict=True):
-        nbformat.write(notebook, text.with_suffix(".ipynb"))
+    with tempfile.TemporaryDirectory() as empty:
+        for group, folder in ((set(TEXTS) - set(TUTORIALS), FOLDER), (TUTORIALS, Path(empty))):
+            texts = [text for text in TEXTS if text in group and (not names or text.stem in names)]
+            for text, notebook in zip(texts, execute(texts, folder), strict=True):
+                nbformat.write(notebook, text.with_suffix(".ipynb"))
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    main()

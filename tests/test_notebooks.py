@@ -1,13 +1,20 @@
 """Tests of the notebooks: they run, and the stored notebooks match their texts."""
 
+import importlib.util
+import os
 import re
 import runpy
+import subprocess
+import sys
 from pathlib import Path
 
 import jupytext
 import nbformat
 import pytest
 from helpers import addresses, imported
+
+import rps_jax
+from rps_jax.analysis import statistics
 
 FOLDER = Path(__file__).parents[1] / "notebooks"
 RUNNER = runpy.run_path(str(FOLDER / "execute.py"))
@@ -62,17 +69,66 @@ def test_stored_notebooks_have_figures_and_no_errors_or_local_paths(name):
 
 
 # These run for minutes; other tests call the same functions.
-LONG = ("02", "05", "06")
+LONG = ("02", "05", "06", "08", "09")
 EXECUTED = [pytest.param(n, marks=[pytest.mark.slow] if n[:2] in LONG else []) for n in TEXTS]
 
 
 @pytest.mark.parametrize("name", EXECUTED)
-def test_it_runs_and_if_it_only_reads_prints_the_stored_output(name, pytestconfig, monkeypatch):
-    """The notebook is executed with the compiled programs of other tests."""
+def test_it_runs_and_if_it_only_reads_prints_the_stored_output(
+    name, pytestconfig, monkeypatch, tmp_path
+):
+    """It runs with the compiled programs of other tests, and a tutorial in `tmp_path`."""
     monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", str(pytestconfig.rootpath / ".jax_cache"))
     monkeypatch.setenv("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.5")
-    (notebook,) = RUNNER["execute"]([TEXTS[name]])
+    folder = tmp_path if TEXTS[name] in RUNNER["TUTORIALS"] else FOLDER
+    (notebook,) = RUNNER["execute"]([TEXTS[name]], folder)
     expected = stored(name)
     assert [kind for _, kind, _ in outputs(notebook)] == [kind for _, kind, _ in outputs(expected)]
     if name[:2] in ("03", "04"):
         assert printed(notebook) == printed(expected)
+
+
+TUTORIALS = [text.stem for text in RUNNER["TUTORIALS"]]
+
+
+@pytest.mark.parametrize("name", TUTORIALS)
+def test_a_tutorial_needs_the_package_alone(name):
+    modules = set(re.findall(r"^(?:import|from) (\w+)", TEXTS[name].read_text(), re.MULTILINE))
+    dependencies = {"jax", "matplotlib", "numpy", "pandas", "pathlib", "scipy", "typing", "xarray"}
+    assert modules - dependencies - ({"gymnasium"} if name.startswith("09") else set()) == {
+        "rps_jax"
+    }
+
+
+def test_the_first_page_lists_all_notebooks_and_examples():
+    page = (FOLDER / "README.md").read_text()
+    files = [f"{stem}.ipynb" for stem in TEXTS]
+    files += [f"examples/{path.name}" for path in (FOLDER / "examples").glob("*.py")]
+    assert [file for file in files if f"]({file})" not in page] == []
+
+
+def test_the_sentences_on_influence_are_computed():
+    """Text and figure count the same quantities."""
+    texts = [v for _, kind, v in outputs(stored("04_robustness")) if kind == "text/markdown"]
+    (sentence,) = [text for text in texts if text.startswith("Of ")]
+    drawn, count = map(int, re.findall(r"\d+", sentence)[:2])
+    influences = statistics.influences(rps_jax.load(FOLDER / "runs" / "compare" / "wide"))
+    assert (drawn, count) == (len(influences), sum(x.q < 0.05 for x in influences))
+    cells = stored("04_robustness").cells
+    prose = "".join(cell.source for cell in cells[2:] if cell.cell_type == "markdown")
+    numbers = ("95 % intervals", "1 m", "0.05", "90 deg", "29 cm", "240,000 worlds", "02_one")
+    for number in numbers:  # of definitions, and of another study
+        prose = prose.replace(number, "")
+    assert not re.search(r"\d|\b(one|two|three|four|five|six|ten) (of|drawn|most|worlds)\b", prose)
+
+
+def test_training_by_stable_baselines3_as_the_tutorial_shows_it(tmp_path):
+    if not importlib.util.find_spec("stable_baselines3"):
+        pytest.skip("stable_baselines3 is not installed: run `pip install stable-baselines3`")
+    text = TEXTS["09_gymnasium"].read_text()
+    block = re.search(r"^# ```python\n(.*?)^# ```$", text, re.MULTILINE | re.DOTALL)
+    code = re.sub(r"^# ?", "", block[1], flags=re.MULTILINE)
+    short = code.replace("1_000_000", "16_384")
+    assert short != code
+    subprocess.run([sys.executable, "-c", short], cwd=tmp_path, check=True, env=dict(os.environ))
+    assert (tmp_path / "policy_sb3.zip").exists()

@@ -170,12 +170,12 @@ def test_a_shove_shows_while_the_push_is_paused(paused):
 
 
 LABELS = """
-const boxes = [], own = CanvasRenderingContext2D.prototype.fillText;
-CanvasRenderingContext2D.prototype.fillText = function (text, x, y) {
+const boxes = [], canvas = CanvasRenderingContext2D.prototype, own = canvas.fillText;
+canvas.fillText = function (text, x, y) {
   const w = this.measureText(text).width, left = this.textAlign === "right" ? x - w : x;
   boxes.push([text, left, y - 9, left + w, y]);
 };
-try { (new Function(arguments[0]))(); } finally { CanvasRenderingContext2D.prototype.fillText = own; }
+try { (new Function(arguments[0]))(); } finally { canvas.fillText = own; }
 return boxes;
 """
 
