@@ -34,6 +34,7 @@ ROOMS = (
     *("record", "geometry", "robot", "control", "world", "lowering", "engines"),
     *("analysis", "trials", "runs", "tuning", "studies", "app"),
 )
+PAGES = (*ROOMS, "errors")  # of the reference
 # Sections of a page that are separate pages: title of the section, by path.
 SECTIONS = {"rps_jax/law.md": "The law", "rps_jax/adding.md": "How to add"}
 # Pages by tab; studies that no tab names are in `Studies`.
@@ -116,7 +117,7 @@ def nav() -> list[Any]:
         for title, pages in TABS.items()
     }
     tabs["Studies"] += [f"sweeps/{name}/README.md" for name in sorted(studies - named)]
-    tabs["Reference"] = ["reference/README.md", *(f"reference/{room}.md" for room in ROOMS)]
+    tabs["Reference"] = ["reference/README.md", *(f"reference/{room}.md" for room in PAGES)]
     return [{title: pages} for title, pages in tabs.items()]
 
 
@@ -128,7 +129,7 @@ def site_link(link: str, page: str, files: Any) -> str:
         path = "push.html"
     elif path.startswith("rps_jax/") and (source.is_dir() or source.suffix == ".py"):
         parts = path.removesuffix(".py").removesuffix("/__init__").split("/")
-        if len(parts) > 1 and parts[1] in ROOMS:
+        if len(parts) > 1 and parts[1] in PAGES:
             path = f"reference/{parts[1]}.md"
             path += f"#{'.'.join(parts)}" if len(parts) > 2 else ""
         else:
@@ -179,15 +180,18 @@ def code(path: Path) -> str:
 
 
 def about(path: Path) -> str:
-    """Return ": " and the first sentence of a Python file's docstring, else an empty text."""
-    text = ast.get_docstring(ast.parse(path.read_text("utf-8"))) if path.suffix == ".py" else None
-    return f": {first_sentence(text)}" if text else ""
+    """Return the summary of a Python file, or an empty text."""
+    return (
+        summary(ast.get_docstring(ast.parse(path.read_text("utf-8"))))
+        if path.suffix == ".py"
+        else ""
+    )
 
 
-def first_sentence(docstring: str) -> str:
-    """Return the first paragraph of a docstring up to its first full stop."""
-    paragraph = " ".join(docstring.partition("\n\n")[0].split())
-    return re.split(r"(?<=[.:])\s", paragraph)[0].removesuffix(":").removesuffix(".") + "."
+def summary(docstring: str | None) -> str:
+    """Return the first paragraph of a docstring on one line, as a sentence without a colon."""
+    text = " ".join((docstring or "").partition("\n\n")[0].split())
+    return re.sub(r":?$", "", text).replace("|", "\\|")
 
 
 def listing(path: Path) -> str:
@@ -199,27 +203,24 @@ def listing(path: Path) -> str:
     ]
     suffixes = (".py", ".json", ".ipynb")
     files = sorted(inner for inner in path.iterdir() if inner.suffix in suffixes)
-    links = [*(f"[{file.name}]({file.name}){about(file)}" for file in files), *folders]
+    links = [*(f"[{x.name}]({x.name}) {about(x)}".strip() for x in files), *folders]
     return f"# {path.relative_to(ROOT)}\n\n" + "".join(f"- {link}\n" for link in links)
 
 
 def reference() -> dict[str, str]:
     """Return an index with one sentence for each name, and a page for each subpackage."""
-    homes = {name: rps_jax._HOMES[name] for name in rps_jax.__all__}
     names = [
         f"| [`rps_jax.{name}`]({home.split('.')[1]}.md#{home}.{name}) | "
-        f"{first_sentence(inspect.getdoc(getattr(rps_jax, name)) or '')} |"
-        for name, home in homes.items()
-        if home.split(".")[1] in ROOMS
+        f"{summary(inspect.getdoc(getattr(rps_jax, name)))} |"
+        for name, home in sorted(rps_jax._HOMES.items())
     ]
     modules = []
-    for room in ROOMS:
+    for room in PAGES:
         paths = sorted((ROOT / "rps_jax" / room).glob("[a-z]*.py"))
         home = f"rps_jax.{room}"
-        head = first_sentence(inspect.getdoc(importlib.import_module(home)) or "")
-        modules += [f"| [`{home}`]({room}.md) | {head} |"]
+        modules += [f"| [`{home}`]({room}.md) | {summary(importlib.import_module(home).__doc__)} |"]
         modules += [
-            f"| [`{home}.{path.stem}`]({room}.md#{home}.{path.stem}) | {about(path)[2:]} |"
+            f"| [`{home}.{path.stem}`]({room}.md#{home}.{path.stem}) | {about(path)} |"
             for path in paths
         ]
     index = [
@@ -231,7 +232,7 @@ def reference() -> dict[str, str]:
         "Names that the table of public names does not list may move between versions.",
         "", "| module | description |", "|---|---|", *modules, "",
     ]  # fmt: skip
-    pages = {f"{room}.md": f"# rps_jax.{room}\n\n::: rps_jax.{room}\n" for room in ROOMS}
+    pages = {f"{room}.md": f"# rps_jax.{room}\n\n::: rps_jax.{room}\n" for room in PAGES}
     return {"README.md": "\n".join(index)} | pages
 
 

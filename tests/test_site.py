@@ -2,9 +2,13 @@
 
 import re
 import runpy
+import tomllib
+from types import SimpleNamespace
 
 import pytest
 from helpers import ROOT
+
+import rps_jax
 
 pytest.importorskip("mkdocs", reason="the extra docs is not installed")
 pytest.importorskip("latex2mathml", reason="the extra docs is not installed")
@@ -29,7 +33,9 @@ def test_every_study_and_notebook_is_in_one_tab():
 LINKS = [
     ("sweeps/table/README.md", "README.md", "sweeps/table/README.md"),
     ("engines/mjx.py", "rps_jax/README.md", "../reference/engines.md#rps_jax.engines.mjx"),
-    ("push/page.html", "docs/gallery.md", "../push.html"),
+    ("push/README.md", "docs/gallery.md", "../push.html"),
+    ("docs/push", "README.md", "push.html"),
+    ("errors.py", "rps_jax/README.md", "../reference/errors.md"),
     ("rps_jax/record", "README.md", "reference/record.md"),
     ("notebooks/03_paper.ipynb", "README.md", "notebooks/03_paper.md"),
     ("../notebooks/03_paper.py", "rps_jax/README.md", "../notebooks/03_paper.md"),
@@ -52,6 +58,44 @@ def test_a_notebook_keeps_its_words_code_tables_and_pictures():
     for name, content in pictures.items():
         assert content.startswith(b"\x89PNG")
         assert f"]({name})" in text
+
+
+def test_the_index_has_a_link_and_a_sentence_for_each_public_name():
+    pages = HOOKS["reference"]()
+    rows = re.findall(r"^\| \[`rps_jax\.(\w+)`\]\((\w+\.md)#rps_jax\.[\w.]+\) \| (.+) \|$",
+                      pages["README.md"].partition("## Modules")[0], re.MULTILINE)  # fmt: skip
+    assert {name for name, _, _ in rows} == set(rps_jax.__all__)
+    for name, page, sentence in rows:
+        assert page in pages
+        assert re.fullmatch(r"[A-Z].{15,}\.", sentence), name
+
+
+def test_each_way_to_add_something_has_a_heading():
+    page = HOOKS["texts"]()["rps_jax/adding.md"]
+    headings = re.findall(r"^## (.*)$", page, re.MULTILINE)
+    assert {"A law", "An object", "An engine", "A learning loop"} <= set(headings)
+    assert "**..." not in page
+
+
+@pytest.mark.parametrize(("origin", "address"), [
+    ("git@github.com:lab/rps_jax.git", "https://github.com/lab/rps_jax"),
+    ("https://user:secret@gitlab.example.org/a/b/rps_jax.git/", "https://gitlab.example.org/a/b/rps_jax"),
+    ("ssh://git@host.example:2222/lab/rps_jax", "https://host.example/lab/rps_jax"),
+    ("/srv/git/rps_jax.git", None), ("../rps_jax", None), ("file:///srv/rps_jax", None), ("", None),
+])  # fmt: skip
+def test_the_site_links_the_web_address_of_a_remote(origin, address):
+    assert HOOKS["web_address"](origin) == address
+
+
+def test_the_site_names_version_and_repository(monkeypatch):
+    monkeypatch.setenv("GITHUB_REPOSITORY", "lab/rps_jax")
+    monkeypatch.setenv("GITHUB_SERVER_URL", "https://git.example.org")
+    urls = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["urls"]
+    assert all(url.startswith("https://") for url in urls.values())
+    config = HOOKS["on_config"](SimpleNamespace(repo_url=None))
+    assert config.repo_url == urls.get("Repository", "https://git.example.org/lab/rps_jax")
+    assert rps_jax.__version__ in config.site_name
+    assert "navigation.footer" in (ROOT / "mkdocs.yml").read_text()  # previous and next
 
 
 def test_an_equation_becomes_mathml():
