@@ -52,12 +52,12 @@ intervals = {
     name: [statistics.wilson(int((~mask[rows]).sum()), rows.sum()) for mask in failed.values()]
     for name, rows in groups.items()
 }
-apart = [
+disjoint = [
     name for name, x in intervals.items() if max(low for low, _ in x) > min(high for _, high in x)
 ]
 Markdown(
-    f"{'; '.join(lines)}. The intervals of the laws are disjoint for {drawing.listed(apart)}, and "
-    f"overlap for {drawing.listed(groups.keys() - apart)}. No tuner has used prisms."
+    f"{'; '.join(lines)}. The intervals of the laws are disjoint for {drawing.listed(disjoint)}, "
+    f"and overlap for {drawing.listed(groups.keys() - disjoint)}. No tuner has used prisms."
 )
 
 # %% [markdown]
@@ -71,12 +71,12 @@ lines = []
 for law, part in laws.items():
     modes, distance = statistics.failure_modes(part, max_lost), statistics.distance_left(part)
     for i, mode in enumerate(statistics.FAILURES):
-        left = 100 * distance[modes == i]  # [cm]
-        if left.size:
+        distance_cm = 100 * distance[modes == i]
+        if distance_cm.size:
             lines.append(
-                f"- {law}, {mode}: {left.size} worlds, at a median of "
-                f"{np.median(left):.0f} cm from the target; {(left < 30).sum()} within 30 cm, "
-                f"{(left > 100).sum()} beyond 1 m"
+                f"- {law}, {mode}: {distance_cm.size} worlds, at a median of "
+                f"{np.median(distance_cm):.0f} cm from the target; {(distance_cm < 30).sum()} "
+                f"within 30 cm, {(distance_cm > 100).sum()} beyond 1 m"
             )
 Markdown("\n".join(lines))
 
@@ -115,20 +115,17 @@ pd.DataFrame(statistics.influences(results.sel(law=["tuned"]))).head(3)
 # %%
 lines = []
 for law, part in laws.items():
-    for x in statistics.influences(results.sel(law=[law])):
-        binned = statistics.bins(results[x.name].values, part.success.values > 0)
-        rates, unit = binned.successes / binned.trials, results[x.name].attrs["units"]
+    clear = [x.name for x in statistics.influences(results.sel(law=[law])) if x.q < 0.05]
+    for name in clear:
+        binned = statistics.bins(results[name].values, part.success.values > 0)
+        rates, unit = 100 * binned.successes / binned.trials, results[name].attrs["units"]
         worst, best = (
-            f"{100 * rates[i]:.0f} % at about {binned.middle[i]:.3g} {unit}".removesuffix(" 1")
+            f"{rates[i]:.0f} % at about {binned.middle[i]:.3g} {unit}".removesuffix(" 1")
             for i in (rates.argmin(), rates.argmax())
         )
-        if x.q < 0.05:
-            lines.append(f"- {law}, {drawing.quantity(x.name)}: between {worst} and {best}")
-    if not lines or not lines[-1].startswith(f"- {law}"):
-        lines.append(f"- {law}: no quantity")
-Markdown(
-    "\n".join(["Quantities with q < 0.05, and success in their worst and best bin:", "", *lines])
-)
+        lines.append(f"- {law}, {drawing.quantity(name)}: success from {worst} to {best}")
+    lines += [] if clear else [f"- {law}: no quantity"]
+Markdown("\n".join(["Influences (q < 0.05), with the worst and the best bin:", "", *lines]))
 
 # %% [markdown]
 # Zero corners mean a cylinder. The half width of the base is 29 cm. A run of 240,000 worlds

@@ -84,8 +84,10 @@ trace.plot()
 boxes = "wide,objects=random_box"
 score = rps_jax.score("my_law.py", domain=boxes, worlds=60, progress=False)
 means = score[["success", "contact_lost_time"]].mean("world").to_dataframe().round(2)
-lost, kept = means.contact_lost_time["lean"], means.contact_lost_time["rps"]
-print(f"Mean time without contact: {lost:.0f} s with this law, {kept:.0f} s with RPS.")
+lost = means.contact_lost_time
+print(
+    f"Mean time without contact: {lost['lean']:.0f} s with this law, {lost['rps']:.0f} s with RPS."
+)
 print(means)
 
 # %% [markdown]

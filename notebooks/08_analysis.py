@@ -46,8 +46,8 @@ print(heavy.success.mean("world").to_series())
 # Both laws ran in the same worlds, so they are compared world by world:
 
 # %%
-one, other = (results.success.sel(law=law) == 1 for law in laws)
-print(f"only {laws[0]}: {int((one & ~other).sum())}, only {laws[1]}: {int((other & ~one).sum())}")
+paper, tuned = (results.success.sel(law=law) == 1 for law in laws)
+print(f"only rps: {int((paper & ~tuned).sum())}, only rps_tuned: {int((tuned & ~paper).sum())}")
 
 # %% [markdown]
 # ## A heat map
@@ -64,9 +64,9 @@ cells = success.sel(law="rps").groupby(**{name: BinGrouper(e) for name, e in edg
 rate, count = cells.mean(), cells.count()
 fig, ax = plt.subplots(figsize=(6, 4))
 image = ax.pcolormesh(*edges.values(), rate.values.T, vmin=0, vmax=1, cmap="RdYlGn")
-for (i, j), number in np.ndenumerate(count.values):
+for (i, j), worlds in np.ndenumerate(count.values):
     x, y = (e[k : k + 2].mean() for e, k in zip(edges.values(), (i, j), strict=True))
-    ax.text(x, y, int(np.nan_to_num(number)), ha="center", va="center", fontsize=8)
+    ax.text(x, y, int(np.nan_to_num(worlds)), ha="center", va="center", fontsize=8)
 labels = [f"{results[n].attrs['long_name']} [{results[n].attrs['units']}]" for n in edges]
 ax.set(xlabel=labels[0], ylabel=labels[1])
 _ = fig.colorbar(image, label="share of successes")
@@ -121,7 +121,7 @@ print(f"{len(quantities)} quantities were tested. Clear influence:", ", ".join(c
 #
 # ## A table for other tools
 #
-# Poses have a dimension of their own, so the table leaves them out.
+# Poses have a third dimension, so the table leaves them out.
 
 # %%
 table = results.drop_dims("pose").to_dataframe().reset_index()

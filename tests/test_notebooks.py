@@ -116,9 +116,9 @@ def test_the_sentences_on_influence_are_computed():
     assert (drawn, count) == (len(influences), sum(x.q < 0.05 for x in influences))
     cells = stored("04_robustness").cells
     prose = "".join(cell.source for cell in cells[2:] if cell.cell_type == "markdown")
-    numbers = ("95 % intervals", "1 m", "0.05", "90 deg", "29 cm", "240,000 worlds", "02_one")
-    for number in numbers:  # of definitions, and of another study
-        prose = prose.replace(number, "")
+    constants = ("95 % intervals", "1 m", "0.05", "90 deg", "29 cm", "240,000 worlds", "02_one")
+    for text in constants:  # of definitions, and of another study
+        prose = prose.replace(text, "")
     assert not re.search(r"\d|\b(one|two|three|four|five|six|ten) (of|drawn|most|worlds)\b", prose)
 
 

@@ -184,9 +184,9 @@ def labels(browser, draw):
     """Return the labels that a drawing function writes, after a check that none overlap."""
     boxes = browser.execute_script(LABELS, draw)
     for i, (text, x0, y0, x1, y1) in enumerate(boxes):
-        for other, *box in boxes[:i]:
-            apart = x1 < box[0] or box[2] < x0 or y1 < box[1] or box[3] < y0
-            assert apart, (text, other)
+        for name, *box in boxes[:i]:
+            disjoint = x1 < box[0] or box[2] < x0 or y1 < box[1] or box[3] < y0
+            assert disjoint, (text, name)
     return [text for text, *_ in boxes]
 
 
