@@ -5,6 +5,7 @@
 `test_cli.py` compares the names and defaults of this record with those of the checkout.
 """
 
+import argparse
 import contextlib
 import io
 import json
@@ -69,4 +70,5 @@ def write_record() -> None:
 
 
 if __name__ == "__main__":
+    argparse.ArgumentParser(description="Write tests/command_line.json anew.").parse_args()
     write_record()

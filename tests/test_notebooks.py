@@ -107,6 +107,21 @@ def test_the_first_page_lists_all_notebooks_and_examples():
     assert [file for file in files if f"]({file})" not in page] == []
 
 
+SCRIPTS = ("execute", *(f"examples/{path.stem}" for path in (FOLDER / "examples").glob("[ct]*.py")))
+
+
+@pytest.mark.usefixtures("registries")
+@pytest.mark.parametrize("script", SCRIPTS)
+def test_help_runs_nothing(script, capsys, monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("sys.argv", [script, "--help"])
+    with pytest.raises(SystemExit) as end:
+        runpy.run_path(str(FOLDER / f"{script}.py"), run_name="__main__")
+    assert not end.value.code
+    assert "--help" in capsys.readouterr().out
+    assert not list(tmp_path.iterdir())
+
+
 def test_the_sentences_on_influence_are_computed():
     """Text and figure count the same quantities."""
     texts = [v for _, kind, v in outputs(stored("04_robustness")) if kind == "text/markdown"]

@@ -5,6 +5,8 @@
 All other ranges are those of the domain `wide`.
 """
 
+import tyro
+
 import rps_jax
 from rps_jax import Range
 
@@ -27,4 +29,4 @@ def main(worlds: int = 300, horizon: float = 300.0):
 
 
 if __name__ == "__main__":
-    main()
+    tyro.cli(main, description=__doc__)

@@ -7,6 +7,7 @@ rps sweep --laws rps notebooks/examples/custom_law.py:PParams --worlds 1000
 from typing import NamedTuple
 
 import jax.numpy as jnp
+import tyro
 
 import rps_jax
 from rps_jax import Details, Twist
@@ -49,4 +50,4 @@ def main(worlds: int = 300, horizon: float = 300.0):
 
 
 if __name__ == "__main__":
-    main()
+    tyro.cli(main, description=__doc__)

@@ -9,6 +9,7 @@ domains, in `PushEnv` and in films.
 from pathlib import Path
 
 import numpy as np
+import tyro
 
 import rps_jax
 from rps_jax.geometry.footprint import polygon
@@ -17,7 +18,7 @@ CORNERS = np.pi / 180 * np.arange(30, 390, 60)  # [rad] counter-clockwise
 OUTLINE = 0.2 * np.stack([np.cos(CORNERS), np.sin(CORNERS)], axis=-1)  # (6, 2) [m]
 
 
-def main(horizon: float = 300.0, engine="fused"):
+def main(horizon: float = 300.0, engine: str = "fused"):
     """Push the object to targets ahead and to the left, and return the outcomes."""
     path = Path(__file__).with_name("hexagon.xml")
     rps_jax.register_object("hexagon", path, polygon(OUTLINE))
@@ -29,4 +30,4 @@ def main(horizon: float = 300.0, engine="fused"):
 
 
 if __name__ == "__main__":
-    main()
+    tyro.cli(main, description=__doc__)

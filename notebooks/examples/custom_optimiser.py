@@ -5,6 +5,7 @@
 `rps_jax.evaluate` runs all candidates of a generation at once and returns labelled outcomes.
 """
 
+import tyro
 from scipy.optimize import differential_evolution
 
 import rps_jax
@@ -40,4 +41,4 @@ def main(worlds: int = 64, generations: int = 10, horizon: float = 300.0):
 
 
 if __name__ == "__main__":
-    main()
+    tyro.cli(main, description=__doc__)
