@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -23,17 +24,18 @@ from rps_jax.record.options import option
 from rps_jax.robot import robot as robots
 from rps_jax.robot.robot import RobotLike
 from rps_jax.robot.skin import with_contacts
-from rps_jax.runs.question import Question, Run, call_of
+from rps_jax.runs.question import BagQuestion, Run, call_of
 
 _UNITS = {"v_x": "m/s", "v_y": "m/s", "omega": "rad/s"}
 
 
 @dataclass(frozen=True)
-class Shadow(Question[xr.Dataset]):
+class Shadow(BagQuestion[xr.Dataset]):
     """Feed a recorded bag to a law, and compare its twists with the recorded ones."""
 
     file: str | Path = option("", positional=True)
-    """MCAP file with what a robot observed, as `rps push --bag` writes it."""
+    """Bag with what a robot observed, as `rps push --bag` or `ros2 bag record` writes it: an MCAP
+    file, a .db3 file or a folder."""
     law: str | Any = "rps_plus"
     """The law, by its name or its file, with changes, as rps_plus,mine.json."""
     robot: RobotLike = "ideal"
@@ -47,17 +49,24 @@ class Shadow(Question[xr.Dataset]):
         """Parameters of the law."""
         return registry.check_params(registry.resolve_law(self.law)[1])
 
+    @cached_property
+    def steps(self) -> dict[str, np.ndarray]:
+        """Steps of the bag."""
+        return bags.read(Path(self.file), self.topics)
+
     def check(self) -> None:
-        """Check the law and the robot, and that the file is there."""
+        """Check the law, the robot and the bag."""
         _ = self.params, robots.parse_robot(self.robot)
         bags.check()
-        if not Path(self.file).is_file():
-            raise errors.not_allowed("bag", self.file, "give an MCAP file")
+        if not bags.is_bag(Path(self.file)):
+            rule = "give an MCAP file, a .db3 file, or a folder of `ros2 bag record`"
+            raise errors.not_allowed("bag", self.file, rule)
+        _ = self.steps
 
     def answer(self, run: Run) -> xr.Dataset:
         """Run the law over the bag."""
         shell = robots.parse_robot(self.robot).shell
-        recorded = with_contacts(bags.read(Path(self.file)), shell, f"bag = {self.file}")
+        recorded = with_contacts(self.steps, shell, f"bag = {self.file}")
         twists = shadowed(registry.law_of(self.params), self.params, recorded)
         both = np.stack([recorded["twist"], twists])
         return xr.Dataset(

@@ -16,7 +16,7 @@ import numpy as np
 from rps_jax import errors
 from rps_jax.record import files
 
-HIDDEN, POSITIONAL, _BOUNDS = "hidden", "positional", "bounds"  # metadata of fields
+HIDDEN, POSITIONAL, FLAG, _BOUNDS = "hidden", "positional", "flag", "bounds"  # metadata of fields
 
 
 def option(
@@ -29,14 +29,16 @@ def option(
     kw_only: Any = dataclasses.MISSING,
     hidden: bool = False,
     positional: bool = False,
+    flag: str = "",
 ) -> Any:  # any type of field, as of `dataclasses.field`
     """Declare a field with bounds for its number, or for each number of its tuple.
 
-    The command line has a `positional` field without a flag, and does not offer a `hidden` one.
+    The command line has a `positional` field without a flag, and does not offer a `hidden` one. A
+    field with a `flag` has a tuple of texts, one for each time that the flag of this name is given.
     """
     bounds = {"at_least": at_least, "at_most": at_most, "above": above, "unit": unit or None}
     bounds = {name: bound for name, bound in bounds.items() if bound is not None}
-    metadata = {_BOUNDS: bounds, HIDDEN: hidden, POSITIONAL: positional}
+    metadata = {_BOUNDS: bounds, HIDDEN: hidden, POSITIONAL: positional, FLAG: flag}
     return dataclasses.field(default=default, metadata=metadata, kw_only=kw_only)
 
 
@@ -127,6 +129,21 @@ def parse_changes(kind: str, text: str) -> tuple[str, dict[str, Any]]:
         values = [_number_or_text(word) for word in value.split(":")]
         changes[field] = values if len(values) > 1 else values[0]
     return name, changes
+
+
+def parse_names(field: str, value: str | Mapping[str, str]) -> dict[str, str]:
+    """Return names by names, from a mapping or a text `NAME=OTHER,NAME=OTHER`."""
+    if isinstance(value, str):
+        pairs = [pair.partition("=") for pair in value.split(",") if pair.strip()]
+    elif isinstance(value, Mapping):
+        pairs = [(str(name), "=", str(other)) for name, other in value.items()]
+    else:
+        raise errors.not_allowed(field, repr(value), 'give {"name": "other"} or "name=other"')
+    if not all(name.strip() and other.strip() for name, _, other in pairs):
+        raise errors.not_allowed(field, value, "write name=other, separated by commas")
+    if pairs:
+        errors.check_each_once(field, [name.strip() for name, _, _ in pairs])
+    return {name.strip(): other.strip() for name, _, other in pairs}
 
 
 def _number_or_text(word: str) -> float | str:

@@ -37,6 +37,7 @@ from rps_jax.control.base import LawParams
 from rps_jax.control.registry import LawLike, LawsLike
 from rps_jax.engines import device
 from rps_jax.record import cache, files, folder, options, provenance
+from rps_jax.record.bag import TopicsLike
 from rps_jax.record.options import option
 from rps_jax.robot.robot import RobotLike
 from rps_jax.runs.run import Run
@@ -281,6 +282,16 @@ class Question(Command[T]):
 
 
 # --- base classes with shared options ------------------------------------------------------
+
+
+@dataclass(frozen=True, kw_only=True)
+class BagQuestion(Question[T]):
+    """Base class of questions that read bags."""
+
+    topics: TopicsLike = option((), kw_only=True, flag="topic")
+    """Topic of a bag that has another name, as odom=/ridgeback/odom; the option may be repeated.
+    The keys are odom, target, contact, taxels, force, object, cmd_vel, tf and tf_static. In Python
+    a dict: topics={"odom": "/ridgeback/odom"}."""
 
 
 @dataclass(frozen=True, kw_only=True)

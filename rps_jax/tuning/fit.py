@@ -39,6 +39,7 @@ from rps_jax.record import files
 from rps_jax.record.options import option
 from rps_jax.runs.push import Trace, recorded_law
 from rps_jax.runs.question import (
+    BagQuestion,
     DomainQuestion,
     LawQuestion,
     Run,
@@ -97,7 +98,7 @@ class Fitted:
 
 
 @dataclass(frozen=True)
-class LogsQuestion(SimulationQuestion[Fitted]):
+class LogsQuestion(BagQuestion[Fitted], SimulationQuestion[Fitted]):
     """Question about logs, its first arguments."""
 
     logs: tuple[str | Path | Trace, ...] = option((), positional=True)
@@ -126,6 +127,7 @@ class Fit(LawQuestion[Fitted], DomainQuestion[Fitted], LogsQuestion):
     TITLE: ClassVar[str] = "A domain fitted to logs"
     IGNORED_FIELDS: ClassVar[tuple[str, ...]] = ("logs",)
     QUICK: ClassVar[Mapping[str, Any]] = {"worlds": 768, "window": 20.0}
+    IGNORED_FIELDS: ClassVar[tuple[str, ...]] = ("topics",)  # the logs' values matter
 
     law: LawLike = "rps"
     worlds: int = option(6144, 96, 1_000_000)
@@ -139,7 +141,7 @@ class Fit(LawQuestion[Fitted], DomainQuestion[Fitted], LogsQuestion):
         several = self.logs if isinstance(self.logs, tuple | list) else (self.logs,)
         if not several:
             raise InputError("logs = () is not allowed: give at least one.")
-        return [logs_.read(log, self.ranges.robot.shell) for log in several]
+        return [logs_.read(log, self.ranges.robot.shell, self.topics) for log in several]
 
     @cached_property
     def bank(self) -> Bank:

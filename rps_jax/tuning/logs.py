@@ -77,7 +77,7 @@ class RawLog(NamedTuple):
     exact: bool  # the pose is the true one, not the one by odometry
 
 
-def read(source: Trace | str | Path, shell: Shell) -> RawLog:
+def read(source: Trace | str | Path, shell: Shell, topics: bag.TopicsLike = ()) -> RawLog:
     """Load and validate one log, a trace or a path; `shell` is that of the robot.
 
     Raises:
@@ -87,13 +87,12 @@ def read(source: Trace | str | Path, shell: Shell) -> RawLog:
     name = f"log = {path}"
     if isinstance(source, Trace):
         log = _from_trace(source.data, name)
-    elif path.is_dir():
-        log = _from_trace(files.read_results(path), name)
-    elif path.suffix == ".mcap" and path.is_file():
-        bag.check()
-        steps = with_contacts(bag.read(path), shell, f"bag = {source}")
+    elif bag.is_bag(path):
+        steps = with_contacts(bag.read(path, topics), shell, f"bag = {source}")
         known = (*COLUMNS, "signal")
         log = RawLog({k: np.asarray(v, float) for k, v in steps.items() if k in known}, False)
+    elif path.is_dir():
+        log = _from_trace(files.read_results(path), name)
     elif path.suffix == ".csv" and path.is_file():
         log = _from_table(path, name)
     else:

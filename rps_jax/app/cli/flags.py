@@ -188,6 +188,8 @@ def _fields(info: StructTypeInfo) -> StructConstructorSpec | None:
             marks = [tyro.conf.Positional, tyro.conf.arg(metavar=field.name.upper())]
             default = tyro.MISSING if default == "" else default
         kind = str if types_[field.name] is PhysicsField else types_[field.name]
+        if flag := field.metadata.get(options.FLAG):
+            marks, kind = [tyro.conf.arg(name=flag), tyro.conf.UseAppendAction], tuple[str, ...]
         if get_origin(kind) is Sequence:
             kind = tuple[get_args(kind)[0], ...]
         marked = typing.cast(type, Annotated[(kind, *marks)] if marks else kind)
@@ -208,4 +210,4 @@ def _flag_names(kind: type) -> Iterator[str]:
         if options.field_types(kind)[field.name] is Setting:
             yield from _flag_names(Setting)
         else:
-            yield f"--{field.name.replace('_', '-')}"
+            yield f"--{(field.metadata.get(options.FLAG) or field.name).replace('_', '-')}"

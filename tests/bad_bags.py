@@ -1,0 +1,898 @@
+"""Bags of many kinds: reordered, of other formats, frames and names, and invalid.
+
+    python tests/bad_bags.py            # print the table: kind, expected, result
+
+Each case writes a bag of the same push, and expects either the steps of the plain bag or a sentence
+that contains some words. `tests/test_bags.py` runs all cases.
+"""
+
+from __future__ import annotations
+
+import copy
+import io
+import math
+import random
+import sqlite3
+import struct
+import tempfile
+import zipfile
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import lz4.frame
+import numpy as np
+import zstandard
+from mcap.reader import NonSeekingReader
+from mcap.writer import CompressionType, IndexType
+from mcap.writer import Writer as McapWriter
+from mcap_ros2.writer import Writer as EncodingWriter
+from rosbags import rosbag1, rosbag2
+from rosbags.typesys import Stores, get_typestore
+
+from rps_jax.errors import InputError
+from rps_jax.record import bag
+from rps_jax.record.bag import Step
+
+STORE = get_typestore(Stores.ROS2_HUMBLE)
+COUNT = 40
+KINDS = bag.TOPICS | {
+    "/tf_static": "tf2_msgs/TFMessage",
+    "/plain": "geometry_msgs/Twist",
+    "/pose": "geometry_msgs/PoseStamped",
+}
+MS, SECOND = 10**6, 10**9
+
+
+class Row(NamedTuple):
+    """A message as fields, with its time of receipt [ns]."""
+
+    topic: str
+    time: int
+    message: dict[str, Any]
+
+
+class Record(NamedTuple):
+    """A message as bytes."""
+
+    topic: str
+    kind: str
+    text: str  # definition of the type
+    time: int
+    data: bytes
+
+
+class Case(NamedTuple):
+    """Bag and its expected outcome."""
+
+    kind: str
+    source: list[Row] | Callable[[Path], Path]  # messages, or what writes a file into a folder
+    expected: str = ""  # words of the sentence, or nothing if the steps are those of the plain bag
+    topics: Mapping[str, str] | Sequence[str] = ()
+    atol: float = 0.0
+
+
+def push() -> list[Step]:
+    """Return steps in which each field changes at each step."""
+    rng = np.random.default_rng(0)
+    steps = []
+    for i in range(COUNT):
+        kind = (0, 1, 2, 1)[i % 4]
+        contact = np.float32([0.36, 0.01 * i - 0.2]) * (kind > 0)
+        signal, force = np.float32(rng.random(42)), rng.normal(0, 20, 2)
+        pose, twist = (0.1 * i, 0.02 * i, 0.15 * i - 3.0), (0.05, 0.001 * i, -0.002 * i)
+        object_ = {"p_world_object": (1 + 0.1 * i, 0.5), "r_object": 0.25}
+        steps.append(
+            Step(1 + 0.02 * i, pose, (6.0, 2.0), kind, contact, twist, signal, force, **object_)
+        )
+    return steps
+
+
+def rows() -> list[Row]:
+    """Return the messages of the plain bag."""
+    return [Row(*row) for row in bag._messages(push())]
+
+
+def edited(
+    topic: str,
+    edit: Callable[[dict[str, Any]], object],
+    at: Iterable[int] | None = None,
+    source: Iterable[Row] | None = None,
+) -> list[Row]:
+    """Return rows with some messages of a topic changed, by default all."""
+    result, i = [], -1
+    for row in rows() if source is None else source:
+        if row.topic == topic:
+            i += 1
+            if at is None or i in at:
+                row = row._replace(message=copy.deepcopy(row.message))
+                edit(row.message)
+        result.append(row)
+    return result
+
+
+def received(
+    shift: Callable[[Row, int], int], topic: str | None = None, at: Iterable[int] | None = None
+) -> list[Row]:
+    """Return rows with other times of receipt."""
+    result, counts = [], dict[str, int]()
+    for row in rows():
+        i = counts[row.topic] = counts.get(row.topic, -1) + 1
+        if topic in (None, row.topic) and (at is None or i in at):
+            row = row._replace(time=shift(row, i))
+        result.append(row)
+    return result
+
+
+def stamped(change: Callable[[int], int], topics: Iterable[str] = ()) -> list[Row]:
+    """Return rows with other header stamps [ns]."""
+
+    def edit(message: dict[str, Any]) -> None:
+        for part in message.get("transforms", [message]):
+            if "header" in part:
+                stamp = part["header"]["stamp"]
+                time = change(stamp["sec"] * SECOND + stamp["nanosec"])
+                part["header"] |= {"stamp": {"sec": time // SECOND, "nanosec": time % SECOND}}
+
+    result = rows()
+    for topic in topics or KINDS:
+        result = edited(topic, edit, source=result)
+    return result
+
+
+def renamed(names: Mapping[str, str]) -> list[Row]:
+    return [row._replace(topic=names.get(row.topic[1:], row.topic)) for row in rows()]
+
+
+def without(*topics: str) -> list[Row]:
+    return [row for row in rows() if row.topic not in topics]
+
+
+def set_(path: str, value: object) -> Callable[[dict[str, Any]], object]:
+    """Return an edit of one field, as `pose.pose.position.x`."""
+
+    def edit(message: dict[str, Any]) -> None:
+        *owners, last = path.split(".")
+        for owner in owners:
+            message = message[int(owner) if owner.isdigit() else owner]
+        message[last] = value
+
+    return edit
+
+
+def framed(topic: str, frame: str, source: Iterable[Row] | None = None) -> list[Row]:
+    return edited(topic, set_("header.frame_id", frame), source=source)
+
+
+def moved(topic: str, x: float, y: float, frame: str, field: str = "point") -> list[Row]:
+    """Return rows with a point in another frame, shifted."""
+
+    def edit(message: dict[str, Any]) -> None:
+        message["header"] = message["header"] | {"frame_id": frame}
+        owner = message["polygon"] if field == "points" else message
+        points = owner["points"] if field == "points" else [owner[field]]
+        shifted = [{"x": p["x"] + x, "y": p["y"] + y, "z": 0.0} for p in points]
+        owner[field] = shifted if field == "points" else shifted[0]
+
+    return edited(topic, edit)
+
+
+def transform(
+    parent: str, child: str, x: float, y: float, yaw: float = 0.0, topic: str = "/tf_static",
+    stamp: int = 0,
+) -> Row:  # fmt: skip
+    frame = bag._frame(bag._header(stamp, parent), child, x, y, yaw)
+    return Row(topic, max(stamp, SECOND), {"transforms": [frame]})
+
+
+# --- files ---------------------------------------------------------------------------------
+
+
+def encode(messages: Iterable[Row], kinds: Mapping[str, str] = KINDS) -> list[Record]:
+    """Return messages as bytes, in their order."""
+    file, schemas, messages = io.BytesIO(), {}, list(messages)
+    writer = EncodingWriter(file, compression=CompressionType.NONE)
+    for i, row in enumerate(messages):
+        name = kinds["/" + row.topic.rsplit("/", 1)[-1]].replace("/", "/msg/")
+        if name not in schemas:
+            text, _ = STORE.generate_msgdef(name, ros_version=2)
+            schemas[name] = writer.register_msgdef(name, text)
+        writer.write_message(row.topic, schemas[name], row.message, i, i)
+    writer.finish()
+    records = zip(messages, records_of(file.getvalue()), strict=True)
+    return [record._replace(time=row.time) for row, record in records]
+
+
+def records_of(content: bytes) -> list[Record]:
+    """Return the messages of an MCAP file."""
+    reader = NonSeekingReader(io.BytesIO(content))
+    return [
+        Record(channel.topic, schema.name, schema.data.decode(), message.log_time, message.data)
+        for schema, channel, message in reader.iter_messages(log_time_order=False)
+    ]
+
+
+def mcap(
+    records: Iterable[Record],
+    name: str = "bag.mcap",
+    *,
+    schema: str = "ros2msg",
+    encoding: str = "cdr",
+    profile: str = "ros2",
+    text: Callable[[Record], str] = lambda r: r.text,
+    **options: Any,
+) -> Callable[[Path], Path]:
+    """Return what writes an MCAP file."""
+
+    def write(folder: Path) -> Path:
+        path, channels = folder / name, dict[tuple[str, str], int]()
+        path.parent.mkdir(exist_ok=True)
+        with open(path, "wb") as file:
+            writer = McapWriter(file, **options)
+            writer.start(profile)
+            for r in records:
+                if (key := (r.topic, r.kind)) not in channels:
+                    number = writer.register_schema(r.kind, schema, text(r).encode())
+                    channels[key] = writer.register_channel(r.topic, encoding, number)
+                writer.add_message(channels[key], max(r.time, 0), r.data, max(r.time, 0))
+            writer.finish()
+        return path
+
+    return write
+
+
+def plain(messages: Iterable[Row], **options: Any) -> Callable[[Path], Path]:
+    """Return what writes rows as an MCAP file."""
+    return lambda folder: mcap(encode(messages), **options)(folder)
+
+
+def folder_of(
+    plugin: str = "MCAP", compression: str = "NONE", parts: int = 1
+) -> Callable[[Path], Path]:
+    """Return what writes a folder as `ros2 bag record` does, split into files."""
+
+    def write(folder: Path) -> Path:
+        records, names = encode(rows()), list[str]()
+        for i in range(parts):
+            part = folder / f"push {i}"
+            storage = rosbag2.StoragePlugin[plugin]
+            writer = rosbag2.Writer(part, version=9, storage_plugin=storage)
+            writer.set_compression(
+                rosbag2.CompressionMode[compression], rosbag2.CompressionFormat.ZSTD
+            )
+            with writer:
+                channels = {}
+                for r in records[i * len(records) // parts : (i + 1) * len(records) // parts]:
+                    if r.topic not in channels:
+                        channels[r.topic] = writer.add_connection(r.topic, r.kind, typestore=STORE)
+                    writer.write(channels[r.topic], r.time, r.data)
+            names += [p.name for p in part.iterdir() if p.suffix != ".yaml"]
+        first = folder / "push 0"
+        for i in range(1, parts):
+            (folder / f"push {i}" / names[i]).rename(first / names[i])
+        if parts > 1:
+            text = (first / "metadata.yaml").read_text()
+            listed = "".join(f"\n  - {name}" for name in names)
+            text = text.replace(
+                f"relative_file_paths:\n  - {names[0]}", f"relative_file_paths:{listed}"
+            )
+            assert names[1] in text
+            (first / "metadata.yaml").write_text(text)
+        return first.rename(folder / "push#1 ?")
+
+    return write
+
+
+def file_of(write: Callable[[Path], Path], name: str = "") -> Callable[[Path], Path]:
+    """Return what writes a folder, and gives its only file of messages, as `name`."""
+
+    def inner(folder: Path) -> Path:
+        (path,) = (p for p in write(folder).iterdir() if p.suffix != ".yaml")
+        return path.rename(folder / name) if name else path
+
+    return inner
+
+
+def cut(write: Callable[[Path], Path], share: float) -> Callable[[Path], Path]:
+    """Return what writes the first part of a file."""
+
+    def inner(folder: Path) -> Path:
+        path = write(folder)
+        path.write_bytes(path.read_bytes()[: int(share * path.stat().st_size)])
+        return path
+
+    return inner
+
+
+def content(data: bytes, name: str = "bag.mcap") -> Callable[[Path], Path]:
+    def write(folder: Path) -> Path:
+        (folder / name).write_bytes(data)
+        return folder / name
+
+    return write
+
+
+def flipped(folder: Path) -> Path:
+    """Write an MCAP file with one wrong bit in a number."""
+    path = mcap(encode(rows()), compression=CompressionType.NONE)(folder)
+    data = bytearray(path.read_bytes())
+    data[data.index(struct.pack("<d", 6.0)) + 5] ^= 1
+    path.write_bytes(data)
+    return path
+
+
+def chunked(data: bytes, size: int, compression: str) -> bytes:
+    """Return an MCAP file with one chunk."""
+
+    def record(opcode: int, body: bytes) -> bytes:
+        return struct.pack("<BQ", opcode, len(body)) + body
+
+    header = record(1, struct.pack("<I", 4) + b"ros2" + struct.pack("<I", 0))
+    start = struct.pack("<QQQII", 0, 0, size, 0, len(compression)) + compression.encode()
+    magic = b"\x89MCAP0\r\n"
+    return magic + header + record(6, start + struct.pack("<Q", len(data)) + data) + magic
+
+
+def old_sqlite(folder: Path) -> Path:
+    """Write a bag as the first releases of ROS 2 did, without definitions."""
+    path = file_of(folder_of("SQLITE3"))(folder)
+    with sqlite3.connect(path) as database:
+        for table in ("message_definitions", "metadata", "schema"):
+            database.execute(f"DROP TABLE {table}")
+        for column in ("offered_qos_profiles", "type_description_hash"):
+            database.execute(f"ALTER TABLE topics DROP COLUMN {column}")
+    return path
+
+
+def odd_sqlite(folder: Path) -> Path:
+    """Write a bag with a text for a time."""
+    path = file_of(folder_of("SQLITE3"))(folder)
+    with sqlite3.connect(path) as database:
+        database.execute("UPDATE messages SET timestamp = 'soon' WHERE id = 9")
+    return path
+
+
+def other_sqlite(folder: Path) -> Path:
+    with sqlite3.connect(folder / "bag.db3") as database:
+        database.execute("CREATE TABLE notes (id INTEGER)")
+    return folder / "bag.db3"
+
+
+def ros1_bag(folder: Path) -> Path:
+    """Write a bag of ROS 1."""
+    store = get_typestore(Stores.ROS1_NOETIC)
+    with rosbag1.Writer(folder / "push.bag") as writer:
+        channels = {}
+        for r in encode(without("/object", "/target_marker", "/tf")):
+            if r.topic not in channels:
+                channels[r.topic] = writer.add_connection(r.topic, r.kind, typestore=store)
+            data = STORE.cdr_to_ros1(r.data, r.kind)
+            writer.write(channels[r.topic], r.time, bytes(data))
+    return folder / "push.bag"
+
+
+def ros1_records() -> list[Record]:
+    store = get_typestore(Stores.ROS1_NOETIC)
+    return [
+        r._replace(
+            kind=r.kind.replace("/msg/", "/"),
+            text=store.generate_msgdef(r.kind)[0],
+            data=bytes(STORE.cdr_to_ros1(r.data, r.kind)),
+        )
+        for r in encode(without("/object", "/target_marker", "/tf"))
+    ]
+
+
+def big_endian(record: Record) -> Record:
+    message = STORE.deserialize_cdr(record.data, record.kind)
+    data = STORE.serialize_cdr(message, record.kind, little_endian=False)
+    return record._replace(data=bytes(data))
+
+
+def changed(change: Callable[[Record], Record]) -> Callable[[Path], Path]:
+    """Return what writes an MCAP file with changed records."""
+    return lambda folder: mcap(map(change, encode(rows())))(folder)
+
+
+def idl(record: Record) -> str:
+    """Return the definition of a type, and of those in it, as IDL."""
+    names, parts = [record.kind], []
+    bases = {"float64": "double", "float32": "float", "uint8": "octet", "bool": "boolean"}
+    for name in names:
+        package, _, short = name.split("/")
+        fields = []
+        for field, (node, desc) in STORE.fielddefs[name][1]:
+            inner, size = (desc[0], desc[1]) if node.value > 2 else ((node, desc), None)
+            if inner[0].value == 2 and inner[1] not in names:
+                names.append(inner[1])
+            word = inner[1].replace("/", "::") if inner[0].value == 2 else inner[1][0]
+            word = bases.get(word, word)
+            word = f"sequence<{word}>" if node.value == 4 else word
+            fields.append(f"{word} {field}{f'[{size}]' if node.value == 3 else ''};")
+        struct_ = f"struct {short} {{ {' '.join(fields)} }};"
+        module = f"module {package} {{ module msg {{ {struct_} }}; }};"
+        parts.append(f"{'=' * 80}\nIDL: {name}\n{module}\n")
+    return "".join(parts)
+
+
+def several(folder: Path) -> Path:
+    """Write a folder of two bags without metadata."""
+    for name in ("push/a.mcap", "push/b.mcap"):
+        plain(rows(), name=name)(folder)
+    return folder / "push"
+
+
+def changed_folder(change: Callable[[Path], object], parts: int = 1) -> Callable[[Path], Path]:
+    def write(folder: Path) -> Path:
+        path = folder_of(parts=parts)(folder)
+        change(path)
+        return path
+
+    return write
+
+
+def zipped(folder: Path) -> Path:
+    with zipfile.ZipFile(folder / "bag.zip", "w") as archive:
+        archive.write(plain(rows())(folder), "bag.mcap")
+    return folder / "bag.zip"
+
+
+# --- cases ---------------------------------------------------------------------------------
+
+
+def shuffled(seed: int) -> list[Row]:
+    result = rows()
+    random.Random(seed).shuffle(result)
+    return result
+
+
+def repeated() -> list[Row]:
+    """Return each message twice; the first of two commands is another."""
+    twice = [row for row in rows() for _ in range(2)]
+    return edited("/cmd_vel", set_("twist.linear.x", 9.0), range(0, 2 * COUNT, 2), twice)
+
+
+def as_twist(source: Iterable[Row]) -> list[Row]:
+    return [
+        Row("/plain", row.time, row.message["twist"]) if row.topic == "/cmd_vel" else row
+        for row in source
+    ]
+
+
+def as_pose(source: Iterable[Row]) -> list[Row]:
+    def pose(message: dict[str, Any]) -> dict[str, Any]:
+        return {"header": message["header"], "pose": {"position": message["point"]}}
+
+    return [
+        Row("/pose", row.time, pose(row.message)) if row.topic == "/target" else row
+        for row in source
+    ]
+
+
+def base_target() -> list[Row]:
+    """Return rows whose target is in the frame of the base, once, at the third step."""
+    x, y, yaw = push()[2].pose
+    c, s, dx, dy = math.cos(yaw), math.sin(yaw), 6.0 - x, 2.0 - y
+    point = {"x": c * dx + s * dy, "y": c * dy - s * dx}
+    (row,) = [row for row in rows() if row.topic == "/target"][2:3]
+    message = {"header": row.message["header"] | {"frame_id": "base_link"}, "point": point}
+    return [row._replace(time=SECOND, message=message), *without("/target")]
+
+
+def prefixed() -> list[Row]:
+    """Return rows with a prefix of all frames."""
+    result = edited("/odom", set_("child_frame_id", "r1/base_link"))
+    for topic, frame in zip(STAMPED, ["odom"] * 3 + ["base_link"] * 3, strict=True):
+        result = framed(topic, f"r1/{frame}", result)
+    return result
+
+
+def moving_map() -> list[Row]:
+    """Return rows with a target in a map that moves against odom by 1 m in a step."""
+
+    def edit(i: int) -> Callable[[dict[str, Any]], None]:
+        return lambda m: m.update(
+            header=m["header"] | {"frame_id": "map"}, point={"x": 6.0 + 2 * i, "y": 2.0}
+        )
+
+    result = rows()
+    for i in range(COUNT):
+        result = edited("/target", edit(i), [i], result)
+        stamp = round(1e9 * push()[i].time)
+        result.append(transform("map", "odom", 2.0 * i, 0.0, topic="/tf", stamp=stamp))
+    return result
+
+
+STATIC = {
+    "map": transform("map", "odom", 2.0, -1.0),
+    "skin": transform("base_link", "skin", 0.25, 0.5),
+    "same": transform("base_footprint", "base_link", 0.0, 0.0),
+    "turned": transform("base_link", "turned", 0.0, 0.0, math.pi / 2),
+}
+NO_INDEX = {"index_types": IndexType.NONE, "use_statistics": False, "repeat_channels": False,
+            "repeat_schemas": False, "use_summary_offsets": False}  # fmt: skip
+STAMPED = ("/odom", "/target", "/object", "/contact", "/force", "/cmd_vel")
+NAN, INF = float("nan"), float("inf")
+
+
+def turned_force(message: dict[str, Any]) -> None:
+    x, y = message["wrench"]["force"]["x"], message["wrench"]["force"]["y"]
+    message["header"] = message["header"] | {"frame_id": "turned"}
+    message["wrench"] = {"force": {"x": y, "y": -x}}
+
+
+def cases() -> list[Case]:
+    """Return all cases."""
+    return [
+        *(Case(kind, *entry) for kind, entry in _order().items()),
+        *(Case(kind, *entry) for kind, entry in (_formats() | _invalid_files()).items()),
+        *(Case(kind, *entry) for kind, entry in (_frames() | _topics() | _values()).items()),
+    ]
+
+
+def _order() -> dict[str, tuple[Any, ...]]:
+    """Return bags in other orders, and with other stamps."""
+    late, hour = 1_700_000_000 * SECOND, 3600 * SECOND
+    whole, sorted_ = rows(), sorted(rows(), key=lambda r: r.topic)
+    by_system = stamped(lambda t: t + late, ["/cmd_vel"])
+    ends = [r._replace(time=r.time * 10) for r in stamped(lambda t: 10 * t)
+            if r.topic != "/odom" or r.time < 1.4 * SECOND]  # fmt: skip
+    return {
+        "as written": (whole,),
+        "topic after topic": (sorted_,),
+        "topics in the reverse order": (sorted(rows(), key=lambda r: r.topic, reverse=True),),
+        "commands before observations of the same stamp": (
+            sorted(rows(), key=lambda r: (r.time, r.topic != "/cmd_vel")),
+        ),
+        "the whole file reversed": (whole[::-1],),
+        **{f"shuffled, {seed}": (shuffled(seed),) for seed in range(3)},
+        "shuffled, small chunks": (plain(shuffled(3), chunk_size=500),),
+        "a receipt back by 5 s": (received(lambda r, _: r.time - 5 * SECOND, "/odom", [9]),),
+        "a receipt at 0": (received(lambda r, _: 0, "/cmd_vel", [9]),),
+        "a receipt ahead by an hour": (received(lambda r, _: r.time + hour, "/cmd_vel", [9]),),
+        "receipts repeated": (received(lambda r, i: SECOND + i // 2 * 40 * MS, "/cmd_vel"),),
+        "all receipts of a topic equal": (received(lambda r, _: SECOND, "/target"),),
+        "receipts late by 80 ms": (received(lambda r, _: r.time + 80 * MS),),
+        "receipts by another clock": (received(lambda r, _: r.time + late),),
+        "receipts of stamped topics late by 0 to 9 ms": (
+            [r._replace(time=r.time + (i * 7 % 10 if r.topic in STAMPED else 4) * MS)
+             for i, r in enumerate(whole)],
+        ),
+        "each message twice, the last counts": (repeated(),),
+        "stamps of the system clock": (
+            [r._replace(time=r.time + late) for r in stamped(lambda t: t + late)], "", (), 1e-6,
+        ),
+        "no stamps": (stamped(lambda t: 0),),
+        "no stamps, shuffled": (random.Random(1).sample(stamped(lambda t: 0), len(whole)),),
+        "no stamps of the target": (stamped(lambda t: 0, ["/target"]),),
+        "no stamps of the target, receipts late by 80 ms": (
+            [r._replace(time=r.time + 80 * MS) for r in stamped(lambda t: 0, ["/target"])],
+        ),
+        "commands without header": (as_twist(whole), "", {"cmd_vel": "/plain"}),
+        "commands without header, reversed": (as_twist(whole[::-1]), "", ["cmd_vel=/plain"]),
+        "commands without header, receipts by another clock": (
+            as_twist(received(lambda r, _: r.time + late)), "", "cmd_vel=plain",
+        ),
+        "a target as a pose": (as_pose(whole), "", {"target": "/pose"}),
+        "only commands": (sorted_[:COUNT], "has no messages on /odom"),
+        "header stamps begin anew": (
+            [*whole, *received(lambda r, _: r.time + 2 * SECOND)], "go back from 1.780 to 1.000 s",
+        ),
+        "a header stamp of odom goes back": (
+            edited("/odom", set_("header.stamp", {"sec": 1}), [9]),
+            "on /odom that go back from 1.160 to 1.000 s",
+        ),
+        "a header stamp of a command is 0": (
+            edited("/cmd_vel", set_("header.stamp", {}), [9]), "on /cmd_vel that go back",
+        ),
+        "sim time and system time mixed": (
+            [r for r in by_system if r.topic != "/taxels"], "synchronise the clocks",
+        ),
+        "sim time and system time mixed, taxels": (by_system, "no header stamps on /taxels"),
+        "a simulation slower than the clock": (
+            received(lambda r, _: 20 * r.time), "no header stamps on /taxels",
+        ),
+        "odom ends early": (ends, "no message on /odom in the 4 s before the command at 17.8"),
+    }  # fmt: skip
+
+
+def _formats() -> dict[str, tuple[Any, ...]]:
+    """Return bags in other formats."""
+    whole = rows()
+    folders = {
+        f"{plugin}: {kind}": (folder_of(plugin, *options),)
+        for plugin in ("MCAP", "SQLITE3")
+        for kind, options in {
+            "folder": (),
+            "folder of 3 files": ("NONE", 3),
+            "folder, messages compressed": ("MESSAGE",),
+            "folder, files compressed": ("FILE",),
+            "folder of 2 files, files compressed": ("FILE", 2),
+        }.items()
+    }
+    return folders | {
+        "MCAP without compression": (plain(whole, compression=CompressionType.NONE),),
+        "MCAP with lz4": (plain(whole, compression=CompressionType.LZ4),),
+        "MCAP without chunks": (plain(whole, use_chunking=False),),
+        "MCAP without summary": (plain(whole, **NO_INDEX),),
+        "MCAP without chunks and summary": (plain(whole, use_chunking=False, **NO_INDEX),),
+        "MCAP without checksums": (plain(whole, enable_crcs=False),),
+        "MCAP with small chunks": (plain(whole, chunk_size=300),),
+        "MCAP without profile": (plain(whole, profile=""),),
+        "suffix .MCAP": (plain(whole, name="BAG.MCAP"),),
+        "suffix .txt": (plain(whole, name="bag.txt"),),
+        "suffix .db3 of an MCAP file": (plain(whole, name="bag.db3"),),
+        "schemas in IDL": (plain(whole, schema="ros2idl", text=idl),),
+        "schemas in OMG IDL": (plain(whole, schema="omgidl", text=idl),),
+        "schemas without text": (plain(whole, text=lambda r: ""),),
+        "schemas without text and language": (plain(whole, schema="", text=lambda r: ""),),
+        "types without msg": (changed(lambda r: r._replace(kind=r.kind.replace("/msg/", "/"))),),
+        "big endian": (changed(big_endian),),
+        "messages compressed in an MCAP file": (
+            changed(lambda r: r._replace(data=zstandard.compress(r.data))),
+        ),
+        "messages of ROS 1 in MCAP": (
+            lambda f: mcap(ros1_records(), schema="ros1msg", encoding="ros1", profile="ros1")(f),
+        ),
+        "folder without metadata": (changed_folder(lambda p: (p / "metadata.yaml").unlink()),),
+        "a file .mcap.zstd": (file_of(folder_of("MCAP", "FILE")),),
+        "a file .db3.zstd": (file_of(folder_of("SQLITE3", "FILE")),),
+        "a file .db3": (file_of(folder_of("SQLITE3")),),
+        "a file .DB3": (file_of(folder_of("SQLITE3"), "PUSH.DB3"),),
+        "a file .db3 named .mcap": (file_of(folder_of("SQLITE3"), "push.mcap"),),
+        "a file .db3, messages compressed": (file_of(folder_of("SQLITE3", "MESSAGE")),),
+        "a file .db3 without definitions": (old_sqlite,),
+        "other topics of unknown types": (
+            lambda f: mcap([*encode(whole), Record("/raw", "x/msg/Y", "~?", SECOND, b"?")])(f),
+        ),
+    }  # fmt: skip
+
+
+def _invalid_files() -> dict[str, tuple[Any, ...]]:
+    """Return files that are no bags, or damaged."""
+    whole, bomb = rows(), bytes(2**27)
+    return {
+        "an empty file": (content(b""), "is empty"),
+        "an empty file .db3": (content(b"", "bag.db3"), "is empty"),
+        "a text": (content(b"time,x,y\n"), "is no bag: give FILE.mcap"),
+        "a zip archive": (zipped, "is no bag"),
+        "a path that is missing": (lambda f: f / "none.mcap", "is no bag"),
+        "a cut MCAP file": (cut(plain(whole), 0.5), "is cut off: save the rest"),
+        "a cut MCAP file without chunks": (
+            cut(plain(whole, use_chunking=False), 0.5), "is cut off: save the rest",
+        ),
+        "an MCAP file without end": (cut(plain(whole, **NO_INDEX), 0.99), "is cut off"),
+        "a wrong bit": (flipped, "is damaged (crc validation failed"),
+        "a cut file .db3": (cut(file_of(folder_of("SQLITE3")), 0.5), ".recover | sqlite3"),
+        "a cut file .mcap.zstd": (cut(file_of(folder_of("MCAP", "FILE")), 0.5), "is damaged"),
+        "zstd of no bag": (content(zstandard.compress(b"no"), "a.zstd"), "its content is no bag"),
+        "another sqlite3 file": (other_sqlite, "no tables topics and messages"),
+        "ROS 1": (ros1_bag, "is a ROS 1 bag: run `rosbags-convert --src"),
+        "messages in JSON": (plain(whole, encoding="json"), "in the encoding json"),
+        "messages in protobuf": (
+            plain(whole, encoding="protobuf", schema="protobuf"), "in the encoding protobuf",
+        ),
+        "messages of odd bytes": (
+            changed(lambda r: r._replace(data=b"odd")),
+            "has a message on /odom that cannot be decoded as nav_msgs/Odometry",
+        ),
+        "a schema of odd text": (plain(whole, text=lambda r: "~?"), "that cannot be decoded"),
+        "a schema of other fields": (plain(whole, text=lambda r: "byte x"), "cannot be decoded"),
+        "an empty folder": (lambda f: f, "has no file .mcap or .db3"),
+        "a folder of two bags": (several, "give one of them, or run `ros2 bag reindex"),
+        "a folder that lacks a file": (
+            changed_folder(lambda p: (p / "push 1.mcap").unlink(), 3), "lacks push 1.mcap",
+        ),
+        "a folder with odd metadata": (
+            changed_folder(lambda p: (p / "metadata.yaml").write_text("a: [")), "ros2 bag reindex",
+        ),
+        "a chunk larger than it says, zstd": (
+            content(chunked(zstandard.compress(bomb), 100, "zstd")), "a chunk of 134217728 bytes",
+        ),
+        "a chunk larger than it says, lz4": (
+            content(chunked(lz4.frame.compress(bomb), 100, "lz4")), "a chunk of 67108865 bytes",
+        ),
+        "an unknown compression": (content(chunked(b"?", 100, "br")), "has the compression br"),
+        "a receipt as text": (odd_sqlite, "cannot be decoded"),
+    }  # fmt: skip
+
+
+def _frames() -> dict[str, tuple[Any, ...]]:
+    """Return bags in other frames."""
+    late_map = transform("map", "odom", 2.0, -1.0, topic="/tf", stamp=9 * SECOND)
+    no_rotation = edited("/tf_static", set_("transforms.0.transform.rotation", {"w": 0.0}),
+                         source=[STATIC["map"]])  # fmt: skip
+    from_map, turned = moved("/target", 2.0, -1.0, "map"), framed("/cmd_vel", "turned")
+    no_path = "has {} in the frame {}, and no transform from it to {}".format
+    return {
+        "frames with a slash": (framed("/target", "/odom", framed("/contact", "/base_link")),),
+        "odom with a slash": (framed("/odom", "/odom"),),
+        "empty frames": (framed("/target", "", framed("/contact", "", framed("/cmd_vel", ""))),),
+        "empty frames of odom": (
+            edited("/odom", set_("child_frame_id", ""), source=framed("/odom", "")),
+        ),
+        "frames with a prefix": (prefixed(),),
+        "a target in map, static": ([*from_map, STATIC["map"]],),
+        "a target in map, over two transforms": (
+            [*moved("/target", 3.0, 1.0, "earth"), STATIC["map"],
+             transform("earth", "map", 1.0, 2.0)],
+        ),
+        "a target below odom": (
+            [*moved("/target", -2.0, 1.0, "hall"), transform("odom", "hall", 2.0, -1.0)],
+        ),
+        "a target in map, moving": (moving_map(),),
+        "a target in base_link, once": (
+            [r for r in base_target() if r.time >= 1.04 * SECOND or r.topic != "/cmd_vel"],
+            "", (), 1e-12,
+        ),
+        "a contact in another frame": (
+            [*moved("/contact", -0.25, -0.5, "skin", "points"), STATIC["skin"]], "", (), 1e-7,
+        ),
+        "a force in another frame": (
+            [*edited("/force", turned_force), STATIC["turned"]], "", (), 1e-12,
+        ),
+        "commands in a frame at the base": (
+            [*framed("/cmd_vel", "base_footprint"), STATIC["same"]],
+        ),
+        "a target in map": (framed("/target", "map"), no_path("/target", "map", "odom")),
+        "a target in base_link, before odom": (
+            [r for r in base_target() if r.topic != "/odom" or r.time > 1.2 * SECOND],
+            "no transform of odom to base_link at the time of /target, 1.040 s",
+        ),
+        "a contact in a camera": (
+            framed("/contact", "camera"), no_path("/contact", "camera", "base_link"),
+        ),
+        "a force in a wheel": (framed("/force", "wheel"), no_path("/force", "wheel", "base_link")),
+        "an object in map": (framed("/object", "map"), no_path("/object", "map", "odom")),
+        "commands in odom": (framed("/cmd_vel", "odom"), "publish commands in base_link"),
+        "commands in a tool": (
+            framed("/cmd_vel", "tool"), no_path("/cmd_vel", "tool", "base_link"),
+        ),
+        "commands in a turned frame": (
+            [*turned, STATIC["turned"]], "publish commands in base_link",
+        ),
+        "frames of odom change": (
+            edited("/odom", set_("header.frame_id", "map"), range(9)), "several frames on /odom",
+        ),
+        "a transform too late": (
+            [*from_map, late_map], "no transform of map to odom at the time of /target",
+        ),
+        "a transform that is no rotation": (
+            [*from_map, *no_rotation], "whose norm is not 1 on /tf_static",
+        ),
+    }  # fmt: skip
+
+
+def _topics() -> dict[str, tuple[Any, ...]]:
+    """Return bags with other topics."""
+    whole, names = rows(), {topic[1:]: f"/ridgeback{topic}" for topic in STAMPED}
+    other = renamed(names)
+    texts = [f"{key}={name}" for key, name in names.items()]
+    one = [r for r in whole if r.topic != "/cmd_vel" or r.time < 1.01 * SECOND]
+    return {
+        "other names": (other, "", names),
+        "other names, as texts": (other, "", texts),
+        "other names, in one text": (other, "", ",".join(texts)),
+        "names without slash": ([r._replace(topic=r.topic[1:]) for r in whole],),
+        "names that are not told": (
+            other, "has no messages on /odom, /target, /cmd_vel; its topics are "
+            "/ridgeback/cmd_vel (geometry_msgs/TwistStamped)",
+        ),
+        "a wrong name": (
+            whole, "has no messages on /odometry; its topics are /cmd_vel", {"odom": "/odometry"},
+        ),
+        "a wrong name of an optional topic": (whole, "no messages on /ft", {"force": "/ft"}),
+        "a wrong key": (whole, "unknown key of a topic 'odometry'", {"odometry": "/odom"}),
+        "a key twice": (whole, "name each once", ["odom=/odom", "odom=/o"]),
+        "a key alone": (whole, "topic = odom is not allowed", ["odom"]),
+        "a topic of another type": (
+            whole, "has std_msgs/Float32MultiArray on /taxels: record nav_msgs/Odometry",
+            {"odom": "/taxels"},
+        ),
+        "no contacts and taxels": (
+            [r for r in whole if r.topic not in ("/contact", "/taxels")],
+            "has no messages on /contact or /taxels",
+        ),
+        "no messages": ([], "its topics are none"),
+        "one command": (one, "has too few commands, 1, on /cmd_vel"),
+    }  # fmt: skip
+
+
+def _values() -> dict[str, tuple[Any, ...]]:
+    """Return bags with odd values."""
+    zero = {"x": 0.0, "y": 0.0, "z": 0.0, "w": 0.0}
+    norm, tilt = "whose norm is not 1", "that tilts beyond 0.1 rad"
+    quaternions = {
+        "a quaternion of zeros": ({}, norm),
+        "a quaternion of norm 2": ({"w": 2.0}, norm),
+        "a quaternion of norm 1.01": ({"w": 1.01}, norm),
+        "a quaternion as Euler angles": ({"z": 1.3}, norm),
+        "a quaternion with NaN": ({"z": NAN, "w": 1.0}, "a number that is not finite"),
+        "a base on its side": ({"x": 0.7071068, "w": 0.7071068}, tilt),
+        "a quaternion with w first": ({"x": 1.0}, tilt),
+    }
+    fields = (
+        ("/odom", "pose.pose.position.x", NAN), ("/odom", "pose.pose.position.y", INF),
+        ("/target", "point.x", NAN), ("/target", "point.y", -INF),
+        ("/contact", "polygon.points", [{"x": NAN}]), ("/contact", "polygon.points", [{"y": INF}]),
+        ("/taxels", "data", [NAN] * 42), ("/force", "wrench.force.x", NAN),
+        ("/object", "pose.position.y", NAN), ("/object", "scale.x", NAN),
+        ("/cmd_vel", "twist.linear.x", NAN), ("/cmd_vel", "twist.angular.z", INF),
+    )  # fmt: skip
+
+    def opposite(message: dict[str, Any]) -> None:
+        q = message["pose"]["pose"]["orientation"]
+        message["pose"]["pose"]["orientation"] = {k: -v for k, v in q.items()}
+
+    def apart(message: dict[str, Any]) -> None:
+        ends = zip(message["polygon"]["points"], (-0.25, 0.25), strict=True)
+        message["polygon"] = {"points": [p | {"y": p["y"] + shift} for p, shift in ends]}
+
+    return {
+        **{kind: (edited("/odom", set_("pose.pose.orientation", zero | q), [5]),
+                  f"{words} on /odom at 1.100 s")
+           for kind, (q, words) in quaternions.items()},
+        **{f"{path} of {topic} = {str(value)[:20]}": (edited(topic, set_(path, value), [5]),
+                                                      f"not finite on {topic} at 1.100 s")
+           for topic, path, value in fields},
+        "a quaternion of the opposite sign": (edited("/odom", opposite, [5]), "", (), 1e-12),
+        "a contact with both ends": (edited("/contact", apart, [2, 6, 10]), "", (), 1e-7),
+        "a contact of 4 points": (
+            edited("/contact", set_("polygon.points", [{}] * 4), [5]), "a contact of 4 points",
+        ),
+        "taxels of two counts": (
+            edited("/taxels", set_("data", [0.0] * 41), [5]), "has 42 and 41 values on /taxels",
+        ),
+    }  # fmt: skip
+
+
+ALL = cases()
+
+
+def reference(folder: Path) -> dict[str, np.ndarray]:
+    """Return the steps of the plain bag, as `rps push` writes it."""
+    return bag.read(bag.write(folder / "reference.mcap", push(), {}))
+
+
+def result_of(case: Case, folder: Path, expected: dict[str, np.ndarray]) -> str:
+    """Return the sentence of a refusal, or how the steps differ; nothing if they are equal."""
+    try:
+        write = case.source if callable(case.source) else plain(case.source)
+        steps = bag.read(write(folder), case.topics)
+    except InputError as error:
+        return str(error)
+    late = steps["time"][0] - expected["time"][-len(steps["time"])]
+    steps["time"] = steps["time"] - late if abs(late) > 1e8 else steps["time"]
+    for name, values in expected.items():
+        if name not in steps:
+            if "object" not in name:
+                return f"{name} is missing"
+            continue
+        part = values[-len(steps["time"]) :]
+        if name == "period":
+            part, steps[name] = part[1:], steps[name][1:]
+        difference = np.abs(steps[name] - part).max()
+        if not difference <= case.atol:
+            return f"{name} differs by {difference:.3g}"
+    return ""
+
+
+def main() -> None:
+    """Print the table of all cases."""
+    print("| kind | expected | result |\n|---|---|---|")
+    with tempfile.TemporaryDirectory() as name:
+        expected = reference(Path(name))
+        for i, case in enumerate(ALL):
+            folder = Path(name) / str(i)
+            folder.mkdir()
+            result = result_of(case, folder, expected)
+            fine = case.expected in result if case.expected else not result
+            words = f"a sentence: {case.expected}" if case.expected else "the same steps"
+            verdict = "" if fine else "WRONG: "
+            cells = case.kind, words, verdict + (result or "the same steps")
+            print("|", " | ".join(x.replace(name, "").replace("|", "\\|") for x in cells), "|")
+    print(f"\n{len(ALL)} bags")
+
+
+if __name__ == "__main__":
+    main()
