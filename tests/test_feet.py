@@ -199,6 +199,6 @@ def test_feet_are_drawn_only_for_random_objects():
     names = {"feet", "feet_number", "feet_turn"}
     assert set(points.names(ranges)) - set(points.names(plain)) == names
     u = points.points_of(ranges, np.arange(6), 1)
-    again = points.check_points(ranges, u).draw(ranges, np.array([0, 3]))
-    drawn = draws.draw(ranges, 1, np.array([0, 3]))
+    again = points.draw(ranges, 1, points.check_points(ranges, u), [0, 3])
+    drawn = draws.draw(ranges, 1, [0, 3])
     np.testing.assert_array_equal(again.solid.feet, drawn.solid.feet)
