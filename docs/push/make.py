@@ -41,6 +41,7 @@ from rps_jax.world.scene import FRICTION
 
 HERE = Path(__file__).parent
 RECORDED = HERE / "recorded.json"
+SITE = HERE.parents[1] / "site"
 LAWS = {
     "rps": "RPS, the paper's",
     "rps_tuned": "RPS, tuned by evolution",
@@ -261,7 +262,7 @@ def main() -> None:
     """Write the page of the command line, and open or record it on request."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition(":")[0] + ".")
     parser.add_argument(
-        "file", nargs="?", type=Path, default=Path("push.html"), help="default: push.html"
+        "file", nargs="?", type=Path, default=SITE / "push.html", help="default: site/push.html"
     )
     parser.add_argument("--open", action="store_true", help="open the page in the browser")
     parser.add_argument("--record", action="store_true", help="record the 3-D push again")
@@ -272,9 +273,7 @@ def main() -> None:
         RECORDED.write_text(json.dumps(record(), separators=(",", ":")) + "\n", "utf-8")
     path = options.file.resolve()
     home = path.with_name("index.html")  # of the site, if the page lies in it
-    back = (
-        home.name if home.exists() else os.path.relpath(HERE.parents[1] / "README.md", path.parent)
-    )
+    back = home.name if home.exists() else os.path.relpath(SITE.with_name("README.md"), path.parent)
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(page(back), "utf-8")
     sys.stdout.write(f"{options.file}: {path.stat().st_size / 1e6:.2f} MB\n")
