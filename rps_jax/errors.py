@@ -67,7 +67,8 @@ def check_number(
     bounds = [f"{words} {limit:g}" for words, limit in limits.items() if math.isfinite(limit)]
     allowed = " and ".join(["a number", *bounds]) + (f" [{unit}]" if unit else "")
     try:
-        refused = (isinstance(value, str) and not text) or "complex" in type(value).__name__
+        refused = isinstance(value, bool) or "complex" in type(value).__name__
+        refused = refused or (isinstance(value, str) and not text)
         scalar = math.nan if refused else float(value)
     except (TypeError, ValueError, OverflowError):
         scalar = math.nan
@@ -93,7 +94,8 @@ def check_vector(name: str, values: Iterable[object], **bounds: float | str) -> 
 
 def check_count(name: str, value: object, *, at_least: int = 1, at_most: int) -> int:
     """Return a value if it is a whole number within bounds, or raise InputError."""
-    if not (isinstance(value, numbers.Integral) and at_least <= int(value) <= at_most):
+    is_whole = isinstance(value, numbers.Integral) and not isinstance(value, bool)
+    if not (is_whole and at_least <= int(value) <= at_most):
         rule = f"it must be a whole number from {at_least} to {at_most}"
         raise not_allowed(name, value, rule)
     return int(value)
@@ -127,7 +129,7 @@ def check_each_once(
     field: str, values: Sequence[object], labels: Sequence[object] | None = None
 ) -> None:
     """Raise InputError if there is no value, or if a value (or its label) is repeated."""
-    if not values or len(set(values if labels is None else labels)) < len(values):
+    if len({*map(str, values if labels is None else labels)}) < max(len(values), 1):
         raise not_allowed(field, values, "name each once, at least one")
 
 

@@ -7,6 +7,8 @@ import os
 import platform
 import shutil
 import subprocess
+import sys
+from collections.abc import Iterator
 from importlib import metadata
 from typing import Any, Literal
 
@@ -31,6 +33,58 @@ def configure_xla() -> None:
     for flag, value in flags.items():
         if flag not in (flags_before := os.environ.get("XLA_FLAGS", "")):
             os.environ["XLA_FLAGS"] = f"{flags_before} {flag}={value}".strip()
+
+
+def has_started() -> bool:
+    """Return whether JAX has started its devices in this process."""
+    bridge = sys.modules.get("jax._src.xla_bridge")
+    return bridge is not None and bridge.backends_are_initialized()
+
+
+class _Fork:
+    """Whether this process is the fork of one in which JAX had started."""
+
+    broken = False
+
+    @classmethod
+    def note(cls) -> None:
+        """Note that this process was forked."""
+        cls.broken = cls.broken or has_started()
+
+
+if hasattr(os, "register_at_fork"):  # not on Windows
+    os.register_at_fork(after_in_child=_Fork.note)
+
+
+def check_process() -> None:
+    """Raise InputError in the fork of a process in which JAX had started: it would hang."""
+    if _Fork.broken:
+        raise InputError(
+            "this process is a fork of one in which JAX runs, whose threads it lacks, so that it "
+            "would hang: start workers with the context 'spawn', as multiprocessing.get_context"
+            "('spawn'), or with vector_kwargs={'context': 'spawn'} in gymnasium.make_vec."
+        )
+
+
+@contextlib.contextmanager
+def standard_jax() -> Iterator[None]:
+    """Run with JAX's default checks in this thread, whatever the user's own code needs.
+
+    The engines mix types by design, move arrays implicitly, and use NaN and infinity as values.
+    Also a decorator.
+    """
+    import jax
+
+    check_process()
+    with contextlib.ExitStack() as stack:
+        for context, value in (
+            (jax.numpy_dtype_promotion, "standard"), (jax.numpy_rank_promotion, "allow"),
+            (jax.transfer_guard, "allow"), (jax.disable_jit, False), (jax.no_tracing, False),
+            (jax.debug_nans, False), (jax.debug_infs, False), (jax.check_tracer_leaks, False),
+            (jax.legacy_prng_key, "allow"), (jax.enable_custom_prng, False),
+        ):  # fmt: skip
+            stack.enter_context(context(value))
+        yield
 
 
 def choose(name: Device) -> None:

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TypeVar
 
 from rps_jax.record import files
+from rps_jax.record.options import check_arguments
 
 T = TypeVar("T")
 MAX_BYTES = 512 * 2**20  # [bytes] of the files in one folder of the cache
@@ -43,6 +44,7 @@ def use_cache(folder: str | Path | None = None) -> Path | None:
     """
     import jax
 
+    check_arguments(use_cache, {"folder": folder})
     path = (default_folder() if folder is None else Path(folder)).absolute()
     try:
         path.mkdir(parents=True, exist_ok=True)

@@ -5,9 +5,11 @@ The command line, the checks and the manifests of runs are derived from these de
 
 import dataclasses
 import functools
+import numbers
+import os
 import types
 import typing
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal, get_args, get_origin
 
@@ -52,23 +54,30 @@ def check_fields(record: object, prefix: str = "") -> None:
     """Check the fields of a dataclass by their types and bounds; errors name them after a prefix.
 
     Integers are `int`, finite numbers `float`, and closed choices `Literal`, or one of these and
-    `None`. Fields of other types are checked by their bounds, if these are declared, number by
-    number; their default is always allowed.
+    `None`. Fields of other types are checked by their types, and by their bounds, if these are
+    declared, number by number; their default is always allowed.
     """
     types_ = field_types(type(record))
     for field in dataclasses.fields(typing.cast(Any, record)):
-        if (value := getattr(record, field.name)) is not field.default:
+        # As the user gave it: a property may convert it.
+        if (value := vars(record)[field.name]) is not field.default:
             _check(f"{prefix}{field.name}", value, types_[field.name], field.metadata)
 
 
-def _check(name: str, value: Any, kind: object, metadata: Mapping[str, Any]) -> None:
+def check_arguments(function: Callable[..., object], values: Mapping[str, object]) -> None:
+    """Check the arguments of a function by their types, as `check_fields` checks fields."""
+    for name, value in values.items():
+        _check(name, value, field_types(function)[name], {})
+
+
+def _check(name: str, value: Any, kind: Any, metadata: Mapping[str, Any]) -> None:
     """Check a value by its type, and by the bounds in the metadata of its field."""
-    if get_origin(kind) in (typing.Union, types.UnionType):
-        if value is None and type(None) in get_args(kind):
-            return
-        kinds = [inner for inner in get_args(kind) if inner is not type(None)]
-        kind = kinds[0] if len(kinds) == 1 else None
+    kinds = _alternatives(kind)
+    if value is None and type(None) in kinds:
+        return
+    kinds = [inner for inner in kinds if inner is not type(None)]
     bounds = metadata.get(_BOUNDS)
+    kind = kinds[0] if len(kinds) == 1 else None
     if get_origin(kind) is Literal:
         errors.check_name(name, str(value), get_args(kind))
     elif kind is int:
@@ -83,9 +92,59 @@ def _check(name: str, value: Any, kind: object, metadata: Mapping[str, Any]) -> 
             raise errors.not_allowed(name, value, f"give {len(get_args(kind))} numbers")
         for item in items:
             _check(name, item, get_args(kind)[0], metadata)
+    elif not any(_is_of(value, inner) for inner in kinds):
+        nouns = list(dict.fromkeys(map(_noun, kinds)))
+        example = f", as [{value!r}]" if isinstance(value, str) and "several" in nouns[0] else ""
+        raise errors.not_allowed(name, repr(value), f"give {' or '.join(nouns)}{example}")
     elif bounds:
         for number in np.ravel(np.asarray(value, object)):
             errors.check_finite(name, number, **bounds)
+
+
+def _alternatives(kind: Any) -> Sequence[Any]:
+    """Return the types of a union, or the type itself."""
+    return get_args(kind) if get_origin(kind) in (typing.Union, types.UnionType) else (kind,)
+
+
+def _is_of(value: Any, kind: Any) -> bool:
+    """Return whether a value has a declared type; a tuple of numbers may be a list or an array."""
+    origin, inner = get_origin(kind), get_args(kind)
+    if origin in (typing.Union, types.UnionType):
+        return any(_is_of(value, alternative) for alternative in inner)
+    if origin in (tuple, Sequence):
+        if isinstance(value, str | bytes | Mapping) or not _has_items(value):
+            return False
+        items = list(value)
+        if origin is tuple and Ellipsis not in inner and len(items) != len(inner):
+            return False
+        return all(_is_of(item, inner[0]) for item in items)
+    if kind is float or kind is int:
+        number = numbers.Real if kind is float else numbers.Integral
+        is_scalar = np.ndim(value) == 0 and hasattr(value, "dtype") and value.dtype.kind in "iuf"
+        return isinstance(value, number) or is_scalar
+    if kind is bool:
+        return isinstance(value, bool | np.bool_)
+    if kind is Path:
+        return isinstance(value, os.PathLike)
+    kind = origin or kind
+    is_open = kind is Any or not isinstance(kind, type) or hasattr(kind, "__get__")
+    return is_open or isinstance(value, kind)
+
+
+def _has_items(value: object) -> bool:
+    return isinstance(value, Sequence) or (isinstance(value, Iterable) and np.ndim(value) > 0)
+
+
+def _noun(kind: Any) -> str:
+    """Return the noun of a type, for errors."""
+    origin, inner = get_origin(kind), get_args(kind)
+    nouns = {str: "a text", Path: "a path", bool: "True or False", float: "a number"}
+    nouns |= {int: "a whole number", Mapping: "a mapping of names", Callable: "a function"}
+    if origin in (tuple, Sequence):
+        count = "several" if origin is Sequence or Ellipsis in inner else str(len(inner))
+        items = dict.fromkeys(map(_noun, _alternatives(inner[0])))
+        return f"{count} {' or '.join(f'{item[2:]}s' for item in items)}"
+    return nouns.get(origin or kind) or f"a {getattr(origin or kind, '__name__', kind)}"
 
 
 def to_json(value: Any) -> Any:

@@ -314,6 +314,9 @@ SkinLike = str | Skin  # a sensor, or its text: see `parse_skin`
 def parse_skin(skin: SkinLike) -> Any:
     """Return a skin from a name with changes, as `capacitive,foam=0.01`; or raise InputError."""
     if not isinstance(skin, str):
+        if not isinstance(skin, Skin):
+            rule = f"choose from {', '.join(SKINS)}, or give a skin"
+            raise errors.not_allowed("skin", repr(skin), rule)
         skin.check()
         return skin
     name, changes = parse_changes("skin", skin)

@@ -16,7 +16,9 @@ from rps_jax.control import registry
 from rps_jax.control.base import LawParams
 from rps_jax.control.registry import LawLike
 from rps_jax.errors import InputError
+from rps_jax.engines import device
 from rps_jax.record import cache
+from rps_jax.record import options as options_
 from rps_jax.robot.robot import RobotLike
 from rps_jax.runs.question import Split, seed_of
 from rps_jax.trials import batch
@@ -31,6 +33,7 @@ from rps_jax.world import points as points_
 from rps_jax.world.domain import DomainLike, parse_domain
 
 
+@device.standard_jax()
 def evaluate(
     law: LawLike | Sequence[LawLike],
     domain: DomainLike = "wide",
@@ -84,6 +87,7 @@ def evaluate(
       >>> results.score.mean("world").shape
       (4,)
     """
+    options_.check_arguments(evaluate, locals())
     ranges, params = parse_domain(domain, robot), candidates(law)
     at = None if points is None else points_.check_points(ranges, points)
     count = worlds if at is None else len(at.u)
@@ -119,6 +123,7 @@ def stack(laws: Sequence[LawLike]) -> LawParams:
       >>> rps_jax.stack(["rps", "rps,K_h=0.3"]).K_h.tolist()
       [1.0, 0.3]
     """
+    options_.check_arguments(stack, {"laws": laws})
     several = [registry.resolve_law(law)[1] for law in laws]
     kinds = {type(params).__name__ for params in several}
     if len(kinds) != 1:

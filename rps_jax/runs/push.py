@@ -23,6 +23,7 @@ from rps_jax.analysis.report import Picture, Section
 from rps_jax.control import registry
 from rps_jax.control.base import Law, LawParams, Senses
 from rps_jax.control.observation import Twist
+from rps_jax.engines import device
 from rps_jax.record import bag as bags
 from rps_jax.record import folder
 from rps_jax.record.bag import Step
@@ -103,6 +104,7 @@ class Trace(Trajectory):
             images = [renderer.draw(qpos, rendering.NO_CONTACT) for renderer, qpos in poses]
         return stills(images, [f"{self.snapshots.time[i]:.0f} s" for i in shown])
 
+    @device.standard_jax()
     def film(
         self,
         path: str | Path,

@@ -147,13 +147,15 @@ class Command(Generic[T]):
         Raises:
           InputError: an option is not allowed.
         """
-        command = self.with_quick_values()
-        command.validate()
-        cache.use_cache_if_requested()
-        if command.report_to is not None:
-            return command.execute(command.report_to)
-        with command.progress_bar() as bar:
-            return command.execute(bar)
+        options.check_fields(self)
+        with device.standard_jax():
+            command = self.with_quick_values()
+            command.validate()
+            cache.use_cache_if_requested()
+            if command.report_to is not None:
+                return command.execute(command.report_to)
+            with command.progress_bar() as bar:
+                return command.execute(bar)
 
     def validate(self) -> None:
         """Raise InputError for options that are not allowed, before anything is compiled."""

@@ -16,8 +16,9 @@ import pandas as pd
 import xarray as xr
 
 from rps_jax import errors
+from rps_jax.engines import device
 from rps_jax.errors import InputError
-from rps_jax.record import files
+from rps_jax.record import files, options
 from rps_jax.record.checkpoint import Checkpoints
 from rps_jax.runs.plan import Plan, chunks_by_key, draw
 from rps_jax.runs.question import with_coordinates
@@ -199,9 +200,10 @@ class Results:
 def _prefetch(batches: Iterator[WorldBatch], count: int) -> Iterator[WorldBatch]:
     """Build up to `count` batches ahead in a thread, while earlier ones run."""
     with ThreadPoolExecutor(1) as builder:
-        queue = deque(builder.submit(next, batches, None) for _ in range(count))
+        build = functools.partial(builder.submit, device.standard_jax()(next), batches, None)
+        queue = deque(build() for _ in range(count))
         while (worlds := queue.popleft().result()) is not None:
-            queue.append(builder.submit(next, batches, None))
+            queue.append(build())
             yield worlds
 
 
@@ -266,4 +268,5 @@ def load(run: str | Path) -> xr.Dataset:
       >>> loaded.equals(results)
       True
     """
+    options.check_arguments(load, {"run": run})
     return with_coordinates(files.read_results(Path(run)))

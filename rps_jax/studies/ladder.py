@@ -106,7 +106,8 @@ class Ladder(SweepOptions, MultiLawQuestion[xr.Dataset | xr.DataTree]):
 
     @cached_property
     def chosen(self) -> dict[str, LawParams]:
-        return registry.resolve_laws(all_laws() if self.laws == () else self.laws)
+        is_default = isinstance(self.laws, tuple) and not self.laws
+        return registry.resolve_laws(all_laws() if is_default else self.laws)
 
     @cached_property
     def sweeps(self) -> dict[str, _TestSweep]:

@@ -37,7 +37,7 @@ from jax.sharding import PartitionSpec as P
 from rps_jax import engines, errors
 from rps_jax.control import registry, soft
 from rps_jax.control.base import Law, LawParams
-from rps_jax.engines import programs
+from rps_jax.engines import device, programs
 from rps_jax.trials import host, trial
 from rps_jax.trials.progress import Progress, ProgressCallback, Timing, no_progress
 from rps_jax.trials.setting import Setting
@@ -177,7 +177,7 @@ def rows(tree: Tree, index: Any) -> Tree:
 def _run_in_threads(tasks: Sequence[Callable[[], object]], count: int, monitor: _Monitor) -> None:
     """Run tasks on `count` threads; the first that fails stops the others."""
     with ThreadPoolExecutor(count) as pool:
-        futures = [pool.submit(task) for task in tasks]
+        futures = [pool.submit(device.standard_jax()(task)) for task in tasks]
         try:
             for future in as_completed(futures):
                 future.result()

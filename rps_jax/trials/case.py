@@ -63,11 +63,11 @@ class Case(TrialOptions):
     """Scripted shift of the object during the push."""
 
     def __post_init__(self) -> None:
+        check_fields(self)
         errors.check_name("object", objects.parse_object(self.object), objects.OBJECTS)
         registry.check_params(self.params)
         scene.check_contact(self.contact, self.mass)
         skins.parse_skin(self.skin or "ideal")
-        check_fields(self)
         errors.check_number("shift time", self.shift.time, at_least=0, unit="s")
         errors.check_vector("shift", self.shift.p_robot, at_least=-5, at_most=5, unit="m")
         scene.check_target(self.target, self.base.shell)

@@ -28,18 +28,20 @@ from rps_jax.control.laws import rps
 from rps_jax.control.laws.rps import RPSParams
 from rps_jax.control.learned import features
 from rps_jax.control.observation import TaxelObservation, Twist
+from rps_jax.engines import device
 from rps_jax.engines.base import ControlPeriod, Driven, Motion, Stage
 from rps_jax.engines.mjx_colliders import mjx
 from rps_jax.geometry import footprint as fp
 from rps_jax.geometry import planar
-from rps_jax.robot.robot import Robot
+from rps_jax.record.options import check_fields
+from rps_jax.robot.robot import Robot, RobotLike
 from rps_jax.trials import trial
 from rps_jax.trials.batch import WorldBatch, rows
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import ControlLoop, Measurement, Trial, World
 from rps_jax.trials.worlds import drawn_scene, drawn_worlds
 from rps_jax.world import domain, draws, objects, video
-from rps_jax.world.domain import DOMAINS, Domain
+from rps_jax.world.domain import DOMAINS, Domain, DomainLike
 from rps_jax.world.draws import Draw
 from rps_jax.world.scene import Scene
 
@@ -96,35 +98,46 @@ class PushEnv:
     the object fell over), or if the physics diverged. A state that is done does not change, and
     its rewards are 0.
 
+    With the engine quasistatic, `step` has derivatives, which are zero or jump where a contact, a
+    taxel or a rule switches. Those of the other engines are refused.
+
     Every reset takes one of `worlds` random worlds of the domain, which are drawn in advance on the
     host, and new noise. Shape family and engine are static.
 
     Raises:
-      InputError: an unknown object, a skin without taxels, or an engine that JAX does not run.
+      InputError: an unknown object, a skin without taxels, an engine that JAX does not run, or a
+        key, state or action of another type or shape.
     """
 
     object: str = "random_box"  # in all worlds; the objects of the domain are not used
-    domain: Domain = DOMAINS["wide"]
+    domain: DomainLike = DOMAINS["wide"]
     params: RPSParams = RPSParams.paper()  # only the bounds of the twist and d_success are used
     setting: Setting = Setting(engine="fused")
-    robot: Robot | str | None = None  # name, as kairos; None: the domain's
+    robot: RobotLike | None = None  # name, as kairos; None: the domain's
     weights: Reward = Reward()
     worlds: int = 1024
 
     def __post_init__(self) -> None:
         """Check the options, and draw the worlds before a loop is traced."""
+        check_fields(self)
         engines.get(self.setting.engine).check_traced()
-        errors.check_name("skin of an environment", self.domain.skin, ("capacitive",))
+        errors.check_name("skin of an environment", self._alone.skin, ("capacitive",))
         errors.check_count("worlds", self.worlds, at_most=1_000_000)
         rps.check(self.params)
         check_finite_leaves(self.weights)
-        self._drive  # noqa: B018
+        with device.standard_jax():
+            self._drive  # noqa: B018
 
     # --- the loop ---
 
+    @device.standard_jax()
     def reset(self, rng: jax.Array) -> State:
         """Return a random world at its start, from a key."""
-        key_world, key = jax.random.split(rng)
+        try:
+            key_world, key = jax.random.split(rng)
+        except (TypeError, ValueError) as error:
+            rule = "give one key, as jax.random.key(0), and map reset over several by jax.vmap"
+            raise errors.not_allowed("rng", repr(rng), rule) from error
         index = jax.random.randint(key_world, (), 0, self.worlds)
         world = rows(self.table, index)
         return self.begin(world._replace(key=jax.random.key_data(key)), index)
@@ -145,8 +158,12 @@ class PushEnv:
         metrics = _metrics(current, measured, zero)
         return State(current, _obs(current, measured), zero, zero, metrics, info)
 
+    @device.standard_jax()
     def step(self, state: State, action: jax.Array) -> State:
         """Run one control period with the base at the twist of an action (3,)."""
+        if not isinstance(state, State):
+            rule = "give the State that reset returned"
+            raise errors.not_allowed("state", repr(state), rule)
         world, previous = state.info["world"], state.data
         decided, twist = trial.execute(world, previous, self.twist(action), self.dt)
         robot = trial.pushing(world)
@@ -176,6 +193,13 @@ class PushEnv:
 
     def twist(self, action: jax.Array) -> Twist:
         """Return the twist [m/s, m/s, rad/s] of an action (3,), within the bounds."""
+        rule = "it must be 3 numbers: v_x, v_y and omega; map step over several worlds by jax.vmap"
+        try:
+            action = jnp.asarray(action)
+        except (TypeError, ValueError) as error:
+            raise errors.not_allowed("action", repr(action), rule) from error
+        if action.shape != (3,) or jnp.iscomplexobj(action):
+            raise errors.not_allowed("action", f"{action.dtype}{[*action.shape]}", rule)
         v_max, omega_max = self.params.v_max, self.params.omega_max
         twist = Twist(v_max * action[0], v_max * action[1], omega_max * action[2])
         return rps.saturate(self.params, twist)
@@ -298,6 +322,8 @@ class PushEnv:
         del scene_option, modify_scene_fns
         if isinstance(trajectory, State):
             return self.render([trajectory], height, width, camera)[0]
+        if not isinstance(trajectory, Sequence):
+            raise errors.not_allowed("trajectory", repr(trajectory), "give one State or a list")
         images = []
         for index, states in itertools.groupby(trajectory, lambda s: int(s.info["index"])):
             shown = list(states)
@@ -330,16 +356,35 @@ def _metrics(current: Trial, measured: Measurement, progress: jax.Array) -> dict
 
 
 def world_driver(stage: Stage, setting: Setting) -> Callable[..., Driven]:
-    """Return a function that drives one world; under vmap, the stage drives the whole batch."""
+    """Return a function that drives one world; under vmap, the stage drives the whole batch.
+
+    It has derivatives if the engine has both modes of these.
+    """
+    engine = engines.get(setting.engine)
+
+    @jax.custom_jvp
+    def without_derivatives(arguments: Any) -> Any:
+        return arguments
+
+    @without_derivatives.defjvp
+    def _(primals: Any, tangents: Any) -> Any:
+        rule = (
+            "PushEnv has no derivatives with it: choose quasistatic, or stop the gradients of states "
+            "and actions by jax.lax.stop_gradient, as learning without a model does"
+        )
+        raise errors.not_allowed("engine", engine.name, rule)
 
     def drive_batch(
         fields: Any, motion: Motion, twist: Twist, robot: Robot | None = None
     ) -> Driven:
         return stage.drive(fields, motion, ControlPeriod(twist, setting.physics, robot))
 
-    @jax.custom_batching.custom_vmap
-    def drive(*arguments: Any) -> Driven:
+    def drive_single(*arguments: Any) -> Driven:
         return rows(drive_batch(*jax.tree.map(lambda x: jnp.asarray(x)[None], arguments)), 0)
+
+    if "reverse" in engine.modes:
+        return drive_single
+    drive = jax.custom_batching.custom_vmap(drive_single)
 
     @drive.def_vmap
     def _(size: int, batched: Any, *arguments: Any) -> tuple[Driven, Driven]:
@@ -349,4 +394,4 @@ def world_driver(stage: Stage, setting: Setting) -> Callable[..., Driven]:
         driven = drive_batch(*jax.tree.map(broadcast, arguments, tuple(batched)))
         return driven, jax.tree.map(lambda _: True, driven)
 
-    return drive
+    return lambda *arguments: drive(*without_derivatives(arguments))

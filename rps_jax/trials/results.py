@@ -7,6 +7,7 @@ import xarray as xr
 from numpy.typing import ArrayLike
 
 from rps_jax.control.laws.rps import RPSParams
+from rps_jax.engines import device
 from rps_jax.geometry.footprint import Footprint
 from rps_jax.trials import trial
 from rps_jax.trials.pushes import Trajectory
@@ -98,6 +99,7 @@ def _plain(values: ArrayLike) -> np.ndarray:
     return values.astype(np.int8) if values.dtype == bool else values
 
 
+@device.standard_jax()
 def trace_dataset(trajectory: Trajectory) -> xr.Dataset:
     """Return one trial over time (time, ...), with its outcome, target and thresholds."""
     snapshots, world = trajectory.snapshots, trajectory.world

@@ -10,6 +10,7 @@ from rps_jax import engines, errors
 from rps_jax.control import registry
 from rps_jax.control.base import LawParams
 from rps_jax.engines import EngineName
+from rps_jax.record import options
 from rps_jax.robot.robot import Robot
 from rps_jax.trials.trial import Rules
 from rps_jax.world import physics as physics_
@@ -56,7 +57,7 @@ class Setting:
     """Seed of random worlds, and of the imperfections of skins."""
 
     def __post_init__(self) -> None:
-        errors.check_name("engine", self.engine, engines.ENGINES)
+        options.check_fields(self)
         self.rules.check()
         errors.check_count("seed", self.seed, at_least=0, at_most=2**32 - 1)
         if self.physics.cone != "elliptic":  # all engines have this one: import no engine

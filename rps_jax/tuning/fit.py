@@ -32,6 +32,7 @@ from rps_jax.analysis.report import Picture, Section
 from rps_jax.control import registry
 from rps_jax.control.base import Law, LawParams
 from rps_jax.control.registry import LawLike
+from rps_jax.engines import device
 from rps_jax.engines.base import Stage
 from rps_jax.errors import InputError
 from rps_jax.geometry.solid import GRAVITY
@@ -272,7 +273,7 @@ class Bank:
         drawn = [draws.draw(self.domain, seed, group) for group in groups]
         workers = run.workers or engines.get(self.setting.engine).workers("cpu")
         with ThreadPoolExecutor(workers) as pool:
-            pairs = zip(*pool.map(self.statistics, drawn), strict=True)
+            pairs = zip(*pool.map(device.standard_jax()(self.statistics), drawn), strict=True)
         order = np.argsort(np.concatenate(groups))
         ways = [pd.concat(frames).iloc[order] for frames in pairs]
         cube = points.points_of(self.domain, index, seed)

@@ -97,7 +97,7 @@ class Learn(PPO, SimulationQuestion[xr.Dataset]):
         "minutes": 5.0,
     }
 
-    domain: Sequence[DomainLike] = ("wide",)
+    domain: DomainLike | Sequence[DomainLike] = ("wide",)
     """Domains to learn in: wide, real, prisms, hostile, or JSON files of ranges; changes follow
     each, as wide,objects=random_box."""
     minutes: float = option(10.0, 0, 1e5, unit="min")

@@ -73,7 +73,7 @@ class Tuning(LawQuestion[xr.Dataset]):
     """Law with the initial parameters: a name, as rps, rps_tuned or rps_plus, or a file's class
     with bounds, as my_law.py:MyParams; changes follow, as rps,K_h=0.3 or rps,tuned.json. Gradients
     need a law with a smooth form: rps or rps_plus."""
-    domain: Sequence[DomainLike] = ("wide",)
+    domain: DomainLike | Sequence[DomainLike] = ("wide",)
     """Domains to tune in: paper, hardware, wide, real, prisms, hostile, or JSON files of ranges;
     changes follow each, as wide,mass=3:10."""
     objects: tuple[str, ...] = ("random_box", "random_cylinder")

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 
 from rps_jax import errors
 from rps_jax.record import files
-from rps_jax.record.options import parse_changes
+from rps_jax.record.options import check_fields, parse_changes
 from rps_jax.robot.robot import Robot, RobotLike, parse_robot
 from rps_jax.world import paper, scene
 from rps_jax.world.objects import FAMILIES, OBJECTS, PAPER_OBJECTS
@@ -127,6 +127,7 @@ class Domain:
     robot_slip: Range | None = drawn(None, 42, "1", 0, 0.5, "slip of the wheels", "robot", "slip")
 
     def __post_init__(self) -> None:
+        check_fields(self, "domain ")
         for name in self.objects:
             errors.check_name("domain object", name, (*RANDOM, *OBJECTS))
         errors.check_each_once("domain objects", self.objects)
@@ -143,8 +144,6 @@ class Domain:
             if (interval := getattr(self, name)) is None:
                 continue
             field = f"domain {name}"
-            if not isinstance(interval, Range):
-                raise errors.not_allowed(field, interval, "give a Range, as Range(3, 10)")
             low, high, log = interval
             bounds = {"at_least": quantity.low, "at_most": quantity.high, "unit": quantity.unit}
             for side, value in (("low", low), ("high", high)):

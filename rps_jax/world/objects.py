@@ -20,6 +20,7 @@ from rps_jax.geometry import solid
 from rps_jax.geometry.footprint import Footprint
 from rps_jax.geometry.solid import SIDES, Solid
 from rps_jax.record import files
+from rps_jax.record.options import check_arguments
 
 FAMILIES = {
     "box": "box",
@@ -125,6 +126,7 @@ def register_object(
       >>> Case("crate", "S1", (2.0, 0.0), "rps").object
       'crate'
     """
+    check_arguments(register_object, {"name": name, "path": path})
     if name in _BUILT_IN:
         rule = f"{', '.join(_BUILT_IN)} exist already"
         raise errors.not_allowed("name of an object", name, rule)
