@@ -20,7 +20,6 @@ from rps_jax.trials.trial import Rules
 
 HOW = {"object": "random_cylinder", "domain": NEAR, "worlds": 6, "hold": 1.0}
 HOW |= {"setting": Setting("fused", fidelity="fast", rules=Rules(horizon=20.0))}
-DISABLED = {"autoreset_mode": AutoresetMode.DISABLED}
 COUNT = 4
 AHEAD = np.tile(np.float32([1.0, 0.0, 0.0]), (COUNT, 1))
 
@@ -149,17 +148,115 @@ test_invalid_options_of_one_environment_are_refused = refusals(
 test_invalid_options_of_several_environments_are_refused = refusals(
     gym.GymPushVector,
     ({"num_envs": 0}, "num_envs = 0 is not allowed"),
-    ({"num_envs": 2} | DISABLED, "unknown autoreset_mode 'Disabled'"),
+    ({"autoreset_mode": "Never"}, "unknown autoreset_mode 'Never': choose from NextStep"),
+    ({"render_mode": "ansi"}, "unknown render_mode 'ansi': choose from rgb_array"),
+    ({"wolds": 3}, "unknown option 'wolds': .*did you mean 'worlds'"),
+    ({"domain": 3}, "domain = 3 is not allowed: give a name or a Domain"),
+    ({"setting": None}, "setting = None is not allowed: give a Setting"),
 )
 
 
-def test_invalid_actions_are_refused(single, vector):
-    vector.reset(seed=0)
-    with pytest.raises(InputError, match=r"action = of shape \(3,\) is not allowed"):
-        vector.step(AHEAD[0])
+@pytest.mark.parametrize(
+    ("action", "message"),
+    [
+        ([np.nan, 0, 0], r"action = \[\[nan, 0.0, 0.0\]\] is not allowed: it must be finite"),
+        ([np.inf, 0, 0], r"action = \[\[inf, 0.0, 0.0\]\]"),
+        ([1, 0], r"action = of shape \(1, 2\) is not allowed: .* of shape \(1, 3\)"),
+        ([1, 0, 0, 0], r"action = of shape \(1, 4\)"),
+        (1.0, r"action = of shape \(1,\)"),
+        ([AHEAD[0]] * 2, r"action = of shape \(1, 2, 3\)"),
+        ("left", r"action = \['left'\]"),
+        (None, r"action = \[None\]|of shape \(1,\)"),
+        ({"v_x": 1}, r"action = \[\{'v_x': 1\}\]"),
+        ([[1], [1, 2], 3], "action = "),
+    ],
+)
+def test_invalid_actions_are_refused(single, action, message):
     single.reset(seed=0)
-    with pytest.raises(InputError, match=r"action = \[\[nan, 0.0, 0.0\]\] is not allowed"):
-        single.unwrapped.step([np.nan, 0, 0])
+    with pytest.raises(InputError, match=message):
+        single.unwrapped.step(action)
+
+
+def test_greater_actions_are_reduced_to_the_bounds(single):
+    far, bounded = [], []
+    for action, found in (([9.0, 0.0, -9.0], far), ([1.0, 0.0, -1.0], bounded)):
+        single.reset(seed=0)
+        found.append(single.step(np.float32(action))[0])
+    same(far, bounded)
+
+
+def test_a_step_needs_a_running_episode(single):
+    alone = gymnasium.make_vec("rps_jax/Push-v0", num_envs=1, **HOW)
+    for call in (lambda: alone.step(AHEAD[:1]), alone.unwrapped.images):
+        with pytest.raises(InputError, match="no episode has started: call reset before step"):
+            call()
+    single.reset(seed=0)
+    single.unwrapped._vector._ended[:] = True
+    with pytest.raises(InputError, match=r"worlds \[0\] have ended: call reset before step"):
+        single.step(AHEAD[0])
+    with pytest.raises(InputError, match="options = {'world': 3} is not allowed"):
+        single.reset(options={"world": 3})
+    single.reset()
+    single.step(AHEAD[0])
+
+
+def test_each_world_has_its_own_seed(single, vector):
+    start, _ = vector.reset(seed=5)
+    later = [vector.step(AHEAD)[0] for _ in range(2)]
+    shuffled, _ = vector.reset(seed=[8, None, 6, 5])
+    same(shuffled[[3, 2, 0]], start[[0, 1, 3]])
+    alone, _ = single.reset(seed=7)
+    same(alone, start[2], atol=1e-6)
+    vector.reset(seed=5)
+    same([vector.step(AHEAD)[0] for _ in range(2)], later)
+    unseeded, _ = vector.reset()
+    assert not np.array_equal(unseeded, start)
+
+
+def test_a_mask_restarts_some_worlds(vector):
+    start, _ = vector.reset(seed=5)
+    moved, *_ = vector.step(AHEAD)
+    where = np.array([True, False, False, True])
+    options = {"reset_mask": where}
+    obs, infos = vector.reset(seed=5, options=options)
+    same(obs[where], start[where])
+    same(obs[~where], moved[~where])
+    same(infos["_time"], where)
+    same(infos["time"], np.where(where, 0.0, 1.0))
+    assert options["reset_mask"] is where
+    same(vector.step(AHEAD)[4]["time"], np.where(where, 1.0, 2.0))
+
+
+def test_a_mask_restarts_ended_worlds_without_autoreset(vector):
+    envs = make_vector(autoreset_mode="Disabled")
+    for name in ("_start", "_act", "_select"):  # whose programs are compiled
+        setattr(envs.unwrapped, name, getattr(vector.unwrapped, name))
+    _, _, ended, *_ = step_until_success(envs)
+    with pytest.raises(InputError, match=rf"worlds \[{np.flatnonzero(ended)[0]}.* have ended"):
+        envs.step(AHEAD)
+    _, infos = envs.reset(options={"reset_mask": ended})
+    assert (infos["time"][ended] == 0).all()
+    assert not envs.step(AHEAD)[2][ended].any()
+
+
+@pytest.mark.parametrize(
+    ("reset", "message"),
+    [
+        ({"options": {"reset_mask": [True]}}, "reset_mask = .* shape \\(4,\\)"),
+        ({"options": {"reset_mask": np.zeros(COUNT, bool)}}, "with a true value"),
+        ({"options": {"reset_mask": np.ones(COUNT)}}, "type bool"),
+        ({"options": {"mask": 1}}, "unknown option of reset 'mask': choose from reset_mask"),
+        ({"seed": [1, 2]}, r"seed = \[1, 2\] is not allowed: .* a list of 4"),
+        ({"seed": -1}, "seed = -1"),
+        ({"seed": 1.5}, "seed = 1.5"),
+        ({"seed": "abc"}, "seed = abc"),
+        ({"seed": [1, 2, 3, "x"]}, "seed = x"),
+    ],
+)
+def test_invalid_resets_are_refused(vector, reset, message):
+    vector.reset(seed=0)
+    with pytest.raises(InputError, match=message):
+        vector.reset(**reset)
 
 
 def test_without_gymnasium_the_error_names_the_package(monkeypatch):

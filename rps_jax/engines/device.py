@@ -75,7 +75,6 @@ def standard_jax() -> Iterator[None]:
     """
     import jax
 
-    check_process()
     with contextlib.ExitStack() as stack:
         for context, value in (
             (jax.numpy_dtype_promotion, "standard"), (jax.numpy_rank_promotion, "allow"),

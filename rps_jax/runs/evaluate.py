@@ -15,8 +15,8 @@ from rps_jax import errors
 from rps_jax.control import registry
 from rps_jax.control.base import LawParams
 from rps_jax.control.registry import LawLike
-from rps_jax.errors import InputError
 from rps_jax.engines import device
+from rps_jax.errors import InputError
 from rps_jax.record import cache
 from rps_jax.record import options as options_
 from rps_jax.robot.robot import RobotLike
@@ -88,6 +88,7 @@ def evaluate(
       (4,)
     """
     options_.check_arguments(evaluate, locals())
+    device.check_process()
     ranges, params = parse_domain(domain, robot), candidates(law)
     at = None if points is None else points_.check_points(ranges, points)
     count = worlds if at is None else len(at.u)

@@ -148,6 +148,7 @@ class Command(Generic[T]):
           InputError: an option is not allowed.
         """
         options.check_fields(self)
+        device.check_process()
         with device.standard_jax():
             command = self.with_quick_values()
             command.validate()

@@ -133,6 +133,7 @@ class PushEnv:
     @device.standard_jax()
     def reset(self, rng: jax.Array) -> State:
         """Return a random world at its start, from a key."""
+        device.check_process()
         try:
             key_world, key = jax.random.split(rng)
         except (TypeError, ValueError) as error:
@@ -240,7 +241,7 @@ class PushEnv:
     @property
     def observation_size(self) -> int:
         """Length of an observation."""
-        return jax.eval_shape(self.reset, jax.random.key(0)).obs.shape[-1]
+        return self._alone.robot.shell.count + 2
 
     @property
     def action_size(self) -> int:
@@ -369,7 +370,7 @@ def world_driver(stage: Stage, setting: Setting) -> Callable[..., Driven]:
     @without_derivatives.defjvp
     def _(primals: Any, tangents: Any) -> Any:
         rule = (
-            "PushEnv has no derivatives with it: choose quasistatic, or stop the gradients of states "
+            "PushEnv has no derivatives with it: choose quasistatic, or stop gradients of states "
             "and actions by jax.lax.stop_gradient, as learning without a model does"
         )
         raise errors.not_allowed("engine", engine.name, rule)

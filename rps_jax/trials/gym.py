@@ -8,9 +8,14 @@
 
 Both step a `PushEnv` and accept its options by name: object, setting, robot, params, weights and
 worlds. `gymnasium.make("rps_jax.trials.gym:rps_jax/Push-v0")` needs no second import.
+
+The second steps all worlds in one program, which is much faster than one process for each. Such
+processes must be spawned, since JAX hangs in a forked one: `gymnasium.make_vec("rps_jax/Push-v0",
+4, "async", vector_kwargs={"context": "spawn"})`.
 """
 
-from collections.abc import Mapping
+import dataclasses
+from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import Any, Literal
 
@@ -20,6 +25,7 @@ import numpy as np
 
 from rps_jax import errors
 from rps_jax.control import soft
+from rps_jax.engines import device
 from rps_jax.trials.batch import rows
 from rps_jax.trials.env import SHAPED_REWARD, PushEnv, State
 from rps_jax.world import domain as domains
@@ -33,7 +39,7 @@ try:
 except ImportError as error:
     raise errors.not_installed("gymnasium", "gym") from error
 
-_SEEDS = 2**31
+_SEEDS = 2**32
 
 
 def _hold_action(
@@ -48,6 +54,12 @@ def _hold_action(
     return jax.lax.scan(step, (state, jnp.zeros_like(state.reward)), length=steps)[0]
 
 
+def _restart(env: PushEnv, key: jax.Array) -> tuple[jax.Array, State]:
+    """Return the random stream after a restart, and the state at the start of its world."""
+    key, world_key = jax.random.split(key)
+    return key, env.reset(world_key)
+
+
 class GymPush(gymnasium.Env[np.ndarray, np.ndarray]):
     """Push an unknown object to a target by touch: `gymnasium.make("rps_jax/Push-v0")`.
 
@@ -56,7 +68,8 @@ class GymPush(gymnasium.Env[np.ndarray, np.ndarray]):
     [m] in the robot frame (x ahead, y to the left), by odometry.
 
     Action, Box (3,) float32 within -1 and 1: the twist (v_x, v_y, omega) in the robot's frame, in
-    units of v_max [m/s], v_max and omega_max [rad/s] of `params`. It is held for `hold` [s].
+    units of v_max [m/s], v_max and omega_max [rad/s] of `params`. It is held for `hold` [s]. A
+    greater one is reduced: (v_x, v_y) to a norm of 1, omega to +-1.
 
     Reward [1]: `weights`, a `Reward` of `rps_jax.trials.env`; by default that of `rps learn`.
 
@@ -67,7 +80,8 @@ class GymPush(gymnasium.Env[np.ndarray, np.ndarray]):
 
     Raises:
       InputError: an option that `PushEnv` does not allow, a `hold` shorter than a control period,
-        or an action that is not finite or of another shape.
+        an action that is not finite or of another shape, or a step before `reset` or after the end
+        of an episode.
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 5}  # noqa: RUF012
@@ -81,7 +95,9 @@ class GymPush(gymnasium.Env[np.ndarray, np.ndarray]):
         **options: Any,
     ):
         """Draw the worlds; nothing is compiled before the first reset."""
-        self._vector = GymPushVector(domain=domain, hold=hold, **options)
+        self._vector = GymPushVector(
+            1, render_mode, autoreset_mode="Disabled", domain=domain, hold=hold, **options
+        )
         self.render_mode, self.push_env = render_mode, self._vector.push_env
         self.observation_space = self._vector.single_observation_space
         self.action_space = self._vector.single_action_space
@@ -90,22 +106,28 @@ class GymPush(gymnasium.Env[np.ndarray, np.ndarray]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, dict[str, Any]]:
-        """Start in a random world, which depends on the seed; `options` are ignored."""
+        """Start in a random world, which depends on the seed; there are no `options`."""
+        if options:
+            raise errors.not_allowed("options", options, "this environment has none")
         super().reset(seed=seed)
-        self._vector.start(self.np_random)
-        obs, _, _, info = self._vector.observe()
-        return obs[0], {name: values[0].item() for name, values in info.items()}
+        obs, info = self._vector.reset(seed=seed)
+        return obs[0], self._info(info)
 
     def step(self, action: Any) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         """Execute an action (3,)."""
-        rewards = self._vector.act(np.asarray(action)[None])
-        obs, terminated, truncated, infos = self._vector.observe()
-        info = {name: values[0].item() for name, values in infos.items()}
-        return obs[0], float(rewards[0]), bool(terminated[0]), bool(truncated[0]), info
+        *results, infos = self._vector.step([action])
+        obs, reward, terminated, truncated = (values[0] for values in results)
+        return obs, float(reward), bool(terminated), bool(truncated), self._info(infos)
+
+    @staticmethod
+    def _info(infos: Mapping[str, Any]) -> dict[str, Any]:
+        """Return the infos of the only world, without masks."""
+        return {name: x[0].item() for name, x in infos.items() if not name.startswith("_")}
 
     def render(self) -> Any:
         """Return an image (240, 320, 3) uint8 in the mode rgb_array, else None."""
-        return self._vector.images()[0] if self.render_mode == "rgb_array" else None
+        images = self._vector.render()
+        return images and images[0]
 
 
 class GymPushVector(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
@@ -115,9 +137,14 @@ class GymPushVector(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
     ended restarts in another world, as `autoreset_mode` says. `NextStep`, the default, restarts it
     in the step after its last; that step ignores the action, and its reward is 0. `SameStep`
     restarts it at once and returns its last observation and info as `final_obs` and `final_info`.
+    `Disabled` leaves that to `reset`.
+
+    A world depends on its own seed alone: of `reset(seed=5)` world i has the seed 5 + i, and a list
+    has one seed or None for each. `reset(options={"reset_mask": mask})` restarts the worlds of a
+    mask (num_envs,) bool; the others go on, and their infos are masked.
 
     Raises:
-      InputError: as `GymPush`, or another mode.
+      InputError: as `GymPush`, or another mode, seed or mask.
     """
 
     metadata = {"autoreset_mode": AutoresetMode.NEXT_STEP, "render_modes": ["rgb_array"]}  # noqa: RUF012
@@ -127,17 +154,21 @@ class GymPushVector(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         num_envs: int = 1,
         render_mode: str | None = None,
         *,
-        autoreset_mode: AutoresetMode | Literal["NextStep", "SameStep"] = "NextStep",
+        autoreset_mode: AutoresetMode | Literal["NextStep", "SameStep", "Disabled"] = "NextStep",
         domain: DomainLike = "wide",
         hold: float = 0.2,
         **options: Any,
     ):
         """Draw the worlds; nothing is compiled before the first reset."""
         self.num_envs = errors.check_count("num_envs", num_envs, at_most=1_000_000)
-        modes = (AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP)
         mode = str(getattr(autoreset_mode, "value", autoreset_mode))
-        errors.check_name("autoreset_mode", mode, [allowed.value for allowed in modes])
+        errors.check_name("autoreset_mode", mode, [allowed.value for allowed in AutoresetMode])
+        for name in options:
+            known = (field.name for field in dataclasses.fields(PushEnv))
+            errors.check_name("option", name, ("hold", *known))
         options = {"weights": SHAPED_REWARD} | options
+        if render_mode is not None:
+            errors.check_name("render_mode", render_mode, self.metadata["render_modes"])
         self.render_mode = render_mode
         self.push_env = PushEnv(domain=domains.parse_domain(domain), **options)
         dt = self.push_env.dt
@@ -151,35 +182,47 @@ class GymPushVector(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
         self._ended = np.zeros(num_envs, bool)
+        self._keys: jax.Array | None = None  # (num_envs,) random streams of the worlds
         self._state: State | None = None
-        self._start = jax.jit(jax.vmap(self.push_env.reset))
+        self._start = jax.jit(jax.vmap(partial(_restart, self.push_env)))
         self._act = jax.jit(jax.vmap(partial(_hold_action, self.push_env, steps)))
         self._select = jax.jit(jax.vmap(soft.tree_where))
 
-    def start(self, random: np.random.Generator, where: np.ndarray | None = None) -> None:
+    def start(self, where: np.ndarray | None = None) -> None:
         """Start random worlds, all of them or those of a mask (num_envs,)."""
-        keys = jax.random.split(jax.random.key(int(random.integers(_SEEDS))), self.num_envs)
-        started = self._start(keys)
-        self._state = started if where is None else self._select(where, started, self._state)
+        started = self._start(self._keys)
+        if where is not None:
+            started = self._select(where, started, (self._keys, self._state))
+        self._keys, self._state = started
+
+    @property
+    def state(self) -> State:
+        """States of all worlds; InputError before the first `reset`."""
+        if self._state is None:
+            raise errors.InputError("no episode has started: call reset before step and render.")
+        return self._state
 
     def act(self, actions: Any) -> np.ndarray:
         """Execute actions (num_envs, 3) in running trials; return the rewards (num_envs,)."""
-        actions = np.asarray(actions, np.float32)
         shape = (self.num_envs, self.push_env.action_size)
-        if actions.shape != shape or not np.isfinite(actions).all():
-            value = actions.tolist() if actions.shape == shape else f"of shape {actions.shape}"
-            raise errors.not_allowed("action", value, f"it must be finite, of shape {shape}")
-        self._state, rewards = self._act(self._state, actions)
+        rule = f"it must be finite, of shape {shape}"
+        try:
+            array = np.asarray(actions, np.float32)
+        except (TypeError, ValueError) as error:
+            raise errors.not_allowed("action", repr(actions), rule) from error
+        if array.shape != shape or not np.isfinite(array).all():
+            value = array.tolist() if array.shape == shape else f"of shape {array.shape}"
+            raise errors.not_allowed("action", value, rule)
+        self._state, rewards = self._act(self.state, array)
         return np.asarray(rewards, float)
 
     def observe(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, dict[str, np.ndarray]]:
         """Return observations (num_envs, T + 2), terminated and truncated flags, and infos."""
-        assert self._state is not None, "call reset first"
-        data, metrics = self._state.data, self._state.metrics
+        data, metrics = self.state.data, self.state.metrics
         ended = np.array(data.success | data.tipped | data.diverged)
         infos = {
             "is_success": data.success, "time": data.steps * self.push_env.dt,
-            "in_contact": metrics["in_contact"] > 0, "world": self._state.info["index"],
+            "in_contact": metrics["in_contact"] > 0, "world": self.state.info["index"],
         }  # fmt: skip
         infos = {name: np.array(values) for name, values in infos.items()}
         done = np.array(data.done)
@@ -187,27 +230,74 @@ class GymPushVector(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
 
     def images(self) -> list[np.ndarray]:
         """Return an image (240, 320, 3) uint8 of each world."""
-        assert self._state is not None, "reset comes first"
-        return self.push_env.render([rows(self._state, i) for i in range(self.num_envs)])
+        return self.push_env.render([rows(self.state, i) for i in range(self.num_envs)])
 
+    @device.standard_jax()
     def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+        self,
+        *,
+        seed: int | Sequence[int | None] | None = None,
+        options: dict[str, Any] | None = None,
     ) -> tuple[np.ndarray, dict[str, Any]]:
-        """Start in random worlds, which depend on the seed; `options` are ignored."""
-        super().reset(seed=seed)
-        self.start(self.np_random)
-        self._ended[:] = False
+        """Start in random worlds, which depend on their seeds: all, or those of a `reset_mask`."""
+        device.check_process()  # not at construction, where workers cannot report an error
+        for name in options or {}:
+            errors.check_name("option of reset", name, ["reset_mask"])
+        where = self._checked_mask((options or {}).get("reset_mask"))
+        if isinstance(seed, int | np.integer):
+            errors.check_count("seed", seed, at_least=0, at_most=2**63)
+            super().reset(seed=int(seed))
+            seed = [int(seed) + i for i in range(self.num_envs)]
+        self._seed(seed, where)
+        self.start(None if where.all() else where)
+        self._ended &= ~where
         obs, _, _, infos = self.observe()
-        return obs, self._with_masks(infos, ~self._ended)
+        return obs, self._with_masks(infos, where)
 
+    def _checked_mask(self, mask: Any) -> np.ndarray:
+        """Return the mask (num_envs,) of the worlds to reset, by default of all."""
+        if mask is None:
+            return np.ones(self.num_envs, bool)
+        where = np.asarray(mask)
+        if where.shape != (self.num_envs,) or where.dtype != bool or not where.any():
+            rule = (
+                f"it must be an array of shape ({self.num_envs},) and type bool with a true value"
+            )
+            raise errors.not_allowed("reset_mask", mask, rule)
+        if self._state is None and not where.all():
+            raise errors.not_allowed("reset_mask", mask, "the first reset must be of all worlds")
+        return where
+
+    def _seed(self, seeds: Any, where: np.ndarray) -> None:
+        """Set the random streams of worlds in a mask; those without a seed go on with their own."""
+        seeds = [None] * self.num_envs if seeds is None else seeds
+        if np.shape(seeds) != (self.num_envs,):
+            rule = f"give a whole number, or a list of {self.num_envs}"
+            raise errors.not_allowed("seed", seeds, rule)
+        known = np.array([seed is not None for seed in seeds])
+        for seed in np.asarray(seeds, object)[known]:
+            errors.check_count("seed", seed, at_least=0, at_most=2**64)
+        drawn = self.np_random.integers(_SEEDS, size=self.num_envs)
+        values = [drawn[i] if s is None else int(s) % _SEEDS for i, s in enumerate(seeds)]
+        keys = jax.vmap(jax.random.key)(np.uint32(values))
+        self._keys = keys if self._keys is None else jnp.where(known & where, keys, self._keys)
+
+    @device.standard_jax()
     def step(
         self, actions: Any
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
         """Execute actions (num_envs, 3)."""
-        same = self.metadata["autoreset_mode"] is AutoresetMode.SAME_STEP
+        device.check_process()
+        mode = self.metadata["autoreset_mode"]
+        same = mode is AutoresetMode.SAME_STEP
+        if mode is AutoresetMode.DISABLED and self._ended.any():
+            raise errors.InputError(
+                f"the episodes of worlds {np.flatnonzero(self._ended).tolist()} have ended: call "
+                "reset before step, in a vector with options={'reset_mask': ended}."
+            )
         rewards = self.act(actions)  # 0 for trials that had ended
         if not same and self._ended.any():
-            self.start(self.np_random, self._ended)
+            self.start(self._ended)
         obs, terminated, truncated, infos = self.observe()
         self._ended, final = terminated | truncated, {}
         if same and self._ended.any():
@@ -215,7 +305,7 @@ class GymPushVector(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             for i in np.flatnonzero(self._ended):
                 last[i] = obs[i]
             final = {"final_obs": last, "final_info": self._with_masks(infos, self._ended)}
-            self.start(self.np_random, self._ended)
+            self.start(self._ended)
             obs, _, _, infos = self.observe()
         infos = self._with_masks(infos, np.ones(self.num_envs, bool))
         return obs, rewards, terminated, truncated, infos | self._with_masks(final, self._ended)
