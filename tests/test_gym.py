@@ -194,7 +194,7 @@ def test_a_step_needs_a_running_episode(single):
     single.unwrapped._vector._ended[:] = True
     with pytest.raises(InputError, match=r"worlds \[0\] have ended: call reset before step"):
         single.step(AHEAD[0])
-    with pytest.raises(InputError, match="options = {'world': 3} is not allowed"):
+    with pytest.raises(InputError, match=r"options = \{'world': 3\} is not allowed"):
         single.reset(options={"world": 3})
     single.reset()
     single.step(AHEAD[0])

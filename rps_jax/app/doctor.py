@@ -1,7 +1,9 @@
 """The doctor: a report of what works on this machine, with a fix for the rest."""
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Self
 
 from rps_jax.engines import device, native
 from rps_jax.errors import InputError
@@ -19,18 +21,24 @@ class Doctor(Action[None]):
     """Print versions, devices and folders, and a fix for each check that fails."""
 
     out: Path | str | None = option(None, kw_only=True, hidden=True)
+    faults: Sequence[str] = option((), kw_only=True, hidden=True)
+    """Faults of the environment."""
+
+    def with_faults(self, faults: Sequence[str]) -> Self:
+        return replace(self, faults=faults)
 
     def execute(self, callback: ProgressCallback) -> None:
         """Print the report."""
-        print(report(cache.default_folder()))
+        print(report(cache.default_folder(), self.faults))
 
 
 doctor = call_of(Doctor)
 
 
-def report(cache: Path) -> str:
+def report(cache: Path, faults: Sequence[str] = ()) -> str:
     """Return versions, devices, folders and the checks of rendering, one line each."""
-    fixes = {"cache": _check_cache(cache), **video.check()}
+    fixes = {f"variable {i}": fault for i, fault in enumerate(faults, 1)}
+    fixes |= {"cache": _check_cache(cache), **video.check()}
     environment = device.collect_environment()
     hardware = environment["device"]
     rows = {

@@ -10,6 +10,7 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from importlib import metadata
+from pathlib import Path
 from typing import Any, Literal
 
 from rps_jax.errors import InputError
@@ -30,6 +31,10 @@ def configure_xla() -> None:
     release = tuple(map(int, metadata.version("jax").split(".")[:2]))
     if release >= (0, 12) and platform.machine().lower() in ("x86_64", "amd64"):
         flags["--xla_cpu_max_isa"] = "AVX"
+    given = os.environ.get("XLA_FLAGS", "").strip()
+    if given and not given.startswith("-"):  # the name of a file of flags
+        with contextlib.suppress(OSError):
+            os.environ["XLA_FLAGS"] = " ".join(Path(given).read_text().split())
     for flag, value in flags.items():
         if flag not in (flags_before := os.environ.get("XLA_FLAGS", "")):
             os.environ["XLA_FLAGS"] = f"{flags_before} {flag}={value}".strip()
@@ -99,7 +104,9 @@ def choose(name: Device) -> None:
         try:
             jax.devices()
         except (RuntimeError, AssertionError) as error:  # JAX raises either
-            message = f"JAX_PLATFORMS = {platforms} is not available: name another, or none."
+            variable = "JAX_PLATFORMS" if platforms else "JAX_PLATFORM_NAME"
+            name = platforms or os.environ.get(variable)
+            message = f"{variable} = {name} is not available: name another, or none."
             raise InputError(message) from error
         return
     jax.config.update("jax_platforms", "cuda" if name == "gpu" else "cpu")

@@ -131,6 +131,12 @@ class Command(Generic[T]):
         """Return a line that the shell prints before the run, or nothing."""
         return ""
 
+    def with_faults(self, faults: Sequence[str]) -> Self:
+        """Return the command unless the environment has faults, which are sentences."""
+        if faults:
+            raise errors.InputError(faults[0])
+        return self
+
     def num_trials(self) -> int | None:
         """Return the number of trials, if it is known."""
         return None

@@ -5,6 +5,7 @@ use the upright solid over the footprint, in all engines.
 """
 
 import math
+import os
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -78,7 +79,11 @@ def parse_object(text: str) -> str:
 def read(path: Path) -> mujoco.MjSpec:
     """Read an MJCF file in any folder; `base.xml` is that of `mjcf_folder`."""
     base = (mjcf_folder() / "base.xml").read_bytes()
-    return mujoco.MjSpec.from_file(str(path), include={"base.xml": base})
+    try:
+        name = os.fsencode(path).decode()  # MuJoCo encodes it in UTF-8, whatever the locale
+    except UnicodeDecodeError as error:
+        raise errors.not_allowed("object", path, "MuJoCo needs a name in UTF-8") from error
+    return mujoco.MjSpec.from_file(name, include={"base.xml": base})
 
 
 def register_object(

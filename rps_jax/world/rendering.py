@@ -23,6 +23,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from rps_jax import errors
+from rps_jax.world import opengl
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
@@ -244,11 +245,11 @@ def choose_gl() -> None:
 
 
 def _import_mujoco() -> Any:
-    choose_gl()
     try:
+        choose_gl()
         import mujoco
     except Exception as error:  # of any kind, by a missing GL library
-        raise VideoError(_FIX_GL) from error
+        raise VideoError(opengl.FAULT or _FIX_GL) from error
     return mujoco
 
 
@@ -266,7 +267,7 @@ def _renderer(model: Any, size: tuple[int, int]) -> Iterator[Any]:
                 warnings.simplefilter("ignore")
                 renderer = mujoco.Renderer(model, height=height, width=width)
         except Exception as error:  # of any kind, by OpenGL
-            raise VideoError(_FIX_GL) from error
+            raise VideoError(opengl.FAULT or _FIX_GL) from error
         finally:
             buffer.offwidth, buffer.offheight, quality.offsamples = limits
     with contextlib.closing(renderer):

@@ -9,7 +9,7 @@ import sys
 from collections.abc import Sequence
 from typing import NoReturn
 
-from rps_jax.app.cli import names, running
+from rps_jax.app.cli import environment, names, running
 
 
 def run() -> NoReturn:
@@ -17,6 +17,7 @@ def run() -> NoReturn:
 
     Threads of XLA may still be compiling then, and can crash while Python is taken down.
     """
+    environment.start_process()
     code = main()
     if code == 130:
         sys.stdout.flush()
@@ -39,9 +40,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _run(words: list[str]) -> None:
     """Find the question of a command, parse its options, and execute it."""
+    name, rest = names.split(words)
+    faults = environment.unset_bad_variables()
     from rps_jax.app.cli import flags
     from rps_jax.engines import device
 
-    name, rest = names.split(words)
     device.configure_xla()
-    running.execute(*flags.parse(names.question_type(name), name, rest))
+    with device.standard_jax():
+        running.execute(*flags.parse(names.question_type(name), name, rest), faults)

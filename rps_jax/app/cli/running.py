@@ -16,7 +16,7 @@ import warnings
 from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TextIO
 
 from rps_jax.errors import InputError
 
@@ -43,7 +43,7 @@ def exit_code(command: Callable[[], object]) -> int:
             command()
         sys.stdout.flush()
     except BrokenPipeError:  # nobody reads the output
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        _discard(sys.stdout)
     except InputError as error:
         return _print_error(error)
     except OSError as error:
@@ -67,8 +67,16 @@ def exit_code(command: Callable[[], object]) -> int:
 
 def _print_error(sentence: object) -> int:
     """Print one sentence on the error stream; return the exit code for bad input."""
-    print(f"rps: error: {InputError(sentence)}", file=sys.stderr)
+    try:
+        print(f"rps: error: {InputError(sentence)}", file=sys.stderr, flush=True)
+    except OSError:  # nobody reads it
+        _discard(sys.stderr)
     return 2
+
+
+def _discard(stream: TextIO) -> None:
+    """Send what is left of a stream, and all that follows, to the null device."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
 
 
 @contextlib.contextmanager
@@ -113,8 +121,11 @@ def _raise_interrupts() -> None:
         raise KeyboardInterrupt
 
 
-def execute(command: Command[object], session: Session) -> None:
-    """Check a command and execute it; write and print the report of a question."""
+def execute(command: Command[object], session: Session, faults: list[str]) -> None:
+    """Check a command and execute it; write and print the report of a question.
+
+    The command refuses `faults` of the environment, or reports them.
+    """
     import jax
     from tqdm import tqdm
 
@@ -122,11 +133,19 @@ def execute(command: Command[object], session: Session) -> None:
     from rps_jax.record import cache, folder
     from rps_jax.runs.push import Trace
     from rps_jax.runs.question import Question, timing_line
+    from rps_jax.world import opengl
 
     if command.out is None:
         command = dataclasses.replace(command, out=command.default_folder)
+    if opengl.FAULT:
+        faults.append(opengl.FAULT)
     is_small = session.device == "auto" and command.suits_processors()
-    device.choose("cpu" if is_small or getattr(command, "ray", None) else session.device)
+    try:
+        device.choose("cpu" if is_small or getattr(command, "ray", None) else session.device)
+    except InputError as error:
+        faults.append(str(error))
+        jax.config.update("jax_platforms", "cpu")
+    command = command.with_faults(faults)
     command.validate()
     _raise_interrupts()
     if note := command.note():

@@ -1,0 +1,69 @@
+"""The environment of a command: streams, variables that would abort it, and the terminal."""
+
+import importlib
+import os
+import re
+import shutil
+import subprocess
+import sys
+
+from rps_jax.errors import InputError, not_allowed
+
+_MIN_COLUMNS = 40  # of a terminal: tyro never ends the help of a narrower one
+_START_XLA = "import jaxlib.xla_client as client; client.make_cpu_client()"
+_FATAL = re.compile(r"^F\d{4} .*?\] (.*)$", re.MULTILINE)  # line of XLA before it aborts
+
+
+def start_process() -> None:
+    """Open the null device for closed standard streams, and set what output depends on.
+
+    The first file that is opened would otherwise get the number of a closed stream. Where the
+    locale is ASCII, Python starts again in UTF-8, in which file names are.
+    """
+    if sys.getfilesystemencoding() == "ascii":
+        os.execv(sys.executable, [sys.executable, "-X", "utf8", *sys.orig_argv[1:]])
+    os.environ["MPLBACKEND"] = "agg"  # figures are only written to files
+    if shutil.get_terminal_size().columns < _MIN_COLUMNS:
+        os.environ["COLUMNS"] = str(_MIN_COLUMNS)
+    for number, name in enumerate(("stdin", "stdout", "stderr")):
+        if getattr(sys, name) is None:
+            null = os.open(os.devnull, os.O_RDWR)
+            if null > number:
+                os.dup2(null, number)
+            setattr(sys, name, os.fdopen(number, "w" if number else "r", closefd=False))
+
+
+def unset_bad_variables() -> list[str]:
+    """Unset variables that would abort the process; return a sentence for each.
+
+    Raises:
+      InputError: JAX or tqdm refuses its variables.
+    """
+    faults = [fault] if (fault := _unset_bad_flags()) else []
+    for module in ("jax", "tqdm"):
+        try:
+            importlib.import_module(module)
+        except ValueError as error:
+            raise InputError(
+                f"{module} cannot be imported ({error}): correct or unset the environment variable "
+                f"{module.upper()}_... that this names."
+            ) from error
+    return faults
+
+
+def _unset_bad_flags() -> str:
+    """Unset XLA_FLAGS if XLA would abort this process because of it, and return why."""
+    from rps_jax.engines import device
+
+    flags = os.environ.get("XLA_FLAGS", "")
+    if not flags or device.has_started():
+        return ""
+    command = [sys.executable, "-c", _START_XLA]
+    started = subprocess.run(command, capture_output=True, text=True, errors="replace")
+    if not started.returncode:
+        return ""
+    del os.environ["XLA_FLAGS"]
+    reason = _FATAL.search(started.stderr)
+    is_unknown = reason and "Check failed" not in reason[1]
+    rule = reason[1].partition(". (")[0] if is_unknown else "XLA cannot read the value of a flag"
+    return str(not_allowed("XLA_FLAGS", flags, f"{rule}; correct or unset it"))
