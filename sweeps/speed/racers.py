@@ -9,6 +9,7 @@ runs one trial in C MuJoCo and prints the final pose of the object.
 
 from __future__ import annotations
 
+import argparse
 import functools
 import importlib.metadata
 import json
@@ -359,7 +360,10 @@ def race(
 
 
 if __name__ == "__main__":
-    folder, seconds, index = sys.argv[1:]
-    task = Task(Path(folder) / "scene.xml", np.load(Path(folder) / "starts.npy"), float(seconds))
-    pose = in_c(_model(task), task.qpos[int(index) % len(task.qpos)], task.seconds)
+    parser = argparse.ArgumentParser(description=str(__doc__).partition("\n")[0])
+    for argument, kind in {"folder": Path, "seconds": float, "index": int}.items():
+        parser.add_argument(argument, type=kind)
+    words = parser.parse_args()
+    task = Task(words.folder / "scene.xml", np.load(words.folder / "starts.npy"), words.seconds)
+    pose = in_c(_model(task), task.qpos[words.index % len(task.qpos)], task.seconds)
     print(json.dumps(pose.tolist()))
