@@ -1,9 +1,27 @@
-"""Faults of all classes of `fuzz.py`: no command ends in a traceback or hangs."""
+"""Faults of input and environment: no command ends in a traceback, hangs, or prints two errors.
+
+pytest -m "slow or not slow" tests/test_faults.py    # all environments: a minute
+"""
+
+import dataclasses
+import inspect
+import os
+import re
+import runpy
+import subprocess
+import sys
 
 import fuzz
+import numpy as np
 import pytest
+from helpers import ROOT, one_sentence
 
+import rps_jax
 from rps_jax.analysis.report import Picture
+from rps_jax.app.cli import environment
+from rps_jax.engines import device
+from rps_jax.errors import InputError
+from rps_jax.record import options
 
 SHARE = {"values": 60, "laws": 1000, "edits": 6, "damages": 12}
 
@@ -26,3 +44,192 @@ def test_faults_are_reported_in_one_sentence(name, registries, undrawn):
     counts = run(SHARE[name], 1, bad.append)
     assert not bad, "\n\n".join(bad)
     assert counts["refused"] >= SHARE[name] // 10
+
+
+# --- types of arguments ----------------------------------------------------------------------
+
+COMMANDS = {
+    "push": {}, "table": {}, "sweep": {}, "replay": {"run": "/nowhere"}, "hardware": {},
+    "sensitivity": {}, "tune_es": {}, "learn": {}, "Setting": {}, "Domain": {}, "PushEnv": {},
+    "evaluate": {"law": "rps"}, "load": {}, "stack": {}, "use_cache": {},
+}  # fmt: skip
+WRONG = {
+    "a nested list": [[1, 2], 3],
+    "a matrix": np.zeros((2, 2)),
+    "an object": object(),
+    "a set": {0.5},
+    "a complex number": 1j,
+    "bytes": b"box",
+}
+
+
+@pytest.mark.parametrize("value", WRONG.values(), ids=WRONG)
+@pytest.mark.parametrize("name", COMMANDS)
+def test_values_of_a_wrong_type_are_refused_in_one_sentence(name, value):
+    call = getattr(rps_jax, name)
+    function = inspect.unwrap(call)
+    if dataclasses.is_dataclass(function):
+        names = [field.name for field in dataclasses.fields(function)]
+    else:
+        names = list(inspect.signature(function).parameters)
+    with fuzz.never_stepping():
+        for field in names:
+            with pytest.raises(InputError) as refused:
+                call(**COMMANDS[name] | {field: value})
+            assert str(refused.value).endswith(".")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"target": 2}, "target = 2 is not allowed: give 2 numbers"),
+        ({"target": (1, 2, 3)}, r"target = \(1, 2, 3\) is not allowed: give 2 numbers"),
+        ({"target": ("a", "b")}, r"target = \('a', 'b'\) is not allowed: give 2 numbers"),
+        ({"target": (float("nan"), 0)}, "target x = nan is not allowed"),
+        ({"object": 3}, "object = 3 is not allowed: give a text"),
+        ({"friction": 0.3}, "friction = 0.3 is not allowed: give a text or a Friction or 2 num"),
+        ({"skin": 3}, "skin = 3 is not allowed: give a text or a IdealSkin"),
+        ({"out": 3}, "out = 3 is not allowed: give a path or a text"),
+        ({"quick": 1}, "quick = 1 is not allowed: give True or False"),
+        ({"gap": True}, "gap = True is not allowed: it must be a number"),
+        ({"slots": True}, "slots = True is not allowed: it must be a whole number"),
+        ({"report_to": 3}, "report_to = 3 is not allowed: give a function"),
+    ],
+)
+def test_a_wrong_type_is_named_with_the_right_one(arguments, message):
+    with pytest.raises(InputError, match=message):
+        rps_jax.push(**arguments)
+
+
+def test_one_name_for_several_is_refused_with_an_example():
+    with pytest.raises(InputError, match=r"objects = 'box' .*: give several texts, as \['box'\]"):
+        rps_jax.table(objects="box")
+
+
+def test_sequences_may_be_tuples_lists_or_arrays():
+    @dataclasses.dataclass(frozen=True)
+    class Record:
+        pair: tuple[float, float] = (0, 0)
+        names: tuple[str, ...] = ()
+
+    for pair in ((1, 2), [1.0, 2], np.array([1, 2]), np.float32([1, 2])):
+        options.check_fields(Record(pair, ["a", np.str_("b")]))
+
+
+# --- the environment -------------------------------------------------------------------------
+
+# Commands of a shell, in which `push` is a short one without a film, and their exit codes and
+# output.
+SHELL = [
+    # Streams that nobody reads.
+    ("rps --help >&-", 0, ""),
+    ("rps --help | head -1 >&2", 0, "usage"),
+    ("rps psh >&- 2>&-", 2, ""),
+    ("rps psh 2>/dev/full", 2, ""),
+    ("rps psh 2>&1 | true", 2, ""),
+    # Variables.
+    ("MUJOCO_GL=vulkan push", 2, "MUJOCO_GL = vulkan is not allowed .* set it to egl"),
+    ("MUJOCO_GL=vulkan rps doctor >&2", 0, "FAILS: MUJOCO_GL = vulkan is not allowed"),
+    ("JAX_ENABLE_X64=maybe push", 2, "jax cannot be imported .*JAX_ENABLE_X64.*: correct or"),
+    ("XLA_FLAGS=--xla_nonsense=1 push", 2, "XLA_FLAGS = --xla_nonsense=1 .*Unknown flag"),
+    ("MPLBACKEND=Qt9Agg TERM=dumb COLUMNS=0 LC_ALL=C PYTHONUTF8=0 PYTHONIOENCODING=ascii "
+     "push --object Körper/Fuß.xml >&2", 0, "least distance"),
+]  # fmt: skip
+MORE = [
+    ("rps --version >&-", 0, ""),
+    ("rps sweep --help >&-", 0, ""),
+    ("rps sweep --help | head -1 >&2", 0, "usage"),
+    ("rps doctor >&-", 0, ""),
+    ("rps doctor 2>&-", 0, ""),
+    ("push >&-", 0, ""),
+    ("push 2>&-", 0, ""),
+    ("push >&- 2>&- <&-", 0, ""),
+    ("push | true", 0, ""),
+    ("push >/dev/full", 2, "No space left on device"),
+    *((f"MPLBACKEND={name} push", 0, "") for name in ("QtAgg", "GTK4Agg", "nonsense", "module://x")),
+    *((f"MUJOCO_GL={name} push", 2, f"MUJOCO_GL = {name} is not allowed") for name in ("x", "wgl")),
+    *((f"MUJOCO_GL={name} push", 0, "") for name in ("disable", "off", "EGL")),
+    ("PYOPENGL_PLATFORM=x film >&2", 0, "no film: MuJoCo cannot draw"),
+    ("IMAGEIO_FFMPEG_EXE=/nowhere film >&2", 0, "no film: ffmpeg was not found"),
+    ("XLA_FLAGS=nonsense push", 2, 'XLA_FLAGS = nonsense .*Could not open file "nonsense"'),
+    ("XLA_FLAGS=--xla_force_host_platform_device_count=abc push", 2, "cannot read the value of a"),
+    ("XLA_FLAGS=--xla_nonsense=1 rps doctor >&2", 0, "FAILS: XLA_FLAGS = --xla_nonsense"),
+    ("XLA_FLAGS=flags.txt push", 0, ""),
+    *((f"JAX_PLATFORMS={name} push", 2, f"JAX_PLATFORMS = {name} is not available")
+      for name in ("tpu", "cuda", "nonsense", "cpu,nonsense")),
+    ("JAX_PLATFORMS=nonsense rps doctor >&2", 0, "FAILS: JAX_PLATFORMS = nonsense"),
+    ("JAX_NUMPY_DTYPE_PROMOTION=maybe push", 2, "jax cannot be imported"),
+    ("TQDM_MININTERVAL=abc push", 2, "tqdm cannot be imported .*: correct or unset"),
+    *((f"JAX_{name} push", 0, "") for name in (
+        "NUMPY_DTYPE_PROMOTION=strict", "NUMPY_RANK_PROMOTION=raise", "TRANSFER_GUARD=disallow",
+        "DEBUG_NANS=1", "DEBUG_INFS=1", "DISABLE_JIT=1", "CHECK_TRACER_LEAKS=1", "ENABLE_X64=1",
+        "LEGACY_PRNG_KEY=error", "ENABLE_CUSTOM_PRNG=1", "NO_TRACING=1", "ENABLE_CHECKS=1",
+    )),
+    *((f"RPS_CACHE={name} push", 0, "") for name in ("/proc/x", "/etc/passwd", "''", "'~x/y'")),
+    *((f"HOME={name} RPS_CACHE= push", 0, "") for name in ("/nowhere", "/proc", "''")),
+    *((f"TMPDIR={name} film", 0, "") for name in ("/nowhere", "/proc", "/etc/passwd")),
+    *((f"COLUMNS={name} rps push --help >&2", 0, "--target") for name in ("0", "1", "-5", "abc")),
+    ("LC_ALL=C PYTHONUTF8=0 rps push --object Ö.xml", 2, "cannot be read"),
+    ("MPLCONFIGDIR=/proc/x push", 0, ""),
+    ("RPS_COMPILER=/nowhere/cc rps doctor", 0, ""),
+    ("PATH=/usr/bin:/bin RPS_COMPILER=/bin/false rps doctor", 0, ""),
+    ("mkdir gone; cd gone; rmdir ../gone; push", 2, "out = runs/push cannot be written"),
+]  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """A folder with an object of a name that is not ASCII, and a file of flags."""
+    folder = tmp_path_factory.mktemp("environment")
+    (folder / "Körper").mkdir()
+    (folder / "Körper" / "Fuß.xml").write_bytes((ROOT / "mjcf" / "cylinder.xml").read_bytes())
+    (folder / "flags.txt").write_text("--xla_cpu_enable_fast_math=false\n")
+    return folder
+
+
+SHORT = "push --object cylinder --target 1 0 --engine quasistatic --horizon 1 --overwrite"
+
+
+@pytest.mark.parametrize(
+    ("line", "code", "output"),
+    [*SHELL, *(pytest.param(*case, marks=pytest.mark.slow) for case in MORE)],
+)
+def test_a_command_survives_its_environment(folder, line, code, output):
+    line = re.sub(r"\bfilm\b(?=[^:]*$)", f"rps {SHORT} --film-length 0.2", line)
+    line = re.sub(r"(?<!rps )\bpush\b", f"rps {SHORT} --no-video", line)
+    line = line.replace("rps ", f"{sys.executable} -m rps_jax ")
+    env = os.environ | {"PYTHONPATH": str(ROOT), "JAX_PLATFORMS": "cpu"}
+    shell = ["bash", "-o", "pipefail", "-c", line]
+    done = subprocess.run(shell, cwd=folder, env=env, capture_output=True, timeout=120)
+    error = done.stderr.decode(errors="replace")
+    assert "Traceback" not in error
+    assert done.returncode == code, error
+    assert re.search(output, error), error
+    if code == 2 and error:
+        one_sentence(error)
+
+
+def test_flags_that_xla_refuses_are_unset_with_the_reason(monkeypatch):
+    monkeypatch.setattr(device, "has_started", lambda: False)
+    monkeypatch.setenv("XLA_FLAGS", "--xla_cpu_enable_fast_math=false")
+    assert environment.unset_bad_variables() == []
+    monkeypatch.setenv("XLA_FLAGS", "--xla_nonsense=1")
+    (fault,) = environment.unset_bad_variables()
+    assert "Unknown flag in XLA_FLAGS: --xla_nonsense=1; correct or unset it." in fault
+    assert "XLA_FLAGS" not in os.environ
+
+
+SCRIPTS = ("docs/push/make.py", "sweeps/speed/peers.py", "sweeps/speed/racers.py")
+SCRIPTS += ("notebooks/execute.py", "tests/command_line.py")
+
+
+@pytest.mark.parametrize("path", SCRIPTS)
+def test_a_script_explains_itself_and_writes_nothing(path, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    for words, code, output in ((["--help"], 0, "usage: "), (["--nonsense"], 2, "usage: ")):
+        monkeypatch.setattr(sys, "argv", [path, *words])
+        with pytest.raises(SystemExit) as end:
+            runpy.run_path(str(ROOT / path), run_name="__main__")
+        assert end.value.code == code
+        assert output in "".join(capsys.readouterr())
+    assert not list(tmp_path.iterdir())
