@@ -12,6 +12,7 @@ from helpers import FAST, NEAR, advance, refusals, row
 from rps_jax.control.base import Law
 from rps_jax.control.laws.rps import RPSParams
 from rps_jax.control.observation import Details
+from rps_jax.errors import InputError
 from rps_jax.robot.shell import Shell
 from rps_jax.trials import env, trial
 from rps_jax.trials.env import PushEnv, Reward
@@ -231,6 +232,83 @@ def test_states_are_drawn_each_in_its_own_world(pushing):
     np.testing.assert_allclose(again.astype(int), images[1].astype(int), atol=2)
 
 
+QUASISTATIC = Setting("quasistatic", FAST, rules=Rules(horizon=20.0))
+
+
+@pytest.mark.parametrize("engine", ["quasistatic", "fused", "mjx"])
+def test_step_has_derivatives_with_the_quasistatic_engine_alone(engine):
+    push = PushEnv("random_cylinder", NEAR, setting=replace(QUASISTATIC, engine=engine), worlds=2)
+    state = jax.eval_shape(push.reset, jax.random.key(0))
+    reward = lambda action, state: push.step(state, action).reward  # noqa: E731
+    pair, batch = (AHEAD, state), (jnp.stack([AHEAD, BACK]), state)
+    batched = jax.vmap(reward, (0, None))
+    for function, arguments in (
+        (jax.grad(reward), pair),
+        (jax.jacfwd(reward), pair),
+        (jax.grad(lambda state, action: reward(action, state), allow_int=True), pair[::-1]),
+        (jax.vmap(jax.grad(reward), (0, None)), batch),
+        (jax.grad(lambda *batch: batched(*batch).sum()), batch),
+        (lambda action, state: jax.jvp(lambda x: reward(x, state), (action,), (action,)), pair),
+    ):
+        if engine == "quasistatic":
+            jax.eval_shape(function, *arguments)
+        else:
+            with pytest.raises(InputError, match=f"engine = {engine} .* no derivatives with it"):
+                jax.eval_shape(function, *arguments)
+    stopped = jax.grad(lambda action, state: reward(jax.lax.stop_gradient(action), state))
+    jax.eval_shape(stopped, *pair)
+
+
+@pytest.mark.slow
+def test_derivatives_of_a_push_are_those_of_finite_differences():
+    push = PushEnv("random_cylinder", NEAR, setting=QUASISTATIC, worlds=2)
+
+    def advance(state, action, steps):
+        """Return the state after some steps, and the sum of their rewards."""
+
+        def step(state, _):
+            state = push.step(state, action)
+            return state, state.reward
+
+        state, rewards = jax.lax.scan(step, state, length=steps)
+        return state, rewards.sum()
+
+    start = jax.jit(push.reset)(jax.random.key(1))
+    touching = jax.jit(partial(advance, steps=100))(start, AHEAD)[0]
+    assert touching.metrics["in_contact"] == 1
+    total = jax.jit(lambda action: advance(touching, action, 20)[1])
+    action, h = jnp.array([0.7, 0.1, 0.1]), 0.03
+    slopes = [(total(action + h * e) - total(action - h * e)) / (2 * h) for e in np.eye(3)]
+    np.testing.assert_allclose(jax.grad(total)(action), slopes, rtol=0.01)
+
+
+@pytest.mark.parametrize(
+    ("action", "message"),
+    [
+        (jnp.ones(2), r"action = float32\[2\] is not allowed: it must be 3 numbers"),
+        (jnp.ones((5, 3)), r"action = float32\[5, 3\] .* by jax.vmap"),
+        (jnp.ones(3, complex), r"action = complex64\[3\]"),
+        (1.0, r"action = float32\[\]"),
+        ("left", "action = 'left'"),
+        (None, "action = None"),
+    ],
+)
+def test_actions_of_another_shape_or_type_are_refused(pushing, action, message):
+    with pytest.raises(InputError, match=message):
+        jax.eval_shape(lambda state: pushing.env.step(state, action), row(pushing.start, 0))
+
+
+def test_a_step_needs_a_state_and_a_reset_one_key(pushing):
+    for state in (None, AHEAD, (1, 2)):
+        with pytest.raises(InputError, match=r"state = .*: give the State that reset returned"):
+            pushing.env.step(state, AHEAD)
+    for key in (None, "key", jax.random.split(jax.random.key(0)), np.zeros(3)):
+        with pytest.raises(InputError, match=r"rng = .*: give one key, as jax.random.key"):
+            pushing.env.reset(key)
+    with pytest.raises(InputError, match=r"trajectory = None .*: give one State or a list"):
+        pushing.env.render(None)
+
+
 test_invalid_environments_are_refused = refusals(
     PushEnv,
     ({"object": "ball"}, "unknown domain object 'ball'"),
@@ -239,4 +317,7 @@ test_invalid_environments_are_refused = refusals(
     ({"domain": DOMAINS["paper"]}, "skin of an environment 'ideal': choose from capacitive"),
     ({"params": RPSParams(v_max=-1.0)}, "v_max = -1.0"),
     ({"weights": Reward(success=float("nan"))}, "success = nan"),
+    ({"weights": 1.0}, "weights = 1.0 is not allowed: give a Reward"),
+    ({"domain": None}, "domain = None is not allowed: give a Domain or a text"),
+    ({"domain": "wild"}, "unknown domain 'wild'"),
 )

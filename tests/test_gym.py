@@ -2,6 +2,7 @@
 
 import importlib
 import sys
+import warnings
 
 import gymnasium
 import jax
@@ -13,6 +14,7 @@ from helpers import NEAR, refusals, row, same
 
 from rps_jax.errors import InputError
 from rps_jax.runs import question
+from rps_jax.runs.evaluate import evaluate
 from rps_jax.trials import gym
 from rps_jax.trials.progress import no_progress
 from rps_jax.trials.setting import Setting
@@ -237,6 +239,67 @@ def test_a_mask_restarts_ended_worlds_without_autoreset(vector):
     _, infos = envs.reset(options={"reset_mask": ended})
     assert (infos["time"][ended] == 0).all()
     assert not envs.step(AHEAD)[2][ended].any()
+
+
+def test_a_forked_worker_says_why_it_cannot_run(single):
+    """It lacks the threads of JAX, and would wait for them."""
+    single.reset(seed=0)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # JAX and Python warn of the fork
+        envs = gymnasium.vector.AsyncVectorEnv([lambda: single.unwrapped] * 2, context="fork")
+        with pytest.raises(InputError, match=r"is a fork .* 'spawn', as multiprocessing.get_con"):
+            envs.reset(seed=0)
+        envs.close(terminate=True)
+
+
+@pytest.mark.slow
+def test_spawned_workers_run():
+    how = HOW | {"setting": Setting("quasistatic", rules=Rules(horizon=20.0)), "domain": "wide"}
+    options = {"vectorization_mode": "async", "vector_kwargs": {"context": "spawn"}}
+    envs = gymnasium.make_vec("rps_jax/Push-v0", num_envs=2, **options, **how)
+    obs, _ = envs.reset(seed=7)
+    alone, _ = gymnasium.make("rps_jax/Push-v0", **how).reset(seed=8)
+    same(obs[1], alone, atol=1e-6)
+    assert np.isfinite(envs.step(AHEAD[:2])[0]).all()
+    envs.close()
+
+
+STRICT = {
+    "jax_numpy_dtype_promotion": "strict", "jax_numpy_rank_promotion": "raise",
+    "jax_transfer_guard": "disallow", "jax_debug_infs": True, "jax_debug_nans": True,
+    "jax_disable_jit": True, "jax_check_tracer_leaks": True, "jax_legacy_prng_key": "error",
+    "jax_no_tracing": True, "jax_enable_custom_prng": True,
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("option", "value"), STRICT.items())
+def test_checks_that_a_user_asks_of_jax_do_not_stop_it(vector, option, value):
+    vector.reset(seed=5)
+    expected = vector.step(AHEAD)
+    case = {"worlds": 2, "setting": Setting("quasistatic", rules=Rules(horizon=0.1))}
+    default = getattr(jax.config, option)
+    jax.config.update(option, value)
+    try:
+        vector.reset(seed=5)
+        found = vector.step(AHEAD)
+        scores = evaluate("rps", "wide,objects=random_cylinder", **case, progress=False).score
+    finally:
+        jax.config.update(option, default)
+    same(found[:4], expected[:4])
+    assert np.isfinite(scores).all()
+
+
+@pytest.mark.parametrize("kind", [gymnasium.make, gymnasium.make_vec])
+def test_a_film_is_recorded(kind, tmp_path):
+    pytest.importorskip("moviepy")
+    wrappers = gymnasium.wrappers if kind is gymnasium.make else gymnasium.wrappers.vector
+    env = kind("rps_jax/Push-v0", render_mode="rgb_array", **HOW | {"hold": 0.2})
+    env = wrappers.RecordVideo(env, str(tmp_path), episode_trigger=lambda _: True, video_length=2)
+    env.reset(seed=0)
+    for _ in range(3):
+        env.step(env.action_space.sample())
+    env.close()
+    assert next(tmp_path.glob("*.mp4")).stat().st_size > 1000
 
 
 @pytest.mark.parametrize(
