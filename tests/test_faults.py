@@ -14,7 +14,7 @@ import sys
 import fuzz
 import numpy as np
 import pytest
-from helpers import ROOT, one_sentence
+from helpers import ROOT, one_sentence, output_of
 
 import rps_jax
 from rps_jax.analysis.report import Picture
@@ -219,7 +219,7 @@ def test_flags_that_xla_refuses_are_unset_with_the_reason(monkeypatch):
     assert "XLA_FLAGS" not in os.environ
 
 
-SCRIPTS = ("docs/push/make.py", "sweeps/speed/peers.py", "sweeps/speed/racers.py")
+SCRIPTS = ("docs/push/make.py", "sweeps/speed/racers.py")
 SCRIPTS += ("notebooks/execute.py", "tests/command_line.py")
 
 
@@ -233,3 +233,30 @@ def test_a_script_explains_itself_and_writes_nothing(path, tmp_path, monkeypatch
         assert end.value.code == code
         assert output in "".join(capsys.readouterr())
     assert not list(tmp_path.iterdir())
+
+
+LIBRARY = """
+import rps_jax
+from rps_jax.world import rendering
+brief = rps_jax.Setting("quasistatic", rules=rps_jax.Rules(horizon=1.0))
+trace = rps_jax.push("cylinder", target=(1.0, 0.0), setting=brief)
+for call in (trace.plot, rendering.check_rendering, lambda: rps_jax.attack):
+    try:
+        call()
+    except rps_jax.InputError as error:
+        print(error)
+"""
+
+
+def test_the_library_needs_opengl_and_a_backend_for_figures_alone():
+    env = os.environ | {"MUJOCO_GL": "vulkan", "MPLBACKEND": "Qt9Agg", "PYTHONPATH": str(ROOT)}
+    lines = output_of(sys.executable, "-c", LIBRARY, env=env).splitlines()
+    names = [line.partition(" is not allowed")[0] for line in lines]
+    assert names == ["MPLBACKEND = Qt9Agg", "MUJOCO_GL = vulkan", "MPLBACKEND = Qt9Agg"]
+
+
+def test_one_module_imports_mujoco():
+    """It says what is wrong with MUJOCO_GL, whichever module is imported first."""
+    pattern = re.compile(r"^(import mujoco|from mujoco import)", re.MULTILINE)
+    paths = (ROOT / "rps_jax").rglob("*.py")
+    assert not [path for path in paths if pattern.search(path.read_text())]

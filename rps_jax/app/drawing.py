@@ -7,13 +7,13 @@ from collections.abc import Sequence
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
-import mujoco
 import numpy as np
 
 from rps_jax.robot.shell import Shell
 from rps_jax.robot.skin import NONE
 from rps_jax.trials.stepper import Moment
 from rps_jax.world import rendering
+from rps_jax.world.opengl import mujoco
 from rps_jax.world.scene import Scene
 
 if TYPE_CHECKING:

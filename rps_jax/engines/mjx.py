@@ -12,7 +12,6 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import mujoco
 import numpy as np
 
 from rps_jax import errors
@@ -32,6 +31,7 @@ from rps_jax.geometry.solid import Solid
 from rps_jax.robot import drive as drives
 from rps_jax.robot.robot import Robot
 from rps_jax.world import scene
+from rps_jax.world.opengl import mujoco
 from rps_jax.world.physics import Physics
 from rps_jax.world.scene import JOINTS, Friction
 

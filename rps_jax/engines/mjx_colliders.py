@@ -26,6 +26,7 @@ import numpy as np
 
 from rps_jax.engines.fused.contacts import Corners, meetings
 from rps_jax.geometry import vectors
+from rps_jax.world import opengl as opengl  # imports MuJoCo
 
 with contextlib.redirect_stdout(io.StringIO()):  # MJX reports on the console that warp is absent
     from mujoco import mjx as mjx

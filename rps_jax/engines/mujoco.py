@@ -8,9 +8,7 @@ from concurrent.futures import ThreadPoolExecutor
 from typing import Any, TypeVar
 
 import jax
-import mujoco
 import numpy as np
-from mujoco import rollout
 
 from rps_jax.engines import device
 from rps_jax.engines.base import Engine
@@ -18,6 +16,7 @@ from rps_jax.geometry.solid import Solid
 from rps_jax.robot import drive as drives
 from rps_jax.robot.robot import Robot
 from rps_jax.world import scene
+from rps_jax.world.opengl import mujoco, rollout
 from rps_jax.world.physics import Physics
 from rps_jax.world.scene import JOINTS, Friction
 

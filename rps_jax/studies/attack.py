@@ -19,13 +19,18 @@ from typing import Any, ClassVar
 import numpy as np
 import pandas as pd
 import xarray as xr
-from matplotlib.cm import ScalarMappable
-from matplotlib.colors import TwoSlopeNorm
 from scipy import stats
 
 from rps_jax import errors
 from rps_jax.analysis import statistics, tables
-from rps_jax.analysis.figures.style import Figure, axis_label, tiles, words
+from rps_jax.analysis.figures.style import (
+    Figure,
+    ScalarMappable,
+    TwoSlopeNorm,
+    axis_label,
+    tiles,
+    words,
+)
 from rps_jax.analysis.report import Picture, Section
 from rps_jax.engines import device
 from rps_jax.errors import InputError

@@ -17,12 +17,10 @@ from typing import ClassVar
 
 import numpy as np
 import xarray as xr
-from matplotlib.cm import ScalarMappable
-from matplotlib.colors import Normalize
 
 from rps_jax import errors
 from rps_jax.analysis import statistics
-from rps_jax.analysis.figures.style import Figure, quantity, tiles
+from rps_jax.analysis.figures.style import Figure, Normalize, ScalarMappable, quantity, tiles
 from rps_jax.analysis.report import Picture, Section
 from rps_jax.record import files
 from rps_jax.record.options import option

@@ -19,7 +19,6 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import mujoco
 import numpy as np
 
 from rps_jax import engines, errors
@@ -43,6 +42,7 @@ from rps_jax.trials.worlds import drawn_scene, drawn_worlds
 from rps_jax.world import domain, draws, objects, video
 from rps_jax.world.domain import DOMAINS, Domain, DomainLike
 from rps_jax.world.draws import Draw
+from rps_jax.world.opengl import mujoco
 from rps_jax.world.scene import Scene
 
 

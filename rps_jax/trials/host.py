@@ -9,20 +9,24 @@ from collections.abc import Iterator, Sequence
 
 import jax
 import numpy as np
-from mujoco import MjModel
 
 from rps_jax.control.base import LawParams
 from rps_jax.engines.base import Driven, Motion
 from rps_jax.engines.mujoco import Batch
 from rps_jax.trials import trial
 from rps_jax.trials.trial import ControlLoop, Snapshot, Trial, World
+from rps_jax.world.opengl import mujoco
 
 _decide = jax.jit(jax.vmap(trial.decide, (0, 0, 0, None)))
 _settle = jax.jit(jax.vmap(trial.settle))
 
 
 def run(
-    models: Sequence[MjModel], worlds: World, params: LawParams, loop: ControlLoop, threads: int
+    models: Sequence[mujoco.MjModel],
+    worlds: World,
+    params: LawParams,
+    loop: ControlLoop,
+    threads: int,
 ) -> Iterator[tuple[Trial, Snapshot]]:
     """Run a batch of worlds to their ends; yield trials and snapshots of each control step.
 

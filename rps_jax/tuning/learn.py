@@ -17,11 +17,10 @@ import jax.numpy as jnp
 import numpy as np
 import xarray as xr
 from jax.stages import Lowered
-from matplotlib.axes import Axes
 
 from rps_jax import engines, errors
 from rps_jax.analysis import tables
-from rps_jax.analysis.figures.style import Figure, tiles
+from rps_jax.analysis.figures.style import Axes, Figure, tiles
 from rps_jax.analysis.report import Picture, Section
 from rps_jax.control.laws.rps import RPSParams
 from rps_jax.control.learned import policy as policies

@@ -10,7 +10,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import mujoco
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -22,6 +21,7 @@ from rps_jax.geometry.footprint import Footprint
 from rps_jax.geometry.solid import SIDES, Solid
 from rps_jax.record import files
 from rps_jax.record.options import check_arguments
+from rps_jax.world.opengl import mujoco
 
 FAMILIES = {
     "box": "box",

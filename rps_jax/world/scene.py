@@ -8,7 +8,6 @@ from typing import Any, Literal, NamedTuple, get_args
 
 import jax
 import jax.numpy as jnp
-import mujoco
 import numpy as np
 
 from rps_jax import errors
@@ -19,6 +18,7 @@ from rps_jax.robot.robot import Robot
 from rps_jax.robot.shell import Shell
 from rps_jax.world import objects
 from rps_jax.world.objects import FAMILIES, OBJECTS, SHAPES, path_of
+from rps_jax.world.opengl import mujoco
 from rps_jax.world.physics import PHYSICS, Physics
 
 Side = Literal["near", "far"]

@@ -6,6 +6,9 @@ from typing import Any
 import numpy as np
 from matplotlib import figure, patches, transforms
 from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable as ScalarMappable
+from matplotlib.colors import Normalize as Normalize
+from matplotlib.colors import TwoSlopeNorm as TwoSlopeNorm
 
 from rps_jax.analysis import statistics
 from rps_jax.robot import shell
