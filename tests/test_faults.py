@@ -88,7 +88,7 @@ def test_values_of_a_wrong_type_are_refused_in_one_sentence(name, value):
         ({"target": (float("nan"), 0)}, "target x = nan is not allowed"),
         ({"object": 3}, "object = 3 is not allowed: give a text"),
         ({"friction": 0.3}, "friction = 0.3 is not allowed: give a text or a Friction or 2 num"),
-        ({"skin": 3}, "skin = 3 is not allowed: give a text or a IdealSkin"),
+        ({"skin": 3}, "skin = 3 is not allowed: give a text or an IdealSkin"),
         ({"out": 3}, "out = 3 is not allowed: give a path or a text"),
         ({"quick": 1}, "quick = 1 is not allowed: give True or False"),
         ({"gap": True}, "gap = True is not allowed: it must be a number"),

@@ -19,6 +19,10 @@ from rps_jax import errors
 from rps_jax.record import files
 
 HIDDEN, POSITIONAL, FLAG, _BOUNDS = "hidden", "positional", "flag", "bounds"  # metadata of fields
+_NOUNS: dict[Any, str] = {  # of types, for errors
+    str: "a text", Path: "a path", bool: "True or False", float: "a number", int: "a whole number",
+    np.ndarray: "an array", Mapping: "a mapping of names", Callable: "a function",
+}  # fmt: skip
 
 
 def option(
@@ -124,8 +128,10 @@ def _is_of(value: Any, kind: Any) -> bool:
         return isinstance(value, number) or is_scalar
     if kind is bool:
         return isinstance(value, bool | np.bool_)
+    if kind is np.ndarray:
+        return _has_items(value) and not isinstance(value, str | bytes)
     if kind is Path:
-        return isinstance(value, os.PathLike)
+        return isinstance(value, str | os.PathLike)
     kind = origin or kind
     is_open = kind is Any or not isinstance(kind, type) or hasattr(kind, "__get__")
     return is_open or isinstance(value, kind)
@@ -138,13 +144,14 @@ def _has_items(value: object) -> bool:
 def _noun(kind: Any) -> str:
     """Return the noun of a type, for errors."""
     origin, inner = get_origin(kind), get_args(kind)
-    nouns = {str: "a text", Path: "a path", bool: "True or False", float: "a number"}
-    nouns |= {int: "a whole number", Mapping: "a mapping of names", Callable: "a function"}
     if origin in (tuple, Sequence):
         count = "several" if origin is Sequence or Ellipsis in inner else str(len(inner))
-        items = dict.fromkeys(map(_noun, _alternatives(inner[0])))
-        return f"{count} {' or '.join(f'{item[2:]}s' for item in items)}"
-    return nouns.get(origin or kind) or f"a {getattr(origin or kind, '__name__', kind)}"
+        items = dict.fromkeys(_noun(item).partition(" ")[2] for item in _alternatives(inner[0]))
+        return f"{count} {' or '.join(f'{item}s' for item in items)}"
+    kind = origin or kind
+    name = getattr(kind, "__name__", str(kind))
+    example = f", as {kind.EXAMPLE}" if hasattr(kind, "EXAMPLE") else ""
+    return _NOUNS.get(kind) or f"{'an' if name[0] in 'AEIOU' else 'a'} {name}{example}"
 
 
 def to_json(value: Any) -> Any:

@@ -26,6 +26,8 @@ class Range(NamedTuple):
     high: float
     log: bool = False
 
+    EXAMPLE = "Range(3, 10)"  # for errors
+
     def at(self, u: np.ndarray) -> np.ndarray:
         """Return the quantity at u in [0, 1)."""
         if self.log:
