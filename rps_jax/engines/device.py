@@ -31,10 +31,10 @@ def configure_xla() -> None:
     release = tuple(map(int, metadata.version("jax").split(".")[:2]))
     if release >= (0, 12) and platform.machine().lower() in ("x86_64", "amd64"):
         flags["--xla_cpu_max_isa"] = "AVX"
-    given = os.environ.get("XLA_FLAGS", "").strip()
-    if given and not given.startswith("-"):  # the name of a file of flags
+    text = os.environ.get("XLA_FLAGS", "").strip()
+    if text and not text.startswith("-"):  # the name of a file of flags
         with contextlib.suppress(OSError):
-            os.environ["XLA_FLAGS"] = " ".join(Path(given).read_text().split())
+            os.environ["XLA_FLAGS"] = " ".join(Path(text).read_text().split())
     for flag, value in flags.items():
         if flag not in (flags_before := os.environ.get("XLA_FLAGS", "")):
             os.environ["XLA_FLAGS"] = f"{flags_before} {flag}={value}".strip()

@@ -123,9 +123,9 @@ def _is_of(value: Any, kind: Any) -> bool:
             return False
         return all(_is_of(item, inner[0]) for item in items)
     if kind is float or kind is int:
-        number = numbers.Real if kind is float else numbers.Integral
+        base = numbers.Real if kind is float else numbers.Integral
         is_scalar = np.ndim(value) == 0 and hasattr(value, "dtype") and value.dtype.kind in "iuf"
-        return isinstance(value, number) or is_scalar
+        return isinstance(value, base) or is_scalar
     if kind is bool:
         return isinstance(value, bool | np.bool_)
     if kind is np.ndarray:

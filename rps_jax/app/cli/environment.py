@@ -25,12 +25,12 @@ def start_process() -> None:
     os.environ["MPLBACKEND"] = "agg"  # figures are only written to files
     if shutil.get_terminal_size().columns < _MIN_COLUMNS:
         os.environ["COLUMNS"] = str(_MIN_COLUMNS)
-    for number, name in enumerate(("stdin", "stdout", "stderr")):
+    for descriptor, name in enumerate(("stdin", "stdout", "stderr")):
         if getattr(sys, name) is None:
             null = os.open(os.devnull, os.O_RDWR)
-            if null > number:
-                os.dup2(null, number)
-            setattr(sys, name, os.fdopen(number, "w" if number else "r", closefd=False))
+            if null > descriptor:
+                os.dup2(null, descriptor)
+            setattr(sys, name, os.fdopen(descriptor, "w" if descriptor else "r", closefd=False))
 
 
 def unset_bad_variables() -> list[str]:
