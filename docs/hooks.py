@@ -268,7 +268,7 @@ def on_config(config: Any) -> Any:
     config.nav = nav()
     config.site_name = f"rps_jax {rps_jax.__version__}"
     config.copyright = f"rps_jax {rps_jax.__version__}, Apache-2.0"
-    config.repo_url = config.repo_url or repository()
+    config.repo_url, config.repo_name = config.repo_url or repository(), "Repository"
     return config
 
 

@@ -95,6 +95,8 @@ def test_the_site_names_version_and_repository(monkeypatch):
     config = HOOKS["on_config"](SimpleNamespace(repo_url=None))
     assert config.repo_url == urls.get("Repository", "https://git.example.org/lab/rps_jax")
     assert rps_jax.__version__ in config.site_name
+    link = (ROOT / "docs" / "theme" / "partials" / "source.html").read_text()
+    assert "data-md-component" not in link  # which would load data of the repository
     assert "navigation.footer" in (ROOT / "mkdocs.yml").read_text()  # previous and next
 
 
