@@ -249,7 +249,7 @@ COMMANDS = {
     "gallery run": {"--each 0": "each = 0"},
     "export c --law rps": {"--skin ideal": "name one with taxels", "--prefix 2": "prefix = 2 is"},
     "shadow": {"none.mcap": "give an MCAP file"},
-    "fit": {"none.csv": "give a trace, a run folder of rps push, FILE.csv or FILE.mcap"},
+    "fit": {"none.csv": "none.csv cannot be read"},
     "puhs": {"": "puhs"},
 }
 CASES = {f"{name} {more}": says for name, cases in COMMANDS.items() for more, says in cases.items()}

@@ -26,16 +26,18 @@ from numpy.typing import ArrayLike
 
 from rps_jax.errors import InputError
 
-FileKind = Literal["json", "python", "xml", "policy", "part", "results"]
+FileKind = Literal["json", "python", "xml", "policy", "table", "part", "results"]
 _MAX_PART = 2**33  # [bytes]
 _KINDS: dict[FileKind, tuple[int, str]] = {  # greatest size [bytes], and a description
     "json": (2**26, "a JSON file"),
     "python": (2**22, "a Python file"),
     "xml": (2**24, "an MJCF file"),
     "policy": (2**28, "a policy's FILE.npz"),
+    "table": (2**28, "a table FILE.csv or FILE.parquet"),
     "part": (_MAX_PART, "the folder of a run"),
     "results": (2**37, "a file of results"),
 }
+_PACKED = (".gz", ".bz2", ".xz", ".zip")
 JsonObject = dict[str, Any]  # parsed JSON has values of any type
 _STRUCTURE = "structure"  # attribute of a NetCDF file
 
@@ -103,6 +105,16 @@ def write_json(path: Path, content: object, *, checked: bool = False) -> Path:
 def write_results(path: Path, results: xr.Dataset) -> Path:
     """Write a NetCDF 4 file of labelled results, with its checksum."""
     return write_bytes(path, encode_results(results), checked=True)
+
+
+def suffix_of(path: str | Path) -> str:
+    """Return the suffix of a file name in lower case."""
+    return Path(path).suffix.lower()
+
+
+def unpacked(path: Path) -> Path:
+    """Return the path of a file that may be compressed, without a suffix as `.gz`."""
+    return path.with_suffix("") if suffix_of(path) in _PACKED else path
 
 
 def checksum_path(path: Path) -> Path:

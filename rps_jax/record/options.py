@@ -187,7 +187,7 @@ def parse_changes(kind: str, text: str) -> tuple[str, dict[str, Any]]:
     changes: dict[str, Any] = {}
     for assignment in assignments:
         field, equals, value = assignment.partition("=")
-        if not equals and field.endswith(".json"):
+        if not equals and files.suffix_of(field) == ".json":
             changes |= files.read_json(Path(field))
             continue
         if not (field and equals):

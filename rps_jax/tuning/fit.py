@@ -38,6 +38,7 @@ from rps_jax.errors import InputError
 from rps_jax.geometry.solid import GRAVITY
 from rps_jax.record import files
 from rps_jax.record.options import option
+from rps_jax.record.table import is_table
 from rps_jax.runs.push import Trace, recorded_law
 from rps_jax.runs.question import (
     BagQuestion,
@@ -105,7 +106,11 @@ class LogsQuestion(BagQuestion[Fitted], SimulationQuestion[Fitted]):
     logs: tuple[str | Path | Trace, ...] = option((), positional=True)
     """Logs of one object on one floor: tables FILE.csv (time, x, y, yaw, contact_type, contact_x,
     contact_y, v_x, v_y, omega, target_x, target_y and, if known, object_x, object_y, object_yaw,
-    force_x, force_y, taxel_0, ...), bags FILE.mcap, run folders of rps push, or traces."""
+    force_x, force_y, taxel_0, ...), bags FILE.mcap, run folders of rps push, or traces. Titles may
+    name other units than m, rad, s and N, as 'yaw [deg]'; a table may also be .parquet or .gz."""
+    columns: str | Mapping[str, str] = option("", kw_only=True)
+    """Titles of the tables' columns that have other names, as time=t,x=pose_x; a unit may follow a
+    title, as in 'yaw=heading [deg]'. In Python also a dict."""
 
 
 @dataclass(frozen=True)
@@ -126,9 +131,9 @@ class Fit(LawQuestion[Fitted], DomainQuestion[Fitted], LogsQuestion):
     """
 
     TITLE: ClassVar[str] = "A domain fitted to logs"
-    IGNORED_FIELDS: ClassVar[tuple[str, ...]] = ("logs",)
     QUICK: ClassVar[Mapping[str, Any]] = {"worlds": 768, "window": 20.0}
-    IGNORED_FIELDS: ClassVar[tuple[str, ...]] = ("topics",)  # the logs' values matter
+    # The values of the logs matter.
+    IGNORED_FIELDS: ClassVar[tuple[str, ...]] = ("logs", "topics", "columns")
 
     law: LawLike = "rps"
     worlds: int = option(6144, 96, 1_000_000)
@@ -142,7 +147,11 @@ class Fit(LawQuestion[Fitted], DomainQuestion[Fitted], LogsQuestion):
         several = self.logs if isinstance(self.logs, tuple | list) else (self.logs,)
         if not several:
             raise InputError("logs = () is not allowed: give at least one.")
-        return [logs_.read(log, self.ranges.robot.shell, self.topics) for log in several]
+        paths = [Path(log) for log in several if not isinstance(log, Trace)]
+        if self.columns and not any(map(is_table, paths)):
+            raise errors.not_allowed("columns", self.columns, "no log is a table; omit it")
+        shell = self.ranges.robot.shell
+        return [logs_.read(log, shell, self.topics, self.columns) for log in several]
 
     @cached_property
     def bank(self) -> Bank:
@@ -199,8 +208,9 @@ class Fit(LawQuestion[Fitted], DomainQuestion[Fitted], LogsQuestion):
         samples = posterior.sample(networks, x, SAMPLES, self.setting.seed)
         data = summary(self.ranges, samples)
         low, high = np.nanquantile(bank.reshape(-1, len(names)), [0.001, 0.999], axis=0)
-        data["outside"] = np.mean((x < low) | (x > high))
-        data["outside"].attrs["long_name"] = "share of statistics beyond 99.8 % of the worlds'"
+        outside = np.mean((x < low) | (x > high), axis=0)
+        name = "share of logs beyond 99.8 % of the worlds, by statistic"
+        data["outside"] = xr.DataArray(outside, {"statistic": names}, attrs={"long_name": name})
         fitted = fitted_domain(self.ranges, data)
         if run.folder is not None:
             files.write_json(run.folder / "fitted.json", dataclasses.asdict(fitted))
@@ -208,10 +218,13 @@ class Fit(LawQuestion[Fitted], DomainQuestion[Fitted], LogsQuestion):
 
     def intro(self, results: Fitted) -> str:
         fields = self.observed[1]
+        conversions = dict.fromkeys(x for raw in self.raw_logs for x in raw.conversions)
+        converted = f" Converted: {', '.join(conversions)}." if conversions else ""
         return (
             f"Logs: {len(self.raw_logs)}, the first {self.bank.window:g} s of each at "
             f"{1 / self.bank.interval:.3g} Hz, with {', '.join(fields) or 'touch and odometry'}; "
             f"{self.worlds} worlds of the domain {self.domain}, law {self.label}, in closed loop."
+            + converted
         )
 
     def report(self, results: Fitted, run: Run) -> Sequence[Section]:
@@ -221,14 +234,19 @@ class Fit(LawQuestion[Fitted], DomainQuestion[Fitted], LogsQuestion):
             f"{UNDETERMINED:.0%} of the prior's: the logs do not determine it, and its range is "
             f"unchanged. `rps sweep --domain {self.out}/fitted.json` simulates the fitted domain."
         )
-        if (outside := float(data.outside)) > 0.05:
+        if (share := float(data.outside.mean())) > 0.05:
+            counts = (data.outside.to_series() > 0).groupby(logs_.meaning).agg(["sum", "size"])
+            parts = (f"{n} of {size} of {topic}" for topic, (n, size) in counts.iterrows() if n)
             text += (
-                f" {outside:.0%} of the logs' statistics lie outside those of 99.8 % of the "
-                "domain's worlds: the logs are not of this domain, law or robot, and this fit is "
-                "invalid."
+                f" {share:.0%} of the logs' statistics, {', '.join(parts)}, lie outside those of "
+                "99.8 % of the domain's worlds. This fit is invalid: the logs are of "
+                "another law or robot, or the domain's ranges of what is named here are too narrow."
             )
-        share = data.probability.to_series().items()
-        pairs = [["object", "probability"], *([str(name), f"{value:.2f}"] for name, value in share)]
+        objects = data.probability.to_series().items()
+        pairs = [
+            ["object", "probability"],
+            *([str(name), f"{value:.2f}"] for name, value in objects),
+        ]
         return [
             Section("Quantities", text, table(data), Picture("marginals", results.plot)),
             Section("Objects", "", pairs),

@@ -1,8 +1,8 @@
 """Logs of pushes for `rps fit`: loaded, validated, resampled to one clock, and summarised.
 
 A log is one of these: a trace, which `push` and `replay` return or store in their run folder; a
-bag, which `rps push --bag` writes or a robot records (`record.bag` lists the topics); or a table
-`FILE.csv` with a header and the columns
+bag, which `rps push --bag` writes or a robot records (`record.bag` lists the topics); or a table,
+as CSV in the usual dialects or Parquet (see `record.table`), with a header and the columns
 
     time                             [s]
     x, y, yaw                        [m, m, rad] of the base, by its odometry
@@ -16,7 +16,8 @@ bag, which `rps push --bag` writes or a robot records (`record.bag` lists the to
     force_x, force_y                 [N] of the object on the base, if known, in the robot frame
 """
 
-from collections.abc import Iterator
+import re
+from collections.abc import Iterator, Mapping, Sequence
 from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple
@@ -26,34 +27,49 @@ import numpy as np
 import pandas as pd
 import xarray as xr
 
-from rps_jax.errors import InputError, not_allowed
+from rps_jax.errors import InputError, check_name, not_allowed
 from rps_jax.geometry import planar
 from rps_jax.record import bag, files
+from rps_jax.record.options import parse_names
+from rps_jax.record.table import Table, is_table
 from rps_jax.robot.shell import Shell
 from rps_jax.robot.skin import check_taxels, with_contacts
 from rps_jax.runs.push import Trace
 from rps_jax.world.scene import JOINTS
 
+# Columns of a table, by the field of a log, with their units.
 COLUMNS = {
-    "time": ("time",),
-    "pose": ("x", "y", "yaw"),
-    "contact_type": ("contact_type",),
-    "p_robot_contact": ("contact_x", "contact_y"),
-    "twist": ("v_x", "v_y", "omega"),
-    "target": ("target_x", "target_y"),
-    "object_pose": ("object_x", "object_y", "object_yaw"),
-    "f_robot": ("force_x", "force_y"),
+    "time": {"time": "s"},
+    "pose": {"x": "m", "y": "m", "yaw": "rad"},
+    "contact_type": {"contact_type": ""},
+    "p_robot_contact": {"contact_x": "m", "contact_y": "m"},
+    "twist": {"v_x": "m/s", "v_y": "m/s", "omega": "rad/s"},
+    "target": {"target_x": "m", "target_y": "m"},
+    "object_pose": {"object_x": "m", "object_y": "m", "object_yaw": "rad"},
+    "f_robot": {"force_x": "N", "force_y": "N"},
 }
+_UNITS = {title: unit for titles in COLUMNS.values() for title, unit in titles.items()}
+_TAXEL = re.compile(r"taxel_(\d+)")
 OPTIONAL = ("object_pose", "f_robot", "signal")  # fields that a log may lack
 _TOUCH = ("contact_type", "p_robot_contact")
 _SHORTEST = 5.0  # [s]
 _SLOWEST = 0.2  # [s] between two rows, at most
+_JUMPS = (0.5, 0.5, 1.0)  # [m, m, rad] between two rows, at least
+_RARE = 0.02  # share of rows with a jump of x or y that are no error of the unit, at most
 _STILL = 0.001  # [m] that a target may move
-# Largest magnitudes of a log, and the units that the error names.
-_LIMITS = {
-    "twist": (np.array([3.0, 3.0, 10.0]), "v_x and v_y [m/s] and omega [rad/s]"),
-    "f_robot": (np.full(2, 1e5), "forces [N]"),
+_FARTHEST = 100.0  # [m] of a target from the start
+_NEAR = 5.0  # [m] between the origins of base and object in contact, at most
+_HIGHEST_FORCE = 5000.0  # [N] median in contact, at most
+_LIMITS = {  # greatest magnitudes by column, with the unit
+    "twist": {"v_x": (3.0, "m/s"), "v_y": (3.0, "m/s"), "omega": (10.0, "rad/s")},
+    "f_robot": {"force_x": (1e5, "N"), "force_y": (1e5, "N")},
+    "signal": {"taxel": (1000.0, "1, the relative change of capacitance")},
 }
+# Motion is compared with commands over windows, so that noise and delays matter little.
+_WINDOW = 2.0  # [s]
+_RESOLUTION = 0.05  # [m] and [rad] of both motions
+_MISFIT = 5.0  # greatest ratio of the two, as root mean squares
+_ALIGNED = 0.7  # similarity of the two at least, if the base moves less than commanded
 
 
 class Log(NamedTuple):
@@ -75,36 +91,53 @@ class RawLog(NamedTuple):
 
     columns: dict[str, np.ndarray]
     exact: bool  # the pose is the true one, not the one by odometry
+    rows: np.ndarray | None = None  # (N,) in the file of a table
+    conversions: Sequence[str] = ()  # of columns in other units, in words
 
 
-def read(source: Trace | str | Path, shell: Shell, topics: bag.TopicsLike = ()) -> RawLog:
-    """Load and validate one log, a trace or a path; `shell` is that of the robot.
+def read(
+    source: Trace | str | Path,
+    shell: Shell,
+    topics: bag.TopicsLike = (),
+    titles: str | Mapping[str, str] = "",
+) -> RawLog:
+    """Load and validate one log, a trace or a path.
+
+    Args:
+      source: the log.
+      shell: that of the robot.
+      topics: other names of a bag's topics: see `bag.topic_names`.
+      titles: those of a table, by the names of its columns, as {"time": "t", "yaw": "a [deg]"}.
 
     Raises:
-      InputError: the log cannot be read, lacks a column, or is not of this robot.
+      InputError: the log cannot be read, lacks a column, is not of this robot, or not in its units.
     """
     path = Path("a trace" if isinstance(source, Trace) else source)
-    name = f"log = {path}"
+    name, period = f"log = {path}", None
     if isinstance(source, Trace):
         log = _from_trace(source.data, name)
     elif bag.is_bag(path):
-        steps = with_contacts(bag.read(path, topics), shell, f"bag = {source}")
+        steps = bag.read(path, topics)
         known = (*COLUMNS, "signal")
         log = RawLog({k: np.asarray(v, float) for k, v in steps.items() if k in known}, False)
+        period = steps["period"]
     elif path.is_dir():
         log = _from_trace(files.read_results(path), name)
-    elif path.suffix == ".csv" and path.is_file():
-        log = _from_table(path, name)
+    elif is_table(path):
+        log = _from_table(path, name, parse_names("columns", titles))
     else:
-        rule = "give a trace, a run folder of rps push, FILE.csv or FILE.mcap"
+        rule = "give a trace, a run folder of rps push, a table FILE.csv, or a bag FILE.mcap"
         raise not_allowed("log", path, rule)
     columns = log.columns
     if "signal" in columns:
         check_taxels(columns["signal"], shell, name)
-    period = np.full(np.size(columns["time"]), np.inf)  # of taxels that are filtered already
+    for fault in _faults(log):
+        raise InputError(f"{name} {fault}.")
+    if period is None:  # taxels are filtered already
+        period = np.full(np.size(columns["time"]), np.inf)
     contacts = with_contacts(columns | {"period": period}, shell, name)
-    columns |= {key: np.asarray(contacts[key], float) for key in _TOUCH}
-    for fault in _faults(columns, shell):
+    columns |= {key: np.asarray(contacts[key], float) for key in columns.keys() | {*_TOUCH}}
+    for fault in _contact_faults(columns, shell):
         raise InputError(f"{name} {fault}.")
     columns["target"] = np.atleast_2d(columns["target"])[0]
     return log
@@ -128,55 +161,162 @@ def _from_trace(data: xr.Dataset, name: str) -> RawLog:
     return RawLog({k: np.asarray(v, float) for k, v in columns.items()}, True)
 
 
-def _from_table(path: Path, name: str) -> RawLog:
+def _unit_of(name: str) -> str | None:
+    """Return the unit of a column of a table, or None if the name is unknown."""
+    return _UNITS.get(name, "1" if _TAXEL.fullmatch(name) else None)
+
+
+def _from_table(path: Path, name: str, titles: Mapping[str, str]) -> RawLog:
     """Return the log of a table."""
-    try:
-        table = pd.read_csv(
-            path, dtype=float, index_col=False, skipinitialspace=True, encoding_errors="replace"
-        )
-    except ValueError as error:
-        rule = f"write a header, and numbers in every cell ({error})"
-        raise not_allowed("log", path, rule) from error
-    table.columns = table.columns.str.strip()
-    taxels = sorted(map(str, table.filter(regex=r"^taxel_\d+$")), key=lambda title: int(title[6:]))
-    needed = [k for k in COLUMNS if k not in OPTIONAL and not (taxels and k in _TOUCH)]
-    if missing := [title for k in needed for title in COLUMNS[k] if title not in table]:
-        raise InputError(f"{name} lacks the column {missing[0]}: `rps fit --help` lists them.")
-    columns = {
-        key: table[list(titles)].to_numpy().squeeze()
-        for key, titles in COLUMNS.items()
-        if {*titles} <= {*table}
-    }
-    if taxels:
-        columns["signal"] = table[taxels].to_numpy()
-    return RawLog(columns, False)
+    for title in titles:
+        if _unit_of(title) is None:
+            check_name("column of a log", title, [*_UNITS, "taxel_0"])
+    table = Table(path, name, _unit_of, titles)
+    taxels = [title for title in table.columns if _TAXEL.fullmatch(title)]
+    fields = COLUMNS | ({"signal": sorted(taxels, key=lambda x: int(x[6:]))} if taxels else {})
+    optional = (*OPTIONAL, *(_TOUCH if taxels else ()))
+    fields = {k: x for k, x in fields.items() if k not in optional or {*x} & {*table.columns}}
+    table.require(title for titles in fields.values() for title in titles)
+    columns = dict[str, np.ndarray]()
+    for key, titles in fields.items():
+        # Where there is no contact, its cells may be empty.
+        is_contact = key in ("p_robot_contact", "f_robot") and "contact_type" in columns
+        unused = columns["contact_type"] == 0 if is_contact else False
+        values = [table.values_of(title, unused) for title in titles]
+        columns[key] = values[0] if key in ("time", "contact_type") else np.stack(values, -1)
+    for key in {"pose", "object_pose"} & {*columns}:
+        columns[key][:, 2] = np.unwrap(columns[key][:, 2])
+    return RawLog(columns, False, table.rows, table.conversions)
 
 
-def _faults(columns: dict[str, np.ndarray], shell: Shell) -> Iterator[str]:
-    """Yield why a log is not of this robot, or not in these units."""
+def _faults(log: RawLog) -> Iterator[str]:
+    """Yield the faults of a log, except those of its contacts."""
+    columns = log.columns
+
+    def at(i: int) -> str:
+        return f"step {i}" if log.rows is None else f"row {log.rows[i]}"
+
     if np.size(columns["time"]) < 2:
         yield "is empty: give a header and at least two rows"
     for key, values in columns.items():
         if len(bad := np.argwhere(~np.isfinite(values))):
-            yield f"has no number for {key} in row {bad[0][0]}: fill or remove the row"
+            yield f"has no number for {key} in {at(bad[0][0])}: fill or remove the row"
+    kinds = columns.get("contact_type", np.zeros(1))
+    if (bad := ~np.isin(kinds, (0, 1, 2))).any():
+        i = int(bad.argmax())
+        yield f"has contact_type = {kinds[i]:g} in {at(i)}: write 0 none, 1 a point, 2 a line"
     if np.ptp(np.atleast_2d(columns["target"]), axis=0).max() > _STILL:
         yield "has a target that moves: cut the log where it does"
     time, steps = columns["time"], np.diff(columns["time"])
     if (steps <= 0).any():
-        yield "is not allowed: its time must rise"
+        i = int((steps <= 0).argmax()) + 1
+        change = f"{time[i - 1]:.9g} s is followed by {time[i]:.9g} s in {at(i)}"
+        yield f"is not allowed: its time must rise, and {change}"
     interval, worst = float(np.median(steps)), float(steps.max())
     if interval > _SLOWEST:
-        yield f"has a row every {interval:g} s: give the time in seconds, a row every {_SLOWEST} s"
+        unit = _nearest(interval / 0.02, {"ms": 1e3, "us": 1e6, "ns": 1e9})
+        yield (
+            f"has a row every {interval:g} s: give the time in seconds, a row every {_SLOWEST} s, "
+            f"or name its unit, as 'time [{unit}]'"
+        )
     if worst > max(5 * interval, _SLOWEST):
-        yield f"has a gap of {worst:.2g} s at {time[steps.argmax()]:.2f} s: cut the log there"
+        i = int(steps.argmax())
+        yield f"has a gap of {worst:.2g} s at {time[i]:.2f} s, {at(i)}: cut the log there"
     if time[-1] - time[0] < _SHORTEST:
         yield f"lasts {time[-1] - time[0]:.1f} s: it must last {_SHORTEST:g} s"
-    for key, (limit, units) in _LIMITS.items():
-        if key in columns and (abs(columns[key]) > limit).any():
-            yield f"has {key} up to {abs(columns[key]).max():g}: write {units}"
-    moved = np.abs(np.diff(columns["pose"], axis=0)).max(0)
-    if (moved > np.array([0.5, 0.5, 1.0])).any():
-        yield f"has a pose that jumps by {moved.max():.3g}: write x, y [m] and unbroken yaw [rad]"
+    moved = np.abs(np.diff(columns["pose"], axis=0)) / np.array(_JUMPS)
+    i, axis = np.unravel_index(moved.argmax(), moved.shape)
+    change = " to ".join(f"{value:.3g}" for value in columns["pose"][i : i + 2, axis])
+    jump = f"has a pose that jumps: {[*COLUMNS['pose']][axis]} from {change} in {at(i + 1)}"
+    if 0 < np.mean(moved[:, :2] > 1) < _RARE:
+        yield f"{jump}; cut the log there"
+    yield from _motion_faults(time, columns["pose"], columns["twist"])
+    for key, limits in _LIMITS.items():
+        values = np.abs(columns.get(key, np.zeros(len(limits)))).reshape(-1, len(limits)).max(0)
+        for (title, (limit, unit)), value in zip(limits.items(), values, strict=True):
+            if value > limit:
+                yield (
+                    f"has {title} up to {value:g}, beyond the limit of {limit:g}: write it in "
+                    f"[{unit}], or name its unit in the title of a table"
+                )
+    if moved.max() > 1:
+        yield f"{jump}; write x, y in [m] and yaw in [rad], or cut the log there"
+    if "object_pose" in columns:
+        yaw, span = columns["object_pose"][:, 2], round(_WINDOW / interval)
+        turned = np.quantile(np.abs(_over(yaw[None], span)), 0.95)
+        if max(abs(yaw[0]), turned) > 2 * np.pi:
+            yield f"has an object that turns too far: {_suspicion('object_yaw', 'deg')}"
+    far = float(np.linalg.norm(np.atleast_2d(columns["target"])[0] - columns["pose"][0, :2]))
+    if far > _FARTHEST:
+        yield f"has its target {far:.3g} m from the start: target_x and target_y are not in metres"
+
+
+def _motion_faults(time: np.ndarray, pose: np.ndarray, twist: np.ndarray) -> Iterator[str]:
+    """Yield the contradictions of motion (N, 3) and commands (N, 3), by their units or frames.
+
+    A base that slips, lags, or is blocked for some time passes.
+    """
+    period = np.diff(time, append=time[-1])[:, None]
+    span = min(len(time) - 1, max(1, round(_WINDOW / float(np.median(period)))))
+
+    def windows(rates: np.ndarray) -> np.ndarray:
+        return _over(np.cumsum(rates * period, axis=0)[None], span)[0]
+
+    moved = _over(pose[None], span)[0]
+    by_yaw = {f: windows(_rotate(f * pose[:, 2], twist)) for f in (1.0, np.pi / 180, 0.0, -1.0)}
+    commanded = by_yaw[0.0]
+    ratios = []
+    for part, titles, commands, units in (
+        (slice(2), "x and y", "v_x and v_y", {"mm": 1e3, "cm": 1e2, "mm/s": 1e-3, "cm/s": 1e-2}),
+        (slice(2, 3), "yaw", "omega", {"deg": 180 / np.pi, "deg/s": np.pi / 180}),
+    ):
+        a, b = (np.mean(np.sum(x[:, part] ** 2, -1)) for x in (moved, commanded))
+        ratio = float(np.sqrt((a + _RESOLUTION**2) / (b + _RESOLUTION**2)))
+        likeness = max(_similarity(moved[:, part], x[:, part]) for x in by_yaw.values())
+        ratios.append(ratio)
+        if ratio > _MISFIT or (ratio < 1 / _MISFIT and likeness > _ALIGNED):
+            suspect, unit = (titles if ratio > 1 else commands), _nearest(ratio, units)
+            yield (
+                f"has a base that moves {ratio:.3g} times as far in {titles} as {commands} "
+                f"command: {_suspicion(suspect, unit)}"
+            )
+    if _similarity(moved[:, 2:], commanded[:, 2:]) < -_ALIGNED and ratios[1] > 1 / _MISFIT:
+        yield "has a base that turns against omega: yaw and omega must rise counter-clockwise"
+    similar = {f: _similarity(moved[:, :2], x[:, :2]) for f, x in by_yaw.items()}
+    best = max(similar, key=lambda f: similar[f])
+    turns = similar[best] > 0.9 and best == np.pi / 180 and np.abs(pose[:, 2]).max() > 2 * np.pi
+    if similar[1.0] < (0.95 if turns else 0.5) and 0.5 < ratios[0] < 2:
+        reason = "x, y, yaw, v_x and v_y are not of one robot and frame"
+        reasons = {
+            np.pi / 180: _suspicion("yaw", "deg"),
+            0.0: "v_x and v_y may be in the frame of x and y; write them in that of the robot",
+            -1.0: "yaw may rise clockwise; change its sign, and that of omega",
+        }
+        reason = reasons[best] if similar[best] > 0.9 else reason
+        yield f"has a base that does not move in the direction of v_x and v_y: {reason}"
+
+
+def _suspicion(titles: str, unit: str) -> str:
+    """Return that columns may be in another unit, and how to fix it."""
+    title = titles.split()[0]
+    return (
+        f"{titles} may be in {unit}; write SI units, or name the unit in the title of a table, as "
+        f"'{title} [{unit}]'"
+    )
+
+
+def _nearest(ratio: float, factors: Mapping[str, float]) -> str:
+    """Return the unit whose factor is nearest to a ratio."""
+    return min(factors, key=lambda unit: abs(np.log(factors[unit] / ratio)))
+
+
+def _similarity(a: np.ndarray, b: np.ndarray) -> float:
+    """Return the cosine between vectors (N, k), of all entries together."""
+    return float(np.sum(a * b) / max(1e-12, np.sqrt(np.sum(a**2) * np.sum(b**2))))
+
+
+def _contact_faults(columns: dict[str, np.ndarray], shell: Shell) -> Iterator[str]:
+    """Yield the contradictions of contacts to the robot, the object and the forces."""
     in_contact = columns["contact_type"] > 0
     if not in_contact.any():
         yield "has no contact, so it has no information: log a push"
@@ -184,10 +324,25 @@ def _faults(columns: dict[str, np.ndarray], shell: Shell) -> Iterator[str]:
     inside = np.median(np.max(reach - half, axis=-1))
     if (reach > half + 0.03).any() or inside < -0.05:
         (x, y), (length, width) = reach.max(0), half
+        unit = _nearest(max(x, y) / length, {"m": 1.0, "mm": 1e3, "cm": 1e2})
+        titles = "contact_x and contact_y"
         yield (
             f"has contacts up to ({x:.3f}, {y:.3f}) m, and the robot ends at ({length:.3f}, "
-            f"{width:.3f}) m: it is of another robot, or not in metres; see --robot"
+            f"{width:.3f}) m: it is of another robot (see --robot), or "
+            + (f"{titles} are not in its frame" if unit == "m" else _suspicion(titles, unit))
         )
+    if "object_pose" in columns:
+        offset = columns["object_pose"][:, :2] - columns["pose"][:, :2]
+        far = float(np.median(np.linalg.norm(offset[in_contact], axis=-1)))
+        if far > _NEAR:
+            yield (
+                f"has its object {far:.3g} m from the base in contact: give object_x and "
+                "object_y in the frame of x and y, in m"
+            )
+    if "f_robot" in columns:
+        force = float(np.median(np.linalg.norm(columns["f_robot"][in_contact], axis=-1)))
+        if force > _HIGHEST_FORCE:
+            yield f"has a median force of {force:.3g} N in contact: write force_x, force_y in [N]"
 
 
 def resample(raw: RawLog, interval: float, window: float) -> Log:
@@ -202,6 +357,22 @@ def resample(raw: RawLog, interval: float, window: float) -> Log:
 # --- summary statistics --------------------------------------------------------------------
 
 _BLOCKS = 10
+
+
+_MEANINGS = {
+    "noise": "the noise of pose and twist",
+    "follow": "the response of the base to commands",
+    "object_pose": "the object's pose",
+    "f_robot": "the forces",
+    "signal": "the taxels",
+}
+
+
+def meaning(statistic: str) -> str:
+    """Return what a statistic describes, in words."""
+    group, _, rest = statistic.partition("/")
+    key = rest.partition("_")[0] if group == "base" else group
+    return _MEANINGS.get(key, "the path, the commands and the contacts")
 
 
 def mirror(log: Log) -> Log:

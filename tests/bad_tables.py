@@ -1,0 +1,424 @@
+"""Tables of one push as users write them, each with the result that is expected of a fit's reader.
+
+    python tests/bad_tables.py
+
+prints kind, expected result and result of each. A table is equal to the reference, or is refused
+with words that the sentence must contain.
+"""
+
+import bz2
+import gzip
+import io
+import lzma
+import sys
+import tempfile
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import pandas as pd
+
+from rps_jax.errors import InputError
+from rps_jax.robot.robot import Robot
+from rps_jax.tuning import logs
+
+SHELL = Robot().shell
+EQUAL = "equal"
+ROWS = 400
+Change = Callable[[pd.DataFrame], pd.DataFrame]
+
+
+def push(count: int = ROWS, **changes: Any) -> pd.DataFrame:
+    """Return the log of a base that drives a curve with a contact at its front."""
+    time = np.round(0.02 * np.arange(count), 2)
+    omega = 0.3 * np.sin(0.7 * time)
+    yaw = 2.9 + 0.02 * np.cumsum(np.append(0.0, omega[:-1]))
+    x, y = (0.1 * 0.02 * np.cumsum(np.append(0.0, f(yaw)[:-1])) for f in (np.cos, np.sin))
+    values = {"time": time, "x": x, "y": y, "yaw": yaw, "contact_type": 1, "contact_x": 0.3625}
+    values |= {"contact_y": 0.05, "v_x": 0.1, "v_y": 0.0, "omega": omega}
+    values |= {"target_x": -2.0, "target_y": 0.5} | changes
+    return pd.DataFrame(values, range(count)).round(9)
+
+
+def known_object(**changes: Any) -> Change:
+    """Return a change that adds the pose of the object and the force on the base."""
+
+    def change(t: pd.DataFrame) -> pd.DataFrame:
+        pose = {"object_x": t.x - 0.6, "object_y": t.y, "object_yaw": 0.5 * t.yaw}
+        return t.assign(**pose, force_x=-30.0, force_y=2.0).assign(**changes)
+
+    return change
+
+
+class Case(NamedTuple):
+    """File, with the options and the expected result of reading it."""
+
+    expected: str
+    content: Callable[[], bytes]
+    columns: Any = ""
+    suffix: str = ".csv"
+
+
+def text(change: Change = lambda t: t, encoding: str = "utf-8", **options: Any) -> Any:
+    """Return the content of the table that pandas writes."""
+    return lambda: (
+        change(push()).to_csv(index=options.pop("index", False), **options).encode(encoding)
+    )
+
+
+def lines(edit: Callable[[list[str]], list[str]], newline: str = "\n", **options: Any) -> Any:
+    """Return the content of the table after an edit of its lines."""
+
+    def content() -> bytes:
+        plain = text(**options)().decode()
+        return newline.join([*edit(plain.splitlines()), ""]).encode()
+
+    return content
+
+
+def renamed(**titles: str) -> Change:
+    return lambda t: t.rename(columns=titles)
+
+
+def scaled(**factors: float) -> Change:
+    return lambda t: t.assign(**{name: t[name] * factor for name, factor in factors.items()})
+
+
+def units(**titles: tuple[str, float]) -> Change:
+    """Return a change of units, with new titles."""
+    return lambda t: scaled(**{k: f for k, (_, f) in titles.items()})(t).rename(
+        columns={k: title for k, (title, _) in titles.items()}
+    )
+
+
+def cell(row: int, column: str, value: object) -> Change:
+    def change(t: pd.DataFrame) -> pd.DataFrame:
+        t = t.astype(object)
+        t.loc[row, column] = value
+        return t
+
+    return change
+
+
+def zipped(name: str = "log.csv") -> bytes:
+    file = io.BytesIO()
+    with zipfile.ZipFile(file, "w") as archive:
+        archive.writestr(name, text()())
+        if name.startswith("xl/"):
+            archive.writestr("xl/styles.xml", "")
+    return file.getvalue()
+
+
+def savetxt(**options: Any) -> bytes:
+    file = io.BytesIO()
+    np.savetxt(file, push().to_numpy(), **options)
+    return file.getvalue()
+
+
+def stamps(form: str) -> Change:
+    start = pd.Timestamp("2026-03-01T10:15:00Z")
+    return lambda t: t.assign(
+        time=[
+            f"{start + pd.Timedelta(seconds=s):{form}}" if form else str(pd.Timedelta(seconds=s))
+            for s in t.time
+        ]
+    )
+
+
+DEG, MM = 180 / np.pi, 1000.0
+TITLES = [*push(1)]
+CAPITALS = renamed(**{name: name.title().replace("_", " ") for name in TITLES})
+UNITS = renamed(
+    time="time [s]",
+    x="x (m)",
+    y=" y [ m ]",
+    yaw="yaw {rad}",
+    v_x="v_x [m/s]",
+    v_y="v_y [m s^-1]",
+    omega="omega / (rad/s)",
+    contact_type="contact_type [-]",
+)
+OTHER = {"time": ("time [ms]", 1e3), "x": ("x [mm]", MM), "y": ("Y (cm)", 100.0)}
+OTHER |= {"yaw": ("yaw [deg]", DEG), "v_x": ("v_x [mm/s]", MM), "omega": ("omega [°/s]", DEG)}
+OTHER |= {"contact_x": ("contact_x [mm]", MM), "contact_y": ("contact_y [mm]", MM)}
+SHORT = {name: name[0] + name[-2:] for name in TITLES}
+PAIRS = ",".join(f"{name}={title}" for name, title in SHORT.items())
+
+CASES: dict[str, Case] = {
+    # What pandas, Excel, R, NumPy and ROS write.
+    "plain": Case(EQUAL, text()),
+    "semicolons": Case(EQUAL, text(sep=";")),
+    "tabs": Case(EQUAL, text(sep="\t"), suffix=".tsv"),
+    "bars": Case(EQUAL, text(sep="|")),
+    "blanks": Case(EQUAL, lambda: push().to_string(index=False).encode(), suffix=".txt"),
+    "comma and blank": Case(EQUAL, lines(lambda rows: [row.replace(",", ", ") for row in rows])),
+    "decimal commas": Case(EQUAL, text(sep=";", decimal=",")),
+    "decimal commas after tabs": Case(EQUAL, text(sep="\t", decimal=",")),
+    "decimal commas in quotes": Case(EQUAL, text(decimal=",")),
+    "quotes": Case(EQUAL, text(quoting=1)),
+    "BOM": Case(EQUAL, text(encoding="utf-8-sig")),
+    "UTF-16": Case(EQUAL, text(encoding="utf-16", sep="\t")),
+    "UTF-16 without BOM": Case(EQUAL, text(encoding="utf-16-le")),
+    "Latin-1": Case(EQUAL, text(units(yaw=("yaw [°]", DEG)), encoding="latin-1")),
+    "CRLF": Case(EQUAL, lines(list, "\r\n")),
+    "CR": Case(EQUAL, lines(list, "\r")),
+    "CRCRLF": Case(EQUAL, lines(list, "\r\r\n")),
+    "blank lines": Case(EQUAL, lines(lambda rows: ["", *rows[:50], "", ",,,,,,,,,,,", *rows[50:]])),
+    "comments": Case(
+        EQUAL, lines(lambda rows: ["# of robot 3", "% a;b", *rows[:9], "#,,", *rows[9:]])
+    ),
+    "header as a comment": Case(EQUAL, lines(lambda rows: ["# 2026", f"#{rows[0]}", *rows[1:]])),
+    "numpy.savetxt": Case(EQUAL, lambda: savetxt(header=" ".join(TITLES)), suffix=".dat"),
+    "numpy.savetxt without header": Case("has no header", lambda: savetxt(delimiter=",")),
+    "sep= of Excel": Case(EQUAL, lines(lambda rows: ["sep=;", *rows], sep=";", decimal=",")),
+    "index column": Case(EQUAL, text(index=True)),
+    "named index": Case(EQUAL, text(index=True, index_label="step")),
+    "row names of R": Case(
+        EQUAL,
+        lines(
+            lambda rows: [rows[0], *(f'"{i}" {row}' for i, row in enumerate(rows[1:], 1))],
+            sep=" ",
+            quoting=2,
+        ),
+    ),
+    "trailing commas": Case(EQUAL, lines(lambda rows: [row + "," for row in rows])),
+    "trailing commas below": Case(
+        EQUAL, lines(lambda rows: [rows[0], *(r + "," for r in rows[1:])])
+    ),
+    "additional columns": Case(EQUAL, text(lambda t: t.assign(note="a, b", battery=np.nan))),
+    "order": Case(EQUAL, text(lambda t: t[t.columns[::-1]])),
+    "capitals": Case(EQUAL, text(CAPITALS)),
+    "surrounding blanks": Case(EQUAL, lines(lambda rows: [r.replace(",", " , ") for r in rows])),
+    "minus sign": Case(EQUAL, lines(lambda rows: [r.replace("-", "\N{MINUS SIGN}") for r in rows])),
+    "upper suffix": Case(EQUAL, text(), suffix=".CSV"),
+    "gzip": Case(EQUAL, lambda: gzip.compress(text()()), suffix=".csv.gz"),
+    "gzip, upper suffix": Case(EQUAL, lambda: gzip.compress(text()()), suffix=".CSV.GZ"),
+    "gzip named CSV": Case(EQUAL, lambda: gzip.compress(text()())),
+    "bzip2": Case(EQUAL, lambda: bz2.compress(text()()), suffix=".csv.bz2"),
+    "xz": Case(EQUAL, lambda: lzma.compress(text()()), suffix=".csv.xz"),
+    "zip": Case(EQUAL, zipped, suffix=".csv.zip"),
+    "cut gzip": Case("cannot be unpacked", lambda: gzip.compress(text()())[:900], suffix=".csv.gz"),
+    "Excel": Case("save its sheet as CSV", lambda: zipped("xl/workbook.xml")),
+    "Excel by name": Case(
+        "save its sheet as CSV", lambda: zipped("xl/workbook.xml"), suffix=".xlsx"
+    ),
+    "another suffix": Case("give a trace, a run folder of rps push, a", text(), suffix=".json"),
+    "Excel's error in the first cell": Case(
+        "row 9, column time, but '#N/A'", text(cell(7, "time", "#N/A"))
+    ),
+    "units in a blank-separated header": Case(
+        EQUAL, lambda: savetxt(header="time [s] " + " ".join(TITLES[1:])), suffix=".txt"
+    ),
+    "empty": Case("is empty", lambda: b""),
+    "delimiters alone": Case("is empty", lambda: b",,,\n,,\n"),
+    "lines above the header": Case(
+        "write # before lines of text", lines(lambda rows: ["Log of robot 3", *rows])
+    ),
+    "header alone": Case("is empty", lines(lambda rows: rows[:1])),
+    "binary": Case("lacks the columns|is no table|cells in row", lambda: bytes(range(1, 256)) * 9),
+    # Titles and units.
+    "units": Case(EQUAL, text(UNITS)),
+    "other units": Case(EQUAL, text(units(**OTHER))),
+    "nanoseconds": Case(EQUAL, text(units(time=("time [ns]", 1e9)))),
+    "unknown unit": Case(
+        r"'x \[px\]' in \[px\], which is no known unit", text(renamed(x="x [px]"))
+    ),
+    "--columns": Case(EQUAL, text(renamed(**SHORT)), PAIRS),
+    "columns as a mapping": Case(
+        EQUAL, text(renamed(**SHORT)), {k: f" {x}" for k, x in SHORT.items()}
+    ),
+    "--columns with a unit": Case(EQUAL, text(units(yaw=("heading", DEG))), "yaw=heading[deg]"),
+    "--columns of a title with a unit": Case(EQUAL, text(units(yaw=("h [deg]", DEG))), "yaw=h"),
+    "--columns of a suffix": Case(EQUAL, text(units(yaw=("yaw_deg", DEG))), "yaw=yaw_deg"),
+    "--columns of SI suffixes": Case(EQUAL, text(renamed(x="x_m", yaw="a_rad")), "x=x_m,yaw=a_rad"),
+    "--columns of an unknown title": Case(
+        "no column 'yow' for yaw: it has .*did you mean 'yaw'", text(), "yaw=yow"
+    ),
+    "--columns of an unknown name": Case("unknown column of a log 'yow'", text(), "yow=yaw"),
+    "--columns without =": Case("columns = yaw is not allowed", text(), "yaw"),
+    "--columns twice": Case("name each once", text(), "yaw=x,yaw=y"),
+    "missing columns": Case(
+        "lacks the columns y, yaw, omega: it has .*write --columns 'yaw=yaw_rad,omega=Omega_z'",
+        text(lambda t: renamed(yaw="yaw_rad", omega="Omega_z")(t.drop(columns="y"))),
+    ),
+    "missing column": Case(
+        "lacks the column time: it has 't': write --columns 'time=t'", text(renamed(time="t"))
+    ),
+    "titles of another program": Case(
+        "write --columns 'x=pose_x,y=pose_y,yaw=pose_yaw,v_x=cmd_v_x,v_y=cmd_v_y,omega=cmd_omega'",
+        text(
+            lambda t: t.rename(
+                columns={k: f"pose_{k}" for k in ("x", "y", "yaw")}
+                | {k: f"cmd_{k}" for k in ("v_x", "v_y", "omega")}
+            )
+        ),
+    ),
+    "no similar column": Case(
+        "lacks the column yaw: write --columns 'yaw=TITLE' with a TITLE of 'theta'",
+        text(renamed(yaw="theta")),
+    ),
+    "half an object": Case(
+        "lacks the column object_yaw",
+        text(lambda t: known_object()(t).drop(columns="object_yaw")),
+    ),
+    "repeated column": Case("several columns for x, 'x' and 'X'", text(lambda t: t.assign(X=1.0))),
+    "repeated column, named": Case(EQUAL, text(lambda t: t.assign(X=1.0)), "x=x"),
+    "same title twice": Case("several columns for x", text(renamed(y="x"))),
+    # Cells.
+    "empty cell": Case("row 9, column yaw, but an empty cell", text(cell(7, "yaw", ""))),
+    "empty cells without contact": Case(
+        "other values",
+        text(
+            lambda t: t.assign(contact_type=1 * (t.index > 9)).assign(
+                contact_x=t.contact_x.where(t.index > 9), contact_y=t.contact_y.where(t.index > 9)
+            )
+        ),
+    ),
+    "empty cells in contact": Case(
+        "row 2, column contact_x, but an empty cell and 9 more",
+        text(lambda t: t.assign(contact_x=t.contact_x.where(t.index > 9))),
+    ),
+    "nan": Case("row 9, column yaw, but 'nan'", text(cell(7, "yaw", "nan"))),
+    "inf": Case("row 9, column v_x, but 'inf'", text(cell(7, "v_x", "inf"))),
+    "text": Case(
+        "row 9, column Yaw, but 'left'", text(lambda t: CAPITALS(cell(7, "yaw", "left")(t)))
+    ),
+    "text below comments": Case(
+        "row 12, column yaw, but 'left'",
+        lines(
+            lambda rows: [
+                "# a",
+                "",
+                *rows[:9],
+                rows[9].replace(rows[9].split(",")[3], "left"),
+                *rows[10:],
+            ]
+        ),
+    ),
+    "bool": Case(
+        "row 2, column contact_type, but 'True' and 399 more",
+        text(lambda t: t.assign(contact_type=True)),
+    ),
+    "units in a row": Case(
+        "row 2, column time, but 's'",
+        lines(lambda rows: [rows[0], "s,m,m,rad,,m,m,m/s,m/s,rad/s,m,m", *rows[1:]]),
+    ),
+    "thousands": Case("'1,234.5' in row 9, column x", text(cell(7, "x", "1,234.5"))),
+    "thousands, whole": Case(
+        "'1,000' in row 52, column time",
+        text(lambda t: t.assign(time=[f"{round(1e3 * s):,}" for s in t.time])),
+        "time=time[ms]",
+    ),
+    "short row": Case(
+        "has 3 cells in row 9, and 12 in the header, row 1",
+        lines(lambda rows: [*rows[:8], "1,2,3", *rows[9:]]),
+    ),
+    "cut file": Case("cells in row", lambda: text()()[:-40]),
+    "long row": Case(
+        "has 13 cells in row 9", lines(lambda rows: [*rows[:8], rows[8] + ",5", *rows[9:]])
+    ),
+    "header repeated": Case("row 402, column time, but 'time'", lines(lambda rows: rows + rows)),
+    "kind of contact": Case("contact_type = 3 in row 2", text(lambda t: t.assign(contact_type=3))),
+    # Times.
+    "ISO date-times": Case(EQUAL, text(stamps("%Y-%m-%dT%H:%M:%S.%f%z"))),
+    "date-times": Case(EQUAL, text(stamps("%Y-%m-%d %H:%M:%S.%f"))),
+    "durations": Case(EQUAL, text(stamps(""))),
+    "Unix stamps": Case("later", text(lambda t: t.assign(time=t.time + 1_772_360_100))),
+    "Unix stamps [ns]": Case(
+        "later",
+        text(lambda t: t.assign(time=[17723601 * 10**11 + round(1e9 * s) for s in t.time])),
+        "time=time[ns]",
+    ),
+    "date-times with commas": Case(EQUAL, text(stamps("%Y-%m-%d %H:%M:%S,%f"))),
+    "first time missing": Case(
+        "row 2, column time, but an empty cell: write seconds or ISO",
+        text(lambda t: cell(0, "time", "")(t.assign(time=(2000 + t.time * 1e3).astype(int)))),
+    ),
+    "bad date-time": Case(
+        "row 9, column time, but 'soon'",
+        text(lambda t: cell(7, "time", "soon")(stamps("%FT%T.%f")(t))),
+    ),
+    "milliseconds": Case(r"a row every 20 s.*'time \[ms\]'", text(scaled(time=1e3))),
+    "nanoseconds as seconds": Case(r"'time \[ns\]'", text(scaled(time=1e9))),
+    "time falls": Case(
+        "its time must rise, and .* is followed by 0 s in row 11", text(cell(9, "time", 0))
+    ),
+    "time repeated": Case("its time must rise", text(lambda t: t.assign(time=t.time.round(1)))),
+    # Units that no title names.
+    "wrapped yaw": Case(EQUAL, text(lambda t: t.assign(yaw=(t.yaw + np.pi) % (2 * np.pi) - np.pi))),
+    "wrapped yaw in degrees": Case(
+        EQUAL, text(lambda t: t.assign(yaw=(DEG * t.yaw + 180) % 360 - 180)), "yaw=yaw[deg]"
+    ),
+    "yaw in degrees": Case("yaw may be in deg", text(scaled(yaw=DEG))),
+    "wrapped degrees": Case(
+        "yaw may be in deg", text(lambda t: t.assign(yaw=(DEG * t.yaw + 180) % 360 - 180))
+    ),
+    "yaw and omega in degrees": Case("yaw may be in deg", text(scaled(yaw=DEG, omega=0.5 * DEG))),
+    "omega in degrees": Case("omega may be in deg/s", text(scaled(omega=DEG))),
+    "position in mm": Case("x and y may be in mm", text(scaled(x=MM, y=MM))),
+    "position in cm": Case("x and y may be in cm", text(scaled(x=100, y=100))),
+    "speed in mm/s": Case("v_x and v_y may be in mm/s", text(scaled(v_x=MM))),
+    "speed in cm/s": Case("v_x and v_y may be in cm/s", text(scaled(v_x=100))),
+    "all lengths in mm": Case(
+        "contact_x and contact_y may be in mm",
+        text(scaled(x=10, y=10, v_x=10, contact_x=MM, contact_y=MM)),
+    ),
+    "contact in mm": Case("contact_y may be in mm", text(scaled(contact_x=MM, contact_y=MM))),
+    "contact in cm": Case("contact_y may be in cm", text(scaled(contact_x=100, contact_y=100))),
+    "target in mm": Case("target_x and target_y are not in metres", text(scaled(target_x=MM))),
+    "twist in the world": Case(
+        "v_x and v_y may be in the frame of x and y",
+        text(lambda t: t.assign(v_x=0.1 * np.cos(t.yaw), v_y=0.1 * np.sin(t.yaw))),
+    ),
+    "force in kN": Case("median force", text(known_object(force_x=-3e4))),
+    "object in mm": Case("has its object 600 m from the base", text(known_object(object_x=-600))),
+    "object in degrees": Case("object_yaw may be in deg", text(known_object(object_yaw=45.0))),
+    "turning object in degrees": Case(
+        "object_yaw may be in deg",
+        text(lambda t: known_object()(t).assign(object_yaw=DEG * (t.yaw - 2.9))),
+    ),
+    "x mirrored": Case("does not move in the direction of v_x and v_y", text(scaled(x=-1.0))),
+    "omega clockwise": Case("turns against omega", text(scaled(omega=-1.0))),
+    "all lengths and speeds in mm": Case(
+        "v_x up to 100, beyond the limit of 3",
+        text(lambda t: t.assign(**{k: MM * t[k] for k in ("x", "y", "v_x", "contact_x")})),
+    ),
+    "jump": Case(
+        "pose that jumps: x from .* in row 202",
+        text(lambda t: t.assign(x=t.x + 3 * (t.index >= 200))),
+    ),
+}
+
+
+def write(case: Case, folder: Path) -> Path:
+    """Write the file of a case."""
+    path = folder / f"log{case.suffix}"
+    path.write_bytes(case.content())
+    return path
+
+
+def result_of(case: Case, folder: Path) -> str:
+    """Return how the reader takes a file: equal to the reference, later, other, or the sentence."""
+    try:
+        log = logs.read(write(case, folder), SHELL, titles=case.columns)
+    except InputError as error:
+        return str(error)
+    expected = logs.read(reference(folder), SHELL).columns
+    same = [k for k, x in expected.items() if np.allclose(log.columns[k], x, rtol=0, atol=2e-6)]
+    if {*same} == {*expected} == {*log.columns}:
+        return EQUAL
+    shifted = np.allclose(np.ptp(log.columns["time"]), np.ptp(expected["time"]), atol=1e-5)
+    return "later" if {*expected} - {*same} == {"time"} and shifted else "other values"
+
+
+def reference(folder: Path) -> Path:
+    """Write the reference table."""
+    return write(Case(EQUAL, text()), folder)
+
+
+if __name__ == "__main__":
+    with tempfile.TemporaryDirectory() as name:
+        for kind, case in CASES.items():
+            sys.stdout.write(f"{kind} | {case.expected} | {result_of(case, Path(name))}\n")
