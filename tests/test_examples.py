@@ -19,12 +19,13 @@ from rps_jax.control import registry
 from rps_jax.control.base import Law
 from rps_jax.control.laws import rps as rps_law
 from rps_jax.control.laws.rps import RPSParams, RPSState, step
+from rps_jax.control.learned import policy
 from rps_jax.control.observation import Details, Twist
 from rps_jax.control.registry import register_law
 from rps_jax.errors import InputError
 from rps_jax.geometry.footprint import Footprint, circle, polygon, rectangle
 from rps_jax.record import files
-from rps_jax.robot.robot import Robot
+from rps_jax.robot.robot import Robot, parse_robot
 from rps_jax.robot.skin import CapacitiveSkin
 from rps_jax.runs.plan import Plan, load_plan, open_run, scene_of
 from rps_jax.trials import pushes
@@ -32,7 +33,7 @@ from rps_jax.trials.case import Case
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.worlds import drawn_worlds
 from rps_jax.world import draws, objects, scene
-from rps_jax.world.domain import Domain, Range
+from rps_jax.world.domain import Domain, Range, parse_domain
 from rps_jax.world.scene import FRICTION, Friction
 from sweeps.speed import robot as on_a_robot
 
@@ -366,3 +367,22 @@ def test_skin_and_law_on_a_robot_observe_the_time_since_the_last_step(monkeypatc
     names["run"](SlowRobot(), np.zeros(2, np.float32), 0.02)
     assert commands[0] < 0.01
     assert min(commands[1:]) > 0.01
+
+
+def test_suffixes_of_files_have_any_case(tmp_path, registries):
+    (tmp_path / "crate.xml").write_text(BOX.read_text())
+    (tmp_path / "CRATE.XML").write_text(BOX.read_text())
+    names = (objects.parse_object(str(tmp_path / x)) for x in ("crate.xml", "CRATE.XML"))
+    lower, upper = (objects.REGISTERED[name].solid for name in names)
+    same(lower, upper)
+    (tmp_path / "R.JSON").write_text('{"mass": 77.0}')
+    assert parse_robot(str(tmp_path / "R.JSON")).mass == 77.0
+    (tmp_path / "D.JSON").write_text('{"mass": [7.0, 8.0]}')
+    assert parse_domain(str(tmp_path / "D.JSON")).mass[:2] == (7.0, 8.0)
+    (tmp_path / "L.JSON").write_text('{"K_h": 0.25}')
+    assert registry.parse_law(f"rps,{tmp_path}/L.JSON")[1].K_h == 0.25
+    (tmp_path / "LAW.PY").write_text((EXAMPLES / "custom_law.py").read_text())
+    (tmp_path / "P.NPZ").write_bytes(next(iter(policy.SHIPPED.values())).read_bytes())
+    for text in ("LAW.PY", "LAW.PY:PParams", "P.NPZ"):
+        _, params = registry.parse_law(f"{tmp_path}/{text}")
+        same(registry.params_from_json(registry.params_to_json(params)), params)

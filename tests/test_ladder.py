@@ -139,6 +139,11 @@ def test_outcomes_are_written_as_a_long_table(tmp_path, monkeypatch):
     units = dict(zip(columns.column, columns.unit, strict=True))
     assert (units["time"], units["mass"], units["base_yaw"], units["law"]) == ("s", "kg", "rad", "")
     assert all(columns.meaning)
+    for name in ("other.CSV", "other.csv.gz"):
+        write_table(results, tmp_path / name)
+        compression = "gzip" if name.endswith("gz") else None
+        pd.testing.assert_frame_equal(pd.read_csv(tmp_path / name, compression=compression), table)
+        assert (tmp_path / "other.columns.csv").exists()
     # pyarrow is optional, so pandas writes text instead of Parquet here.
     monkeypatch.setattr(pd.DataFrame, "to_parquet", pd.DataFrame.to_csv)
     write_table(results, tmp_path / "other.parquet")
@@ -154,6 +159,7 @@ def write_without_pyarrow(**options):
 test_invalid_tables_are_refused = refusals(
     write_without_pyarrow,
     ({"table": "results.xls"}, "name a file NAME.csv or NAME.parquet"),
+    ({"table": "results.parquet.gz"}, "name a file NAME.csv or NAME.parquet"),
     ({"table": "nowhere/results.csv"}, "nowhere is not a folder"),
     ({"table": "r.csv", "shard": "1/2", "out": "run"}, "table is not allowed with a shard"),
     ({"table": "results.parquet"}, "run pip install pyarrow, or name a .csv file"),

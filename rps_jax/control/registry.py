@@ -184,16 +184,18 @@ def parse_law(text: str) -> tuple[str, LawParams]:
     head, changes = parse_changes("law", str(text))
     values = {name: errors.check_number(f"{head} {name}", x) for name, x in changes.items()}
     words = str(text).split(",")[1:]
-    label = ",".join([label, *(Path(x).stem if x.endswith(".json") else x for x in words)])
+    label = ",".join(
+        [label, *(Path(x).stem if files.suffix_of(x) == ".json" else x for x in words)]
+    )
     return label, replace_leaves(params, values)
 
 
 def _parse_head(text: str) -> tuple[str, LawParams]:
     """Return the label and the parameters of a law without changes."""
-    if text.endswith(".npz"):
+    if files.suffix_of(text) == ".npz":
         return _load_policy(Path(text))
-    path, _, kind = (text, "", "") if text.endswith(".py") else text.rpartition(":")
-    if not path.endswith(".py"):
+    path, _, kind = (text, "", "") if _is_python(text) else text.rpartition(":")
+    if not _is_python(path):
         rule = f"choose from {', '.join(LAWS)}, or give FILE.py or policy.npz"
         if text not in LAWS:
             raise errors.not_allowed("law", text, rule)
@@ -207,6 +209,10 @@ def _parse_head(text: str) -> tuple[str, LawParams]:
         raise errors.not_allowed("law", text, rule)
     _SOURCES[type(law[1])] = sources.describe(Path(path))
     return law
+
+
+def _is_python(path: str) -> bool:
+    return files.suffix_of(path) == ".py"
 
 
 def _find_registered(module: str, kind: str) -> tuple[str, LawParams] | None:
@@ -303,7 +309,7 @@ def params_from_json(values: Mapping[str, Any], run: Path | None = None) -> LawP
     source = {key: leaves.pop(key) for key in ("file", "digest", "imports") if key in leaves}
     if source:
         file = str(sources.find(source, run))
-        _, law = parse_law(file if file.endswith(".npz") else f"{file}:{kind}")
+        _, law = parse_law(file if files.suffix_of(file) == ".npz" else f"{file}:{kind}")
         if type(law) in _SOURCES:
             _SOURCES[type(law)] = source
     known = {type(params).__name__: params for params in (_HIDDEN | LAWS).values()}

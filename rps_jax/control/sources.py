@@ -11,6 +11,7 @@ import importlib.util
 import sys
 import warnings
 from collections.abc import Iterator, Mapping
+from importlib.machinery import SourceFileLoader
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -23,7 +24,8 @@ _IMPORTS: dict[str, dict[str, str]] = {}  # of loaded files, by the name of thei
 
 def run_file(path: Path, name: str) -> ModuleType:
     """Run a user's Python file as a module of this name; any error becomes an InputError."""
-    spec = importlib.util.spec_from_file_location(name, path)
+    loader = SourceFileLoader(name, str(path))  # of any suffix, as .PY
+    spec = importlib.util.spec_from_file_location(name, path, loader=loader)
     assert spec is not None
     assert spec.loader is not None
     module = sys.modules[name] = importlib.util.module_from_spec(spec)
@@ -102,7 +104,7 @@ def find(record: Mapping[str, Any], run: Path | None) -> Path:
 
 def _digest(path: Path) -> str:
     """Return a digest of a file."""
-    content = files.read_regular(path, "policy" if path.suffix == ".npz" else "python")
+    content = files.read_regular(path, "policy" if files.suffix_of(path) == ".npz" else "python")
     return files.sha256(content)[:16]
 
 

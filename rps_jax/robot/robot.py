@@ -198,7 +198,7 @@ def parse_robot(robot: RobotLike) -> Robot:
     """
     if isinstance(robot, str):
         head, changes = parse_changes("robot", robot)
-        if head.endswith(".json"):
+        if files.suffix_of(head) == ".json":
             robot = files.read_json(Path(head)) | changes
         else:
             preset = ROBOTS[errors.check_name("robot", head, ROBOTS)]

@@ -5,7 +5,6 @@ A chunk is a NumPy archive of the columns of its trials, which is much faster to
 """
 
 import functools
-import importlib.util
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -15,11 +14,11 @@ import numpy as np
 import pandas as pd
 import xarray as xr
 
-from rps_jax import errors
 from rps_jax.engines import device
 from rps_jax.errors import InputError
 from rps_jax.record import files, options
 from rps_jax.record.checkpoint import Checkpoints
+from rps_jax.record.table import check_parquet
 from rps_jax.runs.plan import Plan, chunks_by_key, draw
 from rps_jax.runs.question import with_coordinates
 from rps_jax.trials.batch import Job, WorldBatch
@@ -209,11 +208,10 @@ def _prefetch(batches: Iterator[WorldBatch], count: int) -> Iterator[WorldBatch]
 
 def check_table(path: Path) -> None:
     """Raise InputError unless a table can be written there: .csv, or .parquet with pyarrow."""
-    if path.suffix not in (".csv", ".parquet"):
+    is_csv = files.suffix_of(files.unpacked(path)) == ".csv"
+    if not is_csv and files.suffix_of(path) != ".parquet":
         raise InputError(f"table = {path} is not allowed: name a file NAME.csv or NAME.parquet.")
-    if path.suffix == ".parquet" and not importlib.util.find_spec("pyarrow"):
-        rule = "it needs pyarrow: run pip install pyarrow, or name a .csv file"
-        raise errors.not_allowed("table", path, rule)
+    check_parquet("table", path)
     if not path.parent.is_dir():
         raise InputError(f"table = {path} is not allowed: {path.parent} is not a folder.")
 
@@ -245,9 +243,9 @@ def write_table(results: xr.Dataset, path: Path) -> None:
         for name, attr in attrs.items()
     ]
     header = pd.DataFrame(rows, columns=["column", "unit", "meaning"])
-    write = frame.to_parquet if path.suffix == ".parquet" else frame.to_csv
+    write = frame.to_parquet if files.suffix_of(path) == ".parquet" else frame.to_csv
     files.write_atomically(path, lambda partial: write(partial, index=False))
-    columns_path = path.with_suffix(".columns.csv")
+    columns_path = files.unpacked(path).with_suffix(".columns.csv")
     files.write_atomically(columns_path, lambda partial: header.to_csv(partial, index=False))
 
 

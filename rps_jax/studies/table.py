@@ -14,6 +14,7 @@ from rps_jax.analysis import tables
 from rps_jax.analysis.figures.paper import min_distance
 from rps_jax.analysis.report import Picture, Section
 from rps_jax.control.registry import LawsLike
+from rps_jax.record import files
 from rps_jax.runs.push import case_options
 from rps_jax.runs.question import MultiLawQuestion, Run, call_of
 from rps_jax.trials import pushes
@@ -76,7 +77,9 @@ class Table(TrialOptions, MultiLawQuestion[xr.Dataset]):
     def run_cases(self, run: Run) -> xr.Dataset:
         """Run all cases, and return their outcomes."""
         outcome, _ = pushes.run(self.cases, self.setting, **run.batch_options)
-        objects = [Path(name).stem if name.endswith(".xml") else name for name in self.objects]
+        objects = [
+            Path(name).stem if files.suffix_of(name) == ".xml" else name for name in self.objects
+        ]
         frictions = [label_of(friction) for friction in self.friction]
         return outcome_dataset(outcome, list(self.chosen), objects, frictions, self.targets)
 

@@ -307,7 +307,7 @@ def parse_domain(domain: DomainLike, robot: RobotLike | None = None) -> Domain:
     if not isinstance(domain, str):
         raise errors.not_allowed("domain", domain, "give a name or a Domain")
     head, changes = parse_changes("domain", domain)
-    if head.endswith(".json"):
+    if files.suffix_of(head) == ".json":
         base = from_json(files.read_json(Path(head)))
     else:
         base = DOMAINS[errors.check_name("domain", head, DOMAINS)]

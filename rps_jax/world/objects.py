@@ -66,7 +66,7 @@ def path_of(name: str) -> Path:
 
 def parse_object(text: str) -> str:
     """Return the name of an object from its name or its MJCF file, which is then registered."""
-    if not isinstance(text, str) or not text.endswith(".xml"):
+    if not isinstance(text, str) or files.suffix_of(text) != ".xml":
         return text
     path = Path(text).absolute()
     name = path.stem if path.stem not in _BUILT_IN else str(path)
@@ -83,7 +83,12 @@ def read(path: Path) -> mujoco.MjSpec:
         name = os.fsencode(path).decode()  # MuJoCo encodes it in UTF-8, whatever the locale
     except UnicodeDecodeError as error:
         raise errors.not_allowed("object", path, "MuJoCo needs a name in UTF-8") from error
-    return mujoco.MjSpec.from_file(name, include={"base.xml": base})
+    if path.suffix == ".xml":
+        return mujoco.MjSpec.from_file(name, include={"base.xml": base})
+    # MuJoCo reads no other suffix, as .XML.
+    spec = mujoco.MjSpec.from_string(path.read_text("utf-8"), include={"base.xml": base})
+    spec.modelfiledir = str(Path(name).parent)
+    return spec
 
 
 def register_object(

@@ -81,7 +81,7 @@ def split(words: list[str]) -> tuple[str, list[str]]:
         if name in known():
             return name, words[count:]
     first = words[0]
-    if first.endswith(".py") or "/" in first or Path(first).is_dir():
+    if first.lower().endswith(".py") or "/" in first or Path(first).is_dir():
         return first, words[1:]
     name = " ".join(words[:2]) if first in ("tune", "export") else first
     return check_name("command", name, known()), []  # which raises
