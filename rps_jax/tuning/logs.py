@@ -136,7 +136,7 @@ def read(
     if period is None:  # taxels are filtered already
         period = np.full(np.size(columns["time"]), np.inf)
     contacts = with_contacts(columns | {"period": period}, shell, name)
-    columns |= {key: np.asarray(contacts[key], float) for key in columns.keys() | {*_TOUCH}}
+    columns |= {key: np.asarray(contacts[key], float) for key in (*columns, *_TOUCH)}
     for fault in _contact_faults(columns, shell):
         raise InputError(f"{name} {fault}.")
     columns["target"] = np.atleast_2d(columns["target"])[0]
