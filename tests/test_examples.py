@@ -185,6 +185,33 @@ test_params_of_no_law_are_rejected = refusals(
 # --- custom laws ---------------------------------------------------------------------------
 
 
+OBJECT = """<mujoco model="c"><include file="base.xml"/>{head}<worldbody><body name="object">
+<freejoint name="object"/><geom name="object" class="object" type="box" size="0.2 0.3 0.25"
+mass="12"{attribute}/></body>{world}</worldbody>{tail}</mujoco>"""
+
+
+@pytest.mark.parametrize(
+    ("place", "text", "message"),
+    [
+        ("world", '<geom type="box" size="1 0.1 0.1"/>', "geom of another body .* as a wall"),
+        ("world", '<body pos="0 3 0"><geom size="0.1"/></body>', "a body"),
+        ("tail", '<equality><joint joint1="base_x" joint2="base_y"/></equality>', "equality"),
+        ("tail", '<actuator><motor joint="base_x"/></actuator>', "an actuator"),
+        ("head", '<option wind="1 0 0"/>', "the option wind"),
+        ("head", '<option timestep="0.002"/>', "the option timestep"),
+        ("attribute", ' contype="1"', "collides by contype"),
+    ],
+)
+def test_physics_of_an_object_file_that_no_trial_uses_is_refused(place, text, message, tmp_path):
+    blank = dict.fromkeys(("head", "attribute", "world", "tail"), "")
+    path = tmp_path / "crate.xml"
+    path.write_text(OBJECT.format(**blank | {place: text}))
+    with pytest.raises(InputError, match=message):
+        objects.register_object("crate", path)
+    path.write_text(OBJECT.format(**blank | {"world": '<light name="l"/><site name="s"/>'}))
+    objects.register_object("crate", path)
+
+
 def test_a_custom_law_runs_in_the_same_worlds_as_rps(capsys):
     results = example("custom_law")["main"](worlds=1, horizon=3.0)
     assert "mine" in capsys.readouterr().out

@@ -181,7 +181,31 @@ def _compiled(label: str, path: Path) -> mujoco.MjModel:
     if not math.isclose(model.body_subtreemass[body.id], body.mass[0]):
         rule = "give the body object all geoms, and no other body within it"
         raise InputError(f"{label}: bodies of {path} are not allowed: {rule}.")
+    _check_ignored(label, path, model, spec)
     return model
+
+
+def _check_ignored(label: str, path: Path, model: mujoco.MjModel, spec: mujoco.MjSpec) -> None:
+    """Raise InputError for physics that no engine would simulate: they replace the scene."""
+    plain = read(mjcf_folder() / "prism.xml").compile()
+    names = {"nbody": "a body", "npair": "a contact pair", "neq": "an equality constraint"}
+    names |= {"ntendon": "a tendon", "nu": "an actuator", "nsensor": "a sensor"}
+    extra = [words for name, words in names.items() if getattr(model, name) > getattr(plain, name)]
+    body, plain_body = model.body("object").id, plain.body("object").id
+    if (model.geom_bodyid != body).sum() > (plain.geom_bodyid != plain_body).sum():
+        extra.append("a geom of another body than the object, as a wall")
+    if any(geom.contype or geom.conaffinity for geom in spec.geoms):
+        extra.append("a geom that collides by contype and conaffinity")
+    for name in vars(type(model.opt)):  # attributes of MjOption
+        if not name.startswith("_") and not np.array_equal(
+            *(getattr(m.opt, name) for m in (model, plain))
+        ):
+            extra.append(f"the option {name}")
+    if extra:
+        raise InputError(
+            f"{label}: {path} has {', '.join(extra)}, which no trial uses: remove it. "
+            "Friction, time step and solver are options of the commands."
+        )
 
 
 def _geom_outline(label: str, model: mujoco.MjModel) -> Footprint:
