@@ -9,6 +9,7 @@ import pytest
 from helpers import decode, rps
 
 from rps_jax.app import film
+from rps_jax.app.cli import flags
 from rps_jax.control.laws.rps import RPSParams
 from rps_jax.errors import InputError
 from rps_jax.runs.plan import Plan, open_run
@@ -51,14 +52,63 @@ def test_a_film_shows_each_trial_in_its_tile_and_holds_the_end(tmp_path):
     assert rps(f"film {tmp_path} --grid 2x4 --seconds 2 --speed 4.8 --out {out}") == 0
     images = decode(out)
     # 20 control steps of 0.02 s a frame: at 0, 0.4, ... 2 s, and the last for a second more.
-    assert images.shape == (6 + FPS, 2 * 270, 4 * 480, 3)
-    cells = tiles(images, 2, 4)
+    assert images.shape == (6 + FPS, 540, 2 * 960, 3)  # two worlds fill the picture
+    cells = tiles(images, 1, 2)
     for column in (0, 1):
         assert cells[0, 0, column].std() > 10
         assert differ(cells[0, 0, column], cells[5, 0, column])
         assert not differ(cells[5, 0, column], cells[-1, 0, column])
-    assert np.abs(cells[:, 0, 2:] - 58).max() < 10  # no trials there
-    assert np.abs(cells[:, 1] - 58).max() < 10
+
+
+def test_a_place_without_a_trial_is_grey(tmp_path):
+    (take,) = film.of_sweep(tmp_path, plan_of("random_box"), ["rps"], "first", (1, 1))
+    shots = [video.Shot(take.part.worlds.qpos[0], np.zeros(2), "")] * 3
+    drawn = [video.Tile(take.scenes[0], (1.0, 1.0))] * 3
+    options = {"shape": film.fitted_grid(3, (5, 5)), "size": (160, 90)}
+    video.render(drawn, [shots], tmp_path / "x.mp4", **options)
+    ((row, (last, empty)),) = tiles(decode(tmp_path / "x.mp4"), 2, 2)
+    assert min(cell.std() for cell in (*row, last)) > 10
+    assert np.abs(empty - 58).mean() < 1
+
+
+GRIDS = {
+    "": (5, 5),
+    **{"--worlds " + " ".join(map(str, range(n))): (12, 12) for n in (1, 4, 9)},
+    "--laws one two": (2, 3),
+    "--laws one two --worlds 0 1 2 3 4": (2, 12),
+    "--laws one": (5, 5),
+    "--grid 2x4": (2, 4),
+}
+
+
+@pytest.mark.parametrize("words", GRIDS)
+def test_a_film_has_room_for_the_named_worlds(words):
+    command, _ = flags.parse(film.Film, "film", [*f"run {words}".split()])
+    assert command.shape == GRIDS[words]
+
+
+@pytest.mark.parametrize(
+    ("count", "room", "grid"),
+    [
+        *((n * n, (12, 12), (n, n)) for n in (1, 2, 3, 4, 5, 12)),
+        *((2, (5, 5), (1, 2)), (3, (5, 5), (2, 2)), (5, (5, 5), (2, 3)), (7, (5, 5), (3, 3))),
+        *((24, (4, 6), (4, 6)), (7, (2, 4), (2, 4)), (3, (12, 1), (3, 1)), (2, (3, 4), (1, 2))),
+    ],
+)
+def test_a_grid_has_the_largest_tiles(count, room, grid):
+    assert film.fitted_grid(count, room) == grid
+
+
+def test_each_law_has_a_row_of_the_grid():
+    assert film.fitted_grid(10, (2, 12), rows=2) == (2, 5)
+    assert film.fitted_grid(5, (5, 5), rows=1) == (2, 3)
+
+
+def test_more_worlds_than_the_grid_holds_are_refused(tmp_path):
+    plan = plan_of("random_cylinder", "random_box")
+    rule = "number of worlds = 4 is not allowed: the film has room for 3: .* a larger --grid"
+    with pytest.raises(InputError, match=rule):
+        film.of_sweep(tmp_path, plan, ["rps"], (0, 1, 2, 3), (1, 3))
 
 
 def test_worlds_of_several_objects_keep_their_order(tmp_path):
@@ -84,6 +134,7 @@ def test_several_laws_have_a_row_each_and_a_world_a_column(tmp_path):
     plan = dataclasses.replace(base_plan, laws={"one": RPSParams.paper(), "two": RPSParams.nps()})
     takes = film.of_sweep(tmp_path, plan, ["two", "one"], "first", (2, 3))
     assert in_order(takes) == [f"{law}, world {i}" for law in ("two", "one") for i in range(3)]
+    assert list(takes[-1].tiles) == [4]
     with pytest.raises(InputError, match="a row for each of 2 laws"):
         film.of_sweep(tmp_path, plan, ["two", "one"], "first", (3, 2))
     with pytest.raises(InputError, match="unknown law 'three'"):

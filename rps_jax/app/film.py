@@ -33,6 +33,7 @@ from rps_jax.world.scene import Scene
 from rps_jax.world.video import Shot, Tile
 
 _FILM_SIZE = (1920, 1080)  # [px] that the grid is fitted into
+_GRID_LIMIT = 12  # rows and columns
 _LENGTH = 40  # [s] of a film at the default speed, at most
 _FREEZE = 1.0  # [s] that the end is held
 T = TypeVar("T")
@@ -46,7 +47,8 @@ class Film(Action[Path]):
     run: str | Path = option("", positional=True)
     """Run folder of `rps sweep`."""
     grid: str | None = None
-    """Rows and columns of the film; by default 4x6, or with --laws a row for each and 3 columns."""
+    """Greatest number of rows and columns, as 4x6; fewer worlds have a smaller grid of larger
+    tiles. By default 5x5, or with --laws a row for each and 3 columns; --worlds are all shown."""
     law: str | None = None
     """Which of the run's laws; by default the first."""
     laws: tuple[str, ...] = ()
@@ -72,12 +74,15 @@ class Film(Action[Path]):
 
     @property
     def shape(self) -> tuple[int, int]:
-        """Rows and columns."""
-        grid = self.grid or (f"{len(self.laws)}x3" if self.laws else "4x6")
-        match = re.fullmatch(r"([1-9]|1[0-2])x([1-9]|1[0-2])", grid)
+        """Rows and columns, at most."""
+        if self.grid is None:
+            rows = len(self.laws) if len(self.laws) > 1 else 0
+            columns = _GRID_LIMIT if self.worlds else 3 if rows else 5
+            return rows or columns, columns
+        match = re.fullmatch(r"([1-9]|1[0-2])x([1-9]|1[0-2])", self.grid)
         if match is None:
-            rule = "write ROWSxCOLUMNS, as 4x6, each from 1 to 12"
-            raise errors.not_allowed("grid", grid, rule)
+            rule = f"write ROWSxCOLUMNS, as 4x6, each from 1 to {_GRID_LIMIT}"
+            raise errors.not_allowed("grid", self.grid, rule)
         return int(match[1]), int(match[2])
 
     def note(self) -> str:
@@ -111,8 +116,10 @@ class Film(Action[Path]):
         speed = self.speed or float(max(1, math.ceil(seconds / _LENGTH)))
         tiles = [map(Tile, take.scenes, take.part.worlds.p_world_target) for take in takes]
         frames = _frames(takes, setting, speed, seconds, callback)
-        grid = {"shape": self.shape, "size": _tile_size(self.shape), "camera": self.camera}
-        video.render(_in_grid_order(tiles, takes), frames, out, fps=_FPS, **grid)
+        ordered = _in_grid_order(tiles, takes)
+        shape = fitted_grid(len(ordered), self.shape, rows=len(self.laws))
+        grid = {"shape": shape, "size": _tile_size(shape), "camera": self.camera}
+        video.render(ordered, frames, out, fps=_FPS, **grid)
         return out
 
     def takes(self) -> tuple[list[Take], Setting]:
@@ -144,10 +151,11 @@ def of_sweep(
 ) -> list[Take]:
     """Return the takes of worlds of a sweep, with a row of the grid for each of several laws.
 
-    The `selection` is `first`, `hardest` (as in the report of the sweep), or indices.
+    The `selection` is `first`, `hardest` (as in the report of the sweep), or indices; `shape` is
+    rows and columns of the grid, at most.
 
     Raises:
-      InputError: the plan has not these laws and worlds, or the grid no row for each law.
+      InputError: the plan has not these laws and worlds, or the grid no room for them.
     """
     errors.check_each_once("laws", laws)
     for law in laws:
@@ -160,7 +168,10 @@ def of_sweep(
         errors.check_each_once("worlds", selection)
         for world in selection:
             errors.check_count("worlds", world, at_least=0, at_most=plan.worlds - 1)
-        index = np.asarray(selection[:count], int)
+        if len(selection) > count:
+            rule = f"the film has room for {count}: name fewer, or a larger --grid"
+            raise errors.not_allowed("number of worlds", len(selection), rule)
+        index = np.asarray(selection, int)
     elif selection == "first":
         index = np.arange(min(count, plan.worlds))
     else:
@@ -174,12 +185,23 @@ def of_sweep(
         for object_index in np.unique(of_object):
             columns = np.flatnonzero(of_object == object_index)
             worlds = index[columns].tolist()
-            tiles = (row * shape[1] + columns).tolist()
+            tiles = (row * index.size + columns).tolist()
             part = build_batch(plan, law, index[columns])
             scenes = [scene_of(plan, i) for i in worlds]
             labels = [f"{prefix}world {i}" for i in worlds]
             takes.append(Take(tiles, part, scenes, labels))
     return takes
+
+
+def fitted_grid(tiles: int, shape: tuple[int, int], rows: int = 1) -> tuple[int, int]:
+    """Return rows and columns, at most `shape`, of the grid with the largest tiles.
+
+    Several `rows` are used as they are, with a law in each.
+    """
+    if rows > 1:
+        return rows, tiles // rows
+    grids = [(-(-tiles // columns), columns) for columns in range(1, shape[1] + 1)]
+    return min((grid for grid in grids if grid[0] <= shape[0]), key=lambda x: (max(x), *x))
 
 
 def _tile_size(shape: tuple[int, int]) -> tuple[int, int]:

@@ -32,7 +32,7 @@ SIZE = (960, 540)  # [px] width, height
 
 _EMPTY = 58  # grey of a place in a grid without a trial
 _INK = (24, 26, 30)  # RGB around labels and tiles
-_LABEL = 13  # [1] heights of a label in a tile
+_LABEL, _LABEL_SIZES = 13, (9, 40)  # [1] heights of a label in a tile; [px] its sizes
 
 _FIX_FFMPEG = "ffmpeg was not found or does not run: run `pip install imageio-ffmpeg`."
 
@@ -142,7 +142,7 @@ def _labelled(renderer: SceneRenderer, shot: Shot) -> np.ndarray:
     if not shot.label:
         return drawn
     image = Image.fromarray(drawn)
-    font = ImageFont.load_default(size=max(9, image.height // _LABEL))
+    font = ImageFont.load_default(size=int(np.clip(image.height // _LABEL, *_LABEL_SIZES)))
     draw = ImageDraw.Draw(image)
     draw.text((5, 3), shot.label, "white", font, stroke_width=2, stroke_fill=_INK)
     draw.rectangle((0, 0, image.width - 1, image.height - 1), outline=_INK)
