@@ -118,6 +118,17 @@ def test_above_is_a_map_with_x_up_and_y_left(box):
 
 
 @pytest.mark.parametrize("camera", ["above", "oblique"])
+def test_the_camera_follows_a_base_that_drives_away(box, camera):
+    options = {"p_world_target": FAR, "size": (320, 180), "camera": camera}
+    poses = np.tile(scene.initial_qpos(box), (4, 1))
+    poses[:2, [0, 3]] += 12.0
+    poses[:2, [1, 4]] -= 9.0
+    poses[1::2, 3] += 99.0  # the object is out of sight
+    far, without, near, ground = (video.images(box, [qpos], **options)[0] for qpos in poses)
+    assert len(changed(far, without)) > 0.7 * len(changed(near, ground)) > 50
+
+
+@pytest.mark.parametrize("camera", ["above", "oblique"])
 def test_both_cameras_see_targets_on_all_sides(box, camera):
     qpos = scene.initial_qpos(box)
     for target in itertools.product((-2.5, 2.5), repeat=2):

@@ -30,6 +30,7 @@ if TYPE_CHECKING:
 
     from rps_jax.world.scene import Scene
 
+_VIEW = 2.0  # [m] from the middle to where a base is in view; beyond, the camera follows it
 _TRAIL_STEP = 0.02  # [m] between the points of a trail
 _TRAIL_POINTS = 1500  # at most, so that memory stays flat: 30 m; the oldest go first
 _TRAIL_WIDTH = 0.007  # [1] of the image's height
@@ -115,6 +116,7 @@ class SceneRenderer:
         self.data.qpos[:] = qpos
         self.mujoco.mj_kinematics(self.model, self.data)  # poses of the bodies, without dynamics
         self.mujoco.mj_camlight(self.model, self.data)
+        self.data.cam_xpos[:, :2] += qpos[:2] - np.clip(qpos[:2], -_VIEW, _VIEW)
         self.renderer.update_scene(self.data, camera=self.camera)
         view = self.renderer.scene
         view.flags[self.mujoco.mjtRndFlag.mjRND_SHADOW] = self._size[1] >= _SHADOWS_FROM
