@@ -78,13 +78,19 @@ def test_a_push_draws_and_films_a_trial(tmp_path, capsys):
     assert int(trace.outcome_success) == 1
     assert (tmp_path / "trial.png").stat().st_size > 10_000
     assert (tmp_path / "push.mp4").stat().st_size > 1_000
+    text, page = ((tmp_path / f"report.{kind}").read_text() for kind in ("md", "html"))
+    assert '<video src="push.mp4"' in text
+    assert "![Film](stills.png)" in text
+    assert (tmp_path / "stills.png").stat().st_size > 10_000
+    assert page.count('src="data:image/png;base64,') == 2
+    assert page.count('src="data:video/mp4;base64,') == 1
 
 
 def test_a_push_without_ffmpeg_explains_the_fix_and_does_the_rest(tmp_path, capsys, monkeypatch):
     monkeypatch.setenv("IMAGEIO_FFMPEG_EXE", "/bin/false")
     assert rps(PUSH, tmp_path) == 0
     printed = capsys.readouterr().out
-    assert "no film: " in printed
+    assert "There is no film: " in printed
     assert "pip install imageio-ffmpeg" in printed
     assert (tmp_path / "trial.png").exists()
     assert not (tmp_path / "push.mp4").exists()

@@ -16,12 +16,18 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _STYLE = """
-body { font: 15px/1.5 system-ui, sans-serif; max-width: 72em; margin: 2em auto; padding: 0 1em; }
-table { border-collapse: collapse; margin: 1em 0; font-size: 13px; }
+body { font: 15px/1.5 system-ui, sans-serif; max-width: 72em; margin: 2em auto; padding: 0 1em;
+  overflow-wrap: anywhere; }
+table { border-collapse: collapse; margin: 1em 0; font-size: 13px; display: block;
+  max-width: max-content; overflow-x: auto; overflow-wrap: normal; }
 th, td { border: 1px solid #ccc; padding: .2em .6em; text-align: left; }
 th { background: #f2f2f2; }
-img { max-width: 100%; display: block; margin: 1em 0; }
+img, video { max-width: 100%; display: block; margin: 1em 0; }
 code { background: #f5f5f5; }
+@media (max-width: 45em) { /* figures stay readable, and scroll */
+  p:has(> img) { overflow-x: auto; }
+  img { max-width: 36em; }
+}
 """
 
 
@@ -47,6 +53,7 @@ class Section(NamedTuple):
     text: str = ""  # Markdown
     table: Sequence[Sequence[str]] = ()  # header and rows
     picture: Picture | None = None
+    film: Path | None = None  # MP4 in the folder of the report
 
     def _repr_markdown_(self) -> str:
         """Return heading, text and table as Markdown, also for Jupyter."""
@@ -58,23 +65,29 @@ def write_report(folder: Path, title: str, intro: str, sections: Sequence[Sectio
     """Write `report.md` and the self-contained `report.html`; return the path of the first."""
     import markdown  # imported late: it takes as long as all other imports of this module
 
-    texts, pictures = [f"# {title}", intro], {}
+    texts, media = [f"# {title}", intro], {}
     for section in sections:
         texts.append(section._repr_markdown_())
+        if section.film:
+            name = section.film.name
+            media[name] = "video/mp4", section.film.read_bytes()
+            texts.append(f'<video src="{name}" controls loop muted playsinline></video>')
+            texts.append(f"Film: [{name}]({name})")
         if section.picture:
-            name = f"{section.picture.name}.png"
-            pictures[name] = section.picture.png()
-            files.write_bytes(folder / name, pictures[name])
+            name, content = f"{section.picture.name}.png", section.picture.png()
+            media[name] = "image/png", content
+            files.write_bytes(folder / name, content)
             texts.append(f"![{section.title}]({name})")
     text = "\n\n".join(text for text in texts if text) + "\n"
     files.write_text(folder / "report.md", text)
     body = markdown.markdown(text, extensions=["tables"])
-    for name, content in pictures.items():
+    for name, (kind, content) in media.items():
         data = base64.b64encode(content).decode()
-        body = body.replace(f'src="{name}"', f'src="data:image/png;base64,{data}"')
+        body = body.replace(f'src="{name}"', f'src="data:{kind};base64,{data}"')
     page = (
-        f'<!doctype html><html lang="en"><meta charset="utf-8"><title>{html.escape(title)}</title>'
-        f"<style>{_STYLE}</style>{body}</html>\n"
+        '<!doctype html><html lang="en"><meta charset="utf-8">'
+        '<meta name="viewport" content="width=device-width, initial-scale=1">'
+        f"<title>{html.escape(title)}</title><style>{_STYLE}</style><body>{body}</html>\n"
     )
     files.write_text(folder / "report.html", page)
     return folder / "report.md"

@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING, TextIO
 from rps_jax.errors import InputError
 
 if TYPE_CHECKING:
+    from rps_jax.analysis.report import Section
     from rps_jax.app.cli.flags import Session
     from rps_jax.runs.push import Trace
     from rps_jax.runs.question import Command, Question
@@ -166,12 +167,14 @@ def execute(command: Command[object], session: Session, faults: list[str]) -> No
             if results is not None:
                 print(f"{command.name}: {results}")
             return
-        report = _write_report(command, results, bar)
+        film: list[Section] = []
+        if session.video and isinstance(results, Trace):
+            bar.phase("film")
+            film.append(_film(results, out, session.film_length, shown=command.shows_progress))
+        report = _write_report(command, results, bar, film)
     print(report.read_text(encoding="utf-8"))
     if timing:
         print(timing)
-    if session.video and isinstance(results, Trace):
-        _write_film(results, out, session.film_length)
     if getattr(command, "film", False) and (out / "worlds").is_dir():
         from rps_jax.app.film import Film
 
@@ -185,8 +188,10 @@ def _import_early() -> None:
     threading.Thread(target=list, args=(imports,), daemon=True).start()
 
 
-def _write_report(question: Question[object], results: object, bar: Bar) -> Path:
-    """Write the report of the results, and return its path."""
+def _write_report(
+    question: Question[object], results: object, bar: Bar, film: list[Section]
+) -> Path:
+    """Write the report of the results, with the section of a film, and return its path."""
     import xarray as xr
 
     from rps_jax.analysis.report import write_report
@@ -195,7 +200,7 @@ def _write_report(question: Question[object], results: object, bar: Bar) -> Path
 
     out = Path(str(question.out))
     bar.phase("report")
-    sections = question.report(results, question.create_run(out, bar))
+    sections = [*question.report(results, question.create_run(out, bar)), *film]
     intro = [question.intro(results)]
     with contextlib.suppress(InputError):
         intro.append(provenance.describe(out))
@@ -205,16 +210,17 @@ def _write_report(question: Question[object], results: object, bar: Bar) -> Path
     return write_report(out, question.title, "\n\n".join(filter(None, intro)), sections)
 
 
-def _write_film(trace: Trace, out: Path, seconds: float) -> None:
-    """Write stills and the film of a trial to its run folder, with a bar."""
+def _film(trace: Trace, out: Path, seconds: float, *, shown: bool) -> Section:
+    """Write the film of a trial to its run folder; return its section of the report."""
     from tqdm import tqdm
 
-    from rps_jax.analysis.report import save
+    from rps_jax.analysis.report import Picture, Section
     from rps_jax.world import video
 
     try:
-        save(trace.stills(), out / "stills.png")
-        watch = partial(tqdm, unit="frame", desc="film")
-        print(f"film: {trace.film(out / 'push.mp4', seconds, watch=watch)}")
+        stills = trace.stills()
+        watch = partial(tqdm, unit="frame", desc="film", disable=not shown, leave=False)
+        film = trace.film(out / "push.mp4", seconds, watch=watch)
     except video.VideoError as error:
-        print(f"no film: {error}")
+        return Section("Film", f"There is no film: {error}")
+    return Section("Film", picture=Picture("stills", lambda: stills), film=film)
