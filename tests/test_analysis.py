@@ -2,6 +2,7 @@
 
 import itertools
 
+import chromium
 import numpy as np
 import pytest
 import xarray as xr
@@ -9,6 +10,7 @@ from helpers import results_of
 from scipy import stats
 
 from rps_jax.analysis import report, statistics, tables
+from rps_jax.analysis.figures.paper import one_trial
 from rps_jax.analysis.figures.style import Figure
 from rps_jax.analysis.figures.sweeps import success_curves
 from rps_jax.analysis.report import Picture, Section
@@ -226,10 +228,68 @@ def test_a_report_is_one_self_contained_html_file(tmp_path):
     assert "<td>1</td>" in page
     assert 'src="data:image/png;base64,' in page
     assert "dot.png" not in page
+    assert '<meta name="viewport" content="width=device-width, initial-scale=1">' in page
     assert "A &lt;title&gt;" in page
     assert path == tmp_path / "report.md"
     assert "![Numbers](dot.png)" in path.read_text()
     assert (tmp_path / "dot.png").read_bytes() == picture.png()
+
+
+def test_a_report_embeds_a_film(tmp_path):
+    film = tmp_path / "push.mp4"
+    film.write_bytes(b"film")
+    report.write_report(tmp_path, "push", "", [Section("Film", film=film)])
+    text, page = ((tmp_path / f"report.{kind}").read_text() for kind in ("md", "html"))
+    assert '<video src="push.mp4" controls' in text
+    assert "[push.mp4](push.mp4)" in text
+    assert '<video src="data:video/mp4;base64,ZmlsbQ==" controls' in page
+
+
+def test_a_report_fits_a_narrow_screen(tmp_path):
+    """Wide tables and figures scroll, and long words break."""
+    wide = Picture("wide", lambda: Figure(figsize=(11, 6)))
+    table = [["quantity"] * 12, ["1234567890"] * 12]
+    sections = [Section("a" * 200, "`" + "b" * 200 + "`", table, wide)]
+    report.write_report(tmp_path, "wide", "", sections)
+    with chromium.opened(tmp_path / "profile", "--headless=new") as browser:
+        size = {"width": 390, "height": 844, "deviceScaleFactor": 1, "mobile": True}
+        browser.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)
+        browser.get((tmp_path / "report.html").as_uri())
+        width = browser.execute_script("return document.documentElement.scrollWidth")
+        shown = "return document.querySelector('img').getBoundingClientRect().width"
+        assert width == 390
+        assert browser.execute_script(shown) > 500
+
+
+def test_fig_6_shows_contact_on_the_side_and_covers_nothing_by_a_legend(drawn):
+    time = np.arange(5.0)
+    ones = np.ones(5)
+    path = np.stack([-time, -time], axis=1)
+    qpos = np.zeros((5, 10))
+    qpos[:, :2], qpos[:, 3:5], qpos[:, 6] = path, path + 0.5, 1
+    columns = dict.fromkeys(("v_x", "v_y", "omega", "a_r", "contact_type", "realigning"), ones)
+    trace = xr.Dataset(
+        {name: ("time", values) for name, values in columns.items()}
+        | {"qpos": (("time", "joint"), qpos), "p_world_contact": (("time", "axis"), path)}
+        | {"l": ("time", 0.3 * np.sign(time - 2)), "half_length": 0.4, "half_width": 0.3}
+        | {"outline": (("corner", "axis"), 0.2 * np.eye(2)), "d_success": 0.05}
+        | {"p_world_target": ("axis", [1.0, 1.0]), "outcome_success": 1, "outcome_time": 4.0},
+        {"time": time},
+    )
+    figure = drawn(one_trial, trace, "a push")
+    path, _, offset, _, rate = figure.axes
+    low, high = offset.get_ylim()
+    l = offset.lines[0].get_ydata()  # noqa: E741
+    assert low < -0.31 < min(l) < max(l) < 0.31 < high
+    (a_r,) = rate.lines
+    assert not np.isclose(a_r.get_ydata()[0], rate.get_ylim()).any()
+    legends = [ax.get_legend() for ax in figure.axes if ax.get_legend()]
+    assert len(legends) == 3
+    for legend in legends:
+        box = legend.get_window_extent()
+        assert not any(box.overlaps(ax.get_window_extent()) for ax in figure.axes)
+    names = [text.get_text() for text in path.get_legend().get_texts()]
+    assert names == ["base", "contact point", "object", "target"]
 
 
 # --- bounds --------------------------------------------------------------------------------

@@ -1,6 +1,7 @@
 """Figures of the paper, from its grid of trials and from traces over time."""
 
 from collections.abc import Sequence
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -24,6 +25,7 @@ from rps_jax.control.laws import rps
 from rps_jax.control.laws.rps import RPSParams
 from rps_jax.robot import shell, skin
 
+_BASE, _OBJECT = "0.35", "#8a5a2b"
 _SCALE, _COLOURS = Normalize(0, 2), "viridis_r"  # of the distance to the target [m], in Fig. 5
 
 
@@ -55,24 +57,25 @@ def one_trial(trace: xr.Dataset, title: str) -> Figure:
     grid = figure.add_gridspec(3, 2, width_ratios=(1.1, 1))
     path = figure.add_subplot(grid[:, 0], xlabel="x [m]", ylabel="y [m]")
     draw_path(path, trace)
-    path.legend(fontsize=8)
+    _legend_above(path)
 
     velocity = figure.add_subplot(grid[0, 1])
     velocity.plot(time, trace.v_x, label="$v_x$ [m/s]", color="C0")
     velocity.plot(time, trace.v_y, label="$v_y$ [m/s]", color="C1")
     velocity.plot(time, trace.omega, label=r"$\omega$ [rad/s]", color="C2")
-    velocity.legend(ncols=3, fontsize=8, loc="lower right")
+    _legend_above(velocity)
     velocity.set_ylabel("a) twist")
 
     offset = figure.add_subplot(grid[1, 1], sharex=velocity)
     offset.plot(time, np.where(touching, trace.l, np.nan), color="C0")
     offset.set_ylabel("b) $l$ [m]", color="C0")
-    offset.set_ylim(-trace.half_width, trace.half_width)
+    offset.set_ylim(-1.1 * trace.half_width, 1.1 * trace.half_width)  # the sides are inside
     for sign in (-1, 1) if "l_cr" in trace else ():
         offset.axhline(sign * float(trace.l_cr), color="0.6", lw=0.7, ls="--")
     rate = offset.twinx()
     rate.plot(time, np.where(touching, trace.a_r, np.nan), color="C3", lw=0.9)
     rate.set_ylabel("$a_r$ [1]", color="C3")
+    rate.margins(y=0.2)  # beside l where both are at their limits
 
     kind = figure.add_subplot(grid[2, 1], sharex=velocity)
     kind.step(time, trace.contact_type, where="post", color="0.2", lw=0.9)
@@ -84,13 +87,19 @@ def one_trial(trace: xr.Dataset, title: str) -> Figure:
         shade(ax, time, ~touching, SHADES["lost"])
     bands = (("Realignment State", SHADES["realigning"]), ("no contact", SHADES["lost"]))
     marks = [patches.Patch(color=colour, label=name) for name, colour in bands]
-    kind.legend(handles=marks, fontsize=8, loc="upper right", ncols=2)
+    _legend_above(kind, handles=marks)
     result = "reached" if trace.outcome_success else "not reached"
     x, y = trace.p_world_target.values
     figure.suptitle(
         f"{title}, target ({x:.3g}, {y:.3g}) m: {result} at {float(trace.outcome_time):.1f} s"
     )
     return figure
+
+
+def _legend_above(ax: Axes, **options: Any) -> None:
+    """Add a legend above a panel, where it covers nothing."""
+    columns = len(options.get("handles") or ax.get_legend_handles_labels()[1])
+    ax.legend(loc="lower right", bbox_to_anchor=(1, 1), ncols=columns, fontsize=8, **options)
 
 
 def _object(trace: xr.Dataset, index: int) -> np.ndarray:
@@ -101,21 +110,20 @@ def _object(trace: xr.Dataset, index: int) -> np.ndarray:
     return trace.outline.values @ turn.T + [x, y]
 
 
-def draw_path(ax: Axes, trace: xr.Dataset) -> None:
-    """Draw a trial as a map: paths of the base and of the contact point, and seven snapshots."""
+def draw_path(ax: Axes, trace: xr.Dataset, snapshots: int = 7) -> None:
+    """Draw a trial as a map: base, object and contact point, and snapshots from start to end."""
     pose, target = trace.qpos.values[:, :3], trace.p_world_target.values
     half = float(trace.half_length), float(trace.half_width)
-    ax.plot(*pose[:, :2].T, color="0.35", label="base")
-    ax.plot(*trace.p_world_contact.values.T, ".", ms=1.5, color="C0", label="contact point")
-    for index in np.linspace(0, len(pose) - 1, 7).astype(int):
-        ax.add_patch(base_patch(pose[index], half, fill=False))
-        last = index == len(pose) - 1
-        name = "object" if last else None
-        shown = {"fc": "#e8c39e", "ec": "#8a5a2b", "alpha": 0.9 if last else 0.35}
-        ax.fill(*_object(trace, index).T, label=name, **shown)
-    ax.plot(*target, "*", ms=14, color="C3", label="target")
+    ax.plot(*pose[:, :2].T, color=_BASE, label="base", zorder=3)
+    ax.plot(*trace.p_world_contact.values.T, ".", ms=2, color="C0", label="contact point")
+    ax.plot(*trace.qpos.values[:, 3:5].T, "--", lw=1, color=_OBJECT, label="object")
+    for index in np.linspace(0, len(pose) - 1, snapshots).astype(int):
+        alpha = 0.9 if index == len(pose) - 1 else 0.35
+        ax.fill(*_object(trace, index).T, fc="#e8c39e", ec=_OBJECT, alpha=alpha)
+        ax.add_patch(base_patch(pose[index], half, fill=False)).set_alpha(alpha)
+    ax.plot(*target, "*", ms=10, color="C3", label="target")
     ax.add_patch(patches.Circle(target, float(trace.d_success), fill=False, color="C3"))
-    ax.set_aspect("equal")
+    ax.set_aspect("equal", adjustable="datalim")
     ax.grid(alpha=0.3)
 
 
