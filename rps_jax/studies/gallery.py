@@ -1,6 +1,7 @@
 """Gallery of failures: maps of failed trials by failure mode, and what each mode has in common."""
 
 import shlex
+import textwrap
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -10,7 +11,7 @@ import numpy as np
 import xarray as xr
 from scipy import stats
 
-from rps_jax.analysis import statistics
+from rps_jax.analysis import mechanisms, statistics
 from rps_jax.analysis.figures.paper import draw_path
 from rps_jax.analysis.figures.style import Figure, tiles
 from rps_jax.analysis.report import Picture, Section
@@ -24,7 +25,8 @@ from rps_jax.trials.progress import SequentialProgress
 from rps_jax.trials.results import trace_dataset
 from rps_jax.world.domain import LABELS
 
-_COLUMNS = 6  # of maps
+_COLUMNS = 6  # of maps, at most
+_WIDTH = 7.2  # [in] of the maps side by side, at least
 NEAR = 0.2  # [m] least distance below which a timeout is near the target
 
 
@@ -108,7 +110,8 @@ class Gallery(Question[xr.Dataset]):
         return trials.assign(kind=("world", modes))
 
     def intro(self, results: xr.Dataset) -> str:
-        return f"Run {self.run}: failure modes and maps."
+        maps = "The maps show the outlines of base and object at the start (pale) and at the end."
+        return f"Run {self.run}: failure modes. {maps} {mechanisms.THRESHOLDS}"
 
     def report(self, results: xr.Dataset, run: Run) -> Sequence[Section]:
         plan, law = self.plan_and_law
@@ -122,7 +125,8 @@ class Gallery(Question[xr.Dataset]):
             title = f"{law}: {mode}, {len(plotted)} of {indices.size} in {size} worlds"
             text = _text(self.run, law, results, indices)
             picture = Picture(mode.replace(" ", "_"), partial(maps_figure, plotted, title))
-            sections.append(Section(f"{mode}: {indices.size} of {size}", text, (), picture))
+            rows = mechanism_table(plotted)
+            sections.append(Section(f"{mode}: {indices.size} of {size}", text, rows, picture))
         return sections
 
 
@@ -156,16 +160,37 @@ def _simulate(
     return traces
 
 
+def mechanism_table(traces: Mapping[int, xr.Dataset]) -> list[list[str]]:
+    """Return a row for the trace of each world: its end, and the mechanisms measured in it."""
+    rows = [["world", "end", "least distance", "path of the base", "measured"]]
+    for world, trace in traces.items():
+        text = mechanisms.describe(trace)
+        end, path = float(trace.outcome_time), float(trace.outcome_path_length)
+        rows.append([str(world), f"{end:.0f} s", _miss(trace), f"{path:.1f} m", text or "-"])
+    return rows
+
+
+def _miss(trace: xr.Dataset) -> str:
+    """Return the least distance of contact point and target in words."""
+    distance = float(trace.outcome_min_distance)
+    return f"{distance:.2f} m left" if np.isfinite(distance) else "untouched"
+
+
 def maps_figure(traces: Mapping[int, xr.Dataset], title: str) -> Figure:
     """Draw a map of the trial of each world."""
-    figure, axes = tiles(len(traces), _COLUMNS, (2.3, 2.4), (0.4, 0.9))
+    columns = min(_COLUMNS, len(traces))
+    width = max(2.3, _WIDTH / columns)
+    figure, axes = tiles(len(traces), columns, (width, width + 0.1), (0.4, 0.9))
     for ax, (world, trace) in zip(axes.ravel(), traces.items(), strict=False):
-        draw_path(ax, trace)
+        draw_path(ax, trace, snapshots=2)
         ax.tick_params(labelsize=6)
-        distance = float(trace.outcome_min_distance)
-        miss = f"{distance:.2f} m left" if np.isfinite(distance) else "untouched"
-        ax.set_title(f"world {world}, {miss}", fontsize=7)
+        ax.set_title(f"world {world}, {_miss(trace)}", fontsize=7)
+    for ax in axes[-1]:
+        ax.set_xlabel("x [m]", fontsize=7)
+    for ax in axes[:, 0]:
+        ax.set_ylabel("y [m]", fontsize=7)
     handles, names = axes[0, 0].get_legend_handles_labels()
     figure.legend(handles, names, fontsize=8, loc="outside lower center", ncols=len(names))
-    figure.suptitle(title, fontsize=10)
+    characters = int(12 * figure.get_figwidth())
+    figure.suptitle(textwrap.fill(title, characters, break_on_hyphens=False), fontsize=10)
     return figure
