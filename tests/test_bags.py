@@ -118,7 +118,7 @@ def test_a_bag_gives_the_same_steps_or_one_sentence(case, tmp_path, plain_steps)
 
 
 def test_the_twists_of_a_law_do_not_depend_on_the_order_of_a_bag(recorded, tmp_path):
-    """Nor on the format, the names of topics, or the frame of the target."""
+    """Nor on the names of its topics."""
     expected = shadow(recorded[0], "rps_plus")
     records = bad_bags.records_of(recorded[0].read_bytes())
     by_topic = sorted(records, key=lambda r: r.topic)
