@@ -25,6 +25,7 @@ from rps_jax.robot import robot as robots
 from rps_jax.robot.robot import RobotLike
 from rps_jax.robot.skin import with_contacts
 from rps_jax.runs.question import BagQuestion, Run, call_of
+from rps_jax.tuning.logs import motion_faults
 
 _UNITS = {"v_x": "m/s", "v_y": "m/s", "omega": "rad/s"}
 
@@ -67,6 +68,8 @@ class Shadow(BagQuestion[xr.Dataset]):
         """Run the law over the bag."""
         shell = robots.parse_robot(self.robot).shell
         recorded = with_contacts(self.steps, shell, f"bag = {self.file}")
+        motion = (recorded[name] for name in ("time", "pose", "twist"))
+        doubts = "; it ".join(motion_faults(*motion))  # the base may follow other commands
         twists = shadowed(registry.law_of(self.params), self.params, recorded)
         both = np.stack([recorded["twist"], twists])
         return xr.Dataset(
@@ -75,7 +78,7 @@ class Shadow(BagQuestion[xr.Dataset]):
                 for i, (name, unit) in enumerate(_UNITS.items())
             },
             {"source": ["commanded", "law"], "time": recorded["time"]},
-            {"law": registry.resolve_law(self.law)[0]},
+            {"law": registry.resolve_law(self.law)[0], "doubts": doubts},
         )
 
     def report(self, results: Any, run: Run) -> Sequence[Section]:
@@ -96,6 +99,8 @@ class Shadow(BagQuestion[xr.Dataset]):
             f"differences between the twists of {results.attrs['law']} and the recorded ones, at "
             "the same observations."
         )
+        if results.attrs["doubts"]:
+            text += f" Check the bag: it {results.attrs['doubts']}."
         if count := int(is_nan.sum()):
             text += (
                 f" {results.attrs['law']} returned NaN or infinity at {count} of {is_nan.size} "

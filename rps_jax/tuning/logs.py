@@ -230,7 +230,7 @@ def _faults(log: RawLog) -> Iterator[str]:
     jump = f"has a pose that jumps: {[*COLUMNS['pose']][axis]} from {change} in {at(i + 1)}"
     if 0 < np.mean(moved[:, :2] > 1) < _RARE:
         yield f"{jump}; cut the log there"
-    yield from _motion_faults(time, columns["pose"], columns["twist"])
+    yield from motion_faults(time, columns["pose"], columns["twist"])
     for key, limits in _LIMITS.items():
         values = np.abs(columns.get(key, np.zeros(len(limits)))).reshape(-1, len(limits)).max(0)
         for (title, (limit, unit)), value in zip(limits.items(), values, strict=True):
@@ -251,7 +251,7 @@ def _faults(log: RawLog) -> Iterator[str]:
         yield f"has its target {far:.3g} m from the start: target_x and target_y are not in metres"
 
 
-def _motion_faults(time: np.ndarray, pose: np.ndarray, twist: np.ndarray) -> Iterator[str]:
+def motion_faults(time: np.ndarray, pose: np.ndarray, twist: np.ndarray) -> Iterator[str]:
     """Yield the contradictions of motion (N, 3) and commands (N, 3), by their units or frames.
 
     A base that slips, lags, or is blocked for some time passes.
