@@ -103,7 +103,7 @@ class Fitted:
 class LogsQuestion(BagQuestion[Fitted], SimulationQuestion[Fitted]):
     """Question about logs, its first arguments."""
 
-    logs: tuple[str | Path | Trace, ...] = option((), positional=True)
+    logs: str | Path | Trace | Sequence[str | Path | Trace] = option((), positional=True)
     """Logs of one object on one floor: tables FILE.csv (time, x, y, yaw, contact_type, contact_x,
     contact_y, v_x, v_y, omega, target_x, target_y and, if known, object_x, object_y, object_yaw,
     force_x, force_y, taxel_0, ...), bags FILE.mcap, run folders of rps push, or traces. Titles may
