@@ -23,7 +23,6 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from rps_jax import errors
-from rps_jax.world import opengl
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
@@ -249,10 +248,12 @@ def choose_gl() -> None:
 def _import_mujoco() -> Any:
     try:
         choose_gl()
-        import mujoco
+        from rps_jax.world import opengl
     except Exception as error:  # of any kind, by a missing GL library
-        raise VideoError(opengl.FAULT or _FIX_GL) from error
-    return mujoco
+        raise VideoError(_FIX_GL) from error
+    if opengl.FAULT:
+        raise VideoError(opengl.FAULT)
+    return opengl.mujoco
 
 
 @contextlib.contextmanager
@@ -269,7 +270,7 @@ def _renderer(model: Any, size: tuple[int, int]) -> Iterator[Any]:
                 warnings.simplefilter("ignore")
                 renderer = mujoco.Renderer(model, height=height, width=width)
         except Exception as error:  # of any kind, by OpenGL
-            raise VideoError(opengl.FAULT or _FIX_GL) from error
+            raise VideoError(_FIX_GL) from error
         finally:
             buffer.offwidth, buffer.offheight, quality.offsamples = limits
     with contextlib.closing(renderer):
