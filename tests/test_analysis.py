@@ -56,9 +56,8 @@ def test_statistics_and_tables_of_a_sweep_by_hand():
         min_distance=[[0.04, 0.5, np.inf, 1], [0.04, 0.04, 1, 2]],
         contact_lost_time=[[0.0, 0, 0, 0], [0, 0, 151, 0]],
         path_length=[[2.0, 9, 9, 9], [3, 4, 9, 9]],
-        which_object=[0, 0, 1, 1],
         distance=[1.0, 2.0, 3.0, 1.0],
-    ).assign_coords(object=["box", "drum"], world=range(4))
+    ).assign_coords(object=("world", ["box", "box", "drum", "drum"]), world=range(4))
     first, second = (results.sel(law=law) for law in "ab")
     names = np.array([*statistics.FAILURES, ""])
     modes = [names[statistics.failure_modes(trials, 150)].tolist() for trials in (first, second)]

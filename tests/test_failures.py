@@ -9,7 +9,6 @@ from scipy import stats
 import rps_jax
 from rps_jax.control.laws.rps_plus import RPSPlusParams
 from rps_jax.errors import InputError
-from rps_jax.record import files
 from rps_jax.runs.question import Run
 from rps_jax.studies import attack, rare, regress, sensitivity
 from rps_jax.studies.probe import Probe
@@ -193,9 +192,9 @@ def test_an_attack_fills_many_more_cells_than_drawn_worlds(synthetic):
     assert (np.diff(results.severity) <= 0).all()
     worlds, elite = points.worlds_at("wide", results.u), results.isel(elite=0)
     at = {axis: float(worlds[axis][0]) for axis in ("com_offset", "friction_robot")}
-    margin = results.margin.isel(object=int(elite.which_object))
+    margin = results.margin.sel(object=elite.elite_object)
     assert float(elite.severity) - 1 in margin.sel(at, method="nearest").values
-    assert {0, 1} <= set(results.which_object.values)
+    assert {"random_box", "random_cylinder"} <= set(results.elite_object.values)
 
 
 def test_a_killed_attack_resumes_with_the_same_results(synthetic, tmp_path):
@@ -295,7 +294,7 @@ def test_the_command_of_sensitivity_draws_and_continues(tmp_path, capsys):
     assert "Trials fail at" in capsys.readouterr().out
     for name in ("sobol", "interactions"):
         assert (tmp_path / f"{name}.png").stat().st_size > 5000
-    indices = files.read_dataset(tmp_path / "sobol.nc")
+    indices = rps_jax.load(tmp_path)
     assert indices.total.sizes["factor"] == 5
 
 
@@ -332,8 +331,7 @@ def test_gains_and_losses_by_hand():
         contact_lost_time=np.zeros((1, 4)),
         tilt=np.zeros((1, 4)),
         distance=np.ones(4),
-        which_object=[0, 0, 1, 1],
-    ).assign_coords(known=["a", "b"], object=["random_box", "random_prism"])
+    ).assign_coords(known=["a", "b"], object=("world", ["random_box"] * 2 + ["random_prism"] * 2))
     results["known_success"] = ("known", "world"), known
     results["known_severity"] = ("known", "world"), np.where(known, 0.3, 1.1)
     assert regress.success_table(results)[-1] == ["mine", "2 of 4", "+1 -1", "+2 -1", "1"]

@@ -12,6 +12,7 @@ from helpers import PAPER, SLOTS, addresses, decode, rps
 import rps_jax
 from rps_jax.errors import InputError
 from rps_jax.record import files
+from rps_jax.runs.sweep import merge
 
 LAWS = {"paper": PAPER, "slow": PAPER._replace(v_max=0.02)}
 # As the examples of the docstrings, so that all share one program.
@@ -40,7 +41,7 @@ def test_a_sweep_in_memory_is_the_same_as_one_in_a_folder(engine, domain, tmp_pa
     options = {"worlds": 8, "setting": setting, "part": 4, "slots": SLOTS}
     results = rps_jax.sweep(LAWS, domain, **options)
     assert results.success.dims == ("law", "world")
-    assert dict(results.sizes) == {"law": 2, "world": 8, "pose": 3, "object": len(domain.objects)}
+    assert dict(results.sizes) == {"law": 2, "world": 8, "pose": 3}
     assert results.mass.dims == results.coords["mass"].dims == ("world",)
     identical(results, rps_jax.sweep(LAWS, domain, out=tmp_path, **options))
     identical(results, rps_jax.load(tmp_path))
@@ -54,6 +55,61 @@ def run(tmp_path_factory):
     """The folder of a sweep, and its results."""
     folder = tmp_path_factory.mktemp("sweep")
     return folder, rps_jax.sweep(LAWS, DRUMS, worlds=4, out=folder, **BRIEF)
+
+
+FAST = {"setting": rps_jax.Setting("quasistatic", rules=RULES)}
+TUNED = {"objects": ("random_cylinder",), "tuned": ("K_h", "K_v"), "worlds": 2, "validation": 2}
+STORED = {  # from the run folder of a sweep and a new folder, the answer of a call
+    "sweep": lambda run, out: rps_jax.sweep("rps", DRUMS, worlds=8, out=out, **FAST),
+    "score": lambda run, out: rps_jax.score("pursuit", domain=DRUMS, worlds=4, out=out, **FAST),
+    "regress": lambda run, out: rps_jax.regress({"mine": "rps"}, worlds=3, out=out, **FAST),
+    "push": lambda run, out: rps_jax.push("cylinder", target=(1.0, 0.5), out=out, **FAST).data,
+    "replay": lambda run, out: rps_jax.replay(run, 2, out=out).data,
+    "gallery": lambda run, out: rps_jax.gallery(run, out=out),
+    "merge": lambda run, out: merge((run,), out=out),
+    "tune_es": lambda run, out: rps_jax.tune_es(
+        "rps", **TUNED, population=4, generations=1, out=out, **FAST
+    ),
+}
+
+
+@pytest.mark.parametrize("name", STORED)
+def test_stored_results_are_those_of_the_call_and_of_xarray(name, run, tmp_path):
+    answer, path = STORED[name](run[0], tmp_path / "run"), tmp_path / "run" / "results.nc"
+    assert {"command", "version", "seed", "engine"} <= answer.attrs.keys()
+    assert answer.attrs.get("domain") == {"push": None, "regress": "wide"}.get(name, "custom")
+    assert answer.attrs["seed"] == 0
+    identical(answer, rps_jax.load(tmp_path / "run"))
+    with xr.open_dataset(path) as opened:
+        identical(answer, opened.load())
+    if "world" in answer.dims:
+        drawn = {"object", "mass", "size", "friction_ground", "bearing"}
+        assert drawn <= answer.coords.keys()
+        assert all(answer[x].attrs["long_name"] for x in answer.coords)
+        assert all("units" in answer[x].attrs for x in drawn - {"object"})
+        assert set(answer.object.values) <= {"random_cylinder", "random_box", "random_prism"}
+
+
+def test_results_of_an_earlier_version_get_the_labels_of_this_one(run, tmp_path):
+    folder, results = run
+    drawn = [name for name in results.coords if results[name].dims == ("world",)]
+    old = results.reset_coords(set(drawn) - {"world"}).drop_vars(["object", "pose"])
+    old = old.assign(which_object=("world", np.zeros(4, np.int16)))
+    old = old.assign_coords(object=["random_cylinder"]).assign_attrs(structure="0123")
+    files.write_results(tmp_path / "results.nc", old)
+    xr.testing.assert_equal(rps_jax.load(tmp_path), results)
+    assert rps_jax.load(tmp_path).coords.keys() == results.coords.keys()
+
+
+def test_candidates_are_labelled_by_their_parameters():
+    laws = ["rps,K_h=0.3", "rps,K_h=0.6"]
+    results = rps_jax.evaluate(laws, DRUMS, 2, split="validate", **FAST)
+    assert results.K_h.dims == ("candidate",)
+    assert results.K_h.values.tolist() == [0.3, 0.6]
+    assert results.swap_dims(candidate="K_h").score.sel(K_h=0.6).dims == ("world",)
+    attrs = {"seed": 0, "split": "validate", "engine": "quasistatic", "law": "RPSParams"}
+    assert attrs.items() <= results.attrs.items()
+    assert results.mass.attrs == {"units": "kg", "long_name": "mass of the object"}
 
 
 # --- one trial -----------------------------------------------------------------------------

@@ -95,8 +95,8 @@ def compare(first: xr.DataArray, second: xr.DataArray) -> Comparison:
 
 def worlds_by_object(results: xr.Dataset) -> dict[str, np.ndarray]:
     """Return a mask (world,) of the worlds with each object."""
-    index = results.which_object.values
-    return {str(name): index == i for i, name in enumerate(results.object.values)}
+    objects = results.object.values
+    return {str(name): objects == name for name in dict.fromkeys(objects.tolist())}
 
 
 def varied_quantities(results: xr.Dataset) -> list[str]:

@@ -206,7 +206,6 @@ def against_table(results: xr.Dataset, reference: str) -> list[list[str]]:
 
 def hardest_table(results: xr.Dataset, run: str, count: int = 10) -> list[list[str]]:
     """Return a row for each of the hardest worlds, with the command that replays it."""
-    names = [str(name) for name in results.object.values]
     laws = [str(law) for law in results.law.values]
     rows = [["world", "object", *laws, "mass", "friction", "target", "replay"]]
     for world in map(int, statistics.hardest(results, count)):
@@ -215,7 +214,7 @@ def hardest_table(results: xr.Dataset, run: str, count: int = 10) -> list[list[s
         rows.append(
             [
                 str(world),
-                names[int(trials.which_object)],
+                str(trials.object.values),
                 *(_outcome(trials.sel(law=law)) for law in laws),
                 f"{float(trials.mass):.1f} kg",
                 f"{float(trials.friction_ground):.2f}, {float(trials.friction_robot):.2f}",

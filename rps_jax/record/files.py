@@ -39,7 +39,6 @@ _KINDS: dict[FileKind, tuple[int, str]] = {  # greatest size [bytes], and a desc
 }
 _PACKED = (".gz", ".bz2", ".xz", ".zip")
 JsonObject = dict[str, Any]  # parsed JSON has values of any type
-_STRUCTURE = "structure"  # attribute of a NetCDF file
 
 
 class MissingFileError(InputError):
@@ -219,31 +218,15 @@ def read_results(folder: Path) -> xr.Dataset:
 def encode_results(results: xr.Dataset) -> bytes:
     """Return a NetCDF 4 file that depends on the results alone, not on time or machine.
 
-    It is built in memory, since HDF5 crashes the process when its disk is full. An attribute holds
-    the digest of its structure, by which `decode_results` notices edits.
+    It is built in memory, since HDF5 crashes the process when its disk is full.
     """
-    signed = results.assign_attrs({_STRUCTURE: _structure(results)})
     # A view that Python's garbage collector finds first crashes Python before 3.12.2.
-    with signed.to_netcdf(engine="h5netcdf") as view:
+    with results.to_netcdf(engine="h5netcdf") as view:
         return bytes(view)
 
 
-def _structure(results: xr.Dataset) -> str:
-    """Return the digest of the names, dimensions, sizes, types and units of all variables."""
-    variables = []
-    for name, variable in sorted(results.variables.items(), key=lambda item: str(item[0])):
-        # Texts may have any length.
-        dtype = "text" if variable.dtype.kind in "OUST" else variable.dtype.str
-        unit = variable.attrs.get("units", "")
-        variables.append((str(name), variable.dims, variable.shape, dtype, unit))
-    return sha256(repr(variables).encode())[:16]
-
-
-def decode_results(content: bytes, source: object, *, signed: bool = False) -> xr.Dataset:
-    """Return the results of `encode_results`; errors name the `source`.
-
-    If they must be `signed`, files without a digest of their structure are refused, too.
-    """
+def decode_results(content: bytes, source: object) -> xr.Dataset:
+    """Return the results of `encode_results`, as xarray opens them; errors name the `source`."""
     try:
         with xr.open_dataset(io.BytesIO(content), engine="h5netcdf") as results:
             size = sum(variable.nbytes for variable in results.variables.values())
@@ -252,10 +235,18 @@ def decode_results(content: bytes, source: object, *, signed: bool = False) -> x
             results.load()
     except Exception as error:  # of any kind, by HDF5 on damaged files
         raise CorruptFileError(source, error) from error
-    structure = results.attrs.pop(_STRUCTURE, None)
-    if structure != _structure(results) and (signed or structure is not None):
-        raise CorruptFileError(source, "its names, sizes, types or units were changed")
-    return results
+    return _with_current_labels(results)
+
+
+def _with_current_labels(results: xr.Dataset) -> xr.Dataset:
+    """Return results that version 0.3 or earlier stored with the labels of this version."""
+    results.attrs.pop("structure", None)
+    if "which_object" not in results or results.which_object.dims != ("world",):
+        return results
+    names = results.object.values[results.which_object.values]
+    results = results.drop_dims("object").drop_vars("which_object").assign(object=("world", names))
+    results = results.assign_coords(pose=["x", "y", "yaw"])
+    return results.set_coords([name for name in results if results[name].dims == ("world",)])
 
 
 def check_columns(

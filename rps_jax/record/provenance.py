@@ -1,6 +1,7 @@
 """Provenance of a run: command, versions, device and commit, in `environment.json`."""
 
 import contextlib
+import functools
 import importlib.metadata
 import platform
 import shlex
@@ -9,6 +10,7 @@ import sys
 import time
 from pathlib import Path
 
+from rps_jax import __version__
 from rps_jax.errors import InputError
 from rps_jax.record import files
 from rps_jax.record import folder as run_folder
@@ -29,6 +31,12 @@ def collect_environment(**device: object) -> JsonObject:
         **device,
         "packages": {name: _version(name) for name in _PACKAGES},
     }
+
+
+def attributes() -> dict[str, str]:
+    """Return command, version and commit of this process, as attributes of results."""
+    record = {"command": shlex.join(_command()), "version": __version__, "commit": git_commit()}
+    return {name: value for name, value in record.items() if value}
 
 
 def _command() -> list[str]:
@@ -104,6 +112,7 @@ def _version(package: str) -> str | None:
         return None
 
 
+@functools.cache
 def git_commit() -> str | None:
     """Return the git commit of the checkout of this code, marked if changed; None elsewhere."""
     root = Path(__file__).resolve().parents[2]

@@ -4,7 +4,7 @@ Worlds for tuning, validation and testing have different seeds.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Sequence, Set
 from typing import Any, NamedTuple, Unpack
 
 import jax
@@ -17,14 +17,14 @@ from rps_jax.control.base import LawParams
 from rps_jax.control.registry import LawLike
 from rps_jax.engines import device
 from rps_jax.errors import InputError
-from rps_jax.record import cache
+from rps_jax.record import cache, provenance
 from rps_jax.record import options as options_
 from rps_jax.robot.robot import RobotLike
-from rps_jax.runs.question import Split, seed_of
+from rps_jax.runs.question import Split, name_or_custom, seed_of
 from rps_jax.trials import batch
 from rps_jax.trials.batch import BatchOptions
 from rps_jax.trials.progress import Bar, ProgressCallback, Timing, is_interactive
-from rps_jax.trials.results import labelled, variable
+from rps_jax.trials.results import POSE, WORLD, labelled, variable
 from rps_jax.trials.rollout import Candidates, outcomes
 from rps_jax.trials.score import Objective
 from rps_jax.trials.setting import Setting
@@ -71,8 +71,8 @@ def evaluate(
       report_to: callback that receives the progress instead of a bar.
 
     Returns:
-      Scores and outcomes (candidate, world), and the drawn quantities (world) as coordinates. A
-      lower score is better.
+      Scores and outcomes (candidate, world). Coordinates are the drawn quantities (world) and the
+      scalar parameters (candidate) by name. A lower score is better.
 
     Raises:
       InputError: an argument is not allowed.
@@ -107,7 +107,25 @@ def evaluate(
     for name, values in scored.outcome._asdict().items():
         variables[name] = variable(name, dims, values)
     drawn = points_.drawn_columns(ranges, seed, at, request.worlds)
-    return xr.Dataset(variables, {"pose": ["x", "y", "yaw"], "world": request.worlds} | drawn)
+    tried = _parameters(params, {*variables, *drawn, "pose", "world", "candidate"})
+    indices = {
+        "candidate": ("candidate", np.arange(scored.score.shape[0]), {"long_name": "candidate"}),
+        "world": ("world", request.worlds, {"long_name": WORLD}),
+    }
+    attrs = provenance.attributes() | {"domain": name_or_custom(domain), "split": split}
+    attrs |= {"seed": setting.seed, "engine": setting.engine, "law": type(params).__name__}
+    return xr.Dataset(variables, {"pose": POSE} | indices | tried | drawn, attrs)
+
+
+def _parameters(params: LawParams, taken: Set[str]) -> dict[str, xr.Variable]:
+    """Return the scalar parameters (candidate) by name, or as `params.NAME` if it is taken."""
+    columns = {}
+    for name, values in registry.named_leaves(params).items():
+        if values.ndim == 1:
+            attrs = {"long_name": f"parameter {name} of the law"}
+            label = f"params.{name}" if name in taken else name
+            columns[label] = xr.Variable("candidate", values, attrs)
+    return columns
 
 
 def stack(laws: Sequence[LawLike]) -> LawParams:

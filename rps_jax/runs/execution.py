@@ -19,7 +19,6 @@ from rps_jax.record import files, provenance
 from rps_jax.record import folder as run_folder
 from rps_jax.record.checkpoint import Checkpoints
 from rps_jax.runs.plan import Plan, Shard, open_run, shard_chunks
-from rps_jax.runs.question import with_coordinates
 from rps_jax.runs.results import Results, name_of
 from rps_jax.trials.batch import BatchSize
 from rps_jax.trials.progress import Progress, ProgressCallback, no_progress
@@ -28,6 +27,12 @@ from rps_jax.trials.rollout import rollout
 
 # Runs the missing chunks of a shard in a folder, and may return their results.
 RunMissing = Callable[..., Results | None]
+# Adds attributes and other labels to the outcomes of all trials.
+Label = Callable[[xr.Dataset], xr.Dataset]
+
+
+def _unchanged(outcomes: xr.Dataset) -> xr.Dataset:
+    return outcomes
 
 
 def run_missing(
@@ -62,6 +67,7 @@ def run_plan(
     shard: Shard = Shard(),
     *,
     execute: RunMissing = run_missing,
+    label: Label = _unchanged,
     **options: Any,
 ) -> xr.Dataset:
     """Run a plan in memory, or what a run folder lacks of it or of a shard.
@@ -71,6 +77,7 @@ def run_plan(
       folder: run folder, which gets the chunks and `results.nc`; None: in memory.
       shard: part of the plan that is run in the folder.
       execute: `run_missing` or `cluster.run_on_cluster`.
+      label: completes the outcomes of all trials before they are written; not those of a shard.
       options: slots, workers and callback.
 
     Returns:
@@ -80,24 +87,26 @@ def run_plan(
     if folder is None:
         results = Results(plan, list(plan.chunks))
         rollout([results], plan.setting, results.collect, **options)
-        return with_coordinates(results.dataset())
+        return label(results.dataset())
     open_run(folder, plan)
     with run_folder.lock(folder, shard.index, shard.count):
         results = execute(folder, plan, shard=shard, **options) or Results(plan)
         if shard.count > 1:
             return _shard_dataset(results, folder, shard)
-        return write_dataset(results, [folder], folder)
+        return write_dataset(results, [folder], folder, label)
 
 
-def write_dataset(results: Results, folders: Sequence[Path], out: Path) -> xr.Dataset:
+def write_dataset(
+    results: Results, folders: Sequence[Path], out: Path, label: Label = _unchanged
+) -> xr.Dataset:
     """Add the chunks of run folders to results, and write `results.nc` into the folder `out`.
 
     Raises:
       InputError: chunks are missing.
     """
-    dataset = results.read_all(folders)
+    dataset = label(results.read_all(folders))
     files.write_results(out / "results.nc", dataset)
-    return with_coordinates(dataset)
+    return dataset
 
 
 def _shard_dataset(results: Results, folder: Path, shard: Shard) -> xr.Dataset:

@@ -68,4 +68,5 @@ def add_models(results: xr.Dataset, plan: Plan, run: Run) -> xr.Dataset:
     joined = joined.assign_coords(model=list(by_model))
     if run.folder is not None:
         files.write_results(run.folder / "models.nc", joined)
-    return results.assign(model_success=joined.success.transpose("model", "law", "world"))
+    success = joined.success.transpose("model", "law", "world").assign_attrs(results.success.attrs)
+    return results.assign(model_success=success)

@@ -27,6 +27,7 @@ from rps_jax.control.base import LawParams
 from rps_jax.errors import InputError
 from rps_jax.record import files, provenance
 from rps_jax.record import folder as run_folder
+from rps_jax.runs.question import name_or_custom
 from rps_jax.trials.batch import WorldBatch
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.worlds import drawn_scene, drawn_worlds
@@ -190,6 +191,12 @@ def load_plan(folder: Path) -> Plan:
             f"{provenance.package_version(folder)}: use that one."
         )
     return plan
+
+
+def attributes_of(plan: Plan) -> dict[str, str | int]:
+    """Return seed, engine and domain of a plan, as attributes of results."""
+    setting, name = plan.setting, name_or_custom(plan.domain)
+    return {"seed": setting.seed, "engine": setting.engine, "domain": name}
 
 
 def draw(plan: Plan, index: ArrayLike) -> Draw:

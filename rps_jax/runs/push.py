@@ -8,8 +8,8 @@ from __future__ import annotations
 import dataclasses
 import functools
 import json
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -28,7 +28,14 @@ from rps_jax.record import bag as bags
 from rps_jax.record import folder
 from rps_jax.record.bag import Step
 from rps_jax.record.options import option
-from rps_jax.runs.plan import Plan, build_batch, load_plan, scene_of, world_title
+from rps_jax.runs.plan import (
+    Plan,
+    attributes_of,
+    build_batch,
+    load_plan,
+    scene_of,
+    world_title,
+)
 from rps_jax.runs.question import Question, Run, SimulationQuestion, call_of
 from rps_jax.trials import pushes
 from rps_jax.trials.batch import WorldBatch
@@ -56,6 +63,7 @@ class Trace(Trajectory):
     scene: Scene
     title: str
     engine: str
+    attrs: Mapping[str, str | int] = field(default_factory=dict)  # of `data`
 
     def __repr__(self) -> str:
         return f"<Trace of {self.title}: {self.summary}>"
@@ -76,7 +84,7 @@ class Trace(Trajectory):
     @property
     def data(self) -> xr.Dataset:
         """The trial over time: variables (time, ...), its outcome as scalars."""
-        return trace_dataset(self)
+        return trace_dataset(self).assign_attrs(self.attrs)
 
     def plot(self, path: str | Path | None = None) -> Figure:
         """Draw the trial as Fig. 6 of the paper does; with a path it is written there, too."""
@@ -258,7 +266,8 @@ class Push(Case, TraceQuestion, SimulationQuestion[Trace]):
         case, setting = self.case, self.setting
         trajectory = self.record(pushes.build([case], setting), setting, run)
         scene = pushes.scene_of(case, setting.physics)
-        return Trace(**vars(trajectory), scene=scene, title=case.title, engine=setting.engine)
+        named = {"scene": scene, "title": case.title, "engine": setting.engine}
+        return Trace(**vars(trajectory), **named, attrs=self.attributes())
 
 
 push = call_of(Push)
@@ -315,7 +324,9 @@ class Replay(TraceQuestion):
         world = build_batch(plan, name, [self.world])
         trajectory = self.record(world, plan.setting, run)
         scene, title = scene_of(plan, self.world), f"{world_title(plan, self.world)}, {name}"
-        return Trace(**vars(trajectory), scene=scene, title=title, engine=plan.setting.engine)
+        named = {"scene": scene, "title": title, "engine": plan.setting.engine}
+        attrs = self.attributes() | attributes_of(plan)
+        return Trace(**vars(trajectory), **named, attrs=attrs)
 
 
 replay = call_of(Replay)

@@ -24,7 +24,17 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from operator import attrgetter
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, Generic, Literal, ParamSpec, Self, TypeVar
+from typing import (
+    TYPE_CHECKING,
+    Any,
+    ClassVar,
+    Generic,
+    Literal,
+    ParamSpec,
+    Self,
+    TypeVar,
+    get_args,
+)
 
 import jax
 import numpy as np
@@ -53,6 +63,7 @@ P = ParamSpec("P")
 D = TypeVar("D", bound="DataclassInstance")
 T = TypeVar("T", covariant=True)
 Split = Literal["tune", "validate", "test"]
+_SPLITS: tuple[Split, ...] = get_args(Split)
 _OLD_NAMES = {
     "OfLaw": "LawQuestion",
     "OfLaws": "MultiLawQuestion",
@@ -73,8 +84,13 @@ def seed_of(seed: int, split: Split) -> int:
 
     The worlds of a domain that draws little, such as `paper`, hardly depend on the seed.
     """
-    splits = ("tune", "validate", "test")
-    return len(splits) * seed + splits.index(errors.check_name("split", split, splits))
+    return len(_SPLITS) * seed + _SPLITS.index(errors.check_name("split", split, _SPLITS))
+
+
+def split_of(seed: int) -> tuple[int, Split]:
+    """Return the seed and the split for which `seed_of` returns a seed."""
+    seed, index = divmod(seed, len(_SPLITS))
+    return seed, _SPLITS[index]
 
 
 def call_of(command: Callable[P, Command[T]]) -> Callable[P, T]:
@@ -243,6 +259,16 @@ class Question(Command[T]):
         """Return everything that the answer depends on, as JSON."""
         return {"question": self.name} | self.fields_as_json()
 
+    def attributes(self) -> dict[str, str | int]:
+        """Return the attributes of the results: command, version, seed, engine and domain."""
+        record: dict[str, str | int] = {**provenance.attributes()}
+        if isinstance(setting := getattr(self, "setting", None), Setting):
+            record |= {"seed": setting.seed, "engine": setting.engine}
+        if (domain := getattr(self, "domain", None)) is not None:
+            several = [domain] if isinstance(domain, str | Domain) else domain
+            record["domain"] = " ".join(map(name_or_custom, several))
+        return record
+
     # --- execution -------------------------------------------------------------------------
 
     def execute(self, callback: ProgressCallback) -> T:
@@ -252,6 +278,8 @@ class Question(Command[T]):
             return self.answer(self.create_run(out, callback))
         with self.open_folder() as out:
             answer = self.answer(self.create_run(out, callback))
+            if isinstance(answer, xr.Dataset | xr.DataTree):
+                answer.attrs |= self.attributes()
             results = answer if isinstance(answer, xr.Dataset) else getattr(answer, "data", None)
             if out is not None and isinstance(results, xr.Dataset):
                 files.write_results(out / "results.nc", results)
@@ -394,16 +422,11 @@ def timing_line(timing: Timing, device: str) -> str:
     )
 
 
-def with_coordinates(results: xr.Dataset) -> xr.Dataset:
-    """Return results with names of a pose's axes, and with drawn quantities as coordinates."""
-    if "pose" in results.dims:
-        results = results.assign_coords(pose=["x", "y", "yaw"])
-    return results.set_coords([name for name in results if results[name].dims == ("world",)])
-
-
 def name_or_custom(item: object) -> str:
     """Return the name of a domain or a skin, or `custom` if it has none."""
-    return item if isinstance(item, str) else "custom"
+    if isinstance(item, str):
+        return item
+    return next((name for name, domain in domains.DOMAINS.items() if domain == item), "custom")
 
 
 def count_true(mask: np.ndarray) -> int:

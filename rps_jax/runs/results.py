@@ -20,14 +20,12 @@ from rps_jax.record import files, options
 from rps_jax.record.checkpoint import Checkpoints
 from rps_jax.record.table import check_parquet
 from rps_jax.runs.plan import Plan, chunks_by_key, draw
-from rps_jax.runs.question import with_coordinates
 from rps_jax.trials.batch import Job, WorldBatch
-from rps_jax.trials.results import UNITS, labelled, variable
+from rps_jax.trials.results import POSE, UNITS, WORLD, labelled, variable
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import Outcome
 from rps_jax.trials.worlds import drawn_worlds
-from rps_jax.world import draws
-from rps_jax.world.domain import LABELS, unit_of
+from rps_jax.world import draws, points
 
 StoreChunk = Callable[[int, bytes], object]  # called with the number of a chunk and its content
 # Types of an outcome's columns; the rest are float32.
@@ -172,28 +170,18 @@ class Results:
     # --- the dataset -----------------------------------------------------------------------
 
     def dataset(self) -> xr.Dataset:
-        """Return outcomes (law, world) and drawn quantities (world)."""
-        worlds = np.arange(self.plan.worlds)
-        objects = self.plan.object_of(worlds).astype(np.int16)
-        meaning = "index of the object in the coordinate object"
-        columns = labelled(which_object=("world", objects, "1", meaning))
-        for name, values in self._outcomes.items():
-            columns[name] = variable(name, ("law", "world"), values)
-        for name, values in self._drawn.items():
-            label = LABELS.get(name, name.replace("_", " "))
-            columns |= labelled(**{name: ("world", values, unit_of(name), label)})
-        for column in columns.values():
+        """Return outcomes (law, world), with the drawn quantities (world) as coordinates."""
+        worlds, dims = np.arange(self.plan.worlds), ("law", "world")
+        columns = {name: variable(name, dims, values) for name, values in self._outcomes.items()}
+        drawn = points.drawn_variables(self.plan.domain, self.plan.object_of(worlds), self._drawn)
+        for column in (*columns.values(), *drawn.values()):
             column.encoding["_FillValue"] = None  # every number is a result
-        labels = {
-            "law": (list(self.plan.laws), "what decides"),
-            "object": (list(self.plan.domain.objects), "name of the object"),
-            "world": (worlds, "index of the world"),
-        }
+        labels = {"law": (list(self.plan.laws), "what decides"), "world": (worlds, WORLD)}
         coordinates = {
             name: xr.Variable(name, values, {"long_name": meaning})
             for name, (values, meaning) in labels.items()
         }
-        return xr.Dataset(columns, coordinates)
+        return xr.Dataset(columns, coordinates | drawn | {"pose": POSE})
 
 
 def _prefetch(batches: Iterator[WorldBatch], count: int) -> Iterator[WorldBatch]:
@@ -222,9 +210,8 @@ def write_table(results: xr.Dataset, path: Path) -> None:
     Columns are law, world, object, the outcomes (poses as base_x, base_y [m], base_yaw [rad], and
     so on) and the drawn quantities. NAME.columns.csv has the unit and the meaning of each.
     """
-    flat = results.reset_coords().drop_vars(["which_object", "object", "pose"], errors="ignore")
-    objects = results.object.values[results.which_object.values]
-    columns = labelled(object=("world", objects, "", "name of the object"))
+    flat = results.reset_coords().drop_vars("pose", errors="ignore")
+    columns = {"object": results.object.variable}
     for name, values in ((str(name), values) for name, values in flat.items()):
         if values.dims == ("law", "world", "pose"):
             body = name.removesuffix("_pose")
@@ -250,7 +237,9 @@ def write_table(results: xr.Dataset, path: Path) -> None:
 
 
 def load(run: str | Path) -> xr.Dataset:
-    """Load the results of a run folder; those of a sweep have the drawn quantities as coordinates.
+    """Load the results of a run folder, as `xarray.open_dataset` reads its `results.nc`.
+
+    Those of a sweep have the drawn quantities as coordinates. The checksum of the file is verified.
 
     Raises:
       InputError: the folder holds no results, or its file is damaged.
@@ -267,4 +256,4 @@ def load(run: str | Path) -> xr.Dataset:
       True
     """
     options.check_arguments(load, {"run": run})
-    return with_coordinates(files.read_results(Path(run)))
+    return files.read_results(Path(run))

@@ -24,7 +24,7 @@ from rps_jax.record import folder as run_folder
 from rps_jax.record.options import option
 from rps_jax.runs import cluster, model_panel
 from rps_jax.runs.execution import run_missing, run_plan, write_dataset
-from rps_jax.runs.plan import Plan, Shard, load_plan, open_run, shard_chunks
+from rps_jax.runs.plan import Plan, Shard, attributes_of, load_plan, open_run, shard_chunks
 from rps_jax.runs.question import (
     DomainQuestion,
     MultiLawQuestion,
@@ -58,7 +58,13 @@ class PlanQuestion(SimulationQuestion[xr.Dataset]):
         return self.plan.configuration()
 
     def answer(self, run: Run) -> xr.Dataset:
-        return run_plan(self.plan, run.folder, **run.batch_options)
+        return run_plan(
+            self.plan, run.folder, label=partial(self.labelled, run=run), **run.batch_options
+        )
+
+    def labelled(self, outcomes: xr.Dataset, run: Run) -> xr.Dataset:
+        """Return the outcomes of all trials as they are stored, with attributes."""
+        return outcomes.assign_attrs(self.attributes())
 
 
 @dataclass(frozen=True)
@@ -208,8 +214,17 @@ class Sweep(SweepOptions, SweepQuestion):
     def answer(self, run: Run) -> xr.Dataset:
         """Run the plan; of a single shard, return its own trials (row)."""
         execute = cluster.on_cluster(self.ray, self.ray_device) if self.ray else run_missing
-        options = run.batch_options
-        outcomes = run_plan(self.plan, run.folder, self.parsed_shard, execute=execute, **options)
+        return run_plan(
+            self.plan,
+            run.folder,
+            self.parsed_shard,
+            execute=execute,
+            label=partial(self.labelled, run=run),
+            **run.batch_options,
+        )
+
+    def labelled(self, outcomes: xr.Dataset, run: Run) -> xr.Dataset:
+        outcomes = super().labelled(outcomes, run)
         return model_panel.add_models(outcomes, self.plan, run) if self.models else outcomes
 
     def execute(self, callback: ProgressCallback) -> xr.Dataset:
@@ -269,7 +284,9 @@ class Merge(Question[xr.Dataset]):
                     f"run = {folder} has another plan than {first} "
                     f"({run_folder.describe_difference(manifest, shard)}): merge shards of one run."
                 )
-        merged = write_dataset(Results(self.plan), folders, open_run(out, self.plan))
+        attrs = self.attributes() | attributes_of(self.plan)
+        label = partial(xr.Dataset.assign_attrs, **attrs)
+        merged = write_dataset(Results(self.plan), folders, open_run(out, self.plan), label)
         for folder in folders:
             provenance.write_environment(out, provenance.read_environment(folder))
         return merged

@@ -369,17 +369,19 @@ class _Search:
         failed = failed[np.argsort(-elites["objective"][failed], kind="stable")]
         worst = {name: x[failed] for name, x in elites.items()}
         ranges = [quantities[name] for name in axes]
+        objects = np.array(self.domain.objects)
         middles = (np.arange(self.options.cells) + 0.5) / self.options.cells
         return xr.Dataset(
             {
                 "margin": (("object", *axes), margin),
                 "u": (("elite", "quantity"), worst["solution"]),
                 "severity": ("elite", worst["objective"]),
-                **{name: ("elite", worst[name]) for name in ("time", "left", "which_object")},
+                **{name: ("elite", worst[name]) for name in ("time", "left")},
+                "elite_object": ("elite", objects[worst["which_object"]]),
                 **{name: ("generation", x) for name, x in pd.DataFrame(history).items()},
             },
             {
-                "object": list(self.domain.objects),
+                "object": objects,
                 "quantity": list(quantities),
                 **{x.name: (x.name, x.range.at(middles), {"units": x.unit}) for x in ranges},
             },

@@ -32,7 +32,7 @@ from rps_jax.control.laws.guided import KNOTS, GuidedParams
 from rps_jax.control.laws.rps import RPSParams
 from rps_jax.record import files
 from rps_jax.record.options import option
-from rps_jax.runs.plan import Plan, load_plan
+from rps_jax.runs.plan import Plan, attributes_of, load_plan
 from rps_jax.runs.question import DomainQuestion, Run, call_of, count_true, seed_of
 from rps_jax.trials import score
 from rps_jax.trials.progress import SequentialProgress
@@ -121,6 +121,9 @@ class Ceiling(DomainQuestion[xr.Dataset]):
         search = {name: getattr(self, name) for name in _SEARCH_OPTIONS}
         worlds = self.world_indices.tolist()
         return {"ceiling": self.plan.configuration(), "worlds": worlds} | search
+
+    def attributes(self) -> dict[str, str | int]:
+        return super().attributes() | ({} if self.run is None else attributes_of(self.plan))
 
     def answer(self, run: Run) -> xr.Dataset:
         """Search plans round by round; a resumed run loads its finished rounds."""

@@ -33,6 +33,7 @@ from rps_jax.runs.question import (
     count_true,
     name_or_custom,
     seed_of,
+    split_of,
 )
 from rps_jax.runs.sweep import Sweep, SweepOptions, describe_plan
 from rps_jax.trials.progress import ProgressCallback, SequentialProgress
@@ -55,12 +56,15 @@ def _senses(params: LawParams) -> Senses:
 class _TestSweep(Sweep):
     """Sweep over the test worlds of one domain, labelled with what each law senses."""
 
-    def answer(self, run: Run) -> xr.Dataset:
-        results = super().answer(run)
-        if "row" in results.dims:  # trials of one shard
-            return results
-        senses = [_senses(self.chosen[str(law)]) for law in results.law.values]
-        return results.assign_coords(senses=("law", senses, {"long_name": "what the law senses"}))
+    def attributes(self) -> dict[str, str | int]:
+        """Return the attributes of the results, with the seed of the ladder."""
+        seed, split = split_of(self.setting.seed)
+        return super().attributes() | {"seed": seed, "split": split}
+
+    def labelled(self, outcomes: xr.Dataset, run: Run) -> xr.Dataset:
+        outcomes = super().labelled(outcomes, run)
+        senses = [_senses(self.chosen[str(law)]) for law in outcomes.law.values]
+        return outcomes.assign_coords(senses=("law", senses, {"long_name": "what the law senses"}))
 
     def report(self, results: xr.Dataset, run: Run) -> Sequence[Section]:
         first, *rest = super().report(results, run)

@@ -69,7 +69,8 @@ class Paper(SimulationQuestion[xr.DataTree]):
         results["hardware"] = hardware.answer(run)
         if run.folder is not None:
             for name, dataset in results.items():
-                files.write_results(run.folder / f"{name}.nc", dataset)
+                labelled = dataset.assign_attrs(self.attributes())
+                files.write_results(run.folder / f"{name}.nc", labelled)
         return xr.DataTree.from_dict(results)
 
     def intro(self, results: xr.DataTree) -> str:

@@ -66,11 +66,14 @@ class Regress(PlanQuestion, MultiLawQuestion[xr.Dataset]):
         at = points.check_points(DOMAINS[DOMAIN], worlds().u.values[: self.worlds])
         return Plan(DOMAINS[DOMAIN], len(at.u), self.chosen, self.setting, points=at)
 
-    def answer(self, run: Run) -> xr.Dataset:
-        results = super().answer(run)
+    def attributes(self) -> dict[str, str | int]:
+        return super().attributes() | {"domain": DOMAIN}
+
+    def labelled(self, outcomes: xr.Dataset, run: Run) -> xr.Dataset:
+        outcomes = super().labelled(outcomes, run)
         known = worlds()[["success", "severity"]].reset_coords(drop=True)
-        known = known.isel(world=slice(results.sizes["world"]))
-        return results.merge(known.rename({name: f"known_{name}" for name in known}))
+        known = known.isel(world=slice(outcomes.sizes["world"]))
+        return outcomes.merge(known.rename({name: f"known_{name}" for name in known}))
 
     def intro(self, results: xr.Dataset) -> str:
         return (
@@ -109,12 +112,12 @@ def changes(results: xr.Dataset, law: str, against: str, rules: Rules = Rules())
     """Return a row for each world whose outcome changes with a law, the worst losses first."""
     severity = severity_of(results.sel(law=law), rules)
     earlier = results.known_severity.sel(known=against).values
-    names = [str(name).replace("_", " ") for name in results.object.values]
     rows = [["world", "object", against, law]]
     for world in np.argsort(earlier - severity, kind="stable"):
         if (severity[world] < 1) != (earlier[world] < 1):
             cells = [_outcome(float(values[world])) for values in (earlier, severity)]
-            rows.append([str(world), names[int(results.which_object[world])], *cells])
+            name = str(results.object.values[world]).replace("_", " ")
+            rows.append([str(world), name, *cells])
     return rows
 
 

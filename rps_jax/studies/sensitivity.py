@@ -22,7 +22,6 @@ from rps_jax import errors
 from rps_jax.analysis import statistics
 from rps_jax.analysis.figures.style import Figure, Normalize, ScalarMappable, quantity, tiles
 from rps_jax.analysis.report import Picture, Section
-from rps_jax.record import files
 from rps_jax.record.options import option
 from rps_jax.runs.plan import Plan
 from rps_jax.runs.question import (
@@ -112,11 +111,8 @@ class Sensitivity(PlanQuestion, DomainQuestion[xr.Dataset], LawQuestion[xr.Datas
         at = points.check_points(self.ranges, self.u())
         return Plan(self.ranges, len(at.u), {"law": self.params}, self.setting, points=at)
 
-    def answer(self, run: Run) -> xr.Dataset:
-        results = analyze(self, super().answer(run))
-        if run.folder is not None:
-            files.write_results(run.folder / "sobol.nc", results)
-        return results
+    def labelled(self, outcomes: xr.Dataset, run: Run) -> xr.Dataset:
+        return super().labelled(analyze(self, outcomes), run)
 
     def intro(self, results: xr.Dataset) -> str:
         design = f"{self.base} for each of {len(self.factors)} factors and two more"

@@ -14,6 +14,8 @@ from rps_jax.trials.pushes import Trajectory
 from rps_jax.trials.trial import Outcome
 
 DIMS = ("law", "object", "friction", "target")
+WORLD = "index of the world"
+POSE = xr.Variable("pose", ["x", "y", "yaw"], {"long_name": "x [m], y [m] and yaw [rad]"})
 UNITS = {
     "success": ("1", "target reached within the rules"),
     "time": ("s", "simulated time at which the trial ended"),
@@ -73,7 +75,7 @@ def outcome_dataset(
             "target": np.arange(len(targets)),
             "target_x": ("target", position[:, 0], {"units": "m"}),
             "target_y": ("target", position[:, 1], {"units": "m"}),
-            "pose": ["x", "y", "yaw"],
+            "pose": POSE,
         },
     )
 

@@ -7,7 +7,7 @@ numbers in [0, 1), of which a domain reads only some. A search for worlds moves 
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -23,6 +23,7 @@ from rps_jax.record import files
 from rps_jax.robot.robot import Robot
 from rps_jax.world import draws
 from rps_jax.world.domain import (
+    LABELS,
     QUANTITIES,
     RANDOM,
     VELOCITY_ERRORS,
@@ -246,15 +247,25 @@ def worlds_at(
 
 def drawn_columns(
     domain: Domain, seed: int, points: Points | None, index: np.ndarray
-) -> dict[str, Any]:
+) -> dict[str, xr.Variable]:
     """Return objects and drawn quantities of worlds as coordinates of a dataset."""
-    objects = domain.object_of(cases(domain, points, index))
-    columns: dict[str, Any] = {"object": ("world", np.array(domain.objects)[objects])}
+    columns: dict[str, np.ndarray] = {}
     for rows, drawn in draw_by_object(domain, seed, points, index):
-        for name, (values, unit) in draws.table(drawn).items():
-            empty = ("world", np.empty(index.size), {"units": unit})
-            columns.setdefault(name, empty)[1][rows] = values
-    return columns
+        for name, (values, _) in draws.table(drawn).items():
+            columns.setdefault(name, np.empty(index.size))[rows] = values
+    return drawn_variables(domain, domain.object_of(cases(domain, points, index)), columns)
+
+
+def drawn_variables(
+    domain: Domain, objects: np.ndarray, columns: Mapping[str, np.ndarray]
+) -> dict[str, xr.Variable]:
+    """Return objects (n,) and drawn quantities (n,) of worlds with names, units and meanings."""
+    names = np.array([domain.objects[i] for i in objects.tolist()])
+    variables = {"object": xr.Variable("world", names, {"long_name": "name of the object"})}
+    for name, values in columns.items():
+        label = LABELS.get(name, name.replace("_", " "))
+        variables[name] = xr.Variable("world", values, {"units": unit_of(name), "long_name": label})
+    return variables
 
 
 def _labelled(domain: Domain, u: np.ndarray) -> xr.Dataset:
