@@ -73,11 +73,14 @@ STORED = {  # from the run folder of a sweep and a new folder, the answer of a c
 }
 
 
+DOMAIN_TEXTS = {"push": None, "regress": "wide", "tune_es": "wide"}  # the rest: `DRUMS`
+
+
 @pytest.mark.parametrize("name", STORED)
 def test_stored_results_are_those_of_the_call_and_of_xarray(name, run, tmp_path):
     answer, path = STORED[name](run[0], tmp_path / "run"), tmp_path / "run" / "results.nc"
     assert {"command", "version", "seed", "engine"} <= answer.attrs.keys()
-    assert answer.attrs.get("domain") == {"push": None, "regress": "wide"}.get(name, "custom")
+    assert answer.attrs.get("domain") == DOMAIN_TEXTS.get(name, "custom")
     assert answer.attrs["seed"] == 0
     identical(answer, rps_jax.load(tmp_path / "run"))
     with xr.open_dataset(path) as opened:
@@ -91,7 +94,7 @@ def test_stored_results_are_those_of_the_call_and_of_xarray(name, run, tmp_path)
 
 
 def test_results_of_an_earlier_version_get_the_labels_of_this_one(run, tmp_path):
-    folder, results = run
+    _, results = run
     drawn = [name for name in results.coords if results[name].dims == ("world",)]
     old = results.reset_coords(set(drawn) - {"world"}).drop_vars(["object", "pose"])
     old = old.assign(which_object=("world", np.zeros(4, np.int16)))

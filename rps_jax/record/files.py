@@ -206,9 +206,13 @@ def read_dataset(path: Path) -> xr.Dataset:
 
 def read_results(folder: Path) -> xr.Dataset:
     """Read the results of a run folder; InputError if they are missing or corrupt."""
-    path = Path(folder) / "results.nc"
+    folder = Path(folder)
+    path = folder / "results.nc"
     if not path.exists():
-        raise InputError(f"run = {folder} holds no results.nc: give the folder of a finished run.")
+        inner = next((f", as {file.parent}" for file in sorted(folder.glob("*/results.nc"))), "")
+        raise InputError(
+            f"run = {folder} holds no results.nc: give the folder of a finished run{inner}."
+        )
     return read_dataset(path)
 
 

@@ -58,12 +58,20 @@ def claim(folder: Path, configuration: JsonObject) -> Path:
         if not (folder / MANIFEST).exists():
             _copy_sources(folder, configuration)
             files.write_json(folder / MANIFEST, new, checked=True)
-        elif (stored := files.read_checked_json(folder / MANIFEST)) != new:
+        elif words := difference(folder, configuration):
             raise InputError(
-                f"out = {folder} holds another run ({describe_difference(stored, new)}): choose "
-                "another folder, ask for the same, or pass --overwrite."
+                f"out = {folder} holds another run ({words}): choose another folder, ask for the "
+                "same, or remove it first by --overwrite (in Python overwrite=True)."
             )
     return folder
+
+
+def difference(folder: Path, configuration: JsonObject) -> str:
+    """Return how the run in a folder differs from a configuration, in words; "" without a run."""
+    if not (folder / MANIFEST).exists():
+        return ""
+    stored = files.read_checked_json(folder / MANIFEST)
+    return describe_difference(stored, json.loads(json.dumps(configuration)))
 
 
 def sources(folder: Path, digest: str) -> Path:

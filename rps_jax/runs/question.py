@@ -19,6 +19,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import functools
+import itertools
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields
@@ -71,7 +72,9 @@ _OLD_NAMES = {
     "Pushes": "SimulationQuestion",
 }
 # Options that say how a run is executed; results do not depend on them.
-_EXECUTION_OPTIONS = ("out", "bag", "slots", "workers", "quick", "progress", "report_to")
+_EXECUTION_OPTIONS = (
+    *("out", "overwrite", "bag", "slots", "workers", "quick", "progress", "report_to"),
+)
 
 
 def __getattr__(name: str) -> Any:
@@ -231,6 +234,9 @@ class Action(Command[T]):
 class Question(Command[T]):
     """Command with an answer, which is labelled data with a report."""
 
+    overwrite: bool = False
+    """Whether a run that the folder already holds is removed first."""
+
     TITLE: ClassVar[str] = ""  # of the report
     IGNORED_FIELDS: ClassVar[tuple[str, ...]] = ()  # fields on which the answer does not depend
     # Whether `answer` opens the run folder and stores results.
@@ -273,6 +279,8 @@ class Question(Command[T]):
 
     def execute(self, callback: ProgressCallback) -> T:
         """Answer the question, and store the results in the run folder if there is one."""
+        if self.overwrite and self.out is not None:
+            folder.remove_run(Path(self.out))
         if self.STORES_ITSELF:
             out = None if self.out is None else Path(self.out)
             return self.answer(self.create_run(out, callback))
@@ -284,6 +292,15 @@ class Question(Command[T]):
             if out is not None and isinstance(results, xr.Dataset):
                 files.write_results(out / "results.nc", results)
             return answer
+
+    def in_free_folder(self) -> Self:
+        """Return the question with the first of the folders OUT, OUT-2, ... without another run."""
+        first, configuration = Path(str(self.out)), self.configuration()
+        for number in itertools.count(1):
+            out = first if number == 1 else first.with_name(f"{first.name}-{number}")
+            if self.overwrite or not folder.difference(out, configuration):
+                return self if number == 1 else dataclasses.replace(self, out=out)
+        raise AssertionError
 
     def create_run(self, out: Path | None, callback: ProgressCallback) -> Run:
         """Return the run folder and the resources of the run."""

@@ -274,6 +274,9 @@ class Merge(Question[xr.Dataset]):
         if self.out is None:
             raise InputError("out = None is not allowed: name the run folder of the merged sweep.")
 
+    def configuration(self) -> dict[str, Any]:
+        return self.plan.configuration()
+
     def answer(self, run: Run) -> xr.Dataset:
         first, *rest = folders = [Path(folder) for folder in self.folders]
         out = run_folder.ensure_writable(Path(str(self.out)))

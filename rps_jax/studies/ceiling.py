@@ -65,8 +65,9 @@ class Ceiling(DomainQuestion[xr.Dataset]):
     """Run folder of a sweep or a ladder that gives domain, worlds and setting."""
     sample: int = option(300, 0, 10_000_000)
     """Number of worlds, from the first on, that are tried whichever law succeeds in them."""
-    lost_by: tuple[str, ...] = ("rps_tuned",)
-    """Laws of the run; worlds in which they all fail are tried, too."""
+    lost_by: tuple[str, ...] = ()
+    """Laws of the run; worlds in which they all fail are tried, too. By default rps_tuned if the
+    run has it, else the first law of the run."""
     most: int | None = option(None, 0, 10_000_000)
     """Maximum number of these failed worlds; by default all."""
     samples: int = option(64, 3, 100_000)
@@ -88,12 +89,18 @@ class Ceiling(DomainQuestion[xr.Dataset]):
         """Outcomes (law, world) of the run, if there is one."""
         return None if self.run is None else files.read_results(Path(self.run))
 
+    @property
+    def failing_laws(self) -> tuple[str, ...]:
+        """Laws of the run whose failed worlds are tried."""
+        laws = [] if self.results is None else self.results.law.values.tolist()
+        return self.lost_by or tuple(["rps_tuned"] if "rps_tuned" in laws else laws[:1])
+
     @functools.cached_property
     def world_indices(self) -> np.ndarray:
         """Indices (W,) of the worlds that are tried."""
         if self.results is None:
             return np.arange(self.sample)
-        failed = failed_worlds(self.results, self.lost_by)
+        failed = failed_worlds(self.results, self.failing_laws)
         first = np.arange(min(self.sample, self.results.sizes["world"]))
         return np.union1d(failed[: self.most], first).astype(int)
 
@@ -224,9 +231,9 @@ class Ceiling(DomainQuestion[xr.Dataset]):
             "not solve may still be solvable."
         )
         if self.results is not None:
-            laws = " and ".join(self.lost_by)
+            laws = " and ".join(self.failing_laws)
             text = f"Worlds in which {laws} fail, and the first {self.sample} worlds. {text}"
-            table = solved_table(results, self.results, self.lost_by)
+            table = solved_table(results, self.results, self.failing_laws)
         return [Section("A planner that knows the world", text, table)]
 
 

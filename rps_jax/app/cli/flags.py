@@ -47,7 +47,6 @@ class Session:
     """Options of the command line alone, at their defaults. Subclasses offer some as flags."""
 
     device: Device = option("auto", hidden=True)
-    overwrite: bool = option(False, hidden=True)
     video: bool = option(True, hidden=True)
     film_length: float = option(FILM_LENGTH, hidden=True)
 
@@ -60,8 +59,6 @@ class FolderSession(Session):
     """Where the worlds are stepped: auto takes the GPU if JAX finds one, and processors for a few
     trials, which they have ended before a GPU has begun. On a processor the fused engine is
     compiled by the machine's C compiler if it has one, with xla by XLA alone."""
-    overwrite: bool = False
-    """Whether a run that the folder already holds is removed first."""
 
 
 @dataclass(frozen=True)

@@ -131,11 +131,12 @@ def execute(command: Command[object], session: Session, faults: list[str]) -> No
     from tqdm import tqdm
 
     from rps_jax.engines import device
-    from rps_jax.record import cache, folder
+    from rps_jax.record import cache
     from rps_jax.runs.push import Trace
     from rps_jax.runs.question import Question, timing_line
     from rps_jax.world import opengl
 
+    is_default = command.out == type(command)().out
     if command.out is None:
         command = dataclasses.replace(command, out=command.default_folder)
     if opengl.FAULT:
@@ -148,13 +149,15 @@ def execute(command: Command[object], session: Session, faults: list[str]) -> No
         jax.config.update("jax_platforms", "cpu")
     command = command.with_faults(faults)
     command.validate()
+    if is_default and isinstance(command, Question):
+        default, command = command.out, command.in_free_folder()
+        if command.out != default:
+            print(f"{default} holds another run: the folder of this one is {command.out}.")
     _raise_interrupts()
     if note := command.note():
         print(note)
     cache.use_cache()
     out = Path(str(command.out))
-    if session.overwrite:
-        folder.remove_run(out)
     tqdm.set_lock(threading.RLock())  # of this process alone: no semaphore is left if it is stopped
     with command.progress_bar() as bar:
         _raise_interrupts()
