@@ -14,7 +14,7 @@ from rps_jax.control.laws.rps import BOUNDS, RPSParams
 from rps_jax.errors import InputError
 from rps_jax.runs import evaluate
 from rps_jax.runs.evaluate import CandidateScores
-from rps_jax.runs.question import Run
+from rps_jax.runs.question import Run, split_of
 from rps_jax.trials.progress import Timing, no_progress
 from rps_jax.trials.score import Objective
 from rps_jax.trials.setting import Setting
@@ -215,7 +215,11 @@ def pretended(monkeypatch):
     """Arguments of the calls that run worlds, which return a formula instead."""
     calls = []
 
-    score = lambda *args, **how: calls.append(args) or pretend(*args, **how)  # noqa: E731
+    def score(asks, *args, **how):
+        if split_of(asks[0].seed)[1] != "test":  # of the end
+            calls.append(asks)
+        return pretend(asks, *args, **how)
+
     monkeypatch.setattr(evaluate, "score_candidates", score)
     return calls
 

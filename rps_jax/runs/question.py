@@ -239,6 +239,8 @@ class Question(Command[T]):
 
     TITLE: ClassVar[str] = ""  # of the report
     IGNORED_FIELDS: ClassVar[tuple[str, ...]] = ()  # fields on which the answer does not depend
+    # Whether the report has the times of all processes of the run.
+    REPORTS_TIMES: ClassVar[bool] = False
     # Whether `answer` opens the run folder and stores results.
     STORES_ITSELF: ClassVar[bool] = False
 
@@ -260,6 +262,16 @@ class Question(Command[T]):
     def intro(self, results: Any) -> str:
         """Return the first paragraph of the report."""
         return ""
+
+    def quick_note(self) -> str:
+        """Return the first line of the report of a quick run, or nothing."""
+        if not getattr(self, "quick", False) or not self.quick_values():
+            return ""
+        values = (_value_in_words(name, attrgetter(name)(self)) for name in self.quick_values())
+        return (
+            f"**This is a quick run** ({'; '.join(values)}). It tests that the command works here; "
+            "for results leave out --quick."
+        )
 
     def configuration(self) -> dict[str, Any]:
         """Return everything that the answer depends on, as JSON."""
@@ -437,6 +449,15 @@ def timing_line(timing: Timing, device: str) -> str:
         f"compile {timing.compile:.1f} s, run {timing.run:.1f} s ({rate:.0f} simulated s per s) on "
         f"{device}"
     )
+
+
+def _value_in_words(name: str, value: object) -> str:
+    """Return the name and the value of an option in words; of a record what is no default."""
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        changed = (f for f in fields(value) if getattr(value, f.name) != f.default)
+        return "; ".join(_value_in_words(f.name, getattr(value, f.name)) for f in changed)
+    words = map(str, value) if isinstance(value, tuple | list) else [str(value)]
+    return f"{name.rpartition('.')[2].replace('_', ' ')} {', '.join(words)}"
 
 
 def name_or_custom(item: object) -> str:

@@ -5,7 +5,7 @@
 
 import functools
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, field, fields, replace
 from functools import partial
@@ -71,7 +71,8 @@ class Learn(PPO, SimulationQuestion[xr.Dataset]):
     """Learn a law from touch by PPO, in random worlds for tuning, and write it as `policy.npz`.
 
     The answer is the learning curve: the metrics of each update (update), with units as
-    attributes. Its attributes `compile` and `run` [s] split the wall clock.
+    attributes. Its attributes `compile` and `run` [s] split the wall clock, and `test_success` [1]
+    is the success rate of the learned law in test worlds.
 
     Example:
       >>> import rps_jax
@@ -85,6 +86,7 @@ class Learn(PPO, SimulationQuestion[xr.Dataset]):
 
     TITLE: ClassVar[str] = "A learned law"
     IGNORED_FIELDS: ClassVar[tuple[str, ...]] = ("minutes", "updates", "every")
+    REPORTS_TIMES: ClassVar[bool] = True
     QUICK: ClassVar[Mapping[str, Any]] = {
         "domain": ("wide,objects=random_box",),
         "network": "mlp",
@@ -172,22 +174,35 @@ class Learn(PPO, SimulationQuestion[xr.Dataset]):
         simulated = float(results.simulated[-1]) if results.sizes["update"] else 0.0
         seconds = results.attrs["run"]
         validated = results.to_dataframe().dropna(subset="validation")
+        worlds = self.validation * sum(len(domain.objects) for domain in self.domains)
+
+        def share(rate: float) -> str:
+            return tables.share(round(rate * worlds), worlds)
+
         text = (
-            f"Compile {results.attrs['compile']:.1f} s, run {seconds:.1f} s "
-            f"({simulated / max(seconds, 1e-9):.0f} simulated s per s). "
-            f"`{run.folder}/policy.npz` is the learned law, with a validation success of "
-            f"{tables.percent(max(validated.validation, default=0.0))} %."
+            f"`{run.folder}/policy.npz` is the learned law. "
+            f"{_test_sentence(results.attrs, share)}In validation its success is "
+            f"{share(max(validated.validation, default=0.0))}; these worlds chose it among the "
+            f"validated laws. Compile {results.attrs['compile']:.1f} s, run {seconds:.1f} s "
+            f"({simulated / max(seconds, 1e-9):.0f} simulated s per s)."
         )
         rows = [["update", "wall clock", "success in validation", "mean time", "curriculum"]]
         for update, row in validated.iterrows():
             wall, level = f"{row.time / 60:.1f} min", f"{100 * row.level:.0f} %"
-            rate, mean = f"{tables.percent(row.validation)} %", f"{row.validation_time:.0f} s"
+            rate, mean = share(row.validation), f"{row.validation_time:.0f} s"
             rows.append([str(update), wall, rate, mean, level])
         picture = Picture("curve", partial(figure_of, results))
         return [Section("Learning curve", text, rows, picture)]
 
 
 learn = call_of(Learn)
+
+
+def _test_sentence(attrs: Mapping[str, Any], share: Callable[[float], str]) -> str:
+    """Return the success of the learned law in the test worlds, if it was tested."""
+    if "test_success" not in attrs:
+        return ""
+    return f"Test: in worlds that it has not met, it succeeds in {share(attrs['test_success'])}. "
 
 
 class _Learner:
@@ -229,11 +244,11 @@ class _Learner:
     def run(self) -> xr.Dataset:
         """Learn until the time limit or the number of updates, with 0 for no limit."""
         seconds, updates = 60 * self.options.minutes, self.options.updates
-        reserve = 0.0  # [s] for the last validation
+        reserve = 0.0  # [s] for the last validation, and as long for the test
         last_checkpoint = last_validation = self.elapsed
 
         def is_finished() -> bool:
-            late = seconds and self.elapsed + reserve >= seconds
+            late = seconds and self.elapsed + 2 * reserve >= seconds
             return bool(late or (updates and len(self.curve) >= updates))
 
         while not is_finished():
@@ -246,7 +261,12 @@ class _Learner:
                 last_checkpoint = self.elapsed
         if self.curve and np.isnan(self.curve[-1]["validation"]):
             self._validate()
-        return self.checkpoint()
+        curve = self.checkpoint()
+        if self.curve:
+            tables = [env.table for env in self.options.environments("test")]
+            success, _ = jax.device_get(self._evaluate(tables, self.best))
+            curve.attrs["test_success"] = float(np.mean(success))
+        return curve
 
     def _record(self, metrics: Metrics) -> None:
         """Add an update to the curve, and report the progress."""

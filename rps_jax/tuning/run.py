@@ -19,7 +19,7 @@ import numpy as np
 import xarray as xr
 
 from rps_jax import errors
-from rps_jax.analysis import tables
+from rps_jax.analysis import statistics, tables
 from rps_jax.analysis.figures import tuning as figures
 from rps_jax.analysis.report import Picture, Section
 from rps_jax.control import registry
@@ -29,7 +29,7 @@ from rps_jax.record import files
 from rps_jax.record.options import option
 from rps_jax.runs import evaluate
 from rps_jax.runs.evaluate import Candidates, CandidateScores
-from rps_jax.runs.question import LawQuestion, Run, seed_of
+from rps_jax.runs.question import LawQuestion, Run, count_true, seed_of
 from rps_jax.trials.progress import Bar, Progress
 from rps_jax.trials.score import Objective
 from rps_jax.trials.trial import Rules
@@ -58,6 +58,7 @@ class Tuning(LawQuestion[xr.Dataset]):
     """Base of the questions for better parameters of a law."""
 
     IGNORED_FIELDS: ClassVar[tuple[str, ...]] = ("budget", "generations")
+    REPORTS_TIMES: ClassVar[bool] = True
     QUICK: ClassVar[dict[str, Any]] = {
         # The few parameters that matter most, since few trials cannot determine more; cylinders on
         # the quasi-static model, which compile and run fastest.
@@ -205,7 +206,25 @@ class Tuning(LawQuestion[xr.Dataset]):
             count, simulated = count + 1, simulated + float(results.simulated)
             report(Progress(0, 0.0))
             proposal = search.send({str(name): x.values for name, x in results.items()})
-        return self._write(run.folder, best, log)
+        results = self._write(run.folder, best, log)
+        return results.merge(self._test(best, run._replace(callback=report)))
+
+    def _test(self, best: np.ndarray, run: Run) -> xr.Dataset:
+        """Return the success of start and tuned law in worlds that the search has not met."""
+
+        def compute() -> xr.Dataset:
+            params, seed = self.space.params(np.stack([self.base, best])), self.setting.seed
+            worlds = np.arange(self.validation)
+            request = Candidates(params, self.domains, seed_of(seed, "test"), worlds)
+            (scores,), _ = evaluate.score_candidates(
+                [request], self.setting, self.objective, **run.batch_options
+            )
+            attrs = {"units": "1", "long_name": "success in worlds that the search has not met"}
+            success = np.asarray(scores.outcome.success, np.int8)
+            variables = {"test_success": (("tested", "test_world"), success, attrs)}
+            return xr.Dataset(variables, {"tested": ["start", "tuned"]})
+
+        return run.checkpoint(f"test-{files.sha256(best.tobytes())[:8]}", compute)
 
     def _try_proposal(self, proposal: Proposal, generation: int, run: Run) -> xr.Dataset:
         """Try the proposal of a generation, and return its results."""
@@ -247,13 +266,17 @@ class Tuning(LawQuestion[xr.Dataset]):
         )
 
     def report(self, results: xr.Dataset, run: Run) -> Sequence[Section]:
-        best = int(results.validation.argmin("generation"))
-        rates = [tables.percent(float(rate)) for rate in results.validation_success.values]
+        best, worlds = int(results.validation.argmin("generation")), results.sizes["test_world"]
+        counts = np.rint(worlds * results.validation_success.values).astype(int).tolist()
+        rates = [tables.share(count, worlds) for count in counts]
         totals = (f"{x} {float(results[x].sum()):,.1f} s" for x in UNITS if x in results)
         text = (
-            f"Validation: objective {float(results.validation[0]):.4f} and success {rates[0]} % "
-            f"at the start, {float(results.validation[best]):.4f} and {rates[best]} % after "
-            f"{best} of {results.sizes['generation']}. Times: {', '.join(totals)}."
+            f"{test_sentences(results.test_success)}\n\n"
+            f"Validation: objective {float(results.validation[0]):.4f} and success {rates[0]} "
+            f"at the start, {float(results.validation[best]):.4f} and {rates[best]} after "
+            f"{best} of {results.sizes['generation']}. These worlds chose the generation, so the "
+            f"tuned law looks better there than it is. Times of the generations: "
+            f"{', '.join(totals)}."
         )
         if run.folder is not None:
             text += f" The law with these parameters is `{self.label},{run.folder / TUNED}`."
@@ -263,6 +286,20 @@ class Tuning(LawQuestion[xr.Dataset]):
             rows.append([str(name), f"{float(start[str(name)]):.4g}", f"{float(value):.4g}"])
         picture = Picture("tuning", partial(figures.search, results))
         return [Section("Results", text, rows, picture)]
+
+
+def test_sentences(success: xr.DataArray) -> str:
+    """Return sentences on the success (tested, test_world) of start and tuned law."""
+    start, tuned = success
+    c = statistics.compare(start, tuned)
+    rates = [tables.share(count_true(x.values > 0), x.size) for x in success]
+    better = "better" if c.gained > c.lost else "worse"
+    verdict = f"The tuned law is {better}." if c.p < 0.05 else "Too few to tell which is better."
+    return (
+        f"Test: in {start.size} worlds that the search has not met, the start succeeds in "
+        f"{rates[0]} and the tuned law in {rates[1]}; {c.gained} gained and {c.lost} lost "
+        f"(McNemar p = {c.p:.2g}). {verdict}"
+    )
 
 
 def _is_of_proposal(results: xr.Dataset, vectors: np.ndarray) -> bool:

@@ -165,6 +165,7 @@ def execute(command: Command[object], session: Session, faults: list[str]) -> No
         bar.on_compiled = _import_early
         results = command.execute(bar)
         timed = bar.timing.simulated > 0 and bar.over != "clock"
+        timed = timed and not getattr(command, "REPORTS_TIMES", False)
         timing = timing_line(bar.timing, jax.devices()[0].device_kind) if timed else ""
         if not isinstance(command, Question):
             if results is not None:
@@ -204,7 +205,7 @@ def _write_report(
     out = Path(str(question.out))
     bar.phase("report")
     sections = [*question.report(results, question.create_run(out, bar)), *film]
-    intro = [question.intro(results)]
+    intro = [question.quick_note(), question.intro(results)]
     with contextlib.suppress(InputError):
         intro.append(provenance.describe(out))
     if isinstance(results, xr.Dataset | xr.DataTree):
