@@ -101,13 +101,16 @@ def check_count(name: str, value: object, *, at_least: int = 1, at_most: int) ->
     return int(value)
 
 
-def check_name(kind: str, name: str, known: Iterable[str]) -> str:
-    """Return a name if it is known, or raise an InputError with the known and the nearest names."""
+def check_name(kind: str, name: str, known: Iterable[str], file: str = "") -> str:
+    """Return a name if it is known, or raise an InputError with the known and the nearest names.
+
+    The error also names a `file` that is allowed instead, as FILE.json.
+    """
     known = list(known)
     if name in known:
         return name
-    hint = suggest(name, known)
-    raise InputError(f"unknown {kind} '{name}': choose from {', '.join(known)}{hint}.")
+    hint, alternative = suggest(name, known), f", or give {file}" if file else ""
+    raise InputError(f"unknown {kind} '{name}': choose from {', '.join(known)}{alternative}{hint}.")
 
 
 def current_name(owner: str, prefix: str, name: str, old_names: Mapping[str, str]) -> str:
@@ -121,8 +124,13 @@ def current_name(owner: str, prefix: str, name: str, old_names: Mapping[str, str
 
 def suggest(name: object, known: Sequence[str]) -> str:
     """Return a hint at the known name that is most similar to an unknown one, if any is."""
-    matches = difflib.get_close_matches(str(name), known, n=1)
-    return f" (did you mean '{matches[0]}'?)" if matches else ""
+    plain = {_plain(text): text for text in known}
+    matches = difflib.get_close_matches(_plain(str(name)), plain, n=1)
+    return f" (did you mean '{plain[matches[0]]}'?)" if matches else ""
+
+
+def _plain(name: str) -> str:
+    return name.lower().replace("_", "-")
 
 
 def check_each_once(

@@ -141,6 +141,7 @@ def test_the_first_worlds_and_common_failures_are_tried(monkeypatch):
         return Ceiling(run="run", lost_by=lost_by, **options).world_indices.tolist()
 
     assert worlds("a", "b", sample=1) == [0, 1, 3]
+    assert worlds(sample=0) == worlds("a", sample=0) == [0, 1, 3, 4]
     assert worlds("a", sample=0, most=2) == [0, 1]
     with pytest.raises(InputError, match="unknown law of the run 'c'"):
         worlds("c", sample=0)

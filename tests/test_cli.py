@@ -2,10 +2,12 @@
 
 import gc
 import json
+import re
 import signal
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import command_line
 import numpy as np
@@ -13,11 +15,15 @@ import pytest
 import xarray as xr
 from helpers import refusal, rps
 
-from rps_jax.app.cli import flags, running
+import rps_jax
+from rps_jax.app.cli import flags, names, running
 from rps_jax.control import registry
 from rps_jax.errors import InputError
 from rps_jax.record import files
+from rps_jax.runs.question import Question
 from rps_jax.trials.results import DIMS
+from rps_jax.trials.setting import Setting
+from rps_jax.trials.trial import Rules
 from rps_jax.tuning.evolution import TuneES
 from rps_jax.world import paper
 
@@ -63,6 +69,93 @@ def test_another_run_is_not_written_over_it_unasked(runs, capsys):
     assert "holds another run (setting.seed = 0 there, 1 asked for)" in error
     assert "--overwrite" in error
     assert (runs[0] / "results.nc").read_bytes() == content
+
+
+QUICK_PUSH = "push --engine quasistatic --horizon 1 --no-video --target"
+QUASISTATIC = "--engine quasistatic --horizon 8 --slots 4 --workers 1"
+
+
+def test_other_options_get_a_numbered_folder(tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for target, folder in (("1 0", "push"), ("2 0", "push-2"), ("1 0", "push"), ("2 1", "push-3")):
+        assert rps(f"{QUICK_PUSH} {target}") == 0
+        text = capsys.readouterr().out
+        assert text.splitlines()[-1] == f"run folder: runs/{folder}"
+        assert ("holds another run" in text) == (folder != "push")
+    (first,) = tmp_path.glob("runs/push/results.nc")
+    assert "holds another run" in refusal(capsys, f"{QUICK_PUSH} 3 0 --out runs/push")
+    assert rps(f"{QUICK_PUSH} 3 0 --overwrite") == 0
+    assert xr.load_dataset(first).p_world_target.values.tolist() == [3, 0]
+    assert not (tmp_path / "runs" / "push-4").exists()
+
+
+def test_every_question_offers_and_every_call_accepts_overwrite(tmp_path):
+    for name in names.known():
+        question = names.question_type(name)
+        expected = ["--overwrite"] if issubclass(question, Question) else []
+        flag_names = [flag for kind in (question, flags.session_type(question))
+                      for flag in flags._flag_names(kind)]  # fmt: skip
+        assert [flag for flag in flag_names if flag == "--overwrite"] == expected, name
+    setting = Setting("quasistatic", rules=Rules(horizon=1.0))
+    first = rps_jax.push("cylinder", target=(1.0, 0.0), setting=setting, out=tmp_path)
+    with pytest.raises(InputError, match=r"holds another run .* overwrite=True"):
+        rps_jax.push("cylinder", target=(2.0, 0.0), setting=setting, out=tmp_path)
+    second = {"target": (2.0, 0.0), "setting": setting, "out": tmp_path, "overwrite": True}
+    assert not rps_jax.push("cylinder", **second).data.equals(first.data)
+
+
+def test_the_commands_of_a_report_reproduce_the_run(tmp_path, capsys, monkeypatch):
+    """The first is that of the run; others replay its worlds, or look at its failures."""
+    monkeypatch.chdir(tmp_path)
+    drums = "--domain wide,objects=random_cylinder --worlds 2"
+    for command in (
+        f"sweep --laws rps rps,v_max=0.02 {drums} --seed 5 {QUASISTATIC} --out a",
+        f"score rps,v_max=0.02 {drums} --seed 7 {QUASISTATIC} --laws rps --out b",
+        "gallery a --each 1 --law rps,v_max=0.02 --out c",
+    ):
+        monkeypatch.setattr(sys, "argv", ["rps", *command.split()])
+        assert rps(command) == 0
+        text = capsys.readouterr().out
+        seeds = re.findall(r"seed (\d+)", text)
+        assert set(seeds) == set(re.findall(r"--seed (\d+)", command)), seeds
+        out = Path(command.split()[-1])
+        results = rps_jax.load(out)
+        made_by, *replays = dict.fromkeys(re.findall(r"`rps ([^`]+)`", text))
+        assert made_by == command == results.attrs["command"].removeprefix("rps ")
+        assert replays
+        monkeypatch.setattr(sys, "argv", ["rps", *made_by.split()])
+        assert rps(made_by, "--overwrite") == 0
+        xr.testing.assert_identical(rps_jax.load(out), results)
+        assert rps(replays[0], "--no-video", "--out", out / "again") == 0
+        _, folder, world, _, law = replays[0].split()
+        trial = rps_jax.load(folder).sel(world=int(world), law=law)
+        trace = rps_jax.load(out / "again")
+        assert int(trace.outcome_success) == int(trial.success)
+        assert float(trace.outcome_time) == pytest.approx(float(trial.time), abs=0.5)
+        capsys.readouterr()
+
+
+SUGGESTIONS = {
+    "sweep --wolds 3": "--worlds",
+    "shadow a.mcap --overwrit": "--overwrite",
+    "swep": "sweep",
+    "push --engine MuJoCo": "mujoco",
+    "push --object cylindr": "cylinder",
+    "push --skin idael": "ideal",
+    "sweep --domain wyde": "wide",
+    "sweep --domain wide,objects=random_bx": "random_box",
+    "sweep --robot MPO-500": "mpo_500",
+    "tune es --objects random_boxx": "random_box",
+    "table --objects nonuniform-box": "nonuniform_box",
+}
+
+
+@pytest.mark.parametrize("words", SUGGESTIONS)
+def test_the_nearest_name_is_suggested(words, capsys):
+    error = refusal(capsys, words)
+    assert f"(did you mean '{SUGGESTIONS[words]}'?)" in error
+    for option, file in {"object": "xml", "robot": "json", "domain": "json"}.items():
+        assert f"unknown {option} '" not in error or f"or give FILE.{file}" in error
 
 
 PUSH = "push --target 0.6 0 --engine fused --horizon 18 --film-length 0.4 --out"

@@ -143,6 +143,43 @@ def test_an_invalid_object_file_is_rejected_with_the_reason(message, tmp_path):
     assert "mine" not in objects.OBJECTS
 
 
+LEG = '<geom class="object" type="box" size="0.1 0.3 0.4" pos="0.3 0.2 0"/></body>'
+L_CORNERS = "-0.2 -0.2 0.2 -0.2 0.4 -0.1 0.4 0.5 0.2 0.5 -0.2 0.2"  # convex hull, about
+CONCAVE = "-0.2 -0.2 0.2 -0.2 0.2 0.1 0.4 0.1 0.4 0.5 -0.2 0.5"
+OUTLINES = {
+    "geoms reach 0.36 m beyond the geom object, .* convex hull.*register_object": "",
+    r"vertices = .* is not allowed: the outline must be strictly convex": CONCAVE,
+    "numeric footprint = .* give a radius, or x and y": "0.1 0.2 0.3",
+}
+
+
+def l_shape(tmp_path, corners):
+    """Write the file of an L-shaped object, with an outline if there are corners."""
+    custom = f'<custom><numeric name="footprint" data="{corners}"/></custom>' if corners else ""
+    text = BOX.read_text().replace("</body>", LEG, 1).replace("<worldbody>", f"{custom}<worldbody>")
+    path = tmp_path / "l_shape.xml"
+    path.write_text(text)
+    return path
+
+
+@pytest.mark.parametrize("message", OUTLINES)
+def test_a_concave_object_is_refused_with_the_way_to_give_an_outline(message, tmp_path, capsys):
+    path = l_shape(tmp_path, OUTLINES[message])
+    assert re.search(message, refusal(capsys, "push --engine quasistatic --object", path))
+
+
+def test_an_object_file_has_the_outline_of_its_solid(tmp_path):
+    assert objects.parse_object(str(l_shape(tmp_path, L_CORNERS))) == "l_shape"
+    loaded = scene.load("l_shape")
+    assert loaded.family == "prism"
+    corners = np.unique(np.round(np.asarray(loaded.footprint.vertices), 6), axis=0)
+    expected = np.array(L_CORNERS.split(), float).reshape(-1, 2)
+    np.testing.assert_allclose(corners, np.unique(expected, axis=0), atol=1e-6)
+    path = l_shape(tmp_path, "0.7").rename(tmp_path / "round.xml")
+    assert objects.parse_object(str(path)) == "round"
+    assert float(scene.load("round").footprint.radius) == pytest.approx(0.7)
+
+
 class Ahead(NamedTuple):
     v: float = 0.05  # [m/s]
     d_success: float = 0.05  # [m]

@@ -185,7 +185,7 @@ def test_two_devices_agree_with_one_and_never_communicate(whole, tmp_path, monke
 
 def test_results_hold_every_world_with_its_drawn_quantities(whole, tmp_path):
     results = merged([whole], tmp_path)
-    assert dict(results.sizes) == {"law": 2, "world": 20, "pose": 3, "object": 1}
+    assert dict(results.sizes) == {"law": 2, "world": 20, "pose": 3}
     columns = draws.table(draws.draw(BOXES, 0, np.arange(20)))
     for name, (values, unit) in columns.items():
         np.testing.assert_allclose(results[name], values, rtol=1e-6)

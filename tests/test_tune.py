@@ -6,6 +6,7 @@ from unittest import mock
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import xarray as xr
 from helpers import PAPER, read_curve, refusal
 from helpers import rps as command
 
@@ -19,6 +20,7 @@ from rps_jax.trials.progress import Timing, no_progress
 from rps_jax.trials.score import Objective
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import Outcome, Rules
+from rps_jax.tuning import run as tuning
 from rps_jax.tuning.descent import TuneGrad
 from rps_jax.tuning.evolution import TuneES
 from rps_jax.tuning.space import SUBSETS, Space
@@ -167,6 +169,27 @@ def test_quick_tunes_few_parameters_of_rps_and_all_of_other_laws():
     quick = TuneES("rps", quick=True).with_quick_values()
     assert quick.tuned == ("K_h", "K_v", "l_cr", "d_th")
     assert TuneES("pursuit", quick=True).with_quick_values().tuned == ("full",)
+
+
+def test_the_report_of_a_quick_run_says_so_first():
+    assert TuneES("rps").quick_note() == ""
+    note = TuneES("rps", quick=True, worlds=7).with_quick_values().quick_note()
+    assert note.startswith("**This is a quick run** (tuned K_h, K_v, l_cr, d_th; objects random_cy")
+    assert "; engine quasistatic; horizon 150.0; validation 64; " in note
+    assert "; worlds 7; " in note
+
+
+def test_the_test_of_a_tuned_law_says_whether_it_is_better():
+    start, better = np.zeros(8), np.ones(8)
+    for values, words in (
+        ([start, better], "The tuned law is better."),
+        ([better, start], "The tuned law is worse."),
+        ([start, start], "Too few to tell which is better."),
+    ):
+        success = xr.DataArray(np.array(values), dims=("tested", "test_world"))
+        sentences = tuning.test_sentences(success)
+        assert sentences.endswith(words)
+        assert "in 8 worlds that the search has not met" in sentences
 
 
 def test_one_parameter_is_enough():
@@ -318,5 +341,8 @@ def test_the_command_line(tmp_path, capsys):
     assert command(*calls) == 0
     assert set(json.loads((tmp_path / "run" / "tuned.json").read_text())) == {"L", "K_h"}
     assert (tmp_path / "run" / "tuning.png").stat().st_size > 10_000
-    assert "Validation: objective" in capsys.readouterr().out
+    text = capsys.readouterr().out
+    assert "Validation: objective" in text
+    assert "Test: in 2 worlds that the search has not met, the start succeeds in " in text
+    assert text.count("compile") == text.count("simulated") == 1
     assert "seed = 0 there, 1 asked for" in refusal(capsys, *calls, "--seed", 1)

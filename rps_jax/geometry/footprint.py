@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from rps_jax.errors import InputError
+from rps_jax import errors
 from rps_jax.geometry import planar
 from rps_jax.geometry.arrays import Array, Float, Scalar
 
@@ -47,15 +47,20 @@ def polygon(vertices: np.ndarray | list) -> Footprint:
     """
     points = np.asarray(vertices, float)
     if points.ndim != 2 or points.shape[0] < 3 or points.shape[1] != 2:
-        raise InputError(f"vertices must have shape (N >= 3, 2), not {points.shape}")
+        rule = "give three corners or more, each as x, y [m]"
+        raise errors.not_allowed("shape of vertices", points.shape, rule)
     if not np.isfinite(points).all():
-        raise InputError("vertices must be finite")
+        raise errors.not_allowed("vertices", points.tolist(), "they must be finite")
     edges = np.roll(points, -1, axis=0) - points
     following = np.roll(edges, -1, axis=0)
     turns = edges[:, 0] * following[:, 1] - edges[:, 1] * following[:, 0]
     turning = np.arctan2(turns, np.sum(edges * following, axis=1)).sum()
     if not (turns > 0).all() or not np.isclose(turning, 2 * np.pi):
-        raise InputError("vertices must be strictly convex and counter-clockwise")
+        rule = (
+            "the outline must be strictly convex and counter-clockwise from above, without "
+            "repeated corners; of a concave object, as an L, give the convex hull"
+        )
+        raise errors.not_allowed("vertices", points.tolist(), rule)
     return Footprint(jnp.asarray(points, float), jnp.zeros(()))
 
 

@@ -42,6 +42,8 @@ def attributes() -> dict[str, str]:
 def _command() -> list[str]:
     """Return the words of the running command, as a shell can run it again."""
     program = Path(sys.argv[0])
+    if "ipykernel" in sys.modules or program.name in ("", "-", "-c"):
+        return ["python"]  # a notebook or a prompt
     if program.name in ("rps", "rps.exe") or program.parts[-2:] == ("rps_jax", "__main__.py"):
         return ["rps", *sys.argv[1:]]
     return ["python", sys.argv[0], *sys.argv[1:]] if program.suffix == ".py" else list(sys.argv)

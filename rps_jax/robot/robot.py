@@ -201,7 +201,7 @@ def parse_robot(robot: RobotLike) -> Robot:
         if files.suffix_of(head) == ".json":
             robot = files.read_json(Path(head)) | changes
         else:
-            preset = ROBOTS[errors.check_name("robot", head, ROBOTS)]
+            preset = ROBOTS[errors.check_name("robot", head, ROBOTS, "FILE.json")]
             robot = {name: getattr(preset, name) for name in _FIELDS} | changes
     if isinstance(robot, Mapping):
         for name in robot:

@@ -117,13 +117,13 @@ def evaluate(
     return xr.Dataset(variables, {"pose": POSE} | indices | tried | drawn, attrs)
 
 
-def _parameters(params: LawParams, taken: Set[str]) -> dict[str, xr.Variable]:
-    """Return the scalar parameters (candidate) by name, or as `params.NAME` if it is taken."""
+def _parameters(params: LawParams, reserved: Set[str]) -> dict[str, xr.Variable]:
+    """Return the scalar parameters (candidate) by name, or as `params.NAME` if that is reserved."""
     columns = {}
     for name, values in registry.named_leaves(params).items():
         if values.ndim == 1:
             attrs = {"long_name": f"parameter {name} of the law"}
-            label = f"params.{name}" if name in taken else name
+            label = f"params.{name}" if name in reserved else name
             columns[label] = xr.Variable("candidate", values, attrs)
     return columns
 

@@ -54,6 +54,7 @@ from rps_jax.robot.robot import RobotLike
 from rps_jax.runs.run import Run
 from rps_jax.trials.progress import Bar, ProgressCallback, Timing, is_interactive
 from rps_jax.trials.setting import Setting
+from rps_jax.trials.trial import Rules
 from rps_jax.world import domain as domains
 from rps_jax.world.domain import Domain, DomainLike
 
@@ -452,11 +453,13 @@ def timing_line(timing: Timing, device: str) -> str:
 
 
 def _value_in_words(name: str, value: object) -> str:
-    """Return the name and the value of an option in words; of a record what is no default."""
-    if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        changed = (f for f in fields(value) if getattr(value, f.name) != f.default)
-        return "; ".join(_value_in_words(f.name, getattr(value, f.name)) for f in changed)
-    words = map(str, value) if isinstance(value, tuple | list) else [str(value)]
+    """Return the name and the value of an option in words; of rules those that are changed."""
+    if isinstance(value, Rules):
+        defaults, values = Rules._field_defaults, value._asdict()
+        changed = {key: item for key, item in values.items() if item != defaults[key]}
+        return "; ".join(itertools.starmap(_value_in_words, changed.items()))
+    items = value if isinstance(value, tuple | list) else [value]
+    words = (name_or_custom(x) if isinstance(x, Domain) else str(x) for x in items)
     return f"{name.rpartition('.')[2].replace('_', ' ')} {', '.join(words)}"
 
 

@@ -73,6 +73,7 @@ class Regress(PlanQuestion, MultiLawQuestion[xr.Dataset]):
         outcomes = super().labelled(outcomes, run)
         known = worlds()[["success", "severity"]].reset_coords(drop=True)
         known = known.isel(world=slice(outcomes.sizes["world"]))
+        known.known.attrs["long_name"] = "earlier law"
         return outcomes.merge(known.rename({name: f"known_{name}" for name in known}))
 
     def intro(self, results: xr.Dataset) -> str:

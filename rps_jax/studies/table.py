@@ -44,7 +44,7 @@ class Table(TrialOptions, MultiLawQuestion[xr.Dataset]):
 
     laws: LawsLike = paper.LAWS
     objects: Sequence[str] = PAPER_OBJECTS
-    """Objects to push: their names, or custom MJCF files, FILE.xml."""
+    """Objects to push: their names, or custom MJCF files, FILE.xml, as of `rps push --object`."""
     friction: Sequence[FrictionLike] = ("S1", "S2")
     """Frictions: sets of the paper's Table I (S1, S2), or coefficients GROUND,ROBOT."""
     targets: Sequence[tuple[float, float]] = paper.TARGETS

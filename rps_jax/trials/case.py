@@ -49,7 +49,9 @@ class Case(TrialOptions):
     """
 
     object: str = "box"
-    """Object to push: its name, or a custom MJCF file, FILE.xml."""
+    """Object to push: its name, or a custom MJCF file, FILE.xml, of an upright box or cylinder. For
+    another convex outline the file has its corners, counter-clockwise from above [m], as
+    <custom><numeric name="footprint" data="X Y X Y X Y"/></custom>."""
     friction: FrictionLike = "S1"
     """Friction: a set of the paper's Table I (S1, S2), or coefficients GROUND,ROBOT."""
     target: tuple[float, float] = (-2.0, 0.0)
@@ -64,7 +66,8 @@ class Case(TrialOptions):
 
     def __post_init__(self) -> None:
         check_fields(self)
-        errors.check_name("object", objects.parse_object(self.object), objects.OBJECTS)
+        name = objects.parse_object(self.object)
+        errors.check_name("object", name, objects.OBJECTS, "FILE.xml")
         registry.check_params(self.params)
         scene.check_contact(self.contact, self.mass)
         skins.parse_skin(self.skin or "ideal")

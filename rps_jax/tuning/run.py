@@ -8,6 +8,7 @@ runs the search and checkpoints every generation, so a killed run resumes.
 from __future__ import annotations
 
 import functools
+import shlex
 from collections.abc import Callable, Generator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
@@ -271,7 +272,9 @@ class Tuning(LawQuestion[xr.Dataset]):
         rates = [tables.share(count, worlds) for count in counts]
         totals = (f"{x} {float(results[x].sum()):,.1f} s" for x in UNITS if x in results)
         text = (
-            f"{test_sentences(results.test_success)}\n\n"
+            f"{test_sentences(results.test_success)} The worlds have the objects "
+            f"{', '.join(self.objects)}, the engine {self.setting.engine} and the horizon "
+            f"{float(self.setting.rules.horizon):g} s; others may decide otherwise.\n\n"
             f"Validation: objective {float(results.validation[0]):.4f} and success {rates[0]} "
             f"at the start, {float(results.validation[best]):.4f} and {rates[best]} after "
             f"{best} of {results.sizes['generation']}. These worlds chose the generation, so the "
@@ -279,7 +282,11 @@ class Tuning(LawQuestion[xr.Dataset]):
             f"{', '.join(totals)}."
         )
         if run.folder is not None:
-            text += f" The law with these parameters is `{self.label},{run.folder / TUNED}`."
+            law = f"{self.label},{run.folder / TUNED}"
+            text += (
+                f" The law with these parameters is `{law}`; "
+                f"`rps ladder --laws {shlex.join([self.label, law])}` tests it on all objects."
+            )
         rows = [["parameter", "start", "tuned"]]
         start = registry.named_leaves(self.space.base)
         for name, value in zip(results.parameter.values, results.tuned.values, strict=True):

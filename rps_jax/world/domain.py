@@ -131,7 +131,7 @@ class Domain:
     def __post_init__(self) -> None:
         check_fields(self, "domain ")
         for name in self.objects:
-            errors.check_name("domain object", name, (*RANDOM, *OBJECTS))
+            errors.check_name("domain object", name, (*RANDOM, *OBJECTS), "FILE.xml")
         errors.check_each_once("domain objects", self.objects)
         for friction in self.frictions:
             scene.check_contact(friction, None)
@@ -310,7 +310,7 @@ def parse_domain(domain: DomainLike, robot: RobotLike | None = None) -> Domain:
     if files.suffix_of(head) == ".json":
         base = from_json(files.read_json(Path(head)))
     else:
-        base = DOMAINS[errors.check_name("domain", head, DOMAINS)]
+        base = DOMAINS[errors.check_name("domain", head, DOMAINS, "FILE.json")]
     for name in changes:
         if name in base.idle:
             rule = f"its objects, frictions, targets or skin leave no {name} to draw"

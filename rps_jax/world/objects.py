@@ -40,6 +40,12 @@ _REQUIRED = {
     "geom": ("ground", "base", "object", "skin_front", "skin_left", "skin_right"),
 }
 _UPRIGHT = (1.0, 0.0, 0.0, 0.0)
+_OVERHANG = 0.005  # [m] of geoms beyond the solid for contacts, at most
+_GIVE_OUTLINE = (
+    "give the outline, a circle or a convex polygon of 3 to 8 corners (of a concave object its "
+    'convex hull): in the file <custom><numeric name="footprint" data="X Y X Y X Y"/></custom> [m] '
+    "or footprint=polygon(...) to rps_jax.register_object"
+)
 
 
 class Registered(NamedTuple):
@@ -101,14 +107,16 @@ def register_object(
 
     The file includes `base.xml`, perhaps of another folder. It has a body `object` with
     a free joint `object` and upright geoms, one of them named `object`. The body's origin is at
-    half the height of that geom.
+    half the height of that geom. Contacts and skin use one upright solid: a circle or a convex
+    polygon of up to 8 corners, which must hold all geoms unless an outline is given.
 
     Args:
       name: of the object; it replaces an object registered under the same name.
       path: MJCF file. Mass, centre of mass and inertia are those of all geoms of the body.
       footprint: outline of the solid for contacts, in the body's frame: a circle about the origin,
-        or a convex polygon of up to 8 corners around it. By default that of the geom `object`, if
-        it is a box or a cylinder. The height of the solid is that of this geom.
+        or a convex polygon of up to 8 corners around it. By default that of the file: the numeric
+        `footprint` in its element `custom`, with a radius or corners x y x y ... [m], or else the
+        geom `object`, if it is a box or a cylinder. The height of the solid is that of this geom.
       feet: positions (S, 2) [m] of 3 to 8 points on which it stands, in the body's frame, or with
         weights (S, 3) [m, m, 1], as of springs; by default its corners or its rim. Only the engine
         quasistatic uses weights: the others compute the load of each foot from the tilt of the
@@ -143,7 +151,7 @@ def register_object(
     path = Path(path).absolute()
     label = f"object '{name}'"
     model = _compiled(label, path)
-    family, vertices, radius = _outline(label, footprint or _geom_outline(label, model))
+    family, vertices, radius = _outline(label, footprint or _file_outline(label, model))
     body = model.body("object")
     if feet is not None:
         family, vertices = "cylinder" if radius else "prism", solid.padded(vertices)
@@ -208,16 +216,39 @@ def _check_ignored(label: str, path: Path, model: mujoco.MjModel, spec: mujoco.M
         )
 
 
+def _file_outline(label: str, model: mujoco.MjModel) -> Footprint:
+    """Return the outline that a file gives, or else that of its geom `object`."""
+    for i in range(model.nnumeric):
+        if model.numeric(i).name == "footprint":
+            values = model.numeric(i).data
+            if values.size % 2 == 0:
+                return fp.polygon(values.reshape(-1, 2))
+            if values.size == 1:
+                return fp.circle(values[0])
+            rule = "give a radius, or x and y of each corner [m]"
+            raise errors.not_allowed(f"{label}: numeric footprint", values.tolist(), rule)
+    return _geom_outline(label, model)
+
+
 def _geom_outline(label: str, model: mujoco.MjModel) -> Footprint:
-    """Return the outline of the geom `object`, or raise InputError."""
-    geom = model.geom("object")
-    centred = np.allclose(geom.pos[:2], 0) and np.allclose(geom.quat, _UPRIGHT)
-    if centred and geom.type[0] == mujoco.mjtGeom.mjGEOM_BOX:
-        return fp.rectangle(geom.size[0], geom.size[1])
-    if centred and geom.type[0] == mujoco.mjtGeom.mjGEOM_CYLINDER:
-        return fp.circle(geom.size[0])
-    rule = "the geom object is no upright box or cylinder about the origin, so give the outline"
-    raise errors.not_allowed(f"{label}: footprint", None, rule)
+    """Return the outline of the geom `object` if it holds all geoms, or raise InputError."""
+    geom, outline = model.geom("object"), None
+    if np.allclose(geom.pos[:2], 0) and np.allclose(geom.quat, _UPRIGHT):
+        if geom.type[0] == mujoco.mjtGeom.mjGEOM_BOX:
+            outline = fp.rectangle(geom.size[0], geom.size[1])
+        elif geom.type[0] == mujoco.mjtGeom.mjGEOM_CYLINDER:
+            outline = fp.circle(geom.size[0])
+    if outline is None:
+        reason = "the geom object is no upright box or cylinder about the origin"
+        raise errors.not_allowed(f"{label}: footprint", None, f"{reason}, so {_GIVE_OUTLINE}")
+    reach = max(
+        float(np.max(fp.signed_distance(outline, _points_of(model, i)[:, :2])))
+        for i in np.flatnonzero(model.geom_bodyid == model.body("object").id)
+    )
+    if reach > _OVERHANG:
+        reason = f"its geoms reach {reach:.2g} m beyond the geom object, which alone has contacts"
+        raise errors.not_allowed(f"{label}: footprint", None, f"{reason}, so {_GIVE_OUTLINE}")
+    return outline
 
 
 def _outline(label: str, footprint: Footprint) -> tuple[str, np.ndarray, float]:
@@ -259,18 +290,26 @@ def _feet(label: str, feet: np.ndarray, com: np.ndarray) -> np.ndarray:
     return np.concatenate([feet, missing])
 
 
-def _height(label: str, model: mujoco.MjModel) -> float:
-    """Return the height of the geom `object` [m]."""
-    geom = model.geom("object")
+def _points_of(model: mujoco.MjModel, geom_id: int) -> np.ndarray:
+    """Return points (n, 3) [m] of a geom in its body's frame, whose convex hull is the geom."""
+    geom, turn = model.geom(geom_id), np.zeros(9)
+    middle, half = model.geom_aabb[geom_id].reshape(2, 3)
     if geom.type[0] == mujoco.mjtGeom.mjGEOM_MESH:
         mesh = model.mesh(geom.dataid[0])
         points = model.mesh_vert[mesh.vertadr[0] : mesh.vertadr[0] + mesh.vertnum[0]]
-    else:
-        middle, half = model.geom_aabb[geom.id].reshape(2, 3)
+    elif geom.type[0] == mujoco.mjtGeom.mjGEOM_BOX:
         points = middle + half * (2 * np.array(list(np.ndindex(2, 2, 2))) - 1)
-    turn = np.zeros(9)
+    else:  # round about its axis
+        angle = np.linspace(0, 2 * np.pi, 33)
+        rim = np.stack([np.cos(angle), np.sin(angle), np.ones(33)], axis=1)
+        points = middle + half * np.concatenate([rim, rim * [1, 1, -1]])
     mujoco.mju_quat2Mat(turn, geom.quat)
-    z = points @ turn.reshape(3, 3)[2] + geom.pos[2]
+    return np.asarray(points @ turn.reshape(3, 3).T + geom.pos)
+
+
+def _height(label: str, model: mujoco.MjModel) -> float:
+    """Return the height of the geom `object` [m]."""
+    z = _points_of(model, model.geom("object").id)[:, 2]
     low, high = float(z.min()), float(z.max())
     if abs(low + high) > 1e-3:
         rule = "the body's origin must be in the middle of its height"
