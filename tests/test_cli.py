@@ -21,6 +21,7 @@ from rps_jax.control import registry
 from rps_jax.errors import InputError
 from rps_jax.record import files
 from rps_jax.runs.question import Question
+from rps_jax.runs.sweep import merge
 from rps_jax.trials.results import DIMS
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import Rules
@@ -102,6 +103,10 @@ def test_every_question_offers_and_every_call_accepts_overwrite(tmp_path):
         rps_jax.push("cylinder", target=(2.0, 0.0), setting=setting, out=tmp_path)
     second = {"target": (2.0, 0.0), "setting": setting, "out": tmp_path, "overwrite": True}
     assert not rps_jax.push("cylinder", **second).data.equals(first.data)
+    (tmp_path / "inner").mkdir()
+    with pytest.raises(InputError, match="overwrite would remove the run that is read"):
+        merge((tmp_path / "inner",), out=tmp_path, overwrite=True)
+    assert rps_jax.load(tmp_path).sizes["time"]
 
 
 def test_the_commands_of_a_report_reproduce_the_run(tmp_path, capsys, monkeypatch):

@@ -290,6 +290,15 @@ class Question(Command[T]):
 
     # --- execution -------------------------------------------------------------------------
 
+    def validate(self) -> None:
+        super().validate()
+        if self.overwrite and self.out is not None:
+            sources = [getattr(self, "run", None), *getattr(self, "folders", ())]
+            out = Path(self.out).resolve()
+            if any(Path(x).resolve().is_relative_to(out) for x in sources if x is not None):
+                rule = "overwrite would remove the run that is read; choose another folder"
+                raise errors.not_allowed("out", self.out, rule)
+
     def execute(self, callback: ProgressCallback) -> T:
         """Answer the question, and store the results in the run folder if there is one."""
         if self.overwrite and self.out is not None:
