@@ -211,5 +211,5 @@ def test_a_run_is_loaded_with_the_copy_of_a_law_that_has_changed(tmp_path):
 
 
 def test_an_unknown_law_is_named_with_the_other_forms():
-    with pytest.raises(InputError, match=r"law = pi is not allowed: .* FILE.py or policy.npz"):
+    with pytest.raises(InputError, match=r"unknown law 'pi': .* FILE.py or policy.npz"):
         registry.parse_law("pi")

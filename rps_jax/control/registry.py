@@ -196,10 +196,7 @@ def _parse_head(text: str) -> tuple[str, LawParams]:
         return _load_policy(Path(text))
     path, _, kind = (text, "", "") if _is_python(text) else text.rpartition(":")
     if not _is_python(path):
-        rule = f"choose from {', '.join(LAWS)}, or give FILE.py or policy.npz"
-        if text not in LAWS:
-            raise errors.not_allowed("law", text, rule)
-        return text, LAWS[text]
+        return text, LAWS[errors.check_name("law", text, LAWS, "FILE.py or policy.npz")]
     # The file is run again if another law has taken its name since.
     if (law := _find_registered(sources.load(Path(path)), kind)) is None:
         law = _find_registered(sources.load(Path(path), again=True), kind)

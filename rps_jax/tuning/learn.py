@@ -95,7 +95,8 @@ class Learn(PPO, SimulationQuestion[xr.Dataset]):
         "drawn": 1024,
         "validation": 64,
         "num_minibatches": 4,
-        "minutes": 5.0,
+        "minutes": 15.0,
+        "updates": 300,  # on any machine the same number
     }
 
     domain: DomainLike | Sequence[DomainLike] = ("wide",)
