@@ -264,7 +264,7 @@ def load_part(parts: Checkpoints | None, name: str, options: str) -> xr.Dataset 
     """
     if parts is None or (content := parts.get(name)) is None:
         return None
-    results = files.decode_results(content, parts.folder / name, signed=True)
+    results = files.decode_results(content, parts.folder / name)
     if results.attrs.get("run_as") != options:
         raise InputError(
             f"{parts.folder / name}-*.nc was run with other options: choose another folder, or "
