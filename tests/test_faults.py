@@ -150,7 +150,7 @@ MORE = [
     *((f"MUJOCO_GL={name} push", 2, f"MUJOCO_GL = {name} is not allowed") for name in ("x", "wgl")),
     *((f"MUJOCO_GL={name} push", 0, "") for name in ("disable", "off", "EGL")),
     ("PYOPENGL_PLATFORM=x film >&2", 0, "no film: MuJoCo cannot draw"),
-    ("IMAGEIO_FFMPEG_EXE=/nowhere/x film >&2", 0, "no film: ffmpeg was not found"),
+    ("IMAGEIO_FFMPEG_EXE=/nowhere/x film >&2", 0, "no film: IMAGEIO_FFMPEG_EXE = /nowhere/x"),
     ("XLA_FLAGS=nonsense push", 2, 'XLA_FLAGS = nonsense .*Could not open file "nonsense"'),
     ("XLA_FLAGS=--xla_force_host_platform_device_count=abc push", 2, "cannot read the value of a"),
     ("XLA_FLAGS=--xla_nonsense=1 rps doctor >&2", 0, "FAILS: XLA_FLAGS = --xla_nonsense"),

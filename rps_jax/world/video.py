@@ -179,6 +179,10 @@ def _encoder(path: Path, size: tuple[int, int], fps: int) -> Iterator[Callable[[
     except OSError as error:
         # ffmpeg's own failure comes as an OSError too, with the end of its log as the message.
         reason = error.strerror or str(error).strip().splitlines()[-1]
+        if error.filename and error.filename == os.environ.get("IMAGEIO_FFMPEG_EXE"):
+            rule = f"it does not run ({reason}): name another ffmpeg, or unset it"
+            fault = errors.not_allowed("IMAGEIO_FFMPEG_EXE", error.filename, rule)
+            raise VideoError(fault) from error
         raise VideoError(
             f"{path} could not be written ({reason}): choose a folder that exists, can be "
             "written to and has space left; if it does, run `pip install imageio-ffmpeg`."
