@@ -173,7 +173,7 @@ MORE = [
     ("MPLCONFIGDIR=/proc/x push", 0, ""),
     ("RPS_COMPILER=/nowhere/cc rps doctor", 0, ""),
     ("PATH=/usr/bin:/bin RPS_COMPILER=/bin/false rps doctor", 0, ""),
-    ("mkdir gone; cd gone; rmdir ../gone; push", 2, "out = runs/push cannot be written"),
+    ("mkdir gone; cd gone; rmdir ../gone; push", 2, "the current folder was deleted: change"),
 ]  # fmt: skip
 
 

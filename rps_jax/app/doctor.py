@@ -37,7 +37,7 @@ doctor = call_of(Doctor)
 
 def report(cache: Path, faults: Sequence[str] = ()) -> str:
     """Return versions, devices, folders and the checks of rendering, one line each."""
-    fixes = {f"variable {i}": fault for i, fault in enumerate(faults, 1)}
+    fixes = {f"fault {i}": fault for i, fault in enumerate(faults, 1)}
     fixes |= {"cache": _check_cache(cache), **video.check()}
     environment = device.collect_environment()
     hardware = environment["device"]

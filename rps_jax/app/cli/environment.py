@@ -34,12 +34,16 @@ def start_process() -> None:
 
 
 def unset_bad_variables() -> list[str]:
-    """Unset variables that would abort the process; return a sentence for each.
+    """Unset variables that would abort the process; return a sentence for each fault.
 
     Raises:
       InputError: JAX or tqdm refuses its variables.
     """
     faults = [fault] if (fault := _unset_bad_flags()) else []
+    try:
+        os.getcwd()
+    except FileNotFoundError:
+        faults.append("the current folder was deleted: change to another, as by `cd ~`.")
     for module in ("jax", "tqdm"):
         try:
             importlib.import_module(module)
