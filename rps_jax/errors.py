@@ -10,7 +10,7 @@ import re
 import warnings
 from collections.abc import Iterable, Mapping, Sequence
 from types import ModuleType
-from typing import Any
+from typing import Any, cast
 
 
 class InputError(ValueError):
@@ -95,10 +95,11 @@ def check_vector(name: str, values: Iterable[object], **bounds: float | str) -> 
 def check_count(name: str, value: object, *, at_least: int = 1, at_most: int) -> int:
     """Return a value if it is a whole number within bounds, or raise InputError."""
     is_whole = isinstance(value, numbers.Integral) and not isinstance(value, bool)
-    if not (is_whole and at_least <= int(value) <= at_most):
+    count = int(cast("int", value)) if is_whole else at_least - 1
+    if not at_least <= count <= at_most:
         rule = f"it must be a whole number from {at_least} to {at_most}"
         raise not_allowed(name, value, rule)
-    return int(value)
+    return count
 
 
 def check_name(kind: str, name: str, known: Iterable[str], file: str = "") -> str:

@@ -81,13 +81,13 @@ def standard_jax() -> Iterator[None]:
     import jax
 
     with contextlib.ExitStack() as stack:
-        for context, value in (
-            (jax.numpy_dtype_promotion, "standard"), (jax.numpy_rank_promotion, "allow"),
-            (jax.transfer_guard, "allow"), (jax.disable_jit, False), (jax.no_tracing, False),
-            (jax.debug_nans, False), (jax.debug_infs, False), (jax.check_tracer_leaks, False),
-            (jax.legacy_prng_key, "allow"), (jax.enable_custom_prng, False),
+        for context in (
+            jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"),
+            jax.transfer_guard("allow"), jax.disable_jit(False), jax.no_tracing(False),
+            jax.debug_nans(False), jax.debug_infs(False), jax.check_tracer_leaks(False),
+            jax.legacy_prng_key("allow"), jax.enable_custom_prng(False),
         ):  # fmt: skip
-            stack.enter_context(context(value))
+            stack.enter_context(context)
         yield
 
 
@@ -105,8 +105,8 @@ def choose(name: Device) -> None:
             jax.devices()
         except (RuntimeError, AssertionError) as error:  # JAX raises either
             variable = "JAX_PLATFORMS" if platforms else "JAX_PLATFORM_NAME"
-            name = platforms or os.environ.get(variable)
-            message = f"{variable} = {name} is not available: name another, or none."
+            wanted = platforms or os.environ.get(variable)
+            message = f"{variable} = {wanted} is not available: name another, or none."
             raise InputError(message) from error
         return
     jax.config.update("jax_platforms", "cuda" if name == "gpu" else "cpu")

@@ -9,7 +9,7 @@ import numbers
 import os
 import types
 import typing
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal, get_args, get_origin
 
@@ -123,7 +123,7 @@ def _is_of(value: Any, kind: Any) -> bool:
             return False
         return all(_is_of(item, inner[0]) for item in items)
     if kind is float or kind is int:
-        base = numbers.Real if kind is float else numbers.Integral
+        base: Any = numbers.Real if kind is float else numbers.Integral
         is_scalar = np.ndim(value) == 0 and hasattr(value, "dtype") and value.dtype.kind in "iuf"
         return isinstance(value, base) or is_scalar
     if kind is bool:
@@ -132,13 +132,14 @@ def _is_of(value: Any, kind: Any) -> bool:
         return _has_items(value) and not isinstance(value, str | bytes)
     if kind is Path:
         return isinstance(value, str | os.PathLike)
-    kind = origin or kind
-    is_open = kind is Any or not isinstance(kind, type) or hasattr(kind, "__get__")
-    return is_open or isinstance(value, kind)
+    bare: Any = origin or kind
+    if bare is Any or not isinstance(bare, type) or hasattr(bare, "__get__"):
+        return True
+    return isinstance(value, bare)
 
 
-def _has_items(value: object) -> bool:
-    return isinstance(value, Sequence) or (isinstance(value, Iterable) and np.ndim(value) > 0)
+def _has_items(value: Any) -> bool:
+    return isinstance(value, Sequence) or (hasattr(value, "__iter__") and np.ndim(value) > 0)
 
 
 def _noun(kind: Any) -> str:

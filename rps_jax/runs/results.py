@@ -187,7 +187,8 @@ class Results:
 def _prefetch(batches: Iterator[WorldBatch], count: int) -> Iterator[WorldBatch]:
     """Build up to `count` batches ahead in a thread, while earlier ones run."""
     with ThreadPoolExecutor(1) as builder:
-        build = functools.partial(builder.submit, device.standard_jax()(next), batches, None)
+        following: Callable[..., WorldBatch | None] = device.standard_jax()(next)
+        build = functools.partial(builder.submit, following, batches, None)
         queue = deque(build() for _ in range(count))
         while (worlds := queue.popleft().result()) is not None:
             queue.append(build())

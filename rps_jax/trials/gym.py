@@ -226,7 +226,7 @@ class GymPushVector(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         }  # fmt: skip
         infos = {name: np.array(values) for name, values in infos.items()}
         done = np.array(data.done)
-        return np.array(self._state.obs, np.float32), done & ended, done & ~ended, infos
+        return np.array(self.state.obs, np.float32), done & ended, done & ~ended, infos
 
     def images(self) -> list[np.ndarray]:
         """Return an image (240, 320, 3) uint8 of each world."""
@@ -279,7 +279,7 @@ class GymPushVector(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             errors.check_count("seed", seed, at_least=0, at_most=2**64)
         drawn = self.np_random.integers(_SEEDS, size=self.num_envs)
         values = [drawn[i] if s is None else int(s) % _SEEDS for i, s in enumerate(seeds)]
-        keys = jax.vmap(jax.random.key)(np.uint32(values))
+        keys = jax.vmap(jax.random.key)(np.asarray(values, np.uint32))
         self._keys = keys if self._keys is None else jnp.where(known & where, keys, self._keys)
 
     @device.standard_jax()

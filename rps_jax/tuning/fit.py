@@ -144,7 +144,8 @@ class Fit(LawQuestion[Fitted], DomainQuestion[Fitted], LogsQuestion):
     @cached_property
     def raw_logs(self) -> list[RawLog]:
         """Logs, loaded and validated."""
-        several = self.logs if isinstance(self.logs, tuple | list) else (self.logs,)
+        given: Any = self.logs
+        several = [given] if isinstance(given, str | Path | Trace) else list(given)
         if not several:
             raise InputError("logs = () is not allowed: give at least one.")
         paths = [Path(log) for log in several if not isinstance(log, Trace)]

@@ -10,6 +10,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import jax.numpy as jnp
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -242,8 +243,8 @@ def _geom_outline(label: str, model: mujoco.MjModel) -> Footprint:
         reason = "the geom object is no upright box or cylinder about the origin"
         raise errors.not_allowed(f"{label}: footprint", None, f"{reason}, so {_GIVE_OUTLINE}")
     reach = max(
-        float(np.max(fp.signed_distance(outline, _points_of(model, i)[:, :2])))
-        for i in np.flatnonzero(model.geom_bodyid == model.body("object").id)
+        float(np.max(fp.signed_distance(outline, jnp.asarray(_points_of(model, i)[:, :2]))))
+        for i in np.flatnonzero(model.geom_bodyid == model.body("object").id).tolist()
     )
     if reach > _OVERHANG:
         reason = f"its geoms reach {reach:.2g} m beyond the geom object, which alone has contacts"

@@ -67,7 +67,7 @@ def _unset_bad_flags() -> str:
     if not started.returncode:
         return ""
     del os.environ["XLA_FLAGS"]
-    reason = _FATAL.search(started.stderr)
-    is_unknown = reason and "Check failed" not in reason[1]
-    rule = reason[1].partition(". (")[0] if is_unknown else "XLA cannot read the value of a flag"
+    found = _FATAL.search(started.stderr)
+    reason = found[1].partition(". (")[0] if found else "Check failed"
+    rule = "XLA cannot read the value of a flag" if "Check failed" in reason else reason
     return str(not_allowed("XLA_FLAGS", flags, f"{rule}; correct or unset it"))
