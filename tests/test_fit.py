@@ -50,7 +50,9 @@ WRONG = {
     "lacks the column contact_y": lambda table: table.drop(columns="contact_y"),
     "has a gap of 2 s at": lambda table: table.drop(index=range(100, 199)),
     "lasts 1.9 s: it must last 5 s": lambda table: table[:95],
-    r"v_x up to 4, beyond the limit of 3: write it in \[m/s\]": put("v_x", 4.0, slice(9, 12)),
+    r"v_x and v_y up to 4 m/s, beyond the limit of 3: write SI units": put(
+        "v_x", 4.0, slice(9, 12)
+    ),
     "yaw may be in deg": lambda table: table.assign(yaw=10 * table.time),
     "has no contact": put("contact_type", 0),
     r"up to \(0.480, 0.050\) m, and the robot ends at": put("contact_x", 0.48),

@@ -55,21 +55,18 @@ _TOUCH = ("contact_type", "p_robot_contact")
 _SHORTEST = 5.0  # [s]
 _SLOWEST = 0.2  # [s] between two rows, at most
 _JUMPS = (0.5, 0.5, 1.0)  # [m, m, rad] between two rows, at least
-_RARE = 0.02  # share of rows with a jump of x or y that are no error of the unit, at most
+_RARE = 0.02  # share of jumps that are no error of the unit of x or y, at most
 _STILL = 0.001  # [m] that a target may move
-_FARTHEST = 100.0  # [m] of a target from the start
-_NEAR = 5.0  # [m] between the origins of base and object in contact, at most
-_HIGHEST_FORCE = 5000.0  # [N] median in contact, at most
-_LIMITS = {  # greatest magnitudes by column, with the unit
-    "twist": {"v_x": (3.0, "m/s"), "v_y": (3.0, "m/s"), "omega": (10.0, "rad/s")},
-    "f_robot": {"force_x": (1e5, "N"), "force_y": (1e5, "N")},
-    "signal": {"taxel": (1000.0, "1, the relative change of capacitance")},
-}
 # Motion is compared with commands over windows, so that noise and delays matter little.
 _WINDOW = 2.0  # [s]
 _RESOLUTION = 0.05  # [m] and [rad] of both motions
 _MISFIT = 5.0  # greatest ratio of the two, as root mean squares
 _ALIGNED = 0.7  # similarity of the two at least, if the base moves less than commanded
+_FRAMES = "yaw may be in deg or rise clockwise, or v_x and v_y may be in the frame of x and y"
+_FIX = "write SI units, or name the unit in the title of a table, as 'time [ms]' or 'yaw [deg]'"
+
+LogLike = Trace | str | Path
+NamesLike = str | Mapping[str, str]  # titles by names
 
 
 class Log(NamedTuple):
@@ -96,10 +93,7 @@ class RawLog(NamedTuple):
 
 
 def read(
-    source: Trace | str | Path,
-    shell: Shell,
-    topics: bag.TopicsLike = (),
-    titles: str | Mapping[str, str] = "",
+    source: LogLike, shell: Shell, topics: bag.TopicsLike = (), titles: NamesLike = ""
 ) -> RawLog:
     """Load and validate one log, a trace or a path.
 
@@ -137,7 +131,7 @@ def read(
         period = np.full(np.size(columns["time"]), np.inf)
     contacts = with_contacts(columns | {"period": period}, shell, name)
     columns |= {key: np.asarray(contacts[key], float) for key in (*columns, *_TOUCH)}
-    for fault in _contact_faults(columns, shell):
+    for fault in _unit_faults(columns, shell):
         raise InputError(f"{name} {fault}.")
     columns["target"] = np.atleast_2d(columns["target"])[0]
     return log
@@ -190,7 +184,7 @@ def _from_table(path: Path, name: str, titles: Mapping[str, str]) -> RawLog:
 
 
 def _faults(log: RawLog) -> Iterator[str]:
-    """Yield the faults of a log, except those of its contacts."""
+    """Yield the faults of the clock, the cells and the motion of a log."""
     columns = log.columns
 
     def at(i: int) -> str:
@@ -210,15 +204,10 @@ def _faults(log: RawLog) -> Iterator[str]:
     time, steps = columns["time"], np.diff(columns["time"])
     if (steps <= 0).any():
         i = int((steps <= 0).argmax()) + 1
-        change = f"{time[i - 1]:.9g} s is followed by {time[i]:.9g} s in {at(i)}"
-        yield f"is not allowed: its time must rise, and {change}"
+        yield f"is not allowed: its time must rise, and is {time[i]:.9g} s in {at(i)}, not later"
     interval, worst = float(np.median(steps)), float(steps.max())
     if interval > _SLOWEST:
-        unit = _nearest(interval / 0.02, {"ms": 1e3, "us": 1e6, "ns": 1e9})
-        yield (
-            f"has a row every {interval:g} s: give the time in seconds, a row every {_SLOWEST} s, "
-            f"or name its unit, as 'time [{unit}]'"
-        )
+        yield f"has a row every {interval:g} s, and it must be every {_SLOWEST} s: {_FIX}"
     if worst > max(5 * interval, _SLOWEST):
         i = int(steps.argmax())
         yield f"has a gap of {worst:.2g} s at {time[i]:.2f} s, {at(i)}: cut the log there"
@@ -227,28 +216,10 @@ def _faults(log: RawLog) -> Iterator[str]:
     moved = np.abs(np.diff(columns["pose"], axis=0)) / np.array(_JUMPS)
     i, axis = np.unravel_index(moved.argmax(), moved.shape)
     change = " to ".join(f"{value:.3g}" for value in columns["pose"][i : i + 2, axis])
-    jump = f"has a pose that jumps: {[*COLUMNS['pose']][axis]} from {change} in {at(i + 1)}"
-    if 0 < np.mean(moved[:, :2] > 1) < _RARE:
-        yield f"{jump}; cut the log there"
+    if 0 < np.mean(moved > 1) < _RARE:
+        change = f"{[*COLUMNS['pose']][axis]} from {change} in {at(i + 1)}"
+        yield f"has a pose that jumps: {change}: cut the log there, or {_FIX}"
     yield from motion_faults(time, columns["pose"], columns["twist"])
-    for key, limits in _LIMITS.items():
-        values = np.abs(columns.get(key, np.zeros(len(limits)))).reshape(-1, len(limits)).max(0)
-        for (title, (limit, unit)), value in zip(limits.items(), values, strict=True):
-            if value > limit:
-                yield (
-                    f"has {title} up to {value:g}, beyond the limit of {limit:g}: write it in "
-                    f"[{unit}], or name its unit in the title of a table"
-                )
-    if moved.max() > 1:
-        yield f"{jump}; write x, y in [m] and yaw in [rad], or cut the log there"
-    if "object_pose" in columns:
-        yaw, span = columns["object_pose"][:, 2], round(_WINDOW / interval)
-        turned = np.quantile(np.abs(_over(yaw[None], span)), 0.95)
-        if max(abs(yaw[0]), turned) > 2 * np.pi:
-            yield f"has an object that turns too far: {_suspicion('object_yaw', 'deg')}"
-    far = float(np.linalg.norm(np.atleast_2d(columns["target"])[0] - columns["pose"][0, :2]))
-    if far > _FARTHEST:
-        yield f"has its target {far:.3g} m from the start: target_x and target_y are not in metres"
 
 
 def motion_faults(time: np.ndarray, pose: np.ndarray, twist: np.ndarray) -> Iterator[str]:
@@ -258,56 +229,21 @@ def motion_faults(time: np.ndarray, pose: np.ndarray, twist: np.ndarray) -> Iter
     """
     period = np.diff(time, append=time[-1])[:, None]
     span = min(len(time) - 1, max(1, round(_WINDOW / float(np.median(period)))))
-
-    def windows(rates: np.ndarray) -> np.ndarray:
-        return _over(np.cumsum(rates * period, axis=0)[None], span)[0]
-
-    moved = _over(pose[None], span)[0]
-    by_yaw = {f: windows(_rotate(f * pose[:, 2], twist)) for f in (1.0, np.pi / 180, 0.0, -1.0)}
-    commanded = by_yaw[0.0]
-    ratios = []
-    for part, titles, commands, units in (
-        (slice(2), "x and y", "v_x and v_y", {"mm": 1e3, "cm": 1e2, "mm/s": 1e-3, "cm/s": 1e-2}),
-        (slice(2, 3), "yaw", "omega", {"deg": 180 / np.pi, "deg/s": np.pi / 180}),
+    integrals = (np.cumsum(x * period, axis=0) for x in (twist, _rotate(pose[:, 2], twist)))
+    moved, size, path = (_over(x[None], span)[0] for x in (pose, *integrals))
+    for part, titles, units, commands, rates, least in (
+        (slice(2, 3), "yaw", "deg", "omega", "deg/s", -_ALIGNED),
+        (slice(2), "x and y", "mm or cm", "v_x and v_y", "mm/s or cm/s", 0.5),
     ):
-        a, b = (np.mean(np.sum(x[:, part] ** 2, -1)) for x in (moved, commanded))
+        a, b = (np.mean(np.sum(x[:, part] ** 2, -1)) for x in (moved, size))
         ratio = float(np.sqrt((a + _RESOLUTION**2) / (b + _RESOLUTION**2)))
-        likeness = max(_similarity(moved[:, part], x[:, part]) for x in by_yaw.values())
-        ratios.append(ratio)
+        likeness = _similarity(moved[:, part], path[:, part])
         if ratio > _MISFIT or (ratio < 1 / _MISFIT and likeness > _ALIGNED):
-            suspect, unit = (titles if ratio > 1 else commands), _nearest(ratio, units)
-            yield (
-                f"has a base that moves {ratio:.3g} times as far in {titles} as {commands} "
-                f"command: {_suspicion(suspect, unit)}"
-            )
-    if _similarity(moved[:, 2:], commanded[:, 2:]) < -_ALIGNED and ratios[1] > 1 / _MISFIT:
-        yield "has a base that turns against omega: yaw and omega must rise counter-clockwise"
-    similar = {f: _similarity(moved[:, :2], x[:, :2]) for f, x in by_yaw.items()}
-    best = max(similar, key=lambda f: similar[f])
-    turns = similar[best] > 0.9 and best == np.pi / 180 and np.abs(pose[:, 2]).max() > 2 * np.pi
-    if similar[1.0] < (0.95 if turns else 0.5) and 0.5 < ratios[0] < 2:
-        reason = "x, y, yaw, v_x and v_y are not of one robot and frame"
-        reasons = {
-            np.pi / 180: _suspicion("yaw", "deg"),
-            0.0: "v_x and v_y may be in the frame of x and y; write them in that of the robot",
-            -1.0: "yaw may rise clockwise; change its sign, and that of omega",
-        }
-        reason = reasons[best] if similar[best] > 0.9 else reason
-        yield f"has a base that does not move in the direction of v_x and v_y: {reason}"
-
-
-def _suspicion(titles: str, unit: str) -> str:
-    """Return that columns may be in another unit, and how to fix it."""
-    title = titles.split()[0]
-    return (
-        f"{titles} may be in {unit}; write SI units, or name the unit in the title of a table, as "
-        f"'{title} [{unit}]'"
-    )
-
-
-def _nearest(ratio: float, factors: Mapping[str, float]) -> str:
-    """Return the unit whose factor is nearest to a ratio."""
-    return min(factors, key=lambda unit: abs(np.log(factors[unit] / ratio)))
+            suspect, unit = (titles, units) if ratio > 1 else (commands, rates)
+            fault = f"moves {ratio:.3g} times as far in {titles} as {commands} command"
+            yield f"has a base that {fault}: {suspect} may be in {unit}; {_FIX}"
+        elif likeness < least and 0.5 < ratio < 2:
+            yield f"has a base that does not move in the direction of {commands}: {_FRAMES}"
 
 
 def _similarity(a: np.ndarray, b: np.ndarray) -> float:
@@ -315,34 +251,31 @@ def _similarity(a: np.ndarray, b: np.ndarray) -> float:
     return float(np.sum(a * b) / max(1e-12, np.sqrt(np.sum(a**2) * np.sum(b**2))))
 
 
-def _contact_faults(columns: dict[str, np.ndarray], shell: Shell) -> Iterator[str]:
-    """Yield the contradictions of contacts to the robot, the object and the forces."""
-    in_contact = columns["contact_type"] > 0
+def _unit_faults(columns: dict[str, np.ndarray], shell: Shell) -> Iterator[str]:
+    """Yield the quantities that are too large for their units, and contacts beyond the robot."""
+    in_contact, pose = columns["contact_type"] > 0, columns["pose"]
     if not in_contact.any():
         yield "has no contact, so it has no information: log a push"
+    object_pose = columns.get("object_pose", pose * [1, 1, 0])
+    turned = _over(object_pose[None, :, 2], round(_WINDOW / np.median(np.diff(columns["time"]))))
+    for titles, values, limit, unit in (
+        ("v_x and v_y", columns["twist"][:, :2], 3.0, "m/s"),
+        ("omega", columns["twist"][:, 2], 10.0, "rad/s"),
+        ("target_x and target_y", columns["target"] - pose[0, :2], 100.0, "m"),
+        ("object_x and object_y", (object_pose - pose)[in_contact, :2], 20.0, "m"),
+        ("object_yaw", np.append(turned, object_pose[0, 2]), 2 * np.pi, "rad"),
+        ("force_x and force_y", columns.get("f_robot", 0 * pose), 1e4, "N"),
+        ("taxels", columns.get("signal", 0 * pose), 1000.0, "1"),
+    ):
+        if (value := np.abs(values).max(initial=0)) > limit:
+            yield f"has {titles} up to {value:.4g} {unit}, beyond the limit of {limit:.3g}: {_FIX}"
     reach, half = np.abs(columns["p_robot_contact"][in_contact]), np.array(shell.half, float)
     inside = np.median(np.max(reach - half, axis=-1))
     if (reach > half + 0.03).any() or inside < -0.05:
         (x, y), (length, width) = reach.max(0), half
-        unit = _nearest(max(x, y) / length, {"m": 1.0, "mm": 1e3, "cm": 1e2})
-        titles = "contact_x and contact_y"
-        yield (
-            f"has contacts up to ({x:.3f}, {y:.3f}) m, and the robot ends at ({length:.3f}, "
-            f"{width:.3f}) m: it is of another robot (see --robot), or "
-            + (f"{titles} are not in its frame" if unit == "m" else _suspicion(titles, unit))
-        )
-    if "object_pose" in columns:
-        offset = columns["object_pose"][:, :2] - columns["pose"][:, :2]
-        far = float(np.median(np.linalg.norm(offset[in_contact], axis=-1)))
-        if far > _NEAR:
-            yield (
-                f"has its object {far:.3g} m from the base in contact: give object_x and "
-                "object_y in the frame of x and y, in m"
-            )
-    if "f_robot" in columns:
-        force = float(np.median(np.linalg.norm(columns["f_robot"][in_contact], axis=-1)))
-        if force > _HIGHEST_FORCE:
-            yield f"has a median force of {force:.3g} N in contact: write force_x, force_y in [N]"
+        sizes = f"({x:.3f}, {y:.3f}) m, and the robot ends at ({length:.3f}, {width:.3f}) m"
+        reason = "it is of another robot (see --robot), or contact_x and contact_y may be in mm"
+        yield f"has contacts up to {sizes}: {reason} or cm; {_FIX}"
 
 
 def resample(raw: RawLog, interval: float, window: float) -> Log:
