@@ -322,7 +322,7 @@ def test_a_log_is_fitted_from_the_shell(tmp_path, capsys, optimised):
     assert "undetermined" in text
     # No world gives such a log: its object never slides.
     words = " ".join(text.split())
-    assert re.search(r"\d+ of 18 of the response of the base to commands, .* fit is invalid", words)
+    assert re.search(r"\d+ of 18 of the response to commands, .* fit is invalid", words)
     result = domains.parse_domain(str(tmp_path / "fitted.json"))
     assert result.objects == ("random_box",)
     assert (tmp_path / "marginals.png").stat().st_size > 10_000

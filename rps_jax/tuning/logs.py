@@ -107,14 +107,13 @@ def read(
       InputError: the log cannot be read, lacks a column, is not of this robot, or not in its units.
     """
     path = Path("a trace" if isinstance(source, Trace) else source)
-    name, period = f"log = {path}", None
+    name = f"log = {path}"
     if isinstance(source, Trace):
         log = _from_trace(source.data, name)
     elif bag.is_bag(path):
         steps = bag.read(path, topics)
-        known = (*COLUMNS, "signal")
+        known = (*COLUMNS, "signal", "period")
         log = RawLog({k: np.asarray(v, float) for k, v in steps.items() if k in known}, False)
-        period = steps["period"]
     elif path.is_dir():
         log = _from_trace(files.read_results(path), name)
     elif is_table(path):
@@ -123,12 +122,12 @@ def read(
         rule = "give a trace, a run folder of rps push, a table FILE.csv, or a bag FILE.mcap"
         raise not_allowed("log", path, rule)
     columns = log.columns
+    # Taxels of other logs are filtered already.
+    period = columns.pop("period", np.full(np.size(columns["time"]), np.inf))
     if "signal" in columns:
         check_taxels(columns["signal"], shell, name)
     for fault in _faults(log):
         raise InputError(f"{name} {fault}.")
-    if period is None:  # taxels are filtered already
-        period = np.full(np.size(columns["time"]), np.inf)
     contacts = with_contacts(columns | {"period": period}, shell, name)
     columns |= {key: np.asarray(contacts[key], float) for key in (*columns, *_TOUCH)}
     for fault in _unit_faults(columns, shell):
@@ -187,7 +186,7 @@ def _faults(log: RawLog) -> Iterator[str]:
     """Yield the faults of the clock, the cells and the motion of a log."""
     columns = log.columns
 
-    def at(i: int) -> str:
+    def at(i: int | np.intp) -> str:
         return f"step {i}" if log.rows is None else f"row {log.rows[i]}"
 
     if np.size(columns["time"]) < 2:
@@ -196,14 +195,12 @@ def _faults(log: RawLog) -> Iterator[str]:
         if len(bad := np.argwhere(~np.isfinite(values))):
             yield f"has no number for {key} in {at(bad[0][0])}: fill or remove the row"
     kinds = columns.get("contact_type", np.zeros(1))
-    if (bad := ~np.isin(kinds, (0, 1, 2))).any():
-        i = int(bad.argmax())
+    for i in np.flatnonzero(~np.isin(kinds, (0, 1, 2))):
         yield f"has contact_type = {kinds[i]:g} in {at(i)}: write 0 none, 1 a point, 2 a line"
     if np.ptp(np.atleast_2d(columns["target"]), axis=0).max() > _STILL:
         yield "has a target that moves: cut the log where it does"
     time, steps = columns["time"], np.diff(columns["time"])
-    if (steps <= 0).any():
-        i = int((steps <= 0).argmax()) + 1
+    for i in np.flatnonzero(steps <= 0) + 1:
         yield f"is not allowed: its time must rise, and is {time[i]:.9g} s in {at(i)}, not later"
     interval, worst = float(np.median(steps)), float(steps.max())
     if interval > _SLOWEST:
@@ -213,10 +210,10 @@ def _faults(log: RawLog) -> Iterator[str]:
         yield f"has a gap of {worst:.2g} s at {time[i]:.2f} s, {at(i)}: cut the log there"
     if time[-1] - time[0] < _SHORTEST:
         yield f"lasts {time[-1] - time[0]:.1f} s: it must last {_SHORTEST:g} s"
-    moved = np.abs(np.diff(columns["pose"], axis=0)) / np.array(_JUMPS)
-    i, axis = np.unravel_index(moved.argmax(), moved.shape)
-    change = " to ".join(f"{value:.3g}" for value in columns["pose"][i : i + 2, axis])
-    if 0 < np.mean(moved > 1) < _RARE:
+    jumps = np.abs(np.diff(columns["pose"], axis=0)) > np.array(_JUMPS)
+    if 0 < jumps.mean() < _RARE:
+        i, axis = np.argwhere(jumps)[0]
+        change = " to ".join(f"{value:.3g}" for value in columns["pose"][i : i + 2, axis])
         change = f"{[*COLUMNS['pose']][axis]} from {change} in {at(i + 1)}"
         yield f"has a pose that jumps: {change}: cut the log there, or {_FIX}"
     yield from motion_faults(time, columns["pose"], columns["twist"])
@@ -235,20 +232,15 @@ def motion_faults(time: np.ndarray, pose: np.ndarray, twist: np.ndarray) -> Iter
         (slice(2, 3), "yaw", "deg", "omega", "deg/s", -_ALIGNED),
         (slice(2), "x and y", "mm or cm", "v_x and v_y", "mm/s or cm/s", 0.5),
     ):
-        a, b = (np.mean(np.sum(x[:, part] ** 2, -1)) for x in (moved, size))
-        ratio = float(np.sqrt((a + _RESOLUTION**2) / (b + _RESOLUTION**2)))
-        likeness = _similarity(moved[:, part], path[:, part])
+        a, b, c = (np.linalg.norm(x[:, part]) / np.sqrt(len(x)) for x in (moved, size, path))
+        ratio = float(np.hypot(a, _RESOLUTION) / np.hypot(b, _RESOLUTION))
+        likeness = np.mean(np.sum((moved * path)[:, part], -1)) / max(1e-12, a * c)
         if ratio > _MISFIT or (ratio < 1 / _MISFIT and likeness > _ALIGNED):
             suspect, unit = (titles, units) if ratio > 1 else (commands, rates)
             fault = f"moves {ratio:.3g} times as far in {titles} as {commands} command"
             yield f"has a base that {fault}: {suspect} may be in {unit}; {_FIX}"
         elif likeness < least and 0.5 < ratio < 2:
             yield f"has a base that does not move in the direction of {commands}: {_FRAMES}"
-
-
-def _similarity(a: np.ndarray, b: np.ndarray) -> float:
-    """Return the cosine between vectors (N, k), of all entries together."""
-    return float(np.sum(a * b) / max(1e-12, np.sqrt(np.sum(a**2) * np.sum(b**2))))
 
 
 def _unit_faults(columns: dict[str, np.ndarray], shell: Shell) -> Iterator[str]:
@@ -290,15 +282,8 @@ def resample(raw: RawLog, interval: float, window: float) -> Log:
 # --- summary statistics --------------------------------------------------------------------
 
 _BLOCKS = 10
-
-
-_MEANINGS = {
-    "noise": "the noise of pose and twist",
-    "follow": "the response of the base to commands",
-    "object_pose": "the object's pose",
-    "f_robot": "the forces",
-    "signal": "the taxels",
-}
+_MEANINGS = {"object_pose": "the object's pose", "f_robot": "the forces", "signal": "the taxels"}
+_MEANINGS |= {"noise": "the noise of pose and twist", "follow": "the response to commands"}
 
 
 def meaning(statistic: str) -> str:
