@@ -42,6 +42,15 @@ def push(count: int = ROWS, **changes: Any) -> pd.DataFrame:
     return pd.DataFrame(values, range(count)).round(9)
 
 
+def straight(heading: float) -> pd.DataFrame:
+    """Return the log of a base that turns little from a heading [deg], with angles in degrees."""
+    table = push()
+    omega = 0.05 * np.sin(0.7 * table.time)
+    yaw = np.radians(heading) + 0.02 * np.cumsum(omega)
+    x, y = (0.1 * 0.02 * np.cumsum(f(yaw)) for f in (np.cos, np.sin))
+    return table.assign(x=x, y=y, yaw=np.degrees(yaw), omega=np.degrees(omega))
+
+
 def known_object(**changes: Any) -> Change:
     """Return a change that adds the pose of the object and the force on the base."""
 
@@ -372,6 +381,9 @@ CASES: dict[str, Case] = {
     "wrapped degrees": Case(
         "pose that jumps: yaw from .* 'yaw .deg.'",
         text(lambda t: t.assign(yaw=(DEG * t.yaw + 180) % 360 - 180)),
+    ),
+    "yaw and omega in degrees, almost straight": Case(
+        "yaw may be in deg", lambda: straight(50.0).to_csv(index=False).encode()
     ),
     "yaw and omega in degrees": Case("yaw may be in deg", text(scaled(yaw=DEG, omega=0.5 * DEG))),
     "omega in degrees": Case("omega may be in deg/s", text(scaled(omega=DEG))),

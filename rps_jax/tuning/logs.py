@@ -226,21 +226,29 @@ def motion_faults(time: np.ndarray, pose: np.ndarray, twist: np.ndarray) -> Iter
     """
     period = np.diff(time, append=time[-1])[:, None]
     span = min(len(time) - 1, max(1, round(_WINDOW / float(np.median(period)))))
-    integrals = (np.cumsum(x * period, axis=0) for x in (twist, _rotate(pose[:, 2], twist)))
-    moved, size, path = (_over(x[None], span)[0] for x in (pose, *integrals))
+    worlds = (_rotate(yaw, twist) for yaw in (pose[:, 2], np.radians(pose[:, 2])))
+    integrals = (np.cumsum(x * period, axis=0) for x in (twist, *worlds))
+    moved, size, path, path_by_deg = (_over(x[None], span)[0] for x in (pose, *integrals))
     for part, titles, units, commands, rates, least in (
         (slice(2, 3), "yaw", "deg", "omega", "deg/s", -_ALIGNED),
         (slice(2), "x and y", "mm or cm", "v_x and v_y", "mm/s or cm/s", 0.5),
     ):
-        a, b, c = (np.linalg.norm(x[:, part]) / np.sqrt(len(x)) for x in (moved, size, path))
+        a, b = (np.linalg.norm(x[:, part]) / np.sqrt(len(x)) for x in (moved, size))
         ratio = float(np.hypot(a, _RESOLUTION) / np.hypot(b, _RESOLUTION))
-        likeness = np.mean(np.sum((moved * path)[:, part], -1)) / max(1e-12, a * c)
+        likeness, by_deg = (_similarity(moved[:, part], x[:, part]) for x in (path, path_by_deg))
+        if by_deg > max(0.9, likeness) and np.abs(pose[:, 2]).max() > 2 * np.pi:
+            least = 0.95
         if ratio > _MISFIT or (ratio < 1 / _MISFIT and likeness > _ALIGNED):
             suspect, unit = (titles, units) if ratio > 1 else (commands, rates)
             fault = f"moves {ratio:.3g} times as far in {titles} as {commands} command"
             yield f"has a base that {fault}: {suspect} may be in {unit}; {_FIX}"
         elif likeness < least and 0.5 < ratio < 2:
             yield f"has a base that does not move in the direction of {commands}: {_FRAMES}"
+
+
+def _similarity(a: np.ndarray, b: np.ndarray) -> float:
+    """Return the cosine between vectors (N, k), of all entries together."""
+    return float(np.sum(a * b) / max(1e-12, np.linalg.norm(a) * np.linalg.norm(b)))
 
 
 def _unit_faults(columns: dict[str, np.ndarray], shell: Shell) -> Iterator[str]:
