@@ -576,23 +576,23 @@ def _order() -> dict[str, tuple[Any, ...]]:
         "a target as a pose": (as_pose(whole), "", {"target": "/pose"}),
         "only commands": (sorted_[:COUNT], "has no messages on /odom"),
         "header stamps begin anew": (
-            [*whole, *received(lambda r, _: r.time + 2 * SECOND)], "go back from 1.780 to 1.000 s",
+            [*whole, *received(lambda r, _: r.time + 2 * SECOND)], "a header stamp that goes back",
         ),
         "a header stamp of odom goes back": (
             edited("/odom", set_("header.stamp", {"sec": 1}), [9]),
-            "on /odom that go back from 1.160 to 1.000 s",
+            "a header stamp that goes back on /odom at 1.000 s",
         ),
         "a header stamp of a command is 0": (
-            edited("/cmd_vel", set_("header.stamp", {}), [9]), "on /cmd_vel that go back",
+            edited("/cmd_vel", set_("header.stamp", {}), [9]), "goes back on /cmd_vel at 0.000 s",
         ),
         "sim time and system time mixed": (
-            [r for r in by_system if r.topic != "/taxels"], "synchronise the clocks",
+            [r for r in by_system if r.topic != "/taxels"], "in the 1 s before that on /cmd_vel",
         ),
-        "sim time and system time mixed, taxels": (by_system, "no header stamps on /taxels"),
+        "sim time and system time mixed, taxels": (by_system, "of other topics, on /taxels"),
         "a simulation slower than the clock": (
-            received(lambda r, _: 20 * r.time), "no header stamps on /taxels",
+            received(lambda r, _: 20 * r.time), "no header stamp, nor times of receipt",
         ),
-        "odom ends early": (ends, "no message on /odom in the 4 s before the command at 17.8"),
+        "odom ends early": (ends, "no message on /odom in the 1 s before that on /cmd_vel at 15"),
     }  # fmt: skip
 
 
@@ -652,48 +652,51 @@ def _invalid_files() -> dict[str, tuple[Any, ...]]:
     """Return files that are no bags, or damaged."""
     whole, bomb = rows(), bytes(2**27)
     return {
-        "an empty file": (content(b""), "is empty"),
-        "an empty file .db3": (content(b"", "bag.db3"), "is empty"),
-        "a text": (content(b"time,x,y\n"), "is no bag: give FILE.mcap"),
+        "an empty file": (content(b""), "is no bag of ROS 2): give FILE.mcap"),
+        "an empty file .db3": (content(b"", "bag.db3"), "is no bag of ROS 2"),
+        "a text": (content(b"time,x,y\n"), "is no bag of ROS 2): give FILE.mcap"),
         "a zip archive": (zipped, "is no bag"),
-        "a path that is missing": (lambda f: f / "none.mcap", "is no bag"),
-        "a cut MCAP file": (cut(plain(whole), 0.5), "is cut off: save the rest"),
+        "a path that is missing": (lambda f: f / "none.mcap", "No such file"),
+        "a cut MCAP file": (cut(plain(whole), 0.5), "is cut off or damaged, save the rest"),
         "a cut MCAP file without chunks": (
-            cut(plain(whole, use_chunking=False), 0.5), "is cut off: save the rest",
+            cut(plain(whole, use_chunking=False), 0.5), "is cut off or damaged, save the rest",
         ),
         "an MCAP file without end": (cut(plain(whole, **NO_INDEX), 0.99), "is cut off"),
-        "a wrong bit": (flipped, "is damaged (crc validation failed"),
+        "a wrong bit": (flipped, "cannot be read (crc validation failed"),
         "a cut file .db3": (cut(file_of(folder_of("SQLITE3")), 0.5), ".recover | sqlite3"),
-        "a cut file .mcap.zstd": (cut(file_of(folder_of("MCAP", "FILE")), 0.5), "is damaged"),
-        "zstd of no bag": (content(zstandard.compress(b"no"), "a.zstd"), "its content is no bag"),
-        "another sqlite3 file": (other_sqlite, "no tables topics and messages"),
-        "ROS 1": (ros1_bag, "is a ROS 1 bag: run `rosbags-convert --src"),
+        "a cut file .mcap.zstd": (cut(file_of(folder_of("MCAP", "FILE")), 0.5), "compress it"),
+        "zstd of no bag": (content(zstandard.compress(b"no"), "a.zstd"), "is no bag of ROS 2"),
+        "another sqlite3 file": (other_sqlite, "no such table: topics"),
+        "ROS 1": (ros1_bag, "convert this ROS 1 bag by `rosbags-convert --src"),
         "messages in JSON": (plain(whole, encoding="json"), "in the encoding json"),
         "messages in protobuf": (
             plain(whole, encoding="protobuf", schema="protobuf"), "in the encoding protobuf",
         ),
         "messages of odd bytes": (
             changed(lambda r: r._replace(data=b"odd")),
-            "has a message on /odom that cannot be decoded as nav_msgs/Odometry",
+            "has a nav_msgs/Odometry in the encoding cdr on /odom that cannot be decoded",
         ),
-        "a schema of odd text": (plain(whole, text=lambda r: "~?"), "that cannot be decoded"),
-        "a schema of other fields": (plain(whole, text=lambda r: "byte x"), "cannot be decoded"),
-        "an empty folder": (lambda f: f, "has no file .mcap or .db3"),
-        "a folder of two bags": (several, "give one of them, or run `ros2 bag reindex"),
+        "a schema of odd text": (plain(whole, text=lambda r: "~?"),),
+        "a schema of other fields": (plain(whole, text=lambda r: "byte x"),),
+        "an empty folder": (lambda f: f, "metadata.yaml'): give FILE.mcap"),
+        "a folder of two bags": (several, "a folder of them (`ros2 bag reindex FOLDER`"),
         "a folder that lacks a file": (
-            changed_folder(lambda p: (p / "push 1.mcap").unlink(), 3), "lacks push 1.mcap",
+            changed_folder(lambda p: (p / "push 1.mcap").unlink(), 3), "push 1.mcap'): give",
         ),
         "a folder with odd metadata": (
             changed_folder(lambda p: (p / "metadata.yaml").write_text("a: [")), "ros2 bag reindex",
         ),
         "a chunk larger than it says, zstd": (
-            content(chunked(zstandard.compress(bomb), 100, "zstd")), "a chunk of 134217728 bytes",
+            content(chunked(zstandard.compress(bomb), 100, "zstd")), "more than 67108864 bytes",
         ),
         "a chunk larger than it says, lz4": (
-            content(chunked(lz4.frame.compress(bomb), 100, "lz4")), "a chunk of 67108865 bytes",
+            content(chunked(lz4.frame.compress(bomb), 100, "lz4")), "more than 67108864 bytes",
         ),
-        "an unknown compression": (content(chunked(b"?", 100, "br")), "has the compression br"),
+        "an unknown compression": (content(chunked(b"?", 100, "br")), "the compression br, "),
         "a receipt as text": (odd_sqlite, "cannot be decoded"),
+        "a receipt beyond 64 bits": (
+            changed(lambda r: r._replace(time=2**64 - 1)), "cannot be decoded",
+        ),
     }  # fmt: skip
 
 
@@ -713,6 +716,9 @@ def _frames() -> dict[str, tuple[Any, ...]]:
         ),
         "frames with a prefix": (prefixed(),),
         "a target in map, static": ([*from_map, STATIC["map"]],),
+        "a target in map, static, and a message without transforms": (
+            [Row("/tf", SECOND, {"transforms": []}), *from_map, STATIC["map"]],
+        ),
         "a target in map, over two transforms": (
             [*moved("/target", 3.0, 1.0, "earth"), STATIC["map"],
              transform("earth", "map", 1.0, 2.0)],
@@ -737,7 +743,7 @@ def _frames() -> dict[str, tuple[Any, ...]]:
         "a target in map": (framed("/target", "map"), no_path("/target", "map", "odom")),
         "a target in base_link, before odom": (
             [r for r in base_target() if r.topic != "/odom" or r.time > 1.2 * SECOND],
-            "no transform of odom to base_link at the time of /target, 1.040 s",
+            "no transform of odom to base_link at the time of the message on /target at 1.040 s",
         ),
         "a contact in a camera": (
             framed("/contact", "camera"), no_path("/contact", "camera", "base_link"),
@@ -752,10 +758,10 @@ def _frames() -> dict[str, tuple[Any, ...]]:
             [*turned, STATIC["turned"]], "publish commands in base_link",
         ),
         "frames of odom change": (
-            edited("/odom", set_("header.frame_id", "map"), range(9)), "several frames on /odom",
+            edited("/odom", set_("header.frame_id", "map"), range(9)), "a change of frames on",
         ),
         "a transform too late": (
-            [*from_map, late_map], "no transform of map to odom at the time of /target",
+            [*from_map, late_map], "no transform of map to odom at the time of the message",
         ),
         "a transform that is no rotation": (
             [*from_map, *no_rotation], "whose norm is not 1 on /tf_static",
@@ -786,7 +792,7 @@ def _topics() -> dict[str, tuple[Any, ...]]:
         "a key twice": (whole, "name each once", ["odom=/odom", "odom=/o"]),
         "a key alone": (whole, "topic = odom is not allowed", ["odom"]),
         "a topic of another type": (
-            whole, "has std_msgs/Float32MultiArray on /taxels: record nav_msgs/Odometry",
+            whole, "has a std_msgs/Float32MultiArray in the encoding cdr on /taxels that cannot",
             {"odom": "/taxels"},
         ),
         "no contacts and taxels": (
@@ -841,7 +847,7 @@ def _values() -> dict[str, tuple[Any, ...]]:
             edited("/contact", set_("polygon.points", [{}] * 4), [5]), "a contact of 4 points",
         ),
         "taxels of two counts": (
-            edited("/taxels", set_("data", [0.0] * 41), [5]), "has 42 and 41 values on /taxels",
+            edited("/taxels", set_("data", [0.0] * 41), [5]), "be decoded (41 values, not 42)",
         ),
     }  # fmt: skip
 

@@ -205,8 +205,8 @@ def test_bags_that_are_no_log_are_refused_before_anything_compiles(tmp_path, com
         "has 41 taxels, and the robot 42": lambda: bagged(path, rows, signal=np.zeros((400, 41))),
         "lasts 1.9 s: it must last 5 s": lambda: bagged(path, rows[:95]),
         "no messages on /odom": lambda: bag.write(path, [], {}),
-        "is no bag: give FILE.mcap": lambda: path.write_bytes(b"no bag"),
-        "is cut off: save the rest": lambda: path.write_bytes(
+        "is no bag of ROS 2): give FILE.mcap": lambda: path.write_bytes(b"no bag"),
+        "cut off or damaged, save the rest": lambda: path.write_bytes(
             bagged(path, rows).read_bytes()[:20_000]
         ),
     }.items():

@@ -29,12 +29,11 @@ from __future__ import annotations
 
 import functools
 import math
-from array import array
-from collections import defaultdict, deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
 from functools import partial
+from operator import attrgetter
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -48,27 +47,16 @@ from rps_jax.record.bag_storage import is_bag as is_bag
 Message = dict[str, Any]  # fields of any type
 Floats = Sequence[float] | np.ndarray
 TopicsLike = str | Mapping[str, str] | Sequence[str]  # names of topics: see `topic_names`
-_MAX_NUMBERS = 2**28  # of all messages, and of all steps; a message counts 8 more
+_MAX_NUMBERS = 2**27  # of all messages, and of all steps; a message counts 32 more
 _MARKER_PERIOD = 1.0  # [s] between two target markers
-TOPICS = {
-    "/odom": "nav_msgs/Odometry",
-    "/target": "geometry_msgs/PointStamped",
-    "/contact": "geometry_msgs/PolygonStamped",
-    "/taxels": "std_msgs/Float32MultiArray",
-    "/force": "geometry_msgs/WrenchStamped",
-    "/object": "visualization_msgs/Marker",
-    "/cmd_vel": "geometry_msgs/TwistStamped",
-    "/target_marker": "visualization_msgs/Marker",
-    "/tf": "tf2_msgs/TFMessage",
-}
-_REQUIRED = ("odom", "target", "cmd_vel")
-_TOUCH = ("contact", "taxels")  # of which one is required, too
 _STALE = 1.0  # [s] that a stream of messages may pause
 _EARLY = 0.1  # [s] before a transform that it holds
 _SKEW = 0.5  # [s] of 80 % of the delays between stamp and receipt
 _MAX_TILT = 0.1  # [rad] of the base against the floor
 _UNIT = 1e-3  # [1] by which the norm of a quaternion may differ from 1
-_SAME = 1e-6  # [m] by which two frames may differ that are one
+_SAME = 1e-6  # [m, rad] by which two frames may differ that are one
+_CORRECT = "cut the bag there, or correct the node that publishes it, or its clock (use_sim_time)"
+_NO_HEADER = SimpleNamespace(stamp=SimpleNamespace(sec=0, nanosec=0), frame_id="")
 
 
 class Step(NamedTuple):
@@ -87,12 +75,66 @@ class Step(NamedTuple):
     object_pose: Floats | None = None  # (3,) [m, m, rad] for viewers alone
 
 
-_require = partial(errors.require, extra="bags")
-
-
 def check() -> None:
     """Raise InputError unless the packages of the extra `bags` are installed."""
-    _ = _require("mcap_ros2.writer"), _require("rosbags.typesys")
+    _ = errors.require("mcap_ros2.writer", "bags"), errors.require("rosbags.typesys", "bags")
+
+
+# --- topics --------------------------------------------------------------------------------
+
+
+def _floats(*vectors: str) -> Callable[[Any], Floats]:
+    """Return what reads numbers from a message, by names as `pose.position.xyz`."""
+    parts = [vector.rpartition(".") for vector in vectors]
+    return attrgetter(*(f"{owner}.{axis}" for owner, _, axes in parts for axis in axes))
+
+
+def _contact(message: Any) -> Floats:
+    """Return the middle of a contact, and its type."""
+    points = [(p.x, p.y, p.z) for p in message.polygon.points]
+    if len(points) > 2:
+        raise ValueError(f"a contact of {len(points)} points, not of none, one or two")
+    middle = (sum(axis) / len(points) for axis in zip(*points, strict=True))
+    return [*middle, len(points)] if points else [0.0, 0.0, 0.0, 0.0]
+
+
+def _plane_pose(values: np.ndarray) -> np.ndarray:
+    # math.atan2 has the same bits on every machine.
+    yaw = [2 * math.atan2(z, w) for z, w in values[:, 5:].tolist()]
+    return np.column_stack([values[:, :2], np.unwrap(yaw)])
+
+
+def _xy(values: np.ndarray) -> np.ndarray:
+    return values[:, :2]
+
+
+_TREE = ("tf", "tf_static")
+_TF = {"tf2_msgs/TFMessage": _floats("transform.translation.xyz", "transform.rotation.xyzw")}
+_READERS: dict[str, dict[str, Callable[[Any], Floats]]] = {  # of messages, by topic and type
+    "odom": {"nav_msgs/Odometry": _floats("pose.pose.position.xyz", "pose.pose.orientation.xyzw")},
+    "target": {"geometry_msgs/PointStamped": _floats("point.xyz"),
+               "geometry_msgs/PoseStamped": _floats("pose.position.xyz")},
+    "contact": {"geometry_msgs/PolygonStamped": _contact},
+    "taxels": {"std_msgs/Float32MultiArray": attrgetter("data")},
+    "force": {"geometry_msgs/WrenchStamped": _floats("wrench.force.xyz")},
+    "object": {"visualization_msgs/Marker": _floats("pose.position.xyz", "scale.x")},
+    "cmd_vel": {"geometry_msgs/TwistStamped": _floats("twist.linear.xy", "twist.angular.z"),
+                "geometry_msgs/Twist": _floats("linear.xy", "angular.z")},
+    **dict.fromkeys(_TREE, _TF),
+}  # fmt: skip
+_FIELDS: dict[str, tuple[str, Callable[[np.ndarray], np.ndarray]]] = {  # of values (N, k)
+    "pose": ("odom", _plane_pose),
+    "target": ("target", _xy),
+    "contact_type": ("contact", lambda v: v[:, 3].astype(int)),
+    "p_robot_contact": ("contact", lambda v: np.where(v[:, 3:] > 0, v[:, :2], 0.0)),
+    "signal": ("taxels", lambda v: v.astype(np.float32)),
+    "f_robot": ("force", _xy),
+    "p_world_object": ("object", _xy),
+    "r_object": ("object", lambda v: 0.5 * v[:, 3]),
+    "twist": ("cmd_vel", lambda v: v),
+}
+TOPICS = {f"/{key}": next(iter(readers)) for key, readers in _READERS.items()}  # types
+TOPICS["/target_marker"] = TOPICS["/object"]
 
 
 # --- writing -------------------------------------------------------------------------------
@@ -100,11 +142,14 @@ def check() -> None:
 
 def write(path: Path, steps: Iterable[Step], metadata: Mapping[str, str]) -> Path:
     """Write a bag atomically."""
-    module, typesys = _require("mcap_ros2.writer"), _require("rosbags.typesys")
-    definitions = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
+    check()
+    from mcap_ros2.writer import Writer
+    from rosbags.typesys import Stores, get_typestore
+
+    definitions = get_typestore(Stores.ROS2_HUMBLE)
 
     def fill(partial: Path) -> None:
-        with open(partial, "wb") as file, module.Writer(file) as writer:
+        with open(partial, "wb") as file, Writer(file) as writer:
             schemas = {}
             for kind in dict.fromkeys(TOPICS.values()):
                 name = kind.replace("/", "/msg/")
@@ -123,33 +168,26 @@ def _messages(steps: Iterable[Step]) -> Iterator[tuple[str, int, Message]]:
     for step in steps:
         stamp = round(1e9 * step.time)
         odom, base = _header(stamp, "odom"), _header(stamp, "base_link")
-        x, y, yaw = map(float, step.pose)
-        pose = {"position": _xyz(x, y), "orientation": _yaw(yaw)}
-        yield "/odom", stamp, {
-            "header": odom,
-            "child_frame_id": "base_link",
-            "pose": {"pose": pose},
-            "twist": {"twist": _velocity(previous, step)},
-        }  # fmt: skip
+        pose = {"pose": _pose(*step.pose)}
+        child = {"header": odom, "child_frame_id": "base_link"}
+        yield "/odom", stamp, {**child, "pose": pose, "twist": {"twist": _velocity(previous, step)}}
         yield "/target", stamp, {"header": odom, "point": _xyz(*step.target)}
         points = [_xyz(*step.p_robot_contact)] * int(step.contact_type)
         yield "/contact", stamp, {"header": base, "polygon": {"points": points}}
         if step.signal is not None:
-            count = len(step.signal)
-            dim = [{"label": "taxels", "size": count, "stride": count}]
-            yield "/taxels", stamp, {"layout": {"dim": dim}, "data": list(step.signal)}
+            dim = {"label": "taxels", "size": len(step.signal), "stride": len(step.signal)}
+            yield "/taxels", stamp, {"layout": {"dim": [dim]}, "data": list(step.signal)}
         if step.f_robot is not None:
             yield "/force", stamp, {"header": base, "wrench": {"force": _xyz(*step.f_robot)}}
         if step.p_world_object is not None:
-            width = 2 * float(step.r_object)
-            yield "/object", stamp, _cylinder(odom, "object", step.p_world_object, width)
-        frames = [_frame(odom, "base_link", x, y, yaw)]
+            yield "/object", stamp, _cylinder(odom, "object", step.p_world_object, step.r_object)
+        frames = [_frame(odom, "base_link", *step.pose)]
         if step.object_pose is not None:
-            frames.append(_frame(odom, "object", *map(float, step.object_pose)))
+            frames.append(_frame(odom, "object", *step.object_pose))
         yield "/tf", stamp, {"transforms": frames}
         if step.time >= marker_time + _MARKER_PERIOD:
             marker_time = step.time
-            yield "/target_marker", stamp, _cylinder(odom, "target", step.target, 0.1)
+            yield "/target_marker", stamp, _cylinder(odom, "target", step.target, 0.05)
         yield "/cmd_vel", stamp, {"header": base, "twist": _twist(*step.twist)}
         previous = step
 
@@ -162,57 +200,48 @@ def _xyz(x: float, y: float) -> dict[str, float]:
     return {"x": float(x), "y": float(y)}
 
 
-def _yaw(yaw: float) -> dict[str, float]:
-    return {"z": math.sin(yaw / 2), "w": math.cos(yaw / 2)}
+def _pose(x: float, y: float, yaw: float = 0.0) -> Message:
+    half = float(yaw) / 2
+    return {"position": _xyz(x, y), "orientation": {"z": math.sin(half), "w": math.cos(half)}}
 
 
 def _twist(v_x: float, v_y: float, omega: float) -> Message:
     return {"linear": _xyz(v_x, v_y), "angular": {"z": float(omega)}}
 
 
-def _velocity(previous: Step | None, step: Step) -> Message:
-    """Return the velocity of the base since the previous step, in its own frame."""
-    if previous is None or step.time <= previous.time:
+def _velocity(last: Step | None, step: Step) -> Message:
+    """Return the velocity of the base since the last step, in its own frame."""
+    if last is None or step.time <= last.time:
         return _twist(0, 0, 0)
-    pose = np.asarray(step.pose, float)
-    v_x, v_y, omega = (pose - np.asarray(previous.pose, float)) / (step.time - previous.time)
-    c, s = math.cos(pose[2]), math.sin(pose[2])
+    v_x, v_y, omega = np.subtract(step.pose, last.pose, dtype=float) / (step.time - last.time)
+    c, s = math.cos(step.pose[2]), math.sin(step.pose[2])
     return _twist(c * v_x + s * v_y, c * v_y - s * v_x, omega)
 
 
 def _frame(header: Message, child: str, x: float, y: float, yaw: float) -> Message:
-    transform = {"translation": _xyz(x, y), "rotation": _yaw(yaw)}
+    transform = {"translation": _xyz(x, y), "rotation": _pose(x, y, yaw)["orientation"]}
     return {"header": header, "child_frame_id": child, "transform": transform}
 
 
-def _cylinder(header: Message, name: str, center: Floats, width: float) -> Message:
-    """Return a marker of type 3."""
-    pose = {"position": _xyz(*center), "orientation": _yaw(0)}
-    return {
-        **{"header": header, "ns": name, "type": 3, "pose": pose},
-        "scale": {"x": width, "y": width, "z": 0.01},
-        "color": {"r": 0.1, "g": 0.6, "b": 0.2, "a": 0.8},
-    }
+def _cylinder(header: Message, name: str, center: Floats, r: float) -> Message:
+    """Return a marker of type 3 with a radius [m]."""
+    scale, color = _xyz(2 * r, 2 * r) | {"z": 0.01}, {"r": 0.1, "g": 0.6, "b": 0.2, "a": 0.8}
+    shape = {"type": 3, "pose": _pose(*center), "scale": scale, "color": color}
+    return {"header": header, "ns": name, **shape}
 
 
 # --- reading -------------------------------------------------------------------------------
 
 
 def topic_names(topics: TopicsLike) -> dict[str, str]:
-    """Return the topics of a bag by their keys, as {"odom": "/odom", ...}.
+    """Return the topics of a bag that have other names, by their keys, as {"odom": "/r1/odom"}.
 
     Args:
-      topics: other names, as {"odom": "/ridgeback/odom"} or texts `odom=/ridgeback/odom`.
+      topics: names by keys, or texts `odom=/r1/odom`.
 
     Raises:
       InputError: a key is unknown or repeated, or a name is missing.
     """
-    renamed = _renamed(topics)
-    return {key: f"/{key}" for key in _READERS if key not in renamed} | renamed
-
-
-def _renamed(topics: TopicsLike) -> dict[str, str]:
-    """Return the topics that have other names, by their keys."""
     whole = topics if isinstance(topics, str | Mapping) else ",".join(map(str, topics))
     names = options.parse_names("topic", whole)
     for key in names:
@@ -235,154 +264,57 @@ def read(path: Path, topics: TopicsLike = ()) -> dict[str, np.ndarray]:
       InputError: the path is no bag; the bag is damaged or too large, or lacks a topic; or its
         messages have no order, numbers that are not finite, an unknown frame, or no rotation.
     """
-    names, renamed = topic_names(topics), _renamed(topics)
+    names = topic_names(topics)
     check()
     try:
-        return _steps(Path(path), names, renamed)
+        return _steps(Path(path), names)
     except InputError as error:
         raise InputError(f"bag = {path} {str(error).rstrip('.')}.") from error
 
 
-def _steps(path: Path, names: dict[str, str], required: Iterable[str]) -> dict[str, np.ndarray]:
+def _steps(path: Path, renamed: dict[str, str]) -> dict[str, np.ndarray]:
     """Return the steps of a bag, as `read` does."""
-    logs, contents = _collect(path, {k: v for k, v in names.items() if k not in _FRAMES})
-    missing = [names[key] for key in {**dict.fromkeys(_REQUIRED), **dict.fromkeys(required)}
-               if key not in logs and key not in _FRAMES]  # fmt: skip
-    if not any(key in logs for key in _TOUCH):
-        missing.append(" or ".join(names[key] for key in _TOUCH))
+    names = {key: f"/{key}" for key in _READERS if key not in renamed} | renamed
+    logs, contents = _collect(path, {key: names[key] for key in names if key not in _TREE})
+    required = dict.fromkeys(["odom", "target", "cmd_vel", *renamed])
+    missing = [names[key] for key in required if key not in logs and key not in _TREE]
+    if not logs.keys() & {"contact", "taxels"}:
+        missing.append(f"{names['contact']} or {names['taxels']}")
     if missing:
-        kinds = [f"{topic} ({kind})"[:90] for topic, kind in sorted(contents.items())]
-        more = f" and {len(kinds) - 10} more" if len(kinds) > 10 else ""
         raise InputError(
             f"has no messages on {', '.join(missing)}; its topics are "
-            f"{', '.join(kinds[:10]) or 'none'}{more}: name others by --topic KEY=/TOPIC"
+            f"{', '.join(sorted(contents)) or 'none'}: name others by --topic KEY=/TOPIC"
         )
     delay = _delay(logs.values())
-    series = {key: log.in_order(delay) for key, log in logs.items()}
+    series = {key: _in_order(names[key], log, delay) for key, log in logs.items()}
     commands = series.pop("cmd_vel")
-    commands = commands.at(np.flatnonzero(np.append(np.diff(commands.time) > 0, True)))
-    last = max(series.values(), key=lambda s: s.time[0])  # to begin
-    commands = commands.at(commands.time >= last.time[0])
-    if len(commands.time) < 2:
-        raise InputError(
-            f"has too few commands, {len(commands.time)}, on {commands.topic} after the first "
-            f"message of {last.topic} at {_seconds(last.time[0])} s: record at least two"
-        )
-    widths = sum(s.values.shape[1] + 8 for s in [commands, *series.values()])
-    _check_size(len(commands.time) * widths)
-    rows = {key: s.at(s.latest(commands.time)) for key, s in series.items()}
+    commands = commands.at(commands.time >= max(s.time[0] for s in series.values()))
+    if (count := len(commands.time)) < 2:
+        words = f"has too few commands, {count}, on {commands.topic} after all topics have begun"
+        raise InputError(f"{words}: record at least two")
+    _check_size(count * sum(s.values.shape[1] + 32 for s in series.values()))
+    rows = {"cmd_vel": commands} | {key: s.latest(commands.time) for key, s in series.items()}
     for key, row in rows.items():
-        is_stream = key != "target" and len(series[key].time) > len(commands.time) / 4
-        age = 1e-9 * (commands.time - row.time)
-        if (key == "odom" or is_stream) and age.max() > _STALE:
-            when = _seconds(commands.time[age.argmax()])
-            raise InputError(
-                f"has no message on {row.topic} in the {age.max():.3g} s before the command at "
-                f"{when} s: cut the bag there, or synchronise the clocks"
-            )
-    rows["cmd_vel"] = commands
-    for key, row in rows.items():
+        if key == "odom" or (key != "target" and len(logs[key]) > count / 4):  # a stream
+            late = commands.time - row.time > 1e9 * _STALE
+            commands.refuse(late, f"no message on {row.topic} in the {_STALE:g} s before that")
         row.check(_MAX_TILT if key == "odom" else None)
-    _to_frames(rows, _Transforms(path, names, series["odom"], delay))
-    return _fields(commands, rows)
-
-
-def _fields(commands: _Series, rows: Mapping[str, _Series]) -> dict[str, np.ndarray]:
-    """Return the fields of `Step`, by the values of topics at the commands."""
-    odom = rows["odom"].values
-    # math.atan2 has the same bits on every machine.
-    yaw = [2 * math.atan2(z, w) for z, w in odom[:, 5:].tolist()]
+    edges = functools.cache(partial(_edges, path, names, logs["odom"], delay))
+    _to_frames(rows, edges, names["tf_static"])
     time = 1e-9 * commands.time
-    periods = np.diff(time)
-    fields = {
+    return {
         "time": time,
-        "period": np.concatenate([[np.median(periods)], periods]),
-        "pose": np.column_stack([odom[:, :2], np.unwrap(yaw)]),
-        "target": rows["target"].values[:, :2],
-        "twist": commands.values,
+        "period": np.insert(np.diff(time), 0, np.median(np.diff(time))),
+        **{name: get(rows[key].values) for name, (key, get) in _FIELDS.items() if key in rows},
     }
-    if "contact" in rows:
-        fields["contact_type"] = rows["contact"].values[:, 3].astype(int)
-        fields["p_robot_contact"] = rows["contact"].values[:, :2]
-    if "taxels" in rows:
-        fields["signal"] = rows["taxels"].values.astype(np.float32)
-    if "force" in rows:
-        fields["f_robot"] = rows["force"].values[:, :2]
-    if "object" in rows:
-        fields["p_world_object"] = rows["object"].values[:, :2]
-        fields["r_object"] = 0.5 * rows["object"].values[:, 3]
-    return fields
-
-
-def _seconds(time: float) -> str:
-    return f"{1e-9 * time:.3f}"
 
 
 # --- messages as arrays --------------------------------------------------------------------
 
-
-@dataclass
-class _Log:
-    """Messages of one topic in the order of the bag, in compact arrays."""
-
-    topic: str
-    receipt: array[int] = field(default_factory=lambda: array("q"))  # [ns]
-    stamp: array[int] = field(default_factory=lambda: array("q"))  # [ns] of the header, or 0
-    frames: array[int] = field(default_factory=lambda: array("q"))  # indices of `pairs`
-    pairs: dict[tuple[str, str], int] = field(default_factory=dict)  # of the header, of the child
-    values: array[float] = field(default_factory=lambda: array("d"))
-    width: int = 0  # of the values of a message
-
-    def append(self, receipt: int, part: Any, values: Floats) -> None:
-        """Append the values of a message, or of a part of one."""
-        header, child = getattr(part, "header", None), getattr(part, "child_frame_id", "")
-        stamp = 0 if header is None else header.stamp.sec * 10**9 + header.stamp.nanosec
-        frame = "" if header is None else header.frame_id
-        pair = frame.lstrip("/"), child.lstrip("/")
-        self.width = self.width or len(values)
-        if self.width != len(values) or not self.width:
-            raise InputError(
-                f"has {self.width} and {len(values)} values on {self.topic}, at "
-                f"{_seconds(stamp or receipt)} s: cut the bag there"
-            )
-        self.receipt.append(receipt)
-        self.stamp.append(stamp)
-        self.frames.append(self.pairs.setdefault(pair, len(self.pairs)))
-        self.values.frombytes(np.asarray(values, float).tobytes())
-
-    def in_order(self, delay: int | None, *, merged: bool = False) -> _Series:
-        """Return the messages in the order of time; the last of equal times is the last received.
-
-        Args:
-          delay: [ns] from stamp to receipt, or None if it is not constant.
-          merged: whether the topic has several publishers, whose stamps may overlap.
-
-        Raises:
-          InputError: header stamps go back, or a topic without them has no time.
-        """
-        receipt, stamp = np.asarray(self.receipt), np.asarray(self.stamp)
-        if stamp.any():
-            time, by_receipt = stamp, np.argsort(receipt, kind="stable")
-            back = np.diff(stamp) < 0
-            # One of both orders may be wrong: files are reordered, and clocks of receivers jump.
-            if not merged and back.any() and (np.diff(stamp[by_receipt]) < 0).any():
-                i = int(np.argmax(back))
-                raise InputError(
-                    f"has header stamps on {self.topic} that go back from {_seconds(stamp[i])} to "
-                    f"{_seconds(stamp[i + 1])} s: cut the bag there"
-                )
-        elif delay is None:
-            raise InputError(
-                f"has no header stamps on {self.topic}, and times of receipt that do not keep pace "
-                "with the stamps of other topics: record all topics by one clock, in simulation "
-                "with --use-sim-time"
-            )
-        else:
-            time = receipt - delay
-        order = np.lexsort((receipt, time))
-        values = np.frombuffer(self.values).reshape(len(time), self.width)
-        frames = np.asarray(self.frames)[order]
-        return _Series(self.topic, time[order], values[order], frames, list(self.pairs))
+# Rows of a topic: time of receipt [ns]; stamp [ns] of the header, or 0; frames of header and child;
+# values.
+_Pair = tuple[str, str]
+_Log = list[tuple[np.int64, int, _Pair, np.ndarray]]
 
 
 class _Series(NamedTuple):
@@ -391,68 +323,63 @@ class _Series(NamedTuple):
     topic: str
     time: np.ndarray  # (N,) [ns]
     values: np.ndarray  # (N, k)
-    frames: np.ndarray  # (N,) indices of `pairs`
-    pairs: list[tuple[str, str]]  # frames of headers, and of children
+    frames: np.ndarray  # (N, 2) of the headers, and of the children
 
     def at(self, index: np.ndarray) -> _Series:
         """Return some of the messages."""
-        time, values, frames = self.time[index], self.values[index], self.frames[index]
-        return self._replace(time=time, values=values, frames=frames)
+        return _Series(self.topic, *(column[index] for column in self[1:]))
 
-    def latest(self, time: np.ndarray) -> np.ndarray:
-        """Return the index of the latest message at each time [ns]; -1 before the first."""
-        return np.searchsorted(self.time, time, side="right") - 1
+    def latest(self, time: np.ndarray) -> _Series:
+        """Return the latest message at each time [ns], or the first before it."""
+        return self.at(np.maximum(np.searchsorted(self.time, time, side="right") - 1, 0))
+
+    def refuse(self, bad: np.ndarray | np.bool, words: str, fix: str = _CORRECT) -> None:
+        """Raise InputError if a message is bad; its quaternion replaces `{}` in the words."""
+        if bad.any():
+            i = int(bad.argmax())
+            words = words.replace("{}", ", ".join(f"{v:.3g}" for v in self.values[i, 3:]))
+            raise InputError(f"has {words} on {self.topic} at {1e-9 * self.time[i]:.3f} s: {fix}")
 
     def check(self, max_tilt: float | None = None) -> None:
-        """Raise InputError unless the numbers are finite, and the quaternions of poses rotations.
+        """Raise InputError unless numbers are finite, and quaternions rotations.
 
         Args:
           max_tilt: [rad] of the quaternions in the columns 3 to 6 against the floor, if there are.
         """
-        faults = [(~np.isfinite(self.values).all(1), "a number that is not finite")]
+        self.refuse(~np.isfinite(self.values).all(axis=1), "a number that is not finite")
         if max_tilt is not None:
             x, y, *_ = q = self.values[:, 3:].T
-            with np.errstate(all="ignore"):
-                tilt = 2 * np.arcsin(np.minimum(np.hypot(x, y), 1))
-                excess = abs(np.linalg.norm(q, axis=0) - 1)
-            words = "a quaternion {} whose norm is not 1"
-            faults.append((excess > _UNIT, words))
-            faults.append((tilt > max_tilt, f"a quaternion {{}} that tilts beyond {max_tilt} rad"))
-        for bad, words in faults:
-            if bad.any():
-                i = int(np.argmax(bad))
-                q = ", ".join(f"{v:.3g}" for v in self.values[i, 3:])
-                raise InputError(
-                    f"has {words.format(f'({q})')} on {self.topic} at {_seconds(self.time[i])} s: "
-                    "cut it out, or correct the node that publishes it"
-                )
+            excess = abs(np.linalg.norm(q, axis=0) - 1)
+            self.refuse(excess > _UNIT, "a quaternion ({}) whose norm is not 1")
+            tilt = 2 * np.arcsin(np.minimum(np.hypot(x, y), 1))
+            self.refuse(tilt > max_tilt, f"a quaternion ({{}}) that tilts beyond {max_tilt} rad")
 
 
-def _collect(path: Path, names: Mapping[str, str]) -> tuple[dict[str, _Log], dict[str, str]]:
-    """Return the messages of some topics by their keys, and the types of all topics of a bag."""
+def _collect(path: Path, names: Mapping[str, str]) -> tuple[dict[str, _Log], set[str]]:
+    """Return the messages of topics by their keys, and all topics of a bag with their types."""
     keys = {name: key for key, slashed in names.items() for name in (slashed, slashed[1:])}
-    logs, contents, size = dict[str, _Log](), dict[str, str](), 0
-    for channel, receipt, data in bag_storage.entries(path, keys):
-        contents[channel.topic] = channel.kind
+    logs, contents, pairs, size = dict[str, _Log](), set[str](), dict[_Pair, _Pair](), 0
+    for topic, kind, encoding, receipt, data in bag_storage.entries(path, keys):
         if data is None:
+            contents.add(f"{topic} ({kind})")
             continue
-        key = keys[channel.topic]
-        if channel.kind not in _READERS[key]:
-            kinds = " or ".join(_READERS[key])
-            raise InputError(f"has {channel.kind[:60]} on {channel.topic}: record {kinds}")
-        log = logs.setdefault(key, _Log(channel.topic))
+        readers, log = _READERS[keys[topic]], logs.setdefault(keys[topic], [])
         try:
-            message = bag_storage.decoded(channel, data)
-            for part in message.transforms if key in _FRAMES else (message,):
-                values = _READERS[key][channel.kind](part)
-                log.append(receipt, part, values)
-                size += len(values) + 8
-        except InputError:
-            raise
+            message = bag_storage.decoded(kind, encoding, data)
+            for part in getattr(message, "transforms", [message]):
+                values = np.array(readers[kind](part), float)
+                header = getattr(part, "header", _NO_HEADER)
+                stamp = header.stamp.sec * 10**9 + header.stamp.nanosec
+                pair = header.frame_id.lstrip("/"), getattr(part, "child_frame_id", "").lstrip("/")
+                log.append((np.int64(receipt), stamp, pairs.setdefault(pair, pair), values))
+                size += len(values) + 32
+                if len(values) != len(log[0][3]):
+                    raise ValueError(f"{len(values)} values, not {len(log[0][3])}")
         except Exception as error:  # of any kind, by the readers of odd messages and types
             raise InputError(
-                f"has a message on {channel.topic} that cannot be decoded as {channel.kind} "
-                f"({bag_storage.reason(error)}): record it again with ROS 2"
+                f"has a {kind} in the encoding {encoding} on {topic} that cannot be decoded "
+                f"({bag_storage.reason(error)}), received at {receipt} ns: record "
+                f"{' or '.join(readers)} with ROS 2, or cut it out"
             ) from error
         _check_size(size)
     return logs, contents
@@ -465,164 +392,108 @@ def _check_size(count: int) -> None:
 
 def _delay(logs: Iterable[_Log]) -> int | None:
     """Return the median time [ns] from stamp to receipt; None if it changes, 0 without stamps."""
-    delays = [np.subtract(log.receipt, log.stamp) for log in logs if np.any(log.stamp)]
-    if not delays:
-        return 0
-    delay = np.sort(np.concatenate(delays))
-    low, middle, high = delay[[len(delay) // 10, len(delay) // 2, -1 - len(delay) // 10]]
-    return None if 1e-9 * (high - low) > _SKEW else int(middle)
+    delays = sorted(int(row[0]) - row[1] for log in logs for row in log if row[1]) or [0]
+    low, middle, high = (delays[int(q * len(delays))] for q in (0.1, 0.5, 0.9))
+    return None if 1e-9 * (high - low) > _SKEW else middle
 
 
-def _point(vector: Any) -> list[float]:
-    return [vector.x, vector.y, vector.z]
+def _in_order(topic: str, log: _Log, delay: int | None) -> _Series:
+    """Return messages in the order of time; of equal times, the last received.
 
+    Args:
+      topic: their name.
+      log: the messages of the topic, or of one transform, in the order of the bag.
+      delay: [ns] from stamp to receipt, or None if it is not constant.
 
-def _pose(position: Any, q: Any) -> list[float]:
-    return [*_point(position), q.x, q.y, q.z, q.w]
-
-
-def _command(twist: Any) -> list[float]:
-    return [twist.linear.x, twist.linear.y, twist.angular.z]
-
-
-def _contact(message: Any) -> list[float]:
-    """Return the middle of a contact, and its type."""
-    points = message.polygon.points
-    if len(points) > 2:
-        raise InputError(
-            f"has a contact of {len(points)} points: publish none without contact, one of a point "
-            "contact, and two of a line contact"
-        )
-    extremes = [_point(points[i]) for i in (0, -1)] if points else np.zeros((2, 3))
-    return [*np.mean(extremes, axis=0), len(points)]
-
-
-_Reader = Callable[[Any], Floats]
-_FRAMES = ("tf", "tf_static")
-_TRANSFORMS: dict[str, _Reader] = {
-    "tf2_msgs/TFMessage": lambda m: _pose(m.transform.translation, m.transform.rotation)
-}
-# Values of a message, or of a transform of one, by the key of the topic and the type.
-_READERS: dict[str, dict[str, _Reader]] = {
-    "odom": {"nav_msgs/Odometry": lambda m: _pose(m.pose.pose.position, m.pose.pose.orientation)},
-    "target": {
-        "geometry_msgs/PointStamped": lambda m: _point(m.point),
-        "geometry_msgs/PoseStamped": lambda m: _point(m.pose.position),
-    },
-    "contact": {"geometry_msgs/PolygonStamped": _contact},
-    "taxels": {"std_msgs/Float32MultiArray": lambda m: m.data},
-    "force": {"geometry_msgs/WrenchStamped": lambda m: _point(m.wrench.force)},
-    "object": {"visualization_msgs/Marker": lambda m: [*_point(m.pose.position), m.scale.x]},
-    "cmd_vel": {
-        "geometry_msgs/TwistStamped": lambda m: _command(m.twist),
-        "geometry_msgs/Twist": _command,
-    },
-    **dict.fromkeys(_FRAMES, _TRANSFORMS),
-}
+    Raises:
+      InputError: header stamps go back, or a topic without them has no time.
+    """
+    receipt, stamp = np.array([row[:2] for row in log]).T
+    time = stamp if stamp.any() else receipt - (delay or 0)
+    values = np.concatenate([row[3] for row in log]).reshape(len(log), len(log[0][3]))
+    series = _Series(topic, time, values, np.array([row[2] for row in log], object))
+    bad = (stamp == 0) & (delay is None and not stamp.any())
+    series.refuse(bad, "no header stamp, nor times of receipt at the pace of other topics,")
+    # One of both orders may be wrong: files are reordered, and clocks of receivers jump.
+    if (np.diff(stamp[np.argsort(receipt, kind="stable")]) < 0).any():
+        series.refuse(np.append(False, np.diff(stamp) < 0), "a header stamp that goes back")
+    order = np.lexsort((receipt, time))
+    return series.at(order[np.append(np.diff(time[order]) > 0, True)])
 
 
 # --- frames --------------------------------------------------------------------------------
 
 
-def _to_frames(rows: Mapping[str, _Series], transforms: _Transforms) -> None:
+_Edges = dict[_Pair, Callable[[], _Series]]  # transforms by the frames of parent and child
+
+
+def _edges(path: Path, names: Mapping[str, str], odom: _Log, delay: int | None) -> _Edges:
+    """Return the transforms of a bag by the frames of parent and child."""
+    edges: dict[_Pair, tuple[str, _Log]] = {}
+    for key, log in _collect(path, {key: names[key] for key in _TREE})[0].items():
+        for row in log:
+            edges.setdefault(row[2], (names[key], []))[1].append(row)
+    edges[odom[0][2]] = names["odom"], odom
+    return {pair: partial(_in_order, *edge, delay) for pair, edge in edges.items()}
+
+
+def _to_frames(rows: Mapping[str, _Series], edges: Callable[[], _Edges], static: str) -> None:
     """Transform points and forces, in place, into the frames that the law needs.
 
     These are the frame of the odometry and its child frame. An empty frame is the right one.
+
+    Args:
+      rows: the messages at the commands, by the keys of topics.
+      edges: the transforms of the bag.
+      static: the topic whose transforms hold at any time.
 
     Raises:
       InputError: the bag has no transform, or commands are in another frame.
     """
     odom = rows["odom"]
-    if len(used := np.unique(odom.frames)) > 1:
-        pairs = " and ".join(" to ".join(odom.pairs[i]) for i in used)
-        raise InputError(f"has several frames on {odom.topic}, {pairs}: cut the bag there")
-    world, base = (x or y for x, y in zip(odom.pairs[used[0]], ("odom", "base_link"), strict=True))
+    odom.refuse((odom.frames != odom.frames[0]).any(axis=1), "a change of frames")
+    world, base = odom.frames[0][0] or "odom", odom.frames[0][1] or "base_link"
     goals = {"target": world, "object": world, "contact": base, "force": base, "cmd_vel": base}
-    for key, goal in goals.items():
-        if key not in rows:
-            continue
-        row = rows[key]
-        for i in np.unique(row.frames):
-            if (frame := row.pairs[i][0]) in ("", goal):
-                continue
-            at = row.frames == i
-            if key == "contact":
-                at &= row.values[:, 3] > 0  # without contact the position is 0
-            if not at.any():
-                continue
-            move = partial(transforms.move, row.topic, row.time[at], frame, goal)
-            points = row.values[at, :3]
-            if key == "force":
-                points = move(points) - move(0 * points)
-            elif key != "cmd_vel":
-                points = move(points)
-            elif any(abs(move(x + 0 * points) - x).max() > _SAME for x in np.eye(3)):
-                raise InputError(
-                    f"has {row.topic} in the frame {frame}: publish commands in {goal}, the frame "
-                    f"of the base in {odom.topic}"
-                )
-            row.values[at, :3] = points
+    for key in [key for key in goals if key in rows]:
+        row, goal = rows[key], goals[key]
+        for frame in sorted({*row.frames[:, 0]} - {"", goal}):
+            at = row.frames[:, 0] == frame
+            part = row.at(at)
+            matrices = _transform(part, frame, goal, edges(), static)
+            if key == "cmd_vel":
+                bad = abs(matrices - np.eye(4)).max(axis=(1, 2)) > _SAME
+                part.refuse(bad, f"the frame {frame}", f"publish commands in {goal}")
+            else:
+                points = np.insert(part.values[:, :3], 3, key != "force", axis=1)
+                row.values[at, :3] = np.einsum("nij,nj->ni", matrices, points)[:, :3]
 
 
-class _Transforms:
-    """Transforms of a bag, which are read when the first point is in another frame."""
-
-    def __init__(self, path: Path, names: Mapping[str, str], odom: _Series, delay: int | None):
-        self.path, self.names, self.odom, self.delay = path, names, odom, delay
-
-    @functools.cached_property
-    def edges(self) -> dict[str, dict[str, tuple[_Series, bool]]]:
-        """Poses of frames in others, by both names; whether to invert them."""
-        edges = defaultdict[str, dict[str, tuple[_Series, bool]]](dict)
-        logs, _ = _collect(self.path, {key: self.names[key] for key in _FRAMES})
-        poses = [log.in_order(self.delay, merged=True) for log in logs.values()]
-        for series in (*poses, self.odom):
-            order = np.argsort(series.frames, kind="stable")
-            stops = np.cumsum(np.bincount(series.frames, minlength=len(series.pairs)))
-            groups = zip(series.pairs, np.split(order, stops[:-1]), strict=True)
-            for (parent, child), index in groups:
-                edges[child][parent] = series.at(index), False
-                edges[parent][child] = series.at(index), True
-        return edges
-
-    def move(
-        self, topic: str, time: np.ndarray, frame: str, goal: str, points: np.ndarray
-    ) -> np.ndarray:
-        """Return points (N, 3) in the frame `goal`, at times (N,) [ns]."""
-        for edge, inverse in self._path(topic, frame, goal):
-            is_static = edge.topic == self.names["tf_static"]
-            latest = np.maximum(edge.latest(time), 0)
-            pose = edge.at(np.full(len(time), -1) if is_static else latest)
-            age = 1e-9 * (time - pose.time)
-            bad = (age > _STALE) | (age < -_EARLY)
-            if not is_static and bad.any():
-                frames = " to ".join(edge.pairs[edge.frames[0]])
-                raise InputError(
-                    f"has no transform of {frames} at the time of {topic}, "
-                    f"{_seconds(time[bad.argmax()])} s: record {edge.topic} all the time"
-                )
-            pose.check(math.inf)
-            turn, shift = Rotation.from_quat(pose.values[:, 3:]), pose.values[:, :3]
-            points = turn.apply(points - shift, True) if inverse else turn.apply(points) + shift
-        return points
-
-    def _path(self, topic: str, frame: str, goal: str) -> list[tuple[_Series, bool]]:
-        """Return the shortest chain of transforms from a frame to another."""
-        chains: dict[str, str] = {goal: ""}  # the next frame on the way to the goal
-        queue = deque([goal])
-        while queue and frame not in chains:
-            last = queue.popleft()
-            for neighbour in self.edges.get(last, {}):
-                if neighbour not in chains:
-                    chains[neighbour] = last
-                    queue.append(neighbour)
-        if frame not in chains:
-            raise InputError(
-                f"has {topic} in the frame {frame}, and no transform from it to {goal}, a frame of "
-                f"{self.odom.topic}: record /tf and /tf_static, or publish it in {goal}"
-            )
-        path = []
-        while frame != goal:
-            path.append(self.edges[frame][chains[frame]])
-            frame = chains[frame]
-        return path
+def _transform(row: _Series, frame: str, goal: str, edges: _Edges, static: str) -> np.ndarray:
+    """Return the matrices (N, 4, 4) from a frame to `goal`, at the times of messages."""
+    paths: dict[str, list[tuple[str, str]]] = {goal: []}  # the shortest, by their first frame
+    queue = [goal]
+    for node in queue:
+        for parent, child in edges:
+            neighbour = child if node == parent else parent
+            if node in (parent, child) and neighbour not in paths:
+                paths[neighbour] = [(parent, child), *paths[node]]
+                queue.append(neighbour)
+    if frame not in paths:
+        raise InputError(
+            f"has {row.topic} in the frame {frame}, and no transform from it to {goal}: record "
+            f"/tf and /tf_static, or publish it in {goal}"
+        )
+    matrices = np.eye(4)
+    for parent, child in paths[frame]:
+        series = edges[parent, child]()
+        poses = series.latest(row.time)
+        age = 1e-9 * (row.time - poses.time)
+        late = ((age > _STALE) | (age < -_EARLY)) & (series.topic != static)
+        row.refuse(late, f"no transform of {parent} to {child} at the time of the message")
+        poses.check(math.inf)
+        edge = np.tile(np.eye(4), (len(late), 1, 1))
+        edge[:, :3, :3] = Rotation.from_quat(poses.values[:, 3:]).as_matrix()
+        edge[:, :3, 3] = poses.values[:, :3]
+        matrices = (np.linalg.inv(edge) if frame == parent else edge) @ matrices
+        frame = child if frame == parent else parent
+    return matrices
