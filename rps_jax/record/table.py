@@ -139,7 +139,7 @@ def _parse(text: str, name: str) -> tuple[pd.DataFrame, str]:
     except (ValueError, csv.Error) as error:
         raise InputError(f"{name} is no table ({error}): write CSV.") from error
     count, ranges = len(titles), (np.arange(start, start + len(table)) for start in (0, 1))
-    if table[count].notna().all() and any(np.array_equal(table[0], x) for x in ranges):
+    if bool(table[count].notna().all()) and any(np.array_equal(table[0], x) for x in ranges):
         table = table.iloc[:, 1:]  # the number of the row has no title
     more = table.iloc[:, count:].notna().sum(axis=1)
     if more.any():
@@ -226,7 +226,7 @@ class Table:
         cells = self._table.iloc[:, i]
         is_text = cells.dtype.kind not in "iuf"
         plain = cells.astype(str).str.replace(self._decimal, ".") if is_text else cells
-        values = pd.to_numeric(plain, errors="coerce").to_numpy(float, na_value=np.nan)
+        values = np.asarray(pd.to_numeric(plain, errors="coerce"), float)
         values = scale * np.where(cells.isna() & unused, 0.0, values)
         fix = "a number as 1234.5, or remove the row"
         if unit == "s" and is_text and np.isnan(values).mean() > 0.5:

@@ -166,7 +166,8 @@ def _from_table(path: Path, name: str, titles: Mapping[str, str]) -> RawLog:
             check_name("column of a log", title, [*_UNITS, "taxel_0"])
     table = Table(path, name, _unit_of, titles)
     taxels = [title for title in table.columns if _TAXEL.fullmatch(title)]
-    fields = COLUMNS | ({"signal": sorted(taxels, key=lambda x: int(x[6:]))} if taxels else {})
+    signal = dict.fromkeys(sorted(taxels, key=lambda title: int(title[6:])), "1")
+    fields = COLUMNS | ({"signal": signal} if signal else {})
     optional = (*OPTIONAL, *(_TOUCH if taxels else ()))
     fields = {k: x for k, x in fields.items() if k not in optional or {*x} & {*table.columns}}
     table.require(title for titles in fields.values() for title in titles)
