@@ -68,8 +68,8 @@ def test_stored_notebooks_have_figures_and_no_errors_or_local_paths(name):
     assert not any("execution" in cell.metadata for cell in stored(name).cells)
 
 
-# These run for minutes; other tests call the same functions.
-LONG = ("02", "05", "06", "08", "09")
+# These run for a minute or more; other tests call the same functions.
+LONG = ("02", "05", "06", "07", "08", "09")
 EXECUTED = [pytest.param(n, marks=[pytest.mark.slow] if n[:2] in LONG else []) for n in TEXTS]
 
 
