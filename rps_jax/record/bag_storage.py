@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from rps_jax.errors import InputError
+from rps_jax.record import files
 
 _LIMIT = 64 * 2**20  # of a record, and of an unpacked chunk or message
 _MAX_FILE = 2 * 2**30  # of an unpacked file
@@ -41,7 +42,7 @@ def is_bag(path: Path) -> bool:
         if path.is_dir():
             names = [*path.glob("metadata.yaml"), *_bags(path)]
             return bool(names) and not (path / "results.nc").exists()
-        return path.is_file() and (path.suffix.lower() in _SUFFIXES or bool(_magic(path)))
+        return path.is_file() and (files.suffix_of(path) in _SUFFIXES or bool(_magic(path)))
     except OSError:
         return True  # reading it says why it cannot be read
 
@@ -81,7 +82,7 @@ def _magic(path: Path) -> bytes:
 
 
 def _bags(folder: Path) -> list[Path]:
-    return sorted(file for file in folder.iterdir() if file.suffix.lower() in _SUFFIXES)
+    return sorted(file for file in folder.iterdir() if files.suffix_of(file) in _SUFFIXES)
 
 
 def _files(path: Path) -> list[Path]:
@@ -90,11 +91,11 @@ def _files(path: Path) -> list[Path]:
 
     if not path.is_dir():
         return [path]
-    metadata, files = path / "metadata.yaml", _bags(path)
-    if metadata.exists() or len(files) != 1:
+    metadata, bags = path / "metadata.yaml", _bags(path)
+    if metadata.exists() or len(bags) != 1:
         content = (YAML(typ="safe").load(metadata) or {})["rosbag2_bagfile_information"]
-        files = [path / Path(name).name for name in content["relative_file_paths"]]
-    return files
+        bags = [path / Path(name).name for name in content["relative_file_paths"]]
+    return bags
 
 
 # --- compression ---------------------------------------------------------------------------

@@ -6,6 +6,7 @@ import re
 import shutil
 import subprocess
 import sys
+import warnings
 
 from rps_jax.errors import InputError, not_allowed
 
@@ -22,6 +23,7 @@ def start_process() -> None:
     """
     if sys.getfilesystemencoding() == "ascii":
         os.execv(sys.executable, [sys.executable, "-X", "utf8", *sys.orig_argv[1:]])
+    warnings.formatwarning = lambda message, *_, **__: f"rps: warning: {message}\n"
     os.environ["MPLBACKEND"] = "agg"  # figures are only written to files
     if shutil.get_terminal_size().columns < _MIN_COLUMNS:
         os.environ["COLUMNS"] = str(_MIN_COLUMNS)
@@ -67,7 +69,7 @@ def _unset_bad_flags() -> str:
     if not started.returncode:
         return ""
     del os.environ["XLA_FLAGS"]
-    found = _FATAL.search(started.stderr)
-    reason = found[1].partition(". (")[0] if found else "Check failed"
+    match = _FATAL.search(started.stderr)
+    reason = match[1].partition(". (")[0] if match else "Check failed"
     rule = "XLA cannot read the value of a flag" if "Check failed" in reason else reason
     return str(not_allowed("XLA_FLAGS", flags, f"{rule}; correct or unset it"))

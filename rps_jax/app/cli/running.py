@@ -12,7 +12,6 @@ import os
 import signal
 import sys
 import threading
-import warnings
 from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
@@ -38,7 +37,6 @@ def exit_code(command: Callable[[], object]) -> int:
     for stream in (sys.stdout, sys.stderr):  # a terminal without UTF-8 shows `?`
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="replace")
-    warnings.formatwarning = lambda message, *_, **__: f"rps: warning: {message}\n"
     try:
         with _interruptible():
             command()
@@ -76,7 +74,7 @@ def _print_error(sentence: object) -> int:
 
 
 def _discard(stream: TextIO) -> None:
-    """Send what is left of a stream, and all that follows, to the null device."""
+    """Send the rest of a stream and all further output to the null device."""
     os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
 
 
@@ -209,8 +207,8 @@ def _write_report(
     with contextlib.suppress(InputError):
         intro.append(provenance.describe(out))
     if isinstance(results, xr.Dataset | xr.DataTree):
-        trees = xr.DataTree(results).subtree if isinstance(results, xr.Dataset) else results.subtree
-        intro += [nan_twists(node.to_dataset()) for node in trees]
+        tree = xr.DataTree(results) if isinstance(results, xr.Dataset) else results
+        intro += [nan_twists(node.to_dataset()) for node in tree.subtree]
     return write_report(out, question.title, "\n\n".join(filter(None, intro)), sections)
 
 
