@@ -206,7 +206,7 @@ class SpeedStudy(Study[T]):
 
 
 def run_process(words: Sequence[str | Path], problem: str, folder: Path | None = None) -> str:
-    """Run a process, by default in the current folder, and return what it prints.
+    """Run a process, by default in the current folder, and return its output.
 
     Raises:
       InputError: the process failed; the sentence starts with the `problem`.

@@ -73,8 +73,8 @@ def measured(trace: xr.Dataset) -> dict[str, str]:
         duration = period[realigning[:-1]].sum()
         measures["Realignment State"] = f"{_times(realigning)}, {duration:.0f} s in all"
 
-    left = np.stack([-np.sin(yaw), np.cos(yaw)], axis=1)
-    sway = np.sum(np.diff(base, axis=0) * (left[:-1] + left[1:]) / 2, axis=1).cumsum()
+    lateral = np.stack([-np.sin(yaw), np.cos(yaw)], axis=1)  # axis of the base
+    sway = np.sum(np.diff(base, axis=0) * (lateral[:-1] + lateral[1:]) / 2, axis=1).cumsum()
     across = trace.p_robot_contact.values[touching, 1]
     behind_front = half[0] - trace.p_robot_contact.values[:, 0] > CORNER
     if (duration := period[(touching & behind_front)[:-1]].sum()) >= SIDE_TIME:

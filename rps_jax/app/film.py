@@ -196,7 +196,7 @@ def of_sweep(
 def fitted_grid(tiles: int, shape: tuple[int, int], rows: int = 1) -> tuple[int, int]:
     """Return rows and columns, at most `shape`, of the grid with the largest tiles.
 
-    Several `rows` are used as they are, with a law in each.
+    Of several `rows`, each has the tiles of one law.
     """
     if rows > 1:
         return rows, tiles // rows

@@ -85,12 +85,12 @@ class Shadow(BagQuestion[xr.Dataset]):
         """Return the differences between the twists of the law and the recorded ones."""
         rows = [["", "root mean square", "greatest", "at time [s]"]]
         is_nan = ~np.isfinite(results.to_array().sel(source="law")).all("variable").values
-        kept = results.isel(time=~is_nan)
+        finite = results.isel(time=~is_nan)
         for name, unit in _UNITS.items():
-            error = np.abs(kept[name].sel(source="law") - kept[name].sel(source="commanded"))
+            error = np.abs(finite[name].sel(source="law") - finite[name].sel(source="commanded"))
             if not error.size:
                 continue
-            worst, when = float(error.max()), float(kept.time[int(np.argmax(error.values))])
+            worst, when = float(error.max()), float(finite.time[int(np.argmax(error.values))])
             mean = f"{float(np.sqrt(np.mean(error**2))):.2g}"
             rows.append([f"{name} [{unit}]", mean, f"{worst:.2g}", f"{when:.2f}"])
         start, end = float(results.time[0]), float(results.time[-1])

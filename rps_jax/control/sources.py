@@ -59,14 +59,14 @@ def _imports_of(root: Path) -> Iterator[dict[str, str]]:
 
     These modules are forgotten then, since another folder may have modules of the same names.
     """
-    root, before, imports = root.resolve(), set(sys.modules), dict[str, str]()
+    root, known_modules, imports = root.resolve(), set(sys.modules), dict[str, str]()
     sys.path.insert(0, str(root))
     importlib.invalidate_caches()
     try:
         yield imports
     finally:
         sys.path.remove(str(root))
-        for name in set(sys.modules) - before:
+        for name in set(sys.modules) - known_modules:
             file = Path(getattr(sys.modules[name], "__file__", None) or "/")
             if file.is_relative_to(root) and not name.startswith("_rps_jax_"):
                 del sys.modules[name]

@@ -135,7 +135,7 @@ def _trace(name: str, function: Function, *args: object) -> object:
 
 def _program(function: Function, args: Sequence[object]) -> tuple[object, object]:
     """Trace a function, and return its program without addresses, and its abstract results."""
-    # A function of its own, since JAX remembers the trace of a function.
+    # A new function, since JAX caches traces by the function.
     traced, results = jax.make_jaxpr(lambda *x: function(*x), return_shape=True)(*args)
     if any(isinstance(x, jax.core.Tracer) for x in traced.consts):
         raise jax.errors.UnexpectedTracerError("a constant is traced")

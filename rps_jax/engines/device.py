@@ -105,8 +105,8 @@ def choose(name: Device) -> None:
             jax.devices()
         except (RuntimeError, AssertionError) as error:  # JAX raises either
             variable = "JAX_PLATFORMS" if platforms else "JAX_PLATFORM_NAME"
-            wanted = platforms or os.environ.get(variable)
-            message = f"{variable} = {wanted} is not available: name another, or none."
+            platform_name = platforms or os.environ.get(variable)
+            message = f"{variable} = {platform_name} is not available: name another, or none."
             raise InputError(message) from error
         return
     jax.config.update("jax_platforms", "cuda" if name == "gpu" else "cpu")

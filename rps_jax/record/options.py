@@ -203,14 +203,14 @@ def parse_names(field: str, value: str | Mapping[str, str]) -> dict[str, str]:
     if isinstance(value, str):
         pairs = [pair.partition("=") for pair in value.split(",") if pair.strip()]
     elif isinstance(value, Mapping):
-        pairs = [(str(name), "=", str(other)) for name, other in value.items()]
+        pairs = [(str(name), "=", str(alias)) for name, alias in value.items()]
     else:
         raise errors.not_allowed(field, repr(value), 'give {"name": "other"} or "name=other"')
-    if not all(name.strip() and other.strip() for name, _, other in pairs):
+    if not all(name.strip() and alias.strip() for name, _, alias in pairs):
         raise errors.not_allowed(field, value, "write name=other, separated by commas")
     if pairs:
         errors.check_each_once(field, [name.strip() for name, _, _ in pairs])
-    return {name.strip(): other.strip() for name, _, other in pairs}
+    return {name.strip(): alias.strip() for name, _, alias in pairs}
 
 
 def _number_or_text(word: str) -> float | str:

@@ -318,10 +318,10 @@ class Question(Command[T]):
     def in_free_folder(self) -> Self:
         """Return the question with the first of the folders OUT, OUT-2, ... without another run."""
         first, configuration = Path(str(self.out)), self.configuration()
-        for number in itertools.count(1):
-            out = first if number == 1 else first.with_name(f"{first.name}-{number}")
+        for count in itertools.count(1):
+            out = first if count == 1 else first.with_name(f"{first.name}-{count}")
             if self.overwrite or not folder.difference(out, configuration):
-                return self if number == 1 else dataclasses.replace(self, out=out)
+                return self if count == 1 else dataclasses.replace(self, out=out)
         raise AssertionError
 
     def create_run(self, out: Path | None, callback: ProgressCallback) -> Run:

@@ -63,7 +63,7 @@ class PlanQuestion(SimulationQuestion[xr.Dataset]):
         )
 
     def labelled(self, outcomes: xr.Dataset, run: Run) -> xr.Dataset:
-        """Return the outcomes of all trials as they are stored, with attributes."""
+        """Return the outcomes of all trials with the attributes of the results."""
         return outcomes.assign_attrs(self.attributes())
 
 

@@ -144,8 +144,8 @@ class Fit(LawQuestion[Fitted], DomainQuestion[Fitted], LogsQuestion):
     @cached_property
     def raw_logs(self) -> list[RawLog]:
         """Logs, loaded and validated."""
-        given: Any = self.logs
-        several = [given] if isinstance(given, str | Path | Trace) else list(given)
+        logs: Any = self.logs
+        several = [logs] if isinstance(logs, str | Path | Trace) else list(logs)
         if not several:
             raise InputError("logs = () is not allowed: give at least one.")
         paths = [Path(log) for log in several if not isinstance(log, Trace)]
