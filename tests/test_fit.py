@@ -84,12 +84,16 @@ def test_tables_are_read_as_users_write_them(kind, tmp_path, compiled):
     assert not compiled
 
 
-def drive(delay=0, slip=0.0, blocked=0.0, noise=0.0, start=0.0, speed=0.1, period=0.02):
-    """Return the log of a base that slips, lags or is blocked for a share of its commands."""
+def drive(delay=0, slip: Any = 0.0, blocked=0.0, noise=0.0, start=0.0, speed=0.1, period=0.02):
+    """Return the log of a base that slips, lags or is blocked for a share of its commands.
+
+    The slip is one number, or those of v_x, v_y and omega.
+    """
     rng, time = np.random.default_rng(0), np.arange(0.0, 12.0, period)
     count = len(time)
     twist = np.stack([speed + 0 * time, 0.03 * np.sin(time), 0.3 * np.sin(0.7 * time)], -1)
-    share = np.where(np.arange(count) % 200 < 200 * blocked, 0.0, 1 - slip)[:, None]
+    blocks = (np.arange(count) % 200 < 200 * blocked)[:, None]
+    share = np.where(blocks, 0.0, 1 - np.array(slip))
     done = share * np.concatenate([np.zeros((delay, 3)), twist[: count - delay]])
     yaw = start + period * np.cumsum(done[:, 2])
     velocity = logs._rotate(yaw, done)[:, :2]
@@ -106,6 +110,9 @@ def drive(delay=0, slip=0.0, blocked=0.0, noise=0.0, start=0.0, speed=0.1, perio
     [
         {"delay": 25},
         {"slip": 0.5},
+        {"slip": 0.9},
+        {"slip": (0.1, 0.9, 0.9)},
+        {"slip": (0.0, 0.2, 0.45)},
         {"blocked": 0.7},
         {"blocked": 1.0},
         {"blocked": 1.0, "noise": 0.005, "speed": 0.3},

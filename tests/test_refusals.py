@@ -88,7 +88,8 @@ REFUSED = {
         ({"v_max": (1.0, 0.5, 0.2)}, "give one number, or two"),
     ],
     lambda **values: parse_robot(values): [
-        *each(force_max=-1, lag=NAN, mass=0, slip=0.7),
+        *each(force_max=-1, lag=NAN, mass=0, slip=0.95, slip_sideways=-0.1, slip_yaw=1.0),
+        *each(slip=[0.1, 0.2, 0.3], slip_yaw="0.1:0.4", mass=[100.0], half_length=[0.3, 0.4]),
         ({"acceleration_max": [0.5]}, "give two numbers"),
         ({"force_max": 20, "resistance": 0.05}, "rolling resistance takes 64 N"),
         ({"speed": 1}, "unknown robot quantity 'speed'"),

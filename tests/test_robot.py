@@ -5,24 +5,31 @@ import math
 from dataclasses import asdict, replace
 from functools import partial
 from itertools import product
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import SHORT, case, refusal, same
+from helpers import NEAR, SHORT, case, refusal, same
 from staging import push_object, recompiled
 
 import rps_jax
 from rps_jax import engines
+from rps_jax.control import registry
+from rps_jax.control.base import Law
+from rps_jax.control.observation import Details, Twist
 from rps_jax.geometry.solid import GRAVITY
 from rps_jax.robot import drive
 from rps_jax.robot.robot import ROBOTS, Robot, parse_robot
 from rps_jax.trials import pushes
+from rps_jax.trials.case import Case
+from rps_jax.trials.env import PushEnv
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import Rules
+from rps_jax.tuning import fit
 from rps_jax.world import domain, draws, scene
-from rps_jax.world.domain import DOMAINS
+from rps_jax.world.domain import DOMAINS, Range
 from rps_jax.world.physics import preset
 from rps_jax.world.scene import JOINTS
 
@@ -65,8 +72,109 @@ def test_the_twist_is_bounded_as_a_vector_and_reached_by_lag_and_acceleration(na
     np.testing.assert_allclose(velocities, expected, atol=1e-7)
 
 
-def test_wheels_that_slip_lose_their_share():
-    np.testing.assert_allclose(drive.apply_slip(Robot(slip=0.1), jnp.ones(3)), 0.9, rtol=1e-6)
+# Robot, and the shares of v_x, v_y and omega that its wheels lose.
+SLIPS = {
+    "of all": (Robot(slip=0.1), (0.1, 0.1, 0.1)),
+    "in yaw": (Robot(slip_yaw=0.45), (0.0, 0.0, 0.45)),
+    "sideways": (Robot(slip_sideways=0.3), (0.0, 0.3, 0.0)),
+    "mixed": (Robot(slip=0.1, slip_yaw=0.45), (0.1, 0.1, 0.45)),
+    "but not sideways": (Robot(slip=0.9, slip_sideways=0.0), (0.9, 0.0, 0.9)),
+}
+TWIST = jnp.array([0.05, 0.02, -0.15])
+
+
+@pytest.mark.parametrize("name", SLIPS)
+def test_wheels_that_slip_lose_their_share_of_each_axis(name):
+    robot, shares = SLIPS[name]
+    assert not robot.ideal
+    expected = TWIST * (1 - np.array(shares))
+    np.testing.assert_allclose(drive.apply_slip(robot, TWIST), expected, rtol=1e-6)
+
+
+def test_slip_alone_is_that_of_all_axes_and_none_costs_nothing():
+    assert drive.apply_slip(Robot(lag=0.1), TWIST) is TWIST
+    for share in (0.1, 0.45):
+        robots = Robot(slip=share), Robot(slip=share, slip_sideways=share, slip_yaw=share)
+        same(*(jax.jit(drive.apply_slip)(robot, TWIST) for robot in robots))
+
+
+class Steady(NamedTuple):
+    """Parameters of a law that commands one twist."""
+
+    v_x: Any  # [m/s]
+    v_y: Any  # [m/s]
+    omega: Any  # [rad/s]
+    d_success: Any = 0.05
+
+
+@pytest.fixture
+def steady(registries):
+    """Register a law that commands one twist for one test."""
+
+    def step(params, state, obs):
+        return state, Twist(*params[:3]), Details.from_obs(obs)
+
+    registry.register_law("steady", Law(lambda params: (), step), Steady(0.1, 0.0, 0.0))
+
+
+def position_after(twist, seconds):
+    """Return the pose (3,) [m, m, rad] of a base that executes a twist from the origin."""
+    turn = twist[2] * seconds
+    a, b = (seconds, 0.0)
+    if twist[2]:
+        a, b = np.sin(turn) / twist[2], (1 - np.cos(turn)) / twist[2]
+    return np.array([a * twist[0] - b * twist[1], b * twist[0] + a * twist[1], turn])
+
+
+@pytest.mark.usefixtures("steady")
+@pytest.mark.parametrize("engine", ["fused", "mjx", "mujoco", "quasistatic"])
+def test_a_base_turns_and_strafes_less_than_commanded_in_all_engines(engine):
+    """Away from the object; the fused engine is compiled C."""
+    commands = ((0.1, 0.0, 0.5), (0.1, 0.0, 0.0), (0.1, 0.05, 0.5))
+    shares = ((0.0, 0.0, 0.0), (0.0, 0.0, 0.45), (0.0, 0.45, 0.0), (0.1, 0.9, 0.45))
+    pairs = list(product(commands, shares))
+    bases = [Robot(slip=x, slip_sideways=y, slip_yaw=z) for _, (x, y, z) in pairs]
+    cases = [
+        Case("box", "S1", (2.0, 0.0), Steady(*command), gap=0.3, robot=base)
+        for (command, _), base in zip(pairs, bases, strict=True)
+    ]
+    outcome, _ = pushes.run(cases, Setting(engine, rules=Rules(horizon=0.4)))
+    executed = [np.array(command) * (1 - np.array(share)) for command, share in pairs]
+    expected = np.array([position_after(twist, outcome.time[0]) for twist in executed])
+    np.testing.assert_allclose(outcome.base_pose[:, 2], expected[:, 2], rtol=1e-4, atol=1e-6)
+    np.testing.assert_allclose(outcome.base_pose[:, :2], expected[:, :2], atol=3e-4)
+    assert not outcome.stalled.any()
+
+
+def test_the_environment_and_a_single_trial_turn_by_the_share_that_is_left():
+    drums = replace(NEAR, objects=("random_cylinder",), robot=Robot(slip_yaw=0.45))
+    setting = Setting("quasistatic", SHORT.physics, rules=Rules(horizon=20.0))
+    push = PushEnv("random_cylinder", drums, setting=setting, worlds=2)
+    state = push.reset(jax.random.key(0))
+    step = jax.jit(push.step)
+    for _ in range(5):
+        state = step(state, jnp.array([0.0, 0.5, 1.0]))
+    turn = 0.55 * 0.15 * 5 * push.dt
+    np.testing.assert_allclose(state.data.qpos[2], turn, rtol=1e-4)
+    np.testing.assert_allclose(state.data.qpos[1], 0.5 * 0.05 * 5 * push.dt, rtol=1e-3)
+    trace = rps_jax.push("box", target=(0.6, 0.3), setting=setting, robot="ideal,slip_yaw=0.45")
+    steady = (trace.data.omega.values == np.float32(0.15))[:-1] & (np.diff(trace.data.omega) == 0)
+    turned = np.diff(trace.data.qpos.values[:, 2])[steady]  # in 0.1 s
+    assert steady.sum() > 20
+    np.testing.assert_allclose(turned, 0.55 * 0.15 * 0.1, atol=1e-6)
+
+
+def test_a_base_with_slip_stalls_at_its_own_speed():
+    """A base with 90 % slip that aims at 50 mm/s executes 5 mm/s."""
+    state = drive.init_drive(TWIST)._replace(aim=jnp.array(AHEAD))
+    for robot, speed, stands in (
+        (Robot(slip=0.9), 0.005 * 0.99, 0),
+        (Robot(slip=0.9), 0.0004, 1),
+        (Robot(), 0.0049, 1),
+        (Robot(), 0.0051, 0),
+    ):
+        qvel = jnp.zeros(9).at[0].set(speed)
+        assert int(drive.count_stalled_steps(robot, state, qvel).stalled) == stands
 
 
 # --- the drive -----------------------------------------------------------------------------
@@ -193,8 +301,30 @@ def test_random_robots_are_drawn_last_and_change_no_other_draw():
     assert again.lag is None
 
 
+def test_slips_are_drawn_apart_and_by_columns_of_their_own():
+    index = np.arange(4)
+    slip = Range(0, 0.9)
+    yaw_alone = replace(DOMAINS["wide"], robot_slip_yaw=slip, objects=("random_box",))
+    all_three = replace(yaw_alone, robot_slip=slip, robot_slip_sideways=slip)
+    drawn = draws.draw(all_three, 5, index)
+    names = ("robot_slip", "robot_slip_sideways", "robot_slip_yaw")
+    columns = draws.table(drawn)
+    assert len({columns[name][0].tobytes() for name in names}) == 3
+    assert {columns[name][1] for name in names} == {"1"}
+    turning = draws.draw(yaw_alone, 5, index)
+    same(drawn.robot.slip_yaw, turning.robot.slip_yaw)
+    assert set(draws.table(turning)) & set(names) == {"robot_slip_yaw"}
+    assert len({domain.LABELS[name] for name in names}) == 3
+    assert len({*draws.USES.values()}) == len(draws.USES)
+    assert set(names) <= set(fit.coordinates(all_three))
+
+
 def test_a_domain_with_robots_survives_a_json_round_trip():
-    for expected in (DOMAINS["real"], replace(DOMAINS["wide"], robot=ROBOTS["mpo_500"])):
+    slip = Range(0.1, 0.45)
+    slips = replace(DOMAINS["wide"], robot_slip=slip, robot_slip_sideways=slip, robot_slip_yaw=slip)
+    rollers = Robot(slip=0.05, slip_sideways=0.2, slip_yaw=0.45)
+    domains = DOMAINS["real"], replace(DOMAINS["wide"], robot=ROBOTS["mpo_500"]), slips
+    for expected in (*domains, replace(slips, robot=rollers)):
         assert domain.from_json(json.loads(json.dumps(asdict(expected)))) == expected
 
 

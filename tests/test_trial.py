@@ -110,7 +110,7 @@ def test_yaw_is_unbounded_and_position_is_bounded(single):
     state = trial.start(*single)
     for i, value, diverges in ((2, 500.0, False), (2, np.nan, True), (0, 101.0, True)):
         driven = Driven(trial.motion(state)._replace(qpos=state.qpos.at[i].set(value)))
-        assert bool(trial.settle(state, state, driven).diverged) == diverges
+        assert bool(trial.settle(single[0], state, state, driven).diverged) == diverges
 
 
 def test_a_shove_happens_once_however_its_time_is_rounded(single):

@@ -18,9 +18,9 @@ from rps_jax.geometry.arrays import Number
 from rps_jax.geometry.vectors import Vec
 from rps_jax.robot.robot import Robot
 
-STALLED = 0.1  # [1] share of the aimed speed below which a base stands still
+STALLED = 0.1  # [1] share of the executed speed below which a base stands still
 _STALL = 1.0  # [s] of standing still after which a base has stalled
-_MOVING = 1e-3  # [m/s] aimed speed above which a base can stall
+_MOVING = 1e-3  # [m/s] executed speed above which a base can stall
 
 
 class Drive(NamedTuple):
@@ -64,7 +64,10 @@ def aim(robot: Robot, previous: jax.Array, twist: jax.Array, period: float) -> j
 
 def apply_slip(robot: Robot, aim: jax.Array) -> jax.Array:
     """Return the twist (3,) of wheels that slip, which the base's own sensors do not measure."""
-    return aim if robot.slip is None else aim * (1 - robot.slip)
+    shares = [robot.slip if x is None else x for x in (None, robot.slip_sideways, robot.slip_yaw)]
+    if all(share is None for share in shares):
+        return aim
+    return jnp.stack([v if s is None else v * (1 - s) for v, s in zip(aim, shares, strict=True)])
 
 
 def push(
@@ -106,12 +109,12 @@ def push(
     return force, (x, y, z)
 
 
-def count_stalled_steps(drive: Drive, qvel: jax.Array) -> Drive:
+def count_stalled_steps(robot: Robot, drive: Drive, qvel: jax.Array) -> Drive:
     """Return the drive with the count of control steps in which the base stands still, pushing.
 
     `qvel` (9,) is that of a trial: the base's velocity [m/s, m/s, rad/s] in the world comes first.
     """
-    speed = planar.norm(drive.aim[:2])
+    speed = planar.norm(apply_slip(robot, drive.aim)[:2])
     stands = (planar.norm(qvel[:2]) < STALLED * speed) & (speed > _MOVING)
     return drive._replace(stalled=jnp.where(stands, drive.stalled + 1, 0))
 

@@ -51,7 +51,10 @@ class Robot:
     # () [1] friction coefficient of the wheels; bounds force and torque
     traction: Number = option(None, _POSITIVE, 5)
     resistance: Number = option(None, 0, 1)  # () [1] rolling resistance over the weight
-    slip: Number = option(None, 0, 0.5)  # () [1] share of the velocity that the wheels lose
+    slip: Number = option(None, 0, 0.9)  # () [1] share of the velocity that the wheels lose
+    # () [1] shares of v_y and of omega, as rollers lose more of these; None: equal to `slip`
+    slip_sideways: Number = option(None, 0, 0.9)
+    slip_yaw: Number = option(None, 0, 0.9)
 
     @property
     def driven(self) -> bool:
@@ -109,13 +112,11 @@ class Robot:
     def check(self) -> None:
         """Raise InputError for numbers that no robot has; each is one number, or None."""
         check_fields(self, "robot ")
+        for name in [field for field in _FIELDS if field != "boards"]:
+            shapes, form = _SHAPES.get(name, (((),), "one number"))
+            if (value := getattr(self, name)) is not None and np.shape(value) not in shapes:
+                raise errors.not_allowed(f"robot {name}", value, f"give {form}")
         Shell(self.half_length, self.half_width, self.boards).check()
-        if np.size(self.v_max) > 2:
-            rule = "give one number, or two, forward and sideways [m/s]"
-            raise errors.not_allowed("robot v_max", self.v_max, rule)
-        if self.acceleration_max is not None and np.size(self.acceleration_max) != 2:
-            rule = "give two numbers, [m/s^2, rad/s^2]"
-            raise errors.not_allowed("robot acceleration_max", self.acceleration_max, rule)
         if self.push_max is not None and self.push_max <= 0:
             rolling = (self.resistance or 0) * self.mass * GRAVITY
             rule = f"rolling resistance takes {rolling:.0f} N, so that no force is left to push"
@@ -131,8 +132,13 @@ def _minimum(a: Number, b: Number) -> Number:
     return xp.minimum(a, b)
 
 
+_SHAPES = {  # allowed shapes of limits that are no single number
+    "v_max": (((), (1,), (2,)), "one number, or two, forward and sideways [m/s]"),
+    "acceleration_max": (((2,),), "two numbers, [m/s^2, rad/s^2]"),
+}
 _FIELDS = [field.name for field in dataclasses.fields(Robot)]
-_AIM_LIMITS = ("v_max", "omega_max", "lag", "acceleration_max", "slip")
+_AIM_LIMITS = ("v_max", "omega_max", "lag", "acceleration_max")
+_AIM_LIMITS += ("slip", "slip_sideways", "slip_yaw")
 _NOT_LIMITS = ("half_length", "half_width", "boards", "mass", "bandwidth", "resistance")
 LIMITS = tuple(name for name in _FIELDS if name not in _NOT_LIMITS)
 jax.tree_util.register_dataclass(Robot, data_fields=_FIELDS, meta_fields=[])

@@ -169,7 +169,7 @@ class PushEnv:
         decided, twist = trial.execute(world, previous, self.twist(action), self.dt)
         robot = trial.pushing(world)
         driven = self._drive(world.fields, trial.motion(decided), twist, robot)
-        moved = trial.settle(previous, decided, driven)
+        moved = trial.settle(world, previous, decided, driven)
         current, measured = self._observe(world, moved)
         ended = moved.done  # before this step, or because the physics diverged
         distance = previous.law_state

@@ -55,5 +55,5 @@ def run(
             after = Motion(batch.qpos, batch.qvel, batch.warmstart, batch.integral)
             motion = jax.tree.map(lambda x: x.astype(dtype), after)
             force = batch.force.astype(dtype) if loop.law.senses == "force" else None
-            trials = _settle(trials, decided, Driven(motion, force=force))
+            trials = _settle(worlds, trials, decided, Driven(motion, force=force))
             yield trials, snapshot

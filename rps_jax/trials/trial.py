@@ -311,7 +311,7 @@ def decide(
     return decided, twist, snapshot
 
 
-def settle(previous: Trial, decided: Trial, driven: Driven) -> Trial:
+def settle(world: World, previous: Trial, decided: Trial, driven: Driven) -> Trial:
     """Return the trial after one control period: `decided` at the positions `driven`, or ended.
 
     A trial that had ended before, as `previous` says, is returned as it was.
@@ -324,9 +324,9 @@ def settle(previous: Trial, decided: Trial, driven: Driven) -> Trial:
         & jnp.all(jnp.abs(qpos.at[2].set(0.0)) < _MAX_DISTANCE)  # the base may turn without limit
     )
     state = decided.drive
-    if state is not None:
+    if world.robot is not None and state is not None:
         state = state if integral is None else state._replace(integral=integral)
-        state = drive.count_stalled_steps(state, qvel)
+        state = drive.count_stalled_steps(world.robot, state, qvel)
     moved = decided._replace(
         qpos=qpos,
         qvel=qvel,
@@ -357,7 +357,7 @@ def control_step(
     force = loop.law.senses == "force"
     period = ControlPeriod(twists, loop.physics, pushing(worlds), force)
     driven = stage.drive(worlds.fields, motion(decided), period)
-    return mapped(settle)(trials, decided, driven), snapshots
+    return mapped(settle)(worlds, trials, decided, driven), snapshots
 
 
 def motion(trials: Trial) -> Motion:

@@ -60,7 +60,8 @@ _STILL = 0.001  # [m] that a target may move
 # Motion is compared with commands over windows, so that noise and delays matter little.
 _WINDOW = 2.0  # [s]
 _RESOLUTION = 0.05  # [m] and [rad] of both motions
-_MISFIT = 5.0  # greatest ratio of the two, as root mean squares
+_MISFIT = 5.0  # greatest ratio of motion to command, as root mean squares
+_LOST = 0.08  # least ratio of the two; wheels may lose 90 %
 _ALIGNED = 0.7  # similarity of the two at least, if the base moves less than commanded
 _FRAMES = "yaw may be in deg or rise clockwise, or v_x and v_y may be in the frame of x and y"
 _FIX = "write SI units, or name the unit in the title of a table, as 'time [ms]' or 'yaw [deg]'"
@@ -239,7 +240,7 @@ def motion_faults(time: np.ndarray, pose: np.ndarray, twist: np.ndarray) -> Iter
         likeness, by_deg = (_similarity(moved[:, part], x[:, part]) for x in (path, path_by_deg))
         if by_deg > max(0.9, likeness) and np.abs(pose[:, 2]).max() > 2 * np.pi:
             least = 0.95
-        if ratio > _MISFIT or (ratio < 1 / _MISFIT and likeness > _ALIGNED):
+        if ratio > _MISFIT or (ratio < _LOST and likeness > _ALIGNED):
             suspect, unit = (titles, units) if ratio > 1 else (commands, rates)
             fault = f"moves {ratio:.3g} times as far in {titles} as {commands} command"
             yield f"has a base that {fault}: {suspect} may be in {unit}; {_FIX}"

@@ -110,7 +110,8 @@ class Domain:
     yaw_noise: Range = drawn(Range(0, 0.01), 17, "rad", 0, 1, "noise of the heading", "base")
     pose_latency: Range = drawn(Range(0, 0.1), 18, "s", 0, 1, "latency of the pose", "base")
     command_delay: Range = drawn(Range(0, 0.1), 19, "s", 0, 1, "delay of the command", "base")
-    # Of each component of the twist, constant in a trial: columns 20, 21 and 22.
+    # Of each component of the command, constant in a trial and of either sign: columns 20, 21 and
+    # 22. The robot's limits bound the wrong command; wheels lose their slip after the limits.
     velocity_error: Range = drawn(Range(-0.03, 0.03), 20, "1", -0.9, 0.9, "", "base")
     # The robot and its drawn limits; None: the robot's own value.
     robot: Robot = Robot()
@@ -126,7 +127,13 @@ class Domain:
         None, 38, "m/s^2", _POSITIVE, 100, "greatest acceleration of the robot", "robot",
         "acceleration_max",
     )  # fmt: skip
-    robot_slip: Range | None = drawn(None, 42, "1", 0, 0.5, "slip of the wheels", "robot", "slip")
+    robot_slip: Range | None = drawn(None, 42, "1", 0, 0.9, "slip of the wheels", "robot", "slip")
+    robot_slip_sideways: Range | None = drawn(
+        None, 47, "1", 0, 0.9, "slip of the wheels sideways", "robot", "slip_sideways"
+    )
+    robot_slip_yaw: Range | None = drawn(
+        None, 48, "1", 0, 0.9, "slip of the wheels when turning", "robot", "slip_yaw"
+    )
 
     def __post_init__(self) -> None:
         check_fields(self, "domain ")
