@@ -1,0 +1,238 @@
+"""Posterior of draws by importance weights: readings, unknowns and predictions of numbers."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Mapping
+
+import numpy as np
+import xarray as xr
+from scipy.special import logsumexp
+
+from rps_jax.analysis import statistics
+from sweeps.paper_reading import experiments, printed
+from sweeps.paper_reading.printed import NUMBERS, PARTS
+from sweeps.paper_reading.unknowns import NAMES, UNKNOWNS, Part, Proposal, texts, values
+
+_READINGS = ("saturate_first", "clip_each")  # of which the evidence is compared
+_SHARE = 0.1  # of the draws: effective number at least, when a proposal is fitted
+_QUANTILES = (0.05, 0.5, 0.95)
+
+
+def log_weights(
+    results: xr.Dataset, without: str = "", parts: tuple[str, ...] = PARTS
+) -> np.ndarray:
+    """Return the log weights (draw,) of draws, by the numbers of some parts without one number."""
+    used = [
+        name
+        for name in map(str, results.number.values)
+        if name != without and printed.part_of(name) in parts
+    ]
+    fit = results.log_likelihood.sel(number=used).sum("number").values
+    return fit - results.log_proposal.values
+
+
+def normalised(log: np.ndarray) -> np.ndarray:
+    """Return weights that sum to 1."""
+    return np.exp(log - logsumexp(log))
+
+
+def effective(weights: np.ndarray) -> float:
+    """Return the effective number of draws (Kish)."""
+    return float(weights.sum() ** 2 / np.sum(weights**2))
+
+
+def best(results: xr.Dataset) -> int:
+    """Return the draw of the highest likelihood."""
+    return int(np.argmax(results.log_likelihood.sum("number").values))
+
+
+# Parts of the numbers that tell of a part of the unknowns.
+_INFORMED: Mapping[Part, tuple[str, ...]] = {
+    "text": PARTS,
+    "hardware": ("hardware",),
+    "simulation": ("Table II", "targets", "Fig. 6"),
+}
+
+
+def proposal(results: xr.Dataset) -> Proposal:
+    """Return a proposal for the next round: the posterior of each part of the unknowns, tempered.
+
+    The power of the likelihood is the highest one at which enough draws count.
+    """
+    weights = {}
+    for part, informed in _INFORMED.items():
+        fit = log_weights(results, parts=informed) + results.log_proposal.values
+        low, high = 0.0, 1.0
+        for _ in range(30):
+            middle = 0.5 * (low + high)
+            each = normalised(middle * fit - results.log_proposal.values)
+            low, high = (middle, high) if effective(each) >= _SHARE * fit.size else (low, middle)
+        weights[part] = normalised(low * fit - results.log_proposal.values)
+    return Proposal.fitted(results.u.values, weights)
+
+
+def summary(results: xr.Dataset) -> str:
+    """Return a sentence on draws, numbers and the effective number of draws."""
+    weights = normalised(log_weights(results))
+    return (
+        f"{results.sizes['draw']:,} draws of {len(NAMES)} unknowns against {len(NUMBERS)} numbers "
+        "and observations of the paper; effective number of draws "
+        f"{effective(weights):.0f}. A mean has a normal likelihood, with a standard deviation of "
+        "4 mm for D and 2.5 s for times; a count a beta-binomial one; an observation in the text "
+        "is wrong with a probability of 10 %. The best draw has "
+        f"{_cells_inside(results)} of 18 cells of Table II inside the paper's Wilson intervals."
+    )
+
+
+# --- tables ----------------------------------------------------------------------------------
+
+
+def readings_table(results: xr.Dataset) -> list[list[str]]:
+    """Return a row for each reading: its posterior probability by parts of the numbers, and all."""
+    columns = {"hardware": ("hardware",), "Table II and targets": ("Table II", "targets"),
+               "Fig. 6": ("Fig. 6",), "all": PARTS}  # fmt: skip
+    rows = [[*(UNKNOWNS[name].label for name in _READINGS), *columns]]
+    chosen = [np.array(texts(results.u.values, name)) for name in _READINGS]
+    weights = [normalised(log_weights(results, parts=parts)) for parts in columns.values()]
+    for words in itertools.product(*(UNKNOWNS[name].choices for name in _READINGS)):
+        mask = np.all([x == word for x, word in zip(chosen, words, strict=True)], 0)
+        cells = [_probability(each, mask) for each in weights]
+        rows.append([*words, *cells])
+    return rows
+
+
+def _probability(weights: np.ndarray, mask: np.ndarray) -> str:
+    """Return a share of weights and its standard error, in percent."""
+    share = weights[mask].sum()
+    error = np.sqrt(np.sum(weights**2 * (mask - share) ** 2))
+    return f"{100 * share:.0f} ± {100 * error:.0f} %"
+
+
+def unknowns_table(results: xr.Dataset) -> list[list[str]]:
+    """Return a row for each unknown: its prior, its posterior, and its value in the best draw."""
+    weights, at = normalised(log_weights(results)), best(results)
+    rows = [["part", "unknown", "prior", "posterior: median, 5 to 95 %", "the best draw"]]
+    for name, unknown in UNKNOWNS.items():
+        u = results.u.values
+        if unknown.choices:
+            drawn = np.array(texts(u, name))
+            share = _probability(weights, drawn == unknown.choices[1])
+            cells = [" or ".join(unknown.choices), f"{unknown.choices[1]}: {share}", drawn[at]]
+        else:
+            drawn, unit = values(u, name), "" if unknown.unit == "1" else f" {unknown.unit}"
+            prior = f"{unknown.range.low:g} to {unknown.range.high:g}{unit}"
+            low, middle, high = quantiles(drawn, weights)
+            cells = [prior, f"{middle:.2g}{unit} [{low:.2g}, {high:.2g}]", f"{drawn[at]:.2g}{unit}"]
+        rows.append([unknown.part, unknown.label, *cells])
+    return rows
+
+
+def quantiles(x: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    """Return the weighted 5, 50 and 95 % quantiles of finite values."""
+    finite = np.isfinite(x) & (weights > 0)
+    if not finite.any():
+        return np.full(3, np.nan)
+    return np.quantile(x[finite], _QUANTILES, weights=weights[finite], method="inverted_cdf")
+
+
+def predictions(results: xr.Dataset) -> dict[str, dict[str, np.ndarray]]:
+    """Return quantiles (3,) of each number under prior, posterior, and posterior without it.
+
+    Counts are scaled to the number of trials in the paper.
+    """
+    prior = normalised(-results.log_proposal.values)
+    posterior = normalised(log_weights(results))
+    found = {}
+    for name in map(str, results.number.values):
+        simulated = scaled(results, name)
+        left_out = normalised(log_weights(results, without=name))
+        each = {"prior": prior, "posterior": posterior, "left out": left_out}
+        found[name] = {key: quantiles(simulated, weights) for key, weights in each.items()}
+    return found
+
+
+def scaled(results: xr.Dataset, name: str) -> np.ndarray:
+    """Return a simulated number (draw,), a count as if out of the paper's number of trials."""
+    simulated, of = results.simulated.sel(number=name).values, NUMBERS[name].of
+    return simulated * of / float(results.trials.sel(number=name)) if of else simulated
+
+
+def numbers_table(results: xr.Dataset) -> list[list[str]]:
+    """Return a row for each number: the paper's, predictions, and the best draw's."""
+    at, predicted = best(results), predictions(results)
+    rows = [["number", "paper", "prior", "posterior", "predicted from the others", "the best draw",
+             "inside the paper's interval"]]  # fmt: skip
+    for name, quantities in predicted.items():
+        number, ours = NUMBERS[name], scaled(results, name)[at]
+        cells = [_words(name, *each) for each in quantities.values()]
+        rows.append(
+            [name, _word(name, number.value), *cells, _word(name, ours), agrees(name, ours)]
+        )
+    return rows
+
+
+def agrees(name: str, value: float) -> str:
+    """Return whether a number agrees with the paper's: within its Wilson interval or tolerance."""
+    number = NUMBERS[name]
+    if number.of == 1:
+        return "yes" if value == number.value else "no"
+    if number.of:
+        low, high = statistics.wilson(int(number.value), number.of)
+        return "yes" if low <= value / number.of <= high else "no"
+    return "yes" if abs(value - number.value) <= 2 * number.deviation else "no"
+
+
+def _cells_inside(results: xr.Dataset) -> int:
+    """Return the number of cells of Table II in which the best draw agrees with the paper."""
+    at, cells = best(results), [name for name in NUMBERS if printed.part_of(name) == "Table II"]
+    return sum(agrees(name, scaled(results, name)[at]) == "yes" for name in cells)
+
+
+def _word(name: str, value: float) -> str:
+    number = NUMBERS[name]
+    if number.of == 1:
+        return "yes" if value else "no"
+    if number.of:
+        return f"{value:.0f} of {number.of}"
+    return f"{value:.3f} m" if number.unit == "m" else f"{value:.0f} s"
+
+
+def _words(name: str, low: float, middle: float, high: float) -> str:
+    """Return a median and its interval."""
+    number = NUMBERS[name]
+    form = ".3f" if number.unit == "m" else ".0f"
+    return f"{middle:{form}} [{low:{form}}, {high:{form}}]"
+
+
+def checks_table(results: xr.Dataset) -> list[list[str]]:
+    """Return a row for each number of the hardware: the best draw repeated in two engines."""
+    rows = [["number", "paper", *(f"{engine}: mean, range" for engine in results.engine.values)]]
+    for name in map(str, results.checked_number.values):
+        repeated = results.checked.sel(checked_number=name).values
+        form = {"m": ".3f", "s": ".0f"}.get(NUMBERS[name].unit, ".1f")
+        cells = [f"{x.mean():{form}} [{x.min():{form}}, {x.max():{form}}]" for x in repeated]
+        rows.append([name, _word(name, NUMBERS[name].value), *cells])
+    return rows
+
+
+_TOLD = {
+    "Fig. 6: the right corner touches first":
+        "the sensor initially detected only the right corner, 0.2 m from the center",
+    "Fig. 6: a_r starts near its highest": "a_r started from nearly at its highest value",
+    "Fig. 6: line contact before Realignment":
+        "a line contact occurred with the side edge of the box",
+    "Fig. 6: one Realignment State":
+        "the Realignment State ... remained active until ... the center of the robot",
+    "Fig. 6: success": "the robot successfully pushed the object to the target",
+}  # fmt: skip
+
+
+def figure_6_table(results: xr.Dataset) -> list[list[str]]:
+    """Return a row for each statement of the text on Fig. 6: what the best draw does."""
+    holds, weights = experiments.observations(results), normalised(log_weights(results))
+    rows = [["the paper's text", "in the best draw", "posterior probability"]]
+    for name, text in _TOLD.items():
+        share = _probability(weights, results.simulated.sel(number=name).values > 0)
+        rows.append([text, "yes" if holds[name] else "no", share])
+    return rows

@@ -1,0 +1,139 @@
+"""Study of which reading of the paper, and which physics, give all of its printed numbers.
+
+    rps sweeps/paper_reading --quick
+
+draws readings of the text, the hardware's unmeasured physics and the simulator's ingredients, runs
+the experiments of the paper under each draw, and weights the draws by the likelihood of the printed
+numbers (adaptive importance sampling). `unknowns` has the draws, `experiments` runs them, `printed`
+has the numbers and their likelihood, `evidence` the posterior, and `drawing` the figures.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import partial
+from typing import ClassVar
+
+import numpy as np
+import xarray as xr
+
+from rps_jax.analysis.report import Picture
+from rps_jax.record.options import option
+from rps_jax.runs.question import Run, call_of
+from rps_jax.trials.progress import SequentialProgress
+from rps_jax.trials.setting import Setting
+from rps_jax.world import paper
+from sweeps.paper_reading import drawing, evidence, experiments, printed
+from sweeps.paper_reading.experiments import Target
+from sweeps.paper_reading.unknowns import Proposal
+from sweeps.study_base import Table, TrialStudy
+
+_REPEATS = 8  # runs of the best draw with other starts and noise
+
+
+@dataclass(frozen=True)
+class PaperReading(TrialStudy[xr.Dataset]):
+    """Infer readings of the paper and its physics from all of its printed numbers together.
+
+    The result has the points `u` (draw, unknown) in the unit cube, the log density of the proposals
+    `log_proposal` (draw), and the simulated numbers (draw, number), of which counts are out of
+    `trials` (number). For the best draw it has the hardware's numbers in both engines, `checked`
+    (engine, repeat, number), and its Fig. 6 over time.
+    """
+
+    TITLE: ClassVar[str] = "Which reading of the paper gives its numbers"
+    QUICK: ClassVar[Mapping[str, object]] = {
+        "draws": 2, "rounds": 1, "first": 4, "targets": paper.FEW_TARGETS, "repeats": 1,
+    }  # fmt: skip
+
+    draws: int = option(400, 2, 100_000)
+    """Number of draws in each round."""
+    rounds: int = option(5, 1, 100)
+    """Number of rounds; draws are concentrated where those of earlier rounds fit."""
+    first: int = option(4000, 2, 1_000_000)
+    """Number of draws before the rounds, of which only the hardware's experiments run."""
+    repeats: int = option(_REPEATS, 1, 100)
+    """Number of repetitions of the hardware's experiments under the best draw."""
+    targets: tuple[Target, ...] = paper.TARGETS
+    """Targets of the simulated trials [m]."""
+    setting: Setting = field(default=Setting("fused"), kw_only=True)
+
+    def num_trials(self) -> int:
+        """Number of trials of all draws."""
+        table = len(paper.LAWS) * 6 * len(self.targets)
+        return 16 * (self.first + 2 * self.repeats) + self.rounds * self.draws * (17 + table)
+
+    def answer(self, run: Run) -> xr.Dataset:
+        """Run the rounds that the folder lacks, and check the best draw."""
+        progress = SequentialProgress(run.callback)
+        run = run._replace(callback=progress)
+        pilot = run.checkpoint("first", partial(self._draw, Proposal.prior(), 0, (), run))
+        progress.finish(16 * self.first)
+        proposals = [evidence.proposal(_joined([pilot], [Proposal.prior()]))]
+        rounds: list[xr.Dataset] = []
+        for index in range(self.rounds):
+            if rounds:
+                proposals.append(evidence.proposal(_joined(rounds, proposals)))
+            compute = partial(self._draw, proposals[-1], index + 1, self.targets, run)
+            rounds.append(run.checkpoint(f"round_{index}", compute))
+            progress.finish((self.num_trials() - 16 * self.first) // self.rounds)
+        results = _joined(rounds, proposals)
+        best = results.isel(draw=[evidence.best(results)])
+        checked = run.checkpoint("best", partial(self._check_best, best, run))
+        return xr.merge([results, checked], combine_attrs="drop")
+
+    def _draw(
+        self, proposal: Proposal, index: int, targets: tuple[Target, ...], run: Run
+    ) -> xr.Dataset:
+        """Return draws of a proposal and their numbers."""
+        rng = np.random.default_rng([self.setting.seed, index])
+        u = proposal.sample(self.draws if targets else self.first, rng)
+        return experiments.numbers(u, self.setting, targets, run, index)
+
+    def _check_best(self, best: xr.Dataset, run: Run) -> xr.Dataset:
+        """Return the hardware's numbers of one draw in two engines, and its Fig. 6 over time."""
+        u = np.repeat(best.u.values, self.repeats, 0)
+        by_engine = []
+        for engine in ("fused", "mujoco"):
+            setting = replace(self.setting, engine=engine)
+            found = experiments.hardware(u, setting, run, 1000)
+            names = list(found)
+            by_engine.append(np.stack([found[name] for name in names], 1))
+        trace = experiments.figure_6(best.u.values, self.setting, run.callback)[0]
+        columns = {"checked": (("engine", "repeat", "checked_number"), np.stack(by_engine))}
+        coords = {"engine": ["fused", "mujoco"], "checked_number": names}
+        return xr.merge([xr.Dataset(columns, coords), trace], combine_attrs="drop")
+
+    def intro(self, results: xr.Dataset) -> str:
+        """Describe the draws and the likelihood."""
+        return evidence.summary(results)
+
+    def report_tables(self, results: xr.Dataset) -> Sequence[Table]:
+        """Return posterior, predictions, the best draw and its Fig. 6."""
+        return [
+            Table(evidence.readings_table(results), name="reading_evidence",
+                  title="Evidence for each reading"),
+            Table(evidence.unknowns_table(results), name="reading_posterior", title="Posterior",
+                  picture=Picture("posterior", partial(drawing.posterior, results))),
+            Table(evidence.numbers_table(results), name="reading_numbers",
+                  title="Printed numbers and their predictions",
+                  picture=Picture("predictions", partial(drawing.predictions, results))),
+            Table(evidence.checks_table(results), name="reading_checks",
+                  title="The best draw again, in two engines"),
+            Table(evidence.figure_6_table(results), name="reading_figure_6",
+                  title="Fig. 6, point by point",
+                  picture=Picture("figure_6", partial(drawing.figure_6, results))),
+        ]  # fmt: skip
+
+
+paper_reading = call_of(PaperReading)
+
+
+def _joined(rounds: Sequence[xr.Dataset], proposals: Sequence[Proposal]) -> xr.Dataset:
+    """Return the draws of all rounds, with the log density of the mixture of their proposals."""
+    results = xr.concat(rounds, "draw", data_vars="minimal")
+    densities = [proposal.log_density(results.u.values) for proposal in proposals]
+    mixture = np.logaddexp.reduce(densities, 0) - np.log(len(densities))
+    likelihoods = printed.log_likelihoods(results.simulated, results.trials)
+    return results.assign(log_proposal=("draw", mixture), log_likelihood=likelihoods)
