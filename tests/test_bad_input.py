@@ -155,6 +155,7 @@ COMMANDS = {
         "--domain wide,masses=3:4": "unknown domain quantity 'masses': .*did you mean 'mass'",
         "--domain paper,mass=50:60": "paper,mass=50:60 is not allowed: .* leave no mass to draw",
         "--domain wide,com_offset=0:0.9": r"domain com_offset \(high\) = 0.9 is not allowed",
+        "--domain hostile,load_size=0.4": r"load_size \(high\) = 0.4 .* up to 0.7 .* 0.3",
         "--laws npss": "unknown law 'npss': .*did you mean 'nps'",
         "--laws rps,L.json": "L = -1.0 is not allowed",
         "--laws rps,L_word.json": "rps L = x is not allowed: it must be a number",

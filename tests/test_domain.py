@@ -14,6 +14,7 @@ from helpers import refusals, row, same
 from staging import recompiled
 
 from rps_jax import engines
+from rps_jax.errors import InputError
 from rps_jax.geometry import solid
 from rps_jax.geometry.footprint import polygon
 from rps_jax.robot.robot import Robot
@@ -29,6 +30,7 @@ from rps_jax.world.scene import FRICTION
 
 WIDE = DOMAINS["wide"]
 COUNT = 12
+OF_SCENES = ("mass", "size", "height", "com_offset", "load_size")
 NO_RANGE = r"domain mass = .* give a Range, as Range\(3, 10\)"
 
 
@@ -66,7 +68,7 @@ def test_everything_lies_in_its_range_and_fills_it(name):
     for quantity in set(columns) & set(domain.QUANTITIES):
         values = columns[quantity][0]
         low, high, log = getattr(chosen, quantity)
-        if name == "hardware" and quantity in ("mass", "size", "height", "com_offset"):
+        if name == "hardware" and quantity in OF_SCENES:
             continue  # these belong to the objects
         assert low - 1e-9 <= values.min() <= values.max() <= high + 1e-9, quantity
         if high > low:
@@ -114,37 +116,95 @@ def test_fused_bodies_equal_those_of_recompiled_models(name):
 
 @pytest.mark.parametrize("name", list(RANDOM))
 def test_mass_properties_are_those_that_mujoco_finds(name):
-    """The solid has uniform density and a small load in it."""
+    """A solid is two bodies of uniform density: its whole, and a scaled copy that touches it."""
     worlds = drawn(name, 6, seed=1)
     for i in range(6):
-        drawn_solid, alone = row(worlds.solid, i), row(worlds.solid, slice(i, i + 1))
-        offset = np.linalg.norm(drawn_solid.p_object_com)
-        along = drawn_solid.p_object_com[None, :2] / offset
-        share = offset / (0.8 * solid.reach(alone.vertices, alone.radius, along)[0])
-        sphere = {"type": mujoco.mjtGeom.mjGEOM_SPHERE, "size": [1e-4] * 3}
+        drawn_solid, size = row(worlds.solid, i), worlds.values["load_size"][i]
+        edge, share = edge_and_share(worlds, i)
+        area = solid.area(row(worlds.solid, slice(i, i + 1)))[0]
         spec = mujoco.MjSpec()
         body = spec.worldbody.add_body()
-        body.add_geom(**_even(spec, drawn_solid), mass=(1 - share) * drawn_solid.mass)
-        body.add_geom(**sphere, pos=drawn_solid.p_object_com / share, mass=share * drawn_solid.mass)
+        for scale, part in ((1.0, 1 - share), (size, share)):
+            density = part * drawn_solid.mass / (scale**2 * area * drawn_solid.height)
+            at = [*(1 - scale) * edge, 0]
+            body.add_geom(**_even(spec, drawn_solid, scale), pos=at, density=density)
         model = spec.compile()
         turn = np.zeros(9)
         mujoco.mju_quat2Mat(turn, model.body_iquat[1])
         theirs = turn.reshape(3, 3) @ np.diag(model.body_inertia[1]) @ turn.reshape(3, 3).T
-        axes = solid.axes(alone)[0]
-        mine = axes @ np.diag(drawn_solid.inertia) @ axes.T
+        np.testing.assert_allclose(drawn_solid.mass, model.body_mass[1], rtol=1e-5)
         np.testing.assert_allclose(drawn_solid.p_object_com, model.body_ipos[1], atol=1e-6)
-        np.testing.assert_allclose(mine, theirs, rtol=1e-4, atol=1e-4 * drawn_solid.inertia.max())
+        mine = inertia_in_object(worlds, i)
+        np.testing.assert_allclose(mine, theirs, rtol=1e-4, atol=1e-5 * drawn_solid.inertia.max())
 
 
-def _even(spec, row):
-    """Return the geom of a solid of uniform density."""
+@pytest.mark.parametrize("name", ["random_cylinder", "random_prism"])
+def test_mass_properties_are_integrals_over_both_bodies(name):
+    worlds = drawn(name, 4, seed=2, com_offset=Range(0.3, 0.7))
+    for i in range(4):
+        shape, size = row(worlds.solid, i), worlds.values["load_size"][i]
+        edge, share = edge_and_share(worlds, i)
+        ticks = np.linspace(-1, 1, 1200) * (np.abs(shape.vertices).max() + shape.radius)
+        x, y = np.meshgrid(ticks, ticks)
+        local = [(z - (1 - size) * p) / size for z, p in zip((x, y), edge, strict=True)]
+        whole, load = inside(shape, x, y), inside(shape, *local)
+        assert not (load & ~whole).any()
+        weight = shape.mass * ((1 - share) * whole / whole.sum() + share * load / load.sum())
+        com = np.array([(weight * z).sum() for z in (x, y)]) / shape.mass
+        np.testing.assert_allclose(shape.p_object_com, [*com, 0], atol=1e-4)
+        x, y = x - com[0], y - com[1]
+        upright = shape.mass * shape.height**2 / 12
+        xx, yy, xy = ((weight * z).sum() for z in (x * x, y * y, x * y))
+        theirs = [[yy + upright, -xy, 0], [-xy, xx + upright, 0], [0, 0, xx + yy]]
+        np.testing.assert_allclose(inertia_in_object(worlds, i), theirs, rtol=4e-3, atol=2e-3 * xx)
+
+
+def edge_and_share(worlds, i):
+    """Return the point (2,) [m] where the load touches the outline, and its share of the mass."""
+    alone = row(worlds.solid, slice(i, i + 1))
+    offset = np.linalg.norm(alone.p_object_com)
+    along = alone.p_object_com[:, :2] / offset
+    reach = solid.reach(alone.vertices, alone.radius, along)[0]
+    return reach * along[0], offset / ((1 - worlds.values["load_size"][i]) * reach)
+
+
+def inertia_in_object(worlds, i):
+    axes = solid.axes(row(worlds.solid, slice(i, i + 1)))[0]
+    return axes @ np.diag(worlds.solid.inertia[i]) @ axes.T
+
+
+def inside(shape, x, y):
+    """Whether points lie in an outline."""
+    if len(shape.vertices) == 1:
+        return np.hypot(x, y) <= shape.radius
+    ahead = np.roll(shape.vertices, -1, axis=0) - shape.vertices
+    sides = zip(shape.vertices, ahead, strict=True)
+    return np.all([e[0] * (y - v[1]) >= e[1] * (x - v[0]) for v, e in sides], axis=0)
+
+
+def _even(spec, row, scale):
+    """Return the geom of a solid of uniform density, its outline scaled about the origin."""
     half = row.height / 2
     if len(row.vertices) == 1:
-        return {"type": mujoco.mjtGeom.mjGEOM_CYLINDER, "size": [row.radius, half, 0]}
-    corners = np.unique(row.vertices, axis=0)
+        return {"type": mujoco.mjtGeom.mjGEOM_CYLINDER, "size": [scale * row.radius, half, 0]}
+    corners = scale * np.unique(row.vertices, axis=0)
     points = [[*corner, z] for z in (-half, half) for corner in corners]
-    spec.add_mesh(name="solid", uservert=np.ravel(points))
-    return {"type": mujoco.mjtGeom.mjGEOM_MESH, "meshname": "solid"}
+    mesh = spec.add_mesh(name=f"solid_{scale}", uservert=np.ravel(points))
+    return {"type": mujoco.mjtGeom.mjGEOM_MESH, "meshname": mesh.name}
+
+
+def test_the_largest_load_fits_and_a_larger_one_is_refused():
+    """At the limit the load is the whole mass."""
+    worlds = drawn("random_box", com_offset=Range(0.7, 0.7), load_size=Range(0.3, 0.3))
+    x, y = 2 * worlds.solid.vertices[:, 0].T
+    whole = np.sort(np.stack([x, y], -1), axis=1) * 0.3
+    expected = np.sum(whole**2, axis=1) / 12 * worlds.solid.mass
+    np.testing.assert_allclose(worlds.solid.inertia[:, 2], expected)
+    refused = (
+        r"domain load_size \(high\) = 0.31 .* with com_offset up to 0.7 its high is at most 0.3"
+    )
+    with pytest.raises(InputError, match=refused):
+        replace(WIDE, com_offset=Range(0, 0.7), load_size=Range(0.1, 0.31))
 
 
 def test_prisms_are_convex_of_three_to_eight_sides_and_centred():

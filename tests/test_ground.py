@@ -24,13 +24,14 @@ def blocks(half_x, half_y, offset=0.0, bearing=0.0):
     half_x, half_y = np.broadcast_arrays(np.atleast_1d(half_x), half_y)
     unit = np.ones(len(half_x))
     outline = solid.rectangles(half_x, half_y)
-    return solid.build(outline, 0 * unit, 0.8 * unit, 20 * unit, offset * unit, bearing * unit)
+    load = offset * unit, bearing * unit, 0.1 * unit
+    return solid.build(outline, 0 * unit, 0.8 * unit, 20 * unit, *load)
 
 
 def drums(count=1, radius=0.25):
     unit = np.ones(count)
     return solid.build(
-        np.zeros((count, 1, 2)), radius * unit, 0.7 * unit, 25 * unit, 0 * unit, 0 * unit
+        np.zeros((count, 1, 2)), radius * unit, 0.7 * unit, 25 * unit, *np.zeros((3, count))
     )
 
 

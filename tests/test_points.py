@@ -115,7 +115,7 @@ def test_objects_may_come_in_any_order(tmp_path):
 def test_points_that_are_none_are_refused(tmp_path, capsys):
     u = points.points_of("wide", np.arange(2))
     for wrong, words in (
-        (u[:, 1:], r"shape of u = \(2, 35\) is not allowed: it must be \(n, 36\)"),
+        (u[:, 1:], r"shape of u = \(2, 36\) is not allowed: it must be \(n, 37\)"),
         (u[:0], "is not allowed"),
         (u + 1, r"u\[0, 0\] = 1\.1.* \(object\) is not allowed: it must be at least 0 and below 1"),
         (np.where(u == u[1, 3], np.nan, u), r"u\[1, 3\] = nan"),

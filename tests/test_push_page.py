@@ -113,7 +113,7 @@ def test_the_support_of_an_object_equals_that_of_the_package(corners):
         vertices, radius = solid.rectangles(size, rng.uniform(0.1, 0.4, 20)), np.zeros(20)
         vertices = np.concatenate([vertices, vertices[:, -1:].repeat(corners - 4, 1)], axis=1)
     unit = np.ones(20)
-    solids = solid.build(vertices, radius, unit, unit, offset, bearing)
+    solids = solid.build(vertices, radius, unit, unit, offset, bearing, 0.1 * unit)
     with jax.enable_x64(True):
         outlines = MAKE["Outline"](vertices, radius, offset, bearing)
         com, arm = jax.vmap(MAKE["support"])(outlines)

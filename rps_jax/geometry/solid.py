@@ -1,7 +1,7 @@
 """Batches of solids: outlines, mass properties and feet, in NumPy.
 
-A solid is an upright prism or cylinder of uniform density with a compact load inside. The origin
-of its frame is at half its height above the centroid of its outline; z is up. Arrays are in double
+A solid is an upright prism or cylinder of uniform density with a load inside. The origin of its
+frame is at half its height above the centroid of its outline; z is up. Arrays are in double
 precision, and their leading axis is n, the number of solids.
 """
 
@@ -15,7 +15,6 @@ from rps_jax.geometry import vectors
 
 GRAVITY = 9.81  # [m/s^2]
 SIDES = 8  # vertices of a prism at most; those of fewer sides repeat some
-_LOAD_AT = 0.8  # [1] place of the load, as a share of the way from the middle to the outline
 
 
 class Solid(NamedTuple):
@@ -41,22 +40,24 @@ def build(
     mass: np.ndarray,
     com_offset: np.ndarray,
     com_bearing: np.ndarray,
+    load_size: np.ndarray,
 ) -> Solid:
     """Return solids whose centre of mass a load moves off the middle.
 
-    The load is a share of the mass, at `_LOAD_AT` of the way to the outline and at half height. It
-    moves the centre of mass by `com_offset` (n,) [1] of that way, in the direction `com_bearing`
-    (n,) [rad]. The rest of the mass fills the solid uniformly.
+    The load is a copy of the solid of equal height, whose outline is scaled by `load_size` (n,) [1]
+    about the point of the solid's outline in the direction `com_bearing` (n,) [rad]. Its mass moves
+    the centre of mass by `com_offset` (n,) [1], at most 1 - `load_size`, of the way to that point.
+    The rest of the mass fills the solid uniformly.
     """
     direction = np.stack([np.cos(com_bearing), np.sin(com_bearing)], axis=-1)
-    at = _LOAD_AT * reach(vertices, radius, direction)[:, None] * direction
-    share = com_offset / _LOAD_AT
+    at = ((1 - load_size) * reach(vertices, radius, direction))[:, None] * direction
+    share = com_offset / (1 - load_size)
     xx, yy, xy = _second_moments(vertices, radius)
-    rest, pair = 1 - share, share * (1 - share)
-    xx = rest * xx + pair * at[:, 0] ** 2
-    yy = rest * yy + pair * at[:, 1] ** 2
-    xy = rest * xy + pair * at[:, 0] * at[:, 1]
-    zz = rest * height**2 / 12
+    scale, pair = 1 - share + share * load_size**2, share * (1 - share)
+    xx = scale * xx + pair * at[:, 0] ** 2
+    yy = scale * yy + pair * at[:, 1] ** 2
+    xy = scale * xy + pair * at[:, 0] * at[:, 1]
+    zz = height**2 / 12
     middle, half = 0.5 * (xx + yy), np.hypot(0.5 * (xx - yy), xy)
     turn = 0.5 * np.arctan2(2 * xy, xx - yy)  # of the axis with the largest second moment of area
     inertia = mass[:, None] * np.stack([middle - half + zz, middle + half + zz, xx + yy], axis=-1)

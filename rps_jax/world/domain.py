@@ -79,6 +79,9 @@ class Domain:
     height: Range = drawn(Range(0.3, 0.8), 3, "m", 0.1, 2.0, "height of the object")
     # As a share of the way from the middle to the outline.
     com_offset: Range = drawn(Range(0, 0.4), 4, "1", 0, 0.75, "centre of mass off the middle")
+    # Of the load that moves the centre of mass: a copy of the object, of equal height, with an
+    # outline of this share of its width that touches the object's from inside. The rest is uniform.
+    load_size: Range = drawn(Range(0.1, 0.25), 46, "1", 0.01, 0.9, "size of the load")
     # Three or four feet, at this share of the way from the centre of mass to the outline; None: it
     # stands on its corners or its rim.
     feet: Range | None = drawn(None, 43, "1", 0.1, 1, "feet, of the way to the outline")
@@ -160,6 +163,10 @@ class Domain:
             if low > high or (log and low <= 0):
                 rule = "low must not exceed high" + (", and be above 0" if log else "")
                 raise errors.not_allowed(field, f"{low:g} to {high:g}", rule)
+        offset, load = self.com_offset.high, self.load_size.high
+        if offset + load > 1:
+            rule = f"with com_offset up to {offset:g} its high is at most {1 - offset:g}"
+            raise errors.not_allowed("domain load_size (high)", load, rule)
         reach = math.hypot(*self.robot.shell.half)
         if not self.targets and self.distance.low <= reach:
             rule = f"targets must lie outside the robot, which reaches {reach:.2f} m"

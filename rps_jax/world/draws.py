@@ -69,6 +69,8 @@ def draw_at(domain: Domain, index: np.ndarray, uniform: np.ndarray) -> Draw:
     at = {name: item.at(u[name]) for name, item in ranges.items() if item is not None}
     if domain.skin == "ideal":
         at |= {name: np.zeros(index.size) for name in quantities_of("skin") if name in at}
+    if name not in RANDOM:
+        at["load_size"] = np.zeros(index.size)
     error = [domain.velocity_error.at(u[name]) for name in VELOCITY_ERRORS]
     key = [np.floor(u[name] * 2**32).astype(np.uint32) for name in ("key_0", "key_1")]
     return Draw(
@@ -112,9 +114,8 @@ def _solid(name: str, at: dict[str, np.ndarray], u: dict[str, np.ndarray]) -> So
         vertices = solid.rectangles(depth, breadth)
     else:
         vertices = _polygons(depth, breadth, u)
-    solids = solid.build(
-        vertices, radius, at["height"], at["mass"], at["com_offset"], 2 * np.pi * u["com_bearing"]
-    )
+    load = at["com_offset"], 2 * np.pi * u["com_bearing"], at["load_size"]
+    solids = solid.build(vertices, radius, at["height"], at["mass"], *load)
     if "feet" not in at:
         return solids
     return solid.on_feet(solids, at["feet"], 3 + np.floor(2 * u["feet_number"]), u["feet_turn"])

@@ -64,18 +64,21 @@ def coordinates(domain: Domain) -> tuple[Coordinate, ...]:
     ]
     random = set(domain.objects) & set(RANDOM)
     idle = set(domain.idle) | ({"aspect"} if random == {"random_cylinder"} else set())
+    if not random or domain.com_offset.high == 0:
+        idle |= {"com_bearing", "load_size"}
     for name in draws.USES:
+        if name in idle:
+            continue
         if name in (*_OF_PRISMS, *_OF_FEET):
             if domain.feet is not None if name in _OF_FEET else "random_prism" in random:
                 labels.append(Coordinate(name, "shape", Range(0, 1), "1"))
         elif name == "com_bearing":
-            if random and domain.com_offset.high > 0:
-                labels.append(Coordinate(name, "range", Range(0, 2 * np.pi), "rad"))
+            labels.append(Coordinate(name, "range", Range(0, 2 * np.pi), "rad"))
         elif name.startswith("key_"):
             labels.append(Coordinate(name, "noise", Range(0, 1), "1"))
         else:
             interval = getattr(domain, "velocity_error" if name in VELOCITY_ERRORS else name)
-            if name not in idle and interval is not None and interval.low < interval.high:
+            if interval is not None and interval.low < interval.high:
                 labels.append(Coordinate(name, "range", interval, unit_of(name)))
     return tuple(labels)
 

@@ -72,7 +72,7 @@ def targets() -> dict[str, Target]:
     """Return the paper's box (40 cm) and cylinder, and a box of 60 cm of equal height and mass."""
     box, cylinder = (scene.solid_of(scene.load(name)) for name in ("box", "cylinder"))
     half = np.array([0.3])
-    mass = (half * 0 + 20.0, np.zeros(1), np.zeros(1))
+    mass = (half * 0 + 20.0, *np.zeros((3, 1)))
     wide = solid.build(solid.rectangles(half, half), 0 * half, box.height, *mass)
     return {
         "box": Target("box", box, yaw=ASKEW),
