@@ -15,6 +15,9 @@ A cell is a text, a number, a list of numbers (a rate and the limits of its inte
 column with `merge` leaves repeated texts out. A cell `{"from": NAME, "row": [...], "column": ...}`
 shows a cell of another table, in the row that starts with these values. A table of such cells has
 columns and rows only.
+
+`STALE` names the data files that are older than a change of their inputs and wait for their
+computation. The note under their tables says so.
 """
 
 import json
@@ -30,6 +33,8 @@ SWEEPS = ROOT / "sweeps"
 KEYS = ("command", "device", "versions", "commit", "date", "columns", "rows")
 _BLOCK = re.compile(r"(<!-- (table|command): (\S+) -->\n).*?(<!-- end -->)", re.DOTALL)
 _CELL = re.compile(r"(<!-- cell: ([^>]*?) -->).*?(<!-- end -->)", re.DOTALL)
+# The change since each stale data file: what follows "Computed by 0.3.0 at commit ..., before".
+STALE: dict[str, str] = {}
 _SKIPPED = {"runs", "build", "dist"}  # folders of the root that hold no pages of the repository
 
 
@@ -114,13 +119,29 @@ def _cited(cell: dict[str, Any], root: Path) -> str:
     return text(rows[0][i], data["columns"][i], root)
 
 
-def caption(data: dict[str, Any], link: str) -> str:
-    """Return one line with device and date, and a link to the data file."""
+def cell(words: str, root: Path = SWEEPS) -> str:
+    """Return the text of the cell `NAME | ROW | COLUMN` without its interval."""
+    name, *row, column = (word.strip() for word in words.split("|"))
+    return _cited({"from": name, "row": row, "column": column}, root).split(" [")[0]
+
+
+def caption(name: str, data: dict[str, Any], link: str) -> str:
+    """Return one line: what is stale, device and date, and a link to the data file."""
     if data["command"] is None:
-        return f"\n<sub>Every number is cited: [from which table]({link}).</sub>\n"
-    parts = [f"Device: {data['device']}"] if data["device"] else []
-    parts += [f"date: {data['date']}"] if data["date"] else []
-    return f"\n<sub>{'; '.join([*parts, f'[command, versions and values]({link})'])}.</sub>\n"
+        cited = {cell["from"] for row in data["rows"] for cell in row if isinstance(cell, dict)}
+        sources: dict[str, list[str]] = {}
+        for source in sorted(cited & STALE.keys()):
+            sources.setdefault(STALE[source], []).append(f"`{source}`")
+        notes = [f"{', '.join(of)}: computed before {change}" for change, of in sources.items()]
+        last = f"Every number is cited: [from which table]({link})"
+    else:
+        version, commit = data["versions"]["rps_jax"], (data["commit"] or "")[:7]
+        at = f" at commit {commit}" if commit else ""
+        notes = [f"Computed by {version}{at}, before {STALE[name]}"] if name in STALE else []
+        parts = [f"Device: {data['device']}"] if data["device"] else []
+        parts += [f"date: {data['date']}"] if data["date"] else []
+        last = "; ".join([*parts, f"[command, versions and values]({link})"])
+    return f"\n<sub>{'. '.join([*notes, last])}.</sub>\n"
 
 
 def commands(data: dict[str, Any]) -> str:
@@ -138,16 +159,13 @@ def render(page: Path, root: Path = SWEEPS) -> str:
         if kind == "command":
             return start + commands(data) + end
         link = Path(os.path.relpath(path_of(name, root), page.parent)).as_posix()
-        return start + table(data, root) + caption(data, link) + end
+        return start + table(data, root) + caption(name, data, link) + end
 
-    def cell(match: re.Match[str]) -> str:
+    def cited(match: re.Match[str]) -> str:
         start, words, end = match.groups()
-        name, *row, column = (word.strip() for word in words.split("|"))
-        return (
-            start + _cited({"from": name, "row": row, "column": column}, root).split(" [")[0] + end
-        )
+        return start + cell(words, root) + end
 
-    return _CELL.sub(cell, _BLOCK.sub(block, page.read_text(encoding="utf-8")))
+    return _CELL.sub(cited, _BLOCK.sub(block, page.read_text(encoding="utf-8")))
 
 
 def pages(root: Path = ROOT) -> list[Path]:

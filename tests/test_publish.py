@@ -2,6 +2,7 @@
 
 import json
 import re
+import shlex
 import shutil
 from dataclasses import replace
 from fnmatch import fnmatch
@@ -17,6 +18,7 @@ from rps_jax.runs.question import seed_of
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import Rules
 from rps_jax.world.domain import DOMAINS, Range
+from sweeps import render_tables
 from sweeps.gradients import study as gradients
 from sweeps.publish import dependencies, rows, study
 from sweeps.publish.recipes import HISTORY, RECIPES, Recipe
@@ -72,6 +74,51 @@ def test_failed_recipes_are_named_and_the_others_are_run(recipe_folder, capsys):
     assert len(first["digest"]) == 16
     runs = (recipe_folder / "run" / "runs").iterdir()
     assert [path.name for path in runs] == ["one"]  # one run for both recipes
+
+
+@pytest.mark.parametrize(
+    ("digest", "listed", "message"),
+    [
+        (None, (), ""),
+        ("0" * 16, (), r"stale: the inputs of table have changed; .*--only table, or list them"),
+        ("0" * 16, ("table",), ""),
+        (None, ("table",), r"lists table, which no change has made stale: remove these names"),
+        ("0" * 16, ("table", "gone"), r"lists gone, which"),
+    ],
+)
+def test_a_stale_file_must_be_listed_and_a_current_one_must_not(
+    digest, listed, message, tmp_path, monkeypatch, capsys
+):
+    data = json.loads((SWEEPS / "table" / "results" / "table.json").read_text())
+    data["digest"] = digest or study.digest([shlex.split(line) for line in data["command"]])
+    (tmp_path / "results").mkdir()
+    (tmp_path / "results" / "table.json").write_text(json.dumps(data))
+    monkeypatch.setattr(study, "_SWEEPS", tmp_path)
+    for name in listed:
+        monkeypatch.setitem(render_tables.STALE, name, "the box had a lid")
+    words = (SWEEPS / "publish", "--check-digests", "--out", tmp_path / "run")
+    assert rps(*words) == (2 if message else 0)
+    output = capsys.readouterr()
+    assert re.search(message, output.err) if message else not output.err
+    assert ("stale: computed before the box had a lid" in output.out) == bool(
+        listed and not message
+    )
+
+
+def test_the_note_of_a_table_says_that_its_numbers_are_stale(monkeypatch):
+    data = {"command": ["rps table"], "versions": {"rps_jax": "0.3.0"}, "commit": "0123456789ab",
+            "device": "", "date": "", "rows": [["x"]]}  # fmt: skip
+    cited = {"command": None, "rows": [["x", {"from": "table"}], ["y", {"from": "ladder"}]]}
+    assert render_tables.caption("table", data, "t.json") == (
+        "\n<sub>[command, versions and values](t.json).</sub>\n"
+    )
+    monkeypatch.setitem(render_tables.STALE, "table", "the box had a lid")
+    for commit, at in ((data["commit"], " at commit 0123456"), (None, "")):
+        note = render_tables.caption("table", data | {"commit": commit}, "t.json")
+        assert f"<sub>Computed by 0.3.0{at}, before the box had a lid. [command" in note
+    assert "<sub>[command" in render_tables.caption("ladder", data, "l.json")
+    note = render_tables.caption("summary", cited, "s.json")
+    assert "<sub>`table`: computed before the box had a lid. Every number is cited" in note
 
 
 def test_laws_with_default_and_tuned_parameters_are_compared():

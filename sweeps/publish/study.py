@@ -1,7 +1,7 @@
 """State of the published numbers, and the commands that compute them again.
 
 rps sweeps/publish                       # stale data files, with reasons and durations
-rps sweeps/publish --check-digests       # fails if the inputs of a published number changed
+rps sweeps/publish --check-digests       # fails if a data file is stale and not listed as such
 rps sweeps/publish --only 'fit_*' table  # computes these again; a killed run is continued
 rps sweeps/publish --only '*' --needs gpu
 """
@@ -31,6 +31,7 @@ from rps_jax.errors import InputError
 from rps_jax.record import provenance
 from rps_jax.runs.question import Run, call_of
 from sweeps.publish.recipes import HISTORY, RECIPES, Recipe
+from sweeps.render_tables import STALE
 from sweeps.study_base import (
     Rows,
     Study,
@@ -63,7 +64,8 @@ class Publish(Study[xr.Dataset]):
     needs: Literal["any", "cpu", "gpu"] = "any"
     """Device of the data files to compute again: processors, a GPU, or both."""
     check_digests: bool = False
-    """Whether to fail if the inputs of a published number have changed since it was computed."""
+    """Whether to fail if the inputs of a published number have changed since it was computed, or
+    if STALE in sweeps/render_tables.py, which permits that, lists a number that is up to date."""
 
     def check(self) -> None:
         """Check that the data files exist."""
@@ -78,12 +80,9 @@ class Publish(Study[xr.Dataset]):
             self._compute_again(run)
         states = [xr.Dataset(_description(path), {"file": path.stem}) for path in published()]
         results = xr.concat(states, "file")
-        stale = results.file[results.state.str.startswith("stale")].values.tolist()
-        if self.check_digests and stale:
-            raise InputError(
-                f"published numbers are stale: the inputs of {', '.join(stale)} have changed; "
-                f"compute them again by rps sweeps/publish --only {' '.join(stale)}."
-            )
+        states = dict(zip(results.file.values.tolist(), results.state.values.tolist(), strict=True))
+        if self.check_digests and (problems := stale_problems(states)):
+            raise InputError(" ".join(problems))
         return results
 
     def _compute_again(self, run: Run) -> None:
@@ -129,6 +128,27 @@ def published() -> list[Path]:
     return sorted(_SWEEPS.rglob("results/*.json"))
 
 
+def stale_problems(states: Mapping[str, str]) -> list[str]:
+    """Return a sentence on stale files that `STALE` lacks, and one on those that it must not list.
+
+    The states are in words, by file.
+    """
+    stale = {name for name, state in states.items() if state.startswith("stale")}
+    problems = []
+    if unlisted := sorted(stale - STALE.keys()):
+        problems.append(
+            f"published numbers are stale: the inputs of {', '.join(unlisted)} have changed; "
+            f"compute them again by rps sweeps/publish --only {' '.join(unlisted)}, or list them "
+            "in STALE of sweeps/render_tables.py with the change."
+        )
+    if current := sorted(STALE.keys() - stale):
+        problems.append(
+            f"STALE in sweeps/render_tables.py lists {', '.join(current)}, which no change has "
+            "made stale: remove these names, and run python sweeps/render_tables.py."
+        )
+    return problems
+
+
 def _description(path: Path) -> dict[str, str]:
     """Return version, date, state and duration of a data file, in words."""
     data = json.loads(path.read_text())
@@ -160,7 +180,8 @@ def _state(name: str, data: Mapping[str, Any]) -> str:
     except (InputError, SystemExit) as error:
         return f"stale: its command does not exist today ({error})"
     if current != data["digest"]:
-        return "stale: its laws, domains, physics or seeds have changed"
+        change = STALE.get(name, "a change of its laws, domains, physics or seeds")
+        return f"stale: computed before {change}"
     return CURRENT if version == rps_jax.__version__ else f"computed by {version}, still current"
 
 
