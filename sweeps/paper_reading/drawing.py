@@ -18,8 +18,8 @@ _BINS = 8
 def posterior(results: xr.Dataset) -> Figure:
     """Draw the posterior of every unknown over its prior; a dashed line marks the best draw."""
     weights, at = evidence.normalised(evidence.log_weights(results)), evidence.best(results)
-    figure = Figure(figsize=(13, 8), layout="constrained")
-    axes = figure.subplots(4, 7).flat
+    figure = Figure(figsize=(13, 9.5), layout="constrained")
+    axes = figure.subplots(5, 6).flat
     for ax in axes[len(NAMES) :]:
         ax.set_axis_off()
     for ax, name in zip(axes, NAMES, strict=False):

@@ -63,21 +63,24 @@ def proposal(results: xr.Dataset) -> Proposal:
     weights = {}
     for part, informed in _INFORMED.items():
         fit = log_weights(results, parts=informed) + results.log_proposal.values
+        least = _SHARE * (results.simulation.values.max() + 1)
         low, high = 0.0, 1.0
         for _ in range(30):
             middle = 0.5 * (low + high)
             each = normalised(middle * fit - results.log_proposal.values)
-            low, high = (middle, high) if effective(each) >= _SHARE * fit.size else (low, middle)
+            enough = effective(_of_simulations(results, each)) >= least
+            low, high = (middle, high) if enough else (low, middle)
         weights[part] = normalised(low * fit - results.log_proposal.values)
     return Proposal.fitted(results.u.values, weights)
 
 
 def summary(results: xr.Dataset) -> str:
     """Return a sentence on draws, numbers and the effective number of draws."""
-    weights = normalised(log_weights(results))
+    weights = _of_simulations(results, normalised(log_weights(results)))
     return (
-        f"{results.sizes['draw']:,} draws of {len(NAMES)} unknowns against {len(NUMBERS)} numbers "
-        "and observations of the paper; effective number of draws "
+        f"{weights.size:,} draws of the text and the simulation, each with "
+        f"{results.sizes['draw'] // weights.size} draws of the hardware: {len(NAMES)} unknowns "
+        f"against {len(NUMBERS)} numbers and observations of the paper; effective number of draws "
         f"{effective(weights):.0f}. A mean has a normal likelihood, with a standard deviation of "
         "4 mm for D and 2.5 s for times; a count a beta-binomial one; an observation in the text "
         "is wrong with a probability of 10 %. The best draw has "
@@ -97,16 +100,21 @@ def readings_table(results: xr.Dataset) -> list[list[str]]:
     weights = [normalised(log_weights(results, parts=parts)) for parts in columns.values()]
     for words in itertools.product(*(UNKNOWNS[name].choices for name in _READINGS)):
         mask = np.all([x == word for x, word in zip(chosen, words, strict=True)], 0)
-        cells = [_probability(each, mask) for each in weights]
+        cells = [_probability(results, each, mask) for each in weights]
         rows.append([*words, *cells])
     return rows
 
 
-def _probability(weights: np.ndarray, mask: np.ndarray) -> str:
+def _probability(results: xr.Dataset, weights: np.ndarray, mask: np.ndarray) -> str:
     """Return a share of weights and its standard error, in percent."""
     share = weights[mask].sum()
-    error = np.sqrt(np.sum(weights**2 * (mask - share) ** 2))
+    error = np.sqrt(np.sum(_of_simulations(results, weights * (mask - share)) ** 2))
     return f"{100 * share:.0f} ± {100 * error:.0f} %"
+
+
+def _of_simulations(results: xr.Dataset, x: np.ndarray) -> np.ndarray:
+    """Return sums of x (draw,) over the draws that share a simulation."""
+    return np.bincount(results.simulation.values, x)
 
 
 def unknowns_table(results: xr.Dataset) -> list[list[str]]:
@@ -117,7 +125,7 @@ def unknowns_table(results: xr.Dataset) -> list[list[str]]:
         u = results.u.values
         if unknown.choices:
             drawn = np.array(texts(u, name))
-            share = _probability(weights, drawn == unknown.choices[1])
+            share = _probability(results, weights, drawn == unknown.choices[1])
             cells = [" or ".join(unknown.choices), f"{unknown.choices[1]}: {share}", drawn[at]]
         else:
             drawn, unit = values(u, name), "" if unknown.unit == "1" else f" {unknown.unit}"
@@ -233,6 +241,6 @@ def figure_6_table(results: xr.Dataset) -> list[list[str]]:
     holds, weights = experiments.observations(results), normalised(log_weights(results))
     rows = [["the paper's text", "in the best draw", "posterior probability"]]
     for name, text in _TOLD.items():
-        share = _probability(weights, results.simulated.sel(number=name).values > 0)
+        share = _probability(results, weights, results.simulated.sel(number=name).values > 0)
         rows.append([text, "yes" if holds[name] else "no", share])
     return rows

@@ -12,7 +12,6 @@ import jax.numpy as jnp
 import numpy as np
 import xarray as xr
 
-from rps_jax.control import registry
 from rps_jax.control.base import LawParams
 from rps_jax.control.laws.rps import RPSParams
 from rps_jax.robot.skin import LINE, POINT, IdealSkin
@@ -31,7 +30,7 @@ from rps_jax.world.physics import PHYSICS
 from rps_jax.world.scene import FRICTION
 from sweeps.paper_reading import printed
 from sweeps.paper_reading.printed import SHORT
-from sweeps.paper_reading.unknowns import NAMES, UNKNOWNS, params, texts, values
+from sweeps.paper_reading.unknowns import NAMES, UNKNOWNS, aps_params, params, texts, values
 
 Target = tuple[float, float]
 FIG_6: Target = (-2.0, 0.0)  # box, S1
@@ -99,7 +98,7 @@ class _Trials(Candidates):
                 continue
             skin = batch.worlds.skin
             assert isinstance(skin, IdealSkin)
-            drawn = self.tolerance[batch.indices].astype(skin.tolerance.dtype)
+            drawn = self.tolerance[batch.indices].astype(np.asarray(skin.tolerance).dtype)
             skin = skin._replace(tolerance=drawn)
             yield batch._replace(worlds=batch.worlds._replace(skin=skin))
 
@@ -112,11 +111,18 @@ def _where(mask: np.ndarray, first: np.ndarray, second: np.ndarray) -> np.ndarra
 def _request(
     domain: Domain, u: Mapping[str, np.ndarray], law: LawParams, **fields: np.ndarray
 ) -> _Trials:
-    """Return trials at points u (trials,) by name; leaves of the law are (trials,) or scalars."""
+    """Return trials at points u (trials,) by name; leaves of the law are (trials,)."""
     columns = np.stack([u[name] for name in points.names(domain)], axis=1)
     at, count = points.check_points(domain, columns), len(columns)
-    leaves = jax.tree.map(lambda x: np.broadcast_to(np.asarray(x, float), (1, count)), law)
-    return _Trials(leaves, [domain], 0, np.arange(count), at, True, **fields)
+    return _Trials(
+        jax.tree.map(lambda leaf: leaf[None], law),
+        [domain],
+        0,
+        np.arange(count),
+        at,
+        True,
+        **fields,
+    )
 
 
 def _grid(u: np.ndarray, *sizes: int) -> tuple[np.ndarray, list[np.ndarray]]:
@@ -209,11 +215,8 @@ def simulation(
         at, changed = u[chosen], _physics(setting, cone)
         draw, columns, fields = _simulated(at, domain)
         rps = jax.tree.map(lambda leaf, draw=draw: leaf[draw], params(at))
-        laws = {
-            "rps": rps,
-            "nps": rps._replace(reactive=np.zeros(draw.size)),
-            "aps": registry.LAWS["aps"],
-        }
+        aps = jax.tree.map(lambda leaf, draw=draw: leaf[draw], aps_params(at))
+        laws = {"rps": rps, "nps": rps._replace(reactive=np.zeros(draw.size)), "aps": aps}
         requests = [_request(domain, columns, laws[law], **fields) for law in paper.LAWS]
         found, _ = outcomes(requests, changed, **run.batch_options)
         for i, outcome in enumerate(found):
@@ -286,19 +289,22 @@ def observations(trace: xr.Dataset) -> dict[str, float]:
 
 
 def numbers(
-    u: np.ndarray, setting: Setting, targets: tuple[Target, ...], run: Run, seed: int
+    u: np.ndarray, samples: int, setting: Setting, targets: tuple[Target, ...], run: Run, seed: int
 ) -> xr.Dataset:
     """Return all simulated numbers (draw, number), and the trials (number) of the counts.
 
-    Without targets only the hardware's experiments run.
+    Points u (draw, unknown) differ in the hardware alone within each `samples` of them, for which
+    the simulation runs once. Without targets only the hardware's experiments run.
     """
     found = {
         name: (x, len(HARDWARE.targets)) for name, x in hardware(u, setting, run, seed).items()
     }
     if targets:
-        found |= printed.counts(simulation(u, setting, targets, run))
-        told = [observations(trace) for trace in figure_6(u, setting, run.callback)]
-        found |= {name: (np.array([each[name] for each in told]), 1) for name in told[0]}
+        once = u[::samples]
+        told = [observations(trace) for trace in figure_6(once, setting, run.callback)]
+        simulated = printed.counts(simulation(once, setting, targets, run))
+        simulated |= {name: (np.array([each[name] for each in told]), 1) for name in told[0]}
+        found |= {name: (np.repeat(x, samples), count) for name, (x, count) in simulated.items()}
     names = [name for name in printed.NUMBERS if name in found]
     columns = {
         "simulated": (("draw", "number"), np.stack([found[n][0] for n in names], 1)),

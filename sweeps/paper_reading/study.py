@@ -26,7 +26,7 @@ from rps_jax.trials.setting import Setting
 from rps_jax.world import paper
 from sweeps.paper_reading import drawing, evidence, experiments, printed
 from sweeps.paper_reading.experiments import Target
-from sweeps.paper_reading.unknowns import Proposal
+from sweeps.paper_reading.unknowns import Proposal, redraw_hardware
 from sweeps.study_base import Table, TrialStudy
 
 _REPEATS = 8  # runs of the best draw with other starts and noise
@@ -44,12 +44,15 @@ class PaperReading(TrialStudy[xr.Dataset]):
 
     TITLE: ClassVar[str] = "Which reading of the paper gives its numbers"
     QUICK: ClassVar[Mapping[str, object]] = {
-        "draws": 2, "rounds": 1, "first": 4, "targets": paper.FEW_TARGETS, "repeats": 1,
+        "draws": 2, "rounds": 1, "samples": 2, "first": 4, "repeats": 1,
+        "targets": paper.FEW_TARGETS,
     }  # fmt: skip
 
-    draws: int = option(400, 2, 100_000)
+    draws: int = option(450, 2, 100_000)
     """Number of draws in each round."""
-    rounds: int = option(5, 1, 100)
+    samples: int = option(32, 1, 1000)
+    """Number of draws of the hardware for each of these."""
+    rounds: int = option(4, 1, 100)
     """Number of rounds; draws are concentrated where those of earlier rounds fit."""
     first: int = option(4000, 2, 1_000_000)
     """Number of draws before the rounds, of which only the hardware's experiments run."""
@@ -62,34 +65,41 @@ class PaperReading(TrialStudy[xr.Dataset]):
     def num_trials(self) -> int:
         """Number of trials of all draws."""
         table = len(paper.LAWS) * 6 * len(self.targets)
-        return 16 * (self.first + 2 * self.repeats) + self.rounds * self.draws * (17 + table)
+        of_draw = 16 * self.samples + table + 1
+        return 16 * (self.first + 2 * self.repeats) + self.rounds * self.draws * of_draw
 
     def answer(self, run: Run) -> xr.Dataset:
         """Run the rounds that the folder lacks, and check the best draw."""
         progress = SequentialProgress(run.callback)
         run = run._replace(callback=progress)
-        pilot = run.checkpoint("first", partial(self._draw, Proposal.prior(), 0, (), run))
+        pilot = run.checkpoint("first", partial(self._draw_hardware, run))
         progress.finish(16 * self.first)
-        proposals = [evidence.proposal(_joined([pilot], [Proposal.prior()]))]
+        proposals = [evidence.proposal(_joined([pilot], [Proposal.prior()], 1))]
         rounds: list[xr.Dataset] = []
         for index in range(self.rounds):
             if rounds:
-                proposals.append(evidence.proposal(_joined(rounds, proposals)))
+                proposals.append(evidence.proposal(_joined(rounds, proposals, self.samples)))
             compute = partial(self._draw, proposals[-1], index + 1, self.targets, run)
             rounds.append(run.checkpoint(f"round_{index}", compute))
             progress.finish((self.num_trials() - 16 * self.first) // self.rounds)
-        results = _joined(rounds, proposals)
+        results = _joined(rounds, proposals, self.samples)
         best = results.isel(draw=[evidence.best(results)])
         checked = run.checkpoint("best", partial(self._check_best, best, run))
         return xr.merge([results, checked], combine_attrs="drop")
+
+    def _draw_hardware(self, run: Run) -> xr.Dataset:
+        """Return draws of the prior and the hardware's numbers."""
+        u = Proposal.prior().sample(self.first, np.random.default_rng([self.setting.seed, 0]))
+        return experiments.numbers(u, 1, self.setting, (), run, 0)
 
     def _draw(
         self, proposal: Proposal, index: int, targets: tuple[Target, ...], run: Run
     ) -> xr.Dataset:
         """Return draws of a proposal and their numbers."""
         rng = np.random.default_rng([self.setting.seed, index])
-        u = proposal.sample(self.draws if targets else self.first, rng)
-        return experiments.numbers(u, self.setting, targets, run, index)
+        once = proposal.sample(self.draws, rng)
+        u = redraw_hardware(proposal, once, self.samples, rng)
+        return experiments.numbers(u, self.samples, self.setting, targets, run, index)
 
     def _check_best(self, best: xr.Dataset, run: Run) -> xr.Dataset:
         """Return the hardware's numbers of one draw in two engines, and its Fig. 6 over time."""
@@ -130,10 +140,20 @@ class PaperReading(TrialStudy[xr.Dataset]):
 paper_reading = call_of(PaperReading)
 
 
-def _joined(rounds: Sequence[xr.Dataset], proposals: Sequence[Proposal]) -> xr.Dataset:
-    """Return the draws of all rounds, with the log density of the mixture of their proposals."""
+def _joined(
+    rounds: Sequence[xr.Dataset], proposals: Sequence[Proposal], samples: int
+) -> xr.Dataset:
+    """Return the draws of all rounds, with the log density of the mixture of their proposals.
+
+    `simulation` (draw,) is the index of the simulation, which several draws share.
+    """
     results = xr.concat(rounds, "draw", data_vars="minimal")
     densities = [proposal.log_density(results.u.values) for proposal in proposals]
     mixture = np.logaddexp.reduce(densities, 0) - np.log(len(densities))
     likelihoods = printed.log_likelihoods(results.simulated, results.trials)
-    return results.assign(log_proposal=("draw", mixture), log_likelihood=likelihoods)
+    simulation = np.arange(results.sizes["draw"]) // samples
+    return results.assign(
+        log_proposal=("draw", mixture),
+        log_likelihood=likelihoods,
+        simulation=("draw", simulation),
+    )

@@ -11,6 +11,7 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
+from rps_jax.control.laws.aps import APSParams
 from rps_jax.control.laws.rps import RPSParams
 from rps_jax.world.domain import Range
 
@@ -39,6 +40,9 @@ UNKNOWNS: dict[str, Unknown] = {
     "counts_d": Unknown("text", "D counts", choices=("time in contact", "all the time")),
     "counts_time": Unknown("text", "time counts", choices=("from the start", "from contact")),
     "rear": Unknown("text", "corner of the load on the nonuniform box", choices=("near", "far")),
+    "aps_aim_beyond": Unknown("text", "APS: aim beyond the target, radii", Range(0.6, 1.2)),
+    "aps_r_robot": Unknown("text", "APS: radius of the robot", Range(0.29, 0.47), "m"),
+    "aps_min_motion": Unknown("text", "APS: least motion", Range(1e-4, 1e-2, log=True), "m"),
     "ground_box": Unknown("hardware", "friction box-ground", Range(0.1, 0.8)),
     "ground_cylinder": Unknown("hardware", "friction cylinder-ground", Range(0.1, 0.8)),
     "robot_box": Unknown("hardware", "friction box-robot", Range(0.15, 1.2)),
@@ -58,7 +62,7 @@ UNKNOWNS: dict[str, Unknown] = {
     "sim_gap": Unknown("simulation", "gap at the start", Range(0, 0.1), "m"),
 }
 NAMES = tuple(UNKNOWNS)
-OF_LAW = tuple(name for name in RPSParams._fields if name in UNKNOWNS)
+_OF_RPS = tuple(name for name in RPSParams._fields if name in UNKNOWNS)
 
 
 def values(u: np.ndarray, name: str) -> np.ndarray:
@@ -77,7 +81,23 @@ def texts(u: np.ndarray, name: str) -> list[str]:
 def params(u: np.ndarray) -> RPSParams:
     """Return the parameters of RPS (n,) under the readings at points u (n, q)."""
     known = {name: np.full(len(u), value) for name, value in RPSParams()._asdict().items()}
-    return RPSParams(**known | {name: values(u, name) for name in OF_LAW})
+    return RPSParams(**known | {name: values(u, name) for name in _OF_RPS})
+
+
+def aps_params(u: np.ndarray) -> APSParams:
+    """Return the parameters of APS (n,) under the readings at points u (n, q)."""
+    known = {name: np.full(len(u), value) for name, value in APSParams()._asdict().items()}
+    drawn = {name: values(u, f"aps_{name}") for name in known if f"aps_{name}" in UNKNOWNS}
+    return APSParams(**known | drawn)
+
+
+def redraw_hardware(
+    proposal: Proposal, u: np.ndarray, samples: int, rng: np.random.Generator
+) -> np.ndarray:
+    """Return each point u (n, q) several times, (n * samples, q), with its own hardware each."""
+    repeated = np.repeat(u, samples, 0)
+    is_hardware = [unknown.part == "hardware" for unknown in UNKNOWNS.values()]
+    return np.where(is_hardware, proposal.sample(len(repeated), rng), repeated)
 
 
 # --- proposals: densities in the unit cube ---------------------------------------------------
