@@ -45,6 +45,7 @@ from sweeps import render_tables
 T = TypeVar("T", covariant=True)
 Rows = list[list[str]]
 _PACKAGES = ("rps_jax", "jax", "mujoco", "mujoco-mjx")  # whose versions a data file has
+_NEW_LIMITS = ("slip_sideways", "slip_yaw")  # of robots, later than data files; absent if None
 # Removed options by question, with the values that all later runs have; digests still cover them.
 _REMOVED_OPTIONS: Mapping[str, Mapping[str, Any]] = {
     "ground": {"worlds": None},
@@ -357,14 +358,14 @@ def digest(commands: Sequence[Sequence[str]]) -> str:
 
 def _expanded(value: Any) -> Any:
     """Return a configuration with the values of its laws and domains after their names."""
-    if isinstance(value, dict):  # omit quantities that are not drawn, so that new ones are allowed
-        items = (item for item in value.items() if item[1] is not None or item[0] not in QUANTITIES)
+    if isinstance(value, dict):  # omit absent quantities, so that new ones are allowed
+        absent = {*QUANTITIES, *_NEW_LIMITS}
+        items = (item for item in value.items() if item[1] is not None or item[0] not in absent)
         return {key: _expanded(item) for key, item in items}
     if isinstance(value, list | tuple):
         return [_expanded(item) for item in value]
     if isinstance(value, str) and value in DOMAINS:
-        ranges = dataclasses.asdict(DOMAINS[value])
-        return [value, {name: item for name, item in ranges.items() if item is not None}]
+        return [value, _expanded(dataclasses.asdict(DOMAINS[value]))]
     if isinstance(value, str) and value in registry.LAWS:
         return [value, registry.params_to_json(registry.LAWS[value])]
     return value

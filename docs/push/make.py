@@ -148,7 +148,7 @@ def family_routines(family: str) -> list[Routine]:
         arguments = fields, trial.motion(state), ControlPeriod(twist, physics)
         batch = jax.tree.map(lambda x: jnp.asarray(x)[None], arguments)
         driven = jax.tree.map(lambda x: x[0], stage.drive(*batch))
-        return (trial.settle(previous, state, driven)._replace(**UNTRACED),)
+        return (trial.settle(world, previous, state, driven)._replace(**UNTRACED),)
 
     shape = _shapes(start._replace(**UNTRACED))
     twist = Twist(*(jnp.zeros(()),) * 3)
