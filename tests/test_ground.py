@@ -11,7 +11,9 @@ import xarray as xr
 from rps_jax.errors import InputError
 from rps_jax.geometry import solid
 from rps_jax.robot.shell import HALF_WIDTH
-from sweeps.ground import grounds, pushes, rigid
+from rps_jax.world import draws
+from rps_jax.world.domain import DOMAINS
+from sweeps.ground import grounds, pushes, rigid, straight
 from sweeps.ground.rigid import Pushed, Rounding
 
 MU, MU_ROBOT = 0.3, 0.35
@@ -212,3 +214,29 @@ def test_a_study_is_labelled_and_cached_and_refuses_other_options(tmp_path, monk
     assert [row[0] for row in rows] == [kind.what for kind in kinds.values()]
     with pytest.raises(InputError, match="run with other options"):
         grounds.run(("fast",), tmp_path, objects=("cylinder",), offsets=(0.05,))
+
+
+def test_prisms_face_the_base_with_a_side_before_their_middle():
+    drawn = draws.draw(DOMAINS["prisms"], 0, np.arange(40))
+    yaw = straight.yaw_of_side(drawn.solid.vertices)
+    c, s = np.cos(yaw)[:, None], np.sin(yaw)[:, None]
+    x, y = np.moveaxis(drawn.solid.vertices, -1, 0)
+    x, y = c * x - s * y, s * x + c * y
+    for row_x, row_y in zip(x, y, strict=True):
+        side = row_y[np.isclose(row_x, row_x.min(), atol=1e-9)]
+        assert side.min() < 0 < side.max()
+    np.testing.assert_allclose(
+        straight.yaw_of_side(blocks(0.1, [0.3, 0.05]).vertices), 0, atol=1e-12
+    )
+
+
+def test_straight_pushes_on_low_friction_need_mu_m_g():
+    results = straight.straight(kinds=("standard", "lower"), worlds=6)
+    assert dict(results.sizes) == {"kind": 2, "world": 6}
+    slippery = results.friction.values[0] < 0.4
+    assert slippery.any()
+    np.testing.assert_allclose(results.force.values[:, slippery], 1, atol=0.05)
+    assert (results.spread.values[:, slippery] < 0.05).all()
+    header, *rows = straight.table(results)
+    assert len(rows) == 2
+    assert len(header) == len(rows[0])
