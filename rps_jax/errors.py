@@ -12,6 +12,8 @@ from collections.abc import Iterable, Mapping, Sequence
 from types import ModuleType
 from typing import Any, cast
 
+import numpy as np
+
 
 class InputError(ValueError):
     """Invalid input: one sentence with the field, its value, the allowed values and the fix.
@@ -90,6 +92,34 @@ def check_vector(name: str, values: Iterable[object], **bounds: float | str) -> 
     return [
         check_finite(f"{name} {axis}", v, **bounds) for axis, v in zip("xy", values, strict=True)
     ]
+
+
+def check_array(
+    name: str, values: object, *shapes: tuple[int | str, ...], dtype: type = float
+) -> np.ndarray:
+    """Return finite numbers as an array of one of the shapes, where a letter is any length above 0.
+
+    Raises:
+      InputError: the values are no numbers, not finite, or of another shape.
+    """
+    texts = (str(shape).replace("'", "") for shape in shapes)
+    rule = f"it must be finite, of shape {' or '.join(texts)}"
+    try:
+        array = np.asarray(values, dtype)
+    except (TypeError, ValueError) as error:
+        raise not_allowed(name, repr(values), rule) from error
+    if not any(
+        len(shape) == array.ndim
+        and all(
+            m > 0 if isinstance(n, str) else n == m for n, m in zip(shape, array.shape, strict=True)
+        )
+        for shape in shapes
+    ):
+        raise not_allowed(name, f"of shape {array.shape}", rule)
+    for index in np.argwhere(~np.isfinite(array))[:1].tolist():
+        where = array.tolist() if array.size < 10 else f"{array[tuple(index)]} at index {index}"
+        raise not_allowed(name, where, rule)
+    return array
 
 
 def check_count(name: str, value: object, *, at_least: int = 1, at_most: int) -> int:

@@ -12,6 +12,7 @@ from helpers import refusal, rps, same
 
 import rps_jax
 from rps_jax.errors import InputError
+from rps_jax.geometry import solid
 from rps_jax.record import bag
 from rps_jax.robot.robot import Robot
 from rps_jax.robot.skin import with_contacts
@@ -96,7 +97,7 @@ def drive(delay=0, slip: Any = 0.0, blocked=0.0, noise=0.0, start=0.0, speed=0.1
     share = np.where(blocks, 0.0, 1 - np.array(slip))
     done = share * np.concatenate([np.zeros((delay, 3)), twist[: count - delay]])
     yaw = start + period * np.cumsum(done[:, 2])
-    velocity = logs._rotate(yaw, done)[:, :2]
+    velocity = solid.rotate(yaw, done)[:, :2]
     pose = np.column_stack([period * np.cumsum(velocity, 0), yaw]) + noise * rng.normal(
         size=(count, 3)
     )

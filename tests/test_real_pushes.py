@@ -1,20 +1,19 @@
-"""The study of real pushes: laws that its models obey, and its data."""
+"""The study of real pushes: its data, its models and its tables."""
 
 import json
 
 import numpy as np
+import pandas as pd
 import pytest
 import xarray as xr
 from helpers import ROOT
 
+from rps_jax.engines import fingers
 from rps_jax.errors import InputError
-from sweeps.real_pushes import contact, pushes, sliding, study
-from sweeps.real_pushes.pushes import COM, OUTLINE, turned
-from sweeps.real_pushes.sliding import Ground
-from sweeps.real_pushes.study import predict
+from rps_jax.geometry.solid import rotate
+from sweeps.real_pushes import contact, pushes, study
+from sweeps.real_pushes.pushes import COM, OUTLINE
 
-FEET = np.array([[0.03, 0.03], [0.09, 0.03], [0.03, 0.09]])
-GROUND = Ground((FEET - COM)[None], np.ones((1, 3)), np.zeros(1), np.zeros(1))
 STEPS = 30
 FOLDER = ROOT / "sweeps" / "real_pushes"
 
@@ -24,82 +23,6 @@ def sample():
     """Ten pushes of each kind."""
     whole = pushes.read()
     return whole.groupby("kind").head(10).reset_index(drop=True)
-
-
-def pushed(ways, pose=(0.0, 0.0, 0.0), friction=0.5):
-    """Return pose and force of one push by fingers (F, 2) [m] along a vector (2,) [m].
-
-    Fingers and vector are in the body's frame at the start.
-    """
-    start, way, pose = (np.array(x, float) for x in (*ways, pose))
-    if len(start) == 1:
-        start = np.concatenate([start, start + 100.0])
-    share = np.linspace(0, 1, STEPS + 1)[:, None, None]
-    path = turned(np.full((STEPS + 1, 2), pose[2]), start + share * way) + pose[:2]
-    result = sliding.push(OUTLINE, COM, GROUND, path[:, None], pose[None], np.array([friction]))
-    return result.pose[:, 0], result.force[:, 0]
-
-
-UPWARDS = ([[0.025, -0.001], [0.075, -0.001]], (0.0, 0.02))  # two fingers about the centroid's x
-
-
-@pytest.mark.parametrize("friction", [0.05, 0.5])
-def test_two_fingers_through_the_centre_of_friction_translate(friction):
-    """The feet bear a third each, and fingers at equal distances hold it straight."""
-    pose, force = pushed(UPWARDS, friction=friction)
-    assert pose[-1] == pytest.approx([0.0, 0.019, 0.0], abs=2e-5)
-    assert force[-1] == pytest.approx([0.0, 1.0], abs=2e-3)  # the friction mu m g
-
-
-def test_an_off_centre_finger_turns_the_object_with_less_than_its_weight():
-    pose, force = pushed(([[0.1, -0.001]], (0.0, 0.02)))
-    assert pose[-1, 2] > 0.05
-    assert 0.1 < np.linalg.norm(force[-1]) < 0.95
-
-
-def test_a_finger_stays_in_its_cone_and_outside():
-    mu, way = 0.3, ([[0.07, -0.002]], (0.02, 0.02))
-    pose, force = pushed(way, friction=mu)
-    along, across = (
-        np.sum(force * turned(pose[:-1, 2], np.array(axis)), 1) for axis in ([0.0, 1.0], [1.0, 0.0])
-    )
-    touching = along > 1e-6
-    assert touching.sum() > STEPS / 2
-    assert (np.abs(across[touching]) <= mu * along[touching] * (1 + 1e-6)).all()
-    assert across[touching][-1] == pytest.approx(mu * along[touching][-1], rel=0.01)  # it slides
-    p_object_finger = turned(-pose[-1, 2], np.array([0.09, 0.018]) - pose[-1, :2])
-    gap, _ = sliding.nearest(OUTLINE, p_object_finger)
-    assert abs(gap) < 3e-4
-
-
-SIDEWAYS = ([[0.1, -0.001]], (0.004, 0.02))
-
-
-def test_feet_move_with_the_pose():
-    """Moving and turning a push moves and turns its result."""
-    pose = (0.3, -0.2, 2.0)
-    first, second = (pushed(SIDEWAYS, pose=x)[0] for x in ((0, 0, 0), pose))
-    expected = turned(np.full(len(first), 2.0), first[:, :2]) + pose[:2]
-    np.testing.assert_allclose(second[:, :2], expected, atol=1e-6)
-    np.testing.assert_allclose(second[:, 2], first[:, 2] + 2.0, atol=1e-5)
-
-
-def test_feet_bear_the_weight_about_its_centre():
-    at = np.array([[[0.1, 0.0], [-0.1, 0.1], [-0.1, -0.1], [0.0, 0.02]]])
-    weight, centre = np.array([[1.0, 2.0, 1.0, 0.5]]), np.array([[0.01, 0.02]])
-    load = sliding.supported_load(at, weight, centre)
-    assert load.sum() == pytest.approx(1)
-    assert (load >= 0).all()
-    np.testing.assert_allclose(np.einsum("bs,bsi->bi", load, at), centre, atol=1e-12)
-
-
-def test_nearest_is_the_edge_or_the_corner():
-    points = np.array([[0.05, -0.01], [-0.03, -0.04], [0.1, 0.1], [0.05, 0.05]])
-    gap, normal = sliding.nearest(OUTLINE, points)
-    root = np.sqrt(0.5)
-    np.testing.assert_allclose(gap, [0.01, 0.05, 0.05 * root, -0.05 * root], atol=1e-12)
-    np.testing.assert_allclose(normal, [[0, -1], [-0.6, -0.8], [root, root], [root, root]],
-                               atol=1e-12)  # fmt: skip
 
 
 def test_the_data_agree_with_their_page():
@@ -126,8 +49,8 @@ def test_fingers_start_outside_and_end_at_the_pushed_object(sample):
     way = pushes.finger_paths(sample, STEPS)
     pre, post = pushes.initial_poses(sample), pushes.measured(sample)
     for pose, finger, low, high in ((pre, way[0], 2e-4, 5e-3), (post, way[-1], -2e-3, 6e-3)):
-        p_object_finger = turned(-pose[:, None, 2], finger - pose[:, None, :2])
-        gap = sliding.nearest(OUTLINE, p_object_finger)[0].min(axis=1)
+        p_object_finger = rotate(-pose[:, None, 2], finger - pose[:, None, :2])
+        gap = fingers.nearest(OUTLINE, p_object_finger)[0].min(axis=1)
         assert (gap > low).all()
         assert (gap < high).all()
 
@@ -136,8 +59,7 @@ def test_a_rigid_body_on_its_feet_is_nearest(sample):
     actual = pushes.measured(sample)
 
     def median(model):
-        prediction = predict(sample, model, steps=STEPS)
-        pose = np.stack([prediction[f"post_{name}"].values for name in pushes.POSE], axis=1)
+        pose = study.predict_all(sample, model, steps=STEPS).pose
         return float(np.median(pushes.errors_of(pose, actual).both))
 
     feet = median("rigid_feet")
@@ -148,47 +70,43 @@ def test_a_rigid_body_on_its_feet_is_nearest(sample):
 
 def test_mujoco_with_stiff_fingers_comes_near_the_rigid_body(sample):
     subset = sample[sample.support != pushes.FLAT].groupby("kind").head(2).reset_index(drop=True)
-    rigid = predict(subset, "rigid_feet")
-    soft = predict(subset, "mujoco_ours_stiff")
-    for name, near in (("x", 2e-3), ("y", 2e-3), ("yaw", 0.03)):
-        off = np.abs(rigid[f"post_{name}"] - soft[f"post_{name}"])
-        assert float(off.median()) < near
+    rigid, soft = (study.predict_all(subset, x).pose for x in ("rigid_feet", "mujoco_ours_stiff"))
+    assert (np.median(np.abs(rigid - soft), axis=0) < [2e-3, 2e-3, 0.03]).all()
     assert contact.KINDS["mujoco_ours"].scale == 4
 
 
-def test_a_prediction_accepts_files_and_datasets_without_final_poses(sample, tmp_path):
+def test_a_table_may_be_a_file_or_a_dataset_without_final_poses(sample, tmp_path):
     names = [name for name in sample if name.startswith(("post_", "gap", "force"))]
-    inputs, path = sample.drop(columns=names), tmp_path / "kept.csv"
+    inputs, path = sample.drop(columns=names), tmp_path / "pushes.csv"
     inputs.to_csv(path, index=False)
-    first = predict(sample, "ellipsoid", steps=10)
+    first = study.predict_all(sample, "ellipsoid", steps=10).pose
     for table in (path, str(path), inputs, inputs.to_xarray()):
-        again = predict(table, "ellipsoid", steps=10)
-        np.testing.assert_allclose(again.post_yaw, first.post_yaw, rtol=1e-12)
-    assert list(first.id.values) == list(sample.id)
+        again = study.predict_all(pushes.read(table), "ellipsoid", steps=10).pose
+        np.testing.assert_allclose(again, first, rtol=1e-12)
+    assert np.isnan(pushes.measured(pushes.read(path))).all()
 
 
 def test_an_invalid_table_is_refused(sample):
-    for table, model, message in (
-        (sample.drop(columns="edge"), "rigid_feet", "lack the column edge, which kind = two_point"),
-        (sample.assign(pre_yaw=np.nan), "rigid_feet", "pre_yaw = nan in row 0 is not allowed"),
-        (sample.assign(support="round"), "rigid_feet", "support = round is not allowed"),
-        (sample.assign(usable=0), "rigid_feet", "without a usable row"),
-        (sample, "rigid", "unknown model 'rigid'"),
+    for table, message in (
+        (sample.drop(columns="edge"), "lack the column edge, which kind = two_point"),
+        (sample.assign(pre_yaw=np.nan), "pre_yaw = nan in row 0 is not allowed"),
+        (sample.assign(support="round"), "support = round is not allowed"),
+        (sample.assign(usable=0), "without a usable row"),
     ):
         with pytest.raises(InputError, match=message):
-            predict(table, model)
+            pushes.read(table)
 
 
 def test_errors_by_hand():
     measured = np.array([0.0, 0.0, 0.0])
-    about = np.array([*(COM - turned(np.array(0.2), COM)), 0.2])  # turned about the centroid
+    about = np.array([*(COM - rotate(np.array(0.2), COM)), 0.2])  # turned about the centroid
     off = pushes.errors_of(np.stack([about, np.array([0.003, 0.004, 0.0])]), measured)
     np.testing.assert_allclose(off.place, [0, 5e-3], atol=1e-12)
     np.testing.assert_allclose(off.turn, [0.2, 0], atol=1e-12)
     # Over the area of the triangle, root of the mean square.
     grid = np.random.default_rng(0).random((200_000, 2))
     grid = 0.15 * grid[grid.sum(axis=1) < 1]
-    moved = turned(np.full(len(grid), 0.2), grid) + about[:2]
+    moved = rotate(np.full(len(grid), 0.2), grid) + about[:2]
     truth = np.sqrt(np.mean(np.sum((moved - grid) ** 2, axis=1)))
     assert off.both[0] == pytest.approx(truth, rel=0.01)
     assert off.both[1] == pytest.approx(5e-3)
@@ -201,7 +119,9 @@ def test_a_small_study_resumes_and_lists_every_model(tmp_path):
     results = question()
     again = question()
     assert results.drop_attrs().identical(again.drop_attrs())
-    assert set(study.tables(results)) == {"models", "mujoco", "friction", "layouts", "forces"}
+    assert set(study.tables(results)) == {
+        "models", "mujoco", "friction", "layouts", "series", "heading", "forces",
+    }  # fmt: skip
     ran = np.isfinite(results.predicted.sel(model="mujoco_ours")).all("pose")
     assert ran.any()
     assert not (results.fits & ran).any()
@@ -210,15 +130,88 @@ def test_a_small_study_resumes_and_lists_every_model(tmp_path):
     assert len(lines) == 1 + int(np.isfinite(results.both).sum())
 
 
+def validated(values, tried, layouts, series):
+    """Return errors of samples (tried, sample) [m] with the friction of other layouts."""
+    off = (("fitted", "tried", "sample"), np.asarray(values)[None])
+    count = len(layouts)
+    labels = {"support": list(layouts), "series": list(series), "finger": ["point"] * count,
+              "group": [study.GROUPS[0]] * count}  # fmt: skip
+    coordinates = {f"sample_{name}": ("sample", x) for name, x in labels.items()}
+    coordinates |= {"fitted": ["rigid_feet"], "tried": tried}
+    names = ("sample_place", "sample_turn", "sample_both")
+    return study._validated(xr.Dataset(dict.fromkeys(names, off), coordinates))
+
+
 def test_a_layout_is_judged_with_the_friction_of_the_others():
     """Layout a fits best with 0.2, layout b with 0.4; each is evaluated with both values."""
     both = np.repeat([[1.0, 4.0], [3.0, 2.0]], 3, axis=1) / 1e3  # [m] at 0.2 and 0.4
-    off = (("fitted", "tried", "few"), both[None])
-    labels = {"fitted": ["rigid_feet"], "tried": [0.2, 0.4], "few_support": ("few", list("aaabbb")),
-              "few_finger": ("few", ["point"] * 6)}  # fmt: skip
-    results = xr.Dataset({"few_both": off, "few_place": off, "few_turn": off}, labels)
-    judged = [(row[1], row[4], row[7][0], row[8]) for row in study._layout_rows(results)]
-    assert judged == [("a", 0.4, 3.0, 1.0), ("b", 0.2, 4.0, 2.0)]
+    rows = list(study._layout_rows(validated(both, [0.2, 0.4], "aaabbb", "aaabbb")))
+    assert [(row[1], row[4], row[5][0], row[-1]) for row in rows] == [
+        ("a", 0.4, 3.0, 1.0), ("b", 0.2, 4.0, 2.0),
+    ]  # fmt: skip
+
+
+def test_a_new_series_lies_in_its_interval():
+    """Seven series with lognormal medians predict the eighth in 95 % of the draws."""
+    rng = np.random.default_rng(0)
+    inside = []
+    for _ in range(400):
+        *known, new = np.exp(rng.normal(0.3, 0.5, (8, 4)))
+        low, high = np.transpose(study.new_interval(known))
+        inside.append((low < new) & (new < high))
+    assert 0.93 < np.mean(inside) < 0.97
+    assert study.new_interval(np.ones((2, 4))) == [None] * 4
+
+
+def test_the_interval_over_layouts_is_wider_than_that_over_pushes():
+    """Layouts whose errors differ more than those of their pushes."""
+    rng = np.random.default_rng(0)
+    off = np.exp(rng.normal(0, 0.1, 400) + np.repeat([0.0, 0.5, 0.1, 0.9], 100)) / 1e3
+    rows = validated(off[None], [0.4], np.repeat(list("abcd"), 100), np.repeat(list("efgh"), 100))
+    series = [[study._errors_in(x)] for _, x in rows.groupby("layout")]
+    drawn = [study._summary(x)[0] for x in study._resampled(series)]
+    low, high = np.quantile(drawn, [0.025, 0.975])
+    _, near_low, near_high = study.median_interval(rows.place.to_numpy())
+    assert high - low > 3 * (near_high - near_low)
+    assert low < rows.place.median() < high
+
+
+def test_repetitions_are_pushes_with_the_same_command(sample):
+    table = pushes.read()
+    action = pushes.actions(table)
+    assert (action >= 0).sum() == 119
+    assert set(table.kind[action >= 0]) == {"two_point_rotation"}
+    counts = pd.Series(action[action >= 0]).value_counts()
+    assert set(counts) == {2, 3}
+    rows = pushes.chosen(table, action == counts.index[0])
+    # The same motion from elsewhere is the same push.
+    initial = pushes.initial_poses(rows)
+    moved = np.column_stack([rotate(initial[:, 2], np.full((len(rows), 2), 0.01)), initial[:, 2]])
+    measured = np.column_stack([initial[:, :2], np.zeros(len(rows))]) + moved
+    results = xr.Dataset({
+        "initial": (("push", "pose"), initial),
+        "measured": (("push", "pose"), measured),
+        "action": ("push", np.zeros(len(rows), int)),
+    })  # fmt: skip
+    off, repeated = pushes.repetitions(results)
+    np.testing.assert_allclose(off, 0, atol=1e-12)
+    assert list(repeated) == list(range(len(rows)))
+
+
+INTERVALS = {
+    "point, three feet": {"place": 0.85, "turn": 0.35},
+    "two-point, three feet": {"place": 1.62, "turn": 0.74, "both, 90 %": 5.65},
+}  # [mm, degrees] errors of pushes that are not in the data
+
+
+def test_the_published_intervals_cover_pushes_outside_of_the_data():
+    data = json.loads((FOLDER / "results" / "real_pushes_series.json").read_text())
+    names = [column["name"] for column in data["columns"]]
+    rows = {row[0]: row for row in data["rows"] if row[1] == study.WORDS["rigid_feet"]}
+    for group, values in INTERVALS.items():
+        for name, value in values.items():
+            low, high = rows[group][names.index(name) + 1]
+            assert low < value < high
 
 
 def test_the_published_friction_is_that_of_predictions():

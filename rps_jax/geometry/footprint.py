@@ -9,6 +9,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from numpy.typing import ArrayLike
 
 from rps_jax import errors
 from rps_jax.geometry import planar
@@ -45,12 +46,15 @@ def polygon(vertices: np.ndarray | list) -> Footprint:
       >>> polygon([(0.2, 0.0), (-0.1, 0.2), (-0.1, -0.2)]).vertices.shape
       (3, 2)
     """
-    points = np.asarray(vertices, float)
-    if points.ndim != 2 or points.shape[0] < 3 or points.shape[1] != 2:
+    return Footprint(jnp.asarray(check_corners("vertices", vertices)), jnp.zeros(()))
+
+
+def check_corners(name: str, vertices: ArrayLike) -> np.ndarray:
+    """Return the corners (N, 2) [m] of a convex polygon, or raise InputError: see `polygon`."""
+    points = errors.check_array(name, vertices, ("N", 2))
+    if len(points) < 3:
         rule = "give three corners or more, each as x, y [m]"
-        raise errors.not_allowed("shape of vertices", points.shape, rule)
-    if not np.isfinite(points).all():
-        raise errors.not_allowed("vertices", points.tolist(), "they must be finite")
+        raise errors.not_allowed(name, points.tolist(), rule)
     edges = np.roll(points, -1, axis=0) - points
     following = np.roll(edges, -1, axis=0)
     turns = edges[:, 0] * following[:, 1] - edges[:, 1] * following[:, 0]
@@ -60,8 +64,8 @@ def polygon(vertices: np.ndarray | list) -> Footprint:
             "the outline must be strictly convex and counter-clockwise from above, without "
             "repeated corners; of a concave object, as an L, give the convex hull"
         )
-        raise errors.not_allowed("vertices", points.tolist(), rule)
-    return Footprint(jnp.asarray(points, float), jnp.zeros(()))
+        raise errors.not_allowed(name, points.tolist(), rule)
+    return points
 
 
 def place(footprint: Footprint, position: Float[Array, "2"], yaw: Scalar) -> Footprint:

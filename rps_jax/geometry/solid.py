@@ -6,11 +6,14 @@ precision, and their leading axis is n, the number of solids.
 """
 
 from collections.abc import Sequence
+from functools import partial
 from typing import NamedTuple
 
 import jax
 import numpy as np
+from numpy.typing import ArrayLike
 
+from rps_jax import errors
 from rps_jax.geometry import vectors
 
 GRAVITY = 9.81  # [m/s^2]
@@ -149,6 +152,13 @@ def extent(solid: Solid, yaw: np.ndarray) -> np.ndarray:
     return solid.radius - x.min(axis=1)
 
 
+def rotate(yaw: np.ndarray, vector: np.ndarray) -> np.ndarray:
+    """Turn the first two entries of vectors (..., k) by yaw (...) [rad]: see `planar.rotate`."""
+    c, s = np.cos(yaw), np.sin(yaw)
+    x, y = c * vector[..., 0] - s * vector[..., 1], s * vector[..., 0] + c * vector[..., 1]
+    return np.stack([x, y, *np.moveaxis(vector[..., 2:], -1, 0)], axis=-1)
+
+
 def axes(solid: Solid) -> np.ndarray:
     """Return rotation matrices (n, 3, 3) from principal axes to the object's frame."""
     return np.moveaxis(np.array(vectors.matrix(list(solid.q_object_body.T))), -1, 0)
@@ -162,19 +172,36 @@ def friction_arm(solid: Solid) -> np.ndarray:
     of a cylinder's rim, the first in the direction of the centre of mass.
     """
     at, share = support(solid)
-    com = solid.p_object_com[:, :2]
-    rows = np.concatenate([np.ones((*share.shape, 1)), at - com[:, None]], axis=-1)
-    bears = np.ones(share.shape, bool)
-    load = share
+    return mean_arm(at - solid.p_object_com[:, None, :2], share)
+
+
+def mean_arm(at: np.ndarray, weight: np.ndarray) -> np.ndarray:
+    """Return the mean distance (n,) [m] of the load from its centre: see `supported_load`."""
+    load = supported_load(at, weight, np.zeros((len(at), 2)))
+    return np.sum(load * np.linalg.norm(at, axis=-1), axis=1)
+
+
+def supported_load(at: np.ndarray, weight: np.ndarray, centre: np.ndarray) -> np.ndarray:
+    """Return loads (n, S) [1] of springs at (n, S, 2) [m] that only push.
+
+    Springs of stiffness `weight` (n, S) share the load, whose sum is 1 and whose centre is at (n,
+    2) [m]. If this is impossible, as for an object that tips over, their centre is the nearest
+    possible one in the least-squares sense.
+    """
+    scale = np.maximum(np.abs(at).max(axis=(1, 2), keepdims=True), 1e-9)
+    rows = np.concatenate([np.ones((*weight.shape, 1)), at / scale], axis=-1)
+    required = np.concatenate([np.ones((len(at), 1, 1)), centre[:, None] / scale], axis=-1)
+    bears, load = weight > 0, weight
     for _ in range(at.shape[1]):
-        weighted = rows * (bears * share)[..., None]
-        # Pressure is linear in position; its sum is 1, its centre the centre of mass.
-        pressure = np.linalg.pinv(weighted.swapaxes(1, 2) @ rows)[..., :1]
-        load = (weighted @ pressure)[..., 0]
+        weighted = rows * (weight * bears)[..., None]
+        # Pressure is linear in position.
+        inverse = np.linalg.pinv(weighted.swapaxes(1, 2) @ rows, rcond=1e-9)
+        load = (weighted @ inverse @ required.swapaxes(1, 2))[..., 0]
         if not np.any(load < 0):
             break
         bears &= load >= 0
-    return np.sum(load * np.linalg.norm(rows[..., 1:], axis=-1), axis=1)
+    load = np.maximum(load, 0)
+    return load / load.sum(axis=1, keepdims=True)
 
 
 def support(solid: Solid) -> tuple[np.ndarray, np.ndarray]:
@@ -191,6 +218,32 @@ def support(solid: Solid) -> tuple[np.ndarray, np.ndarray]:
     lean = np.arctan2(y, x)[:, None] + np.array([0, 2, 4]) * np.pi / 3
     rim = solid.radius[:, None, None] * np.stack([np.cos(lean), np.sin(lean)], axis=-1)
     return rim, np.ones(lean.shape)
+
+
+def check_feet(name: str, feet: ArrayLike, com: np.ndarray, at_most: int = 10_000) -> np.ndarray:
+    """Return feet (S, 3) [m, m, 1] from x, y and an optional weight, about a centre of mass (2,).
+
+    Raises:
+      InputError: there are too few or too many, a weight is not positive, or the object tips over.
+    """
+    points = errors.check_array(name, feet, ("S", 2), ("S", 3))
+    refuse = partial(errors.not_allowed, name, points.tolist())
+    if not 3 <= len(points) <= at_most:
+        raise refuse(f"give 3 to {at_most} rows of x, y [m] and, if you like, a weight")
+    if points.shape[1] == 2:
+        points = np.column_stack([points, np.ones(len(points))])
+    if (points[:, 2] <= 0).any():
+        raise refuse("weights must be positive")
+    if not np.all(encloses(points[:, :2], com)):
+        raise refuse("the centre of mass must be between them, or it tips over")
+    return points
+
+
+def encloses(points: np.ndarray, at: np.ndarray) -> np.ndarray:
+    """Return whether the hull of points (S, 2) encloses each of other points (..., 2)."""
+    bearing = np.linspace(0, 2 * np.pi, 360)
+    axes = np.stack([np.cos(bearing), np.sin(bearing)])
+    return ((points @ axes).max(axis=0) > at @ axes).all(axis=-1)
 
 
 def standing(solid: Solid) -> Solid:

@@ -205,14 +205,7 @@ class GymPushVector(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
     def act(self, actions: Any) -> np.ndarray:
         """Execute actions (num_envs, 3) in running trials; return the rewards (num_envs,)."""
         shape = (self.num_envs, self.push_env.action_size)
-        rule = f"it must be finite, of shape {shape}"
-        try:
-            array = np.asarray(actions, np.float32)
-        except (TypeError, ValueError) as error:
-            raise errors.not_allowed("action", repr(actions), rule) from error
-        if array.shape != shape or not np.isfinite(array).all():
-            value = array.tolist() if array.shape == shape else f"of shape {array.shape}"
-            raise errors.not_allowed("action", value, rule)
+        array = errors.check_array("action", actions, shape, dtype=np.float32)
         self._state, rewards = self._act(self.state, array)
         return np.asarray(rewards, float)
 

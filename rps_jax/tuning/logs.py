@@ -29,6 +29,7 @@ import xarray as xr
 
 from rps_jax.errors import InputError, check_name, not_allowed
 from rps_jax.geometry import planar
+from rps_jax.geometry.solid import rotate
 from rps_jax.record import bag, files
 from rps_jax.record.options import parse_names
 from rps_jax.record.table import Table, is_table
@@ -228,7 +229,7 @@ def motion_faults(time: np.ndarray, pose: np.ndarray, twist: np.ndarray) -> Iter
     """
     period = np.diff(time, append=time[-1])[:, None]
     span = min(len(time) - 1, max(1, round(_WINDOW / float(np.median(period)))))
-    worlds = (_rotate(yaw, twist) for yaw in (pose[:, 2], np.radians(pose[:, 2])))
+    worlds = (rotate(yaw, twist) for yaw in (pose[:, 2], np.radians(pose[:, 2])))
     integrals = (np.cumsum(x * period, axis=0) for x in (twist, *worlds))
     moved, size, path, path_by_deg = (_over(x[None], span)[0] for x in (pose, *integrals))
     for part, titles, units, commands, rates, least in (
@@ -343,11 +344,11 @@ def statistics(log: Log, interval: float) -> pd.DataFrame:
         put(name, _blocks(values, where))
     put("noise", _log(_jitter(np.concatenate([pose, log.twist], -1), valid)))
     # How well, and with which delay, the base follows the commands.
-    command, half = _rotate(pose[..., 2], log.twist), max(1, round(0.5 / interval))
+    command, half = rotate(pose[..., 2], log.twist), max(1, round(0.5 / interval))
     path = interval * np.cumsum(command, axis=1)
     for span in (half, 4 * half):
         angle, both = -pose[:, :-span, 2], valid[:, span:] & valid[:, :-span]
-        motion, expected, change = (_rotate(angle, _over(x, span)) for x in (pose, path, command))
+        motion, expected, change = (rotate(angle, _over(x, span)) for x in (pose, path, command))
         for axis in range(3):
             row = slice(axis, axis + 1)
             inputs = np.concatenate([expected[..., row], change[..., row]], -1)
@@ -373,10 +374,10 @@ def statistics(log: Log, interval: float) -> pd.DataFrame:
         distance = np.linalg.norm(pose_robot[..., :2] - contact, axis=-1, keepdims=True)
         spread = np.column_stack([_mean(distance, touch), _rms(distance, touch)])
         put("away", spread, "object_pose")
-        offset = _rotate(log.pose[..., 2], contact) + (log.pose - pose_world)[..., :2]
-        p_object_contact = _rotate(-pose_world[..., 2], offset)
+        offset = rotate(log.pose[..., 2], contact) + (log.pose - pose_world)[..., :2]
+        p_object_contact = rotate(-pose_world[..., 2], offset)
         put("on_it", _blocks(p_object_contact, touch), "object_pose")
-        velocity = _rotate(-log.pose[:, :-half, 2], _over(pose_world, half)) / 0.5
+        velocity = rotate(-log.pose[:, :-half, 2], _over(pose_world, half)) / 0.5
         arm = contact[:, :-half, 1:] - pose_robot[:, :-half, 1:2]
         inputs = np.concatenate([mean_twist, arm, mean_twist[..., :1] * arm], -1)
         put("moved", _regression(inputs, velocity, both), "object_pose")
@@ -403,16 +404,9 @@ def statistics(log: Log, interval: float) -> pd.DataFrame:
     return pd.DataFrame(columns)
 
 
-def _rotate(angle: np.ndarray, v: np.ndarray) -> np.ndarray:
-    """Rotate the first two entries of vectors (..., k) by angles (...)."""
-    c, s = np.cos(angle), np.sin(angle)
-    x, y = c * v[..., 0] - s * v[..., 1], s * v[..., 0] + c * v[..., 1]
-    return np.concatenate([np.stack([x, y], -1), v[..., 2:]], -1)
-
-
 def _relative(pose: np.ndarray, frame: np.ndarray) -> np.ndarray:
     """Return poses (..., 3) relative to frames (..., 3)."""
-    return _rotate(-frame[..., 2], pose - frame)
+    return rotate(-frame[..., 2], pose - frame)
 
 
 def _over(values: np.ndarray, span: int) -> np.ndarray:

@@ -6,7 +6,6 @@ use the upright solid over the footprint, in all engines.
 
 import math
 import os
-from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -156,7 +155,9 @@ def register_object(
     body = model.body("object")
     if feet is not None:
         family, vertices = "cylinder" if radius else "prism", solid.padded(vertices)
-        feet = _feet(label, np.asarray(feet, float), body.ipos[:2])
+        feet = solid.check_feet(f"{label}: feet", feet, body.ipos[:2], at_most=SIDES)
+        missing = np.repeat(feet[-1:] * [1, 1, 0], SIDES - len(feet), axis=0)
+        feet = np.concatenate([feet, missing])
     single = solid_of_body(body, vertices, radius, _height(label, model))
     REGISTERED[name] = Registered(path, single._replace(feet=feet))
     FAMILIES[name] = family
@@ -272,23 +273,6 @@ def _outline(label: str, footprint: Footprint) -> tuple[str, np.ndarray, float]:
     if len(vertices) == 4 and np.allclose(np.abs(vertices), half):
         return "box", solid.rectangles(*half[:, None])[0], 0.0
     return "prism", solid.padded(vertices), 0.0
-
-
-def _feet(label: str, feet: np.ndarray, com: np.ndarray) -> np.ndarray:
-    """Return feet (SIDES, 3) [m, m, 1]; missing ones have a weight of 0."""
-    if feet.ndim == 2 and feet.shape[1] == 2:
-        feet = np.column_stack([feet, np.ones(len(feet))])
-    refuse = partial(errors.not_allowed, f"{label}: feet", feet.tolist())
-    if feet.ndim != 2 or feet.shape[1] != 3 or not 3 <= len(feet) <= SIDES:
-        raise refuse(f"give 3 to {SIDES} rows of x, y [m] and, if you like, a weight")
-    if not np.isfinite(feet).all() or (feet[:, 2] <= 0).any():
-        raise refuse("all numbers must be finite, and weights positive")
-    bearing = np.linspace(0, 2 * np.pi, 360)
-    reach = (feet[:, :2] - com) @ np.stack([np.cos(bearing), np.sin(bearing)])
-    if reach.max(axis=0).min() <= 0:
-        raise refuse("the centre of mass must be between them, or it tips over")
-    missing = np.repeat(feet[-1:] * [1, 1, 0], SIDES - len(feet), axis=0)
-    return np.concatenate([feet, missing])
 
 
 def _points_of(model: mujoco.MjModel, geom_id: int) -> np.ndarray:

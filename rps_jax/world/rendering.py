@@ -110,7 +110,7 @@ class SceneRenderer:
 
         While the camera stands still, only the rectangle with moving bodies is drawn again.
         """
-        qpos = _checked("qpos", qpos, self.model.nq)
+        qpos = errors.check_array("qpos", qpos, (self.model.nq,))
         contact = np.array(p_world_contact, float)  # a copy: the trail keeps it
         self.data.qpos[:] = qpos
         self.mujoco.mj_kinematics(self.model, self.data)  # poses of the bodies, without dynamics
@@ -212,7 +212,7 @@ def open_renderers(
         for scene, p_world_target in tiles:
             model = scene.model
             errors.check_name("camera", camera, [model.camera(i).name for i in range(model.ncam)])
-            target = _checked("p_world_target", p_world_target, 2)
+            target = errors.check_array("p_world_target", p_world_target, (2,)).copy()
             limits = (model.vis.global_.offwidth, model.vis.global_.offheight)
             for n, limit in zip(size, limits, strict=True):
                 errors.check_finite("size", n, at_least=2, at_most=limit, unit="px")
@@ -220,14 +220,6 @@ def open_renderers(
                 renderers[id(model)] = stack.enter_context(_renderer(model, size))
             scene_renderers.append(SceneRenderer(renderers[id(model)], scene, camera, target))
         yield scene_renderers
-
-
-def _checked(name: str, values: ArrayLike, length: int) -> np.ndarray:
-    """Return a copy (length,) of finite values; InputError for others."""
-    array = np.array(values, float)
-    if array.shape != (length,) or not np.isfinite(array).all():
-        raise errors.not_allowed(name, array, f"it must be {length} finite numbers")
-    return array
 
 
 @functools.cache

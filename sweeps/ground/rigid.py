@@ -25,7 +25,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rps_jax.geometry.solid import Solid
+from rps_jax.geometry.solid import Solid, rotate
 from rps_jax.robot.shell import HALF_WIDTH
 
 _FAR = 1.0  # [m] gap of an impossible contact
@@ -116,7 +116,7 @@ def push(
         twist, force = solution.twist, solution.force
         # The centre of mass moves on a line, and the origin about it.
         p_object_com, yaw = pushed.solids.p_object_com[:, :2], pose[:, 2] + step * twist[:, 2]
-        arm = _turned(pose[:, 2], p_object_com) - _turned(yaw, p_object_com)
+        arm = rotate(pose[:, 2], p_object_com) - rotate(yaw, p_object_com)
         pose = np.column_stack([pose[:, :2] + step * (twist[:, :2] - u) + arm, yaw])
         poses.append(pose)
         solutions.append(solution)
@@ -170,11 +170,11 @@ def supports(solids: Solid, yaw: np.ndarray, pressure: np.ndarray) -> np.ndarray
     first of these is in the direction to which the centre of mass and the `pressure` (B, 2) [m],
     the moment of the push over the weight, move the load.
     """
-    com = _turned(yaw, solids.p_object_com[:, :2])
+    com = rotate(yaw, solids.p_object_com[:, :2])
     if solids.feet is not None:
-        return _turned(yaw[:, None], solids.feet[..., :2]) - com[:, None]
+        return rotate(yaw[:, None], solids.feet[..., :2]) - com[:, None]
     if solids.vertices.shape[1] > 1:
-        return _turned(yaw[:, None], solids.vertices) - com[:, None]
+        return rotate(yaw[:, None], solids.vertices) - com[:, None]
     x, y = (com + pressure).T
     angle = np.arctan2(y, x)[:, None] + np.array([0, 2, 4]) * np.pi / 3
     rim = solids.radius[:, None, None] * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
@@ -213,14 +213,14 @@ def contacts(solids: Solid, pose: np.ndarray) -> Contacts:
     They are corners of the object on the face, and the two ends of the face on sides of the object.
     """
     position, yaw = pose[:, None, :2], pose[:, 2]
-    centre = position + _turned(yaw, solids.p_object_com[:, :2])[:, None]
+    centre = position + rotate(yaw, solids.p_object_com[:, :2])[:, None]
     if solids.vertices.shape[1] == 1:
         nearest = np.zeros_like(position)
         nearest[..., 1] = np.clip(position[..., 1], -HALF_WIDTH, HALF_WIDTH)
         away = position - nearest
         far = np.linalg.norm(away, axis=-1)
         return Contacts(away / far[..., None], nearest - centre, far - solids.radius[:, None])
-    corners = position + _turned(yaw[:, None], solids.vertices)
+    corners = position + rotate(yaw[:, None], solids.vertices)
     ahead = np.broadcast_to([1.0, 0.0], corners.shape)
     gap = np.where(np.abs(corners[..., 1]) <= HALF_WIDTH, corners[..., 0], _FAR)
     edges = np.array([[0.0, -HALF_WIDTH], [0.0, HALF_WIDTH]])
@@ -337,13 +337,6 @@ def _derivatives(
         for close in (gap < 0, gap < _NEAR * problem.step)
     )
     return gradient, upper + held - bend, upper + near
-
-
-def _turned(yaw: np.ndarray, vector: np.ndarray) -> np.ndarray:
-    """Turn vectors (..., 2) by yaw (...) [rad]."""
-    c, s = np.cos(yaw)[..., None], np.sin(yaw)[..., None]
-    x, y = vector[..., :1], vector[..., 1:]
-    return np.concatenate([c * x - s * y, s * x + c * y], axis=-1)
 
 
 def _across(vector: np.ndarray) -> np.ndarray:

@@ -15,9 +15,10 @@ import mujoco
 import numpy as np
 import pandas as pd
 
+from rps_jax.engines import fingers
+from rps_jax.geometry.solid import rotate
 from rps_jax.world.physics import MUJOCO_GROUND, Physics, preset
 from sweeps.real_pushes import pushes
-from sweeps.real_pushes.sliding import turned
 
 _FINE = 400  # parts of a way, between which fingers go straight
 _SETTLE = 0.5  # [s] that the object stands before the push
@@ -103,11 +104,11 @@ def _push_once(
 def _ball_offsets(start: np.ndarray, path: np.ndarray) -> np.ndarray:
     """Return offsets (2, 2) [m] of the balls so that they touch where the points of a path do."""
     yaw = start[2]
-    path_in_body = turned(np.full(path.shape[:2], -yaw), path - start[:2])
-    gap, normal = pushes.sliding.nearest(pushes.OUTLINE, path_in_body)
+    path_in_body = rotate(np.full(path.shape[:2], -yaw), path - start[:2])
+    gap, normal = fingers.nearest(pushes.OUTLINE, path_in_body)
     first = np.argmax(gap <= 0, axis=0)
     first = np.where((gap <= 0).any(axis=0), first, gap.argmin(axis=0))
-    return _BALL * turned(np.full(2, yaw), normal[first, [0, 1]])
+    return _BALL * rotate(np.full(2, yaw), normal[first, [0, 1]])
 
 
 @functools.lru_cache(maxsize=64)

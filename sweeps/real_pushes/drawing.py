@@ -12,8 +12,8 @@ from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 
 from rps_jax.analysis.figures.style import Figure
+from rps_jax.geometry.solid import rotate
 from sweeps.real_pushes import pushes
-from sweeps.real_pushes.sliding import turned
 
 _SHARES = (0.1, 0.3, 0.5, 0.7, 0.9, 0.97)  # of all pushes, that are predicted better than the drawn
 _DRAWN = {
@@ -67,24 +67,28 @@ def figure(results: xr.Dataset, table: pd.DataFrame, words: Mapping[str, str]) -
         Line2D([], [], color="0.4", marker="o", ls="none", ms=4, label="feet, before"),
     ]
     above.legend(handles=lines, loc="outside lower center", ncols=5, fontsize=9)
-    names = [name for name in _DRAWN if name in results.model]
     for ax, finger in zip(below.subplots(1, 2), _FINGERS, strict=True):
         rows = judged & (results.finger.values == finger)
-        for name in names:
-            off = np.sort(1e3 * results.both.sel(model=name).values[rows])
-            off = off[np.isfinite(off)]
+        lines = [
+            (results.both.sel(model=name).values[rows], color, words[name])
+            for name, color in _DRAWN.items()
+            if name in results.model
+        ]
+        if finger == "two-point":
+            off = pushes.repetitions(results)[0].both
+            lines.append((off, "k", "a repetition of the push"))
+        for values, color, label in lines:
+            off = np.sort(1e3 * values[np.isfinite(values)])
             if off.size:
                 share = 100 * (np.arange(off.size) + 1) / off.size
-                ax.plot(off, share, color=_DRAWN[name], lw=1.6, label=words[name])
-        ax.axvspan(0.3, 0.8, color="0.93", lw=0)
+                ax.plot(off, share, color=color, lw=1.6, label=label)
         ax.set(xscale="log", xlim=(0.3, 60), ylim=(0, 100), ylabel="pushes that are nearer [%]")
         ax.set_xlabel("distance of the predicted from the measured end, over the whole body [mm]")
         ax.set_title(f"{finger} pushes on three feet")
         ax.set_xticks([0.3, 1, 3, 10, 30], ["0.3", "1", "3", "10", "30"])
         ax.grid(alpha=0.3)
-        ax.text(0.33, 93, "a push repeats\nno better", fontsize=8, va="top", color="0.4")
     handles, labels = below.axes[-1].get_legend_handles_labels()
-    below.legend(handles, labels, loc="outside lower center", ncols=len(labels), fontsize=9)
+    below.legend(handles, labels, loc="outside lower center", ncols=len(labels), fontsize=8)
     return picture
 
 
@@ -95,13 +99,13 @@ def _push(ax: Axes, push: xr.Dataset, row: pd.Series, path: np.ndarray) -> None:
     middle = fingers.mean(axis=1)
     at = middle[-1] - middle[0]
     turn = np.pi / 2 - np.arctan2(at[1], at[0])
-    origin = pre[:2] + turned(pre[2], pushes.COM)
+    origin = pre[:2] + rotate(pre[2], pushes.COM)
 
     def to_figure(points: np.ndarray) -> np.ndarray:
-        return 1e3 * turned(np.full(points.shape[:-1], turn), points - origin)
+        return 1e3 * rotate(np.full(points.shape[:-1], turn), points - origin)
 
     def outline(pose: np.ndarray, corners: np.ndarray = pushes.OUTLINE) -> np.ndarray:
-        return to_figure(pose[:2] + turned(np.full(len(corners), pose[2]), corners))
+        return to_figure(pose[:2] + rotate(np.full(len(corners), pose[2]), corners))
 
     for pose, style in zip((pre, push.measured, push.predicted), _STYLES, strict=True):
         shape = outline(np.asarray(pose))

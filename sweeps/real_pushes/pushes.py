@@ -15,9 +15,11 @@ import pandas as pd
 import xarray as xr
 
 from rps_jax import errors
+from rps_jax.engines import fingers
+from rps_jax.engines.fingers import Ground
 from rps_jax.errors import InputError
-from sweeps.real_pushes import sliding
-from sweeps.real_pushes.sliding import Ground, turned
+from rps_jax.geometry.solid import rotate
+from rps_jax.runs.predict_push import uniform_pressure
 
 PushTable = pd.DataFrame | xr.Dataset | Path | str
 DATA = Path(__file__).parent / "data"
@@ -32,7 +34,6 @@ FLAT = "patch"  # the support of a flat object
 UNKNOWN = "unknown_3pts"  # three feet at unknown positions; the default is assumed
 DEFAULT_FEET = "30_90_30_30_30_90"
 _ALONG = np.array([[1, 0], [-np.sqrt(0.5), np.sqrt(0.5)], [0, -1]])  # the edges 0, 1, 2
-_CELLS = 9  # of a flat object's grid, along each leg
 _FAR = 1e3  # [m] where a finger is that is not there
 POSE = ("x", "y", "yaw")
 _NEEDED = {
@@ -114,6 +115,11 @@ def kind_of_finger(table: pd.DataFrame) -> np.ndarray:
     return np.where(table.kind == "point", "point", "two-point")
 
 
+def edges(table: pd.DataFrame) -> np.ndarray:
+    """Return the pushed edges (n,); 0 where unknown."""
+    return np.asarray(table.edge.fillna(0), int) if "edge" in table else np.zeros(len(table), int)
+
+
 def chosen(table: pd.DataFrame, rows: np.ndarray) -> pd.DataFrame:
     """Return the rows of a table in a mask (n,)."""
     return table.iloc[np.flatnonzero(rows)].reset_index(drop=True)
@@ -125,6 +131,14 @@ def doubted(table: pd.DataFrame) -> np.ndarray:
     return np.asarray(noted | (table.support == UNKNOWN), bool)
 
 
+def actions(table: pd.DataFrame) -> np.ndarray:
+    """Return labels (n,) of turns that were repeated on the same feet; -1 for all other pushes."""
+    turns = (table.kind == "two_point_rotation") & (table.support != FLAT) & ~doubted(table)
+    keys = table.reindex(columns=["support", "surface", *_NEEDED["two_point_rotation"]]).round(4)
+    group = keys.groupby(list(keys), dropna=False)
+    return np.where(turns & (group.support.transform("size") > 1), group.ngroup(), -1)
+
+
 # --- support points -------------------------------------------------------------------------
 
 
@@ -132,11 +146,10 @@ def doubted(table: pd.DataFrame) -> np.ndarray:
 def feet_of(support: str) -> np.ndarray:
     """Return feet (S, 2) [m] of a support in the body frame; its name has all x in mm, then all y.
 
-    A flat object stands on a grid of points. Raises InputError for an invalid name.
+    A flat object stands on many points. Raises InputError for an invalid name.
     """
     if support == FLAT:
-        x, y = np.meshgrid(*[(np.arange(_CELLS) + 0.5) / _CELLS * 0.15] * 2)
-        return np.stack([x, y], axis=-1)[x + y < 0.15 - 1e-9]
+        return uniform_pressure(OUTLINE, COM)[:, :2]  # of equal areas
     words = (DEFAULT_FEET if support == UNKNOWN else support).split("_")
     try:
         x, y = np.array(words, float).reshape(2, -1) / 1000
@@ -149,10 +162,7 @@ def feet_of(support: str) -> np.ndarray:
 
 
 def grounds(table: pd.DataFrame, *, on: str) -> Ground:
-    """Return the support: its `feet`, the `corners` of its outline, or an `ellipsoid`.
-
-    The ellipsoid's c is the mean distance of the load from the centre of mass.
-    """
+    """Return the support: its `feet`, the `corners` of its outline, or an `ellipsoid`."""
     count = len(table)
     corners = [OUTLINE] * count
     feet = corners if on == "corners" else [feet_of(name) for name in table.support]
@@ -163,11 +173,8 @@ def grounds(table: pd.DataFrame, *, on: str) -> Ground:
     zero = np.zeros(count)
     surface = table.surface if "surface" in table else [""] * count
     shift = np.array([GROUND.get(name, GROUND["hardboard"]) * PUSHED_AT for name in surface])
-    if on == "ellipsoid":
-        load = sliding.supported_load(at, weight, np.zeros((count, 2)))
-        arm = np.sum(load * np.linalg.norm(at, axis=-1), axis=1)
-        return Ground(np.zeros((count, 1, 2)), np.ones((count, 1)), arm, zero)
-    return Ground(at, weight, zero, shift)
+    ground = Ground(at, weight, zero, shift)
+    return ground.ellipsoid() if on == "ellipsoid" else ground
 
 
 # --- paths of the fingers -------------------------------------------------------------------
@@ -185,14 +192,13 @@ def finger_paths(table: pd.DataFrame, steps: int) -> np.ndarray:
     width = np.full(len(table), 0.05)
     if "finger_width" in table:
         width = np.where(table.finger_width > 0, table.finger_width, width)
-    edge = np.asarray(table.edge.fillna(0), int) if "edge" in table else np.zeros(len(table), int)
-    along = _ALONG[edge]
+    along = _ALONG[edges(table)]
     inward = np.stack([-along[:, 1], along[:, 0]], axis=1)
     straight = kind != "two_point_rotation"
     if straight.any():
         tips = [np.asarray(table[[f"tip_x{i}", f"tip_y{i}"]], float)[straight] for i in (0, 1)]
         line = tips[0] + share * (tips[1] - tips[0])
-        half_width = turned(pre[straight, 2], along[straight]) * width[straight, None] / 2
+        half_width = rotate(pre[straight, 2], along[straight]) * width[straight, None] / 2
         double = (kind[straight] != "point")[:, None]
         paths[:, straight, 0] = line - np.where(double, half_width, 0)
         paths[:, straight, 1] = np.where(double, line + half_width, _FAR)
@@ -204,8 +210,8 @@ def finger_paths(table: pd.DataFrame, steps: int) -> np.ndarray:
         meet = meet - np.asarray(part.close, float)[:, None] * inward[turning]
         for i, sign in enumerate((-0.5, 0.5)):
             start = meet + sign * width[turning, None] * along[turning]
-            at = centre + turned(angle, np.broadcast_to(start - centre, (*angle.shape, 2)))
-            paths[:, turning, i] = pre[turning, :2] + turned(pre[turning, 2], at)
+            at = centre + rotate(angle, np.broadcast_to(start - centre, (*angle.shape, 2)))
+            paths[:, turning, i] = pre[turning, :2] + rotate(pre[turning, 2], at)
     return paths
 
 
@@ -227,7 +233,7 @@ def slide(table: pd.DataFrame, friction: np.ndarray, *, on: str, steps: int) -> 
         if rows.any():
             part = chosen(table, rows)
             inputs = finger_paths(part, steps), initial_poses(part), friction[rows]
-            motion = sliding.push(OUTLINE, COM, grounds(part, on=on), *inputs)
+            motion = fingers.push(OUTLINE, COM, grounds(part, on=on), *inputs)
             pose[rows], force[rows] = motion.pose[-1], motion.force[steps // 2 :].mean(axis=0)
     return Motion(pose, force)
 
@@ -235,8 +241,8 @@ def slide(table: pd.DataFrame, friction: np.ndarray, *, on: str, steps: int) -> 
 def with_pusher(table: pd.DataFrame, steps: int) -> np.ndarray:
     """Return poses (n, 3) of an object that moves with its pusher after the first contact."""
     pre, path = initial_poses(table), finger_paths(table, steps)
-    path_in_body = turned(-pre[:, None, 2], path - pre[:, None, :2])
-    gap = sliding.nearest(OUTLINE, path_in_body)[0].min(axis=2)
+    path_in_body = rotate(-pre[:, None, 2], path - pre[:, None, :2])
+    gap = fingers.nearest(OUTLINE, path_in_body)[0].min(axis=2)
     meets = gap <= 0
     first = np.where(meets.any(axis=0), meets.argmax(axis=0), gap.argmin(axis=0))
     start, end = path[first, np.arange(len(table))], path[-1]
@@ -246,7 +252,7 @@ def with_pusher(table: pd.DataFrame, steps: int) -> np.ndarray:
         for points in (start, end)
     ]
     turn = angle(directions[1] - directions[0])
-    moved = end[:, 0] + turned(turn, pre[:, :2] - start[:, 0])
+    moved = end[:, 0] + rotate(turn, pre[:, :2] - start[:, 0])
     return np.column_stack([moved, pre[:, 2] + turn])
 
 
@@ -270,6 +276,17 @@ def errors_of(predicted: np.ndarray, actual: np.ndarray) -> Errors:
     combined with the rotation times the radius of gyration, 50 mm.
     """
     turn = np.abs(angle(predicted[..., 2] - actual[..., 2]))
-    centre = [p[..., :2] + turned(p[..., 2], COM) for p in (predicted, actual)]
+    centre = [p[..., :2] + rotate(p[..., 2], COM) for p in (predicted, actual)]
     distance = np.linalg.norm(centre[0] - centre[1], axis=-1)
     return Errors(distance, turn, np.hypot(distance, 2 * GYRATION * np.sin(turn / 2)))
+
+
+def repetitions(results: xr.Dataset) -> tuple[Errors, np.ndarray]:
+    """Return the differences between repetitions of a push, and the repeated pushes (n,).
+
+    The differences are of the motions in the frame of the object before the push.
+    """
+    initial, action = results.initial.values, results.action.values
+    moved = rotate(-initial[:, 2], results.measured.values - initial)
+    first, second = np.nonzero(np.triu(action[:, None] == action, 1) & (action >= 0))
+    return errors_of(moved[first], moved[second]), np.unique([first, second])

@@ -5,15 +5,13 @@
 
 predicts where each push ends with several models, and tells how far that is from where it was
 measured. Friction at the fingers is fitted on one half of the pushes, and all are judged on the
-other. Pushes of a file in the same columns are all judged, with the friction of `FRICTION`.
-
-    from sweeps.real_pushes.study import predict
-    predict("pushes.csv", model="rigid_feet")
+other. Pushes of a file in the same columns are all judged, with the friction of `FRICTION`. In
+Python, `rps_jax.predict_push` predicts the motion of any known object.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
 from itertools import product
@@ -23,8 +21,8 @@ from typing import Any, ClassVar
 import numpy as np
 import pandas as pd
 import xarray as xr
+from scipy.stats import t as t_distribution
 
-from rps_jax import errors
 from rps_jax.analysis.report import Picture
 from rps_jax.record import files
 from rps_jax.record.options import option
@@ -57,53 +55,33 @@ GROUPS = (
     "two-point, flat",
     "two-point, support in doubt",
 )
+ON_FEET = (GROUPS[0], GROUPS[2], GROUPS[3])  # groups with layouts of feet
 _SHOWN = {  # models in the table; all of the others
     GROUPS[1]: FITTED,
     GROUPS[2]: ("rigid_feet",),
     GROUPS[4]: FITTED,
     GROUPS[5]: ("rigid_feet",),
 }
+EDGES = ("y = 0", "hypotenuse", "x = 0")
 _FRICTIONS = tuple(round(0.05 * i, 2) for i in range(2, 18))  # frictions at the fingers
 _FIT = 100  # pushes with one finger, and with two each, that friction is fitted on
+_SERIES = 10  # pushes at least of a series for the spread of series
 _TOGETHER = 320  # pushes that are predicted in one batch
 _DRAWS = 2000  # of the bootstrap
 _SPLIT = 2015  # seed of the halves
 
 
-def predict(
-    table: pushes.PushTable | None = None,
-    model: str = "rigid_feet",
-    *,
+def predict_all(
+    table: pd.DataFrame,
+    model: str,
     friction: Mapping[str, float] = FRICTION,
     steps: int = STEPS,
-) -> xr.Dataset:
-    """Predict the final poses of pushes.
-
-    Args:
-      table: a data frame, a dataset of one dimension, or the path of a CSV file, with the columns
-        of `data/pushes.csv` (measurements after a push are optional); by default the
-        pushes of this project.
-      model: name of the model.
-      friction: between finger(s) and object [1], by `point` and `two-point`.
-      steps: of the path of the fingers, except for MuJoCo.
-
-    Returns:
-      `post_x`, `post_y` [m] and `post_yaw` [rad] by `push`, with the coordinate `id`.
-
-    Raises:
-      InputError: the table cannot be read or is incomplete, or the model is unknown.
-    """
-    errors.check_name("model", model, WORDS)
-    read = pushes.read(table)
-    pose = _predicted(read, model, friction, steps).pose
-    data = {f"post_{name}": ("push", pose[:, i]) for i, name in enumerate(pushes.POSE)}
-    return xr.Dataset(data, {"id": ("push", _ids(read))}, {"model": model})
-
-
-def _predicted(
-    table: pd.DataFrame, model: str, friction: Mapping[str, float], steps: int = STEPS
 ) -> pushes.Motion:
-    """Return final poses and, for sliding models, mean forces."""
+    """Return the final poses of pushes and, of sliding models, their mean forces.
+
+    `friction` [1] is between finger(s) and object, by `point` and `two-point`; a path has `steps`,
+    except in MuJoCo.
+    """
     mu = np.array([friction[name] for name in pushes.kind_of_finger(table)], float)
     if model in SLIDING:
         return pushes.slide(table, mu, on=SLIDING[model], steps=steps)
@@ -208,10 +186,13 @@ class RealPushes(QuickStudy[xr.Dataset]):
             id=("push", _ids(table)),
             finger=("push", pushes.kind_of_finger(table).astype(str)),
             group=("push", groups_of(table)),
+            action=("push", pushes.actions(table)),
+            edge=("push", pushes.edges(table)),
             fits=("push", self.fits),
         )
         actual = pushes.measured(table)
         results["measured"] = (("push", "pose"), actual)
+        results["initial"] = (("push", "pose"), pushes.initial_poses(table))
         if {"force_wx", "force_wy", "surface"} <= set(table):
             results["surface"] = ("push", table.surface.fillna("").to_numpy(str))
             force = table[["force_wx", "force_wy"]].to_numpy()
@@ -225,45 +206,44 @@ class RealPushes(QuickStudy[xr.Dataset]):
         return results
 
     def _fitted(self, run: Run) -> xr.Dataset:
-        """Return the error of each friction on few pushes, and the best `friction`.
+        """Return the errors of each friction on samples, and the best `friction`.
 
-        The median error is `fit_error` [m] (fitted, finger_kind, tried). `_layout_rows` needs the
-        errors (fitted, tried, few) of pushes on each layout of feet.
+        A few pushes of one half determine the friction. Their median error is `fit_error` [m]
+        (fitted, finger_kind, tried). `_validated` needs the errors (fitted, tried, sample) of all
+        pushes on feet.
         """
-        whole, indices = self.table, np.arange(len(self.table))
+        whole = self.table
         finger, support = pushes.kind_of_finger(whole), np.asarray(whole.support)
         halves = self.fits & ~pushes.doubted(whole)
-        on_feet = np.isin(groups_of(whole), (GROUPS[0], GROUPS[3]))
-
-        def few(masks: Iterable[np.ndarray]) -> np.ndarray:
-            """Return whether a push is among the first few of a mask (n,), in random order."""
-            order = [np.random.default_rng(_SPLIT).permutation(np.flatnonzero(x)) for x in masks]
-            return np.isin(indices, np.concatenate([rows[:_FIT] for rows in order]))
-
-        of_finger = [finger == name for name in FINGERS]
-        fits = few(halves & mask for mask in of_finger)
-        laid = few(
-            on_feet & mask & (support == name)
-            for mask in of_finger
-            for name in dict.fromkeys(support)
-        )
-        table = pushes.chosen(whole, fits | laid)
+        group, fitted_on = groups_of(whole), np.zeros(len(whole), bool)
+        for name in FINGERS:
+            rows = np.flatnonzero(halves & (finger == name))
+            fitted_on[np.random.default_rng(_SPLIT).permutation(rows)[:_FIT]] = True
+        on_feet = np.isin(group, ON_FEET)
+        samples = fitted_on | on_feet
+        table = pushes.chosen(whole, samples)
         needed = {"rigid_feet", *self.models} if set(MUJOCOS) & set(self.models) else self.models
         fitted = [name for name in FITTED if name in needed]
         by_model = [run.checkpoint(f"fit_{x}", partial(self._tried, table, x)) for x in fitted]
+        series = whole.file if "file" in whole else pd.Series([""] * len(whole))
+        labels = {
+            "finger": finger.astype(str),
+            "group": group,
+            "support": np.where(on_feet, support, "").astype(str),
+            "series": series.to_numpy(str),
+        }
         off = xr.concat(by_model, "fitted").assign_coords(
             fitted=fitted,
-            few_finger=("few", pushes.kind_of_finger(table).astype(str)),
-            few_support=("few", np.where(laid, support, "")[fits | laid].astype(str)),
+            **{f"sample_{name}": ("sample", x[samples]) for name, x in labels.items()},
         )
-        rows = xr.DataArray(fits[fits | laid], dims="few")
-        by_finger = [off.few_both.where(rows & (off.few_finger == name)) for name in FINGERS]
+        rows = xr.DataArray(fitted_on[samples], dims="sample")
+        by_finger = [off.sample_both.where(rows & (off.sample_finger == x)) for x in FINGERS]
         kinds = xr.IndexVariable("finger_kind", list(FINGERS))
-        off["fit_error"] = xr.concat([values.median("few") for values in by_finger], kinds)
+        off["fit_error"] = xr.concat([values.median("sample") for values in by_finger], kinds)
         return off.assign(friction=off.fit_error.fillna(9.0).idxmin("tried"))
 
     def _tried(self, table: pd.DataFrame, model: str) -> xr.Dataset:
-        """Return errors (tried, few) of one model with all frictions."""
+        """Return errors (tried, sample) of one model with all frictions."""
         errors_of, count = [], len(table)
         for tried in (_FRICTIONS[i : i + 4] for i in range(0, len(_FRICTIONS), 4)):
             repeated = pd.concat([table] * len(tried), ignore_index=True)
@@ -272,7 +252,7 @@ class RealPushes(QuickStudy[xr.Dataset]):
             pose = pose.reshape(len(tried), count, 3)
             errors_of.append(pushes.errors_of(pose, pushes.measured(table)))
         off = Errors(*map(np.concatenate, zip(*errors_of, strict=True)))._asdict()
-        columns = {f"few_{name}": (("tried", "few"), values) for name, values in off.items()}
+        columns = {f"sample_{name}": (("tried", "sample"), values) for name, values in off.items()}
         return xr.Dataset(columns, {"tried": list(_FRICTIONS)})
 
     def _predict(self, model: str, friction: xr.Dataset | None) -> xr.Dataset:
@@ -288,7 +268,7 @@ class RealPushes(QuickStudy[xr.Dataset]):
             rows = np.flatnonzero(self._rows(model)[first : first + _TOGETHER]) + first
             if rows.size:
                 part = self.table.iloc[rows].reset_index(drop=True)
-                pose[rows], force[rows] = _predicted(part, model, chosen)
+                pose[rows], force[rows] = predict_all(part, model, chosen)
         return xr.Dataset(
             {"predicted": (("push", "pose"), pose), "force": (("push", "axis"), force)}
         )
@@ -360,11 +340,29 @@ _FRICTION_COLUMNS = [
 ]
 _LAYOUT_COLUMNS = [
     _PUSHES,
-    _column("feet that nothing was fitted on", merge=True),
+    _column("feet that nothing was fitted on"),
     *(_MODEL, _NUMBER),
     _column("friction, fitted on other feet", "{:.2f}"),
-    *_MEDIANS.values(),
+    *_COLUMNS[3:],
     _column("both, fitted on these feet", "{:.2f} mm"),
+]
+_NEW = "of a new series"
+_SERIES_COLUMNS = [
+    *(_PUSHES, _MODEL, _NUMBER),
+    _column("series", "{:d}"),
+    *(_MEDIANS["place"], _column(_NEW, "{:.2f}", " to {:.2f} mm")),
+    *(_MEDIANS["turn"], _column(_NEW, "{:.2f}", " to {:.2f}°")),
+    *(_MEDIANS["both"], _column(_NEW, "{:.2f}", " to {:.2f} mm")),
+    *(
+        _column("both, 90 %", "{:.1f} mm", " [{:.1f}, {:.1f}]"),
+        _column(_NEW, "{:.1f}", " to {:.1f} mm"),
+    ),
+]
+_HEADING_COLUMNS = [
+    *(_PUSHES, _column("pushed edge"), _NUMBER),
+    _column("predicted heading minus measured", "{:+.2f}°", " [{:+.2f}, {:+.2f}]"),
+    _column("turn", "{:.2f}°"),
+    _column("turn without the offset of all", "{:.2f}°"),
 ]
 _FORCE_COLUMNS = [
     _column("point pushes"),
@@ -384,7 +382,10 @@ def _row(label: str, model: str, off: Errors) -> list[Any]:
 
 
 def _rounded(cells: list[Any]) -> list[Any]:
-    return [[round(x, 3) for x in c] if isinstance(c, list) else round(float(c), 3) for c in cells]
+    return [
+        [round(float(x), 3) for x in c] if isinstance(c, list) else c and round(float(c), 3)
+        for c in cells
+    ]
 
 
 def _errors(results: xr.Dataset, model: str, rows: np.ndarray) -> Errors:
@@ -415,7 +416,11 @@ def tables(results: xr.Dataset) -> dict[str, Table]:
         published["mujoco"] = (_COLUMNS, rows((GROUPS[0], GROUPS[3]), shown, ran))
     if "friction" in results:
         published["friction"] = _FRICTION_COLUMNS, _friction_rows(results)
-        published["layouts"] = _LAYOUT_COLUMNS, _layout_rows(results)
+        validated = _validated(results)
+        published["series"] = _SERIES_COLUMNS, _series_rows(results, validated)
+        published["layouts"] = _LAYOUT_COLUMNS, _layout_rows(validated)
+    if "rigid_feet" in models:
+        published["heading"] = _HEADING_COLUMNS, _heading_rows(results)
     if "force_measured" in results and "rigid_feet" in models:
         published["forces"] = _FORCE_COLUMNS, _force_rows(results)
     by_name = {
@@ -440,22 +445,114 @@ def _friction_rows(results: xr.Dataset) -> Iterator[list[Any]]:
             yield [name, WORDS[model], *_rounded(cells)]
 
 
-def _layout_rows(results: xr.Dataset) -> Iterator[list[Any]]:
+def _validated(results: xr.Dataset) -> pd.DataFrame:
+    """Return errors [mm, degrees] of all pushes on feet, with the best friction for other feet.
+
+    `alone` is the error `both` with the best friction for the same feet.
+    """
+    group, support, finger, series = (
+        results[f"sample_{name}"].values for name in ("group", "support", "finger", "series")
+    )
+    frames = []
+    for name, layout in product(ON_FEET, dict.fromkeys(support)):
+        held_out = (group == name) & (support == layout)
+        rest = np.isin(group, (GROUPS[0], GROUPS[3])) & (support != layout)
+        rest &= finger == name.split(",")[0]
+        shown = _SHOWN.get(name, FITTED) if held_out.any() and rest.any() else ()
+        for model in (x for x in shown if x in results.fitted):
+            off = [results[f"sample_{x}"].sel(fitted=model).values for x in Errors._fields]
+            best, best_here = (
+                int(np.median(off[2][:, rows], axis=1).argmin()) for rows in (rest, held_out)
+            )
+            columns = dict(zip(Errors._fields, (x[best, held_out] for x in off), strict=True))
+            columns = {x: unit * columns[x] for x, unit in zip(columns, _UNITS, strict=True)}
+            columns |= {"group": name, "layout": layout, "model": model}
+            columns |= {"friction": float(results.tried[best]), "series": series[held_out]}
+            frames.append(pd.DataFrame(columns | {"alone": 1e3 * off[2][best_here, held_out]}))
+    return pd.concat(frames) if frames else pd.DataFrame(columns=["group", "layout", "model"])
+
+
+def _layout_rows(validated: pd.DataFrame) -> Iterator[list[Any]]:
     """Yield errors on each layout of feet, with the best friction for the other layouts."""
-    support, finger = results.few_support.values, results.few_finger.values
-    for name in FINGERS:
-        has_layout = (finger == name) & (support != "")
-        for layout in dict.fromkeys(support[has_layout]):
-            held_out, rest = has_layout & (support == layout), has_layout & (support != layout)
-            for model in map(str, results.fitted.values) if rest.any() else ():
-                off = [results[f"few_{x}"].sel(fitted=model).values for x in Errors._fields]
-                medians = (np.median(off[2][:, rows], axis=1) for rows in (rest, held_out))
-                best, best_here = (int(values.argmin()) for values in medians)
-                mu, alone = float(results.tried[best]), 1e3 * np.median(off[2][best_here, held_out])
-                cells = [[unit * x for x in median_interval(values[best, held_out])]
-                         for unit, values in zip(_UNITS, off, strict=True)]  # fmt: skip
-                head = [name, layout, WORDS[model], int(held_out.sum())]
-                yield [*head, *_rounded([mu, *cells, alone])]
+    for (group, layout, model), rows in validated.groupby(["group", "layout", "model"], sort=False):
+        cells = [float(rows.friction.iloc[0])]
+        for x in Errors._fields:
+            cells += [[*median_interval(rows[x].to_numpy())], rows[x].quantile(0.9)]
+        yield [group, layout, WORDS[model], len(rows), *_rounded([*cells, rows.alone.median()])]
+
+
+def _series_rows(results: xr.Dataset, validated: pd.DataFrame) -> Iterator[list[Any]]:
+    """Yield errors over all layouts, and the intervals in which those of a new series lie."""
+    validated = validated[validated.group != GROUPS[2]]
+    for (group, model), rows in validated.groupby(["group", "model"], sort=False):
+        series = [[_errors_in(x) for _, x in part.groupby("series")]
+                  for _, part in rows.groupby("layout")]  # fmt: skip
+        limits = np.quantile([_summary(x) for x in _resampled(series)], [0.025, 0.975], axis=0)
+        new = new_interval([_summary(x) for part in series for x in part if len(x) >= _SERIES])
+        cells: list[Any] = []
+        for value, interval, of_new in zip(_summary(_errors_in(rows)), limits.T, new, strict=True):
+            cells += [[value, *interval], of_new]
+        yield [group, WORDS[model], len(rows), sum(map(len, series)), *_rounded(cells)]
+    off, repeated = pushes.repetitions(results)
+    of_model = _errors(results, "rigid_feet", repeated) if "rigid_feet" in results.model else off
+    for name, values in (("a repetition of the push", off), (WORDS["rigid_feet"], of_model)):
+        if values.both.size:
+            rows = np.stack(values, axis=1) * _UNITS
+            resampled = [_summary(x) for x in _resampled([[rows]])]
+            limits = np.quantile(resampled, [0.025, 0.975], axis=0).T
+            cells = [[value, *x] for value, x in zip(_summary(rows), limits, strict=True)]
+            label = f"{GROUPS[3]}, repeated pushes"
+            with_blanks = [x for cell in cells for x in (cell, None)]
+            yield [label, name, len(rows), None, *_rounded(with_blanks)]
+
+
+def _errors_in(rows: pd.DataFrame) -> np.ndarray:
+    return rows[list(Errors._fields)].to_numpy()
+
+
+def _summary(off: np.ndarray) -> np.ndarray:
+    """Return the medians of errors (n, 3), and the 90 % quantile of the last one."""
+    return np.append(np.median(off, axis=0), np.quantile(off[:, 2], 0.9))
+
+
+def _resampled(series: Sequence[Sequence[np.ndarray]]) -> Iterator[np.ndarray]:
+    """Yield errors (n, 3) of drawn pushes of drawn series of drawn layouts: a cluster bootstrap."""
+    rng = np.random.default_rng(0)
+
+    def drawn(items: Sequence[Any]) -> list[Any]:
+        return [items[i] for i in rng.integers(len(items), size=len(items))]
+
+    for _ in range(_DRAWS):
+        parts = [x for part in drawn(series) for x in drawn(part)]
+        yield np.concatenate([x[rng.integers(len(x), size=len(x))] for x in parts])
+
+
+def new_interval(summaries: Sequence[np.ndarray]) -> list[list[float] | None]:
+    """Return 95 % prediction intervals [low, high] for a new series, of each number.
+
+    The logarithms of the numbers (K, n) of series are taken as normally distributed.
+    """
+    count = len(summaries)
+    if count < 3:
+        return [None] * 4
+    logs = np.log(summaries)
+    half = t_distribution.ppf(0.975, count - 1) * logs.std(axis=0, ddof=1) * np.sqrt(1 + 1 / count)
+    middle = logs.mean(axis=0)
+    return np.exp(np.stack([middle - half, middle + half], axis=1)).tolist()
+
+
+def _heading_rows(results: xr.Dataset) -> Iterator[list[Any]]:
+    """Yield the signed errors of the heading, which an offset of the measurement would share."""
+    predicted = results.predicted.sel(model="rigid_feet").values[:, 2]
+    measured = results.measured.values[:, 2]
+    off = np.degrees(pushes.angle(predicted - measured))
+    for name in (GROUPS[0], GROUPS[3]):
+        group = (results.group.values == name) & ~results.fits.values & np.isfinite(off)
+        for i, edge in enumerate(EDGES):
+            if (rows := group & (results.edge.values == i)).any():
+                without = np.median(np.abs(off[rows] - np.median(off[group])))
+                cells = [[*median_interval(off[rows])], np.median(np.abs(off[rows])), without]
+                yield [name, edge, int(rows.sum()), *_rounded(cells)]
 
 
 def _force_rows(results: xr.Dataset) -> Iterator[list[Any]]:
