@@ -96,8 +96,9 @@ PAIRS = [("box", "capacitive"), ("cylinder", "ideal"), ("prism", "ideal")]
 
 @pytest.mark.parametrize(("shape", "skin"), PAIRS)
 def test_a_control_step_is_the_processors(shape, skin, tmp_path):
-    """This holds for any combination of worlds in a warp."""
-    stage, inputs, loop, pushing = build_push(shape, skin)
+    """This holds for any combination of worlds in a warp. Wheels slip, by axis."""
+    slips = {"robot_slip_sideways": Range(0, 0.3), "robot_slip_yaw": Range(0, 0.5)}
+    stage, inputs, loop, pushing = build_push(shape, skin, **slips)
 
     def world_step(world, params, state):
         return trial.control_step(stage, world, params, state, loop, lambda f, *_: f)[0]

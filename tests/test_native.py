@@ -17,7 +17,7 @@ from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import ControlLoop
 from rps_jax.trials.worlds import drawn_worlds
 from rps_jax.world import draws
-from rps_jax.world.domain import DOMAINS
+from rps_jax.world.domain import DOMAINS, Range
 
 pytestmark = pytest.mark.skipif(native.target() is None, reason="there is no C compiler")
 
@@ -235,6 +235,17 @@ def test_the_loop_of_an_equation_is_compiled_as_a_whole(law, skin, request, monk
         monkeypatch.setattr(native, "_library", lambda text, name: b"")
         monkeypatch.setattr(native, "_register", lambda name, body: True)
     stage, inputs, loop = batch("box", skin, 2, law)
+    primitives = str(jax.make_jaxpr(advance(stage, loop, 3))(*inputs, start_trials(inputs, loop)))
+    assert "rps_native" in primitives
+    assert "while" not in primitives
+
+
+@pytest.mark.usefixtures("cache")
+def test_the_loop_of_a_base_with_slip_is_compiled_as_a_whole(monkeypatch):
+    monkeypatch.setattr(native, "_library", lambda text, name: b"")
+    monkeypatch.setattr(native, "_register", lambda name, body: True)
+    slips = dict.fromkeys(("robot_slip", "robot_slip_sideways", "robot_slip_yaw"), Range(0, 0.5))
+    stage, inputs, loop = batch("box", count=2, law="rps", domain="real", **slips)
     primitives = str(jax.make_jaxpr(advance(stage, loop, 3))(*inputs, start_trials(inputs, loop)))
     assert "rps_native" in primitives
     assert "while" not in primitives
