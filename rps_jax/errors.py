@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import difflib
 import importlib
+import itertools
 import math
 import numbers
 import re
@@ -97,25 +98,22 @@ def check_vector(name: str, values: Iterable[object], **bounds: float | str) -> 
 def check_array(
     name: str, values: object, *shapes: tuple[int | str, ...], dtype: type = float
 ) -> np.ndarray:
-    """Return finite numbers as an array of one of the shapes, where a letter is any length above 0.
+    """Return finite numbers as a new array of one of the shapes; a letter is any length above 0.
 
     Raises:
       InputError: the values are no numbers, not finite, or of another shape.
     """
     texts = (str(shape).replace("'", "") for shape in shapes)
-    rule = f"it must be finite, of shape {' or '.join(texts)}"
+    rule = f"it must be finite numbers of shape {' or '.join(texts)}"
     try:
-        array = np.asarray(values, dtype)
+        array = np.asarray(values)
+        array = array.astype(dtype, casting="unsafe" if array.dtype == object else "same_kind")
     except (TypeError, ValueError) as error:
         raise not_allowed(name, repr(values), rule) from error
-    if not any(
-        len(shape) == array.ndim
-        and all(
-            m > 0 if isinstance(n, str) else n == m for n, m in zip(shape, array.shape, strict=True)
-        )
-        for shape in shapes
-    ):
-        raise not_allowed(name, f"of shape {array.shape}", rule)
+    pairs = (itertools.zip_longest(shape, array.shape) for shape in shapes)
+    known = [tuple(m if isinstance(n, str) else n for n, m in pair) for pair in pairs]
+    if array.shape not in known or not array.size:
+        raise not_allowed(name, f"of shape {array.shape}" if array.ndim else values, rule)
     for index in np.argwhere(~np.isfinite(array))[:1].tolist():
         where = array.tolist() if array.size < 10 else f"{array[tuple(index)]} at index {index}"
         raise not_allowed(name, where, rule)

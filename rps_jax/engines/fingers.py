@@ -232,6 +232,6 @@ def _solve(step: _Step, twist: np.ndarray) -> np.ndarray:
         better = power[best] <= _power(part, twist)
         twists[rows] = np.where(better[:, None], tried[best], twist)
     raise InputError(
-        f"{rows.size} of {len(twist)} pushes have a step whose forces do not balance: change the "
-        "path or a friction slightly."
+        f"{rows.size} of {len(twists)} pushes have a step whose forces do not balance, as between "
+        "fingers that squeeze the object: change the path, or a friction slightly."
     )

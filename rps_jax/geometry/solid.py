@@ -147,9 +147,7 @@ def corners(solid: Solid) -> np.ndarray:
 
 def extent(solid: Solid, yaw: np.ndarray) -> np.ndarray:
     """Return the reach (n,) [m] towards -x of solids turned by `yaw` (n,) [rad]."""
-    c, s = np.cos(yaw)[:, None], np.sin(yaw)[:, None]
-    x = c * solid.vertices[..., 0] - s * solid.vertices[..., 1]
-    return solid.radius - x.min(axis=1)
+    return solid.radius - rotate(yaw[:, None], solid.vertices)[..., 0].min(axis=1)
 
 
 def rotate(yaw: np.ndarray, vector: np.ndarray) -> np.ndarray:
@@ -234,7 +232,8 @@ def check_feet(name: str, feet: ArrayLike, com: np.ndarray, at_most: int = 10_00
         points = np.column_stack([points, np.ones(len(points))])
     if (points[:, 2] <= 0).any():
         raise refuse("weights must be positive")
-    if not np.all(encloses(points[:, :2], com)):
+    in_line = np.linalg.matrix_rank(points[:, :2] - com) < 2
+    if in_line or not np.all(encloses(points[:, :2], com)):
         raise refuse("the centre of mass must be between them, or it tips over")
     return points
 

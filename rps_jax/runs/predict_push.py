@@ -132,6 +132,9 @@ def predict_push(
         friction_ground * mass * solid.GRAVITY * np.concatenate([np.zeros_like(means[:1]), means])
     )
     gaps = np.array([_gaps(corners, *at) for at in zip(poses, paths, strict=True)])
+    if gaps.min() < -_INSIDE * width:
+        rule = "fingers must not squeeze a rigid object: move one of them away"
+        raise errors.not_allowed("path", f"that ends {-gaps.min():.2g} m inside the object", rule)
     words = "force of the fingers on the object, mean since the previous time"
     columns = labelled(
         time=("time", times, "1" if time is None else "s", "time"),

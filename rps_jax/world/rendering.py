@@ -212,7 +212,7 @@ def open_renderers(
         for scene, p_world_target in tiles:
             model = scene.model
             errors.check_name("camera", camera, [model.camera(i).name for i in range(model.ncam)])
-            target = errors.check_array("p_world_target", p_world_target, (2,)).copy()
+            target = errors.check_array("p_world_target", p_world_target, (2,))
             limits = (model.vis.global_.offwidth, model.vis.global_.offheight)
             for n, limit in zip(size, limits, strict=True):
                 errors.check_finite("size", n, at_least=2, at_most=limit, unit="px")
