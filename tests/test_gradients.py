@@ -39,12 +39,16 @@ def some_worlds(key, n=32):
 
 
 smoothed = functools.partial(estimators.evolution, sigma=0.2, pairs=2)
-ESTIMATORS = {
+SLOPES = {
     "forward": lambda scores, _, worlds: estimators.forward(scores, THETA, worlds),
-    "reverse": lambda scores, _, worlds: gradients.reverse(scores, THETA, worlds),
+    "reverse": lambda scores, _, worlds: gradients.slopes(scores, THETA, worlds),
     "differences": lambda scores, _, w: estimators.differences(scores, THETA, w, step=0.1),
     "evolution": lambda scores, key, worlds: smoothed(scores, THETA, worlds, key),
 }
+ESTIMATORS = {
+    name: lambda *inputs, f=f: gradients.estimate(f(*inputs)) for name, f in SLOPES.items()
+}
+ESTIMATORS["reverse"] = lambda scores, _, worlds: gradients.reverse(scores, THETA, worlds)
 every_estimator = pytest.mark.parametrize("name", ESTIMATORS)
 
 
@@ -85,6 +89,7 @@ def test_all_but_evolution_are_the_derivatives_in_each_world():
     worlds = some_worlds(jax.random.key(2))
     slopes = STIFF * (THETA - worlds)  # (32, 3)
     for name in ("forward", "reverse", "differences"):
+        np.testing.assert_allclose(SLOPES[name](bowls, None, worlds), slopes, rtol=1e-4, atol=1e-5)
         estimate = found_by(name, bowls, None, worlds)
         np.testing.assert_allclose(estimate.gradient, slopes.mean(axis=0), rtol=1e-5)
         np.testing.assert_allclose(estimate.variance, slopes.var(axis=0, ddof=1) / 32, rtol=1e-4)
@@ -97,7 +102,8 @@ def test_evolution_has_the_gradient_of_the_smoothed_score():
 
     sigma = jnp.array([0.5, 0.1, 0.3])
     worlds, key = jnp.zeros(200_000), jax.random.key(3)
-    estimate = estimators.evolution(cubes, THETA, worlds, key, sigma=sigma, pairs=1)
+    slopes = estimators.evolution(cubes, THETA, worlds, key, sigma=sigma, pairs=1)
+    estimate = gradients.estimate(slopes)
     expected = 3 * THETA**2 + 3 * sigma**2
     assert (np.abs(estimate.gradient - expected) < 4 * np.sqrt(estimate.variance)).all()
     assert (estimate.variance < 0.05**2 * 9).all()

@@ -200,9 +200,11 @@ def test_rare_failures_have_rows_of_the_median_and_of_all_repetitions():
 
 def test_cosines_have_a_column_per_horizon():
     cosine = xr.DataArray([[0.5, -0.25]], dims=("estimator", "horizon"))
-    results = xr.Dataset({"cosine": cosine, "doubt": ("horizon", [0.1, 0.2])},
+    results = xr.Dataset({"cosine": cosine, "low": cosine - 0.4, "high": cosine + 0.4,
+                          "decided": cosine > 0, "doubt": ("horizon", [0.1, 0.2])},
                        {"estimator": ["forward"], "horizon": [2.0, 30.0]})  # fmt: skip
-    assert gradients.table(results)[1:] == [["forward", "", "0.50", "", "-0.25", "", ""]]
+    decided, undecided = "0.50 [0.10, 0.90]", "-0.25 [-0.65, 0.15], undecided"
+    assert gradients.table(results)[1:] == [["forward", "", decided, "", undecided, ""]]
 
 
 def test_dependencies_include_indirect_ones():

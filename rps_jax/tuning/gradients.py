@@ -54,8 +54,7 @@ def estimate(samples: jax.Array, clip: float = jnp.inf) -> Estimate:
     mean = jnp.sum(samples, axis=0) / jnp.maximum(count, 1)
     squares = jnp.sum(jnp.where(is_finite, (samples - mean) ** 2, 0.0), axis=0)
     variance = squares / jnp.maximum(count - 1, 1) / jnp.maximum(count, 1)
-    finite = jnp.mean(is_finite, axis=0, dtype=mean.dtype)
-    return Estimate(mean, jnp.where(count > 1, variance, jnp.inf), finite)
+    return Estimate(mean, jnp.where(count > 1, variance, jnp.inf), count / len(samples))
 
 
 def reverse(scores: Scores, theta: jax.Array, worlds: Any, *, clip: float = jnp.inf) -> Estimate:
@@ -64,9 +63,13 @@ def reverse(scores: Scores, theta: jax.Array, worlds: Any, *, clip: float = jnp.
     The cost is a few evaluations of the scores. `clip` is that of `estimate`. The worlds must step
     without a solver loop, as on the quasi-static model.
     """
-    thetas = per_world(theta, worlds)
-    slopes = jax.jacrev(lambda t: jnp.sum(scores(t, worlds), axis=0))(thetas)
-    return estimate(jnp.moveaxis(slopes, (-2, -1), (0, 1)), clip)
+    return estimate(slopes(scores, theta, worlds), clip)
+
+
+def slopes(scores: Scores, theta: jax.Array, worlds: Any) -> jax.Array:
+    """Return the gradient in each world (n, p, ...) by reverse-mode differentiation."""
+    jacobian = jax.jacrev(lambda thetas: jnp.sum(scores(thetas, worlds), axis=0))
+    return jnp.moveaxis(jacobian(per_world(theta, worlds)), (-2, -1), (0, 1))
 
 
 def per_world(theta: jax.Array, worlds: Any) -> jax.Array:

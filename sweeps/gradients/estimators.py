@@ -1,6 +1,7 @@
 """Gradient estimators of this study and of notebook 05, for comparison with reverse mode.
 
-`rps_jax.tuning.gradients` defines scores, `Estimate` and the estimator `reverse`.
+Each returns the gradient in each world (n, p, ...), as `rps_jax.tuning.gradients.slopes` does in
+reverse mode; `rps_jax.tuning.gradients.estimate` averages them.
 """
 
 from collections.abc import Callable, Sequence
@@ -16,15 +17,15 @@ from rps_jax.trials import pushes, trial
 from rps_jax.trials.case import Case
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import ControlLoop, Snapshot
-from rps_jax.tuning.gradients import Estimate, Scores, estimate, per_world, window
+from rps_jax.tuning.gradients import Estimate, Scores, per_world, window
 from rps_jax.world.physics import Physics
 
 
-def forward(scores: Scores, theta: jax.Array, worlds: Any, *, clip: float = jnp.inf) -> Estimate:
-    """Estimate the gradient by forward-mode differentiation in each world.
+def forward(scores: Scores, theta: jax.Array, worlds: Any) -> jax.Array:
+    """Return the gradients by forward-mode differentiation.
 
-    The cost is p evaluations of the scores. `clip` is that of `estimate`. Forward mode passes
-    through the solver loops of the fused engine and of MJX (with a pyramidal cone).
+    The cost is p evaluations of the scores. Forward mode passes through the solver loops of the
+    fused engine and of MJX (with a pyramidal cone).
     """
     thetas = per_world(theta, worlds)
 
@@ -32,13 +33,13 @@ def forward(scores: Scores, theta: jax.Array, worlds: Any, *, clip: float = jnp.
         tangents = jnp.broadcast_to(direction, thetas.shape)
         return jax.jvp(lambda t: scores(t, worlds), (thetas,), (tangents,))[1]
 
-    return estimate(jax.vmap(along, out_axes=1)(jnp.eye(theta.size, dtype=theta.dtype)), clip)
+    return jax.vmap(along, out_axes=1)(jnp.eye(theta.size, dtype=theta.dtype))
 
 
 def differences(
     scores: Scores, theta: jax.Array, worlds: Any, *, step: float | jax.Array
-) -> Estimate:
-    """Estimate the gradient by central differences in each world, from 2 p n scores.
+) -> jax.Array:
+    """Return the gradients by central differences, from 2 p n scores.
 
     The `step` is () or (p,), in the units of theta.
     """
@@ -48,7 +49,7 @@ def differences(
     values = scores(thetas, _repeat(worlds, 2 * p))
     rises = -jnp.diff(values.reshape(2, p, n, *values.shape[1:]), axis=0)[0]
     width = jnp.reshape(2 * jnp.asarray(step), (-1,) + (1,) * values.ndim)
-    return estimate(jnp.swapaxes(rises / width, 0, 1))
+    return jnp.swapaxes(rises / width, 0, 1)
 
 
 def evolution(
@@ -59,12 +60,12 @@ def evolution(
     *,
     sigma: float | jax.Array,
     pairs: int = 1,
-) -> Estimate:
-    """Estimate the gradient of the mean score, smoothed by `sigma`, by antithetic random steps.
+) -> jax.Array:
+    """Return the gradients of the score, smoothed by `sigma`, by antithetic random steps.
 
-    Each world tries `pairs` random normal directions and their opposites: 2 pairs n scores. The
-    estimate of the gradient of E[score(theta + sigma e)] is unbiased, and this gradient exists even
-    where scores jump. `sigma`, () or (p,), is in the units of theta.
+    Each world tries `pairs` random normal directions and their opposites: 2 pairs n scores. Their
+    mean is unbiased for the gradient of E[score(theta + sigma e)], which exists even where scores
+    jump. `sigma`, () or (p,), is in the units of theta.
 
     Reference: Nesterov and Spokoiny, "Random gradient-free minimization of convex functions",
     Foundations of Computational Mathematics 17, 2017.
@@ -76,7 +77,7 @@ def evolution(
     rises = -jnp.diff(values.reshape(2, pairs, n, 1, *values.shape[1:]), axis=0)[0]
     along = directions / (2 * sigma)
     slopes = rises * along.reshape(*along.shape, *(1,) * (values.ndim - 1))
-    return estimate(jnp.mean(slopes, axis=0))
+    return jnp.mean(slopes, axis=0)
 
 
 def combine(a: Estimate, b: Estimate) -> Estimate:
@@ -123,9 +124,8 @@ def distances(
       >>> space = Space(("K_h", "L"))
       >>> ahead = Case("box", "S1", (1.0, 1.0), skin=IdealSkin(temperature=0.001), gap=0.0)
       >>> scores, worlds = estimators.distances([ahead], space.params, [0.2, 0.4])
-      >>> estimate = estimators.forward(scores, space.vector(RPSParams.paper()), worlds)
-      >>> estimate.gradient.shape
-      (2, 2)
+      >>> estimators.forward(scores, space.vector(RPSParams.paper()), worlds).shape
+      (1, 2, 2)
     """
     part = pushes.build(cases, setting)
     law = registry.smooth_law(registry.law_of(cases[0].params))

@@ -2,7 +2,8 @@
 
 The score is the distance from contact to target after a time, averaged over random worlds of one
 object. The reference (`truth`) is the gradient of the original law and skin by central differences
-in thousands of worlds. An estimator that smooths scores is biased.
+in thousands of worlds. An estimator that smooths scores is biased. The results hold the gradient
+in each world, so that any other statistic needs no new run.
 
     rps sweeps/gradients --quick
 """
@@ -10,7 +11,7 @@ in thousands of worlds. An estimator that smooths scores is biased.
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, ClassVar
@@ -33,7 +34,7 @@ from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import World
 from rps_jax.trials.worlds import drawn_worlds
 from rps_jax.tuning.descent import soften_skins
-from rps_jax.tuning.gradients import Estimate, Scores, reverse
+from rps_jax.tuning.gradients import Scores, estimate, slopes
 from rps_jax.tuning.space import Space, expand_subsets
 from rps_jax.world import domain as domains
 from rps_jax.world import draws
@@ -42,17 +43,22 @@ from sweeps.gradients import estimators
 from sweeps.study_base import QuickStudy, Rows, Table
 
 TRUTH = "truth"
-HORIZONS = (0.5, 2.0, 8.0, 30.0, 100.0, 300.0)  # [s]
-# clipped is reverse with a bound on each world's gradient; combined, of reverse and evolution.
+HORIZONS = (0.5, 2.0, 8.0, 30.0, 100.0)  # [s]
 ESTIMATORS = ("reverse", "clipped", "forward", "evolution", "combined")
+# Estimators that are computed from the gradients of others in each world.
+_INPUTS = {"clipped": ("reverse",), "combined": ("reverse", "evolution")}
+_RESAMPLES = 1000  # of the bootstrap
+_INTERVAL = (0.05, 0.95)  # its quantiles
 
 
 @dataclass(frozen=True)
 class Gradients(QuickStudy[xr.Dataset]):
     """Compare gradient estimators with finite differences after several simulated times.
 
-    The answer has the cosine to finite differences (estimator, horizon), and the standard error of
-    these (horizon).
+    The answer has the `cosine` to finite differences (estimator, horizon) with the interval `low`
+    to `high` and whether it is `decided`, and the standard error `doubt` of the differences
+    (horizon). Variables named by a measurement are the gradients [m] in each world (world,
+    parameter, horizon); `truth` has other worlds.
     """
 
     TITLE: ClassVar[str] = "Gradients against finite differences"
@@ -76,11 +82,9 @@ class Gradients(QuickStudy[xr.Dataset]):
     """Parameters to differentiate by: names, or logistic, or full."""
     horizons: tuple[float, ...] = option(HORIZONS, 0.1, 300, unit="s")
     """Times at which the distance is measured [s]."""
-    worlds: int = option(64, 2, 1_000_000)
-    """Number of worlds of one estimate."""
-    repeats: int = option(4, 2, 1_000_000)
-    """Number of estimates, each in other worlds."""
-    truth: int = option(4096, 2, 1_000_000)
+    worlds: int = option(256, 2, 1_000_000)
+    """Number of worlds of an estimate."""
+    truth: int = option(2048, 2, 1_000_000)
     """Number of worlds of the finite differences."""
     delta: float = option(0.05, above=0, at_most=5)
     """Step of the central differences, in units of the bounded map [1]."""
@@ -114,30 +118,32 @@ class Gradients(QuickStudy[xr.Dataset]):
 
     @property
     def measurements(self) -> tuple[str, ...]:
-        """Names of all measurements in order: truth, the inputs of `combined`, and the rest."""
-        inputs = ("reverse", "evolution") if "combined" in self.estimators else ()
-        return tuple(dict.fromkeys((TRUTH, *inputs, *self.estimators)))
+        """Names of all measurements in order: truth, and what the estimators average."""
+        inputs = (name for x in self.estimators for name in _INPUTS.get(x, (x,)))
+        return tuple(dict.fromkeys((TRUTH, *inputs)))
 
     def num_trials(self) -> int | None:
         """Number of measurements."""
         return len(self.measurements)
 
     def answer(self, run: Run) -> xr.Dataset:
-        """Measure the truth and all estimators that the run folder lacks."""
-        estimates: dict[str, xr.Dataset] = {}
+        """Measure the gradients that the run folder lacks, and compare the estimators."""
+        parts: list[xr.Dataset] = []
         for name in self.measurements:
             set_phase(run.callback, name)
-            compute = partial(_measure, self, name, estimates)
-            estimates[name] = run.checkpoint(name, compute)
-            run.callback(Progress(len(estimates), 0.0))
-        return compare(estimates, self.estimators)
+            parts.append(run.checkpoint(name, partial(_measure, self, name)))
+            run.callback(Progress(len(parts), 0.0))
+        return compare(xr.merge(parts), self.estimators, self.clip)
 
     def intro(self, results: xr.Dataset) -> str:
         """Return the options in a sentence."""
         return (
             f"Gradients of the remaining distance by {', '.join(self.space.names)}, in worlds of "
             f"{self.object.replace('_', ' ')}; the truth are central differences in "
-            f"{self.truth:,} worlds."
+            f"{self.truth:,} worlds. An estimate is of {self.worlds:,} worlds. Brackets have the 5 "
+            "and 95 % quantiles of a bootstrap over the worlds of the estimate and of the truth. A "
+            "cosine is undecided if these have different signs, or if one world has more than half "
+            "of the gradient, of which a bootstrap cannot tell how rare it is."
         )
 
     def report_tables(self, results: xr.Dataset) -> Sequence[Table]:
@@ -171,84 +177,107 @@ def _distances(study: Gradients, stage: Any, physics: Any, smooth: bool) -> Scor
     return scores
 
 
-def truth(study: Gradients) -> Estimate:
-    """Return the central differences: gradient (p, H) [m] with its variance."""
-    stage, worlds, physics = _stage_and_worlds(study, study.engine, "test", study.truth)
-    scores = jax.jit(_distances(study, stage, physics, smooth=False))
-    return estimators.differences(scores, study.theta, worlds, step=study.delta)
-
-
-def repeats(study: Gradients, name: str) -> Iterator[Estimate]:
-    """Yield estimates (p, H) by one estimator, each in other worlds."""
-    engine: EngineName = "quasistatic" if name in ("reverse", "clipped") else study.engine
-    smooth = name != "evolution"
-    count = study.repeats * study.worlds
-    stage, worlds, physics = _stage_and_worlds(study, engine, "tune", count)
+def _measure(study: Gradients, name: str) -> xr.Dataset:
+    """Return the gradient in each world by one estimator, or of the truth."""
+    is_true, smooth = name == TRUTH, name not in (TRUTH, "evolution")
+    engine: EngineName = "quasistatic" if name == "reverse" else study.engine
+    split, count = ("test", study.truth) if is_true else ("tune", study.worlds)
+    stage, worlds, physics = _stage_and_worlds(study, engine, split, count)
     scores = _distances(study, stage, physics, smooth)
-    functions: dict[str, Callable[..., Estimate]] = {
-        "reverse": lambda worlds, key: reverse(scores, study.theta, worlds),
-        "clipped": lambda worlds, key: reverse(scores, study.theta, worlds, clip=study.clip),
-        "forward": lambda worlds, key: estimators.forward(scores, study.theta, worlds),
-        "evolution": partial(estimators.evolution, scores, study.theta, sigma=study.sigma),
+    key = jax.random.key(study.seed)
+    functions: dict[str, Callable[..., jax.Array]] = {
+        TRUTH: partial(estimators.differences, step=study.delta),
+        "reverse": slopes,
+        "forward": estimators.forward,
+        "evolution": partial(estimators.evolution, key=key, sigma=study.sigma),
     }
-    estimator = jax.jit(functions[name])
-    if smooth:
-        worlds = soften_skins(worlds)
-    for r in range(study.repeats):
-        rows = slice(r * study.worlds, (r + 1) * study.worlds)
-        key = jax.random.fold_in(jax.random.key(study.seed), r)
-        yield estimator(jax.tree.map(lambda leaf, rows=rows: leaf[rows], worlds), key)
-
-
-def _measure(study: Gradients, name: str, estimates: dict[str, xr.Dataset]) -> xr.Dataset:
-    """Return the repeated estimates of one estimator, or the truth."""
-    if name == "combined":
-        pair: Any = [
-            Estimate(*(jnp.asarray(estimates[n][f].values) for f in Estimate._fields))
-            for n in ("reverse", "evolution")
-        ]
-        leaves = jax.device_get(jax.vmap(estimators.combine)(*pair))
-    else:
-        all_of = [truth(study)] if name == TRUTH else repeats(study, name)
-        leaves = jax.tree.map(lambda *x: np.stack(x), *jax.device_get(list(all_of)))
-    dims = ("repeat", "parameter", "horizon")
+    samples = jax.jit(partial(functions[name], scores))
+    worlds = soften_skins(worlds) if smooth else worlds
+    dims = (f"{TRUTH}_world" if is_true else "world", "parameter", "horizon")
     return xr.Dataset(
-        {field: (dims, leaf) for field, leaf in leaves._asdict().items()},
+        {name: (dims, np.asarray(samples(study.theta, worlds)))},
         {"parameter": list(study.space.names), "horizon": ("horizon", list(study.horizons))},
     )
 
 
-def compare(estimates: Mapping[str, xr.Dataset], names: Sequence[str]) -> xr.Dataset:
-    """Return the comparison of estimators with the truth.
+def compare(samples: xr.Dataset, names: Sequence[str], clip: float) -> xr.Dataset:
+    """Return the gradients in each world with the comparison of estimators with the truth.
 
-    `cosine` (estimator, horizon) is that of an estimate and the truth, the mean over the repeats;
-    `doubt` (horizon) is the standard error of the truth, relative to its norm.
+    `cosine` (estimator, horizon) is that of an estimate and the truth. `low` and `high` are the
+    quantiles of `_INTERVAL` of a bootstrap over the worlds of the estimates, which all share, and
+    over those of the truth. It is `decided` if they have the same sign, and no world has more than
+    half of the sum of the norms: the bootstrap of a mean of such samples has no coverage. `doubt`
+    (horizon) is the standard error of the truth, relative to its norm.
     """
-    true = estimates[TRUTH].isel(repeat=0)
-    norm, cosines = _norm(true.gradient), []
-    for name in names:
-        gradient = estimates[name].gradient
-        product = (gradient * true.gradient).sum("parameter")
-        cosines.append((product / (_norm(gradient) * norm)).mean("repeat"))
-    cosine = xr.concat(cosines, xr.IndexVariable("estimator", list(names)))
-    doubt = np.sqrt(true.variance.sum("parameter")) / norm
-    return xr.Dataset({"cosine": cosine, "doubt": doubt})
+    gradients = {str(name): jnp.asarray(array.values) for name, array in samples.items()}
+    true, random = gradients.pop(TRUTH), np.random.default_rng(0)
+    sizes = [samples.sizes["world"], samples.sizes[f"{TRUTH}_world"]]
+    rows = [random.integers(n, size=(_RESAMPLES, n), dtype=np.int32) for n in sizes]
+    drawn = _cosines(tuple(names), gradients, true, clip, *rows)
+    whole = _cosines(tuple(names), gradients, true, clip, *(np.arange(n)[None] for n in sizes))
+    low, high = np.nanquantile(drawn, _INTERVAL, axis=0)
+    shares = {name: _largest_share(samples[name]) for name in gradients}
+    shared = np.stack([shares.get(name, 0 * low[0]) < 0.5 for name in names])
+    dims, of_truth = ("estimator", "horizon"), estimate(true)
+    doubt = jnp.sqrt(jnp.sum(of_truth.variance, axis=0) / jnp.sum(of_truth.gradient**2, axis=0))
+    return samples.assign(
+        cosine=(dims, np.asarray(whole[0])),
+        low=(dims, low),
+        high=(dims, high),
+        decided=(dims, shared & (low * high > 0)),
+        doubt=("horizon", np.asarray(doubt)),
+    ).assign_coords(estimator=list(names))
 
 
-def _norm(gradient: xr.DataArray) -> xr.DataArray:
-    return (gradient**2).sum("parameter") ** 0.5
+def _largest_share(gradient: xr.DataArray) -> np.ndarray:
+    """Return the share (H,) [1] of the largest norm in the sum of the norms of all worlds."""
+    finite = gradient.where(np.isfinite(gradient), 0.0).astype(float)
+    norm = (finite**2).sum("parameter") ** 0.5
+    return (norm.max("world") / norm.sum("world").clip(min=np.finfo(float).tiny)).values
+
+
+@partial(jax.jit, static_argnums=(0, 3))
+def _cosines(
+    names: tuple[str, ...],
+    gradients: Mapping[str, jax.Array],  # (n, p, H) in the worlds of the estimates
+    true: jax.Array,  # (m, p, H)
+    clip: float,
+    rows: jax.Array,  # (B, n) indices of worlds
+    true_rows: jax.Array,  # (B, m)
+) -> jax.Array:
+    """Return cosines (B, estimators, H) between estimates and the truth in selected worlds."""
+
+    def cosines(selected: tuple[jax.Array, jax.Array]) -> jax.Array:
+        drawn = {name: array[selected[0]] for name, array in gradients.items()}
+        estimates = {name: estimate(array) for name, array in drawn.items()}
+        if "clipped" in names:
+            estimates["clipped"] = estimate(drawn["reverse"], clip)
+        if "combined" in names:
+            estimates["combined"] = estimators.combine(estimates["reverse"], estimates["evolution"])
+        target = estimate(true[selected[1]]).gradient
+        stacked = jnp.stack([estimates[name].gradient for name in names])
+        stacked /= jnp.max(jnp.abs(stacked), axis=1, keepdims=True)  # no overflow of the squares
+        norms = jnp.sqrt(jnp.sum(stacked**2, axis=1) * jnp.sum(target**2, axis=0))
+        return jnp.sum(stacked * target, axis=1) / norms
+
+    return jax.lax.map(cosines, (rows, true_rows))
 
 
 def table(results: xr.Dataset) -> Rows:
     """Return a header and one row per estimator: its cosine with the true gradient, by horizon."""
     horizons = sorted({*HORIZONS, *results.horizon.values})
-    shown = results.reindex(horizon=horizons)
+    shown = results.reindex(horizon=horizons)  # missing ones are NaN
 
-    def cells(values: xr.DataArray) -> list[str]:
-        return ["" if np.isnan(value) else f"{value:.2f}" for value in values.values]
+    def cell(cosine: float, low: float, high: float, decided: bool) -> str:
+        word = "" if decided else ", undecided"
+        return "" if np.isnan(cosine) else f"{cosine:.2f} [{low:.2f}, {high:.2f}]{word}"
 
     rows = [["estimator", *(f"{horizon:g} s" for horizon in horizons)]]
-    rows += [[str(c.estimator.item()), *cells(c)] for c in shown.cosine.transpose("estimator", ...)]
+    for name in map(str, results.estimator.values):
+        row = shown.sel(estimator=name)
+        fields = (row[field].values for field in ("cosine", "low", "high", "decided"))
+        rows.append([name, *map(cell, *fields)])
     if results.sizes["horizon"] == len(horizons):
-        rows.append(["standard error of the truth, as a share of it", *cells(shown.doubt)])
+        doubt = ["" if np.isnan(value) else f"{value:.2f}" for value in shown.doubt.values]
+        rows.append(["standard error of the truth, as a share of it", *doubt])
     return rows

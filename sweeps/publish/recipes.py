@@ -75,7 +75,7 @@ _DESCENT = f"rps tune grad {_RACE} --starts 2 --worlds 512 --steps 20 --learning
 _RACERS = " ".join(f"rps,runs/{name}/tuned.json" for name in ("evolution", "gradient", "hybrid"))
 _RIVALS = ("rps", "pursuit", "dipole", "force_push", "force_push_published")
 _SWEPT = "sweep --laws rps_tuned --domain wide"
-_GRADIENTS = "rps sweeps/gradients --worlds 32 --estimators"
+_GRADIENTS = "rps sweeps/gradients --estimators"
 
 # In order of importance, which is the order of computation.
 RECIPES: dict[str, Recipe] = {
@@ -268,7 +268,7 @@ RECIPES: dict[str, Recipe] = {
         f"{_GRADIENTS} reverse clipped evolution combined",
         f"{_GRADIENTS} reverse clipped evolution combined --object random_cylinder",
         f"{_GRADIENTS} forward --horizons 0.5 2 8 30",
-        gpu=30,
+        cores=25,
         section="Estimators against the truth",
         labels=("boxes", "cylinders", "boxes"),
     ),
