@@ -1,5 +1,6 @@
 """Tests of the notebooks: they run, and the stored notebooks match their texts."""
 
+import ast
 import importlib.util
 import os
 import re
@@ -15,6 +16,7 @@ from helpers import addresses, imported
 
 import rps_jax
 from rps_jax.analysis import statistics
+from sweeps import render_tables
 
 FOLDER = Path(__file__).parents[1] / "notebooks"
 RUNNER = runpy.run_path(str(FOLDER / "execute.py"))
@@ -135,6 +137,22 @@ def test_the_sentences_on_influence_are_computed():
     for text in constants:  # of definitions, and of another study
         prose = prose.replace(text, "")
     assert not re.search(r"\d|\b(one|two|three|four|five|six|ten) (of|drawn|most|worlds)\b", prose)
+
+
+def test_notebooks_show_the_cells_of_tables_that_they_cite():
+    """Their texts cite no table by a copied number."""
+    cited = []
+    for name in TEXTS:
+        for cell in stored(name).cells:
+            if cell.cell_type == "code" and re.search(r"render_tables\.(cell|load)\(", cell.source):
+                (output,) = cell.outputs
+                names = {"render_tables": render_tables, "Markdown": str}
+                *lines, last = ast.parse(cell.source).body
+                exec(compile(ast.Module(lines, []), name, "exec"), names)
+                expected = eval(compile(ast.Expression(last.value), name, "eval"), names)
+                assert output.data["text/markdown"] == expected
+                cited.append(name)
+    assert cited == ["03_paper", "05_tuning", "05_tuning"]
 
 
 def test_training_by_stable_baselines3_as_the_tutorial_shows_it(tmp_path):
