@@ -135,9 +135,10 @@ def caption(name: str, data: dict[str, Any], link: str) -> str:
         notes = [f"{', '.join(of)}: computed before {change}" for change, of in sources.items()]
         last = f"Every number is cited: [from which table]({link})"
     else:
-        version, commit = data["versions"]["rps_jax"], (data["commit"] or "")[:7]
-        at = f" at commit {commit}" if commit else ""
-        notes = [f"Computed by {version}{at}, before {STALE[name]}"] if name in STALE else []
+        notes = []
+        if name in STALE:
+            at = f" at commit {data['commit'][:7]}" if data["commit"] else ""
+            notes = [f"Computed by {data['versions']['rps_jax']}{at}, before {STALE[name]}"]
         parts = [f"Device: {data['device']}"] if data["device"] else []
         parts += [f"date: {data['date']}"] if data["date"] else []
         last = "; ".join([*parts, f"[command, versions and values]({link})"])
