@@ -59,9 +59,9 @@ drawing.twist_field(sets, 2.0)
 #
 # - The arrows depend on $l$ alone, the colour on both. The law has two tasks, to keep the contact
 #   and to turn to the target. They share the base without a switch.
-# - With the contact at the centre the base turns at its maximum rate from a few degrees of error
-#   on: the pale band is narrow. With a large offset it needs about 50 degrees, since Eq. 6 turns
-#   in proportion to $v_x$, of which a tenth is left.
+# - With the contact at the centre the base turns at its maximum rate from 31 degrees of error on,
+#   where $\tan\gamma = \omega_{max} L / v_{max}$ = 0.6. With a large offset it needs about 80
+#   degrees, since Eq. 6 turns in proportion to $v_x$, of which a tenth is left.
 # - Beyond $l_{cr}$, the dashed lines in the upper row, the base does not turn: it first brings
 #   the contact back.
 # - Inside the Realignment State, beyond the dashed lines in the lower row, turning returns

@@ -107,8 +107,8 @@ Markdown(f"{count} of {len(rows)} interpretations give 144 of 144.")
 #   $\pm 1.56$ rad, and `inf` gives the tangent as printed (`gamma_max`).
 # - The end of the middle region is 0.15 m (`l_mr`).
 # - The adaptive rate while realigning is 10, the value of $\eta$ (`a_r_max`).
-# - The order of saturation: $\omega$ follows from the unsaturated velocities and is then clipped;
-#   $(v_x, v_y)$ is scaled as a vector (`saturate_first`, `clip_each`).
+# - The order of saturation: $(v_x, v_y)$ is scaled as a vector, and $\omega$ follows from the
+#   scaled velocities and is then clipped (`saturate_first`, `clip_each`).
 # - sgn(0) is 0 (`sgn_0`).
 # - A heading error of exactly $\pi$ is wrapped to $-\pi$, so the robot turns right
 #   (`planar.wrap`).

@@ -82,6 +82,11 @@ class Condition:
             return False
         return True
 
+    def is_default(self, laws: Sequence[str]) -> bool:
+        """Return whether it changes only parameters, to values that all laws have already."""
+        unchanged = (self._changed(registry.LAWS[x]) == registry.LAWS[x] for x in laws)
+        return bool(self.params) and not self.case and all(unchanged)
+
     def _changed(self, params: LawParams) -> LawParams:
         """Return changed parameters of RPS or of a law that contains RPS; others unchanged."""
         if isinstance(params, RPSParams):

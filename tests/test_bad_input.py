@@ -48,7 +48,12 @@ DOMAIN_FILES = {
     "keys": ({"objects": {"random_box": 1}}, "names, as .*random_box"),
     "twice": ({"objects": ["random_box"] * 2}, "objects = .* is not allowed: name each once"),
 }
-PARAMS_FILES = {"L": {"L": -1}, "L_word": {"L": "x"}, "good": {"L": 0.3}}
+PARAMS_FILES = {
+    "L": {"L": -1, "saturate_first": 1},
+    "L_word": {"L": "x"},
+    "good": {"L": 0.3, "saturate_first": 1},
+    "old": {"L": 0.3},
+}
 # Changes that corrupt the manifest of a run, with patterns of the reason, and those of versions.
 WORD = registry.params_to_json(RPSParams.paper()) | {"L": "x"}
 CORRUPT = {
@@ -159,6 +164,8 @@ COMMANDS = {
         "--laws npss": "unknown law 'npss': .*did you mean 'nps'",
         "--laws rps,L.json": "L = -1.0 is not allowed",
         "--laws rps,L_word.json": "rps L = x is not allowed: it must be a number",
+        "--laws rps,old.json": "the file omits saturate_first, whose default was 0 in version 0.3",
+        "--laws nps,old.json": "append ,saturate_first=0 or ,saturate_first=1",
         "--laws rps,list.json": "list.json is no JSON object .it holds no names with values",
         "--laws rps,.": "law = rps,. is not allowed: write changes as name=value or file.json",
         "--laws rps,good.json rps,good.json": "laws = .* is not allowed: name each once",

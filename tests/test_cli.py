@@ -266,7 +266,7 @@ def test_files_of_equal_names_are_distinguished_by_their_folders(tmp_path):
     for folder, gain in {"es": 0.3, "grad": 0.4}.items():
         path = tmp_path / folder / "tuned.json"
         path.parent.mkdir()
-        path.write_text(json.dumps({"K_h": gain}))
+        path.write_text(json.dumps({"K_h": gain, "saturate_first": 1}))
         texts.append(f"rps,{path}")
     assert list(registry.resolve_laws(["rps", texts[0]])) == ["rps", "rps,tuned"]
     assert list(registry.resolve_laws(["rps", *texts])) == ["rps", *texts]

@@ -122,5 +122,10 @@ def test_the_command_line_and_a_run_of_another_kind(tmp_path, capsys):
     assert (curve.finite[:2] == 1.0).all()
     assert np.isfinite(curve[["gradient", "gradient_error"]][:2]).all(axis=None)
     assert curve["params.L"][1] != curve["params.L"][0] or curve.gradient[0] == 0
-    assert set(json.loads((tmp_path / "tuned.json").read_text())) == {"L", "K_h", "v_lost"}
+    assert set(json.loads((tmp_path / "tuned.json").read_text())) == {
+        "L",
+        "K_h",
+        "v_lost",
+        "saturate_first",
+    }
     assert "steps = 2 there, 3 asked for" in refusal(capsys, f"{RUN} --steps 3 --out", tmp_path)

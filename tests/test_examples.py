@@ -444,7 +444,7 @@ def test_suffixes_of_files_have_any_case(tmp_path, registries):
     (tmp_path / "D.JSON").write_text('{"mass": [7.0, 8.0]}')
     assert parse_domain(str(tmp_path / "D.JSON")).mass[:2] == (7.0, 8.0)
     (tmp_path / "L.JSON").write_text('{"K_h": 0.25}')
-    assert registry.parse_law(f"rps,{tmp_path}/L.JSON")[1].K_h == 0.25
+    assert registry.parse_law(f"rps_tuned,{tmp_path}/L.JSON")[1].K_h == 0.25
     (tmp_path / "LAW.PY").write_text((EXAMPLES / "custom_law.py").read_text())
     (tmp_path / "P.NPZ").write_bytes(next(iter(policy.SHIPPED.values())).read_bytes())
     for text in ("LAW.PY", "LAW.PY:PParams", "P.NPZ"):

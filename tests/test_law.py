@@ -29,7 +29,7 @@ FRONT = 0.3625  # [m] x of a contact on the front face
 PERIOD = 0.02  # [s] of the control loop
 FREE = {"v_max": 1e6, "omega_max": 1e6}  # shows the equations before saturation
 UNBOUNDED = PAPER._replace(**FREE)
-SCALED, CLIPPED = {"saturate_first": 1.0}, {"clip_each": 1.0}
+UNSATURATED, CLIPPED = {"saturate_first": 0.0}, {"clip_each": 1.0}
 SIGNED, LOST = {"zeta": 3.0, "sgn_0": 1.0}, {"v_lost": 0.05, "keep_contact": 1.0}
 
 details_of = jax.jit(rps.step_with_details)
@@ -96,6 +96,7 @@ def test_the_defaults_are_the_papers_values_of_section_iii_a():
     assert PAPER.a_r_max == PAPER.eta
     assert 1.5 < PAPER.gamma_max < math.pi / 2
     assert RPSParams.nps() == PAPER._replace(reactive=0.0)
+    assert RPSParams.unsaturated() == PAPER._replace(**UNSATURATED)
     state = RPSState.init(PAPER._replace(l_cr=0.2))
     assert (state.l_th, state.touched) == (jnp.float32(0.2), False)
 
@@ -221,6 +222,7 @@ UNREACHABLE = [
     for p in np.float32([[3.4e38, 0.0], [1e30, 0.0], [3.4e38, 3.4e38]])
 ]
 SATURATED = (0.00980581, 0.0490290)  # v = (0.05, 0.25) / sqrt(26)
+REALIGNING = (0.00497519, -0.0497519, -0.0260417)  # v = (0.05, -0.5) / sqrt(101)
 
 
 @pytest.mark.parametrize(
@@ -235,21 +237,23 @@ SATURATED = (0.00980581, 0.0490290)  # v = (0.05, 0.25) / sqrt(26)
         # v* = 0.13, |l| = 0.18: sigma = 1/4; omega = 0.25 * 0.13 / 0.2 * (-5/12), Eq. 8.
         ("no limits", FREE, observe(FAR, l=-0.18), 0.15, (0.0129355, -0.1293548, -0.0677083)),
         # (0.0255, 0.1275) is scaled to norm 0.05.
-        # omega keeps the unsaturated v_x: 0.0254951 / 0.2 * -5/12 (the saturated: -0.0204).
-        ("v saturates", {}, observe(FAR, l=0.12), 0.24, (*SATURATED, -0.0531148)),
-        ("saturated first", SCALED, observe(FAR, l=0.12), 0.24, (*SATURATED, -0.0204288)),
+        # omega has the saturated v_x: 0.00980581 / 0.2 * -5/12; the unsaturated is 0.0254951.
+        ("v saturates", {}, observe(FAR, l=0.12), 0.24, (*SATURATED, -0.0204288)),
+        ("unsaturated", UNSATURATED, observe(FAR, l=0.12), 0.24, (*SATURATED, -0.0531148)),
         ("clipped", CLIPPED, observe(FAR, l=0.12), 0.24, (0.0254951, 0.05, -0.0531148)),
-        # omega = 0.25 * 0.05 / 0.2 * -5/12, where 0.13 would give -0.0677.
-        ("realigning", SCALED, observe(FAR, l=-0.18), 0.15, (0.00497519, -0.0497519, -0.0260417)),
-        # As above with tangent -12/5: -0.30594 is clipped (the saturated v_x: -0.1177).
-        ("both saturate", {}, observe((0.5, -1.2), l=0.12), 0.24, (*SATURATED, -0.15)),
+        # omega = 0.25 * 0.05 / 0.2 * -5/12, and with 0.13 instead of 0.05 -0.0677.
+        ("realigning", {}, observe(FAR, l=-0.18), 0.15, REALIGNING),
+        ("unsaturated", UNSATURATED, observe(FAR, -0.18), 0.15, (*REALIGNING[:2], -0.0677083)),
+        # As above with tangent -12/5: -0.11767; with the unsaturated v_x -0.30594 is clipped.
+        ("steep", {}, observe((0.5, -1.2), l=0.12), 0.24, (*SATURATED, -0.1176697)),
+        ("both", UNSATURATED, observe((0.5, -1.2), l=0.12), 0.24, (*SATURATED, -0.15)),
         # |l| > l_cr: a_r = 10, sigma = 0. v* = 0.13 scaled to 0.05.
         ("critical region", {}, observe(FAR, l=0.25), 0.24, (0.00497519, 0.0497519, 0.0)),
         # v* = 0.04, a_r = -10 although ||d|| < d_th; omega = 1/4 * 0.04 / 0.2 * 7/24.
         ("realigning, near", {}, observe(NEAR, -0.18), 0.15, (0.00398015, -0.0398015, 0.0145833)),
         # Equal l and d, not realigning: a_r = 0.
         ("normal, near", {}, observe(NEAR, l=-0.18), 0.24, (0.04, 0.0, 0.0583333)),
-        # Heading error 3 rad, gamma = 1.56, tan = 92.6: 0.1 / 0.2 * 92.6 is clipped.
+        # Heading error 3 rad, gamma = 1.56, tan = 92.6: 0.05 / 0.2 * 92.6 is clipped.
         ("behind", {}, observe(BEHIND), 0.24, (0.05, 0.0, 0.15)),
         # A centred contact has no sign; else a_r = 3 + 7 / (1 + e^7.2) = 3.00522.
         ("centred", {"zeta": 3.0}, observe((2.0, 0.0)), 0.24, (0.05, 0.0, 0.0)),
@@ -269,12 +273,12 @@ def test_one_step_by_hand(case, changes, observation, l_th, expected):
 
 
 def test_the_tangent_as_printed_turns_away_from_a_target_behind():
-    # v_x = 0.1, omega = 0.1 / 0.2 * tan(error): tan is positive at 1.5 and negative at 1.7.
+    # v_x = 0.05, omega = 0.05 / 0.2 * tan(error): tan is positive at 1.5 and negative at 1.7.
     as_printed = PAPER._replace(gamma_max=math.inf, omega_max=100.0)
     for error in (1.5, 1.7, 3.0, -1.5, -1.7, -3.0):
         observation = observe((math.cos(error), math.sin(error)))
         omega = twist_of(as_printed, observation)[2]
-        assert omega == pytest.approx(0.5 * math.tan(error), rel=1e-3)
+        assert omega == pytest.approx(0.25 * math.tan(error), rel=1e-3)
         assert (omega * error > 0) == (abs(error) < math.pi / 2)
         assert twist_of(PAPER, observation)[2] * error > 0
 
@@ -580,6 +584,31 @@ def test_float32_stays_float32_where_float64_is_enabled():
         new, twist = rps.step(params, start, observation)
         assert new.l_th.dtype == new.p_robot_contact.dtype == jnp.float32
         assert {v.dtype for v in twist} == {np.dtype(np.float32)}
+
+
+def test_tuned_laws_keep_the_order_of_saturation_of_their_tuning(tmp_path):
+    """A file of parameters that omits it is unambiguous for these alone."""
+    from rps_jax.control import registry
+
+    everywhere = registry._HIDDEN | registry.LAWS
+    names = ("_guided", *registry.PACKAGE_LAWS)  # without those of other tests
+    leaves = {name: registry.named_leaves(everywhere[name]) for name in names}
+    orders = {
+        name: value
+        for name, values in leaves.items()
+        for path, value in values.items()
+        if path.endswith("saturate_first")
+    }
+    unsaturated = dict.fromkeys(("rps_tuned", "rps_unsaturated", "rps_plus", "_guided"), 0.0)
+    assert orders == {"rps": 1.0, "nps": 1.0} | unsaturated
+    path = tmp_path / "tuned.json"
+    path.write_text('{"K_h": 0.3}')
+    assert registry.parse_law("rps,K_h=0.3")[1] == PAPER._replace(K_h=0.3)
+    for name, changes in (("rps_tuned", ""), ("rps_unsaturated", ""), ("rps", ",saturate_first=0")):
+        _, params = registry.parse_law(f"{name},{path}{changes}")
+        assert params == registry.LAWS[name]._replace(K_h=0.3, saturate_first=0.0)
+    with pytest.raises(errors.InputError, match="the file omits saturate_first, whose default was"):
+        registry.parse_law(f"rps,{path}")
 
 
 def test_help_has_the_units_and_equations_of_every_parameter():

@@ -28,6 +28,7 @@ from rps_jax.world.physics import preset
 from rps_jax.world.scene import FRICTION
 from sweeps import conditions
 from sweeps.ambiguities import readings
+from sweeps.ambiguities.study import Ambiguities
 from sweeps.conditions import Condition, Grid
 from sweeps.fidelity import study as fidelity
 from sweeps.hardware import study as reproduce
@@ -189,6 +190,15 @@ def test_every_condition_is_a_study_that_could_run():
             assert len(condition.cases(Grid(targets=NEAR))) == 12
     assert len(readings.curve()) == 3 * len(readings.TOLERANCES)
     assert set(fidelity.QUICK) <= set(fidelity.CONDITIONS)
+
+
+def test_a_reading_that_a_law_has_already_is_no_row():
+    paper_law, plus = (set(Ambiguities(laws=laws).chosen) for laws in ((), ("rps_plus",)))
+    assert paper_law - plus == {"unsaturated", "keep_on_loss", "l_mr_20cm"}
+    assert plus - paper_law == {"saturate_first"}
+    assert readings.DEFAULT in plus
+    assert "saturate_first" in Ambiguities(laws=("rps", "rps_plus")).chosen
+    assert set(Ambiguities(readings=("saturate_first",)).chosen) == {"default", "saturate_first"}
 
 
 def test_the_cells_of_table_ii_are_judged_by_their_intervals():

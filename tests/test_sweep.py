@@ -350,7 +350,7 @@ def test_another_configuration_is_refused_with_its_differences(whole):
 
 def test_sweep_merge_and_replay_on_the_command_line(tmp_path, capsys):
     tuned, drums, run = (tmp_path / name for name in ("tuned.json", "drums.json", "run"))
-    tuned.write_text(json.dumps({"L": 0.3}))
+    tuned.write_text(json.dumps({"L": 0.3, "saturate_first": 0}))
     drums.write_text(json.dumps({"objects": ["random_cylinder"], "distance": [1, 2]}))
     words = "--fidelity fast --worlds 12 --horizon 6 --part 5 --slots"
     command = ["sweep", *words.split(), SLOTS, "--domain", drums, "--out", run,

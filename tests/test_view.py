@@ -65,7 +65,7 @@ LAWS = ["rps,K_h=0.3", "rps,tuned.json", "mine.py:PParams,v=0.04", "policy.npz"]
 def test_every_kind_of_law_is_shown_live(law, tmp_path, monkeypatch, registries):
     """Laws are given by name with changes, as tuned parameters, as a user's file, or learned."""
     monkeypatch.chdir(tmp_path)
-    (tmp_path / "tuned.json").write_text(json.dumps({"L": 0.3}))
+    (tmp_path / "tuned.json").write_text(json.dumps({"L": 0.3, "saturate_first": 1}))
     shutil.copy(ROOT / "notebooks" / "examples" / "custom_law.py", tmp_path / "mine.py")
     shutil.copy(Path(learned.__file__).parent / "learned_mlp.npz", tmp_path / "policy.npz")
     request = viewer.PushRequest("cylinder", "S1", law, (0.6, 0.0))

@@ -127,6 +127,8 @@ class Law(Generic[Params, State, Obs]):
     senses: Senses = "touch"
     check: Callable[[Params], Params] = check_finite_leaves  # raises InputError for bad params
     bounds: tuple[tuple[str, Bound], ...] = ()  # of the parameters that may be tuned
+    # Defaults of an earlier version that differ; a file of changes must name these parameters.
+    earlier: tuple[tuple[str, float], ...] = ()
     # Default widths of the smoothed law, which `init` and `step` accept as the keyword
     # `temperatures`. None: the law has no smooth form.
     temperatures: Smoothing | None = None

@@ -187,7 +187,17 @@ def parse_law(text: str) -> tuple[str, LawParams]:
     label = ",".join(
         [label, *(Path(x).stem if files.suffix_of(x) == ".json" else x for x in words)]
     )
-    return label, replace_leaves(params, values)
+    changed = replace_leaves(params, values)
+    if any(files.suffix_of(word) == ".json" for word in words):
+        for name, earlier in law_of(params).earlier:
+            default = named_leaves(params).get(name, earlier)
+            if name not in values and default != earlier:
+                rule = (
+                    f"the file omits {name}, whose default was {earlier:g} in version 0.3 and is "
+                    f"{default:g} now; append ,{name}={earlier:g} or ,{name}={default:g}"
+                )
+                raise errors.not_allowed("law", text, rule)
+    return label, changed
 
 
 def _parse_head(text: str) -> tuple[str, LawParams]:

@@ -80,14 +80,16 @@ class Space:
     def changed_values(self, vector: ArrayLike) -> dict[str, float]:
         """Return the tuned parameters of a vector (p,), and all others that differ from the preset.
 
-        The preset is the first of the law; that of RPS has the paper's parameters.
+        The preset is the first of the law; that of RPS has the paper's parameters. Parameters whose
+        default has changed between versions are included.
         """
         preset = next(p for p in registry.LAWS.values() if type(p) is type(self.base))
         values, defaults = (
             {name: float(f"{float(value):.7g}") for name, value in leaves.items()}
             for leaves in map(registry.named_leaves, (self.params(vector), preset))
         )
-        return {n: x for n, x in values.items() if n in self.names or x != defaults[n]}
+        names = (*self.names, *dict(registry.law_of(self.base).earlier))
+        return {n: x for n, x in values.items() if n in names or x != defaults[n]}
 
 
 def _share(bound: Bound, values: Mapping[str, Leaf], name: str) -> Leaf:

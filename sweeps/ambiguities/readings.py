@@ -50,6 +50,7 @@ READINGS = {
     "l_mr_20cm": _params("l_mr 0.20 m", l_mr=0.20),
     "a_r_max_5": _params("a_r_max 5 instead of 10", a_r_max=5.0),
     "a_r_max_20": _params("a_r_max 20", a_r_max=20.0),
+    "unsaturated": _params("omega from the unsaturated velocity", saturate_first=0.0),
     "saturate_first": _params("omega from the saturated velocity", saturate_first=1.0),
     "clip_each": _params("v_x and v_y clipped one by one", clip_each=1.0),
     "period_5ms": Condition("control period 5 ms instead of 20", _setting(control_period=0.005)),

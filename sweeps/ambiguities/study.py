@@ -52,7 +52,11 @@ class Ambiguities(ConditionStudy):
     @property
     def chosen(self) -> dict[str, Condition]:
         """Selected readings, the defaults first."""
-        names = self.readings or [name for name in self.known if name not in self.refused]
+        names = self.readings or [
+            name
+            for name, reading in self.known.items()
+            if name not in self.refused and not reading.is_default(self.grid.laws)
+        ]
         first = [] if self.curve else [readings.DEFAULT]
         return {name: self.known[name] for name in (*first, *names)}
 

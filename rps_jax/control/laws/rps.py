@@ -5,6 +5,12 @@ Frames: W is the world, R the robot (origin at the centre of the base, x forward
 `p_robot_contact` is the paper's p^R_C; `l`, the contact offset, is its y component. Functions take
 single worlds; `jax.vmap` batches any argument, parameters included.
 
+Order of saturation: the paper says that the computed velocities "were saturated at 0.05 m/s [...]
+and 0.15 rad/s [...] prior to being commanded", and that "the change of omega as a function of v_x^R
+in addition to gamma offers a key advantage". It leaves open whether v_x in Eq. 6 and v* in Eq. 9
+are the saturated ones. The bicycle model of its reference bounds the speed before it computes the
+yaw rate. So do we; otherwise omega is often at its bound, whatever v_x (see `unsaturated`).
+
 The law has switches. With `Temperatures` each switch is a weight from 0 to 1 that mixes its two
 alternatives (see `soft`), so that the law is smooth. Without them it is the paper's law.
 """
@@ -64,7 +70,7 @@ class RPSParams(NamedTuple):
     # Switches, each 0 or 1.
     reactive: float | jax.Array = 1.0  # 1: RPS; 0: NPS (a_r = 0 and no Realignment)
     keep_contact: float | jax.Array = 0.0  # 1: after a loss the last contact is used
-    saturate_first: float | jax.Array = 0.0  # 1: omega from the saturated linear velocity
+    saturate_first: float | jax.Array = 1.0  # 1: omega from the saturated v_x; 0: the unsaturated
     clip_each: float | jax.Array = 0.0  # 1: v_x and v_y clipped one by one, not as a vector
 
     @classmethod
@@ -79,7 +85,7 @@ class RPSParams(NamedTuple):
         See `sweeps/random_worlds`; some of the worlds had robots with limits. The base keeps full
         speed until the target. Within d_th it moves straight ahead or, beyond l_cr, almost purely
         sideways, and Eq. 5 acts only outside d_th. After a loss of contact the law acts as if the
-        last contact persisted.
+        last contact persisted. These values were tuned with omega from the unsaturated v_x.
         """
         return cls(
             eta=7.434028,
@@ -96,12 +102,18 @@ class RPSParams(NamedTuple):
             gamma_max=1.535043,
             v_lost=0.03196665,
             keep_contact=1.0,
+            saturate_first=0.0,
         )
 
     @classmethod
     def nps(cls) -> RPSParams:
         """Return the non-reactive baseline: a_r = 0, and no Realignment State (Sec. III-B)."""
         return cls(reactive=0.0)
+
+    @classmethod
+    def unsaturated(cls) -> RPSParams:
+        """Return the paper's values with omega from the unsaturated v_x, then clipped."""
+        return cls(saturate_first=0.0)
 
 
 # v_max, omega_max, v_approach and d_success belong to the robot and the task, not to the law.
@@ -329,5 +341,11 @@ LAW = Law(
     check=check,
     bounds=tuple(BOUNDS.items()),
     temperatures=Temperatures(),
+    earlier=(("saturate_first", 0.0),),
 )
-PRESETS = {"rps": RPSParams.paper(), "rps_tuned": RPSParams.tuned(), "nps": RPSParams.nps()}
+PRESETS = {
+    "rps": RPSParams.paper(),
+    "rps_tuned": RPSParams.tuned(),
+    "nps": RPSParams.nps(),
+    "rps_unsaturated": RPSParams.unsaturated(),
+}
