@@ -16,8 +16,8 @@ _BINS = 8
 
 
 def posterior(results: xr.Dataset) -> Figure:
-    """Draw the posterior of every unknown over its prior; a dashed line marks the best draw."""
-    weights, at = evidence.normalised(evidence.log_weights(results)), evidence.best(results)
+    """Draw the posterior of every unknown over its prior; a dashed line marks the closest draw."""
+    weights, at = evidence.normalised(evidence.log_weights(results)), evidence.closest(results)
     figure = Figure(figsize=(13, 9.5), layout="constrained")
     axes = figure.subplots(5, 6).flat
     for ax in axes[len(NAMES) :]:
@@ -40,7 +40,7 @@ def posterior(results: xr.Dataset) -> Figure:
 
 def predictions(results: xr.Dataset) -> Figure:
     """Draw the paper's numbers beside their predictions: medians, 5 to 95 %."""
-    predicted, at = evidence.predictions(results), evidence.best(results)
+    predicted, at = evidence.predictions(results), evidence.closest(results)
     groups = {
         "D [m]": [n for n, x in NUMBERS.items() if x.unit == "m"],
         "time [s]": [n for n, x in NUMBERS.items() if x.unit == "s"],
@@ -59,7 +59,7 @@ def predictions(results: xr.Dataset) -> Figure:
                 ax.plot(scale * middle, y, "|", color="k", ms=6)
             ours = scale * evidence.scaled(results, name)[at]
             ax.plot(
-                ours, row, "o", mfc="w", color="C3", ms=5, label=None if row else "the best draw"
+                ours, row, "o", mfc="w", color="C3", ms=5, label=None if row else "the closest draw"
             )
             ax.plot(scale * NUMBERS[name].value, row, "k*", ms=9, label=None if row else "paper")
         ax.set_yticks(range(len(names)), [name.replace("hardware, ", "") for name in names])
@@ -73,7 +73,7 @@ def predictions(results: xr.Dataset) -> Figure:
 
 
 def figure_6(results: xr.Dataset) -> Figure:
-    """Draw the paper's Fig. 6 from the best draw: path, velocities, contact and its type."""
+    """Draw the paper's Fig. 6 from the closest draw: path, velocities, contact and its type."""
     figure = Figure(figsize=(11, 6), layout="constrained")
     grid = figure.add_gridspec(3, 2, width_ratios=(1, 1.5))
     path = figure.add_subplot(grid[:, 0])
@@ -90,7 +90,7 @@ def figure_6(results: xr.Dataset) -> Figure:
     middle.plot(time, results.a_r / 50, lw=1, label="a_r / 50")
     below.plot(time, results.contact_type, lw=1, label="contact: 0 none, 1 point, 2 line")
     for ax in (above, middle, below):
-        shade(ax, time, realigning, "C0")
+        shade(ax, time, realigning, "0.85")
         ax.legend(fontsize=7, loc="upper right")
         ax.grid(alpha=0.3)
     below.set_xlabel("time [s]; shaded: Realignment State")

@@ -29,7 +29,7 @@ from sweeps.paper_reading.experiments import Target
 from sweeps.paper_reading.unknowns import Proposal, redraw_hardware
 from sweeps.study_base import Table, TrialStudy
 
-_REPEATS = 8  # runs of the best draw with other starts and noise
+_REPEATS = 8  # runs of the closest draw with other starts and noise
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,7 @@ class PaperReading(TrialStudy[xr.Dataset]):
 
     The result has the points `u` (draw, unknown) in the unit cube, the log density of the proposals
     `log_proposal` (draw), and the simulated numbers (draw, number), of which counts are out of
-    `trials` (number). For the best draw it has the hardware's numbers in both engines, `checked`
+    `trials` (number). For the closest draw it has the hardware's numbers in both engines, `checked`
     (engine, repeat, number), and its Fig. 6 over time.
     """
 
@@ -57,7 +57,7 @@ class PaperReading(TrialStudy[xr.Dataset]):
     first: int = option(4000, 2, 1_000_000)
     """Number of draws before the rounds, of which only the hardware's experiments run."""
     repeats: int = option(_REPEATS, 1, 100)
-    """Number of repetitions of the hardware's experiments under the best draw."""
+    """Number of repetitions of the hardware's experiments under the closest draw."""
     targets: tuple[Target, ...] = paper.TARGETS
     """Targets of the simulated trials [m]."""
     setting: Setting = field(default=Setting("fused"), kw_only=True)
@@ -69,7 +69,7 @@ class PaperReading(TrialStudy[xr.Dataset]):
         return 16 * (self.first + 2 * self.repeats) + self.rounds * self.draws * of_draw
 
     def answer(self, run: Run) -> xr.Dataset:
-        """Run the rounds that the folder lacks, and check the best draw."""
+        """Run the rounds that the folder lacks, and check the closest draw."""
         progress = SequentialProgress(run.callback)
         run = run._replace(callback=progress)
         pilot = run.checkpoint("first", partial(self._draw_hardware, run))
@@ -83,8 +83,8 @@ class PaperReading(TrialStudy[xr.Dataset]):
             rounds.append(run.checkpoint(f"round_{index}", compute))
             progress.finish((self.num_trials() - 16 * self.first) // self.rounds)
         results = _joined(rounds, proposals, self.samples)
-        best = results.isel(draw=[evidence.best(results)])
-        checked = run.checkpoint("best", partial(self._check_best, best, run))
+        closest = results.isel(draw=[evidence.closest(results)])
+        checked = run.checkpoint("closest", partial(self._check, closest, run))
         return xr.merge([results, checked], combine_attrs="drop")
 
     def _draw_hardware(self, run: Run) -> xr.Dataset:
@@ -101,16 +101,16 @@ class PaperReading(TrialStudy[xr.Dataset]):
         u = redraw_hardware(proposal, once, self.samples, rng)
         return experiments.numbers(u, self.samples, self.setting, targets, run, index)
 
-    def _check_best(self, best: xr.Dataset, run: Run) -> xr.Dataset:
+    def _check(self, closest: xr.Dataset, run: Run) -> xr.Dataset:
         """Return the hardware's numbers of one draw in two engines, and its Fig. 6 over time."""
-        u = np.repeat(best.u.values, self.repeats, 0)
+        u = np.repeat(closest.u.values, self.repeats, 0)
         by_engine = []
         for engine in ("fused", "mujoco"):
             setting = replace(self.setting, engine=engine)
             found = experiments.hardware(u, setting, run, 1000)
             names = list(found)
             by_engine.append(np.stack([found[name] for name in names], 1))
-        trace = experiments.figure_6(best.u.values, self.setting, run.callback)[0]
+        trace = experiments.figure_6(closest.u.values, self.setting, run.callback)[0]
         columns = {"checked": (("engine", "repeat", "checked_number"), np.stack(by_engine))}
         coords = {"engine": ["fused", "mujoco"], "checked_number": names}
         return xr.merge([xr.Dataset(columns, coords), trace], combine_attrs="drop")
@@ -120,7 +120,7 @@ class PaperReading(TrialStudy[xr.Dataset]):
         return evidence.summary(results)
 
     def report_tables(self, results: xr.Dataset) -> Sequence[Table]:
-        """Return posterior, predictions, the best draw and its Fig. 6."""
+        """Return posterior, predictions, the closest draw and its Fig. 6."""
         return [
             Table(evidence.readings_table(results), name="reading_evidence",
                   title="Evidence for each reading"),
@@ -130,7 +130,7 @@ class PaperReading(TrialStudy[xr.Dataset]):
                   title="Printed numbers and their predictions",
                   picture=Picture("predictions", partial(drawing.predictions, results))),
             Table(evidence.checks_table(results), name="reading_checks",
-                  title="The best draw again, in two engines"),
+                  title="The closest draw again, in two engines"),
             Table(evidence.figure_6_table(results), name="reading_figure_6",
                   title="Fig. 6, point by point",
                   picture=Picture("figure_6", partial(drawing.figure_6, results))),
