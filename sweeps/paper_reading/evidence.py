@@ -181,9 +181,8 @@ def numbers_table(results: xr.Dataset) -> list[list[str]]:
     for name, quantities in predicted.items():
         number, ours = NUMBERS[name], scaled(results, name)[at]
         cells = [_words(name, *each) for each in quantities.values()]
-        rows.append(
-            [name, _word(name, number.value), *cells, _word(name, ours), agrees(name, ours)]
-        )
+        inside = "yes" if agrees(name, ours) else "no"
+        rows.append([name, _word(name, number.value), *cells, _word(name, ours), inside])
     return rows
 
 
