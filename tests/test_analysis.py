@@ -19,6 +19,7 @@ from rps_jax.runs.question import Run
 from rps_jax.studies import hardware
 from rps_jax.trials.progress import no_progress
 from rps_jax.tuning import learn
+from rps_jax.world import paper
 from rps_jax.world.domain import LABELS
 from sweeps.speed.study import throughput
 
@@ -199,6 +200,24 @@ def test_a_path_is_drawn_with_its_target_and_its_last_contact(drawn):
     assert lines == [line, target, [[0.4, 0.2]], line, target]
 
 
+def test_the_papers_numbers_are_beside_ours_under_each_friction(drawn):
+    dims, objects = ("law", "object", "friction", "target"), list(paper.HARDWARE_OBJECTS)
+    columns = {  # the second box under the second friction fails
+        "success": [[[[1, 1], [1, 0]], [[0, 0], [0, 0]]]],
+        "mean_abs_l": [[[[0.03, 0.05], [0.02, 9.0]], [[1.0, 1.0], [1.0, 1.0]]]],
+        "time": [[[[80.0, 90.0], [70.0, 900.0]], [[1.0, 1.0], [1.0, 1.0]]]],
+    }
+    results = xr.Dataset({name: (dims, x) for name, x in columns.items()}, {"object": objects})
+    d, time = drawn(hardware.numbers_figure, results).axes
+    np.testing.assert_allclose(d.lines[0].get_xdata(), [0.04, 0.02])
+    np.testing.assert_allclose(time.lines[0].get_xdata(), [85, 70])
+    assert [list(line.get_xdata()) for line in d.lines[1::2]] == [[0.032], [0.059]]
+    _, box, cylinder = hardware.table(results)
+    assert box == ["hardware box", "3 of 4 [30, 95]", "8 of 8", "0.033 m (by friction 0.020-0.040)",
+                   "0.032 m", "80 s (by friction 70-85)", "89 s"]  # fmt: skip
+    assert cylinder[1:] == ["0 of 4 [0, 49]", "8 of 8", "-", "0.059 m", "-", "88 s"]
+
+
 def test_recovered_pushes_are_counted():
     dims = ("object", "shift", "side", "target")
     shoved = xr.Dataset(
@@ -209,7 +228,7 @@ def test_recovered_pushes_are_counted():
         {"object": ["hardware_box"], "shift": [0.1, 0.4]},
     )
     _, *rows = hardware.shift_table(shoved)
-    assert rows == [["10 cm", "3 of 4 (30-95 %)"], ["40 cm", "0 of 0 (0-100 %)"]]
+    assert rows == [["10 cm", "3 of 4 [30, 95]"], ["40 cm", "0 of 0 [0, 100]"]]
 
 
 def test_speeds_are_drawn_by_batch(drawn):

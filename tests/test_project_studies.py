@@ -22,12 +22,12 @@ STUDIES = sorted(path.parent for path in SWEEPS.glob("*/study.py"))
 # Options of studies whose value is out of bounds, or is none of their choices.
 OUT_OF_BOUNDS = [
     *("landscape --candidates 1", "speed --worlds 0", "speed --at-once 0"),
-    *("levers --worlds 1", "levers --simulated nan", "hardware --setups 1"),
+    *("levers --worlds 1", "levers --simulated nan", "paper_reading --draws 1"),
     *("real_pushes --mujoco -1", "fit --logs 1", "fit/bags.py --logs 0", "export --inputs 0"),
 ]
 UNKNOWN = [
     *("gradients --object box", "gradients --estimators backward", "gradients --tuned v_max"),
-    *("landscape --domain wyde", "engines --domain wyde", "hardware --domain wyde"),
+    *("landscape --domain wyde", "engines --domain wyde"),
     *("random_worlds --domains wyde", "random_worlds --laws none", "export --laws nune"),
     *("speed --names fast", "speed/costs.py --names mjx", "levers --program mjx"),
     *("engines --objects cone", "engines --engines fast", "fidelity --conditions fine"),

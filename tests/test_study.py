@@ -22,7 +22,7 @@ from rps_jax.trials.case import Case
 from rps_jax.trials.results import DIMS
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import Rules, Shift
-from rps_jax.world import paper, points, scene
+from rps_jax.world import paper, scene
 from rps_jax.world.objects import PAPER_OBJECTS
 from rps_jax.world.physics import preset
 from rps_jax.world.scene import FRICTION
@@ -31,7 +31,6 @@ from sweeps.ambiguities import readings
 from sweeps.ambiguities.study import Ambiguities
 from sweeps.conditions import Condition, Grid
 from sweeps.fidelity import study as fidelity
-from sweeps.hardware import study as reproduce
 
 NEAR = ((0.6, 0.0), (0.62, 0.03))
 SHORT = Setting(engine="mujoco", rules=Rules(horizon=18.0))
@@ -131,50 +130,19 @@ def test_the_hardware_experiments_cover_friction_targets_and_shoves():
     assert results.sizes["target"] == 8
     assert (results.mean_abs_l < 0.29).any()  # it was touched
     rows = hardware.table(results)
-    assert rows[1][1] == "0 of 96"
+    assert rows[1][1].startswith("0 of 96")
     assert "8 of 8" in rows[1]
     assert results.recovered.shape == (2, 1, 2, 8)
     # All trials ended at 3 s, before the object was to be moved: none tells anything.
     assert not results.counted.any()
 
 
-def test_a_setup_has_one_robot_and_a_friction_for_each_object():
-    question = reproduce.Reproduce(setups=4, setting=rps_jax.Setting("quasistatic"))
-    columns = points.names(question.ranges)
-    u = question.plan.points.u.reshape(4, 2, 8, -1)
-    for name in ("foam", "robot_lag", "command_delay"):
-        column = u[..., columns.index(name)]
-        assert (np.ptp(column, axis=(1, 2)) == 0).all()
-        assert np.ptp(column) > 0
-    mu = u[..., columns.index("friction_robot")]
-    assert (np.ptp(mu, axis=2) == 0).all()
-    assert (mu[:, 0, 0] != mu[:, 1, 0]).all()
-    assert (np.ptp(u[..., columns.index("yaw")], axis=2) > 0).all()
-    cases = points.cases(question.ranges, question.plan.points, np.arange(64))
-    object_indices = np.tile(np.repeat([0, 1], 8), 4)
-    np.testing.assert_array_equal(question.ranges.object_of(cases), object_indices)
-    np.testing.assert_array_equal(cases % 8, np.tile(np.arange(8), 8))
-
-
-def test_the_nearest_setups_reproduce_all_of_the_papers_numbers():
-    reference = [paper.HARDWARE_RESULTS[name] for name in paper.HARDWARE_OBJECTS]
-    off = np.arange(101.0)
-    by_object, setup = ("setup", "object"), np.ones((101, 1))
-    setups = xr.Dataset(
-        {
-            "D": (by_object, [t.mean_abs_l for t in reference] + 0.001 * off[:, None]),
-            "time": (by_object, [t.time for t in reference] * setup),
-            "success": (by_object, np.full((101, 2), 8)),
-            "off": ("setup", off),
-            "drawn": (("setup", "quantity"), off[:, None]),
-        },
-        {"object": ["box", "cylinder"], "quantity": ["foam"]},
-    )
-    assert list(reproduce.nearest(setups.isel(setup=slice(None, None, -1))).off) == [0, 1, 2, 3, 4]
-    results, quantities = reproduce.tables(setups).values()
-    assert results[1] == ["D, box", "0.032 m", "0.082 m [0.037, 0.127]", "0.034 m [0.032, 0.036]",
-                          "0.032 m"]  # fmt: skip
-    assert quantities[1][2:] == ["2 [0.2, 3.8]", "+1.00", "+1.00", *quantities[1][5:]]
+def test_the_papers_base_slips_by_default_most_when_it_turns():
+    cases = hardware.Hardware().table.cases
+    robots = {(case.base.slip, case.base.slip_sideways, case.base.slip_yaw) for case in cases}
+    ((ahead, sideways, yaw),) = robots
+    assert 0 < ahead < sideways < yaw < 0.6
+    assert len({case.friction for case in cases}) == 12
 
 
 def test_the_hardware_targets_are_2_1_m_from_the_start():

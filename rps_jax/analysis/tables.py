@@ -34,7 +34,7 @@ def table_ii(results: xr.Dataset) -> list[list[str]]:
     for law in map(str, results.law.values):
         success = results.success.sel(law=law)
         counts = [int(success.sel(object=o, friction=f).sum()) for o, f in columns]
-        cells = [f"{n}/{size} {_interval(n, size)}" for n, size in _with_sum(counts, trials)]
+        cells = [f"{n}/{size} {interval(n, size)}" for n, size in _with_sum(counts, trials)]
         rows.append([law.upper(), "ours", *cells])
         in_paper = [paper.TABLE_II.get((law, o, f)) for o, f in columns]
         counts = [n for n in in_paper if n is not None]
@@ -48,7 +48,8 @@ def _with_sum(counts: Sequence[int], trials: int) -> list[tuple[int, int]]:
     return [*((n, trials) for n in counts), (sum(counts), trials * len(counts))]
 
 
-def _interval(successes: int, trials: int) -> str:
+def interval(successes: int, trials: int) -> str:
+    """Format the Wilson 95 % interval of a success rate, in percent."""
     low, high = statistics.wilson(successes, trials)
     return f"[{100 * low:.0f}, {100 * high:.0f}]"
 

@@ -35,9 +35,9 @@ class TrialOptions:
     """Side of the nonuniform box on which its load stands, seen from the robot; left open by the
     paper."""
     robot: RobotLike = "ideal"
-    """The robot: ideal (it follows every twist at once, with any force), kairos (the paper's),
-    ridgeback or mpo_500, or a JSON file of its size, boards and limits. Changes follow, as
-    kairos,force_max=300."""
+    """The robot: ideal (it follows every twist at once, with any force), slipping (its wheels lose
+    shares of the twist), kairos (the paper's), ridgeback or mpo_500, or a JSON file of its size,
+    boards and limits. Changes follow, as kairos,force_max=300."""
 
 
 @dataclass(frozen=True)

@@ -83,7 +83,7 @@ RECIPES: dict[str, Recipe] = {
     "models": recipe(f"rps sweeps/random_worlds {_MACHINE}", gpu=30),
     "million": recipe(f"rps sweeps/random_worlds/million.py {_MACHINE}", gpu=9),
     "rest": recipe(f"rps sweeps/fidelity/rest.py {_MACHINE}", cores=5),
-    "hardware_[qr]*": recipe(f"rps sweeps/hardware {_MACHINE}", gpu=20),
+    "reading_*": recipe(f"rps sweeps/paper_reading {_MACHINE}", gpu=10),
     "feet": recipe(
         "rps sweep --domain wide --laws rps rps_tuned rps_plus --worlds 400",
         "rps sweep --domain wide,feet=0.5:0.9 --laws rps rps_tuned rps_plus --worlds 400",
