@@ -45,13 +45,16 @@ def effective(weights: np.ndarray) -> float:
 
 def closest(results: xr.Dataset) -> int:
     """Return the draw that agrees with most of the paper's numbers, of these the likeliest."""
-    matches = np.sum([agrees(name, scaled(results, name)) for name in _names(results)], 0)
     fit = results.log_likelihood.sum("number").values
-    return int(np.lexsort((fit, matches))[-1])
+    return int(np.lexsort((fit, _matches(results, _names(results))))[-1])
 
 
 def _names(results: xr.Dataset) -> list[str]:
     return list(map(str, results.number.values))
+
+
+def _cells(results: xr.Dataset) -> list[str]:
+    return [name for name in _names(results) if printed.part_of(name) == "Table II"]
 
 
 # Parts of the numbers that tell of a part of the unknowns.
@@ -84,6 +87,7 @@ def proposal(results: xr.Dataset) -> Proposal:
 def summary(results: xr.Dataset) -> str:
     """Return a sentence on draws, numbers and the effective number of draws."""
     weights = _of_simulations(results, normalised(log_weights(results)))
+    cells = _cells(results)
     return (
         f"{weights.size:,} draws of the text and the simulation, each with "
         f"{results.sizes['draw'] // weights.size} draws of the hardware: {len(NAMES)} unknowns "
@@ -91,7 +95,8 @@ def summary(results: xr.Dataset) -> str:
         f"{effective(weights):.0f}. A mean has a normal likelihood, with a standard deviation of "
         "4 mm for D and 2.5 s for times; a count a beta-binomial one; an observation in the text "
         "is wrong with a probability of 10 %. The closest draw has "
-        f"{_cells_inside(results)} of 18 cells of Table II inside the paper's Wilson intervals."
+        f"{int(_matches(results, cells)[closest(results)])} of {len(cells)} cells of Table II "
+        "inside the paper's Wilson intervals."
     )
 
 
@@ -174,16 +179,31 @@ def scaled(results: xr.Dataset, name: str) -> np.ndarray:
 
 
 def numbers_table(results: xr.Dataset) -> list[list[str]]:
-    """Return a row for each number: the paper's, predictions, and the closest draw's."""
+    """Return a row for each number: the paper's, predictions, and the closest draw's.
+
+    The last rows count the numbers that agree.
+    """
     at, predicted = closest(results), predictions(results)
     header = ["number", "paper", "prior", "posterior", "predicted from the others"]
     rows = [[*header, "the closest draw", "inside the paper's interval"]]
     for name, quantities in predicted.items():
         number, ours = NUMBERS[name], scaled(results, name)[at]
-        cells = [_words(name, *each) for each in quantities.values()]
+        cells = [_words(name, each) for each in quantities.values()]
         inside = "yes" if agrees(name, ours) else "no"
         rows.append([name, _word(name, number.value), *cells, _word(name, ours), inside])
+    weights = normalised(-results.log_proposal.values), normalised(log_weights(results))
+    for words, names in (("cells of Table II", _cells(results)), ("all of these", _names(results))):
+        matches = _matches(results, names)
+        ranges = [_range(quantiles(matches, each), ".0f") for each in weights]
+        of = f"{len(names)} of {len(names)}"
+        ours = f"{matches[at]:.0f} of {len(names)}"
+        rows.append([f"inside the interval: {words}", of, *ranges, "", ours, ""])
     return rows
+
+
+def _matches(results: xr.Dataset, names: list[str]) -> np.ndarray:
+    """Return the number (draw,) of the paper's numbers that agree."""
+    return np.sum([agrees(name, scaled(results, name)) for name in names], 0)
 
 
 def agrees(name: str, values: np.ndarray) -> np.ndarray:
@@ -196,12 +216,6 @@ def agrees(name: str, values: np.ndarray) -> np.ndarray:
     return np.abs(values - number.value) <= 2 * number.deviation
 
 
-def _cells_inside(results: xr.Dataset) -> int:
-    """Return the number of cells of Table II in which the closest draw agrees with the paper."""
-    at, cells = closest(results), [name for name in NUMBERS if printed.part_of(name) == "Table II"]
-    return sum(bool(agrees(name, scaled(results, name)[at])) for name in cells)
-
-
 def _word(name: str, value: float) -> str:
     number = NUMBERS[name]
     if number.of == 1:
@@ -211,11 +225,14 @@ def _word(name: str, value: float) -> str:
     return f"{value:.3f} m" if number.unit == "m" else f"{value:.0f} s"
 
 
-def _words(name: str, low: float, middle: float, high: float) -> str:
+def _words(name: str, limits: np.ndarray) -> str:
     """Return a median and its interval."""
-    number = NUMBERS[name]
-    form = ".3f" if number.unit == "m" else ".0f"
-    return f"{middle:{form}} [{low:{form}}, {high:{form}}]"
+    return _range(limits, ".3f" if NUMBERS[name].unit == "m" else ".0f")
+
+
+def _range(limits: np.ndarray, form: str) -> str:
+    low, middle, high = (f"{x:{form}}" for x in limits)
+    return f"{middle} [{low}, {high}]"
 
 
 def checks_table(results: xr.Dataset) -> list[list[str]]:

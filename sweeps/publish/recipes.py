@@ -68,6 +68,12 @@ _PLUS = {
     "`paper`, the paper's grid, 144": "rps ladder --domain paper --seed 7 "
     "--laws rps_plus rps_tuned",
 }
+_HARDWARE = {
+    "`rps`, slipping": "",
+    "`rps`, ideal": " --robot ideal",
+    "`rps_unsaturated`, slipping": " --law rps_unsaturated",
+    "`rps_unsaturated`, ideal": " --law rps_unsaturated --robot ideal",
+}
 _ROBOTS = ("ideal", "kairos", "ridgeback", "mpo_500")
 _REAL = "rps sweep --domain real --worlds 4096 --seed 11 --laws rps rps_tuned"
 _RACE = "--tuned K_h K_v L beta l_cr d_th --horizon 150 --validation 256 --seed 5"
@@ -101,11 +107,12 @@ RECIPES: dict[str, Recipe] = {
         section="Table II*",
     ),
     "hardware": recipe(
-        "rps hardware --engine fused", cores=4, gpu=2, section="Hardware experiments"
+        *_each("rps hardware --engine fused{}", *_HARDWARE.values()),
+        cores=2,
+        section="Hardware experiments",
+        labels=tuple(_HARDWARE),
     ),
-    "shoves": recipe(
-        "rps hardware --engine fused", cores=4, gpu=2, section="The object shoved aside"
-    ),
+    "shoves": recipe("rps hardware --engine fused", cores=1, section="The object shoved aside"),
     "real_pushes_*": recipe(f"rps sweeps/real_pushes {_MACHINE}", cores=15),
     "ladder": recipe(
         *_LADDERS, gpu=6, section="Against rps_tuned*", labels=_WIDE, columns=_AGAINST
