@@ -235,10 +235,11 @@ def test_a_base_has_no_droop_under_load_by_integral_action_and_pushes_as_far_if_
 def test_engines_agree_on_a_small_base_that_contact_slows():
     push = partial(push_object, seconds=3.0, twist=(0.05, 0.01, 0.15))
     ideal = Robot(half_length=0.5, half_width=0.12)
-    weak = replace(ideal, mass=60.0, force_max=62.0, torque_max=5.0)
+    # Nearer to the 59 N of friction it almost stalls, and the time step matters, too.
+    weak = replace(ideal, mass=60.0, force_max=70.0, torque_max=5.0)
     qpos = {name: push(name, weak).qpos[-1] for name in ("fused", "mujoco", "mjx")}
     for name in ("fused", "mjx"):
-        np.testing.assert_allclose(qpos[name], qpos["mujoco"], atol=4e-3, err_msg=name)
+        np.testing.assert_allclose(qpos[name], qpos["mujoco"], atol=1e-3, err_msg=name)
     assert np.abs(push("fused", ideal).qpos[-1] - qpos["fused"])[:6].max() > 0.01  # it did slow
 
 

@@ -216,8 +216,9 @@ def compare(samples: xr.Dataset, names: Sequence[str], clip: float) -> xr.Datase
     drawn = _cosines(tuple(names), gradients, true, clip, *rows)
     whole = _cosines(tuple(names), gradients, true, clip, *(np.arange(n)[None] for n in sizes))
     low, high = np.nanquantile(drawn, _INTERVAL, axis=0)
-    shares = {name: _largest_share(samples[name]) for name in gradients}
-    shared = np.stack([shares.get(name, 0 * low[0]) < 0.5 for name in names])
+    shares = {name: np.zeros(low.shape[1:]) for name in names}
+    shares |= {name: _largest_share(samples[name]) for name in gradients}
+    shared = np.stack([shares[name] < 0.5 for name in names])
     dims, of_truth = ("estimator", "horizon"), estimate(true)
     doubt = jnp.sqrt(jnp.sum(of_truth.variance, axis=0) / jnp.sum(of_truth.gradient**2, axis=0))
     return samples.assign(

@@ -143,7 +143,7 @@ def push(family: str, drawn: Draw, kind: Kind) -> np.ndarray:
 
         fields = jax.tree.map(lambda x: jnp.asarray(x, float), fields)
         start = Motion(jnp.asarray(qpos, float), still, still)
-        force = jax.jit(lambda motion: jax.lax.scan(step, motion, speeds)[1])(start)
+        force = jax.jit(lambda motion: jax.lax.scan(step, motion, jnp.asarray(speeds))[1])(start)
         return -np.asarray(force, float)[-(pushed // 2) :, :, 0]
     batch, rows, late = Batch(stage, qpos, 1), np.arange(count), []
     for speed in speeds:

@@ -67,7 +67,7 @@ def predictions(results: xr.Dataset) -> Figure:
         ax.set_xlabel(title)
         ax.invert_yaxis()
         ax.grid(alpha=0.3)
-    handles, labels = ax.get_legend_handles_labels()
+    handles, labels = figure.axes[-1].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=5, fontsize=8)
     return figure
 

@@ -81,14 +81,14 @@ def texts(u: np.ndarray, name: str) -> list[str]:
 def params(u: np.ndarray) -> RPSParams:
     """Return the parameters of RPS (n,) under the readings at points u (n, q)."""
     known = {name: np.full(len(u), value) for name, value in RPSParams()._asdict().items()}
-    return RPSParams(**known | {name: values(u, name) for name in _OF_RPS})
+    return RPSParams()._replace(**known | {name: values(u, name) for name in _OF_RPS})
 
 
 def aps_params(u: np.ndarray) -> APSParams:
     """Return the parameters of APS (n,) under the readings at points u (n, q)."""
     known = {name: np.full(len(u), value) for name, value in APSParams()._asdict().items()}
     drawn = {name: values(u, f"aps_{name}") for name in known if f"aps_{name}" in UNKNOWNS}
-    return APSParams(**known | drawn)
+    return APSParams()._replace(**known | drawn)
 
 
 def redraw_hardware(

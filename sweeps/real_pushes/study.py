@@ -233,8 +233,8 @@ class RealPushes(QuickStudy[xr.Dataset]):
             "series": series.to_numpy(str),
         }
         off = xr.concat(by_model, "fitted").assign_coords(
-            fitted=fitted,
-            **{f"sample_{name}": ("sample", x[samples]) for name, x in labels.items()},
+            {f"sample_{name}": ("sample", x[samples]) for name, x in labels.items()}
+            | {"fitted": ("fitted", fitted)}
         )
         rows = xr.DataArray(fitted_on[samples], dims="sample")
         by_finger = [off.sample_both.where(rows & (off.sample_finger == x)) for x in FINGERS]
@@ -474,7 +474,9 @@ def _validated(results: xr.Dataset) -> pd.DataFrame:
 
 def _layout_rows(validated: pd.DataFrame) -> Iterator[list[Any]]:
     """Yield errors on each layout of feet, with the best friction for the other layouts."""
-    for (group, layout, model), rows in validated.groupby(["group", "layout", "model"], sort=False):
+    columns = ["group", "layout", "model"]
+    for _, rows in validated.groupby(columns, sort=False):
+        group, layout, model = rows[columns].iloc[0]
         cells = [float(rows.friction.iloc[0])]
         for x in Errors._fields:
             cells += [[*median_interval(rows[x].to_numpy())], rows[x].quantile(0.9)]
@@ -483,8 +485,10 @@ def _layout_rows(validated: pd.DataFrame) -> Iterator[list[Any]]:
 
 def _series_rows(results: xr.Dataset, validated: pd.DataFrame) -> Iterator[list[Any]]:
     """Yield errors over all layouts, and the intervals in which those of a new series lie."""
-    validated = validated[validated.group != GROUPS[2]]
-    for (group, model), rows in validated.groupby(["group", "model"], sort=False):
+    for _, rows in validated.query(f"group != {GROUPS[2]!r}").groupby(
+        ["group", "model"], sort=False
+    ):
+        group, model = rows[["group", "model"]].iloc[0]
         series = [[_errors_in(x) for _, x in part.groupby("series")]
                   for _, part in rows.groupby("layout")]  # fmt: skip
         limits = np.quantile([_summary(x) for x in _resampled(series)], [0.025, 0.975], axis=0)
