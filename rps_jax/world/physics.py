@@ -54,9 +54,8 @@ _PYRAMID = Physics(timestep=0.001, cone="pyramidal", iterations=20, ls_iteration
 PHYSICS = {
     "default": {
         "reference": _EXACT,
-        # Share of the 432 outcomes equal to the reference's in C (`rps paper`):
-        "standard": Physics(),  # MJX 99.5 %, fused 100 %
-        # MJX 95.6 %, fused 100 %. On the ground of `standard`, flat boxes at rest drift at 20 ms.
+        "standard": Physics(),
+        # On the ground of `standard`, flat boxes at rest drift at 20 ms.
         "fast": Physics(timestep=0.02, iterations=6, ls_iterations=8, ground_solref=(0.1, 0.3)),
     },
     "paper_gazebo": {

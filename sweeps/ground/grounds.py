@@ -63,7 +63,7 @@ CONVERGED = {
 STEPPED = {
     "ours_5ms": _on(_C, "ours, 5 ms", timestep=0.005),
     "standard": _on(preset(), "ours, standard: 10 ms"),
-    "fast": _on(_FAST, "ours, fast: 20 ms, impedance 0.5"),
+    "fast": _on(_FAST, "ours, fast: 20 ms, damping ratio 0.3"),
     "mujocos_5ms": _on(_DEFAULT, "MuJoCo's own, 5 ms", timestep=0.005),
     "mujocos_10ms": _on(_DEFAULT, "MuJoCo's own, 10 ms", timestep=0.01),
 }
@@ -77,13 +77,14 @@ STIFFER = {
 } | {
     f"damping_{name}": _on(_C, f"ours, damping ratio {ratio}: {times} times as stiff",
                            timestep=timestep, solref=(0.1, ratio))
-    for name, ratio, times, timestep in (("01", 0.1, 9, 5e-4), ("003", 0.03, 100, 1e-4))
+    for name, ratio, times, timestep in (("01", 0.1, 4, 5e-4), ("003", 0.03, 44, 1e-4))
 }  # fmt: skip
 # Lifted less by MuJoCo's cones: the lower the impedance, the deeper an object rests.
 _LOW = {"solref": (0.1, 0.2), "ground_impedance": 0.3}
 LOWER = {
     "lower": _on(_C, "(0.1 s, 0.2), impedance 0.3", **_LOW),
     "lower_10ms": _on(preset(), "(0.1 s, 0.2), impedance 0.3, 10 ms", **_LOW),
+    "damped": _on(_C, "(0.1 s, 0.3), impedance 0.7", solref=(0.1, 0.3), ground_impedance=0.7),
     "lower_20ms": _on(_FAST, "(0.1 s, 0.4), impedance 0.5, 20 ms", solref=(0.1, 0.4)),
 }
 GROUNDS = CONVERGED | STEPPED | STIFFER | LOWER

@@ -50,18 +50,18 @@ class Kind(NamedTuple):
 
 
 _STANDARD = preset()
-_STIFFER = replace(_STANDARD, ground_solref=(0.1, 0.2), ground_impedance=0.5)
+_DAMPED = replace(_STANDARD, ground_solref=(0.1, 0.3), ground_impedance=0.7)
 KINDS = {
     "reference": Kind("ours, 1 ms", preset(fidelity="reference")),
     "standard": Kind("ours, standard: 10 ms", _STANDARD),
     "fused": Kind("ours, standard: 10 ms, engine fused", _STANDARD, "fused"),
-    "fast": Kind("ours, fast: 20 ms, impedance 0.5", preset(fidelity="fast")),
+    "fast": Kind("ours, fast: 20 ms, damping ratio 0.3", preset(fidelity="fast")),
     "slow": Kind("ours, 10 ms, base at 2.5 cm/s", _STANDARD, speed=SPEED / 2),
     "impratio_1": Kind("ours, 10 ms, impratio 1", replace(_STANDARD, impratio=1.0)),
     "impratio_100": Kind("ours, 10 ms, impratio 100", replace(_STANDARD, impratio=100.0)),
-    "lower": Kind("(0.1 s, 0.2), impedance 0.3, 10 ms", replace(_STIFFER, ground_impedance=0.3)),
-    "stiffer": Kind("(0.1 s, 0.2), impedance 0.5, 10 ms", _STIFFER),
-    "stiffer_fused": Kind("(0.1 s, 0.2), impedance 0.5, 10 ms, engine fused", _STIFFER, "fused"),
+    "lower": Kind("(0.1 s, 0.2), impedance 0.3, 10 ms", replace(_STANDARD, ground_impedance=0.3)),
+    "damped": Kind("(0.1 s, 0.3), impedance 0.7, 10 ms", _DAMPED),
+    "damped_fused": Kind("(0.1 s, 0.3), impedance 0.7, 10 ms, engine fused", _DAMPED, "fused"),
     "mujocos": Kind("MuJoCo's own, 2 ms", replace(_STANDARD, timestep=0.002, **MUJOCO_GROUND)),
 }
 
