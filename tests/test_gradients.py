@@ -205,7 +205,8 @@ def test_a_combination_weighs_by_inverse_variance_by_hand(a, b, expected):
 
 
 def params_of(theta) -> RPSParams:
-    return RPSParams.paper()._replace(L=theta[0], K_h=theta[1], beta=theta[2], K_v=theta[3])
+    # Once saturated, a velocity does not depend on K_v, nor does omega that follows from it.
+    return RPSParams.unsaturated()._replace(L=theta[0], K_h=theta[1], beta=theta[2], K_v=theta[3])
 
 
 def final_distance(snapshots):
