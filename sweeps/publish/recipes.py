@@ -194,7 +194,7 @@ RECIPES: dict[str, Recipe] = {
         labels=("rps_tuned", "rps_plus", "rps_plus, three axes"),
     ),
     "regression": recipe(
-        "rps regress --laws rps rps_tuned rps_plus learned_gru", cores=3, gpu=1, section="Wins"
+        "rps regress --laws rps rps_tuned rps_plus learned_gru", cores=3, gpu=1, section="Successes"
     ),
     "readings": recipe("rps sweeps/ambiguities", cores=15, gpu=4, section="Readings, *"),
     "readings_plus": recipe(
