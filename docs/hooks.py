@@ -49,7 +49,7 @@ TABS: dict[str, list[Any]] = {
     ],
     "The law": ["rps_jax/law.md", "notebooks/01_the_law.md", "notebooks/02_one_push.md"],
     "The paper": [
-        *("notebooks/03_paper.md", "table", "hardware", "ambiguities"),
+        *("notebooks/03_paper.md", "table", "hardware", "paper_reading", "ambiguities"),
     ],
     "Random worlds": ["notebooks/04_robustness.md", "random_worlds", "models"],
     "Tuning": [

@@ -45,16 +45,17 @@ print(
 #
 # 1. *Approach* (yellow). Without contact, the base moves forward at 1 cm/s until the skin
 #    touches.
-# 2. *Turning at the edge* (blue, until 43 s). The target is straight behind, so the base turns
+# 2. *Turning at the edge* (blue, until 35 s). The target is straight behind, so the base turns
 #    right, and within seconds the contact moves to the left edge of the front. There the law
 #    enters the Realignment State: $a_r$ = 10, and the speed is almost all sideways, after the
 #    contact. The box touches at one point near $l_{cr}$ (dashed), and base and box rotate about
 #    each other. Since $\sigma$ is nearly zero at this offset, the rotation is slow: this phase
-#    takes a third of the trial.
-# 3. *Pushing* (43 to 98 s). The box has rotated until its side is flat on the front (the point
-#    becomes a line at 38 s). The contact offset decreases to 7 cm, below $\beta$; $a_r$ decreases
-#    to 0.4, and the base moves forward at nearly full speed with a little motion to the left.
-# 4. *Arrival* (from 98 s). Within $d_{th}$ = 0.5 m Eq. 5 gives no lateral motion: $a_r$ drops to
+#    takes a quarter of the trial.
+# 3. *Pushing* (35 to 102 s). The box rotates until its side is flat on the front: the point becomes
+#    a line at 50 s, and the contact offset jumps and recovers. It decreases to 7 cm, below $\beta$;
+#    $a_r$ decreases to 0.5, and the base moves forward at nearly full speed with some motion to the
+#    left.
+# 4. *Arrival* (from 102 s). Within $d_{th}$ = 0.5 m Eq. 5 gives no lateral motion: $a_r$ drops to
 #    0, and the path bends visibly. The speed decreases with the distance (Eq. 3), so the last
 #    half metre takes 23 s, nearly a fifth of the trial.
 #

@@ -1,7 +1,7 @@
 """Reproduction of the paper: its tables, figures and hardware experiments in one run folder.
 
-`notebooks/03_paper` lists the details that the paper leaves open. The study `sweeps/ambiguities`
-measures the effect of each reading.
+`notebooks/03_paper` lists the details that the paper leaves open. `sweeps/ambiguities` measures the
+effect of each reading, and `sweeps/paper_reading` infers the reading from all printed numbers.
 """
 
 from collections.abc import Sequence
@@ -81,7 +81,7 @@ class Paper(SimulationQuestion[xr.DataTree]):
         reached = "reached" if int(trial.outcome_success) else "not reached"
         text = f"The target is {reached} at {float(trial.outcome_time):.1f} s."
         fig_6 = Picture("trial", partial(figures.one_trial, trial, push.case.title))
-        left_open = "`notebooks/03_paper` lists our readings; `sweeps/ambiguities` measures others."
+        left_open = "`notebooks/03_paper` lists our readings; `sweeps/paper_reading` infers them."
         return [
             *_setup(),
             *table.sections(results["table"].to_dataset()),

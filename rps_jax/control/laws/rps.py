@@ -9,7 +9,8 @@ Order of saturation: the paper says that the computed velocities "were saturated
 and 0.15 rad/s [...] prior to being commanded", and that "the change of omega as a function of v_x^R
 in addition to gamma offers a key advantage". It leaves open whether v_x in Eq. 6 and v* in Eq. 9
 are the saturated ones. The bicycle model of its reference bounds the speed before it computes the
-yaw rate. So do we; otherwise omega is often at its bound, whatever v_x (see `unsaturated`).
+yaw rate. So do we; otherwise omega is often at its bound, whatever v_x (see `unsaturated`), and the
+paper's hardware results do not come out (`sweeps/paper_reading`).
 
 The law has switches. With `Temperatures` each switch is a weight from 0 to 1 that mixes its two
 alternatives (see `soft`), so that the law is smooth. Without them it is the paper's law.
