@@ -3,11 +3,14 @@
 import numpy as np
 import pytest
 import xarray as xr
+from helpers import ROOT
 
 from rps_jax.control.laws.rps import RPSParams
+from rps_jax.robot.robot import ROBOTS
 from rps_jax.robot.skin import LINE, POINT
 from rps_jax.world import paper
 from rps_jax.world.objects import PAPER_OBJECTS
+from sweeps import render_tables
 from sweeps.paper_reading import drawing, evidence, experiments, printed
 from sweeps.paper_reading.printed import NUMBERS, Printed
 from sweeps.paper_reading.unknowns import NAMES, UNKNOWNS, Proposal, redraw_hardware, texts
@@ -216,3 +219,17 @@ def test_the_papers_numbers_are_drawn_beside_their_predictions(toy):
     stars = [line.get_xdata()[0] for line in time.lines if line.get_marker() == "*"]
     assert stars == [89, 88]
     assert len(rates.get_yticklabels()) == 23
+
+
+def test_the_page_and_the_slipping_base_agree_with_the_published_inference():
+    rows = render_tables.load("reading_numbers")["rows"]
+    inside = [row[-1] == "yes" for row in rows if row[0].startswith("Table II")]
+    page = (ROOT / "sweeps" / "paper_reading" / "README.md").read_text()
+    assert f"{sum(inside)} of {len(inside)} cells of Table II" in page
+    for name, label in {"slip": "v_x", "slip_sideways": "v_y", "slip_yaw": "omega"}.items():
+        row = f"reading_posterior | hardware | share of {label} that is lost"
+        median = float(render_tables.cell(f"{row} | posterior: median, 5 to 95 %"))
+        assert getattr(ROBOTS["slipping"], name) == pytest.approx(median, abs=0.03)
+    low = render_tables.load("reading_posterior")["rows"]
+    (friction,) = (row[3] for row in low if row[1] == "friction box-robot")
+    assert paper.HARDWARE_ROBOT[0] == pytest.approx(float(friction.split("[")[1][:4]), abs=0.05)
