@@ -33,7 +33,7 @@ SWEEPS = ROOT / "sweeps"
 KEYS = ("command", "device", "versions", "commit", "date", "columns", "rows")
 _BLOCK = re.compile(r"(<!-- (table|command): (\S+) -->\n).*?(<!-- end -->)", re.DOTALL)
 _CELL = re.compile(r"(<!-- cell: ([^>]*?) -->).*?(<!-- end -->)", re.DOTALL)
-# The change since each stale data file: what follows "Computed by 0.3.0 at commit ..., before".
+# The change since each stale data file: what follows "Computed by 0.3.0 before".
 _LOADS = "random objects had loads of finite size and slid on today's ground"
 _READING = f"omega followed from the saturated v_x, and {_LOADS}"
 STALE: dict[str, str] = {
@@ -150,8 +150,7 @@ def caption(name: str, data: dict[str, Any], link: str) -> str:
     else:
         notes = []
         if name in STALE:
-            at = f" at commit {data['commit'][:7]}" if data["commit"] else ""
-            notes = [f"Computed by {data['versions']['rps_jax']}{at}, before {STALE[name]}"]
+            notes = [f"Computed by {data['versions']['rps_jax']} before {STALE[name]}"]
         parts = [f"Device: {data['device']}"] if data["device"] else []
         parts += [f"date: {data['date']}"] if data["date"] else []
         last = "; ".join([*parts, f"[command, versions and values]({link})"])

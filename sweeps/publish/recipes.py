@@ -133,6 +133,13 @@ RECIPES: dict[str, Recipe] = {
         gpu=4,
         section=rows.comparison,
     ),
+    "saturation": recipe(
+        "rps ladder --laws rps_unsaturated rps rps_tuned --domain wide hostile real "
+        "--worlds 10000 --seed 4",
+        cores=10,
+        gpu=4,
+        section=rows.comparison,
+    ),
     "random_worlds": recipe(
         "rps sweep --domain wide --worlds 36000 --laws rps nps aps",
         gpu=4,
