@@ -94,6 +94,8 @@ def test_a_stale_file_must_be_listed_and_a_current_one_must_not(
     (tmp_path / "results").mkdir()
     (tmp_path / "results" / "table.json").write_text(json.dumps(data))
     monkeypatch.setattr(study, "_SWEEPS", tmp_path)
+    for name in tuple(render_tables.STALE):
+        monkeypatch.delitem(render_tables.STALE, name)
     for name in listed:
         monkeypatch.setitem(render_tables.STALE, name, "the box had a lid")
     words = (SWEEPS / "publish", "--check-digests", "--out", tmp_path / "run")
