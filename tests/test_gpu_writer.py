@@ -53,7 +53,7 @@ class Emulated:
     def __init__(self, function, example, folder, threads):
         """Compile it; `example` are the arguments of one world."""
         leaves, self.tree = jax.tree.flatten(example)
-        with vectors.reductions_in_one():
+        with vectors.trace_one_world():
             closed, computed = jax.make_jaxpr(function, return_shape=True)(*example)
         self.outs, self.structure = jax.tree.flatten(computed)
         self.threads, shapes = threads, [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in leaves]

@@ -20,8 +20,7 @@ import tempfile
 import threading
 import warnings
 from collections import defaultdict
-from collections.abc import Callable, Iterator, Sequence
-from contextvars import ContextVar
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -47,7 +46,6 @@ _NO_COMPILER = (
     "a C compiler (apt install gcc) or NVRTC (pip install nvidia-cuda-nvrtc) is not installed"
 )
 _PLATFORMS = {"cpu": "cpu", "gpu": "CUDA"}
-_TRACING: ContextVar[bool] = ContextVar("rps_jax_traces_one_world", default=False)
 libraries: dict[str, ctypes.CDLL] = {}  # of the functions that XLA can call, by name
 _locks: defaultdict[str, threading.RLock] = defaultdict(threading.RLock)
 
@@ -57,7 +55,7 @@ def is_available() -> bool:
 
     Warns if a GPU has no compiler, unless the user chose so by `RPS_COMPILER=none`.
     """
-    if jax.config.jax_enable_x64 or _TRACING.get():
+    if jax.config.jax_enable_x64 or vectors.ONE_WORLD.get():
         return False
     compiler = target()
     on_gpu = jax.default_backend() == "gpu"
@@ -136,17 +134,6 @@ def concurrent(
     return run
 
 
-@contextlib.contextmanager
-def _one_world() -> Iterator[None]:
-    """Trace a function of one world: its reductions are one operation, and nothing is nested."""
-    token = _TRACING.set(True)
-    try:
-        with vectors.reductions_in_one():
-            yield
-    finally:
-        _TRACING.reset(token)
-
-
 class _Function:
     """The jaxpr of a function of one world, with the arguments and shapes of a batch."""
 
@@ -156,7 +143,7 @@ class _Function:
     ) -> None:  # fmt: skip
         self.leaves, tree = jax.tree.flatten(jax.tree.map(jnp.asarray, arguments))
         self.inputs = [jax.ShapeDtypeStruct(x.shape[1:], x.dtype) for x in self.leaves]
-        with _one_world():
+        with vectors.trace_one_world():
             world = jax.tree.unflatten(tree, self.inputs)
             self.jaxpr, out = jax.make_jaxpr(function, return_shape=True)(*world)
         self.results, self.structure = jax.tree.flatten(out)

@@ -108,21 +108,21 @@ def times(p: Sequence[Number], q: Sequence[Number]) -> tuple[Number, Number, Num
 
 # --- reductions over the leading axis, of corners or contacts ----------------------------------
 
-_IN_ONE = ContextVar("rps_jax_reductions_in_one", default=False)
+ONE_WORLD = ContextVar("rps_jax_traces_one_world", default=False)  # so nothing is nested
 
 
 @contextmanager
-def reductions_in_one() -> Iterator[None]:
-    """Trace reductions as one operation, from which `rps_jax.lowering` makes one loop.
+def trace_one_world() -> Iterator[None]:
+    """Trace a function of one world for `rps_jax.lowering`: each reduction is one operation.
 
     On a processor XLA turns such an operation into a loop over the leading axis for one world at a
     time, and sums of slices into vectors of worlds.
     """
-    token = _IN_ONE.set(True)
+    token = ONE_WORLD.set(True)
     try:
         yield
     finally:
-        _IN_ONE.reset(token)
+        ONE_WORLD.reset(token)
 
 
 def _over(
@@ -130,7 +130,7 @@ def _over(
 ) -> Number:
     if isinstance(x, float | int):
         return x
-    if _IN_ONE.get():
+    if ONE_WORLD.get():
         return in_one(x, axis=0)
     rows = [x[i] for i in range(x.shape[0])]
     while len(rows) > 1:  # in pairs, for a short chain of dependent operations
