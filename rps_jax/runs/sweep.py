@@ -39,23 +39,33 @@ from rps_jax.world import points
 from rps_jax.world.points import Points
 
 
-class PlanQuestion(SimulationQuestion[xr.Dataset]):
+class _StoredPlan(Question[xr.Dataset]):
+    """Base class of questions whose run folder has a `plan` as its manifest."""
+
+    STORES_ITSELF: ClassVar[bool] = True  # chunk by chunk, see `execution`
+    plan: Plan | functools.cached_property[Plan]
+
+    def configuration(self) -> dict[str, Any]:
+        return self.plan.configuration()
+
+    def intro(self, results: xr.Dataset) -> str:
+        return describe_plan(self.plan)
+
+    def report(self, results: xr.Dataset, run: Run) -> Sequence[Section]:
+        return plan_sections(self.plan, results, run.folder)
+
+
+class PlanQuestion(_StoredPlan, SimulationQuestion[xr.Dataset]):
     """Base class of questions whose trials are those of a `plan`, the manifest of the run folder.
 
     The answer has the outcomes (law, world), and the drawn quantities (world) as coordinates.
     """
-
-    STORES_ITSELF: ClassVar[bool] = True  # chunk by chunk, see `execution`
-    plan: Plan | functools.cached_property[Plan]
 
     def check(self) -> None:
         self.plan.check_here()
 
     def num_trials(self) -> int | None:
         return self.plan.num_trials
-
-    def configuration(self) -> dict[str, Any]:
-        return self.plan.configuration()
 
     def answer(self, run: Run) -> xr.Dataset:
         return run_plan(
@@ -90,12 +100,6 @@ class SweepQuestion(PlanQuestion, DomainQuestion[xr.Dataset], MultiLawQuestion[x
         # A file takes longer to write than many of its trials take to run.
         chunk_size = self.part or min(max(count // 16, 1024), 16384)
         return Plan(self.ranges, count, self.chosen, self.setting, chunk_size, at)
-
-    def intro(self, results: xr.Dataset) -> str:
-        return describe_plan(self.plan)
-
-    def report(self, results: xr.Dataset, run: Run) -> Sequence[Section]:
-        return plan_sections(self.plan, results, run.folder)
 
 
 def describe_plan(plan: Plan) -> str:
@@ -252,11 +256,10 @@ sweep = call_of(Sweep)
 
 
 @dataclass(frozen=True)
-class Merge(Question[xr.Dataset]):
+class Merge(_StoredPlan):
     """Merge the shards of a sweep into one run folder, with its results and its report."""
 
     TITLE: ClassVar[str] = Sweep.TITLE
-    STORES_ITSELF: ClassVar[bool] = True
 
     folders: tuple[Path, ...] = option((), positional=True)
     """Run folders of the shards; one, if they share it."""
@@ -274,9 +277,6 @@ class Merge(Question[xr.Dataset]):
         if self.out is None:
             raise InputError("out = None is not allowed: name the run folder of the merged sweep.")
 
-    def configuration(self) -> dict[str, Any]:
-        return self.plan.configuration()
-
     def answer(self, run: Run) -> xr.Dataset:
         first, *rest = folders = [Path(folder) for folder in self.folders]
         out = run_folder.ensure_writable(Path(str(self.out)))
@@ -293,12 +293,6 @@ class Merge(Question[xr.Dataset]):
         for folder in folders:
             provenance.write_environment(out, provenance.read_environment(folder))
         return merged
-
-    def intro(self, results: xr.Dataset) -> str:
-        return describe_plan(self.plan)
-
-    def report(self, results: xr.Dataset, run: Run) -> Sequence[Section]:
-        return plan_sections(self.plan, results, run.folder)
 
 
 merge = call_of(Merge)
