@@ -157,7 +157,7 @@ def run_on_cluster(
         shared = _software(environment), prepare, slots, threads
         shares = _divide(chunks_by_key(plan, missing).values(), count)
         waiting = [task.remote(bare_plan, chunks, *shared) for chunks in shares]
-        with _one_sentence_errors(ray, waiting):
+        try:
             while waiting:
                 (ended,), waiting[:] = ray.wait(waiting)
                 contents, progress, worker = ray.get(ended)
@@ -169,6 +169,17 @@ def run_on_cluster(
                 simulated = total.simulated + progress.simulated
                 total = Progress(total.finished + progress.finished, simulated)
                 callback(total)
+        except ray.exceptions.RayError as error:
+            cause = getattr(error, "cause", None)
+            if cause is not None and not isinstance(cause, ray.exceptions.RayError):
+                raise cause from error
+            raise InputError(
+                f"ray has failed ({_last_line(error)}): finished chunks are stored; run the same "
+                "command again."
+            ) from error
+        finally:
+            for task in waiting:
+                ray.cancel(task, force=True)
 
 
 def _divide(groups: Iterable[Sequence[int]], workers: int) -> Iterator[Sequence[int]]:
@@ -176,24 +187,6 @@ def _divide(groups: Iterable[Sequence[int]], workers: int) -> Iterator[Sequence[
     for chunks in groups:
         size = math.ceil(len(chunks) / (workers * _TASKS))
         yield from (chunks[i : i + size] for i in range(0, len(chunks), size))
-
-
-@contextlib.contextmanager
-def _one_sentence_errors(ray: ModuleType, waiting: Sequence[Any]) -> Iterator[None]:
-    """Raise the error of a task in this process, and cancel all tasks."""
-    try:
-        yield
-    except ray.exceptions.RayError as error:
-        cause = getattr(error, "cause", None)
-        if cause is not None and not isinstance(cause, ray.exceptions.RayError):
-            raise cause from error
-        raise InputError(
-            f"ray has failed ({_last_line(error)}): finished chunks are stored; run the same "
-            "command again."
-        ) from error
-    finally:
-        for task in waiting:
-            ray.cancel(task, force=True)
 
 
 def on_cluster(address: str, device: Device) -> Callable[..., None]:
