@@ -112,12 +112,9 @@ def predict_push(
         rule = "fingers start outside and near: give path and pose in one frame, in metres"
         value = f"{moves.sum(axis=0).max():.2g} m long, {gap.min():.2g} m off the object at first"
         raise errors.not_allowed("path", value, rule)
-    ground = fingers.Ground(
-        np.broadcast_to(points[:, :2] - p_com, (count, len(points), 2)),
-        np.broadcast_to(points[:, 2], (count, len(points))),
-        np.zeros(count),
-        np.full(count, friction_ground * height),
-    )
+    support = np.broadcast_to(points - [*p_com, 0.0], (count, *points.shape))
+    shift = np.full(count, friction_ground * height)
+    ground = fingers.Ground(support[..., :2], support[..., 2], np.zeros(count), shift)
     chosen = ground.ellipsoid() if model == "ellipsoid" else ground
     parts = np.maximum(np.ceil(moves.max(axis=(1, 2)) * _STEPS / width), 1)
     first = np.concatenate([[0], np.cumsum(parts)]).astype(int)
@@ -128,9 +125,7 @@ def predict_push(
         raise errors.not_allowed("height", f"{height:g} m", "the object would tip over: push lower")
     poses = motion.pose[first]
     means = np.add.reduceat(motion.force, first[:-1]) / np.diff(first)[:, None, None]
-    force = (
-        friction_ground * mass * solid.GRAVITY * np.concatenate([np.zeros_like(means[:1]), means])
-    )
+    force = friction_ground * mass * solid.GRAVITY * np.insert(means, 0, 0.0, axis=0)
     gaps = np.array([_gaps(corners, *at) for at in zip(poses, paths, strict=True)])
     if gaps.min() < -_INSIDE * width:
         rule = "fingers must not squeeze a rigid object: move one of them away"
