@@ -31,6 +31,8 @@ UNITS = {
     "base_pose": ("m, m, rad", "x, y, yaw of the base in the world at the end"),
     "object_pose": ("m, m, rad", "x, y, yaw of the object in the world at the end"),
 }
+_TRACED = {"v_x": "m/s", "v_y": "m/s", "omega": "rad/s", "l": "m", "distance": "m", "a_r": "1",
+           "gamma": "rad", "realigning": "1"}  # fmt: skip  # units of numbers of a trace
 
 
 def nan_twists(results: xr.Dataset) -> str:
@@ -113,15 +115,9 @@ def trace_dataset(trajectory: Trajectory) -> xr.Dataset:
         "qpos": over_time(snapshots.qpos, "m, rad, 1", "joint"),
         "contact_type": over_time(snapshots.reading.contact_type, "1"),
         "p_robot_contact": over_time(snapshots.reading.p_robot_contact, "m", "axis"),
-        "v_x": over_time(snapshots.twist.v_x, "m/s"),
-        "v_y": over_time(snapshots.twist.v_y, "m/s"),
-        "omega": over_time(snapshots.twist.omega, "rad/s"),
-        "l": over_time(snapshots.details.l, "m"),
-        "distance": over_time(snapshots.details.distance, "m"),
-        "a_r": over_time(snapshots.details.a_r, "1"),
-        "gamma": over_time(snapshots.details.gamma, "rad"),
-        "realigning": over_time(snapshots.details.realigning, "1"),
     }
+    scalars = snapshots.twist._asdict() | snapshots.details._asdict()
+    variables |= {name: over_time(scalars[name], unit) for name, unit in _TRACED.items()}
     for name, value in trajectory.outcome._asdict().items():
         variables[f"outcome_{name}"] = variable(name, (), np.asarray(value))
     variables["p_world_contact"] = over_time(trial.p_world_contact(snapshots), "m", "axis")
