@@ -25,9 +25,7 @@ from rps_jax.robot import robot as robots
 from rps_jax.robot.robot import RobotLike
 from rps_jax.robot.skin import with_contacts
 from rps_jax.runs.question import BagQuestion, Run, call_of
-from rps_jax.tuning.logs import motion_faults
-
-_UNITS = {"v_x": "m/s", "v_y": "m/s", "omega": "rad/s"}
+from rps_jax.tuning.logs import COLUMNS, motion_faults
 
 
 @dataclass(frozen=True)
@@ -75,7 +73,7 @@ class Shadow(BagQuestion[xr.Dataset]):
         return xr.Dataset(
             {
                 name: (("source", "time"), both[..., i], {"units": unit})
-                for i, (name, unit) in enumerate(_UNITS.items())
+                for i, (name, unit) in enumerate(COLUMNS["twist"].items())
             },
             {"source": ["commanded", "law"], "time": recorded["time"]},
             {"law": registry.resolve_law(self.law)[0], "doubts": doubts},
@@ -86,7 +84,7 @@ class Shadow(BagQuestion[xr.Dataset]):
         rows = [["", "root mean square", "greatest", "at time [s]"]]
         is_nan = ~np.isfinite(results.to_array().sel(source="law")).all("variable").values
         finite = results.isel(time=~is_nan)
-        for name, unit in _UNITS.items():
+        for name, unit in COLUMNS["twist"].items():
             error = np.abs(finite[name].sel(source="law") - finite[name].sel(source="commanded"))
             if not error.size:
                 continue
