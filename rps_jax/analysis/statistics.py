@@ -29,8 +29,6 @@ NOT_PROMISED = (
 class Comparison(NamedTuple):
     """Outcomes of the same trials under two conditions, trial by trial."""
 
-    equal: float  # [1] share of trials with the same outcome
-    equal_interval: tuple[float, float]  # Wilson, 95 %
     gained: int  # trials that fail under the first and succeed under the second
     lost: int  # trials that succeed under the first and fail under the second
     p: float  # [1] of McNemar's exact test that gains and losses are equally likely
@@ -88,9 +86,8 @@ def compare(first: xr.DataArray, second: xr.DataArray) -> Comparison:
     """Compare outcomes (any equal shape) of the same trials."""
     a, b = first.values.astype(bool).ravel(), second.values.astype(bool).ravel()
     gained, lost = int(np.sum(~a & b)), int(np.sum(a & ~b))
-    equal = a.size - gained - lost
     p = min(1.0, 2 * float(scipy.special.bdtr(min(gained, lost), gained + lost, 0.5)))
-    return Comparison(equal / a.size, wilson(equal, a.size), gained, lost, p)
+    return Comparison(gained, lost, p)
 
 
 def worlds_by_object(results: xr.Dataset) -> dict[str, np.ndarray]:

@@ -130,12 +130,11 @@ def agreement_table(results: Mapping[str, xr.Dataset]) -> Rows:
         succeeded = dataset.success.values > 0
         same = succeeded == (base.success.values > 0)
         c = statistics.compare(base.success, dataset.success)
-        low, high = c.equal_interval
+        low, high = statistics.wilson(int(same.sum()), same.size)
         counts, equal = (
             [f"{mask[group].sum()} of {group.sum()}" for group in groups.values()]
             for mask in (succeeded, same)
         )
-        interval = f"{100 * low:.0f}-{100 * high:.0f} %"
-        difference = f"+{c.gained} -{c.lost}"
-        rows.append([name, *counts, f"{100 * c.equal:.1f} %", interval, *equal, difference])
+        share, interval = f"{100 * same.mean():.1f} %", f"{100 * low:.0f}-{100 * high:.0f} %"
+        rows.append([name, *counts, share, interval, *equal, f"+{c.gained} -{c.lost}"])
     return rows

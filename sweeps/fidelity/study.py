@@ -150,12 +150,14 @@ def table(results: xr.Dataset) -> Rows:
     for name in map(str, results.condition.values):
         condition = results.sel(condition=name)
         c = statistics.compare(base, condition.success)
-        low, high = c.equal_interval
+        total = base.size
+        equal = total - c.gained - c.lost
+        low, high = statistics.wilson(equal, total)
         median, worst = 1000 * np.quantile(condition.early_error.values, (0.5, 0.95))
         cost = float(condition.run_time) / float(condition.simulated)
         rows.append([
             str(condition.what.values),
-            f"{100 * c.equal:.1f} %", f"{100 * low:.0f}-{100 * high:.0f} %",
+            f"{100 * (equal / total):.1f} %", f"{100 * low:.0f}-{100 * high:.0f} %",
             f"+{c.gained} -{c.lost}", f"{c.p:.2g}", f"{median:.1f}, {worst:.1f} mm",
             f"{1000 * cost:.3g} ms",
         ])  # fmt: skip
