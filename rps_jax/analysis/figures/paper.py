@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import xarray as xr
 from matplotlib import patches
+from matplotlib.artist import setp
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
@@ -155,10 +156,8 @@ def min_distance(results: xr.Dataset) -> Figure:
             successes, trials = int(part.success.sum()), part.success.size
             name = "all objects" if column == "all" else words(column)
             ax.set_title(f"{law.upper()}, {name}: {successes}/{trials}", fontsize=9)
-    for ax in axes[-1]:
-        ax.set_xlabel("x [m]")
-    for ax in axes[:, 0]:
-        ax.set_ylabel("y [m]")
+    setp(axes[-1], xlabel="x [m]")
+    setp(axes[:, 0], ylabel="y [m]")
     colours, label = ScalarMappable(_SCALE, _COLOURS), "least distance of contact to target [m]"
     figure.colorbar(colours, ax=axes, label=label, shrink=0.8, extend="max")
     return figure

@@ -4,6 +4,7 @@ import textwrap
 from collections.abc import Sequence
 
 import xarray as xr
+from matplotlib.artist import setp
 
 from rps_jax.analysis import statistics
 from rps_jax.analysis.figures.style import Figure, axis_label, success_rates, tiles
@@ -35,8 +36,7 @@ def success_curves(results: xr.Dataset, count: int = 6) -> Figure:
         chance = " (may be chance)" * _is_flat(influence)
         ax.set_title(f"spread {_spread(influence)}, q = {influence.q:.1g}{chance}", fontsize=8)
         ax.grid(alpha=0.3)
-    for ax in axes[:, 0]:
-        ax.set_ylabel("success [%]")
+    setp(axes[:, 0], ylabel="success [%]")
     axes[0, 0].set_ylim(top=103)
     axes[0, 0].legend(fontsize=8)
     title = (
