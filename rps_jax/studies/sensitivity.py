@@ -192,15 +192,11 @@ def index_table(results: xr.Dataset) -> list[list[str]]:
     return rows
 
 
-def count_failing_points(results: xr.Dataset) -> int:
-    """Count the base points at which the trial of one of the two base samples fails."""
-    blocks = results.success.values.reshape(results.attrs["base"], -1)[:, [0, -1]]
-    return int((blocks == 0).any(axis=1).sum())
-
-
 def reliability(results: xr.Dataset) -> str:
     """Say in a sentence whether there are enough failures for reliable indices."""
-    count = count_failing_points(results)
+    # Base points at which the trial of one of the two base samples fails.
+    blocks = results.success.values.reshape(results.attrs["base"], -1)[:, [0, -1]]
+    count = count_true((blocks == 0).any(axis=1))
     warning = ", too few for reliable indices of success: run more worlds"
     end = warning if count < MIN_FAILING_POINTS else ""
     return f"Trials fail at {count} of {results.attrs['base']} base points{end}."
