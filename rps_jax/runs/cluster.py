@@ -89,7 +89,11 @@ def connected(address: str, **options: Any) -> Iterator[ModuleType]:
     if address == "local":
         options = {"include_dashboard": False} | options
     try:
-        _reach(address)
+        # Try the address first: Ray itself tries for minutes, and then ends the process.
+        known = os.environ.get("RAY_ADDRESS", "auto") if address == "auto" else address
+        host, _, port = known.rpartition(":")
+        if host and port.isdigit():
+            socket.create_connection((host, int(port)), PATIENCE).close()
         with warnings.catch_warnings():  # Ray starts its processes by fork and exec
             warnings.filterwarnings("ignore", r"os\.fork", RuntimeWarning)
             ray.init(address, log_to_driver=False, logging_level=logging.ERROR, **options)
@@ -102,15 +106,6 @@ def connected(address: str, **options: Any) -> Iterator[ModuleType]:
         yield ray
     finally:
         ray.shutdown()
-
-
-def _reach(address: str) -> None:
-    """Try the address first: Ray itself tries for minutes, and then ends the process."""
-    if address == "auto":
-        address = os.environ.get("RAY_ADDRESS", "auto")
-    host, _, port = address.rpartition(":")
-    if host and port.isdigit():
-        socket.create_connection((host, int(port)), PATIENCE).close()
 
 
 def _last_line(error: BaseException) -> str:

@@ -91,9 +91,13 @@ def run_plan(
     open_run(folder, plan)
     with run_folder.lock(folder, shard.index, shard.count):
         results = execute(folder, plan, shard=shard, **options) or Results(plan)
-        if shard.count > 1:
-            return _shard_dataset(results, folder, shard)
-        return write_dataset(results, [folder], folder, label)
+        if shard.count == 1:
+            return write_dataset(results, [folder], folder, label)
+        chunks = shard_chunks(plan, shard)
+        results.read(folder, list(chunks))
+        trials = np.unravel_index(np.concatenate(list(chunks.values())), results.shape)
+        law, world = (xr.DataArray(index, dims="row") for index in trials)
+        return results.dataset()[list(UNITS)].isel(law=law, world=world)
 
 
 def write_dataset(
@@ -107,15 +111,6 @@ def write_dataset(
     dataset = label(results.read_all(folders))
     files.write_results(out / "results.nc", dataset)
     return dataset
-
-
-def _shard_dataset(results: Results, folder: Path, shard: Shard) -> xr.Dataset:
-    """Return the outcomes (row) of a shard's trials, with the law and the world of each."""
-    chunks = shard_chunks(results.plan, shard)
-    results.read(folder, list(chunks))
-    trials = np.unravel_index(np.concatenate(list(chunks.values())), results.shape)
-    law, world = (xr.DataArray(index, dims="row") for index in trials)
-    return results.dataset()[list(UNITS)].isel(law=law, world=world)
 
 
 def missing_chunks(folder: Path, plan: Plan, shard: Shard) -> tuple[list[int], int]:

@@ -40,12 +40,6 @@ def name_of(chunk: int) -> str:
     return f"{chunk:07d}"
 
 
-def _of_another_version(chunk: int, why: str) -> InputError:
-    return InputError(
-        f"part {chunk} of the run was written by another version ({why}): use that version."
-    )
-
-
 class Results:
     """Results of a plan, which fill as trials end or as stored chunks are inserted.
 
@@ -154,7 +148,10 @@ class Results:
         columns.pop(_REMOVED, None)
         drawn = set(columns) - {"trial", *UNITS}
         if missing := {"trial", *UNITS, *(() if law[0] or drawn else ("drawn",))} - set(columns):
-            raise _of_another_version(chunk, f"it lacks {', '.join(sorted(missing))}")
+            raise InputError(
+                f"part {chunk} of the run was written by another version (it lacks "
+                f"{', '.join(sorted(missing))}): use that version."
+            )
         for name, values in columns.items():
             shape = worlds.shape + (self._outcomes[name].shape[2:] if name in UNITS else ())
             if values.shape != shape or values.dtype.kind not in "biuf":
