@@ -74,7 +74,10 @@ def compile_function(
         exported = export.export(jitted, disabled_checks=safe)(*leaves)
         (structure,) = structures
         with contextlib.suppress(ValueError, TypeError, AttributeError):  # cannot be serialised
-            cache.write(path, _encode(structure) + b"\n" + bytes(exported.serialize()))
+            example = structure.unflatten([0] * structure.num_leaves)
+            text = json.dumps(_to_json(example)).encode()
+            if _decode(text) == structure:
+                cache.write(path, text + b"\n" + bytes(exported.serialize()))
     else:
         structure, exported = stored
     program = compile_lowered(jax.jit(exported.call, donate_argnums=donated).lower(*leaves))
@@ -98,18 +101,6 @@ def _digests(data: object) -> object:
     if isinstance(array, np.ndarray):
         return array.shape, str(array.dtype), hashlib.sha256(array.tobytes()).hexdigest()
     return data
-
-
-def _encode(structure: pytree.PyTreeDef) -> bytes:
-    """Return the structure of a pytree as JSON, which `_decode` reads.
-
-    Raises:
-      ValueError, TypeError, AttributeError: it has nodes that JSON cannot hold.
-    """
-    text = json.dumps(_to_json(structure.unflatten([0] * structure.num_leaves))).encode()
-    if _decode(text) != structure:
-        raise ValueError(f"{structure} cannot be cached")
-    return text
 
 
 def _decode(text: bytes) -> pytree.PyTreeDef:
