@@ -172,7 +172,8 @@ def p_world_contact(snapshots: Snapshot) -> Float[Array, "T 2"]:
 
 def start(world: World, params: LawParams, law: Law = rps.LAW) -> Trial:
     """Return the trial of a world before its first control step."""
-    zero, false = jnp.zeros((), jnp.int32), jnp.zeros((), bool)
+    zero = jnp.zeros_like(world.qpos[0])
+    count, false = jnp.zeros((), jnp.int32), jnp.zeros((), bool)
     return Trial(
         qpos=world.qpos,
         qvel=jnp.zeros_like(world.qpos[:9]),
@@ -181,18 +182,10 @@ def start(world: World, params: LawParams, law: Law = rps.LAW) -> Trial:
         skin=world.skin.init(world.key),
         poses=jnp.tile(world.qpos[JOINTS.base], (*world.odometry.past.shape, 1)),
         twists=jnp.zeros((*world.odometry.past.shape, 3), world.qpos.dtype),
-        steps=zero,
-        contact_steps=zero,
-        lost_steps=zero,
-        sum_abs_l=jnp.zeros_like(world.qpos[0]),
-        min_distance=jnp.full_like(world.qpos[0], jnp.inf),
-        path_length=jnp.zeros_like(world.qpos[0]),
-        done=false,
-        success=false,
-        tilt=jnp.zeros_like(world.qpos[0]),
-        tipped=false,
-        diverged=false,
-        nan_twist=false,
+        min_distance=jnp.full_like(zero, jnp.inf),
+        **dict.fromkeys(("sum_abs_l", "path_length", "tilt"), zero),
+        **dict.fromkeys(("steps", "contact_steps", "lost_steps"), count),
+        **dict.fromkeys(("done", "success", "tipped", "diverged", "nan_twist"), false),
         drive=None if world.robot is None else drive.init_drive(world.qpos),
         load=base.init_load(world.qpos) if law.senses == "force" else None,
     )
