@@ -93,9 +93,7 @@ class Case(TrialOptions):
     @cached_property
     def base(self) -> Robot:
         """The robot."""
-        robot = robots.parse_robot(self.robot)
-        robot.check()
-        return robot
+        return robots.parse_robot(self.robot)
 
     @cached_property
     def sensor(self) -> Skin:
