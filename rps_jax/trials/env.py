@@ -32,7 +32,7 @@ from rps_jax.engines.base import ControlPeriod, Driven, Motion, Stage
 from rps_jax.engines.mjx_colliders import mjx
 from rps_jax.geometry import footprint as fp
 from rps_jax.geometry import planar
-from rps_jax.record.options import check_fields
+from rps_jax.record.options import check_fields, option
 from rps_jax.robot.robot import Robot, RobotLike
 from rps_jax.trials import trial
 from rps_jax.trials.batch import WorldBatch, rows
@@ -115,14 +115,13 @@ class PushEnv:
     setting: Setting = Setting(engine="fused")
     robot: RobotLike | None = None  # name, as kairos; None: the domain's
     weights: Reward = Reward()
-    worlds: int = 1024
+    worlds: int = option(1024, 1, 1_000_000)
 
     def __post_init__(self) -> None:
         """Check the options, and draw the worlds before a loop is traced."""
         check_fields(self)
         engines.get(self.setting.engine).check_traced()
         errors.check_name("skin of an environment", self._alone.skin, ("capacitive",))
-        errors.check_count("worlds", self.worlds, at_most=1_000_000)
         rps.check(self.params)
         check_finite_leaves(self.weights)
         with device.standard_jax():

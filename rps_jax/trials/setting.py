@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from rps_jax import engines, errors
+from rps_jax import engines
 from rps_jax.control import registry
 from rps_jax.control.base import LawParams
 from rps_jax.engines import EngineName
@@ -53,13 +53,12 @@ class Setting:
     """How finely the physics is solved: reference is converged and meant for the engine mujoco,
     standard is for results, and fast gives up some accuracy."""
     rules: Rules = Rules()
-    seed: int = 0
+    seed: int = options.option(0, 0, 2**32 - 1)
     """Seed of random worlds, and of the imperfections of skins."""
 
     def __post_init__(self) -> None:
         options.check_fields(self)
         self.rules.check()
-        errors.check_count("seed", self.seed, at_least=0, at_most=2**32 - 1)
         if self.physics.cone != "elliptic":  # all engines have this one: import no engine
             engines.get(self.engine).check_physics(self.physics)
 
