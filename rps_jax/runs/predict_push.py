@@ -92,8 +92,7 @@ def predict_push(
 
     paths = errors.check_array("path", path, ("T", 2), ("T", "F", 2), ("n", "T", "F", 2))
     is_batch = paths.ndim == 4
-    paths = paths[:, None] if paths.ndim == 2 else paths
-    paths = paths if is_batch else paths[None]
+    paths = np.array(paths[:, None] if paths.ndim == 2 else paths, ndmin=4)
     count, length = paths.shape[:2]
     pose = errors.check_array("pose", pose, (3,), *[(count, 3)] * is_batch)
     errors.check_finite("yaw of the pose", np.abs(pose[..., 2]).max(), at_most=13, unit="rad")
