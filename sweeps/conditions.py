@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, NamedTuple, Unpack
+from typing import Any, ClassVar, NamedTuple, Unpack
 
 import jax
 import numpy as np
@@ -32,6 +32,7 @@ from rps_jax.trials.rollout import outcomes
 from rps_jax.trials.setting import Setting
 from rps_jax.world import paper
 from rps_jax.world.objects import PAPER_OBJECTS
+from rps_jax.world.physics import PHYSICS
 from rps_jax.world.scene import FRICTION, Friction
 from sweeps.study_base import TrialStudy, load_part
 
@@ -202,6 +203,8 @@ class ConditionStudy(TrialStudy[xr.Dataset]):
 
     The results hold outcomes (condition, law, object, friction, target).
     """
+
+    PRESETS: ClassVar = {"physics": PHYSICS, "laws": paper.LAWS}
 
     targets: tuple[tuple[float, float], ...] = paper.TARGETS
     """Targets X Y [m], one pair after the other; by default the paper's 24."""

@@ -34,8 +34,10 @@ KEYS = ("command", "device", "versions", "commit", "date", "columns", "rows")
 _BLOCK = re.compile(r"(<!-- (table|command): (\S+) -->\n).*?(<!-- end -->)", re.DOTALL)
 _CELL = re.compile(r"(<!-- cell: ([^>]*?) -->).*?(<!-- end -->)", re.DOTALL)
 # The change since each stale data file: what follows "Computed by 0.3.0 before".
+_GROUND = "objects slid on today's ground"
 _LOADS = "random objects had loads of finite size and slid on today's ground"
-_READING = f"omega followed from the saturated v_x, and {_LOADS}"
+_SATURATED = "omega followed from the saturated v_x, and "
+_READING = _SATURATED + _LOADS
 STALE: dict[str, str] = {
     **dict.fromkeys(
         (
@@ -47,6 +49,8 @@ STALE: dict[str, str] = {
         _READING,
     ),
     **dict.fromkeys(("attack", "million", "rare_million", "sb3", "sensitivity"), _LOADS),
+    "ground": _GROUND,
+    "fidelity": _SATURATED + _GROUND,
 }
 _SKIPPED = {"runs", "build", "dist"}  # folders of the root that hold no pages of the repository
 

@@ -33,7 +33,7 @@ from rps_jax.app.cli import flags, names
 from rps_jax.control import registry
 from rps_jax.engines import device
 from rps_jax.errors import InputError
-from rps_jax.record import files, provenance
+from rps_jax.record import files, options, provenance
 from rps_jax.record.checkpoint import Checkpoints
 from rps_jax.runs import execution
 from rps_jax.runs.plan import Plan
@@ -121,6 +121,7 @@ class Study(Question[T]):
     CHOICES: ClassVar[Mapping[str, Collection[str]]] = {}  # known names of fields
     DIMENSION: ClassVar[str] = ""  # along which the parts are joined
     GROWS: ClassVar[tuple[str, ...]] = ()  # options that may change when a run is continued
+    PRESETS: ClassVar[Mapping[str, Any]] = {}  # physics and laws that code names, not options
     RESULTS: ClassVar[str] = "results"  # folder of the data files, relative to the study's folder
 
     # --- for subclasses to override --------------------------------------------------------
@@ -160,8 +161,9 @@ class Study(Question[T]):
 
     def configuration(self) -> dict[str, Any]:
         """Return everything that the parts of the run depend on, as JSON."""
-        options = super().configuration()
-        return {k: v for k, v in options.items() if k not in (*self.GROWS, "machine")}
+        fields = super().configuration()
+        fields |= {"presets": options.to_json(self.PRESETS)} if self.PRESETS else {}
+        return {k: v for k, v in fields.items() if k not in (*self.GROWS, "machine")}
 
     def answer(self, run: Run) -> Any:
         """Compute the parts that are missing, and join them."""
@@ -349,9 +351,9 @@ def digest(commands: Sequence[Sequence[str]]) -> str:
             continue
         name, rest = names.split(words)
         question, _ = flags.parse(names.question_type(name), name, rest)
-        options = question.configuration()
-        options |= _REMOVED_OPTIONS.get(options.get("question", ""), {})
-        configurations.append(_expanded(options))
+        fields = question.configuration()
+        fields |= _REMOVED_OPTIONS.get(fields.get("question", ""), {})
+        configurations.append(_expanded(fields))
     text = json.dumps(configurations, sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 

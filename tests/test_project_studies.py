@@ -4,6 +4,7 @@ import json
 import re
 import shlex
 import shutil
+from dataclasses import replace
 
 import pytest
 from helpers import ROOT, refusal
@@ -11,6 +12,7 @@ from helpers import ROOT, refusal
 from rps_jax.app.cli import flags, names
 from rps_jax.control import registry
 from rps_jax.control.learned import policy
+from rps_jax.world.physics import PHYSICS
 from sweeps.publish import study as publish
 from sweeps.publish.recipes import RECIPES
 from sweeps.study_base import _PACKAGES, Table, _reads_folder, digest, split_folder, write_table
@@ -150,6 +152,31 @@ def test_a_digest_changes_with_laws_domains_and_options():
     assert digest([command]) == digest([[*command, "--engine", "fused"]])
     for changes in (["--laws", "rps"], ["--domain", "real"], ["--seed", "3"], ["--worlds", "9"]):
         assert digest([command]) != digest([[*command, *changes]])
+
+
+# Studies that measure this machine, and one that has another ground.
+WITHOUT_PRESETS = ("speed", "levers", "publish", "force_push_grid")
+WITH_THE_PAPERS_LAW = ("ambiguities", "fidelity", "gradients", "paper_reading")
+
+
+def test_a_digest_changes_with_the_presets_in_the_code_of_a_study(monkeypatch):
+    """The options of these commands name neither the ground nor the parameters of the law."""
+    files = [json.loads(path.read_text()) for path in publish.published()]
+    lines = {line for data in files if "digest" in data for line in data["command"]}
+    studies = [shlex.split(line) for line in sorted(lines) if line.startswith("rps sweeps/")]
+    initial = [digest([words]) for words in studies]
+    for fidelity, physics in PHYSICS["default"].items():
+        changed = replace(physics, ground_impedance=0.6)
+        monkeypatch.setitem(PHYSICS["default"], fidelity, changed)
+    with_ground = [digest([words]) for words in studies]
+    changed = registry.LAWS["rps"]._replace(saturate_first=0.0)
+    monkeypatch.setitem(registry.LAWS, "rps", changed)
+    with_law = [digest([words]) for words in studies]
+    for words, *digests in zip(studies, initial, with_ground, with_law, strict=True):
+        has_presets = words[1].split("/")[1] not in WITHOUT_PRESETS
+        assert (digests[0] != digests[1]) == has_presets, words
+        has_law = words[1] in [f"sweeps/{name}" for name in WITH_THE_PAPERS_LAW]
+        assert digests[1] != digests[2] or not has_law, words
 
 
 def test_no_published_number_is_stale(monkeypatch):

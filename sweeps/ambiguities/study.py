@@ -32,7 +32,7 @@ class Ambiguities(ConditionStudy):
 
     TITLE: ClassVar[str] = "What the paper leaves open"
     QUICK: ClassVar[Mapping[str, Any]] = {"targets": paper.FEW_TARGETS}
-    GROWS: ClassVar[tuple[str, ...]] = ("laws", "readings", "gazebo", "curve")
+    GROWS: ClassVar[tuple[str, ...]] = ("readings", "gazebo", "curve")
 
     laws: tuple[str, ...] = ()
     """Names of laws; by default rps, and with --gazebo also nps and aps."""

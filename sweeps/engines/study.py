@@ -24,7 +24,7 @@ from rps_jax.runs.question import Run, call_of
 from rps_jax.trials.setting import Setting
 from rps_jax.world import domain as domains
 from rps_jax.world.domain import DomainLike, Range
-from rps_jax.world.physics import preset
+from rps_jax.world.physics import PHYSICS, preset
 from sweeps.study_base import Rows, Table, TrialStudy, run_plans
 
 _CONVERGED = Setting(physics=preset(fidelity="reference"), engine="mujoco")
@@ -58,6 +58,7 @@ class Engines(TrialStudy[xr.DataTree]):
     }
     CHOICES: ClassVar = {"engines": ENGINES}
     GROWS: ClassVar[tuple[str, ...]] = ("engines",)
+    PRESETS: ClassVar = PHYSICS["default"]
 
     law: LawLike = "rps"
     """The law: its name, as rps or aps, or a file's; changes follow, as rps,K_h=0.3."""

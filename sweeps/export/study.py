@@ -33,6 +33,7 @@ from rps_jax.trials.case import Case
 from rps_jax.trials.setting import Setting
 from rps_jax.world import paper
 from rps_jax.world.objects import PAPER_OBJECTS
+from rps_jax.world.physics import PHYSICS
 from sweeps.export import loop, native
 from sweeps.study_base import QuickStudy, Table, records, run_parts, text_table
 
@@ -55,6 +56,7 @@ class Export(QuickStudy[xr.DataTree]):
 
     TITLE: ClassVar[str] = "Laws in C and ONNX beside those in JAX"
     GROWS: ClassVar[tuple[str, ...]] = ("laws", "tables", "in_worlds")
+    PRESETS: ClassVar = PHYSICS["default"]
     QUICK: ClassVar[Mapping[str, object]] = {
         "laws": ("rps_plus",),
         **{"inputs": 20_000, "states": 20_000, "worlds": 4, "bags": 1},

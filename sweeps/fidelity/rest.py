@@ -23,7 +23,7 @@ from rps_jax.trials.progress import Progress
 from rps_jax.trials.worlds import starts
 from rps_jax.world import domain as domains
 from rps_jax.world import draws
-from rps_jax.world.physics import Physics, preset
+from rps_jax.world.physics import PHYSICS, Physics, preset
 from sweeps.study_base import QuickStudy, Rows, Table
 
 DOMAINS = ("wide", "hostile", "hostile,friction_ground=0.05:0.1,com_offset=0.5:0.7")
@@ -41,6 +41,7 @@ class Rest(QuickStudy[xr.Dataset]):
 
     TITLE: ClassVar[str] = "Do objects at rest stay?"
     QUICK: ClassVar[Mapping[str, object]] = {"worlds": 9, "seconds": 1.0}
+    PRESETS: ClassVar = PHYSICS["default"]
 
     worlds: int = option(150, 3, 100_000)
     """Number of worlds of each domain."""

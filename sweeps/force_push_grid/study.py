@@ -37,6 +37,7 @@ class ForcePushGrid(QuickStudy[xr.Dataset]):
     QUICK: ClassVar[Mapping[str, object]] = {"duration": 60.0, "sliders": ("box",)}
     CHOICES: ClassVar = {"laws": grid.LAWS, "sliders": grid.SLIDERS}
     GROWS: ClassVar[tuple[str, ...]] = ("laws", "sliders")
+    PRESETS: ClassVar = {"physics": grid.PHYSICS, "law": grid.PARAMS}
 
     laws: tuple[grid.LawName, ...] = grid.LAWS
     """Laws: force_push, and open_loop, which only returns to the path."""

@@ -39,6 +39,7 @@ from rps_jax.tuning.space import Space, expand_subsets
 from rps_jax.world import domain as domains
 from rps_jax.world import draws
 from rps_jax.world.domain import RANDOM, DomainLike
+from rps_jax.world.physics import PHYSICS
 from sweeps.gradients import estimators
 from sweeps.study_base import QuickStudy, Rows, Table
 
@@ -70,6 +71,7 @@ class Gradients(QuickStudy[xr.Dataset]):
     }
     CHOICES: ClassVar = {"estimators": ESTIMATORS, "object": RANDOM}
     GROWS: ClassVar[tuple[str, ...]] = ("estimators",)
+    PRESETS: ClassVar = {"physics": PHYSICS["default"], "laws": ("rps",)}
 
     estimators: tuple[str, ...] = ESTIMATORS
     """reverse, clipped (reverse with a bound in each world), forward, evolution or combined."""

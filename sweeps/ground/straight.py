@@ -28,7 +28,7 @@ from rps_jax.trials.worlds import starts
 from rps_jax.world import draws
 from rps_jax.world.domain import DOMAINS, Range
 from rps_jax.world.draws import Draw
-from rps_jax.world.physics import MUJOCO_GROUND, Physics, preset
+from rps_jax.world.physics import MUJOCO_GROUND, PHYSICS, Physics, preset
 from sweeps.ground.pushes import DISTANCE, GAP
 from sweeps.study_base import QuickStudy, Rows, Table, run_parts, text_table
 
@@ -74,6 +74,7 @@ class Straight(QuickStudy[xr.Dataset]):
     QUICK: ClassVar[dict[str, object]] = {"worlds": 9, "kinds": ("standard", "lower")}
     CHOICES: ClassVar = {"kinds": KINDS}
     GROWS: ClassVar[tuple[str, ...]] = ("kinds",)
+    PRESETS: ClassVar = PHYSICS["default"]
 
     kinds: tuple[str, ...] = tuple(KINDS)
     """Names of the grounds; by default all."""

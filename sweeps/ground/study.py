@@ -20,6 +20,7 @@ from matplotlib.lines import Line2D
 from rps_jax.analysis.figures.style import Figure, words
 from rps_jax.analysis.report import Picture
 from rps_jax.runs.question import Run, call_of
+from rps_jax.world.physics import PHYSICS
 from sweeps.ground import grounds
 from sweeps.study_base import QuickStudy, Table
 
@@ -36,6 +37,7 @@ class Ground(QuickStudy[xr.Dataset]):
     QUICK: ClassVar[Mapping[str, object]] = {"grounds": grounds.QUICK}
     CHOICES: ClassVar = {"grounds": grounds.GROUNDS}
     GROWS: ClassVar[tuple[str, ...]] = ("grounds",)
+    PRESETS: ClassVar = PHYSICS["default"]
 
     grounds: tuple[str, ...] = tuple(grounds.GROUNDS)
     """Names of the grounds; by default all."""

@@ -24,6 +24,7 @@ from rps_jax.runs.question import Run, call_of
 from rps_jax.trials.progress import SequentialProgress
 from rps_jax.trials.setting import Setting
 from rps_jax.world import paper
+from rps_jax.world.physics import PHYSICS
 from sweeps.paper_reading import drawing, evidence, experiments, printed
 from sweeps.paper_reading.experiments import Target
 from sweeps.paper_reading.unknowns import Proposal, redraw_hardware
@@ -47,6 +48,7 @@ class PaperReading(TrialStudy[xr.Dataset]):
         "draws": 2, "rounds": 1, "samples": 2, "first": 4, "repeats": 1,
         "targets": paper.FEW_TARGETS,
     }  # fmt: skip
+    PRESETS: ClassVar = {"physics": PHYSICS, "laws": paper.LAWS}
 
     draws: int = option(450, 2, 100_000)
     """Number of draws in each round."""

@@ -27,6 +27,7 @@ from rps_jax.analysis.report import Picture
 from rps_jax.record import files
 from rps_jax.record.options import option
 from rps_jax.runs.question import Run, call_of
+from rps_jax.world.physics import PHYSICS
 from sweeps.real_pushes import contact, pushes
 from sweeps.real_pushes.drawing import figure
 from sweeps.real_pushes.pushes import Errors
@@ -127,6 +128,7 @@ class RealPushes(QuickStudy[xr.Dataset]):
     TITLE: ClassVar[str] = "Does the physics predict real pushes?"
     CHOICES: ClassVar = {"models": WORDS}
     QUICK: ClassVar[Mapping[str, object]] = {"few": 60, "mujoco": 6}
+    PRESETS: ClassVar = PHYSICS["default"]
 
     pushes: Path | None = None
     """CSV file of pushes to predict, with the columns of data/pushes.csv; by default that file."""
