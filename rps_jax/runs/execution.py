@@ -31,10 +31,6 @@ RunMissing = Callable[..., Results | None]
 Label = Callable[[xr.Dataset], xr.Dataset]
 
 
-def _unchanged(outcomes: xr.Dataset) -> xr.Dataset:
-    return outcomes
-
-
 def run_missing(
     folder: Path,
     plan: Plan,
@@ -67,7 +63,7 @@ def run_plan(
     shard: Shard = Shard(),
     *,
     execute: RunMissing = run_missing,
-    label: Label = _unchanged,
+    label: Label = lambda outcomes: outcomes,
     **options: Any,
 ) -> xr.Dataset:
     """Run a plan in memory, or what a run folder lacks of it or of a shard.
@@ -101,7 +97,7 @@ def run_plan(
 
 
 def write_dataset(
-    results: Results, folders: Sequence[Path], out: Path, label: Label = _unchanged
+    results: Results, folders: Sequence[Path], out: Path, label: Label = lambda outcomes: outcomes
 ) -> xr.Dataset:
     """Add the chunks of run folders to results, and write `results.nc` into the folder `out`.
 
