@@ -132,7 +132,11 @@ def compile_solid(
     for name, size in geom_sizes(family, single).items():
         spec.geom(name).size[: size.size] = size
     if family == "prism":
-        _set_corners(spec, single)
+        distinct = np.any(single.vertices != np.roll(single.vertices, 1, axis=0), axis=1)
+        corners, half = single.vertices[distinct], single.height / 2
+        spec.mesh("prism").uservert = np.concatenate(
+            [np.column_stack([corners, np.full(len(corners), z)]) for z in (-half, half)]
+        ).ravel()
     if single.feet is not None and family == "cylinder":
         _add_feet(spec)
     if single.feet is not None or family == "prism":
@@ -190,15 +194,6 @@ def geom_sizes(family: str, solids: Solid) -> dict[str, np.ndarray]:
         size = np.stack([solids.radius, half, np.zeros_like(half)], axis=-1)
         return {"object": size, "object_side": size}
     return {}  # a prism is a mesh and points
-
-
-def _set_corners(spec: mujoco.MjSpec, single: Solid) -> None:
-    """Set the corners of the mesh of a prism."""
-    distinct = np.any(single.vertices != np.roll(single.vertices, 1, axis=0), axis=1)
-    corners, half = single.vertices[distinct], single.height / 2
-    spec.mesh("prism").uservert = np.concatenate(
-        [np.column_stack([corners, np.full(len(corners), z)]) for z in (-half, half)]
-    ).ravel()
 
 
 def _add_feet(spec: mujoco.MjSpec) -> None:
