@@ -33,9 +33,8 @@ class Checkpoints:
         return {name: path for name, path, _ in self._valid_files()}
 
     def items(self, names: Container[str] | None = None) -> Iterator[tuple[str, bytes]]:
-        """Yield names and contents of all parts, or of some, in the order of their names."""
-        for name, _, content in self._valid_files(names):
-            yield name, content
+        """Return names and contents of all parts, or of some, in the order of their names."""
+        return ((name, content) for name, _, content in self._valid_files(names))
 
     def get(self, name: str) -> bytes | None:
         """Return the content of one part; None if it is unfinished."""
