@@ -56,7 +56,6 @@ class Shadow(BagQuestion[xr.Dataset]):
     def check(self) -> None:
         """Check the law, the robot and the bag."""
         _ = self.params, robots.parse_robot(self.robot)
-        bags.check()
         if not bags.is_bag(Path(self.file)):
             rule = "give an MCAP file, a .db3 file, or a folder of `ros2 bag record`"
             raise errors.not_allowed("bag", self.file, rule)
