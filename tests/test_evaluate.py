@@ -15,9 +15,17 @@ from rps_jax.control.observation import Details, Twist
 from rps_jax.errors import InputError
 from rps_jax.runs import evaluate as room
 from rps_jax.runs.evaluate import Candidates, Split, evaluate, seed_of
+from rps_jax.studies.attack import Attack
+from rps_jax.studies.ceiling import Ceiling
+from rps_jax.studies.ladder import Ladder
+from rps_jax.studies.rare import Rare
+from rps_jax.studies.sensitivity import Sensitivity
 from rps_jax.trials.score import Objective
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import Rules
+from rps_jax.tuning.evolution import TuneES
+from rps_jax.tuning.fit import Fit
+from rps_jax.tuning.learn import Learn
 from rps_jax.tuning.space import Space
 from rps_jax.world import draws
 from rps_jax.world.domain import DOMAINS, Range
@@ -41,6 +49,17 @@ def paper(count, **changes):
 def test_no_two_splits_share_a_seed():
     seeds = [seed_of(seed, split) for seed in range(50) for split in get_args(Split)]
     assert len(set(seeds)) == len(seeds)
+
+
+@pytest.mark.parametrize(
+    "command", [Attack, Ceiling, Fit, Ladder, Learn, Rare, Sensitivity, TuneES], ids=str
+)
+def test_a_seed_that_no_split_can_have_is_named(command, tmp_path):
+    """The sentence has the seed of the user, not that of the split."""
+    options = {"out": tmp_path / "run", "setting": Setting(seed=2**31)}
+    with pytest.raises(InputError, match=r"^seed = 2147483648 is not allowed: .* to 1431655764"):
+        command(**options)()
+    assert not (tmp_path / "run").exists()
 
 
 def test_results_are_labelled_as_those_of_a_sweep():

@@ -93,7 +93,6 @@ def evaluate(
     at = None if points is None else points_.check_points(ranges, points)
     count = worlds if at is None else len(at.u)
     errors.check_count("worlds", count, at_most=10_000_000)
-    errors.check_count("seed", setting.seed, at_least=0, at_most=2**30)
     setting.check_here(ranges.weakest, [params])
     params, seed = _checked(params), seed_of(setting.seed, split)
     request = Candidates(params, [ranges], seed, np.arange(count), at)

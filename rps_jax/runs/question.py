@@ -87,7 +87,11 @@ def seed_of(seed: int, split: Split) -> int:
     """Return the seed of the worlds of one split; no two splits of any seeds share a world.
 
     The worlds of a domain that draws little, such as `paper`, hardly depend on the seed.
+
+    Raises:
+      InputError: the split is unknown, or the seed too large.
     """
+    errors.check_count("seed", seed, at_least=0, at_most=2**32 // len(_SPLITS) - 1)
     return len(_SPLITS) * seed + _SPLITS.index(errors.check_name("split", split, _SPLITS))
 
 

@@ -117,7 +117,7 @@ class Attack(DomainQuestion[xr.Dataset], LawQuestion[xr.Dataset]):
         errors.check_each_once("axes", self.axes)
         for name in self.axes:
             points.check_drawn("axes", name, self.ranges)
-        errors.check_count("seed", self.setting.seed, at_least=0, at_most=2**30)
+        _ = seed_of(self.setting.seed, "tune")
         self.check_engine([self.params])
         errors.require("ribs", "failures")
 

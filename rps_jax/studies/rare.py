@@ -207,7 +207,7 @@ class Rare(DomainQuestion[xr.Dataset], LawQuestion[xr.Dataset]):
     def check(self) -> None:
         least = self.groups * 2 * round(1 / self.share)
         errors.check_count("particles", self.particles, at_least=least, at_most=10_000_000)
-        errors.check_count("seed", self.setting.seed, at_least=0, at_most=2**30)
+        _ = seed_of(self.setting.seed, "tune")
         self.check_engine([self.params])
 
     @property

@@ -175,6 +175,7 @@ class Fit(LawQuestion[Fitted], DomainQuestion[Fitted], LogsQuestion):
         return logs, fields
 
     def check(self) -> None:
+        _ = seed_of(self.setting.seed, "tune")
         self.check_engine([self.params])
         check_law(self.label, registry.law_of(self.params), self.setting)
         if len({raw.exact for raw in self.raw_logs}) > 1:

@@ -131,7 +131,7 @@ class Learn(PPO, SimulationQuestion[xr.Dataset]):
         if not (self.minutes or self.updates):
             raise errors.InputError("minutes = 0 is not allowed without updates: set one of them.")
         errors.check_each_once("domain", self.domains)
-        errors.check_count("seed", self.setting.seed, at_least=0, at_most=2**30)
+        _ = seed_of(self.setting.seed, "tune")
         for domain in self.domains:
             errors.check_name("skin of a domain to learn in", domain.skin, ("capacitive",))
         engines.get(self.setting.engine).check_traced()

@@ -152,7 +152,7 @@ class Tuning(LawQuestion[xr.Dataset]):
         return {k: v for k, v in self.QUICK.items() if k != "tuned" or is_rps}
 
     def check(self) -> None:
-        errors.check_count("seed", self.setting.seed, at_least=0, at_most=2**30)
+        _ = seed_of(self.setting.seed, "tune")
         if not registry.law_of(self.params).bounds:
             names = [n for n, params in registry.LAWS.items() if registry.law_of(params).bounds]
             rule = f"its parameters have no bounds; choose from {', '.join(names)}"
