@@ -21,7 +21,7 @@ import dataclasses
 import functools
 import itertools
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from operator import attrgetter
 from pathlib import Path
@@ -305,12 +305,15 @@ class Question(Command[T]):
 
     def execute(self, callback: ProgressCallback) -> T:
         """Answer the question, and store the results in the run folder if there is one."""
-        if self.overwrite and self.out is not None:
-            folder.remove_run(Path(self.out))
+        out = None if self.out is None else Path(self.out)
+        if self.overwrite and out is not None:
+            folder.remove_run(out)
         if self.STORES_ITSELF:
-            out = None if self.out is None else Path(self.out)
             return self.answer(self.create_run(out, callback))
-        with self.open_folder() as out:
+        with contextlib.ExitStack() as stack:
+            if out is not None:
+                stack.enter_context(folder.lock(folder.claim(out, self.configuration())))
+                provenance.write_environment(out, device.collect_environment())
             answer = self.answer(self.create_run(out, callback))
             if isinstance(answer, xr.Dataset | xr.DataTree):
                 answer.attrs |= self.attributes()
@@ -332,17 +335,6 @@ class Question(Command[T]):
         """Return the run folder and the resources of the run."""
         size = getattr(self, "slots", None), getattr(self, "workers", None)
         return Run(out, callback, *size)
-
-    @contextlib.contextmanager
-    def open_folder(self) -> Iterator[Path | None]:
-        """Lock the run folder, which is new or holds the same configuration."""
-        if self.out is None:
-            yield None
-            return
-        out = folder.claim(Path(self.out), self.configuration())
-        with folder.lock(out):
-            provenance.write_environment(out, device.collect_environment())
-            yield out
 
     def fields_as_json(self) -> dict[str, Any]:
         """Return the fields as JSON, with laws by their parameters and a domain by its ranges."""
