@@ -197,12 +197,7 @@ class SimdNodes(Target):
             values = [values[0], values[2], values[1]]
         if op not in self.operations:
             raise UnsupportedError(name)
-        return self._elementwise(op, values, kind, out.shape)
-
-    def _elementwise(
-        self, op: str, values: Sequence[Value], kind: str, shape: tuple[int, ...]
-    ) -> Array:
-        size, args = size_of(shape), []
+        shape, size, args = out.shape, size_of(out.shape), []
         for value in values:
             own_shape = np.shape(value)
             if own_shape != shape and size_of(own_shape) > 1:
