@@ -10,7 +10,7 @@ import contextlib
 import importlib.util
 import sys
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from importlib.machinery import SourceFileLoader
 from pathlib import Path
 from types import ModuleType
@@ -46,31 +46,23 @@ def load(path: Path, *, again: bool = False) -> str:
     name = f"_rps_jax_{path.stem}_{_digest(path)}"
     imports = _IMPORTS.get(name, {})
     is_current = name in sys.modules and _digests(path.parent, imports) == imports
-    if again or not is_current:
-        with _imports_of(path.parent) as imports:
-            run_file(path, name)
-        _IMPORTS[name] = imports
-    return name
-
-
-@contextlib.contextmanager
-def _imports_of(root: Path) -> Iterator[dict[str, str]]:
-    """Allow imports from a folder; yield the digests of the imported files, filled at the end.
-
-    These modules are forgotten then, since another folder may have modules of the same names.
-    """
-    root, known_modules, imports = root.resolve(), set(sys.modules), dict[str, str]()
+    if is_current and not again:
+        return name
+    # Allow imports from its folder. Forget them after: another folder may have the same names.
+    root, known_modules, imports = path.parent.resolve(), set(sys.modules), dict[str, str]()
     sys.path.insert(0, str(root))
     importlib.invalidate_caches()
     try:
-        yield imports
+        run_file(path, name)
     finally:
         sys.path.remove(str(root))
-        for name in set(sys.modules) - known_modules:
-            file = Path(getattr(sys.modules[name], "__file__", None) or "/")
-            if file.is_relative_to(root) and not name.startswith("_rps_jax_"):
-                del sys.modules[name]
+        for module in set(sys.modules) - known_modules:
+            file = Path(getattr(sys.modules[module], "__file__", None) or "/")
+            if file.is_relative_to(root) and not module.startswith("_rps_jax_"):
+                del sys.modules[module]
                 imports[file.relative_to(root).as_posix()] = _digest(file)
+    _IMPORTS[name] = imports
+    return name
 
 
 def describe(path: Path) -> dict[str, Any]:
