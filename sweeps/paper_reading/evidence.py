@@ -246,7 +246,7 @@ def checks_table(results: xr.Dataset) -> list[list[str]]:
     return rows
 
 
-_TOLD = {
+_STATEMENTS = {
     "Fig. 6: the right corner touches first":
         "the sensor initially detected only the right corner, 0.2 m from the center",
     "Fig. 6: a_r starts near its highest": "a_r started from nearly at its highest value",
@@ -262,7 +262,7 @@ def figure_6_table(results: xr.Dataset) -> list[list[str]]:
     """Return a row for each statement of the text on Fig. 6: what the closest draw does."""
     holds, weights = experiments.observations(results), normalised(log_weights(results))
     rows = [["the paper's text", "in the closest draw", "posterior probability"]]
-    for name, text in _TOLD.items():
+    for name, text in _STATEMENTS.items():
         share = _probability(results, weights, results.simulated.sel(number=name).values > 0)
         rows.append([text, "yes" if holds[name] else "no", share])
     return rows

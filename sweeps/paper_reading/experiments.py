@@ -72,7 +72,7 @@ def _simulated_domain(targets: tuple[Target, ...]) -> Domain:
 
 @dataclass(frozen=True, eq=False)
 class _Trials(Candidates):
-    """Trials with parameters of their own, on skins of drawn tolerance."""
+    """Trials with drawn parameters, tolerance of the skin, and side of the load."""
 
     tolerance: np.ndarray | None = None  # (W,) [m] of an ideal skin
     is_far: np.ndarray | None = None  # (W,) whether the nonuniform box has its load at the far side
@@ -148,7 +148,7 @@ def _share(name: str, u: np.ndarray, domain: Domain, quantity: str) -> np.ndarra
 def hardware(u: np.ndarray, setting: Setting, run: Run, seed: int = 0) -> dict[str, np.ndarray]:
     """Return the numbers (draw,) of the hardware experiments at points u (draw, unknown).
 
-    Each push has a start of its own; `seed` draws it, and the noise of the skin.
+    `seed` draws the start of each push, and the noise of the skin.
     """
     draw, (objects, targets) = _grid(u, len(SHORT), len(HARDWARE.targets))
     columns = {"object": objects, "target": targets}
@@ -218,8 +218,8 @@ def simulation(
         aps = jax.tree.map(lambda leaf, draw=draw: leaf[draw], aps_params(at))
         laws = {"rps": rps, "nps": rps._replace(reactive=np.zeros(draw.size)), "aps": aps}
         requests = [_request(domain, columns, laws[law], **fields) for law in paper.LAWS]
-        found, _ = outcomes(requests, changed, **run.batch_options)
-        for i, outcome in enumerate(found):
+        results, _ = outcomes(requests, changed, **run.batch_options)
+        for i, outcome in enumerate(results):
             success[chosen, i] = np.asarray(outcome.success).reshape(len(chosen), *shape)
     x, y = np.array(targets).T
     coords = {"law": list(paper.LAWS), "object": list(domain.objects), "friction": list(FRICTION)}
@@ -296,19 +296,21 @@ def numbers(
     Points u (draw, unknown) differ in the hardware alone within each `samples` of them, for which
     the simulation runs once. Without targets only the hardware's experiments run.
     """
-    found = {
+    results = {
         name: (x, len(HARDWARE.targets)) for name, x in hardware(u, setting, run, seed).items()
     }
     if targets:
         once = u[::samples]
-        told = [observations(trace) for trace in figure_6(once, setting, run.callback)]
+        observed = [observations(trace) for trace in figure_6(once, setting, run.callback)]
         simulated = printed.counts(simulation(once, setting, targets, run))
-        simulated |= {name: (np.array([each[name] for each in told]), 1) for name in told[0]}
-        found |= {name: (np.repeat(x, samples), count) for name, (x, count) in simulated.items()}
-    names = [name for name in printed.NUMBERS if name in found]
+        simulated |= {
+            name: (np.array([each[name] for each in observed]), 1) for name in observed[0]
+        }
+        results |= {name: (np.repeat(x, samples), count) for name, (x, count) in simulated.items()}
+    names = [name for name in printed.NUMBERS if name in results]
     columns = {
-        "simulated": (("draw", "number"), np.stack([found[n][0] for n in names], 1)),
-        "trials": ("number", [found[name][1] for name in names]),
+        "simulated": (("draw", "number"), np.stack([results[n][0] for n in names], 1)),
+        "trials": ("number", [results[name][1] for name in names]),
         "u": (("draw", "unknown"), u),
     }
     return xr.Dataset(columns, {"number": names, "unknown": list(NAMES)})

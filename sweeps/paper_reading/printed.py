@@ -1,4 +1,4 @@
-"""All numbers that the paper prints, and the likelihood of a simulation that gives others."""
+"""Printed numbers of the paper, and their likelihood given simulated numbers."""
 
 from __future__ import annotations
 

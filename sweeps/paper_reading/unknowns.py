@@ -1,4 +1,4 @@
-"""What the paper does not tell: how to read its text, and what its experiments were like.
+"""Unknowns of the paper: readings of its text, and physics of its experiments.
 
 A draw has a value of every unknown, from one point of the unit cube. Unknowns of the text hold in
 simulation and on the hardware; the others belong to one of these.

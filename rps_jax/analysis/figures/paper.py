@@ -156,8 +156,8 @@ def min_distance(results: xr.Dataset) -> Figure:
             successes, trials = int(part.success.sum()), part.success.size
             name = "all objects" if column == "all" else words(column)
             ax.set_title(f"{law.upper()}, {name}: {successes}/{trials}", fontsize=9)
-    setp(axes[-1], xlabel="x [m]")
-    setp(axes[:, 0], ylabel="y [m]")
+    setp(axes[-1].tolist(), xlabel="x [m]")
+    setp(axes[:, 0].tolist(), ylabel="y [m]")
     colours, label = ScalarMappable(_SCALE, _COLOURS), "least distance of contact to target [m]"
     figure.colorbar(colours, ax=axes, label=label, shrink=0.8, extend="max")
     return figure

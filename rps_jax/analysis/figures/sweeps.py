@@ -36,7 +36,7 @@ def success_curves(results: xr.Dataset, count: int = 6) -> Figure:
         chance = " (may be chance)" * _is_flat(influence)
         ax.set_title(f"spread {_spread(influence)}, q = {influence.q:.1g}{chance}", fontsize=8)
         ax.grid(alpha=0.3)
-    setp(axes[:, 0], ylabel="success [%]")
+    setp(axes[:, 0].tolist(), ylabel="success [%]")
     axes[0, 0].set_ylim(top=103)
     axes[0, 0].legend(fontsize=8)
     title = (
