@@ -173,18 +173,10 @@ void run(int n, const law_x *reals, const law_i *integers, law_out *out) {{
     ]
 
 
-def js_function(names, tables):
-    """Return the function `run` of the inputs x and i in JavaScript."""
-    run = traced(names)
-    lines = js.statements(run, {group: f"{group}." for group in run.inputs}, tables)
-    result = js.object_of("out", run.outputs)
-    return f"function run({', '.join(run.inputs)}) {{\n{lines}\n  return {{ out: {result} }};\n}}\n"
-
-
 def run_js(names, real, folder):
     """Return the results of JavaScript."""
     tables = {}
-    text = js_function(names, tables)
+    text = js.function("run", traced(names), tables)
     x, i = inputs(real)
     main = (
         f"const rows = {json.dumps(list(zip(x.tolist(), i.tolist(), strict=True)))};\n"
@@ -242,7 +234,7 @@ BACK_ENDS = {
     "gpu": (np.float32, lambda names: GpuWriter(4).source(*jaxpr(names)), run_gpu),
     "c float": (np.float32, lambda names: c_statements(names, {}), run_c),
     "c double": (np.float64, lambda names: c_statements(names, {}), run_c),
-    "js": (np.float64, lambda names: js_function(names, {}), run_js),
+    "js": (np.float64, lambda names: js.function("run", traced(names), {}), run_js),
     "onnx": (np.float32, onnx_graph, run_onnx),
 }
 NEEDS = {"gpu": "g++", "js": "node", "simd": str(COMPILER)}

@@ -74,6 +74,15 @@ def statements(routine: Routine, groups: Mapping[str, str], tables: dict[str, st
     return "\n".join(f"  {line}" for line in lines)
 
 
+def function(name: str, routine: Routine, tables: dict[str, str]) -> str:
+    """Return a routine as a function of its groups of fields."""
+    lines = statements(routine, {group: f"{group}." for group in routine.inputs}, tables)
+    results = ", ".join(f"{group}: {object_of(group, routine.outputs)}"
+                        for group in routine.outputs)  # fmt: skip
+    head = f"function {name}({', '.join(routine.inputs)}) {{"
+    return f"{head}\n{lines}\n  return {{ {results} }};\n}}\n"
+
+
 def object_of(group: str, groups: Mapping[str, Group]) -> str:
     """Return the results of a routine as an object."""
     fields = ", ".join(f"{field.name}: result_{group}_{field.name}" for field in groups[group])
