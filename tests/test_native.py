@@ -240,6 +240,7 @@ def test_the_loop_of_an_equation_is_compiled_as_a_whole(law, skin, request, monk
     assert "while" not in primitives
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("cache")
 def test_the_loop_of_a_base_with_slip_is_compiled_as_a_whole(monkeypatch):
     monkeypatch.setattr(native, "_library", lambda text, name: b"")

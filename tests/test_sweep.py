@@ -212,7 +212,7 @@ def sweep_in_a_process(folder):
     swept(folder, KILLED)
 
 
-def test_a_run_killed_six_times_equals_an_undisturbed_one(tmp_path, monkeypatch):
+def test_a_run_killed_four_times_equals_an_undisturbed_one(tmp_path, monkeypatch):
     """SIGKILL hits start and work alternately at random moments; the last process ends."""
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join(sys.path))  # or the server finds no tests
     context = multiprocessing.get_context("forkserver")
@@ -222,11 +222,11 @@ def test_a_run_killed_six_times_equals_an_undisturbed_one(tmp_path, monkeypatch)
     def done():
         return len(list(folder.glob("parts/*.npz")))
 
-    for kill in range(7):
+    for kill in range(5):
         previous = done()
         process = context.Process(target=sweep_in_a_process, args=(folder,))
         process.start()
-        if kill < 6:
+        if kill < 4:
             while kill % 2 and process.is_alive() and done() == previous:
                 time.sleep(0.01)  # until it is at work, however slow the machine
             process.join(dice.uniform(0.0, 0.5 if kill % 2 else 2.0))
