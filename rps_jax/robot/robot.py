@@ -137,8 +137,8 @@ _SHAPES = {  # allowed shapes of limits that are no single number
     "acceleration_max": (((2,),), "two numbers, [m/s^2, rad/s^2]"),
 }
 _FIELDS = [field.name for field in dataclasses.fields(Robot)]
-_AIM_LIMITS = ("v_max", "omega_max", "lag", "acceleration_max")
-_AIM_LIMITS += ("slip", "slip_sideways", "slip_yaw")
+_SLIPS = ("slip", "slip_sideways", "slip_yaw")
+_AIM_LIMITS = ("v_max", "omega_max", "lag", "acceleration_max", *_SLIPS)
 _NOT_LIMITS = ("half_length", "half_width", "boards", "mass", "bandwidth", "resistance")
 LIMITS = tuple(name for name in _FIELDS if name not in _NOT_LIMITS)
 jax.tree_util.register_dataclass(Robot, data_fields=_FIELDS, meta_fields=[])

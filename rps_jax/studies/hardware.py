@@ -38,7 +38,7 @@ from rps_jax.world.scene import Friction
 
 MIDDLE = Friction(HARDWARE_GROUND[1], HARDWARE_ROBOT[1])  # friction of the paths and of the shove
 _FRICTIONS = tuple(starmap(Friction, product(HARDWARE_GROUND, HARDWARE_ROBOT)))
-# [columns of results]: label, unit, and digits of the table
+# Label, unit, and digits in the table of two columns of the results, by name.
 _MEANS = {"mean_abs_l": ("D", "m", 3), "time": ("time", "s", 0)}
 _TRACED = ("qpos", "p_world_contact", "outcome_success")  # variables of a trial over time
 

@@ -24,11 +24,7 @@ def log_weights(
     results: xr.Dataset, without: str = "", parts: tuple[str, ...] = PARTS
 ) -> np.ndarray:
     """Return the log weights (draw,) of draws, by the numbers of some parts without one number."""
-    used = [
-        name
-        for name in map(str, results.number.values)
-        if name != without and printed.part_of(name) in parts
-    ]
+    used = [name for name in _names(results) if name != without and printed.part_of(name) in parts]
     fit = results.log_likelihood.sel(number=used).sum("number").values
     return fit - results.log_proposal.values
 
@@ -93,8 +89,9 @@ def summary(results: xr.Dataset) -> str:
         f"{results.sizes['draw'] // weights.size} draws of the hardware: {len(NAMES)} unknowns "
         f"against {len(NUMBERS)} numbers and observations of the paper; effective number of draws "
         f"{effective(weights):.0f}. A mean has a normal likelihood, with a standard deviation of "
-        "4 mm for D and 2.5 s for times; a count a beta-binomial one; an observation in the text "
-        "is wrong with a probability of 10 %. The closest draw has "
+        f"{1000 * printed.D:g} mm for D and {printed.TIME:g} s for times; a count a beta-binomial "
+        "one; an observation in the text is wrong with a probability of "
+        f"{100 * printed.WRONG:g} %. The closest draw has "
         f"{int(_matches(results, cells)[closest(results)])} of {len(cells)} cells of Table II "
         "inside the paper's Wilson intervals."
     )
@@ -164,7 +161,7 @@ def predictions(results: xr.Dataset) -> dict[str, dict[str, np.ndarray]]:
     prior = normalised(-results.log_proposal.values)
     posterior = normalised(log_weights(results))
     found = {}
-    for name in map(str, results.number.values):
+    for name in _names(results):
         simulated = scaled(results, name)
         left_out = normalised(log_weights(results, without=name))
         each = {"prior": prior, "posterior": posterior, "left out": left_out}

@@ -114,15 +114,8 @@ def _request(
     """Return trials at points u (trials,) by name; leaves of the law are (trials,)."""
     columns = np.stack([u[name] for name in points.names(domain)], axis=1)
     at, count = points.check_points(domain, columns), len(columns)
-    return _Trials(
-        jax.tree.map(lambda leaf: leaf[None], law),
-        [domain],
-        0,
-        np.arange(count),
-        at,
-        True,
-        **fields,
-    )
+    leaves = jax.tree.map(lambda leaf: leaf[None], law)
+    return _Trials(leaves, [domain], 0, np.arange(count), at, per_world=True, **fields)
 
 
 def _grid(u: np.ndarray, *sizes: int) -> tuple[np.ndarray, list[np.ndarray]]:
@@ -208,11 +201,8 @@ def simulation(
     domain = _simulated_domain(targets)
     shape = domain.counts
     success = np.empty((len(u), len(paper.LAWS), *shape), bool)
-    for cone in UNKNOWNS["cone"].choices:
-        chosen = np.flatnonzero([text == cone for text in texts(u, "cone")])
-        if not chosen.size:
-            continue
-        at, changed = u[chosen], _physics(setting, cone)
+    for chosen, changed in _by_cone(u, setting):
+        at = u[chosen]
         draw, columns, fields = _simulated(at, domain)
         rps = jax.tree.map(lambda leaf, draw=draw: leaf[draw], params(at))
         aps = jax.tree.map(lambda leaf, draw=draw: leaf[draw], aps_params(at))
@@ -227,9 +217,15 @@ def simulation(
     return xr.DataArray(success, coords, ("draw", "law", "object", "friction", "target"))
 
 
-def _physics(setting: Setting, cone: str) -> Setting:
-    """Return a setting with the physics of the paper's simulator, and a friction cone."""
-    return replace(setting, physics=replace(PHYSICS["paper_gazebo"]["standard"], cone=cone))
+def _by_cone(u: np.ndarray, setting: Setting) -> Iterator[tuple[np.ndarray, Setting]]:
+    """Yield the draws of each friction cone, and a setting with this cone in the paper's simulator.
+
+    Cones that no draw has are left out.
+    """
+    cones, physics = np.array(texts(u, "cone")), PHYSICS["paper_gazebo"]["standard"]
+    for cone in UNKNOWNS["cone"].choices:
+        if (chosen := np.flatnonzero(cones == cone)).size:
+            yield chosen, replace(setting, physics=replace(physics, cone=cone))
 
 
 def _simulated(
@@ -250,11 +246,8 @@ def figure_6(u: np.ndarray, setting: Setting, callback: ProgressCallback) -> lis
     """Return the trial of Fig. 6 of each draw over time: box, S1, target (-2, 0)."""
     domain = replace(_simulated_domain((FIG_6,)), objects=("box",), frictions=(FRICTION["S1"],))
     traces: list[xr.Dataset] = [xr.Dataset()] * len(u)
-    for cone in UNKNOWNS["cone"].choices:
-        chosen = np.flatnonzero([text == cone for text in texts(u, "cone")])
-        if not chosen.size:
-            continue
-        at, changed = u[chosen], _physics(setting, cone)
+    for chosen, changed in _by_cone(u, setting):
+        at = u[chosen]
         _, columns, fields = _simulated(at, domain)
         (batch,) = _request(domain, columns, params(at), **fields).batches(changed)
         dtype = jnp.result_type(float)

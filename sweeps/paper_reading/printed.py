@@ -10,9 +10,8 @@ from scipy import stats
 
 from rps_jax.world import paper
 
-_D, _TIME = 0.004, 2.5  # [m], [s] standard deviation of what no draw can explain
-_WRONG = 0.1  # [1] probability that the text tells the opposite of an observation
-_AHEAD = ((1.0, 0.0), (2.0, 0.0))
+D, TIME = 0.004, 2.5  # [m], [s] standard deviation of what no draw can explain
+WRONG = 0.1  # [1] probability that the text tells the opposite of an observation
 SHORT = {"hardware_box": "box", "hardware_cylinder": "cylinder"}
 
 
@@ -30,7 +29,7 @@ class Printed(NamedTuple):
         A count is beta-binomial: both counts have one unknown rate, with the prior of Jeffreys.
         """
         if self.of == 1:
-            return np.log(np.where(simulated == self.value, 1 - _WRONG, _WRONG))
+            return np.log(np.where(simulated == self.value, 1 - WRONG, WRONG))
         if self.of:
             rates = simulated + 0.5, trials - simulated + 0.5
             return stats.betabinom.logpmf(self.value, self.of, *rates)
@@ -43,8 +42,8 @@ def _numbers() -> dict[str, Printed]:
     for key, name in SHORT.items():
         printed = paper.HARDWARE_RESULTS[key]
         numbers[f"hardware, {name}: successes"] = Printed(printed.success, 8)
-        numbers[f"hardware, {name}: D"] = Printed(printed.mean_abs_l, 0, _D, "m")
-        numbers[f"hardware, {name}: time"] = Printed(printed.time, 0, _TIME, "s")
+        numbers[f"hardware, {name}: D"] = Printed(printed.mean_abs_l, 0, D, "m")
+        numbers[f"hardware, {name}: time"] = Printed(printed.time, 0, TIME, "s")
     for (law, name, friction), count in paper.TABLE_II.items():
         words = name.replace("_", " ")
         numbers[f"Table II, {law.upper()}, {words} {friction}"] = Printed(count, 24)
