@@ -3,8 +3,8 @@
 XLA starts each operation on a few worlds separately, which takes longer than the operation itself.
 Here `lowering` prints a function of one world as one C function with a vector lane for each world,
 or as one CUDA kernel. The compiled library is stored in the program cache, under a key of its
-text, the compiler and the device, with a checksum. XLA compiles the function where there is no
-compiler, in double precision, and where it is differentiated.
+text, the compiler and the device, with a checksum. Derivatives are compiled in the same way. XLA
+compiles the function where there is no compiler, and in double precision.
 """
 
 from __future__ import annotations
@@ -26,8 +26,11 @@ from typing import Any, TypeAlias
 
 import jax
 import jax.numpy as jnp
+import numpy as np
+from jax.custom_derivatives import SymbolicZero
 
 from rps_jax.engines import device
+from rps_jax.engines.linear_map import linear_map
 from rps_jax.geometry import vectors
 from rps_jax.lowering import nvrtc
 from rps_jax.lowering.gpu_writer import WARP, GpuWriter
@@ -83,15 +86,111 @@ def target() -> str | None:
     return (gpu := nvrtc.target()) and f"{macros} {gpu}"
 
 
-def batched(function: Callable[..., Pytree], whole: Callable[..., Pytree]) -> Callable[..., Pytree]:
+def batched(
+    function: Callable[..., Pytree],
+    whole: Callable[..., Pytree],
+    derivative: Callable[[Pytree, Pytree], Pytree] | None = None,
+    differentiated: Callable[..., Pytree] | None = None,
+) -> Callable[..., Pytree]:
     """Return a function of a batch of worlds (B, ...) that runs world by world.
+
+    Its derivatives in both modes are compiled as the function itself is.
 
     Args:
       function: the function of one world; pure.
       whole: the same function of a batch, which XLA compiles where `function` is not compiled.
+      derivative: of arguments and results of one world; the function's derivatives are those of
+        this one by the arguments. By default it is the function itself.
+      differentiated: the same function of a batch, used where it is differentiated.
     """
+    if not is_available():
+        return whole
     run = concurrent([function], lambda arguments: [whole(*arguments)])
-    return lambda *arguments: run(arguments)[0]
+    derivative = derivative or (lambda arguments, _: function(*arguments))
+
+    @jax.custom_jvp
+    def call(*arguments: Pytree) -> Pytree:
+        return run(arguments)[0]
+
+    def rule(primals: Pytree, tangents: Pytree) -> tuple[Pytree, Pytree]:
+        if differentiated is not None:
+            zeros = _instantiate(tangents)
+            return jax.jvp(differentiated, primals, zeros)
+        results = call(*primals)
+        return results, _tangents(derivative, primals, tangents, results)
+
+    call.defjvp(rule, symbolic_zeros=True)
+    return call
+
+
+def mapped(function: Callable[..., Pytree], axes: Sequence[int | None]) -> Callable[..., Pytree]:
+    """Return `jax.vmap(function, axes)`, compiled and differentiated world by world."""
+    run = batched(function, jax.vmap(function))
+
+    def call(*arguments: Pytree) -> Pytree:
+        size = len(jax.tree.leaves(arguments[0])[0])
+
+        def repeat(x: Any) -> jax.Array:
+            return jnp.broadcast_to(x, (size, *jnp.shape(x)))
+
+        return run(*(
+            x if axis == 0 else jax.tree.map(repeat, x)
+            for x, axis in zip(arguments, axes, strict=True)
+        ))  # fmt: skip
+
+    return call
+
+
+def _tangents(
+    derivative: Callable[[Pytree, Pytree], Pytree],
+    primals: Pytree, tangents: Pytree, results: Pytree,
+) -> Pytree:  # fmt: skip
+    """Return the tangents of the results of a batch of worlds."""
+    leaves, tree = jax.tree.flatten(primals)
+    result_leaves, result_tree = jax.tree.flatten(results)
+    directions = jax.tree.leaves(tangents)
+    varied = [i for i, x in enumerate(directions) if not isinstance(x, SymbolicZero)]
+    real = [i for i, x in enumerate(result_leaves) if jnp.issubdtype(x.dtype, jnp.floating)]
+
+    def linearised(values: Sequence[Any]) -> tuple[Callable[[list[Any]], list[Any]], list[Any]]:
+        """Return a function of the varied arguments of one world, and their values."""
+        arguments, known = list(values[: len(leaves)]), result_tree.unflatten(values[len(leaves) :])
+
+        def run(some: list[Any]) -> list[Any]:
+            replaced = dict(zip(varied, some, strict=True))
+            varied_arguments = [replaced.get(i, x) for i, x in enumerate(arguments)]
+            out = jax.tree.leaves(derivative(tree.unflatten(varied_arguments), known))
+            return [out[i] for i in real]
+
+        return run, [arguments[i] for i in varied]
+
+    def push(values: Sequence[Any], vectors: Sequence[Any]) -> list[Any]:
+        function, point = linearised(values)
+        return jax.jvp(function, (point,), (list(vectors),))[1]
+
+    def pull(values: Sequence[Any], vectors: Sequence[Any]) -> list[Any]:
+        function, point = linearised(values)
+        return jax.vjp(function, point)[1](list(vectors))[0]
+
+    moved = linear_map(
+        batched(push, jax.vmap(push)), batched(pull, jax.vmap(pull)),
+        [*leaves, *result_leaves], [directions[i] for i in varied],
+        [result_leaves[i] for i in real],
+    )  # fmt: skip
+    values = dict(zip(real, moved, strict=True))
+    zeros = [np.zeros(x.shape, jax.dtypes.float0) for x in result_leaves]
+    return result_tree.unflatten([values.get(i, x) for i, x in enumerate(zeros)])
+
+
+def _instantiate(tangents: Pytree) -> Pytree:
+    """Return tangents with arrays in place of symbolic zeros."""
+
+    def dense(x: Any) -> Any:
+        if not isinstance(x, SymbolicZero):
+            return x
+        return (np if x.dtype == jax.dtypes.float0 else jnp).zeros(x.shape, x.dtype)
+
+    return jax.tree.map(dense, tangents)
 
 
 def concurrent(

@@ -176,6 +176,7 @@ def _scatter_add(
 COMPOUNDS: dict[str, Function] = {
     "clamp": lambda low, x, high: jnp.minimum(jnp.maximum(x, low), high),
     "square": lambda x: x * x,
+    "add_any": lambda x, y: x + y,
     "ne": lambda x, y: ~(x == y),
     "abs_i": lambda x: jnp.maximum(x, -x),
     "sign": _sign,

@@ -46,7 +46,7 @@ _RANDOM = {
     **{"random_bits": "random_bits", "random_split": "split", "random_fold_in": "fold_in"},
 }
 _IDENTITIES = ("stop_gradient", "copy", "copy_p", "optimization_barrier", "pvary",
-               "reduce_precision")  # fmt: skip
+               "reduce_precision", "name")  # fmt: skip
 
 
 def traced(function: Callable[..., Any], *arguments: Any) -> tuple[ClosedJaxpr, Any]:

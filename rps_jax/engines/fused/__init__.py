@@ -28,7 +28,7 @@ class Fused(Engine):
 
     name = "fused"
     side_by_side = True
-    modes = ("forward",)
+    modes = ("forward", "reverse")
 
     def stage(
         self, family: str, solids: Solid, friction: Friction, physics: Physics, robots: Robot

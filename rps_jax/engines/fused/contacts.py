@@ -139,7 +139,7 @@ def _lower_face(body: Body, m: Sequence[Vec]) -> tuple[Vec, Array]:
         return sp.to_world(m, body.vertices.at), body.vertices.real
     # Three points of a cylinder's rim, the lowest first; the fourth is padding.
     up = sp.to_world(m, body.up)
-    tilt = jnp.sqrt(up[0] * up[0] + up[1] * up[1])
+    tilt = sp.norm(up[:2])
     standing = tilt < _UPRIGHT
     divisor = jnp.maximum(tilt, _UPRIGHT)
     # Horizontal direction in which it leans; of an upright one, fixed to the object.

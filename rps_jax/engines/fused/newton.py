@@ -14,10 +14,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from functools import partial, reduce
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jax.ad_checkpoint import checkpoint_name
+from jax.custom_derivatives import SymbolicZero
 
 from rps_jax.engines.fused.contacts import Body, Contact, Point, State
 from rps_jax.geometry import vectors as sp
@@ -26,6 +28,7 @@ from rps_jax.geometry.solid import GRAVITY
 from rps_jax.geometry.vectors import Vec
 from rps_jax.world.physics import Physics
 
+SOLUTION = "accelerations"  # name of the solver's results, for policies of `jax.checkpoint`
 _TOLERANCE = 1e-4  # [m/s^2] error of the acceleration at which the solver ends
 _FLAT = 1e-3  # [1] share of the initial slope at which a line search ends
 _FAR = 1e9  # upper bound of a line search without a bracket
@@ -127,46 +130,48 @@ def _solve(h: list[list[Number]], g: Sequence[Number]) -> list[Number]:
     return x
 
 
-def accelerations(
-    body: Body,
-    state: State,
-    m: Sequence[Vec],
-    contacts: list[Contact],
-    physics: Physics,
-    base: Base = Base(),
-) -> list[Vec]:
-    """Return the minimum of MuJoCo's convex cost.
+class Problem(NamedTuple):
+    """The convex cost of one step."""
 
-    Newton's method with an exact line search finds it from the last accelerations. The solver ends
-    at an error of `_TOLERANCE`; the tolerance of `physics`, which also depends on the mass of the
-    base, is not used.
+    mass: Number  # [kg] of the object
+    spin: list[Vec]  # [kg m^2] its inertia tensor in the world's axes
+    free: Vec  # [rad/s^2] its angular acceleration without contacts
+    contacts: list[Contact]
+    base: Base
+    start: list[Vec]  # last accelerations, the solver's first guess
 
-    Returns:
-      Linear and angular acceleration of the object; and of a base with a limited force along x, y
-      and about the vertical.
-    """
-    i_w = _spin(body, m)
-    i, w = body.inertia, state.w
-    torque = sp.cross((i[0] * w[0], i[1] * w[1], i[2] * w[2]), w)  # - w x (I w)
-    free = sp.to_world(m, (torque[0] / i[0], torque[1] / i[1], torque[2] / i[2]))
+    @classmethod
+    def of(
+        cls, body: Body, state: State, m: Sequence[Vec], contacts: list[Contact], base: Base
+    ) -> Problem:
+        """Return the problem of a state; `m` are the rows of the rotation of its principal axes."""
+        i, w = body.inertia, state.w
+        torque = sp.cross((i[0] * w[0], i[1] * w[1], i[2] * w[2]), w)  # - w x (I w)
+        free = sp.to_world(m, (torque[0] / i[0], torque[1] / i[1], torque[2] / i[2]))
+        start = [state.a, state.alpha, *([] if state.driven is None else [state.driven.a])]
+        return cls(body.mass, _spin(body, m), free, contacts, base, start)
 
-    def gauss(x: Sequence[Vec]) -> list[Vec]:
+    def gauss(self, x: Sequence[Vec]) -> list[Vec]:
         """Return M (x - free accelerations)."""
         a, alpha, *b = x
-        linear = sp.scale(body.mass, (a[0], a[1], a[2] + GRAVITY))
-        angular = sp.to_world(i_w, sp.sub(alpha, free))
-        return [linear, angular, *(sp.sub(_times(base.inertia, y), base.force) for y in b)]
+        linear = sp.scale(self.mass, (a[0], a[1], a[2] + GRAVITY))
+        angular = sp.to_world(self.spin, sp.sub(alpha, self.free))
+        inertia, force = self.base
+        return [linear, angular, *(sp.sub(_times(inertia, y), force) for y in b)]
 
-    def gradient(x: Sequence[Vec]) -> tuple[list[Number], list[list[Number]]]:
-        g = gauss(x)
+    def gradient(
+        self, x: Sequence[Vec], physics: Physics
+    ) -> tuple[list[Number], list[list[Number]]]:
+        """Return the gradient of the cost, and the lower triangle of its Hessian."""
+        g = self.gauss(x)
         h: list[list[Number]] = [[0.0] * (3 * len(x)) for _ in range(3 * len(x))]
         for row in range(3):
             if len(x) > 2:
-                h[6 + row][6 + row] = base.inertia[row]
-            h[row][row] = body.mass
+                h[6 + row][6 + row] = self.base.inertia[row]
+            h[row][row] = self.mass
             for column in range(row + 1):
-                h[3 + row][3 + column] = i_w[row][column]
-        for c in contacts:
+                h[3 + row][3 + column] = self.spin[row][column]
+        for c in self.contacts:
             force, k = contact_force(c, sp.add(_rows(c, x), c.bias), physics)
             f = sp.combine(force, (c.n, c.t, c.s))
             g[:2] = sp.sub(g[0], _sums(f)), sp.sub(g[1], _sums(sp.cross(c.r, f)))
@@ -175,20 +180,79 @@ def accelerations(
             _stiffen(h, c, k)
         return [entry for block in g for entry in block], h
 
+
+def accelerations(
+    problem: Problem, physics: Physics, solution: Sequence[Vec] | None = None
+) -> list[Vec]:
+    """Return the minimum of MuJoCo's convex cost, with exact derivatives.
+
+    The derivative is that of the implicit function theorem at the minimum: minus the inverse
+    Hessian times the derivative of the gradient. The iterations are not differentiated. Where a
+    contact appears or a cone ends, it is one-sided. Second derivatives do not exist.
+
+    Args:
+      problem: of one world or a batch.
+      physics: cone and limits of the solver.
+      solution: result of an earlier call with this problem; then only derivatives are computed.
+
+    Returns:
+      Linear and angular acceleration of the object; and of a base with a limited force along x, y
+      and about the vertical.
+    """
+    # Literal numbers stay literal: `vectors` folds zeros and ones.
+    leaves, tree = jax.tree.flatten((problem, solution))
+    arrays = {i: x for i, x in enumerate(leaves) if isinstance(x, jax.Array)}
+
+    def rebuilt(values: dict[int, jax.Array]) -> tuple[Problem, Sequence[Vec] | None]:
+        return tree.unflatten([values.get(i, x) for i, x in enumerate(leaves)])
+
+    @jax.custom_jvp
+    def run(values: dict[int, jax.Array]) -> list[Vec]:
+        problem, solution = rebuilt(values)
+        return _minimise(problem, physics) if solution is None else list(solution)
+
+    def rule(primals: Any, tangents: Any) -> tuple[list[Vec], list[Vec]]:
+        (values,), (tangents,) = primals, tangents
+        x = checkpoint_name(run(values), SOLUTION)
+        varied = [i for i, y in tangents.items() if not isinstance(y, SymbolicZero)]
+
+        def gradient(some: dict[int, jax.Array]) -> tuple[list[Number], list[list[Number]]]:
+            g, h = rebuilt(values | some)[0].gradient(x, physics)
+            return [jnp.asarray(entry) for entry in g], h
+
+        _, dg, h = jax.jvp(
+            gradient, ({i: values[i] for i in varied},), ({i: tangents[i] for i in varied},),
+            has_aux=True,
+        )  # fmt: skip
+        step = _solve(h, [-entry for entry in dg])
+        return x, [(step[i], step[i + 1], step[i + 2]) for i in range(0, len(step), 3)]
+
+    run.defjvp(rule, symbolic_zeros=True)
+    return run(arrays)
+
+
+def _minimise(problem: Problem, physics: Physics) -> list[Vec]:
+    """Return the minimum, by Newton's method with an exact line search from the last accelerations.
+
+    The solver ends at an error of `_TOLERANCE`; the tolerance of `physics`, which also depends on
+    the mass of the base, is not used.
+    """
+    mass, base = problem.mass, problem.base
+
     def improve(carry):
         count, x, active, _ = carry
-        g, h = gradient(x)
+        g, h = problem.gradient(x, physics)
         step = _solve(h, [-entry for entry in g])
         d: list[Vec] = [(step[i], step[i + 1], step[i + 2]) for i in range(0, len(step), 3)]
-        slope = reduce(sp.plus, map(sp.dot, gauss(x), d))
-        bend = body.mass * sp.dot(d[0], d[0]) + sp.dot(d[1], sp.to_world(i_w, d[1]))
+        slope = reduce(sp.plus, map(sp.dot, problem.gauss(x), d))
+        bend = mass * sp.dot(d[0], d[0]) + sp.dot(d[1], sp.to_world(problem.spin, d[1]))
         for e in d[2:]:
             bend = bend + sp.dot(base.inertia, _times(e, e))
-        lines = [(c, sp.add(_rows(c, x), c.bias), _rows(c, d)) for c in contacts]
+        lines = [(c, sp.add(_rows(c, x), c.bias), _rows(c, d)) for c in problem.contacts]
         # Inner product of step and gradient: twice the decrease of a quadratic cost.
         gain = -sp.dot(step, g)
         length = _line_search(lines, slope, bend, active * gain, physics)
-        continues = gain > 2 * body.mass * _TOLERANCE**2
+        continues = gain > 2 * mass * _TOLERANCE**2
         # A converged world stays while others continue, so that its result does not depend on them.
         move = jnp.where(continues, length, jnp.minimum(length, 1.0))
         move = jnp.where(active > 0, move, 0.0)
@@ -196,12 +260,11 @@ def accelerations(
         active = jnp.where(continues, active, 0.0)
         return count + 1, x, active, _any(active)
 
-    active = jnp.ones_like(body.mass)
-    start = [state.a, state.alpha, *([] if state.driven is None else [state.driven.a])]
+    active = jnp.ones_like(mass)
     return jax.lax.while_loop(
         lambda carry: (carry[0] < physics.iterations) & carry[3],
         improve,
-        (0, start, active, _any(active)),
+        (0, problem.start, active, _any(active)),
     )[1]
 
 

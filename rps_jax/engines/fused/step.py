@@ -10,15 +10,16 @@ a compiler can keep a whole world in registers.
 from __future__ import annotations
 
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jax.ad_checkpoint import checkpoint_policies
 
 from rps_jax.engines import native
 from rps_jax.engines.base import ControlPeriod, Driven, Motion
 from rps_jax.engines.fused.contacts import Body, Corners, DrivenBase, State, on_base, on_ground
-from rps_jax.engines.fused.newton import Base, accelerations, wrench_on_base
+from rps_jax.engines.fused.newton import SOLUTION, Base, Problem, accelerations, wrench_on_base
 from rps_jax.geometry import vectors as sp
 from rps_jax.geometry.arrays import Entries
 from rps_jax.geometry.vectors import Vec
@@ -26,6 +27,8 @@ from rps_jax.robot import drive as drives
 from rps_jax.robot.robot import Robot
 from rps_jax.world.physics import Physics
 from rps_jax.world.scene import JOINTS
+
+_SAVED = checkpoint_policies.save_only_these_names(SOLUTION)
 
 
 def _split(array: Entries, at: slice = slice(None)) -> Entries:
@@ -79,12 +82,17 @@ def leave(body: Body, state: State, twist: Vec) -> Motion:
 
 
 def step(
-    body: Body, state: State, twist: Vec, physics: Physics, robot: Robot | None = None
+    body: Body,
+    state: State,
+    twist: Vec,
+    physics: Physics,
+    robot: Robot | None = None,
+    solution: list[Vec] | None = None,
 ) -> State:
     """Compute one step of MuJoCo's semi-implicit Euler rule with the base at `twist`.
 
     A `robot` with a limited force is pushed towards it. `twist` [m/s, m/s, rad/s] is in the base's
-    frame.
+    frame. The derivatives of a step whose accelerations are known need no solver: `solution`.
     """
     m, dt, driven = sp.matrix(state.q), physics.timestep, state.driven
     contacts = [on_ground(body, state, m, physics), on_base(body, state, m, twist, physics)]
@@ -94,7 +102,7 @@ def step(
         force, integral = drives.push(robot, driven.integral, twist, driven.v, turn, dt)
         base = Base((robot.mass, robot.mass, robot.inertia), force)
         driven = driven._replace(integral=integral)
-    x = accelerations(body, state, m, contacts, physics, base)
+    x = accelerations(Problem.of(body, state, m, contacts, base), physics, solution)
     a, alpha, *b = x
     if driven is not None:
         driven = driven._replace(v=sp.add(driven.v, sp.scale(dt, b[0])), a=b[0])
@@ -133,11 +141,14 @@ class FusedStage(NamedTuple):
     def drive(self, fields: Body, motion: Motion, period: ControlPeriod) -> Driven:
         """Step a batch of worlds (B,) for one control period.
 
-        It is a function of C, or a kernel on an NVIDIA GPU, where they can be compiled; elsewhere,
-        and where it is differentiated, XLA compiles it.
+        It is a function of C, or a kernel on an NVIDIA GPU, where they can be compiled, and so is
+        the derivative of each step; elsewhere XLA compiles it.
         """
         steps = partial(_drive, physics=period.physics, force=period.force)
-        run = native.batched(steps, steps) if motion.qpos.ndim == 2 else steps
+        by_step = partial(_drive_by_step, physics=period.physics, force=period.force)
+        if motion.qpos.ndim != 2:
+            return steps(fields, motion, period.twists, period.robot)
+        run = native.batched(steps, steps, differentiated=by_step)
         return run(fields, motion, period.twists, period.robot)
 
 
@@ -146,14 +157,51 @@ def _drive(
 ) -> Driven:
     """Step a batch of worlds, or one world, for one control period."""
     scalars = spread(body)
+
+    # Derivatives compute each step again, without its solver.
+    @partial(jax.checkpoint, prevent_cse=False, policy=_SAVED)
+    def next_state(state: State) -> State:
+        return step(scalars, state, twist, physics, robot)
+
     state = jax.lax.fori_loop(
-        0,
-        physics.substeps,
-        lambda _, state: step(scalars, state, twist, physics, robot),
-        enter(body, motion, robot, force),
+        0, physics.substeps, lambda _, x: next_state(x), enter(body, motion, robot, force)
     )
+    return _driven(body, state, twist, physics)
+
+
+def _driven(body: Body, state: State, twist: Vec, physics: Physics) -> Driven:
+    """Return worlds after a control period that ends in a state."""
     felt = state.felt and jnp.stack(state.felt, axis=-1) / physics.substeps
     return Driven(leave(body, state, twist), force=felt)
+
+
+def _drive_by_step(
+    body: Body, motion: Motion, twist: Vec, robot: Robot | None, *, physics: Physics, force: bool
+) -> Driven:
+    """Step a batch of worlds by one native function for each physics step."""
+    start = enter(body, motion, robot, force)
+    tree = jax.tree.structure(start)
+
+    def single(packed: jax.Array, body: Body, twist: Vec, robot: Robot | None) -> jax.Array:
+        state = tree.unflatten(_split(packed))
+        return _pack(step(spread(body), state, twist, physics, robot))
+
+    def derivative(arguments: Any, result: jax.Array) -> jax.Array:
+        packed, body, twist, robot = arguments
+        state, after = tree.unflatten(_split(packed)), tree.unflatten(_split(result))
+        x = [after.a, after.alpha, *([] if after.driven is None else [after.driven.a])]
+        return _pack(step(spread(body), state, twist, physics, robot, x))
+
+    run = native.batched(single, jax.vmap(single), derivative)
+    packed = jax.lax.fori_loop(
+        0, physics.substeps, lambda _, x: run(x, body, twist, robot), _pack(start)
+    )
+    return _driven(body, tree.unflatten(_split(packed)), twist, physics)
+
+
+def _pack(state: State) -> jax.Array:
+    """Return the entries of a state along a new last axis."""
+    return jnp.stack(jax.tree.leaves(state), axis=-1)
 
 
 def spread(body: Body) -> Body:
