@@ -41,8 +41,9 @@ from rps_jax.record import cache
 Pytree: TypeAlias = Any  # of arrays; functions of this module take any
 # XLA, too, fuses a sum with the product before it. No other optimisation may change results.
 _FLAGS = ("-O2", "-march=native", "-fno-math-errno", "-ffp-contract=fast", "-w")
-# They take a fifth of the compiler's time, and the functions are as fast without them.
-_FLAGS += ("-fno-gcse", "-fno-rerun-cse-after-loop")
+# Without these passes the compiler takes half of the time, and the functions are as fast.
+_FLAGS += ("-fno-gcse", "-fno-rerun-cse-after-loop", "-fno-tree-dse")
+_FLAGS += ("--param", "sccvn-max-alias-queries-per-access=30")
 _NAME = "rps_native_"
 _THREADS = 4  # of a GPU that compute a world
 _NO_COMPILER = (
@@ -106,7 +107,6 @@ def batched(
     if not is_available():
         return whole
     run = concurrent([function], lambda arguments: [whole(*arguments)])
-    derivative = derivative or (lambda arguments, _: function(*arguments))
 
     @jax.custom_jvp
     def call(*arguments: Pytree) -> Pytree:
@@ -117,14 +117,21 @@ def batched(
             zeros = _instantiate(tangents)
             return jax.jvp(differentiated, primals, zeros)
         results = call(*primals)
-        return results, _tangents(derivative, primals, tangents, results)
+        if derivative is not None:
+            return results, _tangents(derivative, (primals, results), tangents, results)
+        return results, _tangents(function, primals, tangents, results)
 
     call.defjvp(rule, symbolic_zeros=True)
     return call
 
 
-def mapped(function: Callable[..., Pytree], axes: Sequence[int | None]) -> Callable[..., Pytree]:
-    """Return `jax.vmap(function, axes)`, compiled and differentiated world by world."""
+def mapped(
+    function: Callable[..., Pytree], axes: Sequence[int | None] | None = None
+) -> Callable[..., Pytree]:
+    """Return `jax.vmap(function, axes)`, compiled and differentiated world by world.
+
+    An argument of axis None is repeated for each world.
+    """
     run = batched(function, jax.vmap(function))
 
     def call(*arguments: Pytree) -> Pytree:
@@ -133,53 +140,53 @@ def mapped(function: Callable[..., Pytree], axes: Sequence[int | None]) -> Calla
         def repeat(x: Any) -> jax.Array:
             return jnp.broadcast_to(x, (size, *jnp.shape(x)))
 
-        return run(*(
-            x if axis == 0 else jax.tree.map(repeat, x)
-            for x, axis in zip(arguments, axes, strict=True)
-        ))  # fmt: skip
+        every = axes or [0] * len(arguments)
+        pairs = zip(arguments, every, strict=True)
+        return run(*(x if axis == 0 else jax.tree.map(repeat, x) for x, axis in pairs))
 
     return call
 
 
 def _tangents(
-    derivative: Callable[[Pytree, Pytree], Pytree],
-    primals: Pytree, tangents: Pytree, results: Pytree,
-) -> Pytree:  # fmt: skip
-    """Return the tangents of the results of a batch of worlds."""
-    leaves, tree = jax.tree.flatten(primals)
-    result_leaves, result_tree = jax.tree.flatten(results)
+    function: Callable[..., Pytree], arguments: Pytree, tangents: Pytree, like: Pytree
+) -> Pytree:
+    """Return the tangents of the results of a function of one world, in a batch of worlds.
+
+    Arguments without tangents, behind the others, are constant; `like` has the types of the
+    results.
+    """
+    leaves, tree = jax.tree.flatten(arguments)
+    like_leaves, like_tree = jax.tree.flatten(like)
     directions = jax.tree.leaves(tangents)
     varied = [i for i, x in enumerate(directions) if not isinstance(x, SymbolicZero)]
-    real = [i for i, x in enumerate(result_leaves) if jnp.issubdtype(x.dtype, jnp.floating)]
+    real = [i for i, x in enumerate(like_leaves) if jnp.issubdtype(x.dtype, jnp.floating)]
 
-    def linearised(values: Sequence[Any]) -> tuple[Callable[[list[Any]], list[Any]], list[Any]]:
+    def of_varied(values: Sequence[Any]) -> tuple[Callable[[list[Any]], list[Any]], list[Any]]:
         """Return a function of the varied arguments of one world, and their values."""
-        arguments, known = list(values[: len(leaves)]), result_tree.unflatten(values[len(leaves) :])
 
         def run(some: list[Any]) -> list[Any]:
             replaced = dict(zip(varied, some, strict=True))
-            varied_arguments = [replaced.get(i, x) for i, x in enumerate(arguments)]
-            out = jax.tree.leaves(derivative(tree.unflatten(varied_arguments), known))
-            return [out[i] for i in real]
+            whole = tree.unflatten([replaced.get(i, x) for i, x in enumerate(values)])
+            results = jax.tree.leaves(function(*whole))
+            return [results[i] for i in real]
 
-        return run, [arguments[i] for i in varied]
+        return run, [values[i] for i in varied]
 
     def push(values: Sequence[Any], vectors: Sequence[Any]) -> list[Any]:
-        function, point = linearised(values)
-        return jax.jvp(function, (point,), (list(vectors),))[1]
+        run, point = of_varied(values)
+        return jax.jvp(run, (point,), (list(vectors),))[1]
 
     def pull(values: Sequence[Any], vectors: Sequence[Any]) -> list[Any]:
-        function, point = linearised(values)
-        return jax.vjp(function, point)[1](list(vectors))[0]
+        run, point = of_varied(values)
+        return jax.vjp(run, point)[1](list(vectors))[0]
 
     moved = linear_map(
         batched(push, jax.vmap(push)), batched(pull, jax.vmap(pull)),
-        [*leaves, *result_leaves], [directions[i] for i in varied],
-        [result_leaves[i] for i in real],
+        leaves, [directions[i] for i in varied], [like_leaves[i] for i in real],
     )  # fmt: skip
     values = dict(zip(real, moved, strict=True))
-    zeros = [np.zeros(x.shape, jax.dtypes.float0) for x in result_leaves]
-    return result_tree.unflatten([values.get(i, x) for i, x in enumerate(zeros)])
+    zeros = [np.zeros(x.shape, jax.dtypes.float0) for x in like_leaves]
+    return like_tree.unflatten([values.get(i, x) for i, x in enumerate(zeros)])
 
 
 def _instantiate(tangents: Pytree) -> Pytree:

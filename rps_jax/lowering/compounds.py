@@ -172,6 +172,22 @@ def _scatter_add(
     return x + lax.scatter_p.bind(jnp.zeros_like(x), indices, updates, **params)
 
 
+def _update(x: jax.Array, update: jax.Array, *starts: jax.Array) -> jax.Array:
+    """Replace a slice at an index that is known at run time, clamped to the array."""
+    limits = [size - width for size, width in zip(x.shape, update.shape, strict=True)]
+    result = x
+    for at in np.ndindex(*(limit + 1 for limit in limits)):
+        chosen = [
+            jnp.clip(start, 0, limit) == k
+            for start, k, limit in zip(starts, at, limits, strict=True)
+            if limit
+        ]
+        replaced = lax.dynamic_update_slice_p.bind(x, update, *map(np.int32, at))
+        is_here = functools.reduce(operator.and_, chosen, np.True_)
+        result = jnp.where(is_here, replaced, result)
+    return result
+
+
 # Functions by the name of an operation (see `target.operation_of`), or of a primitive of any kind.
 COMPOUNDS: dict[str, Function] = {
     "clamp": lambda low, x, high: jnp.minimum(jnp.maximum(x, low), high),
@@ -203,4 +219,5 @@ COMPOUNDS: dict[str, Function] = {
     "cummin": _cumulative(lax.min),
     "gather": _gather,
     "scatter-add": _scatter_add,
+    "dynamic_update_slice": _update,
 }  # fmt: skip
