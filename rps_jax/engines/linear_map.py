@@ -16,24 +16,31 @@ from jax.interpreters import ad, batching, mlir
 
 # Of residuals (on which the map depends) and of vectors: tuples of arrays.
 Map: TypeAlias = Callable[[Sequence[Any], Sequence[Any]], Sequence[jax.Array]]
+Maps: TypeAlias = tuple[Map, Map | None]
 
 
 def linear_map(
-    forward: Map, transpose: Map, residuals: Sequence[Any], vectors: Sequence[Any], like: Any
+    forward: Map,
+    transpose: Map | None,
+    residuals: Sequence[Any],
+    vectors: Sequence[Any],
+    like: Any,
+    label: str = "",
 ) -> list[jax.Array]:
     """Return `forward(residuals, vectors)`, linear in the vectors, with a given transpose.
 
     Args:
       forward: the map.
-      transpose: from residuals and vectors of the results to vectors of the arguments.
+      transpose: from residuals and vectors of the results to vectors of the arguments; None of a
+        map without vectors, a function of the residuals.
       residuals: arrays that are not differentiated.
       vectors: arrays.
       like: results have the shapes and types of these arrays.
+      label: name of the map in a jaxpr.
     """
     outs = tuple(jax.core.ShapedArray(x.shape, x.dtype) for x in like)
-    return _primitive.bind(
-        *residuals, *vectors, maps=(forward, transpose), count=len(residuals), outs=outs
-    )
+    static = {"maps": (forward, transpose), "count": len(residuals), "outs": outs}
+    return _primitive.bind(*residuals, *vectors, **static, label=label)
 
 
 _primitive = Primitive("linear_map")
@@ -41,33 +48,35 @@ _primitive.multiple_results = True
 
 
 @_primitive.def_impl
-def _run(*arrays: Any, maps: tuple[Map, Map], count: int, outs: Any) -> list[jax.Array]:
-    del outs
+def _run(*arrays: Any, maps: Maps, count: int, **_: Any) -> list[jax.Array]:
     return list(maps[0](arrays[:count], arrays[count:]))
 
 
 _primitive.def_abstract_eval(lambda *_, outs, **__: outs)
 
 
-def _transpose(cotangents: Any, *arrays: Any, maps: tuple[Map, Map], count: int, outs: Any) -> Any:
+def _transpose(cotangents: Any, *arrays: Any, maps: Maps, count: int, outs: Any, label: str) -> Any:
     vectors = [
         jnp.zeros(out.shape, out.dtype) if isinstance(x, ad.Zero) else x
         for x, out in zip(cotangents, outs, strict=True)
     ]
     like = [x.aval for x in arrays[count:]]
     forward, transpose = maps
-    return [None] * count + linear_map(transpose, forward, arrays[:count], vectors, like)
+    assert transpose is not None  # a map without vectors is not transposed
+    moved = linear_map(transpose, forward, arrays[:count], vectors, like, label)
+    return [None] * count + moved
 
 
-def _batch(arrays: Any, axes: Any, *, maps: tuple[Map, Map], count: int, outs: Any) -> Any:
+def _batch(arrays: Any, axes: Any, *, maps: Maps, count: int, outs: Any, label: str) -> Any:
     size = next(x.shape[i] for x, i in zip(arrays, axes, strict=True) if i is not None)
     whole = [
         jnp.broadcast_to(x, (size, *x.shape)) if i is None else jnp.moveaxis(x, i, 0)
         for x, i in zip(arrays, axes, strict=True)
     ]
     like = [jax.ShapeDtypeStruct((size, *out.shape), out.dtype) for out in outs]
-    forward, transpose = map(jax.vmap, maps)
-    return linear_map(forward, transpose, whole[:count], whole[count:], like), [0] * len(outs)
+    forward, transpose = jax.vmap(maps[0]), maps[1] and jax.vmap(maps[1])
+    results = linear_map(forward, transpose, whole[:count], whole[count:], like, label)
+    return results, [0] * len(outs)
 
 
 def _refuse(*_: Any, **__: Any) -> Any:
