@@ -28,7 +28,7 @@ WEIGHT = 20 * GRAVITY  # [N] of the box
 S1, SLIPPERY = FRICTION["S1"], Friction(1e-4, 0.35)
 
 
-@pytest.mark.parametrize("engine", ["fused", "mjx", "mujoco"])
+@pytest.mark.parametrize("engine", ["fused", pytest.param("mjx", marks=pytest.mark.slow), "mujoco"])
 def test_a_box_pushed_straight_ahead_pushes_back_with_the_friction_of_its_weight(engine):
     """They agree within some per cent: MuJoCo's soft friction lifts a sliding object."""
     steady = push_object(engine).force[50:].mean(axis=0)

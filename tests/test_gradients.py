@@ -10,7 +10,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from rps_jax import engines, errors
 from rps_jax.control import registry
 from rps_jax.control.laws import rps
 from rps_jax.control.laws.rps import RPSParams
@@ -20,7 +19,6 @@ from rps_jax.trials.case import Case
 from rps_jax.trials.setting import Setting
 from rps_jax.tuning import gradients
 from rps_jax.tuning.gradients import Estimate
-from rps_jax.world.physics import Physics
 from sweeps.gradients import estimators
 
 THETA = jnp.array([0.5, -1.0, 2.0])
@@ -211,13 +209,6 @@ def params_of(theta) -> RPSParams:
 
 def final_distance(snapshots):
     return snapshots.details.distance[-1]
-
-
-def test_mjx_must_have_a_pyramidal_cone():
-    with pytest.raises(errors.InputError, match="cone = elliptic"):
-        engines.get("mjx").check_derivatives("forward", Physics())
-    with pytest.raises(errors.InputError, match="reverse-mode"):
-        engines.get("mjx").check_derivatives("reverse", Physics(cone="pyramidal"))
 
 
 @pytest.mark.slow

@@ -14,17 +14,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from rps_jax import errors
 from rps_jax.control.observation import Twist
-from rps_jax.engines.base import ControlPeriod, Driven, Engine, Mode, Motion
-from rps_jax.engines.mjx_colliders import (
-    collision,
-    constraint,
-    forward,
-    mjx,
-    smooth,
-    solver,
-)
+from rps_jax.engines import mjx_gradients
+from rps_jax.engines.base import ControlPeriod, Driven, Engine, Motion
+from rps_jax.engines.mjx_colliders import collision, constraint, forward, mjx, smooth
 from rps_jax.engines.mujoco import compile_rows
 from rps_jax.geometry import planar
 from rps_jax.geometry.solid import Solid
@@ -61,6 +54,8 @@ class MJXStage(NamedTuple):
         """
         physics = period.physics
         step = jax.vmap(partial(self._step, timestep=physics.timestep))
+        # Derivatives compute each step again, without its solver.
+        step = jax.checkpoint(step, prevent_cse=False, policy=mjx_gradients.SAVED)
 
         def body(state: Motion, _: None) -> tuple[Motion, jax.Array | None]:
             # vmap inside of the loop: JAX would trace a batched loop again.
@@ -114,22 +109,16 @@ def step(model: mjx.Model, data: mjx.Data, outline: jax.Array | None = None) -> 
     data = smooth.rne(model, data)
     force = data.qfrc_applied - data.qfrc_bias
     free = smooth.solve_m(model, data, force)
-    data = solver.solve(model, data.replace(qfrc_smooth=force, qacc_smooth=free))
-    return forward._advance(model, data, data.act_dot, data.qacc)
+    data = mjx_gradients.solve(model, data.replace(qfrc_smooth=force, qacc_smooth=free))
+    after = forward._advance(model, data, data.act_dot, data.qacc)
+    return mjx_gradients.with_turns(model, data, after)
 
 
 class MJX(Engine):
     """Engine of the paper's tables."""
 
     name = "mjx"
-    modes = ("forward",)
-
-    def check_derivatives(self, mode: Mode, physics: Physics) -> None:
-        """Raise InputError unless a trial can be differentiated in this mode."""
-        super().check_derivatives(mode, physics)
-        if physics.cone == "elliptic":
-            rule = "MJX has no finite derivatives for it; choose pyramidal, or the engine fused"
-            raise errors.not_allowed("cone", physics.cone, rule)
+    modes = ("forward", "reverse")
 
     def stage(
         self, family: str, solids: Solid, friction: Friction, physics: Physics, robots: Robot

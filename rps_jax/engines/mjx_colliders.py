@@ -30,11 +30,14 @@ from rps_jax.world import opengl as opengl  # imports MuJoCo
 
 with contextlib.redirect_stdout(io.StringIO()):  # MJX reports on the console that warp is absent
     from mujoco import mjx as mjx
-    from mujoco.mjx._src import collision_driver, collision_primitive, math
+    from mujoco.mjx._src import collision_driver, collision_primitive
     from mujoco.mjx._src import constraint as constraint
     from mujoco.mjx._src import forward as forward
+    from mujoco.mjx._src import math as math
+    from mujoco.mjx._src import sensor as sensor
     from mujoco.mjx._src import smooth as smooth
     from mujoco.mjx._src import solver as solver
+    from mujoco.mjx._src import types as types
     from mujoco.mjx._src.collision_types import Collision, GeomInfo
     from mujoco.mjx._src.types import Data, GeomType, Model
 

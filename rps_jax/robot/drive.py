@@ -96,8 +96,9 @@ def push(
     demand = [m * 2 * rate * e + i for m, e, i in zip(inertia, errors, integral, strict=True)]
     output = list(demand)
     if (limit := robot.push_max) is not None:
-        size = xp.sqrt(demand[0] * demand[0] + demand[1] * demand[1])
-        share = xp.minimum(1.0, limit / xp.maximum(size, 1e-9))
+        square = demand[0] * demand[0] + demand[1] * demand[1]
+        size = xp.sqrt(xp.maximum(square, 1e-18))  # the square root of 0 has no derivative
+        share = xp.minimum(1.0, limit / size)
         output[:2] = demand[0] * share, demand[1] * share
     if (limit := robot.turn_max) is not None:
         output[2] = xp.minimum(xp.maximum(demand[2], -limit), limit)

@@ -1,0 +1,266 @@
+"""Exact derivatives through MJX: of models that are not ours, and of our worlds."""
+
+from functools import cache, partial
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+
+from rps_jax import engines, errors
+from rps_jax.control.observation import Twist
+from rps_jax.engines import mjx_gradients
+from rps_jax.engines.base import ControlPeriod, Motion
+from rps_jax.engines.mjx_colliders import mjx, types
+from rps_jax.geometry import vectors as sp
+from rps_jax.robot.robot import Robot
+from rps_jax.trials.worlds import starts
+from rps_jax.world import domain as domains
+from rps_jax.world import draws
+from rps_jax.world.physics import Physics
+
+BOX = """<body pos="0 0 0.0985"><freejoint/>
+<geom type="box" size="0.2 0.15 0.1" mass="2" friction="0.6"/></body>"""
+# A thigh between limits, with friction, and an ankle with a limit; the foot is a capsule.
+LEG = """<body pos="1 0 0.446"><joint type="slide" axis="0 0 1"/>
+<joint type="slide" axis="1 0 0" damping="1"/><geom type="sphere" size="0.05" mass="3"/>
+<body><joint axis="0 1 0" range="-60 20" limited="true" frictionloss="0.3"/>
+<geom type="capsule" fromto="0 0 0 0 0 -0.35" size="0.05" mass="2" contype="0" conaffinity="0"/>
+<body pos="0 0 -0.4"><joint type="ball" range="0 40" limited="true" damping="0.1"/>
+<geom type="capsule" fromto="-0.1 0 -0.02 0.15 0 -0.02" size="0.03" mass="0.5" condim="{condim}"
+friction="0.7 0.02 0.005"/></body></body></body>"""
+OPTION = 'timestep="0.004" ls_iterations="50" tolerance="1e-15"'
+
+
+class Case:
+    """A body on a plane: states are positions, velocities and a factor of all friction."""
+
+    def __init__(self, body, cone="elliptic", solver="Newton", integrator="Euler", iterations=100):
+        option = f'{OPTION} cone="{cone}" solver="{solver}" integrator="{integrator}"'
+        self.plain = mujoco.MjModel.from_xml_string(
+            f'<mujoco><option {option} iterations="{iterations}"/><worldbody>'
+            f'<geom type="plane" size="0 0 1"/>{body}</worldbody></mujoco>'
+        )
+        self.model, self.data = mjx.put_model(self.plain), mjx.make_data(self.plain)
+
+    def state(self, *qvel):
+        return np.concatenate([self.plain.qpos0, qvel, [1.0]])
+
+    def stepped(self, step, x):
+        """Return model and data after a step from a state."""
+        nq, nv = self.plain.nq, self.plain.nv
+        model = self.model.tree_replace({"geom_friction": self.model.geom_friction * x[-1]})
+        qvel = x[nq : nq + nv]
+        return model, step(model, self.data.replace(qpos=x[:nq], qvel=qvel))
+
+    def after(self, step, x):
+        """Return the state after a step."""
+        data = self.stepped(step, x)[1]
+        return jnp.concatenate([data.qpos, data.qvel, x[-1:]])
+
+    def forces(self, step, x):
+        """Return the forces of the constraints in a step."""
+        data = self.stepped(step, x)[1]
+        return jnp.concatenate([data.qfrc_constraint, data._impl.efc_force])
+
+
+def differences(function, x, h=1e-6, steps=1):
+    """Return the matrix of central differences after some steps of a batched function."""
+    sides = np.concatenate([x + h * np.eye(x.size), x - h * np.eye(x.size)])
+    for _ in range(steps):
+        sides = function(sides)
+    up, down = np.split(np.asarray(sides), 2)
+    return (up - down).T / (2 * h)
+
+
+@pytest.fixture(scope="module")
+def compiled_box():
+    """A box on a plane, with programs: step of MJX, our step, its derivatives."""
+    with jax.enable_x64(True):
+        case = Case(BOX)
+        ours = partial(case.after, mjx_gradients.step)
+        case.theirs = jax.jit(jax.vmap(partial(case.after, mjx.step)))
+        case.ours, case.jacobian = jax.jit(jax.vmap(ours)), jax.jit(jax.jacrev(ours))
+        case.forward = jax.jit(lambda x, way: jax.jvp(ours, (x,), (way,))[1])
+        return case
+
+
+@pytest.fixture
+def box(compiled_box):
+    with jax.enable_x64(True):
+        yield compiled_box
+
+
+def test_derivatives_of_1_and_100_steps_of_a_box_on_a_plane_are_central_differences(box):
+    """The box falls, slides and turns; derivatives of 100 steps are a product of matrices."""
+    x = start = box.state(4.0, 1.0, 0.0, 0.2, 0.3, 3.0)
+    product = np.eye(x.size)
+    for i in range(100):
+        matrix = box.jacobian(x)
+        product, x = matrix @ product, box.ours(x[None])[0]
+        if i in (0, 99):
+            expected = differences(box.theirs, start, steps=i + 1)
+            atol = 1e-3 * np.abs(expected).max()
+            np.testing.assert_allclose(product, expected, rtol=0, atol=atol)
+    assert np.linalg.norm(x[7:9]) > 0.1  # it still slides
+
+
+def test_values_are_those_of_mjx_bit_for_bit_and_both_modes_agree(box):
+    rng = np.random.default_rng(0)
+    states = box.state(*np.zeros(6)) + 0.01 * rng.normal(size=(28, 14))
+    np.testing.assert_array_equal(box.ours(states), box.theirs(states))
+    for x, way in zip(states[:4], rng.normal(size=(4, 14)), strict=True):
+        expected = np.asarray(box.jacobian(x)) @ way
+        np.testing.assert_allclose(box.forward(x, way), expected, rtol=1e-9, atol=1e-9)
+
+
+def test_in_the_air_friction_has_no_effect_and_a_body_at_rest_can_turn(box):
+    """The derivative by an angular velocity of zero, which that of MJX lacks."""
+    x = box.state(*np.zeros(6))
+    x[2] += 1.0
+    matrix = box.jacobian(x)
+    np.testing.assert_array_equal(matrix[:-1, -1], 0.0)
+    np.testing.assert_allclose(matrix[4:7, 10:13], 0.002 * np.eye(3), atol=1e-12)
+    np.testing.assert_allclose(matrix[:-1], differences(box.theirs, x)[:-1], atol=1e-7)
+
+
+# --- our worlds ---
+
+STEP = Physics(control_period=0.01)
+
+
+@cache
+def some_worlds(name, count, driven, x64=False, feet=""):
+    """Return shape family, drawn worlds, robot, and states (count, ...) near contact by kind.
+
+    Kinds are: at rest, sliding and turning flat, on an edge, on a corner. Some touch the base.
+    """
+    dtype, rng = np.float64 if x64 else np.float32, np.random.default_rng(0)
+    ranges = domains.parse_domain(f"wide,objects={name},gap=0,lateral=-0.05:0.05{feet}")
+    drawn = draws.draw(ranges, 3, np.arange(count))
+    kind = np.arange(count)[:, None] % 4
+    qpos = starts(drawn)
+    qpos[:, [3, 5]] += 0.0005 * rng.uniform(-1, 0.2, (count, 2))
+    lean = np.choose(kind, [0.0, 3e-4, [[0.1, 0.0]], 0.1]) * rng.normal(size=(count, 2))
+    turned = sp.times(qpos[:, 6:10].T, np.column_stack([np.ones(count), lean, 0 * kind]).T)
+    qpos[:, 6:10] = np.stack(turned, axis=1) / np.linalg.norm(turned, axis=0)[:, None]
+    speeds = [0.05, 0.05, 0.1, 0.05, 0.05, 0.02, 0.1, 0.1, 0.2]
+    qvel, twist = rng.normal(size=(count, 9)) * speeds, rng.normal(size=(count, 3)) * speeds[:3]
+    state = [qpos, *(np.where(kind > 0, x, 0) for x in (qvel, twist))]
+    robot = Robot(force_max=100.0) if driven else Robot()
+    robots = jax.tree.map(lambda x: np.full(count, x, dtype), robot) if driven else None
+    return ranges.families[0], drawn, robot, robots, [x.astype(dtype) for x in state]
+
+
+def pulled_back(engine, worlds, physics, weights):
+    """Return next states and forces (n, 22), and the gradients of their weighted sum, by input.
+
+    The gradient by a quaternion is tangential: engines differ in that along it, which has no use.
+    """
+    family, drawn, robot, robots, (qpos, qvel, twist) = worlds
+    inputs = family, drawn.solid, drawn.friction, physics, robot
+    stage, fields = engines.get(engine).stage(*inputs)
+    fields = jax.tree.map(lambda x: jnp.asarray(x, qpos.dtype), fields)
+
+    def after(fields, qpos, qvel, twist, robots):
+        integral = None if robots is None else jnp.zeros_like(twist)
+        motion = Motion(qpos, qvel, jnp.zeros_like(qvel), integral)
+        period = ControlPeriod(Twist(*twist.T), physics, robots, force=True)
+        driven = stage.drive(fields, motion, period)
+        return jnp.concatenate([driven.motion.qpos, driven.motion.qvel, driven.force], axis=1)
+
+    @jax.jit
+    def run(*inputs):
+        values, pull = jax.vjp(after, *inputs)
+        return values, pull(weights)
+
+    values, gradients = run(fields, qpos, qvel, twist, robots)
+    at = np.array(gradients[1])
+    q = qpos[:, 6:10]
+    at[:, 6:10] -= (at[:, 6:10] * q).sum(axis=1, keepdims=True) * q
+    return np.asarray(values), (gradients[0], at, *gradients[2:])
+
+
+def check_finite(gradients):
+    for path, leaf in jax.tree.leaves_with_path(gradients):
+        assert np.isfinite(leaf).all(), jax.tree_util.keystr(path)
+
+
+def test_gradients_of_our_boxes_are_finite_and_those_of_the_fused_engine():
+    """In float32, with the standard solver; the flat boxes alone have equal contacts in both.
+
+    MJX has up to four contacts, within 1 mm of the deepest, and fused has all corners. The solvers
+    end at different errors, of up to 1e-3 of an acceleration.
+    """
+    worlds = some_worlds("random_box", 400, driven=False)
+    weights = jax.random.normal(jax.random.key(0), (400, 22))
+    values, gradients = pulled_back("mjx", worlds, STEP, weights)
+    check_finite(gradients)
+    expected = pulled_back("fused", worlds, STEP, weights)
+    for ours, theirs in zip(
+        (values, *gradients[1:4]), (expected[0], *expected[1][1:4]), strict=True
+    ):
+        error = np.abs(ours - theirs).max(axis=1) / np.abs(theirs).max(axis=1)
+        flat = error.reshape(-1, 4)[:, :2]
+        assert np.median(flat) < 1e-3
+        assert (flat < 0.02).mean() > 0.95
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("name", "driven", "cone", "feet"),
+    [
+        ("random_cylinder", True, "elliptic", ""),
+        ("random_cylinder", False, "pyramidal", ",feet=0.5:0.9"),
+        ("random_prism", True, "pyramidal", ""),
+        ("random_prism", True, "elliptic", ",feet=0.5:0.9"),
+        ("random_box", True, "pyramidal", ""),
+    ],
+)
+def test_gradients_of_all_objects_are_finite(name, driven, cone, feet):
+    """In 10,000 states, for weights of any size."""
+    worlds = some_worlds(name, 10_000, driven, feet=feet)
+    physics = Physics(control_period=0.01, cone=cone)
+    weights = jax.random.normal(jax.random.key(0), (10_000, 22))
+    weights = weights * 10 ** jax.random.uniform(
+        jax.random.key(1), (10_000, 1), minval=-3, maxval=6
+    )
+    check_finite(pulled_back("mjx", worlds, physics, weights)[1])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("condim", "options"),
+    [
+        (3, {}),
+        (6, {"integrator": "implicitfast"}),
+        (4, {"cone": "pyramidal"}),
+        (1, {"cone": "pyramidal"}),
+        (3, {"solver": "CG", "iterations": 3000}),
+    ],
+)
+def test_derivatives_of_a_leg_are_central_differences(condim, options):
+    """Contacts of all dimensions, limits, friction loss, damping; and the constraint forces."""
+    with jax.enable_x64(True):
+        case = Case(LEG.format(condim=condim), **options)
+        # Differences of CG would have the error of its solution.
+        exact = Case(LEG.format(condim=condim), **options | {"solver": "Newton"})
+        rng = np.random.default_rng(1)
+        for function in ("after", "forces"):
+            jacobian = jax.jit(jax.jacrev(partial(getattr(case, function), mjx_gradients.step)))
+            step = jax.jit(jax.vmap(partial(getattr(exact, function), mjx.step)))
+            for thigh, ankle in ((0.1, 0.1), (-1.06, 0.3), (0.36, 0.8)):
+                x = case.state(*rng.normal(size=6) * 0.3)
+                x[2], x[3:7] = thigh, (np.cos(ankle / 2), 0, np.sin(ankle / 2), 0)
+                expected = differences(step, x)
+                atol = 1e-3 * np.abs(expected).max(axis=1, keepdims=True) + 1e-6
+                assert (np.abs(jacobian(x) - expected) < atol).all()
+
+
+def test_models_without_derivatives_are_refused(box):
+    rk4 = box.model.tree_replace({"opt.integrator": types.IntegratorType.RK4})
+    with pytest.raises(errors.InputError, match=r"integrator = RK4 .* Euler or implicitfast"):
+        mjx_gradients.step(rk4, box.data)
+    with pytest.raises(errors.InputError, match=r"model = mjmodel .*put_model\(model, impl='jax'"):
+        mjx_gradients.solve(box.plain, box.data)
