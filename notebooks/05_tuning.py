@@ -172,10 +172,11 @@ cases = [
 horizons = (1.0, 3.0, 10.0)  # [s]
 distances, starts = estimators.distances(cases, space.params, horizons)  # at all three times
 theta, key = space.vector(RPSParams.paper()), jax.random.key(0)
+options = gradients.Options
 estimates = {
     "derivative": estimators.forward(distances, theta, starts),
-    "differences": estimators.differences(distances, theta, starts, step=0.01),
-    "evolution": estimators.evolution(distances, theta, starts, key, sigma=0.15, pairs=4),
+    "differences": estimators.differences(distances, theta, starts, options=options(sigma=0.01)),
+    "evolution": gradients.evolution(distances, theta, starts, key, options(sigma=0.15, pairs=4)),
 }
 means = {name: gradients.estimate(slopes) for name, slopes in estimates.items()}
 bars = {name: (mean.gradient.T, mean.variance.T) for name, mean in means.items()}

@@ -44,7 +44,7 @@ STALE: dict[str, str] = {
             *("ceiling", "engines_ideal", "engines_wide", "headline", "models", "race"),
             *("rivals_tuned", "export_bags", "export_inputs", "export_odd", "export_paper"),
             *("export_speed", "export_trials", "export_worlds", "fit_bags", "fit_coverage"),
-            *("fit_quantities", "fit_worth", "gradients"),
+            *("fit_quantities", "fit_worth"),
         ),
         _READING,
     ),

@@ -16,7 +16,7 @@ from rps_jax.runs.evaluate import CandidateScores
 from rps_jax.trials.score import Objective
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import Rules
-from rps_jax.tuning import descent, gradients
+from rps_jax.tuning import descent
 from rps_jax.tuning.descent import TuneGrad
 
 SETTING = Setting("quasistatic", rules=Rules(horizon=20.0, max_lost=10.0))
@@ -74,6 +74,15 @@ def test_a_law_without_a_smooth_form_is_refused():
     TuneGrad("pursuit", tuned=("K_v",), estimator="evolution").validate()
 
 
+def test_an_estimator_must_exist_and_its_engine_have_derivatives():
+    with pytest.raises(InputError, match="unknown estimator 'reverse': choose from exact, clipped"):
+        TuneGrad("rps", estimator="reverse").validate()
+    mujoco = Setting("mujoco")
+    with pytest.raises(InputError, match="engine = mujoco is not allowed: reverse-mode"):
+        TuneGrad("rps", setting=mujoco).validate()
+    TuneGrad("rps", estimator="evolution", setting=mujoco).validate()
+
+
 def test_steps_go_downhill_and_stay_within_the_clip():
     rule = TuneGrad("rps", learning_rate=0.5, clip=1.0, steps=10).rule
     change, state = rule.update(jnp.array([30.0, 40.0]), rule.init(jnp.zeros(2)), jnp.zeros(2))
@@ -87,8 +96,8 @@ def test_antithetic_steps_find_the_slope_of_the_objective():
     question = TuneGrad("rps", tuned=("L", "K_h"), worlds=3, pairs=4000, setting=SETTING)
 
     def pretend(asks):
-        z = question.space.vector(asks[0].params)
-        return [CandidateScores(None, np.asarray(2 * z[:, 0] - z[:, 1])[:, None] + np.zeros(3))]
+        z = question.space.vector(asks[0].params)  # (P, 3, 2): each world has other steps
+        return [CandidateScores(None, np.asarray(2 * z[..., 0] - z[..., 1]) + np.arange(3))]
 
     estimate = descent.evolution_gradients(jnp.zeros((2, 2)), question, 0, pretend)
     np.testing.assert_allclose(estimate.gradient, [[2, -1], [2, -1]], atol=0.2)
@@ -96,21 +105,35 @@ def test_antithetic_steps_find_the_slope_of_the_objective():
     assert (errors < 4).all()
 
 
+def test_the_tail_alone_counts_for_a_risk_averse_objective():
+    """Of ten worlds, whose score is a multiple of the parameter, two are the worst fifth."""
+    objective = Objective(risk="cvar", tail=0.2)
+    slopes = jnp.arange(10.0)
+
+    def by_world(theta):
+        return objective.linearise(theta * slopes)
+
+    assert jax.jacrev(lambda t: by_world(t).mean())(1.0) == pytest.approx(8.5)
+    step = 1e-3
+    values = [objective.value((1.0 + side * step) * slopes) for side in (1, -1)]
+    assert (values[0] - values[1]) / (2 * step) == pytest.approx(8.5, rel=1e-3)
+    np.testing.assert_array_equal(Objective().linearise(slopes), slopes)
+
+
 def test_windows_start_at_the_states_of_their_trials(monkeypatch):
     """Trials are replaced by counts of their steps of 20 ms."""
 
     monkeypatch.setattr(descent, "start_all", lambda *arguments, law: jnp.zeros(arguments[-1].size))
-    monkeypatch.setattr(descent, "control_step", lambda *arguments: (arguments[3] + 1, None))
-    monkeypatch.setattr(gradients, "window", lambda *_, **__: lambda thetas, starts: starts[1])
+    monkeypatch.setattr(descent, "advance", lambda batches, loop, steps: [batches[0][-1] + steps])
     late = jnp.array([0.0, 0.5, 1.0])
     for within, steps in ((10.0, [0, 250, 500]), (0.0, [0, 0, 0])):
         question = TuneGrad("rps", tuned=("L", "K_h"), within=within, setting=SETTING)
-        scores = descent.window_scores(question, None)
-        np.testing.assert_array_equal(scores(jnp.zeros((3, 2)), (None, late)), steps)
+        trials = descent.window_starts(question, None, jnp.zeros(2), late, late)
+        np.testing.assert_array_equal(trials, steps)
 
 
 # Cylinders on the quasi-static model, to compile few programs.
-RUN = "tune grad --engine quasistatic --estimator reverse --objects random_cylinder --worlds 2 "
+RUN = "tune grad --engine quasistatic --estimator clipped --objects random_cylinder --worlds 2 "
 RUN += "--validation 2 --starts 2 --horizon 5 --window 1 --within 2 --tuned L K_h v_lost --slots 4"
 
 

@@ -28,7 +28,7 @@ OUT_OF_BOUNDS = [
     *("real_pushes --mujoco -1", "fit --logs 1", "fit/bags.py --logs 0", "export --inputs 0"),
 ]
 UNKNOWN = [
-    *("gradients --object box", "gradients --estimators backward", "gradients --tuned v_max"),
+    *("gradients --objects box", "gradients --estimators backward", "gradients --tuned v_max"),
     *("landscape --domain wyde", "engines --domain wyde"),
     *("random_worlds --domains wyde", "random_worlds --laws none", "export --laws nune"),
     *("speed --names fast", "speed/costs.py --names mjx", "levers --program mjx"),

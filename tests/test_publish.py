@@ -19,7 +19,6 @@ from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import Rules
 from rps_jax.world.domain import DOMAINS, Range
 from sweeps import render_tables
-from sweeps.gradients import study as gradients
 from sweeps.publish import dependencies, rows, study
 from sweeps.publish.recipes import HISTORY, RECIPES, Recipe
 from sweeps.random_worlds import million
@@ -197,15 +196,6 @@ def test_rare_failures_have_rows_of_the_median_and_of_all_repetitions():
     assert (together[1], together[-1]) == ("0.3", "600")
     assert last == ["drawn worlds", "0.25", "[0.2, 0.3]", "0.10", "400"]
     assert len(rows.rare_failures(results)) == 3
-
-
-def test_cosines_have_a_column_per_horizon():
-    cosine = xr.DataArray([[0.5, -0.25]], dims=("estimator", "horizon"))
-    results = xr.Dataset({"cosine": cosine, "low": cosine - 0.4, "high": cosine + 0.4,
-                          "decided": cosine > 0, "doubt": ("horizon", [0.1, 0.2])},
-                       {"estimator": ["forward"], "horizon": [2.0, 30.0]})  # fmt: skip
-    decided, undecided = "0.50 [0.10, 0.90]", "-0.25 [-0.65, 0.15], undecided"
-    assert gradients.table(results)[1:] == [["forward", "", decided, "", undecided, ""]]
 
 
 def test_dependencies_include_indirect_ones():

@@ -4,11 +4,15 @@ import re
 from dataclasses import replace
 
 import numpy as np
+import pandas as pd
 import pytest
 import xarray as xr
 
 from rps_jax.errors import InputError
+from rps_jax.trials.setting import Setting
+from sweeps.gradients import check, network, race
 from sweeps.gradients import study as gradients
+from sweeps.gradients.learner import WindowLearner
 from sweeps.gradients.study import Gradients
 
 
@@ -31,39 +35,85 @@ def compare(measured, *names, clip=2.0):
     return compared
 
 
+def rows(results):
+    """Return the table of one object."""
+    return gradients.table(results.expand_dims(object=["random_box"]))
+
+
 def test_the_measures_by_hand():
     measured = samples(
         truth=[[2.0, 0.1], [2.0, -0.1]],
         # The bound on a world is 4, twice the median of the norms 1, 2, 2 and 90.
-        reverse=[[0.0, 1.0], [2.0, 0.0], [-2.0, 0.0], [0.0, -90.0]],
+        exact=[[0.0, 1.0], [2.0, 0.0], [-2.0, 0.0], [0.0, -90.0]],
         forward=1e25 * np.array([[-1.0, 0.0], [-3.0, 0.0], [-1.0, 0.0], [-3.0, 0.0]]),
         evolution=[[1.0, 0.0], [0.0, 1.0], [1.0, 0.0], [0.0, 1.0]],
     )
-    names = ("reverse", "clipped", "forward", "evolution", "combined")
+    names = ("exact", "clipped", "forward", "evolution", "mixed")
     judged = compare(measured, *names).isel(horizon=0)
     cosine = dict(zip(names, judged.cosine.values, strict=True))
-    assert cosine["reverse"] == pytest.approx(0, abs=1e-6)  # mean (0, -89 / 4)
+    assert cosine["exact"] == pytest.approx(0, abs=1e-6)  # mean (0, -89 / 4)
     assert cosine["clipped"] == pytest.approx(0, abs=1e-6)  # mean (0, -3 / 4)
     assert cosine["forward"] == pytest.approx(-1)
     assert cosine["evolution"] == pytest.approx(np.sqrt(0.5))  # mean (1 / 2, 1 / 2)
-    # Entry by entry, reverse has the variances 2 / 3 and 507.2, evolution 1 / 12 in both.
-    weight = np.array([1 / (1 + 8), 1 / (1 + 12 * 507.2)])
-    mean = weight * [0, -22.25] + (1 - weight) * 0.5
-    assert cosine["combined"] == pytest.approx(mean[0] / np.hypot(*mean), rel=1e-3)
+    # The variances are 2 / 3 + 507.2 and 2 / 12; the means are no two standard errors apart.
+    weight = (1 / 6) / (1 / 6 + 2 / 3 + 507.2)
+    mean = weight * np.array([0, -22.25]) + (1 - weight) * 0.5
+    assert cosine["mixed"] == pytest.approx(mean[0] / np.hypot(*mean), rel=1e-3)
+    assert judged.error.sel(estimator="clipped") == pytest.approx(np.hypot(2, 0.75) / 2)
+    assert judged.error.sel(estimator="forward") == pytest.approx(1e25)
     assert float(judged.doubt) == pytest.approx(0.05)  # sqrt(0 + 0.01) / 2
     assert judged.low.sel(estimator="forward") == pytest.approx(-1)
-    head, first, *_, last = gradients.table(compare(measured, "evolution", "reverse", "forward"))
-    assert first[:2] == ["evolution", ""]
+    head, first, *_, last, _ = rows(compare(measured, "evolution", "exact", "forward"))
+    assert first[:2] == ["boxes", "evolution"]
     assert first[head.index("1 s")].startswith("0.71 [0.00, 1.00]")
-    assert last[:3] == ["forward", "", "-1.00 [-1.00, -1.00]"]
+    assert last == ["boxes", "forward", "-1.00 [-1.00, -1.00]"]
+
+
+def test_derivatives_are_compared_in_each_world():
+    slopes = [[0.0, 1.0], [2.0, 0.0], [-2.0, 0.0], [0.0, -90.0], [0.0, 0.0]]
+    truth = [[0.0, 1.0], [2.0, 0.0], [-2.0, 0.0], [0.0, -100.0], [0.0, 0.0]]
+    results = check.Check().combine(samples(exact=slopes, differences=truth))
+    np.testing.assert_allclose(results.error[:, 0], [0.0, 0.0, 0.0, 0.1, np.nan])
+    _, median, right, *_, largest = check.table(results.expand_dims(object=["random_box"]))
+    assert median == ["boxes", "median error", "0.0e+00"]
+    assert right == ["boxes", "share of worlds with an error below 1 %", "0.75"]
+    assert largest[-1] == "9.0e+01"
+
+
+def test_the_best_validation_within_a_budget_is_tested():
+    columns = {"validation": [0.4, 0.3, 0.2, 0.1], "simulated": [10.0, 10.0, 20.0, 20.0]}
+    columns |= {"run": [1.0] * 4, "differentiate": [0.0, 9.0, 0.0, 0.0], "params.L": [1, 2, 3, 4]}
+    curve = pd.DataFrame(columns)
+    choices = {("simulated", 40.0): 3, ("simulated", 25.0): 2, ("wall", 11.5): 2, ("wall", 0.1): 1}
+    for (budget, amount), L in choices.items():
+        assert race.law_of(race.best_within(curve, budget, amount)).L == L
+
+
+def test_a_learner_by_gradients_needs_derivatives():
+    for options, message in (
+        ({"estimator": "none"}, "unknown estimator 'none'"),
+        ({"setting": Setting("mujoco")}, "engine = mujoco is not allowed"),
+    ):
+        with pytest.raises(InputError, match=message):
+            WindowLearner(**options).validate()
+
+
+def test_a_learning_curve_is_summed_up_by_hand():
+    columns = {"time": [30.0, 90.0, 180.0], "validation": [0.1, np.nan, 0.4], "level": [0.2] * 3}
+    columns |= {"simulated": [1.0, 2.0, 3600.0]}
+    curve = xr.Dataset({k: ("update", x) for k, x in columns.items()}, attrs={"test_success": 0.3})
+    results = network.summary(curve).expand_dims(run=["ppo"])
+    assert network.table(results)[1] == [
+        *("ppo", "10.0 %", "10.0 %", "", "", "30.0 %", "20 %", "3.0", "3", "1 h"),
+    ]
 
 
 def test_a_cosine_without_a_sign_is_undecided():
     random = np.random.default_rng(2)
     noise, drift = random.normal(size=(2, 64, 2))
-    results = compare(samples(truth=drift + np.array([3, 0]), reverse=noise, forward=noise + 1),
-                      "reverse", "forward")  # fmt: skip
-    head, noisy, decided = gradients.table(results)
+    results = compare(samples(truth=drift + np.array([3, 0]), exact=noise, forward=noise + 1),
+                      "exact", "forward")  # fmt: skip
+    head, noisy, decided, _ = rows(results)
     column = head.index("1 s")
     assert noisy[column].endswith("], undecided")
     assert re.fullmatch(r"0\.\d\d \[0\.\d\d, 0\.\d\d\]", decided[column])
@@ -75,7 +125,7 @@ def test_a_cosine_of_one_dominant_world_is_undecided():
     true, drawn = random.normal(size=(2, 64, 2)) + np.array([3, 0])
     heavy = drawn * 2.0 ** np.arange(64)[:, None]
     results = compare(
-        samples(truth=true, reverse=heavy, forward=drawn), "reverse", "forward", "clipped"
+        samples(truth=true, exact=heavy, forward=drawn), "exact", "forward", "clipped"
     )
     assert (results.low > 0).all()
     assert results.decided.values[:, 0].tolist() == [False, True, True]
@@ -94,20 +144,20 @@ def test_the_interval_of_a_cosine_holds_the_true_one():
 
 
 SIZES = {"worlds": 2, "truth": 6, "tuned": ("K_h", "L"), "horizons": (4.0, 8.0)}
-SMALL = Gradients(("evolution",), object="random_cylinder", engine="quasistatic", **SIZES)
+SMALL = Gradients(("evolution",), objects=("random_cylinder",), engine="quasistatic", **SIZES)
 
 
 def test_a_study_resumes_and_refuses_other_options(tmp_path, monkeypatch):
     """The quasi-static model compiles fastest."""
     names, measured = [], gradients._measure
-    recorded = lambda *args: names.append(args[1]) or measured(*args)  # noqa: E731
+    recorded = lambda *args: names.append(args[2]) or measured(*args)  # noqa: E731
     monkeypatch.setattr(gradients, "_measure", recorded)
     results = replace(SMALL, out=tmp_path)()
     xr.testing.assert_identical(results, replace(SMALL, out=tmp_path)())
     assert names == ["truth", "evolution"]  # each ran once
     more = replace(SMALL, estimators=("evolution", "forward"), out=tmp_path)
     assert more.measurements == ("truth", "evolution", "forward")
-    assert results.evolution.sizes == {"world": 2, "parameter": 2, "horizon": 2}
+    assert results.evolution.sizes == {"object": 1, "world": 2, "parameter": 2, "horizon": 2}
     assert results.truth.sizes["truth_world"] == 6
     assert (np.abs(results.cosine) <= 1 + 1e-6).all()
     assert (results.doubt > 0).all()

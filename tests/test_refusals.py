@@ -117,7 +117,7 @@ REFUSED = {
         *each(population=3, spread=0.0, generations=0, prior=-1.0)
     ],
     then("validate", Gradients): [
-        *each(object="box", worlds=1, delta=0.0),
+        *each(objects=("box",), worlds=1, delta=0.0),
         *(({"horizons": horizons}, "horizons") for horizons in ((), (2.0, 1.0))),
     ],
 }

@@ -204,7 +204,8 @@ def pretend(asks, setting, objective, **_):
     answers = []
     for ask in asks:
         value = (np.asarray(ask.params.L) - 0.4) ** 2 + (np.asarray(ask.params.K_h) - 0.6) ** 2
-        scores = value[:, None] + 1e-3 * np.sin(ask.worlds + ask.seed)
+        value = value.reshape(len(value), -1)  # (P, 1), or (P, W) if each world has parameters
+        scores = value + 1e-3 * np.sin(ask.worlds + ask.seed)
         outcome = Outcome(scores < 0.05, *[scores] * (len(Outcome._fields) - 1))
         answers.append(CandidateScores(outcome, scores))
     return answers, Timing(0.0, 1.0, 1.0)

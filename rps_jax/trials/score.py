@@ -88,6 +88,19 @@ class Objective:
         worst = max(1, round(self.tail * scores.shape[-1]))
         return jnp.mean(jnp.sort(scores, axis=-1)[..., -worst:], axis=-1)
 
+    def linearise(self, scores: jax.Array) -> jax.Array:
+        """Return scores (..., W) whose mean has the gradient of the risk of scores (..., W).
+
+        For cvar these are the excess over the quantile, which is held (Rockafellar and Uryasev
+        2000, Eq. 4).
+        """
+        if self.risk == "mean":
+            return scores
+        quantile = jnp.quantile(
+            jax.lax.stop_gradient(scores), 1 - self.tail, axis=-1, keepdims=True
+        )
+        return jnp.maximum(scores - quantile, 0.0) / self.tail
+
 
 def severity(
     trials: Mapping[str, ArrayLike] | xr.Dataset, missed: ArrayLike, rules: Rules

@@ -120,6 +120,10 @@ class Learn(PPO, SimulationQuestion[xr.Dataset]):
     out: Path | str | None = field(default="runs/learn", kw_only=True)
     """Run folder, with `policy.npz`; a killed run resumes there."""
 
+    # Functions of the algorithm, which a subclass may replace.
+    start: ClassVar[Callable[..., RunnerState]] = staticmethod(rollout.start)
+    update: ClassVar[Callable[..., tuple[RunnerState, Any]]] = staticmethod(rollout.update)
+
     @functools.cached_property
     def domains(self) -> tuple[Domain, ...]:
         """Domains to learn in."""
@@ -219,8 +223,8 @@ class _Learner:
         self.network = network = rollout.network_of(options, envs)
         compile_start = time.perf_counter()
         self._validation_tables = [env.table for env in validation_envs]
-        start = partial(rollout.start, options, network, envs, seed=options.setting.seed)
-        update = partial(rollout.update, options, network, envs)
+        start = partial(options.start, options, network, envs, seed=options.setting.seed)
+        update = partial(options.update, options, network, envs)
         evaluate = partial(rollout.evaluate_policy, network, validation_envs)
         shapes = jax.eval_shape(start, tables)
         lowered = (

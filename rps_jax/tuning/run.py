@@ -240,7 +240,8 @@ class Tuning(LawQuestion[xr.Dataset]):
             return scores
 
         results = {**proposal, **self.judge(proposal, generation, score)}
-        times["simulated"] += float(results.pop("simulated", 0.0))
+        for name in times:
+            times[name] += float(results.pop(name, 0.0))
         values = self.space.changed_values(results["center"])
         results |= times | {"params": np.array([values[name] for name in self.space.names])}
         variables = {

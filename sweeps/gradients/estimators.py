@@ -1,7 +1,6 @@
-"""Gradient estimators of this study and of notebook 05, for comparison with reverse mode.
+"""Gradient estimators of this study and of notebook 05 beside those of the package.
 
-Each returns the gradient in each world (n, p, ...), as `rps_jax.tuning.gradients.slopes` does in
-reverse mode; `rps_jax.tuning.gradients.estimate` averages them.
+They have the interface of `rps_jax.tuning.gradients`, whose `estimate` averages their samples.
 """
 
 from collections.abc import Callable, Sequence
@@ -17,16 +16,31 @@ from rps_jax.trials import pushes, trial
 from rps_jax.trials.case import Case
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import ControlLoop, Snapshot
-from rps_jax.tuning.gradients import Estimate, Scores, per_world, window
+from rps_jax.tuning import gradients
+from rps_jax.tuning.gradients import (
+    Estimator,
+    Options,
+    Scores,
+    per_world,
+    random_steps,
+    repeat,
+    window,
+)
 from rps_jax.world.physics import Physics
 
 
-def forward(scores: Scores, theta: jax.Array, worlds: Any) -> jax.Array:
-    """Return the gradients by forward-mode differentiation.
+def forward(
+    scores: Scores,
+    theta: jax.Array,
+    worlds: Any,
+    key: jax.Array | None = None,
+    options: Options = Options(),
+) -> jax.Array:
+    """Return the derivatives in forward mode, at the cost of p evaluations of the scores.
 
-    The cost is p evaluations of the scores. Forward mode passes through the solver loops of the
-    fused engine and of MJX (with a pyramidal cone).
+    Forward mode passes through the solver loop of MJX with a pyramidal cone.
     """
+    del key, options
     thetas = per_world(theta, worlds)
 
     def along(direction: jax.Array) -> jax.Array:
@@ -37,65 +51,39 @@ def forward(scores: Scores, theta: jax.Array, worlds: Any) -> jax.Array:
 
 
 def differences(
-    scores: Scores, theta: jax.Array, worlds: Any, *, step: float | jax.Array
-) -> jax.Array:
-    """Return the gradients by central differences, from 2 p n scores.
-
-    The `step` is () or (p,), in the units of theta.
-    """
-    n, p = per_world(theta, worlds).shape
-    steps = jnp.repeat(jnp.diag(jnp.broadcast_to(jnp.asarray(step, theta.dtype), p)), n, axis=0)
-    thetas = theta + jnp.concatenate([steps, -steps])
-    values = scores(thetas, _repeat(worlds, 2 * p))
-    rises = -jnp.diff(values.reshape(2, p, n, *values.shape[1:]), axis=0)[0]
-    width = jnp.reshape(2 * jnp.asarray(step), (-1,) + (1,) * values.ndim)
-    return jnp.swapaxes(rises / width, 0, 1)
-
-
-def evolution(
     scores: Scores,
     theta: jax.Array,
     worlds: Any,
-    key: jax.Array,
-    *,
-    sigma: float | jax.Array,
-    pairs: int = 1,
+    key: jax.Array | None = None,
+    options: Options = Options(),
 ) -> jax.Array:
-    """Return the gradients of the score, smoothed by `sigma`, by antithetic random steps.
-
-    Each world tries `pairs` random normal directions and their opposites: 2 pairs n scores. Their
-    mean is unbiased for the gradient of E[score(theta + sigma e)], which exists even where scores
-    jump. `sigma`, () or (p,), is in the units of theta.
-
-    Reference: Nesterov and Spokoiny, "Random gradient-free minimization of convex functions",
-    Foundations of Computational Mathematics 17, 2017.
-    """
+    """Return central differences with steps of sigma, from 2 p n scores."""
     n, p = per_world(theta, worlds).shape
-    directions = jax.random.normal(key, (pairs, n, p), theta.dtype)
-    steps = jnp.concatenate([directions, -directions]) * sigma
-    values = scores(theta + steps.reshape(-1, p), _repeat(worlds, 2 * pairs))
-    rises = -jnp.diff(values.reshape(2, pairs, n, 1, *values.shape[1:]), axis=0)[0]
-    along = directions / (2 * sigma)
-    slopes = rises * along.reshape(*along.shape, *(1,) * (values.ndim - 1))
-    return jnp.mean(slopes, axis=0)
+    sigma = jnp.broadcast_to(jnp.asarray(options.sigma, theta.dtype), p)
+    steps = jnp.repeat(jnp.diag(sigma), n, axis=0)
+    thetas = theta + jnp.concatenate([steps, -steps])
+    values = scores(thetas, repeat(worlds, 2 * p))
+    rises = -jnp.diff(values.reshape(2, p, n, *values.shape[1:]), axis=0)[0]
+    return jnp.swapaxes(rises / jnp.reshape(2 * sigma, (-1,) + (1,) * values.ndim), 0, 1)
 
 
-def combine(a: Estimate, b: Estimate) -> Estimate:
-    """Return the mean of two independent estimates, weighted by their inverse variances.
+def bundled(
+    scores: Scores, theta: jax.Array, worlds: Any, key: jax.Array, options: Options = Options()
+) -> jax.Array:
+    """Return the derivatives of the smoothed score: means over antithetic random steps."""
+    _, thetas, repeated = random_steps(theta, worlds, key, options)
+    samples = gradients.exact(scores, thetas, repeated)
+    return jnp.mean(samples.reshape(2 * options.pairs, -1, *samples.shape[1:]), axis=0)
 
-    Each entry is weighted separately. This mean has the least variance of all weighted means, if
-    the variances are correct. An estimate with infinite variance has no weight.
-    """
-    total = a.variance + b.variance
-    weight = jnp.where(total > 0, b.variance / jnp.where(total > 0, total, 1.0), 0.5)  # of a
-    weight = jnp.where(jnp.isinf(b.variance), 1.0, weight)
-    weight = jnp.where(jnp.isinf(a.variance), 0.0, weight)
-    least = jnp.minimum(a.variance, b.variance)
-    return Estimate(
-        weight * a.gradient + (1 - weight) * b.gradient,
-        jnp.where(jnp.isinf(total), least, weight * a.variance),
-        weight * a.finite + (1 - weight) * b.finite,
-    )
+
+# All estimators of the study by name.
+ESTIMATORS: dict[str, Estimator] = {
+    **gradients.ESTIMATORS,
+    "bundled": bundled,
+    "warm": gradients.exact,  # of trials with wider switches of the taxels
+    "forward": forward,
+    "differences": differences,
+}
 
 
 def distances(
@@ -148,8 +136,3 @@ def distances_at(
         return snapshots.details.distance[steps]
 
     return window(stage, params_of, remaining, ControlLoop(physics, law=law), int(steps[-1]) + 1)
-
-
-def _repeat(worlds: Any, times: int) -> Any:
-    """Repeat worlds (n, ...) several times, (times n, ...)."""
-    return jax.tree.map(lambda x: jnp.concatenate([x] * times), worlds)

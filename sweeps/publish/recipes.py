@@ -81,7 +81,6 @@ _DESCENT = f"rps tune grad {_RACE} --starts 2 --worlds 512 --steps 20 --learning
 _RACERS = " ".join(f"rps,runs/{name}/tuned.json" for name in ("evolution", "gradient", "hybrid"))
 _RIVALS = ("rps", "pursuit", "dipole", "force_push", "force_push_published")
 _SWEPT = "sweep --laws rps_tuned --domain wide"
-_GRADIENTS = "rps sweeps/gradients --estimators"
 
 # In order of importance, which is the order of computation.
 RECIPES: dict[str, Recipe] = {
@@ -278,14 +277,10 @@ RECIPES: dict[str, Recipe] = {
         gpu=15,
         section=rows.comparison,
     ),
-    "gradients": recipe(
-        f"{_GRADIENTS} reverse clipped evolution combined",
-        f"{_GRADIENTS} reverse clipped evolution combined --object random_cylinder",
-        f"{_GRADIENTS} forward --horizons 0.5 2 8 30",
-        cores=25,
-        section="Estimators against the truth",
-        labels=("boxes", "cylinders", "boxes"),
-    ),
+    "gradients_cosine": recipe(f"rps sweeps/gradients {_MACHINE}", cores=200, gpu=8),
+    "gradients_norm": recipe(f"rps sweeps/gradients {_MACHINE}", cores=200, gpu=8),
+    "gradients_growth": recipe(f"rps sweeps/gradients/growth.py {_MACHINE}", cores=60, gpu=4),
+    "gradients_bursts": recipe(f"rps sweeps/gradients/growth.py {_MACHINE}", cores=60, gpu=4),
     "robot": recipe(f"rps sweeps/speed/robot.py {_MACHINE}", cores=1),
     "dependencies": recipe(f"rps sweeps/publish/dependencies.py {_MACHINE}", cores=15),
     "extras": recipe(f"rps sweeps/publish/dependencies.py {_MACHINE}", cores=15),

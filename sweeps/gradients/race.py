@@ -1,0 +1,222 @@
+"""Race gradients against evolution: equal wall time and equal simulated time.
+
+Each tuning is a run of `rps tune grad` or `rps tune es` from the paper's parameters, in a folder of
+its own, and is killed after some minutes; a second call continues it, up to these minutes. The
+generation with the best validation within a budget is tested in worlds that no tuning has met.
+
+    rps sweeps/gradients/race.py --lanes 2 --minutes 5
+
+Several tunings run at once on one GPU and share it equally. Then a budget of wall time is that of a
+loaded GPU.
+"""
+
+from __future__ import annotations
+
+import itertools
+import os
+import shlex
+import subprocess
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+import pandas as pd
+import xarray as xr
+
+from rps_jax import errors
+from rps_jax.analysis import statistics
+from rps_jax.control import registry
+from rps_jax.control.laws.rps import RPSParams
+from rps_jax.record.options import option
+from rps_jax.runs.evaluate import evaluate
+from rps_jax.runs.question import Run, SimulationQuestion, call_of
+from rps_jax.trials.setting import Setting
+from sweeps.study_base import Rows, Study, Table, part_name
+
+COUNTS = {6: "K_h K_v L beta l_cr d_th", 13: "full"}  # tuned parameters by their number
+_COMMON = "--horizon 150 --validation 256"
+METHODS = {  # commands that are compared
+    "gradient": f"rps tune grad {_COMMON} --starts 1 --worlds 512 --steps 40 --learning-rate 0.1",
+    "evolution": f"rps tune es {_COMMON} --population 16 --worlds 64 --generations 1000",
+}
+QUICK_SIZES = (
+    " --objects random_cylinder --engine quasistatic --horizon 20 --validation 4 --worlds 4"
+)
+_CLOCKS = ("run", "differentiate")  # columns of a tuning's log that are wall time [s]
+BUDGETS = ("wall", "simulated")
+
+
+@dataclass(frozen=True)
+class Race(Study[xr.Dataset], SimulationQuestion[xr.Dataset]):
+    """Race gradients against evolution: equal wall time and equal simulated time.
+
+    The answer has the `success` (tuning, budget, world) of the tuned laws in test worlds, and that
+    of the paper's law, `start_success` (world).
+    """
+
+    TITLE: ClassVar[str] = "Gradients against evolution"
+    CHOICES: ClassVar = {"methods": METHODS}
+    QUICK: ClassVar[Mapping[str, Any]] = {"worlds": 4, "counts": (6,), "seeds": (1,)}
+    DIMENSION: ClassVar[str] = "tuning"
+    REPORTS_TIMES: ClassVar[bool] = True
+
+    methods: tuple[str, ...] = tuple(METHODS)
+    """gradient or evolution."""
+    counts: tuple[int, ...] = tuple(COUNTS)
+    """Numbers of tuned parameters, 6 or 13."""
+    seeds: tuple[int, ...] = (1, 2, 3)
+    """Seeds of the tunings."""
+    minutes: float = option(4.0, above=0, at_most=1e4, unit="min")
+    """Wall clock after which a tuning is killed [min], with compilation."""
+    wall: float = option(120.0, above=0, unit="s")
+    """Budget of wall time without compilation [s]."""
+    simulated: float = option(2.4e6, above=0, unit="s")
+    """Budget of simulated time [s]; a derivative counts as the simulation that takes as long."""
+    worlds: int = option(2000, 1, 1_000_000)
+    """Number of test worlds of `wide`."""
+    lanes: int = option(1, 1, 64)
+    """Number of tunings that run at once."""
+    gpus: int = option(0, 0, 8)
+    """Number of GPUs for the tunings; 0 leaves the choice to them."""
+    setting: Setting = field(default=Setting(), kw_only=True)
+    out: Path | str | None = field(default="runs/race", kw_only=True)
+    """Run folder; the tunings have folders there."""
+
+    def check(self) -> None:
+        super().check()
+        for count in self.counts:
+            errors.check_name("count", str(count), [str(x) for x in COUNTS])
+
+    def configuration(self) -> dict[str, Any]:
+        """Return everything that the answer depends on; the commands stand for the tunings."""
+        fields = {k: v for k, v in super().configuration().items() if k not in ("lanes", "gpus")}
+        return fields | {"commands": METHODS}
+
+    def tunings(self) -> dict[tuple[str, int, int], str]:
+        """Return the commands of the tunings by method, count and seed."""
+        labels = itertools.product(self.methods, self.counts, self.seeds)
+        sizes = QUICK_SIZES if self.quick else ""
+        return {
+            (m, n, s): f"{METHODS[m]} --tuned {COUNTS[n]} --seed {s}{sizes}" for m, n, s in labels
+        }
+
+    def tune(self, index: int, command: str, folder: Path) -> None:
+        """Run or continue a tuning until its time is up."""
+        environment = dict(os.environ, XLA_PYTHON_CLIENT_PREALLOCATE="false")
+        if self.gpus:
+            environment["CUDA_VISIBLE_DEVICES"] = str(index % self.gpus)
+        program = [sys.executable, "-m", "rps_jax", *shlex.split(command)[1:], "--out", str(folder)]
+        with open(folder.with_suffix(".log"), "a", encoding="utf-8") as log:
+            process = subprocess.Popen(program, env=environment, stdout=log, stderr=log)
+            try:
+                process.wait(60 * self.minutes)
+            except subprocess.TimeoutExpired:
+                process.kill()
+                process.wait()
+
+    def answer(self, run: Run) -> xr.Dataset:
+        """Run the tunings that lack a test, and test all."""
+        assert run.folder is not None
+        folders = {label: run.folder / part_name(*label) for label in self.tunings()}
+        stored = () if run.checkpoints is None else run.checkpoints.paths()
+        with ThreadPoolExecutor(self.lanes) as pool:
+            for index, (label, command) in enumerate(self.tunings().items()):
+                if part_name(*label) not in stored:
+                    pool.submit(self.tune, index, command, folders[label])
+        return super().answer(run)
+
+    def parts(self, run: Run) -> Mapping[Any, Callable[[], xr.Dataset]]:
+        """Return the test of each tuning, by its label."""
+        folder = run.folder or Path(str(self.out))
+        return {
+            part_name(*label): partial(self._test, folder / part_name(*label), label)
+            for label in self.tunings()
+        }
+
+    def _test(self, folder: Path, label: tuple[str, int, int]) -> xr.Dataset:
+        """Return the success of the best law of a tuning within each budget."""
+        if not (folder / "curve.csv").exists():
+            reason = f"{folder.with_suffix('.log')} tells why; or raise minutes"
+            raise errors.InputError(f"{folder} has no generation: {reason}.")
+        curve = pd.read_csv(folder / "curve.csv")
+        chosen = [best_within(curve, name, getattr(self, name)) for name in BUDGETS]
+        laws = [RPSParams.paper(), *map(law_of, chosen)]
+        scores = evaluate(
+            laws, "wide", self.worlds, split="test", setting=self.setting, progress=False
+        )
+        start, *tuned = scores.success.values.astype(np.int8)
+        columns = {"method": label[0], "count": label[1], "seed": label[2]}
+        variables = {name: ((), value) for name, value in columns.items()}
+        totals = {"generations": len(curve), "wall": spent(curve, "wall").iloc[-1]}
+        totals |= {"simulated": spent(curve, "simulated").iloc[-1]}
+        variables |= {name: ((), float(value)) for name, value in totals.items()}
+        variables |= {"start_success": ("world", start)}
+        return xr.Dataset(
+            variables | {"success": (("budget", "world"), np.stack(tuned))},
+            {"budget": list(BUDGETS)},
+        )
+
+    def intro(self, results: xr.Dataset) -> str:
+        """Return the budgets."""
+        return (
+            f"Tunings from the paper's parameters, with {self.wall:g} s of wall time without "
+            f"compilation or {self.simulated:g} simulated seconds; success in {self.worlds:,} "
+            "worlds of `wide` that no tuning has met."
+        )
+
+    def report_tables(self, results: xr.Dataset) -> Sequence[Table]:
+        """Return the success of the tunings."""
+        return [Table(table(results), merge="parameters", name="gradients_race", title="Success")]
+
+
+race = call_of(Race)
+
+
+def spent(curve: pd.DataFrame, budget: str) -> pd.Series:
+    """Return what each generation of a log has used of a budget, with all before it [s]."""
+    clocks = [name for name in _CLOCKS if name in curve] if budget == "wall" else ["simulated"]
+    return curve[clocks].sum(axis=1).cumsum()
+
+
+def best_within(curve: pd.DataFrame, budget: str, amount: float) -> pd.Series:
+    """Return the generation with the best validation within a budget; at least the first."""
+    within = curve[(spent(curve, budget) <= amount) | (curve.index == 0)]
+    return within.loc[within.validation.idxmin()]
+
+
+def law_of(row: pd.Series) -> RPSParams:
+    """Return the parameters of a generation."""
+    names = [name for name in row.index if name.startswith("params.")]
+    changes = {name.removeprefix("params."): float(row[name]) for name in names}
+    return registry.replace_leaves(RPSParams.paper(), changes)
+
+
+def table(results: xr.Dataset) -> Rows:
+    """Return a header and a row per number of parameters, budget and method."""
+    head = ["parameters", "equal", "method", "success, mean", "by seed [%]", "gained, lost"]
+    start = results.start_success.isel(tuning=0)
+    rows = [[*head, "generations"]]
+    rows.append(["", "", "start", f"{100 * float(start.mean()):.1f} %", "", "", ""])
+    cases = itertools.product(sorted(set(results["count"].values)), BUDGETS, METHODS)
+    for count, budget, method in cases:
+        at = (results["count"] == count) & (results["method"] == method)
+        if not at.any():
+            continue
+        chosen = results.isel(tuning=np.flatnonzero(at))
+        success = chosen.success.sel(budget=budget)
+        rates = 100 * success.mean("world").values
+        compared = [statistics.compare(start, x) for x in success]
+        gained, lost = (sum(getattr(c, name) for c in compared) for name in ("gained", "lost"))
+        seeds = ", ".join(f"{x:.1f}" for x in rates)
+        generations = f"{chosen.generations.values.mean():.0f}"
+        counts = f"+{gained} -{lost}"
+        label = f"{'wall time' if budget == 'wall' else 'simulated time'}"
+        rows.append(
+            [str(count), label, method, f"{rates.mean():.1f} %", seeds, counts, generations]
+        )
+    return rows

@@ -1,0 +1,191 @@
+"""Compare scores of windows: which one has the gradient of whole trials?
+
+`rps tune grad` differentiates the score of a window of a softened trial. Here its gradients are
+compared, for several lengths of the window and temperatures, with the gradient of the objective of
+whole trials under the original law, by central differences in other worlds.
+
+    rps sweeps/gradients/score.py --quick
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import partial
+from typing import Any, ClassVar
+
+import jax.numpy as jnp
+import numpy as np
+import xarray as xr
+
+from rps_jax.record.options import option
+from rps_jax.runs import evaluate
+from rps_jax.runs.evaluate import Candidates, CandidateScores
+from rps_jax.runs.question import Run, SimulationQuestion, call_of, seed_of
+from rps_jax.trials.setting import Setting
+from rps_jax.trials.trial import Rules
+from rps_jax.tuning import descent
+from rps_jax.tuning.descent import TuneGrad
+from rps_jax.tuning.gradients import Estimate, estimate
+from sweeps.study_base import QuickStudy, Rows, Table
+
+_DRAWS = 4000  # of the errors of both gradients
+
+
+@dataclass(frozen=True)
+class ScoreStudy(QuickStudy[xr.Dataset], SimulationQuestion[xr.Dataset]):
+    """Compare scores of windows: which one has the gradient of whole trials?
+
+    The answer has, by score (score), the gradient (parameter) with its `error`, the `cosine` to
+    that of whole trials with the interval `low` to `high`, and the `cost` [s] in simulated time.
+    """
+
+    TITLE: ClassVar[str] = "Scores of windows against whole trials"
+    QUICK: ClassVar[Mapping[str, Any]] = {
+        "windows": (2.0,),
+        "taxels": (0.03,),
+        "worlds": 4,
+        "truth": 8,
+        "tuned": ("K_h", "L"),
+        "setting.engine": "quasistatic",
+        "setting.rules": Rules(horizon=20.0),
+    }
+
+    windows: tuple[float, ...] = option((2.0, 8.0, 30.0), 0.1, 300, unit="s")
+    """Lengths of windows [s]."""
+    arrivals: tuple[float, ...] = option((0.005,), above=0, unit="m")
+    """Temperatures at which a softened trial arrives [m]."""
+    taxels: tuple[float, ...] = option((0.03, 0.1), above=0, at_most=1)
+    """Temperatures of the taxels of a softened trial [1]."""
+    estimators: tuple[str, ...] = ("clipped",)
+    """Estimators of the gradients of windows."""
+    tuned: tuple[str, ...] = ("full",)
+    """Parameters to differentiate by: names, or logistic, or full."""
+    worlds: int = option(512, 2, 1_000_000)
+    """Number of worlds of an estimate."""
+    truth: int = option(2048, 2, 1_000_000)
+    """Number of worlds of the central differences of whole trials."""
+    delta: float = option(0.1, above=0, at_most=5)
+    """Step of the central differences, in units of the bounded map [1]."""
+    setting: Setting = field(default=Setting(rules=Rules(horizon=150.0)), kw_only=True)
+
+    def tuning(
+        self, estimator: str, window: float = 8.0, arrive: float = 0.005, taxels: float = 0.03
+    ) -> TuneGrad:
+        """Return the tuning whose gradient is estimated."""
+        return TuneGrad(
+            "rps",
+            tuned=self.tuned,
+            worlds=self.worlds,
+            estimator=estimator,
+            window=window,
+            arrive=arrive,
+            taxels=taxels,
+            setting=self.setting,
+        )
+
+    def check(self) -> None:
+        super().check()
+        for name in self.estimators:
+            self.tuning(name).validate()
+
+    def parts(self, run: Run) -> Mapping[Any, Callable[[], xr.Dataset]]:
+        """Return the function of each gradient by its label."""
+        parts = {"truth": partial(self._truth, run)}
+        parts["evolution, whole trials"] = partial(self._evolution, run)
+        axes = self.estimators, self.windows, self.arrivals, self.taxels
+        for name, window, arrive, taxels in itertools.product(*axes):
+            label = f"{name}, window {window:g} s, arrival {1000 * arrive:g} mm, taxels {taxels:g}"
+            tuning = self.tuning(name, window, arrive, taxels)
+            parts[label] = partial(self._window, tuning)
+        return parts
+
+    DIMENSION: ClassVar[str] = "score"
+
+    def answer(self, run: Run) -> xr.Dataset:
+        """Compute the gradients that are missing, and compare them with the truth."""
+        results = super().answer(run)
+        random, (count,) = np.random.default_rng(0), results.parameter.shape
+        drawn = [
+            x.gradient.values + x.error.values * random.normal(size=(_DRAWS, count))
+            for _, x in results.groupby("score", squeeze=False)
+        ]
+        labels = [str(label) for label, _ in results.groupby("score", squeeze=False)]
+        draws = dict(zip(labels, drawn, strict=True))
+        pairs = {x: _cosine(draws[x], draws["truth"]) for x in map(str, results.score.values)}
+        low, high = np.array([np.quantile(x, (0.05, 0.95)) for x in pairs.values()]).T
+        truth = results.gradient.sel(score="truth").values
+        cosine = _cosine(results.gradient.values, truth)
+        columns = {"cosine": cosine, "low": low, "high": high}
+        return results.assign({name: ("score", x) for name, x in columns.items()})
+
+    def report_tables(self, results: xr.Dataset) -> Sequence[Table]:
+        """Return the cosine of each score."""
+        return [Table(table(results), name="gradients_score", title="Scores of windows")]
+
+    def _scores(self, run: Run, request: Candidates) -> tuple[CandidateScores, float]:
+        """Return the scores of candidates in whole trials, and the simulated time [s]."""
+        objective = self.tuning("evolution").objective
+        (scores,), timing = evaluate.score_candidates(
+            [request], self.setting, objective, **run.batch_options
+        )
+        return scores, timing.simulated
+
+    def _truth(self, run: Run) -> xr.Dataset:
+        """Return the gradient of the objective by central differences."""
+        tuning = self.tuning("evolution")
+        steps = self.delta * np.eye(len(tuning.space.names))
+        params = tuning.space.params(tuning.base + np.concatenate([steps, -steps]))
+        worlds, seed = np.arange(self.truth), seed_of(self.setting.seed, "test")
+        scores, simulated = self._scores(run, Candidates(params, tuning.domains, seed, worlds))
+        up, down = np.split(scores.score, 2)  # (p, W) each
+        return self._row(estimate(jnp.asarray((up - down).T / (2 * self.delta))), simulated)
+
+    def _evolution(self, run: Run) -> xr.Dataset:
+        """Return the gradient by evolution in whole trials."""
+        tuning, simulated = self.tuning("evolution"), 0.0
+
+        def score(requests: list[Candidates]) -> list[CandidateScores]:
+            nonlocal simulated
+            scores, seconds = self._scores(run, requests[0])
+            simulated += seconds
+            return [scores]
+
+        thetas = jnp.asarray(tuning.base)[None]
+        gradient = descent.evolution_gradients(thetas, tuning, 0, score)
+        return self._row(gradient, simulated, 0)
+
+    def _window(self, tuning: TuneGrad) -> xr.Dataset:
+        """Return the gradient of windows."""
+        gradient, cost, _ = descent.window_gradients(jnp.asarray(tuning.base)[None], tuning, 0)
+        return self._row(gradient, cost, 0)
+
+    def _row(self, x: Estimate, cost: float, index: int | None = None) -> xr.Dataset:
+        """Return a gradient (p,), or that of a start, with its standard error and its cost."""
+        values = (np.asarray(x.gradient, float), np.sqrt(np.asarray(x.variance, float)))
+        gradient, error = values if index is None else (value[index] for value in values)
+        names = list(self.tuning("evolution").space.names)
+        variables = {"gradient": ("parameter", gradient), "error": ("parameter", error)}
+        return xr.Dataset(variables | {"cost": ((), cost, {"units": "s"})}, {"parameter": names})
+
+
+score_study = call_of(ScoreStudy)
+
+
+def _cosine(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Return cosines (...) of vectors (..., p)."""
+    norms = np.linalg.norm(a, axis=-1) * np.linalg.norm(b, axis=-1)
+    return np.sum(a * b, -1) / np.maximum(norms, np.finfo(float).tiny)
+
+
+def table(results: xr.Dataset) -> Rows:
+    """Return a header and a row per score."""
+    rows = [["score", "cosine to whole trials", "error, relative", "simulated time"]]
+    for label in map(str, results.score.values):
+        row = results.sel(score=label)
+        size = max(np.linalg.norm(row.gradient), np.finfo(float).tiny)
+        error = np.linalg.norm(row.error) / size
+        cosine = f"{float(row.cosine):.2f} [{float(row.low):.2f}, {float(row.high):.2f}]"
+        rows.append([label, cosine, f"{error:.2f}", f"{float(row.cost):,.0f} s"])
+    return rows
