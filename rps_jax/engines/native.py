@@ -13,6 +13,7 @@ import contextlib
 import ctypes
 import functools
 import hashlib
+import math
 import os
 import re
 import subprocess
@@ -45,7 +46,7 @@ _FLAGS = ("-O2", "-march=native", "-fno-math-errno", "-ffp-contract=fast", "-w")
 _FLAGS += ("-fno-gcse", "-fno-rerun-cse-after-loop", "-fno-tree-dse")
 _FLAGS += ("--param", "sccvn-max-alias-queries-per-access=30")
 _NAME = "rps_native_"
-_THREADS = 4  # of a GPU that compute a world
+_THREADS = (4, 16)  # of a GPU that compute a world: the second if shared memory is short
 _NO_COMPILER = (
     "a C compiler (apt install gcc) or NVRTC (pip install nvidia-cuda-nvrtc) is not installed"
 )
@@ -92,6 +93,7 @@ def batched(
     whole: Callable[..., Pytree],
     derivative: Callable[[Pytree, Pytree], Pytree] | None = None,
     differentiated: Callable[..., Pytree] | None = None,
+    packed: Sequence[int] = (),
 ) -> Callable[..., Pytree]:
     """Return a function of a batch of worlds (B, ...) that runs world by world.
 
@@ -103,6 +105,8 @@ def batched(
       derivative: of arguments and results of one world; the function's derivatives are those of
         this one by the arguments. By default it is the function itself.
       differentiated: the same function of a batch, used where it is differentiated.
+      packed: indices of arguments that reverse mode stores as one array for each type of number,
+        since a loop stores each array by itself.
     """
     if not is_available():
         return whole
@@ -119,20 +123,20 @@ def batched(
         results = call(*primals)
         if derivative is not None:
             return results, _tangents(derivative, (primals, results), tangents, results)
-        return results, _tangents(function, primals, tangents, results)
+        return results, _tangents(function, primals, tangents, results, packed)
 
     call.defjvp(rule, symbolic_zeros=True)
     return call
 
 
-def mapped(
-    function: Callable[..., Pytree], axes: Sequence[int | None] | None = None
-) -> Callable[..., Pytree]:
+def mapped(function: Callable[..., Pytree], axes: Sequence[int | None]) -> Callable[..., Pytree]:
     """Return `jax.vmap(function, axes)`, compiled and differentiated world by world.
 
-    An argument of axis None is repeated for each world.
+    An argument of axis None is repeated for each world. All others but the first may change from
+    step to step: reverse mode packs them.
     """
-    run = batched(function, jax.vmap(function))
+    varying = [i for i, axis in enumerate(axes) if i and axis == 0]
+    run = batched(function, jax.vmap(function), packed=varying)
 
     def call(*arguments: Pytree) -> Pytree:
         size = len(jax.tree.leaves(arguments[0])[0])
@@ -140,29 +144,48 @@ def mapped(
         def repeat(x: Any) -> jax.Array:
             return jnp.broadcast_to(x, (size, *jnp.shape(x)))
 
-        every = axes or [0] * len(arguments)
-        pairs = zip(arguments, every, strict=True)
+        pairs = zip(arguments, axes, strict=True)
         return run(*(x if axis == 0 else jax.tree.map(repeat, x) for x, axis in pairs))
 
     return call
 
 
 def _tangents(
-    function: Callable[..., Pytree], arguments: Pytree, tangents: Pytree, like: Pytree
+    function: Callable[..., Pytree],
+    arguments: Pytree,
+    tangents: Pytree,
+    like: Pytree,
+    packed: Sequence[int] = (),
 ) -> Pytree:
     """Return the tangents of the results of a function of one world, in a batch of worlds.
 
     Arguments without tangents, behind the others, are constant; `like` has the types of the
-    results.
+    results, and `packed` is that of `batched`.
     """
     leaves, tree = jax.tree.flatten(arguments)
+    owners = [i for i, x in enumerate(arguments) for _ in jax.tree.leaves(x)]
+    groups: dict[object, list[int]] = {}  # positions of the leaves of each stored array
+    for i, (leaf, owner) in enumerate(zip(leaves, owners, strict=True)):
+        groups.setdefault(leaf.dtype if owner in packed else i, []).append(i)
     like_leaves, like_tree = jax.tree.flatten(like)
     directions = jax.tree.leaves(tangents)
     varied = [i for i, x in enumerate(directions) if not isinstance(x, SymbolicZero)]
     real = [i for i, x in enumerate(like_leaves) if jnp.issubdtype(x.dtype, jnp.floating)]
 
-    def of_varied(values: Sequence[Any]) -> tuple[Callable[[list[Any]], list[Any]], list[Any]]:
+    def pack(group: Sequence[int]) -> jax.Array:
+        if len(group) == 1:
+            return leaves[group[0]]
+        return jnp.concatenate([jnp.reshape(leaves[i], (len(leaves[i]), -1)) for i in group], 1)
+
+    def of_varied(stored: Sequence[Any]) -> tuple[Callable[[list[Any]], list[Any]], list[Any]]:
         """Return a function of the varied arguments of one world, and their values."""
+        values: list[Any] = [None] * len(leaves)
+        for group, array in zip(groups.values(), stored, strict=True):
+            shapes = [leaves[i].shape[1:] for i in group]
+            ends = np.cumsum([math.prod(shape) for shape in shapes])[:-1]
+            parts = [array] if len(group) == 1 else jnp.split(array, ends)
+            for i, part, shape in zip(group, parts, shapes, strict=True):
+                values[i] = jnp.reshape(part, shape)
 
         def run(some: list[Any]) -> list[Any]:
             replaced = dict(zip(varied, some, strict=True))
@@ -182,7 +205,8 @@ def _tangents(
 
     moved = linear_map(
         batched(push, jax.vmap(push)), batched(pull, jax.vmap(pull)),
-        leaves, [directions[i] for i in varied], [like_leaves[i] for i in real],
+        [*map(pack, groups.values())], [directions[i] for i in varied],
+        [like_leaves[i] for i in real],
     )  # fmt: skip
     values = dict(zip(real, moved, strict=True))
     zeros = [np.zeros(x.shape, jax.dtypes.float0) for x in like_leaves]
@@ -264,10 +288,8 @@ class _Function:
 def _compiled(functions: Sequence[_Function]) -> str | None:
     """Compile functions, or load them from the cache; return their name in XLA, or None."""
     on_gpu = jax.default_backend() == "gpu"
-    printer = functools.partial(GpuWriter, _THREADS) if on_gpu else SimdWriter
     try:
-        with jax.ensure_compile_time_eval():
-            texts = [printer().source(x.jaxpr, x.inputs, x.results, x.is_sorted) for x in functions]
+        threads, texts = _texts(functions) if on_gpu else (1, _printed(functions, SimdWriter))
     except UnsupportedError as error:
         message = f"{error} XLA compiles this law, which is some ten times slower."
         warnings.warn(message, stacklevel=2)
@@ -284,7 +306,7 @@ def _compiled(functions: Sequence[_Function]) -> str | None:
         if load(name):
             return name
         try:
-            body = _kernels(name, texts, functions) if on_gpu else _library(
+            body = _kernels(name, texts, functions, WARP // threads) if on_gpu else _library(
                 texts[0].replace(HANDLER, name), name)  # fmt: skip
         except RuntimeError as error:
             compiler, reason = error.args
@@ -293,6 +315,25 @@ def _compiled(functions: Sequence[_Function]) -> str | None:
         cache.write(_cache_path(name), body)
         _register(name, body)
     return name
+
+
+def _texts(functions: Sequence[_Function]) -> tuple[int, list[str]]:
+    """Return the number of threads of a world, and the kernels.
+
+    Raises:
+      TooLargeError: a kernel needs too much shared memory.
+    """
+    *fewer, most = _THREADS
+    for threads in fewer:
+        with contextlib.suppress(TooLargeError):
+            return threads, _printed(functions, functools.partial(GpuWriter, threads))
+    return most, _printed(functions, functools.partial(GpuWriter, most))
+
+
+def _printed(functions: Sequence[_Function], printer: Callable[[], SimdWriter]) -> list[str]:
+    """Return the texts of functions."""
+    with jax.ensure_compile_time_eval():
+        return [printer().source(x.jaxpr, x.inputs, x.results, x.is_sorted) for x in functions]
 
 
 def _library(text: str, name: str) -> bytes:
@@ -312,8 +353,8 @@ def _library(text: str, name: str) -> bytes:
         return library.read_bytes()
 
 
-def _kernels(name: str, texts: Sequence[str], functions: Sequence[_Function]) -> bytes:
-    """Compile kernels, and the library that launches them.
+def _kernels(name: str, texts: Sequence[str], functions: Sequence[_Function], worlds: int) -> bytes:
+    """Compile kernels with so many `worlds` in a block, and the library that launches them.
 
     Raises:
       RuntimeError: the compiler that fails, and its first message.
@@ -323,7 +364,7 @@ def _kernels(name: str, texts: Sequence[str], functions: Sequence[_Function]) ->
         paths = [Path(folder) / f"{k}.cubin" for k in range(len(texts))]
         for path, image in zip(paths, nvrtc.images(texts), strict=True):
             path.write_bytes(image)
-        return _library(nvrtc.launcher(name, paths, shapes, WARP // _THREADS), name)
+        return _library(nvrtc.launcher(name, paths, shapes, worlds), name)
 
 
 def called_names(program: bytes) -> list[str]:

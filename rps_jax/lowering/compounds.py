@@ -193,6 +193,7 @@ COMPOUNDS: dict[str, Function] = {
     "clamp": lambda low, x, high: jnp.minimum(jnp.maximum(x, low), high),
     "square": lambda x: x * x,
     "add_any": lambda x, y: x + y,
+    "one_minus_square": lambda x: 1 - x * x,  # of versions of JAX from 0.11 on
     "ne": lambda x, y: ~(x == y),
     "abs_i": lambda x: jnp.maximum(x, -x),
     "sign": _sign,

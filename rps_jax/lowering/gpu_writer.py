@@ -88,7 +88,8 @@ class GpuNodes(SimdNodes):
         """Vectorise a gather of scalars: apply their common operation to gathered operands."""
         first, size, nodes = scalars[0].node, len(scalars), {a.node for a in scalars}
         operations = {(x.op, len(x.args), x.extra) for x in nodes}
-        if len(operations) > 1 or any(x.is_single or x.op.startswith("fold") for x in nodes):
+        unique = any(x.is_single or not x.args or x.op.startswith("fold") for x in nodes)
+        if len(operations) > 1 or unique:
             return super().gathered(scalars, kind, (size,))
         args = [
             self._gathered_numbers(

@@ -350,7 +350,8 @@ def control_step(
     force = loop.law.senses == "force"
     period = ControlPeriod(twists, loop.physics, pushing(worlds), force)
     driven = stage.drive(worlds.fields, motion(decided), period)
-    return mapped(settle)(worlds, trials, decided, driven), snapshots
+    settled = mapped(settle, (0, 0, 0, 0))(worlds, trials, decided, driven)
+    return settled, snapshots
 
 
 def motion(trials: Trial) -> Motion:
