@@ -279,8 +279,11 @@ RECIPES: dict[str, Recipe] = {
     ),
     "gradients_cosine": recipe(f"rps sweeps/gradients {_MACHINE}", cores=200, gpu=8),
     "gradients_norm": recipe(f"rps sweeps/gradients {_MACHINE}", cores=200, gpu=8),
-    "gradients_growth": recipe(f"rps sweeps/gradients/growth.py {_MACHINE}", cores=60, gpu=4),
-    "gradients_bursts": recipe(f"rps sweeps/gradients/growth.py {_MACHINE}", cores=60, gpu=4),
+    "gradients_check": recipe(
+        f"rps sweeps/gradients/check.py --worlds 16 --horizons 0.5 2 8 {_MACHINE}", cores=6
+    ),
+    "gradients_growth": recipe(f"rps sweeps/gradients/growth.py --worlds 48 {_MACHINE}", cores=10),
+    "gradients_bursts": recipe(f"rps sweeps/gradients/growth.py --worlds 48 {_MACHINE}", cores=10),
     "robot": recipe(f"rps sweeps/speed/robot.py {_MACHINE}", cores=1),
     "dependencies": recipe(f"rps sweeps/publish/dependencies.py {_MACHINE}", cores=15),
     "extras": recipe(f"rps sweeps/publish/dependencies.py {_MACHINE}", cores=15),
