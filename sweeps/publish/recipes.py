@@ -82,6 +82,8 @@ _RACERS = " ".join(f"rps,runs/{name}/tuned.json" for name in ("evolution", "grad
 _RIVALS = ("rps", "pursuit", "dipole", "force_push", "force_push_published")
 _SWEPT = "sweep --laws rps_tuned --domain wide"
 
+_WINDOWS = "rps sweeps/gradients/learner.py --network mlp --width 23 --minutes 4.7 --seed 1"
+
 # In order of importance, which is the order of computation.
 RECIPES: dict[str, Recipe] = {
     "headline": recipe(f"rps sweeps/random_worlds {_MACHINE}", gpu=30),
@@ -284,6 +286,17 @@ RECIPES: dict[str, Recipe] = {
     ),
     "gradients_growth": recipe(f"rps sweeps/gradients/growth.py --worlds 48 {_MACHINE}", cores=10),
     "gradients_bursts": recipe(f"rps sweeps/gradients/growth.py --worlds 48 {_MACHINE}", cores=10),
+    "gradients_score": recipe(f"rps sweeps/gradients/score.py --windows 2 8 30 {_MACHINE}", gpu=8),
+    "gradients_race": recipe(
+        f"rps sweeps/gradients/race.py --lanes 6 --gpus 2 --wall 90 {_MACHINE}", gpu=12
+    ),
+    "gradients_network": recipe(
+        "rps learn --network mlp --width 23 --minutes 9.3 --seed 1 --out runs/ppo",
+        f"{_WINDOWS} --out runs/windows",
+        f"{_WINDOWS} --estimator evolution --out runs/evolution",
+        f"rps sweeps/gradients/network.py {_MACHINE}",
+        gpu=20,
+    ),
     "robot": recipe(f"rps sweeps/speed/robot.py {_MACHINE}", cores=1),
     "dependencies": recipe(f"rps sweeps/publish/dependencies.py {_MACHINE}", cores=15),
     "extras": recipe(f"rps sweeps/publish/dependencies.py {_MACHINE}", cores=15),
