@@ -13,6 +13,7 @@ Reference: Xu et al., "Accelerated policy learning with parallel differentiable 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
@@ -59,6 +60,9 @@ class WindowLearner(Learn):
     norm [1]."""
     sigma: float = option(0.02, above=0, kw_only=True)
     """Standard deviation of random steps of a weight [1]."""
+    noise: float = option(0.2, above=0, at_most=2, kw_only=True)
+    """Standard deviation of the actions in the worlds that are stepped [1]; those of windows have
+    none."""
     out: Path | str | None = field(default="runs/window_learner", kw_only=True)
     """Run folder, with `policy.npz`; a killed run resumes there."""
 
@@ -73,8 +77,9 @@ class WindowLearner(Learn):
     def start(options: WindowLearner, *inputs: Any, seed: int = 0) -> RunnerState:
         """Return the state of `rollout.start` with a second optimiser, of the policy."""
         runner = rollout.start(options, *inputs, seed=seed)
-        optimiser = runner.train.optimiser, _rule(options).init(runner.train.weights["actor"])
-        return runner._replace(train=runner.train._replace(optimiser=optimiser))
+        weights = runner.train.weights | {"log_std": jnp.full(3, math.log(options.noise))}
+        optimiser = runner.train.optimiser, _rule(options).init(weights["actor"])
+        return runner._replace(train=runner.train._replace(weights=weights, optimiser=optimiser))
 
     @staticmethod
     def update(
