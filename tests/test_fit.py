@@ -1,7 +1,7 @@
 """Fits to logs: validation of logs, their statistics, and the coverage of the posterior."""
 
 import re
-from typing import Any
+from typing import Any, NamedTuple
 
 import bad_tables
 import numpy as np
@@ -16,8 +16,9 @@ from rps_jax.geometry import solid
 from rps_jax.record import bag
 from rps_jax.robot.robot import Robot
 from rps_jax.robot.skin import with_contacts
-from rps_jax.tuning import fit, logs, posterior
+from rps_jax.tuning import fit, least_squares, logs, posterior
 from rps_jax.world import domain as domains
+from rps_jax.world import points
 from sweeps.fit import bags
 
 SHELL = Robot().shell
@@ -349,3 +350,127 @@ def test_the_table_of_bags_counts_intervals_with_the_truth_and_moved_bounds():
     _, ours, theirs = bags.table(result)
     assert ours[1:] == ["2", "3 of 4, 75.0 %", "1 of 2, 50.0 %", "3 of 4, 75.0 %", "3 of 4, 75.0 %"]
     assert theirs[1:] == ["2", "4 of 4, 100.0 %", "2 of 2, 100.0 %", "", ""]
+
+
+# --- replayed windows ----------------------------------------------------------------------
+
+PINNED = "mass=20:20,size=0.2:0.2,aspect=1:1,height=0.5:0.5,load_size=0.15:0.15"
+
+
+class Pushes(NamedTuple):
+    """Windows of pushes at the front of the base, without a log."""
+
+    windows_: least_squares.Windows
+
+    @property
+    def first(self):
+        return np.zeros(len(self.windows_.pose))
+
+    def windows(self, latency):
+        return self.windows_
+
+
+def test_replayed_windows_determine_friction_and_the_centre_of_mass():
+    """Minima of noiseless windows have the true values, to 1 %."""
+    rng, zero = np.random.default_rng(1), np.zeros((8, 1))
+    domain = domains.parse_domain(f"wide,objects=random_box,{PINNED},friction_ground=0.3:0.3")
+    twist = rng.uniform([0.03, -0.02, -0.05], [0.05, 0.02, 0.05], (8, 1, 3))
+    y, yaw = rng.uniform(-0.1, 0.1, (8, 1)), rng.uniform(-0.2, 0.2, (8, 1))
+    pose = np.hstack([0.3625 + 0.2 * (np.cos(yaw) + np.sin(abs(yaw))), y, yaw])
+    pushes = Pushes(
+        least_squares.Windows(np.repeat(twist, 20, 1), pose, 0 * pose, np.hstack([zero] * 6))
+    )
+    replay = least_squares.Replay(domain, [pushes], rps_jax.Setting("fused"), True)
+    names = points.names(domain)
+    assert [names[i] for i in replay.active] == ["com_offset", "com_bearing", "friction_robot"]
+    start = rng.random((6, len(names)))
+    truth = np.repeat(start[:1], 6, 0)
+    truth[:, replay.active] = [0.6, 0.7, 0.4]
+    whitened, _ = replay.derivatives(truth)
+    common = (np.sqrt(9) - 1) * whitened[0].mean(axis=0)
+    measured = pushes.windows_._replace(result=whitened[0] + common)
+    replay = replay._replace(tracks=[Pushes(measured)])
+    u, r, j = replay.minima(start)
+    least = np.argmin(least_squares.cost(r))
+    np.testing.assert_allclose(u[least, replay.active], [0.6, 0.7, 0.4], rtol=0.01)
+    samples, eigenvalues = least_squares.sample(replay, u, r, j, 500, 0)
+    assert samples[:, replay.active].std(axis=0).max() < 0.15
+    assert eigenvalues.min() > 12
+
+
+def linear(rows, truth, noise=0.001):
+    """Return `Replay.derivatives` of linear windows, with noise and a last unknown column."""
+    a = np.random.default_rng(0).normal(size=(rows, 6, len(truth)))
+    a[..., -1] = 0.0
+
+    def derivatives(self, u):
+        r = np.einsum("bcp,np->nbc", a, u[:, self.active] - truth)
+        error = noise * np.random.default_rng(int(1e6 * truth[0])).normal(size=r[0].shape)
+        return r + error, np.repeat(a[None], len(u), 0)
+
+    return derivatives
+
+
+def test_intervals_of_linear_windows_hold_the_truth(monkeypatch):
+    monkeypatch.setattr(least_squares, "_INFORMATION", 1.0)
+    monkeypatch.setattr(least_squares, "_PROPOSALS", 5_000)
+    domain = domains.parse_domain(f"wide,objects=random_box,{PINNED}")
+    names, inside = points.names(domain), []
+    for case in range(40):
+        replay = least_squares.Replay(domain, [], rps_jax.Setting(), True)
+        truth = np.random.default_rng(case).uniform(0.2, 0.8, len(replay.active))
+        monkeypatch.setattr(least_squares.Replay, "derivatives", linear(16, truth, 0.3))
+        minima = replay.minima(np.random.default_rng(case).random((6, len(names))))
+        samples, eigenvalues = least_squares.sample(replay, *minima, 1000, case)
+        low, high = np.quantile(samples[:, replay.active], [0.05, 0.95], axis=0)
+        inside.append((low <= truth) & (truth <= high))
+        assert eigenvalues[-1] == pytest.approx(0, abs=1e-6)
+        assert (high - low)[-1] > 0.8
+    assert 0.8 < np.mean(inside) < 0.98
+
+
+@pytest.fixture
+def object_log(tmp_path):
+    """Return a table of a base that pushes an object 12 s ahead, with the object's pose."""
+    table = log_table(600)
+    table = table.assign(x=0.02 * table.time, v_x=0.02)
+    return written(
+        tmp_path / "log.csv", table.assign(object_x=0.6 + table.x, object_y=0.05, object_yaw=0.0)
+    )
+
+
+GRADIENT_FAULTS = {
+    "lack object_x, object_y and object_yaw: log them, or choose neural": lambda t: t.drop(
+        columns=["object_x", "object_y", "object_yaw"]
+    ),
+    r"have 2 windows of 2 s that are mostly in contact, and it needs 5: give longer": put(
+        "contact_type", 0, slice(200, None)
+    ),
+}
+
+
+@pytest.mark.parametrize("message", [*GRADIENT_FAULTS, "mujoco"])
+def test_logs_that_cannot_be_replayed_are_refused(message, object_log, tmp_path, compiled, capsys):
+    if message in GRADIENT_FAULTS:
+        written(object_log, GRADIENT_FAULTS[message](pd.read_csv(object_log)))
+    engine = ["--engine", "mujoco"] if message == "mujoco" else []
+    out = "--method", "gradient", "--out", tmp_path / "run"
+    assert re.search(message, refusal(capsys, "fit", object_log, *engine, *out))
+    assert not compiled
+
+
+def test_both_methods_return_the_same_variables(object_log, monkeypatch, compiled, tmp_path):
+    """Only the gradient has eigenvalues; its report names what the windows do not determine."""
+    monkeypatch.setattr(least_squares.Replay, "derivatives", linear(5, np.full(9, 0.5)))
+    question = fit.Fit(object_log, domain="wide,objects=random_cylinder", method="gradient")
+    fitted = question()
+    width = len(fit.coordinates(question.ranges))
+    expected = {*fit.summary(question.ranges, np.random.default_rng(0).random((50, width)))}
+    assert {*fitted.data.data_vars} == expected | {"outside", "eigenvalue"}
+    assert fitted.data.sizes["draw"] == fit.SAMPLES
+    assert np.isfinite(fitted.data.sample).all()
+    text = question.report(fitted, None)[0].text
+    assert "determine 8 of 9 combinations" in text
+    assert "mass has no influence" in text
+    assert "invalid" not in text
+    assert not compiled

@@ -10,7 +10,7 @@ the fitted domain, and compares both with trials in the true worlds.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property, partial
 from typing import ClassVar
@@ -75,16 +75,24 @@ class FitStudy(Study[xr.Dataset], DomainQuestion[xr.Dataset], LawQuestion[xr.Dat
         self, networks: posterior.Posterior, statistics: np.ndarray, test: xr.Dataset
     ) -> xr.Dataset:
         """Return the fits to statistics (log, N, F) of the test worlds, with the true values."""
+        samples = (
+            posterior.sample(networks, x, fit.SAMPLES, log) for log, x in enumerate(statistics)
+        )
+        return self.compare_samples(samples, test)
+
+    def compare_samples(self, samples: Iterable[np.ndarray], test: xr.Dataset) -> xr.Dataset:
+        """Return the summaries of samples (n, q) of each test world, with the true values."""
         fits = []
-        for log, x in enumerate(statistics):
-            fitted = fit.summary(self.ranges, posterior.sample(networks, x, fit.SAMPLES, log))
+        for log, points_ in enumerate(samples):
+            fitted = fit.summary(self.ranges, points_)
             values = fit.values_of(self.ranges, test.u.values[log : log + 1])
             truth = np.array([values[str(name)][0] for name in fitted.quantity.values])
             probability = fitted.probability.isel(object=self.ranges.object_of(np.array(log)))
             columns = {
                 "truth": ("quantity", truth),
                 "rank": ("quantity", (fitted["sample"].values < truth).mean(0)),
-                **fitted[["shrinkage", "undetermined", "low", "high"]],
+                **fitted[["shrinkage", "undetermined", "low", "median", "high"]],
+                **fitted[["prior_low", "prior_high"]],
                 "object_told": probability.drop_vars("object"),
             }
             fits.append(xr.Dataset(columns))

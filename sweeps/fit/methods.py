@@ -1,0 +1,186 @@
+"""Compare the methods of `rps fit` on logs of test worlds, whose true values are known.
+
+    rps sweeps/fit/methods.py
+
+fits the same logs by networks that learn from simulated worlds and by least squares on replayed
+windows, and compares errors, the coverage of 90 % intervals, time and simulated trials.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import partial
+from typing import ClassVar
+
+import numpy as np
+import xarray as xr
+
+from rps_jax.analysis.figures.style import quantity
+from rps_jax.engines import device
+from rps_jax.record.options import option
+from rps_jax.runs.question import Run, call_of, seed_of
+from rps_jax.trials.progress import no_progress, set_phase
+from rps_jax.tuning import fit, least_squares, posterior
+from rps_jax.tuning.least_squares import Replay, Track
+from rps_jax.tuning.logs import Log
+from rps_jax.world import domain as domains
+from rps_jax.world import points
+from sweeps.fit.study import FitStudy, within
+from sweeps.study_base import Rows, Table
+
+KINDS = {"touch, object": ("object_pose",), "touch, object, force": ("object_pose", "f_robot")}
+METHODS = ("neural", "gradient")
+_QUANTITIES = ("friction_robot", "friction_ground", "mass", "ground_force", "size", "aspect",
+               "height", "com_offset", "pose_latency")  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Methods(FitStudy):
+    """Compare the methods of `rps fit` in worlds whose true values are known."""
+
+    TITLE: ClassVar[str] = "Methods of fitting worlds to logs"
+    QUICK: ClassVar[Mapping[str, object]] = {"worlds": 192, "logs": 2, "window": 12.0}
+
+    domain: domains.DomainLike = "wide,objects=random_box"
+    """Ranges from which worlds are drawn, by name or as a JSON file; changes follow."""
+    worlds: int = option(4096, 96, 1_000_000, kw_only=True)
+    """Number of worlds from which the networks learn."""
+    logs: int = option(200, 2, 10_000, kw_only=True)
+    """Number of worlds whose logs are fitted."""
+    starts: int = option(48, 6, 1000, kw_only=True)
+    """Number of worlds from which least squares start."""
+
+    @property
+    def bank(self) -> fit.Bank:
+        """Simulated worlds, with a row of the log in every second control step."""
+        period = self.setting.physics.control_period
+        return fit.Bank(self.ranges, self.params, self.setting, self.window, 2 * period)
+
+    def answer(self, run: Run) -> xr.Dataset:
+        """Fit the logs by each method and from each kind of log."""
+        start = time.perf_counter()
+        training = self.bank.worlds(self.worlds, run)
+        simulation = time.perf_counter() - start
+        test = self.bank.worlds(self.logs, run._replace(callback=no_progress), "test")
+        networks = [
+            run.checkpoint(f"neural-{i}", partial(self._by_networks, kind, training, test, run))
+            for i, kind in enumerate(KINDS)
+        ]
+        tracks = self._tracks()
+        windows = [
+            run.checkpoint(f"gradient-{i}", partial(self._by_windows, kind, tracks, test, run))
+            for i, kind in enumerate(KINDS)
+        ]
+        parts = [xr.concat(x, xr.IndexVariable("kind", list(KINDS))) for x in (networks, windows)]
+        result = xr.concat(parts, xr.IndexVariable("estimator", list(METHODS)))
+        return result.assign(simulation=simulation)
+
+    def _by_networks(
+        self, kind: str, training: xr.Dataset, test: xr.Dataset, run: Run
+    ) -> xr.Dataset:
+        """Return the fits of the networks."""
+        set_phase(run.callback, f"learn from {kind}")
+        start, names = time.perf_counter(), fit.statistic_names(training, KINDS[kind])
+        networks = self.train(training, names)
+        x = test.sel(statistic=names).statistics.values[:, :1]
+        samples = [posterior.sample(networks, row, fit.SAMPLES, i) for i, row in enumerate(x)]
+        seconds = (time.perf_counter() - start) / self.logs
+        return self.compare_samples(samples, test).assign(
+            seconds=("log", np.full(self.logs, seconds)), windows=("log", np.zeros(self.logs))
+        )
+
+    def _tracks(self) -> list[tuple[Track, float]]:
+        """Return the paths of the logs of the test worlds, and the time [s] of smoothing them."""
+        seed, bank = seed_of(self.setting.seed, "test"), self.bank
+        logs: dict[int, Log] = {}
+        index = np.arange(self.logs)
+        for at, drawn in points.draw_by_object(self.ranges, seed, None, index):
+            batch = bank.logs(drawn)
+            for row, i in enumerate(at.tolist()):
+                fields = (None if x is None else x[row : row + 1] for x in batch)
+                logs[i] = Log(*fields)
+
+        def track(i: int) -> tuple[Track, float]:
+            start = time.thread_time()
+            return Track.of(logs[i], bank.interval, False, True), time.thread_time() - start
+
+        with ThreadPoolExecutor(device.count_processors()) as pool:
+            return list(pool.map(track, range(self.logs)))
+
+    def _by_windows(
+        self, kind: str, tracks: Sequence[tuple[Track, float]], test: xr.Dataset, run: Run
+    ) -> xr.Dataset:
+        """Return the fits of replayed windows; logs with too few windows keep the prior."""
+        set_phase(run.callback, f"replay {kind}")
+        names = points.names(self.ranges)
+        columns = [names.index(name) for name in fit.coordinates(self.ranges)]
+        starts = points.points_of(self.ranges, np.arange(self.starts), seed_of(0, "tune"))
+
+        def samples(log: int) -> tuple[np.ndarray, float, int]:
+            track, seconds = tracks[log]
+            track = track if "f_robot" in KINDS[kind] else track._replace(force=None)
+            replay, start = Replay(self.ranges, [track], self.setting, False), time.perf_counter()
+            u = np.random.default_rng(log).random((fit.SAMPLES, len(names)))
+            if replay.count >= fit.LEAST_WINDOWS:
+                minima = device.standard_jax()(replay.minima)(starts)
+                u, _ = least_squares.sample(replay, *minima, fit.SAMPLES, log)
+            return u[:, columns], seconds + time.perf_counter() - start, replay.count
+
+        with ThreadPoolExecutor(device.count_processors()) as pool:
+            results, seconds, counts = zip(*pool.map(samples, range(self.logs)), strict=True)
+        return self.compare_samples(results, test).assign(
+            seconds=("log", np.array(seconds)), windows=("log", np.array(counts, float))
+        )
+
+    def report_tables(self, results: xr.Dataset) -> Sequence[Table]:
+        """Return the comparison of the methods, over all quantities and by quantity."""
+        return [
+            Table(method_rows(results, self), name="fit_methods", title="Methods"),
+            Table(quantity_rows(results), name="fit_methods_quantities", title="By quantity"),
+        ]
+
+
+methods = call_of(Methods)
+
+
+def method_rows(results: xr.Dataset, study: Methods) -> Rows:
+    """Return a header and one row for each kind of log and method."""
+    rows = [["log", "method", "90 % intervals hold the truth", "those of told quantities", "told",
+             "error of told quantities", "seconds a log", "simulated"]]  # fmt: skip
+    for kind in map(str, results.kind.values):
+        for method in METHODS:
+            fits = results.sel(kind=kind, estimator=method)
+            covered, told = within(fits), fits.undetermined == 0
+            shares = covered.mean(), covered.where(told).mean(), told.mean()
+            cells = [f"{100 * float(share):.1f} %" for share in shares]
+            error = f"{100 * float(_error(fits).where(told).median()):.1f} %"
+            seconds, replays = float(fits.seconds.median()), float(fits.windows.mean())
+            count = (study.starts // 6 + 16) * 6 * replays * least_squares.WINDOW
+            trials = f"{count:,.0f} s and derivatives for each log"
+            if method == "neural":
+                trials = f"{study.worlds * study.window:,.0f} s for all logs"
+                seconds += float(results.simulation) / study.logs
+            rows.append([kind, method, *cells, error, f"{seconds:.1f}", trials])
+    return rows
+
+
+def quantity_rows(results: xr.Dataset) -> Rows:
+    """Return a header and one row for each quantity; errors are shares of the prior's interval."""
+    pairs = [(kind, method) for kind in map(str, results.kind.values) for method in METHODS]
+    rows = [["quantity", *(f"{kind}: {method}" for kind, method in pairs)]]
+    for name in _QUANTITIES:
+        cells = []
+        for kind, method in pairs:
+            fits = results.sel(kind=kind, estimator=method, quantity=name)
+            error, covered = float(_error(fits).median()), float(within(fits).mean())
+            cells.append(f"{100 * error:.1f} %, {100 * covered:.0f} %")
+        rows.append([quantity(name), *cells])
+    return rows
+
+
+def _error(fits: xr.Dataset) -> xr.DataArray:
+    """Return errors of the median, as shares of the prior's 90 % interval."""
+    return abs(fits["median"] - fits.truth) / (fits.prior_high - fits.prior_low)
