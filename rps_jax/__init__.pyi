@@ -26,9 +26,12 @@ from rps_jax.studies.sensitivity import sensitivity as sensitivity
 # --- tune and learn ----------------------------------------------------------------------------
 from rps_jax.tuning.evolution import tune_es as tune_es
 from rps_jax.tuning.descent import tune_grad as tune_grad
+from rps_jax.tuning.derivatives import value_and_grad as value_and_grad
 from rps_jax.tuning.learn import learn as learn
 from rps_jax.tuning.fit import fit as fit
 from rps_jax.trials.env import PushEnv as PushEnv
+from rps_jax.trials.single import draw_worlds as draw_worlds
+from rps_jax.trials.single import rollout as rollout
 
 # --- laws --------------------------------------------------------------------------------------
 from rps_jax.control.base import Law as Law

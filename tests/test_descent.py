@@ -78,7 +78,7 @@ def test_an_estimator_must_exist_and_its_engine_have_derivatives():
     with pytest.raises(InputError, match="unknown estimator 'reverse': choose from exact, clipped"):
         TuneGrad("rps", estimator="reverse").validate()
     mujoco = Setting("mujoco")
-    with pytest.raises(InputError, match="engine = mujoco is not allowed: reverse-mode"):
+    with pytest.raises(InputError, match="engine = mujoco is not allowed: it has no reverse-mode"):
         TuneGrad("rps", setting=mujoco).validate()
     TuneGrad("rps", estimator="evolution", setting=mujoco).validate()
 

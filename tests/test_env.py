@@ -12,15 +12,16 @@ from helpers import FAST, NEAR, advance, refusals, row
 from rps_jax.control.base import Law
 from rps_jax.control.laws.rps import RPSParams
 from rps_jax.control.observation import Details
+from rps_jax.engines.fused import Fused
 from rps_jax.errors import InputError
 from rps_jax.robot.shell import Shell
-from rps_jax.trials import env, trial
+from rps_jax.trials import trial
 from rps_jax.trials.env import PushEnv, Reward
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import Rules
 from rps_jax.trials.worlds import drawn_worlds
 from rps_jax.world import draws
-from rps_jax.world.domain import DOMAINS
+from rps_jax.world.domain import DOMAINS, Range
 
 COUNT, STEPS = 4, 50
 AHEAD, BACK = jnp.array([1.0, 0.0, 0.0]), jnp.array([-1.0, 0.0, 0.0])
@@ -202,23 +203,6 @@ def test_a_step_equals_a_trial_with_the_same_twist(pushing):
     np.testing.assert_array_equal(sensed_more, mine.metrics["in_contact"])
 
 
-def test_a_batch_is_driven_as_a_whole():
-    """On a GPU, one kernel steps all worlds."""
-    sizes = []
-
-    class Stage:
-        def drive(self, fields, motion, period):
-            sizes.append(jnp.shape(fields)[0])
-            return fields + 0 * period.twists, motion, period.twists
-
-    drive = env.world_driver(Stage(), Setting(engine="mujoco"))  # type: ignore[arg-type]
-    batch = jnp.arange(5.0)
-    together = jax.vmap(drive, (0, 0, None))(batch, batch, jnp.array(2.0))
-    np.testing.assert_array_equal(together[0], batch)
-    np.testing.assert_array_equal(together[2], np.full(5, 2.0))
-    assert sizes == [5] or sizes == [1, 5]  # size 1 occurs only while tracing
-
-
 def test_states_are_drawn_each_in_its_own_world(pushing):
     push, state = pushing.env, pushing.start
     index = np.asarray(state.info["index"])
@@ -235,51 +219,47 @@ def test_states_are_drawn_each_in_its_own_world(pushing):
 QUASISTATIC = Setting("quasistatic", FAST, rules=Rules(horizon=20.0))
 
 
-@pytest.mark.parametrize("engine", ["quasistatic"])
-def test_step_has_derivatives_with_the_quasistatic_engine_alone(engine):
-    push = PushEnv("random_cylinder", NEAR, setting=replace(QUASISTATIC, engine=engine), worlds=2)
-    state = jax.eval_shape(push.reset, jax.random.key(0))
-    reward = lambda action, state: push.step(state, action).reward  # noqa: E731
-    pair, batch = (AHEAD, state), (jnp.stack([AHEAD, BACK]), state)
-    batched = jax.vmap(reward, (0, None))
-    for function, arguments in (
-        (jax.grad(reward), pair),
-        (jax.jacfwd(reward), pair),
-        (jax.grad(lambda state, action: reward(action, state), allow_int=True), pair[::-1]),
-        (jax.vmap(jax.grad(reward), (0, None)), batch),
-        (jax.grad(lambda *batch: batched(*batch).sum()), batch),
-        (lambda action, state: jax.jvp(lambda x: reward(x, state), (action,), (action,)), pair),
-    ):
-        if engine == "quasistatic":
-            jax.eval_shape(function, *arguments)
-        else:
-            with pytest.raises(InputError, match=f"engine = {engine} .* no derivatives with it"):
-                jax.eval_shape(function, *arguments)
-    stopped = jax.grad(lambda action, state: reward(jax.lax.stop_gradient(action), state))
-    jax.eval_shape(stopped, *pair)
+def test_what_is_felt_and_rewarded_has_derivatives_by_action_and_state():
+    """Central differences in double precision, of the smooth environment while contact is lost."""
+    near = replace(NEAR, gap=Range(0.008, 0.008), noise=Range(0, 0))  # the foam is 10 mm thick
+    with jax.enable_x64(True):
+        push = PushEnv("random_cylinder", near, setting=QUASISTATIC, worlds=2, smooth=True)
 
-
-@pytest.mark.slow
-def test_derivatives_of_a_push_are_those_of_finite_differences():
-    push = PushEnv("random_cylinder", NEAR, setting=QUASISTATIC, worlds=2)
-
-    def advance(state, action, steps):
-        """Return the state after some steps, and the sum of their rewards."""
-
-        def step(state, _):
+        def step(state, action):
             state = push.step(state, action)
-            return state, state.reward
+            return state, (state.reward, state.obs.sum(), state.metrics["in_contact"])
 
-        state, rewards = jax.lax.scan(step, state, length=steps)
-        return state, rewards.sum()
+        def total(inputs, start):
+            """Return the sum of rewards and observations, from a start that is moved along x."""
+            moved = start.data._replace(qpos=start.data.qpos.at[3].add(inputs[3]))
+            actions = jnp.stack([AHEAD] * 10 + [BACK] * 10) + inputs[:3]
+            _, terms = jax.lax.scan(step, start.replace(data=moved), actions)
+            return terms[0].sum() + terms[1].sum(), terms[2]
 
-    start = jax.jit(push.reset)(jax.random.key(1))
-    touching = jax.jit(partial(advance, steps=100))(start, AHEAD)[0]
-    assert touching.metrics["in_contact"] == 1
-    total = jax.jit(lambda action: advance(touching, action, 20)[1])
-    action, h = jnp.array([0.7, 0.1, 0.1]), 0.03
-    slopes = [(total(action + h * e) - total(action - h * e)) / (2 * h) for e in np.eye(3)]
-    np.testing.assert_allclose(jax.grad(total)(action), slopes, rtol=0.01)
+        run = jax.jit(jax.value_and_grad(total, has_aux=True))
+        start = push.reset(jax.random.key(1))
+        (_, contact), slopes = run(inputs := jnp.array([-0.5, 0.1, 0.1, -0.001]), start)
+        assert contact.max() > 0.9, contact
+        assert ((contact > 0.05) & (contact < 0.95)).sum() >= 2  # a weight
+        h = 1e-6
+        values = [[run(inputs + s * h * e, start)[0][0] for s in (1, -1)] for e in np.eye(4)]
+        differences = np.diff(np.array(values)[:, ::-1])[:, 0] / (2 * h)
+        assert (np.abs(differences) > 1e-3).sum() >= 3
+        np.testing.assert_allclose(slopes, differences, rtol=1e-5, atol=1e-7)
+
+
+def test_an_engine_without_derivatives_is_refused_where_they_are_taken(pushing, monkeypatch):
+    monkeypatch.setattr(Fused, "modes", ())
+    reward = lambda action, state: pushing.env.step(state, action).reward  # noqa: E731
+    state = row(pushing.start, 0)
+    jax.eval_shape(jax.grad(lambda a, s: reward(jax.lax.stop_gradient(a), s)), AHEAD, state)
+    for function, action in (
+        (jax.grad(reward), AHEAD),
+        (jax.jacfwd(reward), AHEAD),
+        (jax.vmap(jax.grad(reward), (0, None)), AHEAD[None]),
+    ):
+        with pytest.raises(InputError, match=r"engine = fused .* it has no forward-mode deriv"):
+            jax.eval_shape(function, action, state)
 
 
 @pytest.mark.parametrize(

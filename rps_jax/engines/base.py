@@ -9,11 +9,20 @@ from __future__ import annotations
 
 import abc
 from dataclasses import dataclass, field
-from typing import Any, ClassVar, Literal, NamedTuple, Protocol, runtime_checkable
+from typing import (
+    Any,
+    ClassVar,
+    Literal,
+    NamedTuple,
+    Protocol,
+    TypeVar,
+    get_args,
+    runtime_checkable,
+)
 
 import jax
 
-from rps_jax import errors
+from rps_jax import engines, errors
 from rps_jax.control.observation import Twist
 from rps_jax.engines import device
 from rps_jax.geometry.arrays import Float
@@ -23,6 +32,7 @@ from rps_jax.world.physics import Physics
 from rps_jax.world.scene import Friction
 
 Mode = Literal["forward", "reverse"]  # of differentiation
+T = TypeVar("T")  # a pytree
 
 
 class Motion(NamedTuple):
@@ -108,8 +118,25 @@ class Engine(abc.ABC):
     def check_derivatives(self, mode: Mode, physics: Physics) -> None:
         """Raise InputError unless a trial can be differentiated in this mode."""
         if mode not in self.modes:
-            known = " and ".join(self.modes) or "no"
-            raise self._refused(f"{mode}-mode differentiation is missing, it has {known} mode")
+            known = [name for name in engines.ENGINES if mode in engines.get(name).modes]
+            raise self._refused(f"it has no {mode}-mode derivatives; choose {' or '.join(known)}")
+
+    def guard_derivatives(self, tree: T, physics: Physics) -> T:
+        """Return a pytree unchanged; where it is differentiated in a missing mode, refuse that."""
+        try:
+            for mode in get_args(Mode):
+                self.check_derivatives(mode, physics)
+        except errors.InputError as error:
+            refusal = str(error)
+        else:
+            return tree
+
+        def refuse(primals: Any, tangents: Any) -> Any:
+            raise errors.InputError(refusal)
+
+        guarded = jax.custom_jvp(lambda tree: tree)
+        guarded.defjvp(refuse)
+        return guarded(tree)
 
     @abc.abstractmethod
     def stage(

@@ -233,7 +233,7 @@ def solved(g: Vec, h: Sequence[Number]) -> Vec:
 
 
 class QuasistaticEngine(Engine):
-    """Planar engine without inertia: the fastest, and differentiable in both modes."""
+    """Planar engine without inertia, differentiable in both modes."""
 
     name = "quasistatic"
     cones = ("elliptic",)  # its friction is the same in all directions

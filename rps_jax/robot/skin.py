@@ -69,6 +69,8 @@ class IdealSkin(NamedTuple):
     shell: Shell = Shell()  # outline and boards; in a trial, the robot's
     temperature: float | jax.Array | None = None  # [m]
 
+    SMOOTH = 0.001  # [m] a good temperature
+
     def check(self) -> None:
         """Raise InputError for fields that are no lengths."""
         for name in ("tolerance", "point_length"):
@@ -162,6 +164,8 @@ class CapacitiveSkin(NamedTuple):
     dead_share: float | jax.Array = 0.0  # [1] probability that a taxel is dead
     shell: Shell = Shell()  # outline and boards; in a trial, the robot's
     temperature: float | jax.Array | None = None  # [1]
+
+    SMOOTH = 0.03  # [1] a good temperature
 
     def check(self) -> None:
         """Raise InputError for foam, filter or imperfections that no skin can have."""

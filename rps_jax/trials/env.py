@@ -13,7 +13,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import itertools
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -22,23 +22,24 @@ import jax.numpy as jnp
 import numpy as np
 
 from rps_jax import engines, errors
+from rps_jax.control import soft
 from rps_jax.control.base import check_finite_leaves
 from rps_jax.control.laws import rps
 from rps_jax.control.laws.rps import RPSParams
 from rps_jax.control.learned import features
 from rps_jax.control.observation import TaxelObservation, Twist
 from rps_jax.engines import device
-from rps_jax.engines.base import ControlPeriod, Driven, Motion, Stage
+from rps_jax.engines.base import ControlPeriod
 from rps_jax.engines.mjx_colliders import mjx
 from rps_jax.geometry import footprint as fp
 from rps_jax.geometry import planar
 from rps_jax.record.options import check_fields, option
-from rps_jax.robot.robot import Robot, RobotLike
+from rps_jax.robot.robot import RobotLike
 from rps_jax.trials import trial
 from rps_jax.trials.batch import WorldBatch, rows
 from rps_jax.trials.setting import Setting
-from rps_jax.trials.trial import ControlLoop, Measurement, Trial, World
-from rps_jax.trials.worlds import drawn_scene, drawn_worlds
+from rps_jax.trials.trial import ControlLoop, Measurement, SingleWorld, Trial, World
+from rps_jax.trials.worlds import drawn_scene, drawn_worlds, soften_skins
 from rps_jax.world import domain, draws, objects, video
 from rps_jax.world.domain import DOMAINS, Domain, DomainLike
 from rps_jax.world.draws import Draw
@@ -98,8 +99,11 @@ class PushEnv:
     the object fell over), or if the physics diverged. A state that is done does not change, and
     its rewards are 0.
 
-    With the engine quasistatic, `step` has derivatives, which are zero or jump where a contact, a
-    taxel or a rule switches. Those of the other engines are refused.
+    `step` has derivatives by state and action with every engine that has them; with the others
+    they are refused. With `smooth`, contact is a weight from 0 to 1, and so are progress and the
+    cost of lost contact, which otherwise switch. Signals of taxels change smoothly from the first
+    compression of the foam on. Jumps remain: success, the end of a trial, a first contact, from
+    which on progress counts, and the bounds of the action.
 
     Every reset takes one of `worlds` random worlds of the domain, which are drawn in advance on the
     host, and new noise. Shape family and engine are static.
@@ -116,6 +120,7 @@ class PushEnv:
     robot: RobotLike | None = None  # name, as kairos; None: the domain's
     weights: Reward = Reward()
     worlds: int = option(1024, 1, 1_000_000)
+    smooth: bool = False  # whether contact is a weight, for derivatives
 
     def __post_init__(self) -> None:
         """Check the options, and draw the worlds before a loop is traced."""
@@ -125,7 +130,7 @@ class PushEnv:
         rps.check(self.params)
         check_finite_leaves(self.weights)
         with device.standard_jax():
-            self._drive  # noqa: B018
+            self._batch  # noqa: B018
 
     # --- the loop ---
 
@@ -164,10 +169,13 @@ class PushEnv:
         if not isinstance(state, State):
             rule = "give the State that reset returned"
             raise errors.not_allowed("state", repr(state), rule)
-        world, previous = state.info["world"], state.data
-        decided, twist = trial.execute(world, previous, self.twist(action), self.dt)
-        robot = trial.pushing(world)
-        driven = self._drive(world.fields, trial.motion(decided), twist, robot)
+        engine, physics = engines.get(self.setting.engine), self.setting.physics
+        inputs = state.info["world"], state.data, self.twist(action)
+        world, previous, twist = engine.guard_derivatives(inputs, physics)
+        decided, twist = trial.execute(world, previous, twist, self.dt)
+        period = ControlPeriod(twist, physics, trial.pushing(world))
+        one = SingleWorld(self._batch.stage)
+        driven = one.drive(world.fields, trial.motion(decided), period)
         moved = trial.settle(world, previous, decided, driven)
         current, measured = self._observe(world, moved)
         ended = moved.done  # before this step, or because the physics diverged
@@ -175,7 +183,7 @@ class PushEnv:
         progress = jnp.where(jnp.isfinite(distance), distance - current.law_state, 0.0)
         reward = (
             self.weights.progress * progress
-            - self.weights.no_contact * self.dt * ~measured.reading.in_contact
+            - self.weights.no_contact * self.dt * soft.not_(measured.reading.in_contact)
             + self.weights.success * current.success
         )
         terms = self._true_state_terms(world, previous, current)
@@ -224,7 +232,12 @@ class PushEnv:
         """Sense and judge, unless the trial has ended; `law_state` is the last distance felt."""
         loop = ControlLoop(self.setting.physics, self.setting.rules)
         judged, measured = trial.observe(world, self.params, previous, loop)
-        distance = jnp.where(measured.reading.in_contact, measured.distance, previous.law_state)
+        contact, last = measured.reading.in_contact, previous.law_state
+        distance = jnp.where(contact > 0.5, measured.distance, last)
+        if self.smooth:  # a first contact switches
+            touched = jnp.isfinite(last)
+            mixed = soft.where(contact, measured.distance, jnp.where(touched, last, 0.0))
+            distance = jnp.where(touched, mixed, distance)
         judged = judged._replace(law_state=distance)
         frozen = jax.tree.map(lambda a, b: jnp.where(previous.done, a, b), previous, judged)
         return frozen, measured
@@ -297,11 +310,8 @@ class PushEnv:
     def _batch(self) -> WorldBatch:
         """Worlds of the domain, on the device."""
         part = drawn_worlds(self._alone, self._drawn, self.setting)
-        return part._replace(worlds=jax.tree.map(jnp.asarray, part.worlds))
-
-    @functools.cached_property
-    def _drive(self) -> Callable[..., Driven]:
-        return world_driver(self._batch.stage, self.setting)
+        worlds = soften_skins(part.worlds) if self.smooth else part.worlds
+        return part._replace(worlds=jax.tree.map(jnp.asarray, worlds))
 
     def _scene(self, index: int) -> Scene:
         return drawn_scene(self._alone, self._drawn, self.setting.physics, index)
@@ -353,45 +363,3 @@ def _metrics(current: Trial, measured: Measurement, progress: jax.Array) -> dict
         "diverged": current.diverged,
     }
     return {"progress": progress} | {k: v.astype(progress.dtype) for k, v in flags.items()}
-
-
-def world_driver(stage: Stage, setting: Setting) -> Callable[..., Driven]:
-    """Return a function that drives one world; under vmap, the stage drives the whole batch.
-
-    It has derivatives if the engine has both modes of these.
-    """
-    engine = engines.get(setting.engine)
-
-    @jax.custom_jvp
-    def without_derivatives(arguments: Any) -> Any:
-        return arguments
-
-    @without_derivatives.defjvp
-    def _(primals: Any, tangents: Any) -> Any:
-        rule = (
-            "PushEnv has no derivatives with it: choose quasistatic, or stop gradients of states "
-            "and actions by jax.lax.stop_gradient, as learning without a model does"
-        )
-        raise errors.not_allowed("engine", engine.name, rule)
-
-    def drive_batch(
-        fields: Any, motion: Motion, twist: Twist, robot: Robot | None = None
-    ) -> Driven:
-        return stage.drive(fields, motion, ControlPeriod(twist, setting.physics, robot))
-
-    def drive_single(*arguments: Any) -> Driven:
-        return rows(drive_batch(*jax.tree.map(lambda x: jnp.asarray(x)[None], arguments)), 0)
-
-    if "reverse" in engine.modes:
-        return drive_single
-    drive = jax.custom_batching.custom_vmap(drive_single)
-
-    @drive.def_vmap
-    def _(size: int, batched: Any, *arguments: Any) -> tuple[Driven, Driven]:
-        def broadcast(x: jax.Array, is_batched: bool) -> jax.Array:
-            return x if is_batched else jnp.broadcast_to(x, (size, *jnp.shape(x)))
-
-        driven = drive_batch(*jax.tree.map(broadcast, arguments, tuple(batched)))
-        return driven, jax.tree.map(lambda _: True, driven)
-
-    return lambda *arguments: drive(*without_derivatives(arguments))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass
-from typing import Any
+from typing import Any, Literal
 
 from rps_jax import engines
 from rps_jax.control import registry
@@ -43,8 +43,8 @@ class Setting:
 
     engine: EngineName = "fused"
     """What steps the worlds: mjx (MuJoCo's equations in JAX), fused (the same equations,
-    specialised to these scenes: much faster), mujoco (C MuJoCo, on all cores) or quasistatic
-    (planar, without inertia: fastest, and differentiable)."""
+    specialised to these scenes: the fastest, with exact derivatives), mujoco (C MuJoCo, on all
+    cores) or quasistatic (planar, without inertia; its derivatives are those of that model)."""
     physics: PhysicsField = PhysicsField()
     """How friction is modelled: default is isotropic Coulomb friction; paper_gazebo is a friction
     pyramid, as in the paper's simulator. Changes follow, as default,timestep=0.005 or
@@ -55,6 +55,8 @@ class Setting:
     rules: Rules = Rules()
     seed: int = options.option(0, 0, 2**32 - 1)
     """Seed of random worlds, and of the imperfections of skins."""
+    gradient: Literal["exact"] = options.option("exact", hidden=True)
+    """How derivatives are computed: exact, from the engine's own equations."""
 
     def __post_init__(self) -> None:
         options.check_fields(self)

@@ -354,6 +354,38 @@ def control_step(
     return settled, snapshots
 
 
+def unroll(
+    stage: Stage,
+    worlds: World,
+    params: LawParams,
+    trials: Trial,
+    loop: ControlLoop,
+    steps: int,
+    mapped: Callable[..., Any] = jax.vmap,
+) -> tuple[Trial, Snapshot]:
+    """Run `steps` control steps of a batch; return also snapshots (steps, B, ...).
+
+    In reverse mode it stores the state of each step. `mapped` is that of `control_step`.
+    """
+
+    @partial(jax.checkpoint, prevent_cse=False)
+    def step(trials: Trial, _: None) -> tuple[Trial, Snapshot]:
+        return control_step(stage, worlds, params, trials, loop, mapped)
+
+    return jax.lax.scan(step, trials, length=steps)
+
+
+class SingleWorld(NamedTuple):
+    """Stage that steps one world without a batch axis; under `jax.vmap` it steps a batch."""
+
+    stage: Stage
+
+    def drive(self, fields: Any, motion: Motion, period: ControlPeriod) -> Driven:
+        """Step one world for one control period: see `Stage.drive`."""
+        batch = jax.tree.map(lambda x: jnp.asarray(x)[None], (fields, motion, period))
+        return jax.tree.map(lambda x: x[0], self.stage.drive(*batch))
+
+
 def motion(trials: Trial) -> Motion:
     """Return the part of trials that an engine steps."""
     integral = None if trials.drive is None else trials.drive.integral
@@ -480,11 +512,8 @@ def record(
 ) -> tuple[Trial, Snapshot]:
     """Run `steps` control steps of a batch; return also snapshots (steps // stride, B, ...)."""
 
-    def body(trials, _):
-        return control_step(stage, worlds, params, trials, loop)
-
     def interval(trials, _):
-        trials, snapshots = jax.lax.scan(body, trials, length=stride)
+        trials, snapshots = unroll(stage, worlds, params, trials, loop, stride)
         return trials, jax.tree.map(lambda x: x[0], snapshots)
 
     return jax.lax.scan(interval, trials, length=steps // stride)

@@ -25,11 +25,11 @@ from rps_jax.control import registry, soft
 from rps_jax.control.base import LawParams
 from rps_jax.engines.base import Stage
 from rps_jax.record.options import option
-from rps_jax.robot.skin import CapacitiveSkin
 from rps_jax.runs.question import call_of
 from rps_jax.trials.score import Objective
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import ControlLoop, Snapshot, Trial, World, advance, start_all
+from rps_jax.trials.worlds import soften_skins
 from rps_jax.tuning import gradients
 from rps_jax.tuning.gradients import Estimate
 from rps_jax.tuning.run import Proposal, Results, ScoreCandidates, Search, Tuning
@@ -226,21 +226,13 @@ def soft_score(
     detect a failure.
     """
     period = setting.physics.control_period
-    contact, distance = snapshots.reading.in_contact, snapshots.details.distance
+    contact, distance = 1.0 * snapshots.reading.in_contact, snapshots.details.distance
     arrival = contact * jax.nn.sigmoid((params.d_success - distance) / arrive)
     under_way = jnp.cumprod(1 - arrival)
     touched = jax.lax.cummax(contact)
     time = period * jnp.sum(under_way) + under_way[-1] * distance[-1] / params.v_max
     lost = period * jnp.sum(under_way * touched * (1 - contact))
     return jnp.asarray(objective.score(1.0, time, lost, 0.0, setting.rules))
-
-
-def soften_skins(worlds: World, taxels: float = 0.03) -> World:
-    """Return worlds (n, ...) with smooth skins; `taxels` is the temperature of taxels [1]."""
-    sensor = worlds.skin
-    temperature = taxels if isinstance(sensor, CapacitiveSkin) else 0.001
-    temperatures = jnp.full(len(worlds.key), temperature)
-    return worlds._replace(skin=sensor._replace(temperature=temperatures))
 
 
 def window_starts(

@@ -15,7 +15,6 @@ Derivatives miss all jumps of a score.
 """
 
 from collections.abc import Callable
-from functools import partial
 from typing import Any, NamedTuple, Protocol
 
 import jax
@@ -202,12 +201,7 @@ def window(
     def scores(thetas: jax.Array, starts: tuple[World, Trial]) -> jax.Array:
         worlds, trials = starts
         params = jax.vmap(params_of)(thetas)
-
-        @partial(jax.checkpoint, prevent_cse=False)  # in reverse, memory of one state a step
-        def step(trials: Trial, _: None) -> tuple[Trial, Snapshot]:
-            return trial.control_step(stage, worlds, params, trials, loop)
-
-        _, snapshots = jax.lax.scan(step, trials, length=steps)
+        _, snapshots = trial.unroll(stage, worlds, params, trials, loop, steps)
         return jax.vmap(cost, in_axes=1)(snapshots)
 
     return scores

@@ -49,6 +49,7 @@ class Quantity(NamedTuple):
     label: str  # in reports; empty: not reported
     owner: Owner = "object"
     sets: str = ""  # field of the robot; fields of skin and odometry have the quantity's name
+    jumps: bool = False  # whether a world changes in steps with it, so that it has no derivative
 
 
 def drawn(default: Range | None, *declaration: Any) -> Any:
@@ -102,7 +103,7 @@ class Domain:
     # Of each raw reading, as a change of capacitance.
     noise: Range = drawn(Range(0, 0.05), 13, "1", 0, 1, "noise of the skin", "skin")
     gain_spread: Range = drawn(Range(0, 0.1), 14, "1", 0, 1, "spread of the taxels' gains", "skin")
-    dead_share: Range = drawn(Range(0, 0.05), 15, "1", 0, 1, "dead taxels", "skin")
+    dead_share: Range = drawn(Range(0, 0.05), 15, "1", 0, 1, "dead taxels", "skin", "", True)
     # None: the skin's default.
     foam: Range | None = drawn(None, 40, "m", 0.002, 0.05, "foam of the skin", "skin")
     time_constant: Range | None = drawn(
@@ -111,8 +112,12 @@ class Domain:
     # The base: errors of its odometry and of the executed twist.
     pose_noise: Range = drawn(Range(0, 0.005), 16, "m", 0, 1, "noise of the position", "base")
     yaw_noise: Range = drawn(Range(0, 0.01), 17, "rad", 0, 1, "noise of the heading", "base")
-    pose_latency: Range = drawn(Range(0, 0.1), 18, "s", 0, 1, "latency of the pose", "base")
-    command_delay: Range = drawn(Range(0, 0.1), 19, "s", 0, 1, "delay of the command", "base")
+    pose_latency: Range = drawn(
+        Range(0, 0.1), 18, "s", 0, 1, "latency of the pose", "base", "", True
+    )
+    command_delay: Range = drawn(
+        Range(0, 0.1), 19, "s", 0, 1, "delay of the command", "base", "", True
+    )
     # Of each component of the command, constant in a trial and of either sign: columns 20, 21 and
     # 22. The robot's limits bound the wrong command; wheels lose their slip after the limits.
     velocity_error: Range = drawn(Range(-0.03, 0.03), 20, "1", -0.9, 0.9, "", "base")

@@ -4,6 +4,7 @@ An address gives the same world in any batch and on any device: the bits come fr
 generator, and the quantities are computed from them on the host in double precision.
 """
 
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -48,14 +49,23 @@ _RANGED = {name: item.column for name, item in QUANTITIES.items() if name != "ve
 USES: dict[str, int] = dict(sorted((_RANGED | _UNRANGED).items(), key=lambda item: item[1]))
 
 
-def draw(domain: Domain, seed: int, index: ArrayLike) -> Draw:
-    """Return the worlds `index` (n,), all of one object of the domain."""
+def draw(
+    domain: Domain, seed: int, index: ArrayLike, moves: Mapping[str, np.ndarray] | None = None
+) -> Draw:
+    """Return the worlds `index` (n,), all of one object of the domain: see `draw_at`."""
     index = np.asarray(index, np.int64)
-    return draw_at(domain, index, random_numbers(seed, index))
+    return draw_at(domain, index, random_numbers(seed, index), moves)
 
 
-def draw_at(domain: Domain, index: np.ndarray, uniform: np.ndarray) -> Draw:
+def draw_at(
+    domain: Domain,
+    index: np.ndarray,
+    uniform: np.ndarray,
+    moves: Mapping[str, np.ndarray] | None = None,
+) -> Draw:
     """Return worlds of one object from their random numbers (n, columns) in [0, 1).
+
+    Numbers (n,) of `moves`, by name, are added to drawn quantities.
 
     Raises:
       ValueError: the worlds are of several objects.
@@ -67,20 +77,25 @@ def draw_at(domain: Domain, index: np.ndarray, uniform: np.ndarray) -> Draw:
     name = domain.objects[int(objects[0])]
     ranges = {name: getattr(domain, name) for name in QUANTITIES if name in u}
     at = {name: item.at(u[name]) for name, item in ranges.items() if item is not None}
+    at["com_bearing"] = 2 * np.pi * u["com_bearing"]
+    at |= {name: domain.velocity_error.at(u[name]) for name in VELOCITY_ERRORS}
     if domain.skin == "ideal":
         at |= {name: np.zeros(index.size) for name in quantities_of("skin") if name in at}
     if name not in RANDOM:
         at["load_size"] = np.zeros(index.size)
-    error = [domain.velocity_error.at(u[name]) for name in VELOCITY_ERRORS]
+    if domain.frictions:
+        listed = np.array(domain.frictions)[domain.choices(index)[1]].T
+        at |= dict(zip(("friction_ground", "friction_robot"), listed, strict=True))
+    at |= {name: at[name] + move for name, move in (moves or {}).items()}
     key = [np.floor(u[name] * 2**32).astype(np.uint32) for name in ("key_0", "key_1")]
     return Draw(
         indices=index,
         cases=index,
         solid=_solid(name, at, u),
-        friction=_friction(domain, index, at),
-        values=at,
+        friction=Friction(at["friction_ground"], at["friction_robot"]),
+        values={name: values for name, values in at.items() if name in ranges},
         p_world_target=_targets(domain, index, at),
-        velocity_error=np.stack(error, axis=-1),
+        velocity_error=np.stack([at[name] for name in VELOCITY_ERRORS], axis=-1),
         robot=_robots(domain.robot, at, index.size),
         key=np.stack(key, axis=-1),
     )
@@ -114,7 +129,7 @@ def _solid(name: str, at: dict[str, np.ndarray], u: dict[str, np.ndarray]) -> So
         vertices = solid.rectangles(depth, breadth)
     else:
         vertices = _polygons(depth, breadth, u)
-    load = at["com_offset"], 2 * np.pi * u["com_bearing"], at["load_size"]
+    load = at["com_offset"], at["com_bearing"], at["load_size"]
     solids = solid.build(vertices, radius, at["height"], at["mass"], *load)
     if "feet" not in at:
         return solids
@@ -144,12 +159,6 @@ def _robots(robot: Robot, at: dict[str, np.ndarray], count: int) -> Robot:
         if (values := getattr(robot, name)) is not None
     }
     return replace(scene.repeat_robot(replace(robot, **several), count), **limits)
-
-
-def _friction(domain: Domain, index: np.ndarray, at: dict[str, np.ndarray]) -> Friction:
-    if not domain.frictions:
-        return Friction(at["friction_ground"], at["friction_robot"])
-    return Friction(*np.array(domain.frictions)[domain.choices(index)[1]].T)
 
 
 def _targets(domain: Domain, index: np.ndarray, at: dict[str, np.ndarray]) -> np.ndarray:

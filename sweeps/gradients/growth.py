@@ -38,8 +38,7 @@ from rps_jax.trials import trial
 from rps_jax.trials.progress import Progress, set_phase
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import ControlLoop, Snapshot, Trial, World
-from rps_jax.trials.worlds import drawn_worlds
-from rps_jax.tuning.descent import soften_skins
+from rps_jax.trials.worlds import drawn_worlds, soften_skins
 from rps_jax.world import domain as domains
 from rps_jax.world import draws
 from rps_jax.world.domain import RANDOM, DomainLike

@@ -35,9 +35,8 @@ from rps_jax.trials import trial
 from rps_jax.trials.progress import Progress, set_phase
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import World
-from rps_jax.trials.worlds import drawn_worlds
+from rps_jax.trials.worlds import drawn_worlds, soften_skins
 from rps_jax.tuning import gradients as gradients_
-from rps_jax.tuning.descent import soften_skins
 from rps_jax.tuning.gradients import Options, Scores, estimate
 from rps_jax.tuning.space import Space, expand_subsets
 from rps_jax.world import domain as domains

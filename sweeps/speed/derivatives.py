@@ -28,7 +28,7 @@ from rps_jax.runs.question import Run, call_of
 from rps_jax.trials.rollout import Candidates
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import ControlLoop, advance, control_step, start_all
-from rps_jax.tuning.descent import soften_skins
+from rps_jax.trials.worlds import soften_skins
 from rps_jax.world.domain import parse_domain
 from sweeps.study_base import SpeedStudy, Table, records, text_table
 

@@ -1,0 +1,145 @@
+"""One trial as a pure function of a world and the parameters of a law.
+
+    batch = draw_worlds("wide,objects=random_box", 8)
+    trajectory = rollout(rows(batch.worlds, 0), RPSParams.tuned(), batch.stage, horizon=2.0)
+
+`rollout` can be differentiated, mapped and compiled: `jax.grad`, `jax.jacfwd`, `jax.vmap`,
+`jax.jit` and `jax.checkpoint`. Under `jax.vmap` an engine steps all worlds at once.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from rps_jax import engines, errors
+from rps_jax.control import registry
+from rps_jax.control.base import LawParams
+from rps_jax.engines import device
+from rps_jax.engines.base import Stage
+from rps_jax.record.options import check_arguments
+from rps_jax.robot.robot import RobotLike
+from rps_jax.trials import trial
+from rps_jax.trials.batch import WorldBatch
+from rps_jax.trials.setting import Setting
+from rps_jax.trials.trial import ControlLoop, SingleWorld, Snapshot, World
+from rps_jax.trials.worlds import drawn_worlds, soften_skins
+from rps_jax.world import draws
+from rps_jax.world.domain import DomainLike, parse_domain
+
+
+@device.standard_jax()
+def draw_worlds(
+    domain: DomainLike,
+    worlds: int = 1,
+    *,
+    robot: RobotLike | None = None,
+    setting: Setting = Setting(),
+) -> WorldBatch:
+    """Return random worlds of one object, staged for an engine, for `rollout`.
+
+    Args:
+      domain: ranges from which worlds are drawn, with one object, as wide,objects=random_box.
+      worlds: number of worlds n, of indices 0, 1, ...
+      robot: its name, as kairos, or a JSON file; None: the domain's.
+      setting: engine, physics and the seed of the worlds.
+
+    Returns:
+      `worlds`, a pytree whose leaves are (n, ...), and `stage`, which they share.
+
+    Raises:
+      InputError: an argument is not allowed, or the domain has several objects.
+
+    Example:
+      >>> import rps_jax
+      >>> batch = rps_jax.draw_worlds("wide,objects=random_cylinder", 3)
+      >>> batch.worlds.p_world_target.shape
+      (3, 2)
+    """
+    check_arguments(draw_worlds, locals())
+    device.check_process()
+    ranges = parse_domain(domain, robot)
+    errors.check_count("worlds", worlds, at_most=10_000_000)
+    if len(ranges.objects) != 1:
+        rule = "worlds of one program have one object; name it, as wide,objects=random_box"
+        raise errors.not_allowed("domain objects", ranges.objects, rule)
+    engines.get(setting.engine).check_traced()
+    setting.check_here(ranges.weakest)
+    drawn = draws.draw(ranges, setting.seed, np.arange(worlds))
+    return drawn_worlds(ranges, drawn, setting)
+
+
+@device.standard_jax()
+def rollout(
+    world: World,
+    params: LawParams,
+    stage: Stage,
+    setting: Setting = Setting(),
+    *,
+    horizon: float = 2.0,
+    smooth: bool = False,
+) -> Snapshot:
+    """Return the trajectory of one world, as a pure function of the world and the law's parameters.
+
+    Derivatives are those of the engine, by any number of the world or of the parameters. They are
+    zero or jump where the law, the skin or a rule switches, unless `smooth` is set. Success and the
+    end of a trial always switch.
+
+    Args:
+      world: one world of `draw_worlds`, without a batch axis; map over worlds by `jax.vmap`.
+      params: parameters of a law.
+      stage: that of the worlds.
+      setting: that with which the worlds were drawn.
+      horizon: duration [s].
+      smooth: whether law and skin have their smooth forms: `registry.smooth_law` and a temperature
+        of the skin, which is `skin.SMOOTH` unless the world has one.
+
+    Returns:
+      Snapshots (T, ...), one for each control step; after the trial's end they repeat the last one.
+
+    Raises:
+      InputError: an argument is not allowed, the law has no smooth form, or the engine is not
+        traced by JAX, or is differentiated and has no derivatives.
+
+    Example:
+      >>> import jax
+      >>> import rps_jax
+      >>> setting, law = rps_jax.Setting("quasistatic"), rps_jax.RPSParams.tuned()
+      >>> batch = rps_jax.draw_worlds("wide,objects=random_cylinder", 3, setting=setting)
+      >>> def final_distance(world):  # [m]; `jax.grad` differentiates it
+      ...     trajectory = rps_jax.rollout(world, law, batch.stage, setting, horizon=0.5)
+      ...     return trajectory.details.distance[-1]
+      >>> jax.vmap(final_distance)(batch.worlds).shape
+      (3,)
+    """
+    check_arguments(rollout, locals())
+    engine = engines.get(setting.engine)
+    engine.check_traced()
+    steps, loop = count_steps(horizon, setting), control_loop(params, setting, smooth=smooth)
+    if np.ndim(world.p_world_target) != 1:
+        rule = "give one world, and map over several by jax.vmap"
+        raise errors.not_allowed("world", f"of shape {np.shape(world.p_world_target)}", rule)
+    world = soften_skins(world) if smooth else world
+    world, params = engine.guard_derivatives((world, params), setting.physics)
+    start = trial.start(world, params, loop.law)
+    one = SingleWorld(stage)
+    return trial.unroll(one, world, params, start, loop, steps, lambda f, *_: f)[1]
+
+
+def control_loop(params: LawParams, setting: Setting, *, smooth: bool) -> ControlLoop:
+    """Return the control loop of a law, or of its smooth form; or raise InputError."""
+    law = registry.law_of(params)
+    if smooth and law.temperatures is None:
+        rule = (
+            f"the law of {type(params).__name__} has no smooth form; choose rps or rps_plus, or "
+            "smooth=False, whose derivatives miss all switches of the law"
+        )
+        raise errors.not_allowed("smooth", smooth, rule)
+    law = registry.smooth_law(law) if smooth else law
+    return ControlLoop(setting.physics, setting.rules, law)
+
+
+def count_steps(horizon: float, setting: Setting) -> int:
+    """Return the number of control steps of a horizon [s], or raise InputError."""
+    period = setting.physics.control_period
+    errors.check_finite("horizon", horizon, at_least=period, at_most=1e5, unit="s")
+    return round(horizon / period)

@@ -1,0 +1,391 @@
+"""Values and gradients of a score by parameters of laws and by quantities of random worlds.
+
+The exact gradient of the score by the numbers of a world, from the engine, is chained with the
+derivative of these numbers by a drawn quantity. Worlds are built on the host in double precision,
+so that central differences give this derivative, and a new quantity needs no code here.
+"""
+
+from __future__ import annotations
+
+import re
+import warnings
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import xarray as xr
+
+from rps_jax import engines, errors
+from rps_jax.control import registry
+from rps_jax.control.base import LawParams, named_leaves
+from rps_jax.control.registry import LawsLike
+from rps_jax.engines import device
+from rps_jax.engines.base import Stage
+from rps_jax.errors import InputError
+from rps_jax.record import cache, provenance
+from rps_jax.record.options import check_arguments
+from rps_jax.robot.robot import RobotLike
+from rps_jax.runs.question import name_or_custom
+from rps_jax.trials import trial
+from rps_jax.trials.results import WORLD, labelled
+from rps_jax.trials.score import Objective
+from rps_jax.trials.setting import Setting
+from rps_jax.trials.single import control_loop, count_steps
+from rps_jax.trials.trial import ControlLoop, Snapshot, World
+from rps_jax.trials.worlds import drawn_worlds, soften_skins
+from rps_jax.tuning import gradients
+from rps_jax.tuning.descent import TuneGrad, soft_score
+from rps_jax.world import draws, points
+from rps_jax.world.domain import (
+    QUANTITIES,
+    VELOCITY_ERRORS,
+    Domain,
+    DomainLike,
+    parse_domain,
+    unit_of,
+)
+from rps_jax.world.draws import Draw
+
+Score = Callable[[Snapshot], Any]  # of a trajectory (T, ...) of one world: one number ()
+_STEP = 1e-6  # of differences, relative to a quantity
+_SMALLEST = 0.01  # in its unit, below which the step is not relative
+_NOISE = 1e-12  # relative change of a number of a world that is rounding
+_MAX_BEND = 0.01  # [1] relative difference of one-sided derivatives beyond which there is none
+_VECTORS = ("target", "com")  # x, y [m]
+_DISCRETE = ("corners", "sides", "feet_number", "object", "seed", "key_0", "key_1", "world")
+
+
+class Number(NamedTuple):
+    """Number by which a score is differentiated."""
+
+    label: str
+    unit: str
+    name: str  # of a drawn quantity, or of a leaf of the parameters
+    index: int = 0  # in a vector of a world
+    is_parameter: bool = False
+
+
+@device.standard_jax()
+def value_and_grad(
+    score: Score | Objective = Objective(),
+    laws: LawsLike = "rps_tuned",
+    domain: DomainLike = "wide",
+    worlds: int = 32,
+    wrt: Sequence[str] | str = ("K_h", "friction_robot", "com", "target"),
+    *,
+    horizon: float = 5.0,
+    smooth: bool = True,
+    robot: RobotLike | None = None,
+    setting: Setting = Setting(),
+) -> xr.Dataset:
+    """Compute a score and its exact gradient in each of several random worlds.
+
+    Gradients are those of the engine's own equations, by the implicit function theorem at the
+    solution of each physics step. Where contacts, cones or rules switch they are one-sided, and
+    jumps of the score are not in them. Beyond some 8 s most pushes are chaotic: gradients are then
+    finite, huge and of no use for an optimiser; `norm` shows it. Law and skin have their smooth
+    forms by default, so that what the law feels has derivatives.
+
+    Args:
+      score: function of the snapshots (T, ...) of one trial, which returns one number; or an
+        objective, as of `tune_grad`: the time to the target, softened.
+      laws: one law or several, as of `sweep`.
+      domain: ranges from which worlds are drawn.
+      worlds: number of worlds, of indices 0, 1, ...: those of `sweep` with this seed.
+      wrt: names of parameters of the laws (`params.NAME` if a drawn quantity has this name), of
+        quantities that the domain draws, and `target` and `com`, both x and y [m]: the centre of
+        mass moves without its load, at constant inertia about it.
+      horizon: duration of a trial [s].
+      smooth: whether law and skin have their smooth forms.
+      robot: its name, as kairos, or a JSON file; None: the domain's.
+      setting: engine, physics, rules, and the seed of the worlds.
+
+    Returns:
+      `value` (law, world); `gradient` (law, world, quantity), with `unit` and `kind` of each
+      quantity; `finite`, whether it is finite; its `norm` (law, world); `mean` and its standard
+      `error` (law, quantity) over the worlds in which it is finite. `map_error` (quantity) bounds
+      the relative error of the central differences by which worlds depend on a quantity. The
+      attribute `notes`, also a warning, names quantities without influence, as the mass of what an
+      ideal base pushes, and why.
+
+    Raises:
+      InputError: an argument is not allowed; the engine or a quantity has no derivatives.
+
+    Example:
+      >>> import rps_jax
+      >>> def final_distance(trajectory):  # [m]
+      ...     return trajectory.details.distance[-1]
+      >>> names = ("K_h", "friction_robot", "com", "target")
+      >>> drums = "wide,objects=random_cylinder,gap=0:0"
+      >>> inputs = (final_distance, "rps_tuned", drums, 8, names)
+      >>> results = rps_jax.value_and_grad(*inputs, horizon=2.0)
+      >>> results.gradient.sel(quantity="target_x").dims
+      ('law', 'world')
+    """
+    check_arguments(value_and_grad, locals())
+    device.check_process()
+    ranges, chosen = parse_domain(domain, robot), registry.resolve_laws(laws)
+    errors.check_count("worlds", worlds, at_most=1_000_000)
+    steps, engine = count_steps(horizon, setting), engines.get(setting.engine)
+    engine.check_traced()
+    engine.check_derivatives("reverse", setting.physics)
+    setting.check_here(ranges.weakest, chosen.values())
+    loops = [control_loop(params, setting, smooth=smooth) for params in chosen.values()]
+    several = [numbers_of(wrt, params, ranges) for params in chosen.values()]
+    if any(numbers != several[0] for numbers in several):
+        rule = "parameters of wrt must have the same shapes and units in all laws"
+        raise errors.not_allowed("laws", ", ".join(chosen), rule)
+    if isinstance(score, Objective) and not all(hasattr(p, "v_max") for p in chosen.values()):
+        rule = "a law without a parameter v_max needs a function of the snapshots"
+        raise errors.not_allowed("score", "an Objective", rule)
+    cache.use_cache_if_requested()
+    numbers, index = several[0], np.arange(worlds)
+    value = np.empty((len(chosen), worlds))
+    gradient, bend = np.empty((*value.shape, len(numbers))), np.empty((worlds, len(numbers)))
+    used = np.array([number.is_parameter for number in numbers])
+    for at, drawn in points.draw_by_object(ranges, setting.seed, None, index):
+        batch = drawn_worlds(ranges, drawn, setting)
+        staged = soften_skins(batch.worlds) if smooth else batch.worlds
+        slopes, bend[at] = world_slopes(ranges, drawn, setting, numbers)
+        used |= [any(i in x for x in slopes.values()) for i in range(len(numbers))]
+        for i, (params, loop) in enumerate(zip(chosen.values(), loops, strict=True)):
+            value[i, at], gradient[i, at] = _value_and_slopes(
+                *(batch.stage, staged, slopes, params, loop), score, numbers, steps, setting
+            )
+    gradient = np.where(bend > _MAX_BEND, np.nan, gradient)
+    mean = [gradients.estimate(jnp.asarray(x)) for x in gradient]
+    dims, mean_dims = ("law", "world", "quantity"), ("law", "quantity")
+    error = [np.sqrt(x.variance) for x in mean]
+    variables = labelled(
+        value=(dims[:2], value, "1", "score"),
+        gradient=(dims, gradient, "1 / unit", "derivative of the score"),
+        finite=(dims, np.isfinite(gradient), "1", "whether the derivative is finite"),
+        norm=(dims[:2], np.linalg.norm(gradient, axis=-1), "1 / unit", "norm of the gradient"),
+        mean=(mean_dims, [x.gradient for x in mean], "1 / unit", "mean over finite derivatives"),
+        error=(mean_dims, error, "1 / unit", "standard error of the mean"),
+    )
+    kinds = ["parameter" if number.is_parameter else "world" for number in numbers]
+    coords: dict[str, Any] = {
+        "law": list(chosen),
+        "world": ("world", index, {"long_name": WORLD}),
+        "quantity": [number.label for number in numbers],
+        "unit": ("quantity", [number.unit for number in numbers]),
+        "kind": ("quantity", kinds),
+        "map_error": ("quantity", bend.max(axis=0), {"units": "1"}),
+    }
+    coords |= points.drawn_columns(ranges, setting.seed, None, index)
+    notes = " ".join(_notes(ranges, setting.engine, numbers, used, gradient, bend))
+    if notes:
+        warnings.warn(notes, stacklevel=3)
+    attrs = provenance.attributes() | {
+        "domain": name_or_custom(domain), "seed": setting.seed, "engine": setting.engine,
+        "gradient": setting.gradient, "horizon": steps * setting.physics.control_period,
+        "skin_temperature": float(staged.skin.temperature[0]) if smooth else 0.0,
+        "notes": notes,
+    }  # fmt: skip
+    return xr.Dataset(variables, coords, attrs)
+
+
+# --- the numbers -----------------------------------------------------------------------------
+
+
+def numbers_of(wrt: Sequence[str] | str, params: LawParams, domain: Domain) -> tuple[Number, ...]:
+    """Return the numbers of names, in order.
+
+    Raises:
+      InputError: a name is unknown, repeated, or of something without a derivative.
+    """
+    names = (wrt,) if isinstance(wrt, str) else tuple(wrt)
+    errors.check_each_once("wrt", names)
+    drawn = (*QUANTITIES, *VELOCITY_ERRORS, "com_bearing")
+    parameters = {
+        f"params.{leaf}" if leaf in (*drawn, *_VECTORS) else leaf: (leaf, np.shape(value))
+        for leaf, value in named_leaves(params).items()
+    }
+    numbers: list[Number] = []
+    for name in names:
+        if name in parameters:
+            leaf, shape = parameters[name]
+            unit = _unit_of_leaf(params, leaf)
+            for at in np.ndindex(shape):
+                label = f"{name}[{','.join(map(str, at))}]" if at else name
+                numbers.append(Number(label, unit, leaf, is_parameter=True))
+        elif name in _VECTORS:
+            numbers += [Number(f"{name}_{axis}", "m", name, i) for i, axis in enumerate("xy")]
+        else:
+            is_known = name in QUANTITIES
+            if name in _DISCRETE or (is_known and QUANTITIES[name].jumps):
+                rule = "worlds change in steps with it, so that it has no derivative"
+                raise errors.not_allowed("wrt", name, rule)
+            errors.check_name("name of wrt", name, (*parameters, *_VECTORS, *drawn))
+            if name in domain.idle - {"friction_ground", "friction_robot"}:
+                rule = f"the domain's objects, targets or skin leave no {name} to draw"
+                raise errors.not_allowed("wrt", name, rule)
+            if is_known and getattr(domain, name) is None:
+                rule = f"the domain draws none; append ,{name}=LOW:HIGH to its name"
+                raise errors.not_allowed("wrt", name, rule)
+            parts = tuple(VELOCITY_ERRORS) if name == "velocity_error" else (name,)
+            units = {"com_bearing": "rad"}
+            numbers += [Number(x, units.get(x, unit_of(x)), x) for x in parts]
+    errors.check_each_once("wrt", [number.label for number in numbers])
+    return tuple(numbers)
+
+
+def _unit_of_leaf(params: object, path: str) -> str:
+    """Return the unit in the comment of a parameter; empty if it has none."""
+    *owners, name = path.split(".")
+    for owner in owners:
+        params = getattr(params, owner, None)
+    doc = getattr(getattr(type(params), name, None), "__doc__", None) or ""
+    return "".join(re.findall(r"^\[([^\]]*)\]", doc))
+
+
+def world_slopes(
+    domain: Domain, drawn: Draw, setting: Setting, numbers: Sequence[Number]
+) -> tuple[dict[str, dict[int, np.ndarray]], np.ndarray]:
+    """Return derivatives of worlds by numbers: central differences on the host, in float64.
+
+    Returns:
+      Derivatives (n, ...) of those leaves of the worlds that depend on a number, by the name of
+      the leaf and the index of the number; and relative differences (n, q) [1] of the one-sided
+      derivatives, which bound the relative errors of the central ones.
+    """
+
+    def leaves(draw: Draw) -> dict[str, Any]:
+        worlds = drawn_worlds(domain, draw, setting).worlds._replace(shift=None, key=None)
+        return named_leaves(worlds)
+
+    dtype = jnp.result_type(float)
+    slopes: dict[str, dict[int, np.ndarray]] = {}
+    bends = np.zeros((drawn.indices.size, len(numbers)))
+    with jax.enable_x64(True):
+        middle = leaves(drawn)
+        for i, number in enumerate(numbers):
+            if number.is_parameter:
+                continue
+            value = _value_of(drawn, number)
+            step = _STEP * np.maximum(np.abs(value), _SMALLEST)
+            above, below = (
+                leaves(_moved(domain, drawn, setting, number, x)) for x in (step, -step)
+            )
+            for name, leaf in middle.items():
+                up, at, down = (x.reshape(len(step), -1) for x in (above[name], leaf, below[name]))
+                change, bend = up - down, up - 2 * at + down
+                noise = _NOISE * np.abs(at).max(initial=0.0)
+                change[np.abs(change) <= noise] = 0.0
+                if not change.any():
+                    continue
+                slope = change / (2 * step[:, None])
+                slopes.setdefault(name, {})[i] = slope.reshape(leaf.shape).astype(dtype)
+                size = np.maximum(np.abs(change).max(axis=1), noise)
+                bends[:, i] = np.maximum(bends[:, i], np.abs(bend).max(axis=1) / size)
+    return slopes, bends
+
+
+def _value_of(drawn: Draw, number: Number) -> np.ndarray:
+    """Return the values (n,) of a number in drawn worlds; 1 of an angle or an error."""
+    vectors = {"target": drawn.p_world_target, "com": drawn.solid.p_object_com}
+    if number.name in vectors:
+        return vectors[number.name][:, number.index]
+    return drawn.values.get(number.name, np.ones(drawn.indices.size))
+
+
+def _moved(domain: Domain, drawn: Draw, setting: Setting, number: Number, step: np.ndarray) -> Draw:
+    """Return drawn worlds with a number changed by steps (n,)."""
+    if number.name not in _VECTORS:
+        return draws.draw(domain, setting.seed, drawn.indices, {number.name: step})
+    move = np.eye(3)[number.index] * step[:, None]
+    if number.name == "target":
+        return drawn._replace(p_world_target=drawn.p_world_target + move[:, :2])
+    solid = drawn.solid
+    return drawn._replace(solid=solid._replace(p_object_com=solid.p_object_com + move))
+
+
+# --- the score -------------------------------------------------------------------------------
+
+
+@partial(jax.jit, static_argnums=(5, 6, 7, 8))
+def _value_and_slopes(
+    stage: Stage,
+    worlds: World,
+    slopes: Mapping[str, Mapping[int, jax.Array]],
+    params: LawParams,
+    loop: ControlLoop,
+    score: Score | Objective,
+    numbers: tuple[Number, ...],
+    steps: int,
+    setting: Setting,
+) -> tuple[jax.Array, jax.Array]:
+    """Return the scores (n,) of worlds, and their derivatives (n, q) by numbers."""
+    leaves = named_leaves(worlds)
+    names = {number.name: None for number in numbers if number.is_parameter}
+
+    def changed(theta: jax.Array) -> LawParams:
+        values = {}
+        for name in names:
+            value = jnp.asarray(named_leaves(params)[name], theta.dtype)
+            at = [i for i, x in enumerate(numbers) if x.is_parameter and x.name == name]
+            values[name] = value + theta[np.array(at)].reshape(value.shape)
+        return registry.replace_leaves(params, values)
+
+    def scores(thetas: jax.Array) -> jax.Array:
+        moved = {name: leaves[name] for name in slopes}
+        for name, by_number in slopes.items():
+            for i, slope in by_number.items():
+                moved[name] += slope * thetas[:, i].reshape(-1, *[1] * (slope.ndim - 1))
+        world, candidates = registry.replace_leaves(worlds, moved), jax.vmap(changed)(thetas)
+        trials = trial.start_all(world, candidates, np.ones(len(thetas), bool), law=loop.law)
+        _, snapshots = trial.unroll(stage, world, candidates, trials, loop, steps)
+        return jax.vmap(partial(_score, score, setting), (1, 0))(snapshots, candidates)
+
+    thetas = jnp.zeros((len(worlds.qpos), len(numbers)), worlds.qpos.dtype)
+    values, pull_back = jax.vjp(scores, thetas)
+    return values, pull_back(jnp.ones_like(values))[0]
+
+
+def _score(
+    score: Score | Objective, setting: Setting, snapshots: Snapshot, params: LawParams
+) -> jax.Array:
+    """Return the score () of a trajectory (T, ...), or raise InputError if it is no number."""
+    if isinstance(score, Objective):
+        return soft_score(snapshots, params, setting, score, TuneGrad.arrive)
+    try:
+        value = jnp.asarray(score(snapshots))
+    except Exception as error:
+        reason = " ".join(str(error).split())[:300].rstrip(".")
+        raise InputError(f"score raises {type(error).__name__} ({reason}).") from error
+    if value.shape or not jnp.issubdtype(value.dtype, jnp.floating):
+        rule = "of the snapshots (T, ...) of one trial it must return one real number"
+        raise errors.not_allowed("result of score", f"{value.dtype}{[*value.shape]}", rule)
+    return value
+
+
+def _notes(
+    domain: Domain,
+    engine: str,
+    numbers: Sequence[Number],
+    used: np.ndarray,
+    gradient: np.ndarray,
+    bend: np.ndarray,
+) -> Iterator[str]:
+    """Yield sentences on numbers without influence or without derivatives."""
+    is_mass = np.array([x.name == "mass" and not x.is_parameter for x in numbers])
+    is_mass &= not domain.weakest.driven
+    if is_mass.any():
+        yield (
+            "mass has no influence, and its derivative is zero up to rounding, since an ideal base "
+            "pushes with any force: limit it by robot='kairos' or domain='real', with an engine "
+            "other than quasistatic."
+        )
+    is_zero, bent = ~gradient.any(axis=(0, 1)), (bend > _MAX_BEND).any(axis=0)
+    for mask, sentence in (
+        (~used & ~is_mass, f"No influence with the engine {engine}, which does not use them:"),
+        (used & is_zero & ~is_mass, "Derivatives of zero in every world within the horizon:"),
+        (bent, "No derivatives in worlds whose numbers have a kink (see finite):"),
+    ):
+        labels = [number.label for number, chosen in zip(numbers, mask, strict=True) if chosen]
+        if labels:
+            yield f"{sentence} {', '.join(labels)}."

@@ -1,0 +1,271 @@
+"""Gradients by laws and worlds: exact, labelled, and refused where they do not exist."""
+
+import re
+import warnings
+from dataclasses import replace
+from types import SimpleNamespace
+from unittest import mock
+
+import jax
+import numpy as np
+import pytest
+from helpers import ROOT, refusals, row
+
+import rps_jax
+from rps_jax.control.laws.rps import RPSParams
+from rps_jax.engines import quasistatic
+from rps_jax.trials import single
+from rps_jax.trials.setting import Setting
+from rps_jax.tuning import derivatives
+from rps_jax.world import draws
+from rps_jax.world.domain import PERFECT, QUANTITIES, VELOCITY_ERRORS, Range, parse_domain
+
+README = (ROOT / "rps_jax" / "README.md").read_text().partition("### Gradients\n")[2]
+QUASISTATIC = Setting("quasistatic")
+TOUCHING = replace(
+    parse_domain("wide,objects=random_cylinder,com_offset=0.1:0.4"),
+    **PERFECT | {"lateral": Range(0.02, 0.12), "yaw": Range(-0.6, 0.6)},
+    gap=Range(0.0, 0.002),
+)
+TOUCHING = replace(TOUCHING, noise=Range(0.01, 0.05))
+NAMES = ("v_max", "friction_robot", "com_offset", "noise", "distance", "target", "com", "mass")
+
+
+def final_distance(trajectory):
+    """Distance [m] of the contact to the target at the end."""
+    return trajectory.details.distance[-1]
+
+
+def gradients_of(domain, law="rps_tuned"):
+    """The gradient in double precision; equal shapes share one program.
+
+    By default three percent of the quasi-static steps do not converge, and err by some 1e-3.
+    """
+    iterations = mock.patch.multiple(quasistatic, _ITERATIONS=14, _SHARP=7)
+    with warnings.catch_warnings(), jax.enable_x64(True), iterations:
+        warnings.simplefilter("ignore")
+        options = {"horizon": 1.0, "setting": QUASISTATIC}
+        return rps_jax.value_and_grad(final_distance, law, domain, 4, NAMES, **options)
+
+
+@pytest.fixture(scope="module")
+def results():
+    return gradients_of(TOUCHING)
+
+
+def of(results, name):
+    return results.gradient.sel(quantity=name).values[0]
+
+
+@pytest.mark.parametrize("name", ["v_max", "friction_robot", "com_offset", "noise", "distance"])
+def test_gradients_are_central_differences(results, name):
+    h = 1e-5
+    if name == "v_max":
+        sides = [(TOUCHING, f"rps_tuned,v_max={0.05 + s * h}") for s in (1, -1)]
+    else:
+        low, high, _ = getattr(TOUCHING, name)
+        ranges = [Range(low + s * h, high + s * h) for s in (1, -1)]
+        sides = [(replace(TOUCHING, **{name: x}), "rps_tuned") for x in ranges]
+    up, down = (gradients_of(*side).value.values[0] for side in sides)
+    differences = (up - down) / (2 * h)
+    assert np.abs(differences).max() > 1e-4
+    np.testing.assert_allclose(of(results, name), differences, rtol=1e-5, atol=1e-8)
+
+
+def test_vectors_agree_with_the_quantities_that_turn_and_stretch_them(results):
+    bearing = results.bearing.values
+    along = np.cos(bearing) * of(results, "target_x") + np.sin(bearing) * of(results, "target_y")
+    np.testing.assert_allclose(along, of(results, "distance"), rtol=1e-6)
+    drawn = draws.draw(TOUCHING, 0, np.arange(4))
+    x, y, _ = drawn.solid.p_object_com.T
+    along = x * of(results, "com_x") + y * of(results, "com_y")
+    # The quasi-static engine uses no inertia, which a moving load changes.
+    np.testing.assert_allclose(along, drawn.values["com_offset"] * of(results, "com_offset"), 1e-6)
+
+
+def test_the_mirrored_world_has_mirrored_gradients():
+    numbers, column = draws.random_numbers, draws.USES["com_bearing"]
+
+    def mirrored(seed, index):
+        rows = numbers(seed, index)
+        rows[:, column] = 1 - rows[:, column]
+        return rows
+
+    def domain(sign):
+        turned = {"lateral": 0.08 * sign, "yaw": 0.3 * sign, "bearing": 0.7 * sign}
+        fixed = {name: Range(value, value) for name, value in turned.items()}
+        return replace(TOUCHING, **PERFECT | fixed)
+
+    one = gradients_of(domain(1))
+    with mock.patch.object(draws, "random_numbers", mirrored):
+        other = gradients_of(domain(-1))
+    np.testing.assert_allclose(one.value, other.value, rtol=1e-9)
+    for name, sign in {"target_x": 1, "target_y": -1, "com_x": 1, "com_y": -1, "v_max": 1}.items():
+        assert np.abs(of(one, name)).max() > 1e-5, name
+        np.testing.assert_allclose(of(one, name), sign * of(other, name), rtol=1e-6, atol=1e-9)
+
+
+def test_the_results_are_labelled(results):
+    assert results.gradient.dims == ("law", "world", "quantity")
+    assert results.value.dims == results.norm.dims == ("law", "world")
+    assert results["mean"].dims == results.error.dims == ("law", "quantity")
+    units = dict(zip(results.quantity.values, results.unit.values, strict=True))
+    assert units == {
+        "v_max": "m/s", "friction_robot": "1", "com_offset": "1", "noise": "1", "distance": "m",
+        "target_x": "m", "target_y": "m", "com_x": "m", "com_y": "m", "mass": "kg",
+    }  # fmt: skip
+    assert (results.kind == "parameter").values.tolist() == [True] + [False] * 9
+    assert (results.map_error < 1e-4).all()
+    attrs = {"engine": "quasistatic", "gradient": "exact", "horizon": 1.0, "seed": 0}
+    assert attrs.items() <= results.attrs.items()
+    assert results.attrs["skin_temperature"] == pytest.approx(0.03)
+    assert {"mass", "friction_robot", "object"} <= set(results.coords)
+    assert (results.finite == 1).all()
+    norm = np.linalg.norm(results.gradient.values, axis=-1)
+    np.testing.assert_allclose(results.norm, norm)
+    np.testing.assert_allclose(results["mean"], results.gradient.mean("world"), rtol=1e-6)
+    spread = results.gradient.std("world", ddof=1) / 2
+    np.testing.assert_allclose(results.error, spread, rtol=1e-5)
+
+
+def test_a_mass_without_influence_is_told(results):
+    assert (of(results, "mass") == 0).all()
+    assert re.search("mass has no influence.*robot='kairos'.*domain='real'", results.notes)
+    notes = lambda name, domain: " ".join(  # noqa: E731
+        derivatives._notes(
+            parse_domain(domain), "fused", derivatives.numbers_of(name, RPSParams(), TOUCHING),
+            np.array([True]), np.ones((1, 2, 1)), np.zeros((2, 1)),
+        )
+    )  # fmt: skip
+    assert "mass has no influence" in notes("mass", "wide")
+    assert not notes("mass", "real")
+    assert not notes("friction_ground", "wide")
+
+
+def test_a_kink_of_the_world_has_no_derivative_and_is_told():
+    """The principal axes of a square box are any."""
+    square = parse_domain("wide,objects=random_box,aspect=1:1,com_offset=0:0")
+    drawn = draws.draw(square, 0, np.arange(3))
+    numbers = derivatives.numbers_of(("aspect", "height"), RPSParams(), square)
+    slopes, bends = derivatives.world_slopes(square, drawn, Setting("fused"), numbers)
+    assert (bends[:, 0] > 0.1).all()
+    assert (bends[:, 1] < 1e-5).all()
+    assert slopes["fields.height"].keys() == {1}
+    gradient = np.where(bends > 0.01, np.nan, 1.0)[None]
+    notes = derivatives._notes(square, "fused", numbers, np.ones(2, bool), gradient, bends)
+    assert [x for x in notes if "kink" in x] == [
+        "No derivatives in worlds whose numbers have a kink (see finite): aspect."
+    ]
+
+
+def test_the_table_of_names_is_that_of_the_code():
+    table = re.findall(r"^\| (?:object|task|skin|base|robot) \| (.*?) \|", README, re.MULTILINE)
+    names = {name for line in table for name in re.findall(r"`(\w+)`", line)}
+    smooth = {name for name, quantity in QUANTITIES.items() if not quantity.jumps}
+    assert names == {*smooth, *VELOCITY_ERRORS, "com_bearing", "target", "com"}
+
+
+def test_the_examples_of_the_page_agree():
+    """Reverse mode of the call, and forward mode of the plain JAX route, with the same worlds."""
+    call, route = re.findall(r"```python\n(.*?)```", README, re.DOTALL)[:2]
+    assert len([line for line in call.splitlines() if line]) <= 8
+    assert len([line for line in route.splitlines() if line]) <= 10
+    space = {}
+    exec(call, space)
+    exec(route, space)
+    expected = space["results"].gradient.sel(quantity="K_h").values[0]
+    assert np.isfinite(expected).all()
+    np.testing.assert_allclose(space["slopes"], expected, rtol=0.05, atol=1e-4)
+
+
+def test_worlds_are_those_of_a_sweep_and_one_object_each():
+    batch = rps_jax.draw_worlds("wide,objects=random_cylinder", 3, setting=Setting(seed=5))
+    drawn = draws.draw(parse_domain("wide,objects=random_cylinder"), 5, np.arange(3))
+    np.testing.assert_allclose(batch.worlds.p_world_target, drawn.p_world_target, rtol=1e-6)
+    with pytest.raises(rps_jax.InputError, match="worlds of one program have one object"):
+        rps_jax.draw_worlds("wide", 3)
+
+
+BATCH = single.draw_worlds(TOUCHING, 2, setting=QUASISTATIC)
+ROUTE = {"world": row(BATCH.worlds, 0), "params": RPSParams(), "stage": BATCH.stage}
+test_invalid_rollouts_are_refused = refusals(
+    rps_jax.rollout,
+    (
+        ROUTE | {"horizon": 0.0},
+        r"horizon = 0.0 .* at least 0.02 .*\[s\]",
+    ),
+    (ROUTE | {"horizon": "long"}, "horizon = long"),
+    (ROUTE | {"world": BATCH.worlds}, "give one world, and map over several by jax.vmap"),
+    (ROUTE | {"world": None}, "world = None is not allowed: give a World"),
+    (ROUTE | {"setting": Setting("mujoco")}, "engine = mujoco is not allowed"),
+    (ROUTE | {"params": 3.0}, "params = 3.0"),
+    (
+        ROUTE | {"params": rps_jax.control.registry.LAWS["pursuit"], "smooth": True},
+        "smooth = True .* has no smooth form; choose rps or rps_plus, or smooth=False",
+    ),
+)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"wrt": ("corners",)}, "wrt = corners .* worlds change in steps with it"),
+        ({"wrt": "seed"}, "wrt = seed .* change in steps"),
+        ({"wrt": "pose_latency"}, "wrt = pose_latency .* change in steps"),
+        ({"wrt": ("dead_share",)}, "wrt = dead_share .* change in steps"),
+        ({"wrt": ("friction",)}, r"unknown name of wrt 'friction': .*did you mean"),
+        ({"wrt": ()}, "wrt = .* name each once, at least one"),
+        ({"wrt": ("K_h", "K_h")}, "name each once"),
+        ({"wrt": ("velocity_error", "v_x_error")}, "name each once"),
+        ({"wrt": "robot_force"}, "wrt = robot_force .* append ,robot_force=LOW:HIGH"),
+        ({"wrt": "feet"}, "wrt = feet .* append ,feet=LOW:HIGH"),
+        ({"wrt": "mass", "domain": "paper"}, "wrt = mass .* leave no mass to draw"),
+        ({"wrt": "distance", "domain": "paper"}, "wrt = distance .* leave no distance"),
+        ({"wrt": 3}, "wrt = 3"),
+        ({"laws": "pursuit", "wrt": "K_v"}, "smooth = True .* PursuitParams has no smooth form"),
+        ({"laws": ("rps", "rps_plus")}, "unknown name of wrt 'K_h'.*law.K_h"),
+        ({"laws": "straight"}, "unknown law 'straight'"),
+        ({"domain": "wild"}, "unknown domain 'wild'"),
+        ({"worlds": 0}, "worlds = 0"),
+        ({"horizon": -1.0}, "horizon = -1"),
+        ({"score": "time"}, "score = 'time' is not allowed"),
+        ({"score": lambda snapshots: snapshots.time}, r"result of score = float32\[5\]"),
+        ({"setting": Setting("mujoco")}, "engine = mujoco is not allowed: JAX must trace it"),
+        ({"smooth": "yes"}, "smooth = 'yes'"),
+    ],
+)
+def test_what_has_no_gradient_is_refused(changes, message):
+    options = {"score": final_distance, "laws": "rps_tuned", "domain": TOUCHING, "worlds": 2}
+    options |= {"wrt": "K_h", "horizon": 0.1, "setting": QUASISTATIC}
+    with pytest.raises(rps_jax.InputError, match=message):
+        rps_jax.value_and_grad(**options | changes)
+
+
+@pytest.mark.parametrize(
+    ("score", "message"),
+    [
+        (lambda snapshots: None, "score raises ValueError"),
+        (lambda snapshots: "low", "score raises TypeError"),
+        (lambda snapshots: snapshots.speed, r"score raises AttributeError .*speed"),
+        (lambda snapshots: snapshots.done[-1], r"result of score = bool\[\]"),
+    ],
+)
+def test_a_score_must_return_a_number(score, message):
+    snapshots = SimpleNamespace(done=np.zeros(5, bool))
+    with pytest.raises(rps_jax.InputError, match=message):
+        derivatives._score(score, QUASISTATIC, snapshots, RPSParams())
+
+
+def test_an_engine_without_a_mode_is_refused_before_anything_compiles(monkeypatch, compiled):
+    monkeypatch.setattr("rps_jax.engines.fused.Fused.modes", ("forward",))
+    with pytest.raises(rps_jax.InputError, match=r"engine = fused .* it has no reverse-mode"):
+        rps_jax.value_and_grad(setting=Setting("fused"))
+    assert not compiled
+
+
+def test_a_law_with_arrays_has_a_number_for_each_entry():
+    network = rps_jax.control.registry.LAWS["rps"]._replace(K_h=np.ones((2, 1)))
+    labels = [x.label for x in derivatives.numbers_of(("K_h", "L"), network, TOUCHING)]
+    assert labels == ["K_h[0,0]", "K_h[1,0]", "L"]
+    units = [x.unit for x in derivatives.numbers_of(("K_h", "L", "K_v"), RPSParams(), TOUCHING)]
+    assert units == ["1", "m", "1/s"]
