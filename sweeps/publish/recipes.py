@@ -279,6 +279,8 @@ RECIPES: dict[str, Recipe] = {
         gpu=15,
         section=rows.comparison,
     ),
+    "plans": recipe(f"rps sweeps/planning {_MACHINE}", cores=15),
+    "replans": recipe(f"rps sweeps/planning {_MACHINE}", cores=15),
     "gradients_cosine": recipe(f"rps sweeps/gradients {_MACHINE}", cores=200, gpu=8),
     "gradients_norm": recipe(f"rps sweeps/gradients {_MACHINE}", cores=200, gpu=8),
     "gradients_check": recipe(
