@@ -219,7 +219,7 @@ def replan(method: str, problem: Problem, model: Any) -> tuple[np.ndarray, float
         used += time.process_time() - start_time
         entries = jnp.asarray(theta[:, knot], float)
         motion = problem.simulator.knot(problem.fields, motion, entries)
-    return _ends(problem, motion), used / count
+    return _at_target(problem, motion), used / count
 
 
 def predicted(problem: Problem, model: Any) -> np.ndarray:
@@ -235,7 +235,7 @@ def _improved(method: Method, problem: Problem, theta: np.ndarray, iterations: i
     return theta
 
 
-def _ends(problem: Problem, motion: Motion) -> np.ndarray:
+def _at_target(problem: Problem, motion: Motion) -> np.ndarray:
     """Return 1 for pushes that end at their targets, 0 for the rest."""
     position, yaw = jax.vmap(object_pose)(motion.qpos)
     pose = jnp.concatenate([position, yaw[:, None]], axis=-1)
@@ -280,8 +280,8 @@ def replan_rows(results: xr.Dataset) -> Rows:
     rows = [["object", "duration", "one plan", *names, *times]]
     for case in results.case.values:
         row = results.sel(case=case)
-        ends = [row.once, *(row.replanned.sel(planner=x) for x in methods)]
-        shares = [f"{100 * float(x.mean()):.0f} %" for x in ends]
+        shares = [row.once, *(row.replanned.sel(planner=x) for x in methods)]
+        shares = [f"{100 * float(x.mean()):.0f} %" for x in shares]
         spent = [f"{1e3 * float(row.replan_time.sel(planner=x)):.0f} ms" for x in methods]
         label = [words(str(row.object.values)), f"{float(row.horizon):g} s"]
         rows.append([*label, *shares, *spent])
@@ -311,6 +311,10 @@ def figure_of(results: xr.Dataset) -> Figure:
         ax.autoscale_view()
         label = f"{words(str(push.object.values))}, {float(push.horizon):g} s"
         ax.set_title(label, fontsize=9)
+    for ax in axes[-1]:
+        ax.set_xlabel("x [m]", fontsize=9)
+    for ax in axes[:, 0]:
+        ax.set_ylabel("y [m]", fontsize=9)
     return sheet
 
 
