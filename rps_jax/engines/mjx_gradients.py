@@ -105,15 +105,15 @@ def step(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     return with_turns(model, data, integrate(model, data))
 
 
-def with_turns(model: mjx.Model, data: mjx.Data, after: mjx.Data) -> mjx.Data:
+def with_turns(model: mjx.Model, data: mjx.Data, stepped: mjx.Data) -> mjx.Data:
     """Return the data after a step, with derivatives of quaternions by any angular velocity.
 
     Those of MJX are zero below 1e-8 rad/s, as of a body at rest.
     """
-    qpos, free = after.qpos, model.jnt_type == types.JointType.FREE
+    qpos, free = stepped.qpos, model.jnt_type == types.JointType.FREE
     for joint in np.flatnonzero(free | (model.jnt_type == types.JointType.BALL)):
         q, v = (x[joint] + 3 * free[joint] for x in (model.jnt_qposadr, model.jnt_dofadr))
-        half = 0.5 * model.opt.timestep * after.qvel[v : v + 3]
+        half = 0.5 * model.opt.timestep * stepped.qvel[v : v + 3]
         square = half @ half
         small = square < _SMALL**2
         angle = jnp.sqrt(jnp.where(small, 1.0, square))
@@ -122,7 +122,7 @@ def with_turns(model: mjx.Model, data: mjx.Data, after: mjx.Data) -> mjx.Data:
         turn = jnp.concatenate([cosine[None], sinc * half])
         quat = math.normalize(math.quat_mul(data.qpos[q : q + 4], turn))
         qpos = qpos.at[q : q + 4].set(with_derivative(qpos[q : q + 4], quat))
-    return after.replace(qpos=qpos)
+    return stepped.replace(qpos=qpos)
 
 
 def _check(model: Any) -> None:

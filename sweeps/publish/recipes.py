@@ -286,6 +286,7 @@ RECIPES: dict[str, Recipe] = {
     "gradients_check": recipe(
         f"rps sweeps/gradients/check.py --worlds 16 --horizons 0.5 2 8 {_MACHINE}", cores=6
     ),
+    "gradients_mjx": recipe(f"rps sweeps/gradients/mjx.py {_MACHINE}", cores=6),
     "gradients_growth": recipe(f"rps sweeps/gradients/growth.py --worlds 48 {_MACHINE}", cores=10),
     "gradients_bursts": recipe(f"rps sweeps/gradients/growth.py --worlds 48 {_MACHINE}", cores=10),
     "gradients_score": recipe(f"rps sweeps/gradients/score.py --windows 2 8 30 {_MACHINE}", gpu=8),
