@@ -9,19 +9,21 @@
 
 from __future__ import annotations
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 
 from rps_jax import engines, errors
 from rps_jax.control import registry
 from rps_jax.control.base import LawParams
-from rps_jax.engines import device
+from rps_jax.engines import device, native
 from rps_jax.engines.base import Stage
 from rps_jax.record.options import check_arguments
 from rps_jax.robot.robot import RobotLike
 from rps_jax.trials import trial
 from rps_jax.trials.batch import WorldBatch
 from rps_jax.trials.setting import Setting
-from rps_jax.trials.trial import ControlLoop, SingleWorld, Snapshot, World
+from rps_jax.trials.trial import ControlLoop, Snapshot, World
 from rps_jax.trials.worlds import drawn_worlds, soften_skins
 from rps_jax.world import draws
 from rps_jax.world.domain import DomainLike, parse_domain
@@ -121,8 +123,9 @@ def rollout(
     world = soften_skins(world) if smooth else world
     world, params = engine.guard_derivatives((world, params), setting.physics)
     start = trial.start(world, params, loop.law)
-    one = SingleWorld(stage)
-    return trial.unroll(one, world, params, start, loop, steps, lambda f, *_: f)[1]
+    inputs = jax.tree.map(lambda x: jnp.asarray(x)[None], (world, params, start))
+    _, snapshots = trial.unroll(stage, *inputs, loop=loop, steps=steps, mapped=native.mapped)
+    return jax.tree.map(lambda x: x[:, 0], snapshots)
 
 
 def control_loop(params: LawParams, setting: Setting, *, smooth: bool) -> ControlLoop:

@@ -22,7 +22,7 @@ from rps_jax import engines, errors
 from rps_jax.control import registry
 from rps_jax.control.base import LawParams, named_leaves
 from rps_jax.control.registry import LawsLike
-from rps_jax.engines import device
+from rps_jax.engines import device, native
 from rps_jax.engines.base import Stage
 from rps_jax.errors import InputError
 from rps_jax.record import cache, provenance
@@ -338,7 +338,8 @@ def _value_and_slopes(
                 moved[name] += slope * thetas[:, i].reshape(-1, *[1] * (slope.ndim - 1))
         world, candidates = registry.replace_leaves(worlds, moved), jax.vmap(changed)(thetas)
         trials = trial.start_all(world, candidates, np.ones(len(thetas), bool), law=loop.law)
-        _, snapshots = trial.unroll(stage, world, candidates, trials, loop, steps)
+        inputs = stage, world, candidates, trials, loop, steps
+        _, snapshots = trial.unroll(*inputs, native.mapped)
         return jax.vmap(partial(_score, score, setting), (1, 0))(snapshots, candidates)
 
     thetas = jnp.zeros((len(worlds.qpos), len(numbers)), worlds.qpos.dtype)

@@ -21,6 +21,7 @@ import jax
 import jax.numpy as jnp
 
 from rps_jax.control.base import LawParams
+from rps_jax.engines import native
 from rps_jax.engines.base import Stage
 from rps_jax.trials import trial
 from rps_jax.trials.trial import ControlLoop, Snapshot, Trial, World
@@ -201,7 +202,7 @@ def window(
     def scores(thetas: jax.Array, starts: tuple[World, Trial]) -> jax.Array:
         worlds, trials = starts
         params = jax.vmap(params_of)(thetas)
-        _, snapshots = trial.unroll(stage, worlds, params, trials, loop, steps)
+        _, snapshots = trial.unroll(stage, worlds, params, trials, loop, steps, native.mapped)
         return jax.vmap(cost, in_axes=1)(snapshots)
 
     return scores

@@ -27,7 +27,7 @@ from rps_jax.record.options import option
 from rps_jax.runs.question import Run, call_of
 from rps_jax.trials.rollout import Candidates
 from rps_jax.trials.setting import Setting
-from rps_jax.trials.trial import ControlLoop, advance, control_step, start_all
+from rps_jax.trials.trial import ControlLoop, advance, start_all, unroll
 from rps_jax.trials.worlds import soften_skins
 from rps_jax.world.domain import parse_domain
 from sweeps.study_base import SpeedStudy, Table, records, text_table
@@ -97,14 +97,9 @@ class Derivatives(SpeedStudy[xr.Dataset]):
             return advance([(batch.stage, worlds, params, trials)], loop, steps)[0].qpos
 
         def score(params: Any, worlds: Any) -> jax.Array:
-            def step(trials: Any, _: None) -> tuple[Any, jax.Array]:
-                moved, snapshots = control_step(
-                    batch.stage, worlds, params, trials, loop, native.mapped
-                )
-                return moved, snapshots.details.distance
-
             trials = start_all(worlds, params, live, law=law)
-            return jnp.sum(jax.lax.scan(step, trials, length=steps)[1][-1])
+            inputs = batch.stage, worlds, params, trials, loop, steps
+            return jnp.sum(unroll(*inputs, native.mapped)[1].details.distance[-1])
 
         by_law = jax.grad(score)
         by_all = jax.grad(score, argnums=(0, 1), allow_int=True)
