@@ -396,7 +396,7 @@ def figure_of(results: xr.Dataset) -> Figure:
                 norm = norms(of_object[measurement])
                 low, middle, high = norm.quantile([0.05, 0.5, 1.0], "world").values
                 spread(bottom, middle, low, high, measurement)
-        top.set(title=label)
+        top.set(title=label, ylim=(0.05, 1e4))  # beyond, a gradient means nothing
         bottom.set(xlabel="simulated time [s]", title="5 %, median and largest norm of worlds")
         for ax in (top, bottom):
             ax.set(xscale="log", yscale="log")
