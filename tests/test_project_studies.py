@@ -25,7 +25,8 @@ STUDIES = sorted(path.parent for path in SWEEPS.glob("*/study.py"))
 OUT_OF_BOUNDS = [
     *("landscape --candidates 1", "speed --worlds 0", "speed --at-once 0"),
     *("levers --worlds 1", "levers --simulated nan", "paper_reading --draws 1"),
-    *("real_pushes --mujoco -1", "fit --logs 1", "fit/bags.py --logs 0", "export --inputs 0"),
+    *("real_pushes --mujoco -1", "fit --logs 1", "fit/bags.py --logs 0", "fit/methods.py --logs 1"),
+    "export --inputs 0",
 ]
 UNKNOWN = [
     *("gradients --objects box", "gradients --estimators backward", "gradients --tuned v_max"),

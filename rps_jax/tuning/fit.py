@@ -298,7 +298,7 @@ class Fit(LawQuestion[Fitted], DomainQuestion[Fitted], LogsQuestion):
             )
             if "mass" in data.quantity and "f_robot" not in self.observed[1]:
                 text += (
-                    " The mass has no influence on them, because the base follows its measured "
+                    " The mass has almost no influence, because the base follows its measured "
                     "path with any force: log force_x and force_y."
                 )
         if (share := float(data.outside.mean())) > 0.05:

@@ -287,7 +287,7 @@ def sample(
         mean = at[active] + np.linalg.solve(h, _PRIOR * (0.5 - at[active]))
         values, vectors = np.linalg.eigh(h)
         normal = rng.standard_normal((_PROPOSALS * (number > 0), len(h)))
-        x = mean + (normal / np.sqrt(values)) @ vectors.T
+        x = mean + (normal / np.sqrt(np.maximum(values, _PRIOR))) @ vectors.T
         inside = x[(replay.periodic | ((x >= 0) & (x < 1))).all(axis=1)]
         inside = inside if len(inside) else np.clip(x, 0, _MOST)
         free[:, active] = inside[rng.integers(max(1, len(inside)), size=number)] % 1
