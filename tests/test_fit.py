@@ -462,7 +462,9 @@ def test_logs_that_cannot_be_replayed_are_refused(message, object_log, tmp_path,
 def test_both_methods_return_the_same_variables(object_log, monkeypatch, compiled, tmp_path):
     """Only the gradient has eigenvalues; its report names what the windows do not determine."""
     monkeypatch.setattr(least_squares.Replay, "derivatives", linear(5, np.full(9, 0.5)))
-    question = fit.Fit(object_log, domain="wide,objects=random_cylinder", method="gradient")
+    options = {"method": "gradient", "worlds": 96}
+    question = fit.Fit(object_log, domain="wide,objects=random_cylinder", **options)
+    assert question.num_trials() == 6
     fitted = question()
     width = len(fit.coordinates(question.ranges))
     expected = {*fit.summary(question.ranges, np.random.default_rng(0).random((50, width)))}

@@ -68,7 +68,6 @@ from rps_jax.world.draws import Draw
 
 Method = Literal["neural", "gradient"]
 _BATCH = 64  # worlds of one object that are stepped at once
-_WORLDS_PER_START = 64  # of the method `gradient`
 LEAST_WINDOWS = 5
 _LARGE = np.array([0.02, 0.02, 0.05])  # [m, m, rad] errors of a window in an invalid fit
 SAMPLES = 2000
@@ -147,7 +146,8 @@ class Fit(LawQuestion[Fitted], DomainQuestion[Fitted], LogsQuestion):
     pushes in closed loop) or gradient (least squares on replayed windows of the logs, by exact
     derivatives of the engine, whatever the law; it needs the object's pose)."""
     worlds: int = option(6144, 96, 1_000_000)
-    """Number of worlds of the domain that are simulated; gradient starts from a 64th of them."""
+    """Number of worlds of the domain that are simulated; gradient starts from a 64th of them, and
+    from at least 6 of each object."""
     window: float = option(30.0, 5, 300, unit="s")
     """Length of the first part of each log that is used [s]; at most that of the shortest log."""
 
@@ -224,7 +224,8 @@ class Fit(LawQuestion[Fitted], DomainQuestion[Fitted], LogsQuestion):
             self._check_replay()
 
     def num_trials(self) -> int | None:
-        return self.worlds if self.method == "neural" else self.worlds // _WORLDS_PER_START
+        least = least_squares.STARTS * len(self.ranges.objects)
+        return self.worlds if self.method == "neural" else max(least, self.worlds // 64)
 
     def fields_as_json(self) -> dict[str, Any]:
         """Fields as JSON; logs by the digests of their values."""

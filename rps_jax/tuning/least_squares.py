@@ -38,7 +38,7 @@ from rps_jax.world.physics import Physics
 from rps_jax.world.points import Points
 
 WINDOW, _SETTLING = 2.0, 0.4  # [s] of a window, and of its start, in which contacts settle
-_STARTS, _ITERATIONS = 6, 15  # of the minimisation, for each object
+STARTS, _ITERATIONS = 6, 15  # of the minimisation, for each object
 _STEP = 1e-3  # of the central differences of constants on the host
 _FREEDOM = 4.0  # degrees of freedom of Student's t distribution
 _SMALL = np.array([1e-4, 1e-4, 3e-4, 1e-4, 1e-4, 3e-4, 0.1, 0.1])  # least scale of each channel
@@ -155,9 +155,9 @@ class Replay(NamedTuple):
 
     def _minimise(self, u: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return the minima from the best of the points (n, q) of one object."""
-        chunks = np.resize(u, (-(-len(u) // _STARTS), _STARTS, u.shape[1]))
+        chunks = np.resize(u, (-(-len(u) // STARTS), STARTS, u.shape[1]))
         costs = np.concatenate([cost(self.derivatives(chunk)[0]) for chunk in chunks])
-        u = chunks.reshape(-1, u.shape[1])[np.argsort(costs)[:_STARTS]]
+        u = chunks.reshape(-1, u.shape[1])[np.argsort(costs)[:STARTS]]
         r, j = self.derivatives(u)
         damping = np.full((len(u), 1), 1e-2)
         for _ in range(_ITERATIONS):
