@@ -289,7 +289,11 @@ RECIPES: dict[str, Recipe] = {
     "gradients_mjx": recipe(f"rps sweeps/gradients/mjx.py {_MACHINE}", cores=6),
     "gradients_growth": recipe(f"rps sweeps/gradients/growth.py --worlds 48 {_MACHINE}", cores=10),
     "gradients_bursts": recipe(f"rps sweeps/gradients/growth.py --worlds 48 {_MACHINE}", cores=10),
-    "gradients_score": recipe(f"rps sweeps/gradients/score.py --windows 2 8 30 {_MACHINE}", gpu=8),
+    "gradients_score": recipe(
+        "rps sweeps/gradients/score.py --tuned K_h K_v L beta l_cr d_th --worlds 128 --truth 192 "
+        f"--windows 2 8 30 --taxels 0.03 --fidelity fast {_MACHINE}",
+        cores=12,
+    ),
     "gradients_race": recipe(
         f"rps sweeps/gradients/race.py --lanes 6 --gpus 2 --wall 90 {_MACHINE}", gpu=12
     ),
