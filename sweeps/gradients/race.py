@@ -40,8 +40,10 @@ from sweeps.study_base import Rows, Study, Table, part_name
 
 COUNTS = {6: "K_h K_v L beta l_cr d_th", 13: "full"}  # tuned parameters by their number
 _COMMON = "--horizon 150 --validation 256"
+_DESCENT = f"rps tune grad {_COMMON} --starts 1 --worlds 512"
 METHODS = {  # commands that are compared
-    "gradient": f"rps tune grad {_COMMON} --starts 1 --worlds 512 --steps 40 --learning-rate 0.1",
+    "gradient": f"{_DESCENT} --steps 40 --learning-rate 0.1",
+    "slopes": f"{_DESCENT} --estimator evolution --steps 25 --learning-rate 0.2",
     "evolution": f"rps tune es {_COMMON} --population 16 --worlds 64 --generations 1000",
 }
 QUICK_SIZES = (
@@ -66,14 +68,14 @@ class Race(Study[xr.Dataset], SimulationQuestion[xr.Dataset]):
     REPORTS_TIMES: ClassVar[bool] = True
 
     methods: tuple[str, ...] = tuple(METHODS)
-    """gradient or evolution."""
+    """gradient (derivatives of windows), slopes (antithetic steps in whole trials) or evolution."""
     counts: tuple[int, ...] = tuple(COUNTS)
     """Numbers of tuned parameters, 6 or 13."""
     seeds: tuple[int, ...] = (1, 2, 3)
     """Seeds of the tunings."""
     minutes: float = option(4.0, above=0, at_most=1e4, unit="min")
     """Wall clock after which a tuning is killed [min], with compilation."""
-    wall: float = option(120.0, above=0, unit="s")
+    wall: float = option(60.0, above=0, unit="s")
     """Budget of wall time without compilation [s]."""
     simulated: float = option(2.4e6, above=0, unit="s")
     """Budget of simulated time [s]; a derivative counts as the simulation that takes as long."""

@@ -294,9 +294,7 @@ RECIPES: dict[str, Recipe] = {
         f"--windows 2 8 30 --taxels 0.03 --fidelity fast {_MACHINE}",
         cores=12,
     ),
-    "gradients_race": recipe(
-        f"rps sweeps/gradients/race.py --lanes 6 --gpus 2 --wall 90 {_MACHINE}", gpu=12
-    ),
+    "gradients_race": recipe(f"rps sweeps/gradients/race.py --lanes 9 --gpus 2 {_MACHINE}", gpu=12),
     "gradients_network": recipe(
         "rps learn --network mlp --width 23 --minutes 9.3 --seed 1 --out runs/ppo",
         f"{_WINDOWS} --out runs/windows",
