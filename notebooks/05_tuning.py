@@ -212,10 +212,4 @@ drawing.races(logs)
 # One step by gradients gains as much as the first generation of evolution, at equal cost. Further
 # steps by gradients gain nothing and steer ever more, perhaps because 8 s do not contain the later
 # effect on the contact. Evolution that continues from there, with a small spread, needs many
-# generations to improve. `sweeps/gradients` repeats these runs with today's version:
-
-# %%
-rates = [
-    render_tables.cell(f"race | `wide`, 1,000 | {x} | success") for x in ("evolution", "gradient")
-]
-Markdown("In test worlds of `wide`, evolution succeeds in {}, gradients in {}.".format(*rates))
+# generations to improve. `sweeps/gradients` has a race of today's version.

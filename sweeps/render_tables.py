@@ -41,7 +41,7 @@ _READING = _SATURATED + _LOADS
 STALE: dict[str, str] = {
     **dict.fromkeys(
         (
-            *("ceiling", "engines_ideal", "engines_wide", "headline", "models", "race"),
+            *("ceiling", "engines_ideal", "engines_wide", "headline", "models"),
             *("rivals_tuned", "export_bags", "export_inputs", "export_odd", "export_paper"),
             *("export_speed", "export_trials", "export_worlds", "fit_bags", "fit_coverage"),
             *("fit_quantities", "fit_worth"),

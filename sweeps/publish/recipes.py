@@ -76,13 +76,9 @@ _HARDWARE = {
 }
 _ROBOTS = ("ideal", "kairos", "ridgeback", "mpo_500")
 _REAL = "rps sweep --domain real --worlds 4096 --seed 11 --laws rps rps_tuned"
-_RACE = "--tuned K_h K_v L beta l_cr d_th --horizon 150 --validation 256 --seed 5"
-_DESCENT = f"rps tune grad {_RACE} --starts 2 --worlds 512 --steps 20 --learning-rate 0.2"
-_RACERS = " ".join(f"rps,runs/{name}/tuned.json" for name in ("evolution", "gradient", "hybrid"))
 _RIVALS = ("rps", "pursuit", "dipole", "force_push", "force_push_published")
 _SWEPT = "sweep --laws rps_tuned --domain wide"
 
-_WINDOWS = "rps sweeps/gradients/learner.py --network mlp --width 23 --minutes 4.7 --seed 1"
 
 # In order of importance, which is the order of computation.
 RECIPES: dict[str, Recipe] = {
@@ -269,18 +265,6 @@ RECIPES: dict[str, Recipe] = {
         gpu=10,
         section=rows.default_beside_tuned,
     ),
-    "race": recipe(
-        f"rps tune es {_RACE} --population 16 --worlds 64 --budget 2.4e6 --out runs/evolution",
-        f"{_DESCENT} --budget 2.4e6 --out runs/gradient",
-        f"{_DESCENT} --budget 1.2e6 --out runs/half",
-        f"rps tune es {_RACE} --law rps,runs/half/tuned.json --spread 0.2 --prior 0.01 "
-        "--population 16 --worlds 64 --budget 1.2e6 --out runs/hybrid",
-        f"rps ladder --laws rps {_RACERS} --domain paper wide hostile --worlds 1000 --seed 3",
-        gpu=15,
-        section=rows.comparison,
-    ),
-    "plans": recipe(f"rps sweeps/planning {_MACHINE}", cores=15),
-    "replans": recipe(f"rps sweeps/planning {_MACHINE}", cores=15),
     "gradients_cosine": recipe(f"rps sweeps/gradients {_MACHINE}", cores=200, gpu=8),
     "gradients_norm": recipe(f"rps sweeps/gradients {_MACHINE}", cores=200, gpu=8),
     "gradients_check": recipe(
@@ -294,13 +278,17 @@ RECIPES: dict[str, Recipe] = {
         f"--windows 2 8 30 --taxels 0.03 --fidelity fast {_MACHINE}",
         cores=12,
     ),
-    "gradients_race": recipe(f"rps sweeps/gradients/race.py --lanes 9 --gpus 2 {_MACHINE}", gpu=12),
+    "gradients_race": recipe(
+        f"rps sweeps/gradients/race.py --counts 13 --lanes 6 --gpus 1 --minutes 6 --wall 180 "
+        f"{_MACHINE}",
+        gpu=8,
+    ),
     "gradients_network": recipe(
-        "rps learn --network mlp --width 23 --minutes 9.3 --seed 1 --out runs/ppo",
-        f"{_WINDOWS} --out runs/windows",
-        f"{_WINDOWS} --estimator evolution --out runs/evolution",
-        f"rps sweeps/gradients/network.py {_MACHINE}",
-        gpu=20,
+        "rps learn --network mlp --width 23 --minutes 8 --seed 1 --out runs/ppo",
+        "rps sweeps/gradients/learner.py --network mlp --width 23 --minutes 4 --seed 1 "
+        "--out runs/windows",
+        f"rps sweeps/gradients/network.py --folders runs/ppo runs/windows {_MACHINE}",
+        gpu=13,
     ),
     "robot": recipe(f"rps sweeps/speed/robot.py {_MACHINE}", cores=1),
     "dependencies": recipe(f"rps sweeps/publish/dependencies.py {_MACHINE}", cores=15),
@@ -347,6 +335,10 @@ RECIPES: dict[str, Recipe] = {
     ),
     # After the installation of the third-party engines: see `speed/arena.py`.
     "arena": recipe(f"rps sweeps/speed/arena.py --peers peers {_MACHINE}", gpu=5),
+    "derivatives": recipe(f"rps sweeps/speed/derivatives.py {_MACHINE}", cores=2),
+    "derivatives_gpu": recipe(
+        f"rps sweeps/speed/derivatives.py --worlds 4096 --file derivatives_gpu {_MACHINE}", gpu=2
+    ),
     "costs": recipe(
         "rps sweeps/speed/costs.py --names 'fused standard' 'mjx standard' --families box "
         "prism --most 3",
