@@ -61,8 +61,9 @@ def solve(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     solved = solver.solve(held_model, held)
     results = solved.qacc, solved.qfrc_constraint, solved._impl.efc_force
     minimum, force, rows = checkpoint_name(results, SOLUTION)
-    newton = {"opt.solver": types.SolverType.NEWTON}  # which has a Hessian
-    model, held_model = model.tree_replace(newton), held_model.tree_replace(newton)
+    newton: Any = {"opt.solver": types.SolverType.NEWTON}  # which has a Hessian
+    models: Any = [x.tree_replace(newton) for x in (model, held_model)]
+    model, held_model = models
     at = solver.Context.create(model, data.replace(qacc=minimum), grad=False)
     gradient = at.Ma - data.qfrc_smooth - at.qfrc_constraint
     zero = jnp.zeros_like(gradient)

@@ -224,7 +224,8 @@ def _instantiate(tangents: Pytree) -> Pytree:
     def dense(x: Any) -> Any:
         if not isinstance(x, SymbolicZero):
             return x
-        return (np if x.dtype == jax.dtypes.float0 else jnp).zeros(x.shape, x.dtype)
+        shape, dtype = x.aval.shape, x.aval.dtype
+        return np.zeros(shape, dtype) if dtype == jax.dtypes.float0 else jnp.zeros(shape, dtype)
 
     return jax.tree.map(dense, tangents)
 

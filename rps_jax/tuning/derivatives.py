@@ -64,7 +64,7 @@ class Number(NamedTuple):
     label: str
     unit: str
     name: str  # of a drawn quantity, or of a leaf of the parameters
-    index: int = 0  # in a vector of a world
+    axis: int = 0  # of a vector of a world
     is_parameter: bool = False
 
 
@@ -145,10 +145,12 @@ def value_and_grad(
     numbers, index = several[0], np.arange(worlds)
     value = np.empty((len(chosen), worlds))
     gradient, bend = np.empty((*value.shape, len(numbers))), np.empty((worlds, len(numbers)))
-    used = np.array([number.is_parameter for number in numbers])
+    used, temperature = np.array([number.is_parameter for number in numbers]), 0.0
     for at, drawn in points.draw_by_object(ranges, setting.seed, None, index):
         batch = drawn_worlds(ranges, drawn, setting)
         staged = soften_skins(batch.worlds) if smooth else batch.worlds
+        skin: Any = staged.skin
+        temperature = float(skin.temperature[0]) if smooth else 0.0
         slopes, bend[at] = world_slopes(ranges, drawn, setting, numbers)
         used |= [any(i in x for x in slopes.values()) for i in range(len(numbers))]
         for i, (params, loop) in enumerate(zip(chosen.values(), loops, strict=True)):
@@ -183,7 +185,7 @@ def value_and_grad(
     attrs = provenance.attributes() | {
         "domain": name_or_custom(domain), "seed": setting.seed, "engine": setting.engine,
         "gradient": setting.gradient, "horizon": steps * setting.physics.control_period,
-        "skin_temperature": float(staged.skin.temperature[0]) if smooth else 0.0,
+        "skin_temperature": temperature,
         "notes": notes,
     }  # fmt: skip
     return xr.Dataset(variables, coords, attrs)
@@ -289,7 +291,7 @@ def _value_of(drawn: Draw, number: Number) -> np.ndarray:
     """Return the values (n,) of a number in drawn worlds; 1 of an angle or an error."""
     vectors = {"target": drawn.p_world_target, "com": drawn.solid.p_object_com}
     if number.name in vectors:
-        return vectors[number.name][:, number.index]
+        return vectors[number.name][:, number.axis]
     return drawn.values.get(number.name, np.ones(drawn.indices.size))
 
 
@@ -297,7 +299,7 @@ def _moved(domain: Domain, drawn: Draw, setting: Setting, number: Number, step: 
     """Return drawn worlds with a number changed by steps (n,)."""
     if number.name not in _VECTORS:
         return draws.draw(domain, setting.seed, drawn.indices, {number.name: step})
-    move = np.eye(3)[number.index] * step[:, None]
+    move = np.eye(3)[number.axis] * step[:, None]
     if number.name == "target":
         return drawn._replace(p_world_target=drawn.p_world_target + move[:, :2])
     solid = drawn.solid
@@ -336,7 +338,8 @@ def _value_and_slopes(
         for name, by_number in slopes.items():
             for i, slope in by_number.items():
                 moved[name] += slope * thetas[:, i].reshape(-1, *[1] * (slope.ndim - 1))
-        world, candidates = registry.replace_leaves(worlds, moved), jax.vmap(changed)(thetas)
+        world: Any = registry.replace_leaves(worlds, moved)  # pyright: ignore[reportArgumentType]
+        candidates = jax.vmap(changed)(thetas)
         trials = trial.start_all(world, candidates, np.ones(len(thetas), bool), law=loop.law)
         inputs = stage, world, candidates, trials, loop, steps
         _, snapshots = trial.unroll(*inputs, native.mapped)
@@ -381,7 +384,8 @@ def _notes(
             "pushes with any force: limit it by robot='kairos' or domain='real', with an engine "
             "other than quasistatic."
         )
-    is_zero, bent = ~gradient.any(axis=(0, 1)), (bend > _MAX_BEND).any(axis=0)
+    is_zero: Any = ~gradient.any(axis=(0, 1))
+    bent: Any = (bend > _MAX_BEND).any(axis=0)
     for mask, sentence in (
         (~used & ~is_mass, f"No influence with the engine {engine}, which does not use them:"),
         (used & is_zero & ~is_mass, "Derivatives of zero in every world within the horizon:"),

@@ -198,9 +198,10 @@ class Fit(LawQuestion[Fitted], DomainQuestion[Fitted], LogsQuestion):
         engines.get(self.setting.engine).check_derivatives("forward", self.setting.physics)
         rule = "the logs lack object_x, object_y and object_yaw: log them, or choose neural"
         if "object_pose" in self.observed[1]:
-            rule = f"the logs have {self.replay.count} windows of {least_squares.WINDOW:g} s that "
+            count = self.replay.num_windows
+            rule = f"the logs have {count} windows of {least_squares.WINDOW:g} s that "
             rule += f"are mostly in contact, and it needs {LEAST_WINDOWS}: give longer logs"
-            if self.replay.count >= LEAST_WINDOWS:
+            if count >= LEAST_WINDOWS:
                 return
         raise errors.not_allowed("method", self.method, rule)
 
@@ -260,7 +261,9 @@ class Fit(LawQuestion[Fitted], DomainQuestion[Fitted], LogsQuestion):
         """Minimise the residuals of the replayed windows, and sample the posterior."""
         set_phase(run.callback, "replay")
         seed, names = self.setting.seed, points.names(self.ranges)
-        start = points.points_of(self.ranges, np.arange(self.num_trials()), seed_of(seed, "tune"))
+        start = points.points_of(
+            self.ranges, np.arange(self.num_trials() or 0), seed_of(seed, "tune")
+        )
         minima = device.standard_jax()(self.replay.minima)(start)
         u, eigenvalues = least_squares.sample(self.replay, *minima, SAMPLES, seed)
         data = summary(self.ranges, u[:, [names.index(x) for x in coordinates(self.ranges)]])
@@ -278,7 +281,7 @@ class Fit(LawQuestion[Fitted], DomainQuestion[Fitted], LogsQuestion):
         converted = f" Converted: {', '.join(conversions)}." if conversions else ""
         how = f"law {self.label}, in closed loop."
         if self.method == "gradient":
-            how = f"in which {self.replay.count} windows of the logs are replayed."
+            how = f"in which {self.replay.num_windows} windows of the logs are replayed."
         return (
             f"Logs: {len(self.raw_logs)}, the first {self.bank.window:g} s of each at "
             f"{1 / self.bank.interval:.3g} Hz, with {', '.join(fields) or 'touch and odometry'}; "

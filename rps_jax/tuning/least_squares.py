@@ -127,7 +127,7 @@ class Replay(NamedTuple):
     exact: bool  # poses of the base are not late
 
     @property
-    def count(self) -> int:
+    def num_windows(self) -> int:
         """Number of windows B."""
         return sum(track.first.size for track in self.tracks)
 
@@ -192,16 +192,16 @@ class Replay(NamedTuple):
         latency = np.zeros(len(moved)) if self.exact else drawn.values["pose_latency"]
         windows = [track.windows(x) for x in latency for track in self.tracks]
         constants = jax.tree.map(
-            lambda x: np.repeat(x, self.count, axis=0), (fields, drawn.solid.height)
+            lambda x: np.repeat(x, self.num_windows, axis=0), (fields, drawn.solid.height)
         )
         inputs = (*constants, jax.tree.map(lambda *x: np.concatenate(x), *windows))
         inputs = jax.tree.map(lambda x: x.reshape(len(steps), -1, *x.shape[1:]), inputs)
         middle = jax.tree.map(lambda x: np.float32(x[0]), inputs)
         slopes = jax.tree.map(lambda x: np.float32((x[1::2] - x[2::2]) / (2 * _STEP)), inputs)
         r, j = _linearised(stage, middle, slopes, self.setting.physics)
-        both = np.concatenate([r[None], j]).reshape(len(j) + 1, len(u), self.count, -1)
+        both = np.concatenate([r[None], j]).reshape(len(j) + 1, len(u), self.num_windows, -1)
         both = np.nan_to_num(np.asarray(both, float), nan=1.0)
-        both -= (1 - (1 + self.count) ** -0.5) * both.mean(axis=2, keepdims=True)
+        both -= (1 - (1 + self.num_windows) ** -0.5) * both.mean(axis=2, keepdims=True)
         return both[0], np.moveaxis(both[1:], 0, -1)
 
 
@@ -244,9 +244,9 @@ def _replay(stage: Stage, inputs: Any, physics: Physics) -> jax.Array:
 
 def _scale(r: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return squared scales (m, 1, C) of residuals (m, B, C), and the weights of these."""
-    small, weight = _SMALL[: r.shape[-1]] ** 2, np.ones_like(r)
+    scale, weight = np.zeros(1), np.ones_like(r)
     for _ in range(20):
-        scale = np.mean(weight * r * r, axis=1, keepdims=True) + small
+        scale = np.mean(weight * r * r, axis=1, keepdims=True) + _SMALL[: r.shape[-1]] ** 2
         weight = (_FREEDOM + 1) / (_FREEDOM + r * r / scale)
     return scale, weight
 

@@ -12,9 +12,10 @@ import time
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from functools import partial
+from functools import cached_property, partial
 from typing import ClassVar
 
+import jax
 import numpy as np
 import xarray as xr
 
@@ -53,7 +54,7 @@ class Methods(FitStudy):
     starts: int = option(48, 6, 1000, kw_only=True)
     """Number of worlds from which least squares start."""
 
-    @property
+    @cached_property
     def bank(self) -> fit.Bank:
         """Simulated worlds, with a row of the log in every second control step."""
         period = self.setting.physics.control_period
@@ -100,8 +101,7 @@ class Methods(FitStudy):
         for at, drawn in points.draw_by_object(self.ranges, seed, None, index):
             batch = bank.logs(drawn)
             for row, i in enumerate(at.tolist()):
-                fields = (None if x is None else x[row : row + 1] for x in batch)
-                logs[i] = Log(*fields)
+                logs[i] = jax.tree.map(lambda x, row=row: x[row : row + 1], batch)
 
         def track(i: int) -> tuple[Track, float]:
             start = time.thread_time()
@@ -124,10 +124,10 @@ class Methods(FitStudy):
             track = track if "f_robot" in KINDS[kind] else track._replace(force=None)
             replay, start = Replay(self.ranges, [track], self.setting, False), time.perf_counter()
             u = np.random.default_rng(log).random((fit.SAMPLES, len(names)))
-            if replay.count >= fit.LEAST_WINDOWS:
+            if replay.num_windows >= fit.LEAST_WINDOWS:
                 minima = device.standard_jax()(replay.minima)(starts)
                 u, _ = least_squares.sample(replay, *minima, fit.SAMPLES, log)
-            return u[:, columns], seconds + time.perf_counter() - start, replay.count
+            return u[:, columns], seconds + time.perf_counter() - start, replay.num_windows
 
         with ThreadPoolExecutor(device.count_processors()) as pool:
             results, seconds, counts = zip(*pool.map(samples, range(self.logs)), strict=True)

@@ -47,7 +47,7 @@ class WindowLearner(Learn):
     """
 
     TITLE: ClassVar[str] = "A law learned by gradients of short windows"
-    QUICK: ClassVar[Mapping[str, Any]] = Learn.QUICK | {"setting.engine": "quasistatic"}
+    QUICK: ClassVar[Mapping[str, Any]] = {**Learn.QUICK, "setting.engine": "quasistatic"}
 
     estimator: str = field(default="clipped", kw_only=True)
     """Estimator of the gradient: exact, clipped, bundled, evolution or mixed."""
@@ -91,17 +91,18 @@ class WindowLearner(Learn):
     ) -> tuple[RunnerState, dict[str, jax.Array]]:
         """Make one update: a step of the policy; then `rollout.update` for all else."""
         train = runner.train
-        inner, outer = train.optimiser
+        states: Any = train.optimiser
+        inner, outer = states
         theta, unravel = ravel_pytree(train.weights["actor"])
         estimate = estimators.ESTIMATORS[options.estimator]
         settings = Options(options.world_clip, options.sigma)
-        key, found = jax.random.fold_in(runner.key, 1), []
+        key, slopes = jax.random.fold_in(runner.key, 1), list[jax.Array]()
         for index, (env, batch) in enumerate(zip(envs, runner.batches, strict=True)):
             scores = window_scores(options, network, env, unravel, train.weights["critic"])
             worlds, env_key = jax.lax.stop_gradient(batch), jax.random.fold_in(key, index)
             samples = estimate(scores, theta, worlds, env_key, settings)
-            found.append(gradients.estimate(samples).gradient)
-        gradient = unravel(sum(found) / len(found))
+            slopes.append(gradients.estimate(samples).gradient)
+        gradient = unravel(jnp.mean(jnp.stack(slopes), axis=0))
         change, outer = _rule(options).update(gradient, outer)
         actor = optax.apply_updates(train.weights["actor"], change)
         plain = runner._replace(train=train._replace(optimiser=inner))
@@ -140,7 +141,7 @@ def window_scores(
 
         @partial(jax.checkpoint, prevent_cse=False)
         def step(batch: EnvBatch, _: None) -> tuple[EnvBatch, jax.Array]:
-            inputs, _ = rollout._inputs(env, batch)
+            inputs = rollout._inputs(env, batch)[0]
             hidden, mean = jax.vmap(network.apply)(weights, batch.memory.hidden, inputs)
             return rollout.act(env, network, batch, hidden, mean)
 

@@ -194,7 +194,7 @@ def best_within(curve: pd.DataFrame, budget: str, amount: float) -> pd.Series:
 def law_of(row: pd.Series) -> RPSParams:
     """Return the parameters of a generation."""
     names = [name for name in row.index if name.startswith("params.")]
-    changes = {name.removeprefix("params."): float(row[name]) for name in names}
+    changes = {name.removeprefix("params."): float(np.asarray(row[name])) for name in names}
     return registry.replace_leaves(RPSParams.paper(), changes)
 
 

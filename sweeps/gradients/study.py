@@ -153,8 +153,10 @@ class Gradients(QuickStudy[xr.Dataset]):
                 parts.append(run.checkpoint(part_name(name, measurement), compute))
                 done += 1
                 run.callback(Progress(done, 0.0))
-            by_object.append(self.combine(xr.merge(parts)))
-        return xr.concat(by_object, xr.IndexVariable("object", list(self.objects)))
+            merged: Any = xr.merge(parts)
+            by_object.append(self.combine(merged))
+        joined: Any = xr.concat(by_object, xr.IndexVariable("object", list(self.objects)))
+        return joined
 
     def combine(self, samples: xr.Dataset) -> xr.Dataset:
         """Return the gradients in each world of an object with the statistics of the answer."""
@@ -358,7 +360,11 @@ def norm_table(results: xr.Dataset) -> Rows:
         for measurement in SINGLE:
             if measurement in results:
                 norm = norms(of_object[measurement])
-                finite = np.isfinite(of_object[measurement]).all("parameter").mean("world")
+                finite = (
+                    xr.apply_ufunc(np.isfinite, of_object[measurement])
+                    .all("parameter")
+                    .mean("world")
+                )
                 add(f"{measurement}: share finite", finite, ".3f")
                 add(f"{measurement}: median norm [m]", norm.median("world"), ".1e")
                 add(f"{measurement}: largest norm [m]", norm.max("world"), ".1e")

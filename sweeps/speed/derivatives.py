@@ -109,7 +109,8 @@ class Derivatives(SpeedStudy[xr.Dataset]):
             program = jax.jit(function).lower(repeated, worlds).compile()
             times[name] = time.perf_counter() - start
             results[name], times[f"run_{name}"] = _timed(program, repeated, worlds)
-            memory = program.memory_analysis().temp_size_in_bytes
+            usage: Any = program.memory_analysis()
+            memory = usage.temp_size_in_bytes
         leaves = [np.asarray(x).reshape(self.worlds, -1) for x in jax.tree.leaves(results["law"])]
         finite = np.isfinite(np.concatenate(leaves, axis=1)).all(axis=1)
         return xr.Dataset({
