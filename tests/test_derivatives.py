@@ -133,7 +133,7 @@ def test_a_mass_without_influence_is_told(results):
     assert re.search("mass has no influence.*robot='kairos'.*domain='real'", results.notes)
     notes = lambda name, domain: " ".join(  # noqa: E731
         derivatives._notes(
-            parse_domain(domain), "fused", derivatives.numbers_of(name, RPSParams(), TOUCHING),
+            parse_domain(domain), "fused", derivatives.coordinates_of(name, RPSParams(), TOUCHING),
             np.array([True]), np.ones((1, 2, 1)), np.zeros((2, 1)),
         )
     )  # fmt: skip
@@ -146,7 +146,7 @@ def test_a_kink_of_the_world_has_no_derivative_and_is_told():
     """The principal axes of a square box are any."""
     square = parse_domain("wide,objects=random_box,aspect=1:1,com_offset=0:0")
     drawn = draws.draw(square, 0, np.arange(3))
-    numbers = derivatives.numbers_of(("aspect", "height"), RPSParams(), square)
+    numbers = derivatives.coordinates_of(("aspect", "height"), RPSParams(), square)
     slopes, bends = derivatives.world_slopes(square, drawn, Setting("fused"), numbers)
     assert (bends[:, 0] > 0.1).all()
     assert (bends[:, 1] < 1e-5).all()
@@ -265,7 +265,7 @@ def test_an_engine_without_a_mode_is_refused_before_anything_compiles(monkeypatc
 
 def test_a_law_with_arrays_has_a_number_for_each_entry():
     network = rps_jax.control.registry.LAWS["rps"]._replace(K_h=np.ones((2, 1)))
-    labels = [x.label for x in derivatives.numbers_of(("K_h", "L"), network, TOUCHING)]
+    labels = [x.label for x in derivatives.coordinates_of(("K_h", "L"), network, TOUCHING)]
     assert labels == ["K_h[0,0]", "K_h[1,0]", "L"]
-    units = [x.unit for x in derivatives.numbers_of(("K_h", "L", "K_v"), RPSParams(), TOUCHING)]
+    units = [x.unit for x in derivatives.coordinates_of(("K_h", "L", "K_v"), RPSParams(), TOUCHING)]
     assert units == ["1", "m", "1/s"]

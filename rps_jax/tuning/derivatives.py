@@ -58,8 +58,8 @@ _VECTORS = ("target", "com")  # x, y [m]
 _DISCRETE = ("corners", "sides", "feet_number", "object", "seed", "key_0", "key_1", "world")
 
 
-class Number(NamedTuple):
-    """Number by which a score is differentiated."""
+class Coordinate(NamedTuple):
+    """Scalar by which a score is differentiated."""
 
     label: str
     unit: str
@@ -134,28 +134,31 @@ def value_and_grad(
     engine.check_derivatives("reverse", setting.physics)
     setting.check_here(ranges.weakest, chosen.values())
     loops = [control_loop(params, setting, smooth=smooth) for params in chosen.values()]
-    several = [numbers_of(wrt, params, ranges) for params in chosen.values()]
-    if any(numbers != several[0] for numbers in several):
+    several = [coordinates_of(wrt, params, ranges) for params in chosen.values()]
+    if any(coordinates != several[0] for coordinates in several):
         rule = "parameters of wrt must have the same shapes and units in all laws"
         raise errors.not_allowed("laws", ", ".join(chosen), rule)
     if isinstance(score, Objective) and not all(hasattr(p, "v_max") for p in chosen.values()):
         rule = "a law without a parameter v_max needs a function of the snapshots"
         raise errors.not_allowed("score", "an Objective", rule)
     cache.use_cache_if_requested()
-    numbers, index = several[0], np.arange(worlds)
+    coordinates, index = several[0], np.arange(worlds)
     value = np.empty((len(chosen), worlds))
-    gradient, bend = np.empty((*value.shape, len(numbers))), np.empty((worlds, len(numbers)))
-    used, temperature = np.array([number.is_parameter for number in numbers]), 0.0
+    gradient, bend = (
+        np.empty((*value.shape, len(coordinates))),
+        np.empty((worlds, len(coordinates))),
+    )
+    used, temperature = np.array([coordinate.is_parameter for coordinate in coordinates]), 0.0
     for at, drawn in points.draw_by_object(ranges, setting.seed, None, index):
         batch = drawn_worlds(ranges, drawn, setting)
         staged = soften_skins(batch.worlds) if smooth else batch.worlds
         skin: Any = staged.skin
         temperature = float(skin.temperature[0]) if smooth else 0.0
-        slopes, bend[at] = world_slopes(ranges, drawn, setting, numbers)
-        used |= [any(i in x for x in slopes.values()) for i in range(len(numbers))]
+        slopes, bend[at] = world_slopes(ranges, drawn, setting, coordinates)
+        used |= [any(i in x for x in slopes.values()) for i in range(len(coordinates))]
         for i, (params, loop) in enumerate(zip(chosen.values(), loops, strict=True)):
             value[i, at], gradient[i, at] = _value_and_slopes(
-                *(batch.stage, staged, slopes, params, loop), score, numbers, steps, setting
+                *(batch.stage, staged, slopes, params, loop), score, coordinates, steps, setting
             )
     gradient = np.where(bend > _MAX_BEND, np.nan, gradient)
     mean = [gradients.estimate(jnp.asarray(x)) for x in gradient]
@@ -169,17 +172,17 @@ def value_and_grad(
         mean=(mean_dims, [x.gradient for x in mean], "1 / unit", "mean over finite derivatives"),
         error=(mean_dims, error, "1 / unit", "standard error of the mean"),
     )
-    kinds = ["parameter" if number.is_parameter else "world" for number in numbers]
+    kinds = ["parameter" if coordinate.is_parameter else "world" for coordinate in coordinates]
     coords: dict[str, Any] = {
         "law": list(chosen),
         "world": ("world", index, {"long_name": WORLD}),
-        "quantity": [number.label for number in numbers],
-        "unit": ("quantity", [number.unit for number in numbers]),
+        "quantity": [coordinate.label for coordinate in coordinates],
+        "unit": ("quantity", [coordinate.unit for coordinate in coordinates]),
         "kind": ("quantity", kinds),
         "map_error": ("quantity", bend.max(axis=0), {"units": "1"}),
     }
     coords |= points.drawn_columns(ranges, setting.seed, None, index)
-    notes = " ".join(_notes(ranges, setting.engine, numbers, used, gradient, bend))
+    notes = " ".join(_notes(ranges, setting.engine, coordinates, used, gradient, bend))
     if notes:
         warnings.warn(notes, stacklevel=3)
     attrs = provenance.attributes() | {
@@ -191,10 +194,12 @@ def value_and_grad(
     return xr.Dataset(variables, coords, attrs)
 
 
-# --- the numbers -----------------------------------------------------------------------------
+# --- the coordinates -----------------------------------------------------------------------------
 
 
-def numbers_of(wrt: Sequence[str] | str, params: LawParams, domain: Domain) -> tuple[Number, ...]:
+def coordinates_of(
+    wrt: Sequence[str] | str, params: LawParams, domain: Domain
+) -> tuple[Coordinate, ...]:
     """Return the numbers of names, in order.
 
     Raises:
@@ -207,16 +212,18 @@ def numbers_of(wrt: Sequence[str] | str, params: LawParams, domain: Domain) -> t
         f"params.{leaf}" if leaf in (*drawn, *_VECTORS) else leaf: (leaf, np.shape(value))
         for leaf, value in named_leaves(params).items()
     }
-    numbers: list[Number] = []
+    coordinates: list[Coordinate] = []
     for name in names:
         if name in parameters:
             leaf, shape = parameters[name]
             unit = _unit_of_leaf(params, leaf)
             for at in np.ndindex(shape):
                 label = f"{name}[{','.join(map(str, at))}]" if at else name
-                numbers.append(Number(label, unit, leaf, is_parameter=True))
+                coordinates.append(Coordinate(label, unit, leaf, is_parameter=True))
         elif name in _VECTORS:
-            numbers += [Number(f"{name}_{axis}", "m", name, i) for i, axis in enumerate("xy")]
+            coordinates += [
+                Coordinate(f"{name}_{axis}", "m", name, i) for i, axis in enumerate("xy")
+            ]
         else:
             is_known = name in QUANTITIES
             if name in _DISCRETE or (is_known and QUANTITIES[name].jumps):
@@ -231,9 +238,9 @@ def numbers_of(wrt: Sequence[str] | str, params: LawParams, domain: Domain) -> t
                 raise errors.not_allowed("wrt", name, rule)
             parts = tuple(VELOCITY_ERRORS) if name == "velocity_error" else (name,)
             units = {"com_bearing": "rad"}
-            numbers += [Number(x, units.get(x, unit_of(x)), x) for x in parts]
-    errors.check_each_once("wrt", [number.label for number in numbers])
-    return tuple(numbers)
+            coordinates += [Coordinate(x, units.get(x, unit_of(x)), x) for x in parts]
+    errors.check_each_once("wrt", [coordinate.label for coordinate in coordinates])
+    return tuple(coordinates)
 
 
 def _unit_of_leaf(params: object, path: str) -> str:
@@ -246,7 +253,7 @@ def _unit_of_leaf(params: object, path: str) -> str:
 
 
 def world_slopes(
-    domain: Domain, drawn: Draw, setting: Setting, numbers: Sequence[Number]
+    domain: Domain, drawn: Draw, setting: Setting, coordinates: Sequence[Coordinate]
 ) -> tuple[dict[str, dict[int, np.ndarray]], np.ndarray]:
     """Return derivatives of worlds by numbers: central differences on the host, in float64.
 
@@ -262,16 +269,16 @@ def world_slopes(
 
     dtype = jnp.result_type(float)
     slopes: dict[str, dict[int, np.ndarray]] = {}
-    bends = np.zeros((drawn.indices.size, len(numbers)))
+    bends = np.zeros((drawn.indices.size, len(coordinates)))
     with jax.enable_x64(True):
         middle = leaves(drawn)
-        for i, number in enumerate(numbers):
-            if number.is_parameter:
+        for i, coordinate in enumerate(coordinates):
+            if coordinate.is_parameter:
                 continue
-            value = _value_of(drawn, number)
+            value = _value_of(drawn, coordinate)
             step = _STEP * np.maximum(np.abs(value), _SMALLEST)
             above, below = (
-                leaves(_moved(domain, drawn, setting, number, x)) for x in (step, -step)
+                leaves(_moved(domain, drawn, setting, coordinate, x)) for x in (step, -step)
             )
             for name, leaf in middle.items():
                 up, at, down = (x.reshape(len(step), -1) for x in (above[name], leaf, below[name]))
@@ -287,20 +294,22 @@ def world_slopes(
     return slopes, bends
 
 
-def _value_of(drawn: Draw, number: Number) -> np.ndarray:
+def _value_of(drawn: Draw, coordinate: Coordinate) -> np.ndarray:
     """Return the values (n,) of a number in drawn worlds; 1 of an angle or an error."""
     vectors = {"target": drawn.p_world_target, "com": drawn.solid.p_object_com}
-    if number.name in vectors:
-        return vectors[number.name][:, number.axis]
-    return drawn.values.get(number.name, np.ones(drawn.indices.size))
+    if coordinate.name in vectors:
+        return vectors[coordinate.name][:, coordinate.axis]
+    return drawn.values.get(coordinate.name, np.ones(drawn.indices.size))
 
 
-def _moved(domain: Domain, drawn: Draw, setting: Setting, number: Number, step: np.ndarray) -> Draw:
+def _moved(
+    domain: Domain, drawn: Draw, setting: Setting, coordinate: Coordinate, step: np.ndarray
+) -> Draw:
     """Return drawn worlds with a number changed by steps (n,)."""
-    if number.name not in _VECTORS:
-        return draws.draw(domain, setting.seed, drawn.indices, {number.name: step})
-    move = np.eye(3)[number.axis] * step[:, None]
-    if number.name == "target":
+    if coordinate.name not in _VECTORS:
+        return draws.draw(domain, setting.seed, drawn.indices, {coordinate.name: step})
+    move = np.eye(3)[coordinate.axis] * step[:, None]
+    if coordinate.name == "target":
         return drawn._replace(p_world_target=drawn.p_world_target + move[:, :2])
     solid = drawn.solid
     return drawn._replace(solid=solid._replace(p_object_com=solid.p_object_com + move))
@@ -317,19 +326,19 @@ def _value_and_slopes(
     params: LawParams,
     loop: ControlLoop,
     score: Score | Objective,
-    numbers: tuple[Number, ...],
+    coordinates: tuple[Coordinate, ...],
     steps: int,
     setting: Setting,
 ) -> tuple[jax.Array, jax.Array]:
     """Return the scores (n,) of worlds, and their derivatives (n, q) by numbers."""
     leaves = named_leaves(worlds)
-    names = {number.name: None for number in numbers if number.is_parameter}
+    names = {coordinate.name: None for coordinate in coordinates if coordinate.is_parameter}
 
     def changed(theta: jax.Array) -> LawParams:
         values = {}
         for name in names:
             value = jnp.asarray(named_leaves(params)[name], theta.dtype)
-            at = [i for i, x in enumerate(numbers) if x.is_parameter and x.name == name]
+            at = [i for i, x in enumerate(coordinates) if x.is_parameter and x.name == name]
             values[name] = value + theta[np.array(at)].reshape(value.shape)
         return registry.replace_leaves(params, values)
 
@@ -345,7 +354,7 @@ def _value_and_slopes(
         _, snapshots = trial.unroll(*inputs, native.mapped)
         return jax.vmap(partial(_score, score, setting), (1, 0))(snapshots, candidates)
 
-    thetas = jnp.zeros((len(worlds.qpos), len(numbers)), worlds.qpos.dtype)
+    thetas = jnp.zeros((len(worlds.qpos), len(coordinates)), worlds.qpos.dtype)
     values, pull_back = jax.vjp(scores, thetas)
     return values, pull_back(jnp.ones_like(values))[0]
 
@@ -370,13 +379,13 @@ def _score(
 def _notes(
     domain: Domain,
     engine: str,
-    numbers: Sequence[Number],
+    coordinates: Sequence[Coordinate],
     used: np.ndarray,
     gradient: np.ndarray,
     bend: np.ndarray,
 ) -> Iterator[str]:
     """Yield sentences on numbers without influence or without derivatives."""
-    is_mass = np.array([x.name == "mass" and not x.is_parameter for x in numbers])
+    is_mass = np.array([x.name == "mass" and not x.is_parameter for x in coordinates])
     is_mass &= not domain.weakest.driven
     if is_mass.any():
         yield (
@@ -391,6 +400,8 @@ def _notes(
         (used & is_zero & ~is_mass, "Derivatives of zero in every world within the horizon:"),
         (bent, "No derivatives in worlds whose numbers have a kink (see finite):"),
     ):
-        labels = [number.label for number, chosen in zip(numbers, mask, strict=True) if chosen]
+        labels = [
+            coordinate.label for coordinate, chosen in zip(coordinates, mask, strict=True) if chosen
+        ]
         if labels:
             yield f"{sentence} {', '.join(labels)}."

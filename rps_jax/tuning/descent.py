@@ -185,14 +185,14 @@ class TuneGrad(Tuning):
             thetas: jax.Array, key: jax.Array, stage: Stage, worlds: World, trials: Trial
         ) -> jax.Array:
             scores = window_scores(self, stage)
-            at = jax.vmap(lambda x, begun: scores(gradients.per_world(x, worlds), (worlds, begun)))
+            at = jax.vmap(lambda x, first: scores(gradients.per_world(x, worlds), (worlds, first)))
             return at(thetas, trials)
 
         def estimates(
             thetas: jax.Array, key: jax.Array, stage: Stage, worlds: World, trials: Trial
         ) -> Estimate:
             samples = partial(estimator, window_scores(self, stage), options=self.estimator_options)
-            at = jax.vmap(lambda x, begun: gradients.estimate(samples(x, (worlds, begun), key=key)))
+            at = jax.vmap(lambda x, first: gradients.estimate(samples(x, (worlds, first), key=key)))
             return at(thetas, trials)
 
         return jax.jit(starts), jax.jit(evaluate), jax.jit(estimates)

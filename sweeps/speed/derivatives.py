@@ -83,8 +83,8 @@ class Derivatives(SpeedStudy[xr.Dataset]):
     def _measured(self, family: str) -> xr.Dataset:
         setting, params = Setting("fused"), RPSParams.paper()
         domain = parse_domain(f"wide,objects=random_{family}")
-        one = jax.tree.map(lambda x: np.asarray(x)[None], params)
-        (batch,) = Candidates(one, [domain], 0, np.arange(self.worlds)).batches(setting)
+        single = jax.tree.map(lambda x: np.asarray(x)[None], params)
+        (batch,) = Candidates(single, [domain], 0, np.arange(self.worlds)).batches(setting)
         worlds = jax.tree.map(jnp.asarray, soften_skins(batch.worlds))
         repeated = jax.tree.map(lambda x: jnp.full(self.worlds, x, float), params)
         law = registry.smooth_law(registry.law_of(params))
