@@ -96,7 +96,9 @@ def classes(x, physics):
     return states
 
 
-@pytest.mark.parametrize("name", ["random_box", "random_cylinder"])
+@pytest.mark.parametrize(
+    "name", ["random_box", pytest.param("random_cylinder", marks=pytest.mark.slow)]
+)
 def test_a_step_has_the_derivative_of_its_difference(name, monkeypatch):
     """By 24 inputs and more at once, in 200 states of contact, of each class."""
     monkeypatch.setattr(newton, "_TOLERANCE", 1e-13)

@@ -187,6 +187,7 @@ def check_finite(gradients):
         assert np.isfinite(leaf).all(), jax.tree_util.keystr(path)
 
 
+@pytest.mark.slow
 def test_gradients_of_our_boxes_are_finite_and_those_of_the_fused_engine():
     """In float32, with the standard solver; the flat boxes alone have equal contacts in both.
 

@@ -454,6 +454,7 @@ def closed_loop():
         return jax.device_get(distance), jax.device_get(gradient)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", TUNED)
 def test_derivatives_of_the_closed_loop_are_those_of_finite_differences(name):
     distance, gradient = closed_loop()
