@@ -118,8 +118,15 @@ def batched(
 
     def rule(primals: Pytree, tangents: Pytree) -> tuple[Pytree, Pytree]:
         if differentiated is not None:
-            zeros = _instantiate(tangents)
-            return jax.jvp(differentiated, primals, zeros)
+            inputs, tree = jax.tree.flatten(primals)
+            varied = {i: x for i, x in enumerate(jax.tree.leaves(tangents)) if _varies(x)}
+
+            def of_varied(values: dict[int, jax.Array]) -> Pytree:
+                return differentiated(
+                    *tree.unflatten([values.get(i, x) for i, x in enumerate(inputs)])
+                )
+
+            return jax.jvp(of_varied, ({i: inputs[i] for i in varied},), (varied,))
         results = call(*primals)
         if derivative is not None:
             return results, _tangents(derivative, (primals, results), tangents, results)
@@ -174,7 +181,7 @@ def _tangents(
         groups.setdefault(leaf.dtype if owner in packed else i, []).append(i)
     like_leaves, like_tree = jax.tree.flatten(like)
     directions = jax.tree.leaves(tangents)
-    varied = [i for i, x in enumerate(directions) if not isinstance(x, SymbolicZero)]
+    varied = [i for i, x in enumerate(directions) if _varies(x)]
     real = [i for i, x in enumerate(like_leaves) if jnp.issubdtype(x.dtype, jnp.floating)]
 
     def pack(group: Sequence[int]) -> jax.Array:
@@ -218,16 +225,9 @@ def _tangents(
     return like_tree.unflatten([values.get(i, x) for i, x in enumerate(zeros)])
 
 
-def _instantiate(tangents: Pytree) -> Pytree:
-    """Return tangents with arrays in place of symbolic zeros."""
-
-    def dense(x: Any) -> Any:
-        if not isinstance(x, SymbolicZero):
-            return x
-        shape, dtype = x.aval.shape, x.aval.dtype
-        return np.zeros(shape, dtype) if dtype == jax.dtypes.float0 else jnp.zeros(shape, dtype)
-
-    return jax.tree.map(dense, tangents)
+def _varies(tangent: Any) -> bool:
+    """Whether a tangent is not a symbolic zero."""
+    return not isinstance(tangent, SymbolicZero)
 
 
 def concurrent(
