@@ -26,7 +26,7 @@ def unlike(option, value, *choices):
     return f"unknown {option.strip('-')} '{value}': choose from {', '.join(choices)}"
 
 
-ESTIMATORS = ("reverse", "evolution")
+ESTIMATORS = ("exact", "clipped", "evolution", "mixed")
 # Patterns of errors by the arguments of a command.
 NO_RANGE = "domain mass = .* is not allowed: write low and high"
 # Contents of domain files, and patterns of their errors.

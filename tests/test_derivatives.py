@@ -165,6 +165,7 @@ def test_the_table_of_names_is_that_of_the_code():
     assert names == {*smooth, *VELOCITY_ERRORS, "com_bearing", "target", "com"}
 
 
+@pytest.mark.slow
 def test_the_examples_of_the_page_agree():
     """Reverse mode of the call, and forward mode of the plain JAX route, with the same worlds."""
     call, route = re.findall(r"```python\n(.*?)```", README, re.DOTALL)[:2]

@@ -64,7 +64,7 @@ def driven(engine, names, steps):
 Y = 4  # of the object, along the base's front, on which it comes to lie
 
 
-@pytest.mark.parametrize("engine", ["fused", "mjx"])
+@pytest.mark.parametrize("engine", ["fused", pytest.param("mjx", marks=pytest.mark.slow)])
 def test_feet_change_the_final_pose_and_engines_agree_with_c_mujoco(engine):
     feet, corners = (pushed_in_c(name) for name in ("on_feet", "on_corners"))
     assert feet[Y] - corners[Y] > 0.01

@@ -45,6 +45,7 @@ def test_the_pusher_starts_behind_its_contact_point():
     np.testing.assert_allclose(np.unique(yaw.round(9)), np.round((-math.pi / 8, 0, math.pi / 8), 9))
 
 
+@pytest.mark.slow
 def test_the_law_returns_all_boxes_to_the_path_and_open_loop_loses_most(tmp_path, monkeypatch):
     """Boxes start up to 0.4 m off the path and follow it for 6 m in 60 s."""
     question = ForcePushGrid(sliders=("box",), duration=60.0, out=tmp_path)

@@ -2,6 +2,7 @@
 
 import sys
 
+import pytest
 from helpers import output_of
 
 PROGRAM = """
@@ -30,6 +31,7 @@ assert others() == alone
 """
 
 
+@pytest.mark.slow
 def test_a_cylinder_of_another_program_falls_unchanged():
     """Bit for bit, after this package stepped a cylinder with MJX in the same process."""
     output_of(sys.executable, "-c", PROGRAM)

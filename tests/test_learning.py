@@ -456,6 +456,7 @@ def test_rewards_of_privileged_quantities():
     assert float(together) == pytest.approx(cosine(current) - cosine(previous), abs=1e-6)
 
 
+@pytest.mark.slow
 def test_the_ladder_runs_the_policy_of_the_command(learned, tmp_path, capsys, registries):
     """The command learns the policy of the call."""
     out = tmp_path / "learn"

@@ -99,6 +99,7 @@ def test_the_bits_of_a_world_depend_on_no_other_world(shape):
         same(computed, jax.tree.map(lambda x, order=order: x[order], together))
 
 
+@pytest.mark.slow
 def test_a_drive_is_compiled_and_its_derivative_is_xlas(monkeypatch):
     stage, inputs, loop = batch("box", count=3)
     start = trial.motion(start_trials(inputs, loop))

@@ -152,7 +152,7 @@ def test_notebooks_show_the_cells_of_tables_that_they_cite():
                 expected = eval(compile(ast.Expression(last.value), name, "eval"), names)
                 assert output.data["text/markdown"] == expected
                 cited.append(name)
-    assert cited == ["03_paper"] * 4 + ["05_tuning"] * 2
+    assert cited == ["03_paper"] * 4 + ["05_tuning"]
 
 
 def test_training_by_stable_baselines3_as_the_tutorial_shows_it(tmp_path):

@@ -50,6 +50,7 @@ def test_methods_yield_their_best_plans(name, problem):
     assert np.diff([count for _, _, count in steps]).min() > 0
 
 
+@pytest.mark.slow
 def test_gauss_newton_solves_pushes_and_replanning_corrects_the_model(problem):
     solved, _ = study.replan("gauss_newton", problem, problem.fields)
     assert solved.tolist() == [1, 1, 1]

@@ -53,7 +53,7 @@ REFUSED = [
     ("fit --law aps", "fit needs a law that senses touch"),
     ("fit/bags.py --law aps", "fit needs a law that senses touch"),
     ("export --tables sped", "sped"),
-    ("planning --engine mujoco", "reverse-mode differentiation is missing"),
+    ("planning --engine mujoco", "no reverse-mode derivatives"),
 ]
 for line in OUT_OF_BOUNDS + UNKNOWN:
     _, option, value = line.split()
@@ -156,8 +156,11 @@ def test_a_digest_changes_with_laws_domains_and_options():
         assert digest([command]) != digest([[*command, *changes]])
 
 
-# Studies that measure this machine, and one that has another ground.
-WITHOUT_PRESETS = ("speed", "levers", "publish", "force_push_grid", "gradients/mjx.py")
+# Studies that measure this machine, have another ground or none, or read run folders.
+WITHOUT_PRESETS = (
+    *("speed", "levers", "publish", "force_push_grid"),
+    *("gradients/mjx.py", "gradients/network.py"),
+)
 WITH_THE_PAPERS_LAW = ("ambiguities", "fidelity", "gradients", "paper_reading")
 
 

@@ -234,6 +234,7 @@ def test_a_base_has_no_droop_under_load_by_integral_action_and_pushes_as_far_if_
         assert velocity == pytest.approx(0.05, rel=rel)
 
 
+@pytest.mark.slow
 def test_engines_agree_on_a_small_base_that_contact_slows():
     push = partial(push_object, seconds=3.0, twist=(0.05, 0.01, 0.15))
     ideal = Robot(half_length=0.5, half_width=0.12)

@@ -67,7 +67,7 @@ class Race(Study[xr.Dataset], SimulationQuestion[xr.Dataset]):
     DIMENSION: ClassVar[str] = "tuning"
     REPORTS_TIMES: ClassVar[bool] = True
 
-    methods: tuple[str, ...] = tuple(METHODS)
+    methods: tuple[str, ...] = ("gradient", "evolution")
     """gradient (derivatives of windows), slopes (antithetic steps in whole trials) or evolution."""
     counts: tuple[int, ...] = tuple(COUNTS)
     """Numbers of tuned parameters, 6 or 13."""
@@ -97,7 +97,7 @@ class Race(Study[xr.Dataset], SimulationQuestion[xr.Dataset]):
     def configuration(self) -> dict[str, Any]:
         """Return everything that the answer depends on; the commands stand for the tunings."""
         fields = {k: v for k, v in super().configuration().items() if k not in ("lanes", "gpus")}
-        return fields | {"commands": METHODS}
+        return fields | {"commands": {name: METHODS[name] for name in self.methods}}
 
     def tunings(self) -> dict[tuple[str, int, int], str]:
         """Return the commands of the tunings by method, count and seed."""

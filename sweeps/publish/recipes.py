@@ -265,6 +265,8 @@ RECIPES: dict[str, Recipe] = {
         gpu=10,
         section=rows.default_beside_tuned,
     ),
+    "plans": recipe(f"rps sweeps/planning {_MACHINE}", cores=15),
+    "replans": recipe(f"rps sweeps/planning {_MACHINE}", cores=15),
     "gradients_cosine": recipe(f"rps sweeps/gradients {_MACHINE}", cores=200, gpu=8),
     "gradients_norm": recipe(f"rps sweeps/gradients {_MACHINE}", cores=200, gpu=8),
     "gradients_check": recipe(
