@@ -122,9 +122,9 @@ def batched(
             varied = {i: x for i, x in enumerate(jax.tree.leaves(tangents)) if _varies(x)}
 
             def of_varied(values: dict[int, jax.Array]) -> Pytree:
-                return differentiated(
-                    *tree.unflatten([values.get(i, x) for i, x in enumerate(inputs)])
-                )
+                assert differentiated is not None  # as above
+                arguments = tree.unflatten([values.get(i, x) for i, x in enumerate(inputs)])
+                return differentiated(*arguments)
 
             return jax.jvp(of_varied, ({i: inputs[i] for i in varied},), (varied,))
         results = call(*primals)
