@@ -81,8 +81,8 @@ def _batch(arrays: Any, axes: Any, *, maps: Maps, count: int, outs: Any, label: 
 
 def _refuse(*_: Any, **__: Any) -> Any:
     raise NotImplementedError(
-        "native functions have no second derivatives; with the environment variable "
-        "RPS_COMPILER=none XLA compiles them, and they have."
+        "native functions have no second derivatives: set the environment variable "
+        "RPS_COMPILER=none, so that XLA compiles them."
     )
 
 
