@@ -81,8 +81,7 @@ def _batch(arrays: Any, axes: Any, *, maps: Maps, count: int, outs: Any, label: 
 
 def _refuse(*_: Any, **__: Any) -> Any:
     raise NotImplementedError(
-        "native functions have no second derivatives: set the environment variable "
-        "RPS_COMPILER=none, so that XLA compiles them."
+        "trials have no second derivatives: differentiate once, or take differences of gradients."
     )
 
 

@@ -188,7 +188,7 @@ def accelerations(
 
     The derivative is that of the implicit function theorem at the minimum: minus the inverse
     Hessian times the derivative of the gradient. The iterations are not differentiated. Where a
-    contact appears or a cone ends, it is one-sided.
+    contact appears or a cone ends, it is one-sided. Second derivatives do not exist.
 
     Args:
       problem: of one world or a batch.
