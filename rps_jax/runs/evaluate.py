@@ -103,7 +103,7 @@ def evaluate(
         (scored,), _ = score_candidates([request], setting, objective, **options)
     dims = "candidate", "world"
     variables = labelled(score=(dims, scored.score, "1", "objective"))
-    for name, values in scored.outcome._asdict().items():
+    for name, values in scored.outcome.columns().items():
         variables[name] = variable(name, dims, values)
     drawn = points_.drawn_columns(ranges, seed, at, request.worlds)
     tried = _parameters(params, {*variables, *drawn, "pose", "world", "candidate"})

@@ -52,7 +52,8 @@ class Results:
         """Prepare to run chunks; each is passed to `store` when it is complete."""
         self.plan, self._chunks, self._store = plan, chunks, store
         self.shape = len(plan.laws), plan.worlds
-        self._outcomes = {name: self._empty(name) for name in UNITS}  # (law, world, ...)
+        self._names = (*UNITS, *plan.domain.task.OUTCOMES)
+        self._outcomes = {name: self._empty(name) for name in self._names}  # (law, world, ...)
         self._drawn: dict[str, np.ndarray] = {}  # (world,) drawn quantities
         self._running = {chunk: plan.chunks[chunk].size for chunk in chunks}  # trials
 
@@ -96,7 +97,7 @@ class Results:
     def collect(self, indices: np.ndarray, outcomes: Outcome) -> None:
         """Add the outcomes of trials, and store the chunks that are complete with them."""
         at = np.unravel_index(indices, self.shape)
-        for name, leaf in outcomes._asdict().items():
+        for name, leaf in outcomes.columns().items():
             self._outcomes[name][at] = leaf
         for chunk in self._chunk_of[indices].tolist():
             self._running[chunk] -= 1
@@ -146,19 +147,20 @@ class Results:
         except ValueError as error:
             raise files.CorruptFileError(source, error) from error
         columns.pop(_REMOVED, None)
-        drawn = set(columns) - {"trial", *UNITS}
-        if missing := {"trial", *UNITS, *(() if law[0] or drawn else ("drawn",))} - set(columns):
+        known = {"trial", *self._names}
+        drawn = set(columns) - known
+        if missing := {*known, *(() if law[0] or drawn else ("drawn",))} - set(columns):
             raise InputError(
                 f"part {chunk} of the run was written by another version (it lacks "
                 f"{', '.join(sorted(missing))}): use that version."
             )
         for name, values in columns.items():
-            shape = worlds.shape + (self._outcomes[name].shape[2:] if name in UNITS else ())
+            shape = worlds.shape + (self._outcomes[name].shape[2:] if name in known else ())
             if values.shape != shape or values.dtype.kind not in "biuf":
                 raise files.CorruptFileError(source, f"{name} is not numbers of {shape}")
         if not np.array_equal(columns["trial"], self.plan.chunks[chunk]):
             raise files.CorruptFileError(source, "it holds other trials")
-        for name in UNITS:
+        for name in self._names:
             self._outcomes[name][at] = columns[name]
         for name in columns:
             if name in drawn:

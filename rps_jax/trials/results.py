@@ -12,6 +12,7 @@ from rps_jax.geometry.footprint import Footprint
 from rps_jax.trials import trial
 from rps_jax.trials.pushes import Trajectory
 from rps_jax.trials.trial import Outcome
+from rps_jax.world import tasks
 
 DIMS = ("law", "object", "friction", "target")
 WORLD = "index of the world"
@@ -31,6 +32,7 @@ UNITS = {
     "base_pose": ("m, m, rad", "x, y, yaw of the base in the world at the end"),
     "object_pose": ("m, m, rad", "x, y, yaw of the object in the world at the end"),
 }
+_ALL_UNITS = UNITS | tasks.OUTCOMES
 _TRACED = {"v_x": "m/s", "v_y": "m/s", "omega": "rad/s", "l": "m", "distance": "m", "a_r": "1",
            "gamma": "rad", "realigning": "1"}  # fmt: skip  # units of numbers of a trace
 
@@ -65,7 +67,7 @@ def outcome_dataset(
     """Return outcomes (S * O * F * T, ...), nested in this order, as a dataset with `DIMS`."""
     shape = (len(laws), len(objects), len(frictions), len(targets))
     variables = {}
-    for name, values in outcome._asdict().items():
+    for name, values in outcome.columns().items():
         variables[name] = variable(name, DIMS, values.reshape(shape + values.shape[1:]))
     position = np.asarray(targets, float)
     return xr.Dataset(
@@ -92,7 +94,7 @@ def labelled(**columns: tuple[str | Sequence[str], ArrayLike, str, str]) -> dict
 
 def variable(name: str, dims: Sequence[str], values: np.ndarray) -> xr.Variable:
     """Return one field of outcomes with its unit; poses (..., 3) have one more dimension."""
-    unit, meaning = UNITS[name]
+    unit, meaning = _ALL_UNITS[name]
     attrs = {"units": unit, "long_name": meaning}
     return xr.Variable((*dims, "pose")[: values.ndim], _plain(values), attrs)
 
@@ -118,7 +120,7 @@ def trace_dataset(trajectory: Trajectory) -> xr.Dataset:
     }
     scalars = snapshots.twist._asdict() | snapshots.details._asdict()
     variables |= {name: over_time(scalars[name], unit) for name, unit in _TRACED.items()}
-    for name, value in trajectory.outcome._asdict().items():
+    for name, value in trajectory.outcome.columns().items():
         variables[f"outcome_{name}"] = variable(name, (), np.asarray(value))
     variables["p_world_contact"] = over_time(trial.p_world_contact(snapshots), "m", "axis")
     variables["p_world_target"] = xr.Variable(

@@ -104,13 +104,13 @@ def outcomes(
     *firsts, count = _first_trials(requests)
 
     def collect(indices: np.ndarray, ended: Outcome) -> None:
-        for name, leaf in ended._asdict().items():
+        for name, leaf in ended.columns().items():
             if name not in columns:
                 columns[name] = np.empty((count, *leaf.shape[1:]), leaf.dtype)
             columns[name][indices] = leaf
 
     timing = rollout(requests, setting, collect, **options)
-    whole = Outcome(**columns)  # pyright: ignore[reportArgumentType]
+    whole = Outcome.of_columns(columns)
     trials = (
         first + np.arange(math.prod(request.shape)).reshape(request.shape)
         for first, request in zip(firsts, requests, strict=True)

@@ -6,12 +6,15 @@ them. `advance` runs many control steps, and `record` also returns snapshots. Th
 that has ended stays as it is, and a batch stops when all its trials have ended.
 """
 
+from __future__ import annotations
+
 import dataclasses
 import functools
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import jax
@@ -44,6 +47,8 @@ from rps_jax.robot.robot import Robot
 from rps_jax.robot.skin import NONE, Reading, Skin, SkinState
 from rps_jax.world.physics import Physics
 from rps_jax.world.scene import JOINTS
+from rps_jax.world.tasks import reach
+from rps_jax.world.tasks.base import Place
 
 # A world is a runaway beyond these, far outside anything a base at 0.05 m/s can cause.
 _MAX_SPEED = 20.0  # [m/s], [rad/s]
@@ -97,6 +102,7 @@ class World(NamedTuple):
     key: jax.Array  # of the imperfections of skin and odometry
     odometry: Odometry = Odometry()
     robot: Robot | None = None  # with limits; None follows every twist
+    task: Any = reach.Nothing()  # a `Course`
 
 
 class Trial(NamedTuple):
@@ -125,6 +131,7 @@ class Trial(NamedTuple):
     nan_twist: Bool[Array, "*B"]  # the law returned a twist that is not finite
     drive: Drive | None = None  # of a robot with limits
     load: Load | None = None  # of a law that senses the contact's force
+    task: Any = reach.Nothing()  # progress of the task
 
 
 class Snapshot(NamedTuple):
@@ -154,6 +161,17 @@ class Outcome(NamedTuple):
     stalled: Bool[Array, "*B"]  # it ended with the base standing still against the object
     base_pose: Float[Array, "*B 3"]  # [m, m, rad] in the world, at the end
     object_pose: Float[Array, "*B 3"]  # [m, m, rad] of the object in the world, at the end
+    task: Mapping[str, Array] = MappingProxyType({})  # by name: see `Task.OUTCOMES`
+
+    def columns(self) -> dict[str, Array]:
+        """Return all outcomes by name."""
+        return {name: x for name, x in self._asdict().items() if name != "task"} | dict(self.task)
+
+    @classmethod
+    def of_columns(cls, columns: Mapping[str, Any]) -> Outcome:
+        """Return the outcome of all columns by name."""
+        own = {name: columns[name] for name in cls._fields if name in columns}
+        return cls(**own, task={k: x for k, x in columns.items() if k not in own})
 
 
 def object_pose(qpos: Float[Array, "10"]) -> tuple[Float[Array, "2"], Float[Array, ""]]:
@@ -188,6 +206,7 @@ def start(world: World, params: LawParams, law: Law = rps.LAW) -> Trial:
         **dict.fromkeys(("done", "success", "tipped", "diverged", "nan_twist"), false),
         drive=None if world.robot is None else drive.init_drive(world.qpos),
         load=base.init_load(world.qpos) if law.senses == "force" else None,
+        task=world.task.start(),
     )
 
 
@@ -239,10 +258,17 @@ def observe(
 
     touch = reading.contact_type != NONE
     lost_steps = trial.lost_steps + (~touch & (trial.contact_steps > 0))
-    success = touch & (distance < params.d_success)
+    p_world_contact = pose[:2] + planar.rotate(pose[2], reading.p_robot_contact)
+    place = Place(
+        *(world.p_world_target, p_world_contact, touch, pose, world.skin.shell.half),
+        *(*object_pose(trial.qpos), world.footprint),
+    )
+    task, aim = world.task.step(trial.task, place)
+    observation = observation._replace(p_world_target=aim.p_world_target)
+    success = touch & (distance < params.d_success) & aim.at_end
     tilt = planar.tilt(trial.qpos[JOINTS.object][3:])
     tipped = tilt > rules.max_tilt
-    over = (time >= rules.horizon) | (lost_steps * period > rules.max_lost) | tipped
+    over = (time >= rules.horizon) | (lost_steps * period > rules.max_lost) | tipped | aim.failed
     judged = trial._replace(
         skin=skin,
         poses=poses,
@@ -256,6 +282,7 @@ def observe(
         tilt=jnp.maximum(trial.tilt, tilt),
         tipped=tipped,
         done=success | over,
+        task=task,
     )
     return judged, Measurement(reading, observation, distance)
 
@@ -419,6 +446,7 @@ def outcome(trial: Trial, period: float) -> Outcome:
         stalled=drive.has_stalled(trial.drive, period) & ~trial.success & ~trial.diverged,
         base_pose=trial.qpos[..., JOINTS.base],
         object_pose=pose.reshape(*trial.qpos.shape[:-1], 3),
+        task=trial.task.outcomes(),
     )
 
 

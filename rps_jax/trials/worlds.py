@@ -76,6 +76,7 @@ def drawn_worlds(
         setting,
         skin=_skin(domain, drawn),
         p_world_target=drawn.p_world_target,
+        task=drawn.course,
         shift=Shift(np.full(count, np.inf), np.zeros((count, 2))),
         qpos=starts(drawn),
         key=drawn.key,

@@ -2,10 +2,9 @@
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, fields, replace
-from functools import partial
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -14,48 +13,12 @@ from rps_jax import errors
 from rps_jax.record import files
 from rps_jax.record.options import check_fields, parse_changes
 from rps_jax.robot.robot import Robot, RobotLike, parse_robot
-from rps_jax.world import paper, scene
+from rps_jax.world import paper, scene, tasks
 from rps_jax.world.objects import FAMILIES, OBJECTS, PAPER_OBJECTS
+from rps_jax.world.quantity import Owner, Quantity, Range, check_ranges, declared, drawn, range_of
 from rps_jax.world.scene import FRICTION, Friction
-
-
-class Range(NamedTuple):
-    """Interval of a drawn quantity, uniform in the quantity or in its logarithm."""
-
-    low: float
-    high: float
-    log: bool = False
-
-    EXAMPLE = "Range(3, 10)"  # for errors
-
-    def at(self, u: np.ndarray) -> np.ndarray:
-        """Return the quantity at u in [0, 1)."""
-        if self.log:
-            return self.low * (self.high / self.low) ** u
-        return self.low + u * (self.high - self.low)
-
-
-Owner = Literal["object", "task", "skin", "base", "robot"]  # of a quantity
-_KEY = "quantity"
-
-
-class Quantity(NamedTuple):
-    """Declaration of a drawn quantity, without its range."""
-
-    column: int  # of a world's random numbers; a new quantity takes the next free one
-    unit: str
-    low: float  # bounds of its range
-    high: float
-    label: str  # in reports; empty: not reported
-    owner: Owner = "object"
-    sets: str = ""  # field of the robot; fields of skin and odometry have the quantity's name
-    jumps: bool = False  # whether a world changes in steps with it, so that it has no derivative
-
-
-def drawn(default: Range | None, *declaration: Any) -> Any:
-    """Declare a drawn quantity by its default range, and the values of a `Quantity`."""
-    return field(default=default, metadata={_KEY: Quantity(*declaration)})
-
+from rps_jax.world.tasks import Task, TaskLike, parse_task
+from rps_jax.world.tasks.reach import Reach
 
 _POSITIVE = 1e-3
 
@@ -142,6 +105,8 @@ class Domain:
     robot_slip_yaw: Range | None = drawn(
         None, 48, "1", 0, 0.9, "slip of the wheels when turning", "robot", "slip_yaw"
     )
+    # What is asked of the law; the ranges of a path are the task's own.
+    task: Task = Reach()
 
     def __post_init__(self) -> None:
         check_fields(self, "domain ")
@@ -155,27 +120,39 @@ class Domain:
             objects = f"{self.feet} with objects = {self.objects}"
             raise errors.not_allowed("domain feet", objects, "only random objects have drawn feet")
         self.robot.check()
+        if self.targets and not self.task.HAS_TARGET:
+            rule = f"the task {self.task.kind} has its own end; leave them out"
+            raise errors.not_allowed("domain targets", self.targets, rule)
         for target in self.targets:
             scene.check_target(target, self.robot.shell)
-        for name, quantity in QUANTITIES.items():
-            if (interval := getattr(self, name)) is None:
-                continue
-            field = f"domain {name}"
-            low, high, log = interval
-            bounds = {"at_least": quantity.low, "at_most": quantity.high, "unit": quantity.unit}
-            for side, value in (("low", low), ("high", high)):
-                errors.check_finite(f"{field} ({side})", value, **bounds)
-            if low > high or (log and low <= 0):
-                rule = "low must not exceed high" + (", and be above 0" if log else "")
-                raise errors.not_allowed(field, f"{low:g} to {high:g}", rule)
+        check_ranges(self, "domain ")
         offset, load = self.com_offset.high, self.load_size.high
         if offset + load > 1:
             rule = f"with com_offset up to {offset:g} its high is at most {1 - offset:g}"
             raise errors.not_allowed("domain load_size (high)", load, rule)
         reach = math.hypot(*self.robot.shell.half)
-        if not self.targets and self.distance.low <= reach:
+        if self.task.HAS_TARGET and not self.targets and self.distance.low <= reach:
             rule = f"targets must lie outside the robot, which reaches {reach:.2f} m"
             raise errors.not_allowed("domain distance (low)", f"{self.distance.low:g} m", rule)
+
+        self.task.check_size(float(self.robot.shell.half[1]), self._widest)
+
+    def _widest(self) -> float:
+        """Return the greatest width of an object [m], along its axes."""
+        widths = [0.0]
+        for name in self.objects:
+            if name in RANDOM:
+                ratio = max(self.aspect.high, 1 / self.aspect.low)
+                widths.append(2 * self.size.high * math.sqrt(1 if "cylinder" in name else ratio))
+            else:
+                shape = scene.solid_of(scene.load(name))
+                across = np.abs(shape.vertices).max() + float(shape.radius.max())
+                widths.append(2 * float(across))
+        return max(widths)
+
+    def range_of(self, name: str) -> Range | None:
+        """Return the range of a quantity, of the domain itself or of its task; None: not drawn."""
+        return getattr(self if name in _OWN else self.task, name, None)
 
     @property
     def weakest(self) -> Robot:
@@ -209,11 +186,12 @@ class Domain:
             unused |= set(quantities_of("object")) - {"friction_ground", "friction_robot"}
         if self.frictions:
             unused |= {"friction_ground", "friction_robot"}
-        if self.targets:
+        if self.targets or not self.task.HAS_TARGET:
             unused |= {"distance", "bearing"}
         if self.skin == "ideal":
             unused |= set(quantities_of("skin"))
-        return frozenset(name for name in unused if getattr(self, name) is not None)
+        unused |= self.task.idle
+        return frozenset(name for name in unused if self.range_of(name) is not None)
 
     @property
     def families(self) -> tuple[str, ...]:
@@ -227,9 +205,8 @@ class Domain:
 
 
 RANDOM = {"random_box": "box", "random_cylinder": "cylinder", "random_prism": "prism"}
-QUANTITIES: dict[str, Quantity] = {
-    item.name: item.metadata[_KEY] for item in fields(Domain) if _KEY in item.metadata
-}
+_OWN = declared(Domain)
+QUANTITIES: dict[str, Quantity] = _OWN | tasks.QUANTITIES
 
 
 def quantities_of(*owners: Owner) -> tuple[str, ...]:
@@ -313,12 +290,18 @@ DOMAINS = {
 DomainLike = Domain | str  # or its text: see `parse_domain`
 
 
-def parse_domain(domain: DomainLike, robot: RobotLike | None = None) -> Domain:
+def parse_domain(
+    domain: DomainLike, robot: RobotLike | None = None, task: TaskLike | None = None
+) -> Domain:
     """Return a domain from its name, as wide, or from a JSON file of ranges.
 
     Changes may follow a name or a file, as `wide,mass=3:10,objects=random_box`. A `robot` replaces
-    the domain's, except for its drawn limits.
+    the domain's, except for its drawn limits. A `task` that has no single target replaces the
+    domain's targets.
     """
+    if task is not None:
+        base, parsed = parse_domain(domain, robot), parse_task(task)
+        return replace(base, task=parsed, targets=base.targets if parsed.HAS_TARGET else ())
     if robot is not None:
         return replace(parse_domain(domain), robot=parse_robot(robot))
     if isinstance(domain, Domain):
@@ -335,16 +318,6 @@ def parse_domain(domain: DomainLike, robot: RobotLike | None = None) -> Domain:
             rule = f"its objects, frictions, targets or skin leave no {name} to draw"
             raise errors.not_allowed("domain", domain, rule)
     return replace(base, **_from_json(changes, base))
-
-
-def _range(default: Range | None, values: Any) -> Range:
-    low, high, *flags = values if isinstance(values, list | tuple) else (values, values)
-    if len(flags) > 1 or not all(isinstance(flag, bool) for flag in flags):
-        raise ValueError("more than low, high, and whether uniform in the logarithm")
-    if isinstance(low, str | bool) or isinstance(high, str | bool):
-        raise TypeError("no numbers")
-    log = bool(flags[0]) if flags else default is not None and default.log
-    return Range(float(low), float(high), log)
 
 
 def _names(values: object) -> tuple[str, ...]:
@@ -366,6 +339,7 @@ _FORMS: dict[str, tuple[Callable[[Any], Any], str]] = {
         "pairs of x and y [m], as [[2, 0]]",
     ),
     "skin": (str, "its name"),
+    "task": (parse_task, 'its name, as "path"'),
     "robot": (parse_robot, 'a robot\'s name or numbers, as {"force_max": 300}'),
 }
 
@@ -383,10 +357,10 @@ def _from_json(values: Mapping[str, Any], base: Domain) -> dict[str, Any]:
         errors.check_name("domain quantity", name, known)
         if value is None and name in QUANTITIES and known[name].default is None:
             continue
-        ranged = partial(_range, getattr(base, name))
-        read, form = _FORMS.get(name, (ranged, "low and high, as [0.1, 0.5]"))
+        default = getattr(base, name)
+        read, form = _FORMS.get(name, (None, "low and high, as [0.1, 0.5]"))
         try:
-            parsed[name] = read(value)
+            parsed[name] = range_of(default, value) if read is None else read(value)
         except (TypeError, ValueError, OverflowError) as error:
             raise errors.not_allowed(f"domain {name}", value, f"write {form}") from error
     return parsed

@@ -15,9 +15,10 @@ from numpy.typing import ArrayLike
 from rps_jax.geometry import solid
 from rps_jax.geometry.solid import SIDES, Solid
 from rps_jax.robot.robot import Robot
-from rps_jax.world import scene
+from rps_jax.world import scene, tasks
 from rps_jax.world.domain import QUANTITIES, RANDOM, VELOCITY_ERRORS, Domain, quantities_of, unit_of
 from rps_jax.world.scene import Friction
+from rps_jax.world.tasks.base import Course, CourseInputs
 
 COLUMNS = 64  # random numbers of a world; unused ones are for new quantities
 
@@ -30,7 +31,8 @@ class Draw(NamedTuple):
     solid: Solid
     friction: Friction  # (n,) each
     values: dict[str, np.ndarray]  # (n,) of each quantity of the domain, in its unit
-    p_world_target: np.ndarray  # (n, 2) [m]
+    p_world_target: np.ndarray  # (n, 2) [m] end of the trial
+    course: Course  # (n, ...) of the task
     velocity_error: np.ndarray  # (n, 3) [1]
     robot: Robot  # (n,) each
     key: np.ndarray  # (n, 2) uint32, of the noise of sensors and odometry
@@ -43,6 +45,7 @@ _UNRANGED = {
     **{"key_0": 23, "key_1": 24, "sides": 25, "turn": 26},
     **{f"corner_{i}": 27 + i for i in range(SIDES)},
     **{"feet_number": 44, "feet_turn": 45},
+    **tasks.MORE_NUMBERS,
 }
 _RANGED = {name: item.column for name, item in QUANTITIES.items() if name != "velocity_error"}
 # Columns of the random numbers of a world by name, in their order.
@@ -75,7 +78,7 @@ def draw_at(
         raise ValueError("worlds of several objects cannot be batched")
     u = {name: uniform[:, column] for name, column in USES.items()}
     name = domain.objects[int(objects[0])]
-    ranges = {name: getattr(domain, name) for name in QUANTITIES if name in u}
+    ranges = {name: domain.range_of(name) for name in QUANTITIES if name in u}
     at = {name: item.at(u[name]) for name, item in ranges.items() if item is not None}
     at["com_bearing"] = 2 * np.pi * u["com_bearing"]
     at |= {name: domain.velocity_error.at(u[name]) for name in VELOCITY_ERRORS}
@@ -87,6 +90,10 @@ def draw_at(
         listed = np.array(domain.frictions)[domain.choices(index)[1]].T
         at |= dict(zip(("friction_ground", "friction_robot"), listed, strict=True))
     at |= {name: at[name] + move for name, move in (moves or {}).items()}
+    robot = _robots(domain.robot, at, index.size)
+    front = np.broadcast_to(np.asarray(robot.half_length, float), index.shape)
+    inputs = CourseInputs(u, _targets(domain, index, at), front)
+    ends, course = domain.task.courses(inputs)
     key = [np.floor(u[name] * 2**32).astype(np.uint32) for name in ("key_0", "key_1")]
     return Draw(
         indices=index,
@@ -94,9 +101,10 @@ def draw_at(
         solid=_solid(name, at, u),
         friction=Friction(at["friction_ground"], at["friction_robot"]),
         values={name: values for name, values in at.items() if name in ranges},
-        p_world_target=_targets(domain, index, at),
+        p_world_target=ends,
+        course=course,
         velocity_error=np.stack([at[name] for name in VELOCITY_ERRORS], axis=-1),
-        robot=_robots(domain.robot, at, index.size),
+        robot=robot,
         key=np.stack(key, axis=-1),
     )
 

@@ -34,6 +34,7 @@ from rps_jax.world.domain import (
     unit_of,
 )
 from rps_jax.world.draws import Draw
+from rps_jax.world.tasks import MORE_NUMBERS
 
 CoordinateKind = Literal["range", "choice", "shape", "noise"]
 FILE = "points.nc"  # in a run folder whose worlds are points
@@ -69,7 +70,10 @@ def coordinates(domain: Domain) -> tuple[Coordinate, ...]:
     for name in draws.USES:
         if name in idle:
             continue
-        if name in (*_OF_PRISMS, *_OF_FEET):
+        if name in MORE_NUMBERS:
+            if name in domain.task.MORE_NUMBERS and not domain.task.idle:
+                labels.append(Coordinate(name, "shape", Range(0, 1), "1"))
+        elif name in (*_OF_PRISMS, *_OF_FEET):
             if domain.feet is not None if name in _OF_FEET else "random_prism" in random:
                 labels.append(Coordinate(name, "shape", Range(0, 1), "1"))
         elif name == "com_bearing":
@@ -77,7 +81,7 @@ def coordinates(domain: Domain) -> tuple[Coordinate, ...]:
         elif name.startswith("key_"):
             labels.append(Coordinate(name, "noise", Range(0, 1), "1"))
         else:
-            interval = getattr(domain, "velocity_error" if name in VELOCITY_ERRORS else name)
+            interval = domain.range_of("velocity_error" if name in VELOCITY_ERRORS else name)
             if interval is not None and interval.low < interval.high:
                 labels.append(Coordinate(name, "range", interval, unit_of(name)))
     return tuple(labels)

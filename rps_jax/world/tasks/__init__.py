@@ -1,0 +1,75 @@
+"""Tasks: what a law gets as its target, and when a trial succeeds or fails; one file each."""
+
+from __future__ import annotations
+
+import importlib
+import pkgutil
+from collections.abc import Mapping
+from dataclasses import fields
+from pathlib import Path
+from typing import Any
+
+from rps_jax import errors
+from rps_jax.record import files
+from rps_jax.record.options import parse_changes
+from rps_jax.world.quantity import Quantity, declared, range_of
+from rps_jax.world.tasks.base import Task
+
+TASKS: dict[str, type[Task]] = {}  # by name
+for _file in sorted(x.name for x in pkgutil.iter_modules(__path__) if x.name != "base"):
+    _kind: type[Task] = importlib.import_module(f"{__name__}.{_file}").TASK
+    TASKS[_kind.kind] = _kind
+
+QUANTITIES: dict[str, Quantity] = {
+    name: quantity for kind in TASKS.values() for name, quantity in declared(kind).items()
+}
+# Columns of random numbers without a range of their own.
+MORE_NUMBERS = {name: i for kind in TASKS.values() for name, i in kind.MORE_NUMBERS.items()}
+OUTCOMES = {name: text for kind in TASKS.values() for name, text in kind.OUTCOMES.items()}
+
+TaskLike = Task | str | Mapping[str, Any]  # or its text: see `parse_task`
+
+
+def parse_task(task: TaskLike) -> Task:
+    """Return a task from its name, as path, or from a mapping with its kind.
+
+    Changes may follow a name, as `corridor,width=1.2:1.6`, or a JSON file of them, as
+    `path,route.json` with `{"waypoints": [[0.4, 0], [2, 0], [3, 1]]}`.
+
+    Raises:
+      InputError: the name or a value is not allowed.
+    """
+    if isinstance(task, Task):
+        return task
+    if isinstance(task, str):
+        name, changes = parse_changes("task", task)
+        if files.suffix_of(name) == ".json":
+            task = files.read_json(Path(name)) | changes
+        else:
+            task = {"kind": name} | changes
+    if not isinstance(task, Mapping) or "kind" not in task:
+        rule = f"give the name of a task: {', '.join(TASKS)}"
+        raise errors.not_allowed("task", repr(task), rule)
+    kind = TASKS[errors.check_name("task", str(task["kind"]), TASKS, "FILE.json")]
+    known = {x.name: x for x in fields(kind)}
+    values: dict[str, Any] = {}
+    for name, value in task.items():
+        if name == "kind":
+            continue
+        errors.check_name(f"task quantity of {kind.kind}", name, known)
+        default = known[name].default
+        try:
+            if name in declared(kind):
+                value = range_of(default, value)
+            elif isinstance(default, bool):
+                value = value in (True, "true", "True", 1)
+            elif isinstance(default, int) and float(value).is_integer():
+                value = int(value)
+            elif isinstance(default, tuple):
+                value = tuple((float(x), float(y)) for x, y in value)
+        except (TypeError, ValueError, OverflowError) as error:
+            is_range = name in declared(kind)
+            form = "a number, or low and high as [0.3, 0.6]" if is_range else "pairs of x, y [m]"
+            raise errors.not_allowed(f"task {name}", value, f"write {form}") from error
+        values[name] = value
+    return kind(**values)

@@ -1,0 +1,103 @@
+"""Types of a task: its declaration, the numbers of one world, and what it judges.
+
+A task is one file of this folder. It has a frozen dataclass that extends `Task`, with the ranges of
+what is drawn, and a pytree that is a `Course`, with the numbers of one world.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any, ClassVar, NamedTuple, Protocol
+
+import jax
+import numpy as np
+
+from rps_jax.geometry.arrays import Array, Bool, Float, Scalar
+from rps_jax.geometry.footprint import Footprint
+from rps_jax.record.options import check_fields
+from rps_jax.world.quantity import check_ranges
+
+
+class Place(NamedTuple):
+    """Position of base, object and contact in the world, in one control step."""
+
+    p_world_goal: Float[Array, "2"]  # [m] where the trial ends
+    p_world_contact: Float[Array, "2"]  # [m]; ignored unless it touches
+    touches: Bool[Array, ""]
+    base: Float[Array, "3"]  # [m, m, rad] pose of the base
+    half: tuple[Any, Any]  # [m] half length and half width of the base
+    p_world_object: Float[Array, "2"]  # [m]
+    object_yaw: Scalar  # [rad]
+    footprint: Footprint  # of the object, in its own frame
+
+
+class Aim(NamedTuple):
+    """What a task asks of a law in one control step, and what it judges."""
+
+    p_world_target: Float[Array, "2"]  # [m] of the law
+    at_end: Bool[Array, ""] | bool = True  # whether the trial may succeed now
+    failed: Bool[Array, ""] | bool = False
+
+
+class Course(Protocol):
+    """Numbers of a task in one world: a pytree."""
+
+    def start(self) -> Any:
+        """Return the progress before the first control step: a pytree with `outcomes`."""
+        ...
+
+    def step(self, progress: Any, place: Place) -> tuple[Any, Aim]:
+        """Return the progress after one control step, and the aim."""
+        ...
+
+
+class Progress(Protocol):
+    """Running state of a task: a pytree."""
+
+    def outcomes(self) -> dict[str, jax.Array]:
+        """Return the outcomes by name, batched or not: those of `Task.OUTCOMES`."""
+        ...
+
+
+class CourseInputs(NamedTuple):
+    """Numbers of n worlds on which a task's course depends."""
+
+    u: Mapping[str, np.ndarray]  # (n,) random numbers in [0, 1) of the task's quantities
+    p_world_target: np.ndarray  # (n, 2) [m] drawn target of `reach`
+    front: np.ndarray  # (n,) [m] x of the base's front
+
+
+@dataclass(frozen=True)
+class Task:
+    """Declaration of a task: its ranges are fields, its bounds are in their declarations."""
+
+    kind: str = ""  # name of the task
+    # Units and meanings of the outcomes that it adds.
+    OUTCOMES: ClassVar[Mapping[str, tuple[str, str]]] = {}
+    HAS_TARGET: ClassVar[bool] = False  # whether trials end at the domain's targets
+    MORE_NUMBERS: ClassVar[Mapping[str, int]] = {}  # columns of random numbers without a range
+
+    @property
+    def idle(self) -> frozenset[str]:
+        """Names of its ranges that are not drawn."""
+        return frozenset()
+
+    def __post_init__(self) -> None:
+        check_fields(self, "task ")
+        check_ranges(self, "task ")
+        self.check()
+
+    def check(self) -> None:
+        """Raise InputError for values that are not allowed."""
+
+    def check_size(self, half_width: float, object_width: Callable[[], float]) -> None:
+        """Raise InputError unless a base and the widest object [m] have room."""
+
+    def courses(self, inputs: CourseInputs) -> tuple[np.ndarray, Course]:
+        """Return the ends (n, 2) [m] of trials, and the numbers of n worlds."""
+        raise NotImplementedError
+
+    def lines(self, course: Any) -> dict[str, np.ndarray]:
+        """Return what pictures show of one world: polylines (..., 2) [m] by name."""
+        return {}

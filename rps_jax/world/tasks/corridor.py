@@ -1,0 +1,156 @@
+"""Corridors: a path between two walls that neither base nor object may touch.
+
+Walls are at half the width on either side of the path, with mitred corners. They begin behind the
+base and continue beyond the end of the path. Doors are narrower places. A trial fails at the first
+touch, by the exact outlines of base and object.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import ClassVar, Literal, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+
+from rps_jax import errors
+from rps_jax.geometry import footprint as fp
+from rps_jax.geometry import polyline
+from rps_jax.geometry.arrays import Array, Bool, Float
+from rps_jax.record.options import option
+from rps_jax.world.quantity import Range, drawn
+from rps_jax.world.tasks.base import Aim, CourseInputs, Place
+from rps_jax.world.tasks.path import Path, PathCourse, PathProgress
+
+_BEHIND = 1.5  # [m] of the walls before the base's front
+_BEYOND = 1.5  # [m] of the walls after the end of the path
+NOTHING, BASE, OBJECT = 0, 1, 2  # what touched a wall
+
+
+class CorridorProgress(NamedTuple):
+    """Progress along the path, and the first touch of a wall."""
+
+    path: PathProgress
+    clearance: Float[Array, "*B"]  # [m] least of base and object so far
+    wall_touch: Float[Array, "*B"]  # 0 nothing, 1 the base, 2 the object
+    p_world_touch: Float[Array, "*B 2"]  # [m] NaN before a touch
+
+    def outcomes(self) -> dict[str, Array]:
+        """Return the outcomes of the path, and of the walls."""
+        return self.path.outcomes() | {
+            "clearance": self.clearance,
+            "wall_touch": self.wall_touch,
+            "touch_x": self.p_world_touch[..., 0],
+            "touch_y": self.p_world_touch[..., 1],
+        }
+
+
+class CorridorCourse(NamedTuple):
+    """Path and walls of a world."""
+
+    path: PathCourse
+    walls: Float[Array, "*B W 2 2"]  # [m] both ends of each
+
+    def start(self) -> CorridorProgress:
+        """Return the progress at the start."""
+        inner = self.path.start()
+        nan = jnp.full((2,), jnp.nan, inner.arc.dtype)
+        return CorridorProgress(inner, jnp.inf + inner.arc, inner.arc, nan)
+
+    def step(self, progress: CorridorProgress, place: Place) -> tuple[CorridorProgress, Aim]:
+        """Advance along the path, and fail at a touch."""
+        inner, aim = self.path.step(progress.path, place)
+        base = fp.place(fp.rectangle(*place.half), place.base[:2], place.base[2])
+        item = fp.place(place.footprint, place.p_world_object, place.object_yaw)
+        of_base, at_base = polyline.clearance(base, self.walls)
+        of_object, at_object = polyline.clearance(item, self.walls)
+        by_base = of_base <= of_object
+        least = jnp.where(by_base, of_base, of_object)
+        touched: Bool[Array, ""] = least <= 0
+        who = jnp.where(touched, jnp.where(by_base, BASE, OBJECT), NOTHING)
+        point = jnp.where(by_base, at_base, at_object)
+        moved = CorridorProgress(
+            inner,
+            jnp.minimum(progress.clearance, least),
+            who.astype(least.dtype),
+            jnp.where(touched, point, jnp.nan),
+        )
+        return moved, aim._replace(failed=touched)
+
+
+@dataclass(frozen=True)
+class Corridor(Path):
+    """Follow a path between walls."""
+
+    kind: Literal["corridor"] = "corridor"
+    OUTCOMES: ClassVar[Mapping[str, tuple[str, str]]] = Path.OUTCOMES | {
+        "clearance": ("m", "least distance of base and object from the walls"),
+        "wall_touch": ("1", "what touched a wall and ended the trial: 1 the base, 2 the object"),
+        "touch_x": ("m", "x of the touch in the world"),
+        "touch_y": ("m", "y of the touch in the world"),
+    }
+
+    width: Range = drawn(Range(1.4, 2.4), 59, "m", 0.3, 20, "width of the corridor", "course")
+    doors: int = option(0, 0, 4)  # narrower places along the path
+    door_width: Range = drawn(Range(0.8, 0.8), 60, "1", 0.1, 1, "doors, of the width", "course")
+
+    @property
+    def idle(self) -> frozenset[str]:
+        """Names of the ranges that are not drawn."""
+        return super().idle | (frozenset() if self.doors else {"door_width"})
+
+    def check_size(self, half_width: float, object_width: Callable[[], float]) -> None:
+        """Raise InputError for a corridor narrower than base or objects."""
+        narrowest = self.width.low * (self.door_width.low if self.doors else 1)
+        for name, size in (("base", 2 * half_width), ("widest object", object_width())):
+            if narrowest <= size:
+                rule = f"the {name} is {size:.2f} m wide, and the narrowest place must be wider"
+                raise errors.not_allowed("task width (low)", f"{self.width.low:g} m", rule)
+
+    def courses(self, inputs: CourseInputs) -> tuple[np.ndarray, CorridorCourse]:
+        """Return the ends, paths and walls of worlds."""
+        ends, inner = super().courses(inputs)
+        half = self.width.at(inputs.u["width"]) / 2
+        walls = _walls(inner.line.vertices, half)
+        opening = half * self.door_width.at(inputs.u["door_width"])
+        doors = [
+            _door(inner.line.vertices, (i + 1) / (self.doors + 1), opening, 1.5 * half)
+            for i in range(self.doors)
+        ]
+        return ends, CorridorCourse(inner, np.concatenate([walls, *doors], axis=1))
+
+    def lines(self, course: CorridorCourse) -> dict[str, np.ndarray]:
+        """Return path and walls."""
+        return super().lines(course.path) | {"walls": np.asarray(course.walls)}
+
+
+def _walls(vertices: np.ndarray, half: np.ndarray) -> np.ndarray:
+    """Return the walls (n, W, 2, 2) [m] beside paths (n, N, 2) at a half width (n,) [m]."""
+    steps = np.diff(vertices, axis=1)
+    units = steps / np.linalg.norm(steps, axis=-1, keepdims=True)
+    points = vertices.copy()
+    points[:, 0] -= _BEHIND * units[:, 0]
+    points[:, -1] += _BEYOND * units[:, -1]
+    normals = np.stack([-units[..., 1], units[..., 0]], axis=-1)
+    before = np.concatenate([normals[:, :1], normals], axis=1)
+    after = np.concatenate([normals, normals[:, -1:]], axis=1)
+    mitre = (before + after) / (1 + np.sum(before * after, axis=-1, keepdims=True))
+    sides = [points + sign * half[:, None, None] * mitre for sign in (1, -1)]
+    return np.concatenate([np.stack([s[:, :-1], s[:, 1:]], axis=2) for s in sides], axis=1)
+
+
+def _door(vertices: np.ndarray, share: float, inner: np.ndarray, outer: np.ndarray) -> np.ndarray:
+    """Return two walls (n, 2, 2, 2) [m] across paths, in the middle of a segment of theirs.
+
+    They leave an opening of half width `inner` (n,) [m], and end at `outer` (n,) [m].
+    """
+    first = int(share * (vertices.shape[1] - 1))
+    a, b = vertices[:, first], vertices[:, first + 1]
+    unit = (b - a) / np.linalg.norm(b - a, axis=-1, keepdims=True)
+    normal = np.stack([-unit[:, 1], unit[:, 0]], axis=-1)
+    ends = [(a + b) / 2 + s * x[:, None] * normal for s in (1, -1) for x in (inner, outer)]
+    return np.stack([np.stack(ends[:2], axis=1), np.stack(ends[2:], axis=1)], axis=1)
+
+
+TASK = Corridor

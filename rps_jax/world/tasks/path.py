@@ -1,0 +1,191 @@
+"""Paths: the contact point follows a polyline or a spline to its end.
+
+The law's target is the point of the path a lookahead ahead of the nearest point (pure pursuit), and
+laws do not change. A trial succeeds at the path's end.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import ClassVar, Literal, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from scipy.interpolate import CubicSpline
+
+from rps_jax import errors
+from rps_jax.geometry import polyline
+from rps_jax.geometry.arrays import Array, Float, Int
+from rps_jax.geometry.polyline import Polyline
+from rps_jax.world.quantity import Range, drawn
+from rps_jax.world.tasks.base import Aim, CourseInputs, Place, Task
+
+_SEGMENTS = 8  # of a drawn path
+_PER_SPAN = 6  # segments of a spline between two waypoints
+_REACH = 1.0  # [m] along the path, either way, in which the nearest point is sought
+_END = 0.5  # [m] before the end, from which on a trial may succeed
+_LEAD = 1.5  # [m] of a drawn path before its first turn, at least
+_NEAR = 0.5  # [m] between the base's front and the first waypoint, at most
+# [m] upper ends of the classes of a histogram of errors; the last is open.
+_EDGES = np.append(0.0025 * 1.5 ** np.arange(15), np.inf)
+
+
+class PathProgress(NamedTuple):
+    """How far a trial has come along its path, and how far off it was."""
+
+    arc: Float[Array, "*B"]  # [m] of the nearest point so far
+    share: Float[Array, "*B"]  # [1] of the path's length
+    sum_error: Float[Array, "*B"]  # [m] over steps in contact
+    max_error: Float[Array, "*B"]  # [m]
+    counts: Int[Array, "*B 16"]  # steps in contact by the class of their error
+
+    def outcomes(self) -> dict[str, Array]:
+        """Return progress and cross-track errors; of a trial without contact they are NaN."""
+        below = jnp.cumsum(self.counts, axis=-1)
+        steps = below[..., -1]
+        wanted = 0.95 * steps[..., None]
+        # Linear within a class; the last class ends at the largest error.
+        edges = jnp.asarray(np.append(0.0, _EDGES[:-1]), self.arc.dtype)
+        tops = jnp.minimum(jnp.append(edges[1:], jnp.inf), self.max_error[..., None])
+        is_there = (below >= wanted) & (below - self.counts < wanted)
+        inner = (wanted - (below - self.counts)) / jnp.maximum(self.counts, 1)
+        quantile = jnp.sum(jnp.where(is_there, edges + inner * (tops - edges), 0.0), axis=-1)
+        nan = jnp.where(steps > 0, 0.0, jnp.nan)
+        return {
+            "progress": self.share,
+            "error_mean": self.sum_error / jnp.maximum(steps, 1) + nan,
+            "error_95": quantile + nan,
+            "error_max": self.max_error + nan,
+        }
+
+
+class PathCourse(NamedTuple):
+    """Path of a world."""
+
+    line: Polyline
+    lookahead: Float[Array, "*B"]  # [m]
+
+    def start(self) -> PathProgress:
+        """Return the progress at the start of the path."""
+        zero = jnp.zeros_like(self.lookahead)
+        return PathProgress(zero, zero, zero, zero, jnp.zeros(len(_EDGES), jnp.int32))
+
+    def step(self, progress: PathProgress, place: Place) -> tuple[PathProgress, Aim]:
+        """Advance to the point nearest to the contact; its distance is the cross-track error."""
+        length = self.line.arcs[-1]
+        arc, error = polyline.nearest(
+            self.line, place.p_world_contact, progress.arc - _REACH, progress.arc + _REACH
+        )
+        arc = jnp.where(place.touches, arc, progress.arc)
+        error = jnp.where(place.touches, error, 0.0)
+        edges = jnp.asarray(_EDGES, error.dtype)
+        lower = jnp.asarray(np.append(-1.0, _EDGES[:-1]), error.dtype)
+        counted = place.touches & (error > lower) & (error <= edges)
+        moved = PathProgress(
+            arc,
+            jnp.maximum(progress.share, arc / length),
+            progress.sum_error + error,
+            jnp.maximum(progress.max_error, error),
+            progress.counts + counted,
+        )
+        target = polyline.at_arc(self.line, arc + self.lookahead)
+        return moved, Aim(target, at_end=arc > length - _END)
+
+
+@dataclass(frozen=True)
+class Path(Task):
+    """Follow a path, given by its waypoints or drawn."""
+
+    kind: Literal["path"] = "path"
+    OUTCOMES: ClassVar[Mapping[str, tuple[str, str]]] = {
+        "progress": ("1", "share of the path that the contact point has passed"),
+        "error_mean": ("m", "mean cross-track error of the contact point"),
+        "error_95": ("m", "95 % quantile over time of the cross-track error"),
+        "error_max": ("m", "largest cross-track error"),
+    }
+    MORE_NUMBERS: ClassVar[Mapping[str, int]] = {f"turn_{i}": 52 + i for i in range(1, 7)}
+
+    # Along the path, from its nearest point to the law's target.
+    lookahead: Range = drawn(Range(0.5, 0.5), 49, "m", 0.05, 5, "lookahead on the path", "course")
+    length: Range = drawn(Range(3, 6), 50, "m", 0.5, 40, "length of the path", "course")
+    turns: Range = drawn(
+        Range(1, 4), 51, "1", 0, _SEGMENTS - 1, "number of turns", "course", "", True
+    )
+    turn: Range = drawn(Range(0.3, 0.8), 52, "rad", 0, 1.6, "angle of the turns", "course")
+    # [m] in the world, where the base starts at the origin; then nothing but the lookahead is drawn
+    waypoints: tuple[tuple[float, float], ...] = ()
+    spline: bool = False  # whether a cubic spline joins the waypoints, instead of straight lines
+
+    @property
+    def idle(self) -> frozenset[str]:
+        """Names of the ranges that are not drawn, since waypoints are given."""
+        return frozenset(("length", "turns", "turn") if self.waypoints else ())
+
+    def check(self) -> None:
+        """Raise InputError for waypoints that are no path."""
+        if self.spline and not self.waypoints:
+            raise errors.not_allowed("task spline", True, "give waypoints, which it joins")
+        if not self.waypoints:
+            return
+        points = errors.check_array("task waypoints", self.waypoints, ("N", 2))
+        rule = ""
+        if len(points) < 2:
+            rule = "a path has two points or more, each as x, y [m]"
+        elif np.abs(points).max() > 50:
+            rule = "each coordinate must be from -50 to 50 m"
+        elif len(points) > 100:
+            rule = "a path has at most 100 waypoints"
+        elif (np.linalg.norm(np.diff(points, axis=0), axis=1) < 0.01).any():
+            rule = "consecutive waypoints must be at least 1 cm apart"
+        if rule:
+            raise errors.not_allowed("task waypoints", points.tolist(), rule)
+
+    def courses(self, inputs: CourseInputs) -> tuple[np.ndarray, PathCourse]:
+        """Return the ends and the paths of worlds."""
+        line = Polyline.through(self.vertices(inputs))
+        lookahead = self.lookahead.at(inputs.u["lookahead"])
+        return line.vertices[:, -1], PathCourse(line, lookahead)
+
+    def vertices(self, inputs: CourseInputs) -> np.ndarray:
+        """Return the vertices (n, N, 2) [m] of paths, which start at the base's front."""
+        front, u = inputs.front, inputs.u
+        if self.waypoints:
+            points = np.array(self.waypoints, float)
+            off = float(np.max(np.hypot(points[0, 0] - front, points[0, 1])))
+            if off > _NEAR:
+                rule = f"it must start within {_NEAR} m of the base's front, ({front[0]:.2f}, 0)"
+                raise errors.not_allowed("task waypoints", points[0].tolist(), rule)
+            if self.spline and len(points) > 2:
+                at = Polyline.through(points).arcs
+                along = np.interp(
+                    np.arange((len(points) - 1) * _PER_SPAN + 1) / _PER_SPAN,
+                    np.arange(len(points)), at,
+                )  # fmt: skip
+                points = CubicSpline(at, points)(along)
+            return np.broadcast_to(points, (front.size, *points.shape))
+        low, high, _ = self.turns
+        count = np.minimum(np.floor(low + (high + 1 - low) * u["turns"]), high)[:, None]
+        # A half of each random number is the sign of a turn. Beyond 90 degrees it turns back.
+        heading, headings = np.zeros(front.size), [np.zeros(front.size)]
+        for name in ("turn", *self.MORE_NUMBERS):
+            angle = self.turn.at((2 * u[name]) % 1) * np.where(u[name] < 0.5, -1, 1)
+            angle = np.where(np.abs(heading + angle) > np.pi / 2 + 1e-9, -angle, angle)
+            heading = heading + angle
+            headings.append(heading)
+        # Segments after the last turn divide the last part of the path.
+        k = np.arange(_SEGMENTS)[None]
+        part = self.length.at(u["length"])[:, None] / (count + 1)
+        lengths = np.where(k < count, part, part / (_SEGMENTS - count))
+        lengths[:, :1] = np.where(count > 0, np.maximum(lengths[:, :1], _LEAD), lengths[:, :1])
+        at = np.take_along_axis(np.stack(headings, 1), np.minimum(k, count).astype(int), 1)
+        steps = lengths[..., None] * np.stack([np.cos(at), np.sin(at)], axis=-1)
+        start = np.stack([front, 0 * front], axis=-1)[:, None]
+        return np.concatenate([start, start + np.cumsum(steps, axis=1)], axis=1)
+
+    def lines(self, course: PathCourse) -> dict[str, np.ndarray]:
+        """Return the path."""
+        return {"path": np.asarray(course.line.vertices)}
+
+
+TASK = Path
