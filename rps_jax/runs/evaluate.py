@@ -31,6 +31,7 @@ from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import Outcome
 from rps_jax.world import points as points_
 from rps_jax.world.domain import DomainLike, parse_domain
+from rps_jax.world.tasks import TaskLike
 
 
 @device.standard_jax()
@@ -43,6 +44,7 @@ def evaluate(
     split: Split = "tune",
     objective: Objective = Objective(),
     robot: RobotLike | None = None,
+    task: TaskLike | None = None,
     setting: Setting = Setting(),
     slots: int | None = None,
     workers: int | None = None,
@@ -64,6 +66,7 @@ def evaluate(
       split: use of the worlds; two splits have different worlds, whatever the seeds.
       objective: score of a trial.
       robot: its name, as kairos, or a JSON file; None: the domain's.
+      task: its name, as path, with changes; None: the domain's.
       setting: engine, physics, fidelity, rules, and the seed of the worlds.
       slots: worlds that one worker steps at once; by default as suits engine and device.
       workers: host threads; by default as suits engine and device.
@@ -89,7 +92,7 @@ def evaluate(
     """
     options_.check_arguments(evaluate, locals())
     device.check_process()
-    ranges, params = parse_domain(domain, robot), candidates(law)
+    ranges, params = parse_domain(domain, robot, task), candidates(law)
     at = None if points is None else points_.check_points(ranges, points)
     count = worlds if at is None else len(at.u)
     errors.check_count("worlds", count, at_most=10_000_000)

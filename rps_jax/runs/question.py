@@ -57,6 +57,7 @@ from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import Rules
 from rps_jax.world import domain as domains
 from rps_jax.world.domain import Domain, DomainLike
+from rps_jax.world.tasks import TaskLike
 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
@@ -429,15 +430,20 @@ class DomainQuestion(SimulationQuestion[T]):
     """The robot: ideal, slipping, kairos (the paper's), ridgeback or mpo_500, or a JSON file of its
     size, boards and limits. By default the domain's, which is ideal but in the domain real."""
 
+    task: TaskLike | None = field(default=None, kw_only=True)
+    """The task: reach (one target, as in the paper), path (follow a path by a lookahead) or
+    corridor (a path between walls that end a trial when touched), or a JSON file, as of waypoints.
+    Changes follow, as corridor,width=1.2:1.6. By default the domain's, reach."""
+
     @functools.cached_property
     def ranges(self) -> Domain:
-        """The domain, with the robot."""
-        return domains.parse_domain(self.domain, self.robot)
+        """The domain, with robot and task."""
+        return domains.parse_domain(self.domain, self.robot, self.task)
 
     def fields_as_json(self) -> dict[str, Any]:
-        """Return the fields as JSON; the robot is part of the domain."""
+        """Return the fields as JSON; robot and task are part of the domain."""
         record = super().fields_as_json() | {"domain": dataclasses.asdict(self.ranges)}
-        del record["robot"]
+        del record["robot"], record["task"]
         return record
 
     def check_engine(self, laws: Sequence[LawParams] = ()) -> None:

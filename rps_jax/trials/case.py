@@ -15,7 +15,9 @@ from rps_jax.robot.skin import Skin, SkinLike
 from rps_jax.trials.trial import Shift
 from rps_jax.world import objects, scene
 from rps_jax.world.scene import FRICTION, Friction, Side
+from rps_jax.world.tasks import Task, TaskLike, parse_task
 
+_TARGET = (-2.0, 0.0)  # [m] default
 FrictionLike = str | Friction | tuple[float, float]  # a friction set, or coefficients ground, robot
 
 
@@ -54,11 +56,15 @@ class Case(TrialOptions):
     <custom><numeric name="footprint" data="X Y X Y X Y"/></custom>."""
     friction: FrictionLike = "S1"
     """Friction: a set of the paper's Table I (S1, S2), or coefficients GROUND,ROBOT."""
-    target: tuple[float, float] = (-2.0, 0.0)
+    target: tuple[float, float] = _TARGET
     """Target X Y [m] in the world, where the base starts at the origin."""
     law: LawLike = "rps"
     """The law: its name, as rps, rps_tuned or rps_plus, or a file's, as my_law.py:MyParams or
     policy.npz; changes follow, as rps,K_h=0.3 or rps,tuned.json."""
+    task: TaskLike = option("reach", kw_only=True)
+    """The task: reach (one target, as in the paper), path (follow a path by a lookahead) or
+    corridor (a path between walls that end a trial when touched), or a JSON file, as of waypoints.
+    Changes follow, as corridor,width=1.2. Ranges are drawn by the seed."""
     bearing: float = option(0.0, -10, 10, unit="rad", kw_only=True, hidden=True)
     """Rotation of the whole trial [rad]; only a friction pyramid makes a difference."""
     shift: Shift = option(Shift(), kw_only=True, hidden=True)
@@ -74,6 +80,10 @@ class Case(TrialOptions):
         errors.check_number("shift time", self.shift.time, at_least=0, unit="s")
         errors.check_vector("shift", self.shift.p_robot, at_least=-5, at_most=5, unit="m")
         scene.check_target(self.target, self.base.shell)
+        self.challenge.check_size(float(self.base.shell.half[1]), lambda: 0.0)
+        if not self.challenge.HAS_TARGET and (self.target, self.bearing) != (_TARGET, 0.0):
+            rule = f"the task {self.challenge.kind} has its own end; leave target and bearing out"
+            raise errors.not_allowed("target", self.target, rule)
 
     @cached_property
     def object_name(self) -> str:
@@ -89,6 +99,11 @@ class Case(TrialOptions):
     def contact(self) -> Friction:
         """Coefficients of the two contacts."""
         return friction_of(self.friction)
+
+    @cached_property
+    def challenge(self) -> Task:
+        """The task."""
+        return parse_task(self.task)
 
     @cached_property
     def base(self) -> Robot:

@@ -45,6 +45,7 @@ from rps_jax.world.domain import DOMAINS, Domain, DomainLike
 from rps_jax.world.draws import Draw
 from rps_jax.world.opengl import mujoco
 from rps_jax.world.scene import Scene
+from rps_jax.world.tasks import TaskLike
 
 
 class Reward(NamedTuple):
@@ -118,6 +119,7 @@ class PushEnv:
     params: RPSParams = RPSParams.paper()  # only the bounds of the twist and d_success are used
     setting: Setting = Setting(engine="fused")
     robot: RobotLike | None = None  # name, as kairos; None: the domain's
+    task: TaskLike | None = None  # name, as path; None: the domain's
     weights: Reward = Reward()
     worlds: int = option(1024, 1, 1_000_000)
     smooth: bool = False  # whether contact is a weight, for derivatives
@@ -299,7 +301,7 @@ class PushEnv:
     @functools.cached_property
     def _alone(self) -> Domain:
         return dataclasses.replace(
-            domain.parse_domain(self.domain, self.robot), objects=(self.object,)
+            domain.parse_domain(self.domain, self.robot, self.task), objects=(self.object,)
         )
 
     @functools.cached_property

@@ -24,10 +24,11 @@ from rps_jax.trials.progress import Progress, ProgressCallback, Timing, no_progr
 from rps_jax.trials.rollout import outcomes
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import ControlLoop, Outcome, Shift, Snapshot, Trial, World
-from rps_jax.world import scene
+from rps_jax.world import draws, scene
 from rps_jax.world.objects import FAMILIES
 from rps_jax.world.physics import Physics
 from rps_jax.world.scene import JOINTS, Friction, Scene
+from rps_jax.world.tasks.base import CourseInputs
 
 
 @dataclass(frozen=True)
@@ -72,6 +73,7 @@ def build(
     (setting.seed, index) is the key of the imperfections of the skin of a world; by default the
     indices count from 0.
     """
+    trials = np.arange(len(cases)) if indices is None else np.asarray(indices)
     for case in cases:
         setting.check_here(case.base, [case.params])
     keys = [(case.object_name, case.mass, case.rear, case.base) for case in cases]
@@ -81,8 +83,15 @@ def build(
     solids = {key: x.rounded_solid if traced else x.solid for key, x in scenes.items()}
     starts = [_start_of(case, scenes[key]) for case, key in zip(cases, keys, strict=True)]
     qpos, targets = (np.array(column) for column in zip(*starts, strict=True))
+    courses, ends = [], []
+    uniform = draws.random_numbers(setting.seed, trials)
+    for case, numbers, target in zip(cases, uniform, targets, strict=True):
+        u = {name: numbers[column : column + 1] for name, column in draws.USES.items()}
+        front = np.array([float(case.base.half_length)])
+        end, course = case.challenge.courses(CourseInputs(u, target[None], front))
+        ends.append(end[0])
+        courses.append(rows(course, 0))
     shifts = zip(*(case.shift for case in cases), strict=True)
-    trials = np.arange(len(cases)) if indices is None else np.asarray(indices)
     root = jax.random.PRNGKey(setting.seed)
     batch = worlds.build(
         trials,
@@ -92,7 +101,8 @@ def build(
         _stack([case.base for case in cases]),
         setting,
         skin=_stack([case.sensor for case in cases]),
-        p_world_target=targets,
+        p_world_target=np.array(ends),
+        task=_stack(courses),
         shift=Shift(*(np.array(column, float) for column in shifts)),
         qpos=qpos,
         key=jax.device_get(jax.vmap(partial(jax.random.fold_in, root))(trials)),
@@ -105,7 +115,7 @@ def build(
 def kind(case: Case) -> Hashable:
     """Return the key of the compiled program for a case: family, law, sensor and robot."""
     structure = jax.tree.structure((case.sensor, case.base))
-    return FAMILIES[case.object_name], type(case.params), structure
+    return FAMILIES[case.object_name], type(case.params), structure, case.challenge.shape
 
 
 def _stack(trees: Sequence[Any], dtype: Any = float) -> Any:

@@ -126,6 +126,10 @@ def trace_dataset(trajectory: Trajectory) -> xr.Dataset:
     variables["p_world_target"] = xr.Variable(
         "axis", list(trajectory.p_world_target), {"units": "m"}
     )
+    for name, points in world.task.lines().items():
+        dims = *(f"{name}_{i}" for i in range(points.ndim - 1)), "axis"
+        meaning = {"units": "m", "long_name": f"{name} of the task in the world"}
+        variables[name] = xr.Variable(dims, points, meaning)
     for name in ("d_success", *(("l_cr",) if isinstance(trajectory.params, RPSParams) else ())):
         variables[name] = xr.Variable((), _plain(getattr(trajectory.params, name)), {"units": "m"})
     for name, value in zip(("half_length", "half_width"), world.skin.shell.half, strict=True):

@@ -122,6 +122,10 @@ def draw_path(ax: Axes, trace: xr.Dataset, snapshots: int = 7) -> None:
         alpha = 0.9 if index == len(pose) - 1 else 0.35
         ax.fill(*_object(trace, index).T, fc="#e8c39e", ec=_OBJECT, alpha=alpha)
         ax.add_patch(base_patch(pose[index], half, fill=False)).set_alpha(alpha)
+    if "path" in trace:
+        ax.plot(*trace.path.values.T, "-", lw=1, color="0.6", label="path", zorder=0)
+    for wall in trace.walls.values if "walls" in trace else ():
+        ax.plot(*wall.T, "-", lw=2, color="0.2")
     ax.plot(*target, "*", ms=10, color="C3", label="target")
     ax.add_patch(patches.Circle(target, float(trace.d_success), fill=False, color="C3"))
     ax.set_aspect("equal", adjustable="datalim")

@@ -6,7 +6,7 @@ what is drawn, and a pytree that is a `Course`, with the numbers of one world.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Hashable, Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar, NamedTuple, Protocol
 
@@ -51,6 +51,10 @@ class Course(Protocol):
         """Return the progress after one control step, and the aim."""
         ...
 
+    def lines(self) -> dict[str, np.ndarray]:
+        """Return what pictures show: polylines (..., N, 2) [m] by name, `path` and `walls`."""
+        ...
+
 
 class Progress(Protocol):
     """Running state of a task: a pytree."""
@@ -88,6 +92,11 @@ class Task:
         check_ranges(self, "task ")
         self.check()
 
+    @property
+    def shape(self) -> Hashable:
+        """Key of the shapes of a course; worlds with equal keys share a compiled program."""
+        return self.kind
+
     def check(self) -> None:
         """Raise InputError for values that are not allowed."""
 
@@ -97,7 +106,3 @@ class Task:
     def courses(self, inputs: CourseInputs) -> tuple[np.ndarray, Course]:
         """Return the ends (n, 2) [m] of trials, and the numbers of n worlds."""
         raise NotImplementedError
-
-    def lines(self, course: Any) -> dict[str, np.ndarray]:
-        """Return what pictures show of one world: polylines (..., 2) [m] by name."""
-        return {}

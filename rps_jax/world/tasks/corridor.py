@@ -7,7 +7,7 @@ touch, by the exact outlines of base and object.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Hashable, Mapping
 from dataclasses import dataclass
 from typing import ClassVar, Literal, NamedTuple
 
@@ -78,6 +78,10 @@ class CorridorCourse(NamedTuple):
         )
         return moved, aim._replace(failed=touched)
 
+    def lines(self) -> dict[str, np.ndarray]:
+        """Return path and walls."""
+        return self.path.lines() | {"walls": np.asarray(self.walls)}
+
 
 @dataclass(frozen=True)
 class Corridor(Path):
@@ -94,6 +98,11 @@ class Corridor(Path):
     width: Range = drawn(Range(1.4, 2.4), 59, "m", 0.3, 20, "width of the corridor", "course")
     doors: int = option(0, 0, 4)  # narrower places along the path
     door_width: Range = drawn(Range(0.8, 0.8), 60, "1", 0.1, 1, "doors, of the width", "course")
+
+    @property
+    def shape(self) -> Hashable:
+        """Kind, and numbers of vertices and doors."""
+        return super().shape, self.doors
 
     @property
     def idle(self) -> frozenset[str]:
@@ -119,10 +128,6 @@ class Corridor(Path):
             for i in range(self.doors)
         ]
         return ends, CorridorCourse(inner, np.concatenate([walls, *doors], axis=1))
-
-    def lines(self, course: CorridorCourse) -> dict[str, np.ndarray]:
-        """Return path and walls."""
-        return super().lines(course.path) | {"walls": np.asarray(course.walls)}
 
 
 def _walls(vertices: np.ndarray, half: np.ndarray) -> np.ndarray:

@@ -6,7 +6,7 @@ laws do not change. A trial succeeds at the path's end.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Hashable, Mapping
 from dataclasses import dataclass
 from typing import ClassVar, Literal, NamedTuple
 
@@ -92,6 +92,10 @@ class PathCourse(NamedTuple):
         target = polyline.at_arc(self.line, arc + self.lookahead)
         return moved, Aim(target, at_end=arc > length - _END)
 
+    def lines(self) -> dict[str, np.ndarray]:
+        """Return the path."""
+        return {"path": np.asarray(self.line.vertices)}
+
 
 @dataclass(frozen=True)
 class Path(Task):
@@ -121,6 +125,11 @@ class Path(Task):
     def idle(self) -> frozenset[str]:
         """Names of the ranges that are not drawn, since waypoints are given."""
         return frozenset(("length", "turns", "turn") if self.waypoints else ())
+
+    @property
+    def shape(self) -> Hashable:
+        """Kind, and number of the vertices."""
+        return self.kind, len(self.waypoints), self.spline
 
     def check(self) -> None:
         """Raise InputError for waypoints that are no path."""
@@ -182,10 +191,6 @@ class Path(Task):
         steps = lengths[..., None] * np.stack([np.cos(at), np.sin(at)], axis=-1)
         start = np.stack([front, 0 * front], axis=-1)[:, None]
         return np.concatenate([start, start + np.cumsum(steps, axis=1)], axis=1)
-
-    def lines(self, course: PathCourse) -> dict[str, np.ndarray]:
-        """Return the path."""
-        return {"path": np.asarray(course.line.vertices)}
 
 
 TASK = Path

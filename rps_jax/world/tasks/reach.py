@@ -19,6 +19,9 @@ class Nothing(NamedTuple):
     def step(self, progress: Nothing, place: Place) -> tuple[Nothing, Aim]:
         return progress, Aim(place.p_world_goal)
 
+    def lines(self) -> dict[str, np.ndarray]:
+        return {}
+
     def outcomes(self) -> dict[str, Any]:
         return {}
 
