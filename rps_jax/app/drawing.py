@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -63,7 +63,7 @@ class Drawing:
 
     def __init__(self, server: ViserServer, scene: Scene) -> None:
         """Add the bodies of a scene, in place of the last push."""
-        world = server.scene
+        world = self._world = server.scene
         world.remove_by_name(_ROOT)
         world.add_frame(_ROOT, show_axes=False)
         self.held = False  # whether a user drags the target
@@ -88,6 +88,24 @@ class Drawing:
         path = partial(world.add_line_segments, points=nowhere, thickness=0.025)
         self._base_path = path(f"{_ROOT}/base_path", colors=_rgb(rendering.BASE_RGBA))
         self._contact_path = path(f"{_ROOT}/contact_path", colors=_rgb(rendering.CONTACT_RGBA))
+
+    def draw_lines(self, lines: Mapping[str, np.ndarray]) -> None:
+        """Draw the path and the walls of a task: see `Course.lines`."""
+        if "path" in lines:
+            points = _joined(list(lines["path"]), 0.004)
+            colour = _rgb(rendering.PATH_RGBA)
+            self._world.add_line_segments(f"{_ROOT}/path", points, colour, thickness=0.02)
+        half_thickness, half_height = rendering.WALL_HALF
+        for i, (start, end) in enumerate(lines.get("walls", ())):
+            x, y = (end - start) / 2
+            yaw = math.atan2(y, x)
+            self._world.add_box(
+                f"{_ROOT}/wall_{i}",
+                _rgb(rendering.WALL_RGBA),
+                (2 * math.hypot(x, y), 2 * half_thickness, 2 * half_height),
+                wxyz=(math.cos(yaw / 2), 0.0, 0.0, math.sin(yaw / 2)),
+                position=(*((start + end) / 2), half_height),
+            )
 
     def place_target(self, p_world_target: ArrayLike) -> None:
         """Put the target at (2,) [m], unless a user drags it."""

@@ -114,7 +114,15 @@ class Film(Action[Path]):
         takes, setting = self.takes()
         seconds, out = self._length(setting), Path(self.out or self.default_folder)
         speed = self.speed or float(max(1, math.ceil(seconds / _LENGTH)))
-        tiles = [map(Tile, take.scenes, take.part.worlds.p_world_target) for take in takes]
+        tiles = [
+            [
+                Tile(scene, target, rows(take.part.worlds.task, i).lines())
+                for i, (scene, target) in enumerate(
+                    zip(take.scenes, take.part.worlds.p_world_target, strict=True)
+                )
+            ]
+            for take in takes
+        ]
         frames = _frames(takes, setting, speed, seconds, callback)
         ordered = _in_grid_order(tiles, takes)
         shape = fitted_grid(len(ordered), self.shape, rows=len(self.laws))

@@ -234,6 +234,7 @@ class Page:
         self._cursor, self._drawn, self._playing = 0.0, (0, 0), True
         with self._server.atomic():
             self._drawing = Drawing(self._server, push.scene)
+            self._drawing.draw_lines(push.live.lines)
             self._connect(self._drawing.target.on_update, self._drag)
 
     def _advance(self, live: Live, elapsed: float) -> None:

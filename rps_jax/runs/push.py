@@ -50,6 +50,7 @@ from rps_jax.world.scene import Scene
 
 if TYPE_CHECKING:
     from rps_jax.analysis.figures.style import Figure
+    from rps_jax.world.rendering import Tile
 
 
 _STILL = (640, 360)  # [px] width and height of one of several pictures side by side
@@ -67,6 +68,13 @@ class Trace(Trajectory):
 
     def __repr__(self) -> str:
         return f"<Trace of {self.title}: {self.summary}>"
+
+    @property
+    def _tile(self) -> Tile:
+        """The trial in pictures."""
+        from rps_jax.world.rendering import Tile
+
+        return Tile(self.scene, self.p_world_target, self.world.task.lines())
 
     @property
     def summary(self) -> str:
@@ -106,7 +114,7 @@ class Trace(Trajectory):
         from rps_jax.world import rendering
 
         shown = _evenly_spaced(len(self.snapshots.time), count)
-        tiles = [rendering.Tile(self.scene, self.p_world_target)] * len(shown)
+        tiles = [self._tile] * len(shown)
         with rendering.open_renderers(tiles, _STILL, "oblique") as renderers:
             poses = zip(renderers, self.snapshots.qpos[shown], strict=True)
             images = [renderer.draw(qpos, rendering.NO_CONTACT) for renderer, qpos in poses]
@@ -142,8 +150,7 @@ class Trace(Trajectory):
         contacts = np.asarray(p_world_contact(self.snapshots))[shown]
         pairs = zip(watch(self.snapshots.qpos[shown]), contacts, strict=True)
         shots = ([video.Shot(qpos, contact, "")] for qpos, contact in pairs)
-        tile = video.Tile(self.scene, self.p_world_target)
-        video.render([tile], shots, Path(path), fps=fps, size=size)
+        video.render([self._tile], shots, Path(path), fps=fps, size=size)
         return Path(path)
 
 

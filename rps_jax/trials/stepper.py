@@ -76,6 +76,11 @@ class Live:
         """Target (2,) [m] in the world."""
         return np.asarray(self._worlds.p_world_target[0])
 
+    @property
+    def lines(self) -> dict[str, np.ndarray]:
+        """What pictures show of the task: see `Course.lines`."""
+        return rows(self._worlds.task, 0).lines()
+
     # --- control ---
 
     def reset(self) -> None:
@@ -108,8 +113,10 @@ class Live:
         """Move the target [m].
 
         Raises:
-          InputError: it is not finite, or out of bounds.
+          InputError: it is not finite, or out of bounds, or the task has its own end.
         """
+        if self.lines:
+            raise errors.not_allowed("target", p_world_target, "the task has its own end")
         target = errors.check_vector("target", p_world_target, at_least=-50, at_most=50, unit="m")
         dtype = self._worlds.p_world_target.dtype
         self._worlds = self._worlds._replace(p_world_target=np.array([target], dtype))

@@ -17,7 +17,8 @@ import sys
 import threading
 import warnings
 from collections import deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -36,6 +37,9 @@ _TRAIL_WIDTH = 0.007  # [1] of the image's height
 _TRAIL_ROOM = 8  # [px] more than the width of a trail in the largest image
 BASE_RGBA = (0.08, 0.09, 0.11, 1.0)
 CONTACT_RGBA = (0.62, 0.04, 0.46, 1.0)
+PATH_RGBA = (0.05, 0.35, 0.65, 1.0)
+WALL_RGBA = (0.45, 0.47, 0.5, 1.0)
+WALL_HALF = (0.02, 0.15)  # [m] half thickness and half height of a wall in pictures
 CONTACT_HEIGHT = 0.36  # [m] just above the chassis, which would hide the marker from above
 CONTACT_RADIUS = 0.04  # [m]
 _CORNERS = np.array(list(itertools.product((-1, 1), repeat=3)))  # of a cube
@@ -61,6 +65,7 @@ class Tile(NamedTuple):
 
     scene: Scene
     p_world_target: ArrayLike  # (2,) [m]
+    lines: Mapping[str, np.ndarray] = MappingProxyType({})  # of its task: see `Course.lines`
 
 
 class _Trail:
@@ -88,8 +93,9 @@ class _Trail:
 class SceneRenderer:
     """A scene and its camera; each image adds to the trails."""
 
-    def __init__(self, renderer: Any, scene: Scene, camera: str, target: np.ndarray) -> None:
+    def __init__(self, renderer: Any, tile: Tile, camera: str, target: np.ndarray) -> None:
         """Create it for a camera of the scene, with the flag at `target` (2,) [m]."""
+        scene, self._lines = tile.scene, tile.lines
         self.mujoco = _import_mujoco()
         self.renderer = renderer
         self.model = scene.model
@@ -121,12 +127,12 @@ class SceneRenderer:
         view.flags[self.mujoco.mjtRndFlag.mjRND_SHADOW] = self._size[1] >= _SHADOWS_FROM
         self.base_trail.add(qpos[:2])
         self.contact_trail.add(contact)
+        path = itertools.pairwise(self._lines.get("path", ()))
+        self._add_lines(path, PATH_RGBA, 0.004)
         for trail in (self.base_trail, self.contact_trail):
-            for a, b in trail.segments():
-                line = self._add_geom("mjGEOM_LINE", np.zeros(3), np.zeros(3), trail.rgba)
-                points = ([*point, trail.height] for point in (a, b))
-                width = _TRAIL_WIDTH * self.renderer.height
-                self.mujoco.mjv_connector(line, line.type, width, *points)
+            self._add_lines(trail.segments(), trail.rgba, trail.height)
+        for start, end in self._lines.get("walls", ()):
+            self._add_wall(start, end)
         if not np.isnan(contact).any():
             position, size = np.array([*contact, CONTACT_HEIGHT]), np.full(3, CONTACT_RADIUS)
             marker = self._add_geom("mjGEOM_SPHERE", size, position, CONTACT_RGBA)
@@ -180,6 +186,23 @@ class SceneRenderer:
             points = np.concatenate([points, points - ray * (points[:, 2:] / ray[..., 2:])])
         return points
 
+    def _add_lines(
+        self, segments: Iterable[tuple[np.ndarray, np.ndarray]], rgba: Any, height: float
+    ) -> None:
+        """Add lines between pairs of points (2,) [m] at a height [m]."""
+        width = _TRAIL_WIDTH * self.renderer.height
+        for a, b in segments:
+            line = self._add_geom("mjGEOM_LINE", np.zeros(3), np.zeros(3), rgba)
+            self.mujoco.mjv_connector(line, line.type, width, *([*x, height] for x in (a, b)))
+
+    def _add_wall(self, start: np.ndarray, end: np.ndarray) -> None:
+        """Add a wall between two points (2,) [m]."""
+        x, y = (end - start) / 2
+        size, middle = [math.hypot(x, y), *WALL_HALF], [*((start + end) / 2), WALL_HALF[1]]
+        wall = self._add_geom("mjGEOM_BOX", np.array(size), np.array(middle), WALL_RGBA)
+        c, s = np.array([x, y]) / size[0]
+        wall.mat = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
+
     def _add_geom(self, kind: str, size: np.ndarray, position: np.ndarray, rgba: Any) -> Any:
         """Add a geom to this image, which has at most 10,000."""
         view = self.renderer.scene
@@ -209,16 +232,16 @@ def open_renderers(
     with contextlib.ExitStack() as stack:
         renderers: dict[int, Any] = {}
         scene_renderers = []
-        for scene, p_world_target in tiles:
-            model = scene.model
+        for tile in tiles:
+            model = tile.scene.model
             errors.check_name("camera", camera, [model.camera(i).name for i in range(model.ncam)])
-            target = errors.check_array("p_world_target", p_world_target, (2,))
+            target = errors.check_array("p_world_target", tile.p_world_target, (2,))
             limits = (model.vis.global_.offwidth, model.vis.global_.offheight)
             for n, limit in zip(size, limits, strict=True):
                 errors.check_finite("size", n, at_least=2, at_most=limit, unit="px")
             if id(model) not in renderers:
                 renderers[id(model)] = stack.enter_context(_renderer(model, size))
-            scene_renderers.append(SceneRenderer(renderers[id(model)], scene, camera, target))
+            scene_renderers.append(SceneRenderer(renderers[id(model)], tile, camera, target))
         yield scene_renderers
 
 
