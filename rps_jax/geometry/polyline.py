@@ -16,12 +16,12 @@ from rps_jax.geometry.footprint import Footprint
 class Polyline(NamedTuple):
     """Vertices, and the arc length from the first vertex to each."""
 
-    vertices: Float[Array, "*B N 2"]  # [m]
-    arcs: Float[Array, "*B N"]  # [m]
+    vertices: Float[Array, "*B K 2"]  # [m]
+    arcs: Float[Array, "*B K"]  # [m]
 
     @classmethod
     def through(cls, vertices: np.ndarray) -> Polyline:
-        """Return polylines through vertices (..., N, 2) [m], on the host."""
+        """Return polylines through vertices (..., K, 2) [m], on the host."""
         lengths = np.linalg.norm(np.diff(vertices, axis=-2), axis=-1)
         zero = np.zeros_like(lengths[..., :1])
         return cls(vertices, np.concatenate([zero, np.cumsum(lengths, axis=-1)], axis=-1))
@@ -65,7 +65,8 @@ def clearance(
     """
     corners, (start, end) = outline.vertices, (walls[:, 0], walls[:, 1])
     along = end - start
-    normal = planar.rotate(jnp.pi / 2, along) / planar.norm(along)[:, None]
+    length = planar.norm(along)[:, None]
+    normal = planar.rotate(jnp.pi / 2, along) / jnp.where(length > 0, length, 1.0)
     square, gap = jnp.full(walls.shape[:1], jnp.inf), jnp.full(walls.shape[:1], -jnp.inf)
     low, high = square, gap  # heights of the corners above each wall
     for corner, following in zip(corners, jnp.roll(corners, -1, axis=0), strict=True):
@@ -79,7 +80,7 @@ def clearance(
             square = jnp.minimum(square, _square(corner, edge, point))
         beyond = jnp.minimum(_dot(start - corner, out), _dot(end - corner, out))
         gap = jnp.maximum(gap, jnp.where(size > 0, beyond, -jnp.inf))
-    gap = jnp.maximum(gap, jnp.maximum(low, -high))
+    gap = jnp.maximum(gap, jnp.where(length[:, 0] > 0, jnp.maximum(low, -high), -jnp.inf))
     distance = planar.safe_sqrt(square)
     if len(corners) > 1:  # a point has no inside
         distance = jnp.where(gap > 0, distance, gap)
@@ -91,9 +92,8 @@ def _nearest_on_wall(outline: Footprint, wall: Float[Array, "2 2"]) -> Float[Arr
     """Return the point [m] of one wall that is nearest to an outline."""
     along, corners = wall[1] - wall[0], outline.vertices
     points = jnp.concatenate([wall[0] + _share(wall[0], along, corners)[:, None] * along, wall])
-    squares = jnp.concatenate(
-        [_square(wall[0], along, corners), jnp.square(fp.signed_distance(outline, wall))]
-    )
+    to_ends = fp.signed_distance(outline, wall) + outline.radius
+    squares = jnp.concatenate([_square(wall[0], along, corners), to_ends**2])
     return points[jnp.argmin(squares)]
 
 

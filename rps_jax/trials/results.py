@@ -32,7 +32,6 @@ UNITS = {
     "base_pose": ("m, m, rad", "x, y, yaw of the base in the world at the end"),
     "object_pose": ("m, m, rad", "x, y, yaw of the object in the world at the end"),
 }
-_ALL_UNITS = UNITS | tasks.OUTCOMES
 _TRACED = {"v_x": "m/s", "v_y": "m/s", "omega": "rad/s", "l": "m", "distance": "m", "a_r": "1",
            "gamma": "rad", "realigning": "1"}  # fmt: skip  # units of numbers of a trace
 
@@ -94,7 +93,7 @@ def labelled(**columns: tuple[str | Sequence[str], ArrayLike, str, str]) -> dict
 
 def variable(name: str, dims: Sequence[str], values: np.ndarray) -> xr.Variable:
     """Return one field of outcomes with its unit; poses (..., 3) have one more dimension."""
-    unit, meaning = _ALL_UNITS[name]
+    unit, meaning = (UNITS | tasks.OUTCOMES)[name]
     attrs = {"units": unit, "long_name": meaning}
     return xr.Variable((*dims, "pose")[: values.ndim], _plain(values), attrs)
 

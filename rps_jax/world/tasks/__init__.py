@@ -9,6 +9,8 @@ from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from rps_jax import errors
 from rps_jax.record import files
 from rps_jax.record.options import parse_changes
@@ -66,7 +68,9 @@ def parse_task(task: TaskLike) -> Task:
             elif isinstance(default, int) and float(value).is_integer():
                 value = int(value)
             elif isinstance(default, tuple):
-                value = tuple((float(x), float(y)) for x, y in value)
+                points = np.asarray(value, float)
+                points = points.reshape(-1, 2) if points.ndim == 1 else points  # of a text, 1:0:2:1
+                value = tuple(map(tuple, points.tolist()))
         except (TypeError, ValueError, OverflowError) as error:
             is_range = name in declared(kind)
             form = "a number, or low and high as [0.3, 0.6]" if is_range else "pairs of x, y [m]"

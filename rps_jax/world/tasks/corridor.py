@@ -95,7 +95,7 @@ class Corridor(Path):
         "touch_y": ("m", "y of the touch in the world"),
     }
 
-    width: Range = drawn(Range(1.4, 2.4), 59, "m", 0.3, 20, "width of the corridor", "course")
+    width: Range = drawn(Range(1.4, 2.2), 59, "m", 0.3, 20, "width of the corridor", "course")
     doors: int = option(0, 0, 4)  # narrower places along the path
     door_width: Range = drawn(Range(0.8, 0.8), 60, "1", 0.1, 1, "doors, of the width", "course")
 
@@ -103,6 +103,23 @@ class Corridor(Path):
     def shape(self) -> Hashable:
         """Kind, and numbers of vertices and doors."""
         return super().shape, self.doors
+
+    def check(self) -> None:
+        """Raise InputError for turns in which the walls of a corner would cross."""
+        super().check()
+        need = self.width.high * np.tan(self.turn.high / 2) if self.turns.high else 0.0
+        part = self.length.low / (self.turns.high + 1)
+        if self.waypoints:
+            units = _units(self.route()[None])[0]
+            cross = units[:-1, 0] * units[1:, 1] - units[:-1, 1] * units[1:, 0]
+            turns = np.abs(np.arctan2(cross, np.sum(units[:-1] * units[1:], axis=1)))
+            room = np.append(0, self.width.high / 2 * np.tan(turns / 2))
+            lengths = np.linalg.norm(np.diff(self.route(), axis=0), axis=1)
+            short = lengths - room - np.append(room[1:], 0)
+            need, part = 0.0, float(short.min())
+        if part < need:
+            rule = "it must leave room for its corners: give fewer or smaller turns, longer parts"
+            raise errors.not_allowed("task width (high)", f"{self.width.high:g} m", rule)
 
     @property
     def idle(self) -> frozenset[str]:
@@ -132,8 +149,7 @@ class Corridor(Path):
 
 def _walls(vertices: np.ndarray, half: np.ndarray) -> np.ndarray:
     """Return the walls (n, W, 2, 2) [m] beside paths (n, N, 2) at a half width (n,) [m]."""
-    steps = np.diff(vertices, axis=1)
-    units = steps / np.linalg.norm(steps, axis=-1, keepdims=True)
+    units = _units(vertices)
     points = vertices.copy()
     points[:, 0] -= _BEHIND * units[:, 0]
     points[:, -1] += _BEYOND * units[:, -1]
@@ -145,14 +161,22 @@ def _walls(vertices: np.ndarray, half: np.ndarray) -> np.ndarray:
     return np.concatenate([np.stack([s[:, :-1], s[:, 1:]], axis=2) for s in sides], axis=1)
 
 
+def _units(vertices: np.ndarray) -> np.ndarray:
+    """Return the directions (n, N - 1, 2) of paths (n, N, 2); of no length, the one before."""
+    steps = np.diff(vertices, axis=1)
+    lengths = np.linalg.norm(steps, axis=-1, keepdims=True)
+    last = np.where(lengths > 0, np.arange(steps.shape[1])[:, None], 0)
+    last = np.maximum.accumulate(last, axis=1)
+    return np.take_along_axis(steps / np.where(lengths > 0, lengths, 1.0), last, axis=1)
+
+
 def _door(vertices: np.ndarray, share: float, inner: np.ndarray, outer: np.ndarray) -> np.ndarray:
     """Return two walls (n, 2, 2, 2) [m] across paths, in the middle of a segment of theirs.
 
     They leave an opening of half width `inner` (n,) [m], and end at `outer` (n,) [m].
     """
     first = int(share * (vertices.shape[1] - 1))
-    a, b = vertices[:, first], vertices[:, first + 1]
-    unit = (b - a) / np.linalg.norm(b - a, axis=-1, keepdims=True)
+    a, b, unit = vertices[:, first], vertices[:, first + 1], _units(vertices)[:, first]
     normal = np.stack([-unit[:, 1], unit[:, 0]], axis=-1)
     ends = [(a + b) / 2 + s * x[:, None] * normal for s in (1, -1) for x in (inner, outer)]
     return np.stack([np.stack(ends[:2], axis=1), np.stack(ends[2:], axis=1)], axis=1)

@@ -112,9 +112,9 @@ class Path(Task):
 
     # Along the path, from its nearest point to the law's target.
     lookahead: Range = drawn(Range(0.5, 0.5), 49, "m", 0.05, 5, "lookahead on the path", "course")
-    length: Range = drawn(Range(3, 6), 50, "m", 0.5, 40, "length of the path", "course")
+    length: Range = drawn(Range(4, 8), 50, "m", 0.5, 40, "length of the path", "course")
     turns: Range = drawn(
-        Range(1, 4), 51, "1", 0, _SEGMENTS - 1, "number of turns", "course", "", True
+        Range(1, 3), 51, "1", 0, _SEGMENTS - 1, "number of turns", "course", "", True
     )
     turn: Range = drawn(Range(0.3, 0.8), 52, "rad", 0, 1.6, "angle of the turns", "course")
     # [m] in the world, where the base starts at the origin; then nothing but the lookahead is drawn
@@ -156,6 +156,15 @@ class Path(Task):
         lookahead = self.lookahead.at(inputs.u["lookahead"])
         return line.vertices[:, -1], PathCourse(line, lookahead)
 
+    def route(self) -> np.ndarray:
+        """Return the vertices (N, 2) [m] of the path through the waypoints."""
+        points = np.array(self.waypoints, float)
+        if not self.spline or len(points) < 3:
+            return points
+        arcs = Polyline.through(points).arcs
+        at = np.arange((len(points) - 1) * _PER_SPAN + 1) / _PER_SPAN
+        return CubicSpline(arcs, points)(np.interp(at, np.arange(len(points)), arcs))
+
     def vertices(self, inputs: CourseInputs) -> np.ndarray:
         """Return the vertices (n, N, 2) [m] of paths, which start at the base's front."""
         front, u = inputs.front, inputs.u
@@ -165,13 +174,7 @@ class Path(Task):
             if off > _NEAR:
                 rule = f"it must start within {_NEAR} m of the base's front, ({front[0]:.2f}, 0)"
                 raise errors.not_allowed("task waypoints", points[0].tolist(), rule)
-            if self.spline and len(points) > 2:
-                at = Polyline.through(points).arcs
-                along = np.interp(
-                    np.arange((len(points) - 1) * _PER_SPAN + 1) / _PER_SPAN,
-                    np.arange(len(points)), at,
-                )  # fmt: skip
-                points = CubicSpline(at, points)(along)
+            points = self.route()
             return np.broadcast_to(points, (front.size, *points.shape))
         low, high, _ = self.turns
         count = np.minimum(np.floor(low + (high + 1 - low) * u["turns"]), high)[:, None]
@@ -182,11 +185,11 @@ class Path(Task):
             angle = np.where(np.abs(heading + angle) > np.pi / 2 + 1e-9, -angle, angle)
             heading = heading + angle
             headings.append(heading)
-        # Segments after the last turn divide the last part of the path.
+        # Segments after the last part have no length.
         k = np.arange(_SEGMENTS)[None]
         part = self.length.at(u["length"])[:, None] / (count + 1)
-        lengths = np.where(k < count, part, part / (_SEGMENTS - count))
-        lengths[:, :1] = np.where(count > 0, np.maximum(lengths[:, :1], _LEAD), lengths[:, :1])
+        lengths = np.where(k <= count, part, 0.0)
+        lengths[:, :1] = np.maximum(lengths[:, :1], _LEAD)
         at = np.take_along_axis(np.stack(headings, 1), np.minimum(k, count).astype(int), 1)
         steps = lengths[..., None] * np.stack([np.cos(at), np.sin(at)], axis=-1)
         start = np.stack([front, 0 * front], axis=-1)[:, None]

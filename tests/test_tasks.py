@@ -1,0 +1,317 @@
+"""Tests of tasks: paths, corridors and their geometry, against shapely."""
+
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any, ClassVar, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from shapely import LineString, Point, Polygon
+from shapely.affinity import translate
+
+import rps_jax
+from rps_jax.errors import InputError
+from rps_jax.geometry import footprint as fp
+from rps_jax.geometry import polyline
+from rps_jax.geometry.footprint import Footprint
+from rps_jax.geometry.polyline import Polyline
+from rps_jax.runs.push import Push
+from rps_jax.trials.setting import Setting
+from rps_jax.trials.trial import Rules
+from rps_jax.world import draws, tasks
+from rps_jax.world.domain import Range, parse_domain
+from rps_jax.world.tasks import corridor, path
+from rps_jax.world.tasks.base import Aim, CourseInputs, Place, Task
+from rps_jax.world.tasks.path import Path
+
+BRIEF = Setting("quasistatic", rules=Rules(horizon=40.0))
+
+
+def random_walls(rng: np.random.Generator, count: int) -> np.ndarray:
+    """Return walls (count, 2, 2) [m] about the origin."""
+    return rng.uniform(-1.5, 1.5, (count, 2, 2))
+
+
+def outlines(rng: np.random.Generator) -> list[tuple[Footprint, Any]]:
+    """Return a circle, a rectangle and a polygon with a repeated corner, and shapely's of each."""
+    circle = Footprint(jnp.array([[0.1, -0.2]]), jnp.asarray(0.3))
+    corners = np.array([[0.5, 0.3], [-0.4, 0.4], [-0.5, -0.2], [0.3, -0.5], [0.3, -0.5]])
+    shapes = [(circle, Point(0.1, -0.2).buffer(0.3, quad_segs=2000))]
+    turned = fp.place(fp.rectangle(0.4, 0.2), rng.uniform(-0.3, 0.3, 2), 0.7)
+    for vertices in (np.asarray(turned.vertices), corners):
+        shapes.append((Footprint(jnp.asarray(vertices), jnp.zeros(())), Polygon(vertices)))
+    return shapes
+
+
+def test_the_clearance_from_walls_is_exact() -> None:
+    rng = np.random.default_rng(0)
+    crossings = 0
+    for outline, shape in outlines(rng):
+        clearance = jax.jit(partial(polyline.clearance, outline))
+        for _ in range(60):
+            walls = random_walls(rng, 3)
+            found, point = clearance(jnp.asarray(walls))
+            lines = [LineString(wall) for wall in walls]
+            distance = min(shape.distance(line) for line in lines)
+            crosses = any(shape.intersects(line) for line in lines)
+            crossings += crosses
+            assert (found <= 1e-6) == crosses
+            if not crosses:
+                assert found == pytest.approx(distance, abs=2e-6)
+                assert shape.distance(Point(point)) == pytest.approx(distance, abs=2e-6)
+            assert min(line.distance(Point(point)) for line in lines) < 1e-6
+    assert 30 < crossings < 150
+
+
+def test_the_way_out_of_a_wall_ends_its_crossing() -> None:
+    rng = np.random.default_rng(1)
+    _, (outline, shape), _ = outlines(rng)
+    inside = 0
+    for _ in range(40):
+        walls = random_walls(rng, 1)
+        found, _ = polyline.clearance(outline, jnp.asarray(walls))
+        if found < -1e-3:
+            inside += 1
+            turns, wall = np.linspace(0, 2 * np.pi, 181), LineString(walls[0])
+
+            def crosses(share: float, a: float, way: float = -found, wall: Any = wall) -> bool:
+                moved = translate(shape, share * way * np.cos(a), share * way * np.sin(a))
+                return moved.intersects(wall)
+
+            assert not all(crosses(1.01, a) for a in turns)
+            assert all(crosses(0.98, a) for a in turns)
+    assert inside > 5
+
+
+def test_points_of_a_path_are_shapelys() -> None:
+    rng = np.random.default_rng(2)
+    for _ in range(30):
+        vertices = np.cumsum(rng.normal(size=(6, 2)), axis=0)
+        line, whole = Polyline.through(vertices), LineString(vertices)
+        assert line.arcs[-1] == pytest.approx(whole.length)
+        point = rng.normal(size=2)
+        arc, distance = polyline.nearest(line, jnp.asarray(point), 0.0, 100.0)
+        assert distance == pytest.approx(whole.distance(Point(point)), abs=1e-5)
+        assert np.asarray(polyline.at_arc(line, arc)) == pytest.approx(
+            np.ravel(whole.interpolate(float(arc)).coords), abs=1e-5
+        )
+    start, _ = polyline.nearest(line, jnp.asarray(vertices[-1]), 0.0, 0.5)
+    assert 0 <= start <= 0.5
+
+
+def drawn(task: str, count: int = 200, domain: str = "wide,objects=random_box") -> draws.Draw:
+    """Return worlds of a task."""
+    return draws.draw(parse_domain(domain, task=task), 3, np.arange(count))
+
+
+def test_drawn_paths_start_at_the_front_and_never_turn_back() -> None:
+    worlds = drawn("path,turns=0:4,turn=0.2:1.2,length=4:8")
+    steps = np.diff(worlds.course.line.vertices, axis=1)
+    headings = np.arctan2(steps[..., 1], steps[..., 0])
+    shown = np.linalg.norm(steps, axis=2) > 0
+    assert (np.abs(headings) <= np.pi / 2 + 1e-9).all()
+    assert (headings[:, 0] == 0).all()
+    turns = shown.sum(axis=1) - 1
+    assert set(turns) == {0, 1, 2, 3, 4}
+    assert worlds.course.line.vertices[:, 0] == pytest.approx(
+        np.stack([worlds.robot.half_length, np.zeros(200)], axis=1)
+    )
+    assert worlds.p_world_target == pytest.approx(worlds.course.line.vertices[:, -1])
+    lengths = worlds.course.line.arcs[:, -1]
+    assert ((lengths > 4 - 1e-9) & (lengths < 9.5)).all()
+    few = draws.draw(parse_domain("wide,objects=random_box", task="path"), 3, np.array([5, 7]))
+    again = drawn("path")
+    assert (few.course.line.vertices == again.course.line.vertices[[5, 7]]).all()
+
+
+def test_walls_are_at_half_the_width() -> None:
+    worlds = drawn("corridor,width=1.5,turns=1", 40)
+    for vertices, walls in zip(worlds.course.path.line.vertices, worlds.course.walls, strict=True):
+        whole = LineString(vertices)
+        sides = [LineString(wall) for wall in walls]
+        assert min(side.distance(whole) for side in sides) == pytest.approx(0.75, abs=1e-9)
+        assert not any(side.intersects(whole) for side in sides)
+        inner = sides[2].interpolate(0.5, normalized=True)
+        assert whole.distance(inner) == pytest.approx(0.75, abs=0.2)
+
+
+def test_doors_leave_an_opening() -> None:
+    worlds = drawn("corridor,width=1.6,doors=2,door_width=0.75,turns=0", 5)
+    for vertices, walls in zip(worlds.course.path.line.vertices, worlds.course.walls, strict=True):
+        whole, doors = LineString(vertices), [LineString(wall) for wall in walls[-4:]]
+        assert [door.distance(whole) for door in doors] == pytest.approx([0.6] * 4)
+
+
+def place(contact: tuple[float, float], touches: bool = True) -> Place:
+    """Return a place with a contact point, and a base and an object about the origin."""
+    return Place(
+        *(jnp.zeros(2), jnp.array(contact), jnp.asarray(touches), jnp.zeros(3), (0.3, 0.2)),
+        *(jnp.array([0.8, 0.0]), 0.0, fp.rectangle(0.2, 0.2)),
+    )
+
+
+def test_cross_track_errors_are_those_of_the_contact_points() -> None:
+    line = Polyline.through(np.array([[0.0, 0.0], [4.0, 0.0], [4.0, 4.0]]))
+    course = path.PathCourse(jax.tree.map(jnp.asarray, line), jnp.asarray(0.5))
+    rng = np.random.default_rng(4)
+    errors = np.abs(rng.normal(0, 0.08, 400))
+    progress, step = course.start(), jax.jit(course.step)
+    for x, y in zip(np.linspace(0, 3, 400), errors, strict=True):
+        progress, aim = step(progress, place((x, y)))
+        assert aim.p_world_target == pytest.approx([min(x + 0.5, 4), max(x - 3.5, 0)], abs=1e-5)
+        assert not aim.at_end
+    progress, _ = step(progress, place((0.0, 3.0), touches=False))
+    found = progress.outcomes()
+    assert found["error_mean"] == pytest.approx(errors.mean(), rel=1e-4)
+    assert found["error_max"] == pytest.approx(errors.max(), rel=1e-5)
+    assert found["error_95"] == pytest.approx(np.quantile(errors, 0.95), rel=0.08)
+    assert found["progress"] == pytest.approx(3 / 8, abs=1e-5)
+    _, aim = step(progress._replace(arc=jnp.asarray(7.8)), place((4.0, 3.9)))
+    assert aim.at_end
+    assert aim.p_world_target == pytest.approx([4.0, 4.0], abs=1e-5)
+    untouched = course.start().outcomes()
+    assert np.isnan(untouched["error_mean"])
+    assert untouched["progress"] == 0
+
+
+def test_a_straight_path_with_a_long_lookahead_is_a_target() -> None:
+    options = {"skin": "ideal", "setting": BRIEF}
+    reach = rps_jax.push("cylinder", target=(2.0, 0.5), **options)
+    task = "path,waypoints=0.3625:0:2:0.5,lookahead=5"
+    along = Path(waypoints=((0.3625, 0.0), (2.0, 0.5)), lookahead=Range(5, 5))
+    assert tasks.parse_task(task) == along
+    followed = rps_jax.push("cylinder", task=along, **options)
+    for name in ("qpos", "v_x", "omega"):
+        assert followed.data[name].values == pytest.approx(reach.data[name].values, abs=2e-3)
+    assert followed.outcome.task["progress"] > 0.9
+
+
+def test_walls_change_nothing_until_they_are_touched() -> None:
+    domain = parse_domain("wide,objects=random_box")
+    wide, narrow, free = (
+        rps_jax.sweep("rps", domain, task=task, worlds=8, setting=BRIEF)
+        for task in ("corridor,width=19,turns=0", "corridor,width=1.42", "path,turns=0")
+    )
+    for name in ("time", "path_length", "error_mean", "success"):
+        assert wide[name].values == pytest.approx(free[name].values, rel=1e-3, abs=1e-3)
+    assert (wide.wall_touch == 0).all()
+    assert wide.clearance.values == pytest.approx(wide.clearance.values.clip(7, 9.5))
+    touched = narrow.wall_touch.values > 0
+    assert touched.any()
+    assert (narrow.success.values[touched] == 0).all()
+    assert (narrow.clearance.values[touched] <= 0).all()
+    assert np.isfinite(narrow.touch_x.values[touched]).all()
+    assert np.isnan(narrow.touch_x.values[~touched]).all()
+
+
+def test_a_trial_ends_at_the_first_touch_of_the_exact_outlines() -> None:
+    task = "corridor,width=0.62,turns=1,turn=1.2,lookahead=1.2"
+    trace = rps_jax.push("box", task=task, skin="ideal", setting=replace(BRIEF, rules=Rules(90.0)))
+    data, world = trace.data, trace.world
+    walls = [LineString(x) for x in data.walls.values]
+    half = float(data.half_length), float(data.half_width)
+    assert data.outcome_wall_touch in (corridor.BASE, corridor.OBJECT)
+
+    def crosses(i: int) -> bool:
+        x, y, yaw = data.qpos.values[i, :3]
+        base = fp.place(fp.rectangle(*half), jnp.array([x, y]), yaw)
+        position, turn = rps_jax.trials.trial.object_pose(jnp.asarray(data.qpos.values[i]))
+        item = fp.place(world.footprint, position, turn)
+        shapes = Polygon(np.asarray(base.vertices)), Polygon(np.asarray(item.vertices))
+        return any(shape.intersects(wall) for shape in shapes for wall in walls)
+
+    assert not any(crosses(i) for i in range(0, data.sizes["time"] - 1, 20))
+    point = Point(float(data.outcome_touch_x), float(data.outcome_touch_y))
+    assert min(wall.distance(point) for wall in walls) < 1e-5
+
+
+class Timer(NamedTuple):
+    """Course and progress of a task that fails after ten control steps."""
+
+    count: Any = 0.0
+
+    def start(self) -> "Timer":
+        return Timer(jnp.zeros(()))
+
+    def step(self, progress: "Timer", place: Place) -> tuple["Timer", Aim]:
+        later = Timer(progress.count + 1.0)
+        return later, Aim(place.p_world_goal, failed=later.count >= 10)
+
+    def outcomes(self) -> dict[str, Any]:
+        return {"count": self.count}
+
+    def lines(self) -> dict[str, np.ndarray]:
+        return {}
+
+
+@dataclass(frozen=True)
+class Timed(Task):
+    """A task that is not in the package."""
+
+    kind: str = "timed"
+    HAS_TARGET: ClassVar[bool] = True
+    OUTCOMES: ClassVar[dict[str, tuple[str, str]]] = {"count": ("1", "control steps")}
+
+    def courses(self, inputs: CourseInputs) -> tuple[np.ndarray, Timer]:
+        return inputs.p_world_target, Timer(np.zeros(inputs.front.size))
+
+
+def test_a_task_is_one_declaration(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(tasks.TASKS, "timed", Timed)
+    monkeypatch.setitem(tasks.OUTCOMES, "count", ("1", "control steps"))
+    domain = replace(parse_domain("wide,objects=random_cylinder"), task=Timed())
+    results = rps_jax.sweep("rps", domain, worlds=3, setting=BRIEF)
+    assert results["count"].values.tolist() == [[10, 10, 10]]
+    assert not results.success.any()
+    assert results["count"].attrs["long_name"] == "control steps"
+
+
+REFUSED = {
+    "hall": "unknown task 'hall'",
+    "path,width=2": "task quantity of path",
+    "path,lookahead=0": "task lookahead (low) = 0",
+    "path,length=6:3": "task length = 6 to 3",
+    "corridor,width=0.5": "task width (low) = 0.5 m is not allowed",
+    "corridor,doors=1,door_width=0.3": "task width (low)",
+    "corridor,doors=9": "task doors = 9",
+    "corridor,width=3,turns=4": "task width (high)",
+    "path,spline=true": "task spline",
+}
+
+
+@pytest.mark.parametrize("task", REFUSED)
+def test_bad_tasks_are_refused(task: str) -> None:
+    with pytest.raises(InputError) as error:
+        parse_domain("wide", task=task)
+    assert REFUSED[task].lower() in str(error.value).lower()
+    with pytest.raises(InputError):
+        Push(task=task).validate()
+
+
+@pytest.mark.parametrize(
+    "points",
+    [
+        [(0.4, 0.0)],
+        [(0.4, 0.0), (np.nan, 1.0)],
+        [(0.4, 0.0), (0.4, 0.0)],
+        [(0.4, 0.0), (90.0, 0.0)],
+        [(0.4, 0.0, 1.0), (1.0, 1.0, 1.0)],
+    ],
+)
+def test_bad_waypoints_are_refused(points: list[tuple[float, ...]]) -> None:
+    with pytest.raises(InputError, match="task waypoints"):
+        tasks.parse_task({"kind": "path", "waypoints": points})
+
+
+def test_a_path_must_start_at_the_base() -> None:
+    far = tasks.parse_task({"kind": "path", "waypoints": [(3.0, 0.0), (4.0, 0.0)]})
+    with pytest.raises(InputError, match=r"must start within 0.5 m of the base's front"):
+        rps_jax.push("box", task=far, setting=BRIEF)
+
+
+def test_a_task_with_its_own_end_takes_no_target() -> None:
+    with pytest.raises(InputError, match="has its own end"):
+        rps_jax.push("box", task="path", target=(1.0, 1.0), setting=BRIEF)
+    assert parse_domain("paper", task="path").targets == ()
