@@ -107,7 +107,7 @@ def drawn(task: str, count: int = 200, domain: str = "wide,objects=random_box") 
 
 
 def test_drawn_paths_start_at_the_front_and_never_turn_back() -> None:
-    worlds = drawn("path,turns=0:4,turn=0.2:1.2,length=4:8")
+    worlds = drawn("path,turns=0:4,turn_angle=0.2:1.2,length=4:8")
     steps = np.diff(worlds.course.line.vertices, axis=1)
     headings = np.arctan2(steps[..., 1], steps[..., 0])
     shown = np.linalg.norm(steps, axis=2) > 0
@@ -207,7 +207,7 @@ def test_walls_change_nothing_until_they_are_touched() -> None:
 
 
 def test_a_trial_ends_at_the_first_touch_of_the_exact_outlines() -> None:
-    task = "corridor,width=0.62,turns=1,turn=1.2,lookahead=1.2"
+    task = "corridor,width=0.62,turns=1,turn_angle=1.2,lookahead=1.2"
     trace = rps_jax.push("box", task=task, skin="ideal", setting=replace(BRIEF, rules=Rules(90.0)))
     data, world = trace.data, trace.world
     walls = [LineString(x) for x in data.walls.values]

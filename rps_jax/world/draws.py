@@ -48,6 +48,8 @@ _UNRANGED = {
     **tasks.MORE_NUMBERS,
 }
 _RANGED = {name: item.column for name, item in QUANTITIES.items() if name != "velocity_error"}
+if _RANGED.keys() & _UNRANGED:
+    raise ValueError(f"two quantities are named {_RANGED.keys() & _UNRANGED}")
 # Columns of the random numbers of a world by name, in their order.
 USES: dict[str, int] = dict(sorted((_RANGED | _UNRANGED).items(), key=lambda item: item[1]))
 

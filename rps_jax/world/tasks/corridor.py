@@ -18,6 +18,7 @@ from rps_jax import errors
 from rps_jax.geometry import footprint as fp
 from rps_jax.geometry import polyline
 from rps_jax.geometry.arrays import Array, Bool, Float
+from rps_jax.geometry.polyline import Polyline
 from rps_jax.record.options import option
 from rps_jax.world.quantity import Range, drawn
 from rps_jax.world.tasks.base import Aim, CourseInputs, Place
@@ -107,7 +108,7 @@ class Corridor(Path):
     def check(self) -> None:
         """Raise InputError for turns in which the walls of a corner would cross."""
         super().check()
-        need = self.width.high * np.tan(self.turn.high / 2) if self.turns.high else 0.0
+        need = self.width.high * np.tan(self.turn_angle.high / 2) if self.turns.high else 0.0
         part = self.length.low / (self.turns.high + 1)
         if self.waypoints:
             units = _units(self.route()[None])[0]
@@ -141,7 +142,7 @@ class Corridor(Path):
         walls = _walls(inner.line.vertices, half)
         opening = half * self.door_width.at(inputs.u["door_width"])
         doors = [
-            _door(inner.line.vertices, (i + 1) / (self.doors + 1), opening, 1.5 * half)
+            _door(inner.line, (i + 1) / (self.doors + 1), opening, 1.5 * half)
             for i in range(self.doors)
         ]
         return ends, CorridorCourse(inner, np.concatenate([walls, *doors], axis=1))
@@ -170,13 +171,15 @@ def _units(vertices: np.ndarray) -> np.ndarray:
     return np.take_along_axis(steps / np.where(lengths > 0, lengths, 1.0), last, axis=1)
 
 
-def _door(vertices: np.ndarray, share: float, inner: np.ndarray, outer: np.ndarray) -> np.ndarray:
-    """Return two walls (n, 2, 2, 2) [m] across paths, in the middle of a segment of theirs.
+def _door(line: Polyline, share: float, inner: np.ndarray, outer: np.ndarray) -> np.ndarray:
+    """Return two walls (n, 2, 2, 2) [m] across paths, in the middle of the segment at a share.
 
     They leave an opening of half width `inner` (n,) [m], and end at `outer` (n,) [m].
     """
-    first = int(share * (vertices.shape[1] - 1))
-    a, b, unit = vertices[:, first], vertices[:, first + 1], _units(vertices)[:, first]
+    passed = line.arcs[:, 1:] <= share * line.arcs[:, -1:]
+    rows, first = np.arange(len(passed)), np.minimum(passed.sum(axis=1), passed.shape[1] - 1)
+    a, b = line.vertices[rows, first], line.vertices[rows, first + 1]
+    unit = _units(line.vertices)[rows, first]
     normal = np.stack([-unit[:, 1], unit[:, 0]], axis=-1)
     ends = [(a + b) / 2 + s * x[:, None] * normal for s in (1, -1) for x in (inner, outer)]
     return np.stack([np.stack(ends[:2], axis=1), np.stack(ends[2:], axis=1)], axis=1)

@@ -108,7 +108,7 @@ class Path(Task):
         "error_95": ("m", "95 % quantile over time of the cross-track error"),
         "error_max": ("m", "largest cross-track error"),
     }
-    MORE_NUMBERS: ClassVar[Mapping[str, int]] = {f"turn_{i}": 52 + i for i in range(1, 7)}
+    MORE_NUMBERS: ClassVar[Mapping[str, int]] = {f"turn_angle_{i}": 52 + i for i in range(1, 7)}
 
     # Along the path, from its nearest point to the law's target.
     lookahead: Range = drawn(Range(0.5, 0.5), 49, "m", 0.05, 5, "lookahead on the path", "course")
@@ -116,7 +116,7 @@ class Path(Task):
     turns: Range = drawn(
         Range(1, 3), 51, "1", 0, _SEGMENTS - 1, "number of turns", "course", "", True
     )
-    turn: Range = drawn(Range(0.3, 0.8), 52, "rad", 0, 1.6, "angle of the turns", "course")
+    turn_angle: Range = drawn(Range(0.3, 0.8), 52, "rad", 0, 1.6, "angle of the turns", "course")
     # [m] in the world, where the base starts at the origin; then nothing but the lookahead is drawn
     waypoints: tuple[tuple[float, float], ...] = ()
     spline: bool = False  # whether a cubic spline joins the waypoints, instead of straight lines
@@ -124,7 +124,7 @@ class Path(Task):
     @property
     def idle(self) -> frozenset[str]:
         """Names of the ranges that are not drawn, since waypoints are given."""
-        return frozenset(("length", "turns", "turn") if self.waypoints else ())
+        return frozenset(("length", "turns", "turn_angle") if self.waypoints else ())
 
     @property
     def shape(self) -> Hashable:
@@ -180,8 +180,8 @@ class Path(Task):
         count = np.minimum(np.floor(low + (high + 1 - low) * u["turns"]), high)[:, None]
         # A half of each random number is the sign of a turn. Beyond 90 degrees it turns back.
         heading, headings = np.zeros(front.size), [np.zeros(front.size)]
-        for name in ("turn", *self.MORE_NUMBERS):
-            angle = self.turn.at((2 * u[name]) % 1) * np.where(u[name] < 0.5, -1, 1)
+        for name in ("turn_angle", *self.MORE_NUMBERS):
+            angle = self.turn_angle.at((2 * u[name]) % 1) * np.where(u[name] < 0.5, -1, 1)
             angle = np.where(np.abs(heading + angle) > np.pi / 2 + 1e-9, -angle, angle)
             heading = heading + angle
             headings.append(heading)
