@@ -150,7 +150,7 @@ def test_a_kink_of_the_world_has_no_derivative_and_is_told():
     slopes, bends = derivatives.world_slopes(square, drawn, Setting("fused"), numbers)
     assert (bends[:, 0] > 0.1).all()
     assert (bends[:, 1] < 1e-5).all()
-    assert slopes["fields.height"].keys() == {1}
+    assert ["world.fields.height" in slope for slope in slopes] == [False, True]
     gradient = np.where(bends > 0.01, np.nan, 1.0)[None]
     notes = derivatives._notes(square, "fused", numbers, np.ones(2, bool), gradient, bends)
     assert [x for x in notes if "kink" in x] == [

@@ -13,7 +13,7 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any, TypeVar, get_args
 
 import jax
 import numpy as np
@@ -26,6 +26,7 @@ from rps_jax.errors import InputError
 from rps_jax.record import files
 from rps_jax.record.options import parse_changes
 
+T = TypeVar("T")  # a pytree
 # Both are `Any` for the command line, which reads a text; a program may pass parameters.
 LawLike = str | Any  # text that names a law, or parameters of its class
 LawsLike = str | Any | Sequence[Any] | Mapping[str, Any]  # one law or several, or labelled laws
@@ -65,12 +66,12 @@ def leaves_to_json(tree: object) -> dict[str, Any]:
     return {name: np.asarray(leaf, float).tolist() for name, leaf in named_leaves(tree).items()}
 
 
-def replace_leaves(params: Params, changes: Mapping[str, Any]) -> Params:
-    """Replace leaves of parameters, by their paths (see `named_leaves`)."""
-    leaves = named_leaves(params)
+def replace_leaves(tree: T, changes: Mapping[str, Any]) -> T:
+    """Replace leaves of parameters, or of any pytree, by their paths (see `named_leaves`)."""
+    leaves = named_leaves(tree)
     for name in changes:
-        errors.check_name(f"parameter of {type(params).__name__}", name, leaves)
-    return jax.tree.unflatten(jax.tree.structure(params), list({**leaves, **changes}.values()))
+        errors.check_name(f"parameter of {type(tree).__name__}", name, leaves)
+    return jax.tree.unflatten(jax.tree.structure(tree), list({**leaves, **changes}.values()))
 
 
 def law_of(params: LawParams | type) -> Law:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import re
 import warnings
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -34,7 +34,7 @@ from rps_jax.trials.results import WORLD, labelled
 from rps_jax.trials.score import Objective
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.single import control_loop, count_steps
-from rps_jax.trials.trial import ControlLoop, Snapshot, World
+from rps_jax.trials.trial import ControlLoop, Snapshot
 from rps_jax.trials.worlds import drawn_worlds, soften_skins
 from rps_jax.tuning import gradients
 from rps_jax.tuning.descent import TuneGrad, soft_score
@@ -54,7 +54,7 @@ _STEP = 1e-6  # of differences, relative to a quantity
 _SMALLEST = 0.01  # in its unit, below which the step is not relative
 _NOISE = 1e-12  # relative change of a number of a world that is rounding
 _MAX_BEND = 0.01  # [1] relative difference of one-sided derivatives beyond which there is none
-_VECTORS = ("target", "com")  # x, y [m]
+_VECTORS = {"target": "p_world_target", "com": "solid.p_object_com"}  # [m], leaves of a draw
 _DISCRETE = ("corners", "sides", "feet_number", "object", "seed", "key_0", "key_1", "world")
 
 
@@ -63,8 +63,8 @@ class Coordinate(NamedTuple):
 
     label: str
     unit: str
-    name: str  # of a drawn quantity, or of a leaf of the parameters
-    axis: int = 0  # of a vector of a world
+    name: str  # of a drawn quantity or a vector, or of a leaf of the parameters
+    index: tuple[int, ...] = ()  # in a vector or a leaf
     is_parameter: bool = False
 
 
@@ -142,24 +142,30 @@ def value_and_grad(
         rule = "a law without a parameter v_max needs a function of the snapshots"
         raise errors.not_allowed("score", "an Objective", rule)
     cache.use_cache_if_requested()
-    coordinates, index = several[0], np.arange(worlds)
-    value = np.empty((len(chosen), worlds))
-    gradient, bend = (
-        np.empty((*value.shape, len(coordinates))),
-        np.empty((worlds, len(coordinates))),
-    )
-    used, temperature = np.array([coordinate.is_parameter for coordinate in coordinates]), 0.0
+    numbers, index = several[0], np.arange(worlds)
+    value, bend = np.empty((len(chosen), worlds)), np.empty((worlds, len(numbers)))
+    gradient = np.empty((*value.shape, len(numbers)))
+    used, temperature = np.array([x.is_parameter for x in numbers]), 0.0
     for at, drawn in points.draw_by_object(ranges, setting.seed, None, index):
         batch = drawn_worlds(ranges, drawn, setting)
-        staged = soften_skins(batch.worlds) if smooth else batch.worlds
-        skin: Any = staged.skin
-        temperature = float(skin.temperature[0]) if smooth else 0.0
-        slopes, bend[at] = world_slopes(ranges, drawn, setting, coordinates)
-        used |= [any(i in x for x in slopes.values()) for i in range(len(coordinates))]
+        if smooth:
+            batch = batch._replace(worlds=soften_skins(batch.worlds))
+            temperature = float(batch.worlds.skin.temperature[0])
+        slopes, bend[at] = world_slopes(ranges, drawn, setting, numbers)
+        used |= list(map(bool, slopes))
+        names = {name for slope in slopes for name in slope}
+        names |= {f"params.{x.name}" for x in numbers if x.is_parameter}
         for i, (params, loop) in enumerate(zip(chosen.values(), loops, strict=True)):
-            value[i, at], gradient[i, at] = _value_and_slopes(
-                *(batch.stage, staged, slopes, params, loop), score, coordinates, steps, setting
-            )
+            inputs = {"world": batch.worlds, "params": batch.with_params(params).params}
+            leaves = {name: x for name, x in named_leaves(inputs).items() if name in names}
+            options = {"loop": loop, "score": score, "steps": steps, "setting": setting}
+            results = _value_and_slopes(batch.stage, inputs, leaves, **options)
+            value[i, at], by_leaf = jax.device_get(results)
+            for k, (x, slope) in enumerate(zip(numbers, slopes, strict=True)):
+                products = [y * by_leaf[name] for name, y in slope.items()]
+                if x.is_parameter:
+                    products = [by_leaf[f"params.{x.name}"][(slice(None), *x.index)]]
+                gradient[i, at, k] = sum(y.reshape(at.size, -1).sum(axis=1) for y in products)
     gradient = np.where(bend > _MAX_BEND, np.nan, gradient)
     mean = [gradients.estimate(jnp.asarray(x)) for x in gradient]
     dims, mean_dims = ("law", "world", "quantity"), ("law", "quantity")
@@ -172,17 +178,17 @@ def value_and_grad(
         mean=(mean_dims, [x.gradient for x in mean], "1 / unit", "mean over finite derivatives"),
         error=(mean_dims, error, "1 / unit", "standard error of the mean"),
     )
-    kinds = ["parameter" if coordinate.is_parameter else "world" for coordinate in coordinates]
+    kinds = ["parameter" if x.is_parameter else "world" for x in numbers]
     coords: dict[str, Any] = {
         "law": list(chosen),
         "world": ("world", index, {"long_name": WORLD}),
-        "quantity": [coordinate.label for coordinate in coordinates],
-        "unit": ("quantity", [coordinate.unit for coordinate in coordinates]),
+        "quantity": [x.label for x in numbers],
+        "unit": ("quantity", [x.unit for x in numbers]),
         "kind": ("quantity", kinds),
         "map_error": ("quantity", bend.max(axis=0), {"units": "1"}),
     }
     coords |= points.drawn_columns(ranges, setting.seed, None, index)
-    notes = " ".join(_notes(ranges, setting.engine, coordinates, used, gradient, bend))
+    notes = " ".join(_notes(ranges, setting.engine, numbers, used, gradient, bend))
     if notes:
         warnings.warn(notes, stacklevel=3)
     attrs = provenance.attributes() | {
@@ -207,40 +213,32 @@ def coordinates_of(
     """
     names = (wrt,) if isinstance(wrt, str) else tuple(wrt)
     errors.check_each_once("wrt", names)
-    drawn = (*QUANTITIES, *VELOCITY_ERRORS, "com_bearing")
-    parameters = {
-        f"params.{leaf}" if leaf in (*drawn, *_VECTORS) else leaf: (leaf, np.shape(value))
-        for leaf, value in named_leaves(params).items()
-    }
-    coordinates: list[Coordinate] = []
+    drawn, leaves = (*QUANTITIES, *VELOCITY_ERRORS, "com_bearing"), named_leaves(params)
+    known = {f"params.{x}" if x in (*drawn, *_VECTORS) else x: x for x in leaves}
+    numbers: list[Coordinate] = []
     for name in names:
-        if name in parameters:
-            leaf, shape = parameters[name]
-            unit = _unit_of_leaf(params, leaf)
-            for at in np.ndindex(shape):
+        if name in known:
+            leaf = known[name]
+            for at in np.ndindex(np.shape(leaves[leaf])):
                 label = f"{name}[{','.join(map(str, at))}]" if at else name
-                coordinates.append(Coordinate(label, unit, leaf, is_parameter=True))
+                numbers.append(Coordinate(label, _unit_of_leaf(params, leaf), leaf, at, True))
         elif name in _VECTORS:
-            coordinates += [
-                Coordinate(f"{name}_{axis}", "m", name, i) for i, axis in enumerate("xy")
-            ]
+            numbers += [Coordinate(f"{name}_{x}", "m", name, (i,)) for i, x in enumerate("xy")]
         else:
-            is_known = name in QUANTITIES
-            if name in _DISCRETE or (is_known and QUANTITIES[name].jumps):
+            rule, quantity = "", QUANTITIES.get(name)
+            if name in _DISCRETE or (quantity and quantity.jumps):
                 rule = "worlds change in steps with it, so that it has no derivative"
-                raise errors.not_allowed("wrt", name, rule)
-            errors.check_name("name of wrt", name, (*parameters, *_VECTORS, *drawn))
-            if name in domain.idle - {"friction_ground", "friction_robot"}:
+            elif name in domain.idle - {"friction_ground", "friction_robot"}:
                 rule = f"the domain's objects, targets or skin leave no {name} to draw"
-                raise errors.not_allowed("wrt", name, rule)
-            if is_known and getattr(domain, name) is None:
+            elif quantity and getattr(domain, name) is None:
                 rule = f"the domain draws none; append ,{name}=LOW:HIGH to its name"
+            if rule:
                 raise errors.not_allowed("wrt", name, rule)
+            errors.check_name("name of wrt", name, (*known, *_VECTORS, *drawn))
             parts = tuple(VELOCITY_ERRORS) if name == "velocity_error" else (name,)
-            units = {"com_bearing": "rad"}
-            coordinates += [Coordinate(x, units.get(x, unit_of(x)), x) for x in parts]
-    errors.check_each_once("wrt", [coordinate.label for coordinate in coordinates])
-    return tuple(coordinates)
+            numbers += [Coordinate(x, unit_of(x), x) for x in parts]
+    errors.check_each_once("wrt", [x.label for x in numbers])
+    return tuple(numbers)
 
 
 def _unit_of_leaf(params: object, path: str) -> str:
@@ -253,109 +251,76 @@ def _unit_of_leaf(params: object, path: str) -> str:
 
 
 def world_slopes(
-    domain: Domain, drawn: Draw, setting: Setting, coordinates: Sequence[Coordinate]
-) -> tuple[dict[str, dict[int, np.ndarray]], np.ndarray]:
+    domain: Domain, drawn: Draw, setting: Setting, numbers: Sequence[Coordinate]
+) -> tuple[list[dict[str, np.ndarray]], np.ndarray]:
     """Return derivatives of worlds by numbers: central differences on the host, in float64.
 
     Returns:
-      Derivatives (n, ...) of those leaves of the worlds that depend on a number, by the name of
-      the leaf and the index of the number; and relative differences (n, q) [1] of the one-sided
-      derivatives, which bound the relative errors of the central ones.
+      For each number, derivatives (n, ...) of those leaves of the worlds that depend on it, by
+      their names; and relative differences (n, q) [1] of the one-sided derivatives, which bound
+      the relative errors of the central ones.
     """
 
     def leaves(draw: Draw) -> dict[str, Any]:
         worlds = drawn_worlds(domain, draw, setting).worlds._replace(shift=None, key=None)
-        return named_leaves(worlds)
+        return named_leaves({"world": worlds})
 
-    dtype = jnp.result_type(float)
-    slopes: dict[str, dict[int, np.ndarray]] = {}
-    bends = np.zeros((drawn.indices.size, len(coordinates)))
+    def moved(number: Coordinate, step: np.ndarray) -> Draw:
+        if number.name not in _VECTORS:
+            return draws.draw(domain, setting.seed, drawn.indices, {number.name: step})
+        path = _VECTORS[number.name]
+        value = np.array(named_leaves(drawn)[path])
+        value[:, number.index[0]] += step
+        return registry.replace_leaves(drawn, {path: value})
+
+    count = drawn.indices.size
+    slopes: list[dict[str, np.ndarray]] = [{} for _ in numbers]
+    bends = np.zeros((count, len(numbers)))
     with jax.enable_x64(True):
         middle = leaves(drawn)
-        for i, coordinate in enumerate(coordinates):
-            if coordinate.is_parameter:
+        for i, number in enumerate(numbers):
+            if number.is_parameter:
                 continue
-            value = _value_of(drawn, coordinate)
+            value = drawn.values.get(number.name, np.ones(count))
             step = _STEP * np.maximum(np.abs(value), _SMALLEST)
-            above, below = (
-                leaves(_moved(domain, drawn, setting, coordinate, x)) for x in (step, -step)
-            )
+            above, below = (leaves(moved(number, x)) for x in (step, -step))
             for name, leaf in middle.items():
-                up, at, down = (x.reshape(len(step), -1) for x in (above[name], leaf, below[name]))
+                up, at, down = (x.reshape(count, -1) for x in (above[name], leaf, below[name]))
                 change, bend = up - down, up - 2 * at + down
                 noise = _NOISE * np.abs(at).max(initial=0.0)
                 change[np.abs(change) <= noise] = 0.0
-                if not change.any():
-                    continue
-                slope = change / (2 * step[:, None])
-                slopes.setdefault(name, {})[i] = slope.reshape(leaf.shape).astype(dtype)
-                size = np.maximum(np.abs(change).max(axis=1), noise)
-                bends[:, i] = np.maximum(bends[:, i], np.abs(bend).max(axis=1) / size)
+                if change.any():
+                    slopes[i][name] = (change / (2 * step[:, None])).reshape(leaf.shape)
+                    size = np.maximum(np.abs(change).max(axis=1), noise)
+                    bends[:, i] = np.maximum(bends[:, i], np.abs(bend).max(axis=1) / size)
     return slopes, bends
-
-
-def _value_of(drawn: Draw, coordinate: Coordinate) -> np.ndarray:
-    """Return the values (n,) of a number in drawn worlds; 1 of an angle or an error."""
-    vectors = {"target": drawn.p_world_target, "com": drawn.solid.p_object_com}
-    if coordinate.name in vectors:
-        return vectors[coordinate.name][:, coordinate.axis]
-    return drawn.values.get(coordinate.name, np.ones(drawn.indices.size))
-
-
-def _moved(
-    domain: Domain, drawn: Draw, setting: Setting, coordinate: Coordinate, step: np.ndarray
-) -> Draw:
-    """Return drawn worlds with a number changed by steps (n,)."""
-    if coordinate.name not in _VECTORS:
-        return draws.draw(domain, setting.seed, drawn.indices, {coordinate.name: step})
-    move = np.eye(3)[coordinate.axis] * step[:, None]
-    if coordinate.name == "target":
-        return drawn._replace(p_world_target=drawn.p_world_target + move[:, :2])
-    solid = drawn.solid
-    return drawn._replace(solid=solid._replace(p_object_com=solid.p_object_com + move))
 
 
 # --- the score -------------------------------------------------------------------------------
 
 
-@partial(jax.jit, static_argnums=(5, 6, 7, 8))
+@partial(jax.jit, static_argnames=("loop", "score", "steps", "setting"))
 def _value_and_slopes(
     stage: Stage,
-    worlds: World,
-    slopes: Mapping[str, Mapping[int, jax.Array]],
-    params: LawParams,
+    inputs: Any,
+    leaves: dict[str, jax.Array],
+    *,
     loop: ControlLoop,
     score: Score | Objective,
-    coordinates: tuple[Coordinate, ...],
     steps: int,
     setting: Setting,
-) -> tuple[jax.Array, jax.Array]:
-    """Return the scores (n,) of worlds, and their derivatives (n, q) by numbers."""
-    leaves = named_leaves(worlds)
-    names = {coordinate.name: None for coordinate in coordinates if coordinate.is_parameter}
+) -> tuple[jax.Array, dict[str, jax.Array]]:
+    """Return the scores (n,) of worlds and laws, and their derivatives (n, ...) by some leaves."""
 
-    def changed(theta: jax.Array) -> LawParams:
-        values = {}
-        for name in names:
-            value = jnp.asarray(named_leaves(params)[name], theta.dtype)
-            at = [i for i, x in enumerate(coordinates) if x.is_parameter and x.name == name]
-            values[name] = value + theta[np.array(at)].reshape(value.shape)
-        return registry.replace_leaves(params, values)
+    def scores(leaves: dict[str, jax.Array]) -> jax.Array:
+        moved = registry.replace_leaves(inputs, leaves)
+        worlds, params = moved["world"], moved["params"]
+        running = np.ones(len(worlds.qpos), bool)
+        trials = trial.start_all(worlds, params, running, law=loop.law)
+        _, snapshots = trial.unroll(stage, worlds, params, trials, loop, steps, native.mapped)
+        return jax.vmap(partial(_score, score, setting), (1, 0))(snapshots, params)
 
-    def scores(thetas: jax.Array) -> jax.Array:
-        moved = {name: leaves[name] for name in slopes}
-        for name, by_number in slopes.items():
-            for i, slope in by_number.items():
-                moved[name] += slope * thetas[:, i].reshape(-1, *[1] * (slope.ndim - 1))
-        world: Any = registry.replace_leaves(worlds, moved)  # pyright: ignore[reportArgumentType]
-        candidates = jax.vmap(changed)(thetas)
-        trials = trial.start_all(world, candidates, np.ones(len(thetas), bool), law=loop.law)
-        inputs = stage, world, candidates, trials, loop, steps
-        _, snapshots = trial.unroll(*inputs, native.mapped)
-        return jax.vmap(partial(_score, score, setting), (1, 0))(snapshots, candidates)
-
-    thetas = jnp.zeros((len(worlds.qpos), len(coordinates)), worlds.qpos.dtype)
-    values, pull_back = jax.vjp(scores, thetas)
+    values, pull_back = jax.vjp(scores, leaves)
     return values, pull_back(jnp.ones_like(values))[0]
 
 
@@ -379,13 +344,13 @@ def _score(
 def _notes(
     domain: Domain,
     engine: str,
-    coordinates: Sequence[Coordinate],
+    numbers: Sequence[Coordinate],
     used: np.ndarray,
     gradient: np.ndarray,
     bend: np.ndarray,
 ) -> Iterator[str]:
     """Yield sentences on numbers without influence or without derivatives."""
-    is_mass = np.array([x.name == "mass" and not x.is_parameter for x in coordinates])
+    is_mass = np.array([x.name == "mass" and not x.is_parameter for x in numbers])
     is_mass &= not domain.weakest.driven
     if is_mass.any():
         yield (
@@ -400,8 +365,6 @@ def _notes(
         (used & is_zero & ~is_mass, "Derivatives of zero in every world within the horizon:"),
         (bent, "No derivatives in worlds whose numbers have a kink (see finite):"),
     ):
-        labels = [
-            coordinate.label for coordinate, chosen in zip(coordinates, mask, strict=True) if chosen
-        ]
+        labels = [x.label for x, chosen in zip(numbers, mask, strict=True) if chosen]
         if labels:
             yield f"{sentence} {', '.join(labels)}."

@@ -246,10 +246,12 @@ LABELS: dict[str, str] = {
     **VELOCITY_ERRORS,
 }
 
+_UNITS = {"com_bearing": "rad"}  # of numbers that belong to no range
+
 
 def unit_of(name: str) -> str:
-    """Return the unit of a column of a table of worlds."""
-    return QUANTITIES[name].unit if name in QUANTITIES else "1"
+    """Return the unit of a drawn quantity, or of a column of a table of worlds."""
+    return QUANTITIES[name].unit if name in QUANTITIES else _UNITS.get(name, "1")
 
 
 def _constant(value: float) -> Range:
