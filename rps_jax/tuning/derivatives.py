@@ -37,7 +37,6 @@ from rps_jax.trials.single import control_loop, count_steps
 from rps_jax.trials.trial import ControlLoop, Snapshot
 from rps_jax.trials.worlds import drawn_worlds, soften_skins
 from rps_jax.tuning import gradients
-from rps_jax.tuning.descent import TuneGrad, soft_score
 from rps_jax.world import draws, points
 from rps_jax.world.domain import (
     QUANTITIES,
@@ -329,7 +328,7 @@ def _score(
 ) -> jax.Array:
     """Return the score () of a trajectory (T, ...), or raise InputError if it is no number."""
     if isinstance(score, Objective):
-        return soft_score(snapshots, params, setting, score, TuneGrad.arrive)
+        return soft_score(snapshots, params, setting, score)
     try:
         value = jnp.asarray(score(snapshots))
     except Exception as error:
@@ -339,6 +338,30 @@ def _score(
         rule = "of the snapshots (T, ...) of one trial it must return one real number"
         raise errors.not_allowed("result of score", f"{value.dtype}{[*value.shape]}", rule)
     return value
+
+
+def soft_score(
+    snapshots: Snapshot,
+    params: LawParams,
+    setting: Setting,
+    objective: Objective,
+    arrive: float = 0.005,
+) -> jax.Array:
+    """Return the objective's score () of the snapshots (T, ...) of a softened window.
+
+    The base arrives at a step by a weight: in contact, and nearer than d_success within the
+    temperature `arrive` [m]. Later steps count by the weight of not having arrived. At the end
+    the remaining distance costs the time to drive it at v_max, because no window is long enough to
+    detect a failure.
+    """
+    period = setting.physics.control_period
+    contact, distance = 1.0 * snapshots.reading.in_contact, snapshots.details.distance
+    arrival = contact * jax.nn.sigmoid((params.d_success - distance) / arrive)
+    under_way = jnp.cumprod(1 - arrival)
+    touched = jax.lax.cummax(contact)
+    time = period * jnp.sum(under_way) + under_way[-1] * distance[-1] / params.v_max
+    lost = period * jnp.sum(under_way * touched * (1 - contact))
+    return jnp.asarray(objective.score(1.0, time, lost, 0.0, setting.rules))
 
 
 def _notes(

@@ -38,7 +38,7 @@ from rps_jax.tuning.space import Space, expand_subsets
 from rps_jax.world.domain import Domain, DomainLike, parse_domain
 
 TUNED = "tuned.json"  # file of a run folder: the parameters with the best validation
-UNITS = {"compile": "s", "run": "s", "simulated": "s", "differentiate": "s"}
+UNITS = {"compile": "s", "run": "s", "simulated": "s"}
 # Dimensions of those results of a generation that are arrays.
 DIMS = {
     **dict.fromkeys(("vectors", "gradients"), ("candidate", "parameter")),
@@ -73,8 +73,7 @@ class Tuning(LawQuestion[xr.Dataset]):
 
     law: LawLike = "rps"
     """Law with the initial parameters: a name, as rps, rps_tuned or rps_plus, or a file's class
-    with bounds, as my_law.py:MyParams; changes follow, as rps,K_h=0.3 or rps,tuned.json. Gradients
-    need a law with a smooth form: rps or rps_plus."""
+    with bounds, as my_law.py:MyParams; changes follow, as rps,K_h=0.3 or rps,tuned.json."""
     domain: DomainLike | Sequence[DomainLike] = ("wide",)
     """Domains to tune in: paper, hardware, wide, real, prisms, hostile, or JSON files of ranges;
     changes follow each, as wide,mass=3:10."""

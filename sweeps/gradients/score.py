@@ -1,6 +1,6 @@
 """Compare scores of windows: which one has the gradient of whole trials?
 
-`rps tune grad` differentiates the score of a window of a softened trial. Here its gradients are
+`windows.py` differentiates the score of a window of a softened trial. Here its gradients are
 compared, for several lengths of the window and temperatures, with the gradient of the objective of
 whole trials under the original law, by central differences in other worlds.
 
@@ -26,8 +26,8 @@ from rps_jax.runs.question import Run, SimulationQuestion, call_of, seed_of
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import Rules
 from rps_jax.tuning import descent
-from rps_jax.tuning.descent import TuneGrad
 from rps_jax.tuning.gradients import Estimate, estimate
+from sweeps.gradients.windows import WindowTuning, window_gradients
 from sweeps.study_base import QuickStudy, Rows, Table
 
 _DRAWS = 4000  # of the errors of both gradients
@@ -72,9 +72,9 @@ class ScoreStudy(QuickStudy[xr.Dataset], SimulationQuestion[xr.Dataset]):
 
     def tuning(
         self, estimator: str, window: float = 8.0, arrive: float = 0.005, taxels: float = 0.03
-    ) -> TuneGrad:
+    ) -> WindowTuning:
         """Return the tuning whose gradient is estimated."""
-        return TuneGrad(
+        return WindowTuning(
             "rps",
             tuned=self.tuned,
             worlds=self.worlds,
@@ -156,9 +156,9 @@ class ScoreStudy(QuickStudy[xr.Dataset], SimulationQuestion[xr.Dataset]):
         gradient = descent.evolution_gradients(thetas, tuning, 0, score)
         return self._row(gradient, simulated, 0)
 
-    def _window(self, tuning: TuneGrad) -> xr.Dataset:
+    def _window(self, tuning: WindowTuning) -> xr.Dataset:
         """Return the gradient of windows."""
-        gradient, cost, _ = descent.window_gradients(jnp.asarray(tuning.base)[None], tuning, 0)
+        gradient, cost, _ = window_gradients(jnp.asarray(tuning.base)[None], tuning, 0)
         return self._row(gradient, cost, 0)
 
     def _row(self, x: Estimate, cost: float, index: int | None = None) -> xr.Dataset:
