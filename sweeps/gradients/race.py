@@ -1,7 +1,7 @@
 """Race gradients against evolution: equal wall time and equal simulated time.
 
 Each tuning is a run of `rps tune grad`, `windows.py` or `rps tune es` from the paper's parameters,
-in a folder of its own, and is killed after some minutes; a second call continues it, up to these
+in a separate folder, and is killed after some minutes; a second call continues it, up to these
 minutes. The generation with the best validation within a budget is tested in worlds that no tuning
 has met.
 
@@ -94,7 +94,7 @@ class Race(Study[xr.Dataset], SimulationQuestion[xr.Dataset]):
             errors.check_name("count", str(count), [str(x) for x in COUNTS])
 
     def configuration(self) -> dict[str, Any]:
-        """Return everything that the answer depends on; the commands stand for the tunings."""
+        """Return all inputs of the answer; the commands stand for the tunings."""
         fields = {k: v for k, v in super().configuration().items() if k not in ("lanes", "gpus")}
         return fields | {"commands": {name: METHODS[name] for name in self.methods}}
 

@@ -48,7 +48,7 @@ from sweeps.study_base import QuickStudy, Rows, Table, part_name
 TRUTH = "truth"
 HORIZONS = (0.5, 2.0, 8.0, 30.0)  # [s]
 ESTIMATORS = ("exact", "warm", "clipped", "bundled", "evolution", "mixed")
-SINGLE = ("exact", "warm", "bundled", "evolution")  # that have samples of their own
+SINGLE = ("exact", "warm", "bundled", "evolution")  # estimators with separate samples
 WARM = 0.1  # [1] temperature of the taxels for `warm`
 # Estimators that are computed from the samples of others.
 _INPUTS = {"clipped": ("exact",), "mixed": ("exact", "evolution")}
