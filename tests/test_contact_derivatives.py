@@ -143,7 +143,8 @@ def products(a, b):
 
 
 @pytest.mark.parametrize("domain", [
-    "wide,objects=random_box", "real,objects=random_cylinder", "real,objects=random_prism",
+    pytest.param("wide,objects=random_box", marks=pytest.mark.slow),
+    "real,objects=random_cylinder", "real,objects=random_prism",
 ])  # fmt: skip
 def test_derivatives_are_finite_and_both_modes_agree(domain):
     """In 10,000 states up to far from any contact, in float32, by native functions."""

@@ -77,7 +77,10 @@ def close(actual, desired, warm, rest):
         np.testing.assert_allclose(a, b, rtol=1e-4, atol=rest)
 
 
-PAIRS = [("box", "capacitive"), ("cylinder", "ideal"), ("prism", "capacitive")]
+PAIRS = [
+    pytest.param("box", "capacitive", marks=pytest.mark.slow),
+    ("cylinder", "ideal"), ("prism", "capacitive"),
+]  # fmt: skip
 
 
 @pytest.mark.parametrize(("shape", "skin"), PAIRS)
