@@ -52,10 +52,10 @@ class TuneGrad(Tuning):
 
     worlds: int = option(512, 1, 10_000_000)
     """Number of worlds of a step, in each domain; every step has other worlds."""
-    learning_rate: float = option(0.3, above=0)
+    learning_rate: float = option(0.2, above=0)
     """Root mean square change of the parameters in the first step, in units of the bounded map [1];
     it decays to zero along a cosine."""
-    steps: int = option(40, 1, 1_000_000)
+    steps: int = option(50, 1, 1_000_000)
     """Number of steps of each descent."""
     starts: int = option(1, 1, 1_000_000)
     """Number of concurrent descents: one from the start itself, the others from random vectors

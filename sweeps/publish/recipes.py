@@ -281,7 +281,7 @@ RECIPES: dict[str, Recipe] = {
         cores=12,
     ),
     "gradients_race": recipe(
-        f"rps sweeps/gradients/race.py --lanes 12 --gpus 1 --minutes 4.75 --wall 200 {_MACHINE}",
+        f"rps sweeps/gradients/race.py --lanes 12 --gpus 1 --minutes 4.75 --wall 210 {_MACHINE}",
         gpu=8,
     ),
     "gradients_network": recipe(
