@@ -90,9 +90,8 @@ def check_finite(name: str, value: Any, **bounds: Any) -> float:
 
 def check_vector(name: str, values: Iterable[object], **bounds: float | str) -> list[float]:
     """Return the finite numbers x and y within bounds: see `check_number`."""
-    return [
-        check_finite(f"{name} {axis}", v, **bounds) for axis, v in zip("xy", values, strict=True)
-    ]
+    axes = zip("xy", values, strict=True)
+    return [check_finite(f"{name} {axis}", value, **bounds) for axis, value in axes]
 
 
 def check_array(

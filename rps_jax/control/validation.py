@@ -106,9 +106,8 @@ def _check_traced(
         for name, leaf in fields._asdict().items():
             dtype = getattr(leaf, "dtype", None)
             is_scalar = np.shape(leaf) == () and getattr(dtype, "kind", "") in tuple(kinds)
-            check(
-                "" if is_scalar else f"{group} whose {name} is {_describe(leaf)}", "a real scalar"
-            )
+            fault = "" if is_scalar else f"{group} whose {name} is {_describe(leaf)}"
+            check(fault, "a real scalar")
     check(_difference(state, next_state), "the shapes and types that init returned")
 
 
@@ -154,9 +153,8 @@ def _difference(state: object, next_state: object) -> str:
     """Describe how a state differs from the initial one; empty if it does not."""
     if jax.tree.structure(state) != jax.tree.structure(next_state):
         return "a state of another structure"
-    for (name, old), new in zip(
-        named_leaves(state).items(), jax.tree.leaves(next_state), strict=True
-    ):
+    leaves = zip(named_leaves(state).items(), jax.tree.leaves(next_state), strict=True)
+    for (name, old), new in leaves:
         if _describe(old) != _describe(new):
             return f"a state whose {name} is {_describe(new)}, and {_describe(old)} in init"
     return ""

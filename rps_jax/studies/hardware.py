@@ -143,13 +143,11 @@ class Hardware(LawQuestion[xr.Dataset]):
 
     def _trace(self, run: Run) -> xr.Dataset:
         """Return the paths of Fig. 7: all objects and targets, at the middle friction."""
-        record = partial(
-            pushes.record_batch, setting=self.setting, interval=0.5, callback=run.callback
-        )
-        batches = [pushes.build(self._cases(name), self.setting) for name in HARDWARE_OBJECTS]
-        by_object = [
-            [trace_dataset(x)[list(_TRACED)] for x in record(worlds)] for worlds in batches
-        ]
+        by_object = []
+        for name in HARDWARE_OBJECTS:
+            batch = pushes.build(self._cases(name), self.setting)
+            trials = pushes.record_batch(batch, self.setting, interval=0.5, callback=run.callback)
+            by_object.append([trace_dataset(x)[list(_TRACED)] for x in trials])
         # NaN after the end of a trial.
         traces = xr.combine_nested(by_object, ["object", "target"], join="outer")
         traces = traces.transpose("object", "target", ...)

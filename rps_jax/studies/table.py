@@ -77,9 +77,7 @@ class Table(TrialOptions, MultiLawQuestion[xr.Dataset]):
     def run_cases(self, run: Run) -> xr.Dataset:
         """Run all cases, and return their outcomes."""
         outcome, _ = pushes.run(self.cases, self.setting, **run.batch_options)
-        objects = [
-            Path(name).stem if files.suffix_of(name) == ".xml" else name for name in self.objects
-        ]
+        objects = [Path(x).stem if files.suffix_of(x) == ".xml" else x for x in self.objects]
         frictions = [label_of(friction) for friction in self.friction]
         return outcome_dataset(outcome, list(self.chosen), objects, frictions, self.targets)
 

@@ -363,8 +363,7 @@ class _Program:
         inputs, trials = zip(*map(self.shapes, range(len(self.queues))), strict=True)
         masks = tuple(jax.ShapeDtypeStruct((n,), bool, sharding=self.sharding) for n in self.slots)
         stages, rules = jax.eval_shape(lambda: (self.stages, self.setting.rules))
-        arguments = (stages, inputs, trials, masks, masks, rules)
-        leaves, structure = jax.tree.flatten(arguments)
+        leaves, structure = jax.tree.flatten((stages, inputs, trials, masks, masks, rules))
         physics = self.setting.physics
         return _compile_advance(physics, self.law, self.sharding, structure, tuple(leaves))
 

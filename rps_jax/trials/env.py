@@ -298,9 +298,8 @@ class PushEnv:
 
     @functools.cached_property
     def _alone(self) -> Domain:
-        return dataclasses.replace(
-            domain.parse_domain(self.domain, self.robot), objects=(self.object,)
-        )
+        ranges = domain.parse_domain(self.domain, self.robot)
+        return dataclasses.replace(ranges, objects=(self.object,))
 
     @functools.cached_property
     def _drawn(self) -> Draw:

@@ -253,10 +253,8 @@ class GymPushVector(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             return np.ones(self.num_envs, bool)
         where = np.asarray(mask)
         if where.shape != (self.num_envs,) or where.dtype != bool or not where.any():
-            rule = (
-                f"it must be an array of shape ({self.num_envs},) and type bool with a true value"
-            )
-            raise errors.not_allowed("reset_mask", mask, rule)
+            kind = f"an array of shape ({self.num_envs},) and type bool"
+            raise errors.not_allowed("reset_mask", mask, f"it must be {kind} with a true value")
         if self._state is None and not where.all():
             raise errors.not_allowed("reset_mask", mask, "the first reset must be of all worlds")
         return where

@@ -121,9 +121,8 @@ def trace_dataset(trajectory: Trajectory) -> xr.Dataset:
     for name, value in trajectory.outcome._asdict().items():
         variables[f"outcome_{name}"] = variable(name, (), np.asarray(value))
     variables["p_world_contact"] = over_time(trial.p_world_contact(snapshots), "m", "axis")
-    variables["p_world_target"] = xr.Variable(
-        "axis", list(trajectory.p_world_target), {"units": "m"}
-    )
+    target = list(trajectory.p_world_target)
+    variables["p_world_target"] = xr.Variable("axis", target, {"units": "m"})
     for name in ("d_success", *(("l_cr",) if isinstance(trajectory.params, RPSParams) else ())):
         variables[name] = xr.Variable((), _plain(getattr(trajectory.params, name)), {"units": "m"})
     for name, value in zip(("half_length", "half_width"), world.skin.shell.half, strict=True):

@@ -26,8 +26,7 @@ class PhysicsField:
     def __get__(self, instance: Setting | None, owner: type | None = None) -> Physics:
         if instance is None:
             return "default"  # pyright: ignore[reportReturnType]  # of the dataclass's field
-        value = instance.__dict__["physics"]
-        return physics_.parse_physics(value, instance.fidelity)
+        return physics_.parse_physics(instance.__dict__["physics"], instance.fidelity)
 
     def __set__(self, instance: Setting, value: str | Physics) -> None:
         instance.__dict__["physics"] = value

@@ -231,10 +231,8 @@ def observe(
     touched = reading.p_robot_contact, reading.in_contact
     observation = Observation(trial.qpos[:2], trial.qpos[2], *touched, world.p_world_target, period)
     distance = planar.norm(displacement(observation))
-    pose = trial.qpos[JOINTS.base]
-    poses, believed = base.observe_pose(
-        world.odometry, trial.poses, pose, world.key, trial.steps, period
-    )
+    motion = trial.poses, trial.qpos[JOINTS.base], world.key, trial.steps, period
+    poses, believed = base.observe_pose(world.odometry, *motion)
     observation = observation._replace(p_world_robot=believed[:2], yaw=believed[2])
 
     touch = reading.contact_type != NONE
@@ -453,9 +451,8 @@ def advance(batches: Sequence[Batch], loop: ControlLoop, steps: int) -> tuple[Tr
 
         def step(carry: tuple[int | jax.Array, Trial]) -> tuple[int | jax.Array, Trial]:
             count, trial = carry
-            return count + 1, control_step(
-                stage, world, params, trial, world_loop, lambda f, *_: f
-            )[0]
+            inputs = stage, world, params, trial, world_loop
+            return count + 1, control_step(*inputs, mapped=lambda f, *_: f)[0]
 
         return jax.lax.while_loop(lambda c: (c[0] < steps) & ~c[1].done, step, (0, trial))[1]
 
@@ -497,8 +494,7 @@ def _advance_in_xla(batches: Sequence[Batch], loop: ControlLoop, steps: int) -> 
             return count + unchecked, jax.lax.fori_loop(0, unchecked, step, trials)
         return count + 1, step(0, trials)
 
-    started = tuple(batch[-1] for batch in batches)
-    return jax.lax.while_loop(any_runs, body, (0, started))[1]
+    return jax.lax.while_loop(any_runs, body, (0, tuple(batch[-1] for batch in batches)))[1]
 
 
 @partial(jax.jit, static_argnames=("steps", "stride"), donate_argnames="trials")

@@ -261,9 +261,8 @@ class Fit(LawQuestion[Fitted], DomainQuestion[Fitted], LogsQuestion):
         """Minimise the residuals of the replayed windows, and sample the posterior."""
         set_phase(run.callback, "replay")
         seed, names = self.setting.seed, points.names(self.ranges)
-        start = points.points_of(
-            self.ranges, np.arange(self.num_trials() or 0), seed_of(seed, "tune")
-        )
+        index = np.arange(self.num_trials() or 0)
+        start = points.points_of(self.ranges, index, seed_of(seed, "tune"))
         minima = device.standard_jax()(self.replay.minima)(start)
         u, eigenvalues = least_squares.sample(self.replay, *minima, SAMPLES, seed)
         data = summary(self.ranges, u[:, [names.index(x) for x in coordinates(self.ranges)]])

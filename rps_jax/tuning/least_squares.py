@@ -191,9 +191,8 @@ class Replay(NamedTuple):
         stage, fields = engine.stage(family, *bodies)
         latency = np.zeros(len(moved)) if self.exact else drawn.values["pose_latency"]
         windows = [track.windows(x) for x in latency for track in self.tracks]
-        constants = jax.tree.map(
-            lambda x: np.repeat(x, self.num_windows, axis=0), (fields, drawn.solid.height)
-        )
+        constants = fields, drawn.solid.height
+        constants = jax.tree.map(lambda x: np.repeat(x, self.num_windows, axis=0), constants)
         inputs = (*constants, jax.tree.map(lambda *x: np.concatenate(x), *windows))
         inputs = jax.tree.map(lambda x: x.reshape(len(steps), -1, *x.shape[1:]), inputs)
         middle = jax.tree.map(lambda x: np.float32(x[0]), inputs)

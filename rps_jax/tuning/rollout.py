@@ -146,9 +146,8 @@ def act(
 ) -> tuple[EnvBatch, jax.Array]:
     """Execute an action (N, 3) in each world; return the batch and the rewards (N,)."""
     bounded = features.clip_action(action)
-    touch_state = jax.vmap(TouchState.mark_decision)(
-        batch.memory.touch_state, batch.states.info["observation"]
-    )
+    inputs = batch.memory.touch_state, batch.states.info["observation"]
+    touch_state = jax.vmap(TouchState.mark_decision)(*inputs)
 
     def step(carry: ActCarry, _: None) -> tuple[ActCarry, None]:
         states, touch_state, reward = carry

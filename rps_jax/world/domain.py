@@ -48,13 +48,23 @@ class Quantity(NamedTuple):
     high: float
     label: str  # in reports; empty: not reported
     owner: Owner = "object"
-    sets: str = ""  # field of the robot; fields of skin and odometry have the quantity's name
     jumps: bool = False  # whether a world changes in steps with it, so that it has no derivative
 
 
 def drawn(default: Range | None, *declaration: Any) -> Any:
     """Declare a drawn quantity by its default range, and the values of a `Quantity`."""
     return field(default=default, metadata={_KEY: Quantity(*declaration)})
+
+
+def limit(*declaration: Any) -> Any:
+    """Declare a drawn limit of the robot, which has its own value by default."""
+    return drawn(None, *declaration, "robot")
+
+
+def robot_field(name: str) -> str:
+    """Return the field of the robot that a drawn limit sets, as force_max of robot_force."""
+    field = name.removeprefix("robot_")
+    return field if hasattr(Robot, field) else f"{field}_max"
 
 
 _POSITIVE = 1e-3
@@ -103,7 +113,7 @@ class Domain:
     # Of each raw reading, as a change of capacitance.
     noise: Range = drawn(Range(0, 0.05), 13, "1", 0, 1, "noise of the skin", "skin")
     gain_spread: Range = drawn(Range(0, 0.1), 14, "1", 0, 1, "spread of the taxels' gains", "skin")
-    dead_share: Range = drawn(Range(0, 0.05), 15, "1", 0, 1, "dead taxels", "skin", "", True)
+    dead_share: Range = drawn(Range(0, 0.05), 15, "1", 0, 1, "dead taxels", "skin", True)
     # None: the skin's default.
     foam: Range | None = drawn(None, 40, "m", 0.002, 0.05, "foam of the skin", "skin")
     time_constant: Range | None = drawn(
@@ -112,36 +122,23 @@ class Domain:
     # The base: errors of its odometry and of the executed twist.
     pose_noise: Range = drawn(Range(0, 0.005), 16, "m", 0, 1, "noise of the position", "base")
     yaw_noise: Range = drawn(Range(0, 0.01), 17, "rad", 0, 1, "noise of the heading", "base")
-    pose_latency: Range = drawn(
-        Range(0, 0.1), 18, "s", 0, 1, "latency of the pose", "base", "", True
-    )
-    command_delay: Range = drawn(
-        Range(0, 0.1), 19, "s", 0, 1, "delay of the command", "base", "", True
-    )
+    pose_latency: Range = drawn(Range(0, 0.1), 18, "s", 0, 1, "latency of the pose", "base", True)
+    command_delay: Range = drawn(Range(0, 0.1), 19, "s", 0, 1, "delay of the command", "base", True)
     # Of each component of the command, constant in a trial and of either sign: columns 20, 21 and
     # 22. The robot's limits bound the wrong command; wheels lose their slip after the limits.
     velocity_error: Range = drawn(Range(-0.03, 0.03), 20, "1", -0.9, 0.9, "", "base")
     # The robot and its drawn limits; None: the robot's own value.
     robot: Robot = Robot()
-    robot_force: Range | None = drawn(
-        None, 35, "N", 1, 1e5, "greatest force of the robot", "robot", "force_max"
-    )
-    robot_traction: Range | None = drawn(
-        None, 36, "1", _POSITIVE, 5, "traction of the robot's wheels", "robot", "traction"
-    )
-    robot_lag: Range | None = drawn(None, 37, "s", 0, 5, "lag of the robot", "robot", "lag")
+    robot_force: Range | None = limit(35, "N", 1, 1e5, "greatest force of the robot")
+    robot_traction: Range | None = limit(36, "1", _POSITIVE, 5, "traction of the robot's wheels")
+    robot_lag: Range | None = limit(37, "s", 0, 5, "lag of the robot")
     # Also of the wheels when turning.
-    robot_acceleration: Range | None = drawn(
-        None, 38, "m/s^2", _POSITIVE, 100, "greatest acceleration of the robot", "robot",
-        "acceleration_max",
-    )  # fmt: skip
-    robot_slip: Range | None = drawn(None, 42, "1", 0, 0.9, "slip of the wheels", "robot", "slip")
-    robot_slip_sideways: Range | None = drawn(
-        None, 47, "1", 0, 0.9, "slip of the wheels sideways", "robot", "slip_sideways"
+    robot_acceleration: Range | None = limit(
+        38, "m/s^2", _POSITIVE, 100, "greatest acceleration of the robot"
     )
-    robot_slip_yaw: Range | None = drawn(
-        None, 48, "1", 0, 0.9, "slip of the wheels when turning", "robot", "slip_yaw"
-    )
+    robot_slip: Range | None = limit(42, "1", 0, 0.9, "slip of the wheels")
+    robot_slip_sideways: Range | None = limit(47, "1", 0, 0.9, "slip of the wheels sideways")
+    robot_slip_yaw: Range | None = limit(48, "1", 0, 0.9, "slip of the wheels when turning")
 
     def __post_init__(self) -> None:
         check_fields(self, "domain ")

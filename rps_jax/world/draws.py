@@ -16,7 +16,15 @@ from rps_jax.geometry import solid
 from rps_jax.geometry.solid import SIDES, Solid
 from rps_jax.robot.robot import Robot
 from rps_jax.world import scene
-from rps_jax.world.domain import QUANTITIES, RANDOM, VELOCITY_ERRORS, Domain, quantities_of, unit_of
+from rps_jax.world.domain import (
+    QUANTITIES,
+    RANDOM,
+    VELOCITY_ERRORS,
+    Domain,
+    quantities_of,
+    robot_field,
+    unit_of,
+)
 from rps_jax.world.scene import Friction
 
 COLUMNS = 64  # random numbers of a world; unused ones are for new quantities
@@ -149,7 +157,7 @@ def _polygons(depth: np.ndarray, breadth: np.ndarray, u: dict[str, np.ndarray]) 
 
 def _robots(robot: Robot, at: dict[str, np.ndarray], count: int) -> Robot:
     """Return the robots (count,) of worlds, with their drawn limits."""
-    limits = {QUANTITIES[name].sets: at[name] for name in quantities_of("robot") if name in at}
+    limits = {robot_field(name): at[name] for name in quantities_of("robot") if name in at}
     if (linear := limits.get("acceleration_max")) is not None:
         limits["acceleration_max"] = np.stack([linear, linear / robot.arm], axis=-1)
 
@@ -188,7 +196,7 @@ def table(drawn: Draw) -> dict[str, tuple[np.ndarray, str]]:
     for name, quantity in QUANTITIES.items():
         values = derived.get(name, drawn.values.get(name))
         if quantity.owner == "robot":
-            values = getattr(drawn.robot, quantity.sets)
+            values = getattr(drawn.robot, robot_field(name))
         if quantity.label and values is not None:  # the first number of a limit with several
             columns[name] = values.reshape(len(values), -1)[:, 0]
     columns["corners"] = solid.corners(shape)

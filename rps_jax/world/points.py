@@ -280,10 +280,9 @@ def _labelled(domain: Domain, u: np.ndarray) -> xr.Dataset:
         name: ("quantity", values) for name, values in (columns | {"kind": kinds}).items()
     }
     coords |= {"quantity": quantities, "world": np.arange(len(u))}
-    text = {"units": "1", "long_name": "point of the unit cube"}
-    return xr.Dataset(
-        {"u": (("world", "quantity"), u, text)}, coords, {"domain": json.dumps(asdict(domain))}
-    )
+    words = {"units": "1", "long_name": "point of the unit cube"}
+    data = {"u": (("world", "quantity"), u, words)}
+    return xr.Dataset(data, coords, {"domain": json.dumps(asdict(domain))})
 
 
 def _is_json_of(text: Any, domain: Domain) -> bool:

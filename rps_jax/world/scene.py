@@ -50,9 +50,8 @@ class Scene(NamedTuple):
     @property
     def footprint(self) -> Footprint:
         """Outline of the object, in JAX's precision."""
-        return Footprint(
-            jnp.asarray(self.solid.vertices, float), jnp.asarray(self.solid.radius, float)
-        )
+        outline = self.solid.vertices, self.solid.radius
+        return Footprint(*(jnp.asarray(x, float) for x in outline))
 
     @property
     def rounded_solid(self) -> Solid:

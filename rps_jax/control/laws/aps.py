@@ -158,8 +158,7 @@ def step(
     state = _learn(params, state, obs.p_world_object, a_OT)
 
     alpha = jnp.mod(planar.direction(from_object) - a_OT, 2 * jnp.pi)
-    reach = params.r_robot + obs.r_object + params.margin
-    near = planar.norm(from_object) <= reach
+    near = params.r_robot + obs.r_object + params.margin >= planar.norm(from_object)
     push, relocate = activations(params, state, alpha, near)
     radial = -jnp.stack([jnp.cos(alpha), jnp.sin(alpha)])  # towards the object
     orbit = jnp.sign(jnp.sin(alpha)) * jnp.stack([-jnp.sin(alpha), jnp.cos(alpha)])  # to alpha = pi
