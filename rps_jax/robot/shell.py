@@ -78,10 +78,7 @@ class Shell:
         """Return the shell of a base, or of many bases if the sizes are (n,)."""
         x, y = (float(np.max(half)) for half in (half_length, half_width))
         sides = _lengths(x, y)
-        pitches = [
-            sides[row.side] / row.taxels if row.pitch is None else np.max(row.pitch)
-            for row in boards
-        ]
+        pitches = [sides[x.side] / x.taxels if x.pitch is None else np.max(x.pitch) for x in boards]
         is_default = np.all(np.asarray(half_width) == HALF_WIDTH)
         samples = math.ceil(float(max(pitches)) / _SPACING)
         return cls(half_length, None if is_default else half_width, boards, samples)

@@ -162,10 +162,8 @@ def candidates(law: Any) -> LawParams:
     if isinstance(law, list) or type(law) is tuple:
         return stack(law)
     example = next((p for p in registry.LAWS.values() if type(p) is type(law)), None)
-    is_single = example is not None and all(
-        np.ndim(x) == np.ndim(y)
-        for x, y in zip(jax.tree.leaves(law), jax.tree.leaves(example), strict=True)
-    )
+    leaves = zip(*map(jax.tree.leaves, (law, example)), strict=True)
+    is_single = example is not None and all(np.ndim(x) == np.ndim(y) for x, y in leaves)
     return stack([law]) if is_single else law
 
 

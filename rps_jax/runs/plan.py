@@ -172,10 +172,7 @@ def load_plan(folder: Path) -> Plan:
         plan = Plan(
             domain.from_json(dict(record["domain"])),
             record["worlds"],
-            {
-                name: registry.params_from_json(law, folder)
-                for name, law in dict(record["laws"]).items()
-            },
+            {k: registry.params_from_json(x, folder) for k, x in dict(record["laws"]).items()},
             Setting.from_json(record),
             record["part"],
         )

@@ -173,10 +173,9 @@ class Results:
         drawn = points.drawn_variables(self.plan.domain, self.plan.object_of(worlds), self._drawn)
         for column in (*columns.values(), *drawn.values()):
             column.encoding["_FillValue"] = None  # every number is a result
-        labels = {"law": (list(self.plan.laws), "what decides"), "world": (worlds, WORLD)}
         coordinates = {
-            name: xr.Variable(name, values, {"long_name": meaning})
-            for name, (values, meaning) in labels.items()
+            "law": xr.Variable("law", list(self.plan.laws), {"long_name": "what decides"}),
+            "world": xr.Variable("world", worlds, {"long_name": WORLD}),
         }
         return xr.Dataset(columns, coordinates | drawn | {"pose": POSE})
 

@@ -58,10 +58,7 @@ class Table(TrialOptions, MultiLawQuestion[xr.Dataset]):
             errors.check_each_once(name, getattr(self, name))
         sensing = case_options(self, self.setting)
         grid = product(self.chosen.values(), self.objects, self.friction, self.targets)
-        return [
-            Case(name, friction, target, params, **sensing)
-            for params, name, friction, target in grid
-        ]
+        return [Case(name, friction, xy, law, **sensing) for law, name, friction, xy in grid]
 
     def check(self) -> None:
         if not self.cases:

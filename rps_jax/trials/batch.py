@@ -82,10 +82,8 @@ class WorldBatch(NamedTuple):
     def split(self, count: int) -> tuple[WorldBatch, WorldBatch | None]:
         """Return the first `count` trials, and the rest if there is one."""
         arrays = self._replace(stage=None)
-        first, rest = (
-            rows(arrays, part)._replace(stage=self.stage)
-            for part in (slice(count), slice(count, None))
-        )
+        parts = slice(count), slice(count, None)
+        first, rest = (rows(arrays, part)._replace(stage=self.stage) for part in parts)
         return first, rest if rest.indices.size else None
 
 

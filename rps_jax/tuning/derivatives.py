@@ -193,8 +193,7 @@ def value_and_grad(
     attrs = provenance.attributes() | {
         "domain": name_or_custom(domain), "seed": setting.seed, "engine": setting.engine,
         "gradient": setting.gradient, "horizon": steps * setting.physics.control_period,
-        "skin_temperature": temperature,
-        "notes": notes,
+        "skin_temperature": temperature, "notes": notes,
     }  # fmt: skip
     return xr.Dataset(variables, coords, attrs)
 

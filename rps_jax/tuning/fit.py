@@ -313,10 +313,7 @@ class Fit(LawQuestion[Fitted], DomainQuestion[Fitted], LogsQuestion):
                 "object, or the domain's ranges of what is named here are too narrow."
             )
         objects = data.probability.to_series().items()
-        pairs = [
-            ["object", "probability"],
-            *([str(name), f"{value:.2f}"] for name, value in objects),
-        ]
+        pairs = [["object", "probability"], *([str(x), f"{share:.2f}"] for x, share in objects)]
         return [
             Section("Quantities", text, table(data), Picture("marginals", results.plot)),
             Section("Objects", "", pairs),

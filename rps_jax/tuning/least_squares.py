@@ -80,10 +80,8 @@ class Track(NamedTuple):
         """Return the paths of a log (1, T, ...), smooth ones unless its poses are exact."""
         rows, settling = _rows(interval)
         count = int(log.valid[0].sum())
-        pose, twist, measured, felt = (
-            np.zeros(0) if x is None else x[0, :count]
-            for x in (log.pose, log.twist, log.object_pose, log.f_robot)
-        )
+        fields = log.pose, log.twist, log.object_pose, log.f_robot
+        pose, twist, measured, felt = (np.zeros(0) if x is None else x[0, :count] for x in fields)
         touch, starts = log.contact_type[0] > 0, range(0, count - rows, rows - settling)
         first = np.array([i for i in starts if touch[i + settling : i + rows].mean() > 0.5], int)
         if not exact and first.size:

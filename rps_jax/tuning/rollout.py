@@ -203,10 +203,8 @@ def update(
         batches, key = carry
         key, noise_key, *start_keys = jax.random.split(key, 2 + len(envs))
         weights, count = runner.train.weights, ppo.num_envs
-        inputs = [
-            (*_inputs(env, batch), batch.memory.hidden, batch.first)
-            for env, batch in zip(envs, batches, strict=True)
-        ]
+        pairs = zip(envs, batches, strict=True)
+        inputs = [(*_inputs(env, x), x.memory.hidden, x.first) for env, x in pairs]
         obs, private, previous_hidden, first = _join(inputs)
         hidden, mean = network.apply(weights["actor"], previous_hidden, obs)
         noise = jax.random.normal(noise_key, mean.shape, mean.dtype)

@@ -161,11 +161,8 @@ def _robots(robot: Robot, at: dict[str, np.ndarray], count: int) -> Robot:
     if (linear := limits.get("acceleration_max")) is not None:
         limits["acceleration_max"] = np.stack([linear, linear / robot.arm], axis=-1)
 
-    several = {
-        name: np.asarray(values, float)
-        for name in ("v_max", "acceleration_max")
-        if (values := getattr(robot, name)) is not None
-    }
+    bounds = {name: getattr(robot, name) for name in ("v_max", "acceleration_max")}
+    several = {name: np.asarray(x, float) for name, x in bounds.items() if x is not None}
     return replace(scene.repeat_robot(replace(robot, **several), count), **limits)
 
 

@@ -57,11 +57,8 @@ def coordinates(domain: Domain) -> tuple[Coordinate, ...]:
 
     Unused ranges and ranges of a single value are no coordinates.
     """
-    labels = [
-        Coordinate(name, "choice", Range(0, count), "1")
-        for name, count in zip(_CHOICES, domain.counts, strict=True)
-        if count > 1
-    ]
+    lists = zip(_CHOICES, domain.counts, strict=True)
+    labels = [Coordinate(name, "choice", Range(0, n), "1") for name, n in lists if n > 1]
     random = set(domain.objects) & set(RANDOM)
     idle = set(domain.idle) | ({"aspect"} if random == {"random_cylinder"} else set())
     if not random or domain.com_offset.high == 0:
@@ -161,10 +158,8 @@ def cases(domain: Domain, points: Points | None, index: Any) -> np.ndarray:
         return np.asarray(index)
     rows = dict(zip(names(domain), points.u[np.asarray(index)].T, strict=True))
     nothing = np.zeros(np.shape(index))
-    choices = [
-        np.floor(rows.get(name, nothing) * count).astype(np.int64)
-        for name, count in zip(_CHOICES, domain.counts, strict=True)
-    ]
+    counts = zip(_CHOICES, domain.counts, strict=True)
+    choices = [np.floor(rows.get(x, nothing) * n).astype(np.int64) for x, n in counts]
     return np.asarray(np.ravel_multi_index(choices, domain.counts))
 
 
