@@ -105,10 +105,8 @@ def smooth_law(law: Law, temperatures: Smoothing | None = None) -> Law:
     `temperatures` (widths of the switches) are those of the law.
     """
     if law.temperatures is None:
-        names = [name for name, params in LAWS.items() if law_of(params).temperatures is not None]
-        raise InputError(
-            f"this law has no smooth form, which gradients need: choose {', '.join(names)}."
-        )
+        names = ", ".join(k for k, x in LAWS.items() if law_of(x).temperatures is not None)
+        raise InputError(f"this law has no smooth form, which gradients need: choose {names}.")
     return _smooth_law(law, law.temperatures if temperatures is None else temperatures)
 
 
@@ -185,9 +183,8 @@ def parse_law(text: str) -> tuple[str, LawParams]:
     head, changes = parse_changes("law", str(text))
     values = {name: errors.check_number(f"{head} {name}", x) for name, x in changes.items()}
     words = str(text).split(",")[1:]
-    label = ",".join(
-        [label, *(Path(x).stem if files.suffix_of(x) == ".json" else x for x in words)]
-    )
+    parts = (Path(x).stem if files.suffix_of(x) == ".json" else x for x in words)
+    label = ",".join([label, *parts])
     changed = replace_leaves(params, values)
     if any(files.suffix_of(word) == ".json" for word in words):
         for name, earlier in law_of(params).earlier:

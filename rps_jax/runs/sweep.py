@@ -217,10 +217,8 @@ class Sweep(SweepOptions, SweepQuestion):
     def answer(self, run: Run) -> xr.Dataset:
         """Run the plan; of a single shard, return its own trials (row)."""
         execute = cluster.on_cluster(self.ray, self.ray_device) if self.ray else run_missing
-        label, options = partial(self.labelled, run=run), run.batch_options
-        return run_plan(
-            self.plan, run.folder, self.parsed_shard, execute=execute, label=label, **options
-        )
+        label, inputs = partial(self.labelled, run=run), (self.plan, run.folder, self.parsed_shard)
+        return run_plan(*inputs, execute=execute, label=label, **run.batch_options)
 
     def labelled(self, outcomes: xr.Dataset, run: Run) -> xr.Dataset:
         outcomes = super().labelled(outcomes, run)

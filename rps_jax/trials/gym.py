@@ -42,9 +42,7 @@ except ImportError as error:
 _SEEDS = 2**32
 
 
-def _hold_action(
-    env: PushEnv, steps: int, state: State, action: jax.Array
-) -> tuple[State, jax.Array]:
+def _hold(env: PushEnv, steps: int, state: State, action: jax.Array) -> tuple[State, jax.Array]:
     """Hold an action (3,) for `steps` control steps; return the state and the sum of rewards."""
 
     def step(carry: tuple[State, jax.Array], _: None) -> tuple[tuple[State, jax.Array], None]:
@@ -185,7 +183,7 @@ class GymPushVector(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         self._keys: jax.Array | None = None  # (num_envs,) random streams of the worlds
         self._state: State | None = None
         self._start = jax.jit(jax.vmap(partial(_restart, self.push_env)))
-        self._act = jax.jit(jax.vmap(partial(_hold_action, self.push_env, steps)))
+        self._act = jax.jit(jax.vmap(partial(_hold, self.push_env, steps)))
         self._select = jax.jit(jax.vmap(soft.tree_where))
 
     def start(self, where: np.ndarray | None = None) -> None:

@@ -132,10 +132,8 @@ def control_loop(params: LawParams, setting: Setting, *, smooth: bool) -> Contro
     """Return the control loop of a law, or of its smooth form; or raise InputError."""
     law = registry.law_of(params)
     if smooth and law.temperatures is None:
-        rule = (
-            f"the law of {type(params).__name__} has no smooth form; choose rps or rps_plus, or "
-            "smooth=False, whose derivatives miss all switches of the law"
-        )
+        rule = f"the law of {type(params).__name__} has no smooth form; choose rps or rps_plus, or "
+        rule += "smooth=False, whose derivatives miss all switches of the law"
         raise errors.not_allowed("smooth", smooth, rule)
     law = registry.smooth_law(law) if smooth else law
     return ControlLoop(setting.physics, setting.rules, law)

@@ -49,6 +49,7 @@ from rps_jax.world.domain import (
 from rps_jax.world.draws import Draw
 
 Score = Callable[[Snapshot], Any]  # of a trajectory (T, ...) of one world: one number ()
+ScoreLike = Score | Objective
 _STEP = 1e-6  # of differences, relative to a quantity
 _SMALLEST = 0.01  # in its unit, below which the step is not relative
 _NOISE = 1e-12  # relative change of a number of a world that is rounding
@@ -69,7 +70,7 @@ class Coordinate(NamedTuple):
 
 @device.standard_jax()
 def value_and_grad(
-    score: Score | Objective = Objective(),
+    score: ScoreLike = Objective(),
     laws: LawsLike = "rps_tuned",
     domain: DomainLike = "wide",
     worlds: int = 32,
@@ -177,13 +178,12 @@ def value_and_grad(
         mean=(mean_dims, [x.gradient for x in mean], "1 / unit", "mean over finite derivatives"),
         error=(mean_dims, error, "1 / unit", "standard error of the mean"),
     )
-    kinds = ["parameter" if x.is_parameter else "world" for x in numbers]
     coords: dict[str, Any] = {
         "law": list(chosen),
         "world": ("world", index, {"long_name": WORLD}),
         "quantity": [x.label for x in numbers],
         "unit": ("quantity", [x.unit for x in numbers]),
-        "kind": ("quantity", kinds),
+        "kind": ("quantity", ["parameter" if x.is_parameter else "world" for x in numbers]),
         "map_error": ("quantity", bend.max(axis=0), {"units": "1"}),
     }
     coords |= points.drawn_columns(ranges, setting.seed, None, index)
@@ -304,7 +304,7 @@ def _value_and_slopes(
     leaves: dict[str, jax.Array],
     *,
     loop: ControlLoop,
-    score: Score | Objective,
+    score: ScoreLike,
     steps: int,
     setting: Setting,
 ) -> tuple[jax.Array, dict[str, jax.Array]]:
@@ -322,9 +322,7 @@ def _value_and_slopes(
     return values, pull_back(jnp.ones_like(values))[0]
 
 
-def _score(
-    score: Score | Objective, setting: Setting, snapshots: Snapshot, params: LawParams
-) -> jax.Array:
+def _score(score: ScoreLike, setting: Setting, snapshots: Snapshot, params: LawParams) -> jax.Array:
     """Return the score () of a trajectory (T, ...), or raise InputError if it is no number."""
     if isinstance(score, Objective):
         return soft_score(snapshots, params, setting, score)

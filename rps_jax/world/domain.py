@@ -255,9 +255,8 @@ def _constant(value: float) -> Range:
     return Range(value, value)
 
 
-PERFECT: dict[str, Any] = dict.fromkeys(
-    ("noise", "gain_spread", "dead_share", "lateral", "yaw", *quantities_of("base")), _constant(0)
-)
+_ERRORS = ("noise", "gain_spread", "dead_share", "lateral", "yaw", *quantities_of("base"))
+PERFECT: dict[str, Any] = dict.fromkeys(_ERRORS, _constant(0))
 _HARDWARE: dict[str, Any] = PERFECT | {"noise": _constant(0.05), "gain_spread": _constant(0.1)}
 DOMAINS = {
     "paper": Domain(

@@ -116,14 +116,12 @@ class Points:
     @staticmethod
     def read(folder: Path, digest: str) -> Points:
         """Return the points of a run folder if they have this digest, or raise InputError."""
-        if not (folder / FILE).exists():
+        path, dims = folder / FILE, {"u": ("world", "quantity")}
+        if not path.exists():
             raise InputError(f"run = {folder} lacks its {FILE}: run the same command again.")
-        stored = files.check_columns(
-            files.read_dataset(folder / FILE), folder / FILE, {"u": ("world", "quantity")}, {}
-        )
-        points = Points(stored.u.values)
+        points = Points(files.check_columns(files.read_dataset(path), path, dims, {}).u.values)
         if points.digest != digest:
-            raise files.CorruptFileError(folder / FILE, "its points are not those of the run")
+            raise files.CorruptFileError(path, "its points are not those of the run")
         return points
 
 
