@@ -91,9 +91,8 @@ def _check_traced(
 
     def check(fault: str, expected: str) -> None:
         if fault:
-            raise InputError(
-                f"step of the law in {_definition(step)} returns {fault}: return {expected}."
-            )
+            law = f"step of the law in {_definition(step)}"
+            raise InputError(f"{law} returns {fault}: return {expected}.")
 
     is_triple = isinstance(results, tuple) and len(results) == 3
     next_state, twist, details = results if is_triple else (None, None, None)

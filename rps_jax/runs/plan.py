@@ -163,9 +163,8 @@ def load_plan(folder: Path) -> Plan:
     """
     record = run_folder.read_manifest(folder)
     if "arms" in record or "strategies" in record:  # as 0.2.0 called them
-        raise InputError(
-            f"run = {folder} was written by {provenance.package_version(folder)}: use that version."
-        )
+        version = provenance.package_version(folder)
+        raise InputError(f"run = {folder} was written by {version}: use that version.")
     if "laws" not in record:
         raise InputError(f"run = {folder} does not hold a sweep: give the folder of `rps sweep`.")
     try:

@@ -55,8 +55,6 @@ def _batched(closed: ClosedJaxpr, fixed: int, batch: int) -> ClosedJaxpr:
     axes = [None] * fixed + [0] * (len(closed.in_avals) - fixed)
     with jax.enable_x64(True):
         function = jax.vmap(jaxpr_as_fun(closed), in_axes=axes)
-    shapes = [
-        jax.ShapeDtypeStruct(x.shape if axis is None else (batch, *x.shape), x.dtype)
-        for axis, x in zip(axes, closed.in_avals, strict=True)
-    ]
+    pairs = zip([() if axis is None else (batch,) for axis in axes], closed.in_avals, strict=True)
+    shapes = [jax.ShapeDtypeStruct((*lead, *x.shape), x.dtype) for lead, x in pairs]
     return walk.traced(function, *shapes)[0]
