@@ -145,7 +145,7 @@ jax.tree_util.register_dataclass(Robot, data_fields=_FIELDS, meta_fields=[])
 
 
 def _covered(half_length: float, half_width: float, mass: float, **limits: Any) -> Robot:
-    """Return a robot with as many of the paper's boards as fit on each side, centred."""
+    """Return a robot of this outline with the paper's boards, centred on each side."""
     pitch = 2 * HALF_WIDTH / 12  # of the paper's taxels
     side, front = (int(2 * half / (3 * pitch) + 1e-6) for half in (half_length, half_width))
     sides = Boards("left", side, pitch), Boards("front", front, pitch), Boards("right", side, pitch)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import re
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -20,7 +20,7 @@ import xarray as xr
 
 from rps_jax import engines, errors
 from rps_jax.control import registry
-from rps_jax.control.base import LawParams, named_leaves
+from rps_jax.control.base import LawParams, Leaf, named_leaves
 from rps_jax.control.registry import LawsLike
 from rps_jax.engines import device, native
 from rps_jax.engines.base import Stage
@@ -150,7 +150,8 @@ def value_and_grad(
         batch = drawn_worlds(ranges, drawn, setting)
         if smooth:
             batch = batch._replace(worlds=soften_skins(batch.worlds))
-            temperature = float(batch.worlds.skin.temperature[0])
+            skin: Any = batch.worlds.skin
+            temperature = float(skin.temperature[0])
         slopes, bend[at] = world_slopes(ranges, drawn, setting, numbers)
         used |= list(map(bool, slopes))
         names = {name for slope in slopes for name in slope}
@@ -158,8 +159,7 @@ def value_and_grad(
         for i, (params, loop) in enumerate(zip(chosen.values(), loops, strict=True)):
             inputs = {"world": batch.worlds, "params": batch.with_params(params).params}
             leaves = {name: x for name, x in named_leaves(inputs).items() if name in names}
-            options = {"loop": loop, "score": score, "steps": steps, "setting": setting}
-            results = _value_and_slopes(batch.stage, inputs, leaves, **options)
+            results = _value_and_slopes(batch.stage, inputs, leaves, loop, score, steps, setting)
             value[i, at], by_leaf = jax.device_get(results)
             for k, (x, slope) in enumerate(zip(numbers, slopes, strict=True)):
                 products = [y * by_leaf[name] for name, y in slope.items()]
@@ -297,12 +297,11 @@ def world_slopes(
 # --- the score -------------------------------------------------------------------------------
 
 
-@partial(jax.jit, static_argnames=("loop", "score", "steps", "setting"))
+@partial(jax.jit, static_argnums=(3, 4, 5, 6))
 def _value_and_slopes(
     stage: Stage,
     inputs: Any,
-    leaves: dict[str, jax.Array],
-    *,
+    leaves: Mapping[str, Leaf],
     loop: ControlLoop,
     score: ScoreLike,
     steps: int,
@@ -310,7 +309,7 @@ def _value_and_slopes(
 ) -> tuple[jax.Array, dict[str, jax.Array]]:
     """Return the scores (n,) of worlds and laws, and their derivatives (n, ...) by some leaves."""
 
-    def scores(leaves: dict[str, jax.Array]) -> jax.Array:
+    def scores(leaves: Mapping[str, Leaf]) -> jax.Array:
         moved = registry.replace_leaves(inputs, leaves)
         worlds, params = moved["world"], moved["params"]
         running = np.ones(len(worlds.qpos), bool)

@@ -32,7 +32,7 @@ _REACH = 2.1  # [m]
 _ANGLES = [k * math.pi / 4 for k in range(8)]
 HARDWARE_LAYOUTS = {
     "circle": tuple((_REACH * math.cos(a), _REACH * math.sin(a)) for a in _ANGLES),
-    "grid": tuple(pair for pair in product((_REACH, 0, -_REACH), repeat=2) if any(pair)),
+    "grid": tuple((x, y) for x, y in product((_REACH, 0, -_REACH), repeat=2) if x or y),
 }  # both are readings of the paper's "8 different target points at 2.1 m intervals apart"
 HARDWARE_GROUND = (0.2, 0.35, 0.5, 0.65)  # [1] object-ground
 # [1] object-robot: polyurethane foam coated with ink. The box's results tell that its friction is

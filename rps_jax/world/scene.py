@@ -133,8 +133,8 @@ def compile_solid(
     if family == "prism":
         distinct = np.any(single.vertices != np.roll(single.vertices, 1, axis=0), axis=1)
         corners, half = single.vertices[distinct], single.height / 2
-        ends = [np.column_stack([corners, np.full(len(corners), z)]) for z in (-half, half)]
-        spec.mesh("prism").uservert = np.concatenate(ends).ravel()
+        faces = [np.column_stack([corners, np.full(len(corners), z)]) for z in (-half, half)]
+        spec.mesh("prism").uservert = np.concatenate(faces).ravel()
     if single.feet is not None and family == "cylinder":
         _add_feet(spec)
     if single.feet is not None or family == "prism":
@@ -198,7 +198,12 @@ def _add_feet(spec: mujoco.MjSpec) -> None:
     """Add the feet of a prism to a cylinder; only these touch the ground."""
     default = spec.find_default("ground_object")
     spec.delete(spec.pair("ground_object"))
-    point = {"type": mujoco.mjtGeom.mjGEOM_SPHERE, "size": [1e-6, 0, 0], "mass": 0, "group": 3}
+    point: dict[str, Any] = {
+        "type": mujoco.mjtGeom.mjGEOM_SPHERE,
+        "size": [1e-6, 0, 0],
+        "mass": 0,
+        "group": 3,
+    }
     for i in range(solid.SIDES):
         spec.body("object").add_geom(name=f"foot_{i}", **point)
         pair = {"geomname1": "ground", "geomname2": f"foot_{i}"}

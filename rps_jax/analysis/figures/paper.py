@@ -38,8 +38,8 @@ def profile(params: RPSParams) -> Figure:
     figure, ax = panel((5.5, 3.2), "contact offset $l$ [m]", "adaptive rate $a_r$ [1]")
     ax.plot(l, a_r, color="C0")
     for side in (-1, 1):
-        ends = side * float(params.l_cr), side * shell.HALF_WIDTH
-        ax.axvspan(*ends, color=SHADES["realigning"], lw=0)
+        critical = side * float(params.l_cr), side * shell.HALF_WIDTH
+        ax.axvspan(*critical, color=SHADES["realigning"], lw=0)
         ax.axvline(side * float(params.beta), color="0.6", lw=0.7, ls="--")
     ax.set_title("Eq. 5; dashed: $\\pm\\beta$; shaded: critical region", fontsize=9)
     return figure
