@@ -213,7 +213,6 @@ def score_candidates(
 ) -> tuple[list[CandidateScores], Timing]:
     """Score every candidate in every world of its request, as `outcomes` runs them."""
     results, timing = outcomes(requests, setting, **options)
-    return [
-        CandidateScores(outcome, objective.scores(outcome, request.distances, setting.rules))
-        for request, outcome in zip(requests, results, strict=True)
-    ], timing
+    pairs = zip(requests, results, strict=True)
+    scores = [objective.scores(x, request.distances, setting.rules) for request, x in pairs]
+    return list(map(CandidateScores, results, scores)), timing
