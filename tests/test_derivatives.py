@@ -53,7 +53,7 @@ def results():
     return gradients_of(TOUCHING)
 
 
-def of(results, name):
+def slope(results, name):
     return results.gradient.sel(quantity=name).values[0]
 
 
@@ -69,25 +69,28 @@ def test_gradients_are_central_differences(results, name):
     up, down = (gradients_of(*side).value.values[0] for side in sides)
     differences = (up - down) / (2 * h)
     assert np.abs(differences).max() > 1e-4
-    np.testing.assert_allclose(of(results, name), differences, rtol=1e-5, atol=1e-8)
+    np.testing.assert_allclose(slope(results, name), differences, rtol=1e-5, atol=1e-8)
 
 
 def test_vectors_agree_with_the_quantities_that_turn_and_stretch_them(results):
     bearing = results.bearing.values
-    along = np.cos(bearing) * of(results, "target_x") + np.sin(bearing) * of(results, "target_y")
-    np.testing.assert_allclose(along, of(results, "distance"), rtol=1e-6)
+    along = np.cos(bearing) * slope(results, "target_x")
+    along += np.sin(bearing) * slope(results, "target_y")
+    np.testing.assert_allclose(along, slope(results, "distance"), rtol=1e-6)
     drawn = draws.draw(TOUCHING, 0, np.arange(4))
     x, y, _ = drawn.solid.p_object_com.T
-    along = x * of(results, "com_x") + y * of(results, "com_y")
+    along = x * slope(results, "com_x") + y * slope(results, "com_y")
     # The quasi-static engine uses no inertia, which a moving load changes.
-    np.testing.assert_allclose(along, drawn.values["com_offset"] * of(results, "com_offset"), 1e-6)
+    np.testing.assert_allclose(
+        along, drawn.values["com_offset"] * slope(results, "com_offset"), 1e-6
+    )
 
 
 def test_the_mirrored_world_has_mirrored_gradients():
-    numbers, column = draws.random_numbers, draws.USES["com_bearing"]
+    random_numbers, column = draws.random_numbers, draws.USES["com_bearing"]
 
     def mirrored(seed, index):
-        rows = numbers(seed, index)
+        rows = random_numbers(seed, index)
         rows[:, column] = 1 - rows[:, column]
         return rows
 
@@ -96,13 +99,15 @@ def test_the_mirrored_world_has_mirrored_gradients():
         fixed = {name: Range(value, value) for name, value in turned.items()}
         return replace(TOUCHING, **PERFECT | fixed)
 
-    one = gradients_of(domain(1))
+    plain = gradients_of(domain(1))
     with mock.patch.object(draws, "random_numbers", mirrored):
-        other = gradients_of(domain(-1))
-    np.testing.assert_allclose(one.value, other.value, rtol=1e-9)
+        mirror_image = gradients_of(domain(-1))
+    np.testing.assert_allclose(plain.value, mirror_image.value, rtol=1e-9)
     for name, sign in {"target_x": 1, "target_y": -1, "com_x": 1, "com_y": -1, "v_max": 1}.items():
-        assert np.abs(of(one, name)).max() > 1e-5, name
-        np.testing.assert_allclose(of(one, name), sign * of(other, name), rtol=1e-6, atol=1e-9)
+        assert np.abs(slope(plain, name)).max() > 1e-5, name
+        np.testing.assert_allclose(
+            slope(plain, name), sign * slope(mirror_image, name), rtol=1e-6, atol=1e-9
+        )
 
 
 def test_the_results_are_labelled(results):
@@ -129,7 +134,7 @@ def test_the_results_are_labelled(results):
 
 
 def test_a_mass_without_influence_is_told(results):
-    assert (of(results, "mass") == 0).all()
+    assert (slope(results, "mass") == 0).all()
     assert re.search("mass has no influence.*robot='kairos'.*domain='real'", results.notes)
     notes = lambda name, domain: " ".join(  # noqa: E731
         derivatives._notes(
@@ -146,13 +151,13 @@ def test_a_kink_of_the_world_has_no_derivative_and_is_told():
     """The principal axes of a square box are any."""
     square = parse_domain("wide,objects=random_box,aspect=1:1,com_offset=0:0")
     drawn = draws.draw(square, 0, np.arange(3))
-    numbers = derivatives.coordinates_of(("aspect", "height"), RPSParams(), square)
-    slopes, bends = derivatives.world_slopes(square, drawn, Setting("fused"), numbers)
+    coordinates = derivatives.coordinates_of(("aspect", "height"), RPSParams(), square)
+    slopes, bends = derivatives.world_slopes(square, drawn, Setting("fused"), coordinates)
     assert (bends[:, 0] > 0.1).all()
     assert (bends[:, 1] < 1e-5).all()
     assert ["world.fields.height" in slope for slope in slopes] == [False, True]
     gradient = np.where(bends > 0.01, np.nan, 1.0)[None]
-    notes = derivatives._notes(square, "fused", numbers, np.ones(2, bool), gradient, bends)
+    notes = derivatives._notes(square, "fused", coordinates, np.ones(2, bool), gradient, bends)
     assert [x for x in notes if "kink" in x] == [
         "No derivatives in worlds whose numbers have a kink (see finite): aspect."
     ]

@@ -114,7 +114,7 @@ def test_antithetic_steps_find_the_slope_of_the_objective():
 
 
 def test_the_tail_alone_counts_for_a_risk_averse_objective():
-    """Of ten worlds, whose score is a multiple of the parameter, two are the worst fifth."""
+    """The score of ten worlds is a multiple of the parameter; two are the worst fifth."""
     objective = Objective(risk="cvar", tail=0.2)
     slopes = jnp.arange(10.0)
 

@@ -150,9 +150,9 @@ def test_a_chaotic_score_has_a_large_derivative_and_a_small_smoothed_slope():
         return jnp.mean(jax.lax.scan(step, starts, length=40)[1], axis=0)
 
     starts = jax.random.uniform(jax.random.key(12), (4000,), minval=0.1, maxval=0.9)
-    one, key = jnp.zeros(1), jax.random.key(13)
+    start, key = jnp.zeros(1), jax.random.key(13)
     samples = {
-        name: jax.jit(lambda w, name=name: sampled(name, chaos, one, w, key, Options(sigma=1.0)))(
+        name: jax.jit(lambda w, name=name: sampled(name, chaos, start, w, key, Options(sigma=1.0)))(
             starts
         )
         for name in ("exact", "clipped", "bundled", "evolution", "mixed")
