@@ -63,6 +63,7 @@ class Race(Study[xr.Dataset], SimulationQuestion[xr.Dataset]):
     TITLE: ClassVar[str] = "Gradients against evolution"
     CHOICES: ClassVar = {"methods": METHODS}
     QUICK: ClassVar[Mapping[str, Any]] = {"worlds": 4, "counts": (6,), "seeds": (1,)}
+    IGNORED_FIELDS: ClassVar[tuple[str, ...]] = ("minutes", "lanes", "gpus")
     DIMENSION: ClassVar[str] = "tuning"
     REPORTS_TIMES: ClassVar[bool] = True
 
@@ -95,8 +96,8 @@ class Race(Study[xr.Dataset], SimulationQuestion[xr.Dataset]):
 
     def configuration(self) -> dict[str, Any]:
         """Return all inputs of the answer; the commands stand for the tunings."""
-        fields = {k: v for k, v in super().configuration().items() if k not in ("lanes", "gpus")}
-        return fields | {"commands": {name: METHODS[name] for name in self.methods}}
+        commands = {name: METHODS[name] for name in self.methods}
+        return super().configuration() | {"commands": commands}
 
     def tunings(self) -> dict[tuple[str, int, int], str]:
         """Return the commands of the tunings by method, count and seed."""
@@ -193,7 +194,8 @@ def law_of(row: pd.Series) -> RPSParams:
     """Return the parameters of a generation."""
     names = [name for name in row.index if name.startswith("params.")]
     changes = {name.removeprefix("params."): float(np.asarray(row[name])) for name in names}
-    return registry.replace_leaves(RPSParams.paper(), changes)
+    params = registry.replace_leaves(RPSParams.paper(), changes)
+    return params._replace(l_mr=min(params.l_mr, params.l_cr))  # as in the tuning: see `Space`
 
 
 def table(results: xr.Dataset) -> Rows:
