@@ -124,8 +124,8 @@ def check_count(name: str, value: object, *, at_least: int = 1, at_most: int) ->
     is_whole = isinstance(value, numbers.Integral) and not isinstance(value, bool)
     count = int(cast("int", value)) if is_whole else at_least - 1
     if not at_least <= count <= at_most:
-        rule = f"it must be a whole number from {at_least} to {at_most}"
-        raise not_allowed(name, value, rule)
+        span = f" from {at_least} to {at_most}" if at_least > -(2**63) else ""
+        raise not_allowed(name, value, f"it must be a whole number{span}")
     return count
 
 

@@ -136,15 +136,16 @@ def test_the_results_are_labelled(results):
 def test_a_mass_without_influence_is_told(results):
     assert (slope(results, "mass") == 0).all()
     assert re.search("mass has no influence.*robot='kairos'.*domain='real'", results.notes)
-    notes = lambda name, domain: " ".join(  # noqa: E731
+    notes = lambda name, domain, value=np.zeros((1, 2)): " ".join(  # noqa: E731
         derivatives._notes(
             parse_domain(domain), "fused", derivatives.coordinates_of(name, RPSParams(), TOUCHING),
-            np.array([True]), np.ones((1, 2, 1)), np.zeros((2, 1)),
+            np.array([True]), value, np.ones((1, 2, 1)), np.zeros((2, 1)),
         )
     )  # fmt: skip
     assert "mass has no influence" in notes("mass", "wide")
     assert not notes("mass", "real")
     assert not notes("friction_ground", "wide")
+    assert "not finite in 1 of 2 trials" in notes("mass", "real", np.array([[1.0, np.nan]]))
 
 
 def test_a_kink_of_the_world_has_no_derivative_and_is_told():
@@ -157,7 +158,9 @@ def test_a_kink_of_the_world_has_no_derivative_and_is_told():
     assert (bends[:, 1] < 1e-5).all()
     assert ["world.fields.height" in slope for slope in slopes] == [False, True]
     gradient = np.where(bends > 0.01, np.nan, 1.0)[None]
-    notes = derivatives._notes(square, "fused", coordinates, np.ones(2, bool), gradient, bends)
+    notes = derivatives._notes(
+        square, "fused", coordinates, np.ones(2, bool), bends, gradient, bends
+    )
     assert [x for x in notes if "kink" in x] == [
         "No derivatives in worlds whose numbers have a kink (see finite): aspect."
     ]
@@ -194,6 +197,7 @@ def test_worlds_are_those_of_a_sweep_and_one_object_each():
 
 BATCH = single.draw_worlds(TOUCHING, 2, setting=QUASISTATIC)
 ROUTE = {"world": row(BATCH.worlds, 0), "params": RPSParams(), "stage": BATCH.stage}
+ROUTE |= {"setting": QUASISTATIC}
 test_invalid_rollouts_are_refused = refusals(
     rps_jax.rollout,
     (
@@ -201,10 +205,19 @@ test_invalid_rollouts_are_refused = refusals(
         r"horizon = 0.0 .* at least 0.02 .*\[s\]",
     ),
     (ROUTE | {"horizon": "long"}, "horizon = long"),
+    (ROUTE | {"horizon": 301.0}, r"horizon = 301.0 .* at most 300 \[s\]"),
     (ROUTE | {"world": BATCH.worlds}, "give one world, and map over several by jax.vmap"),
     (ROUTE | {"world": None}, "world = None is not allowed: give a World"),
+    (ROUTE | {"world": BATCH}, "world = a WorldBatch is not allowed: give a World"),
     (ROUTE | {"setting": Setting("mujoco")}, "engine = mujoco is not allowed"),
+    (ROUTE | {"setting": Setting()}, "engine = fused .* worlds were drawn for quasistatic"),
     (ROUTE | {"params": 3.0}, "params = 3.0"),
+    (
+        ROUTE | {"params": RPSParams(K_h=np.ones(4))},
+        r"params.K_h = of shape \(4,\) .* give one number, and map over several by jax.vmap",
+    ),
+    (ROUTE | {"params": RPSParams(K_h=None)}, "rps.K_h = None"),
+    (ROUTE | {"params": RPSParams(K_h=float("nan"))}, "rps.K_h = nan"),
     (
         ROUTE | {"params": rps_jax.control.registry.LAWS["pursuit"], "smooth": True},
         "smooth = True .* has no smooth form; choose rps or rps_plus, or smooth=False",
@@ -250,8 +263,10 @@ def test_what_has_no_gradient_is_refused(changes, message):
 @pytest.mark.parametrize(
     ("score", "message"),
     [
-        (lambda snapshots: None, "score raises ValueError"),
-        (lambda snapshots: "low", "score raises TypeError"),
+        (lambda snapshots: None, "result of score = NoneType .* return one real number"),
+        (lambda snapshots: {"low": 1.0}, "result of score = dict .* return one real number"),
+        (lambda snapshots: 1, "result of score = int .* return one real number"),
+        (lambda snapshots: jax.jit(float)(1.0), "score converts a traced value to a number: keep"),
         (lambda snapshots: snapshots.speed, r"score raises AttributeError .*speed"),
         (lambda snapshots: snapshots.done[-1], r"result of score = bool\[\]"),
     ],

@@ -117,18 +117,21 @@ def _trace(name: str, function: Function, *args: object) -> object:
     except InputError:
         raise
     except (Exception, SystemExit) as error:  # any error of the user's function
-        fault = next((t for kind, t in _TRACER_ERRORS.items() if isinstance(error, kind)), "")
-        if not fault:
-            reason = " ".join(str(error).split())[:300].rstrip(".")
-            fault = f"raises {type(error).__name__}" + (f" ({reason})" if reason else "")
         line = _line_of(error) or _definition(function)
-        raise InputError(f"{name} of the law in {line} {fault}.") from error
+        raise InputError(f"{name} of the law in {line} {fault_of(error)}.") from error
     if programs[0] != programs[1]:
         raise InputError(
             f"{name} of the law in {_definition(function)} is not pure, since a second call "
             "computes something else: keep what changes in the state, and a key of jax.random."
         )
     return results[0]
+
+
+def fault_of(error: BaseException) -> str:
+    """Return the verb phrase of a function whose trace fails with an error."""
+    reason = " ".join(str(error).split())[:300].rstrip(".")
+    raised = f"raises {type(error).__name__}" + (f" ({reason})" if reason else "")
+    return next((t for kind, t in _TRACER_ERRORS.items() if isinstance(error, kind)), raised)
 
 
 def _program(function: Function, args: Sequence[object]) -> tuple[object, object]:

@@ -94,6 +94,14 @@ class Engine(abc.ABC):
     def _refused(self, rule: str) -> errors.InputError:
         return errors.not_allowed("engine", self.name, rule)
 
+    def check_stage(self, stage: Stage) -> None:
+        """Raise InputError unless the stage is of this engine, or of one that it extends."""
+        owner = getattr(stage, "engine", self.name)
+        if owner not in [getattr(kind, "name", "") for kind in type(self).__mro__]:
+            raise self._refused(
+                f"the worlds were drawn for {owner}; give the setting of their draw"
+            )
+
     def check_physics(self, physics: Physics) -> None:
         """Raise InputError unless the engine supports the physics."""
         if physics.cone not in self.cones:

@@ -19,7 +19,7 @@ import numpy as np
 import xarray as xr
 
 from rps_jax import engines, errors
-from rps_jax.control import registry
+from rps_jax.control import registry, validation
 from rps_jax.control.base import LawParams, Leaf, named_leaves
 from rps_jax.control.registry import LawsLike
 from rps_jax.engines import device, native
@@ -187,7 +187,7 @@ def value_and_grad(
         "map_error": ("quantity", bend.max(axis=0), {"units": "1"}),
     }
     coords |= points.drawn_columns(ranges, setting.seed, None, index)
-    notes = " ".join(_notes(ranges, setting.engine, numbers, used, gradient, bend))
+    notes = " ".join(_notes(ranges, setting.engine, numbers, used, value, gradient, bend))
     if notes:
         warnings.warn(notes, stacklevel=3)
     attrs = provenance.attributes() | {
@@ -326,14 +326,15 @@ def _score(score: ScoreLike, setting: Setting, snapshots: Snapshot, params: LawP
     if isinstance(score, Objective):
         return soft_score(snapshots, params, setting, score)
     try:
-        value = jnp.asarray(score(snapshots))
+        value = score(snapshots)
     except Exception as error:
-        reason = " ".join(str(error).split())[:300].rstrip(".")
-        raise InputError(f"score raises {type(error).__name__} ({reason}).") from error
-    if value.shape or not jnp.issubdtype(value.dtype, jnp.floating):
+        raise InputError(f"score {validation.fault_of(error)}.") from error
+    is_array = hasattr(value, "dtype") and hasattr(value, "shape")
+    shown = f"{value.dtype}{[*value.shape]}" if is_array else type(value).__name__
+    if shown not in ("float32[]", "float64[]", "float"):
         rule = "of the snapshots (T, ...) of one trial it must return one real number"
-        raise errors.not_allowed("result of score", f"{value.dtype}{[*value.shape]}", rule)
-    return value
+        raise errors.not_allowed("result of score", shown, rule)
+    return jnp.asarray(value)
 
 
 def soft_score(
@@ -365,10 +366,13 @@ def _notes(
     engine: str,
     numbers: Sequence[Coordinate],
     used: np.ndarray,
+    value: np.ndarray,
     gradient: np.ndarray,
     bend: np.ndarray,
 ) -> Iterator[str]:
-    """Yield sentences on numbers without influence or without derivatives."""
+    """Yield sentences on numbers without influence, and on what is not finite."""
+    if invalid := np.sum(~np.isfinite(value)):
+        yield f"The score is not finite in {invalid} of {value.size} trials."
     is_mass = np.array([x.name == "mass" and not x.is_parameter for x in numbers])
     is_mass &= not domain.weakest.driven
     if is_mass.any():

@@ -137,6 +137,7 @@ class FusedStage(NamedTuple):
     """Stage of the fused engine, whose worlds share nothing."""
 
     native = True
+    engine = "fused"
 
     def drive(self, fields: Body, motion: Motion, period: ControlPeriod) -> Driven:
         """Step a batch of worlds (B,) for one control period.
