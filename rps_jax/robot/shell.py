@@ -118,12 +118,9 @@ class Shell:
 
     def on_strip(self, s: jax.Array) -> jax.Array:
         """Return points (..., 2) [m] in the robot frame at positions `s` (...) [m] of the strip."""
-        x, y = self.half
-        x = jnp.asarray(x, s.dtype)
-        corners = jnp.cumsum(jnp.stack([0 * x, 2 * x, jnp.full_like(x, 2 * y), 2 * x]))
-        at_x = jnp.interp(s, corners, jnp.stack([-x, x, x, -x]))
-        y = y * np.array([1.0, 1.0, -1.0, -1.0])
-        return jnp.stack([at_x, jnp.interp(s, corners, jnp.asarray(y, s.dtype))], axis=-1)
+        x, y = (jnp.asarray(half, s.dtype) for half in self.half)
+        along = jnp.clip(s, 0, 2 * x) - jnp.clip(s - 2 * (x + y), 0, 2 * x)  # left and right side
+        return jnp.stack([along - x, y - jnp.clip(s - 2 * x, 0, 2 * y)], axis=-1)
 
     def check(self) -> None:
         """Raise InputError for a base without size, or boards that overlap or leave it."""
