@@ -198,9 +198,9 @@ drawing.estimates(horizons, bars, names)
 #
 # ## Gradients and evolution at equal cost
 #
-# `rps tune grad` therefore uses windows of 8 s, which start at any time of a trial. The cost of
-# the remaining distance after a window is the time to drive it. `runs/race` has the logs of four
-# runs from the paper's parameters, in the same worlds: evolution and gradients with 2.4 million
+# In version 0.1.0 `rps tune grad` used windows of 8 s, which started at any time of a trial. The
+# cost of the remaining distance after a window was the time to drive it. `runs/race` has the logs
+# of four runs from the paper's parameters, in the same worlds: evolution and gradients with 2.4 million
 # simulated seconds each, half of the run by gradients, and evolution that continued this half.
 
 # %%
@@ -212,4 +212,5 @@ drawing.races(logs)
 # One step by gradients gains as much as the first generation of evolution, at equal cost. Further
 # steps by gradients gain nothing and steer ever more, perhaps because 8 s do not contain the later
 # effect on the contact. Evolution that continues from there, with a small spread, needs many
-# generations to improve. `sweeps/gradients` has a race of today's version.
+# generations to improve. Today `rps tune grad` follows slopes of whole trials instead:
+# `sweeps/gradients` has its race.

@@ -19,7 +19,7 @@ from rps_jax.trials.case import Case
 from rps_jax.trials.setting import Setting
 from rps_jax.tuning import gradients
 from rps_jax.tuning.gradients import Estimate, Options
-from sweeps.gradients import estimators
+from sweeps.gradients import critic, estimators
 
 THETA = jnp.array([0.5, -1.0, 2.0])
 STIFF = jnp.array([1.0, 2.0, 0.5])
@@ -219,6 +219,17 @@ def test_an_empty_estimate_is_zero_with_infinite_variance():
     np.testing.assert_array_equal(estimate.gradient, [0.0, 1.0])
     np.testing.assert_array_equal(estimate.variance, [np.inf, np.inf])
     np.testing.assert_array_equal(estimate.finite, [0.0, 0.5])
+
+
+@pytest.mark.slow
+def test_a_critic_is_fitted_to_remaining_scores(monkeypatch):
+    monkeypatch.setattr(critic, "_UPDATES", 500)
+    monkeypatch.setattr(critic, "_BATCH", 64)
+    monkeypatch.setattr(critic, "_WIDTH", 16)
+    x = np.random.default_rng(0).normal(size=(500, 3)).astype(np.float32)
+    y = np.tanh(x[:, 0]) + 0.5 * x[:, 1]
+    error = np.asarray(critic.fit(x, y)(jnp.asarray(x))) - y
+    assert np.std(error) < 0.2 * np.std(y)
 
 
 # Windows of trials

@@ -87,6 +87,8 @@ def test_the_best_validation_within_a_budget_is_tested():
     choices = {("simulated", 40.0): 3, ("simulated", 25.0): 2, ("wall", 11.5): 2, ("wall", 0.1): 1}
     for (budget, amount), L in choices.items():
         assert race.law_of(race.best_within(curve, budget, amount)).L == L
+    law = race.law_of(pd.Series({"params.l_cr": 0.12}))
+    assert law.l_mr == law.l_cr == 0.12  # a fixed l_mr follows a tuned l_cr
 
 
 def test_a_learner_by_gradients_needs_derivatives():

@@ -77,7 +77,7 @@ class Race(Study[xr.Dataset], SimulationQuestion[xr.Dataset]):
     """Wall clock after which a tuning is killed [min], with compilation."""
     wall: float = option(60.0, above=0, unit="s")
     """Budget of wall time without compilation [s]."""
-    simulated: float = option(4e6, above=0, unit="s")
+    simulated: float = option(2.4e6, above=0, unit="s")
     """Budget of simulated time [s]; a derivative counts as the simulation that takes as long."""
     worlds: int = option(2000, 1, 1_000_000)
     """Number of test worlds of `wide`."""
