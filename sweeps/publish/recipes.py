@@ -281,7 +281,8 @@ RECIPES: dict[str, Recipe] = {
         cores=12,
     ),
     "gradients_race": recipe(
-        f"rps sweeps/gradients/race.py --lanes 12 --gpus 1 --minutes 4.75 --wall 210 {_MACHINE}",
+        "rps sweeps/gradients/race.py --lanes 12 --gpus 1 --minutes 4.75 --wall 210 "
+        f"--simulated 2.4e6 {_MACHINE}",
         gpu=8,
     ),
     "gradients_network": recipe(
