@@ -200,8 +200,9 @@ drawing.estimates(horizons, bars, names)
 #
 # In version 0.1.0 `rps tune grad` used windows of 8 s, which started at any time of a trial. The
 # cost of the remaining distance after a window was the time to drive it. `runs/race` has the logs
-# of four runs from the paper's parameters, in the same worlds: evolution and gradients with 2.4 million
-# simulated seconds each, half of the run by gradients, and evolution that continued this half.
+# of four runs from the paper's parameters, in the same worlds: evolution and gradients with 2.4
+# million simulated seconds each, half of the run by gradients, and evolution that continued this
+# half.
 
 # %%
 logs = {name: read_log(f"race/{name}") for name in ("evolution", "gradient")}

@@ -28,7 +28,7 @@ _MOMENTUM = 0.8  # [1] weight of earlier gradients in the direction of a step
 
 @dataclass(frozen=True)
 class TuneGrad(Tuning):
-    """Tune a law's parameters by gradients, in many worlds.
+    """Tune a law by gradients of whole trials; derivatives pay for single pushes: value_and_grad.
 
     The answer is that of `TuneES`, with a step as a generation.
 
