@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
+from typing import cast
 
 import jax
 import jax.numpy as jnp
@@ -31,6 +32,8 @@ from rps_jax.tuning.gradients import Estimate
 from sweeps.gradients import estimators
 from sweeps.gradients.windows import WindowTuning, window_starts
 
+Layers = list[tuple[jax.Array, jax.Array]]  # weights and biases
+Fit = tuple[Layers, optax.OptState]
 Critic = Callable[[jax.Array], jax.Array]  # from features (..., F) to remaining scores (...) [1]
 _INTERVAL = 4.0  # [s] between the states of a trial to which a critic is fitted
 _UPDATES, _BATCH, _WIDTH = 3000, 512, 64  # of the fit; units of its two hidden layers
@@ -89,28 +92,28 @@ def fit(x: np.ndarray, y: np.ndarray) -> Critic:
     rule = optax.adamw(optax.cosine_decay_schedule(2e-3, _UPDATES), weight_decay=1e-2)
     inputs, targets = jnp.asarray(x), jnp.asarray(y)
 
-    def value(layers: list[tuple[jax.Array, jax.Array]], x: jax.Array) -> jax.Array:
+    def value(layers: Layers, x: jax.Array) -> jax.Array:
         hidden = (x - mean) / scale
         for weights, bias in layers[:-1]:
             hidden = jnp.tanh(hidden @ weights + bias)
         weights, bias = layers[-1]
         return (hidden @ weights + bias)[..., 0]
 
+    def update(carry: Fit, key: jax.Array) -> tuple[Fit, None]:
+        layers, state = carry
+        chosen = jax.random.randint(key, (_BATCH,), 0, len(y))
+
+        def loss(layers: Layers) -> jax.Array:
+            return jnp.mean((value(layers, inputs[chosen]) - targets[chosen]) ** 2)
+
+        change, state = rule.update(jax.grad(loss)(layers), state, layers)
+        return (cast(Layers, optax.apply_updates(layers, change)), state), None
+
     @jax.jit
-    def train(layers, state, key):
-        def update(carry, key):
-            layers, state = carry
-            chosen = jax.random.randint(key, (_BATCH,), 0, len(y))
+    def train(start: Fit, key: jax.Array) -> Fit:
+        return jax.lax.scan(update, start, jax.random.split(key, _UPDATES))[0]
 
-            def loss(layers):
-                return jnp.mean((value(layers, inputs[chosen]) - targets[chosen]) ** 2)
-
-            change, state = rule.update(jax.grad(loss)(layers), state, layers)
-            return (optax.apply_updates(layers, change), state), None
-
-        return jax.lax.scan(update, (layers, state), jax.random.split(key, _UPDATES))[0]
-
-    layers, _ = train(layers, rule.init(layers), keys[-1])
+    layers, _ = train((layers, rule.init(layers)), keys[-1])
     return partial(value, layers)
 
 

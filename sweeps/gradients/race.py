@@ -95,7 +95,7 @@ class Race(Study[xr.Dataset], SimulationQuestion[xr.Dataset]):
             errors.check_name("count", str(count), [str(x) for x in COUNTS])
 
     def configuration(self) -> dict[str, Any]:
-        """Return all inputs of the answer; the commands stand for the tunings."""
+        """Return all inputs of the answer, with the commands of the tunings."""
         commands = {name: METHODS[name] for name in self.methods}
         return super().configuration() | {"commands": commands}
 
