@@ -56,6 +56,9 @@ class ControlPeriod:
     robot: Robot | None = None  # (B,) whose force is limited; None: bases follow every twist
     # Whether `Driven.force` is computed.
     force: bool = field(default=False, metadata={"static": True})
+    # Accelerations of each physics step: () to return them, or those of an equal period, from which
+    # its derivatives are computed without a solver; None: neither.
+    solutions: Any = None
 
 
 class Driven(NamedTuple):
@@ -65,6 +68,7 @@ class Driven(NamedTuple):
     # [N, N, N m] wrench of the object on the base, about the base's origin and in its frame; mean
     # over the physics steps of the period; None: not requested.
     force: Float[Any, "*B 3"] | None = None
+    solutions: Any = None  # of `ControlPeriod`, where it requests them
 
 
 @runtime_checkable

@@ -21,17 +21,16 @@ import tempfile
 import threading
 import warnings
 from collections import defaultdict
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
 from typing import Any, TypeAlias
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.custom_derivatives import SymbolicZero
 
 from rps_jax.engines import device
-from rps_jax.engines.linear_map import linear_map
+from rps_jax.engines.linear_map import linear_map, restrict, varied_indices
 from rps_jax.geometry import vectors
 from rps_jax.lowering import nvrtc
 from rps_jax.lowering.gpu_writer import WARP, GpuWriter
@@ -91,9 +90,7 @@ def target() -> str | None:
 def batched(
     function: Callable[..., Pytree],
     whole: Callable[..., Pytree],
-    derivative: Callable[[Pytree, Pytree], Pytree] | None = None,
-    differentiated: Callable[..., Pytree] | None = None,
-    packed: Sequence[int] = (),
+    saving: Callable[[Pytree, Pytree], tuple[Pytree, Pytree]] | None = None,
 ) -> Callable[..., Pytree]:
     """Return a function of a batch of worlds (B, ...) that runs world by world.
 
@@ -102,11 +99,8 @@ def batched(
     Args:
       function: the function of one world; pure.
       whole: the same function of a batch, which XLA compiles where `function` is not compiled.
-      derivative: of arguments and results of one world; the function's derivatives are those of
-        this one by the arguments. By default it is the function itself.
-      differentiated: the same function of a batch, used where it is differentiated.
-      packed: indices of arguments that reverse mode stores as one array for each type of number,
-        since a loop stores each array by itself.
+      saving: the same function of a tuple of arguments, and of numbers that it returns beside the
+        results, from which its derivatives are faster; with () it computes them.
     """
     if not is_available():
         return whole
@@ -117,20 +111,17 @@ def batched(
         return run(arguments)[0]
 
     def rule(primals: Pytree, tangents: Pytree) -> tuple[Pytree, Pytree]:
-        if differentiated is not None:
-            inputs, tree = jax.tree.flatten(primals)
-            varied = {i: x for i, x in enumerate(jax.tree.leaves(tangents)) if _varies(x)}
+        if saving is None:
+            results = call(*primals)
+            return results, _tangents(lambda x, _: function(*x), primals, (), tangents, results)
 
-            def of_varied(values: dict[int, jax.Array]) -> Pytree:
-                assert differentiated is not None  # as above
-                arguments = tree.unflatten([values.get(i, x) for i, x in enumerate(inputs)])
-                return differentiated(*arguments)
+        def save(*arguments: Pytree) -> tuple[Pytree, Pytree]:
+            return saving(arguments, ())
 
-            return jax.jvp(of_varied, ({i: inputs[i] for i in varied},), (varied,))
-        results = call(*primals)
-        if derivative is not None:
-            return results, _tangents(derivative, (primals, results), tangents, results)
-        return results, _tangents(function, primals, tangents, results, packed)
+        run_saving = concurrent([save], lambda arguments: [jax.vmap(save)(*arguments)])
+        results, saved = run_saving(primals)[0]
+        function_of_saved = lambda x, saved: saving(x, saved)[0]  # noqa: E731
+        return results, _tangents(function_of_saved, primals, saved, tangents, results)
 
     call.defjvp(rule, symbolic_zeros=True)
     return call
@@ -139,10 +130,8 @@ def batched(
 def mapped(function: Callable[..., Pytree], axes: Sequence[int | None]) -> Callable[..., Pytree]:
     """Return `jax.vmap(function, axes)`, compiled and differentiated world by world.
 
-    An argument of axis None is repeated for each world. All others but the first may change from
-    step to step: reverse mode packs them.
+    An argument of axis None is repeated for each world.
     """
-    varying = [i for i, axis in enumerate(axes) if i and axis == 0]
 
     def call(*arguments: Pytree) -> Pytree:
         size = len(jax.tree.leaves(arguments[0])[0])
@@ -157,77 +146,125 @@ def mapped(function: Callable[..., Pytree], axes: Sequence[int | None]) -> Calla
         inputs = [jax.tree.leaves(x) for x in arguments]
         pairs = zip(inputs, axes, strict=True)
         inputs = [x if axis == 0 else list(map(repeat, x)) for x, axis in pairs]
-        return batched(single, jax.vmap(single), packed=varying)(*inputs)
+        return batched(single, jax.vmap(single))(*inputs)
 
     return call
 
 
+def scan(
+    step: Callable[[Pytree, Pytree, Pytree], tuple[tuple[Pytree, Pytree], Pytree]],
+    state: Pytree, constants: Pytree, length: int,
+) -> tuple[Pytree, Pytree]:  # fmt: skip
+    """Return `jax.lax.scan` of a batch of worlds (B, ...) by one native function for each step.
+
+    A loop reads and writes few arrays: those of the state and of the constants, each with one array
+    for each type of number, and one more of the constants that are differentiated.
+
+    Args:
+      step: of one world, from state, constants and the saved numbers of `batched`'s `saving`. It
+        returns state and output, and these numbers.
+      state: first state.
+      constants: pytree of arrays that do not change.
+      length: number of steps.
+    """
+    leaves, tree = jax.tree.flatten((state, constants))
+    count, types = len(jax.tree.leaves(state)), [(x.shape[1:], x.dtype) for x in leaves]
+
+    def run(values: Sequence[jax.Array], varied: Collection[int] = ()) -> tuple[Pytree, Pytree]:
+        keys = [
+            (str(x.dtype), i >= count, i >= count and i in varied) for i, x in enumerate(leaves)
+        ]
+        first, rest = Packing(types[:count], keys[:count]), Packing(types[count:], keys[count:])
+        constants = rest.pack(values[count:])
+
+        def saving(arguments: Pytree, saved: Pytree) -> tuple[Pytree, Pytree]:
+            state, constants = tree.unflatten(
+                [*first.unpack(arguments[0]), *rest.unpack(arguments[1])]
+            )
+            (state, output), saved = step(state, constants, saved)
+            return (first.pack(jax.tree.leaves(state)), output), saved
+
+        def single(*arguments: Pytree) -> Pytree:
+            return saving(arguments, None)[0]
+
+        call = batched(single, jax.vmap(single), saving)
+        start = first.pack(values[:count])
+        end, outputs = jax.lax.scan(lambda x, _: call(x, constants), start, length=length)
+        return jax.tree.structure(state).unflatten(first.unpack(end)), outputs
+
+    @jax.custom_jvp
+    def call(values: list[jax.Array]) -> tuple[Pytree, Pytree]:
+        return run(values)
+
+    def rule(primals: Any, tangents: Any) -> Any:
+        ((values,), (directions,)) = primals, tangents
+        indices = varied_indices(directions)
+        of_varied, point = restrict(functools.partial(run, varied=indices), values, indices)
+        return jax.jvp(of_varied, (point,), ([directions[i] for i in indices],))
+
+    call.defjvp(rule, symbolic_zeros=True)
+    return call(leaves)
+
+
+class Packing:
+    """Arrays as few arrays, each of those with the same key along the last axis."""
+
+    def __init__(self, types: Sequence[tuple[tuple[int, ...], Any]], keys: Sequence[Any]) -> None:
+        """`types` are the shapes, without leading axes, and dtypes."""
+        self._shapes = [shape for shape, _ in types]
+        self._groups: dict[Any, list[int]] = {}
+        for i, key in enumerate(keys):
+            self._groups.setdefault(key, []).append(i)
+
+    def pack(self, leaves: Sequence[jax.Array]) -> list[jax.Array]:
+        """Return arrays (..., N) of leaves, which have the same leading axes."""
+        lead = [x.shape[: x.ndim - len(s)] for x, s in zip(leaves, self._shapes, strict=True)]
+        flat = [jnp.reshape(x, (*axes, -1)) for x, axes in zip(leaves, lead, strict=True)]
+        return [jnp.concatenate([flat[i] for i in x], -1) for x in self._groups.values()]
+
+    def unpack(self, arrays: Sequence[jax.Array]) -> list[jax.Array]:
+        """Return the leaves of arrays (..., N)."""
+        leaves: dict[int, jax.Array] = {}
+        for group, array in zip(self._groups.values(), arrays, strict=True):
+            ends = np.cumsum([math.prod(self._shapes[i]) for i in group])[:-1]
+            for i, part in zip(group, jnp.split(array, ends, axis=-1), strict=True):
+                leaves[i] = jnp.reshape(part, (*array.shape[:-1], *self._shapes[i]))
+        return [leaves[i] for i in range(len(leaves))]
+
+
 def _tangents(
-    function: Callable[..., Pytree],
-    arguments: Pytree,
-    tangents: Pytree,
-    like: Pytree,
-    packed: Sequence[int] = (),
-) -> Pytree:
+    function: Callable[[Pytree, Pytree], Pytree],
+    arguments: Pytree, saved: Pytree, tangents: Pytree, results: Pytree,
+) -> Pytree:  # fmt: skip
     """Return the tangents of the results of a function of one world, in a batch of worlds.
 
-    Arguments without tangents, behind the others, are constant; `like` has the types of the
-    results, and `packed` is that of `batched`.
+    The function's second argument, `saved`, is constant.
     """
-    leaves, tree = jax.tree.flatten(arguments)
-    owners = [i for i, x in enumerate(arguments) for _ in jax.tree.leaves(x)]
-    groups: dict[object, list[int]] = {}  # positions of the leaves of each stored array
-    for i, (leaf, owner) in enumerate(zip(leaves, owners, strict=True)):
-        groups.setdefault(leaf.dtype if owner in packed else i, []).append(i)
-    like_leaves, like_tree = jax.tree.flatten(like)
+    leaves, tree = jax.tree.flatten((arguments, saved))
+    result_leaves, result_tree = jax.tree.flatten(results)
     directions = jax.tree.leaves(tangents)
-    varied = [i for i, x in enumerate(directions) if _varies(x)]
-    real = [i for i, x in enumerate(like_leaves) if jnp.issubdtype(x.dtype, jnp.floating)]
+    varied = varied_indices(directions)
+    real = [i for i, x in enumerate(result_leaves) if jnp.issubdtype(x.dtype, jnp.floating)]
 
-    def pack(group: Sequence[int]) -> jax.Array:
-        if len(group) == 1:
-            return leaves[group[0]]
-        return jnp.concatenate([jnp.reshape(leaves[i], (len(leaves[i]), -1)) for i in group], 1)
-
-    def of_varied(stored: Sequence[Any]) -> tuple[Callable[[list[Any]], list[Any]], list[Any]]:
-        """Return a function of the varied arguments of one world, and their values."""
-        values: list[Any] = [None] * len(leaves)
-        for group, array in zip(groups.values(), stored, strict=True):
-            shapes = [leaves[i].shape[1:] for i in group]
-            ends = np.cumsum([math.prod(shape) for shape in shapes])[:-1]
-            parts = [array] if len(group) == 1 else jnp.split(array, ends)
-            for i, part, shape in zip(group, parts, shapes, strict=True):
-                values[i] = jnp.reshape(part, shape)
-
-        def run(some: list[Any]) -> list[Any]:
-            replaced = dict(zip(varied, some, strict=True))
-            whole = tree.unflatten([replaced.get(i, x) for i, x in enumerate(values)])
-            results = jax.tree.leaves(function(*whole))
-            return [results[i] for i in real]
-
-        return run, [values[i] for i in varied]
+    def real_results(values: Sequence[Any]) -> list[Any]:
+        leaves = jax.tree.leaves(function(*tree.unflatten(values)))
+        return [leaves[i] for i in real]
 
     def push(values: Sequence[Any], vectors: Sequence[Any]) -> list[Any]:
-        run, point = of_varied(values)
-        return jax.jvp(run, (point,), (list(vectors),))[1]
+        of_varied, point = restrict(real_results, values, varied)
+        return jax.jvp(of_varied, (point,), (list(vectors),))[1]
 
     def pull(values: Sequence[Any], vectors: Sequence[Any]) -> list[Any]:
-        run, point = of_varied(values)
-        return jax.vjp(run, point)[1](list(vectors))[0]
+        of_varied, point = restrict(real_results, values, varied)
+        return jax.vjp(of_varied, point)[1](list(vectors))[0]
 
     moved = linear_map(
         batched(push, jax.vmap(push)), batched(pull, jax.vmap(pull)),
-        [*map(pack, groups.values())], [directions[i] for i in varied],
-        [like_leaves[i] for i in real],
+        leaves, [directions[i] for i in varied], [result_leaves[i] for i in real],
     )  # fmt: skip
     values = dict(zip(real, moved, strict=True))
-    zeros = [np.zeros(x.shape, jax.dtypes.float0) for x in like_leaves]
-    return like_tree.unflatten([values.get(i, x) for i, x in enumerate(zeros)])
-
-
-def _varies(tangent: Any) -> bool:
-    """Whether a tangent is not a symbolic zero."""
-    return not isinstance(tangent, SymbolicZero)
+    zeros = [np.zeros(x.shape, jax.dtypes.float0) for x in result_leaves]
+    return result_tree.unflatten([values.get(i, x) for i, x in enumerate(zeros)])
 
 
 def concurrent(

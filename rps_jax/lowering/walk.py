@@ -31,6 +31,7 @@ from rps_jax.lowering.target import (
 )
 
 _MAX_STEPS = 256  # of a scan that is unrolled
+_MAX_UNROLLED = 500  # equations of the body of a scan that is unrolled
 # Primitives that only move numbers, with the number of operands that are moved; None: all. The
 # operands behind them are indices.
 _MOVES = {
@@ -74,6 +75,8 @@ def _walk(closed: ClosedJaxpr | Jaxpr, arguments: Sequence[Value], target: Targe
         return np.asarray(atom.val, atom.aval.dtype) if isinstance(atom, Literal) else values[atom]
 
     for eqn in jaxpr.eqns:
+        if not eqn.outvars:
+            continue
         results = _results(eqn, [read(atom) for atom in eqn.invars], target)
         values |= dict(zip(eqn.outvars, results, strict=True))
     return [read(atom) for atom in jaxpr.outvars]
@@ -235,6 +238,10 @@ def _scan(eqn: JaxprEqn, values: list[Value], target: Target) -> list[Value]:
             return loop
     scanned = list(zip(values[fixed + carried :], body.jaxpr.invars[fixed + carried :],
                        strict=True))  # fmt: skip
+    if len(body.jaxpr.eqns) > _MAX_UNROLLED and length > 1:
+        loop = _scan_loop(body, consts, carry, scanned, length, params["reverse"], target)
+        if loop is not None:
+            return loop
     rows: list[list[Value]] = [[]] * length
     order = range(length)
     for step in reversed(order) if params["reverse"] else order:
@@ -255,3 +262,54 @@ def _row(value: Value, step: int, out: Any, target: Target) -> Value:
         return np.asarray(value[step])
     size = size_of(out.shape)
     return target.moved([value], (step * size + np.arange(size)).reshape(out.shape), out)
+
+
+def _scan_loop(
+    body: ClosedJaxpr, consts: Sequence[Value], carry: Sequence[Value],
+    scanned: Sequence[tuple[Value, Any]], length: int, reverse: bool, target: Target,
+) -> list[Value] | None:  # fmt: skip
+    """Emit a loop for a scan with scanned or stacked values; None: the target has no loops."""
+    outs = _types(body.jaxpr.outvars[len(carry) :])
+    one = np.ones((), np.int32)
+    whole = [jax.ShapeDtypeStruct((length, *x.shape), x.dtype) for x in outs]
+
+    def at(index: Value, shape: Sequence[int]) -> list[Value]:
+        return [index, *[np.zeros((), np.int32)] * len(shape)]
+
+    def turn(values: Sequence[Value]) -> list[Value]:
+        index, *values = values
+        carried, stacked = values[: len(carry)], values[len(carry) :]
+        rows = []
+        for value, var in scanned:
+            shape = var.aval.shape
+            row = target.apply(
+                "dynamic_slice",
+                [value, *at(index, shape)],
+                {"slice_sizes": (1, *shape)},
+                jax.ShapeDtypeStruct((1, *shape), var.aval.dtype),
+            )
+            rows.append(target.moved([row], np.arange(size_of(shape)).reshape(shape), var.aval))
+        results = _walk(body, [*consts, *carried, *rows], target)
+        updated = []
+        for array, row, out, kind in zip(stacked, results[len(carry) :], outs, whole, strict=True):
+            row = target.moved([row], np.arange(size_of(out.shape)).reshape(1, *out.shape), out)
+            types = [
+                kind,
+                jax.ShapeDtypeStruct((1, *out.shape), out.dtype),
+                *[one] * (1 + len(out.shape)),
+            ]
+            updated.append(
+                _expanded(
+                    COMPOUNDS["dynamic_update_slice"],
+                    [array, row, *at(index, out.shape)],
+                    types,
+                    target,
+                )[0]
+            )
+        index = target.apply("sub" if reverse else "add", [index, one], {}, one)
+        return [index, *results[: len(carry)], *updated]
+
+    start = np.asarray(length - 1 if reverse else 0, np.int32)
+    zeros = [np.zeros(x.shape, x.dtype) for x in whole]
+    loop = target.for_loop(turn, [start, *carry, *zeros], length)
+    return loop and loop[1:]

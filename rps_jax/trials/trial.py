@@ -307,7 +307,7 @@ def settle(world: World, previous: Trial, decided: Trial, driven: Driven) -> Tri
 
     A trial that had ended before, as `previous` says, is returned as it was.
     """
-    (qpos, qvel, warmstart, integral), force = driven
+    (qpos, qvel, warmstart, integral), force, *_ = driven
     sane = (
         ~decided.nan_twist
         & jnp.all(jnp.isfinite(qpos))
@@ -339,17 +339,20 @@ def control_step(
     trials: Trial,
     loop: ControlLoop,
     mapped: Callable[..., Any] = jax.vmap,
-) -> tuple[Trial, Snapshot]:
+    solutions: Any = None,
+) -> tuple[Trial, Snapshot, Any]:
     """Run one control step of a batch of worlds; trials that have ended do not change.
 
     For a single world without batch dimension, `mapped` returns its function unchanged.
+    `solutions` are those of `ControlPeriod`, and the last result those of `Driven`.
     """
     decided, twists, snapshots = mapped(decide, (0, 0, 0, None))(worlds, params, trials, loop)
     force = loop.law.senses == "force"
-    period = ControlPeriod(twists, loop.physics, pushing(worlds), force)
+    period = ControlPeriod(twists, loop.physics, pushing(worlds), force, solutions)
     driven = stage.drive(worlds.fields, motion(decided), period)
-    settled = mapped(settle, (0, 0, 0, 0))(worlds, trials, decided, driven)
-    return settled, snapshots
+    result = driven._replace(solutions=None)
+    settled = mapped(settle, (0, 0, 0, 0))(worlds, trials, decided, result)
+    return settled, snapshots, driven.solutions
 
 
 def unroll(
@@ -367,11 +370,23 @@ def unroll(
     `control_step`; with `native.mapped`, derivatives are fastest.
     """
 
-    def step(trials: Trial, _: None) -> tuple[Trial, Snapshot]:
-        return control_step(stage, worlds, params, trials, loop, mapped)
+    def single(trial: Trial, inputs: Any, solutions: Any) -> tuple[tuple[Trial, Snapshot], Any]:
+        """Run one control step of one world."""
+        world, params, rules = inputs
+        world_loop = dataclasses.replace(loop, rules=rules)
+        step = stage, world, params, trial, world_loop, lambda f, *_: f, solutions
+        *results, solutions = control_step(*step)
+        return tuple(results), solutions
 
-    if not (getattr(stage, "native", False) and native.is_available()):
-        step = jax.checkpoint(step, prevent_cse=False)  # XLA would store all intermediate numbers
+    if mapped is native.mapped and getattr(stage, "native", False) and native.is_available():
+        rules = jax.tree.map(lambda x: jnp.broadcast_to(x, trials.done.shape), loop.rules)
+        return native.scan(single, trials, (worlds, params, rules), steps)
+
+    # Without a checkpoint, XLA would store all intermediate numbers.
+    @partial(jax.checkpoint, prevent_cse=False)
+    def step(trials: Trial, _: None) -> tuple[Trial, Snapshot]:
+        return control_step(stage, worlds, params, trials, loop, mapped)[:2]
+
     return jax.lax.scan(step, trials, length=steps)
 
 
