@@ -22,8 +22,9 @@ import threading
 import warnings
 from collections import defaultdict
 from collections.abc import Callable, Collection, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -51,6 +52,8 @@ _NO_COMPILER = (
 )
 _PLATFORMS = {"cpu": "cpu", "gpu": "CUDA"}
 libraries: dict[str, ctypes.CDLL] = {}  # of the functions that XLA can call, by name
+# Compilers run while JAX traces the next functions.
+_COMPILATIONS = ThreadPoolExecutor(4, "compiler")
 _locks: defaultdict[str, threading.RLock] = defaultdict(threading.RLock)
 
 
@@ -91,6 +94,7 @@ def batched(
     function: Callable[..., Pytree],
     whole: Callable[..., Pytree],
     saving: Callable[[Pytree, Pytree], tuple[Pytree, Pytree]] | None = None,
+    saves: bool = False,
 ) -> Callable[..., Pytree]:
     """Return a function of a batch of worlds (B, ...) that runs world by world.
 
@@ -101,27 +105,27 @@ def batched(
       whole: the same function of a batch, which XLA compiles where `function` is not compiled.
       saving: the same function of a tuple of arguments, and of numbers that it returns beside the
         results, from which its derivatives are faster; with () it computes them.
+      saves: whether it is `saving` also where it is not differentiated.
     """
     if not is_available():
         return whole
     run = concurrent([function], lambda arguments: [whole(*arguments)])
 
+    def save(*arguments: Pytree) -> tuple[Pytree, Pytree]:
+        return saving(arguments, ()) if saving is not None else (function(*arguments), ())
+
+    run_saving = concurrent([save], lambda arguments: [jax.vmap(save)(*arguments)])
+
+    def of_saved(arguments: Pytree, saved: Pytree) -> Pytree:
+        return saving(arguments, saved)[0] if saving is not None else function(*arguments)
+
     @jax.custom_jvp
     def call(*arguments: Pytree) -> Pytree:
-        return run(arguments)[0]
+        return run_saving(arguments)[0][0] if saves else run(arguments)[0]
 
     def rule(primals: Pytree, tangents: Pytree) -> tuple[Pytree, Pytree]:
-        if saving is None:
-            results = call(*primals)
-            return results, _tangents(lambda x, _: function(*x), primals, (), tangents, results)
-
-        def save(*arguments: Pytree) -> tuple[Pytree, Pytree]:
-            return saving(arguments, ())
-
-        run_saving = concurrent([save], lambda arguments: [jax.vmap(save)(*arguments)])
-        results, saved = run_saving(primals)[0]
-        function_of_saved = lambda x, saved: saving(x, saved)[0]  # noqa: E731
-        return results, _tangents(function_of_saved, primals, saved, tangents, results)
+        results, saved = run_saving(primals)[0] if saving is not None else (call(*primals), ())
+        return results, _tangents(of_saved, primals, saved, tangents, results)
 
     call.defjvp(rule, symbolic_zeros=True)
     return call
@@ -170,7 +174,9 @@ def scan(
     leaves, tree = jax.tree.flatten((state, constants))
     count, types = len(jax.tree.leaves(state)), [(x.shape[1:], x.dtype) for x in leaves]
 
-    def run(values: Sequence[jax.Array], varied: Collection[int] = ()) -> tuple[Pytree, Pytree]:
+    def run(
+        values: Sequence[jax.Array], varied: Collection[int] = (), is_differentiated: bool = True
+    ) -> tuple[Pytree, Pytree]:
         keys = [
             (str(x.dtype), i >= count, i >= count and i in varied) for i, x in enumerate(leaves)
         ]
@@ -187,14 +193,14 @@ def scan(
         def single(*arguments: Pytree) -> Pytree:
             return saving(arguments, None)[0]
 
-        call = batched(single, jax.vmap(single), saving)
+        call = batched(single, jax.vmap(single), saving, saves=is_differentiated)
         start = first.pack(values[:count])
         end, outputs = jax.lax.scan(lambda x, _: call(x, constants), start, length=length)
         return jax.tree.structure(state).unflatten(first.unpack(end)), outputs
 
     @jax.custom_jvp
     def call(values: list[jax.Array]) -> tuple[Pytree, Pytree]:
-        return run(values)
+        return run(values, is_differentiated=False)
 
     def rule(primals: Any, tangents: Any) -> Any:
         ((values,), (directions,)) = primals, tangents
@@ -284,52 +290,90 @@ def concurrent(
     if not is_available():
         return whole
 
+    @functools.cache
+    def compiled(types: Sequence[tuple[Any, Sequence[Any]]]) -> tuple[list[_Function], Any]:
+        calls = [_Function(f, *x, sort_by) for f, x in zip(functions, types, strict=True)]
+        groups = [calls] if jax.default_backend() == "gpu" else [[call] for call in calls]
+        return calls, [(group, _compiled(group)) for group in groups]
+
     @jax.custom_jvp
     def run(*arguments: Pytree) -> list[Pytree]:
-        calls = [_Function(f, x, sort_by) for f, x in zip(functions, arguments, strict=True)]
-        groups = [calls] if jax.default_backend() == "gpu" else [[call] for call in calls]
-        names = [_compiled(group) for group in groups]
-        if None in names:
+        flat = [jax.tree.flatten(jax.tree.map(jnp.asarray, x)) for x in arguments]
+        types = tuple((tree, tuple((x.shape, x.dtype) for x in leaves)) for leaves, tree in flat)
+        calls, groups = compiled(types)
+        if any(library is None for _, library in groups):
             return list(whole(*arguments))
-        results: list[Pytree] = []
-        for group, name in zip(groups, names, strict=True):
-            shapes = [x for call in group for x in call.shapes]
-            leaves = [x for call in group for x in call.leaves]
-            call_library = jax.ffi.ffi_call(str(name), shapes, vmap_method="broadcast_all")
-            # As a map of no vectors it has a message where it is differentiated twice.
-            run_library = functools.partial(lambda f, x, _: f(*x), call_library)
-            values = iter(linear_map(run_library, None, leaves, [], shapes, str(name)))
-            results += [
-                jax.tree.unflatten(call.structure, [next(values) for _ in call.results])
-                for call in group
-            ]
-        return results
+        inputs = [leaves for leaves, _ in flat]
+        if sort_by is not None:
+            orders = [jnp.argsort(sort_by(*x)).astype(jnp.int32) for x in arguments]
+            inputs = [[*x, order] for x, order in zip(inputs, orders, strict=True)]
+        sizes = [len(x) for x in inputs]
+
+        def run_libraries(values: Sequence[Any], _: Any) -> list[jax.Array]:
+            """Call the libraries, for which it waits until they are compiled."""
+            rest = iter(values)
+            leaves = [[next(rest) for _ in range(size)] for size in sizes]
+            try:
+                names = [library.ready() for _, library in groups]
+            except RuntimeError as error:
+                compiler, reason = error.args
+                warnings.warn(f"{compiler} fails, so XLA compiles: {reason}", stacklevel=2)
+                pairs = zip(types, leaves, strict=True)
+                trees = [tree.unflatten(x[: len(kinds)]) for (tree, kinds), x in pairs]
+                return jax.tree.leaves(list(whole(*trees)))
+            owners, results = iter(leaves), list[jax.Array]()
+            for (group, _), name in zip(groups, names, strict=True):
+                shapes = [x for call in group for x in call.shapes]
+                run_library = jax.ffi.ffi_call(name, shapes, vmap_method="broadcast_all")
+                results += run_library(*(x for _ in group for x in next(owners)))
+            return results
+
+        shapes = [x for call in calls for x in call.shapes]
+        # As a map of no vectors it has a message where it is differentiated twice.
+        label = " ".join(library.name for _, library in groups)
+        leaves = [x for call in inputs for x in call]
+        results = iter(linear_map(run_libraries, None, leaves, [], shapes, label))
+        return [call.structure.unflatten([next(results) for _ in call.results]) for call in calls]
 
     run.defjvp(lambda primals, tangents: jax.jvp(lambda *x: list(whole(*x)), primals, tangents))
     return run
 
 
+class _Library(NamedTuple):
+    """A library that XLA can call, or that is being compiled."""
+
+    name: str
+    compilation: Future[None] | None = None
+
+    def ready(self) -> str:
+        """Return its name when it is compiled.
+
+        Raises:
+          RuntimeError: the compiler that fails, and its first message.
+        """
+        if self.compilation is not None:
+            self.compilation.result()
+        return self.name
+
+
 class _Function:
-    """The jaxpr of a function of one world, with the arguments and shapes of a batch."""
+    """The jaxpr of a function of one world, and the shapes of the results of a batch."""
 
     def __init__(
-        self, function: Callable[..., Pytree], arguments: Pytree,
+        self, function: Callable[..., Pytree], tree: Any, types: Sequence[tuple[Any, Any]],
         sort_by: Callable[..., jax.Array] | None,
     ) -> None:  # fmt: skip
-        self.leaves, tree = jax.tree.flatten(jax.tree.map(jnp.asarray, arguments))
-        self.inputs = [jax.ShapeDtypeStruct(x.shape[1:], x.dtype) for x in self.leaves]
+        self.inputs = [jax.ShapeDtypeStruct(shape[1:], dtype) for shape, dtype in types]
         with vectors.trace_one_world():
-            world = jax.tree.unflatten(tree, self.inputs)
+            world = tree.unflatten(self.inputs)
             self.jaxpr, out = jax.make_jaxpr(function, return_shape=True)(*world)
         self.results, self.structure = jax.tree.flatten(out)
-        count, self.is_sorted = len(self.leaves[0]), sort_by is not None
-        if sort_by is not None:
-            self.leaves.append(jnp.argsort(sort_by(*arguments)).astype(jnp.int32))
+        self.is_sorted, count = sort_by is not None, types[0][0][0]
         self.shapes = [jax.ShapeDtypeStruct((count, *x.shape), x.dtype) for x in self.results]
 
 
-def _compiled(functions: Sequence[_Function]) -> str | None:
-    """Compile functions, or load them from the cache; return their name in XLA, or None."""
+def _compiled(functions: Sequence[_Function]) -> _Library | None:
+    """Start to compile functions, or load them from the cache; None: XLA compiles them."""
     on_gpu = jax.default_backend() == "gpu"
     try:
         threads, texts = _texts(functions) if on_gpu else (1, _printed(functions, SimdWriter))
@@ -345,19 +389,17 @@ def _compiled(functions: Sequence[_Function]) -> str | None:
         return None
     key = repr((texts, on_gpu and (nvrtc.LAUNCH, nvrtc.FLAGS), target(), jax.__version__))
     name = _NAME + hashlib.sha256(key.encode()).hexdigest()[:32]
-    with _locks[name]:
-        if load(name):
-            return name
-        try:
+
+    def compilation() -> None:
+        with _locks[name]:
+            if name in libraries:
+                return
             body = _kernels(name, texts, functions, WARP // threads) if on_gpu else _library(
                 texts[0].replace(HANDLER, name), name)  # fmt: skip
-        except RuntimeError as error:
-            compiler, reason = error.args
-            warnings.warn(f"{compiler} fails, so XLA compiles: {reason}", stacklevel=2)
-            return None
-        cache.write(_cache_path(name), body)
-        _register(name, body)
-    return name
+            cache.write(_cache_path(name), body)
+            _register(name, body)
+
+    return _Library(name, None if load(name) else _COMPILATIONS.submit(compilation))
 
 
 def _texts(functions: Sequence[_Function]) -> tuple[int, list[str]]:
@@ -402,7 +444,8 @@ def _kernels(name: str, texts: Sequence[str], functions: Sequence[_Function], wo
     Raises:
       RuntimeError: the compiler that fails, and its first message.
     """
-    shapes = [(len(x.leaves), len(x.results), *first_array(x.inputs)) for x in functions]
+    counts = [(len(x.inputs) + x.is_sorted, len(x.results)) for x in functions]
+    shapes = [(*n, *first_array(x.inputs)) for n, x in zip(counts, functions, strict=True)]
     with tempfile.TemporaryDirectory() as folder:
         paths = [Path(folder) / f"{k}.cubin" for k in range(len(texts))]
         for path, image in zip(paths, nvrtc.images(texts), strict=True):
