@@ -216,6 +216,22 @@ def _moved_by_numpy(eqn: JaxprEqn, arrays: list[Value]) -> list[np.ndarray] | No
     if name in ("concatenate", "stack"):
         axis = params.get("dimension", params.get("axis"))
         return [getattr(np, name)(arrays, axis)]
+    if name == "split":
+        return np.split(arrays[0], np.cumsum(params["sizes"])[:-1], params["axis"])
+    if name == "unstack":
+        return list(np.moveaxis(arrays[0], params["axis"], 0))
+    if name == "transpose":
+        return [np.transpose(arrays[0], params["permutation"])]
+    if name == "rev":
+        return [np.flip(arrays[0], params["dimensions"])]
+    if name == "pad" and size_of(shape) and min(min(x) for x in params["padding_config"]) >= 0:
+        result = np.full(shape, arrays[1], np.asarray(arrays[0]).dtype)
+        inside = [
+            slice(a, n - b, c + 1)
+            for n, (a, b, c) in zip(shape, params["padding_config"], strict=True)
+        ]
+        result[tuple(inside)] = arrays[0]
+        return [result]
     return None
 
 
