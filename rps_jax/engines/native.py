@@ -13,7 +13,8 @@ import contextlib
 import ctypes
 import functools
 import hashlib
-import math
+import itertools
+import operator
 import os
 import re
 import subprocess
@@ -29,6 +30,7 @@ from typing import Any, NamedTuple, TypeAlias
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.flatten_util import ravel_pytree
 
 from rps_jax.engines import device
 from rps_jax.engines.linear_map import linear_map, restrict, varied_indices
@@ -139,18 +141,13 @@ def mapped(function: Callable[..., Pytree], axes: Sequence[int | None]) -> Calla
 
     def call(*arguments: Pytree) -> Pytree:
         size = len(jax.tree.leaves(arguments[0])[0])
-        trees = list(map(jax.tree.structure, arguments))
 
         def repeat(x: Any) -> jax.Array:
             return jnp.broadcast_to(x, (size, *jnp.shape(x)))
 
-        def single(*leaves: Sequence[Any]) -> Pytree:
-            return function(*(tree.unflatten(x) for tree, x in zip(trees, leaves, strict=True)))
-
-        inputs = [jax.tree.leaves(x) for x in arguments]
-        pairs = zip(inputs, axes, strict=True)
-        inputs = [x if axis == 0 else list(map(repeat, x)) for x, axis in pairs]
-        return batched(single, jax.vmap(single))(*inputs)
+        pairs = zip(arguments, axes, strict=True)
+        inputs = [x if axis == 0 else jax.tree.map(repeat, x) for x, axis in pairs]
+        return batched(function, jax.vmap(function))(*inputs)
 
     return call
 
@@ -172,35 +169,45 @@ def scan(
       length: number of steps.
     """
     leaves, tree = jax.tree.flatten((state, constants))
-    count, types = len(jax.tree.leaves(state)), [(x.shape[1:], x.dtype) for x in leaves]
+    count = len(jax.tree.leaves(state))
 
-    def run(
-        values: Sequence[jax.Array], varied: Collection[int] = (), is_differentiated: bool = True
-    ) -> tuple[Pytree, Pytree]:
-        keys = [
-            (str(x.dtype), i >= count, i >= count and i in varied) for i, x in enumerate(leaves)
-        ]
-        first, rest = Packing(types[:count], keys[:count]), Packing(types[count:], keys[count:])
-        constants = rest.pack(values[count:])
+    def run(values: list[jax.Array], varied: Collection[int] | None = None) -> Pytree:
+        groups: dict[Any, list[int]] = {}  # of the state, then of the constants
+        for i, x in enumerate(values):
+            key = i >= count, x.dtype, i >= count and i in (varied or ())
+            groups.setdefault(key, []).append(i)
+        carried = sum(not is_constant for is_constant, *_ in groups)
+        restore: Any = [ravel_pytree([values[i][0] for i in x])[1] for x in groups.values()]
+
+        def packed(leaves: Sequence[jax.Array], indices: Sequence[list[int]]) -> list[jax.Array]:
+            return [ravel_pytree([leaves[i] for i in x])[0] for x in indices]
+
+        def unpacked(arrays: Sequence[jax.Array], indices: Sequence[list[int]]) -> list[jax.Array]:
+            parts = [f(x) for f, x in zip(restore, arrays, strict=False)]
+            pairs = zip(itertools.chain(*indices), itertools.chain(*parts), strict=True)
+            return [x for _, x in sorted(pairs, key=operator.itemgetter(0))]
+
+        indices = list(groups.values())
 
         def saving(arguments: Pytree, saved: Pytree) -> tuple[Pytree, Pytree]:
-            state, constants = tree.unflatten(
-                [*first.unpack(arguments[0]), *rest.unpack(arguments[1])]
-            )
+            state, constants = tree.unflatten(unpacked([*arguments[0], *arguments[1]], indices))
             (state, output), saved = step(state, constants, saved)
-            return (first.pack(jax.tree.leaves(state)), output), saved
+            return (packed(jax.tree.leaves(state), indices[:carried]), output), saved
 
         def single(*arguments: Pytree) -> Pytree:
             return saving(arguments, None)[0]
 
-        call = batched(single, jax.vmap(single), saving, saves=is_differentiated)
-        start = first.pack(values[:count])
-        end, outputs = jax.lax.scan(lambda x, _: call(x, constants), start, length=length)
-        return jax.tree.structure(state).unflatten(first.unpack(end)), outputs
+        arrays = jax.vmap(lambda x: packed(x, indices))(values)
+        call = batched(single, jax.vmap(single), saving, saves=varied is not None)
+        end, outputs = jax.lax.scan(
+            lambda x, _: call(x, arrays[carried:]), arrays[:carried], length=length
+        )
+        end = jax.vmap(lambda x: unpacked(x, indices[:carried]))(end)
+        return jax.tree.structure(state).unflatten(end), outputs
 
     @jax.custom_jvp
     def call(values: list[jax.Array]) -> tuple[Pytree, Pytree]:
-        return run(values, is_differentiated=False)
+        return run(values)
 
     def rule(primals: Any, tangents: Any) -> Any:
         ((values,), (directions,)) = primals, tangents
@@ -210,32 +217,6 @@ def scan(
 
     call.defjvp(rule, symbolic_zeros=True)
     return call(leaves)
-
-
-class Packing:
-    """Arrays as few arrays, each of those with the same key along the last axis."""
-
-    def __init__(self, types: Sequence[tuple[tuple[int, ...], Any]], keys: Sequence[Any]) -> None:
-        """`types` are the shapes, without leading axes, and dtypes."""
-        self._shapes = [shape for shape, _ in types]
-        self._groups: dict[Any, list[int]] = {}
-        for i, key in enumerate(keys):
-            self._groups.setdefault(key, []).append(i)
-
-    def pack(self, leaves: Sequence[jax.Array]) -> list[jax.Array]:
-        """Return arrays (..., N) of leaves, which have the same leading axes."""
-        lead = [x.shape[: x.ndim - len(s)] for x, s in zip(leaves, self._shapes, strict=True)]
-        flat = [jnp.reshape(x, (*axes, -1)) for x, axes in zip(leaves, lead, strict=True)]
-        return [jnp.concatenate([flat[i] for i in x], -1) for x in self._groups.values()]
-
-    def unpack(self, arrays: Sequence[jax.Array]) -> list[jax.Array]:
-        """Return the leaves of arrays (..., N)."""
-        leaves: dict[int, jax.Array] = {}
-        for group, array in zip(self._groups.values(), arrays, strict=True):
-            ends = np.cumsum([math.prod(self._shapes[i]) for i in group])[:-1]
-            for i, part in zip(group, jnp.split(array, ends, axis=-1), strict=True):
-                leaves[i] = jnp.reshape(part, (*array.shape[:-1], *self._shapes[i]))
-        return [leaves[i] for i in range(len(leaves))]
 
 
 def _tangents(

@@ -14,7 +14,8 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.extend.core import ClosedJaxpr, Jaxpr, JaxprEqn, Literal
+from jax import lax
+from jax.extend.core import ClosedJaxpr, Jaxpr, JaxprEqn, Literal, jaxpr_as_fun
 
 from rps_jax.lowering.compounds import COMPOUNDS
 from rps_jax.lowering.target import (
@@ -254,10 +255,15 @@ def _scan(eqn: JaxprEqn, values: list[Value], target: Target) -> list[Value]:
             return loop
     scanned = list(zip(values[fixed + carried :], body.jaxpr.invars[fixed + carried :],
                        strict=True))  # fmt: skip
-    if len(body.jaxpr.eqns) > _MAX_UNROLLED and length > 1:
-        loop = _scan_loop(body, consts, carry, scanned, length, params["reverse"], target)
-        if loop is not None:
-            return loop
+    if len(body.jaxpr.eqns) > _MAX_UNROLLED:
+        counts = {
+            "length": length,
+            "reverse": params["reverse"],
+            "fixed": fixed,
+            "carried": carried,
+        }
+        function = functools.partial(_scan_loop, jaxpr=body, **counts)
+        return list(_expanded(function, values, _types(eqn.invars), target))
     rows: list[list[Value]] = [[]] * length
     order = range(length)
     for step in reversed(order) if params["reverse"] else order:
@@ -281,51 +287,22 @@ def _row(value: Value, step: int, out: Any, target: Target) -> Value:
 
 
 def _scan_loop(
-    body: ClosedJaxpr, consts: Sequence[Value], carry: Sequence[Value],
-    scanned: Sequence[tuple[Value, Any]], length: int, reverse: bool, target: Target,
-) -> list[Value] | None:  # fmt: skip
-    """Emit a loop for a scan with scanned or stacked values; None: the target has no loops."""
-    outs = _types(body.jaxpr.outvars[len(carry) :])
-    one = np.ones((), np.int32)
-    whole = [jax.ShapeDtypeStruct((length, *x.shape), x.dtype) for x in outs]
+    *values: jax.Array, jaxpr: ClosedJaxpr, length: int, reverse: bool, fixed: int, carried: int
+) -> list[jax.Array]:
+    """Compute a scan by a loop over its carry and its stacked results."""
+    consts, scanned = values[:fixed], values[fixed + carried :]
+    outs = jaxpr.out_avals[carried:]
 
-    def at(index: Value, shape: Sequence[int]) -> list[Value]:
-        return [index, *[np.zeros((), np.int32)] * len(shape)]
+    def turn(count: jax.Array, state: list[jax.Array]) -> list[jax.Array]:
+        step = length - 1 - count if reverse else count
+        rows = [lax.dynamic_index_in_dim(x, step, keepdims=False) for x in scanned]
+        results = jaxpr_as_fun(jaxpr)(*consts, *state[:carried], *rows)
+        stacked = zip(state[carried:], results[carried:], strict=True)
+        rows = [lax.dynamic_update_index_in_dim(x, row, step, 0) for x, row in stacked]
+        return [*results[:carried], *rows]
 
-    def turn(values: Sequence[Value]) -> list[Value]:
-        index, *values = values
-        carried, stacked = values[: len(carry)], values[len(carry) :]
-        rows = []
-        for value, var in scanned:
-            shape = var.aval.shape
-            row = target.apply(
-                "dynamic_slice",
-                [value, *at(index, shape)],
-                {"slice_sizes": (1, *shape)},
-                jax.ShapeDtypeStruct((1, *shape), var.aval.dtype),
-            )
-            rows.append(target.moved([row], np.arange(size_of(shape)).reshape(shape), var.aval))
-        results = _walk(body, [*consts, *carried, *rows], target)
-        updated = []
-        for array, row, out, kind in zip(stacked, results[len(carry) :], outs, whole, strict=True):
-            row = target.moved([row], np.arange(size_of(out.shape)).reshape(1, *out.shape), out)
-            types = [
-                kind,
-                jax.ShapeDtypeStruct((1, *out.shape), out.dtype),
-                *[one] * (1 + len(out.shape)),
-            ]
-            updated.append(
-                _expanded(
-                    COMPOUNDS["dynamic_update_slice"],
-                    [array, row, *at(index, out.shape)],
-                    types,
-                    target,
-                )[0]
-            )
-        index = target.apply("sub" if reverse else "add", [index, one], {}, one)
-        return [index, *results[: len(carry)], *updated]
-
-    start = np.asarray(length - 1 if reverse else 0, np.int32)
-    zeros = [np.zeros(x.shape, x.dtype) for x in whole]
-    loop = target.for_loop(turn, [start, *carry, *zeros], length)
-    return loop and loop[1:]
+    start = [
+        *values[fixed : fixed + carried],
+        *(jnp.zeros((length, *x.shape), x.dtype) for x in outs),
+    ]
+    return lax.fori_loop(np.int32(0), np.int32(length), turn, start)
