@@ -93,10 +93,7 @@ def target() -> str | None:
 
 
 def batched(
-    function: Callable[..., Pytree],
-    whole: Callable[..., Pytree],
-    saving: Callable[[Pytree, Pytree], tuple[Pytree, Pytree]] | None = None,
-    saves: bool = False,
+    function: Callable[..., Pytree], whole: Callable[..., Pytree], saves: bool = False
 ) -> Callable[..., Pytree]:
     """Return a function of a batch of worlds (B, ...) that runs world by world.
 
@@ -105,29 +102,29 @@ def batched(
     Args:
       function: the function of one world; pure.
       whole: the same function of a batch, which XLA compiles where `function` is not compiled.
-      saving: the same function of a tuple of arguments, and of numbers that it returns beside the
-        results, from which its derivatives are faster; with () it computes them.
-      saves: whether it is `saving` also where it is not differentiated.
+      saves: whether `function` is a function of a tuple of arguments and of `saved`, and returns
+        results and `saved`: numbers that it computes if it gets (), and from which, as constants,
+        its derivatives are faster.
     """
     if not is_available():
         return whole
-    run = concurrent([function], lambda arguments: [whole(*arguments)])
 
-    def save(*arguments: Pytree) -> tuple[Pytree, Pytree]:
-        return saving(arguments, ()) if saving is not None else (function(*arguments), ())
+    def save(arguments: Pytree, saved: Pytree) -> tuple[Pytree, Pytree]:
+        return function(arguments, saved) if saves else (function(*arguments), ())
 
-    run_saving = concurrent([save], lambda arguments: [jax.vmap(save)(*arguments)])
+    def start(*arguments: Pytree) -> tuple[Pytree, Pytree]:
+        return save(arguments, ())
 
-    def of_saved(arguments: Pytree, saved: Pytree) -> Pytree:
-        return saving(arguments, saved)[0] if saving is not None else function(*arguments)
+    in_xla = jax.vmap(start) if saves else lambda *arguments: (whole(*arguments), ())
+    run = concurrent([start], lambda arguments: [in_xla(*arguments)])
 
     @jax.custom_jvp
     def call(*arguments: Pytree) -> Pytree:
-        return run_saving(arguments)[0][0] if saves else run(arguments)[0]
+        return run(arguments)[0][0]
 
     def rule(primals: Pytree, tangents: Pytree) -> tuple[Pytree, Pytree]:
-        results, saved = run_saving(primals)[0] if saving is not None else (call(*primals), ())
-        return results, _tangents(of_saved, primals, saved, tangents, results)
+        results, saved = run(primals)[0]
+        return results, _tangents(lambda *x: save(*x)[0], primals, saved, tangents, results)
 
     call.defjvp(rule, symbolic_zeros=True)
     return call
@@ -171,10 +168,10 @@ def scan(
     leaves, tree = jax.tree.flatten((state, constants))
     count = len(jax.tree.leaves(state))
 
-    def run(values: list[jax.Array], varied: Collection[int] | None = None) -> Pytree:
+    def run(values: list[jax.Array], varied: Collection[int] = ()) -> Pytree:
         groups: dict[Any, list[int]] = {}  # of the state, then of the constants
         for i, x in enumerate(values):
-            key = i >= count, x.dtype, i >= count and i in (varied or ())
+            key = i >= count, x.dtype, i >= count and i in varied
             groups.setdefault(key, []).append(i)
         carried = sum(not is_constant for is_constant, *_ in groups)
         restore: Any = [ravel_pytree([values[i][0] for i in x])[1] for x in groups.values()]
@@ -194,20 +191,13 @@ def scan(
             (state, output), saved = step(state, constants, saved)
             return (packed(jax.tree.leaves(state), indices[:carried]), output), saved
 
-        def single(*arguments: Pytree) -> Pytree:
-            return saving(arguments, None)[0]
-
         arrays = jax.vmap(lambda x: packed(x, indices))(values)
-        call = batched(single, jax.vmap(single), saving, saves=varied is not None)
+        call = batched(saving, jax.vmap(lambda *x: saving(x, None)[0]), saves=True)
         end, outputs = jax.lax.scan(
             lambda x, _: call(x, arrays[carried:]), arrays[:carried], length=length
         )
         end = jax.vmap(lambda x: unpacked(x, indices[:carried]))(end)
         return jax.tree.structure(state).unflatten(end), outputs
-
-    @jax.custom_jvp
-    def call(values: list[jax.Array]) -> tuple[Pytree, Pytree]:
-        return run(values)
 
     def rule(primals: Any, tangents: Any) -> Any:
         ((values,), (directions,)) = primals, tangents
@@ -215,6 +205,7 @@ def scan(
         of_varied, point = restrict(functools.partial(run, varied=indices), values, indices)
         return jax.jvp(of_varied, (point,), ([directions[i] for i in indices],))
 
+    call = jax.custom_jvp(lambda values: run(values))
     call.defjvp(rule, symbolic_zeros=True)
     return call(leaves)
 

@@ -156,7 +156,7 @@ class FusedStage(NamedTuple):
         inputs = fields, motion, period.twists, period.robot
         if motion.qpos.ndim != 2:
             return steps(*inputs, period.solutions)
-        return native.batched(steps, steps, saving)(*inputs)
+        return native.batched(saving, steps, saves=True)(*inputs)
 
 
 def _drive(
