@@ -47,6 +47,13 @@ _RANDOM = {
     **dict.fromkeys(("random_wrap", "random_unwrap")),
     **{"random_bits": "random_bits", "random_split": "split", "random_fold_in": "fold_in"},
 }
+# Further primitives that only move numbers, by NumPy.
+_BY_NUMPY: dict[str, Callable[[np.ndarray, Params], Sequence[np.ndarray]]] = {
+    "split": lambda x, p: np.split(x, np.cumsum(p["sizes"])[:-1], p["axis"]),
+    "unstack": lambda x, p: list(np.moveaxis(x, p["axis"], 0)),
+    "transpose": lambda x, p: [np.transpose(x, p["permutation"])],
+    "rev": lambda x, p: [np.flip(x, p["dimensions"])],
+}
 _IDENTITIES = ("stop_gradient", "copy", "copy_p", "optimization_barrier", "pvary",
                "reduce_precision", "name")  # fmt: skip
 
@@ -217,22 +224,11 @@ def _moved_by_numpy(eqn: JaxprEqn, arrays: list[Value]) -> list[np.ndarray] | No
     if name in ("concatenate", "stack"):
         axis = params.get("dimension", params.get("axis"))
         return [getattr(np, name)(arrays, axis)]
-    if name == "split":
-        return np.split(arrays[0], np.cumsum(params["sizes"])[:-1], params["axis"])
-    if name == "unstack":
-        return list(np.moveaxis(arrays[0], params["axis"], 0))
-    if name == "transpose":
-        return [np.transpose(arrays[0], params["permutation"])]
-    if name == "rev":
-        return [np.flip(arrays[0], params["dimensions"])]
-    if name == "pad" and size_of(shape) and min(min(x) for x in params["padding_config"]) >= 0:
-        result = np.full(shape, arrays[1], np.asarray(arrays[0]).dtype)
-        inside = [
-            slice(a, n - b, c + 1)
-            for n, (a, b, c) in zip(shape, params["padding_config"], strict=True)
-        ]
-        result[tuple(inside)] = arrays[0]
-        return [result]
+    if name == "pad" and all(min(a, b) >= 0 == c for a, b, c in params["padding_config"]):
+        widths = [(a, b) for a, b, _ in params["padding_config"]]
+        return [np.pad(arrays[0], widths, constant_values=arrays[1])]
+    if name in _BY_NUMPY:
+        return list(_BY_NUMPY[name](arrays[0], params))
     return None
 
 
