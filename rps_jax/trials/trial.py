@@ -366,7 +366,7 @@ def unroll(
 ) -> tuple[Trial, Snapshot]:
     """Run `steps` control steps of a batch; return also snapshots (steps, B, ...).
 
-    In reverse mode it stores the state of each step, some 3 kB. `mapped` is that of
+    In reverse mode it stores the state of each step, some 1 kB. `mapped` is that of
     `control_step`; with `native.mapped`, derivatives are fastest.
     """
 
