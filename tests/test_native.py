@@ -298,10 +298,7 @@ def test_a_scan_of_worlds_is_that_of_jax_and_so_are_its_derivatives(monkeypatch)
         )
         for a, b in zip(*map(jax.tree.leaves, (native_result, expected)), strict=True):
             np.testing.assert_allclose(a, b, rtol=1e-5)
-    # Forward, and backward or a tangent map; by less the backward function returns less.
-    returned = [len(x.results) for functions in compiled for x in functions]
-    assert len(compiled) == 7
-    assert returned[1] > returned[3]
+    assert len(compiled) == 7  # forward, and backward or a tangent map
 
 
 @pytest.mark.parametrize("skin", ["capacitive", "ideal"])

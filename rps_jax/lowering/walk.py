@@ -233,7 +233,7 @@ def _moved_by_numpy(eqn: JaxprEqn, arrays: list[Value]) -> list[np.ndarray] | No
 
 
 def _scan(eqn: JaxprEqn, values: list[Value], target: Target) -> list[Value]:
-    """Emit a loop for a `fori_loop`, and unroll any other `scan`."""
+    """Emit a loop for a `fori_loop` or a large body, and unroll any other `scan`."""
     params = eqn.params
     length, body = params["length"], params["jaxpr"]
     if length > _MAX_STEPS:
@@ -249,17 +249,12 @@ def _scan(eqn: JaxprEqn, values: list[Value], target: Target) -> list[Value]:
         loop = target.for_loop(_with_consts(body, consts, target), carry, length)
         if loop is not None:
             return loop
+    elif _count_equations(body) > _MAX_UNROLLED:
+        counts = {"length": length, "fixed": fixed, "carried": carried}
+        function = functools.partial(_scan_loop, jaxpr=body, reverse=params["reverse"], **counts)
+        return list(_expanded(function, values, _types(eqn.invars), target))
     scanned = list(zip(values[fixed + carried :], body.jaxpr.invars[fixed + carried :],
                        strict=True))  # fmt: skip
-    if len(body.jaxpr.eqns) > _MAX_UNROLLED:
-        counts = {
-            "length": length,
-            "reverse": params["reverse"],
-            "fixed": fixed,
-            "carried": carried,
-        }
-        function = functools.partial(_scan_loop, jaxpr=body, **counts)
-        return list(_expanded(function, values, _types(eqn.invars), target))
     rows: list[list[Value]] = [[]] * length
     order = range(length)
     for step in reversed(order) if params["reverse"] else order:
@@ -287,18 +282,22 @@ def _scan_loop(
 ) -> list[jax.Array]:
     """Compute a scan by a loop over its carry and its stacked results."""
     consts, scanned = values[:fixed], values[fixed + carried :]
-    outs = jaxpr.out_avals[carried:]
 
-    def turn(count: jax.Array, state: list[jax.Array]) -> list[jax.Array]:
-        step = length - 1 - count if reverse else count
+    def turn(state: list[jax.Array], _: None) -> tuple[list[jax.Array], None]:
+        step, *state = state
         rows = [lax.dynamic_index_in_dim(x, step, keepdims=False) for x in scanned]
         results = jaxpr_as_fun(jaxpr)(*consts, *state[:carried], *rows)
         stacked = zip(state[carried:], results[carried:], strict=True)
         rows = [lax.dynamic_update_index_in_dim(x, row, step, 0) for x, row in stacked]
-        return [*results[:carried], *rows]
+        return [step + np.int32(-1 if reverse else 1), *results[:carried], *rows], None
 
-    start = [
-        *values[fixed : fixed + carried],
-        *(jnp.zeros((length, *x.shape), x.dtype) for x in outs),
-    ]
-    return lax.fori_loop(np.int32(0), np.int32(length), turn, start)
+    start = jnp.int32(length - 1 if reverse else 0), *values[fixed : fixed + carried]
+    stacked = [jnp.zeros((length, *x.shape), x.dtype) for x in jaxpr.out_avals[carried:]]
+    return lax.scan(turn, [*start, *stacked], length=length)[0][1:]
+
+
+def _count_equations(jaxpr: ClosedJaxpr | Jaxpr) -> int:
+    """Count the equations of a jaxpr and of those that it contains."""
+    params = jax.tree.leaves([list(eqn.params.values()) for eqn in jaxpr.eqns])
+    inner = [x for x in params if isinstance(x, ClosedJaxpr | Jaxpr)]
+    return len(jaxpr.eqns) + sum(map(_count_equations, inner))
