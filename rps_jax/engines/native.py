@@ -48,7 +48,9 @@ _FLAGS = ("-O2", "-march=native", "-fno-math-errno", "-ffp-contract=fast", "-w")
 _FLAGS += ("-fno-gcse", "-fno-rerun-cse-after-loop", "-fno-tree-dse")
 _FLAGS += ("--param", "sccvn-max-alias-queries-per-access=30")
 _NAME = "rps_native_"
-_THREADS = (4, 16)  # of a GPU that compute a world: the second if shared memory is short
+# Threads of a GPU that compute a world in whole trials, whose worlds are sorted, and in other
+# functions: the second number if shared memory is short.
+_THREADS = {True: (4, 16), False: (4, 16)}
 _NO_COMPILER = (
     "a C compiler (apt install gcc) or NVRTC (pip install nvidia-cuda-nvrtc) is not installed"
 )
@@ -380,7 +382,7 @@ def _texts(functions: Sequence[_Function]) -> tuple[int, list[str]]:
     Raises:
       TooLargeError: a kernel needs too much shared memory.
     """
-    *fewer, most = _THREADS
+    *fewer, most = _THREADS[functions[0].is_sorted]
     for threads in fewer:
         with contextlib.suppress(TooLargeError):
             return threads, _printed(functions, functools.partial(GpuWriter, threads))
