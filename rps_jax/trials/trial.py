@@ -339,20 +339,26 @@ def control_step(
     trials: Trial,
     loop: ControlLoop,
     mapped: Callable[..., Any] = jax.vmap,
-    solutions: Any = None,
-) -> tuple[Trial, Snapshot, Any]:
+) -> tuple[Trial, Snapshot]:
     """Run one control step of a batch of worlds; trials that have ended do not change.
 
     For a single world without batch dimension, `mapped` returns its function unchanged.
-    `solutions` are those of `ControlPeriod`, and the last result those of `Driven`.
     """
+    return _solved_step(stage, worlds, params, trials, loop, mapped, None)[0]
+
+
+def _solved_step(
+    stage: Stage, worlds: World, params: LawParams, trials: Trial, loop: ControlLoop,
+    mapped: Callable[..., Any], solutions: Any,
+) -> tuple[tuple[Trial, Snapshot], Any]:  # fmt: skip
+    """Run `control_step` with the solutions of `ControlPeriod`; return also those of `Driven`."""
     decided, twists, snapshots = mapped(decide, (0, 0, 0, None))(worlds, params, trials, loop)
     force = loop.law.senses == "force"
     period = ControlPeriod(twists, loop.physics, pushing(worlds), force, solutions)
     driven = stage.drive(worlds.fields, motion(decided), period)
     result = driven._replace(solutions=None)
     settled = mapped(settle, (0, 0, 0, 0))(worlds, trials, decided, result)
-    return settled, snapshots, driven.solutions
+    return (settled, snapshots), driven.solutions
 
 
 def unroll(
@@ -374,9 +380,8 @@ def unroll(
         """Run one control step of one world."""
         world, params, rules = inputs
         world_loop = dataclasses.replace(loop, rules=rules)
-        step = stage, world, params, trial, world_loop, lambda f, *_: f, solutions
-        *results, solutions = control_step(*step)
-        return tuple(results), solutions
+        step = stage, world, params, trial, world_loop, lambda f, *_: f
+        return _solved_step(*step, solutions)
 
     if mapped is native.mapped and getattr(stage, "native", False) and native.is_available():
         rules = jax.tree.map(lambda x: jnp.broadcast_to(x, trials.done.shape), loop.rules)
@@ -385,7 +390,7 @@ def unroll(
     # Without a checkpoint, XLA would store all intermediate numbers.
     @partial(jax.checkpoint, prevent_cse=False)
     def step(trials: Trial, _: None) -> tuple[Trial, Snapshot]:
-        return control_step(stage, worlds, params, trials, loop, mapped)[:2]
+        return control_step(stage, worlds, params, trials, loop, mapped)
 
     return jax.lax.scan(step, trials, length=steps)
 
