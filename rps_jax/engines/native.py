@@ -95,7 +95,10 @@ def target() -> str | None:
 
 
 def batched(
-    function: Callable[..., Pytree], whole: Callable[..., Pytree], saves: bool = False
+    function: Callable[..., Pytree],
+    whole: Callable[..., Pytree],
+    saves: bool = False,
+    always: bool = False,
 ) -> Callable[..., Pytree]:
     """Return a function of a batch of worlds (B, ...) that runs world by world.
 
@@ -106,7 +109,8 @@ def batched(
       whole: the same function of a batch, which XLA compiles where `function` is not compiled.
       saves: whether `function` is a function of a tuple of arguments and of `saved`, and returns
         results and `saved`: numbers that it computes if it gets (), and from which, as constants,
-        its derivatives are faster.
+        its derivatives are faster. Where it is not differentiated, it gets None.
+      always: whether it gets () there, too, so that no other function is compiled.
     """
     if not is_available():
         return whole
@@ -117,15 +121,19 @@ def batched(
     def start(*arguments: Pytree) -> tuple[Pytree, Pytree]:
         return save(arguments, ())
 
+    def plain(*arguments: Pytree) -> Pytree:
+        return save(arguments, None)[0]
+
+    run_plain = concurrent([plain], lambda arguments: [whole(*arguments)])
     in_xla = jax.vmap(start) if saves else lambda *arguments: (whole(*arguments), ())
     run = concurrent([start], lambda arguments: [in_xla(*arguments)])
 
     @jax.custom_jvp
     def call(*arguments: Pytree) -> Pytree:
-        return run(arguments)[0][0]
+        return run(arguments)[0][0] if always else run_plain(arguments)[0]
 
     def rule(primals: Pytree, tangents: Pytree) -> tuple[Pytree, Pytree]:
-        results, saved = run(primals)[0]
+        results, saved = run(primals)[0] if saves else (call(*primals), ())
         return results, _tangents(lambda *x: save(*x)[0], primals, saved, tangents, results)
 
     call.defjvp(rule, symbolic_zeros=True)
@@ -170,10 +178,10 @@ def scan(
     leaves, tree = jax.tree.flatten((state, constants))
     count = len(jax.tree.leaves(state))
 
-    def run(values: list[jax.Array], varied: Collection[int] = ()) -> Pytree:
+    def run(values: list[jax.Array], varied: Collection[int] | None = None) -> Pytree:
         groups: dict[Any, list[int]] = {}  # of the state, then of the constants
         for i, x in enumerate(values):
-            key = i >= count, x.dtype, i >= count and i in varied
+            key = i >= count, x.dtype, i >= count and i in (varied or ())
             groups.setdefault(key, []).append(i)
         carried = sum(not is_constant for is_constant, *_ in groups)
         restore: Any = [ravel_pytree([values[i][0] for i in x])[1] for x in groups.values()]
@@ -194,7 +202,7 @@ def scan(
             return (packed(jax.tree.leaves(state), indices[:carried]), output), saved
 
         arrays = jax.vmap(lambda x: packed(x, indices))(values)
-        call = batched(saving, jax.vmap(lambda *x: saving(x, None)[0]), saves=True)
+        call = batched(saving, jax.vmap(lambda *x: saving(x, None)[0]), True, varied is not None)
         end, outputs = jax.lax.scan(
             lambda x, _: call(x, arrays[carried:]), arrays[:carried], length=length
         )
