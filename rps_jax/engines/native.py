@@ -148,13 +148,19 @@ def mapped(function: Callable[..., Pytree], axes: Sequence[int | None]) -> Calla
 
     def call(*arguments: Pytree) -> Pytree:
         size = len(jax.tree.leaves(arguments[0])[0])
+        trees = list(map(jax.tree.structure, arguments))
 
         def repeat(x: Any) -> jax.Array:
             return jnp.broadcast_to(x, (size, *jnp.shape(x)))
 
-        pairs = zip(arguments, axes, strict=True)
-        inputs = [x if axis == 0 else jax.tree.map(repeat, x) for x, axis in pairs]
-        return batched(function, jax.vmap(function))(*inputs)
+        # Records check the shapes of a world: a batch is passed as leaves.
+        def single(*leaves: Sequence[Any]) -> Pytree:
+            return function(*(tree.unflatten(x) for tree, x in zip(trees, leaves, strict=True)))
+
+        inputs = [jax.tree.leaves(x) for x in arguments]
+        pairs = zip(inputs, axes, strict=True)
+        inputs = [x if axis == 0 else list(map(repeat, x)) for x, axis in pairs]
+        return batched(single, jax.vmap(single))(*inputs)
 
     return call
 
