@@ -50,7 +50,7 @@ _FLAGS += ("--param", "sccvn-max-alias-queries-per-access=30")
 _NAME = "rps_native_"
 # Threads of a GPU that compute a world in whole trials, whose worlds are sorted, and in other
 # functions: the second number if shared memory is short.
-_THREADS = {True: (4, 16), False: (4, 16)}
+_THREADS = {True: (4, 16), False: (8, 16)}
 _NO_COMPILER = (
     "a C compiler (apt install gcc) or NVRTC (pip install nvidia-cuda-nvrtc) is not installed"
 )
