@@ -98,7 +98,7 @@ class Fitted:
             ax.axvspan(float(column.prior_low), float(column.prior_high), color="0.88")
             flat = bool(column.undetermined)
             ax.hist(column["sample"], 40, density=True, color="0.6" if flat else "C0")
-            ax.set_title(quantity(name) + (" (undetermined)" if flat else ""), fontsize=8)
+            ax.set_title(quantity(name) + ("\n(undetermined)" if flat else ""), fontsize=8)
             ax.set(yticks=[], xlabel=f"[{column.unit.values}]")
             ax.tick_params(labelsize=7)
         return figure
