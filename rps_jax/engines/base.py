@@ -102,9 +102,7 @@ class Engine(abc.ABC):
         """Raise InputError unless the stage is of this engine, or of one that it extends."""
         owner = getattr(stage, "engine", self.name)
         if owner not in [getattr(kind, "name", "") for kind in type(self).__mro__]:
-            raise self._refused(
-                f"the worlds were drawn for {owner}; give the setting of their draw"
-            )
+            raise self._refused(f"the worlds were drawn for {owner}; give their setting")
 
     def check_physics(self, physics: Physics) -> None:
         """Raise InputError unless the engine supports the physics."""

@@ -100,8 +100,7 @@ def _check(name: str, value: Any, kind: Any, metadata: Mapping[str, Any]) -> Non
     elif not any(_is_of(value, inner) for inner in kinds):
         nouns = list(dict.fromkeys(map(_noun, kinds)))
         example = f", as [{value!r}]" if isinstance(value, str) and "several" in nouns[0] else ""
-        text = repr(value)
-        shown = text if len(text) <= _MAX_SHOWN else _noun(type(value))
+        shown = text if len(text := repr(value)) <= _MAX_SHOWN else _noun(type(value))
         raise errors.not_allowed(name, shown, f"give {' or '.join(nouns)}{example}")
     elif bounds:
         for number in np.ravel(np.asarray(value, object)):
