@@ -64,7 +64,7 @@ class Coordinate(NamedTuple):
     label: str
     unit: str
     name: str  # of a drawn quantity or a vector, or of a leaf of the parameters
-    index: tuple[int, ...] = ()  # in a vector or a leaf
+    entry: tuple[int, ...] = ()  # of a vector or a leaf
     is_parameter: bool = False
 
 
@@ -164,7 +164,7 @@ def value_and_grad(
             for k, (x, slope) in enumerate(zip(numbers, slopes, strict=True)):
                 products = [y * by_leaf[name] for name, y in slope.items()]
                 if x.is_parameter:
-                    products = [by_leaf[f"params.{x.name}"][(slice(None), *x.index)]]
+                    products = [by_leaf[f"params.{x.name}"][(slice(None), *x.entry)]]
                 gradient[i, at, k] = sum(y.reshape(at.size, -1).sum(axis=1) for y in products)
     gradient = np.where(bend > _MAX_BEND, np.nan, gradient)
     mean = [gradients.estimate(jnp.asarray(x)) for x in gradient]
@@ -268,7 +268,7 @@ def world_slopes(
             return draws.draw(domain, setting.seed, drawn.indices, {number.name: step})
         path = _VECTORS[number.name]
         value = np.array(named_leaves(drawn)[path])
-        value[:, number.index[0]] += step
+        value[:, number.entry[0]] += step
         return registry.replace_leaves(drawn, {path: value})
 
     count = drawn.indices.size

@@ -136,7 +136,8 @@ class Methods(FitStudy):
             u = np.random.default_rng(log).random((fit.SAMPLES, len(names)))
             if replay.num_windows >= fit.LEAST_WINDOWS:
                 minima = device.standard_jax()(minimise)(replay, starts)
-                u, _ = least_squares.sample(replay, *minima, fit.SAMPLES, log)
+                u, r, j = minima
+                u, _ = least_squares.sample(replay, u, r, j, fit.SAMPLES, log)
             return u[:, columns], replay.num_windows
 
         start = time.process_time()

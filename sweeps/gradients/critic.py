@@ -133,7 +133,7 @@ def window_scores(tuning: WindowTuning, stage: Stage, critic: Critic) -> gradien
         lost = period * jnp.sum(under_way * touched * (1 - contact))
         score = objective.score(1.0, period * jnp.sum(under_way), lost, 0.0, setting.rules)
         rest = critic(features(world, params, last, loop))
-        return score + under_way[-1] * jnp.where(last.done, 0.0, rest)
+        return jnp.asarray(score + under_way[-1] * jnp.where(last.done, 0.0, rest))
 
     steps = max(1, round(tuning.window / period))
 

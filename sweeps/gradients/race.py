@@ -181,7 +181,7 @@ race = call_of(Race)
 
 def spent(curve: pd.DataFrame, budget: str) -> pd.Series:
     """Return what each generation of a log has used of a budget, with all before it [s]."""
-    return curve["run" if budget == "wall" else "simulated"].cumsum()
+    return pd.Series(curve["run" if budget == "wall" else "simulated"]).cumsum()
 
 
 def best_within(curve: pd.DataFrame, budget: str, amount: float) -> pd.Series:
