@@ -53,7 +53,8 @@ TABS: dict[str, list[Any]] = {
     ],
     "Random worlds": ["notebooks/04_robustness.md", "random_worlds", "models"],
     "Tuning": [
-        *("notebooks/05_tuning.md", "tuned", "landscape", "gradients"),
+        *("notebooks/05_tuning.md", "notebooks/10_gradients.md", "tuned", "landscape"),
+        "gradients",
     ],
     "Laws": ["ladder", "rps_plus", "mends", "learned", "force_push_grid", "failures"],
     "Robots": [

@@ -184,24 +184,23 @@ drawing.estimates(horizons, bars, names)
 
 # %% [markdown]
 # Bars are two standard errors over the targets, so they contain the differences between targets
-# and the noise of an estimate. Up to 3 s derivatives and differences are equal; evolution agrees,
-# with bars up to twice as wide. At 10 s this still holds for $K_h$, and nearly for $L$ and $K_v$.
-# For $\beta$ the bars of the derivative are three times as wide as those of the differences: in
-# some worlds the derivative is much larger than the effect of the parameter. Rounding determines
-# the worlds and the size: another compilation also doubled the bars of $L$ and $K_v$. The bars of
-# evolution grow as well, but for every parameter they stay within two and a half times those of
-# the differences.
+# and the noise of an estimate. Derivatives and differences are equal at all times, and so are their
+# bars, which grow with the time. Evolution agrees within its bars, which are wider: many times
+# where a parameter matters little, as $K_v$ and $\beta$ in the first seconds, since all parameters
+# change at once, and up to five times at 10 s.
 #
-# A success takes about 80 s. Derivatives are therefore useful over short horizons, and we tuned
-# the law over whole trials by evolution. With one box, 24 worlds and four parameters, this is an
-# example and not a benchmark; `sweeps/gradients` has the study.
+# A success takes about 80 s, and in the engine `fused` the derivatives of some random worlds
+# explode within 8 s (`10_gradients`). We tuned the law over whole trials by evolution. With one
+# box, 24 worlds and four parameters, this is an example and not a benchmark; `sweeps/gradients` has
+# the study.
 #
 # ## Gradients and evolution at equal cost
 #
-# `rps tune grad` therefore uses windows of 8 s, which start at any time of a trial. The cost of
-# the remaining distance after a window is the time to drive it. `runs/race` has the logs of four
-# runs from the paper's parameters, in the same worlds: evolution and gradients with 2.4 million
-# simulated seconds each, half of the run by gradients, and evolution that continued this half.
+# In version 0.1.0 `rps tune grad` used windows of 8 s, which started at any time of a trial. The
+# cost of the remaining distance after a window was the time to drive it. `runs/race` has the logs
+# of four runs from the paper's parameters, in the same worlds: evolution and gradients with 2.4
+# million simulated seconds each, half of the run by gradients, and evolution that continued this
+# half.
 
 # %%
 logs = {name: read_log(f"race/{name}") for name in ("evolution", "gradient")}
@@ -212,4 +211,5 @@ drawing.races(logs)
 # One step by gradients gains as much as the first generation of evolution, at equal cost. Further
 # steps by gradients gain nothing and steer ever more, perhaps because 8 s do not contain the later
 # effect on the contact. Evolution that continues from there, with a small spread, needs many
-# generations to improve. `sweeps/gradients` has a race of today's version.
+# generations to improve. Today `rps tune grad` follows slopes of whole trials instead:
+# `sweeps/gradients` has its race.

@@ -29,13 +29,13 @@ log.plot()
 # %% [markdown]
 # ## Quantities that the log determines
 #
-# `fit` simulates 384 worlds of the domain and learns to estimate a world's quantities from the
+# `fit` simulates 1536 worlds of the domain and learns to estimate a world's quantities from the
 # statistics of its log. Blue is the posterior, grey the central 90 % of the prior; a grey
 # histogram is a quantity that the log does not determine. More worlds determine more (default
 # 6144).
 
 # %%
-fitted = rps_jax.fit(log, domain, worlds=384, window=15.0, setting=setting, progress=False)
+fitted = rps_jax.fit(log, domain, worlds=1536, window=15.0, setting=setting, progress=False)
 fitted.plot()
 
 # %%

@@ -90,9 +90,8 @@ def check_finite(name: str, value: Any, **bounds: Any) -> float:
 
 def check_vector(name: str, values: Iterable[object], **bounds: float | str) -> list[float]:
     """Return the finite numbers x and y within bounds: see `check_number`."""
-    return [
-        check_finite(f"{name} {axis}", v, **bounds) for axis, v in zip("xy", values, strict=True)
-    ]
+    axes = zip("xy", values, strict=True)
+    return [check_finite(f"{name} {axis}", value, **bounds) for axis, value in axes]
 
 
 def check_array(
@@ -125,8 +124,8 @@ def check_count(name: str, value: object, *, at_least: int = 1, at_most: int) ->
     is_whole = isinstance(value, numbers.Integral) and not isinstance(value, bool)
     count = int(cast("int", value)) if is_whole else at_least - 1
     if not at_least <= count <= at_most:
-        rule = f"it must be a whole number from {at_least} to {at_most}"
-        raise not_allowed(name, value, rule)
+        span = f" from {at_least} to {at_most}" if at_least > -(2**63) else ""
+        raise not_allowed(name, value, f"it must be a whole number{span}")
     return count
 
 

@@ -46,7 +46,7 @@ RUNS = {
     "regress": f"regress --laws rps rps_plus --worlds 12 {SHORT}",
     "sensitivity": f"sensitivity --quick --worlds 128 {SHORT}",
     "tune_es": f"tune es --quick --generations 2 --population 8 --worlds 16 {SHORT}",
-    "tune_grad": "tune grad --quick --steps 2 --starts 1 --worlds 8 --within 20 --horizon 20",
+    "tune_grad": "tune grad --quick --steps 2 --worlds 8 --horizon 20",
     "learn": "learn --quick --updates 2 --minutes 60 --num-envs 16 --num-minibatches 2",
     "gallery": "gallery {sweep_mujoco} --each 2",
     "replay": "replay {sweep_mujoco} 3 --law rps --no-video",

@@ -52,11 +52,11 @@ def never_stepping() -> contextlib.ExitStack:
     """Stop commands before the first world is stepped or the first program is compiled."""
     from rps_jax.app import film
     from rps_jax.trials import trial
-    from rps_jax.tuning import rollout
+    from rps_jax.tuning.learn import Learn
 
     stack = contextlib.ExitStack()
-    for module, name in ((trial, "start_all"), (rollout, "start"), (film, "_shots")):
-        stack.enter_context(mock.patch.object(module, name, side_effect=Accepted))
+    for owner, name in ((trial, "start_all"), (Learn, "start"), (film, "_shots")):
+        stack.enter_context(mock.patch.object(owner, name, side_effect=Accepted))
     return stack
 
 

@@ -48,6 +48,13 @@ int cuEventCreate(void **to, unsigned flags) {
   *to = (void *)++events;
   return note("event", " %ld", events);
 }
+int cuThreadExchangeStreamCaptureMode(int *mode) {
+  static int current = 1; /* of a thread that captures */
+  int last = current;
+  current = *mode;
+  *mode = last;
+  return note("mode", " %d", current);
+}
 int cuEventDestroy_v2(void *event) { return note("end event", " %ld", (long)event); }
 int cuEventRecord(void *event, void *stream) {
   return note("record", " %ld on %ld", (long)event, (long)stream);
@@ -91,5 +98,14 @@ const char *call(XLA_FFI_Error *(*handler)(XLA_FFI_CallFrame *), float **data, i
   log_[0] = 0;
   broken = fails;
   return handler(&frame) ? told : "";
+}
+/* Traits of a handler, as XLA asks for them. */
+unsigned traits_of(XLA_FFI_Error *(*handler)(XLA_FFI_CallFrame *)) {
+  XLA_FFI_Metadata metadata = {sizeof metadata};
+  XLA_FFI_Metadata_Extension query = {{sizeof query, XLA_FFI_Extension_Metadata}, &metadata};
+  XLA_FFI_CallFrame frame = {0};
+  frame.extension_start = &query.extension_base;
+  handler(&frame);
+  return metadata.traits;
 }
 const char *said(void) { return log_; }

@@ -26,7 +26,6 @@ def unlike(option, value, *choices):
     return f"unknown {option.strip('-')} '{value}': choose from {', '.join(choices)}"
 
 
-ESTIMATORS = ("exact", "clipped", "evolution", "mixed")
 # Patterns of errors by the arguments of a command.
 NO_RANGE = "domain mass = .* is not allowed: write low and high"
 # Contents of domain files, and patterns of their errors.
@@ -221,13 +220,12 @@ COMMANDS = {
         "es --tuned mass": "unknown tuned parameter 'mass': choose from eta",
         "es --tuned L L": "tuned = .* is not allowed: name each once",
         "es --objective.risk worst": unlike("--objective.risk", "worst", "mean", "cvar"),
-        "grad --estimator backprop": unlike("--estimator", "backprop", *ESTIMATORS),
         "grad --learning-rate 0": "learning_rate = 0.0 is not allowed",
-        "grad --window -1": "window = -1.0 is not allowed",
+        "grad --sigma 0": "sigma = 0.0 is not allowed",
         "grad --starts 0": "starts = 0 is not allowed",
-        "grad --clip 0": "clip = 0.0 is not allowed",
+        "grad --spread -1": "spread = -1.0 is not allowed",
         "grad --pairs 0": "pairs = 0 is not allowed",
-        "grad --within -1": "within = -1.0 is not allowed",
+        "grad --steps 0": "steps = 0 is not allowed",
         "grad --budget nan": "budget = nan is not allowed",
     },
     "ladder": {

@@ -53,7 +53,7 @@ def results():
     return gradients_of(TOUCHING)
 
 
-def of(results, name):
+def slope(results, name):
     return results.gradient.sel(quantity=name).values[0]
 
 
@@ -69,25 +69,28 @@ def test_gradients_are_central_differences(results, name):
     up, down = (gradients_of(*side).value.values[0] for side in sides)
     differences = (up - down) / (2 * h)
     assert np.abs(differences).max() > 1e-4
-    np.testing.assert_allclose(of(results, name), differences, rtol=1e-5, atol=1e-8)
+    np.testing.assert_allclose(slope(results, name), differences, rtol=1e-5, atol=1e-8)
 
 
 def test_vectors_agree_with_the_quantities_that_turn_and_stretch_them(results):
     bearing = results.bearing.values
-    along = np.cos(bearing) * of(results, "target_x") + np.sin(bearing) * of(results, "target_y")
-    np.testing.assert_allclose(along, of(results, "distance"), rtol=1e-6)
+    along = np.cos(bearing) * slope(results, "target_x")
+    along += np.sin(bearing) * slope(results, "target_y")
+    np.testing.assert_allclose(along, slope(results, "distance"), rtol=1e-6)
     drawn = draws.draw(TOUCHING, 0, np.arange(4))
     x, y, _ = drawn.solid.p_object_com.T
-    along = x * of(results, "com_x") + y * of(results, "com_y")
+    along = x * slope(results, "com_x") + y * slope(results, "com_y")
     # The quasi-static engine uses no inertia, which a moving load changes.
-    np.testing.assert_allclose(along, drawn.values["com_offset"] * of(results, "com_offset"), 1e-6)
+    np.testing.assert_allclose(
+        along, drawn.values["com_offset"] * slope(results, "com_offset"), 1e-6
+    )
 
 
 def test_the_mirrored_world_has_mirrored_gradients():
-    numbers, column = draws.random_numbers, draws.USES["com_bearing"]
+    random_numbers, column = draws.random_numbers, draws.USES["com_bearing"]
 
     def mirrored(seed, index):
-        rows = numbers(seed, index)
+        rows = random_numbers(seed, index)
         rows[:, column] = 1 - rows[:, column]
         return rows
 
@@ -96,13 +99,15 @@ def test_the_mirrored_world_has_mirrored_gradients():
         fixed = {name: Range(value, value) for name, value in turned.items()}
         return replace(TOUCHING, **PERFECT | fixed)
 
-    one = gradients_of(domain(1))
+    plain = gradients_of(domain(1))
     with mock.patch.object(draws, "random_numbers", mirrored):
-        other = gradients_of(domain(-1))
-    np.testing.assert_allclose(one.value, other.value, rtol=1e-9)
+        mirror_image = gradients_of(domain(-1))
+    np.testing.assert_allclose(plain.value, mirror_image.value, rtol=1e-9)
     for name, sign in {"target_x": 1, "target_y": -1, "com_x": 1, "com_y": -1, "v_max": 1}.items():
-        assert np.abs(of(one, name)).max() > 1e-5, name
-        np.testing.assert_allclose(of(one, name), sign * of(other, name), rtol=1e-6, atol=1e-9)
+        assert np.abs(slope(plain, name)).max() > 1e-5, name
+        np.testing.assert_allclose(
+            slope(plain, name), sign * slope(mirror_image, name), rtol=1e-6, atol=1e-9
+        )
 
 
 def test_the_results_are_labelled(results):
@@ -129,30 +134,33 @@ def test_the_results_are_labelled(results):
 
 
 def test_a_mass_without_influence_is_told(results):
-    assert (of(results, "mass") == 0).all()
+    assert (slope(results, "mass") == 0).all()
     assert re.search("mass has no influence.*robot='kairos'.*domain='real'", results.notes)
-    notes = lambda name, domain: " ".join(  # noqa: E731
+    notes = lambda name, domain, value=np.zeros((1, 2)): " ".join(  # noqa: E731
         derivatives._notes(
             parse_domain(domain), "fused", derivatives.coordinates_of(name, RPSParams(), TOUCHING),
-            np.array([True]), np.ones((1, 2, 1)), np.zeros((2, 1)),
+            np.array([True]), value, np.ones((1, 2, 1)), np.zeros((2, 1)),
         )
     )  # fmt: skip
     assert "mass has no influence" in notes("mass", "wide")
     assert not notes("mass", "real")
     assert not notes("friction_ground", "wide")
+    assert "not finite in 1 of 2 trials" in notes("mass", "real", np.array([[1.0, np.nan]]))
 
 
 def test_a_kink_of_the_world_has_no_derivative_and_is_told():
     """The principal axes of a square box are any."""
     square = parse_domain("wide,objects=random_box,aspect=1:1,com_offset=0:0")
     drawn = draws.draw(square, 0, np.arange(3))
-    numbers = derivatives.coordinates_of(("aspect", "height"), RPSParams(), square)
-    slopes, bends = derivatives.world_slopes(square, drawn, Setting("fused"), numbers)
+    coordinates = derivatives.coordinates_of(("aspect", "height"), RPSParams(), square)
+    slopes, bends = derivatives.world_slopes(square, drawn, Setting("fused"), coordinates)
     assert (bends[:, 0] > 0.1).all()
     assert (bends[:, 1] < 1e-5).all()
-    assert slopes["fields.height"].keys() == {1}
+    assert ["world.fields.height" in slope for slope in slopes] == [False, True]
     gradient = np.where(bends > 0.01, np.nan, 1.0)[None]
-    notes = derivatives._notes(square, "fused", numbers, np.ones(2, bool), gradient, bends)
+    notes = derivatives._notes(
+        square, "fused", coordinates, np.ones(2, bool), bends, gradient, bends
+    )
     assert [x for x in notes if "kink" in x] == [
         "No derivatives in worlds whose numbers have a kink (see finite): aspect."
     ]
@@ -189,6 +197,7 @@ def test_worlds_are_those_of_a_sweep_and_one_object_each():
 
 BATCH = single.draw_worlds(TOUCHING, 2, setting=QUASISTATIC)
 ROUTE = {"world": row(BATCH.worlds, 0), "params": RPSParams(), "stage": BATCH.stage}
+ROUTE |= {"setting": QUASISTATIC}
 test_invalid_rollouts_are_refused = refusals(
     rps_jax.rollout,
     (
@@ -196,10 +205,19 @@ test_invalid_rollouts_are_refused = refusals(
         r"horizon = 0.0 .* at least 0.02 .*\[s\]",
     ),
     (ROUTE | {"horizon": "long"}, "horizon = long"),
+    (ROUTE | {"horizon": 301.0}, r"horizon = 301.0 .* at most 300 \[s\]"),
     (ROUTE | {"world": BATCH.worlds}, "give one world, and map over several by jax.vmap"),
     (ROUTE | {"world": None}, "world = None is not allowed: give a World"),
+    (ROUTE | {"world": BATCH}, "world = a WorldBatch is not allowed: give a World"),
     (ROUTE | {"setting": Setting("mujoco")}, "engine = mujoco is not allowed"),
+    (ROUTE | {"setting": Setting()}, "engine = fused .* worlds were drawn for quasistatic"),
     (ROUTE | {"params": 3.0}, "params = 3.0"),
+    (
+        ROUTE | {"params": RPSParams(K_h=np.ones(4))},
+        r"params.K_h = of shape \(4,\) .* give one number, and map over several by jax.vmap",
+    ),
+    (ROUTE | {"params": RPSParams(K_h=None)}, "rps.K_h = None"),
+    (ROUTE | {"params": RPSParams(K_h=float("nan"))}, "rps.K_h = nan"),
     (
         ROUTE | {"params": rps_jax.control.registry.LAWS["pursuit"], "smooth": True},
         "smooth = True .* has no smooth form; choose rps or rps_plus, or smooth=False",
@@ -245,8 +263,10 @@ def test_what_has_no_gradient_is_refused(changes, message):
 @pytest.mark.parametrize(
     ("score", "message"),
     [
-        (lambda snapshots: None, "score raises ValueError"),
-        (lambda snapshots: "low", "score raises TypeError"),
+        (lambda snapshots: None, "result of score = NoneType .* return one real number"),
+        (lambda snapshots: {"low": 1.0}, "result of score = dict .* return one real number"),
+        (lambda snapshots: 1, "result of score = int .* return one real number"),
+        (lambda snapshots: jax.jit(float)(1.0), "score converts a traced value to a number: keep"),
         (lambda snapshots: snapshots.speed, r"score raises AttributeError .*speed"),
         (lambda snapshots: snapshots.done[-1], r"result of score = bool\[\]"),
     ],

@@ -1,4 +1,4 @@
-"""Tuning by gradients: the softened score, its limit, and resumed runs."""
+"""Tuning by gradients: steps, slopes of whole trials, and windows of softened trials."""
 
 import json
 from types import SimpleNamespace
@@ -6,7 +6,6 @@ from types import SimpleNamespace
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optax
 import pytest
 from helpers import read_curve, refusal, rps
 
@@ -16,8 +15,10 @@ from rps_jax.runs.evaluate import CandidateScores
 from rps_jax.trials.score import Objective
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import Rules
-from rps_jax.tuning import descent
+from rps_jax.tuning import derivatives, descent
 from rps_jax.tuning.descent import TuneGrad
+from sweeps.gradients import windows
+from sweeps.gradients.windows import WindowTuning
 
 SETTING = Setting("quasistatic", rules=Rules(horizon=20.0, max_lost=10.0))
 OBJECTIVE = Objective(time=0.3, lost=0.1, miss=0.5)
@@ -33,7 +34,7 @@ def snapshots(distance, contact):
 
 def score(distance, contact, arrive=1e-5):
     shots = snapshots(distance, contact)
-    return float(descent.soft_score(shots, RPSParams(), SETTING, OBJECTIVE, arrive))
+    return float(derivatives.soft_score(shots, RPSParams(), SETTING, OBJECTIVE, arrive))
 
 
 def test_at_low_temperature_the_score_is_the_hard_score():
@@ -55,7 +56,7 @@ def test_the_way_that_is_left_costs_the_time_of_driving_it(contact, lost):
 def test_the_soft_score_has_a_slope_where_the_hard_score_jumps():
     def at(d):
         question = snapshots(d * jnp.ones(5), jnp.ones(5))
-        return descent.soft_score(question, RPSParams(), SETTING, OBJECTIVE, 0.005)
+        return derivatives.soft_score(question, RPSParams(), SETTING, OBJECTIVE, 0.005)
 
     slope = float(jax.grad(at)(0.05))
     assert slope > 10 * OBJECTIVE.time / SETTING.rules.horizon  # [1/m] more than a way's own
@@ -68,27 +69,34 @@ def test_the_first_start_is_the_base():
     assert (np.abs(thetas[1:] - thetas[0]).max(axis=1) > 0.1).all()
 
 
-def test_a_law_without_a_smooth_form_is_refused():
+def test_windows_need_a_law_with_a_smooth_form():
     with pytest.raises(InputError, match="no smooth form"):
-        TuneGrad("pursuit", tuned=("K_v",)).validate()
-    TuneGrad("pursuit", tuned=("K_v",), estimator="evolution").validate()
+        WindowTuning("pursuit", tuned=("K_v",)).validate()
+    TuneGrad("pursuit", tuned=("K_v",)).validate()
 
 
-def test_an_estimator_must_exist_and_its_engine_have_derivatives():
+def test_windows_need_an_estimator_and_an_engine_with_derivatives():
     with pytest.raises(InputError, match="unknown estimator 'reverse': choose from exact, clipped"):
-        TuneGrad("rps", estimator="reverse").validate()
+        WindowTuning("rps", estimator="reverse").validate()
     mujoco = Setting("mujoco")
     with pytest.raises(InputError, match="engine = mujoco is not allowed: it has no reverse-mode"):
-        TuneGrad("rps", setting=mujoco).validate()
-    TuneGrad("rps", estimator="evolution", setting=mujoco).validate()
+        WindowTuning("rps", setting=mujoco).validate()
+    TuneGrad("rps", setting=mujoco).validate()
 
 
-def test_steps_go_downhill_and_stay_within_the_clip():
-    rule = TuneGrad("rps", learning_rate=0.5, clip=1.0, steps=10).rule
-    change, state = rule.update(jnp.array([30.0, 40.0]), rule.init(jnp.zeros(2)), jnp.zeros(2))
-    np.testing.assert_allclose(change, [-0.5, -0.5], rtol=1e-4)  # the first step of Adam
-    # Its first moment is a tenth of the clipped gradient.
-    np.testing.assert_allclose(optax.tree.get(state, "mu"), [0.06, 0.08], rtol=1e-6)
+def test_steps_go_downhill_and_shrink_to_zero():
+    """The first step follows the gradient; the second the mean of 0.2 x (3, 4) x 0.8 and (0, 1)."""
+    search = TuneGrad("rps", tuned=("L", "K_h"), learning_rate=0.5, steps=2).search()
+    start = next(search)["vectors"]
+    length = 0.5 * np.sqrt(2)  # of a step, and half of it in the middle of the cosine
+    for gradient, change in (([30, 40], [0.6, 0.8]), ([0, 10], [4.8, 8.4])):
+        results = {"vectors": start, "base": np.array(0.5), "gradients": np.array([gradient])}
+        moved = search.send(results)["vectors"]
+        change = -length * np.array([change]) / np.linalg.norm(change)
+        np.testing.assert_allclose(moved - start, change, rtol=1e-6)
+        start, length = moved, length / 2
+    flat = {"vectors": start, "base": np.array(0.5), "gradients": np.zeros((1, 2))}
+    np.testing.assert_allclose(search.send(flat)["vectors"], start)
 
 
 def test_antithetic_steps_find_the_slope_of_the_objective():
@@ -106,7 +114,7 @@ def test_antithetic_steps_find_the_slope_of_the_objective():
 
 
 def test_the_tail_alone_counts_for_a_risk_averse_objective():
-    """Of ten worlds, whose score is a multiple of the parameter, two are the worst fifth."""
+    """The score of ten worlds is a multiple of the parameter; two are the worst fifth."""
     objective = Objective(risk="cvar", tail=0.2)
     slopes = jnp.arange(10.0)
 
@@ -123,23 +131,25 @@ def test_the_tail_alone_counts_for_a_risk_averse_objective():
 def test_windows_start_at_the_states_of_their_trials(monkeypatch):
     """Trials are replaced by counts of their steps of 20 ms."""
 
-    monkeypatch.setattr(descent, "start_all", lambda *arguments, law: jnp.zeros(arguments[-1].size))
-    monkeypatch.setattr(descent, "advance", lambda batches, loop, steps: [batches[0][-1] + steps])
+    monkeypatch.setattr(windows, "start_all", lambda *arguments, law: jnp.zeros(arguments[-1].size))
+    monkeypatch.setattr(windows, "advance", lambda batches, loop, steps: [batches[0][-1] + steps])
     late = jnp.array([0.0, 0.5, 1.0])
     for within, steps in ((10.0, [0, 250, 500]), (0.0, [0, 0, 0])):
-        question = TuneGrad("rps", tuned=("L", "K_h"), within=within, setting=SETTING)
-        trials = descent.window_starts(question, None, jnp.zeros(2), late, late)
+        question = WindowTuning("rps", tuned=("L", "K_h"), within=within, setting=SETTING)
+        trials = windows.window_starts(question, None, jnp.zeros(2), late, late)
         np.testing.assert_array_equal(trials, steps)
 
 
 # Cylinders on the quasi-static model, to compile few programs.
-RUN = "tune grad --engine quasistatic --estimator clipped --objects random_cylinder --worlds 2 "
-RUN += "--validation 2 --starts 2 --horizon 5 --window 1 --within 2 --tuned L K_h v_lost --slots 4"
+RUN = "--engine quasistatic --objects random_cylinder --worlds 2 --validation 2 --starts 2 "
+RUN += "--horizon 5 --tuned L K_h v_lost --slots 4 --steps"
+WINDOWS = "sweeps/gradients/windows.py --window 1 --within 2 --arrive 0.01"
 
 
 @pytest.mark.slow
-def test_the_command_line_and_a_run_of_another_kind(tmp_path, capsys):
-    assert rps(f"{RUN} --steps 2 --out", tmp_path) == 0
+@pytest.mark.parametrize("command", ["tune grad", WINDOWS])
+def test_the_command_line_and_a_run_of_another_kind(tmp_path, capsys, command):
+    assert rps(f"{command} {RUN} 2 --out", tmp_path) == 0
     curve = read_curve(tmp_path).reset_index()
     assert len(curve) == 3
     assert (curve.finite[:2] == 1.0).all()
@@ -151,4 +161,4 @@ def test_the_command_line_and_a_run_of_another_kind(tmp_path, capsys):
         "v_lost",
         "saturate_first",
     }
-    assert "steps = 2 there, 3 asked for" in refusal(capsys, f"{RUN} --steps 3 --out", tmp_path)
+    assert "steps = 2 there, 3 asked for" in refusal(capsys, f"{command} {RUN} 3 --out", tmp_path)

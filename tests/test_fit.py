@@ -1,6 +1,7 @@
 """Fits to logs: validation of logs, their statistics, and the coverage of the posterior."""
 
 import re
+from functools import partial
 from typing import Any, NamedTuple
 
 import bad_tables
@@ -19,7 +20,7 @@ from rps_jax.robot.skin import with_contacts
 from rps_jax.tuning import fit, least_squares, logs, posterior
 from rps_jax.world import domain as domains
 from rps_jax.world import points
-from sweeps.fit import bags
+from sweeps.fit import bags, methods
 
 SHELL = Robot().shell
 
@@ -427,6 +428,25 @@ def test_intervals_of_linear_windows_hold_the_truth(monkeypatch):
         assert eigenvalues[-1] == pytest.approx(0, abs=1e-6)
         assert (high - low)[-1] > 0.8
     assert 0.8 < np.mean(inside) < 0.98
+
+
+def test_cma_es_finds_the_minimum_of_least_squares(monkeypatch):
+    domain = domains.parse_domain(f"wide,objects=random_box,{PINNED}")
+    replay = least_squares.Replay(domain, [], rps_jax.Setting(), True)
+    active, a = replay.active, np.random.default_rng(0).normal(size=(16, 6, len(replay.active)))
+
+    def derivatives(self, u):
+        r = np.einsum("bcp,np->nbc", a, u[:, active] - 0.4)
+        return r + 0.3, np.repeat(a[None], len(u), 0)[..., : len(self.active)]
+
+    monkeypatch.setattr(least_squares.Replay, "derivatives", derivatives)
+    start = np.random.default_rng(1).random((30, len(points.names(domain))))
+    for minima in (replay.minima, partial(methods.evolved, replay)):
+        u, r, j = minima(start)
+        assert least_squares.cost(r).min() == pytest.approx(
+            least_squares.cost(replay.minima(start)[1]).min(), abs=0.1
+        )
+        assert j.shape == (len(u), 16, 6, len(active))
 
 
 @pytest.fixture

@@ -91,7 +91,10 @@ def test_operations_agree_with_jax(threads, tmp_path):
             np.testing.assert_allclose(actual, desired, rtol=3e-6, atol=1e-6, err_msg=name)
 
 
-PAIRS = [("box", "capacitive"), ("cylinder", "ideal"), ("prism", "ideal")]
+PAIRS = [
+    ("box", "capacitive"), ("cylinder", "ideal"),
+    pytest.param("prism", "ideal", marks=pytest.mark.slow),
+]  # fmt: skip
 
 
 @pytest.mark.parametrize(("shape", "skin"), PAIRS)

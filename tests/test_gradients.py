@@ -19,7 +19,7 @@ from rps_jax.trials.case import Case
 from rps_jax.trials.setting import Setting
 from rps_jax.tuning import gradients
 from rps_jax.tuning.gradients import Estimate, Options
-from sweeps.gradients import estimators
+from sweeps.gradients import critic, estimators
 
 THETA = jnp.array([0.5, -1.0, 2.0])
 STIFF = jnp.array([1.0, 2.0, 0.5])
@@ -150,9 +150,9 @@ def test_a_chaotic_score_has_a_large_derivative_and_a_small_smoothed_slope():
         return jnp.mean(jax.lax.scan(step, starts, length=40)[1], axis=0)
 
     starts = jax.random.uniform(jax.random.key(12), (4000,), minval=0.1, maxval=0.9)
-    one, key = jnp.zeros(1), jax.random.key(13)
+    start, key = jnp.zeros(1), jax.random.key(13)
     samples = {
-        name: jax.jit(lambda w, name=name: sampled(name, chaos, one, w, key, Options(sigma=1.0)))(
+        name: jax.jit(lambda w, name=name: sampled(name, chaos, start, w, key, Options(sigma=1.0)))(
             starts
         )
         for name in ("exact", "clipped", "bundled", "evolution", "mixed")
@@ -203,15 +203,15 @@ def test_entries_are_dropped_one_by_one():
 def test_a_sample_beyond_the_bound_is_scaled_down_to_it_by_hand():
     # Norms 5, 0.5, 1e30 and none: of those that are, the median is 5, and twice that 10.
     samples = jnp.array([[3.0, 4.0], [0.3, 0.4], [0.0, -1e30], [0.0, 0.0]])
-    bounded = gradients.clip(samples, 2.0)
+    bounded = estimators.clip(samples, 2.0)
     np.testing.assert_allclose(bounded, [[3, 4], [0.3, 0.4], [0, -10], [0, 0]], rtol=1e-5)
     # Each score of a world has a separate bound.
     two = jnp.stack([samples, samples[::-1] / 10], axis=-1)
-    both = gradients.clip(two, 2.0)
+    both = estimators.clip(two, 2.0)
     np.testing.assert_allclose(both[..., 1], bounded[::-1] / 10, rtol=1e-5)
-    broken = gradients.clip(samples.at[1, 0].set(jnp.nan), 2.0)
+    broken = estimators.clip(samples.at[1, 0].set(jnp.nan), 2.0)
     np.testing.assert_allclose(gradients.estimate(broken).finite, 0.75)
-    np.testing.assert_array_equal(gradients.clip(jnp.zeros((3, 2)), 2.0), np.zeros((3, 2)))
+    np.testing.assert_array_equal(estimators.clip(jnp.zeros((3, 2)), 2.0), np.zeros((3, 2)))
 
 
 def test_an_empty_estimate_is_zero_with_infinite_variance():
@@ -219,6 +219,17 @@ def test_an_empty_estimate_is_zero_with_infinite_variance():
     np.testing.assert_array_equal(estimate.gradient, [0.0, 1.0])
     np.testing.assert_array_equal(estimate.variance, [np.inf, np.inf])
     np.testing.assert_array_equal(estimate.finite, [0.0, 0.5])
+
+
+@pytest.mark.slow
+def test_a_critic_is_fitted_to_remaining_scores(monkeypatch):
+    monkeypatch.setattr(critic, "_UPDATES", 500)
+    monkeypatch.setattr(critic, "_BATCH", 64)
+    monkeypatch.setattr(critic, "_WIDTH", 16)
+    x = np.random.default_rng(0).normal(size=(500, 3)).astype(np.float32)
+    y = np.tanh(x[:, 0]) + 0.5 * x[:, 1]
+    error = np.asarray(critic.fit(x, y)(jnp.asarray(x))) - y
+    assert np.std(error) < 0.2 * np.std(y)
 
 
 # Windows of trials
@@ -243,7 +254,7 @@ def test_the_derivative_of_a_window_of_fused_trials_is_its_finite_difference():
     law = registry.smooth_law(rps.LAW)
     starts = (worlds, trial.start_all(worlds, params, np.ones(3, bool), law=law))
     loop = trial.ControlLoop(setting.physics, law=law)
-    scores = gradients.window(stage, params_of, final_distance, loop, 50)
+    scores = estimators.window(stage, params_of, final_distance, loop, 50)
     along = jax.jit(lambda thetas, way: jax.jvp(lambda x: scores(x, starts), (thetas,), (way,)))
     theta, h = np.array([0.2, 1.0, 0.12, 0.04], np.float32), 0.01
     slopes, differences = [], []

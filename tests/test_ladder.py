@@ -89,14 +89,14 @@ def test_all_laws_meet_the_same_test_worlds():
 
 def test_several_domains_are_several_ladders(tmp_path, capsys):
     setting = Setting("quasistatic", rules=Rules(horizon=2.0))
-    domains = ("wide,objects=random_cylinder", "paper")
-    tree = climb(("rps", "dipole"), domains, 3, setting=setting, slots=6, out=tmp_path)
+    domains = ("wide,objects=random_cylinder", "wide,objects=random_cylinder,gap=0.01")
+    tree = climb(("rps", "dipole"), domains, 6, setting=setting, slots=6, out=tmp_path)
     assert list(tree.children) == list(domains)
     for domain in domains:
-        alone = climb(("rps", "dipole"), domain, 3, setting=setting, slots=6)
+        alone = climb(("rps", "dipole"), domain, 6, setting=setting, slots=6)
         xr.testing.assert_identical(tree[domain].to_dataset(), alone)
         np.testing.assert_array_equal(load(tmp_path / domain).success, alone.success)
-    command = f"ladder --laws rps dipole --worlds 3 {QUASISTATIC} --horizon 2 --out {tmp_path}"
+    command = f"ladder --laws rps dipole --worlds 6 {QUASISTATIC} --horizon 2 --out {tmp_path}"
     assert rps(command, "--domain", *domains) == 0  # reads the finished sweeps
     text = capsys.readouterr().out
     for domain in domains:
@@ -108,7 +108,8 @@ def test_several_domains_are_several_ladders(tmp_path, capsys):
 
 
 def test_the_command_reports_information_against_success(tmp_path, capsys):
-    command = f"ladder --domain paper --worlds 6 {QUASISTATIC} --laws rps_tuned pursuit --out"
+    command = f"ladder --domain wide,objects=random_cylinder --worlds 6 {QUASISTATIC}"
+    command += " --laws rps_tuned pursuit --out"
     assert rps(command, tmp_path) == 0
     text = capsys.readouterr().out
     assert "## Models" not in text
@@ -121,10 +122,10 @@ def test_the_command_reports_information_against_success(tmp_path, capsys):
 def test_outcomes_are_written_as_a_long_table(tmp_path, monkeypatch):
     setting = Setting("quasistatic", rules=Rules(horizon=2.0))
     path = tmp_path / "results.csv"
-    results = climb(("rps", "dipole"), CYLINDERS, 3, setting=setting, table=path)
+    results = climb(("rps", "dipole"), CYLINDERS, 6, setting=setting, slots=6, table=path)
     table = pd.read_csv(path)
-    assert table.law.tolist() == ["rps"] * 3 + ["dipole"] * 3
-    assert table.world.tolist() == [0, 1, 2] * 2
+    assert table.law.tolist() == ["rps"] * 6 + ["dipole"] * 6
+    assert table.world.tolist() == [*range(6)] * 2
     assert set(table.object) == {"random_cylinder"}
     for (law, world), row in table.set_index(["law", "world"]).iterrows():
         trial = results.sel(law=law, world=world)

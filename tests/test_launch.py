@@ -21,9 +21,9 @@ NAME = "rps_native_launched"
 RUN = """
 import ctypes, json, sys
 import numpy as np
-folder, fails = sys.argv[1:]
+folder, fails, library = sys.argv[1:]
 driver = ctypes.CDLL(f"{folder}/libcuda.so.1")
-launcher = ctypes.CDLL(f"{folder}/launcher.so")
+launcher = ctypes.CDLL(f"{folder}/{library}.so")
 worlds = np.array([2, 20])
 arrays = [x for n in worlds for x in (np.arange(n, dtype=np.float32), np.arange(n),
                                       np.zeros(n, np.float32))]
@@ -34,7 +34,7 @@ calls = []
 for _ in range(2):
     error = driver.call(handler, pointers, ctypes.c_void_p(worlds.ctypes.data), fails.encode())
     calls.append([error.decode(), driver.said().decode().splitlines()])
-print(json.dumps([calls, arrays[2].tolist(), arrays[5].tolist()]))
+print(json.dumps([calls, arrays[2].tolist(), arrays[5].tolist(), driver.traits_of(handler)]))
 """
 
 
@@ -46,35 +46,47 @@ def folder(tmp_path_factory):
     for digit in "35":
         codes.append(folder / f"{digit}.cubin")
         codes[-1].write_text(digit)
-    text = nvrtc.launcher(NAME, codes, [(2, 1, 0, 1), (2, 1, 0, 1)], worlds=8)
-    (folder / "launcher.so").write_bytes(native._library(text, NAME))
+    for library, count in (("launcher", 2), ("single", 1)):
+        text = nvrtc.launcher(NAME, codes[:count], [(2, 1, 0, 1)] * count, worlds=8)
+        (folder / f"{library}.so").write_bytes(native._library(text, NAME))
     words = [str(COMPILER), "-O1", "-w", "-shared", "-fPIC", "-Wl,-soname,libcuda.so.1"]
     words += [f"-I{jax.ffi.include_dir()}", str(Path(__file__).with_name("launch.c"))]
     output_of(*words, "-o", folder / "libcuda.so.1")
     return folder
 
 
-def launched(folder, fails="nothing"):
-    """Return the errors and the driver's logs of two calls, and the results of both kernels."""
+def launched(folder, fails="nothing", library="launcher"):
+    """Return errors and driver logs of two calls, the results of both kernels, and the traits."""
     environment = os.environ | {"LD_LIBRARY_PATH": str(folder)}
-    return json.loads(output_of(sys.executable, "-c", RUN, folder, fails, env=environment))
+    words = sys.executable, "-c", RUN, folder, fails, library
+    return json.loads(output_of(*words, env=environment))
 
 
 def test_kernels_run_concurrently_and_later_work_waits_for_all(folder):
-    ((error, first), (_, second)), *results = launched(folder)
-    assert error == ""
+    ((error, first), (_, second)), *results, traits = launched(folder)
+    assert (error, traits) == ("", 0)
     np.testing.assert_array_equal(results[0], 3 * np.arange(2))
     np.testing.assert_array_equal(results[1], 5 * np.arange(20))
-    loaded = ["load 3", "kernel step", "load 5", "kernel step"]
+    loaded = ["mode 2", "load 3", "kernel step", "load 5", "kernel step", "mode 1"]
     assert first == [
-        *(*loaded, "context", "push 7", "event 201", "record 201 on 7"),
+        *(*loaded, "context", "push 7", "mode 2", "event 201", "record 201 on 7"),
         "launch 3 on 7: 1 of 32",  # 8 worlds in a block of 32 threads
         # Earlier work of XLA's stream comes first.
         *("stream 101", "event 202", "await 201 on 101", "launch 5 on 101: 3 of 32"),
         *("record 202 on 101", "await 202 on 7"),
-        *("end event 202", "end stream 101", "end event 201", "pop"),
+        *("end event 202", "end stream 101", "end event 201", "mode 1", "pop"),
     ]
-    assert [line.split()[0] for line in second] == [line.split()[0] for line in first[4:]]
+    assert [line.split()[0] for line in second] == [line.split()[0] for line in first[6:]]
+
+
+def test_a_single_kernel_can_be_captured_in_a_cuda_graph(folder):
+    """Its call is one launch; the driver also loads kernels while a stream is captured."""
+    ((error, first), (_, second)), result, _, traits = launched(folder, library="single")
+    assert (error, traits) == ("", 1)
+    np.testing.assert_array_equal(result, 3 * np.arange(2))
+    call = ["context", "push 7", "mode 2", "launch 3 on 7: 1 of 32", "mode 1", "pop"]
+    assert first == ["mode 2", "load 3", "kernel step", "mode 1", *call]
+    assert second == call
 
 
 @pytest.mark.parametrize(("fails", "error"), [

@@ -183,6 +183,7 @@ def test_every_public_function_has_an_example():
 
 # Questions whose small runs take longest; other tests run them, too.
 LONG = {"hardware", "learn", "ladder", "regress", "ceiling", "score", "attack", "replay"}
+LONG |= {"value_and_grad", "gallery"}
 
 
 def mark_long(name):

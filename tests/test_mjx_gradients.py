@@ -54,7 +54,7 @@ class Case:
         qvel = x[nq : nq + nv]
         return model, step(model, self.data.replace(qpos=x[:nq], qvel=qvel))
 
-    def after(self, step, x):
+    def next_state(self, step, x):
         """Return the state after a step."""
         data = self.stepped(step, x)[1]
         return jnp.concatenate([data.qpos, data.qvel, x[-1:]])
@@ -79,8 +79,8 @@ def compiled_box():
     """A box on a plane, with programs: step of MJX, our step, its derivatives."""
     with jax.enable_x64(True):
         case = Case(BOX)
-        ours = partial(case.after, mjx_gradients.step)
-        case.theirs = jax.jit(jax.vmap(partial(case.after, mjx.step)))
+        ours = partial(case.next_state, mjx_gradients.step)
+        case.theirs = jax.jit(jax.vmap(partial(case.next_state, mjx.step)))
         case.ours, case.jacobian = jax.jit(jax.vmap(ours)), jax.jit(jax.jacrev(ours))
         case.forward = jax.jit(lambda x, way: jax.jvp(ours, (x,), (way,))[1])
         return case
@@ -106,10 +106,19 @@ def test_derivatives_of_1_and_100_steps_of_a_box_on_a_plane_are_central_differen
     assert np.linalg.norm(x[7:9]) > 0.1  # it still slides
 
 
-def test_values_are_those_of_mjx_bit_for_bit_and_both_modes_agree(box):
-    rng = np.random.default_rng(0)
-    states = box.state(*np.zeros(6)) + 0.01 * rng.normal(size=(28, 14))
+def some_states(box):
+    """Return random states of a box near the ground (28, 14)."""
+    return box.state(*np.zeros(6)) + 0.01 * np.random.default_rng(0).normal(size=(28, 14))
+
+
+def test_values_are_those_of_mjx_bit_for_bit(box):
+    states = some_states(box)
     np.testing.assert_array_equal(box.ours(states), box.theirs(states))
+
+
+@pytest.mark.slow
+def test_both_modes_agree(box):
+    states, rng = some_states(box), np.random.default_rng(1)
     for x, way in zip(states[:4], rng.normal(size=(4, 14)), strict=True):
         expected = np.asarray(box.jacobian(x)) @ way
         np.testing.assert_allclose(box.forward(x, way), expected, rtol=1e-9, atol=1e-9)
@@ -156,14 +165,15 @@ def some_worlds(name, count, driven, x64=False, feet=""):
 def pulled_back(engine, worlds, physics, weights):
     """Return next states and forces (n, 22), and the gradients of their weighted sum, by input.
 
-    The gradient by a quaternion is tangential: engines differ in that along it, which has no use.
+    Gradients by quaternions are tangential. Engines differ in the part along the quaternion, which
+    has no meaning.
     """
     family, drawn, robot, robots, (qpos, qvel, twist) = worlds
     inputs = family, drawn.solid, drawn.friction, physics, robot
     stage, fields = engines.get(engine).stage(*inputs)
     fields = jax.tree.map(lambda x: jnp.asarray(x, qpos.dtype), fields)
 
-    def after(fields, qpos, qvel, twist, robots):
+    def outputs(fields, qpos, qvel, twist, robots):
         integral = None if robots is None else jnp.zeros_like(twist)
         motion = Motion(qpos, qvel, jnp.zeros_like(qvel), integral)
         period = ControlPeriod(Twist(*twist.T), physics, robots, force=True)
@@ -172,7 +182,7 @@ def pulled_back(engine, worlds, physics, weights):
 
     @jax.jit
     def run(*inputs):
-        values, pull = jax.vjp(after, *inputs)
+        values, pull = jax.vjp(outputs, *inputs)
         return values, pull(weights)
 
     values, gradients = run(fields, qpos, qvel, twist, robots)
@@ -189,7 +199,7 @@ def check_finite(gradients):
 
 @pytest.mark.slow
 def test_gradients_of_our_boxes_are_finite_and_those_of_the_fused_engine():
-    """In float32, with the standard solver; the flat boxes alone have equal contacts in both.
+    """Check float32 and the standard solver; only flat boxes have equal contacts in both engines.
 
     MJX has up to four contacts, within 1 mm of the deepest, and fused has all corners. The solvers
     end at different errors, of up to 1e-3 of an acceleration.
@@ -220,7 +230,7 @@ def test_gradients_of_our_boxes_are_finite_and_those_of_the_fused_engine():
     ],
 )
 def test_gradients_of_all_objects_are_finite(name, driven, cone, feet):
-    """In 10,000 states, for weights of any size."""
+    """Check 10,000 states and weights of any size."""
     worlds = some_worlds(name, 10_000, driven, feet=feet)
     physics = Physics(control_period=0.01, cone=cone)
     weights = jax.random.normal(jax.random.key(0), (10_000, 22))
@@ -248,7 +258,7 @@ def test_derivatives_of_a_leg_are_central_differences(condim, options):
         # Differences of CG would have the error of its solution.
         exact = Case(LEG.format(condim=condim), **options | {"solver": "Newton"})
         rng = np.random.default_rng(1)
-        for function in ("after", "forces"):
+        for function in ("next_state", "forces"):
             jacobian = jax.jit(jax.jacrev(partial(getattr(case, function), mjx_gradients.step)))
             step = jax.jit(jax.vmap(partial(getattr(exact, function), mjx.step)))
             for thigh, ankle in ((0.1, 0.1), (-1.06, 0.3), (0.36, 0.8)):

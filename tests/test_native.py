@@ -11,7 +11,7 @@ from helpers import same
 from rps_jax.control import registry
 from rps_jax.engines import native
 from rps_jax.engines.base import ControlPeriod
-from rps_jax.lowering import nodes
+from rps_jax.lowering import nodes, walk
 from rps_jax.trials import trial
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import ControlLoop
@@ -77,7 +77,10 @@ def close(actual, desired, warm, rest):
         np.testing.assert_allclose(a, b, rtol=1e-4, atol=rest)
 
 
-PAIRS = [("box", "capacitive"), ("cylinder", "ideal"), ("prism", "capacitive")]
+PAIRS = [
+    pytest.param("box", "capacitive", marks=pytest.mark.slow),
+    ("cylinder", "ideal"), ("prism", "capacitive"),
+]  # fmt: skip
 
 
 @pytest.mark.parametrize(("shape", "skin"), PAIRS)
@@ -226,6 +229,76 @@ def test_an_operation_agrees_with_jax(name):
     for a, b in zip(*map(jax.tree.leaves, (jax.jit(run)(x), jax.vmap(function)(x))), strict=True):
         assert a.dtype == b.dtype
         np.testing.assert_allclose(a, b, rtol=3e-6, atol=1e-6)
+
+
+@pytest.mark.parametrize("reverse", [False, True])
+def test_a_scan_with_a_large_body_is_a_loop(reverse, monkeypatch):
+    monkeypatch.setattr(walk, "_MAX_UNROLLED", 0)
+
+    def function(x):
+        rows = jnp.arange(6.0).reshape(3, 2), x * jnp.arange(3.0)
+        step = lambda c, y: (c + y[0] * x, (c, y[1] + c[0], y[0] > x))  # noqa: E731
+        return jax.lax.scan(step, jnp.ones(2), rows, reverse=reverse)
+
+    x = jnp.arange(5.0)
+    run = native.batched(function, lambda _: pytest.fail("it was not compiled"))
+    for a, b in zip(*map(jax.tree.leaves, (jax.jit(run)(x), jax.vmap(function)(x))), strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-6)
+
+
+def test_constants_are_moved_as_jax_moves_them():
+    def function(x):
+        parts = jnp.split(x, [1, 3], axis=1)
+        rows = jnp.pad(x, ((1, 0), (0, 2)), constant_values=7), x[:, ::-1], x.T, *parts
+        return [*rows, jax.lax.pad(x, jnp.float32(3), ((1, 0, 1), (-1, 0, 0))), *x]
+
+    x = np.arange(12, dtype=np.float32).reshape(3, 4)
+    results = walk.walk(jax.make_jaxpr(function)(x), [x], nodes.SimdNodes())
+    for a, b in zip(results, function(jnp.asarray(x)), strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+def test_a_scan_of_worlds_is_that_of_jax_and_so_are_its_derivatives(monkeypatch):
+    """By what varies alone; constants, integers and stored numbers are not differentiated."""
+    compiled = []
+
+    def recorded(functions, original=native._compiled):
+        compiled.append(functions)
+        return original(functions)
+
+    monkeypatch.setattr(native, "_compiled", recorded)
+
+    def step(state, constants, saved):
+        (x, count), (a, b) = state, constants
+        root = saved or (jnp.sqrt(1 + x * x),)  # stored numbers are constant
+        x = x + a * jnp.sin(x) * b["k"].sum() + 0.1 * root[0]
+        return ((x, count + 1), {"x": x * count}), root
+
+    def score(x, a, k, scan):
+        end, out = scan(step, (x, jnp.arange(4)), (a, {"k": k}), 5)
+        return (end[0] ** 2).sum() + (out["x"] * jnp.arange(1.0, 6)[:, None]).sum()
+
+    def by_jax(step, state, constants, length):
+        def whole(state, _):
+            state = state[0], state[1]
+            fixed = jax.vmap(lambda *x: step(*x, ())[1])(state, constants)
+            fixed = jax.lax.stop_gradient(fixed)
+            return jax.vmap(lambda *x: step(*x)[0])(state, constants, fixed)
+
+        return jax.lax.scan(whole, state, length=length)
+
+    inputs = jnp.linspace(0.1, 1, 4), jnp.linspace(0.2, 0.5, 4), jnp.full((4, 3), 0.3)
+    for transform in (
+        lambda f: jax.grad(f, argnums=(0, 1, 2)), lambda f: jax.grad(f, argnums=1),
+        lambda f: jax.jacfwd(f, argnums=2), lambda f: f,
+    ):  # fmt: skip
+        native_result, expected = (
+            jax.jit(transform(lambda *x, scan=scan: score(*x, scan)))(*inputs)
+            for scan in (native.scan, by_jax)
+        )
+        for a, b in zip(*map(jax.tree.leaves, (native_result, expected)), strict=True):
+            np.testing.assert_allclose(a, b, rtol=1e-5)
+    assert len(compiled) == 7  # forward, and backward or a tangent map
 
 
 @pytest.mark.parametrize("skin", ["capacitive", "ideal"])

@@ -71,7 +71,7 @@ def test_stored_notebooks_have_figures_and_no_errors_or_local_paths(name):
 
 
 # These run for a minute or more; other tests call the same functions.
-LONG = ("02", "05", "06", "07", "08", "09")
+LONG = ("02", "05", "06", "07", "08", "09", "10")
 EXECUTED = [pytest.param(n, marks=[pytest.mark.slow] if n[:2] in LONG else []) for n in TEXTS]
 
 
@@ -152,7 +152,7 @@ def test_notebooks_show_the_cells_of_tables_that_they_cite():
                 expected = eval(compile(ast.Expression(last.value), name, "eval"), names)
                 assert output.data["text/markdown"] == expected
                 cited.append(name)
-    assert cited == ["03_paper"] * 4 + ["05_tuning"]
+    assert cited == ["03_paper"] * 4 + ["05_tuning"] + ["10_gradients"] * 2
 
 
 def test_training_by_stable_baselines3_as_the_tutorial_shows_it(tmp_path):

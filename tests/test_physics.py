@@ -141,7 +141,9 @@ def all_films(request):
     return films(request.param)
 
 
-IN_ALL = pytest.mark.parametrize("all_films", ["mjx", "fused", "mujoco"], indirect=True)
+# MJX compiles for long; in other tests, and in few steps, it agrees with C MuJoCo.
+MJX = pytest.param("mjx", marks=pytest.mark.slow)
+IN_ALL = pytest.mark.parametrize("all_films", [MJX, "fused", "mujoco"], indirect=True)
 
 
 @IN_ALL

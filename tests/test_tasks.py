@@ -39,7 +39,7 @@ def outlines(rng: np.random.Generator) -> list[tuple[Footprint, Any]]:
     circle = Footprint(jnp.array([[0.1, -0.2]]), jnp.asarray(0.3))
     corners = np.array([[0.5, 0.3], [-0.4, 0.4], [-0.5, -0.2], [0.3, -0.5], [0.3, -0.5]])
     shapes = [(circle, Point(0.1, -0.2).buffer(0.3, quad_segs=2000))]
-    turned = fp.place(fp.rectangle(0.4, 0.2), rng.uniform(-0.3, 0.3, 2), 0.7)
+    turned = fp.place(fp.rectangle(0.4, 0.2), jnp.asarray(rng.uniform(-0.3, 0.3, 2)), 0.7)
     for vertices in (np.asarray(turned.vertices), corners):
         shapes.append((Footprint(jnp.asarray(vertices), jnp.zeros(())), Polygon(vertices)))
     return shapes
@@ -76,7 +76,7 @@ def test_the_way_out_of_a_wall_ends_its_crossing() -> None:
             inside += 1
             turns, wall = np.linspace(0, 2 * np.pi, 181), LineString(walls[0])
 
-            def crosses(share: float, a: float, way: float = -found, wall: Any = wall) -> bool:
+            def crosses(share: float, a: float, way: Any = -found, wall: Any = wall) -> bool:
                 moved = translate(shape, share * way * np.cos(a), share * way * np.sin(a))
                 return moved.intersects(wall)
 
@@ -87,8 +87,7 @@ def test_the_way_out_of_a_wall_ends_its_crossing() -> None:
 
 def test_points_of_a_path_are_shapelys() -> None:
     rng = np.random.default_rng(2)
-    for _ in range(30):
-        vertices = np.cumsum(rng.normal(size=(6, 2)), axis=0)
+    for vertices in np.cumsum(rng.normal(size=(30, 6, 2)), axis=1):
         line, whole = Polyline.through(vertices), LineString(vertices)
         assert line.arcs[-1] == pytest.approx(whole.length)
         point = rng.normal(size=2)
@@ -97,8 +96,8 @@ def test_points_of_a_path_are_shapelys() -> None:
         assert np.asarray(polyline.at_arc(line, arc)) == pytest.approx(
             np.ravel(whole.interpolate(float(arc)).coords), abs=1e-5
         )
-    start, _ = polyline.nearest(line, jnp.asarray(vertices[-1]), 0.0, 0.5)
-    assert 0 <= start <= 0.5
+        start, _ = polyline.nearest(line, jnp.asarray(vertices[-1]), 0.0, 0.5)
+        assert 0 <= start <= 0.5
 
 
 def drawn(task: str, count: int = 200, domain: str = "wide,objects=random_box") -> draws.Draw:

@@ -189,16 +189,14 @@ def against_table(results: xr.Dataset, reference: str) -> list[list[str]]:
     """
     by_law = {str(law): results.success.sel(law=law) for law in results.law.values}
     base = by_law[reference]
-    comparisons = {
-        law: statistics.compare(base, x) for law, x in by_law.items() if law != reference
-    }
-    adjusted = statistics.holm([comparison.p for comparison in comparisons.values()])
-    p = dict(zip(comparisons, map(_p, adjusted), strict=True))
+    tests = {law: statistics.compare(base, x) for law, x in by_law.items() if law != reference}
+    adjusted = statistics.holm([test.p for test in tests.values()])
+    p = dict(zip(tests, map(_p, adjusted), strict=True))
     gained = f"successes in the {int((base.values == 0).sum())} failures of {reference}"
     rows = [["", "success", f"against {reference}", "p (Holm)", gained]]
     for law, success in sorted(by_law.items(), key=lambda item: -float(item[1].mean())):
         cells = ["", "", ""]
-        if c := comparisons.get(law):
+        if c := tests.get(law):
             difference = f"{_difference(c, base.size)} (+{c.gained} -{c.lost})"
             cells = [difference, p[law], str(c.gained)]
         rows.append([law, _rate(success.values > 0), *cells])

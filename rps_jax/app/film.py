@@ -196,8 +196,7 @@ def of_sweep(
             tiles = (row * index.size + columns).tolist()
             part = build_batch(plan, law, index[columns])
             scenes = [scene_of(plan, i) for i in worlds]
-            labels = [f"{prefix}world {i}" for i in worlds]
-            takes.append(Take(tiles, part, scenes, labels))
+            takes.append(Take(tiles, part, scenes, [f"{prefix}world {i}" for i in worlds]))
     return takes
 
 
@@ -264,8 +263,7 @@ def _shots(take: Take, setting: Setting, interval: int) -> Iterator[tuple[bool, 
         trials, snapshots, _ = advance(trials)
         moment = rows(jax.device_get(snapshots), 0)
         contacts = np.asarray(trial.p_world_contact(moment))
-        time = steps * setting.physics.control_period
-        states = map(_status, done, success, time)
+        states = map(_status, done, success, steps * setting.physics.control_period)
         texts = [f"{label}, {state}" for label, state in zip(take.labels, states, strict=True)]
         fresh = map(Shot, moment.qpos, contacts, texts)
         # An unchanged shot is not drawn again.

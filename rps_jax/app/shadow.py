@@ -69,14 +69,11 @@ class Shadow(BagQuestion[xr.Dataset]):
         doubts = "; it ".join(motion_faults(*motion))  # the base may follow other commands
         twists = shadowed(registry.law_of(self.params), self.params, recorded)
         both = np.stack([recorded["twist"], twists])
-        return xr.Dataset(
-            {
-                name: (("source", "time"), both[..., i], {"units": unit})
-                for i, (name, unit) in enumerate(COLUMNS["twist"].items())
-            },
-            {"source": ["commanded", "law"], "time": recorded["time"]},
-            {"law": registry.resolve_law(self.law)[0], "doubts": doubts},
-        )
+        pairs = zip(COLUMNS["twist"].items(), np.moveaxis(both, -1, 0), strict=True)
+        columns = {name: (("source", "time"), x, {"units": unit}) for (name, unit), x in pairs}
+        coords = {"source": ["commanded", "law"], "time": recorded["time"]}
+        attrs = {"law": registry.resolve_law(self.law)[0], "doubts": doubts}
+        return xr.Dataset(columns, coords, attrs)
 
     def report(self, results: Any, run: Run) -> Sequence[Section]:
         """Return the differences between the twists of the law and the recorded ones."""

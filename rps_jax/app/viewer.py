@@ -153,9 +153,7 @@ def _in_world(plan: Plan, law: str, index: int) -> Push:
 class Page:
     """The panel, the clock and what the browser asks for."""
 
-    def __init__(
-        self, server: ViserServer, gate: Gate, request: PushRequest, build: Builder
-    ) -> None:
+    def __init__(self, server: ViserServer, gate: Gate, request: PushRequest, build: Builder):
         """Create a page without a push, whose panel shows a `request`.
 
         `build` may raise InputError.

@@ -96,12 +96,10 @@ class Details(NamedTuple):
         """Return the details of a law without adaptive rate and steering angle (both are 0)."""
         distance = planar.norm(displacement(obs))
         zero = jnp.zeros_like(distance)
-        l = obs.p_robot_contact[..., 1]  # noqa: E741
-        return cls(l, distance, zero, zero, zero > 0)
+        return cls(obs.p_robot_contact[..., 1], distance, zero, zero, zero > 0)
 
 
 def displacement(obs: Observation) -> Float[Array, "2"]:
     """Compute Eq. 4, d = p^W_T - (p^W_R + R^W_R p^R_C) [m]: from contact to target, in W."""
     p_world_contact = obs.p_world_robot + planar.rotate(obs.yaw, obs.p_robot_contact)
-    d = obs.p_world_target - p_world_contact
-    return jnp.clip(d, -_WORLD_SIZE, _WORLD_SIZE)
+    return jnp.clip(obs.p_world_target - p_world_contact, -_WORLD_SIZE, _WORLD_SIZE)

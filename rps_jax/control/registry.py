@@ -13,7 +13,7 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any, TypeVar, get_args
 
 import jax
 import numpy as np
@@ -26,6 +26,7 @@ from rps_jax.errors import InputError
 from rps_jax.record import files
 from rps_jax.record.options import parse_changes
 
+T = TypeVar("T")  # a pytree
 # Both are `Any` for the command line, which reads a text; a program may pass parameters.
 LawLike = str | Any  # text that names a law, or parameters of its class
 LawsLike = str | Any | Sequence[Any] | Mapping[str, Any]  # one law or several, or labelled laws
@@ -65,12 +66,12 @@ def leaves_to_json(tree: object) -> dict[str, Any]:
     return {name: np.asarray(leaf, float).tolist() for name, leaf in named_leaves(tree).items()}
 
 
-def replace_leaves(params: Params, changes: Mapping[str, Any]) -> Params:
-    """Replace leaves of parameters, by their paths (see `named_leaves`)."""
-    leaves = named_leaves(params)
+def replace_leaves(tree: T, changes: Mapping[str, Any]) -> T:
+    """Replace leaves of parameters, or of any pytree, by their paths (see `named_leaves`)."""
+    leaves = named_leaves(tree)
     for name in changes:
-        errors.check_name(f"parameter of {type(params).__name__}", name, leaves)
-    return jax.tree.unflatten(jax.tree.structure(params), list({**leaves, **changes}.values()))
+        errors.check_name(f"parameter of {type(tree).__name__}", name, leaves)
+    return jax.tree.unflatten(jax.tree.structure(tree), list({**leaves, **changes}.values()))
 
 
 def law_of(params: LawParams | type) -> Law:
@@ -104,10 +105,8 @@ def smooth_law(law: Law, temperatures: Smoothing | None = None) -> Law:
     `temperatures` (widths of the switches) are those of the law.
     """
     if law.temperatures is None:
-        names = [name for name, params in LAWS.items() if law_of(params).temperatures is not None]
-        raise InputError(
-            f"this law has no smooth form, which gradients need: choose {', '.join(names)}."
-        )
+        names = ", ".join(k for k, x in LAWS.items() if law_of(x).temperatures is not None)
+        raise InputError(f"this law has no smooth form, which gradients need: choose {names}.")
     return _smooth_law(law, law.temperatures if temperatures is None else temperatures)
 
 
@@ -184,9 +183,8 @@ def parse_law(text: str) -> tuple[str, LawParams]:
     head, changes = parse_changes("law", str(text))
     values = {name: errors.check_number(f"{head} {name}", x) for name, x in changes.items()}
     words = str(text).split(",")[1:]
-    label = ",".join(
-        [label, *(Path(x).stem if files.suffix_of(x) == ".json" else x for x in words)]
-    )
+    parts = (Path(x).stem if files.suffix_of(x) == ".json" else x for x in words)
+    label = ",".join([label, *parts])
     changed = replace_leaves(params, values)
     if any(files.suffix_of(word) == ".json" for word in words):
         for name, earlier in law_of(params).earlier:

@@ -35,9 +35,8 @@ def run_file(path: Path, name: str) -> ModuleType:
         del sys.modules[name]
         if isinstance(error, InputError):
             raise
-        raise InputError(
-            f"{path} cannot be run ({type(error).__name__}: {error}): correct the file."
-        ) from error
+        fault = f"{path} cannot be run ({type(error).__name__}: {error}): correct the file."
+        raise InputError(fault) from error
     return module
 
 
@@ -87,9 +86,8 @@ def find(record: Mapping[str, Any], run: Path | None) -> Path:
         return path
     copy = None if run is None else folder.sources(run, str(record["digest"])) / path.name
     if copy is None or _digests(copy.parent, expected) != expected:
-        raise InputError(
-            f"law = {path} has changed since the run, which has no copy: restore the file."
-        )
+        fault = f"law = {path} has changed since the run, which has no copy: restore the file."
+        raise InputError(fault)
     warnings.warn(f"law = {path} has changed since the run: its copy {copy} is used", stacklevel=2)
     return copy
 

@@ -91,9 +91,8 @@ def _check_traced(
 
     def check(fault: str, expected: str) -> None:
         if fault:
-            raise InputError(
-                f"step of the law in {_definition(step)} returns {fault}: return {expected}."
-            )
+            law = f"step of the law in {_definition(step)}"
+            raise InputError(f"{law} returns {fault}: return {expected}.")
 
     is_triple = isinstance(results, tuple) and len(results) == 3
     next_state, twist, details = results if is_triple else (None, None, None)
@@ -106,9 +105,8 @@ def _check_traced(
         for name, leaf in fields._asdict().items():
             dtype = getattr(leaf, "dtype", None)
             is_scalar = np.shape(leaf) == () and getattr(dtype, "kind", "") in tuple(kinds)
-            check(
-                "" if is_scalar else f"{group} whose {name} is {_describe(leaf)}", "a real scalar"
-            )
+            fault = "" if is_scalar else f"{group} whose {name} is {_describe(leaf)}"
+            check(fault, "a real scalar")
     check(_difference(state, next_state), "the shapes and types that init returned")
 
 
@@ -119,18 +117,21 @@ def _trace(name: str, function: Function, *args: object) -> object:
     except InputError:
         raise
     except (Exception, SystemExit) as error:  # any error of the user's function
-        fault = next((t for kind, t in _TRACER_ERRORS.items() if isinstance(error, kind)), "")
-        if not fault:
-            reason = " ".join(str(error).split())[:300].rstrip(".")
-            fault = f"raises {type(error).__name__}" + (f" ({reason})" if reason else "")
         line = _line_of(error) or _definition(function)
-        raise InputError(f"{name} of the law in {line} {fault}.") from error
+        raise InputError(f"{name} of the law in {line} {fault_of(error)}.") from error
     if programs[0] != programs[1]:
         raise InputError(
             f"{name} of the law in {_definition(function)} is not pure, since a second call "
             "computes something else: keep what changes in the state, and a key of jax.random."
         )
     return results[0]
+
+
+def fault_of(error: BaseException) -> str:
+    """Return the verb phrase of a function whose trace fails with an error."""
+    reason = " ".join(str(error).split())[:300].rstrip(".")
+    raised = f"raises {type(error).__name__}" + (f" ({reason})" if reason else "")
+    return next((t for kind, t in _TRACER_ERRORS.items() if isinstance(error, kind)), raised)
 
 
 def _program(function: Function, args: Sequence[object]) -> tuple[object, object]:
@@ -154,9 +155,8 @@ def _difference(state: object, next_state: object) -> str:
     """Describe how a state differs from the initial one; empty if it does not."""
     if jax.tree.structure(state) != jax.tree.structure(next_state):
         return "a state of another structure"
-    for (name, old), new in zip(
-        named_leaves(state).items(), jax.tree.leaves(next_state), strict=True
-    ):
+    leaves = zip(named_leaves(state).items(), jax.tree.leaves(next_state), strict=True)
+    for (name, old), new in leaves:
         if _describe(old) != _describe(new):
             return f"a state whose {name} is {_describe(new)}, and {_describe(old)} in init"
     return ""

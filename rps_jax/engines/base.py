@@ -56,6 +56,9 @@ class ControlPeriod:
     robot: Robot | None = None  # (B,) whose force is limited; None: bases follow every twist
     # Whether `Driven.force` is computed.
     force: bool = field(default=False, metadata={"static": True})
+    # Accelerations of each physics step: () to return them, or those of an equal period, from which
+    # its derivatives are computed without a solver; None: neither.
+    solutions: Any = None
 
 
 class Driven(NamedTuple):
@@ -65,6 +68,7 @@ class Driven(NamedTuple):
     # [N, N, N m] wrench of the object on the base, about the base's origin and in its frame; mean
     # over the physics steps of the period; None: not requested.
     force: Float[Any, "*B 3"] | None = None
+    solutions: Any = None  # of `ControlPeriod`, where it requests them
 
 
 @runtime_checkable
@@ -93,6 +97,12 @@ class Engine(abc.ABC):
 
     def _refused(self, rule: str) -> errors.InputError:
         return errors.not_allowed("engine", self.name, rule)
+
+    def check_stage(self, stage: Stage) -> None:
+        """Raise InputError unless the stage is of this engine, or of one that it extends."""
+        owner = getattr(stage, "engine", self.name)
+        if owner not in [getattr(kind, "name", "") for kind in type(self).__mro__]:
+            raise self._refused(f"the worlds were drawn for {owner}; give their setting")
 
     def check_physics(self, physics: Physics) -> None:
         """Raise InputError unless the engine supports the physics."""

@@ -11,6 +11,7 @@ from typing import Any, TypeAlias
 
 import jax
 import jax.numpy as jnp
+from jax.custom_derivatives import SymbolicZero
 from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 
@@ -41,6 +42,23 @@ def linear_map(
     outs = tuple(jax.core.ShapedArray(x.shape, x.dtype) for x in like)
     static = {"maps": (forward, transpose), "count": len(residuals), "outs": outs}
     return _primitive.bind(*residuals, *vectors, **static, label=label)
+
+
+def varied_indices(tangents: Sequence[Any]) -> list[int]:
+    """Return the indices of the tangents that are not zero, in a rule with `symbolic_zeros`."""
+    return [i for i, x in enumerate(tangents) if not isinstance(x, SymbolicZero)]
+
+
+def restrict(
+    function: Callable[[list[Any]], Any], values: Sequence[Any], indices: Sequence[int]
+) -> tuple[Callable[[list[Any]], Any], list[Any]]:
+    """Return a function of some entries of its list, the others constant, and these entries."""
+
+    def restricted(entries: list[Any]) -> Any:
+        replaced = dict(zip(indices, entries, strict=True))
+        return function([replaced.get(i, x) for i, x in enumerate(values)])
+
+    return restricted, [values[i] for i in indices]
 
 
 _primitive = Primitive("linear_map")

@@ -45,6 +45,7 @@ class MJXStage(NamedTuple):
 
     model: mjx.Model
     data: mjx.Data  # a template for the state of each world
+    engine = "mjx"
 
     def drive(self, fields: dict[str, jax.Array], motion: Motion, period: ControlPeriod) -> Driven:
         """Step a batch for one control period.

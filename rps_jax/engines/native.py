@@ -13,7 +13,8 @@ import contextlib
 import ctypes
 import functools
 import hashlib
-import math
+import itertools
+import operator
 import os
 import re
 import subprocess
@@ -21,17 +22,18 @@ import tempfile
 import threading
 import warnings
 from collections import defaultdict
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.custom_derivatives import SymbolicZero
+from jax.flatten_util import ravel_pytree
 
 from rps_jax.engines import device
-from rps_jax.engines.linear_map import linear_map
+from rps_jax.engines.linear_map import linear_map, restrict, varied_indices
 from rps_jax.geometry import vectors
 from rps_jax.lowering import nvrtc
 from rps_jax.lowering.gpu_writer import WARP, GpuWriter
@@ -46,12 +48,16 @@ _FLAGS = ("-O2", "-march=native", "-fno-math-errno", "-ffp-contract=fast", "-w")
 _FLAGS += ("-fno-gcse", "-fno-rerun-cse-after-loop", "-fno-tree-dse")
 _FLAGS += ("--param", "sccvn-max-alias-queries-per-access=30")
 _NAME = "rps_native_"
-_THREADS = (4, 16)  # of a GPU that compute a world: the second if shared memory is short
+# Threads of a GPU that compute a world in whole trials, whose worlds are sorted, and in other
+# functions: the second number if shared memory is short.
+_THREADS = {True: (4, 16), False: (8, 16)}
 _NO_COMPILER = (
     "a C compiler (apt install gcc) or NVRTC (pip install nvidia-cuda-nvrtc) is not installed"
 )
 _PLATFORMS = {"cpu": "cpu", "gpu": "CUDA"}
 libraries: dict[str, ctypes.CDLL] = {}  # of the functions that XLA can call, by name
+# Compilers run while JAX traces the next functions.
+_COMPILATIONS = ThreadPoolExecutor(4, "compiler")
 _locks: defaultdict[str, threading.RLock] = defaultdict(threading.RLock)
 
 
@@ -91,9 +97,8 @@ def target() -> str | None:
 def batched(
     function: Callable[..., Pytree],
     whole: Callable[..., Pytree],
-    derivative: Callable[[Pytree, Pytree], Pytree] | None = None,
-    differentiated: Callable[..., Pytree] | None = None,
-    packed: Sequence[int] = (),
+    saves: bool = False,
+    always: bool = False,
 ) -> Callable[..., Pytree]:
     """Return a function of a batch of worlds (B, ...) that runs world by world.
 
@@ -102,35 +107,34 @@ def batched(
     Args:
       function: the function of one world; pure.
       whole: the same function of a batch, which XLA compiles where `function` is not compiled.
-      derivative: of arguments and results of one world; the function's derivatives are those of
-        this one by the arguments. By default it is the function itself.
-      differentiated: the same function of a batch, used where it is differentiated.
-      packed: indices of arguments that reverse mode stores as one array for each type of number,
-        since a loop stores each array by itself.
+      saves: whether `function` is a function of a tuple of arguments and of `saved`, and returns
+        results and `saved`: numbers that it computes if it gets (), and from which, as constants,
+        its derivatives are faster. Where it is not differentiated, it gets None.
+      always: whether it gets () there, too, so that no other function is compiled.
     """
     if not is_available():
         return whole
-    run = concurrent([function], lambda arguments: [whole(*arguments)])
+
+    def save(arguments: Pytree, saved: Pytree) -> tuple[Pytree, Pytree]:
+        return function(arguments, saved) if saves else (function(*arguments), ())
+
+    def start(*arguments: Pytree) -> tuple[Pytree, Pytree]:
+        return save(arguments, ())
+
+    def plain(*arguments: Pytree) -> Pytree:
+        return save(arguments, None)[0]
+
+    run_plain = concurrent([plain], lambda arguments: [whole(*arguments)])
+    in_xla = jax.vmap(start) if saves else lambda *arguments: (whole(*arguments), ())
+    run = concurrent([start], lambda arguments: [in_xla(*arguments)])
 
     @jax.custom_jvp
     def call(*arguments: Pytree) -> Pytree:
-        return run(arguments)[0]
+        return run(arguments)[0][0] if always else run_plain(arguments)[0]
 
     def rule(primals: Pytree, tangents: Pytree) -> tuple[Pytree, Pytree]:
-        if differentiated is not None:
-            inputs, tree = jax.tree.flatten(primals)
-            varied = {i: x for i, x in enumerate(jax.tree.leaves(tangents)) if _varies(x)}
-
-            def of_varied(values: dict[int, jax.Array]) -> Pytree:
-                assert differentiated is not None  # as above
-                arguments = tree.unflatten([values.get(i, x) for i, x in enumerate(inputs)])
-                return differentiated(*arguments)
-
-            return jax.jvp(of_varied, ({i: inputs[i] for i in varied},), (varied,))
-        results = call(*primals)
-        if derivative is not None:
-            return results, _tangents(derivative, (primals, results), tangents, results)
-        return results, _tangents(function, primals, tangents, results, packed)
+        results, saved = run(primals)[0] if saves else (call(*primals), ())
+        return results, _tangents(lambda *x: save(*x)[0], primals, saved, tangents, results)
 
     call.defjvp(rule, symbolic_zeros=True)
     return call
@@ -139,10 +143,8 @@ def batched(
 def mapped(function: Callable[..., Pytree], axes: Sequence[int | None]) -> Callable[..., Pytree]:
     """Return `jax.vmap(function, axes)`, compiled and differentiated world by world.
 
-    An argument of axis None is repeated for each world. All others but the first may change from
-    step to step: reverse mode packs them.
+    An argument of axis None is repeated for each world.
     """
-    varying = [i for i, axis in enumerate(axes) if i and axis == 0]
 
     def call(*arguments: Pytree) -> Pytree:
         size = len(jax.tree.leaves(arguments[0])[0])
@@ -151,83 +153,112 @@ def mapped(function: Callable[..., Pytree], axes: Sequence[int | None]) -> Calla
         def repeat(x: Any) -> jax.Array:
             return jnp.broadcast_to(x, (size, *jnp.shape(x)))
 
+        # Records check the shapes of a world: a batch is passed as leaves.
         def single(*leaves: Sequence[Any]) -> Pytree:
             return function(*(tree.unflatten(x) for tree, x in zip(trees, leaves, strict=True)))
 
         inputs = [jax.tree.leaves(x) for x in arguments]
         pairs = zip(inputs, axes, strict=True)
         inputs = [x if axis == 0 else list(map(repeat, x)) for x, axis in pairs]
-        return batched(single, jax.vmap(single), packed=varying)(*inputs)
+        return batched(single, jax.vmap(single))(*inputs)
 
     return call
 
 
+def scan(
+    step: Callable[[Pytree, Pytree, Pytree], tuple[tuple[Pytree, Pytree], Pytree]],
+    state: Pytree, constants: Pytree, length: int,
+) -> tuple[Pytree, Pytree]:  # fmt: skip
+    """Return `jax.lax.scan` of a batch of worlds (B, ...) by one native function for each step.
+
+    A loop reads and writes few arrays: those of the state and of the constants, each with one array
+    for each type of number, and one more of the constants that are differentiated.
+
+    Args:
+      step: of one world, from state, constants and the saved numbers of `batched`'s `saving`. It
+        returns state and output, and these numbers.
+      state: first state.
+      constants: pytree of arrays that do not change.
+      length: number of steps.
+    """
+    leaves, tree = jax.tree.flatten((state, constants))
+    count = len(jax.tree.leaves(state))
+
+    def run(values: list[jax.Array], varied: Collection[int] | None = None) -> Pytree:
+        groups: dict[Any, list[int]] = {}  # of the state, then of the constants
+        for i, x in enumerate(values):
+            key = i >= count, x.dtype, i >= count and i in (varied or ())
+            groups.setdefault(key, []).append(i)
+        carried = sum(not is_constant for is_constant, *_ in groups)
+        restore: Any = [ravel_pytree([values[i][0] for i in x])[1] for x in groups.values()]
+
+        def packed(leaves: Sequence[jax.Array], indices: Sequence[list[int]]) -> list[jax.Array]:
+            return [ravel_pytree([leaves[i] for i in x])[0] for x in indices]
+
+        def unpacked(arrays: Sequence[jax.Array], indices: Sequence[list[int]]) -> list[jax.Array]:
+            parts = [f(x) for f, x in zip(restore, arrays, strict=False)]
+            pairs = zip(itertools.chain(*indices), itertools.chain(*parts), strict=True)
+            return [x for _, x in sorted(pairs, key=operator.itemgetter(0))]
+
+        indices = list(groups.values())
+
+        def saving(arguments: Pytree, saved: Pytree) -> tuple[Pytree, Pytree]:
+            state, constants = tree.unflatten(unpacked([*arguments[0], *arguments[1]], indices))
+            (state, output), saved = step(state, constants, saved)
+            return (packed(jax.tree.leaves(state), indices[:carried]), output), saved
+
+        arrays = jax.vmap(lambda x: packed(x, indices))(values)
+        call = batched(saving, jax.vmap(lambda *x: saving(x, None)[0]), True, varied is not None)
+        end, outputs = jax.lax.scan(
+            lambda x, _: call(x, arrays[carried:]), arrays[:carried], length=length
+        )
+        end = jax.vmap(lambda x: unpacked(x, indices[:carried]))(end)
+        return jax.tree.structure(state).unflatten(end), outputs
+
+    def rule(primals: Any, tangents: Any) -> Any:
+        ((values,), (directions,)) = primals, tangents
+        indices = varied_indices(directions)
+        of_varied, point = restrict(functools.partial(run, varied=indices), values, indices)
+        return jax.jvp(of_varied, (point,), ([directions[i] for i in indices],))
+
+    call = jax.custom_jvp(lambda values: run(values))
+    call.defjvp(rule, symbolic_zeros=True)
+    return call(leaves)
+
+
 def _tangents(
-    function: Callable[..., Pytree],
-    arguments: Pytree,
-    tangents: Pytree,
-    like: Pytree,
-    packed: Sequence[int] = (),
-) -> Pytree:
+    function: Callable[[Pytree, Pytree], Pytree],
+    arguments: Pytree, saved: Pytree, tangents: Pytree, results: Pytree,
+) -> Pytree:  # fmt: skip
     """Return the tangents of the results of a function of one world, in a batch of worlds.
 
-    Arguments without tangents, behind the others, are constant; `like` has the types of the
-    results, and `packed` is that of `batched`.
+    The function's second argument, `saved`, is constant.
     """
-    leaves, tree = jax.tree.flatten(arguments)
-    owners = [i for i, x in enumerate(arguments) for _ in jax.tree.leaves(x)]
-    groups: dict[object, list[int]] = {}  # positions of the leaves of each stored array
-    for i, (leaf, owner) in enumerate(zip(leaves, owners, strict=True)):
-        groups.setdefault(leaf.dtype if owner in packed else i, []).append(i)
-    like_leaves, like_tree = jax.tree.flatten(like)
+    leaves, tree = jax.tree.flatten((arguments, saved))
+    result_leaves, result_tree = jax.tree.flatten(results)
     directions = jax.tree.leaves(tangents)
-    varied = [i for i, x in enumerate(directions) if _varies(x)]
-    real = [i for i, x in enumerate(like_leaves) if jnp.issubdtype(x.dtype, jnp.floating)]
+    varied = varied_indices(directions)
+    real = [i for i, x in enumerate(result_leaves) if jnp.issubdtype(x.dtype, jnp.floating)]
 
-    def pack(group: Sequence[int]) -> jax.Array:
-        if len(group) == 1:
-            return leaves[group[0]]
-        return jnp.concatenate([jnp.reshape(leaves[i], (len(leaves[i]), -1)) for i in group], 1)
-
-    def of_varied(stored: Sequence[Any]) -> tuple[Callable[[list[Any]], list[Any]], list[Any]]:
-        """Return a function of the varied arguments of one world, and their values."""
-        values: list[Any] = [None] * len(leaves)
-        for group, array in zip(groups.values(), stored, strict=True):
-            shapes = [leaves[i].shape[1:] for i in group]
-            ends = np.cumsum([math.prod(shape) for shape in shapes])[:-1]
-            parts = [array] if len(group) == 1 else jnp.split(array, ends)
-            for i, part, shape in zip(group, parts, shapes, strict=True):
-                values[i] = jnp.reshape(part, shape)
-
-        def run(some: list[Any]) -> list[Any]:
-            replaced = dict(zip(varied, some, strict=True))
-            whole = tree.unflatten([replaced.get(i, x) for i, x in enumerate(values)])
-            results = jax.tree.leaves(function(*whole))
-            return [results[i] for i in real]
-
-        return run, [values[i] for i in varied]
+    def real_results(values: Sequence[Any]) -> list[Any]:
+        leaves = jax.tree.leaves(function(*tree.unflatten(values)))
+        return [leaves[i] for i in real]
 
     def push(values: Sequence[Any], vectors: Sequence[Any]) -> list[Any]:
-        run, point = of_varied(values)
-        return jax.jvp(run, (point,), (list(vectors),))[1]
+        of_varied, point = restrict(real_results, values, varied)
+        return jax.jvp(of_varied, (point,), (list(vectors),))[1]
 
     def pull(values: Sequence[Any], vectors: Sequence[Any]) -> list[Any]:
-        run, point = of_varied(values)
-        return jax.vjp(run, point)[1](list(vectors))[0]
+        of_varied, point = restrict(real_results, values, varied)
+        return jax.vjp(of_varied, point)[1](list(vectors))[0]
 
     moved = linear_map(
         batched(push, jax.vmap(push)), batched(pull, jax.vmap(pull)),
-        [*map(pack, groups.values())], [directions[i] for i in varied],
-        [like_leaves[i] for i in real],
+        leaves, [directions[i] for i in varied], [result_leaves[i] for i in real],
     )  # fmt: skip
     values = dict(zip(real, moved, strict=True))
-    zeros = [np.zeros(x.shape, jax.dtypes.float0) for x in like_leaves]
-    return like_tree.unflatten([values.get(i, x) for i, x in enumerate(zeros)])
-
-
-def _varies(tangent: Any) -> bool:
-    """Whether a tangent is not a symbolic zero."""
-    return not isinstance(tangent, SymbolicZero)
+    zeros = [np.zeros(x.shape, jax.dtypes.float0) for x in result_leaves]
+    return result_tree.unflatten([values.get(i, x) for i, x in enumerate(zeros)])
 
 
 def concurrent(
@@ -247,52 +278,90 @@ def concurrent(
     if not is_available():
         return whole
 
+    @functools.cache
+    def compiled(types: Sequence[tuple[Any, Sequence[Any]]]) -> tuple[list[_Function], Any]:
+        calls = [_Function(f, *x, sort_by) for f, x in zip(functions, types, strict=True)]
+        groups = [calls] if jax.default_backend() == "gpu" else [[call] for call in calls]
+        return calls, [(group, _compiled(group)) for group in groups]
+
     @jax.custom_jvp
     def run(*arguments: Pytree) -> list[Pytree]:
-        calls = [_Function(f, x, sort_by) for f, x in zip(functions, arguments, strict=True)]
-        groups = [calls] if jax.default_backend() == "gpu" else [[call] for call in calls]
-        names = [_compiled(group) for group in groups]
-        if None in names:
+        flat = [jax.tree.flatten(jax.tree.map(jnp.asarray, x)) for x in arguments]
+        types = tuple((tree, tuple((x.shape, x.dtype) for x in leaves)) for leaves, tree in flat)
+        calls, groups = compiled(types)
+        if any(library is None for _, library in groups):
             return list(whole(*arguments))
-        results: list[Pytree] = []
-        for group, name in zip(groups, names, strict=True):
-            shapes = [x for call in group for x in call.shapes]
-            leaves = [x for call in group for x in call.leaves]
-            call_library = jax.ffi.ffi_call(str(name), shapes, vmap_method="broadcast_all")
-            # As a map of no vectors it has a message where it is differentiated twice.
-            run_library = functools.partial(lambda f, x, _: f(*x), call_library)
-            values = iter(linear_map(run_library, None, leaves, [], shapes, str(name)))
-            results += [
-                jax.tree.unflatten(call.structure, [next(values) for _ in call.results])
-                for call in group
-            ]
-        return results
+        inputs = [leaves for leaves, _ in flat]
+        if sort_by is not None:
+            orders = [jnp.argsort(sort_by(*x)).astype(jnp.int32) for x in arguments]
+            inputs = [[*x, order] for x, order in zip(inputs, orders, strict=True)]
+        sizes = [len(x) for x in inputs]
+
+        def run_libraries(values: Sequence[Any], _: Any) -> list[jax.Array]:
+            """Call the libraries, for which it waits until they are compiled."""
+            rest = iter(values)
+            leaves = [[next(rest) for _ in range(size)] for size in sizes]
+            try:
+                names = [library.ready() for _, library in groups]
+            except RuntimeError as error:
+                compiler, reason = error.args
+                warnings.warn(f"{compiler} fails, so XLA compiles: {reason}", stacklevel=2)
+                pairs = zip(types, leaves, strict=True)
+                trees = [tree.unflatten(x[: len(kinds)]) for (tree, kinds), x in pairs]
+                return jax.tree.leaves(list(whole(*trees)))
+            owners, results = iter(leaves), list[jax.Array]()
+            for (group, _), name in zip(groups, names, strict=True):
+                shapes = [x for call in group for x in call.shapes]
+                run_library = jax.ffi.ffi_call(name, shapes, vmap_method="broadcast_all")
+                results += run_library(*(x for _ in group for x in next(owners)))
+            return results
+
+        shapes = [x for call in calls for x in call.shapes]
+        # As a map of no vectors it has a message where it is differentiated twice.
+        label = " ".join(library.name for _, library in groups)
+        leaves = [x for call in inputs for x in call]
+        results = iter(linear_map(run_libraries, None, leaves, [], shapes, label))
+        return [call.structure.unflatten([next(results) for _ in call.results]) for call in calls]
 
     run.defjvp(lambda primals, tangents: jax.jvp(lambda *x: list(whole(*x)), primals, tangents))
     return run
 
 
+class _Library(NamedTuple):
+    """A library that XLA can call, or that is being compiled."""
+
+    name: str
+    compilation: Future[None] | None = None
+
+    def ready(self) -> str:
+        """Return its name when it is compiled.
+
+        Raises:
+          RuntimeError: the compiler that fails, and its first message.
+        """
+        if self.compilation is not None:
+            self.compilation.result()
+        return self.name
+
+
 class _Function:
-    """The jaxpr of a function of one world, with the arguments and shapes of a batch."""
+    """The jaxpr of a function of one world, and the shapes of the results of a batch."""
 
     def __init__(
-        self, function: Callable[..., Pytree], arguments: Pytree,
+        self, function: Callable[..., Pytree], tree: Any, types: Sequence[tuple[Any, Any]],
         sort_by: Callable[..., jax.Array] | None,
     ) -> None:  # fmt: skip
-        self.leaves, tree = jax.tree.flatten(jax.tree.map(jnp.asarray, arguments))
-        self.inputs = [jax.ShapeDtypeStruct(x.shape[1:], x.dtype) for x in self.leaves]
+        self.inputs = [jax.ShapeDtypeStruct(shape[1:], dtype) for shape, dtype in types]
         with vectors.trace_one_world():
-            world = jax.tree.unflatten(tree, self.inputs)
+            world = tree.unflatten(self.inputs)
             self.jaxpr, out = jax.make_jaxpr(function, return_shape=True)(*world)
         self.results, self.structure = jax.tree.flatten(out)
-        count, self.is_sorted = len(self.leaves[0]), sort_by is not None
-        if sort_by is not None:
-            self.leaves.append(jnp.argsort(sort_by(*arguments)).astype(jnp.int32))
+        self.is_sorted, count = sort_by is not None, types[0][0][0]
         self.shapes = [jax.ShapeDtypeStruct((count, *x.shape), x.dtype) for x in self.results]
 
 
-def _compiled(functions: Sequence[_Function]) -> str | None:
-    """Compile functions, or load them from the cache; return their name in XLA, or None."""
+def _compiled(functions: Sequence[_Function]) -> _Library | None:
+    """Start to compile functions, or load them from the cache; None: XLA compiles them."""
     on_gpu = jax.default_backend() == "gpu"
     try:
         threads, texts = _texts(functions) if on_gpu else (1, _printed(functions, SimdWriter))
@@ -308,19 +377,17 @@ def _compiled(functions: Sequence[_Function]) -> str | None:
         return None
     key = repr((texts, on_gpu and (nvrtc.LAUNCH, nvrtc.FLAGS), target(), jax.__version__))
     name = _NAME + hashlib.sha256(key.encode()).hexdigest()[:32]
-    with _locks[name]:
-        if load(name):
-            return name
-        try:
+
+    def compilation() -> None:
+        with _locks[name]:
+            if name in libraries:
+                return
             body = _kernels(name, texts, functions, WARP // threads) if on_gpu else _library(
                 texts[0].replace(HANDLER, name), name)  # fmt: skip
-        except RuntimeError as error:
-            compiler, reason = error.args
-            warnings.warn(f"{compiler} fails, so XLA compiles: {reason}", stacklevel=2)
-            return None
-        cache.write(_cache_path(name), body)
-        _register(name, body)
-    return name
+            cache.write(_cache_path(name), body)
+            _register(name, body)
+
+    return _Library(name, None if load(name) else _COMPILATIONS.submit(compilation))
 
 
 def _texts(functions: Sequence[_Function]) -> tuple[int, list[str]]:
@@ -329,7 +396,7 @@ def _texts(functions: Sequence[_Function]) -> tuple[int, list[str]]:
     Raises:
       TooLargeError: a kernel needs too much shared memory.
     """
-    *fewer, most = _THREADS
+    *fewer, most = _THREADS[functions[0].is_sorted]
     for threads in fewer:
         with contextlib.suppress(TooLargeError):
             return threads, _printed(functions, functools.partial(GpuWriter, threads))
@@ -365,7 +432,8 @@ def _kernels(name: str, texts: Sequence[str], functions: Sequence[_Function], wo
     Raises:
       RuntimeError: the compiler that fails, and its first message.
     """
-    shapes = [(len(x.leaves), len(x.results), *first_array(x.inputs)) for x in functions]
+    counts = [(len(x.inputs) + x.is_sorted, len(x.results)) for x in functions]
+    shapes = [(*n, *first_array(x.inputs)) for n, x in zip(counts, functions, strict=True)]
     with tempfile.TemporaryDirectory() as folder:
         paths = [Path(folder) / f"{k}.cubin" for k in range(len(texts))]
         for path, image in zip(paths, nvrtc.images(texts), strict=True):

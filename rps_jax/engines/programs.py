@@ -69,7 +69,7 @@ def compile_function(
     stored = None if path is None else _read(path, leaves)
     if stored is None:
         jitted = jax.jit(flat, donate_argnums=donated)
-        jitted.trace(*leaves)  # compiles the native functions that it calls
+        jitted.lower(*leaves)  # waits for the native functions that it calls
         safe = list(map(export.DisabledSafetyCheck.custom_call, [*native.libraries]))
         exported = export.export(jitted, disabled_checks=safe)(*leaves)
         (structure,) = structures

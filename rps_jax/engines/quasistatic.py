@@ -79,6 +79,8 @@ class Problem(NamedTuple):
 class Quasistatic(NamedTuple):
     """Stage of quasi-static worlds, which share nothing."""
 
+    engine = "quasistatic"
+
     def drive(self, fields: Slider, motion: Motion, period: ControlPeriod) -> Driven:
         """Step a batch for one control period, with constant height and tilt of the object.
 

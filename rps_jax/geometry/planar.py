@@ -55,8 +55,7 @@ def direction(vector: Float[Array, "*B 2"]) -> Float[Array, "*B"]:
     # Scaling changes no angle and keeps x*x + y*y, which the derivative divides by, in range.
     unit = vector / jnp.where(is_zero, 1.0, scale)[..., None]
     x = jnp.where(is_zero, 1.0, unit[..., 0])
-    y = jnp.where(is_zero, 0.0, unit[..., 1])
-    return jnp.arctan2(y, x)
+    return jnp.arctan2(jnp.where(is_zero, 0.0, unit[..., 1]), x)
 
 
 def wrap(angle: Float[Array, "*B"]) -> Float[Array, "*B"]:

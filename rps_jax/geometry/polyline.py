@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -20,11 +20,12 @@ class Polyline(NamedTuple):
     arcs: Float[Array, "*B K"]  # [m]
 
     @classmethod
-    def through(cls, vertices: np.ndarray) -> Polyline:
+    def through(cls, vertices: Any) -> Polyline:
         """Return polylines through vertices (..., K, 2) [m], on the host."""
         lengths = np.linalg.norm(np.diff(vertices, axis=-2), axis=-1)
         zero = np.zeros_like(lengths[..., :1])
-        return cls(vertices, np.concatenate([zero, np.cumsum(lengths, axis=-1)], axis=-1))
+        arcs: Any = np.concatenate([zero, np.cumsum(lengths, axis=-1)], axis=-1)
+        return cls(vertices, arcs)
 
 
 def at_arc(line: Polyline, arc: Scalar) -> Float[Array, "2"]:

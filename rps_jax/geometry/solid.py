@@ -55,7 +55,7 @@ def build(
     direction = np.stack([np.cos(com_bearing), np.sin(com_bearing)], axis=-1)
     at = ((1 - load_size) * reach(vertices, radius, direction))[:, None] * direction
     share = com_offset / (1 - load_size)
-    xx, yy, xy = _second_moments(vertices, radius)
+    xx, yy, xy = _moments(vertices, radius)
     scale, pair = 1 - share + share * load_size**2, share * (1 - share)
     xx = scale * xx + pair * at[:, 0] ** 2
     yy = scale * yy + pair * at[:, 1] ** 2
@@ -270,9 +270,7 @@ def _triangles(vertices: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return vertices[..., 0] * ahead[..., 1] - vertices[..., 1] * ahead[..., 0], ahead
 
 
-def _second_moments(
-    vertices: np.ndarray, radius: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _moments(vertices: np.ndarray, radius: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the mean of x^2, y^2 and x y [m^2] over outlines centred at the origin."""
     if vertices.shape[1] == 1:
         quarter = radius**2 / 4

@@ -22,6 +22,8 @@ static int (*context_of)(void *, void **), (*push)(void *), (*pop)(void **);
 static int (*create_stream)(void **, unsigned), (*destroy_stream)(void *);
 static int (*create_event)(void **, unsigned), (*destroy_event)(void *);
 static int (*record)(void *, void *), (*await)(void *, void *, unsigned);
+static int (*exchange_mode)(int *);
+enum { RELAXED = 2 }; /* mode of a thread that may load kernels while XLA captures a stream */
 
 static void load_kernels(void) {
   void *cuda = dlopen("libcuda.so.1", RTLD_NOW);
@@ -32,32 +34,40 @@ static void load_kernels(void) {
     {&create_stream, "cuStreamCreate"}, {&destroy_stream, "cuStreamDestroy_v2"},
     {&create_event, "cuEventCreate"}, {&destroy_event, "cuEventDestroy_v2"},
     {&record, "cuEventRecord"}, {&await, "cuStreamWaitEvent"},
+    {&exchange_mode, "cuThreadExchangeStreamCaptureMode"},
   };
   for (unsigned i = 0; i < sizeof all / sizeof *all; i++)
     if (!cuda || !(*(void **)all[i].to = dlsym(cuda, all[i].name))) { failed = -1; return; }
+  int mode = RELAXED;
+  exchange_mode(&mode);
   for (int k = 0; k < KERNELS && !failed; k++) {
     void *library;
     failed = load_library(&library, images[k], 0, 0, 0, 0, 0, 0);
     if (!failed) failed = get_kernel(&kernels[k], library, "step");
   }
+  exchange_mode(&mode);
+}
+
+static int launch_one(int k, void *arguments, int64_t worlds, void *stream) {
+  void *with[] = {arguments};
+  return launch(kernels[k], (worlds + WORLDS - 1) / WORLDS, 1, 1, 32, 1, 1, 0, stream, with, 0);
 }
 
 /* Launch the first kernel on a stream and each other on a new stream; return 0, or CUDA's error code.
    The next work of the stream waits for all of them. */
 static int launch_all(void **arguments, const int64_t *worlds, void *stream) {
+  if (KERNELS == 1) return launch_one(0, arguments[0], worlds[0], stream);
   void *started, *streams[KERNELS], *done[KERNELS];
   int code = create_event(&started, 2), created = 1;
   if (code) return code;
   code = record(started, stream);
   for (int k = 0; k < KERNELS && !code; k++) {
-    void *on = stream, *with[] = {arguments[k]};
     if (k) {
       if ((code = create_stream(&streams[k], 1)) || (code = create_event(&done[k], 2))) break;
       created = k + 1;
       if ((code = await(streams[k], started, 0))) break;
-      on = streams[k];
     }
-    code = launch(kernels[k], (worlds[k] + WORLDS - 1) / WORLDS, 1, 1, 32, 1, 1, 0, on, with, 0);
+    code = launch_one(k, arguments[k], worlds[k], k ? streams[k] : stream);
   }
   for (int k = 1; k < created; k++) {
     if (!code) code = record(done[k], streams[k]);
@@ -75,7 +85,12 @@ static XLA_FFI_Error *error_of(XLA_FFI_CallFrame *frame, const char *message) {
 }
 
 XLA_FFI_Error *NAME(XLA_FFI_CallFrame *frame) {
-  if (answers_version(frame)) return 0;
+  if (answers_version(frame)) {
+    /* XLA may capture the launch of one kernel in a CUDA graph, and replay it. */
+    XLA_FFI_Metadata_Extension *query = (void *)frame->extension_start;
+    if (KERNELS == 1) query->metadata->traits = XLA_FFI_HANDLER_TRAITS_COMMAND_BUFFER_COMPATIBLE;
+    return 0;
+  }
   pthread_once(&once, load_kernels);
   if (failed) return error_of(frame, "the GPU's driver cannot load a kernel");
   XLA_FFI_Stream_Get_Args stream = {sizeof stream, 0, frame->ctx, 0};
@@ -95,7 +110,10 @@ XLA_FFI_Error *NAME(XLA_FFI_CallFrame *frame) {
     pointers[k][n] = worlds[k];
     arguments[k] = pointers[k];
   }
+  int mode = RELAXED; /* the driver loads a kernel into the context at its first launch */
+  exchange_mode(&mode);
   int code = launch_all(arguments, worlds, stream.stream);
+  exchange_mode(&mode);
   pop(&last);
   return code ? error_of(frame, "a kernel could not be launched") : 0;
 }

@@ -14,7 +14,8 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.extend.core import ClosedJaxpr, Jaxpr, JaxprEqn, Literal
+from jax import lax
+from jax.extend.core import ClosedJaxpr, Jaxpr, JaxprEqn, Literal, jaxpr_as_fun
 
 from rps_jax.lowering.compounds import COMPOUNDS
 from rps_jax.lowering.target import (
@@ -31,6 +32,7 @@ from rps_jax.lowering.target import (
 )
 
 _MAX_STEPS = 256  # of a scan that is unrolled
+_MAX_UNROLLED = 500  # equations of the body of a scan that is unrolled
 # Primitives that only move numbers, with the number of operands that are moved; None: all. The
 # operands behind them are indices.
 _MOVES = {
@@ -44,6 +46,13 @@ _MOVES = {
 _RANDOM = {
     **dict.fromkeys(("random_wrap", "random_unwrap")),
     **{"random_bits": "random_bits", "random_split": "split", "random_fold_in": "fold_in"},
+}
+# Further primitives that only move numbers, by NumPy.
+_BY_NUMPY: dict[str, Callable[[np.ndarray, Params], Sequence[np.ndarray]]] = {
+    "split": lambda x, p: np.split(x, np.cumsum(p["sizes"])[:-1], p["axis"]),
+    "unstack": lambda x, p: list(np.moveaxis(x, p["axis"], 0)),
+    "transpose": lambda x, p: [np.transpose(x, p["permutation"])],
+    "rev": lambda x, p: [np.flip(x, p["dimensions"])],
 }
 _IDENTITIES = ("stop_gradient", "copy", "copy_p", "optimization_barrier", "pvary",
                "reduce_precision", "name")  # fmt: skip
@@ -74,6 +83,8 @@ def _walk(closed: ClosedJaxpr | Jaxpr, arguments: Sequence[Value], target: Targe
         return np.asarray(atom.val, atom.aval.dtype) if isinstance(atom, Literal) else values[atom]
 
     for eqn in jaxpr.eqns:
+        if not eqn.outvars:
+            continue
         results = _results(eqn, [read(atom) for atom in eqn.invars], target)
         values |= dict(zip(eqn.outvars, results, strict=True))
     return [read(atom) for atom in jaxpr.outvars]
@@ -213,11 +224,16 @@ def _moved_by_numpy(eqn: JaxprEqn, arrays: list[Value]) -> list[np.ndarray] | No
     if name in ("concatenate", "stack"):
         axis = params.get("dimension", params.get("axis"))
         return [getattr(np, name)(arrays, axis)]
+    if name == "pad" and all(min(a, b) >= 0 == c for a, b, c in params["padding_config"]):
+        widths = [(a, b) for a, b, _ in params["padding_config"]]
+        return [np.pad(arrays[0], widths, constant_values=arrays[1])]
+    if name in _BY_NUMPY:
+        return list(_BY_NUMPY[name](arrays[0], params))
     return None
 
 
 def _scan(eqn: JaxprEqn, values: list[Value], target: Target) -> list[Value]:
-    """Emit a loop for a `fori_loop`, and unroll any other `scan`."""
+    """Emit a loop for a `fori_loop` or a large body, and unroll any other `scan`."""
     params = eqn.params
     length, body = params["length"], params["jaxpr"]
     if length > _MAX_STEPS:
@@ -233,6 +249,10 @@ def _scan(eqn: JaxprEqn, values: list[Value], target: Target) -> list[Value]:
         loop = target.for_loop(_with_consts(body, consts, target), carry, length)
         if loop is not None:
             return loop
+    elif _count_equations(body) > _MAX_UNROLLED:
+        counts = {"length": length, "fixed": fixed, "carried": carried}
+        function = functools.partial(_scan_loop, jaxpr=body, reverse=params["reverse"], **counts)
+        return list(_expanded(function, values, _types(eqn.invars), target))
     scanned = list(zip(values[fixed + carried :], body.jaxpr.invars[fixed + carried :],
                        strict=True))  # fmt: skip
     rows: list[list[Value]] = [[]] * length
@@ -255,3 +275,29 @@ def _row(value: Value, step: int, out: Any, target: Target) -> Value:
         return np.asarray(value[step])
     size = size_of(out.shape)
     return target.moved([value], (step * size + np.arange(size)).reshape(out.shape), out)
+
+
+def _scan_loop(
+    *values: jax.Array, jaxpr: ClosedJaxpr, length: int, reverse: bool, fixed: int, carried: int
+) -> list[jax.Array]:
+    """Compute a scan by a loop over its carry and its stacked results."""
+    consts, scanned = values[:fixed], values[fixed + carried :]
+
+    def turn(state: list[jax.Array], _: None) -> tuple[list[jax.Array], None]:
+        step, *state = state
+        rows = [lax.dynamic_index_in_dim(x, step, keepdims=False) for x in scanned]
+        results = jaxpr_as_fun(jaxpr)(*consts, *state[:carried], *rows)
+        stacked = zip(state[carried:], results[carried:], strict=True)
+        rows = [lax.dynamic_update_index_in_dim(x, row, step, 0) for x, row in stacked]
+        return [step + np.int32(-1 if reverse else 1), *results[:carried], *rows], None
+
+    start = jnp.int32(length - 1 if reverse else 0), *values[fixed : fixed + carried]
+    stacked = [jnp.zeros((length, *x.shape), x.dtype) for x in jaxpr.out_avals[carried:]]
+    return lax.scan(turn, [*start, *stacked], length=length)[0][1:]
+
+
+def _count_equations(jaxpr: ClosedJaxpr | Jaxpr) -> int:
+    """Count the equations of a jaxpr and of those that it contains."""
+    params = jax.tree.leaves([list(eqn.params.values()) for eqn in jaxpr.eqns])
+    inner = [x for x in params if isinstance(x, ClosedJaxpr | Jaxpr)]
+    return len(jaxpr.eqns) + sum(map(_count_equations, inner))

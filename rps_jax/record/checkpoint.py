@@ -30,11 +30,11 @@ class Checkpoints:
 
     def paths(self) -> dict[str, Path]:
         """Return the files of all parts, in the order of their names."""
-        return {name: path for name, path, _ in self._valid_files()}
+        return {name: path for name, path, _ in self._valid()}
 
     def items(self, names: Container[str] | None = None) -> Iterator[tuple[str, bytes]]:
         """Return names and contents of all parts, or of some, in the order of their names."""
-        return ((name, content) for name, _, content in self._valid_files(names))
+        return ((name, content) for name, _, content in self._valid(names))
 
     def get(self, name: str) -> bytes | None:
         """Return the content of one part; None if it is unfinished."""
@@ -75,9 +75,7 @@ class Checkpoints:
                     entries.append((_part_name(path), -path.stat().st_mtime_ns, path))
         return [path for *_, path in sorted(entries)]
 
-    def _valid_files(
-        self, names: Container[str] | None = None
-    ) -> Iterator[tuple[str, Path, bytes]]:
+    def _valid(self, names: Container[str] | None = None) -> Iterator[tuple[str, Path, bytes]]:
         """Yield name, path and content of the newest valid file of all parts, or of some."""
         last = None
         for path in self._files(names):

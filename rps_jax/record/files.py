@@ -159,9 +159,8 @@ def read_checked(path: Path, kind: FileKind = "results") -> bytes:
         if read_regular(checksum, "json").split(b" ")[0] != sha256(content).encode():
             if read_regular(path, kind) != content:  # another process has just replaced it
                 return read_checked(path, kind)
-            raise CorruptFileError(
-                path, f"{checksum.name} is of another content; delete that if the change was yours"
-            )
+            reason = f"{checksum.name} is of another content; delete that if the change was yours"
+            raise CorruptFileError(path, reason)
     return content
 
 
@@ -190,9 +189,8 @@ def read_checked_json(path: Path) -> JsonObject:
     try:
         content = read_checked(path, "json")
     except MissingFileError as error:
-        raise InputError(
-            f"run = {path.parent} holds no {path.name}: give the folder of a run."
-        ) from error
+        fault = f"run = {path.parent} holds no {path.name}: give the folder of a run."
+        raise InputError(fault) from error
     try:
         return parse_json(content)
     except ValueError as error:
@@ -210,9 +208,8 @@ def read_results(folder: Path) -> xr.Dataset:
     path = folder / "results.nc"
     if not path.exists():
         inner = next((f", as {file.parent}" for file in sorted(folder.glob("*/results.nc"))), "")
-        raise InputError(
-            f"run = {folder} holds no results.nc: give the folder of a finished run{inner}."
-        )
+        fault = f"run = {folder} holds no results.nc: give the folder of a finished run{inner}."
+        raise InputError(fault)
     return read_dataset(path)
 
 

@@ -32,9 +32,8 @@ def remove_run(folder: Path) -> None:
                     for path in (run / name, run / f"{name}.sha256"):
                         path.unlink(missing_ok=True)
             except OSError as error:
-                raise InputError(
-                    f"out = {run} cannot be removed ({error.strerror}): choose another folder."
-                ) from error
+                fault = f"out = {run} cannot be removed ({error.strerror}): choose another folder."
+                raise InputError(fault) from error
 
 
 def ensure_writable(folder: Path) -> Path:
@@ -44,9 +43,8 @@ def ensure_writable(folder: Path) -> Path:
         with tempfile.TemporaryFile(dir=folder):
             pass
     except OSError as error:
-        raise InputError(
-            f"out = {folder} cannot be written ({error.strerror}): choose a writable folder."
-        ) from error
+        fault = f"out = {folder} cannot be written ({error.strerror}): choose a writable folder."
+        raise InputError(fault) from error
     return folder
 
 

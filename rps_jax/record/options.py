@@ -19,6 +19,7 @@ from rps_jax import errors
 from rps_jax.record import files
 
 HIDDEN, POSITIONAL, FLAG, _BOUNDS = "hidden", "positional", "flag", "bounds"  # metadata of fields
+_MAX_SHOWN = 200  # characters of a value in an error
 _NOUNS: dict[Any, str] = {  # of types, for errors
     str: "a text", Path: "a path", bool: "True or False", float: "a number", int: "a whole number",
     np.ndarray: "an array", Mapping: "a mapping of names", Callable: "a function",
@@ -99,7 +100,8 @@ def _check(name: str, value: Any, kind: Any, metadata: Mapping[str, Any]) -> Non
     elif not any(_is_of(value, inner) for inner in kinds):
         nouns = list(dict.fromkeys(map(_noun, kinds)))
         example = f", as [{value!r}]" if isinstance(value, str) and "several" in nouns[0] else ""
-        raise errors.not_allowed(name, repr(value), f"give {' or '.join(nouns)}{example}")
+        shown = text if len(text := repr(value)) <= _MAX_SHOWN else _noun(type(value))
+        raise errors.not_allowed(name, shown, f"give {' or '.join(nouns)}{example}")
     elif bounds:
         for number in np.ravel(np.asarray(value, object)):
             errors.check_finite(name, number, **bounds)

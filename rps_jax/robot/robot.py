@@ -144,13 +144,17 @@ LIMITS = tuple(name for name in _FIELDS if name not in _NOT_LIMITS)
 jax.tree_util.register_dataclass(Robot, data_fields=_FIELDS, meta_fields=[])
 
 
-def _covered(length: float, width: float) -> tuple[Boards, ...]:
-    """Return the paper's boards that fit on a base of this length and width [m], centred."""
+def _covered(half_length: float, half_width: float, mass: float, **limits: Any) -> Robot:
+    """Return a robot of this outline with the paper's boards, centred on each side."""
     pitch = 2 * HALF_WIDTH / 12  # of the paper's taxels
-    side, front = (int(size / (3 * pitch) + 1e-6) for size in (length, width))
-    return Boards("left", side, pitch), Boards("front", front, pitch), Boards("right", side, pitch)
+    side, front = (int(2 * half / (3 * pitch) + 1e-6) for half in (half_length, half_width))
+    sides = Boards("left", side, pitch), Boards("front", front, pitch), Boards("right", side, pitch)
+    return Robot(half_length, half_width, sides, mass, **limits)
 
 
+_ROLLERS: dict[str, Any] = {"traction": 0.5, "resistance": 0.03}  # of mecanum wheels: our choice
+# Of the MPO-500: four motors of 1.91 N m at most, geared 25:1, on wheels of 254 mm.
+_GEARED_MOTORS = {"force_max": 1504.0, "torque_max": 558.0} | _ROLLERS
 # From data sheets and the makers' robot descriptions, where these give a number. None of these has
 # a skin: they get the paper's boards.
 ROBOTS: dict[str, Robot] = {
@@ -161,38 +165,18 @@ ROBOTS: dict[str, Robot] = {
     "slipping": Robot(slip=0.095, slip_sideways=0.18, slip_yaw=0.42),
     # The paper's: a Robotnik SUMMIT-XL STEEL with a UR16e arm. Robotnik's `summit_xl_common` gives
     # 125 kg (summit_xls_base.urdf.xacro), 2.5 m/s^2 and 3.2 rad/s^2 (base_local_planner_params);
-    # the arm's sheet 33 kg. Traction of the rollers and rolling are our choice.
-    "kairos": Robot(
-        mass=158.0, v_max=3.0, acceleration_max=(2.5, 3.2), traction=0.5, resistance=0.03
-    ),
+    # the arm's sheet 33 kg.
+    "kairos": Robot(mass=158.0, v_max=3.0, acceleration_max=(2.5, 3.2), **_ROLLERS),
     # Clearpath Ridgeback, mecanum wheels: outline and 195 kg, the sum, are those of
     # ridgeback.urdf.xacro, speeds and accelerations of ridgeback_control/config/control.yaml.
-    "ridgeback": Robot(
-        half_length=0.48,
-        half_width=0.3965,
-        boards=_covered(0.96, 0.793),
-        mass=195.0,
-        v_max=1.1,
-        omega_max=2.0,
-        acceleration_max=(2.5, 1.0),
-        traction=0.5,
-        resistance=0.03,
+    "ridgeback": _covered(
+        0.48, 0.3965, 195.0, v_max=1.1, omega_max=2.0, acceleration_max=(2.5, 1.0), **_ROLLERS
     ),
     # Neobotix MPO-500, mecanum wheels; its hardware documentation gives 988 by 662 mm, 0.9 m/s,
-    # 2.4 m/s^2, wheels at 250 and 274 mm from the middle, and of each of four motors 1.91 N m at
-    # most, geared 25:1, on wheels of 254 mm: 1504 N. It gives no mass, which is our choice; the
-    # turn is what keeps the wheels at 2.4 m/s^2.
-    "mpo_500": Robot(
-        half_length=0.494,
-        half_width=0.331,
-        boards=_covered(0.988, 0.662),
-        mass=130.0,
-        v_max=0.9,
-        acceleration_max=(2.4, 6.47),
-        force_max=1504.0,
-        torque_max=558.0,
-        traction=0.5,
-        resistance=0.03,
+    # 2.4 m/s^2, and wheels at 250 and 274 mm from the middle. It gives no mass, which is our
+    # choice; the turn is what keeps the wheels at 2.4 m/s^2.
+    "mpo_500": _covered(
+        0.494, 0.331, 130.0, v_max=0.9, acceleration_max=(2.4, 6.47), **_GEARED_MOTORS
     ),
 }
 

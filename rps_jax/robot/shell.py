@@ -78,10 +78,7 @@ class Shell:
         """Return the shell of a base, or of many bases if the sizes are (n,)."""
         x, y = (float(np.max(half)) for half in (half_length, half_width))
         sides = _lengths(x, y)
-        pitches = [
-            sides[row.side] / row.taxels if row.pitch is None else np.max(row.pitch)
-            for row in boards
-        ]
+        pitches = [sides[x.side] / x.taxels if x.pitch is None else np.max(x.pitch) for x in boards]
         is_default = np.all(np.asarray(half_width) == HALF_WIDTH)
         samples = math.ceil(float(max(pitches)) / _SPACING)
         return cls(half_length, None if is_default else half_width, boards, samples)
@@ -121,12 +118,9 @@ class Shell:
 
     def on_strip(self, s: jax.Array) -> jax.Array:
         """Return points (..., 2) [m] in the robot frame at positions `s` (...) [m] of the strip."""
-        x, y = self.half
-        x = jnp.asarray(x, s.dtype)
-        corners = jnp.cumsum(jnp.stack([0 * x, 2 * x, jnp.full_like(x, 2 * y), 2 * x]))
-        at_x = jnp.interp(s, corners, jnp.stack([-x, x, x, -x]))
-        y = y * np.array([1.0, 1.0, -1.0, -1.0])
-        return jnp.stack([at_x, jnp.interp(s, corners, jnp.asarray(y, s.dtype))], axis=-1)
+        x, y = (jnp.asarray(half, s.dtype) for half in self.half)
+        along = jnp.clip(s, 0, 2 * x) - jnp.clip(s - 2 * (x + y), 0, 2 * x)  # left and right side
+        return jnp.stack([along - x, y - jnp.clip(s - 2 * x, 0, 2 * y)], axis=-1)
 
     def check(self) -> None:
         """Raise InputError for a base without size, or boards that overlap or leave it."""

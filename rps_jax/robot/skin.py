@@ -74,9 +74,8 @@ class IdealSkin(NamedTuple):
     def check(self) -> None:
         """Raise InputError for fields that are no lengths."""
         for name in ("tolerance", "point_length"):
-            errors.check_finite(
-                f"skin {name}", getattr(self, name), at_least=0, at_most=0.1, unit="m"
-            )
+            length = getattr(self, name)
+            errors.check_finite(f"skin {name}", length, at_least=0, at_most=0.1, unit="m")
         _check(self)
 
     def init(self, key: Array) -> SkinState:
@@ -218,8 +217,7 @@ class CapacitiveSkin(NamedTuple):
         active = (state.signal > self.threshold) & state.alive
         middles = jnp.asarray(self.shell.taxels()[:, 0], raw.dtype)
         first, last = _extremes(active, middles)
-        kind = jnp.minimum(jnp.sum(active), LINE)
-        return state, _reading(kind, first, last)
+        return state, _reading(jnp.minimum(jnp.sum(active), LINE), first, last)
 
     def sense(
         self, state: SkinState, footprint: Footprint, period: Scalar
@@ -340,9 +338,8 @@ def _first(excess: jax.Array) -> jax.Array:
     Each is active with the probability sigmoid(excess), independently of the others.
     """
     none_before = -jnp.cumsum(jax.nn.softplus(excess))[:-1]
-    return jax.nn.softmax(
-        jax.nn.log_sigmoid(excess) + jnp.concatenate([jnp.zeros_like(excess[:1]), none_before])
-    )
+    log_active = jax.nn.log_sigmoid(excess)
+    return jax.nn.softmax(log_active + jnp.concatenate([jnp.zeros_like(excess[:1]), none_before]))
 
 
 def _extremes(active: jax.Array, values: jax.Array) -> tuple[jax.Array, jax.Array]:

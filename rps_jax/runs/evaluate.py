@@ -165,10 +165,8 @@ def candidates(law: Any) -> LawParams:
     if isinstance(law, list) or type(law) is tuple:
         return stack(law)
     example = next((p for p in registry.LAWS.values() if type(p) is type(law)), None)
-    is_single = example is not None and all(
-        np.ndim(x) == np.ndim(y)
-        for x, y in zip(jax.tree.leaves(law), jax.tree.leaves(example), strict=True)
-    )
+    leaves = zip(*map(jax.tree.leaves, (law, example)), strict=True)
+    is_single = example is not None and all(np.ndim(x) == np.ndim(y) for x, y in leaves)
     return stack([law]) if is_single else law
 
 
@@ -218,7 +216,6 @@ def score_candidates(
 ) -> tuple[list[CandidateScores], Timing]:
     """Score every candidate in every world of its request, as `outcomes` runs them."""
     results, timing = outcomes(requests, setting, **options)
-    return [
-        CandidateScores(outcome, objective.scores(outcome, request.distances, setting.rules))
-        for request, outcome in zip(requests, results, strict=True)
-    ], timing
+    pairs = zip(requests, results, strict=True)
+    scores = [objective.scores(x, request.distances, setting.rules) for request, x in pairs]
+    return list(map(CandidateScores, results, scores)), timing

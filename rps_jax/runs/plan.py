@@ -99,7 +99,12 @@ class Plan:
         """Return the key of the program that runs a chunk."""
         law, object_index = divmod(chunk // self.max_chunks, len(self.domain.objects))
         params = list(self.laws.values())[law]
-        return object_index, type(params), *map(np.shape, jax.tree.leaves(params))
+        return (
+            object_index,
+            self.domain.task.shape,
+            type(params),
+            *map(np.shape, jax.tree.leaves(params)),
+        )
 
     def configuration(self) -> dict[str, Any]:
         """Return everything that the results depend on, as JSON."""
@@ -163,19 +168,15 @@ def load_plan(folder: Path) -> Plan:
     """
     record = run_folder.read_manifest(folder)
     if "arms" in record or "strategies" in record:  # as 0.2.0 called them
-        raise InputError(
-            f"run = {folder} was written by {provenance.package_version(folder)}: use that version."
-        )
+        version = provenance.package_version(folder)
+        raise InputError(f"run = {folder} was written by {version}: use that version.")
     if "laws" not in record:
         raise InputError(f"run = {folder} does not hold a sweep: give the folder of `rps sweep`.")
     try:
         plan = Plan(
             domain.from_json(dict(record["domain"])),
             record["worlds"],
-            {
-                name: registry.params_from_json(law, folder)
-                for name, law in dict(record["laws"]).items()
-            },
+            {k: registry.params_from_json(x, folder) for k, x in dict(record["laws"]).items()},
             Setting.from_json(record),
             record["part"],
         )

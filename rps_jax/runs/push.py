@@ -13,7 +13,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import jax
 import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike
@@ -38,7 +37,7 @@ from rps_jax.runs.plan import (
 )
 from rps_jax.runs.question import Question, Run, SimulationQuestion, call_of
 from rps_jax.trials import pushes
-from rps_jax.trials.batch import WorldBatch
+from rps_jax.trials.batch import WorldBatch, rows
 from rps_jax.trials.case import Case, TrialOptions
 from rps_jax.trials.progress import Bar
 from rps_jax.trials.pushes import Trajectory
@@ -176,9 +175,8 @@ class TraceQuestion(Question[Trace]):
         fine = dataclasses.replace(fine, snapshots=fine.snapshots._replace(details=details))
         attrs = {"law": json.dumps(registry.params_to_json(fine.params)), "period": str(period)}
         bags.write(Path(self.bag), bag_steps(fine, observations, period), attrs)
-        stride = max(1, round(0.1 / period))
-        coarse = jax.tree.map(lambda x: x[::stride], fine.snapshots)
-        return dataclasses.replace(fine, snapshots=coarse)
+        coarse = slice(None, None, max(1, round(0.1 / period)))
+        return dataclasses.replace(fine, snapshots=rows(fine.snapshots, coarse))
 
     @property
     def horizon(self) -> float:
@@ -328,8 +326,7 @@ class Replay(TraceQuestion):
 
     def answer(self, run: Run) -> Trace:
         plan, name = self._chosen
-        world = build_batch(plan, name, [self.world])
-        trajectory = self.record(world, plan.setting, run)
+        trajectory = self.record(build_batch(plan, name, [self.world]), plan.setting, run)
         scene, title = scene_of(plan, self.world), f"{world_title(plan, self.world)}, {name}"
         named = {"scene": scene, "title": title, "engine": plan.setting.engine}
         attrs = self.attributes() | attributes_of(plan)

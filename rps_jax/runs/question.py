@@ -109,8 +109,7 @@ def call_of(command: Callable[P, Command[T]]) -> Callable[P, T]:
     def call(*args: P.args, **kwargs: P.kwargs) -> T:
         return command(*args, **kwargs)()
 
-    name = snake_case(command.__name__)
-    call.__name__ = call.__qualname__ = name
+    call.__name__ = call.__qualname__ = snake_case(command.__name__)
     call.__doc__ = f"{command.__doc__}\n\nFields of `{command.__name__}` are its arguments.\n"
     return call
 

@@ -155,7 +155,7 @@ class Results:
                 f"{', '.join(sorted(missing))}): use that version."
             )
         for name, values in columns.items():
-            shape = worlds.shape + (self._outcomes[name].shape[2:] if name in known else ())
+            shape = worlds.shape + (self._outcomes[name].shape[2:] if name in self._outcomes else ())
             if values.shape != shape or values.dtype.kind not in "biuf":
                 raise files.CorruptFileError(source, f"{name} is not numbers of {shape}")
         if not np.array_equal(columns["trial"], self.plan.chunks[chunk]):
@@ -175,10 +175,9 @@ class Results:
         drawn = points.drawn_variables(self.plan.domain, self.plan.object_of(worlds), self._drawn)
         for column in (*columns.values(), *drawn.values()):
             column.encoding["_FillValue"] = None  # every number is a result
-        labels = {"law": (list(self.plan.laws), "what decides"), "world": (worlds, WORLD)}
         coordinates = {
-            name: xr.Variable(name, values, {"long_name": meaning})
-            for name, (values, meaning) in labels.items()
+            "law": xr.Variable("law", list(self.plan.laws), {"long_name": "what decides"}),
+            "world": xr.Variable("world", worlds, {"long_name": WORLD}),
         }
         return xr.Dataset(columns, coordinates | drawn | {"pose": POSE})
 

@@ -68,9 +68,8 @@ class PlanQuestion(_StoredPlan, SimulationQuestion[xr.Dataset]):
         return self.plan.num_trials
 
     def answer(self, run: Run) -> xr.Dataset:
-        return run_plan(
-            self.plan, run.folder, label=partial(self.labelled, run=run), **run.batch_options
-        )
+        label = partial(self.labelled, run=run)
+        return run_plan(self.plan, run.folder, label=label, **run.batch_options)
 
     def labelled(self, outcomes: xr.Dataset, run: Run) -> xr.Dataset:
         """Return the outcomes of all trials with the attributes of the results."""
@@ -218,14 +217,8 @@ class Sweep(SweepOptions, SweepQuestion):
     def answer(self, run: Run) -> xr.Dataset:
         """Run the plan; of a single shard, return its own trials (row)."""
         execute = cluster.on_cluster(self.ray, self.ray_device) if self.ray else run_missing
-        return run_plan(
-            self.plan,
-            run.folder,
-            self.parsed_shard,
-            execute=execute,
-            label=partial(self.labelled, run=run),
-            **run.batch_options,
-        )
+        label, inputs = partial(self.labelled, run=run), (self.plan, run.folder, self.parsed_shard)
+        return run_plan(*inputs, execute=execute, label=label, **run.batch_options)
 
     def labelled(self, outcomes: xr.Dataset, run: Run) -> xr.Dataset:
         outcomes = super().labelled(outcomes, run)

@@ -228,10 +228,8 @@ class _Search:
         self.cells = (options.cells,) * 3
         self.axes = [names.index(name) for name in options.axes]
         # Emitters vary ranges and choices, except the object: each object has its own emitters.
-        self.varied = [
-            i for i, x in enumerate(quantities)
-            if x.kind == "range" or (x.kind == "choice" and x.name != "object")
-        ]  # fmt: skip
+        varied = [x.kind in ("range", "choice") and x.name != "object" for x in quantities]
+        self.varied = np.flatnonzero(varied).tolist()
         self.varied_axes = [self.varied.index(axis) for axis in self.axes]
         # [1] of the emitters' steps, by quantity
         self.scale = np.where(np.isin(self.varied, self.axes), _AXIS_SCALE, 1.0)
@@ -243,10 +241,8 @@ class _Search:
         """Try drawn worlds, then generations of emitters until the deadline [s]."""
         options, probe = self.options, self.probe
         set_phase(probe.run.callback, "drawn worlds")
-        drawn, archive = (
-            _grid_archive(self.q, (self.objects, *self.cells), extra_fields=_FIELDS)
-            for _ in range(2)
-        )
+        create = partial(_grid_archive, self.q, (self.objects, *self.cells), extra_fields=_FIELDS)
+        drawn, archive = create(), create()
         for first in range(0, options.drawn, _DRAWN_AT_ONCE):
             count = -(-min(_DRAWN_AT_ONCE, options.drawn - first) // self.objects)
             self._try(self.rng.random((self.objects, count, len(self.varied))), drawn)
@@ -276,11 +272,9 @@ class _Search:
                     near = np.quantile(objective[k], 1 - _NEAR_MISSES)
                     thresholds[k] = 1.0 if enough else min(1.0, near)
                     schedulers[k] = self._scheduler(k, archive, float(thresholds[k]))
-            sums = {
-                "failing": int(failing.sum()),
-                "trials": probe.trials - attributes["drawn_trials"],
-                "simulated": probe.simulated - attributes["drawn_simulated"],
-            }
+            trials = probe.trials - attributes["drawn_trials"]
+            simulated = probe.simulated - attributes["drawn_simulated"]
+            sums = {"failing": int(failing.sum()), "trials": trials, "simulated": simulated}
             history.append(sums)
         return self._labelled(archive, history).assign_attrs(attributes)
 
@@ -341,10 +335,8 @@ class _Search:
         accepted = (elites["which_object"] == k) & (elites["objective"] >= threshold)
         v, objective = elites["solution"][accepted][:, self.varied], elites["objective"][accepted]
         z = stats.norm.ppf(np.clip(v, _EDGE, 1 - _EDGE)) / self.scale
-        grid = _grid_archive(
-            len(self.varied), self.cells, seed=self.seed + k,
-            learning_rate=_LEARNING_RATE, threshold_min=threshold,
-        )  # fmt: skip
+        annealing = {"learning_rate": _LEARNING_RATE, "threshold_min": threshold}
+        grid = _grid_archive(len(self.varied), self.cells, seed=self.seed + k, **annealing)
         grid.add(z, objective, v[:, self.varied_axes])
         order = np.argsort(-objective, kind="stable")
         rules = {"ranker": "imp", "selection_rule": "mu", "restart_rule": "basic"}

@@ -205,15 +205,13 @@ class Ceiling(DomainQuestion[xr.Dataset]):
         plan, slots = self.plan, self.world_indices.size * self.samples
         offsets = np.swapaxes(plans, 0, 1)  # (K, W, J, 3)
         steps = max(1, round(self.hold / plan.setting.physics.control_period))
-        law, hold = jax.tree.map(
-            partial(np.full, offsets.shape[:2]), (RPSParams.tuned(), float(steps))
-        )
+        same = RPSParams.tuned(), float(steps)
+        law, hold = jax.tree.map(partial(np.full, offsets.shape[:2]), same)
         params = GuidedParams(law, offsets, hold)
         seed, domains = plan.setting.seed, [plan.domain]
         request = Candidates(params, domains, seed, worlds, plan.points, per_world=True)
-        (outcome,), _ = outcomes(
-            [request], plan.setting, capacity=lambda _: slots, **run.batch_options
-        )
+        options = run.batch_options
+        (outcome,), _ = outcomes([request], plan.setting, capacity=lambda _: slots, **options)
         return jax.tree.map(lambda x: np.swapaxes(x, 0, 1).reshape(-1, *x.shape[2:]), outcome)
 
     def intro(self, results: xr.Dataset) -> str:

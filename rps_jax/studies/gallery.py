@@ -152,9 +152,8 @@ def _simulate(
     objects = plan.object_of(worlds)
     for k in np.unique(objects):
         rows = worlds[objects == k]
-        trajectories = pushes.record_batch(
-            build_batch(plan, law, rows), plan.setting, interval=0.5, callback=progress
-        )
+        batch = build_batch(plan, law, rows)
+        trajectories = pushes.record_batch(batch, plan.setting, interval=0.5, callback=progress)
         progress.finish(rows.size)
         traces |= dict(zip(rows.tolist(), map(trace_dataset, trajectories), strict=True))
     return traces

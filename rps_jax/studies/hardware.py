@@ -122,18 +122,14 @@ class Hardware(LawQuestion[xr.Dataset]):
     def _shove(self, run: Run) -> xr.Dataset:
         """Return the success after the object is shoved along the front of the robot."""
         shoves = product(HARDWARE_OBJECTS, self.shifts, (1.0, -1.0))
-        cases = [
-            case
-            for name, size, side in shoves
-            for case in self._cases(name, Shift(self.shift_time, (0.0, side * size)))
-        ]
+        shifts = [(name, Shift(self.shift_time, (0.0, side * size))) for name, size, side in shoves]
+        cases = [case for name, shift in shifts for case in self._cases(name, shift)]
         outcome, _ = pushes.run(cases, self.setting, **run.batch_options)
         dims = ("object", "shift", "side", "target")
         # A trial that ends before the shove is not counted.
-        recovered, counted = (
-            values.reshape(len(HARDWARE_OBJECTS), len(self.shifts), 2, -1)
-            for values in (outcome.success, outcome.time > self.shift_time)
-        )
+        shape = len(HARDWARE_OBJECTS), len(self.shifts), 2, len(self.targets)
+        recovered = outcome.success.reshape(shape)
+        counted = outcome.time.reshape(shape) > self.shift_time
         variables = labelled(
             recovered=(dims, recovered, "1", "the target is reached after the shove"),
             counted=(dims, counted, "1", "the trial was under way when the object was shoved"),
@@ -143,13 +139,11 @@ class Hardware(LawQuestion[xr.Dataset]):
 
     def _trace(self, run: Run) -> xr.Dataset:
         """Return the paths of Fig. 7: all objects and targets, at the middle friction."""
-        record = partial(
-            pushes.record_batch, setting=self.setting, interval=0.5, callback=run.callback
-        )
-        batches = [pushes.build(self._cases(name), self.setting) for name in HARDWARE_OBJECTS]
-        by_object = [
-            [trace_dataset(x)[list(_TRACED)] for x in record(worlds)] for worlds in batches
-        ]
+        by_object = []
+        for name in HARDWARE_OBJECTS:
+            batch = pushes.build(self._cases(name), self.setting)
+            trials = pushes.record_batch(batch, self.setting, interval=0.5, callback=run.callback)
+            by_object.append([trace_dataset(x)[list(_TRACED)] for x in trials])
         # NaN after the end of a trial.
         traces = xr.combine_nested(by_object, ["object", "target"], join="outer")
         traces = traces.transpose("object", "target", ...)

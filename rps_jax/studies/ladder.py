@@ -265,9 +265,8 @@ def _comparison(results: xr.Dataset) -> list[Section]:
     picture = Picture("ladder", partial(draw_ladder, results))
     sections = [Section("Information against success", text, (), picture)]
     if REFERENCE in results.law and results.sizes["law"] > 1:
-        title = f"Against {REFERENCE}, world by world"
         rows = tables.against_table(results, REFERENCE)
-        sections.append(Section(title, "", rows))
+        sections.append(Section(f"Against {REFERENCE}, world by world", "", rows))
     return sections
 
 

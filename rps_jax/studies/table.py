@@ -58,10 +58,7 @@ class Table(TrialOptions, MultiLawQuestion[xr.Dataset]):
             errors.check_each_once(name, getattr(self, name))
         sensing = case_options(self, self.setting)
         grid = product(self.chosen.values(), self.objects, self.friction, self.targets)
-        return [
-            Case(name, friction, target, params, **sensing)
-            for params, name, friction, target in grid
-        ]
+        return [Case(name, friction, xy, law, **sensing) for law, name, friction, xy in grid]
 
     def check(self) -> None:
         if not self.cases:
@@ -77,9 +74,7 @@ class Table(TrialOptions, MultiLawQuestion[xr.Dataset]):
     def run_cases(self, run: Run) -> xr.Dataset:
         """Run all cases, and return their outcomes."""
         outcome, _ = pushes.run(self.cases, self.setting, **run.batch_options)
-        objects = [
-            Path(name).stem if files.suffix_of(name) == ".xml" else name for name in self.objects
-        ]
+        objects = [Path(x).stem if files.suffix_of(x) == ".xml" else x for x in self.objects]
         frictions = [label_of(friction) for friction in self.friction]
         return outcome_dataset(outcome, list(self.chosen), objects, frictions, self.targets)
 

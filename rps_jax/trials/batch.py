@@ -82,10 +82,8 @@ class WorldBatch(NamedTuple):
     def split(self, count: int) -> tuple[WorldBatch, WorldBatch | None]:
         """Return the first `count` trials, and the rest if there is one."""
         arrays = self._replace(stage=None)
-        first, rest = (
-            rows(arrays, part)._replace(stage=self.stage)
-            for part in (slice(count), slice(count, None))
-        )
+        parts = slice(count), slice(count, None)
+        first, rest = (rows(arrays, part)._replace(stage=self.stage) for part in parts)
         return first, rest if rest.indices.size else None
 
 
@@ -363,8 +361,7 @@ class _Program:
         inputs, trials = zip(*map(self.shapes, range(len(self.queues))), strict=True)
         masks = tuple(jax.ShapeDtypeStruct((n,), bool, sharding=self.sharding) for n in self.slots)
         stages, rules = jax.eval_shape(lambda: (self.stages, self.setting.rules))
-        arguments = (stages, inputs, trials, masks, masks, rules)
-        leaves, structure = jax.tree.flatten(arguments)
+        leaves, structure = jax.tree.flatten((stages, inputs, trials, masks, masks, rules))
         physics = self.setting.physics
         return _compile_advance(physics, self.law, self.sharding, structure, tuple(leaves))
 

@@ -300,9 +300,8 @@ class PushEnv:
 
     @functools.cached_property
     def _alone(self) -> Domain:
-        return dataclasses.replace(
-            domain.parse_domain(self.domain, self.robot, self.task), objects=(self.object,)
-        )
+        ranges = domain.parse_domain(self.domain, self.robot, self.task)
+        return dataclasses.replace(ranges, objects=(self.object,))
 
     @functools.cached_property
     def _drawn(self) -> Draw:
@@ -340,12 +339,10 @@ class PushEnv:
         for index, states in itertools.groupby(trajectory, lambda s: int(s.info["index"])):
             shown = list(states)
             target = np.asarray(shown[0].info["world"].p_world_target)
+            poses, size = [np.asarray(s.data.qpos) for s in shown], (width, height)
+            view = camera or "oblique"
             images += video.images(
-                self._scene(index),
-                [np.asarray(s.data.qpos) for s in shown],
-                p_world_target=target,
-                size=(width, height),
-                camera=camera or "oblique",
+                self._scene(index), poses, p_world_target=target, size=size, camera=view
             )
         return images
 
@@ -359,9 +356,6 @@ def _obs(current: Trial, measured: Measurement) -> jax.Array:
 
 
 def _metrics(current: Trial, measured: Measurement, progress: jax.Array) -> dict[str, jax.Array]:
-    flags = {
-        "in_contact": measured.reading.in_contact,
-        "success": current.success,
-        "diverged": current.diverged,
-    }
+    flags = {"in_contact": measured.reading.in_contact, "success": current.success}
+    flags |= {"diverged": current.diverged}
     return {"progress": progress} | {k: v.astype(progress.dtype) for k, v in flags.items()}

@@ -42,9 +42,7 @@ except ImportError as error:
 _SEEDS = 2**32
 
 
-def _hold_action(
-    env: PushEnv, steps: int, state: State, action: jax.Array
-) -> tuple[State, jax.Array]:
+def _hold(env: PushEnv, steps: int, state: State, action: jax.Array) -> tuple[State, jax.Array]:
     """Hold an action (3,) for `steps` control steps; return the state and the sum of rewards."""
 
     def step(carry: tuple[State, jax.Array], _: None) -> tuple[tuple[State, jax.Array], None]:
@@ -185,7 +183,7 @@ class GymPushVector(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         self._keys: jax.Array | None = None  # (num_envs,) random streams of the worlds
         self._state: State | None = None
         self._start = jax.jit(jax.vmap(partial(_restart, self.push_env)))
-        self._act = jax.jit(jax.vmap(partial(_hold_action, self.push_env, steps)))
+        self._act = jax.jit(jax.vmap(partial(_hold, self.push_env, steps)))
         self._select = jax.jit(jax.vmap(soft.tree_where))
 
     def start(self, where: np.ndarray | None = None) -> None:
@@ -253,10 +251,8 @@ class GymPushVector(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             return np.ones(self.num_envs, bool)
         where = np.asarray(mask)
         if where.shape != (self.num_envs,) or where.dtype != bool or not where.any():
-            rule = (
-                f"it must be an array of shape ({self.num_envs},) and type bool with a true value"
-            )
-            raise errors.not_allowed("reset_mask", mask, rule)
+            kind = f"an array of shape ({self.num_envs},) and type bool"
+            raise errors.not_allowed("reset_mask", mask, f"it must be {kind} with a true value")
         if self._state is None and not where.all():
             raise errors.not_allowed("reset_mask", mask, "the first reset must be of all worlds")
         return where

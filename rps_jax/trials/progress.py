@@ -169,6 +169,4 @@ def set_phase(callback: ProgressCallback, name: str) -> None:
 
 def is_interactive() -> bool:
     """Return whether the error stream is a terminal, or this is a notebook."""
-    if "ipykernel" in sys.modules:
-        return True
-    return sys.stderr is not None and sys.stderr.isatty()
+    return "ipykernel" in sys.modules or (sys.stderr is not None and sys.stderr.isatty())

@@ -148,9 +148,7 @@ class Cases(NamedTuple):
 
 
 def run(
-    cases: Sequence[Case],
-    setting: Setting = Setting(engine="mjx"),
-    **options: Unpack[BatchOptions],
+    cases: Sequence[Case], setting: Setting = Setting(engine="mjx"), **options: Unpack[BatchOptions]
 ) -> tuple[Outcome, Timing]:
     """Run every case to its end, by `rollout` with its options.
 
@@ -196,9 +194,8 @@ def _record(
     compile_time, segments = time.perf_counter() - start_time, []
     while True:
         trials, snapshots, outcomes = record(trials)
-        done, steps_done, snapshots, outcomes = jax.device_get(
-            (trials.done, trials.steps, snapshots, outcomes)
-        )
+        results = trials.done, trials.steps, snapshots, outcomes
+        done, steps_done, snapshots, outcomes = jax.device_get(results)
         segments.append(snapshots)
         callback(Progress(int(done.sum()), float(steps_done.sum()) * period, compile_time))
         if done.all():

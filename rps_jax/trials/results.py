@@ -1,6 +1,7 @@
 """Labelled data of outcomes: a grid of trials, or one trial over time."""
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -64,23 +65,15 @@ def outcome_dataset(
     targets: Sequence[tuple[float, float]],
 ) -> xr.Dataset:
     """Return outcomes (S * O * F * T, ...), nested in this order, as a dataset with `DIMS`."""
-    shape = (len(laws), len(objects), len(frictions), len(targets))
+    axes = laws, objects, frictions, range(len(targets))
+    coords: dict[str, Any] = {dim: list(x) for dim, x in zip(DIMS, axes, strict=True)}
+    for name, values in zip(("target_x", "target_y"), np.asarray(targets, float).T, strict=True):
+        coords[name] = "target", values, {"units": "m"}
     variables = {}
     for name, values in outcome.columns().items():
-        variables[name] = variable(name, DIMS, values.reshape(shape + values.shape[1:]))
-    position = np.asarray(targets, float)
-    return xr.Dataset(
-        variables,
-        coords={
-            "law": list(laws),
-            "object": list(objects),
-            "friction": list(frictions),
-            "target": np.arange(len(targets)),
-            "target_x": ("target", position[:, 0], {"units": "m"}),
-            "target_y": ("target", position[:, 1], {"units": "m"}),
-            "pose": POSE,
-        },
-    )
+        shape = *map(len, axes), *values.shape[1:]
+        variables[name] = variable(name, DIMS, values.reshape(shape))
+    return xr.Dataset(variables, coords | {"pose": POSE})
 
 
 def labelled(**columns: tuple[str | Sequence[str], ArrayLike, str, str]) -> dict[str, xr.Variable]:
@@ -122,9 +115,8 @@ def trace_dataset(trajectory: Trajectory) -> xr.Dataset:
     for name, value in trajectory.outcome.columns().items():
         variables[f"outcome_{name}"] = variable(name, (), np.asarray(value))
     variables["p_world_contact"] = over_time(trial.p_world_contact(snapshots), "m", "axis")
-    variables["p_world_target"] = xr.Variable(
-        "axis", list(trajectory.p_world_target), {"units": "m"}
-    )
+    target = list(trajectory.p_world_target)
+    variables["p_world_target"] = xr.Variable("axis", target, {"units": "m"})
     for name, points in world.task.lines().items():
         dims = *(f"{name}_{i}" for i in range(points.ndim - 1)), "axis"
         meaning = {"units": "m", "long_name": f"{name} of the task in the world"}

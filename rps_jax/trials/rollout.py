@@ -111,11 +111,9 @@ def outcomes(
 
     timing = rollout(requests, setting, collect, **options)
     whole = Outcome.of_columns(columns)
-    trials = (
-        first + np.arange(math.prod(request.shape)).reshape(request.shape)
-        for first, request in zip(firsts, requests, strict=True)
-    )
-    return [rows(whole, index) for index in trials], timing
+    trials = (np.arange(math.prod(x.shape)).reshape(x.shape) for x in requests)
+    pairs = zip(firsts, trials, strict=True)
+    return [rows(whole, first + index) for first, index in pairs], timing
 
 
 def _first_trials(requests: Sequence[Request]) -> list[int]:

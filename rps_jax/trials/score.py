@@ -96,9 +96,8 @@ class Objective:
         """
         if self.risk == "mean":
             return scores
-        quantile = jnp.quantile(
-            jax.lax.stop_gradient(scores), 1 - self.tail, axis=-1, keepdims=True
-        )
+        held = jax.lax.stop_gradient(scores)
+        quantile = jnp.quantile(held, 1 - self.tail, axis=-1, keepdims=True)
         return jnp.maximum(scores - quantile, 0.0) / self.tail
 
 

@@ -26,8 +26,7 @@ class PhysicsField:
     def __get__(self, instance: Setting | None, owner: type | None = None) -> Physics:
         if instance is None:
             return "default"  # pyright: ignore[reportReturnType]  # of the dataclass's field
-        value = instance.__dict__["physics"]
-        return physics_.parse_physics(value, instance.fidelity)
+        return physics_.parse_physics(instance.__dict__["physics"], instance.fidelity)
 
     def __set__(self, instance: Setting, value: str | Physics) -> None:
         instance.__dict__["physics"] = value
@@ -83,9 +82,7 @@ class Setting:
     @classmethod
     def from_json(cls, record: Mapping[str, Any]) -> Setting:
         """Return the setting of a record with the fields of `to_json`."""
-        values: dict[str, Any] = {
-            name: tuple(value) if isinstance(value, list) else value
-            for name, value in dict(record["physics"]).items()
-        }
+        physics = dict(record["physics"]).items()
+        values: dict[str, Any] = {k: tuple(x) if isinstance(x, list) else x for k, x in physics}
         rules = Rules(**record["rules"])
         return cls(record["engine"], Physics(**values), rules=rules, seed=record["seed"])

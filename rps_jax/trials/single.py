@@ -15,7 +15,7 @@ import numpy as np
 
 from rps_jax import engines, errors
 from rps_jax.control import registry
-from rps_jax.control.base import LawParams
+from rps_jax.control.base import LawParams, named_leaves
 from rps_jax.engines import device, native
 from rps_jax.engines.base import Stage
 from rps_jax.record.options import check_arguments
@@ -120,6 +120,8 @@ def rollout(
     if np.ndim(world.p_world_target) != 1:
         rule = "give one world, and map over several by jax.vmap"
         raise errors.not_allowed("world", f"of shape {np.shape(world.p_world_target)}", rule)
+    _check_scalars(params)
+    engine.check_stage(stage)
     world = soften_skins(world) if smooth else world
     world, params = engine.guard_derivatives((world, params), setting.physics)
     start = trial.start(world, params, loop.law)
@@ -128,14 +130,24 @@ def rollout(
     return jax.tree.map(lambda x: x[:, 0], snapshots)
 
 
+def _check_scalars(params: LawParams) -> None:
+    """Raise InputError for parameters that are no numbers, or arrays where the law has scalars."""
+    presets = (x for x in registry.LAWS.values() if type(x) is type(params))
+    known = named_leaves(next(presets, params))
+    for name, leaf in named_leaves(params).items():
+        if np.shape(leaf) and not np.shape(known.get(name, leaf)):
+            rule = "give one number, and map over several by jax.vmap"
+            raise errors.not_allowed(f"params.{name}", f"of shape {np.shape(leaf)}", rule)
+    if not any(isinstance(x, jax.core.Tracer) for x in jax.tree.leaves(params)):
+        registry.check_params(params)
+
+
 def control_loop(params: LawParams, setting: Setting, *, smooth: bool) -> ControlLoop:
     """Return the control loop of a law, or of its smooth form; or raise InputError."""
     law = registry.law_of(params)
     if smooth and law.temperatures is None:
-        rule = (
-            f"the law of {type(params).__name__} has no smooth form; choose rps or rps_plus, or "
-            "smooth=False, whose derivatives miss all switches of the law"
-        )
+        rule = f"the law of {type(params).__name__} has no smooth form; choose rps or rps_plus, or "
+        rule += "smooth=False, whose derivatives miss all switches of the law"
         raise errors.not_allowed("smooth", smooth, rule)
     law = registry.smooth_law(law) if smooth else law
     return ControlLoop(setting.physics, setting.rules, law)
@@ -144,5 +156,6 @@ def control_loop(params: LawParams, setting: Setting, *, smooth: bool) -> Contro
 def count_steps(horizon: float, setting: Setting) -> int:
     """Return the number of control steps of a horizon [s], or raise InputError."""
     period = setting.physics.control_period
-    errors.check_finite("horizon", horizon, at_least=period, at_most=1e5, unit="s")
+    longest = float(setting.rules.horizon)
+    errors.check_finite("horizon", horizon, at_least=period, at_most=longest, unit="s")
     return round(horizon / period)

@@ -163,7 +163,7 @@ class Outcome(NamedTuple):
     object_pose: Float[Array, "*B 3"]  # [m, m, rad] of the object in the world, at the end
     task: Mapping[str, Array] = MappingProxyType({})  # by name: see `Task.OUTCOMES`
 
-    def columns(self) -> dict[str, Array]:
+    def columns(self) -> dict[str, Any]:
         """Return all outcomes by name."""
         return {name: x for name, x in self._asdict().items() if name != "task"} | dict(self.task)
 
@@ -250,14 +250,13 @@ def observe(
     touched = reading.p_robot_contact, reading.in_contact
     observation = Observation(trial.qpos[:2], trial.qpos[2], *touched, world.p_world_target, period)
     distance = planar.norm(displacement(observation))
-    pose = trial.qpos[JOINTS.base]
-    poses, believed = base.observe_pose(
-        world.odometry, trial.poses, pose, world.key, trial.steps, period
-    )
+    motion = trial.poses, trial.qpos[JOINTS.base], world.key, trial.steps, period
+    poses, believed = base.observe_pose(world.odometry, *motion)
     observation = observation._replace(p_world_robot=believed[:2], yaw=believed[2])
 
     touch = reading.contact_type != NONE
     lost_steps = trial.lost_steps + (~touch & (trial.contact_steps > 0))
+    pose = trial.qpos[JOINTS.base]
     p_world_contact = pose[:2] + planar.rotate(pose[2], reading.p_robot_contact)
     place = Place(
         *(world.p_world_target, p_world_contact, touch, pose, world.skin.shell.half),
@@ -336,7 +335,7 @@ def settle(world: World, previous: Trial, decided: Trial, driven: Driven) -> Tri
 
     A trial that had ended before, as `previous` says, is returned as it was.
     """
-    (qpos, qvel, warmstart, integral), force = driven
+    (qpos, qvel, warmstart, integral), force, *_ = driven
     sane = (
         ~decided.nan_twist
         & jnp.all(jnp.isfinite(qpos))
@@ -373,12 +372,21 @@ def control_step(
 
     For a single world without batch dimension, `mapped` returns its function unchanged.
     """
+    return _solved_step(stage, worlds, params, trials, loop, mapped, None)[0]
+
+
+def _solved_step(
+    stage: Stage, worlds: World, params: LawParams, trials: Trial, loop: ControlLoop,
+    mapped: Callable[..., Any], solutions: Any,
+) -> tuple[tuple[Trial, Snapshot], Any]:  # fmt: skip
+    """Run `control_step` with the solutions of `ControlPeriod`; return also those of `Driven`."""
     decided, twists, snapshots = mapped(decide, (0, 0, 0, None))(worlds, params, trials, loop)
     force = loop.law.senses == "force"
-    period = ControlPeriod(twists, loop.physics, pushing(worlds), force)
+    period = ControlPeriod(twists, loop.physics, pushing(worlds), force, solutions)
     driven = stage.drive(worlds.fields, motion(decided), period)
-    settled = mapped(settle, (0, 0, 0, 0))(worlds, trials, decided, driven)
-    return settled, snapshots
+    result = driven._replace(solutions=None)
+    settled = mapped(settle, (0, 0, 0, 0))(worlds, trials, decided, result)
+    return (settled, snapshots), driven.solutions
 
 
 def unroll(
@@ -392,15 +400,26 @@ def unroll(
 ) -> tuple[Trial, Snapshot]:
     """Run `steps` control steps of a batch; return also snapshots (steps, B, ...).
 
-    In reverse mode it stores the state of each step, some 3 kB. `mapped` is that of
+    In reverse mode it stores the state of each step, some 1 kB. `mapped` is that of
     `control_step`; with `native.mapped`, derivatives are fastest.
     """
 
+    def single(trial: Trial, inputs: Any, solutions: Any) -> tuple[tuple[Trial, Snapshot], Any]:
+        """Run one control step of one world."""
+        world, params, rules = inputs
+        world_loop = dataclasses.replace(loop, rules=rules)
+        step = stage, world, params, trial, world_loop, lambda f, *_: f
+        return _solved_step(*step, solutions)
+
+    if mapped is native.mapped and getattr(stage, "native", False) and native.is_available():
+        rules = jax.tree.map(lambda x: jnp.broadcast_to(x, trials.done.shape), loop.rules)
+        return native.scan(single, trials, (worlds, params, rules), steps)
+
+    # Without a checkpoint, XLA would store all intermediate numbers.
+    @partial(jax.checkpoint, prevent_cse=False)
     def step(trials: Trial, _: None) -> tuple[Trial, Snapshot]:
         return control_step(stage, worlds, params, trials, loop, mapped)
 
-    if not (getattr(stage, "native", False) and native.is_available()):
-        step = jax.checkpoint(step, prevent_cse=False)  # XLA would store all intermediate numbers
     return jax.lax.scan(step, trials, length=steps)
 
 
@@ -481,9 +500,8 @@ def advance(batches: Sequence[Batch], loop: ControlLoop, steps: int) -> tuple[Tr
 
         def step(carry: tuple[int | jax.Array, Trial]) -> tuple[int | jax.Array, Trial]:
             count, trial = carry
-            return count + 1, control_step(
-                stage, world, params, trial, world_loop, lambda f, *_: f
-            )[0]
+            inputs = stage, world, params, trial, world_loop
+            return count + 1, control_step(*inputs, mapped=lambda f, *_: f)[0]
 
         return jax.lax.while_loop(lambda c: (c[0] < steps) & ~c[1].done, step, (0, trial))[1]
 
@@ -525,8 +543,7 @@ def _advance_in_xla(batches: Sequence[Batch], loop: ControlLoop, steps: int) -> 
             return count + unchecked, jax.lax.fori_loop(0, unchecked, step, trials)
         return count + 1, step(0, trials)
 
-    started = tuple(batch[-1] for batch in batches)
-    return jax.lax.while_loop(any_runs, body, (0, started))[1]
+    return jax.lax.while_loop(any_runs, body, (0, tuple(batch[-1] for batch in batches)))[1]
 
 
 @partial(jax.jit, static_argnames=("steps", "stride"), donate_argnames="trials")

@@ -19,8 +19,8 @@ import numpy as np
 import xarray as xr
 
 from rps_jax import engines, errors
-from rps_jax.control import registry
-from rps_jax.control.base import LawParams, named_leaves
+from rps_jax.control import registry, validation
+from rps_jax.control.base import LawParams, Leaf, named_leaves
 from rps_jax.control.registry import LawsLike
 from rps_jax.engines import device, native
 from rps_jax.engines.base import Stage
@@ -34,10 +34,9 @@ from rps_jax.trials.results import WORLD, labelled
 from rps_jax.trials.score import Objective
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.single import control_loop, count_steps
-from rps_jax.trials.trial import ControlLoop, Snapshot, World
+from rps_jax.trials.trial import ControlLoop, Snapshot
 from rps_jax.trials.worlds import drawn_worlds, soften_skins
 from rps_jax.tuning import gradients
-from rps_jax.tuning.descent import TuneGrad, soft_score
 from rps_jax.world import draws, points
 from rps_jax.world.domain import (
     QUANTITIES,
@@ -50,11 +49,12 @@ from rps_jax.world.domain import (
 from rps_jax.world.draws import Draw
 
 Score = Callable[[Snapshot], Any]  # of a trajectory (T, ...) of one world: one number ()
+ScoreLike = Score | Objective
 _STEP = 1e-6  # of differences, relative to a quantity
 _SMALLEST = 0.01  # in its unit, below which the step is not relative
 _NOISE = 1e-12  # relative change of a number of a world that is rounding
 _MAX_BEND = 0.01  # [1] relative difference of one-sided derivatives beyond which there is none
-_VECTORS = ("target", "com")  # x, y [m]
+_VECTORS = {"target": "p_world_target", "com": "solid.p_object_com"}  # [m], leaves of a draw
 _DISCRETE = ("corners", "sides", "feet_number", "object", "seed", "key_0", "key_1", "world")
 
 
@@ -63,14 +63,14 @@ class Coordinate(NamedTuple):
 
     label: str
     unit: str
-    name: str  # of a drawn quantity, or of a leaf of the parameters
-    axis: int = 0  # of a vector of a world
+    name: str  # of a drawn quantity or a vector, or of a leaf of the parameters
+    entry: tuple[int, ...] = ()  # of a vector or a leaf
     is_parameter: bool = False
 
 
 @device.standard_jax()
 def value_and_grad(
-    score: Score | Objective = Objective(),
+    score: ScoreLike = Objective(),
     laws: LawsLike = "rps_tuned",
     domain: DomainLike = "wide",
     worlds: int = 32,
@@ -142,24 +142,30 @@ def value_and_grad(
         rule = "a law without a parameter v_max needs a function of the snapshots"
         raise errors.not_allowed("score", "an Objective", rule)
     cache.use_cache_if_requested()
-    coordinates, index = several[0], np.arange(worlds)
-    value = np.empty((len(chosen), worlds))
-    gradient, bend = (
-        np.empty((*value.shape, len(coordinates))),
-        np.empty((worlds, len(coordinates))),
-    )
-    used, temperature = np.array([coordinate.is_parameter for coordinate in coordinates]), 0.0
+    numbers, index = several[0], np.arange(worlds)
+    value, bend = np.empty((len(chosen), worlds)), np.empty((worlds, len(numbers)))
+    gradient = np.empty((*value.shape, len(numbers)))
+    used, temperature = np.array([x.is_parameter for x in numbers]), 0.0
     for at, drawn in points.draw_by_object(ranges, setting.seed, None, index):
         batch = drawn_worlds(ranges, drawn, setting)
-        staged = soften_skins(batch.worlds) if smooth else batch.worlds
-        skin: Any = staged.skin
-        temperature = float(skin.temperature[0]) if smooth else 0.0
-        slopes, bend[at] = world_slopes(ranges, drawn, setting, coordinates)
-        used |= [any(i in x for x in slopes.values()) for i in range(len(coordinates))]
+        if smooth:
+            batch = batch._replace(worlds=soften_skins(batch.worlds))
+            skin: Any = batch.worlds.skin
+            temperature = float(skin.temperature[0])
+        slopes, bend[at] = world_slopes(ranges, drawn, setting, numbers)
+        used |= list(map(bool, slopes))
+        names = {name for slope in slopes for name in slope}
+        names |= {f"params.{x.name}" for x in numbers if x.is_parameter}
         for i, (params, loop) in enumerate(zip(chosen.values(), loops, strict=True)):
-            value[i, at], gradient[i, at] = _value_and_slopes(
-                *(batch.stage, staged, slopes, params, loop), score, coordinates, steps, setting
-            )
+            inputs = {"world": batch.worlds, "params": batch.with_params(params).params}
+            leaves = {name: x for name, x in named_leaves(inputs).items() if name in names}
+            results = _value_and_slopes(batch.stage, inputs, leaves, loop, score, steps, setting)
+            value[i, at], by_leaf = jax.device_get(results)
+            for k, (x, slope) in enumerate(zip(numbers, slopes, strict=True)):
+                products = [y * by_leaf[name] for name, y in slope.items()]
+                if x.is_parameter:
+                    products = [by_leaf[f"params.{x.name}"][(slice(None), *x.entry)]]
+                gradient[i, at, k] = sum(y.reshape(at.size, -1).sum(axis=1) for y in products)
     gradient = np.where(bend > _MAX_BEND, np.nan, gradient)
     mean = [gradients.estimate(jnp.asarray(x)) for x in gradient]
     dims, mean_dims = ("law", "world", "quantity"), ("law", "quantity")
@@ -172,24 +178,22 @@ def value_and_grad(
         mean=(mean_dims, [x.gradient for x in mean], "1 / unit", "mean over finite derivatives"),
         error=(mean_dims, error, "1 / unit", "standard error of the mean"),
     )
-    kinds = ["parameter" if coordinate.is_parameter else "world" for coordinate in coordinates]
     coords: dict[str, Any] = {
         "law": list(chosen),
         "world": ("world", index, {"long_name": WORLD}),
-        "quantity": [coordinate.label for coordinate in coordinates],
-        "unit": ("quantity", [coordinate.unit for coordinate in coordinates]),
-        "kind": ("quantity", kinds),
+        "quantity": [x.label for x in numbers],
+        "unit": ("quantity", [x.unit for x in numbers]),
+        "kind": ("quantity", ["parameter" if x.is_parameter else "world" for x in numbers]),
         "map_error": ("quantity", bend.max(axis=0), {"units": "1"}),
     }
     coords |= points.drawn_columns(ranges, setting.seed, None, index)
-    notes = " ".join(_notes(ranges, setting.engine, coordinates, used, gradient, bend))
+    notes = " ".join(_notes(ranges, setting.engine, numbers, used, value, gradient, bend))
     if notes:
         warnings.warn(notes, stacklevel=3)
     attrs = provenance.attributes() | {
         "domain": name_or_custom(domain), "seed": setting.seed, "engine": setting.engine,
         "gradient": setting.gradient, "horizon": steps * setting.physics.control_period,
-        "skin_temperature": temperature,
-        "notes": notes,
+        "skin_temperature": temperature, "notes": notes,
     }  # fmt: skip
     return xr.Dataset(variables, coords, attrs)
 
@@ -207,40 +211,32 @@ def coordinates_of(
     """
     names = (wrt,) if isinstance(wrt, str) else tuple(wrt)
     errors.check_each_once("wrt", names)
-    drawn = (*QUANTITIES, *VELOCITY_ERRORS, "com_bearing")
-    parameters = {
-        f"params.{leaf}" if leaf in (*drawn, *_VECTORS) else leaf: (leaf, np.shape(value))
-        for leaf, value in named_leaves(params).items()
-    }
-    coordinates: list[Coordinate] = []
+    drawn, leaves = (*QUANTITIES, *VELOCITY_ERRORS, "com_bearing"), named_leaves(params)
+    known = {f"params.{x}" if x in (*drawn, *_VECTORS) else x: x for x in leaves}
+    numbers: list[Coordinate] = []
     for name in names:
-        if name in parameters:
-            leaf, shape = parameters[name]
-            unit = _unit_of_leaf(params, leaf)
-            for at in np.ndindex(shape):
+        if name in known:
+            leaf = known[name]
+            for at in np.ndindex(np.shape(leaves[leaf])):
                 label = f"{name}[{','.join(map(str, at))}]" if at else name
-                coordinates.append(Coordinate(label, unit, leaf, is_parameter=True))
+                numbers.append(Coordinate(label, _unit_of_leaf(params, leaf), leaf, at, True))
         elif name in _VECTORS:
-            coordinates += [
-                Coordinate(f"{name}_{axis}", "m", name, i) for i, axis in enumerate("xy")
-            ]
+            numbers += [Coordinate(f"{name}_{x}", "m", name, (i,)) for i, x in enumerate("xy")]
         else:
-            is_known = name in QUANTITIES
-            if name in _DISCRETE or (is_known and QUANTITIES[name].jumps):
+            rule, quantity = "", QUANTITIES.get(name)
+            if name in _DISCRETE or (quantity and quantity.jumps):
                 rule = "worlds change in steps with it, so that it has no derivative"
-                raise errors.not_allowed("wrt", name, rule)
-            errors.check_name("name of wrt", name, (*parameters, *_VECTORS, *drawn))
-            if name in domain.idle - {"friction_ground", "friction_robot"}:
+            elif name in domain.idle - {"friction_ground", "friction_robot"}:
                 rule = f"the domain's objects, targets or skin leave no {name} to draw"
-                raise errors.not_allowed("wrt", name, rule)
-            if is_known and getattr(domain, name) is None:
+            elif quantity and getattr(domain, name) is None:
                 rule = f"the domain draws none; append ,{name}=LOW:HIGH to its name"
+            if rule:
                 raise errors.not_allowed("wrt", name, rule)
+            errors.check_name("name of wrt", name, (*known, *_VECTORS, *drawn))
             parts = tuple(VELOCITY_ERRORS) if name == "velocity_error" else (name,)
-            units = {"com_bearing": "rad"}
-            coordinates += [Coordinate(x, units.get(x, unit_of(x)), x) for x in parts]
-    errors.check_each_once("wrt", [coordinate.label for coordinate in coordinates])
-    return tuple(coordinates)
+            numbers += [Coordinate(x, unit_of(x), x) for x in parts]
+    errors.check_each_once("wrt", [x.label for x in numbers])
+    return tuple(numbers)
 
 
 def _unit_of_leaf(params: object, path: str) -> str:
@@ -253,139 +249,131 @@ def _unit_of_leaf(params: object, path: str) -> str:
 
 
 def world_slopes(
-    domain: Domain, drawn: Draw, setting: Setting, coordinates: Sequence[Coordinate]
-) -> tuple[dict[str, dict[int, np.ndarray]], np.ndarray]:
+    domain: Domain, drawn: Draw, setting: Setting, numbers: Sequence[Coordinate]
+) -> tuple[list[dict[str, np.ndarray]], np.ndarray]:
     """Return derivatives of worlds by numbers: central differences on the host, in float64.
 
     Returns:
-      Derivatives (n, ...) of those leaves of the worlds that depend on a number, by the name of
-      the leaf and the index of the number; and relative differences (n, q) [1] of the one-sided
-      derivatives, which bound the relative errors of the central ones.
+      For each number, derivatives (n, ...) of those leaves of the worlds that depend on it, by
+      their names; and relative differences (n, q) [1] of the one-sided derivatives, which bound
+      the relative errors of the central ones.
     """
 
     def leaves(draw: Draw) -> dict[str, Any]:
         worlds = drawn_worlds(domain, draw, setting).worlds._replace(shift=None, key=None)
-        return named_leaves(worlds)
+        return named_leaves({"world": worlds})
 
-    dtype = jnp.result_type(float)
-    slopes: dict[str, dict[int, np.ndarray]] = {}
-    bends = np.zeros((drawn.indices.size, len(coordinates)))
+    def moved(number: Coordinate, step: np.ndarray) -> Draw:
+        if number.name not in _VECTORS:
+            return draws.draw(domain, setting.seed, drawn.indices, {number.name: step})
+        path = _VECTORS[number.name]
+        value = np.array(named_leaves(drawn)[path])
+        value[:, number.entry[0]] += step
+        return registry.replace_leaves(drawn, {path: value})
+
+    count = drawn.indices.size
+    slopes: list[dict[str, np.ndarray]] = [{} for _ in numbers]
+    bends = np.zeros((count, len(numbers)))
     with jax.enable_x64(True):
         middle = leaves(drawn)
-        for i, coordinate in enumerate(coordinates):
-            if coordinate.is_parameter:
+        for i, number in enumerate(numbers):
+            if number.is_parameter:
                 continue
-            value = _value_of(drawn, coordinate)
+            value = drawn.values.get(number.name, np.ones(count))
             step = _STEP * np.maximum(np.abs(value), _SMALLEST)
-            above, below = (
-                leaves(_moved(domain, drawn, setting, coordinate, x)) for x in (step, -step)
-            )
+            above, below = (leaves(moved(number, x)) for x in (step, -step))
             for name, leaf in middle.items():
-                up, at, down = (x.reshape(len(step), -1) for x in (above[name], leaf, below[name]))
+                up, at, down = (x.reshape(count, -1) for x in (above[name], leaf, below[name]))
                 change, bend = up - down, up - 2 * at + down
                 noise = _NOISE * np.abs(at).max(initial=0.0)
                 change[np.abs(change) <= noise] = 0.0
-                if not change.any():
-                    continue
-                slope = change / (2 * step[:, None])
-                slopes.setdefault(name, {})[i] = slope.reshape(leaf.shape).astype(dtype)
-                size = np.maximum(np.abs(change).max(axis=1), noise)
-                bends[:, i] = np.maximum(bends[:, i], np.abs(bend).max(axis=1) / size)
+                if change.any():
+                    slopes[i][name] = (change / (2 * step[:, None])).reshape(leaf.shape)
+                    size = np.maximum(np.abs(change).max(axis=1), noise)
+                    bends[:, i] = np.maximum(bends[:, i], np.abs(bend).max(axis=1) / size)
     return slopes, bends
-
-
-def _value_of(drawn: Draw, coordinate: Coordinate) -> np.ndarray:
-    """Return the values (n,) of a number in drawn worlds; 1 of an angle or an error."""
-    vectors = {"target": drawn.p_world_target, "com": drawn.solid.p_object_com}
-    if coordinate.name in vectors:
-        return vectors[coordinate.name][:, coordinate.axis]
-    return drawn.values.get(coordinate.name, np.ones(drawn.indices.size))
-
-
-def _moved(
-    domain: Domain, drawn: Draw, setting: Setting, coordinate: Coordinate, step: np.ndarray
-) -> Draw:
-    """Return drawn worlds with a number changed by steps (n,)."""
-    if coordinate.name not in _VECTORS:
-        return draws.draw(domain, setting.seed, drawn.indices, {coordinate.name: step})
-    move = np.eye(3)[coordinate.axis] * step[:, None]
-    if coordinate.name == "target":
-        return drawn._replace(p_world_target=drawn.p_world_target + move[:, :2])
-    solid = drawn.solid
-    return drawn._replace(solid=solid._replace(p_object_com=solid.p_object_com + move))
 
 
 # --- the score -------------------------------------------------------------------------------
 
 
-@partial(jax.jit, static_argnums=(5, 6, 7, 8))
+@partial(jax.jit, static_argnums=(3, 4, 5, 6))
 def _value_and_slopes(
     stage: Stage,
-    worlds: World,
-    slopes: Mapping[str, Mapping[int, jax.Array]],
-    params: LawParams,
+    inputs: Any,
+    leaves: Mapping[str, Leaf],
     loop: ControlLoop,
-    score: Score | Objective,
-    coordinates: tuple[Coordinate, ...],
+    score: ScoreLike,
     steps: int,
     setting: Setting,
-) -> tuple[jax.Array, jax.Array]:
-    """Return the scores (n,) of worlds, and their derivatives (n, q) by numbers."""
-    leaves = named_leaves(worlds)
-    names = {coordinate.name: None for coordinate in coordinates if coordinate.is_parameter}
+) -> tuple[jax.Array, dict[str, jax.Array]]:
+    """Return the scores (n,) of worlds and laws, and their derivatives (n, ...) by some leaves."""
 
-    def changed(theta: jax.Array) -> LawParams:
-        values = {}
-        for name in names:
-            value = jnp.asarray(named_leaves(params)[name], theta.dtype)
-            at = [i for i, x in enumerate(coordinates) if x.is_parameter and x.name == name]
-            values[name] = value + theta[np.array(at)].reshape(value.shape)
-        return registry.replace_leaves(params, values)
+    def scores(leaves: Mapping[str, Leaf]) -> jax.Array:
+        moved = registry.replace_leaves(inputs, leaves)
+        worlds, params = moved["world"], moved["params"]
+        running = np.ones(len(worlds.qpos), bool)
+        trials = trial.start_all(worlds, params, running, law=loop.law)
+        _, snapshots = trial.unroll(stage, worlds, params, trials, loop, steps, native.mapped)
+        return jax.vmap(partial(_score, score, setting), (1, 0))(snapshots, params)
 
-    def scores(thetas: jax.Array) -> jax.Array:
-        moved = {name: leaves[name] for name in slopes}
-        for name, by_number in slopes.items():
-            for i, slope in by_number.items():
-                moved[name] += slope * thetas[:, i].reshape(-1, *[1] * (slope.ndim - 1))
-        world: Any = registry.replace_leaves(worlds, moved)  # pyright: ignore[reportArgumentType]
-        candidates = jax.vmap(changed)(thetas)
-        trials = trial.start_all(world, candidates, np.ones(len(thetas), bool), law=loop.law)
-        inputs = stage, world, candidates, trials, loop, steps
-        _, snapshots = trial.unroll(*inputs, native.mapped)
-        return jax.vmap(partial(_score, score, setting), (1, 0))(snapshots, candidates)
-
-    thetas = jnp.zeros((len(worlds.qpos), len(coordinates)), worlds.qpos.dtype)
-    values, pull_back = jax.vjp(scores, thetas)
+    values, pull_back = jax.vjp(scores, leaves)
     return values, pull_back(jnp.ones_like(values))[0]
 
 
-def _score(
-    score: Score | Objective, setting: Setting, snapshots: Snapshot, params: LawParams
-) -> jax.Array:
+def _score(score: ScoreLike, setting: Setting, snapshots: Snapshot, params: LawParams) -> jax.Array:
     """Return the score () of a trajectory (T, ...), or raise InputError if it is no number."""
     if isinstance(score, Objective):
-        return soft_score(snapshots, params, setting, score, TuneGrad.arrive)
+        return soft_score(snapshots, params, setting, score)
     try:
-        value = jnp.asarray(score(snapshots))
+        value = score(snapshots)
     except Exception as error:
-        reason = " ".join(str(error).split())[:300].rstrip(".")
-        raise InputError(f"score raises {type(error).__name__} ({reason}).") from error
-    if value.shape or not jnp.issubdtype(value.dtype, jnp.floating):
+        raise InputError(f"score {validation.fault_of(error)}.") from error
+    is_array = hasattr(value, "dtype") and hasattr(value, "shape")
+    shown = f"{value.dtype}{[*value.shape]}" if is_array else type(value).__name__
+    if shown not in ("float32[]", "float64[]", "float"):
         rule = "of the snapshots (T, ...) of one trial it must return one real number"
-        raise errors.not_allowed("result of score", f"{value.dtype}{[*value.shape]}", rule)
-    return value
+        raise errors.not_allowed("result of score", shown, rule)
+    return jnp.asarray(value)
+
+
+def soft_score(
+    snapshots: Snapshot,
+    params: LawParams,
+    setting: Setting,
+    objective: Objective,
+    arrive: float = 0.005,
+) -> jax.Array:
+    """Return the objective's score () of the snapshots (T, ...) of a softened window.
+
+    The base arrives at a step by a weight: in contact, and nearer than d_success within the
+    temperature `arrive` [m]. Later steps count by the weight of not having arrived. At the end
+    the remaining distance costs the time to drive it at v_max, because no window is long enough to
+    detect a failure.
+    """
+    period = setting.physics.control_period
+    contact, distance = 1.0 * snapshots.reading.in_contact, snapshots.details.distance
+    arrival = contact * jax.nn.sigmoid((params.d_success - distance) / arrive)
+    under_way = jnp.cumprod(1 - arrival)
+    touched = jax.lax.cummax(contact)
+    time = period * jnp.sum(under_way) + under_way[-1] * distance[-1] / params.v_max
+    lost = period * jnp.sum(under_way * touched * (1 - contact))
+    return jnp.asarray(objective.score(1.0, time, lost, 0.0, setting.rules))
 
 
 def _notes(
     domain: Domain,
     engine: str,
-    coordinates: Sequence[Coordinate],
+    numbers: Sequence[Coordinate],
     used: np.ndarray,
+    value: np.ndarray,
     gradient: np.ndarray,
     bend: np.ndarray,
 ) -> Iterator[str]:
-    """Yield sentences on numbers without influence or without derivatives."""
-    is_mass = np.array([x.name == "mass" and not x.is_parameter for x in coordinates])
+    """Yield sentences on numbers without influence, and on what is not finite."""
+    if invalid := np.sum(~np.isfinite(value)):
+        yield f"The score is not finite in {invalid} of {value.size} trials."
+    is_mass = np.array([x.name == "mass" and not x.is_parameter for x in numbers])
     is_mass &= not domain.weakest.driven
     if is_mass.any():
         yield (
@@ -400,8 +388,6 @@ def _notes(
         (used & is_zero & ~is_mass, "Derivatives of zero in every world within the horizon:"),
         (bent, "No derivatives in worlds whose numbers have a kink (see finite):"),
     ):
-        labels = [
-            coordinate.label for coordinate, chosen in zip(coordinates, mask, strict=True) if chosen
-        ]
+        labels = [x.label for x, chosen in zip(numbers, mask, strict=True) if chosen]
         if labels:
             yield f"{sentence} {', '.join(labels)}."

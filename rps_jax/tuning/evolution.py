@@ -55,10 +55,8 @@ class TuneES(Tuning):
 
     def search(self) -> Search:
         """Search by CMA-ES of the package cmaes; `center` is the mean of the candidates."""
-        seed = np.random.SeedSequence((self.setting.seed, 0)).generate_state(1)[0]
-        strategy = cmaes.CMA(
-            self.base, self.spread, population_size=self.population, seed=int(seed)
-        )
+        seed = int(np.random.SeedSequence((self.setting.seed, 0)).generate_state(1)[0])
+        strategy = cmaes.CMA(self.base, self.spread, population_size=self.population, seed=seed)
         while True:
             vectors = np.stack([strategy.ask() for _ in range(self.population)])
             results = yield {"vectors": vectors, "center": strategy.mean.copy()}

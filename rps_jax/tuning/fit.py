@@ -98,7 +98,7 @@ class Fitted:
             ax.axvspan(float(column.prior_low), float(column.prior_high), color="0.88")
             flat = bool(column.undetermined)
             ax.hist(column["sample"], 40, density=True, color="0.6" if flat else "C0")
-            ax.set_title(quantity(name) + (" (undetermined)" if flat else ""), fontsize=8)
+            ax.set_title(quantity(name) + ("\n(undetermined)" if flat else ""), fontsize=8)
             ax.set(yticks=[], xlabel=f"[{column.unit.values}]")
             ax.tick_params(labelsize=7)
         return figure
@@ -261,9 +261,8 @@ class Fit(LawQuestion[Fitted], DomainQuestion[Fitted], LogsQuestion):
         """Minimise the residuals of the replayed windows, and sample the posterior."""
         set_phase(run.callback, "replay")
         seed, names = self.setting.seed, points.names(self.ranges)
-        start = points.points_of(
-            self.ranges, np.arange(self.num_trials() or 0), seed_of(seed, "tune")
-        )
+        index = np.arange(self.num_trials() or 0)
+        start = points.points_of(self.ranges, index, seed_of(seed, "tune"))
         minima = device.standard_jax()(self.replay.minima)(start)
         u, eigenvalues = least_squares.sample(self.replay, *minima, SAMPLES, seed)
         data = summary(self.ranges, u[:, [names.index(x) for x in coordinates(self.ranges)]])
@@ -314,10 +313,7 @@ class Fit(LawQuestion[Fitted], DomainQuestion[Fitted], LogsQuestion):
                 "object, or the domain's ranges of what is named here are too narrow."
             )
         objects = data.probability.to_series().items()
-        pairs = [
-            ["object", "probability"],
-            *([str(name), f"{value:.2f}"] for name, value in objects),
-        ]
+        pairs = [["object", "probability"], *([str(x), f"{share:.2f}"] for x, share in objects)]
         return [
             Section("Quantities", text, table(data), Picture("marginals", results.plot)),
             Section("Objects", "", pairs),

@@ -80,10 +80,8 @@ class Track(NamedTuple):
         """Return the paths of a log (1, T, ...), smooth ones unless its poses are exact."""
         rows, settling = _rows(interval)
         count = int(log.valid[0].sum())
-        pose, twist, measured, felt = (
-            np.zeros(0) if x is None else x[0, :count]
-            for x in (log.pose, log.twist, log.object_pose, log.f_robot)
-        )
+        fields = log.pose, log.twist, log.object_pose, log.f_robot
+        pose, twist, measured, felt = (np.zeros(0) if x is None else x[0, :count] for x in fields)
         touch, starts = log.contact_type[0] > 0, range(0, count - rows, rows - settling)
         first = np.array([i for i in starts if touch[i + settling : i + rows].mean() > 0.5], int)
         if not exact and first.size:
@@ -191,9 +189,8 @@ class Replay(NamedTuple):
         stage, fields = engine.stage(family, *bodies)
         latency = np.zeros(len(moved)) if self.exact else drawn.values["pose_latency"]
         windows = [track.windows(x) for x in latency for track in self.tracks]
-        constants = jax.tree.map(
-            lambda x: np.repeat(x, self.num_windows, axis=0), (fields, drawn.solid.height)
-        )
+        constants = fields, drawn.solid.height
+        constants = jax.tree.map(lambda x: np.repeat(x, self.num_windows, axis=0), constants)
         inputs = (*constants, jax.tree.map(lambda *x: np.concatenate(x), *windows))
         inputs = jax.tree.map(lambda x: x.reshape(len(steps), -1, *x.shape[1:]), inputs)
         middle = jax.tree.map(lambda x: np.float32(x[0]), inputs)

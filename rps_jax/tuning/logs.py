@@ -361,9 +361,8 @@ def statistics(log: Log, interval: float) -> pd.DataFrame:
     put("l_size", _mean(np.abs(contact), touch))
     put("switches", _mean((np.diff(log.contact_type, axis=1) != 0)[..., None], valid[:, 1:]))
     put("first", np.where(touch.any(1), touch.argmax(1), -1) * interval)
-    drive = np.concatenate(
-        [mean_twist, contact[:, :-half, 1:], np.ones_like(mean_twist[..., :1])], -1
-    )
+    constant = np.ones_like(mean_twist[..., :1])
+    drive = np.concatenate([mean_twist, contact[:, :-half, 1:], constant], -1)
     put("slide", _regression(drive, _over(contact, half)[..., 1:] / 0.5, both))
     if log.object_pose is not None:
         pose_world = log.object_pose

@@ -146,9 +146,8 @@ def act(
 ) -> tuple[EnvBatch, jax.Array]:
     """Execute an action (N, 3) in each world; return the batch and the rewards (N,)."""
     bounded = features.clip_action(action)
-    touch_state = jax.vmap(TouchState.mark_decision)(
-        batch.memory.touch_state, batch.states.info["observation"]
-    )
+    inputs = batch.memory.touch_state, batch.states.info["observation"]
+    touch_state = jax.vmap(TouchState.mark_decision)(*inputs)
 
     def step(carry: ActCarry, _: None) -> tuple[ActCarry, None]:
         states, touch_state, reward = carry
@@ -204,10 +203,8 @@ def update(
         batches, key = carry
         key, noise_key, *start_keys = jax.random.split(key, 2 + len(envs))
         weights, count = runner.train.weights, ppo.num_envs
-        inputs = [
-            (*_inputs(env, batch), batch.memory.hidden, batch.first)
-            for env, batch in zip(envs, batches, strict=True)
-        ]
+        pairs = zip(envs, batches, strict=True)
+        inputs = [(*_inputs(env, x), x.memory.hidden, x.first) for env, x in pairs]
         obs, private, previous_hidden, first = _join(inputs)
         hidden, mean = network.apply(weights["actor"], previous_hidden, obs)
         noise = jax.random.normal(noise_key, mean.shape, mean.dtype)

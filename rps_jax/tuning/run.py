@@ -31,14 +31,14 @@ from rps_jax.record.options import option
 from rps_jax.runs import evaluate
 from rps_jax.runs.evaluate import Candidates, CandidateScores
 from rps_jax.runs.question import LawQuestion, Run, count_true, seed_of
-from rps_jax.trials.progress import Bar, Progress
+from rps_jax.trials.progress import Bar, Progress, Timing
 from rps_jax.trials.score import Objective
 from rps_jax.trials.trial import Rules
 from rps_jax.tuning.space import Space, expand_subsets
 from rps_jax.world.domain import Domain, DomainLike, parse_domain
 
 TUNED = "tuned.json"  # file of a run folder: the parameters with the best validation
-UNITS = {"compile": "s", "run": "s", "simulated": "s", "differentiate": "s"}
+UNITS = {"compile": "s", "run": "s", "simulated": "s"}
 # Dimensions of those results of a generation that are arrays.
 DIMS = {
     **dict.fromkeys(("vectors", "gradients"), ("candidate", "parameter")),
@@ -73,8 +73,7 @@ class Tuning(LawQuestion[xr.Dataset]):
 
     law: LawLike = "rps"
     """Law with the initial parameters: a name, as rps, rps_tuned or rps_plus, or a file's class
-    with bounds, as my_law.py:MyParams; changes follow, as rps,K_h=0.3 or rps,tuned.json. Gradients
-    need a law with a smooth form: rps or rps_plus."""
+    with bounds, as my_law.py:MyParams; changes follow, as rps,K_h=0.3 or rps,tuned.json."""
     domain: DomainLike | Sequence[DomainLike] = ("wide",)
     """Domains to tune in: paper, hardware, wide, real, prisms, hostile, or JSON files of ranges;
     changes follow each, as wide,mass=3:10."""
@@ -217,9 +216,7 @@ class Tuning(LawQuestion[xr.Dataset]):
             params, seed = self.space.params(np.stack([self.base, best])), self.setting.seed
             worlds = np.arange(self.validation)
             request = Candidates(params, self.domains, seed_of(seed, "test"), worlds)
-            (scores,), _ = evaluate.score_candidates(
-                [request], self.setting, self.objective, **run.batch_options
-            )
+            (scores,), _ = self._score([request], run)
             attrs = {"units": "1", "long_name": "success in worlds that the search has not met"}
             success = np.asarray(scores.outcome.success, np.int8)
             variables = {"test_success": (("tested", "test_world"), success, attrs)}
@@ -227,14 +224,16 @@ class Tuning(LawQuestion[xr.Dataset]):
 
         return run.checkpoint(f"test-{files.sha256(best.tobytes())[:8]}", compute)
 
+    def _score(self, tried: list[Candidates], run: Run) -> tuple[list[CandidateScores], Timing]:
+        """Run candidates; return their outcomes and scores, and where the time went."""
+        return evaluate.score_candidates(tried, self.setting, self.objective, **run.batch_options)
+
     def _try_proposal(self, proposal: Proposal, generation: int, run: Run) -> xr.Dataset:
         """Try the proposal of a generation, and return its results."""
         times = dict.fromkeys(("simulated", "compile", "run"), 0.0)  # [s]
 
         def score(candidates: list[Candidates]) -> list[CandidateScores]:
-            scores, timing = evaluate.score_candidates(
-                candidates, self.setting, self.objective, **run.batch_options
-            )
+            scores, timing = self._score(candidates, run)
             for name in times:
                 times[name] += getattr(timing, name)
             return scores

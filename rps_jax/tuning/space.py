@@ -63,10 +63,8 @@ class Space:
     def params(self, vector: ArrayLike) -> LawParams:
         """Return the parameters, leaves (...), of vectors (..., p)."""
         vector, bounds = jnp.asarray(vector, float), self._bounds
-        values = {
-            name: jnp.broadcast_to(jnp.asarray(value, vector.dtype), vector.shape[:-1])
-            for name, value in registry.named_leaves(self.base).items()
-        }
+        base, shape = registry.named_leaves(self.base), vector.shape[:-1]
+        values = {k: jnp.broadcast_to(jnp.asarray(x, vector.dtype), shape) for k, x in base.items()}
         for name in sorted(self.names, key=lambda name: bool(bounds[name].relative_to)):
             low, high, log, whole = bounds[name]
             u = jax.nn.sigmoid(vector[..., self.names.index(name)])
@@ -84,10 +82,9 @@ class Space:
         default has changed between versions are included.
         """
         preset = next(p for p in registry.LAWS.values() if type(p) is type(self.base))
-        values, defaults = (
-            {name: float(f"{float(value):.7g}") for name, value in leaves.items()}
-            for leaves in map(registry.named_leaves, (self.params(vector), preset))
-        )
+        both = map(registry.named_leaves, (self.params(vector), preset))
+        rounded = ({k: float(f"{float(x):.7g}") for k, x in leaves.items()} for leaves in both)
+        values, defaults = rounded
         names = (*self.names, *dict(registry.law_of(self.base).earlier))
         return {n: x for n, x in values.items() if n in names or x != defaults[n]}
 

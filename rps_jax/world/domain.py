@@ -20,6 +20,18 @@ from rps_jax.world.scene import FRICTION, Friction
 from rps_jax.world.tasks import Task, TaskLike, parse_task
 from rps_jax.world.tasks.reach import Reach
 
+
+def limit(*declaration: Any) -> Any:
+    """Declare a drawn limit of the robot, which has its own value by default."""
+    return drawn(None, *declaration, "robot")
+
+
+def robot_field(name: str) -> str:
+    """Return the field of the robot that a drawn limit sets, as force_max of robot_force."""
+    field = name.removeprefix("robot_")
+    return field if hasattr(Robot, field) else f"{field}_max"
+
+
 _POSITIVE = 1e-3
 
 
@@ -66,7 +78,7 @@ class Domain:
     # Of each raw reading, as a change of capacitance.
     noise: Range = drawn(Range(0, 0.05), 13, "1", 0, 1, "noise of the skin", "skin")
     gain_spread: Range = drawn(Range(0, 0.1), 14, "1", 0, 1, "spread of the taxels' gains", "skin")
-    dead_share: Range = drawn(Range(0, 0.05), 15, "1", 0, 1, "dead taxels", "skin", "", True)
+    dead_share: Range = drawn(Range(0, 0.05), 15, "1", 0, 1, "dead taxels", "skin", True)
     # None: the skin's default.
     foam: Range | None = drawn(None, 40, "m", 0.002, 0.05, "foam of the skin", "skin")
     time_constant: Range | None = drawn(
@@ -75,36 +87,23 @@ class Domain:
     # The base: errors of its odometry and of the executed twist.
     pose_noise: Range = drawn(Range(0, 0.005), 16, "m", 0, 1, "noise of the position", "base")
     yaw_noise: Range = drawn(Range(0, 0.01), 17, "rad", 0, 1, "noise of the heading", "base")
-    pose_latency: Range = drawn(
-        Range(0, 0.1), 18, "s", 0, 1, "latency of the pose", "base", "", True
-    )
-    command_delay: Range = drawn(
-        Range(0, 0.1), 19, "s", 0, 1, "delay of the command", "base", "", True
-    )
+    pose_latency: Range = drawn(Range(0, 0.1), 18, "s", 0, 1, "latency of the pose", "base", True)
+    command_delay: Range = drawn(Range(0, 0.1), 19, "s", 0, 1, "delay of the command", "base", True)
     # Of each component of the command, constant in a trial and of either sign: columns 20, 21 and
     # 22. The robot's limits bound the wrong command; wheels lose their slip after the limits.
     velocity_error: Range = drawn(Range(-0.03, 0.03), 20, "1", -0.9, 0.9, "", "base")
     # The robot and its drawn limits; None: the robot's own value.
     robot: Robot = Robot()
-    robot_force: Range | None = drawn(
-        None, 35, "N", 1, 1e5, "greatest force of the robot", "robot", "force_max"
-    )
-    robot_traction: Range | None = drawn(
-        None, 36, "1", _POSITIVE, 5, "traction of the robot's wheels", "robot", "traction"
-    )
-    robot_lag: Range | None = drawn(None, 37, "s", 0, 5, "lag of the robot", "robot", "lag")
+    robot_force: Range | None = limit(35, "N", 1, 1e5, "greatest force of the robot")
+    robot_traction: Range | None = limit(36, "1", _POSITIVE, 5, "traction of the robot's wheels")
+    robot_lag: Range | None = limit(37, "s", 0, 5, "lag of the robot")
     # Also of the wheels when turning.
-    robot_acceleration: Range | None = drawn(
-        None, 38, "m/s^2", _POSITIVE, 100, "greatest acceleration of the robot", "robot",
-        "acceleration_max",
-    )  # fmt: skip
-    robot_slip: Range | None = drawn(None, 42, "1", 0, 0.9, "slip of the wheels", "robot", "slip")
-    robot_slip_sideways: Range | None = drawn(
-        None, 47, "1", 0, 0.9, "slip of the wheels sideways", "robot", "slip_sideways"
+    robot_acceleration: Range | None = limit(
+        38, "m/s^2", _POSITIVE, 100, "greatest acceleration of the robot"
     )
-    robot_slip_yaw: Range | None = drawn(
-        None, 48, "1", 0, 0.9, "slip of the wheels when turning", "robot", "slip_yaw"
-    )
+    robot_slip: Range | None = limit(42, "1", 0, 0.9, "slip of the wheels")
+    robot_slip_sideways: Range | None = limit(47, "1", 0, 0.9, "slip of the wheels sideways")
+    robot_slip_yaw: Range | None = limit(48, "1", 0, 0.9, "slip of the wheels when turning")
     # What is asked of the law; the ranges of a path are the task's own.
     task: Task = Reach()
 
@@ -223,19 +222,20 @@ LABELS: dict[str, str] = {
     **VELOCITY_ERRORS,
 }
 
+_UNITS = {"com_bearing": "rad"}  # of numbers that belong to no range
+
 
 def unit_of(name: str) -> str:
-    """Return the unit of a column of a table of worlds."""
-    return QUANTITIES[name].unit if name in QUANTITIES else "1"
+    """Return the unit of a drawn quantity, or of a column of a table of worlds."""
+    return QUANTITIES[name].unit if name in QUANTITIES else _UNITS.get(name, "1")
 
 
 def _constant(value: float) -> Range:
     return Range(value, value)
 
 
-PERFECT: dict[str, Any] = dict.fromkeys(
-    ("noise", "gain_spread", "dead_share", "lateral", "yaw", *quantities_of("base")), _constant(0)
-)
+_ERRORS = ("noise", "gain_spread", "dead_share", "lateral", "yaw", *quantities_of("base"))
+PERFECT: dict[str, Any] = dict.fromkeys(_ERRORS, _constant(0))
 _HARDWARE: dict[str, Any] = PERFECT | {"noise": _constant(0.05), "gain_spread": _constant(0.1)}
 DOMAINS = {
     "paper": Domain(

@@ -16,7 +16,15 @@ from rps_jax.geometry import solid
 from rps_jax.geometry.solid import SIDES, Solid
 from rps_jax.robot.robot import Robot
 from rps_jax.world import scene, tasks
-from rps_jax.world.domain import QUANTITIES, RANDOM, VELOCITY_ERRORS, Domain, quantities_of, unit_of
+from rps_jax.world.domain import (
+    QUANTITIES,
+    RANDOM,
+    VELOCITY_ERRORS,
+    Domain,
+    quantities_of,
+    robot_field,
+    unit_of,
+)
 from rps_jax.world.scene import Friction
 from rps_jax.world.tasks.base import Course, CourseInputs
 
@@ -159,15 +167,12 @@ def _polygons(depth: np.ndarray, breadth: np.ndarray, u: dict[str, np.ndarray]) 
 
 def _robots(robot: Robot, at: dict[str, np.ndarray], count: int) -> Robot:
     """Return the robots (count,) of worlds, with their drawn limits."""
-    limits = {QUANTITIES[name].sets: at[name] for name in quantities_of("robot") if name in at}
+    limits = {robot_field(name): at[name] for name in quantities_of("robot") if name in at}
     if (linear := limits.get("acceleration_max")) is not None:
         limits["acceleration_max"] = np.stack([linear, linear / robot.arm], axis=-1)
 
-    several = {
-        name: np.asarray(values, float)
-        for name in ("v_max", "acceleration_max")
-        if (values := getattr(robot, name)) is not None
-    }
+    bounds = {name: getattr(robot, name) for name in ("v_max", "acceleration_max")}
+    several = {name: np.asarray(x, float) for name, x in bounds.items() if x is not None}
     return replace(scene.repeat_robot(replace(robot, **several), count), **limits)
 
 
@@ -198,7 +203,7 @@ def table(drawn: Draw) -> dict[str, tuple[np.ndarray, str]]:
     for name, quantity in QUANTITIES.items():
         values = derived.get(name, drawn.values.get(name))
         if quantity.owner == "robot":
-            values = getattr(drawn.robot, quantity.sets)
+            values = getattr(drawn.robot, robot_field(name))
         if quantity.label and values is not None:  # the first number of a limit with several
             columns[name] = values.reshape(len(values), -1)[:, 0]
     columns["corners"] = solid.corners(shape)

@@ -207,9 +207,8 @@ def _check_ignored(label: str, path: Path, model: mujoco.MjModel, spec: mujoco.M
     if any(geom.contype or geom.conaffinity for geom in spec.geoms):
         extra.append("a geom that collides by contype and conaffinity")
     for name in vars(type(model.opt)):  # attributes of MjOption
-        if not name.startswith("_") and not np.array_equal(
-            *(getattr(m.opt, name) for m in (model, plain))
-        ):
+        values = [getattr(x.opt, name) for x in (model, plain)]
+        if not name.startswith("_") and not np.array_equal(*values):
             extra.append(f"the option {name}")
     if extra:
         raise InputError(

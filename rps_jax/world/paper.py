@@ -29,13 +29,10 @@ TABLE_II: dict[tuple[str, str, str], int] = {
 # Sec. III-C, on the robot itself.
 HARDWARE_OBJECTS = ("hardware_box", "hardware_cylinder")
 _REACH = 2.1  # [m]
+_ANGLES = [k * math.pi / 4 for k in range(8)]
 HARDWARE_LAYOUTS = {
-    "circle": tuple(
-        (_REACH * math.cos(k * math.pi / 4), _REACH * math.sin(k * math.pi / 4)) for k in range(8)
-    ),
-    "grid": tuple(
-        (x, y) for x in (_REACH, 0, -_REACH) for y in (_REACH, 0, -_REACH) if (x, y) != (0, 0)
-    ),
+    "circle": tuple((_REACH * math.cos(a), _REACH * math.sin(a)) for a in _ANGLES),
+    "grid": tuple((x, y) for x, y in product((_REACH, 0, -_REACH), repeat=2) if x or y),
 }  # both are readings of the paper's "8 different target points at 2.1 m intervals apart"
 HARDWARE_GROUND = (0.2, 0.35, 0.5, 0.65)  # [1] object-ground
 # [1] object-robot: polyurethane foam coated with ink. The box's results tell that its friction is

@@ -58,11 +58,8 @@ def coordinates(domain: Domain) -> tuple[Coordinate, ...]:
 
     Unused ranges and ranges of a single value are no coordinates.
     """
-    labels = [
-        Coordinate(name, "choice", Range(0, count), "1")
-        for name, count in zip(_CHOICES, domain.counts, strict=True)
-        if count > 1
-    ]
+    lists = zip(_CHOICES, domain.counts, strict=True)
+    labels = [Coordinate(name, "choice", Range(0, n), "1") for name, n in lists if n > 1]
     random = set(domain.objects) & set(RANDOM)
     idle = set(domain.idle) | ({"aspect"} if random == {"random_cylinder"} else set())
     if not random or domain.com_offset.high == 0:
@@ -123,14 +120,12 @@ class Points:
     @staticmethod
     def read(folder: Path, digest: str) -> Points:
         """Return the points of a run folder if they have this digest, or raise InputError."""
-        if not (folder / FILE).exists():
+        path, dims = folder / FILE, {"u": ("world", "quantity")}
+        if not path.exists():
             raise InputError(f"run = {folder} lacks its {FILE}: run the same command again.")
-        stored = files.check_columns(
-            files.read_dataset(folder / FILE), folder / FILE, {"u": ("world", "quantity")}, {}
-        )
-        points = Points(stored.u.values)
+        points = Points(files.check_columns(files.read_dataset(path), path, dims, {}).u.values)
         if points.digest != digest:
-            raise files.CorruptFileError(folder / FILE, "its points are not those of the run")
+            raise files.CorruptFileError(path, "its points are not those of the run")
         return points
 
 
@@ -165,10 +160,8 @@ def cases(domain: Domain, points: Points | None, index: Any) -> np.ndarray:
         return np.asarray(index)
     rows = dict(zip(names(domain), points.u[np.asarray(index)].T, strict=True))
     nothing = np.zeros(np.shape(index))
-    choices = [
-        np.floor(rows.get(name, nothing) * count).astype(np.int64)
-        for name, count in zip(_CHOICES, domain.counts, strict=True)
-    ]
+    counts = zip(_CHOICES, domain.counts, strict=True)
+    choices = [np.floor(rows.get(x, nothing) * n).astype(np.int64) for x, n in counts]
     return np.asarray(np.ravel_multi_index(choices, domain.counts))
 
 
@@ -284,10 +277,9 @@ def _labelled(domain: Domain, u: np.ndarray) -> xr.Dataset:
         name: ("quantity", values) for name, values in (columns | {"kind": kinds}).items()
     }
     coords |= {"quantity": quantities, "world": np.arange(len(u))}
-    text = {"units": "1", "long_name": "point of the unit cube"}
-    return xr.Dataset(
-        {"u": (("world", "quantity"), u, text)}, coords, {"domain": json.dumps(asdict(domain))}
-    )
+    words = {"units": "1", "long_name": "point of the unit cube"}
+    data = {"u": (("world", "quantity"), u, words)}
+    return xr.Dataset(data, coords, {"domain": json.dumps(asdict(domain))})
 
 
 def _is_json_of(text: Any, domain: Domain) -> bool:

@@ -40,7 +40,6 @@ class Quantity(NamedTuple):
     high: float
     label: str  # in reports; empty: not reported
     owner: Owner = "object"
-    sets: str = ""  # field of the robot; fields of skin and odometry have the quantity's name
     jumps: bool = False  # whether a world changes in steps with it, so that it has no derivative
 
 

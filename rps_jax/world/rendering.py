@@ -176,9 +176,8 @@ class SceneRenderer:
         data, moving = self.data, self._moving
         rotation = data.geom_xmat[moving].reshape(-1, 3, 3)
         bodies = np.einsum("gij,cgj->cgi", rotation, self._corners) + data.geom_xpos[moving]
-        marker = [*p_world_marker, CONTACT_HEIGHT / 2] + _CORNERS * (
-            CONTACT_HEIGHT / 2 + CONTACT_RADIUS
-        )
+        half = CONTACT_HEIGHT / 2
+        marker = [*p_world_marker, half] + _CORNERS * (half + CONTACT_RADIUS)
         points = np.concatenate([bodies.reshape(-1, 3), marker])
         for i, sun in enumerate(data.light_xpos):
             far = self.model.light_type[i] == self.mujoco.mjtLightType.mjLIGHT_DIRECTIONAL
@@ -295,9 +294,8 @@ def _renderer(model: Any, size: tuple[int, int]) -> Iterator[Any]:
 def check_rendering() -> None:
     """Draw a sphere; raise VideoError if this fails, or the image is black."""
     mujoco = _import_mujoco()
-    model = mujoco.MjModel.from_xml_string(
-        '<mujoco><worldbody><geom size="1"/></worldbody></mujoco>'
-    )
+    xml = '<mujoco><worldbody><geom size="1"/></worldbody></mujoco>'
+    model = mujoco.MjModel.from_xml_string(xml)
     with _renderer(model, (16, 16)) as renderer:
         data = mujoco.MjData(model)
         mujoco.mj_forward(model, data)

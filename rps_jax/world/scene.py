@@ -50,9 +50,8 @@ class Scene(NamedTuple):
     @property
     def footprint(self) -> Footprint:
         """Outline of the object, in JAX's precision."""
-        return Footprint(
-            jnp.asarray(self.solid.vertices, float), jnp.asarray(self.solid.radius, float)
-        )
+        outline = self.solid.vertices, self.solid.radius
+        return Footprint(*(jnp.asarray(x, float) for x in outline))
 
     @property
     def rounded_solid(self) -> Solid:
@@ -134,9 +133,8 @@ def compile_solid(
     if family == "prism":
         distinct = np.any(single.vertices != np.roll(single.vertices, 1, axis=0), axis=1)
         corners, half = single.vertices[distinct], single.height / 2
-        spec.mesh("prism").uservert = np.concatenate(
-            [np.column_stack([corners, np.full(len(corners), z)]) for z in (-half, half)]
-        ).ravel()
+        faces = [np.column_stack([corners, np.full(len(corners), z)]) for z in (-half, half)]
+        spec.mesh("prism").uservert = np.concatenate(faces).ravel()
     if single.feet is not None and family == "cylinder":
         _add_feet(spec)
     if single.feet is not None or family == "prism":
@@ -200,10 +198,14 @@ def _add_feet(spec: mujoco.MjSpec) -> None:
     """Add the feet of a prism to a cylinder; only these touch the ground."""
     default = spec.find_default("ground_object")
     spec.delete(spec.pair("ground_object"))
+    point: dict[str, Any] = {
+        "type": mujoco.mjtGeom.mjGEOM_SPHERE,
+        "size": [1e-6, 0, 0],
+        "mass": 0,
+        "group": 3,
+    }
     for i in range(solid.SIDES):
-        spec.body("object").add_geom(
-            name=f"foot_{i}", type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[1e-6, 0, 0], mass=0, group=3
-        )
+        spec.body("object").add_geom(name=f"foot_{i}", **point)
         pair = {"geomname1": "ground", "geomname2": f"foot_{i}"}
         spec.add_pair(default, name=f"ground_object_{i}", **pair)
 

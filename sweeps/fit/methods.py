@@ -2,8 +2,9 @@
 
     rps sweeps/fit/methods.py
 
-fits the same logs by networks that learn from simulated worlds and by least squares on replayed
-windows, and compares errors, the coverage of 90 % intervals, time and simulated trials.
+fits the same logs by networks that learn from simulated worlds, by least squares on replayed
+windows, and by CMA-ES of the same cost, and compares errors, the coverage of 90 % intervals, time
+and simulated trials.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ from dataclasses import dataclass
 from functools import cached_property, partial
 from typing import ClassVar
 
+import cmaes
 import jax
 import numpy as np
 import xarray as xr
@@ -33,7 +35,9 @@ from sweeps.fit.study import FitStudy, within
 from sweeps.study_base import Rows, Table
 
 KINDS = {"touch, object": ("object_pose",), "touch, object, force": ("object_pose", "f_robot")}
-METHODS = ("neural", "gradient")
+METHODS = ("neural", "gradient", "evolution")
+_POPULATION, _GENERATIONS = 24, 64  # of CMA-ES: about as many seconds as the derivatives
+_SPREAD = 0.2  # standard deviation of its first generation, in units of the cube
 _QUANTITIES = ("friction_robot", "friction_ground", "mass", "ground_force", "size", "aspect",
                "height", "com_offset", "pose_latency")  # fmt: skip
 
@@ -52,7 +56,7 @@ class Methods(FitStudy):
     logs: int = option(200, 2, 10_000, kw_only=True)
     """Number of worlds whose logs are fitted."""
     starts: int = option(48, 6, 1000, kw_only=True)
-    """Number of worlds from which least squares start."""
+    """Number of worlds from which least squares and CMA-ES start."""
 
     @cached_property
     def bank(self) -> fit.Bank:
@@ -62,33 +66,37 @@ class Methods(FitStudy):
 
     def answer(self, run: Run) -> xr.Dataset:
         """Fit the logs by each method and from each kind of log."""
-        start = time.perf_counter()
+        start = time.process_time()
         training = self.bank.worlds(self.worlds, run)
-        simulation = time.perf_counter() - start
+        seconds = time.process_time() - start  # checkpoint: a resumed run simulates less
+        simulation = run.checkpoint("simulation", lambda: xr.Dataset({"simulation": seconds}))
         test = self.bank.worlds(self.logs, run._replace(callback=no_progress), "test")
         networks = [
             run.checkpoint(f"neural-{i}", partial(self._by_networks, kind, training, test, run))
             for i, kind in enumerate(KINDS)
         ]
         tracks = self._tracks()
-        windows = [
-            run.checkpoint(f"gradient-{i}", partial(self._by_windows, kind, tracks, test, run))
-            for i, kind in enumerate(KINDS)
-        ]
-        parts = [xr.concat(x, xr.IndexVariable("kind", list(KINDS))) for x in (networks, windows)]
+        by_method = [networks]
+        for method in METHODS[1:]:
+            compute = partial(self._by_windows, method, tracks, test)
+            by_method.append([
+                run.checkpoint(f"{method}-{i}", partial(compute, kind, run))
+                for i, kind in enumerate(KINDS)
+            ])  # fmt: skip
+        parts = [xr.concat(x, xr.IndexVariable("kind", list(KINDS))) for x in by_method]
         result = xr.concat(parts, xr.IndexVariable("estimator", list(METHODS)))
-        return result.assign(simulation=simulation)
+        return xr.merge([result, simulation])
 
     def _by_networks(
         self, kind: str, training: xr.Dataset, test: xr.Dataset, run: Run
     ) -> xr.Dataset:
         """Return the fits of the networks."""
         set_phase(run.callback, f"learn from {kind}")
-        start, names = time.perf_counter(), fit.statistic_names(training, KINDS[kind])
+        start, names = time.process_time(), fit.statistic_names(training, KINDS[kind])
         networks = self.train(training, names)
         x = test.sel(statistic=names).statistics.values[:, :1]
         samples = [posterior.sample(networks, row, fit.SAMPLES, i) for i, row in enumerate(x)]
-        seconds = (time.perf_counter() - start) / self.logs
+        seconds = (time.process_time() - start) / self.logs
         return self.compare_samples(samples, test).assign(
             seconds=("log", np.full(self.logs, seconds)), windows=("log", np.zeros(self.logs))
         )
@@ -111,28 +119,33 @@ class Methods(FitStudy):
             return list(pool.map(track, range(self.logs)))
 
     def _by_windows(
-        self, kind: str, tracks: Sequence[tuple[Track, float]], test: xr.Dataset, run: Run
-    ) -> xr.Dataset:
+        self, method: str, tracks: Sequence[tuple[Track, float]], test: xr.Dataset,
+        kind: str, run: Run,
+    ) -> xr.Dataset:  # fmt: skip
         """Return the fits of replayed windows; logs with too few windows keep the prior."""
-        set_phase(run.callback, f"replay {kind}")
+        set_phase(run.callback, f"{method}: replay {kind}")
+        minimise = {"gradient": Replay.minima, "evolution": evolved}[method]
         names = points.names(self.ranges)
         columns = [names.index(name) for name in fit.coordinates(self.ranges)]
         starts = points.points_of(self.ranges, np.arange(self.starts), seed_of(0, "tune"))
 
-        def samples(log: int) -> tuple[np.ndarray, float, int]:
-            track, seconds = tracks[log]
+        def samples(log: int) -> tuple[np.ndarray, int]:
+            track = tracks[log][0]
             track = track if "f_robot" in KINDS[kind] else track._replace(force=None)
-            replay, start = Replay(self.ranges, [track], self.setting, False), time.perf_counter()
+            replay = Replay(self.ranges, [track], self.setting, False)
             u = np.random.default_rng(log).random((fit.SAMPLES, len(names)))
             if replay.num_windows >= fit.LEAST_WINDOWS:
-                minima = device.standard_jax()(replay.minima)(starts)
-                u, _ = least_squares.sample(replay, *minima, fit.SAMPLES, log)
-            return u[:, columns], seconds + time.perf_counter() - start, replay.num_windows
+                minima = device.standard_jax()(minimise)(replay, starts)
+                u, r, j = minima
+                u, _ = least_squares.sample(replay, u, r, j, fit.SAMPLES, log)
+            return u[:, columns], replay.num_windows
 
+        start = time.process_time()
         with ThreadPoolExecutor(device.count_processors()) as pool:
-            results, seconds, counts = zip(*pool.map(samples, range(self.logs)), strict=True)
+            results, counts = zip(*pool.map(samples, range(self.logs)), strict=True)
+        seconds = (time.process_time() - start) / self.logs + np.mean([x for _, x in tracks])
         return self.compare_samples(results, test).assign(
-            seconds=("log", np.array(seconds)), windows=("log", np.array(counts, float))
+            seconds=("log", np.full(self.logs, seconds)), windows=("log", np.array(counts, float))
         )
 
     def report_tables(self, results: xr.Dataset) -> Sequence[Table]:
@@ -146,20 +159,62 @@ class Methods(FitStudy):
 methods = call_of(Methods)
 
 
+class _Values(Replay):
+    """Least-squares problem without derivatives."""
+
+    @property
+    def active(self) -> list[int]:
+        """No columns, so that `derivatives` returns the residuals alone."""
+        return []
+
+
+def evolved(replay: Replay, u: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the best point (1, q) of CMA-ES from the best of the points (n, q).
+
+    The cost is that of `Replay.minima`, without derivatives. Also returns the residuals (1, B, C)
+    at this point, and their derivatives (1, B, C, p) for its interval.
+    """
+    values, active = _Values(*replay), replay.active
+    batches = np.resize(u, (-(-len(u) // _POPULATION), _POPULATION, u.shape[1]))
+    costs = [least_squares.cost(values.derivatives(batch)[0]) for batch in batches]
+    best = batches.reshape(-1, u.shape[1])[np.argmin(costs)]
+    least, u = np.min(costs), np.tile(best, (_POPULATION, 1))
+    bounds = np.where(replay.periodic[:, None], [-np.inf, np.inf], [0.0, 1 - 1e-6])
+    strategy = cmaes.CMA(
+        best[active], _SPREAD, bounds=bounds, population_size=_POPULATION, seed=len(batches)
+    )
+    for _ in range(_GENERATIONS):
+        candidates = np.stack([strategy.ask() for _ in range(_POPULATION)])
+        u[:, active] = np.where(replay.periodic, candidates % 1, candidates)
+        costs = least_squares.cost(values.derivatives(u)[0])
+        strategy.tell(list(zip(candidates, costs, strict=True)))
+        if costs.min() < least:
+            best, least = u[costs.argmin()].copy(), costs.min()
+    u = np.tile(best, (least_squares.STARTS, 1))  # as many as `minima` compiles for
+    r, j = replay.derivatives(u)
+    return u[:1], r[:1], j[:1]
+
+
 def method_rows(results: xr.Dataset, study: Methods) -> Rows:
     """Return a header and one row for each kind of log and method."""
-    rows = [["log", "method", "90 % intervals hold the truth", "those of told quantities", "told",
-             "error of told quantities", "seconds a log", "simulated"]]  # fmt: skip
+    rows = [["log", "method", "90 % intervals hold the truth", "those of determined quantities",
+             "determined", "error of determined quantities", "processor seconds a log",
+             "simulated"]]  # fmt: skip
     for kind in map(str, results.kind.values):
         for method in METHODS:
             fits = results.sel(kind=kind, estimator=method)
-            covered, told = within(fits), fits.undetermined == 0
-            shares = covered.mean(), covered.where(told).mean(), told.mean()
+            covered, determined = within(fits), fits.undetermined == 0
+            shares = covered.mean(), covered.where(determined).mean(), determined.mean()
             cells = [f"{100 * float(share):.1f} %" for share in shares]
-            error = f"{100 * float(_error(fits).where(told).median()):.1f} %"
-            seconds, replays = float(fits.seconds.median()), float(fits.windows.mean())
-            count = (study.starts // 6 + 16) * 6 * replays * least_squares.WINDOW
-            trials = f"{count:,.0f} s and derivatives for each log"
+            error = f"{100 * float(_error(fits).where(determined).median()):.1f} %"
+            seconds, windows = float(fits.seconds.median()), float(fits.windows.mean())
+            replays = {
+                "gradient": (study.starts // 6 + 16) * 6,
+                "evolution": study.starts + _POPULATION * _GENERATIONS,
+            }.get(method, 0)
+            trials = f"{replays * windows * least_squares.WINDOW:,.0f} s for each log"
+            if method == "gradient":
+                trials = trials.replace(" s ", " s and derivatives ")
             if method == "neural":
                 trials = f"{study.worlds * study.window:,.0f} s for all logs"
                 seconds += float(results.simulation) / study.logs

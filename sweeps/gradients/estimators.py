@@ -1,10 +1,15 @@
-"""Gradient estimators of this study and of notebook 05 beside those of the package.
+"""Gradient estimators of the studies and of notebook 05, and the scores that they differentiate.
 
 They have the interface of `rps_jax.tuning.gradients`, whose `estimate` averages their samples.
+`ESTIMATORS` has all by name; one more is one entry.
+
+Derivatives of chaotic worlds may be finite and meaningless: then their variance is large. Scores
+that are differentiated must be smooth: use `registry.smooth_law` with a skin with a temperature.
+Derivatives miss all jumps of a score.
 """
 
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, Protocol
 
 import jax
 import jax.numpy as jnp
@@ -12,21 +17,56 @@ import numpy as np
 
 from rps_jax.control import registry
 from rps_jax.control.base import Law, LawParams
+from rps_jax.engines import native
+from rps_jax.engines.base import Stage
 from rps_jax.trials import pushes, trial
 from rps_jax.trials.case import Case
 from rps_jax.trials.setting import Setting
-from rps_jax.trials.trial import ControlLoop, Snapshot
+from rps_jax.trials.trial import ControlLoop, Snapshot, Trial, World
 from rps_jax.tuning import gradients
-from rps_jax.tuning.gradients import (
-    Estimator,
-    Options,
-    Scores,
-    per_world,
-    random_steps,
-    repeat,
-    window,
-)
+from rps_jax.tuning.gradients import Options, Scores, per_world, random_steps, repeat
 from rps_jax.world.physics import Physics
+
+
+class Estimator(Protocol):
+    """Function that returns samples (n, p, ...) of a gradient."""
+
+    def __call__(
+        self,
+        scores: Scores,
+        theta: jax.Array,
+        worlds: Any,
+        key: jax.Array,
+        options: Options = Options(),
+    ) -> jax.Array: ...
+
+
+def exact(
+    scores: Scores,
+    theta: jax.Array,
+    worlds: Any,
+    key: jax.Array | None = None,
+    options: Options = Options(),
+) -> jax.Array:
+    """Return the derivatives in reverse mode; they cost a few evaluations of the scores."""
+    del key, options
+    jacobian = jax.jacrev(lambda thetas: jnp.sum(scores(thetas, worlds), axis=0))
+    return jnp.moveaxis(jacobian(per_world(theta, worlds)), (-2, -1), (0, 1))
+
+
+def clipped(
+    scores: Scores, theta: jax.Array, worlds: Any, key: jax.Array, options: Options = Options()
+) -> jax.Array:
+    """Return the derivatives with a bound on their norms."""
+    return clip(exact(scores, theta, worlds), options.clip)
+
+
+def mixed(
+    scores: Scores, theta: jax.Array, worlds: Any, key: jax.Array, options: Options = Options()
+) -> jax.Array:
+    """Return mixtures of `exact` and `evolution` with the least mean squared error: see `mix`."""
+    first = exact(scores, theta, worlds)
+    return mix(first, gradients.evolution(scores, theta, worlds, key, options))
 
 
 def forward(
@@ -72,18 +112,74 @@ def bundled(
 ) -> jax.Array:
     """Return the derivatives of the smoothed score: means over antithetic random steps."""
     _, thetas, repeated = random_steps(theta, worlds, key, options)
-    samples = gradients.exact(scores, thetas, repeated)
+    samples = exact(scores, thetas, repeated)
     return jnp.mean(samples.reshape(2 * options.pairs, -1, *samples.shape[1:]), axis=0)
 
 
 # All estimators of the study by name.
 ESTIMATORS: dict[str, Estimator] = {
-    **gradients.ESTIMATORS,
+    "exact": exact,
+    "clipped": clipped,
+    "evolution": gradients.evolution,
+    "mixed": mixed,
     "bundled": bundled,
-    "warm": gradients.exact,  # of trials with wider switches of the taxels
+    "warm": exact,  # of trials with wider switches of the taxels
     "forward": forward,
     "differences": differences,
 }
+
+
+def clip(samples: jax.Array, bound: float) -> jax.Array:
+    """Scale samples (n, p, ...) whose norm over p exceeds `bound` times the median norm down to it.
+
+    This biases the mean but keeps a few samples from dominating it. Samples of norm 0 do not count.
+    """
+    scale = jnp.max(jnp.abs(samples), axis=1, keepdims=True)
+    scaled = samples / jnp.where(scale > 0, scale, 1.0)  # whose squares do not overflow
+    size = scale * jnp.sqrt(jnp.sum(scaled**2, axis=1, keepdims=True))
+    # The median of the worlds with a gradient; trials that have ended have none.
+    counted = jnp.where(jnp.isfinite(size) & (size > 0), size, jnp.nan)
+    limit = bound * jnp.nan_to_num(jnp.nanmedian(counted, axis=0))
+    return samples * jnp.minimum(1.0, limit / jnp.where(size == 0, 1.0, size))
+
+
+def mix(first: jax.Array, zeroth: jax.Array) -> jax.Array:
+    """Mix samples (n, p, ...) of derivatives and of slopes for the least mean squared error.
+
+    The error of the derivatives has their measured variance and their measured bias: the distance
+    of the means beyond two standard errors. A derivative that is not finite gets no weight. The
+    variance of the mixed samples lacks that of the weight.
+
+    Reference: Suh et al., "Do differentiable simulators give better policy gradients?", ICML 2022;
+    there the weight keeps the error below a bound.
+    """
+    means = gradients.estimate(first), gradients.estimate(zeroth)
+    noise_1, noise_0 = (jnp.sum(x.variance, axis=0) for x in means)
+    distance = jnp.sum((means[0].gradient - means[1].gradient) ** 2, axis=0)
+    bias = jnp.maximum(distance - 4 * (noise_1 + noise_0), 0.0)
+    share = jnp.nan_to_num(noise_0 / (noise_0 + noise_1 + jnp.nan_to_num(bias)))
+    return jnp.where(jnp.isfinite(first), share * first + (1 - share) * zeroth, zeroth)
+
+
+def window(
+    stage: Stage,  # of an engine with derivatives: see `Engine.check_derivatives`
+    params_of: Callable[[jax.Array], LawParams],  # from theta (p,), differentiable
+    cost: Callable[[Snapshot], jax.Array],  # () or (...) of snapshots (steps, ...) of one trial
+    loop: ControlLoop,  # with the smooth law that the parameters belong to
+    steps: int,
+) -> Scores:
+    """Return scores of windows of trials, of `steps` control steps each.
+
+    The worlds of these scores are batched pairs (World, Trial); a window starts at its trial.
+    """
+
+    def scores(thetas: jax.Array, starts: tuple[World, Trial]) -> jax.Array:
+        worlds, trials = starts
+        params = jax.vmap(params_of)(thetas)
+        _, snapshots = trial.unroll(stage, worlds, params, trials, loop, steps, native.mapped)
+        return jax.vmap(cost, in_axes=1)(snapshots)
+
+    return scores
 
 
 def distances(

@@ -2,7 +2,7 @@
 
 A random change of the poses at the start is propagated by the derivatives of the control steps of
 softened trials. Its norm after some time is the growth. Most variants remove one part of the
-derivative, such as that of the contact point which the law feels, and leave the trial as it is. A
+derivative, such as that of the contact point that the law feels, and do not change the trial. A
 part whose removal ends the growth belongs to the loop that causes it. Two variants have other
 skins: taxels with wider switches, and an ideal skin, which feels the contact without taxels.
 
@@ -54,7 +54,7 @@ SKINS = {f"taxels at {WARM:g}": WARM, "ideal skin": None}
 VARIANTS = (WHOLE, *(f"without {part}" for part in PARTS), *SKINS)
 # Components of a change of the poses: of the base in the world, of the object in the robot's frame.
 COMPONENTS = ("base x, y", "base yaw", "object ahead", "object aside", "object yaw", "object tilt")
-_MANY = 1e3  # [1] growth of a world that counts as exploding
+_EXPLOSION = 1e3  # [1] growth of a world that counts as exploding
 _NEAR = 11  # steps around one for which it is near a switch, or the sharpest is taken
 _BURST = 0.01  # [1] share of the steps with the largest growth
 
@@ -167,7 +167,7 @@ growth = call_of(Growth)
 
 
 def gate(x: Any, gain: jax.Array) -> Any:
-    """Return arrays as they are, with derivatives scaled by a gain ()."""
+    """Return unchanged arrays, with derivatives scaled by a gain ()."""
     return jax.tree.map(lambda a: gain * a + (1 - gain) * jax.lax.stop_gradient(a), x)
 
 
@@ -205,9 +205,9 @@ def _program(study: Growth, name: str, skin: str = "") -> Any:
 def _propagate(program: Any, variant: str) -> xr.Dataset:
     """Return growth, components and switches without a part of the derivative."""
     with jax.enable_x64(True):
-        kept = (variant != f"without {part}" for part in PARTS)
+        gains = (variant != f"without {part}" for part in PARTS)
         run = program(variant) if variant in SKINS else program()
-        growth, components, switch, sharpness = run(Gains(*(jnp.asarray(float(x)) for x in kept)))
+        growth, components, switch, sharpness = run(Gains(*(jnp.asarray(float(x)) for x in gains)))
     return xr.Dataset(
         {
             "growth": (("world", "step"), growth.T),
@@ -254,8 +254,8 @@ def propagate(
             return reading.p_robot_contact[1]
 
         yaw = trial_.qpos[2]
-        aside = jnp.zeros(10).at[3:5].set(jnp.stack([-jnp.sin(yaw), jnp.cos(yaw)]))
-        return jnp.abs(jax.jvp(offset, (trial_.qpos,), (aside,))[1])
+        sideways = jnp.zeros(10).at[3:5].set(jnp.stack([-jnp.sin(yaw), jnp.cos(yaw)]))
+        return jnp.abs(jax.jvp(offset, (trial_.qpos,), (sideways,))[1])
 
     leaves, structure = jax.tree.flatten(start)
     real = [jnp.issubdtype(x.dtype, jnp.floating) for x in leaves]
@@ -343,9 +343,9 @@ def variant_table(results: xr.Dataset) -> Rows:
         for variant in map(str, results.variant.values):
             final = _final(results.sel(object=name, variant=variant))
             quantiles = (10.0**x for x in final.quantile([0.5, 0.95, 1.0]).values)
-            many = int((final > np.log10(_MANY)).sum())
+            count = int((final > np.log10(_EXPLOSION)).sum())
             texts = (f"{x:.1e}" for x in quantiles)
-            rows.append([label_of(name), variant, *texts, f"{many} of {final.size}"])
+            rows.append([label_of(name), variant, *texts, f"{count} of {final.size}"])
     return rows
 
 
@@ -358,7 +358,7 @@ def burst_table(results: xr.Dataset) -> Rows:
         of_object = results.sel(object=name)
         growth = of_object.growth.sel(variant=WHOLE).values
         gain = np.diff(growth, axis=1)
-        explodes = growth[:, -1] > np.log(_MANY)
+        explodes = growth[:, -1] > np.log(_EXPLOSION)
         for label, chosen in (("exploding", explodes), ("others", ~explodes)):
             if not chosen.any():
                 continue

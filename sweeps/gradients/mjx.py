@@ -1,4 +1,4 @@
-"""Exact derivatives of MJX in models of its own, against central differences.
+"""Exact derivatives of MJX in custom models, against central differences.
 
 rps sweeps/gradients/mjx.py
 """
@@ -30,7 +30,7 @@ class MJXGradients(Study[xr.Dataset]):
     finite entries of MJX's forward mode from rest; and the error `reverse` of its reverse mode.
     """
 
-    TITLE: ClassVar[str] = "Exact derivatives of MJX in models of its own"
+    TITLE: ClassVar[str] = "Exact derivatives of MJX in custom models"
     DIMENSION: ClassVar[str] = "case"
     CHOICES: ClassVar = {"models": mjx_upstream.MODELS}
     GROWS: ClassVar[tuple[str, ...]] = ("models",)
@@ -62,11 +62,11 @@ class MJXGradients(Study[xr.Dataset]):
 
     def report_tables(self, results: xr.Dataset) -> Sequence[Table]:
         """Return the errors of each model and cone."""
-        many = f"{results.steps.values[-1]} steps"
+        last = f"{results.steps.values[-1]} steps"
         columns = [
             {"name": "model", "merge": True},
             {"name": "cone"},
-            *({"name": f"error, {name}", "format": "{:.1e}"} for name in ("1 step", many)),
+            *({"name": f"error, {name}", "format": "{:.1e}"} for name in ("1 step", last)),
             {"name": "forward mode of MJX from rest", "format": "{:.0%} finite"},
             {"name": "`jax.grad` of MJX"},
         ]

@@ -57,7 +57,7 @@ def implicit_solve(m, d):
 
 
 def load(name, cone):
-    """Return model, data and a state: the box slides, the humanoid stands in a squat and falls."""
+    """Return model, data and a state: a sliding box, or a humanoid that falls from a squat."""
     model = mujoco.MjModel.from_xml_string(MODELS[name])
     model.opt.cone, model.opt.tolerance = CONES[cone], 1e-15
     model.opt.iterations, model.opt.ls_iterations = 100, 50
@@ -72,7 +72,7 @@ def load(name, cone):
     return mjx.put_model(model), mjx.make_data(model), state
 
 
-def after(step, model, data, x):
+def next_state(step, model, data, x):
     """Return the state (qpos, qvel, ctrl) after one step."""
     q, v, u = jnp.split(x, [model.nq, model.nq + model.nv])
     data = step(model, data.replace(qpos=q, qvel=v, ctrl=u))
@@ -88,7 +88,7 @@ def measure(step, name, cone, counts, sizes=(1e-5, 1e-6, 1e-7)):
     """
     model, data, start = load(name, cone)
     patched, solver.solve = solver.solve, plain_solve
-    plain = partial(after, mjx.step, model, data)
+    plain = partial(next_state, mjx.step, model, data)
     rest = np.where(np.arange(start.size) < model.nq, start, 0.0)
     forward = np.asarray(jax.jit(lambda x: jax.jvp(plain, (x,), (start,))[1])(rest))
     batch = jax.jit(jax.vmap(plain))
@@ -96,7 +96,7 @@ def measure(step, name, cone, counts, sizes=(1e-5, 1e-6, 1e-7)):
     sides = {h: start + h * unit for h in sizes}
     batch(sides[sizes[0]]).block_until_ready()
     solver.solve = patched
-    ours = partial(after, step, model, data)
+    ours = partial(next_state, step, model, data)
     jacobian = jax.jit(lambda x: (jax.jacrev(ours)(x), ours(x)))
     product, x, errors = np.eye(start.size), start, {}
     for i in range(1, max(counts) + 1):
@@ -114,7 +114,7 @@ def failure(name, cone):
     """Return the error of `jax.grad` through `mjx.step` with MJX's solver."""
     model, data, start = load(name, cone)
     try:
-        jax.eval_shape(jax.grad(lambda x: after(mjx.step, model, data, x).sum()), start)
+        jax.eval_shape(jax.grad(lambda x: next_state(mjx.step, model, data, x).sum()), start)
     except ValueError as error:
         return f"{type(error).__name__}: {str(error).partition('.')[0]}"
     return ""
@@ -126,8 +126,8 @@ if __name__ == "__main__":
     solver.solve = implicit_solve
     for name in MODELS:
         for cone in CONES:
-            found, finite = measure(mjx.step, name, cone, (1, 100))
-            words = ", ".join(f"{count} steps {error:.1e}" for count, error in found.items())
+            errors, finite = measure(mjx.step, name, cone, (1, 100))
+            words = ", ".join(f"{count} steps {error:.1e}" for count, error in errors.items())
             print(
                 f"{name}, {cone}: {words}; MJX in forward mode, from rest: {finite:.0%} finite",
                 flush=True,

@@ -72,7 +72,7 @@ def summary(curve: xr.Dataset) -> xr.Dataset:
         x if t <= minutes[-1] * 1.05 and x >= 0 else np.nan
         for t, x in zip(TIMES, best, strict=True)
     ]
-    numbers: Mapping[str, Any] = {
+    scalars: Mapping[str, Any] = {
         "test": curve.attrs.get("test_success", np.nan),
         "level": float(curve.level[-1]),
         "updates": float(curve.sizes["update"]),
@@ -84,7 +84,7 @@ def summary(curve: xr.Dataset) -> xr.Dataset:
             "validation": ("time", best),
             "at": ("check", minutes[known]),
             "success": ("check", validation[known]),
-            **{name: ((), value) for name, value in numbers.items()},
+            **{name: ((), value) for name, value in scalars.items()},
         },
         {"check": np.arange(known.sum())},
     )

@@ -1,8 +1,9 @@
 """Race gradients against evolution: equal wall time and equal simulated time.
 
-Each tuning is a run of `rps tune grad` or `rps tune es` from the paper's parameters, in a folder of
-its own, and is killed after some minutes; a second call continues it, up to these minutes. The
-generation with the best validation within a budget is tested in worlds that no tuning has met.
+Each tuning is a run of `rps tune grad`, `windows.py` or `rps tune es` from the paper's parameters,
+in a separate folder, and is killed after some minutes; a second call continues it, up to these
+minutes. The generation with the best validation within a budget is tested in worlds that no tuning
+has met.
 
     rps sweeps/gradients/race.py --lanes 2 --minutes 5
 
@@ -40,16 +41,14 @@ from sweeps.study_base import Rows, Study, Table, part_name
 
 COUNTS = {6: "K_h K_v L beta l_cr d_th", 13: "full"}  # tuned parameters by their number
 _COMMON = "--horizon 150 --validation 256"
-_DESCENT = f"rps tune grad {_COMMON} --starts 1 --worlds 512"
 METHODS = {  # commands that are compared
-    "gradient": f"{_DESCENT} --steps 40 --learning-rate 0.1",
-    "slopes": f"{_DESCENT} --estimator evolution --steps 25 --learning-rate 0.2",
+    "slopes": f"rps tune grad {_COMMON}",
+    "windows": f"rps sweeps/gradients/windows.py {_COMMON} --worlds 512",
     "evolution": f"rps tune es {_COMMON} --population 16 --worlds 64 --generations 1000",
 }
 QUICK_SIZES = (
     " --objects random_cylinder --engine quasistatic --horizon 20 --validation 4 --worlds 4"
 )
-_CLOCKS = ("run", "differentiate")  # columns of a tuning's log that are wall time [s]
 BUDGETS = ("wall", "simulated")
 
 
@@ -64,11 +63,12 @@ class Race(Study[xr.Dataset], SimulationQuestion[xr.Dataset]):
     TITLE: ClassVar[str] = "Gradients against evolution"
     CHOICES: ClassVar = {"methods": METHODS}
     QUICK: ClassVar[Mapping[str, Any]] = {"worlds": 4, "counts": (6,), "seeds": (1,)}
+    IGNORED_FIELDS: ClassVar[tuple[str, ...]] = ("minutes", "lanes", "gpus")
     DIMENSION: ClassVar[str] = "tuning"
     REPORTS_TIMES: ClassVar[bool] = True
 
-    methods: tuple[str, ...] = ("gradient", "evolution")
-    """gradient (derivatives of windows), slopes (antithetic steps in whole trials) or evolution."""
+    methods: tuple[str, ...] = ("slopes", "evolution")
+    """slopes (antithetic steps in whole trials), windows (derivatives of windows) or evolution."""
     counts: tuple[int, ...] = tuple(COUNTS)
     """Numbers of tuned parameters, 6 or 13."""
     seeds: tuple[int, ...] = (1, 2, 3)
@@ -95,9 +95,9 @@ class Race(Study[xr.Dataset], SimulationQuestion[xr.Dataset]):
             errors.check_name("count", str(count), [str(x) for x in COUNTS])
 
     def configuration(self) -> dict[str, Any]:
-        """Return everything that the answer depends on; the commands stand for the tunings."""
-        fields = {k: v for k, v in super().configuration().items() if k not in ("lanes", "gpus")}
-        return fields | {"commands": {name: METHODS[name] for name in self.methods}}
+        """Return all inputs of the answer, with the commands of the tunings."""
+        commands = {name: METHODS[name] for name in self.methods}
+        return super().configuration() | {"commands": commands}
 
     def tunings(self) -> dict[tuple[str, int, int], str]:
         """Return the commands of the tunings by method, count and seed."""
@@ -181,8 +181,7 @@ race = call_of(Race)
 
 def spent(curve: pd.DataFrame, budget: str) -> pd.Series:
     """Return what each generation of a log has used of a budget, with all before it [s]."""
-    clocks = [name for name in _CLOCKS if name in curve] if budget == "wall" else ["simulated"]
-    return curve[clocks].sum(axis=1).cumsum()
+    return pd.Series(curve["run" if budget == "wall" else "simulated"]).cumsum()
 
 
 def best_within(curve: pd.DataFrame, budget: str, amount: float) -> pd.Series:
@@ -195,7 +194,8 @@ def law_of(row: pd.Series) -> RPSParams:
     """Return the parameters of a generation."""
     names = [name for name in row.index if name.startswith("params.")]
     changes = {name.removeprefix("params."): float(np.asarray(row[name])) for name in names}
-    return registry.replace_leaves(RPSParams.paper(), changes)
+    params = registry.replace_leaves(RPSParams.paper(), changes)
+    return params._replace(l_mr=min(params.l_mr, params.l_cr))  # as in the tuning: see `Space`
 
 
 def table(results: xr.Dataset) -> Rows:

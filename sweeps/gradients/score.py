@@ -1,6 +1,6 @@
 """Compare scores of windows: which one has the gradient of whole trials?
 
-`rps tune grad` differentiates the score of a window of a softened trial. Here its gradients are
+`windows.py` differentiates the score of a window of a softened trial. Here its gradients are
 compared, for several lengths of the window and temperatures, with the gradient of the objective of
 whole trials under the original law, by central differences in other worlds.
 
@@ -26,8 +26,9 @@ from rps_jax.runs.question import Run, SimulationQuestion, call_of, seed_of
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import Rules
 from rps_jax.tuning import descent
-from rps_jax.tuning.descent import TuneGrad
 from rps_jax.tuning.gradients import Estimate, estimate
+from sweeps.gradients import critic
+from sweeps.gradients.windows import WindowTuning, window_gradients
 from sweeps.study_base import QuickStudy, Rows, Table
 
 _DRAWS = 4000  # of the errors of both gradients
@@ -44,6 +45,7 @@ class ScoreStudy(QuickStudy[xr.Dataset], SimulationQuestion[xr.Dataset]):
     TITLE: ClassVar[str] = "Scores of windows against whole trials"
     QUICK: ClassVar[Mapping[str, Any]] = {
         "windows": (2.0,),
+        "critics": (2.0,),
         "taxels": (0.03,),
         "worlds": 4,
         "truth": 8,
@@ -54,6 +56,8 @@ class ScoreStudy(QuickStudy[xr.Dataset], SimulationQuestion[xr.Dataset]):
 
     windows: tuple[float, ...] = option((2.0, 8.0, 30.0), 0.1, 300, unit="s")
     """Lengths of windows [s]."""
+    critics: tuple[float, ...] = option((8.0,), 0.1, 300, unit="s")
+    """Lengths of windows with a critic at their ends [s]."""
     arrivals: tuple[float, ...] = option((0.005,), above=0, unit="m")
     """Temperatures at which a softened trial arrives [m]."""
     taxels: tuple[float, ...] = option((0.03, 0.1), above=0, at_most=1)
@@ -71,10 +75,15 @@ class ScoreStudy(QuickStudy[xr.Dataset], SimulationQuestion[xr.Dataset]):
     setting: Setting = field(default=Setting(rules=Rules(horizon=150.0)), kw_only=True)
 
     def tuning(
-        self, estimator: str, window: float = 8.0, arrive: float = 0.005, taxels: float = 0.03
-    ) -> TuneGrad:
+        self,
+        estimator: str,
+        window: float = 8.0,
+        arrive: float = 0.005,
+        taxels: float = 0.03,
+        within: float = 100.0,
+    ) -> WindowTuning:
         """Return the tuning whose gradient is estimated."""
-        return TuneGrad(
+        return WindowTuning(
             "rps",
             tuned=self.tuned,
             worlds=self.worlds,
@@ -82,6 +91,7 @@ class ScoreStudy(QuickStudy[xr.Dataset], SimulationQuestion[xr.Dataset]):
             window=window,
             arrive=arrive,
             taxels=taxels,
+            within=within,
             setting=self.setting,
         )
 
@@ -99,6 +109,11 @@ class ScoreStudy(QuickStudy[xr.Dataset], SimulationQuestion[xr.Dataset]):
             label = f"{name}, window {window:g} s, arrival {1000 * arrive:g} mm, taxels {taxels:g}"
             tuning = self.tuning(name, window, arrive, taxels)
             parts[label] = partial(self._window, tuning)
+        horizon = float(self.setting.rules.horizon)
+        for window, taxels in itertools.product(self.critics, self.taxels):
+            tuning = self.tuning("clipped", window, taxels=taxels, within=horizon)
+            label = f"clipped, window {window:g} s, critic, taxels {taxels:g}"
+            parts[label] = partial(self._critic, tuning)
         return parts
 
     DIMENSION: ClassVar[str] = "score"
@@ -156,18 +171,29 @@ class ScoreStudy(QuickStudy[xr.Dataset], SimulationQuestion[xr.Dataset]):
         gradient = descent.evolution_gradients(thetas, tuning, 0, score)
         return self._row(gradient, simulated, 0)
 
-    def _window(self, tuning: TuneGrad) -> xr.Dataset:
+    def _window(self, tuning: WindowTuning) -> xr.Dataset:
         """Return the gradient of windows."""
-        gradient, cost, _ = descent.window_gradients(jnp.asarray(tuning.base)[None], tuning, 0)
+        gradient, cost, _ = window_gradients(jnp.asarray(tuning.base)[None], tuning, 0)
         return self._row(gradient, cost, 0)
 
-    def _row(self, x: Estimate, cost: float, index: int | None = None) -> xr.Dataset:
-        """Return a gradient (p,), or that of a start, with its standard error and its cost."""
+    def _critic(self, tuning: WindowTuning) -> xr.Dataset:
+        """Return the gradient of windows with a critic."""
+        gradient, cost, explained = critic.critic_gradient(tuning)
+        return self._row(gradient, cost, explained=explained)
+
+    def _row(
+        self, x: Estimate, cost: float, index: int | None = None, explained: float = np.nan
+    ) -> xr.Dataset:
+        """Return a gradient (p,), or that of a start, with its standard error and its cost.
+
+        `explained` is the share of the variance of remaining scores that a critic explains [1].
+        """
         values = (np.asarray(x.gradient, float), np.sqrt(np.asarray(x.variance, float)))
         gradient, error = values if index is None else (value[index] for value in values)
         names = list(self.tuning("evolution").space.names)
         variables = {"gradient": ("parameter", gradient), "error": ("parameter", error)}
-        return xr.Dataset(variables | {"cost": ((), cost, {"units": "s"})}, {"parameter": names})
+        variables |= {"cost": ((), cost, {"units": "s"}), "explained": ((), explained)}
+        return xr.Dataset(variables, {"parameter": names})
 
 
 score_study = call_of(ScoreStudy)
@@ -181,11 +207,14 @@ def _cosine(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 def table(results: xr.Dataset) -> Rows:
     """Return a header and a row per score."""
-    rows = [["score", "cosine to whole trials", "error, relative", "simulated time"]]
+    head = ["score", "cosine to whole trials", "error, relative", "critic explains"]
+    rows = [[*head, "simulated time"]]
     for label in map(str, results.score.values):
         row = results.sel(score=label)
         size = max(np.linalg.norm(row.gradient), np.finfo(float).tiny)
         error = np.linalg.norm(row.error) / size
         cosine = f"{float(row.cosine):.2f} [{float(row.low):.2f}, {float(row.high):.2f}]"
-        rows.append([label, cosine, f"{error:.2f}", f"{float(row.cost):,.0f} s"])
+        explained = float(row.explained)
+        share = "" if np.isnan(explained) else f"{100 * explained:.0f} %"
+        rows.append([label, cosine, f"{error:.2f}", share, f"{float(row.cost):,.0f} s"])
     return rows

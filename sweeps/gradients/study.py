@@ -36,7 +36,6 @@ from rps_jax.trials.progress import Progress, set_phase
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import World
 from rps_jax.trials.worlds import drawn_worlds, soften_skins
-from rps_jax.tuning import gradients as gradients_
 from rps_jax.tuning.gradients import Options, Scores, estimate
 from rps_jax.tuning.space import Space, expand_subsets
 from rps_jax.world import domain as domains
@@ -49,7 +48,7 @@ from sweeps.study_base import QuickStudy, Rows, Table, part_name
 TRUTH = "truth"
 HORIZONS = (0.5, 2.0, 8.0, 30.0)  # [s]
 ESTIMATORS = ("exact", "warm", "clipped", "bundled", "evolution", "mixed")
-SINGLE = ("exact", "warm", "bundled", "evolution")  # that have samples of their own
+SINGLE = ("exact", "warm", "bundled", "evolution")  # estimators with separate samples
 WARM = 0.1  # [1] temperature of the taxels for `warm`
 # Estimators that are computed from the samples of others.
 _INPUTS = {"clipped": ("exact",), "mixed": ("exact", "evolution")}
@@ -313,9 +312,9 @@ def _compared(
     def compared(selected: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
         samples = {name: array[selected[0]] for name, array in measured.items()}
         if "clipped" in names:
-            samples["clipped"] = gradients_.clip(samples["exact"], clip)
+            samples["clipped"] = estimators.clip(samples["exact"], clip)
         if "mixed" in names:
-            samples["mixed"] = gradients_.mix(samples["exact"], samples["evolution"])
+            samples["mixed"] = estimators.mix(samples["exact"], samples["evolution"])
         target = estimate(true[selected[1]]).gradient
         stacked = jnp.stack([estimate(samples[name]).gradient for name in names])
         size = jnp.sqrt(jnp.sum(target**2, axis=0))

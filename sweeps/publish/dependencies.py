@@ -46,7 +46,7 @@ PURPOSE = {
     "imageio-ffmpeg": "an ffmpeg for films",
     "pillow": "labels in films; matplotlib needs it too",
     "tqdm": "progress bars",
-    "optax": "the optimisers of `rps tune grad`",
+    "optax": "the optimisers of networks",
     "cmaes": "the evolution of `rps tune es`, in NumPy",
     "filelock": "one process at a time in a run folder",
     "tyro": "the command line, from typed options",

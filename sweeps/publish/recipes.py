@@ -276,13 +276,13 @@ RECIPES: dict[str, Recipe] = {
     "gradients_growth": recipe(f"rps sweeps/gradients/growth.py --worlds 48 {_MACHINE}", cores=10),
     "gradients_bursts": recipe(f"rps sweeps/gradients/growth.py --worlds 48 {_MACHINE}", cores=10),
     "gradients_score": recipe(
-        "rps sweeps/gradients/score.py --tuned K_h K_v L beta l_cr d_th --worlds 128 --truth 192 "
-        f"--windows 2 8 30 --taxels 0.03 --fidelity fast {_MACHINE}",
+        "rps sweeps/gradients/score.py --tuned K_h K_v L beta l_cr d_th --worlds 256 "
+        f"--truth 1024 --delta 0.3 --windows 2 8 30 --taxels 0.03 --fidelity fast {_MACHINE}",
         cores=12,
     ),
     "gradients_race": recipe(
-        f"rps sweeps/gradients/race.py --counts 13 --lanes 6 --gpus 1 --minutes 6 --wall 180 "
-        f"{_MACHINE}",
+        "rps sweeps/gradients/race.py --lanes 12 --gpus 1 --minutes 4.75 --wall 210 "
+        f"--simulated 2.4e6 {_MACHINE}",
         gpu=8,
     ),
     "gradients_network": recipe(

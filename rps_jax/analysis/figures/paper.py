@@ -38,9 +38,8 @@ def profile(params: RPSParams) -> Figure:
     figure, ax = panel((5.5, 3.2), "contact offset $l$ [m]", "adaptive rate $a_r$ [1]")
     ax.plot(l, a_r, color="C0")
     for side in (-1, 1):
-        ax.axvspan(
-            side * float(params.l_cr), side * shell.HALF_WIDTH, color=SHADES["realigning"], lw=0
-        )
+        critical = side * float(params.l_cr), side * shell.HALF_WIDTH
+        ax.axvspan(*critical, color=SHADES["realigning"], lw=0)
         ax.axvline(side * float(params.beta), color="0.6", lw=0.7, ls="--")
     ax.set_title("Eq. 5; dashed: $\\pm\\beta$; shaded: critical region", fontsize=9)
     return figure
@@ -90,10 +89,8 @@ def one_trial(trace: xr.Dataset, title: str) -> Figure:
     marks = [patches.Patch(color=colour, label=name) for name, colour in bands]
     _legend_above(kind, handles=marks)
     result = "reached" if trace.outcome_success else "not reached"
-    x, y = trace.p_world_target.values
-    figure.suptitle(
-        f"{title}, target ({x:.3g}, {y:.3g}) m: {result} at {float(trace.outcome_time):.1f} s"
-    )
+    (x, y), end = trace.p_world_target.values, f"{float(trace.outcome_time):.1f} s"
+    figure.suptitle(f"{title}, target ({x:.3g}, {y:.3g}) m: {result} at {end}")
     return figure
 
 

@@ -173,7 +173,7 @@ def execute(command: Command[object], session: Session, faults: list[str]) -> No
         if session.video and isinstance(results, Trace):
             bar.phase("film")
             film.append(_film(results, out, session.film_length, shown=command.shows_progress))
-        report = _write_report(command, results, bar, film)
+        report = _report(command, results, bar, film)
     print(report.read_text(encoding="utf-8"))
     if timing:
         print(timing)
@@ -190,9 +190,7 @@ def _import_early() -> None:
     threading.Thread(target=list, args=(imports,), daemon=True).start()
 
 
-def _write_report(
-    question: Question[object], results: object, bar: Bar, film: list[Section]
-) -> Path:
+def _report(question: Question[object], results: object, bar: Bar, film: list[Section]) -> Path:
     """Write the report of the results, with the section of a film, and return its path."""
     import xarray as xr
 

@@ -27,10 +27,7 @@ def models(program: Program, prefix: str, batch: int | None = None) -> dict[str,
         closed = _batched(closed, len(params), batch)
 
     def tensors(mark: str, group: str) -> list[Tensor]:
-        return [
-            Tensor(mark + field.name, (*lead, *field.shape), field.kind, field.about)
-            for field in groups[group]
-        ]
+        return [Tensor(mark + x.name, (*lead, *x.shape), x.kind, x.about) for x in groups[group]]
 
     inputs = [*tensors("memory_", "memory"), *tensors("", "observation")]
     outputs = [*tensors("next_memory_", "memory"), *tensors("", "twist")]
@@ -42,11 +39,8 @@ def models(program: Program, prefix: str, batch: int | None = None) -> dict[str,
         prefix, inputs, pairs, producer_name="rps_jax", producer_version=__version__,
         doc_string=f"One control step of the law {program.label}; it checks no input.",
     )  # fmt: skip
-    start = {
-        f"memory_{field.name}": np.asarray(field.value).tolist()
-        for field in groups["memory"]
-        if field.size
-    }
+    memory = [field for field in groups["memory"] if field.size]
+    start = {f"memory_{x.name}": np.asarray(x.value).tolist() for x in memory}
     units = {x.name: x.about for x in (*inputs, *(x for x, _ in pairs))}
     values = {field.name: np.asarray(field.value).tolist() for field in groups["params"]}
     about = {"law": program.label, "robot": program.robot, "params": json.dumps(values)}
@@ -61,8 +55,6 @@ def _batched(closed: ClosedJaxpr, fixed: int, batch: int) -> ClosedJaxpr:
     axes = [None] * fixed + [0] * (len(closed.in_avals) - fixed)
     with jax.enable_x64(True):
         function = jax.vmap(jaxpr_as_fun(closed), in_axes=axes)
-    shapes = [
-        jax.ShapeDtypeStruct(x.shape if axis is None else (batch, *x.shape), x.dtype)
-        for axis, x in zip(axes, closed.in_avals, strict=True)
-    ]
+    pairs = zip([() if axis is None else (batch,) for axis in axes], closed.in_avals, strict=True)
+    shapes = [jax.ShapeDtypeStruct((*lead, *x.shape), x.dtype) for lead, x in pairs]
     return walk.traced(function, *shapes)[0]

@@ -133,11 +133,9 @@ def _learn(
 def _aim(params: APSParams, obs: PoseObservation) -> jax.Array:
     """Return the aim (2,) [m] beyond the target, on the line from the contact or the object."""
     touch = obs.touch
-    angle = jnp.where(
-        touch.in_contact,
-        planar.direction(displacement(touch)),
-        planar.direction(touch.p_world_target - obs.p_world_object),
-    )
+    of_contact = planar.direction(displacement(touch))
+    of_object = planar.direction(touch.p_world_target - obs.p_world_object)
+    angle = jnp.where(touch.in_contact, of_contact, of_object)
     beyond = params.aim_beyond * obs.r_object
     return touch.p_world_target + beyond * jnp.stack([jnp.cos(angle), jnp.sin(angle)])
 
@@ -158,8 +156,7 @@ def step(
     state = _learn(params, state, obs.p_world_object, a_OT)
 
     alpha = jnp.mod(planar.direction(from_object) - a_OT, 2 * jnp.pi)
-    reach = params.r_robot + obs.r_object + params.margin
-    near = planar.norm(from_object) <= reach
+    near = params.r_robot + obs.r_object + params.margin >= planar.norm(from_object)
     push, relocate = activations(params, state, alpha, near)
     radial = -jnp.stack([jnp.cos(alpha), jnp.sin(alpha)])  # towards the object
     orbit = jnp.sign(jnp.sin(alpha)) * jnp.stack([-jnp.sin(alpha), jnp.cos(alpha)])  # to alpha = pi

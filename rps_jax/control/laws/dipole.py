@@ -75,9 +75,8 @@ def step(
     theta = planar.wrap(planar.direction(from_object) - to_aim)
     heading = to_aim + 2 * theta - touch.yaw
     error = planar.wrap(planar.direction(-from_object) - touch.yaw)
-    twist = Twist(
-        params.v_max * jnp.cos(heading), params.v_max * jnp.sin(heading), params.K_h * error
-    ).saturate(params.v_max, params.omega_max)
+    v_x, v_y = params.v_max * jnp.cos(heading), params.v_max * jnp.sin(heading)
+    twist = Twist(v_x, v_y, params.K_h * error).saturate(params.v_max, params.omega_max)
     return DipoleState(start, jnp.ones_like(state.started)), twist, Details.from_obs(touch)
 
 

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from rps_jax import errors
+from rps_jax.control import soft
 from rps_jax.control.base import Law, check_finite_leaves, document_fields
 from rps_jax.control.laws import rps
 from rps_jax.control.laws.rps import RPSParams, RPSState
@@ -75,8 +76,7 @@ def step(
     v_max, omega_max = params.law.v_max, params.law.omega_max
     scaled = (v_max * offset[0], v_max * offset[1], omega_max * offset[2])
     guided = rps.saturate(params.law, Twist(*(a + b for a, b in zip(twist, scaled, strict=True))))
-    is_zero = jnp.all(offset == 0)
-    twist = jax.tree.map(lambda a, b: jnp.where(is_zero, a, b), twist, guided)
+    twist = soft.tree_where(jnp.all(offset == 0), twist, guided)
     return GuidedState(law_state, state.steps + 1), twist, details
 
 

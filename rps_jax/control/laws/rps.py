@@ -231,10 +231,8 @@ def saturate(params: RPSParams, twist: Twist) -> Twist:
     """
     scaled = twist.saturate(params.v_max, params.omega_max)
     v_max, clip_each = jnp.asarray(params.v_max), jnp.asarray(params.clip_each > 0)
-    v_x, v_y = (
-        jnp.where(clip_each, jnp.clip(v, -v_max, v_max), v_scaled)
-        for v, v_scaled in zip(twist[:2], scaled[:2], strict=True)
-    )
+    pairs = zip(twist[:2], scaled[:2], strict=True)
+    v_x, v_y = (jnp.where(clip_each, jnp.clip(v, -v_max, v_max), x) for v, x in pairs)
     return Twist(v_x, v_y, scaled.omega)
 
 
@@ -251,11 +249,8 @@ def _push(
     realigning = soft.and_(
         soft.greater(jnp.abs(l), l_th, temps.realign), jnp.asarray(params.reactive) > 0
     )  # Algorithm 1: enter or leave the Realignment State
-    a_r = soft.where(
-        realigning,
-        params.a_r_max * _sgn(params, l, temps.sgn),
-        adaptive_rate(params, l, distance, temps),
-    )
+    a_r_max = params.a_r_max * _sgn(params, l, temps.sgn)
+    a_r = soft.where(realigning, a_r_max, adaptive_rate(params, l, distance, temps))
     v_x, v_y = linear_velocity(v_star, a_r)  # Eqs. 1-2
     bounded = saturate(params, Twist(v_x, v_y, jnp.zeros_like(v_x)))
     first = jnp.asarray(params.saturate_first) > 0

@@ -160,14 +160,10 @@ def step(
     near = soft.and_(pushing, soft.greater(params.d_near, details.distance, temps.d_th))  # P1
     is_away = soft.greater_equal(details.distance, params.law.d_success, temps.arrive)
     p_robot_last = planar.rotate(-obs.yaw, p_world_last - obs.p_world_robot)
-    for condition, action in (
-        (soft.and_(near, is_away), translation(params, d, obs.yaw)),
-        (
-            soft.greater(steps_lost, params.n_lost, temperatures and _LOST_WIDTH),
-            search(params, p_robot_last, contact[1], temps),
-        ),
-    ):
-        twist = soft.tree_where(condition, action, twist)
+    is_close, shift = soft.and_(near, is_away), translation(params, d, obs.yaw)
+    is_lost = soft.greater(steps_lost, params.n_lost, temperatures and _LOST_WIDTH)
+    sweep = search(params, p_robot_last, contact[1], temps)
+    twist = soft.tree_where(is_lost, sweep, soft.tree_where(is_close, shift, twist))
     return RPSPlusState(law_state, p_world_last, steps_lost), twist, details
 
 

@@ -29,11 +29,7 @@ _DRIFT = 0.01  # [m] tanh scale of the contact's motion on the base between two 
 
 
 def taxel_observation(
-    touch: Observation,
-    reading: Reading,
-    skin: Skin,
-    state: SkinState,
-    footprint: Footprint,
+    touch: Observation, reading: Reading, skin: Skin, state: SkinState, footprint: Footprint
 ) -> TaxelObservation:
     """Return the observation of a law that senses taxels.
 

@@ -19,9 +19,9 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 from jax.ad_checkpoint import checkpoint_name
-from jax.custom_derivatives import SymbolicZero
 
 from rps_jax.engines.fused.contacts import Body, Contact, Point, State
+from rps_jax.engines.linear_map import restrict, varied_indices
 from rps_jax.geometry import vectors as sp
 from rps_jax.geometry.arrays import Number
 from rps_jax.geometry.solid import GRAVITY
@@ -201,34 +201,34 @@ def accelerations(
     """
     # Literal numbers stay literal: `vectors` folds zeros and ones.
     leaves, tree = jax.tree.flatten((problem, solution))
-    arrays = {i: x for i, x in enumerate(leaves) if isinstance(x, jax.Array)}
+    positions = [i for i, x in enumerate(leaves) if isinstance(x, jax.Array)]
 
-    def rebuilt(values: dict[int, jax.Array]) -> tuple[Problem, Sequence[Vec] | None]:
+    def rebuilt(arrays: Sequence[jax.Array]) -> tuple[Problem, Sequence[Vec] | None]:
+        values = dict(zip(positions, arrays, strict=True))
         return tree.unflatten([values.get(i, x) for i, x in enumerate(leaves)])
 
     @jax.custom_jvp
-    def run(values: dict[int, jax.Array]) -> list[Vec]:
-        problem, solution = rebuilt(values)
+    def run(arrays: list[jax.Array]) -> list[Vec]:
+        problem, solution = rebuilt(arrays)
         return _minimise(problem, physics) if solution is None else list(solution)
 
     def rule(primals: Any, tangents: Any) -> tuple[list[Vec], list[Vec]]:
-        (values,), (tangents,) = primals, tangents
-        x = checkpoint_name(run(values), SOLUTION)
-        varied = [i for i, y in tangents.items() if not isinstance(y, SymbolicZero)]
+        (arrays,), (directions,) = primals, tangents
+        x = checkpoint_name(run(arrays), SOLUTION)
 
-        def gradient(some: dict[int, jax.Array]) -> tuple[list[Number], list[list[Number]]]:
-            g, h = rebuilt(values | some)[0].gradient(x, physics)
+        def gradient(arrays: list[jax.Array]) -> tuple[list[Number], list[list[Number]]]:
+            g, h = rebuilt(arrays)[0].gradient(x, physics)
             return [jnp.asarray(entry) for entry in g], h
 
-        _, dg, h = jax.jvp(
-            gradient, ({i: values[i] for i in varied},), ({i: tangents[i] for i in varied},),
-            has_aux=True,
-        )  # fmt: skip
+        varied = varied_indices(directions)
+        of_varied, point = restrict(gradient, arrays, varied)
+        tangent = [directions[i] for i in varied]
+        _, dg, h = jax.jvp(of_varied, (point,), (tangent,), has_aux=True)
         step = _solve(h, [-entry for entry in dg])
         return x, [(step[i], step[i + 1], step[i + 2]) for i in range(0, len(step), 3)]
 
     run.defjvp(rule, symbolic_zeros=True)
-    return run(arrays)
+    return run([leaves[i] for i in positions])
 
 
 def _minimise(problem: Problem, physics: Physics) -> list[Vec]:

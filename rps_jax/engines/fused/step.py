@@ -137,71 +137,51 @@ class FusedStage(NamedTuple):
     """Stage of the fused engine, whose worlds share nothing."""
 
     native = True
+    engine = "fused"
 
     def drive(self, fields: Body, motion: Motion, period: ControlPeriod) -> Driven:
-        """Step a batch of worlds (B,) for one control period.
+        """Step worlds for one control period: a batch (B,), or one world.
 
-        It is a function of C, or a kernel on an NVIDIA GPU, where they can be compiled, and so is
-        the derivative of each step; elsewhere XLA compiles it.
+        A batch is stepped by a function of C, or a kernel on an NVIDIA GPU, where they can be
+        compiled, and so are the derivatives; elsewhere XLA compiles it.
         """
-        steps = partial(_drive, physics=period.physics, force=period.force)
-        by_step = partial(_drive_by_step, physics=period.physics, force=period.force)
+
+        def steps(*inputs: Any) -> Driven:
+            return _drive(*inputs, physics=period.physics, force=period.force)
+
+        def saving(inputs: Any, solutions: Any) -> tuple[Driven, Any]:
+            driven = steps(*inputs, solutions)
+            return driven._replace(solutions=None), driven.solutions
+
+        inputs = fields, motion, period.twists, period.robot
         if motion.qpos.ndim != 2:
-            return steps(fields, motion, period.twists, period.robot)
-        run = native.batched(steps, steps, differentiated=by_step)
-        return run(fields, motion, period.twists, period.robot)
+            return steps(*inputs, period.solutions)
+        return native.batched(saving, steps, saves=True)(*inputs)
 
 
 def _drive(
-    body: Body, motion: Motion, twist: Vec, robot: Robot | None, *, physics: Physics, force: bool
-) -> Driven:
+    body: Body, motion: Motion, twist: Vec, robot: Robot | None, solutions: Any = None,
+    *, physics: Physics, force: bool,
+) -> Driven:  # fmt: skip
     """Step a batch of worlds, or one world, for one control period."""
     scalars = spread(body)
 
     # Derivatives compute each step again, without its solver.
     @partial(jax.checkpoint, prevent_cse=False, policy=_SAVED)
-    def next_state(state: State) -> State:
-        return step(scalars, state, twist, physics, robot)
+    def next_state(state: State, solution: list[Vec] | None = None) -> State:
+        return step(scalars, state, twist, physics, robot, solution)
 
-    state = jax.lax.fori_loop(
-        0, physics.substeps, lambda _, x: next_state(x), enter(body, motion, robot, force)
-    )
-    return _driven(body, state, twist, physics)
+    def solve(state: State, solution: list[Vec] | None) -> tuple[State, list[Vec]]:
+        state = next_state(state, solution)
+        return state, [state.a, state.alpha, *([] if state.driven is None else [state.driven.a])]
 
-
-def _driven(body: Body, state: State, twist: Vec, physics: Physics) -> Driven:
-    """Return worlds after a control period that ends in a state."""
-    felt = state.felt and jnp.stack(state.felt, axis=-1) / physics.substeps
-    return Driven(leave(body, state, twist), force=felt)
-
-
-def _drive_by_step(
-    body: Body, motion: Motion, twist: Vec, robot: Robot | None, *, physics: Physics, force: bool
-) -> Driven:
-    """Step a batch of worlds by one native function for each physics step."""
     start = enter(body, motion, robot, force)
-    tree = jax.tree.structure(start)
-
-    def single(packed: jax.Array, body: Body, twist: Vec, robot: Robot | None) -> jax.Array:
-        state = tree.unflatten(_split(packed))
-        return _pack(step(spread(body), state, twist, physics, robot))
-
-    def derivative(arguments: Any, result: jax.Array) -> jax.Array:
-        packed, body, twist, robot = arguments
-        state, after = tree.unflatten(_split(packed)), tree.unflatten(_split(result))
-        x = [after.a, after.alpha, *([] if after.driven is None else [after.driven.a])]
-        return _pack(step(spread(body), state, twist, physics, robot, x))
-
-    run = native.batched(single, jax.vmap(single), derivative)
-    packed = jax.lax.fori_loop(
-        0, physics.substeps, lambda _, x: run(x, body, twist, robot), _pack(start)
-    )
-    return _driven(body, tree.unflatten(_split(packed)), twist, physics)
-
-
-def _pack(state: State) -> jax.Array:
-    """Return the entries of a state along a new last axis."""
-    return jnp.stack(jax.tree.leaves(state), axis=-1)
+    if solutions is None:
+        state = jax.lax.fori_loop(0, physics.substeps, lambda _, x: next_state(x), start)
+    else:
+        state, solutions = jax.lax.scan(solve, start, solutions or None, physics.substeps)
+    felt = state.felt and jnp.stack(state.felt, axis=-1) / physics.substeps
+    return Driven(leave(body, state, twist), felt, solutions)
 
 
 def spread(body: Body) -> Body:

@@ -59,7 +59,7 @@ def parse_task(task: TaskLike) -> Task:
         if name == "kind":
             continue
         errors.check_name(f"task quantity of {kind.kind}", name, known)
-        default = known[name].default
+        default: Any = known[name].default
         try:
             if name in declared(kind):
                 value = range_of(default, value)

@@ -78,9 +78,9 @@ class Task:
 
     kind: str = ""  # name of the task
     # Units and meanings of the outcomes that it adds.
-    OUTCOMES: ClassVar[Mapping[str, tuple[str, str]]] = {}
+    OUTCOMES: ClassVar[dict[str, tuple[str, str]]] = {}
     HAS_TARGET: ClassVar[bool] = False  # whether trials end at the domain's targets
-    MORE_NUMBERS: ClassVar[Mapping[str, int]] = {}  # columns of random numbers without a range
+    MORE_NUMBERS: ClassVar[dict[str, int]] = {}  # columns of random numbers without a range
 
     @property
     def idle(self) -> frozenset[str]:
@@ -103,6 +103,6 @@ class Task:
     def check_size(self, half_width: float, object_width: Callable[[], float]) -> None:
         """Raise InputError unless a base and the widest object [m] have room."""
 
-    def courses(self, inputs: CourseInputs) -> tuple[np.ndarray, Course]:
-        """Return the ends (n, 2) [m] of trials, and the numbers of n worlds."""
+    def courses(self, inputs: CourseInputs) -> tuple[np.ndarray, Any]:
+        """Return the ends (n, 2) [m] of trials, and the `Course` (n, ...) of n worlds."""
         raise NotImplementedError

@@ -7,9 +7,9 @@ touch, by the exact outlines of base and object.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable, Mapping
+from collections.abc import Callable, Hashable
 from dataclasses import dataclass
-from typing import ClassVar, Literal, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -88,8 +88,8 @@ class CorridorCourse(NamedTuple):
 class Corridor(Path):
     """Follow a path between walls."""
 
-    kind: Literal["corridor"] = "corridor"
-    OUTCOMES: ClassVar[Mapping[str, tuple[str, str]]] = Path.OUTCOMES | {
+    kind: str = "corridor"
+    OUTCOMES: ClassVar[dict[str, tuple[str, str]]] = Path.OUTCOMES | {
         "clearance": ("m", "least distance of base and object from the walls"),
         "wall_touch": ("1", "what touched a wall and ended the trial: 1 the base, 2 the object"),
         "touch_x": ("m", "x of the touch in the world"),
@@ -135,17 +135,18 @@ class Corridor(Path):
                 rule = f"the {name} is {size:.2f} m wide, and the narrowest place must be wider"
                 raise errors.not_allowed("task width (low)", f"{self.width.low:g} m", rule)
 
-    def courses(self, inputs: CourseInputs) -> tuple[np.ndarray, CorridorCourse]:
+    def courses(self, inputs: CourseInputs) -> tuple[np.ndarray, Any]:
         """Return the ends, paths and walls of worlds."""
         ends, inner = super().courses(inputs)
         half = self.width.at(inputs.u["width"]) / 2
-        walls = _walls(inner.line.vertices, half)
+        walls = _walls(np.asarray(inner.line.vertices), half)
         opening = half * self.door_width.at(inputs.u["door_width"])
         doors = [
             _door(inner.line, (i + 1) / (self.doors + 1), opening, 1.5 * half)
             for i in range(self.doors)
         ]
-        return ends, CorridorCourse(inner, np.concatenate([walls, *doors], axis=1))
+        joined: Any = np.concatenate([walls, *doors], axis=1)
+        return ends, CorridorCourse(inner, joined)
 
 
 def _walls(vertices: np.ndarray, half: np.ndarray) -> np.ndarray:
@@ -176,10 +177,11 @@ def _door(line: Polyline, share: float, inner: np.ndarray, outer: np.ndarray) ->
 
     They leave an opening of half width `inner` (n,) [m], and end at `outer` (n,) [m].
     """
-    passed = line.arcs[:, 1:] <= share * line.arcs[:, -1:]
+    vertices, arcs = np.asarray(line.vertices), np.asarray(line.arcs)
+    passed = arcs[:, 1:] <= share * arcs[:, -1:]
     rows, first = np.arange(len(passed)), np.minimum(passed.sum(axis=1), passed.shape[1] - 1)
-    a, b = line.vertices[rows, first], line.vertices[rows, first + 1]
-    unit = _units(line.vertices)[rows, first]
+    a, b = vertices[rows, first], vertices[rows, first + 1]
+    unit = _units(vertices)[rows, first]
     normal = np.stack([-unit[:, 1], unit[:, 0]], axis=-1)
     ends = [(a + b) / 2 + s * x[:, None] * normal for s in (1, -1) for x in (inner, outer)]
     return np.stack([np.stack(ends[:2], axis=1), np.stack(ends[2:], axis=1)], axis=1)

@@ -6,9 +6,9 @@ laws do not change. A trial succeeds at the path's end.
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Mapping
+from collections.abc import Hashable
 from dataclasses import dataclass
-from typing import ClassVar, Literal, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -101,21 +101,19 @@ class PathCourse(NamedTuple):
 class Path(Task):
     """Follow a path, given by its waypoints or drawn."""
 
-    kind: Literal["path"] = "path"
-    OUTCOMES: ClassVar[Mapping[str, tuple[str, str]]] = {
+    kind: str = "path"
+    OUTCOMES: ClassVar[dict[str, tuple[str, str]]] = {
         "progress": ("1", "share of the path that the contact point has passed"),
         "error_mean": ("m", "mean cross-track error of the contact point"),
         "error_95": ("m", "95 % quantile over time of the cross-track error"),
         "error_max": ("m", "largest cross-track error"),
     }
-    MORE_NUMBERS: ClassVar[Mapping[str, int]] = {f"turn_angle_{i}": 52 + i for i in range(1, 7)}
+    MORE_NUMBERS: ClassVar[dict[str, int]] = {f"turn_angle_{i}": 52 + i for i in range(1, 7)}
 
     # Along the path, from its nearest point to the law's target.
-    lookahead: Range = drawn(Range(0.5, 0.5), 49, "m", 0.05, 5, "lookahead on the path", "course")
+    lookahead: Range = drawn(Range(1, 1), 49, "m", 0.05, 5, "lookahead on the path", "course")
     length: Range = drawn(Range(4, 8), 50, "m", 0.5, 40, "length of the path", "course")
-    turns: Range = drawn(
-        Range(1, 3), 51, "1", 0, _SEGMENTS - 1, "number of turns", "course", "", True
-    )
+    turns: Range = drawn(Range(1, 3), 51, "1", 0, _SEGMENTS - 1, "number of turns", "course", True)
     turn_angle: Range = drawn(Range(0.3, 0.8), 52, "rad", 0, 1.6, "angle of the turns", "course")
     # [m] in the world, where the base starts at the origin; then nothing but the lookahead is drawn
     waypoints: tuple[tuple[float, float], ...] = ()
@@ -150,11 +148,11 @@ class Path(Task):
         if rule:
             raise errors.not_allowed("task waypoints", points.tolist(), rule)
 
-    def courses(self, inputs: CourseInputs) -> tuple[np.ndarray, PathCourse]:
+    def courses(self, inputs: CourseInputs) -> tuple[np.ndarray, Any]:
         """Return the ends and the paths of worlds."""
-        line = Polyline.through(self.vertices(inputs))
-        lookahead = self.lookahead.at(inputs.u["lookahead"])
-        return line.vertices[:, -1], PathCourse(line, lookahead)
+        vertices = self.vertices(inputs)
+        lookahead: Any = self.lookahead.at(inputs.u["lookahead"])
+        return vertices[:, -1], PathCourse(Polyline.through(vertices), lookahead)
 
     def route(self) -> np.ndarray:
         """Return the vertices (N, 2) [m] of the path through the waypoints."""
