@@ -155,7 +155,9 @@ class Results:
                 f"{', '.join(sorted(missing))}): use that version."
             )
         for name, values in columns.items():
-            shape = worlds.shape + (self._outcomes[name].shape[2:] if name in self._outcomes else ())
+            shape = worlds.shape + (
+                self._outcomes[name].shape[2:] if name in self._outcomes else ()
+            )
             if values.shape != shape or values.dtype.kind not in "biuf":
                 raise files.CorruptFileError(source, f"{name} is not numbers of {shape}")
         if not np.array_equal(columns["trial"], self.plan.chunks[chunk]):
