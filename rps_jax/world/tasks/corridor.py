@@ -11,13 +11,14 @@ from collections.abc import Callable, Hashable
 from dataclasses import dataclass
 from typing import Any, ClassVar, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
 from rps_jax import errors
 from rps_jax.geometry import footprint as fp
-from rps_jax.geometry import polyline
-from rps_jax.geometry.arrays import Array, Bool, Float
+from rps_jax.geometry import planar, polyline
+from rps_jax.geometry.arrays import Array, Float, Int
 from rps_jax.geometry.polyline import Polyline
 from rps_jax.record.options import option
 from rps_jax.world.quantity import Range, drawn
@@ -26,6 +27,7 @@ from rps_jax.world.tasks.path import Path, PathCourse, PathProgress
 
 _BEHIND = 1.5  # [m] of the walls before the base's front
 _BEYOND = 1.5  # [m] of the walls after the end of the path
+_STEPS = 5  # control steps between two measurements of the walls, unless one may be touched
 NOTHING, BASE, OBJECT = 0, 1, 2  # what touched a wall
 
 
@@ -36,6 +38,9 @@ class CorridorProgress(NamedTuple):
     clearance: Float[Array, "*B"]  # [m] least of base and object so far
     wall_touch: Float[Array, "*B"]  # 0 nothing, 1 the base, 2 the object
     p_world_touch: Float[Array, "*B 2"]  # [m] NaN before a touch
+    measured: Float[Array, "*B"]  # [m] last measured distance from the walls
+    measured_at: Float[Array, "*B 2 3"]  # [m, m, rad] poses of base and object then
+    steps: Int[Array, "*B"]
 
     def outcomes(self) -> dict[str, Array]:
         """Return the outcomes of the path, and of the walls."""
@@ -56,28 +61,46 @@ class CorridorCourse(NamedTuple):
     def start(self) -> CorridorProgress:
         """Return the progress at the start."""
         inner = self.path.start()
-        nan = jnp.full((2,), jnp.nan, inner.arc.dtype)
-        return CorridorProgress(inner, jnp.inf + inner.arc, inner.arc, nan)
+        zero, nan = inner.arc, jnp.full((2,), jnp.nan, inner.arc.dtype)
+        poses = jnp.zeros((2, 3), zero.dtype)
+        count = jnp.zeros((), jnp.int32)
+        return CorridorProgress(inner, jnp.inf + zero, zero, nan, zero, poses, count)
 
     def step(self, progress: CorridorProgress, place: Place) -> tuple[CorridorProgress, Aim]:
-        """Advance along the path, and fail at a touch."""
+        """Advance along the path, and fail at a touch.
+
+        Walls are measured in every fifth step, and in each in which one may be touched.
+        """
         inner, aim = self.path.step(progress.path, place)
-        base = fp.place(fp.rectangle(*place.half), place.base[:2], place.base[2])
-        item = fp.place(place.footprint, place.p_world_object, place.object_yaw)
-        of_base, at_base = polyline.clearance(base, self.walls)
-        of_object, at_object = polyline.clearance(item, self.walls)
-        by_base = of_base <= of_object
-        least = jnp.where(by_base, of_base, of_object)
-        touched: Bool[Array, ""] = least <= 0
-        who = jnp.where(touched, jnp.where(by_base, BASE, OBJECT), NOTHING)
-        point = jnp.where(by_base, at_base, at_object)
-        moved = CorridorProgress(
-            inner,
-            jnp.minimum(progress.clearance, least),
-            who.astype(least.dtype),
-            jnp.where(touched, point, jnp.nan),
-        )
-        return moved, aim._replace(failed=touched)
+        poses = jnp.stack([place.base, jnp.append(place.p_world_object, place.object_yaw)])
+        radii = planar.norm(jnp.stack(place.half)), fp.circumradius(place.footprint)
+        away = jnp.abs(poses - progress.measured_at)
+        travel = planar.norm(away[:, :2]) + jnp.stack(radii) * away[:, 2]
+        may_touch = progress.measured <= jnp.max(travel)
+        due = may_touch | (progress.steps % _STEPS == 0)
+        outlines = fp.rectangle(*place.half), place.footprint
+
+        def measure(carry: Any) -> Any:
+            poses = carry[-1]  # of the carry, since a loop computes what is constant in any case
+            pairs = zip(outlines, poses, strict=True)
+            placed = [fp.place(outline, pose[:2], pose[2]) for outline, pose in pairs]
+            (of_base, at_base), (of_object, at_object) = (
+                polyline.clearance(x, self.walls) for x in placed
+            )
+            by_base = of_base <= of_object
+            least = jnp.where(by_base, of_base, of_object)
+            who = jnp.where(least > 0, NOTHING, jnp.where(by_base, BASE, OBJECT))
+            point = jnp.where(least > 0, jnp.nan, jnp.where(by_base, at_base, at_object))
+            clearance = jnp.minimum(progress.clearance, least)
+            touch = who.astype(least.dtype), point
+            return jnp.zeros((), bool), clearance, *touch, least, poses, poses
+
+        # A loop of at most one pass: a program for many worlds skips it if none is due.
+        last = progress.clearance, progress.wall_touch, progress.p_world_touch
+        carry = due, *last, progress.measured, progress.measured_at, poses
+        _, *now, _ = jax.lax.while_loop(lambda x: x[0], measure, carry)
+        moved = CorridorProgress(inner, *now, progress.steps + 1)
+        return moved, aim._replace(failed=moved.wall_touch > NOTHING)
 
     def lines(self) -> dict[str, np.ndarray]:
         """Return path and walls."""
@@ -90,7 +113,10 @@ class Corridor(Path):
 
     kind: str = "corridor"
     OUTCOMES: ClassVar[dict[str, tuple[str, str]]] = Path.OUTCOMES | {
-        "clearance": ("m", "least distance of base and object from the walls"),
+        "clearance": (
+            "m",
+            "least distance of base and object from the walls, every fifth control step",
+        ),
         "wall_touch": ("1", "what touched a wall and ended the trial: 1 the base, 2 the object"),
         "touch_x": ("m", "x of the touch in the world"),
         "touch_y": ("m", "y of the touch in the world"),
