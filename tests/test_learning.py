@@ -444,7 +444,8 @@ def test_rewards_of_privileged_quantities():
     previous = state.data
     shift = jnp.array([0.01, -0.02])
     current = previous._replace(qpos=previous.qpos.at[3:5].add(shift))
-    nearer, together = env._true_state_terms(state.info["world"], previous, current)
+    touches = [state.info["observation"].touch] * 2
+    nearer, together = env._true_state_terms(state.info["world"], previous, current, *touches)
     target = state.info["world"].p_world_target
     far = [float(jnp.linalg.norm(target - s.qpos[3:5])) for s in (previous, current)]
     assert float(nearer) == pytest.approx(far[0] - far[1], abs=1e-6)

@@ -34,6 +34,11 @@ int main() {
     while (words >> number) x.push_back(std::stod(number));
     if (what == "odometry") controller.odometry(x[0], x[1], x[2], x[3]);
     if (what == "target") controller.target(x[0], x[1], x[2]);
+    if (what == "path") {
+      std::vector<rps_push::Point> path;
+      for (std::size_t i = 1; i + 1 < x.size(); i += 2) path.push_back({x[i], x[i + 1]});
+      controller.path(x[0], path);
+    }
     if (what == "skin") controller.skin(x[0], std::vector<float>(x.begin() + 1, x.end()));
     if (what != "tick") continue;
     const auto found = controller.tick(x[0]);
@@ -69,8 +74,8 @@ def driven_in_python(controller, events):
     controller.reset()
     commands = []
     for topic, *values in events:
-        if topic == "skin":
-            controller.skin(values[0], values[1:])
+        if topic in ("skin", "path"):
+            getattr(controller, topic)(values[0], values[1:])
         elif (command := getattr(controller, topic)(*values)) is not None:
             commands.append(command)
     return np.array([command[:3] for command in commands]), [c.status for c in commands]
@@ -169,6 +174,39 @@ def test_cpp_and_python_agree_on_a_recorded_bag(binary, tmp_path, python):
     assert np.mean(near < 0.02) > 0.8
 
 
+def test_cpp_and_python_follow_a_path_as_the_task_does(binary, tmp_path, python):
+    pytest.importorskip("mcap_ros2")
+    path = tmp_path / "push.mcap"
+    setting = rps_jax.Setting("quasistatic", rules=rps_jax.Rules(horizon=80.0))
+    task = "corridor,width=1.5,turns=2,length=4"
+    push("cylinder", task=task, law="rps_plus", skin="capacitive", bag=path, setting=setting)
+    read = bag.read(path)
+    assert np.ptp(read["target"], axis=0).min() > 0.2
+    messages = []
+    for i, time in enumerate(read["time"]):
+        messages += [("odometry", time, *read["pose"][i]), ("skin", time, *read["signal"][i])]
+        messages += [("path", time, *read["path"][i].ravel()), ("tick", time)]
+    cpp, statuses = driven_in_cpp(binary, messages)
+    python_twists, _ = driven_in_python(python, messages)
+    assert set(statuses) == {"pushing"}
+    assert np.mean(np.abs(cpp - python_twists).max(-1) > 1e-5) < 0.01
+    near = np.abs(cpp - read["twist"])[:, :2].max(-1)
+    assert np.mean(near < 0.02) > 0.8
+
+
+def test_a_path_replaces_the_target_until_it_ends(driven):
+    ahead = [0.3, 0.0, 3.0, 0.0]
+    inputs = [event for event in events(6.0) if event[0] != "target" or event[1] > 4.0]
+    twists, statuses = driven([("path", 0.01, *ahead), *inputs])
+    times = 0.02 * np.arange(1, len(twists) + 1) + 0.005
+    assert {s for s, t in zip(statuses, times, strict=True) if t < 2.0} == {"pushing"}
+    assert statuses[-1] == "waiting for a path"
+    assert not twists[times > 2.1].any()
+    ended = sorted([*inputs, ("path", 4.5)], key=lambda event: event[1])
+    assert driven([("path", 0.01, *ahead), *ended])[1][-1] == "pushing"
+    assert set(driven([("path", 0.01, np.nan, 0.0), *events(0.5)])[1]) == {"pushing"}
+
+
 # --- consistency of the nodes, which need ROS to run ---------------------------------------
 
 
@@ -179,7 +217,7 @@ def test_the_nodes_name_the_same_topics_and_parameters():
                      "CMakeLists.txt")
     )  # fmt: skip
     ast.parse(python)
-    for topic in ("odom", "taxels", "target", "cmd_vel"):
+    for topic in ("odom", "taxels", "target", "path", "cmd_vel"):
         assert f'"{topic}"' in cpp
         assert f'"{topic}"' in python
     limits = vars(PYTHON["Limits"]())

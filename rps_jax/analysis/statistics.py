@@ -13,10 +13,12 @@ import scipy
 import xarray as xr
 from numpy.typing import ArrayLike
 
+from rps_jax.world import tasks
 from rps_jax.world.domain import LABELS
 
 FAILURES = ("never touched", "lost contact", "timeout", "fell over", "diverged", "stalled")
-# Failure modes in order of precedence.
+MODES = (*FAILURES, *tasks.FAILURES.values())  # with those of tasks
+# Failure modes in order of precedence, after those of tasks.
 _PRECEDENCE = ("diverged", "fell over", "stalled", "never touched", "lost contact")
 _TAIL = 0.05  # share of the worlds in the tail of the CVaR
 # Limits of all intervals of a report.
@@ -147,18 +149,20 @@ def distance_left(trials: xr.Dataset) -> np.ndarray:
 
 
 def failure_modes(trials: xr.Dataset, max_lost: float) -> np.ndarray:
-    """Return indices (world,) into `FAILURES` of the trials of one law, -1 for a success."""
+    """Return indices (world,) into `MODES` of the trials of one law, -1 for a success."""
+    none = xr.zeros_like(trials.success)
     return np.select(
         [
             trials.success.values > 0,
+            *(trials.get(name, none).values > 0 for name in tasks.FAILURES),
             trials.diverged.values > 0,
             trials.tipped.values > 0,
-            trials.get("stalled", xr.zeros_like(trials.success)).values > 0,
+            trials.get("stalled", none).values > 0,
             ~np.isfinite(trials.min_distance.values),
             trials.contact_lost_time.values > max_lost,
         ],
-        [-1, *map(FAILURES.index, _PRECEDENCE)],
-        FAILURES.index("timeout"),
+        [-1, *map(MODES.index, (*tasks.FAILURES.values(), *_PRECEDENCE))],
+        MODES.index("timeout"),
     )
 
 

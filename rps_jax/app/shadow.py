@@ -19,6 +19,8 @@ from rps_jax.control import registry, validation
 from rps_jax.control.base import Law, LawParams
 from rps_jax.control.observation import Twist
 from rps_jax.errors import InputError
+from rps_jax.geometry import planar
+from rps_jax.geometry.polyline import Polyline
 from rps_jax.record import bag as bags
 from rps_jax.record.options import option
 from rps_jax.robot import robot as robots
@@ -26,6 +28,9 @@ from rps_jax.robot.robot import RobotLike
 from rps_jax.robot.skin import with_contacts
 from rps_jax.runs.question import BagQuestion, Run, call_of
 from rps_jax.tuning.logs import COLUMNS, motion_faults
+from rps_jax.world.tasks.path import PathCourse
+
+_STILL = 1e-3  # [m] by which the points of a path may move
 
 
 @dataclass(frozen=True)
@@ -40,6 +45,9 @@ class Shadow(BagQuestion[xr.Dataset]):
     robot: RobotLike = "ideal"
     """The robot of a bag that has taxels but no contacts: ideal, kairos, ridgeback or mpo_500, or a
     JSON file of its size and boards."""
+
+    lookahead: float = option(1.0, 0.05, 5, unit="m")
+    """Lookahead on the path of a bag that has no target [m]."""
 
     TITLE = "A law in the shadow of another"
 
@@ -65,6 +73,8 @@ class Shadow(BagQuestion[xr.Dataset]):
         """Run the law over the bag."""
         shell = robots.parse_robot(self.robot).shell
         recorded = with_contacts(self.steps, shell, f"bag = {self.file}")
+        if "target" not in recorded:
+            recorded |= {"target": pursued(recorded, self.lookahead)}
         motion = (recorded[name] for name in ("time", "pose", "twist"))
         doubts = "; it ".join(motion_faults(*motion))  # the base may follow other commands
         twists = shadowed(registry.law_of(self.params), self.params, recorded)
@@ -105,6 +115,23 @@ class Shadow(BagQuestion[xr.Dataset]):
 
 
 shadow = call_of(Shadow)
+
+
+def pursued(recorded: dict[str, np.ndarray], lookahead: float) -> np.ndarray:
+    """Return the targets (N, 2) [m] on the path of a bag, as of the task `path`.
+
+    Raises:
+      InputError: the path changes.
+    """
+    pose, path = recorded["pose"], recorded["path"]
+    if np.ptp(path, axis=0).max() > _STILL:
+        raise InputError("the bag has a path that changes: cut the bag where it does.")
+    line: Any = jax.tree.map(jnp.asarray, Polyline.through(path[0]))
+    course = PathCourse(line, jnp.asarray(lookahead))
+    contacts = pose[:, :2] + jax.vmap(planar.rotate)(pose[:, 2], recorded["p_robot_contact"])
+    rows = contacts, recorded["contact_type"] > 0
+    _, aims = jax.lax.scan(lambda at, row: course.follow(at, *row), course.start(), rows)
+    return np.asarray(aims.p_world_target)
 
 
 def shadowed(law: Law, params: LawParams, recorded: dict[str, np.ndarray]) -> np.ndarray:

@@ -4,7 +4,11 @@
 compression. Each topic has one message per control step, except `/tf` and the markers:
 
     /odom           nav_msgs/Odometry              pose of the base and its velocity in its frame
-    /target         geometry_msgs/PointStamped     the target (read, too: PoseStamped)
+    /target         geometry_msgs/PointStamped     the law's target, on a path a lookahead ahead
+                                                   (read, too: PoseStamped)
+    /path           nav_msgs/Path                  of a task, once a second; all of a bag have as
+                                                   many poses
+    /walls          visualization_msgs/Marker      of a task, once a second
     /contact        geometry_msgs/PolygonStamped   in base_link: no point without contact, one for a
                                                    point contact, twice the same for a line contact
     /taxels         std_msgs/Float32MultiArray     relative change of capacitance of each taxel,
@@ -73,6 +77,8 @@ class Step(NamedTuple):
     p_world_object: Floats | None = None  # (2,) [m]
     r_object: float = 0.0  # [m]
     object_pose: Floats | None = None  # (3,) [m, m, rad] for viewers alone
+    path: np.ndarray | None = None  # (K, 2) [m] of the task, in the world
+    walls: np.ndarray | None = None  # (W, 2, 2) [m] for viewers alone
 
 
 def check() -> None:
@@ -108,12 +114,14 @@ def _xy(values: np.ndarray) -> np.ndarray:
     return values[:, :2]
 
 
-_TREE = ("tf", "tf_static")
+_TREE, _RARE = ("tf", "tf_static"), ("target", "path")  # _RARE: topics that are no streams
+_POSITION = _floats("pose.position.xyz")
 _TF = {"tf2_msgs/TFMessage": _floats("transform.translation.xyz", "transform.rotation.xyzw")}
 _READERS: dict[str, dict[str, Callable[[Any], Floats]]] = {  # of messages, by topic and type
     "odom": {"nav_msgs/Odometry": _floats("pose.pose.position.xyz", "pose.pose.orientation.xyzw")},
     "target": {"geometry_msgs/PointStamped": _floats("point.xyz"),
-               "geometry_msgs/PoseStamped": _floats("pose.position.xyz")},
+               "geometry_msgs/PoseStamped": _POSITION},
+    "path": {"nav_msgs/Path": lambda m: [x for pose in m.poses for x in _POSITION(pose)]},
     "contact": {"geometry_msgs/PolygonStamped": _contact},
     "taxels": {"std_msgs/Float32MultiArray": attrgetter("data")},
     "force": {"geometry_msgs/WrenchStamped": _floats("wrench.force.xyz")},
@@ -125,6 +133,7 @@ _READERS: dict[str, dict[str, Callable[[Any], Floats]]] = {  # of messages, by t
 _FIELDS: dict[str, tuple[str, Callable[[np.ndarray], np.ndarray]]] = {  # of values (N, k)
     "pose": ("odom", _plane_pose),
     "target": ("target", _xy),
+    "path": ("path", lambda v: v.reshape(len(v), -1, 3)[..., :2]),
     "contact_type": ("contact", lambda v: v[:, 3].astype(int)),
     "p_robot_contact": ("contact", lambda v: np.where(v[:, 3:] > 0, v[:, :2], 0.0)),
     "signal": ("taxels", lambda v: v.astype(np.float32)),
@@ -134,7 +143,7 @@ _FIELDS: dict[str, tuple[str, Callable[[np.ndarray], np.ndarray]]] = {  # of val
     "twist": ("cmd_vel", lambda v: v),
 }
 TOPICS = {f"/{key}": next(iter(readers)) for key, readers in _READERS.items()}  # types
-TOPICS["/target_marker"] = TOPICS["/object"]
+TOPICS |= dict.fromkeys(("/target_marker", "/walls"), TOPICS["/object"])
 
 
 # --- writing -------------------------------------------------------------------------------
@@ -188,6 +197,13 @@ def _messages(steps: Iterable[Step]) -> Iterator[tuple[str, int, Message]]:
         if step.time >= marker_time + _MARKER_PERIOD:
             marker_time = step.time
             yield "/target_marker", stamp, _cylinder(odom, "target", step.target, 0.05)
+            if step.path is not None:
+                poses = [{"header": odom, "pose": _pose(*point)} for point in step.path]
+                yield "/path", stamp, {"header": odom, "poses": poses}
+            if step.walls is not None:
+                ends = [_xyz(*end) for end in step.walls.reshape(-1, 2)]
+                lines = {"type": 5, "points": ends, "pose": _pose(0, 0), "scale": {"x": 0.04}}
+                yield "/walls", stamp, _cylinder(odom, "walls", (0, 0), 0.0) | lines
         yield "/cmd_vel", stamp, {"header": base, "twist": _twist(*step.twist)}
         previous = step
 
@@ -276,7 +292,7 @@ def _steps(path: Path, renamed: dict[str, str]) -> dict[str, np.ndarray]:
     """Return the steps of a bag, as `read` does."""
     names = {key: f"/{key}" for key in _READERS if key not in renamed} | renamed
     logs, contents = _collect(path, {key: names[key] for key in names if key not in _TREE})
-    required = dict.fromkeys(["odom", "target", "cmd_vel", *renamed])
+    required = dict.fromkeys(["odom", "path" if "path" in logs else "target", "cmd_vel", *renamed])
     missing = [names[key] for key in required if key not in logs and key not in _TREE]
     if not logs.keys() & {"contact", "taxels"}:
         missing.append(f"{names['contact']} or {names['taxels']}")
@@ -295,7 +311,7 @@ def _steps(path: Path, renamed: dict[str, str]) -> dict[str, np.ndarray]:
     _check_size(count * sum(s.values.shape[1] + 32 for s in series.values()))
     rows = {"cmd_vel": commands} | {key: s.latest(commands.time) for key, s in series.items()}
     for key, row in rows.items():
-        if key == "odom" or (key != "target" and len(logs[key]) > count / 4):  # a stream
+        if key == "odom" or (key not in _RARE and len(logs[key]) > count / 4):  # a stream
             late = commands.time - row.time > 1e9 * _STALE
             commands.refuse(late, f"no message on {row.topic} in the {_STALE:g} s before that")
         row.check(_MAX_TILT if key == "odom" else None)
@@ -453,7 +469,8 @@ def _to_frames(rows: Mapping[str, _Series], edges: Callable[[], _Edges], static:
     odom = rows["odom"]
     odom.refuse((odom.frames != odom.frames[0]).any(axis=1), "a change of frames")
     world, base = odom.frames[0][0] or "odom", odom.frames[0][1] or "base_link"
-    goals = {"target": world, "object": world, "contact": base, "force": base, "cmd_vel": base}
+    goals = dict.fromkeys(("target", "path", "object"), world)
+    goals |= dict.fromkeys(("contact", "force", "cmd_vel"), base)
     for key in [key for key in goals if key in rows]:
         row, goal = rows[key], goals[key]
         for frame in sorted({*row.frames[:, 0]} - {"", goal}):
@@ -464,8 +481,11 @@ def _to_frames(rows: Mapping[str, _Series], edges: Callable[[], _Edges], static:
                 bad = abs(matrices - np.eye(4)).max(axis=(1, 2)) > _SAME
                 part.refuse(bad, f"the frame {frame}", f"publish commands in {goal}")
             else:
-                points = np.insert(part.values[:, :3], 3, key != "force", axis=1)
-                row.values[at, :3] = np.einsum("nij,nj->ni", matrices, points)[:, :3]
+                size = part.values.shape[1] if key == "path" else 3
+                points = part.values[:, :size].reshape(len(part.values), -1, 3)
+                points = np.insert(points, 3, key != "force", axis=2)
+                moved = np.einsum("nij,nkj->nki", matrices, points)[..., :3]
+                row.values[at, :size] = moved.reshape(len(points), size)
 
 
 def _transform(row: _Series, frame: str, goal: str, edges: _Edges, static: str) -> np.ndarray:

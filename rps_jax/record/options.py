@@ -150,7 +150,7 @@ def _noun(kind: Any) -> str:
     if origin in (tuple, Sequence):
         count = "several" if origin is Sequence or Ellipsis in inner else str(len(inner))
         items = dict.fromkeys(_noun(item).partition(" ")[2] for item in _alternatives(inner[0]))
-        return f"{count} {' or '.join(f'{item}s' for item in items)}"
+        return f"{count} {' or '.join(item.removesuffix('s') + 's' for item in items)}"
     kind = origin or kind
     name = getattr(kind, "__name__", str(kind))
     example = f", as {kind.EXAMPLE}" if hasattr(kind, "EXAMPLE") else ""

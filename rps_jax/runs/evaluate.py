@@ -20,7 +20,7 @@ from rps_jax.errors import InputError
 from rps_jax.record import cache, provenance
 from rps_jax.record import options as options_
 from rps_jax.robot.robot import RobotLike
-from rps_jax.runs.question import Split, name_or_custom, seed_of
+from rps_jax.runs.question import Split, name_or_custom, seed_of, task_attribute
 from rps_jax.trials import batch
 from rps_jax.trials.batch import BatchOptions
 from rps_jax.trials.progress import Bar, ProgressCallback, Timing, is_interactive
@@ -115,6 +115,7 @@ def evaluate(
         "world": ("world", request.worlds, {"long_name": WORLD}),
     }
     attrs = provenance.attributes() | {"domain": name_or_custom(domain), "split": split}
+    attrs |= task_attribute(ranges)
     attrs |= {"seed": setting.seed, "engine": setting.engine, "law": type(params).__name__}
     return xr.Dataset(variables, {"pose": POSE} | indices | tried | drawn, attrs)
 

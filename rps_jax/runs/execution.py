@@ -22,7 +22,6 @@ from rps_jax.runs.plan import Plan, Shard, open_run, shard_chunks
 from rps_jax.runs.results import Results, name_of
 from rps_jax.trials.batch import BatchSize
 from rps_jax.trials.progress import Progress, ProgressCallback, no_progress
-from rps_jax.trials.results import UNITS
 from rps_jax.trials.rollout import rollout
 
 # Runs the missing chunks of a shard in a folder, and may return their results.
@@ -93,7 +92,7 @@ def run_plan(
         results.read(folder, list(chunks))
         trials = np.unravel_index(np.concatenate(list(chunks.values())), results.shape)
         law, world = (xr.DataArray(index, dims="row") for index in trials)
-        return results.dataset()[list(UNITS)].isel(law=law, world=world)
+        return results.dataset().isel(law=law, world=world)
 
 
 def write_dataset(

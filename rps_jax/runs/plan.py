@@ -27,7 +27,7 @@ from rps_jax.control.base import LawParams
 from rps_jax.errors import InputError
 from rps_jax.record import files, provenance
 from rps_jax.record import folder as run_folder
-from rps_jax.runs.question import name_or_custom
+from rps_jax.runs.question import name_or_custom, task_attribute
 from rps_jax.trials.batch import WorldBatch
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.worlds import drawn_scene, drawn_worlds
@@ -109,7 +109,7 @@ class Plan:
     def configuration(self) -> dict[str, Any]:
         """Return everything that the results depend on, as JSON."""
         record = {
-            "domain": dataclasses.asdict(self.domain),
+            "domain": domain.to_json(self.domain),
             "worlds": self.worlds,
             "laws": {name: registry.params_to_json(params) for name, params in self.laws.items()},
             "part": self.part,
@@ -197,7 +197,8 @@ def load_plan(folder: Path) -> Plan:
 def attributes_of(plan: Plan) -> dict[str, str | int]:
     """Return seed, engine and domain of a plan, as attributes of results."""
     setting, name = plan.setting, name_or_custom(plan.domain)
-    return {"seed": setting.seed, "engine": setting.engine, "domain": name}
+    record = {"seed": setting.seed, "engine": setting.engine, "domain": name}
+    return record | task_attribute(plan.domain)
 
 
 def draw(plan: Plan, index: ArrayLike) -> Draw:

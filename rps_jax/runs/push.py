@@ -44,7 +44,7 @@ from rps_jax.trials.pushes import Trajectory
 from rps_jax.trials.results import trace_dataset
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import object_pose, p_world_contact
-from rps_jax.world import paper
+from rps_jax.world import paper, tasks
 from rps_jax.world.scene import Scene
 
 if TYPE_CHECKING:
@@ -82,10 +82,13 @@ class Trace(Trajectory):
         if outcome.diverged:
             cause = "the law returned NaN" if outcome.nan_twist else "the physics ran away"
             return f"diverged at {float(outcome.time):.2f} s, since {cause}"
+        failed = [
+            f", {text}" for name, text in tasks.FAILURES.items() if outcome.task.get(name, 0) > 0
+        ]
         return (
             f"target ({x:g}, {y:g}) m {'reached' if outcome.success else 'not reached'} at "
             f"{float(outcome.time):.1f} s, least distance {float(outcome.min_distance):.3f} m, "
-            f"contact lost for {float(outcome.contact_lost_time):.1f} s"
+            f"contact lost for {float(outcome.contact_lost_time):.1f} s{''.join(failed)}"
         )
 
     @property
@@ -216,6 +219,7 @@ def recorded_law(law: Law, senses: Senses = "taxels") -> Law:
 def bag_steps(trajectory: Trajectory, obs: Any, period: float) -> Iterator[Step]:
     """Yield the steps of a bag of a recorded trial, with its observations (T, ...)."""
     snapshots, touch = trajectory.snapshots, obs.touch
+    lines = trajectory.world.task.lines()
     extra = {"signal", "f_robot", "p_world_object", "r_object"} & set(obs._fields)
     for i in range(len(snapshots.time)):
         position, yaw = object_pose(snapshots.qpos[i])
@@ -228,6 +232,7 @@ def bag_steps(trajectory: Trajectory, obs: Any, period: float) -> Iterator[Step]
             [np.broadcast_to(v, snapshots.time.shape)[i] for v in snapshots.twist],
             object_pose=[*np.asarray(position), float(yaw)],
             **{name: getattr(obs, name)[i] for name in extra},
+            **lines,
         )
 
 

@@ -57,7 +57,8 @@ from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import Rules
 from rps_jax.world import domain as domains
 from rps_jax.world.domain import Domain, DomainLike
-from rps_jax.world.tasks import TaskLike
+from rps_jax.world.tasks import TaskLike, parse_task
+from rps_jax.world.tasks.reach import Reach
 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
@@ -290,7 +291,8 @@ class Question(Command[T]):
         if (domain := getattr(self, "domain", None)) is not None:
             several = [domain] if isinstance(domain, str | Domain) else domain
             record["domain"] = " ".join(map(name_or_custom, several))
-        return record
+        ranges = getattr(self, "ranges", None) or next(iter(getattr(self, "domains", ())), None)
+        return record | (task_attribute(ranges) if isinstance(ranges, Domain) else {})
 
     # --- execution -------------------------------------------------------------------------
 
@@ -339,7 +341,9 @@ class Question(Command[T]):
     def fields_as_json(self) -> dict[str, Any]:
         """Return the fields as JSON, with laws by their parameters and a domain by its ranges."""
         names = [f.name for f in fields(self)]
-        ignored = (*_EXECUTION_OPTIONS, *self.IGNORED_FIELDS)
+        ignored = [*_EXECUTION_OPTIONS, *self.IGNORED_FIELDS]
+        if parse_task(getattr(self, "task", None) or "reach") == Reach():
+            ignored.append("task")  # as in the manifests of earlier versions
         return {name: self._field_as_json(name) for name in names if name not in ignored}
 
     def _field_as_json(self, name: str) -> object:
@@ -348,8 +352,10 @@ class Question(Command[T]):
             return registry.params_to_json(params)
         if name == "laws" and isinstance(self, MultiLawQuestion):
             return {k: registry.params_to_json(v) for k, v in self.chosen.items()}
+        if name == "task":
+            return dataclasses.asdict(parse_task(value))
         if name == "domain" and isinstance(value, str | Domain):
-            return dataclasses.asdict(domains.parse_domain(value))
+            return domains.to_json(domains.parse_domain(value))
         return value.to_json() if isinstance(value, Setting) else options.to_json(value)
 
 
@@ -362,8 +368,8 @@ class BagQuestion(Question[T]):
 
     topics: TopicsLike = option((), kw_only=True, flag="topic")
     """Topic of a bag that has another name, as odom=/ridgeback/odom; the option may be repeated.
-    The keys are odom, target, contact, taxels, force, object, cmd_vel, tf and tf_static. In Python
-    a dict: topics={"odom": "/ridgeback/odom"}."""
+    The keys are odom, target, path, contact, taxels, force, object, cmd_vel, tf and tf_static. In
+    Python a dict: topics={"odom": "/ridgeback/odom"}."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -418,8 +424,18 @@ class MultiLawQuestion(SimulationQuestion[T]):
         return registry.resolve_laws(self.laws)
 
 
+@dataclass(frozen=True, kw_only=True)
+class TaskOption:
+    """Option of questions about random worlds."""
+
+    task: TaskLike | None = None
+    """The task: reach (one target, as in the paper), path (follow a path by a lookahead) or
+    corridor (a path between walls that end a trial when touched), or a JSON file, as of waypoints.
+    Changes follow, as corridor,width=1.2:1.6. By default the domain's, reach."""
+
+
 @dataclass(frozen=True)
-class DomainQuestion(SimulationQuestion[T]):
+class DomainQuestion(TaskOption, SimulationQuestion[T]):
     """Question about random worlds of a domain."""
 
     domain: DomainLike = "wide"
@@ -429,21 +445,20 @@ class DomainQuestion(SimulationQuestion[T]):
     """The robot: ideal, slipping, kairos (the paper's), ridgeback or mpo_500, or a JSON file of its
     size, boards and limits. By default the domain's, which is ideal but in the domain real."""
 
-    task: TaskLike | None = field(default=None, kw_only=True)
-    """The task: reach (one target, as in the paper), path (follow a path by a lookahead) or
-    corridor (a path between walls that end a trial when touched), or a JSON file, as of waypoints.
-    Changes follow, as corridor,width=1.2:1.6. By default the domain's, reach."""
-
     @functools.cached_property
     def ranges(self) -> Domain:
         """The domain, with robot and task."""
         return domains.parse_domain(self.domain, self.robot, self.task)
 
+    @property
+    def worlds_in_words(self) -> str:
+        """Domain and task, for reports."""
+        return ", task ".join([name_or_custom(self.domain), *task_attribute(self.ranges).values()])
+
     def fields_as_json(self) -> dict[str, Any]:
         """Return the fields as JSON; robot and task are part of the domain."""
-        record = super().fields_as_json() | {"domain": dataclasses.asdict(self.ranges)}
-        del record["robot"], record["task"]
-        return record
+        record = super().fields_as_json() | {"domain": domains.to_json(self.ranges)}
+        return {name: x for name, x in record.items() if name not in ("robot", "task")}
 
     def check_engine(self, laws: Sequence[LawParams] = ()) -> None:
         """Raise InputError unless the engine can step these worlds with these laws here."""
@@ -478,6 +493,11 @@ def name_or_custom(item: object) -> str:
     if isinstance(item, str):
         return item
     return next((name for name, domain in domains.DOMAINS.items() if domain == item), "custom")
+
+
+def task_attribute(domain: Domain) -> dict[str, str]:
+    """Return the task of a domain as an attribute of results; nothing for `reach`."""
+    return {} if domain.task == Reach() else {"task": str(domain.task)}
 
 
 def count_true(mask: np.ndarray) -> int:

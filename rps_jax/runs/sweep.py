@@ -32,6 +32,7 @@ from rps_jax.runs.question import (
     Run,
     SimulationQuestion,
     call_of,
+    task_attribute,
 )
 from rps_jax.runs.results import Results, check_table, write_table
 from rps_jax.trials.progress import ProgressCallback
@@ -104,8 +105,9 @@ class SweepQuestion(PlanQuestion, DomainQuestion[xr.Dataset], MultiLawQuestion[x
 def describe_plan(plan: Plan) -> str:
     """Return the number and source of the worlds and the engine, in words."""
     source = f"seed {plan.setting.seed}" if plan.points is None else "points of the unit cube"
+    task = "".join(f", task {text}" for text in task_attribute(plan.domain).values())
     return (
-        f"{plan.worlds:,} worlds, {source}, engine {plan.setting.engine}, steps of "
+        f"{plan.worlds:,} worlds{task}, {source}, engine {plan.setting.engine}, steps of "
         f"{1000 * plan.setting.physics.timestep:g} ms; every law meets the same worlds. "
         "Intervals: Wilson 95 %; bounds of failures: Clopper-Pearson 95 %."
     )
@@ -117,6 +119,9 @@ def plan_sections(plan: Plan, results: xr.Dataset, folder: Path | None) -> list[
     if results.sizes["law"] > 1:
         rows = tables.difference_table(results)
         sections.append(Section("Differences, world by world", "", rows))
+    if rows := tables.task_table(results):
+        text = "Medians and ranges of 90 % of the worlds; of failures the number of trials by kind."
+        sections.append(Section("Outcomes of the task", text, rows))
     if statistics.varied_quantities(results):
         # Imported late: matplotlib takes half a second.
         from rps_jax.analysis.figures.sweeps import success_curves

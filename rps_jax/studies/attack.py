@@ -43,7 +43,6 @@ from rps_jax.runs.question import (
     Run,
     call_of,
     count_true,
-    name_or_custom,
     seed_of,
 )
 from rps_jax.runs.results import load
@@ -163,7 +162,7 @@ class Attack(DomainQuestion[xr.Dataset], LawQuestion[xr.Dataset]):
 
     def intro(self, results: xr.Dataset) -> str:
         return (
-            f"{self.label} in the domain {name_or_custom(self.domain)}: axes "
+            f"{self.label} in the domain {self.worlds_in_words}: axes "
             f"{', '.join(self.axes)}, {self.repeats} noises each."
         )
 

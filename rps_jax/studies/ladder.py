@@ -29,9 +29,9 @@ from rps_jax.robot.robot import RobotLike
 from rps_jax.runs.question import (
     MultiLawQuestion,
     Run,
+    TaskOption,
     call_of,
     count_true,
-    name_or_custom,
     seed_of,
     split_of,
 )
@@ -72,7 +72,7 @@ class _TestSweep(Sweep):
 
 
 @dataclass(frozen=True)
-class Ladder(SweepOptions, MultiLawQuestion[xr.Dataset | xr.DataTree]):
+class Ladder(SweepOptions, TaskOption, MultiLawQuestion[xr.Dataset | xr.DataTree]):
     """Compare laws in the same test worlds, ordered by senses.
 
     No tuner sees test worlds. The result for one domain has the outcomes (law, world), and as
@@ -250,7 +250,7 @@ def score_row(sweep: Sweep, results: xr.Dataset, seed: int) -> list[list[str]]:
     times = results.time.values[0][successes[0]]
     median = f"{np.median(times):.1f} s" if times.size else "-"
     source = f"seed {seed}" if sweep.points is None else "given points"
-    worlds = f"{successes.shape[1]:,} test worlds of {name_or_custom(sweep.domain)}, {source}"
+    worlds = f"{successes.shape[1]:,} test worlds of {sweep.worlds_in_words}, {source}"
     header = ["law", "success", "median time", *rest, "worlds"]
     return [header, [law, rates[0], median, *rates[1:], f"{worlds}, {sweep.setting.engine}"]]
 

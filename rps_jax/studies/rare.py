@@ -26,7 +26,7 @@ from scipy import stats
 from rps_jax import errors
 from rps_jax.analysis.report import Section
 from rps_jax.record.options import option
-from rps_jax.runs.question import DomainQuestion, LawQuestion, Run, call_of, name_or_custom, seed_of
+from rps_jax.runs.question import DomainQuestion, LawQuestion, Run, call_of, seed_of
 from rps_jax.studies.probe import Probe
 from rps_jax.world import points
 
@@ -240,7 +240,7 @@ class Rare(DomainQuestion[xr.Dataset], LawQuestion[xr.Dataset]):
         event = "does not reach its target"
         if self.beyond:
             event = f"misses the target by more than {self.beyond:g} m"
-        return f"{self.label} in the domain {name_or_custom(self.domain)}: a failure {event}."
+        return f"{self.label} in the domain {self.worlds_in_words}: a failure {event}."
 
     def report(self, results: xr.Dataset, run: Run) -> Sequence[Section]:
         text = (

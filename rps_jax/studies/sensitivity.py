@@ -30,7 +30,6 @@ from rps_jax.runs.question import (
     Run,
     call_of,
     count_true,
-    name_or_custom,
     seed_of,
 )
 from rps_jax.runs.sweep import PlanQuestion
@@ -42,7 +41,7 @@ OUTPUTS = {
     "left": "least distance to the target",
 }
 # Name of the factor that joins all quantities of a kind; the quantity "noise" is that of the skin.
-_JOINT_FACTORS = {"shape": "shape", "noise": "key"}
+_JOINT_FACTORS = {"shape": "shape", "path": "path", "noise": "key"}
 MIN_FAILING_POINTS = 30  # base points with a failure that reliable indices need
 # SALib's names of the indices and of the half widths of their intervals.
 _INDICES = {"first": "S1", "first_reach": "S1_conf", "total": "ST", "total_reach": "ST_conf"}
@@ -117,7 +116,7 @@ class Sensitivity(PlanQuestion, DomainQuestion[xr.Dataset], LawQuestion[xr.Datas
     def intro(self, results: xr.Dataset) -> str:
         design = f"{self.base} for each of {len(self.factors)} factors and two more"
         return (
-            f"{self.label} in the domain {name_or_custom(self.domain)}: {self.plan.worlds:,} "
+            f"{self.label} in the domain {self.worlds_in_words}: {self.plan.worlds:,} "
             f"worlds, {design}; {count_true(results.success.values == 0)} fail."
         )
 

@@ -80,10 +80,11 @@ class Case(TrialOptions):
         errors.check_number("shift time", self.shift.time, at_least=0, unit="s")
         errors.check_vector("shift", self.shift.p_robot, at_least=-5, at_most=5, unit="m")
         scene.check_target(self.target, self.base.shell)
-        self.challenge.check_size(float(self.base.shell.half[1]), lambda: 0.0)
-        if not self.challenge.HAS_TARGET and (self.target, self.bearing) != (_TARGET, 0.0):
-            rule = f"the task {self.challenge.kind} has its own end; leave target and bearing out"
-            raise errors.not_allowed("target", self.target, rule)
+        self.challenge.check_room(self.base.shell, lambda: (scene.size_of(name)[0], 0.0))
+        if tuple(self.target) != _TARGET:
+            self.challenge.check_target("target", self.target)
+        if self.bearing:
+            self.challenge.check_target("bearing", self.bearing)
 
     @cached_property
     def object_name(self) -> str:

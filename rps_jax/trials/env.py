@@ -27,7 +27,7 @@ from rps_jax.control.base import check_finite_leaves
 from rps_jax.control.laws import rps
 from rps_jax.control.laws.rps import RPSParams
 from rps_jax.control.learned import features
-from rps_jax.control.observation import TaxelObservation, Twist
+from rps_jax.control.observation import Observation, TaxelObservation, Twist
 from rps_jax.engines import device
 from rps_jax.engines.base import ControlPeriod
 from rps_jax.engines.mjx_colliders import mjx
@@ -51,12 +51,13 @@ from rps_jax.world.tasks import TaskLike
 class Reward(NamedTuple):
     """Weights of the terms of the reward."""
 
-    # [1/m] of the decrease of the distance from contact point to target since the last contact
+    # [1/m] of the decrease of the way from contact point to target since the last contact; of a
+    # path it is the way along the path
     progress: float = 1.0
     no_contact: float = 0.05  # [1/s] cost without contact, which equals progress at 5 cm/s
     success: float = 1.0  # [1] once, for a success
     # Terms that use the true state, which a law does not observe.
-    object: float = 0.0  # [1/m] of the decrease of the distance from outline to target
+    object: float = 0.0  # [1/m] of the decrease of the way from outline to target
     behind: float = 0.0  # [1] of the increase of the cosine between directions to target and object
 
 
@@ -88,7 +89,8 @@ class PushEnv:
 
     Observation (T + 2,): the T taxels of the robot, the paper's 42, in the order of `Shell.taxels`,
     each the filtered relative change of its capacitance [1], 0 if it is dead; then the target
-    (x, y) [m] in the robot's frame, at the pose that the odometry estimates.
+    (x, y) [m] in the robot's frame, at the pose that the odometry estimates. Of a path, it is the
+    point of the path a lookahead ahead of the contact.
 
     Action (3,): the twist (v_x, v_y, omega) in the robot's frame, in units of the parameters'
     v_max, v_max and omega_max. (v_x, v_y) is scaled down to a norm of 1, omega is clipped to +-1.
@@ -97,7 +99,8 @@ class PushEnv:
     from where the contact was lost. So the sum of rewards measures how much nearer the object is.
 
     Done: by the rules of `setting` (the paper's: success, 300 s, or 150 s without contact; or
-    the object fell over), or if the physics diverged. A state that is done does not change, and
+    the object fell over), if the physics diverged, or if the task failed, as at the touch of a
+    wall. `data.task.outcomes()` has the task's outcomes. A state that is done does not change, and
     its rewards are 0.
 
     `step` has derivatives by state and action with every engine that has them; with the others
@@ -188,7 +191,8 @@ class PushEnv:
             - self.weights.no_contact * self.dt * soft.not_(measured.reading.in_contact)
             + self.weights.success * current.success
         )
-        terms = self._true_state_terms(world, previous, current)
+        targets = state.info["observation"].touch, measured.observation
+        terms = self._true_state_terms(world, previous, current, *targets)
         for weight, term in zip(self.weights[3:], terms, strict=True):
             reward += weight * term if weight else 0.0
         obs = self._observation(world, current, measured)
@@ -215,30 +219,32 @@ class PushEnv:
         return rps.saturate(self.params, twist)
 
     def _true_state_terms(
-        self, world: World, previous: Trial, current: Trial
+        self, world: World, previous: Trial, current: Trial, *touches: Observation
     ) -> tuple[jax.Array, jax.Array]:
         """Return the changes of the terms `object` [m] and `behind` [1] of the reward."""
 
-        def terms(state: Trial) -> tuple[jax.Array, jax.Array]:
+        def terms(state: Trial, touch: Observation) -> tuple[jax.Array, jax.Array]:
             p_object, _ = trial.object_pose(state.qpos)
-            to_target = planar.norm(world.p_world_target - p_object)
-            gap = to_target - fp.circumradius(world.footprint)
-            ways = p_object - state.qpos[:2], world.p_world_target - state.qpos[:2]
+            way = world.task.remaining(state.task, world.p_world_target, p_object)
+            gap = way - fp.circumradius(world.footprint)
+            ways = p_object - state.qpos[:2], touch.p_world_target - state.qpos[:2]
             lengths = jnp.maximum(planar.norm(ways[0]) * planar.norm(ways[1]), 1e-6)
             return jnp.maximum(gap, 0.0), jnp.dot(*ways) / lengths
 
-        (old_gap, old_cosine), (gap, cosine) = terms(previous), terms(current)
+        (old_gap, old_cosine), (gap, cosine) = map(terms, (previous, current), touches)
         return old_gap - gap, cosine - old_cosine
 
     def _observe(self, world: World, previous: Trial) -> tuple[Trial, Measurement]:
-        """Sense and judge, unless the trial has ended; `law_state` is the last distance felt."""
+        """Sense and judge, unless the trial has ended; `law_state` is the last way felt [m]."""
         loop = ControlLoop(self.setting.physics, self.setting.rules)
         judged, measured = trial.observe(world, self.params, previous, loop)
         contact, last = measured.reading.in_contact, previous.law_state
-        distance = jnp.where(contact > 0.5, measured.distance, last)
+        p_world_contact = trial.contact_of(judged.qpos, measured.reading.p_robot_contact)
+        way = world.task.remaining(judged.task, world.p_world_target, p_world_contact)
+        distance = jnp.where(contact > 0.5, way, last)
         if self.smooth:  # a first contact switches
             touched = jnp.isfinite(last)
-            mixed = soft.where(contact, measured.distance, jnp.where(touched, last, 0.0))
+            mixed = soft.where(contact, way, jnp.where(touched, last, 0.0))
             distance = jnp.where(touched, mixed, distance)
         judged = judged._replace(law_state=distance)
         frozen = jax.tree.map(lambda a, b: jnp.where(previous.done, a, b), previous, judged)
@@ -249,6 +255,12 @@ class PushEnv:
         skin = world.skin, current.skin, trial.outline(world, current.qpos)
         touch = measured.observation._replace(period=jnp.asarray(self.dt))
         return features.taxel_observation(touch, measured.reading, *skin)
+
+    def has_timed_out(self, data: Trial) -> jax.Array:
+        """Return whether trials (...) ended by a time limit, and not by success or failure."""
+        horizon, max_lost, _ = self.setting.rules
+        late = (data.steps * self.dt >= horizon) | (data.lost_steps * self.dt > max_lost)
+        return data.done & late & ~(data.success | data.tipped | data.diverged)
 
     # --- properties ---
 
@@ -338,11 +350,12 @@ class PushEnv:
         images = []
         for index, states in itertools.groupby(trajectory, lambda s: int(s.info["index"])):
             shown = list(states)
-            target = np.asarray(shown[0].info["world"].p_world_target)
+            world: World = jax.device_get(shown[0].info["world"])
             poses, size = [np.asarray(s.data.qpos) for s in shown], (width, height)
-            view = camera or "oblique"
+            view, lines = camera or "oblique", world.task.lines()
+            inputs = self._scene(index), poses
             images += video.images(
-                self._scene(index), poses, p_world_target=target, size=size, camera=view
+                *inputs, p_world_target=world.p_world_target, lines=lines, size=size, camera=view
             )
         return images
 

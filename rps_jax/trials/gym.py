@@ -63,7 +63,8 @@ class GymPush(gymnasium.Env[np.ndarray, np.ndarray]):
 
     Observation, Box (T + 2,) float32: the T taxels of the robot, the paper's 42, in the order of
     `Shell.taxels`, each the filtered relative change of its capacitance [1]; then the target (x, y)
-    [m] in the robot frame (x ahead, y to the left), by odometry.
+    [m] in the robot frame (x ahead, y to the left), by odometry; of the task `path` it is the point
+    of the path a lookahead ahead.
 
     Action, Box (3,) float32 within -1 and 1: the twist (v_x, v_y, omega) in the robot's frame, in
     units of v_max [m/s], v_max and omega_max [rad/s] of `params`. It is held for `hold` [s]. A
@@ -71,10 +72,12 @@ class GymPush(gymnasium.Env[np.ndarray, np.ndarray]):
 
     Reward [1]: `weights`, a `Reward` of `rps_jax.trials.env`; by default that of `rps learn`.
 
-    Terminated: the object arrived or fell over, or the physics diverged. Truncated: a time limit of
+    Terminated: the object arrived or fell over, the physics diverged, or the task failed, as at the
+    touch of a wall. Truncated: a time limit of
     the rules was reached, for the trial or for the time without contact.
 
-    Info: `is_success`, `time` [s] since the start, `in_contact`, and `world`, its index.
+    Info: `is_success`, `time` [s] since the start, `in_contact`, `world`, its index, and the
+    outcomes of the task, as `progress` of a path; those without a value are left out.
 
     Raises:
       InputError: an option that `PushEnv` does not allow, a `hold` shorter than a control period,
@@ -119,8 +122,8 @@ class GymPush(gymnasium.Env[np.ndarray, np.ndarray]):
 
     @staticmethod
     def _info(infos: Mapping[str, Any]) -> dict[str, Any]:
-        """Return the infos of the only world, without masks."""
-        return {name: x[0].item() for name, x in infos.items() if not name.startswith("_")}
+        """Return the infos of the only world that it has, without masks."""
+        return {name: infos[name][0].item() for name in infos if infos.get(f"_{name}", [False])[0]}
 
     def render(self) -> Any:
         """Return an image (240, 320, 3) uint8 in the mode rgb_array, else None."""
@@ -210,14 +213,14 @@ class GymPushVector(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
     def observe(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, dict[str, np.ndarray]]:
         """Return observations (num_envs, T + 2), terminated and truncated flags, and infos."""
         data, metrics = self.state.data, self.state.metrics
-        ended = np.array(data.success | data.tipped | data.diverged)
         infos = {
             "is_success": data.success, "time": data.steps * self.push_env.dt,
             "in_contact": metrics["in_contact"] > 0, "world": self.state.info["index"],
+            **data.task.outcomes(),
         }  # fmt: skip
         infos = {name: np.array(values) for name, values in infos.items()}
-        done = np.array(data.done)
-        return np.array(self.state.obs, np.float32), done & ended, done & ~ended, infos
+        done, late = np.array(data.done), np.array(self.push_env.has_timed_out(data))
+        return np.array(self.state.obs, np.float32), done & ~late, late, infos
 
     def images(self) -> list[np.ndarray]:
         """Return an image (240, 320, 3) uint8 of each world."""
@@ -305,8 +308,12 @@ class GymPushVector(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
 
     @staticmethod
     def _with_masks(infos: Mapping[str, Any], where: np.ndarray) -> dict[str, Any]:
-        """Return infos, each with the mask of the worlds that have it."""
-        return dict(infos) | {f"_{name}": where.copy() for name in infos}
+        """Return infos, each with the mask of the worlds that have it; none has NaN."""
+        masks = {
+            name: where & ~np.isnan(x) if np.asarray(x).dtype.kind == "f" else where.copy()
+            for name, x in infos.items()
+        }
+        return dict(infos) | {f"_{name}": mask for name, mask in masks.items()}
 
 
 if "rps_jax/Push-v0" not in gymnasium.registry:

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from rps_jax import engines
+from rps_jax import engines, errors
 from rps_jax.control.base import Law, LawParams
 from rps_jax.control.laws.rps import RPSParams
 from rps_jax.engines import device, programs
@@ -108,6 +108,10 @@ def build(
         key=jax.device_get(jax.vmap(partial(jax.random.fold_in, root))(trials)),
         odometry=_stack([Odometry()] * len(cases)),
     )
+    has_end = not cases[0].challenge.HAS_TARGET
+    for i in np.flatnonzero(trial.fails_at_start(batch.worlds) if has_end else ()).tolist():
+        rule = "a wall crosses base or object at the start; widen it, or start the path ahead"
+        raise errors.not_allowed("task", cases[i].challenge, rule)
     params = _stack([case.params for case in cases], jnp.result_type(float))
     return batch._replace(params=params)
 

@@ -27,6 +27,7 @@ from rps_jax.trials.trial import ControlLoop, Snapshot, World
 from rps_jax.trials.worlds import drawn_worlds, soften_skins
 from rps_jax.world import draws
 from rps_jax.world.domain import DomainLike, parse_domain
+from rps_jax.world.tasks import TaskLike
 
 
 @device.standard_jax()
@@ -35,6 +36,7 @@ def draw_worlds(
     worlds: int = 1,
     *,
     robot: RobotLike | None = None,
+    task: TaskLike | None = None,
     setting: Setting = Setting(),
 ) -> WorldBatch:
     """Return random worlds of one object, staged for an engine, for `rollout`.
@@ -43,6 +45,7 @@ def draw_worlds(
       domain: ranges from which worlds are drawn, with one object, as wide,objects=random_box.
       worlds: number of worlds n, of indices 0, 1, ...
       robot: its name, as kairos, or a JSON file; None: the domain's.
+      task: its name, as path, with changes; None: the domain's.
       setting: engine, physics and the seed of the worlds.
 
     Returns:
@@ -59,7 +62,7 @@ def draw_worlds(
     """
     check_arguments(draw_worlds, locals())
     device.check_process()
-    ranges = parse_domain(domain, robot)
+    ranges = parse_domain(domain, robot, task)
     errors.check_count("worlds", worlds, at_most=10_000_000)
     if len(ranges.objects) != 1:
         rule = "worlds of one program have one object; name it, as wide,objects=random_box"

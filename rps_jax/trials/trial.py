@@ -227,6 +227,28 @@ def outline(world: World, qpos: Float[Array, "10"]) -> Footprint:
     return fp.place(world.footprint, p_robot_object, object_yaw - yaw)
 
 
+def contact_of(qpos: Float[Array, "10"], p_robot_contact: Float[Array, "2"]) -> Float[Array, "2"]:
+    """Return a contact point in the world [m]."""
+    return qpos[:2] + planar.rotate(qpos[2], p_robot_contact)
+
+
+def place_of(
+    world: World, qpos: Float[Array, "10"], p_robot_contact: Float[Array, "2"], touches: Array
+) -> Place:
+    """Return what a task judges, at the positions qpos."""
+    contact = contact_of(qpos, p_robot_contact), touches
+    base = qpos[JOINTS.base], world.skin.shell.half
+    return Place(world.p_world_target, *contact, *base, *object_pose(qpos), world.footprint)
+
+
+@jax.jit
+@jax.vmap
+def fails_at_start(world: World) -> Bool[Array, ""] | bool:
+    """Return whether the task has failed in each of several worlds before the first step."""
+    place = place_of(world, world.qpos, jnp.zeros(2), jnp.zeros((), bool))
+    return world.task.step(world.task.start(), place)[1].failed
+
+
 class Measurement(NamedTuple):
     """Readings of skin and odometry in one control step."""
 
@@ -256,12 +278,7 @@ def observe(
 
     touch = reading.contact_type != NONE
     lost_steps = trial.lost_steps + (~touch & (trial.contact_steps > 0))
-    pose = trial.qpos[JOINTS.base]
-    p_world_contact = pose[:2] + planar.rotate(pose[2], reading.p_robot_contact)
-    place = Place(
-        *(world.p_world_target, p_world_contact, touch, pose, world.skin.shell.half),
-        *(*object_pose(trial.qpos), world.footprint),
-    )
+    place = place_of(world, trial.qpos, reading.p_robot_contact, touch)
     task, aim = world.task.step(trial.task, place)
     observation = observation._replace(p_world_target=aim.p_world_target)
     success = touch & (distance < params.d_success) & aim.at_end

@@ -28,7 +28,7 @@ from rps_jax.errors import InputError
 from rps_jax.record import cache, provenance
 from rps_jax.record.options import check_arguments
 from rps_jax.robot.robot import RobotLike
-from rps_jax.runs.question import name_or_custom
+from rps_jax.runs.question import name_or_custom, task_attribute
 from rps_jax.trials import trial
 from rps_jax.trials.results import WORLD, labelled
 from rps_jax.trials.score import Objective
@@ -47,6 +47,7 @@ from rps_jax.world.domain import (
     unit_of,
 )
 from rps_jax.world.draws import Draw
+from rps_jax.world.tasks import TaskLike
 
 Score = Callable[[Snapshot], Any]  # of a trajectory (T, ...) of one world: one number ()
 ScoreLike = Score | Objective
@@ -79,6 +80,7 @@ def value_and_grad(
     horizon: float = 5.0,
     smooth: bool = True,
     robot: RobotLike | None = None,
+    task: TaskLike | None = None,
     setting: Setting = Setting(),
 ) -> xr.Dataset:
     """Compute a score and its exact gradient in each of several random worlds.
@@ -101,6 +103,7 @@ def value_and_grad(
       horizon: duration of a trial [s].
       smooth: whether law and skin have their smooth forms.
       robot: its name, as kairos, or a JSON file; None: the domain's.
+      task: its name, as path, with changes; None: the domain's. Paths need a function as `score`.
       setting: engine, physics, rules, and the seed of the worlds.
 
     Returns:
@@ -127,7 +130,7 @@ def value_and_grad(
     """
     check_arguments(value_and_grad, locals())
     device.check_process()
-    ranges, chosen = parse_domain(domain, robot), registry.resolve_laws(laws)
+    ranges, chosen = parse_domain(domain, robot, task), registry.resolve_laws(laws)
     errors.check_count("worlds", worlds, at_most=1_000_000)
     steps, engine = count_steps(horizon, setting), engines.get(setting.engine)
     engine.check_traced()
@@ -141,6 +144,8 @@ def value_and_grad(
     if isinstance(score, Objective) and not all(hasattr(p, "v_max") for p in chosen.values()):
         rule = "a law without a parameter v_max needs a function of the snapshots"
         raise errors.not_allowed("score", "an Objective", rule)
+    if isinstance(score, Objective):
+        ranges.task.check_target("task", ranges.task, "give a function as score")
     cache.use_cache_if_requested()
     numbers, index = several[0], np.arange(worlds)
     value, bend = np.empty((len(chosen), worlds)), np.empty((worlds, len(numbers)))
@@ -193,7 +198,7 @@ def value_and_grad(
     attrs = provenance.attributes() | {
         "domain": name_or_custom(domain), "seed": setting.seed, "engine": setting.engine,
         "gradient": setting.gradient, "horizon": steps * setting.physics.control_period,
-        "skin_temperature": temperature, "notes": notes,
+        "skin_temperature": temperature, "notes": notes, **task_attribute(ranges),
     }  # fmt: skip
     return xr.Dataset(variables, coords, attrs)
 
@@ -221,11 +226,13 @@ def coordinates_of(
                 label = f"{name}[{','.join(map(str, at))}]" if at else name
                 numbers.append(Coordinate(label, _unit_of_leaf(params, leaf), leaf, at, True))
         elif name in _VECTORS:
+            if name == "target":
+                domain.task.check_target("wrt", name)
             numbers += [Coordinate(f"{name}_{x}", "m", name, (i,)) for i, x in enumerate("xy")]
         else:
             rule, quantity = "", QUANTITIES.get(name)
-            if name in _DISCRETE or (quantity and quantity.jumps):
-                rule = "worlds change in steps with it, so that it has no derivative"
+            if name in _DISCRETE or (quantity and (quantity.jumps or quantity.owner == "course")):
+                rule = "it has no derivative: worlds change in steps with it, or a path does"
             elif name in domain.idle - {"friction_ground", "friction_robot"}:
                 rule = f"the domain's objects, targets or skin leave no {name} to draw"
             elif quantity and getattr(domain, name) is None:

@@ -208,6 +208,7 @@ class Fit(LawQuestion[Fitted], DomainQuestion[Fitted], LogsQuestion):
     def check(self) -> None:
         _ = seed_of(self.setting.seed, "tune")
         self.check_engine([self.params])
+        self.ranges.task.check_target("task", self.ranges.task, "logs have a target, so omit it")
         if self.method == "neural":
             check_law(self.label, registry.law_of(self.params), self.setting)
         if len({raw.exact for raw in self.raw_logs}) > 1:

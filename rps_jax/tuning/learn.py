@@ -7,7 +7,7 @@ import functools
 import time
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict, dataclass, field, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar
@@ -30,7 +30,7 @@ from rps_jax.engines import device
 from rps_jax.record import files
 from rps_jax.record.checkpoint import Checkpoints
 from rps_jax.record.options import option
-from rps_jax.runs.question import Run, SimulationQuestion, Split, call_of, seed_of
+from rps_jax.runs.question import Run, SimulationQuestion, Split, TaskOption, call_of, seed_of
 from rps_jax.trials.env import SHAPED_REWARD, PushEnv
 from rps_jax.trials.progress import Bar, Progress, ProgressCallback
 from rps_jax.trials.results import labelled
@@ -39,8 +39,8 @@ from rps_jax.trials.trial import Rules
 from rps_jax.tuning import rollout
 from rps_jax.tuning.ppo import PPO
 from rps_jax.tuning.rollout import RunnerState
-from rps_jax.tuning.run import parse_domains
-from rps_jax.world.domain import Domain, DomainLike
+from rps_jax.tuning.run import Domains, parse_domains
+from rps_jax.world.domain import Domain, to_json
 
 _CHECKPOINT = "learner"
 _VALIDATION_RATIO = 10  # learning time between two validations, as a multiple of their time
@@ -67,7 +67,7 @@ UNITS = {
 
 
 @dataclass(frozen=True)
-class Learn(PPO, SimulationQuestion[xr.Dataset]):
+class Learn(PPO, TaskOption, SimulationQuestion[xr.Dataset]):
     """Learn a law from touch by PPO, in random worlds for tuning, and write it as `policy.npz`.
 
     The answer is the learning curve: the metrics of each update (update), with units as
@@ -85,7 +85,7 @@ class Learn(PPO, SimulationQuestion[xr.Dataset]):
     """
 
     TITLE: ClassVar[str] = "A learned law"
-    IGNORED_FIELDS: ClassVar[tuple[str, ...]] = ("minutes", "updates", "every")
+    IGNORED_FIELDS: ClassVar[tuple[str, ...]] = ("minutes", "updates", "every", "task")
     REPORTS_TIMES: ClassVar[bool] = True
     QUICK: ClassVar[Mapping[str, Any]] = {
         "domain": ("wide,objects=random_box",),
@@ -99,7 +99,7 @@ class Learn(PPO, SimulationQuestion[xr.Dataset]):
         "updates": 300,  # on any machine the same number
     }
 
-    domain: DomainLike | Sequence[DomainLike] = ("wide",)
+    domain: Domains = ("wide",)
     """Domains to learn in: wide, real, prisms, hostile, or JSON files of ranges; changes follow
     each, as wide,objects=random_box."""
     minutes: float = option(10.0, 0, 1e5, unit="min")
@@ -127,7 +127,7 @@ class Learn(PPO, SimulationQuestion[xr.Dataset]):
     @functools.cached_property
     def domains(self) -> tuple[Domain, ...]:
         """Domains to learn in."""
-        return parse_domains(self.domain)
+        return parse_domains(self.domain, self.task)
 
     def check(self) -> None:
         if self.out is None:
@@ -148,7 +148,7 @@ class Learn(PPO, SimulationQuestion[xr.Dataset]):
 
     def fields_as_json(self) -> dict[str, Any]:
         """Fields as JSON, with domains by their ranges."""
-        return super().fields_as_json() | {"domain": [asdict(domain) for domain in self.domains]}
+        return super().fields_as_json() | {"domain": list(map(to_json, self.domains))}
 
     def environments(self, split: Split = "tune") -> list[PushEnv]:
         """Return the environments of a split; those for validation have the paper's rules."""

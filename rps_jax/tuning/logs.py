@@ -114,7 +114,7 @@ def read(
         log = _from_trace(source.data, name)
     elif bag.is_bag(path):
         steps = bag.read(path, topics)
-        known = (*COLUMNS, "signal", "period")
+        known = (*COLUMNS, "signal", "period", "path")
         log = RawLog({k: np.asarray(v, float) for k, v in steps.items() if k in known}, False)
     elif path.is_dir():
         log = _from_trace(files.read_results(path), name)
@@ -124,6 +124,8 @@ def read(
         rule = "give a trace, a run folder of rps push, a table FILE.csv, or a bag FILE.mcap"
         raise not_allowed("log", path, rule)
     columns = log.columns
+    if "path" in columns:
+        raise InputError(f"{name} has a path: fit needs a log with one target.")
     # Taxels of other logs are filtered already.
     period = columns.pop("period", np.full(np.size(columns["time"]), np.inf))
     if "signal" in columns:
@@ -151,6 +153,7 @@ def _from_trace(data: xr.Dataset, name: str) -> RawLog:
         "p_robot_contact": data.p_robot_contact.values,
         "twist": np.stack([np.broadcast_to(data[k], len(qpos)) for k in COLUMNS["twist"]], -1),
         "target": data.p_world_target.values,
+        **({"path": data.path.values} if "path" in data else {}),
         "object_pose": np.column_stack([qpos[:, x : x + 2], yaw]),
     }
     return RawLog({k: np.asarray(v, float) for k, v in columns.items()}, True)

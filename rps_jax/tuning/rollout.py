@@ -4,7 +4,7 @@ One update is one program. Every world of every environment takes several action
 held for several control steps; then `ppo` updates the network.
 
 Curriculum: at a low level targets are near and ahead. The level rises when enough trials succeed,
-up to the targets of the domain.
+up to the targets of the domain. Tasks with a path have no curriculum.
 """
 
 from collections.abc import Sequence
@@ -28,6 +28,7 @@ from rps_jax.trials.env import PushEnv, State
 from rps_jax.trials.trial import World
 from rps_jax.tuning import ppo as ppo_
 from rps_jax.tuning.ppo import PPO, TrainState, Transition
+from rps_jax.world.tasks.reach import Nothing
 
 T = TypeVar("T")
 ActCarry = tuple[State, TouchState, jax.Array]  # states, touch states, rewards (N,)
@@ -85,7 +86,9 @@ def start(
 
 
 def ease(world: World, level: jax.Array) -> World:
-    """Return a world with a nearer target, more ahead; unchanged at a level of 1."""
+    """Return a world with a nearer target, more ahead; unchanged at level 1, or with a path."""
+    if not isinstance(world.task, Nothing):
+        return world
     x, y = world.p_world_target
     distance, bearing = jnp.hypot(x, y), level * jnp.arctan2(y, x)
     near = jnp.minimum(distance, 0.8)  # [m] outside robot and object
@@ -177,7 +180,7 @@ def _episode_stats(env: PushEnv, batch: EnvBatch) -> tuple[Stats, jax.Array]:
         "earned": jnp.where(data.done, batch.earned, 0.0),  # [1] rewards
         "touching": batch.states.metrics["in_contact"],  # after an action
     }
-    return stats, data.done & (data.success | data.tipped | data.diverged)
+    return stats, data.done & ~env.has_timed_out(data)
 
 
 def _join(parts: Sequence[T]) -> T:

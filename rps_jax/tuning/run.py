@@ -10,7 +10,7 @@ from __future__ import annotations
 import functools
 import shlex
 from collections.abc import Callable, Generator, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar
@@ -30,12 +30,13 @@ from rps_jax.record import files
 from rps_jax.record.options import option
 from rps_jax.runs import evaluate
 from rps_jax.runs.evaluate import Candidates, CandidateScores
-from rps_jax.runs.question import LawQuestion, Run, count_true, seed_of
+from rps_jax.runs.question import LawQuestion, Run, TaskOption, count_true, seed_of
 from rps_jax.trials.progress import Bar, Progress, Timing
 from rps_jax.trials.score import Objective
 from rps_jax.trials.trial import Rules
 from rps_jax.tuning.space import Space, expand_subsets
-from rps_jax.world.domain import Domain, DomainLike, parse_domain
+from rps_jax.world.domain import Domain, DomainLike, parse_domain, to_json
+from rps_jax.world.tasks import TaskLike
 
 TUNED = "tuned.json"  # file of a run folder: the parameters with the best validation
 UNITS = {"compile": "s", "run": "s", "simulated": "s"}
@@ -46,6 +47,7 @@ DIMS = {
     **dict.fromkeys(("center", "params"), ("parameter",)),
 }
 
+Domains = DomainLike | Sequence[DomainLike]
 Results = Mapping[str, np.ndarray | jax.Array | float]  # of a generation, by name
 Proposal = Mapping[str, np.ndarray]  # arrays by name, `vectors` (P, p) among them
 # Runs candidates in the worlds of a tuning.
@@ -55,10 +57,10 @@ Search = Generator[Proposal, Mapping[str, np.ndarray], None]
 
 
 @dataclass(frozen=True)
-class Tuning(LawQuestion[xr.Dataset]):
+class Tuning(TaskOption, LawQuestion[xr.Dataset]):
     """Base of the questions for better parameters of a law."""
 
-    IGNORED_FIELDS: ClassVar[tuple[str, ...]] = ("budget", "generations")
+    IGNORED_FIELDS: ClassVar[tuple[str, ...]] = ("budget", "generations", "task")
     REPORTS_TIMES: ClassVar[bool] = True
     QUICK: ClassVar[dict[str, Any]] = {
         # The few parameters that matter most, since few trials cannot determine more; cylinders on
@@ -74,7 +76,7 @@ class Tuning(LawQuestion[xr.Dataset]):
     law: LawLike = "rps"
     """Law with the initial parameters: a name, as rps, rps_tuned or rps_plus, or a file's class
     with bounds, as my_law.py:MyParams; changes follow, as rps,K_h=0.3 or rps,tuned.json."""
-    domain: DomainLike | Sequence[DomainLike] = ("wide",)
+    domain: Domains = ("wide",)
     """Domains to tune in: paper, hardware, wide, real, prisms, hostile, or JSON files of ranges;
     changes follow each, as wide,mass=3:10."""
     objects: tuple[str, ...] = ("random_box", "random_cylinder")
@@ -102,7 +104,9 @@ class Tuning(LawQuestion[xr.Dataset]):
     @functools.cached_property
     def domains(self) -> tuple[Domain, ...]:
         """Domains of the worlds in which candidates are tried."""
-        ranges = tuple(replace(d, objects=self.objects) for d in parse_domains(self.domain))
+        ranges = tuple(
+            replace(d, objects=self.objects) for d in parse_domains(self.domain, self.task)
+        )
         errors.check_each_once("domain", ranges)
         return ranges
 
@@ -161,7 +165,7 @@ class Tuning(LawQuestion[xr.Dataset]):
 
     def fields_as_json(self) -> dict[str, Any]:
         """Fields as JSON, with the names of all tuned parameters and the ranges of all domains."""
-        ranges = [asdict(domain) for domain in self.domains]
+        ranges = list(map(to_json, self.domains))
         return super().fields_as_json() | {"tuned": self.space.names, "domain": ranges}
 
     def progress_bar(self) -> Bar:
@@ -320,7 +324,7 @@ def _is_of_proposal(results: xr.Dataset, vectors: np.ndarray) -> bool:
     return np.allclose(results.vectors, vectors, rtol=1e-4, atol=1e-4, equal_nan=True)
 
 
-def parse_domains(domain: DomainLike | Sequence[DomainLike]) -> tuple[Domain, ...]:
+def parse_domains(domain: Domains, task: TaskLike | None = None) -> tuple[Domain, ...]:
     """Return one or several domains by their names, files or ranges."""
     several = [domain] if isinstance(domain, str | Domain) else domain
-    return tuple(map(parse_domain, several))
+    return tuple(parse_domain(item, task=task) for item in several)

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, fields, replace
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -119,9 +119,8 @@ class Domain:
             objects = f"{self.feet} with objects = {self.objects}"
             raise errors.not_allowed("domain feet", objects, "only random objects have drawn feet")
         self.robot.check()
-        if self.targets and not self.task.HAS_TARGET:
-            rule = f"the task {self.task.kind} has its own end; leave them out"
-            raise errors.not_allowed("domain targets", self.targets, rule)
+        if self.targets:
+            self.task.check_target("domain targets", self.targets, "leave them out")
         for target in self.targets:
             scene.check_target(target, self.robot.shell)
         check_ranges(self, "domain ")
@@ -133,21 +132,18 @@ class Domain:
         if self.task.HAS_TARGET and not self.targets and self.distance.low <= reach:
             rule = f"targets must lie outside the robot, which reaches {reach:.2f} m"
             raise errors.not_allowed("domain distance (low)", f"{self.distance.low:g} m", rule)
+        self.task.check_room(self.robot.shell, self._room)
 
-        self.task.check_size(float(self.robot.shell.half[1]), self._widest)
-
-    def _widest(self) -> float:
-        """Return the greatest width of an object [m], along its axes."""
-        widths = [0.0]
-        for name in self.objects:
-            if name in RANDOM:
-                ratio = max(self.aspect.high, 1 / self.aspect.low)
-                widths.append(2 * self.size.high * math.sqrt(1 if "cylinder" in name else ratio))
-            else:
-                shape = scene.solid_of(scene.load(name))
-                across = np.abs(shape.vertices).max() + float(shape.radius.max())
-                widths.append(2 * float(across))
-        return max(widths)
+    def _room(self) -> tuple[float, float]:
+        """Return the greatest width of objects and their reach to a side at the start [m]."""
+        ratio = max(self.aspect.high, 1 / self.aspect.low)
+        sizes = [scene.size_of(name) for name in self.objects if name not in RANDOM]
+        for name in set(self.objects) & set(RANDOM):
+            stretch = 1.0 if name == "random_cylinder" else math.sqrt(ratio)
+            reach = 1.0 if name == "random_cylinder" else math.sqrt(ratio + 1 / ratio)
+            sizes.append((2 * self.size.high * stretch, self.size.high * reach))
+        width, reach = np.max(sizes, axis=0)
+        return float(width), float(reach + max(map(abs, self.lateral[:2])))
 
     def range_of(self, name: str) -> Range | None:
         """Return the range of a quantity, of the domain itself or of its task; None: not drawn."""
@@ -344,8 +340,14 @@ _FORMS: dict[str, tuple[Callable[[Any], Any], str]] = {
 }
 
 
+def to_json(domain: Domain) -> dict[str, Any]:
+    """Return a domain as JSON; without the task `reach`, as in earlier versions."""
+    record = asdict(domain)
+    return record if domain.task != Reach() else {k: x for k, x in record.items() if k != "task"}
+
+
 def from_json(values: dict[str, Any]) -> Domain:
-    """Return the domain of the JSON of `dataclasses.asdict`, or raise InputError."""
+    """Return the domain of the JSON of `to_json`, or raise InputError."""
     return Domain(**_from_json(values, DOMAINS["wide"]))
 
 

@@ -110,7 +110,8 @@ def draw_at(
         cases=index,
         solid=_solid(name, at, u),
         friction=Friction(at["friction_ground"], at["friction_robot"]),
-        values={name: values for name, values in at.items() if name in ranges},
+        values={name: values for name, values in at.items() if name in ranges}
+        | domain.task.measures(course),
         p_world_target=ends,
         course=course,
         velocity_error=np.stack([at[name] for name in VELOCITY_ERRORS], axis=-1),

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -31,12 +31,13 @@ from rps_jax.world.domain import (
     Range,
     from_json,
     parse_domain,
+    to_json,
     unit_of,
 )
 from rps_jax.world.draws import Draw
-from rps_jax.world.tasks import MORE_NUMBERS
+from rps_jax.world.tasks import MORE_NUMBERS, TaskLike
 
-CoordinateKind = Literal["range", "choice", "shape", "noise"]
+CoordinateKind = Literal["range", "choice", "shape", "path", "noise"]
 FILE = "points.nc"  # in a run folder whose worlds are points
 _CHOICES = ("object", "friction", "target")  # from the lists of a domain
 _OF_PRISMS = ("sides", "turn", *(f"corner_{i}" for i in range(SIDES)))
@@ -48,7 +49,9 @@ class Coordinate(NamedTuple):
     """Coordinate of the cube."""
 
     name: str
-    kind: CoordinateKind  # a range; a choice from a list; corners or feet; the key of all noise
+    kind: (
+        CoordinateKind  # a range; a choice of a list; corners or feet; turns; the key of all noise
+    )
     range: Range  # of the quantity, or from 0 to the length of the list
     unit: str
 
@@ -68,8 +71,8 @@ def coordinates(domain: Domain) -> tuple[Coordinate, ...]:
         if name in idle:
             continue
         if name in MORE_NUMBERS:
-            if name in domain.task.MORE_NUMBERS and not domain.task.idle:
-                labels.append(Coordinate(name, "shape", Range(0, 1), "1"))
+            if name in domain.task.MORE_NUMBERS and name not in domain.task.idle:
+                labels.append(Coordinate(name, "path", Range(0, 1), "1"))
         elif name in (*_OF_PRISMS, *_OF_FEET):
             if domain.feet is not None if name in _OF_FEET else "random_prism" in random:
                 labels.append(Coordinate(name, "shape", Range(0, 1), "1"))
@@ -203,19 +206,24 @@ def points_of(domain: Domain | str, index: ArrayLike, seed: int = 0) -> np.ndarr
 
 
 def worlds_at(
-    domain: Domain | str, u: ArrayLike | xr.Dataset, *, robot: Robot | str | None = None
+    domain: Domain | str,
+    u: ArrayLike | xr.Dataset,
+    *,
+    robot: Robot | str | None = None,
+    task: TaskLike | None = None,
 ) -> xr.Dataset:
     """Return the worlds at points of the unit cube, as `sweep` and `evaluate` take them.
 
     A quantity is `low + u (high - low)`, or `low (high / low)^u` if its range is uniform in the
     logarithm. Kinds of coordinates are `range`; `choice`, of the object, friction or target from
-    the domain's lists; `shape`, of a prism's corners or of feet; and `noise`, the key of the noise
-    of a trial: worlds close to each other in it have unrelated noise.
+    the domain's lists; `shape`, of a prism's corners or of feet; `path`, of its turns; and `noise`,
+    the key of the noise of a trial: worlds close to each other in it have unrelated noise.
 
     Args:
       domain: ranges of the quantities that differ between worlds, or their name, as wide.
       u: (n, q) in [0, 1), a row for each world, a column for each coordinate, in order.
       robot: its name, as kairos, or a JSON file; None: the domain's.
+      task: its name, as path, with changes; None: the domain's.
 
     Returns:
       `u` (world, quantity); for each quantity its `low`, `high`, `log`, `unit` and `kind`; and
@@ -239,7 +247,7 @@ def worlds_at(
       >>> bool((found.mass == drawn.mass).all())
       True
     """
-    domain = parse_domain(domain, robot)
+    domain = parse_domain(domain, robot, task)
     points = check_points(domain, u)
     columns = drawn_columns(domain, 0, points, np.arange(len(points.u)))
     return _labelled(domain, points.u).assign_coords(columns)
@@ -279,7 +287,7 @@ def _labelled(domain: Domain, u: np.ndarray) -> xr.Dataset:
     coords |= {"quantity": quantities, "world": np.arange(len(u))}
     words = {"units": "1", "long_name": "point of the unit cube"}
     data = {"u": (("world", "quantity"), u, words)}
-    return xr.Dataset(data, coords, {"domain": json.dumps(asdict(domain))})
+    return xr.Dataset(data, coords, {"domain": json.dumps(to_json(domain))})
 
 
 def _is_json_of(text: Any, domain: Domain) -> bool:

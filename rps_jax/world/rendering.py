@@ -197,9 +197,11 @@ class SceneRenderer:
     def _add_wall(self, start: np.ndarray, end: np.ndarray) -> None:
         """Add a wall between two points (2,) [m]."""
         x, y = (end - start) / 2
-        size, middle = [math.hypot(x, y), *WALL_HALF], [*((start + end) / 2), WALL_HALF[1]]
+        if not (length := math.hypot(x, y)):  # after the last part of a drawn path
+            return
+        size, middle = [length, *WALL_HALF], [*((start + end) / 2), WALL_HALF[1]]
         wall = self._add_geom("mjGEOM_BOX", np.array(size), np.array(middle), WALL_RGBA)
-        c, s = np.array([x, y]) / size[0]
+        c, s = x / length, y / length
         wall.mat = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
 
     def _add_geom(self, kind: str, size: np.ndarray, position: np.ndarray, rgba: Any) -> Any:

@@ -6,8 +6,9 @@ import contextlib
 import os
 import tempfile
 import warnings
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -62,6 +63,7 @@ def images(
     frames: Iterable[ArrayLike],
     *,
     p_world_target: ArrayLike,
+    lines: Mapping[str, np.ndarray] = MappingProxyType({}),
     size: tuple[int, int] = SIZE,
     camera: str = "oblique",
 ) -> list[np.ndarray]:
@@ -72,6 +74,7 @@ def images(
       frames: qpos (10,): base x, y [m], yaw [rad]; object position [m] and quaternion, in the
         world.
       p_world_target: (2,) [m] of the flag.
+      lines: path and walls of a task, see `Course.lines`.
       size: width and height [px].
       camera: name of a camera of the scene: oblique or above.
 
@@ -79,7 +82,7 @@ def images(
       InputError: a qpos, target, size or camera that cannot be used.
       VideoError: this machine cannot draw.
     """
-    with open_renderers([Tile(scene, p_world_target)], size, camera) as (renderer,):
+    with open_renderers([Tile(scene, p_world_target, lines)], size, camera) as (renderer,):
         return [renderer.draw(qpos, NO_CONTACT) for qpos in frames]
 
 

@@ -28,7 +28,9 @@ QUANTITIES: dict[str, Quantity] = {
 # Columns of random numbers without a range of their own.
 MORE_NUMBERS = {name: i for kind in TASKS.values() for name, i in kind.MORE_NUMBERS.items()}
 OUTCOMES = {name: text for kind in TASKS.values() for name, text in kind.OUTCOMES.items()}
+FAILURES = {name: text for kind in TASKS.values() for name, text in kind.FAILURES.items()}
 
+_FORMS = {bool: "true or false", int: "a whole number", tuple: "pairs of x, y [m]"}  # for errors
 TaskLike = Task | str | Mapping[str, Any]  # or its text: see `parse_task`
 
 
@@ -36,7 +38,8 @@ def parse_task(task: TaskLike) -> Task:
     """Return a task from its name, as path, or from a mapping with its kind.
 
     Changes may follow a name, as `corridor,width=1.2:1.6`, or a JSON file of them, as
-    `path,route.json` with `{"waypoints": [[0.4, 0], [2, 0], [3, 1]]}`.
+    `path,route.json` with `{"waypoints": [[0.4, 0], [2, 0], [3, 1]]}`. Without a kind, a mapping
+    with waypoints is a path.
 
     Raises:
       InputError: the name or a value is not allowed.
@@ -49,8 +52,10 @@ def parse_task(task: TaskLike) -> Task:
             task = files.read_json(Path(name)) | changes
         else:
             task = {"kind": name} | changes
+    if isinstance(task, Mapping) and str(task.get("waypoints", ())) not in ("()", "[]"):
+        task = {"kind": "path"} | dict(task)
     if not isinstance(task, Mapping) or "kind" not in task:
-        rule = f"give the name of a task: {', '.join(TASKS)}"
+        rule = f"give a kind ({', '.join(TASKS)}), or waypoints as [[0.4, 0], [2, 1]]"
         raise errors.not_allowed("task", repr(task), rule)
     kind = TASKS[errors.check_name("task", str(task["kind"]), TASKS, "FILE.json")]
     known = {x.name: x for x in fields(kind)}
@@ -64,16 +69,18 @@ def parse_task(task: TaskLike) -> Task:
             if name in declared(kind):
                 value = range_of(default, value)
             elif isinstance(default, bool):
-                value = value in (True, "true", "True", 1)
+                value = {"true": True, "false": False}[str(value).lower()]
             elif isinstance(default, int) and float(value).is_integer():
                 value = int(value)
             elif isinstance(default, tuple):
                 points = np.asarray(value, float)
                 points = points.reshape(-1, 2) if points.ndim == 1 else points  # of a text, 1:0:2:1
+                if points.size and points.shape[1:] != (2,):
+                    raise ValueError("no pairs")
                 value = tuple(map(tuple, points.tolist()))
-        except (TypeError, ValueError, OverflowError) as error:
+        except (LookupError, TypeError, ValueError, OverflowError) as error:
             is_range = name in declared(kind)
-            form = "a number, or low and high as [0.3, 0.6]" if is_range else "pairs of x, y [m]"
+            form = "a number, or low and high as [0.3, 0.6]" if is_range else _FORMS[type(default)]
             raise errors.not_allowed(f"task {name}", value, f"write {form}") from error
         values[name] = value
     return kind(**values)

@@ -7,16 +7,18 @@ what is drawn, and a pytree that is a `Course`, with the numbers of one world.
 from __future__ import annotations
 
 from collections.abc import Callable, Hashable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any, ClassVar, NamedTuple, Protocol
 
 import jax
 import numpy as np
 
+from rps_jax import errors
 from rps_jax.geometry.arrays import Array, Bool, Float, Scalar
 from rps_jax.geometry.footprint import Footprint
 from rps_jax.record.options import check_fields
-from rps_jax.world.quantity import check_ranges
+from rps_jax.robot.shell import Shell
+from rps_jax.world.quantity import Range, check_ranges
 
 
 class Place(NamedTuple):
@@ -51,6 +53,10 @@ class Course(Protocol):
         """Return the progress after one control step, and the aim."""
         ...
 
+    def remaining(self, progress: Any, p_world_goal: Array, point: Array) -> Array:
+        """Return the way [m] from a point (2,) [m] to the end, for rewards."""
+        ...
+
     def lines(self) -> dict[str, np.ndarray]:
         """Return what pictures show: polylines (..., N, 2) [m] by name, `path` and `walls`."""
         ...
@@ -82,9 +88,22 @@ class Task:
     HAS_TARGET: ClassVar[bool] = False  # whether trials end at the domain's targets
     MORE_NUMBERS: ClassVar[dict[str, int]] = {}  # columns of random numbers without a range
 
+    # Outcomes that are not 0 in a trial that the task has failed, with the failure in words.
+    FAILURES: ClassVar[dict[str, str]] = {}
+
+    def __str__(self) -> str:
+        """Return the text that `parse_task` reads: the name and the fields that differ."""
+        changes = []
+        for item in fields(self):
+            value = getattr(self, item.name)
+            if item.name != "kind" and value != item.default:
+                items = np.ravel(value[:2] if isinstance(value, Range) else value).tolist()
+                changes.append(f"{item.name}={':'.join(map(str, items))}")
+        return ",".join([self.kind, *changes])
+
     @property
     def idle(self) -> frozenset[str]:
-        """Names of its ranges that are not drawn."""
+        """Names of its quantities that are not drawn."""
         return frozenset()
 
     def __post_init__(self) -> None:
@@ -100,8 +119,22 @@ class Task:
     def check(self) -> None:
         """Raise InputError for values that are not allowed."""
 
-    def check_size(self, half_width: float, object_width: Callable[[], float]) -> None:
-        """Raise InputError unless a base and the widest object [m] have room."""
+    def check_target(self, field: str, value: object, rule: str = "leave it out") -> None:
+        """Raise InputError for a field that needs trials which end at a target."""
+        if not self.HAS_TARGET:
+            reason = f"the task {self.kind} has its own end; {rule}"
+            raise errors.not_allowed(field, value, reason)
+
+    def check_room(self, shell: Shell, of_objects: Callable[[], tuple[float, float]]) -> None:
+        """Raise InputError unless a base with this shell and objects have room.
+
+        `of_objects` loads models. It returns the greatest width of objects along their axes [m],
+        and how far they reach to a side of the base's middle at the start [m].
+        """
+
+    def measures(self, course: Any) -> dict[str, np.ndarray]:
+        """Return quantities (n,) of courses that the drawn numbers do not tell, by name."""
+        return {}
 
     def courses(self, inputs: CourseInputs) -> tuple[np.ndarray, Any]:
         """Return the ends (n, 2) [m] of trials, and the `Course` (n, ...) of n worlds."""

@@ -21,9 +21,10 @@ from rps_jax.geometry import planar, polyline
 from rps_jax.geometry.arrays import Array, Float, Int
 from rps_jax.geometry.polyline import Polyline
 from rps_jax.record.options import option
+from rps_jax.robot.shell import Shell
 from rps_jax.world.quantity import Range, drawn
 from rps_jax.world.tasks.base import Aim, CourseInputs, Place
-from rps_jax.world.tasks.path import Path, PathCourse, PathProgress
+from rps_jax.world.tasks.path import Path, PathCourse, PathProgress, turns_of, units_of
 
 _BEHIND = 1.5  # [m] of the walls before the base's front
 _BEYOND = 1.5  # [m] of the walls after the end of the path
@@ -102,6 +103,10 @@ class CorridorCourse(NamedTuple):
         moved = CorridorProgress(inner, *now, progress.steps + 1)
         return moved, aim._replace(failed=moved.wall_touch > NOTHING)
 
+    def remaining(self, progress: CorridorProgress, p_world_goal: Array, point: Array) -> Array:
+        """Return the way along the path."""
+        return self.path.remaining(progress.path, p_world_goal, point)
+
     def lines(self) -> dict[str, np.ndarray]:
         """Return path and walls."""
         return self.path.lines() | {"walls": np.asarray(self.walls)}
@@ -122,6 +127,8 @@ class Corridor(Path):
         "touch_y": ("m", "y of the touch in the world"),
     }
 
+    FAILURES: ClassVar[dict[str, str]] = {"wall_touch": "touched a wall"}
+
     width: Range = drawn(Range(1.4, 2.2), 59, "m", 0.3, 20, "width of the corridor", "course")
     doors: int = option(0, 0, 4)  # narrower places along the path
     door_width: Range = drawn(Range(0.8, 0.8), 60, "1", 0.1, 1, "doors, of the width", "course")
@@ -137,9 +144,7 @@ class Corridor(Path):
         need = self.width.high * np.tan(self.turn_angle.high / 2) if self.turns.high else 0.0
         part = self.length.low / (self.turns.high + 1)
         if self.waypoints:
-            units = _units(self.route()[None])[0]
-            cross = units[:-1, 0] * units[1:, 1] - units[:-1, 1] * units[1:, 0]
-            turns = np.abs(np.arctan2(cross, np.sum(units[:-1] * units[1:], axis=1)))
+            turns = np.abs(turns_of(self.route()[None])[0])
             room = np.append(0, self.width.high / 2 * np.tan(turns / 2))
             lengths = np.linalg.norm(np.diff(self.route(), axis=0), axis=1)
             short = lengths - room - np.append(room[1:], 0)
@@ -153,13 +158,27 @@ class Corridor(Path):
         """Names of the ranges that are not drawn."""
         return super().idle | (frozenset() if self.doors else {"door_width"})
 
-    def check_size(self, half_width: float, object_width: Callable[[], float]) -> None:
-        """Raise InputError for a corridor narrower than base or objects."""
+    def check_room(self, shell: Shell, of_objects: Callable[[], tuple[float, float]]) -> None:
+        """Raise InputError for a corridor narrower than base or objects, or with a wall at them."""
+        super().check_room(shell, of_objects)
+        half, (width, reach) = (float(shell.half[0]), float(shell.half[1])), of_objects()
         narrowest = self.width.low * (self.door_width.low if self.doors else 1)
-        for name, size in (("base", 2 * half_width), ("widest object", object_width())):
-            if narrowest <= size:
-                rule = f"the {name} is {size:.2f} m wide, and the narrowest place must be wider"
+        for room, size, words in (
+            (narrowest, 2 * half[1], "the base needs"),
+            (narrowest, width, "the widest object needs"),
+            (self.width.low, 0 if self.waypoints else 2 * reach, "objects off the middle need"),
+        ):
+            if room <= size:
+                rule = f"{words} {size:.2f} m, and the narrowest place must be wider"
                 raise errors.not_allowed("task width (low)", f"{self.width.low:g} m", rule)
+        walls = _walls(self.route()[None], np.array([self.width.low / 2])) if self.waypoints else ()
+        if len(walls) and polyline.clearance(fp.rectangle(*half), jnp.asarray(walls[0]))[0] <= 0:
+            rule = "a wall beside them crosses the base at its start; start them ahead"
+            raise errors.not_allowed("task waypoints", self.waypoints[:2], rule)
+
+    def measures(self, course: CorridorCourse) -> dict[str, np.ndarray]:
+        """Return the measures of the path."""
+        return super().measures(course.path)
 
     def courses(self, inputs: CourseInputs) -> tuple[np.ndarray, Any]:
         """Return the ends, paths and walls of worlds."""
@@ -177,7 +196,7 @@ class Corridor(Path):
 
 def _walls(vertices: np.ndarray, half: np.ndarray) -> np.ndarray:
     """Return the walls (n, W, 2, 2) [m] beside paths (n, N, 2) at a half width (n,) [m]."""
-    units = _units(vertices)
+    units = units_of(vertices)
     points = vertices.copy()
     points[:, 0] -= _BEHIND * units[:, 0]
     points[:, -1] += _BEYOND * units[:, -1]
@@ -189,15 +208,6 @@ def _walls(vertices: np.ndarray, half: np.ndarray) -> np.ndarray:
     return np.concatenate([np.stack([s[:, :-1], s[:, 1:]], axis=2) for s in sides], axis=1)
 
 
-def _units(vertices: np.ndarray) -> np.ndarray:
-    """Return the directions (n, N - 1, 2) of paths (n, N, 2); of no length, the one before."""
-    steps = np.diff(vertices, axis=1)
-    lengths = np.linalg.norm(steps, axis=-1, keepdims=True)
-    last = np.where(lengths > 0, np.arange(steps.shape[1])[:, None], 0)
-    last = np.maximum.accumulate(last, axis=1)
-    return np.take_along_axis(steps / np.where(lengths > 0, lengths, 1.0), last, axis=1)
-
-
 def _door(line: Polyline, share: float, inner: np.ndarray, outer: np.ndarray) -> np.ndarray:
     """Return two walls (n, 2, 2, 2) [m] across paths, in the middle of the segment at a share.
 
@@ -207,7 +217,7 @@ def _door(line: Polyline, share: float, inner: np.ndarray, outer: np.ndarray) ->
     passed = arcs[:, 1:] <= share * arcs[:, -1:]
     rows, first = np.arange(len(passed)), np.minimum(passed.sum(axis=1), passed.shape[1] - 1)
     a, b = vertices[rows, first], vertices[rows, first + 1]
-    unit = _units(vertices)[rows, first]
+    unit = units_of(vertices)[rows, first]
     normal = np.stack([-unit[:, 1], unit[:, 0]], axis=-1)
     ends = [(a + b) / 2 + s * x[:, None] * normal for s in (1, -1) for x in (inner, outer)]
     return np.stack([np.stack(ends[:2], axis=1), np.stack(ends[2:], axis=1)], axis=1)

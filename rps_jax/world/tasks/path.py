@@ -6,7 +6,7 @@ laws do not change. A trial succeeds at the path's end.
 
 from __future__ import annotations
 
-from collections.abc import Hashable
+from collections.abc import Callable, Hashable
 from dataclasses import dataclass
 from typing import Any, ClassVar, NamedTuple
 
@@ -18,6 +18,7 @@ from rps_jax import errors
 from rps_jax.geometry import polyline
 from rps_jax.geometry.arrays import Array, Float, Int
 from rps_jax.geometry.polyline import Polyline
+from rps_jax.robot.shell import Shell
 from rps_jax.world.quantity import Range, drawn
 from rps_jax.world.tasks.base import Aim, CourseInputs, Place, Task
 
@@ -26,6 +27,7 @@ _PER_SPAN = 6  # segments of a spline between two waypoints
 _REACH = 1.0  # [m] along the path, either way, in which the nearest point is sought
 _END = 0.5  # [m] before the end, from which on a trial may succeed
 _LEAD = 1.5  # [m] of a drawn path before its first turn, at least
+_APART = "consecutive waypoints must be at least 1 cm apart"
 _NEAR = 0.5  # [m] between the base's front and the first waypoint, at most
 # [m] upper ends of the classes of a histogram of errors; the last is open.
 _EDGES = np.append(0.0025 * 1.5 ** np.arange(15), np.inf)
@@ -72,16 +74,21 @@ class PathCourse(NamedTuple):
         return PathProgress(zero, zero, zero, zero, jnp.zeros(len(_EDGES), jnp.int32))
 
     def step(self, progress: PathProgress, place: Place) -> tuple[PathProgress, Aim]:
+        """Follow the path."""
+        return self.follow(progress, place.p_world_contact, place.touches)
+
+    def follow(
+        self, progress: PathProgress, p_world_contact: Array, touches: Array
+    ) -> tuple[PathProgress, Aim]:
         """Advance to the point nearest to the contact; its distance is the cross-track error."""
         length = self.line.arcs[-1]
-        arc, error = polyline.nearest(
-            self.line, place.p_world_contact, progress.arc - _REACH, progress.arc + _REACH
-        )
-        arc = jnp.where(place.touches, arc, progress.arc)
-        error = jnp.where(place.touches, error, 0.0)
+        reach = progress.arc - _REACH, progress.arc + _REACH
+        arc, error = polyline.nearest(self.line, p_world_contact, *reach)
+        arc = jnp.where(touches, arc, progress.arc)
+        error = jnp.where(touches, error, 0.0)
         edges = jnp.asarray(_EDGES, error.dtype)
         lower = jnp.asarray(np.append(-1.0, _EDGES[:-1]), error.dtype)
-        counted = place.touches & (error > lower) & (error <= edges)
+        counted = touches & (error > lower) & (error <= edges)
         moved = PathProgress(
             arc,
             jnp.maximum(progress.share, arc / length),
@@ -91,6 +98,12 @@ class PathCourse(NamedTuple):
         )
         target = polyline.at_arc(self.line, arc + self.lookahead)
         return moved, Aim(target, at_end=arc > length - _END)
+
+    def remaining(self, progress: PathProgress, p_world_goal: Array, point: Array) -> Array:
+        """Return the way from a point to the path and along it, near the contact's arc length."""
+        reach = progress.arc - _REACH, progress.arc + _REACH
+        arc, away = polyline.nearest(self.line, point, *reach)
+        return self.line.arcs[-1] - arc + away
 
     def lines(self) -> dict[str, np.ndarray]:
         """Return the path."""
@@ -108,7 +121,9 @@ class Path(Task):
         "error_95": ("m", "95 % quantile over time of the cross-track error"),
         "error_max": ("m", "largest cross-track error"),
     }
-    MORE_NUMBERS: ClassVar[dict[str, int]] = {f"turn_angle_{i}": 52 + i for i in range(1, 7)}
+    MORE_NUMBERS: ClassVar[dict[str, int]] = {
+        f"turn_angle_{i}": 52 + i for i in range(_SEGMENTS - 1)
+    }
 
     # Along the path, from its nearest point to the law's target.
     lookahead: Range = drawn(Range(1, 1), 49, "m", 0.05, 5, "lookahead on the path", "course")
@@ -121,8 +136,9 @@ class Path(Task):
 
     @property
     def idle(self) -> frozenset[str]:
-        """Names of the ranges that are not drawn, since waypoints are given."""
-        return frozenset(("length", "turns", "turn_angle") if self.waypoints else ())
+        """Names of the quantities that are not drawn; each turn draws its angle."""
+        unused = ("length", "turns", *self.MORE_NUMBERS) if self.waypoints else ()
+        return frozenset(("turn_angle", *unused))
 
     @property
     def shape(self) -> Hashable:
@@ -133,26 +149,42 @@ class Path(Task):
         """Raise InputError for waypoints that are no path."""
         if self.spline and not self.waypoints:
             raise errors.not_allowed("task spline", True, "give waypoints, which it joins")
+        if not float(self.turns.low).is_integer() or not float(self.turns.high).is_integer():
+            raise errors.not_allowed("task turns", self.turns[:2], "give whole numbers")
         if not self.waypoints:
             return
         points = errors.check_array("task waypoints", self.waypoints, ("N", 2))
-        rule = ""
-        if len(points) < 2:
-            rule = "a path has two points or more, each as x, y [m]"
-        elif np.abs(points).max() > 50:
-            rule = "each coordinate must be from -50 to 50 m"
-        elif len(points) > 100:
-            rule = "a path has at most 100 waypoints"
-        elif (np.linalg.norm(np.diff(points, axis=0), axis=1) < 0.01).any():
-            rule = "consecutive waypoints must be at least 1 cm apart"
-        if rule:
-            raise errors.not_allowed("task waypoints", points.tolist(), rule)
+        steps = np.linalg.norm(np.diff(points, axis=0), axis=1)
+        for is_bad, bad, rule in (
+            (len(points) < 2, points, "a path has two points or more, each as x, y [m]"),
+            (len(points) > 100, points[100:101], "a path has at most 100 waypoints"),
+            *((abs(x).max() > 50, x, "give coordinates from -50 to 50, in metres") for x in points),
+            *((d < 0.01, points[i : i + 2], _APART) for i, d in enumerate(steps)),
+        ):
+            if is_bad:
+                raise errors.not_allowed("task waypoints", bad.tolist(), rule)
 
     def courses(self, inputs: CourseInputs) -> tuple[np.ndarray, Any]:
         """Return the ends and the paths of worlds."""
         vertices = self.vertices(inputs)
         lookahead: Any = self.lookahead.at(inputs.u["lookahead"])
         return vertices[:, -1], PathCourse(Polyline.through(vertices), lookahead)
+
+    def check_room(self, shell: Shell, of_objects: Callable[[], tuple[float, float]]) -> None:
+        """Raise InputError for waypoints that start away from the base's front."""
+        front = float(shell.half[0])
+        x, y = self.waypoints[0] if self.waypoints else (front, 0.0)
+        if np.hypot(x - front, y) > _NEAR:
+            rule = f"they must start within {_NEAR} m of the base's front, ({front:.2f}, 0) m"
+            raise errors.not_allowed("task waypoints", (x, y), rule)
+
+    def measures(self, course: PathCourse) -> dict[str, np.ndarray]:
+        """Return length, number of turns and their mean angle."""
+        line: Any = course.line
+        angles = np.abs(turns_of(np.asarray(line.vertices)))
+        count = (angles > 1e-9).sum(axis=1)
+        angle = angles.sum(axis=1) / np.maximum(count, 1)
+        return {"length": line.arcs[:, -1], "turns": count, "turn_angle": angle}
 
     def route(self) -> np.ndarray:
         """Return the vertices (N, 2) [m] of the path through the waypoints."""
@@ -167,18 +199,13 @@ class Path(Task):
         """Return the vertices (n, N, 2) [m] of paths, which start at the base's front."""
         front, u = inputs.front, inputs.u
         if self.waypoints:
-            points = np.array(self.waypoints, float)
-            off = float(np.max(np.hypot(points[0, 0] - front, points[0, 1])))
-            if off > _NEAR:
-                rule = f"it must start within {_NEAR} m of the base's front, ({front[0]:.2f}, 0)"
-                raise errors.not_allowed("task waypoints", points[0].tolist(), rule)
             points = self.route()
             return np.broadcast_to(points, (front.size, *points.shape))
         low, high, _ = self.turns
         count = np.minimum(np.floor(low + (high + 1 - low) * u["turns"]), high)[:, None]
         # A half of each random number is the sign of a turn. Beyond 90 degrees it turns back.
         heading, headings = np.zeros(front.size), [np.zeros(front.size)]
-        for name in ("turn_angle", *self.MORE_NUMBERS):
+        for name in self.MORE_NUMBERS:
             angle = self.turn_angle.at((2 * u[name]) % 1) * np.where(u[name] < 0.5, -1, 1)
             angle = np.where(np.abs(heading + angle) > np.pi / 2 + 1e-9, -angle, angle)
             heading = heading + angle
@@ -192,6 +219,22 @@ class Path(Task):
         steps = lengths[..., None] * np.stack([np.cos(at), np.sin(at)], axis=-1)
         start = np.stack([front, 0 * front], axis=-1)[:, None]
         return np.concatenate([start, start + np.cumsum(steps, axis=1)], axis=1)
+
+
+def units_of(vertices: np.ndarray) -> np.ndarray:
+    """Return the directions (n, N - 1, 2) of paths (n, N, 2); of no length, the one before."""
+    steps = np.diff(vertices, axis=1)
+    lengths = np.linalg.norm(steps, axis=-1, keepdims=True)
+    last = np.where(lengths > 0, np.arange(steps.shape[1])[:, None], 0)
+    last = np.maximum.accumulate(last, axis=1)
+    return np.take_along_axis(steps / np.where(lengths > 0, lengths, 1.0), last, axis=1)
+
+
+def turns_of(vertices: np.ndarray) -> np.ndarray:
+    """Return the angles (n, N - 2) [rad] by which paths (n, N, 2) turn, positive to the left."""
+    units = units_of(vertices)
+    x, y = np.moveaxis(units[:, :-1], -1, 0), np.moveaxis(units[:, 1:], -1, 0)
+    return np.arctan2(x[0] * y[1] - x[1] * y[0], x[0] * y[0] + x[1] * y[1])
 
 
 TASK = Path

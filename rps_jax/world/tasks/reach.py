@@ -7,6 +7,8 @@ from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
+from rps_jax.geometry import planar
+from rps_jax.geometry.arrays import Array
 from rps_jax.world.tasks.base import Aim, CourseInputs, Place, Task
 
 
@@ -14,15 +16,23 @@ class Nothing(NamedTuple):
     """Course and progress of the task: there is nothing but the target."""
 
     def start(self) -> Nothing:
+        """Return the progress, which is nothing."""
         return self
 
     def step(self, progress: Nothing, place: Place) -> tuple[Nothing, Aim]:
+        """Return the target as the aim."""
         return progress, Aim(place.p_world_goal)
 
     def lines(self) -> dict[str, np.ndarray]:
+        """Return no lines."""
         return {}
 
+    def remaining(self, progress: Nothing, p_world_goal: Array, point: Array) -> Array:
+        """Return the distance to the target."""
+        return planar.norm(p_world_goal - point)
+
     def outcomes(self) -> dict[str, Any]:
+        """Return no outcomes."""
         return {}
 
 
@@ -34,6 +44,7 @@ class Reach(Task):
     HAS_TARGET: ClassVar[bool] = True
 
     def courses(self, inputs: CourseInputs) -> tuple[np.ndarray, Nothing]:
+        """Return the targets, and nothing else."""
         return inputs.p_world_target, Nothing()
 
 

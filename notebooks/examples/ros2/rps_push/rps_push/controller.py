@@ -14,7 +14,11 @@ import numpy as np
 
 from rps_jax import Observation
 from rps_jax.control import registry
+from rps_jax.geometry.polyline import Polyline
 from rps_jax.robot.skin import CapacitiveSkin
+from rps_jax.world.tasks.path import PathCourse
+
+_VERTICES = 1024  # of a path, at most
 
 
 @dataclass(frozen=True)
@@ -28,6 +32,8 @@ class Limits:
     odometry_age: float = 0.08  # [s] after which an input counts as missing
     taxels_age: float = 0.08  # [s]
     target_age: float = 0.08  # [s]
+    path_age: float = 2.0  # [s]
+    lookahead: float = 1.0  # [m] on the path, from the contact to the law's target
 
 
 class Command(NamedTuple):
@@ -50,6 +56,10 @@ class Controller:
         self._params = registry.resolve_law(law)[1]
         self._law = registry.law_of(self._params)
         self._scan, self._step = jax.jit(skin.read), jax.jit(self._law.step)
+        self._follow = jax.jit(PathCourse.follow)
+        self.reset()
+        self.path(0.0, [(0.0, 0.0), (1.0, 0.0)])
+        self._pursue()
         self.reset()
         self._decide(0.02)
         self._scan(self._skin_state, jnp.zeros(self.taxels), 0.02)
@@ -59,7 +69,8 @@ class Controller:
         self._skin_state = self._skin.init(jax.random.PRNGKey(0))
         self._law_state = self._law.init(self._params)
         self._pose, self._target, self._contact = np.zeros(3), np.zeros(2), (np.zeros(2), False)
-        self._input_times = dict.fromkeys(("odometry", "taxels", "target"), -math.inf)
+        self._course: PathCourse | None = None
+        self._input_times = dict.fromkeys(("odometry", "taxels", "target", "path"), -math.inf)
         self._last = self._scanned = -math.inf
         self._sent = Command()
 
@@ -77,6 +88,33 @@ class Controller:
         """Store the target [m]."""
         if np.isfinite([x, y]).all():
             self._target, self._input_times["target"] = np.array([x, y], float), time
+
+    def path(self, time: float, points: Any) -> None:
+        """Store a path (K, 2) [m], which replaces the target; no point ends it.
+
+        The same path again goes on, and another one starts anew.
+        """
+        vertices = np.asarray(points, np.float32).reshape(-1, 2)
+        if not np.isfinite(vertices).all() or len(vertices) > _VERTICES:
+            return
+        self._input_times["path"] = time
+        if not len(vertices):
+            self._course = None
+            return
+        vertices = np.pad(vertices, ((0, _VERTICES - len(vertices)), (0, 0)), "edge")
+        if self._course is None or (vertices != self._course.line.vertices).any():
+            lookahead = np.asarray(self.limits.lookahead, np.float32)
+            self._course = PathCourse(Polyline.through(vertices), lookahead)
+            self._progress = self._course.start()
+
+    def _pursue(self) -> None:
+        """Set the target a lookahead ahead on the path."""
+        (x, y), touches = self._contact
+        c, s = math.cos(self._pose[2]), math.sin(self._pose[2])
+        contact = self._pose[:2] + np.array([c * x - s * y, s * x + c * y])
+        inputs = self._course, self._progress, contact.astype(np.float32), np.asarray(touches)
+        self._progress, aim = self._follow(*inputs)
+        self._target = np.asarray(aim.p_world_target, float)
 
     def skin(self, time: float, values: Any) -> None:
         """Process one scan: relative changes of capacitance [1], along the strip."""
@@ -97,13 +135,16 @@ class Controller:
         limits, sent = self.limits, self._sent
         period = time - self._last if self._last > -math.inf else 0.02
         self._last = time
-        for name, words in (("odometry",) * 2, ("taxels",) * 2, ("target", "a target")):
+        goal = ("target", "a target") if self._course is None else ("path", "a path")
+        for name, words in (("odometry",) * 2, ("taxels",) * 2, goal):
             if time - self._input_times[name] > getattr(limits, f"{name}_age"):
                 self._sent = Command(status=f"waiting for {words}")
                 return self._sent
         if not period > 0:
             self._sent = Command(status="the clock does not advance")
             return self._sent
+        if self._course is not None:
+            self._pursue()
         law_state, twist = self._decide(period)
         v_x, v_y, omega = map(float, twist)
         if not np.isfinite([v_x, v_y, omega]).all():

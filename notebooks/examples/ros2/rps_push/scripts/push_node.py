@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Lifecycle node around the controller in Python: odometry, taxels and target in, twist out."""
+"""Lifecycle node around the controller in Python: inputs of a robot in, twist out."""
 
 import dataclasses
 import math
@@ -7,7 +7,7 @@ import time
 
 import rclpy
 from geometry_msgs.msg import PointStamped, TwistStamped
-from nav_msgs.msg import Odometry
+from nav_msgs.msg import Odometry, Path
 from rcl_interfaces.msg import FloatingPointRange, ParameterDescriptor
 from rclpy.executors import ExternalShutdownException
 from rclpy.lifecycle import LifecycleNode, TransitionCallbackReturn
@@ -24,6 +24,8 @@ PARAMETERS = {
     "odometry_age": ("time without odometry that stops the base [s]", 0.01, 0.08),
     "taxels_age": ("time without taxels that stops the base [s]", 0.01, 0.08),
     "target_age": ("time without target that stops the base [s]", 0.01, 0.08),
+    "path_age": ("time without path that stops the base [s]", 0.01, 10.0),
+    "lookahead": ("lookahead on the path [m]", 0.05, 5.0),
 }
 
 
@@ -48,6 +50,7 @@ class PushNode(LifecycleNode):
             (Odometry, "odom", self._odometry),
             (Float32MultiArray, "taxels", self._taxels),
             (PointStamped, "target", self._target),
+            (Path, "path", self._path),
         ):
             subscription = self.create_subscription(kind, topic, callback, qos_profile_sensor_data)
             self._subscriptions.append(subscription)
@@ -84,6 +87,10 @@ class PushNode(LifecycleNode):
 
     def _target(self, message):
         self._controller.target(clock(), message.point.x, message.point.y)
+
+    def _path(self, message):
+        points = [(pose.pose.position.x, pose.pose.position.y) for pose in message.poses]
+        self._controller.path(clock(), points)
 
     def _send(self, command):
         message = TwistStamped()

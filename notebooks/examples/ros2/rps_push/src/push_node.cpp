@@ -1,12 +1,14 @@
-// Lifecycle node around the controller: from odometry, taxels and target to a twist.
+// Lifecycle node around the controller: from odometry, taxels and a target or path to a twist.
 #include <chrono>
 #include <cmath>
 #include <memory>
 #include <string>
+#include <vector>
 
 #include "geometry_msgs/msg/point_stamped.hpp"
 #include "geometry_msgs/msg/twist_stamped.hpp"
 #include "nav_msgs/msg/odometry.hpp"
+#include "nav_msgs/msg/path.hpp"
 #include "rclcpp/rclcpp.hpp"
 #include "rclcpp_lifecycle/lifecycle_node.hpp"
 #include "rps_push/controller.hpp"
@@ -24,6 +26,8 @@ class PushNode : public rclcpp_lifecycle::LifecycleNode {
     number("odometry_age", "time without odometry that stops the base [s]", 0.08, 0.01, 0.08);
     number("taxels_age", "time without taxels that stops the base [s]", 0.08, 0.01, 0.08);
     number("target_age", "time without target that stops the base [s]", 0.08, 0.01, 0.08);
+    number("path_age", "time without path that stops the base [s]", 2.0, 0.01, 10.0);
+    number("lookahead", "lookahead on the path [m]", 1.0, 0.05, 5.0);
     number("rate", "commands in a second [Hz]", 50.0, 50.0, 1000.0);
   }
 
@@ -36,6 +40,8 @@ class PushNode : public rclcpp_lifecycle::LifecycleNode {
     limits.odometry_age = get_parameter("odometry_age").as_double();
     limits.taxels_age = get_parameter("taxels_age").as_double();
     limits.target_age = get_parameter("target_age").as_double();
+    limits.path_age = get_parameter("path_age").as_double();
+    limits.lookahead = get_parameter("lookahead").as_double();
     controller_ = std::make_unique<rps_push::Controller>(limits);
     twists_ = create_publisher<geometry_msgs::msg::TwistStamped>("cmd_vel", 1);
     const auto latest = rclcpp::SensorDataQoS().keep_last(1);
@@ -56,6 +62,13 @@ class PushNode : public rclcpp_lifecycle::LifecycleNode {
     target_ = create_subscription<geometry_msgs::msg::PointStamped>(
         "target", latest, [this](geometry_msgs::msg::PointStamped::ConstSharedPtr message) {
           controller_->target(seconds(), message->point.x, message->point.y);
+        });
+    path_ = create_subscription<nav_msgs::msg::Path>(
+        "path", latest, [this](nav_msgs::msg::Path::ConstSharedPtr message) {
+          std::vector<rps_push::Point> points;
+          for (const auto &pose : message->poses)
+            points.push_back({pose.pose.position.x, pose.pose.position.y});
+          controller_->path(seconds(), points);
         });
     return CallbackReturn::SUCCESS;
   }
@@ -80,6 +93,7 @@ class PushNode : public rclcpp_lifecycle::LifecycleNode {
     odometry_.reset();
     taxels_.reset();
     target_.reset();
+    path_.reset();
     twists_.reset();
     controller_.reset();
     return CallbackReturn::SUCCESS;
@@ -123,6 +137,7 @@ class PushNode : public rclcpp_lifecycle::LifecycleNode {
   rclcpp::Subscription<nav_msgs::msg::Odometry>::SharedPtr odometry_;
   rclcpp::Subscription<std_msgs::msg::Float32MultiArray>::SharedPtr taxels_;
   rclcpp::Subscription<geometry_msgs::msg::PointStamped>::SharedPtr target_;
+  rclcpp::Subscription<nav_msgs::msg::Path>::SharedPtr path_;
   rclcpp::TimerBase::SharedPtr timer_;
   std::string status_;
 };

@@ -23,6 +23,12 @@ struct Limits {
   double odometry_age = 0.08;  // [s] after which an input counts as missing
   double taxels_age = 0.08;
   double target_age = 0.08;
+  double path_age = 2.0;
+  double lookahead = 1.0;  // [m] on the path, from the contact to the law's target
+};
+
+struct Point {
+  double x = 0, y = 0;  // [m] in the frame of the odometry
 };
 
 struct Command {
@@ -38,7 +44,9 @@ class Controller {
   void reset() {
     law_init(&params_, &memory_);
     law_skin_init(&skin_);
-    odometry_ = taxels_ = target_ = -1e300;
+    odometry_ = taxels_ = target_ = path_time_ = -1e300;
+    path_.clear();
+    arc_ = 0;
     last_ = scanned_ = -1e300;
     sent_ = Command();
   }
@@ -58,6 +66,17 @@ class Controller {
     obs_.p_world_target[0] = static_cast<law_real>(x);
     obs_.p_world_target[1] = static_cast<law_real>(y);
     target_ = time;
+  }
+
+  // Store a path [m], which replaces the target; no point ends it. The same path again goes on, and
+  // another one starts anew.
+  void path(double time, const std::vector<Point> &points) {
+    for (const Point &p : points)
+      if (!(std::isfinite(p.x) && std::isfinite(p.y))) return;
+    const auto same = [](const Point &a, const Point &b) { return a.x == b.x && a.y == b.y; };
+    if (!std::equal(points.begin(), points.end(), path_.begin(), path_.end(), same)) arc_ = 0;
+    path_ = points;
+    path_time_ = time;
   }
 
   // Process one scan: relative changes of capacitance [1], along the strip.
@@ -85,6 +104,7 @@ class Controller {
     command.status = missing_input(time);
     if (command.status.empty() && !(period > 0)) command.status = "the clock does not advance";
     if (!command.status.empty()) return sent_ = command;
+    if (!path_.empty()) pursue();
     law_twist twist;
     obs_.period = static_cast<law_real>(period);
     if (const int code = law_step(&params_, &memory_, &obs_, &twist); code != LAW_OK) {
@@ -116,10 +136,45 @@ class Controller {
   template <class Observation>
   static void set_taxels(Observation &, const law_contact &, long) {}
 
+  // Set the target a lookahead ahead on the path, as `PathCourse.follow` of rps_jax does: from the
+  // point nearest to the contact, within 1 m of the last one along the path.
+  void pursue() {
+    const double c = std::cos(double(obs_.yaw)), s = std::sin(double(obs_.yaw));
+    const double x = obs_.p_world_robot[0] + c * obs_.p_robot_contact[0] - s * obs_.p_robot_contact[1];
+    const double y = obs_.p_world_robot[1] + s * obs_.p_robot_contact[0] + c * obs_.p_robot_contact[1];
+    const double low = arc_ - 1, high = arc_ + 1;
+    double first = 0, least = 1e300, nearest = arc_;
+    for (std::size_t i = 0; obs_.in_contact && i + 1 < path_.size(); i++) {
+      const Point &a = path_[i], &b = path_[i + 1];
+      const double length = std::hypot(b.x - a.x, b.y - a.y), last = first + length;
+      if (first <= high && last >= low) {
+        const double u = length > 0 ? (b.x - a.x) / length : 0, v = length > 0 ? (b.y - a.y) / length : 0;
+        const double ahead = std::clamp((x - a.x) * u + (y - a.y) * v, std::max(low - first, 0.0),
+                                        std::min(high - first, length));
+        const double off = std::hypot(x - a.x - ahead * u, y - a.y - ahead * v);
+        if (off < least) least = off, nearest = first + ahead;
+      }
+      first = last;
+    }
+    arc_ = nearest;
+    double rest = arc_ + limits_.lookahead;
+    Point target = path_.front();
+    for (std::size_t i = 0; i + 1 < path_.size() && rest > 0; i++) {
+      const Point &a = path_[i], &b = path_[i + 1];
+      const double length = std::hypot(b.x - a.x, b.y - a.y);
+      const double share = length > 0 ? std::min(rest / length, 1.0) : 0;
+      target = {a.x + share * (b.x - a.x), a.y + share * (b.y - a.y)};
+      rest -= length;
+    }
+    obs_.p_world_target[0] = static_cast<law_real>(target.x);
+    obs_.p_world_target[1] = static_cast<law_real>(target.y);
+  }
+
   std::string missing_input(double time) const {
     if (time - odometry_ > limits_.odometry_age) return "waiting for odometry";
     if (time - taxels_ > limits_.taxels_age) return "waiting for taxels";
-    if (time - target_ > limits_.target_age) return "waiting for a target";
+    if (!path_.empty() && time - path_time_ > limits_.path_age) return "waiting for a path";
+    if (path_.empty() && time - target_ > limits_.target_age) return "waiting for a target";
     return "";
   }
 
@@ -130,7 +185,9 @@ class Controller {
   law_skin skin_;
   law_observation obs_{};
   Command sent_;
-  double odometry_, taxels_, target_, last_, scanned_;
+  std::vector<Point> path_;
+  double odometry_, taxels_, target_, path_time_, last_, scanned_;
+  double arc_ = 0;  // [m] of the point of the path nearest to the contact
 };
 
 }  // namespace rps_push
