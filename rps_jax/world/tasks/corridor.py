@@ -82,19 +82,20 @@ class CorridorCourse(NamedTuple):
         outlines = fp.rectangle(*place.half), place.footprint
 
         def measure(carry: Any) -> Any:
-            poses = carry[-1]  # of the carry, since a loop computes what is constant in any case
+            poses = carry[-1]  # changed by the pass: what does not change is computed before
+            origin = poses[0, :2]
             pairs = zip(outlines, poses, strict=True)
-            placed = [fp.place(outline, pose[:2], pose[2]) for outline, pose in pairs]
+            placed = [fp.place(outline, pose[:2] - origin, pose[2]) for outline, pose in pairs]
             (of_base, at_base), (of_object, at_object) = (
-                polyline.clearance(x, self.walls) for x in placed
+                polyline.clearance(x, self.walls - origin) for x in placed
             )
             by_base = of_base <= of_object
             least = jnp.where(by_base, of_base, of_object)
             who = jnp.where(least > 0, NOTHING, jnp.where(by_base, BASE, OBJECT))
-            point = jnp.where(least > 0, jnp.nan, jnp.where(by_base, at_base, at_object))
+            point = jnp.where(least > 0, jnp.nan, origin + jnp.where(by_base, at_base, at_object))
             clearance = jnp.minimum(progress.clearance, least)
             touch = who.astype(least.dtype), point
-            return jnp.zeros((), bool), clearance, *touch, least, poses, poses
+            return jnp.zeros((), bool), clearance, *touch, least, poses, jnp.zeros_like(poses)
 
         # A loop of at most one pass: a program for many worlds skips it if none is due.
         last = progress.clearance, progress.wall_touch, progress.p_world_touch
