@@ -22,7 +22,7 @@ from rps_jax.geometry.polyline import Polyline
 from rps_jax.record import bag, files
 from rps_jax.runs.plan import load_plan
 from rps_jax.runs.push import Push
-from rps_jax.runs.sweep import Sweep
+from rps_jax.runs.sweep import Sweep, plan_sections
 from rps_jax.studies.sensitivity import Sensitivity
 from rps_jax.trials import env, gym
 from rps_jax.trials.case import Case
@@ -145,6 +145,12 @@ def test_a_sweep_records_and_reports_the_outcomes_of_its_task(run):
     for name in ("progress", "error_95", "clearance", "touch_x", "width", "turns"):
         assert columns.meaning[name] == results[name].attrs["long_name"]
         assert columns.unit[name] == results[name].attrs["units"]
+    assert "fail at once" not in section
+    plan = load_plan(run / "run")
+    sections = {
+        x.title: x.text for x in plan_sections(plan, results.assign(time=0 * results.time), None)
+    }
+    assert "12 trials fail at once: a wall" in sections["Outcomes of the task"]
     reach = results.drop_vars(list(tasks.OUTCOMES), errors="ignore")
     assert tables.task_table(reach) == []
 
@@ -237,17 +243,15 @@ BAD = {
     "push --task empty.json": "or waypoints as [[0.4, 0], [2, 1]]",
     "push --task side.json": "a wall beside them crosses the base",
     "push --object box --task close.json": "a wall crosses base or object at the start",
-    "push --task corridor,width=0.5": "the base needs 0.58 m",
-    "push --object nonuniform_box --task corridor,width=0.6,doors=1,door_width=0.6": "needs 0.58 m",
+    "push --task corridor,width=0.5": "the base is 0.58 m wide",
+    "push --task corridor,width=0.6,doors=1,door_width=0.6": "the base is 0.58 m wide",
     "push --task path --target 1 1": "target = (1.0, 1.0) is not allowed: the task path has",
     "push --task pathh": "did you mean 'path'?",
     "push --task path,lookahed=2": "did you mean 'lookahead'?",
     "push --task path,spline=maybe": "write true or false",
     "push --task corridor,doors=x": "write a whole number",
     "push --task path,turns=1.5": "give whole numbers",
-    "sweep --task corridor,width=0.8": "the widest object needs 0.99 m",
-    "sweep --task corridor,width=1.2": "objects off the middle need 1.35 m",
-    "sweep --domain paper --task corridor,width=0.6": "objects off the middle need",
+    "sweep --task corridor,width=0.8": "the widest object is 0.99 m wide",
     "ladder --task pathh": "did you mean 'path'?",
     "learn --task pathh": "did you mean 'path'?",
     "tune es --task pathh": "did you mean 'path'?",

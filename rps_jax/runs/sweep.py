@@ -32,6 +32,7 @@ from rps_jax.runs.question import (
     Run,
     SimulationQuestion,
     call_of,
+    count_true,
     task_attribute,
 )
 from rps_jax.runs.results import Results, check_table, write_table
@@ -121,6 +122,8 @@ def plan_sections(plan: Plan, results: xr.Dataset, folder: Path | None) -> list[
         sections.append(Section("Differences, world by world", "", rows))
     if rows := tables.task_table(results):
         text = "Medians and ranges of 90 % of the worlds; of failures the number of trials by kind."
+        if at_once := count_true(results.time.values == 0):
+            text += f" {at_once} trials fail at once: a wall crosses base or object at the start."
         sections.append(Section("Outcomes of the task", text, rows))
     if statistics.varied_quantities(results):
         # Imported late: matplotlib takes half a second.

@@ -80,7 +80,7 @@ class Case(TrialOptions):
         errors.check_number("shift time", self.shift.time, at_least=0, unit="s")
         errors.check_vector("shift", self.shift.p_robot, at_least=-5, at_most=5, unit="m")
         scene.check_target(self.target, self.base.shell)
-        self.challenge.check_room(self.base.shell, lambda: (scene.size_of(name)[0], 0.0))
+        self.challenge.check_room(self.base.shell, lambda: scene.width_of(name))
         if tuple(self.target) != _TARGET:
             self.challenge.check_target("target", self.target)
         if self.bearing:

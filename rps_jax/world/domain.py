@@ -132,18 +132,15 @@ class Domain:
         if self.task.HAS_TARGET and not self.targets and self.distance.low <= reach:
             rule = f"targets must lie outside the robot, which reaches {reach:.2f} m"
             raise errors.not_allowed("domain distance (low)", f"{self.distance.low:g} m", rule)
-        self.task.check_room(self.robot.shell, self._room)
+        self.task.check_room(self.robot.shell, self._widest)
 
-    def _room(self) -> tuple[float, float]:
-        """Return the greatest width of objects and their reach to a side at the start [m]."""
-        ratio = max(self.aspect.high, 1 / self.aspect.low)
-        sizes = [scene.size_of(name) for name in self.objects if name not in RANDOM]
+    def _widest(self) -> float:
+        """Return the greatest width of an object [m], along its axes."""
+        ratio = math.sqrt(max(self.aspect.high, 1 / self.aspect.low))
+        widths = [scene.width_of(name) for name in self.objects if name not in RANDOM]
         for name in set(self.objects) & set(RANDOM):
-            stretch = 1.0 if name == "random_cylinder" else math.sqrt(ratio)
-            reach = 1.0 if name == "random_cylinder" else math.sqrt(ratio + 1 / ratio)
-            sizes.append((2 * self.size.high * stretch, self.size.high * reach))
-        width, reach = np.max(sizes, axis=0)
-        return float(width), float(reach + max(map(abs, self.lateral[:2])))
+            widths.append(2 * self.size.high * (1 if name == "random_cylinder" else ratio))
+        return max(widths)
 
     def range_of(self, name: str) -> Range | None:
         """Return the range of a quantity, of the domain itself or of its task; None: not drawn."""

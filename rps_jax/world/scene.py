@@ -307,12 +307,10 @@ def solid_of(scene: Scene) -> Solid:
     return jax.tree.map(lambda leaf: np.asarray(leaf, float)[None], single)
 
 
-def size_of(name: str) -> tuple[float, float]:
-    """Return the greatest width of an object of a scene along its axes, and its reach [m]."""
+def width_of(name: str) -> float:
+    """Return the greatest width of an object of a scene along its axes [m]."""
     shape = solid_of(load(name))
-    radius = float(shape.radius.max())
-    away = np.linalg.norm(shape.vertices, axis=-1).max()
-    return 2 * (float(np.abs(shape.vertices).max()) + radius), float(away) + radius
+    return 2 * float(np.abs(shape.vertices).max() + shape.radius.max())
 
 
 def initial_qpos(scene: Scene, gap: float = 0.02, yaw: float = 0.0) -> np.ndarray:

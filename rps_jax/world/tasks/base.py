@@ -125,11 +125,10 @@ class Task:
             reason = f"the task {self.kind} has its own end; {rule}"
             raise errors.not_allowed(field, value, reason)
 
-    def check_room(self, shell: Shell, of_objects: Callable[[], tuple[float, float]]) -> None:
-        """Raise InputError unless a base with this shell and objects have room.
+    def check_room(self, shell: Shell, object_width: Callable[[], float]) -> None:
+        """Raise InputError unless a base with this shell and the widest object [m] have room.
 
-        `of_objects` loads models. It returns the greatest width of objects along their axes [m],
-        and how far they reach to a side of the base's middle at the start [m].
+        `object_width` loads models.
         """
 
     def measures(self, course: Any) -> dict[str, np.ndarray]:

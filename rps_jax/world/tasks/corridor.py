@@ -159,18 +159,14 @@ class Corridor(Path):
         """Names of the ranges that are not drawn."""
         return super().idle | (frozenset() if self.doors else {"door_width"})
 
-    def check_room(self, shell: Shell, of_objects: Callable[[], tuple[float, float]]) -> None:
-        """Raise InputError for a corridor narrower than base or objects, or with a wall at them."""
-        super().check_room(shell, of_objects)
-        half, (width, reach) = (float(shell.half[0]), float(shell.half[1])), of_objects()
+    def check_room(self, shell: Shell, object_width: Callable[[], float]) -> None:
+        """Raise InputError for a corridor narrower than base or objects, or a wall at the base."""
+        super().check_room(shell, object_width)
+        half = float(shell.half[0]), float(shell.half[1])
         narrowest = self.width.low * (self.door_width.low if self.doors else 1)
-        for room, size, words in (
-            (narrowest, 2 * half[1], "the base needs"),
-            (narrowest, width, "the widest object needs"),
-            (self.width.low, 0 if self.waypoints else 2 * reach, "objects off the middle need"),
-        ):
-            if room <= size:
-                rule = f"{words} {size:.2f} m, and the narrowest place must be wider"
+        for name, size in (("base", 2 * half[1]), ("widest object", object_width())):
+            if narrowest <= size:
+                rule = f"the {name} is {size:.2f} m wide, and the narrowest place must be wider"
                 raise errors.not_allowed("task width (low)", f"{self.width.low:g} m", rule)
         walls = _walls(self.route()[None], np.array([self.width.low / 2])) if self.waypoints else ()
         if len(walls) and polyline.clearance(fp.rectangle(*half), jnp.asarray(walls[0]))[0] <= 0:

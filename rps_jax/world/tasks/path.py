@@ -170,7 +170,7 @@ class Path(Task):
         lookahead: Any = self.lookahead.at(inputs.u["lookahead"])
         return vertices[:, -1], PathCourse(Polyline.through(vertices), lookahead)
 
-    def check_room(self, shell: Shell, of_objects: Callable[[], tuple[float, float]]) -> None:
+    def check_room(self, shell: Shell, object_width: Callable[[], float]) -> None:
         """Raise InputError for waypoints that start away from the base's front."""
         front = float(shell.half[0])
         x, y = self.waypoints[0] if self.waypoints else (front, 0.0)
