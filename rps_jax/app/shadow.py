@@ -123,13 +123,14 @@ def pursued(recorded: dict[str, np.ndarray], lookahead: float) -> np.ndarray:
     Raises:
       InputError: the path changes.
     """
-    pose, path = recorded["pose"], recorded["path"]
+    path = recorded["path"]
     if np.ptp(path, axis=0).max() > _STILL:
         raise InputError("the bag has a path that changes: cut the bag where it does.")
     line: Any = jax.tree.map(jnp.asarray, Polyline.through(path[0]))
     course = PathCourse(line, jnp.asarray(lookahead))
-    contacts = pose[:, :2] + jax.vmap(planar.rotate)(pose[:, 2], recorded["p_robot_contact"])
-    rows = contacts, recorded["contact_type"] > 0
+    pose, contact = (jnp.asarray(recorded[name]) for name in ("pose", "p_robot_contact"))
+    contacts = pose[:, :2] + planar.rotate(pose[:, 2], contact)
+    rows = contacts, jnp.asarray(recorded["contact_type"] > 0)
     _, aims = jax.lax.scan(lambda at, row: course.follow(at, *row), course.start(), rows)
     return np.asarray(aims.p_world_target)
 

@@ -469,7 +469,7 @@ def _to_frames(rows: Mapping[str, _Series], edges: Callable[[], _Edges], static:
     odom = rows["odom"]
     odom.refuse((odom.frames != odom.frames[0]).any(axis=1), "a change of frames")
     world, base = odom.frames[0][0] or "odom", odom.frames[0][1] or "base_link"
-    goals = dict.fromkeys(("target", "path", "object"), world)
+    goals: dict[str, str] = dict.fromkeys(("target", "path", "object"), world)
     goals |= dict.fromkeys(("contact", "force", "cmd_vel"), base)
     for key in [key for key in goals if key in rows]:
         row, goal = rows[key], goals[key]

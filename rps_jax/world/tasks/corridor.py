@@ -168,12 +168,13 @@ class Corridor(Path):
             if narrowest <= size:
                 rule = f"the {name} is {size:.2f} m wide, and the narrowest place must be wider"
                 raise errors.not_allowed("task width (low)", f"{self.width.low:g} m", rule)
-        walls = _walls(self.route()[None], np.array([self.width.low / 2])) if self.waypoints else ()
-        if len(walls) and polyline.clearance(fp.rectangle(*half), jnp.asarray(walls[0]))[0] <= 0:
-            rule = "a wall beside them crosses the base at its start; start them ahead"
-            raise errors.not_allowed("task waypoints", self.waypoints[:2], rule)
+        if self.waypoints:
+            (walls,) = _walls(self.route()[None], np.array([self.width.low / 2]))
+            if polyline.clearance(fp.rectangle(*half), jnp.asarray(walls))[0] <= 0:
+                rule = "a wall beside them crosses the base at its start; start them ahead"
+                raise errors.not_allowed("task waypoints", self.waypoints[:2], rule)
 
-    def measures(self, course: CorridorCourse) -> dict[str, np.ndarray]:
+    def measures(self, course: Any) -> dict[str, np.ndarray]:
         """Return the measures of the path."""
         return super().measures(course.path)
 

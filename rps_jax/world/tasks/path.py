@@ -178,7 +178,7 @@ class Path(Task):
             rule = f"they must start within {_NEAR} m of the base's front, ({front:.2f}, 0) m"
             raise errors.not_allowed("task waypoints", (x, y), rule)
 
-    def measures(self, course: PathCourse) -> dict[str, np.ndarray]:
+    def measures(self, course: Any) -> dict[str, np.ndarray]:
         """Return length, number of turns and their mean angle."""
         line: Any = course.line
         angles = np.abs(turns_of(np.asarray(line.vertices)))
