@@ -32,7 +32,7 @@ from rps_jax.tuning.evolution import TuneES
 from rps_jax.tuning.rollout import ease
 from rps_jax.world import draws, points, tasks
 from rps_jax.world.domain import DOMAINS, from_json, parse_domain, to_json
-from rps_jax.world.tasks.base import CourseInputs, Place, Task
+from rps_jax.world.tasks.base import CourseInputs, Positions, Task
 from rps_jax.world.tasks.path import Path, PathCourse
 from rps_jax.world.tasks.reach import Nothing
 
@@ -101,7 +101,7 @@ def test_the_example_of_a_task_is_complete():
     goals, course = task.courses(CourseInputs({}, targets, np.full(2, 0.36)))
     world = jax.tree.map(lambda x: jnp.asarray(x[0]), course)
     off, point = jnp.zeros(2), jnp.array([1.0, 0.0])
-    touch = Place(jnp.array([2.0, 0.0]), point + 0.1, jnp.asarray(True), *[off] * 5)  # pyright: ignore[reportArgumentType]
+    touch = Positions(jnp.array([2.0, 0.0]), point + 0.1, jnp.asarray(True), *[off] * 5)  # pyright: ignore[reportArgumentType]
     progress, aim = world.step(world.start(), touch)
     assert float(progress.outcomes()["off_line"]) == pytest.approx(0.1)
     assert not aim.failed

@@ -23,7 +23,7 @@ from rps_jax.trials.trial import Rules
 from rps_jax.world import draws, tasks
 from rps_jax.world.domain import Range, parse_domain
 from rps_jax.world.tasks import corridor, path
-from rps_jax.world.tasks.base import Aim, CourseInputs, Place, Task
+from rps_jax.world.tasks.base import Aim, CourseInputs, Positions, Task
 from rps_jax.world.tasks.path import Path
 
 BRIEF = Setting("quasistatic", rules=Rules(horizon=40.0))
@@ -52,14 +52,14 @@ def test_the_clearance_from_walls_is_exact() -> None:
         clearance = jax.jit(partial(polyline.clearance, outline))
         for _ in range(60):
             walls = random_walls(rng, 3)
-            found, point = clearance(jnp.asarray(walls))
+            distance_found, point = clearance(jnp.asarray(walls))
             lines = [LineString(wall) for wall in walls]
             distance = min(shape.distance(line) for line in lines)
             crosses = any(shape.intersects(line) for line in lines)
             crossings += crosses
-            assert (found <= 1e-6) == crosses
+            assert (distance_found <= 1e-6) == crosses
             if not crosses:
-                assert found == pytest.approx(distance, abs=2e-6)
+                assert distance_found == pytest.approx(distance, abs=2e-6)
                 assert shape.distance(Point(point)) == pytest.approx(distance, abs=2e-6)
             assert min(line.distance(Point(point)) for line in lines) < 1e-6
     assert 30 < crossings < 150
@@ -71,12 +71,12 @@ def test_the_way_out_of_a_wall_ends_its_crossing() -> None:
     inside = 0
     for _ in range(40):
         walls = random_walls(rng, 1)
-        found, _ = polyline.clearance(outline, jnp.asarray(walls))
-        if found < -1e-3:
+        depth, _ = polyline.clearance(outline, jnp.asarray(walls))
+        if depth < -1e-3:
             inside += 1
             turns, wall = np.linspace(0, 2 * np.pi, 181), LineString(walls[0])
 
-            def crosses(share: float, a: float, way: Any = -found, wall: Any = wall) -> bool:
+            def crosses(share: float, a: float, way: Any = -depth, wall: Any = wall) -> bool:
                 moved = translate(shape, share * way * np.cos(a), share * way * np.sin(a))
                 return moved.intersects(wall)
 
@@ -120,9 +120,9 @@ def test_drawn_paths_start_at_the_front_and_never_turn_back() -> None:
     assert worlds.p_world_target == pytest.approx(worlds.course.line.vertices[:, -1])
     lengths = worlds.course.line.arcs[:, -1]
     assert ((lengths > 4 - 1e-9) & (lengths < 9.5)).all()
-    few = draws.draw(parse_domain("wide,objects=random_box", task="path"), 3, np.array([5, 7]))
+    two = draws.draw(parse_domain("wide,objects=random_box", task="path"), 3, np.array([5, 7]))
     again = drawn("path")
-    assert (few.course.line.vertices == again.course.line.vertices[[5, 7]]).all()
+    assert (two.course.line.vertices == again.course.line.vertices[[5, 7]]).all()
 
 
 def test_walls_are_at_half_the_width() -> None:
@@ -143,9 +143,9 @@ def test_doors_leave_an_opening() -> None:
         assert [door.distance(whole) for door in doors] == pytest.approx([0.6] * 4)
 
 
-def place(contact: tuple[float, float], touches: bool = True) -> Place:
-    """Return a place with a contact point, and a base and an object about the origin."""
-    return Place(
+def positions_at(contact: tuple[float, float], touches: bool = True) -> Positions:
+    """Return positions with a contact point, and a base and an object about the origin."""
+    return Positions(
         *(jnp.zeros(2), jnp.array(contact), jnp.asarray(touches), jnp.zeros(3), (0.3, 0.2)),
         *(jnp.array([0.8, 0.0]), 0.0, fp.rectangle(0.2, 0.2)),
     )
@@ -158,16 +158,16 @@ def test_cross_track_errors_are_those_of_the_contact_points() -> None:
     errors = np.abs(rng.normal(0, 0.08, 400))
     progress, step = course.start(), jax.jit(course.step)
     for x, y in zip(np.linspace(0, 3, 400), errors, strict=True):
-        progress, aim = step(progress, place((x, y)))
+        progress, aim = step(progress, positions_at((x, y)))
         assert aim.p_world_target == pytest.approx([min(x + 0.5, 4), max(x - 3.5, 0)], abs=1e-5)
         assert not aim.at_end
-    progress, _ = step(progress, place((0.0, 3.0), touches=False))
-    found = progress.outcomes()
-    assert found["error_mean"] == pytest.approx(errors.mean(), rel=1e-4)
-    assert found["error_max"] == pytest.approx(errors.max(), rel=1e-5)
-    assert found["error_95"] == pytest.approx(np.quantile(errors, 0.95), rel=0.08)
-    assert found["progress"] == pytest.approx(3 / 8, abs=1e-5)
-    _, aim = step(progress._replace(arc=jnp.asarray(7.8)), place((4.0, 3.9)))
+    progress, _ = step(progress, positions_at((0.0, 3.0), touches=False))
+    outcomes = progress.outcomes()
+    assert outcomes["error_mean"] == pytest.approx(errors.mean(), rel=1e-4)
+    assert outcomes["error_max"] == pytest.approx(errors.max(), rel=1e-5)
+    assert outcomes["error_95"] == pytest.approx(np.quantile(errors, 0.95), rel=0.08)
+    assert outcomes["progress"] == pytest.approx(3 / 8, abs=1e-5)
+    _, aim = step(progress._replace(arc=jnp.asarray(7.8)), positions_at((4.0, 3.9)))
     assert aim.at_end
     assert aim.p_world_target == pytest.approx([4.0, 4.0], abs=1e-5)
     untouched = course.start().outcomes()
@@ -234,9 +234,9 @@ class Timer(NamedTuple):
     def start(self) -> "Timer":
         return Timer(jnp.zeros(()))
 
-    def step(self, progress: "Timer", place: Place) -> tuple["Timer", Aim]:
+    def step(self, progress: "Timer", positions: Positions) -> tuple["Timer", Aim]:
         later = Timer(progress.count + 1.0)
-        return later, Aim(place.p_world_goal, failed=later.count >= 10)
+        return later, Aim(positions.p_world_goal, failed=later.count >= 10)
 
     def outcomes(self) -> dict[str, Any]:
         return {"count": self.count}

@@ -18,8 +18,8 @@
 #define __shared__ static
 using std::min;
 
-struct Place { int x; };
-static Place threadIdx, blockIdx;
+struct Positions { int x; };
+static Positions threadIdx, blockIdx;
 static ucontext_t fibers[32], caller;
 static char stacks[32][1 << 18];
 static uint32_t words[2][32];

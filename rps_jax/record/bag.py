@@ -201,8 +201,8 @@ def _messages(steps: Iterable[Step]) -> Iterator[tuple[str, int, Message]]:
                 poses = [{"header": odom, "pose": _pose(*point)} for point in step.path]
                 yield "/path", stamp, {"header": odom, "poses": poses}
             if step.walls is not None:
-                ends = [_xyz(*end) for end in step.walls.reshape(-1, 2)]
-                lines = {"type": 5, "points": ends, "pose": _pose(0, 0), "scale": {"x": 0.04}}
+                vertices = [_xyz(*end) for end in step.walls.reshape(-1, 2)]
+                lines = {"type": 5, "points": vertices, "pose": _pose(0, 0), "scale": {"x": 0.04}}
                 yield "/walls", stamp, _cylinder(odom, "walls", (0, 0), 0.0) | lines
         yield "/cmd_vel", stamp, {"header": base, "twist": _twist(*step.twist)}
         previous = step

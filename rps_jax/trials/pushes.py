@@ -83,13 +83,13 @@ def build(
     solids = {key: x.rounded_solid if traced else x.solid for key, x in scenes.items()}
     starts = [_start_of(case, scenes[key]) for case, key in zip(cases, keys, strict=True)]
     qpos, targets = (np.array(column) for column in zip(*starts, strict=True))
-    courses, ends = [], []
+    courses, final = [], []
     uniform = draws.random_numbers(setting.seed, trials)
-    for case, numbers, target in zip(cases, uniform, targets, strict=True):
-        u = {name: numbers[column : column + 1] for name, column in draws.USES.items()}
+    for case, row, target in zip(cases, uniform, targets, strict=True):
+        u = {name: row[column : column + 1] for name, column in draws.USES.items()}
         front = np.array([float(case.base.half_length)])
         end, course = case.challenge.courses(CourseInputs(u, target[None], front))
-        ends.append(end[0])
+        final.append(end[0])
         courses.append(rows(course, 0))
     shifts = zip(*(case.shift for case in cases), strict=True)
     root = jax.random.PRNGKey(setting.seed)
@@ -101,7 +101,7 @@ def build(
         _stack([case.base for case in cases]),
         setting,
         skin=_stack([case.sensor for case in cases]),
-        p_world_target=np.array(ends),
+        p_world_target=np.array(final),
         task=_stack(courses),
         shift=Shift(*(np.array(column, float) for column in shifts)),
         qpos=qpos,

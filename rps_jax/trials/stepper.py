@@ -78,7 +78,7 @@ class Live:
 
     @property
     def lines(self) -> dict[str, np.ndarray]:
-        """What pictures show of the task: see `Course.lines`."""
+        """Lines of the task for pictures: see `Course.lines`."""
         return rows(self._worlds.task, 0).lines()
 
     # --- control ---

@@ -48,7 +48,7 @@ from rps_jax.robot.skin import NONE, Reading, Skin, SkinState
 from rps_jax.world.physics import Physics
 from rps_jax.world.scene import JOINTS
 from rps_jax.world.tasks import reach
-from rps_jax.world.tasks.base import Place
+from rps_jax.world.tasks.base import Positions
 
 # A world is a runaway beyond these, far outside anything a base at 0.05 m/s can cause.
 _MAX_SPEED = 20.0  # [m/s], [rad/s]
@@ -170,8 +170,8 @@ class Outcome(NamedTuple):
     @classmethod
     def of_columns(cls, columns: Mapping[str, Any]) -> Outcome:
         """Return the outcome of all columns by name."""
-        own = {name: columns[name] for name in cls._fields if name in columns}
-        return cls(**own, task={k: x for k, x in columns.items() if k not in own})
+        fields = {name: columns[name] for name in cls._fields if name in columns}
+        return cls(**fields, task={k: x for k, x in columns.items() if k not in fields})
 
 
 def object_pose(qpos: Float[Array, "10"]) -> tuple[Float[Array, "2"], Float[Array, ""]]:
@@ -232,21 +232,21 @@ def contact_of(qpos: Float[Array, "10"], p_robot_contact: Float[Array, "2"]) -> 
     return qpos[:2] + planar.rotate(qpos[2], p_robot_contact)
 
 
-def place_of(
+def positions_of(
     world: World, qpos: Float[Array, "10"], p_robot_contact: Float[Array, "2"], touches: Array
-) -> Place:
+) -> Positions:
     """Return what a task judges, at the positions qpos."""
     contact = contact_of(qpos, p_robot_contact), touches
     base = qpos[JOINTS.base], world.skin.shell.half
-    return Place(world.p_world_target, *contact, *base, *object_pose(qpos), world.footprint)
+    return Positions(world.p_world_target, *contact, *base, *object_pose(qpos), world.footprint)
 
 
 @jax.jit
 @jax.vmap
 def fails_at_start(world: World) -> Bool[Array, ""] | bool:
     """Return whether the task has failed in each of several worlds before the first step."""
-    place = place_of(world, world.qpos, jnp.zeros(2), jnp.zeros((), bool))
-    return world.task.step(world.task.start(), place)[1].failed
+    positions = positions_of(world, world.qpos, jnp.zeros(2), jnp.zeros((), bool))
+    return world.task.step(world.task.start(), positions)[1].failed
 
 
 class Measurement(NamedTuple):
@@ -278,8 +278,8 @@ def observe(
 
     touch = reading.contact_type != NONE
     lost_steps = trial.lost_steps + (~touch & (trial.contact_steps > 0))
-    place = place_of(world, trial.qpos, reading.p_robot_contact, touch)
-    task, aim = world.task.step(trial.task, place)
+    positions = positions_of(world, trial.qpos, reading.p_robot_contact, touch)
+    task, aim = world.task.step(trial.task, positions)
     observation = observation._replace(p_world_target=aim.p_world_target)
     success = touch & (distance < params.d_success) & aim.at_end
     tilt = planar.tilt(trial.qpos[JOINTS.object][3:])

@@ -144,7 +144,7 @@ class Domain:
 
     def range_of(self, name: str) -> Range | None:
         """Return the range of a quantity, of the domain itself or of its task; None: not drawn."""
-        return getattr(self if name in _OWN else self.task, name, None)
+        return getattr(self if name in _DECLARED else self.task, name, None)
 
     @property
     def weakest(self) -> Robot:
@@ -197,8 +197,8 @@ class Domain:
 
 
 RANDOM = {"random_box": "box", "random_cylinder": "cylinder", "random_prism": "prism"}
-_OWN = declared(Domain)
-QUANTITIES: dict[str, Quantity] = _OWN | tasks.QUANTITIES
+_DECLARED = declared(Domain)
+QUANTITIES: dict[str, Quantity] = _DECLARED | tasks.QUANTITIES
 
 
 def quantities_of(*owners: Owner) -> tuple[str, ...]:

@@ -103,7 +103,7 @@ def draw_at(
     robot = _robots(domain.robot, at, index.size)
     front = np.broadcast_to(np.asarray(robot.half_length, float), index.shape)
     inputs = CourseInputs(u, _targets(domain, index, at), front)
-    ends, course = domain.task.courses(inputs)
+    targets, course = domain.task.courses(inputs)
     key = [np.floor(u[name] * 2**32).astype(np.uint32) for name in ("key_0", "key_1")]
     return Draw(
         indices=index,
@@ -112,7 +112,7 @@ def draw_at(
         friction=Friction(at["friction_ground"], at["friction_robot"]),
         values={name: values for name, values in at.items() if name in ranges}
         | domain.task.measures(course),
-        p_world_target=ends,
+        p_world_target=targets,
         course=course,
         velocity_error=np.stack([at[name] for name in VELOCITY_ERRORS], axis=-1),
         robot=robot,

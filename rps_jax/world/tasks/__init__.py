@@ -25,7 +25,7 @@ for _file in sorted(x.name for x in pkgutil.iter_modules(__path__) if x.name != 
 QUANTITIES: dict[str, Quantity] = {
     name: quantity for kind in TASKS.values() for name, quantity in declared(kind).items()
 }
-# Columns of random numbers without a range of their own.
+# Columns of random numbers without ranges.
 MORE_NUMBERS = {name: i for kind in TASKS.values() for name, i in kind.MORE_NUMBERS.items()}
 OUTCOMES = {name: text for kind in TASKS.values() for name, text in kind.OUTCOMES.items()}
 FAILURES = {name: text for kind in TASKS.values() for name, text in kind.FAILURES.items()}

@@ -1,7 +1,7 @@
-"""Types of a task: its declaration, the numbers of one world, and what it judges.
+"""Types of a task: its declaration, the parameters of one world, and its verdict.
 
 A task is one file of this folder. It has a frozen dataclass that extends `Task`, with the ranges of
-what is drawn, and a pytree that is a `Course`, with the numbers of one world.
+all drawn quantities, and a pytree that is a `Course`, with the parameters of one world.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from rps_jax.robot.shell import Shell
 from rps_jax.world.quantity import Range, check_ranges
 
 
-class Place(NamedTuple):
+class Positions(NamedTuple):
     """Position of base, object and contact in the world, in one control step."""
 
     p_world_goal: Float[Array, "2"]  # [m] where the trial ends
@@ -35,7 +35,7 @@ class Place(NamedTuple):
 
 
 class Aim(NamedTuple):
-    """What a task asks of a law in one control step, and what it judges."""
+    """Target of a law in one control step, and the verdict of the task."""
 
     p_world_target: Float[Array, "2"]  # [m] of the law
     at_end: Bool[Array, ""] | bool = True  # whether the trial may succeed now
@@ -43,13 +43,13 @@ class Aim(NamedTuple):
 
 
 class Course(Protocol):
-    """Numbers of a task in one world: a pytree."""
+    """Parameters of a task in one world: a pytree."""
 
     def start(self) -> Any:
         """Return the progress before the first control step: a pytree with `outcomes`."""
         ...
 
-    def step(self, progress: Any, place: Place) -> tuple[Any, Aim]:
+    def step(self, progress: Any, positions: Positions) -> tuple[Any, Aim]:
         """Return the progress after one control step, and the aim."""
         ...
 

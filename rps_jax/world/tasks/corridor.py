@@ -23,7 +23,7 @@ from rps_jax.geometry.polyline import Polyline
 from rps_jax.record.options import option
 from rps_jax.robot.shell import Shell
 from rps_jax.world.quantity import Range, drawn
-from rps_jax.world.tasks.base import Aim, CourseInputs, Place
+from rps_jax.world.tasks.base import Aim, CourseInputs, Positions
 from rps_jax.world.tasks.path import Path, PathCourse, PathProgress, turns_of, units_of
 
 _BEHIND = 1.5  # [m] of the walls before the base's front
@@ -67,19 +67,23 @@ class CorridorCourse(NamedTuple):
         count = jnp.zeros((), jnp.int32)
         return CorridorProgress(inner, jnp.inf + zero, zero, nan, zero, poses, count)
 
-    def step(self, progress: CorridorProgress, place: Place) -> tuple[CorridorProgress, Aim]:
+    def step(
+        self, progress: CorridorProgress, positions: Positions
+    ) -> tuple[CorridorProgress, Aim]:
         """Advance along the path, and fail at a touch.
 
         Walls are measured in every fifth step, and in each in which one may be touched.
         """
-        inner, aim = self.path.step(progress.path, place)
-        poses = jnp.stack([place.base, jnp.append(place.p_world_object, place.object_yaw)])
-        radii = planar.norm(jnp.stack(place.half)), fp.circumradius(place.footprint)
+        inner, aim = self.path.step(progress.path, positions)
+        poses = jnp.stack(
+            [positions.base, jnp.append(positions.p_world_object, positions.object_yaw)]
+        )
+        radii = planar.norm(jnp.stack(positions.half)), fp.circumradius(positions.footprint)
         away = jnp.abs(poses - progress.measured_at)
         travel = planar.norm(away[:, :2]) + jnp.stack(radii) * away[:, 2]
         may_touch = progress.measured <= jnp.max(travel)
         due = may_touch | (progress.steps % _STEPS == 0)
-        outlines = fp.rectangle(*place.half), place.footprint
+        outlines = fp.rectangle(*positions.half), positions.footprint
 
         def measure(carry: Any) -> Any:
             poses = carry[-1]  # changed by the pass: what does not change is computed before
@@ -91,17 +95,17 @@ class CorridorCourse(NamedTuple):
             )
             by_base = of_base <= of_object
             least = jnp.where(by_base, of_base, of_object)
-            who = jnp.where(least > 0, NOTHING, jnp.where(by_base, BASE, OBJECT))
+            touched = jnp.where(least > 0, NOTHING, jnp.where(by_base, BASE, OBJECT))
             point = jnp.where(least > 0, jnp.nan, origin + jnp.where(by_base, at_base, at_object))
             clearance = jnp.minimum(progress.clearance, least)
-            touch = who.astype(least.dtype), point
+            touch = touched.astype(least.dtype), point
             return jnp.zeros((), bool), clearance, *touch, least, poses, jnp.zeros_like(poses)
 
-        # A loop of at most one pass: a program for many worlds skips it if none is due.
+        # A loop of at most one pass: a program for many worlds skips the pass if no world needs it.
         last = progress.clearance, progress.wall_touch, progress.p_world_touch
         carry = due, *last, progress.measured, progress.measured_at, poses
-        _, *now, _ = jax.lax.while_loop(lambda x: x[0], measure, carry)
-        moved = CorridorProgress(inner, *now, progress.steps + 1)
+        _, *latest, _ = jax.lax.while_loop(lambda x: x[0], measure, carry)
+        moved = CorridorProgress(inner, *latest, progress.steps + 1)
         return moved, aim._replace(failed=moved.wall_touch > NOTHING)
 
     def remaining(self, progress: CorridorProgress, p_world_goal: Array, point: Array) -> Array:
@@ -180,7 +184,7 @@ class Corridor(Path):
 
     def courses(self, inputs: CourseInputs) -> tuple[np.ndarray, Any]:
         """Return the ends, paths and walls of worlds."""
-        ends, inner = super().courses(inputs)
+        targets, inner = super().courses(inputs)
         half = self.width.at(inputs.u["width"]) / 2
         walls = _walls(np.asarray(inner.line.vertices), half)
         opening = half * self.door_width.at(inputs.u["door_width"])
@@ -189,7 +193,7 @@ class Corridor(Path):
             for i in range(self.doors)
         ]
         joined: Any = np.concatenate([walls, *doors], axis=1)
-        return ends, CorridorCourse(inner, joined)
+        return targets, CorridorCourse(inner, joined)
 
 
 def _walls(vertices: np.ndarray, half: np.ndarray) -> np.ndarray:
@@ -199,9 +203,9 @@ def _walls(vertices: np.ndarray, half: np.ndarray) -> np.ndarray:
     points[:, 0] -= _BEHIND * units[:, 0]
     points[:, -1] += _BEYOND * units[:, -1]
     normals = np.stack([-units[..., 1], units[..., 0]], axis=-1)
-    before = np.concatenate([normals[:, :1], normals], axis=1)
-    after = np.concatenate([normals, normals[:, -1:]], axis=1)
-    mitre = (before + after) / (1 + np.sum(before * after, axis=-1, keepdims=True))
+    previous = np.concatenate([normals[:, :1], normals], axis=1)
+    following = np.concatenate([normals, normals[:, -1:]], axis=1)
+    mitre = (previous + following) / (1 + np.sum(previous * following, axis=-1, keepdims=True))
     sides = [points + sign * half[:, None, None] * mitre for sign in (1, -1)]
     return np.concatenate([np.stack([s[:, :-1], s[:, 1:]], axis=2) for s in sides], axis=1)
 
@@ -217,8 +221,8 @@ def _door(line: Polyline, share: float, inner: np.ndarray, outer: np.ndarray) ->
     a, b = vertices[rows, first], vertices[rows, first + 1]
     unit = units_of(vertices)[rows, first]
     normal = np.stack([-unit[:, 1], unit[:, 0]], axis=-1)
-    ends = [(a + b) / 2 + s * x[:, None] * normal for s in (1, -1) for x in (inner, outer)]
-    return np.stack([np.stack(ends[:2], axis=1), np.stack(ends[2:], axis=1)], axis=1)
+    jambs = [(a + b) / 2 + s * x[:, None] * normal for s in (1, -1) for x in (inner, outer)]
+    return np.stack([np.stack(jambs[:2], axis=1), np.stack(jambs[2:], axis=1)], axis=1)
 
 
 TASK = Corridor

@@ -20,21 +20,21 @@ from rps_jax.geometry.arrays import Array, Float, Int
 from rps_jax.geometry.polyline import Polyline
 from rps_jax.robot.shell import Shell
 from rps_jax.world.quantity import Range, drawn
-from rps_jax.world.tasks.base import Aim, CourseInputs, Place, Task
+from rps_jax.world.tasks.base import Aim, CourseInputs, Positions, Task
 
 _SEGMENTS = 8  # of a drawn path
 _PER_SPAN = 6  # segments of a spline between two waypoints
 _REACH = 1.0  # [m] along the path, either way, in which the nearest point is sought
 _END = 0.5  # [m] before the end, from which on a trial may succeed
 _LEAD = 1.5  # [m] of a drawn path before its first turn, at least
-_APART = "consecutive waypoints must be at least 1 cm apart"
+_MIN_SPACING = "consecutive waypoints must be at least 1 cm apart"
 _NEAR = 0.5  # [m] between the base's front and the first waypoint, at most
 # [m] upper ends of the classes of a histogram of errors; the last is open.
 _EDGES = np.append(0.0025 * 1.5 ** np.arange(15), np.inf)
 
 
 class PathProgress(NamedTuple):
-    """How far a trial has come along its path, and how far off it was."""
+    """Progress of a trial along its path, and its cross-track errors."""
 
     arc: Float[Array, "*B"]  # [m] of the nearest point so far
     share: Float[Array, "*B"]  # [1] of the path's length
@@ -46,12 +46,12 @@ class PathProgress(NamedTuple):
         """Return progress and cross-track errors; of a trial without contact they are NaN."""
         below = jnp.cumsum(self.counts, axis=-1)
         steps = below[..., -1]
-        wanted = 0.95 * steps[..., None]
+        rank = 0.95 * steps[..., None]
         # Linear within a class; the last class ends at the largest error.
         edges = jnp.asarray(np.append(0.0, _EDGES[:-1]), self.arc.dtype)
         tops = jnp.minimum(jnp.append(edges[1:], jnp.inf), self.max_error[..., None])
-        is_there = (below >= wanted) & (below - self.counts < wanted)
-        inner = (wanted - (below - self.counts)) / jnp.maximum(self.counts, 1)
+        is_there = (below >= rank) & (below - self.counts < rank)
+        inner = (rank - (below - self.counts)) / jnp.maximum(self.counts, 1)
         quantile = jnp.sum(jnp.where(is_there, edges + inner * (tops - edges), 0.0), axis=-1)
         nan = jnp.where(steps > 0, 0.0, jnp.nan)
         return {
@@ -73,9 +73,9 @@ class PathCourse(NamedTuple):
         zero = jnp.zeros_like(self.lookahead)
         return PathProgress(zero, zero, zero, zero, jnp.zeros(len(_EDGES), jnp.int32))
 
-    def step(self, progress: PathProgress, place: Place) -> tuple[PathProgress, Aim]:
+    def step(self, progress: PathProgress, positions: Positions) -> tuple[PathProgress, Aim]:
         """Follow the path."""
-        return self.follow(progress, place.p_world_contact, place.touches)
+        return self.follow(progress, positions.p_world_contact, positions.touches)
 
     def follow(
         self, progress: PathProgress, p_world_contact: Array, touches: Array
@@ -159,7 +159,7 @@ class Path(Task):
             (len(points) < 2, points, "a path has two points or more, each as x, y [m]"),
             (len(points) > 100, points[100:101], "a path has at most 100 waypoints"),
             *((abs(x).max() > 50, x, "give coordinates from -50 to 50, in metres") for x in points),
-            *((d < 0.01, points[i : i + 2], _APART) for i, d in enumerate(steps)),
+            *((d < 0.01, points[i : i + 2], _MIN_SPACING) for i, d in enumerate(steps)),
         ):
             if is_bad:
                 raise errors.not_allowed("task waypoints", bad.tolist(), rule)

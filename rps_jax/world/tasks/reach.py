@@ -9,7 +9,7 @@ import numpy as np
 
 from rps_jax.geometry import planar
 from rps_jax.geometry.arrays import Array
-from rps_jax.world.tasks.base import Aim, CourseInputs, Place, Task
+from rps_jax.world.tasks.base import Aim, CourseInputs, Positions, Task
 
 
 class Nothing(NamedTuple):
@@ -19,9 +19,9 @@ class Nothing(NamedTuple):
         """Return the progress, which is nothing."""
         return self
 
-    def step(self, progress: Nothing, place: Place) -> tuple[Nothing, Aim]:
+    def step(self, progress: Nothing, positions: Positions) -> tuple[Nothing, Aim]:
         """Return the target as the aim."""
-        return progress, Aim(place.p_world_goal)
+        return progress, Aim(positions.p_world_goal)
 
     def lines(self) -> dict[str, np.ndarray]:
         """Return no lines."""
