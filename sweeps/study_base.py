@@ -38,7 +38,10 @@ from rps_jax.record.checkpoint import Checkpoints
 from rps_jax.runs import execution
 from rps_jax.runs.plan import Plan
 from rps_jax.runs.question import Question, Run, TrialQuestion
+from rps_jax.runs.results import Results
 from rps_jax.trials.progress import Progress, ProgressCallback, SequentialProgress, no_progress
+from rps_jax.trials.rollout import rollout
+from rps_jax.trials.trial import Outcome
 from rps_jax.world.domain import DOMAINS, QUANTITIES
 from sweeps import render_tables
 
@@ -296,6 +299,22 @@ def run_plans(run: Run, plans: Mapping[str, Plan]) -> dict[str, xr.Dataset]:
         results[name] = execution.run_plan(plan, folder, **options)
         progress.finish(plan.num_trials)
     return results
+
+
+def run_together(plans: Sequence[Plan], run: Run) -> list[xr.Dataset]:
+    """Run plans of one setting and equal shapes in one rollout; return the results of each."""
+    requests = [Results(plan, list(plan.chunks)) for plan in plans]
+    ends = np.cumsum([plan.num_trials for plan in plans])
+
+    def collect(indices: np.ndarray, outcomes: Outcome) -> None:
+        owners = np.searchsorted(ends, indices, side="right")
+        for owner in np.unique(owners).tolist():
+            mask, first = owners == owner, ends[owner] - plans[owner].num_trials
+            columns = {name: x[mask] for name, x in outcomes.columns().items()}
+            requests[owner].collect(indices[mask] - first, Outcome.of_columns(columns))
+
+    rollout(requests, plans[0].setting, collect, **run.batch_options)
+    return [request.dataset() for request in requests]
 
 
 # --- data files -----------------------------------------------------------------------------
