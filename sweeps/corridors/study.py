@@ -48,8 +48,8 @@ KINDS = (
     *("base touched", "object touched", "lost contact", "never touched", "fell over"),
     *("out of time", "diverged"),
 )
-_AT_END = 0.95  # [1] of the path, from which on a failure is one of its end
-_WHERE = ("median progress [%]", f"beyond {100 * _AT_END:.0f} % of the path [%]")
+_ENDS = 0.1, 0.95  # [1] of the path, before and beyond which a failure is one of its ends
+_WHERE = ("in the first metre [%]", "in the last 0.5 m [%]")
 
 
 @dataclass(frozen=True)
@@ -316,8 +316,9 @@ def failure_table(results: xr.Dataset) -> Rows:
             shares = [100 * np.mean(kinds[failed] == i) if failed.any() else 0.0
                       for i in range(len(KINDS))]  # fmt: skip
             progress = trials.progress.values[failed]
-            where = [np.median(progress), np.mean(progress > _AT_END)] if failed.any() else [0, 0]
-            cells = [f"{x:.0f}" for x in (*shares, *(100 * x for x in where))]
+            first, last = _ENDS
+            where = [100 * np.mean(m) for m in (progress < first, progress > last) if m.size]
+            cells = [f"{x:.0f}" for x in (*shares, *(where or (0, 0)))]
             rows.append([row, law, f"{failed.sum():,}", *cells])
     return rows
 
