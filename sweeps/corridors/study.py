@@ -67,6 +67,10 @@ class Corridors(Study[xr.DataTree], MultiLawQuestion[xr.DataTree]):
         "worlds": 48,
         "paths": 60,
     }
+    PRESETS: ClassVar = {
+        **{"widths": list(WIDTHS), "length": list(LENGTH), "lookaheads": LOOKAHEADS.tolist()},
+        **{"turns": list(TURNS.values()), "door": _DOOR_WIDTH},
+    }
 
     laws: LawsLike = (
         *("rps", "rps_tuned", "rps_plus", "learned_gru"),
@@ -168,15 +172,15 @@ class Corridors(Study[xr.DataTree], MultiLawQuestion[xr.DataTree]):
         curves = fit_all(corridors)
         figure = Picture("corridors", partial(figure_of, corridors, curves))
         return [
-            Table(width_table(corridors, curves), name="corridors", merge="turn",
+            Table(width_table(corridors, curves), name="corridors_widths", merge="turn",
                   title="Width that laws need", picture=figure),
             Table(object_table(corridors), name="corridors_objects", merge="turn",
                   title="Width that 90 % need, by object"),
             Table(failure_table(corridors), name="corridors_failures", merge="turn",
                   title="Failures"),
-            Table(lookahead_table(choice), name="corridors_lookahead",
+            Table(lookahead_table(choice), name="corridors_lookaheads",
                   title="Success in corridors by lookahead"),
-            Table(error_table(paths), name="path_errors", merge="law",
+            Table(error_table(paths), name="corridors_paths", merge="law",
                   title="Cross-track error on paths"),
         ]  # fmt: skip
 
