@@ -304,12 +304,12 @@ def run_plans(run: Run, plans: Mapping[str, Plan]) -> dict[str, xr.Dataset]:
 def run_together(plans: Sequence[Plan], run: Run) -> list[xr.Dataset]:
     """Run plans of one setting and equal shapes in one rollout; return the results of each."""
     requests = [Results(plan, list(plan.chunks)) for plan in plans]
-    ends = np.cumsum([plan.num_trials for plan in plans])
+    last = np.cumsum([plan.num_trials for plan in plans])
 
     def collect(indices: np.ndarray, outcomes: Outcome) -> None:
-        owners = np.searchsorted(ends, indices, side="right")
+        owners = np.searchsorted(last, indices, side="right")
         for owner in np.unique(owners).tolist():
-            mask, first = owners == owner, ends[owner] - plans[owner].num_trials
+            mask, first = owners == owner, last[owner] - plans[owner].num_trials
             columns = {name: x[mask] for name, x in outcomes.columns().items()}
             requests[owner].collect(indices[mask] - first, Outcome.of_columns(columns))
 

@@ -67,7 +67,7 @@ def test_the_best_lookahead_is_chosen_in_worlds_that_begin_free() -> None:
 
 
 def test_each_failure_has_the_kind_of_its_end() -> None:
-    ends = {
+    changes = {
         "base touched": {"wall_touch": BASE},
         "object touched": {"wall_touch": OBJECT},
         "lost contact": {"contact_lost_time": 200.0},
@@ -76,13 +76,13 @@ def test_each_failure_has_the_kind_of_its_end() -> None:
         "out of time": {"time": 600.0},
         "diverged": {"diverged": 1},
     }
-    usual = {"success": 0, "wall_touch": 0, "contact_lost_time": 1.0, "min_distance": 0.5,
+    defaults = {"success": 0, "wall_touch": 0, "contact_lost_time": 1.0, "min_distance": 0.5,
              "tipped": 0, "diverged": 0, "time": 90.0}  # fmt: skip
     columns = {
-        name: [end.get(name, value) for end in ends.values()] for name, value in usual.items()
+        name: [end.get(name, value) for end in changes.values()] for name, value in defaults.items()
     }
-    assert [study.KINDS[i] for i in study.failure_kinds(results_of((), **columns))] == list(ends)
-    columns["success"] = [1] * len(ends)
+    assert [study.KINDS[i] for i in study.failure_kinds(results_of((), **columns))] == list(changes)
+    columns["success"] = [1] * len(changes)
     assert (study.failure_kinds(results_of((), **columns)) == -1).all()
 
 
@@ -93,4 +93,5 @@ def test_plans_that_run_together_have_the_results_of_each_alone() -> None:
         for task in ("corridor,width=1.42", "corridor,width=1.8,turn_angle=0.2")
     ]
     for plan, together in zip(plans, run_together(plans, Run(None, no_progress)), strict=True):
-        xr.testing.assert_equal(together, execution.run_plan(plan, None))
+        alone = execution.run_plan(plan, None)
+        xr.testing.assert_allclose(together, alone, rtol=1e-3, atol=1e-3)

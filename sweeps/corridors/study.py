@@ -48,7 +48,7 @@ KINDS = (
     *("base touched", "object touched", "lost contact", "never touched", "fell over"),
     *("out of time", "diverged"),
 )
-_ENDS = 0.1, 0.95  # [1] of the path, before and beyond which a failure is one of its ends
+_BORDERS = 0.1, 0.95  # [1] of the path, before and beyond which a failure is one of its ends
 _WHERE = ("in the first metre [%]", "in the last 0.5 m [%]")
 
 
@@ -320,7 +320,7 @@ def failure_table(results: xr.Dataset) -> Rows:
             shares = [100 * np.mean(kinds[failed] == i) if failed.any() else 0.0
                       for i in range(len(KINDS))]  # fmt: skip
             progress = trials.progress.values[failed]
-            first, last = _ENDS
+            first, last = _BORDERS
             where = [100 * np.mean(m) for m in (progress < first, progress > last) if m.size]
             cells = [f"{x:.0f}" for x in (*shares, *(where or (0, 0)))]
             rows.append([row, law, f"{failed.sum():,}", *cells])

@@ -1,7 +1,7 @@
 """Success of a law over the width of a corridor: a fitted monotone curve, and its levels.
 
 The curve is a / (1 + exp(-(w - m) / s)) of the width w [m], with the plateau a, the middle m [m]
-and the spread s [m]. It is fitted by maximum likelihood over a grid, which has no local optima and
+and the spread s [m]. A maximum-likelihood fit over a grid has no local optima, and it
 serves all resamples of a bootstrap at once.
 """
 
@@ -14,7 +14,7 @@ import numpy as np
 
 _BINS = 40  # of the widths
 _RESAMPLES = 200  # of a bootstrap
-_LEAST, _MOST = 1e-9, 1 - 1e-9  # success of a curve, for its logarithm
+_RATE_MIN, _RATE_MAX = 1e-9, 1 - 1e-9  # success of a curve, for its logarithm
 
 
 class Curve(NamedTuple):
@@ -50,7 +50,7 @@ class Curve(NamedTuple):
 def _rates(params: np.ndarray, width: np.ndarray) -> np.ndarray:
     """Return success rates (k, n) [1] of curves (k, 3) at widths (n,) [m]."""
     plateau, middle, spread = params.T[..., None]
-    return np.clip(plateau / (1 + np.exp(-(width - middle) / spread)), _LEAST, _MOST)
+    return np.clip(plateau / (1 + np.exp(-(width - middle) / spread)), _RATE_MIN, _RATE_MAX)
 
 
 def _grid(low: float, high: float) -> np.ndarray:
