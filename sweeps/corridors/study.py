@@ -19,7 +19,7 @@ from typing import Any, ClassVar
 import numpy as np
 import xarray as xr
 
-from rps_jax.analysis import tables
+from rps_jax.analysis import statistics, tables
 from rps_jax.analysis.figures.style import Figure, success_rates, tiles
 from rps_jax.analysis.report import Picture
 from rps_jax.control.registry import LawsLike
@@ -161,7 +161,8 @@ class Corridors(Study[xr.DataTree], MultiLawQuestion[xr.DataTree]):
             f"{self.worlds:,} worlds for each turn, seed {self.setting.seed}, the same for all "
             f"laws; corridors of {WIDTHS.low:g} to {WIDTHS.high:g} m and {LENGTH.low:g} m length "
             f"with 1 to 3 turns. Lookaheads are chosen in {self.choice:,} other worlds. "
-            "Intervals: Wilson 95 %; of widths and errors bootstrap 95 %."
+            "Intervals: Wilson 95 %; of widths and errors bootstrap 95 %. Gains and losses "
+            "are those of McNemar's test, world by world; p is not adjusted."
         )
 
     def report_tables(self, results: xr.DataTree) -> Sequence[Table]:
@@ -252,7 +253,7 @@ def fit_all(results: xr.Dataset) -> dict[tuple[str, str], Curve]:
 def _width(curve: Curve, level: float) -> str:
     """Return the width that a success rate needs, with its interval."""
     at, low, high = (_metres(width) for width in curve.needed(level))
-    return f"{at} [{low}, {high}]" if at != high else at
+    return at if low == high else f"{at} [{low}, {high}]"
 
 
 def _metres(width: float) -> str:
@@ -268,13 +269,19 @@ def width_table(results: xr.Dataset, curves: Mapping[tuple[str, str], Curve]) ->
     width = started.width.values
     masks = [(width >= a) & (width <= b) for a, b in itertools.pairwise(edges)]
     spans = [f"{a:.2g} to {b:.2g} m" for a, b in itertools.pairwise(edges)]
-    rows = [["turn", "law", "lookahead", *spans, *(f"{100 * x:g} % need" for x in LEVELS)]]
+    base = "rps_tuned" if "rps_tuned" in results.law else str(results.law.values[0])
+    needs = [f"{100 * x:g} % need" for x in LEVELS]
+    rows = [["turn", "law", "lookahead", *spans, *needs, f"against {base}"]]
     for row, law in curves:
         outcomes = started.sel(row=row, law=law)
         success = outcomes.success.values > 0
         rates = [tables.share(int(success[mask].sum()), int(mask.sum())) for mask in masks]
         needed = [_width(curves[row, law], level) for level in LEVELS]
-        rows.append([row, law, f"{float(outcomes.lookahead):g} m", *rates, *needed])
+        compared = statistics.compare(started.success.sel(row=row, law=base), outcomes.success)
+        against = (
+            f"+{compared.gained} -{compared.lost}, p = {compared.p:.2g}" if law != base else ""
+        )
+        rows.append([row, law, f"{float(outcomes.lookahead):g} m", *rates, *needed, against])
     return rows
 
 
