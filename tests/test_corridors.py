@@ -99,6 +99,6 @@ def test_plans_that_run_together_have_the_results_of_each_alone() -> None:
 
 def test_an_interval_is_shown_unless_it_is_a_point() -> None:
     width, success = drawn(0.92, 1.3, 0.1)
-    text = study._width(fit(width[:200], success[:200], 1.1, 2.5), 0.93)
+    text = study.width_text(fit(width[:200], success[:200], 1.1, 2.5), 0.93)
     assert text.startswith("not within the widths [1.")
-    assert study._width(fit(*drawn(1.0, 0.3, 0.02), 1.1, 2.5), 0.9) == "at most 1.10 m"
+    assert study.width_text(fit(*drawn(1.0, 0.3, 0.02), 1.1, 2.5), 0.9) == "at most 1.10 m"

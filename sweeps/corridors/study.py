@@ -14,7 +14,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 import xarray as xr
@@ -22,10 +22,11 @@ import xarray as xr
 from rps_jax.analysis import statistics, tables
 from rps_jax.analysis.figures.style import Figure, success_rates, tiles
 from rps_jax.analysis.report import Picture
+from rps_jax.control.base import LawParams
 from rps_jax.control.registry import LawsLike
 from rps_jax.record.options import option
 from rps_jax.runs.plan import Plan
-from rps_jax.runs.question import MultiLawQuestion, Run, call_of, seed_of
+from rps_jax.runs.question import MultiLawQuestion, Run, Split, call_of, seed_of
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import Rules
 from rps_jax.world.domain import DomainLike, parse_domain
@@ -124,7 +125,9 @@ class Corridors(Study[xr.DataTree], MultiLawQuestion[xr.DataTree]):
         width = Range(WIDTHS.low / door, WIDTHS.high / door)
         return Corridor(length=LENGTH, turn_angle=angle, width=width, doors=1, door_width=opening)
 
-    def _plan(self, task: Path, worlds: int, laws: Mapping[str, Any], split: Any = "test") -> Plan:
+    def _plan(
+        self, task: Path, worlds: int, laws: Mapping[str, LawParams], split: Split = "test"
+    ) -> Plan:
         """Return the plan of a task; worlds of one split depend on the seed alone."""
         setting = replace(self.setting, seed=seed_of(self.setting.seed, split))
         return Plan(
@@ -250,7 +253,7 @@ def fit_all(results: xr.Dataset) -> dict[tuple[str, str], Curve]:
     }
 
 
-def _width(curve: Curve, level: float) -> str:
+def width_text(curve: Curve, level: float) -> str:
     """Return the width that a success rate needs, with its interval."""
     at, low, high = (_metres(width) for width in curve.needed(level))
     return at if low == high else f"{at} [{low}, {high}]"
@@ -276,7 +279,7 @@ def width_table(results: xr.Dataset, curves: Mapping[tuple[str, str], Curve]) ->
         outcomes = started.sel(row=row, law=law)
         success = outcomes.success.values > 0
         rates = [tables.share(int(success[mask].sum()), int(mask.sum())) for mask in masks]
-        needed = [_width(curves[row, law], level) for level in LEVELS]
+        needed = [width_text(curves[row, law], level) for level in LEVELS]
         compared = statistics.compare(started.success.sel(row=row, law=base), outcomes.success)
         against = (
             f"+{compared.gained} -{compared.lost}, p = {compared.p:.2g}" if law != base else ""
@@ -296,7 +299,7 @@ def object_table(results: xr.Dataset) -> Rows:
             for name in objects:
                 part = started.isel(world=started.object.values == name).sel(row=row, law=law)
                 curve = fit(part.width.values, part.success.values > 0, WIDTHS.low, WIDTHS.high)
-                cells.append(_width(curve, LEVELS[0]))
+                cells.append(width_text(curve, LEVELS[0]))
             rows.append([row, law, *cells])
     return rows
 
@@ -351,7 +354,9 @@ def error_table(results: xr.Dataset, resamples: int = 200, seed: int = 0) -> Row
         trials = results.sel(law=law)
         error, success = 100 * trials.error_95.values, trials.success.values > 0
         for low, high in itertools.pairwise(_PATH_TURNS):
-            cells, medians, rates = [], [], []
+            cells: list[str] = []
+            medians: list[float] = []
+            rates: list[str] = []
             for i in range(CENTRES.size):
                 mask = (index == i) & (turn >= low) & (turn < high)
                 values = error[mask & np.isfinite(error)]
@@ -385,9 +390,11 @@ def figure_of(results: xr.Dataset, curves: Mapping[tuple[str, str], Curve]) -> F
     for ax, row in zip(axes.ravel(), names, strict=False):
         for i, law in enumerate(map(str, results.law.values)):
             successes = (started.success.sel(row=row, law=law).values > 0) @ one_hot
-            style: dict[str, Any] = {"color": f"C{i}", "ls": "none", "label": law}
-            success_rates(ax, middle, successes, one_hot.sum(axis=0), curve=i, **style)
-            ax.plot(fine, 100 * curves[row, law].rates(fine), color=f"C{i}", lw=1)
+            trials, colour = one_hot.sum(axis=0), f"C{i}"
+            success_rates(
+                ax, middle, successes, trials, curve=i, color=colour, ls="none", label=law
+            )
+            ax.plot(fine, 100 * curves[row, law].rates(fine), color=colour, lw=1)
         ax.set_title(row, fontsize=9, loc="left")
         ax.grid(alpha=0.3)
     for ax in axes[-1]:
