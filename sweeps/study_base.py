@@ -43,12 +43,14 @@ from rps_jax.trials.progress import Progress, ProgressCallback, SequentialProgre
 from rps_jax.trials.rollout import rollout
 from rps_jax.trials.trial import Outcome
 from rps_jax.world.domain import DOMAINS, QUANTITIES
+from rps_jax.world.tasks.reach import Reach
 from sweeps import render_tables
 
 T = TypeVar("T", covariant=True)
 Rows = list[list[str]]
 _PACKAGES = ("rps_jax", "jax", "mujoco", "mujoco-mjx")  # whose versions a data file has
 _NEW_LIMITS = ("slip_sideways", "slip_yaw")  # of robots, later than data files; absent if None
+_OLD_TASK = "task", dataclasses.asdict(Reach())  # of all domains that are older than other tasks
 # Removed options by question, with the values that all later runs have; digests still cover them.
 _REMOVED_OPTIONS: Mapping[str, Mapping[str, Any]] = {
     "ground": {"worlds": None},
@@ -382,6 +384,7 @@ def _expanded(value: Any) -> Any:
     if isinstance(value, dict):  # omit absent quantities, so that new ones are allowed
         absent = {*QUANTITIES, *_NEW_LIMITS}
         items = (item for item in value.items() if item[1] is not None or item[0] not in absent)
+        items = (item for item in items if item != _OLD_TASK)
         return {key: _expanded(item) for key, item in items}
     if isinstance(value, list | tuple):
         return [_expanded(item) for item in value]
