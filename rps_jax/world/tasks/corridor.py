@@ -100,8 +100,11 @@ class CorridorCourse(NamedTuple):
         # A loop of at most one pass: a program for many worlds skips it if none is due.
         last = progress.clearance, progress.wall_touch, progress.p_world_touch
         carry = due, *last, progress.measured, progress.measured_at, poses
-        _, *now, _ = jax.lax.while_loop(lambda x: x[0], measure, carry)
-        moved = CorridorProgress(inner, *now, progress.steps + 1)
+        _, clearance, who, point, measured, measured_at, _ = jax.lax.while_loop(
+            lambda x: x[0], measure, carry
+        )
+        state = clearance, who, point, measured, measured_at
+        moved = CorridorProgress(inner, *state, progress.steps + 1)
         return moved, aim._replace(failed=moved.wall_touch > NOTHING)
 
     def remaining(self, progress: CorridorProgress, p_world_goal: Array, point: Array) -> Array:
