@@ -38,14 +38,19 @@ from rps_jax.record.checkpoint import Checkpoints
 from rps_jax.runs import execution
 from rps_jax.runs.plan import Plan
 from rps_jax.runs.question import Question, Run, TrialQuestion
+from rps_jax.runs.results import Results
 from rps_jax.trials.progress import Progress, ProgressCallback, SequentialProgress, no_progress
+from rps_jax.trials.rollout import rollout
+from rps_jax.trials.trial import Outcome
 from rps_jax.world.domain import DOMAINS, QUANTITIES
+from rps_jax.world.tasks.reach import Reach
 from sweeps import render_tables
 
 T = TypeVar("T", covariant=True)
 Rows = list[list[str]]
 _PACKAGES = ("rps_jax", "jax", "mujoco", "mujoco-mjx")  # whose versions a data file has
 _NEW_LIMITS = ("slip_sideways", "slip_yaw")  # of robots, later than data files; absent if None
+_OLD_TASK = "task", dataclasses.asdict(Reach())  # of all domains that are older than other tasks
 # Removed options by question, with the values that all later runs have; digests still cover them.
 _REMOVED_OPTIONS: Mapping[str, Mapping[str, Any]] = {
     "ground": {"worlds": None},
@@ -298,6 +303,22 @@ def run_plans(run: Run, plans: Mapping[str, Plan]) -> dict[str, xr.Dataset]:
     return results
 
 
+def run_together(plans: Sequence[Plan], run: Run) -> list[xr.Dataset]:
+    """Run plans of one setting and equal shapes in one rollout; return the results of each."""
+    requests = [Results(plan, list(plan.chunks)) for plan in plans]
+    last = np.cumsum([plan.num_trials for plan in plans])
+
+    def collect(indices: np.ndarray, outcomes: Outcome) -> None:
+        owners = np.searchsorted(last, indices, side="right")
+        for owner in np.unique(owners).tolist():
+            mask, first = owners == owner, last[owner] - plans[owner].num_trials
+            columns = {name: x[mask] for name, x in outcomes.columns().items()}
+            requests[owner].collect(indices[mask] - first, Outcome.of_columns(columns))
+
+    rollout(requests, plans[0].setting, collect, **run.batch_options)
+    return [request.dataset() for request in requests]
+
+
 # --- data files -----------------------------------------------------------------------------
 
 
@@ -363,6 +384,7 @@ def _expanded(value: Any) -> Any:
     if isinstance(value, dict):  # omit absent quantities, so that new ones are allowed
         absent = {*QUANTITIES, *_NEW_LIMITS}
         items = (item for item in value.items() if item[1] is not None or item[0] not in absent)
+        items = (item for item in items if item != _OLD_TASK)
         return {key: _expanded(item) for key, item in items}
     if isinstance(value, list | tuple):
         return [_expanded(item) for item in value]

@@ -119,7 +119,8 @@ class Ladder(SweepOptions, TaskOption, MultiLawQuestion[xr.Dataset | xr.DataTree
         domains = [self.domain] if isinstance(self.domain, str | Domain) else list(self.domain)
         labels = [x if isinstance(x, str) else f"domain_{i}" for i, x in enumerate(domains)]
         errors.check_each_once("domain", domains, labels)
-        names = {f.name for f in dataclasses.fields(_TestSweep)} - {"laws", "domain"}
+        names, of_sweep = ({f.name for f in dataclasses.fields(x)} for x in (self, _TestSweep))
+        names = (names & of_sweep) - {"laws", "domain"}
         shared: dict[str, Any] = {name: getattr(self, name) for name in names}
         shared["setting"] = replace(self.setting, seed=seed_of(self.setting.seed, "test"))
         sweeps = {}

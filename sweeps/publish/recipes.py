@@ -265,6 +265,18 @@ RECIPES: dict[str, Recipe] = {
         gpu=10,
         section=rows.default_beside_tuned,
     ),
+    "corridors_*": recipe(
+        "rps sweeps/corridors --laws rps rps_tuned rps_plus learned_gru force_push dipole aps "
+        f"rps_tuned,sweeps/corridors/tuned.json {_MACHINE}",
+        gpu=3,
+    ),
+    "tuned_for_corridors": recipe(
+        "rps ladder --laws rps_tuned rps_tuned,sweeps/corridors/tuned.json --domain wide real "
+        "--worlds 4000 --seed 10",
+        cores=6,
+        gpu=1,
+        section=rows.comparison,
+    ),
     "plans": recipe(f"rps sweeps/planning {_MACHINE}", cores=15),
     "replans": recipe(f"rps sweeps/planning {_MACHINE}", cores=15),
     "gradients_cosine": recipe(f"rps sweeps/gradients {_MACHINE}", cores=200, gpu=8),

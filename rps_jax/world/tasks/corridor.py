@@ -104,8 +104,11 @@ class CorridorCourse(NamedTuple):
         # A loop of at most one pass: a program for many worlds skips the pass if no world needs it.
         last = progress.clearance, progress.wall_touch, progress.p_world_touch
         carry = due, *last, progress.measured, progress.measured_at, poses
-        _, *latest, _ = jax.lax.while_loop(lambda x: x[0], measure, carry)
-        moved = CorridorProgress(inner, *latest, progress.steps + 1)
+        _, clearance, touched, point, measured, measured_at, _ = jax.lax.while_loop(
+            lambda x: x[0], measure, carry
+        )
+        state = clearance, touched, point, measured, measured_at
+        moved = CorridorProgress(inner, *state, progress.steps + 1)
         return moved, aim._replace(failed=moved.wall_touch > NOTHING)
 
     def remaining(self, progress: CorridorProgress, p_world_goal: Array, point: Array) -> Array:
