@@ -222,6 +222,7 @@ def test_an_elite_fails_whatever_the_noise(synthetic):
     assert failure_rate(often) > failure_rate(once) + 0.02
 
 
+@pytest.mark.slow
 def test_the_command_searches_checks_lists_and_draws(tmp_path, capsys):
     """Cells that are tried fail within a short horizon, also in C MuJoCo."""
     out = tmp_path / "run"

@@ -323,6 +323,7 @@ def test_a_fitted_domain_keeps_undetermined_ranges_and_all_commands_read_it(tmp_
     assert fitted.mass[:2] == pytest.approx((3.23, 12.4), rel=0.03)
 
 
+@pytest.mark.slow
 def test_a_log_is_fitted_from_the_shell(tmp_path, capsys, optimised):
     """A sweep accepts the fitted domain, and a bag is read as its table."""
     options = "--physics default,timestep=0.01 --domain wide,objects=random_box --worlds 96"
