@@ -114,15 +114,7 @@ class Film(Action[Path]):
         takes, setting = self.takes()
         seconds, out = self._length(setting), Path(self.out or self.default_folder)
         speed = self.speed or float(max(1, math.ceil(seconds / _LENGTH)))
-        tiles = [
-            [
-                Tile(scene, target, rows(take.part.worlds.task, i).lines())
-                for i, (scene, target) in enumerate(
-                    zip(take.scenes, take.part.worlds.p_world_target, strict=True)
-                )
-            ]
-            for take in takes
-        ]
+        tiles = [map(take.tile, range(len(take.scenes))) for take in takes]
         frames = _frames(takes, setting, speed, seconds, callback)
         ordered = _in_grid_order(tiles, takes)
         shape = fitted_grid(len(ordered), self.shape, rows=len(self.laws))
@@ -148,6 +140,11 @@ class Take(NamedTuple):
     part: WorldBatch
     scenes: Sequence[Scene]
     labels: Sequence[str]
+
+    def tile(self, i: int) -> Tile:
+        """Return the picture of one trial, with the lines of its task."""
+        world = rows(self.part.worlds, i)
+        return Tile(self.scenes[i], world.p_world_target, world.task.lines())
 
 
 def of_sweep(

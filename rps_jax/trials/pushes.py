@@ -86,7 +86,7 @@ def build(
     courses, final = [], []
     uniform = draws.random_numbers(setting.seed, trials)
     for case, row, target in zip(cases, uniform, targets, strict=True):
-        u = {name: row[column : column + 1] for name, column in draws.USES.items()}
+        u = draws.by_name(row[None])
         front = np.array([float(case.base.half_length)])
         end, course = case.challenge.courses(CourseInputs(u, target[None], front))
         final.append(end[0])

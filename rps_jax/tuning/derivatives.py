@@ -147,26 +147,26 @@ def value_and_grad(
     if isinstance(score, Objective):
         ranges.task.check_target("task", ranges.task, "give a function as score")
     cache.use_cache_if_requested()
-    numbers, index = several[0], np.arange(worlds)
-    value, bend = np.empty((len(chosen), worlds)), np.empty((worlds, len(numbers)))
-    gradient = np.empty((*value.shape, len(numbers)))
-    used, temperature = np.array([x.is_parameter for x in numbers]), 0.0
+    coordinates, index = several[0], np.arange(worlds)
+    value, bend = np.empty((len(chosen), worlds)), np.empty((worlds, len(coordinates)))
+    gradient = np.empty((*value.shape, len(coordinates)))
+    used, temperature = np.array([x.is_parameter for x in coordinates]), 0.0
     for at, drawn in points.draw_by_object(ranges, setting.seed, None, index):
         batch = drawn_worlds(ranges, drawn, setting)
         if smooth:
             batch = batch._replace(worlds=soften_skins(batch.worlds))
             skin: Any = batch.worlds.skin
             temperature = float(skin.temperature[0])
-        slopes, bend[at] = world_slopes(ranges, drawn, setting, numbers)
+        slopes, bend[at] = world_slopes(ranges, drawn, setting, coordinates)
         used |= list(map(bool, slopes))
         names = {name for slope in slopes for name in slope}
-        names |= {f"params.{x.name}" for x in numbers if x.is_parameter}
+        names |= {f"params.{x.name}" for x in coordinates if x.is_parameter}
         for i, (params, loop) in enumerate(zip(chosen.values(), loops, strict=True)):
             inputs = {"world": batch.worlds, "params": batch.with_params(params).params}
             leaves = {name: x for name, x in named_leaves(inputs).items() if name in names}
             results = _value_and_slopes(batch.stage, inputs, leaves, loop, score, steps, setting)
             value[i, at], by_leaf = jax.device_get(results)
-            for k, (x, slope) in enumerate(zip(numbers, slopes, strict=True)):
+            for k, (x, slope) in enumerate(zip(coordinates, slopes, strict=True)):
                 products = [y * by_leaf[name] for name, y in slope.items()]
                 if x.is_parameter:
                     products = [by_leaf[f"params.{x.name}"][(slice(None), *x.entry)]]
@@ -186,13 +186,13 @@ def value_and_grad(
     coords: dict[str, Any] = {
         "law": list(chosen),
         "world": ("world", index, {"long_name": WORLD}),
-        "quantity": [x.label for x in numbers],
-        "unit": ("quantity", [x.unit for x in numbers]),
-        "kind": ("quantity", ["parameter" if x.is_parameter else "world" for x in numbers]),
+        "quantity": [x.label for x in coordinates],
+        "unit": ("quantity", [x.unit for x in coordinates]),
+        "kind": ("quantity", ["parameter" if x.is_parameter else "world" for x in coordinates]),
         "map_error": ("quantity", bend.max(axis=0), {"units": "1"}),
     }
     coords |= points.drawn_columns(ranges, setting.seed, None, index)
-    notes = " ".join(_notes(ranges, setting.engine, numbers, used, value, gradient, bend))
+    notes = " ".join(_notes(ranges, setting.engine, coordinates, used, value, gradient, bend))
     if notes:
         warnings.warn(notes, stacklevel=3)
     attrs = provenance.attributes() | {
@@ -209,7 +209,7 @@ def value_and_grad(
 def coordinates_of(
     wrt: Sequence[str] | str, params: LawParams, domain: Domain
 ) -> tuple[Coordinate, ...]:
-    """Return the numbers of names, in order.
+    """Return the coordinates of names, in order.
 
     Raises:
       InputError: a name is unknown, repeated, or of something without a derivative.
@@ -218,17 +218,17 @@ def coordinates_of(
     errors.check_each_once("wrt", names)
     drawn, leaves = (*QUANTITIES, *VELOCITY_ERRORS, "com_bearing"), named_leaves(params)
     known = {f"params.{x}" if x in (*drawn, *_VECTORS) else x: x for x in leaves}
-    numbers: list[Coordinate] = []
+    coordinates: list[Coordinate] = []
     for name in names:
         if name in known:
             leaf = known[name]
             for at in np.ndindex(np.shape(leaves[leaf])):
                 label = f"{name}[{','.join(map(str, at))}]" if at else name
-                numbers.append(Coordinate(label, _unit_of_leaf(params, leaf), leaf, at, True))
+                coordinates.append(Coordinate(label, _unit_of_leaf(params, leaf), leaf, at, True))
         elif name in _VECTORS:
             if name == "target":
                 domain.task.check_target("wrt", name)
-            numbers += [Coordinate(f"{name}_{x}", "m", name, (i,)) for i, x in enumerate("xy")]
+            coordinates += [Coordinate(f"{name}_{x}", "m", name, (i,)) for i, x in enumerate("xy")]
         else:
             rule, quantity = "", QUANTITIES.get(name)
             if name in _DISCRETE or (quantity and (quantity.jumps or quantity.owner == "course")):
@@ -241,9 +241,9 @@ def coordinates_of(
                 raise errors.not_allowed("wrt", name, rule)
             errors.check_name("name of wrt", name, (*known, *_VECTORS, *drawn))
             parts = tuple(VELOCITY_ERRORS) if name == "velocity_error" else (name,)
-            numbers += [Coordinate(x, unit_of(x), x) for x in parts]
-    errors.check_each_once("wrt", [x.label for x in numbers])
-    return tuple(numbers)
+            coordinates += [Coordinate(x, unit_of(x), x) for x in parts]
+    errors.check_each_once("wrt", [x.label for x in coordinates])
+    return tuple(coordinates)
 
 
 def _unit_of_leaf(params: object, path: str) -> str:
@@ -256,12 +256,12 @@ def _unit_of_leaf(params: object, path: str) -> str:
 
 
 def world_slopes(
-    domain: Domain, drawn: Draw, setting: Setting, numbers: Sequence[Coordinate]
+    domain: Domain, drawn: Draw, setting: Setting, coordinates: Sequence[Coordinate]
 ) -> tuple[list[dict[str, np.ndarray]], np.ndarray]:
-    """Return derivatives of worlds by numbers: central differences on the host, in float64.
+    """Return derivatives of worlds by coordinates: central differences on the host, in float64.
 
     Returns:
-      For each number, derivatives (n, ...) of those leaves of the worlds that depend on it, by
+      For each coordinate, derivatives (n, ...) of those leaves of the worlds that depend on it, by
       their names; and relative differences (n, q) [1] of the one-sided derivatives, which bound
       the relative errors of the central ones.
     """
@@ -270,25 +270,25 @@ def world_slopes(
         worlds = drawn_worlds(domain, draw, setting).worlds._replace(shift=None, key=None)
         return named_leaves({"world": worlds})
 
-    def moved(number: Coordinate, step: np.ndarray) -> Draw:
-        if number.name not in _VECTORS:
-            return draws.draw(domain, setting.seed, drawn.indices, {number.name: step})
-        path = _VECTORS[number.name]
+    def moved(coordinate: Coordinate, step: np.ndarray) -> Draw:
+        if coordinate.name not in _VECTORS:
+            return draws.draw(domain, setting.seed, drawn.indices, {coordinate.name: step})
+        path = _VECTORS[coordinate.name]
         value = np.array(named_leaves(drawn)[path])
-        value[:, number.entry[0]] += step
+        value[:, coordinate.entry[0]] += step
         return registry.replace_leaves(drawn, {path: value})
 
     count = drawn.indices.size
-    slopes: list[dict[str, np.ndarray]] = [{} for _ in numbers]
-    bends = np.zeros((count, len(numbers)))
+    slopes: list[dict[str, np.ndarray]] = [{} for _ in coordinates]
+    bends = np.zeros((count, len(coordinates)))
     with jax.enable_x64(True):
         middle = leaves(drawn)
-        for i, number in enumerate(numbers):
-            if number.is_parameter:
+        for i, coordinate in enumerate(coordinates):
+            if coordinate.is_parameter:
                 continue
-            value = drawn.values.get(number.name, np.ones(count))
+            value = drawn.values.get(coordinate.name, np.ones(count))
             step = _STEP * np.maximum(np.abs(value), _SMALLEST)
-            above, below = (leaves(moved(number, x)) for x in (step, -step))
+            above, below = (leaves(moved(coordinate, x)) for x in (step, -step))
             for name, leaf in middle.items():
                 up, at, down = (x.reshape(count, -1) for x in (above[name], leaf, below[name]))
                 change, bend = up - down, up - 2 * at + down
@@ -371,16 +371,16 @@ def soft_score(
 def _notes(
     domain: Domain,
     engine: str,
-    numbers: Sequence[Coordinate],
+    coordinates: Sequence[Coordinate],
     used: np.ndarray,
     value: np.ndarray,
     gradient: np.ndarray,
     bend: np.ndarray,
 ) -> Iterator[str]:
-    """Yield sentences on numbers without influence, and on what is not finite."""
+    """Yield sentences on coordinates without influence and on worlds without finite numbers."""
     if invalid := np.sum(~np.isfinite(value)):
         yield f"The score is not finite in {invalid} of {value.size} trials."
-    is_mass = np.array([x.name == "mass" and not x.is_parameter for x in numbers])
+    is_mass = np.array([x.name == "mass" and not x.is_parameter for x in coordinates])
     is_mass &= not domain.weakest.driven
     if is_mass.any():
         yield (
@@ -395,6 +395,6 @@ def _notes(
         (used & is_zero & ~is_mass, "Derivatives of zero in every world within the horizon:"),
         (bent, "No derivatives in worlds whose numbers have a kink (see finite):"),
     ):
-        labels = [x.label for x, chosen in zip(numbers, mask, strict=True) if chosen]
+        labels = [x.label for x, chosen in zip(coordinates, mask, strict=True) if chosen]
         if labels:
             yield f"{sentence} {', '.join(labels)}."

@@ -55,9 +55,9 @@ _UNRANGED = {
     **{"feet_number": 44, "feet_turn": 45},
     **tasks.MORE_NUMBERS,
 }
-# Ranges of which each of several columns draws a number.
-_REPEATED = ("velocity_error", "turn_angle")
-_RANGED = {name: item.column for name, item in QUANTITIES.items() if name not in _REPEATED}
+# A range with the column of another number is drawn by several numbers, as the velocity error.
+_TAKEN = set(_UNRANGED.values())
+_RANGED = {name: item.column for name, item in QUANTITIES.items() if item.column not in _TAKEN}
 if _RANGED.keys() & _UNRANGED:
     raise ValueError(f"two quantities are named {_RANGED.keys() & _UNRANGED}")
 # Columns of the random numbers of a world by name, in their order.
@@ -88,7 +88,7 @@ def draw_at(
     objects = domain.object_of(index)
     if (objects != objects[0]).any():
         raise ValueError("worlds of several objects cannot be batched")
-    u = {name: uniform[:, column] for name, column in USES.items()}
+    u = by_name(uniform)
     name = domain.objects[int(objects[0])]
     ranges = {name: domain.range_of(name) for name in QUANTITIES if name in u}
     at = {name: item.at(u[name]) for name, item in ranges.items() if item is not None}
@@ -120,6 +120,11 @@ def draw_at(
         robot=robot,
         key=np.stack(key, axis=-1),
     )
+
+
+def by_name(uniform: np.ndarray) -> dict[str, np.ndarray]:
+    """Return the columns (n,) of random numbers (n, COLUMNS) by name."""
+    return {name: uniform[:, column] for name, column in USES.items()}
 
 
 def random_numbers(seed: int, index: np.ndarray) -> np.ndarray:

@@ -49,9 +49,8 @@ class Coordinate(NamedTuple):
     """Coordinate of the cube."""
 
     name: str
-    kind: (
-        CoordinateKind  # a range; a choice of a list; corners or feet; turns; the key of all noise
-    )
+    # A range; a choice of a list; corners or feet; turns of a path; the key of all noise.
+    kind: CoordinateKind
     range: Range  # of the quantity, or from 0 to the length of the list
     unit: str
 
@@ -199,7 +198,7 @@ def points_of(domain: Domain | str, index: ArrayLike, seed: int = 0) -> np.ndarr
     errors.check_count("seed", seed, at_least=0, at_most=2**32 - 1)
     index = np.atleast_1d(np.asarray(index, np.int64))
     uniform = draws.random_numbers(seed, index)
-    by_name = {name: uniform[:, column] for name, column in draws.USES.items()}
+    by_name = draws.by_name(uniform)
     positions = zip(_CHOICES, domain.choices(index), domain.counts, strict=True)
     of_lists = {name: (choice + 0.5) / count for name, choice, count in positions}
     return np.stack([(by_name | of_lists)[name] for name in names(domain)], axis=-1)
