@@ -29,7 +29,7 @@ from rps_jax.geometry.arrays import Float
 from rps_jax.geometry.solid import Solid
 from rps_jax.robot.robot import Robot
 from rps_jax.world.physics import Physics
-from rps_jax.world.scene import Friction
+from rps_jax.world.scene import Friction, Surroundings
 
 Mode = Literal["forward", "reverse"]  # of differentiation
 T = TypeVar("T")  # a pytree
@@ -94,6 +94,7 @@ class Engine(abc.ABC):
     modes: ClassVar[tuple[Mode, ...]] = ()  # supported modes of differentiation
     forces: ClassVar[bool] = True  # contact can slow and stop a base with a limited force
     computes_force: ClassVar[bool] = True  # it computes the force of a contact
+    surroundings: ClassVar[tuple[str, ...]] = ()  # supported fields of `Surroundings`
 
     def _refused(self, rule: str) -> errors.InputError:
         return errors.not_allowed("engine", self.name, rule)
@@ -114,6 +115,13 @@ class Engine(abc.ABC):
         """Raise InputError unless the engine can step the base of the robot."""
         if robot.driven and not self.forces:
             raise self._refused("a robot with a limited force needs fused, mjx or mujoco")
+
+    def check_surroundings(self, surroundings: Surroundings) -> None:
+        """Raise InputError unless the engine can step worlds with these surroundings."""
+        for name, value in surroundings._asdict().items():
+            if value is not None and name not in self.surroundings:
+                known = [x for x in engines.ENGINES if name in engines.get(x).surroundings]
+                raise self._refused(f"it has no {name}; choose {' or '.join(known)}")
 
     def check_senses(self, senses: str) -> None:
         """Raise InputError unless the engine computes the quantities that a law senses."""
@@ -150,12 +158,18 @@ class Engine(abc.ABC):
 
     @abc.abstractmethod
     def stage(
-        self, family: str, solids: Solid, friction: Friction, physics: Physics, robots: Robot
+        self,
+        family: str,
+        solids: Solid,
+        friction: Friction,
+        physics: Physics,
+        robots: Robot,
+        surroundings: Surroundings = Surroundings(),
     ) -> tuple[Any, Any]:
         """Return the stage, and fields (n, ...) on the host, of worlds of one shape family.
 
-        Solids are (n, ...), friction and robots (n,). The constants that MuJoCo derives when it
-        compiles a model are computed for all worlds at once.
+        Solids are (n, ...), friction, robots and surroundings (n,). The constants that MuJoCo
+        derives when it compiles a model are computed for all worlds at once.
         """
 
     def slots(self, backend: str) -> int:

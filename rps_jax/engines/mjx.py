@@ -26,7 +26,7 @@ from rps_jax.robot.robot import Robot
 from rps_jax.world import scene
 from rps_jax.world.opengl import mujoco
 from rps_jax.world.physics import Physics
-from rps_jax.world.scene import JOINTS, Friction
+from rps_jax.world.scene import JOINTS, Friction, Surroundings
 
 # Fields that differ between objects of one shape family, as paths into an MJX model.
 FIELDS = (
@@ -122,12 +122,19 @@ class MJX(Engine):
     modes = ("forward", "reverse")
 
     def stage(
-        self, family: str, solids: Solid, friction: Friction, physics: Physics, robots: Robot
+        self,
+        family: str,
+        solids: Solid,
+        friction: Friction,
+        physics: Physics,
+        robots: Robot,
+        surroundings: Surroundings = Surroundings(),
     ) -> tuple[MJXStage, dict[str, np.ndarray]]:
         """Return the stage of the first of the worlds, and fields (n, ...) of all."""
         robots = scene.repeat_robot(robots, solids.mass.size)
-        template = scene.compile_row(family, solids, friction, physics, 0, robots).physics
-        rows = compile_rows(family, solids, friction, physics, robots, fields_of)
+        columns = solids, friction, physics
+        template = scene.compile_row(family, *columns, 0, robots, surroundings).physics
+        rows = compile_rows(family, *columns, robots, surroundings, fields_of)
         fields = {name: np.stack([row[name] for row in rows]) for name in FIELDS}
         if solids.feet is not None:
             fields[OUTLINE] = solids.vertices

@@ -18,7 +18,7 @@ from rps_jax.robot.robot import Robot
 from rps_jax.world import scene
 from rps_jax.world.opengl import mujoco, rollout
 from rps_jax.world.physics import Physics
-from rps_jax.world.scene import JOINTS, Friction
+from rps_jax.world.scene import JOINTS, Friction, Surroundings
 
 T = TypeVar("T")
 _STATE = mujoco.mjtState.mjSTATE_FULLPHYSICS
@@ -145,6 +145,7 @@ def compile_rows(
     friction: Friction,
     physics: Physics,
     robots: Robot,
+    surroundings: Surroundings,
     read: Callable[[mujoco.MjModel], T] = lambda model: model,
 ) -> list[T]:
     """Compile the models of worlds (n, ...) in parallel, and return what `read` takes of each.
@@ -153,12 +154,14 @@ def compile_rows(
     """
     count = solids.mass.size
     robots = scene.repeat_robot(robots, count)
-    leaves = [np.ascontiguousarray(x) for x in jax.tree.leaves((solids, friction, robots))]
+    trees = solids, friction, robots, surroundings
+    leaves = [np.ascontiguousarray(x) for x in jax.tree.leaves(trees)]
     keys = [b"".join(leaf[i].tobytes() for leaf in leaves) for i in range(count)]
     distinct = {key: i for i, key in enumerate(keys)}
 
     def compile_row(i: int) -> T:
-        return read(scene.compile_row(family, solids, friction, physics, i, robots).physics)
+        columns = solids, friction, physics, i, robots, surroundings
+        return read(scene.compile_row(family, *columns).physics)
 
     with ThreadPoolExecutor(device.count_processors()) as pool:
         rows = dict(zip(distinct, pool.map(compile_row, distinct.values()), strict=True))
@@ -176,10 +179,16 @@ class MuJoCo(Engine):
         return True
 
     def stage(
-        self, family: str, solids: Solid, friction: Friction, physics: Physics, robots: Robot
+        self,
+        family: str,
+        solids: Solid,
+        friction: Friction,
+        physics: Physics,
+        robots: Robot,
+        surroundings: Surroundings = Surroundings(),
     ) -> tuple[list[mujoco.MjModel], dict[str, np.ndarray]]:
         """Return the models of the worlds; equal worlds share one."""
-        return compile_rows(family, solids, friction, physics, robots), {}
+        return compile_rows(family, solids, friction, physics, robots, surroundings), {}
 
 
 ENGINE = MuJoCo()

@@ -37,7 +37,7 @@ from rps_jax.geometry.vectors import Vec
 from rps_jax.robot.robot import Robot
 from rps_jax.world import scene
 from rps_jax.world.physics import Physics
-from rps_jax.world.scene import JOINTS, Friction
+from rps_jax.world.scene import JOINTS, Friction, Surroundings
 
 _MIN_SPEED = 1e-5  # [m/s] speed of a base at rest
 DEPTH = 1e-4  # [m] approximate penetration of a push
@@ -244,7 +244,13 @@ class QuasistaticEngine(Engine):
     computes_force = False  # only the direction of the force is known, not its size
 
     def stage(
-        self, family: str, solids: Solid, friction: Friction, physics: Physics, robots: Robot
+        self,
+        family: str,
+        solids: Solid,
+        friction: Friction,
+        physics: Physics,
+        robots: Robot,
+        surroundings: Surroundings = Surroundings(),
     ) -> tuple[Quasistatic, Slider]:
         """Return the stage, and the sliders (n, ...) of the worlds; bases follow every twist."""
         assert not robots.driven, "checked by check_robot"

@@ -20,7 +20,7 @@ from rps_jax.world import scene
 from rps_jax.world.domain import RANDOM, Domain, Owner, Range, quantities_of
 from rps_jax.world.draws import Draw
 from rps_jax.world.physics import Physics
-from rps_jax.world.scene import JOINTS, Friction, Scene
+from rps_jax.world.scene import JOINTS, Friction, Scene, Surroundings
 
 
 def build(
@@ -30,6 +30,7 @@ def build(
     friction: Friction,
     robots: Robot,
     setting: Setting,
+    surroundings: Surroundings = Surroundings(),
     **fields: Any,
 ) -> WorldBatch:
     """Return worlds of one shape family, staged for the engine: on the host, without parameters.
@@ -41,14 +42,17 @@ def build(
       friction: (n,) each.
       robots: (n,), or one.
       setting: engine and physics.
+      surroundings: (n,) each.
       fields: of `World`, (n, ...) each, beside those that follow from solids and robots.
 
     Raises:
-      InputError: the engine cannot step such a robot.
+      InputError: the engine cannot step such a robot, or such surroundings.
     """
     engine, dtype = engines.get(setting.engine), jnp.result_type(float)
     engine.check_robot(robots)
-    stage, staged = engine.stage(family, solids, friction, setting.physics, robots)
+    engine.check_surroundings(surroundings)
+    columns = solids, friction, setting.physics, robots, surroundings
+    stage, staged = engine.stage(family, *columns)
     outline: Any = solids.vertices, solids.radius
     robot = None if robots.ideal else robots
     world = World(fields=staged, footprint=Footprint(*outline), robot=robot, **fields)
@@ -74,6 +78,7 @@ def drawn_worlds(
         drawn.friction,
         drawn.robot,
         setting,
+        drawn.surroundings,
         skin=_skin(domain, drawn),
         p_world_target=drawn.p_world_target,
         task=drawn.course,
@@ -131,7 +136,7 @@ def drawn_scene(domain: Domain, drawn: Draw, physics: Physics, i: int) -> Scene:
     case = int(drawn.cases[i])
     name = domain.objects[int(domain.object_of(case))]
     if name in RANDOM:
-        columns = drawn.solid, drawn.friction, physics, i, drawn.robot
+        columns = drawn.solid, drawn.friction, physics, i, drawn.robot, drawn.surroundings
         return scene.compile_row(domain.family_of(case), *columns)
     ground, robot = (float(leaf[i]) for leaf in drawn.friction)
     return scene.load(name, physics, Friction(ground, robot), robot=domain.robot)

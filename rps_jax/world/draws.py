@@ -25,7 +25,7 @@ from rps_jax.world.domain import (
     robot_field,
     unit_of,
 )
-from rps_jax.world.scene import Friction
+from rps_jax.world.scene import Friction, Surroundings
 from rps_jax.world.tasks.base import Course, CourseInputs
 
 COLUMNS = 64  # random numbers of a world; unused ones are for new quantities
@@ -44,6 +44,7 @@ class Draw(NamedTuple):
     velocity_error: np.ndarray  # (n, 3) [1]
     robot: Robot  # (n,) each
     key: np.ndarray  # (n, 2) uint32, of the noise of sensors and odometry
+    surroundings: Surroundings = Surroundings()  # (n,) each
 
 
 # Columns of random numbers that belong to no range.

@@ -37,6 +37,16 @@ class Friction(NamedTuple):
 FRICTION = {"S1": Friction(0.3, 0.35), "S2": Friction(0.2, 0.5)}  # Table I
 
 
+class Surroundings(NamedTuple):
+    """What surrounds the objects of n worlds beyond a level, uniform floor; None where absent."""
+
+    gravity: Any = None  # (n, 3) [m/s^2] in the frame of the floor, of a slope
+    # (n, 4) unit normal of a line on the floor, its distance from the origin [m], and the factor
+    # [1] of the ground's friction beyond it
+    boundary: Any = None
+    walls: Any = None  # (n, W, 2, 2) [m] both ends of walls that the object may touch
+
+
 class Scene(NamedTuple):
     """Object in front of the robot: models, solid and shell."""
 
@@ -118,6 +128,7 @@ def compile_solid(
     friction: Friction = FRICTION["S1"],
     *,
     robot: Robot = Robot(),
+    around: Surroundings = Surroundings(),  # of one world
 ) -> Scene:
     """Compile a scene with a single solid (leaves without a leading axis) of a shape family."""
     errors.check_name("family", family, SHAPES)
@@ -154,11 +165,13 @@ def compile_row(
     physics: Physics,
     i: int,
     robots: Robot | None = None,  # None: the ideal robot
+    surroundings: Surroundings = Surroundings(),
 ) -> Scene:
-    """Compile a scene with row i of solids (n, ...), friction (n,) and robots (n,)."""
-    single, pair, robot = jax.tree.map(lambda leaf: leaf[i], (solids, friction, robots))
+    """Compile a scene with row i of solids (n, ...), friction, robots and surroundings (n,)."""
+    columns = solids, friction, robots, surroundings
+    single, pair, robot, around = jax.tree.map(lambda leaf: leaf[i], columns)
     friction = Friction(float(pair.ground), float(pair.robot))
-    return compile_solid(family, single, physics, friction, robot=robot or Robot())
+    return compile_solid(family, single, physics, friction, robot=robot or Robot(), around=around)
 
 
 def repeat_robot(robots: Robot, count: int) -> Robot:

@@ -18,7 +18,7 @@ from rps_jax.geometry.solid import Solid
 from rps_jax.robot.robot import Robot
 from rps_jax.world import scene
 from rps_jax.world.physics import Physics
-from rps_jax.world.scene import OFF_CENTRE, Friction
+from rps_jax.world.scene import OFF_CENTRE, Friction, Surroundings
 
 _MAX_ON_PROCESSORS = 500  # trials that processors finish sooner than a GPU
 
@@ -31,7 +31,13 @@ class Fused(Engine):
     modes = ("forward", "reverse")
 
     def stage(
-        self, family: str, solids: Solid, friction: Friction, physics: Physics, robots: Robot
+        self,
+        family: str,
+        solids: Solid,
+        friction: Friction,
+        physics: Physics,
+        robots: Robot,
+        surroundings: Surroundings = Surroundings(),
     ) -> tuple[FusedStage, Body]:
         """Return the stage, and the bodies (n, ...) of the worlds."""
         com, axes = solids.p_object_com + OFF_CENTRE, solid.axes(solids)
