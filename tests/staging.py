@@ -21,7 +21,7 @@ from rps_jax.geometry import vectors as sp
 from rps_jax.robot.robot import Robot
 from rps_jax.world import scene
 from rps_jax.world.physics import Physics, preset
-from rps_jax.world.scene import FRICTION, Friction, Scene
+from rps_jax.world.scene import FRICTION, Friction, Scene, WorldInputs
 
 
 def staged(
@@ -34,7 +34,9 @@ def staged(
         *(np.array([world[name] for world in slide]) for name in ("ground", "base"))
     )
     solids = solid.stack([loaded.solid for loaded in scenes])
-    return engines.get(engine).stage(scenes[0].family, solids, friction, physics, robot)
+    return engines.get(engine).stage(
+        WorldInputs(scenes[0].family, solids, friction, physics, robot)
+    )
 
 
 def recompiled(engine: str, scenes: Sequence[Scene]) -> Any:

@@ -17,7 +17,6 @@ from rps_jax import engines
 from rps_jax.errors import InputError
 from rps_jax.geometry import solid
 from rps_jax.geometry.footprint import polygon
-from rps_jax.robot.robot import Robot
 from rps_jax.trials import pushes
 from rps_jax.trials.case import Case
 from rps_jax.trials.setting import Setting
@@ -26,7 +25,7 @@ from rps_jax.world import domain, draws, paper, scene
 from rps_jax.world.domain import DOMAINS, RANDOM, Range
 from rps_jax.world.objects import PAPER_OBJECTS
 from rps_jax.world.physics import preset
-from rps_jax.world.scene import FRICTION
+from rps_jax.world.scene import FRICTION, WorldInputs
 
 WIDE = DOMAINS["wide"]
 COUNT = 12
@@ -102,14 +101,16 @@ def test_the_paper_domain_is_the_papers_grid(engine):
 
 def compiled_rows(worlds, family, count=COUNT):
     """Return scenes of the worlds that MuJoCo compiles one by one."""
-    arguments = family, worlds.solid, worlds.friction, preset()
-    return [scene.compile_row(*arguments, i) for i in range(count)]
+    inputs = WorldInputs(family, worlds.solid, worlds.friction, preset())
+    return [scene.compile_row(inputs, i) for i in range(count)]
 
 
 @pytest.mark.parametrize("name", ["random_box", "random_cylinder"])
 def test_fused_bodies_equal_those_of_recompiled_models(name):
     worlds, family = drawn(name), RANDOM[name]
-    _, bodies = engines.get("fused").stage(family, worlds.solid, worlds.friction, preset(), Robot())
+    _, bodies = engines.get("fused").stage(
+        WorldInputs(family, worlds.solid, worlds.friction, preset())
+    )
     compiled = recompiled("fused", compiled_rows(worlds, family))
     same(bodies, compiled, rtol=1e-6, atol=1e-7)
 

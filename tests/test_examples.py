@@ -25,7 +25,7 @@ from rps_jax.control.registry import register_law
 from rps_jax.errors import InputError
 from rps_jax.geometry.footprint import Footprint, circle, polygon, rectangle
 from rps_jax.record import files
-from rps_jax.robot.robot import Robot, parse_robot
+from rps_jax.robot.robot import parse_robot
 from rps_jax.robot.skin import CapacitiveSkin
 from rps_jax.runs.plan import Plan, load_plan, open_run, scene_of
 from rps_jax.trials import pushes
@@ -34,7 +34,7 @@ from rps_jax.trials.setting import Setting
 from rps_jax.trials.worlds import drawn_worlds
 from rps_jax.world import draws, objects, scene
 from rps_jax.world.domain import Domain, Range, parse_domain
-from rps_jax.world.scene import FRICTION, Friction
+from rps_jax.world.scene import FRICTION, Friction, WorldInputs
 from sweeps.speed import robot as on_a_robot
 
 EXAMPLES = Path(__file__).parents[1] / "notebooks" / "examples"
@@ -86,7 +86,7 @@ def test_all_engines_have_an_equal_hexagon(hexagon):
     physics = Setting(engine="mjx").physics
     for engine in ("fused", "mjx"):
         alone = recompiled(engine, [hexagon])
-        _, drawn = engines.get(engine).stage("prism", solids, friction, physics, Robot())
+        _, drawn = engines.get(engine).stage(WorldInputs("prism", solids, friction, physics))
         if engine == "mjx":
             assert set(alone) == set(drawn)
         same(alone, drawn, rtol=3e-6, atol=3e-6)

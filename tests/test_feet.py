@@ -12,11 +12,10 @@ from rps_jax.errors import InputError
 from rps_jax.geometry import footprint, solid
 from rps_jax.geometry.footprint import Footprint
 from rps_jax.geometry.solid import SIDES
-from rps_jax.robot.robot import Robot
 from rps_jax.trials.worlds import starts
 from rps_jax.world import domain as domains
 from rps_jax.world import draws, objects, points, scene
-from rps_jax.world.scene import Friction
+from rps_jax.world.scene import Friction, WorldInputs
 from sweeps.ground import rigid
 
 FEET = np.array([[0.1, 0.1], [-0.15, 0.05], [0.05, -0.2]])
@@ -141,7 +140,9 @@ def drawn_on_feet(name, count=4):
 
 def stepped(engine, family, drawn, steps):
     """Return positions (n, 10) of drawn worlds after steps at TWIST in an engine."""
-    stage, fields = engines.get(engine).stage(family, drawn.solid, drawn.friction, FINE, Robot())
+    stage, fields = engines.get(engine).stage(
+        WorldInputs(family, drawn.solid, drawn.friction, FINE)
+    )
     qpos = starts(drawn)
     qpos[:, [3, 5]] -= 0.0005
     return simulate(engine, stage, fields, qpos, TWIST, FINE, steps).qpos[-1]
@@ -181,8 +182,8 @@ def test_objects_on_drawn_feet_end_where_those_of_c_mujoco_do(engine, name):
 
 def test_quasistatic_slides_on_drawn_feet():
     plain, drawn, family = drawn_on_feet("random_prism")
-    arguments = family, drawn.solid, drawn.friction, FINE, Robot()
-    _, sliders = engines.get("quasistatic").stage(*arguments)
+    inputs = WorldInputs(family, drawn.solid, drawn.friction, FINE)
+    _, sliders = engines.get("quasistatic").stage(inputs)
     three = drawn.solid.feet[..., 2].sum(axis=1) == 3
     assert three.any()
     for i in np.flatnonzero(three):

@@ -19,6 +19,7 @@ from rps_jax.trials.worlds import starts
 from rps_jax.world import domain as domains
 from rps_jax.world import draws
 from rps_jax.world.physics import Physics
+from rps_jax.world.scene import WorldInputs
 
 BOX = """<body pos="0 0 0.0985"><freejoint/>
 <geom type="box" size="0.2 0.15 0.1" mass="2" friction="0.6"/></body>"""
@@ -169,8 +170,8 @@ def pulled_back(engine, worlds, physics, weights):
     has no meaning.
     """
     family, drawn, robot, robots, (qpos, qvel, twist) = worlds
-    inputs = family, drawn.solid, drawn.friction, physics, robot
-    stage, fields = engines.get(engine).stage(*inputs)
+    inputs = WorldInputs(family, drawn.solid, drawn.friction, physics, robot)
+    stage, fields = engines.get(engine).stage(inputs)
     fields = jax.tree.map(lambda x: jnp.asarray(x, qpos.dtype), fields)
 
     def outputs(fields, qpos, qvel, twist, robots):

@@ -31,7 +31,7 @@ from rps_jax.tuning import fit
 from rps_jax.world import domain, draws, scene
 from rps_jax.world.domain import DOMAINS, Range
 from rps_jax.world.physics import preset
-from rps_jax.world.scene import JOINTS
+from rps_jax.world.scene import JOINTS, WorldInputs
 
 PERIOD = 0.02
 STANDARD = preset()
@@ -259,13 +259,13 @@ TEMPLATES = [*product(("real", "wide"), ("fused", "mjx")), ("wide", "quasistatic
 def test_worlds_by_template_equal_recompiled_ones(domain, engine):
     """Bases differ in size, and those with a limited force in mass."""
     drawn = draws.draw(replace(DOMAINS[domain], objects=("random_box",)), 3, np.arange(3))
-    args = ("box", drawn.solid, drawn.friction, STANDARD)
     bases = replace(drawn.robot, half_length=np.array([0.3, 0.4, 0.5]),
                     half_width=np.array([0.2, 0.25, 0.4]))  # fmt: skip
     if bases.driven:
         bases = replace(bases, mass=np.array([60.0, 130.0, 200.0]))
-    _, fields = engines.get(engine).stage(*args, bases)
-    theirs = recompiled(engine, [scene.compile_row(*args, i, bases) for i in range(3)])
+    inputs = WorldInputs("box", drawn.solid, drawn.friction, STANDARD, bases)
+    _, fields = engines.get(engine).stage(inputs)
+    theirs = recompiled(engine, [scene.compile_row(inputs, i) for i in range(3)])
     for ours, compiled in zip(*map(jax.tree.leaves, (fields, theirs)), strict=True):
         np.testing.assert_allclose(ours, compiled, rtol=2e-5, atol=2e-6)
 

@@ -26,10 +26,9 @@ from rps_jax import engines, errors
 from rps_jax.control.observation import Twist
 from rps_jax.engines import device
 from rps_jax.geometry.arrays import Float
-from rps_jax.geometry.solid import Solid
 from rps_jax.robot.robot import Robot
 from rps_jax.world.physics import Physics
-from rps_jax.world.scene import Friction, Surroundings
+from rps_jax.world.scene import Surroundings, WorldInputs
 
 Mode = Literal["forward", "reverse"]  # of differentiation
 T = TypeVar("T")  # a pytree
@@ -157,19 +156,11 @@ class Engine(abc.ABC):
         return guarded(tree)
 
     @abc.abstractmethod
-    def stage(
-        self,
-        family: str,
-        solids: Solid,
-        friction: Friction,
-        physics: Physics,
-        robots: Robot,
-        surroundings: Surroundings = Surroundings(),
-    ) -> tuple[Any, Any]:
+    def stage(self, inputs: WorldInputs) -> tuple[Any, Any]:
         """Return the stage, and fields (n, ...) on the host, of worlds of one shape family.
 
-        Solids are (n, ...), friction, robots and surroundings (n,). The constants that MuJoCo
-        derives when it compiles a model are computed for all worlds at once.
+        The constants that MuJoCo derives when it compiles a model are computed for all worlds at
+        once.
         """
 
     def slots(self, backend: str) -> int:

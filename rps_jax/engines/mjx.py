@@ -20,13 +20,11 @@ from rps_jax.engines.base import ControlPeriod, Driven, Engine, Motion
 from rps_jax.engines.mjx_colliders import collision, constraint, forward, mjx, smooth
 from rps_jax.engines.mujoco import compile_rows
 from rps_jax.geometry import planar
-from rps_jax.geometry.solid import Solid
 from rps_jax.robot import drive as drives
 from rps_jax.robot.robot import Robot
 from rps_jax.world import scene
 from rps_jax.world.opengl import mujoco
-from rps_jax.world.physics import Physics
-from rps_jax.world.scene import JOINTS, Friction, Surroundings
+from rps_jax.world.scene import JOINTS, WorldInputs
 
 # Fields that differ between objects of one shape family, as paths into an MJX model.
 FIELDS = (
@@ -121,23 +119,13 @@ class MJX(Engine):
     name = "mjx"
     modes = ("forward", "reverse")
 
-    def stage(
-        self,
-        family: str,
-        solids: Solid,
-        friction: Friction,
-        physics: Physics,
-        robots: Robot,
-        surroundings: Surroundings = Surroundings(),
-    ) -> tuple[MJXStage, dict[str, np.ndarray]]:
+    def stage(self, inputs: WorldInputs) -> tuple[MJXStage, dict[str, np.ndarray]]:
         """Return the stage of the first of the worlds, and fields (n, ...) of all."""
-        robots = scene.repeat_robot(robots, solids.mass.size)
-        columns = solids, friction, physics
-        template = scene.compile_row(family, *columns, 0, robots, surroundings).physics
-        rows = compile_rows(family, *columns, robots, surroundings, fields_of)
+        template = scene.compile_row(inputs, 0).physics
+        rows = compile_rows(inputs, fields_of)
         fields = {name: np.stack([row[name] for row in rows]) for name in FIELDS}
-        if solids.feet is not None:
-            fields[OUTLINE] = solids.vertices
+        if inputs.solids.feet is not None:
+            fields[OUTLINE] = inputs.solids.vertices
         return MJXStage(put(template), mjx.make_data(template)), fields
 
     def slots(self, backend: str) -> int:

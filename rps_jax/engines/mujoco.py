@@ -12,13 +12,11 @@ import numpy as np
 
 from rps_jax.engines import device
 from rps_jax.engines.base import Engine
-from rps_jax.geometry.solid import Solid
 from rps_jax.robot import drive as drives
 from rps_jax.robot.robot import Robot
 from rps_jax.world import scene
 from rps_jax.world.opengl import mujoco, rollout
-from rps_jax.world.physics import Physics
-from rps_jax.world.scene import JOINTS, Friction, Surroundings
+from rps_jax.world.scene import JOINTS, WorldInputs
 
 T = TypeVar("T")
 _STATE = mujoco.mjtState.mjSTATE_FULLPHYSICS
@@ -140,28 +138,18 @@ class Batch:
 
 
 def compile_rows(
-    family: str,
-    solids: Solid,
-    friction: Friction,
-    physics: Physics,
-    robots: Robot,
-    surroundings: Surroundings,
-    read: Callable[[mujoco.MjModel], T] = lambda model: model,
+    inputs: WorldInputs, read: Callable[[mujoco.MjModel], T] = lambda model: model
 ) -> list[T]:
-    """Compile the models of worlds (n, ...) in parallel, and return what `read` takes of each.
+    """Compile the models of n worlds in parallel, and return what `read` takes of each.
 
     Equal worlds share one.
     """
-    count = solids.mass.size
-    robots = scene.repeat_robot(robots, count)
-    trees = solids, friction, robots, surroundings
-    leaves = [np.ascontiguousarray(x) for x in jax.tree.leaves(trees)]
-    keys = [b"".join(leaf[i].tobytes() for leaf in leaves) for i in range(count)]
+    leaves = [np.ascontiguousarray(x) for x in jax.tree.leaves(inputs.columns)]
+    keys = [b"".join(leaf[i].tobytes() for leaf in leaves) for i in range(inputs.count)]
     distinct = {key: i for i, key in enumerate(keys)}
 
     def compile_row(i: int) -> T:
-        columns = solids, friction, physics, i, robots, surroundings
-        return read(scene.compile_row(family, *columns).physics)
+        return read(scene.compile_row(inputs, i).physics)
 
     with ThreadPoolExecutor(device.count_processors()) as pool:
         rows = dict(zip(distinct, pool.map(compile_row, distinct.values()), strict=True))
@@ -178,17 +166,9 @@ class MuJoCo(Engine):
         """Return True: it steps worlds on the host."""
         return True
 
-    def stage(
-        self,
-        family: str,
-        solids: Solid,
-        friction: Friction,
-        physics: Physics,
-        robots: Robot,
-        surroundings: Surroundings = Surroundings(),
-    ) -> tuple[list[mujoco.MjModel], dict[str, np.ndarray]]:
+    def stage(self, inputs: WorldInputs) -> tuple[list[mujoco.MjModel], dict[str, np.ndarray]]:
         """Return the models of the worlds; equal worlds share one."""
-        return compile_rows(family, solids, friction, physics, robots, surroundings), {}
+        return compile_rows(inputs), {}
 
 
 ENGINE = MuJoCo()

@@ -32,12 +32,9 @@ from rps_jax.engines.fused.contacts import Point, circle_and_rectangle, polygon_
 from rps_jax.geometry import planar, solid
 from rps_jax.geometry import vectors as sp
 from rps_jax.geometry.arrays import Entries, Number
-from rps_jax.geometry.solid import Solid
 from rps_jax.geometry.vectors import Vec
-from rps_jax.robot.robot import Robot
 from rps_jax.world import scene
-from rps_jax.world.physics import Physics
-from rps_jax.world.scene import JOINTS, Friction, Surroundings
+from rps_jax.world.scene import JOINTS, WorldInputs
 
 _MIN_SPEED = 1e-5  # [m/s] speed of a base at rest
 DEPTH = 1e-4  # [m] approximate penetration of a push
@@ -243,23 +240,15 @@ class QuasistaticEngine(Engine):
     forces = False
     computes_force = False  # only the direction of the force is known, not its size
 
-    def stage(
-        self,
-        family: str,
-        solids: Solid,
-        friction: Friction,
-        physics: Physics,
-        robots: Robot,
-        surroundings: Surroundings = Surroundings(),
-    ) -> tuple[Quasistatic, Slider]:
+    def stage(self, inputs: WorldInputs) -> tuple[Quasistatic, Slider]:
         """Return the stage, and the sliders (n, ...) of the worlds; bases follow every twist."""
-        assert not robots.driven, "checked by check_robot"
-        count = solids.mass.size
+        solids, count = inputs.solids, inputs.count
+        assert not inputs.robots.driven, "checked by check_robot"
         return Quasistatic(), Slider(
             p_object_com=solids.p_object_com[:, :2],
             arm=solid.friction_arm(solids),
-            friction_robot=np.broadcast_to(friction.robot, count),
-            base_half=scene.base_half(robots, count),
+            friction_robot=np.broadcast_to(inputs.friction.robot, count),
+            base_half=scene.base_half(inputs.robots, count),
             vertices=solids.vertices,
             radius=solids.radius,
         )

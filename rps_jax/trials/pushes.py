@@ -27,7 +27,7 @@ from rps_jax.trials.trial import ControlLoop, Outcome, Shift, Snapshot, Trial, W
 from rps_jax.world import draws, scene
 from rps_jax.world.objects import FAMILIES
 from rps_jax.world.physics import Physics
-from rps_jax.world.scene import JOINTS, Friction, Scene
+from rps_jax.world.scene import JOINTS, Friction, Scene, WorldInputs
 from rps_jax.world.tasks.base import CourseInputs
 
 
@@ -93,12 +93,16 @@ def build(
         courses.append(rows(course, 0))
     shifts = zip(*(case.shift for case in cases), strict=True)
     root = jax.random.PRNGKey(setting.seed)
-    batch = worlds.build(
-        trials,
+    inputs = WorldInputs(
         FAMILIES[cases[0].object_name],
         solid.stack([solids[key] for key in keys]),
         Friction(*np.array([case.contact for case in cases], float).T),
+        setting.physics,
         _stack([case.base for case in cases]),
+    )
+    batch = worlds.build(
+        trials,
+        inputs,
         setting,
         skin=_stack([case.sensor for case in cases]),
         p_world_target=np.array(final),

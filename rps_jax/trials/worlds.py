@@ -9,9 +9,7 @@ import numpy as np
 from rps_jax import engines
 from rps_jax.geometry import solid
 from rps_jax.geometry.footprint import Footprint
-from rps_jax.geometry.solid import Solid
 from rps_jax.robot.base import Odometry
-from rps_jax.robot.robot import Robot
 from rps_jax.robot.skin import CapacitiveSkin, IdealSkin, Skin
 from rps_jax.trials.batch import WorldBatch
 from rps_jax.trials.setting import Setting
@@ -20,41 +18,27 @@ from rps_jax.world import scene
 from rps_jax.world.domain import RANDOM, Domain, Owner, Range, quantities_of
 from rps_jax.world.draws import Draw
 from rps_jax.world.physics import Physics
-from rps_jax.world.scene import JOINTS, Friction, Scene, Surroundings
+from rps_jax.world.scene import JOINTS, Friction, Scene, WorldInputs
 
 
-def build(
-    indices: np.ndarray,
-    family: str,
-    solids: Solid,
-    friction: Friction,
-    robots: Robot,
-    setting: Setting,
-    surroundings: Surroundings = Surroundings(),
-    **fields: Any,
-) -> WorldBatch:
+def build(indices: np.ndarray, inputs: WorldInputs, setting: Setting, **fields: Any) -> WorldBatch:
     """Return worlds of one shape family, staged for the engine: on the host, without parameters.
 
     Args:
       indices: (n,) of the trials.
-      family: shape family of all solids.
-      solids: (n, ...).
-      friction: (n,) each.
-      robots: (n,), or one.
+      inputs: of all engines.
       setting: engine and physics.
-      surroundings: (n,) each.
       fields: of `World`, (n, ...) each, beside those that follow from solids and robots.
 
     Raises:
       InputError: the engine cannot step such a robot, or such surroundings.
     """
     engine, dtype = engines.get(setting.engine), jnp.result_type(float)
-    engine.check_robot(robots)
-    engine.check_surroundings(surroundings)
-    columns = solids, friction, setting.physics, robots, surroundings
-    stage, staged = engine.stage(family, *columns)
-    outline: Any = solids.vertices, solids.radius
-    robot = None if robots.ideal else robots
+    engine.check_robot(inputs.robots)
+    engine.check_surroundings(inputs.surroundings)
+    stage, staged = engine.stage(inputs)
+    outline: Any = inputs.solids.vertices, inputs.solids.radius
+    robot = None if inputs.robots.ideal else inputs.robots
     world = World(fields=staged, footprint=Footprint(*outline), robot=robot, **fields)
     narrow = jax.tree.map(lambda x: x if x.dtype == np.uint32 else x.astype(dtype), world)
     return WorldBatch(indices, narrow, stage)
@@ -73,12 +57,8 @@ def drawn_worlds(
     odometry = _drawn(drawn, "base") | {"velocity_error": drawn.velocity_error}
     return build(
         drawn.indices,
-        domain.family_of(drawn.cases[0]),
-        drawn.solid,
-        drawn.friction,
-        drawn.robot,
+        drawn.inputs(domain, setting.physics),
         setting,
-        drawn.surroundings,
         skin=_skin(domain, drawn),
         p_world_target=drawn.p_world_target,
         task=drawn.course,
@@ -136,7 +116,6 @@ def drawn_scene(domain: Domain, drawn: Draw, physics: Physics, i: int) -> Scene:
     case = int(drawn.cases[i])
     name = domain.objects[int(domain.object_of(case))]
     if name in RANDOM:
-        columns = drawn.solid, drawn.friction, physics, i, drawn.robot, drawn.surroundings
-        return scene.compile_row(domain.family_of(case), *columns)
+        return scene.compile_row(drawn.inputs(domain, physics), i)
     ground, robot = (float(leaf[i]) for leaf in drawn.friction)
     return scene.load(name, physics, Friction(ground, robot), robot=domain.robot)

@@ -184,9 +184,8 @@ class Replay(NamedTuple):
         moved = (u + steps).reshape(-1, u.shape[1])
         drawn = points.draw(self.domain, 0, Points(moved), np.arange(len(moved)))
         robots = dataclasses.replace(drawn.robot, **dict.fromkeys(LIMITS))
-        bodies = drawn.solid, drawn.friction, self.setting.physics, robots
-        engine, family = engines.get(self.setting.engine), self.domain.family_of(drawn.cases[0])
-        stage, fields = engine.stage(family, *bodies)
+        inputs = drawn.inputs(self.domain, self.setting.physics)._replace(robots=robots)
+        stage, fields = engines.get(self.setting.engine).stage(inputs)
         latency = np.zeros(len(moved)) if self.exact else drawn.values["pose_latency"]
         windows = [track.windows(x) for x in latency for track in self.tracks]
         constants = fields, drawn.solid.height

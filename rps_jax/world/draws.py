@@ -25,7 +25,8 @@ from rps_jax.world.domain import (
     robot_field,
     unit_of,
 )
-from rps_jax.world.scene import Friction, Surroundings
+from rps_jax.world.physics import Physics
+from rps_jax.world.scene import Friction, Surroundings, WorldInputs
 from rps_jax.world.tasks.base import Course, CourseInputs
 
 COLUMNS = 64  # random numbers of a world; unused ones are for new quantities
@@ -45,6 +46,11 @@ class Draw(NamedTuple):
     robot: Robot  # (n,) each
     key: np.ndarray  # (n, 2) uint32, of the noise of sensors and odometry
     surroundings: Surroundings = Surroundings()  # (n,) each
+
+    def inputs(self, domain: Domain, physics: Physics) -> WorldInputs:
+        """Return the inputs of engines for these worlds of a domain."""
+        columns = self.solid, self.friction, physics, self.robot, self.surroundings
+        return WorldInputs(domain.family_of(self.cases[0]), *columns)
 
 
 # Columns of random numbers that belong to no range.

@@ -47,6 +47,28 @@ class Surroundings(NamedTuple):
     walls: Any = None  # (n, W, 2, 2) [m] both ends of walls that the object may touch
 
 
+class WorldInputs(NamedTuple):
+    """What MuJoCo compiles n worlds of one shape family from."""
+
+    family: str
+    solids: Solid  # (n, ...)
+    friction: Friction  # (n,) each
+    physics: Physics
+    robots: Robot = Robot()  # (n,), or one for all
+    surroundings: Surroundings = Surroundings()  # (n,) each
+
+    @property
+    def count(self) -> int:
+        """Number of worlds."""
+        return self.solids.mass.size
+
+    @property
+    def columns(self) -> tuple[Solid, Friction, Robot, Surroundings]:
+        """All that may differ between the worlds, with leaves (n, ...)."""
+        robots = repeat_robot(self.robots, self.count)
+        return self.solids, self.friction, robots, self.surroundings
+
+
 class Scene(NamedTuple):
     """Object in front of the robot: models, solid and shell."""
 
@@ -158,20 +180,12 @@ def compile_solid(
     return Scene(family, family, *models, single, robot.shell)
 
 
-def compile_row(
-    family: str,
-    solids: Solid,
-    friction: Friction,
-    physics: Physics,
-    i: int,
-    robots: Robot | None = None,  # None: the ideal robot
-    surroundings: Surroundings = Surroundings(),
-) -> Scene:
-    """Compile a scene with row i of solids (n, ...), friction, robots and surroundings (n,)."""
-    columns = solids, friction, robots, surroundings
-    single, pair, robot, around = jax.tree.map(lambda leaf: leaf[i], columns)
+def compile_row(inputs: WorldInputs, i: int) -> Scene:
+    """Compile a scene of row i."""
+    single, pair, robot, around = jax.tree.map(lambda leaf: leaf[i], inputs.columns)
     friction = Friction(float(pair.ground), float(pair.robot))
-    return compile_solid(family, single, physics, friction, robot=robot or Robot(), around=around)
+    columns = single, inputs.physics, friction
+    return compile_solid(inputs.family, *columns, robot=robot, around=around)
 
 
 def repeat_robot(robots: Robot, count: int) -> Robot:

@@ -17,7 +17,6 @@ import xarray as xr
 from rps_jax import engines
 from rps_jax.engines.mujoco import Batch
 from rps_jax.record.options import option
-from rps_jax.robot.robot import Robot
 from rps_jax.runs.question import Run, call_of
 from rps_jax.trials.progress import Progress
 from rps_jax.trials.worlds import starts
@@ -78,7 +77,7 @@ class Rest(QuickStudy[xr.Dataset]):
             rows = index[ranges.object_of(index) == i]
             drawn = draws.draw(ranges, self.seed, rows)
             family[rows] = ranges.families[i]
-            stage, _ = c.stage(ranges.families[i], drawn.solid, drawn.friction, physics, Robot())
+            stage, _ = c.stage(drawn.inputs(ranges, physics))
             qpos = starts(drawn)
             qpos[:, 0] -= _AWAY
             batch = Batch(stage, qpos, 1)

@@ -45,7 +45,7 @@ from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import ControlLoop, Rules, Shift
 from rps_jax.trials.worlds import build
 from rps_jax.world.physics import Physics
-from rps_jax.world.scene import JOINTS, Friction
+from rps_jax.world.scene import JOINTS, Friction, WorldInputs
 from sweeps.study_base import Rows
 
 SliderName = Literal["box", "cylinder"]
@@ -191,10 +191,7 @@ def worlds(slider: SliderName, grid: Cells, engine: EngineName) -> WorldBatch:
 
     built = build(
         np.arange(count),
-        slider,
-        solids,
-        friction,
-        _ROBOT,
+        WorldInputs(slider, solids, friction, PHYSICS, _ROBOT),
         Setting(engine, PHYSICS),
         skin=repeated(IdealSkin(shell=_ROBOT.shell)),
         p_world_target=np.tile([90.0, 0.0], (count, 1)),  # never reached

@@ -139,7 +139,6 @@ def jax_engine(task: Task, name: str) -> Racer:
     from rps_jax.control.observation import Twist
     from rps_jax.engines.base import ControlPeriod, Motion
     from rps_jax.geometry import solid
-    from rps_jax.robot.robot import Robot
     from rps_jax.world import scene
     from rps_jax.world.physics import preset
 
@@ -148,7 +147,7 @@ def jax_engine(task: Task, name: str) -> Racer:
     box = solid.stack([scene.load("box", physics).solid])
     boxes = jax.tree.map(lambda leaf: np.repeat(leaf, worlds, axis=0), box)
     friction = scene.Friction(*(np.full(worlds, x) for x in scene.FRICTION["S1"]))
-    stage, fields = engines.get(name).stage("box", boxes, friction, physics, Robot())
+    stage, fields = engines.get(name).stage(scene.WorldInputs("box", boxes, friction, physics))
     fields, qpos = jax.device_put((fields, task.qpos.astype(np.float32)))
     twists = Twist(*(jnp.full(worlds, v, jnp.float32) for v in (SPEED, 0.0, 0.0)))
 

@@ -14,11 +14,9 @@ from rps_jax.engines.base import Engine
 from rps_jax.engines.fused.contacts import Body
 from rps_jax.engines.fused.step import FusedStage
 from rps_jax.geometry import solid
-from rps_jax.geometry.solid import Solid
-from rps_jax.robot.robot import Robot
 from rps_jax.world import scene
 from rps_jax.world.physics import Physics
-from rps_jax.world.scene import OFF_CENTRE, Friction, Surroundings
+from rps_jax.world.scene import OFF_CENTRE, WorldInputs
 
 _MAX_ON_PROCESSORS = 500  # trials that processors finish sooner than a GPU
 
@@ -30,16 +28,9 @@ class Fused(Engine):
     side_by_side = True
     modes = ("forward", "reverse")
 
-    def stage(
-        self,
-        family: str,
-        solids: Solid,
-        friction: Friction,
-        physics: Physics,
-        robots: Robot,
-        surroundings: Surroundings = Surroundings(),
-    ) -> tuple[FusedStage, Body]:
+    def stage(self, inputs: WorldInputs) -> tuple[FusedStage, Body]:
         """Return the stage, and the bodies (n, ...) of the worlds."""
+        solids, (friction, physics, robots) = inputs.solids, inputs[2:5]
         com, axes = solids.p_object_com + OFF_CENTRE, solid.axes(solids)
         base_invweight, base_z = _base(physics)
         if robots.driven:
