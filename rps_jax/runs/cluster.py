@@ -156,8 +156,8 @@ def run_on_cluster(
             while waiting:
                 (ended,), waiting[:] = ray.wait(waiting)
                 contents, progress, worker = ray.get(ended)
-                for number, content in contents.items():
-                    execution.store_chunk(folder, number, content)
+                for chunk, content in contents.items():
+                    execution.store_chunk(folder, chunk, content)
                 known[worker["host"], worker["pid"]] = worker
                 all_workers = _join_environments(list(known.values()))
                 provenance.write_environment(folder, environment | all_workers)

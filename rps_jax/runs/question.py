@@ -88,7 +88,7 @@ def __getattr__(name: str) -> Any:
 def seed_of(seed: int, split: Split) -> int:
     """Return the seed of the worlds of one split; no two splits of any seeds share a world.
 
-    The worlds of a domain that draws little, such as `paper`, hardly depend on the seed.
+    The worlds of a domain that draws little, such as `paper`, depend little on the seed.
 
     Raises:
       InputError: the split is unknown, or the seed too large.

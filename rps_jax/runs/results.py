@@ -178,7 +178,7 @@ class Results:
         for column in (*columns.values(), *drawn.values()):
             column.encoding["_FillValue"] = None  # every number is a result
         coordinates = {
-            "law": xr.Variable("law", list(self.plan.laws), {"long_name": "what decides"}),
+            "law": xr.Variable("law", list(self.plan.laws), {"long_name": "control law"}),
             "world": xr.Variable("world", worlds, {"long_name": WORLD}),
         }
         return xr.Dataset(columns, coordinates | drawn | {"pose": POSE})

@@ -245,9 +245,9 @@ class Sweep(SweepOptions, SweepQuestion):
         sections = list(super().report(results, run))
         if "model_success" in results:
             text = (
-                "The same worlds on other grounds, friction cones and steps that measurements do "
-                "not rule out. The interval of a rate is the effect of other worlds; its range "
-                "over the models is the effect of another simulation."
+                "The same worlds with other ground stiffness, friction cones and timesteps that "
+                "agree with measurements. The interval of a rate is the effect of other worlds; "
+                "its range over the models is the effect of another simulation."
             )
             sections.insert(1, Section("Models", text, tables.models_table(results)))
         return sections

@@ -182,10 +182,10 @@ class Hardware(LawQuestion[xr.Dataset]):
             "that end earlier are not counted. Brackets: Wilson 95 % intervals [%]."
         )
         middle = f"Friction: ground {ground:g}, robot {robot:g}, the middle of the range."
-        numbers = Picture("numbers", partial(numbers_figure, results))
+        success = Picture("numbers", partial(numbers_figure, results))
         paths = Picture("paths", partial(paths_figure, results))
         return [
-            Section("Hardware experiments", text, table(results), numbers),
+            Section("Hardware experiments", text, table(results), success),
             Section("Fig. 7: paths of the base", middle, (), paths),
             Section("The object shoved aside", shove, shift_table(results)),
         ]
@@ -207,8 +207,8 @@ def table(results: xr.Dataset) -> list[list[str]]:
         for key, (_, unit, digits) in _MEANS.items():
             values = trials[key].where(success)
             means = values.mean("target")
-            each = values.mean(), means.min(), means.max()
-            mean, low, high = (f"{float(v):.{digits}f}" for v in each)
+            levels = values.mean(), means.min(), means.max()
+            mean, low, high = (f"{float(v):.{digits}f}" for v in levels)
             cell = f"{mean} {unit} (by friction {low}-{high})" if success.any() else "-"
             rows[-1] += [cell, f"{getattr(in_paper, key):.{digits}f} {unit}"]
     return rows

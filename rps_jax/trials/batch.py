@@ -291,13 +291,13 @@ class _TrialQueue:
 
     def take(self, count: int) -> list[WorldBatch]:
         """Remove and return up to `count` waiting trials."""
-        taken = []
+        batches = []
         with self._lock:
             while count and (batch := self._waiting or next(self._batches, None)):
                 first, self._waiting = batch.split(count)
-                taken.append(first)
+                batches.append(first)
                 count -= first.indices.size
-        return taken
+        return batches
 
 
 def _schedule(
@@ -480,8 +480,8 @@ class _Slots:
         period = self._program.setting.physics.control_period
         ended = self._indices[at], rows(outcomes, at), float(steps.sum()) * period
         self.live[at] = False
-        if taken := self._queue.take(at.size):
-            self.inputs = self._fill(at, taken)
+        if batches := self._queue.take(at.size):
+            self.inputs = self._fill(at, batches)
             self._fresh[at] = self.live[at]
         return ended
 

@@ -179,8 +179,8 @@ class PushEnv:
         world, previous, twist = engine.guard_derivatives(inputs, physics)
         decided, twist = trial.execute(world, previous, twist, self.dt)
         period = ControlPeriod(twist, physics, trial.pushing(world))
-        one = SingleWorld(self._batch.stage)
-        driven = one.drive(world.fields, trial.motion(decided), period)
+        stage = SingleWorld(self._batch.stage)
+        driven = stage.drive(world.fields, trial.motion(decided), period)
         moved = trial.settle(world, previous, decided, driven)
         current, measured = self._observe(world, moved)
         ended = moved.done  # before this step, or because the physics diverged

@@ -52,8 +52,8 @@ def run(
             if running.size:
                 twists = np.stack(twist, axis=1)[running].astype(float)
                 batch.drive(running, twists, loop.physics.substeps)
-            after = Motion(batch.qpos, batch.qvel, batch.warmstart, batch.integral)
-            motion = jax.tree.map(lambda x: x.astype(dtype), after)
+            state = Motion(batch.qpos, batch.qvel, batch.warmstart, batch.integral)
+            motion = jax.tree.map(lambda x: x.astype(dtype), state)
             force = batch.force.astype(dtype) if loop.law.senses == "force" else None
             trials = _settle(worlds, trials, decided, Driven(motion, force=force))
             yield trials, snapshot

@@ -29,7 +29,7 @@ UNITS = {
     "tipped": ("1", "the object fell over"),
     "diverged": ("1", "physics became NaN or ran away"),
     "nan_twist": ("1", "it diverged since the law returned a twist that is not finite"),
-    "stalled": ("1", "it ended with the base standing still, for want of force"),
+    "stalled": ("1", "it ended with the base standing still, whose force was too small"),
     "base_pose": ("m, m, rad", "x, y, yaw of the base in the world at the end"),
     "object_pose": ("m, m, rad", "x, y, yaw of the object in the world at the end"),
 }

@@ -47,7 +47,7 @@ _SMALL = np.array([1e-4, 1e-4, 3e-4, 1e-4, 1e-4, 3e-4, 0.1, 0.1])  # least scale
 _INFORMATION = 0.07
 _PRIOR = 3.0  # precision of a nearly flat density around the middle of the cube
 _PROPOSALS = 100_000  # of the sampler, for each minimum
-_MOST = 1 - 1e-6  # greatest coordinate
+_MAX_COORDINATE = 1 - 1e-6  # greatest coordinate
 
 
 def _rows(interval: float) -> tuple[int, int]:
@@ -160,11 +160,11 @@ class Replay(NamedTuple):
         damping = np.full((len(u), 1), 1e-2)
         for _ in range(_ITERATIONS):
             at, (g, h) = u[:, self.active], _expansion(r, j)
-            fixed = ~self.periodic & (((at <= 0) & (g > 0)) | ((at >= _MOST) & (g < 0)))
+            fixed = ~self.periodic & (((at <= 0) & (g > 0)) | ((at >= _MAX_COORDINATE) & (g < 0)))
             diagonal = damping * (1 + np.diagonal(h, axis1=1, axis2=2)) + 1e12 * fixed
             step = np.linalg.solve(h + diagonal[..., None] * np.eye(len(self.active)), g[..., None])
             at, new = at - np.clip(step[..., 0], -0.3, 0.3), u.copy()
-            new[:, self.active] = np.where(self.periodic, at % 1, np.clip(at, 0, _MOST))
+            new[:, self.active] = np.where(self.periodic, at % 1, np.clip(at, 0, _MAX_COORDINATE))
             r_new, j_new = self.derivatives(new)
             better = cost(r_new) < cost(r)
             for old, changed in ((u, new), (r, r_new), (j, j_new)):
@@ -276,17 +276,17 @@ def sample(
     precision = information + _PRIOR * np.eye(len(active))
     weight = softmax(-_INFORMATION * cost(r) - np.linalg.slogdet(precision)[1] / 2)
     samples = []
-    for at, h, number in zip(u, precision, rng.multinomial(count, weight), strict=True):
-        free = rng.random((number, len(at)))
+    for at, h, size in zip(u, precision, rng.multinomial(count, weight), strict=True):
+        free = rng.random((size, len(at)))
         choices = [i for i, x in enumerate(points.coordinates(replay.domain)) if x.kind == "choice"]
         free[:, choices] = at[choices]
         mean = at[active] + np.linalg.solve(h, _PRIOR * (0.5 - at[active]))
         values, vectors = np.linalg.eigh(h)
-        normal = rng.standard_normal((_PROPOSALS * (number > 0), len(h)))
+        normal = rng.standard_normal((_PROPOSALS * (size > 0), len(h)))
         x = mean + (normal / np.sqrt(np.maximum(values, _PRIOR))) @ vectors.T
         inside = x[(replay.periodic | ((x >= 0) & (x < 1))).all(axis=1)]
-        inside = inside if len(inside) else np.clip(x, 0, _MOST)
-        free[:, active] = inside[rng.integers(max(1, len(inside)), size=number)] % 1
+        inside = inside if len(inside) else np.clip(x, 0, _MAX_COORDINATE)
+        free[:, active] = inside[rng.integers(max(1, len(inside)), size=size)] % 1
         samples.append(free)
     least = int(np.argmin(cost(r)))
     return np.concatenate(samples), np.linalg.eigvalsh(information[least])[::-1]

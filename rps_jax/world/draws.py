@@ -63,8 +63,8 @@ _UNRANGED = {
     **tasks.MORE_NUMBERS,
 }
 # A range with the column of another number is drawn by several numbers, as the velocity error.
-_TAKEN = set(_UNRANGED.values())
-_RANGED = {name: item.column for name, item in QUANTITIES.items() if item.column not in _TAKEN}
+_FIXED = set(_UNRANGED.values())
+_RANGED = {name: item.column for name, item in QUANTITIES.items() if item.column not in _FIXED}
 if _RANGED.keys() & _UNRANGED:
     raise ValueError(f"two quantities are named {_RANGED.keys() & _UNRANGED}")
 # Columns of the random numbers of a world by name, in their order.

@@ -38,7 +38,7 @@ FRICTION = {"S1": Friction(0.3, 0.35), "S2": Friction(0.2, 0.5)}  # Table I
 
 
 class Surroundings(NamedTuple):
-    """What surrounds the objects of n worlds beyond a level, uniform floor; None where absent."""
+    """Surroundings of n worlds other than a level, uniform floor; None where absent."""
 
     gravity: Any = None  # (n, 3) [m/s^2] in the frame of the floor, of a slope
     # (n, 4) unit normal of a line on the floor, its distance from the origin [m], and the factor
@@ -48,7 +48,7 @@ class Surroundings(NamedTuple):
 
 
 class WorldInputs(NamedTuple):
-    """What MuJoCo compiles n worlds of one shape family from."""
+    """Inputs from which MuJoCo compiles n worlds of one shape family."""
 
     family: str
     solids: Solid  # (n, ...)
@@ -64,7 +64,7 @@ class WorldInputs(NamedTuple):
 
     @property
     def columns(self) -> tuple[Solid, Friction, Robot, Surroundings]:
-        """All that may differ between the worlds, with leaves (n, ...)."""
+        """Fields that may differ between worlds, with leaves (n, ...)."""
         robots = repeat_robot(self.robots, self.count)
         return self.solids, self.friction, robots, self.surroundings
 
