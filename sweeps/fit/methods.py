@@ -9,9 +9,10 @@ and simulated trials.
 
 from __future__ import annotations
 
+import functools
+import multiprocessing
 import time
-from collections.abc import Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
 from typing import ClassVar
@@ -36,6 +37,7 @@ from sweeps.study_base import Rows, Table
 
 KINDS = {"touch, object": ("object_pose",), "touch, object, force": ("object_pose", "f_robot")}
 METHODS = ("neural", "gradient", "evolution")
+_PART = 25  # logs that one process fits
 _POPULATION, _GENERATIONS = 24, 64  # of CMA-ES: about as many seconds as the derivatives
 _SPREAD = 0.2  # standard deviation of its first generation, in units of the cube
 _QUANTITIES = ("friction_robot", "friction_ground", "mass", "ground_force", "size", "aspect",
@@ -65,26 +67,34 @@ class Methods(FitStudy):
         return fit.Bank(self.ranges, self.params, self.setting, self.window, 2 * period)
 
     def answer(self, run: Run) -> xr.Dataset:
-        """Fit the logs by each method and from each kind of log."""
-        start = time.process_time()
-        training = self.bank.worlds(self.worlds, run)
-        seconds = time.process_time() - start  # checkpoint: a resumed run simulates less
-        simulation = run.checkpoint("simulation", lambda: xr.Dataset({"simulation": seconds}))
-        test = self.bank.worlds(self.logs, run._replace(callback=no_progress), "test")
-        networks = [
-            run.checkpoint(f"neural-{i}", partial(self._by_networks, kind, training, test, run))
-            for i, kind in enumerate(KINDS)
-        ]
-        tracks = self._tracks()
-        by_method = [networks]
-        for method in METHODS[1:]:
-            compute = partial(self._by_windows, method, tracks, test)
-            by_method.append([
-                run.checkpoint(f"{method}-{i}", partial(compute, kind, run))
+        """Fit the logs by each method and from each kind of log.
+
+        Processes fit windows, because Python runs most of the splines and of the tracing. Each part
+        has some logs and does not need the others. Networks learn meanwhile.
+        """
+        quiet, parts = run._replace(callback=no_progress), range(-(-self.logs // _PART))
+        context, cpu = multiprocessing.get_context("spawn"), ("cpu",)
+        with context.Pool(device.count_processors(), device.choose, cpu) as pool:
+            jobs = [
+                pool.starmap_async(_fit_part, [(self, quiet, method, i) for i in parts], 1)
+                for method in METHODS[:0:-1]  # the slowest first
+            ]
+            start = time.process_time()
+            training = self.bank.worlds(self.worlds, run)
+            seconds = time.process_time() - start  # checkpoint: a resumed run simulates less
+            simulation = run.checkpoint("simulation", lambda: xr.Dataset({"simulation": seconds}))
+            test = self.bank.worlds(self.logs, quiet, "test")
+            networks = [
+                run.checkpoint(f"neural-{i}", partial(self._by_networks, kind, training, test, run))
                 for i, kind in enumerate(KINDS)
-            ])  # fmt: skip
-        parts = [xr.concat(x, xr.IndexVariable("kind", list(KINDS))) for x in by_method]
-        result = xr.concat(parts, xr.IndexVariable("estimator", list(METHODS)))
+            ]
+            set_phase(run.callback, "replay windows")
+            by_method = [networks]
+            for job in reversed(jobs):
+                fits = [xr.concat(x, "log").sortby("log") for x in zip(*job.get(), strict=True)]
+                by_method.append([x.drop_vars("log") for x in fits])
+        kinds = [xr.concat(x, xr.IndexVariable("kind", list(KINDS))) for x in by_method]
+        result = xr.concat(kinds, xr.IndexVariable("estimator", list(METHODS)))
         return xr.merge([result, simulation])
 
     def _by_networks(
@@ -97,56 +107,61 @@ class Methods(FitStudy):
         x = test.sel(statistic=names).statistics.values[:, :1]
         samples = [posterior.sample(networks, row, fit.SAMPLES, i) for i, row in enumerate(x)]
         seconds = (time.process_time() - start) / self.logs
-        return self.compare_samples(samples, test).assign(
+        return self.compare_samples(samples, test.u.values).assign(
             seconds=("log", np.full(self.logs, seconds)), windows=("log", np.zeros(self.logs))
         )
 
-    def _tracks(self) -> list[tuple[Track, float]]:
-        """Return the paths of the logs of the test worlds, and the time [s] of smoothing them."""
-        seed, bank = seed_of(self.setting.seed, "test"), self.bank
-        logs: dict[int, Log] = {}
+    @cached_property
+    def test_logs(self) -> list[Log]:
+        """Logs of the test worlds."""
+        logs = dict[int, Log]()
         index = np.arange(self.logs)
-        for at, drawn in points.draw_by_object(self.ranges, seed, None, index):
-            batch = bank.logs(drawn)
+        for at, drawn in points.draw_by_object(self.ranges, self.test_seed, None, index):
+            batch = self.bank.logs(drawn)
             for row, i in enumerate(at.tolist()):
                 logs[i] = jax.tree.map(lambda x, row=row: x[row : row + 1], batch)
+        return [logs[i] for i in range(self.logs)]
 
-        def track(i: int) -> tuple[Track, float]:
-            start = time.thread_time()
-            return Track.of(logs[i], bank.interval, False, True), time.thread_time() - start
+    def indices(self, part: int) -> np.ndarray:
+        """Return the logs of a part; their numbers of windows, hence programs, differ little."""
+        tracks = (Track.of(log, self.bank.interval, True, True) for log in self.test_logs)
+        order = np.argsort([track.first.size for track in tracks], kind="stable")
+        return order[part * _PART : (part + 1) * _PART]
 
-        with ThreadPoolExecutor(device.count_processors()) as pool:
-            return list(pool.map(track, range(self.logs)))
+    def smooth(self, index: np.ndarray) -> tuple[list[Track], float]:
+        """Return the paths of some logs, and the mean processor time [s] of smoothing."""
+        start = time.process_time()
+        tracks = [Track.of(self.test_logs[i], self.bank.interval, False, True) for i in index]
+        return tracks, (time.process_time() - start) / len(index)
 
-    def _by_windows(
-        self, method: str, tracks: Sequence[tuple[Track, float]], test: xr.Dataset,
-        kind: str, run: Run,
+    def by_windows(
+        self, method: str, kind: str, index: np.ndarray,
+        smooth: Callable[[], tuple[list[Track], float]],
     ) -> xr.Dataset:  # fmt: skip
         """Return the fits of replayed windows; logs with too few windows keep the prior."""
-        set_phase(run.callback, f"{method}: replay {kind}")
         minimise = {"gradient": Replay.minima, "evolution": evolved}[method]
         names = points.names(self.ranges)
         columns = [names.index(name) for name in fit.coordinates(self.ranges)]
         starts = points.points_of(self.ranges, np.arange(self.starts), seed_of(0, "tune"))
-
-        def samples(log: int) -> tuple[np.ndarray, int]:
-            track = tracks[log][0]
+        results, counts, (tracks, smoothing) = list[np.ndarray](), list[float](), smooth()
+        start = time.process_time()
+        for log, track in zip(index.tolist(), tracks, strict=True):
             track = track if "f_robot" in KINDS[kind] else track._replace(force=None)
             replay = Replay(self.ranges, [track], self.setting, False)
             u = np.random.default_rng(log).random((fit.SAMPLES, len(names)))
             if replay.num_windows >= fit.LEAST_WINDOWS:
-                minima = device.standard_jax()(minimise)(replay, starts)
-                u, r, j = minima
-                u, _ = least_squares.sample(replay, u, r, j, fit.SAMPLES, log)
-            return u[:, columns], replay.num_windows
+                u, _ = least_squares.sample(replay, *minimise(replay, starts), fit.SAMPLES, log)
+            results.append(u[:, columns])
+            counts.append(replay.num_windows)
+        seconds = (time.process_time() - start) / len(index) + smoothing
+        truth = points.points_of(self.ranges, index, self.test_seed)[:, columns]
+        fits = self.compare_samples(results, truth, index).assign_coords(log=index)
+        return fits.assign(seconds=("log", np.full(len(index), seconds)), windows=("log", counts))
 
-        start = time.process_time()
-        with ThreadPoolExecutor(device.count_processors()) as pool:
-            results, counts = zip(*pool.map(samples, range(self.logs)), strict=True)
-        seconds = (time.process_time() - start) / self.logs + np.mean([x for _, x in tracks])
-        return self.compare_samples(results, test).assign(
-            seconds=("log", np.full(self.logs, seconds)), windows=("log", np.array(counts, float))
-        )
+    @property
+    def test_seed(self) -> int:
+        """Seed of the test worlds."""
+        return seed_of(self.setting.seed, "test")
 
     def report_tables(self, results: xr.Dataset) -> Sequence[Table]:
         """Return the comparison of the methods, over all quantities and by quantity."""
@@ -157,6 +172,18 @@ class Methods(FitStudy):
 
 
 methods = call_of(Methods)
+
+
+def _fit_part(study: Methods, run: Run, method: str, part: int) -> list[xr.Dataset]:
+    """Return the fits of a part of the logs, from each kind of log."""
+    index = study.indices(part)
+    smooth = functools.cache(partial(study.smooth, index))
+    return [
+        run.checkpoint(
+            f"{method}-{i}-{part:03d}", partial(study.by_windows, method, kind, index, smooth)
+        )
+        for i, kind in enumerate(KINDS)
+    ]
 
 
 class _Values(Replay):

@@ -78,16 +78,21 @@ class FitStudy(Study[xr.Dataset], DomainQuestion[xr.Dataset], LawQuestion[xr.Dat
         samples = (
             posterior.sample(networks, x, fit.SAMPLES, log) for log, x in enumerate(statistics)
         )
-        return self.compare_samples(samples, test)
+        return self.compare_samples(samples, test.u.values)
 
-    def compare_samples(self, samples: Iterable[np.ndarray], test: xr.Dataset) -> xr.Dataset:
-        """Return the summaries of samples (n, q) of each test world, with the true values."""
-        fits = []
-        for log, points_ in enumerate(samples):
+    def compare_samples(
+        self, samples: Iterable[np.ndarray], u: np.ndarray, index: np.ndarray | None = None
+    ) -> xr.Dataset:
+        """Return the summaries of samples (n, q) of each test world, with the true values.
+
+        The test worlds have the points `u` (log, q) and an index (log,), by default 0, 1, ...
+        """
+        fits, index = list[xr.Dataset](), np.arange(len(u)) if index is None else index
+        for points_, true_u, log in zip(samples, u, index, strict=True):
             fitted = fit.summary(self.ranges, points_)
-            values = fit.values_of(self.ranges, test.u.values[log : log + 1])
+            values = fit.values_of(self.ranges, true_u[None])
             truth = np.array([values[str(name)][0] for name in fitted.quantity.values])
-            probability = fitted.probability.isel(object=self.ranges.object_of(np.array(log)))
+            probability = fitted.probability.isel(object=self.ranges.object_of(log))
             columns = {
                 "truth": ("quantity", truth),
                 "rank": ("quantity", (fitted["sample"].values < truth).mean(0)),
