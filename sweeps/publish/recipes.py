@@ -307,7 +307,12 @@ RECIPES: dict[str, Recipe] = {
     "robot": recipe(f"rps sweeps/speed/robot.py {_MACHINE}", cores=1),
     "dependencies": recipe(f"rps sweeps/publish/dependencies.py {_MACHINE}", cores=15),
     "extras": recipe(f"rps sweeps/publish/dependencies.py {_MACHINE}", cores=15),
-    "fit_*": recipe(f"rps sweeps/fit {_MACHINE}", f"rps sweeps/fit/bags.py {_MACHINE}", cores=20),
+    **dict.fromkeys(
+        ("fit_coverage", "fit_quantities", "fit_worth"),
+        recipe(f"rps sweeps/fit {_MACHINE}", cores=15),
+    ),
+    "fit_bags": recipe(f"rps sweeps/fit/bags.py {_MACHINE}", cores=5),
+    "fit_methods*": recipe(f"rps sweeps/fit/methods.py {_MACHINE}", cores=50, gpu=7),
     "export_*": recipe(
         f"rps sweeps/export --tables speed {_MACHINE}",
         f"rps sweeps/export --tables trials paper worlds bags odd {_MACHINE}",
