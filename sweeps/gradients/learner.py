@@ -1,9 +1,9 @@
 """Learn a law by gradients of short windows with a value function at their ends, as SHAC does.
 
 The worlds, the network, the rewards, the curriculum and the fit of the value function are those of
-`rps learn`. Its policy step is replaced: the discounted rewards of a window, with the value of its
-last state, are the score of an estimator of `rps_jax.tuning.gradients`, by the weights of the
-policy in each world. So evolution can be compared at equal scores.
+`rps learn`; contact is a weight. Its policy step is replaced: the discounted rewards of a window,
+with the value of its last state, are the score of an estimator of `rps_jax.tuning.gradients`, by
+the weights of the policy in each world. So evolution can be compared at equal scores.
 
     rps sweeps/gradients/learner.py --network mlp --width 23 --minutes 5 --out runs/windows
 
@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar
@@ -28,8 +28,9 @@ from jax.flatten_util import ravel_pytree
 from rps_jax import engines, errors
 from rps_jax.control.learned import network as networks
 from rps_jax.control.learned.network import Network, Weights
+from rps_jax.engines import native
 from rps_jax.record.options import option
-from rps_jax.runs.question import call_of
+from rps_jax.runs.question import Split, call_of
 from rps_jax.trials.env import PushEnv
 from rps_jax.trials.trial import World
 from rps_jax.tuning import gradients, ppo, rollout
@@ -53,8 +54,11 @@ class WindowLearner(Learn):
     """Estimator of the gradient: exact, clipped, bundled, evolution or mixed."""
     num_steps: int = option(16, 1, 1000, kw_only=True)
     """Number of actions of a window."""
-    actor_rate: float = option(2e-3, above=0, at_most=1, kw_only=True)
+    actor_rate: float = option(1e-3, above=0, at_most=1, kw_only=True)
     """Learning rate of the policy."""
+    approach: float = option(0.5, 0, kw_only=True)
+    """Cost of the distance between base and object at the end of a window [1/m]. Without it a
+    policy that has lost the object does not return: derivatives do not see a contact to come."""
     world_clip: float = option(2.0, above=0, kw_only=True)
     """Bound on the norm of the gradient of one world, for clipped, as a multiple of the median
     norm [1]."""
@@ -72,6 +76,11 @@ class WindowLearner(Learn):
         if self.estimator != "evolution":
             engine = engines.get(self.setting.engine)
             engine.check_derivatives("reverse", self.setting.physics)
+
+    def environments(self, split: Split = "tune") -> list[PushEnv]:
+        """Return the environments of a split; those to learn in have a smooth contact."""
+        envs = super().environments(split)
+        return [replace(env, smooth=True) for env in envs] if split == "tune" else envs
 
     @staticmethod
     def start(options: WindowLearner, *inputs: Any, seed: int = 0) -> RunnerState:
@@ -143,11 +152,14 @@ def window_scores(
         def step(batch: EnvBatch, _: None) -> tuple[EnvBatch, jax.Array]:
             inputs = rollout._inputs(env, batch)[0]
             hidden, mean = jax.vmap(network.apply)(weights, batch.memory.hidden, inputs)
-            return rollout.act(env, network, batch, hidden, mean)
+            return rollout.act(env, network, batch, hidden, mean, native.mapped)
 
         last, rewards = jax.lax.scan(step, worlds, length=options.num_steps)
         _, terminated = rollout._episode_stats(env, last)
+        qpos = last.states.data.qpos
+        distance = jnp.linalg.norm(qpos[:, 3:5] - qpos[:, :2], axis=1)
         value = networks.critic(critic, ppo.critic_inputs(*rollout._inputs(env, last)))
+        value -= options.approach * distance
         discounts = options.gamma ** jnp.arange(options.num_steps)
         end = options.gamma**options.num_steps * jnp.where(terminated, 0.0, value)
         return -(discounts @ rewards + end)
