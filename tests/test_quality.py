@@ -100,14 +100,21 @@ def test_a_learner_by_gradients_needs_derivatives():
             WindowLearner(**options).validate()
 
 
-def test_a_learning_curve_is_summed_up_by_hand():
-    columns = {"time": [30.0, 90.0, 180.0], "validation": [0.1, np.nan, 0.4], "level": [0.2] * 3}
+def test_learning_curves_are_summed_up_by_hand(tmp_path):
+    """The second racer was killed before its first checkpoint."""
+    columns = {"time": [30.0, 90.0, 180.0], "validation": [0.1, np.nan, 0.375], "level": [0.2] * 3}
     columns |= {"simulated": [1.0, 2.0, 3600.0]}
-    curve = xr.Dataset({k: ("update", x) for k, x in columns.items()}, attrs={"test_success": 0.3})
-    results = network.summary(curve).expand_dims(run=["ppo"])
-    assert network.table(results)[1] == [
-        *("ppo", "10.0 %", "10.0 %", "", "", "30.0 %", "20 %", "3.0", "3", "1 h"),
-    ]
+    curve = xr.Dataset({k: ("update", x) for k, x in columns.items()}, attrs={"test_success": 0.25})
+    curves = {"ppo": curve, "windows": network.read_curve(tmp_path)}
+    rows = [network.summary(x).assign(method=k, seed=1) for k, x in curves.items()]
+    results = xr.concat(rows, xr.IndexVariable("run", ["a", "b"]), join="outer")
+    results = results.assign_coords(time=list(network.TIMES))
+    assert network.table(results)[1:] == [
+        ["ppo", "1", "10.0 %", "10.0 %", "37.5 %", "", "", "25.0 % [20.9, 29.6]", "20 %",
+         "0.5 min", "3", "1 h"],
+        ["windows", "1", *[""] * 8, "0", "0 h"],
+    ]  # fmt: skip
+    network.figure_of(results)
 
 
 def test_a_cosine_without_a_sign_is_undecided():

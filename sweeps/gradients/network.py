@@ -1,14 +1,17 @@
-"""Compare learned networks: PPO, gradients of short windows, and evolution.
+"""Race three ways to learn a network: PPO, gradients of short windows, and evolution.
 
-The runs are those of `rps learn` and `learner.py`; the name of a row is that of its folder.
+Each racer is a run of `rps learn` or `learner.py` in a separate folder. It ends after some minutes
+of wall clock, with compilation, and is killed if it takes half a minute more; then its row has what
+it wrote. A second call continues the racers.
 
-    rps learn --network mlp --width 23 --minutes 10 --out runs/ppo
-    rps sweeps/gradients/learner.py --network mlp --width 23 --minutes 5 --out runs/windows
-    rps sweeps/gradients/network.py --folders runs/ppo runs/windows
+    rps sweeps/gradients/network.py --lanes 6 --gpus 3 --minutes 5
+
+Several racers run at once. They share a GPU equally if each has equally many.
 """
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -16,51 +19,106 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
+import pandas as pd
 import xarray as xr
 
-from rps_jax.analysis.figures.style import Figure, panel
+from rps_jax.analysis import tables
+from rps_jax.analysis.figures.style import Figure, tiles
 from rps_jax.analysis.report import Picture
-from rps_jax.errors import InputError
 from rps_jax.record import files
+from rps_jax.record.options import option
 from rps_jax.runs.question import Run, call_of
-from sweeps.study_base import Rows, Study, Table
+from rps_jax.world.physics import PHYSICS
+from sweeps.gradients.race import run_commands
+from sweeps.study_base import QuickStudy, Rows, Table, part_name, text_table
 
-TIMES = (1.0, 2.5, 5.0, 10.0)  # [min] of wall clock, with compilation and validation
+TIMES = (1.0, 2.0, 3.0, 4.0, 5.0)  # [min] of wall clock, with compilation and validation
+WORLDS = 3 * 128  # for validation, and as many for the test: of each object of `wide`
+_NETWORK = "--network mlp --width 23 --validation 128 --every 0.25"
+METHODS = {  # commands that are compared
+    "ppo": f"rps learn {_NETWORK}",
+    "windows": f"rps sweeps/gradients/learner.py {_NETWORK}",
+    "evolution": f"rps sweeps/gradients/learner.py {_NETWORK} --estimator evolution",
+}
+QUICK_SIZES = (
+    " --domain wide,objects=random_cylinder --num-envs 4 --num-steps 2 --num-minibatches 1"
+    " --drawn 4 --validation 2 --engine quasistatic --horizon 4 --updates 3"
+)
 
 
 @dataclass(frozen=True)
-class Networks(Study[xr.Dataset]):
-    """Compare learned networks: PPO, gradients of short windows, and evolution.
+class Networks(QuickStudy[xr.Dataset]):
+    """Race three ways to learn a network: PPO, gradients of short windows, and evolution.
 
     The answer has the best `validation` [1] up to each time (run, time), and the `test` (run).
     """
 
     TITLE: ClassVar[str] = "Networks learned by several methods"
+    CHOICES: ClassVar = {"methods": METHODS}
+    QUICK: ClassVar[Mapping[str, Any]] = {"seeds": (1,)}
+    PRESETS: ClassVar = {"physics": PHYSICS["default"], "domains": ("wide",)}
+    IGNORED_FIELDS: ClassVar[tuple[str, ...]] = ("minutes", "lanes", "gpus")
 
-    folders: tuple[str, ...] = ("runs/ppo", "runs/windows", "runs/evolution")
-    """Folders of finished runs."""
+    methods: tuple[str, ...] = tuple(METHODS)
+    """ppo, windows (derivatives of windows with a value function at their ends) or evolution
+    (slopes of the same windows along antithetic random steps of the weights)."""
+    seeds: tuple[int, ...] = (1, 2)
+    """Seeds of the racers."""
+    minutes: float = option(5.0, above=0, at_most=1e4, unit="min")
+    """Wall clock of each racer [min], with compilation, validation and test."""
+    lanes: int = option(1, 1, 64)
+    """Number of racers that run at once."""
+    gpus: int = option(0, 0, 8)
+    """Number of GPUs for the racers; 0 leaves the choice to them."""
+    folders: tuple[str, ...] = ()
+    """Folders of runs that are read instead of a race."""
+    out: Path | str | None = "runs/networks"
+    """Run folder; the racers have folders there."""
 
-    def check(self) -> None:
-        super().check()
-        if not self.folders:
-            raise InputError("folders = () is not allowed: name a run.")
+    def configuration(self) -> dict[str, Any]:
+        """Return all inputs of the answer, with the commands of the racers."""
+        commands = {name: METHODS[name] for name in self.methods}
+        return super().configuration() | {"commands": commands}
 
     def answer(self, run: Run) -> xr.Dataset:
-        """Read the runs."""
-        curves = {Path(folder).name: files.read_results(Path(folder)) for folder in self.folders}
-        columns = [summary(curve) for curve in curves.values()]
-        results = xr.concat(columns, xr.IndexVariable("run", list(curves)), join="outer")
-        return results.assign_coords(time=list(TIMES))
+        """Run the racers, and read their learning curves."""
+        folders: dict[tuple[str, float], Path]
+        if self.folders:
+            folders = {(Path(folder).name, np.nan): Path(folder) for folder in self.folders}
+        else:
+            assert run.folder is not None
+            labels = [(m, s) for s, m in itertools.product(self.seeds, self.methods)]
+            folders = {label: run.folder / part_name(*label) for label in labels}
+            sizes = f"{QUICK_SIZES if self.quick else ''} --minutes {self.minutes:g}"
+            commands = {folders[m, s]: f"{METHODS[m]}{sizes} --seed {s}" for m, s in labels}
+            run_commands(commands, self.minutes + 0.5, self.lanes, self.gpus)
+        rows = [
+            summary(read_curve(folder)).assign(method=method, seed=seed)
+            for (method, seed), folder in folders.items()
+        ]
+        names = xr.IndexVariable("run", [folder.name for folder in folders.values()])
+        return xr.concat(rows, names, join="outer").assign_coords(time=list(TIMES))
 
     def report_tables(self, results: xr.Dataset) -> Sequence[Table]:
         """Return the success by time."""
         picture = Picture("networks", partial(figure_of, results))
+        rows = table(results, tested=not self.quick)
         return [
-            Table(table(results), name="gradients_network", title="Success", picture=picture),
+            Table(rows, merge="method", name="gradients_network", title="Success", picture=picture)
         ]
 
 
 networks = call_of(Networks)
+
+
+def read_curve(folder: Path) -> xr.Dataset:
+    """Return the learning curve of a run folder; of a killed run, that of its last checkpoint."""
+    if (folder / "results.nc").exists():
+        return files.read_results(folder)
+    if (folder / "curve.csv").exists():
+        return pd.read_csv(folder / "curve.csv", index_col="update").to_xarray()
+    columns = dict.fromkeys(("time", "validation", "level", "simulated"), np.zeros(0))
+    return pd.DataFrame(columns, pd.RangeIndex(0, name="update")).to_xarray()
 
 
 def summary(curve: xr.Dataset) -> xr.Dataset:
@@ -69,56 +127,59 @@ def summary(curve: xr.Dataset) -> xr.Dataset:
     known = np.isfinite(validation)
     best = [np.max(validation[known & (minutes <= t)], initial=-np.inf) for t in TIMES]
     best = [
-        x if t <= minutes[-1] * 1.05 and x >= 0 else np.nan
+        x if t <= np.max(minutes, initial=0) * 1.05 and x >= 0 else np.nan
         for t, x in zip(TIMES, best, strict=True)
     ]
     scalars: Mapping[str, Any] = {
         "test": curve.attrs.get("test_success", np.nan),
-        "level": float(curve.level[-1]),
         "updates": float(curve.sizes["update"]),
-        "minutes": float(minutes[-1]),
-        "simulated": float(curve.simulated[-1]),
+        "first": minutes[0] if minutes.size else np.nan,
+        "simulated": np.max(curve.simulated.values, initial=0),
     }
     return xr.Dataset(
         {
             "validation": ("time", best),
             "at": ("check", minutes[known]),
             "success": ("check", validation[known]),
+            "minutes": ("update", minutes),
+            "level": ("update", curve.level.values),
             **{name: ((), value) for name, value in scalars.items()},
         },
-        {"check": np.arange(known.sum())},
+        {"check": np.arange(known.sum()), "update": np.arange(len(minutes))},
     )
 
 
-def table(results: xr.Dataset) -> Rows:
-    """Return a header and a row per run."""
-    times = [f"validation, {t:g} min" for t in TIMES]
-    rows = [["run", *times, "test", "curriculum", "minutes", "updates", "simulated"]]
-
-    def rate(x: float) -> str:
-        return "" if np.isnan(x) else f"{100 * x:.1f} %"
-
-    for name in map(str, results.run.values):
+def table(results: xr.Dataset, tested: bool = True) -> Rows:
+    """Return a header and a row per racer; intervals of tests, unless they had few worlds."""
+    columns = {"method": "{method}", "seed": "{seed:.0f}"}
+    columns |= {f"validation, {t:g} min": f"{{v{t:g}:.1f}} %" for t in TIMES}
+    columns |= {"test": "{share}", "curriculum": "{level:.0f} %", "first update": "{first:.1f} min"}
+    columns |= {"updates": "{updates:,.0f}", "simulated": "{hours:,.0f} h"}
+    rows: list[dict[str, Any]] = []
+    for name in results.run.values:
         row = results.sel(run=name)
-        rows.append(
-            [
-                name,
-                *map(rate, row.validation.values),
-                rate(float(row.test)),
-                f"{100 * float(row.level):.0f} %",
-                f"{float(row.minutes):.1f}",
-                f"{float(row.updates):,.0f}",
-                f"{float(row.simulated) / 3600:,.0f} h",
-            ]
-        )
-    return rows
+        scalars = {key: row[key].item() for key in ("method", "seed", "first", "updates", "test")}
+        validation = {f"v{t:g}": 100 * float(x) for t, x in row.validation.to_series().items()}
+        counts = round(np.nan_to_num(scalars["test"]) * WORLDS), WORLDS if tested else 0
+        share = tables.share(*counts) if np.isfinite(scalars["test"]) else ""
+        hours, level = float(row.simulated) / 3600, 100 * float(row.level.max())
+        rows.append(scalars | validation | {"share": share, "hours": hours, "level": level})
+    return text_table(columns, rows)
 
 
 def figure_of(results: xr.Dataset) -> Figure:
-    """Draw the success in validation against the wall clock."""
-    figure, ax = panel((6, 3.5), "wall clock, with compilation [min]", "success in validation [%]")
-    for name in map(str, results.run.values):
-        row = results.sel(run=name)
-        ax.plot(row.at, 100 * row.success, "o-", ms=3, label=name)
-    ax.legend(fontsize=8)
+    """Draw the success in validation and the level of the curriculum against the wall clock."""
+    figure, axes = tiles(2, 2, (4.5, 3.2), (0, 0))
+    methods = [str(x) for x in results.method.values]
+    for i, method in enumerate(methods):
+        row = results.isel(run=i)
+        label = None if method in methods[:i] else method
+        style = {"color": f"C{sorted(set(methods)).index(method)}", "label": label}
+        axes[0, 0].plot(row.at, 100 * row.success, "o-", ms=3, **style)
+        axes[0, 1].plot(row.minutes, 100 * row.level, **style)
+    labels = "success in validation [%]", "level of the curriculum [%]"
+    for ax, label in zip(axes[0], labels, strict=True):
+        ax.set(xlabel="wall clock, with compilation [min]", ylabel=label, ylim=(-3, 103))
+        ax.grid(alpha=0.3)
+        ax.legend(fontsize=8)
     return figure

@@ -107,29 +107,16 @@ class Race(Study[xr.Dataset], SimulationQuestion[xr.Dataset]):
             (m, n, s): f"{METHODS[m]} --tuned {COUNTS[n]} --seed {s}{sizes}" for m, n, s in labels
         }
 
-    def tune(self, index: int, command: str, folder: Path) -> None:
-        """Run or continue a tuning until its time is up."""
-        environment = dict(os.environ, XLA_PYTHON_CLIENT_PREALLOCATE="false")
-        if self.gpus:
-            environment["CUDA_VISIBLE_DEVICES"] = str(index % self.gpus)
-        program = [sys.executable, "-m", "rps_jax", *shlex.split(command)[1:], "--out", str(folder)]
-        with open(folder.with_suffix(".log"), "a", encoding="utf-8") as log:
-            process = subprocess.Popen(program, env=environment, stdout=log, stderr=log)
-            try:
-                process.wait(60 * self.minutes)
-            except subprocess.TimeoutExpired:
-                process.kill()
-                process.wait()
-
     def answer(self, run: Run) -> xr.Dataset:
         """Run the tunings that lack a test, and test all."""
         assert run.folder is not None
-        folders = {label: run.folder / part_name(*label) for label in self.tunings()}
         stored = () if run.checkpoints is None else run.checkpoints.paths()
-        with ThreadPoolExecutor(self.lanes) as pool:
-            for index, (label, command) in enumerate(self.tunings().items()):
-                if part_name(*label) not in stored:
-                    pool.submit(self.tune, index, command, folders[label])
+        commands = {
+            run.folder / part_name(*label): command
+            for label, command in self.tunings().items()
+            if part_name(*label) not in stored
+        }
+        run_commands(commands, self.minutes, self.lanes, self.gpus)
         return super().answer(run)
 
     def parts(self, run: Run) -> Mapping[Any, Callable[[], xr.Dataset]]:
@@ -177,6 +164,32 @@ class Race(Study[xr.Dataset], SimulationQuestion[xr.Dataset]):
 
 
 race = call_of(Race)
+
+
+def run_commands(commands: Mapping[Path, str], minutes: float, lanes: int, gpus: int) -> None:
+    """Run or continue the command of each folder until it ends or its time is up.
+
+    So many `lanes` run at once. They take turns at the GPUs; with 0 GPUs they choose themselves.
+    Each writes to the folder and to a log beside it.
+    """
+
+    def run(index: int, folder: Path) -> None:
+        environment = dict(os.environ, XLA_PYTHON_CLIENT_PREALLOCATE="false")
+        if gpus:
+            environment["CUDA_VISIBLE_DEVICES"] = str(index % gpus)
+        words = shlex.split(commands[folder])[1:]
+        program = [sys.executable, "-m", "rps_jax", *words, "--out", str(folder)]
+        with open(folder.with_suffix(".log"), "a", encoding="utf-8") as log:
+            process = subprocess.Popen(program, env=environment, stdout=log, stderr=log)
+            try:
+                process.wait(60 * minutes)
+            except subprocess.TimeoutExpired:
+                process.kill()
+                process.wait()
+
+    with ThreadPoolExecutor(lanes) as pool:
+        for future in [pool.submit(run, *item) for item in enumerate(commands)]:
+            future.result()
 
 
 def spent(curve: pd.DataFrame, budget: str) -> pd.Series:
