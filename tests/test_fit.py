@@ -21,6 +21,8 @@ from rps_jax.tuning import fit, least_squares, logs, posterior
 from rps_jax.world import domain as domains
 from rps_jax.world import points
 from sweeps.fit import bags, methods
+from sweeps.real_pushes import fit as real
+from sweeps.real_pushes import problem
 
 SHELL = Robot().shell
 
@@ -500,3 +502,34 @@ def test_both_methods_return_the_same_variables(object_log, monkeypatch, compile
     assert "mass has almost no influence" in text
     assert "invalid" not in text
     assert not compiled
+
+
+# --- real pushes ---------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def cells():
+    """Return the cells of real pushes, with six pushes of each half."""
+    return {label: problem.Cell.of(rows) for label, rows in real.Real(few=6).tables.items()}
+
+
+@pytest.mark.parametrize("group", ["point, three feet", "two-point, three feet", "two-point, flat"])
+def test_derivatives_of_real_pushes_are_those_of_differences(group, cells):
+    """The bound holds for turns, too, whose ends hardly depend on the centre of pressure."""
+    cell = next(cell for name, cell in cells.items() if name.startswith(group))
+    theta, step = np.array([0.42, 0.3, 0.003, -0.002]), np.diag([1e-5, 1e-5, 1e-6, 1e-6])
+    high, low = np.split(cell.residuals(cell.simulate(np.r_[theta + step, theta - step])[0]), 2)
+    differences = np.moveaxis(high - low, 0, -1) / (2 * step.sum(axis=0))
+    error = np.linalg.norm(cell.derivatives(theta) - differences, axis=(1, 2))
+    error /= np.maximum(1, np.linalg.norm(differences, axis=(1, 2)))
+    assert np.median(error) < 2e-3
+    assert error.max() < 0.03  # the tolerance of the force balance, which differences amplify
+
+
+@pytest.mark.parametrize("method", ["least squares", "CMA-ES"])
+def test_methods_recover_the_world_of_simulated_pushes(method, cells):
+    cell, theta = next(iter(cells.values())), np.array([0.42, 0.3, 0.004, -0.003])
+    cell = cell._replace(measured=cell.simulate(theta[None])[0][0])
+    fitted = real.METHODS[method](cell, 32)
+    assert (abs(fitted.theta - theta) < [0.05, 0.01, 0.003, 0.003]).all()
+    assert (np.diag(fitted.covariance) < (problem.HIGH - problem.LOW) ** 2 / 12).all()

@@ -26,8 +26,8 @@ import numpy as np
 from rps_jax.errors import InputError
 from rps_jax.geometry.solid import mean_arm, rotate, supported_load
 
-_SLIP = 1e-3  # slip, as a share of a step, above which friction is dry
-_SINK = 1e-4  # penetration of a finger under mu m g, as a share of a step
+SLIP = 1e-3  # slip, as a share of a step, above which friction is dry
+SINK = 1e-4  # penetration of a finger under mu m g, as a share of a step
 _BALANCED = 1e-5  # [mu m g] tolerance of the force balance
 _MAX_ITERATIONS = 500  # of Newton's method; a few suffice for most steps
 _STEP_SIZES = 0.1 ** np.arange(10)  # of the line search
@@ -84,14 +84,14 @@ def push(
 
     Args:
       outline: corners (N, 2) [m] of a convex polygon, counter-clockwise, body frame.
-      com: centre of mass (2,) [m], body frame.
+      com: centre of mass (2,) or (B, 2) [m], body frame.
       ground: support of the objects.
       paths: paths of F fingers (T + 1, B, F, 2) [m], world; a missing finger is far away.
       pose: of the body frame at the start (B, 3) [m, m, rad], world.
       friction: between object and fingers (B,) [1].
     """
     pose = np.array(pose, float)
-    unit = np.linalg.norm(outline - com, axis=1).mean() / 2  # [m] length scale of rotations
+    unit = np.linalg.norm(outline - com[..., None, :], axis=-1).mean() / 2  # [m] of rotations
     twist, force = np.zeros_like(pose), np.zeros((len(pose), 2))
     poses, forces = [pose], []
     for start, end in itertools.pairwise(paths):
@@ -164,29 +164,29 @@ def _with_moment(direction: np.ndarray, r: np.ndarray) -> np.ndarray:
 def _slide(step: _Step, twist: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return sliding (..., B, S, 3) on the ground, and its smoothed size."""
     slid = np.einsum("bsij,...bj->...bsi", step.slide, twist)
-    return slid, np.sqrt(np.sum(slid * slid, axis=-1) + _SLIP * _SLIP)
+    return slid, np.sqrt(np.sum(slid * slid, axis=-1) + SLIP * SLIP)
 
 
 def _contact(step: _Step, twist: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return gap, slip and smoothed slip (..., B, F), in units of the step length."""
     v_t = np.einsum("bfi,...bi->...bf", step.a_t, twist) - step.d_t
-    size = np.sqrt(v_t * v_t + _SLIP * _SLIP)
+    size = np.sqrt(v_t * v_t + SLIP * SLIP)
     v_n = np.einsum("bfi,...bi->...bf", step.a_n, twist) - step.d_n
-    return step.gap + v_n - step.friction * (size - _SLIP), v_t, size
+    return step.gap + v_n - step.friction * (size - SLIP), v_t, size
 
 
 def _forces(step: _Step, twist: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return normal and friction forces (B, F) [mu m g] of the fingers on the objects."""
     gap, v_t, size = _contact(step, twist)
-    pushing = np.maximum(-gap, 0.0) / _SINK
+    pushing = np.maximum(-gap, 0.0) / SINK
     return pushing, -step.friction * pushing * v_t / size
 
 
 def _power(step: _Step, twist: np.ndarray) -> np.ndarray:
     """Return the power (..., B) [mu m g] of friction and penetration."""
     inside = np.maximum(-_contact(step, twist)[0], 0.0)
-    dissipated = np.sum(step.load * (_slide(step, twist)[1] - _SLIP), axis=-1)
-    return dissipated + np.sum(inside * inside, axis=-1) / (2 * _SINK)
+    dissipated = np.sum(step.load * (_slide(step, twist)[1] - SLIP), axis=-1)
+    return dissipated + np.sum(inside * inside, axis=-1) / (2 * SINK)
 
 
 def _derivatives(step: _Step, twist: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -196,14 +196,14 @@ def _derivatives(step: _Step, twist: np.ndarray) -> tuple[np.ndarray, np.ndarray
     pull = np.einsum("bsi,bsij->bsj", slid / size[..., None], step.slide)
     less = _squares(per, pull)
     gap, v_t, size = _contact(step, twist)
-    pushing = np.maximum(-gap, 0.0) / _SINK
+    pushing = np.maximum(-gap, 0.0) / SINK
     push = step.a_n - (step.friction * v_t / size)[..., None] * step.a_t
     gradient = np.einsum("bs,bsj->bj", step.load, pull) - np.einsum("bf,bfj->bj", pushing, push)
     hessian = _squares(np.repeat(per, 3, axis=1), rows) - less + 1e-7 * np.eye(3)
-    hessian += _squares((gap < 0) / _SINK, push)
-    hessian += _squares(pushing * step.friction * _SLIP**2 / size**3, step.a_t)
+    hessian += _squares((gap < 0) / SINK, push)
+    hessian += _squares(pushing * step.friction * SLIP**2 / size**3, step.a_t)
     # contacts that may close in the step
-    return gradient, hessian, less + _squares(((gap >= 0) & (gap < _NEAR)) / _SINK, push)
+    return gradient, hessian, less + _squares(((gap >= 0) & (gap < _NEAR)) / SINK, push)
 
 
 def _squares(weight: np.ndarray, rows: np.ndarray) -> np.ndarray:
