@@ -88,7 +88,7 @@ def body(model: mujoco.MjModel, vertices: np.ndarray) -> Body:
         friction_robot=friction["base"],
         invweight=model.body_invweight0[object_body.id, 0],
         base_invweight=model.body_invweight0[base.id, 0],
-        base_half=front.size[:2].copy(),
+        base_size=front.size[:2].copy(),
         base_z=front.pos[2] + front.size[2] * np.array([-1.0, 1.0]),
     )
 

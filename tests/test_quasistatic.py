@@ -493,7 +493,7 @@ def test_every_scene_has_a_slider(name):
     stage, slider = staged("quasistatic", [loaded], preset(), base)
     assert isinstance(stage, Quasistatic)
     np.testing.assert_allclose(slider.friction_robot, [0.4])
-    np.testing.assert_allclose(slider.base_half, [[0.3, SIDE]])
+    np.testing.assert_allclose(slider.base_size, [[0.3, SIDE]])
     com = loaded.physics.body("object").ipos[:2]
     np.testing.assert_allclose(slider.p_object_com[0], com, atol=1e-5)
 

@@ -153,19 +153,19 @@ def _add_taxels(world: Any, name: str, shell: Shell) -> Any:
     depth, height, z = _TAXEL
     quarters = np.asarray(shell.taxels(2))  # (T, 2, 2) [m] at 1/4 and 3/4 of each taxel
     along = 2 * (quarters[:, 1] - quarters[:, 0])
-    inward = np.stack([along[:, 1], -along[:, 0]], axis=-1)  # the strip runs clockwise
-    inward /= np.linalg.norm(along, axis=-1, keepdims=True)
+    lengths = np.linalg.norm(along, axis=-1)
+    inward = np.stack([along[:, 1], -along[:, 0]], axis=-1) / lengths[:, None]  # runs clockwise
     middles = quarters.mean(axis=1) + (depth / 2 - 0.004) * inward
     centers = np.column_stack([middles, np.full(len(middles), z)])
-    sizes = 0.92 * np.abs(along) + depth * np.abs(inward)
+    half, zero = np.arctan2(along[:, 1], along[:, 0]) / 2, 0 * lengths
     box = _solid_of(mujoco.mjtGeom.mjGEOM_BOX, np.full(3, 0.5))
     return world.add_batched_meshes_simple(
         name,
         np.asarray(box.vertices),
         np.asarray(box.faces),
-        batched_wxyzs=np.tile([1.0, 0.0, 0.0, 0.0], (len(centers), 1)),
+        batched_wxyzs=np.stack([np.cos(half), zero, zero, np.sin(half)], axis=-1),
         batched_positions=centers,
-        batched_scales=np.column_stack([sizes, np.full(len(centers), height)]),
+        batched_scales=np.stack([0.92 * lengths, depth + zero, height + zero], axis=-1),
         batched_colors=np.tile(_SKIN, (len(centers), 1)).astype(np.uint8),
         flat_shading=True,
         lod="off",

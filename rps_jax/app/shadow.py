@@ -17,7 +17,7 @@ from rps_jax import errors
 from rps_jax.analysis.report import Section
 from rps_jax.control import registry, validation
 from rps_jax.control.base import Law, LawParams
-from rps_jax.control.observation import Twist
+from rps_jax.control.observation import Twist, on_base
 from rps_jax.errors import InputError
 from rps_jax.geometry import planar
 from rps_jax.geometry.polyline import Polyline
@@ -77,7 +77,8 @@ class Shadow(BagQuestion[xr.Dataset]):
             recorded |= {"target": pursued(recorded, self.lookahead)}
         motion = (recorded[name] for name in ("time", "pose", "twist"))
         doubts = "; it ".join(motion_faults(*motion))  # the base may follow other commands
-        twists = shadowed(registry.law_of(self.params), self.params, recorded)
+        law = registry.law_of(self.params)
+        twists = shadowed(law, self.params, recorded, shell.radius)
         both = np.stack([recorded["twist"], twists])
         pairs = zip(COLUMNS["twist"].items(), np.moveaxis(both, -1, 0), strict=True)
         columns = {name: (("source", "time"), x, {"units": unit}) for (name, unit), x in pairs}
@@ -135,8 +136,15 @@ def pursued(recorded: dict[str, np.ndarray], lookahead: float) -> np.ndarray:
     return np.asarray(aims.p_world_target)
 
 
-def shadowed(law: Law, params: LawParams, recorded: dict[str, np.ndarray]) -> np.ndarray:
+def shadowed(
+    law: Law,
+    params: LawParams,
+    recorded: dict[str, np.ndarray],
+    base_radius: float | None = None,
+) -> np.ndarray:
     """Return the twists (N, 3) [m/s, m/s, rad/s] of a law for the observations of a bag.
+
+    The `base_radius` [m] is that of a round base.
 
     A law that observes its last twist gets the recorded one, which moved the base. Rounding errors
     therefore do not grow from step to step.
@@ -161,7 +169,7 @@ def shadowed(law: Law, params: LawParams, recorded: dict[str, np.ndarray]) -> np
     @jax.jit
     def run(params: LawParams, observations: Any) -> jax.Array:
         def step(state: Any, row: Any) -> Any:
-            obs, last = row
+            obs, last = on_base(row[0], base_radius), row[1]
             if law.observe_sent is not None:
                 state = law.observe_sent(params, state, obs, Twist(*last))
             state, twist, _ = law.step(params, state, obs)

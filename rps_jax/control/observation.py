@@ -5,7 +5,7 @@ Frames: W is the world, R the robot (origin at the centre of the base, x forward
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import jax.numpy as jnp
 
@@ -25,6 +25,14 @@ class Observation(NamedTuple):
     in_contact: Bool[Array, ""] | Float[Array, ""]  # for a smooth law also a weight from 0 to 1
     p_world_target: Float[Array, "2"]  # [m]
     period: Scalar = 0.02  # [s] since the last control step
+    base_radius: Scalar | None = None  # [m] of a round base; None: a rectangle
+
+    @property
+    def l(self) -> Float[Array, "*B"]:  # noqa: E743
+        """Contact offset [m] to the left: p^R_C,y, or the arc length from a round base's front."""
+        if self.base_radius is None:
+            return self.p_robot_contact[..., 1]
+        return self.base_radius * planar.direction(self.p_robot_contact)
 
 
 class TaxelObservation(NamedTuple):
@@ -51,6 +59,16 @@ class PoseObservation(NamedTuple):
 
 
 AnyObservation = Observation | TaxelObservation | ForceObservation | PoseObservation
+
+
+Observed = TypeVar("Observed", bound=AnyObservation)
+
+
+def on_base(obs: Observed, radius: Scalar | None) -> Observed:
+    """Return an observation on a round base of a radius [m]; None: on a rectangular one."""
+    if isinstance(obs, Observation):
+        return obs._replace(base_radius=radius)
+    return obs._replace(touch=obs.touch._replace(base_radius=radius))
 
 
 class Twist(NamedTuple):
@@ -96,7 +114,7 @@ class Details(NamedTuple):
         """Return the details of a law without adaptive rate and steering angle (both are 0)."""
         distance = planar.norm(displacement(obs))
         zero = jnp.zeros_like(distance)
-        return cls(obs.p_robot_contact[..., 1], distance, zero, zero, zero > 0)
+        return cls(obs.l, distance, zero, zero, zero > 0)
 
 
 def displacement(obs: Observation) -> Float[Array, "2"]:

@@ -41,6 +41,7 @@ with contextlib.redirect_stdout(io.StringIO()):  # MJX reports on the console th
     from mujoco.mjx._src.collision_types import Collision, GeomInfo
     from mujoco.mjx._src.types import Data, GeomType, Model
 
+_BASE, _OBJECT = 1, 2  # bodies of the stripped models
 _UPRIGHT = 1e-6  # [rad] tilt below which all points of the rim are equally low
 
 
@@ -66,33 +67,38 @@ def plane_cylinder(plane: GeomInfo, cylinder: GeomInfo) -> tuple[jax.Array, jax.
     return distance, points - 0.5 * distance[:, None] * n, frames
 
 
-def _box_box(model: Model, data: Data, *_: object) -> Collision:
-    """Return distances (4,), points (4, 3) and frames (4, 3, 3) [m] of base and upright box."""
-    base, box = map(int, np.flatnonzero(model.geom_type == GeomType.BOX))
+def _geoms(model: Model, body: int, kind: GeomType) -> np.ndarray:
+    """Return the geoms of a kind of a body."""
+    return np.flatnonzero((model.geom_bodyid == body) & (model.geom_type == kind))
+
+
+def _base_box(model: Model, data: Data, *_: object) -> Collision:
+    """Return distances (C,), points (C, 3) and frames (C, 3, 3) [m] of base and upright box."""
+    box = int(_geoms(model, _OBJECT, GeomType.BOX)[0])
     signs = np.array([[1, 1, -1], [-1, 1, -1], [-1, -1, -1], [1, -1, -1]])
-    return upright(model, data, base, box, model.geom_size[box] * signs)
+    return upright(model, data, box, model.geom_size[box] * signs)
 
 
-def _box_prism(
+def _base_prism(
     model: Model, data: Data, key: object, geom: object, outline: jax.Array | None = None
 ) -> Collision:
-    """Return distances (4,), points (4, 3) and frames (4, 3, 3) [m] of base and upright prism."""
-    base, prism, feet = (
-        np.flatnonzero(model.geom_type == kind)
-        for kind in (GeomType.BOX, GeomType.MESH, GeomType.SPHERE)
-    )
+    """Return distances (C,), points (C, 3) and frames (C, 3, 3) [m] of base and upright prism."""
+    prism, feet = (_geoms(model, _OBJECT, kind) for kind in (GeomType.MESH, GeomType.SPHERE))
     corners = model.geom_pos[feet]
     if outline is not None:
         corners = jnp.concatenate([outline, corners[:, 2:]], axis=1)
-    return upright(model, data, base[0], prism[0], corners)
+    return upright(model, data, prism[0], corners)
 
 
-def upright(model: Model, data: Data, base: int, prism: int, corners: jax.Array) -> Collision:
-    """Return distances (4,), points (4, 3) and frames (4, 3, 3) [m] of a box and an upright prism.
+def upright(model: Model, data: Data, prism: int, corners: jax.Array) -> Collision:
+    """Return distances (C,), points (C, 3) and frames (C, 3, 3) [m] of base and upright prism.
 
-    `base` and `prism` are geoms; `corners` (N, 3) [m] are those of the prism in its body.
+    `prism` is a geom; `corners` (N, 3) [m] are those of the prism in its body. The base is a box,
+    with four points, or the two spheres of a round base.
     """
-    body, half = model.geom_bodyid[prism], model.geom_size[base]
+    body, spheres = model.geom_bodyid[prism], _geoms(model, _BASE, GeomType.SPHERE)
+    base = int(np.flatnonzero(model.geom_bodyid == _BASE)[0])
+    half = model.geom_size[base]
     lower = -jnp.abs(corners[:, 2])
     turn = data.geom_xmat[base][:2, 0]
     middle = data.geom_xpos[base]
@@ -100,8 +106,10 @@ def upright(model: Model, data: Data, base: int, prism: int, corners: jax.Array)
         vertices=Corners.of((corners[:, 0], corners[:, 1], lower)),
         height=-2 * lower[0],
         up=vectors.Z,
-        base_half=half[:2],
-        base_z=middle[2] + jnp.array([-1.0, 1.0]) * half[2],
+        base_size=half[:1] if spheres.size else half[:2],
+        base_z=data.geom_xpos[spheres, 2]
+        if spheres.size
+        else middle[2] + jnp.array([-1.0, 1.0]) * half[2],
     )
     state: Any = SimpleNamespace(base=middle, p=data.xpos[body])
     m: Any = [tuple(row) for row in data.xmat[body]]
@@ -112,15 +120,21 @@ def upright(model: Model, data: Data, base: int, prism: int, corners: jax.Array)
     position = middle[:2] + jnp.stack(point, axis=-1) @ back
     zero, unit = jnp.zeros_like(n[0]), jnp.ones_like(n[0])
     frame = jnp.stack([n[0], n[1], zero, -n[1], n[0], zero, zero, zero, unit]).reshape(3, 3)
-    return distance, jnp.concatenate([position, z[:, None]], axis=-1), jnp.stack([frame] * 4)
+    return (
+        distance,
+        jnp.concatenate([position, z[:, None]], axis=-1),
+        jnp.stack([frame] * len(distance)),
+    )
 
 
 Pair = tuple[GeomType, GeomType]
 # Each has the number of points of MJX's collider of the pair, for which `Data` has space.
 COLLIDERS: dict[Pair, Any] = {
     (GeomType.PLANE, GeomType.CYLINDER): plane_cylinder,
-    (GeomType.BOX, GeomType.BOX): _box_box,
-    (GeomType.BOX, GeomType.MESH): _box_prism,
+    (GeomType.BOX, GeomType.BOX): _base_box,
+    (GeomType.BOX, GeomType.MESH): _base_prism,
+    (GeomType.SPHERE, GeomType.BOX): _base_box,
+    (GeomType.SPHERE, GeomType.MESH): _base_prism,
 }
 
 
@@ -134,8 +148,8 @@ def collision(model: Model, data: Data, outline: jax.Array | None = None) -> Dat
         pair: Any = key.types
         default = collision_driver._COLLISION_FUNC[pair]
         collide = COLLIDERS.get(pair, default)
-        if collide is _box_prism:
-            collide = partial(_box_prism, outline=outline)
+        if collide is _base_prism:
+            collide = partial(_base_prism, outline=outline)
         distance, point, frame = collide(model, data, key, contact.geom)
         count = default.ncon
         contact = jax.tree.map(lambda x, n=count: jnp.repeat(x, n, axis=0), contact)

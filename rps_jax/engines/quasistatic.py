@@ -28,7 +28,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from rps_jax.engines.base import ControlPeriod, Driven, Engine, Motion
-from rps_jax.engines.fused.contacts import Point, circle_and_rectangle, polygon_and_rectangle
+from rps_jax.engines.fused.contacts import Point, circle_and_base, polygon_and_base
 from rps_jax.geometry import planar, solid
 from rps_jax.geometry import vectors as sp
 from rps_jax.geometry.arrays import Entries, Number
@@ -50,7 +50,7 @@ class Slider(NamedTuple):
     p_object_com: Entries  # (2,) [m] centre of mass and of friction, in the object's frame
     arm: Number  # () [m] c = m_max / f_max of the friction with the ground
     friction_robot: Number  # () [1]
-    base_half: Entries  # (2,) [m] half length and width of the base
+    base_size: Entries  # (2,) [m] half length and width of the base, or (1,) its radius
     vertices: Entries  # (N, 2) [m] of the outline, counter-clockwise, in the object's frame
     radius: Number  # () [m] of the outline
 
@@ -89,7 +89,7 @@ class Quasistatic(NamedTuple):
         p = free[:, :2] + planar.rotate(yaw, com)
         # The batch axis comes last, as in `contacts`.
         corners = jnp.moveaxis(fields.vertices - com[:, None], (0, 1), (2, 1))
-        sliders = fields._replace(base_half=tuple(fields.base_half.T), vertices=tuple(corners))
+        sliders = fields._replace(base_size=tuple(fields.base_size.T), vertices=tuple(corners))
         poses = (tuple(qpos[:, JOINTS.base].T), (*p.T, yaw))
         twist = (period.twists.v_x, period.twists.v_y, period.twists.omega)
         step = partial(_step, sliders, twist, physics.timestep)
@@ -117,7 +117,7 @@ def _step(slider: Slider, twist: Vec, dt: float, poses: tuple[Vec, Vec]) -> tupl
     offset = (pushed[0] - base[0], pushed[1] - base[1])
     p = (c * offset[0] + s * offset[1], c * offset[1] - s * offset[0])
     v_x, v_y, omega = twist
-    reach = sp.dot(slider.base_half, slider.base_half)
+    reach = sp.dot(slider.base_size, slider.base_size)
     problem = Problem(
         _contacts(slider, (*p, pushed[2] - base[2]), twist),
         jnp.sqrt(v_x * v_x + v_y * v_y + reach * omega * omega + _MIN_SPEED**2),
@@ -184,13 +184,13 @@ def _contacts(slider: Slider, pose: Vec, twist: Vec) -> list[Contact]:
     c, s = jnp.cos(yaw), jnp.sin(yaw)
     x, y = slider.vertices  # (N, ...) each, from the centre of mass
     corners = (p_x + c * x - s * y, p_y + s * x + c * y)
-    radius, half = slider.radius, slider.base_half
+    radius, size = slider.radius, slider.base_size
     if x.shape[0] == 1:
-        normal, point, gap = circle_and_rectangle((corners[0][0], corners[1][0]), radius, half)
+        normal, point, gap = circle_and_base((corners[0][0], corners[1][0]), radius, size)
         points, gaps = [point], [gap]
     else:
         ahead = (jnp.roll(corners[0], -1, axis=0), jnp.roll(corners[1], -1, axis=0))
-        normal, middles, gaps = polygon_and_rectangle(corners, ahead, half)
+        normal, middles, gaps = polygon_and_base(corners, ahead, size)
         gaps = [gap - radius for gap in gaps]
         off = 0.5 * radius
         points = [(q[0] - off * normal[0], q[1] - off * normal[1]) for q in middles]
@@ -248,7 +248,7 @@ class QuasistaticEngine(Engine):
             p_object_com=solids.p_object_com[:, :2],
             arm=solid.friction_arm(solids),
             friction_robot=np.broadcast_to(inputs.friction.robot, count),
-            base_half=scene.base_half(inputs.robots, count),
+            base_size=scene.base_size(inputs.robots, count),
             vertices=solids.vertices,
             radius=solids.radius,
         )

@@ -55,6 +55,8 @@ class Robot:
     # () [1] shares of v_y and of omega, as rollers lose more of these; None: equal to `slip`
     slip_sideways: Number = option(None, 0, 0.9)
     slip_yaw: Number = option(None, 0, 0.9)
+    # () of a round base, in place of half length and half width; None: a rectangle
+    radius: Number = option(None, 0.1, 2, unit="m")
 
     @property
     def driven(self) -> bool:
@@ -69,18 +71,27 @@ class Robot:
     @property
     def inertia(self) -> Number:
         """Moment of inertia () [kg m^2] about the vertical, of a plate with the base's outline."""
+        if self.radius is not None:
+            return self.mass * self.radius**2 / 2
         return self.mass * (self.half_length**2 + self.half_width**2) / 3
+
+    @property
+    def front(self) -> Number:
+        """Distance () [m] from the middle to the front."""
+        return self.half_length if self.radius is None else self.radius
 
     @property
     def arm(self) -> Number:
         """Distance () [m] from the middle to the wheels, at the corners of the outline."""
+        if self.radius is not None:
+            return self.radius
         size = self.half_length**2 + self.half_width**2
         return jnp.sqrt(size) if isinstance(size, jax.Array) else np.sqrt(size)
 
     @property
     def shell(self) -> Shell:
         """Outline and boards, of robots on the host."""
-        return Shell.of(self.half_length, self.half_width, self.boards)
+        return Shell.of(self.half_length, self.half_width, self.boards, self.radius)
 
     @property
     def push_max(self) -> Number:
@@ -116,7 +127,13 @@ class Robot:
             shapes, form = _SHAPES.get(name, (((),), "one number"))
             if (value := getattr(self, name)) is not None and np.shape(value) not in shapes:
                 raise errors.not_allowed(f"robot {name}", value, f"give {form}")
-        Shell(self.half_length, self.half_width, self.boards).check()
+        if self.radius is not None:
+            for name, default in (("half_length", HALF_LENGTH), ("half_width", HALF_WIDTH)):
+                if (half := getattr(self, name)) != default:
+                    sizes = f"{self.radius:g} m with {name} = {half:g} m"
+                    rule = f"a base is round or a rectangle: leave out radius or {name}"
+                    raise errors.not_allowed("robot radius", sizes, rule)
+        Shell(self.half_length, self.half_width, self.boards, radius=self.radius).check()
         if self.push_max is not None and self.push_max <= 0:
             rolling = (self.resistance or 0) * self.mass * GRAVITY
             rule = f"rolling resistance takes {rolling:.0f} N, so that no force is left to push"
@@ -139,7 +156,7 @@ _SHAPES = {  # allowed shapes of limits that are no single number
 _FIELDS = [field.name for field in dataclasses.fields(Robot)]
 _SLIPS = ("slip", "slip_sideways", "slip_yaw")
 _AIM_LIMITS = ("v_max", "omega_max", "lag", "acceleration_max", *_SLIPS)
-_NOT_LIMITS = ("half_length", "half_width", "boards", "mass", "bandwidth", "resistance")
+_NOT_LIMITS = ("half_length", "half_width", "radius", "boards", "mass", "bandwidth", "resistance")
 LIMITS = tuple(name for name in _FIELDS if name not in _NOT_LIMITS)
 jax.tree_util.register_dataclass(Robot, data_fields=_FIELDS, meta_fields=[])
 
@@ -160,6 +177,9 @@ _GEARED_MOTORS = {"force_max": 1504.0, "torque_max": 558.0} | _ROLLERS
 ROBOTS: dict[str, Robot] = {
     # Follows every twist at once, as in the paper's simulation.
     "ideal": Robot(),
+    # As wide as the paper's, to compare shapes. Krivic and Piater (2019), whose APS the paper
+    # compares with, pushed with a round base.
+    "round": Robot(radius=HALF_WIDTH),
     # Loses shares of v_x, v_y and omega: the posterior medians, given the paper's hardware results
     # and its other numbers (`sweeps/paper_reading`). The paper does not measure them.
     "slipping": Robot(slip=0.095, slip_sideways=0.18, slip_yaw=0.42),

@@ -3,6 +3,9 @@
 The skin covers the front, left and right sides. Positions along the rim form one strip that starts
 at the rear of the left side, runs forward, across the front from left to right, and back along the
 right side. A field of None has the paper's value.
+
+The skin of a round base covers its front 270 degrees. The sides are parts of this arc, as long as
+5, 4 and 5 boards of the paper's skin, so that its 42 taxels are spaced evenly.
 """
 
 from __future__ import annotations
@@ -16,13 +19,17 @@ import jax.numpy as jnp
 import numpy as np
 
 from rps_jax import errors
+from rps_jax.geometry import footprint as fp
 from rps_jax.geometry.arrays import Number
+from rps_jax.geometry.footprint import Footprint
 from rps_jax.record.options import check_fields, option
 
 HALF_LENGTH = 0.3625  # [m] of the paper's base: 15 taxels of 48.3 mm make 0.725 m
 HALF_WIDTH = 0.29  # [m] of the paper's base: l_cr + 5 cm, Sec. III-A
 Side = Literal["left", "front", "right"]
 SIDES: tuple[Side, ...] = ("left", "front", "right")  # in the order of the strip
+_ARC = 1.5 * math.pi  # [rad] of a round base that its skin may cover, about the front
+_SHARES: dict[Side, float] = {"left": 5 / 14, "front": 4 / 14, "right": 5 / 14}  # of the arc
 _ALONG = {"left": (1.0, 0.0), "front": (0.0, -1.0), "right": (-1.0, 0.0)}
 _ROUNDING = 1e-9  # [m]
 _SPACING = 0.01  # [m] maximum, between two sample points of a taxel
@@ -56,7 +63,7 @@ class Row(NamedTuple):
     """Part of a side that a row of boards covers."""
 
     start: jax.Array  # (2,) [m] in the robot frame
-    along: np.ndarray  # (2,) unit vector
+    along: np.ndarray  # (2,) unit vector; of a round base not used
     length: Number  # () [m]
     offset: Number  # () [m] of its start along the strip
 
@@ -64,7 +71,7 @@ class Row(NamedTuple):
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Shell:
-    """Outline of a base, a rectangle about its origin, and its boards in the strip's order."""
+    """Outline of a base about its origin, and its boards in the strip's order."""
 
     half_length: Number = option(HALF_LENGTH, 0.1, 2, unit="m")  # ()
     # (); None: the paper's, constant in compiled programs
@@ -72,21 +79,42 @@ class Shell:
     boards: tuple[Boards, ...] = BOARDS
     # Sample points of each taxel for the compression of foam; 1 cm apart they resolve a corner.
     samples: int = field(default=5, metadata={"static": True})
+    # () of a round base, whose half sizes are unused; None: a rectangle
+    radius: Number | None = option(None, 0.1, 2, unit="m")
 
     @classmethod
-    def of(cls, half_length: Number, half_width: Number, boards: tuple[Boards, ...]) -> Shell:
+    def of(
+        cls,
+        half_length: Number,
+        half_width: Number,
+        boards: tuple[Boards, ...],
+        radius: Number | None = None,
+    ) -> Shell:
         """Return the shell of a base, or of many bases if the sizes are (n,)."""
-        x, y = (float(np.max(half)) for half in (half_length, half_width))
-        sides = _lengths(x, y)
+        sizes = (half_length, half_width) if radius is None else (radius,)
+        sides = _lengths(*(float(np.max(size)) for size in sizes))
         pitches = [sides[x.side] / x.taxels if x.pitch is None else np.max(x.pitch) for x in boards]
         is_default = np.all(np.asarray(half_width) == HALF_WIDTH)
         samples = math.ceil(float(max(pitches)) / _SPACING)
-        return cls(half_length, None if is_default else half_width, boards, samples)
+        return cls(half_length, None if is_default else half_width, boards, samples, radius)
 
     @property
     def half(self) -> tuple[Number, Number]:
-        """Half length and half width [m]."""
+        """Half length and half width [m]; of a round base its radius, twice."""
+        x, y = (2 * self.sizes)[:2]
+        return x, y
+
+    @property
+    def sizes(self) -> tuple[Number, ...]:
+        """Half length and half width [m] of a rectangle, or the radius of a circle."""
+        if self.radius is not None:
+            return (self.radius,)
         return self.half_length, HALF_WIDTH if self.half_width is None else self.half_width
+
+    @property
+    def outline(self) -> Footprint:
+        """Outline in the robot frame."""
+        return fp.circle(*self.sizes) if self.radius is not None else fp.rectangle(*self.half)
 
     @property
     def count(self) -> int:
@@ -97,8 +125,8 @@ class Shell:
         """Return the positions of the rows of boards."""
         x, y = self.half
         corners = {"left": (-x, y), "front": (x, y), "right": (x, -y)}
-        offsets = {"left": 0.0, "front": 2 * x, "right": 2 * x + 2 * y}
-        rows, sides = [], _lengths(x, y)
+        rows, sides = [], _lengths(*self.sizes)
+        offsets = {"left": 0.0, "front": sides["left"], "right": sides["left"] + sides["front"]}
         for boards in self.boards:
             along, side = np.array(_ALONG[boards.side]), sides[boards.side]
             start, offset = jnp.stack(corners[boards.side]), offsets[boards.side]
@@ -113,14 +141,23 @@ class Shell:
         for boards, row in zip(self.boards, self.rows(), strict=True):
             count = boards.taxels * samples
             s = (np.arange(count) + 0.5) / count * row.length
-            points.append((row.start + s[:, None] * row.along).reshape(-1, samples, 2))
+            line = row.start + s[:, None] * row.along
+            line = line if self.radius is None else self.on_strip(jnp.asarray(row.offset + s))
+            points.append(line.reshape(-1, samples, 2))
         return jnp.concatenate(points)
 
     def on_strip(self, s: jax.Array) -> jax.Array:
         """Return points (..., 2) [m] in the robot frame at positions `s` (...) [m] of the strip."""
+        if self.radius is not None:
+            angle = _ARC / 2 - s / self.radius
+            return self.radius * jnp.stack([jnp.cos(angle), jnp.sin(angle)], axis=-1)
         x, y = (jnp.asarray(half, s.dtype) for half in self.half)
         along = jnp.clip(s, 0, 2 * x) - jnp.clip(s - 2 * (x + y), 0, 2 * x)  # left and right side
         return jnp.stack([along - x, y - jnp.clip(s - 2 * x, 0, 2 * y)], axis=-1)
+
+    def on_arc(self, bearing: jax.Array) -> jax.Array:
+        """Return positions [m] of a round base's strip at bearings [rad] in the robot frame."""
+        return self.radius * (_ARC / 2 - bearing)
 
     def check(self) -> None:
         """Raise InputError for a base without size, or boards that overlap or leave it."""
@@ -132,7 +169,7 @@ class Shell:
             if boards.pitch is None and boards.middle:
                 rule = "without a pitch a row covers the whole side"
                 raise errors.not_allowed("robot boards' middle", boards.middle, rule)
-        sides, previous = _lengths(*self.half), (0, 0.0)  # side and end [m] of the row before
+        sides, previous = _lengths(*self.sizes), (0, 0.0)  # side and end [m] of the row before
         for boards in self.boards:
             first, length = _span(boards, sides[boards.side])
             last, end = first + length, sides[boards.side]
@@ -154,6 +191,9 @@ def _span(row: Boards, side: Number) -> tuple[Number, Number]:
     return (side - length) / 2 + (0.0 if row.middle is None else row.middle), length
 
 
-def _lengths(x: Number, y: Number) -> dict[Side, Number]:
-    """Return the lengths [m] of the sides of a base of half length x and half width y [m]."""
+def _lengths(*sizes: Number) -> dict[Side, Number]:
+    """Return the lengths [m] of the sides of a base: see `Shell.sizes`."""
+    if len(sizes) == 1:
+        return {side: share * _ARC * sizes[0] for side, share in _SHARES.items()}
+    x, y = sizes
     return {"left": 2 * x, "front": 2 * y, "right": 2 * x}

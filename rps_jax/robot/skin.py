@@ -87,6 +87,8 @@ class IdealSkin(NamedTuple):
     ) -> tuple[SkinState, Reading]:
         """Return the middle between the two ends of the contact interval; the period is unused."""
         del period
+        if self.shell.radius is not None:
+            return state, self._nearest(footprint)
         if self.temperature is not None:
             return state, self._smooth_reading(footprint, self.temperature)
         hits, positions = [], []  # of both ends of each row's interval, in strip order
@@ -99,6 +101,28 @@ class IdealSkin(NamedTuple):
         first, last = _extremes(hits, positions)
         kind = jnp.where(last[2] - first[2] > self.point_length, LINE, POINT)
         return state, _reading(jnp.where(jnp.any(hits), kind, NONE), first[:2], last[:2])
+
+    def _nearest(self, footprint: Footprint) -> Reading:
+        """Return the contact at the point of a round base's boards that is nearest to the object.
+
+        A circle touches in a point.
+        """
+        shell, middle = self.shell, jnp.zeros(2, footprint.vertices.dtype)
+        away = jax.grad(fp.signed_distance, argnums=1)(footprint, middle)
+        nearest = shell.on_arc(planar.direction(-away))
+        spans = [(row.offset, row.offset + row.length) for row in shell.rows()]
+        at = jnp.stack([jnp.clip(nearest, *span) for span in spans])
+        distances = fp.signed_distance(footprint, shell.on_strip(at))
+        distance, point = distances[0], at[0]
+        for i in range(1, len(spans)):
+            closer = distances[i] < distance
+            distance = jnp.where(closer, distances[i], distance)
+            point = jnp.where(closer, at[i], point)
+        ends = (shell.on_strip(point),) * 2
+        if self.temperature is None:
+            return _reading(jnp.where(distance <= self.tolerance, POINT, NONE), *ends)
+        excess = (self.tolerance - distance) / self.temperature
+        return _smooth_reading(excess, jnp.asarray(POINT), *ends)
 
     def _crossings(
         self, footprint: Footprint, tolerance: Scalar

@@ -149,13 +149,13 @@ class Hardware(LawQuestion[xr.Dataset]):
         traces = traces.transpose("object", "target", ...)
         base, contact, success = (traces[name].values.astype(float) for name in _TRACED)
         dims = ("object", "target", "path_time", "axis")
-        half = np.asarray(self.table.cases[0].base.shell.half, float)
+        half = np.asarray(self.table.cases[0].base.shell.sizes, float)
         time = 0.5 * np.arange(1, traces.sizes["time"] + 1)
         variables = labelled(
             base_path=(dims, base[..., :2], "m", "path of the base"),
             contact_path=(dims, contact, "m", "path of the contact point"),
             path_success=(dims[:2], success.astype(int), "1", "the target of Fig. 7 is reached"),
-            half=("axis", half, "m", "half length and half width of the base"),
+            half=("axis" if half.size == 2 else "radius", half, "m", "sizes of the base"),
             path_time=("path_time", time, "s", "time after the start"),
         )
         return xr.Dataset(variables, {"object": list(HARDWARE_OBJECTS), "axis": ["x", "y"]})

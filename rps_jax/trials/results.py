@@ -123,9 +123,12 @@ def trace_dataset(trajectory: Trajectory) -> xr.Dataset:
         variables[name] = xr.Variable(dims, points, meaning)
     for name in ("d_success", *(("l_cr",) if isinstance(trajectory.params, RPSParams) else ())):
         variables[name] = xr.Variable((), _plain(getattr(trajectory.params, name)), {"units": "m"})
-    for name, value in zip(("half_length", "half_width"), world.skin.shell.half, strict=True):
+    shell = world.skin.shell
+    sizes = {"half_length": shell.half[0], "half_width": shell.half[1], "base_radius": shell.radius}
+    for name, value in sizes.items():
         attrs = {"units": "m", "long_name": f"{name.replace('_', ' ')} of the base"}
-        variables[name] = xr.Variable((), float(value), attrs)
+        if value is not None:
+            variables[name] = xr.Variable((), float(value), attrs)
     attrs = {"units": "m", "long_name": "outline of the object in its own frame"}
     variables["outline"] = xr.Variable(("corner", "axis"), _outline(world.footprint), attrs)
     return xr.Dataset(variables, coords={"time": ("time", snapshots.time, {"units": "s"})})

@@ -237,7 +237,7 @@ def positions_of(
 ) -> Positions:
     """Return what a task judges, at the positions qpos."""
     contact = contact_of(qpos, p_robot_contact), touches
-    base = qpos[JOINTS.base], world.skin.shell.half
+    base = qpos[JOINTS.base], world.skin.shell.outline
     return Positions(world.p_world_target, *contact, *base, *object_pose(qpos), world.footprint)
 
 
@@ -271,6 +271,7 @@ def observe(
     skin, reading = world.skin.sense(trial.skin, outline(world, trial.qpos), period)
     touched = reading.p_robot_contact, reading.in_contact
     observation = Observation(trial.qpos[:2], trial.qpos[2], *touched, world.p_world_target, period)
+    observation = observation._replace(base_radius=world.skin.shell.radius)
     distance = planar.norm(displacement(observation))
     motion = trial.poses, trial.qpos[JOINTS.base], world.key, trial.steps, period
     poses, believed = base.observe_pose(world.odometry, *motion)
@@ -290,7 +291,7 @@ def observe(
         poses=poses,
         contact_steps=trial.contact_steps + touch,
         lost_steps=lost_steps,
-        sum_abs_l=trial.sum_abs_l + jnp.where(touch, jnp.abs(reading.p_robot_contact[1]), 0.0),
+        sum_abs_l=trial.sum_abs_l + jnp.where(touch, jnp.abs(observation.l), 0.0),
         min_distance=jnp.where(
             touch, jnp.minimum(trial.min_distance, distance), trial.min_distance
         ),

@@ -128,7 +128,7 @@ class Domain:
         if offset + load > 1:
             rule = f"with com_offset up to {offset:g} its high is at most {1 - offset:g}"
             raise errors.not_allowed("domain load_size (high)", load, rule)
-        reach = math.hypot(*self.robot.shell.half)
+        reach = float(self.robot.arm)
         if self.task.HAS_TARGET and not self.targets and self.distance.low <= reach:
             rule = f"targets must lie outside the robot, which reaches {reach:.2f} m"
             raise errors.not_allowed("domain distance (low)", f"{self.distance.low:g} m", rule)

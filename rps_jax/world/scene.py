@@ -195,10 +195,11 @@ def repeat_robot(robots: Robot, count: int) -> Robot:
     return jax.tree.map(lambda leaf: np.repeat(np.asarray(leaf, float)[None], count, 0), robots)
 
 
-def base_half(robots: Robot, count: int) -> np.ndarray:
-    """Return half length and half width (count, 2) [m] of the bases of robots."""
-    half = np.stack([robots.half_length, robots.half_width], axis=-1)
-    return np.broadcast_to(np.asarray(half, float), (count, 2))
+def base_size(robots: Robot, count: int) -> np.ndarray:
+    """Return half length and half width (count, 2) [m] of bases, or their radius (count, 1)."""
+    half = robots.half_length, robots.half_width
+    sizes = np.stack(half if robots.radius is None else [robots.radius], axis=-1)
+    return np.broadcast_to(np.asarray(sizes, float), (count, sizes.shape[-1]))
 
 
 def base_invweight(robots: Robot) -> np.ndarray:
@@ -252,13 +253,16 @@ def _compile(
 ) -> tuple[mujoco.MjModel, mujoco.MjModel]:
     """Compile the full model and the stripped one."""
     _set_robot(spec, robot)
+    if robot.radius is not None:
+        _touch_round(spec, float(robot.radius))
     for pair in spec.pairs:
-        if pair.name == "base_object":
+        of_base = pair.name.startswith("base_object")
+        if of_base:
             pair.solref[:] = physics.base_solref
         else:
             pair.solref[:] = physics.ground_solref
             pair.solimp[:2] = physics.ground_impedance
-        pair.friction[:2] = friction.robot if pair.name == "base_object" else friction.ground
+        pair.friction[:2] = friction.robot if of_base else friction.ground
     spec.option.cone = getattr(mujoco.mjtCone, f"mjCONE_{physics.cone.upper()}")
     for name in ("timestep", "impratio", "iterations", "ls_iterations", "tolerance"):
         setattr(spec.option, name, getattr(physics, name))
@@ -278,21 +282,27 @@ def check_target(p_world_target: tuple[float, float], shell: Shell = Shell()) ->
     """Raise InputError for a target [m] under the robot or more than 50 m away."""
     x, y = errors.check_vector("target", p_world_target, at_least=-50, at_most=50, unit="m")
     half_x, half_y = shell.half
-    if abs(x) <= half_x and abs(y) <= half_y:
-        covered = f"|x| <= {half_x:g} m and |y| <= {half_y:g} m"
+    under = abs(x) <= half_x and abs(y) <= half_y
+    covered = f"|x| <= {half_x:g} m and |y| <= {half_y:g} m"
+    if shell.radius is not None:
+        under, covered = math.hypot(x, y) <= shell.radius, f"{shell.radius:g} m around (0, 0)"
+    if under:
         rule = f"it must lie outside the robot, which covers {covered}"
         raise errors.not_allowed("target", f"({x:g}, {y:g}) m", rule)
 
 
 def _set_robot(spec: mujoco.MjSpec, robot: Robot) -> None:
-    """Set the size of the base and, if its force is limited, its mass."""
+    """Set the outline of the base and, if its force is limited, its mass."""
     x, y = (float(half) for half in robot.shell.half)
-    spec.geom("base").size[:2] = x, y
-    spec.geom("skin_front").pos[0] = x
-    spec.geom("skin_front").size[1] = y
-    for side, sign in (("left", 1), ("right", -1)):
-        spec.geom(f"skin_{side}").size[0] = x
-        spec.geom(f"skin_{side}").pos[1] = sign * y
+    if robot.radius is None:
+        spec.geom("base").size[:2] = x, y
+        spec.geom("skin_front").pos[0] = x
+        spec.geom("skin_front").size[1] = y
+        for side, sign in (("left", 1), ("right", -1)):
+            spec.geom(f"skin_{side}").size[0] = x
+            spec.geom(f"skin_{side}").pos[1] = sign * y
+    else:
+        _draw_round(spec, robot.shell, x)
     if not robot.driven:
         return
     base = spec.body("base")
@@ -300,6 +310,41 @@ def _set_robot(spec: mujoco.MjSpec, robot: Robot) -> None:
     base.inertia[:] = float(robot.inertia)  # about the other axes it never turns
     for joint in base.joints:
         joint.armature = 0.0
+
+
+def _draw_round(spec: mujoco.MjSpec, shell: Shell, radius: float) -> None:
+    """Draw the base as a cylinder of a radius [m], with its skin, and without wheels."""
+    base, geom, kind = spec.body("base"), spec.geom("base"), mujoco.mjtGeom
+    for item in list(base.geoms):
+        if item.material in ("deck", "wheel", "hub", "skin") and item.type != kind.mjGEOM_CAPSULE:
+            spec.delete(item)
+    geom.type, geom.size[:2] = kind.mjGEOM_CYLINDER, (radius, geom.size[2])
+    looks: dict[str, Any] = {"mass": 0, "group": 2}
+    for name, share, z, half in (("deck", 0.9, 0.36, 0.02), ("wheel", 0.85, 0.03, 0.03)):
+        disc = {"type": kind.mjGEOM_CYLINDER, "size": [share * radius, half, 0]}
+        base.add_geom(pos=[0, 0, z], material=name, **disc, **looks)
+    ends = np.asarray(shell.taxels(2), float)  # (T, 2, 2) [m] at 1/4 and 3/4 of each taxel
+    for (x, y), (dx, dy) in zip(ends.mean(axis=1), ends[:, 0] - ends[:, 1], strict=True):
+        half, yaw = math.hypot(dx, dy), math.atan2(dy, dx) / 2
+        tile = {"type": kind.mjGEOM_BOX, "size": [half, 0.003, 0.05], "material": "skin"}
+        turn = [math.cos(yaw), 0, 0, math.sin(yaw)]
+        base.add_geom(pos=[x, y, 0.27], quat=turn, **tile, **looks)
+
+
+def _touch_round(spec: mujoco.MjSpec, radius: float) -> None:
+    """Let two spheres of a round base of a radius [m] touch the object in place of the base.
+
+    They meet an upright side at the lower and upper edge of the base, or just below the top of a
+    lower object. MuJoCo's contact of a cylinder is a single point, at any height.
+    """
+    geom, contact = spec.geom("base"), spec.pair("base_object")
+    low, high = geom.pos[2] + geom.size[1] * np.array([-1.0, 1.0])
+    sphere = {"type": mujoco.mjtGeom.mjGEOM_SPHERE, "size": [radius, 0, 0], "mass": 0, "group": 3}
+    for name, z in (("low", low), ("high", min(high, 1.96 * spec.body("object").pos[2]))):
+        spec.body("base").add_geom(name=f"base_{name}", pos=[0, 0, z], **sphere)
+    contact.geomname1 = "base_low"
+    second = {"geomname1": "base_high", "geomname2": contact.geomname2}
+    spec.add_pair(spec.find_default("base_object"), name="base_object_high", **second)
 
 
 def _strip(spec: mujoco.MjSpec, full: mujoco.MjModel) -> mujoco.MjModel:
@@ -350,7 +395,7 @@ def initial_qpos(scene: Scene, gap: float = 0.02, yaw: float = 0.0) -> np.ndarra
     qpos = scene.physics.qpos0.copy()
     qpos[JOINTS.base] = 0.0
     height = qpos[JOINTS.object][2]
-    front = scene.physics.geom("base").size[0]
+    front = float(scene.shell.half[0])
     position = [front + gap + reach, 0.0, height]
     qpos[JOINTS.object] = [*position, math.cos(yaw / 2), 0.0, 0.0, math.sin(yaw / 2)]
     return qpos

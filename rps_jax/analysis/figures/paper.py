@@ -17,6 +17,7 @@ from rps_jax.analysis.figures.style import (
     SHADES,
     Figure,
     base_patch,
+    base_sizes,
     panel,
     shade,
     tiles,
@@ -111,14 +112,14 @@ def _object(trace: xr.Dataset, index: int) -> np.ndarray:
 def draw_path(ax: Axes, trace: xr.Dataset, snapshots: int = 7) -> None:
     """Draw a trial as a map: base, object and contact point, and snapshots from start to end."""
     pose, target = trace.qpos.values[:, :3], trace.p_world_target.values
-    half = float(trace.half_length), float(trace.half_width)
+    sizes = base_sizes(trace)
     ax.plot(*pose[:, :2].T, color=_BASE, label="base", zorder=3)
     ax.plot(*trace.p_world_contact.values.T, ".", ms=2, color="C0", label="contact point")
     ax.plot(*trace.qpos.values[:, 3:5].T, "--", lw=1, color=_OBJECT, label="object")
     for index in np.linspace(0, len(pose) - 1, snapshots).astype(int):
         alpha = 0.9 if index == len(pose) - 1 else 0.35
         ax.fill(*_object(trace, index).T, fc="#e8c39e", ec=_OBJECT, alpha=alpha)
-        ax.add_patch(base_patch(pose[index], half, fill=False)).set_alpha(alpha)
+        ax.add_patch(base_patch(pose[index], sizes, fill=False)).set_alpha(alpha)
     if "path" in trace:
         ax.plot(*trace.path.values.T, "-", lw=1, color="0.6", label="path", zorder=0)
     for wall in trace.walls.values if "walls" in trace else ():

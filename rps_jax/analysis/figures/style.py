@@ -1,9 +1,11 @@
 """Shared style of the figures: colours, panels and marks."""
 
 import io
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+import xarray as xr
 from matplotlib import figure, patches, transforms
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable as ScalarMappable
@@ -75,15 +77,29 @@ def panel(size: tuple[float, float], xlabel: str, ylabel: str) -> tuple[Figure, 
 
 def base_patch(
     pose: np.ndarray,
-    half: tuple[float, float] = (shell.HALF_LENGTH, shell.HALF_WIDTH),
+    sizes: Sequence[float] = (shell.HALF_LENGTH, shell.HALF_WIDTH),
     *,
     fill: bool,
 ) -> patches.Polygon:
-    """Return the outline of a base of half length and width (2,) [m] at a pose (3,) [m, m, rad]."""
-    corners = np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]]) * half
+    """Return the outline of a base at a pose (3,) [m, m, rad].
+
+    Its sizes are half length and width (2,) [m], or the radius (1,) [m]; a line shows the heading
+    of a round base.
+    """
+    corners = np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]])
+    if len(sizes) == 1:
+        angle = np.linspace(0, 2 * np.pi, 49)
+        corners = np.append(np.stack([np.cos(angle), np.sin(angle)], axis=-1), [[0, 0]], axis=0)
+    corners = corners * np.asarray(sizes)
     c, s = np.cos(pose[2]), np.sin(pose[2])
     world = corners @ np.array([[c, s], [-s, c]]) + pose[:2]
     return patches.Polygon(world, facecolor="0.35" if fill else "none", edgecolor="0.35")
+
+
+def base_sizes(trace: xr.Dataset) -> list[float]:
+    """Return the sizes of the base of a trial over time, for `base_patch`."""
+    names = ["base_radius"] if "base_radius" in trace else ["half_length", "half_width"]
+    return [float(trace[name]) for name in names]
 
 
 def shade(ax: Axes, time: np.ndarray, active: np.ndarray, colour: str) -> None:

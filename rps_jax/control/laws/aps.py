@@ -37,7 +37,7 @@ class APSParams(NamedTuple):
     K_d: float | jax.Array = 0.4  # [1] heading rate gain
     yaw_error_max: float | jax.Array = 0.3  # [rad] above it the robot turns in place
     margin: float | jax.Array = 0.10  # [m] gap above which the robot approaches straight
-    r_robot: float | jax.Array = HALF_LENGTH  # [m] * equivalent radius of the rectangular base
+    r_robot: float | jax.Array = HALF_LENGTH  # [m] * equivalent radius of a rectangular base
     gamma_drop: float | jax.Array = 0.01  # [rad] decrease of |gamma| after which alpha is good
     alpha_mean: float | jax.Array = jnp.pi  # [rad] prior mean of good alphas
     alpha_variance: float | jax.Array = jnp.pi / 4  # [rad^2] prior variance
@@ -156,7 +156,8 @@ def step(
     state = _learn(params, state, obs.p_world_object, a_OT)
 
     alpha = jnp.mod(planar.direction(from_object) - a_OT, 2 * jnp.pi)
-    near = params.r_robot + obs.r_object + params.margin >= planar.norm(from_object)
+    r_robot = params.r_robot if touch.base_radius is None else touch.base_radius
+    near = r_robot + obs.r_object + params.margin >= planar.norm(from_object)
     push, relocate = activations(params, state, alpha, near)
     radial = -jnp.stack([jnp.cos(alpha), jnp.sin(alpha)])  # towards the object
     orbit = jnp.sign(jnp.sin(alpha)) * jnp.stack([-jnp.sin(alpha), jnp.cos(alpha)])  # to alpha = pi

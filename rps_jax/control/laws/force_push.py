@@ -135,12 +135,12 @@ def step(
 ) -> tuple[ForcePushState, Twist, Details]:
     """Compute one control step; before the first contact the base moves straight ahead."""
     path, filled, offset = state.path.update(obs)
-    contact, theta_d = filled.p_robot_contact, path.theta_d
+    l, theta_d = filled.l, path.theta_d  # noqa: E741
     motion = planar.norm(obs.p_world_robot - state.p_world_robot)
     weight = jnp.exp(-motion / params.drift)
-    l_mean = contact[1] + weight * (state.l_mean - contact[1])
-    l_mean = jnp.where(state.path.touched, l_mean, contact[1])
-    drifted = jnp.stack([jnp.asarray(params.drift, contact.dtype), contact[1] - l_mean])
+    l_mean = l + weight * (state.l_mean - l)
+    l_mean = jnp.where(state.path.touched, l_mean, l)
+    drifted = jnp.stack([jnp.asarray(params.drift, l.dtype), l - l_mean])
     theta_f = planar.wrap(obs.yaw - theta_d) + planar.direction(drifted)
     theta_p = steer(params, state.theta_p, theta_f, offset, params.converge, obs.in_contact)
     angle = planar.wrap(theta_d + theta_p - obs.yaw)

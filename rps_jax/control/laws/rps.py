@@ -2,8 +2,10 @@
 and Ajoudani, "Pushing in the Dark" (IEEE RA-L 2024). This file does not use MuJoCo.
 
 Frames: W is the world, R the robot (origin at the centre of the base, x forward, y left).
-`p_robot_contact` is the paper's p^R_C; `l`, the contact offset, is its y component. Functions take
-single worlds; `jax.vmap` batches any argument, parameters included.
+`p_robot_contact` is the paper's p^R_C; `l`, the contact offset, is its y component. On a round base
+`l` is the arc length from the front, to the left, and the equations are the same (our choice: the
+paper has a flat front). Functions take single worlds; `jax.vmap` batches any argument, parameters
+included.
 
 Order of saturation: the paper says that the computed velocities "were saturated at 0.05 m/s [...]
 and 0.15 rad/s [...] prior to being commanded", and that "the change of omega as a function of v_x^R
@@ -240,7 +242,7 @@ def _push(
     params: RPSParams, l_th: jax.Array, obs: Observation, temps: Temperatures
 ) -> tuple[jax.Array, Twist, Details]:
     """Compute one pass of Algorithm 1's control loop, in contact."""
-    l = obs.p_robot_contact[..., 1]  # noqa: E741
+    l = obs.l  # noqa: E741
     d = displacement(obs)
     distance = planar.norm(d)
     v_star = params.K_v * distance  # Eq. 3

@@ -54,7 +54,7 @@ class Fused(Engine):
             friction_robot=friction.robot,
             invweight=1 / solids.mass,
             base_invweight=np.broadcast_to(base_invweight, solids.mass.size),
-            base_half=scene.base_half(robots, solids.mass.size),
+            base_size=scene.base_size(robots, solids.mass.size),
             base_z=np.broadcast_to(base_z, (solids.mass.size, 2)),
         )
         if solids.feet is not None:

@@ -41,7 +41,7 @@ class Body(NamedTuple):
     friction_robot: Number  # () [1]
     invweight: Number  # () [1/kg] MuJoCo's inverse weight of the object in a contact
     base_invweight: Number  # () [1/kg] inverse weight of the base
-    base_half: Entries  # (2,) [m] half length and width of the base
+    base_size: Entries  # (2,) [m] half length and width of the base, or (1,) its radius
     base_z: Entries  # (2,) [m] heights of the base's lower and upper edge
     feet: Entries = None  # (N, 3) [m] of a prism that does not stand on its vertices; later a `Vec`
     bears: Entries = None  # (N, 1) [1] 1 for a foot, 0 for an unused entry
@@ -227,7 +227,7 @@ def meetings(
     if not isinstance(body.vertices, Corners):
         z = jnp.where(_index(2, body.radius) == 0, low, high)
         centre = outline(body.vertices, z)
-        normal, point, distance = circle_and_rectangle(centre, body.radius, body.base_half)
+        normal, point, distance = circle_and_base(centre, body.radius, body.base_size)
         # A horizontal section of a leaning cylinder is an ellipse, wider along the normal.
         lean = sp.dot(slope, normal)
         wider = body.radius * (jnp.sqrt(1 + lean * lean) - 1)
@@ -236,47 +236,57 @@ def meetings(
         return on_object(z, normal, point, distance, 0.5 * distance)
     middle = 0.5 * (low + high)
     corners, ahead = (outline(foot, middle) for foot in (body.vertices.at, body.vertices.ahead))
-    normal, points, distances = polygon_and_rectangle(corners, ahead, body.base_half)
-    i = _index(4, middle + 0 * normal[0])
-    first = i % 2 == 0
-    z = jnp.where(i < 2, low, high)
-    point = tuple(jnp.where(first, a, b) for a, b in zip(*points, strict=True))
-    gap = jnp.where(first, *distances)
+    normal, points, distances = polygon_and_base(corners, ahead, body.base_size)
+    count = len(points)
+    i = _index(2 * count, middle + 0 * normal[0])
+    first = i % count == 0
+    z = jnp.where(i < count, low, high)
+    point = tuple(jnp.where(first, points[0][k], points[-1][k]) for k in range(2))
+    gap = jnp.where(first, distances[0], distances[-1])
     distance = gap + sp.dot(slope, normal) * (z - middle)
     # The point is midway at the middle height.
     return on_object(z, normal, point, distance, distance - 0.5 * gap)  # type: ignore[arg-type]
 
 
-def circle_and_rectangle(
-    centre: Point, radius: Number, half: Sequence[Number]
+def circle_and_base(
+    centre: Point, radius: Number, size: Sequence[Number]
 ) -> tuple[Point, Point, Number]:
-    """Return normal, point and distance [m] of a circle outside a centred rectangle."""
+    """Return normal, point and distance [m] of a circle outside a centred base."""
+    base_radius = size[0] if len(size) == 1 else None  # else a rectangle of these half sizes
+    half = size if base_radius is None else (0.0, 0.0)
     nearest = tuple(jnp.clip(x, -h, h) for x, h in zip(centre, half, strict=True))
     offset = (centre[0] - nearest[0], centre[1] - nearest[1])
     gap = sp.norm(offset)
     outside = gap > 1e-6
     normal = (jnp.where(outside, offset[0] / gap, 1.0), jnp.where(outside, offset[1] / gap, 0.0))
     distance = jnp.where(outside, gap, centre[0] - half[0]) - radius
-    point = (nearest[0] + 0.5 * distance * normal[0], nearest[1] + 0.5 * distance * normal[1])
+    away = 0.5 * distance
+    if base_radius is not None:
+        distance = distance - base_radius
+        away = base_radius + 0.5 * distance
+    point = (nearest[0] + away * normal[0], nearest[1] + away * normal[1])
     return normal, point, distance
 
 
-def polygon_and_rectangle(
-    corners: Point, ahead: Point, half: Sequence[Number]
+def polygon_and_base(
+    corners: Point, ahead: Point, size: Sequence[Number]
 ) -> tuple[Point, list[Point], list[Number]]:
-    """Return the normal from a centred rectangle to a convex polygon, two points and distances [m].
+    """Return the normal from a centred base to a convex polygon, points and distances [m].
 
-    The polygon has corners (N, ...), each with its next corner `ahead`. The face of maximum
-    separation is the reference face. The most opposed face of the other outline is the incident
-    face; it is clipped to the width of the reference face, as in MuJoCo's box-box collider.
+    There are two points on a rectangle, one on a circle. The polygon has corners (N, ...), each
+    with its next corner `ahead`. The face of maximum separation is the reference face. The most
+    opposed face of the other outline is the incident face; it is clipped to the width of the
+    reference face, as in MuJoCo's box-box collider.
     """
-    a, b = half
     x, y = corners
     along = (ahead[0] - x, ahead[1] - y)
     length = sp.norm(along)
     along = (along[0] / length, along[1] / length)
     n = (along[1], -along[0])
     real = length > 1e-6
+    if len(size) == 1:
+        return _polygon_and_circle(corners, (n, along, length, real), size[0])
+    a, b = size
     gaps = -(x * n[0] + y * n[1]) - (a * jnp.abs(n[0]) + b * jnp.abs(n[1]))
     faces = (n, corners, along, length)
     separation, chosen = _best(jnp.where(real, gaps, -_FAR), faces)
@@ -323,6 +333,28 @@ def polygon_and_rectangle(
         points.append((q[0] - 0.5 * distance * ref[0], q[1] - 0.5 * distance * ref[1]))
         distances.append(distance)
     return normal, points, distances
+
+
+def _polygon_and_circle(
+    corners: Point, edges: tuple[Point, Point, Array, Array], radius: Number
+) -> tuple[Point, list[Point], list[Number]]:
+    """Return `polygon_and_base` of a circle: the polygon's point nearest to the middle.
+
+    In a polygon around the middle it is on the nearest edge. Edges (N, ...) have their outward
+    normals, directions, lengths [m], and whether they are real.
+    """
+    n, along, length, real = edges
+    x, y = corners
+    s = jnp.clip(-sp.dot(corners, along), 0.0, length)
+    q = (x + s * along[0], y + s * along[1])
+    level = -sp.dot(corners, n)  # of the middle above each edge, negative inside
+    inside = sp.greatest(jnp.where(real, level, -_FAR)) < 0
+    _, (q, n) = _best(jnp.where(real, -sp.dot(q, q), -_FAR), (q, n))
+    gap = sp.norm(q)
+    normal = tuple(jnp.where(inside, -a, b / gap) for a, b in zip(n, q, strict=True))
+    distance = jnp.where(inside, -gap, gap) - radius
+    away = radius + 0.5 * distance
+    return (normal[0], normal[1]), [(away * normal[0], away * normal[1])], [distance]
 
 
 def _best(score: Array, values: Entries) -> tuple[Number, Entries]:

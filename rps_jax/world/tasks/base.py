@@ -28,7 +28,7 @@ class Positions(NamedTuple):
     p_world_contact: Float[Array, "2"]  # [m]; ignored unless it touches
     touches: Bool[Array, ""]
     base: Float[Array, "3"]  # [m, m, rad] pose of the base
-    half: tuple[Any, Any]  # [m] half length and half width of the base
+    outline: Footprint  # of the base, in its own frame
     p_world_object: Float[Array, "2"]  # [m]
     object_yaw: Scalar  # [rad]
     footprint: Footprint  # of the object, in its own frame

@@ -78,12 +78,12 @@ class CorridorCourse(NamedTuple):
         poses = jnp.stack(
             [positions.base, jnp.append(positions.p_world_object, positions.object_yaw)]
         )
-        radii = planar.norm(jnp.stack(positions.half)), fp.circumradius(positions.footprint)
+        outlines = positions.outline, positions.footprint
+        radii = jnp.stack([fp.circumradius(outline) for outline in outlines])
         away = jnp.abs(poses - progress.measured_at)
-        travel = planar.norm(away[:, :2]) + jnp.stack(radii) * away[:, 2]
+        travel = planar.norm(away[:, :2]) + radii * away[:, 2]
         may_touch = progress.measured <= jnp.max(travel)
         due = may_touch | (progress.steps % _STEPS == 0)
-        outlines = fp.rectangle(*positions.half), positions.footprint
 
         def measure(carry: Any) -> Any:
             poses = carry[-1]  # changed by the pass: what does not change is computed before
@@ -177,7 +177,7 @@ class Corridor(Path):
                 raise errors.not_allowed("task width (low)", f"{self.width.low:g} m", rule)
         if self.waypoints:
             (walls,) = _walls(self.route()[None], np.array([self.width.low / 2]))
-            if polyline.clearance(fp.rectangle(*half), jnp.asarray(walls))[0] <= 0:
+            if polyline.clearance(shell.outline, jnp.asarray(walls))[0] <= 0:
                 rule = "a wall beside them crosses the base at its start; start them ahead"
                 raise errors.not_allowed("task waypoints", self.waypoints[:2], rule)
 

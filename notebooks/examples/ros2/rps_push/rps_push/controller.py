@@ -128,6 +128,7 @@ class Controller:
 
     def _decide(self, period: float) -> tuple[Any, Any]:
         obs = Observation(self._pose[:2], self._pose[2], *self._contact, self._target, period)
+        obs = obs._replace(base_radius=self._skin.shell.radius)
         return self._step(self._params, self._law_state, obs)[:2]
 
     def tick(self, time: float) -> Command:
