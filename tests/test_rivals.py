@@ -128,6 +128,25 @@ def test_force_push_plans_a_new_path_behind_the_target():
     np.testing.assert_allclose(state.path.p_world_start, (2.46, 0.0), atol=1e-6)
 
 
+@pytest.mark.parametrize(("law", "params", "sense"), [
+    (force_push, ForcePushParams(), lambda obs: obs),
+    (force_push_published, PublishedForcePushParams(), lambda obs: with_force(obs)),
+])  # fmt: skip
+def test_force_push_follows_a_target_that_moves_along_a_path(law, params, sense):
+    # The contact is on the x axis. The target moves ahead, then to the left, then jumps backwards.
+    targets = [(1.0, 0.0), (2.0, 0.0), (2.0, 0.005), (2.0, 0.02), (1.5, 1.0), (-2.0, 0.0)]
+    angles = [0.0, 0.0, 0.0, math.atan2(0.02, 1.64), math.atan2(1, 1.14), math.pi]
+    state = None
+    for target, angle in zip(targets, angles, strict=True):
+        state = follow(law, params, (sense(observe((0.36, 0.0), target)),), state=state)
+        assert float(state.path.theta_d) == pytest.approx(angle, abs=1e-6)
+    # Without contact there is no line to a target.
+    state = follow(
+        law, params, (sense(observe((0.36, 0.0), (0.0, 3.0), touching=False)),), state=state
+    )
+    assert float(state.path.theta_d) == pytest.approx(math.pi)
+
+
 def test_the_published_force_push_steers_by_the_angle_of_the_force():
     """theta_p = 1.3 theta_f + 0.5 Delta, and the contact moves at 0.05 m/s along it."""
     angle = 1.3 * math.atan2(3, 4)

@@ -11,8 +11,13 @@ drifts. Here theta_f is therefore estimated as the base's heading plus the angle
 drift over the skin: that of (lambda, l - l_mean), with l_mean the mean of l over the last length
 lambda of the base's path. As in their experiments, the base turns to face along the path, with gain
 k_omega. Our choices: the path is the straight line from the first contact to the target, and is
-replaced when the contact has passed the target; since a skin cannot pull, the push stays within
-angle_max of the heading; the speed bound is that of RPS.
+replaced when the contact has passed the target or the target has left the line, as targets do that
+move along a path; since a skin cannot pull, the push stays within angle_max of the heading; the
+speed bound is that of RPS.
+
+The line to a target at the lookahead L on a straight path is at the angle -Delta / L from this
+path. From the path, the push is then at (1 + k_theta) theta_f + k_theta Delta / L, which is the law
+of the paper with k_y = k_theta / L.
 """
 
 from __future__ import annotations
@@ -28,6 +33,7 @@ from rps_jax.control.observation import Details, Observation, Twist, displacemen
 from rps_jax.geometry import planar
 from rps_jax.geometry.arrays import Scalar
 
+_TOLERANCE = 0.01  # [m] beside a path, beyond which a target has left it
 _POSITIVE = ("drift", "angle_max", "v_max", "omega_max", "d_success")
 
 
@@ -53,7 +59,7 @@ class ForcePushParams(NamedTuple):
 
 
 class Path(NamedTuple):
-    """Path of the contact: the straight line from the first contact through the target."""
+    """Path of the contact: a straight line from a contact through the target."""
 
     p_world_start: jax.Array  # (2,) [m] start of the path
     theta_d: jax.Array  # () [rad] direction of the path in the world
@@ -69,7 +75,7 @@ class Path(NamedTuple):
     def update(self, obs: Observation) -> tuple[Path, Observation, jax.Array]:
         """Return path, observation with the last contact, and its offset () [m] to the left.
 
-        A new path starts when the contact has passed the target.
+        A new path starts when the contact has passed the target, or the target has left the path.
         """
         touching = jnp.asarray(obs.in_contact)
         contact = jnp.where(touching, obs.p_robot_contact, self.p_robot_contact)
@@ -78,7 +84,9 @@ class Path(NamedTuple):
         p_world_contact = obs.p_world_target - d
         along = jnp.stack([jnp.cos(self.theta_d), jnp.sin(self.theta_d)])
         passed = self.touched & touching & (jnp.sum(d * along) < 0)
-        is_new = (touching & ~self.touched) | passed
+        way = obs.p_world_target - self.p_world_start
+        has_left = jnp.abs(along[0] * way[1] - along[1] * way[0]) > _TOLERANCE
+        is_new = (touching & (~self.touched | has_left)) | passed
         p_world_start = jnp.where(is_new, p_world_contact, self.p_world_start)
         theta_d = jnp.where(is_new, planar.direction(d), self.theta_d)
         normal = jnp.stack([-jnp.sin(theta_d), jnp.cos(theta_d)])

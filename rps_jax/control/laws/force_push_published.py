@@ -13,11 +13,12 @@ the path, at a bounded rate. An admittance reduces the velocity by k_f times the
 
 Our base is not a point, so we made these choices. The moving point is the contact reported by the
 skin. The path is the straight line from the first contact to the target, and is replaced when the
-contact has passed the target. Before the first contact the base moves straight ahead; after it,
-until it senses a force, along the path, as theirs. As in their experiments, the base turns to face
-along the path with gain k_omega; their controller trades this against speed in a quadratic program.
-The speed bound is that of RPS, half of theirs, and so is k_f. One step of ours is two of theirs, so
-`converge` is a rate. We omit their first second of acceleration.
+contact has passed the target or the target has left it. Before the first contact the base moves
+straight ahead; after it, until it senses a force, along the path, as theirs. As in their
+experiments, the base turns to face along the path with gain k_omega; their controller trades this
+against speed in a quadratic program. The speed bound is that of RPS, half of theirs, and so is k_f.
+One step of ours is two of theirs, so `converge` is a rate. We omit their first second of
+acceleration.
 """
 
 from functools import partial
