@@ -62,7 +62,7 @@ def test_a_task_has_a_text_and_a_json(text):
 def test_the_json_of_a_domain_with_a_target_is_that_of_earlier_versions():
     assert "task" not in to_json(DOMAINS["wide"])
     assert "task" not in Push().configuration()
-    assert Push(task="path").configuration()["task"]["lookahead"] == (1, 1, False)
+    assert Push(task="path").configuration()["task"]["lookahead"] == (1.6, 1.6, False)
 
 
 @pytest.mark.parametrize("task", ["path", "corridor", "path,turn_angle=0.5", "corridor,doors=2"])

@@ -24,7 +24,7 @@ from rps_jax.record.options import option
 from rps_jax.robot.shell import Shell
 from rps_jax.world.quantity import Range, drawn
 from rps_jax.world.tasks.base import Aim, CourseInputs, Positions
-from rps_jax.world.tasks.path import Path, PathCourse, PathProgress, turns_of, units_of
+from rps_jax.world.tasks.path import LOOKAHEAD, Path, PathCourse, PathProgress, turns_of, units_of
 
 _BEHIND = 1.5  # [m] of the walls before the base's front
 _BEYOND = 1.5  # [m] of the walls after the end of the path
@@ -137,6 +137,7 @@ class Corridor(Path):
 
     FAILURES: ClassVar[dict[str, str]] = {"wall_touch": "touched a wall"}
 
+    lookahead: Range = drawn(Range(0.6, 0.6), *LOOKAHEAD)  # short, since long ones cut corners
     width: Range = drawn(Range(1.4, 2.2), 59, "m", 0.3, 20, "width of the corridor", "course")
     doors: int = option(0, 0, 4)  # narrower places along the path
     door_width: Range = drawn(Range(0.8, 0.8), 60, "1", 0.1, 1, "doors, of the width", "course")

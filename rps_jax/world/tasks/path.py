@@ -22,6 +22,7 @@ from rps_jax.robot.shell import Shell
 from rps_jax.world.quantity import Range, drawn
 from rps_jax.world.tasks.base import Aim, CourseInputs, Positions, Task
 
+LOOKAHEAD = 49, "m", 0.05, 5, "lookahead on the path", "course"  # as `drawn` takes it
 _SEGMENTS = 8  # of a drawn path
 _PER_SPAN = 6  # segments of a spline between two waypoints
 _REACH = 1.0  # [m] along the path, either way, in which the nearest point is sought
@@ -126,7 +127,7 @@ class Path(Task):
     }
 
     # Along the path, from its nearest point to the law's target.
-    lookahead: Range = drawn(Range(1, 1), 49, "m", 0.05, 5, "lookahead on the path", "course")
+    lookahead: Range = drawn(Range(1.6, 1.6), *LOOKAHEAD)
     length: Range = drawn(Range(4, 8), 50, "m", 0.5, 40, "length of the path", "course")
     turns: Range = drawn(Range(1, 3), 51, "1", 0, _SEGMENTS - 1, "number of turns", "course", True)
     turn_angle: Range = drawn(Range(0.3, 0.8), 52, "rad", 0, 1.6, "angle of the turns", "course")
