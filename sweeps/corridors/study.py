@@ -184,6 +184,8 @@ class Corridors(Study[xr.DataTree], MultiLawQuestion[xr.DataTree]):
                   title="Failures"),
             Table(lookahead_table(choice), name="corridors_lookaheads",
                   title="Success in corridors by lookahead"),
+            Table(lookahead_table(paths), name="corridors_open",
+                  title="Success on paths by lookahead"),
             Table(error_table(paths), name="corridors_paths", merge="law",
                   title="Cross-track error on paths"),
         ]  # fmt: skip
@@ -223,7 +225,7 @@ def lookahead_table(choice: xr.Dataset) -> Rows:
     started = _started(choice)
     successes, worlds = _counts(started.success.values > 0, _lookahead_index(started))
     spans = [f"{a:.2g} to {b:.2g} m" for a, b in itertools.pairwise(LOOKAHEADS)]
-    rows = [["law", *spans, "chosen"]]
+    rows = [["law", *spans, "best"]]
     for law, by_lookahead in zip(map(str, choice.law.values), successes, strict=True):
         rates = [tables.share(int(k), int(n)) for k, n in zip(by_lookahead, worlds, strict=True)]
         rows.append([law, *rates, f"{best_lookaheads(choice)[law]:g} m"])
@@ -234,7 +236,9 @@ def lookahead_table(choice: xr.Dataset) -> Rows:
 
 
 def _started(results: xr.Dataset) -> xr.Dataset:
-    """Return the worlds that do not begin with the object in a wall."""
+    """Return the worlds that do not begin with the object in a wall; all if there are no walls."""
+    if "wall_touch" not in results:
+        return results
     dims = [dim for dim in results.success.dims if dim != "world"]
     inside = ((results.wall_touch > 0) & (results.time < 0.05)).any(dims)
     return results.isel(world=~inside.values)

@@ -1,0 +1,94 @@
+"""Cost of a simulated second of each task, relative to `reach`.
+
+    rps sweeps/corridors/costs.py
+
+Worlds of all tasks have the same objects and a straight way, and no trial ends early. A new row is
+one entry of `TASKS`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import ClassVar
+
+import jax
+import numpy as np
+import xarray as xr
+
+from rps_jax.control import registry
+from rps_jax.record.options import option
+from rps_jax.runs.question import Run, call_of
+from rps_jax.trials.progress import Progress
+from rps_jax.trials.rollout import Candidates, outcomes
+from rps_jax.trials.setting import Setting
+from rps_jax.trials.trial import Rules
+from rps_jax.world.domain import parse_domain
+from sweeps.study_base import SpeedStudy, Table
+
+_DOMAIN = "wide,objects=random_box,distance=19:20,bearing=0"
+_STRAIGHT = "turns=0,length=20,lookahead=1"
+TASKS = {  # the first is the one to compare with; paths have 8 segments, corridors 16 walls
+    "reach": "reach",
+    "path": f"path,{_STRAIGHT}",
+    "corridor": f"corridor,width=3,{_STRAIGHT}",
+    "corridor, two doors": f"corridor,width=3,doors=2,{_STRAIGHT}",
+}
+
+
+@dataclass(frozen=True)
+class Costs(SpeedStudy[xr.Dataset]):
+    """Measure the cost of a simulated second of each task.
+
+    The answer has `cost` (task, round), in wall-clock seconds per simulated second.
+    """
+
+    TITLE: ClassVar[str] = "Cost of tasks"
+    CHOICES: ClassVar = {"tasks": TASKS}
+    GROWS: ClassVar[tuple[str, ...]] = ("tasks",)
+    PRESETS: ClassVar = {"tasks": TASKS, "domain": _DOMAIN}
+
+    tasks: tuple[str, ...] = tuple(TASKS)
+    """Tasks: reach first, then those to compare with it."""
+    worlds: int = option(512, 1, 10_000_000)
+    """Number of worlds."""
+    horizon: float = option(20.0, above=0, at_most=600, unit="s")
+    """Simulated time of each world [s]."""
+    rounds: int = option(5, 1, 1000)
+    """Number of measurements; the first, with compilation, does not count."""
+    workers: int = option(1, 1, 1024)
+    """Number of threads."""
+
+    def num_trials(self) -> int | None:
+        """Return the number of trials."""
+        return len(self.tasks) * self.worlds * (self.rounds + 1)
+
+    def answer(self, run: Run) -> xr.Dataset:
+        """Measure all tasks in turn, round by round."""
+        setting = Setting("fused", rules=Rules(horizon=self.horizon, max_lost=1e4))
+        params = jax.tree.map(lambda x: np.asarray(x)[None], registry.LAWS["rps"])
+        costs = np.zeros((len(self.tasks), self.rounds + 1))
+        for i in range(self.rounds + 1):
+            for j, name in enumerate(self.tasks):
+                domain = parse_domain(_DOMAIN, None, TASKS[name])
+                request = Candidates(params, [domain], 0, np.arange(self.worlds))
+                _, timing = outcomes([request], setting, workers=self.workers)
+                costs[j, i] = timing.run / timing.simulated
+                done = (i * len(self.tasks) + j + 1) * self.worlds
+                run.callback(Progress(done, timing.simulated))
+        cost = (("task", "round"), costs[:, 1:], {"units": "1"})
+        return xr.Dataset({"cost": cost}, {"task": list(self.tasks)})
+
+    def report_tables(self, results: xr.Dataset) -> Sequence[Table]:
+        """Return the least cost of each task, and its ratio to the first."""
+        least = results.cost.min("round").values
+        ratios = (results.cost / results.cost.isel(task=0)).values
+        rows = [["task", "wall clock per simulated second", "relative to reach", "by round"]]
+        for name, cost, of_task in zip(self.tasks, least, ratios, strict=True):
+            spread = f"{of_task.min():.2f} to {of_task.max():.2f}"
+            rows.append([name, f"{1e6 * cost:.1f} µs", f"{cost / least[0]:.3f}", spread])
+        kind = "cpu" if jax.default_backend() == "cpu" else "gpu"
+        return [Table(rows, name=f"corridors_cost_{kind}", title="Cost of tasks")]
+
+
+costs = call_of(Costs)

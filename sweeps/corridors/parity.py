@@ -1,0 +1,114 @@
+"""Outcomes of tasks in the fused engine, compared with those of converged C MuJoCo.
+
+    rps sweeps/corridors/parity.py --rows path --worlds 30
+
+A new row is one entry of `ROWS`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import ClassVar, NamedTuple
+
+import xarray as xr
+
+from rps_jax.analysis import statistics, tables
+from rps_jax.control import registry
+from rps_jax.record.options import option
+from rps_jax.runs.plan import Plan
+from rps_jax.runs.question import Run, call_of
+from rps_jax.trials.setting import Setting
+from rps_jax.world.domain import parse_domain
+from rps_jax.world.physics import preset
+from sweeps.study_base import Study, Table, run_plans
+
+
+class Row(NamedTuple):
+    """Worlds of one row of the table, and the law in them."""
+
+    task: str = "reach"
+    domain: str = "wide"
+    law: str = "rps_tuned"
+
+
+ROWS = {
+    "reach": Row(),
+    "path": Row("path"),
+    "corridor": Row("corridor"),
+}
+SETTINGS = {
+    "reference": Setting("mujoco", physics=preset(fidelity="reference")),
+    "fused": Setting("fused", physics=preset()),
+}
+
+
+@dataclass(frozen=True)
+class Parity(Study[xr.DataTree]):
+    """Compare the outcomes of tasks in the fused engine with those of converged C MuJoCo.
+
+    The answer is a tree with the outcomes (law, world) of each row in both engines.
+    """
+
+    TITLE: ClassVar[str] = "Tasks in the fused engine and in converged C MuJoCo"
+    CHOICES: ClassVar = {"rows": ROWS}
+    GROWS: ClassVar[tuple[str, ...]] = ("rows",)
+    PRESETS: ClassVar = {"rows": list(ROWS.values()), "settings": SETTINGS}
+
+    rows: tuple[str, ...] = tuple(ROWS)
+    """Rows of the table: reach, path, corridor."""
+    worlds: int = option(300, 1, 10_000_000)
+    """Number of worlds of each row."""
+    seed: int = option(77, 0, 2**32 - 1)
+    """Seed of the worlds."""
+    part: int = option(60, 1, 1_000_000)
+    """Number of trials in a part, the maximum that a kill loses."""
+
+    @cached_property
+    def plans(self) -> dict[str, Plan]:
+        """Plans by row and engine."""
+        return {f"{row} {engine}": self._plan(ROWS[row], engine)
+                for row in self.rows for engine in SETTINGS}  # fmt: skip
+
+    def _plan(self, row: Row, engine: str) -> Plan:
+        """Return the plan of a row in an engine."""
+        label, params = registry.resolve_law(row.law)
+        setting = replace(SETTINGS[engine], seed=self.seed)
+        domain = parse_domain(row.domain, None, row.task)
+        return Plan(domain, self.worlds, {label: params}, setting, self.part)
+
+    def check(self) -> None:
+        """Check the names, and that the engines can step these worlds here."""
+        super().check()
+        for plan in self.plans.values():
+            plan.check_here()
+
+    def num_trials(self) -> int | None:
+        """Return the number of trials."""
+        return sum(plan.num_trials for plan in self.plans.values())
+
+    def answer(self, run: Run) -> xr.DataTree:
+        """Run the missing trials."""
+        return xr.DataTree.from_dict(dict(run_plans(run, self.plans)))
+
+    def intro(self, results: xr.DataTree) -> str:
+        """Describe the worlds."""
+        return f"{self.worlds} worlds, equal in both engines. Intervals: Wilson 95 %."
+
+    def report_tables(self, results: xr.DataTree) -> Sequence[Table]:
+        """Return a row per task: success in both engines, and equal outcomes."""
+        rows = [["task", "worlds", "law", "success in C", "fused", "equal outcomes", "+/-"]]
+        for name in self.rows:
+            reference, fused = (results[f"{name} {x}"].success > 0 for x in SETTINGS)
+            rates = [tables.share(int(x.sum()), x.size) for x in (reference, fused)]
+            equal = tables.share(int((reference == fused).sum()), fused.size)
+            compared = statistics.compare(reference, fused)
+            row = ROWS[name]
+            worlds = f"`{row.domain}`, {fused.size:,}"
+            changes = f"+{compared.gained} -{compared.lost}"
+            rows.append([f"`{row.task}`", worlds, row.law, *rates, equal, changes])
+        return [Table(rows, name="corridors_parity", title="Equal outcomes")]
+
+
+parity = call_of(Parity)
