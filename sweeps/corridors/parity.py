@@ -21,7 +21,7 @@ from rps_jax.runs.plan import Plan
 from rps_jax.runs.question import Run, call_of
 from rps_jax.trials.setting import Setting
 from rps_jax.world.domain import parse_domain
-from rps_jax.world.physics import preset
+from rps_jax.world.physics import PHYSICS, preset
 from sweeps.study_base import Study, Table, run_plans
 
 
@@ -54,7 +54,7 @@ class Parity(Study[xr.DataTree]):
     TITLE: ClassVar[str] = "Tasks in the fused engine and in converged C MuJoCo"
     CHOICES: ClassVar = {"rows": ROWS}
     GROWS: ClassVar[tuple[str, ...]] = ("rows",)
-    PRESETS: ClassVar = {"rows": list(ROWS.values()), "settings": SETTINGS}
+    PRESETS: ClassVar = PHYSICS["default"]
 
     rows: tuple[str, ...] = tuple(ROWS)
     """Rows of the table: reach, path, corridor."""
