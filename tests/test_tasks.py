@@ -197,7 +197,11 @@ def test_walls_change_nothing_until_they_are_touched() -> None:
     domain = parse_domain("wide,objects=random_box")
     wide, narrow, free = (
         rps_jax.sweep("rps", domain, task=task, worlds=8, setting=BRIEF)
-        for task in ("corridor,width=19,turns=0", "corridor,width=1.42", "path,turns=0")
+        for task in (
+            "corridor,width=19,turns=0",
+            "corridor,width=1.42",
+            "path,turns=0,lookahead=0.6",
+        )
     )
     for name in ("time", "path_length", "error_mean", "success"):
         assert wide[name].values == pytest.approx(free[name].values, rel=1e-3, abs=1e-3)
