@@ -32,7 +32,8 @@ from rps_jax.control.laws.force_push import steer
 from rps_jax.control.laws.force_push_published import PublishedForcePushParams
 from rps_jax.control.observation import Details, ForceObservation, Twist
 from rps_jax.engines import EngineName
-from rps_jax.geometry import planar, solid
+from rps_jax.geometry import planar, polyline, solid
+from rps_jax.geometry.polyline import Polyline
 from rps_jax.geometry.solid import Solid
 from rps_jax.robot.base import LoadCell, Odometry
 from rps_jax.robot.robot import Robot
@@ -69,14 +70,30 @@ _MASS, _HALF, _HEIGHT = 1.0, 0.5, 0.12  # [kg, m, m] of both sliders
 _BEHIND = 0.5  # [m] of the pusher behind the point of contact, at the start
 _MAX_DISTANCE, _SILENT = 2.0, 20.0  # [m, s] at which a push has failed
 _LEAST_FRICTION = 1e-3  # [1]
+_LEAD, _END, _ARC = 3.0, 100.0, 37  # [m] of a path before its turn and in all; points of a turn
+_REACH, _TANGENT = 1.0, 0.05  # [m] in which the nearest point is sought; beside it, of a direction
 _POINT = 0.01  # [m] half length and width of the base
 _SEGMENT, _LOOK = 1000, 50  # control steps of a call of the program, and between two looks
 _ROBOT = Robot(_POINT, _POINT, (Boards("front", 1, 2 * _POINT / 3),))
 
 
+def curve(radius: float, length: float) -> np.ndarray:
+    """Return the vertices (N, 2) [m] of a path: 3 m ahead, a quarter of a circle, straight on.
+
+    The authors' script has a radius of 2 m. An infinite radius is the x axis.
+    """
+    if math.isinf(radius):
+        return np.array([[0.0, 0.0], [length, 0.0]])
+    angle = np.linspace(0, math.pi / 2, _ARC)
+    arc = (_LEAD, 0.0) + radius * np.stack([np.sin(angle), 1 - np.cos(angle)], axis=-1)
+    end = arc[-1] + (0.0, length - _LEAD - radius * math.pi / 2)
+    return np.concatenate([[(0.0, 0.0)], arc, [end]])
+
+
 class FollowingState(NamedTuple):
     """State of the controller and the criterion of its trial."""
 
+    arc: jax.Array  # () [m] of the path, of the point nearest to the contact
     theta_p: jax.Array  # () [rad] of the last push, relative to the path
     pushed: jax.Array  # () bool: a force has been felt
     clock: jax.Array  # () [s] since then
@@ -84,15 +101,18 @@ class FollowingState(NamedTuple):
     longest: jax.Array  # () [s] without a force, the longest time
 
 
-def build_law(law: LawName = "force_push", duration: float = DURATION) -> Law:
-    """Return a law of a point at the base's origin, which follows the world's x axis.
+def build_law(
+    law: LawName = "force_push", duration: float = DURATION, radius: float = math.inf
+) -> Law:
+    """Return a law of a point at the base's origin, which follows the `curve` of a radius [m].
 
     The point stops `duration` [s] after the first contact.
     """
+    line: Any = jax.tree.map(jnp.asarray, Polyline.through(curve(radius, _END)))
 
     def init(params: PublishedForcePushParams) -> FollowingState:
         zero = jnp.zeros_like(jnp.asarray(params.v_max, float))
-        return FollowingState(zero, jnp.zeros((), bool), zero, zero, zero)
+        return FollowingState(zero, zero, jnp.zeros((), bool), zero, zero, zero)
 
     def step(
         params: PublishedForcePushParams, state: FollowingState, observation: ForceObservation
@@ -102,21 +122,28 @@ def build_law(law: LawName = "force_push", duration: float = DURATION) -> Law:
         f_world = -planar.rotate(touch.yaw, observation.f_robot)
         felt = planar.norm(f_world) >= params.f_min
         pushed = state.pushed | felt
-        offset = touch.p_world_robot[1]
+        # As theirs, the nearest point moves only forward.
+        arc, _ = polyline.nearest(line, touch.p_world_robot, state.arc, state.arc + _REACH)
+        ahead, behind = (polyline.at_arc(line, arc + step) for step in (_TANGENT, -_TANGENT))
+        theta_d = planar.direction(ahead - behind)
+        normal = jnp.stack([-jnp.sin(theta_d), jnp.cos(theta_d)])
+        offset = jnp.sum((touch.p_world_robot - polyline.at_arc(line, arc)) * normal)
         if law == "force_push":
-            theta_f, limit = planar.wrap(planar.direction(f_world)), params.converge * period
+            theta_f = planar.wrap(planar.direction(f_world) - theta_d)
+            limit = params.converge * period
             theta_p = steer(params, state.theta_p, theta_f, offset, limit, felt)
         else:
             theta_p = -params.k_y * offset
         theta_p = jnp.where(pushed, theta_p, 0.0)
-        v_world = params.v_max * jnp.stack([jnp.cos(theta_p), jnp.sin(theta_p)])
+        angle = theta_d + theta_p
+        v_world = params.v_max * jnp.stack([jnp.cos(angle), jnp.sin(angle)])
         v_robot = planar.rotate(-touch.yaw, force_push.yield_to_force(params, v_world, f_world))
         going = state.clock < duration
         v_robot = jnp.where(going, v_robot, 0.0)
         silent = jnp.where(felt, 0.0, state.silent + period)
         longest = jnp.where(going, jnp.maximum(state.longest, silent), state.longest)
         clock = state.clock + jnp.where(pushed, period, 0.0)
-        state = FollowingState(theta_p, pushed, clock, silent, longest)
+        state = FollowingState(arc, theta_p, pushed, clock, silent, longest)
         return state, Twist(v_robot[0], v_robot[1], zero), Details.from_obs(touch)
 
     exact = LoadCell(noise=0.0, time_constant=0.05, threshold=0.0)
@@ -208,6 +235,7 @@ def run_grid(
     slider: SliderName,
     engine: EngineName = "fused",
     duration: float = DURATION,
+    radius: float = math.inf,
     *,
     callback: ProgressCallback = no_progress,
 ) -> xr.Dataset:
@@ -218,25 +246,31 @@ def run_grid(
       slider: box, cylinder.
       engine: what steps them, of those that tell the contact's force to a compiled program.
       duration: [s] from the first contact.
+      radius: [m] of the turn of the path.
       callback: called after every 10 s that were simulated.
 
     Returns:
       Over (inertia, friction, lateral, angle, contact): `success` by their criterion; `silent` [s],
       the longest time without a force; `apart` [m], the farthest the pusher was from the slider's
       middle; `deviation` [m] of the slider from the path at the end; and `completion` [1], the way
-      along the path that was made good, of an ideal pusher's.
+      along the path that was made good, of an ideal pusher's; `error_mean` and `error_95` [m], mean
+      and 95 % quantile of the pusher's distance from the path, from the contact on.
     """
-    grid, law = cells(), build_law(name, duration)
+    grid, law = cells(), build_law(name, duration, radius)
     batch = worlds(slider, grid, engine)
     period, count = PHYSICS.control_period, grid.angle.size
     horizon = duration + 2 * _BEHIND / float(PARAMS.v_max)
     loop = ControlLoop(PHYSICS, Rules(horizon=2 * horizon, max_lost=1e6), law)
     trials = trial.start_all(*batch.inputs, np.ones(count, bool), law=law)
+    line: Any = Polyline.through(curve(radius, _END))
+    away_from = jax.jit(jax.vmap(jax.vmap(_distance, (None, 0)), (None, 0)))
+    errors: list[np.ndarray] = []  # [m] (n,) of the pusher
     apart, steps, start_time, waited = np.zeros(count), 0, time.perf_counter(), 0.0
     while steps * period < horizon:
         inputs = batch.stage, *batch.inputs, trials, loop
         trials, snapshots = trial.record(*inputs, steps=_SEGMENT, stride=_LOOK)
         away = np.asarray(snapshots.qpos[..., 3:5] - snapshots.qpos[..., :2])
+        errors += list(np.asarray(away_from(line, snapshots.qpos[..., :2])))
         apart = np.maximum(apart, np.hypot(*np.moveaxis(away, -1, 0)).max(axis=0))
         waited = waited or time.perf_counter() - start_time  # of the first segment
         steps += _SEGMENT
@@ -246,12 +280,17 @@ def run_grid(
     path_length = float(PARAMS.v_max) * duration
     failed = (apart > _MAX_DISTANCE) | (state.longest > _SILENT) | ~state.pushed
     failed |= np.asarray(trials.tipped | trials.diverged)
-    completion = 1 - np.hypot(end[:, 0] - path_length, end[:, 1]) / path_length
+    ideal = np.asarray(polyline.at_arc(line, jnp.asarray(path_length)))
+    completion = 1 - np.hypot(*(end - ideal).T) / path_length
+    first, period = int(_BEHIND / float(PARAMS.v_max) / period / _LOOK), period * _LOOK
+    error = np.array(errors)[first : first + int(duration / period)]
     columns = {
         "success": ((~failed).astype(np.int8), "1"),
         "silent": (state.longest.astype(float), "s"),
         "apart": (apart, "m"),
-        "deviation": (end[:, 1], "m"),
+        "deviation": (np.asarray(away_from(line, end[None])[0]), "m"),
+        "error_mean": (error.mean(axis=0), "m"),
+        "error_95": (np.quantile(error, 0.95, axis=0), "m"),
         "completion": (completion, "1"),
     }
     coords = dict(zip(DIMS, map(list, _VALUES), strict=True))
@@ -261,6 +300,11 @@ def run_grid(
         coords,
         {"engine": engine, "duration": duration},
     )
+
+
+def _distance(line: Polyline, point: jax.Array) -> jax.Array:
+    """Return the distance () [m] of a point (2,) [m] from a path."""
+    return polyline.nearest(line, point, 0.0, jnp.inf)[1]
 
 
 def table(results: xr.Dataset) -> Rows:
