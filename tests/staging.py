@@ -21,11 +21,15 @@ from rps_jax.geometry import vectors as sp
 from rps_jax.robot.robot import Robot
 from rps_jax.world import scene
 from rps_jax.world.physics import Physics, preset
-from rps_jax.world.scene import FRICTION, Friction, Scene, WorldInputs
+from rps_jax.world.scene import FRICTION, Friction, Scene, Surroundings, WorldInputs
 
 
 def staged(
-    engine: str, scenes: Sequence[Scene], physics: Physics, robot: Robot = Robot()
+    engine: str,
+    scenes: Sequence[Scene],
+    physics: Physics,
+    robot: Robot = Robot(),
+    surroundings: Surroundings = Surroundings(),
 ) -> tuple[Any, Any]:
     """Return stage and fields of worlds in scenes of one shape family."""
     pairs = [[loaded.physics.pair(i) for i in range(loaded.physics.npair)] for loaded in scenes]
@@ -34,9 +38,8 @@ def staged(
         *(np.array([world[name] for world in slide]) for name in ("ground", "base"))
     )
     solids = solid.stack([loaded.solid for loaded in scenes])
-    return engines.get(engine).stage(
-        WorldInputs(scenes[0].family, solids, friction, physics, robot)
-    )
+    columns = solids, friction, physics, robot, surroundings
+    return engines.get(engine).stage(WorldInputs(scenes[0].family, *columns))
 
 
 def recompiled(engine: str, scenes: Sequence[Scene]) -> Any:
@@ -142,7 +145,7 @@ def simulate(
     qvel = np.zeros((count, 9)) if qvel is None else qvel
     twist = np.broadcast_to(np.asarray(twist, float), (count, 3))
     if not engines.get(engine).traced:
-        batch = Batch(stage, qpos, 2, robots)
+        batch = Batch(stage, qpos, 2, robots, **fields)
         batch.qvel[:] = qvel
         states = [(batch.qpos.copy(), batch.qvel.copy(), batch.force.copy())]
         for _ in range(periods):

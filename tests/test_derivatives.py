@@ -167,7 +167,9 @@ def test_a_kink_of_the_world_has_no_derivative_and_is_told():
 
 
 def test_the_table_of_names_is_that_of_the_code():
-    table = re.findall(r"^\| (?:object|task|skin|base|robot) \| (.*?) \|", README, re.MULTILINE)
+    table = re.findall(
+        r"^\| (?:object|floor|task|skin|base|robot) \| (.*?) \|", README, re.MULTILINE
+    )
     names = {name for line in table for name in re.findall(r"`(\w+)`", line)}
     smooth = {
         name

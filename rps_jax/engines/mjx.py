@@ -17,7 +17,7 @@ import numpy as np
 from rps_jax.control.observation import Twist
 from rps_jax.engines import mjx_gradients
 from rps_jax.engines.base import ControlPeriod, Driven, Engine, Motion
-from rps_jax.engines.mjx_colliders import collision, constraint, forward, mjx, smooth
+from rps_jax.engines.mjx_colliders import Extra, collision, constraint, forward, mjx, smooth
 from rps_jax.engines.mujoco import compile_rows
 from rps_jax.geometry import planar
 from rps_jax.robot import drive as drives
@@ -36,6 +36,7 @@ FIELDS = (
 
 # Field of prisms on explicit feet: (N, 2) [m]; other prisms stand on their outline.
 OUTLINE = "outline"
+BOUNDARY = "boundary"  # field of floors with two frictions: (4,) as of `Surroundings`
 
 
 class MJXStage(NamedTuple):
@@ -86,14 +87,14 @@ class MJXStage(NamedTuple):
             data, integral = data.replace(qfrc_applied=applied), jnp.stack(servo)
         data = data.replace(qpos=qpos, qvel=qvel, qacc_warmstart=warmstart)
         with jax.default_matmul_precision("float32"):  # GPUs would round products to TF32
-            data = step(model, data, fields.get(OUTLINE))
+            data = step(model, data, fields.get(OUTLINE), fields.get(BOUNDARY))
         wrench = data.qfrc_constraint[JOINTS.base]  # of the contacts, without the drive
         wrench = wrench.at[:2].set(planar.rotate(-qpos[2], wrench[:2]))
         return Motion(data.qpos, data.qvel, data.qacc_warmstart, integral), wrench
 
 
-def step(model: mjx.Model, data: mjx.Data, outline: jax.Array | None = None) -> mjx.Data:
-    """Compute one step by functions of MJX and our colliders, with a prism's outline (N, 2).
+def step(model: mjx.Model, data: mjx.Data, *extra: Extra) -> mjx.Data:
+    """Compute one step by functions of MJX and our colliders; `extra` is that of `collision`.
 
     Unused features are left out: tendons, actuators, sensors, springs, dampers, cameras and lights.
     As in C MuJoCo, without dampers no velocity is integrated implicitly.
@@ -102,7 +103,7 @@ def step(model: mjx.Model, data: mjx.Data, outline: jax.Array | None = None) -> 
     data = smooth.com_pos(model, data)
     data = smooth.crb(model, data)
     data = smooth.factor_m(model, data)
-    data = collision(model, data, outline)
+    data = collision(model, data, *extra)
     data = constraint.make_constraint(model, data)
     data = smooth.com_vel(model, data)
     data = smooth.rne(model, data)
@@ -118,6 +119,7 @@ class MJX(Engine):
 
     name = "mjx"
     modes = ("forward", "reverse")
+    surroundings = ("slope", "boundary")
 
     def stage(self, inputs: WorldInputs) -> tuple[MJXStage, dict[str, np.ndarray]]:
         """Return the stage of the first of the worlds, and fields (n, ...) of all."""
@@ -126,6 +128,9 @@ class MJX(Engine):
         fields = {name: np.stack([row[name] for row in rows]) for name in FIELDS}
         if inputs.solids.feet is not None:
             fields[OUTLINE] = inputs.solids.vertices
+        slope, boundary, *_ = inputs.surroundings
+        fields |= {} if slope is None else {".opt.gravity": slope}
+        fields |= {} if boundary is None else {BOUNDARY: boundary}
         return MJXStage(put(template), mjx.make_data(template)), fields
 
     def slots(self, backend: str) -> int:

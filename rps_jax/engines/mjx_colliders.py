@@ -127,6 +127,7 @@ def upright(model: Model, data: Data, prism: int, corners: jax.Array) -> Collisi
     )
 
 
+Extra = jax.Array | None  # numbers of a world that a model lacks
 Pair = tuple[GeomType, GeomType]
 # Each has the number of points of MJX's collider of the pair, for which `Data` has space.
 COLLIDERS: dict[Pair, Any] = {
@@ -138,10 +139,11 @@ COLLIDERS: dict[Pair, Any] = {
 }
 
 
-def collision(model: Model, data: Data, outline: jax.Array | None = None) -> Data:
+def collision(model: Model, data: Data, outline: Extra = None, boundary: Extra = None) -> Data:
     """Compute the contacts of a world as `mjx.collision` does, with our colliders first.
 
-    The `outline` (N, 2) [m] is that of a prism; by default it has that of its feet.
+    The `outline` (N, 2) [m] is that of a prism; by default it has that of its feet. A `boundary`
+    (4,) of the floor, as of `Surroundings`, changes the friction of contacts beyond it.
     """
     contacts = []
     for key, contact in collision_driver._contact_groups(model, data).items():
@@ -153,6 +155,10 @@ def collision(model: Model, data: Data, outline: jax.Array | None = None) -> Dat
         distance, point, frame = collide(model, data, key, contact.geom)
         count = default.ncon
         contact = jax.tree.map(lambda x, n=count: jnp.repeat(x, n, axis=0), contact)
+        if boundary is not None and pair[0] == GeomType.PLANE:
+            beyond = (point[..., :2] @ boundary[:2] > boundary[2]).reshape(-1, 1)
+            slide = contact.friction.at[:, :2].multiply(jnp.where(beyond, boundary[3], 1.0))
+            contact = contact.replace(friction=slide)
         contacts.append(contact.replace(dist=distance, pos=point, frame=frame))
     whole = jax.tree.map(lambda *x: jnp.concatenate(x), *contacts)
     return data.tree_replace({"_impl.contact": whole})  # pyright: ignore[reportReturnType]

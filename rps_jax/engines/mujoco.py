@@ -44,6 +44,7 @@ class Batch:
         qpos: np.ndarray,
         threads: int,
         robots: Robot | None = None,
+        boundary: np.ndarray | None = None,
     ):
         """Start from positions (n, 10) at rest.
 
@@ -52,6 +53,7 @@ class Batch:
           qpos: positions (n, 10).
           threads: of the pool.
           robots: (n,) with a limited force, if any.
+          boundary: (n, 4) of the floors, if they have one: see `Surroundings`.
         """
         self.models = [_without_reset(model) for model in models]
         nq, nv = models[0].nq, models[0].nv
@@ -67,6 +69,11 @@ class Batch:
         self.integral = None if robots is None else np.zeros((len(models), 3))
         self.force = np.zeros((len(models), 3))
         self._inertia = np.array([model.dof_M0[JOINTS.base] for model in models])
+        # [N, N, N m] of gravity on the bases along a sloping floor
+        self._weight = np.array([[*m.body("base").mass * m.opt.gravity[:2], 0] for m in models])
+        self._boundary = boundary
+        self._ground = np.flatnonzero(models[0].pair_geom1 == models[0].geom("ground").id)
+        self._friction = np.array([model.pair_friction[self._ground, :2] for model in models])
         self._timestep = models[0].opt.timestep
         self._data = [mujoco.MjData(models[0]) for _ in range(threads)]
         self._pool = rollout.Rollout(nthread=threads)
@@ -80,6 +87,8 @@ class Batch:
         The velocity is written once, for the heading at half of the period. The other engines use
         the heading at the start of each step, half a step earlier: less than 0.001 rad.
         """
+        if self._boundary is not None:
+            self._set_friction(rows, np.asarray(self._boundary))
         if self._robots is not None:
             self._push(rows, twist, substeps)
             return
@@ -96,7 +105,7 @@ class Batch:
         change = states[:, -1, 1 + nq :] - previous[:, 1 + nq :]
         # Only contact changes the velocity of the base, by a small amount: that gives its force.
         gained = states[:, -1, 1 + nq :][:, JOINTS.base] - state[:, 1 + nq :][:, JOINTS.base]
-        wrench = self._inertia[rows] * gained / (substeps * self._timestep)
+        wrench = self._inertia[rows] * gained / (substeps * self._timestep) - self._weight[rows]
         self.force[rows] = _in_base(wrench, (c, s))
         self.state[rows], self.warmstart[rows] = states[:, -1], change / self._timestep
 
@@ -117,11 +126,25 @@ class Batch:
             following = self._rollout(rows, state, warmstart, control=applied, nstep=1)[:, -1]
             warmstart = (following[:, 1 + nq :] - qvel) / dt
             contact = self._inertia[rows] * warmstart[:, JOINTS.base] - np.stack(force, axis=1)
+            contact -= self._weight[rows]
             wrench += _in_base(contact, turn) / substeps
             state = following
         self.state[rows], self.warmstart[rows] = state, warmstart
         self.integral[rows] = np.stack(integral, axis=1)
         self.force[rows] = wrench
+
+    def _set_friction(self, rows: np.ndarray, boundary: np.ndarray) -> None:
+        """Set the friction of each foot of the worlds `rows` by its side of the boundary.
+
+        It holds for one control period, in which a foot moves by a millimetre.
+        """
+        for i, (*normal, border, factor) in zip(rows, boundary[rows], strict=True):
+            model, data = self.models[i], self._data[0]
+            data.qpos[:] = self.qpos[i]
+            mujoco.mj_kinematics(model, data)
+            feet = data.geom_xpos[model.pair_geom2[self._ground], :2]
+            factors = np.where(feet @ normal > border, factor, 1.0)[:, None]
+            model.pair_friction[self._ground, :2] = self._friction[i] * factors
 
     def _rollout(
         self, rows: np.ndarray, state: np.ndarray, warmstart: np.ndarray, **options: Any
@@ -161,6 +184,7 @@ class MuJoCo(Engine):
 
     name = "mujoco"
     traced = False
+    surroundings = ("slope", "boundary")
 
     def suits_processors(self, trials: int | None) -> bool:
         """Return True: it steps worlds on the host."""
@@ -168,7 +192,8 @@ class MuJoCo(Engine):
 
     def stage(self, inputs: WorldInputs) -> tuple[list[mujoco.MjModel], dict[str, np.ndarray]]:
         """Return the models of the worlds; equal worlds share one."""
-        return compile_rows(inputs), {}
+        boundary = inputs.surroundings.boundary
+        return compile_rows(inputs), {} if boundary is None else {"boundary": boundary}
 
 
 ENGINE = MuJoCo()

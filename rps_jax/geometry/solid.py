@@ -246,10 +246,15 @@ def encloses(points: np.ndarray, at: np.ndarray) -> np.ndarray:
 
 
 def standing(solid: Solid) -> Solid:
-    """Return prisms with explicit feet: their corners, if they have no feet yet."""
+    """Return solids with explicit feet: without any, at their corners, or SIDES on a rim."""
     if solid.feet is not None:
         return solid
+    solid = solid._replace(vertices=padded(solid.vertices))
     at, share = support(solid)
+    if solid.vertices.shape[-2] == 1:
+        angle = 2 * np.pi * np.arange(SIDES) / SIDES
+        at = solid.radius[..., None, None] * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+        share = np.ones(at.shape[:-1])
     return solid._replace(feet=np.concatenate([at, share[..., None]], axis=-1))
 
 

@@ -66,7 +66,7 @@ class Plan:
 
     def check_here(self) -> None:
         """Raise InputError unless the engine can step these worlds on this machine."""
-        self.setting.check_here(self.domain.weakest, self.laws.values())
+        self.setting.check_domain(self.domain, self.laws.values())
 
     @property
     def num_trials(self) -> int:

@@ -462,7 +462,7 @@ class DomainQuestion(TaskOption, SimulationQuestion[T]):
 
     def check_engine(self, laws: Sequence[LawParams] = ()) -> None:
         """Raise InputError unless the engine can step these worlds with these laws here."""
-        self.setting.check_here(self.ranges.weakest, laws)
+        self.setting.check_domain(self.ranges, laws)
 
 
 # --- small helpers of reports --------------------------------------------------------------

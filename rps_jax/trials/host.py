@@ -41,7 +41,7 @@ def run(
     trials = trial.start_all(worlds, params, np.ones(len(worlds.qpos), bool), law=loop.law)
     dtype, robot = trials.qpos.dtype, trial.pushing(worlds)
     start = np.asarray(trials.qpos, float)
-    with contextlib.closing(Batch(models, start, threads, robot)) as batch:
+    with contextlib.closing(Batch(models, start, threads, robot, **worlds.fields)) as batch:
         while not np.asarray(trials.done).all():
             decided, twist, snapshot = _decide(worlds, params, trials, loop)
             qpos = np.asarray(decided.qpos)

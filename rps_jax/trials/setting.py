@@ -14,6 +14,7 @@ from rps_jax.record import options
 from rps_jax.robot.robot import Robot
 from rps_jax.trials.trial import Rules
 from rps_jax.world import physics as physics_
+from rps_jax.world.domain import Domain
 from rps_jax.world.physics import Fidelity, Physics
 
 
@@ -69,6 +70,11 @@ class Setting:
         engine.check_robot(robot)
         for params in laws:
             engine.check_senses(registry.law_of(params).senses)
+
+    def check_domain(self, domain: Domain, laws: Iterable[LawParams] = ()) -> None:
+        """Raise InputError unless the engine can step the worlds of a domain with these laws."""
+        engines.get(self.engine).check_surroundings(domain.surroundings)
+        self.check_here(domain.weakest, laws)
 
     def to_json(self) -> dict[str, Any]:
         """Return the setting as manifests have it; `from_json` reads it."""

@@ -68,7 +68,7 @@ def draw_worlds(
         rule = "worlds of one program have one object; name it, as wide,objects=random_box"
         raise errors.not_allowed("domain objects", ranges.objects, rule)
     engines.get(setting.engine).check_traced()
-    setting.check_here(ranges.weakest)
+    setting.check_domain(ranges)
     drawn = draws.draw(ranges, setting.seed, np.arange(worlds))
     return drawn_worlds(ranges, drawn, setting)
 

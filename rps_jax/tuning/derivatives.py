@@ -135,7 +135,7 @@ def value_and_grad(
     steps, engine = count_steps(horizon, setting), engines.get(setting.engine)
     engine.check_traced()
     engine.check_derivatives("reverse", setting.physics)
-    setting.check_here(ranges.weakest, chosen.values())
+    setting.check_domain(ranges, chosen.values())
     loops = [control_loop(params, setting, smooth=smooth) for params in chosen.values()]
     several = [coordinates_of(wrt, params, ranges) for params in chosen.values()]
     if any(coordinates != several[0] for coordinates in several):
@@ -235,7 +235,7 @@ def coordinates_of(
                 rule = "it has no derivative: worlds change in steps with it, or a path does"
             elif name in domain.idle - {"friction_ground", "friction_robot"}:
                 rule = f"the domain's objects, targets or skin leave no {name} to draw"
-            elif quantity and getattr(domain, name) is None:
+            elif quantity and domain.range_of(name) is None:
                 rule = f"the domain draws none; append ,{name}=LOW:HIGH to its name"
             if rule:
                 raise errors.not_allowed("wrt", name, rule)

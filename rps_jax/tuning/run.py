@@ -161,7 +161,7 @@ class Tuning(TaskOption, LawQuestion[xr.Dataset]):
             rule = f"its parameters have no bounds; choose from {', '.join(names)}"
             raise errors.not_allowed("law", self.label, rule)
         for domain in self.domains:
-            self.setting.check_here(domain.weakest, [self.space.base])
+            self.setting.check_domain(domain, [self.space.base])
 
     def fields_as_json(self) -> dict[str, Any]:
         """Fields as JSON, with the names of all tuned parameters and the ranges of all domains."""

@@ -16,7 +16,7 @@ from rps_jax.robot.robot import Robot, RobotLike, parse_robot
 from rps_jax.world import paper, scene, tasks
 from rps_jax.world.objects import FAMILIES, OBJECTS, PAPER_OBJECTS
 from rps_jax.world.quantity import Owner, Quantity, Range, check_ranges, declared, drawn, range_of
-from rps_jax.world.scene import FRICTION, Friction
+from rps_jax.world.scene import FRICTION, Friction, Surroundings
 from rps_jax.world.tasks import Task, TaskLike, parse_task
 from rps_jax.world.tasks.reach import Reach
 
@@ -24,6 +24,11 @@ from rps_jax.world.tasks.reach import Reach
 def limit(*declaration: Any) -> Any:
     """Declare a drawn limit of the robot, which has its own value by default."""
     return drawn(None, *declaration, "robot")
+
+
+def floor(*declaration: Any) -> Any:
+    """Declare a drawn quantity of the floor, which is level and uniform by default."""
+    return drawn(None, *declaration, "floor")
 
 
 def robot_field(name: str) -> str:
@@ -64,6 +69,13 @@ class Domain:
     friction_ground: Range = drawn(Range(0.1, 0.7), 6, "1", _POSITIVE, 10, "friction object-ground")
     friction_robot: Range = drawn(Range(0.1, 0.8), 7, "1", _POSITIVE, 10, "friction object-robot")
     frictions: tuple[Friction, ...] = ()
+    # The floor; None: level and uniform. It falls in a direction of the world (None: in any).
+    slope: Range | None = floor(61, "rad", 0, 0.105, "slope of the floor")
+    slope_bearing: Range | None = floor(62, "rad", -math.pi, math.pi, "downhill bearing")
+    # Factor of the object's friction with the ground beyond a line. The line is at right angles to
+    # the direction from the base to the end of the trial, at this share of it (None: at any).
+    boundary_factor: Range | None = floor(63, "1", 0.05, 20, "factor of friction at the boundary")
+    boundary: Range | None = drawn(None, 39, "1", 0, 1, "boundary, of the way", "floor", True)
     # The task: object and target at the start, in the frame of the base.
     lateral: Range = drawn(Range(-0.12, 0.12), 8, "m", -0.5, 0.5, "lateral offset", "task")
     yaw: Range = drawn(Range(-0.6, 0.6), 9, "rad", -math.pi, math.pi, "yaw of the object", "task")
@@ -118,6 +130,9 @@ class Domain:
         if self.feet is not None and not set(self.objects) <= set(RANDOM):
             objects = f"{self.feet} with objects = {self.objects}"
             raise errors.not_allowed("domain feet", objects, "only random objects have drawn feet")
+        for name, owner in _IMPLIED.items():
+            if getattr(self, name) is not None and getattr(self, owner) is None:
+                raise errors.not_allowed(f"domain {name}", getattr(self, name), f"give {owner} too")
         self.robot.check()
         if len(self.targets):
             self.task.check_target("domain targets", self.targets, "leave them out")
@@ -144,7 +159,15 @@ class Domain:
 
     def range_of(self, name: str) -> Range | None:
         """Return the range of a quantity, of the domain itself or of its task; None: not drawn."""
-        return getattr(self if name in _DECLARED else self.task, name, None)
+        interval = getattr(self if name in _DECLARED else self.task, name, None)
+        if interval is None and name in _IMPLIED and getattr(self, _IMPLIED[name]) is not None:
+            return Range(QUANTITIES[name].low, QUANTITIES[name].high)
+        return interval
+
+    @property
+    def surroundings(self) -> Surroundings:
+        """Ranges of what surrounds the objects; None for what no world has."""
+        return Surroundings(self.slope, self.boundary_factor)
 
     @property
     def weakest(self) -> Robot:
@@ -188,8 +211,9 @@ class Domain:
     @property
     def families(self) -> tuple[str, ...]:
         """Shape family of each of `objects`."""
-        known = FAMILIES | RANDOM | ({} if self.feet is None else {"random_box": "prism"})
-        return tuple(known[name] for name in self.objects)
+        names = [(FAMILIES | RANDOM)[name] for name in self.objects]
+        on_feet = self.feet is not None or self.boundary_factor is not None
+        return tuple("prism" if on_feet and name == "box" else name for name in names)
 
     def family_of(self, index: int) -> str:
         """Return the shape family of the object of one world."""
@@ -198,6 +222,8 @@ class Domain:
 
 RANDOM = {"random_box": "box", "random_cylinder": "cylinder", "random_prism": "prism"}
 _DECLARED = declared(Domain)
+# Quantities that another one requires; without a range, they are anywhere within their bounds.
+_IMPLIED = {"slope_bearing": "slope", "boundary": "boundary_factor"}
 QUANTITIES: dict[str, Quantity] = _DECLARED | tasks.QUANTITIES
 
 

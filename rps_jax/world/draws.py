@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from rps_jax.geometry import solid
-from rps_jax.geometry.solid import SIDES, Solid
+from rps_jax.geometry.solid import GRAVITY, SIDES, Solid
 from rps_jax.robot.robot import Robot
 from rps_jax.world import scene, tasks
 from rps_jax.world.domain import (
@@ -114,10 +114,13 @@ def draw_at(
     inputs = CourseInputs(u, _targets(domain, index, at), front)
     targets, course = domain.task.courses(inputs)
     key = [np.floor(u[name] * 2**32).astype(np.uint32) for name in ("key_0", "key_1")]
+    solids, surroundings = _solid(name, at, u), _surroundings(at, targets)
+    if surroundings.boundary is not None:  # each foot has the friction of its side
+        solids = solid.standing(solids)
     return Draw(
         indices=index,
         cases=index,
-        solid=_solid(name, at, u),
+        solid=solids,
         friction=Friction(at["friction_ground"], at["friction_robot"]),
         values={name: values for name, values in at.items() if name in ranges}
         | domain.task.measures(course),
@@ -126,6 +129,7 @@ def draw_at(
         velocity_error=np.stack([at[name] for name in VELOCITY_ERRORS], axis=-1),
         robot=robot,
         key=np.stack(key, axis=-1),
+        surroundings=surroundings,
     )
 
 
@@ -189,6 +193,20 @@ def _robots(robot: Robot, at: dict[str, np.ndarray], count: int) -> Robot:
     bounds = {name: getattr(robot, name) for name in ("v_max", "acceleration_max")}
     several = {name: np.asarray(x, float) for name, x in bounds.items() if x is not None}
     return replace(scene.repeat_robot(replace(robot, **several), count), **limits)
+
+
+def _surroundings(at: dict[str, np.ndarray], targets: np.ndarray) -> Surroundings:
+    """Return slopes and boundaries of worlds with these quantities and targets (n, 2) [m]."""
+    slope = boundary = None
+    if "slope" in at:
+        angle, bearing = at["slope"], at["slope_bearing"]
+        along = np.sin(angle) * np.array([np.cos(bearing), np.sin(bearing)])
+        slope = GRAVITY * np.column_stack([*along, -np.cos(angle)])
+    if "boundary_factor" in at:
+        way = np.linalg.norm(targets, axis=1)
+        normal = targets.T / np.maximum(way, 1e-9)
+        boundary = np.column_stack([*normal, at["boundary"] * way, at["boundary_factor"]])
+    return Surroundings(slope, boundary)
 
 
 def _targets(domain: Domain, index: np.ndarray, at: dict[str, np.ndarray]) -> np.ndarray:

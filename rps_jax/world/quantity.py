@@ -28,7 +28,7 @@ class Range(NamedTuple):
         return self.low + u * (self.high - self.low)
 
 
-Owner = Literal["object", "task", "course", "skin", "base", "robot"]  # of a quantity
+Owner = Literal["object", "floor", "task", "course", "skin", "base", "robot"]  # of a quantity
 
 
 class Quantity(NamedTuple):

@@ -40,7 +40,7 @@ FRICTION = {"S1": Friction(0.3, 0.35), "S2": Friction(0.2, 0.5)}  # Table I
 class Surroundings(NamedTuple):
     """Surroundings of n worlds other than a level, uniform floor; None where absent."""
 
-    gravity: Any = None  # (n, 3) [m/s^2] in the frame of the floor, of a slope
+    slope: Any = None  # (n, 3) [m/s^2] gravity in the frame of a floor that is not level
     # (n, 4) unit normal of a line on the floor, its distance from the origin [m], and the factor
     # [1] of the ground's friction beyond it
     boundary: Any = None
@@ -176,6 +176,8 @@ def compile_solid(
     body.explicitinertial = True
     body.mass, body.ipos = single.mass, single.p_object_com
     body.iquat, body.inertia = single.q_object_body, single.inertia
+    if around.slope is not None:
+        spec.option.gravity = around.slope
     models = _compile(spec, physics, friction, robot)
     return Scene(family, family, *models, single, robot.shell)
 

@@ -27,6 +27,7 @@ class Fused(Engine):
     name = "fused"
     side_by_side = True
     modes = ("forward", "reverse")
+    surroundings = ("slope", "boundary")
 
     def stage(self, inputs: WorldInputs) -> tuple[FusedStage, Body]:
         """Return the stage, and the bodies (n, ...) of the worlds."""
@@ -56,6 +57,8 @@ class Fused(Engine):
             base_invweight=np.broadcast_to(base_invweight, solids.mass.size),
             base_size=scene.base_size(robots, solids.mass.size),
             base_z=np.broadcast_to(base_z, (solids.mass.size, 2)),
+            gravity=inputs.surroundings.slope,
+            boundary=inputs.surroundings.boundary,
         )
         if solids.feet is not None:
             feet = lower(solids.feet[..., :2])

@@ -45,6 +45,9 @@ class Body(NamedTuple):
     base_z: Entries  # (2,) [m] heights of the base's lower and upper edge
     feet: Entries = None  # (N, 3) [m] of a prism that does not stand on its vertices; later a `Vec`
     bears: Entries = None  # (N, 1) [1] 1 for a foot, 0 for an unused entry
+    gravity: Entries = None  # (3,) [m/s^2] of a floor that is not level
+    # (4,) unit normal of a line, its distance [m], and the factor [1] of the friction beyond it
+    boundary: Entries = None
 
 
 class Corners(NamedTuple):
@@ -128,7 +131,12 @@ def on_ground(body: Body, state: State, m: Sequence[Vec], physics: Physics) -> C
     u = sp.add(state.v, sp.cross(sp.to_world(m, state.w), at))
     d = _stiff(distance, exists, physics.ground_impedance, body.invweight)
     bias = _bias(k, b, physics.ground_impedance, distance, (u[2], u[0], u[1]))
-    return Contact(at, sp.Z, sp.X, sp.Y, bias, d, body.friction_ground)
+    friction = body.friction_ground
+    if body.boundary is not None:
+        x, y, border, factor = body.boundary
+        beyond = x * (state.p[0] + r[0]) + y * (state.p[1] + r[1]) > border
+        friction = jnp.where(beyond, factor * friction, friction)
+    return Contact(at, sp.Z, sp.X, sp.Y, bias, d, friction)
 
 
 def _lower_face(body: Body, m: Sequence[Vec]) -> tuple[Vec, Array]:

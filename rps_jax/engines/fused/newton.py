@@ -139,6 +139,7 @@ class Problem(NamedTuple):
     contacts: list[Contact]
     base: Base
     start: list[Vec]  # last accelerations, the solver's first guess
+    lift: Vec  # [m/s^2] minus gravity
 
     @classmethod
     def of(
@@ -149,12 +150,13 @@ class Problem(NamedTuple):
         torque = sp.cross((i[0] * w[0], i[1] * w[1], i[2] * w[2]), w)  # - w x (I w)
         free = sp.to_world(m, (torque[0] / i[0], torque[1] / i[1], torque[2] / i[2]))
         start = [state.a, state.alpha, *([] if state.driven is None else [state.driven.a])]
-        return cls(body.mass, _spin(body, m), free, contacts, base, start)
+        lift = (0.0, 0.0, GRAVITY) if body.gravity is None else sp.scale(-1, body.gravity)
+        return cls(body.mass, _spin(body, m), free, contacts, base, start, lift)
 
     def gauss(self, x: Sequence[Vec]) -> list[Vec]:
         """Return M (x - free accelerations)."""
         a, alpha, *b = x
-        linear = sp.scale(self.mass, (a[0], a[1], a[2] + GRAVITY))
+        linear = sp.scale(self.mass, sp.add(a, self.lift))
         angular = sp.to_world(self.spin, sp.sub(alpha, self.free))
         inertia, force = self.base
         return [linear, angular, *(sp.sub(_times(inertia, y), force) for y in b)]

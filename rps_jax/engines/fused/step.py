@@ -100,6 +100,8 @@ def step(
     base = Base()
     if robot is not None and driven is not None:
         force, integral = drives.push(robot, driven.integral, twist, driven.v, turn, dt)
+        if body.gravity is not None:
+            force = sp.add(force, sp.scale(robot.mass, (*body.gravity[:2], 0.0)))
         base = Base((robot.mass, robot.mass, robot.inertia), force)
         driven = driven._replace(integral=integral)
     x = accelerations(Problem.of(body, state, m, contacts, base), physics, solution)
