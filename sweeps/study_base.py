@@ -49,7 +49,11 @@ from sweeps import render_tables
 T = TypeVar("T", covariant=True)
 Rows = list[list[str]]
 _PACKAGES = ("rps_jax", "jax", "mujoco", "mujoco-mjx")  # whose versions a data file has
-_NEW_LIMITS = ("slip_sideways", "slip_yaw")  # of robots, later than data files; absent if None
+_NEW_LIMITS = (
+    "slip_sideways",
+    "slip_yaw",
+    "radius",
+)  # of robots, later than data files; absent if None
 _OLD_TASK = "task", dataclasses.asdict(Reach())  # of all domains that are older than other tasks
 # Removed options by question, with the values that all later runs have; digests still cover them.
 _REMOVED_OPTIONS: Mapping[str, Mapping[str, Any]] = {

@@ -1,0 +1,114 @@
+"""Flat against round bases of equal width: success and time of laws in equal worlds.
+
+rps sweeps/round_base --worlds 10000
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import ClassVar
+
+import numpy as np
+import xarray as xr
+
+from rps_jax.analysis import statistics, tables
+from rps_jax.analysis.report import Section
+from rps_jax.control.registry import LawsLike
+from rps_jax.record.options import option
+from rps_jax.runs.plan import Plan
+from rps_jax.runs.question import MultiLawQuestion, Run, call_of
+from rps_jax.runs.sweep import Sweep
+from rps_jax.trials.setting import Setting
+from rps_jax.world.domain import DomainLike
+from sweeps.study_base import Rows, run_plans
+
+BASES = {"flat": "ideal", "round": "round"}  # robots, 0.58 m wide
+
+
+@dataclass(frozen=True)
+class RoundBase(MultiLawQuestion[xr.Dataset]):
+    """Compare a flat and a round base of equal width, in equal worlds.
+
+    The results hold `success` and `time` (base, law, world).
+    """
+
+    TITLE: ClassVar[str] = "Flat and round bases"
+    QUICK: ClassVar = {"worlds": 32}
+
+    laws: LawsLike = ("rps", "rps_tuned", "aps", "dipole", "force_push")
+    domain: DomainLike = "wide"
+    """Ranges from which worlds are drawn: paper, hardware, wide, prisms or hostile, or a JSON file
+    of ranges; changes follow, as wide,mass=3:10."""
+    worlds: int = option(10000, 1, 10_000_000)
+    """Number of worlds."""
+    setting: Setting = field(default=Setting(seed=11), kw_only=True)
+
+    @property
+    def plans(self) -> dict[str, Plan]:
+        """The sweep of each base."""
+        options = {"setting": self.setting}
+        return {
+            base: Sweep(self.chosen, self.domain, self.worlds, robot=robot, **options).plan
+            for base, robot in BASES.items()
+        }
+
+    def check(self) -> None:
+        """Check that the engine can step these worlds here."""
+        for plan in self.plans.values():
+            plan.check_here()
+
+    def num_trials(self) -> int | None:
+        """Return the number of trials."""
+        return len(BASES) * len(self.chosen) * self.worlds
+
+    def answer(self, run: Run) -> xr.Dataset:
+        """Sweep with both bases."""
+        parts = run_plans(run, self.plans)
+        trials = [parts[base][["success", "time"]] for base in BASES]
+        return xr.concat(trials, xr.IndexVariable("base", list(BASES)))
+
+    def intro(self, results: xr.Dataset) -> str:
+        """Describe the worlds."""
+        return (
+            f"{self.worlds:,} worlds, seed {self.setting.seed}, equal for both bases; square "
+            "brackets: 95 % intervals, of rates Wilson, of differences world by world."
+        )
+
+    def report(self, results: xr.Dataset, run: Run) -> Sequence[Section]:
+        """Return success and time of each law on both bases."""
+        return [Section("Flat against round", "", compared(results))]
+
+
+round_base = call_of(RoundBase)
+
+
+def compared(results: xr.Dataset) -> Rows:
+    """Return a header and a row for each law: success, time, and their differences."""
+    pair = "round - flat"
+    times = "median time, flat", "median time, round", f"time, {pair}, where both succeed"
+    rows = [["law", "success, flat", "success, round", pair, "gained", "lost", *times]]
+    for law in map(str, results.law.values):
+        trials = results.sel(law=law)
+        flat, curved = (trials.success.sel(base=base) for base in BASES)
+        comparison = statistics.compare(flat, curved)
+        rates = (tables.share(int(x.sum()), x.size) for x in (flat, curved))
+        points = 100 * (curved.values.astype(float) - flat.values)
+        times = [trials.time.sel(base=base).values for base in BASES]
+        medians = (
+            f"{np.median(time[x.values > 0]):.0f} s" if x.any() else "-"
+            for time, x in zip(times, (flat, curved), strict=True)
+        )
+        both = (flat.values > 0) & (curved.values > 0)
+        longer = _mean((times[1] - times[0])[both], "s")
+        counts = str(comparison.gained), str(comparison.lost)
+        rows.append([law, *rates, _mean(points, "points"), *counts, *medians, longer])
+    return rows
+
+
+def _mean(values: np.ndarray, unit: str) -> str:
+    """Format the mean of differences with its 95 % interval."""
+    if values.size < 2:
+        return "-"
+    mean, half = values.mean(), 1.96 * values.std(ddof=1) / np.sqrt(values.size)
+    return f"{mean:+.1f} {unit} [{mean - half:+.1f}, {mean + half:+.1f}]"
