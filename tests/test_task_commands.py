@@ -240,7 +240,7 @@ CLOSE = {"kind": "corridor", "waypoints": [[-0.1, 0], [0.4, 0], [0.4, 3]], "widt
 BAD = {
     "push --task nofile.json": "nofile.json cannot be read",
     "push --task path,nofile.json": "nofile.json cannot be read",
-    "push --task empty.json": "or waypoints as [[0.4, 0], [2, 1]]",
+    "push --task empty.json": "waypoints as [[0.4, 0], [2, 1]], or a map",
     "push --task side.json": "a wall beside them crosses the base",
     "push --object box --task close.json": "a wall crosses base or object at the start",
     "push --task corridor,width=0.5": "the base is 0.58 m wide",

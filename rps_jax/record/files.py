@@ -24,12 +24,14 @@ import pandas as pd
 import xarray as xr
 from numpy.typing import ArrayLike
 
-from rps_jax.errors import InputError
+from rps_jax.errors import InputError, require
 
-FileKind = Literal["json", "python", "xml", "policy", "table", "part", "results"]
+FileKind = Literal["json", "yaml", "image", "python", "xml", "policy", "table", "part", "results"]
 _MAX_PART = 2**33  # [bytes]
 _KINDS: dict[FileKind, tuple[int, str]] = {  # greatest size [bytes], and a description
     "json": (2**26, "a JSON file"),
+    "yaml": (2**20, "a YAML file"),
+    "image": (2**28, "an image as PGM or PNG"),
     "python": (2**22, "a Python file"),
     "xml": (2**24, "an MJCF file"),
     "policy": (2**28, "a policy's FILE.npz"),
@@ -37,6 +39,7 @@ _KINDS: dict[FileKind, tuple[int, str]] = {  # greatest size [bytes], and a desc
     "part": (_MAX_PART, "the folder of a run"),
     "results": (2**37, "a file of results"),
 }
+FIELD_FILES = (".json", ".yaml", ".yml")  # suffixes of files with names and values
 _PACKED = (".gz", ".bz2", ".xz", ".zip")
 JsonObject = dict[str, Any]  # parsed JSON has values of any type
 
@@ -182,6 +185,21 @@ def read_json(path: Path) -> JsonObject:
         return parse_json(content)
     except ValueError as error:
         raise InputError(f'{path} is no JSON object ({error}): write {{"name": value}}.') from error
+
+
+def read_fields(path: Path) -> JsonObject:
+    """Read names with values from a JSON or YAML file; its `image` is relative to the file."""
+    if suffix_of(path) == ".json":
+        fields = read_json(path)
+    else:
+        content, yaml = read_regular(path, "yaml"), require("ruamel.yaml", "bags")
+        try:
+            fields = dict(yaml.YAML(typ="safe", pure=True).load(content))
+        except Exception as error:  # of any kind: the file is no mapping
+            reason = " ".join(str(error).split())
+            raise InputError(f"{path} is no YAML mapping ({reason}): write name: value.") from error
+    image = {"image": str(path.parent / str(fields["image"]))} if "image" in fields else {}
+    return fields | image
 
 
 def read_checked_json(path: Path) -> JsonObject:

@@ -190,8 +190,8 @@ def parse_changes(kind: str, text: str) -> tuple[str, dict[str, Any]]:
     changes: dict[str, Any] = {}
     for assignment in assignments:
         field, equals, value = assignment.partition("=")
-        if not equals and files.suffix_of(field) == ".json":
-            changes |= files.read_json(Path(field))
+        if not equals and files.suffix_of(field) in files.FIELD_FILES:
+            changes |= files.read_fields(Path(field))
             continue
         if not (field and equals):
             raise errors.not_allowed(kind, text, "write changes as name=value or file.json")

@@ -429,8 +429,9 @@ class TaskOption:
     """Option of questions about random worlds."""
 
     task: TaskLike | None = None
-    """The task: reach (one target, as in the paper), path (follow a path by a lookahead) or
-    corridor (a path between walls that end a trial when touched), or a JSON file, as of waypoints.
+    """The task: reach (one target, as in the paper), path (follow a path by a lookahead),
+    corridor (a path between walls that end a trial when touched) or rooms (a planned path among the
+    obstacles of a map), or a file, as JSON of waypoints or of polygons, or a ROS map.yaml.
     Changes follow, as corridor,width=1.2:1.6. By default the domain's, reach."""
 
 

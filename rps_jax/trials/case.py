@@ -62,8 +62,9 @@ class Case(TrialOptions):
     """The law: its name, as rps, rps_tuned or rps_plus, or a file's, as my_law.py:MyParams or
     policy.npz; changes follow, as rps,K_h=0.3 or rps,tuned.json."""
     task: TaskLike = option("reach", kw_only=True)
-    """The task: reach (one target, as in the paper), path (follow a path by a lookahead) or
-    corridor (a path between walls that end a trial when touched), or a JSON file, as of waypoints.
+    """The task: reach (one target, as in the paper), path (follow a path by a lookahead),
+    corridor (a path between walls that end a trial when touched) or rooms (a planned path among the
+    obstacles of a map), or a file, as JSON of waypoints or of polygons, or a ROS map.yaml.
     Changes follow, as corridor,width=1.2. Ranges are drawn by the seed."""
     bearing: float = option(0.0, -10, 10, unit="rad", kw_only=True, hidden=True)
     """Rotation of the whole trial [rad]; only a friction pyramid makes a difference."""

@@ -43,6 +43,7 @@ PURPOSE = {
     "h5netcdf": "results as NetCDF 4 files",
     "h5py": "the HDF5 below them",
     "matplotlib": "figures",
+    "contourpy": "outlines of maps that are images; matplotlib needs it too",
     "imageio-ffmpeg": "an ffmpeg for films",
     "pillow": "labels in films; matplotlib needs it too",
     "tqdm": "progress bars",
@@ -58,7 +59,7 @@ EXTRAS = {
     "cluster": "`rps sweep --ray` (ray)",
     "viz": "`rps view` (viser)",
     "export": "`rps export onnx` (onnx, and onnxruntime to run the exported file)",
-    "bags": "`rps push --bag` and `rps shadow` (mcap-ros2-support, rosbags)",
+    "bags": "`rps push --bag`, `rps shadow` and ROS maps (mcap-ros2-support, rosbags, ruamel.yaml)",
     "failures": "`rps sensitivity` (SALib) and `rps attack` (ribs, which brings numba and "
     "scikit-learn)",
     "gym": "`rps_jax/Push-v0` of Gymnasium",

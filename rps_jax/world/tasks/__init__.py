@@ -7,13 +7,13 @@ import pkgutil
 from collections.abc import Mapping
 from dataclasses import fields
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 
 from rps_jax import errors
 from rps_jax.record import files
-from rps_jax.record.options import parse_changes
+from rps_jax.record.options import field_types, parse_changes
 from rps_jax.world.quantity import Quantity, declared, range_of
 from rps_jax.world.tasks.base import Task
 
@@ -30,16 +30,21 @@ MORE_NUMBERS = {name: i for kind in TASKS.values() for name, i in kind.MORE_NUMB
 OUTCOMES = {name: text for kind in TASKS.values() for name, text in kind.OUTCOMES.items()}
 FAILURES = {name: text for kind in TASKS.values() for name, text in kind.FAILURES.items()}
 
-_FORMS = {bool: "true or false", int: "a whole number", tuple: "pairs of x, y [m]"}  # for errors
+_FORMS = {
+    bool: "true or false",
+    int: "a whole number",
+    2: "pairs of x, y [m]",
+    3: "x, y, yaw",
+}  # for errors
 TaskLike = Task | str | Mapping[str, Any]  # or its text: see `parse_task`
 
 
 def parse_task(task: TaskLike) -> Task:
     """Return a task from its name, as path, or from a mapping with its kind.
 
-    Changes may follow a name, as `corridor,width=1.2:1.6`, or a JSON file of them, as
+    Changes may follow a name, as `corridor,width=1.2:1.6`, or a JSON or YAML file of them, as
     `path,route.json` with `{"waypoints": [[0.4, 0], [2, 0], [3, 1]]}`. Without a kind, a mapping
-    with waypoints is a path.
+    with waypoints is a path, and one with polygons or an image is `rooms`: see `Task.MARKS`.
 
     Raises:
       InputError: the name or a value is not allowed.
@@ -48,23 +53,27 @@ def parse_task(task: TaskLike) -> Task:
         return task
     if isinstance(task, str):
         name, changes = parse_changes("task", task)
-        if files.suffix_of(name) == ".json":
-            task = files.read_json(Path(name)) | changes
+        if files.suffix_of(name) in files.FIELD_FILES:
+            task = files.read_fields(Path(name)) | changes
         else:
             task = {"kind": name} | changes
-    if isinstance(task, Mapping) and str(task.get("waypoints", ())) not in ("()", "[]"):
-        task = {"kind": "path"} | dict(task)
+    if isinstance(task, Mapping):
+        names = {name for name, value in task.items() if str(value) not in ("()", "[]")}
+        kinds = [{"kind": name} for name, kind in TASKS.items() if names & set(kind.MARKS)]
+        task = {**(kinds or [{}])[0], **task}
     if not isinstance(task, Mapping) or "kind" not in task:
-        rule = f"give a kind ({', '.join(TASKS)}), or waypoints as [[0.4, 0], [2, 1]]"
+        rule = f"give a kind ({', '.join(TASKS)}), waypoints as [[0.4, 0], [2, 1]], or a map"
         raise errors.not_allowed("task", repr(task), rule)
     kind = TASKS[errors.check_name("task", str(task["kind"]), TASKS, "FILE.json")]
     known = {x.name: x for x in fields(kind)}
     values: dict[str, Any] = {}
     for name, value in task.items():
-        if name == "kind":
+        errors.check_name(f"task quantity of {kind.kind}", name, (*known, *kind.MARKS))
+        if name == "kind" or name not in known:
             continue
-        errors.check_name(f"task quantity of {kind.kind}", name, known)
         default: Any = known[name].default
+        inner = get_args(field_types(kind)[name])
+        size = len(get_args(inner[0])) if inner else 0
         try:
             if name in declared(kind):
                 value = range_of(default, value)
@@ -74,13 +83,19 @@ def parse_task(task: TaskLike) -> Task:
                 value = int(value)
             elif isinstance(default, tuple):
                 points = np.asarray(value, float)
-                points = points.reshape(-1, 2) if points.ndim == 1 else points  # of a text, 1:0:2:1
-                if points.size and points.shape[1:] != (2,):
-                    raise ValueError("no pairs")
+                # Of a text, as 1:0:2:1, or a single one.
+                points = points.reshape(-1, size) if points.ndim == 1 else points
+                if points.size and points.shape[1:] != (size,):
+                    raise ValueError("other sizes")
                 value = tuple(map(tuple, points.tolist()))
         except (LookupError, TypeError, ValueError, OverflowError) as error:
             is_range = name in declared(kind)
-            form = "a number, or low and high as [0.3, 0.6]" if is_range else _FORMS[type(default)]
+            form = (
+                "a number, or low and high as [0.3, 0.6]"
+                if is_range
+                else _FORMS[size or type(default)]
+            )
             raise errors.not_allowed(f"task {name}", value, f"write {form}") from error
         values[name] = value
-    return kind(**values)
+    file = {name: value for name, value in task.items() if name not in known}
+    return kind(**values | kind.read(file, values))

@@ -86,10 +86,17 @@ class Task:
     # Units and meanings of the outcomes that it adds.
     OUTCOMES: ClassVar[dict[str, tuple[str, str]]] = {}
     HAS_TARGET: ClassVar[bool] = False  # whether trials end at the domain's targets
+    # Names of which one identifies a mapping without a kind; `read` turns them into fields.
+    MARKS: ClassVar[tuple[str, ...]] = ()
     MORE_NUMBERS: ClassVar[dict[str, int]] = {}  # columns of random numbers without a range
 
     # Outcomes that are not 0 in a trial that the task has failed, with the failure in words.
     FAILURES: ClassVar[dict[str, str]] = {}
+
+    @classmethod
+    def read(cls, file: Mapping[str, Any], values: Mapping[str, Any]) -> dict[str, Any]:
+        """Return fields from those `MARKS` of a mapping that are no fields, and its `values`."""
+        return {}
 
     def __str__(self) -> str:
         """Return the text that `parse_task` reads: the name and the fields that differ."""

@@ -135,6 +135,7 @@ class Corridor(Path):
         "touch_y": ("m", "y of the touch in the world"),
     }
 
+    MARKS: ClassVar[tuple[str, ...]] = ()
     FAILURES: ClassVar[dict[str, str]] = {"wall_touch": "touched a wall"}
 
     lookahead: Range = drawn(Range(0.6, 0.6), *LOOKAHEAD)  # short, since long ones cut corners
@@ -170,9 +171,8 @@ class Corridor(Path):
     def check_room(self, shell: Shell, object_width: Callable[[], float]) -> None:
         """Raise InputError for a corridor narrower than base or objects, or a wall at the base."""
         super().check_room(shell, object_width)
-        half = float(shell.half[0]), float(shell.half[1])
         narrowest = self.width.low * (self.door_width.low if self.doors else 1)
-        for name, size in (("base", 2 * half[1]), ("widest object", object_width())):
+        for name, size in (("base", 2 * float(shell.half[1])), ("widest object", object_width())):
             if narrowest <= size:
                 rule = f"the {name} is {size:.2f} m wide, and the narrowest place must be wider"
                 raise errors.not_allowed("task width (low)", f"{self.width.low:g} m", rule)
@@ -181,10 +181,6 @@ class Corridor(Path):
             if polyline.clearance(shell.outline, jnp.asarray(walls))[0] <= 0:
                 rule = "a wall beside them crosses the base at its start; start them ahead"
                 raise errors.not_allowed("task waypoints", self.waypoints[:2], rule)
-
-    def measures(self, course: Any) -> dict[str, np.ndarray]:
-        """Return the measures of the path."""
-        return super().measures(course.path)
 
     def courses(self, inputs: CourseInputs) -> tuple[np.ndarray, Any]:
         """Return the ends, paths and walls of worlds."""

@@ -112,22 +112,38 @@ class PathCourse(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Path(Task):
-    """Follow a path, given by its waypoints or drawn."""
+class Following(Task):
+    """Tasks that follow a path; their courses are a `PathCourse`, or have it as `path`."""
 
-    kind: str = "path"
     OUTCOMES: ClassVar[dict[str, tuple[str, str]]] = {
         "progress": ("1", "share of the path that the contact point has passed"),
         "error_mean": ("m", "mean cross-track error of the contact point"),
         "error_95": ("m", "95 % quantile over time of the cross-track error"),
         "error_max": ("m", "largest cross-track error"),
     }
+
+    # Along the path, from its nearest point to the law's target.
+    lookahead: Range = drawn(Range(1.6, 1.6), *LOOKAHEAD)
+
+    def measures(self, course: Any) -> dict[str, np.ndarray]:
+        """Return length, number of turns and their mean angle."""
+        line: Any = getattr(course, "path", course).line
+        angles = np.abs(turns_of(np.asarray(line.vertices)))
+        count = (angles > 1e-9).sum(axis=1)
+        angle = angles.sum(axis=1) / np.maximum(count, 1)
+        return {"length": line.arcs[:, -1], "turns": count, "turn_angle": angle}
+
+
+@dataclass(frozen=True)
+class Path(Following):
+    """Follow a path, given by its waypoints or drawn."""
+
+    kind: str = "path"
+    MARKS: ClassVar[tuple[str, ...]] = ("waypoints",)
     MORE_NUMBERS: ClassVar[dict[str, int]] = {
         f"turn_angle_{i}": 52 + i for i in range(_SEGMENTS - 1)
     }
 
-    # Along the path, from its nearest point to the law's target.
-    lookahead: Range = drawn(Range(1.6, 1.6), *LOOKAHEAD)
     length: Range = drawn(Range(4, 8), 50, "m", 0.5, 40, "length of the path", "course")
     turns: Range = drawn(Range(1, 3), 51, "1", 0, _SEGMENTS - 1, "number of turns", "course", True)
     turn_angle: Range = drawn(Range(0.3, 0.8), 52, "rad", 0, 1.6, "angle of the turns", "course")
@@ -178,14 +194,6 @@ class Path(Task):
         if np.hypot(x - front, y) > _NEAR:
             rule = f"they must start within {_NEAR} m of the base's front, ({front:.2f}, 0) m"
             raise errors.not_allowed("task waypoints", (x, y), rule)
-
-    def measures(self, course: Any) -> dict[str, np.ndarray]:
-        """Return length, number of turns and their mean angle."""
-        line: Any = course.line
-        angles = np.abs(turns_of(np.asarray(line.vertices)))
-        count = (angles > 1e-9).sum(axis=1)
-        angle = angles.sum(axis=1) / np.maximum(count, 1)
-        return {"length": line.arcs[:, -1], "turns": count, "turn_angle": angle}
 
     def route(self) -> np.ndarray:
         """Return the vertices (N, 2) [m] of the path through the waypoints."""

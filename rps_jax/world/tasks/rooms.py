@@ -1,0 +1,306 @@
+"""Rooms: a map with obstacles that neither base nor object may touch, and a planned path.
+
+The map has metres and a frame of its own. The world is the frame of the base at its start: it is at
+the origin and looks along x. The path is the shortest of a visibility graph around the corners of
+the walls, by Dijkstra's algorithm of `scipy.sparse.csgraph`. Points are complex numbers here.
+"""
+
+from __future__ import annotations
+
+import functools
+import io
+import warnings
+from collections.abc import Callable, Hashable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, ClassVar
+
+import contourpy
+import jax.numpy as jnp
+import numpy as np
+from PIL import Image
+from scipy import ndimage
+from scipy.sparse import csgraph
+
+from rps_jax import errors
+from rps_jax.geometry import polyline
+from rps_jax.geometry.polyline import Polyline
+from rps_jax.record import files
+from rps_jax.record.options import option
+from rps_jax.robot.shell import Shell
+from rps_jax.world.quantity import Range, drawn
+from rps_jax.world.tasks.base import CourseInputs
+from rps_jax.world.tasks.corridor import Corridor, CorridorCourse
+from rps_jax.world.tasks.path import LOOKAHEAD, Following, PathCourse
+
+# Fields of a ROS map.
+_ROS = ("image", "resolution", "origin", "negate", "occupied_thresh", "free_thresh", "mode")
+_MAX_WALLS = 128
+_MAX_PIXELS = 16_000_000
+# Vertices of a path around a corner, by the clearance: up to 1.08 times the clearance from it. An
+# arc is longer than the shortest by at most 5.5 %.
+_TURN = np.exp(2j * np.pi * np.arange(8) / 8) / np.cos(np.pi / 8)
+
+
+@dataclass(frozen=True)
+class Rooms(Following):
+    """Follow a planned path between the obstacles of a map.
+
+    Instead of walls, a mapping has `polygons`, each with its corners [m], the `outline` of a room,
+    or the fields of a ROS map, with a `tolerance` [m].
+    """
+
+    kind: str = "rooms"
+    OUTCOMES: ClassVar[dict[str, tuple[str, str]]] = Corridor.OUTCOMES
+    FAILURES: ClassVar[dict[str, str]] = Corridor.FAILURES
+    MARKS: ClassVar[tuple[str, ...]] = ("polygons", "outline", *_ROS, "tolerance")
+    # Tasks may share columns of random numbers: a world has one task.
+    MORE_NUMBERS: ClassVar[dict[str, int]] = {"route": 58}
+
+    lookahead: Range = drawn(Corridor.lookahead, *LOOKAHEAD)
+    scale: Range = drawn(Range(1, 1), 59, "1", 0.1, 10, "scale of the map", "course")
+    # [m] both ends of each edge of closed outlines
+    walls: tuple[tuple[float, float], ...] = option((), -1000, 1000, unit="m")
+    # [m, m, rad] of the base, and [m] of the contact; of several, each world draws one of each
+    start: tuple[tuple[float, float, float], ...] = option(((0.0, 0.0, 0.0),), -1000, 1000)
+    goal: tuple[tuple[float, float], ...] = option((), -1000, 1000, unit="m")
+    # The path keeps the sum of both radii from all walls; that of the object is a guess.
+    base_radius: float = option(0.5, 0.1, 5, unit="m")
+    object_radius: float = option(0.25, 0, 5, unit="m")
+
+    @classmethod
+    def read(cls, file: Mapping[str, Any], values: Mapping[str, Any]) -> dict[str, Any]:
+        """Return the walls of polygons, an outline and an image."""
+        polygons: Any = file.get("polygons", ())
+        polygons = polygons if np.iterable(polygons) else [polygons]
+        rings = [_ring(f"task polygon {i}", polygon) for i, polygon in enumerate(polygons)]
+        rings += [_ring("task outline", file["outline"])] if "outline" in file else []
+        if file.keys() - {"polygons", "outline"}:
+            rings += _read_image(file, values.get("start", cls.start))
+        if file.keys() - {"polygons"}:  # walls around the room make its outside an obstacle
+            points = np.concatenate(rings)
+            x, y = ((f.min() - 0.1, f.max() + 0.1) for f in (points.real, points.imag))
+            rings.append(
+                np.array([complex(x[i], y[j]) for i, j in ((0, 0), (1, 0), (1, 1), (0, 1))])
+            )
+        edges = [np.stack([ring, np.roll(ring, -1)], axis=1).ravel().tolist() for ring in rings]
+        walls = tuple((point.real, point.imag) for points in edges for point in points)
+        return {"walls": (*values.get("walls", ()), *walls)} if file else {}
+
+    @property
+    def shape(self) -> Hashable:
+        """Kind, and numbers of routes, vertices and walls."""
+        return self.kind, self._routes.shape, len(self.walls)
+
+    @property
+    def idle(self) -> frozenset[str]:
+        """Names of the numbers that are not drawn."""
+        return frozenset(() if len(self._routes) > 1 else ("route",))
+
+    @property
+    def _routes(self) -> np.ndarray:
+        """Vertices (R, N) [m] of the paths from each start to each goal in the map."""
+        ahead, clearance = self.base_radius, self.base_radius + self.object_radius
+        size = self.scale.low
+        return _plan(self.walls, self.start, self.goal, ahead / size, clearance / size)
+
+    def check(self) -> None:
+        """Raise InputError for a map without a way from each start to each goal."""
+        count = len(self.walls) / 2
+        fewer = "give a larger tolerance [m] of an image, fewer corners, or a part of the map"
+        for is_bad, name, value, rule in (
+            (not count or count % 1, "walls", count, "give polygons, an outline or a map.yaml"),
+            (count > _MAX_WALLS, "walls", count, f"at most {_MAX_WALLS} are allowed: {fewer}"),
+            (not self.start, "start", "()", "give x, y and yaw in the map, as [1, 2, 0]"),
+            (not self.goal, "goal", "()", "give x and y in the map, as [4, 2]"),
+        ):
+            if is_bad:
+                raise errors.not_allowed(f"task {name}", value, rule)
+        _ = self._routes
+
+    def check_room(self, shell: Shell, object_width: Callable[[], float]) -> None:
+        """Raise InputError for a path that is narrower than the base, or a wall at its start."""
+        if self.base_radius < float(shell.half[1]):
+            rule = f"give at least {shell.half[1]} m: half of the base's width"
+            raise errors.not_allowed("task base_radius", self.base_radius, rule)
+        for start in self.start:
+            walls = _placed(_endpoints(self.walls).ravel(), np.array([start]), self.scale.low)
+            walls = jnp.asarray(walls.reshape(-1, 2, 2))
+            if polyline.clearance(shell.outline, walls)[0] <= 0:
+                raise errors.not_allowed("task start", start, "the base touches a wall there")
+
+    def courses(self, inputs: CourseInputs) -> tuple[np.ndarray, Any]:
+        """Return the ends, paths and walls of worlds."""
+        route = np.floor(inputs.u["route"] * len(self._routes)).astype(int)
+        starts = np.array(self.start)[route // len(self.goal)]
+        scale, lookahead = (getattr(self, x).at(inputs.u[x]) for x in ("scale", "lookahead"))
+        vertices = _placed(self._routes[route], starts, scale)
+        # The first two are at the start, and straight ahead: the path begins at the base's front.
+        vertices[:, :2, 0] = np.maximum(vertices[:, :2, 0], inputs.front[:, None])
+        walls: Any = _placed(_endpoints(self.walls).ravel(), starts, scale)
+        path = PathCourse(Polyline.through(vertices), lookahead)
+        return vertices[:, -1], CorridorCourse(path, walls.reshape(route.size, -1, 2, 2))
+
+
+def _endpoints(walls: Any) -> np.ndarray:
+    """Return both ends (W, 2) [m] of walls, from pairs (2 W, 2) of x and y."""
+    return (np.array(walls) @ (1, 1j)).reshape(-1, 2)
+
+
+def _placed(points: np.ndarray, starts: np.ndarray, scale: Any) -> np.ndarray:
+    """Return points (..., K) of the map in worlds (n, K, 2) [m] of starts (n, 3)."""
+    moved = points - (starts @ (1, 1j, 0))[:, None]
+    moved = moved * (scale * np.exp(-1j * starts[:, 2]))[:, None]
+    return np.stack([moved.real, moved.imag], axis=-1)
+
+
+# --- maps ----------------------------------------------------------------------------------------
+
+
+def _ring(name: str, corners: object) -> np.ndarray:
+    """Return the corners (N,) [m] of a simple polygon, or raise InputError."""
+    points = errors.check_array(name, corners, ("N", 2)) @ (1, 1j)
+    points = points[: -1 if points[0] == points[-1] else None]
+    following, i = np.roll(points, -1), np.arange(points.size)
+    is_apart = _distances(points[:, None], following[:, None], points, following) > 1e-9
+    for is_bad, rule in (
+        (i.size < 3, "a polygon has three corners or more, each as x, y [m]"),
+        ((abs(following - points) < 1e-3).any(), "corners are repeated: give each once"),
+        (
+            (~is_apart & ((i - i[:, None] + 1) % max(i.size, 1) > 2)).any(),
+            "its edges cross or touch: divide it into polygons that do not",
+        ),
+    ):
+        if is_bad:
+            raise errors.not_allowed(name, corners, rule)
+    return points
+
+
+def _read_image(file: Mapping[str, Any], starts: Any) -> list[np.ndarray]:
+    """Return the outlines (N,) [m] of the part of a ROS map that starts (S, 3) can reach."""
+    check = functools.partial(errors.check_finite, at_least=0)
+    bounds: Any = {"above": 0, "unit": "m per pixel"}
+    resolution = errors.check_finite("task resolution", file.get("resolution"), **bounds)
+    tolerance = check("task tolerance", file.get("tolerance", resolution), unit="m")
+    high = check("task occupied_thresh", file.get("occupied_thresh", 0.65), at_most=1)
+    low = check("task free_thresh", file.get("free_thresh", 0.196), at_most=1)
+    x, y, yaw = errors.check_array("task origin", file.get("origin", (0, 0, 0)), (3,))
+    for name, allowed in (("negate", (0, 1)), ("mode", ("trinary",))):
+        if (value := file.get(name, allowed[0])) not in allowed:
+            raise errors.not_allowed(f"task {name}", value, f"give one of {list(allowed)}")
+    shades = _shades(Path(str(file.get("image", "an image"))))[::-1]
+    occupied = shades if file.get("negate") else 1 - shades
+    # Unknown cells, and those outside, are walls.
+    labels = np.pad(ndimage.label((occupied < low) & (occupied <= high))[0], 1)
+    unit, origin = resolution * np.exp(1j * yaw), complex(x, y)
+    cells = (errors.check_array("task start", starts, ("N", 3)) @ (1, 1j, 0) - origin) / unit + 1
+    indices = np.floor([cells.imag, cells.real]).astype(int)
+    reached = labels[tuple(np.clip(indices, 0, np.array(labels.shape)[:, None] - 1))]
+    if not reached.all():
+        rule = "it lies in an obstacle, in unknown cells or outside of the image"
+        raise errors.not_allowed("task start", starts, rule)
+    rings = list[np.ndarray]()
+    for line in contourpy.contour_generator(z=np.isin(labels, reached).astype(float)).lines(0.5):
+        # Contours cut the corners of cells: a corner has the halves of both its neighbours.
+        points = (np.where(line[:-1] % 1 == 0.5, line[:-1], line[1:]) - 0.5) @ (1, 1j)
+        points = np.roll(points, -int(abs(points - points.mean()).argmax()))
+        far = int(abs(points - points[0]).argmax())
+        halves = points[: far + 1], np.append(points[far:], points[0])
+        ring = np.concatenate([_simplify(x, tolerance / resolution)[:-1] for x in halves])
+        rings.append(origin + unit * ring)
+    return rings
+
+
+def _shades(path: Path) -> np.ndarray:
+    """Return the brightness (rows, columns) of an image, from 0 to 1."""
+    content = io.BytesIO(files.read_regular(path, "image"))
+    try:
+        with warnings.catch_warnings(action="ignore"):  # a large image is an error
+            image = Image.open(content, formats=("PPM", "PNG", "BMP"))
+        if image.width * image.height > _MAX_PIXELS:
+            raise ValueError(f"it has {image.width} x {image.height} pixels")
+        if image.mode.startswith("I"):
+            return np.asarray(image) / 65535
+        colours = image.convert("RGBA" if image.has_transparency_data else "RGB")
+        return np.asarray(colours).mean(axis=2) / 255
+    except Exception as error:  # of any kind, by Pillow on damaged files
+        rule = f"give a PGM, PNG or BMP file of at most 16 million pixels ({error})"
+        raise errors.not_allowed("task image", path, rule) from error
+
+
+def _simplify(points: np.ndarray, tolerance: float) -> np.ndarray:
+    """Return corners of a line (N,), with its ends, from which no point is beyond a tolerance."""
+    away = _distances(points, points, points[0], points[-1])
+    if away.max() <= tolerance:
+        return points[[0, -1]]
+    halves = points[: away.argmax() + 1], points[away.argmax() :]
+    return np.append(_simplify(halves[0], tolerance)[:-1], _simplify(halves[1], tolerance))
+
+
+# --- planner -------------------------------------------------------------------------------------
+
+
+@functools.lru_cache(64)
+def _plan(walls: Any, starts: Any, goals: Any, ahead: float, clearance: float) -> np.ndarray:
+    """Return paths (R, N) [m] from each start to each goal; shorter ones repeat their end.
+
+    They begin at the start and a way `ahead` of it, from where on they keep a clearance.
+    """
+    (a, b), goal = _endpoints(walls).T, np.array(goals) @ (1, 1j)
+    begin, yaw = np.array(starts) @ (1, 1j, 0), np.array(starts)[:, 2]
+    nodes = np.append(begin + ahead * np.exp(1j * yaw), goal)
+    needed = f"the path keeps {clearance:.2f} m from walls (base_radius + object_radius)"
+    for i, (value, point) in enumerate(zip((*starts, *goals), (*begin, *goal), strict=True)):
+        passed = (a.imag > point.imag) != (b.imag > point.imag)
+        inside = np.sum(passed & ((_side(point, a, b) > 0) == (b.imag > a.imag))) % 2
+        away = _distances(nodes[i], nodes[i], a, b).min()
+        is_start = i < begin.size
+        for is_bad, rule in (
+            (inside, "it lies in an obstacle or outside of the room"),
+            (away < clearance, f"{needed}, and one is {away:.2f} m away"),
+            (abs(begin - point).min() < ahead and not is_start, "the base is there at the start"),
+        ):
+            if is_bad:
+                raise errors.not_allowed(f"task {'start' if is_start else 'goal'}", value, rule)
+    around = (np.unique([a, b])[:, None] + clearance * _TURN).ravel()
+    is_clear = _distances(around[:, None], around[:, None], a, b).min(axis=1) > clearance
+    nodes = np.append(nodes, around[is_clear])
+    lengths = np.zeros((nodes.size, nodes.size))
+    for i, node in enumerate(nodes):
+        is_clear = _distances(node, nodes[:i, None], a, b).min(axis=1) > clearance - 1e-9
+        lengths[i, :i] = np.where(is_clear, abs(nodes[:i] - node), 0.0)
+    result: Any = csgraph.dijkstra(lengths, False, range(begin.size), return_predecessors=True)
+    routes = list[np.ndarray]()
+    for i, j in np.ndindex(begin.size, goal.size):
+        route = [begin.size + j]
+        if np.isinf(result[0][i, route[0]]):
+            rule = f"{needed}, and no path leads there from {starts[i]}"
+            fix = "give a goal in the same room, smaller radii or wider doors"
+            raise errors.not_allowed("task goal", goals[j], f"{rule}: {fix}")
+        while route[-1] != i:
+            route.append(int(result[1][i, route[-1]]))
+        routes.append(np.append(begin[i], nodes[route[::-1]]))
+    size = max(map(len, routes))
+    return np.array([np.pad(route, (0, size - len(route)), "edge") for route in routes])
+
+
+def _distances(p: Any, q: Any, a: Any, b: Any) -> np.ndarray:
+    """Return the distances [m] between segments from p to q, or points, and those from a to b."""
+    pairs = (p, a, b), (q, a, b), (a, p, q), (b, p, q)
+    sides, lengths = ([f(*pair) for pair in pairs] for f in (_side, _to_segment))
+    crosses = (sides[0] * sides[1] < 0) & (sides[2] * sides[3] < 0)
+    return np.where(crosses, 0.0, functools.reduce(np.minimum, lengths))
+
+
+def _side(point: Any, a: Any, b: Any) -> np.ndarray:
+    """Return a number above 0 for points on the left of lines from a to b."""
+    return np.imag(np.conj(b - a) * (point - a))
+
+
+def _to_segment(point: Any, a: Any, b: Any) -> np.ndarray:
+    along, away = b - a, point - a
+    share = np.real(np.conj(along) * away) / np.maximum(abs(along) ** 2, 1e-30)
+    return abs(away - np.clip(share, 0, 1) * along)
+
+
+TASK = Rooms

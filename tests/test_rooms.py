@@ -1,0 +1,377 @@
+"""Tests of rooms: maps, planned paths against shapely and lengths by hand, and bad input."""
+
+import dataclasses
+import json
+from typing import Any
+
+import numpy as np
+import pytest
+from helpers import refusal, rps
+from PIL import Image
+from shapely import LineString, MultiLineString, MultiPoint, Point, Polygon, box
+
+import rps_jax
+from rps_jax.errors import InputError
+from rps_jax.record import files
+from rps_jax.trials.setting import Setting
+from rps_jax.trials.trial import Rules
+from rps_jax.world import draws, points, tasks
+from rps_jax.world.domain import from_json, parse_domain, to_json
+from rps_jax.world.tasks.rooms import Rooms
+
+DOMAIN = "wide,objects=random_cylinder"
+PILLAR = [[3, 2], [4, 2], [4, 3.5], [3, 3.5]]
+ROOM: dict[str, Any] = {
+    "outline": [[0, 0], [8, 0], [8, 4], [6, 4], [6, 6], [0, 6]],
+    "polygons": [PILLAR],
+    "start": [1, 1, 0.3],
+    "goal": [7, 2],
+}
+HALL = {"outline": [[0, 0], [9, 0], [9, 4], [0, 4]], "start": [1.5, 2, 0], "goal": [7, 2]}
+DOOR = [[[4, 0], [4.2, 0], [4.2, 1.3], [4, 1.3]], [[4, 4], [4, 2.7], [4.2, 2.7], [4.2, 4]]]
+
+
+def room(**changes: Any) -> Rooms:
+    """Return the task of a room, with changes."""
+    task = tasks.parse_task(ROOM | changes)
+    assert isinstance(task, Rooms)
+    return task
+
+
+def lines_of(task: Rooms) -> list[LineString]:
+    """Return the walls of a map."""
+    return [LineString(ends) for ends in zip(task.walls[::2], task.walls[1::2], strict=True)]
+
+
+def edges(task: Rooms) -> set[frozenset[tuple[float, ...]]]:
+    """Return the walls of a map, of any direction and order."""
+    ends = np.round(np.array(task.walls), 6).reshape(-1, 2, 2).tolist()
+    return {frozenset(map(tuple, pair)) for pair in ends}
+
+
+def world(task: Rooms, count: int = 1) -> tuple[np.ndarray, np.ndarray, draws.Draw]:
+    """Return paths (n, N, 2) and walls (n, W, 2, 2) of drawn worlds, and the draw."""
+    drawn = draws.draw(parse_domain(DOMAIN, task=task), 0, np.arange(count))
+    lines = drawn.course.lines()
+    return lines["path"], lines["walls"], drawn
+
+
+# --- maps ----------------------------------------------------------------------------------------
+
+
+def cells(shape: Polygon, unit: float, width: int, height: int) -> np.ndarray:
+    """Return whether the middles of cells are within a shape, rows from above."""
+    y, x = unit * (np.mgrid[:height, :width] + 0.5)
+    inside = shape.contains(list(map(Point, zip(x.ravel(), y.ravel(), strict=True))))
+    return np.asarray(inside).reshape(height, width)[::-1]
+
+
+FREE = Polygon(ROOM["outline"], [PILLAR])
+IS_FREE = cells(FREE, 0.125, 66, 50)
+GREY = np.where(IS_FREE, 254, 205).astype(np.uint8)
+GREY[-27:-18, 26:30] = 0  # of the pillar
+IMAGES: dict[str, tuple[Any, dict[str, Any]]] = {
+    "room.pgm": (GREY, {}),
+    "room.png": (np.stack([GREY] * 3, axis=2), {"occupied_thresh": 0.65, "free_thresh": 0.196}),
+    "alpha.png": (
+        np.dstack([np.where(IS_FREE, 254, 0)] * 3 + [0 * GREY + 255]).astype(np.uint8),
+        {"mode": "trinary"},
+    ),
+    "white.png": (255 - GREY, {"negate": 1}),
+    "deep.png": (GREY.astype(np.uint16) * 257, {"negate": 0}),
+    "turned.pgm": (GREY, {"origin": [3.0, -1.0, 0.5]}),
+}
+
+
+@pytest.mark.parametrize("name", IMAGES)
+def test_a_ros_map_and_polygons_of_a_room_have_equal_walls(name, tmp_path):
+    pixels, fields = IMAGES[name]
+    Image.fromarray(pixels).save(tmp_path / name)
+    x, y, yaw = origin = fields.get("origin", [0.0, 0.0, 0.0])
+    turn = np.array([[np.cos(yaw), np.sin(yaw)], [-np.sin(yaw), np.cos(yaw)]])
+
+    def placed(corners: Any) -> Any:
+        return (np.array(corners) @ turn + [x, y]).tolist()
+
+    start = [*placed(ROOM["start"][:2]), ROOM["start"][2] + yaw]
+    changes = {"start": start, "goal": placed(ROOM["goal"])}
+    yaml = {"image": name, "resolution": 0.125, "origin": origin} | fields
+    path = tmp_path / "map.yaml"
+    path.write_text("# map\n" + "".join(f"{name}: {value}\n" for name, value in yaml.items()))
+    texts = (f"{key}={':'.join(map(str, value))}" for key, value in changes.items())
+    task = tasks.parse_task(",".join([str(path), *texts]))
+    polygons = {"outline": placed(ROOM["outline"]), "polygons": [placed(PILLAR)]}
+    assert isinstance(task, Rooms)
+    assert edges(task) == edges(room(**polygons, **changes))
+    assert task.start == (tuple(start),)
+
+
+def test_walls_of_an_image_are_within_the_tolerance(tmp_path):
+    rng = np.random.default_rng(3)
+    blob = MultiPoint(rng.uniform(2, 6, (12, 2))).buffer(0.7).union(box(0.5, 3, 7, 5))
+    (blob,) = (part for part in getattr(blob, "geoms", [blob]) if part.contains(Point(2, 4)))
+    free = cells(blob, 0.05, 170, 170)
+    Image.fromarray(np.where(free, 255, 0).astype(np.uint8)).save(tmp_path / "blob.png")
+    counts = []
+    for tolerance in (0.05, 0.1, 0.2):
+        task = tasks.parse_task(
+            {"image": str(tmp_path / "blob.png"), "resolution": 0.05, "tolerance": tolerance,
+             "start": [2, 4, 0], "goal": [5, 4], "object_radius": 0.1}
+        )  # fmt: skip
+        walls = MultiLineString(lines_of(task)[:-4]).segmentize(0.02)
+        assert walls.hausdorff_distance(blob.boundary.segmentize(0.02)) < tolerance + 0.05
+        counts.append(len(task.walls) // 2)
+    assert counts[0] > counts[1] > counts[2]
+
+
+def test_a_part_of_a_map_without_the_start_is_a_wall(tmp_path):
+    pixels = np.full((80, 160), 255, np.uint8)
+    pixels[:, 100] = 0
+    pixels[20:25, 120:125] = 0  # in the other part
+    Image.fromarray(pixels).save(tmp_path / "two.png")
+    fields = {"image": str(tmp_path / "two.png"), "resolution": 0.05, "start": [1, 2, 0]}
+    task = tasks.parse_task(fields | {"goal": [4, 2]})
+    assert len(edges(task)) == 8
+    with pytest.raises(InputError, match=r"goal = \(7.0, 2.0\) .*a goal in the same room"):
+        tasks.parse_task(fields | {"goal": [7, 2]})
+
+
+# --- paths ---------------------------------------------------------------------------------------
+
+
+def test_a_free_way_is_straight():
+    (path,), _, _ = world(room(**HALL, polygons=[]))
+    assert path[-1] == pytest.approx([5.5, 0])
+    assert path[:, 1] == pytest.approx(0)
+    assert LineString(path).length == pytest.approx(5.5 - 0.3625)
+
+
+def test_a_path_around_a_wall_is_almost_the_shortest():
+    """Two tangents and an arc about each end of a wall of no more than 1 mm."""
+    wall = [[5, -1], [5.001, -1], [5.001, 1], [5, 1]]
+    task = room(outline=[[-9, -9], [19, -9], [19, 9], [-9, 9]], polygons=[wall], start=[0, 0, 0],
+                goal=[10, 0])  # fmt: skip
+    (path,), _, _ = world(task)
+    ahead, clearance = 0.5, 0.75
+    tangents = [np.sqrt((5 - x) ** 2 + 1 - clearance**2) for x in (ahead, 0)]
+    angles = [np.arctan2(1, 5 - x) + np.arcsin(clearance / np.hypot(5 - x, 1)) for x in (ahead, 0)]
+    shortest = ahead + sum(tangents) + clearance * sum(angles)
+    length = LineString([(0, 0), *path[1:]]).length
+    assert shortest - 1e-3 < length < 1.02 * shortest
+    assert len(np.unique(path, axis=0)) <= 7
+
+
+def test_a_path_keeps_the_clearance_and_no_corner_can_be_left_out():
+    rng = np.random.default_rng(5)
+    for k in range(4):
+        corners = [
+            2 + 2.5 * np.array([i, j]) + rng.uniform(-0.4, 0.4, (3, 2))
+            for i in range(4)
+            for j in range(3)
+        ]
+        hulls = [MultiPoint(c).convex_hull for c in corners]
+        polygons = [np.array(h.exterior.coords).tolist() for h in hulls]
+        task = room(outline=[[-2, -2], [13, -2], [13, 10], [-2, 10]], polygons=polygons,
+                    start=[-1, -1, 0.7], goal=[12, 8.9 - k], object_radius=0.2)  # fmt: skip
+        (path,), (walls,), _ = world(task)
+        path = path[: len(np.unique(path, axis=0))]
+        obstacles = MultiLineString(list(walls))
+        assert LineString(path[1:]).distance(obstacles) > 0.7 - 1e-9
+        for i in range(2, len(path) - 1):
+            assert LineString(path[[i - 1, i + 1]]).distance(obstacles) < 0.7
+
+
+def test_the_world_is_the_frame_of_the_base_at_its_start():
+    (path,), (walls,), drawn = world(room())
+    yaw, start = 0.3, np.array([1, 1])
+    turn = np.array([[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]])
+    assert path[0] == pytest.approx([0.3625, 0])
+    assert path[1] == pytest.approx([0.5, 0])
+    assert path[-1] @ turn.T + start == pytest.approx([7, 2])
+    assert drawn.p_world_target[0] == pytest.approx(path[-1])
+    assert (walls @ turn.T + start).reshape(-1, 2) == pytest.approx(np.array(room().walls))
+
+
+def test_worlds_draw_start_goal_and_scale():
+    task = room(start=[[1, 1, 0], [1, 5, 0]], goal=[[7, 2], [5, 5]], scale=[1.0, 2.0])
+    paths, walls, drawn = world(task, 40)
+    sizes = drawn.values["scale"]
+    assert ((sizes >= 1) & (sizes < 2)).all()
+    assert len(np.unique(np.round(paths[:, -1] / sizes[:, None], 6), axis=0)) == 4
+    for path, lines in zip(paths, walls, strict=True):
+        away = LineString(path[1:]).distance(MultiLineString(list(lines)))
+        assert away > 0.75 - 1e-9
+    table = draws.table(drawn)
+    assert table["scale"][0] == pytest.approx(sizes)
+    assert table["length"][0] == pytest.approx([LineString(path).length for path in paths])
+
+
+def test_a_room_is_a_point_of_the_cube_and_has_a_text_and_a_json():
+    task = room(start=[[1, 1, 0], [1, 5, 0]], scale=[1, 1.5])
+    assert tasks.parse_task(str(task)) == task
+    domain, index = parse_domain(DOMAIN, task=task), np.arange(6)
+    assert from_json(json.loads(json.dumps(to_json(domain)))) == domain
+    assert {"scale", "route"} <= set(points.names(domain))
+    assert "route" not in points.names(parse_domain(DOMAIN, task=room()))
+    at = points.check_points(domain, points.points_of(domain, index))
+    drawn, again = (points.draw(domain, 0, x, index).course.lines() for x in (None, at))
+    for name in ("path", "walls"):
+        np.testing.assert_array_equal(drawn[name], again[name])
+
+
+# --- trials --------------------------------------------------------------------------------------
+
+SETTING = Setting("quasistatic", rules=Rules(horizon=40.0))
+
+
+def test_a_trial_ends_at_a_wall_and_a_wide_door_lets_it_pass(tmp_path):
+    wide = files.write_json(tmp_path / "map.json", HALL | {"polygons": DOOR, "object_radius": 0.15})
+    trace = rps_jax.push("cylinder", task=f"rooms,{wide}", skin="ideal", setting=SETTING)
+    assert trace.data.outcome_wall_touch == 0
+    assert 0.1 < trace.data.outcome_clearance < 0.6
+    assert trace.data.walls.shape == (16, 2, 2)
+    low = [[3.6, 0], [3.7, 0], [3.7, 2.5], [3.6, 2.5]]
+    task = HALL | {"polygons": [low], "base_radius": 0.3, "object_radius": 0}
+    touched = rps_jax.push("box", task=task, skin="ideal", setting=SETTING)
+    assert touched.data.outcome_wall_touch > 0
+    assert not touched.outcome.success
+    point = Point(touched.data.outcome_touch_x + 1.5, touched.data.outcome_touch_y + 2)
+    assert Polygon(low).boundary.distance(point) < 1e-5
+
+
+def test_a_sweep_of_rooms_is_stored_and_replayed(tmp_path):
+    path = files.write_json(tmp_path / "map.json", HALL | {"polygons": DOOR, "scale": [1.0, 1.4],
+                                                           "object_radius": 0.1})  # fmt: skip
+    out = tmp_path / "run"
+    options = f"--domain {DOMAIN} --engine quasistatic --horizon 40 --laws rps --worlds 4"
+    assert rps(f"sweep --task {path} {options} --out {out}") == 0
+    path.unlink()  # the run has its own walls
+    results = rps_jax.load(out)
+    assert results.scale.values.max() > 1
+    assert rps_jax.replay(out, 0).data.outcome_wall_touch == results.wall_touch[0, 0]
+
+
+# --- bad input -----------------------------------------------------------------------------------
+
+SQUARE = [[4, 1], [5, 1], [5, 3], [4, 3]]
+ROS = {"image": "room.png", "resolution": 0.125, "start": [1, 1, 0.3], "goal": [7, 2]}
+BAD: dict[str, tuple[dict[str, Any], str]] = {
+    "empty": ({"kind": "rooms", "goal": [1, 1]}, "give polygons, an outline or a map.yaml"),
+    "no goal": ({"polygons": [SQUARE]}, "task goal = () is not allowed: give x and y"),
+    "two points": (HALL | {"polygons": [[[4, 1], [5, 1]]]}, "three corners or more"),
+    "closed two": (HALL | {"polygons": [[[4, 1], [5, 1], [4, 1]]]}, "three corners or more"),
+    "crossing": (HALL | {"polygons": [[[4, 1], [5, 2], [5, 1], [4, 2]]]}, "cross or touch"),
+    "touching": (
+        HALL | {"polygons": [[[4, 1], [6, 1], [6, 3], [5, 1], [4, 3]]]},
+        "cross or touch",
+    ),
+    "repeated": (HALL | {"polygons": [[[4, 1], [4, 1], [5, 2], [4, 2]]]}, "corners are repeated"),
+    "nan": (HALL | {"polygons": [[[4, 1], [float("nan"), 1], [5, 2]]]}, "finite numbers"),
+    "nan start": (HALL | {"start": [float("nan"), 2, 0]}, "task start = nan is not allowed"),
+    "nan goal": (HALL | {"goal": [float("nan"), 2]}, "task goal = nan is not allowed"),
+    "no yaw": (HALL | {"start": [1.5, 2]}, "write x, y, yaw"),
+    "3-D goal": (HALL | {"goal": [[7, 2, 0], [1, 2, 0]]}, "write pairs of x, y"),
+    "millimetres": (HALL | {"goal": [7000, 2000]}, "at most 1000 [m]"),
+    "flat": (HALL | {"polygons": SQUARE}, "task polygon 0 = of shape (2,)"),
+    "number": (HALL | {"polygons": 5}, "task polygon 0 = 5"),
+    "text": (HALL | {"polygons": "square"}, "task polygon 0"),
+    "start in polygon": (
+        HALL | {"polygons": [SQUARE], "start": [4.5, 2, 0]},
+        "task start = (4.5, 2.0, 0.0) is not allowed: it lies in an obstacle",
+    ),
+    "start at wall": (
+        HALL | {"start": [0.2, 2, 0], "object_radius": 0.1},
+        "the base touches a wall",
+    ),
+    "goal in polygon": (HALL | {"polygons": [SQUARE], "goal": [4.5, 2]}, "task goal = (4.5, 2.0)"),
+    "goal outside": (HALL | {"goal": [12, 2]}, "a goal in the same room"),
+    "goal at wall": (HALL | {"goal": [8.8, 2]}, "and one is 0.20 m away"),
+    "goal at start": (HALL | {"goal": [1.5, 2]}, "the base is there at the start"),
+    "unreachable": (HALL | {"polygons": [[[4, 0], [5, 0], [5, 4], [4, 4]]]}, "no path leads there"),
+    "narrow": (
+        HALL | {"polygons": [[[4, 0], [5, 0], [5, 3.5], [4, 3.5]]]},
+        "no path leads there from (1.5, 2.0, 0.0): give a goal in the same room, smaller",
+    ),
+    "narrow base": (HALL | {"base_radius": 0.2}, "half of the base's width"),
+    "many": (
+        HALL | {"outline": [[9 * np.cos(x), 9 * np.sin(x)] for x in np.linspace(0, 6.28, 150)]},
+        "at most 128 are allowed: give a larger tolerance",
+    ),
+    "typo": (HALL | {"polygon": []}, "did you mean 'polygons'?"),
+    "drawn turns": (HALL | {"turns": 2}, "task quantity of rooms"),
+    "waypoints": (
+        HALL | {"waypoints": [[0, 0], [1, 1]], "kind": "rooms"},
+        "task quantity of rooms",
+    ),
+    "no resolution": (
+        {"image": "room.png", "start": [1, 1, 0], "goal": [7, 2]},
+        "task resolution = None is not allowed: it must be a number and above 0",
+    ),
+    "zero resolution": (ROS | {"resolution": 0}, "task resolution = 0"),
+    "text resolution": (ROS | {"resolution": "5 cm"}, "task resolution = 5 cm"),
+    "no image": ({k: v for k, v in ROS.items() if k != "image"}, "an image cannot be read"),
+    "missing image": (ROS | {"image": "none.pgm"}, "none.pgm cannot be read"),
+    "folder": (ROS | {"image": "."}, "it is no regular file"),
+    "huge": (ROS | {"image": "huge.pgm"}, "at most 16 million pixels (Image size (1000000000"),
+    "large": (
+        ROS | {"image": "large.pgm"},
+        "at most 16 million pixels (it has 5000 x 5000 pixels)",
+    ),
+    "cut": (ROS | {"image": "cut.pgm"}, "give a PGM, PNG or BMP file"),
+    "no picture": (ROS | {"image": "map.json"}, "give a PGM, PNG or BMP file"),
+    "noise": (ROS | {"image": "noise.png", "start": [4, 4, 0]}, "give a larger tolerance"),
+    "scale": (ROS | {"mode": "scale"}, "task mode = scale is not allowed: give one of ['trinary']"),
+    "negate": (ROS | {"negate": 2}, "task negate = 2"),
+    "origin": (ROS | {"origin": [0, 0]}, "task origin"),
+    "threshold": (ROS | {"free_thresh": 25}, "task free_thresh = 25"),
+    "tolerance": (ROS | {"tolerance": -1}, "task tolerance = -1"),
+    "start off image": (ROS | {"start": [-3, 1, 0]}, "outside of the image"),
+    "start unknown": (ROS | {"start": [7, 5, 0]}, "in unknown cells"),
+    "goal off image": (ROS | {"goal": [20, 1]}, "a goal in the same room"),
+}
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """Folder of good and bad images."""
+    path = tmp_path_factory.mktemp("maps")
+    Image.fromarray(GREY).save(path / "room.png")
+    noise = np.random.default_rng(0).uniform(size=(80, 80)) < 0.9
+    Image.fromarray(np.where(noise, 255, 0).astype(np.uint8)).save(path / "noise.png")
+    for name, size in (("huge", "40000 25000"), ("large", "5000 5000"), ("cut", "50 50")):
+        (path / f"{name}.pgm").write_bytes(f"P5\n{size}\n255\n".encode() + b"0" * 100)
+    return path
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_bad_maps_are_one_sentence(name, folder, capsys, recwarn):
+    fields, message = BAD[name]
+    path = files.write_json(folder / "map.json", fields)
+    assert message in refusal(capsys, f"push --task {path}")
+    assert message in refusal(capsys, f"sweep --domain {DOMAIN} --task rooms,{path}")
+    assert not [x for x in recwarn if "Decompression" in str(x.category)]
+
+
+YAML = {
+    "image: room.png\nresolution: [0.1\n": "is no YAML mapping",
+    "- image\n- resolution\n": "is no YAML mapping",
+    "": "is no YAML mapping",
+    "\x00": "is no YAML mapping",
+    "image: room.png\n": "task resolution = None",
+    "image: none.png\nresolution: 0.05\norigin: [0, 0, 0]\n": "none.png cannot be read",
+    "image: room.png\nresolution: .nan\n": "task resolution = nan",
+}
+
+
+@pytest.mark.parametrize("text", YAML)
+def test_bad_yaml_is_one_sentence(text, folder, capsys):
+    (folder / "map.yaml").write_text(text)
+    assert YAML[text] in refusal(capsys, f"push --task {folder}/map.yaml,goal=2:2")
+
+
+def test_a_task_without_a_map_is_refused_and_types_are_checked(capsys):
+    assert "give polygons, an outline or a map.yaml" in refusal(capsys, "push --task rooms")
+    for walls in (((0.0, 0.0),), ((0.0,), (1.0,))):
+        with pytest.raises(InputError, match="task walls"):
+            Rooms(walls=walls, goal=((1.0, 1.0),))  # pyright: ignore[reportArgumentType]
+    assert dataclasses.replace(room(), object_radius=0.1).object_radius == 0.1
