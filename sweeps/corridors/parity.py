@@ -28,13 +28,12 @@ from sweeps.study_base import Study, Table, run_plans
 class Row(NamedTuple):
     """Worlds of one row of the table, and the law in them."""
 
-    task: str = "reach"
+    task: str
     domain: str = "wide"
     law: str = "rps_tuned"
 
 
 ROWS = {
-    "reach": Row(),
     "path": Row("path"),
     "corridor": Row("corridor"),
 }
@@ -57,7 +56,7 @@ class Parity(Study[xr.DataTree]):
     PRESETS: ClassVar = PHYSICS["default"]
 
     rows: tuple[str, ...] = tuple(ROWS)
-    """Rows of the table: reach, path, corridor."""
+    """Rows of the table: path, corridor."""
     worlds: int = option(300, 1, 10_000_000)
     """Number of worlds of each row."""
     seed: int = option(77, 0, 2**32 - 1)
