@@ -15,7 +15,7 @@ from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import Rules
 from rps_jax.world.domain import parse_domain
 from rps_jax.world.tasks.corridor import BASE, OBJECT
-from sweeps.corridors import study
+from sweeps.corridors import costs, parity, study
 from sweeps.corridors.widths import fit
 from sweeps.study_base import run_together
 
@@ -102,3 +102,27 @@ def test_an_interval_is_shown_unless_it_is_a_point() -> None:
     text = study.width_text(fit(width[:200], success[:200], 1.1, 2.5), 0.93)
     assert text.startswith("not within the widths [1.")
     assert study.width_text(fit(*drawn(1.0, 0.3, 0.02), 1.1, 2.5), 0.9) == "at most 1.10 m"
+
+
+def test_the_table_of_parity_counts_equal_outcomes() -> None:
+    reference = results_of(("rps_tuned",), success=np.array([[1, 1, 0, 0]]))
+    fused = results_of(("rps_tuned",), success=np.array([[1, 0, 0, 0]]))
+    outcomes = xr.DataTree.from_dict({"path reference": reference, "path fused": fused})
+    (table,) = parity.Parity(rows=("path",)).report_tables(outcomes)
+    _, (name, _, _, law, *rates, changes) = table.rows
+    assert (name, law, changes) == ("path", "rps_tuned", "+0 -1")
+    assert [rate.split()[0] for rate in rates] == ["50.0", "25.0", "75.0"]
+
+
+def test_all_rows_of_tasks_can_be_run() -> None:
+    parity.Parity().validate()
+    for task in costs.TASKS.values():
+        parse_domain(costs.DOMAIN, None, task)
+
+
+def test_costs_are_relative_to_reach() -> None:
+    cost = np.array([[2e-5, 1e-5], [2e-5, 3e-5]])
+    results = xr.Dataset({"cost": (("task", "round"), cost)})
+    (table,) = costs.Costs(tasks=("reach", "path")).report_tables(results)
+    assert table.rows[1][1:3] == ["10.0 µs", "1.000"]
+    assert table.rows[2][2:] == ["2.000", "1.00 to 3.00"]

@@ -5,11 +5,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import xarray as xr
 from helpers import refusals
 
 from rps_jax.control.base import check_finite_leaves
 from rps_jax.errors import InputError
-from sweeps.force_push_grid import grid
+from sweeps.force_push_grid import grid, paths
 from sweeps.force_push_grid.study import ForcePushGrid
 
 
@@ -73,3 +74,43 @@ test_invalid_options_of_the_grid_are_refused = refusals(
     ({"engine": "quasistatic"}, "computes no contact force"),
     ({"engine": "mujoco"}, "JAX must trace it"),
 )
+
+
+def test_a_curve_is_that_of_the_authors_script():
+    """Their corner leads from (3, 0) by a quarter of a circle about (3, 2) to (5, 2)."""
+    points = grid.curve(2.0, 12.0)
+    lengths = np.hypot(*np.diff(points, axis=0).T)
+    assert lengths.sum() == pytest.approx(12.0, abs=1e-3)
+    np.testing.assert_allclose(points[[0, 1, -2]], [(0, 0), (3, 0), (5, 2)], atol=1e-12)
+    np.testing.assert_allclose(np.hypot(*(points[1:-1] - (3, 2)).T), 2.0)
+    assert points[-1] == pytest.approx((5.0, 2 + 9 - math.pi))
+    np.testing.assert_array_equal(grid.curve(math.inf, 12.0), [(0, 0), (12, 0)])
+
+
+def test_each_law_has_its_better_lookahead():
+    shape = (len(paths.LOOKAHEADS), len(paths.RADII), 2, 2, 9)
+    success, error = np.zeros(shape, int), np.full(shape, 0.3)
+    success[0, :, :, 0, :6] = success[1, :, :, 1, :3] = 1
+    error[:, 0] = np.nan  # no contact
+    dims = ("lookahead", "path", "slider", "law", "world")
+    coords = {"path": list(paths.RADII), "slider": list(grid.SLIDERS), "law": ["a", "b"]}
+    columns = {"success": (dims, success), "error_mean": (dims, error)}
+    base = xr.Dataset(columns, coords)
+    point = base.isel(lookahead=0, law=0, drop=True)
+    by_law = paths.best_lookaheads(xr.DataTree.from_dict({"point": point, "base": base}))
+    assert list(by_law) == [paths.POINT, "a, 0.6 m", "b, 1.6 m"]
+    header, *rows = paths.table(by_law)
+    assert len(rows) == 3 * len(paths.RADII)
+    assert len(header) == len(rows[0])
+    assert rows[1][2].startswith("66.7 %")
+    assert rows[1][3] == "30 [30, 30]"
+    assert rows[0][3] == "nan [nan, nan]"
+
+
+@pytest.mark.slow
+def test_the_law_follows_a_curve_with_a_point():
+    """The point follows a turn of 2 m radius; none of the boxes is lost."""
+    results = grid.run_grid("force_push", "box", duration=90.0, radius=2.0)
+    assert int(results.success.sum()) == 243
+    assert 0.5 < float(results.completion.mean()) < 0.9
+    assert float(results.error_mean.median()) < float(results.error_95.median()) < 3.0

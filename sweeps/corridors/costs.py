@@ -26,7 +26,7 @@ from rps_jax.trials.trial import Rules
 from rps_jax.world.domain import parse_domain
 from sweeps.study_base import SpeedStudy, Table
 
-_DOMAIN = "wide,objects=random_box,distance=19:20,bearing=0"
+DOMAIN = "wide,objects=random_box,distance=19:20,bearing=0"
 _STRAIGHT = "turns=0,length=20,lookahead=1"
 TASKS = {  # the first is the one to compare with; paths have 8 segments, corridors 16 walls
     "reach": "reach",
@@ -46,7 +46,7 @@ class Costs(SpeedStudy[xr.Dataset]):
     TITLE: ClassVar[str] = "Cost of tasks"
     CHOICES: ClassVar = {"tasks": TASKS}
     GROWS: ClassVar[tuple[str, ...]] = ("tasks",)
-    PRESETS: ClassVar = {"tasks": TASKS, "domain": _DOMAIN}
+    PRESETS: ClassVar = {"tasks": TASKS, "domain": DOMAIN}
 
     tasks: tuple[str, ...] = tuple(TASKS)
     """Tasks: reach first, then those to compare with it."""
@@ -70,7 +70,7 @@ class Costs(SpeedStudy[xr.Dataset]):
         costs = np.zeros((len(self.tasks), self.rounds + 1))
         for i in range(self.rounds + 1):
             for j, name in enumerate(self.tasks):
-                domain = parse_domain(_DOMAIN, None, TASKS[name])
+                domain = parse_domain(DOMAIN, None, TASKS[name])
                 request = Candidates(params, [domain], 0, np.arange(self.worlds))
                 _, timing = outcomes([request], setting, workers=self.workers)
                 costs[j, i] = timing.run / timing.simulated
@@ -88,7 +88,7 @@ class Costs(SpeedStudy[xr.Dataset]):
             spread = f"{of_task.min():.2f} to {of_task.max():.2f}"
             rows.append([name, f"{1e6 * cost:.1f} µs", f"{cost / least[0]:.3f}", spread])
         kind = "cpu" if jax.default_backend() == "cpu" else "gpu"
-        return [Table(rows, name=f"corridors_cost_{kind}", title="Cost of tasks")]
+        return [Table(rows, name=f"tasks_cost_{kind}", title="Cost of tasks")]
 
 
 costs = call_of(Costs)

@@ -31,11 +31,13 @@ class Row(NamedTuple):
     task: str
     domain: str = "wide"
     law: str = "rps_tuned"
+    robot: str | None = None
 
 
 ROWS = {
     "path": Row("path"),
     "corridor": Row("corridor"),
+    "round base": Row("corridor", robot="round"),
 }
 SETTINGS = {
     "reference": Setting("mujoco", physics=preset(fidelity="reference")),
@@ -56,7 +58,7 @@ class Parity(Study[xr.DataTree]):
     PRESETS: ClassVar = PHYSICS["default"]
 
     rows: tuple[str, ...] = tuple(ROWS)
-    """Rows of the table: path, corridor."""
+    """Rows of the table: path, corridor, round base."""
     worlds: int = option(300, 1, 10_000_000)
     """Number of worlds of each row."""
     seed: int = option(77, 0, 2**32 - 1)
@@ -74,7 +76,7 @@ class Parity(Study[xr.DataTree]):
         """Return the plan of a row in an engine."""
         label, params = registry.resolve_law(row.law)
         setting = replace(SETTINGS[engine], seed=self.seed)
-        domain = parse_domain(row.domain, None, row.task)
+        domain = parse_domain(row.domain, row.robot, row.task)
         return Plan(domain, self.worlds, {label: params}, setting, self.part)
 
     def check(self) -> None:
@@ -97,7 +99,8 @@ class Parity(Study[xr.DataTree]):
 
     def report_tables(self, results: xr.DataTree) -> Sequence[Table]:
         """Return a row per task: success in both engines, and equal outcomes."""
-        rows = [["task", "worlds", "law", "success in C", "fused", "equal outcomes", "+/-"]]
+        heads = ("", "task", "worlds", "law", "success in C MuJoCo", "fused", "equal outcomes")
+        rows = [[*heads, "+/-"]]
         for name in self.rows:
             reference, fused = (results[f"{name} {x}"].success > 0 for x in SETTINGS)
             rates = [tables.share(int(x.sum()), x.size) for x in (reference, fused)]
@@ -106,8 +109,8 @@ class Parity(Study[xr.DataTree]):
             row = ROWS[name]
             worlds = f"`{row.domain}`, {fused.size:,}"
             changes = f"+{compared.gained} -{compared.lost}"
-            rows.append([f"`{row.task}`", worlds, row.law, *rates, equal, changes])
-        return [Table(rows, name="corridors_parity", title="Equal outcomes")]
+            rows.append([name, f"`{row.task}`", worlds, row.law, *rates, equal, changes])
+        return [Table(rows, name="tasks_parity", title="Equal outcomes")]
 
 
 parity = call_of(Parity)

@@ -270,6 +270,12 @@ RECIPES: dict[str, Recipe] = {
         f"rps_tuned,sweeps/corridors/tuned.json {_MACHINE}",
         gpu=3,
     ),
+    "tasks_parity": recipe(f"rps sweeps/corridors/parity.py {_MACHINE}", cores=90),
+    "tasks_cost_cpu": recipe(f"rps sweeps/corridors/costs.py {_MACHINE}", cores=3),
+    "tasks_cost_gpu": recipe(
+        f"rps sweeps/corridors/costs.py --worlds 16384 --rounds 6 {_MACHINE}", gpu=2
+    ),
+    "force_push_paths": recipe(f"rps sweeps/force_push_grid/paths.py {_MACHINE}", cores=60, gpu=2),
     "tuned_for_corridors": recipe(
         "rps ladder --laws rps_tuned rps_tuned,sweeps/corridors/tuned.json --domain wide real "
         "--worlds 4000 --seed 10",
