@@ -49,6 +49,7 @@ class Methods(FitStudy):
     """Compare the methods of `rps fit` in worlds whose true values are known."""
 
     TITLE: ClassVar[str] = "Methods of fitting worlds to logs"
+    GROWS: ClassVar[tuple[str, ...]] = ("evolution_logs",)
     QUICK: ClassVar[Mapping[str, object]] = {"worlds": 192, "logs": 2, "window": 12.0}
 
     domain: domains.DomainLike = "wide,objects=random_box"
@@ -57,6 +58,8 @@ class Methods(FitStudy):
     """Number of worlds from which the networks learn."""
     logs: int = option(200, 2, 10_000, kw_only=True)
     """Number of worlds whose logs are fitted."""
+    evolution_logs: int = option(100, 1, 10_000, kw_only=True)
+    """Number of logs, those with the fewest windows, that CMA-ES fits; in whole parts of 25."""
     starts: int = option(48, 6, 1000, kw_only=True)
     """Number of worlds from which least squares and CMA-ES start."""
 
@@ -72,12 +75,12 @@ class Methods(FitStudy):
         Processes fit windows, because Python runs most of the splines and of the tracing. Each part
         has some logs and does not need the others. Networks learn meanwhile.
         """
-        quiet, parts = run._replace(callback=no_progress), range(-(-self.logs // _PART))
+        quiet = run._replace(callback=no_progress)
         context, cpu = multiprocessing.get_context("spawn"), ("cpu",)
         with context.Pool(device.count_processors(), device.choose, cpu) as pool:
             jobs = [
                 pool.starmap_async(_fit_part, [(self, quiet, method, i) for i in parts], 1)
-                for method in METHODS[:0:-1]  # the slowest first
+                for method, parts in self._parts.items()
             ]
             start = time.process_time()
             training = self.bank.worlds(self.worlds, run)
@@ -89,13 +92,23 @@ class Methods(FitStudy):
                 for i, kind in enumerate(KINDS)
             ]
             set_phase(run.callback, "replay windows")
-            by_method = [networks]
-            for job in reversed(jobs):
-                fits = [xr.concat(x, "log").sortby("log") for x in zip(*job.get(), strict=True)]
-                by_method.append([x.drop_vars("log") for x in fits])
-        kinds = [xr.concat(x, xr.IndexVariable("kind", list(KINDS))) for x in by_method]
-        result = xr.concat(kinds, xr.IndexVariable("estimator", list(METHODS)))
+            index = np.arange(self.logs)
+            by_method = {"neural": [fits.assign_coords(log=index) for fits in networks]}
+            for method, job in zip(self._parts, jobs, strict=True):
+                by_kind = zip(*job.get(), strict=True)
+                by_method[method] = [xr.concat(fits, "log").sortby("log") for fits in by_kind]
+        kinds = [
+            xr.concat(by_method[method], xr.IndexVariable("kind", list(KINDS)))
+            for method in METHODS
+        ]
+        result = xr.concat(kinds, xr.IndexVariable("estimator", list(METHODS)), join="outer")
         return xr.merge([result, simulation])
+
+    @property
+    def _parts(self) -> dict[str, range]:
+        """Parts of the logs that each method fits, the slowest method first."""
+        counts = {"evolution": min(self.evolution_logs, self.logs), "gradient": self.logs}
+        return {method: range(-(-count // _PART)) for method, count in counts.items()}
 
     def _by_networks(
         self, kind: str, training: xr.Dataset, test: xr.Dataset, run: Run
@@ -122,28 +135,27 @@ class Methods(FitStudy):
                 logs[i] = jax.tree.map(lambda x, row=row: x[row : row + 1], batch)
         return [logs[i] for i in range(self.logs)]
 
-    def indices(self, part: int) -> np.ndarray:
-        """Return the logs of a part; their numbers of windows, hence programs, differ little."""
-        tracks = (Track.of(log, self.bank.interval, True, True) for log in self.test_logs)
-        order = np.argsort([track.first.size for track in tracks], kind="stable")
-        return order[part * _PART : (part + 1) * _PART]
+    def tracks(self, part: int) -> tuple[np.ndarray, list[Track], float]:
+        """Return the logs of a part, their smooth paths, and the mean seconds of smoothing.
 
-    def smooth(self, index: np.ndarray) -> tuple[list[Track], float]:
-        """Return the paths of some logs, and the mean processor time [s] of smoothing."""
+        The numbers of windows of its logs, and hence their programs, differ little.
+        """
+        interval, logs = self.bank.interval, self.test_logs
+        counts = [Track.of(log, interval, True, True).first.size for log in logs]
+        index = np.argsort(counts, kind="stable")[part * _PART : (part + 1) * _PART]
         start = time.process_time()
-        tracks = [Track.of(self.test_logs[i], self.bank.interval, False, True) for i in index]
-        return tracks, (time.process_time() - start) / len(index)
+        tracks = [Track.of(logs[i], interval, False, True) for i in index]
+        return index, tracks, (time.process_time() - start) / len(index)
 
     def by_windows(
-        self, method: str, kind: str, index: np.ndarray,
-        smooth: Callable[[], tuple[list[Track], float]],
-    ) -> xr.Dataset:  # fmt: skip
+        self, method: str, kind: str, inputs: Callable[[], tuple[np.ndarray, list[Track], float]]
+    ) -> xr.Dataset:
         """Return the fits of replayed windows; logs with too few windows keep the prior."""
         minimise = {"gradient": Replay.minima, "evolution": evolved}[method]
         names = points.names(self.ranges)
         columns = [names.index(name) for name in fit.coordinates(self.ranges)]
         starts = points.points_of(self.ranges, np.arange(self.starts), seed_of(0, "tune"))
-        results, counts, (tracks, smoothing) = list[np.ndarray](), list[float](), smooth()
+        results, counts, (index, tracks, smoothing) = list[np.ndarray](), list[float](), inputs()
         start = time.process_time()
         for log, track in zip(index.tolist(), tracks, strict=True):
             track = track if "f_robot" in KINDS[kind] else track._replace(force=None)
@@ -176,12 +188,9 @@ methods = call_of(Methods)
 
 def _fit_part(study: Methods, run: Run, method: str, part: int) -> list[xr.Dataset]:
     """Return the fits of a part of the logs, from each kind of log."""
-    index = study.indices(part)
-    smooth = functools.cache(partial(study.smooth, index))
+    inputs = functools.cache(partial(study.tracks, part))
     return [
-        run.checkpoint(
-            f"{method}-{i}-{part:03d}", partial(study.by_windows, method, kind, index, smooth)
-        )
+        run.checkpoint(f"{method}-{i}-{part:03d}", partial(study.by_windows, method, kind, inputs))
         for i, kind in enumerate(KINDS)
     ]
 
@@ -223,44 +232,56 @@ def evolved(replay: Replay, u: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.n
 
 
 def method_rows(results: xr.Dataset, study: Methods) -> Rows:
-    """Return a header and one row for each kind of log and method."""
-    rows = [["log", "method", "90 % intervals hold the truth", "those of determined quantities",
-             "determined", "error of determined quantities", "processor seconds a log",
-             "simulated"]]  # fmt: skip
+    """Return a header and rows for each kind of log and method: all logs, and those of CMA-ES."""
+    rows = [["log", "method", "logs", "90 % intervals hold the truth",
+             "those of determined quantities", "determined", "error of determined quantities",
+             "processor seconds a log", "simulated"]]  # fmt: skip
+    replays = {
+        "gradient": (study.starts // 6 + 16) * 6,
+        "evolution": study.starts + _POPULATION * _GENERATIONS,
+    }
     for kind in map(str, results.kind.values):
-        for method in METHODS:
-            fits = results.sel(kind=kind, estimator=method)
+        common = _fits(results, kind, METHODS[-1]).log
+        all_fits = [(method, _fits(results, kind, method)) for method in METHODS]
+        more = [(method, fits) for method, fits in all_fits if fits.sizes["log"] > common.size]
+        for method, fits in more + [(method, fits.sel(log=common)) for method, fits in all_fits]:
             covered, determined = within(fits), fits.undetermined == 0
             shares = covered.mean(), covered.where(determined).mean(), determined.mean()
             cells = [f"{100 * float(share):.1f} %" for share in shares]
             error = f"{100 * float(_error(fits).where(determined).median()):.1f} %"
             seconds, windows = float(fits.seconds.median()), float(fits.windows.mean())
-            replays = {
-                "gradient": (study.starts // 6 + 16) * 6,
-                "evolution": study.starts + _POPULATION * _GENERATIONS,
-            }.get(method, 0)
-            trials = f"{replays * windows * least_squares.WINDOW:,.0f} s for each log"
+            trials = f"{replays.get(method, 0) * windows * least_squares.WINDOW:,.0f} s a log"
             if method == "gradient":
                 trials = trials.replace(" s ", " s and derivatives ")
             if method == "neural":
                 trials = f"{study.worlds * study.window:,.0f} s for all logs"
                 seconds += float(results.simulation) / study.logs
-            rows.append([kind, method, *cells, error, f"{seconds:.1f}", trials])
+            count = str(fits.sizes["log"])
+            rows.append([kind, method, count, *cells, error, f"{seconds:.1f}", trials])
     return rows
 
 
 def quantity_rows(results: xr.Dataset) -> Rows:
-    """Return a header and one row for each quantity; errors are shares of the prior's interval."""
+    """Return a header and one row for each quantity; errors are shares of the prior's interval.
+
+    The logs are those that all methods fit.
+    """
     pairs = [(kind, method) for kind in map(str, results.kind.values) for method in METHODS]
     rows = [["quantity", *(f"{kind}: {method}" for kind, method in pairs)]]
     for name in _QUANTITIES:
         cells = []
         for kind, method in pairs:
-            fits = results.sel(kind=kind, estimator=method, quantity=name)
+            fits = _fits(results, kind, method).sel(quantity=name)
+            fits = fits.sel(log=_fits(results, kind, METHODS[-1]).log)
             error, covered = float(_error(fits).median()), float(within(fits).mean())
             cells.append(f"{100 * error:.1f} %, {100 * covered:.0f} %")
         rows.append([quantity(name), *cells])
     return rows
+
+
+def _fits(results: xr.Dataset, kind: str, method: str) -> xr.Dataset:
+    """Return the fits of one method to the logs that it fits."""
+    return results.sel(kind=kind, estimator=method).dropna("log", how="all", subset=["rank"])
 
 
 def _error(fits: xr.Dataset) -> xr.DataArray:
