@@ -504,13 +504,39 @@ def test_both_methods_return_the_same_variables(object_log, monkeypatch, compile
     assert not compiled
 
 
+def test_methods_are_compared_on_the_logs_that_all_fit():
+    """Logs that CMA-ES does not fit count neither as covered nor as missed."""
+    shape, study = ("kind", "log", "quantity"), methods.Methods()
+    names, kinds = list(methods._QUANTITIES), list(methods.KINDS)
+
+    def fits(logs, seconds):
+        size = len(kinds), len(logs), len(names)
+        columns = {name: (shape, np.zeros(size)) for name in ("truth", "median", "undetermined")}
+        columns |= {"rank": (shape, np.full(size, 0.5))}
+        columns |= {"prior_low": (shape, np.zeros(size)), "prior_high": (shape, np.ones(size))}
+        row = np.full(size[:2], seconds)
+        columns |= {"seconds": (shape[:2], row), "windows": (shape[:2], row)}
+        return xr.Dataset(columns, {"kind": kinds, "log": logs, "quantity": names})
+
+    parts = [fits([0, 1, 2, 3], 1.0), fits([0, 1, 2, 3], 2.0), fits([1, 3], 3.0)]
+    results = xr.concat(parts, xr.IndexVariable("estimator", list(methods.METHODS)), join="outer")
+    _, *rows = methods.method_rows(results.assign(simulation=4.0), study)
+    counts = [(row[1], row[2], row[3]) for row in rows if row[0] == kinds[0]]
+    everything = [("neural", "4", "100.0 %"), ("gradient", "4", "100.0 %")]
+    common = [(method, "2", "100.0 %") for method in methods.METHODS]
+    assert counts == everything + common
+
+
 # --- real pushes ---------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
 def cells():
     """Return the cells of real pushes, with six pushes of each half."""
-    return {label: problem.Cell.of(rows) for label, rows in real.Real(few=6).tables.items()}
+    return {
+        label: problem.Cell.of(rows)
+        for label, rows in real.Real(few=6, groups=real.GROUPS).tables.items()
+    }
 
 
 @pytest.mark.parametrize("group", ["point, three feet", "two-point, three feet", "two-point, flat"])

@@ -29,7 +29,7 @@ from sweeps.real_pushes import pushes, study
 from sweeps.real_pushes.problem import HIGH, LOW, QUANTITIES, Cell
 from sweeps.study_base import QuickStudy, Table, text_table
 
-GROUPS = ("point, three feet", "point, flat", "two-point, three feet", "two-point, flat")
+GROUPS = ("point, three feet", "two-point, three feet", "point, flat", "two-point, flat")
 _PRIOR = np.sqrt(12)  # inverse standard deviation in the unit cube
 _GRID = np.arange(0.10, 0.91, 0.05)  # frictions that `sweeps/real_pushes` scans
 _STARTS = (0.2, 0.5)  # of least squares, as shares of the range of friction
@@ -147,6 +147,8 @@ class Real(QuickStudy[xr.Dataset]):
     """
 
     TITLE: ClassVar[str] = "Friction and centre of pressure of real pushes"
+    CHOICES: ClassVar = {"groups": GROUPS}
+    GROWS: ClassVar[tuple[str, ...]] = ("groups",)
     DIMENSION: ClassVar[str] = "cell"
     QUICK: ClassVar[Mapping[str, object]] = {"few": 6, "worlds": 32, "cells": 1}
 
@@ -156,6 +158,8 @@ class Real(QuickStudy[xr.Dataset]):
     """Number of simulated worlds from which the networks learn, a multiple of 8."""
     cells: int = option(100, 1, 100)
     """Greatest number of cells."""
+    groups: tuple[str, ...] = GROUPS[:2]
+    """Groups of pushes; a flat object stands on many points and takes ten times as long."""
 
     @cached_property
     def tables(self) -> dict[str, pd.DataFrame]:
@@ -163,7 +167,7 @@ class Real(QuickStudy[xr.Dataset]):
         table = pushes.read()
         halves, action = study.halves_of(table.id.to_numpy()), pushes.actions(table)
         table = table.assign(group=study.groups_of(table), half=halves, action=action)
-        table = table[table.group.isin(GROUPS)].fillna({"surface": "unknown"})
+        table = table[table.group.isin(self.groups)].fillna({"surface": "unknown"})
         cells = {
             ", ".join(map(str, label)): rows.groupby("half").head(self.few).reset_index(drop=True)
             for label, rows in table.groupby(["group", "support", "surface"], sort=False)
