@@ -1,6 +1,7 @@
 """CUDA gives the results of JAX, on an emulated warp."""
 
 import ctypes
+import re
 import shutil
 from pathlib import Path
 
@@ -89,6 +90,23 @@ def test_operations_agree_with_jax(threads, tmp_path):
         for actual, desired in zip(*map(jax.tree.leaves, (a, b)), strict=True):
             assert actual.dtype == desired.dtype
             np.testing.assert_allclose(actual, desired, rtol=3e-6, atol=1e-6, err_msg=name)
+
+
+def test_tables_of_numbers_that_are_not_finite_are_static(tmp_path):
+    """CUDA's compiler refuses INFINITY and NAN, which are function calls, in a static table."""
+    table = np.array([0.5, np.inf, -np.inf, np.nan, -2.0], np.float32)
+
+    def world_step(x):
+        taken = jnp.asarray(table)[x.astype(int)]
+        return taken, x < jnp.asarray(table), jnp.where(x > 0, jnp.asarray(table), x)
+
+    x = jnp.arange(5.0)
+    run = Emulated(world_step, (x[0],), tmp_path, 4)
+    tables = re.findall("static __device__ const .*", run.text)
+    assert any("union" in line for line in tables)
+    assert not [line for line in tables if "INFINITY" in line or "NAN" in line]
+    for actual, desired in zip(run(x), jax.vmap(world_step)(x), strict=True):
+        np.testing.assert_array_equal(actual, desired)
 
 
 PAIRS = [
