@@ -475,13 +475,18 @@ GRADIENT_FAULTS = {
 }
 
 
-@pytest.mark.parametrize("message", [*GRADIENT_FAULTS, "mujoco"])
+OPTION_FAULTS = {
+    "mujoco": ("--engine", "mujoco"),
+    "replays windows on a level, uniform floor": ("--domain", "wide,slope=0:0.1"),
+}
+
+
+@pytest.mark.parametrize("message", [*GRADIENT_FAULTS, *OPTION_FAULTS])
 def test_logs_that_cannot_be_replayed_are_refused(message, object_log, tmp_path, compiled, capsys):
     if message in GRADIENT_FAULTS:
         written(object_log, GRADIENT_FAULTS[message](pd.read_csv(object_log)))
-    engine = ["--engine", "mujoco"] if message == "mujoco" else []
-    out = "--method", "gradient", "--out", tmp_path / "run"
-    assert re.search(message, refusal(capsys, "fit", object_log, *engine, *out))
+    options = *OPTION_FAULTS.get(message, ()), "--method", "gradient", "--out", tmp_path / "run"
+    assert re.search(message, refusal(capsys, "fit", object_log, *options))
     assert not compiled
 
 

@@ -128,9 +128,8 @@ class MJX(Engine):
         fields = {name: np.stack([row[name] for row in rows]) for name in FIELDS}
         if inputs.solids.feet is not None:
             fields[OUTLINE] = inputs.solids.vertices
-        slope, boundary, *_ = inputs.surroundings
-        fields |= {} if slope is None else {".opt.gravity": slope}
-        fields |= {} if boundary is None else {BOUNDARY: boundary}
+        around = {".opt.gravity": inputs.surroundings.slope, BOUNDARY: inputs.surroundings.boundary}
+        fields |= {name: x for name, x in around.items() if x is not None}
         return MJXStage(put(template), mjx.make_data(template)), fields
 
     def slots(self, backend: str) -> int:

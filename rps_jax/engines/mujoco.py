@@ -126,8 +126,7 @@ class Batch:
             following = self._rollout(rows, state, warmstart, control=applied, nstep=1)[:, -1]
             warmstart = (following[:, 1 + nq :] - qvel) / dt
             contact = self._inertia[rows] * warmstart[:, JOINTS.base] - np.stack(force, axis=1)
-            contact -= self._weight[rows]
-            wrench += _in_base(contact, turn) / substeps
+            wrench += _in_base(contact - self._weight[rows], turn) / substeps
             state = following
         self.state[rows], self.warmstart[rows] = state, warmstart
         self.integral[rows] = np.stack(integral, axis=1)

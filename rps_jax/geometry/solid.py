@@ -252,9 +252,8 @@ def standing(solid: Solid) -> Solid:
     solid = solid._replace(vertices=padded(solid.vertices))
     at, share = support(solid)
     if solid.vertices.shape[-2] == 1:
-        angle = 2 * np.pi * np.arange(SIDES) / SIDES
-        at = solid.radius[..., None, None] * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
-        share = np.ones(at.shape[:-1])
+        rim = solid.radius[..., None] * np.exp(2j * np.pi * np.arange(SIDES) / SIDES)
+        at, share = np.stack([rim.real, rim.imag], axis=-1), np.ones(rim.shape)
     return solid._replace(feet=np.concatenate([at, share[..., None]], axis=-1))
 
 

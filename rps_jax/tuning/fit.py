@@ -197,7 +197,9 @@ class Fit(LawQuestion[Fitted], DomainQuestion[Fitted], LogsQuestion):
         """Raise InputError unless the logs can be replayed and differentiated."""
         engines.get(self.setting.engine).check_derivatives("forward", self.setting.physics)
         rule = "the logs lack object_x, object_y and object_yaw: log them, or choose neural"
-        if "object_pose" in self.observed[1]:
+        if any(self.ranges.surroundings):
+            rule = "it replays windows on a level, uniform floor: draw no other, or choose neural"
+        elif "object_pose" in self.observed[1]:
             count = self.replay.num_windows
             rule = f"the logs have {count} windows of {least_squares.WINDOW:g} s that "
             rule += f"are mostly in contact, and it needs {LEAST_WINDOWS}: give longer logs"

@@ -199,9 +199,8 @@ def _surroundings(at: dict[str, np.ndarray], targets: np.ndarray) -> Surrounding
     """Return slopes and boundaries of worlds with these quantities and targets (n, 2) [m]."""
     slope = boundary = None
     if "slope" in at:
-        angle, bearing = at["slope"], at["slope_bearing"]
-        along = np.sin(angle) * np.array([np.cos(bearing), np.sin(bearing)])
-        slope = GRAVITY * np.column_stack([*along, -np.cos(angle)])
+        along = np.sin(at["slope"]) * np.exp(1j * at["slope_bearing"])
+        slope = GRAVITY * np.column_stack([along.real, along.imag, -np.cos(at["slope"])])
     if "boundary_factor" in at:
         way = np.linalg.norm(targets, axis=1)
         normal = targets.T / np.maximum(way, 1e-9)
