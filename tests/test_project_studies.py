@@ -159,7 +159,7 @@ def test_a_digest_changes_with_laws_domains_and_options():
 # Studies that measure this machine, have another ground or none, or read run folders.
 WITHOUT_PRESETS = (
     *("speed", "levers", "publish", "force_push_grid"),
-    *("gradients/mjx.py", "gradients/network.py", "corridors/costs.py"),
+    *("gradients/mjx.py", "corridors/costs.py"),
 )
 WITH_THE_PAPERS_LAW = ("ambiguities", "fidelity", "gradients", "paper_reading")
 

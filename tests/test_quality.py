@@ -103,7 +103,7 @@ def test_a_learner_by_gradients_needs_derivatives():
 def test_learning_curves_are_summed_up_by_hand(tmp_path):
     """The second racer was killed before its first checkpoint."""
     columns = {"time": [30.0, 90.0, 180.0], "validation": [0.1, np.nan, 0.375], "level": [0.2] * 3}
-    columns |= {"simulated": [1.0, 2.0, 3600.0]}
+    columns |= {"simulated": [1.0, 2.0, 3600.0], "touching": [0.5] * 3}
     curve = xr.Dataset({k: ("update", x) for k, x in columns.items()}, attrs={"test_success": 0.25})
     curves = {"ppo": curve, "windows": network.read_curve(tmp_path)}
     rows = [network.summary(x).assign(method=k, seed=1) for k, x in curves.items()]
@@ -111,8 +111,8 @@ def test_learning_curves_are_summed_up_by_hand(tmp_path):
     results = results.assign_coords(time=list(network.TIMES))
     assert network.table(results)[1:] == [
         ["ppo", "1", "10.0 %", "10.0 %", "37.5 %", "", "", "25.0 % [20.9, 29.6]", "20 %",
-         "0.5 min", "3", "1 h"],
-        ["windows", "1", *[""] * 8, "0", "0 h"],
+         "0.5 min", "3", "75.00 s", "1 h", "50 %"],
+        ["windows", "1", *[""] * 8, "0", "", "0 h", ""],
     ]  # fmt: skip
     network.figure_of(results)
 

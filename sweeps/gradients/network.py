@@ -34,6 +34,7 @@ from sweeps.study_base import QuickStudy, Rows, Table, part_name, text_table
 
 TIMES = (1.0, 2.0, 3.0, 4.0, 5.0)  # [min] of wall clock, with compilation and validation
 WORLDS = 3 * 128  # for validation, and as many for the test: of each object of `wide`
+_COLUMNS = "level", "simulated", "touching"
 _NETWORK = "--network mlp --width 23 --validation 128 --every 0.25"
 METHODS = {  # commands that are compared
     "ppo": f"rps learn {_NETWORK}",
@@ -70,8 +71,6 @@ class Networks(QuickStudy[xr.Dataset]):
     """Number of racers that run at once."""
     gpus: int = option(0, 0, 8)
     """Number of GPUs for the racers; 0 leaves the choice to them."""
-    folders: tuple[str, ...] = ()
-    """Folders of runs that are read instead of a race."""
     out: Path | str | None = "runs/networks"
     """Run folder; the racers have folders there."""
 
@@ -82,16 +81,16 @@ class Networks(QuickStudy[xr.Dataset]):
 
     def answer(self, run: Run) -> xr.Dataset:
         """Run the racers, and read their learning curves."""
-        folders: dict[tuple[str, float], Path]
-        if self.folders:
-            folders = {(Path(folder).name, np.nan): Path(folder) for folder in self.folders}
-        else:
-            assert run.folder is not None
-            labels = [(m, s) for s, m in itertools.product(self.seeds, self.methods)]
-            folders = {label: run.folder / part_name(*label) for label in labels}
-            sizes = f"{QUICK_SIZES if self.quick else ''} --minutes {self.minutes:g}"
-            commands = {folders[m, s]: f"{METHODS[m]}{sizes} --seed {s}" for m, s in labels}
-            run_commands(commands, self.minutes + 0.5, self.lanes, self.gpus)
+        assert run.folder is not None
+        labels = list(itertools.product(self.methods, self.seeds))
+        folders = {label: run.folder / part_name(*label) for label in labels}
+        sizes = f"{QUICK_SIZES if self.quick else ''} --minutes {self.minutes:g}"
+        # The racers of a method share a GPU, if there is one for each method.
+        commands = {
+            folders[m, s]: f"{METHODS[m]}{sizes} --seed {s}"
+            for s, m in itertools.product(self.seeds, self.methods)
+        }
+        run_commands(commands, self.minutes + 0.5, self.lanes, self.gpus)
         rows = [
             summary(read_curve(folder)).assign(method=method, seed=seed)
             for (method, seed), folder in folders.items()
@@ -117,7 +116,7 @@ def read_curve(folder: Path) -> xr.Dataset:
         return files.read_results(folder)
     if (folder / "curve.csv").exists():
         return pd.read_csv(folder / "curve.csv", index_col="update").to_xarray()
-    columns = dict.fromkeys(("time", "validation", "level", "simulated"), np.zeros(0))
+    columns = dict.fromkeys(("time", "validation", *_COLUMNS), np.zeros(0))
     return pd.DataFrame(columns, pd.RangeIndex(0, name="update")).to_xarray()
 
 
@@ -135,6 +134,7 @@ def summary(curve: xr.Dataset) -> xr.Dataset:
         "updates": float(curve.sizes["update"]),
         "first": minutes[0] if minutes.size else np.nan,
         "simulated": np.max(curve.simulated.values, initial=0),
+        "touching": float(curve.touching[-10:].mean()),
     }
     return xr.Dataset(
         {
@@ -154,7 +154,8 @@ def table(results: xr.Dataset, tested: bool = True) -> Rows:
     columns = {"method": "{method}", "seed": "{seed:.0f}"}
     columns |= {f"validation, {t:g} min": f"{{v{t:g}:.1f}} %" for t in TIMES}
     columns |= {"test": "{share}", "curriculum": "{level:.0f} %", "first update": "{first:.1f} min"}
-    columns |= {"updates": "{updates:,.0f}", "simulated": "{hours:,.0f} h"}
+    columns |= {"updates": "{updates:,.0f}", "time of an update": "{pace:.2f} s"}
+    columns |= {"simulated": "{hours:,.0f} h", "actions in contact": "{contact:.0f} %"}
     rows: list[dict[str, Any]] = []
     for name in results.run.values:
         row = results.sel(run=name)
@@ -163,7 +164,9 @@ def table(results: xr.Dataset, tested: bool = True) -> Rows:
         counts = round(np.nan_to_num(scalars["test"]) * WORLDS), WORLDS if tested else 0
         share = tables.share(*counts) if np.isfinite(scalars["test"]) else ""
         hours, level = float(row.simulated) / 3600, 100 * float(row.level.max())
-        rows.append(scalars | validation | {"share": share, "hours": hours, "level": level})
+        pace, contact = 60 * float(row.minutes.diff("update").mean()), 100 * float(row.touching)
+        scalars |= {"share": share, "hours": hours, "level": level, "pace": pace}
+        rows.append(scalars | validation | {"contact": contact})
     return text_table(columns, rows)
 
 
@@ -174,7 +177,7 @@ def figure_of(results: xr.Dataset) -> Figure:
     for i, method in enumerate(methods):
         row = results.isel(run=i)
         label = None if method in methods[:i] else method
-        style = {"color": f"C{sorted(set(methods)).index(method)}", "label": label}
+        style = {"color": f"C{list(METHODS).index(method)}", "label": label}
         axes[0, 0].plot(row.at, 100 * row.success, "o-", ms=3, **style)
         axes[0, 1].plot(row.minutes, 100 * row.level, **style)
     labels = "success in validation [%]", "level of the curriculum [%]"

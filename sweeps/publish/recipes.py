@@ -304,11 +304,8 @@ RECIPES: dict[str, Recipe] = {
         gpu=8,
     ),
     "gradients_network": recipe(
-        "rps learn --network mlp --width 23 --minutes 8 --seed 1 --out runs/ppo",
-        "rps sweeps/gradients/learner.py --network mlp --width 23 --minutes 4 --seed 1 "
-        "--out runs/windows",
-        f"rps sweeps/gradients/network.py --folders runs/ppo runs/windows {_MACHINE}",
-        gpu=13,
+        f"rps sweeps/gradients/network.py --lanes 6 --gpus 3 --minutes 5.5 {_MACHINE}",
+        gpu=20,
     ),
     "robot": recipe(f"rps sweeps/speed/robot.py {_MACHINE}", cores=1),
     "dependencies": recipe(f"rps sweeps/publish/dependencies.py {_MACHINE}", cores=15),
