@@ -15,7 +15,8 @@ from test_native import OPERATIONS, advanced, build_push, close, same
 from rps_jax.engines.base import ControlPeriod
 from rps_jax.errors import InputError
 from rps_jax.geometry import vectors
-from rps_jax.lowering.gpu_writer import GpuWriter
+from rps_jax.lowering import nvrtc
+from rps_jax.lowering.gpu_writer import GPU_HEADER, GpuWriter
 from rps_jax.trials import trial
 from rps_jax.world.domain import Range
 
@@ -92,21 +93,18 @@ def test_operations_agree_with_jax(threads, tmp_path):
             np.testing.assert_allclose(actual, desired, rtol=3e-6, atol=1e-6, err_msg=name)
 
 
-def test_tables_of_numbers_that_are_not_finite_are_static(tmp_path):
-    """CUDA's compiler refuses INFINITY and NAN, which are function calls, in a static table."""
-    table = np.array([0.5, np.inf, -np.inf, np.nan, -2.0], np.float32)
-
-    def world_step(x):
-        taken = jnp.asarray(table)[x.astype(int)]
-        return taken, x < jnp.asarray(table), jnp.where(x > 0, jnp.asarray(table), x)
-
-    x = jnp.arange(5.0)
-    run = Emulated(world_step, (x[0],), tmp_path, 4)
-    tables = re.findall("static __device__ const .*", run.text)
-    assert any("union" in line for line in tables)
-    assert not [line for line in tables if "INFINITY" in line or "NAN" in line]
-    for actual, desired in zip(run(x), jax.vmap(world_step)(x), strict=True):
-        np.testing.assert_array_equal(actual, desired)
+def test_tables_hold_numbers_that_are_not_finite(monkeypatch):
+    """CUDA's compiler computes no function for a table: their definitions are quotients."""
+    words = dict(re.findall(r"#define (INFINITY|NAN) \((\S+ / \S+)\)", GPU_HEADER))
+    assert words == {"INFINITY": "1.0f / 0.0f", "NAN": "0.0f / 0.0f"}
+    if nvrtc._library() is None:
+        pytest.skip("there is no NVRTC: pip install 'jax[cuda12]'")
+    monkeypatch.setattr(nvrtc, "target", lambda: "sm_90")
+    table = jnp.array([1.0, jnp.inf, -jnp.inf, jnp.nan])
+    closed = jax.make_jaxpr(lambda i: table[i])(0)
+    index = jax.ShapeDtypeStruct((), jnp.int32)
+    text = GpuWriter(4).source(closed, [index], closed.out_avals, True)
+    assert nvrtc.images([text])
 
 
 PAIRS = [

@@ -4,8 +4,8 @@
    of a warp run each iteration together. `operations.h` follows. */
 
 #ifndef INFINITY
-#define INFINITY __int_as_float(0x7f800000)
-#define NAN __int_as_float(0x7fffffff)
+#define INFINITY (1.0f / 0.0f) /* constants, as tables need */
+#define NAN (0.0f / 0.0f)
 #endif
 #define WORLDS (32 / THREADS)
 #define ALL 0xffffffffu

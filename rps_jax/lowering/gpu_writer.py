@@ -169,15 +169,6 @@ class GpuWriter(SimdWriter):
             raise TooLargeError("the arrays of a world exceed the shared memory of a block.")
         return f"#define THREADS {self._threads}\n#define SHARED {self._shared_size}\n{text}"
 
-    def packed(self, name: str, array: np.ndarray) -> str:
-        """Return a table, as bits if a number is not finite: CUDA has no such constants."""
-        if array.dtype.kind != "f" or np.isfinite(array).all():
-            return super().packed(name, array)
-        texts = (f"{bits}u" for bits in array.astype(np.float32).reshape(-1).view(np.uint32))
-        pair = f"union {{ unsigned bits[{array.size}]; float reals[{array.size}]; }}"
-        values = f"{self.table_type} {pair} {name}_bits = {{{self.listed(texts)}}};"
-        return f"{values}\n#define {name} {name}_bits.reals"
-
     def prepare(self, nodes: Iterable[Node], returned: Iterable[Result]) -> None:
         shared = _shared_arrays(nodes, returned)
         self._shared = {node for node in shared if node.width > self._threads}
