@@ -93,7 +93,7 @@ class Engine(abc.ABC):
     modes: ClassVar[tuple[Mode, ...]] = ()  # supported modes of differentiation
     forces: ClassVar[bool] = True  # contact can slow and stop a base with a limited force
     computes_force: ClassVar[bool] = True  # it computes the force of a contact
-    surroundings: ClassVar[tuple[str, ...]] = ()  # supported fields of `Surroundings`
+    surroundings: ClassVar[tuple[str, ...]] = Surroundings._fields  # those that it supports
 
     def _refused(self, rule: str) -> errors.InputError:
         return errors.not_allowed("engine", self.name, rule)

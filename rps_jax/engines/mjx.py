@@ -17,7 +17,18 @@ import numpy as np
 from rps_jax.control.observation import Twist
 from rps_jax.engines import mjx_gradients
 from rps_jax.engines.base import ControlPeriod, Driven, Engine, Motion
-from rps_jax.engines.mjx_colliders import Extra, collision, constraint, forward, mjx, smooth
+from rps_jax.engines.fused.contacts import AT_ONCE, nearest_walls
+from rps_jax.engines.mjx_colliders import (
+    Extra,
+    collision,
+    constraint,
+    corners_of,
+    forward,
+    geoms,
+    mjx,
+    smooth,
+    types,
+)
 from rps_jax.engines.mujoco import compile_rows
 from rps_jax.geometry import planar
 from rps_jax.robot import drive as drives
@@ -37,6 +48,8 @@ FIELDS = (
 # Field of prisms on explicit feet: (N, 2) [m]; other prisms stand on their outline.
 OUTLINE = "outline"
 BOUNDARY = "boundary"  # field of floors with two frictions: (4,) as of `Surroundings`
+# Field of worlds whose object may touch walls: (W, 4) [m] x, y, x, y of their ends.
+WALLS = "walls"
 
 
 class MJXStage(NamedTuple):
@@ -53,6 +66,8 @@ class MJXStage(NamedTuple):
         frame. If the force is limited, the force of the drive is applied to its joints instead.
         """
         physics = period.physics
+        if WALLS in fields:
+            fields = jax.vmap(self._with_walls)(fields, motion.qpos)
         step = jax.vmap(partial(self._step, timestep=physics.timestep))
         # Derivatives compute each step again, without its solver.
         step = jax.checkpoint(step, prevent_cse=False, policy=mjx_gradients.SAVED)
@@ -64,6 +79,19 @@ class MJXStage(NamedTuple):
 
         motion, wrenches = jax.lax.scan(body, motion, length=physics.substeps)
         return Driven(motion, force=None if wrenches is None else wrenches.mean(axis=0))
+
+    def _with_walls(self, fields: dict[str, jax.Array], qpos: jax.Array) -> dict[str, jax.Array]:
+        """Return fields whose walls are those nearest to the object."""
+        model, free = apply(self.model, fields), tuple(qpos[JOINTS.object])
+        corners: Any = tuple(corners_of(model, fields.get(OUTLINE)).T)
+        near = nearest_walls(tuple(fields[WALLS].T), free[:3], free[3:], corners)
+        position, size, turn = model.geom_pos, model.geom_size, model.geom_quat
+        for geom, wall in zip(geoms(model, 0, types.GeomType.BOX), near, strict=True):
+            (*middle, yaw), half = wall
+            position = position.at[geom, :2].set(jnp.stack(middle))
+            size = size.at[geom, 0].set(half)
+            turn = turn.at[geom, 0].set(jnp.cos(yaw / 2)).at[geom, 3].set(jnp.sin(yaw / 2))
+        return fields | {".geom_pos": position, ".geom_size": size, ".geom_quat": turn}
 
     def _step(
         self,
@@ -119,16 +147,20 @@ class MJX(Engine):
 
     name = "mjx"
     modes = ("forward", "reverse")
-    surroundings = ("slope", "boundary")
 
     def stage(self, inputs: WorldInputs) -> tuple[MJXStage, dict[str, np.ndarray]]:
         """Return the stage of the first of the worlds, and fields (n, ...) of all."""
+        walls = inputs.surroundings.walls
+        if walls is not None:  # the model has only as many as an object touches at once
+            slots = inputs.surroundings._replace(walls=walls[:, :AT_ONCE])
+            inputs = inputs._replace(surroundings=slots)
         template = scene.compile_row(inputs, 0).physics
         rows = compile_rows(inputs, fields_of)
         fields = {name: np.stack([row[name] for row in rows]) for name in FIELDS}
         if inputs.solids.feet is not None:
             fields[OUTLINE] = inputs.solids.vertices
         around = {".opt.gravity": inputs.surroundings.slope, BOUNDARY: inputs.surroundings.boundary}
+        around[WALLS] = None if walls is None else walls.reshape(inputs.count, -1, 4)
         fields |= {name: x for name, x in around.items() if x is not None}
         return MJXStage(put(template), mjx.make_data(template)), fields
 

@@ -1,4 +1,4 @@
-"""Colliders for MJX: plane and cylinder, base and box, base and prism.
+"""Colliders for MJX: plane and cylinder; base or wall, and box or prism.
 
 MJX 3.17.0 computes the lowest point of the rim from `axis * (axis . n) - n`. For an upright
 cylinder this difference is rounding error: a tilt of 1e-5 rad shifts the contact points by 12 mm,
@@ -67,38 +67,45 @@ def plane_cylinder(plane: GeomInfo, cylinder: GeomInfo) -> tuple[jax.Array, jax.
     return distance, points - 0.5 * distance[:, None] * n, frames
 
 
-def _geoms(model: Model, body: int, kind: GeomType) -> np.ndarray:
+def geoms(model: Model, body: int, kind: GeomType) -> np.ndarray:
     """Return the geoms of a kind of a body."""
     return np.flatnonzero((model.geom_bodyid == body) & (model.geom_type == kind))
 
 
-def _base_box(model: Model, data: Data, *_: object) -> Collision:
-    """Return distances (C,), points (C, 3) and frames (C, 3, 3) [m] of base and upright box."""
-    box = int(_geoms(model, _OBJECT, GeomType.BOX)[0])
-    signs = np.array([[1, 1, -1], [-1, 1, -1], [-1, -1, -1], [1, -1, -1]])
-    return upright(model, data, box, model.geom_size[box] * signs)
-
-
-def _base_prism(
-    model: Model, data: Data, key: object, geom: object, outline: jax.Array | None = None
-) -> Collision:
-    """Return distances (C,), points (C, 3) and frames (C, 3, 3) [m] of base and upright prism."""
-    prism, feet = (_geoms(model, _OBJECT, kind) for kind in (GeomType.MESH, GeomType.SPHERE))
-    corners = model.geom_pos[feet]
+def corners_of(model: Model, outline: jax.Array | None = None) -> jax.Array:
+    """Return the corners (N, 3) [m] of box or prism in its body, or the middle of a cylinder."""
+    boxes = geoms(model, _OBJECT, GeomType.BOX)
+    if boxes.size:
+        signs = np.array([[1, 1, -1], [-1, 1, -1], [-1, -1, -1], [1, -1, -1]])
+        return model.geom_size[boxes[0]] * signs
+    if not geoms(model, _OBJECT, GeomType.MESH).size:
+        return jnp.zeros((1, 3))
+    corners = model.geom_pos[geoms(model, _OBJECT, GeomType.SPHERE)]
     if outline is not None:
         corners = jnp.concatenate([outline, corners[:, 2:]], axis=1)
-    return upright(model, data, prism[0], corners)
+    return corners
 
 
-def upright(model: Model, data: Data, prism: int, corners: jax.Array) -> Collision:
+def _with_upright(
+    model: Model, data: Data, key: Any, geom: object, outline: jax.Array | None = None
+) -> Collision:
+    """Return distances (C,), points (C, 3) and frames (C, 3, 3) [m] of an upright box or prism."""
+    pairs = collision_driver._geom_groups(model)[key]
+    if key.types[0] == GeomType.SPHERE:  # two of one round base
+        pairs = pairs[:1]
+    corners = corners_of(model, outline)
+    contacts = [upright(model, data, base, prism, corners) for base, prism, _ in pairs]
+    return jax.tree.map(lambda *x: jnp.concatenate(x), *contacts)
+
+
+def upright(model: Model, data: Data, base: int, prism: int, corners: jax.Array) -> Collision:
     """Return distances (C,), points (C, 3) and frames (C, 3, 3) [m] of base and upright prism.
 
-    `prism` is a geom; `corners` (N, 3) [m] are those of the prism in its body. The base is a box,
-    with four points, or the two spheres of a round base.
+    `base` and `prism` are geoms; `corners` (N, 3) [m] are those of the prism in its body. The base
+    is a box or a wall, with four points, or the two spheres of a round base.
     """
-    body, spheres = model.geom_bodyid[prism], _geoms(model, _BASE, GeomType.SPHERE)
-    base = int(np.flatnonzero(model.geom_bodyid == _BASE)[0])
-    half = model.geom_size[base]
+    body, half = model.geom_bodyid[prism], model.geom_size[base]
+    is_round = model.geom_type[base] == GeomType.SPHERE
     lower = -jnp.abs(corners[:, 2])
     turn = data.geom_xmat[base][:2, 0]
     middle = data.geom_xpos[base]
@@ -106,10 +113,10 @@ def upright(model: Model, data: Data, prism: int, corners: jax.Array) -> Collisi
         vertices=Corners.of((corners[:, 0], corners[:, 1], lower)),
         height=-2 * lower[0],
         up=vectors.Z,
-        base_size=half[:1] if spheres.size else half[:2],
-        base_z=data.geom_xpos[spheres, 2]
-        if spheres.size
-        else middle[2] + jnp.array([-1.0, 1.0]) * half[2],
+        base_size=half[:1] if is_round else half[:2],
+        base_z=data.geom_xpos[geoms(model, _BASE, GeomType.SPHERE), 2]
+        if is_round
+        else jnp.maximum(middle[2] + jnp.array([-1.0, 1.0]) * half[2], 0.0),
     )
     state: Any = SimpleNamespace(base=middle, p=data.xpos[body])
     m: Any = [tuple(row) for row in data.xmat[body]]
@@ -132,10 +139,10 @@ Pair = tuple[GeomType, GeomType]
 # Each has the number of points of MJX's collider of the pair, for which `Data` has space.
 COLLIDERS: dict[Pair, Any] = {
     (GeomType.PLANE, GeomType.CYLINDER): plane_cylinder,
-    (GeomType.BOX, GeomType.BOX): _base_box,
-    (GeomType.BOX, GeomType.MESH): _base_prism,
-    (GeomType.SPHERE, GeomType.BOX): _base_box,
-    (GeomType.SPHERE, GeomType.MESH): _base_prism,
+    (GeomType.BOX, GeomType.BOX): _with_upright,
+    (GeomType.BOX, GeomType.MESH): _with_upright,
+    (GeomType.SPHERE, GeomType.BOX): _with_upright,
+    (GeomType.SPHERE, GeomType.MESH): _with_upright,
 }
 
 
@@ -150,8 +157,8 @@ def collision(model: Model, data: Data, outline: Extra = None, boundary: Extra =
         pair: Any = key.types
         default = collision_driver._COLLISION_FUNC[pair]
         collide = COLLIDERS.get(pair, default)
-        if collide is _base_prism:
-            collide = partial(_base_prism, outline=outline)
+        if collide is _with_upright:
+            collide = partial(_with_upright, outline=outline)
         distance, point, frame = collide(model, data, key, contact.geom)
         count = default.ncon
         contact = jax.tree.map(lambda x, n=count: jnp.repeat(x, n, axis=0), contact)

@@ -183,7 +183,6 @@ class MuJoCo(Engine):
 
     name = "mujoco"
     traced = False
-    surroundings = ("slope", "boundary")
 
     def suits_processors(self, trials: int | None) -> bool:
         """Return True: it steps worlds on the host."""

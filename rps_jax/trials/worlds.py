@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from rps_jax import engines
+from rps_jax import engines, errors
 from rps_jax.geometry import solid
 from rps_jax.geometry.footprint import Footprint
 from rps_jax.robot.base import Odometry
@@ -35,7 +35,13 @@ def build(indices: np.ndarray, inputs: WorldInputs, setting: Setting, **fields: 
     """
     engine, dtype = engines.get(setting.engine), jnp.result_type(float)
     engine.check_robot(inputs.robots)
+    added = getattr(fields.get("task"), "surroundings", None) or {}
+    inputs = inputs._replace(surroundings=inputs.surroundings._replace(**added))
     engine.check_surroundings(inputs.surroundings)
+    friction = inputs.surroundings.friction_wall
+    if friction is not None and setting.physics.cone == "pyramidal" and min(friction) < 0.01:
+        rule = "a friction pyramid needs at least 0.01; choose physics=default"
+        raise errors.not_allowed("task friction_wall", f"{min(friction):g}", rule)
     stage, staged = engine.stage(inputs)
     outline: Any = inputs.solids.vertices, inputs.solids.radius
     robot = None if inputs.robots.ideal else inputs.robots

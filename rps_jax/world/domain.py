@@ -167,7 +167,8 @@ class Domain:
     @property
     def surroundings(self) -> Surroundings:
         """Ranges of what surrounds the objects; None for what no world has."""
-        return Surroundings(self.slope, self.boundary_factor)
+        walls = True if getattr(self.task, "touch", "nothing") == "object" else None
+        return Surroundings(self.slope, self.boundary_factor, walls)
 
     @property
     def weakest(self) -> Robot:

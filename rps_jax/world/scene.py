@@ -25,6 +25,8 @@ Side = Literal["near", "far"]
 # Offset [m] of inertial frames: without it MuJoCo compiles centred bodies to another structure,
 # which cannot be batched with the rest.
 OFF_CENTRE = 1e-6
+WALL_HALF, WALL_TOP = 0.001, 2.5  # [m] half thickness and height of walls, which are sheets
+_WALL_FOOT = -0.5  # [m] their lower edge
 
 
 class Friction(NamedTuple):
@@ -45,6 +47,7 @@ class Surroundings(NamedTuple):
     # [1] of the ground's friction beyond it
     boundary: Any = None
     walls: Any = None  # (n, W, 2, 2) [m] both ends of walls that the object may touch
+    friction_wall: Any = None  # (n,) [1] object-wall
 
 
 class WorldInputs(NamedTuple):
@@ -135,7 +138,7 @@ def load(
         total = sum(geom.mass for geom in geoms)
         for geom in geoms:
             geom.mass *= mass / total
-    model, stripped = _compile(spec, physics, friction, robot)
+    model, stripped = _compile(spec, physics, friction, robot, Surroundings())
     size, body = model.geom("object").size, model.body("object")
     is_box = FAMILIES[name] == "box"
     vertices = solid.rectangles(size[:1], size[1:2])[0] if is_box else np.zeros((1, 2))
@@ -178,7 +181,7 @@ def compile_solid(
     body.iquat, body.inertia = single.q_object_body, single.inertia
     if around.slope is not None:
         spec.option.gravity = around.slope
-    models = _compile(spec, physics, friction, robot)
+    models = _compile(spec, physics, friction, robot, around)
     return Scene(family, family, *models, single, robot.shell)
 
 
@@ -240,6 +243,20 @@ def _add_feet(spec: mujoco.MjSpec) -> None:
         spec.add_pair(default, name=f"ground_object_{i}", **pair)
 
 
+def _add_walls(spec: mujoco.MjSpec, around: Surroundings, physics: Physics) -> None:
+    """Add walls as geoms that touch the object."""
+    default, side = spec.find_default("base_object"), spec.pair("base_object").geomname2
+    box: dict[str, Any] = {"type": mujoco.mjtGeom.mjGEOM_BOX}
+    for i, (start, end) in enumerate(around.walls):
+        (x, y), name = end - start, f"wall_{i}"
+        box["size"] = math.hypot(x, y) / 2, WALL_HALF, (WALL_TOP - _WALL_FOOT) / 2
+        box["pos"] = *(start + end) / 2, (WALL_TOP + _WALL_FOOT) / 2
+        half = math.atan2(y, x) / 2
+        spec.worldbody.add_geom(name=name, quat=[math.cos(half), 0, 0, math.sin(half)], **box)
+        pair = spec.add_pair(default, name=f"{name}_object", geomname1=name, geomname2=side)
+        pair.friction[:2], pair.solref[:] = around.friction_wall, physics.base_solref
+
+
 def foot_positions(solids: Solid) -> np.ndarray:
     """Return the support points (..., N, 3) [m] of solids (...); unused points are at the top.
 
@@ -251,7 +268,7 @@ def foot_positions(solids: Solid) -> np.ndarray:
 
 
 def _compile(
-    spec: mujoco.MjSpec, physics: Physics, friction: Friction, robot: Robot
+    spec: mujoco.MjSpec, physics: Physics, friction: Friction, robot: Robot, around: Surroundings
 ) -> tuple[mujoco.MjModel, mujoco.MjModel]:
     """Compile the full model and the stripped one."""
     _set_robot(spec, robot)
@@ -265,6 +282,8 @@ def _compile(
             pair.solref[:] = physics.ground_solref
             pair.solimp[:2] = physics.ground_impedance
         pair.friction[:2] = friction.robot if of_base else friction.ground
+    if around.walls is not None:
+        _add_walls(spec, around, physics)
     spec.option.cone = getattr(mujoco.mjtCone, f"mjCONE_{physics.cone.upper()}")
     for name in ("timestep", "impratio", "iterations", "ls_iterations", "tolerance"):
         setattr(spec.option, name, getattr(physics, name))

@@ -27,7 +27,6 @@ class Fused(Engine):
     name = "fused"
     side_by_side = True
     modes = ("forward", "reverse")
-    surroundings = ("slope", "boundary")
 
     def stage(self, inputs: WorldInputs) -> tuple[FusedStage, Body]:
         """Return the stage, and the bodies (n, ...) of the worlds."""
@@ -63,6 +62,10 @@ class Fused(Engine):
         if solids.feet is not None:
             feet = lower(solids.feet[..., :2])
             bodies = bodies._replace(feet=feet, bears=np.sign(solids.feet[..., 2:]))
+        around = inputs.surroundings
+        if around.walls is not None:
+            ends = around.walls.reshape(inputs.count, -1, 4)
+            bodies = bodies._replace(walls=ends, friction_wall=around.friction_wall)
         return FusedStage(), bodies
 
     def slots(self, backend: str) -> int:

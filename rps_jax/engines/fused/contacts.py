@@ -18,9 +18,11 @@ from rps_jax.geometry import vectors as sp
 from rps_jax.geometry.arrays import Array, Entries, Number
 from rps_jax.geometry.vectors import Vec
 from rps_jax.world.physics import Physics
+from rps_jax.world.scene import WALL_HALF, WALL_TOP
 
 _FAR = 1e9  # [m] distance of points that never touch
 _PARALLEL = 1e-4  # [m] by which a face of the base is preferred to one of the object
+AT_ONCE = 2  # walls that an object may touch at the same time
 _UPRIGHT = 1e-6  # [rad] tilt below which all points of a cylinder's rim are equally low
 # MuJoCo's default impedance of the skin contact: minimum, maximum, and the depth [m] between.
 _D_MIN, _D_MAX, _WIDTH = 0.9, 0.95, 0.001
@@ -48,6 +50,8 @@ class Body(NamedTuple):
     gravity: Entries = None  # (3,) [m/s^2] of a floor that is not level
     # (4,) unit normal of a line, its distance [m], and the factor [1] of the friction beyond it
     boundary: Entries = None
+    walls: Entries = None  # (W, 4) [m] x, y, x, y of both ends; None: the object touches none
+    friction_wall: Number | None = None  # () [1]
 
 
 class Corners(NamedTuple):
@@ -190,6 +194,48 @@ def on_base(body: Body, state: State, m: Sequence[Vec], twist: Vec, physics: Phy
 
 
 Point = tuple[Number, Number]
+
+
+class Wall(NamedTuple):
+    """An upright wall."""
+
+    pose: Vec  # x, y [m] of its middle, yaw [rad]
+    half_length: Number  # [m]
+
+
+def nearest_walls(ends: Entries, p: Vec, q: Sequence[Number], corners: Vec) -> list[Wall]:
+    """Return the `AT_ONCE` walls nearest to an object.
+
+    Args:
+      ends: x, y, x, y (W, ...) [m] of both ends of at least as many walls.
+      p: position [m] of a frame of the object.
+      q: its quaternion, scalar first.
+      corners: (N, ...) [m] of the object in this frame, or (1, ...) the middle of a cylinder.
+    """
+    x, y, end_x, end_y = ends
+    along, away = (end_x - x, end_y - y), (p[0] - x, p[1] - y)
+    share = jnp.clip(sp.dot(away, along) / sp.dot(along, along), 0.0, 1.0)
+    away = (away[0] - share * along[0], away[1] - share * along[1])
+    gap = sp.norm(away)
+    outline = sp.to_world(sp.matrix(q), corners)[:2]
+    inward = sp.least(sp.dot([c[:, None] for c in outline], [a[None] for a in away]))
+    score = -gap - inward / gap
+    index = jax.lax.broadcasted_iota(jnp.int32, score.shape, 0)
+    rows = (x + end_x) / 2, (y + end_y) / 2, *along, index
+    walls = []
+    for _ in range(AT_ONCE):
+        _, (*middle, ahead, left, chosen) = _best(score, rows)
+        walls.append(Wall((*middle, jnp.arctan2(left, ahead)), sp.norm((ahead, left)) / 2))
+        score = jnp.where(index == chosen, -_FAR, score)
+    return walls
+
+
+def on_wall(body: Body, state: State, m: Sequence[Vec], wall: Wall, physics: Physics) -> Contact:
+    """Return the contacts of the object's side with a wall, as with a base at rest."""
+    box = {"base_size": (wall.half_length, WALL_HALF), "base_z": (0.0, WALL_TOP)}
+    body = body._replace(base_invweight=0.0, friction_robot=body.friction_wall, **box)
+    state = state._replace(base=wall.pose, driven=None)
+    return on_base(body, state, m, (0.0, 0.0, 0.0), physics)
 
 
 def meetings(

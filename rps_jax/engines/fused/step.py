@@ -9,6 +9,7 @@ a compiler can keep a whole world in registers.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -18,7 +19,17 @@ from jax.ad_checkpoint import checkpoint_policies
 
 from rps_jax.engines import native
 from rps_jax.engines.base import ControlPeriod, Driven, Motion
-from rps_jax.engines.fused.contacts import Body, Corners, DrivenBase, State, on_base, on_ground
+from rps_jax.engines.fused.contacts import (
+    Body,
+    Corners,
+    DrivenBase,
+    State,
+    Wall,
+    nearest_walls,
+    on_base,
+    on_ground,
+    on_wall,
+)
 from rps_jax.engines.fused.newton import SOLUTION, Base, Problem, accelerations, wrench_on_base
 from rps_jax.geometry import vectors as sp
 from rps_jax.geometry.arrays import Entries
@@ -88,14 +99,17 @@ def step(
     physics: Physics,
     robot: Robot | None = None,
     solution: list[Vec] | None = None,
+    walls: Sequence[Wall] = (),
 ) -> State:
     """Compute one step of MuJoCo's semi-implicit Euler rule with the base at `twist`.
 
     A `robot` with a limited force is pushed towards it. `twist` [m/s, m/s, rad/s] is in the base's
-    frame. The derivatives of a step whose accelerations are known need no solver: `solution`.
+    frame. The derivatives of a step whose accelerations are known need no solver: `solution`. The
+    object may touch `walls`.
     """
     m, dt, driven = sp.matrix(state.q), physics.timestep, state.driven
     contacts = [on_ground(body, state, m, physics), on_base(body, state, m, twist, physics)]
+    contacts += [on_wall(body, state, m, wall, physics) for wall in walls]
     turn = jnp.cos(state.base[2]), jnp.sin(state.base[2])
     base = Base()
     if robot is not None and driven is not None:
@@ -168,16 +182,21 @@ def _drive(
     """Step a batch of worlds, or one world, for one control period."""
     scalars = spread(body)
 
+    start = enter(body, motion, robot, force)
+    walls: Sequence[Wall] = ()
+    if scalars.walls is not None:
+        corners = _split(jnp.moveaxis(body.vertices, -2, 0))
+        walls = nearest_walls(scalars.walls, start.p, start.q, corners)
+
     # Derivatives compute each step again, without its solver.
     @partial(jax.checkpoint, prevent_cse=False, policy=_SAVED)
     def next_state(state: State, solution: list[Vec] | None = None) -> State:
-        return step(scalars, state, twist, physics, robot, solution)
+        return step(scalars, state, twist, physics, robot, solution, walls)
 
     def solve(state: State, solution: list[Vec] | None) -> tuple[State, list[Vec]]:
         state = next_state(state, solution)
         return state, [state.a, state.alpha, *([] if state.driven is None else [state.driven.a])]
 
-    start = enter(body, motion, robot, force)
     if solutions is None:
         state = jax.lax.fori_loop(0, physics.substeps, lambda _, x: next_state(x), start)
     else:
@@ -188,16 +207,16 @@ def _drive(
 
 def spread(body: Body) -> Body:
     """Return bodies (...) with each entry as a separate array, the input of `step`."""
-    leaves = body._replace(vertices=None, feet=None, bears=None)
+    leaves = body._replace(vertices=None, feet=None, bears=None, walls=None)
     entries = {
         name: _split(leaf) if jnp.ndim(leaf) > jnp.ndim(body.mass) else leaf
         for name, leaf in leaves._asdict().items()
         if leaf is not None
     }
     corners = _split(jnp.moveaxis(body.vertices, -2, 0))
-    if body.feet is not None:
-        for name in ("feet", "bears"):
-            entries[name] = _split(jnp.moveaxis(getattr(body, name), -2, 0))
+    for name in ("feet", "bears", "walls"):
+        if (leaf := getattr(body, name)) is not None:
+            entries[name] = _split(jnp.moveaxis(leaf, -2, 0))
     if body.vertices.shape[-2] == 1:
         return Body(vertices=tuple(x[0] for x in corners), **entries)
     return Body(vertices=Corners.of(corners), **entries)

@@ -1,15 +1,16 @@
-"""Corridors: a path between two walls that neither base nor object may touch.
+"""Corridors: a path between two walls that the base may not touch, nor the object by default.
 
 Walls are at half the width on either side of the path, with mitred corners. They begin behind the
 base and continue beyond the end of the path. Doors are narrower places. A trial fails at the first
-touch, by the exact outlines of base and object.
+touch, by the exact outlines of base and object. With `touch=object`, the object slides along walls
+by contact forces, and a trial fails where the base presses it into one.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Hashable
 from dataclasses import dataclass
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -28,6 +29,11 @@ from rps_jax.world.tasks.path import LOOKAHEAD, Path, PathCourse, PathProgress, 
 
 _BEHIND = 1.5  # [m] of the walls before the base's front
 _BEYOND = 1.5  # [m] of the walls after the end of the path
+_PRESSED = 0.01  # [m] beyond a wall, at which the object has failed where it may touch
+# [m] by which walls overlap in a corner that holds the object, and end before one that juts out, so
+# that an object that slides along a wall never meets the end of the next one.
+_JOINT = 0.01
+_NOWHERE = ((1e4, 1e4), (1e4 + 1, 1e4))  # [m] wall that nothing touches
 _STEPS = 5  # control steps between two measurements of the walls, unless one may be touched
 NOTHING, BASE, OBJECT = 0, 1, 2  # what touched a wall
 
@@ -58,6 +64,8 @@ class CorridorCourse(NamedTuple):
 
     path: PathCourse
     walls: Float[Array, "*B W 2 2"]  # [m] both ends of each
+    # Of an object that may touch walls: fields of `scene.Surroundings`.
+    surroundings: dict[str, Any] | None = None
 
     def start(self) -> CorridorProgress:
         """Return the progress at the start."""
@@ -93,11 +101,12 @@ class CorridorCourse(NamedTuple):
             (of_base, at_base), (of_object, at_object) = (
                 polyline.clearance(x, self.walls - origin) for x in placed
             )
-            by_base = of_base <= of_object
-            least = jnp.where(by_base, of_base, of_object)
+            room = of_object if self.surroundings is None else of_object + _PRESSED
+            by_base = of_base <= room
+            least = jnp.where(by_base, of_base, room)
             touched = jnp.where(least > 0, NOTHING, jnp.where(by_base, BASE, OBJECT))
             point = jnp.where(least > 0, jnp.nan, origin + jnp.where(by_base, at_base, at_object))
-            clearance = jnp.minimum(progress.clearance, least)
+            clearance = jnp.minimum(progress.clearance, jnp.minimum(of_base, of_object))
             touch = touched.astype(least.dtype), point
             return jnp.zeros((), bool), clearance, *touch, least, poses, jnp.zeros_like(poses)
 
@@ -142,15 +151,20 @@ class Corridor(Path):
     width: Range = drawn(Range(1.4, 2.2), 59, "m", 0.3, 20, "width of the corridor", "course")
     doors: int = option(0, 0, 4)  # narrower places along the path
     door_width: Range = drawn(Range(0.8, 0.8), 60, "1", 0.1, 1, "doors, of the width", "course")
+    touch: Literal["nothing", "object"] = "nothing"  # what may touch walls
+    friction_wall: float = option(0.3, 0, 10)  # [1] of an object that may touch them
 
     @property
     def shape(self) -> Hashable:
-        """Kind, and numbers of vertices and doors."""
-        return super().shape, self.doors
+        """Kind, numbers of vertices and doors, and what may touch walls."""
+        return super().shape, self.doors, self.touch
 
     def check(self) -> None:
         """Raise InputError for turns in which the walls of a corner would cross."""
         super().check()
+        if self.touch == "nothing" and self.friction_wall != type(self).friction_wall:
+            rule = "without touch=object, nothing may touch a wall"
+            raise errors.not_allowed("task friction_wall", self.friction_wall, rule)
         need = self.width.high * np.tan(self.turn_angle.high / 2) if self.turns.high else 0.0
         part = self.length.low / (self.turns.high + 1)
         if self.waypoints:
@@ -186,14 +200,20 @@ class Corridor(Path):
         """Return the ends, paths and walls of worlds."""
         targets, inner = super().courses(inputs)
         half = self.width.at(inputs.u["width"]) / 2
-        walls = _walls(np.asarray(inner.line.vertices), half)
+        vertices = np.asarray(inner.line.vertices)
+        walls = _walls(vertices, half)
         opening = half * self.door_width.at(inputs.u["door_width"])
         doors = [
             _door(inner.line, (i + 1) / (self.doors + 1), opening, 1.5 * half)
             for i in range(self.doors)
         ]
         joined: Any = np.concatenate([walls, *doors], axis=1)
-        return targets, CorridorCourse(inner, joined)
+        around = None
+        if self.touch == "object":
+            friction = np.full(len(half), max(self.friction_wall, 1e-5))  # MuJoCo's least
+            smooth = np.concatenate([_without_edges(walls, vertices), *doors], axis=1)
+            around = {"walls": smooth, "friction_wall": friction}
+        return targets, CorridorCourse(inner, joined, around)
 
 
 def _walls(vertices: np.ndarray, half: np.ndarray) -> np.ndarray:
@@ -208,6 +228,26 @@ def _walls(vertices: np.ndarray, half: np.ndarray) -> np.ndarray:
     mitre = (previous + following) / (1 + np.sum(previous * following, axis=-1, keepdims=True))
     sides = [points + sign * half[:, None, None] * mitre for sign in (1, -1)]
     return np.concatenate([np.stack([s[:, :-1], s[:, 1:]], axis=2) for s in sides], axis=1)
+
+
+def _without_edges(walls: np.ndarray, vertices: np.ndarray) -> np.ndarray:
+    """Return walls (n, W, 2, 2) [m] of paths (n, N, 2) whose inner ends an object cannot meet.
+
+    Walls in one line are joined; unused ones are far away.
+    """
+    angles = turns_of(vertices)
+    sides = walls.reshape(len(walls), 2, -1, 2, 2).copy()  # left and right
+    steps = np.diff(sides, axis=3)[:, :, :, 0]
+    lengths = np.linalg.norm(steps, axis=-1, keepdims=True)
+    shifts = steps * np.minimum(_JOINT / np.maximum(lengths, 1e-9), 0.25)
+    out = np.sign(angles)[:, None, :, None] * np.array([-1, 1])[:, None, None]
+    sides[:, :, :-1, 1] += out * shifts[:, :, :-1]
+    sides[:, :, 1:, 0] -= out * shifts[:, :, 1:]
+    for i in reversed(range(angles.shape[1])):
+        straight = np.abs(angles[:, i]) < 1e-6
+        sides[straight, :, i, 1] = sides[straight, :, i + 1, 1]
+        sides[straight, :, i + 1] = _NOWHERE
+    return sides.reshape(walls.shape)
 
 
 def _door(line: Polyline, share: float, inner: np.ndarray, outer: np.ndarray) -> np.ndarray:
