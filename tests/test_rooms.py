@@ -286,7 +286,7 @@ BAD: dict[str, tuple[dict[str, Any], str]] = {
     "goal in polygon": (HALL | {"polygons": [SQUARE], "goal": [4.5, 2]}, "task goal = (4.5, 2.0)"),
     "goal outside": (HALL | {"goal": [12, 2]}, "a goal in the same room"),
     "goal at wall": (HALL | {"goal": [8.8, 2]}, "and one is 0.20 m away"),
-    "goal at start": (HALL | {"goal": [1.5, 2]}, "the base is there at the start"),
+    "goal at start": (HALL | {"goal": [1.5, 2]}, "the base starts there"),
     "unreachable": (HALL | {"polygons": [[[4, 0], [5, 0], [5, 4], [4, 4]]]}, "no path leads there"),
     "narrow": (
         HALL | {"polygons": [[[4, 0], [5, 0], [5, 3.5], [4, 3.5]]]},
@@ -305,7 +305,7 @@ BAD: dict[str, tuple[dict[str, Any], str]] = {
     ),
     "no resolution": (
         {"image": "room.png", "start": [1, 1, 0], "goal": [7, 2]},
-        "task resolution = None is not allowed: it must be a number and above 0",
+        "task resolution = None is not allowed: it must be a number and at least 0.001 [m]",
     ),
     "zero resolution": (ROS | {"resolution": 0}, "task resolution = 0"),
     "text resolution": (ROS | {"resolution": "5 cm"}, "task resolution = 5 cm"),
@@ -374,4 +374,6 @@ def test_a_task_without_a_map_is_refused_and_types_are_checked(capsys):
     for walls in (((0.0, 0.0),), ((0.0,), (1.0,))):
         with pytest.raises(InputError, match="task walls"):
             Rooms(walls=walls, goal=((1.0, 1.0),))  # pyright: ignore[reportArgumentType]
+    task = Rooms(walls=np.array(room().walls), start=[ROOM["start"]], goal=[ROOM["goal"]])  # pyright: ignore[reportArgumentType]
+    assert task.shape == room().shape
     assert dataclasses.replace(room(), object_radius=0.1).object_radius == 0.1

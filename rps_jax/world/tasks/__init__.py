@@ -30,12 +30,9 @@ MORE_NUMBERS = {name: i for kind in TASKS.values() for name, i in kind.MORE_NUMB
 OUTCOMES = {name: text for kind in TASKS.values() for name, text in kind.OUTCOMES.items()}
 FAILURES = {name: text for kind in TASKS.values() for name, text in kind.FAILURES.items()}
 
-_FORMS = {
-    bool: "true or false",
-    int: "a whole number",
-    2: "pairs of x, y [m]",
-    3: "x, y, yaw",
-}  # for errors
+# For errors: of ranges, of types, and of tuples of tuples by their sizes.
+_RANGE = "a number, or low and high as [0.3, 0.6]"
+_FORMS = {bool: "true or false", int: "a whole number", 2: "pairs of x, y [m]", 3: "x, y, yaw"}
 TaskLike = Task | str | Mapping[str, Any]  # or its text: see `parse_task`
 
 
@@ -89,12 +86,7 @@ def parse_task(task: TaskLike) -> Task:
                     raise ValueError("other sizes")
                 value = tuple(map(tuple, points.tolist()))
         except (LookupError, TypeError, ValueError, OverflowError) as error:
-            is_range = name in declared(kind)
-            form = (
-                "a number, or low and high as [0.3, 0.6]"
-                if is_range
-                else _FORMS[size or type(default)]
-            )
+            form = _RANGE if name in declared(kind) else _FORMS[size or type(default)]
             raise errors.not_allowed(f"task {name}", value, f"write {form}") from error
         values[name] = value
     file = {name: value for name, value in task.items() if name not in known}

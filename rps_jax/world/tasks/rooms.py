@@ -79,10 +79,8 @@ class Rooms(Following):
             rings += _read_image(file, values.get("start", cls.start))
         if file.keys() - {"polygons"}:  # walls around the room make its outside an obstacle
             points = np.concatenate(rings)
-            x, y = ((f.min() - 0.1, f.max() + 0.1) for f in (points.real, points.imag))
-            rings.append(
-                np.array([complex(x[i], y[j]) for i, j in ((0, 0), (1, 0), (1, 1), (0, 1))])
-            )
+            x, y = ([f.min() - 0.1, f.max() + 0.1] for f in (points.real, points.imag))
+            rings.append(np.add.outer(x, np.multiply(1j, y)).ravel()[[0, 2, 3, 1]])
         edges = [np.stack([ring, np.roll(ring, -1)], axis=1).ravel().tolist() for ring in rings]
         walls = tuple((point.real, point.imag) for points in edges for point in points)
         return {"walls": (*values.get("walls", ()), *walls)} if file else {}
@@ -100,9 +98,9 @@ class Rooms(Following):
     @property
     def _routes(self) -> np.ndarray:
         """Vertices (R, N) [m] of the paths from each start to each goal in the map."""
-        ahead, clearance = self.base_radius, self.base_radius + self.object_radius
-        size = self.scale.low
-        return _plan(self.walls, self.start, self.goal, ahead / size, clearance / size)
+        map_ = (tuple(map(tuple, x)) for x in (self.walls, self.start, self.goal))
+        radii = self.base_radius / self.scale.low, self.object_radius / self.scale.low
+        return _plan(*map_, *radii)
 
     def check(self) -> None:
         """Raise InputError for a map without a way from each start to each goal."""
@@ -111,8 +109,8 @@ class Rooms(Following):
         for is_bad, name, value, rule in (
             (not count or count % 1, "walls", count, "give polygons, an outline or a map.yaml"),
             (count > _MAX_WALLS, "walls", count, f"at most {_MAX_WALLS} are allowed: {fewer}"),
-            (not self.start, "start", "()", "give x, y and yaw in the map, as [1, 2, 0]"),
-            (not self.goal, "goal", "()", "give x and y in the map, as [4, 2]"),
+            (not len(self.start), "start", "()", "give x, y and yaw in the map, as [1, 2, 0]"),
+            (not len(self.goal), "goal", "()", "give x and y in the map, as [4, 2]"),
         ):
             if is_bad:
                 raise errors.not_allowed(f"task {name}", value, rule)
@@ -124,7 +122,7 @@ class Rooms(Following):
             rule = f"give at least {shell.half[1]} m: half of the base's width"
             raise errors.not_allowed("task base_radius", self.base_radius, rule)
         for start in self.start:
-            walls = _placed(_endpoints(self.walls).ravel(), np.array([start]), self.scale.low)
+            walls = _placed(np.array(self.walls) @ (1, 1j), np.array([start]), self.scale.low)
             walls = jnp.asarray(walls.reshape(-1, 2, 2))
             if polyline.clearance(shell.outline, walls)[0] <= 0:
                 raise errors.not_allowed("task start", start, "the base touches a wall there")
@@ -137,14 +135,9 @@ class Rooms(Following):
         vertices = _placed(self._routes[route], starts, scale)
         # The first two are at the start, and straight ahead: the path begins at the base's front.
         vertices[:, :2, 0] = np.maximum(vertices[:, :2, 0], inputs.front[:, None])
-        walls: Any = _placed(_endpoints(self.walls).ravel(), starts, scale)
+        walls: Any = _placed(np.array(self.walls) @ (1, 1j), starts, scale)
         path = PathCourse(Polyline.through(vertices), lookahead)
         return vertices[:, -1], CorridorCourse(path, walls.reshape(route.size, -1, 2, 2))
-
-
-def _endpoints(walls: Any) -> np.ndarray:
-    """Return both ends (W, 2) [m] of walls, from pairs (2 W, 2) of x and y."""
-    return (np.array(walls) @ (1, 1j)).reshape(-1, 2)
 
 
 def _placed(points: np.ndarray, starts: np.ndarray, scale: Any) -> np.ndarray:
@@ -162,14 +155,12 @@ def _ring(name: str, corners: object) -> np.ndarray:
     points = errors.check_array(name, corners, ("N", 2)) @ (1, 1j)
     points = points[: -1 if points[0] == points[-1] else None]
     following, i = np.roll(points, -1), np.arange(points.size)
-    is_apart = _distances(points[:, None], following[:, None], points, following) > 1e-9
+    touched = _distances(points[:, None], following[:, None], points, following) < 1e-9
+    touched &= (i - i[:, None] + 1) % max(i.size, 1) > 2  # of edges that do not follow each other
     for is_bad, rule in (
         (i.size < 3, "a polygon has three corners or more, each as x, y [m]"),
         ((abs(following - points) < 1e-3).any(), "corners are repeated: give each once"),
-        (
-            (~is_apart & ((i - i[:, None] + 1) % max(i.size, 1) > 2)).any(),
-            "its edges cross or touch: divide it into polygons that do not",
-        ),
+        (touched.any(), "its edges cross or touch: divide it into polygons that do not"),
     ):
         if is_bad:
             raise errors.not_allowed(name, corners, rule)
@@ -179,8 +170,7 @@ def _ring(name: str, corners: object) -> np.ndarray:
 def _read_image(file: Mapping[str, Any], starts: Any) -> list[np.ndarray]:
     """Return the outlines (N,) [m] of the part of a ROS map that starts (S, 3) can reach."""
     check = functools.partial(errors.check_finite, at_least=0)
-    bounds: Any = {"above": 0, "unit": "m per pixel"}
-    resolution = errors.check_finite("task resolution", file.get("resolution"), **bounds)
+    resolution = check("task resolution", file.get("resolution"), at_least=1e-3, unit="m")
     tolerance = check("task tolerance", file.get("tolerance", resolution), unit="m")
     high = check("task occupied_thresh", file.get("occupied_thresh", 0.65), at_most=1)
     low = check("task free_thresh", file.get("free_thresh", 0.196), at_most=1)
@@ -241,14 +231,16 @@ def _simplify(points: np.ndarray, tolerance: float) -> np.ndarray:
 
 
 @functools.lru_cache(64)
-def _plan(walls: Any, starts: Any, goals: Any, ahead: float, clearance: float) -> np.ndarray:
+def _plan(walls: Any, starts: Any, goals: Any, base_radius: float, radius: float) -> np.ndarray:
     """Return paths (R, N) [m] from each start to each goal; shorter ones repeat their end.
 
-    They begin at the start and a way `ahead` of it, from where on they keep a clearance.
+    They begin at the start and `base_radius` ahead of it, from where on they keep both radii from
+    walls.
     """
-    (a, b), goal = _endpoints(walls).T, np.array(goals) @ (1, 1j)
+    a, b = np.transpose((np.array(walls) @ (1, 1j)).reshape(-1, 2))
+    clearance, goal = base_radius + radius, np.array(goals) @ (1, 1j)
     begin, yaw = np.array(starts) @ (1, 1j, 0), np.array(starts)[:, 2]
-    nodes = np.append(begin + ahead * np.exp(1j * yaw), goal)
+    nodes = np.append(begin + base_radius * np.exp(1j * yaw), goal)
     needed = f"the path keeps {clearance:.2f} m from walls (base_radius + object_radius)"
     for i, (value, point) in enumerate(zip((*starts, *goals), (*begin, *goal), strict=True)):
         passed = (a.imag > point.imag) != (b.imag > point.imag)
@@ -258,7 +250,7 @@ def _plan(walls: Any, starts: Any, goals: Any, ahead: float, clearance: float) -
         for is_bad, rule in (
             (inside, "it lies in an obstacle or outside of the room"),
             (away < clearance, f"{needed}, and one is {away:.2f} m away"),
-            (abs(begin - point).min() < ahead and not is_start, "the base is there at the start"),
+            (not is_start and abs(begin - point).min() < base_radius, "the base starts there"),
         ):
             if is_bad:
                 raise errors.not_allowed(f"task {'start' if is_start else 'goal'}", value, rule)
