@@ -24,7 +24,7 @@ from rps_jax.world import rendering
 
 FOLDER = Path(__file__).resolve().parent
 TEXTS = tuple(sorted(FOLDER.glob("[0-9]*.py")))
-TUTORIALS = tuple(text for text in TEXTS if "07" <= text.stem < "10")
+TUTORIALS = tuple(text for text in TEXTS if text.stem[:2] in ("07", "08", "09", "11"))
 KERNEL = {"name": "python3", "display_name": "Python 3", "language": "python"}
 
 

@@ -71,7 +71,7 @@ def test_stored_notebooks_have_figures_and_no_errors_or_local_paths(name):
 
 
 # These run for a minute or more; other tests call the same functions.
-LONG = ("02", "05", "06", "07", "08", "09", "10")
+LONG = ("02", "05", "06", "07", "08", "09", "10", "11")
 EXECUTED = [pytest.param(n, marks=[pytest.mark.slow] if n[:2] in LONG else []) for n in TEXTS]
 
 

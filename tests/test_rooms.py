@@ -374,6 +374,6 @@ def test_a_task_without_a_map_is_refused_and_types_are_checked(capsys):
     for walls in (((0.0, 0.0),), ((0.0,), (1.0,))):
         with pytest.raises(InputError, match="task walls"):
             Rooms(walls=walls, goal=((1.0, 1.0),))  # pyright: ignore[reportArgumentType]
-    task = Rooms(walls=np.array(room().walls), start=[ROOM["start"]], goal=[ROOM["goal"]])  # pyright: ignore[reportArgumentType]
+    task = Rooms(walls=[*map(list, room().walls)], start=[ROOM["start"]], goal=[ROOM["goal"]])  # pyright: ignore[reportArgumentType]
     assert task.shape == room().shape
     assert dataclasses.replace(room(), object_radius=0.1).object_radius == 0.1
