@@ -443,8 +443,9 @@ class DomainQuestion(TaskOption, SimulationQuestion[T]):
     """Ranges from which worlds are drawn: paper, hardware, wide, real (wide, but with limited
     robots), prisms or hostile, or a JSON file of ranges. Changes follow, as wide,mass=3:10."""
     robot: RobotLike | None = field(default=None, kw_only=True)
-    """The robot: ideal, slipping, kairos (the paper's), ridgeback or mpo_500, or a JSON file of its
-    size, boards and limits. By default the domain's, which is ideal but in the domain real."""
+    """The robot: ideal, slipping, kairos (the paper's), ridgeback, mpo_500 or round, or a JSON
+    file of its size, boards and limits. By default the domain's, which is ideal but in the domain
+    real."""
 
     @functools.cached_property
     def ranges(self) -> Domain:

@@ -68,8 +68,8 @@ class Hardware(LawQuestion[xr.Dataset]):
     follow, as capacitive,foam=0.01."""
     robot: RobotLike = "slipping"
     """The robot: slipping (its wheels lose shares of the twist, by which the paper's results come
-    out), ideal (it follows every twist at once, with any force), kairos (the paper's), ridgeback or
-    mpo_500, or a JSON file of its size, boards and limits."""
+    out), ideal (it follows every twist at once, with any force), kairos (the paper's), ridgeback,
+    mpo_500 or round, or a JSON file of its size, boards and limits."""
     layout: Literal["circle", "grid"] = "circle"
     """Layout of the eight targets: circle (each 2.1 m from the start) or grid (2.1 m apart in x and
     y)."""

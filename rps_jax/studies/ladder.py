@@ -102,8 +102,8 @@ class Ladder(SweepOptions, TaskOption, MultiLawQuestion[xr.Dataset | xr.DataTree
     """Number of worlds of each domain; by default 1000, or the grid of a domain with listed targets
     (paper: 144). With several domains it is at most that grid."""
     robot: RobotLike | None = field(default=None, kw_only=True)
-    """The robot: ideal, slipping, kairos (the paper's), ridgeback or mpo_500, or a JSON file of its
-    size, boards and limits. By default the domain's."""
+    """The robot: ideal, slipping, kairos (the paper's), ridgeback, mpo_500 or round, or a JSON
+    file of its size, boards and limits. By default the domain's."""
     part: int | None = option(None, 1, 1_000_000, kw_only=True)
     """Checkpoint interval: at most this many trials per law and object are repeated after a kill.
     By default 1024, and with many worlds a 16th of them, up to 16384."""

@@ -38,8 +38,9 @@ class TrialOptions:
     paper."""
     robot: RobotLike = "ideal"
     """The robot: ideal (it follows every twist at once, with any force), slipping (its wheels lose
-    shares of the twist), kairos (the paper's), ridgeback or mpo_500, or a JSON file of its size,
-    boards and limits. Changes follow, as kairos,force_max=300."""
+    shares of the twist), kairos (the paper's), ridgeback, mpo_500 or round (a disc as wide as
+    the paper's base), or a JSON file of its size, boards and limits. Changes follow, as
+    kairos,force_max=300."""
 
 
 @dataclass(frozen=True)
