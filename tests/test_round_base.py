@@ -54,7 +54,7 @@ def test_outline_and_sizes() -> None:
     driven = Robot(radius=0.3, mass=100.0, force_max=400.0)
     assert driven.inertia == pytest.approx(4.5)  # of a disc, m r^2 / 2
     assert driven.turn_max == pytest.approx(120.0)  # wheels at the rim
-    assert parse_robot("round").front == parse_robot("ideal").half_width
+    assert parse_robot("round").sizes[0] == parse_robot("ideal").half_width
 
 
 def test_taxels_are_evenly_spaced_along_the_front_270_degrees() -> None:
@@ -172,8 +172,8 @@ def test_a_low_object_touches_below_its_top() -> None:
 _LONG = {"side": "front", "count": 4, "pitch": 0.048}
 test_refuses = refusals(
     parse_robot,
-    (("round,half_width=0.2",), "robot radius = 0.29 m with half_width = 0.2 m is not allowed"),
-    (("ridgeback,radius=0.3",), "leave out radius or half_length"),
+    (("round,half_width=0.2",), "robot radius = 0.29 m with half_length, half_width = 0.3625, 0.2 m is not"),
+    (("ridgeback,radius=0.3",), "leave out radius, or the half sizes"),
     (({"radius": 0.05},), "robot radius = 0.05 m? ?is not allowed: .* at least 0.1"),
     (({"radius": [0.3, 0.4]},), "robot radius"),
     (({"radius": 0.2, "boards": _LONG},), "they leave the base"),

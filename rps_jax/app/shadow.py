@@ -77,8 +77,9 @@ class Shadow(BagQuestion[xr.Dataset]):
             recorded |= {"target": pursued(recorded, self.lookahead)}
         motion = (recorded[name] for name in ("time", "pose", "twist"))
         doubts = "; it ".join(motion_faults(*motion))  # the base may follow other commands
-        law = registry.law_of(self.params)
-        twists = shadowed(law, self.params, recorded, shell.radius)
+        if shell.radius is not None:
+            recorded["base_radius"] = np.asarray(shell.radius)
+        twists = shadowed(registry.law_of(self.params), self.params, recorded)
         both = np.stack([recorded["twist"], twists])
         pairs = zip(COLUMNS["twist"].items(), np.moveaxis(both, -1, 0), strict=True)
         columns = {name: (("source", "time"), x, {"units": unit}) for (name, unit), x in pairs}
@@ -136,15 +137,8 @@ def pursued(recorded: dict[str, np.ndarray], lookahead: float) -> np.ndarray:
     return np.asarray(aims.p_world_target)
 
 
-def shadowed(
-    law: Law,
-    params: LawParams,
-    recorded: dict[str, np.ndarray],
-    base_radius: float | None = None,
-) -> np.ndarray:
+def shadowed(law: Law, params: LawParams, recorded: dict[str, np.ndarray]) -> np.ndarray:
     """Return the twists (N, 3) [m/s, m/s, rad/s] of a law for the observations of a bag.
-
-    The `base_radius` [m] is that of a round base.
 
     A law that observes its last twist gets the recorded one, which moved the base. Rounding errors
     therefore do not grow from step to step.
@@ -169,7 +163,7 @@ def shadowed(
     @jax.jit
     def run(params: LawParams, observations: Any) -> jax.Array:
         def step(state: Any, row: Any) -> Any:
-            obs, last = on_base(row[0], base_radius), row[1]
+            obs, last = on_base(row[0], recorded.get("base_radius")), row[1]
             if law.observe_sent is not None:
                 state = law.observe_sent(params, state, obs, Twist(*last))
             state, twist, _ = law.step(params, state, obs)

@@ -127,11 +127,8 @@ def upright(model: Model, data: Data, base: int, prism: int, corners: jax.Array)
     position = middle[:2] + jnp.stack(point, axis=-1) @ back
     zero, unit = jnp.zeros_like(n[0]), jnp.ones_like(n[0])
     frame = jnp.stack([n[0], n[1], zero, -n[1], n[0], zero, zero, zero, unit]).reshape(3, 3)
-    return (
-        distance,
-        jnp.concatenate([position, z[:, None]], axis=-1),
-        jnp.stack([frame] * len(distance)),
-    )
+    points = jnp.concatenate([position, z[:, None]], axis=-1)
+    return distance, points, jnp.stack([frame] * len(distance))
 
 
 Extra = jax.Array | None  # numbers of a world that a model lacks

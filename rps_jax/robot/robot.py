@@ -6,8 +6,10 @@ A limit of None is absent and costs nothing: `Robot()` follows every twist at on
 from __future__ import annotations
 
 import dataclasses
+import operator
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import reduce
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -71,27 +73,27 @@ class Robot:
     @property
     def inertia(self) -> Number:
         """Moment of inertia () [kg m^2] about the vertical, of a plate with the base's outline."""
-        if self.radius is not None:
-            return self.mass * self.radius**2 / 2
-        return self.mass * (self.half_length**2 + self.half_width**2) / 3
-
-    @property
-    def front(self) -> Number:
-        """Distance () [m] from the middle to the front."""
-        return self.half_length if self.radius is None else self.radius
+        return self.mass * self._square / (3 if self.radius is None else 2)
 
     @property
     def arm(self) -> Number:
-        """Distance () [m] from the middle to the wheels, at the corners of the outline."""
-        if self.radius is not None:
-            return self.radius
-        size = self.half_length**2 + self.half_width**2
-        return jnp.sqrt(size) if isinstance(size, jax.Array) else np.sqrt(size)
+        """Distance () [m] from the middle to the wheels, at the rim or the corners."""
+        square = self._square
+        return jnp.sqrt(square) if isinstance(square, jax.Array) else np.sqrt(square)
+
+    @property
+    def _square(self) -> Number:
+        return reduce(operator.add, (size**2 for size in self.sizes))
+
+    @property
+    def sizes(self) -> tuple[Number, ...]:
+        """Half length and half width () [m], or the radius of a round base alone."""
+        return (self.half_length, self.half_width) if self.radius is None else (self.radius,)
 
     @property
     def shell(self) -> Shell:
         """Outline and boards, of robots on the host."""
-        return Shell.of(self.half_length, self.half_width, self.boards, self.radius)
+        return Shell.of(self.boards, *self.sizes)
 
     @property
     def push_max(self) -> Number:
@@ -127,12 +129,11 @@ class Robot:
             shapes, form = _SHAPES.get(name, (((),), "one number"))
             if (value := getattr(self, name)) is not None and np.shape(value) not in shapes:
                 raise errors.not_allowed(f"robot {name}", value, f"give {form}")
-        if self.radius is not None:
-            for name, default in (("half_length", HALF_LENGTH), ("half_width", HALF_WIDTH)):
-                if (half := getattr(self, name)) != default:
-                    sizes = f"{self.radius:g} m with {name} = {half:g} m"
-                    rule = f"a base is round or a rectangle: leave out radius or {name}"
-                    raise errors.not_allowed("robot radius", sizes, rule)
+        half = self.half_length, self.half_width
+        if self.radius is not None and half != (HALF_LENGTH, HALF_WIDTH):
+            sizes = f"{self.radius:g} m with half_length, half_width = {half[0]:g}, {half[1]:g} m"
+            rule = "a base is round or a rectangle: leave out radius, or the half sizes"
+            raise errors.not_allowed("robot radius", sizes, rule)
         Shell(self.half_length, self.half_width, self.boards, radius=self.radius).check()
         if self.push_max is not None and self.push_max <= 0:
             rolling = (self.resistance or 0) * self.mass * GRAVITY

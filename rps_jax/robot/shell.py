@@ -83,20 +83,15 @@ class Shell:
     radius: Number | None = option(None, 0.1, 2, unit="m")
 
     @classmethod
-    def of(
-        cls,
-        half_length: Number,
-        half_width: Number,
-        boards: tuple[Boards, ...],
-        radius: Number | None = None,
-    ) -> Shell:
-        """Return the shell of a base, or of many bases if the sizes are (n,)."""
-        sizes = (half_length, half_width) if radius is None else (radius,)
+    def of(cls, boards: tuple[Boards, ...], *sizes: Number) -> Shell:
+        """Return the shell of a base, or of many bases if the `sizes` are (n,)."""
         sides = _lengths(*(float(np.max(size)) for size in sizes))
         pitches = [sides[x.side] / x.taxels if x.pitch is None else np.max(x.pitch) for x in boards]
-        is_default = np.all(np.asarray(half_width) == HALF_WIDTH)
         samples = math.ceil(float(max(pitches)) / _SPACING)
-        return cls(half_length, None if is_default else half_width, boards, samples, radius)
+        if len(sizes) == 1:
+            return cls(boards=boards, samples=samples, radius=sizes[0])
+        is_default = np.all(np.asarray(sizes[1]) == HALF_WIDTH)
+        return cls(sizes[0], None if is_default else sizes[1], boards, samples)
 
     @property
     def half(self) -> tuple[Number, Number]:

@@ -113,12 +113,9 @@ class IdealSkin(NamedTuple):
         spans = [(row.offset, row.offset + row.length) for row in shell.rows()]
         at = jnp.stack([jnp.clip(nearest, *span) for span in spans])
         distances = fp.signed_distance(footprint, shell.on_strip(at))
-        distance, point = distances[0], at[0]
-        for i in range(1, len(spans)):
-            closer = distances[i] < distance
-            distance = jnp.where(closer, distances[i], distance)
-            point = jnp.where(closer, at[i], point)
-        ends = (shell.on_strip(point),) * 2
+        distance = -planar.greatest(-distances)
+        # Within rounding errors, since a compiler may compute a distance twice.
+        ends = (shell.on_strip(_extremes(distances <= distance + 1e-6, at)[0]),) * 2
         if self.temperature is None:
             return _reading(jnp.where(distance <= self.tolerance, POINT, NONE), *ends)
         excess = (self.tolerance - distance) / self.temperature

@@ -87,7 +87,7 @@ def build(
     uniform = draws.random_numbers(setting.seed, trials)
     for case, row, target in zip(cases, uniform, targets, strict=True):
         u = draws.by_name(row[None])
-        front = np.array([float(case.base.front)])
+        front = np.array([float(case.base.sizes[0])])
         end, course = case.challenge.courses(CourseInputs(u, target[None], front))
         final.append(end[0])
         courses.append(rows(course, 0))

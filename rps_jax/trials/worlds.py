@@ -102,7 +102,7 @@ def soften_skins(worlds: World, taxels: float = CapacitiveSkin.SMOOTH) -> World:
 def starts(drawn: Draw) -> np.ndarray:
     """Return start positions (n, 10): the base at the origin, the object in front of it."""
     qpos, yaw = np.zeros((drawn.indices.size, 10)), drawn.values["yaw"]
-    front = drawn.robot.front + drawn.values["gap"] + solid.extent(drawn.solid, yaw)
+    front = drawn.robot.sizes[0] + drawn.values["gap"] + solid.extent(drawn.solid, yaw)
     half, zero = yaw / 2, np.zeros_like(yaw)
     position = [front, drawn.values["lateral"], drawn.solid.height / 2]
     quaternion = [np.cos(half), zero, zero, np.sin(half)]

@@ -110,7 +110,7 @@ def draw_at(
         at |= dict(zip(("friction_ground", "friction_robot"), listed, strict=True))
     at |= {name: at[name] + move for name, move in (moves or {}).items()}
     robot = _robots(domain.robot, at, index.size)
-    front = np.broadcast_to(np.asarray(robot.front, float), index.shape)
+    front = np.broadcast_to(np.asarray(robot.sizes[0], float), index.shape)
     inputs = CourseInputs(u, _targets(domain, index, at), front)
     targets, course = domain.task.courses(inputs)
     key = [np.floor(u[name] * 2**32).astype(np.uint32) for name in ("key_0", "key_1")]

@@ -202,8 +202,7 @@ def repeat_robot(robots: Robot, count: int) -> Robot:
 
 def base_size(robots: Robot, count: int) -> np.ndarray:
     """Return half length and half width (count, 2) [m] of bases, or their radius (count, 1)."""
-    half = robots.half_length, robots.half_width
-    sizes = np.stack(half if robots.radius is None else [robots.radius], axis=-1)
+    sizes = np.stack(robots.sizes, axis=-1)
     return np.broadcast_to(np.asarray(sizes, float), (count, sizes.shape[-1]))
 
 
@@ -303,12 +302,11 @@ def check_target(p_world_target: tuple[float, float], shell: Shell = Shell()) ->
     """Raise InputError for a target [m] under the robot or more than 50 m away."""
     x, y = errors.check_vector("target", p_world_target, at_least=-50, at_most=50, unit="m")
     half_x, half_y = shell.half
-    under = abs(x) <= half_x and abs(y) <= half_y
-    covered = f"|x| <= {half_x:g} m and |y| <= {half_y:g} m"
-    if shell.radius is not None:
-        under, covered = math.hypot(x, y) <= shell.radius, f"{shell.radius:g} m around (0, 0)"
-    if under:
-        rule = f"it must lie outside the robot, which covers {covered}"
+    order = np.inf if shell.radius is None else 2
+    if np.linalg.norm([x / half_x, y / half_y], order) <= 1:
+        rule = (
+            f"it must lie outside the robot, from its middle {half_x:g} m ahead, {half_y:g} m aside"
+        )
         raise errors.not_allowed("target", f"({x:g}, {y:g}) m", rule)
 
 
@@ -344,12 +342,9 @@ def _draw_round(spec: mujoco.MjSpec, shell: Shell, radius: float) -> None:
     for name, share, z, half in (("deck", 0.9, 0.36, 0.02), ("wheel", 0.85, 0.03, 0.03)):
         disc = {"type": kind.mjGEOM_CYLINDER, "size": [share * radius, half, 0]}
         base.add_geom(pos=[0, 0, z], material=name, **disc, **looks)
-    ends = np.asarray(shell.taxels(2), float)  # (T, 2, 2) [m] at 1/4 and 3/4 of each taxel
-    for (x, y), (dx, dy) in zip(ends.mean(axis=1), ends[:, 0] - ends[:, 1], strict=True):
-        half, yaw = math.hypot(dx, dy), math.atan2(dy, dx) / 2
-        tile = {"type": kind.mjGEOM_BOX, "size": [half, 0.003, 0.05], "material": "skin"}
-        turn = [math.cos(yaw), 0, 0, math.sin(yaw)]
-        base.add_geom(pos=[x, y, 0.27], quat=turn, **tile, **looks)
+    tile = {"type": kind.mjGEOM_CYLINDER, "size": [0.055 * radius, 0.05, 0], "material": "skin"}
+    for x, y in 0.955 * np.asarray(shell.taxels()[:, 0], float):
+        base.add_geom(pos=[x, y, 0.27], **tile, **looks)
 
 
 def _touch_round(spec: mujoco.MjSpec, radius: float) -> None:

@@ -306,20 +306,23 @@ def circle_and_base(
     centre: Point, radius: Number, size: Sequence[Number]
 ) -> tuple[Point, Point, Number]:
     """Return normal, point and distance [m] of a circle outside a centred base."""
-    base_radius = size[0] if len(size) == 1 else None  # else a rectangle of these half sizes
-    half = size if base_radius is None else (0.0, 0.0)
-    nearest = tuple(jnp.clip(x, -h, h) for x, h in zip(centre, half, strict=True))
+    if len(size) == 1:
+        normal, _, distance = circle_and_base(centre, radius, (0.0, 0.0))
+        return _on_circle(size[0], normal, distance - size[0])
+    nearest = tuple(jnp.clip(x, -h, h) for x, h in zip(centre, size, strict=True))
     offset = (centre[0] - nearest[0], centre[1] - nearest[1])
     gap = sp.norm(offset)
     outside = gap > 1e-6
     normal = (jnp.where(outside, offset[0] / gap, 1.0), jnp.where(outside, offset[1] / gap, 0.0))
-    distance = jnp.where(outside, gap, centre[0] - half[0]) - radius
-    away = 0.5 * distance
-    if base_radius is not None:
-        distance = distance - base_radius
-        away = base_radius + 0.5 * distance
-    point = (nearest[0] + away * normal[0], nearest[1] + away * normal[1])
+    distance = jnp.where(outside, gap, centre[0] - size[0]) - radius
+    point = (nearest[0] + 0.5 * distance * normal[0], nearest[1] + 0.5 * distance * normal[1])
     return normal, point, distance
+
+
+def _on_circle(radius: Number, normal: Point, distance: Number) -> tuple[Point, Point, Number]:
+    """Return normal, point and distance [m] of a contact of a round base."""
+    away = radius + 0.5 * distance
+    return normal, (away * normal[0], away * normal[1]), distance
 
 
 def polygon_and_base(
@@ -405,10 +408,9 @@ def _polygon_and_circle(
     inside = sp.greatest(jnp.where(real, level, -_FAR)) < 0
     _, (q, n) = _best(jnp.where(real, -sp.dot(q, q), -_FAR), (q, n))
     gap = sp.norm(q)
-    normal = tuple(jnp.where(inside, -a, b / gap) for a, b in zip(n, q, strict=True))
-    distance = jnp.where(inside, -gap, gap) - radius
-    away = radius + 0.5 * distance
-    return (normal[0], normal[1]), [(away * normal[0], away * normal[1])], [distance]
+    normal = (jnp.where(inside, -n[0], q[0] / gap), jnp.where(inside, -n[1], q[1] / gap))
+    normal, point, distance = _on_circle(radius, normal, jnp.where(inside, -gap, gap) - radius)
+    return normal, [point], [distance]
 
 
 def _best(score: Array, values: Entries) -> tuple[Number, Entries]:
