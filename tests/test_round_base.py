@@ -172,7 +172,10 @@ def test_a_low_object_touches_below_its_top() -> None:
 _LONG = {"side": "front", "count": 4, "pitch": 0.048}
 test_refuses = refusals(
     parse_robot,
-    (("round,half_width=0.2",), "robot radius = 0.29 m with half_length, half_width = 0.3625, 0.2 m is not"),
+    (
+        ("round,half_width=0.2",),
+        "robot radius = 0.29 m with half_length, half_width = 0.3625, 0.2 m is not",
+    ),
     (("ridgeback,radius=0.3",), "leave out radius, or the half sizes"),
     (({"radius": 0.05},), "robot radius = 0.05 m? ?is not allowed: .* at least 0.1"),
     (({"radius": [0.3, 0.4]},), "robot radius"),
