@@ -17,6 +17,7 @@ from rps_jax.geometry.footprint import Footprint
 from rps_jax.geometry.solid import SIDES
 from rps_jax.robot.robot import Robot
 from rps_jax.trials.worlds import starts
+from rps_jax.tuning import derivatives
 from rps_jax.world import domain as domains
 from rps_jax.world import draws, points, scene
 from rps_jax.world.physics import preset
@@ -250,3 +251,22 @@ def test_quasistatic_refuses_floors_before_it_compiles(changes, name):
     message = f"engine = quasistatic is not allowed: it has no {name}; choose mjx"
     with pytest.raises(InputError, match=message):
         rps_jax.sweep("rps", f"wide,{changes}", worlds=4, setting=setting)
+
+
+def test_floors_have_derivatives_except_by_the_position_of_the_boundary():
+    domain, worlds = drawn("random_box", FLOORS, 3)
+    names = ("slope", "slope_bearing", "boundary_factor")
+    coordinates = derivatives.coordinates_of(names, rps_jax.RPSParams.tuned(), domain)
+    assert [(x.label, x.unit) for x in coordinates] == [
+        *zip(names, ("rad", "rad", "1"), strict=True)
+    ]
+    setting = rps_jax.Setting("fused", seed=3)
+    slopes, bends = derivatives.world_slopes(domain, worlds, setting, coordinates)
+    gravity, turned, factor = slopes
+    assert set(gravity) == set(turned) == {"world.fields.gravity"}
+    steep = worlds.values["slope"]
+    np.testing.assert_allclose(gravity["world.fields.gravity"][:, 2], G * np.sin(steep), rtol=1e-6)
+    np.testing.assert_allclose(factor["world.fields.boundary"], [[0, 0, 0, 1]] * 3, atol=1e-8)
+    assert bends.max() < 1e-3
+    with pytest.raises(InputError, match="boundary is not allowed: it has no derivative"):
+        derivatives.coordinates_of(("boundary",), rps_jax.RPSParams.tuned(), domain)

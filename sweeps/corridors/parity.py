@@ -37,6 +37,9 @@ class Row(NamedTuple):
 ROWS = {
     "path": Row("path"),
     "corridor": Row("corridor"),
+    "slope": Row("reach", "wide,slope=0:0.105"),
+    "slope, limited base": Row("reach", "real,slope=0:0.105"),
+    "boundary": Row("reach", "wide,boundary_factor=0.3:3,boundary=0.5"),
     "round base": Row("corridor", robot="round"),
 }
 SETTINGS = {
@@ -58,7 +61,7 @@ class Parity(Study[xr.DataTree]):
     PRESETS: ClassVar = PHYSICS["default"]
 
     rows: tuple[str, ...] = tuple(ROWS)
-    """Rows of the table: path, corridor, round base."""
+    """Rows of the table: path, corridor, slope, boundary, round base and others."""
     worlds: int = option(300, 1, 10_000_000)
     """Number of worlds of each row."""
     seed: int = option(77, 0, 2**32 - 1)

@@ -270,6 +270,7 @@ RECIPES: dict[str, Recipe] = {
         f"rps_tuned,sweeps/corridors/tuned.json {_MACHINE}",
         gpu=3,
     ),
+    "floors_*": recipe(f"rps sweeps/floors {_MACHINE}", cores=30, gpu=2),
     "tasks_parity": recipe(f"rps sweeps/corridors/parity.py {_MACHINE}", cores=90),
     "tasks_cost_cpu": recipe(f"rps sweeps/corridors/costs.py {_MACHINE}", cores=3),
     "tasks_cost_gpu": recipe(
