@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -68,19 +69,29 @@ def clearance(
     along = end - start
     length = planar.norm(along)[:, None]
     normal = planar.rotate(jnp.pi / 2, along) / jnp.where(length > 0, length, 1.0)
-    square, gap = jnp.full(walls.shape[:1], jnp.inf), jnp.full(walls.shape[:1], -jnp.inf)
-    low, high = square, gap  # heights of the corners above each wall
-    for corner, following in zip(corners, jnp.roll(corners, -1, axis=0), strict=True):
-        square = jnp.minimum(square, _square(start, along, corner))
+    ahead = jnp.roll(corners, -1, axis=0)
+
+    def include(i: Array, least: tuple[Array, ...]) -> tuple[Array, ...]:
+        """Include corner i and the edge that follows it."""
+        square, low, high, gap = least
+        corner = corners[i]
         height = _dot(corner - start, normal)
-        low, high = jnp.minimum(low, height), jnp.maximum(high, height)
-        edge = following - corner
+        edge = ahead[i] - corner
         size = planar.norm(edge)
         out = jnp.stack([edge[1], -edge[0]]) / jnp.where(size > 0, size, 1.0)
-        for point in (start, end):
-            square = jnp.minimum(square, _square(corner, edge, point))
+        for distance2 in (
+            _square(start, along, corner), _square(corner, edge, start), _square(corner, edge, end)
+        ):  # fmt: skip
+            square = jnp.minimum(square, distance2)
         beyond = jnp.minimum(_dot(start - corner, out), _dot(end - corner, out))
         gap = jnp.maximum(gap, jnp.where(size > 0, beyond, -jnp.inf))
+        return square, jnp.minimum(low, height), jnp.maximum(high, height), gap
+
+    infinite = jnp.full(walls.shape[:1], jnp.inf)
+    # A loop in compiled programs: a GPU would store the arrays of all corners at once.
+    square, low, high, gap = jax.lax.fori_loop(
+        0, len(corners), include, (infinite, infinite, -infinite, -infinite)
+    )
     gap = jnp.maximum(gap, jnp.where(length[:, 0] > 0, jnp.maximum(low, -high), -jnp.inf))
     distance = planar.safe_sqrt(square)
     if len(corners) > 1:  # a point has no inside
