@@ -1,6 +1,8 @@
 """The interactive push page computes the same twists as Python."""
 
 import contextlib
+import itertools
+import json
 import runpy
 
 import chromium
@@ -8,6 +10,9 @@ import jax
 import numpy as np
 import pytest
 from helpers import ROOT
+from selenium.webdriver.common.action_chains import ActionChains
+from selenium.webdriver.common.by import By
+from shapely import LineString, Point
 
 from rps_jax.geometry import solid
 from rps_jax.lowering.routine import fields_of
@@ -48,11 +53,12 @@ def browser(tmp_path_factory):
 
 
 @contextlib.contextmanager
-def python_push(law):
-    """The paper's push to (-2, 0), in double precision."""
+def python_push(law, **options):
+    """The paper's push to (-2, 0), or in a task, in double precision."""
     with jax.enable_x64(True):
         setting = Setting("quasistatic")
-        live = Live(pushes.build([Case("box", "S1", (-2.0, 0.0), law)], setting), setting)
+        case = Case("box", "S1", (-2.0, 0.0), law, **options)
+        live = Live(pushes.build([case], setting), setting)
         live.step(20_000)
         assert live.done
         yield live
@@ -71,6 +77,105 @@ def test_a_whole_push_has_the_twists_of_python(law, browser):
     assert success
     assert len(computed) == len(expected) > 5000
     np.testing.assert_allclose(computed, expected, rtol=0, atol=1e-5)
+
+
+ROUTE = [[0.4, 0.0], [1.5, 0.0], [2.5, 0.7], [4.0, 0.8]]
+IN_A_TASK = """
+const [task, route, corridor, door] = arguments;
+const push = new Push({ law: "rps", task, route, corridor, door, lookahead: 1.6 });
+while (push.step()) {}
+const { twist } = push.sample;
+return [push.trial.steps, push.touched(), push.outcomes, [twist.v_x, twist.v_y, twist.omega]];
+"""
+
+
+@pytest.mark.parametrize(
+    ("kind", "width", "door", "touched"),
+    [
+        ("corridor", 1.0, 0.9, "base"),
+        pytest.param("corridor", 1.8, 0.9, "", marks=pytest.mark.slow),
+        pytest.param("path", 2, 1, "", marks=pytest.mark.slow),
+    ],
+)
+def test_a_task_has_the_outcomes_of_python(kind, width, door, touched, browser):
+    task = {"kind": kind, "waypoints": ROUTE, "lookahead": 1.6}
+    if kind == "corridor":
+        task |= {"width": width, "doors": 1, "door_width": door}
+    with python_push("rps", task=task) as live:
+        expected, steps = live.outcome, int(live.past[-1].trial.steps)
+        last = np.stack(live.past[-1].snapshot.twist)
+    count, who, outcomes, twist = browser.execute_script(IN_A_TASK, kind, ROUTE, width, door)
+    assert (who, bool(expected.success)) == (touched, not touched)
+    assert abs(count - steps) <= 1
+    np.testing.assert_allclose(twist, last, atol=1e-6)
+    assert set(outcomes) == set(expected.task)
+    for name, value in expected.task.items():
+        computed = np.nan if outcomes[name] is None else outcomes[name]
+        np.testing.assert_allclose(computed, value, atol=1e-6, err_msg=name)
+
+
+def drawn(browser, points):
+    """Draw a line through points [m] with the mouse; return the waypoints and the status."""
+    browser.execute_script("by('draw').click(); drawScene(0); scene.scrollIntoView()")
+    at = (
+        "return arguments[0].map((p) => toScreen(v, p)).map(([x, y]) => [x - v.w / 2, y - v.h / 2])"
+    )
+    pixels = np.round(browser.execute_script(at, points)).astype(int).tolist()
+    mouse = ActionChains(browser, duration=0)
+    mouse.move_to_element_with_offset(browser.find_element(By.ID, "scene"), *pixels[0])
+    mouse.click_and_hold()
+    for (x, y), (next_x, next_y) in itertools.pairwise(pixels):
+        mouse.move_by_offset(next_x - x, next_y - y)
+    mouse.release().perform()
+    return browser.execute_script("return [by('json').value, push.fault]")
+
+
+def test_a_drawn_path_is_a_task_of_the_command_line(paused, tmp_path):
+    x = np.linspace(0.4, 5, 60)
+    line = np.column_stack([x, 0.9 * np.sin(1.5 * x - 0.6)]).tolist()
+    # A pixel is 1 to 2 cm. The turns of a corridor leave room for its corners.
+    for kind, task, tolerance in (("path", "path", 0.05), ("corridor", "corridor,width=1.6", 0.45)):
+        paused.execute_script("by('task').value = arguments[0]; choose()", kind)
+        text, fault = drawn(paused, line)
+        assert not fault
+        (tmp_path / "path.json").write_text(text)
+        case = Case(task=f"{task},{tmp_path / 'path.json'}")
+        points = case.challenge.waypoints
+        assert points == tuple(map(tuple, json.loads(text)["waypoints"]))
+        assert 2 < len(points) <= MAKE["NUM_VERTICES"]
+        for p in line:
+            assert LineString(points).distance(Point(p)) < tolerance
+
+
+BAD_DRAWINGS = {
+    "path starts inside the robot: start it at the front of the base, (0.36, 0.00) m.": [
+        [0.1, 0.1], [2, 0],
+    ],
+    "start it within 0.5 m of the base's front": [[2, 2], [3, 2]],
+    "draw at least 0.5 m.": [[0.5, 0], [0.6, 0]],
+    "draw wider turns, or narrow the corridor.": [[0.5, 0], [3, 0], [1, 1]],
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("sentence", BAD_DRAWINGS)
+def test_a_bad_drawing_gets_one_sentence(sentence, paused):
+    paused.execute_script("by('task').value = 'corridor'; choose()")
+    text, fault = drawn(paused, BAD_DRAWINGS[sentence])
+    assert text == ""
+    assert sentence in fault
+    assert fault.count(". ") == 0
+    assert not paused.execute_script("return push.step()")
+
+
+def test_a_corridor_that_is_too_narrow_is_refused(paused):
+    script = """
+    push.options.corridor = arguments[0]; by("task").value = "corridor"; choose();
+    return [push.fault, push.step()];
+    """
+    fault, stepped = paused.execute_script(script, 0.55)
+    assert fault == "A wall crosses the base at the start: widen the corridor."
+    assert not stepped
+    assert paused.execute_script(script, 1.6) == ["", True]
 
 
 @pytest.mark.parametrize("law", ["rps", pytest.param("learned_gru", marks=pytest.mark.slow)])
@@ -143,10 +248,11 @@ return [[x, y], [a, b]].map(of).every(([p, q]) => p > 0 && p < v.w && q > 0 && q
 
 @pytest.fixture
 def paused(browser):
-    """The page with a new push that is paused."""
-    browser.execute_script("if (playing) by('play').click(); by('restart').click()")
+    """The page with a new push to a target that is paused."""
+    reset = "Object.assign(push.options, { drawn: null, route: ROUTES[0], corridor: 1.6 });"
+    browser.execute_script(reset + "by('task').value = 'reach'; choose(); play(false)")
     yield browser
-    browser.execute_script("by('play').click()")
+    browser.execute_script("by('task').value = 'reach'; choose()")
 
 
 def test_the_view_follows_the_push_wherever_a_user_looks(paused):

@@ -26,6 +26,7 @@ from rps_jax.app import gate, viewer
 from rps_jax.control import learned
 from rps_jax.errors import InputError
 from rps_jax.trials import pushes
+from rps_jax.trials.setting import Setting
 from rps_jax.trials.stepper import Live
 from rps_jax.trials.trial import Rules
 
@@ -233,6 +234,20 @@ def test_the_page_plays_a_push_and_shows_errors(page, browser):
     until(lambda: page.request.friction == "S3")
     button(browser, "Push").click()
     until(lambda: "unknown friction set 'S3': choose from S1, S2." in text())
+
+
+def test_the_panel_of_a_task_has_progress_and_touch(page):
+    waypoints = [[0.4, 0.0], [2.0, 0.0], [3.2, 1.2]]
+    task = {"kind": "corridor", "waypoints": waypoints, "width": 0.9, "lookahead": 3}
+    setting = Setting("quasistatic", rules=Rules(horizon=60.0))
+    live = viewer.View(task=task, setting=setting).push_of(REQUEST._replace(target=(-2, 0))).live
+    live.step(100)
+    page._cursor = 99.0
+    assert "% of the path, 0.01 m off it in the mean, line contact" in page._state_text(live)
+    live.step(3000)
+    page._cursor = float(len(live.past) - 1)
+    assert page._state_text(live).endswith("**not reached**, touched a wall")
+    assert live.lines["walls"].shape == (4, 2, 2)
 
 
 # --- access control ------------------------------------------------------------------------

@@ -27,6 +27,7 @@ from rps_jax.control.learned import features
 from rps_jax.control.observation import TaxelObservation, Twist
 from rps_jax.engines import quasistatic
 from rps_jax.engines.base import ControlPeriod
+from rps_jax.geometry.polyline import Polyline
 from rps_jax.lowering import js
 from rps_jax.lowering.routine import Group, Routine, fields_of, identifier, routine
 from rps_jax.robot.robot import Robot
@@ -36,8 +37,11 @@ from rps_jax.trials import pushes, trial
 from rps_jax.trials.case import Case
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import Rules
-from rps_jax.world import scene
+from rps_jax.world import draws, quantity, scene, tasks
 from rps_jax.world.scene import FRICTION
+from rps_jax.world.tasks import corridor, path, reach
+from rps_jax.world.tasks.base import CourseInputs
+from rps_jax.world.tasks.corridor import CorridorCourse
 
 HERE = Path(__file__).parent
 RECORDED = HERE / "recorded.json"
@@ -49,17 +53,42 @@ LAWS = {
     "learned_gru": "a network that learned from touch",
 }
 NUM_CORNERS = {"cylinder": 1, "prism": 6}  # by family; a box repeats two corners
+# Tasks of the page, with their names in words.
+TASKS = {
+    "reach": "reach the target",
+    "path": "follow a path",
+    "corridor": "follow a corridor",
+}
+NUM_VERTICES = 17  # of each path on the page
 ENDLESS = Rules(horizon=1e5, max_lost=1e5)
 SETTING = Setting("quasistatic", rules=ENDLESS)
 # Bounds of parameters of the robot and the task, for which a law has none.
 TASK = {"v_max": (0.01, 0.1), "omega_max": (0.03, 0.5), "d_success": (0.02, 0.2)}
-UNTRACED: dict[str, Any] = {"skin": None, "poses": None, "twists": None, "law_state": None}
+UNTRACED: dict[str, Any] = {
+    "skin": None,
+    "poses": None,
+    "twists": None,
+    "law_state": None,
+    "task": None,
+}
 
 
 class Arrival(NamedTuple):
     """The law parameter that the rules of a trial need."""
 
     d_success: Any = 0.05  # [m]
+
+
+class Route(NamedTuple):
+    """Path and corridor, as users choose them."""
+
+    vertices: Any  # (NUM_VERTICES, 2) [m]; the last may be repeated
+    lookahead: Any  # () [m]
+    width: Any  # () [m]
+    door: Any  # () [1] width of the door, of the corridor's
+
+
+ROUTE = Route(np.linspace((0.4, 0.0), (5.0, 0.0), NUM_VERTICES), *np.array([1.0, 1.6, 1.0]))
 
 
 class Outline(NamedTuple):
@@ -110,6 +139,36 @@ def _shapes(tree: Any) -> Any:
     return jax.tree.map(lambda x: jax.ShapeDtypeStruct(np.shape(x), jnp.asarray(x).dtype), tree)
 
 
+def course(kind: str, route: Route) -> Any:
+    """Return the course of a task along a route."""
+    line = Polyline.through(route.vertices[None])
+    follow = path.PathCourse(line, jnp.reshape(route.lookahead, 1))
+    half = jnp.reshape(route.width, 1) / 2
+    courses = {
+        "reach": lambda: reach.Nothing(),
+        "path": lambda: follow,
+        "corridor": lambda: CorridorCourse.around(follow, half, half * route.door, 1),
+    }
+    return jax.tree.map(lambda x: x[0], courses[kind]())
+
+
+def task_routines(kind: str) -> list[Routine]:
+    """Return the routines for course and outcomes of a task, and for the room of its corners."""
+    shapes = _shapes(ROUTE)
+    progress = _shapes(course(kind, ROUTE).start())
+
+    def spare(route: Route) -> Any:
+        return ({"length": corridor.spare(route.vertices[None], route.width / 2)[0]},)
+
+    return [
+        routine("spare", spare, {"route": shapes}, ["spare"]),
+        routine(f"course_{kind}", lambda r: (course(kind, r),), {"route": shapes}, ["course"]),
+        routine(
+            f"outcomes_{kind}", lambda p: (p.outcomes(),), {"progress": progress}, ["outcomes"]
+        ),
+    ]
+
+
 def world_of(family: str) -> tuple[Any, Any, Any]:
     """Return stage, world and trial of a family: the paper's, but for the number of corners."""
     case = Case("cylinder" if family == "cylinder" else "box", "S1", (-2.0, 0.0))
@@ -129,17 +188,19 @@ def family_routines(family: str) -> list[Routine]:
     stage, world, start = world_of(family)
     physics, n = SETTING.physics, NUM_CORNERS[family]
     constants = {name: getattr(world, name) for name in ("skin", "odometry", "key", "qpos")}
-    live = {**dict.fromkeys(constants), "fields": None}
+    live = {**dict.fromkeys(constants), "fields": None, "task": None}
     blank = {name: getattr(start, name) for name in UNTRACED}
 
-    def sense(world: Any, params: Any, state: Any) -> Any:
-        full = world._replace(**constants)
+    def sense(world: Any, params: Any, state: Any, course: Any, progress: Any) -> Any:
+        full = world._replace(**constants, task=course)
         loop = trial.ControlLoop(physics, SETTING.rules)
-        state, sensing = trial.observe(full, params, state._replace(**blank), loop)
+        state = state._replace(**blank | {"task": progress})
+        state, sensing = trial.observe(full, params, state, loop)
         outline = trial.outline(full, state.qpos)
         touch = sensing.observation._replace(in_contact=sensing.reading.contact_type != NONE)
         taxels = features.taxel_observation(touch, sensing.reading, full.skin, state.skin, outline)
-        return state._replace(**UNTRACED), taxels, {"contact_type": sensing.reading.contact_type}
+        contact = {"contact_type": sensing.reading.contact_type}
+        return state._replace(**UNTRACED), taxels, contact, state.task
 
     def drive(fields: Any, previous: Any, state: Any, twist: Any) -> Any:
         # Without noise the key is unused; JavaScript has no number for it.
@@ -158,12 +219,21 @@ def family_routines(family: str) -> list[Routine]:
         "params": _shapes(Arrival()),
         "trial": shape,
     }
+    courses = {kind: course(kind, ROUTE) for kind in TASKS}
     drive_shapes = {"fields": _shapes(world.fields), "previous": shape, "state": shape}
     return [
         routine(
             f"support_{family}", lambda o: (support(o),), {"outline": _shapes(outline)}, ["support"]
         ),
-        routine(f"sense_{family}", sense, sense_shapes, ["sensed", "observation", "reading"]),
+        *(
+            routine(
+                f"sense_{family}_{kind}",
+                sense,
+                {**sense_shapes, "course": _shapes(item), "progress": _shapes(item.start())},
+                ["sensed", "observation", "reading", "progress"],
+            )
+            for kind, item in courses.items()
+        ),
         routine(f"drive_{family}", drive, {**drive_shapes, "twist": _shapes(twist)}, ["trial"]),
     ]
 
@@ -205,6 +275,19 @@ def law_routines(name: str) -> tuple[list[Routine], dict[str, Any]]:
     return routines, {label: description}
 
 
+def values_of(tree: Any) -> dict[str, Any]:
+    """Return the numbers of a pytree by their names on the page."""
+    return {x.name: np.asarray(x.value).tolist() for x in fields_of(tree, values=tree)}
+
+
+def routes(count: int = 6) -> list[list[list[float]]]:
+    """Return the vertices of paths that the package draws."""
+    u = draws.by_name(draws.random_numbers(0, np.arange(count)))
+    front = np.full(count, float(Robot().half_length))
+    vertices = path.Path().vertices(CourseInputs(u, np.zeros((count, 2)), front)).round(3)
+    return [[p for p, q in zip(x, [None, *x], strict=False) if p != q] for x in vertices.tolist()]
+
+
 def scripts() -> str:
     """Return the generated JavaScript: functions, laws and constants of the first trial."""
     with jax.enable_x64(True):
@@ -212,25 +295,37 @@ def scripts() -> str:
         routines, laws = {}, {}
         for family in NUM_CORNERS:
             routines |= {item.name: item for item in family_routines(family)}
+        for kind in TASKS:
+            routines |= {item.name: item for item in task_routines(kind)}
         for name in LAWS:
             of_law, description = law_routines(name)
             routines |= {item.name: item for item in of_law}
             laws |= description
         functions = [js.function(name, item, tables) for name, item in routines.items()]
         start = world_of("prism")[2]._replace(**UNTRACED)
-    group = fields_of(start, values=start)
-    blank = {field.name: np.asarray(field.value).tolist() for field in group}
     base = Robot().shell
     taxels = np.asarray(base.taxels(2)).tolist()  # two points of each, a quarter from its ends
     constants = {
         "VERSION": __version__,
         "LAWS": laws,
-        "START": blank,
+        "START": values_of(start),
         "PERIOD": SETTING.physics.control_period,
         "BASE": [float(x) for x in base.half],
         "TAXELS": taxels,
         "FRICTION": {name: list(friction) for name, friction in FRICTION.items()},
         "GAP": Case().gap,
+        "TASKS": {
+            kind: {
+                "title": title,
+                "lookahead": getattr(tasks.TASKS[kind], "lookahead", path.Path.lookahead).low,
+                "start": values_of(course(kind, ROUTE).start()),
+            }
+            for kind, title in TASKS.items()
+        },
+        "ROUTES": routes(),
+        "NUM_VERTICES": NUM_VERTICES,
+        "NEAR": path.NEAR,
+        "SHORTEST": quantity.declared(path.Path)["length"].low,
         "RECORDED": json.loads(RECORDED.read_text("utf-8")),
     }
     lines = [f"const {name} = {js.text_of(value)};" for name, value in constants.items()]

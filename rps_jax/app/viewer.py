@@ -19,6 +19,8 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+import numpy as np
+
 from rps_jax import engines, errors
 from rps_jax.app.drawing import TARGET, Drawing, furnish
 from rps_jax.app.gate import HOST, Gate, accepts_update, check_guarded
@@ -34,7 +36,7 @@ from rps_jax.trials.case import Case, label_of
 from rps_jax.trials.progress import ProgressCallback
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.stepper import CHUNK, Live
-from rps_jax.world import objects
+from rps_jax.world import objects, tasks
 from rps_jax.world.scene import Scene
 
 if TYPE_CHECKING:
@@ -277,16 +279,19 @@ class Page:
 
     def _state_text(self, live: Live) -> str:
         index = int(self._cursor)
-        moment = live.past[index].snapshot
-        words = [
-            f"{index * live.period:.1f} s",
-            f"{float(moment.details.distance):.2f} m to the target",
-            _CONTACTS[int(moment.reading.contact_type)],
-        ]
+        moment, trial = live.past[index].snapshot, live.past[index].trial
+        task = live.outcome.task if self._is_over(live) else trial.task.outcomes()
+        way = f"{float(moment.details.distance):.2f} m to the target"
+        if "progress" in task:
+            error = float(np.nan_to_num(task["error_mean"]))
+            way = f"{float(task['progress']):.0%} of the path, {error:.2f} m off it in the mean"
+        contact = _CONTACTS[int(moment.reading.contact_type)]
+        words = [f"{index * live.period:.1f} s", way, contact]
         if moment.details.realigning:
             words.append("realigning")
         if self._is_over(live):
             words.append("**reached**" if live.outcome.success else "**not reached**")
+            words += tasks.failures_of(task)
         return ", ".join(words)
 
     def _is_over(self, live: Live) -> bool:

@@ -20,3 +20,8 @@ else:
 Scalar = float | Float[Array, ""]
 Number = float | Array | np.ndarray  # of one world, or of a batch, of any shape
 Entries = Any  # an array, or a tuple of numbers: one for each index of its last axis
+
+
+def namespace_of(array: Any) -> Any:
+    """Return NumPy or `jax.numpy`, to which an array belongs."""
+    return array.__array_namespace__()

@@ -6,11 +6,10 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 from rps_jax.geometry import footprint as fp
 from rps_jax.geometry import planar
-from rps_jax.geometry.arrays import Array, Float, Scalar
+from rps_jax.geometry.arrays import Array, Float, Scalar, namespace_of
 from rps_jax.geometry.footprint import Footprint
 
 
@@ -22,10 +21,11 @@ class Polyline(NamedTuple):
 
     @classmethod
     def through(cls, vertices: Any) -> Polyline:
-        """Return polylines through vertices (..., K, 2) [m], on the host."""
-        lengths = np.linalg.norm(np.diff(vertices, axis=-2), axis=-1)
-        zero = np.zeros_like(lengths[..., :1])
-        arcs: Any = np.concatenate([zero, np.cumsum(lengths, axis=-1)], axis=-1)
+        """Return polylines through vertices (..., K, 2) [m], as arrays of the same library."""
+        xp = namespace_of(vertices)
+        lengths = xp.linalg.norm(xp.diff(vertices, axis=-2), axis=-1)
+        zero = xp.zeros_like(lengths[..., :1])
+        arcs = xp.concatenate([zero, xp.cumsum(lengths, axis=-1)], axis=-1)
         return cls(vertices, arcs)
 
 

@@ -9,11 +9,13 @@ from collections.abc import Iterable, Mapping
 
 import numpy as np
 
-from rps_jax.lowering.nodes import Node
+from rps_jax.lowering.nodes import Array, Node, SimdNodes
 from rps_jax.lowering.operations import spelled
 from rps_jax.lowering.routine import Group, Routine
+from rps_jax.lowering.scalar_nodes import ScalarNodes
 from rps_jax.lowering.scalar_writer import ScalarWriter
 
+_LISTED = 12  # elements of an array that is printed as a list, at most
 HELPERS = """\
 const finite = (x) => (Array.isArray(x) ? x.every(finite) : Number.isFinite(Number(x)));
 const nan = (x) => (Array.isArray(x) ? x.some(nan) : Number.isNaN(Number(x)));
@@ -57,15 +59,45 @@ class JsWriter(ScalarWriter):
         return f'const {name} = unpacked("{packed}", {kind}, {len(array)});'
 
 
-def statements(routine: Routine, groups: Mapping[str, str], tables: dict[str, str]) -> str:
+class _LoopNodes(ScalarNodes):
+    """Target whose loops may run until a condition fails: a page has no deadline."""
+
+    while_loop = SimdNodes.while_loop
+
+
+class PageWriter(JsWriter):
+    """Printer of a routine of a page."""
+
+    nodes = _LoopNodes
+    leave = "if (!goes) break;"
+
+    def single(self, node: Node) -> list[str]:
+        """Return the statements of a node; many numbers of one array are picked by a table."""
+        views = [a for a in node.args if isinstance(a, Array)]
+        sources = {view.node for view in views}
+        if node.op != "move" or not _LISTED < node.size == len(views) or len(sources) > 1:
+            return super().single(node)
+        first = min(view.first for view in views)
+        table = self.table(np.array([view.first - first for view in views]))
+        item = self.item(views[0].node, f"k + {first}" if first else "k")
+        return [f"const {node.name} = {table}.map((k) => {item});"]
+
+
+def statements(
+    routine: Routine,
+    groups: Mapping[str, str],
+    tables: dict[str, str],
+    printer: type[JsWriter] = JsWriter,
+) -> str:
     """Return the statements that compute the results of a routine, as named constants.
 
     Args:
       routine: the function.
       groups: text before the names of the fields of each input group, as `params.`.
       tables: declarations of constants, to which those of the routine are added.
+      printer: class that prints the routine.
     """
-    writer = JsWriter(routine, groups, tables)
+    writer = printer(routine, groups, tables)
     lines = list(writer.body)
     for group, field, value in writer.outputs:
         names = [writer.operand(value, i) for i in range(field.size)]
@@ -75,8 +107,9 @@ def statements(routine: Routine, groups: Mapping[str, str], tables: dict[str, st
 
 
 def function(name: str, routine: Routine, tables: dict[str, str]) -> str:
-    """Return a routine as a function of its groups of fields."""
-    lines = statements(routine, {group: f"{group}." for group in routine.inputs}, tables)
+    """Return a routine of a page as a function of its groups of fields."""
+    groups = {group: f"{group}." for group in routine.inputs}
+    lines = statements(routine, groups, tables, PageWriter)
     results = ", ".join(f"{group}: {object_of(group, routine.outputs)}"
                         for group in routine.outputs)  # fmt: skip
     head = f"function {name}({', '.join(routine.inputs)}) {{"

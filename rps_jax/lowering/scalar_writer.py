@@ -26,6 +26,7 @@ class ScalarWriter(Writer):
     alias: ClassVar[str]  # declaration of a flattened input array
     zeros: ClassVar[str]  # array of zeros of a size
     pointer: ClassVar[str] = ""  # mark of a pointer in a declaration
+    nodes: ClassVar[type[ScalarNodes]] = ScalarNodes
 
     def __init__(
         self, routine: Routine, groups: Mapping[str, str], tables: dict[str, str], prefix: str = ""
@@ -43,7 +44,7 @@ class ScalarWriter(Writer):
         fields = [(groups[group], x) for group, fields in routine.inputs.items() for x in fields]
         self._inputs = [(f"{text}{field.name}", field) for text, field in fields]
         outputs = [(group, x) for group, fields in routine.outputs.items() for x in fields]
-        target = ScalarNodes(self.spelling)
+        target = self.nodes(self.spelling)
         values, roots = results(
             routine.jaxpr, [x.type for _, x in fields], [x.type for _, x in outputs], target
         )

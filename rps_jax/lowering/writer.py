@@ -58,6 +58,7 @@ class Writer:
     """Printer of nodes as statements, in an order in which few loops are needed."""
 
     index = "int"  # type of a loop's index
+    leave = "if (!any(goes)) break;"  # of a loop, when no lane goes on
     prefix = ""  # of all names
 
     def __init__(self) -> None:
@@ -223,7 +224,7 @@ class Writer:
             condition = [n for n in reached([loop.condition.node]) if n in loop.inner]
             body += self.lines(condition, loop.inner, computed)
             holds = f"{self.declaration('b', 'goes')} = {self.value(loop.condition, 'b', 1)};"
-            body += self.statement([holds, "if (!any(goes)) break;"])
+            body += self.statement([holds, self.leave])
             computed |= set(condition)
             rest = [n for n in loop.inner if n not in set(condition)]
         body += self.lines(rest, results, computed)

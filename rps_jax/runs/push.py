@@ -82,9 +82,7 @@ class Trace(Trajectory):
         if outcome.diverged:
             cause = "the law returned NaN" if outcome.nan_twist else "the physics ran away"
             return f"diverged at {float(outcome.time):.2f} s, since {cause}"
-        failed = [
-            f", {text}" for name, text in tasks.FAILURES.items() if outcome.task.get(name, 0) > 0
-        ]
+        failed = [f", {text}" for text in tasks.failures_of(outcome.task)]
         return (
             f"target ({x:g}, {y:g}) m {'reached' if outcome.success else 'not reached'} at "
             f"{float(outcome.time):.1f} s, least distance {float(outcome.min_distance):.3f} m, "

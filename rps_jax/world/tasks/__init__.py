@@ -36,6 +36,11 @@ _FORMS = {bool: "true or false", int: "a whole number", 2: "pairs of x, y [m]", 
 TaskLike = Task | str | Mapping[str, Any]  # or its text: see `parse_task`
 
 
+def failures_of(outcomes: Mapping[str, Any]) -> list[str]:
+    """Return in words how a task has failed, by the outcomes of one trial."""
+    return [text for name, text in FAILURES.items() if outcomes.get(name, 0) > 0]
+
+
 def parse_task(task: TaskLike) -> Task:
     """Return a task from its name, as path, or from a mapping with its kind.
 

@@ -19,7 +19,7 @@ import numpy as np
 from rps_jax import errors
 from rps_jax.geometry import footprint as fp
 from rps_jax.geometry import planar, polyline
-from rps_jax.geometry.arrays import Array, Float, Int
+from rps_jax.geometry.arrays import Array, Entries, Float, Int, namespace_of
 from rps_jax.geometry.polyline import Polyline
 from rps_jax.record.options import option
 from rps_jax.robot.shell import Shell
@@ -66,6 +66,16 @@ class CorridorCourse(NamedTuple):
     walls: Float[Array, "*B W 2 2"]  # [m] both ends of each
     # Of an object that may touch walls: fields of `scene.Surroundings`.
     surroundings: dict[str, Any] | None = None
+
+    @classmethod
+    def around(
+        cls, path: PathCourse, half: Entries, opening: Entries, doors: int
+    ) -> CorridorCourse:
+        """Return corridors (n, ...) of a half width [m], with doors of half width `opening`."""
+        xp = namespace_of(path.line.vertices)
+        shares = [(i + 1) / (doors + 1) for i in range(doors)]
+        walls = [_door(path.line, share, opening, 1.5 * half) for share in shares]
+        return cls(path, xp.concatenate([_walls(path.line.vertices, half), *walls], axis=1))
 
     def start(self) -> CorridorProgress:
         """Return the progress at the start."""
@@ -168,11 +178,7 @@ class Corridor(Path):
         need = self.width.high * np.tan(self.turn_angle.high / 2) if self.turns.high else 0.0
         part = self.length.low / (self.turns.high + 1)
         if self.waypoints:
-            turns = np.abs(turns_of(self.route()[None])[0])
-            room = np.append(0, self.width.high / 2 * np.tan(turns / 2))
-            lengths = np.linalg.norm(np.diff(self.route(), axis=0), axis=1)
-            short = lengths - room - np.append(room[1:], 0)
-            need, part = 0.0, float(short.min())
+            need, part = 0.0, float(spare(self.route()[None], self.width.high / 2)[0])
         if part < need:
             rule = "it must leave room for its corners: give fewer or smaller turns, longer parts"
             raise errors.not_allowed("task width (high)", f"{self.width.high:g} m", rule)
@@ -200,34 +206,40 @@ class Corridor(Path):
         """Return the ends, paths and walls of worlds."""
         targets, inner = super().courses(inputs)
         half = self.width.at(inputs.u["width"]) / 2
-        vertices = np.asarray(inner.line.vertices)
-        walls = _walls(vertices, half)
         opening = half * self.door_width.at(inputs.u["door_width"])
-        doors = [
-            _door(inner.line, (i + 1) / (self.doors + 1), opening, 1.5 * half)
-            for i in range(self.doors)
-        ]
-        joined: Any = np.concatenate([walls, *doors], axis=1)
-        around = None
+        course = CorridorCourse.around(inner, half, opening, self.doors)
         if self.touch == "object":
             friction = np.full(len(half), max(self.friction_wall, 1e-5))  # MuJoCo's least
-            smooth = np.concatenate([_without_edges(walls, vertices), *doors], axis=1)
-            around = {"walls": smooth, "friction_wall": friction}
-        return targets, CorridorCourse(inner, joined, around)
+            vertices = np.asarray(inner.line.vertices)
+            walls, doors = np.split(course.walls, [2 * vertices.shape[1] - 2], axis=1)
+            smooth = _without_edges(walls, vertices)
+            around = {"walls": np.concatenate([smooth, doors], axis=1), "friction_wall": friction}
+            course = course._replace(surroundings=around)
+        return targets, course
 
 
-def _walls(vertices: np.ndarray, half: np.ndarray) -> np.ndarray:
+def spare(vertices: Entries, half: Entries) -> Entries:
+    """Return the least length (n,) [m] of paths (n, N, 2) that corners of a half width leave."""
+    xp = namespace_of(vertices)
+    room = half * xp.tan(xp.abs(turns_of(vertices)) / 2)
+    none = xp.zeros_like(room[:, :1])
+    lengths = xp.linalg.norm(xp.diff(vertices, axis=1), axis=-1)
+    used = xp.concatenate([none, room], axis=1), xp.concatenate([room, none], axis=1)
+    return xp.min(lengths - used[0] - used[1], axis=1)
+
+
+def _walls(vertices: Entries, half: Entries) -> Entries:
     """Return the walls (n, W, 2, 2) [m] beside paths (n, N, 2) at a half width (n,) [m]."""
-    units = units_of(vertices)
-    points = vertices.copy()
-    points[:, 0] -= _BEHIND * units[:, 0]
-    points[:, -1] += _BEYOND * units[:, -1]
-    normals = np.stack([-units[..., 1], units[..., 0]], axis=-1)
-    previous = np.concatenate([normals[:, :1], normals], axis=1)
-    following = np.concatenate([normals, normals[:, -1:]], axis=1)
-    mitre = (previous + following) / (1 + np.sum(previous * following, axis=-1, keepdims=True))
+    units, xp = units_of(vertices), namespace_of(vertices)
+    first = vertices[:, :1] - _BEHIND * units[:, :1]
+    last = vertices[:, -1:] + _BEYOND * units[:, -1:]
+    points = xp.concatenate([first, vertices[:, 1:-1], last], axis=1)
+    normals = xp.stack([-units[..., 1], units[..., 0]], axis=-1)
+    previous = xp.concatenate([normals[:, :1], normals], axis=1)
+    following = xp.concatenate([normals, normals[:, -1:]], axis=1)
+    mitre = (previous + following) / (1 + xp.sum(previous * following, axis=-1, keepdims=True))
     sides = [points + sign * half[:, None, None] * mitre for sign in (1, -1)]
-    return np.concatenate([np.stack([s[:, :-1], s[:, 1:]], axis=2) for s in sides], axis=1)
+    return xp.concatenate([xp.stack([s[:, :-1], s[:, 1:]], axis=2) for s in sides], axis=1)
 
 
 def _without_edges(walls: np.ndarray, vertices: np.ndarray) -> np.ndarray:
@@ -250,19 +262,19 @@ def _without_edges(walls: np.ndarray, vertices: np.ndarray) -> np.ndarray:
     return sides.reshape(walls.shape)
 
 
-def _door(line: Polyline, share: float, inner: np.ndarray, outer: np.ndarray) -> np.ndarray:
+def _door(line: Polyline, share: float, inner: Entries, outer: Entries) -> Entries:
     """Return two walls (n, 2, 2, 2) [m] across paths, in the middle of the segment at a share.
 
     They leave an opening of half width `inner` (n,) [m], and end at `outer` (n,) [m].
     """
-    vertices, arcs = np.asarray(line.vertices), np.asarray(line.arcs)
+    vertices, arcs, xp = line.vertices, line.arcs, namespace_of(line.vertices)
     passed = arcs[:, 1:] <= share * arcs[:, -1:]
-    rows, first = np.arange(len(passed)), np.minimum(passed.sum(axis=1), passed.shape[1] - 1)
+    rows, first = np.arange(len(passed)), xp.minimum(passed.sum(axis=1), passed.shape[1] - 1)
     a, b = vertices[rows, first], vertices[rows, first + 1]
     unit = units_of(vertices)[rows, first]
-    normal = np.stack([-unit[:, 1], unit[:, 0]], axis=-1)
+    normal = xp.stack([-unit[:, 1], unit[:, 0]], axis=-1)
     jambs = [(a + b) / 2 + s * x[:, None] * normal for s in (1, -1) for x in (inner, outer)]
-    return np.stack([np.stack(jambs[:2], axis=1), np.stack(jambs[2:], axis=1)], axis=1)
+    return xp.stack([xp.stack(jambs[:2], axis=1), xp.stack(jambs[2:], axis=1)], axis=1)
 
 
 TASK = Corridor

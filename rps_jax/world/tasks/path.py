@@ -16,7 +16,7 @@ from scipy.interpolate import CubicSpline
 
 from rps_jax import errors
 from rps_jax.geometry import polyline
-from rps_jax.geometry.arrays import Array, Float, Int
+from rps_jax.geometry.arrays import Array, Entries, Float, Int, namespace_of
 from rps_jax.geometry.polyline import Polyline
 from rps_jax.robot.shell import Shell
 from rps_jax.world.quantity import Range, drawn
@@ -29,7 +29,7 @@ _REACH = 1.0  # [m] along the path, either way, in which the nearest point is so
 _END = 0.5  # [m] before the end, from which on a trial may succeed
 _LEAD = 1.5  # [m] of a drawn path before its first turn, at least
 _MIN_SPACING = "consecutive waypoints must be at least 1 cm apart"
-_NEAR = 0.5  # [m] between the base's front and the first waypoint, at most
+NEAR = 0.5  # [m] between the base's front and the first waypoint, at most
 # [m] upper ends of the classes of a histogram of errors; the last is open.
 _EDGES = np.append(0.0025 * 1.5 ** np.arange(15), np.inf)
 
@@ -191,8 +191,8 @@ class Path(Following):
         """Raise InputError for waypoints that start away from the base's front."""
         front = float(shell.half[0])
         x, y = self.waypoints[0] if self.waypoints else (front, 0.0)
-        if np.hypot(x - front, y) > _NEAR:
-            rule = f"they must start within {_NEAR} m of the base's front, ({front:.2f}, 0) m"
+        if np.hypot(x - front, y) > NEAR:
+            rule = f"they must start within {NEAR} m of the base's front, ({front:.2f}, 0) m"
             raise errors.not_allowed("task waypoints", (x, y), rule)
 
     def route(self) -> np.ndarray:
@@ -230,20 +230,22 @@ class Path(Following):
         return np.concatenate([start, start + np.cumsum(steps, axis=1)], axis=1)
 
 
-def units_of(vertices: np.ndarray) -> np.ndarray:
+def units_of(vertices: Entries) -> Entries:
     """Return the directions (n, N - 1, 2) of paths (n, N, 2); of no length, the one before."""
-    steps = np.diff(vertices, axis=1)
-    lengths = np.linalg.norm(steps, axis=-1, keepdims=True)
-    last = np.where(lengths > 0, np.arange(steps.shape[1])[:, None], 0)
-    last = np.maximum.accumulate(last, axis=1)
-    return np.take_along_axis(steps / np.where(lengths > 0, lengths, 1.0), last, axis=1)
+    xp = namespace_of(vertices)
+    steps = xp.diff(vertices, axis=1)
+    lengths = xp.linalg.norm(steps, axis=-1)
+    last = xp.where(lengths > 0, np.arange(steps.shape[1]), 0)
+    last = xp.maximum.accumulate(last, axis=1)
+    units = steps / xp.where(lengths > 0, lengths, 1.0)[..., None]
+    return units[np.arange(len(units))[:, None], last]
 
 
-def turns_of(vertices: np.ndarray) -> np.ndarray:
+def turns_of(vertices: Entries) -> Entries:
     """Return the angles (n, N - 2) [rad] by which paths (n, N, 2) turn, positive to the left."""
-    units = units_of(vertices)
-    x, y = np.moveaxis(units[:, :-1], -1, 0), np.moveaxis(units[:, 1:], -1, 0)
-    return np.arctan2(x[0] * y[1] - x[1] * y[0], x[0] * y[0] + x[1] * y[1])
+    units, xp = units_of(vertices), namespace_of(vertices)
+    x, y = xp.moveaxis(units[:, :-1], -1, 0), xp.moveaxis(units[:, 1:], -1, 0)
+    return xp.arctan2(x[0] * y[1] - x[1] * y[0], x[0] * y[0] + x[1] * y[1])
 
 
 TASK = Path
