@@ -45,7 +45,7 @@ TABS: dict[str, list[Any]] = {
     ],
     "Tutorials": [
         *("notebooks/README.md", "notebooks/07_custom_law.md", "notebooks/08_analysis.md"),
-        "notebooks/09_gymnasium.md",
+        *("notebooks/09_gymnasium.md", "notebooks/11_rooms.md"),
     ],
     "The law": ["rps_jax/law.md", "notebooks/01_the_law.md", "notebooks/02_one_push.md"],
     "The paper": [
