@@ -50,7 +50,7 @@ class Body(NamedTuple):
     gravity: Entries = None  # (3,) [m/s^2] of a floor that is not level
     # (4,) unit normal of a line, its distance [m], and the factor [1] of the friction beyond it
     boundary: Entries = None
-    walls: Entries = None  # (W, 4) [m] x, y, x, y of both ends; None: the object touches none
+    walls: Entries = None  # (W, 4) [m] x, y, x, y of both ends; later a list of `Wall`, or None
     friction_wall: Number | None = None  # () [1]
 
 

@@ -9,7 +9,6 @@ a compiler can keep a whole world in registers.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -24,7 +23,6 @@ from rps_jax.engines.fused.contacts import (
     Corners,
     DrivenBase,
     State,
-    Wall,
     nearest_walls,
     on_base,
     on_ground,
@@ -99,17 +97,15 @@ def step(
     physics: Physics,
     robot: Robot | None = None,
     solution: list[Vec] | None = None,
-    walls: Sequence[Wall] = (),
 ) -> State:
     """Compute one step of MuJoCo's semi-implicit Euler rule with the base at `twist`.
 
     A `robot` with a limited force is pushed towards it. `twist` [m/s, m/s, rad/s] is in the base's
-    frame. The derivatives of a step whose accelerations are known need no solver: `solution`. The
-    object may touch `walls`.
+    frame. The derivatives of a step whose accelerations are known need no solver: `solution`.
     """
     m, dt, driven = sp.matrix(state.q), physics.timestep, state.driven
     contacts = [on_ground(body, state, m, physics), on_base(body, state, m, twist, physics)]
-    contacts += [on_wall(body, state, m, wall, physics) for wall in walls]
+    contacts += [on_wall(body, state, m, wall, physics) for wall in body.walls or ()]
     turn = jnp.cos(state.base[2]), jnp.sin(state.base[2])
     base = Base()
     if robot is not None and driven is not None:
@@ -183,15 +179,15 @@ def _drive(
     scalars = spread(body)
 
     start = enter(body, motion, robot, force)
-    walls: Sequence[Wall] = ()
     if scalars.walls is not None:
         corners = _split(jnp.moveaxis(body.vertices, -2, 0))
-        walls = nearest_walls(scalars.walls, start.p, start.q, corners)
+        near = nearest_walls(scalars.walls, start.p, start.q, corners)
+        scalars = scalars._replace(walls=near)
 
     # Derivatives compute each step again, without its solver.
     @partial(jax.checkpoint, prevent_cse=False, policy=_SAVED)
     def next_state(state: State, solution: list[Vec] | None = None) -> State:
-        return step(scalars, state, twist, physics, robot, solution, walls)
+        return step(scalars, state, twist, physics, robot, solution)
 
     def solve(state: State, solution: list[Vec] | None) -> tuple[State, list[Vec]]:
         state = next_state(state, solution)
