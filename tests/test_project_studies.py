@@ -26,7 +26,7 @@ OUT_OF_BOUNDS = [
     *("landscape --candidates 1", "speed --worlds 0", "speed --at-once 0"),
     *("levers --worlds 1", "levers --simulated nan", "paper_reading --draws 1"),
     *("real_pushes --mujoco -1", "fit --logs 1", "fit/bags.py --logs 0", "fit/methods.py --logs 1"),
-    "export --inputs 0",
+    *("export --inputs 0", "real_pushes/fit.py --few 5"),
 ]
 UNKNOWN = [
     *("gradients --objects box", "gradients --estimators backward", "gradients --tuned v_max"),
@@ -34,7 +34,12 @@ UNKNOWN = [
     *("random_worlds --domains wyde", "random_worlds --laws none", "export --laws nune"),
     *("speed --names fast", "speed/costs.py --names mjx", "levers --program mjx"),
     *("engines --objects cone", "engines --engines fast", "fidelity --conditions fine"),
-    *("ambiguities --readings none", "real_pushes --models rigid", "planning --methods newton"),
+    *(
+        "ambiguities --readings none",
+        "real_pushes --models rigid",
+        "real_pushes/fit.py --groups flat",
+        "planning --methods newton",
+    ),
 ]
 REFUSED = [
     ("gradients --horizons 2 1", r"horizons = \(2\.0, 1\.0\) is not allowed"),
@@ -159,7 +164,7 @@ def test_a_digest_changes_with_laws_domains_and_options():
 # Studies that measure this machine, have another ground or none, or read run folders.
 WITHOUT_PRESETS = (
     *("speed", "levers", "publish", "force_push_grid"),
-    *("gradients/mjx.py", "corridors/costs.py"),
+    *("gradients/mjx.py", "corridors/costs.py", "real_pushes/fit.py"),
 )
 WITH_THE_PAPERS_LAW = ("ambiguities", "fidelity", "gradients", "paper_reading")
 

@@ -102,7 +102,7 @@ class Methods(FitStudy):
             for method in METHODS
         ]
         result = xr.concat(kinds, xr.IndexVariable("estimator", list(METHODS)), join="outer")
-        return xr.merge([result, simulation])
+        return xr.merge([result, simulation]).drop_encoding()  # integers of parts, now with NaN
 
     @property
     def _parts(self) -> dict[str, range]:

@@ -316,7 +316,7 @@ RECIPES: dict[str, Recipe] = {
         recipe(f"rps sweeps/fit {_MACHINE}", cores=15),
     ),
     "fit_bags": recipe(f"rps sweeps/fit/bags.py {_MACHINE}", cores=5),
-    "fit_methods*": recipe(f"rps sweeps/fit/methods.py {_MACHINE}", cores=50, gpu=7),
+    "fit_methods*": recipe(f"rps sweeps/fit/methods.py {_MACHINE}", cores=25),
     "fit_real*": recipe(f"rps sweeps/real_pushes/fit.py {_MACHINE}", cores=12),
     "export_*": recipe(
         f"rps sweeps/export --tables speed {_MACHINE}",

@@ -66,7 +66,7 @@ def learn(cell: Cell, worlds: int) -> Fitted:
     """Return mean and covariance of the posterior of `rps fit`, with pushes as a log."""
     rng = np.random.default_rng(0)
     u = rng.random((worlds, 4))
-    r = cell.residuals(np.concatenate([cell.simulate(world(x))[0] for x in np.split(u, 8)]))
+    r = cell.residuals(np.concatenate([cell.simulate(world(x))[0] for x in np.array_split(u, 8)]))
     noise = rng.standard_normal((worlds, _NOISE, *r.shape[1:])) * np.isfinite(cell.measured)
     statistics = (r[:, None] + noise).reshape(worlds, _NOISE, -1)
     networks = posterior.train(u, statistics, 0)
@@ -155,11 +155,11 @@ class Real(QuickStudy[xr.Dataset]):
     few: int = option(12, 6, 1000)
     """Greatest number of pushes of each half of a cell."""
     worlds: int = option(512, 32, 100_000)
-    """Number of simulated worlds from which the networks learn, a multiple of 8."""
+    """Number of simulated worlds from which the networks learn."""
     cells: int = option(100, 1, 100)
     """Greatest number of cells."""
     groups: tuple[str, ...] = GROUPS[:2]
-    """Groups of pushes; a flat object stands on many points and takes ten times as long."""
+    """Groups of pushes; a flat object stands on many points and takes several times as long."""
 
     @cached_property
     def tables(self) -> dict[str, pd.DataFrame]:
