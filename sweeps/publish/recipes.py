@@ -265,6 +265,9 @@ RECIPES: dict[str, Recipe] = {
         gpu=10,
         section=rows.default_beside_tuned,
     ),
+    "round_base": recipe(
+        "rps sweeps/round_base --worlds 500", cores=10, section="Flat against round"
+    ),
     "corridors_*": recipe(
         "rps sweeps/corridors --laws rps rps_tuned rps_plus learned_gru force_push dipole aps "
         f"rps_tuned,sweeps/corridors/tuned.json {_MACHINE}",
