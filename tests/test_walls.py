@@ -12,6 +12,7 @@ import rps_jax
 from rps_jax import engines
 from rps_jax.engines.base import Motion
 from rps_jax.errors import InputError
+from rps_jax.geometry import footprint
 from rps_jax.geometry import solid as solids
 from rps_jax.geometry.solid import Solid
 from rps_jax.trials import worlds
@@ -20,7 +21,8 @@ from rps_jax.world import draws
 from rps_jax.world.domain import parse_domain
 from rps_jax.world.physics import Physics, preset
 from rps_jax.world.scene import Surroundings
-from rps_jax.world.tasks import parse_task
+from rps_jax.world.tasks import corridor, parse_task
+from rps_jax.world.tasks.base import Positions
 
 STANDARD, REFERENCE = preset(), preset("default", "reference")
 Y = 0.22  # [m] of a straight wall, 2 cm beside the object
@@ -155,3 +157,29 @@ def test_walls_of_a_corridor_have_no_inner_ends():
             for start, end in row[mask]:
                 assert np.abs(drawn - start).sum(axis=-1).min() < 0.02
                 assert np.abs(drawn - end).sum(axis=-1).min() < 0.02
+
+
+@pytest.mark.parametrize(
+    ("touch", "depth", "expected"),
+    [
+        ("object", 0.008, corridor.NOTHING),
+        ("object", 0.012, corridor.OBJECT),
+        ("nothing", 0.001, corridor.OBJECT),
+        ("nothing", -0.001, corridor.NOTHING),
+    ],
+)
+def test_a_trial_fails_where_an_object_is_pressed_into_a_wall(touch, depth, expected):
+    task = f"corridor,touch={touch},turns=0,width=1.4,length=6"
+    drawn = rps_jax.draw_worlds("wide,objects=random_box", 1, task=task).worlds
+    course = jax.tree.map(lambda x: jnp.asarray(x[0], float), drawn.task)
+    box = footprint.rectangle(0.2, 0.2)
+    at = jnp.array([1.2, 0.7 - 0.2 + depth])
+    zero = jnp.zeros(())
+    positions = Positions(
+        at, at, zero > 0, jnp.zeros(3), footprint.rectangle(0.36, 0.29), at, zero, box
+    )
+    progress, aim = course.step(course.start(), positions)
+    assert progress.wall_touch == expected
+    assert aim.failed == (expected != corridor.NOTHING)
+    positions = positions._replace(base=jnp.array([0.0, 0.45, 0.0]))
+    assert course.step(course.start(), positions)[0].wall_touch == corridor.BASE
