@@ -50,6 +50,7 @@ KINDS = (
     *("out of time", "diverged"),
 )
 _BORDERS = 0.1, 0.95  # [1] of the path, before and beyond which a failure is one of its ends
+_IN_TIME = 300.0  # [s] default horizon of trials
 _WHERE = ("in the first metre [%]", "in the last 0.5 m [%]")
 
 
@@ -184,8 +185,8 @@ class Corridors(Study[xr.DataTree], MultiLawQuestion[xr.DataTree]):
                   title="Failures"),
             Table(lookahead_table(choice), name="corridors_lookaheads",
                   title="Success in corridors by lookahead"),
-            Table(lookahead_table(paths), name="corridors_open",
-                  title="Success on paths by lookahead"),
+            Table(lookahead_table(paths, _IN_TIME), name="corridors_open",
+                  title="Success on paths within 300 s, by lookahead"),
             Table(error_table(paths), name="corridors_paths", merge="law",
                   title="Cross-track error on paths"),
         ]  # fmt: skip
@@ -220,15 +221,17 @@ def best_lookaheads(choice: xr.Dataset) -> dict[str, float]:
     }
 
 
-def lookahead_table(choice: xr.Dataset) -> Rows:
-    """Return a header and a row per law: its success by lookahead."""
+def lookahead_table(choice: xr.Dataset, horizon: float = math.inf) -> Rows:
+    """Return a header and a row per law: its success within a time [s] by lookahead."""
     started = _started(choice)
-    successes, worlds = _counts(started.success.values > 0, _lookahead_index(started))
+    in_time = (started.success.values > 0) & (started.time.values <= horizon)
+    successes, worlds = _counts(in_time, _lookahead_index(started))
     spans = [f"{a:.2g} to {b:.2g} m" for a, b in itertools.pairwise(LOOKAHEADS)]
     rows = [["law", *spans, "best"]]
     for law, by_lookahead in zip(map(str, choice.law.values), successes, strict=True):
         rates = [tables.share(int(k), int(n)) for k, n in zip(by_lookahead, worlds, strict=True)]
-        rows.append([law, *rates, f"{best_lookaheads(choice)[law]:g} m"])
+        best = CENTRES[np.argmax(by_lookahead / np.maximum(worlds, 1))]
+        rows.append([law, *rates, f"{best:.2g} m"])
     return rows
 
 
