@@ -40,6 +40,7 @@ ROWS = {
     "slope": Row("reach", "wide,slope=0:0.105"),
     "slope, limited base": Row("reach", "real,slope=0:0.105"),
     "boundary": Row("reach", "wide,boundary_factor=0.3:3,boundary=0.5"),
+    "walls that objects touch": Row("corridor,touch=object,width=1.2:1.6"),
     "round base": Row("corridor", robot="round"),
 }
 SETTINGS = {
