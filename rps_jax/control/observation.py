@@ -10,7 +10,7 @@ from typing import NamedTuple, TypeVar
 import jax.numpy as jnp
 
 from rps_jax.geometry import planar
-from rps_jax.geometry.arrays import Array, Bool, Float, Scalar
+from rps_jax.geometry.arrays import Array, Bool, Float, Number, Scalar
 
 # Displacements are clipped to this distance [m], so that no finite float32 overflows.
 _WORLD_SIZE = 1e9
@@ -25,14 +25,15 @@ class Observation(NamedTuple):
     in_contact: Bool[Array, ""] | Float[Array, ""]  # for a smooth law also a weight from 0 to 1
     p_world_target: Float[Array, "2"]  # [m]
     period: Scalar = 0.02  # [s] since the last control step
-    base_radius: Scalar | None = None  # [m] of a round base; None: a rectangle
+    base_radius: Number | None = None  # [m] of a round base; None: a rectangle
 
     @property
     def l(self) -> Float[Array, "*B"]:  # noqa: E743
         """Contact offset [m] to the left: p^R_C,y, or the arc length from a round base's front."""
         if self.base_radius is None:
             return self.p_robot_contact[..., 1]
-        return self.base_radius * planar.direction(self.p_robot_contact)
+        bearing = planar.direction(self.p_robot_contact)
+        return jnp.asarray(self.base_radius, bearing.dtype) * bearing
 
 
 class TaxelObservation(NamedTuple):
@@ -64,7 +65,7 @@ AnyObservation = Observation | TaxelObservation | ForceObservation | PoseObserva
 Observed = TypeVar("Observed", bound=AnyObservation)
 
 
-def on_base(obs: Observed, radius: Scalar | None) -> Observed:
+def on_base(obs: Observed, radius: Number | None) -> Observed:
     """Return an observation on a round base of a radius [m]; None: on a rectangular one."""
     if isinstance(obs, Observation):
         return obs._replace(base_radius=radius)

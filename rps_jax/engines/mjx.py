@@ -160,7 +160,7 @@ class MJX(Engine):
         if inputs.solids.feet is not None:
             fields[OUTLINE] = inputs.solids.vertices
         around = {".opt.gravity": inputs.surroundings.slope, BOUNDARY: inputs.surroundings.boundary}
-        around[WALLS] = None if walls is None else walls.reshape(inputs.count, -1, 4)
+        around[WALLS] = None if walls is None else walls.reshape(inputs.num_worlds, -1, 4)
         fields |= {name: x for name, x in around.items() if x is not None}
         return MJXStage(put(template), mjx.make_data(template)), fields
 

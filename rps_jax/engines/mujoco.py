@@ -167,7 +167,7 @@ def compile_rows(
     Equal worlds share one.
     """
     leaves = [np.ascontiguousarray(x) for x in jax.tree.leaves(inputs.columns)]
-    keys = [b"".join(leaf[i].tobytes() for leaf in leaves) for i in range(inputs.count)]
+    keys = [b"".join(leaf[i].tobytes() for leaf in leaves) for i in range(inputs.num_worlds)]
     distinct = {key: i for i, key in enumerate(keys)}
 
     def compile_row(i: int) -> T:

@@ -243,7 +243,7 @@ class QuasistaticEngine(Engine):
 
     def stage(self, inputs: WorldInputs) -> tuple[Quasistatic, Slider]:
         """Return the stage, and the sliders (n, ...) of the worlds; bases follow every twist."""
-        solids, count = inputs.solids, inputs.count
+        solids, count = inputs.solids, inputs.num_worlds
         assert not inputs.robots.driven, "checked by check_robot"
         return Quasistatic(), Slider(
             p_object_com=solids.p_object_com[:, :2],

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 
 from rps_jax import errors
 from rps_jax.geometry import planar
-from rps_jax.geometry.arrays import Array, Float, Scalar
+from rps_jax.geometry.arrays import Array, Float, Number, Scalar
 
 
 class Footprint(NamedTuple):
@@ -30,7 +30,7 @@ def rectangle(half_x: Scalar, half_y: Scalar) -> Footprint:
     return Footprint(signs * jnp.stack([jnp.asarray(half_x), jnp.asarray(half_y)]), jnp.zeros(()))
 
 
-def circle(radius: Scalar) -> Footprint:
+def circle(radius: Number) -> Footprint:
     """Return a circle of a radius [m] about the origin."""
     return Footprint(jnp.zeros((1, 2)), jnp.asarray(radius, float))
 

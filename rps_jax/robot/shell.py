@@ -144,15 +144,16 @@ class Shell:
     def on_strip(self, s: jax.Array) -> jax.Array:
         """Return points (..., 2) [m] in the robot frame at positions `s` (...) [m] of the strip."""
         if self.radius is not None:
-            angle = _ARC / 2 - s / self.radius
-            return self.radius * jnp.stack([jnp.cos(angle), jnp.sin(angle)], axis=-1)
+            radius = jnp.asarray(self.radius, s.dtype)
+            angle = _ARC / 2 - s / radius
+            return radius * jnp.stack([jnp.cos(angle), jnp.sin(angle)], axis=-1)
         x, y = (jnp.asarray(half, s.dtype) for half in self.half)
         along = jnp.clip(s, 0, 2 * x) - jnp.clip(s - 2 * (x + y), 0, 2 * x)  # left and right side
         return jnp.stack([along - x, y - jnp.clip(s - 2 * x, 0, 2 * y)], axis=-1)
 
     def on_arc(self, bearing: jax.Array) -> jax.Array:
         """Return positions [m] of a round base's strip at bearings [rad] in the robot frame."""
-        return self.radius * (_ARC / 2 - bearing)
+        return jnp.asarray(self.sizes[0], bearing.dtype) * (_ARC / 2 - bearing)
 
     def check(self) -> None:
         """Raise InputError for a base without size, or boards that overlap or leave it."""

@@ -61,14 +61,14 @@ class WorldInputs(NamedTuple):
     surroundings: Surroundings = Surroundings()  # (n,) each
 
     @property
-    def count(self) -> int:
+    def num_worlds(self) -> int:
         """Number of worlds."""
         return self.solids.mass.size
 
     @property
     def columns(self) -> tuple[Solid, Friction, Robot, Surroundings]:
         """Fields that may differ between worlds, with leaves (n, ...)."""
-        robots = repeat_robot(self.robots, self.count)
+        robots = repeat_robot(self.robots, self.num_worlds)
         return self.solids, self.friction, robots, self.surroundings
 
 
@@ -303,7 +303,7 @@ def check_target(p_world_target: tuple[float, float], shell: Shell = Shell()) ->
     x, y = errors.check_vector("target", p_world_target, at_least=-50, at_most=50, unit="m")
     half_x, half_y = shell.half
     order = np.inf if shell.radius is None else 2
-    if np.linalg.norm([x / half_x, y / half_y], order) <= 1:
+    if np.linalg.norm(np.array([x / half_x, y / half_y], float), order) <= 1:
         rule = (
             f"it must lie outside the robot, from its middle {half_x:g} m ahead, {half_y:g} m aside"
         )

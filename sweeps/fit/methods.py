@@ -162,7 +162,8 @@ class Methods(FitStudy):
             replay = Replay(self.ranges, [track], self.setting, False)
             u = np.random.default_rng(log).random((fit.SAMPLES, len(names)))
             if replay.num_windows >= fit.LEAST_WINDOWS:
-                u, _ = least_squares.sample(replay, *minimise(replay, starts), fit.SAMPLES, log)
+                u, r, j = minimise(replay, starts)
+                u, _ = least_squares.sample(replay, u, r, j, fit.SAMPLES, log)
             results.append(u[:, columns])
             counts.append(replay.num_windows)
         seconds = (time.process_time() - start) / len(index) + smoothing

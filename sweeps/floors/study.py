@@ -129,7 +129,9 @@ def cost_table(results: xr.Dataset, base: str, masks: Mapping[str, np.ndarray]) 
         for law in map(str, results.law.values):
             trials, level = (results.sel(law=law, floor=x) for x in (floor, base))
             success = trials.success.values > 0
-            shares = [(success & mask, mask) for mask in ({"all": success >= 0} | masks).values()]
+            shares = [
+                (success & mask, mask) for mask in ({"all": success >= 0} | dict(masks)).values()
+            ]
             rates = [tables.share(int(x.sum()), int(mask.sum())) for x, mask in shares]
             time = f"{np.median(trials.time.values[success]):.0f} s" if success.any() else "-"
             compared = statistics.compare(level.success, trials.success)

@@ -14,7 +14,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
-from typing import ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import cmaes
 import numpy as np
@@ -101,9 +101,10 @@ def descend(cell: Cell, worlds: int) -> Fitted:
         j = cell.derivatives(world(x)) * (HIGH - LOW)
         return np.concatenate([j.reshape(-1, 4), _PRIOR * np.eye(4)])
 
+    options: dict[str, Any] = {"jac": slopes, "bounds": (0, 1), "loss": "soft_l1"}
     fits = [
-        least_squares(values, np.array([x, 0.5, 0.5, 0.5]), slopes, bounds=(0, 1), xtol=1e-3,
-                      ftol=1e-3, loss="soft_l1", max_nfev=12)
+        least_squares(values, np.array([x, 0.5, 0.5, 0.5]), xtol=1e-3, ftol=1e-3, max_nfev=12,
+                      **options)
         for x in _STARTS
     ]  # fmt: skip
     best = min(fits, key=lambda fit: fit.cost)
@@ -168,9 +169,10 @@ class Real(QuickStudy[xr.Dataset]):
         halves, action = study.halves_of(table.id.to_numpy()), pushes.actions(table)
         table = table.assign(group=study.groups_of(table), half=halves, action=action)
         table = table[table.group.isin(self.groups)].fillna({"surface": "unknown"})
+        labelled: Any = table.groupby(["group", "support", "surface"], sort=False)
         cells = {
             ", ".join(map(str, label)): rows.groupby("half").head(self.few).reset_index(drop=True)
-            for label, rows in table.groupby(["group", "support", "surface"], sort=False)
+            for label, rows in labelled
         }
         return dict(list(cells.items())[: self.cells])
 
@@ -186,7 +188,7 @@ class Real(QuickStudy[xr.Dataset]):
             pairs = (halves, halves[::-1])
             rows = [self._predict(name, *pair) for pair in pairs]
             parts.append(xr.concat(rows, xr.IndexVariable("half", [0, 1])))
-        result = xr.concat(parts, xr.IndexVariable("estimator", list(METHODS)))
+        result: Any = xr.concat(parts, xr.IndexVariable("estimator", list(METHODS)))
         has_force = bool(np.isfinite(halves[0].measured[:, 3]).all())
         return result.assign(group=str(table.group.iloc[0]), has_force=has_force)
 

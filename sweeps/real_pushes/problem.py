@@ -113,7 +113,9 @@ def _outcome(
     unit = jax.lax.stop_gradient(jnp.linalg.norm(OUTLINE - com, axis=-1).mean() / 2)
     scale = jnp.abs(feet - com).max()
 
-    def step(state: tuple[jax.Array, ...], inputs: list[jax.Array]) -> tuple[object, jax.Array]:
+    def step(
+        state: tuple[jax.Array, jax.Array, jax.Array], inputs: list[jax.Array]
+    ) -> tuple[tuple[jax.Array, jax.Array, jax.Array], jax.Array]:
         centre, yaw, force = state
         start, end, twist, length, nearest, outward, corner, bears = inputs
         at = feet - com
@@ -151,8 +153,8 @@ def _outcome(
         force = pushing @ normal - (theta[0] * pushing * v_t / size) @ tangent
         return (centre + length * twist[:2], yaw + length * twist[2] / unit, force), force
 
-    first = pose[:2] + planar.rotate(pose[2], com), pose[2], jnp.zeros(2)
+    first = pose[:2] + planar.rotate(pose[2], jnp.asarray(com)), pose[2], jnp.zeros(2)
     (centre, yaw, _), force = jax.lax.scan(step, first, steps)
     force = theta[1] * pushes.MASS * GRAVITY * force[_STEPS // 2 :].mean(axis=0)
-    position = centre + planar.rotate(yaw, COM - com)
+    position = centre + planar.rotate(yaw, jnp.asarray(COM - com))
     return jnp.concatenate([position, yaw[None], force])

@@ -47,9 +47,10 @@ class RoundBase(MultiLawQuestion[xr.Dataset]):
     @property
     def plans(self) -> dict[str, Plan]:
         """The sweep of each base."""
-        options = {"setting": self.setting}
         return {
-            base: Sweep(self.chosen, self.domain, self.worlds, robot=robot, **options).plan
+            base: Sweep(
+                self.chosen, self.domain, self.worlds, robot=robot, setting=self.setting
+            ).plan
             for base, robot in BASES.items()
         }
 

@@ -157,7 +157,7 @@ def step(
 
     alpha = jnp.mod(planar.direction(from_object) - a_OT, 2 * jnp.pi)
     r_robot = params.r_robot if touch.base_radius is None else touch.base_radius
-    near = r_robot + obs.r_object + params.margin >= planar.norm(from_object)
+    near = planar.norm(from_object) <= r_robot + obs.r_object + params.margin
     push, relocate = activations(params, state, alpha, near)
     radial = -jnp.stack([jnp.cos(alpha), jnp.sin(alpha)])  # towards the object
     orbit = jnp.sign(jnp.sin(alpha)) * jnp.stack([-jnp.sin(alpha), jnp.cos(alpha)])  # to alpha = pi

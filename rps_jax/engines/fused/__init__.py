@@ -64,7 +64,7 @@ class Fused(Engine):
             bodies = bodies._replace(feet=feet, bears=np.sign(solids.feet[..., 2:]))
         around = inputs.surroundings
         if around.walls is not None:
-            ends = around.walls.reshape(inputs.count, -1, 4)
+            ends = around.walls.reshape(inputs.num_worlds, -1, 4)
             bodies = bodies._replace(walls=ends, friction_wall=around.friction_wall)
         return FusedStage(), bodies
 

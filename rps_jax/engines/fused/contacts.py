@@ -9,7 +9,7 @@ Reference: MuJoCo documentation, "Computation: Constraint model".
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -217,9 +217,9 @@ def nearest_walls(ends: Entries, p: Vec, q: Sequence[Number], corners: Vec) -> l
     share = jnp.clip(sp.dot(away, along) / sp.dot(along, along), 0.0, 1.0)
     away = (away[0] - share * along[0], away[1] - share * along[1])
     gap = sp.norm(away)
-    outline = sp.to_world(sp.matrix(q), corners)[:2]
+    outline: Any = sp.to_world(sp.matrix(q), corners)[:2]
     inward = sp.least(sp.dot([c[:, None] for c in outline], [a[None] for a in away]))
-    score = -gap - inward / gap
+    score: Any = -gap - inward / gap
     index = jax.lax.broadcasted_iota(jnp.int32, score.shape, 0)
     rows = (x + end_x) / 2, (y + end_y) / 2, *along, index
     walls = []
@@ -342,7 +342,8 @@ def polygon_and_base(
     n = (along[1], -along[0])
     real = length > 1e-6
     if len(size) == 1:
-        return _polygon_and_circle(corners, (n, along, length, real), size[0])
+        edges: Any = n, along, length, real
+        return _polygon_and_circle(corners, edges, size[0])
     a, b = size
     gaps = -(x * n[0] + y * n[1]) - (a * jnp.abs(n[0]) + b * jnp.abs(n[1]))
     faces = (n, corners, along, length)

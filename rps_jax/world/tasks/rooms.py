@@ -175,13 +175,15 @@ def _read_image(file: Mapping[str, Any], starts: Any) -> list[np.ndarray]:
     high = check("task occupied_thresh", file.get("occupied_thresh", 0.65), at_most=1)
     low = check("task free_thresh", file.get("free_thresh", 0.196), at_most=1)
     x, y, yaw = errors.check_array("task origin", file.get("origin", (0, 0, 0)), (3,))
-    for name, allowed in (("negate", (0, 1)), ("mode", ("trinary",))):
+    choices: dict[str, tuple[int | str, ...]] = {"negate": (0, 1), "mode": ("trinary",)}
+    for name, allowed in choices.items():
         if (value := file.get(name, allowed[0])) not in allowed:
             raise errors.not_allowed(f"task {name}", value, f"give one of {list(allowed)}")
     shades = _shades(Path(str(file.get("image", "an image"))))[::-1]
     occupied = shades if file.get("negate") else 1 - shades
     # Unknown cells, and those outside, are walls.
-    labels = np.pad(ndimage.label((occupied < low) & (occupied <= high))[0], 1)
+    labelled: Any = ndimage.label((occupied < low) & (occupied <= high))
+    labels = np.pad(labelled[0], 1)
     unit, origin = resolution * np.exp(1j * yaw), complex(x, y)
     cells = (errors.check_array("task start", starts, ("N", 3)) @ (1, 1j, 0) - origin) / unit + 1
     indices = np.floor([cells.imag, cells.real]).astype(int)
@@ -190,7 +192,8 @@ def _read_image(file: Mapping[str, Any], starts: Any) -> list[np.ndarray]:
         rule = "it lies in an obstacle, in unknown cells or outside of the image"
         raise errors.not_allowed("task start", starts, rule)
     rings = list[np.ndarray]()
-    for line in contourpy.contour_generator(z=np.isin(labels, reached).astype(float)).lines(0.5):
+    lines: Any = contourpy.contour_generator(z=np.isin(labels, reached).astype(float)).lines(0.5)
+    for line in lines:
         # Contours cut the corners of cells: a corner has the halves of both its neighbours.
         points = (np.where(line[:-1] % 1 == 0.5, line[:-1], line[1:]) - 0.5) @ (1, 1j)
         points = np.roll(points, -int(abs(points - points.mean()).argmax()))
