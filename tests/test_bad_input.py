@@ -189,7 +189,7 @@ COMMANDS = {
         "run in_c --out x": "run = in_c has another plan than run .engine = 'mjx' there",
     },
     "replay": {
-        "older 0": "older was written by another version .rules.max_lost = 'nothing' there, 150",
+        "older 0": "older was written by another version .rules.max_lost = None there, 150",
         "arms 0": "run = arms was written by rps_jax 0.2.0: use that version",
         "run x": "world = x is not allowed: give a whole number",
         "run -1": "world = -1 is not allowed: it must be a whole number from 0 to",

@@ -167,6 +167,16 @@ def test_invalid_json_without_checksum_is_reported(content, folder):
         reports_corruption(path)
 
 
+def test_fields_of_later_versions_are_absent_in_older_runs():
+    """None says that a quantity is absent, so a run that lacks it goes on."""
+    older, later = {"robot": {"mass": 9}}, {"robot": {"mass": 9, "radius": None}, "slope": None}
+    assert run_folder.describe_difference(older, later) == ""
+    assert run_folder.describe_difference(later, older) == ""
+    later["robot"]["radius"] = 0.3
+    words = run_folder.describe_difference(older, later)
+    assert words == "robot.radius = None there, 0.3 asked for"
+
+
 def test_a_file_without_checksum_is_read(sound, tmp_path):
     """Older versions wrote no checksums."""
     folder = shutil.copytree(sound, tmp_path / "run")

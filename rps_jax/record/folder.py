@@ -129,7 +129,10 @@ def read_manifest(folder: Path) -> JsonObject:
 
 
 def describe_difference(stored: object, new: object) -> str:
-    """Return the first three differences of two JSON values, in words."""
+    """Return the first three differences of two JSON values, in words.
+
+    A field of None and a missing one are equal: later versions have more fields.
+    """
     differences = list(_differences(stored, new, ""))
     more = f" and {len(differences) - 3} more" if len(differences) > 3 else ""
     return "; ".join(differences[:3]) + more
@@ -138,7 +141,7 @@ def describe_difference(stored: object, new: object) -> str:
 def _differences(stored: object, new: object, path: str) -> Iterator[str]:
     if isinstance(stored, dict) and isinstance(new, dict):
         for key in {**stored, **new}:
-            old_value, new_value = stored.get(key, "nothing"), new.get(key, "nothing")
-            yield from _differences(old_value, new_value, f"{path}.{key}" if path else key)
+            pair = stored.get(key), new.get(key)
+            yield from _differences(*pair, f"{path}.{key}" if path else key)
     elif stored != new:
         yield f"{path} = {_SHORT.repr(stored)} there, {_SHORT.repr(new)} asked for"

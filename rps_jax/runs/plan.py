@@ -185,10 +185,10 @@ def load_plan(folder: Path) -> Plan:
     if "points" in record:
         plan = dataclasses.replace(plan, points=Points.read(folder, str(record["points"])))
     # Options that an older version did not store would otherwise get the defaults of this version.
-    if (current := json.loads(json.dumps(plan.configuration()))) != record:
+    current = json.loads(json.dumps(plan.configuration()))
+    if words := run_folder.describe_difference(record, current):
         raise InputError(
-            f"run = {folder} was written by another version "
-            f"({run_folder.describe_difference(record, current)}), "
+            f"run = {folder} was written by another version ({words}), "
             f"{provenance.package_version(folder)}: use that one."
         )
     return plan
