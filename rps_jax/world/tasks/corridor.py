@@ -222,7 +222,7 @@ def spare(vertices: Entries, half: Entries) -> Entries:
     """Return the least length (n,) [m] of paths (n, N, 2) that corners of a half width leave."""
     xp = namespace_of(vertices)
     room = half * xp.tan(xp.abs(turns_of(vertices)) / 2)
-    none = xp.zeros_like(room[:, :1])
+    none = xp.zeros_like(vertices[:, :1, 0])
     lengths = xp.linalg.norm(xp.diff(vertices, axis=1), axis=-1)
     used = xp.concatenate([none, room], axis=1), xp.concatenate([room, none], axis=1)
     return xp.min(lengths - used[0] - used[1], axis=1)
