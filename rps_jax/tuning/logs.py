@@ -28,7 +28,6 @@ import pandas as pd
 import xarray as xr
 
 from rps_jax.errors import InputError, check_name, not_allowed
-from rps_jax.geometry import footprint as fp
 from rps_jax.geometry import planar
 from rps_jax.geometry.solid import rotate
 from rps_jax.record import bag, files
@@ -277,9 +276,11 @@ def _unit_faults(columns: dict[str, np.ndarray], shell: Shell) -> Iterator[str]:
         if (value := np.abs(values).max(initial=0)) > limit:
             yield f"has {titles} up to {value:.4g} {unit}, beyond the limit of {limit:.3g}: {_FIX}"
     contacts = columns["p_robot_contact"][in_contact]
-    outside = np.asarray(fp.signed_distance(shell.outline, jnp.asarray(contacts)))
+    reach, half = np.abs(contacts), np.array(shell.half, float)
+    outside = np.max(reach - half, axis=1)
+    if shell.radius is not None:
+        outside = np.linalg.norm(contacts, axis=1) - half[0]
     if (outside > 0.03).any() or np.median(outside) < -0.05:
-        reach, half = np.abs(contacts), np.array(shell.half, float)
         (x, y), (length, width) = reach.max(0), half
         sizes = f"({x:.3f}, {y:.3f}) m, and the robot ends at ({length:.3f}, {width:.3f}) m"
         reason = "it is of another robot (see --robot), or contact_x and contact_y may be in mm"
