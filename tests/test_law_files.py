@@ -4,6 +4,7 @@ import json
 import shutil
 import textwrap
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -176,7 +177,7 @@ def test_a_law_imports_the_modules_beside_it(tmp_path):
         (tmp_path / name / "gains.py").write_text(f"V_Y = {value}")
         _, params = registry.parse_law(str(path))
         observation = registry.validation.observation_shapes("touch")
-        zeros = type(observation)(*(jnp.zeros(x.shape, x.dtype) for x in observation))
+        zeros = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), observation)
         speeds[name] = float(registry.law_of(params).step(params, (), zeros)[1].v_y)
     assert speeds == {"one": 0.01, "two": 0.02}
 

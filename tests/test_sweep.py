@@ -191,7 +191,9 @@ def test_results_hold_every_world_with_its_drawn_quantities(whole, tmp_path):
         np.testing.assert_allclose(results[name], values, rtol=1e-6)
         assert results[name].attrs["units"] == unit
     undrawn = {name for name in QUANTITIES if BOXES.range_of(name) is None}
-    assert undrawn == {*domain.quantities_of("robot", "course"), "foam", "time_constant", "feet"}
+    floors = {"slope", "slope_bearing", "boundary_factor", "boundary"}
+    unused = {"foam", "time_constant", "feet"} | floors
+    assert undrawn == {*domain.quantities_of("robot", "course")} | unused
     assert set(LABELS) == {*columns, *undrawn}
     again = outcomes([worlds_of(np.arange(20))])
     for i, outcome in again.items():
