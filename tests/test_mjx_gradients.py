@@ -245,6 +245,7 @@ def check_agreement(pairs, kinds, bounds):
     assert not excess
 
 
+@pytest.mark.slow
 def test_the_fused_engine_has_the_gradients_of_mjx_for_a_box_on_a_plane(box, monkeypatch):
     """Compare 200 states of the box by state and friction, in float64; the base is far away.
 

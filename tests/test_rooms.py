@@ -239,6 +239,7 @@ def test_a_trial_ends_at_a_wall_and_a_wide_door_lets_it_pass(tmp_path):
     assert Polygon(low).boundary.distance(point) < 1e-5
 
 
+@pytest.mark.slow
 def test_a_sweep_of_rooms_is_stored_and_replayed(tmp_path):
     path = files.write_json(tmp_path / "map.json", HALL | {"polygons": DOOR, "scale": [1.0, 1.4],
                                                            "object_radius": 0.1})  # fmt: skip

@@ -144,7 +144,7 @@ def test_rps_gets_the_arc_length() -> None:
     assert bool(details.realigning)  # beyond l_cr
 
 
-@pytest.mark.parametrize("name", ["box", "cylinder"])
+@pytest.mark.parametrize("name", [pytest.param("box", marks=pytest.mark.slow), "cylinder"])
 def test_engines_agree(name: str) -> None:
     """Compare pushes in which an object slides and turns on the arc."""
     loaded = scene.load(name, FINE, FRICTION["S1"], robot=ROUND)

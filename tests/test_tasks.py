@@ -193,6 +193,7 @@ def test_a_straight_path_with_a_long_lookahead_is_a_target() -> None:
     assert followed.outcome.task["progress"] > 0.9
 
 
+@pytest.mark.slow
 def test_walls_change_nothing_until_they_are_touched() -> None:
     domain = parse_domain("wide,objects=random_box")
     wide, narrow, free = (
