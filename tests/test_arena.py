@@ -31,6 +31,7 @@ def test_initial_poses_touch_the_base_without_overlap():
     assert np.ptp(starts[:, 4]) > 0.1  # they differ
 
 
+@pytest.mark.slow
 def test_engines_are_accurate_and_missing_ones_give_a_reason(tmp_path):
     names = ("C MuJoCo, rollout", "one process a trial", "fused", "MuJoCo Warp")
     race = arena.Arena(names, (4,), seconds=0.5, starts=2, step=1e-3, out=tmp_path / "run")

@@ -147,6 +147,7 @@ def test_the_first_worlds_and_common_failures_are_tried(monkeypatch):
         worlds("c", sample=0)
 
 
+@pytest.mark.slow
 def test_the_command_tries_the_failures_of_a_law(tmp_path, capsys):
     options = "--slots 6 --workers 1"
     ladder = "ladder --domain paper --worlds 6 --engine quasistatic --laws rps_tuned pursuit"

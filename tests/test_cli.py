@@ -109,6 +109,7 @@ def test_every_question_offers_and_every_call_accepts_overwrite(tmp_path):
     assert rps_jax.load(tmp_path).sizes["time"]
 
 
+@pytest.mark.slow
 def test_the_commands_of_a_report_reproduce_the_run(tmp_path, capsys, monkeypatch):
     """The first is that of the run; others replay its worlds, or look at its failures."""
     monkeypatch.chdir(tmp_path)

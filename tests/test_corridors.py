@@ -86,6 +86,7 @@ def test_each_failure_has_the_kind_of_its_end() -> None:
     assert (study.failure_kinds(results_of((), **columns)) == -1).all()
 
 
+@pytest.mark.slow
 def test_plans_that_run_together_have_the_results_of_each_alone() -> None:
     setting = Setting("quasistatic", seed=3, rules=Rules(horizon=20.0))
     plans = [

@@ -219,6 +219,7 @@ def test_states_are_drawn_each_in_its_own_world(pushing):
 QUASISTATIC = Setting("quasistatic", FAST, rules=Rules(horizon=20.0))
 
 
+@pytest.mark.slow
 def test_what_is_felt_and_rewarded_has_derivatives_by_action_and_state():
     """Central differences in double precision, of the smooth environment while contact is lost."""
     near = replace(NEAR, gap=Range(0.008, 0.008), noise=Range(0, 0))  # the foam is 10 mm thick

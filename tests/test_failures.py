@@ -184,6 +184,7 @@ def synthetic(monkeypatch):
 SMALL = {"generations": 12, "batch": 32, "drawn": 600, "cells": 8, "repeats": 1, "check_again": 0}
 
 
+@pytest.mark.slow
 def test_an_attack_fills_many_more_cells_than_drawn_worlds(synthetic):
     results = rps_jax.attack("rps", "wide", **SMALL)
     assert results.margin.sizes == {"object": 3, "size": 8, "com_offset": 8, "friction_robot": 8}

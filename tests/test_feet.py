@@ -169,7 +169,11 @@ def test_drawn_feet_change_nothing_else_and_bear_the_object(name):
 
 @pytest.mark.parametrize(
     ("engine", "name"),
-    [("fused", "random_box"), ("fused", "random_cylinder"), ("mjx", "random_cylinder")],
+    [
+        ("fused", "random_box"),
+        ("fused", "random_cylinder"),
+        pytest.param("mjx", "random_cylinder", marks=pytest.mark.slow),
+    ],
 )
 def test_objects_on_drawn_feet_end_where_those_of_c_mujoco_do(engine, name):
     plain, drawn, family = drawn_on_feet(name)

@@ -360,6 +360,7 @@ def learned(tmp_path_factory):
     return folder, learn(CYLINDERS, **TINY, updates=4, out=folder)
 
 
+@pytest.mark.slow
 def test_a_killed_and_resumed_run_equals_an_uninterrupted_one(learned, tmp_path):
     folder, whole = learned
     out, rounds = tmp_path / "parts", []

@@ -98,6 +98,7 @@ def box(compiled_box):
         yield compiled_box
 
 
+@pytest.mark.slow
 def test_derivatives_of_1_and_100_steps_of_a_box_on_a_plane_are_central_differences(box):
     """The box falls, slides and turns; derivatives of 100 steps are a product of matrices."""
     x = start = box.state(4.0, 1.0, 0.0, 0.2, 0.3, 3.0)

@@ -92,7 +92,7 @@ return [push.trial.steps, push.touched(), push.outcomes, [twist.v_x, twist.v_y, 
 @pytest.mark.parametrize(
     ("kind", "width", "door", "touched"),
     [
-        ("corridor", 1.0, 0.9, "base"),
+        pytest.param("corridor", 1.0, 0.9, "base", marks=pytest.mark.slow),
         pytest.param("corridor", 1.8, 0.9, "", marks=pytest.mark.slow),
         pytest.param("path", 2, 1, "", marks=pytest.mark.slow),
     ],

@@ -498,6 +498,7 @@ def test_every_scene_has_a_slider(name):
     np.testing.assert_allclose(slider.p_object_com[0], com, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_the_papers_grid_agrees_with_the_other_engines(optimised):
     """RPS 140 of 144, as on the fused engine; NPS 26, and on the fused engine 27."""
     grid = product(("rps", "nps"), objects.PAPER_OBJECTS, FRICTION.values(), paper.TARGETS)

@@ -174,6 +174,7 @@ def test_cpp_and_python_agree_on_a_recorded_bag(binary, tmp_path, python):
     assert np.mean(near < 0.02) > 0.8
 
 
+@pytest.mark.slow
 def test_cpp_and_python_follow_a_path_as_the_task_does(binary, tmp_path, python):
     pytest.importorskip("mcap_ros2")
     path = tmp_path / "push.mcap"

@@ -214,7 +214,7 @@ def sweep_in_a_process(folder):
     swept(folder, KILLED)
 
 
-def test_a_run_killed_four_times_equals_an_undisturbed_one(tmp_path, monkeypatch):
+def test_a_run_killed_twice_equals_an_undisturbed_one(tmp_path, monkeypatch):
     """SIGKILL hits start and work alternately at random moments; the last process ends."""
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join(sys.path))  # or the server finds no tests
     context = multiprocessing.get_context("forkserver")
@@ -224,11 +224,11 @@ def test_a_run_killed_four_times_equals_an_undisturbed_one(tmp_path, monkeypatch
     def done():
         return len(list(folder.glob("parts/*.npz")))
 
-    for kill in range(5):
+    for kill in range(3):
         previous = done()
         process = context.Process(target=sweep_in_a_process, args=(folder,))
         process.start()
-        if kill < 4:
+        if kill < 2:
             while kill % 2 and process.is_alive() and done() == previous:
                 time.sleep(0.01)  # until it is at work, however slow the machine
             process.join(dice.uniform(0.0, 0.5 if kill % 2 else 2.0))
@@ -236,7 +236,7 @@ def test_a_run_killed_four_times_equals_an_undisturbed_one(tmp_path, monkeypatch
         process.join()
         interrupted += 0 < done() < len(KILLED.chunks)
     assert process.exitcode == 0
-    assert interrupted > 1
+    assert interrupted > 0
     assert parts_of(folder) == parts_of(swept(tmp_path / "whole", KILLED))
 
 

@@ -155,6 +155,7 @@ def test_a_sweep_records_and_reports_the_outcomes_of_its_task(run):
     assert tables.task_table(reach) == []
 
 
+@pytest.mark.slow
 def test_a_corridor_is_resumed_sharded_merged_and_replayed(run, capsys):
     results = rps_jax.load(run / "run")
     next((run / "run" / "parts").iterdir()).unlink()
