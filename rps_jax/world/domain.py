@@ -167,7 +167,7 @@ class Domain:
     @property
     def surroundings(self) -> Surroundings:
         """Ranges of what surrounds the objects; None for what no world has."""
-        walls = True if getattr(self.task, "touch", "nothing") == "object" else None
+        walls = True if self.task.has_contact_walls else None
         return Surroundings(self.slope, self.boundary_factor, walls)
 
     @property

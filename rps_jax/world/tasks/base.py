@@ -109,6 +109,11 @@ class Task:
         return ",".join([self.kind, *changes])
 
     @property
+    def has_contact_walls(self) -> bool:
+        """Whether the object touches walls by contact forces."""
+        return False
+
+    @property
     def idle(self) -> frozenset[str]:
         """Names of its quantities that are not drawn."""
         return frozenset()

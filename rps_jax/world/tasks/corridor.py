@@ -184,6 +184,11 @@ class Corridor(Path):
             raise errors.not_allowed("task width (high)", f"{self.width.high:g} m", rule)
 
     @property
+    def has_contact_walls(self) -> bool:
+        """Whether the object may touch walls."""
+        return self.touch == "object"
+
+    @property
     def idle(self) -> frozenset[str]:
         """Names of the ranges that are not drawn."""
         return super().idle | (frozenset() if self.doors else {"door_width"})
@@ -208,7 +213,7 @@ class Corridor(Path):
         half = self.width.at(inputs.u["width"]) / 2
         opening = half * self.door_width.at(inputs.u["door_width"])
         course = CorridorCourse.around(inner, half, opening, self.doors)
-        if self.touch == "object":
+        if self.has_contact_walls:
             friction = np.full(len(half), max(self.friction_wall, 1e-5))  # MuJoCo's least
             vertices = np.asarray(inner.line.vertices)
             walls, doors = np.split(course.walls, [2 * vertices.shape[1] - 2], axis=1)
