@@ -151,7 +151,7 @@ class MJX(Engine):
     def stage(self, inputs: WorldInputs) -> tuple[MJXStage, dict[str, np.ndarray]]:
         """Return the stage of the first of the worlds, and fields (n, ...) of all."""
         walls = inputs.surroundings.walls
-        if walls is not None:  # the model has only as many as an object touches at once
+        if walls is not None:  # the model has two, and they move
             slots = inputs.surroundings._replace(walls=walls[:, :AT_ONCE])
             inputs = inputs._replace(surroundings=slots)
         template = scene.compile_row(inputs, 0).physics

@@ -179,8 +179,6 @@ def compile_solid(
     body.explicitinertial = True
     body.mass, body.ipos = single.mass, single.p_object_com
     body.iquat, body.inertia = single.q_object_body, single.inertia
-    if around.slope is not None:
-        spec.option.gravity = around.slope
     models = _compile(spec, physics, friction, robot, around)
     return Scene(family, family, *models, single, robot.shell)
 
@@ -283,6 +281,8 @@ def _compile(
         pair.friction[:2] = friction.robot if of_base else friction.ground
     if around.walls is not None:
         _add_walls(spec, around, physics)
+    if around.slope is not None:
+        spec.option.gravity = around.slope
     spec.option.cone = getattr(mujoco.mjtCone, f"mjCONE_{physics.cone.upper()}")
     for name in ("timestep", "impratio", "iterations", "ls_iterations", "tolerance"):
         setattr(spec.option, name, getattr(physics, name))
