@@ -17,7 +17,7 @@ from rps_jax import errors
 from rps_jax.analysis.report import Section
 from rps_jax.control import registry, validation
 from rps_jax.control.base import Law, LawParams
-from rps_jax.control.observation import Twist, on_base
+from rps_jax.control.observation import Twist, with_base_radius
 from rps_jax.errors import InputError
 from rps_jax.geometry import planar
 from rps_jax.geometry.polyline import Polyline
@@ -163,7 +163,8 @@ def shadowed(law: Law, params: LawParams, recorded: dict[str, np.ndarray]) -> np
     @jax.jit
     def run(params: LawParams, observations: Any) -> jax.Array:
         def step(state: Any, row: Any) -> Any:
-            obs, last = on_base(row[0], recorded.get("base_radius")), row[1]
+            sensed, last = row
+            obs = with_base_radius(sensed, recorded.get("base_radius"))
             if law.observe_sent is not None:
                 state = law.observe_sent(params, state, obs, Twist(*last))
             state, twist, _ = law.step(params, state, obs)

@@ -65,7 +65,7 @@ AnyObservation = Observation | TaxelObservation | ForceObservation | PoseObserva
 Observed = TypeVar("Observed", bound=AnyObservation)
 
 
-def on_base(obs: Observed, radius: Number | None) -> Observed:
+def with_base_radius(obs: Observed, radius: Number | None) -> Observed:
     """Return an observation on a round base of a radius [m]; None: on a rectangular one."""
     if isinstance(obs, Observation):
         return obs._replace(base_radius=radius)

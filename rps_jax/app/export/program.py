@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from rps_jax.control import registry, validation
-from rps_jax.control.observation import TaxelObservation, Twist, on_base
+from rps_jax.control.observation import TaxelObservation, Twist, with_base_radius
 from rps_jax.errors import not_allowed
 from rps_jax.lowering.routine import Group, Pytree, Routine, fields_of, routine
 from rps_jax.robot import robot as robots
@@ -92,7 +92,7 @@ def program(law: registry.LawLike, robot: Any = "ideal", skin: Any = "capacitive
         start = functions.init(jax.tree.map(lambda x: np.asarray(x, float), params))
 
     def step(params: Pytree, memory: Pytree, observation: Pytree) -> tuple[Pytree, Twist]:
-        sensed = on_base(observation, base.radius)
+        sensed = with_base_radius(observation, base.radius)
         memory, twist, _ = functions.step(params, memory, sensed)
         return memory, Twist(*twist)
 
