@@ -35,6 +35,7 @@ TASKS = {  # the first is the one to compare with; paths have 8 segments, corrid
     "path": f"path,{_STRAIGHT}",
     "corridor": f"corridor,width=3,{_STRAIGHT}",
     "corridor, two doors": f"corridor,width=3,doors=2,{_STRAIGHT}",
+    "walls that objects touch": f"corridor,touch=object,width=3,{_STRAIGHT}",
 }
 
 
