@@ -179,6 +179,11 @@ def test_the_table_of_names_is_that_of_the_code():
     assert names == {*smooth, *VELOCITY_ERRORS, "com_bearing", "target", "com"}
 
 
+def test_the_front_page_has_the_first_example_of_the_page():
+    example = re.search(r"```python\n.*?```", README, re.DOTALL)[0]
+    assert example in (ROOT / "README.md").read_text()
+
+
 @pytest.mark.slow
 def test_the_examples_of_the_page_agree():
     """Reverse mode of the call, and forward mode of the plain JAX route, with the same worlds."""
