@@ -49,6 +49,14 @@ STALE: dict[str, str] = {
         _READING,
     ),
     **dict.fromkeys(("attack", "million", "rare_million", "sb3", "sensitivity"), _LOADS),
+    **dict.fromkeys(
+        (
+            *("arena", "commands", "commands_gpu", "compilers", "compilers_gpu", "costs"),
+            *("derivatives", "derivatives_gpu", "kernel", "levers", "robot", "speed"),
+            "speed_cores",
+        ),
+        "later changes of the code, which small runs do not time",
+    ),
     "ground": _GROUND,
     "fidelity": _SATURATED + _GROUND,
 }

@@ -2,8 +2,8 @@
 
 A subclass of `Study` declares the parts of its results and its tables. Each table is a section of
 the report. With the option `--machine`, tables that have a name are written to `results/NAME.json`
-in the folder of the study, and `render_tables.py` shows them on the pages. A data file has a digest
-of everything that its numbers depend on.
+in the folder of the study, and `render_tables.py` shows them on the pages. A data file has digests
+of everything that its numbers depend on: of the settings, and of the source code by room.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ from rps_jax.trials.rollout import rollout
 from rps_jax.trials.trial import Outcome
 from rps_jax.world.domain import DOMAINS, QUANTITIES
 from rps_jax.world.tasks.reach import Reach
-from sweeps import render_tables
+from sweeps import render_tables, sources
 
 T = TypeVar("T", covariant=True)
 Rows = list[list[str]]
@@ -338,9 +338,10 @@ def write_table(path: Path, runs: Sequence[Mapping[str, Any]], device: str, tabl
     last = runs[-1]
     with_folders = [run["command"] for run in runs]
     commands = [_without_unread_folder(command, with_folders) for command in with_folders]
-    digests = {}
+    digests: dict[str, Any] = {}
     with contextlib.suppress(InputError):  # a script has no digest, and its run is still published
         digests["digest"] = digest(commands)
+        digests["code"] = code_digests(commands, last["commit"])
     columns, rows = table.columns_and_rows()
     data = {
         "command": [shlex.join(command) for command in commands],
@@ -381,6 +382,22 @@ def digest(commands: Sequence[Sequence[str]]) -> str:
         configurations.append(_expanded(fields))
     text = json.dumps(configurations, sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
+def code_digests(commands: Sequence[Sequence[str]], commit: str | None) -> dict[str, str]:
+    """Return a digest of each room of the source that commands run, at the commit of their run."""
+    code = sources.digests_at(commit)
+    return {room: code[room] for room in sorted(rooms_of(commands) & code.keys())}
+
+
+def rooms_of(commands: Iterable[Sequence[str]]) -> set[str]:
+    """Return the rooms of the source that commands of `rps` run.
+
+    Raises:
+      InputError: a command does not exist.
+    """
+    questions = [names.question_type(names.split(list(words[1:]))[0]) for words in commands]
+    return sources.rooms_of(Path(inspect.getfile(question)) for question in questions)
 
 
 def _expanded(value: Any) -> Any:

@@ -18,7 +18,7 @@ from rps_jax.runs.question import seed_of
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import Rules
 from rps_jax.world.domain import DOMAINS, Range
-from sweeps import render_tables
+from sweeps import render_tables, sources
 from sweeps.publish import dependencies, rows, study
 from sweeps.publish.recipes import HISTORY, RECIPES, Recipe
 from sweeps.random_worlds import million
@@ -90,6 +90,7 @@ def test_a_stale_file_must_be_listed_and_a_current_one_must_not(
 ):
     data = json.loads((SWEEPS / "table" / "results" / "table.json").read_text())
     data["digest"] = digest or study.digest([shlex.split(line) for line in data["command"]])
+    data["code"] = sources.digests()
     (tmp_path / "results").mkdir()
     (tmp_path / "results" / "table.json").write_text(json.dumps(data))
     monkeypatch.setattr(study, "_SWEEPS", tmp_path)
@@ -104,6 +105,105 @@ def test_a_stale_file_must_be_listed_and_a_current_one_must_not(
     assert ("stale: computed before the box had a lid" in output.out) == bool(
         listed and not message
     )
+
+
+@pytest.fixture
+def source_tree(tmp_path, monkeypatch):
+    """Folder with a law of four rooms, whose file `rps_jax/control/law.py` is returned."""
+    for name, text in {
+        "rps_jax/control/law.py": "from rps_jax.geometry import planar\n\nV = 1.0\n",
+        "rps_jax/geometry/planar.py": "def f(): return 1\n",
+        "rps_jax/engines/fused.py": "def late():\n    import rps_jax\n    return rps_jax.sweep\n",
+        "rps_jax/runs/sweep.py": "from rps_jax.record import files\n",
+        "rps_jax/record/files.py": "A = 1\n",
+        "sweeps/a/study.py": "from rps_jax.control import law\n",
+    }.items():
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_text(text)
+    monkeypatch.setattr(sources, "ROOT", tmp_path)
+    monkeypatch.setattr(sources, "EQUAL", tmp_path / "equal.json")
+    for cached in (sources.digests, sources._imports):
+        cached.cache_clear()
+    yield tmp_path / "rps_jax" / "control" / "law.py"
+    for cached in (sources.digests, sources._imports):
+        cached.cache_clear()
+
+
+def digests_of(path, text):
+    path.write_text(text)
+    sources.digests.cache_clear()
+    return sources.digests()
+
+
+def test_a_number_depends_on_the_rooms_that_its_command_imports(source_tree):
+    """Also inside functions, and by the public names; a room that only stores is none of them."""
+    assert sources.rooms_of([source_tree]) == {"control", "geometry"}
+    study_of = source_tree.parents[2] / "sweeps" / "a" / "study.py"
+    assert sources.rooms_of([study_of]) == {"sweeps/a", "control", "geometry"}
+    assert sources.rooms_of([source_tree.parents[1] / "engines/fused.py"]) == {"engines", "runs"}
+
+
+@pytest.mark.parametrize(("text", "changes"), [
+    ('"""A law."""\n\n# fast\nV = (1.0)\n"""Speed."""\n', False),
+    ("V = 1.5\n", True), ("V = 1.0\n\n\ndef f(): pass\n", True),
+])  # fmt: skip
+def test_a_digest_covers_code_and_no_comment(source_tree, text, changes):
+    initial = digests_of(source_tree, "V = 1.0\n")
+    changed = digests_of(source_tree, text)
+    assert (initial["control"] != changed["control"]) == changes
+    assert initial["geometry"] == changed["geometry"]
+
+
+def test_a_digest_ignores_the_texts_of_errors(source_tree):
+    law = "def f(v):\n    if v < {}:\n        raise ValueError({})\n"
+    texts = law.format(0, "'below 0'"), law.format(0, "f'{v} is below 0'"), law.format(1, "''")
+    first, same, other = (digests_of(source_tree, text)["control"] for text in texts)
+    assert first == same != other
+
+
+def test_a_change_of_the_code_is_stale_until_it_is_confirmed(source_tree):
+    data = {"code": dict(digests_of(source_tree, "V = 1.0\n")), "commit": None}
+    rooms = ("control", "geometry")
+    assert sources.changed_rooms("table", data, rooms) == []
+    middle = digests_of(source_tree, "W = 1.0\n")["control"]
+    assert sources.changed_rooms("table", data, rooms) == ["control"]
+    last = digests_of(source_tree, "U = 1.0\n")["control"]
+    chain = [[data["code"]["control"], middle], [middle, last]]
+    entries = [{"reason": "renamed", "files": ["table"], "code": {"control": x}} for x in chain]
+    sources.EQUAL.write_text(json.dumps(entries[:1]))
+    assert sources.changed_rooms("table", data, rooms) == ["control"]
+    sources.EQUAL.write_text(json.dumps(entries))
+    assert sources.changed_rooms("table", data, rooms) == []
+    assert sources.changed_rooms("ladder", data, rooms) == ["control"]
+    assert sources.changed_rooms("", data, rooms) == ["control"]
+
+
+def test_a_reason_confirms_all_files_that_are_stale_by_their_code_alone(
+    tmp_path, monkeypatch, capsys
+):
+    table = json.loads((SWEEPS / "table" / "results" / "table.json").read_text())
+    table["digest"] = study.digest([shlex.split(line) for line in table["command"]])
+    code = sources.digests()
+    (tmp_path / "results").mkdir()
+    for name, changes in {
+        "current": {"code": code},
+        "renamed": {"code": code | {"engines": "0" * 12}},
+        "settings": {"code": code | {"engines": "1" * 12}, "digest": "2" * 16},
+        "listed": {"code": code | {"engines": "3" * 12}},
+    }.items():
+        (tmp_path / "results" / f"{name}.json").write_text(json.dumps(table | changes))
+    monkeypatch.setattr(study, "_SWEEPS", tmp_path)
+    monkeypatch.setattr(study, "STALE", {"listed": "the box had a lid", "settings": "x"})
+    monkeypatch.setattr(sources, "EQUAL", tmp_path / "equal.json")
+    words = (SWEEPS / "publish", "--check-digests", "--out", tmp_path / "run")
+    assert rps(*words) == 2
+    assert "the inputs of renamed have changed" in capsys.readouterr().err
+    assert rps(*words, "--confirm", "equal runs") == 0
+    (entry,) = json.loads((tmp_path / "equal.json").read_text())
+    assert (entry["reason"], entry["files"]) == ("equal runs", ["renamed"])
+    assert entry["code"] == {"engines": ["0" * 12, code["engines"]]}
+    output = capsys.readouterr().out
+    assert "confirmed: its code changed, its numbers did not" in output
 
 
 def test_the_note_of_a_table_says_that_its_numbers_are_stale(monkeypatch):

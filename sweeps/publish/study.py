@@ -2,6 +2,7 @@
 
 rps sweeps/publish                       # stale data files, with reasons and durations
 rps sweeps/publish --check-digests       # fails if a data file is stale and not listed as such
+rps sweeps/publish --confirm "REASON"    # states that changes of the code altered no number
 rps sweeps/publish --only 'fit_*' table  # computes these again; a killed run is continued
 rps sweeps/publish --only '*' --needs gpu
 """
@@ -28,8 +29,9 @@ from rps_jax import errors
 from rps_jax.analysis.report import Section
 from rps_jax.app.cli import flags, names
 from rps_jax.errors import InputError
-from rps_jax.record import provenance
+from rps_jax.record import files, provenance
 from rps_jax.runs.question import Run, call_of
+from sweeps import sources
 from sweeps.publish.recipes import HISTORY, RECIPES, Recipe
 from sweeps.render_tables import STALE
 from sweeps.study_base import (
@@ -39,6 +41,7 @@ from sweeps.study_base import (
     digest,
     machine,
     records,
+    rooms_of,
     split_folder,
     text_table,
     write_table,
@@ -57,7 +60,7 @@ class Publish(Study[xr.Dataset]):
     """
 
     TITLE: ClassVar[str] = "Published numbers and their dependencies"
-    GROWS: ClassVar[tuple[str, ...]] = ("only", "needs", "check_digests")
+    GROWS: ClassVar[tuple[str, ...]] = ("only", "needs", "check_digests", "confirm")
 
     only: tuple[str, ...] = ()
     """Data files to compute again, as fit_coverage or fit_*; by default none."""
@@ -66,6 +69,9 @@ class Publish(Study[xr.Dataset]):
     check_digests: bool = False
     """Whether to fail if the inputs of a published number have changed since it was computed, or
     if STALE in sweeps/render_tables.py, which permits that, lists a number that is up to date."""
+    confirm: str = ""
+    """Reason why changes of the source code altered no number, such as equal digests of small runs,
+    for all files that are stale by their code alone and not in STALE."""
 
     def check(self) -> None:
         """Check that the data files exist."""
@@ -78,6 +84,8 @@ class Publish(Study[xr.Dataset]):
         """Compute selected data files again, and return the state of all data files."""
         if self.only:
             self._compute_again(run)
+        if self.confirm:
+            confirm(self.confirm)
         states = [xr.Dataset(_description(path), {"file": path.stem}) for path in published()]
         results = xr.concat(states, "file")
         states = dict(zip(results.file.values.tolist(), results.state.values.tolist(), strict=True))
@@ -113,8 +121,8 @@ class Publish(Study[xr.Dataset]):
         current = int((results.state == CURRENT).sum())
         text = (
             f"{current} of {results.sizes['file']} data files are of rps_jax {rps_jax.__version__} "
-            "and none of their inputs has changed since. A file without a digest is older than the "
-            "digests: only its command and its commit tell its inputs."
+            "and neither their settings nor their code has changed since. A file without a digest "
+            "is older than the digests: only its command and its commit tell its inputs."
         )
         rows = text_table(columns, records(ordered, "file"))
         return [Table(rows, title="Data files", text=text)]
@@ -139,7 +147,8 @@ def stale_problems(states: Mapping[str, str]) -> list[str]:
         problems.append(
             f"published numbers are stale: the inputs of {', '.join(unlisted)} have changed; "
             f"compute them again by rps sweeps/publish --only {' '.join(unlisted)}, or list them "
-            "in STALE of sweeps/render_tables.py with the change."
+            "in STALE of sweeps/render_tables.py with the change, or, if the code changed and the "
+            "numbers are the same, state why by rps sweeps/publish --confirm REASON."
         )
     if current := sorted(STALE.keys() - stale):
         problems.append(
@@ -147,6 +156,34 @@ def stale_problems(states: Mapping[str, str]) -> list[str]:
             "made stale: remove these names, and run python sweeps/render_tables.py."
         )
     return problems
+
+
+def confirm(reason: str) -> None:
+    """State in `equal.json` that the source code of today gives the numbers of all current files.
+
+    The digests of the code of older files, which have none, are first stored in `commits.json`.
+    """
+    datas = {path.stem: json.loads(path.read_text()) for path in published()}
+    datas = {name: data for name, data in datas.items() if "digest" in data}
+    sources.store({data["commit"] for data in datas.values() if "code" not in data})
+    names, code = [], dict[str, list[str]]()
+    for name, data in datas.items():
+        if name in STALE or not _has_current_settings(data):
+            continue
+        rooms = rooms_of(map(shlex.split, data["command"]))
+        for room in (changed := sources.changed_rooms(name, data, rooms)):
+            code.setdefault(room, []).append(sources.latest(name, room, data))
+        names += [name] if changed else []
+    if names:
+        today = sources.digests()
+        code = {room: [*sorted({*old}), today[room]] for room, old in sorted(code.items())}
+        changes = [*sources.equal_changes(), {"reason": reason, "files": names, "code": code}]
+        files.write_text(sources.EQUAL, json.dumps(changes, indent=1) + "\n")
+
+
+def _has_current_settings(data: Mapping[str, Any]) -> bool:
+    """Return whether the settings of the commands of a data file are those of today."""
+    return digest([shlex.split(command) for command in data["command"]]) == data["digest"]
 
 
 def _description(path: Path) -> dict[str, str]:
@@ -168,20 +205,25 @@ def _description(path: Path) -> dict[str, str]:
 def _state(name: str, data: Mapping[str, Any]) -> str:
     """Return whether a data file is up to date."""
     if "command" not in data:
-        sources = {cell["from"] for row in data["rows"] for cell in row if isinstance(cell, dict)}
-        return f"cites {', '.join(sorted(sources))}"
+        cited = {cell["from"] for row in data["rows"] for cell in row if isinstance(cell, dict)}
+        return f"cites {', '.join(sorted(cited))}"
     if name in HISTORY:
         return f"history: {HISTORY[name]}"
     version = str(data["versions"]["rps_jax"])
     if "digest" not in data:
         return f"computed by {version}, without a digest"
     try:
-        current = digest([shlex.split(command) for command in data["command"]])
+        is_current = _has_current_settings(data)
     except (InputError, SystemExit) as error:
         return f"stale: its command does not exist today ({error})"
-    if current != data["digest"]:
-        change = STALE.get(name, "a change of its laws, domains, physics or seeds")
-        return f"stale: computed before {change}"
+    change = "" if is_current else "a change of its laws, domains, physics or seeds"
+    rooms = rooms_of(map(shlex.split, data["command"]))
+    if not change and (changed := sources.changed_rooms(name, data, rooms)):
+        change = f"a change of the code of {', '.join(changed)}"
+    if change:
+        return f"stale: computed before {STALE.get(name, change)}"
+    if sources.changed_rooms("", data, rooms):
+        return "confirmed: its code changed, its numbers did not, by equal.json"
     return CURRENT if version == rps_jax.__version__ else f"computed by {version}, still current"
 
 
