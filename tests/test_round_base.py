@@ -14,10 +14,13 @@ from rps_jax.control.laws import rps
 from rps_jax.engines.fused.contacts import circle_and_base, polygon_and_base
 from rps_jax.geometry import footprint as fp
 from rps_jax.geometry.footprint import Footprint
-from rps_jax.robot.robot import Robot, parse_robot
+from rps_jax.robot.robot import ROBOTS, Robot, parse_robot
 from rps_jax.robot.shell import Boards
 from rps_jax.robot.skin import NONE, POINT, SKINS, Skin
-from rps_jax.world import scene
+from rps_jax.trials.setting import Setting
+from rps_jax.trials.worlds import drawn_worlds
+from rps_jax.world import draws, scene
+from rps_jax.world.domain import parse_domain
 from rps_jax.world.scene import FRICTION
 
 ROUND = Robot(radius=0.3)
@@ -134,6 +137,14 @@ def test_skin_ends_with_its_boards() -> None:
     for bearing in (0.4, 0.9):
         reading = read(smooth, turned(box(0.503, 0.0), bearing), front)
         assert float(reading.in_contact) == pytest.approx(float(bearing < 0.5))
+
+
+def test_drawn_worlds_have_round_bases():
+    domain = parse_domain("wide,objects=random_box", "round")
+    batch = drawn_worlds(domain, draws.draw(domain, 3, np.arange(4)), Setting("fused"))
+    leaves = jax.tree.leaves((batch.worlds.skin, batch.worlds.robot))
+    assert {np.shape(leaf)[0] for leaf in leaves} == {4}
+    assert np.all(batch.worlds.skin.shell.radius == ROBOTS["round"].radius)
 
 
 def test_rps_gets_the_arc_length() -> None:

@@ -89,7 +89,7 @@ class Shell:
         pitches = [sides[x.side] / x.taxels if x.pitch is None else np.max(x.pitch) for x in boards]
         samples = math.ceil(float(max(pitches)) / _SPACING)
         if len(sizes) == 1:
-            return cls(boards=boards, samples=samples, radius=sizes[0])
+            return cls(sizes[0], boards=boards, samples=samples, radius=sizes[0])
         is_default = np.all(np.asarray(sizes[1]) == HALF_WIDTH)
         return cls(sizes[0], None if is_default else sizes[1], boards, samples)
 
