@@ -9,8 +9,10 @@ import jax.numpy as jnp
 
 from rps_jax.geometry import footprint as fp
 from rps_jax.geometry import planar
-from rps_jax.geometry.arrays import Array, Float, Scalar, namespace_of
+from rps_jax.geometry.arrays import Array, Float, Int, Scalar, namespace_of
 from rps_jax.geometry.footprint import Footprint
+
+_Pair = tuple[Array, Array]  # both coordinates of vectors
 
 
 class Polyline(NamedTuple):
@@ -29,12 +31,32 @@ class Polyline(NamedTuple):
         return cls(vertices, arcs)
 
 
+class _Segments(NamedTuple):
+    """Segments of one polyline, each a number per segment (K - 1,)."""
+
+    # Coordinates are separate arrays: on a GPU, each thread then keeps those of its segments.
+    x: Array  # [m] of the start
+    y: Array  # [m]
+    unit_x: Array  # [1] direction; 0 without a length
+    unit_y: Array  # [1]
+    first: Array  # [m] arc length at the start
+    length: Array  # [m]
+
+    @classmethod
+    def of(cls, line: Polyline) -> _Segments:
+        """Return the segments of a polyline."""
+        x, y = line.vertices[:, 0], line.vertices[:, 1]
+        length = jnp.diff(line.arcs)
+        scale = 1 / jnp.where(length > 0, length, 1.0)
+        return cls(x[:-1], y[:-1], jnp.diff(x) * scale, jnp.diff(y) * scale, line.arcs[:-1], length)
+
+
 def at_arc(line: Polyline, arc: Scalar) -> Float[Array, "2"]:
     """Return the point [m] of one polyline at an arc length [m], at most its whole length."""
-    lengths = jnp.diff(line.arcs)
-    units = jnp.diff(line.vertices, axis=0) / jnp.where(lengths > 0, lengths, 1.0)[:, None]
-    passed = jnp.clip(arc - line.arcs[:-1], 0.0, lengths)
-    return line.vertices[0] + jnp.sum(passed[:, None] * units, axis=0)
+    of = _Segments.of(line)
+    passed = jnp.clip(arc - of.first, 0.0, of.length)
+    away = [jnp.sum(passed * unit) for unit in (of.unit_x, of.unit_y)]
+    return line.vertices[0] + jnp.stack(away)
 
 
 def nearest(
@@ -44,86 +66,107 @@ def nearest(
 
     Only arc lengths from `low` to `high` [m] count, so that a path may return to itself.
     """
-    start, first, last = line.vertices[:-1], line.arcs[:-1], line.arcs[1:]
-    lengths = last - first
-    units = jnp.diff(line.vertices, axis=0) / jnp.where(lengths > 0, lengths, 1.0)[:, None]
-    x, y = point[0] - start[:, 0], point[1] - start[:, 1]
-    ahead = x * units[:, 0] + y * units[:, 1]
-    ahead = jnp.clip(ahead, jnp.maximum(low - first, 0.0), jnp.minimum(high - first, lengths))
-    away_x, away_y = x - ahead * units[:, 0], y - ahead * units[:, 1]
-    counts = (first <= high) & (last >= low)
+    of = _Segments.of(line)
+    x, y = point[0] - of.x, point[1] - of.y
+    ahead = x * of.unit_x + y * of.unit_y
+    ahead = jnp.clip(
+        ahead, jnp.maximum(low - of.first, 0.0), jnp.minimum(high - of.first, of.length)
+    )
+    away_x, away_y = x - ahead * of.unit_x, y - ahead * of.unit_y
+    counts = (of.first <= high) & (of.first + of.length >= low)
     squares = jnp.where(counts, away_x * away_x + away_y * away_y, jnp.inf)
     chosen = jnp.argmin(squares)
-    return first[chosen] + ahead[chosen], planar.safe_sqrt(squares[chosen])
+    return of.first[chosen] + ahead[chosen], planar.safe_sqrt(squares[chosen])
 
 
 def clearance(
     outline: Footprint, walls: Float[Array, "W 2 2"]
-) -> tuple[Float[Array, ""], Float[Array, "2"]]:
-    """Return the signed distance [m] of an outline from walls, and the nearest point [m] of these.
+) -> tuple[Float[Array, ""], Int[Array, ""]]:
+    """Return the signed distance [m] of an outline from walls, and the index of the nearest wall.
 
     A wall is a segment between two points [m]. The distance is exact; where the outline crosses a
     wall, it is minus the shortest way out of it.
     """
-    corners, (start, end) = outline.vertices, (walls[:, 0], walls[:, 1])
-    along = end - start
-    length = planar.norm(along)[:, None]
-    normal = planar.rotate(jnp.pi / 2, along) / jnp.where(length > 0, length, 1.0)
+    corners = outline.vertices
     ahead = jnp.roll(corners, -1, axis=0)
+    # Coordinates are separate arrays: see `_Segments`.
+    start = walls[:, 0, 0], walls[:, 0, 1]
+    along = _Vectors.of(walls[:, 1, 0] - start[0], walls[:, 1, 1] - start[1])
+    normal = along.normal
 
     def include(i: Array, least: tuple[Array, ...]) -> tuple[Array, ...]:
         """Include corner i and the edge that follows it."""
         square, low, high, gap = least
-        corner = corners[i]
-        height = _dot(corner - start, normal)
-        edge = ahead[i] - corner
-        size = planar.norm(edge)
-        out = jnp.stack([edge[1], -edge[0]]) / jnp.where(size > 0, size, 1.0)
-        for distance2 in (
-            _square(start, along, corner), _square(corner, edge, start), _square(corner, edge, end)
-        ):  # fmt: skip
-            square = jnp.minimum(square, distance2)
-        beyond = jnp.minimum(_dot(start - corner, out), _dot(end - corner, out))
-        gap = jnp.maximum(gap, jnp.where(size > 0, beyond, -jnp.inf))
+        corner = corners[i, 0], corners[i, 1]
+        edge = _Vectors.of(ahead[i, 0] - corner[0], ahead[i, 1] - corner[1])
+        to_corner = corner[0] - start[0], corner[1] - start[1]
+        to_start = -to_corner[0], -to_corner[1]
+        to_end = to_start[0] + along.x, to_start[1] + along.y
+        for way, segment in ((to_corner, along), (to_start, edge), (to_end, edge)):
+            square = jnp.minimum(square, _square(way, segment))
+        height = _dot(to_corner, normal)
+        # The normal of an edge points into the outline, whose corners turn to the left.
+        inside = jnp.maximum(_dot(to_start, edge.normal), _dot(to_end, edge.normal))
+        gap = jnp.maximum(gap, jnp.where(edge.inverse > 0, -inside, -jnp.inf))
         return square, jnp.minimum(low, height), jnp.maximum(high, height), gap
 
-    infinite = jnp.full(walls.shape[:1], jnp.inf)
+    infinite = jnp.full(walls.shape[:1], jnp.inf, walls.dtype)
     # A loop in compiled programs: a GPU would store the arrays of all corners at once.
     square, low, high, gap = jax.lax.fori_loop(
         0, len(corners), include, (infinite, infinite, -infinite, -infinite)
     )
-    gap = jnp.maximum(gap, jnp.where(length[:, 0] > 0, jnp.maximum(low, -high), -jnp.inf))
+    gap = jnp.maximum(gap, jnp.where(along.inverse > 0, jnp.maximum(low, -high), -jnp.inf))
     distance = planar.safe_sqrt(square)
     if len(corners) > 1:  # a point has no inside
         distance = jnp.where(gap > 0, distance, gap)
     chosen = jnp.argmin(distance)
-    return distance[chosen] - outline.radius, _nearest_on_wall(outline, walls[chosen])
+    return distance[chosen] - outline.radius, chosen
 
 
-def _nearest_on_wall(outline: Footprint, wall: Float[Array, "2 2"]) -> Float[Array, "2"]:
+def nearest_on_wall(outline: Footprint, wall: Float[Array, "2 2"]) -> Float[Array, "2"]:
     """Return the point [m] of one wall that is nearest to an outline."""
-    along, corners = wall[1] - wall[0], outline.vertices
-    points = jnp.concatenate([wall[0] + _share(wall[0], along, corners)[:, None] * along, wall])
+    along, way = wall[1] - wall[0], outline.vertices - wall[0]
+    pair = (way[:, 0], way[:, 1]), _Vectors.of(along[0], along[1])
+    points = jnp.concatenate([wall[0] + _share(*pair)[:, None] * along, wall])
     to_ends = fp.signed_distance(outline, wall) + outline.radius
-    squares = jnp.concatenate([_square(wall[0], along, corners), to_ends**2])
+    squares = jnp.concatenate([_square(*pair), to_ends**2])
     return points[jnp.argmin(squares)]
 
 
-def _dot(a: Float[Array, "... 2"], b: Float[Array, "... 2"]) -> Float[Array, "..."]:
-    return a[..., 0] * b[..., 0] + a[..., 1] * b[..., 1]
+class _Vectors(NamedTuple):
+    """Vectors from the start to the end of segments, with the inverse of their squared lengths."""
+
+    x: Array  # [m]
+    y: Array  # [m]
+    inverse: Array  # [1/m^2] 0 without a length
+
+    @classmethod
+    def of(cls, x: Array, y: Array) -> _Vectors:
+        """Return vectors by their coordinates."""
+        square = x * x + y * y
+        return cls(x, y, jnp.where(square > 0, 1 / jnp.where(square > 0, square, 1.0), 0.0))
+
+    @property
+    def normal(self) -> _Pair:
+        """Unit vectors to the left [1]."""
+        scale = planar.safe_sqrt(self.inverse)
+        return -self.y * scale, self.x * scale
 
 
-def _share(
-    start: Float[Array, "... 2"], along: Float[Array, "... 2"], point: Float[Array, "... 2"]
-) -> Float[Array, "..."]:
-    """Return the point of segments nearest to points, as a share of the segment's length."""
-    length2 = _dot(along, along)
-    return jnp.clip(_dot(point - start, along) / jnp.where(length2 > 0, length2, 1.0), 0.0, 1.0)
+def _dot(a: _Pair, b: _Pair) -> Array:
+    return a[0] * b[0] + a[1] * b[1]
 
 
-def _square(
-    start: Float[Array, "... 2"], along: Float[Array, "... 2"], point: Float[Array, "... 2"]
-) -> Float[Array, "..."]:
-    """Return the squared distance [m^2] of points from segments."""
-    away = point - start - _share(start, along, point)[..., None] * along
+def _share(way: _Pair, along: _Vectors) -> Array:
+    """Return the point of segments nearest to a point, as a share of a segment's length.
+
+    `way` [m] is from a segment's start to the point.
+    """
+    return jnp.clip(_dot(way, along[:2]) * along.inverse, 0.0, 1.0)
+
+
+def _square(way: _Pair, along: _Vectors) -> Array:
+    """Return the squared distance [m^2] of points from segments: see `_share`."""
+    share = _share(way, along)
+    away = way[0] - share * along.x, way[1] - share * along.y
     return _dot(away, away)

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Hashable
 from dataclasses import dataclass
-from typing import Any, ClassVar, Literal, NamedTuple
+from typing import Any, ClassVar, Literal, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -20,6 +20,7 @@ from rps_jax import errors
 from rps_jax.geometry import footprint as fp
 from rps_jax.geometry import planar, polyline
 from rps_jax.geometry.arrays import Array, Entries, Float, Int, namespace_of
+from rps_jax.geometry.footprint import Footprint
 from rps_jax.geometry.polyline import Polyline
 from rps_jax.record.options import option
 from rps_jax.robot.shell import Shell
@@ -36,6 +37,7 @@ _JOINT = 0.01
 _NOWHERE = ((1e4, 1e4), (1e4 + 1, 1e4))  # [m] wall that nothing touches
 _STEPS = 5  # control steps between two measurements of the walls, unless one may be touched
 NOTHING, BASE, OBJECT = 0, 1, 2  # what touched a wall
+_T = TypeVar("_T")  # a pytree
 
 
 class CorridorProgress(NamedTuple):
@@ -103,30 +105,39 @@ class CorridorCourse(NamedTuple):
         may_touch = progress.measured <= jnp.max(travel)
         due = may_touch | (progress.steps % _STEPS == 0)
 
-        def measure(carry: Any) -> Any:
-            poses = carry[-1]  # changed by the pass: what does not change is computed before
+        def place(poses: Array) -> list[Footprint]:
+            """Return both outlines, with the base at the origin."""
             origin = poses[0, :2]
             pairs = zip(outlines, poses, strict=True)
-            placed = [fp.place(outline, pose[:2] - origin, pose[2]) for outline, pose in pairs]
+            return [fp.place(outline, pose[:2] - origin, pose[2]) for outline, pose in pairs]
+
+        def measure(poses: Array, last: _Measured) -> _Measured:
+            walls = self.walls - poses[0, :2]
             (of_base, at_base), (of_object, at_object) = (
-                polyline.clearance(x, self.walls - origin) for x in placed
+                polyline.clearance(x, walls) for x in place(poses)
             )
             room = of_object if self.surroundings is None else of_object + _PRESSED
             by_base = of_base <= room
             least = jnp.where(by_base, of_base, room)
             touched = jnp.where(least > 0, NOTHING, jnp.where(by_base, BASE, OBJECT))
-            point = jnp.where(least > 0, jnp.nan, origin + jnp.where(by_base, at_base, at_object))
-            clearance = jnp.minimum(progress.clearance, jnp.minimum(of_base, of_object))
-            touch = touched.astype(least.dtype), point
-            return jnp.zeros((), bool), clearance, *touch, least, poses, jnp.zeros_like(poses)
+            clearance = jnp.minimum(last.clearance, jnp.minimum(of_base, of_object))
+            wall = jnp.where(by_base, at_base, at_object)
+            return _Measured(clearance, touched.astype(least.dtype), wall, least, poses)
 
-        # A loop of at most one pass: a program for many worlds skips the pass if no world needs it.
-        last = progress.clearance, progress.wall_touch, progress.p_world_touch
-        carry = due, *last, progress.measured, progress.measured_at, poses
-        _, clearance, touched, point, measured, measured_at, _ = jax.lax.while_loop(
-            lambda x: x[0], measure, carry
-        )
-        state = clearance, touched, point, measured, measured_at
+        def locate(poses: Array, last: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+            touch, wall, _ = last
+            of_wall = self.walls[wall] - poses[0, :2]
+            points = [polyline.nearest_on_wall(x, of_wall) for x in place(poses)]
+            return touch, wall, poses[0, :2] + jnp.where(touch == BASE, *points)
+
+        last = _Measured(
+            progress.clearance, progress.wall_touch, jnp.zeros((), jnp.int32), progress.measured,
+            progress.measured_at,
+        )  # fmt: skip
+        now = _where_due(due, measure, poses, last)
+        found = now.wall_touch, now.wall, progress.p_world_touch
+        *_, point = _where_due(now.wall_touch > NOTHING, locate, poses, found)
+        state = now.clearance, now.wall_touch, point, now.measured, now.measured_at
         moved = CorridorProgress(inner, *state, progress.steps + 1)
         return moved, aim._replace(failed=moved.wall_touch > NOTHING)
 
@@ -137,6 +148,29 @@ class CorridorCourse(NamedTuple):
     def lines(self) -> dict[str, np.ndarray]:
         """Return path and walls."""
         return self.path.lines() | {"walls": np.asarray(self.walls)}
+
+
+class _Measured(NamedTuple):
+    """Last measurement of the walls; fields as in `CorridorProgress`."""
+
+    clearance: Array
+    wall_touch: Array
+    wall: Array  # () index of the nearest wall
+    measured: Array
+    measured_at: Array
+
+
+def _where_due(due: Array, function: Callable[[Array, _T], _T], poses: Array, last: _T) -> _T:
+    """Return `function(poses, last)` where it is due, else `last`.
+
+    It is a loop of at most one pass: a program for many worlds skips the pass if no world needs it.
+    """
+
+    def once(carry: tuple[Array, Array, _T]) -> tuple[Array, Array, _T]:
+        _, poses, last = carry  # changed by the pass: what does not change is computed before
+        return jnp.zeros((), bool), jnp.zeros_like(poses), function(poses, last)
+
+    return jax.lax.while_loop(lambda carry: carry[0], once, (due, poses, last))[-1]
 
 
 @dataclass(frozen=True)
