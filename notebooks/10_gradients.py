@@ -17,12 +17,9 @@
 import jax
 import matplotlib.pyplot as plt
 import numpy as np
-from IPython.display import Markdown
 
 import rps_jax
 from rps_jax.tuning import gradients
-from sweeps import render_tables
-from sweeps.gradients import estimators
 
 
 def final_distance(trajectory):  # [m] from the contact to the target
@@ -95,12 +92,10 @@ axes[0].set(xlabel="horizon [s]", ylabel="norm of the gradient [m]")
 axes[1].set(xlabel="horizon [s]", ylabel="median relative error [1]")
 _ = axes[0].legend(*axes[1].get_legend_handles_labels(), title="temperature of taxels")
 
-# %%
-rows = (f"gradients_growth | boxes | {x}" for x in ("whole derivative", "without contact point"))
-whole, rest = (render_tables.cell(f"{row} | largest") for row in rows)
-Markdown(f"A change of a box grows up to {whole}-fold, without the felt contact point {rest}-fold.")
-
 # %% [markdown]
+# A change of a box grows up to <!-- cell: gradients_growth | boxes | whole derivative | largest -->1.8e+13<!-- end -->-fold, without
+# the felt contact point <!-- cell: gradients_growth | boxes | without contact point | largest -->1.9e+02<!-- end -->-fold.
+#
 # The cause is this loop: the contact point moves along the face, the law turns the base, and the
 # object turns. A few worlds then dominate a mean over worlds. A bound on their norms (`clipped`) is
 # biased, wider taxels are another skin, and short windows lack later effects. Mean derivatives by
@@ -109,7 +104,8 @@ Markdown(f"A change of a box grows up to {whole}-fold, without the felt contact 
 # %%
 for seconds in (2, 8):
     samples = {name: x[:, 50 * seconds - 25] for name, x in slopes.items()}
-    samples["boxes, clipped"] = estimators.clip(samples["boxes"], 2.0)
+    norm = np.linalg.norm(samples["boxes"], axis=1, keepdims=True)
+    samples["boxes, clipped"] = samples["boxes"] * np.minimum(1.0, 2.0 * np.median(norm) / norm)
     for name, (mean, variance, _) in ((k, gradients.estimate(x)) for k, x in samples.items()):
         print(f"{seconds} s, {name}: {mean[0]:.4f} +- {variance[0] ** 0.5:.4f}")
 
@@ -149,10 +145,10 @@ print(f"median error {np.median(error):.4f}, in {np.sum(error < 2 * precision**-
 # Derivatives of short windows do not tune a law: windows do not contain whether a push fails later.
 # `rps tune grad` follows slopes of whole trials along random steps instead, and `rps tune es`
 # evolution ([the race](../sweeps/gradients/README.md)). Success in held-out worlds by number of
-# tuned parameters, after equal wall time, best first:
-
-# %%
-rows = [row for row in render_tables.load("gradients_race")["rows"] if row[1] != "simulated time"]
-rows.sort(key=lambda row: float(row[3].split()[0]), reverse=True)
-lines = [f"| {method} | {count} | {success} |" for count, _, method, success, *_ in rows]
-Markdown("\n".join(["| method | parameters | success |", "| --- | --- | --- |", *lines]))
+# tuned parameters, after equal wall time, from <!-- cell: gradients_race |  | success, mean -->89.0 %<!-- end --> at the
+# start:
+#
+# - 13 parameters, slopes: <!-- cell: gradients_race | 13 | wall time | slopes | success, mean -->98.0 %<!-- end -->
+# - 13 parameters, evolution: <!-- cell: gradients_race | 13 | wall time | evolution | success, mean -->96.9 %<!-- end -->
+# - 6 parameters, slopes: <!-- cell: gradients_race | 6 | wall time | slopes | success, mean -->96.0 %<!-- end -->
+# - 6 parameters, evolution: <!-- cell: gradients_race | 6 | wall time | evolution | success, mean -->93.7 %<!-- end -->

@@ -19,7 +19,6 @@ from rps_jax.control.laws import rps
 from rps_jax.control.laws.rps import RPSParams, RPSState
 from rps_jax.control.observation import Details, Observation, Twist
 from rps_jax.robot import shell
-from sweeps import render_tables
 
 
 def listed(names: Iterable[str]) -> str:
@@ -164,6 +163,8 @@ def time_to_success(results: xr.Dataset, law: str) -> Figure:
 
 def printed_numbers() -> Figure:
     """Plot numbers that the paper prints beside their predictions: medians, 5 to 95 %."""
+    from sweeps import render_tables  # of the repository
+
     data = render_tables.load("reading_numbers")
     names = [column["name"] for column in data["columns"]]
     rows = [dict(zip(names, row, strict=True)) for row in data["rows"]]

@@ -203,6 +203,12 @@ def pages(root: Path = ROOT) -> list[Path]:
     return sorted(paths)
 
 
+def notebooks(root: Path = ROOT) -> list[Path]:
+    """Return the notebooks and their texts, whose sentences have cells of tables."""
+    paths = (root / "notebooks").glob("[0-9]*")
+    return sorted(path for path in paths if path.suffix in (".py", ".ipynb"))
+
+
 def main(arguments: list[str]) -> int:
     """Render all pages, or check that they match the data; return the exit code."""
     if arguments not in ([], ["--check"]):
@@ -212,7 +218,7 @@ def main(arguments: list[str]) -> int:
     try:
         for name in data_files():
             table(load(name))
-        for page in pages():
+        for page in (*pages(), *notebooks()):
             rendered = render(page)
             if rendered != page.read_text(encoding="utf-8"):
                 stale.append(page)

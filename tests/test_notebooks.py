@@ -5,17 +5,20 @@ import importlib.util
 import os
 import re
 import runpy
+import shutil
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 
 import jupytext
 import nbformat
 import pytest
-from helpers import addresses, imported
+from helpers import addresses, imported, output_of, rps
 
 import rps_jax
 from rps_jax.analysis import statistics
+from rps_jax.app import notebooks
 from sweeps import render_tables
 
 FOLDER = Path(__file__).parents[1] / "notebooks"
@@ -90,16 +93,64 @@ def test_it_runs_and_if_it_only_reads_prints_the_stored_output(
         assert printed(notebook) == printed(expected)
 
 
-TUTORIALS = [text.stem for text in RUNNER["TUTORIALS"]]
-
-
-@pytest.mark.parametrize("name", TUTORIALS)
-def test_a_tutorial_needs_the_package_alone(name):
+@pytest.mark.parametrize("name", notebooks.NAMES)
+def test_a_notebook_of_the_package_needs_the_package_alone(name):
     modules = set(re.findall(r"^(?:import|from) (\w+)", TEXTS[name].read_text(), re.MULTILINE))
-    dependencies = {"jax", "matplotlib", "numpy", "pandas", "pathlib", "scipy", "typing", "xarray"}
+    dependencies = {"IPython", "drawing", "jax", "matplotlib", "numpy", "pandas", "pathlib"}
+    dependencies |= {"scipy", "tempfile", "typing", "xarray"}
     assert modules - dependencies - ({"gymnasium"} if name.startswith("09") else set()) == {
         "rps_jax"
     }
+
+
+def test_notebooks_are_copied_without_outputs_and_overwrite_nothing(tmp_path, capsys):
+    folder = tmp_path / "mine"
+    assert rps("notebooks", folder) == 0
+    assert capsys.readouterr().out.strip() == f"notebooks: {folder}"
+    names = sorted(path.name for path in folder.iterdir())
+    assert names == sorted([*(f"{name}.ipynb" for name in notebooks.NAMES), "drawing.py"])
+    for name in notebooks.NAMES:
+        copy = nbformat.read(folder / f"{name}.ipynb", as_version=4)
+        nbformat.validate(copy)
+        code, expected = ([c.source for c in x.cells if c.cell_type == "code"]
+                          for x in (copy, stored(name)))  # fmt: skip
+        assert code == expected
+        assert not any(cell.get("outputs") for cell in copy.cells)
+        assert "](../" not in "".join(cell.source for cell in copy.cells)
+    assert rps("notebooks", folder) == 2
+    assert re.search(r"out = .* already has 01_the_law\.ipynb", capsys.readouterr().err)
+
+
+def test_a_wheel_has_the_texts_of_the_notebooks():
+    project = tomllib.loads((FOLDER.parent / "pyproject.toml").read_text())
+    included = project["tool"]["hatch"]["build"]["targets"]["wheel"]["force-include"]
+    names = [*notebooks.NAMES, "drawing"]
+    expected = {f"notebooks/{name}.py": f"rps_jax/notebooks/{name}.py" for name in names}
+    assert included == {"mjcf": "rps_jax/mjcf"} | expected
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["01_the_law", "08_analysis"])
+def test_a_notebook_runs_from_an_installed_package(name, tmp_path):
+    """The package is a copy without the repository, in the layout of a wheel."""
+    package = tmp_path / "site" / "rps_jax"
+    shutil.copytree(FOLDER.parent / "rps_jax", package)
+    shutil.copytree(FOLDER.parent / "mjcf", package / "mjcf")
+    (package / "notebooks").mkdir()
+    for stem in (*notebooks.NAMES, "drawing"):
+        shutil.copy(FOLDER / f"{stem}.py", package / "notebooks")
+    script = (
+        "import nbformat, sys; from nbclient import NotebookClient; import rps_jax\n"
+        "from rps_jax.app.notebooks import notebooks\n"
+        f"notebooks({str(tmp_path / 'mine')!r})\n"
+        f"book = nbformat.read({str(tmp_path / 'mine' / f'{name}.ipynb')!r}, 4)\n"
+        f"options = dict(resources=dict(metadata=dict(path={str(tmp_path / 'mine')!r})))\n"
+        "NotebookClient(book, timeout=600, kernel_name='python3', **options).execute()\n"
+        "print(rps_jax.__file__)"
+    )
+    environment = os.environ | {"PYTHONPATH": str(package.parent)}
+    words = [sys.executable, "-c", script]
+    assert output_of(*words, cwd=tmp_path, env=environment).strip() == str(package / "__init__.py")
 
 
 def test_the_first_page_lists_all_notebooks_and_examples():
@@ -152,7 +203,7 @@ def test_notebooks_show_the_cells_of_tables_that_they_cite():
                 expected = eval(compile(ast.Expression(last.value), name, "eval"), names)
                 assert output.data["text/markdown"] == expected
                 cited.append(name)
-    assert cited == ["03_paper"] * 4 + ["05_tuning"] + ["10_gradients"] * 2
+    assert cited == ["03_paper"] * 4 + ["05_tuning"]
 
 
 def test_training_by_stable_baselines3_as_the_tutorial_shows_it(tmp_path):

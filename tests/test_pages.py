@@ -24,7 +24,7 @@ def anchors(page):
     }
 
 
-@pytest.mark.parametrize("page", PAGES, ids=relative)
+@pytest.mark.parametrize("page", [*PAGES, *TABLES["notebooks"]()], ids=relative)
 def test_tables_match_their_data(page):
     assert TABLES["render"](page) == page.read_text()
 
