@@ -49,8 +49,8 @@ def _load_package_laws() -> None:
         for name, params in module.PRESETS.items():
             _LAWS_BY_CLASS[type(params)] = module.LAW
             _table(name)[name] = params
-    for name, path in policy.SHIPPED.items():
-        _, law, params = policy.build_law(policy.decode(path.read_bytes(), path))
+    for name in policy.SHIPPED:
+        _, law, params = policy.build_law(policy.read(name))
         _LAWS_BY_CLASS[type(params)], LAWS[name] = law, params
 
 
@@ -236,8 +236,7 @@ def _find_registered(module: str, kind: str) -> tuple[str, LawParams] | None:
 
 def _load_policy(path: Path) -> tuple[str, LawParams]:
     """Register the learned law of a file, and return its name and parameters."""
-    content = files.read_regular(path, "policy")
-    name, law, params = policy.build_law(policy.decode(content, path))
+    name, law, params = policy.build_law(policy.read(str(path)))
     kind = type(params).__name__  # contains a digest, so that a copy is the law that is known
     name = next((known for known, p in LAWS.items() if type(p).__name__ == kind), name)
     if name not in LAWS:

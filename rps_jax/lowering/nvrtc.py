@@ -50,8 +50,10 @@ def images(texts: Sequence[str]) -> list[bytes]:
     Raises:
       RuntimeError: the compiler that fails, and its first error.
     """
-    with ThreadPoolExecutor(len(texts)) as pool:
-        return list(pool.map(_image, texts))
+    different = list(dict.fromkeys(texts))
+    with ThreadPoolExecutor(len(different)) as pool:
+        images = dict(zip(different, pool.map(_image, different), strict=True))
+    return [images[text] for text in texts]
 
 
 def _image(text: str) -> bytes:

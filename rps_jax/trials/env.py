@@ -13,7 +13,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import itertools
-from collections.abc import Sequence
+from collections.abc import Hashable, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -28,7 +28,7 @@ from rps_jax.control.laws import rps
 from rps_jax.control.laws.rps import RPSParams
 from rps_jax.control.learned import features
 from rps_jax.control.observation import Observation, TaxelObservation, Twist
-from rps_jax.engines import device
+from rps_jax.engines import device, native
 from rps_jax.engines.base import ControlPeriod
 from rps_jax.engines.mjx_colliders import mjx
 from rps_jax.geometry import footprint as fp
@@ -59,6 +59,7 @@ class Reward(NamedTuple):
     # Terms that use the true state, which a law does not observe.
     object: float = 0.0  # [1/m] of the decrease of the way from outline to target
     behind: float = 0.0  # [1] of the increase of the cosine between directions to target and object
+    failure: float = 0.0  # [1] cost once, of a trial that ends without success
 
 
 # Default weights of `rps learn` and of the Gymnasium environment.
@@ -190,10 +191,11 @@ class PushEnv:
             self.weights.progress * progress
             - self.weights.no_contact * self.dt * soft.not_(measured.reading.in_contact)
             + self.weights.success * current.success
+            - self.weights.failure * (current.done & ~current.success)
         )
         targets = state.info["observation"].touch, measured.observation
         terms = self._true_state_terms(world, previous, current, *targets)
-        for weight, term in zip(self.weights[3:], terms, strict=True):
+        for weight, term in zip(self.weights[3:5], terms, strict=True):
             reward += weight * term if weight else 0.0
         obs = self._observation(world, current, measured)
         return state.replace(
@@ -273,6 +275,17 @@ class PushEnv:
     def action_size(self) -> int:
         """Length of an action."""
         return len(Twist._fields)
+
+    @property
+    def static(self) -> Hashable:
+        """Everything that its functions depend on, but for worlds, states and actions."""
+        shared = self.is_native or self  # a native stage has no numbers of its worlds
+        return shared, self.params, self.setting, self.weights, self.smooth
+
+    @property
+    def is_native(self) -> bool:
+        """Whether `engines.native` can compile its functions of one world."""
+        return getattr(self._batch.stage, "native", False) and native.is_available()
 
     @property
     def dt(self) -> float:

@@ -111,6 +111,11 @@ class Learn(PPO, TaskOption, SimulationQuestion[xr.Dataset]):
     """Number of random worlds of each shape and domain; every trial uses one of them."""
     validation: int = option(128, 1, 1_000_000)
     """Number of worlds for validation of each shape and domain."""
+    success: float = option(1.0, 0, 100)
+    """Reward of a success [1]; the rest of a trial earns at most about 1 per metre."""
+    failure: float = option(0.0, 0, 100)
+    """Cost of a trial that ends without success [1]. Above 0, a time limit ends a trial for the
+    value function, too, which otherwise continues it."""
     every: float = option(1.0, above=0, at_most=1e4, unit="min")
     """Wall clock between two checkpoints [min]. The law is validated at the first checkpoint, at
     the end, and at every checkpoint for which validation takes at most a tenth of the time."""
@@ -143,6 +148,12 @@ class Learn(PPO, TaskOption, SimulationQuestion[xr.Dataset]):
         if self.num_minibatches > count:
             rule = f"there are only {count} worlds; raise num_envs"
             raise errors.not_allowed("num_minibatches", self.num_minibatches, rule)
+        if self.initial:
+            network = policies.read(self.initial).network
+            for name, field in (("network", "kind"), ("width", "width"), ("hold", "hold")):
+                if getattr(self, name) != (expected := getattr(network, field)):
+                    rule = f"the initial law {self.initial} has {expected}"
+                    raise errors.not_allowed(name, getattr(self, name), rule)
         period = self.setting.physics.control_period
         errors.check_number("hold", self.hold, at_least=0.999 * period, unit="s")
 
@@ -155,8 +166,9 @@ class Learn(PPO, TaskOption, SimulationQuestion[xr.Dataset]):
         tune = split == "tune"
         rules, worlds = (self.setting.rules, self.drawn) if tune else (Rules(), self.validation)
         setting = replace(self.setting, rules=rules, seed=seed_of(self.setting.seed, split))
+        reward = SHAPED_REWARD._replace(success=self.success, failure=self.failure)
         return [
-            PushEnv(name, domain, RPSParams(), setting, weights=SHAPED_REWARD, worlds=worlds)
+            PushEnv(name, domain, RPSParams(), setting, weights=reward, worlds=worlds)
             for domain in self.domains
             for name in domain.objects
         ]
@@ -237,6 +249,14 @@ class _Learner:
         self.compile = time.perf_counter() - compile_start
         # A copy: no two leaves may share memory, which updates write to.
         self.runner: RunnerState = jax.tree.map(jnp.copy, compiled_start(tables))
+        if options.initial:
+            actor = jax.device_put(policies.read(options.initial).weights)
+            weights, ema = (
+                self.runner.train.weights | {"actor": actor},
+                jax.tree.map(jnp.copy, actor),
+            )
+            train = self.runner.train._replace(weights=weights, ema=ema)
+            self.runner = self.runner._replace(train=train)
         self.best = jax.device_get(self.runner.train.ema)
         self.best_rate, self.curve = -1.0, list[Metrics]()
         self._restore()
@@ -257,7 +277,10 @@ class _Learner:
             return bool(late or (updates and len(self.curve) >= updates))
 
         while not is_finished():
-            self.runner, metrics = self._update(self._tables, self.runner)
+            shares = self.elapsed / (seconds or np.inf), len(self.curve) / (updates or np.inf)
+            progress = jnp.asarray(max(shares), float)
+            runner = self.runner._replace(progress=progress)
+            self.runner, metrics = self._update(self._tables, runner)
             self._record({name: float(x) for name, x in jax.device_get(metrics).items()})
             if self.elapsed - last_checkpoint > 60 * self.options.every and not is_finished():
                 if self.elapsed - last_validation > _VALIDATION_RATIO * reserve:

@@ -24,6 +24,7 @@ from rps_jax.record.options import option
 
 PRIVATE_SIGNS = np.array([1, -1, 1, 1, 1], np.float32)  # of `private` inputs in the mirror image
 _LOG_STD = (-2.5, 0.5)  # bounds on the log standard deviation of an action
+_CRITIC_RATE = 1e-3  # learning rate while the value function alone is learned
 Pair = tuple[jax.Array, jax.Array]
 UpdateCarry = tuple[Weights, optax.OptState, jax.Array]  # weights, optimiser, learning rate
 
@@ -60,9 +61,24 @@ class PPO:
     target_kl: float = option(0.01, above=0, at_most=1)
     """KL divergence of the updated policy from the acting one that the learning rate maintains."""
     level: float = option(0.15, above=0, at_most=1)
-    """Initial level of the curriculum: share of the domain's bearings and distances, up to 1."""
+    """Initial level of the curriculum: share of the domain's bearings and distances, up to 1. With
+    an initial law it is 1."""
     enough: float = option(0.7, 0, 1)
     """Success rate at which the level rises."""
+    initial: str | None = None
+    """Initial law: learned_gru, learned_mlp or the file of a policy. By default random weights."""
+    value_updates: int = option(30, 0, 10**6)
+    """Number of first updates that change the value function alone; only with an initial law."""
+    spread: float = option(0.6, 0.09, 1.6)
+    """Initial standard deviation of the actions [1]; of an initial law rather 0.25."""
+    hard: float = option(0.0, 0, 1)
+    """Share of trials whose worlds are drawn by their recent failures: most often those that
+    sometimes fail."""
+    anneal: float = option(0.0, 0, 1)
+    """Share of the run, at its end, in which target_kl, ent_coef and the greatest learning rate
+    fall to a twentieth."""
+    average: int = option(20, 1, 100_000)
+    """Number of updates over which the weights of the law are averaged."""
 
     @property
     def gamma(self) -> float:
@@ -73,6 +89,10 @@ class PPO:
     def gae_lambda(self) -> float:
         """Lambda of generalised advantage estimation [1]."""
         return math.exp(-self.hold / self.gae_time)
+
+    def schedule(self, progress: jax.Array) -> jax.Array:
+        """Return the factor () of annealed options, after a share of the run."""
+        return jnp.clip((1 - progress) / max(self.anneal, 1e-6), 0.05, 1)
 
 
 class TrainState(NamedTuple):
@@ -91,7 +111,7 @@ class TrainState(NamedTuple):
         weights: Weights = {
             "actor": network.init(actor),
             "critic": networks.init_weights(networks.critic_shapes(inputs, ppo.width), critic),
-            "log_std": jnp.full(3, math.log(0.6)),
+            "log_std": jnp.full(3, math.log(ppo.spread)),
         }
         ema = jax.tree.map(jnp.copy, weights["actor"])
         return cls(weights, ema, _optimiser().init(weights), jnp.asarray(ppo.learning_rate, float))
@@ -171,6 +191,7 @@ def loss(
     steps: Transition,  # leaves (T, N, ...)
     advantage: jax.Array,  # (T, N) [1], normalised
     target: jax.Array,  # (T, N) [1] of the value function
+    schedule: jax.Array | float = 1.0,  # () factor of ent_coef
 ) -> tuple[jax.Array, jax.Array]:
     """Return the loss of a minibatch of worlds, and the KL divergence from the acting policy."""
     mean = means(network, weights["actor"], hidden, steps)
@@ -181,7 +202,7 @@ def loss(
     value_loss = jnp.mean((value - target) ** 2)
     entropy = jnp.sum(weights["log_std"])
     kl = jnp.mean(ratio - 1 - change)  # always positive, with little variance
-    return 0.5 * value_loss - gain - ppo.ent_coef * entropy, kl
+    return 0.5 * value_loss - gain - schedule * ppo.ent_coef * entropy, kl
 
 
 def update_policy(
@@ -191,6 +212,8 @@ def update_policy(
     key: jax.Array,
     hidden: jax.Array,
     steps: Transition,
+    schedule: jax.Array | float = 1.0,  # () factor of annealed options
+    frozen: jax.Array | bool = False,  # () bool: whether the policy does not change
 ) -> tuple[TrainState, jax.Array]:
     """Update the weights by all passes over transitions; return the new state and the mean KL
     divergence of the steps."""
@@ -207,17 +230,22 @@ def update_policy(
         weights, optimiser, rate = carry
         data = jax.tree.map(lambda x: x[:, batch], (steps, advantage, target))
         loss_of = partial(loss, ppo, network)
-        (_, kl), slope = jax.value_and_grad(loss_of, has_aux=True)(weights, hidden[batch], *data)
+        inputs = weights, hidden[batch], *data, schedule
+        (_, kl), slope = jax.value_and_grad(loss_of, has_aux=True)(*inputs)
         change, optimiser = _optimiser().update(slope, optimiser)
-        weights = jax.tree.map(lambda w, x: w - rate * x, weights, change)
-        weights["log_std"] = jnp.clip(weights["log_std"], *_LOG_STD)
-        rate = jnp.where(kl > 2 * ppo.target_kl, rate / 1.2, rate)
-        rate = jnp.where(kl < 0.5 * ppo.target_kl, rate * 1.2, rate)
-        return (weights, optimiser, jnp.clip(rate, 2e-5, 3e-3)), kl
+        speed = jnp.where(frozen, _CRITIC_RATE, rate)
+        moved = jax.tree.map(lambda w, x: w - speed * x, weights, change)
+        moved["log_std"] = jnp.clip(moved["log_std"], *_LOG_STD)
+        weights = jax.tree.map(partial(jnp.where, frozen), weights, moved)
+        weights["critic"] = moved["critic"]
+        target_kl = schedule * ppo.target_kl
+        factor = jnp.where(kl > 2 * target_kl, 1 / 1.2, jnp.where(kl < target_kl / 2, 1.2, 1.0))
+        bounded = jnp.clip(rate * factor, 2e-5 * schedule, 3e-3 * schedule)
+        return (weights, optimiser, jnp.where(frozen, rate, bounded)), kl
 
     carry = state.weights, state.optimiser, state.learning_rate
     (weights, optimiser, rate), kl = jax.lax.scan(step, carry, batches)
-    ema = jax.tree.map(lambda a, b: 0.95 * a + 0.05 * b, state.ema, weights["actor"])
+    ema = jax.tree.map(lambda a, b: a + (b - a) / ppo.average, state.ema, weights["actor"])
     return TrainState(weights, ema, optimiser, rate), jnp.mean(kl)
 
 

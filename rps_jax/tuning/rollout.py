@@ -1,7 +1,8 @@
 """Rollouts for PPO: the policy pushes in many worlds, and worlds restart when their trials end.
 
 One update is one program. Every world of every environment takes several actions, each of them
-held for several control steps; then `ppo` updates the network.
+held for several control steps; then `ppo` updates the network. A GPU runs an action in all worlds
+as one kernel of each environment.
 
 Curriculum: at a low level targets are near and ahead. The level rises when enough trials succeed,
 up to the targets of the domain. Tasks with a path have no curriculum.
@@ -13,6 +14,7 @@ from typing import Any, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from rps_jax import errors
 from rps_jax.control import soft
@@ -20,6 +22,7 @@ from rps_jax.control.learned import features
 from rps_jax.control.learned import network as networks
 from rps_jax.control.learned.features import TouchState
 from rps_jax.control.learned.network import Network, PolicyState, Weights
+from rps_jax.engines import native
 from rps_jax.geometry import footprint as fp
 from rps_jax.geometry import planar
 from rps_jax.trials import trial
@@ -32,6 +35,8 @@ from rps_jax.world.tasks.reach import Nothing
 
 T = TypeVar("T")
 ActCarry = tuple[State, TouchState, jax.Array]  # states, touch states, rewards (N,)
+_FAILURE_DECAY = 0.7  # of a world's failure rate, per trial in it
+_UNSOLVED = 0.05  # [1] of the weight of a world that always fails, in draws of hard worlds
 
 
 class EnvBatch(NamedTuple):
@@ -45,12 +50,17 @@ class EnvBatch(NamedTuple):
 
 Carry = tuple[tuple[EnvBatch, ...], jax.Array]  # batches and key, between two actions
 Stats = dict[str, jax.Array]  # counts of ended trials, of worlds (N,) or sums over them, by name
+# Transitions, inputs of the network after the action, statistics, and indices of the worlds.
+Taken = tuple[Transition, tuple[jax.Array, jax.Array], Stats, jax.Array]
 
 
 class RunnerState(NamedTuple):
     """State of a learning run between two updates."""
 
     train: TrainState
+    progress: jax.Array  # () [1] share of the run that is over
+    updates: jax.Array  # () number of updates
+    failures: tuple[jax.Array, ...]  # (worlds,) [1] recent failure rates of each table's worlds
     level: jax.Array  # () [1] of the curriculum
     ended: jax.Array  # () trials that ended, with exponentially decaying weights
     succeeded: jax.Array  # () successes, with the same weights
@@ -71,18 +81,25 @@ def start(
 ) -> RunnerState:
     """Return the state before the first update, with every trial at a random time."""
     key, first, *keys = jax.random.split(jax.random.PRNGKey(seed), 2 + len(envs))
-    level = jnp.asarray(ppo.level, float)
-    batches = []
-    for env, table, env_key in zip(envs, tables, keys, strict=True):
-        env_key, time_key = jax.random.split(env_key)
-        batch = _restart(network, env, table, level, env_key, ppo.num_envs)
+    level = jnp.asarray(1.0 if ppo.initial else ppo.level, float)
+    indices = [
+        jax.random.randint(k, (ppo.num_envs,), 0, env.worlds)
+        for k, env in zip(keys, envs, strict=True)
+    ]
+    draws = [
+        _draw_worlds(table, level, *x) for table, *x in zip(tables, keys, indices, strict=True)
+    ]
+    batches = list[EnvBatch]()
+    for env, batch, env_key in zip(envs, _begin(network, envs, draws), keys, strict=True):
         horizon_steps = int(float(env.setting.rules.horizon) / env.dt)
+        time_key = jax.random.fold_in(env_key, 1)
         steps = jax.random.randint(time_key, (ppo.num_envs,), 0, horizon_steps)
         states = batch.states.replace(data=batch.states.data._replace(steps=steps))
         batches.append(batch._replace(states=states))
-    zero = jnp.zeros(())
+    zero, failures = jnp.zeros(()), tuple(jnp.full(env.worlds, 0.5) for env in envs)
     train = TrainState.init(ppo, network, first)
-    return RunnerState(train, level, zero, zero, key, tuple(batches))
+    inputs = train, zero, jnp.zeros((), int), failures, level, zero, zero, key
+    return RunnerState(*inputs, tuple(batches))
 
 
 def ease(world: World, level: jax.Array) -> World:
@@ -97,33 +114,87 @@ def ease(world: World, level: jax.Array) -> World:
     return world._replace(p_world_target=jnp.where(level < 1, target, world.p_world_target))
 
 
-def _start(network: Network, env: PushEnv, worlds: World, index: jax.Array) -> EnvBatch:
-    """Return worlds (N, ...) of these indices (N,) at their start, after the first observation."""
+def _alone(function: Callable[..., T], *_: Any) -> Callable[..., T]:
+    """Return a function of one world as it is, where others map it over worlds."""
+    return function
 
-    def start_world(world: World, index: jax.Array) -> tuple[State, PolicyState]:
+
+def _together(
+    envs: Sequence[PushEnv], function: Callable[..., T], inputs: Sequence[tuple[Any, ...]]
+) -> list[T]:
+    """Map `function(env, ...)` of one world over the inputs (N, ...) of each environment."""
+    # Of environments that differ in their worlds alone, one has the function.
+    owners = {env.static: env for env in reversed(envs)}
+    bound = {static: partial(function, env) for static, env in owners.items()}
+    functions = [bound[env.static] for env in envs]
+
+    def in_xla(*inputs: tuple[Any, ...]) -> list[T]:
+        return [jax.vmap(f)(*x) for f, x in zip(functions, inputs, strict=True)]
+
+    run = native.concurrent(functions, in_xla) if all(env.is_native for env in envs) else in_xla
+    return list(run(*inputs))
+
+
+def _begin(
+    network: Network, envs: Sequence[PushEnv], draws: Sequence[tuple[World, jax.Array]]
+) -> list[EnvBatch]:
+    """Return worlds (N, ...) of indices (N,) at their start, after the first observation."""
+
+    def begin(env: PushEnv, world: World, index: jax.Array) -> EnvBatch:
         state = env.begin(world, index)
         memory = PolicyState.init(network, state.obs.dtype)
         touch_state = memory.touch_state.update(state.info["observation"])
-        return state, memory._replace(touch_state=touch_state)
+        state = state.replace(info=state.info | {"world": None})
+        memory = memory._replace(touch_state=touch_state)
+        return EnvBatch(state, memory, jnp.ones((), bool), jnp.zeros(()))
 
-    states, memory = jax.vmap(start_world)(worlds, index)
-    return EnvBatch(states, memory, jnp.ones(index.size, bool), jnp.zeros(index.size))
+    batches = _together(envs, begin, draws)
+    return [_with_info(x, world=draw[0]) for x, draw in zip(batches, draws, strict=True)]
 
 
-def _restart(
-    network: Network, env: PushEnv, table: World, level: jax.Array, key: jax.Array, count: int
-) -> EnvBatch:
-    """Return random worlds at their start; one in five has a random lower level, below level 1."""
+def _with_info(batch: EnvBatch, **info: Any) -> EnvBatch:
+    """Return a batch whose states have other information."""
+    return batch._replace(states=batch.states.replace(info=batch.states.info | info))
 
-    def draw_world(key: jax.Array) -> tuple[World, jax.Array]:
-        index_key, noise_key, level_key = jax.random.split(key, 3)
-        index = jax.random.randint(index_key, (), 0, env.worlds)
+
+def _draw_worlds(
+    table: World, level: jax.Array, key: jax.Array, indices: jax.Array
+) -> tuple[World, jax.Array]:
+    """Return the worlds of indices (N,), and these; one in five has a random lower level."""
+
+    def draw_world(key: jax.Array, index: jax.Array) -> World:
+        noise_key, level_key = jax.random.split(key)
         u = jax.random.uniform(level_key)
         world_level = jnp.where((u < 0.2) & (level < 1), 5 * u, 1.0) * level
         world = ease(rows(table, index), world_level)
-        return world._replace(key=jax.random.key_data(noise_key)), index
+        return world._replace(key=jax.random.key_data(noise_key))
 
-    return _start(network, env, *jax.vmap(draw_world)(jax.random.split(key, count)))
+    return jax.vmap(draw_world)(jax.random.split(key, indices.size), indices), indices
+
+
+def draw_indices(
+    ppo: PPO, failures: jax.Array, key: jax.Array, shape: tuple[int, ...]
+) -> jax.Array:
+    """Return random indices of worlds; a share of them, `ppo.hard`, by their failure rates.
+
+    The weight of a world is greatest where it sometimes fails; it is small where it always does.
+    """
+    keys, worlds = jax.random.split(key, 3), failures.size
+    indices = jax.random.randint(keys[0], shape, 0, worlds)
+    if not ppo.hard:
+        return indices
+    total = jnp.cumsum(failures * (1 + _UNSOLVED - failures) + 1e-6)
+    hard = jnp.searchsorted(total, jax.random.uniform(keys[1], shape) * total[-1])
+    is_hard = jax.random.uniform(keys[2], shape) < ppo.hard
+    return jnp.where(is_hard, jnp.minimum(hard, worlds - 1).astype(indices.dtype), indices)
+
+
+def failure_rates(
+    rates: jax.Array, index: jax.Array, ended: jax.Array, succeeded: jax.Array
+) -> jax.Array:
+    """Return the failure rates (worlds,) after trials (...), of which some have ended."""
+    change = (1 - _FAILURE_DECAY) * ended * (1 - succeeded - rates[index])
+    return jnp.clip(rates.at[index].add(change), 0, 1)
 
 
 def _private(env: PushEnv, state: State) -> jax.Array:
@@ -150,16 +221,16 @@ def act(
 ) -> tuple[EnvBatch, jax.Array]:  # fmt: skip
     """Execute an action (N, 3) in each world; return the batch and the rewards (N,).
 
-    With `native.mapped` as `mapped`, derivatives are fastest.
+    With `native.mapped` as `mapped`, derivatives are fastest; `_alone` is for one world.
     """
-    bounded = features.clip_action(action)
+    bounded, vmap = features.clip_action(action), _alone if mapped is _alone else jax.vmap
     inputs = batch.memory.touch_state, batch.states.info["observation"]
-    touch_state = jax.vmap(TouchState.mark_decision)(*inputs)
+    touch_state = vmap(TouchState.mark_decision)(*inputs)
 
     def step(carry: ActCarry, _: None) -> tuple[ActCarry, None]:
         states, touch_state, reward = carry
         states = mapped(env.step, (0, 0))(states, bounded)
-        touch_state = jax.vmap(TouchState.update)(touch_state, states.info["observation"])
+        touch_state = vmap(TouchState.update)(touch_state, states.info["observation"])
         return (states, touch_state, reward + states.reward), None
 
     carry = batch.states, touch_state, jnp.zeros_like(batch.earned)
@@ -170,10 +241,37 @@ def act(
     return EnvBatch(states, memory, jnp.zeros_like(batch.first), earned), reward
 
 
+def _act_together(
+    envs: Sequence[PushEnv], network: Network, batches: Sequence[EnvBatch], hidden: jax.Array,
+    action: jax.Array,
+) -> list[tuple[EnvBatch, jax.Array]]:  # fmt: skip
+    """Execute the joined actions (sum of N, 3) in the worlds of all environments: see `act`."""
+
+    def single(env: PushEnv, batch: EnvBatch, action: jax.Array) -> tuple[EnvBatch, jax.Array]:
+        moved, reward = act(env, network, batch, jnp.zeros(()), action, _alone)
+        return _with_info(moved, world=None), reward
+
+    ends = np.cumsum([x.first.size for x in batches])[:-1]
+    hiddens, actions = jnp.split(hidden, ends), jnp.split(action, ends)
+    # The kernel neither reads nor writes what does not change.
+    inputs = [x._replace(memory=x.memory._replace(hidden=jnp.zeros(x.first.size))) for x in batches]
+    results = _together(envs, single, list(zip(inputs, actions, strict=True)))
+    return [
+        (
+            _with_info(
+                x._replace(memory=x.memory._replace(hidden=h)), world=before.states.info["world"]
+            ),
+            r,
+        )
+        for (x, r), h, before in zip(results, hiddens, batches, strict=True)
+    ]
+
+
 def _episode_stats(env: PushEnv, batch: EnvBatch) -> tuple[Stats, jax.Array]:
     """Return statistics of the trials that have ended, and whether each is terminated (N,).
 
-    A trial that reached a time limit, with or without contact, is truncated and not terminated.
+    A trial that reached a time limit, with or without contact, is truncated and not terminated,
+    unless a failure has a cost.
     """
     data = batch.states.data
     stats = {
@@ -184,7 +282,8 @@ def _episode_stats(env: PushEnv, batch: EnvBatch) -> tuple[Stats, jax.Array]:
         "earned": jnp.where(data.done, batch.earned, 0.0),  # [1] rewards
         "touching": batch.states.metrics["in_contact"],  # after an action
     }
-    return stats, data.done & ~env.has_timed_out(data)
+    truncated = env.has_timed_out(data) & (env.weights.failure == 0)
+    return stats, data.done & ~truncated
 
 
 def _join(parts: Sequence[T]) -> T:
@@ -205,39 +304,57 @@ def update(
     not constants of the program.
     """
 
-    def take_action(carry: Carry, _: None) -> tuple[Carry, tuple[Transition, Stats]]:
-        """Take one action in all worlds; return its transition and statistics of ended trials."""
+    weights = runner.train.weights
+    key, action_key, index_key, update_key = jax.random.split(runner.key, 4)
+    shape = ppo.num_steps, ppo.num_envs
+    index_keys = jax.random.split(index_key, len(envs))
+    pairs = zip(runner.failures, index_keys, strict=True)
+    indices = tuple(draw_indices(ppo, *pair, shape) for pair in pairs)
+
+    def take_action(carry: Carry, fresh: tuple[jax.Array, ...]) -> tuple[Carry, Taken]:
+        """Take one action in all worlds, and restart those whose trials end."""
         batches, key = carry
         key, noise_key, *start_keys = jax.random.split(key, 2 + len(envs))
-        weights, count = runner.train.weights, ppo.num_envs
         pairs = zip(envs, batches, strict=True)
         inputs = [(*_inputs(env, x), x.memory.hidden, x.first) for env, x in pairs]
         obs, private, previous_hidden, first = _join(inputs)
         hidden, mean = network.apply(weights["actor"], previous_hidden, obs)
         noise = jax.random.normal(noise_key, mean.shape, mean.dtype)
         action = mean + jnp.exp(weights["log_std"]) * noise
-        restarted, results = [], []
-        for i, (env, table, batch) in enumerate(zip(envs, tables, batches, strict=True)):
-            worlds = slice(i * count, (i + 1) * count)
-            batch, reward = act(env, network, batch, hidden[worlds], action[worlds])
-            results.append((_inputs(env, batch), reward, *_episode_stats(env, batch)))
-            start = _restart(network, env, table, runner.level, start_keys[i], count)
-            restarted.append(jax.vmap(soft.tree_where)(batch.states.data.done, start, batch))
-        next_inputs, reward, stats, terminated = _join(results)
-        pairs = (ppo_.critic_inputs(*x) for x in ((obs, private), next_inputs))
-        value, next_value = (networks.critic(weights["critic"], x) for x in pairs)
+        moved = _act_together(envs, network, batches, hidden, action)
+        results = [
+            (_inputs(env, batch), reward, *_episode_stats(env, batch), batch.states.info["index"])
+            for env, (batch, reward) in zip(envs, moved, strict=True)
+        ]
+        drawn = zip(tables, start_keys, fresh, strict=True)
+        starts = _begin(network, envs, [_draw_worlds(x, runner.level, *y) for x, *y in drawn])
+        restarted = tuple(
+            jax.vmap(soft.tree_where)(batch.states.data.done, start, batch)
+            for (batch, _), start in zip(moved, starts, strict=True)
+        )
+        next_inputs, reward, stats, terminated, index = _join(results)
         log_prob = ppo_.log_prob(action, mean, weights["log_std"])
-        decision = obs, private, first, action, log_prob, value
-        steps = Transition(*decision, next_value, reward, stats["ended"], terminated)
-        return (tuple(restarted), key), (steps, jax.tree.map(jnp.sum, stats))
+        zero = jnp.zeros_like(reward)
+        decision = obs, private, first, action, log_prob, zero
+        steps = Transition(*decision, zero, reward, stats["ended"], terminated)
+        return (restarted, key), (steps, next_inputs, stats, index)
 
     hidden = jnp.concatenate([batch.memory.hidden for batch in runner.batches])
-    key, action_key, update_key = jax.random.split(runner.key, 3)
     carry = runner.batches, action_key
-    (batches, _), (steps, step_stats) = jax.lax.scan(take_action, carry, length=ppo.num_steps)
-    stats = jax.tree.map(jnp.sum, step_stats)
-    train, kl = ppo_.update_policy(ppo, network, runner.train, update_key, hidden, steps)
-    updated = runner._replace(train=train, key=key, batches=batches)
+    (batches, _), (steps, after, taken, index) = jax.lax.scan(take_action, carry, indices)
+    pairs = (ppo_.critic_inputs(*x) for x in ((steps.obs, steps.private), after))
+    value, next_value = (networks.critic(weights["critic"], x) for x in pairs)
+    steps = steps._replace(value=value, next_value=next_value)
+    stats = jax.tree.map(jnp.sum, taken)
+    is_first = runner.updates < ppo.value_updates
+    schedule = ppo.schedule(runner.progress), is_first & bool(ppo.initial)
+    train, kl = ppo_.update_policy(ppo, network, runner.train, update_key, hidden, steps, *schedule)
+    trials = (index, taken["ended"], taken["succeeded"])
+    columns = zip(*(jnp.split(x, len(envs), axis=1) for x in trials), strict=True)
+    failures = map(failure_rates, runner.failures, *zip(*columns, strict=True))
+    updated = runner._replace(
+        train=train, key=key, batches=batches, updates=runner.updates + 1, failures=tuple(failures)
+    )
     metrics = stats | {
         "touching": stats["touching"] / steps.reward.size,
         "level": runner.level,
@@ -245,7 +362,7 @@ def update(
         "value": jnp.mean(steps.value),
         "kl": kl,
         "learning_rate": runner.train.learning_rate,
-        "spread": jnp.exp(jnp.mean(runner.train.weights["log_std"])),
+        "spread": jnp.exp(jnp.mean(weights["log_std"])),
     }
     return _raise_level(ppo, updated, stats), metrics
 
@@ -261,23 +378,29 @@ def _raise_level(ppo: PPO, runner: RunnerState, stats: Stats) -> RunnerState:
     return runner._replace(level=level, ended=ended, succeeded=succeeded)
 
 
-def rollout(network: Network, env: PushEnv, table: World, actor: Weights) -> State:
-    """Push by the policy without noise in all worlds of an environment; return the last states."""
-    batch = _start(network, env, table, jnp.arange(env.worlds))
+def rollouts(
+    network: Network, envs: Sequence[PushEnv], tables: Sequence[World], actor: Weights
+) -> list[State]:
+    """Push without noise in all worlds of all environments; return the last states."""
+    draws = [(table, jnp.arange(env.worlds)) for env, table in zip(envs, tables, strict=True)]
 
-    def step(batch: EnvBatch) -> EnvBatch:
-        hidden, mean = network.apply(actor, batch.memory.hidden, _inputs(env, batch)[0])
-        return act(env, network, batch, hidden, mean)[0]
+    def step(batches: list[EnvBatch]) -> list[EnvBatch]:
+        inputs = [_inputs(env, x)[0] for env, x in zip(envs, batches, strict=True)]
+        hidden = _join([x.memory.hidden for x in batches])
+        actions = network.apply(actor, hidden, _join(inputs))
+        return [x for x, _ in _act_together(envs, network, batches, *actions)]
 
-    return jax.lax.while_loop(lambda batch: ~jnp.all(batch.states.data.done), step, batch).states
+    def is_running(batches: list[EnvBatch]) -> jax.Array:
+        return ~jnp.all(_join([x.states.data.done for x in batches]))
+
+    batches = jax.lax.while_loop(is_running, step, _begin(network, envs, draws))
+    return [batch.states for batch in batches]
 
 
 def evaluate_policy(
     network: Network, envs: Sequence[PushEnv], tables: Sequence[World], actor: Weights
 ) -> tuple[jax.Array, jax.Array]:
     """Return success (N,) bool and time (N,) [s] of the law in all worlds of all environments."""
-    results = []
-    for env, table in zip(envs, tables, strict=True):
-        data = rollout(network, env, table, actor).data
-        results.append((data.success, data.steps * env.dt))
-    return _join(results)
+    states = rollouts(network, envs, tables, actor)
+    pairs = zip(envs, states, strict=True)
+    return _join([(x.data.success, x.data.steps * env.dt) for env, x in pairs])

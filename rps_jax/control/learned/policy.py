@@ -70,6 +70,16 @@ def decode(content: bytes, source: Path | str) -> Policy:
         raise errors.not_allowed("policy", f"{source} ({reason})", rule) from error
 
 
+def read(law: str) -> Policy:
+    """Return the policy of a shipped law's name, or of a file.
+
+    Raises:
+      InputError: there is no such file, or no policy in it.
+    """
+    path = SHIPPED.get(law, Path(law))
+    return decode(files.read_regular(path, "policy"), path)
+
+
 def _digest(arrays: Mapping[str, np.ndarray]) -> str:
     """Return the SHA-256 of names, types, shapes and values."""
     sha256 = hashlib.sha256()
