@@ -380,6 +380,51 @@ def test_a_killed_and_resumed_run_equals_an_uninterrupted_one(learned, tmp_path)
     same(mine.weights, theirs.weights)
 
 
+def test_the_value_function_of_an_initial_law_is_learned_first(learned, tmp_path):
+    """The first updates leave the law as it is; the third changes it."""
+    initial = policies.read(str(learned[0] / "policy.npz"))
+    options = TINY | {"initial": str(learned[0] / "policy.npz"), "value_updates": 2}
+    options |= {"hard": 0.5, "anneal": 0.5, "average": 1, "failure": 1.0, "success": 2.0}
+    curve = learn(CYLINDERS, **options, updates=2, out=tmp_path / "run")
+    same(policies.read(str(tmp_path / "run" / "policy.npz")).weights, initial.weights)
+    curve = learn(CYLINDERS, **options, updates=4, out=tmp_path / "run")
+    policy = policies.read(str(tmp_path / "run" / "policy.npz"))
+    assert np.abs(policy.weights["action.w"] - initial.weights["action.w"]).max() > 0
+    assert curve.level.values.tolist() == [1.0] * 4
+    assert curve.kl.values[:2].max() < 1e-7 < curve.kl.values[2:].min()
+    assert np.isfinite(curve.value).all()
+
+
+def test_an_initial_law_has_the_network_of_the_options(learned, tmp_path):
+    path = str(learned[0] / "policy.npz")
+    with pytest.raises(InputError, match=r"width = 7 is not allowed: the initial law .* has 6"):
+        learn(CYLINDERS, **TINY | {"initial": path, "width": 7}, updates=4, out=tmp_path)
+    with pytest.raises(InputError, match="no_such_law"):
+        learn(CYLINDERS, **TINY | {"initial": "no_such_law"}, updates=4, out=tmp_path)
+
+
+def test_worlds_that_sometimes_fail_are_drawn_most():
+    options = PPO(hard=0.5)
+    rates = rollout.failure_rates(
+        jnp.array([0.0, 0.5, 1.0, 0.0]), jnp.array([3, 3, 2]), jnp.array([True, False, False]),
+        jnp.array([False, False, False]),
+    )  # fmt: skip
+    np.testing.assert_allclose(rates, [0, 0.5, 1, 0.3], atol=1e-6)
+    draw = partial(rollout.draw_indices, failures=rates, key=jax.random.PRNGKey(0), shape=(200, 50))
+    counts = np.bincount(np.array(draw(options)).ravel(), minlength=4) / 10_000
+    weights = np.array([0, 0.275, 0.05, 0.225])
+    np.testing.assert_allclose(counts, 0.125 + 0.5 * weights / weights.sum(), atol=0.02)
+    uniform = np.bincount(np.array(draw(PPO())).ravel()) / 10_000
+    np.testing.assert_allclose(uniform, 0.25, atol=0.02)
+
+
+def test_options_fall_at_the_end_of_a_run():
+    schedule = PPO(anneal=0.5).schedule
+    shares = [float(schedule(jnp.array(x))) for x in (0.0, 0.5, 0.75, 1.0)]
+    assert shares == pytest.approx([1, 1, 0.5, 0.05])
+    assert float(PPO().schedule(jnp.array(0.9))) == 1
+
+
 def test_the_results_of_a_run_and_their_table(learned):
     folder, curve = learned
     assert curve.sizes == {"update": 4}
