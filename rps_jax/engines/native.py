@@ -280,7 +280,7 @@ def concurrent(
 
     @functools.cache
     def compiled(types: Sequence[tuple[Any, Sequence[Any]]]) -> tuple[list[_Function], Any]:
-        call = functools.cache(lambda f, x: _Function(f, *x, sort_by))
+        call = functools.cache(lambda f, x: _Function(f, x[0], x[1], sort_by))
         calls = [call(f, x) for f, x in zip(functions, types, strict=True)]
         groups = [calls] if jax.default_backend() == "gpu" else [[call] for call in calls]
         return calls, [(group, _compiled(group)) for group in groups]
