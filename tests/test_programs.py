@@ -43,7 +43,9 @@ def compiler():
 
         shapes = 2 * [jax.ShapeDtypeStruct((n,), jnp.float32)]
         known = [factor] if static is None else [static]
-        program = programs.compile_function(function, shapes, law=rps.LAW, donate=0, static=known)
+        program = programs.trace_function(function, shapes, law=rps.LAW, donate=0, static=known)(
+            None
+        )
         (leaf,) = jax.tree.leaves(program(jnp.ones(n), jnp.ones(n)))
         return np.asarray(leaf).tolist()
 

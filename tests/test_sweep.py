@@ -7,6 +7,7 @@ import os
 import random
 import shutil
 import sys
+import threading
 import time
 from dataclasses import replace
 from functools import partial
@@ -156,31 +157,57 @@ def test_a_faster_base_arrives_earlier():
     assert times[0] < 0.7 * times[1]
 
 
-def communication_on_two_devices(folder):
-    """Sweep on two devices; return the slots of each program and its collective operations."""
-    cache.use_cache()
-    assert jax.device_count() == 2
-    programs, plain = [], jax.stages.Lowered.compile
-    note = lambda *args, **how: programs.append(plain(*args, **how)) or programs[-1]  # noqa: E731
-    jax.stages.Lowered.compile = note
-    swept(folder, workers=1)
-    talk = ("all-reduce", "all-gather", "all-to-all", "permute")
-    slots = [{leaf.shape[0] for leaf in jax.tree.leaves(x.args_info[0][1])} for x in programs]
-    return slots, [word for x in programs for word in talk if word in x.as_text()]
+def runs_on_devices(folder):
+    """Sweep on 4, 2 and 1 devices; return the programs that were not in the cache, and segments.
+
+    The first device waits until the others have run all trials but those in its slots. In the last
+    run the others fail.
+    """
+    cache.use_cache(folder / "cache")
+    devices, plain = jax.local_devices(), batch._Slots.arguments
+    missing, segments, fails, rest_ended = [], {}, [], threading.Event()
+    jax.monitoring.register_event_listener(lambda name, **_: missing.append(name))
+
+    def arguments(self):
+        if self._device is devices[0]:
+            assert rest_ended.wait(60)
+        elif fails:
+            raise OSError("no memory")
+        return plain(self)
+
+    batch._Slots.arguments = arguments
+    for count in (4, 2, 1):
+        batch._devices = lambda count=count: devices[:count]
+        noted = segments.setdefault(count, [])
+
+        def callback(progress, noted=noted):
+            noted.append(progress.segment)
+            if progress.finished >= PLAN.num_trials - SLOTS:
+                rest_ended.set()
+
+        rest_ended.clear() if count > 1 else rest_ended.set()
+        swept(folder / str(count), workers=1, callback=callback)
+    batch._devices = lambda: devices
+    fails.append(True)
+    with pytest.raises(OSError, match="no memory"):
+        swept(folder / "failed", workers=1, callback=segments.setdefault("failed", []).append)
+    shutil.rmtree(folder / "failed")
+    return missing.count("/jax/compilation_cache/cache_misses"), segments
 
 
-def test_two_devices_agree_with_one_and_never_communicate(whole, tmp_path, monkeypatch):
-    flags = f"{os.environ.get('XLA_FLAGS', '')} --xla_force_host_platform_device_count=2"
+def test_several_devices_share_trials_and_programs(whole, tmp_path, monkeypatch):
+    flags = f"{os.environ.get('XLA_FLAGS', '')} --xla_force_host_platform_device_count=4"
     monkeypatch.setenv("XLA_FLAGS", flags)
-    with multiprocessing.get_context("spawn").Pool(1) as pool:
-        slots, collectives = pool.apply(communication_on_two_devices, [tmp_path / "run"])
-    assert slots == [{2 * SLOTS}]
-    assert not collectives
-    double, single = (merged([folder], tmp_path) for folder in (tmp_path / "run", whole))
-    # Another program rounds otherwise, and contact amplifies it.
-    np.testing.assert_array_equal(double.success, single.success)
-    np.testing.assert_allclose(double.min_distance, single.min_distance, atol=0.02)
-    assert np.median(np.abs(double.time - single.time)) < 0.1
+    with multiprocessing.get_context("spawn").Pool(1, maxtasksperchild=1) as pool:
+        for known in (False, True):  # in the second process all programs are cached
+            missing, segments = pool.apply(runs_on_devices, [tmp_path])
+            assert bool(missing) != known
+            assert len(segments.pop("failed")) < 10  # the other devices stop, too
+            assert len(list(tmp_path.glob("cache/traced/*"))) == 1
+            for count, noted in segments.items():
+                assert parts_of(tmp_path / str(count)) == parts_of(whole)
+                assert len({segment.device for segment in noted if segment is not None}) == count
+                shutil.rmtree(tmp_path / str(count))
 
 
 def test_results_hold_every_world_with_its_drawn_quantities(whole, tmp_path):

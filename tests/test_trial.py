@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from functools import partial
+from itertools import pairwise
 
 import chex
 import jax
@@ -80,19 +81,23 @@ def test_rare_termination_checks_on_a_gpu_do_not_change_results(monkeypatch):
     chex.assert_trees_all_close(seldom, run("cpu"), atol=1e-6)
 
 
-@pytest.mark.parametrize("limit", [1, 3, SLOTS])
-def test_suspended_trials_end_alike_in_merged_batches(monkeypatch, limit):
-    """Merged batches of a GPU: two shape families, and at most 1, 3 or all trials suspended."""
+@pytest.mark.parametrize("few", [1, 3, SLOTS])
+def test_trials_end_alike_in_the_merged_batches_of_a_gpu(monkeypatch, few):
+    """Two shape families side by side, the last trials in 1, 3 or as many slots as before."""
     rules = Rules(horizon=60.0)
     cases = [case((0.6 + 0.05 * k, 0.05 * k)) for k in range(6)] + [case(AHEAD)]
     cases += [case((0.6, 0.1 * k), name="cylinder") for k in range(3)]
     alone = run(cases, rules)
-    ran, plain = [], batch._Program.compiled
-    monkeypatch.setattr(batch, "_max_suspended", lambda: limit)
-    note = lambda self: ran.append(self.slots) or plain(self)  # noqa: E731
+    segments, ran, plain = [], [], batch._Program.compiled
+    monkeypatch.setattr(batch, "_few_slots", lambda: few)
+    note = lambda self, device: ran.append(self.slots) or plain(self, device)  # noqa: E731
     monkeypatch.setattr(batch._Program, "compiled", note)
-    results = run(cases, rules, workers=2)
-    assert len(ran[-1]) == 2
+    results = run(cases, rules, callback=lambda progress: segments.append(progress.segment))
+    assert ran[0] == (SLOTS, 3)
+    assert ran[1:] == ([(3, 3)] if few == 3 else [])  # none is left to the last one of few = 1
+    segments = [x for x in segments if x is not None]
+    assert all(x.start < x.end <= y.end and x.end <= y.start for x, y in pairwise(segments))
+    assert segments[0].live == (SLOTS, 3)
     assert alone.success.sum() > 0
     for name in ("success", "time"):
         np.testing.assert_array_equal(getattr(results, name), getattr(alone, name))

@@ -23,6 +23,7 @@ from typing import TYPE_CHECKING, Any
 import jax
 import numpy as np
 from jax import export
+from jax.sharding import SingleDeviceSharding
 
 from rps_jax.control.base import Law
 from rps_jax.engines import native
@@ -32,15 +33,15 @@ if TYPE_CHECKING:
     from jaxlib._jax import pytree  # pyright rejects the alias jax.tree_util.PyTreeDef
 
 
-def compile_function(
+def trace_function(
     function: Callable[..., Any],
     arguments: Sequence[Any],
     *,
     law: Law,
     donate: int,
     static: Sequence[object],
-) -> Callable[..., Any]:
-    """Compile a function for arguments of some shapes, from the cache if it holds the program.
+) -> Callable[[jax.Device | None], Callable[..., Any]]:
+    """Trace a function for arguments of some shapes, or load its program from the cache.
 
     Args:
       function: pure; it depends only on its arguments, the law and `static`.
@@ -50,10 +51,11 @@ def compile_function(
       static: further inputs of the function; the `repr` of each identifies it.
 
     Returns:
-      The compiled function: the same program with and without the cache.
+      A function that compiles the program for a device (None: the default one), once for each. It
+      is the same program with and without the cache.
     """
     if (law_name := identity(law)) is None:
-        return compile_lowered(jax.jit(function, donate_argnums=donate).lower(*arguments))
+        return _compiler(jax.jit(function, donate_argnums=donate), arguments)
     leaves, tree = jax.tree.flatten(jax.eval_shape(lambda *inputs: inputs, *arguments))
     donated = tuple(jax.tree.leaves(jax.tree.unflatten(tree, range(len(leaves)))[donate]))
     structures: list[pytree.PyTreeDef] = []  # of the results, once traced
@@ -80,8 +82,26 @@ def compile_function(
                 cache.write(path, text + b"\n" + bytes(exported.serialize()))
     else:
         structure, exported = stored
-    program = compile_lowered(jax.jit(exported.call, donate_argnums=donated).lower(*leaves))
-    return lambda *inputs: jax.tree.unflatten(structure, program(*jax.tree.leaves(inputs)))
+    compile_for = _compiler(jax.jit(exported.call, donate_argnums=donated), leaves)
+
+    def whole(device: jax.Device | None) -> Callable[..., Any]:
+        program = compile_for(device)
+        return lambda *inputs: jax.tree.unflatten(structure, program(*jax.tree.leaves(inputs)))
+
+    return whole
+
+
+def _compiler(jitted: Any, arguments: Sequence[Any]) -> Callable[[jax.Device | None], Any]:
+    """Return a function that compiles `jitted` for a device and arguments of these shapes."""
+    shapes = jax.eval_shape(lambda *inputs: inputs, *arguments)
+
+    @functools.cache
+    def compile_for(device: jax.Device | None) -> jax.stages.Compiled:
+        sharding = None if device is None else SingleDeviceSharding(device)
+        place = lambda x: x.update(sharding=sharding)  # noqa: E731
+        return _compile_lowered(jitted.lower(*jax.tree.map(place, shapes)))
+
+    return compile_for
 
 
 def _describe(structure: pytree.PyTreeDef) -> object:
@@ -125,7 +145,7 @@ def _from_json(content: object) -> object:
     return content
 
 
-def compile_lowered(lowered: jax.stages.Lowered) -> jax.stages.Compiled:
+def _compile_lowered(lowered: jax.stages.Lowered) -> jax.stages.Compiled:
     """Compile a lowered program; on a GPU, independent operations run concurrently."""
     if jax.default_backend() == "gpu":
         with contextlib.suppress(Exception):  # an XLA without this option

@@ -4,25 +4,30 @@ A job holds the trials that one program can step: one law, one shape family. Its
 batch by batch when slots become free, so that memory does not grow with the number of trials.
 
 - `WorldBatch`: worlds and law parameters of some trials of a job.
-- `_TrialQueue`: the trials of a job that wait for a slot, and its suspended trials.
-- `_Program`: a compiled program for the slots of one queue, or of several queues side by side.
+- `_TrialQueue`: the trials of a job that wait for a slot.
+- `_Program`: a program for the slots of one queue, or of several queues side by side.
 - `_Slots`: the trials in the slots of one queue, on one worker.
 - `_Monitor`: what all workers report to: finished trials, progress and the signal to stop.
 
-`_schedule` orders the programs, and each worker, a host thread, runs them one after another.
+Each worker is a host thread with its own slots on one device. The workers of all devices take
+trials from the same queues after every segment, so that no device waits for another one. The same
+program serves all devices of the host.
 
-A GPU steps a few thousand worlds in hardly less time than a few. When no trial of a job waits and
-few of its trials still run, a worker there suspends these trials and takes the next job. At the end
-the suspended trials of several jobs are resumed side by side in one program.
+A GPU steps the trials of several jobs side by side, and runs a segment while the host reads the
+previous one: a slot whose trial has ended is refilled one segment later. It steps a few thousand
+worlds in hardly less time than a few, and some programs step idle slots as slowly as others. When
+no trial waits and few run, a worker moves these trials to a program with fewer slots.
 """
 
 from __future__ import annotations
 
 import functools
+import itertools
+import operator
 import threading
 import time
 import warnings
-from collections import defaultdict
+from collections import defaultdict, deque
 from collections.abc import Callable, Hashable, Iterable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, as_completed
 from functools import partial
@@ -31,15 +36,13 @@ from typing import TYPE_CHECKING, Any, NamedTuple, TypedDict, TypeVar
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.sharding import AxisType, NamedSharding
-from jax.sharding import PartitionSpec as P
 
 from rps_jax import engines, errors
 from rps_jax.control import registry, soft
 from rps_jax.control.base import Law, LawParams
 from rps_jax.engines import device, programs
 from rps_jax.trials import host, trial
-from rps_jax.trials.progress import Progress, ProgressCallback, Timing, no_progress
+from rps_jax.trials.progress import Progress, ProgressCallback, Segment, Timing, no_progress
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import ControlLoop, Outcome, Rules, Trial, World
 from rps_jax.world.physics import Physics
@@ -49,7 +52,7 @@ if TYPE_CHECKING:
 
 SEGMENT = 10.0  # [s] of simulated time in one call of a program; then slots are refilled
 _REPORT_STEPS = 500  # control steps between two reports of an engine outside of JAX
-_MAX_SUSPENDED = 8192  # trials of a job per GPU
+_FEW_SLOTS = 8192  # of a job, on a GPU on which no trial waits
 _MAX_SIDE_BY_SIDE = 4  # jobs in one program; more would take long to compile
 
 Tree = TypeVar("Tree")  # a pytree
@@ -110,7 +113,7 @@ class BatchSize(TypedDict, total=False):
     """Resources of functions that run trials."""
 
     slots: int | None  # worlds that one worker steps at once on each device of the host
-    workers: int | None  # host threads
+    workers: int | None  # host threads for each device
 
 
 class BatchOptions(BatchSize, total=False):
@@ -134,8 +137,8 @@ def run(
       jobs: trials by the program that steps them.
       setting: engine, physics and rules.
       slots: worlds that one worker steps at once on each device; by default as suits the engine.
-      workers: host threads, each with its slots, or the threads of an engine that JAX
-        does not trace; by default as suits the engine.
+      workers: host threads for each device, each with its slots, or the threads of an engine that
+        JAX does not trace; by default as suits the engine.
       collect: called with trials that ended, in any order, by one thread at a time.
       callback: called with the progress after every segment, by one thread at a time.
 
@@ -147,24 +150,23 @@ def run(
     workers = engine.workers(backend) if workers is None else workers
     errors.check_count("slots", slots, at_most=10_000_000)
     errors.check_count("workers", workers, at_most=1024)
-    monitor = _Monitor(collect, callback, workers)
-    start_time = time.perf_counter()
+    monitor = _Monitor(collect, callback)
     tasks: list[Callable[[], object]]
     if not engine.traced:
         count = max(1, min(workers, len(jobs)))
         tasks = [partial(_run_on_host, job, setting, workers // count, monitor) for job in jobs]
     else:
-        queues = [_TrialQueue(job) for job in jobs]
-        single, joint = _schedule(queues, setting, slots, workers)
-        monitor.start(len(single) + len(joint))
-        tasks = [partial(_work, single, joint, monitor, index) for index in range(workers)]
-        if backend != "cpu":  # an idle processor: compile all programs at once, first used first
-            tasks += [program.compiled for program in (*single, *joint)]
+        devices = _devices()
+        groups = _schedule(list(map(_TrialQueue, jobs)), setting, slots, len(devices))
+        compilations = [partial(x.compiled, d) for x in itertools.chain(*groups) for d in devices]
+        monitor.start(len(compilations))
+        tasks = [partial(_work, groups, monitor, *x) for x in enumerate(devices * workers)]
+        if backend != "cpu":  # idle processors: compile all programs at once, first used first
+            tasks += compilations
         count = len(tasks)
     _run_in_threads(tasks, count, monitor)
-    total = time.perf_counter() - start_time
     monitor.warn_of_nan_twists()
-    return Timing(monitor.compile, total - monitor.compile, monitor.simulated)
+    return Timing(monitor.compile, monitor.elapsed - monitor.compile, monitor.simulated)
 
 
 def rows(tree: Tree, index: Any) -> Tree:
@@ -181,7 +183,6 @@ def _run_in_threads(tasks: Sequence[Callable[[], object]], count: int, monitor: 
                 future.result()
         except BaseException:
             monitor.stop = True
-            monitor.queues_empty.abort()
             pool.shutdown(wait=False, cancel_futures=True)
             raise
 
@@ -189,27 +190,33 @@ def _run_in_threads(tasks: Sequence[Callable[[], object]], count: int, monitor: 
 class _Monitor:
     """Finished trials, progress and stop signal of all workers of a run."""
 
-    def __init__(self, collect: Collect, callback: ProgressCallback, workers: int):
-        self.queues_empty = threading.Barrier(workers)  # workers wait until no trial waits
+    def __init__(self, collect: Collect, callback: ProgressCallback):
         self.simulated = 0.0  # [s] summed over trials
         self.compile = 0.0  # [s] that the worker who waited longest had no program
         self.stop = False  # set when one worker fails or the user interrupts
+        self._start_time = time.perf_counter()
         self._finished = self._nan_twists = 0  # trials
-        self._compiled: set[_Program] = set()
+        self._compiled: set[object] = set()
         self._programs = 0  # that the run needs
         self._waits: defaultdict[int, float] = defaultdict(float)  # [s] for compilation, by thread
         self._collect, self._callback = collect, callback
         self._lock = threading.Lock()
 
-    def add(self, indices: np.ndarray, outcomes: Outcome, simulated: float) -> None:
-        """Add the trials that ended in a segment, and the time [s] that all trials advanced."""
+    @property
+    def elapsed(self) -> float:
+        """Wall clock [s] since the start of the run."""
+        return time.perf_counter() - self._start_time
+
+    def add(self, *ended: _Ended, segment: Segment | None = None) -> None:
+        """Add the trials of some queues that ended in a segment."""
         with self._lock:
-            if indices.size:
-                self._collect(indices, outcomes)
-            self._finished += indices.size
-            self._nan_twists += int(np.count_nonzero(outcomes.nan_twist))
-            self.simulated += simulated
-            self._report()
+            for indices, outcomes, simulated in ended:
+                if indices.size:
+                    self._collect(indices, outcomes)
+                self._finished += indices.size
+                self._nan_twists += int(np.count_nonzero(outcomes.nan_twist))
+                self.simulated += simulated
+            self._report(segment)
 
     def warn_of_nan_twists(self) -> None:
         """Warn if a law returned a twist that is not finite."""
@@ -225,11 +232,12 @@ class _Monitor:
         self._programs = programs
         self._report()
 
-    def _report(self) -> None:
+    def _report(self, segment: Segment | None = None) -> None:
         counts = {"compiled": len(self._compiled), "programs": self._programs}
-        self._callback(Progress(self._finished, self.simulated, self.compile, **counts))
+        times = self._finished, self.simulated, self.compile
+        self._callback(Progress(*times, **counts, segment=segment))
 
-    def add_compile_time(self, program: _Program, seconds: float) -> None:
+    def add_compile_time(self, program: object, seconds: float) -> None:
         """Add a time [s] for which the worker of this thread waited for a program."""
         with self._lock:
             self._compiled.add(program)
@@ -255,7 +263,7 @@ def _run_on_host(job: Job, setting: Setting, threads: int, monitor: _Monitor) ->
             ended, total = np.flatnonzero(done & ~reported), int(np.asarray(trials.steps).sum())
             outcomes = jax.device_get(trial.outcome(trials, period))
             simulated = (total - previous) * period
-            monitor.add(batch.indices[ended], rows(outcomes, ended), simulated)
+            monitor.add((batch.indices[ended], rows(outcomes, ended), simulated))
             reported, previous = done, total
             if monitor.stop:
                 return
@@ -264,8 +272,14 @@ def _run_on_host(job: Job, setting: Setting, threads: int, monitor: _Monitor) ->
 # --- engines in JAX ------------------------------------------------------------------------
 
 
-class _Suspended(NamedTuple):
-    """Running trials of a job that left their slots."""
+def _devices() -> list[jax.Device]:
+    """Return the devices of the host that run the same programs."""
+    first, *rest = jax.local_devices()
+    return [first, *(x for x in rest if x.device_kind == first.device_kind)]
+
+
+class _Running(NamedTuple):
+    """Running trials of a job that left the slots of a program."""
 
     batch: WorldBatch
     trials: Trial  # leaves (n, ...), on the host
@@ -273,21 +287,13 @@ class _Suspended(NamedTuple):
 
 
 class _TrialQueue:
-    """Trials of a job that wait for a slot, and its suspended trials; workers share it."""
+    """Trials of a job that wait for a slot; workers share it."""
 
     def __init__(self, job: Job):
         self.num_trials, self._batches = job.num_trials, iter(job.batches)
         self.example: WorldBatch = next(self._batches)  # for its stage and its shapes
         self._waiting: WorldBatch | None = self.example  # rest of the current batch
         self._lock = threading.Lock()
-        self.suspended: list[_Suspended] = []
-
-    @property
-    def is_empty(self) -> bool:
-        """Whether no trial waits."""
-        with self._lock:
-            self._waiting = self._waiting or next(self._batches, None)
-            return self._waiting is None
 
     def take(self, count: int) -> list[WorldBatch]:
         """Remove and return up to `count` waiting trials."""
@@ -301,83 +307,61 @@ class _TrialQueue:
 
 
 def _schedule(
-    queues: Sequence[_TrialQueue], setting: Setting, slots: int, workers: int
-) -> tuple[list[_Program], list[_Program]]:
-    """Return the programs to run first, one for each long queue until few of its trials run.
+    queues: Sequence[_TrialQueue], setting: Setting, slots: int, devices: int
+) -> list[list[_Program]]:
+    """Return groups of programs for the same queues, the group with most trials first.
 
-    Return also the programs to run then, for suspended trials and short queues, side by side.
+    The second program of a group has fewer slots than the first; many groups have only one.
     """
-    devices, max_suspended = jax.device_count(), _max_suspended()
-    single, joint = list[_Program](), list[_Program]()
-    groups: dict[Hashable, list[tuple[_TrialQueue, int]]] = {}
-    side_by_side = engines.get(setting.engine).side_by_side
+    groups: dict[Hashable, list[_TrialQueue]] = {}
+    few, schedule = _few_slots(), list[list[_Program]]()
+    side_by_side = few is not None and engines.get(setting.engine).side_by_side
     for index, queue in enumerate(queues):
-        per_device = -(-queue.num_trials // devices)
-        width = devices * min(slots, per_device)
-        if width > max_suspended:
-            single.append(_Program([queue], [width], setting))
-            width = min(devices * per_device, workers * max_suspended)
-        if width:
-            key = queue.example.law if side_by_side else index
-            groups.setdefault(key, []).append((queue, width))
+        groups.setdefault(queue.example.law if side_by_side else index, []).append(queue)
     for group in groups.values():
         for i in range(0, len(group), _MAX_SIDE_BY_SIDE):
-            members, widths = zip(*group[i : i + _MAX_SIDE_BY_SIDE], strict=True)
-            joint.append(_Program(members, widths, setting))
-    return single, joint
+            members = group[i : i + _MAX_SIDE_BY_SIDE]
+            most = [min(slots, -(-queue.num_trials // devices)) for queue in members]
+            sizes = dict.fromkeys([tuple(most), tuple(min(n, few or n) for n in most)])
+            schedule.append([_Program(members, size, setting) for size in sizes])
+    return sorted(schedule, key=lambda x: -sum(queue.num_trials for queue in x[0].queues))
 
 
-def _max_suspended() -> int:
-    """Return how many running trials of a job a worker suspends, at most."""
-    return 0 if jax.default_backend() == "cpu" else jax.device_count() * _MAX_SUSPENDED
+def _few_slots() -> int | None:
+    """Return how many slots a job needs when no trial waits; None: as many as before."""
+    return None if jax.default_backend() == "cpu" else _FEW_SLOTS
 
 
 class _Program:
-    """Compiled program that steps the slots of one queue, or of several of one law side by side."""
+    """Program that steps the slots of one queue, or of several of one law side by side."""
 
     def __init__(self, queues: Sequence[_TrialQueue], slots: Sequence[int], setting: Setting):
         self.queues, self.slots, self.setting = queues, slots, setting
         self.law = queues[0].example.law
         self.stages = tuple(queue.example.stage for queue in queues)
-        self.sharding = None
-        if jax.device_count() > 1:
-            mesh = jax.make_mesh((jax.device_count(),), ("worlds",), (AxisType.Auto,))
-            self.sharding = NamedSharding(mesh, P("worlds"))
-        self._lock = threading.Lock()
-        self._compiled: _Advance | None = None
+        self._locks: defaultdict[object, threading.Lock] = defaultdict(threading.Lock)
 
-    def compiled(self) -> _Advance:
-        """Return the compiled function; the first caller compiles it and others wait."""
-        with self._lock:
-            if self._compiled is None:
-                self._compiled = self._compile()
-            return self._compiled
-
-    def put(self, tree: Tree) -> Tree:
-        """Put leaves (slots, ...) on the device, or split them over all devices of the host."""
-        return jax.device_put(tree, self.sharding)
-
-    def _compile(self) -> _Advance:
+    def compiled(self, device: jax.Device) -> _Advance:
+        """Return the function that a device runs; the first caller compiles it and others wait."""
         inputs, trials = zip(*map(self.shapes, range(len(self.queues))), strict=True)
-        masks = tuple(jax.ShapeDtypeStruct((n,), bool, sharding=self.sharding) for n in self.slots)
+        masks = tuple(jax.ShapeDtypeStruct((n,), bool) for n in self.slots)
         stages, rules = jax.eval_shape(lambda: (self.stages, self.setting.rules))
         leaves, structure = jax.tree.flatten((stages, inputs, trials, masks, masks, rules))
-        physics = self.setting.physics
-        return _compile_advance(physics, self.law, self.sharding, structure, tuple(leaves))
+        with self._locks[None]:  # one device traces for all
+            traced = _trace_advance(self.setting.physics, self.law, structure, tuple(leaves))
+        with self._locks[device]:
+            return traced(device)
 
     def shapes(self, index: int) -> tuple[Inputs, Trial]:
         """Return the shapes of the inputs and trials (slots, ...) of a queue."""
         single = rows(self.queues[index].example.inputs, slice(1))
         started = jax.eval_shape(partial(trial.start_all, law=self.law), *single, np.ones(1, bool))
-
-        def shape(leaf: jax.Array) -> jax.ShapeDtypeStruct:
-            size = self.slots[index], *leaf.shape[1:]
-            return jax.ShapeDtypeStruct(size, leaf.dtype, sharding=self.sharding)
-
+        slots = self.slots[index]
+        shape = lambda x: jax.ShapeDtypeStruct((slots, *x.shape[1:]), x.dtype)  # noqa: E731
         return jax.tree.map(shape, (single, started))
 
 
-class _Segment(NamedTuple):
+class _State(NamedTuple):
     """State of the slots of one queue after a segment."""
 
     steps: Any  # (slots,) int: control steps of each trial in this segment
@@ -385,18 +369,18 @@ class _Segment(NamedTuple):
     outcome: Outcome  # (slots, ...)
 
 
-_Advance = Callable[..., tuple[tuple[Trial, ...], tuple[_Segment, ...]]]
+_Advance = Callable[..., tuple[tuple[Trial, ...], tuple[_State, ...]]]
+_Ended = tuple[np.ndarray, Outcome, float]  # indices of trials, outcomes, and [s] that all advanced
 
 
 @functools.lru_cache(maxsize=32)
-def _compile_advance(
+def _trace_advance(
     physics: Physics,
     law: Law,
-    sharding: NamedSharding | None,
     structure: pytree.PyTreeDef,
     leaves: tuple[jax.ShapeDtypeStruct, ...],
-) -> _Advance:
-    """Compile `trial.advance` by one segment for arguments of these shapes; cached."""
+) -> Callable[[jax.Device], _Advance]:
+    """Trace `trial.advance` by one segment for arguments of these shapes; cached."""
 
     def advance(
         stages: tuple[Any, ...],
@@ -405,7 +389,7 @@ def _compile_advance(
         fresh: tuple[jax.Array, ...],
         live: tuple[jax.Array, ...],
         rules: Rules,
-    ) -> tuple[tuple[Trial, ...], tuple[_Segment, ...]]:
+    ) -> tuple[tuple[Trial, ...], tuple[_State, ...]]:
         pairs = zip(inputs, live, strict=True)
         started = [trial.start_all(*leaves, mask, law=law) for leaves, mask in pairs]
         current = tuple(map(jax.vmap(soft.tree_where), fresh, started, trials))
@@ -415,46 +399,36 @@ def _compile_advance(
         advanced = trial.advance([(stage, *x, state) for stage, x, state in batches], loop, steps)
         # Outcomes are in the same program: another one would wait for other workers' segments.
         return advanced, tuple(
-            _Segment(b.steps - a.steps, b.done, trial.outcome(b, physics.control_period))
+            _State(b.steps - a.steps, b.done, trial.outcome(b, physics.control_period))
             for a, b in zip(current, advanced, strict=True)
         )
 
-    if sharding is not None:  # each device runs its own worlds and waits for no other
-        advance = jax.shard_map(
-            advance,
-            mesh=sharding.mesh,
-            in_specs=(P(), *(P("worlds"),) * 4, P()),
-            out_specs=P("worlds"),
-            check_vma=False,
-        )
     arguments = jax.tree.unflatten(structure, leaves)
-    if sharding is None:
-        static = (physics, SEGMENT)
-        return programs.compile_function(advance, arguments, law=law, donate=2, static=static)
-    return programs.compile_lowered(jax.jit(advance, donate_argnums=2).lower(*arguments))
+    static = (physics, SEGMENT)
+    return programs.trace_function(advance, arguments, law=law, donate=2, static=static)
 
 
 class _Slots:
     """Slots of one queue in a program of one worker, and the trials in them."""
 
-    def __init__(self, program: _Program, index: int, resume: bool):
-        """Fill the slots of the queue `index` with suspended trials, or else waiting ones."""
+    def __init__(self, program: _Program, index: int, running: _Running | None, device: jax.Device):
+        """Fill the slots of the queue `index` with running trials, or else waiting ones."""
         queue, slots = program.queues[index], program.slots[index]
-        self._queue, self._program = queue, program
+        self._queue, self._device = queue, device
+        self._period = program.setting.physics.control_period
         self._indices = np.zeros(slots, np.int64)  # of the trials in the run
         self.live = np.zeros(slots, bool)  # whether a slot holds a trial that has not ended
-        self._fresh = np.ones(slots, bool)  # whether a trial starts with the next segment
+        self._first = np.zeros(slots, int)  # segment with which each trial starts, or -1
+        self._count = 0  # segments that were launched
         example = queue.example.inputs
         self._host = jax.tree.map(lambda leaf: np.repeat(leaf[:1], slots, axis=0), example)
-        _, shapes = program.shapes(index)
-        trials, end = jax.tree.map(lambda x: np.zeros(x.shape, x.dtype), shapes), 0
-        suspended = queue.suspended if resume else []
-        for batch, states, fresh in suspended:
-            at = slice(end, end := end + batch.indices.size)
-            _write(trials, at, states)
-            self._fresh[at] = fresh
-        self.trials = program.put(trials)
-        batches = [batch for batch, *_ in suspended] or queue.take(slots)
+        trials = jax.tree.map(lambda x: np.zeros(x.shape, x.dtype), program.shapes(index)[1])
+        if running is not None:
+            at = slice(running.fresh.size)
+            _write(trials, at, running.trials)
+            self._first[at] = np.where(running.fresh, 0, -1)
+        self.trials = jax.device_put(trials, device)
+        batches = queue.take(slots) if running is None else [running.batch]
         self.inputs = self._fill(np.arange(slots), batches)
 
     def _fill(self, at: np.ndarray, batches: Sequence[WorldBatch]) -> Inputs:
@@ -465,33 +439,33 @@ class _Slots:
             self._indices[slots], self.live[slots] = batch.indices, True
             _write(self._host, slots, batch.inputs)
         # A copy: the device may otherwise share the host's memory, which the next call changes.
-        return self._program.put(jax.tree.map(np.copy, self._host))
+        return jax.device_put(jax.tree.map(np.copy, self._host), self._device)
 
     def arguments(self) -> tuple[Inputs, Trial, jax.Array, jax.Array]:
         """Return the arguments of the program for the next segment, in which fresh trials start."""
-        fresh, live = self._program.put(jax.tree.map(np.copy, (self._fresh, self.live)))
-        self._fresh[:] = False
-        return self.inputs, self.trials, fresh, live
+        masks = self._first == self._count, self.live.copy()
+        self._count += 1
+        return self.inputs, self.trials, *jax.device_put(masks, self._device)
 
-    def refill(self, segment: _Segment) -> tuple[np.ndarray, Outcome, float]:
+    def refill(self, segment: int, state: _State) -> _Ended:
         """Replace the trials that ended in a segment; return the arguments of `_Monitor.add`."""
-        steps, done, outcomes = segment
-        at = np.flatnonzero(done & self.live)
-        period = self._program.setting.physics.control_period
-        ended = self._indices[at], rows(outcomes, at), float(steps.sum()) * period
+        steps, done, outcomes = state
+        at = np.flatnonzero(done & self.live & (self._first <= segment))
+        ended = self._indices[at], rows(outcomes, at), float(steps.sum()) * self._period
         self.live[at] = False
         if batches := self._queue.take(at.size):
             self.inputs = self._fill(at, batches)
-            self._fresh[at] = self.live[at]
+            self._first[at] = self._count
         return ended
 
-    def suspend(self) -> None:
-        """Move the trials that run to the queue."""
-        if (at := np.flatnonzero(self.live)).size:
-            worlds, params = rows(self._host, at)
-            batch = WorldBatch(self._indices[at], worlds, self._queue.example.stage, params)
-            trials = rows(jax.device_get(self.trials), at)
-            self._queue.suspended.append(_Suspended(batch, trials, self._fresh[at]))
+    def remove(self) -> _Running:
+        """Return the trials that run; none if there is none."""
+        at = np.flatnonzero(self.live)
+        worlds, params = rows(self._host, at)
+        batch = WorldBatch(self._indices[at], worlds, self._queue.example.stage, params)
+        return _Running(
+            batch, rows(jax.device_get(self.trials), at), self._first[at] >= self._count
+        )
 
 
 def _write(tree: Tree, index: Any, values: Tree) -> None:
@@ -501,50 +475,64 @@ def _write(tree: Tree, index: Any, values: Tree) -> None:
 
 
 def _work(
-    single: Sequence[_Program], joint: Sequence[_Program], monitor: _Monitor, index: int
+    groups: Sequence[Sequence[_Program]], monitor: _Monitor, index: int, device: jax.Device
 ) -> None:
-    """Run programs on one worker until no trial waits or runs; `index` is the worker's."""
-    first = index % max(1, len(single))
-    for program in (*single[first:], *single[:first]):
-        _run(program, _max_suspended(), monitor)
-    monitor.queues_empty.wait()
-    for program in joint[index :: monitor.queues_empty.parties]:
-        _run(program, 0, monitor)
+    """Run groups of programs on a device until no trial waits or runs; `index` of the worker."""
+    first = index % max(1, len(groups))
+    for group in (*groups[first:], *groups[:first]):
+        running: list[_Running | None] = [None] * len(group[0].queues)
+        for program, few in itertools.zip_longest(group, [x.slots for x in group[1:]]):
+            running = [*_run(program, few, running, device, monitor)]
 
 
-def _run(program: _Program, max_suspended: int, monitor: _Monitor) -> None:
-    """Run segments until no trial waits and at most `max_suspended` run; suspend these."""
+def _run(
+    program: _Program, few: Sequence[int] | None, running: Sequence[_Running | None],
+    device: jax.Device, monitor: _Monitor,
+) -> Sequence[_Running | None]:  # fmt: skip
+    """Run segments until no trial waits and at most `few` of each queue run; return these."""
     if monitor.stop:
-        return
-    resume = not max_suspended
-    queues = [_Slots(program, index, resume) for index in range(len(program.queues))]
-    if not any(slots.live.any() for slots in queues):
-        return
-    start_time = time.perf_counter()
-    advance, stages, rules = program.compiled(), program.stages, program.setting.rules
-    monitor.add_compile_time(program, time.perf_counter() - start_time)
+        return running
+    queues = [_Slots(program, *trials, device) for trials in enumerate(running)]
+    limits = few or [0] * len(queues)
+
+    def live() -> tuple[int, ...]:
+        return tuple(int(np.count_nonzero(slots.live)) for slots in queues)
+
+    if not any(live()):
+        return running
+    start_time = monitor.elapsed
+    advance = program.compiled(device)
+    stages, rules = jax.device_put((program.stages, program.setting.rules), device)
+    monitor.add_compile_time((program, device), monitor.elapsed - start_time)
+    delay = 0 if _few_slots() is None else 1  # segments that run while the host reads another
+    end, unread = 0.0, deque[tuple[float, tuple[int, ...], tuple[_State, ...]]]()
     with ThreadPoolExecutor(1) as reporter:  # reports a segment while the next one runs
         report: Future[object] = reporter.submit(int)  # of the last segment that was read
-        unread: tuple[_Segment, ...] | None = None  # segment whose results are still on the GPU
 
-        def read(segments: tuple[_Segment, ...]) -> Future[object]:
-            segments = jax.device_get(segments)
-            ended = [slots.refill(s) for slots, s in zip(queues, segments, strict=True)]
+        def read(number: int) -> None:
+            """Read the oldest segment that was not read, the `number`-th of all."""
+            nonlocal end, report
+            start, counts, states = unread.popleft()
+            pairs = zip(queues, jax.device_get(states), strict=True)
+            start, end = max(start, end), monitor.elapsed
+            segment = Segment(device.id, start, end, counts)
+            ended = [slots.refill(number, state) for slots, state in pairs]
             report.result()
-            return reporter.submit(lambda: [monitor.add(*arguments) for arguments in ended])
+            report = reporter.submit(partial(monitor.add, *ended, segment=segment))
 
-        while not monitor.stop and sum(slots.live.sum() for slots in queues) > max_suspended:
-            arguments = zip(*(slots.arguments() for slots in queues), strict=True)
-            advanced, segments = advance(stages, *arguments, rules)
-            for slots, trials in zip(queues, advanced, strict=True):
-                slots.trials = trials
-            # Where no trial waits for a slot, a GPU runs the next segment while the host reads.
-            overlap = _max_suspended() and all(queue.is_empty for queue in program.queues)
-            segments, unread = (unread, segments) if overlap else (segments, None)
-            if segments is not None:
-                report = read(segments)
-        if unread is not None:
-            report = read(unread)
+        for number in itertools.count(-delay):
+            counts = live()
+            runs = not monitor.stop and any(map(operator.gt, counts, limits))
+            if runs:
+                arguments = zip(*(slots.arguments() for slots in queues), strict=True)
+                start_time = monitor.elapsed
+                advanced, states = advance(stages, *arguments, rules)
+                for slots, trials in zip(queues, advanced, strict=True):
+                    slots.trials = trials
+                unread.append((start_time, counts, states))
+            if number >= 0 and unread:
+                read(number)
+            elif not runs:
+                break
         report.result()
-    for slots in queues:
-        slots.suspend()
+    return [] if few is None else [slots.remove() for slots in queues]

@@ -7,10 +7,19 @@ import sys
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Literal, NoReturn
+from typing import TYPE_CHECKING, Literal, NamedTuple, NoReturn
 
 if TYPE_CHECKING:
     from tqdm import tqdm
+
+
+class Segment(NamedTuple):
+    """Call of a program: some control steps of the trials in its slots."""
+
+    device: int  # its number on the host
+    start: float  # [s] since the start of the run
+    end: float  # [s] when its results were on the host
+    live: tuple[int, ...]  # trials that ran, of each job of the program
 
 
 @dataclass(frozen=True)
@@ -23,6 +32,7 @@ class Progress:
     rounds: int = 0  # generations or updates that are done
     compiled: int = 0  # programs
     programs: int = 0  # that the run needs, if it is known
+    segment: Segment | None = None  # that was reported last, of a run in JAX
 
 
 ProgressCallback = Callable[[Progress], object]

@@ -247,5 +247,6 @@ def recorder(
     fixed = worlds.stage, *worlds.inputs
     arguments = *fixed, trials, loop.rules
     static = (loop.physics, steps, stride)
-    program = programs.compile_function(record, arguments, law=loop.law, donate=3, static=static)
+    traced = programs.trace_function(record, arguments, law=loop.law, donate=3, static=static)
+    program = traced(None)
     return lambda trials: program(*fixed, trials, loop.rules)

@@ -75,7 +75,7 @@ class Kernel(SpeedStudy[xr.Dataset]):
     families: tuple[Literal["box", "cylinder", "prism"], ...] = FAMILIES
     """Families of the objects: box, cylinder, prism."""
     worlds: int = option(16_384, 8193, 10_000_000)
-    """Number of worlds of `wide`; it must exceed the number of suspended trials."""
+    """Number of worlds of `wide`."""
 
     def check(self) -> None:
         """Check that the profiler is installed."""
