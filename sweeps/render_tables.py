@@ -8,13 +8,18 @@ commands, device, versions, commit, date, columns and rows. A page shows the tab
 `<!-- end -->`. Within a sentence `<!-- cell: NAME | ROW | COLUMN -->...<!-- end -->` is a cell
 without its interval. ROW has the first cells of its row, separated by bars. A COLUMN whose name
 occurs twice follows a column to its left, as `both / 90 %`. With `--check` nothing is written, and
-the exit code is 1 if a page differs from the data. Only the standard library is needed.
+the exit code is 1 if a page differs from the data, or if a sentence has a measured number that no
+cell renders. Only the standard library is needed.
 
 A cell is a text, a number, a list of numbers (a rate and the limits of its interval), or null. The
 `format` of a column applies to a number and to the first of a list, its `rest` to the others. A
 column with `merge` leaves repeated texts out. A cell `{"from": NAME, "row": [...], "column": ...}`
 shows a cell of another table, in the row that starts with these values. A table of such cells has
 columns and rows only.
+
+A number counts as measured by its form: a share, a time, a size in mm, a ratio, a count of a count,
+an interval, or a power of ten. `publish/numbers.json` has the exceptions of each page, with their
+words: definitions and settings, and results that have no data file.
 
 `STALE` names the data files that are older than a change of their inputs and wait for their
 computation. The note under their tables says so.
@@ -24,7 +29,7 @@ import json
 import os
 import re
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -60,6 +65,26 @@ STALE: dict[str, str] = {
     "ground": _GROUND,
     "fidelity": _SATURATED + _GROUND,
 }
+NUMBERS = SWEEPS / "publish" / "numbers.json"
+_NUMBER = r"(?<![\w.,/^#-])[-+±]?\d[\d,]*(?:\.\d+)?(?:e[-+]?\d+)?"
+_UNIT = (
+    r"(?: ?%| ?(?:s|ms|µs|us|ns|min|h|x|kB|MB|GB|Hz|kHz|mm)\b"
+    r"|[ -](?:times|fold|seconds?|minutes?|hours?|milliseconds?|microseconds?|percent)\b)"
+)
+_MEASURED = re.compile(
+    rf"(?:{_NUMBER}(?: to | and |, |-))*{_NUMBER}{_UNIT}|{_NUMBER} (?:of|out of) {_NUMBER}"
+    rf"|(?:factor|factors) of {_NUMBER}|\bp [=<] {_NUMBER}|\[{_NUMBER}, {_NUMBER}\]"
+    rf"|\+\d[\d,]* -\d[\d,]*|(?<![\w.])\d[\d.]*e[-+]?\d+"
+)
+# Levels of intervals, and settings that many pages name.
+_DEFINED = re.compile(
+    rf"Wilson 95 %|(?:{_NUMBER} and )?{_NUMBER} % (?:[\w-]+ )?(?:intervals?|quantiles?)"
+    rf"|(?:steps|period) of {_NUMBER} ms|at {_NUMBER} k?Hz|20\d\d"
+)
+_UNREAD = (  # parts of a page that are no prose
+    r"<!-- (table|command): (\S+) -->\n.*?<!-- end -->", r"<!-- cell: [^>]*? -->.*?<!-- end -->",
+    r"```.*?```", r"`[^`]*`", r"\$\$.*?\$\$|\$[^$]*?\$", r"\]\([^)]*\)", r"<[^>]*>", r"https?://\S+",
+)  # fmt: skip
 _SKIPPED = {"runs", "build", "dist"}  # folders of the root that hold no pages of the repository
 
 
@@ -209,6 +234,52 @@ def notebooks(root: Path = ROOT) -> list[Path]:
     return sorted(path for path in paths if path.suffix in (".py", ".ipynb"))
 
 
+def prose(page: Path) -> str:
+    """Return the sentences of a page or of a notebook's text, with # for cells, code and links."""
+    text = page.read_text(encoding="utf-8")
+    if page.suffix == ".py":
+        text = "\n".join(re.findall(r"^# (?!%%)(.*)$", text, re.MULTILINE))
+    for pattern in _UNREAD:
+        text = re.sub(pattern, "#", text, flags=re.DOTALL)
+    return re.sub(r"\s+", " ", text)
+
+
+def loose_numbers(text: str, exceptions: Sequence[str] = ()) -> list[str]:
+    """Return the measured numbers of sentences that no cell renders, with the words before them.
+
+    `exceptions` are words of the sentences, with their numbers.
+    """
+    allowed = [match.span() for match in _DEFINED.finditer(text)]
+    for words in exceptions:
+        allowed += [match.span() for match in re.finditer(re.escape(words), text)]
+    loose = [
+        match
+        for match in _MEASURED.finditer(text)
+        if not any(start <= match.start() and match.end() <= end for start, end in allowed)
+    ]
+    return [text[max(0, match.start() - 30) : match.end()] for match in loose]
+
+
+def number_problems(root: Path = ROOT) -> list[str]:
+    """Return sentences on pages with measured numbers that have neither a cell nor an exception."""
+    declared, problems = json.loads(NUMBERS.read_text(encoding="utf-8")), []
+    texts = [path for path in notebooks(root) if path.suffix == ".py"]
+    for page in (*pages(root), *texts):
+        name, text = page.relative_to(root).as_posix(), prose(page)
+        if name in declared["unchecked"]:
+            continue
+        kinds = (declared[kind].get(name, ()) for kind in ("definitions", "without data"))
+        exceptions = [words for kind in kinds for words in kind]
+        if numbers := loose_numbers(text, exceptions):
+            problems.append(
+                f"{name} has measured numbers that no cell renders: {'; '.join(numbers)}. Write "
+                f"them as cells, or list them with their words in {NUMBERS.relative_to(ROOT)}."
+            )
+        unused = [words for words in exceptions if words not in text]
+        problems += [f"{NUMBERS.relative_to(ROOT)}: {name} lacks {words!r}." for words in unused]
+    return problems
+
+
 def main(arguments: list[str]) -> int:
     """Render all pages, or check that they match the data; return the exit code."""
     if arguments not in ([], ["--check"]):
@@ -227,10 +298,12 @@ def main(arguments: list[str]) -> int:
     except ValueError as error:
         print(f"render_tables: error: {error}", file=sys.stderr)
         return 1
+    problems = number_problems() if arguments else []
+    print("".join(f"{problem}\n" for problem in problems), end="")
     for page in stale:
         state = "differs from its data: run without --check" if arguments else "was rendered"
         print(f"{page.relative_to(ROOT)} {state}.")
-    return 1 if stale and arguments else 0
+    return 1 if (stale or problems) and arguments else 0
 
 
 if __name__ == "__main__":

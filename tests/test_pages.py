@@ -100,6 +100,62 @@ def test_a_number_in_a_sentence_follows_its_data(rendered):
     assert not re.search(r"^\s*<!-- cell", text, re.MULTILINE)  # it would start a paragraph
 
 
+def test_no_page_has_a_measured_number_without_a_cell_or_an_exception():
+    assert TABLES["number_problems"]() == []
+
+
+@pytest.mark.parametrize("number", [
+    "99.34 %", "0.7 to 1.1 mm", "12 s", "26 µs", "1.7x", "1.7 x", "4.6 times", "30-fold",
+    "93 of 100", "140 out of 144", "3 minutes", "[92.6, 93.6]", "p = 0.003", "p < 1e-9",
+    "+12 -3", "3e-13", "a factor of 3.1", "1,525 kB", "2 hours", "93 percent", "1 %, 2 % and 3 %",
+])  # fmt: skip
+def test_a_measured_number_in_a_sentence_needs_a_cell(number, tmp_path):
+    page = tmp_path / "page.md"
+    page.write_text(f"# Result\n\nThe law reaches\n{number} here.\n")
+    assert TABLES["loose_numbers"](TABLES["prose"](page))
+    assert not TABLES["loose_numbers"](TABLES["prose"](page), [number, "1 %", "2 % and 3 %"])
+    for shown in (f"<!-- cell: a | b -->{number}<!-- end -->", f"`{number}`", f"```\n{number}\n```",
+                  f"[page](x_{number.replace(' ', '_')}.md)",
+                  f"<!-- table: x -->\n| {number} |\n<!-- end -->"):  # fmt: skip
+        page.write_text(f"It is\n{shown}\n here.\n")
+        assert not TABLES["loose_numbers"](TABLES["prose"](page))
+
+
+@pytest.mark.parametrize("text", [
+    "in 2024", "Eq. 5, Fig. 6, Table 2 and Sec. 3",
+    "MuJoCo 3.17, Python 3.11 to 3.14, ROS 2 and C99",
+    "Wilson 95 % intervals", "90 % intervals", "5 and 95 % quantiles", "steps of 10 ms", "at 50 Hz",
+    "the 432 trials of three laws", "1. Choose the law", "a mass of 3 to 60 kg, 0.5 m ahead",
+])  # fmt: skip
+def test_a_definition_needs_no_cell(text, tmp_path):
+    (tmp_path / "page.md").write_text(f"It is {text}.\n")
+    assert not TABLES["loose_numbers"](TABLES["prose"](tmp_path / "page.md"))
+
+
+def test_an_exception_must_be_on_its_page(tmp_path, monkeypatch):
+    (tmp_path / "notebooks").mkdir()
+    (tmp_path / "page.md").write_text("It takes 3 s.\n")
+    (tmp_path / "notebooks" / "1_a.py").write_text("# %% [markdown]\n# Half of\n# it: 50 %.\n")
+    declared = {"unchecked": [], "definitions": {"page.md": ["takes 3 s"]}, "without data": {}}
+    globals_of = TABLES["number_problems"].__globals__
+
+    def problems(**changes):
+        path = tmp_path / "numbers.json"
+        path.write_text(json.dumps(declared | changes))
+        monkeypatch.setitem(globals_of, "NUMBERS", path)
+        monkeypatch.setitem(globals_of, "ROOT", tmp_path)
+        return TABLES["number_problems"](tmp_path)
+
+    (notebook,) = problems()
+    assert "notebooks/1_a.py has measured numbers" in notebook
+    assert "Half of it: 50 %" in notebook
+    half = {"notebooks/1_a.py": ["it: 50 %"]}
+    assert problems(**{"without data": half}) == []
+    assert problems(unchecked=["notebooks/1_a.py"]) == []
+    (missing,) = problems(**{"without data": half | {"page.md": ["in 4 s"]}})
+    assert "page.md lacks 'in 4 s'" in missing
+
+
 @pytest.mark.parametrize("page", PAGES, ids=relative)
 def test_links_have_targets(page):
     for link in re.findall(r"\]\(((?!https://)[^)\s]+)\)", page.read_text()):
