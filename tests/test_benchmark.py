@@ -17,15 +17,17 @@ from rps_jax.engines.base import ControlPeriod
 from rps_jax.engines.mjx_colliders import mjx
 from rps_jax.engines.quasistatic import Quasistatic
 from rps_jax.errors import InputError
+from rps_jax.runs.question import Run
 from rps_jax.trials import pushes, trial
 from rps_jax.trials.case import Case
+from rps_jax.trials.progress import no_progress
 from rps_jax.trials.setting import Setting
 from rps_jax.world import scene
 from rps_jax.world.physics import preset
 from rps_jax.world.scene import FRICTION
 from sweeps import programs
 from sweeps.levers import study as levers
-from sweeps.speed import commands, costs, kernel, robot
+from sweeps.speed import commands, costs, gpus, kernel, robot
 from sweeps.speed import study as speeds
 
 
@@ -169,6 +171,31 @@ def test_whole_commands_are_timed_twice_per_gpu_count(monkeypatch):
     assert words[0] == ["rps_jax", "push", "--seed", "1"]
     (table,) = study.report_tables(results)
     assert table.rows[2][3:] == ["1.5 s", "2.0 s", "1,234", "1.1 GB", "1.1 GB"]
+
+
+def test_sweeps_are_timed_on_the_gpus_of_the_host(monkeypatch):
+    calls = []
+
+    def printed(words, label, folder, limit, count):
+        calls.append((label, count))
+        segments = [[0, 1.0, 2.0, [4000, 3000, 0]], [1, 1.0, 4.0, [1000, 0, 0]]][:count]
+        traced = f"a line\n{segments}\n"
+        return traced if words[0] == "-c" else "compile 0.2 s, run 3.0 s (900 simulated s per s)", 1
+
+    monkeypatch.setattr(gpus, "printed", printed)
+    monkeypatch.setattr(gpus, "run_process", lambda *_: "GPU 0: H100\nGPU 1: H100\n")
+    study = gpus.Gpus(worlds=(20, 10))
+    (table,) = study.report_tables(study.answer(Run(None, no_progress)))
+    assert [row[:2] for row in table.rows[1:]] == [
+        ["20", "1"],
+        ["20", "2"],
+        ["10", "1"],
+        ["10", "2"],
+    ]
+    assert [row[-1] for row in table.rows[1:]] == ["", "", "50 %", "50 %"]
+    assert sorted(count for label, count in calls if "horizon" in label) == [1, 1, 2, 2]
+    assert sum("segment" in label for label, _ in calls) == 2
+    assert table.picture.png()
 
 
 def test_step_times_on_a_robot_are_parsed_from_the_examples_output(monkeypatch):

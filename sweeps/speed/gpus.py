@@ -1,0 +1,156 @@
+"""Duration of whole sweeps on several GPUs of one host, and the timeline of their slots.
+
+Every sweep runs in a new process that sees some of the GPUs. First all sweeps fill their caches
+together. `JAX_PLATFORMS=cpu` makes the timing process leave the GPUs to them.
+
+    JAX_PLATFORMS=cpu rps sweeps/speed/gpus.py --machine "eight NVIDIA H100"
+"""
+
+from __future__ import annotations
+
+import json
+import tempfile
+import time
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import cached_property, partial
+from itertools import product
+from pathlib import Path
+from typing import ClassVar
+
+import numpy as np
+import xarray as xr
+
+from rps_jax.analysis.figures.style import Figure, words
+from rps_jax.analysis.report import Picture
+from rps_jax.errors import InputError
+from rps_jax.record.options import option
+from rps_jax.runs.question import Run, call_of
+from rps_jax.trials.progress import Segment
+from rps_jax.world.domain import parse_domain
+from sweeps.speed.commands import TIMING, printed
+from sweeps.study_base import SpeedStudy, Table, records, run_process, text_table
+
+_LIMIT = 600.0  # [s] of a sweep
+_COLUMNS = {
+    "worlds": "{worlds:,}",
+    "GPUs": "{gpus}",
+    "whole command": "{whole:.1f} s",
+    "one GPU over it": "{gain:.2f}",
+    "of it compile": "{compile:.1f} s",
+    "run": "{run:.1f} s",
+    "simulated s/s": "{rate:,.0f}",
+    "GPUs idle": "{idle:.0f} %",
+}
+# A sweep that prints its segments.
+_TRACED = (
+    "import json, rps_jax\n"
+    "segments = []\n"
+    "rps_jax.sweep({!r}, 'wide', worlds={}, report_to=lambda x: segments.append(x.segment))\n"
+    "print(json.dumps([x for x in segments if x is not None]))\n"
+)
+
+
+@dataclass(frozen=True)
+class Gpus(SpeedStudy[xr.Dataset]):
+    """Time whole sweeps of `wide` on some GPUs of this host, with a filled cache.
+
+    The results hold, by sweep, its duration, the times that it prints and, of the fewest worlds on
+    the fewest and on the most GPUs, its segments as JSON.
+    """
+
+    TITLE: ClassVar[str] = "Sweeps on several GPUs"
+    DIMENSION: ClassVar[str] = "sweep"
+    GROWS: ClassVar[tuple[str, ...]] = ("worlds", "gpus")
+
+    law: str = "rps_tuned"
+    """Law to run."""
+    worlds: tuple[int, ...] = option((262_144, 1_048_576), 1, 100_000_000)
+    """Numbers of worlds."""
+    gpus: tuple[int, ...] = option((1, 2, 4, 8), 1, 64)
+    """Numbers of GPUs; those that this host lacks are skipped."""
+
+    @cached_property
+    def sweeps(self) -> Sequence[tuple[int, int]]:
+        """Numbers of worlds and GPUs of all sweeps."""
+        listed = run_process(["nvidia-smi", "-L"], "gpus are not available")
+        return list(product(self.worlds, filter(listed.count("GPU ").__ge__, self.gpus)))
+
+    def parts(self, run: Run) -> Mapping[str, Callable[[], xr.Dataset]]:
+        """Return the function that times each sweep."""
+        return {
+            f"{x} worlds, {gpus} GPUs": partial(self._timed, x, gpus) for x, gpus in self.sweeps
+        }
+
+    def report_tables(self, results: xr.Dataset) -> Sequence[Table]:
+        """Return the durations, with the timeline of the traced sweeps."""
+        rows, traces = [*records(results, "sweep")], {}
+        for row in rows:
+            first = next(x for x in rows if x["worlds"] == row["worlds"])
+            row |= {"gain": first["whole"] / row["whole"], "idle": np.nan}
+            if segments := [Segment(*x) for x in json.loads(row["segments"])]:
+                busy = sum(x.end - x.start for x in segments) / segments[-1].end
+                row["idle"] = 100 * (1 - busy / row["gpus"])
+                traces[row["gpus"]] = segments
+        objects = [words(name) for name in parse_domain("wide").objects]
+        picture = Picture("gpus", partial(timeline, traces, objects))
+        return [Table(text_table(_COLUMNS, rows), name="gpus", merge="worlds", picture=picture)]
+
+    @cached_property
+    def _caches(self) -> tempfile.TemporaryDirectory[str]:
+        """Folder of the caches, which all sweeps fill at the same time."""
+        folder = tempfile.TemporaryDirectory()
+        fill = partial(self._swept, folder.name, options=" --horizon 0.02")
+        with ThreadPoolExecutor(len(self.sweeps)) as pool:
+            list(pool.map(fill, *zip(*self.sweeps, strict=True)))
+        return folder
+
+    def _swept(self, folder: str, worlds: int, gpus: int, options: str = "") -> str:
+        """Return the output of a sweep with its cache in a folder."""
+        cache = Path(folder, f"{worlds}_{gpus}")
+        cache.mkdir(exist_ok=True)
+        command = f"sweep --laws {self.law} --domain wide --worlds {worlds}{options}"
+        command += f" --out {tempfile.mkdtemp(dir=cache)}/run"
+        return printed(["-m", "rps_jax", *command.split()], command, str(cache), _LIMIT, gpus)[0]
+
+    def _timed(self, worlds: int, gpus: int) -> xr.Dataset:
+        """Return the times and the segments of a sweep."""
+        folder, segments, counts = self._caches.name, "[]", [n for _, n in self.sweeps]
+        start = time.perf_counter()
+        output = self._swept(folder, worlds, gpus)
+        whole = time.perf_counter() - start
+        if (match := TIMING.search(output)) is None:
+            raise InputError(f"the sweep of {worlds} worlds printed no time of its run.")
+        if worlds == min(self.worlds) and gpus in (min(counts), max(counts)):
+            call, cache = _TRACED.format(self.law, worlds), f"{folder}/{worlds}_{gpus}"
+            segments = printed(["-c", call], call, cache, _LIMIT, gpus)[0].splitlines()[-1]
+        values = dict(zip(("compile", "run", "rate"), map(float, match.groups()), strict=True))
+        sizes = {"worlds": worlds, "gpus": gpus, "whole": whole}
+        return xr.Dataset(sizes | values | {"segments": segments})
+
+
+gpus = call_of(Gpus)
+
+
+def timeline(traces: Mapping[int, Sequence[Segment]], objects: Sequence[str]) -> Figure:
+    """Plot the busy slots of each device over time, by object; rows are runs and their devices."""
+    rows = [(gpus, device) for gpus, x in traces.items() for device in sorted({y[0] for y in x})]
+    figure = Figure(figsize=(9.0, 1.0 + 1.3 * len(rows)), layout="constrained")
+    axes = figure.subplots(len(rows), sharex=True, squeeze=False)[:, 0]
+    for ax, (gpus, device) in zip(axes, rows, strict=True):
+        segments = [x for x in traces[gpus] if x.device == device]
+        starts = [x.start for x in segments]
+        base = np.zeros(len(segments))
+        for i, name in enumerate(objects):
+            live = np.array([x.live[i] / 1000 if i < len(x.live) else 0.0 for x in segments])
+            widths = [x.end - x.start for x in segments]
+            ax.bar(starts, live, widths, base, align="edge", color=f"C{i}", label=name)
+            base += live
+        ax.set_ylabel(f"{gpus} GPU{'s' * (gpus > 1)}: {device}", rotation=0, ha="right")
+        ax.set_xlim(left=0.0)
+        ax.grid(alpha=0.3)
+    axes[-1].set_xlabel("time since the start of the run [s]")
+    figure.suptitle("busy slots of each GPU [thousands]")
+    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=4)
+    return figure
