@@ -397,7 +397,9 @@ def test_the_value_function_of_an_initial_law_is_learned_first(learned, tmp_path
 
 def test_an_initial_law_has_the_network_of_the_options(learned, tmp_path):
     path = str(learned[0] / "policy.npz")
-    with pytest.raises(InputError, match=r"width = 7 is not allowed: the initial law .* has 6"):
+    with pytest.raises(
+        InputError, match=r"initial = .* is not allowed: its network needs .*width = 6"
+    ):
         learn(CYLINDERS, **TINY | {"initial": path, "width": 7}, updates=4, out=tmp_path)
     with pytest.raises(InputError, match="no_such_law"):
         learn(CYLINDERS, **TINY | {"initial": "no_such_law"}, updates=4, out=tmp_path)

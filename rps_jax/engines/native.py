@@ -269,7 +269,7 @@ def concurrent(
     """Return functions of batches of worlds as one function; a GPU runs them at the same time.
 
     Args:
-      functions: of one world each; pure. Equal functions of equal shapes are compiled once.
+      functions: of one world each; pure.
       whole: all their results from a tuple of arguments for each; XLA compiles it where
         `functions` are not compiled.
       sort_by: returns keys (B,) of a batch's worlds. Worlds with similar keys are computed side by
@@ -280,8 +280,7 @@ def concurrent(
 
     @functools.cache
     def compiled(types: Sequence[tuple[Any, Sequence[Any]]]) -> tuple[list[_Function], Any]:
-        call = functools.cache(lambda f, x: _Function(f, x[0], x[1], sort_by))
-        calls = [call(f, x) for f, x in zip(functions, types, strict=True)]
+        calls = [_Function(f, *x, sort_by) for f, x in zip(functions, types, strict=True)]
         groups = [calls] if jax.default_backend() == "gpu" else [[call] for call in calls]
         return calls, [(group, _compiled(group)) for group in groups]
 
@@ -406,13 +405,8 @@ def _texts(functions: Sequence[_Function]) -> tuple[int, list[str]]:
 
 def _printed(functions: Sequence[_Function], printer: Callable[[], SimdWriter]) -> list[str]:
     """Return the texts of functions."""
-
-    @functools.cache
-    def text(x: _Function) -> str:
-        return printer().source(x.jaxpr, x.inputs, x.results, x.is_sorted)
-
     with jax.ensure_compile_time_eval():
-        return list(map(text, functions))
+        return [printer().source(x.jaxpr, x.inputs, x.results, x.is_sorted) for x in functions]
 
 
 def _library(text: str, name: str) -> bytes:

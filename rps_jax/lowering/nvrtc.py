@@ -50,10 +50,8 @@ def images(texts: Sequence[str]) -> list[bytes]:
     Raises:
       RuntimeError: the compiler that fails, and its first error.
     """
-    different = list(dict.fromkeys(texts))
-    with ThreadPoolExecutor(len(different)) as pool:
-        images = dict(zip(different, pool.map(_image, different), strict=True))
-    return [images[text] for text in texts]
+    with ThreadPoolExecutor(len(texts)) as pool:
+        return list(pool.map(_image, texts))
 
 
 def _image(text: str) -> bytes:

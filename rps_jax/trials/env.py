@@ -13,7 +13,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import itertools
-from collections.abc import Hashable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -275,12 +275,6 @@ class PushEnv:
     def action_size(self) -> int:
         """Length of an action."""
         return len(Twist._fields)
-
-    @property
-    def static(self) -> Hashable:
-        """Everything that its functions depend on, but for worlds, states and actions."""
-        shared = self.is_native or self  # a native stage has no numbers of its worlds
-        return shared, self.params, self.setting, self.weights, self.smooth
 
     @property
     def is_native(self) -> bool:

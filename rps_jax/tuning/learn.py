@@ -149,11 +149,10 @@ class Learn(PPO, TaskOption, SimulationQuestion[xr.Dataset]):
             rule = f"there are only {count} worlds; raise num_envs"
             raise errors.not_allowed("num_minibatches", self.num_minibatches, rule)
         if self.initial:
-            network = policies.read(self.initial).network
-            for name, field in (("network", "kind"), ("width", "width"), ("hold", "hold")):
-                if getattr(self, name) != (expected := getattr(network, field)):
-                    rule = f"the initial law {self.initial} has {expected}"
-                    raise errors.not_allowed(name, getattr(self, name), rule)
+            kind, width, _, hold = policies.read(self.initial).network
+            if (self.network, self.width, self.hold) != (kind, width, hold):
+                rule = f"its network needs network = {kind}, width = {width} and hold = {hold:g} s"
+                raise errors.not_allowed("initial", self.initial, rule)
         period = self.setting.physics.control_period
         errors.check_number("hold", self.hold, at_least=0.999 * period, unit="s")
 
@@ -249,14 +248,6 @@ class _Learner:
         self.compile = time.perf_counter() - compile_start
         # A copy: no two leaves may share memory, which updates write to.
         self.runner: RunnerState = jax.tree.map(jnp.copy, compiled_start(tables))
-        if options.initial:
-            actor = jax.device_put(policies.read(options.initial).weights)
-            weights, ema = (
-                self.runner.train.weights | {"actor": actor},
-                jax.tree.map(jnp.copy, actor),
-            )
-            train = self.runner.train._replace(weights=weights, ema=ema)
-            self.runner = self.runner._replace(train=train)
         self.best = jax.device_get(self.runner.train.ema)
         self.best_rate, self.curve = -1.0, list[Metrics]()
         self._restore()

@@ -20,6 +20,7 @@ import optax
 from rps_jax.control.learned import features
 from rps_jax.control.learned import network as networks
 from rps_jax.control.learned.network import Network, NetworkKind, Weights
+from rps_jax.control.learned.policy import read
 from rps_jax.record.options import option
 
 PRIVATE_SIGNS = np.array([1, -1, 1, 1, 1], np.float32)  # of `private` inputs in the mirror image
@@ -109,7 +110,7 @@ class TrainState(NamedTuple):
         actor, critic = jax.random.split(key)
         inputs = features.feature_count(network.taxels) + PRIVATE_SIGNS.size
         weights: Weights = {
-            "actor": network.init(actor),
+            "actor": read(ppo.initial).weights if ppo.initial else network.init(actor),
             "critic": networks.init_weights(networks.critic_shapes(inputs, ppo.width), critic),
             "log_std": jnp.full(3, math.log(ppo.spread)),
         }

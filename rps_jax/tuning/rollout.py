@@ -8,6 +8,7 @@ Curriculum: at a low level targets are near and ahead. The level rises when enou
 up to the targets of the domain. Tasks with a path have no curriculum.
 """
 
+import itertools
 from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any, NamedTuple, TypeVar
@@ -82,13 +83,9 @@ def start(
     """Return the state before the first update, with every trial at a random time."""
     key, first, *keys = jax.random.split(jax.random.PRNGKey(seed), 2 + len(envs))
     level = jnp.asarray(1.0 if ppo.initial else ppo.level, float)
-    indices = [
-        jax.random.randint(k, (ppo.num_envs,), 0, env.worlds)
-        for k, env in zip(keys, envs, strict=True)
-    ]
-    draws = [
-        _draw_worlds(table, level, *x) for table, *x in zip(tables, keys, indices, strict=True)
-    ]
+    failures = tuple(jnp.full(env.worlds, 0.5) for env in envs)
+    indices = [draw_indices(ppo, *x, (ppo.num_envs,)) for x in zip(failures, keys, strict=True)]
+    draws = list(map(_draw_worlds, tables, itertools.repeat(level), keys, indices))
     batches = list[EnvBatch]()
     for env, batch, env_key in zip(envs, _begin(network, envs, draws), keys, strict=True):
         horizon_steps = int(float(env.setting.rules.horizon) / env.dt)
@@ -96,7 +93,7 @@ def start(
         steps = jax.random.randint(time_key, (ppo.num_envs,), 0, horizon_steps)
         states = batch.states.replace(data=batch.states.data._replace(steps=steps))
         batches.append(batch._replace(states=states))
-    zero, failures = jnp.zeros(()), tuple(jnp.full(env.worlds, 0.5) for env in envs)
+    zero = jnp.zeros(())
     train = TrainState.init(ppo, network, first)
     inputs = train, zero, jnp.zeros((), int), failures, level, zero, zero, key
     return RunnerState(*inputs, tuple(batches))
@@ -123,10 +120,7 @@ def _together(
     envs: Sequence[PushEnv], function: Callable[..., T], inputs: Sequence[tuple[Any, ...]]
 ) -> list[T]:
     """Map `function(env, ...)` of one world over the inputs (N, ...) of each environment."""
-    # Of environments that differ in their worlds alone, one has the function.
-    owners = {env.static: env for env in reversed(envs)}
-    bound = {static: partial(function, env) for static, env in owners.items()}
-    functions = [bound[env.static] for env in envs]
+    functions = [partial(function, env) for env in envs]
 
     def in_xla(*inputs: tuple[Any, ...]) -> list[T]:
         return [jax.vmap(f)(*x) for f, x in zip(functions, inputs, strict=True)]
@@ -247,24 +241,22 @@ def _act_together(
 ) -> list[tuple[EnvBatch, jax.Array]]:  # fmt: skip
     """Execute the joined actions (sum of N, 3) in the worlds of all environments: see `act`."""
 
-    def single(env: PushEnv, batch: EnvBatch, action: jax.Array) -> tuple[EnvBatch, jax.Array]:
+    def single(
+        env: PushEnv, batch: EnvBatch, _: jax.Array, action: jax.Array
+    ) -> tuple[EnvBatch, jax.Array]:  # a kernel would copy what it does not change
         moved, reward = act(env, network, batch, jnp.zeros(()), action, _alone)
         return _with_info(moved, world=None), reward
 
     ends = np.cumsum([x.first.size for x in batches])[:-1]
-    hiddens, actions = jnp.split(hidden, ends), jnp.split(action, ends)
-    # The kernel neither reads nor writes what does not change.
-    inputs = [x._replace(memory=x.memory._replace(hidden=jnp.zeros(x.first.size))) for x in batches]
-    results = _together(envs, single, list(zip(inputs, actions, strict=True)))
-    return [
-        (
-            _with_info(
-                x._replace(memory=x.memory._replace(hidden=h)), world=before.states.info["world"]
-            ),
-            r,
-        )
-        for (x, r), h, before in zip(results, hiddens, batches, strict=True)
-    ]
+    inputs = list(zip(batches, jnp.split(hidden, ends), jnp.split(action, ends), strict=True))
+    results = []
+    for (batch, reward), (old, new_hidden, _) in zip(
+        _together(envs, single, inputs), inputs, strict=True
+    ):
+        memory = batch.memory._replace(hidden=new_hidden)
+        batch = _with_info(batch._replace(memory=memory), world=old.states.info["world"])
+        results.append((batch, reward))
+    return results
 
 
 def _episode_stats(env: PushEnv, batch: EnvBatch) -> tuple[Stats, jax.Array]:
@@ -326,8 +318,8 @@ def update(
             (_inputs(env, batch), reward, *_episode_stats(env, batch), batch.states.info["index"])
             for env, (batch, reward) in zip(envs, moved, strict=True)
         ]
-        drawn = zip(tables, start_keys, fresh, strict=True)
-        starts = _begin(network, envs, [_draw_worlds(x, runner.level, *y) for x, *y in drawn])
+        draws = map(_draw_worlds, tables, itertools.repeat(runner.level), start_keys, fresh)
+        starts = _begin(network, envs, list(draws))
         restarted = tuple(
             jax.vmap(soft.tree_where)(batch.states.data.done, start, batch)
             for (batch, _), start in zip(moved, starts, strict=True)
