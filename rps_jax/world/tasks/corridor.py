@@ -35,7 +35,7 @@ _PRESSED = 0.01  # [m] beyond a wall, at which the object has failed where it ma
 # that an object that slides along a wall never meets the end of the next one.
 _JOINT = 0.01
 _NOWHERE = ((1e4, 1e4), (1e4 + 1, 1e4))  # [m] wall that nothing touches
-_STEPS = 5  # control steps between two measurements of the walls, unless one may be touched
+_STEPS = 8  # control steps between two measurements of the walls, unless one may be touched
 NOTHING, BASE, OBJECT = 0, 1, 2  # what touched a wall
 _T = TypeVar("_T")  # a pytree
 
@@ -92,7 +92,7 @@ class CorridorCourse(NamedTuple):
     ) -> tuple[CorridorProgress, Aim]:
         """Advance along the path, and fail at a touch.
 
-        Walls are measured in every fifth step, and in each in which one may be touched.
+        Walls are measured in every eighth step, and in each in which one may be touched.
         """
         inner, aim = self.path.step(progress.path, positions)
         poses = jnp.stack(
@@ -181,7 +181,7 @@ class Corridor(Path):
     OUTCOMES: ClassVar[dict[str, tuple[str, str]]] = Path.OUTCOMES | {
         "clearance": (
             "m",
-            "least distance of base and object from the walls, every fifth control step",
+            "least distance of base and object from the walls, every eighth control step",
         ),
         "wall_touch": ("1", "what touched a wall and ended the trial: 1 the base, 2 the object"),
         "touch_x": ("m", "x of the touch in the world"),
