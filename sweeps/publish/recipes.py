@@ -266,7 +266,7 @@ RECIPES: dict[str, Recipe] = {
         section=rows.default_beside_tuned,
     ),
     "round_base": recipe(
-        "rps sweeps/round_base --worlds 500", cores=10, section="Flat against round"
+        "rps sweeps/round_base --worlds 3000", cores=60, gpu=1, section="Flat against round"
     ),
     "corridors_*": recipe(
         "rps sweeps/corridors --laws rps rps_tuned rps_plus learned_gru force_push dipole aps "
