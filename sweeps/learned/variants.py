@@ -35,10 +35,12 @@ SHARED = (
     " --horizon 300 --max-lost 150 --hard 0.5 --success 2 --failure 1 --anneal 0.4 --average 100"
 )
 _WARM = "--initial learned_gru --spread 0.25 --learning-rate 2e-4"
+_LIMITS = "robot_force=150:800,robot_traction=0.3:0.8,robot_lag=0:0.5,robot_acceleration=0.1:1"
 VARIANTS = {  # options after the shared ones
     "scratch": "",
     "warm": _WARM,
     "wide and hostile": f"{_WARM} --domain wide hostile",
+    "hard domains": f"{_WARM} --domain hostile real hostile,{_LIMITS}",
     "with tasks": f"{_WARM} --domain wide hostile real wide,task=path wide,task=corridor",
     "uniform worlds": f"{_WARM} --hard 0",
     "reward of 0.2.0": f"{_WARM} --success 1 --failure 0",
