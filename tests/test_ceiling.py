@@ -158,5 +158,8 @@ def test_the_command_tries_the_failures_of_a_law(tmp_path, capsys):
     text = capsys.readouterr().out
     assert "A planner that knows the world" in text
     assert "of the first 2 worlds" in text
+    rows = [line.split("|")[1].strip() for line in text.splitlines() if line.startswith("|")]
+    assert {"box", "all"} < {*rows}
+    assert {"timeout near the target", "timeout far from the target", "lost contact"} & {*rows}
     assert (tmp_path / "ceiling" / "results.nc").exists()
     assert "unknown law of the run 'rsp'" in refusal(capsys, search, "rsp")

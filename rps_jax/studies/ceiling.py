@@ -34,6 +34,7 @@ from rps_jax.record import files
 from rps_jax.record.options import option
 from rps_jax.runs.plan import Plan, attributes_of, load_plan
 from rps_jax.runs.question import DomainQuestion, Run, call_of, count_true, seed_of
+from rps_jax.studies.gallery import failure_modes
 from rps_jax.trials import score
 from rps_jax.trials.progress import SequentialProgress
 from rps_jax.trials.results import labelled
@@ -233,7 +234,8 @@ class Ceiling(DomainQuestion[xr.Dataset]):
         if self.results is not None:
             laws = " and ".join(self.failing_laws)
             text = f"Worlds in which {laws} fail, and the first {self.sample} worlds. {text}"
-            table = solved_table(results, self.results, self.failing_laws)
+            max_lost = float(self.plan.setting.rules.max_lost)
+            table = solved_table(results, self.results, self.failing_laws, max_lost)
         return [Section("A planner that knows the world", text, table)]
 
 
@@ -275,14 +277,22 @@ def failed_worlds(results: xr.Dataset, laws: Sequence[str]) -> np.ndarray:
     return np.flatnonzero((results.success.sel(law=list(laws)).values == 0).all(axis=0))
 
 
-def solved_table(ceiling: xr.Dataset, sweep: xr.Dataset, laws: Sequence[str]) -> list[list[str]]:
-    """Return a row for each object: who solves the worlds of a sweep in which some laws fail."""
+def solved_table(
+    ceiling: xr.Dataset, sweep: xr.Dataset, laws: Sequence[str], max_lost: float
+) -> list[list[str]]:
+    """Return who solves the worlds of a sweep in which some laws fail.
+
+    There is a row for each object, and one for each failure mode of the first law.
+    """
     count, worlds = sweep.sizes["world"], ceiling.world.values
     failed = np.isin(np.arange(count), np.intersect1d(failed_worlds(sweep, laws), worlds))
     planner = np.isin(np.arange(count), worlds[ceiling.solved.values > 0])
     law = (sweep.success.values > 0).any(axis=0)
     masks = (failed, failed & planner, failed & law & ~planner, failed & ~law & ~planner)
+    modes = failure_modes(sweep.sel(law=laws[0]), max_lost)
+    groups = statistics.worlds_by_object(sweep)
+    groups |= {str(mode): modes == mode for mode in np.unique(modes) if mode}
     table = [["object", "failed worlds", "solved by the planner", "only by another law", "by none"]]
-    for name, group in (statistics.worlds_by_object(sweep) | {"all": True}).items():
+    for name, group in (groups | {"all": True}).items():
         table.append([name, *(f"{count_true(mask & group):,}" for mask in masks)])
     return table
