@@ -1,8 +1,8 @@
 """Digests of the source code that the numbers of a data file depend on.
 
 A room is a subpackage of `rps_jax`, the scenes (`mjcf`), a folder of `sweeps`, or a module beside
-these folders. Its digest covers the syntax trees of its modules without comments, docstrings and
-texts of errors, and the content of its other source files. `EQUAL` lists changes that alter no
+these folders. Its digest covers the syntax trees of its modules without comments, docstrings, types
+and texts of errors, and the content of its other source files. `EQUAL` lists changes that alter no
 published number, such as renamed variables: the last of several digests of a room equals the
 others.
 """
@@ -26,6 +26,7 @@ EQUAL = Path(__file__).with_name("publish") / "equal.json"
 COMMITS = EQUAL.with_name("commits.json")  # digests of files that are older than the digests
 _FOLDERS = ("rps_jax", "mjcf", "sweeps")
 _SUFFIXES = (".py", ".npz", ".nc", ".c", ".h", ".xml")  # of source files; in `sweeps` .py alone
+_OF_TYPES = ("typing", "collections.abc", "jaxtyping", "types")  # modules that annotations name
 # Modules that store and show numbers: a change of them alters none.
 _NEUTRAL = (
     *("rps_jax.record", "rps_jax.errors", "rps_jax.app.cli", "rps_jax.__main__"),
@@ -145,12 +146,15 @@ def _tree(node: Any) -> str:
         return repr(node)
     if isinstance(node, ast.Raise):
         return "raise"
+    if isinstance(node, ast.ImportFrom) and node.module in _OF_TYPES:
+        return ""
     if isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant):
         return ""  # a docstring
     if isinstance(node, ast.JoinedStr):  # Python 3.12 adds empty parts
         return _tree([x for x in node.values if getattr(x, "value", None) != ""])
-    fields = "".join(f" {k}={_tree(x)}" for k, x in ast.iter_fields(node) if x not in (None, []))
-    return f"({type(node).__name__}{fields})"
+    fields = (pair for pair in ast.iter_fields(node) if pair[0] not in ("annotation", "returns"))
+    texts = (f" {name}={_tree(value)}" for name, value in fields if value not in (None, []))
+    return f"({type(node).__name__}{''.join(texts)})"
 
 
 # --- imports --------------------------------------------------------------------------------

@@ -145,6 +145,7 @@ def test_a_number_depends_on_the_rooms_that_its_command_imports(source_tree):
 
 @pytest.mark.parametrize(("text", "changes"), [
     ('"""A law."""\n\n# fast\nV = (1.0)\n"""Speed."""\n', False),
+    ("from typing import Any\n\nV: Any = 1.0\n", True),  # a field gets a type
     ("V = 1.5\n", True), ("V = 1.0\n\n\ndef f(): pass\n", True),
 ])  # fmt: skip
 def test_a_digest_covers_code_and_no_comment(source_tree, text, changes):
@@ -154,7 +155,10 @@ def test_a_digest_covers_code_and_no_comment(source_tree, text, changes):
     assert initial["geometry"] == changed["geometry"]
 
 
-def test_a_digest_ignores_the_texts_of_errors(source_tree):
+def test_a_digest_ignores_types_and_the_texts_of_errors(source_tree):
+    typed = "from typing import {0}\n\nv: {0} = 1\n\n\ndef f(v: {0}) -> {0}:\n    return v\n"
+    first, same = (digests_of(source_tree, typed.format(x))["control"] for x in ("Any", "Final"))
+    assert first == same
     law = "def f(v):\n    if v < {}:\n        raise ValueError({})\n"
     texts = law.format(0, "'below 0'"), law.format(0, "f'{v} is below 0'"), law.format(1, "''")
     first, same, other = (digests_of(source_tree, text)["control"] for text in texts)
