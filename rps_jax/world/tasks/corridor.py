@@ -121,7 +121,7 @@ class CorridorCourse(NamedTuple):
             least = jnp.where(by_base, of_base, room)
             touched = jnp.where(least > 0, NOTHING, jnp.where(by_base, BASE, OBJECT))
             clearance = jnp.minimum(last.clearance, jnp.minimum(of_base, of_object))
-            wall = jnp.where(by_base, at_base, at_object)
+            wall = jnp.where(by_base, at_base, at_object).astype(jnp.int32)
             return _Measured(clearance, touched.astype(least.dtype), wall, least, poses)
 
         def locate(poses: Array, last: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
