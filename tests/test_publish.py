@@ -202,7 +202,9 @@ def test_a_reason_confirms_all_files_that_are_stale_by_their_code_alone(
     words = (SWEEPS / "publish", "--check-digests", "--out", tmp_path / "run")
     assert rps(*words) == 2
     assert "the inputs of renamed have changed" in capsys.readouterr().err
-    assert rps(*words, "--confirm", "equal runs") == 0
+    assert rps(*words, "--confirm", "equal runs", "--only", "current") == 2
+    assert not (tmp_path / "equal.json").exists()
+    assert rps(*words, "--confirm", "equal runs", "--only", "ren*") == 0
     (entry,) = json.loads((tmp_path / "equal.json").read_text())
     assert (entry["reason"], entry["files"]) == ("equal runs", ["renamed"])
     assert entry["code"] == {"engines": ["0" * 12, code["engines"]]}

@@ -63,7 +63,8 @@ class Publish(Study[xr.Dataset]):
     GROWS: ClassVar[tuple[str, ...]] = ("only", "needs", "check_digests", "confirm")
 
     only: tuple[str, ...] = ()
-    """Data files to compute again, as fit_coverage or fit_*; by default none."""
+    """Data files to compute again, as fit_coverage or fit_*; by default none. With --confirm, those
+    that it is about; by default all."""
     needs: Literal["any", "cpu", "gpu"] = "any"
     """Device of the data files to compute again: processors, a GPU, or both."""
     check_digests: bool = False
@@ -82,10 +83,10 @@ class Publish(Study[xr.Dataset]):
 
     def answer(self, run: Run) -> xr.Dataset:
         """Compute selected data files again, and return the state of all data files."""
-        if self.only:
-            self._compute_again(run)
         if self.confirm:
-            confirm(self.confirm)
+            confirm(self.confirm, self.only or ("*",))
+        elif self.only:
+            self._compute_again(run)
         states = [xr.Dataset(_description(path), {"file": path.stem}) for path in published()]
         results = xr.concat(states, "file")
         states = dict(zip(results.file.values.tolist(), results.state.values.tolist(), strict=True))
@@ -158,17 +159,19 @@ def stale_problems(states: Mapping[str, str]) -> list[str]:
     return problems
 
 
-def confirm(reason: str) -> None:
-    """State in `equal.json` that the source code of today gives the numbers of all current files.
+def confirm(reason: str, patterns: Sequence[str]) -> None:
+    """State in `equal.json` that the source code of today gives the numbers of current files.
 
-    The digests of the code of older files, which have none, are first stored in `commits.json`.
+    `patterns` select data files. The digests of the code of older files, which have none, are first
+    stored in `commits.json`.
     """
     datas = {path.stem: json.loads(path.read_text()) for path in published()}
     datas = {name: data for name, data in datas.items() if "digest" in data}
     sources.store({data["commit"] for data in datas.values() if "code" not in data})
     names, code = [], dict[str, list[str]]()
     for name, data in datas.items():
-        if name in STALE or not _has_current_settings(data):
+        selected = any(fnmatch.fnmatch(name, pattern) for pattern in patterns)
+        if name in STALE or not selected or not _has_current_settings(data):
             continue
         rooms = rooms_of(map(shlex.split, data["command"]))
         for room in (changed := sources.changed_rooms(name, data, rooms)):
