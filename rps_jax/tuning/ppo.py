@@ -91,9 +91,11 @@ class PPO:
         """Lambda of generalised advantage estimation [1]."""
         return math.exp(-self.hold / self.gae_time)
 
-    def schedule(self, progress: jax.Array) -> jax.Array:
-        """Return the factor () of annealed options, after a share of the run."""
-        return jnp.clip((1 - progress) / max(self.anneal, 1e-6), 0.05, 1)
+    def schedule(self, progress: jax.Array, updates: jax.Array) -> Pair:
+        """Return the factor () of annealed options, after a share of the run, and whether the
+        policy is frozen () bool, after a number of updates."""
+        factor = jnp.clip((1 - progress) / max(self.anneal, 1e-6), 0.05, 1)
+        return factor, (updates < self.value_updates) & bool(self.initial)
 
 
 class TrainState(NamedTuple):

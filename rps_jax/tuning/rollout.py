@@ -52,7 +52,7 @@ class EnvBatch(NamedTuple):
 Carry = tuple[tuple[EnvBatch, ...], jax.Array]  # batches and key, between two actions
 Stats = dict[str, jax.Array]  # counts of ended trials, of worlds (N,) or sums over them, by name
 # Transitions, inputs of the network after the action, statistics, and indices of the worlds.
-Taken = tuple[Transition, tuple[jax.Array, jax.Array], Stats, jax.Array]
+StepResults = tuple[Transition, tuple[jax.Array, jax.Array], Stats, jax.Array]
 
 
 class RunnerState(NamedTuple):
@@ -112,7 +112,7 @@ def ease(world: World, level: jax.Array) -> World:
 
 
 def _alone(function: Callable[..., T], *_: Any) -> Callable[..., T]:
-    """Return a function of one world as it is, where others map it over worlds."""
+    """Return the function itself, for one world, as `jax.vmap` returns it for several."""
     return function
 
 
@@ -243,12 +243,12 @@ def _act_together(
 
     def single(
         env: PushEnv, batch: EnvBatch, _: jax.Array, action: jax.Array
-    ) -> tuple[EnvBatch, jax.Array]:  # a kernel would copy what it does not change
+    ) -> tuple[EnvBatch, jax.Array]:  # the kernel does not copy constant fields
         moved, reward = act(env, network, batch, jnp.zeros(()), action, _alone)
         return _with_info(moved, world=None), reward
 
-    ends = np.cumsum([x.first.size for x in batches])[:-1]
-    inputs = list(zip(batches, jnp.split(hidden, ends), jnp.split(action, ends), strict=True))
+    splits = np.cumsum([x.first.size for x in batches])[:-1]
+    inputs = list(zip(batches, jnp.split(hidden, splits), jnp.split(action, splits), strict=True))
     results = []
     for (batch, reward), (old, new_hidden, _) in zip(
         _together(envs, single, inputs), inputs, strict=True
@@ -303,7 +303,7 @@ def update(
     pairs = zip(runner.failures, index_keys, strict=True)
     indices = tuple(draw_indices(ppo, *pair, shape) for pair in pairs)
 
-    def take_action(carry: Carry, fresh: tuple[jax.Array, ...]) -> tuple[Carry, Taken]:
+    def take_action(carry: Carry, fresh: tuple[jax.Array, ...]) -> tuple[Carry, StepResults]:
         """Take one action in all worlds, and restart those whose trials end."""
         batches, key = carry
         key, noise_key, *start_keys = jax.random.split(key, 2 + len(envs))
@@ -333,17 +333,18 @@ def update(
 
     hidden = jnp.concatenate([batch.memory.hidden for batch in runner.batches])
     carry = runner.batches, action_key
-    (batches, _), (steps, after, taken, index) = jax.lax.scan(take_action, carry, indices)
-    pairs = (ppo_.critic_inputs(*x) for x in ((steps.obs, steps.private), after))
+    (batches, _), (steps, next_inputs, step_stats, index) = jax.lax.scan(
+        take_action, carry, indices
+    )
+    pairs = (ppo_.critic_inputs(*x) for x in ((steps.obs, steps.private), next_inputs))
     value, next_value = (networks.critic(weights["critic"], x) for x in pairs)
     steps = steps._replace(value=value, next_value=next_value)
-    stats = jax.tree.map(jnp.sum, taken)
-    is_first = runner.updates < ppo.value_updates
-    schedule = ppo.schedule(runner.progress), is_first & bool(ppo.initial)
+    stats = jax.tree.map(jnp.sum, step_stats)
+    schedule = ppo.schedule(runner.progress, runner.updates)
     train, kl = ppo_.update_policy(ppo, network, runner.train, update_key, hidden, steps, *schedule)
-    trials = (index, taken["ended"], taken["succeeded"])
-    columns = zip(*(jnp.split(x, len(envs), axis=1) for x in trials), strict=True)
-    failures = map(failure_rates, runner.failures, *zip(*columns, strict=True))
+    trials = (index, step_stats["ended"], step_stats["succeeded"])
+    columns = (jnp.split(x, len(envs), axis=1) for x in trials)
+    failures = map(failure_rates, runner.failures, *columns)
     updated = runner._replace(
         train=train, key=key, batches=batches, updates=runner.updates + 1, failures=tuple(failures)
     )

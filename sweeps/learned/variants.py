@@ -136,14 +136,14 @@ class Variants(QuickStudy[xr.Dataset]):
             times.append(
                 float(np.median(scores.time.values[0][success])) if any(success) else np.nan
             )
-        numbers = {
+        scalars = {
             "updates": float(curve.sizes["update"]),
             "simulated": float(last.simulated),
             "compile": float(curve.attrs["compile"]),
             "tried": float(self.worlds),
         }
         return xr.Dataset(
-            {key: ((), value) for key, value in numbers.items()}
+            {key: ((), value) for key, value in scalars.items()}
             | {"successes": ("domain", successes), "median_time": ("domain", times)},
             {"domain": list(DOMAINS)},
         )
