@@ -1,8 +1,9 @@
 """Proximal policy optimisation (Schulman et al. 2017) of a law that senses taxels.
 
 Each update makes several passes over transitions from many worlds. The value function has
-privileged inputs that the law cannot observe: position and size of the object, and the remaining
-time. The learning rate follows the KL divergence between the acting policy and the updated one.
+privileged inputs that the law cannot observe: position, size and tilt of the object, and the
+remaining time. The learning rate follows the KL divergence between the acting policy and the
+updated one.
 """
 
 from __future__ import annotations
@@ -23,7 +24,8 @@ from rps_jax.control.learned.network import Network, NetworkKind, Weights
 from rps_jax.control.learned.policy import read
 from rps_jax.record.options import option
 
-PRIVATE_SIGNS = np.array([1, -1, 1, 1, 1], np.float32)  # of `private` inputs in the mirror image
+# Of `private` inputs in the mirror image.
+PRIVATE_SIGNS = np.array([1, -1, 1, 1, 1, 1, -1, 1], np.float32)
 _LOG_STD = (-2.5, 0.5)  # bounds on the log standard deviation of an action
 _CRITIC_RATE = 1e-3  # learning rate while the value function alone is learned
 Pair = tuple[jax.Array, jax.Array]

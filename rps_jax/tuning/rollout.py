@@ -192,14 +192,17 @@ def failure_rates(
 
 
 def _private(env: PushEnv, state: State) -> jax.Array:
-    """Return the privileged inputs (P,): position and size of the object, remaining time."""
+    """Return the privileged inputs (P,): position, size and tilt of the object, remaining time."""
     data, world, rules = state.data, state.info["world"], env.setting.rules
     p_world_object, _ = trial.object_pose(data.qpos)
     p_robot_object = planar.rotate(-data.qpos[2], p_world_object - data.qpos[:2])
     remaining = 1 - data.steps * env.dt / rules.horizon
     lost = data.lost_steps * env.dt / jnp.maximum(rules.max_lost, 1.0)
     radius = fp.circumradius(world.footprint) / 0.3
-    return jnp.stack([*jnp.clip(p_robot_object, -3, 3), radius, remaining, lost])
+    w, x, y, z = data.qpos[6:]
+    up = planar.rotate(-data.qpos[2], jnp.stack([x * z + w * y, y * z - w * x]))  # half the axis
+    position = *jnp.clip(p_robot_object, -3, 3), radius
+    return jnp.stack([*position, remaining, lost, *(6 * up), world.qpos[5]])
 
 
 def _inputs(env: PushEnv, batch: EnvBatch) -> tuple[jax.Array, jax.Array]:

@@ -44,6 +44,7 @@ VARIANTS = {  # options after the shared ones
     "with tasks": f"{_WARM} --domain wide hostile real wide,task=path wide,task=corridor",
     "uniform worlds": f"{_WARM} --hard 0",
     "reward of 0.2.0": f"{_WARM} --success 1 --failure 0",
+    "failures cost 3": f"{_WARM} --failure 3",
     "trials of 120 s": f"{_WARM} --horizon 120 --max-lost 30",
     "not annealed": f"{_WARM} --anneal 0 --average 20",
     "4,096 worlds": f"{_WARM} --num-envs 4096 --num-minibatches 16",
