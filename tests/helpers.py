@@ -232,6 +232,12 @@ def addresses() -> Iterator[tuple[str, str]]:
 # --- comparisons ---------------------------------------------------------------------------
 
 
+def jitted(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Return `jax.jit(function)` with results of NumPy: JAX compiles each index and comparison."""
+    program = jax.jit(function)
+    return lambda *arguments: jax.device_get(program(*arguments))
+
+
 def row(tree: Any, i: Any) -> Any:
     """Return a row or a slice of rows of every leaf."""
     return jax.tree.map(lambda leaf: leaf[i], tree)

@@ -35,7 +35,7 @@ def recorded(tmp_path_factory):
     return path, trace
 
 
-LAWS = ("rps_plus", "learned_mlp", "learned_gru", "aps", "force_push_published")
+LAWS = ("rps_plus", "learned_gru", "aps", "force_push_published")
 
 
 @pytest.mark.parametrize("law", LAWS)

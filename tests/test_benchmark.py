@@ -132,7 +132,7 @@ def test_contacts_of_a_box_as_a_prism_equal_those_of_mjx():
         def contacts(qpos):
             return collide(model, mjx.kinematics(model, blank.replace(qpos=qpos)))
 
-        return contacts(jnp.asarray(starts, jnp.float32))._impl.contact
+        return jax.device_get(contacts(jnp.asarray(starts, jnp.float32))._impl.contact)
 
     def deepest(contact):
         robot = contact.geom1[0] != at.physics.geom("ground").id

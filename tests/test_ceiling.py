@@ -105,7 +105,7 @@ def test_perturbations_depend_on_world_and_round_and_fill_one_window():
 
 @pytest.mark.slow
 def test_a_search_resumes_and_its_plans_succeed_in_a_sweep(tmp_path):
-    options = SIZES | {"sample": 6, "setting": SHORT, "slots": 12, "out": tmp_path / "run"}
+    options = SIZES | {"sample": 6, "setting": SHORT, "slots": 8, "out": tmp_path / "run"}
     whole = rps_jax.ceiling(CYLINDERS, **options)
     rounds = list(Checkpoints(tmp_path / "run").paths().values())
     assert len(rounds) >= 2
@@ -118,7 +118,7 @@ def test_a_search_resumes_and_its_plans_succeed_in_a_sweep(tmp_path):
     # Each best plan is a law whose outcome in a sweep equals that in the search.
     plans = {f"{i}": GuidedParams(offsets=whole.offsets.sel(world=i).values) for i in (0, 1)}
     test = replace(SHORT, seed=seed_of(0, "test"))
-    sweep = rps_jax.sweep(plans, CYLINDERS, worlds=6, setting=test, slots=6)
+    sweep = rps_jax.sweep(plans, CYLINDERS, worlds=6, setting=test, slots=8)
     for i in (0, 1):
         trial, search = sweep.sel(law=f"{i}").isel(world=i), whole.sel(world=i)
         assert int(trial.success) == int(search.solved)
@@ -149,7 +149,7 @@ def test_the_first_worlds_and_common_failures_are_tried(monkeypatch):
 
 @pytest.mark.slow
 def test_the_command_tries_the_failures_of_a_law(tmp_path, capsys):
-    options = "--slots 6 --workers 1"
+    options = "--slots 8 --workers 1"
     ladder = "ladder --domain paper --worlds 6 --engine quasistatic --laws rps_tuned pursuit"
     assert command(f"{ladder} {options} --out", tmp_path) == 0
     capsys.readouterr()

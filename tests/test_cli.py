@@ -28,7 +28,7 @@ from rps_jax.trials.trial import Rules
 from rps_jax.tuning.evolution import TuneES
 from rps_jax.world import paper
 
-SMALL = "table --targets 0.6 0 0.62 0.03 --horizon 18 --slots 4 --workers 1 --laws rps nps"
+SMALL = "table --targets 0.6 0 0.62 0.03 --horizon 18 --slots 8 --workers 1 --laws rps nps"
 SMALL += " --objects box nonuniform_box --out"
 
 
@@ -73,7 +73,7 @@ def test_another_run_is_not_written_over_it_unasked(runs, capsys):
 
 
 QUICK_PUSH = "push --engine quasistatic --horizon 1 --no-video --target"
-QUASISTATIC = "--engine quasistatic --horizon 8 --slots 4 --workers 1"
+QUASISTATIC = "--engine quasistatic --horizon 8 --slots 8 --workers 1"
 
 
 def test_other_options_get_a_numbered_folder(tmp_path, capsys, monkeypatch):

@@ -142,7 +142,7 @@ def test_windows_start_at_the_states_of_their_trials(monkeypatch):
 
 # Cylinders on the quasi-static model, to compile few programs.
 RUN = "--engine quasistatic --objects random_cylinder --worlds 2 --validation 2 --starts 2 "
-RUN += "--horizon 5 --tuned L K_h v_lost --slots 4 --steps"
+RUN += "--horizon 5 --tuned L K_h v_lost --slots 8 --steps"
 WINDOWS = "sweeps/gradients/windows.py --window 1 --within 2 --arrive 0.01"
 
 

@@ -32,7 +32,7 @@ from rps_jax.world.domain import DOMAINS, Range
 
 CYLINDERS = replace(DOMAINS["wide"], objects=("random_cylinder",))
 BRIEF = Setting("quasistatic", rules=Rules(horizon=8.0))
-SHORT: Any = {"setting": BRIEF, "slots": 6}
+SHORT: Any = {"setting": BRIEF, "slots": 8}
 
 
 def seeded(seed):
@@ -167,13 +167,13 @@ def test_candidates_have_equal_worlds_in_any_batch():
     hostile = replace(DOMAINS["hostile"], objects=("random_cylinder",))
     domains = [CYLINDERS, hostile]
     asks = [Candidates(x, domains, 3, np.arange(3)) for x in (faster, params)]
-    (first, second), _ = room.score_candidates(asks, BRIEF, Objective(), slots=6)
+    (first, second), _ = room.score_candidates(asks, BRIEF, Objective(), slots=8)
     assert first.score.shape == (2, 6)
     np.testing.assert_array_equal(first.score[0], second.score[0])
     np.testing.assert_array_equal(second.score[0], second.score[1])
     assert (first.score[1] != first.score[0]).any()
     (alone,), _ = room.score_candidates(
-        [Candidates(paper(3), domains, 3, np.arange(1, 2))], BRIEF, Objective(), slots=6
+        [Candidates(paper(3), domains, 3, np.arange(1, 2))], BRIEF, Objective(), slots=8
     )
     np.testing.assert_allclose(alone.score[0], second.score[0, [1, 4]], rtol=1e-4)
 

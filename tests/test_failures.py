@@ -49,14 +49,14 @@ def test_severity_by_hand():
 
 
 def probe_in(folder):
-    return Probe(CYLINDERS, PAPER, BRIEF, Run(folder, no_progress, slots=4, workers=1))
+    return Probe(CYLINDERS, PAPER, BRIEF, Run(folder, no_progress, slots=8, workers=1))
 
 
 def test_a_probe_agrees_with_a_sweep_and_resumes(tmp_path, monkeypatch):
     u = points.points_of(CYLINDERS, np.arange(6))
     probe = probe_in(tmp_path)
     trials = probe(u)
-    sweep = rps_jax.sweep({"law": PAPER}, CYLINDERS, points=u, setting=BRIEF, slots=4)
+    sweep = rps_jax.sweep({"law": PAPER}, CYLINDERS, points=u, setting=BRIEF, slots=8)
     np.testing.assert_allclose(trials.time, sweep.time[0], atol=0.3)
     np.testing.assert_array_equal(trials.severity >= 1, sweep.success[0] == 0)
     np.testing.assert_allclose(probe.simulated, trials.time.sum())
@@ -290,7 +290,7 @@ def test_a_design_needs_four_worlds_for_each_factor():
 
 
 def test_the_command_of_sensitivity_draws_and_continues(tmp_path, capsys):
-    options = "--engine quasistatic --horizon 3 --slots 4 --workers 1 --out"
+    options = "--engine quasistatic --horizon 3 --slots 8 --workers 1 --out"
     assert rps(f"sensitivity --domain hardware --worlds 32 {options}", tmp_path) == 0
     assert "Trials fail at" in capsys.readouterr().out
     for name in ("sobol", "interactions"):
@@ -343,7 +343,7 @@ def test_gains_and_losses_by_hand():
 
 
 def test_the_command_of_regress_reports_known_laws(tmp_path, capsys):
-    options = "--engine quasistatic --slots 4 --workers 1 --out"
+    options = "--engine quasistatic --slots 8 --workers 1 --out"
     assert rps(f"regress --laws rps --worlds 4 {options}", tmp_path) == 0
     text = capsys.readouterr().out
     assert "rps_plus (file)" in text

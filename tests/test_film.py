@@ -46,13 +46,14 @@ def in_order(takes, name="labels"):
     return film._in_grid_order([getattr(take, name) for take in takes], takes)
 
 
-def test_a_film_shows_each_trial_in_its_tile_and_holds_the_end(tmp_path):
+def test_a_film_shows_each_trial_in_its_tile_and_holds_the_end(tmp_path, monkeypatch):
+    monkeypatch.setattr(film, "_FILM_SIZE", (640, 360))  # smaller is drawn sooner
     open_run(tmp_path, plan_of("random_cylinder"))
     out = tmp_path / "two.mp4"
     assert rps(f"film {tmp_path} --grid 2x4 --seconds 2 --speed 4.8 --out {out}") == 0
     images = decode(out)
     # 20 control steps of 0.02 s a frame: at 0, 0.4, ... 2 s, and the last for a second more.
-    assert images.shape == (6 + FPS, 540, 2 * 960, 3)  # two worlds fill the picture
+    assert images.shape == (6 + FPS, 180, 2 * 320, 3)  # two worlds fill the picture
     cells = tiles(images, 1, 2)
     for column in (0, 1):
         assert cells[0, 0, column].std() > 10

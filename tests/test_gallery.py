@@ -198,7 +198,7 @@ def test_the_command_plots_each_mode_and_prints_a_replay_command(tmp_path, capsy
     rps_jax.register_law("backwards", Law(lambda params: (), step_backwards), Backwards())
     drums = parse_domain("wide,objects=random_cylinder,bearing=-0.5:0.5,gap=0.05:0.06")
     laws = {"mine law": "backwards"}
-    rps_jax.sweep(laws, drums, 3, setting=brief, slots=3, out=run)
+    rps_jax.sweep(laws, drums, 3, setting=brief, slots=8, out=run)
     assert rps("gallery", run, "--each", 2) == 0
     text = capsys.readouterr().out
     assert "never touched: 3 of 3" in text

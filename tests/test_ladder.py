@@ -19,7 +19,7 @@ from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import Rules
 from rps_jax.world import draws
 
-QUASISTATIC = "--engine quasistatic --slots 6 --workers 1"
+QUASISTATIC = "--engine quasistatic --slots 8 --workers 1"
 
 
 def test_holms_adjustment_by_hand():
@@ -74,7 +74,7 @@ def test_a_law_may_have_the_values_of_a_file(tmp_path):
 
 def test_all_laws_meet_the_same_test_worlds():
     laws = ("rps_tuned", "pursuit", "dipole")
-    options = {"setting": Setting("quasistatic", rules=Rules(horizon=20.0)), "slots": 6}
+    options = {"setting": Setting("quasistatic", rules=Rules(horizon=20.0)), "slots": 8}
     results = climb(laws, CYLINDERS, 6, **options)
     assert results.success.dims == ("law", "world")
     assert results.law.values.tolist() == list(laws)
@@ -90,10 +90,10 @@ def test_all_laws_meet_the_same_test_worlds():
 def test_several_domains_are_several_ladders(tmp_path, capsys):
     setting = Setting("quasistatic", rules=Rules(horizon=2.0))
     domains = ("wide,objects=random_cylinder", "wide,objects=random_cylinder,gap=0.01")
-    tree = climb(("rps", "dipole"), domains, 6, setting=setting, slots=6, out=tmp_path)
+    tree = climb(("rps", "dipole"), domains, 6, setting=setting, slots=8, out=tmp_path)
     assert list(tree.children) == list(domains)
     for domain in domains:
-        alone = climb(("rps", "dipole"), domain, 6, setting=setting, slots=6)
+        alone = climb(("rps", "dipole"), domain, 6, setting=setting, slots=8)
         xr.testing.assert_identical(tree[domain].to_dataset(), alone)
         np.testing.assert_array_equal(load(tmp_path / domain).success, alone.success)
     command = f"ladder --laws rps dipole --worlds 6 {QUASISTATIC} --horizon 2 --out {tmp_path}"
@@ -122,7 +122,7 @@ def test_the_command_reports_information_against_success(tmp_path, capsys):
 def test_outcomes_are_written_as_a_long_table(tmp_path, monkeypatch):
     setting = Setting("quasistatic", rules=Rules(horizon=2.0))
     path = tmp_path / "results.csv"
-    results = climb(("rps", "dipole"), CYLINDERS, 6, setting=setting, slots=6, table=path)
+    results = climb(("rps", "dipole"), CYLINDERS, 6, setting=setting, slots=8, table=path)
     table = pd.read_csv(path)
     assert table.law.tolist() == ["rps"] * 6 + ["dipole"] * 6
     assert table.world.tolist() == [*range(6)] * 2
@@ -171,7 +171,7 @@ LAW = ROOT / "notebooks" / "examples" / "custom_law.py"
 
 
 def test_a_custom_law_is_scored_in_the_worlds_of_the_ladder(tmp_path, capsys, registries):
-    options = f"--domain wide,objects=random_cylinder --worlds 6 {QUASISTATIC} --horizon 80 --out"
+    options = f"--domain wide,objects=random_cylinder --worlds 6 {QUASISTATIC} --horizon 40 --out"
     assert rps(f"score {LAW},v=0.04 {options}", tmp_path / "score") == 0
     text, results = capsys.readouterr().out, load(tmp_path / "score")
     assert results.law.values.tolist() == ["p_control,v=0.04", "rps", "rps_plus"]

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import pandas as pd
 import pytest
-from helpers import CYLINDERS, moved, row, rps, same
+from helpers import CYLINDERS, jitted, moved, row, rps, same
 
 from rps_jax import InputError, learn
 from rps_jax import sweep as run_sweep
@@ -42,7 +42,8 @@ def network_of(kind, **changes):
 
 def weights_of(network, seed=0):
     """Return random weights, none of them small."""
-    drawn = networks.init_weights(network.shapes, jax.random.PRNGKey(seed))
+    init = jitted(partial(networks.init_weights, network.shapes))
+    drawn = init(jax.random.PRNGKey(seed))
     return {name: np.asarray(weight, np.float32) for name, weight in drawn.items()}
 
 
@@ -248,6 +249,10 @@ def test_the_surrogate_is_that_of_the_paper():
     np.testing.assert_allclose(surrogate, [2.0, 1.2, 0.5, -1.5, -0.8], rtol=1e-6)
 
 
+def init_state(config, network):
+    return jax.jit(partial(TrainState.init, config, network))(jax.random.PRNGKey(0))
+
+
 def batch(network, state, seed=0, steps=5, worlds=4):
     """Return random transitions with actions of the policy."""
     rng = np.random.default_rng(seed)
@@ -259,9 +264,10 @@ def batch(network, state, seed=0, steps=5, worlds=4):
         rng.normal(size=(worlds, *PolicyState.init(network).hidden.shape)), jnp.float32
     )
     transitions = transitions_of(obs, private, fresh)
-    mean = ppo.means(network, state.weights["actor"], hidden, transitions)
+    means = jitted(partial(ppo.means, network))
+    mean = means(state.weights["actor"], hidden, transitions)
     action = mean + 0.5 * jnp.asarray(rng.normal(size=mean.shape), mean.dtype)
-    log_prob = ppo.log_prob(action, mean, state.weights["log_std"])
+    log_prob = jitted(ppo.log_prob)(action, mean, state.weights["log_std"])
     return hidden, transitions._replace(action=action, log_prob=log_prob)
 
 
@@ -269,13 +275,15 @@ def batch(network, state, seed=0, steps=5, worlds=4):
 def test_the_loss_of_the_policy_that_acted(kind):
     """Ratios are 1: the surrogate is the mean advantage, nothing is clipped, nothing diverges."""
     config, network = PPO(network=kind, width=6, ent_coef=0.0), network_of(kind)
-    state = TrainState.init(config, network, jax.random.PRNGKey(0))
+    state = init_state(config, network)
     hidden, transitions = batch(network, state)
     advantage = jnp.arange(20.0).reshape(5, 4)
     value = networks.critic(
         state.weights["critic"], ppo.critic_inputs(transitions.obs, transitions.private)
     )
-    loss, kl = ppo.loss(config, network, state.weights, hidden, transitions, advantage, value + 2)
+    loss, kl = jax.jit(partial(ppo.loss, config, network))(
+        state.weights, hidden, transitions, advantage, value + 2
+    )
     assert float(loss) == pytest.approx(0.5 * 2**2 - 9.5, rel=1e-5)
     assert float(kl) == pytest.approx(0, abs=1e-6)
 
@@ -287,14 +295,14 @@ def test_the_loss_of_the_policy_that_acted(kind):
         mean = ppo.means(network, weights["actor"], hidden, transitions)
         return -jnp.mean(advantage * ppo.log_prob(transitions.action, mean, weights["log_std"]))
 
-    slope, expected = jax.grad(policy_alone)(state.weights), jax.grad(gradient)(state.weights)
+    slope, expected = (jax.jit(jax.grad(f))(state.weights) for f in (policy_alone, gradient))
     for name in network.shapes:
         np.testing.assert_allclose(slope["actor"][name], expected["actor"][name], atol=2e-5)
 
 
 def test_a_mirrored_world_has_an_equal_value():
     config, network = PPO(network="mlp", width=6), network_of("mlp")
-    state = TrainState.init(config, network, jax.random.PRNGKey(0))
+    state = init_state(config, network)
     _, rows = batch(network, state)
     mirrored = features.mirror(rows.obs), ppo.PRIVATE_SIGNS * rows.private
     value, mirrored_value = (
@@ -310,7 +318,7 @@ def test_the_best_action_of_one_step_is_learned(kind):
     """The reward of an action falls with its distance to a function of the observation."""
     options = {"update_epochs": 4, "num_minibatches": 2, "learning_rate": 3e-3, "target_kl": 0.02}
     config, network = PPO(network=kind, width=6, ent_coef=0.0, **options), network_of(kind)
-    state = TrainState.init(config, network, jax.random.PRNGKey(0))
+    state = init_state(config, network)
     flags, private = jnp.ones((4, 64), bool), jnp.zeros((4, 64, ppo.PRIVATE_SIGNS.size))
     blank = jnp.zeros((4, 64, features.feature_count(network.taxels)))
 
@@ -475,7 +483,7 @@ def test_a_sweep_agrees_with_the_environment(learned, registries):
 
 def test_an_easier_world_has_its_target_nearer_and_more_ahead():
     env = PushEnv("random_cylinder", CYLINDERS, setting=Setting(engine="fused"), worlds=3)
-    world = row(env.table, 0)._replace(p_world_target=jnp.array([0.0, 2.0]))
+    world = row(jax.device_get(env.table), 0)._replace(p_world_target=jnp.array([0.0, 2.0]))
     half = rollout.ease(world, jnp.array(0.5)).p_world_target
     np.testing.assert_allclose(half, 1.4 * np.array([1, 1]) / np.sqrt(2), rtol=1e-6)
     np.testing.assert_array_equal(rollout.ease(world, jnp.array(1.0)).p_world_target, [0.0, 2.0])
@@ -488,7 +496,7 @@ def test_rewards_of_privileged_quantities():
         setting=Setting("fused", fidelity="fast"),
         weights=Reward(progress=0.0, no_contact=0.0, success=0.0, object=1.0, behind=0.0),
     )  # fmt: skip
-    state = env.begin(row(env.table, 0), jnp.array(0))
+    state = jax.jit(env.begin)(row(jax.device_get(env.table), 0), jnp.array(0))
     previous = state.data
     shift = jnp.array([0.01, -0.02])
     current = previous._replace(qpos=previous.qpos.at[3:5].add(shift))

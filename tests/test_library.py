@@ -58,17 +58,18 @@ def run(tmp_path_factory):
 
 
 FAST = {"setting": rps_jax.Setting("quasistatic", rules=RULES)}
+SHARED = FAST | {"slots": SLOTS}  # with one program for all
 TUNED = {"objects": ("random_cylinder",), "tuned": ("K_h", "K_v"), "worlds": 2, "validation": 2}
 STORED = {  # from the run folder of a sweep and a new folder, the answer of a call
-    "sweep": lambda run, out: rps_jax.sweep("rps", DRUMS, worlds=8, out=out, **FAST),
-    "score": lambda run, out: rps_jax.score("pursuit", domain=DRUMS, worlds=4, out=out, **FAST),
-    "regress": lambda run, out: rps_jax.regress({"mine": "rps"}, worlds=3, out=out, **FAST),
+    "sweep": lambda run, out: rps_jax.sweep("rps", DRUMS, worlds=8, out=out, **SHARED),
+    "score": lambda run, out: rps_jax.score("nps", domain=DRUMS, worlds=4, out=out, **SHARED),
+    "regress": lambda run, out: rps_jax.regress({"mine": "rps"}, worlds=3, out=out, **SHARED),
     "push": lambda run, out: rps_jax.push("cylinder", target=(1.0, 0.5), out=out, **FAST).data,
     "replay": lambda run, out: rps_jax.replay(run, 2, out=out).data,
     "gallery": lambda run, out: rps_jax.gallery(run, out=out),
     "merge": lambda run, out: merge((run,), out=out),
     "tune_es": lambda run, out: rps_jax.tune_es(
-        "rps", **TUNED, population=4, generations=1, out=out, **FAST
+        "rps", **TUNED, population=4, generations=1, out=out, **SHARED
     ),
 }
 
@@ -106,7 +107,7 @@ def test_results_of_an_earlier_version_get_the_labels_of_this_one(run, tmp_path)
 
 def test_candidates_are_labelled_by_their_parameters():
     laws = ["rps,K_h=0.3", "rps,K_h=0.6"]
-    results = rps_jax.evaluate(laws, DRUMS, 2, split="validate", **FAST)
+    results = rps_jax.evaluate(laws, DRUMS, 2, split="validate", **SHARED)
     assert results.K_h.dims == ("candidate",)
     assert results.K_h.values.tolist() == [0.3, 0.6]
     assert results.swap_dims(candidate="K_h").score.sel(K_h=0.6).dims == ("world",)
@@ -150,9 +151,9 @@ def test_a_push_is_plotted_and_filmed(tmp_path):
 
 
 def test_a_table_equals_that_of_the_command(tmp_path):
-    command = "table --objects box --laws rps aps --friction S2 0.3,0.4 --targets 0.6 0 1 1"
+    command = "table --objects box --laws rps nps --friction S2 0.3,0.4 --targets 0.6 0 1 1"
     assert rps(f"{command} --engine mujoco --horizon 3 --mass 5 --out", tmp_path) == 0
-    options = {"objects": ["box"], "laws": ["rps", "aps"], "friction": ["S2", (0.3, 0.4)]}
+    options = {"objects": ["box"], "laws": ["rps", "nps"], "friction": ["S2", (0.3, 0.4)]}
     options |= {"targets": [(0.6, 0.0), (1.0, 1.0)], "mass": 5.0}
     setting = rps_jax.Setting("mujoco", rules=rps_jax.Rules(horizon=3.0))
     results = rps_jax.table(**options, setting=setting)

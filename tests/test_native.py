@@ -92,7 +92,7 @@ def test_a_control_step_agrees_with_xla(shape, skin, monkeypatch):
     close(computed, expected, warm=2e-3, rest=2e-5)
 
 
-@pytest.mark.parametrize("shape", ["cylinder", "prism"])
+@pytest.mark.parametrize("shape", ["prism", pytest.param("cylinder", marks=pytest.mark.slow)])
 def test_the_bits_of_a_world_depend_on_no_other_world(shape):
     stage, inputs, loop = batch(shape)
     together = advanced(stage, inputs, start_trials(inputs, loop), loop, 300)
@@ -301,13 +301,14 @@ def test_a_scan_of_worlds_is_that_of_jax_and_so_are_its_derivatives(monkeypatch)
     assert len(compiled) == 7  # forward, and backward or a tangent map
 
 
-@pytest.mark.parametrize("skin", ["capacitive", "ideal"])
-@pytest.mark.parametrize("law", ["rps", "nps", "aps", "rps_plus", "pursuit", "dipole"])
-def test_the_loop_of_an_equation_is_compiled_as_a_whole(law, skin, request, monkeypatch):
-    if skin == "ideal":  # its text is enough: each law is compiled with the other skin
-        request.getfixturevalue("cache")
-        monkeypatch.setattr(native, "_library", lambda text, name: b"")
-        monkeypatch.setattr(native, "_register", lambda name, body: True)
+@pytest.mark.parametrize(
+    ("law", "skin"),
+    [
+        ("rps", "ideal"),
+        *((x, "capacitive") for x in ("rps", "aps", "rps_plus", "pursuit", "dipole")),
+    ],
+)
+def test_the_loop_of_an_equation_is_compiled_as_a_whole(law, skin):
     stage, inputs, loop = batch("box", skin, 2, law)
     primitives = str(jax.make_jaxpr(advance(stage, loop, 3))(*inputs, start_trials(inputs, loop)))
     assert "rps_native" in primitives
@@ -349,7 +350,9 @@ def test_xla_compiles_other_functions_and_the_reason_is_named_once(name, monkeyp
         assert reason in str(warning.message)
 
 
-@pytest.mark.parametrize("engine", ["fused", "mjx", "quasistatic"])
+@pytest.mark.parametrize(
+    "engine", ["fused", "quasistatic", pytest.param("mjx", marks=pytest.mark.slow)]
+)
 def test_only_the_fused_engine_calls_compiled_functions(engine):
     stage, inputs, loop = batch("box", "ideal", 2, "rps", engine)
     run = jax.make_jaxpr(advance(stage, loop, 1))

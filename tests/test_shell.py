@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import SETTLED, box, case, refusal
+from helpers import SETTLED, box, case, jitted, refusal
 from staging import push_object
 
 import rps_jax
@@ -25,9 +25,15 @@ from rps_jax.world.scene import JOINTS
 FRONT_ONLY = (Boards("front", 2, 0.05),)  # six taxels of 5 cm, in the middle of the front
 
 
+@jitted
+def sense(sensor, footprint):
+    """Return state and reading of a sensor of an object that has been there for a long time."""
+    return sensor.sense(sensor.init(jax.random.key(0)), footprint, SETTLED)
+
+
 def read(sensor, footprint):
     """Return the reading of a sensor of an object that has been there for a long time."""
-    return sensor.sense(sensor.init(jax.random.key(0)), footprint, SETTLED)[1]
+    return sense(sensor, footprint)[1]
 
 
 square = partial(box, half=0.1)
@@ -89,7 +95,7 @@ def test_a_corner_must_press_harder_on_coarser_taxels():
     felt = []
     for count in (8, 4, 1):
         worn = CapacitiveSkin(shell=Robot(boards=(Boards("front", count),)).shell)
-        state, reading = worn.sense(worn.init(jax.random.key(0)), corner, SETTLED)
+        state, reading = sense(worn, corner)
         felt.append(float(state.signal.max()))
     assert felt == sorted(felt, reverse=True)
     assert int(reading.contact_type) == NONE

@@ -13,7 +13,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import FRONT, SEEDS, SETTLED, SIDE, box, place_before_the_front, property_test, row
+from helpers import (
+    FRONT,
+    SEEDS,
+    SETTLED,
+    SIDE,
+    box,
+    jitted,
+    place_before_the_front,
+    property_test,
+    row,
+)
 from hypothesis import strategies as st
 
 from rps_jax.geometry import footprint as fp
@@ -40,7 +50,7 @@ def sense_one(sensor, state, footprint, period):
     return sensor.sense(state, footprint, period)
 
 
-@jax.jit
+@jitted
 def sense_all(sensor, shapes, key):
     """Return settled readings of a batch of footprints, each of a separate sensor."""
     keys = jax.random.split(key, BATCH)

@@ -22,6 +22,7 @@ from helpers import (
     case,
     central_differences,
     flatten,
+    jitted,
     moved,
     property_test,
 )
@@ -82,14 +83,14 @@ def random_worlds(seed: int, dtype=np.float32):
     return params, RPSState(*map(cast, values)), observation._replace(in_contact=weight)
 
 
-@jax.jit
+@jitted
 def hard(params, state, observation):
     state = state._replace(touched=state.touched > 0.5)
     observation = observation._replace(in_contact=observation.in_contact > 0.5)
     return jax.vmap(rps.step_with_details)(params, state, observation)
 
 
-@jax.jit
+@jitted
 def smooth(params, state, observation, temperatures):
     step = jax.vmap(rps.step_with_details, in_axes=(0, 0, 0, None))
     return step(params, state, observation, temperatures)

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import advance, case
+from helpers import advance, case, jitted
 
 from rps_jax.engines.base import Driven
 from rps_jax.robot.skin import CapacitiveSkin
@@ -108,7 +108,7 @@ def test_trials_end_alike_in_the_merged_batches_of_a_gpu(monkeypatch, few):
 def single():
     """World and parameters of one trial."""
     part = pushes.build([case(NEAR)], FUSED)
-    return jax.tree.map(lambda leaf: jnp.asarray(leaf)[0], part[1::2])
+    return jax.tree.map(lambda leaf: jnp.asarray(leaf[0]), part[1::2])
 
 
 def test_yaw_is_unbounded_and_position_is_bounded(single):
@@ -163,7 +163,7 @@ def advanced():
     broken = worlds._replace(qpos=worlds.qpos.at[1, 4].set(jnp.nan))
 
     def run(subset, live):
-        trials = trial.start_all(subset, params, jnp.full(SLOTS, live))
+        trials = jax.jit(trial.start_all)(subset, params, np.full(SLOTS, live))
         return advance(stage, subset, params, trials, ControlLoop(preset()), 20)
 
     return run(worlds, True), run(broken, True), run(worlds, False)
@@ -183,13 +183,15 @@ def test_a_diverged_world_freezes_and_others_are_unchanged_bit_for_bit(advanced)
 def test_an_object_that_tilts_too_far_ends_its_trial():
     _, worlds, params = world_batch(SLOTS)
     half = np.radians([0.0, 44.0, 46.0, -120.0]) / 2  # about the object's x axis
-    qpos = worlds.qpos.at[:, 6].set(np.cos(half)).at[:, 7].set(np.sin(half))
+    qpos = np.array(worlds.qpos)
+    qpos[:, 6], qpos[:, 7] = np.cos(half), np.sin(half)
     worlds = worlds._replace(qpos=qpos)
-    trials = trial.start_all(worlds, params, jnp.ones(SLOTS, bool))
+    trials = jitted(trial.start_all)(worlds, params, jnp.ones(SLOTS, bool))
 
     def observed(**rules):
         loop = ControlLoop(preset(), **rules)
-        return jax.vmap(lambda *arrays: trial.observe(*arrays, loop)[0])(worlds, params, trials)
+        observe = jax.vmap(lambda *arrays: trial.observe(*arrays, loop)[0])
+        return jitted(observe)(worlds, params, trials)
 
     ended = observed()
     assert ended.tipped.tolist() == ended.done.tolist() == [False, False, True, True]

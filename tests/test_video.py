@@ -73,7 +73,7 @@ def test_a_video_holds_every_frame_of_a_moving_robot(box, tmp_path):
 def test_the_contact_point_leaves_a_path_with_gaps(box, tmp_path):
     def last_image(contacts):
         path, frames = tmp_path / "push.mp4", [scene.initial_qpos(box)] * len(contacts)
-        options = {"p_world_target": FAR, "size": (480, 360), "camera": "above"}
+        options = {"p_world_target": FAR, "size": (240, 180), "camera": "above"}
         render(box, frames, path, p_world_contacts=contacts, **options)
         return decode(path)[-1]
 
@@ -82,7 +82,7 @@ def test_the_contact_point_leaves_a_path_with_gaps(box, tmp_path):
     points = [(1.0, 1.0), (1.0, 0.5), (1.0, -0.5), (1.0, -1.0), nothing]
     whole = last_image([*points, nothing])
     gap = last_image([*points[:2], nothing, *points[2:]])
-    middle = 240  # px: the column of y = 0
+    middle = 120  # px: the column of y = 0
     assert middle in changed(blank, whole)[:, 1]
     assert middle not in changed(blank, gap)[:, 1]
     assert 0 < len(changed(blank, gap)) < len(changed(blank, whole))
@@ -90,7 +90,7 @@ def test_the_contact_point_leaves_a_path_with_gaps(box, tmp_path):
 
 @pytest.mark.parametrize("camera", ["above", "oblique"])
 def test_a_partially_redrawn_image_equals_the_whole_image(box, camera):
-    options = {"p_world_target": (1.0, 1.0), "size": (480, 270), "camera": camera}
+    options = {"p_world_target": (1.0, 1.0), "size": (320, 180), "camera": camera}
     frames = np.tile(scene.initial_qpos(box), (6, 1))
     frames[:, 3:5] += [(0.1 * i, 0.12 * i) for i in range(5)] + [(30, 30)]  # past the flag, away
     for drawn, qpos in zip(video.images(box, frames, **options), frames, strict=True):
@@ -98,10 +98,10 @@ def test_a_partially_redrawn_image_equals_the_whole_image(box, camera):
 
 
 def test_a_trail_drawn_in_parts_equals_one_drawn_at_once(box):
-    options = {"p_world_target": FAR, "size": (480, 270), "camera": "oblique"}
-    frames = np.tile(scene.initial_qpos(box), (90, 1))
-    frames[:, [0, 3]] += np.linspace(0, 1, 90)[:, None]
-    frames[:, [1, 4]] += np.linspace(0, -1, 90)[:, None]
+    options = {"p_world_target": FAR, "size": (320, 180), "camera": "oblique"}
+    frames = np.tile(scene.initial_qpos(box), (40, 1))
+    frames[:, [0, 3]] += np.linspace(0, 1, 40)[:, None]
+    frames[:, [1, 4]] += np.linspace(0, -1, 40)[:, None]
     far = frames.copy()
     far[:-1, 3:5] = (-2.9, -2.9)  # behind the trail, so that all of it is drawn anew at last
     parts, whole = (video.images(box, poses, **options)[-1] for poses in (frames, far))
