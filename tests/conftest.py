@@ -51,6 +51,25 @@ def pytest_collection_finish(session):
     gc.set_threshold(20_000, 20, 20)
 
 
+@pytest.fixture(autouse=True, scope="session")
+def few_pictures():
+    """Render the first picture of each name, and only draw the others, which is faster."""
+    from rps_jax.analysis.report import Picture
+
+    render, rendered = Picture.png, {}
+
+    def png(picture):
+        if picture.name in rendered:
+            picture.draw()
+        else:
+            rendered[picture.name] = render(picture)
+        return rendered[picture.name]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Picture, "png", png)
+        yield
+
+
 @pytest.fixture
 def compiled():
     """Durations [s] of the compilations of this test so far."""

@@ -90,6 +90,12 @@ def read_curve(folder: Path) -> pd.DataFrame:
     return pd.read_csv(folder / "curve.csv", index_col="generation")
 
 
+def jitted(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Return `jax.jit(function)` with results of NumPy: JAX compiles each index and comparison."""
+    program = jax.jit(function)
+    return lambda *arguments: jax.device_get(program(*arguments))
+
+
 SEEDS = strategies.integers(0, 2**32 - 1)
 
 
@@ -202,6 +208,12 @@ def extent(footprint: Footprint, along: Any) -> jax.Array:
     return jnp.max(footprint.vertices @ jnp.asarray(along)) + footprint.radius
 
 
+@jitted
+def sense(sensor: Any, footprint: Footprint) -> Any:
+    """Return state and reading of a sensor of an object that has been there for a long time."""
+    return sensor.sense(sensor.init(jax.random.key(0)), footprint, SETTLED)
+
+
 @jax.jit
 def place_before_the_front(shape: Footprint, yaw: Any, y: Any, gap: Any) -> Footprint:
     """Return `shape` turned by `yaw`, with its origin at `y` and `gap` to the front face."""
@@ -230,12 +242,6 @@ def addresses() -> Iterator[tuple[str, str]]:
 
 
 # --- comparisons ---------------------------------------------------------------------------
-
-
-def jitted(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Return `jax.jit(function)` with results of NumPy: JAX compiles each index and comparison."""
-    program = jax.jit(function)
-    return lambda *arguments: jax.device_get(program(*arguments))
 
 
 def row(tree: Any, i: Any) -> Any:

@@ -199,14 +199,15 @@ def test_an_attack_fills_many_more_cells_than_drawn_worlds(synthetic):
 
 
 def test_a_killed_attack_resumes_with_the_same_results(synthetic, tmp_path):
-    whole = rps_jax.attack("rps", "wide", **SMALL)
-    rps_jax.attack("rps", "wide", **SMALL | {"generations": 5}, out=tmp_path)
+    short = SMALL | {"generations": 7, "drawn": 100}
+    whole = rps_jax.attack("rps", "wide", **short)
+    rps_jax.attack("rps", "wide", **short | {"generations": 5}, out=tmp_path)
     checkpoints = sorted((tmp_path / "parts").iterdir())
     checkpoints[3].write_bytes(b"damaged")
-    resumed = rps_jax.attack("rps", "wide", **SMALL, out=tmp_path)
+    resumed = rps_jax.attack("rps", "wide", **short, out=tmp_path)
     xr.testing.assert_identical(resumed.drop_attrs(), whole.drop_attrs())
     with pytest.raises(InputError, match="holds another run"):
-        rps_jax.attack("rps", "hostile", **SMALL, out=tmp_path)
+        rps_jax.attack("rps", "hostile", **short, out=tmp_path)
 
 
 def test_an_elite_fails_whatever_the_noise(synthetic):

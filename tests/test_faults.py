@@ -17,7 +17,6 @@ import pytest
 from helpers import ROOT, one_sentence, output_of
 
 import rps_jax
-from rps_jax.analysis.report import Picture
 from rps_jax.app.cli import environment
 from rps_jax.engines import device
 from rps_jax.errors import InputError
@@ -26,19 +25,8 @@ from rps_jax.record import options
 SHARE = {"values": 30, "laws": 500, "edits": 3, "damages": 12}
 
 
-@pytest.fixture
-def undrawn(monkeypatch):
-    """Skip the rendering of figures, which would take most of the time."""
-
-    def png(picture):
-        picture.draw()
-        return b"no picture"
-
-    monkeypatch.setattr(Picture, "png", png)
-
-
 @pytest.mark.parametrize("name", SHARE)
-def test_faults_are_reported_in_one_sentence(name, registries, undrawn):
+def test_faults_are_reported_in_one_sentence(name, registries):
     run, _ = fuzz.CLASSES[name]
     bad: list[str] = []
     counts = run(SHARE[name], 1, bad.append)

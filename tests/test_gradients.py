@@ -87,7 +87,7 @@ def test_derivatives_are_those_in_each_world():
     worlds = some_worlds(jax.random.key(2))
     slopes = STIFF * (THETA - worlds)  # (32, 3)
     for name in DERIVATIVES:
-        samples = sampled(name, bowls, THETA, worlds, None)
+        samples = jax.jit(functools.partial(sampled, name, bowls))(THETA, worlds, None)
         np.testing.assert_allclose(samples, slopes, rtol=1e-4, atol=1e-5)
         estimate = found_by(name, bowls, None, worlds)
         np.testing.assert_allclose(estimate.gradient, slopes.mean(axis=0), rtol=1e-5)

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import SETTLED, box, observation, refusals
+from helpers import box, jitted, observation, refusals, sense
 from staging import FINE, simulate, staged
 
 from rps_jax.control.laws import rps
@@ -23,6 +23,7 @@ from rps_jax.world import draws, scene
 from rps_jax.world.domain import parse_domain
 from rps_jax.world.scene import FRICTION
 
+polygon_contact, circle_contact = jitted(polygon_and_base), jitted(circle_and_base)
 ROUND = Robot(radius=0.3)
 ARC = 0.3 * 1.5 * math.pi  # [m] of its skin
 
@@ -34,18 +35,17 @@ def turned(shape: Footprint, angle: float) -> Footprint:
 
 def read(sensor: Skin, shape: Footprint, robot: Robot = ROUND) -> Any:
     """Return the reading of a skin of an object that has been there for a long time."""
-    sensor = sensor._replace(shell=robot.shell)
-    return sensor.sense(sensor.init(jax.random.key(0)), shape, SETTLED)[1]
+    return sense(sensor._replace(shell=robot.shell), shape)[1]
 
 
 def meet(shape: Footprint, radius: float = 0.3) -> tuple[np.ndarray, np.ndarray, float]:
     """Return normal, point and distance [m] of a shape and a round base."""
     x, y = shape.vertices.T
     if len(x) == 1:
-        normal, point, gap = circle_and_base((x[0], y[0]), shape.radius, (radius,))
+        normal, point, gap = circle_contact((x[0], y[0]), shape.radius, (radius,))
         return np.array(normal), np.array(point), float(gap)
     ahead = jnp.roll(x, -1), jnp.roll(y, -1)
-    normal, (point,), (gap,) = polygon_and_base((x, y), ahead, (radius,))
+    normal, (point,), (gap,) = polygon_contact((x, y), ahead, (radius,))
     return np.array(normal), np.array(point), float(gap)
 
 
@@ -103,7 +103,7 @@ def test_turning_the_base_changes_nothing_in_contact(shape: Footprint) -> None:
 def test_a_large_round_base_is_flat() -> None:
     shape, half = box(0.52, 0.05, yaw=0.01), 0.3
     x, y = shape.vertices.T
-    flat, points, gaps = polygon_and_base((x, y), (jnp.roll(x, -1), jnp.roll(y, -1)), (half, half))
+    flat, points, gaps = polygon_contact((x, y), (jnp.roll(x, -1), jnp.roll(y, -1)), (half, half))
     nearest = int(np.argmin(gaps))
     moved = fp.place(shape, jnp.array([1000.0 - half, 0.0]), 0.0)
     normal, point, gap = meet(moved, 1000.0)

@@ -4,11 +4,10 @@ import json
 from dataclasses import replace
 from functools import partial
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import SETTLED, box, case, jitted, refusal
+from helpers import box, case, refusal, sense
 from staging import push_object
 
 import rps_jax
@@ -23,12 +22,6 @@ from rps_jax.world.domain import DOMAINS
 from rps_jax.world.scene import JOINTS
 
 FRONT_ONLY = (Boards("front", 2, 0.05),)  # six taxels of 5 cm, in the middle of the front
-
-
-@jitted
-def sense(sensor, footprint):
-    """Return state and reading of a sensor of an object that has been there for a long time."""
-    return sensor.sense(sensor.init(jax.random.key(0)), footprint, SETTLED)
 
 
 def read(sensor, footprint):

@@ -1,13 +1,13 @@
 """Tests of tasks: paths, corridors and their geometry, against shapely."""
 
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import Any, ClassVar, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from helpers import jitted
 from shapely import LineString, Point, Polygon
 from shapely.affinity import translate
 
@@ -26,6 +26,9 @@ from rps_jax.world.tasks import corridor, path
 from rps_jax.world.tasks.base import Aim, CourseInputs, Positions, Task
 from rps_jax.world.tasks.path import Path
 
+clearance, nearest, nearest_on_wall, at_arc = map(
+    jitted, (polyline.clearance, polyline.nearest, polyline.nearest_on_wall, polyline.at_arc)
+)
 BRIEF = Setting("quasistatic", rules=Rules(horizon=40.0))
 
 
@@ -49,11 +52,10 @@ def test_the_clearance_from_walls_is_exact() -> None:
     rng = np.random.default_rng(0)
     crossings = 0
     for outline, shape in outlines(rng):
-        clearance = jax.jit(partial(polyline.clearance, outline))
         for _ in range(60):
             walls = random_walls(rng, 3)
-            distance_found, wall = clearance(jnp.asarray(walls))
-            point = polyline.nearest_on_wall(outline, jnp.asarray(walls[wall]))
+            distance_found, wall = clearance(outline, walls)
+            point = nearest_on_wall(outline, walls[wall])
             lines = [LineString(wall) for wall in walls]
             distance = min(shape.distance(line) for line in lines)
             crosses = any(shape.intersects(line) for line in lines)
@@ -72,7 +74,7 @@ def test_the_way_out_of_a_wall_ends_its_crossing() -> None:
     inside = 0
     for _ in range(40):
         walls = random_walls(rng, 1)
-        depth, _ = polyline.clearance(outline, jnp.asarray(walls))
+        depth, _ = clearance(outline, walls)
         if depth < -1e-3:
             inside += 1
             turns, wall = np.linspace(0, 2 * np.pi, 181), LineString(walls[0])
@@ -92,12 +94,12 @@ def test_points_of_a_path_are_shapelys() -> None:
         line, whole = Polyline.through(vertices), LineString(vertices)
         assert line.arcs[-1] == pytest.approx(whole.length)
         point = rng.normal(size=2)
-        arc, distance = polyline.nearest(line, jnp.asarray(point), 0.0, 100.0)
+        arc, distance = nearest(line, point, 0.0, 100.0)
         assert distance == pytest.approx(whole.distance(Point(point)), abs=1e-5)
-        assert np.asarray(polyline.at_arc(line, arc)) == pytest.approx(
+        assert at_arc(line, arc) == pytest.approx(
             np.ravel(whole.interpolate(float(arc)).coords), abs=1e-5
         )
-        start, _ = polyline.nearest(line, jnp.asarray(vertices[-1]), 0.0, 0.5)
+        start, _ = nearest(line, vertices[-1], 0.0, 0.5)
         assert 0 <= start <= 0.5
 
 
