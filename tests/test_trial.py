@@ -89,7 +89,7 @@ def test_trials_end_alike_in_the_merged_batches_of_a_gpu(monkeypatch, few):
     cases += [case((0.6, 0.1 * k), name="cylinder") for k in range(3)]
     alone = run(cases, rules)
     segments, ran, plain = [], [], batch._Program.compiled
-    monkeypatch.setattr(batch, "_few_slots", lambda: few)
+    monkeypatch.setattr(batch, "_tail_slots", lambda: few)
     note = lambda self, device: ran.append(self.slots) or plain(self, device)  # noqa: E731
     monkeypatch.setattr(batch._Program, "compiled", note)
     results = run(cases, rules, callback=lambda progress: segments.append(progress.segment))

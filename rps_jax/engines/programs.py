@@ -54,8 +54,6 @@ def trace_function(
       A function that compiles the program for a device (None: the default one), once for each. It
       is the same program with and without the cache.
     """
-    if (law_name := identity(law)) is None:
-        return _compiler(jax.jit(function, donate_argnums=donate), arguments)
     leaves, tree = jax.tree.flatten(jax.eval_shape(lambda *inputs: inputs, *arguments))
     donated = tuple(jax.tree.leaves(jax.tree.unflatten(tree, range(len(leaves)))[donate]))
     structures: list[pytree.PyTreeDef] = []  # of the results, once traced
@@ -65,43 +63,32 @@ def trace_function(
         structures[:] = [structure]
         return results
 
-    shapes = [(x.shape, str(x.dtype)) for x in leaves]
+    shapes, law_name = [(x.shape, str(x.dtype)) for x in leaves], identity(law)
     inputs = function.__qualname__, _describe(tree), shapes, donated, law_name, static
-    path = _path_of(repr(inputs))
-    stored = None if path is None else _read(path, leaves)
-    if stored is None:
-        jitted = jax.jit(flat, donate_argnums=donated)
+    path = _path_of(repr(inputs)) if law_name else None
+    jitted = jax.jit(flat, donate_argnums=donated)
+    if path and (stored := _read(path, leaves)):
+        structures[:], exported = stored[:1], stored[1]
+        jitted = jax.jit(exported.call, donate_argnums=donated)
+    elif law_name:
         jitted.lower(*leaves)  # waits for the native functions that it calls
         safe = list(map(export.DisabledSafetyCheck.custom_call, [*native.libraries]))
         exported = export.export(jitted, disabled_checks=safe)(*leaves)
-        (structure,) = structures
         with contextlib.suppress(ValueError, TypeError, AttributeError):  # cannot be serialised
-            example = structure.unflatten([0] * structure.num_leaves)
+            example = structures[0].unflatten([0] * structures[0].num_leaves)
             text = json.dumps(_to_json(example)).encode()
-            if _decode(text) == structure:
+            if _decode(text) == structures[0]:
                 cache.write(path, text + b"\n" + bytes(exported.serialize()))
-    else:
-        structure, exported = stored
-    compile_for = _compiler(jax.jit(exported.call, donate_argnums=donated), leaves)
-
-    def whole(device: jax.Device | None) -> Callable[..., Any]:
-        program = compile_for(device)
-        return lambda *inputs: jax.tree.unflatten(structure, program(*jax.tree.leaves(inputs)))
-
-    return whole
-
-
-def _compiler(jitted: Any, arguments: Sequence[Any]) -> Callable[[jax.Device | None], Any]:
-    """Return a function that compiles `jitted` for a device and arguments of these shapes."""
-    shapes = jax.eval_shape(lambda *inputs: inputs, *arguments)
+        jitted = jax.jit(exported.call, donate_argnums=donated)
 
     @functools.cache
-    def compile_for(device: jax.Device | None) -> jax.stages.Compiled:
+    def compiled(device: jax.Device | None) -> Callable[..., Any]:
         sharding = None if device is None else SingleDeviceSharding(device)
-        place = lambda x: x.update(sharding=sharding)  # noqa: E731
-        return _compile_lowered(jitted.lower(*jax.tree.map(place, shapes)))
+        placed = [x.update(sharding=sharding) for x in leaves]
+        program = _compile_lowered(jitted.lower(*placed))
+        return lambda *inputs: jax.tree.unflatten(structures[0], program(*jax.tree.leaves(inputs)))
 
-    return compile_for
+    return compiled
 
 
 def _describe(structure: pytree.PyTreeDef) -> object:

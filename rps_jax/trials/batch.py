@@ -14,9 +14,8 @@ trials from the same queues after every segment, so that no device waits for ano
 program serves all devices of the host.
 
 A GPU steps the trials of several jobs side by side, and runs a segment while the host reads the
-previous one: a slot whose trial has ended is refilled one segment later. It steps a few thousand
-worlds in hardly less time than a few, and some programs step idle slots as slowly as others. When
-no trial waits and few run, a worker moves these trials to a program with fewer slots.
+previous one: a slot whose trial has ended is refilled one segment later. The programs of networks
+step idle slots, too, so a worker moves the last trials to a program with fewer slots.
 """
 
 from __future__ import annotations
@@ -52,7 +51,7 @@ if TYPE_CHECKING:
 
 SEGMENT = 10.0  # [s] of simulated time in one call of a program; then slots are refilled
 _REPORT_STEPS = 500  # control steps between two reports of an engine outside of JAX
-_FEW_SLOTS = 8192  # of a job, on a GPU on which no trial waits
+_TAIL_SLOTS = 8192  # of a job, on a GPU on which no trial waits
 _MAX_SIDE_BY_SIDE = 4  # jobs in one program; more would take long to compile
 
 Tree = TypeVar("Tree")  # a pytree
@@ -314,22 +313,22 @@ def _schedule(
     The second program of a group has fewer slots than the first; many groups have only one.
     """
     groups: dict[Hashable, list[_TrialQueue]] = {}
-    few, schedule = _few_slots(), list[list[_Program]]()
-    side_by_side = few is not None and engines.get(setting.engine).side_by_side
+    tail, schedule = _tail_slots(), list[list[_Program]]()
+    side_by_side = tail is not None and engines.get(setting.engine).side_by_side
     for index, queue in enumerate(queues):
         groups.setdefault(queue.example.law if side_by_side else index, []).append(queue)
     for group in groups.values():
         for i in range(0, len(group), _MAX_SIDE_BY_SIDE):
             members = group[i : i + _MAX_SIDE_BY_SIDE]
-            most = [min(slots, -(-queue.num_trials // devices)) for queue in members]
-            sizes = dict.fromkeys([tuple(most), tuple(min(n, few or n) for n in most)])
+            widths = [min(slots, -(-queue.num_trials // devices)) for queue in members]
+            sizes = dict.fromkeys([tuple(widths), tuple(min(n, tail or n) for n in widths)])
             schedule.append([_Program(members, size, setting) for size in sizes])
     return sorted(schedule, key=lambda x: -sum(queue.num_trials for queue in x[0].queues))
 
 
-def _few_slots() -> int | None:
-    """Return how many slots a job needs when no trial waits; None: as many as before."""
-    return None if jax.default_backend() == "cpu" else _FEW_SLOTS
+def _tail_slots() -> int | None:
+    """Return the number of slots of a job when no trial waits; None: it does not change."""
+    return None if jax.default_backend() == "cpu" else _TAIL_SLOTS
 
 
 class _Program:
@@ -481,19 +480,18 @@ def _work(
     first = index % max(1, len(groups))
     for group in (*groups[first:], *groups[:first]):
         running: list[_Running | None] = [None] * len(group[0].queues)
-        for program, few in itertools.zip_longest(group, [x.slots for x in group[1:]]):
-            running = [*_run(program, few, running, device, monitor)]
+        for program, limits in itertools.zip_longest(group, [x.slots for x in group[1:]]):
+            running = [*_run(program, limits, running, device, monitor)]
 
 
 def _run(
-    program: _Program, few: Sequence[int] | None, running: Sequence[_Running | None],
+    program: _Program, limits: Sequence[int] | None, running: Sequence[_Running | None],
     device: jax.Device, monitor: _Monitor,
 ) -> Sequence[_Running | None]:  # fmt: skip
-    """Run segments until no trial waits and at most `few` of each queue run; return these."""
+    """Run segments until no trial waits and at most `limits` of each queue run; return these."""
     if monitor.stop:
         return running
     queues = [_Slots(program, *trials, device) for trials in enumerate(running)]
-    limits = few or [0] * len(queues)
 
     def live() -> tuple[int, ...]:
         return tuple(int(np.count_nonzero(slots.live)) for slots in queues)
@@ -504,25 +502,25 @@ def _run(
     advance = program.compiled(device)
     stages, rules = jax.device_put((program.stages, program.setting.rules), device)
     monitor.add_compile_time((program, device), monitor.elapsed - start_time)
-    delay = 0 if _few_slots() is None else 1  # segments that run while the host reads another
+    delay = 0 if _tail_slots() is None else 1  # segments that run while the host reads another
     end, unread = 0.0, deque[tuple[float, tuple[int, ...], tuple[_State, ...]]]()
     with ThreadPoolExecutor(1) as reporter:  # reports a segment while the next one runs
         report: Future[object] = reporter.submit(int)  # of the last segment that was read
 
-        def read(number: int) -> None:
-            """Read the oldest segment that was not read, the `number`-th of all."""
+        def read(index: int) -> None:
+            """Read the oldest segment that was not read; `index` among all of them."""
             nonlocal end, report
             start, counts, states = unread.popleft()
             pairs = zip(queues, jax.device_get(states), strict=True)
             start, end = max(start, end), monitor.elapsed
             segment = Segment(device.id, start, end, counts)
-            ended = [slots.refill(number, state) for slots, state in pairs]
+            ended = [slots.refill(index, state) for slots, state in pairs]
             report.result()
             report = reporter.submit(partial(monitor.add, *ended, segment=segment))
 
-        for number in itertools.count(-delay):
+        for index in itertools.count(-delay):
             counts = live()
-            runs = not monitor.stop and any(map(operator.gt, counts, limits))
+            runs = not monitor.stop and any(map(operator.gt, counts, limits or [0] * len(queues)))
             if runs:
                 arguments = zip(*(slots.arguments() for slots in queues), strict=True)
                 start_time = monitor.elapsed
@@ -530,9 +528,9 @@ def _run(
                 for slots, trials in zip(queues, advanced, strict=True):
                     slots.trials = trials
                 unread.append((start_time, counts, states))
-            if number >= 0 and unread:
-                read(number)
+            if index >= 0 and unread:
+                read(index)
             elif not runs:
                 break
         report.result()
-    return [] if few is None else [slots.remove() for slots in queues]
+    return [] if limits is None else [slots.remove() for slots in queues]
