@@ -6,6 +6,7 @@ of each command. A test compares it with `scipy.stats`.
 
 import math
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple
 
 import numpy as np
@@ -102,7 +103,8 @@ def varied_quantities(results: xr.Dataset) -> list[str]:
     """Return the names of the quantities of `LABELS` that differ between worlds."""
 
     def differs(values: np.ndarray) -> bool:
-        return np.unique(values[np.isfinite(values)]).size > 1
+        values = values[np.isfinite(values)]
+        return bool(values.size and values.min() < values.max())
 
     return [name for name in LABELS if name in results and differs(results[name].values)]
 
@@ -179,8 +181,8 @@ def bins(values: np.ndarray, success: np.ndarray, count: int = 8) -> Bins:
 
     The outcomes `success` (..., worlds) may be those of several laws.
     """
-    finite = np.isfinite(values)
-    values, success = values[finite], success[..., finite]
+    if not (finite := np.isfinite(values)).all():
+        values, success = values[finite], success[..., finite]
     order = ascending_order(values)
     changes = np.flatnonzero(np.diff(values[order])) + 1
     parts = changes if changes.size < count else count
@@ -253,10 +255,13 @@ def influences(results: xr.Dataset) -> list[Influence]:
 
     An influence has the greatest variance, and the least q, among the laws.
     """
-    binned, laws = {}, results.law.values
-    for name in varied_quantities(results):
-        middle, successes, trials = bins(results[name].values, results.success.values > 0)
-        binned[name] = [Bins(middle, by_bin, trials) for by_bin in successes]
+    names, laws, success = varied_quantities(results), results.law.values, results.success.values
+    with ThreadPoolExecutor() as pool:  # sorting a million numbers takes long
+        all_bins = pool.map(lambda name: bins(results[name].values, success > 0), names)
+    binned = {
+        name: [Bins(middle, by_bin, trials) for by_bin in successes]
+        for name, (middle, successes, trials) in zip(names, all_bins, strict=True)
+    }
     q = false_discovery([equal_rates_p(b) for by_law in binned.values() for b in by_law])
     q = q.reshape(len(binned), len(laws))
     unsorted = [
