@@ -79,6 +79,11 @@ TYPE_URLS = {
     **{f"mujoco.{x}": _MUJOCO + x.lower() for x in ("MjModel", "MjData", "MjSpec")},
 }
 LINK = re.compile(r"(\]\()([^)\s#]+)(#[^)\s]*)?(\))")
+# Source code, signatures and lists of members, whose sentences are at the members.
+_UNSEARCHED = re.compile(
+    r'<details(?= class="mkdocstrings-source")|<div(?= class="doc-signature)'
+    r'|(?<=doc-section-title">)(?:Methods|Functions|Classes|Modules):</span></p>\s*<table'
+)
 FENCE = re.compile(r"^( *)(```|~~~).*?^\1\2`*~* *$", re.MULTILINE | re.DOTALL)
 
 
@@ -326,7 +331,7 @@ def on_page_markdown(markdown: str, page: Any, config: Any, files: Any) -> str:
 
 
 def on_page_content(html: str, page: Any, config: Any, files: Any) -> str:
-    r"""Write equations, \(...\) and \[...\], as MathML."""
+    r"""Write equations, \(...\) and \[...\], as MathML; leave source code out of the search."""
 
     def math(match: re.Match[str]) -> str:
         text = match[2].replace("\\*", "*")  # GitHub needs the backslash
@@ -337,6 +342,9 @@ def on_page_content(html: str, page: Any, config: Any, files: Any) -> str:
         return f'<a href="{url}" title="{match[1]}">{match[2]}</a>' if url else match[0]
 
     html = re.sub(r'<span title="([\w.]+)">(\w+)</span>', type_link, html)
+    html = re.sub(_UNSEARCHED, lambda match: f"{match[0]} data-search-exclude", html)
+    if re.match(r"sweeps/\w+/README", page.file.src_uri):
+        html = html.replace("<table>", "<table data-search-exclude>")  # of numbers
     marked = r'<(div|span) class="arithmatex">\\[(\[](.*?)\\[)\]]</\1>'
     return re.sub(marked, math, html, flags=re.DOTALL)
 

@@ -1,12 +1,18 @@
 """The site: tabs of all pages, links, equations, and reports of errors."""
 
+import functools
+import http.server
+import os
 import re
 import runpy
+import sys
+import threading
 import tomllib
 from types import SimpleNamespace
 
+import chromium
 import pytest
-from helpers import ROOT
+from helpers import ROOT, output_of
 
 import rps_jax
 
@@ -100,9 +106,26 @@ def test_the_site_names_version_and_repository(monkeypatch):
     assert "navigation.footer" in (ROOT / "mkdocs.yml").read_text()  # previous and next
 
 
+def page_of(path):
+    return SimpleNamespace(file=SimpleNamespace(src_uri=path))
+
+
+def test_the_search_leaves_out_code_lists_of_members_and_tables_of_numbers():
+    source, signature = '<details class="mkdocstrings-source">', '<div class="doc-signature x">'
+    members = '<span class="doc-section-title">Functions:</span></p>\n <table>'
+    parameters = members.replace("Functions", "Parameters")
+    html = "".join((source, signature, members, parameters))
+    output = HOOKS["on_page_content"](html, page_of("reference/a.md"), None, None)
+    assert output.count(" data-search-exclude") == 3
+    assert parameters in output
+    for path, count in (("sweeps/table/README.md", 1), ("sweeps/README.md", 0)):
+        output = HOOKS["on_page_content"]("<table><tr>", page_of(path), None, None)
+        assert output.count(" data-search-exclude") == count
+
+
 def test_an_equation_becomes_mathml():
     html = r'<p><span class="arithmatex">\(v^\* &lt; 1\)</span></p>'
-    output = HOOKS["on_page_content"](html, None, None, None)
+    output = HOOKS["on_page_content"](html, page_of("a.md"), None, None)
     assert "<math" in output
     assert "<mo>&#x0002A;</mo>" in output
     assert "\\" not in output
@@ -123,3 +146,56 @@ def test_dead_links_and_loads_from_other_hosts_are_reported(tmp_path):
         "b.html has a dead link to gone.html",
         "x.css loads //example.org/y.png from another host",
     ]
+
+
+PAGES = (
+    *("index.html", "docs/gallery.html", "docs/not_supported.html", "docs/on_a_robot.html"),
+    *("notebooks/07_custom_law.html", "notebooks/10_gradients.html", "rps_jax/index.html"),
+    *("reference/index.html", "reference/control.html", "sweeps/index.html"),
+    *("sweeps/ladder/index.html", "sweeps/random_worlds/index.html", "push.html"),
+)
+
+
+class Quiet(http.server.SimpleHTTPRequestHandler):
+    def log_message(self, *_):
+        pass
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory):
+    """Folder and address of the built site."""
+    folder = tmp_path_factory.mktemp("site")
+    environment = os.environ | {"NO_MKDOCS_2_WARNING": "1"}
+    words = (sys.executable, "-m", "mkdocs", "build", "-q", "--strict", "-d", folder)
+    output_of(*words, cwd=ROOT, env=environment)
+    handler = functools.partial(Quiet, directory=str(folder))
+    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), handler) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        yield folder, f"http://127.0.0.1:{server.server_port}/"
+        server.shutdown()
+
+
+@pytest.mark.slow
+def test_the_search_index_is_small(site):
+    assert (site[0] / "search" / "search_index.json").stat().st_size < 1_000_000
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_pages_are_readable_without_other_hosts_at_two_widths(site, scheme, tmp_path):
+    """No error, no request elsewhere, no sideways scrolling; images and links have names."""
+    script = (ROOT / "tests" / "page_faults.js").read_text()
+    media = {"features": [{"name": "prefers-color-scheme", "value": scheme}]}
+    with chromium.opened(tmp_path, "--headless=new") as browser:
+        browser.execute_cdp_cmd("Emulation.setEmulatedMedia", media)
+        for width in (390, 1280):
+            metrics = {"width": width, "height": 844, "deviceScaleFactor": 1, "mobile": width < 800}
+            browser.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", metrics)
+            for page in PAGES:
+                browser.get(site[1] + page)
+                faults = browser.execute_script(script)
+                assert faults.pop("dark") == (scheme == "dark"), page
+                assert faults.pop("scroll") <= 0, (page, width)
+                assert not any(faults.values()), (page, width, faults)
+                errors = [x["message"] for x in browser.get_log("browser")]
+                assert errors == [], (page, width)
