@@ -99,7 +99,7 @@ def jitted(function: Callable[..., Any]) -> Callable[..., Any]:
 SEEDS = strategies.integers(0, 2**32 - 1)
 
 
-def property_test(*arguments: strategies.SearchStrategy, examples: int = 100) -> Callable[..., Any]:
+def property_test(*arguments: strategies.SearchStrategy, examples: int = 40) -> Callable[..., Any]:
     """Return a decorator that runs a test for random arguments."""
     settings = hypothesis.settings(max_examples=examples, deadline=None)
     return lambda test: settings(hypothesis.given(*arguments)(test))

@@ -21,6 +21,7 @@ distances = jax.jit(jax.vmap(fp.signed_distance))  # (B, P) [m]
 slopes = jax.jit(jax.vmap(jax.vmap(jax.grad(fp.signed_distance, argnums=1), (None, 0))))
 shape_slopes = jax.jit(jax.vmap(jax.vmap(jax.grad(fp.signed_distance), (None, 0))))
 crossings = jax.jit(jax.vmap(fp.crossing))
+place = jax.jit(jax.vmap(fp.place))
 reaches = jax.jit(jax.vmap(extent))
 
 
@@ -46,7 +47,7 @@ def random_polygons(rng) -> Footprint:
 def place_at_random(rng, footprints: Footprint) -> Footprint:
     position = rng.uniform(-0.5, 0.5, (BATCH, 2)).astype(np.float32)
     yaw = rng.uniform(-4, 4, BATCH).astype(np.float32)
-    return jax.vmap(fp.place)(footprints, position, yaw)
+    return place(footprints, position, yaw)
 
 
 KINDS = {"rectangle": random_rectangles, "circle": random_circles, "polygon": random_polygons}
@@ -134,7 +135,7 @@ def test_the_signed_distance_does_not_depend_on_the_frame(kind, seed):
     position = rng.uniform(-2, 2, (BATCH, 2)).astype(np.float32)
     yaw = rng.uniform(-4, 4, BATCH).astype(np.float32)
     moved = planar.rotate(yaw[:, None], points) + position[:, None]
-    got = distances(jax.vmap(fp.place)(footprints, position, yaw), moved)
+    got = distances(place(footprints, position, yaw), moved)
     np.testing.assert_allclose(got, distances(footprints, points), atol=3e-6)
 
 

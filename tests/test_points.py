@@ -102,9 +102,15 @@ def test_sweeps_and_evaluations_take_points_as_they_take_drawn_worlds(tmp_path):
 BOTH = replace(CYLINDERS, objects=("random_box", "random_cylinder"))
 
 
-def test_objects_may_come_in_any_order(tmp_path):
+def some_points():
+    """Return points (5, q) of one box among cylinders."""
     u = points.points_of(BOTH, np.arange(5))
-    u[:, 0] = [0.9, 0.9, 0.9, 0.9, 0.1]  # one box among cylinders
+    u[:, 0] = [0.9, 0.9, 0.9, 0.9, 0.1]
+    return u
+
+
+def test_objects_may_come_in_any_order(tmp_path):
+    u = some_points()
     options = {"setting": replace(SHORT, engine="quasistatic"), "part": 2, "slots": SLOTS}
     swept = rps_jax.sweep("rps", BOTH, points=u, out=tmp_path, **options)
     assert swept.object.values.tolist() == ["random_cylinder"] * 4 + ["random_box"]
@@ -140,11 +146,12 @@ def test_points_that_are_none_are_refused(tmp_path, capsys):
 def test_the_command_sweeps_points_and_can_be_continued(tmp_path, capsys):
     domain, file = tmp_path / "both.json", tmp_path / "some.nc"
     domain.write_text(json.dumps(asdict(BOTH)))
-    files.write_results(file, points.worlds_at(BOTH, points.points_of(BOTH, np.arange(3))))
+    files.write_results(file, points.worlds_at(BOTH, some_points()))
     words = f"sweep --laws rps --engine quasistatic --fidelity fast --horizon 5 --slots {SLOTS}"
-    command = [*words.split(), "--domain", domain, "--points", file, "--out", tmp_path / "r"]
+    command = [*words.split(), "--part", 2, "--domain", domain, "--points", file]
+    command += ["--out", tmp_path / "r"]
     assert rps(*command) == 0
-    assert "3 worlds, points of the unit cube" in capsys.readouterr().out
+    assert "5 worlds, points of the unit cube" in capsys.readouterr().out
     assert rps(*command) == 0
     objects = rps_jax.load(tmp_path / "r").object.values.tolist()
-    assert objects == ["random_box", "random_cylinder", "random_box"]
+    assert objects == ["random_cylinder"] * 4 + ["random_box"]

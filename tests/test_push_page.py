@@ -221,7 +221,7 @@ def test_the_support_of_an_object_equals_that_of_the_package(corners):
     solids = solid.build(vertices, radius, unit, unit, offset, bearing, 0.1 * unit)
     with jax.enable_x64(True):
         outlines = MAKE["Outline"](vertices, radius, offset, bearing)
-        com, arm = jax.vmap(MAKE["support"])(outlines)
+        com, arm = jax.jit(jax.vmap(MAKE["support"]))(outlines)
     np.testing.assert_allclose(com, solids.p_object_com[:, :2], atol=1e-12)
     np.testing.assert_allclose(arm, solid.friction_arm(solids), atol=1e-9)
 

@@ -1,8 +1,10 @@
 """Laws other than the paper's: values by hand, symmetry, bounds, and pushes of a box."""
 
 import math
+from functools import partial
 
 import helpers
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -292,6 +294,13 @@ def with_taxels(observation):
     return TaxelObservation(observation, signal, jnp.asarray(False))
 
 
+@partial(jax.jit, static_argnums=0)
+def second_twist(law, params, observation):
+    """Return the twist (3,) of a law's second step."""
+    state, _, _ = step_once(law, params, observation)
+    return jnp.stack(law.step(params, state, observation)[1])
+
+
 def twist_of(name, touch, p_object, force=(-20.0, 5.0)):
     """Return the twist (3,) of a law's second step."""
     params = RIVALS[name]
@@ -302,8 +311,7 @@ def twist_of(name, touch, p_object, force=(-20.0, 5.0)):
         "pose": with_pose(touch, p_object),
         "taxels": with_taxels(touch),
     }[law.senses]
-    state, _, _ = step_once(law, params, observation)
-    return np.asarray(jnp.stack(law.step(params, state, observation)[1]))
+    return np.asarray(second_twist(law, params, observation))
 
 
 @pytest.mark.parametrize("name", RIVALS)
