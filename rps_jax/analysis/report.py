@@ -15,20 +15,7 @@ from rps_jax.record import files
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-_STYLE = """
-body { font: 15px/1.5 system-ui, sans-serif; max-width: 72em; margin: 2em auto; padding: 0 1em;
-  overflow-wrap: anywhere; }
-table { border-collapse: collapse; margin: 1em 0; font-size: 13px; display: block;
-  max-width: max-content; overflow-x: auto; overflow-wrap: normal; }
-th, td { border: 1px solid #ccc; padding: .2em .6em; text-align: left; min-width: 3em; }
-th { background: #f2f2f2; }
-img, video { max-width: 100%; display: block; margin: 1em 0; }
-code { background: #f5f5f5; }
-@media (max-width: 45em) { /* figures stay readable, and scroll */
-  p:has(> img) { overflow-x: auto; }
-  img { max-width: 36em; }
-}
-"""
+_STYLE = Path(__file__).with_suffix(".css").read_text("utf-8")
 
 
 class Picture(NamedTuple):

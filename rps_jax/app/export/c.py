@@ -7,95 +7,9 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from rps_jax import __version__
-from rps_jax.app.export.program import Program
+from rps_jax.app.export.program import Program, fill
 from rps_jax.lowering.c import HELPERS, literal, statements, struct
 from rps_jax.lowering.routine import Field, Group, Routine
-
-# Placeholders in capitals are lines that are printed for a law.
-_HEADER = """\
-/* The law {label} with the skin of the robot {robot}, written by rps_jax {version}: do not edit.
-
-   C99 without allocation; it needs math.h alone. Numbers are float, or double if {P}_DOUBLE is
-   defined. Frames: the world, and the robot (origin at the middle of the base, x forward, y left).
-   Call {p}_init once and {p}_step in each control period, and {p}_skin_init once and
-   {p}_skin_step for each scan of the taxels, as the example main.c does.
-
-   Taxels are in the order of the strip: left side from the rear, front from left to right, right
-   side from the front. One whose `alive` is 0 is ignored, but must be finite. A step returns
-   {P}_OK, or another code: then the twist is zero (there is no contact), and the memory is
-   unchanged. Do not compile with -ffast-math: it assumes that all numbers are finite. */
-
-#ifndef {P}_H
-#define {P}_H
-
-#include <math.h>
-
-#ifdef {P}_DOUBLE
-typedef double {p}_real;
-#define {P}_F(name) name
-#else
-typedef float {p}_real;
-#define {P}_F(name) name##f
-#endif
-
-#define {P}_TAXELS {taxels}
-
-enum {{
-  {P}_OK = 0,
-  {P}_BAD_INPUT = 1, /* an input was NaN or infinite */
-  {P}_BAD_RESULT = 2 /* the law has no finite twist for these numbers */
-}};
-
-{STRUCTS}
-{INITIALISERS}
-{HELPERS}
-{TABLES}
-/* The memory before the first step. */
-static inline void {p}_init(const {p}_params *params, {p}_memory *memory) {{
-  (void)params;
-{INIT}
-}}
-
-/* One control step; returns a code. */
-static inline int {p}_step(const {p}_params *params, {p}_memory *memory,
-    const {p}_observation *observation, {p}_twist *twist) {{
-  (void)params;
-  twist->v_x = twist->v_y = twist->omega = 0;
-{STEP_CHECKED}
-  {p}_memory next;
-  {p}_twist result;
-{STEP}
-{STEP_RESULT}
-{STEP_MEMORY}
-  *memory = next;
-  *twist = result;
-  return {P}_OK;
-}}
-
-/* The skin before it has felt anything, with all its taxels alive. */
-static inline void {p}_skin_init({p}_skin *skin) {{
-  for (int i = 0; i < {P}_TAXELS; i++) {{
-    skin->signal[i] = 0;
-    skin->alive[i] = 1;
-  }}
-}}
-
-/* One scan of all taxels, `period` [s] after the last; returns a code. */
-static inline int {p}_skin_step(const {p}_skin_params *params, {p}_skin *skin,
-    const {p}_real taxels[{P}_TAXELS], {p}_real period, {p}_contact *contact) {{
-{NO_CONTACT}
-{SKIN_CHECKED}
-  {p}_skin next = *skin;
-  {p}_contact result;
-{SKIN}
-{SKIN_RESULT}
-  *skin = next;
-  *contact = result;
-  return {P}_OK;
-}}
-
-#endif /* {P}_H */
-"""
 
 
 def _initialiser(prefix: str, name: str, groups: Mapping[str, Group]) -> str:
@@ -125,7 +39,7 @@ def _for_each(fields: Sequence[Field], prefix: str, statement: str, kinds: str =
 
 
 def header(program: Program, prefix: str) -> str:
-    """Return the whole header."""
+    """Return the whole header, in whose template capitals are lines that are printed for a law."""
     p, upper, groups, tables = prefix, prefix.upper(), program.groups, dict[str, str]()
     law = {name: f"{name}->" for name in ("params", "memory", "observation")}
     skin = {"skin_params": "params->", "skin": "skin->", "scan": ""}
@@ -153,4 +67,4 @@ def header(program: Program, prefix: str) -> str:
         "HELPERS": HELPERS.format(p=p, P=upper),
     }
     about = {"label": program.label, "robot": program.robot, "version": __version__}
-    return _HEADER.format(**lines, **about, p=p, P=upper, taxels=program.taxels)
+    return fill("law.h.in", **lines, **about, p=p, P=upper, taxels=program.taxels)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+from string import Template
 from typing import Any, NamedTuple, TypeAlias
 
 import jax
@@ -18,6 +20,11 @@ from rps_jax.robot.skin import LINE, CapacitiveSkin
 
 Leaf: TypeAlias = Any  # an array of JAX or NumPy, or its type
 _REAL = jax.ShapeDtypeStruct((), np.float64)
+
+
+def fill(name: str, **values: object) -> str:
+    """Return the text of a template of this folder with values for its placeholders."""
+    return Template(Path(__file__).with_name(name).read_text("utf-8")).substitute(values)
 
 
 class Program(NamedTuple):
