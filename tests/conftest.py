@@ -59,6 +59,7 @@ def few_pictures():
     render, rendered = Picture.png, {}
 
     def png(picture):
+        """Return a PNG file of the picture's name."""
         if picture.name in rendered:
             picture.draw()
         else:
