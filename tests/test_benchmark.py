@@ -178,7 +178,8 @@ def test_sweeps_are_timed_on_the_gpus_of_the_host(monkeypatch):
 
     def printed(words, label, folder, limit, count):
         calls.append((label, count))
-        segments = [[0, 1.0, 2.0, [4000, 3000, 0]], [1, 1.0, 4.0, [1000, 0, 0]]][:count]
+        segments = [[0, 1.0, 2.0, 4000, 3000, 0], [0, 1.5, 2.0, 4, 0, 0], [1, 1.0, 4.0, 9, 0, 0]]
+        segments = [x for x in segments if x[0] < count]
         traced = f"a line\n{segments}\n"
         return traced if words[0] == "-c" else "compile 0.2 s, run 3.0 s (900 simulated s per s)", 1
 

@@ -97,7 +97,7 @@ def test_trials_end_alike_in_the_merged_batches_of_a_gpu(monkeypatch, few):
     assert ran[1:] == ([(3, 3)] if few == 3 else [])  # none is left to the last one of few = 1
     segments = [x for x in segments if x is not None]
     assert all(x.start < x.end <= y.end and x.end <= y.start for x, y in pairwise(segments))
-    assert segments[0].live == (SLOTS, 3)
+    assert segments[0].live == {0: SLOTS, 1: 3}
     assert alone.success.sum() > 0
     for name in ("success", "time"):
         np.testing.assert_array_equal(getattr(results, name), getattr(alone, name))

@@ -255,13 +255,14 @@ def influences(results: xr.Dataset) -> list[Influence]:
 
     An influence has the greatest variance, and the least q, among the laws.
     """
-    names, laws, success = varied_quantities(results), results.law.values, results.success.values
+
+    def bins_of(name: str) -> list[Bins]:
+        middle, successes, trials = bins(results[name].values, results.success.values > 0)
+        return [Bins(middle, by_bin, trials) for by_bin in successes]
+
+    names, laws = varied_quantities(results), results.law.values
     with ThreadPoolExecutor() as pool:  # sorting a million numbers takes long
-        all_bins = pool.map(lambda name: bins(results[name].values, success > 0), names)
-    binned = {
-        name: [Bins(middle, by_bin, trials) for by_bin in successes]
-        for name, (middle, successes, trials) in zip(names, all_bins, strict=True)
-    }
+        binned = dict(zip(names, pool.map(bins_of, names), strict=True))
     q = false_discovery([equal_rates_p(b) for by_law in binned.values() for b in by_law])
     q = q.reshape(len(binned), len(laws))
     unsorted = [

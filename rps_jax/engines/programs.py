@@ -84,7 +84,7 @@ def trace_function(
     @functools.cache
     def compiled(device: jax.Device | None) -> Callable[..., Any]:
         sharding = None if device is None else SingleDeviceSharding(device)
-        placed = [x.update(sharding=sharding) for x in leaves]
+        placed = (x.update(sharding=sharding) for x in leaves)
         program = _compile_lowered(jitted.lower(*placed))
         return lambda *inputs: jax.tree.unflatten(structures[0], program(*jax.tree.leaves(inputs)))
 

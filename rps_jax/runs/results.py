@@ -32,7 +32,7 @@ StoreChunk = Callable[[int, bytes], object]  # called with the number of a chunk
 _FLAGS = ("success", "tipped", "diverged", "nan_twist", "stalled")
 _TYPES: dict[str, type] = dict.fromkeys(_FLAGS, np.int8)
 _REMOVED = "overflows"  # column of a version with the engine warp
-_PREFETCH = 65536  # worlds of one program that are built before they are needed, about
+_PREFETCH = 16384  # worlds of one program that are built before they are needed, about
 
 
 def name_of(chunk: int) -> str:

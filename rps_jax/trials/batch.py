@@ -51,6 +51,7 @@ if TYPE_CHECKING:
 
 SEGMENT = 10.0  # [s] of simulated time in one call of a program; then slots are refilled
 _REPORT_STEPS = 500  # control steps between two reports of an engine outside of JAX
+_FIRST_TRIALS = 16384  # of a job on a GPU in the first segment, while more are built
 _TAIL_SLOTS = 8192  # of a job, on a GPU on which no trial waits
 _MAX_SIDE_BY_SIDE = 4  # jobs in one program; more would take long to compile
 
@@ -156,9 +157,12 @@ def run(
         tasks = [partial(_run_on_host, job, setting, workers // count, monitor) for job in jobs]
     else:
         devices = _devices()
-        groups = _schedule(list(map(_TrialQueue, jobs)), setting, slots, len(devices))
+        groups = _schedule(
+            [*itertools.starmap(_TrialQueue, enumerate(jobs))], setting, slots, len(devices)
+        )
         compilations = [partial(x.compiled, d) for x in itertools.chain(*groups) for d in devices]
-        monitor.start(len(compilations))
+        monitor.programs = len(compilations)
+        monitor.report()
         tasks = [partial(_work, groups, monitor, *x) for x in enumerate(devices * workers)]
         if backend != "cpu":  # idle processors: compile all programs at once, first used first
             tasks += compilations
@@ -196,7 +200,7 @@ class _Monitor:
         self._start_time = time.perf_counter()
         self._finished = self._nan_twists = 0  # trials
         self._compiled: set[object] = set()
-        self._programs = 0  # that the run needs
+        self.programs = 0  # that the run needs
         self._waits: defaultdict[int, float] = defaultdict(float)  # [s] for compilation, by thread
         self._collect, self._callback = collect, callback
         self._lock = threading.Lock()
@@ -215,7 +219,7 @@ class _Monitor:
                 self._finished += indices.size
                 self._nan_twists += int(np.count_nonzero(outcomes.nan_twist))
                 self.simulated += simulated
-            self._report(segment)
+            self.report(segment)
 
     def warn_of_nan_twists(self) -> None:
         """Warn if a law returned a twist that is not finite."""
@@ -226,13 +230,9 @@ class _Monitor:
                 stacklevel=4,
             )
 
-    def start(self, programs: int) -> None:
-        """Report that a run starts, which needs this number of programs."""
-        self._programs = programs
-        self._report()
-
-    def _report(self, segment: Segment | None = None) -> None:
-        counts = {"compiled": len(self._compiled), "programs": self._programs}
+    def report(self, segment: Segment | None = None) -> None:
+        """Report the progress of the run."""
+        counts = {"compiled": len(self._compiled), "programs": self.programs}
         times = self._finished, self.simulated, self.compile
         self._callback(Progress(*times, **counts, segment=segment))
 
@@ -242,7 +242,7 @@ class _Monitor:
             self._compiled.add(program)
             self._waits[threading.get_ident()] += seconds
             self.compile = max(self._waits.values())
-            self._report()
+            self.report()
 
 
 # --- engines outside of JAX ----------------------------------------------------------------
@@ -288,10 +288,11 @@ class _Running(NamedTuple):
 class _TrialQueue:
     """Trials of a job that wait for a slot; workers share it."""
 
-    def __init__(self, job: Job):
-        self.num_trials, self._batches = job.num_trials, iter(job.batches)
+    def __init__(self, index: int, job: Job):
+        self.index, self.num_trials, self._batches = index, job.num_trials, iter(job.batches)
         self.example: WorldBatch = next(self._batches)  # for its stage and its shapes
         self._waiting: WorldBatch | None = self.example  # rest of the current batch
+        self.size = sum(leaf[0].size for leaf in jax.tree.leaves(self.example.worlds))  # of a world
         self._lock = threading.Lock()
 
     def take(self, count: int) -> list[WorldBatch]:
@@ -319,7 +320,8 @@ def _schedule(
         groups.setdefault(queue.example.law if side_by_side else index, []).append(queue)
     for group in groups.values():
         for i in range(0, len(group), _MAX_SIDE_BY_SIDE):
-            members = group[i : i + _MAX_SIDE_BY_SIDE]
+            # The largest worlds, which take longest, start first.
+            members = sorted(group[i : i + _MAX_SIDE_BY_SIDE], key=lambda x: -x.size)
             widths = [min(slots, -(-queue.num_trials // devices)) for queue in members]
             sizes = dict.fromkeys([tuple(widths), tuple(min(n, tail or n) for n in widths)])
             schedule.append([_Program(members, size, setting) for size in sizes])
@@ -411,7 +413,7 @@ class _Slots:
     """Slots of one queue in a program of one worker, and the trials in them."""
 
     def __init__(self, program: _Program, index: int, running: _Running | None, device: jax.Device):
-        """Fill the slots of the queue `index` with running trials, or else waiting ones."""
+        """Fill slots of the queue `index` with the running trials, and others with waiting ones."""
         queue, slots = program.queues[index], program.slots[index]
         self._queue, self._device = queue, device
         self._period = program.setting.physics.control_period
@@ -421,40 +423,44 @@ class _Slots:
         self._count = 0  # segments that were launched
         example = queue.example.inputs
         self._host = jax.tree.map(lambda leaf: np.repeat(leaf[:1], slots, axis=0), example)
+        self._inputs: Inputs | None = None  # on the device, if they are those on the host
         trials = jax.tree.map(lambda x: np.zeros(x.shape, x.dtype), program.shapes(index)[1])
         if running is not None:
-            at = slice(running.fresh.size)
-            _write(trials, at, running.trials)
+            at = np.arange(running.fresh.size)
+            self._write(at, running.batch)
             self._first[at] = np.where(running.fresh, 0, -1)
+            _write(trials, at, running.trials)
         self.trials = jax.device_put(trials, device)
-        batches = queue.take(slots) if running is None else [running.batch]
-        self.inputs = self._fill(np.arange(slots), batches)
+        self.fill(None if _tail_slots() is None else _FIRST_TRIALS)
 
-    def _fill(self, at: np.ndarray, batches: Sequence[WorldBatch]) -> Inputs:
-        """Fill the first of the slots `at` with trials; return the inputs of all slots."""
-        end = 0
-        for batch in batches:
-            slots = at[end : (end := end + batch.indices.size)]
-            self._indices[slots], self.live[slots] = batch.indices, True
-            _write(self._host, slots, batch.inputs)
-        # A copy: the device may otherwise share the host's memory, which the next call changes.
-        return jax.device_put(jax.tree.map(np.copy, self._host), self._device)
+    def _write(self, at: np.ndarray, batch: WorldBatch) -> None:
+        """Write trials into the slots `at`, in which they start with the next segment."""
+        self._indices[at], self._first[at], self.live[at] = batch.indices, self._count, True
+        _write(self._host, at, batch.inputs)
+        self._inputs = None
+
+    def fill(self, count: int | None = None) -> None:
+        """Fill free slots with at most `count` waiting trials."""
+        at = np.flatnonzero(~self.live)[:count]
+        for batch in self._queue.take(at.size) if at.size else ():
+            self._write(at[: batch.indices.size], batch)
+            at = at[batch.indices.size :]
 
     def arguments(self) -> tuple[Inputs, Trial, jax.Array, jax.Array]:
         """Return the arguments of the program for the next segment, in which fresh trials start."""
+        if self._inputs is None:
+            # A copy: the device may share the host's memory, which `fill` changes.
+            self._inputs = jax.device_put(jax.tree.map(np.copy, self._host), self._device)
         masks = self._first == self._count, self.live.copy()
         self._count += 1
-        return self.inputs, self.trials, *jax.device_put(masks, self._device)
+        return self._inputs, self.trials, *jax.device_put(masks, self._device)
 
-    def refill(self, segment: int, state: _State) -> _Ended:
-        """Replace the trials that ended in a segment; return the arguments of `_Monitor.add`."""
+    def free(self, segment: int, state: _State) -> _Ended:
+        """Free the slots of the trials that ended in a segment; return these."""
         steps, done, outcomes = state
         at = np.flatnonzero(done & self.live & (self._first <= segment))
         ended = self._indices[at], rows(outcomes, at), float(steps.sum()) * self._period
         self.live[at] = False
-        if batches := self._queue.take(at.size):
-            self.inputs = self._fill(at, batches)
-            self._first[at] = self._count
         return ended
 
     def remove(self) -> _Running:
@@ -492,45 +498,37 @@ def _run(
     if monitor.stop:
         return running
     queues = [_Slots(program, *trials, device) for trials in enumerate(running)]
-
-    def live() -> tuple[int, ...]:
-        return tuple(int(np.count_nonzero(slots.live)) for slots in queues)
-
-    if not any(live()):
+    if not any(slots.live.any() for slots in queues):
         return running
     start_time = monitor.elapsed
     advance = program.compiled(device)
     stages, rules = jax.device_put((program.stages, program.setting.rules), device)
     monitor.add_compile_time((program, device), monitor.elapsed - start_time)
+    end, unread = 0.0, deque[tuple[float, list[int], tuple[_State, ...]]]()
     delay = 0 if _tail_slots() is None else 1  # segments that run while the host reads another
-    end, unread = 0.0, deque[tuple[float, tuple[int, ...], tuple[_State, ...]]]()
     with ThreadPoolExecutor(1) as reporter:  # reports a segment while the next one runs
         report: Future[object] = reporter.submit(int)  # of the last segment that was read
-
-        def read(index: int) -> None:
-            """Read the oldest segment that was not read; `index` among all of them."""
-            nonlocal end, report
-            start, counts, states = unread.popleft()
-            pairs = zip(queues, jax.device_get(states), strict=True)
-            start, end = max(start, end), monitor.elapsed
-            segment = Segment(device.id, start, end, counts)
-            ended = [slots.refill(index, state) for slots, state in pairs]
-            report.result()
-            report = reporter.submit(partial(monitor.add, *ended, segment=segment))
-
-        for index in itertools.count(-delay):
-            counts = live()
-            runs = not monitor.stop and any(map(operator.gt, counts, limits or [0] * len(queues)))
-            if runs:
+        for index in itertools.count(-delay):  # of the segment that is read
+            counts = [int(np.count_nonzero(slots.live)) for slots in queues]
+            if not monitor.stop and any(map(operator.gt, counts, limits or [0] * len(queues))):
                 arguments = zip(*(slots.arguments() for slots in queues), strict=True)
                 start_time = monitor.elapsed
                 advanced, states = advance(stages, *arguments, rules)
                 for slots, trials in zip(queues, advanced, strict=True):
                     slots.trials = trials
                 unread.append((start_time, counts, states))
-            if index >= 0 and unread:
-                read(index)
-            elif not runs:
+            elif not unread:
                 break
+            if index >= 0:
+                start, counts, states = unread.popleft()
+                pairs = zip(queues, jax.device_get(states), strict=True)
+                start, end = max(start, end), monitor.elapsed
+                live = dict(zip((queue.index for queue in program.queues), counts, strict=True))
+                segment = Segment(device.id, start, end, live)
+                ended = [slots.free(index, state) for slots, state in pairs]
+                report.result()
+                report = reporter.submit(partial(monitor.add, *ended, segment=segment))
+            for slots in queues:
+                slots.fill()
         report.result()
     return [] if limits is None else [slots.remove() for slots in queues]

@@ -19,7 +19,7 @@ class Segment(NamedTuple):
     device: int  # its number on the host
     start: float  # [s] since the start of the run
     end: float  # [s] when its results were on the host
-    live: tuple[int, ...]  # trials that ran, of each job of the program
+    live: dict[int, int]  # trials that ran, by the index of their job
 
 
 @dataclass(frozen=True)

@@ -27,12 +27,12 @@ from rps_jax.analysis.report import Picture
 from rps_jax.errors import InputError
 from rps_jax.record.options import option
 from rps_jax.runs.question import Run, call_of
-from rps_jax.trials.progress import Segment
 from rps_jax.world.domain import parse_domain
 from sweeps.speed.commands import TIMING, printed
 from sweeps.study_base import SpeedStudy, Table, records, run_process, text_table
 
 _LIMIT = 600.0  # [s] of a sweep
+_MAX_SEGMENTS = 10_000  # of a sweep
 _COLUMNS = {
     "worlds": "{worlds:,}",
     "GPUs": "{gpus}",
@@ -43,13 +43,15 @@ _COLUMNS = {
     "simulated s/s": "{rate:,.0f}",
     "GPUs idle": "{idle:.0f} %",
 }
-# A sweep that prints its segments.
+# A sweep that prints device, start, end and live trials of each object of its segments.
 _TRACED = (
     "import json, rps_jax\n"
-    "segments = []\n"
-    "rps_jax.sweep({!r}, 'wide', worlds={}, report_to=lambda x: segments.append(x.segment))\n"
-    "print(json.dumps([x for x in segments if x is not None]))\n"
+    "noted = []\n"
+    "rps_jax.sweep({!r}, 'wide', worlds={}, report_to=lambda x: noted.append(x.segment))\n"
+    "rows = [[*x[:3], *(x.live.get(i, 0) for i in range({}))] for x in noted if x is not None]\n"
+    "print(json.dumps(rows))\n"
 )
+_OBJECTS = [words(name) for name in parse_domain("wide").objects]
 
 
 @dataclass(frozen=True)
@@ -57,7 +59,7 @@ class Gpus(SpeedStudy[xr.Dataset]):
     """Time whole sweeps of `wide` on some GPUs of this host, with a filled cache.
 
     The results hold, by sweep, its duration, the times that it prints and, of the fewest worlds on
-    the fewest and on the most GPUs, its segments as JSON.
+    the fewest and on the most GPUs, its `segments`: device, start, end and live trials by object.
     """
 
     TITLE: ClassVar[str] = "Sweeps on several GPUs"
@@ -86,15 +88,15 @@ class Gpus(SpeedStudy[xr.Dataset]):
     def report_tables(self, results: xr.Dataset) -> Sequence[Table]:
         """Return the durations, with the timeline of the traced sweeps."""
         rows, traces = [*records(results, "sweep")], {}
-        for row in rows:
+        for i, row in enumerate(rows):
             first = next(x for x in rows if x["worlds"] == row["worlds"])
             row |= {"gain": first["whole"] / row["whole"], "idle": np.nan}
-            if segments := [Segment(*x) for x in json.loads(row["segments"])]:
-                busy = sum(x.end - x.start for x in segments) / segments[-1].end
-                row["idle"] = 100 * (1 - busy / row["gpus"])
-                traces[row["gpus"]] = segments
-        objects = [words(name) for name in parse_domain("wide").objects]
-        picture = Picture("gpus", partial(timeline, traces, objects))
+            segments = results.segments[i].dropna("segment").values
+            if len(segments):
+                run = segments[:, 2].max() * row["gpus"]
+                row["idle"] = 100 * (1 - busy_time(segments) / run)
+                traces[f"{row['gpus']} GPUs".replace("1 GPUs", "1 GPU")] = segments
+        picture = Picture("gpus", partial(timeline, traces))
         return [Table(text_table(_COLUMNS, rows), name="gpus", merge="worlds", picture=picture)]
 
     @cached_property
@@ -116,38 +118,51 @@ class Gpus(SpeedStudy[xr.Dataset]):
 
     def _timed(self, worlds: int, gpus: int) -> xr.Dataset:
         """Return the times and the segments of a sweep."""
-        folder, segments, counts = self._caches.name, "[]", [n for _, n in self.sweeps]
+        folder, rows, counts = self._caches.name, [], [n for _, n in self.sweeps]
         start = time.perf_counter()
         output = self._swept(folder, worlds, gpus)
         whole = time.perf_counter() - start
         if (match := TIMING.search(output)) is None:
             raise InputError(f"the sweep of {worlds} worlds printed no time of its run.")
         if worlds == min(self.worlds) and gpus in (min(counts), max(counts)):
-            call, cache = _TRACED.format(self.law, worlds), f"{folder}/{worlds}_{gpus}"
-            segments = printed(["-c", call], call, cache, _LIMIT, gpus)[0].splitlines()[-1]
+            call = _TRACED.format(self.law, worlds, len(_OBJECTS))
+            output, _ = printed(["-c", call], call, f"{folder}/{worlds}_{gpus}", _LIMIT, gpus)
+            rows = json.loads(output.splitlines()[-1])
         values = dict(zip(("compile", "run", "rate"), map(float, match.groups()), strict=True))
         sizes = {"worlds": worlds, "gpus": gpus, "whole": whole}
-        return xr.Dataset(sizes | values | {"segments": segments})
+        segments = np.full((_MAX_SEGMENTS, 3 + len(_OBJECTS)), np.nan)
+        if rows:
+            segments[: len(rows)] = rows
+        return xr.Dataset(sizes | values | {"segments": (("segment", "column"), segments)})
 
 
 gpus = call_of(Gpus)
 
 
-def timeline(traces: Mapping[int, Sequence[Segment]], objects: Sequence[str]) -> Figure:
+def busy_time(segments: np.ndarray) -> float:
+    """Return the time [s] in which segments (n, ...) run, summed over devices."""
+    total = 0.0
+    for device in np.unique(segments[:, 0]):
+        start, end = segments[segments[:, 0] == device][:, 1:3].T
+        order = np.argsort(start)
+        start, end = start[order], end[order]
+        previous = np.maximum.accumulate(np.append(0.0, end[:-1]))
+        total += float(np.maximum(end - np.maximum(start, previous), 0.0).sum())
+    return total
+
+
+def timeline(traces: Mapping[str, np.ndarray]) -> Figure:
     """Plot the busy slots of each device over time, by object; rows are runs and their devices."""
-    rows = [(gpus, device) for gpus, x in traces.items() for device in sorted({y[0] for y in x})]
+    rows = [(run, device) for run, x in traces.items() for device in np.unique(x[:, 0]).astype(int)]
     figure = Figure(figsize=(9.0, 1.0 + 1.3 * len(rows)), layout="constrained")
     axes = figure.subplots(len(rows), sharex=True, squeeze=False)[:, 0]
-    for ax, (gpus, device) in zip(axes, rows, strict=True):
-        segments = [x for x in traces[gpus] if x.device == device]
-        starts = [x.start for x in segments]
-        base = np.zeros(len(segments))
-        for i, name in enumerate(objects):
-            live = np.array([x.live[i] / 1000 if i < len(x.live) else 0.0 for x in segments])
-            widths = [x.end - x.start for x in segments]
-            ax.bar(starts, live, widths, base, align="edge", color=f"C{i}", label=name)
-            base += live
-        ax.set_ylabel(f"{gpus} GPU{'s' * (gpus > 1)}: {device}", rotation=0, ha="right")
+    for ax, (run, device) in zip(axes, rows, strict=True):
+        _, start, end, *live = traces[run][traces[run][:, 0] == device].T
+        base = np.zeros(start.size)
+        for name, trials in zip(_OBJECTS, live, strict=True):
+            ax.bar(start, trials / 1000, end - start, base, align="edge", label=name)
+            base = base + trials / 1000
+        ax.set_ylabel(f"{run}: {device}", rotation=0, ha="right")
         ax.set_xlim(left=0.0)
         ax.grid(alpha=0.3)
     axes[-1].set_xlabel("time since the start of the run [s]")

@@ -70,11 +70,7 @@ class Fused(Engine):
 
     def slots(self, backend: str) -> int:
         """Return the number of worlds that one worker steps at once."""
-        return 64 if backend == "cpu" else 16384
-
-    def workers(self, backend: str) -> int:
-        """Return 2 for a GPU, which steps the worlds of one while the host serves the other."""
-        return super().workers(backend) if backend == "cpu" else 2
+        return 64 if backend == "cpu" else 32768
 
     def suits_processors(self, trials: int | None) -> bool:
         """Whether there are few trials and a C compiler: a GPU takes some 5 s to start."""
