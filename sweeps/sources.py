@@ -25,7 +25,7 @@ ROOT = Path(__file__).resolve().parents[1]
 EQUAL = Path(__file__).with_name("publish") / "equal.json"
 COMMITS = EQUAL.with_name("commits.json")  # digests of files that are older than the digests
 _FOLDERS = ("rps_jax", "mjcf", "sweeps")
-_SUFFIXES = (".py", ".npz", ".nc", ".c", ".h", ".in", ".xml")  # in `sweeps` .py alone
+_SUFFIXES = (".py", ".npz", ".nc", ".c", ".h", ".in", ".js", ".xml")  # in `sweeps` .py alone
 _OF_TYPES = ("typing", "collections.abc", "jaxtyping", "types")  # modules that annotations name
 # Modules that store and show numbers: a change of them alters none.
 _NEUTRAL = (

@@ -6,6 +6,7 @@ import base64
 import json
 import math
 from collections.abc import Iterable, Mapping
+from pathlib import Path
 
 import numpy as np
 
@@ -16,16 +17,7 @@ from rps_jax.lowering.scalar_nodes import ScalarNodes
 from rps_jax.lowering.scalar_writer import ScalarWriter
 
 _LISTED = 12  # elements of an array that is printed as a list, at most
-HELPERS = """\
-const finite = (x) => (Array.isArray(x) ? x.every(finite) : Number.isFinite(Number(x)));
-const nan = (x) => (Array.isArray(x) ? x.some(nan) : Number.isNaN(Number(x)));
-const rint = (x) => (Math.abs(x % 1) === 0.5 ? 2 * Math.round(x / 2) : Math.round(x));
-const unpacked = (text, Kind, rows) => {
-  const all = new Kind(Uint8Array.from(atob(text), (c) => c.charCodeAt(0)).buffer);
-  const columns = all.length / rows;
-  return Array.from({ length: rows }, (_, i) => all.subarray(i * columns, (i + 1) * columns));
-};
-"""
+HELPERS = Path(__file__).with_name("helpers.js").read_text("utf-8")
 
 
 class JsWriter(ScalarWriter):
