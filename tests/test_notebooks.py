@@ -16,8 +16,6 @@ import nbformat
 import pytest
 from helpers import addresses, imported, output_of, rps
 
-import rps_jax
-from rps_jax.analysis import statistics
 from rps_jax.app import notebooks
 from sweeps import render_tables
 
@@ -74,7 +72,7 @@ def test_stored_notebooks_have_figures_and_no_errors_or_local_paths(name):
 
 
 # These run for a minute or more; other tests call the same functions.
-LONG = ("02", "05", "06", "07", "08", "09", "10", "11")
+LONG = ("02", "04", "05", "06", "07", "08", "09", "10", "11")
 EXECUTED = [pytest.param(n, marks=[pytest.mark.slow] if n[:2] in LONG else []) for n in TEXTS]
 
 
@@ -89,7 +87,7 @@ def test_it_runs_and_if_it_only_reads_prints_the_stored_output(
     (notebook,) = RUNNER["execute"]([TEXTS[name]], folder)
     expected = stored(name)
     assert [kind for _, kind, _ in outputs(notebook)] == [kind for _, kind, _ in outputs(expected)]
-    if name[:2] in ("03", "04"):
+    if name.startswith("03"):
         assert printed(notebook) == printed(expected)
 
 
@@ -175,13 +173,8 @@ def test_help_runs_nothing(script, capsys, monkeypatch, tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-def test_the_sentences_on_influence_are_computed():
-    """Text and figure count the same quantities."""
-    texts = [v for _, kind, v in outputs(stored("04_robustness")) if kind == "text/markdown"]
-    (sentence,) = [text for text in texts if text.startswith("Of ")]
-    drawn, count = map(int, re.findall(r"\d+", sentence)[:2])
-    influences = statistics.influences(rps_jax.load(FOLDER / "runs" / "compare" / "wide"))
-    assert (drawn, count) == (len(influences), sum(x.q < 0.05 for x in influences))
+def test_the_sentences_on_random_worlds_are_computed():
+    """Their text has no number of the results."""
     cells = stored("04_robustness").cells
     prose = "".join(cell.source for cell in cells[2:] if cell.cell_type == "markdown")
     constants = ("95 % intervals", "1 m", "0.05", "90 deg", "29 cm", "240,000 worlds", "02_one")
