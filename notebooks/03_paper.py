@@ -8,23 +8,21 @@
 # ---
 
 # %% [markdown]
-# # The paper's trials, from a run folder
+# # The paper's trials
 #
 # The paper simulates 432 trials: three objects, two sets of friction, 24 targets and three laws.
-# This notebook only reads results: those of `rps table` in `runs/table` (set `run` to read another
-# folder), and the published tables of `sweeps`.
+# `rps_jax.table()` runs them, in less than a minute on two cores; `rps table` does the same and
+# stores them. The tables at the end are those of this project's studies.
 
 # %%
 import drawing
-from IPython.display import Image, Markdown
+from IPython.display import Markdown
 
 import rps_jax
 from rps_jax.analysis import tables
 from rps_jax.analysis.figures import paper as figures
-from sweeps import render_tables
 
-run = "runs/table"
-results = rps_jax.load(run)
+results = rps_jax.table(progress=False)
 
 # %% [markdown]
 # ## Table II
@@ -89,45 +87,34 @@ distance.to_series().unstack("law").round(3)
 # ## Which reading gives the paper's numbers
 #
 # The text leaves many details open. `rps sweeps/ambiguities` changes one at a time and counts the
-# successes of RPS. Counts hardly tell the readings apart:
-
-# %%
-first, *rest = [row[4] for row in render_tables.load("readings")["rows"]]
-Markdown(f"{rest.count(first)} of {len(rest)} other readings give {first}, as the defaults do.")
-
-# %% [markdown]
+# successes of RPS. Counts hardly tell the readings apart: most of them give
+# as many as the defaults, <!-- cell: readings | the defaults | all -->140 of 144<!-- end -->.
+#
 # The paper prints more than counts. `rps sweeps/paper_reading` draws readings together with the
 # physics that the paper does not measure (friction, slip of the wheels, lag, gaps), runs all of its
 # experiments, and weights the draws by the likelihood of all printed numbers. The posterior
 # probability of each reading, by the parts of the paper that are used:
-
-# %%
-Markdown(render_tables.table(render_tables.load("reading_evidence")))
-
-# %% [markdown]
+#
+# <!-- table: reading_evidence -->
+# | omega from the saturated v_x | v_x and v_y clipped one by one | hardware | Table II and targets | Fig. 6 | all |
+# | --- | --- | --- | --- | --- | --- |
+# | no | no | 1 ± 0 % | 4 ± 1 % | 30 ± 5 % | 0 ± 0 % |
+# | no | yes | 1 ± 1 % | 18 ± 3 % | 24 ± 6 % | 1 ± 0 % |
+# | yes | no | 95 ± 1 % | 35 ± 4 % | 27 ± 3 % | 96 ± 2 % |
+# | yes | yes | 3 ± 1 % | 43 ± 4 % | 19 ± 3 % | 3 ± 2 % |
+#
+# <sub>Device: one NVIDIA H200 and 16 processors; date: 2026-11-26; [command, versions and values](../sweeps/paper_reading/results/reading_evidence.json).</sub>
+# <!-- end -->
+#
 # The numbers of the hardware decide: $\omega$ follows from the saturated $v_x$, and $(v_x, v_y)$ is
 # scaled as a vector. Table II and Fig. 6 alone leave it open. This reading is the default.
 #
-# The numbers under the posterior, and as predicted from all other numbers:
-
-# %%
-drawing.printed_numbers()
-
-# %% [markdown]
-# The box's D on the hardware can be reproduced, but the other numbers do not predict it: it needs a
-# base that loses a large share of its yaw rate, and nothing else in the paper tells of such a loss.
-
-# %%
-median = "posterior: median, 5 to 95 %"
-lost = render_tables.cell(f"reading_posterior | hardware | share of omega that is lost | {median}")
-columns = ("paper", "posterior", "predicted from the others")
-d = [render_tables.cell(f"reading_numbers | hardware, box: D | {column}") for column in columns]
-Markdown(
-    f"Lost share of the yaw rate: {lost} (median). D of the box: {d[0]} in the paper, {d[1]} m "
-    f"under the posterior, {d[2]} m as predicted from the other numbers."
-)
-
-# %% [markdown]
+# The page of `rps sweeps/paper_reading` has all numbers under the posterior, and as predicted from
+# all other numbers. The box's D on the hardware can be reproduced
+# (<!-- cell: reading_numbers | hardware, box: D | paper -->0.032 m<!-- end --> in the paper, <!-- cell: reading_numbers | hardware, box: D | posterior -->0.033<!-- end --> m under the posterior), but
+# the other numbers do not predict it (<!-- cell: reading_numbers | hardware, box: D | predicted from the others -->0.060<!-- end --> m): it needs a base that loses a
+# share of <!-- cell: reading_posterior | hardware | share of omega that is lost | posterior: median, 5 to 95 % -->0.42<!-- end --> (median) of its yaw rate, and nothing else in the paper tells of such a loss.
+#
 # Four numbers of the hardware meet several fitted settings: these are enough to reproduce the
 # numbers, and no proof that they are the cause. The radius of the first arc of the paper's Fig. 7
 # would decide between slip and its absence: at the bounds of speed and yaw rate it is 0.05/0.15 =
@@ -135,14 +122,21 @@ Markdown(
 #
 # One draw agrees with more of the paper's numbers than all others. This is Fig. 6 in it, beside
 # what the text tells:
-
-# %%
-Markdown(render_tables.table(render_tables.load("reading_figure_6")))
-
-# %%
-Image("../sweeps/paper_reading/figure_6.png", width=900)
-
-# %% [markdown]
+#
+# <!-- table: reading_figure_6 -->
+# | the paper's text | in the closest draw | posterior probability |
+# | --- | --- | --- |
+# | the sensor initially detected only the right corner, 0.2 m from the center | yes | 72 ± 7 % |
+# | a_r started from nearly at its highest value | yes | 98 ± 0 % |
+# | a line contact occurred with the side edge of the box | yes | 98 ± 1 % |
+# | the Realignment State ... remained active until ... the center of the robot | yes | 55 ± 6 % |
+# | the robot successfully pushed the object to the target | yes | 100 ± 0 % |
+#
+# <sub>Device: one NVIDIA H200 and 16 processors; date: 2026-11-26; [command, versions and values](../sweeps/paper_reading/results/reading_figure_6.json).</sub>
+# <!-- end -->
+#
+# ![Fig. 6 in this draw](../sweeps/paper_reading/figure_6.png)
+#
 # ## What the paper leaves open, and what we chose
 #
 # Each choice is a parameter, so one option selects another interpretation.

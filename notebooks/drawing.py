@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
@@ -158,41 +157,6 @@ def time_to_success(results: xr.Dataset, law: str) -> Figure:
     axes[0].legend(fontsize=8)
     assert image is not None
     figure.colorbar(image, ax=axes).set_label("angle of the target from straight ahead [deg]")
-    return figure
-
-
-def printed_numbers() -> Figure:
-    """Plot numbers that the paper prints beside their predictions: medians, 5 to 95 %."""
-    from sweeps import render_tables  # of the repository
-
-    data = render_tables.load("reading_numbers")
-    names = [column["name"] for column in data["columns"]]
-    rows = [dict(zip(names, row, strict=True)) for row in data["rows"]]
-    panels = {"D [m]": ": D", "time [s]": ": time", "successes of 24": "Table II, "}
-    styles = {"prior": "0.75", "posterior": "C0", "predicted from the others": "C1"}
-    figure = Figure(figsize=(11, 5), layout="constrained")
-    grid = figure.add_gridspec(2, 2, width_ratios=(1, 1.4))
-    spaces = grid[0, 0], grid[1, 0], grid[:, 1]
-    for space, (title, part) in zip(spaces, panels.items(), strict=True):
-        ax = figure.add_subplot(space)
-        chosen = [row for row in rows if part in row["number"]]
-        for y, row in enumerate(chosen):
-            for shift, (column, colour) in enumerate(styles.items()):
-                middle, low, high = map(float, re.findall(r"[\d.]+", row[column]))
-                at = y + 0.25 * (shift - 1)
-                ax.plot([low, high], [at, at], color=colour, lw=3, label=None if y else column)
-                ax.plot(middle, at, "k|", ms=6)
-            for column, marker in (("the closest draw", "rd"), ("paper", "k*")):
-                value = float(row[column].split()[0])
-                ax.plot(
-                    value, y, marker, ms=5 if marker == "rd" else 9, label=None if y else column
-                )
-        labels = [row["number"].replace("Table II, ", "").split(": ")[0] for row in chosen]
-        ax.set_yticks(range(len(chosen)), labels, fontsize=8)
-        ax.set(xlabel=title, ylim=(len(chosen) - 0.5, -0.5))
-        ax.grid(alpha=0.3)
-    handles, labels = ax.get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=5, fontsize=8)
     return figure
 
 

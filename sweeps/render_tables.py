@@ -38,6 +38,7 @@ SWEEPS = ROOT / "sweeps"
 KEYS = ("command", "device", "versions", "commit", "date", "columns", "rows")
 _BLOCK = re.compile(r"(<!-- (table|command): (\S+) -->\n).*?(<!-- end -->)", re.DOTALL)
 _CELL = re.compile(r"(<!-- cell: ([^>]*?) -->).*?(<!-- end -->)", re.DOTALL)
+_TEXT_CELL = re.compile(r"^(# %% \[markdown\]\n)((?:#.*\n)*)", re.MULTILINE)  # of notebooks' texts
 # The change since each stale data file: what follows "Computed by 0.3.0 before".
 _GROUND = "objects slid on today's ground"
 _LOADS = "random objects had loads of finite size and slid on today's ground"
@@ -201,7 +202,28 @@ def commands(data: dict[str, Any]) -> str:
 
 
 def render(page: Path, root: Path = SWEEPS) -> str:
-    """Return the text of a page with all blocks rendered from the data."""
+    """Return the text of a page or notebook with all blocks and cells rendered from the data."""
+    text = page.read_text(encoding="utf-8")
+    if page.suffix == ".ipynb":
+        notebook = json.loads(text)
+        for cell in notebook["cells"]:
+            if cell["cell_type"] == "markdown":
+                source = _rendered("".join(cell["source"]), page, root)
+                cell["source"] = source.splitlines(keepends=True)
+        return json.dumps(notebook, indent=1, ensure_ascii=False, sort_keys=True) + "\n"
+    if page.suffix == ".py":
+
+        def commented(match: re.Match[str]) -> str:
+            source = re.sub(r"^# ?", "", match[2], flags=re.MULTILINE)
+            lines = _rendered(source, page, root).splitlines()
+            return match[1] + "".join(f"# {line}".rstrip() + "\n" for line in lines)
+
+        return _TEXT_CELL.sub(commented, text)
+    return _rendered(text, page, root)
+
+
+def _rendered(text: str, page: Path, root: Path) -> str:
+    """Return a text of a page with all blocks and cells rendered."""
 
     def block(match: re.Match[str]) -> str:
         start, kind, name, end = match.groups()
@@ -215,7 +237,7 @@ def render(page: Path, root: Path = SWEEPS) -> str:
         start, words, end = match.groups()
         return start + cell(words, root) + end
 
-    return _CELL.sub(cited, _BLOCK.sub(block, page.read_text(encoding="utf-8")))
+    return _CELL.sub(cited, _BLOCK.sub(block, text))
 
 
 def pages(root: Path = ROOT) -> list[Path]:

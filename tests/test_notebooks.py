@@ -42,12 +42,6 @@ def outputs(notebook):
                 yield output.output_type, kind, re.sub(r"base64,[\w+/=\s]+", "", value)
 
 
-def printed(notebook):
-    """Return the tables and lines that a notebook prints."""
-    shown = ("text/markdown", "text/plain")
-    return [value for _, kind, value in outputs(notebook) if kind in shown]
-
-
 @all_notebooks
 def test_notebooks_import_only_public_names(name):
     assert "rps_jax" in imported(TEXTS[name])
@@ -72,14 +66,12 @@ def test_stored_notebooks_have_figures_and_no_errors_or_local_paths(name):
 
 
 # These run for a minute or more; other tests call the same functions.
-LONG = ("02", "04", "05", "06", "07", "08", "09", "10", "11")
+LONG = ("02", "03", "04", "05", "06", "07", "08", "09", "10", "11")
 EXECUTED = [pytest.param(n, marks=[pytest.mark.slow] if n[:2] in LONG else []) for n in TEXTS]
 
 
 @pytest.mark.parametrize("name", EXECUTED)
-def test_it_runs_and_if_it_only_reads_prints_the_stored_output(
-    name, pytestconfig, monkeypatch, tmp_path
-):
+def test_it_runs(name, pytestconfig, monkeypatch, tmp_path):
     """It runs with the compiled programs of other tests, and a tutorial in `tmp_path`."""
     monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", str(pytestconfig.rootpath / ".jax_cache"))
     monkeypatch.setenv("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.5")
@@ -87,8 +79,6 @@ def test_it_runs_and_if_it_only_reads_prints_the_stored_output(
     (notebook,) = RUNNER["execute"]([TEXTS[name]], folder)
     expected = stored(name)
     assert [kind for _, kind, _ in outputs(notebook)] == [kind for _, kind, _ in outputs(expected)]
-    if name.startswith("03"):
-        assert printed(notebook) == printed(expected)
 
 
 @pytest.mark.parametrize("name", notebooks.NAMES)
@@ -128,7 +118,8 @@ def test_a_wheel_has_the_texts_of_the_notebooks():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["01_the_law", "08_analysis"])
+@pytest.mark.timeout(1200)
+@pytest.mark.parametrize("name", ["01_the_law", "03_paper", "04_robustness"])
 def test_a_notebook_runs_from_an_installed_package(name, tmp_path):
     """The package is a copy without the repository, in the layout of a wheel."""
     package = tmp_path / "site" / "rps_jax"
@@ -196,7 +187,7 @@ def test_notebooks_show_the_cells_of_tables_that_they_cite():
                 expected = eval(compile(ast.Expression(last.value), name, "eval"), names)
                 assert output.data["text/markdown"] == expected
                 cited.append(name)
-    assert cited == ["03_paper"] * 4 + ["05_tuning"]
+    assert cited == ["05_tuning"]
 
 
 def test_training_by_stable_baselines3_as_the_tutorial_shows_it(tmp_path):

@@ -14,8 +14,8 @@ from rps_jax.trials.progress import ProgressCallback
 from rps_jax.world import objects
 
 NAMES = (  # of those that need the package alone; all others read results of the repository
-    *("01_the_law", "02_one_push", "04_robustness", "06_fitting", "07_custom_law", "08_analysis"),
-    *("09_gymnasium", "10_gradients", "11_rooms"),
+    *("01_the_law", "02_one_push", "03_paper", "04_robustness", "06_fitting", "07_custom_law"),
+    *("08_analysis", "09_gymnasium", "10_gradients", "11_rooms"),
 )
 _METADATA = {"kernelspec": {"name": "python3", "display_name": "Python 3", "language": "python"}}
 
@@ -54,7 +54,9 @@ def notebook(text: str) -> str:
         mark, _, source = block.partition("\n")
         if "markdown" in mark:
             source = re.sub(r"^# ?", "", source, flags=re.MULTILINE)
-            source = re.sub(r"\[([^]]*)\]\(\.\./[^)]*\)", r"\1", source)  # pages of the repository
+            source = re.sub(
+                r"!?\[([^]]*)\]\(\.\./[^)]*\)", r"\1", source
+            )  # pages of the repository
             cell = {"cell_type": "markdown"}
         else:
             cell = {"cell_type": "code", "execution_count": None, "outputs": []}
