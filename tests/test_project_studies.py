@@ -148,6 +148,8 @@ def test_a_data_file_has_its_commands_without_local_paths_and_their_digest(tmp_p
     assert data["digest"] == digest([shlex.split(line) for line in (tuned, ladder)])
     changed = tuned.replace("16", "17"), ladder
     assert data["digest"] != digest([shlex.split(line) for line in changed])
+    assert set(data["code"]) >= {"control", "engines", "mjcf", "studies", "trials", "tuning"}
+    assert not set(data["code"]) & {"app", "record"}
     assert "digest" not in stored(tmp_path, "python mine.py")
     for path in SWEEPS.rglob("results/*.json"):
         assert "--out /" not in path.read_text(), path
