@@ -293,6 +293,9 @@ class _TrialQueue:
         self.example: WorldBatch = next(self._batches)  # for its stage and its shapes
         self._waiting: WorldBatch | None = self.example  # rest of the current batch
         self.size = sum(leaf[0].size for leaf in jax.tree.leaves(self.example.worlds))  # of a world
+        inputs = rows(self.example.inputs, slice(1))
+        start = partial(trial.start_all, law=self.example.law)
+        self.shapes = inputs, jax.eval_shape(start, *inputs, np.ones(1, bool))  # of one trial
         self._lock = threading.Lock()
 
     def take(self, count: int) -> list[WorldBatch]:
@@ -355,11 +358,9 @@ class _Program:
 
     def shapes(self, index: int) -> tuple[Inputs, Trial]:
         """Return the shapes of the inputs and trials (slots, ...) of a queue."""
-        single = rows(self.queues[index].example.inputs, slice(1))
-        started = jax.eval_shape(partial(trial.start_all, law=self.law), *single, np.ones(1, bool))
         slots = self.slots[index]
         shape = lambda x: jax.ShapeDtypeStruct((slots, *x.shape[1:]), x.dtype)  # noqa: E731
-        return jax.tree.map(shape, (single, started))
+        return jax.tree.map(shape, self.queues[index].shapes)
 
 
 class _State(NamedTuple):
