@@ -268,6 +268,12 @@ RECIPES: dict[str, Recipe] = {
     "round_base": recipe(
         "rps sweeps/round_base --worlds 3000", cores=60, gpu=1, section="Flat against round"
     ),
+    "round_base_fine": recipe(
+        "rps sweeps/round_base --worlds 400 --laws rps rps_tuned --fidelity reference",
+        cores=10,
+        gpu=2,
+        section="Flat against round",
+    ),
     "corridors_*": recipe(
         "rps sweeps/corridors --laws rps rps_tuned rps_plus learned_gru force_push dipole aps "
         f"rps_tuned,sweeps/corridors/tuned.json {_MACHINE}",
