@@ -8,7 +8,7 @@ A new row is one entry of `ROWS`.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import ClassVar, NamedTuple
 
@@ -21,7 +21,7 @@ from rps_jax.runs.plan import Plan
 from rps_jax.runs.question import Run, call_of
 from rps_jax.trials.setting import Setting
 from rps_jax.world.domain import parse_domain
-from rps_jax.world.physics import PHYSICS, preset
+from rps_jax.world.physics import PHYSICS, Fidelity, preset
 from sweeps.study_base import Study, Table, run_plans
 
 
@@ -32,21 +32,22 @@ class Row(NamedTuple):
     domain: str = "wide"
     law: str = "rps_tuned"
     robot: str | None = None
+    fidelity: Fidelity = "standard"  # of the fused engine
 
 
+_TOUCHED = "corridor,touch=object,width=1.2:1.6"
 ROWS = {
     "path": Row("path"),
     "corridor": Row("corridor"),
     "slope": Row("reach", "wide,slope=0:0.105"),
     "slope, limited base": Row("reach", "real,slope=0:0.105"),
     "boundary": Row("reach", "wide,boundary_factor=0.3:3,boundary=0.5"),
-    "walls that objects touch": Row("corridor,touch=object,width=1.2:1.6"),
+    "walls that objects touch": Row(_TOUCHED),
+    "walls that objects touch, fine steps": Row(_TOUCHED, fidelity="reference"),
     "round base": Row("corridor", robot="round"),
+    "round base, fine steps": Row("corridor", robot="round", fidelity="reference"),
 }
-SETTINGS = {
-    "reference": Setting("mujoco", physics=preset(fidelity="reference")),
-    "fused": Setting("fused", physics=preset()),
-}
+ENGINES = {"reference": "mujoco", "fused": "fused"}
 
 
 @dataclass(frozen=True)
@@ -74,12 +75,13 @@ class Parity(Study[xr.DataTree]):
     def plans(self) -> dict[str, Plan]:
         """Plans by row and engine."""
         return {f"{row} {engine}": self._plan(ROWS[row], engine)
-                for row in self.rows for engine in SETTINGS}  # fmt: skip
+                for row in self.rows for engine in ENGINES}  # fmt: skip
 
     def _plan(self, row: Row, engine: str) -> Plan:
         """Return the plan of a row in an engine."""
         label, params = registry.resolve_law(row.law)
-        setting = replace(SETTINGS[engine], seed=self.seed)
+        fidelity = row.fidelity if engine == "fused" else "reference"
+        setting = Setting(ENGINES[engine], physics=preset(fidelity=fidelity), seed=self.seed)
         domain = parse_domain(row.domain, row.robot, row.task)
         return Plan(domain, self.worlds, {label: params}, setting, self.part)
 
@@ -106,7 +108,7 @@ class Parity(Study[xr.DataTree]):
         heads = ("", "task", "worlds", "law", "success in C MuJoCo", "fused", "equal outcomes")
         rows = [[*heads, "+/-"]]
         for name in self.rows:
-            reference, fused = (results[f"{name} {x}"].success > 0 for x in SETTINGS)
+            reference, fused = (results[f"{name} {x}"].success > 0 for x in ENGINES)
             rates = [tables.share(int(x.sum()), x.size) for x in (reference, fused)]
             equal = tables.share(int((reference == fused).sum()), fused.size)
             compared = statistics.compare(reference, fused)
