@@ -17,6 +17,7 @@ from rps_jax.engines.base import ControlPeriod
 from rps_jax.engines.mjx_colliders import mjx
 from rps_jax.engines.quasistatic import Quasistatic
 from rps_jax.errors import InputError
+from rps_jax.record import provenance
 from rps_jax.runs.question import Run
 from rps_jax.trials import pushes, trial
 from rps_jax.trials.case import Case
@@ -147,6 +148,7 @@ def test_contacts_of_a_box_as_a_prism_equal_those_of_mjx():
 
 
 def test_whole_commands_are_timed_twice_per_gpu_count(monkeypatch):
+    provenance.git_commit()  # starts a process once
     launches = []
 
     class Process:

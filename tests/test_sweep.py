@@ -158,7 +158,7 @@ def test_a_faster_base_arrives_earlier():
 
 
 def runs_on_devices(folder):
-    """Sweep on 4, 2 and 1 devices; return the programs that were not in the cache, and segments.
+    """Sweep on 4, 2, 1 and 3 devices; return the programs that were not in the cache, and segments.
 
     The first device waits until the others have run all trials but those in its slots. In the last
     run the others fail.
@@ -176,7 +176,9 @@ def runs_on_devices(folder):
         return plain(self)
 
     batch._Slots.arguments = arguments
-    for count in (4, 2, 1):
+    for count in (4, 2, 1, "as on GPUs"):
+        if count == "as on GPUs":  # which run a segment while the host reads another
+            batch._tail_slots, count = lambda: SLOTS, 3
         batch._devices = lambda count=count: devices[:count]
         noted = segments.setdefault(count, [])
 

@@ -168,7 +168,7 @@ class Engine(abc.ABC):
         return 64 if backend == "cpu" else 65536
 
     def workers(self, backend: str) -> int:
-        """Return the number of host threads, each of which drives one batch.
+        """Return the number of host threads for each device, each of which drives one batch.
 
         There is one for each processor, since XLA steps a small batch on one processor.
         """
