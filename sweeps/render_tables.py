@@ -63,6 +63,15 @@ STALE: dict[str, str] = {
         ),
         "later changes of the code, which small runs do not time",
     ),
+    **dict.fromkeys(
+        (
+            *("corridors_failures", "corridors_lookaheads", "corridors_objects", "corridors_open"),
+            *("corridors_paths", "corridors_widths", "floors_boundaries", "floors_slopes"),
+            "floors_steps",
+            *("bearings", "force_push_paths", "grid", "ladder", "plus", "regression"),
+        ),
+        "`learned` replaced `learned_gru`",
+    ),
     "ground": _GROUND,
     "fidelity": _SATURATED + _GROUND,
 }

@@ -32,7 +32,7 @@ RUNS = {
     "push_fused": "push --object cylinder --target 0.8 0.3 --engine fused --no-video",
     "push_quasistatic": "push --object box --target 0.6 0 --engine quasistatic --no-video",
     "hardware": "hardware --quick --engine fused --horizon 20 --shifts 0.1",
-    "sweep_fused": "sweep --worlds 24 --laws rps aps learned_gru --domain hostile --horizon 60",
+    "sweep_fused": "sweep --worlds 24 --laws rps aps learned --domain hostile --horizon 60",
     "sweep_mujoco": f"sweep --worlds 12 --laws rps rps_tuned --engine mujoco {SHORT}",
     "sweep_quasistatic": f"sweep --worlds 32 --laws rps --engine quasistatic --domain {BOX}",
     "sweep_mjx": f"sweep --worlds 8 --laws rps --engine mjx --domain {BOX} --horizon 1",

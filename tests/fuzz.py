@@ -557,7 +557,9 @@ def furnish_runs(folder: Path, learned: bool) -> dict[str, list[tuple[str, ...]]
     at = points.worlds_at(drums, points.points_of(drums, range(12)))
     small_run(folder / "points", worlds=None, points=at)
     (folder / "policy").mkdir()
-    shutil.copy(Path(policy.__file__).parent / "learned_mlp.npz", folder / "policy" / "policy.npz")
+    shutil.copy(
+        Path(policy.__file__).parent / "learned_small.npz", folder / "policy" / "policy.npz"
+    )
     runs = {name: (*words, "--out", name) for name, words in COMMANDS.items()}
     for command in [runs[name] for name in runs if learned or name != "learn"]:
         if (result := attempt(command, 300)).how != "told":

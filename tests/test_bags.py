@@ -35,7 +35,7 @@ def recorded(tmp_path_factory):
     return path, trace
 
 
-LAWS = ("rps_plus", "learned_gru", "aps", "force_push_published")
+LAWS = ("rps_plus", "learned", "aps", "force_push_published")
 
 
 @pytest.mark.parametrize("law", LAWS)
@@ -284,6 +284,6 @@ def test_oversized_content_is_refused_before_decompression(tmp_path, monkeypatch
 
 def test_a_missing_column_is_named(tmp_path):
     path = bag.write(tmp_path / "a.mcap", steps(), {})
-    for law, column in (("learned_mlp", "signal"), ("aps", "p_world_object")):
+    for law, column in (("learned_small", "signal"), ("aps", "p_world_object")):
         with pytest.raises(rps_jax.InputError, match=f"has no {column}, which the law senses"):
             Shadow(path, law)()

@@ -31,7 +31,7 @@ CUSTOM = f"{EXAMPLE}:PParams"
 STRICT = ["-std=c99", "-Wall", "-Wextra", "-Werror", "-pedantic"]
 LAWS = [
     *("rps", "nps", "rps_plus", "aps", "pursuit", "dipole", "force_push", "force_push_published"),
-    *("learned_mlp", "learned_gru"),
+    *("learned_small", "learned"),
 ]
 
 
@@ -44,7 +44,7 @@ def compiled(compiler, source, *options):
 # --- C -------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", [name for name in LAWS if name not in ("nps", "learned_gru")])
+@pytest.mark.parametrize("name", [name for name in LAWS if name not in ("nps", "learned")])
 def test_a_law_in_c_agrees_with_jax(name, tmp_path):
     result = agreement(name, "double", 10_000, tmp_path)
     assert (result.inputs, result.unexplained) == (10_000, 0)
@@ -72,7 +72,7 @@ def test_a_fault_in_c_is_detected(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("compiler", COMPILERS)
-@pytest.mark.parametrize("name", ["rps_plus", "learned_mlp", CUSTOM])
+@pytest.mark.parametrize("name", ["rps_plus", "learned_small", CUSTOM])
 def test_the_folder_compiles_without_a_warning_and_runs(name, compiler, tmp_path, registries):
     exported = program.program(name, "kairos")
     texts = folder.files(exported, "law")
@@ -87,7 +87,7 @@ def test_the_folder_compiles_without_a_warning_and_runs(name, compiler, tmp_path
     assert not re.search(r"\b(malloc|calloc|realloc|alloca)\b", texts["law.h"])
 
 
-@pytest.mark.parametrize("name", ["rps_plus", "learned_mlp", "force_push_published", CUSTOM])
+@pytest.mark.parametrize("name", ["rps_plus", "learned_small", "force_push_published", CUSTOM])
 def test_non_finite_inputs_give_a_zero_twist(name, tmp_path, registries):
     exported = program.program(name)
     for compiler in COMPILERS:
@@ -133,7 +133,7 @@ def test_the_skin_in_c_agrees_with_jax(tmp_path):
     assert kinds == {0, 1, 2}
 
 
-@pytest.mark.parametrize("name", ["rps_plus", pytest.param("learned_gru", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("name", ["rps_plus", pytest.param("learned", marks=pytest.mark.slow)])
 def test_a_whole_trial_step_by_step(name, tmp_path):
     """The C law keeps its memory; observations are those of the trial in JAX."""
     case = Case("box", "S1", (-1.0, 0.5), law=name)
@@ -199,7 +199,7 @@ console.log(JSON.stringify({ twists, odd, felt: felt.contact }));
 
 
 @pytest.mark.skipif(shutil.which("node") is None, reason="Node.js is not there")
-@pytest.mark.parametrize("name", ["rps_plus", "learned_mlp", CUSTOM])
+@pytest.mark.parametrize("name", ["rps_plus", "learned_small", CUSTOM])
 def test_javascript_agrees_with_c(name, tmp_path, registries):
     exported = program.program(name)
     native = Native(exported, tmp_path, "double")
@@ -222,7 +222,7 @@ def test_javascript_agrees_with_c(name, tmp_path, registries):
     np.testing.assert_allclose(result["felt"]["p_robot_contact"], [0.3625, 0], atol=1e-9)
 
 
-@pytest.mark.parametrize("name", ["rps_plus", "learned_mlp", "aps", "force_push_published"])
+@pytest.mark.parametrize("name", ["rps_plus", "learned_small", "aps", "force_push_published"])
 def test_onnx_agrees_with_c(name, tmp_path):
     onnx, runtime = pytest.importorskip("onnx"), pytest.importorskip("onnxruntime")
     count, exported = 200, program.program(name)

@@ -122,13 +122,13 @@ def test_every_law_of_the_package_is_identified_by_functions_and_weights():
     laws = {name: registry.law_of(params) for name, params in registry.LAWS.items()}
     identities = {name: programs.identity(law) for name, law in laws.items()}
     assert None not in identities.values()
-    assert identities["learned_gru"] != identities["learned_mlp"]
+    assert identities["learned"] != identities["learned_small"]
     assert identities["rps"] == identities["rps_tuned"] != identities["rps_plus"]
-    gru = laws["learned_gru"]
+    gru = laws["learned"]
     network, weights = gru.step.args
     changed_weights = weights | {"first.b": weights["first.b"] + 1}
     changed = replace(gru, step=partial(gru.step.func, network, changed_weights))
-    assert programs.identity(changed) != identities["learned_gru"]
+    assert programs.identity(changed) != identities["learned"]
     assert programs.identity(replace(gru, init=lambda params: None)) is None
 
 

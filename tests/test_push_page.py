@@ -178,7 +178,7 @@ def test_a_corridor_that_is_too_narrow_is_refused(paused):
     assert paused.execute_script(script, 1.6) == ["", True]
 
 
-@pytest.mark.parametrize("law", ["rps", pytest.param("learned_gru", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("law", ["rps", pytest.param("learned", marks=pytest.mark.slow)])
 def test_each_state_of_a_push_gives_the_twist_of_python(law, browser):
     """At the bound of tan(gamma), the paper's law amplifies a difference fourfold per step.
 

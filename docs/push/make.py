@@ -50,7 +50,7 @@ LAWS = {
     "rps": "RPS, the paper's",
     "rps_tuned": "RPS, tuned by evolution",
     "rps_plus": "RPS+",
-    "learned_gru": "a network that learned from touch",
+    "learned": "a network that learned from touch",
 }
 NUM_CORNERS = {"cylinder": 1, "prism": 6}  # by family; a box repeats two corners
 # Tasks of the page, with their names in words.

@@ -1,9 +1,10 @@
 """Regression worlds: 200 hard worlds in which new laws are compared with earlier ones.
 
 `regression.nc` holds points of the unit cube of the domain `wide`, and the outcomes of the paper's
-law, the tuned one, RPS+ and the learned GRU at these points. Each world was picked because one of
-these laws fails there, or nearly fails; drawing and `rps attack` supplied the candidates. A success
-rate in these worlds therefore says nothing about other worlds: only differences between laws count.
+law, the tuned one, RPS+ and the learned law of 0.3 at these points. Each world was picked because
+one of these laws fails there, or nearly fails; drawing and `rps attack` supplied the candidates. A
+success rate in these worlds therefore says nothing about other worlds: only differences between
+laws count.
 """
 
 import functools

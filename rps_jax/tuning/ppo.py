@@ -69,7 +69,7 @@ class PPO:
     enough: float = option(0.7, 0, 1)
     """Success rate at which the level rises."""
     initial: str | None = None
-    """Initial law: learned_gru, learned_mlp or the file of a policy. By default random weights."""
+    """Initial law: learned, learned_small or the file of a policy. By default random weights."""
     value_updates: int = option(30, 0, 10**6)
     """Number of first updates that change the value function alone; only with an initial law."""
     spread: float = option(0.6, 0.09, 1.6)

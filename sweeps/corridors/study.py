@@ -75,7 +75,7 @@ class Corridors(Study[xr.DataTree], MultiLawQuestion[xr.DataTree]):
     }
 
     laws: LawsLike = (
-        *("rps", "rps_tuned", "rps_plus", "learned_gru"),
+        *("rps", "rps_tuned", "rps_plus", "learned"),
         *("force_push", "dipole", "aps"),
     )
     domain: DomainLike = "wide"

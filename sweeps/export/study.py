@@ -62,7 +62,7 @@ class Export(QuickStudy[xr.DataTree]):
         **{"inputs": 20_000, "states": 20_000, "worlds": 4, "bags": 1},
     }
 
-    laws: tuple[str, ...] = ("rps", "rps_tuned", "rps_plus", "learned_mlp", "learned_gru")
+    laws: tuple[str, ...] = ("rps", "rps_tuned", "rps_plus", "learned_small", "learned")
     """Laws to compare."""
     tables: tuple[TableName, ...] = _TABLES
     """Tables to compute: random inputs, whole trials, the paper's trials and random worlds with C

@@ -48,7 +48,7 @@ class Floors(QuickStudy[xr.DataTree], MultiLawQuestion[xr.DataTree]):
     QUICK: ClassVar[Mapping[str, object]] = {"laws": ("rps", "rps_tuned"), "worlds": 12}
     PRESETS: ClassVar = {"slopes": list(SLOPES), "factors": list(FACTORS)}
 
-    laws: LawsLike = ("rps", "rps_tuned", "rps_plus", "learned_gru")
+    laws: LawsLike = ("rps", "rps_tuned", "rps_plus", "learned")
     domain: DomainLike = "wide"
     """Ranges from which worlds are drawn: paper, hardware, wide, real, prisms or hostile, or a JSON
     file of ranges; changes follow, as wide,mass=3:10."""

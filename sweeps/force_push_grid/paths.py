@@ -70,7 +70,7 @@ class Paths(QuickStudy[xr.DataTree], MultiLawQuestion[xr.DataTree]):
 
     laws: LawsLike = (
         *("force_push", "force_push_published", "rps", "rps_tuned", "rps_plus"),
-        "learned_gru",
+        "learned",
     )
     worlds: int = option(243, 2, 10_000_000)
     """Number of pushes of each law, slider and path."""

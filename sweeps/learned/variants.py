@@ -21,20 +21,22 @@ import numpy as np
 import xarray as xr
 
 from rps_jax.analysis import statistics
-from rps_jax.app.cli import flags, names
+from rps_jax.app.cli import flags
 from rps_jax.record import files, provenance
 from rps_jax.record.options import option
 from rps_jax.runs.evaluate import evaluate
 from rps_jax.runs.question import Run, call_of
 from rps_jax.trials.setting import Setting
+from rps_jax.tuning.learn import Learn
 from sweeps.study_base import QuickStudy, Table, write_table
 
+# `learned_gru.npz` is the law of 0.3, with which most variants start.
 DOMAINS = ("wide", "hostile", "real")
 SHARED = (
     "rps learn --domain wide hostile real --num-envs 1024 --drawn 8192 --validation 128 --every 1.5"
     " --horizon 300 --max-lost 150 --hard 0.5 --success 2 --failure 1 --anneal 0.4 --average 100"
 )
-_WARM = "--initial learned_gru --spread 0.25 --learning-rate 2e-4"
+_WARM = "--initial sweeps/learned/learned_gru.npz --spread 0.25 --learning-rate 2e-4"
 _LIMITS = "robot_force=150:800,robot_traction=0.3:0.8,robot_lag=0:0.5,robot_acceleration=0.1:1"
 VARIANTS = {  # options after the shared ones
     "scratch": "",
@@ -52,7 +54,7 @@ VARIANTS = {  # options after the shared ones
     "small steps": f"{_WARM} --target-kl 0.004",
     "width 128": "--width 128",
     "hold 0.1 s": "--hold 0.1",
-    "mlp": "--network mlp --initial learned_mlp --spread 0.25 --learning-rate 2e-4",
+    "mlp": "--network mlp --initial learned_small --spread 0.25 --learning-rate 2e-4",
     "mlp, width 32": "--network mlp --width 32",
 }
 _QUICK_DOMAIN = "wide,objects=random_cylinder"  # also for judging
@@ -101,8 +103,14 @@ class Variants(QuickStudy[xr.Dataset]):
         return f"{SHARED} {VARIANTS[name]}{QUICK if self.quick else ''}".replace("  ", " ").strip()
 
     def configuration(self) -> dict[str, Any]:
-        """Return everything that the parts depend on, with the commands."""
-        return super().configuration() | {"commands": list(map(self.command, self.variants))}
+        """Return everything that the parts depend on, with all options of learning."""
+        questions = [self._question(name).configuration() for name in self.variants]
+        return super().configuration() | {"learn": questions}
+
+    def _question(self, name: str, *options: str) -> Learn:
+        """Return the run of a variant, with further options."""
+        words = [*shlex.split(self.command(name))[2:], *options]
+        return flags.parse(Learn, "learn", words)[0]
 
     def parts(self, run: Run) -> Mapping[str, Callable[[], xr.Dataset]]:
         """Return the run of each variant, by its name."""
@@ -119,11 +127,8 @@ class Variants(QuickStudy[xr.Dataset]):
     def _learn(self, name: str, folder: Path) -> xr.Dataset:
         """Learn a law, and judge it in each domain."""
         minutes = 0 if self.quick else self.minutes
-        words = [*shlex.split(self.command(name))[2:], "--minutes", str(minutes)]
-        question, _ = flags.parse(
-            names.question_type("learn"), "learn", [*words, "--out", str(folder)]
-        )
-        curve: xr.Dataset = question()
+        question = self._question(name, "--minutes", str(minutes), "--out", str(folder))
+        curve = question()
         last, successes, times = curve.isel(update=-1), list[int](), list[float]()
         for domain in DOMAINS:
             ranges = _QUICK_DOMAIN if self.quick else domain
@@ -174,6 +179,13 @@ def _folder(name: str) -> str:
     return "".join(x if x.isalnum() else "_" for x in name)
 
 
+def _changes(name: str) -> str:
+    """Return the changed options of a variant; most have those of `warm`, too."""
+    first = "those of `warm`, and " if name != "warm" and _WARM in VARIANTS[name] else ""
+    options = VARIANTS[name].removeprefix(_WARM if first else "").strip()
+    return f"{first}`{options}`" if options else ""
+
+
 def _row(result: xr.Dataset) -> list[Any]:
     """Return the row of a variant."""
     name, tried = str(result.variant.item()), int(result.tried)
@@ -182,7 +194,7 @@ def _row(result: xr.Dataset) -> list[Any]:
         rates.append([100 * x for x in (count / tried, *statistics.wilson(count, tried))])
     return [
         name,
-        f"`{VARIANTS[name]}`" if VARIANTS[name] else "",
+        _changes(name),
         int(result.updates),
         float(result.simulated) / 3600,
         float(result.compile),

@@ -57,10 +57,10 @@ _IDEAL = (
 _PLUS = {
     "`wide`, 10,000": _LADDERS[0],
     "`wide` in C MuJoCo, 500": "rps ladder --domain wide --worlds 500 --seed 11 --engine mujoco "
-    "--laws rps_plus rps_tuned learned_gru",
+    "--laws rps_plus rps_tuned learned",
     "`hostile`, 10,000": _LADDERS[1],
     "`hostile` in C MuJoCo, 500": "rps ladder --domain hostile --worlds 500 --seed 11 "
-    "--engine mujoco --laws rps_plus rps_tuned learned_gru",
+    "--engine mujoco --laws rps_plus rps_tuned learned",
     "`hostile`, quasi-static, 1,000": "rps ladder --domain hostile --worlds 1000 --seed 8 "
     "--engine quasistatic --laws rps_plus rps_tuned",
     "`real`, 10,000": "rps ladder --domain real --worlds 10000 --seed 10 "
@@ -76,6 +76,10 @@ _HARDWARE = {
 }
 _ROBOTS = ("ideal", "kairos", "ridgeback", "mpo_500")
 _REAL = "rps sweep --domain real --worlds 4096 --seed 11 --laws rps rps_tuned"
+_VARIANTS = tuple(
+    f"rps sweeps/learned/variants.py --variants '{name}' --minutes 4.5 --out runs/variant_{i}"
+    for i, name in enumerate(("warm", "hard domains", "long credit", "4,096 worlds"))
+)
 _RIVALS = ("rps", "pursuit", "dipole", "force_push", "force_push_published")
 _SWEPT = "sweep --laws rps_tuned --domain wide"
 
@@ -98,7 +102,7 @@ RECIPES: dict[str, Recipe] = {
     "table": recipe("rps table", cores=1, section="Table II*"),
     "table_mjx": recipe("rps table --engine mjx", cores=4, section="Table II*"),
     "grid": recipe(
-        "rps table --laws rps rps_tuned rps_plus learned_gru",
+        "rps table --laws rps rps_tuned rps_plus learned",
         cores=3,
         gpu=1,
         section="Table II*",
@@ -198,7 +202,7 @@ RECIPES: dict[str, Recipe] = {
         labels=("rps_tuned", "rps_plus", "rps_plus, three axes"),
     ),
     "regression": recipe(
-        "rps regress --laws rps rps_tuned rps_plus learned_gru", cores=3, gpu=1, section="Successes"
+        "rps regress --laws rps rps_tuned rps_plus learned", cores=3, gpu=1, section="Successes"
     ),
     "readings": recipe("rps sweeps/ambiguities", cores=15, gpu=4, section="Readings, *"),
     "readings_plus": recipe(
@@ -275,7 +279,7 @@ RECIPES: dict[str, Recipe] = {
         section="Flat against round",
     ),
     "corridors_*": recipe(
-        "rps sweeps/corridors --laws rps rps_tuned rps_plus learned_gru force_push dipole aps "
+        "rps sweeps/corridors --laws rps rps_tuned rps_plus learned force_push dipole aps "
         f"rps_tuned,sweeps/corridors/tuned.json {_MACHINE}",
         gpu=3,
     ),
@@ -334,6 +338,12 @@ RECIPES: dict[str, Recipe] = {
         cores=60,
     ),
     "sb3": recipe(f"rps sweeps/learned/sb3.py {_MACHINE}", cores=3),
+    "learned_variants": recipe(
+        *_VARIANTS,
+        f"rps sweeps/learned/variants.py {' '.join(map('runs/variant_{}'.format, range(4)))} "
+        f"{_MACHINE}",
+        gpu=25,
+    ),
     # --- speed, with nothing else running ---
     "speed": recipe(
         "rps sweeps/speed --names 'C in closed loop' 'fused standard' 'fused fast' quasistatic "

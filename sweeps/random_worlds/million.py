@@ -50,7 +50,7 @@ class Million(TrialStudy[xr.Dataset]):
     QUICK: ClassVar = {"worlds": 64}
     GROWS: ClassVar[tuple[str, ...]] = ("laws",)
 
-    laws: tuple[str, ...] = ("rps_tuned", "rps_plus", "learned_gru")
+    laws: tuple[str, ...] = ("rps_tuned", "rps_plus", "learned")
     """Laws to run in the same worlds."""
     domain: str = "wide"
     """Ranges from which worlds are drawn."""

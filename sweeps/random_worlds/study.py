@@ -43,7 +43,7 @@ class RandomWorlds(TrialStudy[xr.Dataset]):
     QUICK: ClassVar[Mapping[str, object]] = {"worlds": 24, "panel": 0, "in_c": 0}
     GROWS: ClassVar[tuple[str, ...]] = ("domains", "panel", "in_c", "only", "run_missing")
 
-    laws: tuple[str, ...] = ("rps", "rps_tuned", "rps_plus", "learned_gru")
+    laws: tuple[str, ...] = ("rps", "rps_tuned", "rps_plus", "learned")
     """Laws to compare."""
     domains: tuple[str, ...] = ("wide", "real", "hostile")
     """Domains from which worlds are drawn."""

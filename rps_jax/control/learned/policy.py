@@ -20,7 +20,7 @@ from rps_jax.control.learned.network import LearnedParams, Network, Weights
 from rps_jax.record import files
 
 FORMAT, VERSION = "rps_jax policy", 1
-SHIPPED = {path.stem: path for path in sorted(Path(__file__).parent.glob("learned_*.npz"))}
+SHIPPED = {path.stem: path for path in sorted(Path(__file__).parent.glob("learned*.npz"))}
 
 
 class Policy(NamedTuple):
