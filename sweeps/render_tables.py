@@ -59,7 +59,7 @@ STALE: dict[str, str] = {
         (
             *("arena", "commands", "commands_gpu", "compilers", "compilers_gpu", "costs"),
             *("derivatives", "derivatives_gpu", "kernel", "levers", "robot", "speed"),
-            "speed_cores",
+            *("speed_cores", "tasks_cost_cpu", "tasks_cost_gpu"),
         ),
         "later changes of the code, which small runs do not time",
     ),
