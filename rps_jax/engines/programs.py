@@ -30,7 +30,7 @@ from rps_jax.engines import native
 from rps_jax.record import cache
 
 if TYPE_CHECKING:
-    from jaxlib._jax import pytree  # pyright rejects the alias jax.tree_util.PyTreeDef
+    from jaxlib._jax import Device, pytree  # pyright rejects the aliases of both
 
 
 def trace_function(
@@ -40,7 +40,7 @@ def trace_function(
     law: Law,
     donate: int,
     static: Sequence[object],
-) -> Callable[[jax.Device | None], Callable[..., Any]]:
+) -> Callable[[Device | None], Callable[..., Any]]:
     """Trace a function for arguments of some shapes, or load its program from the cache.
 
     Args:
@@ -82,7 +82,7 @@ def trace_function(
         jitted = jax.jit(exported.call, donate_argnums=donated)
 
     @functools.cache
-    def compiled(device: jax.Device | None) -> Callable[..., Any]:
+    def compiled(device: Device | None) -> Callable[..., Any]:
         sharding = None if device is None else SingleDeviceSharding(device)
         placed = (x.update(sharding=sharding) for x in leaves)
         program = _compile_lowered(jitted.lower(*placed))

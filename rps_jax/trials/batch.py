@@ -47,7 +47,7 @@ from rps_jax.trials.trial import ControlLoop, Outcome, Rules, Trial, World
 from rps_jax.world.physics import Physics
 
 if TYPE_CHECKING:
-    from jaxlib._jax import pytree  # pyright rejects the alias jax.tree_util.PyTreeDef
+    from jaxlib._jax import Device, pytree  # pyright rejects the aliases of both
 
 SEGMENT = 10.0  # [s] of simulated time in one call of a program; then slots are refilled
 _REPORT_STEPS = 500  # control steps between two reports of an engine outside of JAX
@@ -271,7 +271,7 @@ def _run_on_host(job: Job, setting: Setting, threads: int, monitor: _Monitor) ->
 # --- engines in JAX ------------------------------------------------------------------------
 
 
-def _devices() -> list[jax.Device]:
+def _devices() -> list[Device]:
     """Return the devices of the host that run the same programs."""
     first, *rest = jax.local_devices()
     return [first, *(x for x in rest if x.device_kind == first.device_kind)]
@@ -345,7 +345,7 @@ class _Program:
         self.stages = tuple(queue.example.stage for queue in queues)
         self._locks: defaultdict[object, threading.Lock] = defaultdict(threading.Lock)
 
-    def compiled(self, device: jax.Device) -> _Advance:
+    def compiled(self, device: Device) -> _Advance:
         """Return the function that a device runs; the first caller compiles it and others wait."""
         inputs, trials = zip(*map(self.shapes, range(len(self.queues))), strict=True)
         masks = tuple(jax.ShapeDtypeStruct((n,), bool) for n in self.slots)
@@ -381,7 +381,7 @@ def _trace_advance(
     law: Law,
     structure: pytree.PyTreeDef,
     leaves: tuple[jax.ShapeDtypeStruct, ...],
-) -> Callable[[jax.Device], _Advance]:
+) -> Callable[[Device], _Advance]:
     """Trace `trial.advance` by one segment for arguments of these shapes; cached."""
 
     def advance(
@@ -413,7 +413,7 @@ def _trace_advance(
 class _Slots:
     """Slots of one queue in a program of one worker, and the trials in them."""
 
-    def __init__(self, program: _Program, index: int, running: _Running | None, device: jax.Device):
+    def __init__(self, program: _Program, index: int, running: _Running | None, device: Device):
         """Fill slots of the queue `index` with the running trials, and others with waiting ones."""
         queue, slots = program.queues[index], program.slots[index]
         self._queue, self._device = queue, device
@@ -449,12 +449,14 @@ class _Slots:
 
     def arguments(self) -> tuple[Inputs, Trial, jax.Array, jax.Array]:
         """Return the arguments of the program for the next segment, in which fresh trials start."""
-        if self._inputs is None:
+        if (inputs := self._inputs) is None:
             # A copy: the device may share the host's memory, which `fill` changes.
-            self._inputs = jax.device_put(jax.tree.map(np.copy, self._host), self._device)
+            inputs = jax.device_put(jax.tree.map(np.copy, self._host), self._device)
+            self._inputs = inputs
         masks = self._first == self._count, self.live.copy()
         self._count += 1
-        return self._inputs, self.trials, *jax.device_put(masks, self._device)
+        fresh, live = jax.device_put(masks, self._device)
+        return inputs, self.trials, fresh, live
 
     def free(self, segment: int, state: _State) -> _Ended:
         """Free the slots of the trials that ended in a segment; return these."""
@@ -481,7 +483,7 @@ def _write(tree: Tree, index: Any, values: Tree) -> None:
 
 
 def _work(
-    groups: Sequence[Sequence[_Program]], monitor: _Monitor, index: int, device: jax.Device
+    groups: Sequence[Sequence[_Program]], monitor: _Monitor, index: int, device: Device
 ) -> None:
     """Run groups of programs on a device until no trial waits or runs; `index` of the worker."""
     first = index % max(1, len(groups))
@@ -493,7 +495,7 @@ def _work(
 
 def _run(
     program: _Program, limits: Sequence[int] | None, running: Sequence[_Running | None],
-    device: jax.Device, monitor: _Monitor,
+    device: Device, monitor: _Monitor,
 ) -> Sequence[_Running | None]:  # fmt: skip
     """Run segments until no trial waits and at most `limits` of each queue run; return these."""
     if monitor.stop:

@@ -16,6 +16,7 @@ import xarray as xr
 
 from rps_jax.analysis import statistics, tables
 from rps_jax.control import registry
+from rps_jax.engines import EngineName
 from rps_jax.record.options import option
 from rps_jax.runs.plan import Plan
 from rps_jax.runs.question import Run, call_of
@@ -47,7 +48,7 @@ ROWS = {
     "round base": Row("corridor", robot="round"),
     "round base, fine steps": Row("corridor", robot="round", fidelity="reference"),
 }
-ENGINES = {"reference": "mujoco", "fused": "fused"}
+ENGINES: dict[str, EngineName] = {"reference": "mujoco", "fused": "fused"}
 
 
 @dataclass(frozen=True)
