@@ -133,9 +133,15 @@ def test_the_skin_in_c_agrees_with_jax(tmp_path):
     assert kinds == {0, 1, 2}
 
 
-@pytest.mark.parametrize("name", ["rps_plus", pytest.param("learned", marks=pytest.mark.slow)])
-def test_a_whole_trial_step_by_step(name, tmp_path):
-    """The C law keeps its memory; observations are those of the trial in JAX."""
+@pytest.mark.parametrize(
+    ("name", "tolerance"),
+    [("rps_plus", 2e-5), pytest.param("learned", 4e-4, marks=pytest.mark.slow)],
+)
+def test_a_whole_trial_step_by_step(name, tolerance, tmp_path):
+    """The C law keeps its memory; observations are those of the trial in JAX.
+
+    The memory of a network amplifies the rounding of floats.
+    """
     case = Case("box", "S1", (-1.0, 0.5), law=name)
     setting = Setting("quasistatic", rules=Rules(horizon=20.0))
     trials = recorded([case], setting)
@@ -146,8 +152,8 @@ def test_a_whole_trial_step_by_step(name, tmp_path):
     (errors,), (from_memory,) = result.free, result.synchronised
     assert np.quantile(from_memory, 0.999) < 1e-5  # given JAX's memory, all steps agree
     # A step differs where a switch flips in one of the two; it must not last.
-    assert np.mean(errors > 2e-5) < 0.01
-    assert np.median(errors) < 1e-6
+    assert np.mean(errors > tolerance) < 0.01
+    assert np.median(errors) < tolerance / 20
 
 
 # --- unsupported operations, and the command -----------------------------------------------

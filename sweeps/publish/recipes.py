@@ -76,6 +76,11 @@ _HARDWARE = {
 }
 _ROBOTS = ("ideal", "kairos", "ridgeback", "mpo_500")
 _REAL = "rps sweep --domain real --worlds 4096 --seed 11 --laws rps rps_tuned"
+_LEARNED = tuple(
+    f"rps sweep --domain {name} --worlds {count} --seed 5301 "
+    f"--laws rps_plus sweeps/learned/learned_gru.npz learned --out runs/learned_{name}"
+    for name, count in (("wide", 4000), ("hostile", 10_000), ("real", 10_000))
+)
 _VARIANTS = tuple(
     f"rps sweeps/learned/variants.py --variants '{name}' --minutes 4.5 --out runs/variant_{i}"
     for i, name in enumerate(("warm", "hard domains", "long credit", "4,096 worlds"))
@@ -338,6 +343,19 @@ RECIPES: dict[str, Recipe] = {
         cores=60,
     ),
     "sb3": recipe(f"rps sweeps/learned/sb3.py {_MACHINE}", cores=3),
+    "learned_test": recipe(
+        *_LEARNED, gpu=4, section=rows.learned_beside_plus, labels=(*_WIDE, "real")
+    ),
+    "learned_failures": recipe(
+        *_LEARNED[1:],
+        *(
+            f"rps ceiling runs/learned_{name} --sample 0 --lost-by learned --samples 16 --rounds 5"
+            for name in ("hostile", "real")
+        ),
+        gpu=4,
+        section="A planner that knows the world",
+        labels=("", "", "hostile", "real"),
+    ),
     "learned_variants": recipe(
         *_VARIANTS,
         f"rps sweeps/learned/variants.py {' '.join(map('runs/variant_{}'.format, range(4)))} "

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -64,10 +65,18 @@ def comparison(results: object) -> Rows:
 
 def plus_beside_tuned(results: xr.Dataset) -> Rows:
     """Return a header and the rows of RPS+ and the tuned law in a ladder, world by world."""
+    return _beside(results, ("rps_plus", "rps_tuned"), "rps_tuned")
+
+
+def learned_beside_plus(results: xr.Dataset) -> Rows:
+    """Return a header and the rows of all laws of a sweep, world by world against RPS+."""
+    return _beside(results, list(map(str, results.law.values)), "rps_plus")
+
+
+def _beside(results: xr.Dataset, laws: Sequence[str], base: str) -> Rows:
     names = list(map(str, results.law.values))
-    base = names.index("rps_tuned")
-    laws = (names.index("rps_plus"), base)
-    return [list(_HEADER), *(_outcome_row(results, law, base) for law in laws)]
+    rows = (_outcome_row(results, names.index(law), names.index(base)) for law in laws)
+    return [list(_HEADER), *rows]
 
 
 _FAILURES = ("fell over", "never touched", "lost contact", "timeout", "diverged", "stalled")
