@@ -76,10 +76,10 @@ _HARDWARE = {
 }
 _ROBOTS = ("ideal", "kairos", "ridgeback", "mpo_500")
 _REAL = "rps sweep --domain real --worlds 4096 --seed 11 --laws rps rps_tuned"
-_LEARNED = tuple(
-    f"rps sweep --domain {name} --worlds {count} --seed 5301 "
-    f"--laws rps_plus sweeps/learned/learned_gru.npz learned --out runs/learned_{name}"
-    for name, count in (("wide", 4000), ("hostile", 10_000), ("real", 10_000))
+_LEARNED = _each(
+    "rps sweep --domain {0} --worlds 10000 --seed 5301 "
+    "--laws rps_plus sweeps/learned/learned_gru.npz learned --out runs/learned_{0}",
+    *(*_WIDE, "real"),
 )
 _VARIANTS = tuple(
     f"rps sweeps/learned/variants.py --variants '{name}' --minutes 4.5 --out runs/variant_{i}"
