@@ -216,6 +216,7 @@ def test_the_note_of_a_table_says_that_its_numbers_are_stale(monkeypatch):
     data = {"command": ["rps table"], "versions": {"rps_jax": "0.3.0"},
             "device": "", "date": "", "rows": [["x"]]}  # fmt: skip
     cited = {"command": None, "rows": [["x", {"from": "table"}], ["y", {"from": "ladder"}]]}
+    monkeypatch.setattr(render_tables, "STALE", {})
     assert render_tables.caption("table", data, "t.json") == (
         "\n<sub>[command, versions and values](t.json).</sub>\n"
     )
