@@ -381,6 +381,7 @@ def digest(commands: Sequence[Sequence[str]]) -> str:
         fields |= _REMOVED_OPTIONS.get(fields.get("question", ""), {})
         configurations.append(_expanded(fields))
     text = json.dumps(configurations, sort_keys=True)
+    text = text.replace(f"{sources.ROOT}/", "")  # of a law's file, in any clone
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
