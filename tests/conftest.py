@@ -2,6 +2,7 @@
 
 import gc
 import os
+import signal
 from pathlib import Path
 
 import pytest
@@ -15,6 +16,8 @@ if os.name == "posix":
 
 
 def pytest_configure(config):
+    # A shell that starts pytest in the background lets it and its subprocesses ignore interrupts.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     shapes.install()
     import jax
 
