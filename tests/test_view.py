@@ -86,8 +86,9 @@ def test_an_undisturbed_push_ends_like_any_other_trial(live):
     results, _ = pushes.run([CASE], SETTING, slots=1, workers=1)
     live.step(2 * round(SETTING.rules.horizon / PERIOD))
     assert live.done
-    for name, value in live.outcome._asdict().items():
-        np.testing.assert_allclose(value, getattr(results, name)[0], atol=1e-5, err_msg=name)
+    expected = results.columns()
+    for name, value in live.outcome.columns().items():
+        np.testing.assert_allclose(value, expected[name][0], atol=1e-5, err_msg=name)
     assert live.past[-1].snapshot.time == pytest.approx(float(results.time[0]), abs=1e-4)
 
 
