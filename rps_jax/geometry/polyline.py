@@ -43,7 +43,7 @@ class _Segments(NamedTuple):
     length: Array  # [m]
 
     @classmethod
-    def of(cls, line: Polyline) -> _Segments:
+    def from_line(cls, line: Polyline) -> _Segments:
         """Return the segments of a polyline."""
         x, y = line.vertices[:, 0], line.vertices[:, 1]
         length = jnp.diff(line.arcs)
@@ -53,9 +53,9 @@ class _Segments(NamedTuple):
 
 def at_arc(line: Polyline, arc: Scalar) -> Float[Array, "2"]:
     """Return the point [m] of one polyline at an arc length [m], at most its whole length."""
-    of = _Segments.of(line)
-    passed = jnp.clip(arc - of.first, 0.0, of.length)
-    away = [jnp.sum(passed * unit) for unit in (of.unit_x, of.unit_y)]
+    segments = _Segments.from_line(line)
+    passed = jnp.clip(arc - segments.first, 0.0, segments.length)
+    away = [jnp.sum(passed * unit) for unit in (segments.unit_x, segments.unit_y)]
     return line.vertices[0] + jnp.stack(away)
 
 
@@ -66,17 +66,19 @@ def nearest(
 
     Only arc lengths from `low` to `high` [m] count, so that a path may return to itself.
     """
-    of = _Segments.of(line)
-    x, y = point[0] - of.x, point[1] - of.y
-    ahead = x * of.unit_x + y * of.unit_y
+    segments = _Segments.from_line(line)
+    x, y = point[0] - segments.x, point[1] - segments.y
+    ahead = x * segments.unit_x + y * segments.unit_y
     ahead = jnp.clip(
-        ahead, jnp.maximum(low - of.first, 0.0), jnp.minimum(high - of.first, of.length)
+        ahead,
+        jnp.maximum(low - segments.first, 0.0),
+        jnp.minimum(high - segments.first, segments.length),
     )
-    away_x, away_y = x - ahead * of.unit_x, y - ahead * of.unit_y
-    counts = (of.first <= high) & (of.first + of.length >= low)
+    away_x, away_y = x - ahead * segments.unit_x, y - ahead * segments.unit_y
+    counts = (segments.first <= high) & (segments.first + segments.length >= low)
     squares = jnp.where(counts, away_x * away_x + away_y * away_y, jnp.inf)
     chosen = jnp.argmin(squares)
-    return of.first[chosen] + ahead[chosen], planar.safe_sqrt(squares[chosen])
+    return segments.first[chosen] + ahead[chosen], planar.safe_sqrt(squares[chosen])
 
 
 def clearance(
@@ -91,14 +93,14 @@ def clearance(
     ahead = jnp.roll(corners, -1, axis=0)
     # Coordinates are separate arrays: see `_Segments`.
     start = walls[:, 0, 0], walls[:, 0, 1]
-    along = _Vectors.of(walls[:, 1, 0] - start[0], walls[:, 1, 1] - start[1])
+    along = _Vectors.from_components(walls[:, 1, 0] - start[0], walls[:, 1, 1] - start[1])
     normal = along.normal
 
     def include(i: Array, least: tuple[Array, ...]) -> tuple[Array, ...]:
         """Include corner i and the edge that follows it."""
         square, low, high, gap = least
         corner = corners[i, 0], corners[i, 1]
-        edge = _Vectors.of(ahead[i, 0] - corner[0], ahead[i, 1] - corner[1])
+        edge = _Vectors.from_components(ahead[i, 0] - corner[0], ahead[i, 1] - corner[1])
         to_corner = corner[0] - start[0], corner[1] - start[1]
         to_start = -to_corner[0], -to_corner[1]
         to_end = to_start[0] + along.x, to_start[1] + along.y
@@ -126,7 +128,7 @@ def clearance(
 def nearest_on_wall(outline: Footprint, wall: Float[Array, "2 2"]) -> Float[Array, "2"]:
     """Return the point [m] of one wall that is nearest to an outline."""
     along, way = wall[1] - wall[0], outline.vertices - wall[0]
-    pair = (way[:, 0], way[:, 1]), _Vectors.of(along[0], along[1])
+    pair = (way[:, 0], way[:, 1]), _Vectors.from_components(along[0], along[1])
     points = jnp.concatenate([wall[0] + _share(*pair)[:, None] * along, wall])
     to_ends = fp.signed_distance(outline, wall) + outline.radius
     squares = jnp.concatenate([_square(*pair), to_ends**2])
@@ -141,7 +143,7 @@ class _Vectors(NamedTuple):
     inverse: Array  # [1/m^2] 0 without a length
 
     @classmethod
-    def of(cls, x: Array, y: Array) -> _Vectors:
+    def from_components(cls, x: Array, y: Array) -> _Vectors:
         """Return vectors by their coordinates."""
         square = x * x + y * y
         return cls(x, y, jnp.where(square > 0, 1 / jnp.where(square > 0, square, 1.0), 0.0))

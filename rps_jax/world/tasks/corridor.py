@@ -105,7 +105,7 @@ class CorridorCourse(NamedTuple):
         may_touch = progress.measured <= jnp.max(travel)
         due = may_touch | (progress.steps % _STEPS == 0)
 
-        def place(poses: Array) -> list[Footprint]:
+        def outlines_at(poses: Array) -> list[Footprint]:
             """Return both outlines, with the base at the origin."""
             origin = poses[0, :2]
             pairs = zip(outlines, poses, strict=True)
@@ -114,7 +114,7 @@ class CorridorCourse(NamedTuple):
         def measure(poses: Array, last: _Measured) -> _Measured:
             walls = self.walls - poses[0, :2]
             (of_base, at_base), (of_object, at_object) = (
-                polyline.clearance(x, walls) for x in place(poses)
+                polyline.clearance(x, walls) for x in outlines_at(poses)
             )
             room = of_object if self.surroundings is None else of_object + _PRESSED
             by_base = of_base <= room
@@ -127,17 +127,18 @@ class CorridorCourse(NamedTuple):
         def locate(poses: Array, last: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
             touch, wall, _ = last
             of_wall = self.walls[wall] - poses[0, :2]
-            points = [polyline.nearest_on_wall(x, of_wall) for x in place(poses)]
+            points = [polyline.nearest_on_wall(x, of_wall) for x in outlines_at(poses)]
             return touch, wall, poses[0, :2] + jnp.where(touch == BASE, *points)
 
         last = _Measured(
             progress.clearance, progress.wall_touch, jnp.zeros((), jnp.int32), progress.measured,
             progress.measured_at,
         )  # fmt: skip
-        now = _where_due(due, measure, poses, last)
-        found = now.wall_touch, now.wall, progress.p_world_touch
-        *_, point = _where_due(now.wall_touch > NOTHING, locate, poses, found)
-        state = now.clearance, now.wall_touch, point, now.measured, now.measured_at
+        current = _where_due(due, measure, poses, last)
+        touch = current.wall_touch, current.wall, progress.p_world_touch
+        *_, point = _where_due(current.wall_touch > NOTHING, locate, poses, touch)
+        walls = current.measured, current.measured_at
+        state = current.clearance, current.wall_touch, point, *walls
         moved = CorridorProgress(inner, *state, progress.steps + 1)
         return moved, aim._replace(failed=moved.wall_touch > NOTHING)
 
@@ -161,7 +162,7 @@ class _Measured(NamedTuple):
 
 
 def _where_due(due: Array, function: Callable[[Array, _T], _T], poses: Array, last: _T) -> _T:
-    """Return `function(poses, last)` where it is due, else `last`.
+    """Return `function(poses, last)` if it is due, else `last`.
 
     It is a loop of at most one pass: a program for many worlds skips the pass if no world needs it.
     """
