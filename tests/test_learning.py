@@ -24,6 +24,8 @@ from rps_jax.control.learned.network import Network, PolicyState
 from rps_jax.control.learned.policy import Policy
 from rps_jax.control.observation import Observation, TaxelObservation
 from rps_jax.record import files
+from rps_jax.robot.robot import Robot
+from rps_jax.robot.shell import Boards
 from rps_jax.runs.plan import Plan, load_plan, open_run
 from rps_jax.trials.env import PushEnv, Reward
 from rps_jax.trials.setting import Setting
@@ -417,6 +419,9 @@ def test_an_initial_law_has_the_network_of_the_options(learned, tmp_path):
         learn(CYLINDERS, **TINY | {"initial": path, "width": 7}, updates=4, out=tmp_path)
     with pytest.raises(InputError, match="no_such_law"):
         learn(CYLINDERS, **TINY | {"initial": "no_such_law"}, updates=4, out=tmp_path)
+    front = replace(CYLINDERS, robot=Robot(boards=(Boards("front", 3),)))
+    with pytest.raises(InputError, match=r"its network needs .*robots with 42 taxels"):
+        learn(front, **TINY | {"initial": path}, updates=4, out=tmp_path)
 
 
 def test_worlds_that_sometimes_fail_are_drawn_most():

@@ -24,7 +24,7 @@ from rps_jax.analysis.figures.style import Axes, Figure, tiles
 from rps_jax.analysis.report import Picture, Section
 from rps_jax.control.laws.rps import RPSParams
 from rps_jax.control.learned import policy as policies
-from rps_jax.control.learned.network import Weights
+from rps_jax.control.learned.network import Network, Weights
 from rps_jax.control.learned.policy import Policy
 from rps_jax.engines import device
 from rps_jax.record import files
@@ -149,9 +149,11 @@ class Learn(PPO, TaskOption, SimulationQuestion[xr.Dataset]):
             rule = f"there are only {count} worlds; raise num_envs"
             raise errors.not_allowed("num_minibatches", self.num_minibatches, rule)
         if self.initial:
-            kind, width, _, hold = policies.read(self.initial).network
-            if (self.network, self.width, self.hold) != (kind, width, hold):
-                rule = f"its network needs network = {kind}, width = {width} and hold = {hold:g} s"
+            kind, width, taxels, hold = initial = policies.read(self.initial).network
+            counts = (domain.robot.shell.count for domain in self.domains)
+            if {Network(self.network, self.width, x, self.hold) for x in counts} != {initial}:
+                options = f"network = {kind}, width = {width} and hold = {hold:g} s"
+                rule = f"its network needs {options}, and robots with {taxels} taxels"
                 raise errors.not_allowed("initial", self.initial, rule)
         period = self.setting.physics.control_period
         errors.check_number("hold", self.hold, at_least=0.999 * period, unit="s")
