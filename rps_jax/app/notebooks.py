@@ -54,9 +54,8 @@ def notebook(text: str) -> str:
         mark, _, source = block.partition("\n")
         if "markdown" in mark:
             source = re.sub(r"^# ?", "", source, flags=re.MULTILINE)
-            source = re.sub(
-                r"!?\[([^]]*)\]\(\.\./[^)]*\)", r"\1", source
-            )  # pages of the repository
+            # Links to pages of the repository, which a copy has not, become their texts.
+            source = re.sub(r"!?\[([^]]*)\]\(\.\./[^)]*\)", r"\1", source)
             cell = {"cell_type": "markdown"}
         else:
             cell = {"cell_type": "code", "execution_count": None, "outputs": []}
