@@ -45,8 +45,8 @@ class RandomWorlds(TrialStudy[xr.Dataset]):
 
     laws: tuple[str, ...] = ("rps", "rps_tuned", "rps_plus", "learned")
     """Laws to compare."""
-    domains: tuple[str, ...] = ("wide", "real", "hostile")
-    """Domains from which worlds are drawn."""
+    domains: tuple[str, ...] = ("wide", "real", "hostile", "wide,task=path", "wide,task=corridor")
+    """Domains from which worlds are drawn, by default all domains and all tasks without a map."""
     worlds: int = option(10_000, 2, 10_000_000)
     """Number of worlds of a domain."""
     panel: int = option(2_000, 0, 10_000_000)
@@ -58,7 +58,7 @@ class RandomWorlds(TrialStudy[xr.Dataset]):
     share a run in this way: afterwards copy the parts of both into one folder."""
     run_missing: bool = True
     """Whether to run the models that the run folder lacks; otherwise they are left out."""
-    setting: Setting = field(default=Setting("fused", seed=3119), kw_only=True)
+    setting: Setting = field(default=Setting("fused", seed=6407), kw_only=True)
 
     def check(self) -> None:
         """Check that the laws and the domains exist."""
