@@ -40,21 +40,18 @@ _BLOCK = re.compile(r"(<!-- (table|command): (\S+) -->\n).*?(<!-- end -->)", re.
 _CELL = re.compile(r"(<!-- cell: ([^>]*?) -->).*?(<!-- end -->)", re.DOTALL)
 _TEXT_CELL = re.compile(r"^(# %% \[markdown\]\n)((?:#.*\n)*)", re.MULTILINE)  # of notebooks' texts
 # The change since each stale data file: what follows "Computed by 0.3.0 before".
-_GROUND = "objects slid on today's ground"
 _LOADS = "random objects had loads of finite size and slid on today's ground"
 _SATURATED = "omega followed from the saturated v_x, and "
 _READING = _SATURATED + _LOADS
 STALE: dict[str, str] = {
     **dict.fromkeys(
         (
-            *("ceiling", "engines_ideal", "engines_wide", "headline", "models"),
-            *("rivals_tuned", "export_bags", "export_inputs", "export_odd", "export_paper"),
-            *("export_speed", "export_trials", "export_worlds", "fit_bags", "fit_coverage"),
-            *("fit_quantities", "fit_worth"),
+            *("engines_wide", "rivals_tuned", "export_bags", "export_inputs", "export_odd"),
+            *("export_paper", "export_speed", "export_trials", "export_worlds", "fit_bags"),
         ),
         _READING,
     ),
-    **dict.fromkeys(("attack", "million", "rare_million", "sb3", "sensitivity"), _LOADS),
+    **dict.fromkeys(("attack", "million", "sb3", "sensitivity"), _LOADS),
     **dict.fromkeys(
         (
             *("arena", "commands", "commands_gpu", "compilers", "compilers_gpu", "costs"),
@@ -63,17 +60,8 @@ STALE: dict[str, str] = {
         ),
         "later changes of the code, which small runs do not time",
     ),
-    **dict.fromkeys(
-        (
-            *("corridors_failures", "corridors_lookaheads", "corridors_objects", "corridors_open"),
-            *("corridors_paths", "corridors_widths", "floors_boundaries", "floors_slopes"),
-            "floors_steps",
-            *("bearings", "force_push_paths", "grid", "ladder", "plus", "regression"),
-        ),
-        "`learned` replaced `learned_gru`",
-    ),
-    "ground": _GROUND,
-    "fidelity": _SATURATED + _GROUND,
+    "plus": "`learned` replaced `learned_gru`",
+    "fidelity": _SATURATED + "objects slid on today's ground",
 }
 NUMBERS = SWEEPS / "publish" / "numbers.json"
 _NUMBER = r"(?<![\w.,/^#-])[-+±]?\d[\d,]*(?:\.\d+)?(?:e[-+]?\d+)?"

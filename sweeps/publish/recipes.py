@@ -83,7 +83,12 @@ _LEARNED = _each(
 )
 _VARIANTS = tuple(
     f"rps sweeps/learned/variants.py --variants '{name}' --minutes 4.5 --out runs/variant_{i}"
-    for i, name in enumerate(("warm", "hard domains", "long credit", "4,096 worlds"))
+    for i, name in enumerate(
+        (
+            *("warm", "hard domains", "long credit", "4,096 worlds"),
+            *("scratch", "uniform worlds", "reward of 0.2.0", "with tasks"),
+        )
+    )
 )
 _RIVALS = ("rps", "pursuit", "dipole", "force_push", "force_push_published")
 _SWEPT = "sweep --laws rps_tuned --domain wide"
@@ -91,8 +96,8 @@ _SWEPT = "sweep --laws rps_tuned --domain wide"
 
 # In order of importance, which is the order of computation.
 RECIPES: dict[str, Recipe] = {
-    "headline": recipe(f"rps sweeps/random_worlds {_MACHINE}", gpu=30),
-    "models": recipe(f"rps sweeps/random_worlds {_MACHINE}", gpu=30),
+    "headline": recipe(f"rps sweeps/random_worlds --in-c 0 {_MACHINE}", gpu=20),
+    "models": recipe(f"rps sweeps/random_worlds --in-c 0 {_MACHINE}", gpu=20),
     "million": recipe(f"rps sweeps/random_worlds/million.py {_MACHINE}", gpu=9),
     "rest": recipe(f"rps sweeps/fidelity/rest.py {_MACHINE}", cores=5),
     "reading_*": recipe(f"rps sweeps/paper_reading {_MACHINE}", gpu=10),
@@ -358,9 +363,9 @@ RECIPES: dict[str, Recipe] = {
     ),
     "learned_variants": recipe(
         *_VARIANTS,
-        f"rps sweeps/learned/variants.py {' '.join(map('runs/variant_{}'.format, range(4)))} "
+        f"rps sweeps/learned/variants.py {' '.join(map('runs/variant_{}'.format, range(8)))} "
         f"{_MACHINE}",
-        gpu=25,
+        gpu=50,
     ),
     # --- speed, with nothing else running ---
     "speed": recipe(
@@ -389,7 +394,7 @@ RECIPES: dict[str, Recipe] = {
         + f" --gpus 1 --warm 1000 10000 --file commands_gpu {_MACHINE}",
         gpu=8,
     ),
-    "gpus": recipe(f"rps sweeps/speed/gpus.py {_MACHINE}", gpu=4),
+    "gpus": recipe(f"rps sweeps/speed/gpus.py --gpus 1 2 4 {_MACHINE}", gpu=4),
     # After the installation of the third-party engines: see `speed/arena.py`.
     "arena": recipe(f"rps sweeps/speed/arena.py --peers peers {_MACHINE}", gpu=5),
     "derivatives": recipe(f"rps sweeps/speed/derivatives.py {_MACHINE}", cores=2),
