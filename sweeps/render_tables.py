@@ -39,7 +39,7 @@ KEYS = ("command", "device", "versions", "commit", "date", "columns", "rows")
 _BLOCK = re.compile(r"(<!-- (table|command): (\S+) -->\n).*?(<!-- end -->)", re.DOTALL)
 _CELL = re.compile(r"(<!-- cell: ([^>]*?) -->).*?(<!-- end -->)", re.DOTALL)
 _TEXT_CELL = re.compile(r"^(# %% \[markdown\]\n)((?:#.*\n)*)", re.MULTILINE)  # of notebooks' texts
-# The change since each stale data file: what follows "Computed by 0.3.0 before".
+# The change since each stale data file: what follows "Computed before".
 _LOADS = "random objects had loads of finite size and slid on today's ground"
 _SATURATED = "omega followed from the saturated v_x, and "
 _READING = _SATURATED + _LOADS
@@ -185,7 +185,7 @@ def caption(name: str, data: dict[str, Any], link: str) -> str:
     else:
         notes = []
         if name in STALE:
-            notes = [f"Computed by {data['versions']['rps_jax']} before {STALE[name]}"]
+            notes = [f"Computed before {STALE[name]}"]
         parts = [f"Device: {data['device']}"] if data["device"] else []
         parts += [f"date: {data['date']}"] if data["date"] else []
         last = "; ".join([*parts, f"[command, versions and values]({link})"])

@@ -12,6 +12,7 @@ import pytest
 import xarray as xr
 from helpers import ROOT, rps
 
+import rps_jax
 from rps_jax import sweep
 from rps_jax.record import files
 from rps_jax.runs.question import seed_of
@@ -212,6 +213,26 @@ def test_a_reason_confirms_all_files_that_are_stale_by_their_code_alone(
     assert "confirmed: its code changed, its numbers did not" in output
 
 
+def test_a_file_of_an_earlier_version_is_current_if_its_inputs_are(tmp_path, monkeypatch, capsys):
+    data = json.loads((SWEEPS / "table" / "results" / "table.json").read_text())
+    data["digest"] = study.digest([shlex.split(line) for line in data["command"]])
+    data |= {"code": sources.digests(), "commit": "0123456789abcdef"}
+    (tmp_path / "results").mkdir()
+    for name, version in {"old": "0.3.0", "new": rps_jax.__version__}.items():
+        versions = data["versions"] | {"rps_jax": version}
+        (tmp_path / "results" / f"{name}.json").write_text(
+            json.dumps(data | {"versions": versions})
+        )
+    monkeypatch.setattr(study, "_SWEEPS", tmp_path)
+    monkeypatch.setattr(study, "STALE", {})
+    assert rps(SWEEPS / "publish", "--check-digests", "--out", tmp_path / "run") == 0
+    output = " ".join(capsys.readouterr().out.split())
+    assert "computed by 0.3.0, still current" in output
+    assert f"1 of 2 data files are of rps_jax {rps_jax.__version__}" in output
+    assert "1 are of earlier code that gives the same numbers, and 0 are stale" in output
+    assert "01234567" in output
+
+
 def test_the_note_of_a_table_says_that_its_numbers_are_stale(monkeypatch):
     data = {"command": ["rps table"], "versions": {"rps_jax": "0.3.0"},
             "device": "", "date": "", "rows": [["x"]]}  # fmt: skip
@@ -222,7 +243,7 @@ def test_the_note_of_a_table_says_that_its_numbers_are_stale(monkeypatch):
     )
     monkeypatch.setitem(render_tables.STALE, "table", "the box had a lid")
     note = render_tables.caption("table", data, "t.json")
-    assert "<sub>Computed by 0.3.0 before the box had a lid. [command" in note
+    assert "<sub>Computed before the box had a lid. [command" in note
     assert "<sub>[command" in render_tables.caption("ladder", data, "l.json")
     note = render_tables.caption("summary", cited, "s.json")
     assert "<sub>`table`: computed before the box had a lid. Every number is cited" in note

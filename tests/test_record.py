@@ -20,6 +20,7 @@ import pytest
 import xarray as xr
 from helpers import ROOT
 
+import rps_jax
 from rps_jax import engines
 from rps_jax.engines import device
 from rps_jax.errors import InputError
@@ -361,6 +362,13 @@ def test_previous_environments_of_a_run_are_kept(tmp_path):
     assert text.index("later") < text.index("before that by") < text.index("commit abc, then, on H")
     (tmp_path / provenance.ENVIRONMENT).write_text("{}")
     reports_corruption(tmp_path / provenance.ENVIRONMENT)
+
+
+def test_an_editable_install_records_the_version_of_its_code(monkeypatch):
+    """The metadata of an editable install stay those of the last installation."""
+    monkeypatch.setattr(provenance.importlib.metadata, "version", lambda name: "0.0.1")
+    versions = provenance.collect_environment()["packages"]
+    assert (versions["rps_jax"], versions["jax"]) == (rps_jax.__version__, "0.0.1")
 
 
 def test_paths_that_are_not_utf8_keep_their_bytes(tmp_path):

@@ -17,7 +17,7 @@ from rps_jax.record import folder as run_folder
 from rps_jax.record.files import JsonObject
 
 ENVIRONMENT = "environment.json"
-_PACKAGES = ("rps_jax", "jax", "jaxlib", "mujoco", "mujoco-mjx", "numpy", "scipy", "xarray")
+_PACKAGES = ("jax", "jaxlib", "mujoco", "mujoco-mjx", "numpy", "scipy", "xarray")
 
 
 def collect_environment(**device: object) -> JsonObject:
@@ -29,7 +29,7 @@ def collect_environment(**device: object) -> JsonObject:
         "python": platform.python_version(),
         "platform": platform.platform(),
         **device,
-        "packages": {name: _version(name) for name in _PACKAGES},
+        "packages": {"rps_jax": __version__} | {name: _version(name) for name in _PACKAGES},
     }
 
 

@@ -49,14 +49,15 @@ from sweeps.study_base import (
 
 _SWEEPS = Path(__file__).parents[1]
 CURRENT = "of today's code"
-_KEYS = ("version", "date", "state", "computed on", "two cores", "one H100")
+EARLIER = "still current"
+_KEYS = ("version", "commit", "date", "state", "computed on", "two cores", "one H100")
 
 
 @dataclass(frozen=True)
 class Publish(Study[xr.Dataset]):
     """Report whether published numbers are up to date, and compute selected ones again.
 
-    The results hold version, date, state and duration (file), in words.
+    The results hold version, commit, date, state and duration (file), in words.
     """
 
     TITLE: ClassVar[str] = "Published numbers and their dependencies"
@@ -119,11 +120,15 @@ class Publish(Study[xr.Dataset]):
         """Return a row per data file, current ones last."""
         ordered = results.sortby("state", ascending=False)
         columns = {name: f"{{{name}}}" for name in ("file", *_KEYS)}
-        current = int((results.state == CURRENT).sum())
+        states = results.state.values.tolist()
+        kinds = ("stale", CURRENT, "confirmed", EARLIER)
+        stale, today, *same = (sum(kind in state for state in states) for kind in kinds)
         text = (
-            f"{current} of {results.sizes['file']} data files are of rps_jax {rps_jax.__version__} "
-            "and neither their settings nor their code has changed since. A file without a digest "
-            "is older than the digests: only its command and its commit tell its inputs."
+            f"{today} of {len(states)} data files are of rps_jax {rps_jax.__version__} and today's "
+            f"code. {sum(same)} are of earlier code that gives the same numbers, and {stale} are "
+            "stale. A version is that of the code at the commit: between two releases it is the "
+            "earlier one. A file without a digest is older than the digests: only its command and "
+            "its commit tell its inputs."
         )
         rows = text_table(columns, records(ordered, "file"))
         return [Table(rows, title="Data files", text=text)]
@@ -190,13 +195,14 @@ def _has_current_settings(data: Mapping[str, Any]) -> bool:
 
 
 def _description(path: Path) -> dict[str, str]:
-    """Return version, date, state and duration of a data file, in words."""
+    """Return version, commit, date, state and duration of a data file, in words."""
     data = json.loads(path.read_text())
     recipe = next((r for name, r in RECIPES.items() if fnmatch.fnmatch(path.stem, name)), None)
     minutes = (recipe.two_cores, recipe.one_gpu) if recipe else (None, None)
     cores, gpu = ("" if t is None else f"{t:g} min" for t in minutes)
     return {
         "version": str(data.get("versions", {}).get("rps_jax", "")),
+        "commit": str(data.get("commit") or "")[:8],
         "date": str(data.get("date") or ""),
         "computed on": recipe.device if recipe else "",
         "two cores": cores,
@@ -227,7 +233,7 @@ def _state(name: str, data: Mapping[str, Any]) -> str:
         return f"stale: computed before {STALE.get(name, change)}"
     if sources.changed_rooms("", data, rooms):
         return "confirmed: its code changed, its numbers did not, by equal.json"
-    return CURRENT if version == rps_jax.__version__ else f"computed by {version}, still current"
+    return CURRENT if version == rps_jax.__version__ else f"computed by {version}, {EARLIER}"
 
 
 # --- computing data files again -------------------------------------------------------------
