@@ -22,12 +22,14 @@ def _homes() -> dict[str, str]:
 
 
 _HOMES = _homes()
+_REMOVED = {"models": "sweep(..., models=True)", "compare": "ladder"}  # of version 0.3
 __all__ = sorted(_HOMES)  # pyright: ignore[reportUnsupportedDunderAll]
 
 
 def __getattr__(name: str) -> Any:
     if name not in _HOMES:
-        raise AttributeError(f"module 'rps_jax' has no attribute '{name}'")
+        hint = f": use {_REMOVED[name]}" if name in _REMOVED else ""
+        raise AttributeError(f"module 'rps_jax' has no attribute '{name}'{hint}")
     home = importlib.import_module(_HOMES[name])
     if hasattr(home, name):
         return getattr(home, name)

@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode
-from helpers import NEAR, refusals, row, same
+from helpers import NEAR, refusals, row, rps, same
 
+import rps_jax
 from rps_jax.errors import InputError
 from rps_jax.runs import question
 from rps_jax.runs.evaluate import evaluate
@@ -334,6 +335,17 @@ def test_previous_names_of_questions_and_runs_warn():
         assert question.OfLaw is question.LawQuestion
     with pytest.warns(DeprecationWarning, match=r"Run\.report is now Run\.callback"):
         assert question.Run(None, no_progress).report is no_progress
+
+
+def test_removed_names_of_the_package_and_the_shell_name_their_successors(capsys):
+    for name, call, command in (
+        ("models", r"sweep\(..., models=True\)", "rps sweep --models"),
+        ("compare", "ladder", "rps ladder --domain A B"),
+    ):
+        with pytest.raises(AttributeError, match=f"'{name}': use {call}$"):
+            getattr(rps_jax, name)
+        assert rps(name, "--domain", "wide") == 2
+        assert f"'{name}' does not exist: use {command}." in capsys.readouterr().err
 
 
 def test_the_previous_module_name_warns_and_has_the_same_classes(monkeypatch):
