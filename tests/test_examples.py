@@ -33,7 +33,7 @@ from rps_jax.trials.case import Case
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.worlds import drawn_worlds
 from rps_jax.world import draws, objects, scene
-from rps_jax.world.domain import Domain, Range, parse_domain
+from rps_jax.world.domain import Domain, Range, from_json, parse_domain, to_json
 from rps_jax.world.scene import FRICTION, Friction, WorldInputs
 from sweeps.speed import robot as on_a_robot
 
@@ -62,9 +62,10 @@ def test_a_custom_hexagon_is_pushed(capsys):
 
 
 @pytest.fixture
-def hexagon():
-    outline = polygon(example("custom_object")["OUTLINE"])
-    objects.register_object("hexagon", EXAMPLES / "hexagon.xml", outline)
+def hexagon(tmp_path):
+    names, path = example("custom_object"), tmp_path / "hexagon.xml"
+    path.write_text(names["MJCF"])
+    objects.register_object("hexagon", path, names["OUTLINE"])
     return scene.load("hexagon")
 
 
@@ -180,6 +181,20 @@ def test_an_object_file_has_the_outline_of_its_solid(tmp_path):
     assert float(scene.load("round").footprint.radius) == pytest.approx(0.7)
 
 
+def test_a_file_is_an_object_of_a_domain_also_in_another_process(tmp_path):
+    path = tmp_path / "crate.xml"
+    path.write_text(BOX.read_text())
+    domain = parse_domain(f"wide,objects={path},yaw=0:0.1")
+    assert domain.objects == ("crate",)
+    record = to_json(domain)
+    del objects.REGISTERED["crate"], objects.FAMILIES["crate"]
+    assert from_json(record) == domain == Domain(objects=(str(path),), yaw=Range(0, 0.1))
+    assert scene.load("crate").physics.body("object").mass[0] == 20.0
+    with pytest.raises(InputError, match="leave no mass to draw"):
+        parse_domain(f"wide,objects={path},mass=3:5")
+    assert parse_domain("paper,objects=random_box,mass=3:5").mass[:2] == (3, 5)
+
+
 class Ahead(NamedTuple):
     v: float = 0.05  # [m/s]
     d_success: float = 0.05  # [m]
@@ -195,6 +210,7 @@ test_an_invalid_footprint_is_rejected = refusals(
     ((Footprint(jnp.array([[0.1, 0.0]]), jnp.array(0.2)),), "a circle about the origin"),
     ((Footprint(jnp.array(SQUARE), jnp.array(0.05)),), "with radius 0.05 m is not allowed"),
     ((Footprint(jnp.array(SQUARE[::-1]), jnp.array(0.0)),), "counter-clockwise"),
+    ((SQUARE[::-1],), "counter-clockwise"),
     ((polygon(np.array(SQUARE) + 0.2),), "the origin must be inside"),
     ((polygon(0.2 * np.array([[np.cos(a), np.sin(a)] for a in np.arange(9) * 0.69])),), "3 to 8"),
     ((rectangle(5.0, 5.0),), "reach of the footprint"),
@@ -215,7 +231,9 @@ test_invalid_laws_are_rejected = refusals(
     (("p", NO_LAW, RPSParams()), "the law 'rps' has a class of the same name RPSParams"),
 )
 test_params_of_no_law_are_rejected = refusals(
-    Case, (("box", FRICTION["S1"], (2.0, 0.0), Ahead()), "params of class Ahead belong to no law")
+    Case,
+    (("box", FRICTION["S1"], (2.0, 0.0), Ahead()), "params of class Ahead belong to no law"),
+    (("box", FRICTION["S1"], (2.0, 0.0), RPSParams), r"the class RPSParams .*, as RPSParams\(\)"),
 )
 
 

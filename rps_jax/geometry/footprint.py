@@ -35,7 +35,7 @@ def circle(radius: Number) -> Footprint:
     return Footprint(jnp.zeros((1, 2)), jnp.asarray(radius, float))
 
 
-def polygon(vertices: np.ndarray | list) -> Footprint:
+def polygon(vertices: ArrayLike) -> Footprint:
     """Return a convex polygon of vertices (N >= 3, 2) [m], counter-clockwise.
 
     Raises:

@@ -14,7 +14,7 @@ from rps_jax.record import files
 from rps_jax.record.options import check_fields, parse_changes
 from rps_jax.robot.robot import Robot, RobotLike, parse_robot
 from rps_jax.world import paper, scene, tasks
-from rps_jax.world.objects import FAMILIES, OBJECTS, PAPER_OBJECTS
+from rps_jax.world.objects import FAMILIES, OBJECTS, PAPER_OBJECTS, parse_object, text_of
 from rps_jax.world.quantity import Owner, Quantity, Range, check_ranges, declared, drawn, range_of
 from rps_jax.world.scene import FRICTION, Friction, Surroundings
 from rps_jax.world.tasks import Task, TaskLike, parse_task
@@ -51,7 +51,7 @@ class Domain:
     no other declaration.
     """
 
-    # The object: a scene of `mjcf/`, or a random one of a shape family.
+    # The object: a scene of `mjcf/`, a custom one by name or FILE.xml, or a random one of a family.
     objects: tuple[str, ...] = ("random_box", "random_cylinder", "random_prism")
     mass: Range = drawn(Range(3, 60, log=True), 0, "kg", 0.1, 1e3, "mass of the object")
     # Half width: the square root of half depth times half breadth.
@@ -121,6 +121,7 @@ class Domain:
 
     def __post_init__(self) -> None:
         check_fields(self, "domain ")
+        object.__setattr__(self, "objects", tuple(map(parse_object, self.objects)))
         for name in self.objects:
             errors.check_name("domain object", name, (*RANDOM, *OBJECTS), "FILE.xml")
         errors.check_each_once("domain objects", self.objects)
@@ -333,11 +334,12 @@ def parse_domain(
         base = from_json(files.read_json(Path(head)))
     else:
         base = DOMAINS[errors.check_name("domain", head, DOMAINS, "FILE.json")]
+    changed = replace(base, **_from_json(changes, base))
     for name in changes:
-        if name in base.idle:
+        if name in changed.idle:
             rule = f"its objects, frictions, targets or skin leave no {name} to draw"
             raise errors.not_allowed("domain", domain, rule)
-    return replace(base, **_from_json(changes, base))
+    return changed
 
 
 def _names(values: object) -> tuple[str, ...]:
@@ -366,7 +368,7 @@ _FORMS: dict[str, tuple[Callable[[Any], Any], str]] = {
 
 def to_json(domain: Domain) -> dict[str, Any]:
     """Return a domain as JSON; without the task `reach`, as in earlier versions."""
-    record = asdict(domain)
+    record = asdict(domain) | {"objects": tuple(map(text_of, domain.objects))}
     return record if domain.task != Reach() else {k: x for k, x in record.items() if k != "task"}
 
 

@@ -44,7 +44,7 @@ _OVERHANG = 0.005  # [m] of geoms beyond the solid for contacts, at most
 _GIVE_OUTLINE = (
     "give the outline, a circle or a convex polygon of 3 to 8 corners (of a concave object its "
     'convex hull): in the file <custom><numeric name="footprint" data="X Y X Y X Y"/></custom> [m] '
-    "or footprint=polygon(...) to rps_jax.register_object"
+    "or as footprint=[(x, y), ...] of rps_jax.register_object"
 )
 
 
@@ -53,6 +53,7 @@ class Registered(NamedTuple):
 
     path: Path  # of the MJCF file
     solid: Solid  # for contacts; leaves without a leading axis
+    is_file: bool = False  # whether the file alone determines it
 
 
 REGISTERED: dict[str, Registered] = {}
@@ -79,7 +80,14 @@ def parse_object(text: str) -> str:
     if REGISTERED.get(name, (None,))[0] != path:
         files.read_regular(path, "xml")
         register_object(name, path)
+        REGISTERED[name] = REGISTERED[name]._replace(is_file=True)
     return name
+
+
+def text_of(name: str) -> str:
+    """Return the text from which another process parses an object: its file, or its name."""
+    custom = REGISTERED.get(name)
+    return str(custom.path) if custom is not None and custom.is_file else name
 
 
 def read(path: Path) -> mujoco.MjSpec:
@@ -100,7 +108,7 @@ def read(path: Path) -> mujoco.MjSpec:
 def register_object(
     name: str,
     path: str | Path,
-    footprint: Footprint | None = None,
+    footprint: Footprint | ArrayLike | None = None,
     feet: ArrayLike | None = None,
 ) -> None:
     """Register a custom object, to be used like the paper's objects.
@@ -113,8 +121,9 @@ def register_object(
     Args:
       name: of the object; it replaces an object registered under the same name.
       path: MJCF file. Mass, centre of mass and inertia are those of all geoms of the body.
-      footprint: outline of the solid for contacts, in the body's frame: a circle about the origin,
-        or a convex polygon of up to 8 corners around it. By default that of the file: the numeric
+      footprint: outline of the solid for contacts, in the body's frame: corners (N, 2) [m] of a
+        convex polygon around the origin, counter-clockwise and at most 8, or a circle about it as
+        a `Footprint`. By default that of the file: the numeric
         `footprint` in its element `custom`, with a radius or corners x y x y ... [m], or else the
         geom `object`, if it is a box or a cylinder. The height of the solid is that of this geom.
       feet: positions (S, 2) [m] of 3 to 8 points on which it stands, in the body's frame, or with
@@ -151,7 +160,11 @@ def register_object(
     path = Path(path).absolute()
     label = f"object '{name}'"
     model = _compiled(label, path)
-    family, vertices, radius = _outline(label, footprint or _file_outline(label, model))
+    if footprint is None:
+        footprint = _file_outline(label, model)
+    elif not isinstance(footprint, Footprint):
+        footprint = fp.polygon(footprint)
+    family, vertices, radius = _outline(label, footprint)
     body = model.body("object")
     if feet is not None:
         family, vertices = "cylinder" if radius else "prism", solid.padded(vertices)
