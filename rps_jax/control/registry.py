@@ -263,6 +263,9 @@ def resolve_law(law: LawLike, index: int = 0) -> tuple[str, LawParams]:
     """
     if isinstance(law, str):
         return parse_law(law)
+    if isinstance(law, type):
+        rule = f"give parameters, as {law.__name__}()"
+        raise errors.not_allowed("law", f"the class {law.__name__}", rule)
     law_of(law)
     presets = {name: params for name, params in LAWS.items() if type(params) is type(law)}
     for name, params in presets.items():

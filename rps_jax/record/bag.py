@@ -265,7 +265,7 @@ def topic_names(topics: TopicsLike) -> dict[str, str]:
     return {key: f"/{name.strip('/')}" for key, name in names.items()}
 
 
-def read(path: Path, topics: TopicsLike = ()) -> dict[str, np.ndarray]:
+def read(path: str | Path, topics: TopicsLike = ()) -> dict[str, np.ndarray]:
     """Return the steps of a bag as arrays, by the fields of `Step` that it has, and `period`.
 
     A step is a command, with the latest message of each other topic that is not after it. Steps
