@@ -10,7 +10,6 @@ from collections.abc import Callable, Hashable, Mapping
 from dataclasses import dataclass, fields
 from typing import Any, ClassVar, NamedTuple, Protocol
 
-import jax
 import numpy as np
 
 from rps_jax import errors
@@ -46,7 +45,10 @@ class Course(Protocol):
     """Parameters of a task in one world: a pytree."""
 
     def start(self) -> Any:
-        """Return the progress before the first control step: a pytree with `outcomes`."""
+        """Return the progress before the first control step.
+
+        It is a pytree, whose `outcomes()` are those of `Task.OUTCOMES`, batched or not.
+        """
         ...
 
     def step(self, progress: Any, positions: Positions) -> tuple[Any, Aim]:
@@ -59,14 +61,6 @@ class Course(Protocol):
 
     def lines(self) -> dict[str, np.ndarray]:
         """Return what pictures show: polylines (..., N, 2) [m] by name, `path` and `walls`."""
-        ...
-
-
-class Progress(Protocol):
-    """Running state of a task: a pytree."""
-
-    def outcomes(self) -> dict[str, jax.Array]:
-        """Return the outcomes by name, batched or not: those of `Task.OUTCOMES`."""
         ...
 
 
