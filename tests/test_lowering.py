@@ -4,13 +4,14 @@ import ctypes
 import functools
 import json
 import re
+import runpy
 import shutil
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import output_of
+from helpers import ROOT, output_of
 from jax import lax
 from test_gpu_writer import Emulated
 
@@ -23,6 +24,7 @@ from rps_jax.lowering.routine import routine
 from rps_jax.lowering.target import UnsupportedError
 from rps_jax.lowering.writer import SimdWriter
 
+MAKE = runpy.run_path(str(ROOT / "docs" / "push" / "make.py"))  # with the printer of a page
 REALS = [0.0, -0.0, 0.5, -1.5, 2.5, 7.0, 1e30, -1e30, np.inf, -np.inf, np.nan]
 BOUNDS = [2147483520.0, -2147483520.0, 2147483648.0, -2147483648.0, -2147483904.0, 3e9]
 DOUBLES = [2147483647.0, -2147483647.0, 2147483647.5, -2147483648.5]
@@ -184,7 +186,7 @@ void run(int n, const law_x *reals, const law_i *integers, law_out *out) {{
 def run_js(names, real, folder):
     """Return the results of JavaScript."""
     tables = {}
-    text = js.function("run", traced(names), tables)
+    text = MAKE["function"]("run", traced(names), tables)
     x, i = inputs(real)
     main = (
         f"const rows = {json.dumps(list(zip(x.tolist(), i.tolist(), strict=True)))};\n"
@@ -242,7 +244,7 @@ BACK_ENDS = {
     "gpu": (np.float32, lambda names: GpuWriter(4).source(*jaxpr(names)), run_gpu),
     "c float": (np.float32, lambda names: c_statements(names, {}), run_c),
     "c double": (np.float64, lambda names: c_statements(names, {}), run_c),
-    "js": (np.float64, lambda names: js.function("run", traced(names), {}), run_js),
+    "js": (np.float64, lambda names: MAKE["function"]("run", traced(names), {}), run_js),
     "onnx": (np.float32, onnx_graph, run_onnx),
 }
 NEEDS = {"gpu": "g++", "js": "node", "simd": str(COMPILER)}

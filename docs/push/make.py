@@ -29,7 +29,10 @@ from rps_jax.engines import quasistatic
 from rps_jax.engines.base import ControlPeriod
 from rps_jax.geometry.polyline import Polyline
 from rps_jax.lowering import js
+from rps_jax.lowering.js import JsWriter
+from rps_jax.lowering.nodes import Array, Node, SimdNodes
 from rps_jax.lowering.routine import Group, Routine, fields_of, identifier, routine
+from rps_jax.lowering.scalar_nodes import ScalarNodes
 from rps_jax.robot.robot import Robot
 from rps_jax.robot.skin import NONE
 from rps_jax.runs.push import push
@@ -288,6 +291,45 @@ def routes(count: int = 6) -> list[list[list[float]]]:
     return [[p for p, q in zip(x, [None, *x], strict=False) if p != q] for x in vertices.tolist()]
 
 
+# --- JavaScript ----------------------------------------------------------------------------
+
+_LISTED = 12  # elements of an array that is printed as a list, at most
+
+
+class _LoopNodes(ScalarNodes):
+    """Target whose loops may run until a condition fails: a page has no deadline."""
+
+    while_loop = SimdNodes.while_loop
+
+
+class PageWriter(JsWriter):
+    """Printer of a routine of a page."""
+
+    nodes = _LoopNodes
+    leave = "if (!goes) break;"
+
+    def single(self, node: Node) -> list[str]:
+        """Return the statements of a node; many numbers of one array are picked by a table."""
+        views = [a for a in node.args if isinstance(a, Array)]
+        sources = {view.node for view in views}
+        if node.op != "move" or not _LISTED < node.size == len(views) or len(sources) > 1:
+            return super().single(node)
+        first = min(view.first for view in views)
+        table = self.table(np.array([view.first - first for view in views]))
+        item = self.item(views[0].node, f"k + {first}" if first else "k")
+        return [f"const {node.name} = {table}.map((k) => {item});"]
+
+
+def function(name: str, routine: Routine, tables: dict[str, str]) -> str:
+    """Return a routine of a page as a function of its groups of fields."""
+    groups = {group: f"{group}." for group in routine.inputs}
+    lines = js.statements(routine, groups, tables, PageWriter)
+    results = ", ".join(f"{group}: {js.object_of(group, routine.outputs)}"
+                        for group in routine.outputs)  # fmt: skip
+    head = f"function {name}({', '.join(routine.inputs)}) {{"
+    return f"{head}\n{lines}\n  return {{ {results} }};\n}}\n"
+
+
 def scripts() -> str:
     """Return the generated JavaScript: functions, laws and constants of the first trial."""
     with jax.enable_x64(True):
@@ -301,7 +343,7 @@ def scripts() -> str:
             of_law, description = law_routines(name)
             routines |= {item.name: item for item in of_law}
             laws |= description
-        functions = [js.function(name, item, tables) for name, item in routines.items()]
+        functions = [function(name, item, tables) for name, item in routines.items()]
         start = world_of("prism")[2]._replace(**UNTRACED)
     base = Robot().shell
     taxels = np.asarray(base.taxels(2)).tolist()  # two points of each, a quarter from its ends

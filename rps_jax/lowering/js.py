@@ -10,13 +10,11 @@ from pathlib import Path
 
 import numpy as np
 
-from rps_jax.lowering.nodes import Array, Node, SimdNodes
+from rps_jax.lowering.nodes import Node
 from rps_jax.lowering.operations import spelled
 from rps_jax.lowering.routine import Group, Routine
-from rps_jax.lowering.scalar_nodes import ScalarNodes
 from rps_jax.lowering.scalar_writer import ScalarWriter
 
-_LISTED = 12  # elements of an array that is printed as a list, at most
 HELPERS = Path(__file__).with_name("helpers.js").read_text("utf-8")
 
 
@@ -51,30 +49,6 @@ class JsWriter(ScalarWriter):
         return f'const {name} = unpacked("{packed}", {kind}, {len(array)});'
 
 
-class _LoopNodes(ScalarNodes):
-    """Target whose loops may run until a condition fails: a page has no deadline."""
-
-    while_loop = SimdNodes.while_loop
-
-
-class PageWriter(JsWriter):
-    """Printer of a routine of a page."""
-
-    nodes = _LoopNodes
-    leave = "if (!goes) break;"
-
-    def single(self, node: Node) -> list[str]:
-        """Return the statements of a node; many numbers of one array are picked by a table."""
-        views = [a for a in node.args if isinstance(a, Array)]
-        sources = {view.node for view in views}
-        if node.op != "move" or not _LISTED < node.size == len(views) or len(sources) > 1:
-            return super().single(node)
-        first = min(view.first for view in views)
-        table = self.table(np.array([view.first - first for view in views]))
-        item = self.item(views[0].node, f"k + {first}" if first else "k")
-        return [f"const {node.name} = {table}.map((k) => {item});"]
-
-
 def statements(
     routine: Routine,
     groups: Mapping[str, str],
@@ -96,16 +70,6 @@ def statements(
         array = np.array(names, object).reshape(field.shape).tolist()
         lines.append(f"const result_{group}_{field.name} = {_nested(array)};")
     return "\n".join(f"  {line}" for line in lines)
-
-
-def function(name: str, routine: Routine, tables: dict[str, str]) -> str:
-    """Return a routine of a page as a function of its groups of fields."""
-    groups = {group: f"{group}." for group in routine.inputs}
-    lines = statements(routine, groups, tables, PageWriter)
-    results = ", ".join(f"{group}: {object_of(group, routine.outputs)}"
-                        for group in routine.outputs)  # fmt: skip
-    head = f"function {name}({', '.join(routine.inputs)}) {{"
-    return f"{head}\n{lines}\n  return {{ {results} }};\n}}\n"
 
 
 def object_of(group: str, groups: Mapping[str, Group]) -> str:
