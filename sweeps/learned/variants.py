@@ -38,11 +38,13 @@ SHARED = (
 )
 _WARM = "--initial sweeps/learned/learned_gru.npz --spread 0.25 --learning-rate 2e-4"
 _LIMITS = "robot_force=150:800,robot_traction=0.3:0.8,robot_lag=0:0.5,robot_acceleration=0.1:1"
+_HARD = f"--domain hostile real hostile,{_LIMITS}"
+_CONTINUED = f"--initial learned --spread 0.2 --learning-rate 2e-4 {_HARD}"
 VARIANTS = {  # options after the shared ones
     "scratch": "",
     "warm": _WARM,
     "wide and hostile": f"{_WARM} --domain wide hostile",
-    "hard domains": f"{_WARM} --domain hostile real hostile,{_LIMITS}",
+    "hard domains": f"{_WARM} {_HARD}",
     "with tasks": f"{_WARM} --domain wide hostile real wide,task=path wide,task=corridor",
     "uniform worlds": f"{_WARM} --hard 0",
     "reward of 0.2.0": f"{_WARM} --success 1 --failure 0",
@@ -56,6 +58,10 @@ VARIANTS = {  # options after the shared ones
     "hold 0.1 s": "--hold 0.1",
     "mlp": "--network mlp --initial learned_small --spread 0.25 --learning-rate 2e-4",
     "mlp, width 32": "--network mlp --width 32",
+    "continued": _CONTINUED,
+    "continued, 4,096 worlds": f"{_CONTINUED} --num-envs 4096 --num-minibatches 16 --seed 1",
+    "continued, failures cost 2": f"{_CONTINUED} --num-envs 4096 --num-minibatches 16 --seed 2"
+    " --failure 2 --hard 0.7",
 }
 _QUICK_DOMAIN = "wide,objects=random_cylinder"  # also for judging
 QUICK = (
@@ -95,6 +101,8 @@ class Variants(QuickStudy[xr.Dataset]):
     """Wall clock of each variant [min], with compilation."""
     worlds: int = option(2000, 1, 1_000_000)
     """Number of worlds for validation of each domain."""
+    file: str = "learned_variants"
+    """Name of the data file."""
     out: Path | str | None = field(default="runs/variants", kw_only=True)
     """Run folder; each variant has a folder there."""
 
@@ -168,7 +176,7 @@ class Variants(QuickStudy[xr.Dataset]):
             f"variants have `{SHARED}` and the changed options."
         )
         rows = [_row(results.sel(variant=name)) for name in results.variant.values.tolist()]
-        return [Table(rows, note, _COLUMNS, name="learned_variants", title="Variants")]
+        return [Table(rows, note, _COLUMNS, name=self.file, title="Variants")]
 
 
 variants = call_of(Variants)

@@ -90,6 +90,12 @@ _VARIANTS = tuple(
         )
     )
 )
+_CONTINUED = tuple(
+    f"rps sweeps/learned/variants.py --variants '{name}' --minutes 11 --out runs/continued_{i}"
+    for i, name in enumerate(
+        ("continued", "continued, 4,096 worlds", "continued, failures cost 2")
+    )
+)
 _RIVALS = ("rps", "pursuit", "dipole", "force_push", "force_push_published")
 _SWEPT = "sweep --laws rps_tuned --domain wide"
 
@@ -366,6 +372,12 @@ RECIPES: dict[str, Recipe] = {
         f"rps sweeps/learned/variants.py {' '.join(map('runs/variant_{}'.format, range(8)))} "
         f"{_MACHINE}",
         gpu=50,
+    ),
+    "learned_continued": recipe(
+        *_CONTINUED,
+        f"rps sweeps/learned/variants.py {' '.join(map('runs/continued_{}'.format, range(3)))} "
+        f"--file learned_continued {_MACHINE}",
+        gpu=35,
     ),
     # --- speed, with nothing else running ---
     "speed": recipe(
