@@ -30,7 +30,7 @@ from rps_jax.trials.setting import Setting
 from rps_jax.tuning.learn import Learn
 from sweeps.study_base import QuickStudy, Table, write_table
 
-# `learned_gru.npz` is the law of 0.3, with which most variants start.
+# `learned_gru.npz` and `learned_mlp.npz` are the laws of 0.3, with which variants start.
 DOMAINS = ("wide", "hostile", "real")
 SHARED = (
     "rps learn --domain wide hostile real --num-envs 1024 --drawn 8192 --validation 128 --every 1.5"
@@ -56,7 +56,8 @@ VARIANTS = {  # options after the shared ones
     "small steps": f"{_WARM} --target-kl 0.004",
     "width 128": "--width 128",
     "hold 0.1 s": "--hold 0.1",
-    "mlp": "--network mlp --initial learned_small --spread 0.25 --learning-rate 2e-4",
+    "mlp": "--network mlp --initial sweeps/learned/learned_mlp.npz --spread 0.25"
+    " --learning-rate 2e-4",
     "mlp, width 32": "--network mlp --width 32",
     "continued": _CONTINUED,
     "continued, 4,096 worlds": f"{_CONTINUED} --num-envs 4096 --num-minibatches 16 --seed 1",

@@ -92,9 +92,7 @@ _VARIANTS = tuple(
 )
 _CONTINUED = tuple(
     f"rps sweeps/learned/variants.py --variants '{name}' --minutes 11 --out runs/continued_{i}"
-    for i, name in enumerate(
-        ("continued", "continued, 4,096 worlds", "continued, failures cost 2")
-    )
+    for i, name in enumerate(("continued", "continued, 4,096 worlds", "continued, failures cost 2"))
 )
 _RIVALS = ("rps", "pursuit", "dipole", "force_push", "force_push_published")
 _SWEPT = "sweep --laws rps_tuned --domain wide"
