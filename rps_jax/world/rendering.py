@@ -52,7 +52,8 @@ _SHADOWS_FROM = 240  # [px] height of an image: they take most of the time witho
 
 _FIX_GL = (
     "MuJoCo cannot draw on this machine: install Mesa's EGL library (`apt install libegl1 "
-    "libgl1-mesa-dri`) and set MUJOCO_GL=egl, or set MUJOCO_GL=osmesa (`apt install libosmesa6`)."
+    "libopengl0 libgl1-mesa-dri`) and set MUJOCO_GL=egl, or set MUJOCO_GL=osmesa (`apt install "
+    "libosmesa6`)."
 )
 
 
