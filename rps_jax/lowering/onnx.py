@@ -81,7 +81,7 @@ class Graph(Target):
         """Return the result of an operator."""
         out = Tensor(f"value_{len(self.nodes)}", tuple(shape), kind)
         names = [tensor.name for tensor in inputs]
-        self.nodes.append(self.onnx.helper.make_node(op, names, [out.name], **attributes))
+        self.nodes.append(self.onnx.helper.make_node(op, names, [out.name], out.name, **attributes))
         return out
 
     def reshaped(self, value: Value, shape: Sequence[int]) -> Tensor:
