@@ -55,4 +55,4 @@ static int __any_sync(unsigned, int x) {
 static void __syncwarp() { together(0, 1001); }
 static float __int_as_float(int x) { return as<float>((uint32_t)x); }
 static int __float_as_int(float x) { return (int)word(x); }
-static float rsqrtf(float x) { return 1.0f / sqrtf(x); }
+#define rsqrtf(x) (1.0f / sqrtf(x))  // a function of the C library from glibc 2.43 on
