@@ -3,6 +3,7 @@
 import re
 import runpy
 import time
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import NamedTuple
@@ -14,9 +15,10 @@ import pytest
 from helpers import observation, refusal, refusals, rps, same
 from staging import recompiled
 
+import rps_jax
 from rps_jax import engines
 from rps_jax.control import registry
-from rps_jax.control.base import Law
+from rps_jax.control.base import Bound, Law
 from rps_jax.control.laws import rps as rps_law
 from rps_jax.control.laws.rps import RPSParams, RPSState, step
 from rps_jax.control.learned import policy
@@ -30,8 +32,9 @@ from rps_jax.robot.skin import CapacitiveSkin
 from rps_jax.runs.plan import Plan, load_plan, open_run, scene_of
 from rps_jax.trials import pushes
 from rps_jax.trials.case import Case
-from rps_jax.trials.setting import Setting
+from rps_jax.trials.setting import Rules, Setting
 from rps_jax.trials.worlds import drawn_worlds
+from rps_jax.tuning.space import Space
 from rps_jax.world import draws, objects, scene
 from rps_jax.world.domain import Domain, Range, from_json, parse_domain, to_json
 from rps_jax.world.scene import FRICTION, Friction, WorldInputs
@@ -227,6 +230,7 @@ test_invalid_laws_are_rejected = refusals(
     register_law,
     (("rps", rps_law.LAW, RPSParams()), "name of a law = rps is not allowed"),
     (("p", NO_LAW, Ahead(v=float("nan"))), "v = nan is not allowed"),
+    (("p", replace(NO_LAW, bounds={"w": Bound(0, 1)}), Ahead()), "bound of law 'p' 'w': .* v,"),
     (("p", NO_LAW, (1.0, 2.0)), "a field or property d_success"),
     (("p", NO_LAW, RPSParams()), "the law 'rps' has a class of the same name RPSParams"),
 )
@@ -305,6 +309,16 @@ def test_the_command_line_accepts_registered_names(tmp_path, capsys, hexagon):
 
 
 LAW = EXAMPLES / "custom_law.py"
+
+
+def test_the_bounds_of_a_custom_law_are_a_mapping(registries):
+    names = example("custom_law")
+    law = Law(lambda params: (), names["step"], bounds={"v": Bound(0.01, 0.1)})
+    register_law("p_control", law, names["PParams"]())
+    candidates = Space(("v",), names["PParams"]()).params([[0.0]])
+    setting = Setting(rules=Rules(horizon=1.0))
+    results = rps_jax.evaluate(candidates, "wide,objects=box", 1, setting=setting)
+    assert results.v.values == pytest.approx([0.055])
 
 
 def test_commands_accept_a_law_of_a_file(tmp_path, capsys):

@@ -3,7 +3,7 @@
 import contextlib
 import re
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import (
@@ -126,7 +126,8 @@ class Law(Generic[Params, State, Obs]):
     step: Callable[[Params, State, Obs], tuple[State, Twist, Details]]
     senses: Senses = "touch"
     check: Callable[[Params], Params] = check_finite_leaves  # raises InputError for bad params
-    bounds: tuple[tuple[str, Bound], ...] = ()  # of the parameters that may be tuned
+    # Of the parameters that may be tuned, by name.
+    bounds: Mapping[str, Bound] | tuple[tuple[str, Bound], ...] = ()
     # Defaults of an earlier version that differ; a file of changes must name these parameters.
     earlier: tuple[tuple[str, float], ...] = ()
     # Default widths of the smoothed law, which `init` and `step` accept as the keyword
@@ -136,3 +137,6 @@ class Law(Generic[Params, State, Obs]):
     cell: LoadCell = LoadCell()  # the sensor of a law that senses force
     # (params, state, obs, sent twist) -> state, for a law whose state holds its last command.
     observe_sent: Callable[[Params, State, Obs, Twist], State] | None = None
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "bounds", tuple(dict(self.bounds).items()))  # a law is hashable

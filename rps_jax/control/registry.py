@@ -160,6 +160,8 @@ def register_law(name: str, law: Law, params: LawParams) -> None:
         raise errors.not_allowed(f"params of law '{name}'", params, rule)
     errors.check_finite(f"d_success of law '{name}'", params.d_success, above=0, unit="m")
     law.check(params)
+    for parameter in dict(law.bounds):
+        errors.check_name(f"bound of law '{name}'", parameter, named_leaves(params))
     for label, known in (_HIDDEN | LAWS).items():
         if label != name and type(known).__name__ == kind.__name__ and law_of(known) != law:
             rule = f"the law '{label}' has a class of the same name {kind.__name__}; rename one"

@@ -337,7 +337,7 @@ LAW = Law(
     RPSState.init,
     step_with_details,
     check=check,
-    bounds=tuple(BOUNDS.items()),
+    bounds=BOUNDS,
     temperatures=Temperatures(),
     earlier=(("saturate_first", 0.0),),
 )

@@ -167,5 +167,5 @@ def step(
     return RPSPlusState(law_state, p_world_last, steps_lost), twist, details
 
 
-LAW = Law(init, step, check=check, bounds=tuple(BOUNDS.items()), temperatures=Temperatures())
+LAW = Law(init, step, check=check, bounds=BOUNDS, temperatures=Temperatures())
 PRESETS = {"rps_plus": RPSPlusParams()}
