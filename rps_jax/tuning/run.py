@@ -158,7 +158,10 @@ class Tuning(TaskOption, LawQuestion[xr.Dataset]):
         _ = seed_of(self.setting.seed, "tune")
         if not registry.law_of(self.params).bounds:
             names = [n for n, params in registry.LAWS.items() if registry.law_of(params).bounds]
-            rule = f"its parameters have no bounds; choose from {', '.join(names)}"
+            rule = (
+                f"its parameters have no bounds; choose from {', '.join(names)}, or give a custom "
+                'law Law(..., bounds={"NAME": Bound(low, high)})'
+            )
             raise errors.not_allowed("law", self.label, rule)
         for domain in self.domains:
             self.setting.check_domain(domain, [self.space.base])
@@ -286,10 +289,11 @@ class Tuning(TaskOption, LawQuestion[xr.Dataset]):
             f"{', '.join(totals)}."
         )
         if run.folder is not None:
-            law = f"{self.label},{run.folder / TUNED}"
+            start = self.law if isinstance(self.law, str) else self.label
+            law = f"{start},{run.folder / TUNED}"
             text += (
                 f" The law with these parameters is `{law}`; "
-                f"`rps ladder --laws {shlex.join([self.label, law])}` tests it on all objects."
+                f"`rps ladder --laws {shlex.join([start, law])}` tests it on all objects."
             )
         rows = [["parameter", "start", "tuned"]]
         start = registry.named_leaves(self.space.base)
