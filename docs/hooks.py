@@ -215,11 +215,15 @@ def listing(path: Path) -> str:
 
 def reference() -> dict[str, str]:
     """Return an index with one sentence for each name, and a page for each subpackage."""
-    names = [
-        f"| [`rps_jax.{name}`]({home.split('.')[1]}.md#{home}.{name}) | "
-        f"{summary(inspect.getdoc(getattr(rps_jax, name)))} |"
-        for name, home in sorted(rps_jax._HOMES.items())
-    ]
+    names = []
+    for name, home in sorted(rps_jax._HOMES.items()):
+        value = getattr(rps_jax, name)
+        source = inspect.unwrap(value) if callable(value) else value  # the class of a command
+        anchor = f"{getattr(source, '__module__', home)}.{getattr(source, '__qualname__', name)}"
+        names += [
+            f"| [`rps_jax.{name}`]({anchor.split('.')[1]}.md#{anchor}) | "
+            f"{summary(inspect.getdoc(value))} |"
+        ]
     modules = []
     for room in PAGES:
         paths = sorted((ROOT / "rps_jax" / room).glob("[a-z]*.py"))

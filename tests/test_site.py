@@ -166,7 +166,7 @@ def site(tmp_path_factory):
     """Folder and address of the built site."""
     folder = tmp_path_factory.mktemp("site")
     environment = os.environ | {"NO_MKDOCS_2_WARNING": "1"}
-    words = (sys.executable, "-m", "mkdocs", "build", "-q", "--strict", "-d", folder)
+    words = (sys.executable, "-m", "mkdocs", "build", "--strict", "-d", folder)
     output_of(*words, cwd=ROOT, env=environment)
     handler = functools.partial(Quiet, directory=str(folder))
     with http.server.ThreadingHTTPServer(("127.0.0.1", 0), handler) as server:
