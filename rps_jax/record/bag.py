@@ -279,6 +279,17 @@ def read(path: str | Path, topics: TopicsLike = ()) -> dict[str, np.ndarray]:
     Raises:
       InputError: the path is no bag; the bag is damaged or too large, or lacks a topic; or its
         messages have no order, numbers that are not finite, an unknown frame, or no rotation.
+
+    Example:
+      >>> import tempfile
+      >>> import rps_jax
+      >>> from rps_jax.record import bag
+      >>> brief = rps_jax.Setting("quasistatic", rules=rps_jax.Rules(horizon=3.0))
+      >>> with tempfile.TemporaryDirectory() as folder:
+      ...     trace = rps_jax.push("cylinder", bag=f"{folder}/push.mcap", setting=brief)
+      ...     steps = bag.read(f"{folder}/push.mcap")
+      >>> steps["twist"].shape  # 50 steps a second, and the last one
+      (151, 3)
     """
     names = topic_names(topics)
     check()
