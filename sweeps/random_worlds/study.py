@@ -46,7 +46,7 @@ class RandomWorlds(TrialStudy[xr.Dataset]):
     laws: tuple[str, ...] = ("rps", "rps_tuned", "rps_plus", "learned")
     """Laws to compare."""
     domains: tuple[str, ...] = ("wide", "real", "hostile", "wide,task=path", "wide,task=corridor")
-    """Domains from which worlds are drawn, by default all domains and all tasks without a map."""
+    """Domains from which worlds are drawn, with the tasks whose paths are drawn."""
     worlds: int = option(10_000, 2, 10_000_000)
     """Number of worlds of a domain."""
     panel: int = option(2_000, 0, 10_000_000)
