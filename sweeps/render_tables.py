@@ -47,7 +47,7 @@ STALE: dict[str, str] = {
     **dict.fromkeys(
         (
             *("engines_wide", "rivals_tuned", "export_bags", "export_inputs", "export_odd"),
-            *("export_paper", "export_speed", "export_trials", "export_worlds", "fit_bags"),
+            *("export_paper", "export_speed", "export_trials", "export_worlds"),
         ),
         _READING,
     ),
@@ -55,8 +55,7 @@ STALE: dict[str, str] = {
     **dict.fromkeys(
         (
             *("arena", "commands", "commands_gpu", "compilers", "compilers_gpu", "costs"),
-            *("derivatives", "derivatives_gpu", "kernel", "levers", "robot", "speed"),
-            *("speed_cores", "tasks_cost_cpu", "tasks_cost_gpu"),
+            *("derivatives_gpu", "kernel", "levers", "speed", "tasks_cost_gpu"),
         ),
         "later changes of the code, which small runs do not time",
     ),
