@@ -100,8 +100,8 @@ _SWEPT = "sweep --laws rps_tuned --domain wide"
 
 # In order of importance, which is the order of computation.
 RECIPES: dict[str, Recipe] = {
-    "headline": recipe(f"rps sweeps/random_worlds --in-c 0 {_MACHINE}", gpu=20),
-    "models": recipe(f"rps sweeps/random_worlds --in-c 0 {_MACHINE}", gpu=20),
+    "headline": recipe(f"rps sweeps/random_worlds {_MACHINE}", gpu=20),
+    "models": recipe(f"rps sweeps/random_worlds {_MACHINE}", gpu=20),
     "million": recipe(f"rps sweeps/random_worlds/million.py {_MACHINE}", gpu=9),
     "rest": recipe(f"rps sweeps/fidelity/rest.py {_MACHINE}", cores=5),
     "reading_*": recipe(f"rps sweeps/paper_reading {_MACHINE}", gpu=10),
