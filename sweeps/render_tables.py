@@ -45,20 +45,10 @@ _SATURATED = "omega followed from the saturated v_x, and "
 _READING = _SATURATED + _LOADS
 STALE: dict[str, str] = {
     **dict.fromkeys(
-        (
-            *("engines_wide", "rivals_tuned", "export_bags", "export_inputs", "export_odd"),
-            *("export_paper", "export_speed", "export_trials", "export_worlds"),
-        ),
-        _READING,
+        ("export_bags", "export_odd", "export_paper", "export_trials", "export_worlds"), _READING
     ),
-    **dict.fromkeys(("attack", "million", "sb3", "sensitivity"), _LOADS),
-    **dict.fromkeys(
-        (
-            *("arena", "commands", "commands_gpu", "compilers", "compilers_gpu", "costs"),
-            *("derivatives_gpu", "kernel", "levers", "speed", "tasks_cost_gpu"),
-        ),
-        "later changes of the code, which small runs do not time",
-    ),
+    "sb3": _LOADS,
+    **dict.fromkeys(("arena", "levers"), "later changes of the code, which small runs do not time"),
     "plus": "`learned` replaced `learned_gru`",
     "fidelity": _SATURATED + "objects slid on today's ground",
 }
