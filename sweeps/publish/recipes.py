@@ -55,16 +55,16 @@ _IDEAL = (
     "velocity_error=0:0"
 )
 _PLUS = {
-    "`wide`, 10,000": _LADDERS[0],
+    "`wide`, 10,000": "rps ladder --domain wide --worlds 10000 --seed 10 --laws rps_plus rps_tuned",
     "`wide` in C MuJoCo, 500": "rps ladder --domain wide --worlds 500 --seed 11 --engine mujoco "
-    "--laws rps_plus rps_tuned learned",
-    "`hostile`, 10,000": _LADDERS[1],
+    "--laws rps_plus rps_tuned",
+    "`hostile`, 10,000": "rps ladder --domain hostile --worlds 10000 --seed 10 "
+    "--laws rps_plus rps_tuned",
     "`hostile` in C MuJoCo, 500": "rps ladder --domain hostile --worlds 500 --seed 11 "
-    "--engine mujoco --laws rps_plus rps_tuned learned",
+    "--engine mujoco --laws rps_plus rps_tuned",
     "`hostile`, quasi-static, 1,000": "rps ladder --domain hostile --worlds 1000 --seed 8 "
     "--engine quasistatic --laws rps_plus rps_tuned",
-    "`real`, 10,000": "rps ladder --domain real --worlds 10000 --seed 10 "
-    "--laws rps rps_tuned rps_plus",
+    "`real`, 10,000": "rps ladder --domain real --worlds 10000 --seed 10 --laws rps_plus rps_tuned",
     "`paper`, the paper's grid, 144": "rps ladder --domain paper --seed 7 "
     "--laws rps_plus rps_tuned",
 }
@@ -141,7 +141,11 @@ RECIPES: dict[str, Recipe] = {
         labels=("", "", *_WIDE),
     ),
     "plus": recipe(
-        *tuple(_PLUS.values()), gpu=12, section=rows.plus_beside_tuned, labels=tuple(_PLUS)
+        *tuple(_PLUS.values()),
+        cores=45,
+        gpu=8,
+        section=rows.plus_beside_tuned,
+        labels=tuple(_PLUS),
     ),
     "tuned": recipe(
         "rps ladder --laws rps rps_tuned --domain wide hostile real --worlds 10000 --seed 4",
