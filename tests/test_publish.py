@@ -354,6 +354,7 @@ def test_the_code_of_the_page_reads_a_million_outcomes(tmp_path, monkeypatch, ca
     results = study()
     files.write_results(tmp_path / "million.nc", million.packed(results))
     seeded = replace(setting, seed=seed_of(37, "test"))
+    assert results.attrs["seed"] == seeded.seed  # with which the page draws the worlds again
     swept = sweep(laws, near, 19, setting=seeded, slots=32)
     bits = np.unpackbits(results.success.values, axis=1, count=19)
     np.testing.assert_array_equal(bits, swept.success)

@@ -1,6 +1,6 @@
 """Outcomes of a million worlds in one file, so that failures can be studied without a GPU.
 
-    rps sweeps/random_worlds/million.py --machine "one NVIDIA H100"
+    rps sweeps/random_worlds/million.py --machine "one NVIDIA H200"
 
 runs three laws in the same 1,048,576 worlds of `wide` and writes `million.nc`: the end of each
 trial, its time and its smallest distance to the target. `rps_jax.world.draws` computes the drawn
@@ -78,15 +78,16 @@ class Million(TrialStudy[xr.Dataset]):
         results = run_parts(run, "law", parts, self.worlds)
         for name, long_name in _LONG_NAMES.items():
             results[name].attrs["long_name"] = long_name
-        ranges, seed = domains.parse_domain(self.domain), self.test_setting.seed
         results.attrs = {
-            "domain": self.domain,
-            "seed": seed,
-            "objects": " ".join(ranges.objects),
+            "objects": " ".join(domains.parse_domain(self.domain).objects),
             "control_period": self.setting.physics.control_period,
             "max_lost": float(self.setting.rules.max_lost),
         }
         return results
+
+    def attributes(self) -> dict[str, str | int]:
+        """Return the attributes of the results, with the seed of `draws.draw`."""
+        return super().attributes() | {"seed": self.test_setting.seed}
 
     def report_tables(self, results: xr.Dataset) -> Sequence[Table]:
         """Return the ends of each law's trials."""
