@@ -16,6 +16,7 @@ import hashlib
 import itertools
 import operator
 import os
+import platform
 import re
 import subprocess
 import tempfile
@@ -47,6 +48,8 @@ _FLAGS = ("-O2", "-march=native", "-fno-math-errno", "-ffp-contract=fast", "-w")
 # Without these passes the compiler takes half of the time, and the functions are as fast.
 _FLAGS += ("-fno-gcse", "-fno-rerun-cse-after-loop", "-fno-tree-dse")
 _FLAGS += ("--param", "sccvn-max-alias-queries-per-access=30")
+if platform.machine() in ("x86_64", "AMD64"):  # GCC splits vectors where it prefers shorter ones
+    _FLAGS += ("-mprefer-vector-width=512",)
 _NAME = "rps_native_"
 # Threads of a GPU that compute a world in whole trials, whose worlds are sorted, and in other
 # functions: the second number if shared memory is short.
