@@ -18,7 +18,7 @@ from typing import Any, ClassVar
 import numpy as np
 import xarray as xr
 
-from rps_jax.analysis import tables
+from rps_jax.analysis import statistics, tables
 from rps_jax.control import registry
 from rps_jax.record.options import option
 from rps_jax.runs import execution, model_panel
@@ -41,10 +41,19 @@ class RandomWorlds(TrialStudy[xr.Dataset]):
 
     TITLE: ClassVar[str] = "Four laws in random worlds"
     QUICK: ClassVar[Mapping[str, object]] = {"worlds": 24, "panel": 0, "in_c": 0}
-    GROWS: ClassVar[tuple[str, ...]] = ("domains", "panel", "in_c", "only", "run_missing")
+    GROWS: ClassVar[tuple[str, ...]] = (
+        "against",
+        "domains",
+        "panel",
+        "in_c",
+        "only",
+        "run_missing",
+    )
 
     laws: tuple[str, ...] = ("rps", "rps_tuned", "rps_plus", "learned")
     """Laws to compare."""
+    against: str = "rps_plus"
+    """Law with which the others are compared world by world, if it is one of them."""
     domains: tuple[str, ...] = ("wide", "real", "hostile", "wide,task=path", "wide,task=corridor")
     """Domains from which worlds are drawn, with the tasks whose paths are drawn."""
     worlds: int = option(10_000, 2, 10_000_000)
@@ -99,6 +108,11 @@ class RandomWorlds(TrialStudy[xr.Dataset]):
             f"{self.worlds:,} worlds of seed {self.setting.seed}, the same for all laws. "
             "Intervals: Wilson 95 %."
         )
+        if self.against in self.laws:
+            text += (
+                f" Against {self.against}: worlds in which only the law succeeds, worlds in which "
+                f"only {self.against} does, and p of the exact McNemar test."
+            )
         has_panel = results.sizes["model"] > 1
         tables = []
         if model_panel.REQUESTED in results.model:
@@ -107,7 +121,8 @@ class RandomWorlds(TrialStudy[xr.Dataset]):
                 "time steps and engines, each in the first of these worlds."
             )
             text += over * has_panel
-            tables.append(Table(rate_table(results), name="headline", title="Success", text=text))
+            table = rate_table(results, self.against)
+            tables.append(Table(table, name="headline", title="Success", text=text))
         if has_panel or not tables:
             tables.append(Table(panel_table(results), name="models", title="Models"))
         unpublished = {"name": ""} if self.only else {}
@@ -137,9 +152,9 @@ def rates(results: xr.Dataset, domain: str, law: str) -> dict[str, tuple[int, in
     }
 
 
-def rate_table(results: xr.Dataset) -> Rows:
+def rate_table(results: xr.Dataset, against: str) -> Rows:
     """Return a header and one row per domain and law, without columns that are empty."""
-    rows = [_rate_row(results, *pair) for pair in _domains_and_laws(results)]
+    rows = [_rate_row(results, *pair, against) for pair in _domains_and_laws(results)]
     names = [name for name in rows[0] if any(row[name] for row in rows)]
     return [names, *([row[name] for name in names] for row in rows)]
 
@@ -148,14 +163,21 @@ def _domains_and_laws(results: xr.Dataset) -> Iterator[tuple[str, str]]:
     return product(map(str, results.domain.values), map(str, results.law.values))
 
 
-def _rate_row(results: xr.Dataset, domain: str, law: str) -> dict[str, str]:
+def _rate_row(results: xr.Dataset, domain: str, law: str, against: str) -> dict[str, str]:
     by_model = rates(results, domain, law)
     default = results.sel(domain=domain, law=law, model=model_panel.REQUESTED)
     median = float(default.time.where(default.success == 1).median())
+    difference = ""
+    if law != against and against in results.law:
+        base = results.success.sel(domain=domain, law=against, model=model_panel.REQUESTED)
+        compared = statistics.compare(base, default.success)
+        p = f"p {compared.p:.1g}" if compared.p else "p < 1e-300"
+        difference = f"+{compared.gained} -{compared.lost}, {p}"
     return {
         "domain": domain,
         "law": law,
         "success": tables.share(*by_model[model_panel.REQUESTED]),
+        f"against {against}": difference,
         "over the models": _rate_range(by_model) if len(by_model) > 1 else "",
         "in C MuJoCo": tables.share(*by_model[IN_C]) if IN_C in by_model else "",
         "median time of a success": f"{median:.1f} s" if np.isfinite(median) else "-",
