@@ -154,6 +154,7 @@ def printed(
       InputError: the command failed or exceeded the time limit [s].
     """
     variables = os.environ | {"RPS_CACHE": f"{folder}/cache"} | dict(environment or {})
+    variables.pop("PYTHONDONTWRITEBYTECODE", None)  # compiling modules takes half of a start
     if gpus is not None:
         variables["CUDA_VISIBLE_DEVICES"] = ",".join(map(str, range(gpus)))
         variables.pop("JAX_PLATFORMS", None)
