@@ -56,6 +56,9 @@ STALE: dict[str, str] = {
         ),
         "an option of the C compiler made the fused engine 1.4 times faster on Intel processors",
     ),
+    **dict.fromkeys(
+        ("commands_gpu", "gpus"), "commands were timed with compiled Python modules in the cache"
+    ),
     "plus": "`learned` replaced `learned_gru`",
     "fidelity": _SATURATED + "objects slid on today's ground",
 }
