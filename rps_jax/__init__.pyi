@@ -6,7 +6,6 @@ __version__: str
 # --- ask ---------------------------------------------------------------------------------------
 from rps_jax.runs.push import push as push
 from rps_jax.runs.push import replay as replay
-from rps_jax.runs.predict_push import predict_push as predict_push
 from rps_jax.studies.table import table as table
 from rps_jax.studies.hardware import hardware as hardware
 from rps_jax.studies.paper import paper as paper

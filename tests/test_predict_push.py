@@ -1,15 +1,16 @@
 """Slow pushes by fingers: cases that are solved by hand, similarity, and a real push."""
 
+import doctest
+
 import numpy as np
 import pytest
 
-import rps_jax
-from rps_jax.engines import fingers
 from rps_jax.errors import InputError
 from rps_jax.geometry import solid
 from rps_jax.geometry.solid import rotate
-from rps_jax.runs.predict_push import uniform_pressure
-from sweeps.real_pushes import pushes, study
+from sweeps.real_pushes import fingers, pushes, study
+from sweeps.real_pushes import predict_push as predict_push_
+from sweeps.real_pushes.predict_push import predict_push, uniform_pressure
 
 SQUARE = np.array([[-0.1, -0.1], [0.1, -0.1], [0.1, 0.1], [-0.1, 0.1]])
 FEET = np.array([[-0.08, -0.06], [0.08, -0.06], [0.0, 0.08]])
@@ -20,7 +21,7 @@ MODELS = pytest.mark.parametrize("model", ["feet", "ellipsoid"])
 
 
 def moved(path=AHEAD, outline=SQUARE, **options):
-    return rps_jax.predict_push(outline, path, **KNOWN | options)
+    return predict_push(outline, path, **KNOWN | options)
 
 
 @MODELS
@@ -142,13 +143,17 @@ def test_a_real_push_ends_where_it_was_measured():
     known = {"mass": pushes.MASS, "friction_ground": 0.28, "friction_finger": 0.5}
     pose = pushes.initial_poses(row)[0]
     options = {"pose": pose, "feet": feet, "height": pushes.PUSHED_AT}
-    result = rps_jax.predict_push(pushes.OUTLINE, path, **options, **known)
+    result = predict_push(pushes.OUTLINE, path, **options, **known)
     off = pushes.errors_of(result.object_pose.values[-1], pushes.measured(row)[0])
     still = pushes.errors_of(pose, pushes.measured(row)[0])
     assert off.both < 2e-3
     assert off.both < still.both / 4
     measured = np.hypot(row.force_wx[0], row.force_wy[0])
     assert np.linalg.norm(result.force[-1]) == pytest.approx(measured, rel=0.2)
+
+
+def test_the_example_of_the_docstring_runs():
+    assert doctest.testmod(predict_push_) == (0, 6)
 
 
 REFUSED = {

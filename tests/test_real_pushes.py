@@ -8,10 +8,9 @@ import pytest
 import xarray as xr
 from helpers import ROOT
 
-from rps_jax.engines import fingers
 from rps_jax.errors import InputError
 from rps_jax.geometry.solid import rotate
-from sweeps.real_pushes import contact, pushes, study
+from sweeps.real_pushes import contact, fingers, pushes, study
 from sweeps.real_pushes.pushes import COM, OUTLINE
 
 STEPS = 30

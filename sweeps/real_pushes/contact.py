@@ -15,10 +15,9 @@ import mujoco
 import numpy as np
 import pandas as pd
 
-from rps_jax.engines import fingers
 from rps_jax.geometry.solid import rotate
 from rps_jax.world.physics import MUJOCO_GROUND, Physics, preset
-from sweeps.real_pushes import pushes
+from sweeps.real_pushes import fingers, pushes
 
 _FINE = 400  # parts of a way, between which fingers go straight
 _SETTLE = 0.5  # [s] that the object stands before the push

@@ -14,11 +14,10 @@ import jax.numpy as jnp
 import numpy as np
 import pandas as pd
 
-from rps_jax.engines import fingers
-from rps_jax.engines.fingers import Ground, Pushed
 from rps_jax.geometry import planar
 from rps_jax.geometry.solid import GRAVITY, rotate, supported_load
-from sweeps.real_pushes import pushes
+from sweeps.real_pushes import fingers, pushes
+from sweeps.real_pushes.fingers import Ground, Pushed
 from sweeps.real_pushes.pushes import COM, OUTLINE
 
 QUANTITIES = ("friction object-finger", "friction object-ground", "pressure x", "pressure y")

@@ -15,11 +15,11 @@ import pandas as pd
 import xarray as xr
 
 from rps_jax import errors
-from rps_jax.engines import fingers
-from rps_jax.engines.fingers import Ground
 from rps_jax.errors import InputError
 from rps_jax.geometry.solid import rotate
-from rps_jax.runs.predict_push import uniform_pressure
+from sweeps.real_pushes import fingers
+from sweeps.real_pushes.fingers import Ground
+from sweeps.real_pushes.predict_push import uniform_pressure
 
 PushTable = pd.DataFrame | xr.Dataset | Path | str
 DATA = Path(__file__).parent / "data"

@@ -6,7 +6,7 @@
 predicts where each push ends with several models, and tells how far that is from where it was
 measured. Friction at the fingers is fitted on one half of the pushes, and all are judged on the
 other. Pushes of a file in the same columns are all judged, with the friction of `FRICTION`. In
-Python, `rps_jax.predict_push` predicts the motion of any known object.
+Python, `predict_push.predict_push` predicts the motion of any known object.
 """
 
 from __future__ import annotations

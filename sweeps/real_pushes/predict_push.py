@@ -11,9 +11,9 @@ from numpy.typing import ArrayLike
 from scipy.interpolate import make_interp_spline
 
 from rps_jax import errors
-from rps_jax.engines import fingers
 from rps_jax.geometry import footprint, solid
 from rps_jax.trials.results import POSE, labelled
+from sweeps.real_pushes import fingers
 
 Support = Literal["feet", "ellipsoid"]
 _STEPS = 500  # of a push by the width of the object
@@ -66,11 +66,11 @@ def predict_push(
       InputError: an argument is not allowed, or the object would tip over.
 
     Example:
-      >>> import rps_jax
+      >>> from sweeps.real_pushes.predict_push import predict_push
       >>> square = [(-0.1, -0.1), (0.1, -0.1), (0.1, 0.1), (-0.1, 0.1)]
       >>> path = [(-0.11, 0.02), (-0.06, 0.02)]  # off the centre, so the square turns
       >>> known = {"mass": 2.0, "friction_ground": 0.3, "friction_finger": 0.5}
-      >>> push = rps_jax.predict_push(square, path, **known)
+      >>> push = predict_push(square, path, **known)
       >>> push.object_pose[-1].values.round(2).tolist()
       [0.04, -0.01, -0.07]
     """
