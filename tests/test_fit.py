@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 import pytest
 import xarray as xr
-from helpers import refusal, rps, same
+from helpers import ROOT, refusal, rps, same
 
 import rps_jax
 from rps_jax.errors import InputError
@@ -17,10 +17,10 @@ from rps_jax.geometry import solid
 from rps_jax.record import bag
 from rps_jax.robot.robot import Robot
 from rps_jax.robot.skin import with_contacts
-from rps_jax.tuning import fit, least_squares, logs, posterior
+from rps_jax.tuning import fit, logs, posterior
 from rps_jax.world import domain as domains
 from rps_jax.world import points
-from sweeps.fit import bags, methods
+from sweeps.fit import bags, least_squares, methods, windows
 from sweeps.real_pushes import fit as real
 from sweeps.real_pushes import problem
 
@@ -465,11 +465,11 @@ def object_log(tmp_path):
     )
 
 
-GRADIENT_FAULTS = {
-    "lack object_x, object_y and object_yaw: log them, or choose neural": lambda t: t.drop(
+WINDOW_FAULTS = {
+    "they lack object_x, object_y and object_yaw: log them, or use rps fit": lambda t: t.drop(
         columns=["object_x", "object_y", "object_yaw"]
     ),
-    r"have 2 windows of 2 s that are mostly in contact, and it needs 5: give longer": put(
+    "they have 2 windows of 2 s that are mostly in contact, and 5 are needed: give longer": put(
         "contact_type", 0, slice(200, None)
     ),
 }
@@ -477,24 +477,24 @@ GRADIENT_FAULTS = {
 
 OPTION_FAULTS = {
     "mujoco": ("--engine", "mujoco"),
-    "replays windows on a level, uniform floor": ("--domain", "wide,slope=0:0.1"),
+    "windows are replayed on a level, uniform floor": ("--domain", "wide,slope=0:0.1"),
 }
 
 
-@pytest.mark.parametrize("message", [*GRADIENT_FAULTS, *OPTION_FAULTS])
+@pytest.mark.parametrize("message", [*WINDOW_FAULTS, *OPTION_FAULTS])
 def test_logs_that_cannot_be_replayed_are_refused(message, object_log, tmp_path, compiled, capsys):
-    if message in GRADIENT_FAULTS:
-        written(object_log, GRADIENT_FAULTS[message](pd.read_csv(object_log)))
-    options = *OPTION_FAULTS.get(message, ()), "--method", "gradient", "--out", tmp_path / "run"
-    assert re.search(message, refusal(capsys, "fit", object_log, *options))
+    if message in WINDOW_FAULTS:
+        written(object_log, WINDOW_FAULTS[message](pd.read_csv(object_log)))
+    options = *OPTION_FAULTS.get(message, ()), "--out", tmp_path / "run"
+    command = ROOT / "sweeps" / "fit" / "windows.py"
+    assert re.search(message, refusal(capsys, command, object_log, *options))
     assert not compiled
 
 
-def test_both_methods_return_the_same_variables(object_log, monkeypatch, compiled, tmp_path):
-    """Only the gradient has eigenvalues; its report names what the windows do not determine."""
+def test_a_fit_of_windows_returns_the_variables_of_fit(object_log, monkeypatch, compiled):
+    """It adds eigenvalues, and its report names what the windows do not determine."""
     monkeypatch.setattr(least_squares.Replay, "derivatives", linear(5, np.full(9, 0.5)))
-    options = {"method": "gradient", "worlds": 96}
-    question = fit.Fit(object_log, domain="wide,objects=random_cylinder", **options)
+    question = windows.FitWindows(object_log, domain="wide,objects=random_cylinder", worlds=6)
     assert question.num_trials() == 6
     fitted = question()
     width = len(fit.coordinates(question.ranges))

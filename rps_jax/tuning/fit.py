@@ -5,9 +5,8 @@
 The law that drove the robot pushes in many worlds of the domain, in closed loop. A neural posterior
 (`posterior`) learns to predict a world's quantities from the statistics of its log (`logs`). Logged
 commands are not replayed: pushing is unstable without feedback, so in a slightly different world
-the robot loses the object within seconds. The method `gradient` replays short windows instead, from
-measured poses of the object (`least_squares`). All logs are of one robot that pushes one object on
-one floor.
+the robot loses the object within seconds. All logs are of one robot that pushes one object on one
+floor.
 """
 
 from __future__ import annotations
@@ -19,7 +18,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property, partial
 from pathlib import Path
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -57,19 +56,15 @@ from rps_jax.trials.progress import Progress, set_phase
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import ControlLoop, Trial, World, object_pose
 from rps_jax.trials.worlds import drawn_worlds
-from rps_jax.tuning import least_squares, posterior
+from rps_jax.tuning import posterior
 from rps_jax.tuning import logs as logs_
-from rps_jax.tuning.least_squares import Replay, Track
 from rps_jax.tuning.logs import Log, RawLog
 from rps_jax.world import domain as domains
 from rps_jax.world import draws, points
 from rps_jax.world.domain import QUANTITIES, VELOCITY_ERRORS, Domain, Range, unit_of
 from rps_jax.world.draws import Draw
 
-Method = Literal["neural", "gradient"]
 _BATCH = 64  # worlds of one object that are stepped at once
-LEAST_WINDOWS = 5
-_LARGE = np.array([0.02, 0.02, 0.05])  # [m, m, rad] errors of a window in an invalid fit
 SAMPLES = 2000
 UNDETERMINED = 0.8  # share of the prior's 90 % interval above which nothing was learned
 _DELAYS = ("pose_latency", "command_delay")
@@ -141,13 +136,8 @@ class Fit(LawQuestion[Fitted], DomainQuestion[Fitted], LogsQuestion):
     IGNORED_FIELDS: ClassVar[tuple[str, ...]] = ("logs", "topics", "columns")
 
     law: LawLike = "rps"
-    method: Method = option("neural", kw_only=True)
-    """How the posterior is computed: neural (networks learn from simulated worlds, in which the law
-    pushes in closed loop) or gradient (least squares on replayed windows of the logs, by exact
-    derivatives of the engine, whatever the law; it needs the object's pose)."""
     worlds: int = option(6144, 96, 1_000_000)
-    """Number of worlds of the domain that are simulated; gradient starts from a 64th of them, and
-    from at least 6 of each object."""
+    """Number of worlds of the domain that are simulated."""
     window: float = option(30.0, 5, 300, unit="s")
     """Length of the first part of each log that is used [s]; at most that of the shortest log."""
 
@@ -184,35 +174,10 @@ class Fit(LawQuestion[Fitted], DomainQuestion[Fitted], LogsQuestion):
         fields = [k for k in logs_.OPTIONAL if all(getattr(log, k) is not None for log in logs)]
         return logs, fields
 
-    @cached_property
-    def replay(self) -> Replay:
-        """Least-squares problem of the logs."""
-        logs, fields = self.observed
-        force = "f_robot" in fields and engines.get(self.setting.engine).computes_force
-        exact, interval = self.bank.exact, self.bank.interval
-        tracks = [Track.of(log, interval, exact, force) for log in logs]
-        return Replay(self.ranges, tracks, self.setting, exact)
-
-    def _check_replay(self) -> None:
-        """Raise InputError unless the logs can be replayed and differentiated."""
-        engines.get(self.setting.engine).check_derivatives("forward", self.setting.physics)
-        rule = "the logs lack object_x, object_y and object_yaw: log them, or choose neural"
-        if any(self.ranges.surroundings):
-            rule = "it replays windows on a level, uniform floor: draw no other, or choose neural"
-        elif "object_pose" in self.observed[1]:
-            count = self.replay.num_windows
-            rule = f"the logs have {count} windows of {least_squares.WINDOW:g} s that "
-            rule += f"are mostly in contact, and it needs {LEAST_WINDOWS}: give longer logs"
-            if count >= LEAST_WINDOWS:
-                return
-        raise errors.not_allowed("method", self.method, rule)
-
     def check(self) -> None:
         _ = seed_of(self.setting.seed, "tune")
         self.check_engine([self.params])
         self.ranges.task.check_target("task", self.ranges.task, "logs have a target, so omit it")
-        if self.method == "neural":
-            check_law(self.label, registry.law_of(self.params), self.setting)
         if len({raw.exact for raw in self.raw_logs}) > 1:
             raise InputError("logs of traces and of odometry are not allowed together: fit each.")
         for raw in self.raw_logs:
@@ -224,12 +189,14 @@ class Fit(LawQuestion[Fitted], DomainQuestion[Fitted], LogsQuestion):
                     f"is {far.low:g} to {far.high:g} m: name a domain that contains it, as wide,"
                     f"distance={min(distance, far.low):.1f}:{max(distance, far.high):.1f}."
                 )
-        if self.method == "gradient":
-            self._check_replay()
+        self.check_method()
+
+    def check_method(self) -> None:
+        """Raise InputError unless the posterior can be computed for these logs and this law."""
+        check_law(self.label, registry.law_of(self.params), self.setting)
 
     def num_trials(self) -> int | None:
-        least = least_squares.STARTS * len(self.ranges.objects)
-        return self.worlds if self.method == "neural" else max(least, self.worlds // 64)
+        return self.worlds
 
     def fields_as_json(self) -> dict[str, Any]:
         """Fields as JSON; logs by the digests of their values."""
@@ -238,13 +205,13 @@ class Fit(LawQuestion[Fitted], DomainQuestion[Fitted], LogsQuestion):
 
     def answer(self, run: Run) -> Fitted:
         """Compute and sample the posterior, and summarise it."""
-        data = self._fit_windows(run) if self.method == "gradient" else self._fit_networks(run)
+        data = self.sample_posterior(run)
         fitted = fitted_domain(self.ranges, data)
         if run.folder is not None:
             files.write_json(run.folder / "fitted.json", dataclasses.asdict(fitted))
         return Fitted(data, fitted)
 
-    def _fit_networks(self, run: Run) -> xr.Dataset:
+    def sample_posterior(self, run: Run) -> xr.Dataset:
         """Simulate the missing worlds, train the posterior, and sample it for the logs."""
         simulated = self.bank.worlds(self.worlds, run)
         logs, fields = self.observed
@@ -260,35 +227,21 @@ class Fit(LawQuestion[Fitted], DomainQuestion[Fitted], LogsQuestion):
         data["outside"] = xr.DataArray(outside, {"statistic": names}, attrs={"long_name": name})
         return data
 
-    def _fit_windows(self, run: Run) -> xr.Dataset:
-        """Minimise the residuals of the replayed windows, and sample the posterior."""
-        set_phase(run.callback, "replay")
-        seed, names = self.setting.seed, points.names(self.ranges)
-        index = np.arange(self.num_trials() or 0)
-        start = points.points_of(self.ranges, index, seed_of(seed, "tune"))
-        minima = device.standard_jax()(self.replay.minima)(start)
-        u, eigenvalues = least_squares.sample(self.replay, *minima, SAMPLES, seed)
-        data = summary(self.ranges, u[:, [names.index(x) for x in coordinates(self.ranges)]])
-        words = {"units": "1", "long_name": "eigenvalue of the scaled J^T J, in units of the cube"}
-        data["eigenvalue"] = ("direction", eigenvalues, words)
-        r = minima[1][np.argmin(least_squares.cost(minima[1])), :, 3:6]
-        coords = {"statistic": [f"object_pose/{name}" for name in ("x", "y", "yaw")]}
-        words = {"long_name": "share of windows with an error above 20 mm or 0.05 rad"}
-        data["outside"] = xr.DataArray(np.mean(abs(r) > _LARGE, axis=0), coords, attrs=words)
-        return data
-
     def intro(self, results: Fitted) -> str:
         fields = self.observed[1]
         conversions = dict.fromkeys(x for raw in self.raw_logs for x in raw.conversions)
         converted = f" Converted: {', '.join(conversions)}." if conversions else ""
-        how = f"law {self.label}, in closed loop."
-        if self.method == "gradient":
-            how = f"in which {self.replay.num_windows} windows of the logs are replayed."
         return (
             f"Logs: {len(self.raw_logs)}, the first {self.bank.window:g} s of each at "
             f"{1 / self.bank.interval:.3g} Hz, with {', '.join(fields) or 'touch and odometry'}; "
-            f"{self.num_trials()} worlds of the domain {self.domain}, {how}{converted}"
+            f"{self.num_trials()} worlds of the domain {self.domain}, "
+            f"{self.use_of_worlds}.{converted}"
         )
+
+    @property
+    def use_of_worlds(self) -> str:
+        """Use of the worlds, for reports."""
+        return f"law {self.label}, in closed loop"
 
     def report(self, results: Fitted, run: Run) -> Sequence[Section]:
         data = results.data
@@ -297,16 +250,6 @@ class Fit(LawQuestion[Fitted], DomainQuestion[Fitted], LogsQuestion):
             f"{UNDETERMINED:.0%} of the prior's: the logs do not determine it, and its range is "
             f"unchanged. `rps sweep --domain {self.out}/fitted.json` simulates the fitted domain."
         )
-        if self.method == "gradient":
-            text += (
-                f" The windows determine {(data.eigenvalue > 12).sum():d} of "
-                f"{data.eigenvalue.size} combinations of quantities (eigenvalues of J^T J)."
-            )
-            if "mass" in data.quantity and "f_robot" not in self.observed[1]:
-                text += (
-                    " The mass has almost no influence, because the base follows its measured "
-                    "path with any force: log force_x and force_y."
-                )
         if (share := float(data.outside.mean())) > 0.05:
             counts = (data.outside.to_series() > 0).groupby(logs_.meaning).agg(["sum", "size"])
             parts = (f"{n} of {size} of {topic}" for topic, (n, size) in counts.iterrows() if n)

@@ -1,4 +1,4 @@
-"""Compare the methods of `rps fit` on logs of test worlds, whose true values are known.
+"""Compare three methods of fitting worlds to logs of test worlds, whose true values are known.
 
     rps sweeps/fit/methods.py
 
@@ -27,11 +27,12 @@ from rps_jax.engines import device
 from rps_jax.record.options import option
 from rps_jax.runs.question import Run, call_of, seed_of
 from rps_jax.trials.progress import no_progress, set_phase
-from rps_jax.tuning import fit, least_squares, posterior
-from rps_jax.tuning.least_squares import Replay, Track
+from rps_jax.tuning import fit, posterior
 from rps_jax.tuning.logs import Log
 from rps_jax.world import domain as domains
 from rps_jax.world import points
+from sweeps.fit import least_squares
+from sweeps.fit.least_squares import Replay, Track
 from sweeps.fit.study import FitStudy, within
 from sweeps.study_base import Rows, Table
 
@@ -46,7 +47,7 @@ _QUANTITIES = ("friction_robot", "friction_ground", "mass", "ground_force", "siz
 
 @dataclass(frozen=True)
 class Methods(FitStudy):
-    """Compare the methods of `rps fit` in worlds whose true values are known."""
+    """Compare methods of fitting worlds to logs, in worlds whose true values are known."""
 
     TITLE: ClassVar[str] = "Methods of fitting worlds to logs"
     GROWS: ClassVar[tuple[str, ...]] = ("evolution_logs",)
@@ -161,7 +162,7 @@ class Methods(FitStudy):
             track = track if "f_robot" in KINDS[kind] else track._replace(force=None)
             replay = Replay(self.ranges, [track], self.setting, False)
             u = np.random.default_rng(log).random((fit.SAMPLES, len(names)))
-            if replay.num_windows >= fit.LEAST_WINDOWS:
+            if replay.num_windows >= least_squares.LEAST_WINDOWS:
                 u, r, j = minimise(replay, starts)
                 u, _ = least_squares.sample(replay, u, r, j, fit.SAMPLES, log)
             results.append(u[:, columns])

@@ -38,6 +38,7 @@ from rps_jax.world.physics import Physics
 from rps_jax.world.points import Points
 
 WINDOW, _SETTLING = 2.0, 0.4  # [s] of a window, and of its start, in which contacts settle
+LEAST_WINDOWS = 5  # of a fit
 STARTS, _ITERATIONS = 6, 15  # of the minimisation, for each object
 _STEP = 1e-3  # of the central differences of constants on the host
 _FREEDOM = 4.0  # degrees of freedom of Student's t distribution
