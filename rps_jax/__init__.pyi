@@ -2,6 +2,7 @@
 # The public names of the package, each at its home. `rps_jax/README.md` has a table of them.
 
 __version__: str
+_REMOVED: dict[str, tuple[str, str]]
 
 # --- ask ---------------------------------------------------------------------------------------
 from rps_jax.runs.push import push as push

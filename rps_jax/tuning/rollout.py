@@ -111,7 +111,7 @@ def ease(world: World, level: jax.Array) -> World:
     return world._replace(p_world_target=jnp.where(level < 1, target, world.p_world_target))
 
 
-def _alone(function: Callable[..., T], *_: Any) -> Callable[..., T]:
+def _unmapped(function: Callable[..., T], *_: Any) -> Callable[..., T]:
     """Return the function itself, for one world, as `jax.vmap` returns it for several."""
     return function
 
@@ -218,9 +218,9 @@ def act(
 ) -> tuple[EnvBatch, jax.Array]:  # fmt: skip
     """Execute an action (N, 3) in each world; return the batch and the rewards (N,).
 
-    With `native.mapped` as `mapped`, derivatives are fastest; `_alone` is for one world.
+    With `native.mapped` as `mapped`, derivatives are fastest; `_unmapped` is for one world.
     """
-    bounded, vmap = features.clip_action(action), _alone if mapped is _alone else jax.vmap
+    bounded, vmap = features.clip_action(action), _unmapped if mapped is _unmapped else jax.vmap
     inputs = batch.memory.touch_state, batch.states.info["observation"]
     touch_state = vmap(TouchState.mark_decision)(*inputs)
 
@@ -247,7 +247,7 @@ def _act_together(
     def single(
         env: PushEnv, batch: EnvBatch, _: jax.Array, action: jax.Array
     ) -> tuple[EnvBatch, jax.Array]:  # the kernel does not copy constant fields
-        moved, reward = act(env, network, batch, jnp.zeros(()), action, _alone)
+        moved, reward = act(env, network, batch, jnp.zeros(()), action, _unmapped)
         return _with_info(moved, world=None), reward
 
     splits = np.cumsum([x.first.size for x in batches])[:-1]

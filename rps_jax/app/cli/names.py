@@ -14,6 +14,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, NamedTuple
 
+from rps_jax import _REMOVED
 from rps_jax.errors import InputError, check_name
 
 if TYPE_CHECKING:
@@ -25,7 +26,6 @@ _HEADINGS = {  # of the help, by the rooms that define commands
     "tuning": "tune and learn",
     "app": "look",
 }
-_REMOVED = {"models": "rps sweep --models", "compare": "rps ladder --domain A B"}  # of 0.3
 _DEFINITION = re.compile(r"^(\w+) = call_of\((\w+)\)$", re.MULTILINE)
 _PACKAGE = Path(__file__).parents[2]
 
@@ -85,7 +85,7 @@ def split(words: list[str]) -> tuple[str, list[str]]:
     if first.lower().endswith(".py") or "/" in first or Path(first).is_dir():
         return first, words[1:]
     if first in _REMOVED:
-        raise InputError(f"command '{first}' does not exist: use {_REMOVED[first]}.")
+        raise InputError(f"command '{first}' does not exist: use {_REMOVED[first][1]}.")
     name = " ".join(words[:2]) if first in ("tune", "export") else first
     return check_name("command", name, known()), []  # which raises
 
