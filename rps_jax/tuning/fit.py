@@ -56,8 +56,8 @@ from rps_jax.trials.progress import Progress, set_phase
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import ControlLoop, Trial, World, object_pose
 from rps_jax.trials.worlds import drawn_worlds
-from rps_jax.tuning import posterior
 from rps_jax.tuning import logs as logs_
+from rps_jax.tuning import posterior
 from rps_jax.tuning.logs import Log, RawLog
 from rps_jax.world import domain as domains
 from rps_jax.world import draws, points
