@@ -81,27 +81,35 @@ def test_rare_termination_checks_on_a_gpu_do_not_change_results(monkeypatch):
     chex.assert_trees_all_close(seldom, run("cpu"), atol=1e-6)
 
 
+# Two shape families, side by side in a merged batch of a GPU.
+FAMILIES = [case((0.6 + 0.05 * k, 0.05 * k)) for k in range(6)] + [case(AHEAD)]
+FAMILIES += [case((0.6, 0.1 * k), name="cylinder") for k in range(3)]
+LONGER = Rules(horizon=60.0)
+
+
+@pytest.fixture(scope="module")
+def apart():
+    """Outcomes of both families, one after the other."""
+    return run(FAMILIES, LONGER)
+
+
 @pytest.mark.parametrize("few", [1, 3, SLOTS])
-def test_trials_end_alike_in_the_merged_batches_of_a_gpu(monkeypatch, few):
-    """Two shape families side by side, the last trials in 1, 3 or as many slots as before."""
-    rules = Rules(horizon=60.0)
-    cases = [case((0.6 + 0.05 * k, 0.05 * k)) for k in range(6)] + [case(AHEAD)]
-    cases += [case((0.6, 0.1 * k), name="cylinder") for k in range(3)]
-    alone = run(cases, rules)
+def test_trials_end_alike_in_the_merged_batches_of_a_gpu(monkeypatch, apart, few):
+    """The last trials in 1, 3 or as many slots as before."""
     segments, ran, plain = [], [], batch._Program.compiled
     monkeypatch.setattr(batch, "_tail_slots", lambda: few)
     note = lambda self, device: ran.append(self.slots) or plain(self, device)  # noqa: E731
     monkeypatch.setattr(batch._Program, "compiled", note)
-    results = run(cases, rules, callback=lambda progress: segments.append(progress.segment))
+    results = run(FAMILIES, LONGER, callback=lambda progress: segments.append(progress.segment))
     assert ran[0] == (SLOTS, 3)
     assert ran[1:] == ([(3, 3)] if few == 3 else [])  # none is left to the last one of few = 1
     segments = [x for x in segments if x is not None]
     assert all(x.start < x.end <= y.end and x.end <= y.start for x, y in pairwise(segments))
     assert segments[0].live == {0: SLOTS, 1: 3}
-    assert alone.success.sum() > 0
+    assert apart.success.sum() > 0
     for name in ("success", "time"):
-        np.testing.assert_array_equal(getattr(results, name), getattr(alone, name))
-    np.testing.assert_allclose(results.object_pose, alone.object_pose, atol=1e-3)  # other shapes
+        np.testing.assert_array_equal(getattr(results, name), getattr(apart, name))
+    np.testing.assert_allclose(results.object_pose, apart.object_pose, atol=1e-3)  # other shapes
 
 
 @pytest.fixture(scope="module")
