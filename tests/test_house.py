@@ -6,7 +6,6 @@ import pkgutil
 import re
 import shutil
 import sys
-from functools import partial
 from importlib import import_module
 
 import pytest
@@ -67,12 +66,12 @@ def test_there_are_few_public_names_and_all_are_in_the_table():
     assert all(entry.__doc__ or not callable(entry) for entry in entries)
 
 
-DUMMY = '''"""The fused engine under another name."""
+DUMMY = '''"""The quasi-static engine under another name."""
 
-from rps_jax.engines.fused import Fused
+from rps_jax.engines.quasistatic import QuasistaticEngine
 
 
-class Dummy(Fused):
+class Dummy(QuasistaticEngine):
     """A custom engine."""
 
     name = "dummy"
@@ -80,16 +79,6 @@ class Dummy(Fused):
 
 ENGINE = Dummy()
 '''
-SWEEP = """
-import rps_jax
-from rps_jax.app import cli
-setting = rps_jax.Setting("dummy", rules=rps_jax.Rules(horizon=0.5))
-found = rps_jax.sweep("rps", "wide,objects=random_cylinder", worlds=1, setting=setting)
-print(rps_jax.__file__, found.success.size)
-cli.main(["sweep", "--help"])
-"""
-
-
 QUANTITY = """    max_compression: Range | None = drawn(
         None, 46, "1", 0.01, 0.99, "greatest compression", "skin", "max_compression"
     )
@@ -97,8 +86,10 @@ QUANTITY = """    max_compression: Range | None = drawn(
 """
 EVERYWHERE = """
 import rps_jax
+from rps_jax.app import cli
 from rps_jax.studies.ladder import Ladder
-setting = rps_jax.Setting("quasistatic", rules=rps_jax.Rules(horizon=0.5))
+print(rps_jax.__file__)
+setting = rps_jax.Setting("dummy", rules=rps_jax.Rules(horizon=0.5))
 drums = "wide,objects=random_cylinder,max_compression=0.3:0.9"
 found = rps_jax.sweep("straight,K_h=0.5", drums, worlds=8, setting=setting)
 drawn = found.max_compression
@@ -110,35 +101,40 @@ for ask in (lambda: rps_jax.sweep("strait", "wide", 1), lambda: rps_jax.attack("
         ask()
     except rps_jax.InputError as error:
         print(error)
+cli.main(["sweep", "--help"])
 """
 
 
-@pytest.fixture
-def copied(tmp_path):
-    """A function that runs Python on an extended copy of the package."""
-    shutil.copytree(PACKAGE, tmp_path / "rps_jax", ignore=shutil.ignore_patterns("__pycache__"))
-    shutil.copytree(ROOT / "mjcf", tmp_path / "mjcf")
-    environment = os.environ | {"PYTHONPATH": str(tmp_path)}
-    return partial(output_of, sys.executable, cwd=tmp_path, env=environment)
-
-
-def test_a_law_is_one_file_and_a_quantity_one_declaration(copied, tmp_path):
-    """Sweeps, ladders, attacks and errors know them with no other change."""
-    laws, domain = tmp_path / "rps_jax" / "control" / "laws", tmp_path / "rps_jax/world/domain.py"
+@pytest.fixture(scope="module")
+def printed(tmp_path_factory):
+    """What a copy of the package with another law, quantity and engine prints."""
+    folder = tmp_path_factory.mktemp("copy")
+    package = folder / "rps_jax"
+    shutil.copytree(PACKAGE, package, ignore=shutil.ignore_patterns("__pycache__"))
+    shutil.copytree(ROOT / "mjcf", folder / "mjcf")
+    laws = package / "control" / "laws"
     law = (laws / "pursuit.py").read_text().replace("PursuitParams", "StraightParams")
     (laws / "straight.py").write_text(law.replace('"pursuit"', '"straight"'))
-    text, anchor = domain.read_text(), "    def __post_init__(self) -> None:\n"
-    domain.write_text(text.replace(anchor, QUANTITY + anchor, 1))
-    assert copied("-c", EVERYWHERE).count("straight") == 4
+    (package / "engines" / "dummy.py").write_text(DUMMY)
+    for path, anchor, more in (
+        ("world/domain.py", "    def __post_init__(self) -> None:\n", QUANTITY + "{}"),
+        ("engines/__init__.py", '"quasistatic"]', '"quasistatic", "dummy"]'),
+    ):
+        text = (package / path).read_text()
+        (package / path).write_text(text.replace(anchor, more.format(anchor), 1))
+    environment = os.environ | {"PYTHONPATH": str(folder)}
+    first, _, rest = output_of(
+        sys.executable, "-c", EVERYWHERE, cwd=folder, env=environment
+    ).partition("\n")
+    assert first == str(package / "__init__.py")
+    return rest
 
 
-def test_a_custom_engine_is_one_file_and_one_line(copied, tmp_path):
+def test_a_law_is_one_file_and_a_quantity_one_declaration(printed):
+    """Sweeps, ladders, attacks and errors know them with no other change."""
+    assert printed.partition("usage:")[0].count("straight") == 4
+
+
+def test_a_custom_engine_is_one_file_and_one_line(printed):
     """It then works from Python and on the command line, which lists it."""
-    (tmp_path / "rps_jax" / "engines" / "dummy.py").write_text(DUMMY)
-    names = tmp_path / "rps_jax" / "engines" / "__init__.py"
-    source, last = names.read_text(), '"quasistatic"]'
-    assert source.count(last) == 1
-    names.write_text(source.replace(last, '"quasistatic", "dummy"]'))
-    swept, _, text = copied("-c", SWEEP).partition("\n")
-    assert swept.split() == [str(tmp_path / "rps_jax" / "__init__.py"), "1"]
-    assert "quasistatic,dummy}" in re.sub(r"\s", "", text)
+    assert "quasistatic,dummy}" in re.sub(r"\s", "", printed)
