@@ -42,11 +42,7 @@ _TEXT_CELL = re.compile(r"^(# %% \[markdown\]\n)((?:#.*\n)*)", re.MULTILINE)  # 
 # The change since each stale data file: what follows "Computed before".
 _LOADS = "random objects had loads of finite size and slid on today's ground"
 _SATURATED = "omega followed from the saturated v_x, and "
-_READING = _SATURATED + _LOADS
 STALE: dict[str, str] = {
-    **dict.fromkeys(
-        ("export_bags", "export_odd", "export_paper", "export_trials", "export_worlds"), _READING
-    ),
     "sb3": _LOADS,
     **dict.fromkeys(("arena", "levers"), "later changes of the code, which small runs do not time"),
     **dict.fromkeys(
