@@ -157,7 +157,7 @@ COMMANDS = {
         "--domain wide,mass=nan:4": r"domain mass \(low\) = nan is not allowed",
         "--domain wide,mass=4:3": "domain mass = 4 to 3 is not allowed: low must not exceed high",
         "--domain wide,masses=3:4": "unknown domain quantity 'masses': .*did you mean 'mass'",
-        "--domain paper,mass=50:60": "paper,mass=50:60 is not allowed: .* leave no mass to draw",
+        "--domain paper,mass=50:60": "domain mass = 50 to 60 is not .* leave no mass to draw",
         "--domain wide,com_offset=0:0.9": r"domain com_offset \(high\) = 0.9 is not allowed",
         "--domain hostile,load_size=0.4": r"load_size \(high\) = 0.4 .* up to 0.7 .* 0.3",
         "--laws npss": "unknown law 'npss': .*did you mean 'nps'",

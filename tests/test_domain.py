@@ -231,7 +231,17 @@ test_ranges_that_mean_nothing_are_refused = refusals(
     ({"pose_latency": Range(0, 5)}, "pose_latency"),
     ({"objects": ()}, "name each once, at least one"),
     *(({"mass": mass}, NO_RANGE) for mass in ((3, 10), 5.0, [3, 10, True])),
+    *(
+        ({"objects": PAPER_OBJECTS, name: Range(0.2, 0.3)}, f"{name} = 0.2 to 0.3 .* no {name} to")
+        for name in ("mass", "size", "aspect", "height", "com_offset", "load_size")
+    ),
 )
+
+
+def test_objects_of_files_may_replace_the_random_ones_of_a_named_domain():
+    for name in DOMAINS:
+        assert domain.parse_domain(f"{name},objects=box").objects == ("box",)
+    assert replace(WIDE, objects=("box", "random_box"), mass=Range(3, 5)).mass == Range(3, 5)
 
 
 def test_a_domain_survives_json():

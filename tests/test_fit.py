@@ -1,6 +1,7 @@
 """Fits to logs: validation of logs, their statistics, and the coverage of the posterior."""
 
 import re
+from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -323,6 +324,8 @@ def test_a_fitted_domain_keeps_undetermined_ranges_and_all_commands_read_it(tmp_
     # Even in the logarithm: from 3 (60 / 3)^0.025 to 3 (60 / 3)^0.475.
     assert fitted.mass.log
     assert fitted.mass[:2] == pytest.approx((3.23, 12.4), rel=0.03)
+    with_a_box = replace(wide, objects=("box", "random_box", "random_cylinder"))
+    assert fit.fitted_domain(with_a_box, fit.summary(with_a_box, u)).mass == wide.mass
 
 
 @pytest.mark.slow

@@ -448,6 +448,8 @@ def fitted_domain(domain: Domain, data: xr.Dataset) -> Domain:
     if velocity.low.notna().all():
         changes["velocity_error"] = Range(float(velocity.low.min()), float(velocity.high.max()))
     objects = tuple(map(str, data.object.values[data.probability.values >= 0.05]))
+    if not set(objects) & domains.RANDOM.keys():  # these draw no mass
+        changes |= {name: getattr(Domain, name) for name in domains.OBJECT_QUANTITIES}
     return dataclasses.replace(domain, objects=objects, **changes)
 
 

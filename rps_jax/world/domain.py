@@ -131,6 +131,11 @@ class Domain:
         if self.feet is not None and not set(self.objects) <= set(RANDOM):
             objects = f"{self.feet} with objects = {self.objects}"
             raise errors.not_allowed("domain feet", objects, "only random objects have drawn feet")
+        for name in () if set(self.objects) & set(RANDOM) else sorted(OBJECT_QUANTITIES):
+            # It may have the range of a named domain.
+            if (value := getattr(self, name)) not in (getattr(Domain, name), _HOSTILE.get(name)):
+                rule = f"its objects {', '.join(self.objects)} leave no {name} to draw"
+                raise errors.not_allowed(f"domain {name}", f"{value.low:g} to {value.high:g}", rule)
         for name, owner in _IMPLIED.items():
             if getattr(self, name) is not None and getattr(self, owner) is None:
                 raise errors.not_allowed(f"domain {name}", getattr(self, name), f"give {owner} too")
@@ -200,7 +205,7 @@ class Domain:
         """Names of unused ranges, whose quantities other fields of the domain determine."""
         unused = set()
         if not set(self.objects) & set(RANDOM):
-            unused |= set(quantities_of("object")) - {"friction_ground", "friction_robot"}
+            unused |= OBJECT_QUANTITIES
         if self.frictions:
             unused |= {"friction_ground", "friction_robot"}
         if self.targets or not self.task.HAS_TARGET:
@@ -234,6 +239,8 @@ def quantities_of(*owners: Owner) -> tuple[str, ...]:
     return tuple(name for name, quantity in QUANTITIES.items() if quantity.owner in owners)
 
 
+# Quantities that only random objects draw.
+OBJECT_QUANTITIES = {*quantities_of("object")} - {"friction_ground", "friction_robot"}
 # Labels of the three draws of the velocity error.
 VELOCITY_ERRORS = {f"{name}_error": f"error of {name}" for name in ("v_x", "v_y", "omega")}
 # Columns of a table of worlds, with their labels.
@@ -258,6 +265,27 @@ def _constant(value: float) -> Range:
 _ERRORS = ("noise", "gain_spread", "dead_share", "lateral", "yaw", *quantities_of("base"))
 PERFECT: dict[str, Any] = dict.fromkeys(_ERRORS, _constant(0))
 _HARDWARE: dict[str, Any] = PERFECT | {"noise": _constant(0.05), "gain_spread": _constant(0.1)}
+_HOSTILE: dict[str, Any] = {
+    "mass": Range(1, 100, log=True),
+    "size": Range(0.06, 0.45),
+    "aspect": Range(0.33, 3.0, log=True),
+    "height": Range(0.2, 1.0),
+    "com_offset": Range(0, 0.7),
+    "friction_ground": Range(0.05, 1.0),
+    "friction_robot": Range(0.05, 1.2),
+    "lateral": Range(-0.25, 0.25),
+    "yaw": Range(-math.pi, math.pi),
+    "gap": Range(0, 0.1),
+    "distance": Range(0.8, 4),
+    "noise": Range(0, 0.1),
+    "gain_spread": Range(0, 0.25),
+    "dead_share": Range(0, 0.15),
+    "pose_noise": Range(0, 0.02),
+    "yaw_noise": Range(0, 0.03),
+    "pose_latency": Range(0, 0.2),
+    "command_delay": Range(0, 0.2),
+    "velocity_error": Range(-0.1, 0.1),
+}
 DOMAINS = {
     "paper": Domain(
         objects=PAPER_OBJECTS,
@@ -284,27 +312,7 @@ DOMAINS = {
         robot_acceleration=Range(0.1, 1.0),
     ),
     "prisms": Domain(objects=("random_prism",)),  # of wide, held out from tuning
-    "hostile": Domain(
-        mass=Range(1, 100, log=True),
-        size=Range(0.06, 0.45),
-        aspect=Range(0.33, 3.0, log=True),
-        height=Range(0.2, 1.0),
-        com_offset=Range(0, 0.7),
-        friction_ground=Range(0.05, 1.0),
-        friction_robot=Range(0.05, 1.2),
-        lateral=Range(-0.25, 0.25),
-        yaw=Range(-math.pi, math.pi),
-        gap=Range(0, 0.1),
-        distance=Range(0.8, 4),
-        noise=Range(0, 0.1),
-        gain_spread=Range(0, 0.25),
-        dead_share=Range(0, 0.15),
-        pose_noise=Range(0, 0.02),
-        yaw_noise=Range(0, 0.03),
-        pose_latency=Range(0, 0.2),
-        command_delay=Range(0, 0.2),
-        velocity_error=Range(-0.1, 0.1),
-    ),
+    "hostile": Domain(**_HOSTILE),
 }
 
 
