@@ -30,6 +30,8 @@ from rps_jax.record import files
 from rps_jax.robot.robot import parse_robot
 from rps_jax.robot.skin import CapacitiveSkin
 from rps_jax.runs.plan import Plan, load_plan, open_run, scene_of
+from rps_jax.runs.push import Push
+from rps_jax.studies.table import Table
 from rps_jax.trials import pushes
 from rps_jax.trials.case import Case
 from rps_jax.trials.setting import Rules, Setting
@@ -193,9 +195,38 @@ def test_a_file_is_an_object_of_a_domain_also_in_another_process(tmp_path):
     del objects.REGISTERED["crate"], objects.FAMILIES["crate"]
     assert from_json(record) == domain == Domain(objects=(str(path),), yaw=Range(0, 0.1))
     assert scene.load("crate").physics.body("object").mass[0] == 20.0
-    with pytest.raises(InputError, match="leave no mass to draw"):
+    with pytest.raises(InputError, match=r"mass = 3 to 5 .* crate leave no mass to draw"):
         parse_domain(f"wide,objects={path},mass=3:5")
+    with pytest.raises(InputError, match="leave no mass to draw"):
+        Domain(objects=("crate",), mass=Range(3, 5))
     assert parse_domain("paper,objects=random_box,mass=3:5").mass[:2] == (3, 5)
+
+
+def test_a_run_is_refused_once_the_file_of_its_object_has_changed(tmp_path):
+    path, run = tmp_path / "crate.xml", tmp_path / "run"
+
+    def plan():
+        for table in (objects.REGISTERED, objects.FAMILIES):  # as in another process
+            table.pop("crate", None)
+        return Plan(Domain((str(path),)), 1, {"rps": RPSParams()})
+
+    path.write_text(BOX.read_text())
+    open_run(run, plan())
+    path.write_text(f"<!-- the same -->{BOX.read_text()}")
+    assert load_plan(run) == plan()
+    path.write_text(BOX.read_text().replace('mass="20"', 'mass="21"'))
+    changed = r"solids.*crate.xml.mass = 20.0 there, 21.0 asked for"
+    with pytest.raises(InputError, match=f"another run .domain.{changed}"):
+        open_run(run, plan())
+    objects.REGISTERED.clear()
+    with pytest.raises(InputError, match=r"crate.xml.mass = 20.0 there, .* restore the files"):
+        load_plan(run)
+    for question in (Push(str(path)), Table(objects=[str(path)])):
+        assert question.configuration()["solids"][str(path)]["mass"] == 21.0
+    manifest = files.read_checked_json(run / "manifest.json")
+    del manifest["domain"]["solids"]  # as version 0.4.0 wrote it
+    files.write_json(run / "manifest.json", manifest, checked=True)
+    assert load_plan(run) == plan()
 
 
 class Ahead(NamedTuple):

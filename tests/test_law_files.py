@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import rps
+from helpers import ROOT, rps
 
 from rps_jax import evaluate, push, sweep
 from rps_jax.app.shadow import shadowed
@@ -209,6 +209,21 @@ def test_a_run_is_loaded_with_the_copy_of_a_law_that_has_changed(tmp_path):
     shutil.rmtree(run / "sources")
     with pytest.raises(InputError, match="which has no copy: restore the file"):
         load_plan(run)
+
+
+def test_a_run_of_a_policy_file_is_loaded_once_the_package_has_the_policy(tmp_path, monkeypatch):
+    path = tmp_path / "mine.npz"
+    shutil.copyfile(ROOT / "rps_jax/control/learned/learned_small.npz", path)
+    plan = Plan(Domain(), 2, {"mine": registry.LAWS["learned_small"]})
+    kind = type(plan.laws["mine"])
+    monkeypatch.setitem(registry._SOURCES, kind, registry.sources.describe(path))
+    run = open_run(tmp_path / "run", plan)
+    assert "digest" in files.read_checked_json(run / "manifest.json")["laws"]["mine"]
+    monkeypatch.delitem(registry._SOURCES, kind)
+    assert load_plan(run).laws.keys() == {"mine"}
+    open_run(run, plan)
+    with pytest.raises(InputError, match="another run"):
+        open_run(run, Plan(Domain(), 2, {"mine": registry.LAWS["learned"]}))
 
 
 def test_an_unknown_law_is_named_with_the_other_forms():

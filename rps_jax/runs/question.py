@@ -57,6 +57,7 @@ from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import Rules
 from rps_jax.world import domain as domains
 from rps_jax.world.domain import Domain, DomainLike
+from rps_jax.world.objects import custom_solids, parse_object
 from rps_jax.world.tasks import TaskLike, parse_task
 from rps_jax.world.tasks.reach import Reach
 
@@ -344,7 +345,10 @@ class Question(Command[T]):
         ignored = [*_EXECUTION_OPTIONS, *self.IGNORED_FIELDS]
         if parse_task(getattr(self, "task", None) or "reach") == Reach():
             ignored.append("task")  # as in the manifests of earlier versions
-        return {name: self._field_as_json(name) for name in names if name not in ignored}
+        record = {name: self._field_as_json(name) for name in names if name not in ignored}
+        texts = getattr(self, "object", ""), *getattr(self, "objects", ())
+        solids = custom_solids(map(parse_object, texts))
+        return record | ({"solids": solids} if solids else {})
 
     def _field_as_json(self, name: str) -> object:
         value = getattr(self, name)

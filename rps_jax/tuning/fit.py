@@ -208,7 +208,7 @@ class Fit(LawQuestion[Fitted], DomainQuestion[Fitted], LogsQuestion):
         data = self.sample_posterior(run)
         fitted = fitted_domain(self.ranges, data)
         if run.folder is not None:
-            files.write_json(run.folder / "fitted.json", dataclasses.asdict(fitted))
+            files.write_json(run.folder / "fitted.json", domains.to_json(fitted))
         return Fitted(data, fitted)
 
     def sample_posterior(self, run: Run) -> xr.Dataset:

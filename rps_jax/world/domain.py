@@ -11,10 +11,18 @@ from numpy.typing import ArrayLike
 
 from rps_jax import errors
 from rps_jax.record import files
+from rps_jax.record.folder import describe_difference
 from rps_jax.record.options import check_fields, parse_changes
 from rps_jax.robot.robot import Robot, RobotLike, parse_robot
 from rps_jax.world import paper, scene, tasks
-from rps_jax.world.objects import FAMILIES, OBJECTS, PAPER_OBJECTS, parse_object, text_of
+from rps_jax.world.objects import (
+    FAMILIES,
+    OBJECTS,
+    PAPER_OBJECTS,
+    custom_solids,
+    parse_object,
+    text_of,
+)
 from rps_jax.world.quantity import Owner, Quantity, Range, check_ranges, declared, drawn, range_of
 from rps_jax.world.scene import FRICTION, Friction, Surroundings
 from rps_jax.world.tasks import Task, TaskLike, parse_task
@@ -375,14 +383,21 @@ _FORMS: dict[str, tuple[Callable[[Any], Any], str]] = {
 
 
 def to_json(domain: Domain) -> dict[str, Any]:
-    """Return a domain as JSON; without the task `reach`, as in earlier versions."""
+    """Return a domain as JSON, with the solids of custom objects; without the task `reach`."""
     record = asdict(domain) | {"objects": tuple(map(text_of, domain.objects))}
+    if solids := custom_solids(domain.objects):
+        record["solids"] = solids
     return record if domain.task != Reach() else {k: x for k, x in record.items() if k != "task"}
 
 
 def from_json(values: dict[str, Any]) -> Domain:
     """Return the domain of the JSON of `to_json`, or raise InputError."""
-    return Domain(**_from_json(values, DOMAINS["wide"]))
+    ranges = dict(values)
+    stored = ranges.pop("solids", None)
+    domain = Domain(**_from_json(ranges, DOMAINS["wide"]))
+    if words := describe_difference(stored, stored and custom_solids(domain.objects)):
+        raise errors.InputError(f"objects have changed since the run ({words}): restore the files.")
+    return domain
 
 
 def _from_json(values: Mapping[str, Any], base: Domain) -> dict[str, Any]:

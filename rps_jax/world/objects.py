@@ -6,9 +6,11 @@ use the upright solid over the footprint, in all engines.
 
 import math
 import os
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from numpy.typing import ArrayLike
@@ -19,7 +21,7 @@ from rps_jax.geometry import footprint as fp
 from rps_jax.geometry import solid
 from rps_jax.geometry.footprint import Footprint
 from rps_jax.geometry.solid import SIDES, Solid
-from rps_jax.record import files
+from rps_jax.record import files, options
 from rps_jax.record.options import check_arguments
 from rps_jax.world.opengl import mujoco
 
@@ -88,6 +90,15 @@ def text_of(name: str) -> str:
     """Return the text from which another process parses an object: its file, or its name."""
     custom = REGISTERED.get(name)
     return str(custom.path) if custom is not None and custom.is_file else name
+
+
+def custom_solids(names: Iterable[str]) -> dict[str, Any]:
+    """Return the solids of the custom objects among `names` as JSON, by their texts.
+
+    They are rounded, so that all processors give the same.
+    """
+    solids = {text_of(name): REGISTERED[name].solid for name in names if name in REGISTERED}
+    return options.to_json(jax.tree.map(lambda x: np.round(x, 9), solids))
 
 
 def read(path: Path) -> mujoco.MjSpec:
