@@ -209,6 +209,17 @@ def test_without_rendering_the_check_names_the_fix(monkeypatch):
     assert done.stderr == ""
 
 
+@pytest.mark.skipif(sys.platform != "linux", reason="elsewhere MuJoCo needs no choice of GL")
+def test_an_egl_that_does_not_work_is_no_fault_of_the_users_variables(monkeypatch):
+    for name in ("MUJOCO_GL", "DISPLAY"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setenv("PYOPENGL_PLATFORM", "none")  # MuJoCo then cannot import EGL
+    done = python("import os; from rps_jax.world import video; print(video.check(), os.environ)")
+    assert "apt install libegl1" in done.stdout
+    assert "MUJOCO_GL = " not in done.stdout
+    assert "'MUJOCO_GL'" not in done.stdout
+
+
 def test_importing_the_module_changes_nothing():
     python(
         "import os, sys; before = dict(os.environ); import rps_jax.world.video; "

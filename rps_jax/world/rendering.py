@@ -1,7 +1,7 @@
 """Images of a MuJoCo scene, with the paths of base and contact up to then.
 
 MuJoCo reads the environment variable MUJOCO_GL when it is imported. `choose_gl` sets it at the
-first image, also if MuJoCo was imported earlier.
+first image, and reloads that part of MuJoCo.
 """
 
 from __future__ import annotations
@@ -249,17 +249,17 @@ def open_renderers(
 
 @functools.cache
 def choose_gl() -> None:
-    """Select EGL on Linux without a display, unless MUJOCO_GL is set or EGL is missing.
-
-    A MuJoCo that is imported already is reloaded.
-    """
+    """Select EGL on Linux without a display, unless MUJOCO_GL is set or EGL does not work."""
     if sys.platform != "linux" or os.environ.get("MUJOCO_GL") or os.environ.get("DISPLAY"):
         return
-    with contextlib.suppress(OSError):
+    from rps_jax.world import opengl
+
+    try:
         ctypes.CDLL("libEGL.so.1")
         os.environ["MUJOCO_GL"] = "egl"
-        if (chosen := sys.modules.get("mujoco.rendering.classic.gl_context")) is not None:
-            importlib.reload(chosen)
+        importlib.reload(opengl.mujoco.rendering.classic.gl_context)
+    except Exception:  # of any kind, by a library that is missing
+        os.environ.pop("MUJOCO_GL", None)
 
 
 def _import_mujoco() -> Any:
