@@ -318,6 +318,11 @@ def test_bad_waypoints_are_refused(points: list[tuple[float, ...]]) -> None:
         tasks.parse_task({"kind": "path", "waypoints": points})
 
 
+def test_a_failure_says_who_touched_a_wall() -> None:
+    words = [tasks.failures_of({"wall_touch": np.float32(value)}) for value in (0, 1, 2)]
+    assert words == [[], ["the base touched a wall"], ["the object touched a wall"]]
+
+
 def test_a_path_must_start_at_the_base() -> None:
     far = tasks.parse_task({"kind": "path", "waypoints": [(3.0, 0.0), (4.0, 0.0)]})
     with pytest.raises(InputError, match=r"must start within 0.5 m of the base's front"):

@@ -247,7 +247,7 @@ def test_the_panel_of_a_task_has_progress_and_touch(page):
     assert "% of the path, 0.01 m off it in the mean, line contact" in page._state_text(live)
     live.step(3000)
     page._cursor = float(len(live.past) - 1)
-    assert page._state_text(live).endswith("**not reached**, touched a wall")
+    assert page._state_text(live).endswith("**not reached**, the base touched a wall")
     assert live.lines["walls"].shape == (4, 2, 2)
 
 

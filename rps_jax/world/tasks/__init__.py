@@ -29,6 +29,7 @@ QUANTITIES: dict[str, Quantity] = {
 MORE_NUMBERS = {name: i for kind in TASKS.values() for name, i in kind.MORE_NUMBERS.items()}
 OUTCOMES = {name: text for kind in TASKS.values() for name, text in kind.OUTCOMES.items()}
 FAILURES = {name: text for kind in TASKS.values() for name, text in kind.FAILURES.items()}
+_SUBJECTS = {1: "the base ", 2: "the object "}
 
 # For errors: of ranges, of types, and of tuples of tuples by their sizes.
 _RANGE = "a number, or low and high as [0.3, 0.6]"
@@ -38,7 +39,8 @@ TaskLike = Task | str | Mapping[str, Any]  # or its text: see `parse_task`
 
 def failures_of(outcomes: Mapping[str, Any]) -> list[str]:
     """Return in words how a task has failed, by the outcomes of one trial."""
-    return [text for name, text in FAILURES.items() if outcomes.get(name, 0) > 0]
+    failed = {name: int(outcomes[name]) for name in FAILURES if outcomes.get(name, 0) > 0}
+    return [_SUBJECTS.get(value, "") + FAILURES[name] for name, value in failed.items()]
 
 
 def parse_task(task: TaskLike) -> Task:

@@ -84,7 +84,8 @@ class Task:
     MARKS: ClassVar[tuple[str, ...]] = ()
     MORE_NUMBERS: ClassVar[dict[str, int]] = {}  # columns of random numbers without a range
 
-    # Outcomes that are not 0 in a trial that the task has failed, with the failure in words.
+    # Outcomes that are not 0 in a trial that the task has failed, 1 by the base and 2 by the
+    # object, with the failure in words.
     FAILURES: ClassVar[dict[str, str]] = {}
 
     @classmethod
