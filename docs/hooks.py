@@ -84,6 +84,11 @@ _UNSEARCHED = re.compile(
     r'<details(?= class="mkdocstrings-source")|<div(?= class="doc-signature)'
     r'|(?<=doc-section-title">)(?:Methods|Functions|Classes|Modules):</span></p>\s*<table'
 )
+# Spaces within a number with its unit and within an interval, in cells of tables.
+_UNBROKEN = re.compile(
+    r"(?<=\d) (?=(?:%|[smhN]|[mµun]s|[cm]m|kg|min|[kMG]B|m/s|rad/s)(?![\w/]))"
+    r"|(?<=\d,) (?=-?[\d.,]+\])"
+)
 FENCE = re.compile(r"^( *)(```|~~~).*?^\1\2`*~* *$", re.MULTILINE | re.DOTALL)
 
 
@@ -335,7 +340,10 @@ def on_page_markdown(markdown: str, page: Any, config: Any, files: Any) -> str:
 
 
 def on_page_content(html: str, page: Any, config: Any, files: Any) -> str:
-    r"""Write equations, \(...\) and \[...\], as MathML; leave source code out of the search."""
+    r"""Write equations, \(...\) and \[...\], as MathML; leave source code out of the search.
+
+    Numbers of tables stay in one piece, and heads break at an underscore.
+    """
 
     def math(match: re.Match[str]) -> str:
         text = match[2].replace("\\*", "*")  # GitHub needs the backslash
@@ -349,6 +357,8 @@ def on_page_content(html: str, page: Any, config: Any, files: Any) -> str:
     html = re.sub(_UNSEARCHED, lambda match: f"{match[0]} data-search-exclude", html)
     if re.match(r"sweeps/\w+/README", page.file.src_uri):
         html = html.replace("<table>", "<table data-search-exclude>")  # of numbers
+    html = re.sub(r"<td>.*?</td>", lambda match: _UNBROKEN.sub("\u00a0", match[0]), html)
+    html = re.sub(r"<th>\w+</th>", lambda match: match[0].replace("_", "_<wbr>"), html)
     marked = r'<(div|span) class="arithmatex">\\[(\[](.*?)\\[)\]]</\1>'
     return re.sub(marked, math, html, flags=re.DOTALL)
 

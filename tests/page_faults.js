@@ -23,5 +23,6 @@ return {
   hosts: performance.getEntriesByType('resource').map((r) => r.name).filter((n) => !n.startsWith(location.origin) && !n.startsWith('data:') && !n.startsWith('blob:')),
   dark,
   scroll: document.scrollingElement.scrollWidth - innerWidth,
+  tables: innerWidth < 1000 ? [] : [...document.querySelectorAll('table, .md-typeset__scrollwrap')].filter((t) => t.scrollWidth > t.clientWidth + 1).map((t) => `${t.scrollWidth - t.clientWidth} px: ${t.innerText.slice(0, 80)}`),
   unnamed: [...document.querySelectorAll('a[href], button')].filter((a) => !a.textContent.trim() && !a.title && !a.ariaLabel && !a.querySelector('img[alt]')).map((a) => a.outerHTML.slice(0, 80)),
 };
