@@ -199,6 +199,8 @@ def runs_on_devices(folder, counts):
 
 
 def test_several_devices_share_trials_and_programs(whole, tmp_path, monkeypatch):
+    (tmp_path / "cache").mkdir()  # without programs of XLA
+    (tmp_path / "cache" / "native").symlink_to(cache.default_folder() / "native")
     flags = f"{os.environ.get('XLA_FLAGS', '')} --xla_force_host_platform_device_count=4"
     monkeypatch.setenv("XLA_FLAGS", flags)
     with multiprocessing.get_context("spawn").Pool(1, maxtasksperchild=1) as pool:
