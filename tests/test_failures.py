@@ -53,7 +53,7 @@ def probe_in(folder):
 
 
 def test_a_probe_agrees_with_a_sweep_and_resumes(tmp_path, monkeypatch):
-    u = points.points_of(CYLINDERS, np.arange(6))
+    u = points.points_of(CYLINDERS, np.arange(8))  # as many as slots, as in other tests
     probe = probe_in(tmp_path)
     trials = probe(u)
     sweep = rps_jax.sweep({"law": PAPER}, CYLINDERS, points=u, setting=BRIEF, slots=8)
@@ -344,7 +344,7 @@ def test_gains_and_losses_by_hand():
 
 
 def test_the_command_of_regress_reports_known_laws(tmp_path, capsys):
-    options = "--engine quasistatic --slots 8 --workers 1 --out"
+    options = "--engine quasistatic --horizon 20 --slots 8 --workers 1 --out"
     assert rps(f"regress --laws rps --worlds 4 {options}", tmp_path) == 0
     text = capsys.readouterr().out
     assert "rps_plus (file)" in text

@@ -74,8 +74,8 @@ def test_a_coordinate_maps_to_the_range_of_its_quantity():
 
 
 def test_sweeps_and_evaluations_take_points_as_they_take_drawn_worlds(tmp_path):
-    u = points.points_of(CYLINDERS, np.arange(6), seed=3)
-    drawn = rps_jax.sweep("rps", CYLINDERS, 6, setting=replace(SHORT, seed=3), slots=SLOTS)
+    u = points.points_of(CYLINDERS, np.arange(SLOTS), seed=3)
+    drawn = rps_jax.sweep("rps", CYLINDERS, SLOTS, setting=replace(SHORT, seed=3), slots=SLOTS)
     folder = tmp_path / "run"
     swept = rps_jax.sweep("rps", CYLINDERS, points=u, out=folder, **SWEPT)
     xr.testing.assert_identical(swept.assign_attrs(seed=3), drawn)

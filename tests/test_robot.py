@@ -153,7 +153,7 @@ def test_the_environment_and_a_single_trial_turn_by_the_share_that_is_left():
     drums = replace(NEAR, objects=("random_cylinder",), robot=Robot(slip_yaw=0.45))
     setting = Setting("quasistatic", SHORT.physics, rules=Rules(horizon=20.0))
     push = PushEnv("random_cylinder", drums, setting=setting, worlds=2)
-    state = push.reset(jax.random.key(0))
+    state = jax.jit(push.reset)(jax.random.key(0))
     step = jax.jit(push.step)
     for _ in range(5):
         state = step(state, jnp.array([0.0, 0.5, 1.0]))
@@ -275,15 +275,12 @@ def test_worlds_by_template_equal_recompiled_ones(domain, engine):
 
 
 def test_a_stalled_base_is_reported_in_the_outcome():
-    weak, strong = Robot(force_max=0.8 * WEIGHT), Robot(force_max=3 * WEIGHT, lag=0.1)
+    weak, strong = (Robot(force_max=f * WEIGHT, lag=0.1) for f in (0.8, 3))
     setting = replace(SHORT, rules=Rules(horizon=20.0))
-    cases = [case((0.6, 0.0), robot=robot) for robot in (weak, strong)]
-    outcomes = [pushes.run([x], setting)[0] for x in cases]
-    assert outcomes[0].stalled[0]
-    assert not outcomes[0].success[0]
-    assert outcomes[0].time[0] == pytest.approx(20.0)
-    assert outcomes[1].success[0]
-    assert not outcomes[1].stalled[0]
+    outcome, _ = pushes.run([case((0.6, 0.0), robot=robot) for robot in (weak, strong)], setting)
+    assert outcome.stalled.tolist() == [True, False]
+    assert outcome.success.tolist() == [False, True]
+    assert outcome.time[0] == pytest.approx(20.0)
 
 
 def test_random_robots_are_drawn_last_and_change_no_other_draw():
