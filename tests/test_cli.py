@@ -303,9 +303,9 @@ BRIEF = "--engine quasistatic --horizon 2"
 def test_a_custom_question_is_one_file(tmp_path, capsys):
     path = tmp_path / "my_study.py"
     path.write_text(STUDY)
-    assert rps(f"{path} --worlds 3 {BRIEF} --law rps --out", tmp_path / "run") == 0
-    assert "0 of 3 were won" in capsys.readouterr().out
-    assert files.read_results(tmp_path / "run").sizes["world"] == 3
+    assert rps(f"{path} --worlds 8 {BRIEF} --law rps --out", tmp_path / "run") == 0
+    assert "0 of 8 were won" in capsys.readouterr().out
+    assert files.read_results(tmp_path / "run").sizes["world"] == 8
     assert "worlds = 0 is not allowed" in refusal(capsys, path, "--worlds", 0)
     assert rps(path, "--help") == 0
     assert "Number of drums." in capsys.readouterr().out
