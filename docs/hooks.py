@@ -84,11 +84,8 @@ _UNSEARCHED = re.compile(
     r'<details(?= class="mkdocstrings-source")|<div(?= class="doc-signature)'
     r'|(?<=doc-section-title">)(?:Methods|Functions|Classes|Modules):</span></p>\s*<table'
 )
-# Spaces within a number with its unit and within an interval, in cells of tables.
-_UNBROKEN = re.compile(
-    r"(?<=\d) (?=(?:%|[smhN]|[mµun]s|[cm]m|kg|min|[kMG]B|m/s|rad/s)(?![\w/]))"
-    r"|(?<=\d,) (?=-?[\d.,]+\])"
-)
+# Space between a number and its unit, in cells of tables.
+_UNBROKEN = re.compile(r"(?<=\d) (?=(?:%|[smhN]|[mµun]s|[cm]m|kg|min|[kMG]B|m/s|rad/s)(?![\w/]))")
 FENCE = re.compile(r"^( *)(```|~~~).*?^\1\2`*~* *$", re.MULTILINE | re.DOTALL)
 
 
@@ -342,7 +339,7 @@ def on_page_markdown(markdown: str, page: Any, config: Any, files: Any) -> str:
 def on_page_content(html: str, page: Any, config: Any, files: Any) -> str:
     r"""Write equations, \(...\) and \[...\], as MathML; leave source code out of the search.
 
-    Numbers of tables stay in one piece, and heads break at an underscore.
+    Numbers of tables stay with their units, and heads break at an underscore.
     """
 
     def math(match: re.Match[str]) -> str:
