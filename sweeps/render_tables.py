@@ -45,13 +45,7 @@ _SATURATED = "omega followed from the saturated v_x, and "
 STALE: dict[str, str] = {
     "sb3": _LOADS,
     **dict.fromkeys(("arena", "levers"), "later changes of the code, which small runs do not time"),
-    **dict.fromkeys(
-        (
-            *("commands", "compilers", "compilers_gpu", "costs", "derivatives", "robot"),
-            *("speed_cores", "tasks_cost_cpu"),
-        ),
-        "an option of the C compiler made the fused engine 1.4 times faster on Intel processors",
-    ),
+    "compilers_gpu": "an option of the C compiler made the fused engine faster on Intel processors",
     **dict.fromkeys(
         ("commands_gpu", "gpus"), "commands were timed with compiled Python modules in the cache"
     ),
