@@ -40,17 +40,13 @@ _BLOCK = re.compile(r"(<!-- (table|command): (\S+) -->\n).*?(<!-- end -->)", re.
 _CELL = re.compile(r"(<!-- cell: ([^>]*?) -->).*?(<!-- end -->)", re.DOTALL)
 _TEXT_CELL = re.compile(r"^(# %% \[markdown\]\n)((?:#.*\n)*)", re.MULTILINE)  # of notebooks' texts
 # The change since each stale data file: what follows "Computed before".
-_LOADS = "random objects had loads of finite size and slid on today's ground"
-_SATURATED = "omega followed from the saturated v_x, and "
 STALE: dict[str, str] = {
-    "sb3": _LOADS,
     **dict.fromkeys(("arena", "levers"), "later changes of the code, which small runs do not time"),
     "compilers_gpu": "an option of the C compiler made the fused engine faster on Intel processors",
     **dict.fromkeys(
         ("commands_gpu", "gpus"), "commands were timed with compiled Python modules in the cache"
     ),
-    "plus": "`learned` replaced `learned_gru`",
-    "fidelity": _SATURATED + "objects slid on today's ground",
+    "fidelity": "omega followed from the saturated v_x, and objects slid on today's ground",
 }
 NUMBERS = SWEEPS / "publish" / "numbers.json"
 _NUMBER = r"(?<![\w.,/^#-])[-+±]?\d[\d,]*(?:\.\d+)?(?:e[-+]?\d+)?"
