@@ -53,7 +53,7 @@ def probe_in(folder):
 
 
 def test_a_probe_agrees_with_a_sweep_and_resumes(tmp_path, monkeypatch):
-    u = points.points_of(CYLINDERS, np.arange(8))  # as many as slots, as in other tests
+    u = points.points_of(CYLINDERS, np.arange(8))  # one for each slot, as in other tests
     probe = probe_in(tmp_path)
     trials = probe(u)
     sweep = rps_jax.sweep({"law": PAPER}, CYLINDERS, points=u, setting=BRIEF, slots=8)

@@ -107,7 +107,7 @@ cli.main(["sweep", "--help"])
 
 @pytest.fixture(scope="module")
 def printed(tmp_path_factory):
-    """What a copy of the package with another law, quantity and engine prints."""
+    """Output of a copy of the package with another law, quantity and engine."""
     folder = tmp_path_factory.mktemp("copy")
     package = folder / "rps_jax"
     shutil.copytree(PACKAGE, package, ignore=shutil.ignore_patterns("__pycache__"))

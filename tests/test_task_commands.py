@@ -172,8 +172,8 @@ def test_a_corridor_is_resumed_sharded_merged_and_replayed(run, capsys):
     trace = rps_jax.replay(run / "run", touched)
     assert trace.data.outcome_wall_touch == results.wall_touch[0, touched]
     assert trace.data.walls.shape[1:] == (2, 2)
-    who = ("base", "object")[int(results.wall_touch[0, touched]) - 1]
-    assert trace.summary.endswith(f", the {who} touched a wall")
+    body = ("base", "object")[int(results.wall_touch[0, touched]) - 1]
+    assert trace.summary.endswith(f", the {body} touched a wall")
     shown = rps_jax.gallery(run / "run", law="rps")
     assert ((shown.kind == "touched a wall") == (results.wall_touch[0] > 0)).all()
     assert "the run has its own" in refusal(capsys, f"ceiling {run}/run --task path")

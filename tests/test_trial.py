@@ -88,28 +88,30 @@ LONGER = Rules(horizon=60.0)
 
 
 @pytest.fixture(scope="module")
-def apart():
+def sequential():
     """Outcomes of both families, one after the other."""
     return run(FAMILIES, LONGER)
 
 
-@pytest.mark.parametrize("few", [1, 3, SLOTS])
-def test_trials_end_alike_in_the_merged_batches_of_a_gpu(monkeypatch, apart, few):
+@pytest.mark.parametrize("tail_slots", [1, 3, SLOTS])
+def test_trials_end_alike_in_the_merged_batches_of_a_gpu(monkeypatch, sequential, tail_slots):
     """The last trials in 1, 3 or as many slots as before."""
     segments, ran, plain = [], [], batch._Program.compiled
-    monkeypatch.setattr(batch, "_tail_slots", lambda: few)
+    monkeypatch.setattr(batch, "_tail_slots", lambda: tail_slots)
     note = lambda self, device: ran.append(self.slots) or plain(self, device)  # noqa: E731
     monkeypatch.setattr(batch._Program, "compiled", note)
     results = run(FAMILIES, LONGER, callback=lambda progress: segments.append(progress.segment))
     assert ran[0] == (SLOTS, 3)
-    assert ran[1:] == ([(3, 3)] if few == 3 else [])  # none is left to the last one of few = 1
+    # None is left to a last slot alone.
+    assert ran[1:] == ([(3, 3)] if tail_slots == 3 else [])
     segments = [x for x in segments if x is not None]
     assert all(x.start < x.end <= y.end and x.end <= y.start for x, y in pairwise(segments))
     assert segments[0].live == {0: SLOTS, 1: 3}
-    assert apart.success.sum() > 0
+    assert sequential.success.sum() > 0
     for name in ("success", "time"):
-        np.testing.assert_array_equal(getattr(results, name), getattr(apart, name))
-    np.testing.assert_allclose(results.object_pose, apart.object_pose, atol=1e-3)  # other shapes
+        np.testing.assert_array_equal(getattr(results, name), getattr(sequential, name))
+    # Programs of other shapes round otherwise.
+    np.testing.assert_allclose(results.object_pose, sequential.object_pose, atol=1e-3)
 
 
 @pytest.fixture(scope="module")
