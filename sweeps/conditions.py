@@ -183,7 +183,7 @@ def condition_rows(results: xr.Dataset, baseline: str, law: str = "rps") -> list
         low, high = statistics.wilson(int(succeeded.sum()), succeeded.size)
         time = trials.time.values[succeeded]
         c, star = comparisons[i], " *" if q[i] < 0.05 else ""
-        difference = f"+{c.gained} -{c.lost}, q = {q[i]:.2g}{star}" if name != baseline else ""
+        difference = f"{c.changes}, q = {q[i]:.2g}{star}" if name != baseline else ""
         table.append(
             [
                 str(trials.what.values),

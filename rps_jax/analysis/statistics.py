@@ -36,6 +36,11 @@ class Comparison(NamedTuple):
     lost: int  # trials that succeed under the first and fail under the second
     p: float  # [1] of McNemar's exact test that gains and losses are equally likely
 
+    @property
+    def changes(self) -> str:
+        """Gains and losses, for tables."""
+        return f"+{self.gained} -{self.lost}"
+
 
 class Bins(NamedTuple):
     """Success by bins of one quantity."""

@@ -214,7 +214,7 @@ def against_table(results: xr.Dataset, reference: str) -> list[list[str]]:
     for law, success in sorted(by_law.items(), key=lambda item: -float(item[1].mean())):
         cells = ["", "", ""]
         if c := tests.get(law):
-            difference = f"{_difference(c, base.size)} (+{c.gained} -{c.lost})"
+            difference = f"{_difference(c, base.size)} ({c.changes})"
             cells = [difference, p[law], str(c.gained)]
         rows.append([law, _rate(success.values > 0), *cells])
     return rows

@@ -115,7 +115,7 @@ class Parity(Study[xr.DataTree]):
             compared = statistics.compare(reference, fused)
             row = ROWS[name]
             worlds = f"`{row.domain}`, {fused.size:,}"
-            changes = f"+{compared.gained} -{compared.lost}"
+            changes = compared.changes
             rows.append([name, f"`{row.task}`", worlds, row.law, *rates, equal, changes])
         return [Table(rows, name="tasks_parity", title="Equal outcomes")]
 

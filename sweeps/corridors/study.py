@@ -288,9 +288,7 @@ def width_table(results: xr.Dataset, curves: Mapping[tuple[str, str], Curve]) ->
         rates = [tables.share(int(success[mask].sum()), int(mask.sum())) for mask in masks]
         needed = [width_text(curves[row, law], level) for level in LEVELS]
         compared = statistics.compare(started.success.sel(row=row, law=base), outcomes.success)
-        against = (
-            f"+{compared.gained} -{compared.lost}, p = {compared.p:.2g}" if law != base else ""
-        )
+        against = f"{compared.changes}, p = {compared.p:.2g}" if law != base else ""
         rows.append([row, law, f"{float(outcomes.lookahead):g} m", *rates, *needed, against])
     return rows
 

@@ -137,5 +137,5 @@ def agreement_table(results: Mapping[str, xr.Dataset]) -> Rows:
             for mask in (succeeded, same)
         )
         share, interval = f"{100 * same.mean():.1f} %", f"{100 * low:.0f}-{100 * high:.0f} %"
-        rows.append([name, *counts, share, interval, *equal, f"+{c.gained} -{c.lost}"])
+        rows.append([name, *counts, share, interval, *equal, c.changes])
     return rows

@@ -158,7 +158,7 @@ def table(results: xr.Dataset) -> Rows:
         rows.append([
             str(condition.what.values),
             f"{100 * (equal / total):.1f} %", f"{100 * low:.0f}-{100 * high:.0f} %",
-            f"+{c.gained} -{c.lost}", f"{c.p:.2g}", f"{median:.1f}, {worst:.1f} mm",
+            c.changes, f"{c.p:.2g}", f"{median:.1f}, {worst:.1f} mm",
             f"{1000 * cost:.3g} ms",
         ])  # fmt: skip
     return rows

@@ -137,7 +137,7 @@ def cost_table(results: xr.Dataset, base: str, masks: Mapping[str, np.ndarray]) 
             compared = statistics.compare(level.success, trials.success)
             both = success & (level.success.values > 0)
             ratio = f"{np.median(trials.time.values[both] / level.time.values[both]):.2f}"
-            change = f"+{compared.gained} -{compared.lost}, p = {compared.p:.2g}"
+            change = f"{compared.changes}, p = {compared.p:.2g}"
             cells = ["", ""] if floor == base else [change, ratio if both.any() else "-"]
             rows.append([floor, law, *rates, time, *cells])
     return rows

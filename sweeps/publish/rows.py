@@ -94,7 +94,7 @@ def _outcome_row(results: xr.Dataset, law: int, base: int) -> list[str]:
     kinds = statistics.failure_modes(outcomes, _MAX_LOST)
     counts = [int((kinds == statistics.FAILURES.index(kind)).sum()) for kind in _FAILURES]
     compared = statistics.compare(results.success[base], results.success[law])
-    difference = [f"+{compared.gained} -{compared.lost}", f"{compared.p:.2g}"]
+    difference = [compared.changes, f"{compared.p:.2g}"]
     return [
         _run_or_law(str(outcomes.law.item())),
         tables.share(int(succeeded.sum()), succeeded.size),
@@ -126,7 +126,7 @@ def default_beside_tuned(results: object) -> Rows:
     adjusted = statistics.holm([compared.p for compared in comparisons])
     for law, pair, compared, p in zip(laws, pairs, comparisons, adjusted, strict=True):
         rates = [tables.share(int(s.sum()), s.size) for s in pair]
-        rows.append([law, *rates, f"+{compared.gained} -{compared.lost}", f"{p:.2g}"])
+        rows.append([law, *rates, compared.changes, f"{p:.2g}"])
     return rows
 
 

@@ -172,7 +172,7 @@ def _rate_row(results: xr.Dataset, domain: str, law: str, against: str) -> dict[
         base = results.success.sel(domain=domain, law=against, model=model_panel.REQUESTED)
         compared = statistics.compare(base, default.success)
         p = f"p {compared.p:.1g}" if compared.p else "p < 1e-300"
-        difference = f"+{compared.gained} -{compared.lost}, {p}"
+        difference = f"{compared.changes}, {p}"
     return {
         "domain": domain,
         "law": law,
