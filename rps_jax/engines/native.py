@@ -51,9 +51,7 @@ _FLAGS += ("--param", "sccvn-max-alias-queries-per-access=30")
 if platform.machine() in ("x86_64", "AMD64"):  # GCC splits vectors where it prefers shorter ones
     _FLAGS += ("-mprefer-vector-width=512",)
 _NAME = "rps_native_"
-# Threads of a GPU that compute a world in whole trials, whose worlds are sorted, and in other
-# functions: the second number if shared memory is short.
-_THREADS = {True: (4, 16), False: (8, 16)}
+_THREADS = (4, 16)  # of a GPU that compute a world: the second if shared memory is short
 _NO_COMPILER = (
     "a C compiler (apt install gcc) or NVRTC (pip install nvidia-cuda-nvrtc) is not installed"
 )
@@ -399,7 +397,7 @@ def _texts(functions: Sequence[_Function]) -> tuple[int, list[str]]:
     Raises:
       TooLargeError: a kernel needs too much shared memory.
     """
-    *fewer, most = _THREADS[functions[0].is_sorted]
+    *fewer, most = _THREADS
     for threads in fewer:
         with contextlib.suppress(TooLargeError):
             return threads, _printed(functions, functools.partial(GpuWriter, threads))
