@@ -408,7 +408,7 @@ RECIPES: dict[str, Recipe] = {
         + f" --gpus 1 --warm 1000 10000 --file commands_gpu {_MACHINE}",
         gpu=8,
     ),
-    "gpus": recipe(f"rps sweeps/speed/gpus.py --gpus 1 2 4 {_MACHINE}", gpu=4),
+    "gpus": recipe(f"rps sweeps/speed/gpus.py --gpus 1 2 {_MACHINE}", gpu=4),
     # After the installation of the third-party engines: see `speed/arena.py`.
     "arena": recipe(f"rps sweeps/speed/arena.py --peers peers {_MACHINE}", gpu=5),
     "derivatives": recipe(f"rps sweeps/speed/derivatives.py {_MACHINE}", cores=2),
