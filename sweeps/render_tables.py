@@ -40,14 +40,7 @@ _BLOCK = re.compile(r"(<!-- (table|command): (\S+) -->\n).*?(<!-- end -->)", re.
 _CELL = re.compile(r"(<!-- cell: ([^>]*?) -->).*?(<!-- end -->)", re.DOTALL)
 _TEXT_CELL = re.compile(r"^(# %% \[markdown\]\n)((?:#.*\n)*)", re.MULTILINE)  # of notebooks' texts
 # The change since each stale data file: what follows "Computed before".
-STALE: dict[str, str] = {
-    **dict.fromkeys(("arena", "levers"), "later changes of the code, which small runs do not time"),
-    "compilers_gpu": "an option of the C compiler made the fused engine faster on Intel processors",
-    **dict.fromkeys(
-        ("commands_gpu", "gpus"), "commands were timed with compiled Python modules in the cache"
-    ),
-    "fidelity": "omega followed from the saturated v_x, and objects slid on today's ground",
-}
+STALE: dict[str, str] = {}
 NUMBERS = SWEEPS / "publish" / "numbers.json"
 _NUMBER = r"(?<![\w.,/^#-])[-+±]?\d[\d,]*(?:\.\d+)?(?:e[-+]?\d+)?"
 _UNIT = (
