@@ -250,7 +250,7 @@ test_invalid_rollouts_are_refused = refusals(
         ({"wrt": "robot_force"}, "wrt = robot_force .* append ,robot_force=LOW:HIGH"),
         ({"wrt": "feet"}, "wrt = feet .* append ,feet=LOW:HIGH"),
         ({"wrt": "mass", "domain": "paper"}, "wrt = mass .* leave no mass to draw"),
-        ({"wrt": "distance", "domain": "paper"}, "wrt = distance .* leave no distance"),
+        ({"wrt": "distance", "domain": "paper"}, "wrt = distance .* its targets leave no distance"),
         ({"wrt": 3}, "wrt = 3"),
         ({"laws": "pursuit", "wrt": "K_v"}, "smooth = True .* PursuitParams has no smooth form"),
         ({"laws": ("rps", "rps_plus")}, "unknown name of wrt 'K_h'.*law.K_h"),

@@ -25,7 +25,9 @@ from rps_jax.world import domain, draws, paper, scene
 from rps_jax.world.domain import DOMAINS, RANDOM, Range
 from rps_jax.world.objects import PAPER_OBJECTS
 from rps_jax.world.physics import preset
-from rps_jax.world.scene import FRICTION, WorldInputs
+from rps_jax.world.scene import FRICTION, Friction, WorldInputs
+from rps_jax.world.tasks.corridor import Corridor
+from rps_jax.world.tasks.path import Path
 
 WIDE = DOMAINS["wide"]
 COUNT = 12
@@ -235,7 +237,29 @@ test_ranges_that_mean_nothing_are_refused = refusals(
         ({"objects": PAPER_OBJECTS, name: Range(0.2, 0.3)}, f"{name} = 0.2 to 0.3 .* no {name} to")
         for name in ("mass", "size", "aspect", "height", "com_offset", "load_size")
     ),
+    *(
+        (changes, f"domain {name} = .* {cause} no {name} to draw")
+        for name, cause, changes in (
+            ("distance", "its targets leave", {"targets": ((2.0, 0.0),), "distance": Range(1, 2)}),
+            ("bearing", "its task path leaves", {"task": Path(), "bearing": Range(0, 1)}),
+            ("distance", "its task corridor leaves", {"task": Corridor(), "distance": Range(1, 2)}),
+            (
+                "friction_robot",
+                "its frictions leave",
+                {"frictions": (Friction(0.3, 0.4),), "friction_robot": Range(0.2, 0.3)},
+            ),
+            ("noise", "its ideal skin leaves", {"skin": "ideal", "noise": Range(0.01, 0.02)}),
+            ("foam", "its ideal skin leaves", {"skin": "ideal", "foam": Range(0.01, 0.02)}),
+        )
+    ),
 )
+
+
+def test_unused_ranges_may_be_those_of_named_domains_or_no_error():
+    for chosen in DOMAINS.values():
+        for task in ("path", "corridor,width=2"):
+            assert domain.parse_domain(replace(chosen, skin="ideal"), task=task).skin == "ideal"
+    assert replace(WIDE, skin="ideal", noise=Range(0, 0)).noise == Range(0, 0)
 
 
 def test_objects_of_files_may_replace_the_random_ones_of_a_named_domain():
@@ -255,9 +279,10 @@ def test_a_domain_survives_json():
 
 def test_undrawn_quantities_are_constant_and_not_labelled_as_drawn():
     assert not WIDE.idle
-    assert {"mass", "com_offset", "friction_robot", "bearing", "noise"} < DOMAINS["paper"].idle
-    assert not {"gap", "yaw", "pose_noise"} & DOMAINS["paper"].idle
+    idle = DOMAINS["paper"].idle.keys()
+    assert {"mass", "com_offset", "friction_robot", "bearing", "noise"} < idle
+    assert not {"gap", "yaw", "pose_noise"} & idle
     ideal = replace(WIDE, objects=("random_box",), skin="ideal")
-    assert ideal.idle == {"noise", "gain_spread", "dead_share"}
+    assert ideal.idle.keys() == {"noise", "gain_spread", "dead_share"}
     table = draws.table(draws.draw(ideal, 0, np.arange(9)))
-    assert {name for name, (values, _) in table.items() if not values.any()} == ideal.idle
+    assert {name for name, (values, _) in table.items() if not values.any()} == ideal.idle.keys()

@@ -291,6 +291,9 @@ REFUSED = {
     "corridor,doors=9": "task doors = 9",
     "corridor,width=3,turns=4": "task width (high)",
     "path,spline=true": "task spline",
+    "path,waypoints=0.4:0:2:1,length=5:9": "length = 5 to 9 is not allowed: its waypoints",
+    "path,turns=0,turn_angle=0.1": "no turn_angle to draw",
+    "corridor,door_width=0.7": "without doors leaves no door_width to draw",
 }
 
 

@@ -233,8 +233,8 @@ def coordinates_of(
             rule, quantity = "", QUANTITIES.get(name)
             if name in _DISCRETE or (quantity and (quantity.jumps or quantity.owner == "course")):
                 rule = "it has no derivative: worlds change in steps with it, or a path does"
-            elif name in domain.idle - {"friction_ground", "friction_robot"}:
-                rule = f"the domain's objects, targets or skin leave no {name} to draw"
+            elif name in domain.idle and name not in ("friction_ground", "friction_robot"):
+                rule = f"of the domain, {domain.idle[name]} no {name} to draw"
             elif quantity and domain.range_of(name) is None:
                 rule = f"the domain draws none; append ,{name}=LOW:HIGH to its name"
             if rule:

@@ -23,7 +23,16 @@ from rps_jax.world.objects import (
     parse_object,
     text_of,
 )
-from rps_jax.world.quantity import Owner, Quantity, Range, check_ranges, declared, drawn, range_of
+from rps_jax.world.quantity import (
+    Owner,
+    Quantity,
+    Range,
+    check_ranges,
+    check_unused,
+    declared,
+    drawn,
+    range_of,
+)
 from rps_jax.world.scene import FRICTION, Friction, Surroundings
 from rps_jax.world.tasks import Task, TaskLike, parse_task
 from rps_jax.world.tasks.reach import Reach
@@ -139,11 +148,8 @@ class Domain:
         if self.feet is not None and not set(self.objects) <= set(RANDOM):
             objects = f"{self.feet} with objects = {self.objects}"
             raise errors.not_allowed("domain feet", objects, "only random objects have drawn feet")
-        for name in () if set(self.objects) & set(RANDOM) else sorted(OBJECT_QUANTITIES):
-            # It may have the range of a named domain.
-            if (value := getattr(self, name)) not in (getattr(Domain, name), _HOSTILE.get(name)):
-                rule = f"its objects {', '.join(self.objects)} leave no {name} to draw"
-                raise errors.not_allowed(f"domain {name}", f"{value.low:g} to {value.high:g}", rule)
+        unused = {name: cause for name, cause in self.idle.items() if name in _DECLARED}
+        check_unused(self, "domain ", unused, PERFECT, _HARDWARE, _HOSTILE)
         for name, owner in _IMPLIED.items():
             if getattr(self, name) is not None and getattr(self, owner) is None:
                 raise errors.not_allowed(f"domain {name}", getattr(self, name), f"give {owner} too")
@@ -209,19 +215,21 @@ class Domain:
         return self.choices(index)[0]
 
     @property
-    def idle(self) -> frozenset[str]:
-        """Names of unused ranges, whose quantities other fields of the domain determine."""
-        unused = set()
+    def idle(self) -> dict[str, str]:
+        """Names of unused ranges, with what determines the quantity, as "its targets leave"."""
+        task = f"its task {self.task.kind} leaves"
+        unused = dict.fromkeys(sorted(self.task.idle), task)
         if not set(self.objects) & set(RANDOM):
-            unused |= OBJECT_QUANTITIES
+            cause = f"its objects {', '.join(self.objects)} leave"
+            unused |= dict.fromkeys(sorted(OBJECT_QUANTITIES), cause)
         if self.frictions:
-            unused |= {"friction_ground", "friction_robot"}
+            unused |= dict.fromkeys(("friction_ground", "friction_robot"), "its frictions leave")
         if self.targets or not self.task.HAS_TARGET:
-            unused |= {"distance", "bearing"}
+            cause = "its targets leave" if self.targets else task
+            unused |= dict.fromkeys(("distance", "bearing"), cause)
         if self.skin == "ideal":
-            unused |= set(quantities_of("skin"))
-        unused |= self.task.idle
-        return frozenset(name for name in unused if self.range_of(name) is not None)
+            unused |= dict.fromkeys(quantities_of("skin"), "its ideal skin leaves")
+        return {name: x for name, x in unused.items() if self.range_of(name) is not None}
 
     @property
     def families(self) -> tuple[str, ...]:
@@ -272,7 +280,13 @@ def _constant(value: float) -> Range:
 
 _ERRORS = ("noise", "gain_spread", "dead_share", "lateral", "yaw", *quantities_of("base"))
 PERFECT: dict[str, Any] = dict.fromkeys(_ERRORS, _constant(0))
-_HARDWARE: dict[str, Any] = PERFECT | {"noise": _constant(0.05), "gain_spread": _constant(0.1)}
+_HARDWARE: dict[str, Any] = PERFECT | {
+    "friction_ground": Range(paper.HARDWARE_GROUND[0], paper.HARDWARE_GROUND[-1]),
+    "friction_robot": Range(paper.HARDWARE_ROBOT[0], paper.HARDWARE_ROBOT[-1]),
+    "distance": _constant(2.1),
+    "noise": _constant(0.05),
+    "gain_spread": _constant(0.1),
+}
 _HOSTILE: dict[str, Any] = {
     "mass": Range(1, 100, log=True),
     "size": Range(0.06, 0.45),
@@ -303,14 +317,7 @@ DOMAINS = {
         skin="ideal",
         **PERFECT,
     ),
-    "hardware": Domain(
-        objects=paper.HARDWARE_OBJECTS,
-        friction_ground=Range(paper.HARDWARE_GROUND[0], paper.HARDWARE_GROUND[-1]),
-        friction_robot=Range(paper.HARDWARE_ROBOT[0], paper.HARDWARE_ROBOT[-1]),
-        gap=_constant(0.02),
-        distance=_constant(2.1),
-        **_HARDWARE,
-    ),
+    "hardware": Domain(objects=paper.HARDWARE_OBJECTS, gap=_constant(0.02), **_HARDWARE),
     "wide": Domain(),
     # The worlds of wide, and robots of limited force, traction, lag and acceleration.
     "real": Domain(
@@ -352,8 +359,8 @@ def parse_domain(
         base = DOMAINS[errors.check_name("domain", head, DOMAINS, "FILE.json")]
     changed = replace(base, **_from_json(changes, base))
     for name in changes:
-        if name in changed.idle:
-            rule = f"its objects, frictions, targets or skin leave no {name} to draw"
+        if name in changed.idle:  # and has the default
+            rule = f"{changed.idle[name]} no {name} to draw; leave it out"
             raise errors.not_allowed("domain", domain, rule)
     return changed
 

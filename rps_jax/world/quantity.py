@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import field, fields
 from typing import Any, Literal, NamedTuple
 
@@ -64,6 +65,27 @@ def check_ranges(record: Any, prefix: str) -> None:
             errors.check_finite(f"{prefix}{name} ({side})", value, **bounds)
         if low > high or (log and low <= 0):
             rule = "low must not exceed high" + (", and be above 0" if log else "")
+            raise errors.not_allowed(f"{prefix}{name}", f"{low:g} to {high:g}", rule)
+
+
+def check_unused(
+    record: Any, prefix: str, unused: Mapping[str, str], *others: Mapping[str, Range]
+) -> None:
+    """Raise InputError if a dataclass gives a range from which no world draws.
+
+    The range may be the default, or that of one of `others`.
+
+    Args:
+      record: the dataclass.
+      prefix: of the names in messages.
+      unused: what determines the quantity of each unused range, as "its targets leave".
+      others: ranges that named records share, whatever else these have.
+    """
+    for name, cause in unused.items():
+        value = getattr(record, name)
+        if value not in (getattr(type(record), name), *(ranges.get(name) for ranges in others)):
+            low, high, _ = value
+            rule = f"{cause} no {name} to draw; leave it out"
             raise errors.not_allowed(f"{prefix}{name}", f"{low:g} to {high:g}", rule)
 
 

@@ -24,7 +24,7 @@ from rps_jax.geometry.footprint import Footprint
 from rps_jax.geometry.polyline import Polyline
 from rps_jax.record.options import option
 from rps_jax.robot.shell import Shell
-from rps_jax.world.quantity import Range, drawn
+from rps_jax.world.quantity import Range, check_unused, drawn
 from rps_jax.world.tasks.base import Aim, CourseInputs, Positions
 from rps_jax.world.tasks.path import LOOKAHEAD, Path, PathCourse, PathProgress, turns_of, units_of
 
@@ -207,6 +207,8 @@ class Corridor(Path):
     def check(self) -> None:
         """Raise InputError for turns in which the walls of a corner would cross."""
         super().check()
+        if not self.doors:
+            check_unused(self, "task ", {"door_width": "a corridor without doors leaves"})
         if self.touch == "nothing" and self.friction_wall != type(self).friction_wall:
             rule = "without touch=object, nothing may touch a wall"
             raise errors.not_allowed("task friction_wall", self.friction_wall, rule)

@@ -19,7 +19,7 @@ from rps_jax.geometry import polyline
 from rps_jax.geometry.arrays import Array, Entries, Float, Int, namespace_of
 from rps_jax.geometry.polyline import Polyline
 from rps_jax.robot.shell import Shell
-from rps_jax.world.quantity import Range, drawn
+from rps_jax.world.quantity import Range, check_unused, drawn
 from rps_jax.world.tasks.base import Aim, CourseInputs, Positions, Task
 
 LOOKAHEAD = 49, "m", 0.05, 5, "lookahead on the path", "course"  # as `drawn` takes it
@@ -168,6 +168,9 @@ class Path(Following):
             raise errors.not_allowed("task spline", True, "give waypoints, which it joins")
         if not float(self.turns.low).is_integer() or not float(self.turns.high).is_integer():
             raise errors.not_allowed("task turns", self.turns[:2], "give whole numbers")
+        ranges = ("length", "turns", "turn_angle") if self.waypoints else ("turn_angle",)
+        if self.waypoints or not self.turns.high:
+            check_unused(self, "task ", dict.fromkeys(ranges, "its waypoints or turns leave"))
         if not self.waypoints:
             return
         points = errors.check_array("task waypoints", self.waypoints, ("N", 2))
