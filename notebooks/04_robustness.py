@@ -8,7 +8,7 @@
 # ---
 
 # %% [markdown]
-# # Random worlds
+# # Failures in random worlds
 #
 # RPS solves the paper's grid (`03_paper`). This notebook shows where it fails. Worlds of the
 # domain `wide` differ in mass, size, shape, friction, centre of mass, start and target, and in

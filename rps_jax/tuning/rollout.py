@@ -214,19 +214,20 @@ def _inputs(env: PushEnv, batch: EnvBatch) -> tuple[jax.Array, jax.Array]:
 
 def act(
     env: PushEnv, network: Network, batch: EnvBatch, hidden: jax.Array, action: jax.Array,
-    mapped: Callable[..., Any] = jax.vmap,
+    vmap: Callable[..., Any] = jax.vmap, mapped: Callable[..., Any] | None = None,
 ) -> tuple[EnvBatch, jax.Array]:  # fmt: skip
     """Execute an action (N, 3) in each world; return the batch and the rewards (N,).
 
-    With `native.mapped` as `mapped`, derivatives are fastest; `_unmapped` is for one world.
+    `vmap` maps a function of one world over the batch; `_unmapped` is for one world. `mapped` does
+    so for the environment's steps, by default `vmap`; derivatives are fastest with `native.mapped`.
     """
-    bounded, vmap = features.clip_action(action), _unmapped if mapped is _unmapped else jax.vmap
+    bounded, map_step = features.clip_action(action), mapped or vmap
     inputs = batch.memory.touch_state, batch.states.info["observation"]
     touch_state = vmap(TouchState.mark_decision)(*inputs)
 
     def step(carry: ActCarry, _: None) -> tuple[ActCarry, None]:
         states, touch_state, reward = carry
-        states = mapped(env.step, (0, 0))(states, bounded)
+        states = map_step(env.step, (0, 0))(states, bounded)
         touch_state = vmap(TouchState.update)(touch_state, states.info["observation"])
         return (states, touch_state, reward + states.reward), None
 

@@ -152,7 +152,7 @@ def window_scores(
         def step(batch: EnvBatch, _: None) -> tuple[EnvBatch, jax.Array]:
             inputs = rollout._inputs(env, batch)[0]
             hidden, mean = jax.vmap(network.apply)(weights, batch.memory.hidden, inputs)
-            return rollout.act(env, network, batch, hidden, mean, native.mapped)
+            return rollout.act(env, network, batch, hidden, mean, mapped=native.mapped)
 
         last, rewards = jax.lax.scan(step, worlds, length=options.num_steps)
         _, terminated = rollout._episode_stats(env, last)
