@@ -262,6 +262,11 @@ RECIPES: dict[str, Recipe] = {
         gpu=4,
         section="Equal outcomes",
     ),
+    "landscape": recipe(
+        "rps sweeps/landscape --worlds 510 --candidates 120",
+        cores=24,
+        section="Success, time and way",
+    ),
     "ground": recipe(
         "rps sweeps/ground",
         cores=30,
