@@ -179,7 +179,8 @@ RECIPES: dict[str, Recipe] = {
     "real": recipe(_REAL, gpu=1, section=rows.by_robot),
     "limits": recipe(
         "rps sweeps/limits --limits force lag acceleration --worlds 16384",
-        cores=11, gpu=4,
+        cores=11,
+        gpu=4,
         section="Success over each limit",
     ),
     "sizes": recipe(
