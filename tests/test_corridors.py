@@ -118,7 +118,7 @@ def test_the_table_of_parity_counts_equal_outcomes() -> None:
 def test_all_rows_of_tasks_can_be_run() -> None:
     parity.Parity().validate()
     for task in costs.TASKS.values():
-        parse_domain(costs.DOMAIN, None, task)
+        costs.domain_of(task)
 
 
 def test_costs_are_relative_to_reach() -> None:

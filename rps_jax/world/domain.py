@@ -224,8 +224,9 @@ class Domain:
             unused |= dict.fromkeys(sorted(OBJECT_QUANTITIES), cause)
         if self.frictions:
             unused |= dict.fromkeys(("friction_ground", "friction_robot"), "its frictions leave")
-        if self.targets or not self.task.HAS_TARGET:
-            cause = "its targets leave" if self.targets else task
+        has_targets = len(self.targets) > 0
+        if has_targets or not self.task.HAS_TARGET:
+            cause = "its targets leave" if has_targets else task
             unused |= dict.fromkeys(("distance", "bearing"), cause)
         if self.skin == "ideal":
             unused |= dict.fromkeys(quantities_of("skin"), "its ideal skin leaves")
