@@ -69,21 +69,21 @@ def check_ranges(record: Any, prefix: str) -> None:
 
 
 def check_unused(
-    record: Any, prefix: str, unused: Mapping[str, str], *others: Mapping[str, Range]
+    record: Any, prefix: str, unused: Mapping[str, str], *allowed: Mapping[str, Range]
 ) -> None:
     """Raise InputError if a dataclass gives a range from which no world draws.
 
-    The range may be the default, or that of one of `others`.
+    The range may be the default, or one of `allowed`.
 
     Args:
       record: the dataclass.
       prefix: of the names in messages.
       unused: what determines the quantity of each unused range, as "its targets leave".
-      others: ranges that named records share, whatever else these have.
+      allowed: ranges of named records, by the name of the quantity.
     """
     for name, cause in unused.items():
         value = getattr(record, name)
-        if value not in (getattr(type(record), name), *(ranges.get(name) for ranges in others)):
+        if value not in (getattr(type(record), name), *(ranges.get(name) for ranges in allowed)):
             low, high, _ = value
             rule = f"{cause} no {name} to draw; leave it out"
             raise errors.not_allowed(f"{prefix}{name}", f"{low:g} to {high:g}", rule)
