@@ -26,10 +26,11 @@ from rps_jax.trials.rollout import Candidates, outcomes
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import Rules
 from rps_jax.world.domain import Domain, parse_domain
+from rps_jax.world.tasks import parse_task
 from sweeps.study_base import SpeedStudy, Table
 
 _BOXES = "wide,objects=random_box"
-DOMAIN = f"{_BOXES},distance=19:20,bearing=0"  # of reach
+DOMAIN = f"{_BOXES},distance=19:20,bearing=0"  # of tasks with a target
 _STRAIGHT = "turns=0,length=20,lookahead=1"
 TASKS = {  # the first is the one to compare with; paths have 8 segments, corridors 16 walls
     "reach": "reach",
@@ -100,7 +101,7 @@ costs = call_of(Costs)
 
 def domain_of(task: str) -> Domain:
     """Return boxes on a task of 20 m, which no trial ends in time."""
-    return parse_domain(DOMAIN if task == "reach" else _BOXES, None, task)
+    return parse_domain(DOMAIN if parse_task(task).HAS_TARGET else _BOXES, None, task)
 
 
 def kind_of_device() -> str:
