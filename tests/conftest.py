@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 import shapes
+import tolerances
 
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
 # Most of the time of the tests is compilation, which takes a third without optimisations.
@@ -15,7 +16,36 @@ if os.name == "posix":
     os.environ.setdefault("RPS_COMPILER", str(Path(__file__).with_name("cc")))
 
 
+def pytest_addoption(parser):
+    help_text = "write each numeric assertion's error over its tolerance (with `-o " + (
+        "enable_assertion_pass_hook=true`, that of `error < tolerance`, too) to FILE.gw*"
+    )
+    parser.addoption("--tolerances", metavar="FILE", help=help_text)
+
+
+RATIOS = []
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_runtest_protocol(item):
+    for ratios in RATIOS:
+        ratios.test = item.nodeid
+
+
+def pytest_assertion_pass(lineno, orig, expl):
+    for ratios in RATIOS:
+        tolerances.compare(ratios, lineno, orig, expl)
+
+
+def pytest_sessionfinish():
+    for ratios in RATIOS:
+        ratios.write()
+
+
 def pytest_configure(config):
+    if path := config.getoption("--tolerances"):
+        worker = os.environ.get("PYTEST_XDIST_WORKER", "main")
+        RATIOS.append(tolerances.install(Path(f"{path}.{worker}")))
     # A shell that starts pytest in the background lets it and its subprocesses ignore interrupts.
     signal.signal(signal.SIGINT, signal.default_int_handler)
     shapes.install()
