@@ -197,6 +197,19 @@ def test_a_straight_path_with_a_long_lookahead_is_a_target() -> None:
     assert followed.outcome.task["progress"] > 0.9
 
 
+def test_the_end_of_a_path_that_is_passed_early_is_not_called_near() -> None:
+    points = [[0.3625, 0], [1.5, 0], [1.5, 1], [0.5, 1], [0.5, 0.05]]
+    task = {"waypoints": points, "lookahead": 5}
+    trace = rps_jax.push("cylinder", task=task, skin="ideal", setting=BRIEF)
+    least, share = float(trace.outcome.min_distance), 100 * trace.outcome.task["progress"]
+    assert least < 0.1
+    assert share < 50
+    assert f"least distance {least:.3f} m, " in trace.summary
+    assert trace.summary.endswith(f", {share:.0f} % of the path passed")
+    trials = trace.data.drop_vars(["outcome_touch_x"], errors="ignore")
+    assert trials.outcome_progress < 0.5
+
+
 @pytest.mark.slow
 def test_walls_change_nothing_until_they_are_touched() -> None:
     domain = parse_domain("wide,objects=random_box")

@@ -75,7 +75,7 @@ class Case(TrialOptions):
     def __post_init__(self) -> None:
         check_fields(self)
         name = objects.parse_object(self.object)
-        errors.check_name("object", name, objects.OBJECTS, "FILE.xml")
+        objects.check_object("object", name)
         registry.check_params(self.params)
         scene.check_contact(self.contact, self.mass)
         skins.parse_skin(self.skin or "ideal")
