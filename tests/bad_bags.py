@@ -70,6 +70,7 @@ class Case(NamedTuple):
     expected: str = ""  # words of the sentence, or nothing if the steps are those of the plain bag
     topics: Mapping[str, str] | Sequence[str] = ()
     atol: float = 0.0
+    senses: Sequence[str] = Step._fields
 
 
 def push() -> list[Step]:
@@ -487,6 +488,17 @@ def prefixed() -> list[Row]:
     return result
 
 
+def on_path(paths: Mapping[int, Sequence[tuple[float, float]]], *left_out: str) -> list[Row]:
+    """Return rows with paths [m] that are published at some steps, without some topics."""
+    result = without(*left_out)
+    for i, points in paths.items():
+        header = bag._header(round(1e9 * push()[i].time), "odom")
+        poses = [{"header": header, "pose": bag._pose(*point)} for point in points]
+        stamp = header["stamp"]["sec"] * SECOND + header["stamp"]["nanosec"]
+        result.append(Row("/path", stamp, {"header": header, "poses": poses}))
+    return result
+
+
 def moving_map() -> list[Row]:
     """Return rows with a target in a map that moves against odom by 1 m in a step."""
 
@@ -511,6 +523,9 @@ STATIC = {
 }
 NO_INDEX = {"index_types": IndexType.NONE, "use_statistics": False, "repeat_channels": False,
             "repeat_schemas": False, "use_summary_offsets": False}  # fmt: skip
+TOUCH = ("contact_type", "p_robot_contact", "target")  # fields that laws of touch sense
+LINE = ((0.0, 0.0), (3.0, 1.0), (6.0, 2.0))  # [m] a path
+POINTER = b"version https://git-lfs.github.com/spec/v1\noid sha256:4d7a2146\nsize 12345\n"
 STAMPED = ("/odom", "/target", "/object", "/contact", "/force", "/cmd_vel")
 NAN, INF = float("nan"), float("inf")
 
@@ -535,6 +550,7 @@ def _order() -> dict[str, tuple[Any, ...]]:
     late, hour = 1_700_000_000 * SECOND, 3600 * SECOND
     whole, sorted_ = rows(), sorted(rows(), key=lambda r: r.topic)
     by_system = stamped(lambda t: t + late, ["/cmd_vel"])
+    by_two = received(lambda r, i: r.time + i % 2 * hour)
     ends = [r._replace(time=r.time * 10) for r in stamped(lambda t: 10 * t)
             if r.topic != "/odom" or r.time < 1.4 * SECOND]  # fmt: skip
     return {
@@ -589,8 +605,16 @@ def _order() -> dict[str, tuple[Any, ...]]:
             [r for r in by_system if r.topic != "/taxels"], "in the 1 s before that on /cmd_vel",
         ),
         "sim time and system time mixed, taxels": (by_system, "of other topics, on /taxels"),
-        "a simulation slower than the clock": (
-            received(lambda r, _: 20 * r.time), "no header stamp, nor times of receipt",
+        "a simulation 20 times slower than the clock": (received(lambda r, _: 20 * r.time),),
+        "a simulation slower than the clock": (received(lambda r, _: r.time * 5 // 4),),
+        "a simulation 10 times faster than the clock": (received(lambda r, _: r.time // 10),),
+        "a simulation that pauses, and then is slower": (
+            received(lambda r, _: r.time if r.time < 1400 * MS else 3 * r.time + hour),
+        ),
+        "receipts by two clocks": (by_two, "no header stamp, nor times of receipt"),
+        "receipts by two clocks, of taxels that a law does not sense": (by_two, "", (), 0.0, TOUCH),
+        "an object of another clock, which a law does not sense": (
+            stamped(lambda t: t + late, ["/object"]), "", (), 0.0, TOUCH,
         ),
         "odom ends early": (ends, "no message on /odom in the 1 s before that on /cmd_vel at 15"),
     }  # fmt: skip
@@ -656,6 +680,10 @@ def _invalid_files() -> dict[str, tuple[Any, ...]]:
         "an empty file .db3": (content(b"", "bag.db3"), "is no bag of ROS 2"),
         "a text": (content(b"time,x,y\n"), "is no bag of ROS 2): give FILE.mcap"),
         "a zip archive": (zipped, "is no bag"),
+        "a pointer of Git LFS": (content(POINTER), "fetch the file itself by `git lfs pull`"),
+        "a folder of pointers of Git LFS": (
+            changed_folder(lambda p: (p / "push 0.mcap").write_bytes(POINTER)), "`git lfs pull`",
+        ),
         "a path that is missing": (lambda f: f / "none.mcap", "No such file"),
         "a cut MCAP file": (cut(plain(whole), 0.5), "is cut off or damaged, save the rest"),
         "a cut MCAP file without chunks": (
@@ -800,6 +828,25 @@ def _topics() -> dict[str, tuple[Any, ...]]:
             "has no messages on /contact or /taxels",
         ),
         "no messages": ([], "its topics are none"),
+        "a path": (on_path({0: LINE, 20: LINE}),),
+        "a path without poses before the path": (on_path({0: (), 20: LINE}),),
+        "a path without poses, and a target": (on_path({0: (), 20: ()}),),
+        "a path without poses, and no target": (
+            on_path({0: (), 20: ()}, "/target"), "has no messages on /path with poses",
+        ),
+        "a path of one pose": (
+            on_path({0: LINE[:1]}), "has a path of less than 0.01 m on /path at 1.000 s: publish",
+        ),
+        "a path of equal poses": (on_path({0: LINE[:1] * 3}), "has a path of less than 0.01 m"),
+        "a path that is shortened": (
+            on_path({0: LINE, 20: LINE[1:]}), "has a path of 2 poses on /path after one of 3, rec",
+        ),
+        "a path that is shortened, beside a target": (
+            on_path({0: LINE, 20: LINE[1:]}), "", (), 0.0, TOUCH,
+        ),
+        "a path again after its end": (
+            on_path({0: LINE, 20: (), 30: LINE}), "a path after one without poses on /path at 1.6",
+        ),
         "one command": (one, "has too few commands, 1, on /cmd_vel"),
     }  # fmt: skip
 
@@ -849,6 +896,9 @@ def _values() -> dict[str, tuple[Any, ...]]:
         "taxels of two counts": (
             edited("/taxels", set_("data", [0.0] * 41), [5]), "be decoded (41 values, not 42)",
         ),
+        "taxels of two counts, which a law does not sense": (
+            edited("/taxels", set_("data", [0.0] * 41), [5]), "", (), 0.0, TOUCH,
+        ),
     }  # fmt: skip
 
 
@@ -864,14 +914,14 @@ def result_of(case: Case, folder: Path, expected: dict[str, np.ndarray]) -> str:
     """Return the sentence of a refusal, or how the steps differ; nothing if they are equal."""
     try:
         write = case.source if callable(case.source) else plain(case.source)
-        steps = bag.read(write(folder), case.topics)
+        steps = bag.read(write(folder), case.topics, case.senses)
     except InputError as error:
         return str(error)
     late = steps["time"][0] - expected["time"][-len(steps["time"])]
     steps["time"] = steps["time"] - late if abs(late) > 1e8 else steps["time"]
     for name, values in expected.items():
         if name not in steps:
-            if "object" not in name:
+            if "object" not in name and name in case.senses:
                 return f"{name} is missing"
             continue
         part = values[-len(steps["time"]) :]

@@ -335,3 +335,53 @@ def test_a_missing_package_is_named(command, tmp_path, capsys, monkeypatch):
     monkeypatch.setitem(sys.modules, package, None)
     hint = f"is not installed: run pip install 'rps_jax[{extra}]'"
     assert hint in refusal(capsys, command)
+
+
+TWICE = {
+    "sweep --domain twice.json": '{"mass": [3, 4], "mass": [5, 6]}',
+    "push --robot twice.json": '{"mass": 100, "mass": 200}',
+    "push --law rps,twice.json": '{"L": 0.3, "L": 0.4}',
+    "push --task twice.json": '{"kind": "path", "turns": 1, "turns": 2}',
+    "push --task twice.yaml": "kind: path\nturns: 1\nturns: 2\n",
+    "push --law rps,L=0.3,L=0.4": "",
+    "push --task path,turns=1,turns=2": "",
+    "sweep --domain wide,mass=3:4,gap=0:0,mass=5:6": "",
+}
+
+
+@pytest.mark.parametrize("command", TWICE)
+def test_a_name_that_is_given_twice_is_refused(command, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    name = f"twice.{command.rpartition('.')[2]}"
+    (tmp_path / name).write_text(TWICE[command])
+    sentence = refusal(capsys, command)
+    assert re.search(
+        r"it has (mass|L|turns) twice|duplicate key|give (mass|L|turns) once", sentence
+    )
+    assert (name in sentence) == bool(TWICE[command])
+
+
+def test_a_file_of_changes_may_be_changed_again(tmp_path):
+    path = files.write_json(tmp_path / "a.json", {"L": 0.3, "saturate_first": 1})
+    assert registry.parse_law(f"rps,{path},L=0.4")[1].L == 0.4
+
+
+POINTER = "version https://git-lfs.github.com/spec/v1\noid sha256:4d7a2146\nsize 12345\n"
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        "sweep --domain {}.json", "push --law rps,{}.json", "push --law {}.npz",
+        "push --law {}.py", "push --object {}.xml", "push --task {}.yaml", "fit {}.csv",
+        "fit {}.mcap", "shadow {}.db3",
+    ],
+)  # fmt: skip
+def test_a_pointer_of_git_lfs_is_named(command, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    words = command.format("pointer").split()
+    name = words[-1].rpartition(",")[2]
+    (tmp_path / name).write_text(POINTER)
+    sentence = refusal(capsys, *words)
+    assert name in sentence
+    assert sentence.endswith("fetch the file itself by `git lfs pull`.\n")

@@ -147,6 +147,17 @@ def test_the_commands_take_the_names_of_topics(recorded, tmp_path, capsys):
     assert not (tmp_path / "shadow").exists()
 
 
+def test_the_steps_of_a_path_end_with_a_path_without_poses(tmp_path, capsys):
+    """As docs/on_a_robot.md tells users to publish at the end."""
+    paths = {0: bad_bags.LINE, 20: bad_bags.LINE, 30: ()}
+    rows = bad_bags.on_path(paths, "/target"), bad_bags.on_path({0: bad_bags.LINE}, "/target")
+    ended, whole = (bad_bags.plain(x, name=f"{len(x)}.mcap")(tmp_path) for x in rows)
+    assert rps("shadow", ended, "--law", "rps", "--out", tmp_path / "run") == 0
+    assert "30 commands in 0.6 s" in capsys.readouterr().out
+    both = shadow(ended, "rps"), shadow(whole, "rps")
+    xr.testing.assert_allclose(both[0], both[1].isel(time=slice(30)))
+
+
 @pytest.mark.parametrize(
     ("field", "factors", "words"),
     [

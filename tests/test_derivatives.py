@@ -36,6 +36,11 @@ def final_distance(trajectory):
     return trajectory.details.distance[-1]
 
 
+def halved(trajectory):
+    """Distance at the end, halved until it is below a millimetre: a loop of unknown length."""
+    return jax.lax.while_loop(lambda x: x > 1e-3, lambda x: x / 2, final_distance(trajectory))
+
+
 def gradients_of(domain, law="rps_tuned"):
     """The gradient in double precision; equal shapes share one program.
 
@@ -260,6 +265,7 @@ test_invalid_rollouts_are_refused = refusals(
         ({"horizon": -1.0}, "horizon = -1"),
         ({"score": "time"}, "score = 'time' is not allowed"),
         ({"score": lambda snapshots: snapshots.time}, r"result of score = float32\[5\]"),
+        ({"score": halved}, "score = halved .* its derivative raises ValueError .*lax.while_loop"),
         ({"setting": Setting("mujoco")}, "engine = mujoco is not allowed: JAX must trace it"),
         ({"smooth": "yes"}, "smooth = 'yes'"),
     ],
@@ -286,6 +292,24 @@ def test_a_score_must_return_a_number(score, message):
     snapshots = SimpleNamespace(done=np.zeros(5, bool))
     with pytest.raises(rps_jax.InputError, match=message):
         derivatives._score(score, QUASISTATIC, snapshots, RPSParams())
+
+
+@pytest.mark.parametrize(
+    "transform",
+    [
+        lambda call: jax.jit(lambda: call(RPSParams()))(),
+        lambda call: jax.jit(lambda x: call(RPSParams(K_h=x)))(0.5),
+        lambda call: jax.vmap(lambda x: call(RPSParams(K_h=x)))(np.ones(2)),
+        lambda call: jax.grad(lambda x: call(RPSParams(K_h=x)))(0.5),
+    ],
+)
+def test_functions_that_return_numbers_of_the_host_cannot_be_transformed(transform, compiled):
+    words = "call it outside of jit, vmap and grad, or transform a function that calls rps_jax.roll"
+    with pytest.raises(rps_jax.InputError, match=f"value_and_grad returns .*{words}"):
+        transform(lambda law: rps_jax.value_and_grad(final_distance, law).value.values)
+    with pytest.raises(rps_jax.InputError, match=f"evaluate returns .*{words}"):
+        transform(lambda law: rps_jax.evaluate(law).score.values)
+    assert not compiled
 
 
 def test_an_engine_without_a_mode_is_refused_before_anything_compiles(monkeypatch, compiled):

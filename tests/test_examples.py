@@ -496,6 +496,22 @@ def test_skin_and_law_on_a_robot_observe_the_time_since_the_last_step(monkeypatc
     assert min(commands[1:]) > 0.01
 
 
+def test_the_name_of_a_file_is_not_offered_as_an_object(tmp_path):
+    """Its file may have failed for another reason."""
+    path = tmp_path / "crate.xml"
+    path.write_text(BOX.read_text())
+    objects.register_object("mine", path)
+    with pytest.raises(InputError, match="mass = -1"):
+        Case(str(path), mass=-1.0)
+    for call in (lambda: Case("crat"), lambda: parse_domain("wide,objects=crat")):
+        with pytest.raises(
+            InputError, match=r"object 'crat': choose from .*mine, or give FILE"
+        ) as e:
+            call()
+        assert "crate" not in str(e.value)
+    assert Case("crate").object_name == "crate"
+
+
 def test_suffixes_of_files_have_any_case(tmp_path, registries):
     (tmp_path / "crate.xml").write_text(BOX.read_text())
     (tmp_path / "CRATE.XML").write_text(BOX.read_text())

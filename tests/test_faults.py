@@ -120,7 +120,7 @@ SHELL = [
     ("JAX_ENABLE_X64=maybe push", 2, "jax cannot be imported .*JAX_ENABLE_X64.*: correct or"),
     ("XLA_FLAGS=--xla_nonsense=1 push", 2, "XLA_FLAGS = --xla_nonsense=1 .*Unknown flag"),
     ("MPLBACKEND=Qt9Agg TERM=dumb COLUMNS=0 LC_ALL=C PYTHONUTF8=0 PYTHONIOENCODING=ascii "
-     "push --object Körper/Fuß.xml >&2", 0, "least distance"),
+     "push --object Körper/Fuß.xml >&2", 0, "not reached at 1.0 s, never touched"),
 ]  # fmt: skip
 MORE = [
     ("MUJOCO_GL=vulkan rps doctor >&2", 0, "FAILS: MUJOCO_GL = vulkan is not allowed"),

@@ -2,6 +2,8 @@
 
 import dataclasses
 import json
+import time
+import warnings
 from typing import Any
 
 import numpy as np
@@ -78,6 +80,8 @@ IMAGES: dict[str, tuple[Any, dict[str, Any]]] = {
         {"mode": "trinary"},
     ),
     "white.png": (255 - GREY, {"negate": 1}),
+    "text.png": (255 - GREY, {"negate": "'1'", "mode": "Trinary"}),
+    "rtabmap.pgm": (GREY, {"map_type": "occupancy", "frame_id": "map", "negate": "false"}),
     "deep.png": (GREY.astype(np.uint16) * 257, {"negate": 0}),
     "turned.pgm": (GREY, {"origin": [3.0, -1.0, 0.5]}),
 }
@@ -136,6 +140,25 @@ def test_a_part_of_a_map_without_the_start_is_a_wall(tmp_path):
         tasks.parse_task(fields | {"goal": [7, 2]})
 
 
+@pytest.mark.parametrize("free_thresh", [0.196, 0.25])
+def test_unknown_cells_that_count_as_free_are_named_once(free_thresh, tmp_path):
+    """Nav2 Humble writes free_thresh: 0.25, and 0.25 of black is darker than grey 205."""
+    pixels = np.full((60, 100), 254, np.uint8)
+    pixels[:, 90:] = 205
+    pixels[10, 10] = 0
+    Image.fromarray(pixels).save(tmp_path / "map.pgm")
+    fields = {"image": str(tmp_path / "map.pgm"), "resolution": 0.1, "start": [2, 3, 0]}
+    with warnings.catch_warnings(record=True) as caught:
+        task = tasks.parse_task(fields | {"goal": [7, 3], "free_thresh": free_thresh})
+    assert isinstance(task, Rooms)
+    sentences = [str(x.message) for x in caught]
+    assert len(sentences) == (free_thresh > 0.2)
+    for sentence in sentences:
+        assert sentence.startswith("10 % of the free cells of the map have the grey 205 of unknown")
+        assert "write free_thresh: 0.196" in sentence
+    assert max(x for x, _ in task.walls[:-8]) == pytest.approx(10 if sentences else 9)
+
+
 # --- paths ---------------------------------------------------------------------------------------
 
 
@@ -144,6 +167,34 @@ def test_a_free_way_is_straight():
     assert path[-1] == pytest.approx([5.5, 0])
     assert path[:, 1] == pytest.approx(0)
     assert LineString(path).length == pytest.approx(5.5 - 0.3625)
+
+
+@pytest.mark.parametrize("yaw", [0.0, 0.5])
+def test_a_goal_at_the_end_of_the_way_ahead_is_as_far_as_that(yaw):
+    """A plan of an edge without length; 5.3 m, if that were no edge."""
+    ahead = 0.5 * np.exp(1j * yaw)
+    start = [1.5, 2, yaw]
+    goal = [1.5 + ahead.real, 2 + ahead.imag]
+    for ends in ({"goal": goal}, {"goal": [goal, [7, 2], goal]}):
+        paths, _, _ = world(room(**HALL | {"start": start} | ends, polygons=[]), 20)
+        lengths = [LineString([(0, 0), *path[1:]]).length for path in paths]
+        assert min(lengths) == pytest.approx(0.5)
+        assert max(lengths) == pytest.approx(0.5 if ends["goal"] is goal else 5.5, abs=0.2)
+
+
+def test_starts_goals_and_corners_may_coincide():
+    """Two starts at one point, and a goal at a vertex of the path around a corner."""
+    polygons = [[[4, 0], [4.2, 0], [4.2, 2], [4, 2]]]
+    hall = HALL | {"outline": [[0, 0], [9, 0], [9, 8], [0, 8]], "polygons": polygons}
+    whole = room(**hall)
+    ((_, *path),) = world(whole)[0]
+    middle = [path[2][0] + 1.5, path[2][1] + 2]
+    task = room(**hall | {"start": [[1.5, 2, 0]] * 2, "goal": [middle, [7, 2]]})
+    paths = world(task, 30)[0]
+    lengths = np.round([LineString(path).length for path in paths], 6)
+    through = LineString(world(whole)[0][0]).length
+    assert set(lengths) == {np.round(through, 6), min(lengths)}
+    assert min(lengths) == pytest.approx(LineString(world(whole)[0][0][:4]).length, abs=1e-6)
 
 
 def test_a_path_around_a_wall_is_almost_the_shortest():
@@ -255,6 +306,7 @@ def test_a_sweep_of_rooms_is_stored_and_replayed(tmp_path):
 # --- bad input -----------------------------------------------------------------------------------
 
 SQUARE = [[4, 1], [5, 1], [5, 3], [4, 3]]
+OVERLAP = [[[3, 0.5], [7, 0.5], [7, 3.5], [3, 3.5]], [[3.2, 0.6], [6.8, 0.6], [7.2, 3.4], [3.2, 3]]]
 ROS = {"image": "room.png", "resolution": 0.125, "start": [1, 1, 0.3], "goal": [7, 2]}
 BAD: dict[str, tuple[dict[str, Any], str]] = {
     "empty": ({"kind": "rooms", "goal": [1, 1]}, "give polygons, an outline or a map.yaml"),
@@ -285,7 +337,28 @@ BAD: dict[str, tuple[dict[str, Any], str]] = {
         "the base touches a wall",
     ),
     "goal in polygon": (HALL | {"polygons": [SQUARE], "goal": [4.5, 2]}, "task goal = (4.5, 2.0)"),
-    "goal outside": (HALL | {"goal": [12, 2]}, "a goal in the same room"),
+    "goal outside": (HALL | {"goal": [12, 2]}, "it lies in an obstacle or outside of the room"),
+    "both outside": (
+        HALL | {"start": [20, 2, 0], "goal": [25, 2]},
+        "task start = (20.0, 2.0, 0.0)",
+    ),
+    "overlap": (
+        HALL | {"polygons": OVERLAP, "start": [4.5, 2, 0], "goal": [5.5, 2], "base_radius": 0.3},
+        "task start = (4.5, 2.0, 0.0) is not allowed: it lies in an obstacle",
+    ),
+    "goal in an overlap": (HALL | {"polygons": OVERLAP, "goal": [5.5, 2]}, "task goal = (5.5, 2"),
+    "degrees": (HALL | {"start": [1.5, 2, 90]}, "yaw of task start = 90.0 is not allowed: it must"),
+    "degrees of a map": (ROS | {"origin": [0, 0, 180]}, "yaw of task origin = 180.0"),
+    "an outline of an image": (
+        ROS | {"outline": [[0, 0], [9, 0], [9, 6], [0, 6]]},
+        "an image has outlines of its own",
+    ),
+    "many polygons": (HALL | {"polygons": [SQUARE] * 100_000}, "at most 128 are allowed"),
+    "many corners": (
+        HALL | {"polygons": [[[4 + np.cos(x), np.sin(x)] for x in np.linspace(0, 6.28, 20_000)]]},
+        "at most 128 are allowed",
+    ),
+    "many starts": (HALL | {"start": [[1.5, 2, 0]] * 129}, "count of task start = 129"),
     "goal at wall": (HALL | {"goal": [8.8, 2]}, "and one is 0.20 m away"),
     "goal at start": (HALL | {"goal": [1.5, 2]}, "the base starts there"),
     "unreachable": (HALL | {"polygons": [[[4, 0], [5, 0], [5, 4], [4, 4]]]}, "no path leads there"),
@@ -320,6 +393,12 @@ BAD: dict[str, tuple[dict[str, Any], str]] = {
     ),
     "cut": (ROS | {"image": "cut.pgm"}, "give a PGM, PNG or BMP file"),
     "no picture": (ROS | {"image": "map.json"}, "give a PGM, PNG or BMP file"),
+    "large noise": (ROS | {"image": "specks.png", "start": [4, 4, 0]}, "remove its specks"),
+    "jagged": (ROS | {"image": "jagged.png", "start": [4, 4, 0]}, "give a larger tolerance"),
+    "tolerance beyond the room": (
+        ROS | {"tolerance": 50},
+        "task tolerance = 50.0 is not allowed: walls of it exclude the",
+    ),
     "noise": (ROS | {"image": "noise.png", "start": [4, 4, 0]}, "give a larger tolerance"),
     "scale": (ROS | {"mode": "scale"}, "task mode = scale is not allowed: give one of ['trinary']"),
     "negate": (ROS | {"negate": 2}, "task negate = 2"),
@@ -339,9 +418,23 @@ def folder(tmp_path_factory):
     Image.fromarray(GREY).save(path / "room.png")
     noise = np.random.default_rng(0).uniform(size=(80, 80)) < 0.9
     Image.fromarray(np.where(noise, 255, 0).astype(np.uint8)).save(path / "noise.png")
+    specks = np.random.default_rng(0).uniform(size=(2000, 2000)) < 0.9
+    jagged = np.full((1000, 1000), True)
+    jagged[100:900:8, 100:] = False  # one obstacle of long teeth
+    jagged[100:900, 990:] = False
+    for name, cells_ in (("specks", specks), ("jagged", jagged)):
+        Image.fromarray(np.where(cells_, 255, 0).astype(np.uint8)).save(path / f"{name}.png")
     for name, size in (("huge", "40000 25000"), ("large", "5000 5000"), ("cut", "50 50")):
         (path / f"{name}.pgm").write_bytes(f"P5\n{size}\n255\n".encode() + b"0" * 100)
     return path
+
+
+@pytest.mark.parametrize("name", ["specks", "jagged", "noise"])
+def test_a_noisy_map_is_refused_at_once(name, folder):
+    start = time.perf_counter()
+    with pytest.raises(InputError, match="at most 128 are allowed"):
+        tasks.parse_task(ROS | {"image": str(folder / f"{name}.png"), "start": [4, 4, 0]})
+    assert time.perf_counter() - start < 3
 
 
 @pytest.mark.parametrize("name", BAD)
@@ -354,9 +447,10 @@ def test_bad_maps_are_one_sentence(name, folder, capsys, recwarn):
 
 
 YAML = {
+    "": "map.yaml is no YAML mapping (it holds no names with values): write name: value",
+    "# nothing\n": "map.yaml is no YAML mapping (it holds no names with values)",
     "image: room.png\nresolution: [0.1\n": "is no YAML mapping",
     "- image\n- resolution\n": "is no YAML mapping",
-    "": "is no YAML mapping",
     "\x00": "is no YAML mapping",
     "image: room.png\n": "task resolution = None",
     "image: none.png\nresolution: 0.05\norigin: [0, 0, 0]\n": "none.png cannot be read",

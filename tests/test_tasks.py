@@ -1,5 +1,6 @@
 """Tests of tasks: paths, corridors and their geometry, against shapely."""
 
+import itertools
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar, NamedTuple
 
@@ -196,6 +197,19 @@ def test_a_straight_path_with_a_long_lookahead_is_a_target() -> None:
     assert followed.outcome.task["progress"] > 0.9
 
 
+def test_the_end_of_a_path_that_is_passed_early_is_not_called_near() -> None:
+    points = [[0.3625, 0], [1.5, 0], [1.5, 1], [0.5, 1], [0.5, 0.05]]
+    task = {"waypoints": points, "lookahead": 5}
+    trace = rps_jax.push("cylinder", task=task, skin="ideal", setting=BRIEF)
+    least, share = float(trace.outcome.min_distance), 100 * trace.outcome.task["progress"]
+    assert least < 0.1
+    assert share < 50
+    assert f"least distance {least:.3f} m, " in trace.summary
+    assert trace.summary.endswith(f", {share:.0f} % of the path passed")
+    trials = trace.data.drop_vars(["outcome_touch_x"], errors="ignore")
+    assert trials.outcome_progress < 0.5
+
+
 @pytest.mark.slow
 def test_walls_change_nothing_until_they_are_touched() -> None:
     domain = parse_domain("wide,objects=random_box")
@@ -304,6 +318,74 @@ def test_bad_tasks_are_refused(task: str) -> None:
     assert REFUSED[task].lower() in str(error.value).lower()
     with pytest.raises(InputError):
         Push(task=task).validate()
+
+
+def strips(points: np.ndarray, half: float) -> list[Polygon]:
+    """Return the parts of a corridor about each two segments, with the walls before and after."""
+    steps = np.diff(points, axis=0)
+    units = steps / np.linalg.norm(steps, axis=1)[:, None]
+    ends = [points[0] - 1.5 * units[0], *points[1:-1], points[-1] + 1.5 * units[-1]]
+    shape = {"cap_style": "flat", "join_style": "mitre", "mitre_limit": 1e4}
+    return [LineString(ends[i : i + 3]).buffer(half, **shape) for i in range(len(ends) - 2)]
+
+
+def test_a_corridor_is_accepted_exactly_if_its_walls_leave_its_width() -> None:
+    """Of random paths; in a refused one, parts that do not follow each other overlap."""
+    rng, counts = np.random.default_rng(1), {True: 0, False: 0}
+    one = np.zeros(1)
+    u = {"width": one, "door_width": one, "lookahead": one}
+    while min(counts.values()) < 50:
+        bends = rng.uniform(-1.9, 1.9, rng.integers(1, 7)).cumsum()
+        steps = rng.uniform(1, 4, bends.size + 1) * np.exp(1j * np.append(0, bends))
+        points = (0.4 + np.append(0, steps.cumsum())).view(float).reshape(-1, 2)
+        half, doors = rng.uniform(0.35, 1.0), int(rng.integers(0, 2))
+        fields = {"kind": "corridor", "waypoints": points.tolist(), "width": 2 * half}
+        try:
+            task = tasks.parse_task(fields | ({"doors": 1, "door_width": 1.0} if doors else {}))
+            walls = task.courses(CourseInputs(u, np.zeros((1, 2)), one))[1].walls[0]
+            walls = walls[: len(walls) - 2 * doors]
+            away = min(LineString(points).distance(LineString(wall)) for wall in walls)
+            assert away > half * (1 - 1e-4)
+        except InputError as error:
+            if "walls of another part of the corridor" not in str(error):
+                continue  # too long for its corners
+            parts = strips(points, half)
+            lines = [LineString(x) for x in itertools.pairwise(points)]
+            others = (
+                part.intersection(line.buffer(1.5 * half, cap_style="flat")).area
+                for i, part in enumerate(parts)
+                for j, line in enumerate(lines)
+                if j not in (i, i + 1)
+            )
+            assert max(others) > 0
+            counts[False] += 1
+        else:
+            counts[True] += 1
+
+
+@pytest.mark.parametrize(
+    "waypoints",
+    [
+        [[0.4, 0], [4, 0], [4, 3], [2, 3], [2, -3]],  # it crosses itself
+        [[0.4, 0], [4, 0], [4, 3], [-0.8, 3], [-0.8, 0.8]],  # it ends in the walls behind
+        [[0.4, 0], [4, 0], [4, 3], [2, 3], [2, 1]],  # the walls beyond its end cross it
+    ],
+)
+def test_a_corridor_that_meets_itself_is_refused(waypoints: list[list[float]]) -> None:
+    fields = {"waypoints": waypoints, "kind": "corridor", "width": 1.4}
+    with pytest.raises(InputError, match="walls of another part of the corridor are"):
+        tasks.parse_task(fields)
+    assert isinstance(tasks.parse_task({"waypoints": waypoints, "kind": "path"}), Path)
+
+
+def test_walls_of_drawn_corridors_leave_their_width() -> None:
+    ranges = "width=1.1:1.5,turns=1:6,turn_angle=0.2:1.5,length=10:30,doors=3,door_width=1"
+    lines = drawn(f"corridor,{ranges}", 400).course.lines()
+    for vertices, walls in zip(lines["path"], lines["walls"], strict=True):
+        line, sides = vertices @ (1, 1j), (walls @ (1, 1j))[:-6]
+        half = polyline.distances(*sides[:1].T[..., None], line[:1], line[1:2]).min()
+        away = polyline.distances(*sides.T[..., None], line[:-1], line[1:])
+        assert away.min() > half * (1 - 1e-6)
 
 
 @pytest.mark.parametrize(

@@ -245,4 +245,6 @@ def _outcome(trial: xr.Dataset) -> str:
     if int(trial.success):
         return f"{float(trial.time):.0f} s"
     distance = float(trial.min_distance)
+    if "progress" in trial:
+        return f"fails, {100 * float(trial.progress):.0f} % of the path"
     return f"fails, {100 * distance:.0f} cm off" if np.isfinite(distance) else "never touches"

@@ -59,7 +59,9 @@ class Shadow(BagQuestion[xr.Dataset]):
     @cached_property
     def steps(self) -> dict[str, np.ndarray]:
         """Steps of the bag."""
-        return bags.read(Path(self.file), self.topics)
+        shapes = validation.observation_shapes(registry.law_of(self.params).senses)
+        senses = [path[-1].name for path, _ in jax.tree_util.tree_flatten_with_path(shapes)[0]]
+        return bags.read(Path(self.file), self.topics, senses)
 
     def check(self) -> None:
         """Check the law, the robot and the bag."""

@@ -71,6 +71,18 @@ def check_process() -> None:
         )
 
 
+def check_eager(name: str, inputs: object) -> None:
+    """Raise InputError for traced inputs of a function, or within `jax.jit`."""
+    import jax
+
+    leaves = jax.tree.leaves((inputs, jax.numpy.zeros(())))
+    if any(isinstance(x, jax.core.Tracer) for x in leaves):
+        raise InputError(
+            f"{name} returns numbers of the host: call it outside of jit, vmap and grad, or "
+            "transform a function that calls rps_jax.rollout."
+        )
+
+
 @contextlib.contextmanager
 def standard_jax() -> Iterator[None]:
     """Run with JAX's default checks in this thread, whatever the user's own code needs.

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import functools
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from rps_jax.geometry import footprint as fp
 from rps_jax.geometry import planar
@@ -172,3 +174,32 @@ def _square(way: _Pair, along: _Vectors) -> Array:
     share = _share(way, along)
     away = way[0] - share * along.x, way[1] - share * along.y
     return _dot(away, away)
+
+
+# --- segments between complex numbers, in NumPy --------------------------------------------------
+
+
+def distances(p: Any, q: Any, a: Any, b: Any) -> np.ndarray:
+    """Return the distances [m] between segments from p to q, or points, and those from a to b."""
+    pairs = (p, a, b), (q, a, b), (a, p, q), (b, p, q)
+    sides, lengths = ([f(*pair) for pair in pairs] for f in (_side, to_segment))
+    crosses = (sides[0] * sides[1] < 0) & (sides[2] * sides[3] < 0)
+    return np.where(crosses, 0.0, functools.reduce(np.minimum, lengths))
+
+
+def is_inside(point: complex, a: np.ndarray, b: np.ndarray) -> bool:
+    """Return whether a ray from a point crosses an odd number of segments from a to b."""
+    passed = (a.imag > point.imag) != (b.imag > point.imag)
+    return bool(np.sum(passed & ((_side(point, a, b) > 0) == (b.imag > a.imag))) % 2)
+
+
+def to_segment(point: Any, a: Any, b: Any) -> np.ndarray:
+    """Return the distances [m] of points from segments from a to b."""
+    along, away = b - a, point - a
+    share = np.real(np.conj(along) * away) / np.maximum(abs(along) ** 2, 1e-30)
+    return abs(away - np.clip(share, 0, 1) * along)
+
+
+def _side(point: Any, a: Any, b: Any) -> np.ndarray:
+    """Return a number above 0 for points on the left of lines from a to b."""
+    return np.imag(np.conj(b - a) * (point - a))

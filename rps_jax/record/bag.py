@@ -7,7 +7,7 @@ compression. Each topic has one message per control step, except `/tf` and the m
     /target         geometry_msgs/PointStamped     the law's target, on a path a lookahead ahead
                                                    (read, too: PoseStamped)
     /path           nav_msgs/Path                  of a task, once a second; all of a bag have as
-                                                   many poses
+                                                   many poses; one without poses ends the steps
     /walls          visualization_msgs/Marker      of a task, once a second
     /contact        geometry_msgs/PolygonStamped   in base_link: no point without contact, one for a
                                                    point contact, twice the same for a line contact
@@ -22,7 +22,8 @@ compression. Each topic has one message per control step, except `/tf` and the m
     /tf             tf2_msgs/TFMessage             odom to base_link and to object
 
 Time is that of the header stamps. A topic whose messages have no stamp, or the stamp zero, has the
-time of receipt less the median delay of the stamped topics. The order of the file does not matter.
+time of receipt less the median delay of the stamped topics; if their clock has another pace, as a
+simulation's, it is interpolated. The order of the file does not matter.
 
 The law needs target and object in the frame of the odometry, and contact and force in its child
 frame. `read` transforms them from other frames by `/tf`, `/tf_static` and the odometry, at their
@@ -33,7 +34,7 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from functools import partial
 from operator import attrgetter
 from pathlib import Path
@@ -55,7 +56,9 @@ _MAX_NUMBERS = 2**27  # of all messages, and of all steps; a message counts 32 m
 _MARKER_PERIOD = 1.0  # [s] between two target markers
 _STALE = 1.0  # [s] that a stream of messages may pause
 _EARLY = 0.1  # [s] before a transform that it holds
-_SKEW = 0.5  # [s] of 80 % of the delays between stamp and receipt
+_SKEW = 0.5  # [s] of 80 % of the delays between stamp and receipt, or of 90 % of late stamps
+_DRIFT = 0.02  # [s] change of the delay from the first to the last quarter of the messages
+_SHORTEST = 0.01  # [m] extent of a path
 _MAX_TILT = 0.1  # [rad] of the base against the floor
 _UNIT = 1e-3  # [1] by which the norm of a quaternion may differ from 1
 _SAME = 1e-6  # [m, rad] by which two frames may differ that are one
@@ -265,16 +268,20 @@ def topic_names(topics: TopicsLike) -> dict[str, str]:
     return {key: f"/{name.strip('/')}" for key, name in names.items()}
 
 
-def read(path: str | Path, topics: TopicsLike = ()) -> dict[str, np.ndarray]:
+def read(
+    path: str | Path, topics: TopicsLike = (), senses: Collection[str] = tuple(Step._fields)
+) -> dict[str, np.ndarray]:
     """Return the steps of a bag as arrays, by the fields of `Step` that it has, and `period`.
 
     A step is a command, with the latest message of each other topic that is not after it. Steps
-    begin when each topic has had a message. A bag with `/taxels` alone, as of a robot, has no
-    `contact_type` and no `p_robot_contact`.
+    begin when each topic has had a message, and end at a path without poses. A bag with `/taxels`
+    alone, as of a robot, has no `contact_type` and no `p_robot_contact`.
 
     Args:
       path: of an MCAP file, of an sqlite3 file, or of a folder of `ros2 bag record`.
       topics: other names of topics: see `topic_names`.
+      senses: optional fields to read. Without `path`, it is read if there is no target; without
+        `signal`, the taxels are read if there are no contacts.
 
     Raises:
       InputError: the path is no bag; the bag is damaged or too large, or lacks a topic; or its
@@ -294,28 +301,46 @@ def read(path: str | Path, topics: TopicsLike = ()) -> dict[str, np.ndarray]:
     names = topic_names(topics)
     check()
     try:
-        return _steps(Path(path), names)
+        return _steps(Path(path), names, senses)
     except InputError as error:
         raise InputError(f"bag = {path} {str(error).rstrip('.')}.") from error
 
 
-def _steps(path: Path, renamed: dict[str, str]) -> dict[str, np.ndarray]:
+def _steps(path: Path, renamed: dict[str, str], senses: Collection[str]) -> dict[str, np.ndarray]:
     """Return the steps of a bag, as `read` does."""
     names = {key: f"/{key}" for key in _READERS if key not in renamed} | renamed
-    logs, contents = _collect(path, {key: names[key] for key in names if key not in _TREE})
-    required = dict.fromkeys(["odom", "path" if "path" in logs else "target", "cmd_vel", *renamed])
-    missing = [names[key] for key in required if key not in logs and key not in _TREE]
-    if not logs.keys() & {"contact", "taxels"}:
+    logs, contents, faults = _collect(path, {k: names[k] for k in names if k not in _TREE})
+    known = logs.keys() | faults.keys()
+    goal = "path" if known & {"path", _END} and "target" not in known else "target"
+    required = dict.fromkeys(["odom", goal, "cmd_vel", *renamed])
+    missing = [
+        names[key] + " with poses" * (key == "path")
+        for key in required
+        if key not in {*known, *_TREE}
+    ]
+    if not known & {"contact", "taxels"}:
         missing.append(f"{names['contact']} or {names['taxels']}")
     if missing:
         raise InputError(
             f"has no messages on {', '.join(missing)}; its topics are "
             f"{', '.join(sorted(contents)) or 'none'}: name others by --topic KEY=/TOPIC"
         )
-    delay = _delay(logs.values())
-    series = {key: _in_order(names[key], log, delay) for key, log in logs.items()}
-    commands = series.pop("cmd_vel")
+    used = [*required, "contact" if "contact" in known else "taxels"]
+    used += [_FIELDS[name][0] for name in senses if name in _FIELDS]
+    for key in used:
+        if key in faults:
+            raise faults[key]
+    logs = {key: log for key, log in logs.items() if key in {*used, _END}}
+    clock = _clock(logs.values())
+    names[_END] = names["path"]
+    series = {key: _in_order(names[key], log, clock) for key, log in logs.items()}
+    commands, end = series.pop("cmd_vel"), series.pop(_END, None)
     commands = commands.at(commands.time >= max(s.time[0] for s in series.values()))
+    if end is not None and "path" in series:
+        paths = series["path"]
+        if (ends := end.time[end.time > paths.time[0]]).size:
+            paths.refuse(paths.time > ends[0], "a path after one without poses")
+            commands = commands.at(commands.time < ends[0])
     if (count := len(commands.time)) < 2:
         words = f"has too few commands, {count}, on {commands.topic} after all topics have begun"
         raise InputError(f"{words}: record at least two")
@@ -326,7 +351,11 @@ def _steps(path: Path, renamed: dict[str, str]) -> dict[str, np.ndarray]:
             late = commands.time - row.time > 1e9 * _STALE
             commands.refuse(late, f"no message on {row.topic} in the {_STALE:g} s before that")
         row.check(_MAX_TILT if key == "odom" else None)
-    edges = functools.cache(partial(_edges, path, names, logs["odom"], delay))
+        if key == "path":
+            extent = np.ptp(row.values.reshape(count, -1, 3), axis=1).max(axis=1)
+            fix = "publish two different poses or more, and none at the end of the path"
+            row.refuse(extent < _SHORTEST, f"a path of less than {_SHORTEST} m", fix)
+    edges = functools.cache(partial(_edges, path, names, logs["odom"], clock))
     _to_frames(rows, edges, names["tf_static"])
     time = 1e-9 * commands.time
     return {
@@ -342,6 +371,8 @@ def _steps(path: Path, renamed: dict[str, str]) -> dict[str, np.ndarray]:
 # values.
 _Pair = tuple[str, str]
 _Log = list[tuple[np.int64, int, _Pair, np.ndarray]]
+_Clock = Callable[[np.ndarray], np.ndarray] | None  # from times of receipt [ns] to stamps
+_END = "end"  # key of the paths without poses
 
 
 class _Series(NamedTuple):
@@ -382,15 +413,23 @@ class _Series(NamedTuple):
             self.refuse(tilt > max_tilt, f"a quaternion ({{}}) that tilts beyond {max_tilt} rad")
 
 
-def _collect(path: Path, names: Mapping[str, str]) -> tuple[dict[str, _Log], set[str]]:
-    """Return the messages of topics by their keys, and all topics of a bag with their types."""
+def _collect(
+    path: Path, names: Mapping[str, str]
+) -> tuple[dict[str, _Log], set[str], dict[str, InputError]]:
+    """Return the messages of topics by their keys, all topics with their types, and faults by key.
+
+    A topic with a fault lacks the messages after it.
+    """
     keys = {name: key for key, slashed in names.items() for name in (slashed, slashed[1:])}
-    logs, contents, pairs, size = dict[str, _Log](), set[str](), dict[_Pair, _Pair](), 0
+    logs, contents, faults = dict[str, _Log](), set[str](), dict[str, InputError]()
+    pairs, size = dict[_Pair, _Pair](), 0
     for topic, kind, encoding, receipt, data in bag_storage.entries(path, keys):
         if data is None:
             contents.add(f"{topic} ({kind})")
             continue
-        readers, log = _READERS[keys[topic]], logs.setdefault(keys[topic], [])
+        if (key := keys[topic]) in faults:
+            continue
+        readers = _READERS[key]
         try:
             message = bag_storage.decoded(kind, encoding, data)
             for part in getattr(message, "transforms", [message]):
@@ -398,18 +437,27 @@ def _collect(path: Path, names: Mapping[str, str]) -> tuple[dict[str, _Log], set
                 header = getattr(part, "header", _NO_HEADER)
                 stamp = header.stamp.sec * 10**9 + header.stamp.nanosec
                 pair = header.frame_id.lstrip("/"), getattr(part, "child_frame_id", "").lstrip("/")
+                log = logs.setdefault(key if len(values) or key != "path" else _END, [])
                 log.append((np.int64(receipt), stamp, pairs.setdefault(pair, pair), values))
                 size += len(values) + 32
-                if len(values) != len(log[0][3]):
-                    raise ValueError(f"{len(values)} values, not {len(log[0][3])}")
+                if (count := len(values)) != (first := len(log[0][3])):
+                    if key == "path":
+                        raise InputError(
+                            f"has a path of {count // 3} poses on {topic} after one of "
+                            f"{first // 3}, received at {receipt} ns: cut the bag there, or "
+                            "publish the same path until its end, and then one without poses"
+                        )
+                    raise ValueError(f"{count} values, not {first}")
+        except InputError as error:
+            faults[key] = error
         except Exception as error:  # of any kind, by the readers of odd messages and types
-            raise InputError(
+            faults[key] = InputError(
                 f"has a {kind} in the encoding {encoding} on {topic} that cannot be decoded "
                 f"({bag_storage.reason(error)}), received at {receipt} ns: record "
                 f"{' or '.join(readers)} with ROS 2, or cut it out"
-            ) from error
+            )
         _check_size(size)
-    return logs, contents
+    return logs, contents, faults
 
 
 def _check_size(count: int) -> None:
@@ -417,29 +465,38 @@ def _check_size(count: int) -> None:
         raise InputError(f"has more than {_MAX_NUMBERS} numbers: cut it into parts")
 
 
-def _delay(logs: Iterable[_Log]) -> int | None:
-    """Return the median time [ns] from stamp to receipt; None if it changes, 0 without stamps."""
-    delays = sorted(int(row[0]) - row[1] for log in logs for row in log if row[1]) or [0]
-    low, middle, high = (delays[int(q * len(delays))] for q in (0.1, 0.5, 0.9))
-    return None if 1e-9 * (high - low) > _SKEW else middle
+def _clock(logs: Iterable[_Log]) -> _Clock:
+    """Return the clock of the stamped messages; None if they have several."""
+    pairs = sorted(row[:2] for log in logs for row in log if row[1]) or [(np.int64(0), 0)]
+    receipt, stamp = np.array(pairs).T
+    delay, latest = receipt - stamp, np.maximum.accumulate(stamp)
+    low, middle, high = (np.sort(delay)[int(q * delay.size)] for q in (0.1, 0.5, 0.9))
+    quarter, skew = max(1, delay.size // 4), 1e9 * _SKEW
+    drift = abs(np.median(delay[:quarter]) - np.median(delay[-quarter:]))
+    is_one = np.quantile(latest - stamp, 0.9) <= skew
+    if high - low <= skew and not (is_one and drift > 1e9 * _DRIFT):
+        return lambda time: time - middle
+    (start, first), passed = (receipt[0], latest[0]), latest - latest[0]
+    pace = lambda t: np.rint(np.interp(t - start, receipt - start, passed)).astype(int)  # noqa: E731
+    return (lambda time: first + pace(time)) if is_one else None
 
 
-def _in_order(topic: str, log: _Log, delay: int | None) -> _Series:
+def _in_order(topic: str, log: _Log, clock: _Clock) -> _Series:
     """Return messages in the order of time; of equal times, the last received.
 
     Args:
       topic: their name.
       log: the messages of the topic, or of one transform, in the order of the bag.
-      delay: [ns] from stamp to receipt, or None if it is not constant.
+      clock: that of the stamped topics, or None.
 
     Raises:
       InputError: header stamps go back, or a topic without them has no time.
     """
     receipt, stamp = np.array([row[:2] for row in log]).T
-    time = stamp if stamp.any() else receipt - (delay or 0)
+    time = stamp if stamp.any() else receipt if clock is None else clock(receipt)
     values = np.concatenate([row[3] for row in log]).reshape(len(log), len(log[0][3]))
     series = _Series(topic, time, values, np.array([row[2] for row in log], object))
-    bad = (stamp == 0) & (delay is None and not stamp.any())
+    bad = (stamp == 0) & (clock is None and not stamp.any())
     series.refuse(bad, "no header stamp, nor times of receipt at the pace of other topics,")
     # One of both orders may be wrong: files are reordered, and clocks of receivers jump.
     if (np.diff(stamp[np.argsort(receipt, kind="stable")]) < 0).any():
@@ -454,14 +511,17 @@ def _in_order(topic: str, log: _Log, delay: int | None) -> _Series:
 _Edges = dict[_Pair, Callable[[], _Series]]  # transforms by the frames of parent and child
 
 
-def _edges(path: Path, names: Mapping[str, str], odom: _Log, delay: int | None) -> _Edges:
+def _edges(path: Path, names: Mapping[str, str], odom: _Log, clock: _Clock) -> _Edges:
     """Return the transforms of a bag by the frames of parent and child."""
     edges: dict[_Pair, tuple[str, _Log]] = {}
-    for key, log in _collect(path, {key: names[key] for key in _TREE})[0].items():
+    logs, _, faults = _collect(path, {key: names[key] for key in _TREE})
+    for fault in faults.values():
+        raise fault
+    for key, log in logs.items():
         for row in log:
             edges.setdefault(row[2], (names[key], []))[1].append(row)
     edges[odom[0][2]] = names["odom"], odom
-    return {pair: partial(_in_order, *edge, delay) for pair, edge in edges.items()}
+    return {pair: partial(_in_order, *edge, clock) for pair, edge in edges.items()}
 
 
 def _to_frames(rows: Mapping[str, _Series], edges: Callable[[], _Edges], static: str) -> None:

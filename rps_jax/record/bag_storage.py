@@ -28,6 +28,7 @@ _FIXES = {  # of a file that cannot be read, by its first bytes
     _SQLITE: "if it is cut off or damaged, save the rest by `sqlite3 {} .recover | sqlite3 b.db3`",
     _ZSTD: "compress it again",
     b"#ROSBAG V": "convert this ROS 1 bag by `rosbags-convert --src {} --dst ros2_bag`",
+    files.POINTER: files.FETCH,
     b"": "give FILE.mcap, FILE.db3, or a folder of them (`ros2 bag reindex FOLDER` repairs it)",
 }
 

@@ -39,6 +39,8 @@ _KINDS: dict[FileKind, tuple[int, str]] = {  # greatest size [bytes], and a desc
     "part": (_MAX_PART, "the folder of a run"),
     "results": (2**37, "a file of results"),
 }
+POINTER = b"version https://"  # first bytes of a pointer of Git LFS
+FETCH = "it is a pointer of Git LFS: fetch the file itself by `git lfs pull`"
 FIELD_FILES = (".json", ".yaml", ".yml")  # suffixes of files with names and values
 _PACKED = (".gz", ".bz2", ".xz", ".zip")
 JsonObject = dict[str, Any]  # parsed JSON has values of any type
@@ -147,12 +149,15 @@ def read_regular(path: Path, kind: FileKind = "results") -> bytes:
         if status.st_size > max_bytes:
             raise ValueError(f"it has more than {max_bytes / 2**20:.0f} MiB")
         with open(path, "rb") as file:
-            return file.read(status.st_size or 2**16)  # some files of the system have no size
+            content = file.read(status.st_size or 2**16)  # some files of the system have no size
     except (OSError, ValueError) as error:
         is_missing = isinstance(error, FileNotFoundError | NotADirectoryError)
         error_type = MissingFileError if is_missing else InputError
         reason = getattr(error, "strerror", error)
         raise error_type(f"{path} cannot be read ({reason}): give {description}.") from error
+    if content.startswith(POINTER):
+        raise InputError(f"{path} cannot be read: {FETCH}.")
+    return content
 
 
 def read_checked(path: Path, kind: FileKind = "results") -> bytes:
@@ -168,11 +173,24 @@ def read_checked(path: Path, kind: FileKind = "results") -> bytes:
 
 
 def parse_json(content: bytes | str) -> JsonObject:
-    """Parse a JSON object; ValueError if it is none."""
+    """Parse a JSON object; ValueError if it is none, or has a name twice."""
     try:
-        value = json.loads(content)
+        return _named_values(json.loads(content, object_pairs_hook=_unique))
     except RecursionError as error:
         raise ValueError("it is nested too deeply") from error
+
+
+def _unique(pairs: Sequence[tuple[str, Any]]) -> JsonObject:
+    """Return names with values; ValueError if a name is repeated."""
+    fields: JsonObject = {}
+    for name, value in pairs:
+        if name in fields:
+            raise ValueError(f"it has {name} twice")
+        fields[name] = value
+    return fields
+
+
+def _named_values(value: object) -> JsonObject:
     if not isinstance(value, dict):
         raise ValueError("it holds no names with values")
     return value
@@ -194,7 +212,7 @@ def read_fields(path: Path) -> JsonObject:
     else:
         content, yaml = read_regular(path, "yaml"), require("ruamel.yaml", "bags")
         try:
-            fields = dict(yaml.YAML(typ="safe", pure=True).load(content))
+            fields = _named_values(yaml.YAML(typ="safe", pure=True).load(content))
         except Exception as error:  # of any kind: the file is no mapping
             reason = " ".join(str(error).split())
             raise InputError(f"{path} is no YAML mapping ({reason}): write name: value.") from error

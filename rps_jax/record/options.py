@@ -195,6 +195,8 @@ def parse_changes(kind: str, text: str) -> tuple[str, dict[str, Any]]:
             continue
         if not (field and equals):
             raise errors.not_allowed(kind, text, "write changes as name=value or file.json")
+        if sum(x.startswith(f"{field}=") for x in assignments) > 1:
+            raise errors.not_allowed(kind, text, f"give {field} once")
         values = [_number_or_text(word) for word in value.split(":")]
         changes[field] = values if len(values) > 1 else values[0]
     return name, changes

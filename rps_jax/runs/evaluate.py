@@ -90,6 +90,7 @@ def evaluate(
       >>> results.score.mean("world").shape
       (4,)
     """
+    device.check_eager("evaluate", locals())
     options_.check_arguments(evaluate, locals())
     device.check_process()
     ranges, params = parse_domain(domain, robot, task), candidates(law)

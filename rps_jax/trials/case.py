@@ -67,7 +67,7 @@ class Case(TrialOptions):
     corridor (a path between walls that end a trial when touched) or rooms (a planned path among the
     obstacles of a map), or a file, as JSON of waypoints or of polygons, or a ROS map.yaml.
     Changes follow, as corridor,width=1.2. Ranges are drawn by the seed."""
-    bearing: float = option(0.0, -10, 10, unit="rad", kw_only=True, hidden=True)
+    bearing: float = option(0.0, -6.3, 6.3, unit="rad", kw_only=True, hidden=True)
     """Rotation of the whole trial [rad]; only a friction pyramid makes a difference."""
     shift: Shift = option(Shift(), kw_only=True, hidden=True)
     """Scripted shift of the object during the push."""
@@ -75,7 +75,7 @@ class Case(TrialOptions):
     def __post_init__(self) -> None:
         check_fields(self)
         name = objects.parse_object(self.object)
-        errors.check_name("object", name, objects.OBJECTS, "FILE.xml")
+        objects.check_object("object", name)
         registry.check_params(self.params)
         scene.check_contact(self.contact, self.mass)
         skins.parse_skin(self.skin or "ideal")

@@ -128,6 +128,7 @@ def value_and_grad(
       >>> results.gradient.sel(quantity="target_x").dims
       ('law', 'world')
     """
+    device.check_eager("value_and_grad", locals())
     check_arguments(value_and_grad, locals())
     device.check_process()
     ranges, chosen = parse_domain(domain, robot, task), registry.resolve_laws(laws)
@@ -341,6 +342,16 @@ def _score(score: ScoreLike, setting: Setting, snapshots: Snapshot, params: LawP
     if shown not in ("float32[]", "float64[]", "float"):
         rule = "of the snapshots (T, ...) of one trial it must return one real number"
         raise errors.not_allowed("result of score", shown, rule)
+
+    def slopes(snapshots: Snapshot) -> Any:
+        value, pull_back = jax.vjp(lambda x: jnp.asarray(score(x)), snapshots)
+        return pull_back(jnp.ones_like(value))
+
+    try:
+        jax.eval_shape(slopes, snapshots)
+    except Exception as error:
+        rule = f"its derivative {validation.fault_of(error)}"
+        raise errors.not_allowed("score", getattr(score, "__name__", score), rule) from error
     return jnp.asarray(value)
 
 

@@ -113,8 +113,8 @@ def read(
     if isinstance(source, Trace):
         log = _from_trace(source.data, name)
     elif bag.is_bag(path):
-        steps = bag.read(path, topics)
         known = (*COLUMNS, "signal", "period", "path")
+        steps = bag.read(path, topics, known)
         log = RawLog({k: np.asarray(v, float) for k, v in steps.items() if k in known}, False)
     elif path.is_dir():
         log = _from_trace(files.read_results(path), name)

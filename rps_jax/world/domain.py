@@ -17,8 +17,8 @@ from rps_jax.robot.robot import Robot, RobotLike, parse_robot
 from rps_jax.world import paper, scene, tasks
 from rps_jax.world.objects import (
     FAMILIES,
-    OBJECTS,
     PAPER_OBJECTS,
+    check_object,
     custom_solids,
     parse_object,
     text_of,
@@ -140,7 +140,7 @@ class Domain:
         check_fields(self, "domain ")
         object.__setattr__(self, "objects", tuple(map(parse_object, self.objects)))
         for name in self.objects:
-            errors.check_name("domain object", name, (*RANDOM, *OBJECTS), "FILE.xml")
+            check_object("domain object", name, *RANDOM)
         errors.check_each_once("domain objects", self.objects)
         for friction in self.frictions:
             scene.check_contact(friction, None)

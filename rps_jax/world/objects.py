@@ -86,6 +86,17 @@ def parse_object(text: str) -> str:
     return name
 
 
+def check_object(kind: str, name: str, *more: str) -> str:
+    """Return the name of an object, or of `more`, or raise InputError.
+
+    The error does not offer the names of files, which may have failed.
+    """
+    if name in OBJECTS:
+        return name
+    known = [x for x in OBJECTS if x not in REGISTERED or not REGISTERED[x].is_file]
+    return errors.check_name(kind, name, (*more, *known), "FILE.xml")
+
+
 def text_of(name: str) -> str:
     """Return the text from which another process parses an object: its file, or its name."""
     custom = REGISTERED.get(name)

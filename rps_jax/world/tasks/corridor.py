@@ -205,7 +205,7 @@ class Corridor(Path):
         return super().shape, self.doors, self.touch
 
     def check(self) -> None:
-        """Raise InputError for turns in which the walls of a corner would cross."""
+        """Raise InputError for corners or parts of which the walls would cross."""
         super().check()
         if not self.doors:
             check_unused(self, "task ", {"door_width": "a corridor without doors leaves"})
@@ -219,6 +219,20 @@ class Corridor(Path):
         if part < need:
             rule = "it must leave room for its corners: give fewer or smaller turns, longer parts"
             raise errors.not_allowed("task width (high)", f"{self.width.high:g} m", rule)
+        if self.waypoints:
+            half, route = np.array([self.width.high / 2]), self.route()
+            path = PathCourse(Polyline.through(route[None]), half)
+            (walls,) = CorridorCourse.around(path, half, half, self.doors).walls @ (1, 1j)
+            line = route @ (1, 1j)
+            away = polyline.distances(*walls.T[..., None], line[:-1], line[1:])
+            wall, part = np.unravel_index(away.argmin(), away.shape)
+            if away[wall, part] < (1 - 1e-6) * half:
+                rule = (
+                    f"walls of another part of the corridor are {away[wall, part]:.2f} m from the "
+                    f"path there, less than half of its width ({half[0]:g} m): lead the path "
+                    f"elsewhere; walls begin {_BEHIND} m before it, and end {_BEYOND} m beyond it"
+                )
+                raise errors.not_allowed("task waypoints", route[part : part + 2].tolist(), rule)
 
     @property
     def has_contact_walls(self) -> bool:

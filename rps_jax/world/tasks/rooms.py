@@ -33,8 +33,11 @@ from rps_jax.world.tasks.base import CourseInputs
 from rps_jax.world.tasks.corridor import Corridor, CorridorCourse
 from rps_jax.world.tasks.path import LOOKAHEAD, Following, PathCourse
 
-# Fields of a ROS map.
+# Fields of a ROS map, and those that Nav2 ignores.
 _ROS = ("image", "resolution", "origin", "negate", "occupied_thresh", "free_thresh", "mode")
+_IGNORED = ("map_type", "frame_id")
+_UNKNOWN = 205  # grey of unknown cells, as maps are saved
+_OUTSIDE = "it lies in an obstacle or outside of the room"
 _MAX_WALLS = 128
 _MAX_PIXELS = 16_000_000
 # Vertices of a path around a corner, by the clearance: up to 1.08 times the clearance from it. An
@@ -53,7 +56,7 @@ class Rooms(Following):
     kind: str = "rooms"
     OUTCOMES: ClassVar[dict[str, tuple[str, str]]] = Corridor.OUTCOMES
     FAILURES: ClassVar[dict[str, str]] = Corridor.FAILURES
-    MARKS: ClassVar[tuple[str, ...]] = ("polygons", "outline", *_ROS, "tolerance")
+    MARKS: ClassVar[tuple[str, ...]] = ("polygons", "outline", *_ROS, "tolerance", *_IGNORED)
     # Tasks may share columns of random numbers: a world has one task.
     MORE_NUMBERS: ClassVar[dict[str, int]] = {"route": 58}
 
@@ -73,10 +76,23 @@ class Rooms(Following):
         """Return the walls of polygons, an outline and an image."""
         polygons: Any = file.get("polygons", ())
         polygons = polygons if np.iterable(polygons) else [polygons]
-        rings = [_ring(f"task polygon {i}", polygon) for i, polygon in enumerate(polygons)]
-        rings += [_ring("task outline", file["outline"])] if "outline" in file else []
-        if file.keys() - {"polygons", "outline"}:
-            rings += _read_image(file, values.get("start", cls.start))
+        corners = {f"task polygon {i}": polygon for i, polygon in enumerate(polygons)}
+        corners |= {"task outline": file["outline"]} if "outline" in file else {}
+        starts, rings = values.get("start", cls.start), list[np.ndarray]()
+        ends = [("start", x) for x in starts] + [("goal", x) for x in values.get("goal", ())]
+        for name, ring in corners.items():
+            rings.append(_ring(name, ring))
+            _check_count(sum(map(len, rings)))
+            for end, value in ends:  # one by one, since polygons may overlap
+                point = complex(*value[:2])
+                is_inside = polyline.is_inside(point, rings[-1], np.roll(rings[-1], -1))
+                if abs(point) < 1000 and is_inside == name.startswith("task polygon"):
+                    raise errors.not_allowed(f"task {end}", value, _OUTSIDE)
+        if file.keys() - {"polygons", "outline", *_IGNORED}:
+            if "outline" in file:
+                rule = "an image has outlines of its own: give polygons with it"
+                raise errors.not_allowed("task outline", file["outline"], rule)
+            rings += _read_image(file, starts)
         if file.keys() - {"polygons"}:  # walls around the room make its outside an obstacle
             points = np.concatenate(rings)
             x, y = ([f.min() - 0.1, f.max() + 0.1] for f in (points.real, points.imag))
@@ -105,15 +121,18 @@ class Rooms(Following):
     def check(self) -> None:
         """Raise InputError for a map without a way from each start to each goal."""
         count = len(self.walls) / 2
-        fewer = "give a larger tolerance [m] of an image, fewer corners, or a part of the map"
+        _check_count(count)
         for is_bad, name, value, rule in (
             (not count or count % 1, "walls", count, "give polygons, an outline or a map.yaml"),
-            (count > _MAX_WALLS, "walls", count, f"at most {_MAX_WALLS} are allowed: {fewer}"),
             (not len(self.start), "start", "()", "give x, y and yaw in the map, as [1, 2, 0]"),
             (not len(self.goal), "goal", "()", "give x and y in the map, as [4, 2]"),
         ):
             if is_bad:
                 raise errors.not_allowed(f"task {name}", value, rule)
+        for name, ends in (("start", self.start), ("goal", self.goal)):
+            errors.check_count(f"count of task {name}", len(ends), at_most=_MAX_WALLS)
+        for _, _, yaw in self.start:
+            errors.check_angle("yaw of task start", yaw)
         _ = self._routes
 
     def check_room(self, shell: Shell, object_width: Callable[[], float]) -> None:
@@ -154,8 +173,9 @@ def _ring(name: str, corners: object) -> np.ndarray:
     """Return the corners (N,) [m] of a simple polygon, or raise InputError."""
     points = errors.check_array(name, corners, ("N", 2)) @ (1, 1j)
     points = points[: -1 if points[0] == points[-1] else None]
+    _check_count(points.size)
     following, i = np.roll(points, -1), np.arange(points.size)
-    touched = _distances(points[:, None], following[:, None], points, following) < 1e-9
+    touched = polyline.distances(points[:, None], following[:, None], points, following) < 1e-9
     touched &= (i - i[:, None] + 1) % max(i.size, 1) > 2  # of edges that do not follow each other
     for is_bad, rule in (
         (i.size < 3, "a polygon has three corners or more, each as x, y [m]"),
@@ -175,12 +195,14 @@ def _read_image(file: Mapping[str, Any], starts: Any) -> list[np.ndarray]:
     high = check("task occupied_thresh", file.get("occupied_thresh", 0.65), at_most=1)
     low = check("task free_thresh", file.get("free_thresh", 0.196), at_most=1)
     x, y, yaw = errors.check_array("task origin", file.get("origin", (0, 0, 0)), (3,))
-    choices: dict[str, tuple[int | str, ...]] = {"negate": (0, 1), "mode": ("trinary",)}
-    for name, allowed in choices.items():
-        if (value := file.get(name, allowed[0])) not in allowed:
-            raise errors.not_allowed(f"task {name}", value, f"give one of {list(allowed)}")
+    errors.check_angle("yaw of task origin", yaw)
+    texts = dict[str, str]()
+    for name, allowed in {"negate": ("0", "1", "false", "true"), "mode": ("trinary",)}.items():
+        texts[name] = str(file.get(name, allowed[0])).lower().removesuffix(".0")
+        if texts[name] not in allowed:
+            raise errors.not_allowed(f"task {name}", file[name], f"give one of {list(allowed)}")
     shades = _shades(Path(str(file.get("image", "an image"))))[::-1]
-    occupied = shades if file.get("negate") else 1 - shades
+    occupied = shades if texts["negate"] in ("1", "true") else 1 - shades
     # Unknown cells, and those outside, are walls.
     labelled: Any = ndimage.label((occupied < low) & (occupied <= high))
     labels = np.pad(labelled[0], 1)
@@ -191,8 +213,19 @@ def _read_image(file: Mapping[str, Any], starts: Any) -> list[np.ndarray]:
     if not reached.all():
         rule = "it lies in an obstacle, in unknown cells or outside of the image"
         raise errors.not_allowed("task start", starts, rule)
+    free = np.isin(labels, reached)
+    # Each obstacle has two walls or more.
+    _check_count(2 * ndimage.label(~free, np.ones((3, 3)))[1])
+    unknown = np.pad(abs(255 * shades - _UNKNOWN) < 0.5, 1) & free
+    if unknown.any():
+        share = f"{100 * unknown.sum() / free.sum():.2g} % of the free cells of the map"
+        warnings.warn(
+            f"{share} have the grey {_UNKNOWN} of unknown cells, which free_thresh = {low:g} "
+            "counts as free: write free_thresh: 0.196 to make them walls",
+            stacklevel=2,
+        )
     rings = list[np.ndarray]()
-    lines: Any = contourpy.contour_generator(z=np.isin(labels, reached).astype(float)).lines(0.5)
+    lines: Any = contourpy.contour_generator(z=free.astype(float)).lines(0.5)
     for line in lines:
         # Contours cut the corners of cells: a corner has the halves of both its neighbours.
         points = (np.where(line[:-1] % 1 == 0.5, line[:-1], line[1:]) - 0.5) @ (1, 1j)
@@ -201,6 +234,12 @@ def _read_image(file: Mapping[str, Any], starts: Any) -> list[np.ndarray]:
         halves = points[: far + 1], np.append(points[far:], points[0])
         ring = np.concatenate([_simplify(x, tolerance / resolution)[:-1] for x in halves])
         rings.append(origin + unit * ring)
+        _check_count(sum(map(len, rings)))
+    a, b = (np.concatenate([np.roll(ring, -i) for ring in rings]) for i in (0, 1))
+    for start in starts:
+        if not polyline.is_inside(complex(*start[:2]), a, b):
+            rule = f"walls of it exclude the start {start}: give a smaller tolerance [m]"
+            raise errors.not_allowed("task tolerance", tolerance, rule)
     return rings
 
 
@@ -223,11 +262,24 @@ def _shades(path: Path) -> np.ndarray:
 
 def _simplify(points: np.ndarray, tolerance: float) -> np.ndarray:
     """Return corners of a line (N,), with its ends, from which no point is beyond a tolerance."""
-    away = _distances(points, points, points[0], points[-1])
-    if away.max() <= tolerance:
-        return points[[0, -1]]
-    halves = points[: away.argmax() + 1], points[away.argmax() :]
-    return np.append(_simplify(halves[0], tolerance)[:-1], _simplify(halves[1], tolerance))
+    corners, i = [0, len(points) - 1], 0
+    while i < len(corners) - 1:
+        part = points[corners[i] : corners[i + 1] + 1]
+        away = polyline.to_segment(part, part[0], part[-1])
+        if away.max() <= tolerance:
+            i += 1
+        else:
+            corners.insert(i + 1, corners[i] + int(away.argmax()))
+            _check_count(len(corners))
+    return points[corners]
+
+
+def _check_count(count: float) -> None:
+    """Raise InputError for too many walls."""
+    if count > _MAX_WALLS:
+        fewer = "give a larger tolerance [m] of an image, remove its specks, give fewer corners"
+        rule = f"at most {_MAX_WALLS} are allowed: {fewer}, or a part of the map"
+        raise errors.not_allowed("task walls", f"at least {count:g}", rule)
 
 
 # --- planner -------------------------------------------------------------------------------------
@@ -246,25 +298,24 @@ def _plan(walls: Any, starts: Any, goals: Any, base_radius: float, radius: float
     nodes = np.append(begin + base_radius * np.exp(1j * yaw), goal)
     needed = f"the path keeps {clearance:.2f} m from walls (base_radius + object_radius)"
     for i, (value, point) in enumerate(zip((*starts, *goals), (*begin, *goal), strict=True)):
-        passed = (a.imag > point.imag) != (b.imag > point.imag)
-        inside = np.sum(passed & ((_side(point, a, b) > 0) == (b.imag > a.imag))) % 2
-        away = _distances(nodes[i], nodes[i], a, b).min()
+        away = polyline.distances(nodes[i], nodes[i], a, b).min()
         is_start = i < begin.size
         for is_bad, rule in (
-            (inside, "it lies in an obstacle or outside of the room"),
+            (polyline.is_inside(point, a, b), _OUTSIDE),
             (away < clearance, f"{needed}, and one is {away:.2f} m away"),
             (not is_start and abs(begin - point).min() < base_radius, "the base starts there"),
         ):
             if is_bad:
                 raise errors.not_allowed(f"task {'start' if is_start else 'goal'}", value, rule)
     around = (np.unique([a, b])[:, None] + clearance * _TURN).ravel()
-    is_clear = _distances(around[:, None], around[:, None], a, b).min(axis=1) > clearance
+    is_clear = polyline.distances(around[:, None], around[:, None], a, b).min(axis=1) > clearance
     nodes = np.append(nodes, around[is_clear])
-    lengths = np.zeros((nodes.size, nodes.size))
+    lengths = np.full((nodes.size, nodes.size), np.inf)
     for i, node in enumerate(nodes):
-        is_clear = _distances(node, nodes[:i, None], a, b).min(axis=1) > clearance - 1e-9
-        lengths[i, :i] = np.where(is_clear, abs(nodes[:i] - node), 0.0)
-    result: Any = csgraph.dijkstra(lengths, False, range(begin.size), return_predecessors=True)
+        is_clear = polyline.distances(node, nodes[:i, None], a, b).min(axis=1) > clearance - 1e-9
+        lengths[i, :i] = np.where(is_clear, abs(nodes[:i] - node), np.inf)
+    graph = csgraph.csgraph_from_dense(lengths, np.inf)  # an edge may have no length
+    result: Any = csgraph.dijkstra(graph, False, range(begin.size), return_predecessors=True)
     routes = list[np.ndarray]()
     for i, j in np.ndindex(begin.size, goal.size):
         route = [begin.size + j]
@@ -277,25 +328,6 @@ def _plan(walls: Any, starts: Any, goals: Any, base_radius: float, radius: float
         routes.append(np.append(begin[i], nodes[route[::-1]]))
     size = max(map(len, routes))
     return np.array([np.pad(route, (0, size - len(route)), "edge") for route in routes])
-
-
-def _distances(p: Any, q: Any, a: Any, b: Any) -> np.ndarray:
-    """Return the distances [m] between segments from p to q, or points, and those from a to b."""
-    pairs = (p, a, b), (q, a, b), (a, p, q), (b, p, q)
-    sides, lengths = ([f(*pair) for pair in pairs] for f in (_side, _to_segment))
-    crosses = (sides[0] * sides[1] < 0) & (sides[2] * sides[3] < 0)
-    return np.where(crosses, 0.0, functools.reduce(np.minimum, lengths))
-
-
-def _side(point: Any, a: Any, b: Any) -> np.ndarray:
-    """Return a number above 0 for points on the left of lines from a to b."""
-    return np.imag(np.conj(b - a) * (point - a))
-
-
-def _to_segment(point: Any, a: Any, b: Any) -> np.ndarray:
-    along, away = b - a, point - a
-    share = np.real(np.conj(along) * away) / np.maximum(abs(along) ** 2, 1e-30)
-    return abs(away - np.clip(share, 0, 1) * along)
 
 
 TASK = Rooms
