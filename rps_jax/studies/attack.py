@@ -116,7 +116,6 @@ class Attack(DomainQuestion[xr.Dataset], LawQuestion[xr.Dataset]):
         errors.check_each_once("axes", self.axes)
         for name in self.axes:
             points.check_drawn("axes", name, self.ranges)
-        _ = seed_of(self.setting.seed, "tune")
         self.check_engine([self.params])
         errors.require("ribs", "failures")
 

@@ -175,7 +175,6 @@ class Fit(LawQuestion[Fitted], DomainQuestion[Fitted], LogsQuestion):
         return logs, fields
 
     def check(self) -> None:
-        _ = seed_of(self.setting.seed, "tune")
         self.check_engine([self.params])
         self.ranges.task.check_target("task", self.ranges.task, "logs have a target, so omit it")
         if len({raw.exact for raw in self.raw_logs}) > 1:
@@ -201,7 +200,9 @@ class Fit(LawQuestion[Fitted], DomainQuestion[Fitted], LogsQuestion):
     def fields_as_json(self) -> dict[str, Any]:
         """Fields as JSON; logs by the digests of their values."""
         contents = (b"".join(v.tobytes() for v in raw.columns.values()) for raw in self.raw_logs)
-        return super().fields_as_json() | {"logs": list(map(files.sha256, contents))}
+        record = {"logs": list(map(files.sha256, contents))}
+        record |= {"tune_seed": seed_of(self.setting.seed, "tune")}
+        return super().fields_as_json() | record
 
     def answer(self, run: Run) -> Fitted:
         """Compute and sample the posterior, and summarise it."""

@@ -155,7 +155,6 @@ class Tuning(TaskOption, LawQuestion[xr.Dataset]):
         return {k: v for k, v in self.QUICK.items() if k != "tuned" or is_rps}
 
     def check(self) -> None:
-        _ = seed_of(self.setting.seed, "tune")
         if not registry.law_of(self.params).bounds:
             names = [n for n, params in registry.LAWS.items() if registry.law_of(params).bounds]
             rule = (
@@ -168,8 +167,9 @@ class Tuning(TaskOption, LawQuestion[xr.Dataset]):
 
     def fields_as_json(self) -> dict[str, Any]:
         """Fields as JSON, with the names of all tuned parameters and the ranges of all domains."""
-        ranges = list(map(to_json, self.domains))
-        return super().fields_as_json() | {"tuned": self.space.names, "domain": ranges}
+        ranges, seed = list(map(to_json, self.domains)), seed_of(self.setting.seed, "tune")
+        record = {"tuned": self.space.names, "domain": ranges, "tune_seed": seed}
+        return super().fields_as_json() | record
 
     def progress_bar(self) -> Bar:
         name = self.name.replace("_", " ")

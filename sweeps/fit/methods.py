@@ -155,7 +155,7 @@ class Methods(FitStudy):
         minimise = {"gradient": Replay.minima, "evolution": evolved}[method]
         names = points.names(self.ranges)
         columns = [names.index(name) for name in fit.coordinates(self.ranges)]
-        starts = points.points_of(self.ranges, np.arange(self.starts), seed_of(0, "tune"))
+        starts = points.points_of(self.ranges, np.arange(self.starts), 0)
         results, counts, (index, tracks, smoothing) = list[np.ndarray](), list[float](), inputs()
         start = time.process_time()
         for log, track in zip(index.tolist(), tracks, strict=True):
