@@ -46,7 +46,7 @@ def paper(count, **changes):
     return same._replace(**changes)
 
 
-class Stopped(Exception):
+class StoppedError(Exception):
     """The end of a command at its first draw of worlds."""
 
 
@@ -61,9 +61,9 @@ def tuner_keys(command):
         return [{env.setting.world_seed} for env in splits]
     if isinstance(command, Fit):
         keys, bank = set(), Bank(CYLINDERS, RPSParams(), command.setting, 1.0, 0.1)
-        with mock.patch.object(draws, "random_numbers", partial(stopped, keys)):
-            with pytest.raises(Stopped):
-                bank.worlds(4, Run(None, no_progress))
+        patched = mock.patch.object(draws, "random_numbers", partial(stopped, keys))
+        with patched, pytest.raises(StoppedError):
+            bank.worlds(4, Run(None, no_progress))
         return keys, set()
     params = command.space.params(command.base[None])
     validation = command.validation_candidates(params)
@@ -73,7 +73,7 @@ def tuner_keys(command):
 def stopped(keys, seed, index):
     """Record the key of drawn worlds, and stop the command."""
     keys.add(seed)
-    raise Stopped
+    raise StoppedError
 
 
 def masses(keys):
@@ -96,7 +96,7 @@ def test_no_command_meets_the_worlds_of_a_tuner(monkeypatch):
             patch.setattr(draws, "random_numbers", partial(stopped, rest))
             for name in sorted(seeded - TUNERS - SEARCHES):
                 law = {"law": "rps"} if name == "score" else {}
-                with pytest.raises(Stopped):
+                with pytest.raises(StoppedError):
                     commands[name](setting=setting, **law)()
         rest.add(replace(setting, split="test").world_seed)  # in which tuners test their result
     assert not tuned & validated

@@ -64,7 +64,7 @@ def evaluate(
       domain: ranges from which worlds are drawn: a name, or a file of ranges.
       worlds: number of worlds for each candidate, of indices 0, 1, ...
       points: points of the unit cube at which the worlds lie instead, as `worlds_at` returns.
-      split: use of the worlds; those for tuning and validation occur in no sweep, whatever the seed.
+      split: use of the worlds; no sweep of any seed has worlds for tuning or validation.
       objective: score of a trial.
       robot: its name, as kairos, or a JSON file; None: the domain's.
       task: its name, as path, with changes; None: the domain's.
@@ -115,11 +115,9 @@ def evaluate(
         "candidate": ("candidate", np.arange(scored.score.shape[0]), {"long_name": "candidate"}),
         "world": ("world", request.worlds, {"long_name": WORLD}),
     }
-    attrs = provenance.attributes() | {
-        "domain": name_or_custom(domain),
-        "law": type(params).__name__,
-    }
-    attrs |= task_attribute(ranges) | replace(setting, split=split).attributes
+    attrs = provenance.attributes() | replace(setting, split=split).attributes
+    attrs |= {"domain": name_or_custom(domain), "law": type(params).__name__}
+    attrs |= task_attribute(ranges)
     return xr.Dataset(variables, {"pose": POSE} | indices | tried | drawn, attrs)
 
 
