@@ -17,12 +17,12 @@ from rps_jax.control.laws.rps import RPSParams
 from rps_jax.control.observation import Details, Twist
 from rps_jax.errors import InputError
 from rps_jax.runs import evaluate as room
-from rps_jax.runs.evaluate import Candidates, evaluate, seed_of
+from rps_jax.runs.evaluate import Candidates, evaluate
 from rps_jax.runs.run import Run
 from rps_jax.trials.env import PushEnv
 from rps_jax.trials.progress import no_progress
 from rps_jax.trials.score import Objective
-from rps_jax.trials.setting import Setting
+from rps_jax.trials.setting import Setting, seed_of
 from rps_jax.trials.trial import Rules
 from rps_jax.tuning.fit import Bank, Fit
 from rps_jax.tuning.learn import Learn

@@ -15,10 +15,10 @@ from rps_jax.control.laws.rps import BOUNDS, RPSParams
 from rps_jax.errors import InputError
 from rps_jax.runs import evaluate
 from rps_jax.runs.evaluate import CandidateScores
-from rps_jax.runs.question import Run, seed_of
+from rps_jax.runs.question import Run
 from rps_jax.trials.progress import Timing, no_progress
 from rps_jax.trials.score import Objective
-from rps_jax.trials.setting import Setting
+from rps_jax.trials.setting import Setting, seed_of
 from rps_jax.trials.trial import Outcome, Rules
 from rps_jax.tuning import run as tuning
 from rps_jax.tuning.descent import TuneGrad

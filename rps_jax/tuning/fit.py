@@ -46,14 +46,12 @@ from rps_jax.runs.question import (
     LawQuestion,
     Run,
     SimulationQuestion,
-    Split,
     call_of,
-    seed_of,
 )
 from rps_jax.trials import trial
 from rps_jax.trials.batch import rows
 from rps_jax.trials.progress import Progress, set_phase
-from rps_jax.trials.setting import Setting
+from rps_jax.trials.setting import Setting, Split, seed_of
 from rps_jax.trials.trial import ControlLoop, Trial, World, object_pose
 from rps_jax.trials.worlds import drawn_worlds
 from rps_jax.tuning import logs as logs_

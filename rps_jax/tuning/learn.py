@@ -30,11 +30,11 @@ from rps_jax.engines import device
 from rps_jax.record import files
 from rps_jax.record.checkpoint import Checkpoints
 from rps_jax.record.options import option
-from rps_jax.runs.question import Run, SimulationQuestion, Split, TaskOption, call_of, seed_of
+from rps_jax.runs.question import Run, SimulationQuestion, TaskOption, call_of
 from rps_jax.trials.env import SHAPED_REWARD, PushEnv
 from rps_jax.trials.progress import Bar, Progress, ProgressCallback
 from rps_jax.trials.results import labelled
-from rps_jax.trials.setting import Setting
+from rps_jax.trials.setting import Setting, Split, seed_of
 from rps_jax.trials.trial import Rules
 from rps_jax.tuning import rollout
 from rps_jax.tuning.ppo import PPO

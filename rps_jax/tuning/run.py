@@ -30,9 +30,10 @@ from rps_jax.record import files
 from rps_jax.record.options import option
 from rps_jax.runs import evaluate
 from rps_jax.runs.evaluate import Candidates, CandidateScores
-from rps_jax.runs.question import LawQuestion, Run, TaskOption, count_true, seed_of
+from rps_jax.runs.question import LawQuestion, Run, TaskOption, count_true
 from rps_jax.trials.progress import Bar, Progress, Timing
 from rps_jax.trials.score import Objective
+from rps_jax.trials.setting import seed_of
 from rps_jax.trials.trial import Rules
 from rps_jax.tuning.space import Space, expand_subsets
 from rps_jax.world.domain import Domain, DomainLike, parse_domain, to_json

@@ -26,8 +26,8 @@ from rps_jax.control.base import LawParams
 from rps_jax.control.registry import LawsLike
 from rps_jax.record.options import option
 from rps_jax.runs.plan import Plan
-from rps_jax.runs.question import MultiLawQuestion, Run, Split, call_of
-from rps_jax.trials.setting import Setting
+from rps_jax.runs.question import MultiLawQuestion, Run, call_of
+from rps_jax.trials.setting import Setting, Split
 from rps_jax.trials.trial import Rules
 from rps_jax.world.domain import DomainLike, parse_domain
 from rps_jax.world.quantity import Range

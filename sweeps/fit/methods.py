@@ -25,8 +25,9 @@ import xarray as xr
 from rps_jax.analysis.figures.style import quantity
 from rps_jax.engines import device
 from rps_jax.record.options import option
-from rps_jax.runs.question import Run, call_of, seed_of
+from rps_jax.runs.question import Run, call_of
 from rps_jax.trials.progress import no_progress, set_phase
+from rps_jax.trials.setting import seed_of
 from rps_jax.tuning import fit, posterior
 from rps_jax.tuning.logs import Log
 from rps_jax.world import domain as domains

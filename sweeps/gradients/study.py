@@ -30,10 +30,10 @@ from rps_jax.control.laws import rps
 from rps_jax.control.laws.rps import RPSParams
 from rps_jax.engines import EngineName
 from rps_jax.record.options import option
-from rps_jax.runs.question import Run, call_of, seed_of
+from rps_jax.runs.question import Run, call_of
 from rps_jax.trials import trial
 from rps_jax.trials.progress import Progress, set_phase
-from rps_jax.trials.setting import Setting
+from rps_jax.trials.setting import Setting, seed_of
 from rps_jax.trials.trial import World
 from rps_jax.trials.worlds import drawn_worlds, soften_skins
 from rps_jax.tuning.gradients import Options, Scores, estimate
