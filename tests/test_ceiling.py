@@ -15,10 +15,10 @@ from rps_jax.control.laws import guided, rps
 from rps_jax.control.laws.guided import GuidedParams
 from rps_jax.control.laws.rps import RPSState
 from rps_jax.record.checkpoint import Checkpoints
-from rps_jax.runs.question import seed_of
 from rps_jax.studies import ceiling
 from rps_jax.studies.ceiling import Ceiling
 from rps_jax.trials import score
+from rps_jax.trials.setting import seed_of
 from rps_jax.trials.trial import Outcome
 
 SHORT = Setting("quasistatic", rules=Rules(horizon=20.0))

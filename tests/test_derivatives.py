@@ -166,6 +166,8 @@ def test_a_kink_of_the_world_has_no_derivative_and_is_told():
     notes = derivatives._notes(
         square, "fused", coordinates, np.ones(2, bool), bends, gradient, bends
     )
+    notes = list(notes)
+    assert "No world has a finite derivative, so the mean is NaN: aspect." in notes
     assert [x for x in notes if "kink" in x] == [
         "No derivatives in worlds whose numbers have a kink (see finite): aspect."
     ]

@@ -15,7 +15,7 @@ from rps_jax.runs.evaluate import CandidateScores
 from rps_jax.trials.score import Objective
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import Rules
-from rps_jax.tuning import derivatives, descent
+from rps_jax.tuning import derivatives, descent, gradients
 from rps_jax.tuning.descent import TuneGrad
 from sweeps.gradients import windows
 from sweeps.gradients.windows import WindowTuning
@@ -111,6 +111,21 @@ def test_antithetic_steps_find_the_slope_of_the_objective():
     np.testing.assert_allclose(estimate.gradient, [[2, -1], [2, -1]], atol=0.2)
     errors = np.abs(estimate.gradient - jnp.array([2.0, -1.0])) / jnp.sqrt(estimate.variance)
     assert (errors < 4).all()
+
+
+def test_a_descent_names_slopes_without_a_sample_and_steps_without_them():
+    question = TuneGrad("rps", tuned=("L", "K_h"), steps=3, setting=SETTING)
+    empty = gradients.estimate(jnp.array([[[jnp.nan], [2.0]], [[jnp.nan], [4.0]]])[..., 0])
+    estimate = jax.tree.map(lambda x: x[None], empty)
+    with pytest.warns(UserWarning, match="1 of 2 slopes have no finite sample"):
+        results = descent.gradient_results(estimate)
+    np.testing.assert_array_equal(results["gradients"], [[np.nan, 3.0]])
+    search = question.search()
+    start = next(search)["vectors"]
+    results = {"vectors": start, "base": np.array(1.0), "gradients": results["gradients"]}
+    moved = search.send(results)["vectors"] - start
+    assert moved[0, 0] == 0
+    assert moved[0, 1] < 0
 
 
 def test_the_tail_alone_counts_for_a_risk_averse_objective():

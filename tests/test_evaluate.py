@@ -1,30 +1,30 @@
 """Candidates in random worlds: the same ones for all, one program, parameters of any law."""
 
-from dataclasses import replace
-from typing import Any, NamedTuple, get_args
+from dataclasses import fields, replace
+from functools import partial
+from typing import Any, NamedTuple
+from unittest import mock
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from rps_jax.app.cli.names import known, question_type
 from rps_jax.control import registry
 from rps_jax.control.base import Law
 from rps_jax.control.laws.rps import RPSParams
 from rps_jax.control.observation import Details, Twist
 from rps_jax.errors import InputError
 from rps_jax.runs import evaluate as room
-from rps_jax.runs.evaluate import Candidates, Split, evaluate, seed_of
-from rps_jax.studies.attack import Attack
-from rps_jax.studies.ceiling import Ceiling
-from rps_jax.studies.ladder import Ladder
-from rps_jax.studies.rare import Rare
-from rps_jax.studies.sensitivity import Sensitivity
+from rps_jax.runs.evaluate import Candidates, evaluate
+from rps_jax.runs.run import Run
+from rps_jax.trials.env import PushEnv
+from rps_jax.trials.progress import no_progress
 from rps_jax.trials.score import Objective
-from rps_jax.trials.setting import Setting
+from rps_jax.trials.setting import Setting, seed_of
 from rps_jax.trials.trial import Rules
-from rps_jax.tuning.evolution import TuneES
-from rps_jax.tuning.fit import Fit
+from rps_jax.tuning.fit import Bank, Fit
 from rps_jax.tuning.learn import Learn
 from rps_jax.tuning.space import Space
 from rps_jax.world import draws
@@ -46,20 +46,82 @@ def paper(count, **changes):
     return same._replace(**changes)
 
 
-def test_no_two_splits_share_a_seed():
-    seeds = [seed_of(seed, split) for seed in range(50) for split in get_args(Split)]
-    assert len(set(seeds)) == len(seeds)
+class StoppedError(Exception):
+    """The end of a command at its first draw of worlds."""
 
 
-@pytest.mark.parametrize(
-    "command", [Attack, Ceiling, Fit, Ladder, Learn, Rare, Sensitivity, TuneES], ids=str
-)
-def test_a_seed_that_no_split_can_have_is_named(command, tmp_path):
-    """The sentence has the seed of the user, not that of the split."""
-    options = {"out": tmp_path / "run", "setting": Setting(seed=2**31)}
-    with pytest.raises(InputError, match=r"^seed = 2147483648 is not allowed: .* to 1431655764"):
-        command(**options)()
-    assert not (tmp_path / "run").exists()
+TUNERS = {"fit", "learn", "tune es", "tune grad"}  # with worlds of tune, validate and test
+SEARCHES = {"attack", "rare", "regress", "sensitivity"}  # their points are not drawn by index
+
+
+def tuner_keys(command):
+    """Return the keys of a tuner's worlds for tuning and for validation."""
+    if isinstance(command, Learn):
+        splits = (command.environments(split)[0] for split in ("tune", "validate"))
+        return [{env.setting.world_seed} for env in splits]
+    if isinstance(command, Fit):
+        keys, bank = set(), Bank(CYLINDERS, RPSParams(), command.setting, 1.0, 0.1)
+        patched = mock.patch.object(draws, "random_numbers", partial(stopped, keys))
+        with patched, pytest.raises(StoppedError):
+            bank.worlds(4, Run(None, no_progress))
+        return keys, set()
+    params = command.space.params(command.base[None])
+    validation = command.validation_candidates(params)
+    return {command.candidates(params, 3).seed}, {validation.seed}
+
+
+def stopped(keys, seed, index):
+    """Record the key of drawn worlds, and stop the command."""
+    keys.add(seed)
+    raise StoppedError
+
+
+def masses(keys):
+    """Return the masses of the first worlds of keys."""
+    return {x for key in keys for x in draws.draw(CYLINDERS, key, np.arange(64)).values["mass"]}
+
+
+def test_no_command_meets_the_worlds_of_a_tuner(monkeypatch):
+    """All commands with a seed, of several seeds; those that draw worlds stop at the first draw."""
+    commands = {name: question_type(name) for name in known()}
+    seeded = {k for k, kind in commands.items() if "setting" in {f.name for f in fields(kind)}}
+    tuned, validated, rest = set(), set(), set()
+    for seed in (0, 1, 2, 3, 7, 2**32 - 1):
+        setting = Setting(seed=seed)
+        for name in TUNERS:
+            tune, validate = tuner_keys(commands[name](setting=setting))
+            tuned |= tune
+            validated |= validate
+        with monkeypatch.context() as patch:
+            patch.setattr(draws, "random_numbers", partial(stopped, rest))
+            for name in sorted(seeded - TUNERS - SEARCHES):
+                law = {"law": "rps"} if name == "score" else {}
+                with pytest.raises(StoppedError):
+                    commands[name](setting=setting, **law)()
+        rest.add(replace(setting, split="test").world_seed)  # in which tuners test their result
+    assert not tuned & validated
+    assert not (tuned | validated) & rest
+    kinds = [masses(tuned), masses(validated), masses(rest)]
+    assert len(set.union(*kinds)) == sum(map(len, kinds))
+
+
+def test_a_sweep_and_the_test_split_have_the_worlds_of_earlier_versions():
+    assert seed_of(7, "test") == 23
+    assert Setting(seed=5).world_seed == 5
+    drawn = draws.draw(CYLINDERS, 0, np.arange(2)).values["mass"]
+    np.testing.assert_allclose(drawn, [3.10558863261133, 29.18796442491775], rtol=1e-12)
+
+
+def test_a_split_of_a_setting_is_that_of_its_worlds_and_of_its_record():
+    tuning = Setting("quasistatic", seed=3, split="tune")
+    assert Setting.from_json(tuning.to_json()) == tuning
+    assert "split" not in Setting(seed=3).to_json()
+    env = PushEnv("random_cylinder", setting=tuning, worlds=2)
+    drawn = draws.draw(CYLINDERS, seed_of(3, "tune"), np.arange(2))
+    np.testing.assert_allclose(env.table.p_world_target, drawn.p_world_target, rtol=1e-6)
+    assert tuning.attributes == {"seed": 3, "engine": "quasistatic", "split": "tune"}
+    with pytest.raises(InputError, match="choose from tune, validate, test"):
+        Setting(split="train")
 
 
 def test_results_are_labelled_as_those_of_a_sweep():
@@ -121,7 +183,6 @@ def test_candidates_are_given_as_a_list_or_as_one_law():
         ({"split": "train"}, "choose from tune, validate, test"),
         ({"domain": "wild"}, "did you mean 'wide'"),
         ({"worlds": 0}, "worlds = 0"),
-        (seeded(2**31), "seed = 2147483648"),
         ({"slots": 0}, "slots = 0"),
     ],
 )

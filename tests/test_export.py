@@ -3,6 +3,7 @@
 import json
 import re
 import shutil
+import subprocess
 
 import jax
 import numpy as np
@@ -85,6 +86,82 @@ def test_the_folder_compiles_without_a_warning_and_runs(name, compiler, tmp_path
     assert "#include <math.h>" in texts["law.h"]
     assert texts["law.h"].count("#include") == 1
     assert not re.search(r"\b(malloc|calloc|realloc|alloca)\b", texts["law.h"])
+
+
+FAST = ["-ffast-math", "-Ofast", "-ffinite-math-only"]
+
+
+@pytest.mark.parametrize("compiler", COMPILERS)
+@pytest.mark.parametrize("flag", FAST)
+def test_a_compiler_that_assumes_finite_numbers_is_refused(flag, compiler, tmp_path):
+    (tmp_path / "law.h").write_text(c.header(program.program("rps"), "law"))
+    (tmp_path / "main.c").write_text('#include "law.h"\nint main(void) { return 0; }\n')
+    command = [compiler, "-std=c99", "-fsyntax-only", tmp_path / "main.c"]
+    output_of(*command)
+    refused = subprocess.run([*command, flag], capture_output=True, text=True, check=False)
+    assert refused.returncode != 0
+    assert "#error" in refused.stderr
+    assert "the law stops at NaN" in refused.stderr
+
+
+@pytest.mark.parametrize("flag", FAST)
+def test_the_stop_at_nan_reads_the_bits_of_numbers(flag, tmp_path):
+    """Even with a flag that lets compilers take `x != x` for false, if its refusal is cut out."""
+    text = c.header(program.program("rps"), "law").replace("#error", "#warning")
+    (tmp_path / "law.h").write_text(text)
+    (tmp_path / "main.c").write_text(NAN_STOP)
+    for real in ("-DLAW_DOUBLE", "-ULAW_DOUBLE"):
+        binary = tmp_path / "stop"
+        options = ["-std=gnu99", "-O2", flag, real]
+        output_of("gcc", *options, tmp_path / "main.c", "-lm", "-o", binary)
+        assert output_of(binary, "nan", "inf").split() == ["1", "1", "0"]
+
+
+NAN_STOP = """
+#include <stdio.h>
+#include <stdlib.h>
+#include "law.h"
+
+int main(int count, char **words) {
+  const law_params params = LAW_PARAMS;
+  for (int i = 1; i <= count; i++) {
+    law_memory memory;
+    law_observation seen = {0};
+    law_twist twist;
+    law_init(&params, &memory);
+    seen.period = (law_real)0.01;
+    seen.p_world_target[0] = 1;
+    if (i < count) seen.yaw = (law_real)strtod(words[i], 0);
+    printf("%d ", law_step(&params, &memory, &seen, &twist));
+  }
+  return 0;
+}
+"""
+
+
+@pytest.mark.parametrize("name", ["learned", "rps_plus", "force_push_published", CUSTOM])
+def test_no_number_of_the_header_is_converted_without_a_cast(name, tmp_path, registries):
+    text = c.header(program.program(name, "kairos"), "law")
+    (tmp_path / "law.h").write_text(text)
+    (tmp_path / "main.c").write_text('#include "law.h"\nint main(void) { return 0; }\n')
+    for real in ("-DLAW_DOUBLE", "-ULAW_DOUBLE"):
+        strict = [*STRICT, "-Wconversion", "-Wdouble-promotion", real]
+        output_of("gcc", *strict, "-fsyntax-only", tmp_path / "main.c")
+
+
+@pytest.mark.parametrize("name", ["learned", "rps_plus"])
+def test_the_header_and_the_page_state_the_stack(name, tmp_path):
+    exported = program.program(name, "kairos")
+    for file, text in folder.files(exported, "law").items():
+        (tmp_path / file).write_text(text)
+    stated = re.search(r"about (\d+) kB of stack", (tmp_path / "law.h").read_text())
+    options = ["-std=c99", "-O2", "-fno-inline", "-fstack-usage", "-c"]
+    output_of("gcc", *options, "main.c", "-o", "main.o", cwd=tmp_path)
+    usage = (tmp_path / "main.su").read_text()
+    measured = max(map(int, re.findall(r"law_(?:skin_)?step\S*\s+(\d+)", usage)))  # [B]
+    assert 0.9 < 1000 * int(stated[1]) / measured < 2
+    page = re.search(rf"`{name}`(?: needs)? ([\d.]+) kB", (ROOT / "docs/on_a_robot.md").read_text())
+    assert float(page[1]) == pytest.approx(measured / 1000, rel=0.15)
 
 
 @pytest.mark.parametrize("name", ["rps_plus", "learned_small", "force_push_published", CUSTOM])
@@ -200,7 +277,10 @@ const twists = given.map((seen) => {
 });
 const odd = step(params, memory, { ...given[0], yaw: NaN });
 const felt = skinStep(skinParams, skinInit(), Array(42).fill(0).fill(0.6, 15, 27), 1);
-console.log(JSON.stringify({ twists, odd, felt: felt.contact }));
+const short = [Array(41).fill(0), Array(42).fill(null)].map(
+  (taxels) => skinStep(skinParams, skinInit(), taxels, 1).code,
+);
+console.log(JSON.stringify({ twists, odd, short, felt: felt.contact }));
 """
 
 
@@ -224,6 +304,7 @@ def test_javascript_agrees_with_c(name, tmp_path, registries):
     np.testing.assert_allclose(twists[:, :3], expected, rtol=1e-9, atol=1e-12)
     assert result["odd"]["code"] == 1
     assert result["odd"]["twist"] == {"v_x": 0, "v_y": 0, "omega": 0}
+    assert result["short"] == [2, 1]  # too few taxels; null, as JSON has a number that is not one
     assert result["felt"]["in_contact"] is True
     np.testing.assert_allclose(result["felt"]["p_robot_contact"], [0.3625, 0], atol=1e-9)
 

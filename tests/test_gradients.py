@@ -214,9 +214,9 @@ def test_a_sample_beyond_the_bound_is_scaled_down_to_it_by_hand():
     np.testing.assert_array_equal(estimators.clip(jnp.zeros((3, 2)), 2.0), np.zeros((3, 2)))
 
 
-def test_an_empty_estimate_is_zero_with_infinite_variance():
+def test_a_mean_of_no_samples_is_nan_with_infinite_variance():
     estimate = gradients.estimate(jnp.array([[jnp.nan, 1.0], [jnp.nan, jnp.nan]]))
-    np.testing.assert_array_equal(estimate.gradient, [0.0, 1.0])
+    np.testing.assert_array_equal(estimate.gradient, [np.nan, 1.0])
     np.testing.assert_array_equal(estimate.variance, [np.inf, np.inf])
     np.testing.assert_array_equal(estimate.finite, [0.0, 0.5])
 

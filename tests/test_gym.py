@@ -212,6 +212,10 @@ def test_each_world_has_its_own_seed(single, vector):
     same(alone, start[2], atol=1e-6)
     vector.reset(seed=5)
     same([vector.step(AHEAD)[0] for _ in range(2)], later)
+    large = [5 + 2**32, 5, 5 + 2**63, 2**64 - 1]
+    distinct, _ = vector.reset(seed=large)
+    same(distinct[1], start[0], atol=1e-6)
+    assert len(np.unique(distinct, axis=0)) == 4
     unseeded, _ = vector.reset()
     assert not np.array_equal(unseeded, start)
 
@@ -313,6 +317,7 @@ def test_a_film_is_recorded(kind, tmp_path):
         ({"seed": [1, 2]}, r"seed = \[1, 2\] is not allowed: .* a list of 4"),
         ({"seed": -1}, "seed = -1"),
         ({"seed": 1.5}, "seed = 1.5"),
+        ({"seed": [1, 2, 3, 2**64]}, "seed = 18446744073709551616"),
         ({"seed": "abc"}, "seed = abc"),
         ({"seed": [1, 2, 3, "x"]}, "seed = x"),
     ],

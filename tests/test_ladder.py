@@ -12,10 +12,9 @@ from rps_jax.control import registry
 from rps_jax.control.laws.rps import RPSParams
 from rps_jax.control.learned import policy
 from rps_jax.errors import InputError
-from rps_jax.runs.question import seed_of
 from rps_jax.runs.results import load, write_table
 from rps_jax.studies import ladder
-from rps_jax.trials.setting import Setting
+from rps_jax.trials.setting import Setting, seed_of
 from rps_jax.trials.trial import Rules
 from rps_jax.world import draws
 

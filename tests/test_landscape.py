@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from rps_jax.control.laws.rps import BOUNDS, RPSParams
-from rps_jax.runs.question import seed_of
+from rps_jax.trials.setting import seed_of
 from rps_jax.trials.trial import Outcome
 from rps_jax.tuning.space import SUBSETS, Space
 from sweeps.landscape import candidates, study

@@ -15,8 +15,7 @@ from helpers import ROOT, rps
 import rps_jax
 from rps_jax import sweep
 from rps_jax.record import files
-from rps_jax.runs.question import seed_of
-from rps_jax.trials.setting import Setting
+from rps_jax.trials.setting import Setting, seed_of
 from rps_jax.trials.trial import Rules
 from rps_jax.world.domain import DOMAINS, Range
 from sweeps import render_tables, sources

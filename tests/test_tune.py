@@ -15,10 +15,10 @@ from rps_jax.control.laws.rps import BOUNDS, RPSParams
 from rps_jax.errors import InputError
 from rps_jax.runs import evaluate
 from rps_jax.runs.evaluate import CandidateScores
-from rps_jax.runs.question import Run, split_of
+from rps_jax.runs.question import Run
 from rps_jax.trials.progress import Timing, no_progress
 from rps_jax.trials.score import Objective
-from rps_jax.trials.setting import Setting
+from rps_jax.trials.setting import Setting, seed_of
 from rps_jax.trials.trial import Outcome, Rules
 from rps_jax.tuning import run as tuning
 from rps_jax.tuning.descent import TuneGrad
@@ -241,7 +241,7 @@ def pretended(monkeypatch):
     calls = []
 
     def score(asks, *args, **how):
-        if split_of(asks[0].seed)[1] != "test":  # of the end
+        if asks[0].seed != seed_of(0, "test"):  # of the end
             calls.append(asks)
         return pretend(asks, *args, **how)
 

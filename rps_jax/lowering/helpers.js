@@ -1,4 +1,5 @@
-const finite = (x) => (Array.isArray(x) ? x.every(finite) : Number.isFinite(Number(x)));
+const finite = (x) =>
+  Array.isArray(x) ? [...x].every(finite) : typeof x === "boolean" || Number.isFinite(x);
 const nan = (x) => (Array.isArray(x) ? x.some(nan) : Number.isNaN(Number(x)));
 const rint = (x) => (Math.abs(x % 1) === 0.5 ? 2 * Math.round(x / 2) : Math.round(x));
 const unpacked = (text, Kind, rows) => {

@@ -5,6 +5,7 @@ Worlds for tuning, validation and testing have different seeds.
 
 import math
 from collections.abc import Sequence, Set
+from dataclasses import replace
 from typing import Any, NamedTuple, Unpack
 
 import jax
@@ -20,14 +21,14 @@ from rps_jax.errors import InputError
 from rps_jax.record import cache, provenance
 from rps_jax.record import options as options_
 from rps_jax.robot.robot import RobotLike
-from rps_jax.runs.question import Split, name_or_custom, seed_of, task_attribute
+from rps_jax.runs.question import name_or_custom, task_attribute
 from rps_jax.trials import batch
 from rps_jax.trials.batch import BatchOptions
 from rps_jax.trials.progress import Bar, ProgressCallback, Timing, is_interactive
 from rps_jax.trials.results import POSE, WORLD, labelled, variable
 from rps_jax.trials.rollout import Candidates, outcomes
 from rps_jax.trials.score import Objective
-from rps_jax.trials.setting import Setting
+from rps_jax.trials.setting import Setting, Split, seed_of
 from rps_jax.trials.trial import Outcome
 from rps_jax.world import points as points_
 from rps_jax.world.domain import DomainLike, parse_domain
@@ -63,7 +64,7 @@ def evaluate(
       domain: ranges from which worlds are drawn: a name, or a file of ranges.
       worlds: number of worlds for each candidate, of indices 0, 1, ...
       points: points of the unit cube at which the worlds lie instead, as `worlds_at` returns.
-      split: use of the worlds; two splits have different worlds, whatever the seeds.
+      split: use of the worlds; no sweep of any seed has worlds for tuning or validation.
       objective: score of a trial.
       robot: its name, as kairos, or a JSON file; None: the domain's.
       task: its name, as path, with changes; None: the domain's.
@@ -115,9 +116,9 @@ def evaluate(
         "candidate": ("candidate", np.arange(scored.score.shape[0]), {"long_name": "candidate"}),
         "world": ("world", request.worlds, {"long_name": WORLD}),
     }
-    attrs = provenance.attributes() | {"domain": name_or_custom(domain), "split": split}
+    attrs = provenance.attributes() | replace(setting, split=split).attributes
+    attrs |= {"domain": name_or_custom(domain), "law": type(params).__name__}
     attrs |= task_attribute(ranges)
-    attrs |= {"seed": setting.seed, "engine": setting.engine, "law": type(params).__name__}
     return xr.Dataset(variables, {"pose": POSE} | indices | tried | drawn, attrs)
 
 

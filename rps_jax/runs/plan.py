@@ -196,14 +196,13 @@ def load_plan(folder: Path) -> Plan:
 
 def attributes_of(plan: Plan) -> dict[str, str | int]:
     """Return seed, engine and domain of a plan, as attributes of results."""
-    setting, name = plan.setting, name_or_custom(plan.domain)
-    record = {"seed": setting.seed, "engine": setting.engine, "domain": name}
+    record = plan.setting.attributes | {"domain": name_or_custom(plan.domain)}
     return record | task_attribute(plan.domain)
 
 
 def draw(plan: Plan, index: ArrayLike) -> Draw:
     """Draw worlds of one object, by their indices."""
-    return points.draw(plan.domain, plan.setting.seed, plan.points, index)
+    return points.draw(plan.domain, plan.setting.world_seed, plan.points, index)
 
 
 def scene_of(plan: Plan, index: int) -> Scene:

@@ -30,11 +30,9 @@ from typing import (
     Any,
     ClassVar,
     Generic,
-    Literal,
     ParamSpec,
     Self,
     TypeVar,
-    get_args,
 )
 
 import jax
@@ -67,8 +65,6 @@ if TYPE_CHECKING:
 P = ParamSpec("P")
 D = TypeVar("D", bound="DataclassInstance")
 T = TypeVar("T", covariant=True)
-Split = Literal["tune", "validate", "test"]
-_SPLITS: tuple[Split, ...] = get_args(Split)
 _OLD_NAMES = {
     "OfLaw": "LawQuestion",
     "OfLaws": "MultiLawQuestion",
@@ -84,24 +80,6 @@ _EXECUTION_OPTIONS = (
 def __getattr__(name: str) -> Any:
     """Return a class by its name in version 0.3, with a warning."""
     return globals()[errors.current_name(f"module '{__name__}'", "", name, _OLD_NAMES)]
-
-
-def seed_of(seed: int, split: Split) -> int:
-    """Return the seed of the worlds of one split; no two splits of any seeds share a world.
-
-    The worlds of a domain that draws little, such as `paper`, depend little on the seed.
-
-    Raises:
-      InputError: the split is unknown, or the seed too large.
-    """
-    errors.check_count("seed", seed, at_least=0, at_most=2**32 // len(_SPLITS) - 1)
-    return len(_SPLITS) * seed + _SPLITS.index(errors.check_name("split", split, _SPLITS))
-
-
-def split_of(seed: int) -> tuple[int, Split]:
-    """Return the seed and the split for which `seed_of` returns a seed."""
-    seed, index = divmod(seed, len(_SPLITS))
-    return seed, _SPLITS[index]
 
 
 def call_of(command: Callable[P, Command[T]]) -> Callable[P, T]:
@@ -288,7 +266,7 @@ class Question(Command[T]):
         """Return the attributes of the results: command, version, seed, engine and domain."""
         record: dict[str, str | int] = {**provenance.attributes()}
         if isinstance(setting := getattr(self, "setting", None), Setting):
-            record |= {"seed": setting.seed, "engine": setting.engine}
+            record |= setting.attributes
         if (domain := getattr(self, "domain", None)) is not None:
             several = [domain] if isinstance(domain, str | Domain) else domain
             record["domain"] = " ".join(map(name_or_custom, several))

@@ -37,17 +37,11 @@ from rps_jax.errors import InputError
 from rps_jax.record.options import option
 from rps_jax.runs import execution
 from rps_jax.runs.plan import Plan
-from rps_jax.runs.question import (
-    DomainQuestion,
-    LawQuestion,
-    Run,
-    call_of,
-    count_true,
-    seed_of,
-)
+from rps_jax.runs.question import DomainQuestion, LawQuestion, Run, call_of, count_true
 from rps_jax.runs.results import load
 from rps_jax.studies.probe import Probe
 from rps_jax.trials.progress import Bar, set_phase
+from rps_jax.trials.setting import seed_of
 from rps_jax.world import points
 
 # [1] shares of the time after which the search ends, and the check of elites.
@@ -116,7 +110,6 @@ class Attack(DomainQuestion[xr.Dataset], LawQuestion[xr.Dataset]):
         errors.check_each_once("axes", self.axes)
         for name in self.axes:
             points.check_drawn("axes", name, self.ranges)
-        _ = seed_of(self.setting.seed, "tune")
         self.check_engine([self.params])
         errors.require("ribs", "failures")
 

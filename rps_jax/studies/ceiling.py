@@ -33,7 +33,7 @@ from rps_jax.control.laws.rps import RPSParams
 from rps_jax.record import files
 from rps_jax.record.options import option
 from rps_jax.runs.plan import Plan, attributes_of, load_plan
-from rps_jax.runs.question import DomainQuestion, Run, call_of, count_true, seed_of
+from rps_jax.runs.question import DomainQuestion, Run, call_of, count_true
 from rps_jax.studies.gallery import failure_modes
 from rps_jax.trials import score
 from rps_jax.trials.progress import SequentialProgress
@@ -111,7 +111,7 @@ class Ceiling(DomainQuestion[xr.Dataset]):
         law = {"guided": GuidedParams()}
         count = int(self.world_indices.max(initial=0)) + 1
         if self.run is None:
-            setting = replace(self.setting, seed=seed_of(self.setting.seed, "test"))
+            setting = replace(self.setting, split="test")
             return Plan(self.ranges, count, law, setting)
         sweep = load_plan(Path(self.run))
         return Plan(sweep.domain, count, law, sweep.setting, points=sweep.points)
@@ -196,7 +196,7 @@ class Ceiling(DomainQuestion[xr.Dataset]):
         for row, (world, time) in enumerate(zip(worlds.tolist(), end, strict=True)):
             first = min(int(time * r / self.rounds / self.hold), KNOTS - 1)
             size = self.samples - 2, min(window, KNOTS - first), 3
-            random = np.random.default_rng((self.plan.setting.seed, world, r))
+            random = np.random.default_rng((self.plan.setting.world_seed, world, r))
             noise[row, 2:, first : first + size[1]] = random.normal(scale=self.spread, size=size)
         return noise
 
@@ -211,7 +211,7 @@ class Ceiling(DomainQuestion[xr.Dataset]):
         same = RPSParams.tuned(), float(steps)
         law, hold = jax.tree.map(partial(np.full, offsets.shape[:2]), same)
         params = GuidedParams(law, offsets, hold)
-        seed, domains = plan.setting.seed, [plan.domain]
+        seed, domains = plan.setting.world_seed, [plan.domain]
         request = Candidates(params, domains, seed, worlds, plan.points, per_world=True)
         options = run.batch_options
         (outcome,), _ = outcomes([request], plan.setting, capacity=lambda _: slots, **options)

@@ -32,8 +32,6 @@ from rps_jax.runs.question import (
     TaskOption,
     call_of,
     count_true,
-    seed_of,
-    split_of,
 )
 from rps_jax.runs.sweep import Sweep, SweepOptions, describe_plan
 from rps_jax.trials.progress import ProgressCallback, SequentialProgress
@@ -55,11 +53,6 @@ def _senses(params: LawParams) -> Senses:
 @dataclass(frozen=True)
 class _TestSweep(Sweep):
     """Sweep over the test worlds of one domain, labelled with what each law senses."""
-
-    def attributes(self) -> dict[str, str | int]:
-        """Return the attributes of the results, with the seed of the ladder."""
-        seed, split = split_of(self.setting.seed)
-        return super().attributes() | {"seed": seed, "split": split}
 
     def labelled(self, outcomes: xr.Dataset, run: Run) -> xr.Dataset:
         outcomes = super().labelled(outcomes, run)
@@ -122,7 +115,7 @@ class Ladder(SweepOptions, TaskOption, MultiLawQuestion[xr.Dataset | xr.DataTree
         names, of_sweep = ({f.name for f in dataclasses.fields(x)} for x in (self, _TestSweep))
         names = (names & of_sweep) - {"laws", "domain"}
         shared: dict[str, Any] = {name: getattr(self, name) for name in names}
-        shared["setting"] = replace(self.setting, seed=seed_of(self.setting.seed, "test"))
+        shared["setting"] = replace(self.setting, split="test")
         sweeps = {}
         for label, domain in zip(labels, domains, strict=True):
             sweep = _TestSweep(self.chosen, domain, **shared)
@@ -164,8 +157,7 @@ class Ladder(SweepOptions, TaskOption, MultiLawQuestion[xr.Dataset | xr.DataTree
         return xr.DataTree.from_dict(results)
 
     def intro(self, results: xr.Dataset | xr.DataTree) -> str:
-        plans = (replace(sweep.plan, setting=self.setting) for sweep in self.sweeps.values())
-        return "\n\n".join(map(describe_plan, plans))
+        return "\n\n".join(describe_plan(sweep.plan) for sweep in self.sweeps.values())
 
     def report(self, results: xr.Dataset | xr.DataTree, run: Run) -> Sequence[Section]:
         if self.single and isinstance(results, xr.Dataset):

@@ -26,7 +26,7 @@ from scipy import stats
 from rps_jax import errors
 from rps_jax.analysis.report import Section
 from rps_jax.record.options import option
-from rps_jax.runs.question import DomainQuestion, LawQuestion, Run, call_of, seed_of
+from rps_jax.runs.question import DomainQuestion, LawQuestion, Run, call_of
 from rps_jax.studies.probe import Probe
 from rps_jax.world import points
 
@@ -207,7 +207,6 @@ class Rare(DomainQuestion[xr.Dataset], LawQuestion[xr.Dataset]):
     def check(self) -> None:
         least = self.groups * 2 * round(1 / self.share)
         errors.check_count("particles", self.particles, at_least=least, at_most=10_000_000)
-        _ = seed_of(self.setting.seed, "tune")
         self.check_engine([self.params])
 
     @property
@@ -219,7 +218,7 @@ class Rare(DomainQuestion[xr.Dataset], LawQuestion[xr.Dataset]):
         domain, seed = self.ranges, self.setting.seed
         probe = Probe(domain, self.params, self.setting, run)
         kinds = [quantity.kind for quantity in points.coordinates(domain)]
-        seeds = seed_of(seed, "tune") * 10_000 + np.arange(self.repetitions)
+        seeds = 30_000 * seed + np.arange(self.repetitions)
         simulations = [subset_simulation(kinds, self, int(i)) for i in seeds]
         results = run_together(lambda u: probe(u).severity.values, simulations)
         estimates, p_groups, levels, u, severity = zip(*results, strict=True)

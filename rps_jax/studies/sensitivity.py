@@ -30,7 +30,6 @@ from rps_jax.runs.question import (
     Run,
     call_of,
     count_true,
-    seed_of,
 )
 from rps_jax.runs.sweep import PlanQuestion
 from rps_jax.world import points
@@ -97,11 +96,15 @@ class Sensitivity(PlanQuestion, DomainQuestion[xr.Dataset], LawQuestion[xr.Datas
         bounds = [[0.0, 1.0]] * len(names)
         return {"num_vars": len(names), "names": names, "bounds": bounds, "groups": groups}
 
+    @property
+    def design_seed(self) -> int:
+        """Seed of the design; that of the bootstrap is the next."""
+        return 3 * self.setting.seed
+
     def u(self) -> np.ndarray:
         """Return the points (worlds, q) of the design, block by block of one base point."""
         sample = errors.require("SALib.sample.sobol", "failures").sample
-        seed = seed_of(self.setting.seed, "tune")
-        values = sample(self.problem, self.base, calc_second_order=False, seed=seed)
+        values = sample(self.problem, self.base, calc_second_order=False, seed=self.design_seed)
         return np.clip(values, 0, np.nextafter(1, 0))
 
     @functools.cached_property
@@ -149,8 +152,7 @@ def analyze(options: Sensitivity, sweep: xr.Dataset) -> xr.Dataset:
         "time": trials.time.values.astype(float),
         "left": statistics.distance_left(trials),
     }
-    seed = seed_of(options.setting.seed, "tune") + 1  # the design has the previous one
-    settings = {"calc_second_order": False, "num_resamples": 200, "seed": seed}
+    settings = {"calc_second_order": False, "num_resamples": 200, "seed": options.design_seed + 1}
     constant = dict.fromkeys(_INDICES.values(), np.zeros(len(options.factors)))
     indices = [
         compute(options.problem, y, **settings) if np.ptp(y) > 0 else constant

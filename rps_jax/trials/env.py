@@ -324,7 +324,7 @@ class PushEnv:
 
     @functools.cached_property
     def _drawn(self) -> Draw:
-        return draws.draw(self._alone, self.setting.seed, np.arange(self.worlds))
+        return draws.draw(self._alone, self.setting.world_seed, np.arange(self.worlds))
 
     @functools.cached_property
     def _batch(self) -> WorldBatch:

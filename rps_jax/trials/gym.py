@@ -39,7 +39,7 @@ try:
 except ImportError as error:
     raise errors.not_installed("gymnasium", "gym") from error
 
-_SEEDS = 2**32
+_SEEDS = 2**32  # of one word of a key
 
 
 def _hold(env: PushEnv, steps: int, state: State, action: jax.Array) -> tuple[State, jax.Array]:
@@ -268,10 +268,11 @@ class GymPushVector(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             raise errors.not_allowed("seed", seeds, rule)
         known = np.array([seed is not None for seed in seeds])
         for seed in np.asarray(seeds, object)[known]:
-            errors.check_count("seed", seed, at_least=0, at_most=2**64)
+            errors.check_count("seed", seed, at_least=0, at_most=_SEEDS**2 - 1)
         drawn = self.np_random.integers(_SEEDS, size=self.num_envs)
-        values = [drawn[i] if s is None else int(s) % _SEEDS for i, s in enumerate(seeds)]
-        keys = jax.vmap(jax.random.key)(np.asarray(values, np.uint32))
+        values = [drawn[i] if s is None else int(s) for i, s in enumerate(seeds)]
+        words = np.array([divmod(value, _SEEDS) for value in values], np.uint32)
+        keys = jax.random.wrap_key_data(words, impl="threefry2x32")
         self._keys = keys if self._keys is None else jnp.where(known & where, keys, self._keys)
 
     @device.standard_jax()

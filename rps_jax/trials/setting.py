@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
-from rps_jax import engines
+from rps_jax import engines, errors
 from rps_jax.control import registry
 from rps_jax.control.base import LawParams
 from rps_jax.engines import EngineName
@@ -16,6 +16,22 @@ from rps_jax.trials.trial import Rules
 from rps_jax.world import physics as physics_
 from rps_jax.world.domain import Domain
 from rps_jax.world.physics import Fidelity, Physics
+
+Split = Literal["tune", "validate", "test"]
+
+
+def seed_of(seed: int, split: Split) -> int:
+    """Return the seed of the worlds of one split: those of one seed have no world of another.
+
+    Those for tuning and validation lie above all seeds of sweeps, so no sweep meets them. Test
+    worlds are those of a sweep with another seed. The worlds of a domain that draws little, such as
+    `paper`, depend little on the seed.
+
+    Raises:
+      InputError: the split is unknown.
+    """
+    index = get_args(Split).index(errors.check_name("split", split, get_args(Split)))
+    return 3 * seed + 2 if split == "test" else seed + 2 ** (34 + index)
 
 
 class PhysicsField:
@@ -57,12 +73,25 @@ class Setting:
     """Seed of random worlds, and of the imperfections of skins."""
     gradient: Literal["exact"] = options.option("exact", hidden=True)
     """How derivatives are computed: exact, from the engine's own equations."""
+    split: Split | None = options.option(None, hidden=True)
+    """Use of the random worlds: tune, validate or test; by default the worlds of a sweep."""
 
     def __post_init__(self) -> None:
         options.check_fields(self)
         self.rules.check()
         if self.physics.cone != "elliptic":  # all engines have this one: import no engine
             engines.get(self.engine).check_physics(self.physics)
+
+    @property
+    def world_seed(self) -> int:
+        """Seed of the random worlds of the split."""
+        return self.seed if self.split is None else seed_of(self.seed, self.split)
+
+    @property
+    def attributes(self) -> dict[str, str | int]:
+        """Attributes of results: seed, engine, and the split if there is one."""
+        record = {"seed": self.seed, "engine": self.engine, "split": self.split}
+        return {name: value for name, value in record.items() if value is not None}
 
     def check_here(self, robot: Robot, laws: Iterable[LawParams] = ()) -> None:
         """Raise InputError unless the engine can step such a robot with these laws."""
@@ -83,12 +112,13 @@ class Setting:
             "physics": asdict(self.physics),
             "rules": registry.leaves_to_json(self.rules),
             "seed": self.seed,
-        }
+        } | ({"split": self.split} if self.split else {})
 
     @classmethod
     def from_json(cls, record: Mapping[str, Any]) -> Setting:
         """Return the setting of a record with the fields of `to_json`."""
-        physics = dict(record["physics"]).items()
-        values: dict[str, Any] = {k: tuple(x) if isinstance(x, list) else x for k, x in physics}
-        rules = Rules(**record["rules"])
-        return cls(record["engine"], Physics(**values), rules=rules, seed=record["seed"])
+        numbers = dict(record["physics"]).items()
+        values: dict[str, Any] = {k: tuple(x) if isinstance(x, list) else x for k, x in numbers}
+        rules, split = Rules(**record["rules"]), record.get("split")
+        physics, seed = Physics(**values), record["seed"]
+        return cls(record["engine"], physics, rules=rules, seed=seed, split=split)

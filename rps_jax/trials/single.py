@@ -69,7 +69,7 @@ def draw_worlds(
         raise errors.not_allowed("domain objects", ranges.objects, rule)
     engines.get(setting.engine).check_traced()
     setting.check_domain(ranges)
-    drawn = draws.draw(ranges, setting.seed, np.arange(worlds))
+    drawn = draws.draw(ranges, setting.world_seed, np.arange(worlds))
     return drawn_worlds(ranges, drawn, setting)
 
 

@@ -152,7 +152,7 @@ def value_and_grad(
     value, bend = np.empty((len(chosen), worlds)), np.empty((worlds, len(coordinates)))
     gradient = np.empty((*value.shape, len(coordinates)))
     used, temperature = np.array([x.is_parameter for x in coordinates]), 0.0
-    for at, drawn in points.draw_by_object(ranges, setting.seed, None, index):
+    for at, drawn in points.draw_by_object(ranges, setting.world_seed, None, index):
         batch = drawn_worlds(ranges, drawn, setting)
         if smooth:
             batch = batch._replace(worlds=soften_skins(batch.worlds))
@@ -192,12 +192,12 @@ def value_and_grad(
         "kind": ("quantity", ["parameter" if x.is_parameter else "world" for x in coordinates]),
         "map_error": ("quantity", bend.max(axis=0), {"units": "1"}),
     }
-    coords |= points.drawn_columns(ranges, setting.seed, None, index)
+    coords |= points.drawn_columns(ranges, setting.world_seed, None, index)
     notes = " ".join(_notes(ranges, setting.engine, coordinates, used, value, gradient, bend))
     if notes:
         warnings.warn(notes, stacklevel=3)
     attrs = provenance.attributes() | {
-        "domain": name_or_custom(domain), "seed": setting.seed, "engine": setting.engine,
+        "domain": name_or_custom(domain), **setting.attributes,
         "gradient": setting.gradient, "horizon": steps * setting.physics.control_period,
         "skin_temperature": temperature, "notes": notes, **task_attribute(ranges),
     }  # fmt: skip
@@ -273,7 +273,7 @@ def world_slopes(
 
     def moved(coordinate: Coordinate, step: np.ndarray) -> Draw:
         if coordinate.name not in _VECTORS:
-            return draws.draw(domain, setting.seed, drawn.indices, {coordinate.name: step})
+            return draws.draw(domain, setting.world_seed, drawn.indices, {coordinate.name: step})
         path = _VECTORS[coordinate.name]
         value = np.array(named_leaves(drawn)[path])
         value[:, coordinate.entry[0]] += step
@@ -401,10 +401,12 @@ def _notes(
         )
     is_zero: Any = ~gradient.any(axis=(0, 1))
     bent: Any = (bend > _MAX_BEND).any(axis=0)
+    is_empty: Any = ~np.isfinite(gradient).any(axis=1).all(axis=0)
     for mask, sentence in (
         (~used & ~is_mass, f"No influence with the engine {engine}, which does not use them:"),
         (used & is_zero & ~is_mass, "Derivatives of zero in every world within the horizon:"),
         (bent, "No derivatives in worlds whose numbers have a kink (see finite):"),
+        (is_empty, "No world has a finite derivative, so the mean is NaN:"),
     ):
         labels = [x.label for x, chosen in zip(coordinates, mask, strict=True) if chosen]
         if labels:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import itertools
 import math
+import warnings
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
@@ -84,7 +85,8 @@ class TuneGrad(Tuning):
         for step in itertools.count():
             results = yield {"vectors": thetas, "base": base}
             base = results["base"]
-            mean = _MOMENTUM * mean + (1 - _MOMENTUM) * results["gradients"]
+            slopes = results["gradients"]
+            mean = _MOMENTUM * mean + (1 - _MOMENTUM) * np.where(np.isnan(slopes), 0.0, slopes)
             norm = np.linalg.norm(mean, axis=1, keepdims=True) / math.sqrt(start.size)
             rate = self.learning_rate * (1 + math.cos(math.pi * step / self.steps)) / 2
             thetas = results["vectors"] - rate * mean / np.where(norm > 0, norm, 1.0)
@@ -132,7 +134,13 @@ tune_grad = call_of(TuneGrad)
 
 
 def gradient_results(estimate: Estimate) -> dict[str, jax.Array]:
-    """Return the results of a step for estimates (S, p)."""
+    """Return the results of a step for estimates (S, p); warn of slopes without a finite sample."""
+    if missing := int(jnp.isnan(estimate.gradient).sum()):
+        warnings.warn(
+            f"{missing} of {estimate.gradient.size} slopes have no finite sample: they are NaN, "
+            "and the step does without them.",
+            stacklevel=2,
+        )
     return {
         "gradients": estimate.gradient,
         "gradient": jnp.linalg.norm(estimate.gradient, axis=1).mean(),

@@ -46,14 +46,12 @@ from rps_jax.runs.question import (
     LawQuestion,
     Run,
     SimulationQuestion,
-    Split,
     call_of,
-    seed_of,
 )
 from rps_jax.trials import trial
 from rps_jax.trials.batch import rows
 from rps_jax.trials.progress import Progress, set_phase
-from rps_jax.trials.setting import Setting
+from rps_jax.trials.setting import Setting, Split, seed_of
 from rps_jax.trials.trial import ControlLoop, Trial, World, object_pose
 from rps_jax.trials.worlds import drawn_worlds
 from rps_jax.tuning import logs as logs_
@@ -175,7 +173,6 @@ class Fit(LawQuestion[Fitted], DomainQuestion[Fitted], LogsQuestion):
         return logs, fields
 
     def check(self) -> None:
-        _ = seed_of(self.setting.seed, "tune")
         self.check_engine([self.params])
         self.ranges.task.check_target("task", self.ranges.task, "logs have a target, so omit it")
         if len({raw.exact for raw in self.raw_logs}) > 1:
@@ -201,7 +198,9 @@ class Fit(LawQuestion[Fitted], DomainQuestion[Fitted], LogsQuestion):
     def fields_as_json(self) -> dict[str, Any]:
         """Fields as JSON; logs by the digests of their values."""
         contents = (b"".join(v.tobytes() for v in raw.columns.values()) for raw in self.raw_logs)
-        return super().fields_as_json() | {"logs": list(map(files.sha256, contents))}
+        record = {"logs": list(map(files.sha256, contents))}
+        record |= {"tune_seed": seed_of(self.setting.seed, "tune")}
+        return super().fields_as_json() | record
 
     def answer(self, run: Run) -> Fitted:
         """Compute and sample the posterior, and summarise it."""

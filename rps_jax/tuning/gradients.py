@@ -22,7 +22,7 @@ Scores = Callable[[jax.Array, Any], jax.Array]
 class Estimate(NamedTuple):
     """Gradient as the mean of independent samples, with its variance."""
 
-    gradient: jax.Array  # (p, ...) 0 where no sample is finite
+    gradient: jax.Array  # (p, ...) NaN where no sample is finite
     variance: jax.Array  # (p, ...) of the mean; inf for fewer than two samples
     finite: jax.Array  # (p, ...) [1] share of the samples that are finite and used
 
@@ -40,7 +40,7 @@ def estimate(samples: jax.Array) -> Estimate:
     is_finite = jnp.isfinite(samples)
     samples = jnp.where(is_finite, samples, 0.0)
     count = jnp.sum(is_finite, axis=0)
-    mean = jnp.sum(samples, axis=0) / jnp.maximum(count, 1)
+    mean = jnp.sum(samples, axis=0) / count
     squares = jnp.sum(jnp.where(is_finite, (samples - mean) ** 2, 0.0), axis=0)
     variance = squares / jnp.maximum(count - 1, 1) / jnp.maximum(count, 1)
     return Estimate(mean, jnp.where(count > 1, variance, jnp.inf), count / len(samples))

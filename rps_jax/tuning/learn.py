@@ -30,11 +30,11 @@ from rps_jax.engines import device
 from rps_jax.record import files
 from rps_jax.record.checkpoint import Checkpoints
 from rps_jax.record.options import option
-from rps_jax.runs.question import Run, SimulationQuestion, Split, TaskOption, call_of, seed_of
+from rps_jax.runs.question import Run, SimulationQuestion, TaskOption, call_of
 from rps_jax.trials.env import SHAPED_REWARD, PushEnv
 from rps_jax.trials.progress import Bar, Progress, ProgressCallback
 from rps_jax.trials.results import labelled
-from rps_jax.trials.setting import Setting
+from rps_jax.trials.setting import Setting, Split, seed_of
 from rps_jax.trials.trial import Rules
 from rps_jax.tuning import rollout
 from rps_jax.tuning.ppo import PPO
@@ -140,7 +140,6 @@ class Learn(PPO, TaskOption, SimulationQuestion[xr.Dataset]):
         if not (self.minutes or self.updates):
             raise errors.InputError("minutes = 0 is not allowed without updates: set one of them.")
         errors.check_each_once("domain", self.domains)
-        _ = seed_of(self.setting.seed, "tune")
         for domain in self.domains:
             errors.check_name("skin of a domain to learn in", domain.skin, ("capacitive",))
         engines.get(self.setting.engine).check_traced()
@@ -160,13 +159,15 @@ class Learn(PPO, TaskOption, SimulationQuestion[xr.Dataset]):
 
     def fields_as_json(self) -> dict[str, Any]:
         """Fields as JSON, with domains by their ranges."""
-        return super().fields_as_json() | {"domain": list(map(to_json, self.domains))}
+        seed = seed_of(self.setting.seed, "tune")
+        ranges = list(map(to_json, self.domains))
+        return super().fields_as_json() | {"domain": ranges, "tune_seed": seed}
 
     def environments(self, split: Split = "tune") -> list[PushEnv]:
         """Return the environments of a split; those for validation have the paper's rules."""
         tune = split == "tune"
         rules, worlds = (self.setting.rules, self.drawn) if tune else (Rules(), self.validation)
-        setting = replace(self.setting, rules=rules, seed=seed_of(self.setting.seed, split))
+        setting = replace(self.setting, rules=rules, split=split)
         reward = SHAPED_REWARD._replace(success=self.success, failure=self.failure)
         return [
             PushEnv(name, domain, RPSParams(), setting, weights=reward, worlds=worlds)

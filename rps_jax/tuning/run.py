@@ -30,9 +30,10 @@ from rps_jax.record import files
 from rps_jax.record.options import option
 from rps_jax.runs import evaluate
 from rps_jax.runs.evaluate import Candidates, CandidateScores
-from rps_jax.runs.question import LawQuestion, Run, TaskOption, count_true, seed_of
+from rps_jax.runs.question import LawQuestion, Run, TaskOption, count_true
 from rps_jax.trials.progress import Bar, Progress, Timing
 from rps_jax.trials.score import Objective
+from rps_jax.trials.setting import seed_of
 from rps_jax.trials.trial import Rules
 from rps_jax.tuning.space import Space, expand_subsets
 from rps_jax.world.domain import Domain, DomainLike, parse_domain, to_json
@@ -155,7 +156,6 @@ class Tuning(TaskOption, LawQuestion[xr.Dataset]):
         return {k: v for k, v in self.QUICK.items() if k != "tuned" or is_rps}
 
     def check(self) -> None:
-        _ = seed_of(self.setting.seed, "tune")
         if not registry.law_of(self.params).bounds:
             names = [n for n, params in registry.LAWS.items() if registry.law_of(params).bounds]
             rule = (
@@ -168,8 +168,9 @@ class Tuning(TaskOption, LawQuestion[xr.Dataset]):
 
     def fields_as_json(self) -> dict[str, Any]:
         """Fields as JSON, with the names of all tuned parameters and the ranges of all domains."""
-        ranges = list(map(to_json, self.domains))
-        return super().fields_as_json() | {"tuned": self.space.names, "domain": ranges}
+        ranges, seed = list(map(to_json, self.domains)), seed_of(self.setting.seed, "tune")
+        record = {"tuned": self.space.names, "domain": ranges, "tune_seed": seed}
+        return super().fields_as_json() | record
 
     def progress_bar(self) -> Bar:
         name = self.name.replace("_", " ")

@@ -42,6 +42,7 @@ _REQUIRED = {
     "geom": ("ground", "base", "object", "skin_front", "skin_left", "skin_right"),
 }
 _UPRIGHT = (1.0, 0.0, 0.0, 0.0)
+_MAX_OFF = 0.02  # [1] of the reach of the geoms: difference of an outline from it, at most
 _OVERHANG = 0.005  # [m] of geoms beyond the solid for contacts, at most
 _GIVE_OUTLINE = (
     "give the outline, a circle or a convex polygon of 3 to 8 corners (of a concave object its "
@@ -148,6 +149,7 @@ def register_object(
         a `Footprint`. By default that of the file: the numeric
         `footprint` in its element `custom`, with a radius or corners x y x y ... [m], or else the
         geom `object`, if it is a box or a cylinder. The height of the solid is that of this geom.
+        It reaches from that geom to the convex hull of all geoms, within 2 %.
       feet: positions (S, 2) [m] of 3 to 8 points on which it stands, in the body's frame, or with
         weights (S, 3) [m, m, 1], as of springs; by default its corners or its rim. Only the engine
         quasistatic uses weights: the others compute the load of each foot from the tilt of the
@@ -187,6 +189,7 @@ def register_object(
     elif not isinstance(footprint, Footprint):
         footprint = fp.polygon(footprint)
     family, vertices, radius = _outline(label, footprint)
+    _check_extent(label, model, vertices, radius)
     body = model.body("object")
     if feet is not None:
         family, vertices = "cylinder" if radius else "prism", solid.padded(vertices)
@@ -307,6 +310,28 @@ def _outline(label: str, footprint: Footprint) -> tuple[str, np.ndarray, float]:
     if len(vertices) == 4 and np.allclose(np.abs(vertices), half):
         return "box", solid.rectangles(*half[:, None])[0], 0.0
     return "prism", solid.padded(vertices), 0.0
+
+
+def _check_extent(label: str, model: mujoco.MjModel, vertices: np.ndarray, radius: float) -> None:
+    """Raise InputError for an outline that is not that of the geoms, which have the mass.
+
+    It may reach from the geom `object` to the convex hull of all geoms.
+    """
+    angle = np.arange(32) * np.pi / 16
+    ways = np.stack([np.cos(angle), np.sin(angle)])
+    owned = np.flatnonzero(model.geom_bodyid == model.body("object").id).tolist()
+    reaches = [np.max(_points_of(model, i)[:, :2] @ ways, axis=0) for i in owned]
+    least, most = reaches[owned.index(model.geom("object").id)], np.max(reaches, axis=0)
+    reach = np.max(vertices @ ways, axis=0) + radius
+    off = np.maximum(least - reach, reach - most)
+    if off.max() > _MAX_OFF * most.max():
+        k = int(np.argmax(off))
+        rule = (
+            f"its geoms, which have the mass, reach {least[k]:.3g} to {most[k]:.3g} m there: "
+            f"give geoms and outline the same size, within {_MAX_OFF:.0%}"
+        )
+        value = f"{reach[k]:.3g} m towards {np.degrees(angle[k]):.0f} degrees"
+        raise errors.not_allowed(f"{label}: reach of the footprint", value, rule)
 
 
 def _points_of(model: mujoco.MjModel, geom_id: int) -> np.ndarray:

@@ -195,7 +195,7 @@ def points_of(domain: Domain | str, index: ArrayLike, seed: int = 0) -> np.ndarr
     `worlds_at` returns the same worlds for them, bit for bit.
     """
     domain = parse_domain(domain)
-    errors.check_count("seed", seed, at_least=0, at_most=2**32 - 1)
+    errors.check_count("seed", seed, at_least=0, at_most=2**63)
     index = np.atleast_1d(np.asarray(index, np.int64))
     uniform = draws.random_numbers(seed, index)
     by_name = draws.by_name(uniform)

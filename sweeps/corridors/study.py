@@ -26,8 +26,8 @@ from rps_jax.control.base import LawParams
 from rps_jax.control.registry import LawsLike
 from rps_jax.record.options import option
 from rps_jax.runs.plan import Plan
-from rps_jax.runs.question import MultiLawQuestion, Run, Split, call_of, seed_of
-from rps_jax.trials.setting import Setting
+from rps_jax.runs.question import MultiLawQuestion, Run, call_of
+from rps_jax.trials.setting import Setting, Split
 from rps_jax.trials.trial import Rules
 from rps_jax.world.domain import DomainLike, parse_domain
 from rps_jax.world.quantity import Range
@@ -130,7 +130,7 @@ class Corridors(Study[xr.DataTree], MultiLawQuestion[xr.DataTree]):
         self, task: Path, worlds: int, laws: Mapping[str, LawParams], split: Split = "test"
     ) -> Plan:
         """Return the plan of a task; worlds of one split depend on the seed alone."""
-        setting = replace(self.setting, seed=seed_of(self.setting.seed, split))
+        setting = replace(self.setting, split=split)
         return Plan(
             replace(parse_domain(self.domain), task=task, targets=()), worlds, laws, setting
         )

@@ -8,7 +8,7 @@ runs `rps rare`, and compares its estimates with the rate in drawn worlds.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import numpy as np
@@ -18,7 +18,7 @@ from rps_jax.analysis import statistics
 from rps_jax.analysis.report import Section
 from rps_jax.record.options import option
 from rps_jax.runs.plan import Plan
-from rps_jax.runs.question import Run, call_of, count_true, seed_of
+from rps_jax.runs.question import Run, call_of, count_true
 from rps_jax.studies.rare import Estimate, Rare, estimate_row, estimate_table
 from rps_jax.trials.progress import set_phase
 from rps_jax.trials.score import severity_of
@@ -45,8 +45,7 @@ class Drawn(Rare):
     def answer(self, run: Run) -> xr.Dataset:
         """Estimate, and sweep the drawn worlds in the subfolder `drawn`."""
         estimates = super().answer(run)
-        seeded = replace(self.setting, seed=seed_of(self.setting.seed, "tune"))
-        plan = Plan(self.ranges, self.brute, {"law": self.params}, seeded, 4096)
+        plan = Plan(self.ranges, self.brute, {"law": self.params}, self.setting, 4096)
         set_phase(run.callback, "drawn worlds")
         results = run_plans(run, {"drawn": plan})["drawn"]
         failed = severity_of(results.sel(law="law"), self.setting.rules) >= self.level

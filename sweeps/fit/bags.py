@@ -23,7 +23,7 @@ import rps_jax
 from rps_jax.control.registry import LawLike
 from rps_jax.record import bag
 from rps_jax.record.options import option
-from rps_jax.runs.question import Run, call_of, seed_of
+from rps_jax.runs.question import Run, call_of
 from rps_jax.tuning import fit, logs
 from rps_jax.world import domain as domains
 from sweeps.fit.study import FitStudy, within
@@ -74,7 +74,7 @@ class Bagged(FitStudy):
     def _bags(self, names: Sequence[str]) -> xr.Dataset:
         """Return statistics (log, F) of the bags of the test worlds."""
         rules = self.setting.rules._replace(horizon=self.window)
-        setting = replace(self.setting, rules=rules, seed=seed_of(self.setting.seed, "test"))
+        setting = replace(self.setting, rules=rules, split="test")
         rows = []
         with tempfile.TemporaryDirectory() as folder:
             run = Path(folder) / "sweep"

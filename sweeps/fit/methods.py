@@ -25,8 +25,9 @@ import xarray as xr
 from rps_jax.analysis.figures.style import quantity
 from rps_jax.engines import device
 from rps_jax.record.options import option
-from rps_jax.runs.question import Run, call_of, seed_of
+from rps_jax.runs.question import Run, call_of
 from rps_jax.trials.progress import no_progress, set_phase
+from rps_jax.trials.setting import seed_of
 from rps_jax.tuning import fit, posterior
 from rps_jax.tuning.logs import Log
 from rps_jax.world import domain as domains
@@ -155,7 +156,7 @@ class Methods(FitStudy):
         minimise = {"gradient": Replay.minima, "evolution": evolved}[method]
         names = points.names(self.ranges)
         columns = [names.index(name) for name in fit.coordinates(self.ranges)]
-        starts = points.points_of(self.ranges, np.arange(self.starts), seed_of(0, "tune"))
+        starts = points.points_of(self.ranges, np.arange(self.starts), 0)
         results, counts, (index, tracks, smoothing) = list[np.ndarray](), list[float](), inputs()
         start = time.process_time()
         for log, track in zip(index.tolist(), tracks, strict=True):

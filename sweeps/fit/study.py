@@ -24,8 +24,9 @@ from rps_jax.analysis.report import Picture
 from rps_jax.control import registry
 from rps_jax.control.registry import LawLike
 from rps_jax.record.options import option
-from rps_jax.runs.question import DomainQuestion, LawQuestion, Run, call_of, seed_of
+from rps_jax.runs.question import DomainQuestion, LawQuestion, Run, call_of
 from rps_jax.trials.progress import Progress, no_progress, set_phase
+from rps_jax.trials.setting import seed_of
 from rps_jax.tuning import fit, posterior
 from rps_jax.world import domain as domains
 from rps_jax.world import draws, points

@@ -21,7 +21,7 @@ from rps_jax import engines, errors
 from rps_jax.analysis.report import Section
 from rps_jax.engines import device
 from rps_jax.record.options import option
-from rps_jax.runs.question import Run, call_of, seed_of
+from rps_jax.runs.question import Run, call_of
 from rps_jax.trials.progress import set_phase
 from rps_jax.tuning.fit import SAMPLES, Fit, Fitted, coordinates, summary
 from rps_jax.world import points
@@ -80,7 +80,7 @@ class FitWindows(Fit):
         set_phase(run.callback, "replay")
         seed, names = self.setting.seed, points.names(self.ranges)
         index = np.arange(self.num_trials() or 0)
-        start = points.points_of(self.ranges, index, seed_of(seed, "tune"))
+        start = points.points_of(self.ranges, index, seed)
         minima = device.standard_jax()(self.replay.minima)(start)
         u, eigenvalues = least_squares.sample(self.replay, *minima, SAMPLES, seed)
         data = summary(self.ranges, u[:, [names.index(x) for x in coordinates(self.ranges)]])

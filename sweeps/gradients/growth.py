@@ -33,7 +33,7 @@ from rps_jax.engines import EngineName
 from rps_jax.engines.base import ControlPeriod
 from rps_jax.geometry import planar
 from rps_jax.record.options import option
-from rps_jax.runs.question import Run, call_of, seed_of
+from rps_jax.runs.question import Run, call_of
 from rps_jax.trials import trial
 from rps_jax.trials.progress import Progress, set_phase
 from rps_jax.trials.setting import Setting
@@ -190,7 +190,7 @@ def _program(study: Growth, name: str, skin: str = "") -> Any:
     """Return the compiled function of gains that propagates changes in the worlds of an object."""
     alone = replace(domains.parse_domain(study.domain), objects=(name,))
     alone = replace(alone, skin="ideal") if skin == "ideal skin" else alone
-    drawn = draws.draw(alone, seed_of(study.seed, "tune"), np.arange(study.worlds))
+    drawn = draws.draw(alone, study.seed, np.arange(study.worlds))
     with jax.enable_x64(True):
         part = drawn_worlds(alone, drawn, study.setting)
         temperature = SKINS.get(skin)

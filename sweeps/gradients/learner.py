@@ -30,8 +30,9 @@ from rps_jax.control.learned import network as networks
 from rps_jax.control.learned.network import Network, Weights
 from rps_jax.engines import native
 from rps_jax.record.options import option
-from rps_jax.runs.question import Split, call_of
+from rps_jax.runs.question import call_of
 from rps_jax.trials.env import PushEnv
+from rps_jax.trials.setting import Split
 from rps_jax.trials.trial import World
 from rps_jax.tuning import gradients, ppo, rollout
 from rps_jax.tuning.gradients import Options

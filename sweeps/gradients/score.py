@@ -22,8 +22,8 @@ import xarray as xr
 from rps_jax.record.options import option
 from rps_jax.runs import evaluate
 from rps_jax.runs.evaluate import Candidates, CandidateScores
-from rps_jax.runs.question import Run, SimulationQuestion, call_of, seed_of
-from rps_jax.trials.setting import Setting
+from rps_jax.runs.question import Run, SimulationQuestion, call_of
+from rps_jax.trials.setting import Setting, seed_of
 from rps_jax.trials.trial import Rules
 from rps_jax.tuning import descent
 from rps_jax.tuning.gradients import Estimate, estimate

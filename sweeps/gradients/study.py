@@ -30,10 +30,10 @@ from rps_jax.control.laws import rps
 from rps_jax.control.laws.rps import RPSParams
 from rps_jax.engines import EngineName
 from rps_jax.record.options import option
-from rps_jax.runs.question import Run, Split, call_of, seed_of
+from rps_jax.runs.question import Run, call_of
 from rps_jax.trials import trial
 from rps_jax.trials.progress import Progress, set_phase
-from rps_jax.trials.setting import Setting
+from rps_jax.trials.setting import Setting, seed_of
 from rps_jax.trials.trial import World
 from rps_jax.trials.worlds import drawn_worlds, soften_skins
 from rps_jax.tuning.gradients import Options, Scores, estimate
@@ -218,10 +218,10 @@ def _measure(study: Gradients, name: str, measurement: str) -> xr.Dataset:
     """Return the gradient in each world of an object by one estimator, or of the truth."""
     is_true = measurement == TRUTH
     smooth = measurement not in (TRUTH, "evolution")
-    split: Split = "test" if is_true else "tune"
+    seed = seed_of(study.seed, "test") if is_true else study.seed
     count = study.truth if is_true else study.worlds
     alone = replace(domains.parse_domain(study.domain), objects=(name,))
-    drawn = draws.draw(alone, seed_of(study.seed, split), np.arange(count))
+    drawn = draws.draw(alone, seed, np.arange(count))
     estimator = estimators.ESTIMATORS["differences" if is_true else measurement]
     with jax.enable_x64(study.DOUBLE):
         part = drawn_worlds(alone, drawn, study.setting)

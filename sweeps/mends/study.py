@@ -25,7 +25,7 @@ from rps_jax.control.registry import LawsLike
 from rps_jax.record.options import option
 from rps_jax.runs import sweep as sweeps
 from rps_jax.runs.plan import Plan
-from rps_jax.runs.question import Run, call_of, seed_of
+from rps_jax.runs.question import Run, call_of
 from rps_jax.runs.sweep import SweepQuestion
 from rps_jax.trials.setting import Setting
 from rps_jax.world.domain import DomainLike
@@ -64,8 +64,8 @@ class Mends(SweepQuestion):
     def plan(self) -> Plan:
         """Plan of the sweep, in tuning worlds."""
         plan = super().plan
-        seed = seed_of(self.setting.seed, "tune")
-        return dataclasses.replace(plan, setting=dataclasses.replace(plan.setting, seed=seed))
+        setting = dataclasses.replace(plan.setting, split="tune")
+        return dataclasses.replace(plan, setting=setting)
 
     def report(self, results: xr.Dataset, run: Run) -> Sequence[Section]:
         """Return sections that compare each addition with the first, world by world."""

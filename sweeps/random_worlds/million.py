@@ -24,7 +24,7 @@ from rps_jax.control import registry
 from rps_jax.record import files
 from rps_jax.record.options import option
 from rps_jax.runs.plan import Plan
-from rps_jax.runs.question import Run, call_of, seed_of
+from rps_jax.runs.question import Run, call_of
 from rps_jax.trials.setting import Setting
 from rps_jax.world import domain as domains
 from sweeps.study_base import Rows, Table, TrialStudy, run_parts, run_plans
@@ -70,7 +70,7 @@ class Million(TrialStudy[xr.Dataset]):
     @property
     def test_setting(self) -> Setting:
         """Setting with the seed of the test worlds."""
-        return dataclasses.replace(self.setting, seed=seed_of(self.setting.seed, "test"))
+        return dataclasses.replace(self.setting, split="test")
 
     def answer(self, run: Run) -> xr.Dataset:
         """Run the laws that are missing."""
@@ -87,7 +87,7 @@ class Million(TrialStudy[xr.Dataset]):
 
     def attributes(self) -> dict[str, str | int]:
         """Return the attributes of the results, with the seed of `draws.draw`."""
-        return super().attributes() | {"seed": self.test_setting.seed}
+        return super().attributes() | {"seed": self.test_setting.world_seed}
 
     def report_tables(self, results: xr.Dataset) -> Sequence[Table]:
         """Return the ends of each law's trials."""

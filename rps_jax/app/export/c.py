@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+import re
 from collections.abc import Mapping, Sequence
 
 import numpy as np
@@ -38,6 +40,12 @@ def _for_each(fields: Sequence[Field], prefix: str, statement: str, kinds: str =
     return "\n".join(lines)
 
 
+def _stack(text: str) -> int:
+    """Return the size [B] of the local variables in statements, in float."""
+    sizes = re.findall(r"^ +(?:const )?\w+ \w+(?:\[(\d+)\])?(?: =|;)", text, re.MULTILINE)
+    return 4 * sum(int(size or 1) for size in sizes)
+
+
 def header(program: Program, prefix: str) -> str:
     """Return the whole header, in whose template capitals are lines that are printed for a law."""
     p, upper, groups, tables = prefix, prefix.upper(), program.groups, dict[str, str]()
@@ -48,8 +56,9 @@ def header(program: Program, prefix: str) -> str:
     def body(routine: Routine, inputs: Mapping[str, str], **outputs: str) -> str:
         return statements(routine, inputs, outputs, tables, p)
 
-    def checks(name: str, owner: str, code: str, condition: str = "!isfinite({0})") -> str:
-        return _for_each(groups[name], owner, f"if ({condition}) return {upper}_{code};")
+    def checks(name: str, owner: str, code: str, fault: str = "!{p}_finite") -> str:
+        statement = f"if ({fault.format(p=p)}({{}})) return {upper}_{code};"
+        return _for_each(groups[name], owner, statement)
 
     lines = {
         "INIT": body(program.init, law, memory="memory->"),
@@ -57,7 +66,7 @@ def header(program: Program, prefix: str) -> str:
         "SKIN": body(program.skin_step, skin, filtered="next.", contact="result."),
         "STEP_CHECKED": checks("observation", "observation->", "BAD_INPUT"),
         "STEP_RESULT": checks("twist", "result.", "BAD_RESULT"),
-        "STEP_MEMORY": checks("memory", "next.", "BAD_RESULT", "{0} != {0}"),
+        "STEP_MEMORY": checks("memory", "next.", "BAD_RESULT", "{p}_nan"),
         "NO_CONTACT": _for_each(groups["contact"], "contact->", "{} = 0;", "fib"),
         "SKIN_CHECKED": checks("scan", "", "BAD_INPUT"),
         "SKIN_RESULT": checks("skin", "next.", "BAD_RESULT"),
@@ -66,5 +75,8 @@ def header(program: Program, prefix: str) -> str:
         "TABLES": "\n".join([*tables.values(), ""] if tables else []),
         "HELPERS": HELPERS.format(p=p, P=upper),
     }
+    stack = max(_stack(lines["STEP"]), _stack(lines["SKIN"]))
+    stack += 4 * sum(field.size for name in ("memory", "skin") for field in groups[name])
     about = {"label": program.label, "robot": program.robot, "version": __version__}
+    about["stack"] = f"{math.ceil(stack / 1000)} kB"
     return fill("law.h.in", **lines, **about, p=p, P=upper, taxels=program.taxels)
