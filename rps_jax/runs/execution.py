@@ -46,7 +46,8 @@ def run_missing(
     missing, finished = missing_chunks(folder, plan, shard)
     callback(Progress(finished, 0.0))
     if missing:
-        provenance.write_environment(folder, device.collect_environment())
+        slots = {"slots": size.get("slots")}  # on which the bits depend
+        provenance.write_environment(folder, device.collect_environment() | slots)
 
     def add_finished(progress: Progress) -> None:
         callback(replace(progress, finished=finished + progress.finished))
