@@ -33,9 +33,9 @@ from rps_jax.world import video
 from rps_jax.world.scene import Scene
 from rps_jax.world.video import Shot, Tile
 
-_FILM_SIZE = (1920, 1080)  # [px] that the grid is fitted into
+_FILM_SIZE = (1280, 720)  # [px] that the grid is fitted into
 _GRID_LIMIT = 12  # rows and columns
-_LENGTH = 40  # [s] of a film at the default speed, at most
+_LENGTH = 30  # [s] of a film at the default speed, at most
 _FREEZE = 1.0  # [s] that the end is held
 T = TypeVar("T")
 _FPS = 12  # frames per second

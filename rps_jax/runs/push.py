@@ -55,7 +55,7 @@ if TYPE_CHECKING:
     from rps_jax.world.rendering import Tile
 
 
-_STILL = (640, 360)  # [px] width and height of one of several pictures side by side
+_STILL = (960, 540)  # [px] width and height of one of several pictures side by side
 FILM_LENGTH = 10.0  # [s] default, whatever the length of the trial
 
 
@@ -378,15 +378,18 @@ def find_differences(run: Path, law: str, worlds: Sequence[int], outcomes: Outco
     """Return whether trials (n,) end otherwise than in their sweep, and warn if one does."""
     if not (run / "results.nc").exists():  # a shard
         return np.zeros(len(worlds), bool)
-    ends = files.read_results(run).sel(law=law).isel(world=list(worlds))
+    ends = files.read_results(run)
+    if law not in ends.law:  # it has failed
+        return np.zeros(len(worlds), bool)
+    ends = ends.sel(law=law).isel(world=list(worlds))
     pairs = [(ends[name].values, outcomes.columns()[name]) for name in _ENDS]
     differ = np.any([stored != x.astype(stored.dtype) for stored, x in pairs], axis=0)
     if differ.any():
         end = ends.isel(world=int(differ.argmax()))
         warnings.warn(
-            f"{differ.sum()} of {differ.size} trials end otherwise than in the sweep, where world "
-            f"{int(end.world)} was {end_in_words(end)}: this device, number of processors or "
-            "version rounds differently.",
+            f"{differ.sum()} of {differ.size} trials end otherwise than in the sweep (world "
+            f"{int(end.world)}: target {end_in_words(end)} there): another device or version "
+            "rounds differently.",
             stacklevel=2,
         )
     return differ

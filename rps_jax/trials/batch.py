@@ -144,6 +144,9 @@ def run(
 
     Returns:
       The times of compilation and run, and the simulated time.
+
+    Raises:
+      Exception: the first one of a job, after all other jobs have ended.
     """
     engine, backend = engines.get(setting.engine), jax.default_backend()
     slots = slots_of(setting, slots)
@@ -154,7 +157,8 @@ def run(
     tasks: list[Callable[[], object]]
     if not engine.traced:
         count = max(1, min(workers, len(jobs)))
-        tasks = [partial(_run_on_host, job, setting, workers // count, monitor) for job in jobs]
+        shared = setting, workers // count, monitor
+        tasks = [partial(monitor.isolate, partial(_run_on_host, job, *shared)) for job in jobs]
     else:
         devices = _devices()
         groups = _schedule([*itertools.starmap(_TrialQueue, enumerate(jobs))], setting, slots)
@@ -163,9 +167,11 @@ def run(
         monitor.report()
         tasks = [partial(_work, groups, monitor, *x) for x in enumerate(devices * workers)]
         if backend != "cpu":  # idle processors: compile all programs at once, first used first
-            tasks += compilations
+            tasks += [partial(monitor.isolate, task) for task in compilations]
         count = len(tasks)
     _run_in_threads(tasks, count, monitor)
+    if monitor.failures:
+        raise monitor.failures[0]
     monitor.warn_of_nan_twists()
     return Timing(monitor.compile, monitor.elapsed - monitor.compile, monitor.simulated)
 
@@ -201,6 +207,7 @@ class _Monitor:
         self.simulated = 0.0  # [s] summed over trials
         self.compile = 0.0  # [s] that the worker who waited longest had no program
         self.stop = False  # set when one worker fails or the user interrupts
+        self.failures: list[Exception] = []  # of jobs, as of a law that cannot be compiled
         self._start_time = time.perf_counter()
         self._finished = self._nan_twists = 0  # trials
         self._compiled: set[object] = set()
@@ -215,15 +222,28 @@ class _Monitor:
         return time.perf_counter() - self._start_time
 
     def add(self, *ended: _Ended, segment: Segment | None = None) -> None:
-        """Add the trials of some queues that ended in a segment."""
+        """Add the trials of some queues that ended in a segment; an error here ends the run."""
         with self._lock:
-            for indices, outcomes, simulated in ended:
-                if indices.size:
-                    self._collect(indices, outcomes)
-                self._finished += indices.size
-                self._nan_twists += int(np.count_nonzero(outcomes.nan_twist))
-                self.simulated += simulated
-            self.report(segment)
+            try:
+                for indices, outcomes, simulated in ended:
+                    if indices.size:
+                        self._collect(indices, outcomes)
+                    self._finished += indices.size
+                    self._nan_twists += int(np.count_nonzero(outcomes.nan_twist))
+                    self.simulated += simulated
+                self.report(segment)
+            except BaseException:
+                self.stop = True
+                raise
+
+    def isolate(self, task: Callable[[], object]) -> None:
+        """Run a task; store its error, so that the other jobs go on."""
+        try:
+            task()
+        except Exception as error:
+            if self.stop:
+                raise
+            self.failures.append(error)
 
     def warn_of_nan_twists(self) -> None:
         """Warn if a law returned a twist that is not finite."""
@@ -490,9 +510,14 @@ def _work(
     """Run groups of programs on a device until no trial waits or runs; `index` of the worker."""
     first = index % max(1, len(groups))
     for group in (*groups[first:], *groups[:first]):
-        running: list[_Running | None] = [None] * len(group[0].queues)
-        for program, limits in itertools.zip_longest(group, [x.slots for x in group[1:]]):
-            running = [*_run(program, limits, running, device, monitor)]
+        monitor.isolate(partial(_run_group, group, device, monitor))
+
+
+def _run_group(group: Sequence[_Program], device: Device, monitor: _Monitor) -> None:
+    """Run a group of programs on a device until no trial waits or runs."""
+    running: list[_Running | None] = [None] * len(group[0].queues)
+    for program, limits in itertools.zip_longest(group, [x.slots for x in group[1:]]):
+        running = [*_run(program, limits, running, device, monitor)]
 
 
 def _run(

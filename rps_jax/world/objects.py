@@ -139,8 +139,8 @@ def register_object(
         geom `object`, if it is a box or a cylinder. The height of the solid is that of this geom.
       feet: positions (S, 2) [m] of 3 to 8 points on which it stands, in the body's frame, or with
         weights (S, 3) [m, m, 1], as of springs; by default its corners or its rim. Only the engine
-        quasistatic uses weights: the others compute the load of each foot from the tilt of the
-        object, on ground of uniform stiffness.
+        quasistatic accepts different weights: the others compute the load of each foot from the
+        tilt of the object, on ground of uniform stiffness.
 
     Raises:
       InputError: the name is one of the paper's, or file, footprint or feet are invalid.
