@@ -1,13 +1,20 @@
-"""Laws, robots, tasks and skins of the package: all combinations can be compiled to C."""
+"""Laws and robots: the package's combinations are compiled to C, and misfits are refused."""
 
 import itertools
 import warnings
+from typing import NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
+from helpers import rps
 
+import rps_jax
 from rps_jax.control import registry
+from rps_jax.control.base import Law
+from rps_jax.control.observation import Details, Twist
+from rps_jax.control.registry import register_law
 from rps_jax.engines import native
 from rps_jax.errors import InputError
 from rps_jax.robot.robot import ROBOTS
@@ -15,7 +22,7 @@ from rps_jax.robot.skin import SKINS
 from rps_jax.trials import pushes, trial
 from rps_jax.trials.case import Case
 from rps_jax.trials.setting import Setting
-from rps_jax.trials.trial import ControlLoop
+from rps_jax.trials.trial import ControlLoop, Rules
 
 ROOM = {"kind": "rooms", "outline": [[-1, -1], [4, -1], [4, 2], [-1, 2]], "goal": [2, 1]}
 TASKS = {"reach": "reach", "path": "path", "corridor": "corridor", "rooms": ROOM}
@@ -54,3 +61,64 @@ def test_no_law_of_the_package_warns_that_it_is_slow(law, robot, task, skin, mon
 
     with warnings.catch_warnings(action="error"):
         jax.eval_shape(advance, *worlds.inputs, start)
+
+
+COMMANDS = {
+    **dict.fromkeys(("push", "view", "rare", "attack", "sensitivity"), "--law learned"),
+    **dict.fromkeys(("sweep", "ladder", "table"), "--laws rps learned"),
+    "hardware": "--law learned --quick",
+    "score": "learned",
+}
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_a_law_for_another_skin_is_refused_before_anything_compiles(
+    command, tmp_path, compiled, capsys
+):
+    out = tmp_path / "run"
+    options = "" if command == "view" else f"--out {out}"
+    assert rps(f"{command} {COMMANDS[command]} --robot ridgeback {options}") == 2
+    assert "number of taxels = 51 is not allowed: the law was learned with 42" in (
+        capsys.readouterr().err
+    )
+    assert not compiled
+    assert not out.exists()
+
+
+class Fragile(NamedTuple):
+    d_success: float = 0.05
+
+
+def test_a_custom_law_for_another_skin_is_refused_with_its_line(registries):
+    def step(params, state, obs):
+        total = jnp.sum(obs.signal * np.ones(42))
+        return state, Twist(total, 0 * total, 0 * total), Details.from_obs(obs.touch)
+
+    register_law("fragile", Law(lambda params: (), step, "taxels"), Fragile())
+    pushes.build([Case(law="fragile")], Setting())
+    with pytest.raises(InputError, match=r"step, for a robot with 51 taxels, of the law in .*42"):
+        pushes.build([Case(law="fragile", robot="ridgeback")], Setting())
+
+
+def test_laws_that_ran_keep_their_results_when_another_fails(registries, tmp_path):
+    def fail(value):
+        raise RuntimeError("no gripper")
+
+    def step(params, state, obs):
+        kind = jax.ShapeDtypeStruct((), obs.yaw.dtype)
+        v = jax.pure_callback(fail, kind, obs.yaw, vmap_method="sequential")
+        return state, Twist(v, v, v), Details.from_obs(obs)
+
+    register_law("fragile", Law(lambda params: (), step), Fragile())
+    setting = Setting("quasistatic", rules=Rules(horizon=1.0))
+    domain = "wide,objects=random_cylinder"
+    options = {"worlds": 3, "setting": setting, "out": tmp_path}
+    with (
+        pytest.raises(Exception, match="no gripper"),
+        pytest.warns(UserWarning, match="has the results of the laws that ran: rps"),
+    ):
+        rps_jax.sweep(["rps", "fragile"], domain, **options)
+    results = rps_jax.load(tmp_path)
+    assert results.law.values.tolist() == ["rps"]
+    expected = rps_jax.sweep("rps", domain, worlds=3, setting=setting)
+    np.testing.assert_array_equal(results.base_pose, expected.base_pose)
