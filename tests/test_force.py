@@ -134,7 +134,9 @@ def test_a_law_observes_the_force_of_its_push(engine):
     law = registry.law_of(gains)
     trials = trial.start_all(worlds, params, np.ones(1, bool), law=law)
     loop = trial.ControlLoop(setting.physics, law=law)
-    trials, _ = trial.record(stage, worlds, params, trials, loop, steps=200)
+    trials, _ = jax.jit(trial.unroll, static_argnames="steps")(
+        stage, worlds, params, trials, loop, steps=200
+    )
     np.testing.assert_allclose(trials.load.wrench[0, 0], -0.3 * 10 * GRAVITY, rtol=0.1)
     np.testing.assert_allclose(trials.load.signal[0, 0], -0.3 * 10 * GRAVITY, rtol=0.1)
 

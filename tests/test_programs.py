@@ -64,8 +64,8 @@ def test_a_program_is_traced_once_for_all_processes(cache, compiler):
 
 def test_a_recorded_trial_is_traced_once_for_all_processes(cache, monkeypatch):
     """A cached trial returns the same named tuples as a traced one."""
-    traced, record = [], trial.record
-    monkeypatch.setattr(trial, "record", lambda *a, **k: traced.append(1) or record(*a, **k))
+    traced, advance = [], trial.advance
+    monkeypatch.setattr(trial, "advance", lambda *a: traced.append(1) or advance(*a))
     setting = Setting("quasistatic", rules=Rules(horizon=0.2))
     worlds = pushes.build([Case("box")], setting)
     first, again = (pushes.record_batch(worlds, setting)[0] for _ in range(2))

@@ -8,12 +8,12 @@ from __future__ import annotations
 import itertools
 import math
 import re
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Literal, NamedTuple, TypeVar
 
-import jax
 import numpy as np
 
 from rps_jax import errors
@@ -22,19 +22,20 @@ from rps_jax.errors import InputError
 from rps_jax.record import files, folder
 from rps_jax.record.options import option
 from rps_jax.runs.plan import Plan, build_batch, scene_of
-from rps_jax.runs.push import another_engine, select_law
+from rps_jax.runs.push import find_differences, program_slots, select_law
 from rps_jax.runs.question import Action, call_of
 from rps_jax.trials import pushes, trial
 from rps_jax.trials.batch import WorldBatch, rows
 from rps_jax.trials.progress import Bar, Progress, ProgressCallback
 from rps_jax.trials.setting import Setting
+from rps_jax.trials.trial import Outcome
 from rps_jax.world import video
 from rps_jax.world.scene import Scene
 from rps_jax.world.video import Shot, Tile
 
-_FILM_SIZE = (1920, 1080)  # [px] that the grid is fitted into
+_FILM_SIZE = (1280, 720)  # [px] that the grid is fitted into
 _GRID_LIMIT = 12  # rows and columns
-_LENGTH = 40  # [s] of a film at the default speed, at most
+_LENGTH = 30  # [s] of a film at the default speed, at most
 _FREEZE = 1.0  # [s] that the end is held
 T = TypeVar("T")
 _FPS = 12  # frames per second
@@ -84,10 +85,6 @@ class Film(Action[Path]):
             rule = f"write ROWSxCOLUMNS, as 4x6, each from 1 to {_GRID_LIMIT}"
             raise errors.not_allowed("grid", self.grid, rule)
         return int(match[1]), int(match[2])
-
-    def note(self) -> str:
-        """Whether another engine than the run's is filmed."""
-        return another_engine(Path(self.run))
 
     def check(self) -> None:
         """Check the grid, the file and the selected trials."""
@@ -140,6 +137,8 @@ class Take(NamedTuple):
     part: WorldBatch
     scenes: Sequence[Scene]
     labels: Sequence[str]
+    slots: int  # of the program
+    compare: Callable[[Outcome], object]  # warns of trials that end otherwise than in the sweep
 
     def tile(self, i: int) -> Tile:
         """Return the picture of one trial, with the lines of its task."""
@@ -193,7 +192,10 @@ def of_sweep(
             tiles = (row * index.size + columns).tolist()
             part = build_batch(plan, law, index[columns])
             scenes = [scene_of(plan, i) for i in worlds]
-            takes.append(Take(tiles, part, scenes, [f"{prefix}world {i}" for i in worlds]))
+            slots = program_slots(run, plan, law, worlds[0])
+            labels = [f"{prefix}world {i}" for i in worlds]
+            compare = partial(find_differences, run, law, worlds)
+            takes.append(Take(tiles, part, scenes, labels, slots, compare))
     return takes
 
 
@@ -249,24 +251,21 @@ def _frames(
 
 def _shots(take: Take, setting: Setting, interval: int) -> Iterator[tuple[bool, list[Shot]]]:
     """Yield whether all trials of a take have ended, and their tiles, at each interval."""
-    part = jax.device_put(take.part)
     ended = np.zeros(len(take.labels), bool)
-    loop = trial.ControlLoop(setting.physics, setting.rules, take.part.law)
-    trials = trial.start_all(part.worlds, part.params, ~ended, law=loop.law)
-    advance = pushes.recorder(part, trials, loop, steps=interval, stride=interval)
-    shots: list[Shot] = []
-    while True:
-        done, success, steps = jax.device_get((trials.done, trials.success, trials.steps))
-        trials, snapshots, _ = advance(trials)
-        moment = rows(jax.device_get(snapshots), 0)
+    period, shots = setting.physics.control_period, list[Shot]()
+    moments = pushes.watch(take.part, setting, interval=interval * period, slots=take.slots)
+    for trials, moment, outcomes in moments:
         contacts = np.asarray(trial.p_world_contact(moment))
-        states = map(_status, done, success, steps * setting.physics.control_period)
+        states = map(_status, trials.done, trials.success, trials.steps * period)
         texts = [f"{label}, {state}" for label, state in zip(take.labels, states, strict=True)]
         fresh = map(Shot, moment.qpos, contacts, texts)
         # An unchanged shot is not drawn again.
         shots = [shots[i] if ended[i] else shot for i, shot in enumerate(fresh)]
-        ended = done
-        yield bool(done.all()), shots
+        ended = trials.done
+        if ended.all():
+            take.compare(outcomes)
+        yield bool(ended.all()), shots
+    yield from itertools.repeat((True, shots))
 
 
 def _status(done: bool, success: bool, time: float) -> str:

@@ -27,9 +27,10 @@ from rps_jax.app.gate import HOST, Gate, accepts_update, check_guarded
 from rps_jax.control import registry
 from rps_jax.control.registry import LawLike
 from rps_jax.errors import InputError
+from rps_jax.record import files
 from rps_jax.record.options import option
-from rps_jax.runs.plan import Plan, build_batch, scene_of, world_title
-from rps_jax.runs.push import another_engine, case_options, select_law
+from rps_jax.runs.plan import Plan, build_batch, load_plan, scene_of, world_title
+from rps_jax.runs.push import case_options, end_in_words, program_slots, select_law
 from rps_jax.runs.question import Action, call_of
 from rps_jax.trials import pushes
 from rps_jax.trials.case import Case, label_of
@@ -87,7 +88,9 @@ class View(Action[None], Case):
 
     def note(self) -> str:
         """Whether another engine than the run's is shown."""
-        return "" if self.run is None else another_engine(Path(self.run))
+        if self.run is None or engines.get(load_plan(Path(self.run)).setting.engine).traced:
+            return ""
+        return "The viewer has no such engine as this run: this is the engine fused."
 
     def check(self) -> None:
         """Check the push, or the world."""
@@ -101,7 +104,11 @@ class View(Action[None], Case):
 
     def _chosen(self, run: str | Path) -> tuple[Plan, str]:
         """The plan and the law of a run that is shown."""
-        return select_law(Path(run), self.world, None if self.law is None else str(self.law))
+        plan, law = select_law(Path(run), self.world, None if self.law is None else str(self.law))
+        if not engines.get(plan.setting.engine).traced:
+            setting = dataclasses.replace(plan.setting, engine="fused")
+            plan = dataclasses.replace(plan, setting=setting)
+        return plan, law
 
     def execute(self, callback: ProgressCallback) -> None:
         """Serve the page until it is ended."""
@@ -109,7 +116,7 @@ class View(Action[None], Case):
         request = PushRequest(self.object, label_of(self.friction), law, self.target)
         first = partial(self.push_of, request)
         if self.run is not None:
-            first = partial(_in_world, *self._chosen(self.run), self.world)
+            first = partial(_in_world, Path(self.run), *self._chosen(self.run), self.world)
         page = open_page(self.port, request, self.push_of)
         print(f"page: {page.url} (Ctrl-C ends it)", flush=True)
         try:
@@ -143,10 +150,14 @@ class PushRequest(NamedTuple):
 Builder = Callable[[PushRequest], Push]
 
 
-def _in_world(plan: Plan, law: str, index: int) -> Push:
-    """A world of a sweep."""
-    live = Live(build_batch(plan, law, [index]), plan.setting)
-    return Push(live, scene_of(plan, index), f"{world_title(plan, index)}, {law}")
+def _in_world(run: Path, plan: Plan, law: str, index: int) -> Push:
+    """A world of a sweep, with its end there."""
+    slots, end = program_slots(run, plan, law, index), ""
+    if (run / "results.nc").exists():  # no shard
+        end = end_in_words(files.read_results(run).sel(law=law, world=index))
+        end = f"; in the sweep {end}"
+    live = Live(build_batch(plan, law, [index]), plan.setting, slots)
+    return Push(live, scene_of(plan, index), f"{world_title(plan, index)}, {law}{end}")
 
 
 # --- the page ------------------------------------------------------------------------------

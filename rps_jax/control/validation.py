@@ -44,7 +44,7 @@ _TRACER_ERRORS: dict[type[Exception], str] = {
 }
 
 
-def observation_shapes(senses: Senses) -> AnyObservation:
+def observation_shapes(senses: Senses, taxels: int = _TAXELS) -> AnyObservation:
     """Return the observation of a law as `jax.ShapeDtypeStruct` leaves."""
     dtype = jnp.result_type(float)
     shape: Callable[..., Any] = lambda *sizes: jax.ShapeDtypeStruct(sizes, dtype)  # noqa: E731
@@ -52,20 +52,23 @@ def observation_shapes(senses: Senses) -> AnyObservation:
     touch = Observation(shape(2), shape(), shape(2), flag, shape(2), shape())
     observations: dict[Senses, AnyObservation] = {
         "touch": touch,
-        "taxels": TaxelObservation(touch, shape(_TAXELS), flag),
+        "taxels": TaxelObservation(touch, shape(taxels), flag),
         "force": ForceObservation(touch, shape(2)),
         "pose": PoseObservation(touch, shape(2), shape()),
     }
     return observations[senses]
 
 
-def check_law(init: Function, step: Function, senses: Senses, params: LawParams) -> None:
-    """Raise InputError unless `init` and `step` return what a trial needs.
+def check_law(
+    init: Function, step: Function, senses: Senses, params: LawParams, taxels: int = _TAXELS
+) -> None:
+    """Raise InputError unless `init` and `step` return what a trial needs on a robot.
 
-    Laws of this package are not checked. A custom law is traced once for each form of its
-    parameters.
+    Laws of this package are not checked for the `taxels` of the paper's robot. A law is traced once
+    for each form of its parameters.
     """
-    if (getattr(_unwrap(step), "__module__", None) or "").startswith("rps_jax."):
+    module = getattr(_unwrap(step), "__module__", None) or ""
+    if taxels == _TAXELS and module.startswith("rps_jax."):
         return
     for name, value in named_leaves(params, is_leaf=lambda x: x is None).items():
         try:
@@ -76,18 +79,24 @@ def check_law(init: Function, step: Function, senses: Senses, params: LawParams)
             rule = "it must be a real number, or an array of these"
             raise not_allowed(f"params.{name}", repr(value), rule)
     leaves, tree = jax.tree.flatten(params)
-    _check_traced(init, step, senses, tree, tuple(np.shape(leaf) for leaf in leaves))
+    _check_traced(init, step, senses, tree, tuple(np.shape(leaf) for leaf in leaves), taxels)
 
 
 @functools.lru_cache(maxsize=256)
 def _check_traced(
-    init: Function, step: Function, senses: Senses, tree: Any, shapes: Sequence[tuple[int, ...]]
+    init: Function,
+    step: Function,
+    senses: Senses,
+    tree: Any,
+    shapes: Sequence[tuple[int, ...]],
+    taxels: int,
 ) -> None:
     """Trace both functions of a law, and compare their results with what a trial needs."""
     dtype = jnp.result_type(float)
     params = jax.tree.unflatten(tree, [jax.ShapeDtypeStruct(shape, dtype) for shape in shapes])
     state = _trace("init", init, params)
-    results: Any = _trace("step", step, params, state, observation_shapes(senses))
+    name = "step" if taxels == _TAXELS else f"step, for a robot with {taxels} taxels,"
+    results: Any = _trace(name, step, params, state, observation_shapes(senses, taxels))
 
     def check(fault: str, expected: str) -> None:
         if fault:

@@ -21,6 +21,7 @@ from typing import (
 )
 
 import jax
+import numpy as np
 
 from rps_jax import engines, errors
 from rps_jax.control.observation import Twist
@@ -93,6 +94,7 @@ class Engine(abc.ABC):
     modes: ClassVar[tuple[Mode, ...]] = ()  # supported modes of differentiation
     forces: ClassVar[bool] = True  # contact can slow and stop a base with a limited force
     computes_force: ClassVar[bool] = True  # it computes the force of a contact
+    weighs_feet: ClassVar[bool] = False  # it distributes the load by the weights of feet
     surroundings: ClassVar[tuple[str, ...]] = Surroundings._fields  # those that it supports
 
     def _refused(self, rule: str) -> errors.InputError:
@@ -114,6 +116,15 @@ class Engine(abc.ABC):
         """Raise InputError unless the engine can step the base of the robot."""
         if robot.driven and not self.forces:
             raise self._refused("a robot with a limited force needs fused, mjx or mujoco")
+
+    def check_feet(self, feet: np.ndarray | None) -> None:
+        """Raise InputError unless the engine uses the weights of feet (n, S, 3)."""
+        if feet is None or self.weighs_feet:
+            return
+        weights = feet[..., 2]
+        if np.any((weights > 0) & (weights != weights.max(axis=-1, keepdims=True))):
+            rule = "it ignores the weights of feet, which the object has"
+            raise self._refused(f"{rule}; choose quasistatic, or register feet without weights")
 
     def check_surroundings(self, surroundings: Surroundings) -> None:
         """Raise InputError unless the engine can step worlds with these surroundings."""

@@ -238,6 +238,7 @@ class QuasistaticEngine(Engine):
     cones = ("elliptic",)  # its friction is the same in all directions
     modes = ("forward", "reverse")
     forces = False
+    weighs_feet = True
     surroundings = ()
     computes_force = False  # only the direction of the force is known, not its size
 

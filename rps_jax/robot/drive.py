@@ -46,7 +46,7 @@ def aim(robot: Robot, previous: jax.Array, twist: jax.Array, period: float) -> j
         v_max = jnp.asarray(robot.v_max)
         speed = planar.norm(twist[:2]) if v_max.ndim == 0 else jnp.abs(twist[:2])
         shares = v_max / jnp.maximum(speed, 1e-9)  # the direction is kept
-        twist = twist.at[:2].multiply(jnp.minimum(1.0, jnp.min(shares)))
+        twist = twist.at[:2].set(twist[:2] * jnp.minimum(1.0, jnp.min(shares)))
     if robot.omega_max is not None:
         twist = twist.at[2].set(jnp.clip(twist[2], -robot.omega_max, robot.omega_max))
     if robot.lag is not None:

@@ -132,7 +132,7 @@ def run_on_cluster(
     `workers` threads, by default one, and claims as many processors, and with `gpus` a GPU if the
     cluster has any and the engine can use one.
     """
-    environment = devices.collect_environment()
+    environment = devices.collect_environment() | {"slots": slots}
     missing, finished = execution.missing_chunks(folder, plan, shard)
     if missing:
         provenance.write_environment(folder, environment)

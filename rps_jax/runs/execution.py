@@ -5,6 +5,7 @@ written as a whole when its last trial has ended, and named by the hash of its c
 chunk is not run again. At the end `results.nc` has all chunks.
 """
 
+import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
@@ -46,7 +47,8 @@ def run_missing(
     missing, finished = missing_chunks(folder, plan, shard)
     callback(Progress(finished, 0.0))
     if missing:
-        provenance.write_environment(folder, device.collect_environment())
+        slots = {"slots": size.get("slots")}  # on which the bits depend
+        provenance.write_environment(folder, device.collect_environment() | slots)
 
     def add_finished(progress: Progress) -> None:
         callback(replace(progress, finished=finished + progress.finished))
@@ -85,7 +87,11 @@ def run_plan(
         return label(results.dataset())
     open_run(folder, plan)
     with run_folder.lock(folder, shard.index, shard.count):
-        results = execute(folder, plan, shard=shard, **options) or Results(plan)
+        try:
+            results = execute(folder, plan, shard=shard, **options) or Results(plan)
+        except Exception:
+            _write_finished_laws(plan, folder)
+            raise
         if shard.count == 1:
             return write_dataset(results, [folder], folder, label)
         chunks = shard_chunks(plan, shard)
@@ -93,6 +99,17 @@ def run_plan(
         trials = np.unravel_index(np.concatenate(list(chunks.values())), results.shape)
         law, world = (xr.DataArray(index, dims="row") for index in trials)
         return results.dataset().isel(law=law, world=world)
+
+
+def _write_finished_laws(plan: Plan, folder: Path) -> None:
+    """Write the results of the laws of which no chunk is missing, and name them in a warning."""
+    results, laws = Results(plan), list(plan.laws)
+    missing = results.read(folder, list(plan.chunks))
+    failed = {laws[plan.chunks[chunk][0] // plan.worlds] for chunk in missing}
+    if finished := [law for law in laws if law not in failed]:
+        files.write_results(folder / "results.nc", results.dataset().sel(law=finished))
+        text = f"{folder / 'results.nc'} has the results of the laws that ran: "
+        warnings.warn(text + ", ".join(finished), stacklevel=2)
 
 
 def write_dataset(

@@ -106,6 +106,12 @@ class Plan:
             *map(np.shape, jax.tree.leaves(params)),
         )
 
+    def count_trials(self, law: str, world: int) -> int:
+        """Return the number of trials of the program that runs a law in a world."""
+        row, object_index = list(self.laws).index(law), int(self.object_of(np.asarray(world)))
+        key = self.program_key((row * len(self.domain.objects) + object_index) * self.max_chunks)
+        return sum(x.size for chunk, x in self.chunks.items() if self.program_key(chunk) == key)
+
     def configuration(self) -> dict[str, Any]:
         """Return everything that the results depend on, as JSON."""
         record = {

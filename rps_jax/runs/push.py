@@ -5,9 +5,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import functools
 import json
+import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -17,14 +19,15 @@ import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike
 
-from rps_jax import engines, errors
+from rps_jax import errors
 from rps_jax.analysis.report import Picture, Section
 from rps_jax.control import registry
 from rps_jax.control.base import Law, LawParams, Senses
 from rps_jax.control.observation import Twist
 from rps_jax.engines import device
+from rps_jax.errors import InputError
 from rps_jax.record import bag as bags
-from rps_jax.record import folder
+from rps_jax.record import files, folder, provenance
 from rps_jax.record.bag import Step
 from rps_jax.record.options import option
 from rps_jax.runs.plan import (
@@ -37,13 +40,13 @@ from rps_jax.runs.plan import (
 )
 from rps_jax.runs.question import Question, Run, SimulationQuestion, call_of
 from rps_jax.trials import pushes
-from rps_jax.trials.batch import WorldBatch, rows
+from rps_jax.trials.batch import WorldBatch, rows, slots_of
 from rps_jax.trials.case import Case, TrialOptions
 from rps_jax.trials.progress import Bar
 from rps_jax.trials.pushes import Trajectory
 from rps_jax.trials.results import trace_dataset
 from rps_jax.trials.setting import Setting
-from rps_jax.trials.trial import object_pose, p_world_contact
+from rps_jax.trials.trial import Outcome, object_pose, p_world_contact
 from rps_jax.world import paper, tasks
 from rps_jax.world.scene import Scene
 
@@ -52,7 +55,7 @@ if TYPE_CHECKING:
     from rps_jax.world.rendering import Tile
 
 
-_STILL = (640, 360)  # [px] width and height of one of several pictures side by side
+_STILL = (960, 540)  # [px] width and height of one of several pictures side by side
 FILM_LENGTH = 10.0  # [s] default, whatever the length of the trial
 
 
@@ -171,12 +174,15 @@ class TraceQuestion(Question[Trace]):
             bags.check()
             folder.ensure_writable(Path(self.bag).parent)
 
-    def record(self, world: WorldBatch, setting: Setting, run: Run) -> Trajectory:
+    def record(
+        self, world: WorldBatch, setting: Setting, run: Run, slots: int | None = None
+    ) -> Trajectory:
         """Run a world and record it, and write its bag if one is named."""
+        options: Any = {"slots": slots, "callback": run.callback}
         if self.bag is None:
-            return pushes.record_batch(world, setting, callback=run.callback)[0]
+            return pushes.record_batch(world, setting, **options)[0]
         period, law = setting.physics.control_period, recorded_law(world.law)
-        (fine,) = pushes.record_batch(world, setting, law, interval=period, callback=run.callback)
+        (fine,) = pushes.record_batch(world, setting, law, interval=period, **options)
         details, observations = tuple(fine.snapshots.details)  # of `recorded_law`
         fine = dataclasses.replace(fine, snapshots=fine.snapshots._replace(details=details))
         attrs = {"law": json.dumps(registry.params_to_json(fine.params)), "period": str(period)}
@@ -290,6 +296,9 @@ push = call_of(Push)
 class Replay(TraceQuestion):
     """Run one world of a sweep again; draw it as in the paper's Fig. 6 and film it.
 
+    On the device of the sweep the trial has the same bits. A warning names a trial that ends
+    otherwise elsewhere.
+
     Example:
       >>> import tempfile
       >>> import rps_jax
@@ -298,7 +307,7 @@ class Replay(TraceQuestion):
       >>> with tempfile.TemporaryDirectory() as run:
       ...     results = rps_jax.sweep("rps", drums, worlds=8, setting=setting, out=run)
       ...     trace = rps_jax.replay(run, 2)
-      >>> bool(trace.outcome.success) == bool(results.success.sel(law="rps", world=2))
+      >>> float(trace.outcome.time) == float(results.time.sel(law="rps", world=2))
       True
     """
 
@@ -329,12 +338,12 @@ class Replay(TraceQuestion):
         super().check()
         _ = self._chosen
 
-    def note(self) -> str:
-        return another_engine(Path(self.run))
-
     def answer(self, run: Run) -> Trace:
         plan, name = self._chosen
-        trajectory = self.record(build_batch(plan, name, [self.world]), plan.setting, run)
+        folder, batch = Path(self.run), build_batch(plan, name, [self.world])
+        slots = program_slots(folder, plan, name, self.world)
+        trajectory = self.record(batch, plan.setting, run, slots)
+        find_differences(folder, name, [self.world], rows(trajectory.outcome, None))
         scene, title = scene_of(plan, self.world), f"{world_title(plan, self.world)}, {name}"
         named = {"scene": scene, "title": title, "engine": plan.setting.engine}
         attrs = self.attributes() | attributes_of(plan)
@@ -351,9 +360,7 @@ def _evenly_spaced(length: int, count: int) -> list[int]:
 
 
 def select_law(run: Path, world: int, law: str | None = None) -> tuple[Plan, str]:
-    """Return the plan of a sweep for recording one of its worlds, and the label of the law.
-
-    The fused engine replaces an engine whose trials cannot be recorded.
+    """Return the plan of a sweep of which a world is recorded, and the label of the law.
 
     Raises:
       InputError: the folder holds no sweep, or not this world or law.
@@ -361,14 +368,41 @@ def select_law(run: Path, world: int, law: str | None = None) -> tuple[Plan, str
     plan = load_plan(run)
     name = errors.check_name("law of the run", law or next(iter(plan.laws)), plan.laws)
     errors.check_count("world", world, at_least=0, at_most=plan.worlds - 1)
-    if not engines.get(plan.setting.engine).traced:
-        plan = dataclasses.replace(plan, setting=dataclasses.replace(plan.setting, engine="fused"))
     return plan, name
 
 
-def another_engine(run: Path) -> str:
-    """Return a note if worlds of a sweep are recorded with another engine than the sweep's."""
-    engine = load_plan(run).setting.engine
-    if engines.get(engine).traced:
-        return ""
-    return f"Trials of the engine {engine} cannot be recorded: this is the engine fused."
+def program_slots(run: Path, plan: Plan, law: str, world: int) -> int:
+    """Return the number of slots of the program that ran a world of a sweep."""
+    stored: Any = None
+    with contextlib.suppress(InputError):  # a folder without a record has the default
+        stored = provenance.read_environment(run).get("slots")
+    return slots_of(plan.setting, stored, plan.count_trials(law, world))
+
+
+def find_differences(run: Path, law: str, worlds: Sequence[int], outcomes: Outcome) -> np.ndarray:
+    """Return whether trials (n,) end otherwise than in their sweep, and warn if one does."""
+    if not (run / "results.nc").exists():  # a shard
+        return np.zeros(len(worlds), bool)
+    ends = files.read_results(run)
+    if law not in ends.law:  # it has failed
+        return np.zeros(len(worlds), bool)
+    ends = ends.sel(law=law).isel(world=list(worlds))
+    pairs = [(ends[name].values, outcomes.columns()[name]) for name in _ENDS]
+    differ = np.any([stored != x.astype(stored.dtype) for stored, x in pairs], axis=0)
+    if differ.any():
+        end = ends.isel(world=int(differ.argmax()))
+        warnings.warn(
+            f"{differ.sum()} of {differ.size} trials end otherwise than in the sweep (world "
+            f"{int(end.world)}: target {end_in_words(end)} there): another device or version "
+            "rounds differently.",
+            stacklevel=2,
+        )
+    return differ
+
+
+_ENDS = "success", "time", "tipped", "diverged"  # outcomes that differ if a trial ends otherwise
+
+
+def end_in_words(trial: xr.Dataset) -> str:
+    """Return success and end of a trial."""
+    return f"{'reached' if trial.success else 'not reached'} at {float(trial.time):.1f} s"

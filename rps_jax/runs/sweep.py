@@ -213,8 +213,7 @@ class Sweep(SweepOptions, SweepQuestion):
             raise InputError("models is not allowed with ray or a shard: run it in one process.")
         if self.out is None and (self.ray or sharded):
             raise InputError("out = None is not allowed with ray or a shard: name a run folder.")
-        if not self.ray:
-            super().check()
+        super().check()
 
     def num_trials(self) -> int | None:
         """Return the number of trials of the shard, or on all models."""

@@ -6,7 +6,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import Any
 
+import jax
 import numpy as np
 import xarray as xr
 from scipy import stats
@@ -18,7 +20,7 @@ from rps_jax.analysis.report import Picture, Section
 from rps_jax.record import files
 from rps_jax.record.options import option
 from rps_jax.runs.plan import Plan, build_batch
-from rps_jax.runs.push import another_engine, select_law
+from rps_jax.runs.push import find_differences, program_slots, select_law
 from rps_jax.runs.question import Question, Run, call_of
 from rps_jax.trials import pushes
 from rps_jax.trials.progress import SequentialProgress
@@ -101,9 +103,6 @@ class Gallery(Question[xr.Dataset]):
     def check(self) -> None:
         select_law(Path(self.run), 0, self.law)
 
-    def note(self) -> str:
-        return another_engine(Path(self.run))
-
     def answer(self, run: Run) -> xr.Dataset:
         plan, law = self.plan_and_law
         trials = files.read_results(Path(self.run)).sel(law=law)
@@ -120,7 +119,7 @@ class Gallery(Question[xr.Dataset]):
         worlds = {mode: np.flatnonzero(kinds == mode) for mode in sorted({*kinds.tolist()} - {""})}
         all_plotted = [np.zeros(0, int), *(indices[: self.each] for indices in worlds.values())]
         progress = SequentialProgress(run.callback)
-        traces = _simulate(plan, law, np.concatenate(all_plotted), progress)
+        traces = _simulate(Path(self.run), plan, law, np.concatenate(all_plotted), progress)
         for mode, indices in worlds.items():
             plotted = {i: traces[i] for i in indices[: self.each].tolist()}
             title = f"{law}: {mode}, {len(plotted)} of {indices.size} in {size} worlds"
@@ -146,17 +145,24 @@ def _text(run: str | Path, law: str, trials: xr.Dataset, worlds: np.ndarray) -> 
 
 
 def _simulate(
-    plan: Plan, law: str, worlds: np.ndarray, progress: SequentialProgress
+    run: Path, plan: Plan, law: str, worlds: np.ndarray, progress: SequentialProgress
 ) -> Mapping[int, xr.Dataset]:
-    """Return traces of trials of a law over time, by world; one batch for each object."""
+    """Return traces of trials of a law over time, by world; one batch for each object.
+
+    The attribute `differs` says whether a trial ends otherwise than in the sweep.
+    """
     traces: dict[int, xr.Dataset] = {}
     objects = plan.object_of(worlds)
     for k in np.unique(objects):
         rows = worlds[objects == k]
-        batch = build_batch(plan, law, rows)
-        trajectories = pushes.record_batch(batch, plan.setting, interval=0.5, callback=progress)
+        batch, slots = build_batch(plan, law, rows), program_slots(run, plan, law, int(rows[0]))
+        options: Any = {"interval": 0.5, "slots": slots, "callback": progress}
+        trajectories = pushes.record_batch(batch, plan.setting, **options)
         progress.finish(rows.size)
-        traces |= dict(zip(rows.tolist(), map(trace_dataset, trajectories), strict=True))
+        ends = jax.tree.map(lambda *x: np.stack(x), *(x.outcome for x in trajectories))
+        differ = find_differences(run, law, rows.tolist(), ends)
+        for i, trajectory, differs in zip(rows.tolist(), trajectories, differ, strict=True):
+            traces[i] = trace_dataset(trajectory).assign_attrs(differs=bool(differs))
     return traces
 
 
@@ -164,7 +170,8 @@ def mechanism_table(traces: Mapping[int, xr.Dataset]) -> list[list[str]]:
     """Return a row for the trace of each world: its end, and the mechanisms measured in it."""
     rows = [["world", "end", "least distance", "path of the base", "measured"]]
     for world, trace in traces.items():
-        text = mechanisms.describe(trace)
+        text = "ends otherwise than in the sweep; " * trace.attrs.get("differs", False)
+        text += mechanisms.describe(trace)
         end, path = float(trace.outcome_time), float(trace.outcome_path_length)
         rows.append([str(world), f"{end:.0f} s", _miss(trace), f"{path:.1f} m", text or "-"])
     return rows

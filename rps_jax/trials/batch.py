@@ -49,7 +49,7 @@ from rps_jax.world.physics import Physics
 if TYPE_CHECKING:
     from jaxlib._jax import Device, pytree  # pyright rejects the aliases of both
 
-SEGMENT = 10.0  # [s] of simulated time in one call of a program; then slots are refilled
+_SEGMENT = 10.0  # [s] of simulated time in one call of a program; then slots are refilled
 _REPORT_STEPS = 500  # control steps between two reports of an engine outside of JAX
 _FIRST_TRIALS = 16384  # of a job on a GPU in the first segment, while more are built
 _TAIL_SLOTS = 8192  # of a job, on a GPU on which no trial waits
@@ -144,9 +144,12 @@ def run(
 
     Returns:
       The times of compilation and run, and the simulated time.
+
+    Raises:
+      Exception: the first one of a job, after all other jobs have ended.
     """
     engine, backend = engines.get(setting.engine), jax.default_backend()
-    slots = engine.slots(backend) if slots is None else slots
+    slots = slots_of(setting, slots)
     workers = engine.workers(backend) if workers is None else workers
     errors.check_count("slots", slots, at_most=10_000_000)
     errors.check_count("workers", workers, at_most=1024)
@@ -154,22 +157,29 @@ def run(
     tasks: list[Callable[[], object]]
     if not engine.traced:
         count = max(1, min(workers, len(jobs)))
-        tasks = [partial(_run_on_host, job, setting, workers // count, monitor) for job in jobs]
+        shared = setting, workers // count, monitor
+        tasks = [partial(monitor.isolate, partial(_run_on_host, job, *shared)) for job in jobs]
     else:
         devices = _devices()
-        groups = _schedule(
-            [*itertools.starmap(_TrialQueue, enumerate(jobs))], setting, slots, len(devices)
-        )
+        groups = _schedule([*itertools.starmap(_TrialQueue, enumerate(jobs))], setting, slots)
         compilations = [partial(x.compiled, d) for x in itertools.chain(*groups) for d in devices]
         monitor.programs = len(compilations)
         monitor.report()
         tasks = [partial(_work, groups, monitor, *x) for x in enumerate(devices * workers)]
         if backend != "cpu":  # idle processors: compile all programs at once, first used first
-            tasks += compilations
+            tasks += [partial(monitor.isolate, task) for task in compilations]
         count = len(tasks)
     _run_in_threads(tasks, count, monitor)
+    if monitor.failures:
+        raise monitor.failures[0]
     monitor.warn_of_nan_twists()
     return Timing(monitor.compile, monitor.elapsed - monitor.compile, monitor.simulated)
+
+
+def slots_of(setting: Setting, slots: int | None = None, trials: int | None = None) -> int:
+    """Return the number of slots of a program, or of the program of a job with so many trials."""
+    slots = engines.get(setting.engine).slots(jax.default_backend()) if slots is None else slots
+    return slots if trials is None else min(slots, -(-trials // len(_devices())))
 
 
 def rows(tree: Tree, index: Any) -> Tree:
@@ -197,6 +207,7 @@ class _Monitor:
         self.simulated = 0.0  # [s] summed over trials
         self.compile = 0.0  # [s] that the worker who waited longest had no program
         self.stop = False  # set when one worker fails or the user interrupts
+        self.failures: list[Exception] = []  # of jobs, as of a law that cannot be compiled
         self._start_time = time.perf_counter()
         self._finished = self._nan_twists = 0  # trials
         self._compiled: set[object] = set()
@@ -211,15 +222,28 @@ class _Monitor:
         return time.perf_counter() - self._start_time
 
     def add(self, *ended: _Ended, segment: Segment | None = None) -> None:
-        """Add the trials of some queues that ended in a segment."""
+        """Add the trials of some queues that ended in a segment; an error here ends the run."""
         with self._lock:
-            for indices, outcomes, simulated in ended:
-                if indices.size:
-                    self._collect(indices, outcomes)
-                self._finished += indices.size
-                self._nan_twists += int(np.count_nonzero(outcomes.nan_twist))
-                self.simulated += simulated
-            self.report(segment)
+            try:
+                for indices, outcomes, simulated in ended:
+                    if indices.size:
+                        self._collect(indices, outcomes)
+                    self._finished += indices.size
+                    self._nan_twists += int(np.count_nonzero(outcomes.nan_twist))
+                    self.simulated += simulated
+                self.report(segment)
+            except BaseException:
+                self.stop = True
+                raise
+
+    def isolate(self, task: Callable[[], object]) -> None:
+        """Run a task; store its error, so that the other jobs go on."""
+        try:
+            task()
+        except Exception as error:
+            if self.stop:
+                raise
+            self.failures.append(error)
 
     def warn_of_nan_twists(self) -> None:
         """Warn if a law returned a twist that is not finite."""
@@ -255,7 +279,7 @@ def _run_on_host(job: Job, setting: Setting, threads: int, monitor: _Monitor) ->
         loop = ControlLoop(setting.physics, setting.rules, batch.law)
         steps = host.run(batch.stage, *batch.inputs, loop, max(1, threads))
         reported, previous = np.zeros(batch.indices.size, bool), 0
-        for index, (trials, _) in enumerate(steps, 1):
+        for index, trials in enumerate(steps):
             done = np.asarray(trials.done)
             if index % _REPORT_STEPS and not done.all():
                 continue
@@ -309,9 +333,7 @@ class _TrialQueue:
         return batches
 
 
-def _schedule(
-    queues: Sequence[_TrialQueue], setting: Setting, slots: int, devices: int
-) -> list[list[_Program]]:
+def _schedule(queues: Sequence[_TrialQueue], setting: Setting, slots: int) -> list[list[_Program]]:
     """Return groups of programs for the same queues, the group with most trials first.
 
     The second program of a group has fewer slots than the first; many groups have only one.
@@ -325,7 +347,7 @@ def _schedule(
         for i in range(0, len(group), _MAX_SIDE_BY_SIDE):
             # The largest worlds, which take longest, start first.
             members = sorted(group[i : i + _MAX_SIDE_BY_SIDE], key=lambda x: -x.size)
-            widths = [min(slots, -(-queue.num_trials // devices)) for queue in members]
+            widths = [slots_of(setting, slots, queue.num_trials) for queue in members]
             sizes = dict.fromkeys([tuple(widths), tuple(min(n, tail or n) for n in widths)])
             schedule.append([_Program(members, size, setting) for size in sizes])
     return sorted(schedule, key=lambda x: -sum(queue.num_trials for queue in x[0].queues))
@@ -350,7 +372,8 @@ class _Program:
         inputs, trials = zip(*map(self.shapes, range(len(self.queues))), strict=True)
         masks = tuple(jax.ShapeDtypeStruct((n,), bool) for n in self.slots)
         stages, rules = jax.eval_shape(lambda: (self.stages, self.setting.rules))
-        leaves, structure = jax.tree.flatten((stages, inputs, trials, masks, masks, rules))
+        steps = jax.ShapeDtypeStruct((), np.int32)
+        leaves, structure = jax.tree.flatten((stages, inputs, trials, masks, masks, rules, steps))
         with self._locks[None]:  # one device traces for all
             traced = _trace_advance(self.setting.physics, self.law, structure, tuple(leaves))
         with self._locks[device]:
@@ -382,7 +405,7 @@ def _trace_advance(
     structure: pytree.PyTreeDef,
     leaves: tuple[jax.ShapeDtypeStruct, ...],
 ) -> Callable[[Device], _Advance]:
-    """Trace `trial.advance` by one segment for arguments of these shapes; cached."""
+    """Trace `trial.advance` for arguments of these shapes; cached."""
 
     def advance(
         stages: tuple[Any, ...],
@@ -391,11 +414,11 @@ def _trace_advance(
         fresh: tuple[jax.Array, ...],
         live: tuple[jax.Array, ...],
         rules: Rules,
+        steps: jax.Array,
     ) -> tuple[tuple[Trial, ...], tuple[_State, ...]]:
         pairs = zip(inputs, live, strict=True)
         started = [trial.start_all(*leaves, mask, law=law) for leaves, mask in pairs]
         current = tuple(map(jax.vmap(soft.tree_where), fresh, started, trials))
-        steps = max(1, round(SEGMENT / physics.control_period))
         loop = ControlLoop(physics, rules, law)
         batches = zip(stages, inputs, current, strict=True)
         advanced = trial.advance([(stage, *x, state) for stage, x, state in batches], loop, steps)
@@ -406,8 +429,7 @@ def _trace_advance(
         )
 
     arguments = jax.tree.unflatten(structure, leaves)
-    static = (physics, SEGMENT)
-    return programs.trace_function(advance, arguments, law=law, donate=2, static=static)
+    return programs.trace_function(advance, arguments, law=law, donate=2, static=(physics,))
 
 
 class _Slots:
@@ -488,9 +510,14 @@ def _work(
     """Run groups of programs on a device until no trial waits or runs; `index` of the worker."""
     first = index % max(1, len(groups))
     for group in (*groups[first:], *groups[:first]):
-        running: list[_Running | None] = [None] * len(group[0].queues)
-        for program, limits in itertools.zip_longest(group, [x.slots for x in group[1:]]):
-            running = [*_run(program, limits, running, device, monitor)]
+        monitor.isolate(partial(_run_group, group, device, monitor))
+
+
+def _run_group(group: Sequence[_Program], device: Device, monitor: _Monitor) -> None:
+    """Run a group of programs on a device until no trial waits or runs."""
+    running: list[_Running | None] = [None] * len(group[0].queues)
+    for program, limits in itertools.zip_longest(group, [x.slots for x in group[1:]]):
+        running = [*_run(program, limits, running, device, monitor)]
 
 
 def _run(
@@ -506,6 +533,7 @@ def _run(
     start_time = monitor.elapsed
     advance = program.compiled(device)
     stages, rules = jax.device_put((program.stages, program.setting.rules), device)
+    steps = np.int32(max(1, round(_SEGMENT / program.setting.physics.control_period)))
     monitor.add_compile_time((program, device), monitor.elapsed - start_time)
     end, unread = 0.0, deque[tuple[float, list[int], tuple[_State, ...]]]()
     delay = 0 if _tail_slots() is None else 1  # segments that run while the host reads another
@@ -516,7 +544,7 @@ def _run(
             if not monitor.stop and any(map(operator.gt, counts, limits or [0] * len(queues))):
                 arguments = zip(*(slots.arguments() for slots in queues), strict=True)
                 start_time = monitor.elapsed
-                advanced, states = advance(stages, *arguments, rules)
+                advanced, states = advance(stages, *arguments, rules, steps)
                 for slots, trials in zip(queues, advanced, strict=True):
                     slots.trials = trials
                 unread.append((start_time, counts, states))
@@ -535,3 +563,36 @@ def _run(
                 slots.fill()
         report.result()
     return [] if limits is None else [slots.remove() for slots in queues]
+
+
+# --- trials on demand ----------------------------------------------------------------------
+
+
+def stepper(
+    worlds: WorldBatch, setting: Setting, slots: int
+) -> Callable[[Inputs, Trial | None, int], tuple[Trial, Outcome]]:
+    """Return a function that steps trials on demand, with the bits of `run` with so many slots.
+
+    It runs the same program. Its arguments are worlds and law parameters (n, ...) of the shapes of
+    `worlds`, their trials (None: they start) and a number of control steps. It returns the trials
+    and their outcomes so far, on the host.
+    """
+    slots = min(slots, _tail_slots() or slots)  # trials end in the smaller program
+    program = _Program([_TrialQueue(0, Job(None, slots, [worlds]))], [slots], setting)
+    blank = jax.tree.map(lambda x: np.zeros(x.shape, x.dtype), program.shapes(0)[1])
+    advance, fresh = program.compiled(_devices()[0]), np.ones(slots, bool)
+
+    def step(inputs: Inputs, trials: Trial | None, steps: int) -> tuple[Trial, Outcome]:
+        count, results = len(inputs[0].qpos), []
+        for first in range(0, count, slots):
+            index = np.arange(first, first + slots)
+            live, index = index < count, np.minimum(index, count - 1)
+            state = blank if trials is None else rows(trials, index)
+            state = state._replace(done=state.done | ~live)
+            arguments = (rows(inputs, index),), (state,), (fresh & (trials is None),), (live,)
+            advanced, states = advance(program.stages, *arguments, setting.rules, np.int32(steps))
+            result = jax.tree.map(np.asarray, (advanced[0], states[0].outcome))
+            results.append(rows(result, slice(count - first)))
+        return jax.tree.map(lambda *leaves: np.concatenate(leaves), *results)
+
+    return step

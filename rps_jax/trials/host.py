@@ -14,7 +14,7 @@ from rps_jax.control.base import LawParams
 from rps_jax.engines.base import Driven, Motion
 from rps_jax.engines.mujoco import Batch
 from rps_jax.trials import trial
-from rps_jax.trials.trial import ControlLoop, Snapshot, Trial, World
+from rps_jax.trials.trial import ControlLoop, Trial, World
 from rps_jax.world.opengl import mujoco
 
 _decide = jax.jit(jax.vmap(trial.decide, (0, 0, 0, None)))
@@ -27,8 +27,8 @@ def run(
     params: LawParams,
     loop: ControlLoop,
     threads: int,
-) -> Iterator[tuple[Trial, Snapshot]]:
-    """Run a batch of worlds to their ends; yield trials and snapshots of each control step.
+) -> Iterator[Trial]:
+    """Run a batch of worlds to their ends; yield trials at the start and after each control step.
 
     Args:
       models: of the worlds, the stage of the engine.
@@ -41,9 +41,10 @@ def run(
     trials = trial.start_all(worlds, params, np.ones(len(worlds.qpos), bool), law=loop.law)
     dtype, robot = trials.qpos.dtype, trial.pushing(worlds)
     start = np.asarray(trials.qpos, float)
+    yield trials
     with contextlib.closing(Batch(models, start, threads, robot, **worlds.fields)) as batch:
         while not np.asarray(trials.done).all():
-            decided, twist, snapshot = _decide(worlds, params, trials, loop)
+            decided, twist, _ = _decide(worlds, params, trials, loop)
             qpos = np.asarray(decided.qpos)
             running = np.flatnonzero(~np.asarray(decided.done))
             # Only a scripted shift moves the object outside of the engine.
@@ -56,4 +57,4 @@ def run(
             motion = jax.tree.map(lambda x: x.astype(dtype), state)
             force = batch.force.astype(dtype) if loop.law.senses == "force" else None
             trials = _settle(worlds, trials, decided, Driven(motion, force=force))
-            yield trials, snapshot
+            yield trials

@@ -2,8 +2,8 @@
 
 import math
 import time
-from collections.abc import Callable, Hashable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Hashable, Iterator, Sequence
+from dataclasses import dataclass
 from functools import partial
 from typing import Any, NamedTuple, Unpack
 
@@ -14,11 +14,11 @@ import numpy as np
 from rps_jax import engines, errors
 from rps_jax.control.base import Law, LawParams
 from rps_jax.control.laws.rps import RPSParams
-from rps_jax.engines import device, programs
+from rps_jax.engines import device
 from rps_jax.geometry import solid
 from rps_jax.robot.base import Odometry
 from rps_jax.trials import host, trial, worlds
-from rps_jax.trials.batch import SEGMENT, BatchOptions, Job, WorldBatch, rows
+from rps_jax.trials.batch import BatchOptions, Job, WorldBatch, rows, stepper
 from rps_jax.trials.case import Case
 from rps_jax.trials.progress import Progress, ProgressCallback, Timing, no_progress
 from rps_jax.trials.rollout import outcomes
@@ -172,81 +172,67 @@ def run(
 def record_batch(
     worlds: WorldBatch,
     setting: Setting,
-    law: Law | None = None,  # None: that of the law parameters
+    law: Law | None = None,  # whose details the snapshots have; None: that of the law parameters
     *,
     interval: float = 0.1,
+    slots: int | None = None,
     callback: ProgressCallback = no_progress,
 ) -> list[Trajectory]:
-    """Run trials of one stage to their ends, with a snapshot every `interval` [s]."""
-    loop = ControlLoop(setting.physics, setting.rules, law or worlds.law)
-    stride = max(1, round(interval / setting.physics.control_period))
-    record = _record if engines.get(setting.engine).traced else _record_on_host
-    snapshots, outcomes = record(worlds, loop, stride, callback)
-    fields = outcomes, *worlds.inputs
+    """Run trials of one stage as `watch` does, with a snapshot every `interval` [s]."""
+    period, start_time, compile_time = setting.physics.control_period, time.perf_counter(), None
+    moments = list[tuple[Snapshot, Outcome]]()
+    for trials, *moment in watch(worlds, setting, law, interval=interval, slots=slots):
+        compile_time = compile_time or time.perf_counter() - start_time  # of the first snapshot
+        moments.append((moment[0], moment[1]))
+        simulated = float(trials.steps.sum()) * period
+        callback(Progress(int(trials.done.sum()), simulated, compile_time))
+    columns = jax.tree.map(lambda *leaves: np.stack(leaves), *(x for x, _ in moments))
+    fields = moments[-1][1], *worlds.inputs
     return [  # with snapshots until the end of each trial
-        Trajectory(rows(snapshots, (~snapshots.done[:, i], i)), *rows(fields, i))
+        Trajectory(rows(columns, (~columns.done[:, i], i)), *rows(fields, i))
         for i in range(worlds.indices.size)
     ]
 
 
-def _record(
-    worlds: WorldBatch, loop: ControlLoop, stride: int, callback: ProgressCallback
-) -> tuple[Snapshot, Outcome]:
-    """Run trials; return snapshots (T, B, ...) after every `stride` control steps and outcomes."""
-    period = loop.physics.control_period
-    steps = stride * max(1, round(SEGMENT / (stride * period)))
-    worlds = jax.device_put(worlds)
-    trials = trial.start_all(*worlds.inputs, np.ones(worlds.indices.size, bool), law=loop.law)
-    start_time = time.perf_counter()
-    record = recorder(worlds, trials, loop, steps=steps, stride=stride)
-    compile_time, segments = time.perf_counter() - start_time, []
-    while True:
-        trials, snapshots, outcomes = record(trials)
-        results = trials.done, trials.steps, snapshots, outcomes
-        done, steps_done, snapshots, outcomes = jax.device_get(results)
-        segments.append(snapshots)
-        callback(Progress(int(done.sum()), float(steps_done.sum()) * period, compile_time))
-        if done.all():
-            return jax.tree.map(lambda *arrays: np.concatenate(arrays), *segments), outcomes
+def watch(
+    worlds: WorldBatch,
+    setting: Setting,
+    law: Law | None = None,
+    *,
+    interval: float,
+    slots: int | None = None,
+) -> Iterator[tuple[Trial, Snapshot, Outcome]]:
+    """Run trials of one stage; yield them every `interval` [s], with snapshots and outcomes so far.
 
-
-def _record_on_host(
-    worlds: WorldBatch, loop: ControlLoop, stride: int, callback: ProgressCallback
-) -> tuple[Snapshot, Outcome]:
-    """Run trials with an engine outside of JAX, as `_record` does with other engines."""
-    period, start_time, compile_time = loop.physics.control_period, time.perf_counter(), 0.0
-    threads = 1 if worlds.indices.size == 1 else device.count_processors()
-    steps = host.run(worlds.stage, *worlds.inputs, loop, threads)
-    snapshots, trials = list[Snapshot](), None
-    for step, (trials, snapshot) in enumerate(steps):
-        compile_time = compile_time or time.perf_counter() - start_time  # of the first step
-        if step % stride == 0:
-            snapshots.append(jax.device_get(snapshot))
-            finished, total = int(np.sum(trials.done)), float(np.sum(trials.steps)) * period
-            callback(Progress(finished, total, compile_time))
-    assert trials is not None
-    outcomes = jax.device_get(trial.outcome(trials, period))
-    return jax.tree.map(lambda *leaves: np.stack(leaves), *snapshots), outcomes
-
-
-def recorder(
-    worlds: WorldBatch, trials: Trial, loop: ControlLoop, *, steps: int, stride: int
-) -> Callable[[Trial], tuple[Trial, Snapshot, Outcome]]:
-    """Compile `trial.record` for a batch, or load it from the cache.
-
-    The function returns trials after `steps` control steps, snapshots, and the outcomes so far.
+    The first are at the start, and the last when all have ended. Trials have the bits of a run in
+    programs with so many slots; by default one for each trial.
     """
+    loop = ControlLoop(setting.physics, setting.rules, law or worlds.law)
+    stride = max(1, round(interval / setting.physics.control_period))
+    for trials, outcome in _states(worlds, setting, stride, slots or worlds.indices.size):
+        snapshots = _snapshots(*worlds.inputs, trials, loop)
+        yield trials, jax.tree.map(np.asarray, snapshots), outcome
 
-    def record(*arguments: Any) -> tuple[Trial, Snapshot, Outcome]:
-        *state, rules = arguments
-        last, snapshots = trial.record(
-            *state, replace(loop, rules=rules), steps=steps, stride=stride
-        )
-        return last, snapshots, trial.outcome(last, loop.physics.control_period)
 
-    fixed = worlds.stage, *worlds.inputs
-    arguments = *fixed, trials, loop.rules
-    static = (loop.physics, steps, stride)
-    traced = programs.trace_function(record, arguments, law=loop.law, donate=3, static=static)
-    program = traced(None)
-    return lambda trials: program(*fixed, trials, loop.rules)
+# Snapshots are computed outside of the program that steps trials, whose bits they leave alone.
+_snapshots = jax.jit(jax.vmap(lambda *inputs: trial.decide(*inputs)[2], (0, 0, 0, None)))
+
+
+def _states(
+    worlds: WorldBatch, setting: Setting, stride: int, slots: int
+) -> Iterator[tuple[Trial, Outcome]]:
+    """Yield trials and their outcomes at the start, after every `stride` steps and at the end."""
+    if not engines.get(setting.engine).traced:
+        threads = 1 if worlds.indices.size == 1 else device.count_processors()
+        loop = ControlLoop(setting.physics, setting.rules, worlds.law)
+        for step, trials in enumerate(host.run(worlds.stage, *worlds.inputs, loop, threads)):
+            if step % stride == 0 or trials.done.all():
+                outcomes = trial.outcome(trials, setting.physics.control_period)
+                yield jax.device_get((trials, outcomes))
+        return
+    advance = stepper(worlds, setting, slots)
+    state = advance(worlds.inputs, None, 0)
+    yield state
+    while not state[0].done.all():
+        state = advance(worlds.inputs, state[0], stride)
+        yield state

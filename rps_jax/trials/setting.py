@@ -9,6 +9,7 @@ from typing import Any, Literal, get_args
 from rps_jax import engines, errors
 from rps_jax.control import registry
 from rps_jax.control.base import LawParams
+from rps_jax.control.validation import check_law
 from rps_jax.engines import EngineName
 from rps_jax.record import options
 from rps_jax.robot.robot import Robot
@@ -98,7 +99,10 @@ class Setting:
         engine = engines.get(self.engine)
         engine.check_robot(robot)
         for params in laws:
-            engine.check_senses(registry.law_of(params).senses)
+            law = registry.law_of(params)
+            engine.check_senses(law.senses)
+            if law.senses == "taxels":
+                check_law(law.init, law.step, law.senses, params, robot.shell.count)
 
     def check_domain(self, domain: Domain, laws: Iterable[LawParams] = ()) -> None:
         """Raise InputError unless the engine can step the worlds of a domain with these laws."""

@@ -8,6 +8,7 @@ live.shove((0.0, 0.2))
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -19,11 +20,11 @@ from rps_jax.control.base import LawParams
 from rps_jax.geometry.footprint import Footprint
 from rps_jax.robot.skin import CapacitiveSkin, Skin
 from rps_jax.trials import trial
-from rps_jax.trials.batch import WorldBatch, rows
+from rps_jax.trials.batch import WorldBatch, rows, stepper
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import ControlLoop, Outcome, Shift, Snapshot, Trial, World
 
-CHUNK = 25  # steps, at most, that one call of the compiled program takes
+CHUNK = 25  # steps, at most, between two checks of the clock
 
 
 class Moment(NamedTuple):
@@ -46,9 +47,11 @@ class Live:
       InputError: an engine that JAX does not trace.
     """
 
-    def __init__(self, part: WorldBatch, setting: Setting) -> None:
+    def __init__(self, part: WorldBatch, setting: Setting, slots: int = 1) -> None:
+        """Start the first of some worlds, with the bits of a run with so many slots."""
         engines.get(setting.engine).check_traced()
-        self._stage, self._loop = part.stage, ControlLoop(setting.physics, setting.rules, part.law)
+        self._loop = ControlLoop(setting.physics, setting.rules, part.law)
+        self._advance = stepper(part, setting, slots)
         self._first: World = rows(part.worlds, slice(1))
         self._params = rows(part.params, slice(1))
         self.past: list[Moment] = []
@@ -86,18 +89,22 @@ class Live:
     def reset(self) -> None:
         """Return to the start, with the first target."""
         self._worlds = self._first
-        started = trial.start_all(self._worlds, self._params, np.ones(1, bool), law=self._loop.law)
-        self._trial: Trial = jax.device_get(started)
+        self._trial: Trial = self._advance((self._worlds, self._params), None, 0)[0]
         self.past.clear()
 
     def step(self, count: int = 1) -> None:
         """Run up to `count` control steps; fewer if the trial ends."""
         while count > 0 and not self.done:
-            chunk = min(count, CHUNK)
-            steps = _steps(self._stage, self._worlds, self._params, self._trial, chunk, self._loop)
-            self._trial, (trials, *records) = jax.device_get(steps)
-            ran = chunk - int(trials.done[:chunk].sum())  # the rest came after the end
-            self.past += [Moment(self._worlds, *rows((trials, *records), i)) for i in range(ran)]
+            inputs, trials = (self._worlds, self._params), list[Trial]()
+            while len(trials) < min(count, CHUNK) and not self.done:
+                trials.append(self._trial)
+                self._trial = self._advance(inputs, self._trial, 1)[0]
+            # As many rows in each call: one program.
+            padded = [*trials, *[trials[-1]] * (CHUNK - len(trials))]
+            stacked = jax.tree.map(lambda *leaves: np.concatenate(leaves), *padded)
+            records = jax.device_get(_observe(*rows(inputs, 0), stacked, self._loop))
+            pairs = enumerate(trials)
+            self.past += [Moment(self._worlds, rows(x, 0), *rows(records, i)) for i, x in pairs]
             # Reset: the clock of an ended trial stands still, and would repeat the shift.
             self._worlds = self._worlds._replace(shift=self._first.shift)
             count -= CHUNK
@@ -143,29 +150,14 @@ class Live:
 
 
 @jax.jit
-def _steps(
-    stage: Any, worlds: World, params: LawParams, trials: Trial, count: int, loop: ControlLoop
-) -> tuple[Trial, tuple[Trial, Snapshot, jax.Array, jax.Array]]:
-    """Run up to CHUNK control steps of a world (1, ...).
-
-    Returns the trial, and for each step, as rows (CHUNK, ...), the trial before it, the snapshot,
-    the contact point and the compression.
-    """
-
-    def step(trials: Trial) -> tuple[Trial, tuple[Trial, Snapshot, jax.Array, jax.Array]]:
-        stepped, snapshot = trial.control_step(stage, worlds, params, trials, loop)
-        outlines = jax.vmap(trial.outline)(worlds, snapshot.qpos)
-        compression = jax.vmap(_compression)(worlds.skin, outlines)
-        contact = trial.p_world_contact(snapshot)
-        return stepped, rows((trials, snapshot, contact, compression), 0)
-
-    def body(i: jax.Array, carry: tuple[Trial, Any]) -> tuple[Trial, Any]:
-        stepped, record = step(carry[0])
-        return stepped, jax.tree.map(lambda values, x: values.at[i].set(x), carry[1], record)
-
-    shapes = jax.eval_shape(step, trials)[1]
-    blank = jax.tree.map(lambda x: jnp.zeros((CHUNK, *x.shape), x.dtype), shapes)
-    return jax.lax.fori_loop(0, count, body, (trials, blank))
+@partial(jax.vmap, in_axes=(None, None, 0, None))
+def _observe(
+    world: World, params: LawParams, trials: Trial, loop: ControlLoop
+) -> tuple[Snapshot, jax.Array, jax.Array]:
+    """Return snapshot, contact point and compression of a world in several states."""
+    snapshot = trial.decide(world, params, trials, loop)[2]
+    contact = trial.p_world_contact(rows(snapshot, None))[0]
+    return snapshot, contact, _compression(world.skin, trial.outline(world, snapshot.qpos))
 
 
 def _compression(skin: Skin, outline: Footprint) -> jax.Array:

@@ -2,7 +2,7 @@
 
 A control step is `decide` (sense, judge, run the law), then the engine's physics steps, then
 `settle`. `decide` and `settle` are pure functions of one world; the engine steps the batch between
-them. `advance` runs many control steps, and `record` also returns snapshots. The state of a trial
+them. `advance` runs many control steps, and `unroll` also returns snapshots. The state of a trial
 that has ended stays as it is, and a batch stops when all its trials have ended.
 """
 
@@ -496,23 +496,28 @@ def start_all(
     return trials._replace(done=~live)
 
 
-_MAX_UNCHECKED = 20  # control steps on a GPU before the host checks whether any trial runs
+_UNCHECKED = 20  # control steps on a GPU before the host checks whether any trial runs
 
 
 # Stage, worlds, law parameters and trials of a batch, with leaves (n, ...).
 Batch = tuple[Stage, World, LawParams, Trial]
 
 
-def advance(batches: Sequence[Batch], loop: ControlLoop, steps: int) -> tuple[Trial, ...]:
+def advance(
+    batches: Sequence[Batch], loop: ControlLoop, steps: int | jax.Array
+) -> tuple[Trial, ...]:
     """Run up to `steps` control steps of batches side by side; fewer if all trials end.
 
-    Every batch has its own stage and shape family.
+    Every batch has its own stage and shape family. The number of steps is no part of the program,
+    so that the same program runs a whole trial and stops wherever a trial is recorded.
     """
     stages = [stage for stage, *_ in batches]
     if not (all(getattr(stage, "native", False) for stage in stages) and native.is_available()):
         return _advance_in_xla(batches, loop, steps)
 
-    def single(stage: Stage, world: World, params: LawParams, trial: Trial, rules: Any) -> Trial:
+    def single(
+        stage: Stage, world: World, params: LawParams, trial: Trial, rules: Any, steps: jax.Array
+    ) -> Trial:
         """Advance one world."""
         world_loop = dataclasses.replace(loop, rules=rules)
 
@@ -523,62 +528,46 @@ def advance(batches: Sequence[Batch], loop: ControlLoop, steps: int) -> tuple[Tr
 
         return jax.lax.while_loop(lambda c: (c[0] < steps) & ~c[1].done, step, (0, trial))[1]
 
-    def in_xla(*inputs: Any) -> tuple[Trial, ...]:  # (worlds, params, trials, rules) of each
+    def in_xla(*inputs: Any) -> tuple[Trial, ...]:  # (worlds, params, trials, rules, steps) of each
         """Advance all batches where the native compiler is not used."""
-        shared = dataclasses.replace(loop, rules=jax.tree.map(lambda x: x[0], inputs[0][-1]))
-        pairs = zip(stages, inputs, strict=True)
-        return _advance_in_xla([(stage, *values[:-1]) for stage, values in pairs], shared, steps)
+        rules, steps = jax.tree.map(lambda x: x[0], inputs[0][-2:])
+        shared, pairs = dataclasses.replace(loop, rules=rules), zip(stages, inputs, strict=True)
+        return _advance_in_xla([(stage, *values[:-2]) for stage, values in pairs], shared, steps)
 
-    def phase(world: World, params: LawParams, trial: Trial, rules: Any) -> jax.Array:
+    def phase(world: World, params: LawParams, trial: Trial, *_: Any) -> jax.Array:
         """Return 0 for trials that push, 1 for those before the first touch, above for ended."""
         return 2 * trial.done + (trial.contact_steps == 0)
 
     inputs = []
     for _, *values, trials in batches:
         rules = jax.tree.map(lambda x, n=trials.done.size: jnp.full(n, x, float), loop.rules)
-        inputs.append((*values, trials, rules))
+        inputs.append((*values, trials, rules, jnp.full(trials.done.size, steps, jnp.int32)))
     singles = [partial(single, stage) for stage in stages]
     return tuple(native.concurrent(singles, in_xla, phase)(*inputs))
 
 
-def _advance_in_xla(batches: Sequence[Batch], loop: ControlLoop, steps: int) -> tuple[Trial, ...]:
+def _advance_in_xla(
+    batches: Sequence[Batch], loop: ControlLoop, steps: int | jax.Array
+) -> tuple[Trial, ...]:
     """Run `advance` as a program of XLA."""
 
     def any_runs(carry):
         count, trials = carry
         return (count < steps) & ~jnp.all(jnp.stack([jnp.all(batch.done) for batch in trials]))
 
-    def step(_, trials):
-        pairs = zip(batches, trials, strict=True)
-        return tuple(control_step(*batch[:-1], current, loop)[0] for batch, current in pairs)
+    def single(stage, worlds, params, trials, count):
+        is_over = trials.done | (count >= steps)  # in unchecked steps
+        stepped, _ = control_step(stage, worlds, params, trials._replace(done=is_over), loop)
+        return stepped._replace(done=jnp.where(is_over, trials.done, stepped.done))
 
-    # A GPU waits for the host at every check whether any trial runs.
-    unchecked = 1 if jax.default_backend() == "cpu" else math.gcd(steps, _MAX_UNCHECKED)
+    def step(_, carry):
+        count, trials = carry
+        pairs = zip(batches, trials, strict=True)
+        return count + 1, tuple(single(*batch[:-1], current, count) for batch, current in pairs)
 
     def body(carry):
-        count, trials = carry
-        if unchecked > 1:
-            return count + unchecked, jax.lax.fori_loop(0, unchecked, step, trials)
-        return count + 1, step(0, trials)
+        # A GPU waits for the host at every check whether any trial runs.
+        on_cpu = jax.default_backend() == "cpu"
+        return step(0, carry) if on_cpu else jax.lax.fori_loop(0, _UNCHECKED, step, carry)
 
     return jax.lax.while_loop(any_runs, body, (0, tuple(batch[-1] for batch in batches)))[1]
-
-
-@partial(jax.jit, static_argnames=("steps", "stride"), donate_argnames="trials")
-def record(
-    stage: Stage,
-    worlds: World,
-    params: LawParams,
-    trials: Trial,
-    loop: ControlLoop,
-    *,
-    steps: int,
-    stride: int = 1,
-) -> tuple[Trial, Snapshot]:
-    """Run `steps` control steps of a batch; return also snapshots (steps // stride, B, ...)."""
-
-    def interval(trials, _):
-        trials, snapshots = unroll(stage, worlds, params, trials, loop, stride)
-        return trials, jax.tree.map(lambda x: x[0], snapshots)
-
-    return jax.lax.scan(interval, trials, length=steps // stride)

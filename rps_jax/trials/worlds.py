@@ -35,6 +35,7 @@ def build(indices: np.ndarray, inputs: WorldInputs, setting: Setting, **fields: 
     """
     engine, dtype = engines.get(setting.engine), jnp.result_type(float)
     engine.check_robot(inputs.robots)
+    engine.check_feet(inputs.solids.feet)
     added = getattr(fields.get("task"), "surroundings", None) or {}
     inputs = inputs._replace(surroundings=inputs.surroundings._replace(**added))
     engine.check_surroundings(inputs.surroundings)

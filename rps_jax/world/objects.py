@@ -152,8 +152,8 @@ def register_object(
         It reaches from that geom to the convex hull of all geoms, within 2 %.
       feet: positions (S, 2) [m] of 3 to 8 points on which it stands, in the body's frame, or with
         weights (S, 3) [m, m, 1], as of springs; by default its corners or its rim. Only the engine
-        quasistatic uses weights: the others compute the load of each foot from the tilt of the
-        object, on ground of uniform stiffness.
+        quasistatic accepts different weights: the others compute the load of each foot from the
+        tilt of the object, on ground of uniform stiffness.
 
     Raises:
       InputError: the name is one of the paper's, or file, footprint or feet are invalid.

@@ -48,7 +48,7 @@ _OPENING = threading.Lock()
 # An image is drawn so many times as fine along either side, and averaged: smoother than the four
 # samples of a pixel that OpenGL would take, and without a GPU in less time.
 _FINER = 2
-_SHADOWS_FROM = 240  # [px] height of an image: they take most of the time without a GPU
+_SHADOWS_FROM = 480  # [px] height of an image: they take most of the time without a GPU
 
 _FIX_GL = (
     "MuJoCo cannot draw on this machine: install Mesa's EGL library (`apt install libegl1 "

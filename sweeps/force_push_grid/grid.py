@@ -43,7 +43,7 @@ from rps_jax.trials import trial
 from rps_jax.trials.batch import WorldBatch
 from rps_jax.trials.progress import Progress, ProgressCallback, no_progress
 from rps_jax.trials.setting import Setting
-from rps_jax.trials.trial import ControlLoop, Rules, Shift
+from rps_jax.trials.trial import ControlLoop, Rules, Shift, Snapshot, Trial
 from rps_jax.trials.worlds import build
 from rps_jax.world.physics import Physics
 from rps_jax.world.scene import JOINTS, Friction, WorldInputs
@@ -230,6 +230,18 @@ def worlds(slider: SliderName, grid: Cells, engine: EngineName) -> WorldBatch:
     return built.with_params(PARAMS)
 
 
+@jax.jit
+def _record(*state: Any) -> tuple[Trial, Snapshot]:
+    """Run `_SEGMENT` control steps of a batch; return also a snapshot of every `_LOOK` steps."""
+    *inputs, trials, loop = state
+
+    def interval(trials: Trial, _: None) -> tuple[Trial, Snapshot]:
+        trials, snapshots = trial.unroll(*inputs, trials, loop, _LOOK)
+        return trials, jax.tree.map(lambda x: x[0], snapshots)
+
+    return jax.lax.scan(interval, trials, length=_SEGMENT // _LOOK)
+
+
 def run_grid(
     name: LawName,
     slider: SliderName,
@@ -268,7 +280,7 @@ def run_grid(
     apart, steps, start_time, waited = np.zeros(count), 0, time.perf_counter(), 0.0
     while steps * period < horizon:
         inputs = batch.stage, *batch.inputs, trials, loop
-        trials, snapshots = trial.record(*inputs, steps=_SEGMENT, stride=_LOOK)
+        trials, snapshots = _record(*inputs)
         away = np.asarray(snapshots.qpos[..., 3:5] - snapshots.qpos[..., :2])
         errors += list(np.asarray(away_from(line, snapshots.qpos[..., :2])))
         apart = np.maximum(apart, np.hypot(*np.moveaxis(away, -1, 0)).max(axis=0))
