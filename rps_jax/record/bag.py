@@ -280,7 +280,7 @@ def read(path: str | Path, topics: TopicsLike = ()) -> dict[str, np.ndarray]:
       InputError: the path is no bag; the bag is damaged or too large, or lacks a topic; or its
         messages have no order, numbers that are not finite, an unknown frame, or no rotation.
 
-    Example:
+    Examples:
       >>> import tempfile
       >>> import rps_jax
       >>> from rps_jax.record import bag

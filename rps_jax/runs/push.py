@@ -246,7 +246,7 @@ def case_options(
 class Push(Case, TraceQuestion, SimulationQuestion[Trace]):
     """Run one trial; draw the paper's Fig. 6 and film it.
 
-    Example:
+    Examples:
       >>> import rps_jax
       >>> brief = rps_jax.Setting("quasistatic", rules=rps_jax.Rules(horizon=3.0))
       >>> trace = rps_jax.push("cylinder", target=(1.0, 0.5), setting=brief)
@@ -285,7 +285,7 @@ push = call_of(Push)
 class Replay(TraceQuestion):
     """Run one world of a sweep again; draw it as in the paper's Fig. 6 and film it.
 
-    Example:
+    Examples:
       >>> import tempfile
       >>> import rps_jax
       >>> drums, rules = rps_jax.Domain(("random_cylinder",)), rps_jax.Rules(horizon=2.0)

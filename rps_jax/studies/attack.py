@@ -73,7 +73,7 @@ class Attack(DomainQuestion[xr.Dataset], LawQuestion[xr.Dataset]):
     generation it has `failing` cells, and the sums `trials` and `simulated` [s]. Attributes hold
     the same sums of drawn worlds.
 
-    Example:
+    Examples:
       >>> import rps_jax
       >>> drums, rules = rps_jax.Domain(("random_cylinder",)), rps_jax.Rules(horizon=1.0)
       >>> small = {"cells": 2, "batch": 8, "generations": 1, "drawn": 8}

@@ -69,7 +69,7 @@ class Gallery(Question[xr.Dataset]):
     The result has, by world, the failure mode `kind`, empty for a success, beside the outcomes and
     the drawn quantities.
 
-    Example:
+    Examples:
       >>> import tempfile
       >>> import rps_jax
       >>> drums, rules = rps_jax.Domain(("random_cylinder",)), rps_jax.Rules(horizon=2.0)

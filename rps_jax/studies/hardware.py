@@ -51,7 +51,7 @@ class Hardware(LawQuestion[xr.Dataset]):
     `counted` (object, shift, side, target). For Fig. 7 it has `base_path` and `contact_path`
     (object, target, path_time, axis) [m] at the middle of the friction range, NaN after the end.
 
-    Example:
+    Examples:
       >>> import rps_jax
       >>> brief = rps_jax.Setting("quasistatic", rules=rps_jax.Rules(horizon=2.0))
       >>> results = rps_jax.hardware(shifts=(0.1,), setting=brief)

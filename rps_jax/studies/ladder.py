@@ -79,7 +79,7 @@ class Ladder(SweepOptions, TaskOption, MultiLawQuestion[xr.Dataset | xr.DataTree
     coordinates the drawn quantities (world) and `senses` (law). The result for several domains is
     a tree with one such dataset for each domain.
 
-    Example:
+    Examples:
       >>> import rps_jax
       >>> drums, rules = rps_jax.Domain(("random_cylinder",)), rps_jax.Rules(horizon=2.0)
       >>> setting = rps_jax.Setting("quasistatic", rules=rules)
@@ -211,7 +211,7 @@ class Score(Ladder, _ScoredLaw):
     The worlds depend only on domain, number and seed, so scores of several people compare. The
     report has one line for a Markdown table. The result is that of `rps_jax.ladder`.
 
-    Example:
+    Examples:
       >>> import rps_jax
       >>> drums, rules = rps_jax.Domain(("random_cylinder",)), rps_jax.Rules(horizon=2.0)
       >>> setting = rps_jax.Setting("quasistatic", rules=rules)

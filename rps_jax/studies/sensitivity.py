@@ -55,7 +55,7 @@ class Sensitivity(PlanQuestion, DomainQuestion[xr.Dataset], LawQuestion[xr.Datas
     `total_reach` of their intervals of 95 % (output, factor), the outcomes (world), and the points
     `u` (world, quantity).
 
-    Example:
+    Examples:
       >>> import rps_jax
       >>> drums, rules = rps_jax.Domain(("random_cylinder",)), rps_jax.Rules(horizon=1.0)
       >>> setting = rps_jax.Setting("quasistatic", rules=rules)

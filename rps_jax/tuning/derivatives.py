@@ -117,7 +117,7 @@ def value_and_grad(
     Raises:
       InputError: an argument is not allowed; the engine or a quantity has no derivatives.
 
-    Example:
+    Examples:
       >>> import rps_jax
       >>> def final_distance(trajectory):  # [m]
       ...     return trajectory.details.distance[-1]

@@ -122,7 +122,7 @@ class Fit(LawQuestion[Fitted], DomainQuestion[Fitted], LogsQuestion):
     `undetermined`, correlations, and the probability of each of the domain's objects. Its `domain`
     is the fitted domain, which `rps fit` writes as fitted.json.
 
-    Example:
+    Examples:
       >>> import rps_jax
       >>> brief = rps_jax.Setting(rules=rps_jax.Rules(horizon=6.0))
       >>> trace = rps_jax.push("box", target=(2.0, 0.5), setting=brief)  # doctest: +SKIP

@@ -74,7 +74,7 @@ class Learn(PPO, TaskOption, SimulationQuestion[xr.Dataset]):
     attributes. Its attributes `compile` and `run` [s] split the wall clock, and `test_success` [1]
     is the success rate of the learned law in test worlds.
 
-    Example:
+    Examples:
       >>> import rps_jax
       >>> small = {"network": "mlp", "width": 4, "num_envs": 4, "num_steps": 2}
       >>> small |= {"num_minibatches": 1, "drawn": 4, "validation": 2}
