@@ -125,9 +125,11 @@ class Fit(LawQuestion[Fitted], DomainQuestion[Fitted], LogsQuestion):
     Examples:
       >>> import rps_jax
       >>> brief = rps_jax.Setting(rules=rps_jax.Rules(horizon=6.0))
-      >>> trace = rps_jax.push("box", target=(2.0, 0.5), setting=brief)  # doctest: +SKIP
-      >>> fitted = rps_jax.fit(trace, "wide", law="rps", quick=True)  # doctest: +SKIP
-      >>> rps_jax.sweep("rps", fitted.domain)  # doctest: +SKIP
+      >>> trace = rps_jax.push("box", target=(2.0, 0.5), setting=brief)
+      >>> fitted = rps_jax.fit(trace, "wide", law="rps", quick=True)
+      >>> fitted.data.sample.dims
+      ('draw', 'quantity')
+      >>> results = rps_jax.sweep("rps", fitted.domain, worlds=4, setting=brief)
     """
 
     TITLE: ClassVar[str] = "A domain fitted to logs"
