@@ -361,7 +361,7 @@ def on_page_content(html: str, page: Any, config: Any, files: Any) -> str:
 
 
 def on_post_build(config: Any) -> None:
-    """Raise an error for dead links and for loads from other hosts."""
+    """Raise an error for dead links, loads from other hosts, and examples that are not code."""
     if sentences := faults(Path(config.site_dir)):
         raise PluginError("\n".join(sentences))
 
@@ -371,11 +371,13 @@ LEADS = re.compile(r"\b(?:src|href)=\"?([^\s\">]+)")
 
 
 def faults(site: Path) -> list[str]:
-    """Return sentences about loads from other hosts and dead links in the pages of a site."""
+    """Return sentences about loads from other hosts, dead links and broken examples of a site."""
     sentences = []
     for path in sorted(site.rglob("*.html")):
         text, page = path.read_text("utf-8"), path.relative_to(site)
         text = re.sub(r"<(script|pre)\b([^>]*)>.*?</\1>", r"<\1\2>", text, flags=re.DOTALL)
+        if re.search(r"(<blockquote>\s*){3}", text):  # the prompt `>>>` as three quotes
+            sentences.append(f"{page} has an example that is not code: head it `Examples:`")
         loads = [url for url in LOADS.findall(text) if re.match(r"(https?:)?//", url)]
         sentences += [f"{page} loads {url} from another host" for url in loads]
         for link in LEADS.findall(text):

@@ -156,7 +156,7 @@ def test_the_figure_shows_the_influential_quantities_and_names_the_rest(drawn):
     assert len(titles) == 2
     assert titles[0].startswith("spread 49.6 %, q = ")  # 1/4 (1 - 7/399), as a deviation
     assert not any("chance" in title for title in titles)
-    title = " ".join(figure.get_suptitle().split())
+    title = " ".join(figure.legends[0].get_title().get_text().split())
     assert "2 of 8 drawn quantities" in title
     assert title.endswith(": yaw of the object, mass of the object")
     text = figure.get_supxlabel().replace("\N{NO-BREAK SPACE}", " ")

@@ -149,9 +149,9 @@ def test_a_finished_trial_is_labelled_and_not_drawn_again(tmp_path):
     (take,) = film.of_sweep(tmp_path, plan, ["rps"], "first", (1, 2))
     ((ended, first), *_, (_, previous), (over, last)) = islice(film._shots(take, setting, 50), 20)
     assert not ended
-    assert [shot.label for shot in first] == ["world 0, 0 s", "world 1, 0 s"]
+    assert [shot.label for shot in first] == ["world 0\n0 s", "world 1\n0 s"]
     assert not over
-    assert last[0].label.startswith("world 0, reached at ")
+    assert last[0].label.startswith("world 0\nreached at ")
     assert last[0] is previous[0]
     assert last[1] is not previous[1]
 

@@ -1,5 +1,6 @@
 """The library as a user calls it: labelled data, the same as on the command line."""
 
+import ast
 import doctest
 import inspect
 import pkgutil
@@ -7,10 +8,11 @@ import pkgutil
 import numpy as np
 import pytest
 import xarray as xr
-from helpers import PAPER, SLOTS, addresses, decode, rps
+from helpers import PAPER, ROOT, SLOTS, addresses, decode, rps
 
 import rps_jax
 from rps_jax.errors import InputError
+from rps_jax.geometry.footprint import polygon
 from rps_jax.record import files
 from rps_jax.runs.sweep import merge
 
@@ -162,6 +164,7 @@ API = {name: pkgutil.resolve_name(f"{module}.{name}") for module, name in addres
 API |= {
     name: getattr(rps_jax, name) for name in rps_jax.__all__
 }  # such as `paper`, before a module
+API["polygon"] = polygon
 PUBLIC = [name for name, entry in API.items() if callable(entry)]
 OPTIONS = doctest.ELLIPSIS | doctest.IGNORE_EXCEPTION_DETAIL
 
@@ -177,9 +180,23 @@ def test_every_public_function_has_an_example():
     assert [name for name in functions if not examples(name)] == []
 
 
+def test_every_example_of_the_package_is_run():
+    docstrings = [
+        ast.get_docstring(node) or ""
+        for path in (ROOT / "rps_jax").rglob("*.py")
+        for node in ast.walk(ast.parse(path.read_text("utf-8")))
+        if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef)
+    ]
+    parse = doctest.DocTestParser().get_examples
+    lines = {x.source for text in docstrings for x in parse(text)}
+    run = [x for name in PUBLIC for test in examples(name) for x in test.examples]
+    assert lines == {x.source for x in run}
+    assert not any(doctest.SKIP in x.options for x in run)
+
+
 # Questions whose small runs take longest; other tests run them, too.
 LONG = {"hardware", "learn", "ladder", "regress", "ceiling", "score", "attack", "replay"}
-LONG |= {"value_and_grad", "gallery"}
+LONG |= {"value_and_grad", "gallery", "fit", "paper"}
 
 
 def mark_long(name):

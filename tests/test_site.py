@@ -1,5 +1,6 @@
 """The site: tabs of all pages, links, equations, and reports of errors."""
 
+import ast
 import functools
 import http.server
 import os
@@ -153,6 +154,37 @@ def test_dead_links_and_loads_from_other_hosts_are_reported(tmp_path):
         "b.html has a dead link to gone.html",
         "x.css loads //example.org/y.png from another host",
     ]
+
+
+def test_an_example_that_is_not_code_is_an_error(tmp_path):
+    page = tmp_path / "a.html"
+    page.write_text("<blockquote>\n<blockquote>\n<blockquote>\n<p>import rps_jax</p>")
+    [sentence] = HOOKS["faults"](tmp_path)
+    assert sentence == "a.html has an example that is not code: head it `Examples:`"
+    page.write_text("<pre><code>&gt;&gt;&gt; import rps_jax</code></pre><blockquote>A</blockquote>")
+    assert HOOKS["faults"](tmp_path) == []
+
+
+def test_every_example_of_a_docstring_is_a_section_of_code():
+    """As mkdocstrings parses it; other headings make quotes of its prompts."""
+    griffe = pytest.importorskip("griffe", reason="the extra docs is not installed")
+    docstrings = [
+        ast.get_docstring(node) or ""
+        for path in (ROOT / "rps_jax").rglob("*.py")
+        for node in ast.walk(ast.parse(path.read_text("utf-8")))
+        if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef)
+    ]
+    examples = [text for text in docstrings if ">>>" in text]
+    assert len(examples) > 30
+    for text in examples:
+        sections = griffe.Docstring(text).parse("google", warnings=False)
+        prose = [str(x.value) for x in sections if x.kind.value != "examples"]
+        assert ">>>" not in "".join(prose), text
+
+
+def test_the_extra_of_the_site_has_the_formatter_of_its_signatures():
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    assert any(x.startswith("ruff") for x in project["optional-dependencies"]["docs"])
 
 
 class Quiet(http.server.SimpleHTTPRequestHandler):

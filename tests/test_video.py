@@ -6,6 +6,7 @@ import os
 import re
 import subprocess
 import sys
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -239,3 +240,17 @@ def test_rendering_works_without_a_display_after_importing_mujoco(monkeypatch):
         monkeypatch.delenv(name, raising=False)
     code = "import mujoco; from rps_jax.world import video; print(video.check())"
     assert python(code).stdout == "{'rendering': '', 'ffmpeg': ''}\n"
+
+
+@pytest.mark.parametrize("size", [(960, 540), (320, 180), (160, 90)])
+def test_the_label_of_a_tile_is_large_and_inside_of_it(size):
+    """Also the longest names of a film of six laws, in its tiles of 320 by 180 pixels."""
+    blank = np.full((size[1], size[0], 3), 200, np.uint8)
+    renderer = SimpleNamespace(draw=lambda *_: blank)
+    shot = video.Shot((), (), "force_push_published, world 12\nreached at 104 s")
+    image = video._labelled(renderer, shot)
+    letters = (image > 220).all(axis=2)[2:-2, 2:-2]
+    assert letters.any()
+    assert not letters[:, -3:].any()
+    plate = (image[2:-2, 2:-2] < 150).all(axis=2).any(axis=1).sum()  # [px] height of both lines
+    assert plate >= min(36, size[1] / 5)

@@ -44,7 +44,7 @@ def measured(trace: xr.Dataset) -> dict[str, str]:
     Returns:
       Names and measures; empty if no measure reaches its threshold.
 
-    Example:
+    Examples:
       >>> import rps_jax
       >>> from rps_jax.analysis import mechanisms
       >>> brief = rps_jax.Setting("quasistatic", rules=rps_jax.Rules(horizon=30.0))

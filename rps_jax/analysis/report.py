@@ -15,6 +15,7 @@ from rps_jax.record import files
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+_DPI = 300  # of a PNG file, for a paper; the page shows it at half of this
 _STYLE = Path(__file__).with_suffix(".css").read_text("utf-8")
 
 
@@ -27,7 +28,7 @@ class Picture(NamedTuple):
     def png(self) -> bytes:
         """Return the PNG file; equal figures have equal files."""
         file = io.BytesIO()
-        self.draw().savefig(file, dpi=150, metadata={"Software": None})
+        self.draw().savefig(file, dpi=_DPI, metadata={"Software": None})
         return file.getvalue()
 
     _repr_png_ = png  # for Jupyter
@@ -38,13 +39,13 @@ class Section(NamedTuple):
 
     title: str
     text: str = ""  # Markdown
-    table: Sequence[Sequence[str]] = ()  # header and rows
+    table: Sequence[Sequence[str]] = ()  # header and rows; without rows the report says "None."
     picture: Picture | None = None
     film: Path | None = None  # MP4 in the folder of the report
 
     def _repr_markdown_(self) -> str:
         """Return heading, text and table as Markdown, also for Jupyter."""
-        table = tables.markdown(self.table) if self.table else ""
+        table = tables.markdown(self.table) if len(self.table) > 1 else "None." * len(self.table)
         return "\n\n".join(filter(None, (f"## {self.title}", self.text, table)))
 
 
@@ -70,7 +71,8 @@ def write_report(folder: Path, title: str, intro: str, sections: Sequence[Sectio
     body = markdown.markdown(text, extensions=["tables"])
     for name, (kind, content) in media.items():
         data = base64.b64encode(content).decode()
-        body = body.replace(f'src="{name}"', f'src="data:{kind};base64,{data}"')
+        width = f'width="{int.from_bytes(content[16:20]) // 2}" ' if kind == "image/png" else ""
+        body = body.replace(f'src="{name}"', f'{width}src="data:{kind};base64,{data}"')
     page = (
         '<!doctype html><html lang="en"><meta charset="utf-8">'
         '<meta name="viewport" content="width=device-width, initial-scale=1">'

@@ -257,7 +257,7 @@ def _shots(take: Take, setting: Setting, interval: int) -> Iterator[tuple[bool, 
     for trials, moment, outcomes in moments:
         contacts = np.asarray(trial.p_world_contact(moment))
         states = map(_status, trials.done, trials.success, trials.steps * period)
-        texts = [f"{label}, {state}" for label, state in zip(take.labels, states, strict=True)]
+        texts = [f"{label}\n{state}" for label, state in zip(take.labels, states, strict=True)]
         fresh = map(Shot, moment.qpos, contacts, texts)
         # An unchanged shot is not drawn again.
         shots = [shots[i] if ended[i] else shot for i, shot in enumerate(fresh)]

@@ -87,6 +87,15 @@ def named_leaves(tree: object, is_leaf: Callable[[object], bool] | None = None) 
     return {jax.tree_util.keystr(path, simple=True, separator="."): leaf for path, leaf in leaves}
 
 
+def unit_of_leaf(params: object, path: str) -> str:
+    """Return the unit in the comment of a parameter; empty if it has none."""
+    *owners, name = path.split(".")
+    for owner in owners:
+        params = getattr(params, owner, None)
+    doc = getattr(getattr(type(params), name, None), "__doc__", None) or ""
+    return "".join(re.findall(r"^\[([^\]]*)\]", doc))
+
+
 def check_finite_leaves(tree: T) -> T:
     """Return the pytree if all its leaves are finite numbers; otherwise raise InputError."""
     for name, leaf in named_leaves(tree).items():

@@ -136,7 +136,7 @@ def register_law(name: str, law: Law, params: LawParams) -> None:
       InputError: the name is a law of this package, the parameters are not as described, or their
         class belongs to another law.
 
-    Example:
+    Examples:
       >>> from typing import NamedTuple
       >>> from rps_jax import Details, Law, Twist, register_law
       >>> class Ahead(NamedTuple):

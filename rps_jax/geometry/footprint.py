@@ -41,7 +41,7 @@ def polygon(vertices: ArrayLike) -> Footprint:
     Raises:
       InputError: the vertices are not finite, not convex or not counter-clockwise.
 
-    Example:
+    Examples:
       >>> from rps_jax.geometry.footprint import polygon
       >>> polygon([(0.2, 0.0), (-0.1, 0.2), (-0.1, -0.2)]).vertices.shape
       (3, 2)

@@ -287,7 +287,7 @@ def read(
       InputError: the path is no bag; the bag is damaged or too large, or lacks a topic; or its
         messages have no order, numbers that are not finite, an unknown frame, or no rotation.
 
-    Example:
+    Examples:
       >>> import tempfile
       >>> import rps_jax
       >>> from rps_jax.record import bag

@@ -36,7 +36,7 @@ def use_cache(folder: str | Path | None = None) -> Path | None:
     Returns:
       The folder, or None if it cannot be written: a run needs no cache.
 
-    Example:
+    Examples:
       >>> import rps_jax
       >>> folder = rps_jax.use_cache("programs")
       >>> folder.name

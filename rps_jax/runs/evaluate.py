@@ -81,7 +81,7 @@ def evaluate(
     Raises:
       InputError: an argument is not allowed.
 
-    Example:
+    Examples:
       >>> import numpy as np
       >>> import rps_jax
       >>> drums, rules = rps_jax.Domain(("random_cylinder",)), rps_jax.Rules(horizon=2.0)
@@ -142,7 +142,7 @@ def stack(laws: Sequence[LawLike]) -> LawParams:
     Raises:
       InputError: there is none, or they are of different classes or shapes.
 
-    Example:
+    Examples:
       >>> import rps_jax
       >>> rps_jax.stack(["rps", "rps,K_h=0.3"]).K_h.tolist()
       [1.0, 0.3]

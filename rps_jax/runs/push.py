@@ -257,7 +257,7 @@ def case_options(
 class Push(Case, TraceQuestion, SimulationQuestion[Trace]):
     """Run one trial; draw the paper's Fig. 6 and film it.
 
-    Example:
+    Examples:
       >>> import rps_jax
       >>> brief = rps_jax.Setting("quasistatic", rules=rps_jax.Rules(horizon=3.0))
       >>> trace = rps_jax.push("cylinder", target=(1.0, 0.5), setting=brief)
@@ -299,7 +299,7 @@ class Replay(TraceQuestion):
     On the device of the sweep the trial has the same bits. A warning names a trial that ends
     otherwise elsewhere.
 
-    Example:
+    Examples:
       >>> import tempfile
       >>> import rps_jax
       >>> drums, rules = rps_jax.Domain(("random_cylinder",)), rps_jax.Rules(horizon=2.0)

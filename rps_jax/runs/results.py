@@ -245,7 +245,7 @@ def load(run: str | Path) -> xr.Dataset:
     Raises:
       InputError: the folder holds no results, or its file is damaged.
 
-    Example:
+    Examples:
       >>> import tempfile
       >>> import rps_jax
       >>> drums, rules = rps_jax.Domain(("random_cylinder",)), rps_jax.Rules(horizon=2.0)

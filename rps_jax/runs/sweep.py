@@ -172,7 +172,7 @@ class SweepOptions:
 class Sweep(SweepOptions, SweepQuestion):
     """Run every law in the same random worlds; the run can be killed and continued.
 
-    Example:
+    Examples:
       >>> import rps_jax
       >>> setting = rps_jax.Setting("quasistatic", rules=rps_jax.Rules(horizon=2.0))
       >>> laws = ("rps", "rps,v_max=0.03")

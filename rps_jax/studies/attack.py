@@ -24,10 +24,12 @@ from scipy import stats
 from rps_jax import errors
 from rps_jax.analysis import statistics, tables
 from rps_jax.analysis.figures.style import (
+    WIDTH,
     Figure,
     ScalarMappable,
     TwoSlopeNorm,
     axis_label,
+    styled,
     tiles,
     words,
 )
@@ -67,7 +69,7 @@ class Attack(DomainQuestion[xr.Dataset], LawQuestion[xr.Dataset]):
     generation it has `failing` cells, and the sums `trials` and `simulated` [s]. Attributes hold
     the same sums of drawn worlds.
 
-    Example:
+    Examples:
       >>> import rps_jax
       >>> drums, rules = rps_jax.Domain(("random_cylinder",)), rps_jax.Rules(horizon=1.0)
       >>> small = {"cells": 2, "batch": 8, "generations": 1, "drawn": 8}
@@ -393,13 +395,16 @@ def yields(results: xr.Dataset) -> dict[str, float]:
 # --- figures -------------------------------------------------------------------------------
 
 
+@styled
 def archive_figure(results: xr.Dataset, quantities: Sequence[str]) -> Figure:
     """Draw the margin of failures: a row for each object, a column for each pair of quantities.
 
     A cell shows the severest trial over the third quantity; a dot marks a failure.
     """
     pairs, objects = list(combinations(quantities, 2)), results.object.values.tolist()
-    figure, axes = tiles(len(objects) * len(pairs), len(pairs), (3.4, 2.7), (1.5, 1.2))
+    figure, axes = tiles(
+        len(objects) * len(pairs), len(pairs), (WIDTH / 3 - 0.25, 2.1), (0.75, 0.3)
+    )
     norm = TwoSlopeNorm(0, -1, max(0.3, float(np.nanquantile(results.margin, 0.98))))
     for row, name in enumerate(objects):
         for ax, (x, y) in zip(axes[row], pairs, strict=True):
@@ -411,11 +416,11 @@ def archive_figure(results: xr.Dataset, quantities: Sequence[str]) -> Figure:
             for axis, label in ((ax.xaxis, x), (ax.yaxis, y)):
                 values = results[label].values
                 ticks = np.linspace(0, values.size - 1, 4).round().astype(int)
-                axis.set_ticks(ticks, [f"{values[i]:.2g}" for i in ticks], fontsize=7)
-                axis.set_label_text(axis_label(label, results[label].attrs["units"]), fontsize=8)
+                axis.set_ticks(ticks, [f"{values[i]:.2g}" for i in ticks])
+                axis.set_label_text(axis_label(label, results[label].attrs["units"]))
             ax.set_facecolor("0.9")
-            ax.set_title(words(name), fontsize=9)
+            ax.set_title(words(name))
     colours, label = ScalarMappable(norm, "RdBu_r"), "margin: severity - 1 [1; m beyond 0]"
     figure.colorbar(colours, ax=axes, label=label, shrink=0.7)
-    figure.suptitle("severest trial of each cell", fontsize=10)
+    figure.suptitle("severest trial of each cell; a dot marks a failure")
     return figure

@@ -50,7 +50,7 @@ class Ceiling(DomainQuestion[xr.Dataset]):
     [1], `alone` [1] (solved by the law without a plan), `time` [s] of the best plan, `rounds` and
     `trials` of the search, and the best plan, `offsets` (world, knot, axis) [1].
 
-    Example:
+    Examples:
       >>> import rps_jax
       >>> drums, rules = rps_jax.Domain(("random_cylinder",)), rps_jax.Rules(horizon=2.0)
       >>> small = {"sample": 2, "samples": 4, "rounds": 1}

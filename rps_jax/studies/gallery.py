@@ -11,11 +11,12 @@ from typing import Any
 import jax
 import numpy as np
 import xarray as xr
+from matplotlib.artist import setp
 from scipy import stats
 
 from rps_jax.analysis import mechanisms, statistics
 from rps_jax.analysis.figures.paper import draw_path
-from rps_jax.analysis.figures.style import Figure, tiles
+from rps_jax.analysis.figures.style import WIDTH, Figure, styled, tiles
 from rps_jax.analysis.report import Picture, Section
 from rps_jax.record import files
 from rps_jax.record.options import option
@@ -27,8 +28,7 @@ from rps_jax.trials.progress import SequentialProgress
 from rps_jax.trials.results import trace_dataset
 from rps_jax.world.domain import LABELS
 
-_COLUMNS = 6  # of maps, at most
-_WIDTH = 7.2  # [in] of the maps side by side, at least
+_COLUMNS = 4  # of maps, at most
 _PASSED = 0.8  # [1] share of a path before which its end is not near
 NEAR = 0.2  # [m] least distance below which a timeout is near the target
 
@@ -72,7 +72,7 @@ class Gallery(Question[xr.Dataset]):
     The result has, by world, the failure mode `kind`, empty for a success, beside the outcomes and
     the drawn quantities.
 
-    Example:
+    Examples:
       >>> import tempfile
       >>> import rps_jax
       >>> drums, rules = rps_jax.Domain(("random_cylinder",)), rps_jax.Rules(horizon=2.0)
@@ -183,21 +183,19 @@ def _miss(trace: xr.Dataset) -> str:
     return f"{distance:.2f} m left" if np.isfinite(distance) else "untouched"
 
 
+@styled
 def maps_figure(traces: Mapping[int, xr.Dataset], title: str) -> Figure:
     """Draw a map of the trial of each world."""
     columns = min(_COLUMNS, len(traces))
-    width = max(2.3, _WIDTH / columns)
-    figure, axes = tiles(len(traces), columns, (width, width + 0.1), (0.4, 0.9))
+    width = WIDTH / max(2, columns)
+    figure, axes = tiles(len(traces), columns, (width, width + 0.1), (0, 0.8))
     for ax, (world, trace) in zip(axes.ravel(), traces.items(), strict=False):
         draw_path(ax, trace, snapshots=2)
-        ax.tick_params(labelsize=6)
-        ax.set_title(f"world {world}, {_miss(trace)}", fontsize=7)
-    for ax in axes[-1]:
-        ax.set_xlabel("x [m]", fontsize=7)
-    for ax in axes[:, 0]:
-        ax.set_ylabel("y [m]", fontsize=7)
+        ax.set_title(f"world {world}, {_miss(trace)}")
+    setp(axes[-1].tolist(), xlabel="x [m]")
+    setp(axes[:, 0].tolist(), ylabel="y [m]")
     handles, names = axes[0, 0].get_legend_handles_labels()
-    figure.legend(handles, names, fontsize=8, loc="outside lower center", ncols=len(names))
-    characters = int(12 * figure.get_figwidth())
-    figure.suptitle(textwrap.fill(title, characters, break_on_hyphens=False), fontsize=10)
+    figure.legend(handles, names, loc="outside lower center", ncols=3 * min(2, columns))
+    characters = int(15 * figure.get_figwidth())
+    figure.suptitle(textwrap.fill(title, characters, break_on_hyphens=False))
     return figure

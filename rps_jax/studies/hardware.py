@@ -14,7 +14,7 @@ import numpy as np
 import xarray as xr
 
 from rps_jax.analysis import tables
-from rps_jax.analysis.figures.style import Figure, base_patch, tiles, words
+from rps_jax.analysis.figures.style import WIDTH, Figure, base_patch, styled, tiles, words
 from rps_jax.analysis.report import Picture, Section
 from rps_jax.control.registry import LawLike
 from rps_jax.record.options import option
@@ -51,7 +51,7 @@ class Hardware(LawQuestion[xr.Dataset]):
     `counted` (object, shift, side, target). For Fig. 7 it has `base_path` and `contact_path`
     (object, target, path_time, axis) [m] at the middle of the friction range, NaN after the end.
 
-    Example:
+    Examples:
       >>> import rps_jax
       >>> brief = rps_jax.Setting("quasistatic", rules=rps_jax.Rules(horizon=2.0))
       >>> results = rps_jax.hardware(shifts=(0.1,), setting=brief)
@@ -214,14 +214,15 @@ def table(results: xr.Dataset) -> list[list[str]]:
     return rows
 
 
+@styled
 def numbers_figure(results: xr.Dataset) -> Figure:
     """Draw the mean D and time of each object under each friction, and the paper's."""
-    figure, axes = tiles(len(_MEANS), len(_MEANS), (5, 2.2), (0, 0.4))
+    figure, axes = tiles(len(_MEANS), len(_MEANS), (WIDTH / 2, 1.3), (0, 0.3))
     for ax, (key, (label, unit, _)) in zip(axes[0], _MEANS.items(), strict=True):
         means = results[key].where(results.success > 0).isel(law=0).mean("target")
         for row, name in enumerate(results.object.values):
             ax.plot(means.sel(object=name), [row] * means.sizes["friction"], "o-", color="C0")
-            ax.plot(getattr(HARDWARE_RESULTS[name], key), row, "k*", ms=13)
+            ax.plot(getattr(HARDWARE_RESULTS[name], key), row, "k*", ms=8)
         ax.set_yticks(range(results.sizes["object"]), [words(o) for o in results.object.values])
         ax.set(xlabel=f"{label} [{unit}]", ylim=(1.5, -0.5))
     figure.legend(["under each friction", "paper"], loc="outside lower center", ncols=2)
@@ -241,28 +242,28 @@ def shift_table(results: xr.Dataset) -> list[list[str]]:
     return rows
 
 
+@styled
 def paths_figure(results: xr.Dataset) -> Figure:
     """Draw Fig. 7: the paths of the base to all targets, and the last contact points."""
     names = list(map(str, results.object.values))
-    figure, axes = tiles(len(names), len(names), (5.2, 5), (0, 0), sharey=True)
+    figure, axes = tiles(len(names), len(names), (WIDTH / 2, 3.5), (0, 0.2), sharey=True)
     for ax, name in zip(axes[0], names, strict=True):
         trials = results.sel(object=name)
         ax.add_patch(base_patch(np.zeros(3), tuple(results.half.values), fill=True))
         for target in range(results.sizes["target"]):
             (line,) = ax.plot(*trials.base_path.values[target].T, lw=1.2)
             xy = float(results.target_x[target]), float(results.target_y[target])
-            ax.plot(*xy, "*", ms=12, color=line.get_color())
+            ax.plot(*xy, "*", ms=8, color=line.get_color())
             contacts = trials.contact_path.isel(target=target).dropna("path_time").values
             if len(contacts):
-                ax.plot(*contacts[-1], "o", ms=5, mfc="white", color=line.get_color())
+                ax.plot(*contacts[-1], "o", mfc="white", color=line.get_color())
         successes = int(trials.path_success.sum())
         ax.set(xlabel="x [m]", aspect="equal")
-        ax.set_title(f"{words(name)}: {successes} of {results.sizes['target']}", fontsize=10)
+        ax.set_title(f"{words(name)}: {successes} of {results.sizes['target']}")
         ax.grid(alpha=0.3)
     axes[0, 0].set_ylabel("y [m]")
     figure.suptitle(
         f"friction ground {MIDDLE.ground:g}, robot {MIDDLE.robot:g}; lines: base; stars: targets; "
-        "circles: last contact point",
-        fontsize=9,
+        "circles: last contact point"
     )
     return figure

@@ -18,7 +18,7 @@ import xarray as xr
 
 from rps_jax import errors
 from rps_jax.analysis import statistics, tables
-from rps_jax.analysis.figures.style import Figure, panel
+from rps_jax.analysis.figures.style import WIDTH, Figure, panel, styled
 from rps_jax.analysis.report import Picture, Section
 from rps_jax.control import registry
 from rps_jax.control.base import LawParams, Senses
@@ -38,6 +38,7 @@ from rps_jax.trials.progress import ProgressCallback, SequentialProgress
 from rps_jax.world.domain import Domain, DomainLike
 
 REFERENCE = "rps_tuned"  # the law that all others are compared with
+_MARKS = "osD^"  # of the senses in the figure
 
 
 def all_laws() -> tuple[str, ...]:
@@ -72,7 +73,7 @@ class Ladder(SweepOptions, TaskOption, MultiLawQuestion[xr.Dataset | xr.DataTree
     coordinates the drawn quantities (world) and `senses` (law). The result for several domains is
     a tree with one such dataset for each domain.
 
-    Example:
+    Examples:
       >>> import rps_jax
       >>> drums, rules = rps_jax.Domain(("random_cylinder",)), rps_jax.Rules(horizon=2.0)
       >>> setting = rps_jax.Setting("quasistatic", rules=rules)
@@ -203,7 +204,7 @@ class Score(Ladder, _ScoredLaw):
     The worlds depend only on domain, number and seed, so scores of several people compare. The
     report has one line for a Markdown table. The result is that of `rps_jax.ladder`.
 
-    Example:
+    Examples:
       >>> import rps_jax
       >>> drums, rules = rps_jax.Domain(("random_cylinder",)), rps_jax.Rules(horizon=2.0)
       >>> setting = rps_jax.Setting("quasistatic", rules=rules)
@@ -263,25 +264,27 @@ def _comparison(results: xr.Dataset) -> list[Section]:
     return sections
 
 
+@styled
 def draw_ladder(results: xr.Dataset) -> Figure:
     """Draw the success of each law, grouped by senses, with Wilson's 95 % intervals."""
     senses = dict(zip(results.law.values.tolist(), results.senses.values.tolist(), strict=True))
     kinds, total = get_args(Senses), results.sizes["world"]
     counts = {law: count_true(results.success.sel(law=law).values > 0) for law in senses}
     order = sorted(senses, key=lambda law: (-kinds.index(senses[law]), counts[law]))
-    above = {"xytext": (0, 6), "textcoords": "offset points", "ha": "center", "fontsize": 8}
-    figure, ax = panel((7, 1.2 + 0.34 * len(order)), "success [%]", "")
+    above = {"xytext": (0, 6), "textcoords": "offset points", "ha": "center"}
+    figure, ax = panel((WIDTH, 0.8 + 0.3 * len(order)), "success [%]", "")
     ax.grid(visible=False, axis="y")
     for y, law in enumerate(order):
-        colour, rate = f"C{kinds.index(senses[law])}", 100 * counts[law] / total
+        index, rate = kinds.index(senses[law]), 100 * counts[law] / total
         low, high = statistics.wilson(counts[law], total)
-        ax.plot([100 * low, 100 * high], [y, y], color=colour, lw=3, alpha=0.4)
-        ax.plot(rate, y, "o", color=colour)
+        ax.plot([100 * low, 100 * high], [y, y], color=f"C{index}", lw=3, alpha=0.4)
+        ax.plot(rate, y, _MARKS[index], color=f"C{index}")
         ax.annotate(tables.percent(counts[law], total), (rate, y), **above)
     for kind in sorted(set(senses.values()), key=kinds.index):
-        ax.plot([], [], "o", color=f"C{kinds.index(kind)}", label=f"senses {kind}")
+        index = kinds.index(kind)
+        ax.plot([], [], _MARKS[index], color=f"C{index}", label=f"senses {kind}")
     ax.set_yticks(range(len(order)), order)
     ax.set(xlim=(-3, 103), ylim=(-0.6, len(order) - 0.3))
-    ax.set_title(f"{total:,} worlds, the same for all laws", fontsize=10)
-    ax.legend(fontsize=8, loc="best")
+    ax.set_title(f"{total:,} worlds, the same for all laws")
+    ax.legend()
     return figure

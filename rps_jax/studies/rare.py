@@ -175,7 +175,7 @@ class Rare(DomainQuestion[xr.Dataset], LawQuestion[xr.Dataset]):
     The result has, by repetition, `p` with `low`, `high`, `variation` and `trials`; the estimates
     `p_group` (repetition, group); and the failing worlds `u` (failure, quantity) with `severity`.
 
-    Example:
+    Examples:
       >>> import rps_jax
       >>> drums, rules = rps_jax.Domain(("random_cylinder",)), rps_jax.Rules(horizon=1.0)
       >>> setting = rps_jax.Setting("quasistatic", rules=rules)

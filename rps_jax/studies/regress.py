@@ -45,7 +45,7 @@ class Regress(PlanQuestion, MultiLawQuestion[xr.Dataset]):
     The result has the outcomes (law, world), and those of the earlier laws, `known_success` and
     `known_severity` (known, world).
 
-    Example:
+    Examples:
       >>> import rps_jax
       >>> brief = rps_jax.Setting("quasistatic", rules=rps_jax.Rules(horizon=1.0))
       >>> results = rps_jax.regress({"mine": "rps,K_h=0.3"}, worlds=3, setting=brief)

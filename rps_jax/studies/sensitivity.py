@@ -20,7 +20,15 @@ import xarray as xr
 
 from rps_jax import errors
 from rps_jax.analysis import statistics
-from rps_jax.analysis.figures.style import Figure, Normalize, ScalarMappable, quantity, tiles
+from rps_jax.analysis.figures.style import (
+    WIDTH,
+    Figure,
+    Normalize,
+    ScalarMappable,
+    quantity,
+    styled,
+    tiles,
+)
 from rps_jax.analysis.report import Picture, Section
 from rps_jax.record.options import option
 from rps_jax.runs.plan import Plan
@@ -54,7 +62,7 @@ class Sensitivity(PlanQuestion, DomainQuestion[xr.Dataset], LawQuestion[xr.Datas
     `total_reach` of their intervals of 95 % (output, factor), the outcomes (world), and the points
     `u` (world, quantity).
 
-    Example:
+    Examples:
       >>> import rps_jax
       >>> drums, rules = rps_jax.Domain(("random_cylinder",)), rps_jax.Rules(horizon=1.0)
       >>> setting = rps_jax.Setting("quasistatic", rules=rules)
@@ -208,30 +216,32 @@ def reliability(results: xr.Dataset) -> str:
 _BINS = 4  # of each range of a map of interactions
 
 
+@styled
 def indices_figure(results: xr.Dataset) -> Figure:
     """Draw the indices of first and total order with their intervals, the greatest on top."""
     factors = rank_factors(results)[::-1]
-    figure = Figure(figsize=(11, 1.4 + 0.24 * len(factors)), layout="constrained")
+    figure = Figure(figsize=(WIDTH, 0.9 + 0.2 * len(factors)), layout="constrained")
     axes = figure.subplots(1, len(OUTPUTS), sharey=True)
     y = np.arange(len(factors))
     for ax, (output, words) in zip(axes, OUTPUTS.items(), strict=True):
         indices = results.sel(output=output, factor=factors)
-        for order, shift, colour in (("total", 0.15, "C3"), ("first", -0.15, "C0")):
-            ax.errorbar(
-                indices[order], y + shift, xerr=indices[f"{order}_reach"], fmt="o", ms=4,
-                capsize=2, lw=1.2, color=colour, label=f"{order} order",
-            )  # fmt: skip
+        for order, shift, mark in (("total", 0.15, "C3o"), ("first", -0.15, "C0s")):
+            reach = indices[f"{order}_reach"]
+            style = {"ms": 3, "capsize": 1.5, "lw": 1, "label": f"{order} order"}
+            ax.errorbar(indices[order], y + shift, xerr=reach, fmt=mark, **style)
         ax.axvline(0, color="0.6", lw=0.8)
         ax.set_xlim(-0.35, 1.35)  # an interval beyond these limits says nothing
-        ax.set_title(f"variance of {words}", fontsize=10)
+        ax.set_title(f"variance of\n{words}")
         ax.set_xlabel("share of the variance [1]")
         ax.grid(axis="x", alpha=0.3)
-    axes[0].set_yticks(y, list(map(quantity, factors)), fontsize=8)
-    axes[-1].legend(fontsize=8, loc="lower right")
+    axes[0].set_yticks(y, list(map(quantity, factors)))
+    handles, names = axes[0].get_legend_handles_labels()
+    figure.legend(handles, names, loc="outside lower center", ncols=2)
     figure.suptitle(f"Sobol indices with intervals of 95 %, {results.sizes['world']:,} worlds")
     return figure
 
 
+@styled
 def interactions(results: xr.Dataset, quantities: Sequence[str], objects: Sequence[str]) -> Figure:
     """Draw the failures over each pair of some quantities; ranges have equal bins."""
     failed, rates = results.success.values == 0, {}
@@ -241,13 +251,13 @@ def interactions(results: xr.Dataset, quantities: Sequence[str], objects: Sequen
         count = partial(np.histogram2d, *u, bins, [(0, 1)] * 2)
         rates[names] = 100 * count(weights=failed)[0] / np.maximum(count()[0], 1)
     norm = Normalize(0, max(float(rate.max()) for rate in rates.values()) or 1.0)
-    figure, axes = tiles(len(rates), 5, (2.5, 2.3), (1, 0.8))
+    figure, axes = tiles(len(rates), 4, (WIDTH / 4 - 0.2, 1.6), (0.8, 0.3))
     for ax, (names, rate) in zip(axes.ravel(), rates.items(), strict=False):
         ax.imshow(rate, origin="lower", norm=norm, cmap="magma_r", aspect="auto")
         for axis, name in zip((ax.yaxis, ax.xaxis), names, strict=True):
             ticks = objects if name == "object" else ()
-            axis.set_ticks(range(len(ticks)), ticks, fontsize=7)
-            axis.set_label_text(quantity(name).replace(" of the ", "\nof the "), fontsize=8)
+            axis.set_ticks(range(len(ticks)), ticks)
+            axis.set_label_text(quantity(name).replace(" of the ", "\nof the "))
     figure.colorbar(ScalarMappable(norm, "magma_r"), ax=axes, label="failures [%]", shrink=0.6)
-    figure.suptitle("each range from its low end (left, bottom) to its high end", fontsize=10)
+    figure.suptitle("each range from its low end (left, bottom) to its high end")
     return figure

@@ -30,7 +30,7 @@ class Table(TrialOptions, MultiLawQuestion[xr.Dataset]):
 
     The result has the outcomes (law, object, friction, target).
 
-    Example:
+    Examples:
       >>> import rps_jax
       >>> brief = rps_jax.Setting("mujoco", rules=rps_jax.Rules(horizon=2.0))
       >>> few = {"targets": [(1.0, 0.0), (1.0, 1.0)], "objects": ["cylinder"]}

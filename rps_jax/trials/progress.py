@@ -80,7 +80,7 @@ class Bar:
     It shows `compile` until the first trials have run, and then the phase of the run. Without a
     known total it appears with the first trials and counts.
 
-    Example:
+    Examples:
       >>> import rps_jax
       >>> from rps_jax.trials.progress import Bar
       >>> drums, rules = rps_jax.Domain(("random_cylinder",)), rps_jax.Rules(horizon=2.0)

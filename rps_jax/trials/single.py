@@ -54,7 +54,7 @@ def draw_worlds(
     Raises:
       InputError: an argument is not allowed, or the domain has several objects.
 
-    Example:
+    Examples:
       >>> import rps_jax
       >>> batch = rps_jax.draw_worlds("wide,objects=random_cylinder", 3)
       >>> batch.worlds.p_world_target.shape
@@ -105,7 +105,7 @@ def rollout(
       InputError: an argument is not allowed, the law has no smooth form, or the engine is not
         traced by JAX, or is differentiated and has no derivatives.
 
-    Example:
+    Examples:
       >>> import jax
       >>> import rps_jax
       >>> setting, law = rps_jax.Setting("quasistatic"), rps_jax.RPSParams.tuned()

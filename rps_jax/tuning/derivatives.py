@@ -7,7 +7,6 @@ so that central differences give this derivative, and a new quantity needs no co
 
 from __future__ import annotations
 
-import re
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
@@ -20,7 +19,7 @@ import xarray as xr
 
 from rps_jax import engines, errors
 from rps_jax.control import registry, validation
-from rps_jax.control.base import LawParams, Leaf, named_leaves
+from rps_jax.control.base import LawParams, Leaf, named_leaves, unit_of_leaf
 from rps_jax.control.registry import LawsLike
 from rps_jax.engines import device, native
 from rps_jax.engines.base import Stage
@@ -117,7 +116,7 @@ def value_and_grad(
     Raises:
       InputError: an argument is not allowed; the engine or a quantity has no derivatives.
 
-    Example:
+    Examples:
       >>> import rps_jax
       >>> def final_distance(trajectory):  # [m]
       ...     return trajectory.details.distance[-1]
@@ -225,7 +224,7 @@ def coordinates_of(
             leaf = known[name]
             for at in np.ndindex(np.shape(leaves[leaf])):
                 label = f"{name}[{','.join(map(str, at))}]" if at else name
-                coordinates.append(Coordinate(label, _unit_of_leaf(params, leaf), leaf, at, True))
+                coordinates.append(Coordinate(label, unit_of_leaf(params, leaf), leaf, at, True))
         elif name in _VECTORS:
             if name == "target":
                 domain.task.check_target("wrt", name)
@@ -245,15 +244,6 @@ def coordinates_of(
             coordinates += [Coordinate(x, unit_of(x), x) for x in parts]
     errors.check_each_once("wrt", [x.label for x in coordinates])
     return tuple(coordinates)
-
-
-def _unit_of_leaf(params: object, path: str) -> str:
-    """Return the unit in the comment of a parameter; empty if it has none."""
-    *owners, name = path.split(".")
-    for owner in owners:
-        params = getattr(params, owner, None)
-    doc = getattr(getattr(type(params), name, None), "__doc__", None) or ""
-    return "".join(re.findall(r"^\[([^\]]*)\]", doc))
 
 
 def world_slopes(

@@ -37,7 +37,7 @@ class TuneGrad(Tuning):
     (`value_and_grad`) do not serve here: they miss whether a push fails. They are the better choice
     for single pushes of some seconds: to plan one, or to fit a log.
 
-    Example:
+    Examples:
       >>> import rps_jax
       >>> drums = {"objects": ("random_cylinder",), "tuned": ("K_h",)}
       >>> brief = rps_jax.Setting("quasistatic", rules=rps_jax.Rules(horizon=2.0))

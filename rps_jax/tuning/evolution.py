@@ -24,7 +24,7 @@ class TuneES(Tuning):
     their distribution in the worlds for validation, and the `params` (generation, parameter) of
     that mean. Its `tuned` (parameter) are the parameters with the best validation.
 
-    Example:
+    Examples:
       >>> import rps_jax
       >>> drums = {"objects": ("random_cylinder",), "tuned": ("K_h", "K_v")}
       >>> brief = rps_jax.Setting("quasistatic", rules=rps_jax.Rules(horizon=2.0))

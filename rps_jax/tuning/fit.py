@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import textwrap
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -25,9 +26,10 @@ import jax.numpy as jnp
 import numpy as np
 import pandas as pd
 import xarray as xr
+from matplotlib.artist import setp
 
 from rps_jax import engines, errors
-from rps_jax.analysis.figures.style import Figure, quantity, tiles
+from rps_jax.analysis.figures.style import WIDTH, Figure, patches, quantity, styled, tiles
 from rps_jax.analysis.report import Picture, Section
 from rps_jax.control import registry
 from rps_jax.control.base import Law, LawParams
@@ -64,6 +66,9 @@ from rps_jax.world.draws import Draw
 
 _BATCH = 64  # worlds of one object that are stepped at once
 SAMPLES = 2000
+_PRIOR = "0.88"  # colour of a prior in the figure
+# Colours and labels of determined and undetermined quantities.
+_POSTERIORS = (("C0", "posterior"), ("0.6", "posterior, undetermined"))
 UNDETERMINED = 0.8  # share of the prior's 90 % interval above which nothing was learned
 _DELAYS = ("pose_latency", "command_delay")
 # Functions of quantities, for logs that determine these but not the quantities: unit, quantities
@@ -82,18 +87,22 @@ class Fitted:
     data: xr.Dataset  # see `Fit`
     domain: Domain  # with the 90 % intervals of all determined quantities as ranges
 
+    @styled
     def plot(self) -> Figure:
         """Draw each quantity's posterior (blue) over the 90 % interval of its prior (grey)."""
         names = list(map(str, self.data.quantity.values))
-        figure, axes = tiles(len(names), 4, (3, 1.9), (0, 0))
+        figure, axes = tiles(len(names), 4, (WIDTH / 4, 1.25), (0, 0.4))
         for ax, name in zip(axes.ravel(), names, strict=False):
             column = self.data.sel(quantity=name)
-            ax.axvspan(float(column.prior_low), float(column.prior_high), color="0.88")
-            flat = bool(column.undetermined)
-            ax.hist(column["sample"], 40, density=True, color="0.6" if flat else "C0")
-            ax.set_title(quantity(name) + ("\n(undetermined)" if flat else ""), fontsize=8)
+            ax.axvspan(float(column.prior_low), float(column.prior_high), color=_PRIOR)
+            colour = _POSTERIORS[bool(column.undetermined)][0]
+            ax.hist(column["sample"], 40, density=True, color=colour)
+            ax.set_title(textwrap.fill(quantity(name), 26))
             ax.set(yticks=[], xlabel=f"[{column.unit.values}]")
-            ax.tick_params(labelsize=7)
+        setp(axes[:, 0].tolist(), ylabel="density")
+        colours = ((_PRIOR, "prior, 90 % interval"), *_POSTERIORS)
+        marks = [patches.Patch(color=colour, label=label) for colour, label in colours]
+        figure.legend(handles=marks, loc="outside lower center", ncols=3)
         return figure
 
 
@@ -120,12 +129,14 @@ class Fit(LawQuestion[Fitted], DomainQuestion[Fitted], LogsQuestion):
     `undetermined`, correlations, and the probability of each of the domain's objects. Its `domain`
     is the fitted domain, which `rps fit` writes as fitted.json.
 
-    Example:
+    Examples:
       >>> import rps_jax
       >>> brief = rps_jax.Setting(rules=rps_jax.Rules(horizon=6.0))
-      >>> trace = rps_jax.push("box", target=(2.0, 0.5), setting=brief)  # doctest: +SKIP
-      >>> fitted = rps_jax.fit(trace, "wide", law="rps", quick=True)  # doctest: +SKIP
-      >>> rps_jax.sweep("rps", fitted.domain)  # doctest: +SKIP
+      >>> trace = rps_jax.push("box", target=(2.0, 0.5), setting=brief)
+      >>> fitted = rps_jax.fit(trace, "wide", law="rps", quick=True)
+      >>> fitted.data.sample.dims
+      ('draw', 'quantity')
+      >>> results = rps_jax.sweep("rps", fitted.domain, worlds=4, setting=brief)
     """
 
     TITLE: ClassVar[str] = "A domain fitted to logs"

@@ -20,7 +20,7 @@ from jax.stages import Lowered
 
 from rps_jax import engines, errors
 from rps_jax.analysis import tables
-from rps_jax.analysis.figures.style import Axes, Figure, tiles
+from rps_jax.analysis.figures.style import WIDTH, Axes, Figure, legend_above, styled, tiles
 from rps_jax.analysis.report import Picture, Section
 from rps_jax.control.laws.rps import RPSParams
 from rps_jax.control.learned import policy as policies
@@ -74,7 +74,7 @@ class Learn(PPO, TaskOption, SimulationQuestion[xr.Dataset]):
     attributes. Its attributes `compile` and `run` [s] split the wall clock, and `test_success` [1]
     is the success rate of the learned law in test worlds.
 
-    Example:
+    Examples:
       >>> import rps_jax
       >>> small = {"network": "mlp", "width": 4, "num_envs": 4, "num_steps": 2}
       >>> small |= {"num_minibatches": 1, "drawn": 4, "validation": 2}
@@ -210,7 +210,7 @@ class Learn(PPO, TaskOption, SimulationQuestion[xr.Dataset]):
             wall, level = f"{row.time / 60:.1f} min", f"{100 * row.level:.0f} %"
             rate, mean = share(row.validation), f"{row.validation_time:.0f} s"
             rows.append([str(update), wall, rate, mean, level])
-        picture = Picture("curve", partial(figure_of, results))
+        picture = Picture("curve", partial(figure_of, results)) if results.sizes["update"] else None
         return [Section("Learning curve", text, rows, picture)]
 
 
@@ -373,12 +373,13 @@ class _Learner:
         self.curve = [dict(zip(UNITS, row, strict=True)) for row in curve.tolist()]
 
 
+@styled
 def figure_of(curve: xr.Dataset) -> Figure:
     """Draw a learning curve: success and rewards against both clocks, and the state of PPO.
 
     Thin lines are single updates; thick lines are means over 1/40 of the run.
     """
-    figure, axes = tiles(4, 2, (5, 2.8), (0, 0))
+    figure, axes = tiles(4, 2, (WIDTH / 2, 2.6), (0, 0))
     clocks = (
         (curve.time / 60, "wall clock, with compilation [min]"),
         (curve.simulated / 3600, "simulated time, summed over worlds [h]"),
@@ -395,11 +396,11 @@ def figure_of(curve: xr.Dataset) -> Figure:
         draw(ax, x, 100 * curve.success, "C0", "trials that ended, with noise, at the dotted level")
         ax.plot(x, 100 * curve.level, "k:", lw=1, label="level of the curriculum")
         label = "validation: the domain itself, no noise"
-        ax.plot(x[valid], 100 * curve.validation[valid], "C3o-", ms=4, label=label)
+        ax.plot(x[valid], 100 * curve.validation[valid], "C3o-", ms=3, label=label)
         ax.set(ylabel="success, level [%]", ylim=(-3, 103))
     (minutes, _), (hours, _) = clocks
-    draw(axes[1, 0], minutes, curve.earned, "C2", "rewards of a trial")
-    axes[1, 0].set_ylabel("rewards of a trial that ended [1]")
+    draw(axes[1, 0], minutes, curve.earned, "C2", "rewards of a trial that ended")
+    axes[1, 0].set_ylabel("rewards [1]")
     axes[1, 1].plot(hours, curve.spread, label="standard deviation of the actions")
     axes[1, 1].plot(hours, 100 * curve.learning_rate, label="100 learning rates")
     axes[1, 1].plot(hours, curve.touching, label="share of decisions in contact")
@@ -407,5 +408,5 @@ def figure_of(curve: xr.Dataset) -> Figure:
     for ax, (_, label) in zip(axes.flat, clocks * 2, strict=True):
         ax.set_xlabel(label)
         ax.grid(alpha=0.3)
-        ax.legend(fontsize=7)
+        legend_above(ax, columns=1)
     return figure

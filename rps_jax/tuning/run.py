@@ -24,7 +24,7 @@ from rps_jax.analysis import statistics, tables
 from rps_jax.analysis.figures import tuning as figures
 from rps_jax.analysis.report import Picture, Section
 from rps_jax.control import registry
-from rps_jax.control.base import LawParams
+from rps_jax.control.base import LawParams, unit_of_leaf
 from rps_jax.control.registry import LawLike
 from rps_jax.record import files
 from rps_jax.record.options import option
@@ -265,7 +265,9 @@ class Tuning(TaskOption, LawQuestion[xr.Dataset]):
             columns = log.params.to_pandas().add_prefix("params.")
             table = log.drop_dims("parameter").to_dataframe().join(columns)
             files.write_csv(folder / "curve.csv", table)
-        return log.assign(tuned=("parameter", [float(params[x]) for x in self.space.names]))
+        names = self.space.names
+        log = log.assign_coords(unit=("parameter", [unit_of_leaf(self.params, x) for x in names]))
+        return log.assign(tuned=("parameter", [float(params[x]) for x in names]))
 
     def intro(self, results: xr.Dataset) -> str:
         names = ", ".join(self.space.names)

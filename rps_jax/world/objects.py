@@ -158,7 +158,7 @@ def register_object(
     Raises:
       InputError: the name is one of the paper's, or file, footprint or feet are invalid.
 
-    Example:
+    Examples:
       >>> from pathlib import Path
       >>> import rps_jax
       >>> crate = '''

@@ -231,7 +231,7 @@ def worlds_at(
     Raises:
       InputError: `u` is of another domain, or outside of [0, 1).
 
-    Example:
+    Examples:
       >>> import numpy as np
       >>> import rps_jax
       >>> from rps_jax.world.points import points_of, worlds_at

@@ -33,7 +33,8 @@ SIZE = (960, 540)  # [px] width, height
 
 _EMPTY = 58  # grey of a place in a grid without a trial
 _INK = (24, 26, 30)  # RGB around labels and tiles
-_LABEL, _LABEL_SIZES = 13, (9, 40)  # [1] heights of a label in a tile; [px] its sizes
+_PLATE = 170  # opacity behind a label, of 255
+_LABEL, _LABEL_SIZES = 9, (16, 40)  # [1] heights of a line of text in a tile; [px] its sizes
 
 _FIX_FFMPEG = "ffmpeg was not found or does not run: run `pip install imageio-ffmpeg`."
 
@@ -140,14 +141,17 @@ def render(
 
 
 def _labelled(renderer: SceneRenderer, shot: Shot) -> np.ndarray:
-    """Draw a tile; a label adds a text and a frame."""
+    """Draw a tile; a label adds a text on a plate, as large as fits, and a frame."""
     drawn = renderer.draw(shot.qpos, shot.p_world_contact)
     if not shot.label:
         return drawn
     image = Image.fromarray(drawn)
-    font = ImageFont.load_default(size=int(np.clip(image.height // _LABEL, *_LABEL_SIZES)))
-    draw = ImageDraw.Draw(image)
-    draw.text((5, 3), shot.label, "white", font, stroke_width=2, stroke_fill=_INK)
+    draw, size = ImageDraw.Draw(image, "RGBA"), float(np.clip(image.height / _LABEL, *_LABEL_SIZES))
+    width = draw.multiline_textbbox((0, 0), shot.label, ImageFont.load_default(size))[2]
+    font = ImageFont.load_default(size * min(1.0, (image.width - 10) / width))
+    _, _, right, bottom = draw.multiline_textbbox((5, 1), shot.label, font)
+    draw.rectangle((0, 0, right + 4, bottom + 4), fill=(*_INK, _PLATE))
+    draw.text((5, 1), shot.label, "white", font)
     draw.rectangle((0, 0, image.width - 1, image.height - 1), outline=_INK)
     return np.asarray(image)
 

@@ -1,7 +1,6 @@
 """Figures of the paper, from its grid of trials and from traces over time."""
 
 from collections.abc import Sequence
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -14,12 +13,16 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
 
 from rps_jax.analysis.figures.style import (
+    COLUMN,
     SHADES,
+    WIDTH,
     Figure,
     base_patch,
     base_sizes,
+    legend_above,
     panel,
     shade,
+    styled,
     tiles,
     words,
 )
@@ -31,21 +34,23 @@ _BASE, _OBJECT = "0.35", "#8a5a2b"
 _SCALE, _COLOURS = Normalize(0, 2), "viridis_r"  # of the distance to the target [m], in Fig. 5
 
 
+@styled
 def profile(params: RPSParams) -> Figure:
     """Draw the logistic profile of Eq. 5 (the paper's Fig. 3): a_r over the contact offset."""
     l = jnp.linspace(-shell.HALF_WIDTH, shell.HALF_WIDTH, 401)  # noqa: E741
     far = jnp.asarray(2 * params.d_th)
     a_r = jax.vmap(lambda l: rps.adaptive_rate(params, l, far))(l)  # noqa: E741
-    figure, ax = panel((5.5, 3.2), "contact offset $l$ [m]", "adaptive rate $a_r$ [1]")
+    figure, ax = panel((COLUMN, 2.4), "contact offset $l$ [m]", "adaptive rate $a_r$ [1]")
     ax.plot(l, a_r, color="C0")
     for side in (-1, 1):
         critical = side * float(params.l_cr), side * shell.HALF_WIDTH
         ax.axvspan(*critical, color=SHADES["realigning"], lw=0)
         ax.axvline(side * float(params.beta), color="0.6", lw=0.7, ls="--")
-    ax.set_title("Eq. 5; dashed: $\\pm\\beta$; shaded: critical region", fontsize=9)
+    ax.set_title("Eq. 5; dashed: $\\pm\\beta$; shaded: critical region")
     return figure
 
 
+@styled
 def one_trial(trace: xr.Dataset, title: str) -> Figure:
     """Draw Fig. 6: the path with contact points; velocities; l and a_r; contact type.
 
@@ -54,17 +59,17 @@ def one_trial(trace: xr.Dataset, title: str) -> Figure:
     and the radius `d_success`.
     """
     time, touching = trace.time.values, trace.contact_type.values != skin.NONE
-    figure = Figure(figsize=(11, 6), layout="constrained")
+    figure = Figure(figsize=(WIDTH, 4.6), layout="constrained")
     grid = figure.add_gridspec(3, 2, width_ratios=(1.1, 1))
     path = figure.add_subplot(grid[:, 0], xlabel="x [m]", ylabel="y [m]")
     draw_path(path, trace)
-    _legend_above(path)
+    legend_above(path, columns=3)
 
     velocity = figure.add_subplot(grid[0, 1])
     velocity.plot(time, trace.v_x, label="$v_x$ [m/s]", color="C0")
     velocity.plot(time, trace.v_y, label="$v_y$ [m/s]", color="C1")
     velocity.plot(time, trace.omega, label=r"$\omega$ [rad/s]", color="C2")
-    _legend_above(velocity)
+    legend_above(velocity)
     velocity.set_ylabel("a) twist")
 
     offset = figure.add_subplot(grid[1, 1], sharex=velocity)
@@ -83,22 +88,18 @@ def one_trial(trace: xr.Dataset, title: str) -> Figure:
     kind.set_yticks((0, 1, 2), ("none", "point", "line"))
     kind.set_ylim(-0.2, 2.2)
     kind.set(ylabel="c) contact", xlabel="time [s]")
+    for ax in (velocity, offset):
+        ax.tick_params(labelbottom=False)
     for ax in (velocity, offset, kind):
         shade(ax, time, trace.realigning.values > 0.5, SHADES["realigning"])
         shade(ax, time, ~touching, SHADES["lost"])
     bands = (("Realignment State", SHADES["realigning"]), ("no contact", SHADES["lost"]))
     marks = [patches.Patch(color=colour, label=name) for name, colour in bands]
-    _legend_above(kind, handles=marks)
+    legend_above(kind, handles=marks)
     result = "reached" if trace.outcome_success else "not reached"
     (x, y), end = trace.p_world_target.values, f"{float(trace.outcome_time):.1f} s"
     figure.suptitle(f"{title}, target ({x:.3g}, {y:.3g}) m: {result} at {end}")
     return figure
-
-
-def _legend_above(ax: Axes, **options: Any) -> None:
-    """Add a legend above a panel, where it covers nothing."""
-    columns = len(options.get("handles") or ax.get_legend_handles_labels()[1])
-    ax.legend(loc="lower right", bbox_to_anchor=(1, 1), ncols=columns, fontsize=8, **options)
 
 
 def _object(trace: xr.Dataset, index: int) -> np.ndarray:
@@ -130,16 +131,18 @@ def draw_path(ax: Axes, trace: xr.Dataset, snapshots: int = 7) -> None:
     ax.grid(alpha=0.3)
 
 
+@styled
 def stills(images: Sequence[np.ndarray], titles: Sequence[str]) -> Figure:
     """Draw Figs. 1 and 4: images (height, width, 3) with their titles, three in a row."""
-    figure, axes = tiles(len(images), 3, (4, 2.3), (0, 0))
+    figure, axes = tiles(len(images), 3, (WIDTH / 3, 1.5), (0, 0))
     for ax, image, title in zip(axes.ravel(), images, titles, strict=False):
         ax.axis("off")
         ax.imshow(image)
-        ax.set_title(words(title), fontsize=9)
+        ax.set_title(words(title))
     return figure
 
 
+@styled
 def min_distance(results: xr.Dataset) -> Figure:
     """Draw Fig. 5: least distance of contact to target over targets, mean over friction sets.
 
@@ -148,8 +151,8 @@ def min_distance(results: xr.Dataset) -> Figure:
     """
     laws, objects = (list(map(str, results[dim].values)) for dim in ("law", "object"))
     columns = [*objects, "all"] if len(objects) > 1 else objects
-    count, size = len(laws) * len(columns), (2.6, 2.5)
-    figure, axes = tiles(count, len(columns), size, (0.9, 0.9), sharex=True, sharey=True)
+    count, size = len(laws) * len(columns), (1.55, 1.75)
+    figure, axes = tiles(count, len(columns), size, (1.0, 0.3), sharex=True, sharey=True)
     for row, law in zip(axes, laws, strict=True):
         for ax, column in zip(row, columns, strict=True):
             part = results.sel(law=law)
@@ -157,7 +160,7 @@ def min_distance(results: xr.Dataset) -> Figure:
             _map(ax, part)
             successes, trials = int(part.success.sum()), part.success.size
             name = "all objects" if column == "all" else words(column)
-            ax.set_title(f"{law.upper()}, {name}: {successes}/{trials}", fontsize=9)
+            ax.set_title(f"{law.upper()}, {name}\n{successes}/{trials}")
     setp(axes[-1].tolist(), xlabel="x [m]")
     setp(axes[:, 0].tolist(), ylabel="y [m]")
     colours, label = ScalarMappable(_SCALE, _COLOURS), "least distance of contact to target [m]"
@@ -172,12 +175,10 @@ def _map(ax: Axes, part: xr.Dataset) -> None:
     distance = distance.mean(("object", "friction")).values
     count = part.success.sum(("object", "friction")).values
     x, y = part.target_x.values, part.target_y.values
-    ax.scatter(x, y, c=distance, s=420, marker="s", cmap=_COLOURS, norm=_SCALE, linewidths=0)
+    ax.scatter(x, y, c=distance, s=140, marker="s", cmap=_COLOURS, norm=_SCALE, linewidths=0)
     for i, successes in enumerate(count):
         colour = "white" if distance[i] > 1.0 else "black"
-        ax.annotate(
-            str(int(successes)), (x[i], y[i]), ha="center", va="center", fontsize=8, color=colour
-        )
+        ax.annotate(str(int(successes)), (x[i], y[i]), ha="center", va="center", color=colour)
     ax.add_patch(base_patch(np.zeros(3), fill=True))
     ax.margins(0.15)
     ax.set_aspect("equal")

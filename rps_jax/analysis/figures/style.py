@@ -1,4 +1,4 @@
-"""Shared style of the figures: colours, panels and marks."""
+"""Shared style of the figures: sizes of a paper, colours, panels and marks."""
 
 import io
 from collections.abc import Sequence
@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
-from matplotlib import figure, patches, transforms
+from matplotlib import cycler, figure, patches, rc_context, transforms
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable as ScalarMappable
 from matplotlib.colors import Normalize as Normalize
@@ -17,14 +17,26 @@ from rps_jax.robot import shell
 from rps_jax.world.domain import LABELS
 
 SHADES = {"realigning": "#bcd7f2", "lost": "#f8e3a1"}
+WIDTH, COLUMN = 7.2, 3.5  # [in] of a page and of one of its two columns
+# Of Okabe and Ito (2008), which differ also for the colour-blind.
+COLOURS = ("#0072B2", "#E69F00", "#009E73", "#D55E00", "#CC79A7", "#56B4E9", "#000000")
+# Decorator of a function that draws: letters of 8 points, and colours for all eyes.
+styled = rc_context(
+    {
+        **dict.fromkeys(("font.size", "axes.titlesize", "figure.titlesize", "figure.labelsize"), 8),
+        "axes.prop_cycle": cycler(color=COLOURS),
+    }
+)
 
 
 class Figure(figure.Figure):
     """Figure of matplotlib that Jupyter shows without `pyplot` and its settings."""
 
+    savefig = styled(figure.Figure.savefig)  # the labels of ticks are made there
+
     def _repr_png_(self) -> bytes:
         file = io.BytesIO()
-        self.savefig(file, dpi=100, metadata={"Software": None})
+        self.savefig(file, dpi=150, metadata={"Software": None})
         return file.getvalue()
 
 
@@ -73,6 +85,12 @@ def panel(size: tuple[float, float], xlabel: str, ylabel: str) -> tuple[Figure, 
     ax.set(xlabel=xlabel, ylabel=ylabel)
     ax.grid(alpha=0.3)
     return sheet, ax
+
+
+def legend_above(ax: Axes, columns: int = 0, **options: Any) -> None:
+    """Add a legend above a panel, where it covers nothing; by default in one row."""
+    columns = columns or len(options.get("handles") or ax.get_legend_handles_labels()[1])
+    ax.legend(loc="lower right", bbox_to_anchor=(1, 1), ncols=columns, **options)
 
 
 def base_patch(

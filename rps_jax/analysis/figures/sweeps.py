@@ -3,15 +3,19 @@
 import textwrap
 from collections.abc import Sequence
 
+import numpy as np
 import xarray as xr
 from matplotlib.artist import setp
 
 from rps_jax.analysis import statistics
-from rps_jax.analysis.figures.style import Figure, axis_label, success_rates, tiles
+from rps_jax.analysis.figures.style import WIDTH, Figure, axis_label, styled, success_rates, tiles
 from rps_jax.analysis.statistics import Influence
 from rps_jax.world.domain import LABELS
 
+_LETTERS = 16  # in an inch of text
 
+
+@styled
 def success_curves(results: xr.Dataset, count: int = 6) -> Figure:
     """Draw success against the most influential drawn quantities, with a curve for each law.
 
@@ -25,38 +29,51 @@ def success_curves(results: xr.Dataset, count: int = 6) -> Figure:
     shown = [x for x in influences[:count] if x.variance > 0 and not _is_flat(x)]
     shown = shown or influences[:1]
     rest = [x for x in influences if x not in shown]
-    figure, axes = tiles(len(shown), 3, (3.5, 2.5), (1, 1.6), sharey=True)
-    columns = axes.shape[1]
-    for ax, influence in zip(axes.ravel(), shown, strict=False):
-        values = results[influence.name]
-        for i, law in enumerate(map(str, results.law.values)):
-            bins = statistics.bins(values.values, results.success.sel(law=law).values > 0)
-            success_rates(ax, *bins, color=f"C{i}", label=law, curve=i)
-        ax.set_xlabel(axis_label(influence.name, values.attrs["units"]), fontsize=9)
-        chance = " (may be chance)" * _is_flat(influence)
-        ax.set_title(f"spread {_spread(influence)}, q = {influence.q:.1g}{chance}", fontsize=8)
-        ax.grid(alpha=0.3)
-    setp(axes[:, 0].tolist(), ylabel="success [%]")
-    axes[0, 0].set_ylim(top=103)
-    axes[0, 0].legend(fontsize=8)
-    title = (
+    columns = min(3, len(shown))
+    width = WIDTH / max(columns, 2)  # [in] of a panel
+    title = _filled(
         f"Success against {len(shown)} of {len(influences)} drawn quantities, in the order of "
-        f"influence: {_names(shown)}"
+        f"influence: {_names(shown)}",
+        columns * width,
     )
-    figure.suptitle(_filled(title, 42 * columns), fontsize=10)
     parts = {
         "Order": "standard deviation of success over the bins beyond binomial noise, in the law in "
         "which it is greatest",
         "Less influential": _names([x for x in rest if not _is_flat(x)], spread=True),
         "Flat within the noise": _names([x for x in rest if _is_flat(x)]),
     }
-    lines = (_filled(f"{k}: {v}.", 60 * columns) for k, v in parts.items() if v)
-    figure.supxlabel("\n".join(lines), fontsize=8, x=0.01, ha="left")
+    caption = "\n".join(_filled(f"{k}: {v}.", columns * width) for k, v in parts.items() if v)
+    laws = list(map(str, results.law.values))
+    by_row = max(1, int(_LETTERS * columns * width / (max(map(len, laws)) + 10)))  # in the legend
+    lines = title.count("\n") + caption.count("\n") + 3 - (-len(laws) // by_row)
+    figure, axes = tiles(len(shown), columns, (width, 1.9), (0, 0.14 * lines), sharey=True)
+    for ax, influence in zip(axes.ravel(), shown, strict=False):
+        values = results[influence.name]
+        # A cylinder has no corners; a line to triangles would cross shapes that do not exist.
+        unordered = influence.name == "corners"
+        for i, law in enumerate(laws):
+            bins = statistics.bins(values.values, results.success.sel(law=law).values > 0)
+            line = "none" if unordered else "-"
+            success_rates(ax, *bins, color=f"C{i}", label=law, curve=i, ls=line)
+        if unordered:
+            counts = np.unique(values)
+            ax.set_xticks(counts, [f"{n:g}" if n else "round" for n in counts])
+        ax.set_xlabel(axis_label(influence.name, values.attrs["units"]))
+        chance = " (may be chance)" * _is_flat(influence)
+        ax.set_title(f"spread {_spread(influence)}, q = {influence.q:.1g}{chance}")
+        ax.grid(alpha=0.3)
+    setp(axes[:, 0].tolist(), ylabel="success [%]")
+    axes[0, 0].set_ylim(top=103)
+    handles, names = axes[0, 0].get_legend_handles_labels()
+    legend = {"ncols": by_row, "frameon": False, "alignment": "left"}
+    figure.legend(handles, names, title=title, loc="outside upper left", **legend)
+    figure.supxlabel(caption, x=0.01, ha="left")
     return figure
 
 
-def _filled(text: str, width: int) -> str:
-    return textwrap.fill(text, width, break_on_hyphens=False)
+def _filled(text: str, width: float) -> str:
+    """Break a text into lines of this width [in]."""
+    return textwrap.fill(text, int(_LETTERS * width), break_on_hyphens=False)
 
 
 def _is_flat(influence: Influence) -> bool:

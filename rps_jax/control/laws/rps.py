@@ -314,7 +314,7 @@ def step(
     (saturation, gamma_max, sigma) are unchanged: they have kinks but no jumps. One jump remains: at
     a heading error of exactly pi the robot turns to one side.
 
-    Example:
+    Examples:
       >>> import numpy as np
       >>> import rps_jax
       >>> params = rps_jax.RPSParams.paper()
