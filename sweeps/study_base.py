@@ -2,15 +2,12 @@
 
 A subclass of `Study` declares the parts of its results and its tables. Each table is a section of
 the report. With the option `--machine`, tables that have a name are written to `results/NAME.json`
-in the folder of the study, and `render_tables.py` shows them on the pages. A data file has digests
-of everything that its numbers depend on: of the settings, and of the source code by room.
+in the folder of the study, and `render_tables.py` shows them on the pages. `probes.py` tells
+whether later code gives the same numbers.
 """
 
 from __future__ import annotations
 
-import contextlib
-import dataclasses
-import hashlib
 import inspect
 import json
 import os
@@ -29,8 +26,6 @@ import xarray as xr
 
 from rps_jax import errors
 from rps_jax.analysis.report import Picture, Section
-from rps_jax.app.cli import flags, names
-from rps_jax.control import registry
 from rps_jax.engines import device
 from rps_jax.errors import InputError
 from rps_jax.record import files, options, provenance
@@ -42,27 +37,11 @@ from rps_jax.runs.results import Results
 from rps_jax.trials.progress import Progress, ProgressCallback, SequentialProgress, no_progress
 from rps_jax.trials.rollout import rollout
 from rps_jax.trials.trial import Outcome
-from rps_jax.world.domain import DOMAINS, QUANTITIES
-from rps_jax.world.tasks.reach import Reach
-from sweeps import render_tables, sources
+from sweeps import probes, render_tables
 
 T = TypeVar("T", covariant=True)
 Rows = list[list[str]]
 _PACKAGES = ("rps_jax", "jax", "mujoco", "mujoco-mjx")  # whose versions a data file has
-_NEW_LIMITS = (
-    "slip_sideways",
-    "slip_yaw",
-    "radius",
-)  # of robots, later than data files; absent if None
-_OLD_TASK = "task", dataclasses.asdict(Reach())  # of all domains that are older than other tasks
-# Removed options by question, with the values that all later runs have; digests still cover them.
-_REMOVED_OPTIONS: Mapping[str, Mapping[str, Any]] = {
-    "ground": {"worlds": None},
-    "speed": {"refill": 0, "rounds": 4},
-    "attack": {"aim": "distance", "algorithm": "mixed"},
-    "tune_es": {"algorithm": "cma", "patience": 0},
-    "tune_grad": {"optimiser": "adam"},
-}
 
 
 # --- tables ---------------------------------------------------------------------------------
@@ -338,17 +317,13 @@ def write_table(path: Path, runs: Sequence[Mapping[str, Any]], device: str, tabl
     last = runs[-1]
     with_folders = [run["command"] for run in runs]
     commands = [_without_unread_folder(command, with_folders) for command in with_folders]
-    digests: dict[str, Any] = {}
-    with contextlib.suppress(InputError):  # a script has no digest, and its run is still published
-        digests["digest"] = digest(commands)
-        digests["code"] = code_digests(commands, last["commit"])
     columns, rows = table.columns_and_rows()
     data = {
         "command": [shlex.join(command) for command in commands],
         "device": device,
         "versions": {name: last["packages"][name] for name in _PACKAGES},
         "commit": last["commit"],
-        **digests,
+        "probes": probes.stored_ids(path.stem),
         "date": last["time"][:10],
         **({"note": table.note} if table.note else {}),
         "columns": columns,
@@ -356,65 +331,6 @@ def write_table(path: Path, runs: Sequence[Mapping[str, Any]], device: str, tabl
     }
     path.parent.mkdir(exist_ok=True)
     return files.write_text(path, json.dumps(data, indent=1) + "\n")
-
-
-def digest(commands: Sequence[Sequence[str]]) -> str:
-    """Return a digest of everything that the numbers of some commands depend on, in 16 letters.
-
-    The digest covers declared values alone: options, parameters, ranges, physics, rules and seeds.
-    It stays the same when code is rewritten, and changes with a default or a tuned law.
-
-    Raises:
-      InputError: a command or an option of it does not exist.
-    """
-    configurations: list[Any] = []
-    for program, *words in commands:
-        if program != "rps":
-            rule = "only `rps NAME` or `rps PATH` has a digest"
-            raise errors.not_allowed("command", program, rule)
-        if _reads_folder(split_folder(words)[0]):  # the command that made the folder has a digest
-            configurations.append(words)
-            continue
-        name, rest = names.split(words)
-        question, _ = flags.parse(names.question_type(name), name, rest)
-        fields = question.configuration()
-        fields |= _REMOVED_OPTIONS.get(fields.get("question", ""), {})
-        configurations.append(_expanded(fields))
-    text = json.dumps(configurations, sort_keys=True)
-    text = text.replace(f"{sources.ROOT}/", "")  # of a law's file, in any clone
-    return hashlib.sha256(text.encode()).hexdigest()[:16]
-
-
-def code_digests(commands: Sequence[Sequence[str]], commit: str | None) -> dict[str, str]:
-    """Return a digest of each room of the source that commands run, at the commit of their run."""
-    code = sources.digests_at(commit)
-    return {room: code[room] for room in sorted(rooms_of(commands) & code.keys())}
-
-
-def rooms_of(commands: Iterable[Sequence[str]]) -> set[str]:
-    """Return the rooms of the source that commands of `rps` run.
-
-    Raises:
-      InputError: a command does not exist.
-    """
-    questions = [names.question_type(names.split(list(words[1:]))[0]) for words in commands]
-    return sources.rooms_of(Path(inspect.getfile(question)) for question in questions)
-
-
-def _expanded(value: Any) -> Any:
-    """Return a configuration with the values of its laws and domains after their names."""
-    if isinstance(value, dict):  # omit absent quantities, so that new ones are allowed
-        absent = {*QUANTITIES, *_NEW_LIMITS}
-        items = (item for item in value.items() if item[1] is not None or item[0] not in absent)
-        items = (item for item in items if item != _OLD_TASK)
-        return {key: _expanded(item) for key, item in items}
-    if isinstance(value, list | tuple):
-        return [_expanded(item) for item in value]
-    if isinstance(value, str) and value in DOMAINS:
-        return [value, _expanded(dataclasses.asdict(DOMAINS[value]))]
-    if isinstance(value, str) and value in registry.LAWS:
-        return [value, registry.params_to_json(registry.LAWS[value])]
-    return value
 
 
 def split_folder(command: Sequence[str]) -> tuple[list[str], str]:

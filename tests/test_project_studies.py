@@ -4,7 +4,6 @@ import json
 import re
 import shlex
 import shutil
-from dataclasses import replace
 
 import pytest
 from helpers import ROOT, refusal
@@ -12,10 +11,8 @@ from helpers import ROOT, refusal
 from rps_jax.app.cli import flags, names
 from rps_jax.control import registry
 from rps_jax.control.learned import policy
-from rps_jax.world.physics import PHYSICS
-from sweeps.publish import study as publish
 from sweeps.publish.recipes import RECIPES
-from sweeps.study_base import _PACKAGES, Table, _reads_folder, digest, split_folder, write_table
+from sweeps.study_base import _PACKAGES, Table, split_folder, write_table
 
 SWEEPS = ROOT / "sweeps"
 FOLDERS = sorted(path.parent for path in SWEEPS.glob("*/README.md"))
@@ -101,26 +98,21 @@ def words_of(line):
 
 
 def published():
-    """Yield the commands of `rps` in all data files, and whether their digest parses them."""
+    """Yield the commands of `rps` in all data files."""
     for path in sorted(SWEEPS.glob("**/results/*.json")):
-        data = json.loads(path.read_text())
-        commands = data.get("command", [])  # a table that cites others has none
+        commands = json.loads(path.read_text()).get("command", [])  # of a table that cites: none
         for line in [commands] if isinstance(commands, str) else commands:
             if line.startswith("rps ") and not re.search(r"\$C|[A-Z]{3,}|\.\.\.", line):
-                words = words_of(line)
-                yield words, "digest" in data and not _reads_folder(words)
+                yield words_of(line)
 
 
 RECIPE_COMMANDS = [words_of(x) for recipe in RECIPES.values() for x in recipe.commands]
-PUBLISHED = dict.fromkeys((x for x in RECIPE_COMMANDS if x[0] == "rps"), False) | dict(published())
+PUBLISHED = {x for x in RECIPE_COMMANDS if x[0] == "rps"} | set(published())
 
 
-@pytest.mark.parametrize("words", [x for x in sorted(PUBLISHED) if not PUBLISHED[x]], ids=" ".join)
+@pytest.mark.parametrize("words", sorted(PUBLISHED), ids=" ".join)
 def test_a_published_command_exists(words, monkeypatch):
-    """Only its options are checked; files that it names may not exist.
-
-    Below, digests parse the other commands.
-    """
+    """Only its options are checked; files that it names may not exist."""
     monkeypatch.chdir(ROOT)
     name, rest = names.split(words[1:])
     question, _ = flags.parse(names.question_type(name), name, rest)
@@ -139,67 +131,14 @@ def stored(folder, *commands):
     return json.loads(path.read_text())
 
 
-def test_a_data_file_has_its_commands_without_local_paths_and_their_digest(tmp_path):
+def test_a_data_file_has_its_commands_without_local_paths(tmp_path):
     """Run folders that other commands read stay."""
     tuned = "rps tune es --worlds 16 --law pursuit --out runs/tuned"
     ladder = "rps ladder --worlds 9 --laws pursuit pursuit,runs/tuned/tuned.json"
     data = stored(tmp_path, tuned, f"{ladder} --out '/somewhere/of mine'")
     assert data["command"] == [tuned, ladder]
-    assert data["digest"] == digest([shlex.split(line) for line in (tuned, ladder)])
-    changed = tuned.replace("16", "17"), ladder
-    assert data["digest"] != digest([shlex.split(line) for line in changed])
-    assert set(data["code"]) >= {"control", "engines", "mjcf", "studies", "trials", "tuning"}
-    assert not set(data["code"]) & {"app", "record"}
-    assert "digest" not in stored(tmp_path, "python mine.py")
     for path in SWEEPS.rglob("results/*.json"):
         assert "--out /" not in path.read_text(), path
-
-
-def test_a_digest_changes_with_laws_domains_and_options():
-    """The default engine may be named; laws, domains, seeds and sizes matter."""
-    command = ["rps", "sweep", "--domain", "wide", "--laws", "rps_tuned", "--worlds", "8"]
-    assert digest([command]) == digest([[*command, "--engine", "fused"]])
-    for changes in (["--laws", "rps"], ["--domain", "real"], ["--seed", "3"], ["--worlds", "9"]):
-        assert digest([command]) != digest([[*command, *changes]])
-
-
-# Studies that measure this machine, have another ground or none, or read run folders.
-WITHOUT_PRESETS = (
-    *("speed", "levers", "publish", "force_push_grid"),
-    *("gradients/mjx.py", "corridors/costs.py", "real_pushes/fit.py"),
-)
-WITH_PRESETS = ("force_push_grid/paths.py",)  # in one of these folders
-WITH_THE_PAPERS_LAW = ("ambiguities", "fidelity", "gradients", "paper_reading")
-
-
-def test_a_digest_changes_with_the_presets_in_the_code_of_a_study(monkeypatch):
-    """The options of these commands name neither the ground nor the parameters of the law."""
-    files = [json.loads(path.read_text()) for path in publish.published()]
-    lines = {line for data in files if "digest" in data for line in data["command"]}
-    studies = [shlex.split(line) for line in sorted(lines) if line.startswith("rps sweeps/")]
-    initial = [digest([words]) for words in studies]
-    for fidelity, physics in PHYSICS["default"].items():
-        changed = replace(physics, ground_impedance=0.6)
-        monkeypatch.setitem(PHYSICS["default"], fidelity, changed)
-    with_ground = [digest([words]) for words in studies]
-    changed = registry.LAWS["rps"]._replace(saturate_first=0.0)
-    monkeypatch.setitem(registry.LAWS, "rps", changed)
-    with_law = [digest([words]) for words in studies]
-    for words, *digests in zip(studies, initial, with_ground, with_law, strict=True):
-        path = words[1].removeprefix("sweeps/")
-        lacks_presets = {path, path.split("/")[0]} & {*WITHOUT_PRESETS}
-        has_presets = path in WITH_PRESETS or not lacks_presets
-        assert (digests[0] != digests[1]) == has_presets, words
-        has_law = words[1] in [f"sweeps/{name}" for name in WITH_THE_PAPERS_LAW]
-        assert digests[1] != digests[2] or not has_law, words
-
-
-def test_no_published_number_is_stale(monkeypatch):
-    """A ladder runs all registered laws, so the laws of other tests are removed first."""
-    laws = {name: registry.LAWS[name] for name in registry.PACKAGE_LAWS}
-    monkeypatch.setattr(registry, "LAWS", laws)
-    states = {path.stem: publish._description(path)["state"] for path in publish.published()}
-    assert publish.stale_problems(states) == []
 
 
 def test_a_copy_of_a_shipped_policy_does_not_change_its_law(tmp_path):

@@ -12,13 +12,13 @@ import pytest
 import xarray as xr
 from helpers import ROOT, rps
 
-import rps_jax
 from rps_jax import sweep
+from rps_jax.app.cli import names
 from rps_jax.record import files
 from rps_jax.trials.setting import Setting, seed_of
 from rps_jax.trials.trial import Rules
 from rps_jax.world.domain import DOMAINS, Range
-from sweeps import render_tables, sources
+from sweeps import probes, render_tables
 from sweeps.publish import dependencies, rows, study
 from sweeps.publish.recipes import HISTORY, RECIPES, Recipe
 from sweeps.random_worlds import million
@@ -70,27 +70,67 @@ def test_failed_recipes_are_named_and_the_others_are_run(recipe_folder, capsys):
     assert second["rows"] == [["3"]]
     assert first["command"] == second["command"] == [f"{PUSH} --laws rps"]
     assert first["device"] == "a core"
-    assert len(first["digest"]) == 16
+    assert first["probes"] == {}
     runs = (recipe_folder / "run" / "runs").iterdir()
     assert [path.name for path in runs] == ["one"]  # one run for both recipes
 
 
+@pytest.mark.parametrize("path", study.published(), ids=lambda path: path.stem)
+def test_the_code_of_a_data_file_left_a_record_of_each_of_its_probes(path):
+    data = json.loads(path.read_text())
+    if "command" in data and path.stem not in HISTORY:
+        assert any(fnmatch(path.stem, pattern) for pattern in probes.PROBES_OF)
+        assert data.get("probes", {}).keys() == probes.probes_of(path.stem)
+        assert all(id in probes.stored()[probe] for probe, id in data.get("probes", {}).items())
+
+
+def test_a_probe_is_a_command_and_is_used():
+    used = {name for names in probes.PROBES_OF.values() for name in names}
+    read = {"gallery", "replay", "score"}  # of no table, but of the library
+    assert used | read == probes.PROBES.keys()
+    for command in probes.PROBES.values():
+        name, _ = names.split(shlex.split(command))
+        assert names.question_type(name)
+
+
+RECORD = {"processor": "a core", "versions": {"jax": "1"}, "variables": {"x": ["ab", 1.0, 2.0]}}
+
+
 @pytest.mark.parametrize(
-    ("digest", "listed", "message"),
+    ("today", "equal"),
     [
-        (None, (), ""),
-        ("0" * 16, (), r"stale: the inputs of table have changed; .*--only table, or list them"),
-        ("0" * 16, ("table",), ""),
-        (None, ("table",), r"lists table, which no change has made stale: remove these names"),
-        ("0" * 16, ("table", "gone"), r"lists gone, which"),
+        ({}, True),
+        ({"variables": {"renamed": ["ab", 1.0, 2.0], "more": ["cd", 0.0, 0.0]}}, True),
+        ({"variables": {"x": ["cd", 1.0, 2.0]}}, False),
+        ({"processor": "other", "variables": {"x": ["cd", 1.09, 2.09]}}, True),
+        ({"processor": "other", "variables": {"x": ["cd", 1.11, 2.0]}}, False),
+        ({"versions": {"jax": "2"}, "variables": {"x": ["cd", 1.0, 2.11]}}, False),
+        ({"processor": "other", "variables": {}}, False),
+    ],
+)
+def test_numbers_are_the_same_bit_for_bit_or_on_another_device_within_a_share(today, equal):
+    assert probes.same(RECORD, RECORD | today) == equal
+
+
+@pytest.mark.parametrize(
+    ("result", "listed", "message"),
+    [
+        ("ab", (), ""),
+        ("cd", (), r"stale: small runs of table give other numbers; .*--only table, or list them"),
+        ("cd", ("table",), ""),
+        ("ab", ("table",), r"lists table, whose small runs give the same numbers: remove these"),
+        ("ab", ("gone",), r"lists gone, no file"),
     ],
 )
 def test_a_stale_file_must_be_listed_and_a_current_one_must_not(
-    digest, listed, message, tmp_path, monkeypatch, capsys
+    result, listed, message, tmp_path, monkeypatch, capsys
 ):
+    monkeypatch.setattr(probes, "FILE", tmp_path / "probes.json")
+    monkeypatch.setattr(
+        probes, "run", lambda probe: RECORD | {"variables": {"x": [result, 1.0, 2.0]}}
+    )
     data = json.loads((SWEEPS / "table" / "results" / "table.json").read_text())
-    data["digest"] = digest or study.digest([shlex.split(line) for line in data["command"]])
-    data["code"] = sources.digests()
+    data["probes"] = {"table": probes.store("table", RECORD)}
     (tmp_path / "results").mkdir()
     (tmp_path / "results" / "table.json").write_text(json.dumps(data))
     monkeypatch.setattr(study, "_SWEEPS", tmp_path)
@@ -98,138 +138,25 @@ def test_a_stale_file_must_be_listed_and_a_current_one_must_not(
         monkeypatch.delitem(render_tables.STALE, name)
     for name in listed:
         monkeypatch.setitem(render_tables.STALE, name, "the box had a lid")
-    words = (SWEEPS / "publish", "--check-digests", "--out", tmp_path / "run")
+    words = (SWEEPS / "publish", "--check-probes", "--out", tmp_path / "run")
     assert rps(*words) == (2 if message else 0)
     output = capsys.readouterr()
     assert re.search(message, output.err) if message else not output.err
-    assert ("stale: computed before the box had a lid" in output.out) == bool(
-        listed and not message
-    )
+    state = "today's table differ" if result == "cd" else "still current"
+    assert state in output.out
 
 
-@pytest.fixture
-def source_tree(tmp_path, monkeypatch):
-    """Folder with a law of four rooms, whose file `rps_jax/control/law.py` is returned."""
-    for name, text in {
-        "rps_jax/control/law.py": "from rps_jax.geometry import planar\n\nV = 1.0\n",
-        "rps_jax/geometry/planar.py": "def f(): return 1\n",
-        "rps_jax/engines/fused.py": "def late():\n    import rps_jax\n    return rps_jax.sweep\n",
-        "rps_jax/runs/sweep.py": "from rps_jax.record import files\n",
-        "rps_jax/record/files.py": "A = 1\n",
-        "sweeps/a/study.py": "from rps_jax.control import law\n",
-    }.items():
-        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
-        (tmp_path / name).write_text(text)
-    monkeypatch.setattr(sources, "ROOT", tmp_path)
-    monkeypatch.setattr(sources, "EQUAL", tmp_path / "equal.json")
-    for cached in (sources.digests, sources._imports):
-        cached.cache_clear()
-    yield tmp_path / "rps_jax" / "control" / "law.py"
-    for cached in (sources.digests, sources._imports):
-        cached.cache_clear()
-
-
-def digests_of(path, text):
-    path.write_text(text)
-    sources.digests.cache_clear()
-    return sources.digests()
-
-
-def test_a_number_depends_on_the_rooms_that_its_command_imports(source_tree):
-    """Also inside functions, and by the public names; a room that only stores is none of them."""
-    assert sources.rooms_of([source_tree]) == {"control", "geometry"}
-    study_of = source_tree.parents[2] / "sweeps" / "a" / "study.py"
-    assert sources.rooms_of([study_of]) == {"sweeps/a", "control", "geometry"}
-    assert sources.rooms_of([source_tree.parents[1] / "engines/fused.py"]) == {"engines", "runs"}
-
-
-@pytest.mark.parametrize(("text", "changes"), [
-    ('"""A law."""\n\n# fast\nV = (1.0)\n"""Speed."""\n', False),
-    ("from typing import Any\n\nV: Any = 1.0\n", True),  # a field gets a type
-    ("V = 1.5\n", True), ("V = 1.0\n\n\ndef f(): pass\n", True),
-])  # fmt: skip
-def test_a_digest_covers_code_and_no_comment(source_tree, text, changes):
-    initial = digests_of(source_tree, "V = 1.0\n")
-    changed = digests_of(source_tree, text)
-    assert (initial["control"] != changed["control"]) == changes
-    assert initial["geometry"] == changed["geometry"]
-
-
-def test_a_digest_ignores_types_and_the_texts_of_errors(source_tree):
-    typed = "from typing import {0}\n\nv: {0} = 1\n\n\ndef f(v: {0}) -> {0}:\n    return v\n"
-    first, same = (digests_of(source_tree, typed.format(x))["control"] for x in ("Any", "Final"))
-    assert first == same
-    law = "def f(v):\n    if v < {}:\n        raise ValueError({})\n"
-    texts = law.format(0, "'below 0'"), law.format(0, "f'{v} is below 0'"), law.format(1, "''")
-    first, same, other = (digests_of(source_tree, text)["control"] for text in texts)
-    assert first == same != other
-
-
-def test_a_change_of_the_code_is_stale_until_it_is_confirmed(source_tree):
-    data = {"code": dict(digests_of(source_tree, "V = 1.0\n")), "commit": None}
-    rooms = ("control", "geometry")
-    assert sources.changed_rooms("table", data, rooms) == []
-    middle = digests_of(source_tree, "W = 1.0\n")["control"]
-    assert sources.changed_rooms("table", data, rooms) == ["control"]
-    last = digests_of(source_tree, "U = 1.0\n")["control"]
-    chain = [[data["code"]["control"], middle], [middle, last]]
-    entries = [{"reason": "renamed", "files": ["table"], "code": {"control": x}} for x in chain]
-    sources.EQUAL.write_text(json.dumps(entries[:1]))
-    assert sources.changed_rooms("table", data, rooms) == ["control"]
-    sources.EQUAL.write_text(json.dumps(entries))
-    assert sources.changed_rooms("table", data, rooms) == []
-    assert sources.changed_rooms("ladder", data, rooms) == ["control"]
-    assert sources.changed_rooms("", data, rooms) == ["control"]
-
-
-def test_a_reason_confirms_all_files_that_are_stale_by_their_code_alone(
-    tmp_path, monkeypatch, capsys
-):
-    table = json.loads((SWEEPS / "table" / "results" / "table.json").read_text())
-    table["digest"] = study.digest([shlex.split(line) for line in table["command"]])
-    code = sources.digests()
-    (tmp_path / "results").mkdir()
-    for name, changes in {
-        "current": {"code": code},
-        "renamed": {"code": code | {"engines": "0" * 12}},
-        "settings": {"code": code | {"engines": "1" * 12}, "digest": "2" * 16},
-        "listed": {"code": code | {"engines": "3" * 12}},
-    }.items():
-        (tmp_path / "results" / f"{name}.json").write_text(json.dumps(table | changes))
-    monkeypatch.setattr(study, "_SWEEPS", tmp_path)
-    monkeypatch.setattr(study, "STALE", {"listed": "the box had a lid", "settings": "x"})
-    monkeypatch.setattr(sources, "EQUAL", tmp_path / "equal.json")
-    words = (SWEEPS / "publish", "--check-digests", "--out", tmp_path / "run")
-    assert rps(*words) == 2
-    assert "the inputs of renamed have changed" in capsys.readouterr().err
-    assert rps(*words, "--confirm", "equal runs", "--only", "current") == 2
-    assert not (tmp_path / "equal.json").exists()
-    assert rps(*words, "--confirm", "equal runs", "--only", "ren*") == 0
-    (entry,) = json.loads((tmp_path / "equal.json").read_text())
-    assert (entry["reason"], entry["files"]) == ("equal runs", ["renamed"])
-    assert entry["code"] == {"engines": ["0" * 12, code["engines"]]}
-    output = capsys.readouterr().out
-    assert "confirmed: its code changed, its numbers did not" in output
-
-
-def test_a_file_of_an_earlier_version_is_current_if_its_inputs_are(tmp_path, monkeypatch, capsys):
-    data = json.loads((SWEEPS / "table" / "results" / "table.json").read_text())
-    data["digest"] = study.digest([shlex.split(line) for line in data["command"]])
-    data |= {"code": sources.digests(), "commit": "0123456789abcdef"}
-    (tmp_path / "results").mkdir()
-    for name, version in {"old": "0.3.0", "new": rps_jax.__version__}.items():
-        versions = data["versions"] | {"rps_jax": version}
-        (tmp_path / "results" / f"{name}.json").write_text(
-            json.dumps(data | {"versions": versions})
-        )
-    monkeypatch.setattr(study, "_SWEEPS", tmp_path)
-    monkeypatch.setattr(study, "STALE", {})
-    assert rps(SWEEPS / "publish", "--check-digests", "--out", tmp_path / "run") == 0
-    output = " ".join(capsys.readouterr().out.split())
-    assert "computed by 0.3.0, still current" in output
-    assert f"1 of 2 data files are of rps_jax {rps_jax.__version__}" in output
-    assert "1 are of earlier code that gives the same numbers, and 0 are stale" in output
-    assert "01234567" in output
+def test_a_small_run_gives_its_record_again(tmp_path, monkeypatch):
+    """The record has each number of its results once, by name."""
+    monkeypatch.setattr(probes, "FILE", tmp_path / "probes.json")
+    probe = "push_quasistatic"
+    id = probes.store(probe, probes.run(probe))
+    probes.run.cache_clear()
+    assert probes.differences({probe: id}) == []
+    record = probes.stored()[probe][id]
+    assert {"results/time", "results/v_y"} <= record["variables"].keys()
+    assert probes.used([{probe: id}]) == probes.stored()
+    assert probes.used([{probe: "other"}]) == {}
 
 
 def test_the_note_of_a_table_says_that_its_numbers_are_stale(monkeypatch):

@@ -1,8 +1,7 @@
 """State of the published numbers, and the commands that compute them again.
 
-rps sweeps/publish                       # stale data files, with reasons and durations
-rps sweeps/publish --check-digests       # fails if a data file is stale and not listed as such
-rps sweeps/publish --confirm "REASON"    # states that changes of the code altered no number
+rps sweeps/publish                       # all data files, with version, state and duration
+rps sweeps/publish --check-probes        # runs the probes; fails if a stale file is not listed
 rps sweeps/publish --only 'fit_*' table  # computes these again; a killed run is continued
 rps sweeps/publish --only '*' --needs gpu
 """
@@ -24,32 +23,27 @@ from typing import Any, ClassVar, Literal
 
 import xarray as xr
 
-import rps_jax
 from rps_jax import errors
 from rps_jax.analysis.report import Section
 from rps_jax.app.cli import flags, names
 from rps_jax.errors import InputError
-from rps_jax.record import files, provenance
+from rps_jax.record import provenance
 from rps_jax.runs.question import Run, call_of
-from sweeps import sources
+from sweeps import probes
 from sweeps.publish.recipes import HISTORY, RECIPES, Recipe
 from sweeps.render_tables import STALE
 from sweeps.study_base import (
     Rows,
     Study,
     Table,
-    digest,
     machine,
     records,
-    rooms_of,
     split_folder,
     text_table,
     write_table,
 )
 
 _SWEEPS = Path(__file__).parents[1]
-CURRENT = "of today's code"
-EARLIER = "still current"
 _KEYS = ("version", "commit", "date", "state", "computed on", "two cores", "one H100")
 
 
@@ -61,19 +55,16 @@ class Publish(Study[xr.Dataset]):
     """
 
     TITLE: ClassVar[str] = "Published numbers and their dependencies"
-    GROWS: ClassVar[tuple[str, ...]] = ("only", "needs", "check_digests", "confirm")
+    GROWS: ClassVar[tuple[str, ...]] = ("only", "needs", "check_probes")
 
     only: tuple[str, ...] = ()
-    """Data files to compute again, as fit_coverage or fit_*; by default none. With --confirm, those
-    that it is about; by default all."""
+    """Data files to compute again, as fit_coverage or fit_*; by default none. With --check-probes,
+    those to check; by default all."""
     needs: Literal["any", "cpu", "gpu"] = "any"
     """Device of the data files to compute again: processors, a GPU, or both."""
-    check_digests: bool = False
-    """Whether to fail if the inputs of a published number have changed since it was computed, or
-    if STALE in sweeps/render_tables.py, which permits that, lists a number that is up to date."""
-    confirm: str = ""
-    """Reason why changes of the source code altered no number, such as equal digests of small runs,
-    for all files that are stale by their code alone and not in STALE."""
+    check_probes: bool = False
+    """Whether to run the small runs of the data files, and to fail if they give other numbers than
+    when a file was computed, or if STALE in sweeps/render_tables.py lists a file without need."""
 
     def check(self) -> None:
         """Check that the data files exist."""
@@ -84,23 +75,32 @@ class Publish(Study[xr.Dataset]):
 
     def answer(self, run: Run) -> xr.Dataset:
         """Compute selected data files again, and return the state of all data files."""
-        if self.confirm:
-            confirm(self.confirm, self.only or ("*",))
-        elif self.only:
+        if self.only and not self.check_probes:
             self._compute_again(run)
-        states = [xr.Dataset(_description(path), {"file": path.stem}) for path in published()]
-        results = xr.concat(states, "file")
-        states = dict(zip(results.file.values.tolist(), results.state.values.tolist(), strict=True))
-        if self.check_digests and (problems := stale_problems(states)):
-            raise InputError(" ".join(problems))
+        descriptions = []
+        for path in published():
+            checked = self.check_probes and self._selects(path.stem)
+            description = _description(path, checked)
+            descriptions.append(xr.Dataset(description, {"file": path.stem}))
+            if checked:
+                print(f"{path.stem}: {description['state']}", flush=True)
+        results = xr.concat(descriptions, "file")
+        if self.check_probes:
+            rows = zip(results.file.values.tolist(), results.state.values.tolist(), strict=True)
+            states = {name: state for name, state in rows if self._selects(name)}
+            if problems := stale_problems(states):
+                raise InputError(" ".join(problems))
         return results
+
+    def _selects(self, name: str) -> bool:
+        """Return whether `only` has a data file; empty, it has all."""
+        return not self.only or any(_match(name, pattern) for pattern in self.only)
 
     def _compute_again(self, run: Run) -> None:
         """Compute the selected data files in turn; failures are collected until the end."""
         failed, folder = [], run.folder or self.default_folder
         for name, recipe in RECIPES.items():
-            selected = any(_match(name, pattern) for pattern in self.only)
-            if not selected or self.needs not in ("any", recipe.device):
+            if not self._selects(name) or self.needs not in ("any", recipe.device):
                 continue
             start = time.perf_counter()
             try:
@@ -120,15 +120,11 @@ class Publish(Study[xr.Dataset]):
         """Return a row per data file, current ones last."""
         ordered = results.sortby("state", ascending=False)
         columns = {name: f"{{{name}}}" for name in ("file", *_KEYS)}
-        states = results.state.values.tolist()
-        kinds = ("stale", CURRENT, "confirmed", EARLIER)
-        stale, today, *same = (sum(kind in state for state in states) for kind in kinds)
+        stale = sum(state.startswith("stale") for state in results.state.values.tolist())
         text = (
-            f"{today} of {len(states)} data files are of rps_jax {rps_jax.__version__} and today's "
-            f"code. {sum(same)} are of earlier code that gives the same numbers, and {stale} are "
-            "stale. A version is that of the code at the commit: between two releases it is the "
-            "earlier one. A file without a digest is older than the digests: only its command and "
-            "its commit tell its inputs."
+            f"{stale} of {results.sizes['file']} data files are stale. A version is that of the "
+            "code at the commit: between two releases it is the earlier one. Small runs tell if "
+            "later code gives the same numbers (`--check-probes`); a measured time has none."
         )
         rows = text_table(columns, records(ordered, "file"))
         return [Table(rows, title="Data files", text=text)]
@@ -151,50 +147,21 @@ def stale_problems(states: Mapping[str, str]) -> list[str]:
     problems = []
     if unlisted := sorted(stale - STALE.keys()):
         problems.append(
-            f"published numbers are stale: the inputs of {', '.join(unlisted)} have changed; "
+            f"published numbers are stale: small runs of {', '.join(unlisted)} give other numbers; "
             f"compute them again by rps sweeps/publish --only {' '.join(unlisted)}, or list them "
-            "in STALE of sweeps/render_tables.py with the change, or, if the code changed and the "
-            "numbers are the same, state why by rps sweeps/publish --confirm REASON."
+            "in STALE of sweeps/render_tables.py with the change."
         )
-    if current := sorted(STALE.keys() - stale):
+    if current := sorted((STALE.keys() & states.keys()) - stale):
         problems.append(
-            f"STALE in sweeps/render_tables.py lists {', '.join(current)}, which no change has "
-            "made stale: remove these names, and run python sweeps/render_tables.py."
+            f"STALE in sweeps/render_tables.py lists {', '.join(current)}, whose small runs give "
+            "the same numbers: remove these names, and run python sweeps/render_tables.py."
         )
+    if unknown := sorted(STALE.keys() - {path.stem for path in published()}):
+        problems.append(f"STALE in sweeps/render_tables.py lists {', '.join(unknown)}, no file.")
     return problems
 
 
-def confirm(reason: str, patterns: Sequence[str]) -> None:
-    """State in `equal.json` that the source code of today gives the numbers of current files.
-
-    `patterns` select data files. The digests of the code of older files, which have none, are first
-    stored in `commits.json`.
-    """
-    datas = {path.stem: json.loads(path.read_text()) for path in published()}
-    datas = {name: data for name, data in datas.items() if "digest" in data}
-    sources.store({data["commit"] for data in datas.values() if "code" not in data})
-    names, code = [], dict[str, list[str]]()
-    for name, data in datas.items():
-        selected = any(fnmatch.fnmatch(name, pattern) for pattern in patterns)
-        if name in STALE or not selected or not _has_current_settings(data):
-            continue
-        rooms = rooms_of(map(shlex.split, data["command"]))
-        for room in (changed := sources.changed_rooms(name, data, rooms)):
-            code.setdefault(room, []).append(sources.latest(name, room, data))
-        names += [name] if changed else []
-    if names:
-        today = sources.digests()
-        code = {room: [*sorted({*old}), today[room]] for room, old in sorted(code.items())}
-        changes = [*sources.equal_changes(), {"reason": reason, "files": names, "code": code}]
-        files.write_text(sources.EQUAL, json.dumps(changes, indent=1) + "\n")
-
-
-def _has_current_settings(data: Mapping[str, Any]) -> bool:
-    """Return whether the settings of the commands of a data file are those of today."""
-    return digest([shlex.split(command) for command in data["command"]]) == data["digest"]
-
-
-def _description(path: Path) -> dict[str, str]:
+def _description(path: Path, checked: bool) -> dict[str, str]:
     """Return version, commit, date, state and duration of a data file, in words."""
     data = json.loads(path.read_text())
     recipe = next((r for name, r in RECIPES.items() if fnmatch.fnmatch(path.stem, name)), None)
@@ -207,33 +174,27 @@ def _description(path: Path) -> dict[str, str]:
         "computed on": recipe.device if recipe else "",
         "two cores": cores,
         "one H100": gpu,
-        "state": _state(path.stem, data),
+        "state": _state(path.stem, data, checked),
     }
 
 
-def _state(name: str, data: Mapping[str, Any]) -> str:
-    """Return whether a data file is up to date."""
+def _state(name: str, data: Mapping[str, Any], checked: bool) -> str:
+    """Return whether a data file is up to date; its small runs tell it if `checked`."""
     if "command" not in data:
         cited = {cell["from"] for row in data["rows"] for cell in row if isinstance(cell, dict)}
         return f"cites {', '.join(sorted(cited))}"
     if name in HISTORY:
         return f"history: {HISTORY[name]}"
-    version = str(data["versions"]["rps_jax"])
-    if "digest" not in data:
-        return f"computed by {version}, without a digest"
-    try:
-        is_current = _has_current_settings(data)
-    except (InputError, SystemExit) as error:
-        return f"stale: its command does not exist today ({error})"
-    change = "" if is_current else "a change of its laws, domains, physics or seeds"
-    rooms = rooms_of(map(shlex.split, data["command"]))
-    if not change and (changed := sources.changed_rooms(name, data, rooms)):
-        change = f"a change of the code of {', '.join(changed)}"
-    if change:
-        return f"stale: computed before {STALE.get(name, change)}"
-    if sources.changed_rooms("", data, rooms):
-        return "confirmed: its code changed, its numbers did not, by equal.json"
-    return CURRENT if version == rps_jax.__version__ else f"computed by {version}, {EARLIER}"
+    state = f"computed by {data['versions']['rps_jax']}"
+    if not checked:
+        return f"stale: computed before {STALE[name]}" if name in STALE else state
+    if not probes.probes_of(name):
+        return f"{state}, a measurement"
+    if missing := probes.probes_of(name) - data.get("probes", {}).keys():
+        return f"stale: {state}, without records of {', '.join(sorted(missing))}"
+    if changed := probes.differences(data["probes"]):
+        return f"stale: {state}, today's {', '.join(changed)} differ"
+    return f"{state}, still current"
 
 
 # --- computing data files again -------------------------------------------------------------

@@ -1,0 +1,250 @@
+"""Small runs that tell whether today's code still gives the published numbers.
+
+A probe is a short command. Its record has, for each variable of its results, a digest of the bits,
+their mean and their root mean square. `PROBES_OF` names the probes of each data file. A data file
+stores the record that its code gave, by an identifier of `publish/probes.json`, and it is current
+if today's run of each probe gives the same: bit for bit on the same processor with the same
+versions, else within `TOLERANCE`.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import fnmatch
+import functools
+import hashlib
+import io
+import json
+import platform
+import re
+import shlex
+import tempfile
+from collections.abc import Iterable, Mapping
+from importlib import metadata
+from pathlib import Path
+from typing import Any, TypeAlias
+
+import numpy as np
+import xarray as xr
+
+from rps_jax.app import cli
+from rps_jax.record import files
+
+Record: TypeAlias = dict[str, Any]  # processor, versions, variables: digest, mean, size of each
+
+FILE = Path(__file__).with_name("publish") / "probes.json"
+TOLERANCE = 0.05  # of the root mean square of a variable, on another processor
+_SWEEPS = Path(__file__).parent
+_PACKAGES = ("jax", "mujoco", "numpy")
+_WALL_TIMES = ("compile", "run", "differentiate")  # variables of results
+_FLOAT = re.compile(r"(?<![\w.])[-+]?\d+(?:\.\d+)?(?:e[-+]?\d+)?")
+_BOX = "wide,objects=random_box"
+_SHORT = "--horizon 20"
+_FAST = "sweep --worlds 24 --laws rps_tuned rps_plus"
+
+# Commands of the probes, by name. A command may read the run folder of an earlier probe.
+PROBES = {
+    "table": "table --quick",
+    "table_mjx": "table --engine mjx --objects box --friction S1 --targets -2 0 2 0 --horizon 1",
+    "push_mujoco": "push --object box --target 0.6 0 --no-video",
+    "push_fused": "push --object cylinder --target 0.8 0.3 --engine fused --no-video",
+    "push_quasistatic": "push --object box --target 0.6 0 --engine quasistatic --no-video",
+    "hardware": "hardware --quick --engine fused --horizon 20 --shifts 0.1",
+    "wide": f"{_FAST} rps nps aps --domain wide --horizon 60",
+    "hostile": "sweep --worlds 24 --laws rps aps learned --domain hostile --horizon 60",
+    "real": f"sweep --worlds 32 --laws rps_tuned force_push --domain real {_SHORT}",
+    "prisms": f"sweep --worlds 32 --laws rps_tuned dipole --domain prisms {_SHORT}",
+    "feet": f"{_FAST} --domain wide,feet=0.5:0.9 --horizon 60",
+    "round": f"{_FAST} --domain wide --robot round {_SHORT}",
+    "path": f"{_FAST} learned --task path {_SHORT}",
+    "corridor": f"{_FAST} learned --task corridor {_SHORT}",
+    "floor": f"{_FAST} --domain wide,slope=0:0.05,boundary_factor=1:2 {_SHORT}",
+    "mujoco": f"sweep --worlds 12 --laws rps rps_tuned --engine mujoco {_SHORT}",
+    "mjx": f"sweep --worlds 8 --laws rps --engine mjx --domain {_BOX} --horizon 1",
+    "quasistatic": f"sweep --worlds 32 --laws rps --engine quasistatic --domain {_BOX}",
+    "ladder": f"ladder --quick --worlds 12 {_SHORT}",
+    "score": f"score rps,K_h=0.5 --worlds 16 {_SHORT}",
+    "ceiling": f"ceiling --domain {_BOX} --quick --horizon 60",
+    "attack": f"attack --quick --generations 2 --minutes 60 --batch 16 {_SHORT}",
+    "rare": f"rare --quick --law rps --domain {_BOX} --particles 40 --levels 2 {_SHORT}",
+    "regress": f"regress --laws rps rps_plus --worlds 12 {_SHORT}",
+    "sensitivity": f"sensitivity --quick --worlds 128 {_SHORT}",
+    "tune_es": f"tune es --quick --generations 2 --population 8 --worlds 16 {_SHORT}",
+    "tune_grad": "tune grad --quick --steps 2 --worlds 8 --horizon 20",
+    "learn": "learn --quick --updates 2 --minutes 60 --num-envs 16 --num-minibatches 2",
+    "gallery": "gallery RUNS/mujoco --each 2",
+    "replay": "replay RUNS/mujoco 3 --law rps --no-video",
+    "export_c": "export c --law rps_plus",
+    "export_js": "export js --law rps",
+    "real_pushes": f"{_SWEEPS / 'real_pushes'} --quick --mujoco 0",
+    "planning": f"{_SWEEPS / 'planning'} --quick",
+}
+_TRIALS = ("wide", "hostile", "real")
+# Probes of each data file, by the first pattern that its name has. A measured time has none.
+PROBES_OF: Mapping[str, tuple[str, ...]] = {
+    "table_mjx": ("table_mjx",),
+    **dict.fromkeys(("table", "grid"), ("table",)),
+    **dict.fromkeys(("gazebo*", "readings*", "fidelity", "rest"), ("table", "push_mujoco")),
+    **dict.fromkeys(("hardware", "shoves", "reading_*"), ("hardware",)),
+    "corridors_*": ("path", "corridor"),
+    "tuned_for_corridors": ("wide", "real"),
+    "tasks_parity": ("path", "corridor", "mujoco", "mjx"),
+    "force_push_paths": ("path", "prisms"),
+    "force_push_grid": ("real", "push_mujoco"),
+    "floors_*": ("floor",),
+    "engines_*": ("wide", "mujoco", "mjx", "quasistatic"),
+    "export_*": ("export_c", "export_js", "wide"),
+    "attack": ("attack",),
+    "rare*": ("rare", "wide"),
+    "regression": ("regress",),
+    "sensitivity": ("sensitivity", "hostile", "real"),
+    "fit_real*": ("real_pushes",),
+    "fit_*": ("push_fused", "wide"),
+    "real_pushes_*": ("real_pushes",),
+    "gradients_*": ("planning", "tune_grad", "learn"),
+    **dict.fromkeys(("ground", "straight"), ("push_mujoco", "push_fused")),
+    "ceiling": ("ladder", "ceiling"),
+    **dict.fromkeys(("ladder", "bearings", "plus", "saturation", "tuned"), ("ladder", *_TRIALS)),
+    "rivals_tuned": ("ladder", "tune_es"),
+    "landscape": ("wide", "hostile", "tune_es"),
+    **dict.fromkeys(("learned_test", "learned_failures", "sb3"), ("hostile", "learn")),
+    **dict.fromkeys(("learned_variants", "learned_continued"), ("hostile", "learn")),
+    **dict.fromkeys(("limits", "sizes", "mends"), ("wide", "hostile")),
+    **dict.fromkeys(("plans", "replans"), ("planning",)),
+    "feet": ("wide", "feet"),
+    **dict.fromkeys(("headline", "models"), (*_TRIALS, "path", "corridor", "mujoco")),
+    **dict.fromkeys(("million", "random_worlds", "robots"), ("wide", "real")),
+    "real": ("real",),
+    "round_base*": ("round",),
+    **dict.fromkeys(("arena", "commands*", "compilers*", "costs", "derivatives*", "gpus"), ()),
+    **dict.fromkeys(("kernel", "levers", "robot", "speed*", "tasks_cost_*"), ()),
+    **dict.fromkeys(("dependencies", "extras"), ()),
+}
+
+
+def probes_of(name: str) -> set[str]:
+    """Return the names of the probes of a data file."""
+    return set(next((v for k, v in PROBES_OF.items() if fnmatch.fnmatch(name, k)), ()))
+
+
+def stored_ids(name: str) -> dict[str, str]:
+    """Run the probes of a data file; return the identifiers of their records, which are stored."""
+    return {probe: store(probe, run(probe)) for probe in sorted(probes_of(name))}
+
+
+def differences(ids: Mapping[str, str]) -> list[str]:
+    """Return the probes whose run of today differs from the records of a data file."""
+    return [probe for probe, id in ids.items() if not same(stored()[probe][id], run(probe))]
+
+
+def same(record: Record, today: Record) -> bool:
+    """Return whether a run gives the numbers of a record; names of variables may differ."""
+    before, now = record["variables"], today["variables"]
+    if {k: record[k] for k in ("processor", "versions")} == {
+        k: today[k] for k in ("processor", "versions")
+    }:
+        return {row[0] for row in before.values()} <= {row[0] for row in now.values()}
+    return before.keys() <= now.keys() and all(
+        abs(a - b) <= TOLERANCE * max(size, 1e-9)
+        for name, (_, *row, size) in before.items()
+        for a, b in zip((*row, size), now[name][1:], strict=True)
+    )
+
+
+# --- records --------------------------------------------------------------------------------
+
+
+def stored() -> dict[str, dict[str, Record]]:
+    """Return the records of all probes, by their identifiers."""
+    return json.loads(FILE.read_text(encoding="utf-8")) if FILE.exists() else {}
+
+
+def store(probe: str, record: Record) -> str:
+    """Store the record of a probe, and return its identifier."""
+    id = hashlib.sha256(json.dumps(record, sort_keys=True).encode()).hexdigest()[:12]
+    records = stored()
+    records.setdefault(probe, {})[id] = record
+    write(records)
+    return id
+
+
+def write(records: Mapping[str, Mapping[str, Record]]) -> None:
+    """Write records, a line for each."""
+    lines = [
+        f" {json.dumps(probe)}: {{\n"
+        + ",\n".join(f"  {json.dumps(id)}: {json.dumps(x)}" for id, x in sorted(rows.items()))
+        + "\n }"
+        for probe, rows in sorted(records.items())
+    ]
+    files.write_text(FILE, "{\n" + ",\n".join(lines) + "\n}\n")
+
+
+def used(ids: Iterable[Mapping[str, str]]) -> dict[str, dict[str, Record]]:
+    """Return the stored records that data files name."""
+    pairs = {pair for of_file in ids for pair in of_file.items()}
+    return {
+        probe: rows
+        for probe, records in stored().items()
+        if (rows := {id: x for id, x in records.items() if (probe, id) in pairs})
+    }
+
+
+@functools.cache
+def run(probe: str) -> Record:
+    """Return the record of a probe, run by the code of today."""
+    out = Path(_folder().name) / probe
+    words = PROBES[probe].split()
+    for word in words:
+        if word.startswith("RUNS/"):
+            run(word.removeprefix("RUNS/"))
+    words = [word.replace("RUNS", _folder().name) for word in words]
+    text = io.StringIO()
+    with contextlib.redirect_stdout(text), contextlib.redirect_stderr(text):
+        code = cli.main([*words, "--out", str(out)])
+    if code:
+        raise RuntimeError(f"the probe `rps {shlex.join(words)}` fails: {text.getvalue()[-400:]}")
+    return {
+        "processor": _processor(),
+        "versions": {name: metadata.version(name) for name in _PACKAGES},
+        "variables": dict(sorted(_variables(out))),
+    }
+
+
+@functools.cache
+def _folder() -> tempfile.TemporaryDirectory[str]:
+    return tempfile.TemporaryDirectory()
+
+
+def _processor() -> str:
+    """Return the model of the processor, or of the GPU that JAX uses."""
+    import jax
+
+    if (used_device := jax.devices()[0]).platform != "cpu":
+        return used_device.device_kind
+    info = Path("/proc/cpuinfo")
+    match = re.search(r"model name\s*: (.*)", info.read_text()) if info.exists() else None
+    return match[1] if match else platform.machine()
+
+
+def _variables(out: Path) -> Iterable[tuple[str, list[Any]]]:
+    """Yield name, and digest, mean and root mean square of the finite numbers, of each array."""
+    for path in sorted(out.rglob("*")):
+        if path.suffix == ".nc" and "parts" not in path.parts:
+            with xr.open_datatree(path) as tree:
+                for group in tree.subtree:
+                    for name, values in group.variables.items():
+                        array = np.ascontiguousarray(values)
+                        if array.dtype.kind in "biuf" and name not in _WALL_TIMES:
+                            key = f"{path.stem}{group.path.rstrip('/')}/{name}"
+                            yield key, _row(array)
+        elif path.suffix in (".h", ".mjs"):  # the numbers, without comments
+            text = re.sub(r"//[^\n]*|/\*.*?\*/", "", path.read_text(), flags=re.DOTALL)
+            yield path.name, _row(np.array(_FLOAT.findall(text), float))
+
+
+def _row(array: np.ndarray) -> list[Any]:
+    """Return digest, mean and root mean square of an array."""
+    numbers = array.astype(float).ravel()
+    numbers = numbers[np.isfinite(numbers)]
+    mean, size = (numbers.mean(), np.sqrt((numbers**2).mean())) if numbers.size else (0.0, 0.0)
+    return [hashlib.sha256(array.tobytes()).hexdigest()[:12], float(mean), float(size)]
