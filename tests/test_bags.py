@@ -158,6 +158,14 @@ def test_the_steps_of_a_path_end_with_a_path_without_poses(tmp_path, capsys):
     xr.testing.assert_allclose(both[0], both[1].isel(time=slice(30)))
 
 
+@pytest.mark.parametrize("points", [bad_bags.LINE[:1], bad_bags.LINE[:1] * 3])
+def test_a_path_of_equal_poses_is_refused(points, tmp_path, capsys):
+    rows = bad_bags.on_path({0: points, 20: points}, "/target")
+    path = bad_bags.plain(rows)(tmp_path)
+    error = refusal(capsys, "shadow", path, "--law", "rps", "--out", tmp_path / "run")
+    assert "a path without length: publish two different poses or more" in error
+
+
 @pytest.mark.parametrize(
     ("field", "factors", "words"),
     [
