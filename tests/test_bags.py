@@ -148,7 +148,7 @@ def test_the_commands_take_the_names_of_topics(recorded, tmp_path, capsys):
 
 
 def test_the_steps_of_a_path_end_with_a_path_without_poses(tmp_path, capsys):
-    """As docs/on_a_robot.md tells users to publish at the end."""
+    """Users of docs/on_a_robot.md publish it at the end."""
     paths = {0: bad_bags.LINE, 20: bad_bags.LINE, 30: ()}
     rows = bad_bags.on_path(paths, "/target"), bad_bags.on_path({0: bad_bags.LINE}, "/target")
     ended, whole = (bad_bags.plain(x, name=f"{len(x)}.mcap")(tmp_path) for x in rows)

@@ -337,9 +337,9 @@ def _steps(path: Path, renamed: dict[str, str], senses: Collection[str]) -> dict
     commands = commands.at(commands.time >= max(s.time[0] for s in series.values()))
     if end is not None and "path" in series:
         paths = series["path"]
-        if (ends := end.time[end.time > paths.time[0]]).size:
-            paths.refuse(paths.time > ends[0], "a path after one without poses")
-            commands = commands.at(commands.time < ends[0])
+        if (stops := end.time[end.time > paths.time[0]]).size:
+            paths.refuse(paths.time > stops[0], "a path after one without poses")
+            commands = commands.at(commands.time < stops[0])
     if (count := len(commands.time)) < 2:
         words = f"has too few commands, {count}, on {commands.topic} after all topics have begun"
         raise InputError(f"{words}: record at least two")

@@ -220,10 +220,12 @@ class Corridor(Path):
             rule = "it must leave room for its corners: give fewer or smaller turns, longer parts"
             raise errors.not_allowed("task width (high)", f"{self.width.high:g} m", rule)
         if self.waypoints:
-            half, route = np.array([self.width.high / 2]), self.route()
-            path, line = PathCourse(Polyline.through(route[None]), half), route @ (1, 1j)
-            (walls,) = CorridorCourse.around(path, half, half, self.doors).walls @ (1, 1j)
-            away = distances(*walls.T[..., None], line[:-1], line[1:]).min(axis=0)
+            half: Any = np.array([self.width.high / 2])
+            route = self.route()
+            path = PathCourse(Polyline.through(route[None]), half)
+            walls: Any = CorridorCourse.around(path, half, half, self.doors).walls
+            (a, b), line = (walls[0] @ (1, 1j)).T[..., None], route @ (1, 1j)
+            away = distances(a, b, line[:-1], line[1:]).min(axis=0)
             if away.min() < 0.999 * half:
                 rule = (
                     f"walls of another part of the corridor are {away.min():.2f} m from the path "

@@ -80,18 +80,18 @@ class Rooms(Following):
         corners = {f"task polygon {i}": polygon for i, polygon in enumerate(polygons)}
         corners |= {"task outline": file["outline"]} if "outline" in file else {}
         starts, rings = values.get("start", cls.start), list[np.ndarray]()
-        ends = [("start", x) for x in starts] + [("goal", x) for x in values.get("goal", ())]
+        poses = [("start", x) for x in starts] + [("goal", x) for x in values.get("goal", ())]
         _check_count(3 * len(corners))
         for name in corners:
             rings.append(ring := _ring(name, corners[name]))
-            for end, value in ends:  # ring by ring, since polygons may overlap
+            for end, value in poses:  # ring by ring, since polygons may overlap
                 point = complex(*value[:2])
                 is_outside = is_inside(point, ring, np.roll(ring, -1)) != (name == "task outline")
                 if is_outside and abs(point) < 1000:
                     raise errors.not_allowed(f"task {end}", value, _OUTSIDE)
         if file.keys() - {"polygons", "outline", *_IGNORED}:
             if "outline" in file:
-                rule = "an image has outlines of its own: give polygons with it"
+                rule = "the image defines the outline: give polygons with it"
                 raise errors.not_allowed("task outline", file["outline"], rule)
             rings += _read_image(file, starts)
         if file.keys() - {"polygons"}:  # walls around the room make its outside an obstacle
@@ -213,14 +213,13 @@ def _read_image(file: Mapping[str, Any], starts: Any) -> list[np.ndarray]:
         rule = "it lies in an obstacle, in unknown cells or outside of the image"
         raise errors.not_allowed("task start", starts, rule)
     free = np.isin(labels, reached)
-    # Each obstacle has two walls or more.
-    _check_count(2 * ndimage.label(~free, np.ones((3, 3)))[1])
+    obstacles: Any = ndimage.label(~free, np.ones((3, 3)))
+    _check_count(2 * obstacles[1])  # each has two walls or more
     if share := 100 * np.mean(abs(255 * np.pad(shades, 1)[free] - _UNKNOWN) < 0.5):
-        warnings.warn(
+        _warn_once(
             f"{share:.2g} % of the free cells of the map have the grey {_UNKNOWN} of unknown "
             f"cells, which free_thresh = {low:g} counts as free: write free_thresh: 0.196, and "
-            "they are walls",
-            stacklevel=2,
+            "they are walls"
         )
     rings = list[np.ndarray]()
     lines: Any = contourpy.contour_generator(z=free.astype(float)).lines(0.5)
@@ -233,6 +232,11 @@ def _read_image(file: Mapping[str, Any], starts: Any) -> list[np.ndarray]:
         ring = np.concatenate([_simplify(x, tolerance / resolution)[:-1] for x in halves])
         rings.append(origin + unit * ring)
     return rings
+
+
+@functools.cache  # a command reads its map several times
+def _warn_once(sentence: str) -> None:
+    warnings.warn(sentence, stacklevel=3)
 
 
 def _shades(path: Path) -> np.ndarray:
