@@ -88,11 +88,6 @@ def check_finite(name: str, value: Any, **bounds: Any) -> float:
     return scalar
 
 
-def check_angle(name: str, value: Any) -> float:
-    """Return a finite angle [rad] of at most one turn; most angles in degrees are refused."""
-    return check_finite(name, value, at_least=-2 * math.pi, at_most=2 * math.pi, unit="rad")
-
-
 def check_vector(name: str, values: Iterable[object], **bounds: float | str) -> list[float]:
     """Return the finite numbers x and y within bounds: see `check_number`."""
     axes = zip("xy", values, strict=True)

@@ -148,7 +148,7 @@ def test_the_commands_take_the_names_of_topics(recorded, tmp_path, capsys):
 
 
 def test_the_steps_of_a_path_end_with_a_path_without_poses(tmp_path, capsys):
-    """As docs/on_a_robot.md tells users to publish at the end."""
+    """Users of docs/on_a_robot.md publish it at the end."""
     paths = {0: bad_bags.LINE, 20: bad_bags.LINE, 30: ()}
     rows = bad_bags.on_path(paths, "/target"), bad_bags.on_path({0: bad_bags.LINE}, "/target")
     ended, whole = (bad_bags.plain(x, name=f"{len(x)}.mcap")(tmp_path) for x in rows)
@@ -156,6 +156,14 @@ def test_the_steps_of_a_path_end_with_a_path_without_poses(tmp_path, capsys):
     assert "30 commands in 0.6 s" in capsys.readouterr().out
     both = shadow(ended, "rps"), shadow(whole, "rps")
     xr.testing.assert_allclose(both[0], both[1].isel(time=slice(30)))
+
+
+@pytest.mark.parametrize("points", [bad_bags.LINE[:1], bad_bags.LINE[:1] * 3])
+def test_a_path_of_equal_poses_is_refused(points, tmp_path, capsys):
+    rows = bad_bags.on_path({0: points, 20: points}, "/target")
+    path = bad_bags.plain(rows)(tmp_path)
+    error = refusal(capsys, "shadow", path, "--law", "rps", "--out", tmp_path / "run")
+    assert "a path without length: publish two different poses or more" in error
 
 
 @pytest.mark.parametrize(

@@ -16,7 +16,7 @@ import xarray as xr
 from rps_jax import errors
 from rps_jax.analysis.report import Section
 from rps_jax.control import registry, validation
-from rps_jax.control.base import Law, LawParams
+from rps_jax.control.base import Law, LawParams, named_leaves
 from rps_jax.control.observation import Twist, with_base_radius
 from rps_jax.errors import InputError
 from rps_jax.geometry import planar
@@ -60,8 +60,7 @@ class Shadow(BagQuestion[xr.Dataset]):
     def steps(self) -> dict[str, np.ndarray]:
         """Steps of the bag."""
         shapes = validation.observation_shapes(registry.law_of(self.params).senses)
-        senses = [path[-1].name for path, _ in jax.tree_util.tree_flatten_with_path(shapes)[0]]
-        return bags.read(Path(self.file), self.topics, senses)
+        return bags.read(Path(self.file), self.topics, named_leaves(shapes))
 
     def check(self) -> None:
         """Check the law, the robot and the bag."""
@@ -125,11 +124,13 @@ def pursued(recorded: dict[str, np.ndarray], lookahead: float) -> np.ndarray:
     """Return the targets (N, 2) [m] on the path of a bag, as of the task `path`.
 
     Raises:
-      InputError: the path changes.
+      InputError: the path changes, or has no length.
     """
     path = recorded["path"]
     if np.ptp(path, axis=0).max() > _STILL:
         raise InputError("the bag has a path that changes: cut the bag where it does.")
+    if np.ptp(path[0], axis=0).max() < _STILL:
+        raise InputError("the bag has a path without length: publish two different poses or more.")
     line: Any = jax.tree.map(jnp.asarray, Polyline.through(path[0]))
     course = PathCourse(line, jnp.asarray(lookahead))
     pose, contact = (jnp.asarray(recorded[name]) for name in ("pose", "p_robot_contact"))

@@ -56,9 +56,8 @@ _MAX_NUMBERS = 2**27  # of all messages, and of all steps; a message counts 32 m
 _MARKER_PERIOD = 1.0  # [s] between two target markers
 _STALE = 1.0  # [s] that a stream of messages may pause
 _EARLY = 0.1  # [s] before a transform that it holds
-_SKEW = 0.5  # [s] of 80 % of the delays between stamp and receipt, or of 90 % of late stamps
-_DRIFT = 0.02  # [s] change of the delay from the first to the last quarter of the messages
-_SHORTEST = 0.01  # [m] extent of a path
+_SKEW = 5e8  # [ns] of 80 % of the delays between stamp and receipt, or of 90 % of late stamps
+_DRIFT = 2e7  # [ns] change of the delay from the first to the last quarter of the messages
 _MAX_TILT = 0.1  # [rad] of the base against the floor
 _UNIT = 1e-3  # [1] by which the norm of a quaternion may differ from 1
 _SAME = 1e-6  # [m, rad] by which two frames may differ that are one
@@ -314,7 +313,7 @@ def _steps(path: Path, renamed: dict[str, str], senses: Collection[str]) -> dict
     goal = "path" if known & {"path", _END} and "target" not in known else "target"
     required = dict.fromkeys(["odom", goal, "cmd_vel", *renamed])
     missing = [
-        names[key] + " with poses" * (key == "path")
+        f"{names[key]}{' with poses' if key == 'path' else ''}"
         for key in required
         if key not in {*known, *_TREE}
     ]
@@ -338,9 +337,9 @@ def _steps(path: Path, renamed: dict[str, str], senses: Collection[str]) -> dict
     commands = commands.at(commands.time >= max(s.time[0] for s in series.values()))
     if end is not None and "path" in series:
         paths = series["path"]
-        if (ends := end.time[end.time > paths.time[0]]).size:
-            paths.refuse(paths.time > ends[0], "a path after one without poses")
-            commands = commands.at(commands.time < ends[0])
+        if (stops := end.time[end.time > paths.time[0]]).size:
+            paths.refuse(paths.time > stops[0], "a path after one without poses")
+            commands = commands.at(commands.time < stops[0])
     if (count := len(commands.time)) < 2:
         words = f"has too few commands, {count}, on {commands.topic} after all topics have begun"
         raise InputError(f"{words}: record at least two")
@@ -351,10 +350,6 @@ def _steps(path: Path, renamed: dict[str, str], senses: Collection[str]) -> dict
             late = commands.time - row.time > 1e9 * _STALE
             commands.refuse(late, f"no message on {row.topic} in the {_STALE:g} s before that")
         row.check(_MAX_TILT if key == "odom" else None)
-        if key == "path":
-            extent = np.ptp(row.values.reshape(count, -1, 3), axis=1).max(axis=1)
-            fix = "publish two different poses or more, and none at the end of the path"
-            row.refuse(extent < _SHORTEST, f"a path of less than {_SHORTEST} m", fix)
     edges = functools.cache(partial(_edges, path, names, logs["odom"], clock))
     _to_frames(rows, edges, names["tf_static"])
     time = 1e-9 * commands.time
@@ -441,13 +436,10 @@ def _collect(
                 log.append((np.int64(receipt), stamp, pairs.setdefault(pair, pair), values))
                 size += len(values) + 32
                 if (count := len(values)) != (first := len(log[0][3])):
-                    if key == "path":
-                        raise InputError(
-                            f"has a path of {count // 3} poses on {topic} after one of "
-                            f"{first // 3}, received at {receipt} ns: cut the bag there, or "
-                            "publish the same path until its end, and then one without poses"
-                        )
-                    raise ValueError(f"{count} values, not {first}")
+                    raise InputError(
+                        f"has a {kind} of {count} numbers on {topic} after one of {first}, "
+                        f"received at {receipt} ns: cut the bag there, or publish equally many"
+                    )
         except InputError as error:
             faults[key] = error
         except Exception as error:  # of any kind, by the readers of odd messages and types
@@ -470,15 +462,16 @@ def _clock(logs: Iterable[_Log]) -> _Clock:
     pairs = sorted(row[:2] for log in logs for row in log if row[1]) or [(np.int64(0), 0)]
     receipt, stamp = np.array(pairs).T
     delay, latest = receipt - stamp, np.maximum.accumulate(stamp)
-    low, middle, high = (np.sort(delay)[int(q * delay.size)] for q in (0.1, 0.5, 0.9))
-    quarter, skew = max(1, delay.size // 4), 1e9 * _SKEW
-    drift = abs(np.median(delay[:quarter]) - np.median(delay[-quarter:]))
-    is_one = np.quantile(latest - stamp, 0.9) <= skew
-    if high - low <= skew and not (is_one and drift > 1e9 * _DRIFT):
+    low, middle, high = (np.sort(delay)[int(q * len(pairs))] for q in (0.1, 0.5, 0.9))
+    quarter = len(pairs) // 4 + 1
+    drift = np.median(delay[:quarter]) - np.median(delay[-quarter:])
+    is_one = np.quantile(latest - stamp, 0.9) <= _SKEW
+    if high - low <= _SKEW and not (is_one and abs(drift) > _DRIFT):
         return lambda time: time - middle
-    (start, first), passed = (receipt[0], latest[0]), latest - latest[0]
-    pace = lambda t: np.rint(np.interp(t - start, receipt - start, passed)).astype(int)  # noqa: E731
-    return (lambda time: first + pace(time)) if is_one else None
+    if not is_one:
+        return None
+    past, passed = receipt - receipt[0], latest - latest[0]  # small enough for floats
+    return lambda time: latest[0] + np.rint(np.interp(time - receipt[0], past, passed)).astype(int)
 
 
 def _in_order(topic: str, log: _Log, clock: _Clock) -> _Series:

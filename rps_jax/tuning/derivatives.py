@@ -316,7 +316,10 @@ def _value_and_slopes(
         return jax.vmap(partial(_score, score, setting), (1, 0))(snapshots, params)
 
     values, pull_back = jax.vjp(scores, leaves)
-    return values, pull_back(jnp.ones_like(values))[0]
+    try:
+        return values, pull_back(jnp.ones_like(values))[0]
+    except ValueError as error:  # of loops of unknown length
+        raise InputError(f"the derivative of score or law {validation.fault_of(error)}.") from error
 
 
 def _score(score: ScoreLike, setting: Setting, snapshots: Snapshot, params: LawParams) -> jax.Array:
@@ -332,16 +335,6 @@ def _score(score: ScoreLike, setting: Setting, snapshots: Snapshot, params: LawP
     if shown not in ("float32[]", "float64[]", "float"):
         rule = "of the snapshots (T, ...) of one trial it must return one real number"
         raise errors.not_allowed("result of score", shown, rule)
-
-    def slopes(snapshots: Snapshot) -> Any:
-        value, pull_back = jax.vjp(lambda x: jnp.asarray(score(x)), snapshots)
-        return pull_back(jnp.ones_like(value))
-
-    try:
-        jax.eval_shape(slopes, snapshots)
-    except Exception as error:
-        rule = f"its derivative {validation.fault_of(error)}"
-        raise errors.not_allowed("score", getattr(score, "__name__", score), rule) from error
     return jnp.asarray(value)
 
 

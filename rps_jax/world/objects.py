@@ -92,10 +92,9 @@ def check_object(kind: str, name: str, *more: str) -> str:
 
     The error does not offer the names of files, which may have failed.
     """
-    if name in OBJECTS:
-        return name
-    known = [x for x in OBJECTS if x not in REGISTERED or not REGISTERED[x].is_file]
-    return errors.check_name(kind, name, (*more, *known), "FILE.xml")
+    files = {x for x, custom in REGISTERED.items() if custom.is_file} - {name}
+    known = [x for x in (*more, *OBJECTS) if x not in files]
+    return errors.check_name(kind, name, known, "FILE.xml")
 
 
 def text_of(name: str) -> str:

@@ -21,7 +21,7 @@ from rps_jax.geometry import footprint as fp
 from rps_jax.geometry import planar, polyline
 from rps_jax.geometry.arrays import Array, Entries, Float, Int, namespace_of
 from rps_jax.geometry.footprint import Footprint
-from rps_jax.geometry.polyline import Polyline
+from rps_jax.geometry.polyline import Polyline, distances
 from rps_jax.record.options import option
 from rps_jax.robot.shell import Shell
 from rps_jax.world.quantity import Range, check_unused, drawn
@@ -220,19 +220,19 @@ class Corridor(Path):
             rule = "it must leave room for its corners: give fewer or smaller turns, longer parts"
             raise errors.not_allowed("task width (high)", f"{self.width.high:g} m", rule)
         if self.waypoints:
-            half, route = np.array([self.width.high / 2]), self.route()
+            half: Any = np.array([self.width.high / 2])
+            route = self.route()
             path = PathCourse(Polyline.through(route[None]), half)
-            (walls,) = CorridorCourse.around(path, half, half, self.doors).walls @ (1, 1j)
-            line = route @ (1, 1j)
-            away = polyline.distances(*walls.T[..., None], line[:-1], line[1:])
-            wall, part = np.unravel_index(away.argmin(), away.shape)
-            if away[wall, part] < (1 - 1e-6) * half:
+            walls: Any = CorridorCourse.around(path, half, half, self.doors).walls
+            (a, b), line = (walls[0] @ (1, 1j)).T[..., None], route @ (1, 1j)
+            away = distances(a, b, line[:-1], line[1:]).min(axis=0)
+            if away.min() < 0.999 * half:
                 rule = (
-                    f"walls of another part of the corridor are {away[wall, part]:.2f} m from the "
-                    f"path there, less than half of its width ({half[0]:g} m): lead the path "
-                    f"elsewhere; walls begin {_BEHIND} m before it, and end {_BEYOND} m beyond it"
+                    f"walls of another part of the corridor are {away.min():.2f} m from the path "
+                    f"there, less than half of its width ({half[0]:g} m): lead the path elsewhere; "
+                    f"walls begin {_BEHIND} m before it, and end {_BEYOND} m beyond it"
                 )
-                raise errors.not_allowed("task waypoints", route[part : part + 2].tolist(), rule)
+                raise errors.not_allowed("task waypoints", route[away.argmin()].tolist(), rule)
 
     @property
     def has_contact_walls(self) -> bool:

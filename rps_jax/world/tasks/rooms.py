@@ -24,7 +24,7 @@ from scipy.sparse import csgraph
 
 from rps_jax import errors
 from rps_jax.geometry import polyline
-from rps_jax.geometry.polyline import Polyline
+from rps_jax.geometry.polyline import Polyline, distances, is_inside, to_segment
 from rps_jax.record import files
 from rps_jax.record.options import option
 from rps_jax.robot.shell import Shell
@@ -37,8 +37,9 @@ from rps_jax.world.tasks.path import LOOKAHEAD, Following, PathCourse
 _ROS = ("image", "resolution", "origin", "negate", "occupied_thresh", "free_thresh", "mode")
 _IGNORED = ("map_type", "frame_id")
 _UNKNOWN = 205  # grey of unknown cells, as maps are saved
-_OUTSIDE = "it lies in an obstacle or outside of the room"
+_OUTSIDE = "it lies in an obstacle or outside of the room (of an image, try a smaller tolerance)"
 _MAX_WALLS = 128
+_TURN_BOUNDS = {"at_least": -6.3, "at_most": 6.3, "unit": "rad"}  # no angle in degrees
 _MAX_PIXELS = 16_000_000
 # Vertices of a path around a corner, by the clearance: up to 1.08 times the clearance from it. An
 # arc is longer than the shortest by at most 5.5 %.
@@ -79,18 +80,18 @@ class Rooms(Following):
         corners = {f"task polygon {i}": polygon for i, polygon in enumerate(polygons)}
         corners |= {"task outline": file["outline"]} if "outline" in file else {}
         starts, rings = values.get("start", cls.start), list[np.ndarray]()
-        ends = [("start", x) for x in starts] + [("goal", x) for x in values.get("goal", ())]
-        for name, ring in corners.items():
-            rings.append(_ring(name, ring))
-            _check_count(sum(map(len, rings)))
-            for end, value in ends:  # one by one, since polygons may overlap
+        poses = [("start", x) for x in starts] + [("goal", x) for x in values.get("goal", ())]
+        _check_count(3 * len(corners))
+        for name in corners:
+            rings.append(ring := _ring(name, corners[name]))
+            for end, value in poses:  # ring by ring, since polygons may overlap
                 point = complex(*value[:2])
-                is_inside = polyline.is_inside(point, rings[-1], np.roll(rings[-1], -1))
-                if abs(point) < 1000 and is_inside == name.startswith("task polygon"):
+                is_outside = is_inside(point, ring, np.roll(ring, -1)) != (name == "task outline")
+                if is_outside and abs(point) < 1000:
                     raise errors.not_allowed(f"task {end}", value, _OUTSIDE)
         if file.keys() - {"polygons", "outline", *_IGNORED}:
             if "outline" in file:
-                rule = "an image has outlines of its own: give polygons with it"
+                rule = "the image defines the outline: give polygons with it"
                 raise errors.not_allowed("task outline", file["outline"], rule)
             rings += _read_image(file, starts)
         if file.keys() - {"polygons"}:  # walls around the room make its outside an obstacle
@@ -129,10 +130,8 @@ class Rooms(Following):
         ):
             if is_bad:
                 raise errors.not_allowed(f"task {name}", value, rule)
-        for name, ends in (("start", self.start), ("goal", self.goal)):
-            errors.check_count(f"count of task {name}", len(ends), at_most=_MAX_WALLS)
         for _, _, yaw in self.start:
-            errors.check_angle("yaw of task start", yaw)
+            errors.check_finite("yaw of task start", yaw, **_TURN_BOUNDS)
         _ = self._routes
 
     def check_room(self, shell: Shell, object_width: Callable[[], float]) -> None:
@@ -175,7 +174,7 @@ def _ring(name: str, corners: object) -> np.ndarray:
     points = points[: -1 if points[0] == points[-1] else None]
     _check_count(points.size)
     following, i = np.roll(points, -1), np.arange(points.size)
-    touched = polyline.distances(points[:, None], following[:, None], points, following) < 1e-9
+    touched = distances(points[:, None], following[:, None], points, following) < 1e-9
     touched &= (i - i[:, None] + 1) % max(i.size, 1) > 2  # of edges that do not follow each other
     for is_bad, rule in (
         (i.size < 3, "a polygon has three corners or more, each as x, y [m]"),
@@ -195,7 +194,7 @@ def _read_image(file: Mapping[str, Any], starts: Any) -> list[np.ndarray]:
     high = check("task occupied_thresh", file.get("occupied_thresh", 0.65), at_most=1)
     low = check("task free_thresh", file.get("free_thresh", 0.196), at_most=1)
     x, y, yaw = errors.check_array("task origin", file.get("origin", (0, 0, 0)), (3,))
-    errors.check_angle("yaw of task origin", yaw)
+    check("yaw of task origin", yaw, **_TURN_BOUNDS)
     texts = dict[str, str]()
     for name, allowed in {"negate": ("0", "1", "false", "true"), "mode": ("trinary",)}.items():
         texts[name] = str(file.get(name, allowed[0])).lower().removesuffix(".0")
@@ -214,15 +213,13 @@ def _read_image(file: Mapping[str, Any], starts: Any) -> list[np.ndarray]:
         rule = "it lies in an obstacle, in unknown cells or outside of the image"
         raise errors.not_allowed("task start", starts, rule)
     free = np.isin(labels, reached)
-    # Each obstacle has two walls or more.
-    _check_count(2 * ndimage.label(~free, np.ones((3, 3)))[1])
-    unknown = np.pad(abs(255 * shades - _UNKNOWN) < 0.5, 1) & free
-    if unknown.any():
-        share = f"{100 * unknown.sum() / free.sum():.2g} % of the free cells of the map"
-        warnings.warn(
-            f"{share} have the grey {_UNKNOWN} of unknown cells, which free_thresh = {low:g} "
-            "counts as free: write free_thresh: 0.196 to make them walls",
-            stacklevel=2,
+    obstacles: Any = ndimage.label(~free, np.ones((3, 3)))
+    _check_count(2 * obstacles[1])  # each has two walls or more
+    if share := 100 * np.mean(abs(255 * np.pad(shades, 1)[free] - _UNKNOWN) < 0.5):
+        _warn_once(
+            f"{share:.2g} % of the free cells of the map have the grey {_UNKNOWN} of unknown "
+            f"cells, which free_thresh = {low:g} counts as free: write free_thresh: 0.196, and "
+            "they are walls"
         )
     rings = list[np.ndarray]()
     lines: Any = contourpy.contour_generator(z=free.astype(float)).lines(0.5)
@@ -234,13 +231,12 @@ def _read_image(file: Mapping[str, Any], starts: Any) -> list[np.ndarray]:
         halves = points[: far + 1], np.append(points[far:], points[0])
         ring = np.concatenate([_simplify(x, tolerance / resolution)[:-1] for x in halves])
         rings.append(origin + unit * ring)
-        _check_count(sum(map(len, rings)))
-    a, b = (np.concatenate([np.roll(ring, -i) for ring in rings]) for i in (0, 1))
-    for start in starts:
-        if not polyline.is_inside(complex(*start[:2]), a, b):
-            rule = f"walls of it exclude the start {start}: give a smaller tolerance [m]"
-            raise errors.not_allowed("task tolerance", tolerance, rule)
     return rings
+
+
+@functools.cache  # a command reads its map several times
+def _warn_once(sentence: str) -> None:
+    warnings.warn(sentence, stacklevel=3)
 
 
 def _shades(path: Path) -> np.ndarray:
@@ -265,7 +261,7 @@ def _simplify(points: np.ndarray, tolerance: float) -> np.ndarray:
     corners, i = [0, len(points) - 1], 0
     while i < len(corners) - 1:
         part = points[corners[i] : corners[i + 1] + 1]
-        away = polyline.to_segment(part, part[0], part[-1])
+        away = to_segment(part, part[0], part[-1])
         if away.max() <= tolerance:
             i += 1
         else:
@@ -298,21 +294,21 @@ def _plan(walls: Any, starts: Any, goals: Any, base_radius: float, radius: float
     nodes = np.append(begin + base_radius * np.exp(1j * yaw), goal)
     needed = f"the path keeps {clearance:.2f} m from walls (base_radius + object_radius)"
     for i, (value, point) in enumerate(zip((*starts, *goals), (*begin, *goal), strict=True)):
-        away = polyline.distances(nodes[i], nodes[i], a, b).min()
+        away = distances(nodes[i], nodes[i], a, b).min()
         is_start = i < begin.size
         for is_bad, rule in (
-            (polyline.is_inside(point, a, b), _OUTSIDE),
+            (is_inside(point, a, b), _OUTSIDE),
             (away < clearance, f"{needed}, and one is {away:.2f} m away"),
             (not is_start and abs(begin - point).min() < base_radius, "the base starts there"),
         ):
             if is_bad:
                 raise errors.not_allowed(f"task {'start' if is_start else 'goal'}", value, rule)
     around = (np.unique([a, b])[:, None] + clearance * _TURN).ravel()
-    is_clear = polyline.distances(around[:, None], around[:, None], a, b).min(axis=1) > clearance
+    is_clear = distances(around[:, None], around[:, None], a, b).min(axis=1) > clearance
     nodes = np.append(nodes, around[is_clear])
     lengths = np.full((nodes.size, nodes.size), np.inf)
     for i, node in enumerate(nodes):
-        is_clear = polyline.distances(node, nodes[:i, None], a, b).min(axis=1) > clearance - 1e-9
+        is_clear = distances(node, nodes[:i, None], a, b).min(axis=1) > clearance - 1e-9
         lengths[i, :i] = np.where(is_clear, abs(nodes[:i] - node), np.inf)
     graph = csgraph.csgraph_from_dense(lengths, np.inf)  # an edge may have no length
     result: Any = csgraph.dijkstra(graph, False, range(begin.size), return_predecessors=True)
