@@ -59,7 +59,7 @@ def test_statistics_and_tables_of_a_sweep_by_hand():
         distance=[1.0, 2.0, 3.0, 1.0],
     ).assign_coords(object=("world", ["box", "box", "drum", "drum"]), world=range(4))
     first, second = (results.sel(law=law) for law in "ab")
-    names = np.array([*statistics.FAILURES, ""])
+    names = np.array([*statistics.MODES, ""])
     modes = [names[statistics.failure_modes(trials, 150)].tolist() for trials in (first, second)]
     assert modes[0] == ["", "timeout", "never touched", "diverged"]
     assert modes[1] == ["", "", "lost contact", "fell over"]

@@ -82,11 +82,12 @@ class Trace(Trajectory):
         if outcome.diverged:
             cause = "the law returned NaN" if outcome.nan_twist else "the physics ran away"
             return f"diverged at {float(outcome.time):.2f} s, since {cause}"
+        contact = "not felt" if outcome.unfelt else "lost"
         failed = [f", {text}" for text in tasks.failures_of(outcome.task)]
         return (
             f"target ({x:g}, {y:g}) m {'reached' if outcome.success else 'not reached'} at "
             f"{float(outcome.time):.1f} s, least distance {float(outcome.min_distance):.3f} m, "
-            f"contact lost for {float(outcome.contact_lost_time):.1f} s{''.join(failed)}"
+            f"contact {contact} for {float(outcome.contact_lost_time):.1f} s{''.join(failed)}"
         )
 
     @property

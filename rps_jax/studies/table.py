@@ -81,7 +81,7 @@ class Table(TrialOptions, MultiLawQuestion[xr.Dataset]):
     def intro(self, results: xr.Dataset) -> str:
         return (
             f"{results.success.size} trials, engine {self.setting.engine}, steps of "
-            f"{1000 * self.setting.physics.timestep:g} ms. Intervals: Wilson 95 %, in percent."
+            f"{1000 * self.setting.physics.timestep:g} ms. {tables.grid_note(self.targets)}"
         )
 
     def report(self, results: xr.Dataset, run: Run) -> Sequence[Section]:

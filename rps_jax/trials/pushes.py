@@ -225,7 +225,7 @@ def _record_on_host(
             finished, total = int(np.sum(trials.done)), float(np.sum(trials.steps)) * period
             callback(Progress(finished, total, compile_time))
     assert trials is not None
-    outcomes = jax.device_get(trial.outcome(trials, period))
+    outcomes = jax.device_get(trial.outcome(trials, worlds.worlds, loop))
     return jax.tree.map(lambda *leaves: np.stack(leaves), *snapshots), outcomes
 
 
@@ -239,10 +239,9 @@ def recorder(
 
     def record(*arguments: Any) -> tuple[Trial, Snapshot, Outcome]:
         *state, rules = arguments
-        last, snapshots = trial.record(
-            *state, replace(loop, rules=rules), steps=steps, stride=stride
-        )
-        return last, snapshots, trial.outcome(last, loop.physics.control_period)
+        ruled = replace(loop, rules=rules)
+        last, snapshots = trial.record(*state, ruled, steps=steps, stride=stride)
+        return last, snapshots, trial.outcome(last, state[1], ruled)
 
     fixed = worlds.stage, *worlds.inputs
     arguments = *fixed, trials, loop.rules
