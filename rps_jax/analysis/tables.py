@@ -25,7 +25,7 @@ def markdown(rows: Sequence[Sequence[str]]) -> str:
 
 
 def table_ii(results: xr.Dataset) -> list[list[str]]:
-    """Return Table II: successes of a grid in which nothing is drawn, beside the paper's."""
+    """Return Table II: successes of a grid of targets, beside the paper's."""
     trials = results.sizes["target"]
     targets = np.stack([results.target_x, results.target_y], axis=-1)
     has_all_targets = np.array_equal(targets, paper.TARGETS)
@@ -43,13 +43,13 @@ def table_ii(results: xr.Dataset) -> list[list[str]]:
     return rows
 
 
-def grid_note(targets: ArrayLike) -> str:
-    """Return a sentence on the independent trials of targets (n, 2), for a symmetric object."""
-    rows = np.round(np.array(targets), 9)
-    count = len({(x, abs(y)) for x, y in rows.tolist()})
+def grid_note(results: xr.Dataset) -> str:
+    """Return a sentence on the independent trials of a grid of targets."""
+    count = len(set(zip(results.target_x.values, abs(results.target_y).values, strict=True)))
     return (
-        "Nothing is drawn, so counts have no interval. With box and cylinder, targets to the left "
-        f"and to the right are mirror images: {count} of {len(rows)} are independent."
+        "The targets are a grid and no sample, so counts have no interval. With box and cylinder, "
+        "targets to the left and to the right are mirror images: "
+        f"{count} of {results.sizes['target']} are independent."
     )
 
 

@@ -160,6 +160,11 @@ class Hardware(LawQuestion[xr.Dataset]):
         )
         return xr.Dataset(variables, {"object": list(HARDWARE_OBJECTS), "axis": ["x", "y"]})
 
+    @property
+    def fitted(self) -> str:
+        """Mark of D and time, to which the slips of the default robot are fitted."""
+        return "fitted; " if self.robot == type(self).robot else ""
+
     def intro(self, results: xr.Dataset) -> str:
         return (
             f"{self.label}, skin {name_or_custom(self.skin)}, robot {name_or_custom(self.robot)}, "
@@ -176,8 +181,7 @@ class Hardware(LawQuestion[xr.Dataset]):
             "successes; in round brackets: the least and the greatest mean among the frictions. "
             "Square brackets: Wilson 95 % intervals."
         )
-        fitted = "fitted; " if self.robot == type(self).robot else ""
-        if fitted:
+        if self.fitted:
             text += (
                 " The slips of the base, and the range of its friction, are fitted to the paper's "
                 "D and times, so their agreement is no prediction."
@@ -188,10 +192,10 @@ class Hardware(LawQuestion[xr.Dataset]):
             "that end earlier are not counted. Brackets: Wilson 95 % intervals [%]."
         )
         middle = f"Friction: ground {ground:g}, robot {robot:g}, the middle of the range."
-        success = Picture("numbers", partial(numbers_figure, results))
+        success = Picture("numbers", partial(numbers_figure, results, self.fitted))
         paths = Picture("paths", partial(paths_figure, results))
         return [
-            Section("Hardware experiments", text, table(results, fitted), success),
+            Section("Hardware experiments", text, table(results, self.fitted), success),
             Section("Fig. 7: paths of the base", middle, (), paths),
             Section("The object shoved aside", shove, shift_table(results)),
         ]
@@ -223,7 +227,7 @@ def table(results: xr.Dataset, fitted: str = "") -> list[list[str]]:
     return rows
 
 
-def numbers_figure(results: xr.Dataset) -> Figure:
+def numbers_figure(results: xr.Dataset, fitted: str = "") -> Figure:
     """Draw the mean D and time of each object under each friction, and the paper's."""
     figure, axes = tiles(len(_MEANS), len(_MEANS), (5, 2.2), (0, 0.4))
     for ax, (key, (label, unit, _)) in zip(axes[0], _MEANS.items(), strict=True):
@@ -233,7 +237,7 @@ def numbers_figure(results: xr.Dataset) -> Figure:
             ax.plot(getattr(HARDWARE_RESULTS[name], key), row, "k*", ms=13)
         ax.set_yticks(range(results.sizes["object"]), [words(o) for o in results.object.values])
         ax.set(xlabel=f"{label} [{unit}]", ylim=(1.5, -0.5))
-    figure.legend(["under each friction", "paper"], loc="outside lower center", ncols=2)
+    figure.legend([f"{fitted}under each friction", "paper"], loc="outside lower center", ncols=2)
     return figure
 
 

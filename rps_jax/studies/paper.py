@@ -12,7 +12,6 @@ from typing import ClassVar
 import numpy as np
 import xarray as xr
 
-from rps_jax.analysis import tables
 from rps_jax.analysis.figures import paper as figures
 from rps_jax.analysis.report import Picture, Section
 from rps_jax.control.laws.rps import RPSParams
@@ -62,9 +61,9 @@ class Paper(SimulationQuestion[xr.DataTree]):
     def answer(self, run: Run) -> xr.DataTree:
         progress = SequentialProgress(run.callback)
         run = run._replace(callback=progress)
-        grid, push, hardware = self.parts
-        results = {"table": grid.answer(run)}
-        progress.finish(grid.num_trials() or 0)
+        tables, push, hardware = self.parts
+        results = {"table": tables.answer(run)}
+        progress.finish(tables.num_trials() or 0)
         results["trial"] = run.checkpoint("trial", lambda: push.answer(run).data)
         progress.finish(1)
         results["hardware"] = hardware.answer(run)
@@ -75,8 +74,7 @@ class Paper(SimulationQuestion[xr.DataTree]):
         return xr.DataTree.from_dict(results)
 
     def intro(self, results: xr.DataTree) -> str:
-        grid = tables.grid_note(self.parts[0].targets)
-        return f"The numbers of the paper *Pushing in the Dark* beside ours. Table II: {grid}"
+        return "The numbers of the paper *Pushing in the Dark* beside ours."
 
     def report(self, results: xr.DataTree, run: Run) -> Sequence[Section]:
         trial, (_, push, hardware) = results["trial"].to_dataset(), self.parts
