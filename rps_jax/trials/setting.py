@@ -114,8 +114,8 @@ class Setting:
     @classmethod
     def from_json(cls, record: Mapping[str, Any]) -> Setting:
         """Return the setting of a record with the fields of `to_json`."""
-        numbers = dict(record["physics"]).items()
-        values: dict[str, Any] = {k: tuple(x) if isinstance(x, list) else x for k, x in numbers}
+        fields = dict(record["physics"]).items()
+        values: dict[str, Any] = {k: tuple(x) if isinstance(x, list) else x for k, x in fields}
         physics, rules = Physics(**values), Rules(**record["rules"])
         seed, split = record["seed"], record.get("split")
         return cls(record["engine"], physics, rules=rules, seed=seed, split=split)
