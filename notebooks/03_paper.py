@@ -27,8 +27,8 @@ results = rps_jax.table(progress=False)
 # %% [markdown]
 # ## Table II
 #
-# Successes of 24 trials, with Wilson 95 % intervals in percent; the paper's counts are below
-# ours.
+# Successes of 24 trials; the paper's counts are below ours. The targets are a grid and no sample,
+# so counts have no interval.
 
 # %%
 Markdown(tables.markdown(tables.table_ii(results)))
@@ -36,8 +36,9 @@ Markdown(tables.markdown(tables.table_ii(results)))
 # %% [markdown]
 # RPS fails here only with cylinders, and at two targets: (1, 1) and (1, -1). It keeps the contact,
 # comes within 8 cm of the target, and then circles it until the horizon. In the paper most
-# failures are of cylinders, too, but some are of boxes, and the total is outside our interval. The
-# totals of the baselines agree, so without reaction the task is as hard here as in the paper.
+# failures are of cylinders, too, but some are of boxes, and there are more of them. The two targets
+# are mirror images, so they are one failure of a symmetric object. The totals of the baselines
+# agree, so without reaction the task is as hard here as in the paper.
 # `sweeps/ambiguities` tests whether the paper's simulator caused the difference.
 
 # %%

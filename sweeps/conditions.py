@@ -162,7 +162,7 @@ def _chunks(
 
 
 def condition_rows(results: xr.Dataset, baseline: str, law: str = "rps") -> list[list[str]]:
-    """Return a header and one row per condition: counts, interval, median time, difference.
+    """Return a header and one row per condition: counts, median time, difference.
 
     The last column compares with the baseline by McNemar's exact test. A star marks significant
     differences at a false discovery rate of 5 % over all rows (Benjamini-Hochberg).
@@ -175,12 +175,11 @@ def condition_rows(results: xr.Dataset, baseline: str, law: str = "rps") -> list
     q = np.ones(len(names))
     q[compared] = statistics.false_discovery([comparisons[i].p for i in compared])
     objects = [str(o) for o in part.object.values]
-    table = [["reading", *objects, "all", "95 %", "median time", "against the first"]]
+    table = [["reading", *objects, "all", "median time", "against the first"]]
     for i, name in enumerate(names):
         trials = part.sel(condition=name)
         succeeded = trials.success.values.astype(bool)
         counts = trials.success.sum("target").transpose("object", "friction").values.astype(int)
-        low, high = statistics.wilson(int(succeeded.sum()), succeeded.size)
         time = trials.time.values[succeeded]
         c, star = comparisons[i], " *" if q[i] < 0.05 else ""
         difference = f"{c.changes}, q = {q[i]:.2g}{star}" if name != baseline else ""
@@ -189,7 +188,6 @@ def condition_rows(results: xr.Dataset, baseline: str, law: str = "rps") -> list
                 str(trials.what.values),
                 *(" ".join(map(str, row)) for row in counts),
                 f"{succeeded.sum()} of {succeeded.size}",
-                f"{100 * low:.0f}-{100 * high:.0f} %",
                 f"{np.median(time):.1f} s" if time.size else "-",
                 difference,
             ]

@@ -17,6 +17,7 @@ from rps_jax.analysis.report import Picture, Section
 from rps_jax.analysis.statistics import Bins
 from rps_jax.runs.question import Run
 from rps_jax.studies import hardware
+from rps_jax.studies.table import Table
 from rps_jax.trials.progress import no_progress
 from rps_jax.tuning import learn
 from rps_jax.world import paper
@@ -59,7 +60,7 @@ def test_statistics_and_tables_of_a_sweep_by_hand():
         distance=[1.0, 2.0, 3.0, 1.0],
     ).assign_coords(object=("world", ["box", "box", "drum", "drum"]), world=range(4))
     first, second = (results.sel(law=law) for law in "ab")
-    names = np.array([*statistics.FAILURES, ""])
+    names = np.array([*statistics.MODES, ""])
     modes = [names[statistics.failure_modes(trials, 150)].tolist() for trials in (first, second)]
     assert modes[0] == ["", "timeout", "never touched", "diverged"]
     assert modes[1] == ["", "", "lost contact", "fell over"]
@@ -214,7 +215,28 @@ def test_the_papers_numbers_are_beside_ours_under_each_friction(drawn):
     _, box, cylinder = hardware.table(results)
     assert box == ["hardware box", "3 of 4 [30, 95]", "8 of 8", "0.033 m (by friction 0.020-0.040)",
                    "0.032 m", "80 s (by friction 70-85)", "89 s"]  # fmt: skip
+    _, marked, _ = hardware.table(results, "fitted; ")
+    assert marked[3:6:2] == ["0.033 m (fitted; by friction 0.020-0.040)",
+                             "80 s (fitted; by friction 70-85)"]  # fmt: skip
     assert cylinder[1:] == ["0 of 4 [0, 49]", "8 of 8", "-", "0.059 m", "-", "88 s"]
+
+
+def test_the_papers_grid_has_counts_of_independent_targets_and_no_interval():
+    dims, targets = ("law", "object", "friction", "target"), np.array(paper.TARGETS)
+    coords = {"law": ["rps"], "object": ["box"], "friction": ["S1"]}
+    coords |= {f"target_{axis}": ("target", x) for axis, x in zip("xy", targets.T, strict=True)}
+    results = xr.Dataset({"success": (dims, np.ones((1, 1, 1, 24)))}, coords)
+    assert tables.table_ii(results)[1:] == [
+        ["RPS", "ours", "24/24", "24/24"],
+        ["", "paper", "23/24", "23/24"],
+    ]
+    assert "14 of 24 are independent" in tables.grid_note(results)
+    assert "Intervals" not in Table().intro(results)
+
+
+def test_fitted_numbers_of_the_hardware_say_so():
+    assert hardware.Hardware().fitted
+    assert not hardware.Hardware(robot="ideal").fitted
 
 
 def test_recovered_pushes_are_counted():

@@ -77,7 +77,7 @@ def test_costs_by_hand():
         min_distance=np.array([0.04, 0.5, np.inf, 0.5]), contact_lost_time=zero, path_length=zero,
         mean_abs_l=zero, tilt=zero, tipped=np.array([False, False, False, True]),
         diverged=np.zeros(4, bool), nan_twist=np.zeros(4, bool), stalled=np.zeros(4, bool),
-        base_pose=pose, object_pose=away,
+        unfelt=np.zeros(4, bool), base_pose=pose, object_pose=away,
     )  # fmt: skip
     np.testing.assert_allclose(score.plan_costs(outcome, Rules()), [0.1, 1.5, 6.2, 2.0])
 

@@ -82,7 +82,7 @@ def masses(keys):
 
 
 def test_no_command_meets_the_worlds_of_a_tuner(monkeypatch):
-    """All commands with a seed, of several seeds; those that draw worlds stop at the first draw."""
+    """A command that draws worlds stops at its first draw."""
     commands = {name: question_type(name) for name in known()}
     seeded = {k for k, kind in commands.items() if "setting" in {f.name for f in fields(kind)}}
     tuned, validated, rest = set(), set(), set()

@@ -181,9 +181,13 @@ def test_an_object_file_has_the_outline_of_its_solid(tmp_path):
     corners = np.unique(np.round(np.asarray(loaded.footprint.vertices), 6), axis=0)
     expected = np.array(L_CORNERS.split(), float).reshape(-1, 2)
     np.testing.assert_allclose(corners, np.unique(expected, axis=0), atol=1e-6)
-    path = l_shape(tmp_path, "0.7").rename(tmp_path / "round.xml")
-    assert objects.parse_object(str(path)) == "round"
-    assert float(scene.load("round").footprint.radius) == pytest.approx(0.7)
+    with pytest.raises(InputError, match=r"reach of the footprint = 0.7 m .* have the mass"):
+        objects.parse_object(str(l_shape(tmp_path, "0.7").rename(tmp_path / "wide.xml")))
+    text = (objects.mjcf_folder() / "cylinder.xml").read_text()
+    custom = '<custom><numeric name="footprint" data="0.252"/></custom><worldbody>'
+    (tmp_path / "round.xml").write_text(text.replace("<worldbody>", custom))
+    assert objects.parse_object(str(tmp_path / "round.xml")) == "round"
+    assert float(scene.load("round").footprint.radius) == pytest.approx(0.252)
 
 
 def test_a_file_is_an_object_of_a_domain_also_in_another_process(tmp_path):
@@ -248,6 +252,11 @@ test_an_invalid_footprint_is_rejected = refusals(
     ((polygon(np.array(SQUARE) + 0.2),), "the origin must be inside"),
     ((polygon(0.2 * np.array([[np.cos(a), np.sin(a)] for a in np.arange(9) * 0.69])),), "3 to 8"),
     ((rectangle(5.0, 5.0),), "reach of the footprint"),
+    (
+        (SQUARE,),
+        "footprint = 0.131 m is .* its geoms, .* reach 0.261 to 0.261 m",
+    ),
+    ((rectangle(0.205, 0.2),), "give both the same size, within 2%"),
 )
 
 

@@ -9,8 +9,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import xarray as xr
 from helpers import advance, case, jitted
 
+from rps_jax.analysis import statistics
 from rps_jax.engines.base import Driven
 from rps_jax.robot.skin import CapacitiveSkin
 from rps_jax.trials import batch, pushes, trial
@@ -159,6 +161,28 @@ def test_contact_lost_for_too_long_ends_a_trial(outcomes):
     assert not outcome.success.any()
     assert outcome.contact_lost_time[0] == pytest.approx(5.0, abs=0.03)
     assert outcome.time[0] < 60.0
+
+
+def test_a_contact_on_dead_taxels_is_no_lost_contact(outcomes):
+    dead = replace(case((1.0, 0.0)), skin=CapacitiveSkin(dead_share=1.0))
+    results = run([dead] * SLOTS, Rules(horizon=20.0))
+    assert results.unfelt.all()
+    assert np.isinf(results.min_distance).all()
+    columns = {k: ("world", v) for k, v in results.columns().items() if np.ndim(v) == 1}
+    modes = statistics.failure_modes(xr.Dataset(columns), 150.0)
+    assert {statistics.MODES[mode] for mode in modes.tolist()} == {"contact not felt"}
+    assert not outcomes.unfelt.any()
+    # After 5 s without contact a trial ends, and the base stands against the object or not.
+    _, worlds, params = world_batch(2)
+    trials = trial.start_all(worlds, params, np.ones(2, bool))
+    counts = {"contact_steps": np.ones(2, int), "lost_steps": np.full(2, 251)}
+    ahead = results.object_pose[0, 0] - results.base_pose[0, 0]  # [m] of an object that is pushed
+    qpos = trials.qpos.at[:, 3].set(trials.qpos[:, 0] + ahead + np.array([0.0, 0.1]))
+    ended = trials._replace(done=np.ones(2, bool), qpos=qpos, **counts)
+    loop = ControlLoop(FUSED.physics, Rules(max_lost=5.0))
+    assert trial.outcome(ended, worlds, loop).unfelt.tolist() == [True, False]
+    felt = ended._replace(lost_steps=np.full(2, 249))
+    assert not trial.outcome(felt, worlds, loop).unfelt.any()
 
 
 def world_batch(count):

@@ -52,7 +52,9 @@ def episode_return(env: rps_jax.PushEnv, steps: int, weights: dict, key: jax.Arr
 
 def main(options: Options) -> list[float]:
     """Train, and return the mean return of each iteration."""
-    env = rps_jax.PushEnv("random_box", setting=rps_jax.Setting("fused", fidelity="fast"))
+    env = rps_jax.PushEnv(
+        "random_box", setting=rps_jax.Setting("fused", fidelity="fast", split="tune")
+    )
     steps = round(options.seconds / env.dt)
     start = {"w": jnp.zeros((3, 44)), "b": jnp.zeros(3)}
     weights, unravel = ravel_pytree(start)

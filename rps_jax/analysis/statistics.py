@@ -17,10 +17,20 @@ from numpy.typing import ArrayLike
 from rps_jax.world import tasks
 from rps_jax.world.domain import LABELS
 
-FAILURES = ("never touched", "lost contact", "timeout", "fell over", "diverged", "stalled")
+FAILURES = (
+    *("never touched", "lost contact", "timeout", "fell over", "diverged", "stalled"),
+    "contact not felt",
+)
 MODES = (*FAILURES, *tasks.FAILURES.values())  # with those of tasks
 # Failure modes in order of precedence, after those of tasks.
-_PRECEDENCE = ("diverged", "fell over", "stalled", "never touched", "lost contact")
+_PRECEDENCE = (
+    "diverged",
+    "fell over",
+    "stalled",
+    "contact not felt",
+    "never touched",
+    "lost contact",
+)
 _TAIL = 0.05  # share of the worlds in the tail of the CVaR
 # Limits of all intervals of a report.
 NOT_PROMISED = (
@@ -165,6 +175,7 @@ def failure_modes(trials: xr.Dataset, max_lost: float) -> np.ndarray:
             trials.diverged.values > 0,
             trials.tipped.values > 0,
             trials.get("stalled", none).values > 0,
+            trials.get("unfelt", none).values > 0,
             ~np.isfinite(trials.min_distance.values),
             trials.contact_lost_time.values > max_lost,
         ],

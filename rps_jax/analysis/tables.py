@@ -25,7 +25,7 @@ def markdown(rows: Sequence[Sequence[str]]) -> str:
 
 
 def table_ii(results: xr.Dataset) -> list[list[str]]:
-    """Return Table II: successes with Wilson 95 % intervals in percent, beside the paper's."""
+    """Return Table II: successes of a grid of targets, beside the paper's."""
     trials = results.sizes["target"]
     targets = np.stack([results.target_x, results.target_y], axis=-1)
     has_all_targets = np.array_equal(targets, paper.TARGETS)
@@ -34,13 +34,23 @@ def table_ii(results: xr.Dataset) -> list[list[str]]:
     for law in map(str, results.law.values):
         success = results.success.sel(law=law)
         counts = [int(success.sel(object=o, friction=f).sum()) for o, f in columns]
-        cells = [f"{n}/{size} {interval(n, size)}" for n, size in _with_sum(counts, trials)]
+        cells = [f"{n}/{size}" for n, size in _with_sum(counts, trials)]
         rows.append([law.upper(), "ours", *cells])
         in_paper = [paper.TABLE_II.get((law, o, f)) for o, f in columns]
         counts = [n for n in in_paper if n is not None]
         if has_all_targets and len(counts) == len(columns):
             rows.append(["", "paper", *(f"{n}/{size}" for n, size in _with_sum(counts, trials))])
     return rows
+
+
+def grid_note(results: xr.Dataset) -> str:
+    """Return a sentence on the independent trials of a grid of targets."""
+    count = len(set(zip(results.target_x.values, abs(results.target_y).values, strict=True)))
+    return (
+        "The targets are a grid and no sample, so counts have no interval. With box and cylinder, "
+        "targets to the left and to the right are mirror images: "
+        f"{count} of {results.sizes['target']} are independent."
+    )
 
 
 def _with_sum(counts: Sequence[int], trials: int) -> list[tuple[int, int]]:
@@ -77,7 +87,8 @@ def success_table(results: xr.Dataset, max_lost: float) -> list[list[str]]:
     The bound of the failure rate is exact. With several laws it holds for any one of them.
     """
     groups = statistics.worlds_by_object(results)
-    recorded = {"stalled": "stalled"} | {text: name for name, text in tasks.FAILURES.items()}
+    recorded = {"stalled": "stalled", "contact not felt": "unfelt"}
+    recorded |= {text: name for name, text in tasks.FAILURES.items()}
     modes = [mode for mode in statistics.MODES if recorded.get(mode, "success") in results]
     laws = results.sizes["law"]
     bound = "fails at most" + f" (best of {laws})" * (laws > 1)

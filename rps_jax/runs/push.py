@@ -86,7 +86,8 @@ class Trace(Trajectory):
             cause = "the law returned NaN" if outcome.nan_twist else "the physics ran away"
             return f"diverged at {float(outcome.time):.2f} s, since {cause}"
         parts = [f"least distance {float(outcome.min_distance):.3f} m"]
-        parts.append(f"contact lost for {float(outcome.contact_lost_time):.1f} s")
+        contact = "not felt" if outcome.unfelt else "lost"
+        parts.append(f"contact {contact} for {float(outcome.contact_lost_time):.1f} s")
         if np.isinf(outcome.min_distance):
             parts = ["never touched"]
         elif "progress" in outcome.task:

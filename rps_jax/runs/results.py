@@ -29,7 +29,7 @@ from rps_jax.world import draws, points
 
 StoreChunk = Callable[[int, bytes], object]  # called with the number of a chunk and its content
 # Types of an outcome's columns; the rest are float32.
-_FLAGS = ("success", "tipped", "diverged", "nan_twist", "stalled")
+_FLAGS = ("success", "tipped", "diverged", "nan_twist", "stalled", "unfelt")
 _TYPES: dict[str, type] = dict.fromkeys(_FLAGS, np.int8)
 _REMOVED = "overflows"  # column of a version with the engine warp
 _PREFETCH = 16384  # worlds of one program that are built before they are needed, about

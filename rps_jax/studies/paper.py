@@ -75,7 +75,7 @@ class Paper(SimulationQuestion[xr.DataTree]):
         return xr.DataTree.from_dict(results)
 
     def intro(self, results: xr.DataTree) -> str:
-        return "The numbers of the paper *Pushing in the Dark* beside ours. Intervals: Wilson 95 %."
+        return "The numbers of the paper *Pushing in the Dark* beside ours."
 
     def report(self, results: xr.DataTree, run: Run) -> Sequence[Section]:
         trial, (_, push, hardware) = results["trial"].to_dataset(), self.parts

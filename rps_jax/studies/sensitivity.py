@@ -104,15 +104,12 @@ class Sensitivity(PlanQuestion, DomainQuestion[xr.Dataset], LawQuestion[xr.Datas
         bounds = [[0.0, 1.0]] * len(names)
         return {"num_vars": len(names), "names": names, "bounds": bounds, "groups": groups}
 
-    @property
-    def design_seed(self) -> int:
-        """Seed of the design; that of the bootstrap is the next."""
-        return 3 * self.setting.seed
-
     def u(self) -> np.ndarray:
         """Return the points (worlds, q) of the design, block by block of one base point."""
         sample = errors.require("SALib.sample.sobol", "failures").sample
-        values = sample(self.problem, self.base, calc_second_order=False, seed=self.design_seed)
+        values = sample(
+            self.problem, self.base, calc_second_order=False, seed=3 * self.setting.seed
+        )
         return np.clip(values, 0, np.nextafter(1, 0))
 
     @functools.cached_property
@@ -160,7 +157,11 @@ def analyze(options: Sensitivity, sweep: xr.Dataset) -> xr.Dataset:
         "time": trials.time.values.astype(float),
         "left": statistics.distance_left(trials),
     }
-    settings = {"calc_second_order": False, "num_resamples": 200, "seed": options.design_seed + 1}
+    settings = {
+        "calc_second_order": False,
+        "num_resamples": 200,
+        "seed": 3 * options.setting.seed + 1,
+    }
     constant = dict.fromkeys(_INDICES.values(), np.zeros(len(options.factors)))
     indices = [
         compute(options.problem, y, **settings) if np.ptp(y) > 0 else constant

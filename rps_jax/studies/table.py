@@ -81,7 +81,7 @@ class Table(TrialOptions, MultiLawQuestion[xr.Dataset]):
     def intro(self, results: xr.Dataset) -> str:
         return (
             f"{results.success.size} trials, engine {self.setting.engine}, steps of "
-            f"{1000 * self.setting.physics.timestep:g} ms. Intervals: Wilson 95 %, in percent."
+            f"{1000 * self.setting.physics.timestep:g} ms."
         )
 
     def report(self, results: xr.Dataset, run: Run) -> Sequence[Section]:
@@ -93,7 +93,7 @@ table = call_of(Table)
 
 def sections(outcomes: xr.Dataset) -> list[Section]:
     """Return the sections with Table II beside the paper's, and Fig. 5."""
-    text = "  \n".join(tables.summary(outcomes).splitlines())
+    text = "  \n".join([*tables.summary(outcomes).splitlines(), tables.grid_note(outcomes)])
     picture = Picture("min_distance", partial(min_distance, outcomes))
     return [
         Section("Table II: successes", text, tables.table_ii(outcomes)),

@@ -284,7 +284,7 @@ def _run_on_host(job: Job, setting: Setting, threads: int, monitor: _Monitor) ->
             if index % _REPORT_STEPS and not done.all():
                 continue
             ended, total = np.flatnonzero(done & ~reported), int(np.asarray(trials.steps).sum())
-            outcomes = jax.device_get(trial.outcome(trials, period))
+            outcomes = jax.device_get(trial.outcome(trials, batch.worlds, loop))
             simulated = (total - previous) * period
             monitor.add((batch.indices[ended], rows(outcomes, ended), simulated))
             reported, previous = done, total
@@ -424,8 +424,8 @@ def _trace_advance(
         advanced = trial.advance([(stage, *x, state) for stage, x, state in batches], loop, steps)
         # Outcomes are in the same program: another one would wait for other workers' segments.
         return advanced, tuple(
-            _State(b.steps - a.steps, b.done, trial.outcome(b, physics.control_period))
-            for a, b in zip(current, advanced, strict=True)
+            _State(b.steps - a.steps, b.done, trial.outcome(b, worlds, loop))
+            for a, b, (worlds, _) in zip(current, advanced, inputs, strict=True)
         )
 
     arguments = jax.tree.unflatten(structure, leaves)

@@ -30,6 +30,7 @@ UNITS = {
     "diverged": ("1", "physics became NaN or ran away"),
     "nan_twist": ("1", "it diverged since the law returned a twist that is not finite"),
     "stalled": ("1", "it ended with the base standing still, whose force was too small"),
+    "unfelt": ("1", "it ended against the object, but the skin felt no contact"),
     "base_pose": ("m, m, rad", "x, y, yaw of the base in the world at the end"),
     "object_pose": ("m, m, rad", "x, y, yaw of the object in the world at the end"),
 }

@@ -44,7 +44,7 @@ from rps_jax.robot import base, drive
 from rps_jax.robot.base import Load, Odometry
 from rps_jax.robot.drive import Drive
 from rps_jax.robot.robot import Robot
-from rps_jax.robot.skin import NONE, Reading, Skin, SkinState
+from rps_jax.robot.skin import NONE, IdealSkin, Reading, Skin, SkinState
 from rps_jax.world.physics import Physics
 from rps_jax.world.scene import JOINTS
 from rps_jax.world.tasks import reach
@@ -159,6 +159,7 @@ class Outcome(NamedTuple):
     diverged: Bool[Array, "*B"]
     nan_twist: Bool[Array, "*B"]  # it diverged since the law returned a twist that is not finite
     stalled: Bool[Array, "*B"]  # it ended with the base standing still against the object
+    unfelt: Bool[Array, "*B"]  # it ended without contact on the skin, but against the object
     base_pose: Float[Array, "*B 3"]  # [m, m, rad] in the world, at the end
     object_pose: Float[Array, "*B 3"]  # [m, m, rad] of the object in the world, at the end
     task: Mapping[str, Array] = MappingProxyType({})  # by name: see `Task.OUTCOMES`
@@ -463,8 +464,17 @@ def pushing(worlds: World) -> Robot | None:
     return worlds.robot.body if worlds.robot is not None and worlds.robot.driven else None
 
 
-def outcome(trial: Trial, period: float) -> Outcome:
-    """Return the result of a trial with the control period `period` [s], batched or not."""
+def is_pressed(world: World, qpos: Float[Array, "10"]) -> Bool[Array, ""]:
+    """Return whether the object touches a taxel, dead or alive, at the positions qpos."""
+    shell = world.skin.shell
+    points = jnp.asarray(shell.taxels(shell.samples), qpos.dtype)
+    return jnp.any(fp.signed_distance(outline(world, qpos), points) < IdealSkin().tolerance)
+
+
+def outcome(trial: Trial, worlds: World, loop: ControlLoop) -> Outcome:
+    """Return the results of a batch of trials in their worlds."""
+    period = loop.physics.control_period
+    is_lost = (trial.contact_steps == 0) | (trial.lost_steps * period > loop.rules.max_lost)
     position, yaw = jax.vmap(object_pose)(trial.qpos.reshape(-1, 10))
     pose = jnp.concatenate([position, yaw[:, None]], axis=-1)
     return Outcome(
@@ -481,6 +491,7 @@ def outcome(trial: Trial, period: float) -> Outcome:
         diverged=trial.diverged,
         nan_twist=trial.nan_twist,
         stalled=drive.has_stalled(trial.drive, period) & ~trial.success & ~trial.diverged,
+        unfelt=trial.done & is_lost & jax.vmap(is_pressed)(worlds, trial.qpos),
         base_pose=trial.qpos[..., JOINTS.base],
         object_pose=pose.reshape(*trial.qpos.shape[:-1], 3),
         task=trial.task.outcomes(),

@@ -209,9 +209,8 @@ class Fit(LawQuestion[Fitted], DomainQuestion[Fitted], LogsQuestion):
     def fields_as_json(self) -> dict[str, Any]:
         """Fields as JSON; logs by the digests of their values."""
         contents = (b"".join(v.tobytes() for v in raw.columns.values()) for raw in self.raw_logs)
-        record = {"logs": list(map(files.sha256, contents))}
-        record |= {"tune_seed": seed_of(self.setting.seed, "tune")}
-        return super().fields_as_json() | record
+        record = {"tune_seed": seed_of(self.setting.seed, "tune")}
+        return super().fields_as_json() | record | {"logs": list(map(files.sha256, contents))}
 
     def answer(self, run: Run) -> Fitted:
         """Compute and sample the posterior, and summarise it."""

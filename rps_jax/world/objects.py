@@ -320,17 +320,16 @@ def _check_extent(label: str, model: mujoco.MjModel, vertices: np.ndarray, radiu
     ways = np.stack([np.cos(angle), np.sin(angle)])
     owned = np.flatnonzero(model.geom_bodyid == model.body("object").id).tolist()
     reaches = [np.max(_points_of(model, i)[:, :2] @ ways, axis=0) for i in owned]
-    least, most = reaches[owned.index(model.geom("object").id)], np.max(reaches, axis=0)
+    least, greatest = reaches[owned.index(model.geom("object").id)], np.max(reaches, axis=0)
     reach = np.max(vertices @ ways, axis=0) + radius
-    off = np.maximum(least - reach, reach - most)
-    if off.max() > _MAX_OFF * most.max():
+    off = np.maximum(least - reach, reach - greatest) / greatest
+    if off.max() > _MAX_OFF:
         k = int(np.argmax(off))
         rule = (
-            f"its geoms, which have the mass, reach {least[k]:.3g} to {most[k]:.3g} m there: "
-            f"give geoms and outline the same size, within {_MAX_OFF:.0%}"
+            f"its geoms, which have the mass, reach {least[k]:.3g} to {greatest[k]:.3g} m there: "
+            f"give both the same size, within {_MAX_OFF:.0%}"
         )
-        value = f"{reach[k]:.3g} m towards {np.degrees(angle[k]):.0f} degrees"
-        raise errors.not_allowed(f"{label}: reach of the footprint", value, rule)
+        raise errors.not_allowed(f"{label}: reach of the footprint", f"{reach[k]:.3g} m", rule)
 
 
 def _points_of(model: mujoco.MjModel, geom_id: int) -> np.ndarray:

@@ -77,7 +77,9 @@ def preset(name: PhysicsName = "default", fidelity: Fidelity = "standard") -> Ph
     Args:
       name: `default`, isotropic Coulomb friction; or `paper_gazebo`, the paper's friction pyramid
         along the world's axes.
-      fidelity: `reference`, converged, for the engine `mujoco`; `standard`, for tables; or `fast`.
+      fidelity: `reference`, converged, for the engine `mujoco`; `standard`, for tables; or `fast`,
+        whose steps of 20 ms double the time constant of the base's contact: MuJoCo lifts it to two
+        steps.
     """
     errors.check_name("physics", name, PHYSICS)
     return PHYSICS[name][errors.check_name("fidelity", fidelity, PHYSICS[name])]

@@ -79,7 +79,15 @@ def _beside(results: xr.Dataset, laws: Sequence[str], base: str) -> Rows:
     return [list(_HEADER), *rows]
 
 
-_FAILURES = ("fell over", "never touched", "lost contact", "timeout", "diverged", "stalled")
+_FAILURES = (
+    "fell over",
+    "never touched",
+    "lost contact",
+    "timeout",
+    "diverged",
+    "stalled",
+    "contact not felt",
+)
 _HEADER = (
     *("law", "success", "by object [%]", "median time", ", ".join(_FAILURES)),
     *("gained, lost", "p"),

@@ -75,8 +75,7 @@ def header(program: Program, prefix: str) -> str:
         "TABLES": "\n".join([*tables.values(), ""] if tables else []),
         "HELPERS": HELPERS.format(p=p, P=upper),
     }
-    stack = max(_stack(lines["STEP"]), _stack(lines["SKIN"]))
-    stack += 4 * sum(field.size for name in ("memory", "skin") for field in groups[name])
+    stack = max(map(_stack, (lines["STEP"], lines["SKIN"])))
     about = {"label": program.label, "robot": program.robot, "version": __version__}
     about["stack"] = f"{math.ceil(stack / 1000)} kB"
     return fill("law.h.in", **lines, **about, p=p, P=upper, taxels=program.taxels)
