@@ -73,7 +73,7 @@ def pytest_configure(config):
 LONGEST = (
     *("learning", "library", "failures", "cli", "native", "contact_derivatives", "fit", "rivals"),
     *("smooth", "trial", "robot", "examples", "tune", "ladder", "export", "sweep", "shell"),
-    *("view", "push_page", "derivatives", "rooms", "cluster", "walls"),
+    *("view", "push_page", "replay", "package_laws", "derivatives", "rooms", "cluster", "walls"),
     *("mjx_gradients", "gpu_writer", "video", "points", "faults", "bags", "ground"),
     *("force_push_grid", "feet", "house", "film", "footprint", "arena", "force", "evaluate"),
     *("gradients", "publish", "study", "quasistatic", "physics", "notebooks", "quality"),

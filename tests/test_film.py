@@ -174,7 +174,7 @@ def test_the_memory_of_a_film_does_not_grow_with_its_length(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("grid", "size"), [("4x6", (320, 180)), ("1x1", (1920, 1080)), ("12x1", (160, 90))]
+    ("grid", "size"), [("4x6", (320, 180)), ("1x1", (1280, 720)), ("12x1", (160, 90))]
 )
 def test_tiles_are_as_large_as_fits(grid, size):
     width, height = film._tile_size(film.Film(grid=grid).shape)

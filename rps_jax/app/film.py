@@ -33,7 +33,8 @@ from rps_jax.world import video
 from rps_jax.world.scene import Scene
 from rps_jax.world.video import Shot, Tile
 
-_FILM_SIZE = (1280, 720)  # [px] that the grid is fitted into
+_FILM_SIZE = (1280, 720)  # [px] that the grid is fitted into, or half as much again
+_SMALL_TILE = 320  # [px] width of a tile, below which the grid is larger
 _GRID_LIMIT = 12  # rows and columns
 _LENGTH = 30  # [s] of a film at the default speed, at most
 _FREEZE = 1.0  # [s] that the end is held
@@ -214,6 +215,7 @@ def _tile_size(shape: tuple[int, int]) -> tuple[int, int]:
     """Return even width and height [px] of the largest tiles of 16 to 9 that fit."""
     rows_, columns = shape
     unit = min(_FILM_SIZE[0] / columns / 16, _FILM_SIZE[1] / rows_ / 9)
+    unit = max(unit, min(1.5 * unit, _SMALL_TILE / 16))
     return 2 * int(8 * unit), 2 * int(4.5 * unit)
 
 

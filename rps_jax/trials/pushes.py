@@ -180,14 +180,15 @@ def record_batch(
 ) -> list[Trajectory]:
     """Run trials of one stage as `watch` does, with a snapshot every `interval` [s]."""
     period, start_time, compile_time = setting.physics.control_period, time.perf_counter(), None
-    moments = list[tuple[Snapshot, Outcome]]()
-    for trials, *moment in watch(worlds, setting, law, interval=interval, slots=slots):
+    moments = list[tuple[Trial, Snapshot, Outcome]]()
+    for moment in watch(worlds, setting, law, interval=interval, slots=slots):
         compile_time = compile_time or time.perf_counter() - start_time  # of the first snapshot
-        moments.append((moment[0], moment[1]))
-        simulated = float(trials.steps.sum()) * period
-        callback(Progress(int(trials.done.sum()), simulated, compile_time))
-    columns = jax.tree.map(lambda *leaves: np.stack(leaves), *(x for x, _ in moments))
-    fields = moments[-1][1], *worlds.inputs
+        moments.append(moment)
+        simulated = float(moment[0].steps.sum()) * period
+        callback(Progress(int(moment[0].done.sum()), simulated, compile_time))
+    _, snapshots, outcomes = zip(*moments, strict=True)
+    columns = jax.tree.map(lambda *leaves: np.stack(leaves), *snapshots)
+    fields = outcomes[-1], *worlds.inputs
     return [  # with snapshots until the end of each trial
         Trajectory(rows(columns, (~columns.done[:, i], i)), *rows(fields, i))
         for i in range(worlds.indices.size)

@@ -233,10 +233,10 @@ def worlds(slider: SliderName, grid: Cells, engine: EngineName) -> WorldBatch:
 @jax.jit
 def _record(*state: Any) -> tuple[Trial, Snapshot]:
     """Run `_SEGMENT` control steps of a batch; return also a snapshot of every `_LOOK` steps."""
-    *inputs, trials, loop = state
+    stage, worlds, params, trials, loop = state
 
     def interval(trials: Trial, _: None) -> tuple[Trial, Snapshot]:
-        trials, snapshots = trial.unroll(*inputs, trials, loop, _LOOK)
+        trials, snapshots = trial.unroll(stage, worlds, params, trials, loop, _LOOK)
         return trials, jax.tree.map(lambda x: x[0], snapshots)
 
     return jax.lax.scan(interval, trials, length=_SEGMENT // _LOOK)
