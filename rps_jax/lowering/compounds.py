@@ -104,7 +104,7 @@ def _mixed_product(x: jax.Array, y: jax.Array, **params: Any) -> jax.Array:
     """Multiply matrices of bools or of different types of numbers."""
     product = functools.partial(lax.dot_general_p.bind, **params)
     dtype = jax.eval_shape(product, x, y).dtype
-    number = np.dtype(np.int32) if dtype == bool else dtype
+    number = np.dtype(np.int32) if dtype.kind == "b" else dtype
     return product(x.astype(number), y.astype(number)).astype(dtype)
 
 

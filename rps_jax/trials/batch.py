@@ -40,7 +40,7 @@ from rps_jax import engines, errors
 from rps_jax.control import registry, soft
 from rps_jax.control.base import Law, LawParams
 from rps_jax.engines import device, programs
-from rps_jax.trials import host, trial
+from rps_jax.trials import host, law_check, trial
 from rps_jax.trials.progress import Progress, ProgressCallback, Segment, Timing, no_progress
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import ControlLoop, Outcome, Rules, Trial, World
@@ -161,6 +161,9 @@ def run(
             [*itertools.starmap(_TrialQueue, enumerate(jobs))], setting, slots, len(devices)
         )
         compilations = [partial(x.compiled, d) for x in itertools.chain(*groups) for d in devices]
+        for queue in itertools.chain(*(program.queues for program, *_ in groups)):
+            example = queue.example
+            law_check.warn_of_difference(example.stage, *example.inputs, example.law, setting)
         monitor.programs = len(compilations)
         monitor.report()
         tasks = [partial(_work, groups, monitor, *x) for x in enumerate(devices * workers)]
