@@ -29,9 +29,8 @@ _FILL = {"f": np.nan, "i": -(2**31), "u": 2**32 - 1, "b": True}
 def _primitive(name: str, dtype: np.dtype | None = None) -> Function:
     """Return an operation that only targets implement."""
 
-    def result(*types: jax.core.ShapedArray, indices: Any = None) -> jax.core.ShapedArray:
+    def result(*types: jax.core.ShapedArray) -> jax.core.ShapedArray:
         shape = np.broadcast_shapes(*(x.shape for x in types))
-        shape = shape if indices is None else (len(indices), *shape[1:])
         return jax.core.ShapedArray(shape, dtype or types[0].dtype)
 
     primitive = Primitive(name)
@@ -42,7 +41,6 @@ def _primitive(name: str, dtype: np.dtype | None = None) -> Function:
 _quotient = _primitive("quotient")  # of integers, whose divisor is neither 0 nor -1
 _truncation = _primitive("truncate", np.dtype(np.int32))  # of reals within the bounds of integers
 _shift_up, _shift_down = map(_primitive, ("shift_up", "shift_down"))  # by less than all bits
-_moved_rows = _primitive("rows")
 _precedes = _primitive("lt_to", np.dtype(np.bool_))  # in the total order of numbers
 
 
@@ -76,36 +74,9 @@ def _shift(shift: Function) -> Function:
 
 
 def _shift_arithmetic(x: jax.Array, by: jax.Array) -> jax.Array:
-    shift = lax.shift_right_logical
-    return jnp.where(x < 0, ~shift(~x, by), shift(x, by))
-
-
-def _as_signed(operation: Function) -> Function:
-    """Return an operation of unsigned integers that reads their bits as signed integers."""
-    return lambda *x: operation(*(y.astype(np.int32) for y in x)).astype(np.uint32)
-
-
-def _count_bits(x: jax.Array) -> jax.Array:
-    """Count the bits that are 1: in pairs, in groups of four and in bytes, which are added."""
-    one = x.dtype.type(1)
-    x = x - (lax.shift_right_logical(x, one) & 0x55555555)
-    x = (x & 0x33333333) + (lax.shift_right_logical(x, 2 * one) & 0x33333333)
-    x = (x + lax.shift_right_logical(x, 4 * one)) & 0x0F0F0F0F
-    return lax.shift_right_logical(x * 0x01010101, 24 * one)
-
-
-def _count_leading_zeros(x: jax.Array) -> jax.Array:
-    for by in (1, 2, 4, 8, 16):
-        x = x | lax.shift_right_logical(x, x.dtype.type(by))
-    return _count_bits(~x)
-
-
-def _mixed_product(x: jax.Array, y: jax.Array, **params: Any) -> jax.Array:
-    """Multiply matrices of bools or of different types of numbers."""
-    product = functools.partial(lax.dot_general_p.bind, **params)
-    dtype = jax.eval_shape(product, x, y).dtype
-    number = np.dtype(np.int32) if dtype.kind == "b" else dtype
-    return product(x.astype(number), y.astype(number)).astype(dtype)
+    """Shift with the sign; bits of unsigned integers are read as of signed ones."""
+    bits, count, shift = x.astype(np.int32), by.astype(np.int32), lax.shift_right_logical
+    return jnp.where(bits < 0, ~shift(~bits, count), shift(bits, count)).astype(x.dtype)
 
 
 def _integer(x: jax.Array, **_: object) -> jax.Array:
@@ -270,50 +241,35 @@ def _precedes_in_any_language(x: jax.Array, y: jax.Array) -> jax.Array:
     return before
 
 
-def _rows(x: Any, indices: Sequence[int]) -> Any:
-    """Return rows at constant indices."""
-    if isinstance(x, jax.core.Tracer):
-        return _moved_rows(x, indices=tuple(indices))
-    return np.asarray(x)[list(indices)]
-
-
-def _rounds(size: int) -> Iterator[tuple[list[int], list[int]]]:
-    """Yield the indices that each round of Batcher's merge exchange compares, low and high."""
-    top = width = 1 << (size - 1).bit_length() >> 1
-    while width:
-        stride, rest, distance = top, 0, width
-        while True:
-            low = [i for i in range(size - distance) if i & width == rest]
-            yield low, [i + distance for i in low]
-            if stride == width:
-                break
-            distance, stride, rest = stride - width, stride // 2, width
-        width //= 2
-
-
 def _sort(
     *operands: jax.Array, dimension: int, num_keys: int, is_before: Function = _is_before,
     **_: object,
 ) -> list[jax.Array]:  # fmt: skip
-    """Sort operands by the first ones with a network; equal keys stay in their order."""
+    """Sort operands by the first ones; equal keys stay in their order."""
     size = operands[0].shape[dimension]
     if size > _MAX_SORTED:
         raise UnsupportedError(f"sort of more than {_MAX_SORTED} numbers")
-    columns = [jnp.moveaxis(x, dimension, 0) for x in operands]
-    index = np.arange(size, dtype=np.int32).reshape(-1, *[1] * (columns[0].ndim - 1))
-    columns.append(np.broadcast_to(index, columns[0].shape))
-    for low, high in _rounds(size):
-        a, b = ([_rows(x, indices) for x in columns] for indices in (low, high))
-        swaps = b[-1] < a[-1]
-        for x, y in reversed([*zip(a[:num_keys], b[:num_keys], strict=True)]):
-            swaps = is_before(y, x) | (~is_before(x, y) & swaps)
-        rest = [i for i in range(size) if i not in {*low, *high}]
-        order = np.argsort([*low, *high, *rest]).tolist()
-        for k, (x, y) in enumerate(zip(a, b, strict=True)):
-            parts = [jnp.where(swaps, y, x), jnp.where(swaps, x, y)]
-            parts += [_rows(columns[k], rest)] if rest else []
-            columns[k] = _rows(jnp.concatenate(parts), order)
-    return [jnp.moveaxis(x, 0, dimension) for x in columns[:-1]]
+    columns = [jnp.moveaxis(x, dimension, -1) for x in operands]
+    index = np.arange(size, dtype=np.int32)
+    columns.append(jnp.broadcast_to(index, columns[0].shape))
+    # Batcher's merge exchange: each round compares numbers at a distance.
+    levels = [1 << k for k in reversed(range((size - 1).bit_length()))]
+    for width in levels:
+        rounds = [(width, 0), *((x - width, width) for x in levels if x > width)]
+        for distance, rest in rounds:
+            low = (index & width == rest) & (index < size - distance)
+            high = np.roll(low, distance)
+
+            def partner(x: jax.Array, low: Any = low, high: Any = high, by: int = distance) -> Any:
+                return jnp.where(low, jnp.roll(x, -by, -1), jnp.where(high, jnp.roll(x, by, -1), x))
+
+            others = list(map(partner, columns))
+            swaps = others[-1] < columns[-1]
+            for x, y in reversed([*zip(columns[:num_keys], others, strict=False)]):
+                swaps = is_before(y, x) | (~is_before(x, y) & swaps)
+            swaps ^= high
+            columns = [jnp.where(swaps, y, x) for x, y in zip(columns, others, strict=True)]
+    return [jnp.moveaxis(x, -1, dimension) for x in columns[:-1]]
 
 
 def _top_k(x: jax.Array, k: int, axis: int) -> list[jax.Array]:
@@ -326,25 +282,10 @@ def _top_k(x: jax.Array, k: int, axis: int) -> list[jax.Array]:
 def _update(x: jax.Array, update: jax.Array, *starts: jax.Array) -> jax.Array:
     """Replace a slice at an index that is known at run time, clamped to the array."""
     limits = [size - width for size, width in zip(x.shape, update.shape, strict=True)]
-    if all(width == 1 for width, limit in zip(update.shape, limits, strict=True) if limit):
-        is_here = np.True_
-        for axis, (start, limit) in enumerate(zip(starts, limits, strict=True)):
-            if limit:
-                index = np.arange(limit + 1, dtype=start.dtype)
-                shape = [-1 if i == axis else 1 for i in range(x.ndim)]
-                is_here = is_here & (index.reshape(shape) == jnp.clip(start, 0, limit))
-        return jnp.where(is_here, update, x)
-    result = x
-    for at in np.ndindex(*(limit + 1 for limit in limits)):
-        chosen = [
-            jnp.clip(start, 0, limit) == k
-            for start, k, limit in zip(starts, at, limits, strict=True)
-            if limit
-        ]
-        replaced = lax.dynamic_update_slice_p.bind(x, update, *map(np.int32, at))
-        is_here = functools.reduce(operator.and_, chosen, np.True_)
-        result = jnp.where(is_here, replaced, result)
-    return result
+    pads = [(limit, limit) for limit in limits]
+    at = [limit - jnp.clip(start, 0, limit) for start, limit in zip(starts, limits, strict=True)]
+    is_here = lax.dynamic_slice(np.pad(np.ones(update.shape, bool), pads), at, x.shape)
+    return jnp.where(is_here, lax.dynamic_slice(jnp.pad(update, pads), at, x.shape), x)
 
 
 # Functions by the name of an operation (see `target.operation_of`), or of a primitive of any kind.
@@ -376,18 +317,14 @@ COMPOUNDS: dict[str, Function] = {
     "round": _round,
     "atan2": _atan2,
     "integer_pow": _power,
-    "mixed_pow": lambda x, y: lax.pow(x, y.astype(x.dtype)),
-    "mixed_dot_general": _mixed_product,
+    **dict.fromkeys(("pow_i", "pow_u"), lambda x, y: lax.pow(x, y.astype(x.dtype))),
     "div_i": _divide,
     "rem_i": _remainder,
     "div_u": lambda x, y: jnp.where(y == 0, np.uint32(2**32 - 1), _quotient(x, jnp.maximum(y, 1))),
     "rem_u": lambda x, y: x - _quotient(x, jnp.maximum(y, 1)) * y,
     "shift_left_i": _shift(_shift_up),
     "shift_right_logical_i": _shift(_shift_down),
-    "shift_right_arithmetic_i": _shift_arithmetic,
-    "shift_right_arithmetic_u": _as_signed(lax.shift_right_arithmetic),
-    "population_count": _count_bits,
-    "clz": _count_leading_zeros,
+    "shift_right_arithmetic": _shift_arithmetic,
     "i_of_f": _integer,
     "u_of_f": _unsigned,
     **dict.fromkeys(("b_of_f", "b_of_i", "b_of_u"), lambda x, **_: x != 0),

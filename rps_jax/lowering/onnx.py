@@ -27,7 +27,6 @@ _DTYPES = {"f": np.float32, "i": np.int32, "b": np.bool_, "u": np.uint32}
 _OPERATORS = spelled("onnx")
 _SHIFTS = {"shift_up": "LEFT", "shift_down": "RIGHT"}
 _REDUCED = {"add": "ReduceSum", "mul": "ReduceProd", "max": "ReduceMax", "min": "ReduceMin"}
-_REDUCIBLE = {("and", "b"), ("or", "b"), ("max", "i"), ("min", "i"), *((x, "f") for x in _REDUCED)}
 
 
 class Tensor(NamedTuple):
@@ -150,7 +149,8 @@ class Graph(Target):
         self, binary: str, x: Tensor, axes: Sequence[int], out: Typed, kind: str
     ) -> Tensor:
         over, shape = self.constant(np.array(axes, np.int64)), out.shape
-        if (binary, kind) not in _REDUCIBLE:  # its sums of integers do not wrap around
+        if binary == "xor" or (kind == "i" and binary not in ("max", "min")):
+            # Its sums of integers do not wrap around.
             return self.reduced_by_rows(binary, x, axes, out)
         if kind == "b":
             whole = self._cast(x, "i")

@@ -119,10 +119,11 @@ def first_array(types: Sequence[Typed]) -> tuple[int, int]:
 def operation_of(name: str, operands: Sequence[Typed], params: Params, out: Typed) -> str:
     """Return the name of an operation: the primitive and the kind of its first operand."""
     kind, first = (kind_of(x.dtype, name) for x in (out, operands[0]))
-    if name in ("pow", "dot_general"):
-        kinds = {kind, *(kind_of(x.dtype, name) for x in operands)}
-        if len(kinds) > 1 or "b" in kinds:
-            return f"mixed_{name}"
+    last = kind_of(operands[-1].dtype, name)
+    if name == "dot_general" and (first + last != 2 * kind or kind == "b"):
+        raise UnsupportedError("dot_general of bools or of different types")
+    if name == "pow":
+        return f"pow_{last}"
     if name == "select_n" and first == "b" and len(operands) == 3:
         return f"choose_{kind}"
     if name == "convert_element_type":

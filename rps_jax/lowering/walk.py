@@ -38,7 +38,7 @@ _MAX_UNROLLED = 500  # equations of the body of a scan that is unrolled
 _MOVES = {
     **dict.fromkeys(("broadcast_in_dim", "reshape", "squeeze", "expand_dims", "slice", "rev"), 1),
     **dict.fromkeys(("transpose", "split", "unstack", "tile", "dynamic_slice", "gather"), 1),
-    **{"scatter": 1, "rows": 1},
+    "scatter": 1,
     **dict.fromkeys(("pad", "dynamic_update_slice"), 2),
     **dict.fromkeys(("stack", "concatenate")),
 }
@@ -53,7 +53,6 @@ _BY_NUMPY: dict[str, Callable[[np.ndarray, Params], Sequence[np.ndarray]]] = {
     "unstack": lambda x, p: list(np.moveaxis(x, p["axis"], 0)),
     "transpose": lambda x, p: [np.transpose(x, p["permutation"])],
     "rev": lambda x, p: [np.flip(x, p["dimensions"])],
-    "rows": lambda x, p: [x[list(p["indices"])]],
 }
 _IDENTITIES = ("stop_gradient", "copy", "copy_p", "optimization_barrier", "pvary", "name")
 
