@@ -76,14 +76,18 @@ OPERATIONS = {
         lambda i: jnp.sort(i.astype(jnp.uint32)).astype(jnp.int32),
     ],
     "i f": [lambda i: (i & 63).astype(jnp.float32)],
-    "i I": [jnp.max, jnp.min, jnp.sum, lambda i: i[1], jnp.argmax, lambda i: lax.reduce_xor(i, (0,))],
+    "i I": [
+        *(jnp.max, jnp.min, jnp.sum, jnp.argmax),
+        *(lambda i: i[1], lambda i: lax.reduce_xor(i, (0,))),
+    ],
     "ii b": [jnp.less, jnp.less_equal, jnp.greater, jnp.greater_equal, jnp.equal, jnp.not_equal],
     "bii i": [jnp.where, lambda b, i, j: lax.sort((b, i, j), num_keys=2)[1]],
     "bb b": [
         *(lax.lt, lax.le, lax.gt, lax.ge, jnp.equal, jnp.not_equal, jnp.maximum, jnp.minimum),
         *(jnp.logical_and, jnp.logical_or, jnp.logical_xor),
     ],
-    "b b": [jnp.logical_not, jnp.sort, lambda b: b[::-1]],  # XLA orders bools wrongly in a clamp of vectors
+    # XLA itself orders bools wrongly in a clamp of vectors.
+    "b b": [jnp.logical_not, jnp.sort, lambda b: b[::-1]],
     "b B": [jnp.any, jnp.all, jnp.max, jnp.min, lambda b: b[2], lambda b: lax.reduce_xor(b, (0,))],
     "b I": [jnp.argmax, jnp.argmin, lambda b: b.sum(dtype=jnp.int32)],
     "b i": [lambda b: b.astype(jnp.int32), lambda b: jnp.argsort(b)],
@@ -130,10 +134,9 @@ def wrong_seeds(seeds):
     compiled = native.batched(run, lambda *_: pytest.fail("it was not compiled"))
     x, i = batch(seeds[0])
     computed, expected = (jax.device_get(jax.jit(f)(x, i)) for f in (compiled, jax.vmap(run)))
-    return [
-        seed for seed, a, b in zip(seeds, computed, expected, strict=True)
-        if not all(map(functools.partial(np.array_equal, equal_nan=True), *map(jax.tree.leaves, (a, b))))
-    ]  # fmt: skip
+    equal = functools.partial(np.array_equal, equal_nan=True)
+    rows = zip(seeds, computed, expected, strict=True)
+    return [seed for seed, *x in rows if not all(map(equal, *map(jax.tree.leaves, x)))]
 
 
 @pytest.mark.parametrize("first", range(0, SEEDS, PER_COMPILATION))

@@ -152,10 +152,9 @@ def compared(
       compare: runs both and returns the difference as a text, which is empty if there is none.
     """
     leaves, tree = jax.tree.flatten(tuple(types))
-    shapes = [(x.shape, x.dtype) for x in leaves]
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # the run itself says why XLA compiles
-        library = _compiled([_Function(lambda *x: function(*x), tree, shapes, None)])
+        library = _compiled([_Function(function, tree, [(x.shape, x.dtype) for x in leaves], None)])
     if library is None:
         return ""
     path = _cache_path(f"{library.name}_compared")

@@ -55,7 +55,7 @@ class CWriter(ScalarWriter):
         def text(value: np.ndarray) -> str:
             if value.ndim:
                 return self.listed(map(text, value))
-            return literal_of(value.item(), kind, "")
+            return literal_of(value.item(), "i" if kind == "b" else kind, "")
 
         sized = sized_name(name, array.shape)
         return f"static {self.declaration(kind, sized)} = {text(array)};"

@@ -6,9 +6,7 @@ languages. As in JAX, NaN propagates, integer arithmetic wraps around, conversio
 
 from __future__ import annotations
 
-import functools
 import itertools
-import operator
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any, TypeAlias
 
@@ -154,7 +152,7 @@ def _cumulative(binary: Function) -> Function:
 def _windows(
     shape: Sequence[int], sizes: Sequence[int], indices: jax.Array, mode: object,
     axes: Sequence[int], batching: Iterable[tuple[int, int]],
-) -> Iterator[tuple[tuple[int, ...], list[Any], Any]]:  # fmt: skip
+) -> Iterator[Any]:  # fmt: skip
     """Yield the position of each row of indices, the start of its window, and whether it counts.
 
     Args:

@@ -161,9 +161,8 @@ def run(
             [*itertools.starmap(_TrialQueue, enumerate(jobs))], setting, slots, len(devices)
         )
         compilations = [partial(x.compiled, d) for x in itertools.chain(*groups) for d in devices]
-        for queue in itertools.chain(*(program.queues for program, *_ in groups)):
-            example = queue.example
-            law_check.warn_of_difference(example.stage, *example.inputs, example.law, setting)
+        for queue in itertools.chain(*(group[0].queues for group in groups)):
+            law_check.warn_of_difference(queue.example, setting)
         monitor.programs = len(compilations)
         monitor.report()
         tasks = [partial(_work, groups, monitor, *x) for x in enumerate(devices * workers)]
