@@ -199,12 +199,13 @@ def _gather(
     return jnp.moveaxis(result, range(len(rest)), rest)
 
 
-def _scatter(combine: Function) -> Function:
-    """Return the function that combines windows of an array with updates, one after another."""
+def _scatter(combine: Function | None) -> Function:
+    """Return the function that combines windows of an array with updates; None replaces them."""
 
     def scatter(
         x: jax.Array, indices: jax.Array, updates: jax.Array,
-        dimension_numbers: lax.ScatterDimensionNumbers, mode: object, **_: object,
+        dimension_numbers: lax.ScatterDimensionNumbers, mode: Any, unique_indices: bool,
+        **_: object,
     ) -> jax.Array:  # fmt: skip
         axes = dimension_numbers
         rest = [i for i in range(updates.ndim) if i not in axes.update_window_dims]
@@ -212,11 +213,16 @@ def _scatter(combine: Function) -> Function:
         blocks = jnp.moveaxis(updates, rest, range(len(rest)))
         window = iter(blocks.shape[len(rest) :])
         sizes = [1 if i in single else next(window) for i in range(x.ndim)]
+        if combine and unique_indices:
+            inverse = lax.GatherDimensionNumbers(*axes)
+            results = combine(lax.gather(x, indices, inverse, sizes, mode=mode), updates)
+            return lax.scatter(x, indices, results, axes, unique_indices=True, mode=mode)
         batching = zip(axes.operand_batching_dims, axes.scatter_indices_batching_dims, strict=True)
         map_ = axes.scatter_dims_to_operand_dims
         for at, starts, inside in _windows(x.shape, sizes, indices, mode, map_, batching):
             previous = lax.dynamic_slice(x, starts, sizes)
-            block = combine(previous, blocks[at].reshape(sizes))
+            block = blocks[at].reshape(sizes)
+            block = combine(previous, block) if combine else block
             x = lax.dynamic_update_slice(x, jnp.where(inside, block, previous), starts)
         return x
 
@@ -337,7 +343,7 @@ COMPOUNDS: dict[str, Function] = {
     "cummax": _cumulative(lax.max),
     "cummin": _cumulative(lax.min),
     "gather": _gather,
-    "scatter": _scatter(lambda x, y: y),
+    "scatter": _scatter(None),
     "scatter-add": _scatter(lax.add),
     "scatter-sub": _scatter(lax.sub),
     "scatter-mul": _scatter(lax.mul),
