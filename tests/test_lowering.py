@@ -15,10 +15,12 @@ import numpy as np
 import pytest
 from helpers import ROOT, output_of
 from jax import lax
+from jax.extend.core import ClosedJaxpr, Jaxpr, Primitive
 from test_gpu_writer import Emulated
 
 from rps_jax.engines import device, native
-from rps_jax.lowering import c, js, operations, walk
+from rps_jax.lowering import c, js, operations, target, walk
+from rps_jax.lowering.compounds import COMPOUNDS
 from rps_jax.lowering.gpu_writer import GpuWriter
 from rps_jax.lowering.nodes import SimdNodes
 from rps_jax.lowering.onnx import Graph, Tensor
@@ -94,6 +96,15 @@ CASES = {
         x.at[i].get(mode="fill", fill_value=-1),
     ),
     "changes": lambda x, i: (x.at[i].set(7), x.at[i % 3].add(i), x.at[i[0] % 3].mul(2)),
+    "further changes": lambda x, i: (
+        x.at[i % 3].subtract(i),
+        x.at[i[1] % 3].max(1),
+        i.at[i].max(2),
+    ),
+    "further moves": lambda x, i: (
+        *(jnp.stack([x, -x]).T, jnp.split(x, [1]), jnp.copy(x), lax.optimization_barrier(x)),
+        lax.dynamic_update_slice(jnp.stack([x, -x]), x[None, :2], (i[0], i[1])),
+    ),
     "changed rows": lambda x, i: jnp.stack([x, -x]).at[i % 2, i[::-1] % 3].min(i),
     "searches": lambda x, i: (
         jnp.searchsorted(jnp.sort(i), i[0]),
@@ -234,11 +245,12 @@ def inputs(real):
 
 
 @functools.cache
-def expected(names, real):
-    """Return JAX's results of cases."""
-    run = jax.jit(jax.vmap(functools.partial(all_results, names)))
+def expected(real):
+    """Return JAX's results of each case that some back end supports."""
+    names = [name for name in [*CASES, *generated()] if not is_refused("simd", name)]
+    run = jax.jit(jax.vmap(lambda *row: [results_of(name, *row) for name in names]))
     with jax.enable_x64(real == np.float64):
-        return jax.device_get(run(*inputs(real)))
+        return dict(zip(names, jax.device_get(run(*inputs(real))), strict=True))
 
 
 def results_of(name, x, i):
@@ -397,31 +409,25 @@ def test_operations_are_those_of_jax(name, tmp_path):
     if name == "onnx":
         pytest.importorskip("onnx")
     real, lower, run = BACK_ENDS[name]
-    rows = [jax.ShapeDtypeStruct((3,), kind) for kind in (np.float32, np.int32)]
-    supported, refused = [], set()
+    supported, wrong = [], {}
     for case in [*CASES, *generated()]:
-        try:
-            lower([case])
+        if is_refused(name, case):
+            with pytest.raises(UnsupportedError):
+                lower([case])
+        else:
             supported.append(case)
-        except UnsupportedError:
-            refused.add(case)
     computed = iter(run(supported, real, tmp_path))
-    leaves = iter(expected(tuple(supported), real))
-    wrong = {}
     for case in supported:
-        types = jax.eval_shape(lambda *row, case=case: results_of(case, *row), *rows)
-        for leaf in itertools.islice(leaves, len(types)):
+        for leaf in expected(real)[case]:
             value = np.asarray(next(computed), float).reshape(leaf.shape)
             rtol = 0 if leaf.dtype.kind != "f" else 1e-12 if real == np.float64 else 4e-6
-            equal = np.isclose(
-                value, leaf.astype(float), rtol=rtol, atol=1e-30 * (rtol > 0), equal_nan=True
-            )
+            limits = {"rtol": rtol, "atol": 1e-30 if rtol else 0, "equal_nan": True}
+            equal = np.isclose(value, leaf.astype(float), **limits)
             if not equal.all():
                 at = tuple(np.argwhere(~equal)[0])
                 x, i = inputs(real)
                 wrong[case] = (x[at[0]].tolist(), i[at[0]].tolist(), value[at], leaf[at])
     assert set(wrong) == DIFFERENT.get(name, set()), wrong
-    assert refused == {case for case in [*CASES, *generated()] if is_refused(name, case)}
 
 
 def test_the_languages_have_the_operations_of_the_headers():
@@ -432,3 +438,19 @@ def test_the_languages_have_the_operations_of_the_headers():
     names = {name for name in SimdNodes.operations if not excluded.match(name)}
     assert names <= set(operations.spelled("c"))
     assert names - {"erf_f", "erfc_f"} <= {*operations.spelled("js"), "exp2_f", "round_f"}
+
+
+def primitive_names(jaxpr):
+    """Return the names of all primitives of a jaxpr and of those that it contains."""
+    names = {eqn.primitive.name for eqn in jaxpr.eqns}
+    params = jax.tree.leaves([list(eqn.params.values()) for eqn in jaxpr.eqns])
+    inner = [getattr(x, "jaxpr", x) for x in params if isinstance(x, ClosedJaxpr | Jaxpr)]
+    return names.union(*map(primitive_names, inner))
+
+
+def test_each_primitive_of_jax_that_the_compiler_knows_has_a_case():
+    known = {*COMPOUNDS, *walk._MOVES, *walk._IDENTITIES, *target.REDUCTIONS}
+    known |= {operation.rpartition("_")[0] for operation in {*SimdNodes.operations, *COMPOUNDS}}
+    primitives = {x.name for x in vars(lax).values() if isinstance(x, Primitive)}
+    closed, *_ = jaxpr([*CASES, *generated()])
+    assert known & primitives <= primitive_names(closed.jaxpr)

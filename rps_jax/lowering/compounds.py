@@ -263,11 +263,8 @@ def _sort(
         for distance, rest in rounds:
             low = (index & width == rest) & (index < size - distance)
             high = np.roll(low, distance)
-
-            def partner(x: jax.Array, low: Any = low, high: Any = high, by: int = distance) -> Any:
-                return jnp.where(low, jnp.roll(x, -by, -1), jnp.where(high, jnp.roll(x, by, -1), x))
-
-            others = list(map(partner, columns))
+            pairs = [(x, jnp.roll(x, distance, -1), jnp.roll(x, -distance, -1)) for x in columns]
+            others = [jnp.where(low, up, jnp.where(high, down, x)) for x, down, up in pairs]
             swaps = others[-1] < columns[-1]
             for x, y in reversed([*zip(columns[:num_keys], others, strict=False)]):
                 swaps = is_before(y, x) | (~is_before(x, y) & swaps)

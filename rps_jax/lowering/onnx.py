@@ -25,7 +25,6 @@ from rps_jax.lowering.target import (
 _OPSET, _FORMAT = 18, 9  # versions of the operators and of the file
 _DTYPES = {"f": np.float32, "i": np.int32, "b": np.bool_, "u": np.uint32}
 _OPERATORS = spelled("onnx")
-_SHIFTS = {"shift_up": "LEFT", "shift_down": "RIGHT"}
 _REDUCED = {"add": "ReduceSum", "mul": "ReduceProd", "max": "ReduceMax", "min": "ReduceMin"}
 
 
@@ -121,7 +120,8 @@ class Graph(Target):
         if operator is None:
             raise UnsupportedError(name)
         if operator == "BitShift":  # of unsigned integers alone
-            bits, direction = [self._cast(tensor, "u") for tensor in x], _SHIFTS[name]
+            bits = [self._cast(tensor, "u") for tensor in x]
+            direction = "LEFT" if name == "shift_up" else "RIGHT"
             return self._cast(self.node(operator, bits, shape, "u", direction=direction), kind)
         if name == "select_n":
             x = [x[0], x[2], x[1]]

@@ -45,8 +45,7 @@ def warn_of_difference(batch: WorldBatch, setting: Setting) -> None:
     # Without the law's state, laws with equal observations share one program.
     loop = ControlLoop(setting.physics, law=dataclasses.replace(law, init=lambda _: ()))
 
-    def observe() -> Any:
-        return _observe(worlds, params, loop)
+    observe = functools.partial(_observe, worlds, params, loop)
 
     def run(obs: Any) -> Any:
         """Return arguments and results of the law in each control step (steps * worlds, ...)."""
