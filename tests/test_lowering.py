@@ -2,6 +2,8 @@
 
 import ctypes
 import functools
+import inspect
+import itertools
 import json
 import re
 import runpy
@@ -13,10 +15,12 @@ import numpy as np
 import pytest
 from helpers import ROOT, output_of
 from jax import lax
+from jax.extend.core import ClosedJaxpr, Jaxpr, Primitive
 from test_gpu_writer import Emulated
 
 from rps_jax.engines import device, native
-from rps_jax.lowering import c, js, operations, walk
+from rps_jax.lowering import c, js, operations, target, walk
+from rps_jax.lowering.compounds import COMPOUNDS
 from rps_jax.lowering.gpu_writer import GpuWriter
 from rps_jax.lowering.nodes import SimdNodes
 from rps_jax.lowering.onnx import Graph, Tensor
@@ -77,7 +81,37 @@ CASES = {
     "an index": lambda x, i: jnp.stack([x, -x])[jnp.clip(i[0], 0, 1), i[1] % 3],
     "an index out of bounds": lambda x, i: (x.at[i].get(), x.at[i].get(mode="clip")),
     "a slice": lambda x, i: lax.dynamic_slice(jnp.stack([x, 2 * x, -x]), (i[0], i[1]), (2, 2)),
+    "a table of bools": lambda x, i: jnp.tile(x > 0, 2) ^ jnp.array([True, False] * 3),
     "a table": lambda x, i: jnp.array([1.0, 5.0, -2.0, 7.5], x.dtype)[i % 4],
+    "sorts": lambda x, i: (jnp.sort(x), jnp.argsort(x, descending=True), jnp.lexsort((x, i % 2))),
+    "a sort of rows": lambda x, i: jnp.sort(jnp.stack([x, -x, x * 0, x[::-1], -x[::-1]]), axis=0),
+    "a sort of many": lambda x, i: lax.sort((jnp.tile(i, 5), jnp.arange(15)), is_stable=True),
+    "a sort by two keys": lambda x, i: lax.sort((jnp.tile(i % 2, 2), jnp.tile(x, 2)), num_keys=2),
+    "medians": lambda x, i: (jnp.median(x), jnp.nanmedian(x), jnp.median(jnp.tile(i % 9, 2)[1:])),
+    "the largest": lambda x, i: lax.top_k(jnp.concatenate([x, x[1:]]), 4),
+    "chosen numbers": lambda x, i: jnp.select([x > 1, i > 0], [x, 2 * x]),
+    "rows by index": lambda x, i: jnp.take_along_axis(jnp.stack([x, x[::-1]]), i[None] % 3, 1),
+    "an index beyond": lambda x, i: (
+        x.at[jnp.array([1, 7])].get(mode="fill", fill_value=5),
+        x.at[i].get(mode="fill", fill_value=-1),
+    ),
+    "changes": lambda x, i: (x.at[i].set(7), x.at[i % 3].add(i), x.at[i[0] % 3].mul(2)),
+    "further changes": lambda x, i: (
+        x.at[i % 3].subtract(i),
+        x.at[i[1] % 3].max(1),
+        i.at[i].max(2),
+    ),
+    "further moves": lambda x, i: (
+        *(jnp.stack([x, -x]).T, jnp.split(x, [1]), jnp.copy(x), lax.optimization_barrier(x)),
+        lax.dynamic_update_slice(jnp.stack([x, -x]), x[None, :2], (i[0], i[1])),
+    ),
+    "changed rows": lambda x, i: jnp.stack([x, -x]).at[i % 2, i[::-1] % 3].min(i),
+    "searches": lambda x, i: (
+        jnp.searchsorted(jnp.sort(i), i[0]),
+        jnp.searchsorted(jnp.sort(x), x, side="right"),
+    ),
+    "interpolation": lambda x, i: jnp.interp(i[0] % 7 / 2, jnp.array([0.0, 1, 2.5]), i % 5.0),
+    "shifts": lambda x, i: (i << 3, i >> 2, lax.shift_right_logical(i, 5 + 0 * i)),
     "moves": lambda x, i: jnp.concatenate([x[::-1], jnp.pad(x, 1), x.at[1].set(3)]),
     "an update": lambda x, i: x.at[1:].add(jnp.ones(2, x.dtype)),
     "a loop": lambda x, i: lax.fori_loop(0, 5, lambda k, y: 0.5 * y + k * x, x),
@@ -90,15 +124,113 @@ CASES = {
     "a matrix": lambda x, i: jnp.where(jnp.abs(x) < 9, x, 1) @ MATRIX.astype(x.dtype),
     "nothing": lambda x, i: (x[:0], x[:0].sum(), jnp.concatenate([x[:0], x]), i[:0] + 1),
 }
-# Cases that a back end refuses, with a sentence that names the operation.
-ONNX_LACKS = {f"{name} of a real" for name in ("log1p", "expm1", "cbrt")}
-ONNX_LACKS |= (ENDLESS := {"a loop with a condition"})
-UNSUPPORTED = {
-    **{"js": {"erf of a real"}, "onnx": ONNX_LACKS},
-    **dict.fromkeys(("c float", "c double"), ENDLESS),
+DTYPES = {"b": np.bool_, "i": np.int32, "u": np.uint32, "f": np.float32}
+SHAPES = [[(3,)] * 3, [()] * 3, [(), (3,), (3,)]]  # vectors, scalars, a scalar and vectors
+NOT_OF_NUMBERS = {"shape_as_value", "broadcast_like", "full_like", "stage", "optimization_barrier"}
+# Static parameters of functions of `lax` that have no defaults.
+STATIC = {
+    **{f"reduce_{name}": [{"axes": (0,)}] for name in ("max", "min", "sum", "prod")},
+    **{f"reduce_{name}": [{"axes": (0,)}] for name in ("and", "or", "xor")},
+    "argmax": [{"axis": 0, "index_dtype": np.int32}],
+    "argmin": [{"axis": 0, "index_dtype": np.int32}],
+    "convert_element_type": (TYPES := [{"new_dtype": dtype} for dtype in DTYPES.values()]),
+    "bitcast_convert_type": TYPES,
+    **{"top_k": [{"k": 2}], "integer_pow": [{"y": y} for y in (-2, 0, 3)]},
+    **{"round": [{"rounding_method": method} for method in lax.RoundingMethod]},
+    **{"reduce_precision": [{"exponent_bits": 8, "mantissa_bits": 23}], "sort": [{}]},
 }
-# Cases in which a back end differs from JAX: ONNX has no sign of zero.
-DIFFERENT = {"onnx": {"arctan2 of zeros"}}
+
+
+def operand(kind, shape, position, x, i):
+    """Return an operand of a kind: the numbers of a row, from a position on."""
+    source = i if kind in "iu" else x
+    source = source.astype(np.uint32) if kind == "u" else source > 0 if kind == "b" else source
+    return source[position] if shape == () else jnp.roll(source, -position)
+
+
+def result_types(function, kinds, shapes):
+    """Return the types of a function's results; none if JAX refuses operands of these types."""
+    operands = zip(shapes, kinds, strict=False)
+    types = [jax.ShapeDtypeStruct(shape, DTYPES[kind]) for shape, kind in operands]
+    try:
+        return {x.dtype for x in jax.tree.leaves(jax.eval_shape(function, *types))}
+    except Exception:  # of many classes
+        return set()
+
+
+def count_operands(function, static):
+    """Return the number of arrays that a function needs, if it needs nothing else."""
+    parameters = inspect.signature(function).parameters.values()
+    needed = [p for p in parameters if p.default is p.empty and p.name not in static]
+    count = sum(p.kind is p.POSITIONAL_OR_KEYWORD for p in needed)
+    return count + 2 * any(p.kind is p.VAR_POSITIONAL for p in needed)
+
+
+def apply_all(function, kinds, shapes, x, i):
+    """Apply a function to operands of each of some shapes."""
+    return [
+        function(*(operand(kind, shape, k, x, i) for k, (kind, shape) in enumerate(operands)))
+        for operands in (zip(kinds, form, strict=False) for form in shapes)
+    ]
+
+
+@functools.cache
+def generated():
+    """Return a case of each function of `lax` and each combination of types that JAX accepts."""
+    functions = {name: f for name, f in vars(lax).items() if inspect.isfunction(f)}
+    functions |= {f"{x}_to": getattr(lax, f"{x}_to_p").bind for x in ("lt", "le")}
+    cases, known = {}, set(map(np.dtype, DTYPES.values()))
+    filtering = jax.config.jax_traceback_filtering
+    jax.config.update("jax_traceback_filtering", "off")  # it takes most of the time
+    for name, function in functions.items():
+        for static in STATIC.get(name, [{}]):
+            count = count_operands(function, static)
+            if name in NOT_OF_NUMBERS or not 1 <= count <= 3:
+                continue
+            applied = functools.partial(function, **static)
+            words = [str(getattr(value, "__name__", value)) for value in static.values()]
+            for kinds in itertools.product(DTYPES, repeat=count):
+                if not result_types(applied, kinds, SHAPES[0]) <= known:
+                    continue
+                shapes = [x for x in SHAPES[: 1 + count] if result_types(applied, kinds, x)]
+                if shapes:
+                    case = functools.partial(apply_all, applied, kinds, shapes)
+                    cases[" ".join([f"lax.{name}", *words, "of", *kinds])] = case
+    jax.config.update("jax_traceback_filtering", filtering)
+    return cases
+
+
+# Cases that a back end refuses, with a sentence that names the operation.
+SPECIAL = {"nextafter", "bessel_i0e", "bessel_i1e", "betainc", "digamma", "igamma", "igammac"}
+SPECIAL |= {
+    "population_count",
+    "clz",
+    "igamma_grad_a",
+    "lgamma",
+    "polygamma",
+    "random_gamma_grad",
+    "zeta",
+    "cumlogsumexp",
+}
+BITS_OF_REALS = {f"bitcast_convert_type {kinds}" for kinds in
+                 ("int32 of f", "float32 of i", "float32 of f")}  # fmt: skip
+UNSIGNED = {"searches", "interpolation"}
+ENDLESS = UNSIGNED | {"a loop with a condition"}
+REFUSED = {
+    **dict.fromkeys(("c float", "c double"), BITS_OF_REALS | {"erf_inv"} | ENDLESS),
+    "js": BITS_OF_REALS | UNSIGNED | {"erf_inv", "erf", "erfc", "erf of a real"},
+    "onnx": BITS_OF_REALS | {"erf_inv", "erfc", "log1p", "expm1", "cbrt"} | ENDLESS
+    | {f"{name} of a real" for name in ("log1p", "expm1", "cbrt")},
+}  # fmt: skip
+PRECISION = {f"lax.convert_element_type float32 of {kind}" for kind in "if"}
+PRECISION |= {"lax.reduce_precision 8 23 of f"}
+# Cases in which a back end differs from JAX.
+DIFFERENT = {
+    "gpu": {"lax.reduce_sum (0,) of f"},  # threads add in another order
+    **dict.fromkeys(("c double", "js"), PRECISION),  # that of the printed code
+    # It has no sign of zero.
+    "onnx": {"arctan2 of zeros", "lax.atan2 of f f", "the largest", "lax.top_k 2 of f"},
+}
 COMPILER = device.find_compiler()
 
 
@@ -113,16 +245,22 @@ def inputs(real):
 
 
 @functools.cache
-def expected(name, real):
-    """Return JAX's results of a case."""
+def expected(real):
+    """Return JAX's results of each case that some back end supports."""
+    names = [name for name in [*CASES, *generated()] if not is_refused("simd", name)]
+    run = jax.jit(jax.vmap(lambda *row: [results_of(name, *row) for name in names]))
     with jax.enable_x64(real == np.float64):
-        results = jax.jit(jax.vmap(CASES[name]))(*inputs(real))
-        return [np.asarray(leaf) for leaf in jax.tree.leaves(results)]
+        return dict(zip(names, jax.device_get(run(*inputs(real))), strict=True))
+
+
+def results_of(name, x, i):
+    """Return the results of a case."""
+    return jax.tree.leaves((CASES.get(name) or generated()[name])(x, i))
 
 
 def all_results(names, x, i):
     """Return the results of cases as one list."""
-    return [leaf for name in names for leaf in jax.tree.leaves(CASES[name](x, i))]
+    return [leaf for name in names for leaf in results_of(name, x, i)]
 
 
 def traced(names):
@@ -250,6 +388,20 @@ BACK_ENDS = {
 NEEDS = {"gpu": "g++", "js": "node", "simd": str(COMPILER)}
 
 
+def is_refused(name, case):
+    """Whether a back end refuses a case; only vectors and CUDA have unsigned integers."""
+    refused = REFUSED.get(name, set())
+    if not case.startswith("lax."):
+        return case in refused
+    function, _, kinds = case[4:].partition(" of ")
+    operands = set(kinds.split())
+    if name not in ("simd", "gpu") and ("u" in operands or "uint32" in function):
+        return True
+    if function == "dot":  # of bools or of different types
+        return operands not in ({"i"}, {"u"}, {"f"})
+    return function in SPECIAL or not refused.isdisjoint({function, case[4:]})
+
+
 @pytest.mark.parametrize("name", BACK_ENDS)
 def test_operations_are_those_of_jax(name, tmp_path):
     if shutil.which(NEEDS.get(name, str(COMPILER))) is None:
@@ -257,33 +409,48 @@ def test_operations_are_those_of_jax(name, tmp_path):
     if name == "onnx":
         pytest.importorskip("onnx")
     real, lower, run = BACK_ENDS[name]
-    supported, refused = [], set()
-    for case in CASES:
-        try:
-            lower([case])
+    supported, wrong = [], {}
+    for case in [*CASES, *generated()]:
+        if is_refused(name, case):
+            with pytest.raises(UnsupportedError):
+                lower([case])
+        else:
             supported.append(case)
-        except UnsupportedError:
-            refused.add(case)
     computed = iter(run(supported, real, tmp_path))
-    wrong = {}
     for case in supported:
-        for leaf in expected(case, real):
+        for leaf in expected(real)[case]:
             value = np.asarray(next(computed), float).reshape(leaf.shape)
-            rtol = 1e-12 if real == np.float64 else 4e-6
-            equal = np.isclose(value, leaf.astype(float), rtol=rtol, atol=1e-30, equal_nan=True)
+            rtol = 0 if leaf.dtype.kind != "f" else 1e-12 if real == np.float64 else 4e-6
+            limits = {"rtol": rtol, "atol": 1e-30 if rtol else 0, "equal_nan": True}
+            equal = np.isclose(value, leaf.astype(float), **limits)
             if not equal.all():
                 at = tuple(np.argwhere(~equal)[0])
                 x, i = inputs(real)
                 wrong[case] = (x[at[0]].tolist(), i[at[0]].tolist(), value[at], leaf[at])
     assert set(wrong) == DIFFERENT.get(name, set()), wrong
-    assert refused == UNSUPPORTED.get(name, set())
 
 
 def test_the_languages_have_the_operations_of_the_headers():
     """Excluded are operations on unsigned integers, bits and random numbers; no law needs them."""
     excluded = re.compile(
-        r"bits_|all_|threefry|shift_|u_of|.*(_u|_of_u)$|(erf_inv_f|truncate_f|quotient_i|any)$"
+        r"bits_|all_|threefry|shift_|u_of|lt_to|in_total|.*(_u|_of_u)$|(erf_inv_f|truncate_f|quotient_i|any)$"
     )
     names = {name for name in SimdNodes.operations if not excluded.match(name)}
     assert names <= set(operations.spelled("c"))
-    assert names - {"erf_f"} <= {*operations.spelled("js"), "exp2_f", "round_f"}
+    assert names - {"erf_f", "erfc_f"} <= {*operations.spelled("js"), "exp2_f", "round_f"}
+
+
+def primitive_names(jaxpr):
+    """Return the names of all primitives of a jaxpr and of those that it contains."""
+    names = {eqn.primitive.name for eqn in jaxpr.eqns}
+    params = jax.tree.leaves([list(eqn.params.values()) for eqn in jaxpr.eqns])
+    inner = [getattr(x, "jaxpr", x) for x in params if isinstance(x, ClosedJaxpr | Jaxpr)]
+    return names.union(*map(primitive_names, inner))
+
+
+def test_each_primitive_of_jax_that_the_compiler_knows_has_a_case():
+    known = {*COMPOUNDS, *walk._MOVES, *walk._IDENTITIES, *target.REDUCTIONS}
+    known |= {operation.rpartition("_")[0] for operation in {*SimdNodes.operations, *COMPOUNDS}}
+    primitives = {x.name for x in vars(lax).values() if isinstance(x, Primitive)}
+    closed, *_ = jaxpr([*CASES, *generated()])
+    assert known & primitives <= primitive_names(closed.jaxpr)

@@ -1,6 +1,7 @@
 """Functions of one world that a C compiler compiles have the results of XLA."""
 
 from dataclasses import replace
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -8,13 +9,14 @@ import numpy as np
 import pytest
 from helpers import same
 
+from rps_jax import Details, Law, Twist, replay, sweep
 from rps_jax.control import registry
 from rps_jax.engines import native
 from rps_jax.engines.base import ControlPeriod
-from rps_jax.lowering import nodes, walk
-from rps_jax.trials import trial
+from rps_jax.lowering import compounds, nodes, walk
+from rps_jax.trials import law_check, trial
 from rps_jax.trials.setting import Setting
-from rps_jax.trials.trial import ControlLoop
+from rps_jax.trials.trial import ControlLoop, Rules
 from rps_jax.trials.worlds import drawn_worlds
 from rps_jax.world import draws
 from rps_jax.world.domain import DOMAINS, Range
@@ -329,8 +331,8 @@ def test_the_loop_of_a_base_with_slip_is_compiled_as_a_whole(monkeypatch):
 
 FALLBACKS = {
     "large products, as of a learned law": (lambda x: jnp.ones((99, 3)) * x @ jnp.ones(3), []),
-    "an unsupported operation": (lambda x: jnp.sort(jnp.stack([x, -x]))[0], [
-        "operation `sort` cannot be translated; use arithmetic, comparisons, jnp.where and "
+    "an unsupported operation": (lambda x: jax.lax.lgamma(x + 1) * 3 * x, [
+        "operation `lgamma` cannot be translated; use arithmetic, comparisons, jnp.where and "
         "elementary functions. XLA compiles this law, which is some ten times slower."
     ]),
     "code that cannot be printed": (None, ["cannot be printed, so XLA compiles: KeyError"]),
@@ -358,6 +360,57 @@ def test_only_the_fused_engine_calls_compiled_functions(engine, monkeypatch):
     stage, inputs, loop = batch("box", "ideal", 2, "rps", engine)
     run = jax.make_jaxpr(advance(stage, loop, 1))
     assert ("rps_native" in str(run(*inputs, start_trials(inputs, loop)))) == (engine == "fused")
+
+
+class MineParams(NamedTuple):
+    """Parameters of a custom law, which chooses by bools and sorts."""
+
+    v: float = 0.05
+    d_success: float = 0.05
+
+
+def mine_step(params, state, obs):
+    count, past = state
+    past = past.at[count % 5].set(obs.l)
+    left, touches = obs.l > 0.01, obs.in_contact
+    v_y = jnp.select([touches > left, touches], [-0.01, 0.01], 0.0)
+    w = jnp.array([0.2, -0.2, 0.0])[jnp.argmax(jnp.stack([jnp.median(past) > 0, left, touches]))]
+    w = w * jax.lax.cond(touches & (count % 3 == 0), lambda: 0.5, lambda: 1.0)
+    return (count + 1, past), Twist(params.v, v_y, w), Details.from_obs(obs)
+
+
+@pytest.fixture
+def mine(registries):
+    """Register a custom law and return its parameters."""
+    law = Law(lambda params: (jnp.zeros((), jnp.int32), jnp.zeros(5)), mine_step)
+    registry.register_law("mine", law, MineParams())
+    return MineParams()
+
+
+def test_a_custom_law_is_compared_with_xla_before_a_run_once(mine, cache, monkeypatch, recwarn):
+    setting, domain = Setting("fused"), replace(DOMAINS["wide"], objects=("box",))
+    part = drawn_worlds(domain, draws.draw(domain, 3, np.arange(2)), setting)
+    law_check.warn_of_difference(part.with_params(mine), setting)
+    assert not recwarn.list
+    monkeypatch.setitem(compounds.COMPOUNDS, "gt_b", lambda x, y: ~x & y)
+    for _ in range(2):
+        with pytest.warns(UserWarning, match="law of MineParams gives other results as compiled"):
+            law_check.warn_of_difference(part.with_params(mine), setting)
+        monkeypatch.setattr(native, "batched", None)  # the result is cached
+    monkeypatch.setattr(native, "compared", None)
+    law_check.warn_of_difference(part.with_params(registry.resolve_law("rps")[1]), setting)
+
+
+def test_a_sweep_of_a_custom_law_is_a_push_in_xla(mine, tmp_path, monkeypatch):
+    setting = Setting("fused", rules=Rules(horizon=8.0))
+    swept = sweep("mine", "wide,objects=box,gap=0.01", worlds=2, setting=setting, out=tmp_path)
+    monkeypatch.setenv("RPS_COMPILER", "none")
+    pushed = replay(tmp_path, 1)
+    ends = swept.isel(world=1).squeeze()
+    assert float(ends.path_length) > 0.3
+    for name in ("path_length", "min_distance", "mean_abs_l", "contact_lost_time"):
+        error = abs(float(ends[name]) - float(getattr(pushed.outcome, name)))
+        assert error < 1e-4, (name, error)
 
 
 def test_another_compiler_shares_no_cached_function(tmp_path, monkeypatch):

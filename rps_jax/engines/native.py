@@ -141,6 +141,30 @@ def batched(
     return call
 
 
+def compared(
+    function: Callable[..., Pytree], types: Sequence[Pytree], compare: Callable[[], str]
+) -> str:
+    """Return the result of comparing a function with XLA's; it is cached with the function.
+
+    Args:
+      function: the function of one world that `batched` compiles.
+      types: shapes and dtypes of its arguments, of a batch of worlds.
+      compare: runs both and returns the difference as a text, which is empty if there is none.
+    """
+    leaves, tree = jax.tree.flatten(tuple(types))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # the run itself says why XLA compiles
+        library = _compiled([_Function(function, tree, [(x.shape, x.dtype) for x in leaves], None)])
+    if library is None:
+        return ""
+    path = _cache_path(f"{library.name}_compared")
+    result = path and cache.read(path, "compared", bytes.decode)
+    if result is None:
+        result = compare()
+        cache.write(path, result.encode())
+    return result
+
+
 def mapped(function: Callable[..., Pytree], axes: Sequence[int | None]) -> Callable[..., Pytree]:
     """Return `jax.vmap(function, axes)`, compiled and differentiated world by world.
 

@@ -6,11 +6,9 @@ languages. As in JAX, NaN propagates, integer arithmetic wraps around, conversio
 
 from __future__ import annotations
 
-import functools
 import itertools
-import operator
-from collections.abc import Callable, Sequence
-from typing import TypeAlias
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from typing import Any, TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -20,9 +18,9 @@ from jax.extend.core import Primitive
 
 from rps_jax.lowering.target import UnsupportedError
 
-Function: TypeAlias = Callable[..., jax.Array]
+Function: TypeAlias = Callable[..., Any]  # of arrays
 _BOUND = 2.0**31  # above all integers
-# What `gather` returns for an index out of bounds.
+_MAX_SORTED = 256  # numbers along an axis
 _FILL = {"f": np.nan, "i": -(2**31), "u": 2**32 - 1, "b": True}
 
 
@@ -40,6 +38,8 @@ def _primitive(name: str, dtype: np.dtype | None = None) -> Function:
 
 _quotient = _primitive("quotient")  # of integers, whose divisor is neither 0 nor -1
 _truncation = _primitive("truncate", np.dtype(np.int32))  # of reals within the bounds of integers
+_shift_up, _shift_down = map(_primitive, ("shift_up", "shift_down"))  # by less than all bits
+_precedes = _primitive("lt_to", np.dtype(np.bool_))  # in the total order of numbers
 
 
 def _sign(x: jax.Array) -> jax.Array:
@@ -64,6 +64,17 @@ def _remainder(x: jax.Array, y: jax.Array) -> jax.Array:
     """Return the remainder of integers: by 0 it is the dividend."""
     divisor = jnp.where((y == 0) | (y == -1), 1, y)
     return jnp.where(y == 0, x, x - _quotient(x, divisor) * divisor)
+
+
+def _shift(shift: Function) -> Function:
+    """Return the function that shifts integers; by all bits or more, the result is 0."""
+    return lambda x, by: jnp.where((by >= 0) & (by < 32), shift(x, by & 31), 0)
+
+
+def _shift_arithmetic(x: jax.Array, by: jax.Array) -> jax.Array:
+    """Shift with the sign; bits of unsigned integers are read as of signed ones."""
+    bits, count, shift = x.astype(np.int32), by.astype(np.int32), lax.shift_right_logical
+    return jnp.where(bits < 0, ~shift(~bits, count), shift(bits, count)).astype(x.dtype)
 
 
 def _integer(x: jax.Array, **_: object) -> jax.Array:
@@ -138,54 +149,144 @@ def _cumulative(binary: Function) -> Function:
     return cumulative
 
 
+def _windows(
+    shape: Sequence[int], sizes: Sequence[int], indices: jax.Array, mode: object,
+    axes: Sequence[int], batching: Iterable[tuple[int, int]],
+) -> Iterator[Any]:  # fmt: skip
+    """Yield the position of each row of indices, the start of its window, and whether it counts.
+
+    Args:
+      shape: of the array.
+      sizes: of a window.
+      indices: rows of starts.
+      mode: whether windows beyond the array count.
+      axes: of the array, one for each column of `indices`.
+      batching: pairs of an axis of the array and the axis of `indices` that has its index.
+    """
+    pairs = list(batching)
+    for position in np.ndindex(indices.shape[:-1]):
+        starts, inside = [np.int32(0)] * len(shape), np.True_
+        for axis, at in pairs:
+            starts[axis] = np.int32(position[at])
+        for start, axis in zip(indices[position], axes, strict=True):
+            starts[axis] = start
+            if "FILL" in str(mode).upper():
+                inside = inside & (start >= 0) & (start <= shape[axis] - sizes[axis])
+        yield position, starts, inside
+
+
+def fill_of(dtype: np.dtype, fill_value: Any) -> np.ndarray:
+    """Return what `gather` returns for an index out of bounds."""
+    return np.asarray(_FILL[dtype.kind] if fill_value is None else fill_value, dtype)
+
+
 def _gather(
     x: jax.Array, indices: jax.Array, dimension_numbers: lax.GatherDimensionNumbers,
-    slice_sizes: Sequence[int], mode: object, **_: object,
+    slice_sizes: Sequence[int], mode: object, fill_value: Any = None, **_: object,
 ) -> jax.Array:  # fmt: skip
     """Gather slices at indices that are known at run time."""
     axes, blocks = dimension_numbers, []
-    if axes.operand_batching_dims:
-        raise UnsupportedError("gather in a batch")
-    for row in indices.reshape(-1, indices.shape[-1]):
-        starts, inside = [jnp.zeros((), indices.dtype)] * x.ndim, []
-        for start, axis in zip(row, axes.start_index_map, strict=True):
-            starts[axis] = start
-            inside += [start >= 0, start <= x.shape[axis] - slice_sizes[axis]]
-        block = lax.dynamic_slice_p.bind(x, *starts, slice_sizes=slice_sizes)
-        if "FILL" in str(mode).upper() and inside:
-            fill = _FILL[x.dtype.kind]
-            block = jnp.where(functools.reduce(operator.and_, inside), block, fill)
-        blocks.append(block)
-    stacked = jnp.squeeze(jnp.stack(blocks), tuple(1 + i for i in axes.collapsed_slice_dims))
+    single = axes.collapsed_slice_dims + axes.operand_batching_dims
+    batching = zip(axes.operand_batching_dims, axes.start_indices_batching_dims, strict=True)
+    windows = _windows(x.shape, slice_sizes, indices, mode, axes.start_index_map, batching)
+    fill = fill_of(x.dtype, fill_value)
+    for _, starts, inside in windows:
+        block = lax.dynamic_slice(x, starts, slice_sizes)
+        blocks.append(block if inside is np.True_ else jnp.where(inside, block, fill))
+    stacked = jnp.squeeze(jnp.stack(blocks), tuple(1 + i for i in single))
     result = stacked.reshape(*indices.shape[:-1], *stacked.shape[1:])
     rest = [i for i in range(result.ndim) if i not in axes.offset_dims]
     return jnp.moveaxis(result, range(len(rest)), rest)
 
 
-def _scatter_add(
-    x: jax.Array, indices: jax.Array, updates: jax.Array, unique_indices: bool, **params: object
-) -> jax.Array:
-    """Add updates at indices: the sum of the array and of updates or zeros."""
-    if not unique_indices:
-        raise UnsupportedError("scatter-add")
-    params |= {"unique_indices": True, "update_jaxpr": None, "update_consts": ()}
-    return x + lax.scatter_p.bind(jnp.zeros_like(x), indices, updates, **params)
+def _scatter(combine: Function | None) -> Function:
+    """Return the function that combines windows of an array with updates; None replaces them."""
+
+    def scatter(
+        x: jax.Array, indices: jax.Array, updates: jax.Array,
+        dimension_numbers: lax.ScatterDimensionNumbers, mode: Any, unique_indices: bool,
+        **_: object,
+    ) -> jax.Array:  # fmt: skip
+        axes = dimension_numbers
+        rest = [i for i in range(updates.ndim) if i not in axes.update_window_dims]
+        single = (*axes.inserted_window_dims, *axes.operand_batching_dims)
+        blocks = jnp.moveaxis(updates, rest, range(len(rest)))
+        window = iter(blocks.shape[len(rest) :])
+        sizes = [1 if i in single else next(window) for i in range(x.ndim)]
+        if combine and unique_indices:
+            inverse = lax.GatherDimensionNumbers(*axes)
+            results = combine(lax.gather(x, indices, inverse, sizes, mode=mode), updates)
+            return lax.scatter(x, indices, results, axes, unique_indices=True, mode=mode)
+        batching = zip(axes.operand_batching_dims, axes.scatter_indices_batching_dims, strict=True)
+        map_ = axes.scatter_dims_to_operand_dims
+        for at, starts, inside in _windows(x.shape, sizes, indices, mode, map_, batching):
+            previous = lax.dynamic_slice(x, starts, sizes)
+            block = blocks[at].reshape(sizes)
+            block = combine(previous, block) if combine else block
+            x = lax.dynamic_update_slice(x, jnp.where(inside, block, previous), starts)
+        return x
+
+    return scatter
+
+
+def _is_before(x: jax.Array, y: jax.Array) -> jax.Array:
+    """Return whether a number comes first in ascending order, in which NaN is last."""
+    before = lax.lt(x, y)
+    if jnp.issubdtype(x.dtype, jnp.floating):
+        before |= (x == x) & (y != y)
+    return before
+
+
+def _precedes_in_any_language(x: jax.Array, y: jax.Array) -> jax.Array:
+    """Return whether a number comes first in total order, in which -0.0 is before 0.0."""
+    before = _is_before(x, y)
+    if jnp.issubdtype(x.dtype, jnp.floating):
+        before |= (x == 0) & (y == 0) & (1 / x < 1 / y)
+    return before
+
+
+def _sort(
+    *operands: jax.Array, dimension: int, num_keys: int, is_before: Function = _is_before,
+    **_: object,
+) -> list[jax.Array]:  # fmt: skip
+    """Sort operands by the first ones; equal keys stay in their order."""
+    size = operands[0].shape[dimension]
+    if size > _MAX_SORTED:
+        raise UnsupportedError(f"sort of more than {_MAX_SORTED} numbers")
+    columns = [jnp.moveaxis(x, dimension, -1) for x in operands]
+    index = np.arange(size, dtype=np.int32)
+    columns.append(jnp.broadcast_to(index, columns[0].shape))
+    # Batcher's merge exchange: each round compares numbers at a distance.
+    levels = [1 << k for k in reversed(range((size - 1).bit_length()))]
+    for width in levels:
+        rounds = [(width, 0), *((x - width, width) for x in levels if x > width)]
+        for distance, rest in rounds:
+            low = (index & width == rest) & (index < size - distance)
+            high = np.roll(low, distance)
+            pairs = [(x, jnp.roll(x, distance, -1), jnp.roll(x, -distance, -1)) for x in columns]
+            others = [jnp.where(low, up, jnp.where(high, down, x)) for x, down, up in pairs]
+            swaps = others[-1] < columns[-1]
+            for x, y in reversed([*zip(columns[:num_keys], others, strict=False)]):
+                swaps = is_before(y, x) | (~is_before(x, y) & swaps)
+            swaps ^= high
+            columns = [jnp.where(swaps, y, x) for x, y in zip(columns, others, strict=True)]
+    return [jnp.moveaxis(x, -1, dimension) for x in columns[:-1]]
+
+
+def _top_k(x: jax.Array, k: int, axis: int) -> list[jax.Array]:
+    """Return the largest numbers and their indices."""
+    index = lax.broadcasted_iota(np.int32, x.shape, axis)
+    columns = _sort(x, index, dimension=axis, num_keys=1, is_before=lambda x, y: _precedes(y, x))
+    return [lax.slice_in_dim(column, 0, k, axis=axis) for column in columns]
 
 
 def _update(x: jax.Array, update: jax.Array, *starts: jax.Array) -> jax.Array:
     """Replace a slice at an index that is known at run time, clamped to the array."""
     limits = [size - width for size, width in zip(x.shape, update.shape, strict=True)]
-    result = x
-    for at in np.ndindex(*(limit + 1 for limit in limits)):
-        chosen = [
-            jnp.clip(start, 0, limit) == k
-            for start, k, limit in zip(starts, at, limits, strict=True)
-            if limit
-        ]
-        replaced = lax.dynamic_update_slice_p.bind(x, update, *map(np.int32, at))
-        is_here = functools.reduce(operator.and_, chosen, np.True_)
-        result = jnp.where(is_here, replaced, result)
-    return result
+    pads = [(limit, limit) for limit in limits]
+    at = [limit - jnp.clip(start, 0, limit) for start, limit in zip(starts, limits, strict=True)]
+    is_here = lax.dynamic_slice(np.pad(np.ones(update.shape, bool), pads), at, x.shape)
+    return jnp.where(is_here, lax.dynamic_slice(jnp.pad(update, pads), at, x.shape), x)
 
 
 # Functions by the name of an operation (see `target.operation_of`), or of a primitive of any kind.
@@ -195,8 +296,21 @@ COMPOUNDS: dict[str, Function] = {
     "add_any": lambda x, y: x + y,
     "one_minus_square": lambda x: 1 - x * x,  # of versions of JAX from 0.11 on
     "ne": lambda x, y: ~(x == y),
+    "lt_b": lambda x, y: ~x & y,
+    "le_b": lambda x, y: ~x | y,
+    "gt_b": lambda x, y: x & ~y,
+    "ge_b": lambda x, y: x | ~y,
+    "max_b": lambda x, y: x | y,
+    "min_b": lambda x, y: x & y,
+    "reduce_max_b": lambda x, axes, **_: jnp.any(x, axes),
+    "reduce_min_b": lambda x, axes, **_: jnp.all(x, axes),
+    "lt_to": _precedes_in_any_language,
+    "le_to": lambda x, y: ~_precedes(y, x),
     "abs_i": lambda x: jnp.maximum(x, -x),
     "sign": _sign,
+    "sign_u": lambda x: jnp.minimum(x, 1),
+    "neg_u": lambda x: 0 - x,
+    "not_u": lambda x: x ^ np.uint32(2**32 - 1),
     "rsqrt": lambda x, **_: 1 / jnp.sqrt(x),
     "exp2": lambda x, **_: lax.pow(jnp.full_like(x, 2), x),
     "logistic": lambda x, **_: 1 / (1 + jnp.exp(-x)),
@@ -204,12 +318,19 @@ COMPOUNDS: dict[str, Function] = {
     "round": _round,
     "atan2": _atan2,
     "integer_pow": _power,
+    **dict.fromkeys(("pow_i", "pow_u"), lambda x, y: lax.pow(x, y.astype(x.dtype))),
     "div_i": _divide,
     "rem_i": _remainder,
+    "div_u": lambda x, y: jnp.where(y == 0, np.uint32(2**32 - 1), _quotient(x, jnp.maximum(y, 1))),
+    "rem_u": lambda x, y: x - _quotient(x, jnp.maximum(y, 1)) * y,
+    "shift_left_i": _shift(_shift_up),
+    "shift_right_logical_i": _shift(_shift_down),
+    "shift_right_arithmetic": _shift_arithmetic,
     "i_of_f": _integer,
     "u_of_f": _unsigned,
-    **dict.fromkeys(("b_of_f", "b_of_i"), lambda x, **_: x != 0),
+    **dict.fromkeys(("b_of_f", "b_of_i", "b_of_u"), lambda x, **_: x != 0),
     **dict.fromkeys(("f_of_b", "i_of_b", "u_of_b"), _of_bool),
+    **dict.fromkeys(("bits_i_of_u", "bits_u_of_i"), lambda x, new_dtype: x.astype(new_dtype)),
     "choose_b": lambda flag, no, yes: (flag & yes) | (~flag & no),
     "select_n": _select,
     "argmax": _argument(lax.gt),
@@ -219,6 +340,13 @@ COMPOUNDS: dict[str, Function] = {
     "cummax": _cumulative(lax.max),
     "cummin": _cumulative(lax.min),
     "gather": _gather,
-    "scatter-add": _scatter_add,
+    "scatter": _scatter(None),
+    "scatter-add": _scatter(lax.add),
+    "scatter-sub": _scatter(lax.sub),
+    "scatter-mul": _scatter(lax.mul),
+    "scatter-min": _scatter(lax.min),
+    "scatter-max": _scatter(lax.max),
+    "sort": _sort,
+    "top_k": _top_k,
     "dynamic_update_slice": _update,
 }  # fmt: skip

@@ -214,13 +214,7 @@ class SimdNodes(Target):
         if len(axes) == len(shape) and size_of(shape) > 1 and (binary, kind) in INITIAL:
             size, op = size_of(shape), f"fold {binary}_{kind}"
             return Array(self.node(op, [flat(value, size)], kind, size), 0, 0, ())
-        rest = [i for i in range(len(shape)) if i not in axes]
-        indices = np.transpose(np.arange(size_of(shape)).reshape(shape), [*axes, *rest])
-        rows = indices.reshape(-1, *out.shape)
-        result = self.moved([value], rows[0], out)
-        for row in rows[1:]:
-            result = self.apply(binary, [result, self.moved([value], row, out)], {}, out)
-        return result
+        return self.reduced_by_rows(binary, value, axes, out)
 
     def _product(self, lhs: Value, rhs: Value, dimensions: Any, out: Typed) -> Value:
         """Multiply matrices."""

@@ -23,7 +23,7 @@ from rps_jax.lowering.target import (
 )
 
 _OPSET, _FORMAT = 18, 9  # versions of the operators and of the file
-_DTYPES = {"f": np.float32, "i": np.int32, "b": np.bool_}
+_DTYPES = {"f": np.float32, "i": np.int32, "b": np.bool_, "u": np.uint32}
 _OPERATORS = spelled("onnx")
 _REDUCED = {"add": "ReduceSum", "mul": "ReduceProd", "max": "ReduceMax", "min": "ReduceMin"}
 
@@ -110,7 +110,7 @@ class Graph(Target):
     def apply(self, name: str, values: Sequence[Value], params: Params, out: Typed) -> Tensor:
         x, shape, kind = [self.tensor(value) for value in values], out.shape, kind_of(out.dtype)
         if name in REDUCTIONS:
-            return self._reduced(REDUCTIONS[name], x[0], params["axes"], shape, kind)
+            return self._reduced(REDUCTIONS[name], x[0], params["axes"], out, kind)
         if name == "dynamic_slice":
             return self._slice(x[0], values[1:], params["slice_sizes"], out)
         if name == "dot_general":
@@ -119,6 +119,10 @@ class Graph(Target):
         operator = _OPERATORS.get(operation_of(name, x, params, out))
         if operator is None:
             raise UnsupportedError(name)
+        if operator == "BitShift":  # of unsigned integers alone
+            bits = [self._cast(tensor, "u") for tensor in x]
+            direction = "LEFT" if name == "shift_up" else "RIGHT"
+            return self._cast(self.node(operator, bits, shape, "u", direction=direction), kind)
         if name == "select_n":
             x = [x[0], x[2], x[1]]
         attributes = {"Mod": {"fmod": 1}, "Cast": {"to": self._type(kind)}}
@@ -142,10 +146,13 @@ class Graph(Target):
         return self.onnx.helper.np_dtype_to_tensor_dtype(np.dtype(_DTYPES[kind]))
 
     def _reduced(
-        self, binary: str, x: Tensor, axes: Sequence[int], shape: Sequence[int], kind: str
+        self, binary: str, x: Tensor, axes: Sequence[int], out: Typed, kind: str
     ) -> Tensor:
-        over = self.constant(np.array(axes, np.int64))
-        if binary in ("and", "or"):
+        over, shape = self.constant(np.array(axes, np.int64)), out.shape
+        if binary == "xor" or (kind == "i" and binary not in ("max", "min")):
+            # Its sums of integers do not wrap around.
+            return self.reduced_by_rows(binary, x, axes, out)
+        if kind == "b":
             whole = self._cast(x, "i")
             op = "ReduceMin" if binary == "and" else "ReduceMax"
             return self._cast(self.node(op, [whole, over], shape, "i", keepdims=0), "b")

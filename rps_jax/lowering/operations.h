@@ -19,7 +19,17 @@ FUNCTION V min_f(V a, V b) { return choose_f((a <= b) | (a != a), a, b); }
 #endif
 FUNCTION I max_i(I a, I b) { return choose_i(a > b, a, b); }
 FUNCTION I min_i(I a, I b) { return choose_i(a < b, a, b); }
+FUNCTION I in_total_order(V x) {
+  I bits = bits_i_of_f(x);
+  return bits ^ (bits >> 31 & 0x7fffffff);
+}
+FUNCTION I lt_to_f(V a, V b) { return in_total_order(a) < in_total_order(b); }
+FUNCTION U max_u(U a, U b) { return choose_u((I)(a > b), a, b); }
+FUNCTION U min_u(U a, U b) { return choose_u((I)(a < b), a, b); }
 FUNCTION I quotient_i(I a, I b) { return a / b; }
+FUNCTION U quotient_u(U a, U b) { return a / b; }
+FUNCTION I shift_up_i(I x, I by) { return (I)((U)x << (U)by); }
+FUNCTION I shift_down_i(I x, I by) { return (I)((U)x >> (U)by); }
 FUNCTION U shift_right_logical_u(U x, U by) {
   return choose_u(by < 32u, x >> (by & 31u), all_u(0u));
 }
@@ -64,5 +74,6 @@ FUNCTION V erf_inv_f(V x) {
   UNROLL
   for (int i = 1; i < 9; i++)
     result = choose_f(inner, all_f(near[i]), all_f(far[i])) + result * w;
-  return choose_f(abs_f(x) == 1.0f, x * INFINITY, result * x);
+  V outside = choose_f(abs_f(x) == 1.0f, x * INFINITY, all_f(NAN));
+  return choose_f(abs_f(x) < 1.0f, result * x, outside);
 }

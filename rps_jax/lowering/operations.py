@@ -61,7 +61,8 @@ TABLE = {
     **{f"{x}_{kind}": _infix(x, kind, sign, x.capitalize(), js if kind == "i" else "")
        for x, (sign, js) in _ARITHMETIC.items() for kind in "fiu"},
     **{f"{x}_{kind}": _infix(x, kind, *spelling)
-       for x, spelling in _COMPARISONS.items() for kind in "fiub"},
+       for x, spelling in _COMPARISONS.items() for kind in "fiu"},
+    "eq_b": _infix("eq", "b", *_COMPARISONS["eq"]),
     **{f"{x}_{kind}": _infix(x, kind, sign, f"Bitwise{x.capitalize()}")
        for x, sign in _BITS.items() for kind in "iu"},
     "and_b": _infix("and", "b", "&", "And")._replace(c="{0} && {1}", js="{0} && {1}"),
@@ -75,6 +76,8 @@ TABLE = {
     "div_f": Operation("{0} / {1}", "{0} / {1}", "Div"),
     "rem_f": Operation("{P}_F(fmod)({0}, {1})", "{0} % {1}", "Mod", "EACH_OF_TWO(rem, fmodf)"),
     "quotient_i": Operation("{0} / {1}", "({0} / {1}) | 0", "Div"),
+    "shift_up_i": Operation("(int)((unsigned)({0}) << {1})", "{0} << {1}", "BitShift"),
+    "shift_down_i": Operation("(int)((unsigned)({0}) >> {1})", "{0} >>> {1} | 0", "BitShift"),
     "neg_f": Operation("-{0}", "-{0}", "Neg"),
     "neg_i": Operation("(int)(0u - (unsigned)({0}))", "-{0} | 0", "Neg"),
     "abs_f": Operation("{P}_F(fabs)({0})", "Math.abs({0})", "Abs"),
@@ -85,6 +88,7 @@ TABLE = {
     "min_i": Operation("{0} < {1} ? {0} : {1}", "Math.min({0}, {1})", "Min"),
     "tanh_f": _function("tanh", "Tanh")._replace(c="{p}_tanh({0})"),
     "erf_f": _function("erf", "Erf")._replace(js=""),
+    "erfc_f": _function("erfc")._replace(js=""),
     "exp2_f": _function("exp2")._replace(js=""),
     "round_f": _function("round")._replace(js=""),
     "rint_f": _function("rint", "Round")._replace(js="rint({0})"),

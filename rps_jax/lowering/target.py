@@ -18,7 +18,7 @@ Body: TypeAlias = Callable[[Sequence[Value]], list[Value]]  # of a loop, from it
 # Binary operation that each reduction repeats.
 REDUCTIONS = {
     **{"reduce_sum": "add", "reduce_prod": "mul", "reduce_max": "max", "reduce_min": "min"},
-    **{"reduce_and": "and", "reduce_or": "or"},
+    **{"reduce_and": "and", "reduce_or": "or", "reduce_xor": "xor"},
 }
 
 
@@ -74,6 +74,17 @@ class Target:
         """Emit a loop that runs while its condition holds."""
         raise UnsupportedError("while")
 
+    def reduced_by_rows(self, binary: str, value: Value, axes: Sequence[int], out: Typed) -> Value:
+        """Reduce some axes by a binary operation for each row along them."""
+        shape = np.shape(value)
+        rest = [i for i in range(len(shape)) if i not in axes]
+        indices = np.transpose(np.arange(size_of(shape)).reshape(shape), [*axes, *rest])
+        first, *rows = indices.reshape(-1, *out.shape)
+        result = self.moved([value], first, out)
+        for row in rows:
+            result = self.apply(binary, [result, self.moved([value], row, out)], {}, out)
+        return result
+
     def windows(
         self, shape: Sequence[int], starts: Sequence[Value], sizes: Sequence[int]
     ) -> tuple[Value, np.ndarray]:
@@ -85,8 +96,10 @@ class Target:
         for start, count in zip(starts, windows.shape, strict=False):
             clamped: Value = zero
             if count > 1:
-                clamped = self.apply("max", [start, zero], {}, zero)
-                clamped = self.apply("min", [clamped, np.asarray(count - 1, np.int32)], {}, zero)
+                clamped = self.apply("min", [start, np.asarray(count - 1, start.dtype)], {}, start)
+                if kind_of(start.dtype) == "u":
+                    clamped = self.apply("convert_element_type", [clamped], {}, zero)
+                clamped = self.apply("max", [clamped, zero], {}, zero)
             index = self.apply("mul", [index, np.asarray(count, np.int32)], {}, zero)
             index = self.apply("add", [index, clamped], {}, zero)
         return index, windows.reshape(-1, size_of(sizes))
@@ -106,7 +119,12 @@ def first_array(types: Sequence[Typed]) -> tuple[int, int]:
 def operation_of(name: str, operands: Sequence[Typed], params: Params, out: Typed) -> str:
     """Return the name of an operation: the primitive and the kind of its first operand."""
     kind, first = (kind_of(x.dtype, name) for x in (out, operands[0]))
-    if name == "select_n" and first == "b":
+    last = kind_of(operands[-1].dtype, name)
+    if name == "dot_general" and (first + last != 2 * kind or kind == "b"):
+        raise UnsupportedError("dot_general of bools or of different types")
+    if name == "pow":
+        return f"pow_{last}"
+    if name == "select_n" and first == "b" and len(operands) == 3:
         return f"choose_{kind}"
     if name == "convert_element_type":
         return f"{kind}_of_{first}"

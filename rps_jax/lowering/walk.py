@@ -17,7 +17,7 @@ import numpy as np
 from jax import lax
 from jax.extend.core import ClosedJaxpr, Jaxpr, JaxprEqn, Literal, jaxpr_as_fun
 
-from rps_jax.lowering.compounds import COMPOUNDS
+from rps_jax.lowering.compounds import COMPOUNDS, fill_of
 from rps_jax.lowering.target import (
     Body,
     Params,
@@ -54,8 +54,7 @@ _BY_NUMPY: dict[str, Callable[[np.ndarray, Params], Sequence[np.ndarray]]] = {
     "transpose": lambda x, p: [np.transpose(x, p["permutation"])],
     "rev": lambda x, p: [np.flip(x, p["dimensions"])],
 }
-_IDENTITIES = ("stop_gradient", "copy", "copy_p", "optimization_barrier", "pvary",
-               "reduce_precision", "name")  # fmt: skip
+_IDENTITIES = ("stop_gradient", "copy", "copy_p", "optimization_barrier", "pvary", "name")
 
 
 def traced(function: Callable[..., Any], *arguments: Any) -> tuple[ClosedJaxpr, Any]:
@@ -130,9 +129,11 @@ def _results(eqn: JaxprEqn, values: list[Value], target: Target) -> Sequence[Val
             return _moved(eqn, values, sources, target)
     if name == "threefry2x32":  # one operation for each of its two results
         return [target.apply(f"{name}_{i}", values, params, out) for i, out in enumerate(outs)]
-    if len(outs) != 1:
+    if len(outs) == 1:
+        return [_apply(name, values, types, params, outs[0], target)]
+    if name not in COMPOUNDS:
         raise UnsupportedError(name)
-    return [_apply(name, values, types, params, outs[0], target)]
+    return _expanded(functools.partial(COMPOUNDS[name], **params), values, types, target)
 
 
 def _types(atoms: Sequence[Any]) -> list[Typed]:
@@ -148,7 +149,10 @@ def _apply(
     operation = operation_of(name, types, params, out)
     if not size_of(out.shape):
         return np.zeros(out.shape, out.dtype)
-    if name == "convert_element_type" and types[0].dtype.kind == out.dtype.kind:
+    is_same = (types[0].dtype.kind, types[0].shape) == (out.dtype.kind, out.shape)
+    if is_same and name in ("convert_element_type", "bitcast_convert_type"):
+        return values[0]
+    if name == "reduce_precision" and params["exponent_bits"] > 7 and params["mantissa_bits"] > 22:
         return values[0]
     if operation not in target.operations and (operation in COMPOUNDS or name in COMPOUNDS):
         function = functools.partial(COMPOUNDS.get(operation) or COMPOUNDS[name], **params)
@@ -197,6 +201,10 @@ def _moved(eqn: JaxprEqn, values: list[Value], sources: list[int], target: Targe
         shape = np.shape(values[i])
         indices[i] = np.arange(start, start + size_of(shape)).reshape(shape)
         start += size_of(shape)
+    if eqn.primitive.name == "gather":  # its last source is the number for an index out of bounds
+        values = [*values, fill_of(eqn.outvars[0].aval.dtype, eqn.params.get("fill_value"))]
+        sources = [*sources, len(values) - 1]
+        eqn = eqn.replace(params={**eqn.params, "fill_value": start})
     moved = _moved_by_numpy(eqn, indices)
     moved = _bind(eqn, indices) if moved is None else moved
     return [

@@ -40,7 +40,7 @@ from rps_jax import engines, errors
 from rps_jax.control import registry, soft
 from rps_jax.control.base import Law, LawParams
 from rps_jax.engines import device, programs
-from rps_jax.trials import host, trial
+from rps_jax.trials import host, law_check, trial
 from rps_jax.trials.progress import Progress, ProgressCallback, Segment, Timing, no_progress
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import ControlLoop, Outcome, Rules, Trial, World
@@ -163,6 +163,8 @@ def run(
         devices = _devices()
         groups = _schedule([*itertools.starmap(_TrialQueue, enumerate(jobs))], setting, slots)
         compilations = [partial(x.compiled, d) for x in itertools.chain(*groups) for d in devices]
+        for queue in itertools.chain(*(group[0].queues for group in groups)):
+            law_check.warn_of_difference(queue.example, setting)
         monitor.programs = len(compilations)
         monitor.report()
         tasks = [partial(_work, groups, monitor, *x) for x in enumerate(devices * workers)]

@@ -320,14 +320,11 @@ def execute(world: World, trial: Trial, twist: Twist, period: float) -> tuple[Tr
     return trial, Twist(*drive.apply_slip(world.robot, aim))
 
 
-def decide(
+def perceive(
     world: World, params: LawParams, trial: Trial, loop: ControlLoop
-) -> tuple[Trial, Twist, Snapshot]:
-    """Sense, judge and run the law in one world.
-
-    Returns the trial before its physics steps, the twist that the base executes, and a snapshot.
-    """
-    period, law = loop.physics.control_period, loop.law
+) -> tuple[Trial, Measurement, Any]:
+    """Sense and judge; return the trial, the readings, and the observation of the law."""
+    law = loop.law
     judged, measured = observe(world, params, trial, loop)
     obs: Any = measured.observation
     if not law.smooth:
@@ -338,8 +335,22 @@ def decide(
         skin = world.skin, judged.skin, outline(world, judged.qpos)
         obs = features.taxel_observation(obs, measured.reading, *skin)
     if judged.load is not None:
-        load, force = law.cell.read(judged.load, world.key, judged.steps, period)
+        load, force = law.cell.read(
+            judged.load, world.key, judged.steps, loop.physics.control_period
+        )
         judged, obs = judged._replace(load=load), ForceObservation(obs, force)
+    return judged, measured, obs
+
+
+def decide(
+    world: World, params: LawParams, trial: Trial, loop: ControlLoop
+) -> tuple[Trial, Twist, Snapshot]:
+    """Sense, judge and run the law in one world.
+
+    Returns the trial before its physics steps, the twist that the base executes, and a snapshot.
+    """
+    period, law = loop.physics.control_period, loop.law
+    judged, measured, obs = perceive(world, params, trial, loop)
     state, twist, details = law.step(params, trial.law_state, obs)
     is_finite = functools.reduce(jnp.logical_and, map(jnp.isfinite, twist))
     judged = judged._replace(law_state=state, nan_twist=~judged.done & ~is_finite)

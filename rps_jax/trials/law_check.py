@@ -1,0 +1,107 @@
+"""Comparison of a custom law as the native compiler and as XLA compile it.
+
+The tests compare the laws of the package. A custom law may use any operation of JAX, so a run
+compares it once, before it starts, with the observations of bases that drive into the object.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import itertools
+import warnings
+from typing import TYPE_CHECKING, Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from rps_jax.control.base import LawParams
+from rps_jax.engines import native, programs
+from rps_jax.geometry import planar
+from rps_jax.trials import trial
+from rps_jax.trials.setting import Setting
+from rps_jax.trials.trial import ControlLoop, Trial, World
+from rps_jax.world.scene import JOINTS
+
+if TYPE_CHECKING:
+    from rps_jax.trials.batch import WorldBatch
+
+_WORLDS, _STEPS = 2, 150
+_TOLERANCE = 1e-3  # of the largest number
+_RARE = 0.02  # share of steps that may differ, since rounding can change a decision
+
+
+def warn_of_difference(batch: WorldBatch, setting: Setting) -> None:
+    """Warn if a custom law differs between the native compiler and XLA.
+
+    It runs in the first worlds of a batch. The result is cached with the compiled law.
+    """
+    law = batch.law
+    is_native = getattr(batch.stage, "native", False) and native.is_available()
+    if not is_native or programs.identity(law) is not None:
+        return
+    worlds, params = jax.tree.map(lambda x: jnp.asarray(x[:_WORLDS]), batch.inputs)
+    # Without the law's state, laws with equal observations share one program.
+    loop = ControlLoop(setting.physics, law=dataclasses.replace(law, init=lambda _: ()))
+
+    observe = functools.partial(_observe, worlds, params, loop)
+
+    def run(obs: Any) -> Any:
+        """Return arguments and results of the law in each control step (steps * worlds, ...)."""
+
+        def turn(states: Any, obs: Any) -> Any:
+            arguments = params, states, obs
+            states, twists, _ = jax.vmap(law.step)(*arguments)
+            return states, (arguments, (states, twists))
+
+        records = jax.lax.scan(turn, jax.vmap(law.init)(params), obs)[1]
+        return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), records)
+
+    def step(*arguments: Any) -> Any:
+        return law.step(*arguments)[:2]
+
+    def compare() -> str:
+        arguments, expected = jax.jit(run)(observe())
+        computed = jax.jit(native.batched(step, jax.vmap(step)))(*arguments)
+        pairs = zip(*map(jax.tree.leaves, jax.device_get((computed, expected))), strict=True)
+        share = np.mean(np.any([*itertools.starmap(_differs, pairs)], axis=0))
+        return f"{share:.0%}" if share > _RARE else ""
+
+    types = jax.eval_shape(lambda: run(observe()))[0]
+    if share := native.compared(step, types, compare):
+        warnings.warn(
+            f"the law of {type(batch.params).__name__} gives other results as compiled code than "
+            f"in JAX in {share} of control steps: set RPS_COMPILER=none, so that XLA compiles it, "
+            "and report this law",
+            stacklevel=2,
+        )
+
+
+@jax.jit
+def _observe(worlds: World, params: LawParams, loop: ControlLoop) -> Any:
+    """Return the observations (steps, B, ...) of bases that move on a curve, without physics."""
+    period = loop.physics.control_period
+
+    def move(state: Trial) -> Trial:
+        time = state.steps * period
+        forward = planar.rotate(state.qpos[2], jnp.stack([0.05, 0.02 * jnp.sin(3 * time)]))
+        velocity = jnp.stack([*forward, 0.1 * jnp.cos(2 * time)])
+        qpos = state.qpos.at[JOINTS.base].add(period * velocity)
+        return state._replace(qpos=qpos, steps=state.steps + 1)
+
+    def turn(trials: Trial, _: None) -> tuple[Trial, Any]:
+        judged, _measured, obs = jax.vmap(trial.perceive, (0, 0, 0, None))(
+            worlds, params, trials, loop
+        )
+        return jax.vmap(move)(judged), obs
+
+    start = jax.vmap(functools.partial(trial.start, law=loop.law))(worlds, params)
+    return jax.lax.scan(turn, start, length=_STEPS)[1]
+
+
+def _differs(computed: np.ndarray, expected: np.ndarray) -> np.ndarray:
+    """Return in which control steps (B,) two results differ."""
+    size = np.max(np.abs(expected), initial=0, where=np.isfinite(expected))
+    equal = np.isclose(computed, expected, rtol=0, atol=_TOLERANCE * size, equal_nan=True)
+    return np.any(~equal.reshape(len(equal), -1), axis=1)
