@@ -13,6 +13,7 @@ from shapely import LineString, MultiLineString, MultiPoint, Point, Polygon, box
 import rps_jax
 from rps_jax.errors import InputError
 from rps_jax.record import files
+from rps_jax.runs.question import task_in_words
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import Rules
 from rps_jax.world import draws, points, tasks
@@ -378,3 +379,11 @@ def test_a_task_without_a_map_is_refused_and_types_are_checked(capsys):
     task = Rooms(walls=[*map(list, room().walls)], start=[ROOM["start"]], goal=[ROOM["goal"]])  # pyright: ignore[reportArgumentType]
     assert task.shape == room().shape
     assert dataclasses.replace(room(), object_radius=0.1).object_radius == 0.1
+
+
+def test_a_report_names_the_number_of_walls_and_not_their_coordinates():
+    domain = parse_domain("wide", task=room())
+    words = task_in_words(domain)
+    assert words.startswith(f", task rooms,walls of {2 * len(room().walls)} numbers,start=")
+    assert str(domain.task).count(":") > 16 > words.count(":")
+    assert tasks.parse_task(str(domain.task)) == domain.task

@@ -459,7 +459,7 @@ class DomainQuestion(TaskOption, SimulationQuestion[T]):
     @property
     def worlds_in_words(self) -> str:
         """Domain and task, for reports."""
-        return ", task ".join([name_or_custom(self.domain), *task_attribute(self.ranges).values()])
+        return name_or_custom(self.domain) + task_in_words(self.ranges)
 
     def fields_as_json(self) -> dict[str, Any]:
         """Return the fields as JSON; robot and task are part of the domain."""
@@ -504,6 +504,11 @@ def name_or_custom(item: object) -> str:
 def task_attribute(domain: Domain) -> dict[str, str]:
     """Return the task of a domain as an attribute of results; nothing for `reach`."""
     return {} if domain.task == Reach() else {"task": str(domain.task)}
+
+
+def task_in_words(domain: Domain) -> str:
+    """Return the task of a domain for a report, after a comma; of long fields the size."""
+    return "" if domain.task == Reach() else f", task {domain.task.text(most=8)}"
 
 
 def count_true(mask: np.ndarray) -> int:

@@ -146,9 +146,9 @@ def _labelled(renderer: SceneRenderer, shot: Shot) -> np.ndarray:
     if not shot.label:
         return drawn
     image = Image.fromarray(drawn)
-    draw, size = ImageDraw.Draw(image, "RGBA"), float(np.clip(image.height / _LABEL, *_LABEL_SIZES))
-    width = draw.multiline_textbbox((0, 0), shot.label, ImageFont.load_default(size))[2]
-    font = ImageFont.load_default(size * min(1.0, (image.width - 10) / width))
+    draw = ImageDraw.Draw(image, "RGBA")
+    fits = 1.8 * image.width / max(map(len, shot.label.splitlines()))
+    font = ImageFont.load_default(min(fits, np.clip(image.height / _LABEL, *_LABEL_SIZES)))
     _, _, right, bottom = draw.multiline_textbbox((5, 1), shot.label, font)
     draw.rectangle((0, 0, right + 4, bottom + 4), fill=(*_INK, _PLATE))
     draw.text((5, 1), shot.label, "white", font)

@@ -94,13 +94,20 @@ class Task:
         return {}
 
     def __str__(self) -> str:
-        """Return the text that `parse_task` reads: the name and the fields that differ."""
+        """Return the text that `parse_task` reads."""
+        return self.text()
+
+    def text(self, most: float = np.inf) -> str:
+        """Return the name and the fields that differ; of one of more numbers only their count."""
         changes = []
         for item in fields(self):
             value = getattr(self, item.name)
             if item.name != "kind" and value != item.default:
                 items = np.ravel(value[:2] if isinstance(value, Range) else value).tolist()
-                changes.append(f"{item.name}={':'.join(map(str, items))}")
+                text = f"{item.name}={':'.join(map(str, items))}"
+                changes.append(
+                    text if len(items) <= most else f"{item.name} of {len(items)} numbers"
+                )
         return ",".join([self.kind, *changes])
 
     @property
