@@ -221,11 +221,11 @@ def test_worlds_in_which_only_one_law_fails_are_listed(tmp_path, capsys):
     assert 0 < expected.size < (~nps).sum()
     results = rps_jax.gallery(run, law="nps", against="rps")
     assert np.flatnonzero(results.kind != "").tolist() == expected.tolist()
-    assert rps("gallery", run, "--law nps --against rps --each 1") == 0
+    assert rps("gallery --law nps --against rps --each 1", run) == 0
     text = capsys.readouterr().out
     assert text.startswith("# Failures of nps where rps succeeds")
     table = text.partition("## Worlds in which only nps fails")[2].partition("##")[0]
-    worlds = re.findall(rf"^\| (\d+) .*`rps replay {run} \1 --law nps` \|$", table, re.MULTILINE)
+    worlds = re.findall(rf"^\| (\d+) .*`rps replay {run} \1 --law nps` +\|$", table, re.MULTILINE)
     assert list(map(int, worlds)) == expected.tolist()
     for name, rule in (("nps", "name another law"), ("pps", "nps, rps")):
-        assert rule in refusal(capsys, "gallery", run, "--law nps --against", name)
+        assert rule in refusal(capsys, f"gallery --law nps --against {name}", run)

@@ -384,6 +384,6 @@ def test_a_task_without_a_map_is_refused_and_types_are_checked(capsys):
 def test_a_report_names_the_number_of_walls_and_not_their_coordinates():
     domain = parse_domain("wide", task=room())
     words = task_in_words(domain)
-    assert words.startswith(f", task rooms,walls of {2 * len(room().walls)} numbers,start=")
+    assert words.startswith(f", task rooms,walls={2 * len(room().walls)} numbers,start=")
     assert str(domain.task).count(":") > 16 > words.count(":")
     assert tasks.parse_task(str(domain.task)) == domain.task

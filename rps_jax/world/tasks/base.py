@@ -104,10 +104,9 @@ class Task:
             value = getattr(self, item.name)
             if item.name != "kind" and value != item.default:
                 items = np.ravel(value[:2] if isinstance(value, Range) else value).tolist()
-                text = f"{item.name}={':'.join(map(str, items))}"
-                changes.append(
-                    text if len(items) <= most else f"{item.name} of {len(items)} numbers"
-                )
+                long = len(items) > most
+                text = f"{len(items)} numbers" if long else ":".join(map(str, items))
+                changes.append(f"{item.name}={text}")
         return ",".join([self.kind, *changes])
 
     @property
