@@ -381,9 +381,9 @@ def test_a_task_without_a_map_is_refused_and_types_are_checked(capsys):
     assert dataclasses.replace(room(), object_radius=0.1).object_radius == 0.1
 
 
-def test_a_report_names_the_number_of_walls_and_not_their_coordinates():
+def test_a_report_leaves_out_the_coordinates_of_walls():
     domain = parse_domain("wide", task=room())
     words = task_in_words(domain)
-    assert words.startswith(f", task rooms,walls={2 * len(room().walls)} numbers,start=")
+    assert words.startswith(", task rooms,walls=...,start=")
     assert str(domain.task).count(":") > 16 > words.count(":")
     assert tasks.parse_task(str(domain.task)) == domain.task

@@ -44,7 +44,7 @@ class Comparison(NamedTuple):
         gained, lost, total = self.gained + 0.5, self.lost + 0.5, trials + 2
         middle = (gained - lost) / total
         half_width = 1.96 * math.sqrt(((gained + lost) / total - middle**2) / total)
-        return max(-1.0, middle - half_width), min(1.0, middle + half_width)
+        return middle - half_width, middle + half_width
 
     @property
     def changes(self) -> str:

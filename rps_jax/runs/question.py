@@ -507,8 +507,9 @@ def task_attribute(domain: Domain) -> dict[str, str]:
 
 
 def task_in_words(domain: Domain) -> str:
-    """Return the task of a domain for a report, after a comma; of long fields the size."""
-    return "" if domain.task == Reach() else f", task {domain.task.text(most=8)}"
+    """Return the task of a domain for a report, after a comma, without its long fields."""
+    text = re.sub("=[^,]{60,}", "=...", str(domain.task))
+    return "" if domain.task == Reach() else f", task {text}"
 
 
 def count_true(mask: np.ndarray) -> int:

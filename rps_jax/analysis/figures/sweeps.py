@@ -31,11 +31,7 @@ def success_curves(results: xr.Dataset, count: int = 6) -> Figure:
     rest = [x for x in influences if x not in shown]
     columns = min(3, len(shown))
     width = WIDTH / max(columns, 2)  # [in] of a panel
-    title = _filled(
-        f"Success against {len(shown)} of {len(influences)} drawn quantities, in the order of "
-        f"influence: {_names(shown)}",
-        columns * width,
-    )
+    title = f"Success against {len(shown)} of {len(influences)} drawn quantities"
     parts = {
         "Order": "standard deviation of success over the bins beyond binomial noise, in the law in "
         "which it is greatest",
@@ -44,7 +40,7 @@ def success_curves(results: xr.Dataset, count: int = 6) -> Figure:
     }
     caption = "\n".join(_filled(f"{k}: {v}.", columns * width) for k, v in parts.items() if v)
     laws = list(map(str, results.law.values))
-    lines = len((title + caption).splitlines()) + len(laws) / columns + 3
+    lines = len(caption.splitlines()) + len(laws) / columns + 4
     figure, axes = tiles(len(shown), columns, (width, 1.9), (0, 0.14 * lines), sharey=True)
     for ax, influence in zip(axes.ravel(), shown, strict=False):
         values = results[influence.name]

@@ -94,19 +94,13 @@ class Task:
         return {}
 
     def __str__(self) -> str:
-        """Return the text that `parse_task` reads."""
-        return self.text()
-
-    def text(self, most: float = np.inf) -> str:
-        """Return the name and the fields that differ; of one of more numbers only their count."""
+        """Return the text that `parse_task` reads: the name and the fields that differ."""
         changes = []
         for item in fields(self):
             value = getattr(self, item.name)
             if item.name != "kind" and value != item.default:
                 items = np.ravel(value[:2] if isinstance(value, Range) else value).tolist()
-                long = len(items) > most
-                text = f"{len(items)} numbers" if long else ":".join(map(str, items))
-                changes.append(f"{item.name}={text}")
+                changes.append(f"{item.name}={':'.join(map(str, items))}")
         return ",".join([self.kind, *changes])
 
     @property
