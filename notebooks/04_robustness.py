@@ -136,7 +136,7 @@ Markdown("\n".join(["Influences (q < 0.05), with the worst and the best bin:", "
 # The hardest worlds are those in which most laws fail, sorted by the remaining distance.
 
 # %%
-Markdown(tables.markdown(tables.hardest_table(results, "runs/wide")))
+Markdown(tables.markdown(tables.worlds_table(results, "runs/wide", statistics.hardest(results))))
 
 # %% [markdown]
 # The command in the last column replays a world of a stored sweep, plots it as in `02_one_push` and

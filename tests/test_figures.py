@@ -141,7 +141,7 @@ def test_each_tuned_parameter_has_its_unit_in_the_figure():
 def test_prior_and_posterior_have_a_legend():
     (legend,) = marginals().legends
     names = [text.get_text() for text in legend.get_texts()]
-    assert names == ["prior, 90 % interval", "posterior", "posterior, undetermined"]
+    assert names == ["90 % of the prior", "posterior"]
 
 
 def test_no_line_joins_cylinders_to_triangles():

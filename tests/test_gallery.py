@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 import xarray as xr
-from helpers import results_of, rps
+from helpers import refusal, results_of, rps
 
 import rps_jax
 from rps_jax import Law
@@ -208,3 +208,24 @@ def test_the_command_plots_each_mode_and_prints_a_replay_command(tmp_path, capsy
         assert re.search(rf"^{row}1\.\d\d m in 30 s +\|$", text, re.MULTILINE)
     picture = run / "gallery" / "never_touched.png"
     assert picture.stat().st_size > 10_000
+
+
+def test_worlds_in_which_only_one_law_fails_are_listed(tmp_path, capsys):
+    """With both outcomes and the replay command; the other law succeeds in each of them."""
+    run, rules = tmp_path / "run", rps_jax.Rules(horizon=60.0)
+    brief = rps_jax.Setting("quasistatic", rules=rules)
+    drums = "wide,objects=random_cylinder,distance=1:1.5,bearing=-1:1"
+    sweep = rps_jax.sweep(("nps", "rps"), drums, 16, setting=brief, slots=8, out=run)
+    nps, rps_ = sweep.success.values > 0
+    expected = np.flatnonzero(~nps & rps_)
+    assert 0 < expected.size < (~nps).sum()
+    results = rps_jax.gallery(run, law="nps", against="rps")
+    assert np.flatnonzero(results.kind != "").tolist() == expected.tolist()
+    assert rps("gallery --law nps --against rps --each 1", run) == 0
+    text = capsys.readouterr().out
+    assert text.startswith("# Failures of nps where rps succeeds")
+    table = text.partition("## Worlds in which only nps fails")[2].partition("##")[0]
+    worlds = re.findall(rf"^\| (\d+) .*`rps replay {run} \1 --law nps` +\|$", table, re.MULTILINE)
+    assert list(map(int, worlds)) == expected.tolist()
+    for name, rule in (("nps", "name another law"), ("pps", "nps, rps")):
+        assert rule in refusal(capsys, f"gallery --law nps --against {name}", run)

@@ -34,9 +34,14 @@ def test_laws_are_compared_with_a_reference_world_by_world():
     header, better, base, worse = tables.against_table(results, "base")
     assert header[-1] == "successes in the 8 failures of base"
     # Exact McNemar: 8 to 0 is 2 / 2^8; 1 to 12 is 2 (1 + 13) / 2^13, doubled as the smaller one.
-    assert (better[0], *better[2:]) == ("better", "+40.00 % (+8 -0)", "0.0078", "8")
+    assert (better[0], *better[2:]) == (
+        "better",
+        "+40.00 % [+14.38, +58.35] (+8 -0)",
+        "0.0078",
+        "8",
+    )
     assert (base[0], *base[2:]) == ("base", "", "", "")
-    assert (worse[0], *worse[2:]) == ("worse", "-55.00 % (+1 -12)", "0.0068", "1")
+    assert (worse[0], *worse[2:]) == ("worse", "-55.00 % [-75.97, -24.03] (+1 -12)", "0.0068", "1")
 
 
 def test_the_default_laws_are_all_laws_in_the_order_of_their_senses():

@@ -15,6 +15,7 @@ from shapely import LineString, MultiLineString, MultiPoint, Point, Polygon, box
 import rps_jax
 from rps_jax.errors import InputError
 from rps_jax.record import files
+from rps_jax.runs.question import task_in_words
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import Rules
 from rps_jax.world import draws, points, tasks
@@ -472,3 +473,11 @@ def test_a_task_without_a_map_is_refused_and_types_are_checked(capsys):
     task = Rooms(walls=[*map(list, room().walls)], start=[ROOM["start"]], goal=[ROOM["goal"]])  # pyright: ignore[reportArgumentType]
     assert task.shape == room().shape
     assert dataclasses.replace(room(), object_radius=0.1).object_radius == 0.1
+
+
+def test_a_report_leaves_out_the_coordinates_of_walls():
+    domain = parse_domain("wide", task=room())
+    words = task_in_words(domain)
+    assert words.startswith(", task rooms,walls=...,start=")
+    assert str(domain.task).count(":") > 16 > words.count(":")
+    assert tasks.parse_task(str(domain.task)) == domain.task

@@ -197,7 +197,10 @@ def _p(value: float) -> str:
 
 
 def _difference(comparison: Comparison, trials: int) -> str:
-    return f"{100 * (comparison.gained - comparison.lost) / trials:+.2f} %"
+    """Format a difference of paired rates with its 95 % interval."""
+    low, high = (100 * x for x in comparison.interval(trials))
+    value = 100 * (comparison.gained - comparison.lost) / trials
+    return f"{value:+.2f} % [{low:+.2f}, {high:+.2f}]"
 
 
 def difference_table(results: xr.Dataset) -> list[list[str]]:
@@ -231,11 +234,11 @@ def against_table(results: xr.Dataset, reference: str) -> list[list[str]]:
     return rows
 
 
-def hardest_table(results: xr.Dataset, run: str, count: int = 10) -> list[list[str]]:
-    """Return a row for each of the hardest worlds, with the command that replays it."""
+def worlds_table(results: xr.Dataset, run: str, worlds: np.ndarray) -> list[list[str]]:
+    """Return a row for each of some failed worlds, with the command that replays it."""
     laws = [str(law) for law in results.law.values]
     rows = [["world", "object", *laws, "mass", "friction", "target", "replay"]]
-    for world in map(int, statistics.hardest(results, count)):
+    for world in worlds.tolist():
         trials = results.isel(world=world)
         fails = next(law for law in laws if not int(trials.success.sel(law=law)))
         rows.append(

@@ -437,7 +437,7 @@ class DomainQuestion(TaskOption, SimulationQuestion[T]):
     @property
     def worlds_in_words(self) -> str:
         """Domain and task, for reports."""
-        return ", task ".join([name_or_custom(self.domain), *task_attribute(self.ranges).values()])
+        return name_or_custom(self.domain) + task_in_words(self.ranges)
 
     def fields_as_json(self) -> dict[str, Any]:
         """Return the fields as JSON; robot and task are part of the domain."""
@@ -482,6 +482,12 @@ def name_or_custom(item: object) -> str:
 def task_attribute(domain: Domain) -> dict[str, str]:
     """Return the task of a domain as an attribute of results; nothing for `reach`."""
     return {} if domain.task == Reach() else {"task": str(domain.task)}
+
+
+def task_in_words(domain: Domain) -> str:
+    """Return the task of a domain for a report, after a comma, without its long fields."""
+    text = re.sub("=[^,]{60,}", "=...", str(domain.task))
+    return "" if domain.task == Reach() else f", task {text}"
 
 
 def count_true(mask: np.ndarray) -> int:

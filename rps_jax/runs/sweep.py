@@ -33,7 +33,7 @@ from rps_jax.runs.question import (
     SimulationQuestion,
     call_of,
     count_true,
-    task_attribute,
+    task_in_words,
 )
 from rps_jax.runs.results import Results, check_table, write_table
 from rps_jax.trials.progress import ProgressCallback
@@ -106,11 +106,11 @@ class SweepQuestion(PlanQuestion, DomainQuestion[xr.Dataset], MultiLawQuestion[x
 def describe_plan(plan: Plan) -> str:
     """Return the number and source of the worlds and the engine, in words."""
     source = f"seed {plan.setting.seed}" if plan.points is None else "points of the unit cube"
-    task = "".join(f", task {text}" for text in task_attribute(plan.domain).values())
     return (
-        f"{plan.worlds:,} worlds{task}, {source}, engine {plan.setting.engine}, steps of "
-        f"{1000 * plan.setting.physics.timestep:g} ms; every law meets the same worlds. "
-        "Intervals: Wilson 95 %; bounds of failures: Clopper-Pearson 95 %."
+        f"{plan.worlds:,} worlds{task_in_words(plan.domain)}, {source}, "
+        f"engine {plan.setting.engine}, steps of {1000 * plan.setting.physics.timestep:g} ms; "
+        "every law meets the same worlds. Intervals: Wilson 95 %; bounds of failures: "
+        "Clopper-Pearson 95 %."
     )
 
 
@@ -119,7 +119,8 @@ def plan_sections(plan: Plan, results: xr.Dataset, folder: Path | None) -> list[
     sections = [success_section(results, float(plan.setting.rules.max_lost))]
     if results.sizes["law"] > 1:
         rows = tables.difference_table(results)
-        sections.append(Section("Differences, world by world", "", rows))
+        text = "Differences of success, with 95 % intervals for paired worlds."
+        sections.append(Section("Differences, world by world", text, rows))
     if rows := tables.task_table(results):
         text = "Medians and ranges of 90 % of the worlds; of failures the number of trials by kind."
         if at_once := count_true(results.time.values == 0):
@@ -132,7 +133,8 @@ def plan_sections(plan: Plan, results: xr.Dataset, folder: Path | None) -> list[
         picture = Picture("success", partial(success_curves, results))
         sections.append(Section("Success against the drawn quantities", "", (), picture))
     text = "Worlds in which most laws fail, and the contact point stays farthest from the target."
-    rows = tables.hardest_table(results, "RUN" if folder is None else str(folder))
+    hardest = statistics.hardest(results)
+    rows = tables.worlds_table(results, "RUN" if folder is None else str(folder), hardest)
     return [*sections, Section("The hardest worlds", text, rows)]
 
 

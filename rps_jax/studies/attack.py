@@ -192,7 +192,7 @@ class Attack(DomainQuestion[xr.Dataset], LawQuestion[xr.Dataset]):
                 f"the same engine. `rps film {shlex.quote(folder)} --which hardest --grid 3x4` "
                 "films the worst."
             )
-            rows = tables.hardest_table(worst, folder, self.worst)
+            rows = tables.worlds_table(worst, folder, statistics.hardest(worst, self.worst))
             sections.append(Section("The worst", text, rows))
         return sections
 

@@ -14,7 +14,8 @@ import xarray as xr
 from matplotlib.artist import setp
 from scipy import stats
 
-from rps_jax.analysis import mechanisms, statistics
+from rps_jax import errors
+from rps_jax.analysis import mechanisms, statistics, tables
 from rps_jax.analysis.figures.paper import draw_path
 from rps_jax.analysis.figures.style import WIDTH, Figure, styled, tiles
 from rps_jax.analysis.report import Picture, Section
@@ -88,12 +89,15 @@ class Gallery(Question[xr.Dataset]):
     """Run folder of a sweep or a ladder."""
     law: str | None = None
     """Law of the run; by default its first."""
+    against: str | None = None
+    """Another law of the run: only worlds in which it succeeds are plotted, and all are listed."""
     each: int = option(30, 1, 200)
     """Maximum number of trials of each failure mode to simulate again and plot."""
 
     @property
     def title(self) -> str:
-        return f"Failures of {self.plan_and_law[1]}"
+        only = f" where {self.against} succeeds" if self.against else ""
+        return f"Failures of {self.plan_and_law[1]}{only}"
 
     @property
     def plan_and_law(self) -> tuple[Plan, str]:
@@ -101,12 +105,18 @@ class Gallery(Question[xr.Dataset]):
         return select_law(Path(self.run), 0, self.law)
 
     def check(self) -> None:
-        select_law(Path(self.run), 0, self.law)
+        _, law = self.plan_and_law
+        if self.against == law:
+            raise errors.not_allowed("against", self.against, "name another law than law")
+        select_law(Path(self.run), 0, self.against)
 
     def answer(self, run: Run) -> xr.Dataset:
         plan, law = self.plan_and_law
-        trials = files.read_results(Path(self.run)).sel(law=law)
+        results = files.read_results(Path(self.run))
+        trials = results.sel(law=law)
         modes = failure_modes(trials, float(plan.setting.rules.max_lost))
+        if self.against:
+            modes[results.success.sel(law=self.against) == 0] = ""
         return trials.assign(kind=("world", modes))
 
     def intro(self, results: xr.Dataset) -> str:
@@ -120,6 +130,10 @@ class Gallery(Question[xr.Dataset]):
         all_plotted = [np.zeros(0, int), *(indices[: self.each] for indices in worlds.values())]
         progress = SequentialProgress(run.callback)
         traces = _simulate(Path(self.run), plan, law, np.concatenate(all_plotted), progress)
+        if self.against:
+            pair = files.read_results(Path(self.run)).sel(law=[law, self.against])
+            rows = tables.worlds_table(pair, str(self.run), np.flatnonzero(kinds != ""))
+            sections.append(Section(f"Worlds in which only {law} fails", "", rows))
         for mode, indices in worlds.items():
             plotted = {i: traces[i] for i in indices[: self.each].tolist()}
             title = f"{law}: {mode}, {len(plotted)} of {indices.size} in {size} worlds"

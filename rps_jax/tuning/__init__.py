@@ -1,1 +1,1 @@
-"""Tuning a law: a space of its parameters, searched by evolution or by gradients; and learning."""
+"""Tuning a law: a space of its parameters, searched by evolution or by slopes; and learning."""

@@ -1,4 +1,4 @@
-"""Tune a law by gradients of its objective in whole trials, which antithetic random steps give.
+"""Tune a law by slopes of its objective in whole trials, along antithetic random steps.
 
 Every world tries random steps of the parameters and their opposites, under the original law and
 the paper's rules; so the gradient includes failures, at which derivatives jump. All worlds of a
@@ -29,7 +29,7 @@ _MOMENTUM = 0.8  # [1] weight of earlier gradients in the direction of a step
 
 @dataclass(frozen=True)
 class TuneGrad(Tuning):
-    """Tune a law by gradients of whole trials; derivatives pay for single pushes: value_and_grad.
+    """Tune a law by slopes of whole trials along random steps, without derivatives.
 
     The answer is that of `TuneES`, with a step as a generation.
 

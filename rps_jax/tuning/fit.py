@@ -29,7 +29,7 @@ import xarray as xr
 from matplotlib.artist import setp
 
 from rps_jax import engines, errors
-from rps_jax.analysis.figures.style import WIDTH, Figure, patches, quantity, styled, tiles
+from rps_jax.analysis.figures.style import WIDTH, Figure, quantity, styled, tiles
 from rps_jax.analysis.report import Picture, Section
 from rps_jax.control import registry
 from rps_jax.control.base import Law, LawParams
@@ -66,9 +66,6 @@ from rps_jax.world.draws import Draw
 
 _BATCH = 64  # worlds of one object that are stepped at once
 SAMPLES = 2000
-_PRIOR = "0.88"  # colour of a prior in the figure
-# Colours and labels of determined and undetermined quantities.
-_POSTERIORS = (("C0", "posterior"), ("0.6", "posterior, undetermined"))
 UNDETERMINED = 0.8  # share of the prior's 90 % interval above which nothing was learned
 _DELAYS = ("pose_latency", "command_delay")
 # Functions of quantities, for logs that determine these but not the quantities: unit, quantities
@@ -89,20 +86,18 @@ class Fitted:
 
     @styled
     def plot(self) -> Figure:
-        """Draw each quantity's posterior (blue) over the 90 % interval of its prior (grey)."""
+        """Draw each quantity's posterior and prior; pale if undetermined."""
         names = list(map(str, self.data.quantity.values))
         figure, axes = tiles(len(names), 4, (WIDTH / 4, 1.25), (0, 0.4))
         for ax, name in zip(axes.ravel(), names, strict=False):
             column = self.data.sel(quantity=name)
-            ax.axvspan(float(column.prior_low), float(column.prior_high), color=_PRIOR)
-            colour = _POSTERIORS[bool(column.undetermined)][0]
-            ax.hist(column["sample"], 40, density=True, color=colour)
-            ax.set_title(textwrap.fill(quantity(name), 26))
+            ax.axvspan(float(column.prior_low), float(column.prior_high), color="0.88")
+            flat = bool(column.undetermined)
+            ax.hist(column["sample"], 40, density=True, alpha=0.4 if flat else 1.0)
+            ax.set_title(textwrap.fill(quantity(name) + " (undetermined)" * flat, 28))
             ax.set(yticks=[], xlabel=f"[{column.unit.values}]")
         setp(axes[:, 0].tolist(), ylabel="density")
-        colours = ((_PRIOR, "prior, 90 % interval"), *_POSTERIORS)
-        marks = [patches.Patch(color=colour, label=label) for colour, label in colours]
-        figure.legend(handles=marks, loc="outside lower center", ncols=3)
+        figure.legend(["90 % of the prior", "posterior"], loc="outside lower center", ncols=2)
         return figure
 
 

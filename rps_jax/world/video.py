@@ -34,7 +34,7 @@ SIZE = (960, 540)  # [px] width, height
 _EMPTY = 58  # grey of a place in a grid without a trial
 _INK = (24, 26, 30)  # RGB around labels and tiles
 _PLATE = 170  # opacity behind a label, of 255
-_LABEL, _LABEL_SIZES = 9, (16, 40)  # [1] heights of a line of text in a tile; [px] its sizes
+_LABEL = 9  # [1] heights of a line of text in a tile
 
 _FIX_FFMPEG = "ffmpeg was not found or does not run: run `pip install imageio-ffmpeg`."
 
@@ -146,9 +146,9 @@ def _labelled(renderer: SceneRenderer, shot: Shot) -> np.ndarray:
     if not shot.label:
         return drawn
     image = Image.fromarray(drawn)
-    draw, size = ImageDraw.Draw(image, "RGBA"), float(np.clip(image.height / _LABEL, *_LABEL_SIZES))
-    width = draw.multiline_textbbox((0, 0), shot.label, ImageFont.load_default(size))[2]
-    font = ImageFont.load_default(size * min(1.0, (image.width - 10) / width))
+    draw = ImageDraw.Draw(image, "RGBA")
+    fits = 1.8 * image.width / max(map(len, shot.label.splitlines()))
+    font = ImageFont.load_default(min(fits, 40, max(16, image.height / _LABEL)))
     _, _, right, bottom = draw.multiline_textbbox((5, 1), shot.label, font)
     draw.rectangle((0, 0, right + 4, bottom + 4), fill=(*_INK, _PLATE))
     draw.text((5, 1), shot.label, "white", font)

@@ -31,11 +31,7 @@ def success_curves(results: xr.Dataset, count: int = 6) -> Figure:
     rest = [x for x in influences if x not in shown]
     columns = min(3, len(shown))
     width = WIDTH / max(columns, 2)  # [in] of a panel
-    title = _filled(
-        f"Success against {len(shown)} of {len(influences)} drawn quantities, in the order of "
-        f"influence: {_names(shown)}",
-        columns * width,
-    )
+    title = f"Success against {len(shown)} of {len(influences)} drawn quantities"
     parts = {
         "Order": "standard deviation of success over the bins beyond binomial noise, in the law in "
         "which it is greatest",
@@ -44,8 +40,7 @@ def success_curves(results: xr.Dataset, count: int = 6) -> Figure:
     }
     caption = "\n".join(_filled(f"{k}: {v}.", columns * width) for k, v in parts.items() if v)
     laws = list(map(str, results.law.values))
-    by_row = max(1, int(_LETTERS * columns * width / (max(map(len, laws)) + 10)))  # in the legend
-    lines = title.count("\n") + caption.count("\n") + 3 - (-len(laws) // by_row)
+    lines = len(caption.splitlines()) + len(laws) / columns + 4
     figure, axes = tiles(len(shown), columns, (width, 1.9), (0, 0.14 * lines), sharey=True)
     for ax, influence in zip(axes.ravel(), shown, strict=False):
         values = results[influence.name]
@@ -53,8 +48,8 @@ def success_curves(results: xr.Dataset, count: int = 6) -> Figure:
         unordered = influence.name == "corners"
         for i, law in enumerate(laws):
             bins = statistics.bins(values.values, results.success.sel(law=law).values > 0)
-            line = "none" if unordered else "-"
-            success_rates(ax, *bins, color=f"C{i}", label=law, curve=i, ls=line)
+            style = {"color": f"C{i}", "label": law, "ls": "none" if unordered else "-"}
+            success_rates(ax, *bins, curve=i, **style)
         if unordered:
             counts = np.unique(values)
             ax.set_xticks(counts, [f"{n:g}" if n else "round" for n in counts])
@@ -65,7 +60,7 @@ def success_curves(results: xr.Dataset, count: int = 6) -> Figure:
     setp(axes[:, 0].tolist(), ylabel="success [%]")
     axes[0, 0].set_ylim(top=103)
     handles, names = axes[0, 0].get_legend_handles_labels()
-    legend = {"ncols": by_row, "frameon": False, "alignment": "left"}
+    legend = {"ncols": columns, "frameon": False, "alignment": "left"}
     figure.legend(handles, names, title=title, loc="outside upper left", **legend)
     figure.supxlabel(caption, x=0.01, ha="left")
     return figure
