@@ -167,7 +167,7 @@ def test_engines_agree(name: str) -> None:
         moved = simulate(engine, stage, fields, start, (0.05, 0.02, 0.05), FINE, 200)
         ends[engine] = moved.qpos[-1, 0]
     assert ends["mujoco"][4] - start[0, 4] > 0.02
-    for engine, tolerance in (("fused", 2e-4), ("mjx", 2e-4), ("quasistatic", 6e-3)):
+    for engine, tolerance in (("fused", 2e-4), ("mjx", 2e-4), ("quasistatic", 0.0125)):
         np.testing.assert_allclose(ends[engine][3:5], ends["mujoco"][3:5], atol=tolerance)
 
 
