@@ -81,7 +81,7 @@ def test_the_gradient_of_a_quadratic_is_unbiased_and_within_its_interval(name):
         ratio = estimate.variance.mean(0) / estimate.gradient.var(0)
         np.testing.assert_allclose(np.log(ratio), 0, atol=change)
     within = np.abs(error) < 1.96 * np.sqrt(estimate.variance)
-    assert (np.abs(within.mean(axis=0) - 0.95) < 0.04).all() or name == "mixed"
+    assert np.abs(within.mean(axis=0) - 0.95).max() < 0.08 or name == "mixed"
     share = repeat(name, 32).variance.mean(0) / estimate.variance.mean(0)
     np.testing.assert_allclose(np.log(share / 16), 0, atol=share_change)
 

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 SIDE = r"([-+*/(). \de]+)"
-COMPARED = re.compile(rf"\(?{SIDE} <=? {SIDE}(?: <=? {SIDE})?\)?")
+COMPARED = re.compile(rf"{SIDE} <=? {SIDE}(?: <=? {SIDE})?")
 SMALL = 0.2  # a larger right-hand side is an outcome or a count, not a tolerance
 
 
@@ -86,6 +86,7 @@ def install(path: Path) -> Ratios:
 def compare(ratios: Ratios, line: int, text: str, explanation: str) -> None:
     """Record a comparison `error < tolerance`, or `low < value < high`, that has passed."""
     first_line = re.sub(r"np\.\w+\(", "(", explanation.strip().split("\n")[0])
+    first_line = re.sub(r"^\((.*)\) == \w+$", r"\1", first_line)
     if not (match := COMPARED.fullmatch(first_line)):
         return
     try:
