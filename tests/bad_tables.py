@@ -444,7 +444,7 @@ def result_of(case: Case, folder: Path) -> str:
     except InputError as error:
         return str(error)
     expected = logs.read(reference(folder), SHELL).columns
-    same = [k for k, x in expected.items() if np.allclose(log.columns[k], x, rtol=0, atol=2e-6)]
+    same = [k for k, x in expected.items() if np.allclose(log.columns[k], x, rtol=0, atol=5e-6)]
     if {*same} == {*expected} == {*log.columns}:
         return EQUAL
     shifted = np.allclose(np.ptp(log.columns["time"]), np.ptp(expected["time"]), atol=1e-5)

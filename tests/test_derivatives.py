@@ -125,7 +125,7 @@ def test_the_results_are_labelled(results):
         "target_x": "m", "target_y": "m", "com_x": "m", "com_y": "m", "mass": "kg",
     }  # fmt: skip
     assert (results.kind == "parameter").values.tolist() == [True] + [False] * 9
-    assert (results.map_error < 1e-4).all()
+    assert results.map_error.values.max() < 3e-4
     attrs = {"engine": "quasistatic", "gradient": "exact", "horizon": 1.0, "seed": 0}
     assert attrs.items() <= results.attrs.items()
     assert results.attrs["skin_temperature"] == pytest.approx(0.03)
@@ -160,7 +160,7 @@ def test_a_kink_of_the_world_has_no_derivative_and_is_told():
     coordinates = derivatives.coordinates_of(("aspect", "height"), RPSParams(), square)
     slopes, bends = derivatives.world_slopes(square, drawn, Setting("fused"), coordinates)
     assert (bends[:, 0] > 0.1).all()
-    assert (bends[:, 1] < 1e-5).all()
+    assert bends[:, 1].max() < 1e-5
     assert ["world.fields.height" in slope for slope in slopes] == [False, True]
     gradient = np.where(bends > 0.01, np.nan, 1.0)[None]
     notes = derivatives._notes(

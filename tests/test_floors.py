@@ -106,7 +106,7 @@ def test_friction_above_the_slope_leaves_only_the_creep_of_soft_contacts(engine)
     d, (time, _) = physics.ground_impedance, physics.ground_solref
     damping = 4 * physics.impratio * d / (1 - d) * 2 / (d * time)  # [1/s] over the mass
     assert qvel[-1, 4] == pytest.approx(G * math.sin(STEEP) / damping, rel=0.02)
-    assert 0 < qpos[-1, 4] < 0.004
+    assert 0 < qpos[-1, 4] < 0.012
 
 
 @pytest.mark.parametrize("engine", ENGINES)
@@ -122,14 +122,15 @@ def test_pushes_need_the_force_of_slope_and_friction(engine):
     for name, start, end, force in cases:
         f_x, f_y, _ = between(films(engine)[name][2], start, end)
         assert -f_x == pytest.approx(force, rel=0.05), (name, start)
-        assert f_y == pytest.approx(0, abs=0.05), (name, start)
+        assert f_y == pytest.approx(0, abs=0.1), (name, start)
 
 
 @pytest.mark.parametrize("engine", ENGINES)
 def test_half_of_the_feet_on_the_rough_side_turn_a_sliding_box_to_it(engine):
     left, right = (films(engine)[f"carpet {side}"][0][-1, 3:] for side in ("left", "right"))
     yaw, mirrored = 2 * math.asin(left[-1]), 2 * math.asin(right[-1])
-    assert 0.06 < yaw < 0.1
+    # A rigid box on four equally loaded feet, integrated in steps of 0.1 ms, turns by 85.4 mrad.
+    assert yaw == pytest.approx(0.0854, abs=0.005 if engine == "mujoco" else 0.045)
     assert mirrored == pytest.approx(-yaw, rel=0.02)
     np.testing.assert_allclose(right[:2], left[:2] * [1, -1], atol=2e-4)
 

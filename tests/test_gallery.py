@@ -35,13 +35,13 @@ def test_each_failure_has_one_mode():
 
 def test_common_quantities_differ_from_all_worlds():
     random = np.random.default_rng(0)
-    size, mass = random.uniform(size=400), random.uniform(size=400)
+    size, mass = random.uniform(size=(2, 8000))
     trials = xr.Dataset({"size": ("world", size), "mass": ("world", mass)})
     ((name, masked, overall),) = gallery.common_quantities(trials, size > 0.8)
     assert name == "size"
     assert abs(masked - 0.9) < 0.03
     assert abs(overall - 0.5) < 0.1
-    assert gallery.common_quantities(trials, np.arange(400) < 2) == []  # too few worlds
+    assert gallery.common_quantities(trials, np.arange(8000) < 2) == []  # too few worlds
 
 
 SQUARE = [[1, 1], [-1, 1], [-1, -1], [1, -1], [1, 1]]

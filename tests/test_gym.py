@@ -103,7 +103,7 @@ def test_a_success_terminates_and_resets_in_the_next_step(vector):
     assert (infos["time"][~ended] >= previous[~ended]).all()
     assert infos["_time"].all()
     start = np.linalg.norm(obs[ended, 42:], axis=1)
-    np.testing.assert_allclose(start, 0.71, atol=0.02)  # far again
+    np.testing.assert_allclose(start, 0.71, atol=0.03)  # far again
     assert (vector.step(AHEAD)[4]["time"][ended] == 1).all()
 
 

@@ -134,7 +134,7 @@ def test_a_drawn_path_is_a_task_of_the_command_line(paused, tmp_path):
     x = np.linspace(0.4, 5, 60)
     line = np.column_stack([x, 0.9 * np.sin(1.5 * x - 0.6)]).tolist()
     # A pixel is 1 to 2 cm. The turns of a corridor leave room for its corners.
-    for kind, task, tolerance in (("path", "path", 0.05), ("corridor", "corridor,width=1.6", 0.45)):
+    for kind, task, tolerance in (("path", "path", 0.1), ("corridor", "corridor,width=1.6", 0.45)):
         paused.execute_script("by('task').value = arguments[0]; choose()", kind)
         text, fault = drawn(paused, line)
         assert not fault
@@ -231,7 +231,7 @@ def test_the_recorded_push_is_upright_and_visible_from_any_side(browser):
     final_pose = "const q = RECORDED.qpos.at(-1); return [q[3], q[4], q[5], q[7], q[8]]"
     x, y, z, *tilt = browser.execute_script(final_pose)
     assert np.hypot(x + 2, y) < 0.2  # the contact is at the target, the middle next to it
-    assert abs(z - 0.4) < 2e-3
+    assert abs(z - 0.4) < 4e-3
     np.testing.assert_allclose(tilt, 0, atol=2e-3)
     look = """
     eye.playing = false; eye.at = 100; eye.turn = arguments[0]; drawRecorded();

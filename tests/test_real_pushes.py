@@ -62,7 +62,7 @@ def test_a_rigid_body_on_its_feet_is_nearest(sample):
         return float(np.median(pushes.errors_of(pose, actual).both))
 
     feet = median("rigid_feet")
-    assert feet < 2.5e-3
+    assert feet < 4.2e-3
     assert 1.5 * feet < median("rigid_corners") < median("no_motion")
     assert 3 * feet < median("with_pusher") < median("no_motion")
 
@@ -70,7 +70,8 @@ def test_a_rigid_body_on_its_feet_is_nearest(sample):
 def test_mujoco_with_stiff_fingers_comes_near_the_rigid_body(sample):
     subset = sample[sample.support != pushes.FLAT].groupby("kind").head(2).reset_index(drop=True)
     rigid, soft = (study.predict_all(subset, x).pose for x in ("rigid_feet", "mujoco_ours_stiff"))
-    assert (np.median(np.abs(rigid - soft), axis=0) < [2e-3, 2e-3, 0.03]).all()
+    median = np.median(np.abs(rigid - soft), axis=0)
+    np.testing.assert_allclose(median / [2e-3, 2e-3, 0.03], 0, atol=1)
     assert contact.KINDS["mujoco_ours"].scale == 4
 
 

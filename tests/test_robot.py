@@ -145,7 +145,7 @@ def test_a_base_turns_and_strafes_less_than_commanded_in_all_engines(engine):
     executed = [np.array(command) * (1 - np.array(share)) for command, share in pairs]
     expected = np.array([position_after(twist, outcome.time[0]) for twist in executed])
     np.testing.assert_allclose(outcome.base_pose[:, 2], expected[:, 2], rtol=1e-4, atol=1e-6)
-    np.testing.assert_allclose(outcome.base_pose[:, :2], expected[:, :2], atol=3e-4)
+    np.testing.assert_allclose(outcome.base_pose[:, :2], expected[:, :2], atol=4e-4)
     assert not outcome.stalled.any()
 
 
@@ -223,7 +223,7 @@ WEIGHT = 0.3 * 20 * GRAVITY  # [N] that it takes to slide the box under S1: 58.9
 def test_a_base_stalls_if_its_force_cannot_slide_the_object(engine):
     strong, weak = (push_object(engine, Robot(force_max=f * WEIGHT), 4.0) for f in (1.1, 0.9))
     assert strong.qvel[-1, 0] == pytest.approx(0.05, rel=0.01)
-    assert abs(weak.qvel[-1, 0]) < 2e-3  # MuJoCo's friction creeps
+    assert abs(weak.qvel[-1, 0]) < 6e-3  # MuJoCo's friction creeps
     assert strong.qpos[-1, JOINTS.object][0] - weak.qpos[-1, JOINTS.object][0] > 0.1
 
 

@@ -76,10 +76,10 @@ def test_nothing_is_felt_without_a_board(sensor):
     assert int(read(worn, square(0.46, 0.26)).contact_type) == NONE
     half = read(worn, square(0.46, 0.15))  # of an object from 0.05 to 0.25
     assert int(half.contact_type) == LINE
-    np.testing.assert_allclose(half.p_robot_contact, [0.3625, 0.10], atol=0.006)
+    np.testing.assert_allclose(half.p_robot_contact, [0.3625, 0.10], atol=0.01)
     smooth = worn._replace(temperature=0.0005 if isinstance(worn, IdealSkin) else 0.01)
     contact = read(smooth, square(0.46, 0.15)).p_robot_contact
-    np.testing.assert_allclose(contact, half.p_robot_contact, atol=0.006)
+    np.testing.assert_allclose(contact, half.p_robot_contact, atol=0.01)
 
 
 def test_a_corner_must_press_harder_on_coarser_taxels():
@@ -108,7 +108,7 @@ def test_engines_agree_on_a_base_of_another_size():
     names = ("fused", "mujoco", "quasistatic")  # MJX drives such a base in test_robot
     qpos = {name: push_object(name, slim, twist=twist).qpos[-1] for name in names}
     for name, final in qpos.items():
-        bound = 0.02 if name == "quasistatic" else 2e-3
+        bound = 0.02 if name == "quasistatic" else 3e-3
         np.testing.assert_allclose(final, qpos["mujoco"], atol=bound, err_msg=name)
     wide = push_object("fused", replace(slim, half_width=0.29), twist=twist).qpos[-1]
     assert np.abs(wide - qpos["fused"])[:9].max() > 0.005

@@ -175,7 +175,7 @@ def test_cross_track_errors_are_those_of_the_contact_points() -> None:
     outcomes = progress.outcomes()
     assert outcomes["error_mean"] == pytest.approx(errors.mean(), rel=1e-4)
     assert outcomes["error_max"] == pytest.approx(errors.max(), rel=1e-5)
-    assert outcomes["error_95"] == pytest.approx(np.quantile(errors, 0.95), rel=0.08)
+    assert outcomes["error_95"] == pytest.approx(np.quantile(errors, 0.95), rel=0.15)
     assert outcomes["progress"] == pytest.approx(3 / 8, abs=1e-5)
     _, aim = step(progress._replace(arc=jnp.asarray(7.8)), positions_at((4.0, 3.9)))
     assert aim.at_end

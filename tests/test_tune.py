@@ -162,7 +162,7 @@ def test_the_first_generation_spreads_about_the_start():
     question, _, proposal = search(population=4000, spread=0.3)
     away = proposal["vectors"] - question.base
     np.testing.assert_allclose(away.std(axis=0), 0.3, rtol=0.05)
-    np.testing.assert_allclose(away.mean(axis=0), 0.0, atol=0.02)
+    np.testing.assert_allclose(away.mean(axis=0), 0.0, atol=0.03)
 
 
 def test_quick_tunes_few_parameters_of_rps_and_all_of_other_laws():

@@ -11,8 +11,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-NUMBER = r"([-+]?\d[\d.]*(?:e[-+]?\d+)?)"
-BELOW = re.compile(rf"^\(?(?:np\.\w+\()?{NUMBER}\)? <=? (?:np\.\w+\()?{NUMBER}\)?")
+SIDE = r"([-+*/(). \de]+)"
+COMPARED = re.compile(rf"{SIDE} <=? {SIDE}(?: <=? {SIDE})?")
 SMALL = 0.2  # a larger right-hand side is an outcome or a count, not a tolerance
 
 
@@ -84,8 +84,17 @@ def install(path: Path) -> Ratios:
 
 
 def compare(ratios: Ratios, line: int, text: str, explanation: str) -> None:
-    """Record a comparison `error < tolerance` that has passed."""
-    if match := BELOW.match(explanation.strip()):
-        error, tolerance = map(float, match.groups())
-        if 0 < tolerance <= SMALL:
-            ratios.add(abs(error) / tolerance, text, line)
+    """Record a comparison `error < tolerance`, or `low < value < high`, that has passed."""
+    first_line = re.sub(r"np\.\w+\(", "(", explanation.strip().split("\n")[0])
+    first_line = re.sub(r"^\((.*)\) == \w+$", r"\1", first_line)
+    if not (match := COMPARED.fullmatch(first_line)):
+        return
+    try:
+        error, *bounds = (eval(side) for side in match.groups() if side)
+    except (ArithmeticError, NameError, SyntaxError, TypeError):
+        return
+    if len(bounds) == 2:
+        low, (value, high) = error, bounds
+        error, bounds = value - (low + high) / 2, [(high - low) / 2]
+    if 0 < bounds[0] <= SMALL:
+        ratios.add(abs(error) / bounds[0], text, line)
