@@ -19,6 +19,7 @@ from rps_jax.world import scene
 from rps_jax.world.physics import Physics
 from rps_jax.world.scene import Friction
 
+pytestmark = pytest.mark.parity
 TWIST = (0.05, 0.01, 0.05)  # [m/s, m/s, rad/s]
 # Object, yaw [rad] and lateral offset [m]: flat on the face, corner first, the base's corner first.
 STARTS = (

@@ -28,6 +28,7 @@ from rps_jax.lowering.routine import routine
 from rps_jax.lowering.target import UnsupportedError
 from rps_jax.lowering.writer import SimdWriter
 
+pytestmark = pytest.mark.parity
 MAKE = runpy.run_path(str(ROOT / "docs" / "push" / "make.py"))  # with the printer of a page
 REALS = [0.0, -0.0, 0.5, -1.5, 2.5, 7.0, 1e30, -1e30, np.inf, -np.inf, np.nan]
 BOUNDS = [2147483520.0, -2147483520.0, 2147483648.0, -2147483648.0, -2147483904.0, 3e9]

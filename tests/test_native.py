@@ -86,6 +86,7 @@ PAIRS = [
 ]  # fmt: skip
 
 
+@pytest.mark.parity
 @pytest.mark.parametrize(("shape", "skin"), PAIRS)
 def test_a_control_step_agrees_with_xla(shape, skin, monkeypatch):
     stage, inputs, loop, pushing = build_push(shape, skin)
@@ -95,6 +96,7 @@ def test_a_control_step_agrees_with_xla(shape, skin, monkeypatch):
     close(computed, expected, warm=4e-3, rest=2e-5)
 
 
+@pytest.mark.parity
 @pytest.mark.parametrize("shape", ["prism", pytest.param("cylinder", marks=pytest.mark.slow)])
 def test_the_bits_of_a_world_depend_on_no_other_world(shape):
     stage, inputs, loop = batch(shape)
@@ -401,6 +403,7 @@ def test_a_custom_law_is_compared_with_xla_before_a_run_once(mine, cache, monkey
     law_check.warn_of_difference(part.with_params(registry.resolve_law("rps")[1]), setting)
 
 
+@pytest.mark.parity
 def test_a_sweep_of_a_custom_law_is_a_push_in_xla(mine, tmp_path, monkeypatch):
     setting = Setting("fused", rules=Rules(horizon=8.0))
     swept = sweep("mine", "wide,objects=box,gap=0.01", worlds=2, setting=setting, out=tmp_path)

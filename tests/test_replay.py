@@ -72,6 +72,7 @@ SLOW_CASES = {
 SLOW = [pytest.param(x, marks=pytest.mark.slow) for x in SLOW_CASES.values()]
 
 
+@pytest.mark.parity
 @pytest.mark.parametrize("case", [*CASES.values(), *SLOW], ids=[*CASES, *SLOW_CASES])
 def test_a_replay_has_the_bits_of_its_sweep(case, tmp_path):
     results = sweep(tmp_path, *case)
