@@ -536,18 +536,18 @@ COMMANDS: dict[str, tuple[str, ...]] = {
 
 
 @functools.cache
-def _furnished(learned: bool) -> tuple[Path, dict[str, list[tuple[str, ...]]]]:
+def _furnished(complete: bool) -> tuple[Path, dict[str, list[tuple[str, ...]]]]:
     """Return a temporary folder with small runs, and the commands that read them."""
     home = Path(tempfile.mkdtemp())
     atexit.register(shutil.rmtree, home, ignore_errors=True)
     with contextlib.chdir(home):
-        return home, furnish_runs(home, learned)
+        return home, furnish_runs(home, complete)
 
 
-def furnish_runs(folder: Path, learned: bool) -> dict[str, list[tuple[str, ...]]]:
+def furnish_runs(folder: Path, complete: bool) -> dict[str, list[tuple[str, ...]]]:
     """Write small runs of several kinds, and return the commands that read each of them.
 
-    A law is `learned` if it is worth the minute that this takes.
+    A complete set has a tuned and a learned law, which take a minute.
     """
     import rps_jax
     from rps_jax.control.learned import policy
@@ -561,7 +561,7 @@ def furnish_runs(folder: Path, learned: bool) -> dict[str, list[tuple[str, ...]]
         Path(policy.__file__).parent / "learned_small.npz", folder / "policy" / "policy.npz"
     )
     runs = {name: (*words, "--out", name) for name, words in COMMANDS.items()}
-    for command in [runs[name] for name in runs if learned or name != "learn"]:
+    for command in [runs[name] for name in runs if complete or name == "sweep"]:
         if (result := attempt(command, 300)).how != "told":
             raise RuntimeError(f"rps {' '.join(command)} made no run ({result.how}): {result.text}")
     reads = {
@@ -575,14 +575,16 @@ def furnish_runs(folder: Path, learned: bool) -> dict[str, list[tuple[str, ...]]
         "policy": [("push", "--skin", "capacitive", "--law", "policy/policy.npz")],
         "learn": [runs["learn"], ("export", "c", "--law", "learn/policy.npz")],
     }  # fmt: skip
-    return {name: words for name, words in reads.items() if learned or name != "learn"}
+    return {
+        name: words for name, words in reads.items() if complete or name not in ("tune", "learn")
+    }
 
 
 def edited_folders(limit: int, seed: int, damaged: bool) -> Iterator[Fault]:
     """Yield commands that read a run folder with one file damaged, or edited consistently."""
     rng = random.Random(seed)
     readers = {".json": json_edits, ".nc": dataset_edits, ".npz": archive_edits}
-    home, reads = _furnished(learned=limit >= 100)
+    home, reads = _furnished(complete=limit >= 100)
     with contextlib.chdir(home):
         candidates = []
         for path in (path for name in reads for path in sorted(Path(name).rglob("*"))):
