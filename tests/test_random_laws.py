@@ -65,8 +65,11 @@ OPERATIONS = {
     "bff f": [jnp.where, lambda b, x, y: jnp.select([b, x > y], [y, x], 0.5)],
     "Bff f": [lambda b, x, y: lax.cond(b, lambda: x + y, lambda: jnp.sort(y))],
     "ii i": [
-        *(jnp.add, jnp.subtract, jnp.multiply, jnp.maximum, jnp.minimum, jnp.floor_divide),
-        *(jnp.remainder, lax.div, lax.rem, jnp.bitwise_and, jnp.bitwise_or, jnp.bitwise_xor),
+        *(jnp.add, jnp.subtract, jnp.multiply, jnp.maximum, jnp.minimum),
+        # A program of XLA ends the process where it divides by a constant 0.
+        *(lambda i, j, f=f: f(i, j | 1)
+          for f in (jnp.floor_divide, jnp.remainder, lax.div, lax.rem)),
+        *(jnp.bitwise_and, jnp.bitwise_or, jnp.bitwise_xor),
         *(lax.shift_left, lax.shift_right_logical, lax.shift_right_arithmetic),
     ],
     "i i": [

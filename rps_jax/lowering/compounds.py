@@ -214,7 +214,7 @@ def _scatter(combine: Function | None) -> Function:
         window = iter(blocks.shape[len(rest) :])
         sizes = [1 if i in single else next(window) for i in range(x.ndim)]
         if combine and unique_indices:
-            inverse = lax.GatherDimensionNumbers(*axes)
+            inverse = lax.GatherDimensionNumbers(*map(tuple, axes))
             results = combine(lax.gather(x, indices, inverse, sizes, mode=mode), updates)
             return lax.scatter(x, indices, results, axes, unique_indices=True, mode=mode)
         batching = zip(axes.operand_batching_dims, axes.scatter_indices_batching_dims, strict=True)
