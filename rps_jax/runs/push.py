@@ -384,14 +384,14 @@ def find_differences(run: Path, law: str, worlds: Sequence[int], outcomes: Outco
     """Return whether trials (n,) end otherwise than in their sweep, and warn if one does."""
     if not (run / "results.nc").exists():  # a shard
         return np.zeros(len(worlds), bool)
-    ends = files.read_results(run)
-    if law not in ends.law:  # it has failed
+    results = files.read_results(run)
+    if law not in results.law:  # it has failed
         return np.zeros(len(worlds), bool)
-    ends = ends.sel(law=law).isel(world=list(worlds))
-    pairs = [(ends[name].values, outcomes.columns()[name]) for name in _ENDS]
+    results = results.sel(law=law).isel(world=list(worlds))
+    pairs = [(results[name].values, outcomes.columns()[name]) for name in _COMPARED]
     differ = np.any([stored != x.astype(stored.dtype) for stored, x in pairs], axis=0)
     if differ.any():
-        end = ends.isel(world=int(differ.argmax()))
+        end = results.isel(world=int(differ.argmax()))
         warnings.warn(
             f"{differ.sum()} of {differ.size} trials end otherwise than in the sweep (world "
             f"{int(end.world)}: target {end_in_words(end)} there): another device or version "
@@ -401,7 +401,7 @@ def find_differences(run: Path, law: str, worlds: Sequence[int], outcomes: Outco
     return differ
 
 
-_ENDS = "success", "time", "tipped", "diverged"  # outcomes that differ if a trial ends otherwise
+_COMPARED = "success", "time", "tipped", "diverged"  # outcomes of a trial
 
 
 def end_in_words(trial: xr.Dataset) -> str:

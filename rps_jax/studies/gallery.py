@@ -173,8 +173,8 @@ def _simulate(
         options: Any = {"interval": 0.5, "slots": slots, "callback": progress}
         trajectories = pushes.record_batch(batch, plan.setting, **options)
         progress.finish(rows.size)
-        ends = jax.tree.map(lambda *x: np.stack(x), *(x.outcome for x in trajectories))
-        differ = find_differences(run, law, rows.tolist(), ends)
+        outcomes = jax.tree.map(lambda *x: np.stack(x), *(x.outcome for x in trajectories))
+        differ = find_differences(run, law, rows.tolist(), outcomes)
         for i, trajectory, differs in zip(rows.tolist(), trajectories, differ, strict=True):
             traces[i] = trace_dataset(trajectory).assign_attrs(differs=bool(differs))
     return traces

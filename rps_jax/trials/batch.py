@@ -158,22 +158,31 @@ def run(
     if not engine.traced:
         count = max(1, min(workers, len(jobs)))
         shared = setting, workers // count, monitor
-        tasks = [partial(monitor.isolate, partial(_run_on_host, job, *shared)) for job in jobs]
+        tasks = [
+            partial(monitor.isolate, i, partial(_run_on_host, job, *shared))
+            for i, job in enumerate(jobs)
+        ]
     else:
         devices = _devices()
         groups = _schedule([*itertools.starmap(_TrialQueue, enumerate(jobs))], setting, slots)
-        compilations = [partial(x.compiled, d) for x in itertools.chain(*groups) for d in devices]
-        for queue in itertools.chain(*(group[0].queues for group in groups)):
-            law_check.warn_of_difference(queue.example, setting)
+        compilations = [
+            partial(monitor.isolate, x.key, partial(x.compiled, d))
+            for x in itertools.chain(*groups)
+            for d in devices
+        ]
+        for program in (group[0] for group in groups):
+            for queue in program.queues:
+                check = partial(law_check.warn_of_difference, queue.example, setting)
+                monitor.isolate(program.key, check)
         monitor.programs = len(compilations)
         monitor.report()
         tasks = [partial(_work, groups, monitor, *x) for x in enumerate(devices * workers)]
         if backend != "cpu":  # idle processors: compile all programs at once, first used first
-            tasks += [partial(monitor.isolate, task) for task in compilations]
+            tasks += compilations
         count = len(tasks)
     _run_in_threads(tasks, count, monitor)
-    if monitor.failures:
-        raise monitor.failures[0]
+    for error in monitor.failures.values():
+        raise error
     monitor.warn_of_nan_twists()
     return Timing(monitor.compile, monitor.elapsed - monitor.compile, monitor.simulated)
 
@@ -209,7 +218,7 @@ class _Monitor:
         self.simulated = 0.0  # [s] summed over trials
         self.compile = 0.0  # [s] that the worker who waited longest had no program
         self.stop = False  # set when one worker fails or the user interrupts
-        self.failures: list[Exception] = []  # of jobs, as of a law that cannot be compiled
+        self.failures: dict[int, Exception] = {}  # of groups of jobs, as of a law that fails
         self._start_time = time.perf_counter()
         self._finished = self._nan_twists = 0  # trials
         self._compiled: set[object] = set()
@@ -238,14 +247,18 @@ class _Monitor:
                 self.stop = True
                 raise
 
-    def isolate(self, task: Callable[[], object]) -> None:
-        """Run a task; store its error, so that the other jobs go on."""
+    def isolate(self, key: int, task: Callable[[], object]) -> None:
+        """Run a task of a group of jobs; its error ends this group, and the others go on."""
         try:
             task()
         except Exception as error:
             if self.stop:
                 raise
-            self.failures.append(error)
+            self.failures.setdefault(key, error)
+
+    def stops(self, program: _Program) -> bool:
+        """Return whether the run or the group of a program has ended early."""
+        return self.stop or program.key in self.failures
 
     def warn_of_nan_twists(self) -> None:
         """Warn if a law returned a twist that is not finite."""
@@ -365,7 +378,7 @@ class _Program:
 
     def __init__(self, queues: Sequence[_TrialQueue], slots: Sequence[int], setting: Setting):
         self.queues, self.slots, self.setting = queues, slots, setting
-        self.law = queues[0].example.law
+        self.law, self.key = queues[0].example.law, queues[0].index  # the key of its group
         self.stages = tuple(queue.example.stage for queue in queues)
         self._locks: defaultdict[object, threading.Lock] = defaultdict(threading.Lock)
 
@@ -512,7 +525,7 @@ def _work(
     """Run groups of programs on a device until no trial waits or runs; `index` of the worker."""
     first = index % max(1, len(groups))
     for group in (*groups[first:], *groups[:first]):
-        monitor.isolate(partial(_run_group, group, device, monitor))
+        monitor.isolate(group[0].key, partial(_run_group, group, device, monitor))
 
 
 def _run_group(group: Sequence[_Program], device: Device, monitor: _Monitor) -> None:
@@ -527,7 +540,7 @@ def _run(
     device: Device, monitor: _Monitor,
 ) -> Sequence[_Running | None]:  # fmt: skip
     """Run segments until no trial waits and at most `limits` of each queue run; return these."""
-    if monitor.stop:
+    if monitor.stops(program):
         return running
     queues = [_Slots(program, *trials, device) for trials in enumerate(running)]
     if not any(slots.live.any() for slots in queues):
@@ -543,7 +556,9 @@ def _run(
         report: Future[object] = reporter.submit(int)  # of the last segment that was read
         for index in itertools.count(-delay):  # of the segment that is read
             counts = [int(np.count_nonzero(slots.live)) for slots in queues]
-            if not monitor.stop and any(map(operator.gt, counts, limits or [0] * len(queues))):
+            if not monitor.stops(program) and any(
+                map(operator.gt, counts, limits or [0] * len(queues))
+            ):
                 arguments = zip(*(slots.arguments() for slots in queues), strict=True)
                 start_time = monitor.elapsed
                 advanced, states = advance(stages, *arguments, rules, steps)
