@@ -271,7 +271,7 @@ class GymPushVector(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             errors.check_count("seed", seed, at_least=0, at_most=_SEEDS**2 - 1)
         drawn = self.np_random.integers(_SEEDS, size=self.num_envs)
         values = [drawn[i] if s is None else int(s) for i, s in enumerate(seeds)]
-        words = np.array([divmod(value, _SEEDS) for value in values], np.uint32)
+        words = jnp.array([divmod(value, _SEEDS) for value in values], jnp.uint32)
         keys = jax.random.wrap_key_data(words, impl="threefry2x32")
         self._keys = keys if self._keys is None else jnp.where(known & where, keys, self._keys)
 
