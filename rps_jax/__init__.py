@@ -22,17 +22,12 @@ def _homes() -> dict[str, str]:
 
 
 _HOMES = _homes()
-_REMOVED = {  # names of version 0.3: what to use instead, in Python and in the shell
-    "models": ("sweep(..., models=True)", "rps sweep --models"),
-    "compare": ("ladder", "rps ladder --domain A B"),
-}
 __all__ = sorted(_HOMES)  # pyright: ignore[reportUnsupportedDunderAll]
 
 
 def __getattr__(name: str) -> Any:
     if name not in _HOMES:
-        hint = f": use {_REMOVED[name][0]}" if name in _REMOVED else ""
-        raise AttributeError(f"module 'rps_jax' has no attribute '{name}'{hint}")
+        raise AttributeError(f"module 'rps_jax' has no attribute '{name}'")
     home = importlib.import_module(_HOMES[name])
     if hasattr(home, name):
         return getattr(home, name)

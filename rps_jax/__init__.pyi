@@ -53,6 +53,3 @@ from rps_jax.trials.setting import Setting as Setting
 from rps_jax.trials.trial import Rules as Rules
 from rps_jax.record.cache import use_cache as use_cache
 from rps_jax.errors import InputError as InputError
-
-# --- names of 0.3 and what replaces them, in Python and in the shell ----------------------------
-_REMOVED: dict[str, tuple[str, str]]

@@ -8,8 +8,7 @@ import itertools
 import math
 import numbers
 import re
-import warnings
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from types import ModuleType
 from typing import Any, cast
 
@@ -139,15 +138,6 @@ def check_name(kind: str, name: str, known: Iterable[str], file: str = "") -> st
         return name
     hint, alternative = suggest(name, known), f", or give {file}" if file else ""
     raise InputError(f"unknown {kind} '{name}': choose from {', '.join(known)}{alternative}{hint}.")
-
-
-def current_name(owner: str, prefix: str, name: str, old_names: Mapping[str, str]) -> str:
-    """Return the name that replaces an old one, with a warning; AttributeError if there is none."""
-    if name not in old_names:
-        raise AttributeError(f"{owner} has no attribute '{name}'")
-    message = f"{prefix}{name} is now {prefix}{old_names[name]}"
-    warnings.warn(message, DeprecationWarning, stacklevel=3)
-    return old_names[name]
 
 
 def suggest(name: object, known: Sequence[str]) -> str:

@@ -13,7 +13,7 @@ from rps_jax.control import registry
 from rps_jax.control.laws.rps import RPSParams
 from rps_jax.engines import ENGINES
 from rps_jax.errors import InputError
-from rps_jax.record import files, provenance
+from rps_jax.record import files
 from rps_jax.record.folder import claim
 from rps_jax.runs.plan import Plan, open_run
 from rps_jax.studies.rare import Rare
@@ -66,7 +66,7 @@ CORRUPT = {
     "laws": ({"laws": []}, ""),
     "physics": ({"physics": {"timestep": -1}}, "timestep = -1 is not allowed"),
 }
-VERSIONS = {"older": {"rules": {"horizon": 300.0}}, "arms": {"arms": {}}}
+VERSIONS = {"older": {"rules": {"horizon": 300.0}}}
 # The same of several commands: "COMMAND, COMMAND: arguments".
 SHARED = {
     "table, hardware, paper, sweep, ladder, tune es: --out file": "out = file cannot be written",
@@ -190,7 +190,6 @@ COMMANDS = {
     },
     "replay": {
         "older 0": "older was written by another version .rules.max_lost = None there, 150",
-        "arms 0": "run = arms was written by rps_jax 0.2.0: use that version",
         "run x": "world = x is not allowed: give a whole number",
         "run -1": "world = -1 is not allowed: it must be a whole number from 0 to",
     },
@@ -292,7 +291,6 @@ def folder(tmp_path_factory):
     for name, changes in changed.items():
         (root / name).mkdir()
         (root / name / "manifest.json").write_text(json.dumps(good | changes))
-    provenance.write_environment(root / "arms", {"packages": {"rps_jax": "0.2.0"}})
     return root
 
 

@@ -10,14 +10,11 @@ import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode
-from helpers import NEAR, refusals, row, rps, same
+from helpers import NEAR, refusals, row, same
 
-import rps_jax
 from rps_jax.errors import InputError
-from rps_jax.runs import question
 from rps_jax.runs.evaluate import evaluate
 from rps_jax.trials import gym
-from rps_jax.trials.progress import no_progress
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import Rules
 
@@ -333,28 +330,3 @@ def test_without_gymnasium_the_error_names_the_package(monkeypatch):
     monkeypatch.delitem(sys.modules, "rps_jax.trials.gym")
     with pytest.raises(InputError, match=r"run pip install 'rps_jax\[gym\]'"):
         importlib.import_module("rps_jax.trials.gym")
-
-
-def test_previous_names_of_questions_and_runs_warn():
-    with pytest.warns(DeprecationWarning, match="OfLaw is now LawQuestion"):
-        assert question.OfLaw is question.LawQuestion
-    with pytest.warns(DeprecationWarning, match=r"Run\.report is now Run\.callback"):
-        assert question.Run(None, no_progress).report is no_progress
-
-
-def test_removed_names_of_the_package_and_the_shell_name_their_successors(capsys):
-    for name, call, command in (
-        ("models", r"sweep\(..., models=True\)", "rps sweep --models"),
-        ("compare", "ladder", "rps ladder --domain A B"),
-    ):
-        with pytest.raises(AttributeError, match=f"'{name}': use {call}$"):
-            getattr(rps_jax, name)
-        assert rps(name, "--domain", "wide") == 2
-        assert f"'{name}' does not exist: use {command}." in capsys.readouterr().err
-
-
-def test_the_previous_module_name_warns_and_has_the_same_classes(monkeypatch):
-    monkeypatch.delitem(sys.modules, "rps_jax.tuning.gym", raising=False)
-    with pytest.warns(DeprecationWarning, match=r"import rps_jax\.trials\.gym instead"):
-        previous = importlib.import_module("rps_jax.tuning.gym")
-    assert (previous.Push, previous.PushVector) == (gym.GymPush, gym.GymPushVector)

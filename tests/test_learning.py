@@ -219,14 +219,6 @@ def test_a_run_of_a_policy_is_loaded_with_its_copy_of_a_changed_file(tmp_path, r
         assert load_plan(tmp_path / "run").laws == {name: params}
 
 
-@pytest.mark.parametrize(
-    ("old", "new"), [("learned_gru", "learned"), ("learned_mlp", "learned_small")]
-)
-def test_a_name_of_an_earlier_version_selects_its_successor_with_a_warning(old, new):
-    with pytest.warns(UserWarning, match=f"the law {old} is now {new}"):
-        assert registry.parse_law(old) == registry.parse_law(new)
-
-
 # --- the algorithm -------------------------------------------------------------------------
 
 

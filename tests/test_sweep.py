@@ -343,17 +343,6 @@ def test_a_part_of_an_older_version_is_named(whole, tmp_path):
         merge([folder], out=folder)
 
 
-def test_a_run_with_the_removed_column_overflows_is_read(whole, tmp_path):
-    folder = shutil.copytree(whole, tmp_path / "run")
-    expected = merge([folder], out=folder)
-    for index, chunk in enumerate(sorted(folder.glob("parts/*.npz"))):
-        columns = files.decode_arrays(chunk.read_bytes())
-        chunk.unlink()
-        older = columns | {"overflows": np.zeros(columns["trial"].size, np.int32)}
-        execution.store_chunk(folder, index, files.encode_arrays(**older))
-    xr.testing.assert_identical(merge([folder], out=folder), expected)
-
-
 def test_the_report_of_one_world_has_the_command_that_replays_its_failure(whole, tmp_path):
     folder = shutil.copytree(whole, tmp_path / "a run")
     results = merge([folder], out=folder)

@@ -9,7 +9,6 @@ import functools
 import importlib
 import pkgutil
 import sys
-import warnings
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -41,10 +40,6 @@ _SOURCES: dict[type, dict[str, str]] = {}  # file and digest, by class of parame
 def _table(name: str) -> dict[str, LawParams]:
     """Return the table to which a law of this name belongs."""
     return _HIDDEN if name.startswith("_") else LAWS
-
-
-# Names of laws in version 0.3; another network has taken the place of learned_gru.
-_OLD_NAMES = {"learned_gru": "learned", "learned_mlp": "learned_small"}
 
 
 def _load_package_laws() -> None:
@@ -211,9 +206,6 @@ def _parse_head(text: str) -> tuple[str, LawParams]:
         return _load_policy(Path(text))
     path, _, kind = (text, "", "") if _is_python(text) else text.rpartition(":")
     if not _is_python(path):
-        if text in _OLD_NAMES:
-            warnings.warn(f"the law {text} is now {_OLD_NAMES[text]}", stacklevel=2)
-            text = _OLD_NAMES[text]
         return text, LAWS[errors.check_name("law", text, LAWS, "FILE.py or policy.npz")]
     # The file is run again if another law has taken its name since.
     if (law := _find_registered(sources.load(Path(path)), kind)) is None:

@@ -272,18 +272,7 @@ def decode_results(content: bytes, source: object) -> xr.Dataset:
             results.load()
     except Exception as error:  # of any kind, by HDF5 on damaged files
         raise CorruptFileError(source, error) from error
-    return _with_current_labels(results)
-
-
-def _with_current_labels(results: xr.Dataset) -> xr.Dataset:
-    """Return results that version 0.3 or earlier stored with the labels of this version."""
-    results.attrs.pop("structure", None)
-    if "which_object" not in results or results.which_object.dims != ("world",):
-        return results
-    names = results.object.values[results.which_object.values]
-    results = results.drop_dims("object").drop_vars("which_object").assign(object=("world", names))
-    results = results.assign_coords(pose=["x", "y", "yaw"])
-    return results.set_coords([name for name in results if results[name].dims == ("world",)])
+    return results
 
 
 def check_columns(

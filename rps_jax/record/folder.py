@@ -140,9 +140,9 @@ def describe_difference(stored: object, new: object) -> str:
 
 def _differences(stored: object, new: object, path: str) -> Iterator[str]:
     if isinstance(stored, dict) and isinstance(new, dict):
-        skipped = {"solids"} - stored.keys()  # which version 0.3.0 did not store
+        skipped = set()
         if "file" not in new and files.suffix_of(str(stored.get("file"))) == ".npz":
-            skipped |= {"file", "digest"}  # of a policy that is shipped now; its class has a digest
+            skipped = {"file", "digest"}  # of a policy that is shipped now; its class has a digest
         for key in (key for key in {**stored, **new} if key not in skipped):
             pair = stored.get(key), new.get(key)
             yield from _differences(*pair, f"{path}.{key}" if path else key)

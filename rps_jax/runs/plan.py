@@ -173,9 +173,6 @@ def load_plan(folder: Path) -> Plan:
       InputError: the folder holds no plan, or one of another version.
     """
     record = run_folder.read_manifest(folder)
-    if "arms" in record or "strategies" in record:  # as 0.2.0 called them
-        version = provenance.package_version(folder)
-        raise InputError(f"run = {folder} was written by {version}: use that version.")
     if "laws" not in record:
         raise InputError(f"run = {folder} does not hold a sweep: give the folder of `rps sweep`.")
     try:

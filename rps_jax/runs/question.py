@@ -65,21 +65,10 @@ if TYPE_CHECKING:
 P = ParamSpec("P")
 D = TypeVar("D", bound="DataclassInstance")
 T = TypeVar("T", covariant=True)
-_OLD_NAMES = {
-    "OfLaw": "LawQuestion",
-    "OfLaws": "MultiLawQuestion",
-    "InDomain": "DomainQuestion",
-    "Pushes": "SimulationQuestion",
-}
 # Options that say how a run is executed; results do not depend on them.
 _EXECUTION_OPTIONS = (
     *("out", "overwrite", "bag", "slots", "workers", "quick", "progress", "report_to"),
 )
-
-
-def __getattr__(name: str) -> Any:
-    """Return a class by its name in version 0.3, with a warning."""
-    return globals()[errors.current_name(f"module '{__name__}'", "", name, _OLD_NAMES)]
 
 
 def call_of(command: Callable[P, Command[T]]) -> Callable[P, T]:

@@ -31,7 +31,6 @@ StoreChunk = Callable[[int, bytes], object]  # called with the number of a chunk
 # Types of an outcome's columns; the rest are float32.
 _FLAGS = ("success", "tipped", "diverged", "nan_twist", "stalled", "unfelt")
 _TYPES: dict[str, type] = dict.fromkeys(_FLAGS, np.int8)
-_REMOVED = "overflows"  # column of a version with the engine warp
 _PREFETCH = 16384  # worlds of one program that are built before they are needed, about
 
 
@@ -146,7 +145,6 @@ class Results:
             columns = files.decode_arrays(content)
         except ValueError as error:
             raise files.CorruptFileError(source, error) from error
-        columns.pop(_REMOVED, None)
         known = {"trial", *self._names}
         drawn = set(columns) - known
         if missing := {*known, *(() if law[0] or drawn else ("drawn",))} - set(columns):

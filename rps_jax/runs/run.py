@@ -6,16 +6,13 @@ import itertools
 from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import xarray as xr
 
-from rps_jax import errors
 from rps_jax.record.checkpoint import Checkpoints
 from rps_jax.trials.batch import BatchOptions
 from rps_jax.trials.progress import ProgressCallback
-
-_OLD_NAMES = {"part": "checkpoint", "parts": "checkpoints", "report": "callback"}
 
 
 class Run(NamedTuple):
@@ -72,7 +69,3 @@ class Run(NamedTuple):
     def batch_options(self) -> BatchOptions:
         """Slots, workers and callback, as keyword arguments of functions that run trials."""
         return BatchOptions(slots=self.slots, workers=self.workers, callback=self.callback)
-
-    def __getattr__(self, name: str) -> Any:
-        """Return an attribute by its name in version 0.3, with a warning."""
-        return getattr(self, errors.current_name("'Run' object", "Run.", name, _OLD_NAMES))

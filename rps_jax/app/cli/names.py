@@ -14,7 +14,6 @@ from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, NamedTuple
 
-from rps_jax import _REMOVED
 from rps_jax.errors import InputError, check_name
 
 if TYPE_CHECKING:
@@ -84,8 +83,6 @@ def split(words: list[str]) -> tuple[str, list[str]]:
     first = words[0]
     if first.lower().endswith(".py") or "/" in first or Path(first).is_dir():
         return first, words[1:]
-    if first in _REMOVED:
-        raise InputError(f"command '{first}' does not exist: use {_REMOVED[first][1]}.")
     name = " ".join(words[:2]) if first in ("tune", "export") else first
     return check_name("command", name, known()), []  # which raises
 
