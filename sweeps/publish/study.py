@@ -77,7 +77,7 @@ class Publish(Study[xr.Dataset]):
         """Compute selected data files again, and return the state of all data files."""
         if self.only and not self.check_probes:
             self._compute_again(run)
-        descriptions = []
+        descriptions = list[xr.Dataset]()
         for path in published():
             checked = self.check_probes and self._selects(path.stem)
             description = _description(path, checked)
