@@ -106,9 +106,10 @@ RECIPES: dict[str, Recipe] = {
     "rest": recipe(f"rps sweeps/fidelity/rest.py {_MACHINE}", cores=5),
     "reading_*": recipe(f"rps sweeps/paper_reading {_MACHINE}", gpu=10),
     "feet": recipe(
-        "rps sweep --domain wide --laws rps rps_tuned rps_plus --worlds 400",
-        "rps sweep --domain wide,feet=0.5:0.9 --laws rps rps_tuned rps_plus --worlds 400",
-        cores=10,
+        "rps sweep --domain wide --laws rps rps_tuned rps_plus --worlds 4000 --seed 7007",
+        "rps sweep --domain wide,feet=0.5:0.9 --laws rps rps_tuned rps_plus --worlds 4000 "
+        "--seed 7007",
+        gpu=2,
         section="Success",
         labels=("corners and rims", "three or four feet"),
         columns=_RATES,
