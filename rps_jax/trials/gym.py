@@ -26,6 +26,7 @@ import numpy as np
 from rps_jax import errors
 from rps_jax.control import soft
 from rps_jax.engines import device
+from rps_jax.record.files import Arrays
 from rps_jax.trials.batch import rows
 from rps_jax.trials.env import SHAPED_REWARD, PushEnv, State
 from rps_jax.world import domain as domains
@@ -210,7 +211,7 @@ class GymPushVector(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         self._state, rewards = self._act(self.state, array)
         return np.asarray(rewards, float)
 
-    def observe(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, dict[str, np.ndarray]]:
+    def observe(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, Arrays]:
         """Return observations (num_envs, T + 2), terminated and truncated flags, and infos."""
         data, metrics = self.state.data, self.state.metrics
         infos = {
@@ -271,7 +272,7 @@ class GymPushVector(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             errors.check_count("seed", seed, at_least=0, at_most=_SEEDS**2 - 1)
         drawn = self.np_random.integers(_SEEDS, size=self.num_envs)
         values = [drawn[i] if s is None else int(s) for i, s in enumerate(seeds)]
-        words = np.array([divmod(value, _SEEDS) for value in values], np.uint32)
+        words = jnp.array([divmod(value, _SEEDS) for value in values], np.uint32)
         keys = jax.random.wrap_key_data(words, impl="threefry2x32")
         self._keys = keys if self._keys is None else jnp.where(known & where, keys, self._keys)
 
