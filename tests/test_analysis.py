@@ -230,8 +230,10 @@ def test_the_papers_numbers_are_beside_ours_under_each_friction(drawn):
     assert box == ["hardware box", "3 of 4 [30, 95]", "8 of 8", "0.033 m (by friction 0.020-0.040)",
                    "0.032 m", "80 s (by friction 70-85)", "89 s"]  # fmt: skip
     _, marked, _ = hardware.table(results, "fitted; ")
-    assert marked[3:6:2] == ["0.033 m (fitted; by friction 0.020-0.040)",
-                             "80 s (fitted; by friction 70-85)"]  # fmt: skip
+    assert marked[3:6:2] == [
+        "0.033 m (fitted; by friction 0.020-0.040)",
+        "80 s (fitted; by friction 70-85)",
+    ]
     assert cylinder[1:] == ["0 of 4 [0, 49]", "8 of 8", "-", "0.059 m", "-", "88 s"]
 
 

@@ -370,11 +370,17 @@ POINTER = "version https://git-lfs.github.com/spec/v1\noid sha256:4d7a2146\nsize
 @pytest.mark.parametrize(
     "command",
     [
-        "sweep --domain {}.json", "push --law rps,{}.json", "push --law {}.npz",
-        "push --law {}.py", "push --object {}.xml", "push --task {}.yaml", "fit {}.csv",
-        "fit {}.mcap", "shadow {}.db3",
+        "sweep --domain {}.json",
+        "push --law rps,{}.json",
+        "push --law {}.npz",
+        "push --law {}.py",
+        "push --object {}.xml",
+        "push --task {}.yaml",
+        "fit {}.csv",
+        "fit {}.mcap",
+        "shadow {}.db3",
     ],
-)  # fmt: skip
+)
 def test_a_pointer_of_git_lfs_is_named(command, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     words = command.format("pointer").split()

@@ -126,7 +126,7 @@ def test_the_results_are_labelled(results):
     }  # fmt: skip
     assert (results.kind == "parameter").values.tolist() == [True] + [False] * 9
     assert results.map_error.values.max() < 3e-4
-    attrs = {"engine": "quasistatic", "gradient": "exact", "horizon": 1.0, "seed": 0}
+    attrs = {"engine": "quasistatic", "horizon": 1.0, "seed": 0}
     assert attrs.items() <= results.attrs.items()
     assert results.attrs["skin_temperature"] == pytest.approx(0.03)
     assert {"mass", "friction_robot", "object"} <= set(results.coords)

@@ -106,12 +106,18 @@ def random_worlds(laws=6):
 
 
 FIGURES = {
-    "tuning": search, "curve": curve, "marginals": marginals, "ladder": rungs, "archive": archive,
-    "sobol": indices, "interactions": interactions, "min_distance": fig_5,
+    "tuning": search,
+    "curve": curve,
+    "marginals": marginals,
+    "ladder": rungs,
+    "archive": archive,
+    "sobol": indices,
+    "interactions": interactions,
+    "min_distance": fig_5,
     "success": lambda: success_curves(random_worlds()),
     "success of one quantity": lambda: success_curves(random_worlds(1), 1),
     "profile": lambda: profile(RPSParams()),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("name", FIGURES)

@@ -213,16 +213,19 @@ SPECIAL |= {
     "zeta",
     "cumlogsumexp",
 }
-BITS_OF_REALS = {f"bitcast_convert_type {kinds}" for kinds in
-                 ("int32 of f", "float32 of i", "float32 of f")}  # fmt: skip
+BITS_OF_REALS = {
+    f"bitcast_convert_type {kinds}" for kinds in ("int32 of f", "float32 of i", "float32 of f")
+}
 UNSIGNED = {"searches", "interpolation"}
 ENDLESS = UNSIGNED | {"a loop with a condition"}
 REFUSED = {
     **dict.fromkeys(("c float", "c double"), BITS_OF_REALS | {"erf_inv"} | ENDLESS),
     "js": BITS_OF_REALS | UNSIGNED | {"erf_inv", "erf", "erfc", "erf of a real"},
-    "onnx": BITS_OF_REALS | {"erf_inv", "erfc", "log1p", "expm1", "cbrt"} | ENDLESS
+    "onnx": BITS_OF_REALS
+    | {"erf_inv", "erfc", "log1p", "expm1", "cbrt"}
+    | ENDLESS
     | {f"{name} of a real" for name in ("log1p", "expm1", "cbrt")},
-}  # fmt: skip
+}
 PRECISION = {f"lax.convert_element_type float32 of {kind}" for kind in "if"}
 PRECISION |= {"lax.reduce_precision 8 23 of f"}
 # Cases in which a back end differs from JAX.

@@ -30,8 +30,10 @@ NAMES = "law", "robot", "task", "skin"
 CHOICES = [[*registry.PACKAGE_LAWS], [*ROBOTS], [*TASKS], [*SKINS]]
 COUNT = max(map(len, CHOICES))
 # Each name at least once, and each robot with several laws, tasks and skins.
-FEW = [tuple(x[i * step % len(x)] for x, step in zip(CHOICES, (1, 1, 1, 3), strict=True))
-       for i in range(COUNT)]  # fmt: skip
+FEW = [
+    tuple(x[i * step % len(x)] for x, step in zip(CHOICES, (1, 1, 1, 3), strict=True))
+    for i in range(COUNT)
+]
 PAIRS = [
     tuple(case)
     for i, j in itertools.combinations(range(len(CHOICES)), 2)

@@ -35,13 +35,13 @@ def indices(i):
 # integers and bools, and F, I and B are scalars.
 OPERATIONS = {
     "ff f": [
-        *(jnp.add, jnp.subtract, jnp.maximum, jnp.minimum, jnp.remainder, jnp.floor_divide),
-        *(lambda x, y: x * y, lambda x, y: jnp.where(y == 0, x, x / 2), lambda x, y: x[::-1] + y),
+        jnp.add, jnp.subtract, jnp.maximum, jnp.minimum, jnp.remainder, jnp.floor_divide,
+        lambda x, y: x * y, lambda x, y: jnp.where(y == 0, x, x / 2), lambda x, y: x[::-1] + y,
         lambda x, y: jnp.interp(x, jnp.arange(4.0), y),
     ],
     "f f": [
-        *(jnp.abs, jnp.sign, jnp.floor, jnp.ceil, jnp.round, jnp.negative, jnp.sort, jnp.cumsum),
-        *(lambda x: lax.top_k(x, COUNT)[0], lax.cummax, lambda x: jnp.sort(x, descending=True)),
+        jnp.abs, jnp.sign, jnp.floor, jnp.ceil, jnp.round, jnp.negative, jnp.sort, jnp.cumsum,
+        lambda x: lax.top_k(x, COUNT)[0], lax.cummax, lambda x: jnp.sort(x, descending=True),
         lambda x: lax.scan(lambda s, y: (jnp.where(y > s, y, s - 1), s + y), x[0], x)[1],
     ],
     "f F": [jnp.median, jnp.max, jnp.min, jnp.sum, lambda x: x[0], lambda x: lax.top_k(x, 2)[0][1]],
@@ -65,29 +65,29 @@ OPERATIONS = {
     "bff f": [jnp.where, lambda b, x, y: jnp.select([b, x > y], [y, x], 0.5)],
     "Bff f": [lambda b, x, y: lax.cond(b, lambda: x + y, lambda: jnp.sort(y))],
     "ii i": [
-        *(jnp.add, jnp.subtract, jnp.multiply, jnp.maximum, jnp.minimum),
+        jnp.add, jnp.subtract, jnp.multiply, jnp.maximum, jnp.minimum,
         # A program of XLA ends the process where it divides by a constant 0.
-        *(lambda i, j, f=f: f(i, j | 1)
-          for f in (jnp.floor_divide, jnp.remainder, lax.div, lax.rem)),
-        *(jnp.bitwise_and, jnp.bitwise_or, jnp.bitwise_xor),
-        *(lax.shift_left, lax.shift_right_logical, lax.shift_right_arithmetic),
+        lambda i, j: jnp.floor_divide(i, j | 1), lambda i, j: jnp.remainder(i, j | 1),
+        lambda i, j: lax.div(i, j | 1), lambda i, j: lax.rem(i, j | 1),
+        jnp.bitwise_and, jnp.bitwise_or, jnp.bitwise_xor,
+        lax.shift_left, lax.shift_right_logical, lax.shift_right_arithmetic,
     ],
     "i i": [
-        *(jnp.abs, jnp.negative, jnp.invert, jnp.sign, jnp.cumsum, jnp.sort, jnp.argsort),
+        jnp.abs, jnp.negative, jnp.invert, jnp.sign, jnp.cumsum, jnp.sort, jnp.argsort,
         lambda i: i.astype(jnp.uint32).astype(jnp.int32) >> 3,
         lambda i: (i.astype(jnp.uint32) // 7).astype(jnp.int32),
         lambda i: jnp.sort(i.astype(jnp.uint32)).astype(jnp.int32),
     ],
     "i f": [lambda i: (i & 63).astype(jnp.float32)],
     "i I": [
-        *(jnp.max, jnp.min, jnp.sum, jnp.argmax),
-        *(lambda i: i[1], lambda i: lax.reduce_xor(i, (0,))),
+        jnp.max, jnp.min, jnp.sum, jnp.argmax,
+        lambda i: i[1], lambda i: lax.reduce_xor(i, (0,)),
     ],
     "ii b": [jnp.less, jnp.less_equal, jnp.greater, jnp.greater_equal, jnp.equal, jnp.not_equal],
     "bii i": [jnp.where, lambda b, i, j: lax.sort((b, i, j), num_keys=2)[1]],
     "bb b": [
-        *(lax.lt, lax.le, lax.gt, lax.ge, jnp.equal, jnp.not_equal, jnp.maximum, jnp.minimum),
-        *(jnp.logical_and, jnp.logical_or, jnp.logical_xor),
+        lax.lt, lax.le, lax.gt, lax.ge, jnp.equal, jnp.not_equal, jnp.maximum, jnp.minimum,
+        jnp.logical_and, jnp.logical_or, jnp.logical_xor,
     ],
     # XLA itself orders bools wrongly in a clamp of vectors.
     "b b": [jnp.logical_not, jnp.sort, lambda b: b[::-1]],

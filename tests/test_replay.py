@@ -51,8 +51,11 @@ CASES = {
     "a law in C, in hostile worlds": ("rps_plus", "hostile,objects=random_prism"),
     "a robot with limits in a corridor": ("nps", "real,objects=random_box", "corridor"),
     "a law that XLA compiles, along a path": (
-        *("learned", "wide,objects=random_cylinder"),
-        *("path", "fused", 1.0),
+        "learned",
+        "wide,objects=random_cylinder",
+        "path",
+        "fused",
+        1.0,
     ),
     "a law that senses force": ("force_push", "wide,objects=random_cylinder"),
     "a planar engine": ("rps", "hostile,objects=random_prism", "reach", "quasistatic"),

@@ -457,7 +457,7 @@ def push(case: Case, law, horizon: float):
     setting = Setting(engine="mujoco", rules=Rules(horizon=horizon))
     _, worlds, models, params = pushes.build([case], setting)
     loop = ControlLoop(setting.physics, setting.rules, law)
-    *_, (trials, _) = host.run(models, worlds, params, loop, threads=1)
+    *_, trials = host.run(models, worlds, params, loop, threads=1)
     return jax.tree.map(lambda x: np.asarray(x)[0], trials)
 
 

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from rps_jax.geometry import solid
 from rps_jax.robot.shell import Shell
 from rps_jax.robot.skin import NONE
 from rps_jax.trials.stepper import Moment
@@ -98,12 +99,11 @@ class Drawing:
         half_thickness, half_height = rendering.WALL_HALF
         for i, (start, end) in enumerate(lines.get("walls", ())):
             x, y = (end - start) / 2
-            yaw = math.atan2(y, x)
             self._world.add_box(
                 f"{_ROOT}/wall_{i}",
                 _rgb(rendering.WALL_RGBA),
                 (2 * math.hypot(x, y), 2 * half_thickness, 2 * half_height),
-                wxyz=(math.cos(yaw / 2), 0.0, 0.0, math.sin(yaw / 2)),
+                wxyz=solid.quaternion(math.atan2(y, x)),
                 position=(*((start + end) / 2), half_height),
             )
 
@@ -118,7 +118,7 @@ class Drawing:
         moment = past[index]
         x, y, yaw = map(float, moment.snapshot.qpos[:3])
         self._base.position = (x, y, 0.0)
-        self._base.wxyz = (math.cos(yaw / 2), 0.0, 0.0, math.sin(yaw / 2))
+        self._base.wxyz = solid.quaternion(yaw)
         self._object.position = moment.snapshot.qpos[3:6]
         self._object.wxyz = moment.snapshot.qpos[6:10]
         colour = _SKIN + moment.compression[:, None] * (_PRESSED - _SKIN)
@@ -157,13 +157,13 @@ def _add_taxels(world: Any, name: str, shell: Shell) -> Any:
     inward = np.stack([along[:, 1], -along[:, 0]], axis=-1) / lengths[:, None]  # runs clockwise
     middles = quarters.mean(axis=1) + (depth / 2 - 0.004) * inward
     centers = np.column_stack([middles, np.full(len(middles), z)])
-    half, zero = np.arctan2(along[:, 1], along[:, 0]) / 2, 0 * lengths
+    zero = 0 * lengths
     box = _solid_of(mujoco.mjtGeom.mjGEOM_BOX, np.full(3, 0.5))
     return world.add_batched_meshes_simple(
         name,
         np.asarray(box.vertices),
         np.asarray(box.faces),
-        batched_wxyzs=np.stack([np.cos(half), zero, zero, np.sin(half)], axis=-1),
+        batched_wxyzs=solid.quaternion(np.arctan2(along[:, 1], along[:, 0])),
         batched_positions=centers,
         batched_scales=np.stack([0.92 * lengths, depth + zero, height + zero], axis=-1),
         batched_colors=np.tile(_SKIN, (len(centers), 1)).astype(np.uint8),
@@ -187,8 +187,8 @@ def _add_geoms(world: Any, model: mujoco.MjModel) -> None:
 def _mesh_of(model: mujoco.MjModel, geom: Any) -> tuple[np.ndarray, np.ndarray]:
     """Return vertices (V, 3) [m] and faces (F, 3) of a geom in its frame."""
     if geom.type[0] != mujoco.mjtGeom.mjGEOM_MESH:
-        solid = _solid_of(geom.type[0], geom.size)
-        return np.asarray(solid.vertices), np.asarray(solid.faces)
+        round_ = _solid_of(geom.type[0], geom.size)
+        return np.asarray(round_.vertices), np.asarray(round_.faces)
     mesh = model.mesh(int(geom.dataid[0]))
     vertices = slice(mesh.vertadr[0], mesh.vertadr[0] + mesh.vertnum[0])
     faces = slice(mesh.faceadr[0], mesh.faceadr[0] + mesh.facenum[0])

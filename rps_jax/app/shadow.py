@@ -22,6 +22,7 @@ from rps_jax.errors import InputError
 from rps_jax.geometry import planar
 from rps_jax.geometry.polyline import Polyline
 from rps_jax.record import bag as bags
+from rps_jax.record.files import Arrays
 from rps_jax.record.options import option
 from rps_jax.robot import robot as robots
 from rps_jax.robot.robot import RobotLike
@@ -57,7 +58,7 @@ class Shadow(BagQuestion[xr.Dataset]):
         return registry.check_params(registry.resolve_law(self.law)[1])
 
     @cached_property
-    def steps(self) -> dict[str, np.ndarray]:
+    def steps(self) -> Arrays:
         """Steps of the bag."""
         shapes = validation.observation_shapes(registry.law_of(self.params).senses)
         return bags.read(Path(self.file), self.topics, named_leaves(shapes))
@@ -120,7 +121,7 @@ class Shadow(BagQuestion[xr.Dataset]):
 shadow = call_of(Shadow)
 
 
-def pursued(recorded: dict[str, np.ndarray], lookahead: float) -> np.ndarray:
+def pursued(recorded: Arrays, lookahead: float) -> np.ndarray:
     """Return the targets (N, 2) [m] on the path of a bag, as of the task `path`.
 
     Raises:
@@ -140,7 +141,7 @@ def pursued(recorded: dict[str, np.ndarray], lookahead: float) -> np.ndarray:
     return np.asarray(aims.p_world_target)
 
 
-def shadowed(law: Law, params: LawParams, recorded: dict[str, np.ndarray]) -> np.ndarray:
+def shadowed(law: Law, params: LawParams, recorded: Arrays) -> np.ndarray:
     """Return the twists (N, 3) [m/s, m/s, rad/s] of a law for the observations of a bag.
 
     A law that observes its last twist gets the recorded one, which moved the base. Rounding errors

@@ -10,7 +10,7 @@ from typing import NamedTuple, TypeVar
 import jax.numpy as jnp
 
 from rps_jax.geometry import planar
-from rps_jax.geometry.arrays import Array, Bool, Float, Number, Scalar
+from rps_jax.geometry.arrays import Array, Bool, Bools, Float, Floats, Number, PerWorld, Scalar
 
 # Displacements are clipped to this distance [m], so that no finite float32 overflows.
 _WORLD_SIZE = 1e9
@@ -28,7 +28,7 @@ class Observation(NamedTuple):
     base_radius: Number | None = None  # [m] of a round base; None: a rectangle
 
     @property
-    def l(self) -> Float[Array, "*B"]:  # noqa: E743
+    def l(self) -> Floats:  # noqa: E743
         """Contact offset [m] to the left: p^R_C,y, or the arc length from a round base's front."""
         if self.base_radius is None:
             return self.p_robot_contact[..., 1]
@@ -75,9 +75,9 @@ def with_base_radius(obs: Observed, radius: Number | None) -> Observed:
 class Twist(NamedTuple):
     """Commanded velocity of the base, in the robot frame."""
 
-    v_x: float | Float[Array, "*B"]  # [m/s] forward
-    v_y: float | Float[Array, "*B"]  # [m/s] left
-    omega: float | Float[Array, "*B"]  # [rad/s] counter-clockwise
+    v_x: PerWorld  # [m/s] forward
+    v_y: PerWorld  # [m/s] left
+    omega: PerWorld  # [rad/s] counter-clockwise
 
     @classmethod
     def from_point_velocity(
@@ -104,11 +104,11 @@ class Twist(NamedTuple):
 class Details(NamedTuple):
     """Intermediate quantities of one control step, for plots and tests."""
 
-    l: Float[Array, "*B"]  # noqa: E741  [m] contact offset, the paper's symbol
-    distance: Float[Array, "*B"]  # [m] ||d||, contact point to target
-    a_r: Float[Array, "*B"]  # [1] adaptive rate
-    gamma: Float[Array, "*B"]  # [rad] steering angle
-    realigning: Bool[Array, "*B"] | Float[Array, "*B"]  # in the Realignment State; or a weight
+    l: Floats  # noqa: E741  [m] contact offset, the paper's symbol
+    distance: Floats  # [m] ||d||, contact point to target
+    a_r: Floats  # [1] adaptive rate
+    gamma: Floats  # [rad] steering angle
+    realigning: Bools | Floats  # in the Realignment State; or a weight
 
     @classmethod
     def from_obs(cls, obs: Observation) -> Details:

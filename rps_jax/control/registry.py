@@ -24,6 +24,7 @@ from rps_jax.control.base import Law, LawParams, Params, Senses, Smoothing, name
 from rps_jax.control.learned import policy
 from rps_jax.errors import InputError
 from rps_jax.record import files
+from rps_jax.record.files import JsonObject
 from rps_jax.record.options import parse_changes
 
 T = TypeVar("T")  # a pytree
@@ -61,7 +62,7 @@ PACKAGE_LAWS = tuple(LAWS)
 # --- parameters ----------------------------------------------------------------------------
 
 
-def leaves_to_json(tree: object) -> dict[str, Any]:
+def leaves_to_json(tree: object) -> JsonObject:
     """Return the leaves of a pytree by path, as floats and lists of floats."""
     return {name: np.asarray(leaf, float).tolist() for name, leaf in named_leaves(tree).items()}
 
@@ -295,7 +296,7 @@ def resolve_laws(laws: LawsLike) -> dict[str, LawParams]:
 # --- laws in manifests ---------------------------------------------------------------------
 
 
-def params_to_json(params: LawParams) -> dict[str, Any]:
+def params_to_json(params: LawParams) -> JsonObject:
     """Return parameters as JSON, with their class, and the file of a custom law.
 
     `params_from_json` is the inverse.

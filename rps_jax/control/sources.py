@@ -18,6 +18,7 @@ from typing import Any
 
 from rps_jax.errors import InputError
 from rps_jax.record import files, folder
+from rps_jax.record.files import JsonObject
 
 _IMPORTS: dict[str, dict[str, str]] = {}  # of loaded files, by the name of their module
 
@@ -64,7 +65,7 @@ def load(path: Path, *, again: bool = False) -> str:
     return name
 
 
-def describe(path: Path) -> dict[str, Any]:
+def describe(path: Path) -> JsonObject:
     """Return the record of a law's file for manifests: path, digest and digests of imports."""
     digest = _digest(path)
     record = {"file": str(path.resolve()), "digest": digest}

@@ -143,17 +143,17 @@ class Engine(abc.ABC):
         if not self.traced:
             raise self._refused("JAX must trace it; choose fused, mjx or quasistatic")
 
-    def check_derivatives(self, mode: Mode, physics: Physics) -> None:
+    def check_derivatives(self, mode: Mode) -> None:
         """Raise InputError unless a trial can be differentiated in this mode."""
         if mode not in self.modes:
             known = [name for name in engines.ENGINES if mode in engines.get(name).modes]
             raise self._refused(f"it has no {mode}-mode derivatives; choose {' or '.join(known)}")
 
-    def guard_derivatives(self, tree: T, physics: Physics) -> T:
+    def guard_derivatives(self, tree: T) -> T:
         """Return a pytree unchanged; where it is differentiated in a missing mode, refuse that."""
         try:
             for mode in get_args(Mode):
-                self.check_derivatives(mode, physics)
+                self.check_derivatives(mode)
         except errors.InputError as error:
             refusal = str(error)
         else:

@@ -11,10 +11,11 @@ import sys
 from collections.abc import Iterator
 from importlib import metadata
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 from rps_jax.errors import InputError
 from rps_jax.record import provenance
+from rps_jax.record.files import JsonObject
 
 Device = Literal["auto", "cpu", "gpu", "xla"]
 
@@ -158,7 +159,7 @@ def count_processors() -> int:
     return os.cpu_count() or 1
 
 
-def collect_environment() -> dict[str, Any]:
+def collect_environment() -> JsonObject:
     """Return the record of this process: command, versions, commit, device and compiler."""
     import jax
 

@@ -31,6 +31,7 @@ from rps_jax.engines.mjx_colliders import (
 )
 from rps_jax.engines.mujoco import compile_rows
 from rps_jax.geometry import planar
+from rps_jax.record.files import Arrays
 from rps_jax.robot import drive as drives
 from rps_jax.robot.robot import Robot
 from rps_jax.world import scene
@@ -148,7 +149,7 @@ class MJX(Engine):
     name = "mjx"
     modes = ("forward", "reverse")
 
-    def stage(self, inputs: WorldInputs) -> tuple[MJXStage, dict[str, np.ndarray]]:
+    def stage(self, inputs: WorldInputs) -> tuple[MJXStage, Arrays]:
         """Return the stage of the first of the worlds, and fields (n, ...) of all."""
         walls = inputs.surroundings.walls
         if walls is not None:  # the model has two, and they move
@@ -176,7 +177,7 @@ def put(model: mujoco.MjModel) -> mjx.Model:
     return mjx.put_model(model).tree_replace(unused)  # pyright: ignore[reportReturnType]
 
 
-def fields_of(model: mujoco.MjModel) -> dict[str, np.ndarray]:
+def fields_of(model: mujoco.MjModel) -> Arrays:
     """Return `FIELDS` of a model, which include all constants that MuJoCo derives from a mass.
 
     They are always the same fields, so that the numbers of a world do not depend on the batch.

@@ -12,6 +12,7 @@ import numpy as np
 
 from rps_jax.engines import device
 from rps_jax.engines.base import Engine
+from rps_jax.record.files import Arrays
 from rps_jax.robot import drive as drives
 from rps_jax.robot.robot import Robot
 from rps_jax.world import scene
@@ -188,7 +189,7 @@ class MuJoCo(Engine):
         """Return True: it steps worlds on the host."""
         return True
 
-    def stage(self, inputs: WorldInputs) -> tuple[list[mujoco.MjModel], dict[str, np.ndarray]]:
+    def stage(self, inputs: WorldInputs) -> tuple[list[mujoco.MjModel], Arrays]:
         """Return the models of the worlds; equal worlds share one."""
         boundary = inputs.surroundings.boundary
         return compile_rows(inputs), {} if boundary is None else {"boundary": boundary}

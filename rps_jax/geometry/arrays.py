@@ -18,7 +18,14 @@ else:
     Array = Any  # NumPy's, too, which JAX takes for its own
 
 Scalar = float | Float[Array, ""]
+# A number of each world of a batch; () of one world.
+Floats = Float[Array, "*B"]
+PerWorld = float | Floats  # or one for all worlds
+Ints = Int[Array, "*B"]
+Bools = Bool[Array, "*B"]
 Number = float | Array | np.ndarray  # of one world, or of a batch, of any shape
+Pair = tuple[Array, Array]
+Parameter = float | Array  # of a law or a sensor; an array in a batch
 Entries = Any  # an array, or a tuple of numbers: one for each index of its last axis
 
 

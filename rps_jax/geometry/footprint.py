@@ -13,14 +13,14 @@ from numpy.typing import ArrayLike
 
 from rps_jax import errors
 from rps_jax.geometry import planar
-from rps_jax.geometry.arrays import Array, Float, Number, Scalar
+from rps_jax.geometry.arrays import Array, Float, Floats, Number, Scalar
 
 
 class Footprint(NamedTuple):
     """Set of points within `radius` of the convex hull of `vertices`, in the object's frame."""
 
     vertices: Float[Array, "*B N 2"]  # [m] counter-clockwise; N is static
-    radius: Float[Array, "*B"]  # [m]
+    radius: Floats  # [m]
 
 
 @jax.jit

@@ -9,7 +9,7 @@ import functools
 import jax
 import jax.numpy as jnp
 
-from rps_jax.geometry.arrays import Array, Float, Scalar
+from rps_jax.geometry.arrays import Array, Float, Floats, Scalar
 
 
 def rotate(
@@ -19,6 +19,11 @@ def rotate(
     c, s = jnp.cos(yaw), jnp.sin(yaw)
     x, y = vector[..., 0], vector[..., 1]
     return jnp.stack([c * x - s * y, s * x + c * y], axis=-1)
+
+
+def unit(angle: Floats) -> Float[Array, "*B 2"]:
+    """Return the unit vectors (..., 2) in the directions `angle` (...) [rad]."""
+    return jnp.stack([jnp.cos(angle), jnp.sin(angle)], axis=-1)
 
 
 def _components(vector: jax.Array) -> list[jax.Array]:
@@ -35,7 +40,7 @@ def _scale(vector: jax.Array) -> jax.Array:
     return jax.lax.stop_gradient(jnp.minimum(largest, 1e37))
 
 
-def norm(vector: Float[Array, "*B n"]) -> Float[Array, "*B"]:
+def norm(vector: Float[Array, "*B n"]) -> Floats:
     """Return the Euclidean norm over the last axis: (..., n) -> (...).
 
     The vector is scaled by the largest component, so squares neither overflow nor vanish in
@@ -48,7 +53,7 @@ def norm(vector: Float[Array, "*B n"]) -> Float[Array, "*B"]:
     return jnp.where(is_zero, 0.0, scale * jnp.sqrt(functools.reduce(jnp.add, squares)))
 
 
-def direction(vector: Float[Array, "*B 2"]) -> Float[Array, "*B"]:
+def direction(vector: Float[Array, "*B 2"]) -> Floats:
     """Return the angle [rad] of planar vectors (..., 2) in [-pi, pi]; 0 with zero slope at zero."""
     scale = _scale(vector)
     is_zero = scale == 0
@@ -58,14 +63,14 @@ def direction(vector: Float[Array, "*B 2"]) -> Float[Array, "*B"]:
     return jnp.arctan2(jnp.where(is_zero, 0.0, unit[..., 1]), x)
 
 
-def wrap(angle: Float[Array, "*B"]) -> Float[Array, "*B"]:
+def wrap(angle: Floats) -> Floats:
     """Wrap an angle into [-pi, pi) [rad], the paper's unit circle S."""
     wrapped = jnp.mod(angle + jnp.pi, 2 * jnp.pi) - jnp.pi
     # Rounding can return the excluded end.
     return jnp.where(wrapped >= jnp.pi, wrapped - 2 * jnp.pi, wrapped)
 
 
-def safe_sqrt(x: Float[Array, "*B"]) -> Float[Array, "*B"]:
+def safe_sqrt(x: Floats) -> Floats:
     """Return the square root of max(x, 0), with zero derivative where x <= 0."""
     positive = x > 0
     return jnp.where(positive, jnp.sqrt(jnp.where(positive, x, 1.0)), 0.0)
@@ -80,13 +85,13 @@ def greatest(x: Float[Array, " n"]) -> Float[Array, ""]:
     return x[jnp.argmax(x)]
 
 
-def yaw_of_quaternion(quaternion: Float[Array, "*B 4"]) -> Float[Array, "*B"]:
+def yaw_of_quaternion(quaternion: Float[Array, "*B 4"]) -> Floats:
     """Return the heading (...) [rad] of unit quaternions (..., 4), scalar first."""
     w, x, y, z = jnp.moveaxis(quaternion, -1, 0)
     return direction(jnp.stack([1 - 2 * (y * y + z * z), 2 * (w * z + x * y)], axis=-1))
 
 
-def tilt(quaternion: Float[Array, "*B 4"]) -> Float[Array, "*B"]:
+def tilt(quaternion: Float[Array, "*B 4"]) -> Floats:
     """Return the tilt (...) [rad] of the vertical under unit quaternions (..., 4)."""
     _, x, y, _ = jnp.moveaxis(quaternion, -1, 0)
     return 2 * jnp.arcsin(jnp.minimum(norm(jnp.stack([x, y], axis=-1)), 1.0))

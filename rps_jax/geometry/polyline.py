@@ -11,10 +11,8 @@ import numpy as np
 
 from rps_jax.geometry import footprint as fp
 from rps_jax.geometry import planar
-from rps_jax.geometry.arrays import Array, Float, Int, Scalar, namespace_of
+from rps_jax.geometry.arrays import Array, Float, Int, Pair, Scalar, namespace_of
 from rps_jax.geometry.footprint import Footprint
-
-_Pair = tuple[Array, Array]  # both coordinates of vectors
 
 
 class Polyline(NamedTuple):
@@ -151,17 +149,17 @@ class _Vectors(NamedTuple):
         return cls(x, y, jnp.where(square > 0, 1 / jnp.where(square > 0, square, 1.0), 0.0))
 
     @property
-    def normal(self) -> _Pair:
+    def normal(self) -> Pair:
         """Unit vectors to the left [1]."""
         scale = planar.safe_sqrt(self.inverse)
         return -self.y * scale, self.x * scale
 
 
-def _dot(a: _Pair, b: _Pair) -> Array:
+def _dot(a: Pair, b: Pair) -> Array:
     return a[0] * b[0] + a[1] * b[1]
 
 
-def _share(way: _Pair, along: _Vectors) -> Array:
+def _share(way: Pair, along: _Vectors) -> Array:
     """Return the point of segments nearest to a point, as a share of a segment's length.
 
     `way` [m] is from a segment's start to the point.
@@ -169,7 +167,7 @@ def _share(way: _Pair, along: _Vectors) -> Array:
     return jnp.clip(_dot(way, along[:2]) * along.inverse, 0.0, 1.0)
 
 
-def _square(way: _Pair, along: _Vectors) -> Array:
+def _square(way: Pair, along: _Vectors) -> Array:
     """Return the squared distance [m^2] of points from segments: see `_share`."""
     share = _share(way, along)
     away = way[0] - share * along.x, way[1] - share * along.y

@@ -52,7 +52,7 @@ def build(
     the centre of mass by `com_offset` (n,) [1], at most 1 - `load_size`, of the way to that point.
     The rest of the mass fills the solid uniformly.
     """
-    direction = np.stack([np.cos(com_bearing), np.sin(com_bearing)], axis=-1)
+    direction = unit(com_bearing)
     at = ((1 - load_size) * reach(vertices, radius, direction))[:, None] * direction
     share = com_offset / (1 - load_size)
     xx, yy, xy = _moments(vertices, radius)
@@ -72,7 +72,7 @@ def build(
         mass,
         np.concatenate([share[:, None] * at, zero[:, None]], axis=-1),
         inertia,
-        np.stack([np.cos(turn / 2), zero, zero, np.sin(turn / 2)], axis=-1),
+        quaternion(turn),
     )
 
 
@@ -84,8 +84,7 @@ def on_feet(solid: Solid, share: np.ndarray, count: np.ndarray, turn: np.ndarray
     """
     com, at = solid.p_object_com[:, :2], []
     for i in range(SIDES):
-        angle = 2 * np.pi * (turn + np.minimum(i, count - 1) / count)
-        toward = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+        toward = unit(2 * np.pi * (turn + np.minimum(i, count - 1) / count))
         along = np.sum(com * toward, axis=1)
         if solid.vertices.shape[1] == 1:
             far = np.sqrt(along**2 + solid.radius**2 - np.sum(com**2, axis=1)) - along
@@ -93,6 +92,17 @@ def on_feet(solid: Solid, share: np.ndarray, count: np.ndarray, turn: np.ndarray
             far = reach(solid.vertices - com[:, None], solid.radius, toward)
         at.append(np.column_stack([com + (share * far)[:, None] * toward, i < count]))
     return solid._replace(vertices=padded(solid.vertices), feet=np.stack(at, axis=1))
+
+
+def unit(angle: np.ndarray) -> np.ndarray:
+    """Return the unit vectors (..., 2) in the directions `angle` (...) [rad]."""
+    return np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+
+
+def quaternion(yaw: ArrayLike) -> np.ndarray:
+    """Return the quaternions (..., 4), scalar first, of turns by `yaw` (...) [rad]."""
+    half = np.asarray(yaw) / 2
+    return np.stack([np.cos(half), 0 * half, 0 * half, np.sin(half)], axis=-1)
 
 
 def padded(vertices: np.ndarray) -> np.ndarray:
@@ -214,7 +224,7 @@ def support(solid: Solid) -> tuple[np.ndarray, np.ndarray]:
         return at, np.any(at != np.roll(at, 1, axis=-2), axis=-1).astype(float)
     x, y, _ = solid.p_object_com.T
     lean = np.arctan2(y, x)[:, None] + np.array([0, 2, 4]) * np.pi / 3
-    rim = solid.radius[:, None, None] * np.stack([np.cos(lean), np.sin(lean)], axis=-1)
+    rim = solid.radius[:, None, None] * unit(lean)
     return rim, np.ones(lean.shape)
 
 
@@ -240,8 +250,7 @@ def check_feet(name: str, feet: ArrayLike, com: np.ndarray, at_most: int = 10_00
 
 def encloses(points: np.ndarray, at: np.ndarray) -> np.ndarray:
     """Return whether the hull of points (S, 2) encloses each of other points (..., 2)."""
-    bearing = np.linspace(0, 2 * np.pi, 360)
-    axes = np.stack([np.cos(bearing), np.sin(bearing)])
+    axes = unit(np.linspace(0, 2 * np.pi, 360)).T
     return ((points @ axes).max(axis=0) > at @ axes).all(axis=-1)
 
 

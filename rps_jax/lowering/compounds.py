@@ -150,9 +150,13 @@ def _cumulative(binary: Function) -> Function:
 
 
 def _windows(
-    shape: Sequence[int], sizes: Sequence[int], indices: jax.Array, mode: object,
-    axes: Sequence[int], batching: Iterable[tuple[int, int]],
-) -> Iterator[Any]:  # fmt: skip
+    shape: Sequence[int],
+    sizes: Sequence[int],
+    indices: jax.Array,
+    mode: object,
+    axes: Sequence[int],
+    batching: Iterable[tuple[int, int]],
+) -> Iterator[Any]:
     """Yield the position of each row of indices, the start of its window, and whether it counts.
 
     Args:
@@ -203,20 +207,19 @@ def _scatter(combine: Function | None) -> Function:
     """Return the function that combines windows of an array with updates; None replaces them."""
 
     def scatter(
-        x: jax.Array, indices: jax.Array, updates: jax.Array,
-        dimension_numbers: lax.ScatterDimensionNumbers, mode: Any, unique_indices: bool,
+        x: jax.Array,
+        indices: jax.Array,
+        updates: jax.Array,
+        dimension_numbers: lax.ScatterDimensionNumbers,
+        mode: object,
         **_: object,
-    ) -> jax.Array:  # fmt: skip
+    ) -> jax.Array:
         axes = dimension_numbers
         rest = [i for i in range(updates.ndim) if i not in axes.update_window_dims]
         single = (*axes.inserted_window_dims, *axes.operand_batching_dims)
         blocks = jnp.moveaxis(updates, rest, range(len(rest)))
         window = iter(blocks.shape[len(rest) :])
         sizes = [1 if i in single else next(window) for i in range(x.ndim)]
-        if combine and unique_indices:
-            inverse = lax.GatherDimensionNumbers(*map(tuple, axes))
-            results = combine(lax.gather(x, indices, inverse, sizes, mode=mode), updates)
-            return lax.scatter(x, indices, results, axes, unique_indices=True, mode=mode)
         batching = zip(axes.operand_batching_dims, axes.scatter_indices_batching_dims, strict=True)
         map_ = axes.scatter_dims_to_operand_dims
         for at, starts, inside in _windows(x.shape, sizes, indices, mode, map_, batching):
@@ -246,9 +249,12 @@ def _precedes_in_any_language(x: jax.Array, y: jax.Array) -> jax.Array:
 
 
 def _sort(
-    *operands: jax.Array, dimension: int, num_keys: int, is_before: Function = _is_before,
+    *operands: jax.Array,
+    dimension: int,
+    num_keys: int,
+    is_before: Function = _is_before,
     **_: object,
-) -> list[jax.Array]:  # fmt: skip
+) -> list[jax.Array]:
     """Sort operands by the first ones; equal keys stay in their order."""
     size = operands[0].shape[dimension]
     if size > _MAX_SORTED:
@@ -273,8 +279,8 @@ def _sort(
     return [jnp.moveaxis(x, -1, dimension) for x in columns[:-1]]
 
 
-def _top_k(x: jax.Array, k: int, axis: int) -> list[jax.Array]:
-    """Return the largest numbers and their indices."""
+def _top_k(x: jax.Array, k: int, axis: int, **_: object) -> list[jax.Array]:
+    """Return the largest numbers and their indices; equal ones keep their order."""
     index = lax.broadcasted_iota(np.int32, x.shape, axis)
     columns = _sort(x, index, dimension=axis, num_keys=1, is_before=lambda x, y: _precedes(y, x))
     return [lax.slice_in_dim(column, 0, k, axis=axis) for column in columns]

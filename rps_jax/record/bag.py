@@ -48,6 +48,7 @@ from rps_jax import errors
 from rps_jax.errors import InputError
 from rps_jax.record import bag_storage, files, options
 from rps_jax.record.bag_storage import is_bag as is_bag
+from rps_jax.record.files import Arrays
 
 Message = dict[str, Any]  # fields of any type
 Floats = Sequence[float] | np.ndarray
@@ -269,7 +270,7 @@ def topic_names(topics: TopicsLike) -> dict[str, str]:
 
 def read(
     path: str | Path, topics: TopicsLike = (), senses: Collection[str] = tuple(Step._fields)
-) -> dict[str, np.ndarray]:
+) -> Arrays:
     """Return the steps of a bag as arrays, by the fields of `Step` that it has, and `period`.
 
     A step is a command, with the latest message of each other topic that is not after it. Steps
@@ -305,7 +306,7 @@ def read(
         raise InputError(f"bag = {path} {str(error).rstrip('.')}.") from error
 
 
-def _steps(path: Path, renamed: dict[str, str], senses: Collection[str]) -> dict[str, np.ndarray]:
+def _steps(path: Path, renamed: dict[str, str], senses: Collection[str]) -> Arrays:
     """Return the steps of a bag, as `read` does."""
     names = {key: f"/{key}" for key in _READERS if key not in renamed} | renamed
     logs, contents, faults = _collect(path, {k: names[k] for k in names if k not in _TREE})

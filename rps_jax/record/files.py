@@ -43,6 +43,7 @@ POINTER = b"version https://"  # first bytes of a pointer of Git LFS
 FETCH = "it is a pointer of Git LFS: fetch the file itself by `git lfs pull`"
 FIELD_FILES = (".json", ".yaml", ".yml")  # suffixes of files with names and values
 _PACKED = (".gz", ".bz2", ".xz", ".zip")
+Arrays = dict[str, np.ndarray]  # by name
 JsonObject = dict[str, Any]  # parsed JSON has values of any type
 
 
@@ -303,7 +304,7 @@ def encode_arrays(**arrays: ArrayLike) -> bytes:
     return content.getvalue()
 
 
-def decode_arrays(content: bytes) -> dict[str, np.ndarray]:
+def decode_arrays(content: bytes) -> Arrays:
     """Return the arrays of a NumPy archive (.npz) without pickled objects.
 
     Raises:

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from rps_jax import errors
-from rps_jax.geometry.arrays import Number
+from rps_jax.geometry.arrays import Number, Pair
 
 _ODOMETRY, _FORCE = 7, 11  # folded into a world's key; the skin splits it into fewer
 
@@ -41,7 +41,7 @@ def observe_pose(
     key: jax.Array,
     steps: jax.Array,
     period: float,
-) -> tuple[jax.Array, jax.Array]:
+) -> Pair:
     """Return the latest poses (K, 3), the current `pose` (3,) first, and the observed pose (3,).
 
     Poses are [m, m, rad]. `steps` () control steps of `period` [s] are done.
@@ -55,9 +55,7 @@ def observe_pose(
     return poses, delayed + sigma * jax.random.normal(noise, (3,), pose.dtype)
 
 
-def delay_twist(
-    odometry: Odometry, twists: jax.Array, twist: jax.Array, period: float
-) -> tuple[jax.Array, jax.Array]:
+def delay_twist(odometry: Odometry, twists: jax.Array, twist: jax.Array, period: float) -> Pair:
     """Return the latest commanded twists (K, 3), `twist` (3,) first, and the executed one (3,)."""
     twists = jnp.concatenate([twist[None], twists[:-1]])
     delayed = twists[_steps_of(odometry.command_delay, period)]

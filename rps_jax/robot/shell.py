@@ -20,6 +20,7 @@ import numpy as np
 
 from rps_jax import errors
 from rps_jax.geometry import footprint as fp
+from rps_jax.geometry import planar
 from rps_jax.geometry.arrays import Number
 from rps_jax.geometry.footprint import Footprint
 from rps_jax.record.options import check_fields, option
@@ -145,8 +146,7 @@ class Shell:
         """Return points (..., 2) [m] in the robot frame at positions `s` (...) [m] of the strip."""
         if self.radius is not None:
             radius = jnp.asarray(self.radius, s.dtype)
-            angle = _ARC / 2 - s / radius
-            return radius * jnp.stack([jnp.cos(angle), jnp.sin(angle)], axis=-1)
+            return radius * planar.unit(_ARC / 2 - s / radius)
         x, y = (jnp.asarray(half, s.dtype) for half in self.half)
         along = jnp.clip(s, 0, 2 * x) - jnp.clip(s - 2 * (x + y), 0, 2 * x)  # left and right side
         return jnp.stack([along - x, y - jnp.clip(s - 2 * x, 0, 2 * y)], axis=-1)

@@ -26,8 +26,19 @@ import numpy as np
 from rps_jax import errors
 from rps_jax.geometry import footprint as fp
 from rps_jax.geometry import planar
-from rps_jax.geometry.arrays import Array, Bool, Float, Int, Scalar
+from rps_jax.geometry.arrays import (
+    Array,
+    Bool,
+    Bools,
+    Float,
+    Floats,
+    Ints,
+    Pair,
+    Parameter,
+    Scalar,
+)
 from rps_jax.geometry.footprint import Footprint
+from rps_jax.record.files import Arrays
 from rps_jax.record.options import parse_changes
 from rps_jax.robot.shell import HALF_WIDTH, Row, Shell
 
@@ -41,10 +52,10 @@ NONE, POINT, LINE = 0, 1, 2  # contact types, Fig. 6c
 class Reading(NamedTuple):
     """Contact that a skin measures; that of a smooth skin has a weight from 0 to 1."""
 
-    contact_type: Int[Array, "*B"]  # NONE, also up to a weight of 1/2, POINT or LINE
+    contact_type: Ints  # NONE, also up to a weight of 1/2, POINT or LINE
     # [m] contact location in the robot frame; 0 if NONE, but of a smooth skin at any weight
     p_robot_contact: Float[Array, "*B 2"]
-    in_contact: Bool[Array, "*B"] | Float[Array, "*B"]  # whether there is contact, or the weight
+    in_contact: Bools | Floats  # whether there is contact, or the weight
 
 
 class SkinState(NamedTuple):
@@ -64,10 +75,10 @@ class IdealSkin(NamedTuple):
     chatters.
     """
 
-    tolerance: float | jax.Array = 0.006  # [m]
-    point_length: float | jax.Array = 2 * HALF_WIDTH / 12  # [m] one taxel: longest POINT contact
+    tolerance: Parameter = 0.006  # [m]
+    point_length: Parameter = 2 * HALF_WIDTH / 12  # [m] one taxel: longest POINT contact
     shell: Shell = Shell()  # outline and boards; in a trial, the robot's
-    temperature: float | jax.Array | None = None  # [m]
+    temperature: Parameter | None = None  # [m]
 
     SMOOTH = 0.001  # [m] a good temperature
 
@@ -152,7 +163,7 @@ class IdealSkin(NamedTuple):
         kind = jnp.where(length > self.point_length, LINE, POINT)
         return _smooth_reading(planar.greatest(excess), kind, first, last)
 
-    def _nodes(self, footprint: Footprint, tolerance: Scalar) -> tuple[jax.Array, jax.Array]:
+    def _nodes(self, footprint: Footprint, tolerance: Scalar) -> Pair:
         """Return points (N,) [m] of the strip within `tolerance` of a footprint, and their lengths.
 
         A row of boards outside of the tolerance has points along its whole length.
@@ -175,15 +186,15 @@ class CapacitiveSkin(NamedTuple):
     eps / gap over its length, where the gap is the thickness of the compressed foam.
     """
 
-    foam: float | jax.Array = 0.010  # [m] uncompressed thickness
-    max_compression: float | jax.Array = 0.9  # [1] share of the thickness that can be compressed
-    time_constant: float | jax.Array = 0.05  # [s] of the low-pass filter
-    threshold: float | jax.Array = 0.25  # [1] relative change of capacitance at contact
-    noise: float | jax.Array = 0.0  # [1] standard deviation of each raw reading
-    gain_spread: float | jax.Array = 0.0  # [1] standard deviation of the taxels' gains about 1
-    dead_share: float | jax.Array = 0.0  # [1] probability that a taxel is dead
+    foam: Parameter = 0.010  # [m] uncompressed thickness
+    max_compression: Parameter = 0.9  # [1] share of the thickness that can be compressed
+    time_constant: Parameter = 0.05  # [s] of the low-pass filter
+    threshold: Parameter = 0.25  # [1] relative change of capacitance at contact
+    noise: Parameter = 0.0  # [1] standard deviation of each raw reading
+    gain_spread: Parameter = 0.0  # [1] standard deviation of the taxels' gains about 1
+    dead_share: Parameter = 0.0  # [1] probability that a taxel is dead
     shell: Shell = Shell()  # outline and boards; in a trial, the robot's
-    temperature: float | jax.Array | None = None  # [1]
+    temperature: Parameter | None = None  # [1]
 
     SMOOTH = 0.03  # [1] a good temperature
 
@@ -296,7 +307,7 @@ def check_taxels(signal: np.ndarray, shell: Shell, source: str) -> None:
         )
 
 
-def with_contacts(steps: dict[str, np.ndarray], shell: Shell, source: str) -> dict[str, np.ndarray]:
+def with_contacts(steps: Arrays, shell: Shell, source: str) -> Arrays:
     """Return the steps of a bag with contacts, computed from its taxels if it has none.
 
     The default skin on this shell filters one scan for each command, as the exported skin does,
@@ -310,9 +321,7 @@ def with_contacts(steps: dict[str, np.ndarray], shell: Shell, source: str) -> di
     check_taxels(steps["signal"], shell, source)
     skin = CapacitiveSkin(shell=shell)
 
-    def scan(
-        state: SkinState, row: tuple[jax.Array, jax.Array]
-    ) -> tuple[SkinState, tuple[jax.Array, ...]]:
+    def scan(state: SkinState, row: Pair) -> tuple[SkinState, tuple[jax.Array, ...]]:
         state, reading = skin.read(state, *row)
         return state, (state.signal, reading.contact_type, reading.p_robot_contact)
 
@@ -363,7 +372,7 @@ def _first(excess: jax.Array) -> jax.Array:
     return jax.nn.softmax(log_active + jnp.concatenate([jnp.zeros_like(excess[:1]), none_before]))
 
 
-def _extremes(active: jax.Array, values: jax.Array) -> tuple[jax.Array, jax.Array]:
+def _extremes(active: jax.Array, values: jax.Array) -> Pair:
     """Return the rows of `values` (n, m) at the first and the last True of `active` (n,)."""
     count = active.shape[0]
     # Minimum and maximum of indices: on a processor `argmax` is twenty times slower.

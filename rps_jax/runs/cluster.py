@@ -29,6 +29,7 @@ from rps_jax.engines.device import Device
 from rps_jax.errors import InputError
 from rps_jax.record import cache, provenance
 from rps_jax.record import folder as run_folder
+from rps_jax.record.files import JsonObject
 from rps_jax.runs import execution
 from rps_jax.runs.plan import Plan, Shard, chunks_by_key
 from rps_jax.runs.results import Results
@@ -40,8 +41,6 @@ PATIENCE = 10.0  # [s] to reach a cluster
 RETRIES = 16  # of a task
 _TASKS = 4  # per worker and program, so that little work is lost with a worker
 
-Environment = dict[str, Any]  # JSON record of versions, devices and host
-
 
 # --- a worker ------------------------------------------------------------------------------
 
@@ -49,11 +48,11 @@ Environment = dict[str, Any]  # JSON record of versions, devices and host
 def _work(
     plan: Plan,
     chunks: Sequence[int],
-    software: Environment,
+    software: JsonObject,
     prepare: Callable[[], object],
     slots: int | None,
     threads: int,
-) -> tuple[dict[int, bytes], Progress, Environment]:
+) -> tuple[dict[int, bytes], Progress, JsonObject]:
     """Run chunks of one program as a task of Ray; return contents, progress and environment."""
     prepare()
     environment = devices.collect_environment()
@@ -140,7 +139,7 @@ def run_on_cluster(
     callback(total)
     if not missing:
         return
-    threads, known = workers or 1, dict[tuple[str, int], Environment]()
+    threads, known = workers or 1, dict[tuple[str, int], JsonObject]()
     with connected(address) as ray:
         gpu = gpus and engines.get(plan.setting.engine).traced
         gpu = gpu and bool(ray.cluster_resources().get("GPU"))
@@ -206,7 +205,7 @@ def _prepare(device: Device, x64: bool) -> None:
     cache.use_cache()
 
 
-def _count_workers(hosts: Sequence[Environment], num_cpus: int, num_gpus: int) -> int:
+def _count_workers(hosts: Sequence[JsonObject], num_cpus: int, num_gpus: int) -> int:
     """Return how many workers with such claims fit on the hosts of a cluster."""
     claims = {"CPU": num_cpus} | ({"GPU": num_gpus} if num_gpus else {})
     resources = [host["Resources"] for host in hosts if host["Alive"]]
@@ -218,7 +217,7 @@ def _count_workers(hosts: Sequence[Environment], num_cpus: int, num_gpus: int) -
     return count
 
 
-def _join_environments(workers: Sequence[Environment]) -> Environment:
+def _join_environments(workers: Sequence[JsonObject]) -> JsonObject:
     """Return the environment record of all workers, and their names."""
     processors = {worker["host"]: worker["processors"] for worker in workers}
     names = ("host", "pid", "device")
@@ -229,6 +228,6 @@ def _join_environments(workers: Sequence[Environment]) -> Environment:
     }
 
 
-def _software(environment: Environment) -> Environment:
+def _software(environment: JsonObject) -> JsonObject:
     """Return the part of the environment on which the bits of results depend."""
     return {name: environment[name] for name in ("packages", "commit", "x64")}

@@ -27,6 +27,7 @@ from rps_jax.control.base import LawParams
 from rps_jax.errors import InputError
 from rps_jax.record import files, provenance
 from rps_jax.record import folder as run_folder
+from rps_jax.record.files import JsonObject
 from rps_jax.runs.question import name_or_custom, task_attribute
 from rps_jax.trials.batch import WorldBatch
 from rps_jax.trials.setting import Setting
@@ -112,7 +113,7 @@ class Plan:
         key = self.program_key((row * len(self.domain.objects) + object_index) * self.max_chunks)
         return sum(x.size for chunk, x in self.chunks.items() if self.program_key(chunk) == key)
 
-    def configuration(self) -> dict[str, Any]:
+    def configuration(self) -> JsonObject:
         """Return everything that the results depend on, as JSON."""
         record = {
             "domain": domain.to_json(self.domain),

@@ -47,6 +47,7 @@ from rps_jax.control.registry import LawLike, LawsLike
 from rps_jax.engines import device
 from rps_jax.record import cache, files, folder, options, provenance
 from rps_jax.record.bag import TopicsLike
+from rps_jax.record.files import JsonObject
 from rps_jax.record.options import option
 from rps_jax.robot.robot import RobotLike
 from rps_jax.runs.run import Run
@@ -247,7 +248,7 @@ class Question(Command[T]):
             "for results leave out --quick."
         )
 
-    def configuration(self) -> dict[str, Any]:
+    def configuration(self) -> JsonObject:
         """Return everything that the answer depends on, as JSON."""
         return {"question": self.name} | self.fields_as_json()
 
@@ -306,7 +307,7 @@ class Question(Command[T]):
         size = getattr(self, "slots", None), getattr(self, "workers", None)
         return Run(out, callback, *size)
 
-    def fields_as_json(self) -> dict[str, Any]:
+    def fields_as_json(self) -> JsonObject:
         """Return the fields as JSON, with laws by their parameters and a domain by its ranges."""
         names = [f.name for f in fields(self)]
         ignored = [*_EXECUTION_OPTIONS, *self.IGNORED_FIELDS]
@@ -428,7 +429,7 @@ class DomainQuestion(TaskOption, SimulationQuestion[T]):
         """Domain and task, for reports."""
         return name_or_custom(self.domain) + task_in_words(self.ranges)
 
-    def fields_as_json(self) -> dict[str, Any]:
+    def fields_as_json(self) -> JsonObject:
         """Return the fields as JSON; robot and task are part of the domain."""
         record = super().fields_as_json() | {"domain": domains.to_json(self.ranges)}
         return {name: x for name, x in record.items() if name not in ("robot", "task")}

@@ -18,6 +18,7 @@ from rps_jax.engines import device
 from rps_jax.errors import InputError
 from rps_jax.record import files, options
 from rps_jax.record.checkpoint import Checkpoints
+from rps_jax.record.files import Arrays
 from rps_jax.record.table import check_parquet
 from rps_jax.runs.plan import Plan, chunks_by_key, draw
 from rps_jax.trials.batch import Job, WorldBatch
@@ -53,7 +54,7 @@ class Results:
         self.shape = len(plan.laws), plan.worlds
         self._names = (*UNITS, *plan.domain.task.OUTCOMES)
         self._outcomes = {name: self._empty(name) for name in self._names}  # (law, world, ...)
-        self._drawn: dict[str, np.ndarray] = {}  # (world,) drawn quantities
+        self._drawn: Arrays = {}  # (world,) drawn quantities
         self._running = {chunk: plan.chunks[chunk].size for chunk in chunks}  # trials
 
     def _empty(self, name: str) -> np.ndarray:
@@ -103,7 +104,7 @@ class Results:
             if not self._running[chunk] and self._store is not None:
                 self._store(chunk, files.encode_arrays(**self._columns(chunk)))
 
-    def _columns(self, chunk: int) -> dict[str, np.ndarray]:
+    def _columns(self, chunk: int) -> Arrays:
         """Return the columns of a chunk to store."""
         trials = self.plan.chunks[chunk]
         law, worlds = at = np.unravel_index(trials, self.shape)

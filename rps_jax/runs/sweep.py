@@ -21,6 +21,7 @@ from rps_jax.engines.device import Device
 from rps_jax.errors import InputError
 from rps_jax.record import files, provenance
 from rps_jax.record import folder as run_folder
+from rps_jax.record.files import JsonObject
 from rps_jax.record.options import option
 from rps_jax.runs import cluster, model_panel
 from rps_jax.runs.execution import run_missing, run_plan, write_dataset
@@ -44,10 +45,10 @@ from rps_jax.world.points import Points
 class _StoredPlan(Question[xr.Dataset]):
     """Base class of questions whose run folder has a `plan` as its manifest."""
 
-    STORES_ITSELF: ClassVar[bool] = True  # chunk by chunk, see `execution`
+    STORES_ITSELF = True  # chunk by chunk, see `execution`
     plan: Plan | functools.cached_property[Plan]
 
-    def configuration(self) -> dict[str, Any]:
+    def configuration(self) -> JsonObject:
         return self.plan.configuration()
 
     def intro(self, results: xr.Dataset) -> str:
@@ -183,7 +184,7 @@ class Sweep(SweepOptions, SweepQuestion):
       ({'law': 2, 'world': 4}, ('world',))
     """
 
-    TITLE: ClassVar[str] = "Sweep over random worlds"
+    TITLE = "Sweep over random worlds"
     QUICK: ClassVar[Mapping[str, Any]] = {"worlds": 64}
 
     laws: LawsLike = ("rps", "nps", "aps")
@@ -261,7 +262,7 @@ sweep = call_of(Sweep)
 class Merge(_StoredPlan):
     """Merge the shards of a sweep into one run folder, with its results and its report."""
 
-    TITLE: ClassVar[str] = Sweep.TITLE
+    TITLE = Sweep.TITLE
 
     folders: tuple[Path, ...] = option((), positional=True)
     """Run folders of the shards; one, if they share it."""

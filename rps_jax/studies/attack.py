@@ -36,6 +36,7 @@ from rps_jax.analysis.figures.style import (
 from rps_jax.analysis.report import Picture, Section
 from rps_jax.engines import device
 from rps_jax.errors import InputError
+from rps_jax.record.files import Arrays
 from rps_jax.record.options import option
 from rps_jax.runs import execution
 from rps_jax.runs.plan import Plan
@@ -79,8 +80,8 @@ class Attack(DomainQuestion[xr.Dataset], LawQuestion[xr.Dataset]):
       ('object', 'size', 'com_offset', 'friction_robot')
     """
 
-    TITLE: ClassVar[str] = "Search for failures"
-    IGNORED_FIELDS: ClassVar[tuple[str, ...]] = ("minutes", "generations", "check_again", "worst")
+    TITLE = "Search for failures"
+    IGNORED_FIELDS = ("minutes", "generations", "check_again", "worst")
     QUICK: ClassVar[Mapping[str, Any]] = {"minutes": 2.0, "drawn": 128, "check_again": 4}
 
     axes: tuple[str, ...] = ("size", "com_offset", "friction_robot")
@@ -272,7 +273,7 @@ class _Search:
             history.append(sums)
         return self._labelled(archive, history).assign_attrs(attributes)
 
-    def _elites(self, archive: Any) -> dict[str, np.ndarray]:
+    def _elites(self, archive: Any) -> Arrays:
         """Return the elites (n,) in the order of their cells, with the index of their object."""
         elites = archive.data()
         order = np.argsort(elites["index"])

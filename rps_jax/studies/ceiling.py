@@ -19,7 +19,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import jax
 import numpy as np
@@ -31,6 +31,7 @@ from rps_jax.analysis.report import Section
 from rps_jax.control.laws.guided import KNOTS, GuidedParams
 from rps_jax.control.laws.rps import RPSParams
 from rps_jax.record import files
+from rps_jax.record.files import JsonObject
 from rps_jax.record.options import option
 from rps_jax.runs.plan import Plan, attributes_of, load_plan
 from rps_jax.runs.question import DomainQuestion, Run, call_of, count_true
@@ -59,7 +60,7 @@ class Ceiling(DomainQuestion[xr.Dataset]):
       [4, 4]
     """
 
-    TITLE: ClassVar[str] = "Ceiling"
+    TITLE = "Ceiling"
     QUICK: ClassVar[Mapping[str, object]] = {"sample": 2, "most": 2, "samples": 12, "rounds": 3}
 
     run: str | Path | None = option(None, positional=True)
@@ -127,7 +128,7 @@ class Ceiling(DomainQuestion[xr.Dataset]):
         """Maximum number of trials."""
         return self.world_indices.size * self.samples * self.rounds
 
-    def configuration(self) -> dict[str, Any]:
+    def configuration(self) -> JsonObject:
         search = {name: getattr(self, name) for name in _SEARCH_OPTIONS}
         worlds = self.world_indices.tolist()
         return {"ceiling": self.plan.configuration(), "worlds": worlds} | search

@@ -42,10 +42,8 @@ def failure_modes(trials: xr.Dataset, max_lost: float) -> np.ndarray:
     return np.where(modes == "timeout", timeouts, modes)
 
 
-def common_quantities(
-    trials: xr.Dataset, worlds: np.ndarray, count: int = 4
-) -> list[tuple[str, float, float]]:
-    """Return the drawn quantities in which some worlds differ most from all worlds.
+def common_quantities(trials: xr.Dataset, worlds: np.ndarray) -> list[tuple[str, float, float]]:
+    """Return the four drawn quantities, at most, in which some worlds differ most from all worlds.
 
     The effect size is the probability that one of them has more of the quantity than another
     world (the statistic of Mann and Whitney), less one half. Effects below 0.1 are left out.
@@ -63,7 +61,7 @@ def common_quantities(
         more = stats.mannwhitneyu(sample, np.nan_to_num(values, nan=np.inf)).statistic
         effect = abs(more / (sample.size * values.size) - 0.5)
         rows.append((effect, (name, float(np.median(sample)), float(np.nanmedian(values)))))
-    return [medians for effect, medians in sorted(rows, reverse=True)[:count] if effect >= 0.1]
+    return [medians for effect, medians in sorted(rows, reverse=True)[:4] if effect >= 0.1]
 
 
 @dataclass(frozen=True)

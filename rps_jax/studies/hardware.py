@@ -59,7 +59,7 @@ class Hardware(LawQuestion[xr.Dataset]):
       {'object': 2, 'shift': 1, 'side': 2, 'target': 8}
     """
 
-    TITLE: ClassVar[str] = "Hardware experiments"
+    TITLE = "Hardware experiments"
     QUICK: ClassVar[Mapping[str, object]] = {"shifts": (0.1, 0.2, 0.3)}
 
     law: LawLike = "rps"

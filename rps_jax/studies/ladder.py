@@ -24,6 +24,7 @@ from rps_jax.control import registry
 from rps_jax.control.base import LawParams, Senses
 from rps_jax.control.registry import LawLike, LawsLike
 from rps_jax.errors import InputError
+from rps_jax.record.files import JsonObject
 from rps_jax.record.options import option
 from rps_jax.robot.robot import RobotLike
 from rps_jax.runs.question import (
@@ -82,7 +83,7 @@ class Ladder(SweepOptions, TaskOption, MultiLawQuestion[xr.Dataset | xr.DataTree
       ({'law': 2, 'world': 4}, ['touch', 'touch'])
     """
 
-    TITLE: ClassVar[str] = "Laws in the same worlds"
+    TITLE = "Laws in the same worlds"
     QUICK: ClassVar[Mapping[str, Any]] = {"worlds": 64, "domain": ("wide,objects=random_box",)}
 
     laws: LawsLike = ()
@@ -141,7 +142,7 @@ class Ladder(SweepOptions, TaskOption, MultiLawQuestion[xr.Dataset | xr.DataTree
     def num_trials(self) -> int | None:
         return sum(sweep.num_trials() or 0 for sweep in self.sweeps.values())
 
-    def configuration(self) -> dict[str, Any]:
+    def configuration(self) -> JsonObject:
         if self.single:
             return self.single.configuration()
         return {"ladder": {name: sweep.configuration() for name, sweep in self.sweeps.items()}}
@@ -213,7 +214,7 @@ class Score(Ladder, _ScoredLaw):
       ['pursuit', 'rps', 'rps_plus']
     """
 
-    TITLE: ClassVar[str] = "Score of a law"
+    TITLE = "Score of a law"
 
     laws: LawsLike = ("rps", "rps_plus")
     """The laws beside it; changes follow each, as rps,K_h=0.3 or rps,tuned.json."""

@@ -7,7 +7,6 @@ effect of each reading, and `sweeps/paper_reading` infers the reading from all p
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
-from typing import ClassVar
 
 import numpy as np
 import xarray as xr
@@ -41,7 +40,7 @@ class Paper(SimulationQuestion[xr.DataTree]):
       ('object', 'friction', 'target')
     """
 
-    TITLE: ClassVar[str] = "Pushing in the Dark, reproduced"
+    TITLE = "Pushing in the Dark, reproduced"
 
     @cached_property
     def parts(self) -> tuple[Table, Push, Hardware]:

@@ -184,7 +184,7 @@ class Rare(DomainQuestion[xr.Dataset], LawQuestion[xr.Dataset]):
       [1.0]
     """
 
-    TITLE: ClassVar[str] = "Rare failures"
+    TITLE = "Rare failures"
     QUICK: ClassVar[Mapping[str, object]] = {
         "particles": 200,
         "groups": 4,

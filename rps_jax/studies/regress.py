@@ -11,7 +11,7 @@ import functools
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import ClassVar, Literal
+from typing import Literal
 
 import numpy as np
 import xarray as xr
@@ -53,7 +53,7 @@ class Regress(PlanQuestion, MultiLawQuestion[xr.Dataset]):
       {'known': 4, 'world': 3}
     """
 
-    TITLE: ClassVar[str] = "Hard worlds"
+    TITLE = "Hard worlds"
 
     laws: LawsLike = ("rps_tuned",)
     worlds: int | None = option(None, 1, 200)

@@ -71,7 +71,7 @@ class Sensitivity(PlanQuestion, DomainQuestion[xr.Dataset], LawQuestion[xr.Datas
       ('output', 'factor')
     """
 
-    TITLE: ClassVar[str] = "Sensitivity of success"
+    TITLE = "Sensitivity of success"
     QUICK: ClassVar[Mapping[str, object]] = {"worlds": 256}
 
     worlds: int = option(1024, 1, 100_000_000)
@@ -183,9 +183,9 @@ def analyze(options: Sensitivity, sweep: xr.Dataset) -> xr.Dataset:
     )
 
 
-def rank_factors(results: xr.Dataset, output: str = "success") -> list[str]:
-    """Return the factors by their total index for an output, the greatest first."""
-    total = results.total.sel(output=output)
+def rank_factors(results: xr.Dataset) -> list[str]:
+    """Return the factors by their total index for success, the greatest first."""
+    total = results.total.sel(output="success")
     return [str(name) for name in total.factor.values[np.argsort(-total.values, kind="stable")]]
 
 

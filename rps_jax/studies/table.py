@@ -39,7 +39,7 @@ class Table(TrialOptions, MultiLawQuestion[xr.Dataset]):
       {'law': 1, 'object': 1, 'friction': 2, 'target': 2}
     """
 
-    TITLE: ClassVar[str] = "Table II: successes"
+    TITLE = "Table II: successes"
     QUICK: ClassVar[Mapping[str, object]] = {"targets": paper.FEW_TARGETS}
 
     laws: LawsLike = paper.LAWS

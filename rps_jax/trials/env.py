@@ -33,6 +33,7 @@ from rps_jax.engines.base import ControlPeriod
 from rps_jax.engines.mjx_colliders import mjx
 from rps_jax.geometry import footprint as fp
 from rps_jax.geometry import planar
+from rps_jax.geometry.arrays import Pair
 from rps_jax.record.options import check_fields, option
 from rps_jax.robot.robot import RobotLike
 from rps_jax.trials import trial
@@ -177,7 +178,7 @@ class PushEnv:
             raise errors.not_allowed("state", repr(state), rule)
         engine, physics = engines.get(self.setting.engine), self.setting.physics
         inputs = state.info["world"], state.data, self.twist(action)
-        world, previous, twist = engine.guard_derivatives(inputs, physics)
+        world, previous, twist = engine.guard_derivatives(inputs)
         decided, twist = trial.execute(world, previous, twist, self.dt)
         period = ControlPeriod(twist, physics, trial.pushing(world))
         stage = SingleWorld(self._batch.stage)
@@ -222,10 +223,10 @@ class PushEnv:
 
     def _true_state_terms(
         self, world: World, previous: Trial, current: Trial, *touches: Observation
-    ) -> tuple[jax.Array, jax.Array]:
+    ) -> Pair:
         """Return the changes of the terms `object` [m] and `behind` [1] of the reward."""
 
-        def terms(state: Trial, touch: Observation) -> tuple[jax.Array, jax.Array]:
+        def terms(state: Trial, touch: Observation) -> Pair:
             p_object, _ = trial.object_pose(state.qpos)
             way = world.task.remaining(state.task, world.p_world_target, p_object)
             gap = way - fp.circumradius(world.footprint)

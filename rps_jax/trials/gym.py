@@ -26,6 +26,7 @@ import numpy as np
 from rps_jax import errors
 from rps_jax.control import soft
 from rps_jax.engines import device
+from rps_jax.record.files import Arrays
 from rps_jax.trials.batch import rows
 from rps_jax.trials.env import SHAPED_REWARD, PushEnv, State
 from rps_jax.world import domain as domains
@@ -210,7 +211,7 @@ class GymPushVector(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         self._state, rewards = self._act(self.state, array)
         return np.asarray(rewards, float)
 
-    def observe(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, dict[str, np.ndarray]]:
+    def observe(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, Arrays]:
         """Return observations (num_envs, T + 2), terminated and truncated flags, and infos."""
         data, metrics = self.state.data, self.state.metrics
         infos = {

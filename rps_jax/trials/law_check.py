@@ -6,7 +6,6 @@ compares it once, before it starts, with the observations of bases that drive in
 
 from __future__ import annotations
 
-import dataclasses
 import functools
 import itertools
 import warnings
@@ -16,12 +15,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from rps_jax.control.base import LawParams
 from rps_jax.engines import native, programs
 from rps_jax.geometry import planar
 from rps_jax.trials import trial
 from rps_jax.trials.setting import Setting
-from rps_jax.trials.trial import ControlLoop, Trial, World
+from rps_jax.trials.trial import ControlLoop, Trial
 from rps_jax.world.scene import JOINTS
 
 if TYPE_CHECKING:
@@ -37,39 +35,38 @@ def warn_of_difference(batch: WorldBatch, setting: Setting) -> None:
 
     It runs in the first worlds of a batch. The result is cached with the compiled law.
     """
-    law = batch.law
+    law, physics = batch.law, setting.physics
     is_native = getattr(batch.stage, "native", False) and native.is_available()
     if not is_native or programs.identity(law) is not None:
         return
     worlds, params = jax.tree.map(lambda x: jnp.asarray(x[:_WORLDS]), batch.inputs)
-    # Without the law's state, laws with equal observations share one program.
-    loop = ControlLoop(setting.physics, law=dataclasses.replace(law, init=lambda _: ()))
 
-    observe = functools.partial(_observe, worlds, params, loop)
+    def turn(trials: Trial, _: None) -> tuple[Trial, Any]:
+        """Run the law once, and move the bases on a curve, without physics."""
+        axes, loop = (0, 0, 0, None), ControlLoop(physics, law=law)
+        judged, _measured, obs = jax.vmap(trial.perceive, axes)(worlds, params, trials, loop)
+        arguments = params, judged.law_state, obs
+        states, twists, _details = jax.vmap(law.step)(*arguments)
+        moved = jax.vmap(functools.partial(_move, period=physics.control_period))(judged)
+        return moved._replace(law_state=states), (arguments, (states, twists))
 
-    def run(obs: Any) -> Any:
+    def run() -> Any:
         """Return arguments and results of the law in each control step (steps * worlds, ...)."""
-
-        def turn(states: Any, obs: Any) -> Any:
-            arguments = params, states, obs
-            states, twists, _ = jax.vmap(law.step)(*arguments)
-            return states, (arguments, (states, twists))
-
-        records = jax.lax.scan(turn, jax.vmap(law.init)(params), obs)[1]
+        start = jax.vmap(functools.partial(trial.start, law=law))(worlds, params)
+        records = jax.lax.scan(turn, start, length=_STEPS)[1]
         return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), records)
 
     def step(*arguments: Any) -> Any:
         return law.step(*arguments)[:2]
 
     def compare() -> str:
-        arguments, expected = jax.jit(run)(observe())
+        arguments, expected = jax.jit(run)()
         computed = jax.jit(native.batched(step, jax.vmap(step)))(*arguments)
         pairs = zip(*map(jax.tree.leaves, jax.device_get((computed, expected))), strict=True)
         share = np.mean(np.any([*itertools.starmap(_differs, pairs)], axis=0))
         return f"{share:.0%}" if share > _RARE else ""
 
-    types = jax.eval_shape(lambda: run(observe()))[0]
-    if share := native.compared(step, types, compare):
+    if share := native.compared(step, jax.eval_shape(run)[0], compare):
         warnings.warn(
             f"the law of {type(batch.params).__name__} gives other results as compiled code than "
             f"in JAX in {share} of control steps: set RPS_COMPILER=none, so that XLA compiles it, "
@@ -78,26 +75,13 @@ def warn_of_difference(batch: WorldBatch, setting: Setting) -> None:
         )
 
 
-@jax.jit
-def _observe(worlds: World, params: LawParams, loop: ControlLoop) -> Any:
-    """Return the observations (steps, B, ...) of bases that move on a curve, without physics."""
-    period = loop.physics.control_period
-
-    def move(state: Trial) -> Trial:
-        time = state.steps * period
-        forward = planar.rotate(state.qpos[2], jnp.stack([0.05, 0.02 * jnp.sin(3 * time)]))
-        velocity = jnp.stack([*forward, 0.1 * jnp.cos(2 * time)])
-        qpos = state.qpos.at[JOINTS.base].add(period * velocity)
-        return state._replace(qpos=qpos, steps=state.steps + 1)
-
-    def turn(trials: Trial, _: None) -> tuple[Trial, Any]:
-        judged, _measured, obs = jax.vmap(trial.perceive, (0, 0, 0, None))(
-            worlds, params, trials, loop
-        )
-        return jax.vmap(move)(judged), obs
-
-    start = jax.vmap(functools.partial(trial.start, law=loop.law))(worlds, params)
-    return jax.lax.scan(turn, start, length=_STEPS)[1]
+def _move(state: Trial, period: float) -> Trial:
+    """Return a trial after a control period in which its base moves on a curve."""
+    time = state.steps * period
+    forward = planar.rotate(state.qpos[2], jnp.stack([0.05, 0.02 * jnp.sin(3 * time)]))
+    velocity = jnp.stack([*forward, 0.1 * jnp.cos(2 * time)])
+    qpos = state.qpos.at[JOINTS.base].add(period * velocity)
+    return state._replace(qpos=qpos, steps=state.steps + 1)
 
 
 def _differs(computed: np.ndarray, expected: np.ndarray) -> np.ndarray:

@@ -9,6 +9,7 @@ from numpy.typing import ArrayLike
 
 from rps_jax.control.laws.rps import RPSParams
 from rps_jax.engines import device
+from rps_jax.geometry import solid
 from rps_jax.geometry.footprint import Footprint
 from rps_jax.trials import trial
 from rps_jax.trials.pushes import Trajectory
@@ -140,5 +141,5 @@ def _outline(shape: Footprint) -> np.ndarray:
     corners, radius = np.asarray(shape.vertices, float), float(shape.radius)
     if radius > 0:
         angle = np.linspace(0, 2 * np.pi, 49)
-        return corners[:1] + radius * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+        return corners[:1] + radius * solid.unit(angle)
     return np.concatenate([corners, corners[:1]])

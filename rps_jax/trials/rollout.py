@@ -28,6 +28,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from rps_jax.control.base import LawParams
+from rps_jax.record.files import Arrays
 from rps_jax.trials import batch
 from rps_jax.trials.batch import BatchOptions, Collect, Job, WorldBatch, rows
 from rps_jax.trials.progress import Timing
@@ -100,7 +101,7 @@ def outcomes(
     Returns:
       The outcomes of each request, on the host with leaves (*shape, ...); and where the time went.
     """
-    columns: dict[str, np.ndarray] = {}
+    columns: Arrays = {}
     *firsts, count = _first_trials(requests)
 
     def collect(indices: np.ndarray, ended: Outcome) -> None:

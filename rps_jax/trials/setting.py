@@ -12,6 +12,7 @@ from rps_jax.control.base import LawParams
 from rps_jax.control.validation import check_law
 from rps_jax.engines import EngineName
 from rps_jax.record import options
+from rps_jax.record.files import JsonObject
 from rps_jax.robot.robot import Robot
 from rps_jax.trials.trial import Rules
 from rps_jax.world import physics as physics_
@@ -73,8 +74,6 @@ class Setting:
     rules: Rules = Rules()
     seed: int = options.option(0, 0, 2**32 - 1)
     """Seed of random worlds, and of the imperfections of skins."""
-    gradient: Literal["exact"] = options.option("exact", hidden=True)
-    """How derivatives are computed: exact, from the engine's own equations."""
     split: Split | None = options.option(None, hidden=True)
     """Use of the random worlds: tune, validate or test; by default the worlds of a sweep."""
 
@@ -110,7 +109,7 @@ class Setting:
         engines.get(self.engine).check_surroundings(domain.surroundings)
         self.check_here(domain.weakest, laws)
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> JsonObject:
         """Return the setting as manifests have it; `from_json` reads it."""
         rules = registry.leaves_to_json(self.rules)
         return {"physics": asdict(self.physics), "rules": rules} | self.attributes

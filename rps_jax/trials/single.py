@@ -126,7 +126,7 @@ def rollout(
     _check_scalars(params)
     engine.check_stage(stage)
     world = soften_skins(world) if smooth else world
-    world, params = engine.guard_derivatives((world, params), setting.physics)
+    world, params = engine.guard_derivatives((world, params))
     start = trial.start(world, params, loop.law)
     inputs = jax.tree.map(lambda x: jnp.asarray(x)[None], (world, params, start))
     _, snapshots = trial.unroll(stage, *inputs, loop=loop, steps=steps, mapped=native.mapped)

@@ -38,7 +38,7 @@ from rps_jax.engines import native
 from rps_jax.engines.base import ControlPeriod, Driven, Motion, Stage
 from rps_jax.geometry import footprint as fp
 from rps_jax.geometry import planar
-from rps_jax.geometry.arrays import Array, Bool, Float, Int, Scalar
+from rps_jax.geometry.arrays import Array, Bool, Bools, Float, Floats, Ints, Scalar
 from rps_jax.geometry.footprint import Footprint
 from rps_jax.robot import base, drive
 from rps_jax.robot.base import Load, Odometry
@@ -117,18 +117,18 @@ class Trial(NamedTuple):
     skin: SkinState
     poses: Float[Array, "*B K 3"]  # [m, m, rad] of the base in the last steps, the latest first
     twists: Float[Array, "*B K 3"]  # [m/s, m/s, rad/s] commanded, the latest first
-    steps: Int[Array, "*B"]  # control steps done
-    contact_steps: Int[Array, "*B"]  # of them in contact
-    lost_steps: Int[Array, "*B"]  # without contact after the first touch
-    sum_abs_l: Float[Array, "*B"]  # [m] over the steps in contact
-    min_distance: Float[Array, "*B"]  # [m] contact point to target; inf before the first touch
-    path_length: Float[Array, "*B"]  # [m] of the base's way
-    done: Bool[Array, "*B"]
-    success: Bool[Array, "*B"]
-    tilt: Float[Array, "*B"]  # [rad] greatest tilt of the object so far
-    tipped: Bool[Array, "*B"]  # the object has fallen over
-    diverged: Bool[Array, "*B"]
-    nan_twist: Bool[Array, "*B"]  # the law returned a twist that is not finite
+    steps: Ints  # control steps done
+    contact_steps: Ints  # of them in contact
+    lost_steps: Ints  # without contact after the first touch
+    sum_abs_l: Floats  # [m] over the steps in contact
+    min_distance: Floats  # [m] contact point to target; inf before the first touch
+    path_length: Floats  # [m] of the base's way
+    done: Bools
+    success: Bools
+    tilt: Floats  # [rad] greatest tilt of the object so far
+    tipped: Bools  # the object has fallen over
+    diverged: Bools
+    nan_twist: Bools  # the law returned a twist that is not finite
     drive: Drive | None = None  # of a robot with limits
     load: Load | None = None  # of a law that senses the contact's force
     task: Any = reach.Nothing()  # progress of the task
@@ -137,29 +137,29 @@ class Trial(NamedTuple):
 class Snapshot(NamedTuple):
     """Observations and actions of one control step."""
 
-    time: Float[Array, "*B"]  # [s]
+    time: Floats  # [s]
     qpos: Float[Array, "*B 10"]  # as in `Trial`
     reading: Reading
     twist: Twist  # [m/s, m/s, rad/s] commanded, robot frame
     details: Details
-    done: Bool[Array, "*B"]  # the trial had ended
+    done: Bools  # the trial had ended
 
 
 class Outcome(NamedTuple):
     """The result of one trial."""
 
-    success: Bool[Array, "*B"]
-    time: Float[Array, "*B"]  # [s] at which it ended
-    min_distance: Float[Array, "*B"]  # [m] contact point to target; inf if never touched
-    contact_lost_time: Float[Array, "*B"]  # [s]
-    path_length: Float[Array, "*B"]  # [m] of the base's way
-    mean_abs_l: Float[Array, "*B"]  # [m] the paper's D; NaN if never touched
-    tilt: Float[Array, "*B"]  # [rad] greatest tilt of the object
-    tipped: Bool[Array, "*B"]  # the object has fallen over
-    diverged: Bool[Array, "*B"]
-    nan_twist: Bool[Array, "*B"]  # it diverged since the law returned a twist that is not finite
-    stalled: Bool[Array, "*B"]  # it ended with the base standing still against the object
-    unfelt: Bool[Array, "*B"]  # it ended without contact on the skin, but against the object
+    success: Bools
+    time: Floats  # [s] at which it ended
+    min_distance: Floats  # [m] contact point to target; inf if never touched
+    contact_lost_time: Floats  # [s]
+    path_length: Floats  # [m] of the base's way
+    mean_abs_l: Floats  # [m] the paper's D; NaN if never touched
+    tilt: Floats  # [rad] greatest tilt of the object
+    tipped: Bools  # the object has fallen over
+    diverged: Bools
+    nan_twist: Bools  # it diverged since the law returned a twist that is not finite
+    stalled: Bools  # it ended with the base standing still against the object
+    unfelt: Bools  # it ended without contact on the skin, but against the object
     base_pose: Float[Array, "*B 3"]  # [m, m, rad] in the world, at the end
     object_pose: Float[Array, "*B 3"]  # [m, m, rad] of the object in the world, at the end
     task: Mapping[str, Array] = MappingProxyType({})  # by name: see `Task.OUTCOMES`
@@ -256,7 +256,7 @@ class Measurement(NamedTuple):
     reading: Reading
     observation: Observation  # at the pose that the odometry estimates
     # [m] contact point to target, at the true pose; without contact, that of the base
-    distance: Float[Array, "*B"]
+    distance: Floats
 
 
 def observe(

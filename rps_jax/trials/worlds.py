@@ -104,10 +104,8 @@ def starts(drawn: Draw) -> np.ndarray:
     """Return start positions (n, 10): the base at the origin, the object in front of it."""
     qpos, yaw = np.zeros((drawn.indices.size, 10)), drawn.values["yaw"]
     front = drawn.robot.sizes[0] + drawn.values["gap"] + solid.extent(drawn.solid, yaw)
-    half, zero = yaw / 2, np.zeros_like(yaw)
-    position = [front, drawn.values["lateral"], drawn.solid.height / 2]
-    quaternion = [np.cos(half), zero, zero, np.sin(half)]
-    qpos[:, JOINTS.object] = np.stack(position + quaternion, axis=-1)
+    position = np.stack([front, drawn.values["lateral"], drawn.solid.height / 2], axis=-1)
+    qpos[:, JOINTS.object] = np.concatenate([position, solid.quaternion(yaw)], axis=-1)
     return qpos
 
 

@@ -25,6 +25,7 @@ from rps_jax.engines import device, native
 from rps_jax.engines.base import Stage
 from rps_jax.errors import InputError
 from rps_jax.record import cache, provenance
+from rps_jax.record.files import Arrays
 from rps_jax.record.options import check_arguments
 from rps_jax.robot.robot import RobotLike
 from rps_jax.runs.question import name_or_custom, task_attribute
@@ -134,7 +135,7 @@ def value_and_grad(
     errors.check_count("worlds", worlds, at_most=1_000_000)
     steps, engine = count_steps(horizon, setting), engines.get(setting.engine)
     engine.check_traced()
-    engine.check_derivatives("reverse", setting.physics)
+    engine.check_derivatives("reverse")
     setting.check_domain(ranges, chosen.values())
     loops = [control_loop(params, setting, smooth=smooth) for params in chosen.values()]
     several = [coordinates_of(wrt, params, ranges) for params in chosen.values()]
@@ -197,7 +198,7 @@ def value_and_grad(
         warnings.warn(notes, stacklevel=3)
     attrs = provenance.attributes() | {
         "domain": name_or_custom(domain), **setting.attributes,
-        "gradient": setting.gradient, "horizon": steps * setting.physics.control_period,
+        "horizon": steps * setting.physics.control_period,
         "skin_temperature": temperature, "notes": notes, **task_attribute(ranges),
     }  # fmt: skip
     return xr.Dataset(variables, coords, attrs)
@@ -248,7 +249,7 @@ def coordinates_of(
 
 def world_slopes(
     domain: Domain, drawn: Draw, setting: Setting, coordinates: Sequence[Coordinate]
-) -> tuple[list[dict[str, np.ndarray]], np.ndarray]:
+) -> tuple[list[Arrays], np.ndarray]:
     """Return derivatives of worlds by coordinates: central differences on the host, in float64.
 
     Returns:
@@ -270,7 +271,7 @@ def world_slopes(
         return registry.replace_leaves(drawn, {path: value})
 
     count = drawn.indices.size
-    slopes: list[dict[str, np.ndarray]] = [{} for _ in coordinates]
+    slopes: list[Arrays] = [{} for _ in coordinates]
     bends = np.zeros((count, len(coordinates)))
     with jax.enable_x64(True):
         middle = leaves(drawn)

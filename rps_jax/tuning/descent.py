@@ -11,7 +11,6 @@ import itertools
 import math
 import warnings
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -47,7 +46,7 @@ class TuneGrad(Tuning):
       {'generation': 2, 'parameter': 1}
     """
 
-    QUICK: ClassVar[dict[str, Any]] = Tuning.QUICK | {
+    QUICK = Tuning.QUICK | {
         "worlds": 64, "steps": 8, "learning_rate": 0.3,
     }  # fmt: skip
 

@@ -6,7 +6,6 @@ All candidates of a generation meet the same worlds; every generation has other 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, ClassVar
 
 import cmaes
 import numpy as np
@@ -34,7 +33,7 @@ class TuneES(Tuning):
       {'generation': 1, 'parameter': 2}
     """
 
-    QUICK: ClassVar[dict[str, Any]] = Tuning.QUICK | {
+    QUICK = Tuning.QUICK | {
         "worlds": 32, "population": 12, "generations": 8, "spread": 1.0,
     }  # fmt: skip
 

@@ -39,6 +39,7 @@ from rps_jax.engines.base import Stage
 from rps_jax.errors import InputError
 from rps_jax.geometry.solid import GRAVITY
 from rps_jax.record import files
+from rps_jax.record.files import Arrays, JsonObject
 from rps_jax.record.options import option
 from rps_jax.record.table import is_table
 from rps_jax.runs.push import Trace, recorded_law
@@ -134,10 +135,10 @@ class Fit(LawQuestion[Fitted], DomainQuestion[Fitted], LogsQuestion):
       >>> results = rps_jax.sweep("rps", fitted.domain, worlds=4, setting=brief)
     """
 
-    TITLE: ClassVar[str] = "A domain fitted to logs"
+    TITLE = "A domain fitted to logs"
     QUICK: ClassVar[Mapping[str, Any]] = {"worlds": 768, "window": 20.0}
     # The values of the logs matter.
-    IGNORED_FIELDS: ClassVar[tuple[str, ...]] = ("logs", "topics", "columns")
+    IGNORED_FIELDS = ("logs", "topics", "columns")
 
     law: LawLike = "rps"
     worlds: int = option(6144, 96, 1_000_000)
@@ -201,7 +202,7 @@ class Fit(LawQuestion[Fitted], DomainQuestion[Fitted], LogsQuestion):
     def num_trials(self) -> int | None:
         return self.worlds
 
-    def fields_as_json(self) -> dict[str, Any]:
+    def fields_as_json(self) -> JsonObject:
         """Fields as JSON; logs by the digests of their values."""
         contents = (b"".join(v.tobytes() for v in raw.columns.values()) for raw in self.raw_logs)
         record = {"tune_seed": seed_of(self.setting.seed, "tune")}
@@ -398,7 +399,7 @@ def statistic_names(bank: xr.Dataset, fields: Sequence[str]) -> list[str]:
     return [n for n in map(str, bank.statistic.values) if n.split("/")[0] in ("base", *fields)]
 
 
-def values_of(domain: Domain, u: np.ndarray) -> dict[str, np.ndarray]:
+def values_of(domain: Domain, u: np.ndarray) -> Arrays:
     """Return quantities (n,) of points (n, D) in their units, and the derived quantities."""
     ranges = {x.name: x.range for x in points.coordinates(domain) if x.kind == "range"}
     columns = zip(coordinates(domain), u.T, strict=True)

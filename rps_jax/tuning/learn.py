@@ -29,6 +29,7 @@ from rps_jax.control.learned.policy import Policy
 from rps_jax.engines import device
 from rps_jax.record import files
 from rps_jax.record.checkpoint import Checkpoints
+from rps_jax.record.files import JsonObject
 from rps_jax.record.options import option
 from rps_jax.runs.question import Run, SimulationQuestion, TaskOption, call_of
 from rps_jax.trials.env import SHAPED_REWARD, PushEnv
@@ -84,9 +85,9 @@ class Learn(PPO, TaskOption, SimulationQuestion[xr.Dataset]):
       (('update',), True)
     """
 
-    TITLE: ClassVar[str] = "A learned law"
-    IGNORED_FIELDS: ClassVar[tuple[str, ...]] = ("minutes", "updates", "every", "task")
-    REPORTS_TIMES: ClassVar[bool] = True
+    TITLE = "A learned law"
+    IGNORED_FIELDS = ("minutes", "updates", "every", "task")
+    REPORTS_TIMES = True
     QUICK: ClassVar[Mapping[str, Any]] = {
         "domain": ("wide,objects=random_box",),
         "network": "mlp",
@@ -157,7 +158,7 @@ class Learn(PPO, TaskOption, SimulationQuestion[xr.Dataset]):
         period = self.setting.physics.control_period
         errors.check_number("hold", self.hold, at_least=0.999 * period, unit="s")
 
-    def fields_as_json(self) -> dict[str, Any]:
+    def fields_as_json(self) -> JsonObject:
         """Fields as JSON, with domains by their ranges."""
         seed = seed_of(self.setting.seed, "tune")
         ranges = list(map(to_json, self.domains))

@@ -31,6 +31,7 @@ from rps_jax.errors import InputError, check_name, not_allowed
 from rps_jax.geometry import planar
 from rps_jax.geometry.solid import rotate
 from rps_jax.record import bag, files
+from rps_jax.record.files import Arrays
 from rps_jax.record.options import parse_names
 from rps_jax.record.table import Table, is_table
 from rps_jax.robot.shell import Shell
@@ -88,7 +89,7 @@ class Log(NamedTuple):
 class RawLog(NamedTuple):
     """Log with its own rows: columns (N, ...) by the fields of `Log`, and `time` (N,) [s]."""
 
-    columns: dict[str, np.ndarray]
+    columns: Arrays
     exact: bool  # the pose is the true one, not the one by odometry
     rows: np.ndarray | None = None  # (N,) in the file of a table
     conversions: Sequence[str] = ()  # of columns in other units, in words
@@ -176,7 +177,7 @@ def _from_table(path: Path, name: str, titles: Mapping[str, str]) -> RawLog:
     optional = (*OPTIONAL, *(_TOUCH if taxels else ()))
     fields = {k: x for k, x in fields.items() if k not in optional or {*x} & {*table.columns}}
     table.require(title for titles in fields.values() for title in titles)
-    columns = dict[str, np.ndarray]()
+    columns = Arrays()
     for key, titles in fields.items():
         # Where there is no contact, its cells may be empty.
         is_contact = key in ("p_robot_contact", "f_robot") and "contact_type" in columns
@@ -257,7 +258,7 @@ def _similarity(a: np.ndarray, b: np.ndarray) -> float:
     return float(np.sum(a * b) / max(1e-12, np.linalg.norm(a) * np.linalg.norm(b)))
 
 
-def _unit_faults(columns: dict[str, np.ndarray], shell: Shell) -> Iterator[str]:
+def _unit_faults(columns: Arrays, shell: Shell) -> Iterator[str]:
     """Yield the quantities that are too large for their units, and contacts beyond the robot."""
     in_contact, pose = columns["contact_type"] > 0, columns["pose"]
     if not in_contact.any():
@@ -328,7 +329,7 @@ def statistics(log: Log, interval: float) -> pd.DataFrame:
     A name starts with the optional field that the statistic needs, `object_pose/`, `f_robot/` or
     `signal/`; the names of all others start with `base/`.
     """
-    columns: dict[str, np.ndarray] = {}
+    columns: Arrays = {}
 
     def put(name: str, values: np.ndarray, group: str = "base") -> None:
         """Add one column (B,), or several (B, k)."""

@@ -15,6 +15,8 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
+from rps_jax.geometry.arrays import Pair
+
 BINS = 24  # of each coordinate
 _WIDTH = 96
 _MEMBERS = 3
@@ -27,7 +29,6 @@ _NEXT_WEIGHT = 0.6
 _PATIENCE = 8  # epochs without a better density before training stops
 
 Params = dict[str, Any]  # weights of a network: arrays, and tuples of arrays, by name
-Pair = tuple[jax.Array, jax.Array]
 Carry = tuple[Params, optax.OptState]  # of training: weights, and state of their optimiser
 
 

@@ -22,13 +22,13 @@ from rps_jax.control.learned import features
 from rps_jax.control.learned import network as networks
 from rps_jax.control.learned.network import Network, NetworkKind, Weights
 from rps_jax.control.learned.policy import read
+from rps_jax.geometry.arrays import Pair
 from rps_jax.record.options import option
 
 # Of `private` inputs in the mirror image.
 PRIVATE_SIGNS = np.array([1, -1, 1, 1, 1, 1, -1, 1], np.float32)
 _LOG_STD = (-2.5, 0.5)  # bounds on the log standard deviation of an action
 _CRITIC_RATE = 1e-3  # learning rate while the value function alone is learned
-Pair = tuple[jax.Array, jax.Array]
 UpdateCarry = tuple[Weights, optax.OptState, jax.Array]  # weights, optimiser, learning rate
 
 
@@ -197,7 +197,7 @@ def loss(
     advantage: jax.Array,  # (T, N) [1], normalised
     target: jax.Array,  # (T, N) [1] of the value function
     schedule: jax.Array | float = 1.0,  # () factor of ent_coef
-) -> tuple[jax.Array, jax.Array]:
+) -> Pair:
     """Return the loss of a minibatch of worlds, and the KL divergence from the acting policy."""
     mean = means(network, weights["actor"], hidden, steps)
     change = log_prob(steps.action, mean, weights["log_std"]) - steps.log_prob

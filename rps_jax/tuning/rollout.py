@@ -26,6 +26,7 @@ from rps_jax.control.learned.network import Network, PolicyState, Weights
 from rps_jax.engines import native
 from rps_jax.geometry import footprint as fp
 from rps_jax.geometry import planar
+from rps_jax.geometry.arrays import Pair
 from rps_jax.trials import trial
 from rps_jax.trials.batch import rows
 from rps_jax.trials.env import PushEnv, State
@@ -52,7 +53,7 @@ class EnvBatch(NamedTuple):
 Carry = tuple[tuple[EnvBatch, ...], jax.Array]  # batches and key, between two actions
 Stats = dict[str, jax.Array]  # counts of ended trials, of worlds (N,) or sums over them, by name
 # Transitions, inputs of the network after the action, statistics, and indices of the worlds.
-StepResults = tuple[Transition, tuple[jax.Array, jax.Array], Stats, jax.Array]
+StepResults = tuple[Transition, Pair, Stats, jax.Array]
 
 
 class RunnerState(NamedTuple):
@@ -107,7 +108,7 @@ def ease(world: World, level: jax.Array) -> World:
     distance, bearing = jnp.hypot(x, y), level * jnp.arctan2(y, x)
     near = jnp.minimum(distance, 0.8)  # [m] outside robot and object
     length = near + level * (distance - near)
-    target = length * jnp.stack([jnp.cos(bearing), jnp.sin(bearing)])
+    target = length * planar.unit(bearing)
     return world._replace(p_world_target=jnp.where(level < 1, target, world.p_world_target))
 
 
@@ -205,7 +206,7 @@ def _private(env: PushEnv, state: State) -> jax.Array:
     return jnp.stack([*position, remaining, lost, *(6 * up), world.qpos[5]])
 
 
-def _inputs(env: PushEnv, batch: EnvBatch) -> tuple[jax.Array, jax.Array]:
+def _inputs(env: PushEnv, batch: EnvBatch) -> Pair:
     """Return the inputs of the network (N, F) and the privileged inputs (N, P)."""
     memory, obs = batch.memory, batch.states.info["observation"]
     inputs = jax.vmap(features.compute_features)(memory.touch_state, memory.action, obs)
@@ -396,7 +397,7 @@ def rollouts(
 
 def evaluate_policy(
     network: Network, envs: Sequence[PushEnv], tables: Sequence[World], actor: Weights
-) -> tuple[jax.Array, jax.Array]:
+) -> Pair:
     """Return success (N,) bool and time (N,) [s] of the law in all worlds of all environments."""
     states = rollouts(network, envs, tables, actor)
     pairs = zip(envs, states, strict=True)

@@ -27,6 +27,7 @@ from rps_jax.control import registry
 from rps_jax.control.base import LawParams, unit_of_leaf
 from rps_jax.control.registry import LawLike
 from rps_jax.record import files
+from rps_jax.record.files import JsonObject
 from rps_jax.record.options import option
 from rps_jax.runs import evaluate
 from rps_jax.runs.evaluate import Candidates, CandidateScores
@@ -61,8 +62,8 @@ Search = Generator[Proposal, Mapping[str, np.ndarray], None]
 class Tuning(TaskOption, LawQuestion[xr.Dataset]):
     """Base of the questions for better parameters of a law."""
 
-    IGNORED_FIELDS: ClassVar[tuple[str, ...]] = ("budget", "generations", "task")
-    REPORTS_TIMES: ClassVar[bool] = True
+    IGNORED_FIELDS = ("budget", "generations", "task")
+    REPORTS_TIMES = True
     QUICK: ClassVar[dict[str, Any]] = {
         # The few parameters that matter most, since few trials cannot determine more; cylinders on
         # the quasi-static model, which compile and run fastest.
@@ -166,7 +167,7 @@ class Tuning(TaskOption, LawQuestion[xr.Dataset]):
         for domain in self.domains:
             self.setting.check_domain(domain, [self.space.base])
 
-    def fields_as_json(self) -> dict[str, Any]:
+    def fields_as_json(self) -> JsonObject:
         """Fields as JSON, with the names of all tuned parameters and the ranges of all domains."""
         ranges, seed = list(map(to_json, self.domains)), seed_of(self.setting.seed, "tune")
         record = {"tuned": self.space.names, "domain": ranges, "tune_seed": seed}

@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike
 
 from rps_jax import errors
 from rps_jax.record import files
+from rps_jax.record.files import JsonObject
 from rps_jax.record.folder import describe_difference
 from rps_jax.record.options import check_fields, parse_changes
 from rps_jax.robot.robot import Robot, RobotLike, parse_robot
@@ -390,7 +391,7 @@ _FORMS: dict[str, tuple[Callable[[Any], Any], str]] = {
 }
 
 
-def to_json(domain: Domain) -> dict[str, Any]:
+def to_json(domain: Domain) -> JsonObject:
     """Return a domain as JSON, with the solids of custom objects; without the task `reach`."""
     record = asdict(domain) | {"objects": tuple(map(text_of, domain.objects))}
     if solids := custom_solids(domain.objects):
@@ -398,7 +399,7 @@ def to_json(domain: Domain) -> dict[str, Any]:
     return record if domain.task != Reach() else {k: x for k, x in record.items() if k != "task"}
 
 
-def from_json(values: dict[str, Any]) -> Domain:
+def from_json(values: JsonObject) -> Domain:
     """Return the domain of the JSON of `to_json`, or raise InputError."""
     ranges = dict(values)
     stored = ranges.pop("solids", None)

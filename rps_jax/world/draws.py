@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike
 
 from rps_jax.geometry import solid
 from rps_jax.geometry.solid import GRAVITY, SIDES, Solid
+from rps_jax.record.files import Arrays
 from rps_jax.robot.robot import Robot
 from rps_jax.world import scene, tasks
 from rps_jax.world.domain import (
@@ -39,7 +40,7 @@ class Draw(NamedTuple):
     cases: np.ndarray  # (n,) indices with the same object, friction and target of the lists
     solid: Solid
     friction: Friction  # (n,) each
-    values: dict[str, np.ndarray]  # (n,) of each quantity of the domain, in its unit
+    values: Arrays  # (n,) of each quantity of the domain, in its unit
     p_world_target: np.ndarray  # (n, 2) [m] end of the trial
     course: Course  # (n, ...) of the task
     velocity_error: np.ndarray  # (n, 3) [1]
@@ -133,7 +134,7 @@ def draw_at(
     )
 
 
-def by_name(uniform: np.ndarray) -> dict[str, np.ndarray]:
+def by_name(uniform: np.ndarray) -> Arrays:
     """Return the columns (n,) of random numbers (n, COLUMNS) by name."""
     return {name: uniform[:, column] for name, column in USES.items()}
 
@@ -152,7 +153,7 @@ def random_numbers(seed: int, index: np.ndarray) -> np.ndarray:
     return rows
 
 
-def _solid(name: str, at: dict[str, np.ndarray], u: dict[str, np.ndarray]) -> Solid:
+def _solid(name: str, at: Arrays, u: Arrays) -> Solid:
     """Return the solids of an object of a scene, or random ones of a shape family."""
     count = u["mass"].size
     if name not in RANDOM:
@@ -173,7 +174,7 @@ def _solid(name: str, at: dict[str, np.ndarray], u: dict[str, np.ndarray]) -> So
     return solid.on_feet(solids, at["feet"], 3 + np.floor(2 * u["feet_number"]), u["feet_turn"])
 
 
-def _polygons(depth: np.ndarray, breadth: np.ndarray, u: dict[str, np.ndarray]) -> np.ndarray:
+def _polygons(depth: np.ndarray, breadth: np.ndarray, u: Arrays) -> np.ndarray:
     """Return convex polygons (n, SIDES, 2) of 3 to SIDES corners on ellipses of these half axes."""
     sides = 3 + np.floor((SIDES - 2) * u["sides"]).astype(int)[:, None]
     corner = np.minimum(np.arange(SIDES), sides - 1)  # the last one repeated
@@ -181,10 +182,10 @@ def _polygons(depth: np.ndarray, breadth: np.ndarray, u: dict[str, np.ndarray]) 
     jitter = np.take_along_axis(jitter, corner, axis=1)
     angle = 2 * np.pi * (u["turn"][:, None] + (corner + 0.5 * jitter) / sides)
     half = np.stack([depth, breadth], axis=-1)[:, None, :]
-    return solid.centred(half * np.stack([np.cos(angle), np.sin(angle)], axis=-1))
+    return solid.centred(half * solid.unit(angle))
 
 
-def _robots(robot: Robot, at: dict[str, np.ndarray], count: int) -> Robot:
+def _robots(robot: Robot, at: Arrays, count: int) -> Robot:
     """Return the robots (count,) of worlds, with their drawn limits."""
     limits = {robot_field(name): at[name] for name in quantities_of("robot") if name in at}
     if (linear := limits.get("acceleration_max")) is not None:
@@ -195,7 +196,7 @@ def _robots(robot: Robot, at: dict[str, np.ndarray], count: int) -> Robot:
     return replace(scene.repeat_robot(replace(robot, **several), count), **limits)
 
 
-def _surroundings(at: dict[str, np.ndarray], targets: np.ndarray) -> Surroundings:
+def _surroundings(at: Arrays, targets: np.ndarray) -> Surroundings:
     """Return slopes and boundaries of worlds with these quantities and targets (n, 2) [m]."""
     slope = boundary = None
     if "slope" in at:
@@ -208,11 +209,10 @@ def _surroundings(at: dict[str, np.ndarray], targets: np.ndarray) -> Surrounding
     return Surroundings(slope, boundary)
 
 
-def _targets(domain: Domain, index: np.ndarray, at: dict[str, np.ndarray]) -> np.ndarray:
+def _targets(domain: Domain, index: np.ndarray, at: Arrays) -> np.ndarray:
     if domain.targets:
         return np.array(domain.targets)[domain.choices(index)[2]]
-    along = np.stack([np.cos(at["bearing"]), np.sin(at["bearing"])], axis=-1)
-    return at["distance"][:, None] * along
+    return at["distance"][:, None] * solid.unit(at["bearing"])
 
 
 def table(drawn: Draw) -> dict[str, tuple[np.ndarray, str]]:

@@ -22,6 +22,7 @@ from rps_jax.geometry import solid
 from rps_jax.geometry.footprint import Footprint
 from rps_jax.geometry.solid import SIDES, Solid
 from rps_jax.record import files, options
+from rps_jax.record.files import JsonObject
 from rps_jax.record.options import check_arguments
 from rps_jax.world.opengl import mujoco
 
@@ -103,7 +104,7 @@ def text_of(name: str) -> str:
     return str(custom.path) if custom is not None and custom.is_file else name
 
 
-def custom_solids(names: Iterable[str]) -> dict[str, Any]:
+def custom_solids(names: Iterable[str]) -> JsonObject:
     """Return the solids of the custom objects among `names` as JSON, by their texts.
 
     They are rounded, so that all processors give the same.
@@ -316,8 +317,7 @@ def _check_extent(label: str, model: mujoco.MjModel, vertices: np.ndarray, radiu
 
     It may reach from the geom `object` to the convex hull of all geoms.
     """
-    angle = np.arange(32) * np.pi / 16
-    ways = np.stack([np.cos(angle), np.sin(angle)])
+    ways = solid.unit(np.arange(32) * np.pi / 16).T
     owned = np.flatnonzero(model.geom_bodyid == model.body("object").id).tolist()
     reaches = [np.max(_points_of(model, i)[:, :2] @ ways, axis=0) for i in owned]
     least, greatest = reaches[owned.index(model.geom("object").id)], np.max(reaches, axis=0)
@@ -342,8 +342,7 @@ def _points_of(model: mujoco.MjModel, geom_id: int) -> np.ndarray:
     elif geom.type[0] == mujoco.mjtGeom.mjGEOM_BOX:
         points = middle + half * (2 * np.array(list(np.ndindex(2, 2, 2))) - 1)
     else:  # round about its axis
-        angle = np.linspace(0, 2 * np.pi, 33)
-        rim = np.stack([np.cos(angle), np.sin(angle), np.ones(33)], axis=1)
+        rim = np.insert(solid.unit(np.linspace(0, 2 * np.pi, 33)), 2, 1.0, axis=1)
         points = middle + half * np.concatenate([rim, rim * [1, 1, -1]])
     mujoco.mju_quat2Mat(turn, geom.quat)
     return np.asarray(points @ turn.reshape(3, 3).T + geom.pos)

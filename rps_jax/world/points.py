@@ -20,6 +20,7 @@ from rps_jax import errors
 from rps_jax.errors import InputError
 from rps_jax.geometry.solid import SIDES
 from rps_jax.record import files
+from rps_jax.record.files import Arrays
 from rps_jax.robot.robot import Robot
 from rps_jax.world import draws
 from rps_jax.world.domain import (
@@ -256,7 +257,7 @@ def drawn_columns(
     domain: Domain, seed: int, points: Points | None, index: np.ndarray
 ) -> dict[str, xr.Variable]:
     """Return objects and drawn quantities of worlds as coordinates of a dataset."""
-    columns: dict[str, np.ndarray] = {}
+    columns: Arrays = {}
     for rows, drawn in draw_by_object(domain, seed, points, index):
         for name, (values, _) in draws.table(drawn).items():
             columns.setdefault(name, np.empty(index.size))[rows] = values

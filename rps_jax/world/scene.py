@@ -14,6 +14,7 @@ from rps_jax import errors
 from rps_jax.geometry import solid
 from rps_jax.geometry.footprint import Footprint
 from rps_jax.geometry.solid import Solid
+from rps_jax.record.files import Arrays
 from rps_jax.robot.robot import Robot
 from rps_jax.robot.shell import Shell
 from rps_jax.world import objects
@@ -212,7 +213,7 @@ def base_invweight(robots: Robot) -> np.ndarray:
     return 2 / (3 * np.asarray(robots.mass, float))
 
 
-def geom_sizes(family: str, solids: Solid) -> dict[str, np.ndarray]:
+def geom_sizes(family: str, solids: Solid) -> Arrays:
     """Return MuJoCo's sizes (..., 3) [m] of the geoms of solids (...), by name."""
     half = solids.height / 2
     if family == "box":

@@ -58,7 +58,7 @@ class FitWindows(Fit):
 
     def check_method(self) -> None:
         """Raise InputError unless the logs can be replayed and differentiated."""
-        engines.get(self.setting.engine).check_derivatives("forward", self.setting.physics)
+        engines.get(self.setting.engine).check_derivatives("forward")
         if any(self.ranges.surroundings):
             rule = "windows are replayed on a level, uniform floor: draw no other, or use rps fit"
             raise errors.not_allowed("domain", self.domain, rule)

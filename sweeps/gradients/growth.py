@@ -109,7 +109,7 @@ class Growth(QuickStudy[xr.Dataset]):
 
     def check(self) -> None:
         super().check()
-        engines.get(self.engine).check_derivatives("forward", self.setting.physics)
+        engines.get(self.engine).check_derivatives("forward")
 
     def num_trials(self) -> int | None:
         """Number of measurements."""

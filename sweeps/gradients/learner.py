@@ -76,7 +76,7 @@ class WindowLearner(Learn):
         errors.check_name("estimator", self.estimator, estimators.ESTIMATORS)
         if self.estimator != "evolution":
             engine = engines.get(self.setting.engine)
-            engine.check_derivatives("reverse", self.setting.physics)
+            engine.check_derivatives("reverse")
 
     def environments(self, split: Split = "tune") -> list[PushEnv]:
         """Return the environments of a split; those to learn in have a smooth contact."""

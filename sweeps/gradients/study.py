@@ -129,7 +129,7 @@ class Gradients(QuickStudy[xr.Dataset]):
         _ = self.space
         for name in {"exact", "warm", "bundled", "forward"}.intersection(self.measurements):
             mode = "forward" if name == "forward" else "reverse"
-            engines.get(self.engine).check_derivatives(mode, self.setting.physics)
+            engines.get(self.engine).check_derivatives(mode)
 
     @property
     def measurements(self) -> tuple[str, ...]:

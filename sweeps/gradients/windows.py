@@ -68,7 +68,7 @@ class WindowTuning(TuneGrad):
         super().check()
         errors.check_name("estimator", self.estimator, estimators.ESTIMATORS)
         registry.smooth_law(registry.law_of(self.params))
-        engines.get(self.setting.engine).check_derivatives("reverse", self.setting.physics)
+        engines.get(self.setting.engine).check_derivatives("reverse")
 
     def slopes(
         self, thetas: jax.Array, step: int, check: Candidates, score: ScoreCandidates

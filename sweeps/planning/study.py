@@ -88,7 +88,7 @@ class Planning(QuickStudy[xr.Dataset]):
     def check(self) -> None:
         """Check the names, and that the engine has derivatives."""
         super().check()
-        engines.get(self.engine).check_derivatives("reverse", Setting(self.engine).physics)
+        engines.get(self.engine).check_derivatives("reverse")
 
     def parts(self, run: Run) -> Mapping[str, Any]:
         """Return the function that computes each case."""

@@ -24,6 +24,7 @@ import jax.numpy as jnp
 from rps_jax.control.base import Law, check_signs, document_fields
 from rps_jax.control.observation import Details, PoseObservation, Twist, displacement
 from rps_jax.geometry import planar
+from rps_jax.geometry.arrays import Pair, Parameter
 from rps_jax.robot.shell import HALF_LENGTH
 
 
@@ -31,23 +32,23 @@ from rps_jax.robot.shell import HALF_LENGTH
 class APSParams(NamedTuple):
     """Parameters of APS; those marked * are ours, since the publication does not give them."""
 
-    K1: float | jax.Array = 0.05  # [1] gain of the mean motion error
-    K2: float | jax.Array = 0.1  # [1] gain of the motion error
-    K_p: float | jax.Array = 0.6  # [1/s] heading gain
-    K_d: float | jax.Array = 0.4  # [1] heading rate gain
-    yaw_error_max: float | jax.Array = 0.3  # [rad] above it the robot turns in place
-    margin: float | jax.Array = 0.10  # [m] gap above which the robot approaches straight
-    r_robot: float | jax.Array = HALF_LENGTH  # [m] * equivalent radius of a rectangular base
-    gamma_drop: float | jax.Array = 0.01  # [rad] decrease of |gamma| after which alpha is good
-    alpha_mean: float | jax.Array = jnp.pi  # [rad] prior mean of good alphas
-    alpha_variance: float | jax.Array = jnp.pi / 4  # [rad^2] prior variance
-    alpha_count: float | jax.Array = 100.0  # [1] weight of the prior
-    aim_beyond: float | jax.Array = 1.0  # [1] * object radii beyond the target; 0: as published
-    min_motion: float | jax.Array = 0.001  # [m] * least motion of the object
-    v_max: float | jax.Array = 0.05  # [m/s] bound on the speed
-    v_min: float | jax.Array = 0.01  # [m/s] * least speed
-    omega_max: float | jax.Array = 0.15  # [rad/s] bound on |omega|
-    d_success: float | jax.Array = 0.05  # [m] target reached
+    K1: Parameter = 0.05  # [1] gain of the mean motion error
+    K2: Parameter = 0.1  # [1] gain of the motion error
+    K_p: Parameter = 0.6  # [1/s] heading gain
+    K_d: Parameter = 0.4  # [1] heading rate gain
+    yaw_error_max: Parameter = 0.3  # [rad] above it the robot turns in place
+    margin: Parameter = 0.10  # [m] gap above which the robot approaches straight
+    r_robot: Parameter = HALF_LENGTH  # [m] * equivalent radius of a rectangular base
+    gamma_drop: Parameter = 0.01  # [rad] decrease of |gamma| after which alpha is good
+    alpha_mean: Parameter = jnp.pi  # [rad] prior mean of good alphas
+    alpha_variance: Parameter = jnp.pi / 4  # [rad^2] prior variance
+    alpha_count: Parameter = 100.0  # [1] weight of the prior
+    aim_beyond: Parameter = 1.0  # [1] * object radii beyond the target; 0: as published
+    min_motion: Parameter = 0.001  # [m] * least motion of the object
+    v_max: Parameter = 0.05  # [m/s] bound on the speed
+    v_min: Parameter = 0.01  # [m/s] * least speed
+    omega_max: Parameter = 0.15  # [rad/s] bound on |omega|
+    d_success: Parameter = 0.05  # [m] target reached
 
 
 class APSState(NamedTuple):
@@ -81,16 +82,14 @@ _POSITIVE = ("alpha_variance", "alpha_count", "v_max", "omega_max", "d_success")
 check = partial(check_signs, "aps", _POSITIVE)
 
 
-def predictive(params: APSParams, state: APSState) -> tuple[jax.Array, jax.Array]:
+def predictive(params: APSParams, state: APSState) -> Pair:
     """Return mean [rad] and variance [rad^2] of the next good alpha (Gaussian, unknown mean)."""
     precision = 1 / params.alpha_variance + state.weight / state.variance
     mean = params.alpha_mean / params.alpha_variance + state.weight * state.mean / state.variance
     return mean / precision, 1 / precision + state.variance
 
 
-def activations(
-    params: APSParams, state: APSState, alpha: jax.Array, near: jax.Array
-) -> tuple[jax.Array, jax.Array]:
+def activations(params: APSParams, state: APSState, alpha: jax.Array, near: jax.Array) -> Pair:
     """Return (psi_push, psi_relocate) [1] at alpha [rad]; the robot approaches unless `near`.
 
     Like the released controller, we divide by the predictive variance, not by its square root.
@@ -137,7 +136,7 @@ def _aim(params: APSParams, obs: PoseObservation) -> jax.Array:
     of_object = planar.direction(touch.p_world_target - obs.p_world_object)
     angle = jnp.where(touch.in_contact, of_contact, of_object)
     beyond = params.aim_beyond * obs.r_object
-    return touch.p_world_target + beyond * jnp.stack([jnp.cos(angle), jnp.sin(angle)])
+    return touch.p_world_target + beyond * planar.unit(angle)
 
 
 def step(
@@ -159,7 +158,7 @@ def step(
     r_robot = params.r_robot if touch.base_radius is None else touch.base_radius
     near = planar.norm(from_object) <= r_robot + obs.r_object + params.margin
     push, relocate = activations(params, state, alpha, near)
-    radial = -jnp.stack([jnp.cos(alpha), jnp.sin(alpha)])  # towards the object
+    radial = -planar.unit(alpha)  # towards the object
     orbit = jnp.sign(jnp.sin(alpha)) * jnp.stack([-jnp.sin(alpha), jnp.cos(alpha)])  # to alpha = pi
     heading = planar.direction(push * radial + relocate * orbit)
     correction = params.K1 * state.gamma_mean + params.K2 * state.gamma

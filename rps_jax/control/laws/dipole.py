@@ -22,6 +22,7 @@ import jax.numpy as jnp
 from rps_jax.control.base import Bound, Law, bounds_of, check_signs, document_fields
 from rps_jax.control.observation import Details, PoseObservation, Twist
 from rps_jax.geometry import planar
+from rps_jax.geometry.arrays import Parameter
 
 
 @document_fields
@@ -29,14 +30,14 @@ class DipoleParams(NamedTuple):
     """Parameters of the dipole law; the lookahead is that of Heins and Schoellig."""
 
     # [1/s] turning rate over heading error
-    K_h: Annotated[float | jax.Array, Bound(0.02, 5, log=True)] = 1.0
+    K_h: Annotated[Parameter, Bound(0.02, 5, log=True)] = 1.0
     # [m] distance along the path from object to aim
-    lookahead: Annotated[float | jax.Array, Bound(0.05, 3, log=True)] = 1.0
+    lookahead: Annotated[Parameter, Bound(0.05, 3, log=True)] = 1.0
     # [1] object radii after which a target is passed
-    beyond: Annotated[float | jax.Array, Bound(0, 5)] = 2.0
-    v_max: float | jax.Array = 0.05  # [m/s] speed, the bound of RPS
-    omega_max: float | jax.Array = 0.15  # [rad/s] bound on |omega|
-    d_success: float | jax.Array = 0.05  # [m] target reached
+    beyond: Annotated[Parameter, Bound(0, 5)] = 2.0
+    v_max: Parameter = 0.05  # [m/s] speed, the bound of RPS
+    omega_max: Parameter = 0.15  # [rad/s] bound on |omega|
+    d_success: Parameter = 0.05  # [m] target reached
 
 
 class DipoleState(NamedTuple):
@@ -61,8 +62,7 @@ def step(
     touch, p_world_object = obs.touch, obs.p_world_object
 
     def path_direction(start: jax.Array) -> jax.Array:
-        angle = planar.direction(touch.p_world_target - start)
-        return jnp.stack([jnp.cos(angle), jnp.sin(angle)])
+        return planar.unit(planar.direction(touch.p_world_target - start))
 
     past = jnp.sum((p_world_object - touch.p_world_target) * path_direction(state.p_world_start))
     is_new = ~state.started | (past > params.beyond * obs.r_object)

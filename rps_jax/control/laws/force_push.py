@@ -31,7 +31,7 @@ import jax.numpy as jnp
 from rps_jax.control.base import Bound, Law, bounds_of, check_signs, document_fields
 from rps_jax.control.observation import Details, Observation, Twist, displacement
 from rps_jax.geometry import planar
-from rps_jax.geometry.arrays import Scalar
+from rps_jax.geometry.arrays import Parameter, Scalar
 
 _TOLERANCE = 0.01  # [m] beside a path, beyond which a target has left it
 _POSITIVE = ("drift", "angle_max", "v_max", "omega_max", "d_success")
@@ -42,20 +42,20 @@ class ForcePushParams(NamedTuple):
     """Parameters of Force Push; the gains are those of its authors' experiments."""
 
     # [1] gain of the force's angle, beyond 1
-    k_theta: Annotated[float | jax.Array, Bound(-2, 4)] = 0.3
-    k_y: Annotated[float | jax.Array, Bound(-2, 2)] = 0.5  # [rad/m] gain of the path
+    k_theta: Annotated[Parameter, Bound(-2, 4)] = 0.3
+    k_y: Annotated[Parameter, Bound(-2, 2)] = 0.5  # [rad/m] gain of the path
     # [1/s] gain of the heading
-    k_omega: Annotated[float | jax.Array, Bound(0.005, 2, log=True)] = 1.0
+    k_omega: Annotated[Parameter, Bound(0.005, 2, log=True)] = 1.0
     # [rad] largest change of theta_p in a step without contact
-    converge: Annotated[float | jax.Array, Bound(0.001, 1, log=True)] = 0.1
+    converge: Annotated[Parameter, Bound(0.001, 1, log=True)] = 0.1
     # [m] lambda, length of motion over which drift is estimated
-    drift: Annotated[float | jax.Array, Bound(0.01, 1, log=True)] = 0.1
+    drift: Annotated[Parameter, Bound(0.01, 1, log=True)] = 0.1
     # [rad] largest angle between push and heading
-    angle_max: Annotated[float | jax.Array, Bound(0.2, 1.57)] = 1.2
-    v_max: float | jax.Array = 0.05  # [m/s] speed of the contact, and bound for the base
-    omega_max: float | jax.Array = 0.15  # [rad/s] bound on |omega|
-    v_approach: float | jax.Array = 0.01  # [m/s] forward speed before the first contact
-    d_success: float | jax.Array = 0.05  # [m] target reached
+    angle_max: Annotated[Parameter, Bound(0.2, 1.57)] = 1.2
+    v_max: Parameter = 0.05  # [m/s] speed of the contact, and bound for the base
+    omega_max: Parameter = 0.15  # [rad/s] bound on |omega|
+    v_approach: Parameter = 0.01  # [m/s] forward speed before the first contact
+    d_success: Parameter = 0.05  # [m] target reached
 
 
 class Path(NamedTuple):
@@ -82,7 +82,7 @@ class Path(NamedTuple):
         filled = obs._replace(p_robot_contact=contact)
         d = displacement(filled)
         p_world_contact = obs.p_world_target - d
-        along = jnp.stack([jnp.cos(self.theta_d), jnp.sin(self.theta_d)])
+        along = planar.unit(self.theta_d)
         passed = self.touched & touching & (jnp.sum(d * along) < 0)
         way = obs.p_world_target - self.p_world_start
         has_left = jnp.abs(along[0] * way[1] - along[1] * way[0]) > _TOLERANCE
@@ -153,7 +153,7 @@ def step(
     theta_p = steer(params, state.theta_p, theta_f, offset, params.converge, obs.in_contact)
     angle = planar.wrap(theta_d + theta_p - obs.yaw)
     angle = jnp.clip(angle, -jnp.asarray(params.angle_max), params.angle_max)
-    v_contact = params.v_max * jnp.stack([jnp.cos(angle), jnp.sin(angle)])
+    v_contact = params.v_max * planar.unit(angle)
     twist = path.twist(params, v_contact, obs.yaw)
     theta_p = jnp.where(path.touched, theta_p, 0.0)
     state = ForcePushState(path, theta_p, l_mean, obs.p_world_robot)

@@ -32,6 +32,7 @@ from rps_jax.control.laws import force_push
 from rps_jax.control.laws.force_push import Path
 from rps_jax.control.observation import Details, ForceObservation, Twist
 from rps_jax.geometry import planar
+from rps_jax.geometry.arrays import Parameter
 
 _POSITIVE = ("v_max", "omega_max", "d_success")
 
@@ -41,23 +42,23 @@ class PublishedForcePushParams(NamedTuple):
     """Parameters of Force Push, as in its authors' experiments; f_min as in their simulations."""
 
     # [1] gain of the force's angle, beyond 1
-    k_theta: Annotated[float | jax.Array, Bound(-2, 4)] = 0.3
+    k_theta: Annotated[Parameter, Bound(-2, 4)] = 0.3
     # [rad/m] gain of the path; 0.1 in their simulations
-    k_y: Annotated[float | jax.Array, Bound(-2, 2)] = 0.5
+    k_y: Annotated[Parameter, Bound(-2, 2)] = 0.5
     # [1/s] gain of the heading
-    k_omega: Annotated[float | jax.Array, Bound(0.005, 2, log=True)] = 1.0
+    k_omega: Annotated[Parameter, Bound(0.005, 2, log=True)] = 1.0
     # [rad/s] largest rate of theta_p without a force
-    converge: Annotated[float | jax.Array, Bound(0.1, 100, log=True)] = 10.0
+    converge: Annotated[Parameter, Bound(0.1, 100, log=True)] = 10.0
     # [N] least force of a contact; 5 N in their experiments
-    f_min: Annotated[float | jax.Array, Bound(0.1, 20, log=True)] = 1.0
+    f_min: Annotated[Parameter, Bound(0.1, 20, log=True)] = 1.0
     # [N] above which the base yields
-    f_max: Annotated[float | jax.Array, Bound(10, 1000, log=True)] = 50.0
+    f_max: Annotated[Parameter, Bound(10, 1000, log=True)] = 50.0
     # [m/s/N] admittance; 0.003 at their speed of 0.1 m/s
-    k_f: Annotated[float | jax.Array, Bound(1e-5, 0.02, log=True)] = 0.0015
-    v_max: float | jax.Array = 0.05  # [m/s] speed of the contact, and bound for the base
-    omega_max: float | jax.Array = 0.15  # [rad/s] bound on |omega|
-    v_approach: float | jax.Array = 0.01  # [m/s] forward speed before the first contact
-    d_success: float | jax.Array = 0.05  # [m] target reached
+    k_f: Annotated[Parameter, Bound(1e-5, 0.02, log=True)] = 0.0015
+    v_max: Parameter = 0.05  # [m/s] speed of the contact, and bound for the base
+    omega_max: Parameter = 0.15  # [rad/s] bound on |omega|
+    v_approach: Parameter = 0.01  # [m/s] forward speed before the first contact
+    d_success: Parameter = 0.05  # [m] target reached
 
 
 class PublishedForcePushState(NamedTuple):
@@ -100,8 +101,7 @@ def step(
     limit = params.converge * touch.period
     theta_p = force_push.steer(params, state.theta_p, theta_f, offset, limit, in_contact)
     theta_p = jnp.where(pushed, theta_p, 0.0)
-    angle = path.theta_d + theta_p
-    v_world = params.v_max * jnp.stack([jnp.cos(angle), jnp.sin(angle)])
+    v_world = params.v_max * planar.unit(path.theta_d + theta_p)
     v_robot = planar.rotate(-touch.yaw, yield_to_force(params, v_world, f_world))
     twist = path.twist(params, v_robot, touch.yaw)
     details = Details.from_obs(filled)._replace(gamma=theta_p)

@@ -22,7 +22,7 @@ from rps_jax.control.base import Law, check_finite_leaves, document_fields
 from rps_jax.control.laws import rps
 from rps_jax.control.laws.rps import RPSParams, RPSState
 from rps_jax.control.observation import Details, Observation, Twist
-from rps_jax.geometry.arrays import Number
+from rps_jax.geometry.arrays import Number, Parameter
 
 KNOTS = 60  # default number of offsets
 
@@ -33,7 +33,7 @@ class GuidedParams(NamedTuple):
 
     law: RPSParams = RPSParams.tuned()
     offsets: ArrayLike = np.zeros((KNOTS, 3))  # (J, 3) [1] of v_x, v_y, omega, in units of bounds
-    hold: float | jax.Array = 250  # [1] control steps per offset: 5 s, so that 60 take 300 s
+    hold: Parameter = 250  # [1] control steps per offset: 5 s, so that 60 take 300 s
 
     @property
     def d_success(self) -> Number:

@@ -15,21 +15,22 @@ import jax.numpy as jnp
 from rps_jax.control.base import Bound, Law, bounds_of, check_signs, document_fields
 from rps_jax.control.observation import Details, Observation, Twist, displacement
 from rps_jax.geometry import planar
+from rps_jax.geometry.arrays import Parameter
 
 
 @document_fields
 class PursuitParams(NamedTuple):
     """Parameters of pursuit; the bounds are those of RPS."""
 
-    K_v: Annotated[float | jax.Array, Bound(0.02, 2, log=True)] = 0.5  # [1/s] speed over distance
+    K_v: Annotated[Parameter, Bound(0.02, 2, log=True)] = 0.5  # [1/s] speed over distance
     # [1/s] turning rate over heading error
-    K_h: Annotated[float | jax.Array, Bound(0.005, 2, log=True)] = 1.0
+    K_h: Annotated[Parameter, Bound(0.005, 2, log=True)] = 1.0
     # [1] least share of the speed that is forward
-    press: Annotated[float | jax.Array, Bound(0, 2)] = 0.2
-    v_max: float | jax.Array = 0.05  # [m/s] bound on the speed
-    omega_max: float | jax.Array = 0.15  # [rad/s] bound on |omega|
-    v_approach: float | jax.Array = 0.01  # [m/s] forward speed without contact
-    d_success: float | jax.Array = 0.05  # [m] target reached
+    press: Annotated[Parameter, Bound(0, 2)] = 0.2
+    v_max: Parameter = 0.05  # [m/s] bound on the speed
+    omega_max: Parameter = 0.15  # [rad/s] bound on |omega|
+    v_approach: Parameter = 0.01  # [m/s] forward speed without contact
+    d_success: Parameter = 0.05  # [m] target reached
 
 
 check = partial(check_signs, "pursuit", ("K_v", "K_h", "v_max", "omega_max", "d_success"))

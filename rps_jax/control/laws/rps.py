@@ -31,7 +31,7 @@ from rps_jax.control import soft
 from rps_jax.control.base import Bound, Law, bounds_of, check_signs, document_fields
 from rps_jax.control.observation import Details, Observation, Twist, displacement
 from rps_jax.geometry import planar
-from rps_jax.geometry.arrays import Array, Bool, Float
+from rps_jax.geometry.arrays import Array, Bools, Float, Floats, Parameter, PerWorld
 
 
 @document_fields
@@ -42,39 +42,39 @@ class RPSParams(NamedTuple):
     """
 
     # [1] upper asymptote of the adaptive rate, Eq. 5
-    eta: Annotated[float | jax.Array, Bound(1, 100, log=True)] = 10.0
-    zeta: Annotated[float | jax.Array, Bound(-2, 5)] = 0.0  # [1] lower asymptote, Eq. 5
+    eta: Annotated[Parameter, Bound(1, 100, log=True)] = 10.0
+    zeta: Annotated[Parameter, Bound(-2, 5)] = 0.0  # [1] lower asymptote, Eq. 5
     # [m] inflection point of |l|, Eq. 5
-    beta: Annotated[float | jax.Array, Bound(0.01, 0.3)] = 0.12
-    k: Annotated[float | jax.Array, Bound(5, 500, log=True)] = 60.0  # [1/m] steepness, Eq. 5
-    K_h: Annotated[float | jax.Array, Bound(0.1, 5, log=True)] = 1.0  # [1] heading gain, Eq. 7
-    K_v: Annotated[float | jax.Array, Bound(0.02, 2, log=True)] = 0.1  # [1/s] velocity gain, Eq. 3
+    beta: Annotated[Parameter, Bound(0.01, 0.3)] = 0.12
+    k: Annotated[Parameter, Bound(5, 500, log=True)] = 60.0  # [1/m] steepness, Eq. 5
+    K_h: Annotated[Parameter, Bound(0.1, 5, log=True)] = 1.0  # [1] heading gain, Eq. 7
+    K_v: Annotated[Parameter, Bound(0.02, 2, log=True)] = 0.1  # [1/s] velocity gain, Eq. 3
     # [m] turning length, Eqs. 6 and 9
-    L: Annotated[float | jax.Array, Bound(0.03, 1.5, log=True)] = 0.2
+    L: Annotated[Parameter, Bound(0.03, 1.5, log=True)] = 0.2
     # [m] start of the critical region; the half width of the base is 0.29
-    l_cr: Annotated[float | jax.Array, Bound(0.1, 0.289)] = 0.24
+    l_cr: Annotated[Parameter, Bound(0.1, 0.289)] = 0.24
     # [m] no lateral motion nearer than this, Eq. 5
-    d_th: Annotated[float | jax.Array, Bound(0.02, 2, log=True)] = 0.5
-    v_max: float | jax.Array = 0.05  # [m/s] bound on the norm of (v_x, v_y)
-    omega_max: float | jax.Array = 0.15  # [rad/s] bound on |omega|
-    d_success: float | jax.Array = 0.05  # [m] target reached, Algorithm 1
-    v_approach: float | jax.Array = 0.01  # [m/s] forward speed without contact (Sec. III-B)
+    d_th: Annotated[Parameter, Bound(0.02, 2, log=True)] = 0.5
+    v_max: Parameter = 0.05  # [m/s] bound on the norm of (v_x, v_y)
+    omega_max: Parameter = 0.15  # [rad/s] bound on |omega|
+    d_success: Parameter = 0.05  # [m] target reached, Algorithm 1
+    v_approach: Parameter = 0.01  # [m/s] forward speed without contact (Sec. III-B)
 
     # [m] end of the middle region, where Realignment stops
-    l_mr: Annotated[float | jax.Array, Bound(0.02, 0.98, relative_to="l_cr")] = 0.15
+    l_mr: Annotated[Parameter, Bound(0.02, 0.98, relative_to="l_cr")] = 0.15
     # [1] adaptive rate in Realignment; eta's value
-    a_r_max: Annotated[float | jax.Array, Bound(1, 100, log=True)] = 10.0
+    a_r_max: Annotated[Parameter, Bound(1, 100, log=True)] = 10.0
     # [rad] bound on |gamma|; inf is the tangent as printed
-    gamma_max: Annotated[float | jax.Array, Bound(0.5, 1.57)] = 1.56
+    gamma_max: Annotated[Parameter, Bound(0.5, 1.57)] = 1.56
     # [m/s] forward speed after contact is lost
-    v_lost: Annotated[float | jax.Array, Bound(0.001, 0.05, log=True)] = 0.01
-    sgn_0: float | jax.Array = 0.0  # [1] sgn(0), from 0 to 1
+    v_lost: Annotated[Parameter, Bound(0.001, 0.05, log=True)] = 0.01
+    sgn_0: Parameter = 0.0  # [1] sgn(0), from 0 to 1
 
     # Switches, each 0 or 1.
-    reactive: float | jax.Array = 1.0  # 1: RPS; 0: NPS (a_r = 0 and no Realignment)
-    keep_contact: float | jax.Array = 0.0  # 1: after a loss the last contact is used
-    saturate_first: float | jax.Array = 1.0  # 1: omega from the saturated v_x; 0: the unsaturated
-    clip_each: float | jax.Array = 0.0  # 1: v_x and v_y clipped one by one, not as a vector
+    reactive: Parameter = 1.0  # 1: RPS; 0: NPS (a_r = 0 and no Realignment)
+    keep_contact: Parameter = 0.0  # 1: after a loss the last contact is used
+    saturate_first: Parameter = 1.0  # 1: omega from the saturated v_x; 0: the unsaturated
+    clip_each: Parameter = 0.0  # 1: v_x and v_y clipped one by one, not as a vector
 
     @classmethod
     def paper(cls) -> RPSParams:
@@ -133,11 +133,10 @@ class Temperatures(NamedTuple):
     (l_cr - l_mr) / 4; above this width l_th has one equilibrium for each l.
     """
 
-    realign: float | jax.Array = 0.01  # Algorithm 1's |l| > l_th
-    # Eq. 5's ||d|| > d_th
-    d_th: Annotated[float | jax.Array, Bound(0.02, 2, log=True)] = 0.02
-    sgn: float | jax.Array = 0.01  # sgn(l)
-    arrive: float | jax.Array = 0.002  # ||d|| < d_success
+    realign: Parameter = 0.01  # Algorithm 1's |l| > l_th
+    d_th: Parameter = 0.02  # Eq. 5's ||d|| > d_th
+    sgn: Parameter = 0.01  # sgn(l)
+    arrive: Parameter = 0.002  # ||d|| < d_success
 
     def check(self) -> None:
         """Raise InputError for a temperature that is not a positive length."""
@@ -148,10 +147,10 @@ class Temperatures(NamedTuple):
 class RPSState(NamedTuple):
     """State of the law between two control steps."""
 
-    l_th: Float[Array, "*B"]  # [m] dynamic threshold: l_cr normally, l_mr while realigning
+    l_th: Floats  # [m] dynamic threshold: l_cr normally, l_mr while realigning
     p_robot_contact: Float[Array, "*B 2"]  # [m] the last contact, in the robot frame
     # Whether there was a contact; a weight in the smooth law.
-    touched: Bool[Array, "*B"] | Float[Array, "*B"]
+    touched: Bools | Floats
 
     @classmethod
     def init(cls, params: RPSParams, temperatures: Temperatures | None = None) -> RPSState:
@@ -189,10 +188,10 @@ def _sgn(params: RPSParams, x: jax.Array, temperature: ArrayLike | None) -> jax.
 
 def adaptive_rate(
     params: RPSParams,
-    l: Float[Array, "*B"],  # noqa: E741
-    distance: Float[Array, "*B"],
+    l: Floats,  # noqa: E741
+    distance: Floats,
     temps: Temperatures = HARD,
-) -> Float[Array, "*B"]:
+) -> Floats:
     """Compute Eq. 5: the adaptive rate a_r [1] from contact offset l [m] and ||d|| [m]."""
     logistic = jax.nn.sigmoid((jnp.abs(l) - params.beta) * params.k)
     a_r = (params.zeta + (params.eta - params.zeta) * logistic) * _sgn(params, l, temps.sgn)
@@ -200,18 +199,14 @@ def adaptive_rate(
     return soft.where(far, a_r, 0.0) * params.reactive
 
 
-def linear_velocity(
-    v_star: float | Float[Array, "*B"], a_r: float | Float[Array, "*B"]
-) -> tuple[Float[Array, "*B"], Float[Array, "*B"]]:
+def linear_velocity(v_star: PerWorld, a_r: PerWorld) -> tuple[Floats, Floats]:
     """Compute Eqs. 1-2: (v_x, v_y) [m/s] with norm v_star [m/s] and slope v_y / v_x = a_r [1]."""
     a_r = jnp.asarray(a_r) * 1.0  # convert to float, and keep the width
     length = planar.norm(jnp.stack([jnp.ones_like(a_r), a_r], axis=-1))
     return v_star / length, v_star * (a_r / length)
 
 
-def steering_angle(
-    params: RPSParams, d: Float[Array, "*B 2"], yaw: float | Float[Array, "*B"]
-) -> Float[Array, "*B"]:
+def steering_angle(params: RPSParams, d: Float[Array, "*B 2"], yaw: PerWorld) -> Floats:
     """Compute Eqs. 7-8: gamma = K_h (theta* - theta) [rad], with theta* the direction of d [m].
 
     The heading error is wrapped to [-pi, pi). The paper's tangent changes sign beyond pi / 2,
@@ -221,7 +216,7 @@ def steering_angle(
     return jnp.clip(gamma, -jnp.asarray(params.gamma_max), params.gamma_max)
 
 
-def realignment_gain(params: RPSParams, l: Float[Array, "*B"]) -> Float[Array, "*B"]:  # noqa: E741
+def realignment_gain(params: RPSParams, l: Floats) -> Floats:  # noqa: E741
     """Compute Eq. 10: sigma = 1 - |l| / l_cr [1], zero in the critical region."""
     return 1.0 - jnp.minimum(jnp.abs(l), params.l_cr) / params.l_cr
 

@@ -41,7 +41,7 @@ from rps_jax.control.laws import rps
 from rps_jax.control.laws.rps import RPSParams, RPSState, Temperatures
 from rps_jax.control.observation import Details, Observation, Twist, displacement
 from rps_jax.geometry import planar
-from rps_jax.geometry.arrays import Number, Scalar
+from rps_jax.geometry.arrays import Number, Parameter, Scalar
 
 FACING = 0.3  # [rad] P3's facing
 REACH = 0.45  # [m] P3's reach: the base's front is 0.36 m ahead of its centre
@@ -56,14 +56,14 @@ class RPSPlusParams(NamedTuple):
 
     law: RPSParams = RPSParams.tuned()._replace(v_approach=0.03)  # of Eqs. 1-10
     # [m] distance within which the base translates, P1
-    d_near: Annotated[float | jax.Array, Bound(0.05, 1, log=True)] = 0.25
+    d_near: Annotated[Parameter, Bound(0.05, 1, log=True)] = 0.25
     # [1] least share of the speed that is forward, P2
-    press: Annotated[float | jax.Array, Bound(0, 1)] = 0.2
+    press: Annotated[Parameter, Bound(0, 1)] = 0.2
     # [1] control steps without contact before P3: 2 s
-    n_lost: Annotated[float | jax.Array, Bound(10, 2000, log=True)] = 100
+    n_lost: Annotated[Parameter, Bound(10, 2000, log=True)] = 100
     # [1] share of v_max towards the last contact, P3
-    ahead: Annotated[float | jax.Array, Bound(0, 1)] = 0.7
-    aside: Annotated[float | jax.Array, Bound(0, 1)] = 0.5  # [1] share of v_max to the side, P3
+    ahead: Annotated[Parameter, Bound(0, 1)] = 0.7
+    aside: Annotated[Parameter, Bound(0, 1)] = 0.5  # [1] share of v_max to the side, P3
 
     @property
     def d_success(self) -> Number:
@@ -71,7 +71,7 @@ class RPSPlusParams(NamedTuple):
         return self.law.d_success
 
     @property
-    def v_max(self) -> float | jax.Array:
+    def v_max(self) -> Parameter:
         """Bound on the speed [m/s]."""
         return self.law.v_max
 

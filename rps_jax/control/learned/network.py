@@ -20,6 +20,7 @@ from rps_jax import errors
 from rps_jax.control.learned import features
 from rps_jax.control.learned.features import TouchState
 from rps_jax.control.observation import Details, TaxelObservation, Twist
+from rps_jax.geometry.arrays import Pair, Parameter
 
 NetworkKind = Literal["mlp", "gru"]
 Weights = dict[str, Any]  # float32 arrays by name, of NumPy or JAX
@@ -54,9 +55,7 @@ class Network(NamedTuple):
         """Return random weights, with a mean action near zero."""
         return init_weights(self.shapes, key, small=("action",))
 
-    def apply(
-        self, weights: Weights, hidden: jax.Array, inputs: jax.Array
-    ) -> tuple[jax.Array, jax.Array]:
+    def apply(self, weights: Weights, hidden: jax.Array, inputs: jax.Array) -> Pair:
         """Map features (..., F) to the hidden state (..., 2, H) and mean action (..., 3) [1]."""
         x = jnp.tanh(dense(weights, "first", mirror_pairs(inputs)))
         if self.kind == "mlp":
@@ -154,9 +153,9 @@ class PolicyState(NamedTuple):
 class LearnedParams(NamedTuple):
     """Parameters of a learned law. The weights are no parameters, but constants of the program."""
 
-    d_success: float | jax.Array = 0.05  # [m] target reached
-    v_max: float | jax.Array = 0.05  # [m/s] bound on the speed
-    omega_max: float | jax.Array = 0.15  # [rad/s] bound on |omega|
+    d_success: Parameter = 0.05  # [m] target reached
+    v_max: Parameter = 0.05  # [m/s] bound on the speed
+    omega_max: Parameter = 0.15  # [rad/s] bound on |omega|
 
 
 def observe_sent(

@@ -15,6 +15,7 @@ import numpy as np
 from rps_jax import errors
 from rps_jax.geometry.arrays import Array, Bool, Float, Scalar
 from rps_jax.geometry.footprint import Footprint
+from rps_jax.record.files import Arrays
 from rps_jax.record.options import check_fields
 from rps_jax.robot.shell import Shell
 from rps_jax.world.quantity import Range, check_ranges
@@ -59,7 +60,7 @@ class Course(Protocol):
         """Return the way [m] from a point (2,) [m] to the end, for rewards."""
         ...
 
-    def lines(self) -> dict[str, np.ndarray]:
+    def lines(self) -> Arrays:
         """Return what pictures show: polylines (..., N, 2) [m] by name, `path` and `walls`."""
         ...
 
@@ -138,7 +139,7 @@ class Task:
         `object_width` loads models.
         """
 
-    def measures(self, course: Any) -> dict[str, np.ndarray]:
+    def measures(self, course: Any) -> Arrays:
         """Return quantities (n,) of courses that the drawn numbers do not tell, by name."""
         return {}
 

@@ -19,9 +19,10 @@ import numpy as np
 from rps_jax import errors
 from rps_jax.geometry import footprint as fp
 from rps_jax.geometry import planar, polyline
-from rps_jax.geometry.arrays import Array, Entries, Float, Int, namespace_of
+from rps_jax.geometry.arrays import Array, Entries, Float, Floats, Ints, namespace_of
 from rps_jax.geometry.footprint import Footprint
 from rps_jax.geometry.polyline import Polyline, distances
+from rps_jax.record.files import Arrays
 from rps_jax.record.options import option
 from rps_jax.robot.shell import Shell
 from rps_jax.world.quantity import Range, check_unused, drawn
@@ -44,12 +45,12 @@ class CorridorProgress(NamedTuple):
     """Progress along the path, and the first touch of a wall."""
 
     path: PathProgress
-    clearance: Float[Array, "*B"]  # [m] least of base and object so far
-    wall_touch: Float[Array, "*B"]  # 0 nothing, 1 the base, 2 the object
+    clearance: Floats  # [m] least of base and object so far
+    wall_touch: Floats  # 0 nothing, 1 the base, 2 the object
     p_world_touch: Float[Array, "*B 2"]  # [m] NaN before a touch
-    measured: Float[Array, "*B"]  # [m] last measured distance from the walls
+    measured: Floats  # [m] last measured distance from the walls
     measured_at: Float[Array, "*B 2 3"]  # [m, m, rad] poses of base and object then
-    steps: Int[Array, "*B"]
+    steps: Ints
 
     def outcomes(self) -> dict[str, Array]:
         """Return the outcomes of the path, and of the walls."""
@@ -146,7 +147,7 @@ class CorridorCourse(NamedTuple):
         """Return the way along the path."""
         return self.path.remaining(progress.path, p_world_goal, point)
 
-    def lines(self) -> dict[str, np.ndarray]:
+    def lines(self) -> Arrays:
         """Return path and walls."""
         return self.path.lines() | {"walls": np.asarray(self.walls)}
 
@@ -189,7 +190,7 @@ class Corridor(Path):
         "touch_y": ("m", "y of the touch in the world"),
     }
 
-    MARKS: ClassVar[tuple[str, ...]] = ()
+    MARKS = ()
     FAILURES: ClassVar[dict[str, str]] = {"wall_touch": "touched a wall"}
 
     lookahead: Range = drawn(Range(0.6, 0.6), *LOOKAHEAD)  # short, since long ones cut corners

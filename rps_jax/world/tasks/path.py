@@ -15,9 +15,10 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 
 from rps_jax import errors
-from rps_jax.geometry import polyline
-from rps_jax.geometry.arrays import Array, Entries, Float, Int, namespace_of
+from rps_jax.geometry import polyline, solid
+from rps_jax.geometry.arrays import Array, Entries, Floats, Int, namespace_of
 from rps_jax.geometry.polyline import Polyline
+from rps_jax.record.files import Arrays
 from rps_jax.robot.shell import Shell
 from rps_jax.world.quantity import Range, check_unused, drawn
 from rps_jax.world.tasks.base import Aim, CourseInputs, Positions, Task
@@ -37,10 +38,10 @@ _EDGES = np.append(0.0025 * 1.5 ** np.arange(15), np.inf)
 class PathProgress(NamedTuple):
     """Progress of a trial along its path, and its cross-track errors."""
 
-    arc: Float[Array, "*B"]  # [m] of the nearest point so far
-    share: Float[Array, "*B"]  # [1] of the path's length
-    sum_error: Float[Array, "*B"]  # [m] over steps in contact
-    max_error: Float[Array, "*B"]  # [m]
+    arc: Floats  # [m] of the nearest point so far
+    share: Floats  # [1] of the path's length
+    sum_error: Floats  # [m] over steps in contact
+    max_error: Floats  # [m]
     counts: Int[Array, "*B 16"]  # steps in contact by the class of their error
 
     def outcomes(self) -> dict[str, Array]:
@@ -67,7 +68,7 @@ class PathCourse(NamedTuple):
     """Path of a world."""
 
     line: Polyline
-    lookahead: Float[Array, "*B"]  # [m]
+    lookahead: Floats  # [m]
 
     def start(self) -> PathProgress:
         """Return the progress at the start of the path."""
@@ -106,7 +107,7 @@ class PathCourse(NamedTuple):
         arc, away = polyline.nearest(self.line, point, *reach)
         return self.line.arcs[-1] - arc + away
 
-    def lines(self) -> dict[str, np.ndarray]:
+    def lines(self) -> Arrays:
         """Return the path."""
         return {"path": np.asarray(self.line.vertices)}
 
@@ -125,7 +126,7 @@ class Following(Task):
     # Along the path, from its nearest point to the law's target.
     lookahead: Range = drawn(Range(1.6, 1.6), *LOOKAHEAD)
 
-    def measures(self, course: Any) -> dict[str, np.ndarray]:
+    def measures(self, course: Any) -> Arrays:
         """Return length, number of turns and their mean angle."""
         line: Any = getattr(course, "path", course).line
         angles = np.abs(turns_of(np.asarray(line.vertices)))
@@ -139,7 +140,7 @@ class Path(Following):
     """Follow a path, given by its waypoints or drawn."""
 
     kind: str = "path"
-    MARKS: ClassVar[tuple[str, ...]] = ("waypoints",)
+    MARKS = ("waypoints",)
     MORE_NUMBERS: ClassVar[dict[str, int]] = {
         f"turn_angle_{i}": 52 + i for i in range(_SEGMENTS - 1)
     }
@@ -228,7 +229,7 @@ class Path(Following):
         lengths = np.where(k <= count, part, 0.0)
         lengths[:, :1] = np.maximum(lengths[:, :1], _LEAD)
         at = np.take_along_axis(np.stack(headings, 1), np.minimum(k, count).astype(int), 1)
-        steps = lengths[..., None] * np.stack([np.cos(at), np.sin(at)], axis=-1)
+        steps = lengths[..., None] * solid.unit(at)
         start = np.stack([front, 0 * front], axis=-1)[:, None]
         return np.concatenate([start, start + np.cumsum(steps, axis=1)], axis=1)
 

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from rps_jax.geometry import planar
 from rps_jax.geometry.arrays import Array
+from rps_jax.record.files import Arrays
 from rps_jax.world.tasks.base import Aim, CourseInputs, Positions, Task
 
 
@@ -23,7 +24,7 @@ class Nothing(NamedTuple):
         """Return the target as the aim."""
         return progress, Aim(positions.p_world_goal)
 
-    def lines(self) -> dict[str, np.ndarray]:
+    def lines(self) -> Arrays:
         """Return no lines."""
         return {}
 
@@ -41,7 +42,7 @@ class Reach(Task):
     """Reach a target, as in the paper."""
 
     kind: str = "reach"
-    HAS_TARGET: ClassVar[bool] = True
+    HAS_TARGET = True
 
     def courses(self, inputs: CourseInputs) -> tuple[np.ndarray, Nothing]:
         """Return the targets, and nothing else."""

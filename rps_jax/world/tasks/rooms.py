@@ -56,8 +56,8 @@ class Rooms(Following):
 
     kind: str = "rooms"
     OUTCOMES: ClassVar[dict[str, tuple[str, str]]] = Corridor.OUTCOMES
-    FAILURES: ClassVar[dict[str, str]] = Corridor.FAILURES
-    MARKS: ClassVar[tuple[str, ...]] = ("polygons", "outline", *_ROS, "tolerance", *_IGNORED)
+    FAILURES = Corridor.FAILURES
+    MARKS = ("polygons", "outline", *_ROS, "tolerance", *_IGNORED)
     # Tasks may share columns of random numbers: a world has one task.
     MORE_NUMBERS: ClassVar[dict[str, int]] = {"route": 58}
 
