@@ -9,15 +9,15 @@ versions, else within `TOLERANCE`.
 
 from __future__ import annotations
 
-import contextlib
 import fnmatch
 import functools
 import hashlib
-import io
 import json
 import platform
 import re
 import shlex
+import subprocess
+import sys
 import tempfile
 from collections.abc import Iterable, Mapping
 from importlib import metadata
@@ -27,7 +27,6 @@ from typing import Any, TypeAlias
 import numpy as np
 import xarray as xr
 
-from rps_jax.app import cli
 from rps_jax.record import files
 
 Record: TypeAlias = dict[str, Any]  # processor, versions, variables: digest, mean, size of each
@@ -198,11 +197,10 @@ def run(probe: str) -> Record:
         if word.startswith("RUNS/"):
             run(word.removeprefix("RUNS/"))
     words = [word.replace("RUNS", _folder().name) for word in words]
-    text = io.StringIO()
-    with contextlib.redirect_stdout(text), contextlib.redirect_stderr(text):
-        code = cli.main([*words, "--out", str(out)])
-    if code:
-        raise RuntimeError(f"the probe `rps {shlex.join(words)}` fails: {text.getvalue()[-400:]}")
+    command = [sys.executable, "-m", "rps_jax", *words, "--out", str(out)]
+    process = subprocess.run(command, capture_output=True, text=True, check=False)
+    if process.returncode:
+        raise RuntimeError(f"the probe `{shlex.join(command)}` fails: {process.stderr[-400:]}")
     return {
         "processor": _processor(),
         "versions": {name: metadata.version(name) for name in _PACKAGES},

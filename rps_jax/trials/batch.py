@@ -49,7 +49,7 @@ from rps_jax.world.physics import Physics
 if TYPE_CHECKING:
     from jaxlib._jax import Device, pytree  # pyright rejects the aliases of both
 
-_SEGMENT = 10.0  # [s] of simulated time in one call of a program; then slots are refilled
+SEGMENT = 10.0  # [s] of simulated time in one call of a program; then slots are refilled
 _REPORT_STEPS = 500  # control steps between two reports of an engine outside of JAX
 _FIRST_TRIALS = 16384  # of a job on a GPU in the first segment, while more are built
 _TAIL_SLOTS = 8192  # of a job, on a GPU on which no trial waits
@@ -548,7 +548,7 @@ def _run(
     start_time = monitor.elapsed
     advance = program.compiled(device)
     stages, rules = jax.device_put((program.stages, program.setting.rules), device)
-    steps = np.int32(max(1, round(_SEGMENT / program.setting.physics.control_period)))
+    steps = np.int32(max(1, round(SEGMENT / program.setting.physics.control_period)))
     monitor.add_compile_time((program, device), monitor.elapsed - start_time)
     end, unread = 0.0, deque[tuple[float, list[int], tuple[_State, ...]]]()
     delay = 0 if _tail_slots() is None else 1  # segments that run while the host reads another
