@@ -7,6 +7,7 @@ languages. As in JAX, NaN propagates, integer arithmetic wraps around, conversio
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any, TypeAlias
 
@@ -318,7 +319,7 @@ COMPOUNDS: dict[str, Function] = {
     "neg_u": lambda x: 0 - x,
     "not_u": lambda x: x ^ np.uint32(2**32 - 1),
     "rsqrt": lambda x, **_: 1 / jnp.sqrt(x),
-    "log2": lambda x, **_: jnp.log(x) / np.log(2),  # of versions of JAX from 0.11 on
+    "log2": lambda x, **_: jnp.log(x) / math.log(2),  # of versions of JAX from 0.11 on
     "exp2": lambda x, **_: lax.pow(jnp.full_like(x, 2), x),
     "logistic": lambda x, **_: 1 / (1 + jnp.exp(-x)),
     "is_finite": lambda x: jnp.abs(x) < jnp.inf,

@@ -4,8 +4,8 @@
    of a warp run each iteration together. `operations.h` follows. */
 
 #ifndef INFINITY
-#define INFINITY (1.0f / 0.0f) /* constants, as tables need */
-#define NAN (0.0f / 0.0f)
+#define INFINITY __builtin_huge_valf() /* constants, as tables need */
+#define NAN __builtin_nanf("")
 #endif
 #define WORLDS (32 / THREADS)
 #define ALL 0xffffffffu
