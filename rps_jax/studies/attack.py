@@ -112,7 +112,7 @@ class Attack(DomainQuestion[xr.Dataset], LawQuestion[xr.Dataset]):
             raise InputError(f"axes = {self.axes} is not allowed: name three quantities.")
         errors.check_each_once("axes", self.axes)
         for name in self.axes:
-            points.check_drawn("axes", name, self.ranges)
+            points.check_drawn(name, self.ranges)
         self.check_engine([self.params])
         errors.require("ribs", "failures")
 

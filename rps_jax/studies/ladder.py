@@ -29,6 +29,7 @@ from rps_jax.record.options import option
 from rps_jax.robot.robot import RobotLike
 from rps_jax.runs.question import (
     MultiLawQuestion,
+    Rows,
     Run,
     TaskOption,
     call_of,
@@ -237,7 +238,7 @@ class Score(Ladder, _ScoredLaw):
 score = call_of(Score)
 
 
-def score_row(sweep: Sweep, results: xr.Dataset, seed: int) -> list[list[str]]:
+def score_row(sweep: Sweep, results: xr.Dataset, seed: int) -> Rows:
     """Return a header and the row of the first law: rates of all laws, median time and worlds."""
     successes = results.success.values > 0
     rates = [tables.share(int(success.sum()), success.size) for success in successes]

@@ -180,7 +180,7 @@ class Corridor(Path):
     """Follow a path between walls."""
 
     kind: str = "corridor"
-    OUTCOMES: ClassVar[dict[str, tuple[str, str]]] = Path.OUTCOMES | {
+    OUTCOMES = Path.OUTCOMES | {
         "clearance": (
             "m",
             "least distance of base and object from the walls, every eighth control step",
