@@ -52,23 +52,20 @@ def contact_force(contact: Contact, x: Vec, physics: Physics) -> tuple[Vec, tupl
     h = n - mu * slip
     e_t, e_s = t / slip, s / slip
     pull = -d_m * h * mu  # normal force of a sliding contact
-    force = (
-        jnp.where(sticks, -d * x[0], pull),
-        jnp.where(sticks, -d_t * x[1], -pull * f * e_t),
-        jnp.where(sticks, -d_t * x[2], -pull * f * e_s),
-    )
+    force = pull, -pull * f * e_t, -pull * f * e_s
     nn = d_m * mu * mu
     along = nn * f * f  # of the slip
     across = pull * f * f / slip
     stiffness = (
-        jnp.where(sticks, d, nn),
-        jnp.where(sticks, 0.0, -nn * f * e_t),
-        jnp.where(sticks, 0.0, -nn * f * e_s),
-        jnp.where(sticks, d_t, along * e_t * e_t + across * e_s * e_s),
-        jnp.where(sticks, 0.0, (along - across) * e_t * e_s),
-        jnp.where(sticks, d_t, along * e_s * e_s + across * e_t * e_t),
+        nn,
+        -nn * f * e_t,
+        -nn * f * e_s,
+        along * e_t * e_t + across * e_s * e_s,
+        (along - across) * e_t * e_s,
+        along * e_s * e_s + across * e_t * e_t,
     )
-    return force, stiffness
+    sticking = (-d * x[0], -d_t * x[1], -d_t * x[2]), (d, 0.0, 0.0, d_t, 0.0, d_t)
+    return jax.tree.map(lambda a, b: jnp.where(sticks, a, b), sticking, (force, stiffness))
 
 
 def _pyramid(contact: Contact, x: Vec, physics: Physics) -> tuple[Vec, tuple[Number, ...]]:
