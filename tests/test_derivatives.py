@@ -238,7 +238,7 @@ test_invalid_rollouts_are_refused = refusals(
     (ROUTE | {"params": RPSParams(K_h=float("nan"))}, "rps.K_h = nan"),
     (
         ROUTE | {"params": rps_jax.control.registry.LAWS["pursuit"], "smooth": True},
-        "smooth = True .* has no smooth form; choose rps or rps_plus, or smooth=False",
+        "smooth = True .* has no smooth form; choose rps.*, rps_plus, or smooth=False",
     ),
 )
 
@@ -259,7 +259,7 @@ test_invalid_rollouts_are_refused = refusals(
         ({"wrt": "mass", "domain": "paper"}, "wrt = mass .* leave no mass to draw"),
         ({"wrt": "distance", "domain": "paper"}, "wrt = distance .* its targets leave no distance"),
         ({"wrt": 3}, "wrt = 3"),
-        ({"laws": "pursuit", "wrt": "K_v"}, "smooth = True .* PursuitParams has no smooth form"),
+        ({"laws": "pursuit", "wrt": "K_v"}, "smooth = True .* this law has no smooth form"),
         ({"laws": ("rps", "rps_plus")}, "unknown name of wrt 'K_h'.*law.K_h"),
         ({"laws": "straight"}, "unknown law 'straight'"),
         ({"domain": "wild"}, "unknown domain 'wild'"),

@@ -366,7 +366,7 @@ def test_previous_environments_of_a_run_are_kept(tmp_path):
 
 def test_an_editable_install_records_the_version_of_its_code(monkeypatch):
     """The metadata of an editable install stay those of the last installation."""
-    monkeypatch.setattr(provenance.importlib.metadata, "version", lambda name: "0.0.1")
+    monkeypatch.setattr(provenance.metadata, "version", lambda name: "0.0.1")
     versions = provenance.collect_environment()["packages"]
     assert (versions["rps_jax"], versions["jax"]) == (rps_jax.__version__, "0.0.1")
 

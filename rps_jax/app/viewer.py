@@ -14,14 +14,14 @@ import queue
 import threading
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from rps_jax import engines, errors
+from rps_jax import errors
 from rps_jax.app.drawing import TARGET, Drawing, furnish
 from rps_jax.app.gate import HOST, Gate, accepts_update, check_guarded
 from rps_jax.control import registry
@@ -73,7 +73,7 @@ class View(Action[None], Case):
     """Index of the world in the sweep."""
     port: int = option(8080, 0, 65535, kw_only=True)
     """Port to serve the page on; 0 takes any that is free."""
-    setting: Setting = field(default=Setting(), kw_only=True)
+    setting: Setting = option(Setting(), kw_only=True)
     out: Path | str | None = option(None, kw_only=True, hidden=True)
     progress: bool | None = option(False, kw_only=True, hidden=True)
 
@@ -88,14 +88,14 @@ class View(Action[None], Case):
 
     def note(self) -> str:
         """Whether another engine than the run's is shown."""
-        if self.run is None or engines.get(load_plan(Path(self.run)).setting.engine).traced:
+        if self.run is None or load_plan(Path(self.run)).setting.simulator.traced:
             return ""
         return "The viewer has no such engine as this run: this is the engine fused."
 
     def check(self) -> None:
         """Check the push, or the world."""
         self.setting.check_here(self.case.base, [self.case.params])
-        engines.get(self.setting.engine).check_traced()
+        self.setting.simulator.check_traced()
         if self.run is not None:
             self._chosen(self.run)
 
@@ -105,7 +105,7 @@ class View(Action[None], Case):
     def _chosen(self, run: str | Path) -> tuple[Plan, str]:
         """The plan and the law of a run that is shown."""
         plan, law = select_law(Path(run), self.world, None if self.law is None else str(self.law))
-        if not engines.get(plan.setting.engine).traced:
+        if not plan.setting.simulator.traced:
             setting = dataclasses.replace(plan.setting, engine="fused")
             plan = dataclasses.replace(plan, setting=setting)
         return plan, law

@@ -10,7 +10,17 @@ from typing import NamedTuple, TypeVar
 import jax.numpy as jnp
 
 from rps_jax.geometry import planar
-from rps_jax.geometry.arrays import Array, Bool, Bools, Float, Floats, Number, PerWorld, Scalar
+from rps_jax.geometry.arrays import (
+    Array,
+    Bool,
+    Bools,
+    Float,
+    Floats,
+    Number,
+    PerWorld,
+    Scalar,
+    Vector,
+)
 
 # Displacements are clipped to this distance [m], so that no finite float32 overflows.
 _WORLD_SIZE = 1e9
@@ -19,11 +29,11 @@ _WORLD_SIZE = 1e9
 class Observation(NamedTuple):
     """Observation of a law that senses touch: odometry, the contact and the target."""
 
-    p_world_robot: Float[Array, "2"]  # [m]
+    p_world_robot: Vector  # [m]
     yaw: Scalar  # [rad] heading of the robot in the world
-    p_robot_contact: Float[Array, "2"]  # [m] contact point; ignored unless in_contact
+    p_robot_contact: Vector  # [m] contact point; ignored unless in_contact
     in_contact: Bool[Array, ""] | Float[Array, ""]  # for a smooth law also a weight from 0 to 1
-    p_world_target: Float[Array, "2"]  # [m]
+    p_world_target: Vector  # [m]
     period: Scalar = 0.02  # [s] since the last control step
     base_radius: Number | None = None  # [m] of a round base; None: a rectangle
 
@@ -48,14 +58,14 @@ class ForceObservation(NamedTuple):
     """Observation of a law that also senses the contact force."""
 
     touch: Observation
-    f_robot: Float[Array, "2"]  # [N] of the object on the base, in its frame: see `LoadCell`
+    f_robot: Vector  # [N] of the object on the base, in its frame: see `LoadCell`
 
 
 class PoseObservation(NamedTuple):
     """Observation of a law that also senses the object's position and size."""
 
     touch: Observation
-    p_world_object: Float[Array, "2"]  # [m]
+    p_world_object: Vector  # [m]
     r_object: Scalar  # [m] radius of the object's outline
 
 
@@ -80,9 +90,7 @@ class Twist(NamedTuple):
     omega: PerWorld  # [rad/s] counter-clockwise
 
     @classmethod
-    def from_point_velocity(
-        cls, p_robot: Float[Array, "2"], v_robot: Float[Array, "2"], omega: Scalar
-    ) -> Twist:
+    def from_point_velocity(cls, p_robot: Vector, v_robot: Vector, omega: Scalar) -> Twist:
         """Return the twist that moves the base's point `p_robot` [m] at `v_robot` [m/s]."""
         return cls(v_robot[0] + omega * p_robot[1], v_robot[1] - omega * p_robot[0], omega)
 
@@ -118,7 +126,7 @@ class Details(NamedTuple):
         return cls(obs.l, distance, zero, zero, zero > 0)
 
 
-def displacement(obs: Observation) -> Float[Array, "2"]:
+def displacement(obs: Observation) -> Vector:
     """Compute Eq. 4, d = p^W_T - (p^W_R + R^W_R p^R_C) [m]: from contact to target, in W."""
     p_world_contact = obs.p_world_robot + planar.rotate(obs.yaw, obs.p_robot_contact)
     return jnp.clip(obs.p_world_target - p_world_contact, -_WORLD_SIZE, _WORLD_SIZE)

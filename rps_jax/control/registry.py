@@ -107,7 +107,8 @@ def smooth_law(law: Law, temperatures: Smoothing | None = None) -> Law:
     """
     if law.temperatures is None:
         names = ", ".join(k for k, x in LAWS.items() if law_of(x).temperatures is not None)
-        raise InputError(f"this law has no smooth form, which gradients need: choose {names}.")
+        rule = f"this law has no smooth form; choose {names}, or smooth=False, whose derivatives "
+        raise errors.not_allowed("smooth", True, f"{rule}miss all switches of the law")
     return _smooth_law(law, law.temperatures if temperatures is None else temperatures)
 
 

@@ -43,6 +43,7 @@ from rps_jax.lowering.writer import HANDLER, SimdWriter
 from rps_jax.record import cache
 
 Pytree: TypeAlias = Any  # of arrays; functions of this module take any
+Function: TypeAlias = Callable[..., Pytree]
 # XLA, too, fuses a sum with the product before it. No other optimisation may change results.
 _FLAGS = ("-O2", "-march=native", "-fno-math-errno", "-ffp-contract=fast", "-w")
 # Without these passes the compiler takes half of the time, and the functions are as fast.
@@ -96,11 +97,11 @@ def target() -> str | None:
 
 
 def batched(
-    function: Callable[..., Pytree],
-    whole: Callable[..., Pytree],
+    function: Function,
+    whole: Function,
     saves: bool = False,
     always: bool = False,
-) -> Callable[..., Pytree]:
+) -> Function:
     """Return a function of a batch of worlds (B, ...) that runs world by world.
 
     Its derivatives in both modes are compiled as the function itself is.
@@ -141,9 +142,7 @@ def batched(
     return call
 
 
-def compared(
-    function: Callable[..., Pytree], types: Sequence[Pytree], compare: Callable[[], str]
-) -> str:
+def compared(function: Function, types: Sequence[Pytree], compare: Callable[[], str]) -> str:
     """Return the result of comparing a function with XLA's; it is cached with the function.
 
     Args:
@@ -165,7 +164,7 @@ def compared(
     return result
 
 
-def mapped(function: Callable[..., Pytree], axes: Sequence[int | None]) -> Callable[..., Pytree]:
+def mapped(function: Function, axes: Sequence[int | None]) -> Function:
     """Return `jax.vmap(function, axes)`, compiled and differentiated world by world.
 
     An argument of axis None is repeated for each world.
@@ -287,7 +286,7 @@ def _tangents(
 
 
 def concurrent(
-    functions: Sequence[Callable[..., Pytree]],
+    functions: Sequence[Function],
     whole: Callable[..., Sequence[Pytree]],
     sort_by: Callable[..., jax.Array] | None = None,
 ) -> Callable[..., Any]:
@@ -373,7 +372,7 @@ class _Function:
     """The jaxpr of a function of one world, and the shapes of the results of a batch."""
 
     def __init__(
-        self, function: Callable[..., Pytree], tree: Any, types: Sequence[tuple[Any, Any]],
+        self, function: Function, tree: Any, types: Sequence[tuple[Any, Any]],
         sort_by: Callable[..., jax.Array] | None,
     ) -> None:  # fmt: skip
         self.inputs = [jax.ShapeDtypeStruct(shape[1:], dtype) for shape, dtype in types]

@@ -23,6 +23,7 @@ Floats = Float[Array, "*B"]
 PerWorld = float | Floats  # or one for all worlds
 Ints = Int[Array, "*B"]
 Bools = Bool[Array, "*B"]
+Vector = Float[Array, "2"]  # in the plane: x and y
 Number = float | Array | np.ndarray  # of one world, or of a batch, of any shape
 Pair = tuple[Array, Array]
 Parameter = float | Array  # of a law or a sensor; an array in a batch

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 
 from rps_jax import errors
 from rps_jax.geometry import planar
-from rps_jax.geometry.arrays import Array, Float, Floats, Number, Scalar
+from rps_jax.geometry.arrays import Array, Float, Floats, Number, Scalar, Vector
 
 
 class Footprint(NamedTuple):
@@ -68,7 +68,7 @@ def check_corners(name: str, vertices: ArrayLike) -> np.ndarray:
     return points
 
 
-def place(footprint: Footprint, position: Float[Array, "2"], yaw: Scalar) -> Footprint:
+def place(footprint: Footprint, position: Vector, yaw: Scalar) -> Footprint:
     """Return the footprint of an object at `position` [m] and `yaw` [rad] in another frame."""
     return footprint._replace(vertices=planar.rotate(yaw, footprint.vertices) + position)
 
@@ -112,7 +112,7 @@ def signed_distance(footprint: Footprint, point: Float[Array, "*P 2"]) -> Float[
 
 
 def crossing(
-    footprint: Footprint, origin: Float[Array, "2"], along: Float[Array, "2"], tolerance: Scalar
+    footprint: Footprint, origin: Vector, along: Vector, tolerance: Scalar
 ) -> tuple[Float[Array, ""], Float[Array, ""]]:
     """Return the interval of a line that lies within `tolerance` [m] of the footprint.
 

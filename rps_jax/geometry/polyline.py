@@ -11,7 +11,7 @@ import numpy as np
 
 from rps_jax.geometry import footprint as fp
 from rps_jax.geometry import planar
-from rps_jax.geometry.arrays import Array, Float, Int, Pair, Scalar, namespace_of
+from rps_jax.geometry.arrays import Array, Float, Int, Pair, Scalar, Vector, namespace_of
 from rps_jax.geometry.footprint import Footprint
 
 
@@ -51,7 +51,7 @@ class _Segments(NamedTuple):
         return cls(x[:-1], y[:-1], jnp.diff(x) * scale, jnp.diff(y) * scale, line.arcs[:-1], length)
 
 
-def at_arc(line: Polyline, arc: Scalar) -> Float[Array, "2"]:
+def at_arc(line: Polyline, arc: Scalar) -> Vector:
     """Return the point [m] of one polyline at an arc length [m], at most its whole length."""
     segments = _Segments.from_line(line)
     passed = jnp.clip(arc - segments.first, 0.0, segments.length)
@@ -60,7 +60,7 @@ def at_arc(line: Polyline, arc: Scalar) -> Float[Array, "2"]:
 
 
 def nearest(
-    line: Polyline, point: Float[Array, "2"], low: Scalar, high: Scalar
+    line: Polyline, point: Vector, low: Scalar, high: Scalar
 ) -> tuple[Float[Array, ""], Float[Array, ""]]:
     """Return the arc length [m] of the nearest point of one polyline, and its distance [m].
 
@@ -125,7 +125,7 @@ def clearance(
     return distance[chosen] - outline.radius, chosen
 
 
-def nearest_on_wall(outline: Footprint, wall: Float[Array, "2 2"]) -> Float[Array, "2"]:
+def nearest_on_wall(outline: Footprint, wall: Float[Array, "2 2"]) -> Vector:
     """Return the point [m] of one wall that is nearest to an outline."""
     along, way = wall[1] - wall[0], outline.vertices - wall[0]
     pair = (way[:, 0], way[:, 1]), _Vectors.from_components(along[0], along[1])

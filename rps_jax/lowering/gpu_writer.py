@@ -24,7 +24,7 @@ from rps_jax.lowering.nodes import (
     view_of,
 )
 from rps_jax.lowering.operations import GPU_HEADER, TYPES, defined
-from rps_jax.lowering.target import Params, TooLargeError, Typed, Value, size_of
+from rps_jax.lowering.target import Params, Shape, TooLargeError, Typed, Value, Values, size_of
 from rps_jax.lowering.writer import STORED, SimdWriter, Writer
 
 WARP = 32
@@ -63,7 +63,7 @@ class GpuNodes(SimdNodes):
         super().__init__()
         self._gathers: dict[Hashable, Array] = {}
 
-    def gathered(self, scalars: Sequence[Value], kind: str, shape: tuple[int, ...]) -> Array:
+    def gathered(self, scalars: Values, kind: str, shape: Shape) -> Array:
         """Gather scalars; many that the same operation computes become one array operation."""
         scalars = tuple(map(_source, scalars))
         if len(scalars) <= WARP:
@@ -99,7 +99,7 @@ class GpuNodes(SimdNodes):
         ]
         return Array(self.node(first.op, args, kind, size, first.extra), 0, 1, (size,))
 
-    def apply(self, name: str, values: Sequence[Value], params: Params, out: Typed) -> Value:
+    def apply(self, name: str, values: Values, params: Params, out: Typed) -> Value:
         """Apply a primitive; sums over threads are added before they are exchanged."""
         sums = (_SUM, f"{name}_f")
         if name in ("add", "sub") and size_of(out.shape) == 1 and out.dtype == np.float32:

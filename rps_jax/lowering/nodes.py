@@ -19,14 +19,17 @@ from jax.extend.core import ClosedJaxpr
 
 from rps_jax.lowering.operations import SIMD_HEADER, defined
 from rps_jax.lowering.target import (
+    DTYPES,
     REDUCTIONS,
     Body,
     Params,
+    Shape,
     Target,
     TooLargeError,
     Typed,
     UnsupportedError,
     Value,
+    Values,
     is_constant,
     kind_of,
     operation_of,
@@ -39,7 +42,6 @@ INITIAL = {
     **{("add", "f"): 0.0, ("add", "i"): 0, ("max", "f"): -np.inf, ("min", "f"): np.inf},
     **{("max", "i"): -(2**31), ("min", "i"): 2**31 - 1, ("and", "b"): True, ("or", "b"): False},
 }
-_DTYPES = {"f": "float32", "i": "int32", "u": "uint32", "b": "bool"}
 # Operations that are not computed in a loop over their numbers.
 _SINGLE = ("move", "take", "while", "for", "if", "input", "part", "product")
 
@@ -110,12 +112,12 @@ class Array(NamedTuple):
     node: Node
     first: int
     step: int
-    shape: tuple[int, ...]
+    shape: Shape
 
     @property
     def dtype(self) -> np.dtype:
         """Type of the numbers in JAX."""
-        return np.dtype(_DTYPES[self.node.kind])
+        return np.dtype(DTYPES[self.node.kind])
 
 
 Factor: TypeAlias = tuple[Value, np.ndarray]  # a value and its flat indices (batch, rows, summed)
@@ -132,7 +134,7 @@ class SimdNodes(Target):
         self._numbers = itertools.count()
         self._known: list[dict[Hashable, Node]] = [{}]  # of each loop that is being built
 
-    def node(self, op: str, args: Sequence[Value], kind: str, size: int, extra: Any = None) -> Node:
+    def node(self, op: str, args: Values, kind: str, size: int, extra: Any = None) -> Node:
         """Return the node of an operation, a new one or an equal one."""
         key = (op, tuple(map(key_of, args)), kind, size, extra)
         for known in self._known:
@@ -149,11 +151,11 @@ class SimdNodes(Target):
           UnsupportedError: the target has no such numbers.
         """
         kind = kind_of(dtype, name, self.kinds)
-        if np.dtype(_DTYPES[kind]).itemsize != getattr(dtype, "itemsize", 0):
+        if np.dtype(DTYPES[kind]).itemsize != getattr(dtype, "itemsize", 0):
             raise UnsupportedError(f"{name} of {dtype}")
         return kind
 
-    def input(self, index: int, shape: tuple[int, ...], dtype: object) -> Array:
+    def input(self, index: int, shape: Shape, dtype: object) -> Array:
         """Return an argument of the function."""
         kind, size = self.kind(dtype, "an argument"), size_of(shape)
         return Array(self.node("input", (), kind, size, index), 0, 1, shape)
@@ -162,7 +164,7 @@ class SimdNodes(Target):
         """Return one number of a value."""
         return element(value, index)
 
-    def moved(self, values: Sequence[Value], indices: np.ndarray, template: Typed) -> Value:
+    def moved(self, values: Values, indices: np.ndarray, template: Typed) -> Value:
         """Gather numbers at constant indices: a view of a node where that suffices."""
         starts = np.cumsum([0, *(size_of(np.shape(v)) for v in values)])
         flat_indices = indices.reshape(-1)
@@ -179,11 +181,11 @@ class SimdNodes(Target):
         kind = self.kind(template.dtype, "move")
         return view_of(sources, indices.shape) or self.gathered(sources, kind, indices.shape)
 
-    def gathered(self, scalars: Sequence[Value], kind: str, shape: tuple[int, ...]) -> Array:
+    def gathered(self, scalars: Values, kind: str, shape: Shape) -> Array:
         """Return scalars of several nodes as an array."""
         return Array(self.node("move", scalars, kind, len(scalars)), 0, 1, shape)
 
-    def apply(self, name: str, values: Sequence[Value], params: Params, out: Typed) -> Value:
+    def apply(self, name: str, values: Values, params: Params, out: Typed) -> Value:
         """Apply a primitive element by element, or as a reduction, a product or a slice."""
         kind = self.kind(out.dtype, name)
         if name in REDUCTIONS:
@@ -250,7 +252,7 @@ class SimdNodes(Target):
             parts.append(np.zeros_like(template) if total is None else total)
         return parts
 
-    def _slice(self, value: Value, starts: Sequence[Value], sizes: Sequence[int], kind: str) -> Any:
+    def _slice(self, value: Value, starts: Values, sizes: Sequence[int], kind: str) -> Any:
         """Slice an array at an index that is known at run time, clamped to the array."""
         shape = np.shape(value)
         index, table = self.windows(shape, starts, sizes)
@@ -265,16 +267,16 @@ class SimdNodes(Target):
 
     # --- loops ---
 
-    def for_loop(self, body: Body, carry: Sequence[Value], length: int) -> list[Value]:
+    def for_loop(self, body: Body, carry: Values, length: int) -> list[Value]:
         """Emit a loop of `length` iterations."""
         return self._loop(None, body, carry, length)
 
-    def while_loop(self, condition: Body, body: Body, carry: Sequence[Value]) -> list[Value]:
+    def while_loop(self, condition: Body, body: Body, carry: Values) -> list[Value]:
         """Emit a loop that each lane leaves when its own condition fails."""
         return self._loop(condition, body, carry, None)
 
     def _loop(
-        self, condition: Body | None, body: Body, carry: Sequence[Value], length: int | None
+        self, condition: Body | None, body: Body, carry: Values, length: int | None
     ) -> list[Value]:
         carried, current = list[Node](), list[Value]()
         for x in carry:
@@ -359,7 +361,7 @@ def element(value: Value, index: int) -> Value:
     return np.asarray(value).reshape(-1)[index]
 
 
-def view_of(scalars: Sequence[Value], shape: tuple[int, ...]) -> Array | None:
+def view_of(scalars: Values, shape: Shape) -> Array | None:
     """Return scalars as a view of their node if they are consecutive or equal there."""
     first = scalars[0]
     if all(isinstance(a, Array) and a.node is first.node for a in scalars):

@@ -11,19 +11,21 @@ import numpy as np
 from rps_jax import errors
 from rps_jax.lowering.operations import spelled
 from rps_jax.lowering.target import (
+    DTYPES,
     REDUCTIONS,
     Params,
+    Shape,
     Target,
     Typed,
     UnsupportedError,
     Value,
+    Values,
     kind_of,
     operation_of,
     size_of,
 )
 
 _OPSET, _FORMAT = 18, 9  # versions of the operators and of the file
-_DTYPES = {"f": np.float32, "i": np.int32, "b": np.bool_, "u": np.uint32}
 _OPERATORS = spelled("onnx")
 _REDUCED = {"add": "ReduceSum", "mul": "ReduceProd", "max": "ReduceMax", "min": "ReduceMin"}
 
@@ -32,14 +34,14 @@ class Tensor(NamedTuple):
     """A value of the graph."""
 
     name: str
-    shape: tuple[int, ...]
+    shape: Shape
     kind: str
     about: str = ""
 
     @property
     def dtype(self) -> np.dtype:
         """Type of the numbers."""
-        return np.dtype(_DTYPES[self.kind])
+        return np.dtype(DTYPES[self.kind])
 
 
 class Graph(Target):
@@ -63,7 +65,7 @@ class Graph(Target):
             return value
         array = np.asarray(value)
         kind = kind_of(array.dtype)
-        return self.constant(array.astype(_DTYPES[kind]), kind)
+        return self.constant(array.astype(DTYPES[kind]), kind)
 
     def constant(self, array: np.ndarray, kind: str = "") -> Tensor:
         """Return a constant as a tensor."""
@@ -92,7 +94,7 @@ class Graph(Target):
         to = self.constant(np.array(shape, np.int64))
         return self.node("Reshape", [tensor, to], shape, tensor.kind)
 
-    def moved(self, values: Sequence[Value], indices: np.ndarray, template: Typed) -> Value:
+    def moved(self, values: Values, indices: np.ndarray, template: Typed) -> Value:
         """Gather numbers at constant indices: a reshape or an expansion where that suffices."""
         if not indices.size:
             return np.zeros(indices.shape, template.dtype)
@@ -107,7 +109,7 @@ class Graph(Target):
             whole = self.node("Gather", [whole, at], (indices.size,), kind, axis=0)
         return self.reshaped(whole, indices.shape)
 
-    def apply(self, name: str, values: Sequence[Value], params: Params, out: Typed) -> Tensor:
+    def apply(self, name: str, values: Values, params: Params, out: Typed) -> Tensor:
         x, shape, kind = [self.tensor(value) for value in values], out.shape, kind_of(out.dtype)
         if name in REDUCTIONS:
             return self._reduced(REDUCTIONS[name], x[0], params["axes"], out, kind)
@@ -128,9 +130,7 @@ class Graph(Target):
         attributes = {"Mod": {"fmod": 1}, "Cast": {"to": self._type(kind)}}
         return self.node(operator, x, shape, kind, **attributes.get(operator, {}))
 
-    def _slice(
-        self, x: Tensor, starts: Sequence[Value], sizes: Sequence[int], out: Typed
-    ) -> Tensor:
+    def _slice(self, x: Tensor, starts: Values, sizes: Sequence[int], out: Typed) -> Tensor:
         """Slice a tensor at an index that is known at run time, clamped to the tensor."""
         index, table = self.windows(x.shape, starts, sizes)
         windows, size = self.constant(table.astype(np.int64)), size_of(sizes)
@@ -143,7 +143,7 @@ class Graph(Target):
         return self.node("Cast", [x], x.shape, kind, to=self._type(kind))
 
     def _type(self, kind: str) -> int:
-        return self.onnx.helper.np_dtype_to_tensor_dtype(np.dtype(_DTYPES[kind]))
+        return self.onnx.helper.np_dtype_to_tensor_dtype(np.dtype(DTYPES[kind]))
 
     def _reduced(
         self, binary: str, x: Tensor, axes: Sequence[int], out: Typed, kind: str

@@ -12,7 +12,7 @@ import numpy as np
 from jax.extend.core import ClosedJaxpr
 
 from rps_jax import errors
-from rps_jax.lowering.target import kind_of, size_of
+from rps_jax.lowering.target import Shape, kind_of, size_of
 from rps_jax.lowering.walk import traced
 
 Pytree: TypeAlias = Any  # of arrays or of `jax.ShapeDtypeStruct`
@@ -23,7 +23,7 @@ class Field(NamedTuple):
     """A named number or array of a group."""
 
     name: str
-    shape: tuple[int, ...]
+    shape: Shape
     kind: str  # f, i or b
     about: str = ""  # unit and meaning
     value: np.ndarray | None = None  # initial value

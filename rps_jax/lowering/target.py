@@ -12,21 +12,24 @@ from rps_jax.errors import InputError
 
 # A constant (`np.ndarray`) or whatever a target returns for an array of the jaxpr.
 Value: TypeAlias = Any
+Shape: TypeAlias = tuple[int, ...]
+Values: TypeAlias = Sequence[Value]
 Params: TypeAlias = Mapping[str, Any]  # static parameters of a primitive
-Body: TypeAlias = Callable[[Sequence[Value]], list[Value]]  # of a loop, from its carry
+Body: TypeAlias = Callable[[Values], list[Value]]  # of a loop, from its carry
 
 # Binary operation that each reduction repeats.
 REDUCTIONS = {
     **{"reduce_sum": "add", "reduce_prod": "mul", "reduce_max": "max", "reduce_min": "min"},
     **{"reduce_and": "and", "reduce_or": "or", "reduce_xor": "xor"},
 }
+DTYPES = {"f": "float32", "i": "int32", "u": "uint32", "b": "bool"}  # by kind
 
 
 class Typed(Protocol):
     """Anything with a shape and a dtype, as an abstract value of JAX."""
 
     @property
-    def shape(self) -> tuple[int, ...]:
+    def shape(self) -> Shape:
         """Sizes of the axes."""
         ...
 
@@ -58,19 +61,19 @@ class Target:
 
     # --- what each back end implements ---
 
-    def moved(self, values: Sequence[Value], indices: np.ndarray, template: Typed) -> Value:
+    def moved(self, values: Values, indices: np.ndarray, template: Typed) -> Value:
         """Gather numbers of the concatenated, flattened values at constant indices."""
         raise NotImplementedError
 
-    def apply(self, name: str, values: Sequence[Value], params: Params, out: Typed) -> Value:
+    def apply(self, name: str, values: Values, params: Params, out: Typed) -> Value:
         """Apply a primitive; `out` is the type of the result."""
         raise NotImplementedError
 
-    def for_loop(self, body: Body, carry: Sequence[Value], length: int) -> list[Value] | None:
+    def for_loop(self, body: Body, carry: Values, length: int) -> list[Value] | None:
         """Emit a loop of `length` iterations; None: the loop is unrolled."""
         return None
 
-    def while_loop(self, condition: Body, body: Body, carry: Sequence[Value]) -> list[Value]:
+    def while_loop(self, condition: Body, body: Body, carry: Values) -> list[Value]:
         """Emit a loop that runs while its condition holds."""
         raise UnsupportedError("while")
 
@@ -86,7 +89,7 @@ class Target:
         return result
 
     def windows(
-        self, shape: Sequence[int], starts: Sequence[Value], sizes: Sequence[int]
+        self, shape: Sequence[int], starts: Values, sizes: Sequence[int]
     ) -> tuple[Value, np.ndarray]:
         """Return the index of the window at a start, clamped, and the indices in each window."""
         positions = np.arange(size_of(shape)).reshape(shape)

@@ -17,14 +17,16 @@ import numpy as np
 from jax import lax
 from jax.extend.core import ClosedJaxpr, Jaxpr, JaxprEqn, Literal, jaxpr_as_fun
 
-from rps_jax.lowering.compounds import COMPOUNDS, fill_of
+from rps_jax.lowering.compounds import COMPOUNDS, Function, fill_of
 from rps_jax.lowering.target import (
     Body,
     Params,
+    Shape,
     Target,
     Typed,
     UnsupportedError,
     Value,
+    Values,
     is_constant,
     kind_of,
     operation_of,
@@ -57,7 +59,7 @@ _BY_NUMPY: dict[str, Callable[[np.ndarray, Params], Sequence[np.ndarray]]] = {
 _IDENTITIES = ("stop_gradient", "copy", "copy_p", "optimization_barrier", "pvary", "name")
 
 
-def traced(function: Callable[..., Any], *arguments: Any) -> tuple[ClosedJaxpr, Any]:
+def traced(function: Function, *arguments: Any) -> tuple[ClosedJaxpr, Any]:
     """Return the jaxpr of a function in float64, and the shapes of its results.
 
     A target rounds constants to its own precision; in float32 they would be rounded twice.
@@ -66,13 +68,13 @@ def traced(function: Callable[..., Any], *arguments: Any) -> tuple[ClosedJaxpr, 
         return jax.make_jaxpr(function, return_shape=True)(*arguments)
 
 
-def walk(closed: ClosedJaxpr, arguments: Sequence[Value], target: Target) -> list[Value]:
+def walk(closed: ClosedJaxpr, arguments: Values, target: Target) -> list[Value]:
     """Return the results of a closed jaxpr as values of a target."""
     with jax.enable_x64(True):
         return _walk(closed, arguments, target)
 
 
-def _walk(closed: ClosedJaxpr | Jaxpr, arguments: Sequence[Value], target: Target) -> list[Value]:
+def _walk(closed: ClosedJaxpr | Jaxpr, arguments: Values, target: Target) -> list[Value]:
     jaxpr = closed.jaxpr if isinstance(closed, ClosedJaxpr) else closed
     consts = closed.consts if isinstance(closed, ClosedJaxpr) else ()
     values: dict[Any, Value] = dict(zip(jaxpr.constvars, map(np.asarray, consts), strict=True))
@@ -89,7 +91,7 @@ def _walk(closed: ClosedJaxpr | Jaxpr, arguments: Sequence[Value], target: Targe
     return [read(atom) for atom in jaxpr.outvars]
 
 
-def _results(eqn: JaxprEqn, values: list[Value], target: Target) -> Sequence[Value]:
+def _results(eqn: JaxprEqn, values: list[Value], target: Target) -> Values:
     """Return the results of one equation."""
     name, params = eqn.primitive.name, eqn.params
     types, outs = _types(eqn.invars), _types(eqn.outvars)
@@ -142,7 +144,7 @@ def _types(atoms: Sequence[Any]) -> list[Typed]:
 
 
 def _apply(
-    name: str, values: Sequence[Value], types: Sequence[Typed], params: Params, out: Typed,
+    name: str, values: Values, types: Sequence[Typed], params: Params, out: Typed,
     target: Target,
 ) -> Value:  # fmt: skip
     """Apply a primitive: by the target if it spells the operation, else as a compound."""
@@ -160,15 +162,13 @@ def _apply(
     return target.apply(name, values, params, out)
 
 
-def _expanded(
-    function: Callable[..., Any], values: Sequence[Value], types: Sequence[Typed], target: Target
-) -> Sequence[Value]:
+def _expanded(function: Function, values: Values, types: Sequence[Typed], target: Target) -> Values:
     """Return the results of a function of JAX of values."""
     shapes = [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in types]
     return _walk(jax.make_jaxpr(function)(*shapes), values, target)
 
 
-def _with_consts(closed: ClosedJaxpr, consts: Sequence[Value], target: Target) -> Body:
+def _with_consts(closed: ClosedJaxpr, consts: Values, target: Target) -> Body:
     """Return a function from the carry of a loop to the results of a jaxpr."""
     return lambda carry: _walk(closed, [*consts, *carry], target)
 
@@ -177,13 +177,13 @@ def _is_key(value: Value) -> bool:
     return isinstance(value, jax.Array) and jnp.issubdtype(value.dtype, jax.dtypes.prng_key)
 
 
-def _bind(eqn: JaxprEqn, values: Sequence[Value]) -> Sequence[jax.Array]:
+def _bind(eqn: JaxprEqn, values: Values) -> Sequence[jax.Array]:
     """Apply the primitive of an equation by JAX."""
     result = eqn.primitive.bind(*map(jnp.asarray, values), **eqn.params)
     return result if eqn.primitive.multiple_results else [result]
 
 
-def _random(eqn: JaxprEqn, values: list[Value], target: Target) -> Sequence[Value]:
+def _random(eqn: JaxprEqn, values: list[Value], target: Target) -> Values:
     """Return the results of a random primitive, by the algorithm of its key."""
     name, params = eqn.primitive.name, dict(eqn.params)
     if name in ("random_wrap", "random_unwrap"):
@@ -216,7 +216,7 @@ def _moved(eqn: JaxprEqn, values: list[Value], sources: list[int], target: Targe
 def _moved_by_numpy(eqn: JaxprEqn, arrays: list[Value]) -> list[np.ndarray] | None:
     """Apply a primitive by NumPy, which is faster than a compilation by JAX; None: a rare one."""
     name, params, out = eqn.primitive.name, eqn.params, eqn.outvars[0].aval
-    shape: tuple[int, ...] = out.shape
+    shape: Shape = out.shape
     if name == "broadcast_in_dim":
         sizes, axes = iter(np.shape(arrays[0])), params["broadcast_dimensions"]
         aligned = [next(sizes) if i in axes else 1 for i in range(len(shape))]

@@ -2,12 +2,12 @@
 
 import contextlib
 import functools
-import importlib.metadata
 import platform
 import shlex
 import subprocess
 import sys
 import time
+from importlib import metadata
 from pathlib import Path
 
 from rps_jax import __version__
@@ -29,7 +29,7 @@ def collect_environment(**device: object) -> JsonObject:
         "python": platform.python_version(),
         "platform": platform.platform(),
         **device,
-        "packages": {"rps_jax": __version__} | {name: _version(name) for name in _PACKAGES},
+        "packages": {"rps_jax": __version__} | {name: metadata.version(name) for name in _PACKAGES},
     }
 
 
@@ -105,13 +105,6 @@ def package_version(folder: Path) -> str:
         return f"rps_jax {read_environment(folder)['packages']['rps_jax']}"
     except (InputError, KeyError, TypeError):
         return "a version that it does not name"
-
-
-def _version(package: str) -> str | None:
-    try:
-        return importlib.metadata.version(package)
-    except importlib.metadata.PackageNotFoundError:
-        return None
 
 
 @functools.cache

@@ -23,7 +23,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from rps_jax import engines, errors
+from rps_jax import errors
 from rps_jax.engines import device as devices
 from rps_jax.engines.device import Device
 from rps_jax.errors import InputError
@@ -141,7 +141,7 @@ def run_on_cluster(
         return
     threads, known = workers or 1, dict[tuple[str, int], JsonObject]()
     with connected(address) as ray:
-        gpu = gpus and engines.get(plan.setting.engine).traced
+        gpu = gpus and plan.setting.simulator.traced
         gpu = gpu and bool(ray.cluster_resources().get("GPU"))
         count = _count_workers(ray.nodes(), threads, int(gpu))
         # Otherwise the process of a GPU's task would end with the task, and compile again.

@@ -22,7 +22,7 @@ import functools
 import itertools
 import re
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, fields
 from operator import attrgetter
 from pathlib import Path
 from typing import (
@@ -39,7 +39,7 @@ import jax
 import numpy as np
 import xarray as xr
 
-from rps_jax import engines, errors
+from rps_jax import errors
 from rps_jax.analysis.report import Section
 from rps_jax.control import registry
 from rps_jax.control.base import LawParams
@@ -51,7 +51,7 @@ from rps_jax.record.files import JsonObject
 from rps_jax.record.options import option
 from rps_jax.robot.robot import RobotLike
 from rps_jax.runs.run import Run
-from rps_jax.trials.progress import Bar, ProgressCallback, Timing, is_interactive
+from rps_jax.trials.progress import Bar, ProgressCallback, is_interactive
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import Rules
 from rps_jax.world import domain as domains
@@ -66,6 +66,7 @@ if TYPE_CHECKING:
 P = ParamSpec("P")
 D = TypeVar("D", bound="DataclassInstance")
 T = TypeVar("T", covariant=True)
+Rows = list[list[str]]  # of a table in a report, with a header
 # Options that say how a run is executed; results do not depend on them.
 _EXECUTION_OPTIONS = (
     *("out", "overwrite", "bag", "slots", "workers", "quick", "progress", "report_to"),
@@ -186,7 +187,7 @@ class Command(Generic[T]):
         setting = getattr(self, "setting", None)
         if setting is None or jax.config.jax_platforms:
             return False
-        return engines.get(setting.engine).suits_processors(self.num_trials())
+        return setting.simulator.suits_processors(self.num_trials())
 
 
 def _replace_field(record: D, name: str, value: object) -> D:
@@ -414,7 +415,7 @@ class DomainQuestion(TaskOption, SimulationQuestion[T]):
     domain: DomainLike = "wide"
     """Ranges from which worlds are drawn: paper, hardware, wide, real (wide, but with limited
     robots), prisms or hostile, or a JSON file of ranges. Changes follow, as wide,mass=3:10."""
-    robot: RobotLike | None = field(default=None, kw_only=True)
+    robot: RobotLike | None = option(None, kw_only=True)
     """The robot: ideal, slipping, kairos (the paper's), ridgeback, mpo_500 or round, or a JSON
     file of its size, boards and limits. By default the domain's, which is ideal but in the domain
     real."""
@@ -440,15 +441,6 @@ class DomainQuestion(TaskOption, SimulationQuestion[T]):
 
 
 # --- small helpers of reports --------------------------------------------------------------
-
-
-def timing_line(timing: Timing, device: str) -> str:
-    """Return the times of a run in one line."""
-    rate = timing.simulated / max(timing.run, 1e-9)
-    return (
-        f"compile {timing.compile:.1f} s, run {timing.run:.1f} s ({rate:.0f} simulated s per s) on "
-        f"{device}"
-    )
 
 
 def _value_in_words(name: str, value: object) -> str:

@@ -34,7 +34,7 @@ from rps_jax.record import files
 from rps_jax.record.files import JsonObject
 from rps_jax.record.options import option
 from rps_jax.runs.plan import Plan, attributes_of, load_plan
-from rps_jax.runs.question import DomainQuestion, Run, call_of, count_true
+from rps_jax.runs.question import DomainQuestion, Rows, Run, call_of, count_true
 from rps_jax.studies.gallery import failure_modes
 from rps_jax.trials import score
 from rps_jax.trials.progress import SequentialProgress
@@ -280,7 +280,7 @@ def failed_worlds(results: xr.Dataset, laws: Sequence[str]) -> np.ndarray:
 
 def solved_table(
     ceiling: xr.Dataset, sweep: xr.Dataset, laws: Sequence[str], max_lost: float
-) -> list[list[str]]:
+) -> Rows:
     """Return who solves the worlds of a sweep in which some laws fail.
 
     There is a row for each object, and one for each failure mode of the first law.

@@ -23,7 +23,7 @@ from rps_jax.record import files
 from rps_jax.record.options import option
 from rps_jax.runs.plan import Plan, build_batch
 from rps_jax.runs.push import find_differences, program_slots, select_law
-from rps_jax.runs.question import Question, Run, call_of
+from rps_jax.runs.question import Question, Rows, Run, call_of
 from rps_jax.trials import pushes
 from rps_jax.trials.progress import SequentialProgress
 from rps_jax.trials.results import trace_dataset
@@ -178,7 +178,7 @@ def _simulate(
     return traces
 
 
-def mechanism_table(traces: Mapping[int, xr.Dataset]) -> list[list[str]]:
+def mechanism_table(traces: Mapping[int, xr.Dataset]) -> Rows:
     """Return a row for the trace of each world: its end, and the mechanisms measured in it."""
     rows = [["world", "end", "least distance", "path of the base", "measured"]]
     for world, trace in traces.items():

@@ -20,7 +20,7 @@ from rps_jax.control.registry import LawLike
 from rps_jax.record.options import option
 from rps_jax.robot.robot import RobotLike
 from rps_jax.robot.skin import SkinLike
-from rps_jax.runs.question import LawQuestion, Run, call_of, name_or_custom
+from rps_jax.runs.question import LawQuestion, Rows, Run, call_of, name_or_custom
 from rps_jax.studies.table import Table
 from rps_jax.trials import pushes
 from rps_jax.trials.case import Case
@@ -204,7 +204,7 @@ class Hardware(LawQuestion[xr.Dataset]):
 hardware = call_of(Hardware)
 
 
-def table(results: xr.Dataset, fitted: str = "") -> list[list[str]]:
+def table(results: xr.Dataset, fitted: str = "") -> Rows:
     """Return a row for each object: success, D and time beside the paper's.
 
     D and time are marked by the text `fitted`.
@@ -242,7 +242,7 @@ def numbers_figure(results: xr.Dataset, fitted: str = "") -> Figure:
     return figure
 
 
-def shift_table(results: xr.Dataset) -> list[list[str]]:
+def shift_table(results: xr.Dataset) -> Rows:
     """Return a row for each shove length: successes of the trials still under way."""
     rows = [["shift", *(words(str(o)) for o in results.object.values)]]
     counted = results.counted > 0

@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -60,15 +61,12 @@ class Probe:
 
     def _simulate(self, at: Points) -> xr.Dataset:
         request = Candidates(stack([self.params]), [self.domain], 0, np.arange(len(at.u)), at)
-        options = self.run.batch_options
-        (outcome,), _ = outcomes([request], self.setting, capacity=_capacity, **options)
+        options: Any = self.run.batch_options
+        # The size of a program is a power of four, so that few compile.
+        options["capacity"] = lambda n: 4 ** math.ceil(math.log2(max(n, _SLOTS)) / 2)
+        (outcome,), _ = outcomes([request], self.setting, **options)
         trials = {name: np.asarray(getattr(outcome, name)[0], float) for name in _STORED}
         trials["left"] = statistics.miss_distance(outcome.min_distance[0], request.distances)
         trials["severity"] = score.severity(trials, trials["left"], self.setting.rules)
         variables = {name: ("world", values) for name, values in trials.items()}
         return xr.Dataset({"u": (("world", "quantity"), at.u), **variables})
-
-
-def _capacity(trials: int) -> int:
-    """Return the size of the program for some trials: a power of four, so that few compile."""
-    return 4 ** math.ceil(math.log2(max(trials, _SLOTS)) / 2)

@@ -26,7 +26,7 @@ from scipy import stats
 from rps_jax import errors
 from rps_jax.analysis.report import Section
 from rps_jax.record.options import option
-from rps_jax.runs.question import DomainQuestion, LawQuestion, Run, call_of
+from rps_jax.runs.question import DomainQuestion, LawQuestion, Rows, Run, call_of
 from rps_jax.studies.probe import Probe
 from rps_jax.world import points
 
@@ -258,7 +258,7 @@ def worlds_needed(p: float, variation: float) -> float:
     return (1 - p) / (p * variation**2) if p > 0 else float("inf")
 
 
-def estimate_table(results: xr.Dataset) -> list[list[str]]:
+def estimate_table(results: xr.Dataset) -> Rows:
     """Return a row for each repetition, and one for all of them together."""
     rows = [["", "probability of failure", "95 %", "variation", "worlds", "share of drawn worlds"]]
     columns = results[list(Estimate._fields)].to_dataframe()

@@ -21,7 +21,7 @@ from rps_jax.control.registry import LawsLike
 from rps_jax.record import files
 from rps_jax.record.options import option
 from rps_jax.runs.plan import Plan
-from rps_jax.runs.question import MultiLawQuestion, Run, call_of
+from rps_jax.runs.question import MultiLawQuestion, Rows, Run, call_of
 from rps_jax.runs.sweep import PlanQuestion
 from rps_jax.trials.score import severity_of
 from rps_jax.trials.trial import Rules
@@ -95,7 +95,7 @@ class Regress(PlanQuestion, MultiLawQuestion[xr.Dataset]):
 regress = call_of(Regress)
 
 
-def success_table(results: xr.Dataset) -> list[list[str]]:
+def success_table(results: xr.Dataset) -> Rows:
     """Return a row for each law: its gains and losses against each law of the file."""
     known, laws = results.known_success > 0, results.success > 0
     against = (f"against {law}" for law in known.known.values)
@@ -110,7 +110,7 @@ def success_table(results: xr.Dataset) -> list[list[str]]:
     return rows
 
 
-def changes(results: xr.Dataset, law: str, against: str, rules: Rules = Rules()) -> list[list[str]]:
+def changes(results: xr.Dataset, law: str, against: str, rules: Rules = Rules()) -> Rows:
     """Return a row for each world whose outcome changes with a law, the worst losses first."""
     severity = severity_of(results.sel(law=law), rules)
     earlier = results.known_severity.sel(known=against).values

@@ -35,6 +35,7 @@ from rps_jax.runs.plan import Plan
 from rps_jax.runs.question import (
     DomainQuestion,
     LawQuestion,
+    Rows,
     Run,
     call_of,
     count_true,
@@ -189,7 +190,7 @@ def rank_factors(results: xr.Dataset) -> list[str]:
     return [str(name) for name in total.factor.values[np.argsort(-total.values, kind="stable")]]
 
 
-def index_table(results: xr.Dataset) -> list[list[str]]:
+def index_table(results: xr.Dataset) -> Rows:
     """Return a row for each factor, by the total index for success."""
     columns = [(output, order) for output in OUTPUTS for order in ("first", "total")]
     rows = [["", *map(": ".join, columns)]]

@@ -21,7 +21,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from rps_jax import engines, errors
+from rps_jax import errors
 from rps_jax.control import soft
 from rps_jax.control.base import check_finite_leaves
 from rps_jax.control.laws import rps
@@ -132,7 +132,7 @@ class PushEnv:
     def __post_init__(self) -> None:
         """Check the options, and draw the worlds before a loop is traced."""
         check_fields(self)
-        engines.get(self.setting.engine).check_traced()
+        self.setting.simulator.check_traced()
         errors.check_name("skin of an environment", self._alone.skin, ("capacitive",))
         rps.check(self.params)
         check_finite_leaves(self.weights)
@@ -176,7 +176,7 @@ class PushEnv:
         if not isinstance(state, State):
             rule = "give the State that reset returned"
             raise errors.not_allowed("state", repr(state), rule)
-        engine, physics = engines.get(self.setting.engine), self.setting.physics
+        engine, physics = self.setting.simulator, self.setting.physics
         inputs = state.info["world"], state.data, self.twist(action)
         world, previous, twist = engine.guard_derivatives(inputs)
         decided, twist = trial.execute(world, previous, twist, self.dt)
@@ -250,7 +250,7 @@ class PushEnv:
             mixed = soft.where(contact, way, jnp.where(touched, last, 0.0))
             distance = jnp.where(touched, mixed, distance)
         judged = judged._replace(law_state=distance)
-        frozen = jax.tree.map(lambda a, b: jnp.where(previous.done, a, b), previous, judged)
+        frozen = soft.tree_where(previous.done, previous, judged)
         return frozen, measured
 
     def _observation(self, world: World, current: Trial, measured: Measurement) -> TaxelObservation:

@@ -204,13 +204,6 @@ class GymPushVector(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             raise errors.InputError("no episode has started: call reset before step and render.")
         return self._state
 
-    def act(self, actions: Any) -> np.ndarray:
-        """Execute actions (num_envs, 3) in running trials; return the rewards (num_envs,)."""
-        shape = (self.num_envs, self.push_env.action_size)
-        array = errors.check_array("action", actions, shape, dtype=np.float32)
-        self._state, rewards = self._act(self.state, array)
-        return np.asarray(rewards, float)
-
     def observe(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, Arrays]:
         """Return observations (num_envs, T + 2), terminated and truncated flags, and infos."""
         data, metrics = self.state.data, self.state.metrics
@@ -222,10 +215,6 @@ class GymPushVector(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         infos = {name: np.array(values) for name, values in infos.items()}
         done, late = np.array(data.done), np.array(self.push_env.has_timed_out(data))
         return np.array(self.state.obs, np.float32), done & ~late, late, infos
-
-    def images(self) -> list[np.ndarray]:
-        """Return an image (240, 320, 3) uint8 of each world."""
-        return self.push_env.render([rows(self.state, i) for i in range(self.num_envs)])
 
     @device.standard_jax()
     def reset(
@@ -289,7 +278,9 @@ class GymPushVector(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
                 f"the episodes of worlds {np.flatnonzero(self._ended).tolist()} have ended: call "
                 "reset before step, in a vector with options={'reset_mask': ended}."
             )
-        rewards = self.act(actions)  # 0 for trials that had ended
+        shape = (self.num_envs, self.push_env.action_size)
+        array = errors.check_array("action", actions, shape, dtype=np.float32)
+        self._state, rewards = self._act(self.state, array)  # 0 for trials that had ended
         if not same and self._ended.any():
             self.start(self._ended)
         obs, terminated, truncated, infos = self.observe()
@@ -302,11 +293,19 @@ class GymPushVector(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             self.start(self._ended)
             obs, _, _, infos = self.observe()
         infos = self._with_masks(infos, np.ones(self.num_envs, bool))
-        return obs, rewards, terminated, truncated, infos | self._with_masks(final, self._ended)
+        return (
+            obs,
+            np.asarray(rewards, float),
+            terminated,
+            truncated,
+            infos | self._with_masks(final, self._ended),
+        )
 
     def render(self) -> Any:
         """Return an image (240, 320, 3) uint8 of each world in the mode rgb_array, else None."""
-        return tuple(self.images()) if self.render_mode == "rgb_array" else None
+        if self.render_mode is None:
+            return None
+        return tuple(self.push_env.render([rows(self.state, i) for i in range(self.num_envs)]))
 
     @staticmethod
     def _with_masks(infos: Mapping[str, Any], where: np.ndarray) -> dict[str, Any]:

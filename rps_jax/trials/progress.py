@@ -73,6 +73,10 @@ class Timing:
     run: float  # [s] wall clock after that
     simulated: float  # [s] of trials
 
+    def __str__(self) -> str:
+        rate = self.simulated / max(self.run, 1e-9)
+        return f"compile {self.compile:.1f} s, run {self.run:.1f} s ({rate:.0f} simulated s per s)"
+
 
 class Bar:
     """Progress bar on the error stream, with rate and time left; a callback of a run.

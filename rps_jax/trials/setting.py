@@ -11,6 +11,7 @@ from rps_jax.control import registry
 from rps_jax.control.base import LawParams
 from rps_jax.control.validation import check_law
 from rps_jax.engines import EngineName
+from rps_jax.engines.base import Engine
 from rps_jax.record import options
 from rps_jax.record.files import JsonObject
 from rps_jax.robot.robot import Robot
@@ -81,7 +82,12 @@ class Setting:
         options.check_fields(self)
         self.rules.check()
         if self.physics.cone != "elliptic":  # all engines have this one: import no engine
-            engines.get(self.engine).check_physics(self.physics)
+            self.simulator.check_physics(self.physics)
+
+    @property
+    def simulator(self) -> Engine:
+        """The engine itself."""
+        return engines.get(self.engine)
 
     @property
     def world_seed(self) -> int:
@@ -96,17 +102,16 @@ class Setting:
 
     def check_here(self, robot: Robot, laws: Iterable[LawParams] = ()) -> None:
         """Raise InputError unless the engine can step such a robot with these laws."""
-        engine = engines.get(self.engine)
-        engine.check_robot(robot)
+        self.simulator.check_robot(robot)
         for params in laws:
             law = registry.law_of(params)
-            engine.check_senses(law.senses)
+            self.simulator.check_senses(law.senses)
             if law.senses == "taxels":
                 check_law(law.init, law.step, law.senses, params, robot.shell.count)
 
     def check_domain(self, domain: Domain, laws: Iterable[LawParams] = ()) -> None:
         """Raise InputError unless the engine can step the worlds of a domain with these laws."""
-        engines.get(self.engine).check_surroundings(domain.surroundings)
+        self.simulator.check_surroundings(domain.surroundings)
         self.check_here(domain.weakest, laws)
 
     def to_json(self) -> JsonObject:

@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from rps_jax import engines, errors
+from rps_jax import errors
 from rps_jax.control import registry
 from rps_jax.control.base import LawParams, named_leaves
 from rps_jax.engines import device, native
@@ -67,7 +67,7 @@ def draw_worlds(
     if len(ranges.objects) != 1:
         rule = "worlds of one program have one object; name it, as wide,objects=random_box"
         raise errors.not_allowed("domain objects", ranges.objects, rule)
-    engines.get(setting.engine).check_traced()
+    setting.simulator.check_traced()
     setting.check_domain(ranges)
     drawn = draws.draw(ranges, setting.world_seed, np.arange(worlds))
     return drawn_worlds(ranges, drawn, setting)
@@ -117,7 +117,7 @@ def rollout(
       (3,)
     """
     check_arguments(rollout, locals())
-    engine = engines.get(setting.engine)
+    engine = setting.simulator
     engine.check_traced()
     steps, loop = count_steps(horizon, setting), control_loop(params, setting, smooth=smooth)
     if np.ndim(world.p_world_target) != 1:
@@ -148,10 +148,6 @@ def _check_scalars(params: LawParams) -> None:
 def control_loop(params: LawParams, setting: Setting, *, smooth: bool) -> ControlLoop:
     """Return the control loop of a law, or of its smooth form; or raise InputError."""
     law = registry.law_of(params)
-    if smooth and law.temperatures is None:
-        rule = f"the law of {type(params).__name__} has no smooth form; choose rps or rps_plus, or "
-        rule += "smooth=False, whose derivatives miss all switches of the law"
-        raise errors.not_allowed("smooth", smooth, rule)
     law = registry.smooth_law(law) if smooth else law
     return ControlLoop(setting.physics, setting.rules, law)
 

@@ -38,7 +38,7 @@ from rps_jax.engines import native
 from rps_jax.engines.base import ControlPeriod, Driven, Motion, Stage
 from rps_jax.geometry import footprint as fp
 from rps_jax.geometry import planar
-from rps_jax.geometry.arrays import Array, Bool, Bools, Float, Floats, Ints, Scalar
+from rps_jax.geometry.arrays import Array, Bool, Bools, Float, Floats, Ints, Scalar, Vector
 from rps_jax.geometry.footprint import Footprint
 from rps_jax.robot import base, drive
 from rps_jax.robot.base import Load, Odometry
@@ -175,7 +175,7 @@ class Outcome(NamedTuple):
         return cls(**fields, task={k: x for k, x in columns.items() if k not in fields})
 
 
-def object_pose(qpos: Float[Array, "10"]) -> tuple[Float[Array, "2"], Float[Array, ""]]:
+def object_pose(qpos: Float[Array, "10"]) -> tuple[Vector, Float[Array, ""]]:
     """Return the planar position [m] and yaw [rad] of the object in the world."""
     free = qpos[JOINTS.object]
     return free[:2], planar.yaw_of_quaternion(free[3:])
@@ -228,13 +228,13 @@ def outline(world: World, qpos: Float[Array, "10"]) -> Footprint:
     return fp.place(world.footprint, p_robot_object, object_yaw - yaw)
 
 
-def contact_of(qpos: Float[Array, "10"], p_robot_contact: Float[Array, "2"]) -> Float[Array, "2"]:
+def contact_of(qpos: Float[Array, "10"], p_robot_contact: Vector) -> Vector:
     """Return a contact point in the world [m]."""
     return qpos[:2] + planar.rotate(qpos[2], p_robot_contact)
 
 
 def positions_of(
-    world: World, qpos: Float[Array, "10"], p_robot_contact: Float[Array, "2"], touches: Array
+    world: World, qpos: Float[Array, "10"], p_robot_contact: Vector, touches: Array
 ) -> Positions:
     """Return what a task judges, at the positions qpos."""
     contact = contact_of(qpos, p_robot_contact), touches

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from rps_jax import engines, errors
+from rps_jax import errors
 from rps_jax.geometry import solid
 from rps_jax.geometry.footprint import Footprint
 from rps_jax.robot.base import Odometry
@@ -33,7 +33,7 @@ def build(indices: np.ndarray, inputs: WorldInputs, setting: Setting, **fields: 
     Raises:
       InputError: the engine cannot step such a robot, or such surroundings.
     """
-    engine, dtype = engines.get(setting.engine), jnp.result_type(float)
+    engine, dtype = setting.simulator, jnp.result_type(float)
     engine.check_robot(inputs.robots)
     engine.check_feet(inputs.solids.feet)
     added = getattr(fields.get("task"), "surroundings", None) or {}

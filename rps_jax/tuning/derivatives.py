@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 import xarray as xr
 
-from rps_jax import engines, errors
+from rps_jax import errors
 from rps_jax.control import registry, validation
 from rps_jax.control.base import LawParams, Leaf, named_leaves, unit_of_leaf
 from rps_jax.control.registry import LawsLike
@@ -133,7 +133,7 @@ def value_and_grad(
     device.check_process()
     ranges, chosen = parse_domain(domain, robot, task), registry.resolve_laws(laws)
     errors.check_count("worlds", worlds, at_most=1_000_000)
-    steps, engine = count_steps(horizon, setting), engines.get(setting.engine)
+    steps, engine = count_steps(horizon, setting), setting.simulator
     engine.check_traced()
     engine.check_derivatives("reverse")
     setting.check_domain(ranges, chosen.values())

@@ -28,7 +28,7 @@ import pandas as pd
 import xarray as xr
 from matplotlib.artist import setp
 
-from rps_jax import engines, errors
+from rps_jax import errors
 from rps_jax.analysis.figures.style import WIDTH, Figure, quantity, styled, tiles
 from rps_jax.analysis.report import Picture, Section
 from rps_jax.control import registry
@@ -47,6 +47,7 @@ from rps_jax.runs.question import (
     BagQuestion,
     DomainQuestion,
     LawQuestion,
+    Rows,
     Run,
     SimulationQuestion,
     call_of,
@@ -307,7 +308,7 @@ class Bank:
         objects, seed = self.domain.object_of(index), seed_of(self.setting.seed, split)
         groups = [index[objects == i] for i in np.unique(objects)]
         drawn = [draws.draw(self.domain, seed, group) for group in groups]
-        workers = run.workers or engines.get(self.setting.engine).workers("cpu")
+        workers = run.workers or self.setting.simulator.workers("cpu")
         with ThreadPoolExecutor(workers) as pool:
             pairs = zip(*pool.map(device.standard_jax()(self.statistics), drawn), strict=True)
         order = np.argsort(np.concatenate(groups))
@@ -347,8 +348,8 @@ class Bank:
 
 def check_law(label: str, law: Law, setting: Setting) -> None:
     """Raise InputError unless logs of this law can be simulated in this setting."""
-    engines.get(setting.engine).check_traced()
-    engines.get(setting.engine).check_senses("force")
+    setting.simulator.check_traced()
+    setting.simulator.check_senses("force")
     if law.senses != "touch":
         rule = f"it senses {law.senses}; fit needs a law that senses touch, as rps or rps_plus"
         raise errors.not_allowed("law", label, rule)
@@ -461,7 +462,7 @@ def fitted_domain(domain: Domain, data: xr.Dataset) -> Domain:
 # --- report --------------------------------------------------------------------------------
 
 
-def table(data: xr.Dataset) -> list[list[str]]:
+def table(data: xr.Dataset) -> Rows:
     """Return a header and one row for each quantity."""
     rows = [["quantity", "unit", "median", "90 %", "prior 90 %", "information"]]
     columns = ["median", "low", "high", "prior_low", "prior_high", "undetermined", "shrinkage"]
@@ -473,7 +474,7 @@ def table(data: xr.Dataset) -> list[list[str]]:
     return rows
 
 
-def correlations(data: xr.Dataset) -> list[list[str]]:
+def correlations(data: xr.Dataset) -> Rows:
     """Return a header and the pairs of quantities that the logs determine only in combination."""
     correlation = data.correlation.values
     names = [str(q) for q in data.quantity.values]

@@ -18,7 +18,7 @@ import numpy as np
 import xarray as xr
 from jax.stages import Lowered
 
-from rps_jax import engines, errors
+from rps_jax import errors
 from rps_jax.analysis import tables
 from rps_jax.analysis.figures.style import WIDTH, Axes, Figure, legend_above, styled, tiles
 from rps_jax.analysis.report import Picture, Section
@@ -123,7 +123,7 @@ class Learn(PPO, TaskOption, SimulationQuestion[xr.Dataset]):
     setting: Setting = field(
         default=Setting(fidelity="fast", rules=Rules(horizon=120.0, max_lost=30.0)), kw_only=True
     )
-    out: Path | str | None = field(default="runs/learn", kw_only=True)
+    out: Path | str | None = option("runs/learn", kw_only=True)
     """Run folder, with `policy.npz`; a killed run resumes there."""
 
     # Functions of the algorithm, which a subclass may replace.
@@ -143,7 +143,7 @@ class Learn(PPO, TaskOption, SimulationQuestion[xr.Dataset]):
         errors.check_each_once("domain", self.domains)
         for domain in self.domains:
             errors.check_name("skin of a domain to learn in", domain.skin, ("capacitive",))
-        engines.get(self.setting.engine).check_traced()
+        self.setting.simulator.check_traced()
         count = self.num_envs * sum(len(domain.objects) for domain in self.domains)
         if self.num_minibatches > count:
             rule = f"there are only {count} worlds; raise num_envs"
@@ -199,9 +199,12 @@ class Learn(PPO, TaskOption, SimulationQuestion[xr.Dataset]):
         def share(rate: float) -> str:
             return tables.share(round(rate * worlds), worlds)
 
+        tested = ""
+        if "test_success" in results.attrs:
+            rate = share(results.attrs["test_success"])
+            tested = f"Test: in worlds that it has not met, it succeeds in {rate}. "
         text = (
-            f"`{run.folder}/policy.npz` is the learned law. "
-            f"{_test_sentence(results.attrs, share)}In validation its success is "
+            f"`{run.folder}/policy.npz` is the learned law. {tested}In validation its success is "
             f"{share(max(validated.validation, default=0.0))}; these worlds chose it among the "
             f"validated laws. Compile {results.attrs['compile']:.1f} s, run {seconds:.1f} s "
             f"({simulated / max(seconds, 1e-9):.0f} simulated s per s)."
@@ -216,13 +219,6 @@ class Learn(PPO, TaskOption, SimulationQuestion[xr.Dataset]):
 
 
 learn = call_of(Learn)
-
-
-def _test_sentence(attrs: Mapping[str, Any], share: Callable[[float], str]) -> str:
-    """Return the success of the learned law in the test worlds, if it was tested."""
-    if "test_success" not in attrs:
-        return ""
-    return f"Test: in worlds that it has not met, it succeeds in {share(attrs['test_success'])}. "
 
 
 class _Learner:

@@ -92,14 +92,14 @@ def names(domain: Domain, *kinds: CoordinateKind) -> tuple[str, ...]:
     return tuple(item.name for item in coordinates(domain) if not kinds or item.kind in kinds)
 
 
-def check_drawn(field: str, name: str, domain: Domain) -> str:
+def check_drawn(name: str, domain: Domain) -> str:
     """Return a name if the domain draws this quantity from a range, or raise InputError."""
     drawn = names(domain, "range")
     known = (*QUANTITIES, *VELOCITY_ERRORS, "com_bearing")
     if name in known and name not in drawn:
         rule = f"this domain does not draw it; it draws {', '.join(drawn)}"
-        raise errors.not_allowed(field, name, rule)
-    return errors.check_name(field, name, drawn)
+        raise errors.not_allowed("axes", name, rule)
+    return errors.check_name("axes", name, drawn)
 
 
 @dataclass(frozen=True, eq=False)

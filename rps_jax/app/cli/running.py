@@ -131,7 +131,7 @@ def execute(command: Command[object], session: Session, faults: list[str]) -> No
     from rps_jax.engines import device
     from rps_jax.record import cache
     from rps_jax.runs.push import Trace
-    from rps_jax.runs.question import Question, timing_line
+    from rps_jax.runs.question import Question
     from rps_jax.world import opengl
 
     is_default = command.out == type(command)().out
@@ -164,7 +164,7 @@ def execute(command: Command[object], session: Session, faults: list[str]) -> No
         results = command.execute(bar)
         timed = bar.timing.simulated > 0 and bar.over != "clock"
         timed = timed and not getattr(command, "REPORTS_TIMES", False)
-        timing = timing_line(bar.timing, jax.devices()[0].device_kind) if timed else ""
+        timing = f"{bar.timing} on {jax.devices()[0].device_kind}" if timed else ""
         if not isinstance(command, Question):
             if results is not None:
                 print(f"{command.name}: {results}")

@@ -28,6 +28,7 @@ from typing import Annotated, Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
+from rps_jax.control import soft
 from rps_jax.control.base import Bound, Law, bounds_of, check_signs, document_fields
 from rps_jax.control.observation import Details, Observation, Twist, displacement
 from rps_jax.geometry import planar
@@ -103,7 +104,7 @@ class Path(NamedTuple):
         push = Twist.from_point_velocity(self.p_robot_contact, v_robot, omega)
         push = push.saturate(params.v_max, params.omega_max)
         ahead = Twist(params.v_approach, 0.0, 0.0)
-        return jax.tree.map(lambda a, b: jnp.where(self.touched, a, b), push, ahead)
+        return soft.tree_where(self.touched, push, ahead)
 
 
 class ForcePushState(NamedTuple):

@@ -23,6 +23,7 @@ from rps_jax.control.observation import Details, TaxelObservation, Twist
 from rps_jax.geometry.arrays import Pair, Parameter
 
 NetworkKind = Literal["mlp", "gru"]
+Shapes = dict[str, tuple[int, ...]]  # of weights, by name
 Weights = dict[str, Any]  # float32 arrays by name, of NumPy or JAX
 _ACTION_SIGNS = np.array([1, -1, -1], np.float32)  # of (v_x, v_y, omega) under the mirror
 _REACH = 1.5  # [1] bound on the mean of each component of an action
@@ -45,10 +46,10 @@ class Network(NamedTuple):
         return self
 
     @property
-    def shapes(self) -> dict[str, tuple[int, ...]]:
+    def shapes(self) -> Shapes:
         """Shapes of the weights by name."""
         size, n = features.feature_count(self.taxels), self.width
-        second = _dense("second", n, n) if self.kind == "mlp" else _gru("memory", n)
+        second = _dense("second", n, n) if self.kind == "mlp" else _gru(n)
         return _dense("first", size, n) | second | _dense("action", n, 3)
 
     def init(self, key: jax.Array) -> Weights:
@@ -61,7 +62,7 @@ class Network(NamedTuple):
         if self.kind == "mlp":
             x = jnp.tanh(dense(weights, "second", x))
         else:
-            x = hidden = _apply_gru(weights, "memory", hidden, x)
+            x = hidden = _apply_gru(weights, hidden, x)
         out = dense(weights, "action", x)
         mean = 0.5 * (out[..., 0, :] + jnp.asarray(_ACTION_SIGNS, out.dtype) * out[..., 1, :])
         return hidden, _REACH * jnp.tanh(mean / _REACH)
@@ -70,15 +71,15 @@ class Network(NamedTuple):
 # --- layers, each on pairs (..., 2, n) -----------------------------------------------------
 
 
-def _dense(name: str, inputs: int, outputs: int) -> dict[str, tuple[int, ...]]:
+def _dense(name: str, inputs: int, outputs: int) -> Shapes:
     return {f"{name}.w": (2 * inputs, outputs), f"{name}.b": (outputs,)}
 
 
-def _gru(name: str, n: int) -> dict[str, tuple[int, ...]]:
-    return _dense(f"{name}.gates", 2 * n, 2 * n) | _dense(f"{name}.new", 2 * n, n)
+def _gru(n: int) -> Shapes:
+    return _dense("memory.gates", 2 * n, 2 * n) | _dense("memory.new", 2 * n, n)
 
 
-def critic_shapes(inputs: int, width: int) -> dict[str, tuple[int, ...]]:
+def critic_shapes(inputs: int, width: int) -> Shapes:
     """Return the shapes of the weights of a value function with `inputs` pairs of inputs."""
     return (
         _dense("first", inputs, width) | _dense("second", width, width) | _dense("value", width, 1)
@@ -92,9 +93,7 @@ def critic(weights: Weights, pair: jax.Array) -> jax.Array:
     return jnp.mean(dense(weights, "value", x)[..., 0], axis=-1)
 
 
-def init_weights(
-    shapes: dict[str, tuple[int, ...]], key: jax.Array, small: tuple[str, ...] = ()
-) -> Weights:
+def init_weights(shapes: Shapes, key: jax.Array, small: tuple[str, ...] = ()) -> Weights:
     """Draw normal weights of variance 1 over the inputs, and zero biases.
 
     Weights of the layers named in `small` are a hundred times smaller.
@@ -119,11 +118,11 @@ def dense(weights: Weights, name: str, pair: jax.Array) -> jax.Array:
     return both @ weights[f"{name}.w"] + weights[f"{name}.b"]
 
 
-def _apply_gru(weights: Weights, name: str, hidden: jax.Array, x: jax.Array) -> jax.Array:
+def _apply_gru(weights: Weights, hidden: jax.Array, x: jax.Array) -> jax.Array:
     """Apply a gated recurrent unit to pairs (..., 2, n)."""
     both = jnp.concatenate([x, hidden], axis=-1)
-    reset, update = jnp.split(jax.nn.sigmoid(dense(weights, f"{name}.gates", both)), 2, axis=-1)
-    new = jnp.tanh(dense(weights, f"{name}.new", jnp.concatenate([x, reset * hidden], axis=-1)))
+    reset, update = jnp.split(jax.nn.sigmoid(dense(weights, "memory.gates", both)), 2, axis=-1)
+    new = jnp.tanh(dense(weights, "memory.new", jnp.concatenate([x, reset * hidden], axis=-1)))
     return (1 - update) * hidden + update * new
 
 

@@ -83,6 +83,11 @@ class State(NamedTuple):
     # [N, N, N m] of the object on the base, in the base's frame, summed over steps, if requested
     felt: Vec | None = None
 
+    @property
+    def accelerations(self) -> list[Vec]:
+        """Last accelerations, also of a base with a limited force."""
+        return [self.a, self.alpha, *([] if self.driven is None else [self.driven.a])]
+
 
 class DrivenBase(NamedTuple):
     """State of a base that its drive pushes, in the world's axes: x, y and about the vertical."""

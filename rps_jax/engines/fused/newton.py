@@ -52,23 +52,20 @@ def contact_force(contact: Contact, x: Vec, physics: Physics) -> tuple[Vec, tupl
     h = n - mu * slip
     e_t, e_s = t / slip, s / slip
     pull = -d_m * h * mu  # normal force of a sliding contact
-    force = (
-        jnp.where(sticks, -d * x[0], pull),
-        jnp.where(sticks, -d_t * x[1], -pull * f * e_t),
-        jnp.where(sticks, -d_t * x[2], -pull * f * e_s),
-    )
+    force = pull, -pull * f * e_t, -pull * f * e_s
     nn = d_m * mu * mu
     along = nn * f * f  # of the slip
     across = pull * f * f / slip
     stiffness = (
-        jnp.where(sticks, d, nn),
-        jnp.where(sticks, 0.0, -nn * f * e_t),
-        jnp.where(sticks, 0.0, -nn * f * e_s),
-        jnp.where(sticks, d_t, along * e_t * e_t + across * e_s * e_s),
-        jnp.where(sticks, 0.0, (along - across) * e_t * e_s),
-        jnp.where(sticks, d_t, along * e_s * e_s + across * e_t * e_t),
+        nn,
+        -nn * f * e_t,
+        -nn * f * e_s,
+        along * e_t * e_t + across * e_s * e_s,
+        (along - across) * e_t * e_s,
+        along * e_s * e_s + across * e_t * e_t,
     )
-    return force, stiffness
+    sticking = (-d * x[0], -d_t * x[1], -d_t * x[2]), (d, 0.0, 0.0, d_t, 0.0, d_t)
+    return jax.tree.map(lambda a, b: jnp.where(sticks, a, b), sticking, (force, stiffness))
 
 
 def _pyramid(contact: Contact, x: Vec, physics: Physics) -> tuple[Vec, tuple[Number, ...]]:
@@ -149,7 +146,7 @@ class Problem(NamedTuple):
         i, w = body.inertia, state.w
         torque = sp.cross((i[0] * w[0], i[1] * w[1], i[2] * w[2]), w)  # - w x (I w)
         free = sp.to_world(m, (torque[0] / i[0], torque[1] / i[1], torque[2] / i[2]))
-        start = [state.a, state.alpha, *([] if state.driven is None else [state.driven.a])]
+        start = state.accelerations
         lift = (0.0, 0.0, GRAVITY) if body.gravity is None else sp.scale(-1, body.gravity)
         return cls(body.mass, _spin(body, m), free, contacts, base, start, lift)
 
@@ -227,10 +224,15 @@ def accelerations(
         tangent = [directions[i] for i in varied]
         _, dg, h = jax.jvp(of_varied, (point,), (tangent,), has_aux=True)
         step = _solve(h, [-entry for entry in dg])
-        return x, [(step[i], step[i + 1], step[i + 2]) for i in range(0, len(step), 3)]
+        return x, _blocks(step)
 
     run.defjvp(rule, symbolic_zeros=True)
     return run([leaves[i] for i in positions])
+
+
+def _blocks(entries: Sequence[Number]) -> list[Vec]:
+    """Return entries as vectors, three each."""
+    return list(zip(*[iter(entries)] * 3, strict=True))
 
 
 def _minimise(problem: Problem, physics: Physics) -> list[Vec]:
@@ -245,7 +247,7 @@ def _minimise(problem: Problem, physics: Physics) -> list[Vec]:
         count, x, active, _ = carry
         g, h = problem.gradient(x, physics)
         step = _solve(h, [-entry for entry in g])
-        d: list[Vec] = [(step[i], step[i + 1], step[i + 2]) for i in range(0, len(step), 3)]
+        d = _blocks(step)
         slope = reduce(sp.plus, map(sp.dot, problem.gauss(x), d))
         bend = mass * sp.dot(d[0], d[0]) + sp.dot(d[1], sp.to_world(problem.spin, d[1]))
         for e in d[2:]:

@@ -191,7 +191,7 @@ def _drive(
 
     def solve(state: State, solution: list[Vec] | None) -> tuple[State, list[Vec]]:
         state = next_state(state, solution)
-        return state, [state.a, state.alpha, *([] if state.driven is None else [state.driven.a])]
+        return state, state.accelerations
 
     if solutions is None:
         state = jax.lax.fori_loop(0, physics.substeps, lambda _, x: next_state(x), start)

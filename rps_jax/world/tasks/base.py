@@ -13,7 +13,7 @@ from typing import Any, ClassVar, NamedTuple, Protocol
 import numpy as np
 
 from rps_jax import errors
-from rps_jax.geometry.arrays import Array, Bool, Float, Scalar
+from rps_jax.geometry.arrays import Array, Bool, Float, Scalar, Vector
 from rps_jax.geometry.footprint import Footprint
 from rps_jax.record.files import Arrays
 from rps_jax.record.options import check_fields
@@ -24,12 +24,12 @@ from rps_jax.world.quantity import Range, check_ranges
 class Positions(NamedTuple):
     """Position of base, object and contact in the world, in one control step."""
 
-    p_world_goal: Float[Array, "2"]  # [m] where the trial ends
-    p_world_contact: Float[Array, "2"]  # [m]; ignored unless it touches
+    p_world_goal: Vector  # [m] where the trial ends
+    p_world_contact: Vector  # [m]; ignored unless it touches
     touches: Bool[Array, ""]
     base: Float[Array, "3"]  # [m, m, rad] pose of the base
     outline: Footprint  # of the base, in its own frame
-    p_world_object: Float[Array, "2"]  # [m]
+    p_world_object: Vector  # [m]
     object_yaw: Scalar  # [rad]
     footprint: Footprint  # of the object, in its own frame
 
@@ -37,7 +37,7 @@ class Positions(NamedTuple):
 class Aim(NamedTuple):
     """Target of a law in one control step, and the verdict of the task."""
 
-    p_world_target: Float[Array, "2"]  # [m] of the law
+    p_world_target: Vector  # [m] of the law
     at_end: Bool[Array, ""] | bool = True  # whether the trial may succeed now
     failed: Bool[Array, ""] | bool = False
 

@@ -138,9 +138,15 @@ class CorridorCourse(NamedTuple):
         current = _where_due(due, measure, poses, last)
         touch = current.wall_touch, current.wall, progress.p_world_touch
         *_, point = _where_due(current.wall_touch > NOTHING, locate, poses, touch)
-        walls = current.measured, current.measured_at
-        state = current.clearance, current.wall_touch, point, *walls
-        moved = CorridorProgress(inner, *state, progress.steps + 1)
+        moved = CorridorProgress(
+            inner,
+            current.clearance,
+            current.wall_touch,
+            point,
+            current.measured,
+            current.measured_at,
+            progress.steps + 1,
+        )
         return moved, aim._replace(failed=moved.wall_touch > NOTHING)
 
     def remaining(self, progress: CorridorProgress, p_world_goal: Array, point: Array) -> Array:
@@ -180,7 +186,7 @@ class Corridor(Path):
     """Follow a path between walls."""
 
     kind: str = "corridor"
-    OUTCOMES: ClassVar[dict[str, tuple[str, str]]] = Path.OUTCOMES | {
+    OUTCOMES = Path.OUTCOMES | {
         "clearance": (
             "m",
             "least distance of base and object from the walls, every eighth control step",
@@ -279,10 +285,9 @@ def spare(vertices: Entries, half: Entries) -> Entries:
     """Return the least length (n,) [m] of paths (n, N, 2) that corners of a half width leave."""
     xp = namespace_of(vertices)
     room = half * xp.tan(xp.abs(turns_of(vertices)) / 2)
-    none = xp.zeros_like(vertices[:, :1, 0])
     lengths = xp.linalg.norm(xp.diff(vertices, axis=1), axis=-1)
-    used = xp.concatenate([none, room], axis=1), xp.concatenate([room, none], axis=1)
-    return xp.min(lengths - used[0] - used[1], axis=1)
+    before, after = (xp.pad(room, ((0, 0), ends)) for ends in ((1, 0), (0, 1)))
+    return xp.min(lengths - before - after, axis=1)
 
 
 def _walls(vertices: Entries, half: Entries) -> Entries:

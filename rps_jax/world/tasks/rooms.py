@@ -55,7 +55,7 @@ class Rooms(Following):
     """
 
     kind: str = "rooms"
-    OUTCOMES: ClassVar[dict[str, tuple[str, str]]] = Corridor.OUTCOMES
+    OUTCOMES = Corridor.OUTCOMES
     FAILURES = Corridor.FAILURES
     MARKS = ("polygons", "outline", *_ROS, "tolerance", *_IGNORED)
     # Tasks may share columns of random numbers: a world has one task.
