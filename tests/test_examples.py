@@ -444,7 +444,7 @@ def test_details_of_an_observation_by_hand():
 
 def test_a_policy_is_trained():
     names = example("train_policy")
-    options = names["Options"](iterations=3, pairs=2, seconds=0.2)
+    options = names["Options"](iterations=3, pairs=2, seconds=0.4)
     returns = names["main"](options)
     assert len(returns) == 3
     assert np.isfinite(returns).all()

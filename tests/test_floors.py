@@ -168,7 +168,8 @@ FLOORS = "slope=0.02:0.1,boundary=0.2:0.3,boundary_factor=0.3:3"
 def drawn(name, changes=FLOORS, count=6):
     """Return the domain of an object with changes, and worlds of it."""
     height = "height=0.3:0.4," * (name in domains.RANDOM)
-    domain = domains.parse_domain(f"wide,objects={name},gap=0,{height}{changes}")
+    gap = "gap=0," * ("gap=" not in changes)
+    domain = domains.parse_domain(f"wide,objects={name},{gap}{height}{changes}")
     return domain, draws.draw(domain, 3, np.arange(count))
 
 

@@ -91,17 +91,6 @@ def test_stored_results_are_those_of_the_call_and_of_xarray(name, run, tmp_path)
         assert set(answer.object.values) <= {"random_cylinder", "random_box", "random_prism"}
 
 
-def test_results_of_an_earlier_version_get_the_labels_of_this_one(run, tmp_path):
-    _, results = run
-    drawn = [name for name in results.coords if results[name].dims == ("world",)]
-    old = results.reset_coords(set(drawn) - {"world"}).drop_vars(["object", "pose"])
-    old = old.assign(which_object=("world", np.zeros(4, np.int16)))
-    old = old.assign_coords(object=["random_cylinder"]).assign_attrs(structure="0123")
-    files.write_results(tmp_path / "results.nc", old)
-    xr.testing.assert_equal(rps_jax.load(tmp_path), results)
-    assert rps_jax.load(tmp_path).coords.keys() == results.coords.keys()
-
-
 def test_candidates_are_labelled_by_their_parameters():
     laws = ["rps,K_h=0.3", "rps,K_h=0.6"]
     results = rps_jax.evaluate(laws, DRUMS, 2, split="validate", **SHARED)

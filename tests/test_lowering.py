@@ -127,6 +127,8 @@ CASES = {
 }
 DTYPES = {"b": np.bool_, "i": np.int32, "u": np.uint32, "f": np.float32}
 SHAPES = [[(3,)] * 3, [()] * 3, [(), (3,), (3,)]]  # vectors, scalars, a scalar and vectors
+# XLA's older emitters cannot clamp bools, and its newer ones order vectors of them wrongly.
+WITHOUT_REFERENCE = {"lax.clamp of b b b"}
 NOT_OF_NUMBERS = {"shape_as_value", "broadcast_like", "full_like", "stage", "optimization_barrier"}
 # Static parameters of functions of `lax` that have no defaults.
 STATIC = {
@@ -194,9 +196,10 @@ def generated():
                 if not result_types(applied, kinds, SHAPES[0]) <= known:
                     continue
                 shapes = [x for x in SHAPES[: 1 + count] if result_types(applied, kinds, x)]
-                if shapes:
+                title = " ".join([f"lax.{name}", *words, "of", *kinds])
+                if shapes and title not in WITHOUT_REFERENCE:
                     case = functools.partial(apply_all, applied, kinds, shapes)
-                    cases[" ".join([f"lax.{name}", *words, "of", *kinds])] = case
+                    cases[title] = case
     jax.config.update("jax_traceback_filtering", filtering)
     return cases
 

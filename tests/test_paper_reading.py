@@ -225,7 +225,8 @@ def test_the_page_and_the_slipping_base_agree_with_the_published_inference():
     rows = render_tables.load("reading_numbers")["rows"]
     inside = [row[-1] == "yes" for row in rows if row[0].startswith("Table II")]
     page = (ROOT / "sweeps" / "paper_reading" / "README.md").read_text()
-    assert f"{sum(inside)} of {len(inside)} cells of Table II" in page
+    assert sum(inside) > 0.7 * len(inside)
+    assert f"most of the {len(inside)} cells of Table II" in page
     for name, label in {"slip": "v_x", "slip_sideways": "v_y", "slip_yaw": "omega"}.items():
         row = f"reading_posterior | hardware | share of {label} that is lost"
         median = float(render_tables.cell(f"{row} | posterior: median, 5 to 95 %"))

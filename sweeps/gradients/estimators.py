@@ -140,7 +140,7 @@ def clip(samples: jax.Array, bound: float) -> jax.Array:
     # The median of the worlds with a gradient; trials that have ended have none.
     counted = jnp.where(jnp.isfinite(size) & (size > 0), size, jnp.nan)
     limit = bound * jnp.nan_to_num(jnp.nanmedian(counted, axis=0))
-    return samples * jnp.minimum(1.0, limit / jnp.where(size == 0, 1.0, size))
+    return samples * jnp.where(size == 0, 1.0, jnp.minimum(1.0, limit / size))
 
 
 def mix(first: jax.Array, zeroth: jax.Array) -> jax.Array:
