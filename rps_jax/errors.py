@@ -22,18 +22,12 @@ class InputError(ValueError):
     """
 
     def __init__(self, sentence: object) -> None:
-        super().__init__(_readable(str(sentence)))
+        short = _LONG_WORD.sub(r"\1…\2", str(sentence))
+        super().__init__("".join(c if c.isprintable() else ascii(c)[1:-1] for c in short))
 
 
 _MAX_WORD = 200  # characters; most paths are shorter
 _LONG_WORD = re.compile(rf"(\S{{60}})\S{{{_MAX_WORD - 60},}}?([^\w\s]{{0,3}})(?!\S)")
-
-
-def _readable(sentence: str) -> str:
-    """Return a sentence with long words shortened and control characters escaped."""
-    short = _LONG_WORD.sub(r"\1…\2", sentence)
-    plain = (c if c.isprintable() else ascii(c)[1:-1] for c in short)
-    return "".join(plain)
 
 
 def not_allowed(name: str, value: object, rule: str) -> InputError:

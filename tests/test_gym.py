@@ -186,8 +186,8 @@ def test_greater_actions_are_reduced_to_the_bounds(single):
 
 
 def test_a_step_needs_a_running_episode(single):
-    alone = gymnasium.make_vec("rps_jax/Push-v0", num_envs=1, **HOW)
-    for call in (lambda: alone.step(AHEAD[:1]), alone.unwrapped.images):
+    alone = gymnasium.make_vec("rps_jax/Push-v0", num_envs=1, render_mode="rgb_array", **HOW)
+    for call in (lambda: alone.step(AHEAD[:1]), alone.unwrapped.render):
         with pytest.raises(InputError, match="no episode has started: call reset before step"):
             call()
     single.reset(seed=0)

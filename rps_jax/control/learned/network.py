@@ -49,7 +49,8 @@ class Network(NamedTuple):
     def shapes(self) -> Shapes:
         """Shapes of the weights by name."""
         size, n = features.feature_count(self.taxels), self.width
-        second = _dense("second", n, n) if self.kind == "mlp" else _gru(n)
+        gru = _dense("memory.gates", 2 * n, 2 * n) | _dense("memory.new", 2 * n, n)
+        second = _dense("second", n, n) if self.kind == "mlp" else gru
         return _dense("first", size, n) | second | _dense("action", n, 3)
 
     def init(self, key: jax.Array) -> Weights:
@@ -73,10 +74,6 @@ class Network(NamedTuple):
 
 def _dense(name: str, inputs: int, outputs: int) -> Shapes:
     return {f"{name}.w": (2 * inputs, outputs), f"{name}.b": (outputs,)}
-
-
-def _gru(n: int) -> Shapes:
-    return _dense("memory.gates", 2 * n, 2 * n) | _dense("memory.new", 2 * n, n)
 
 
 def critic_shapes(inputs: int, width: int) -> Shapes:
