@@ -14,7 +14,7 @@ import queue
 import threading
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -73,7 +73,7 @@ class View(Action[None], Case):
     """Index of the world in the sweep."""
     port: int = option(8080, 0, 65535, kw_only=True)
     """Port to serve the page on; 0 takes any that is free."""
-    setting: Setting = option(Setting(), kw_only=True)
+    setting: Setting = field(default=Setting(), kw_only=True)
     out: Path | str | None = option(None, kw_only=True, hidden=True)
     progress: bool | None = option(False, kw_only=True, hidden=True)
 

@@ -22,7 +22,7 @@ import functools
 import itertools
 import re
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from operator import attrgetter
 from pathlib import Path
 from typing import (
@@ -415,7 +415,7 @@ class DomainQuestion(TaskOption, SimulationQuestion[T]):
     domain: DomainLike = "wide"
     """Ranges from which worlds are drawn: paper, hardware, wide, real (wide, but with limited
     robots), prisms or hostile, or a JSON file of ranges. Changes follow, as wide,mass=3:10."""
-    robot: RobotLike | None = option(None, kw_only=True)
+    robot: RobotLike | None = field(default=None, kw_only=True)
     """The robot: ideal, slipping, kairos (the paper's), ridgeback, mpo_500 or round, or a JSON
     file of its size, boards and limits. By default the domain's, which is ideal but in the domain
     real."""

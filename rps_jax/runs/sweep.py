@@ -6,7 +6,7 @@ The design is paired: every law meets the same worlds. `execution` runs the plan
 import functools
 import shlex
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar
@@ -153,20 +153,20 @@ def success_section(results: xr.Dataset, max_lost: float) -> Section:
 class SweepOptions:
     """Options of a sweep besides its laws and worlds."""
 
-    points: str | Path | xr.Dataset | np.ndarray | None = option(None, kw_only=True)
+    points: str | Path | xr.Dataset | np.ndarray | None = field(default=None, kw_only=True)
     """Points of the domain's unit cube at which the worlds lie, instead of drawn ones: what
     world.points.worlds_at returned, or a NetCDF file of it, as points.nc of a run folder."""
-    models: bool = option(False, kw_only=True)
+    models: bool = field(default=False, kw_only=True)
     """Whether to run the same worlds also on other grounds, cones and steps and in the quasi-static
     model, and to report how much the rates depend on these."""
-    shard: str = option("1/1", kw_only=True)
+    shard: str = field(default="1/1", kw_only=True)
     """Shard K/N of the run: the N shards are run separately, and joined by `rps merge`."""
-    ray: str | None = option(None, kw_only=True)
+    ray: str | None = field(default=None, kw_only=True)
     """Run on the workers of a Ray cluster: auto, its HOST:PORT, or local (all of this host). Each
     worker claims a GPU, or else as many processors as workers, one by default."""
-    ray_device: Device = option("auto", kw_only=True)
+    ray_device: Device = field(default="auto", kw_only=True)
     """Device of the cluster's workers."""
-    table: Path | str | None = option(None, kw_only=True)
+    table: Path | str | None = field(default=None, kw_only=True)
     """File for a table with one row for each law and world: NAME.csv, or NAME.parquet (needs
     pyarrow). NAME.columns.csv beside it has the units and meanings of the columns."""
 

@@ -9,7 +9,7 @@ import dataclasses
 import re
 import textwrap
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from typing import Any, ClassVar, get_args
 
@@ -97,7 +97,7 @@ class Ladder(SweepOptions, TaskOption, MultiLawQuestion[xr.Dataset | xr.DataTree
     worlds: int | None = option(None, 1, 1_000_000_000)
     """Number of worlds of each domain; by default 1000, or the grid of a domain with listed targets
     (paper: 144). With several domains it is at most that grid."""
-    robot: RobotLike | None = option(None, kw_only=True)
+    robot: RobotLike | None = field(default=None, kw_only=True)
     """The robot: ideal, slipping, kairos (the paper's), ridgeback, mpo_500 or round, or a JSON
     file of its size, boards and limits. By default the domain's."""
     part: int | None = option(None, 1, 1_000_000, kw_only=True)

@@ -123,7 +123,7 @@ class Learn(PPO, TaskOption, SimulationQuestion[xr.Dataset]):
     setting: Setting = field(
         default=Setting(fidelity="fast", rules=Rules(horizon=120.0, max_lost=30.0)), kw_only=True
     )
-    out: Path | str | None = option("runs/learn", kw_only=True)
+    out: Path | str | None = field(default="runs/learn", kw_only=True)
     """Run folder, with `policy.npz`; a killed run resumes there."""
 
     # Functions of the algorithm, which a subclass may replace.
