@@ -59,7 +59,7 @@ CASES = {
     ),
     "a law that senses force": ("force_push", "wide,objects=random_cylinder"),
     "a planar engine": ("rps", "hostile,objects=random_prism", "reach", "quasistatic"),
-    "an engine outside of JAX": ("rps", "hostile,objects=random_box", "reach", "mujoco"),
+    "an engine outside of JAX": ("rps", "hostile,objects=random_box", "reach", "mujoco", 1.0),
 }
 SLOW_CASES = {
     "MJX": ("rps", "wide,objects=random_box", "reach", "mjx", 1.0),

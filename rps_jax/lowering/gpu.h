@@ -4,8 +4,8 @@
    of a warp run each iteration together. `operations.h` follows. */
 
 #ifndef INFINITY
-#define INFINITY __builtin_huge_valf() /* constants, as tables need */
-#define NAN __builtin_nanf("")
+#define INFINITY (1.0f / 0.0f) /* constants, as tables need */
+#define NAN __builtin_bit_cast(float, 0x7fc00000) /* 0.0f / 0.0f is negative in a table */
 #endif
 #define WORLDS (32 / THREADS)
 #define ALL 0xffffffffu

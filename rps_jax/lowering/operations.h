@@ -21,7 +21,8 @@ FUNCTION I max_i(I a, I b) { return choose_i(a > b, a, b); }
 FUNCTION I min_i(I a, I b) { return choose_i(a < b, a, b); }
 FUNCTION I in_total_order(V x) {
   I bits = bits_i_of_f(x);
-  return bits ^ (bits >> 31 & 0x7fffffff);
+  I order = bits ^ (bits >> 31 & 0x7fffffff);
+  return max_i(min_i(order, all_i(0x7f800001)), all_i(-0x7f800002)); /* NaN of a sign are equal */
 }
 FUNCTION I lt_to_f(V a, V b) { return in_total_order(a) < in_total_order(b); }
 FUNCTION U max_u(U a, U b) { return choose_u((I)(a > b), a, b); }

@@ -299,7 +299,7 @@ def _run_on_host(job: Job, setting: Setting, threads: int, monitor: _Monitor) ->
             if index % _REPORT_STEPS and not done.all():
                 continue
             ended, total = np.flatnonzero(done & ~reported), int(np.asarray(trials.steps).sum())
-            outcomes = jax.device_get(trial.outcome(trials, batch.worlds, loop))
+            outcomes = jax.device_get(host.outcome(trials, batch.worlds, loop))
             simulated = (total - previous) * period
             monitor.add((batch.indices[ended], rows(outcomes, ended), simulated))
             reported, previous = done, total

@@ -19,6 +19,7 @@ from rps_jax.world.opengl import mujoco
 
 _decide = jax.jit(jax.vmap(trial.decide, (0, 0, 0, None)))
 _settle = jax.jit(jax.vmap(trial.settle))
+outcome = jax.jit(trial.outcome)
 
 
 def run(

@@ -228,7 +228,7 @@ def _states(
         loop = ControlLoop(setting.physics, setting.rules, worlds.law)
         for step, trials in enumerate(host.run(worlds.stage, *worlds.inputs, loop, threads)):
             if step % stride == 0 or trials.done.all():
-                outcomes = trial.outcome(trials, worlds.worlds, loop)
+                outcomes = host.outcome(trials, worlds.worlds, loop)
                 yield jax.device_get((trials, outcomes))
         return
     advance = stepper(worlds, setting, slots)
