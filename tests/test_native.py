@@ -86,7 +86,6 @@ PAIRS = [
 ]  # fmt: skip
 
 
-@pytest.mark.parity
 @pytest.mark.parametrize(("shape", "skin"), PAIRS)
 def test_a_control_step_agrees_with_xla(shape, skin, monkeypatch):
     stage, inputs, loop, pushing = build_push(shape, skin)
