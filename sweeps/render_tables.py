@@ -40,7 +40,39 @@ _BLOCK = re.compile(r"(<!-- (table|command): (\S+) -->\n).*?(<!-- end -->)", re.
 _CELL = re.compile(r"(<!-- cell: ([^>]*?) -->).*?(<!-- end -->)", re.DOTALL)
 _TEXT_CELL = re.compile(r"^(# %% \[markdown\]\n)((?:#.*\n)*)", re.MULTILINE)  # of notebooks' texts
 # The change since each stale data file: what follows "Computed before".
-STALE: dict[str, str] = {}
+STALE: dict[str, str] = {
+    **dict.fromkeys(
+        (
+            "attack",
+            "corridors_failures",
+            "corridors_lookaheads",
+            "corridors_objects",
+            "corridors_open",
+            "corridors_paths",
+            "corridors_widths",
+            "fit_bags",
+            "fit_coverage",
+            "fit_methods",
+            "fit_methods_quantities",
+            "fit_quantities",
+            "fit_real",
+            "fit_real_quantities",
+            "fit_worth",
+            "gradients_network",
+            "gradients_race",
+            "gradients_score",
+            "landscape",
+            "learned_continued",
+            "learned_variants",
+            "mends",
+            "rivals_tuned",
+        ),
+        "tuners got worlds of their own, which no sweep meets",
+    ),
+    **dict.fromkeys(
+        ("ground", "straight"), "a push ran in the program of a sweep, with other last bits"
+    ),
+}
 NUMBERS = SWEEPS / "publish" / "numbers.json"
 _NUMBER = r"(?<![\w.,/^#-])[-+±]?\d[\d,]*(?:\.\d+)?(?:e[-+]?\d+)?"
 _UNIT = (

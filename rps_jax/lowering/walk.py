@@ -123,6 +123,9 @@ def _results(eqn: JaxprEqn, values: list[Value], target: Target) -> Values:
     inner = params.get("call_jaxpr", params.get("jaxpr"))
     if inner is not None:
         return _walk(inner, values, target)
+    if name == "call_hi_primitive":  # of versions of JAX from 0.12 on: it has its meaning itself
+        expand = functools.partial(eqn.primitive.to_lojax, **params)
+        return _expanded(expand, values, types, target)
     if name in _MOVES:
         count = len(values) if _MOVES[name] is None else _MOVES[name]
         # The updates of a scatter, its third operand, are moved as well.
