@@ -85,7 +85,7 @@ PROBES_OF: Mapping[str, tuple[str, ...]] = {
     **dict.fromkeys(("table", "grid"), ("table",)),
     **dict.fromkeys(("gazebo*", "readings*", "fidelity", "rest"), ("table", "push_mujoco")),
     **dict.fromkeys(("hardware", "shoves", "reading_*"), ("hardware",)),
-    "corridors_*": ("path", "corridor"),
+    "corridors_*": ("path", "corridor", "tune_es"),  # lookaheads are chosen in worlds of tuners
     "tuned_for_corridors": ("wide", "real"),
     "tasks_parity": ("path", "corridor", "mujoco", "mjx"),
     "force_push_paths": ("path", "prisms"),
@@ -93,12 +93,12 @@ PROBES_OF: Mapping[str, tuple[str, ...]] = {
     "floors_*": ("floor",),
     "engines_*": ("wide", "mujoco", "mjx", "quasistatic"),
     "export_*": ("export_c", "export_js", "wide"),
-    "attack": ("attack",),
+    "attack": ("attack", "tune_es"),
     "rare*": ("rare", "wide"),
     "regression": ("regress",),
     "sensitivity": ("sensitivity", "hostile", "real"),
-    "fit_real*": ("real_pushes",),
-    "fit_*": ("push_fused", "wide"),
+    "fit_real*": ("real_pushes", "tune_es"),
+    "fit_*": ("push_fused", "wide", "tune_es"),
     "real_pushes_*": ("real_pushes",),
     "gradients_*": ("planning", "tune_grad", "learn"),
     **dict.fromkeys(("ground", "straight"), ("push_mujoco", "push_fused")),
@@ -108,7 +108,8 @@ PROBES_OF: Mapping[str, tuple[str, ...]] = {
     "landscape": ("wide", "hostile", "tune_es"),
     **dict.fromkeys(("learned_test", "learned_failures", "sb3"), ("hostile", "learn")),
     **dict.fromkeys(("learned_variants", "learned_continued"), ("hostile", "learn")),
-    **dict.fromkeys(("limits", "sizes", "mends"), ("wide", "hostile")),
+    "mends": ("wide", "hostile", "tune_es"),
+    **dict.fromkeys(("limits", "sizes"), ("wide", "hostile")),
     **dict.fromkeys(("plans", "replans"), ("planning",)),
     "feet": ("wide", "feet"),
     **dict.fromkeys(("headline", "models"), (*_TRIALS, "path", "corridor", "mujoco")),
@@ -137,16 +138,15 @@ def differences(ids: Mapping[str, str]) -> list[str]:
 
 
 def same(record: Record, today: Record) -> bool:
-    """Return whether a run gives the numbers of a record; names of variables may differ."""
-    before, now = record["variables"], today["variables"]
-    if {k: record[k] for k in ("processor", "versions")} == {
-        k: today[k] for k in ("processor", "versions")
-    }:
-        return {row[0] for row in before.values()} <= {row[0] for row in now.values()}
-    return before.keys() <= now.keys() and all(
+    """Return whether a run gives the numbers of a record; on one processor names may differ."""
+    recorded, current = record["variables"], today["variables"]
+    if all(record[key] == today[key] for key in ("processor", "versions")):
+        digests = {row[0] for row in current.values()}
+        return all(row[0] in digests for row in recorded.values())
+    return recorded.keys() <= current.keys() and all(
         abs(a - b) <= TOLERANCE * max(size, 1e-9)
-        for name, (_, *row, size) in before.items()
-        for a, b in zip((*row, size), now[name][1:], strict=True)
+        for name, (_, *row, size) in recorded.items()
+        for a, b in zip((*row, size), current[name][1:], strict=True)
     )
 
 
