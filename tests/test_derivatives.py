@@ -3,6 +3,7 @@
 import re
 import warnings
 from dataclasses import replace
+from functools import partial
 from types import SimpleNamespace
 from unittest import mock
 
@@ -12,10 +13,14 @@ import pytest
 from helpers import ROOT, refusals, row
 
 import rps_jax
+from rps_jax import engines
 from rps_jax.control.laws.rps import RPSParams
+from rps_jax.control.registry import LAWS, law_of
 from rps_jax.engines import quasistatic
-from rps_jax.trials import single
+from rps_jax.errors import InputError
+from rps_jax.trials import single, trial
 from rps_jax.trials.setting import Setting
+from rps_jax.trials.single import control_loop
 from rps_jax.tuning import derivatives
 from rps_jax.world import draws
 from rps_jax.world.domain import PERFECT, QUANTITIES, VELOCITY_ERRORS, Range, parse_domain
@@ -167,7 +172,7 @@ def test_a_kink_of_the_world_has_no_derivative_and_is_told():
         square, "fused", coordinates, np.ones(2, bool), bends, gradient, bends
     )
     notes = list(notes)
-    assert "No world has a finite derivative, so the mean is NaN: aspect." in notes
+    assert "No world of 3 has a finite derivative, so the mean is NaN: aspect." in notes
     assert [x for x in notes if "kink" in x] == [
         "No derivatives in worlds whose numbers have a kink (see finite): aspect."
     ]
@@ -292,8 +297,9 @@ def test_what_has_no_gradient_is_refused(changes, message):
 )
 def test_a_score_must_return_a_number(score, message):
     snapshots = SimpleNamespace(done=np.zeros(5, bool))
+    options = derivatives._Options(score, 5, QUASISTATIC, False, False)
     with pytest.raises(rps_jax.InputError, match=message):
-        derivatives._score(score, QUASISTATIC, snapshots, RPSParams())
+        derivatives._score(options, snapshots)
 
 
 @pytest.mark.parametrize(
@@ -327,3 +333,54 @@ def test_a_law_with_arrays_has_a_number_for_each_entry():
     assert labels == ["K_h[0,0]", "K_h[1,0]", "L"]
     units = [x.unit for x in derivatives.coordinates_of(("K_h", "L", "K_v"), RPSParams(), TOUCHING)]
     assert units == ["1", "m", "1/s"]
+
+
+# --- continued rollouts --------------------------------------------------------------------
+
+TRACED = [name for name in engines.ENGINES if engines.get(name).traced]
+NOISY = "wide,objects=random_cylinder,gap=0:0.01"  # with latencies and drift of the odometry
+BY_CLASS = {type(params): name for name, params in LAWS.items()}
+
+
+def halves_and_whole(setting, domain, law, smooth=False):
+    """Return the trajectories of two joined halves of 0.6 s, and of one whole of 1.2 s."""
+    batch = rps_jax.draw_worlds(domain, 2, setting=setting)
+
+    @partial(jax.jit, static_argnums=2)
+    def run(worlds, state, horizon):
+        options = {"horizon": horizon, "smooth": smooth, "return_state": True}
+        route = partial(rps_jax.rollout, stage=batch.stage, setting=setting, **options)
+        return jax.vmap(lambda world, x: route(world, law, start=x))(worlds, state)
+
+    loop = control_loop(law, setting, smooth=smooth)
+    fresh = jax.vmap(lambda world: trial.start(world, law, loop.law))(batch.worlds)
+    first, state = run(batch.worlds, fresh, 0.6)
+    second, last = run(batch.worlds, state, 0.6)
+    joined = jax.tree.map(lambda *x: np.concatenate(x, axis=1), first, second)
+    return (joined, last), run(batch.worlds, fresh, 1.2)
+
+
+@pytest.mark.parametrize("name", BY_CLASS.values())
+def test_a_continued_rollout_of_any_law_is_the_whole_one_bit_for_bit(name):
+    law = LAWS[name]
+    engine = "fused" if law_of(law).senses == "force" else "quasistatic"
+    halves, whole = halves_and_whole(rps_jax.Setting(engine), NOISY, law)
+    jax.tree.map(np.testing.assert_array_equal, halves, whole)
+
+
+@pytest.mark.parametrize(("engine", "smooth"), [*((x, False) for x in TRACED), ("fused", True)])
+def test_a_continued_rollout_in_any_engine_is_the_whole_one_bit_for_bit(engine, smooth):
+    domain = "real,objects=random_box,gap=0:0.01" if engine != "quasistatic" else NOISY
+    law = LAWS["rps_plus"]
+    halves, whole = halves_and_whole(rps_jax.Setting(engine), domain, law, smooth)
+    jax.tree.map(np.testing.assert_array_equal, halves, whole)
+
+
+def test_a_state_of_another_law_is_refused():
+    setting = rps_jax.Setting("quasistatic")
+    batch = rps_jax.draw_worlds(NOISY, 1, setting=setting)
+    world, pursuit = row(batch.worlds, 0), LAWS["pursuit"]
+    start = trial.start(world, LAWS["rps"])
+    message = "start = .* is not allowed: give the last state of a rollout of the same law"
+    with pytest.raises(InputError, match=message):
+        rps_jax.rollout(world, pursuit, batch.stage, setting, start=start)

@@ -102,6 +102,7 @@ class Command(Generic[T]):
     """Callback that receives the progress instead of a bar."""
 
     QUICK: ClassVar[Mapping[str, Any]] = {}  # values of `quick`, by the field's name
+    MOVED: ClassVar[Mapping[str, str]] = {}  # what replaces a former flag, by the flag
 
     @property
     def name(self) -> str:
