@@ -63,7 +63,7 @@ TABS: dict[str, list[Any]] = {
     ],
     "Physics": [
         *("mjcf/README.md", "ground", "real_pushes", "notebooks/06_fitting.md", "fit"),
-        *("engines", "fidelity", "docs/mjx_gradients.md"),
+        *("engines", "fidelity", "docs/environments.md", "docs/mjx_gradients.md"),
     ],
     "Studies": ["sweeps/README.md"],
     "Make it yours": ["rps_jax/README.md", "rps_jax/adding.md", "CONTRIBUTING.md"],

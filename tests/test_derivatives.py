@@ -1,5 +1,6 @@
 """Gradients by laws and worlds: exact, labelled, and refused where they do not exist."""
 
+import contextlib
 import re
 import warnings
 from dataclasses import replace
@@ -384,3 +385,21 @@ def test_a_state_of_another_law_is_refused():
     message = "start = .* is not allowed: give the last state of a rollout of the same law"
     with pytest.raises(InputError, match=message):
         rps_jax.rollout(world, pursuit, batch.stage, setting, start=start)
+
+
+# --- the page of environments --------------------------------------------------------------
+
+
+@pytest.mark.slow
+def test_the_programs_of_the_page_push_boxes():
+    """Raw MJX, its engine and the fused one; the latter two step the same worlds."""
+    page = (ROOT / "docs" / "environments.md").read_text()
+    names = {}
+    with contextlib.chdir(ROOT):
+        for code in re.findall(r"```python\n(.*?)```", page, re.DOTALL):
+            exec(code, names)
+    poses = np.asarray(names["poses"])
+    assert (poses[:, -1, 0] > 0.02).all()  # bases drive ahead
+    assert (poses[:, -1, 3] > poses[:, 0, 3] + 0.01).all()  # and push
+    np.testing.assert_allclose(names["in_mjx"], names["in_fused"], atol=3e-3)
+    assert np.ptp(names["in_mjx"], axis=1).min() > 1e-3
