@@ -99,7 +99,7 @@ def value_and_grad(
     effect of a small change. `useful` is the share of some worlds in which they do: in `wide` a
     change of 1 % is predicted within 10 % for 67 % of the entries at 0.5 s, 61 % at 2 s and 33 % at
     5 s. Law and skin have their smooth forms by default, so that what the law feels has
-    derivatives.
+    derivatives. Where a step of the engine quasistatic has not converged, they err by some 1e-3.
 
     Args:
       score: function of the `Trajectory` (T, ...) of one trial and of `args`, which returns one
@@ -107,8 +107,8 @@ def value_and_grad(
       laws: one law or several, as of `sweep`.
       domain: ranges from which worlds are drawn.
       worlds: number of worlds, of indices 0, 1, ...: those of `sweep` with this seed.
-      wrt: names of parameters of the laws (`params.NAME` if a drawn quantity has this name; a
-        pytree in them, as `weights`, stands for all of its leaves), of quantities that the domain
+      wrt: names of parameters of the laws (`params.NAME` if a drawn quantity has this name; the
+        name of a pytree, as `weights`, means all of its leaves), of quantities that the domain
         draws, and `target` and `com`, both x and y [m]: the centre of
         mass moves without its load, at constant inertia about it.
       horizon: duration of a trial [s].
@@ -175,7 +175,7 @@ def _gradients(
 
     Secants are those of a relative `change` of a quantity, one-sided or `central`.
     """
-    given = dict(locals())
+    inputs = dict(locals())
     device.check_process()
     ranges, chosen = parse_domain(domain, robot, task), registry.resolve_laws(laws)
     errors.check_count("worlds", worlds, at_most=1_000_000)
@@ -212,10 +212,10 @@ def _gradients(
         names = {name for slope in slopes for name in slope}
         names |= {f"params.{x.name}" for x in coordinates if x.is_parameter}
         for i, (params, loop) in enumerate(zip(chosen.values(), loops, strict=True)):
-            inputs = {"world": family.worlds, "params": family.with_params(params).params}
-            leaves = {name: x for name, x in named_leaves(inputs).items() if name in names}
+            trees = {"world": family.worlds, "params": family.with_params(params).params}
+            leaves = {name: x for name, x in named_leaves(trees).items() if name in names}
             run = partial(_value_and_slopes, family.stage, loop=loop, options=options, args=args)
-            (value[i, at], extra), by_leaf = jax.device_get(run(inputs, leaves))
+            (value[i, at], extra), by_leaf = jax.device_get(run(trees, leaves))
             aux.setdefault(i, []).append((at, extra))
             for k, (x, slope) in enumerate(zip(coordinates, slopes, strict=True)):
                 products = [y * by_leaf[name] for name, y in slope.items()]
@@ -224,7 +224,7 @@ def _gradients(
                 gradient[i, at, k] = sum(y.reshape(at.size, -1).sum(axis=1) for y in products)
             tested = np.arange(min(_TESTED, at.size))
             size = change * _sizes(coordinates, drawn, leaves)[tested]
-            move = partial(_moved_scores, run, inputs, leaves, coordinates, slopes, tested)
+            move = partial(_moved_scores, run, trees, leaves, coordinates, slopes, tested)
             middle = value[i, at[tested], None]
             rise = move(size) - (move(-size) if central else middle)
             secant[i, at[tested]] = rise / (size * (1 + central))
@@ -273,7 +273,7 @@ def _gradients(
         "skin_temperature": temperature, "notes": notes, **task_attribute(ranges),
     }  # fmt: skip
     results = Gradients(variables, coords, attrs)
-    results.inputs = given
+    results.inputs = inputs
     order = np.argsort(np.concatenate([at for at, _ in aux[0]]))
     by_law = [
         jax.tree.map(lambda *x: np.concatenate(x)[order], *(tree for _, tree in parts))
@@ -404,7 +404,7 @@ def world_slopes(
 
 
 class Trajectory(NamedTuple):
-    """Snapshots of one trial, of T control steps, and what they depend on."""
+    """Snapshots of one trial of T control steps, with its world and parameters."""
 
     time: Any  # (T,) [s]
     qpos: Any  # (T, 10) as in `Trial`

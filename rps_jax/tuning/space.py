@@ -62,10 +62,11 @@ class Space:
     def vector(self, params: LawParams) -> jax.Array:
         """Return the vector (..., p) of parameters with leaves (...)."""
         values, base = registry.named_leaves(params), registry.named_leaves(self.base)
-        leaves = [(self._coordinates(values, name), np.ndim(base[name])) for name in self.names]
-        return jnp.concatenate(
-            [x.reshape(*x.shape[: x.ndim - own], -1) for x, own in leaves], axis=-1
-        )
+        columns = []
+        for name in self.names:
+            x = self._coordinates(values, name)
+            columns.append(x.reshape(*x.shape[: x.ndim - np.ndim(base[name])], -1))
+        return jnp.concatenate(columns, axis=-1)
 
     def _coordinates(self, values: Mapping[str, Leaf], name: str) -> jax.Array:
         low, high, log, _ = bound = self._bounds[name]
@@ -127,5 +128,5 @@ def _widen(whole: Leaf, value: Leaf) -> Leaf:
 
 def _rounded(leaf: Leaf) -> Any:
     """Return a number, or nested lists of numbers, with seven digits."""
-    numbers = [float(f"{float(x):.7g}") for x in np.ravel(leaf)]
-    return np.reshape(numbers, np.shape(leaf)).tolist()
+    rounded = [float(f"{float(x):.7g}") for x in np.ravel(leaf)]
+    return np.reshape(rounded, np.shape(leaf)).tolist()

@@ -7,6 +7,7 @@ within a budget is tested in worlds that no tuning has met.
 
     rps sweeps/gradients/race.py --lanes 2 --minutes 5 --seeds 1
 
+The default race has 84 tunings of four minutes, and takes six to seven hours on two cores.
 Several tunings run at once on one GPU and share it equally. Then a budget of wall time is that of a
 loaded GPU.
 """
