@@ -9,6 +9,7 @@ from types import SimpleNamespace
 from unittest import mock
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from helpers import ROOT, refusals, row
@@ -334,6 +335,76 @@ def test_a_law_with_arrays_has_a_number_for_each_entry():
     assert labels == ["K_h[0,0]", "K_h[1,0]", "L"]
     units = [x.unit for x in derivatives.coordinates_of(("K_h", "L", "K_v"), RPSParams(), TOUCHING)]
     assert units == ["1", "m", "1/s"]
+
+
+# --- scores and checks -----------------------------------------------------------------------
+
+DRUMS = {"domain": TOUCHING, "worlds": 4, "setting": QUASISTATIC, "horizon": 0.2}
+
+
+def test_a_gradient_is_useful_if_it_predicts_a_change_of_one_percent():
+    # v^2 changes by 2.01 %, and v^40 by 48.9 % where its gradient says 40 %.
+    def score(trajectory, power):
+        return (20 * trajectory.params.v_max) ** power
+
+    for power, useful, ratio in ((2, 1.0, 2.01 / 2), (40, 0.0, 48.886 / 40)):
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            results = rps_jax.value_and_grad(score, wrt="v_max", args=(power,), **DRUMS)
+        assert results.useful.values.tolist() == [[useful]]
+        np.testing.assert_allclose(results.secant / results.gradient, ratio, rtol=1e-3)
+        assert any("do not predict the effect" in str(x.message) for x in caught) == (not useful)
+
+
+def test_other_arguments_and_another_seed_compile_nothing_and_more_is_returned():
+    def score(trajectory, goal):
+        distance = final_distance(trajectory) - goal["distance"]
+        return distance, {"end": trajectory.qpos[-1], "radius": trajectory.world.footprint.radius}
+
+    def value(goal, seed):
+        options = DRUMS | {"has_aux": True, "setting": Setting("quasistatic", seed=seed)}
+        results, aux = rps_jax.value_and_grad(
+            score, wrt="v_max", args=({"distance": goal},), **options
+        )
+        return results.value.values, aux
+
+    first, aux = value(0.0, 0)
+    count = derivatives._value_and_slopes._cache_size()
+    np.testing.assert_allclose(value(0.5, 0)[0], first - 0.5, rtol=1e-5)
+    assert (value(0.0, 1)[0] != first).all()
+    assert derivatives._value_and_slopes._cache_size() == count
+    assert aux["end"].shape == (1, 4, 10)
+    assert (aux["radius"] > 0).all()
+
+
+def test_a_score_sees_velocities_forces_and_the_state_of_the_law():
+    def score(x):
+        seen = {"executed": x.executed, "qpos": x.state.qpos, "force": x.force}
+        return jnp.sum(x.executed[:, 0]), seen | {"l_th": x.state.law_state.l_th}
+
+    options = DRUMS | {"setting": Setting("fused"), "horizon": 0.4, "has_aux": True}
+    results, aux = rps_jax.value_and_grad(score, wrt="v_max", states=True, **options)
+    steps = np.diff(aux["qpos"][0], axis=1)
+    way = np.linalg.norm(steps[..., :2], axis=-1) / 0.02
+    speed = np.linalg.norm(aux["executed"][0][..., :2], axis=-1)[:, 1:]
+    np.testing.assert_allclose(way, speed, atol=3e-4)
+    assert (results.gradient > 0).all()
+    assert aux["force"][0, ..., 0].min(axis=1).max() < -1.0  # [N] each object resists
+    assert (aux["l_th"] > 0).all()
+    with pytest.raises(InputError, match=r"states = False .* the score needs states=True"):
+        rps_jax.value_and_grad(lambda x: x.executed[-1, 0], wrt="v_max", **DRUMS)
+
+
+def test_a_check_compares_with_central_differences_in_double_precision():
+    iterations = mock.patch.multiple(quasistatic, _ITERATIONS=14, _SHARP=7)
+    with iterations, warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        results = rps_jax.value_and_grad(final_distance, wrt=("v_max", "target", "noise"), **DRUMS)
+        checked = results.check(2)
+    assert checked.error.shape == (1, 2, 4)
+    assert checked.error.max() < 1e-4
+    same = results.gradient.isel(world=[0, 1])
+    np.testing.assert_allclose(checked.gradient, same, rtol=2e-2, atol=1e-5)
 
 
 # --- continued rollouts --------------------------------------------------------------------
