@@ -17,7 +17,7 @@ from __future__ import annotations
 import functools
 import itertools
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Hashable
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, ClassVar, NamedTuple
@@ -209,25 +209,21 @@ class TuneGrad(Descent):
             worlds = self.worlds if generation < self.steps else 0
             results, slopes = self.try_step(proposal, generation, score, worlds)
             return {**nothing, **results, **gradient_results(slopes)}
-        start_time = time.perf_counter()
+        times = dict.fromkeys(("compile", "run", "simulated"), 0.0)
         anchor = int(proposal["anchor"])
-        states = self._states(anchor, jnp.asarray(proposal["anchors"][0]))
+        states = self._states(anchor, jnp.asarray(proposal["anchors"][0]), times)
         coefficients, extra = proposal["coefficients"], dict[str, Any]()
-        simulated = 0.0
         if anchor == generation:
             new = sum(x.moments for x in states)
             coefficients = fit(proposal["moments"] + new, self.ridge)
             extra = {"new_moments": new, "coefficients": coefficients}
-            simulated = sum(x.seconds for x in states)
-        estimate = self._derivatives(vector, states, coefficients, generation)
-        wall = time.perf_counter() - start_time
+        estimate = self._derivatives(vector, states, coefficients, generation, times)
+        times["simulated"] += _DERIVATIVE_COST * self.windows * self.window
         results: Results = self.step_results(proposal)
         if anchor == generation:
             results, slopes = self.try_step(proposal, generation, score, self.checks)
             cosine = gradients.cosine(estimate.gradient, slopes.gradient)
             extra |= {"slopes": slopes.gradient[None], "cosine": cosine}
-        simulated += _DERIVATIVE_COST * self.windows * self.window
-        times = {"run": wall, "simulated": simulated}
         return {**nothing, **results, **extra, **gradient_results(estimate), **times}
 
     @functools.cached_property
@@ -235,26 +231,36 @@ class TuneGrad(Descent):
         """States of the trials of a generation."""
         return {}
 
-    def _states(self, generation: int, vector: jax.Array) -> list[_States]:
+    def _states(self, generation: int, vector: jax.Array, times: dict[str, float]) -> list[_States]:
         """Return states of trials of the original law with a vector (p,), by shape family."""
         if generation not in self._cache:
             self._cache.clear()
             tried = self.tried(vector[None], generation, self.trials)
-            batches = tried.batches(self.setting)
-            self._cache[generation] = [self._collect(vector, x.stage, x.worlds) for x in batches]
+            self._cache[generation] = [
+                self._collect(vector, x.stage, x.worlds, times) for x in tried.batches(self.setting)
+            ]
         return self._cache[generation]
 
-    def _collect(self, vector: jax.Array, stage: Stage, worlds: World) -> _States:
+    def _collect(
+        self, vector: jax.Array, stage: Stage, worlds: World, times: dict[str, float]
+    ) -> _States:
         soft = soften_skins(worlds, self.taxels)
-        trials, inputs, scores, live, seconds = self._programs[0](vector, stage, worlds, soft)
+        results = self._call(_run_trials, times, vector, stage, worlds, soft)
+        trials, inputs, scores, live, seconds = results
+        times["simulated"] += float(np.sum(seconds))
         live, contact = np.asarray(live), np.asarray(inputs)[..., _CONTACT] > 0
         columns = np.ones((*live.shape, 1)), np.asarray(inputs), np.asarray(scores)[..., None]
         data = np.concatenate(columns, axis=-1, dtype=float)[live]
         chosen = np.argwhere(live & contact) if (live & contact).any() else np.argwhere(live)
-        return _States(stage, soft, trials, chosen, data.T @ data, float(np.sum(seconds)))
+        return _States(stage, soft, trials, chosen, data.T @ data)
 
     def _derivatives(
-        self, vector: jax.Array, states: list[_States], coefficients: np.ndarray, generation: int
+        self,
+        vector: jax.Array,
+        states: list[_States],
+        coefficients: np.ndarray,
+        generation: int,
+        times: dict[str, float],
     ) -> Estimate:
         """Return the clipped derivatives (p,) of windows from random states."""
         random = np.random.default_rng((self.setting.seed, generation))
@@ -265,13 +271,27 @@ class TuneGrad(Descent):
             if count:
                 at = random.choice(family.chosen, count, replace=len(family.chosen) < count)
                 inputs = family.stage, family.worlds, family.trials, jnp.asarray(at)
-                samples.append(self._programs[1](vector, jnp.asarray(coefficients), *inputs))
+                value = jnp.asarray(coefficients, float)
+                samples.append(self._call(_differentiate, times, vector, value, *inputs))
         return gradients.estimate(gradients.clip(jnp.concatenate(samples), self.clip))
 
     @functools.cached_property
-    def _programs(self) -> tuple[Callable[..., Any], Callable[..., Any]]:
-        """Compiled functions of one shape family: `_run_trials` and `_differentiate`."""
-        return jax.jit(partial(_run_trials, self)), jax.jit(partial(_differentiate, self))
+    def _programs(self) -> dict[Hashable, Callable[..., Any]]:
+        """Compiled functions of the shape families."""
+        return {}
+
+    def _call(self, function: Callable[..., Any], times: dict[str, float], *inputs: Any) -> Any:
+        """Call a function of the options and some arrays; add the wall clock to `times` [s]."""
+        leaves, structure = jax.tree.flatten(inputs)
+        key, start_time = (function, structure, *map(jnp.shape, leaves)), time.perf_counter()
+        if key not in self._programs:
+            lowered = jax.jit(partial(function, self)).lower(*inputs)
+            self._programs[key] = lowered.compile()
+            times["compile"] += time.perf_counter() - start_time
+            start_time = time.perf_counter()
+        result = jax.block_until_ready(self._programs[key](*inputs))
+        times["run"] += time.perf_counter() - start_time
+        return result
 
     @property
     def smooth(self) -> Law:
@@ -290,10 +310,7 @@ class _States(NamedTuple):
     worlds: World  # (n, ...) with smooth skins
     trials: Trial  # (K, n, ...) one state of each trial per length of a window
     chosen: np.ndarray  # (m, 2) indices of the states at which windows may start
-    moments: (
-        np.ndarray
-    )  # (F + 2, F + 2) sums of products of 1, the features and the remaining score
-    seconds: float  # [s] simulated in all
+    moments: np.ndarray  # (F + 2, F + 2) sums of products of 1, features and remaining score
 
 
 def _run_trials(
