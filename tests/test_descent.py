@@ -234,6 +234,13 @@ test_bad_options_are_refused_before_anything_compiles = refusals(
 )
 
 
+def test_the_former_flags_say_where_random_steps_are(capsys):
+    for flag in ("--starts", "--spread"):
+        text = refusal(capsys, f"tune grad {flag} 2")
+        assert f"unknown option '{flag}'" in text
+        assert "`rps tune es --estimator antithetic`" in text
+
+
 # Cylinders on the quasi-static model, to compile few programs.
 RUN = "--engine quasistatic --objects random_cylinder --worlds 2 --validation 2 "
 RUN += "--horizon 5 --tuned L K_h v_lost --slots 8"
