@@ -94,7 +94,7 @@ class Graph(Target):
         to = self.constant(np.array(shape, np.int64))
         return self.node("Reshape", [tensor, to], shape, tensor.kind)
 
-    def moved(self, values: Values, indices: np.ndarray, template: Typed) -> Value:
+    def gather(self, values: Values, indices: np.ndarray, template: Typed) -> Value:
         """Gather numbers at constant indices: a reshape or an expansion where that suffices."""
         if not indices.size:
             return np.zeros(indices.shape, template.dtype)

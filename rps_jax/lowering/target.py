@@ -54,14 +54,14 @@ class TooLargeError(InputError):
 
 
 class Target:
-    """Back end of a jaxpr: subclasses implement `moved` and `apply`."""
+    """Back end of a jaxpr: subclasses implement `gather` and `apply`."""
 
     operations: Collection[str] = ()  # that it spells; others are compounds
     kinds = "fib"  # kinds of numbers that it supports, see `kind_of`
 
     # --- what each back end implements ---
 
-    def moved(self, values: Values, indices: np.ndarray, template: Typed) -> Value:
+    def gather(self, values: Values, indices: np.ndarray, template: Typed) -> Value:
         """Gather numbers of the concatenated, flattened values at constant indices."""
         raise NotImplementedError
 
@@ -83,9 +83,9 @@ class Target:
         rest = [i for i in range(len(shape)) if i not in axes]
         indices = np.transpose(np.arange(size_of(shape)).reshape(shape), [*axes, *rest])
         first, *rows = indices.reshape(-1, *out.shape)
-        result = self.moved([value], first, out)
+        result = self.gather([value], first, out)
         for row in rows:
-            result = self.apply(binary, [result, self.moved([value], row, out)], {}, out)
+            result = self.apply(binary, [result, self.gather([value], row, out)], {}, out)
         return result
 
     def windows(
@@ -147,9 +147,10 @@ def kind_of(dtype: object, name: str = "", kinds: str = "fibu") -> str:
     """Return the kind of a dtype: `f` real, `i` signed, `u` unsigned, `b` bool.
 
     Raises:
-      UnsupportedError: it is none of `kinds`; `name` is the operation in the message.
+      UnsupportedError: it is none of `kinds`, or has fewer than 4 bytes; `name` is the operation in
+        the message.
     """
     kind = dtype.kind if isinstance(dtype, np.dtype) else "?"
-    if kind not in kinds:
+    if kind not in kinds or (kind != "b" and np.dtype(dtype).itemsize < 4):
         raise UnsupportedError(f"{name} of {dtype}".strip())
     return kind

@@ -2,7 +2,7 @@
 
 Values are NumPy arrays where they are constant, and otherwise what a `Target` returns. Operations
 that only move numbers (slices, reshapes, stacks, gathers at constant indices) are one operation of
-a target, `moved`: they are applied to flat indices, which gives the source of each number.
+a target, `gather`: they are applied to flat indices, which gives the source of each number.
 """
 
 from __future__ import annotations
@@ -211,7 +211,7 @@ def _moved(eqn: JaxprEqn, values: list[Value], sources: list[int], target: Targe
     moved = _moved_by_numpy(eqn, indices)
     moved = _bind(eqn, indices) if moved is None else moved
     return [
-        target.moved([values[i] for i in sources], np.asarray(x), out)
+        target.gather([values[i] for i in sources], np.asarray(x), out)
         for x, out in zip(moved, _types(eqn.outvars), strict=True)
     ]
 
@@ -276,7 +276,7 @@ def _scan(eqn: JaxprEqn, values: list[Value], target: Target) -> list[Value]:
     for i, var in enumerate(body.jaxpr.outvars[carried:]):
         out = jax.ShapeDtypeStruct((length, *var.aval.shape), var.aval.dtype)
         indices = np.arange(size_of(out.shape)).reshape(out.shape)
-        stacked.append(target.moved([row[i] for row in rows], indices, out))
+        stacked.append(target.gather([row[i] for row in rows], indices, out))
     return [*carry, *stacked]
 
 
@@ -285,7 +285,7 @@ def _row(value: Value, step: int, out: Any, target: Target) -> Value:
     if is_constant(value):
         return np.asarray(value[step])
     size = size_of(out.shape)
-    return target.moved([value], (step * size + np.arange(size)).reshape(out.shape), out)
+    return target.gather([value], (step * size + np.arange(size)).reshape(out.shape), out)
 
 
 def _scan_loop(

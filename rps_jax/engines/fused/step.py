@@ -168,7 +168,7 @@ class FusedStage(NamedTuple):
         inputs = fields, motion, period.twists, period.robot
         if motion.qpos.ndim != 2:
             return steps(*inputs, period.solutions)
-        return native.batched(saving, steps, saves=True)(*inputs)
+        return native.batched(saving, steps, "derivatives")(*inputs)
 
 
 def _drive(
