@@ -99,9 +99,12 @@ def struct(prefix: str, name: str, group: Group) -> str:
 
 
 def statements(
-    routine: Routine, inputs: Mapping[str, str], outputs: Mapping[str, str],
-    tables: dict[str, str], prefix: str,
-) -> str:  # fmt: skip
+    routine: Routine,
+    inputs: Mapping[str, str],
+    outputs: Mapping[str, str],
+    tables: dict[str, str],
+    prefix: str,
+) -> str:
     """Return the statements that compute and store the results of a routine.
 
     Args:
@@ -116,7 +119,7 @@ def statements(
     for group, field, value in writer.outputs:
         name = f"{outputs[group]}{field.name}"
         if len(field.shape) == 1 and field.size > 1:
-            line = f"  {name}[i] = {writer.value(value, field.kind, field.size)};"
+            line = f"  {name}[i] = {writer.read(value, field.size)};"
             lines += writer.elements(field.size, [line])
         else:
             lines += [

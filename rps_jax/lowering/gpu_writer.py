@@ -11,7 +11,6 @@ import itertools
 from collections.abc import Collection, Iterable, Sequence
 
 import numpy as np
-from jax.extend.core import ClosedJaxpr
 
 from rps_jax.lowering.builder import INITIAL
 from rps_jax.lowering.gpu_builder import WARP, GpuBuilder
@@ -19,7 +18,7 @@ from rps_jax.lowering.graph import Array, DynamicSlice, Gather, Input, LoopNode,
 from rps_jax.lowering.operations import GPU_HEADER, TYPES
 from rps_jax.lowering.passes import cross_thread_arrays
 from rps_jax.lowering.simd_writer import STORED, SimdWriter
-from rps_jax.lowering.target import TooLargeError, Typed, Value
+from rps_jax.lowering.target import TooLargeError, Value
 from rps_jax.lowering.writer import Writer
 
 _MAX_SHARED = 48 * 1024  # bytes of a block
@@ -50,7 +49,7 @@ class GpuWriter(SimdWriter):
     """Printer of nodes as CUDA for several threads per world."""
 
     table_type = "static __device__ const"
-    header, function, inputs = f"{GPU_HEADER}\n{_FOLDS}\n", _KERNEL, "a.inputs"
+    function, inputs = _KERNEL, "a.inputs"
     builder = GpuBuilder
     single = Writer.single  # a thread reads inputs as it needs them
 
@@ -65,17 +64,11 @@ class GpuWriter(SimdWriter):
         self._offsets: dict[Node, int] = {}  # in shared memory
         self._shared_size = 1  # numbers of a world in shared memory, at most
 
-    def source(
-        self,
-        closed: ClosedJaxpr,
-        shapes: Sequence[Typed],
-        outs: Sequence[Typed],
-        sorted_worlds: bool = False,
-    ) -> str:
-        text = super().source(closed, shapes, outs, sorted_worlds)
+    def preamble(self) -> str:
         if 4 * self._shared_size * self._worlds > _MAX_SHARED:
             raise TooLargeError("the arrays of a world exceed the shared memory of a block.")
-        return f"#define THREADS {self._threads}\n#define SHARED {self._shared_size}\n{text}"
+        sizes = f"#define THREADS {self._threads}\n#define SHARED {self._shared_size}\n"
+        return f"{sizes}{GPU_HEADER}\n{_FOLDS}\n"
 
     def assign_storage(self, nodes: Iterable[Node], returned: Iterable[Result]) -> None:
         shared = cross_thread_arrays(nodes, returned)
@@ -134,13 +127,13 @@ class GpuWriter(SimdWriter):
             self._pending.append(f"const {TYPES[node.kind]} {name} = {self.item(node, index)};")
         return self._broadcasts[key]
 
-    def read(self, a: Value, node: Node, fused: set[Node]) -> str:
+    def read(self, a: Value, size: int, fused: Collection[Node] = ()) -> str:
         if isinstance(a, Array) and a.node.width > 1 and a.node not in fused:
-            if not a.step or node.size == 1:
+            if not a.step or size == 1:
                 return self._broadcast(a.node, a.first)
-            if node.is_aligned(a):
+            if a.covers(size):
                 return self.element(a.node)
-        return super().read(a, node, fused)
+        return super().read(a, size, fused)
 
     # --- statements ---
 
@@ -190,7 +183,7 @@ class GpuWriter(SimdWriter):
             return [], f"{stored} != 0" if node.kind == "b" else stored
         if isinstance(op, DynamicSlice):
             index, source = node.operands
-            row, table = self.value(index, "i", 1), self.table(np.array(op.windows))
+            row, table = self.read(index, 1), self.table(np.array(op.windows))
             return [], self.item(source.node, f"{table}[{row} * {size} + {at}]")
         if isinstance(op, Gather) and size > 1:
             return self._gather(node)
@@ -245,7 +238,7 @@ class GpuWriter(SimdWriter):
         stored = f"(({STORED[kind]} *)a.outputs[{position}])[at * {size} + i]"
         guard = f" && {self._guard(size)}" if self._guard(size) else ""
         lines = [
-            f"  {self.declaration(kind, 'e')} = {self.value(a, kind, size)};",
+            f"  {self.declaration(kind, 'e')} = {self.read(a, size)};",
             f"  if (exists{guard}) {stored} = e;",
         ]
         return self.statement(self.elements(size, lines))

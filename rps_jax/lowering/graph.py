@@ -138,13 +138,9 @@ class Node:
     @functools.cached_property
     def fusion_barriers(self) -> set[Node]:
         """Predecessors that cannot be computed in the same loop over elements."""
-        arrays = [a for a in self.operands if isinstance(a, Array)]
-        whole = (a.node for a in arrays if not (self.is_fusible and self.is_aligned(a)))
-        return {*whole, *self.captured}
-
-    def is_aligned(self, a: Array) -> bool:
-        """Whether element `i` of this node reads element `i` of a node."""
-        return a.step == 1 and a.first == 0 and a.node.width == self.size
+        arrays = (a for a in self.operands if isinstance(a, Array))
+        barriers = (a.node for a in arrays if not (self.is_fusible and a.covers(self.size)))
+        return {*barriers, *self.captured}
 
 
 @dataclass(eq=False)
@@ -169,6 +165,10 @@ class Array(NamedTuple):
     def dtype(self) -> np.dtype:
         """Type of the numbers in JAX."""
         return np.dtype(DTYPES[self.node.kind])
+
+    def covers(self, size: int) -> bool:
+        """Whether its elements are those of its node, which has `size` elements."""
+        return self.step == 1 and self.first == 0 and self.node.width == size
 
 
 class Result(NamedTuple):

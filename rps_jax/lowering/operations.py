@@ -43,28 +43,56 @@ def _infix(name: str, kind: str, sign: str, onnx: str = "", js: str = "") -> Ope
 
 
 # Functions that the three languages have, and those that ONNX lacks.
-_FUNCTIONS = ("sqrt", "exp", "log", "sin", "cos", "tan", "asin", "acos", "atan", "sinh", "cosh",
-              "asinh", "acosh", "atanh", "floor", "ceil")  # fmt: skip
+_FUNCTIONS = (
+    "sqrt",
+    "exp",
+    "log",
+    "sin",
+    "cos",
+    "tan",
+    "asin",
+    "acos",
+    "atan",
+    "sinh",
+    "cosh",
+    "asinh",
+    "acosh",
+    "atanh",
+    "floor",
+    "ceil",
+)
 _BEYOND_ONNX = ("log1p", "expm1", "cbrt")
 # Signs and operators of ONNX; the integer arithmetic of JavaScript.
 _COMPARISONS = {
     **{"lt": ("<", "Less"), "le": ("<=", "LessOrEqual"), "eq": ("==", "Equal")},
     **{"gt": (">", "Greater"), "ge": (">=", "GreaterOrEqual"), "ne": ("!=", "")},
 }
-_ARITHMETIC = {"add": ("+", "({0} + {1}) | 0"), "sub": ("-", "({0} - {1}) | 0"),
-               "mul": ("*", "Math.imul({0}, {1})")}  # fmt: skip
+_ARITHMETIC = {
+    "add": ("+", "({0} + {1}) | 0"),
+    "sub": ("-", "({0} - {1}) | 0"),
+    "mul": ("*", "Math.imul({0}, {1})"),
+}
 _BITS = {"and": "&", "or": "|", "xor": "^"}
 _CHOICE = "{0} ? {1} : {2}"
 TABLE = {
     **{f"{x}_f": _function(x, x.capitalize()) for x in _FUNCTIONS},
     **{f"{x}_f": _function(x) for x in _BEYOND_ONNX},
-    **{f"{x}_{kind}": _infix(x, kind, sign, x.capitalize(), js if kind == "i" else "")
-       for x, (sign, js) in _ARITHMETIC.items() for kind in "fiu"},
-    **{f"{x}_{kind}": _infix(x, kind, *spelling)
-       for x, spelling in _COMPARISONS.items() for kind in "fiu"},
+    **{
+        f"{x}_{kind}": _infix(x, kind, sign, x.capitalize(), js if kind == "i" else "")
+        for x, (sign, js) in _ARITHMETIC.items()
+        for kind in "fiu"
+    },
+    **{
+        f"{x}_{kind}": _infix(x, kind, *spelling)
+        for x, spelling in _COMPARISONS.items()
+        for kind in "fiu"
+    },
     "eq_b": _infix("eq", "b", *_COMPARISONS["eq"]),
-    **{f"{x}_{kind}": _infix(x, kind, sign, f"Bitwise{x.capitalize()}")
-       for x, sign in _BITS.items() for kind in "iu"},
+    **{
+        f"{x}_{kind}": _infix(x, kind, sign, f"Bitwise{x.capitalize()}")
+        for x, sign in _BITS.items()
+        for kind in "iu"
+    },
     "and_b": _infix("and", "b", "&", "And")._replace(c="{0} && {1}", js="{0} && {1}"),
     "or_b": _infix("or", "b", "|", "Or")._replace(c="{0} || {1}", js="{0} || {1}"),
     "xor_b": _infix("xor", "b", "^", "Xor")._replace(c="{0} != {1}", js="{0} != {1}"),
@@ -93,19 +121,22 @@ TABLE = {
     "round_f": _function("round")._replace(js=""),
     "rint_f": _function("rint", "Round")._replace(js="rint({0})"),
     "logistic_f": Operation(onnx="Sigmoid"),
-    "atan2_f": Operation("{P}_F(atan2)({0}, {1})", "Math.atan2({0}, {1})", "",
-                         "EACH_OF_TWO(atan2, atan2f)"),
-    "pow_f": Operation("{P}_F(pow)({0}, {1})", "Math.pow({0}, {1})", "Pow",
-                       "EACH_OF_TWO(pow, powf)"),
+    "atan2_f": Operation(
+        "{P}_F(atan2)({0}, {1})", "Math.atan2({0}, {1})", "", "EACH_OF_TWO(atan2, atan2f)"
+    ),
+    "pow_f": Operation(
+        "{P}_F(pow)({0}, {1})", "Math.pow({0}, {1})", "Pow", "EACH_OF_TWO(pow, powf)"
+    ),
     "f_of_i": Operation("({p}_real){0}", "{0}", "Cast"),
     "f_of_b": Operation("({p}_real){0}", "{0} ? 1 : 0", "Cast"),
     "i_of_b": Operation("{0}", "{0} ? 1 : 0", "Cast"),
     "truncate_f": Operation("(int){0}", "Math.trunc({0})", "Cast"),
-}  # fmt: skip
+}
 
 _FOLDER = Path(__file__).parent
-_COMMON = "\n".join([*(row.simd for row in TABLE.values() if row.simd),
-                     (_FOLDER / "operations.h").read_text()])  # fmt: skip
+_COMMON = "\n".join(
+    [*(row.simd for row in TABLE.values() if row.simd), (_FOLDER / "operations.h").read_text()]
+)
 XLA_CALL = (_FOLDER / "xla_call.h").read_text()
 SIMD_HEADER = XLA_CALL + (_FOLDER / "simd.h").read_text() + _COMMON
 GPU_HEADER = (_FOLDER / "gpu.h").read_text() + _COMMON

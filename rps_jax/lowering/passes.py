@@ -102,7 +102,7 @@ def _next_group(
 def sink_products(roots: Sequence[Node]) -> list[Node]:
     """Return all live nodes, with a block for products that are not always used.
 
-    A learned law decides five times a second. Its network is evaluated only in these steps.
+    A network is then evaluated only in the steps that use its result.
     """
     nodes = live_nodes(roots)
     if any(isinstance(node.op, MatrixProduct) for node in nodes):
@@ -173,27 +173,17 @@ def _move_into_block(
 
 def cross_thread_arrays(nodes: Iterable[Node], results: Iterable[Result]) -> set[Node]:
     """Return the arrays of which a thread reads elements that another thread computes."""
-    shared: set[Node] = set()
-
-    def read(a: Value, size: int, is_aligned: bool = True) -> None:
-        if not isinstance(a, Array) or a.node.width == 1:
-            return
-        if not (is_aligned and a.step == 1 and a.first == 0 and a.node.width == size):
-            shared.add(a.node.storage)
-
-    def visit(group: Iterable[Node]) -> None:
-        for node in group:
-            if isinstance(node, LoopNode):
-                for carried, *values in zip(node.carried, node.operands, node.results, strict=True):
-                    for a in values:
-                        read(a, carried.size)
-                read(node.condition, 1)
-                visit(node.body)
-                continue
-            for a in node.operands:
-                read(a, node.size, not isinstance(node.op, Gather | DynamicSlice))
-
-    visit(nodes)
-    for result in results:
-        read(result.value, result.size)
-    return shared
+    reads: list[tuple[Value, int]] = [(result.value, result.size) for result in results]
+    waiting = list(nodes)
+    while waiting:
+        node = waiting.pop()
+        if isinstance(node, LoopNode):
+            waiting += node.body
+            sizes = [x.size for x in node.carried] * 2
+            reads += zip((*node.operands, *node.results), sizes, strict=True)
+            reads.append((node.condition, 1))
+        else:
+            size = 0 if isinstance(node.op, Gather | DynamicSlice) else node.size
+            reads += [(a, size) for a in node.operands]
+    arrays = ((a, size) for a, size in reads if isinstance(a, Array) and a.node.width > 1)
+    return {a.node.storage for a, size in arrays if not a.covers(size)}

@@ -35,7 +35,7 @@ class ScalarBuilder(GraphBuilder):
             scalar = source
         return scalar
 
-    # A control step has a deadline, so the length of each loop must be known.
+    # The printed code may have a deadline, so the length of each loop must be known.
     while_loop = Target.while_loop
 
     def products(self, matrix: Factor, rows: Factor, dtype: np.dtype) -> list[Value]:

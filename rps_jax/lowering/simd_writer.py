@@ -44,7 +44,7 @@ class SimdWriter(Writer):
     """Printer of nodes as C with a vector lane for each world."""
 
     table_type = "static const"
-    header, function, inputs = SIMD_HEADER, _FUNCTION, "inputs"
+    function, inputs = _FUNCTION, "inputs"
     builder: type[GraphBuilder] = SimdBuilder
 
     def constant(self, text: str, kind: str) -> str:
@@ -63,7 +63,7 @@ class SimdWriter(Writer):
             text = f"-(int){text}" if node.kind == "b" else text
         elif isinstance(node.op, DynamicSlice):
             index, source = node.operands
-            row, table = self.value(index, "i", 1), self.table(np.array(node.op.windows))
+            row, table = self.read(index, 1), self.table(np.array(node.op.windows))
             text = f"{source.node.name}[{table}[{row}[l] {offset}][l]"
         else:
             return super().single(node)
@@ -75,7 +75,7 @@ class SimdWriter(Writer):
         position, a, size, kind = result
         stored, truth = STORED[kind], " != 0" * (kind == "b")
         lines = [
-            f"  {self.declaration(kind, 'e')} = {self.value(a, kind, size)};",
+            f"  {self.declaration(kind, 'e')} = {self.read(a, size)};",
             "  for (int l = 0; l < LANES && first + l < worlds; l++)",
             f"    (({stored} *)outputs[{position}])[at[l] * {size} + i] = e[l]{truth};",
         ]
@@ -107,7 +107,7 @@ class SimdWriter(Writer):
         for result in returned:
             lines += self.end(result)
         order = f"((const int *){self.inputs}[{len(shapes)}])[index]"
-        return self.header + self.function.format(
+        return self.preamble() + self.function.format(
             TABLES="\n".join(self.tables.values()),
             LINES="\n".join(f"  {line}" for line in lines),
             WORLD=order if sorted_worlds else "index",
@@ -120,3 +120,7 @@ class SimdWriter(Writer):
 
     def assign_storage(self, nodes: Iterable[Node], returned: Iterable[Result]) -> None:
         """Choose where arrays are stored."""
+
+    def preamble(self) -> str:
+        """Return the text before the function, after its statements are printed."""
+        return SIMD_HEADER

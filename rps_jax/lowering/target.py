@@ -19,8 +19,13 @@ Body: TypeAlias = Callable[[Values], list[Value]]  # of a loop, from its carry
 
 # Binary operation that each reduction repeats.
 REDUCTIONS = {
-    **{"reduce_sum": "add", "reduce_prod": "mul", "reduce_max": "max", "reduce_min": "min"},
-    **{"reduce_and": "and", "reduce_or": "or", "reduce_xor": "xor"},
+    "reduce_sum": "add",
+    "reduce_prod": "mul",
+    "reduce_max": "max",
+    "reduce_min": "min",
+    "reduce_and": "and",
+    "reduce_or": "or",
+    "reduce_xor": "xor",
 }
 DTYPES = {"f": "float32", "i": "int32", "u": "uint32", "b": "bool"}  # by kind
 

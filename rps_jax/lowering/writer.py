@@ -12,7 +12,6 @@ from rps_jax.lowering.builder import INITIAL
 from rps_jax.lowering.graph import (
     Array,
     Call,
-    DynamicSlice,
     For,
     Gather,
     LoopNode,
@@ -168,7 +167,7 @@ class Writer:
         if is_masked:
             condition = [n for n in live_nodes([loop.condition.node]) if n in loop.body]
             body += self.lines(condition, loop.body, computed)
-            holds = f"{self.declaration('b', 'goes')} = {self.value(loop.condition, 'b', 1)};"
+            holds = f"{self.declaration('b', 'goes')} = {self.read(loop.condition, 1)};"
             body += self.statement([holds, self.leave])
             computed |= set(condition)
             rest = [n for n in loop.body if n not in set(condition)]
@@ -188,7 +187,7 @@ class Writer:
         self, node: Node, value: Value, declare: bool = False, masked: bool = False
     ) -> list[str]:
         """Return the assignment of a carried node, if masked only in the lanes that continue."""
-        text = self.value(value, node.kind, node.size)
+        text = self.read(value, node.size)
         if masked:
             text = self.call(f"choose_{node.kind}", ["goes", text, self.element(node)])
         line = f"{self.element(node)} = {text};"
@@ -219,20 +218,15 @@ class Writer:
         text = self.literal(array[index], kind) if is_literal else f"{self.table(array)}[i]"
         return self.constant(text, kind)
 
-    def read(self, a: Value, node: Node, fused: set[Node]) -> str:
-        """Return an operand of a node; nodes in `fused` are computed in the same loop."""
-        if isinstance(a, Array) and a.node in fused and node.is_aligned(a):
+    def read(self, a: Value, size: int, fused: Collection[Node] = ()) -> str:
+        """Return a value, or its element `i`; nodes in `fused` are computed in the same loop."""
+        if isinstance(a, Array) and a.node in fused and a.covers(size):
             return f"e{a.node.id}"
-        is_scalar = node.size == 1 or isinstance(node.op, Gather | DynamicSlice)
-        return self.operand(a, 0 if is_scalar else "i")
-
-    def value(self, a: Value, kind: str, size: int) -> str:
-        """Return a value, or its element `i`, where it is assigned."""
-        return self.read(a, Node(0, Call("copy"), (a,), kind, size), set())
+        return self.operand(a, 0 if size == 1 else "i")
 
     def element_text(self, node: Node, fused: set[Node]) -> tuple[list[str], str]:
         """Return statements, and the expression of element `i` of a node."""
-        operands = [self.read(a, node, fused) for a in node.operands]
+        operands = [self.read(a, node.size, fused) for a in node.operands]
         is_call = isinstance(node.op, Call)
         return [], self.call(node.op.function, operands) if is_call else operands[0]
 

@@ -172,9 +172,15 @@ class FusedStage(NamedTuple):
 
 
 def _drive(
-    body: Body, motion: Motion, twist: Vec, robot: Robot | None, solutions: Any = None,
-    *, physics: Physics, force: bool,
-) -> Driven:  # fmt: skip
+    body: Body,
+    motion: Motion,
+    twist: Vec,
+    robot: Robot | None,
+    solutions: Any = None,
+    *,
+    physics: Physics,
+    force: bool,
+) -> Driven:
     """Step a batch of worlds, or one world, for one control period."""
     scalars = spread(body)
 
