@@ -40,15 +40,15 @@ def graph():
     return results(closed, shapes, outs, SimdBuilder())[0]
 
 
-def nodes(ends):
+def nodes(outputs):
     """Return all nodes of results, also those in loops."""
-    found = live_nodes(nodes_of(end.value for end in ends))
-    return [*found, *(x for loop in found if isinstance(loop, LoopNode) for x in loop.body)]
+    outer = live_nodes(nodes_of(x.value for x in outputs))
+    return [*outer, *(x for loop in outer if isinstance(loop, LoopNode) for x in loop.body)]
 
 
-def first(ends, op, function=None):
+def first(outputs, op, function=None):
     """Return the first node of an operation."""
-    matches = (x for x in nodes(ends) if isinstance(x, op) or isinstance(x.op, op))
+    matches = (x for x in nodes(outputs) if isinstance(x, op) or isinstance(x.op, op))
     return next(x for x in matches if function in (None, getattr(x.op, "function", None)))
 
 
@@ -56,56 +56,56 @@ def shifted(value):
     return value._replace(first=value.first + 1)
 
 
-def rename(ends):
-    first(ends, Call, "mul_f").op = Call("lt_f")
+def rename(outputs):
+    first(outputs, Call, "mul_f").op = Call("lt_f")
 
 
-def drop_operand(ends):
-    node = first(ends, Call, "choose_f")
+def drop_operand(outputs):
+    node = first(outputs, Call, "choose_f")
     node.operands = node.operands[:2]
 
 
-def shift_operand(ends):
-    node = first(ends, Call, "mul_f")
+def shift_operand(outputs):
+    node = first(outputs, Call, "mul_f")
     node.operands = tuple(shifted(a) if isinstance(a, Array) else a for a in node.operands)
 
 
-def wrong_constant(ends):
-    node = first(ends, Call, "mul_f")
+def wrong_constant(outputs):
+    node = first(outputs, Call, "mul_f")
     node.operands = (np.ones(4), node.operands[1])
 
 
-def shift_window(ends):
-    node = first(ends, DynamicSlice)
+def shift_window(outputs):
+    node = first(outputs, DynamicSlice)
     node.op = DynamicSlice(tuple((x + 1,) for (x,) in node.op.windows))
 
 
-def read_itself(ends):
-    node = first(ends, Call, "choose_f")
+def read_itself(outputs):
+    node = first(outputs, Call, "choose_f")
     node.operands = (*node.operands[:2], Array(node, 0, 1, (5,)))
 
 
-def undefined_in_loop(ends):
-    loop = first(ends, LoopNode)
+def undefined_in_loop(outputs):
+    loop = first(outputs, LoopNode)
     loop.captured = ()
 
 
-def dangling_in_loop(ends):
-    loop = first(ends, LoopNode)
+def dangling_in_loop(outputs):
+    loop = first(outputs, LoopNode)
     loop.body = (*loop.body, Node(999, Call("neg_f"), (np.ones(1),), "f", 1))
 
 
-def without_loop(ends):
-    first(ends, LoopResult).captured = ()
+def without_loop(outputs):
+    first(outputs, LoopResult).captured = ()
 
 
-def wrong_condition(ends):
-    loop = first(ends, LoopNode)
+def wrong_condition(outputs):
+    loop = first(outputs, LoopNode)
     loop.condition = np.ones(1, np.int32)
 
 
-def wrong_result(ends):
-    ends[0] = ends[0]._replace(kind="i")
+def wrong_result(outputs):
+    outputs[0] = outputs[0]._replace(kind="i")
 
 
 FAULTS = {
@@ -125,11 +125,11 @@ FAULTS = {
 
 @pytest.mark.parametrize("fault", FAULTS, ids=lambda f: f.__name__)
 def test_a_fault_is_found(fault):
-    ends = graph()
-    verifier.check(ends)
-    fault(ends)
+    outputs = graph()
+    verifier.check(outputs)
+    fault(outputs)
     with pytest.raises(GraphError, match=re.escape(FAULTS[fault])):
-        verifier.check(ends)
+        verifier.check(outputs)
 
 
 def test_a_graph_is_printed_one_line_for_each_node():
@@ -146,7 +146,7 @@ def test_the_graphs_of_a_law_are_valid(law, monkeypatch):
     """Each header and module has three routines, and a block for the network of a learned law."""
     checked = []
     check = verifier.check
-    monkeypatch.setattr(verifier, "check", lambda ends: checked.append(check(ends)))
+    monkeypatch.setattr(verifier, "check", lambda outputs: checked.append(check(outputs)))
     program = programs.program(law)
     c.header(program, "law")
     js.module(program, "law")

@@ -289,8 +289,8 @@ def _tangents(
         return jax.vjp(of_varied, point)[1](list(vectors))[0]
 
     forward, transpose = (batched(f, jax.vmap(f)) for f in (push, pull))
-    vectors, like = [directions[i] for i in varied], [result_leaves[i] for i in real]
-    outputs = linear_map(forward, transpose, leaves, vectors, like)
+    vectors, templates = [directions[i] for i in varied], [result_leaves[i] for i in real]
+    outputs = linear_map(forward, transpose, leaves, vectors, templates)
     values = dict(zip(real, outputs, strict=True))
     zeros = [np.zeros(x.shape, jax.dtypes.float0) for x in result_leaves]
     return result_tree.unflatten([values.get(i, x) for i, x in enumerate(zeros)])

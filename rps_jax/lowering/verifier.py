@@ -17,8 +17,6 @@ from rps_jax.lowering.graph import (
     DynamicSlice,
     For,
     Gather,
-    If,
-    Input,
     LoopNode,
     LoopResult,
     MatrixProduct,
@@ -151,8 +149,8 @@ def _require(holds: bool, owner: Node | str, fault: str) -> None:
 def dump(results: Sequence[Result]) -> str:
     """Return a graph as text, one line for each node, for example `v3: f[5] = add_f(v1, 2.0)`."""
     lines = _lines(live_nodes(nodes_of(result.value for result in results)))
-    ends = [f"result {x.position}: {x.kind}[{x.size}] = {_view(x.value)}" for x in results]
-    return "\n".join([*lines, *ends])
+    outputs = [f"result {x.position}: {x.kind}[{x.size}] = {_view(x.value)}" for x in results]
+    return "\n".join([*lines, *outputs])
 
 
 def _lines(nodes: Iterable[Node]) -> Iterator[str]:
@@ -168,9 +166,8 @@ def _lines(nodes: Iterable[Node]) -> Iterator[str]:
 
 def _text(node: Node) -> str:
     """Return a node as one line."""
-    names = {Call: "function", Reduce: "binary", Input: "index", For: "length", If: "expected"}
-    detail = getattr(node.op, names.get(type(node.op), ""), "")
-    text = f"{type(node.op).__name__} {detail}".rstrip()
+    details = [str(x) for x in vars(node.op).values() if isinstance(x, str | int)]
+    text = " ".join([type(node.op).__name__, *details])
     if isinstance(node, LoopNode):
         pairs = zip(node.carried, node.operands, strict=True)
         starts = (f"{x.name}: {x.kind}[{x.size}] = {_view(a)}" for x, a in pairs)
