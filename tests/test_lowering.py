@@ -102,6 +102,9 @@ CASES = {
         2 * x - (2 * x)[0],
         jnp.tile(i + 1, 3) * (i + 1)[2],
     ),
+    "one of the carried numbers": lambda x, i: lax.fori_loop(
+        0, 3, lambda _, y: (jnp.broadcast_to(y[0][1], (3,)), y[1] + i[0]), (x, i)
+    ),
     "a loop of no iterations": lambda x, i: lax.fori_loop(0, 0, lambda _, y: y + i[0], x),
     "small reals": lambda x, i: x.astype(jnp.float16).astype(x.dtype),
     "small integers": lambda x, i: i.astype(jnp.int8).astype(jnp.int32),

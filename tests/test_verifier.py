@@ -104,6 +104,11 @@ def wrong_condition(outputs):
     loop.condition = np.ones(1, np.int32)
 
 
+def alias_carried(outputs):
+    loop = first(outputs, LoopNode)
+    loop.results = (loop.results[0], Array(loop.carried[1], 2, 0, (5,)))
+
+
 def wrong_result(outputs):
     outputs[0] = outputs[0]._replace(kind="i")
 
@@ -119,6 +124,7 @@ FAULTS = {
     dangling_in_loop: "v999: f[1] = Call neg_f([1.]): it has no reader",
     without_loop: "no loop carries it",
     wrong_condition: "an operand has the kind i, not b",
+    alias_carried: "it assigns a carried node that it may have changed",
     wrong_result: "result 0: an operand has the kind f, not i",
 }
 

@@ -32,6 +32,7 @@ from rps_jax.lowering.graph import (
     While,
     element,
     flat,
+    is_unchanged,
     key_of,
     live_nodes,
     nodes_of,
@@ -228,7 +229,7 @@ class GraphBuilder(Target):
         results = []
         for node, value in zip(carried, body(current), strict=True):
             value = flat(value, node.size) if node.size else value
-            if isinstance(value, Array) and value.node in carried and value.node is not node:
+            if isinstance(value, Array) and value.node in carried and not is_unchanged(node, value):
                 copies = [element(value, i) for i in range(node.size)]
                 copy = self.node(Gather(), copies, node.kind, node.size)
                 value = Array(copy, 0, 1, value.shape)

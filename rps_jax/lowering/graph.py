@@ -188,6 +188,11 @@ def nodes_of(values: Iterable[Value]) -> list[Node]:
     return [a.node for a in values if isinstance(a, Array)]
 
 
+def is_unchanged(carried: Node, value: Value) -> bool:
+    """Whether a carried node has the same value after an iteration."""
+    return isinstance(value, Array) and value.node is carried and value.covers(carried.size)
+
+
 def key_of(value: Value) -> Hashable:
     """Return a key that equal operands share."""
     if isinstance(value, Array):

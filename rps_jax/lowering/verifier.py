@@ -23,6 +23,7 @@ from rps_jax.lowering.graph import (
     Node,
     Reduce,
     Result,
+    is_unchanged,
     live_nodes,
     nodes_of,
 )
@@ -116,6 +117,9 @@ def _check_node(node: Node) -> None:
 def _check_loop(loop: LoopNode) -> None:
     for value, node in zip(loop.results, loop.carried, strict=True):
         _check_value(value, node.size, node.kind, loop)
+        is_alias = node.size and not {*loop.carried}.isdisjoint(nodes_of([value]))
+        is_safe = not is_alias or is_unchanged(node, value)
+        _require(is_safe, loop, "it assigns a carried node that it may have changed")
     if not isinstance(loop.op, For):
         _check_value(loop.condition, 1, "b", loop)
     visible = {*loop.carried, *loop.captured}

@@ -19,6 +19,7 @@ from rps_jax.lowering.graph import (
     Node,
     Reduce,
     While,
+    is_unchanged,
     live_nodes,
     nodes_of,
 )
@@ -173,7 +174,7 @@ class Writer:
             rest = [n for n in loop.body if n not in set(condition)]
         body += self.lines(rest, results, computed)
         for node, result in zip(loop.carried, loop.results, strict=True):
-            if node.size and not (isinstance(result, Array) and result.node is node):
+            if node.size and not is_unchanged(node, result):
                 body += self.assign(node, result, masked=is_masked)
         return [*lines, self.loop_head(loop), *(f"  {line}" for line in body), "}"]
 
