@@ -41,7 +41,7 @@ from rps_jax.lowering import nvrtc
 from rps_jax.lowering.gpu_builder import WARP
 from rps_jax.lowering.gpu_writer import GpuWriter
 from rps_jax.lowering.simd_writer import HANDLER, SimdWriter
-from rps_jax.lowering.target import TooLargeError, UnsupportedError, first_array
+from rps_jax.lowering.target import CompilerError, TooLargeError, UnsupportedError, first_array
 from rps_jax.record import cache
 
 Pytree: TypeAlias = Any  # of arrays; functions of this module take any
@@ -338,7 +338,7 @@ def concurrent(
             leaves = [[next(rest) for _ in range(size)] for size in sizes]
             try:
                 names = [library.ready() for _, library in groups]
-            except RuntimeError as error:
+            except CompilerError as error:
                 compiler, reason = error.args
                 warnings.warn(f"{compiler} fails, so XLA compiles: {reason}", stacklevel=2)
                 pairs = zip(types, leaves, strict=True)
@@ -372,7 +372,7 @@ class _Library(NamedTuple):
         """Return its name when it is compiled.
 
         Raises:
-          RuntimeError: the compiler that fails, and its first message.
+          CompilerError: the compiler fails.
         """
         if self.compilation is not None:
             self.compilation.result()
@@ -449,7 +449,7 @@ def _library(text: str, name: str) -> bytes:
     """Compile C to a shared library.
 
     Raises:
-      RuntimeError: the compiler that fails, and its first message.
+      CompilerError: the compiler fails.
     """
     with tempfile.TemporaryDirectory() as folder:
         source, library = Path(folder) / f"{name}.c", Path(folder) / f"{name}.so"
@@ -458,7 +458,7 @@ def _library(text: str, name: str) -> bytes:
         command += [f"-I{jax.ffi.include_dir()}", str(source), "-o", str(library), "-lm", "-ldl"]
         process = subprocess.run(command, capture_output=True, text=True)
         if process.returncode:
-            raise RuntimeError(command[0], [*process.stderr.splitlines(), "no message"][0])
+            raise CompilerError(command[0], [*process.stderr.splitlines(), "no message"][0])
         return library.read_bytes()
 
 
@@ -466,7 +466,7 @@ def _kernels(name: str, texts: Sequence[str], functions: Sequence[_Function], wo
     """Compile kernels with so many `worlds` in a block, and the library that launches them.
 
     Raises:
-      RuntimeError: the compiler that fails, and its first message.
+      CompilerError: the compiler fails.
     """
     counts = [(len(x.inputs) + x.is_sorted, len(x.results)) for x in functions]
     shapes = [(*n, *first_array(x.inputs)) for n, x in zip(counts, functions, strict=True)]

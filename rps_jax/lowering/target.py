@@ -54,6 +54,10 @@ class UnsupportedError(InputError):
         )
 
 
+class CompilerError(Exception):
+    """A C compiler or NVRTC that fails: its name, and its first message."""
+
+
 class TooLargeError(InputError):
     """A function that XLA compiles better than this package: its arrays are too large."""
 
