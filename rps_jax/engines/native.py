@@ -180,16 +180,14 @@ def mapped(function: Function, axes: Sequence[int | None]) -> Function:
         size = len(jax.tree.leaves(arguments[0])[0])
         trees = list(map(jax.tree.structure, arguments))
 
-        def repeat(x: Any) -> jax.Array:
-            return jnp.broadcast_to(x, (size, *jnp.shape(x)))
-
         # Records check the shapes of a world: a batch is passed as leaves.
         def single(*leaves: Sequence[Any]) -> Pytree:
             return function(*(tree.unflatten(x) for tree, x in zip(trees, leaves, strict=True)))
 
-        inputs = [jax.tree.leaves(x) for x in arguments]
-        pairs = zip(inputs, axes, strict=True)
-        inputs = [x if axis == 0 else list(map(repeat, x)) for x, axis in pairs]
+        inputs = [
+            [x if axis == 0 else jnp.broadcast_to(x, (size, *jnp.shape(x))) for x in leaves]
+            for leaves, axis in zip(map(jax.tree.leaves, arguments), axes, strict=True)
+        ]
         return batched(single, jax.vmap(single))(*inputs)
 
     return call
@@ -330,12 +328,11 @@ def concurrent(
         if sort_by is not None:
             orders = [jnp.argsort(sort_by(*x)).astype(jnp.int32) for x in arguments]
             inputs = [[*x, order] for x, order in zip(inputs, orders, strict=True)]
-        sizes = [len(x) for x in inputs]
+        flat_inputs, inputs_tree = jax.tree.flatten(inputs)
 
         def run_libraries(values: Sequence[Any], _: Any) -> list[jax.Array]:
             """Call the libraries, for which it waits until they are compiled."""
-            rest = iter(values)
-            leaves = [[next(rest) for _ in range(size)] for size in sizes]
+            leaves = inputs_tree.unflatten(values)
             try:
                 names = [library.ready() for _, library in groups]
             except CompilerError as error:
@@ -354,8 +351,7 @@ def concurrent(
         shapes = [x for call in calls for x in call.shapes]
         # As a map of no vectors it has a message where it is differentiated twice.
         label = " ".join(library.name for _, library in groups)
-        leaves = [x for call in inputs for x in call]
-        results = iter(linear_map(run_libraries, None, leaves, [], shapes, label))
+        results = iter(linear_map(run_libraries, None, flat_inputs, [], shapes, label))
         return [call.structure.unflatten([next(results) for _ in call.results]) for call in calls]
 
     run.defjvp(lambda primals, tangents: jax.jvp(lambda *x: list(fallback(*x)), primals, tangents))
