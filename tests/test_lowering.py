@@ -103,7 +103,7 @@ CASES = {
         jnp.tile(i + 1, 3) * (i + 1)[2],
     ),
     "one of the carried numbers": lambda x, i: lax.fori_loop(
-        0, 3, lambda _, y: (jnp.broadcast_to(y[0][1], (3,)), y[1] + i[0]), (x, i)
+        0, 3, lambda _, y: (jnp.broadcast_to(y[0][1], (3,)), y[1] + i[0]), (x, i + 1)
     ),
     "a loop of no iterations": lambda x, i: lax.fori_loop(0, 0, lambda _, y: y + i[0], x),
     "small reals": lambda x, i: x.astype(jnp.float16).astype(x.dtype),

@@ -14,7 +14,6 @@ from rps_jax.lowering.graph import (
     Reduce,
     flat,
     gathered_scalar,
-    nodes_of,
     view_of,
 )
 from rps_jax.lowering.operations import GPU_HEADER, defined
@@ -42,22 +41,22 @@ class GpuBuilder(SimdBuilder):
 
     def _stacked(self, scalars: tuple[Value, ...], kind: str) -> Value:
         """Return scalars as one operand."""
-        size, arrays = len(scalars), [a for a in scalars if isinstance(a, Array)]
-        if not arrays:
+        size = len(scalars)
+        if not any(isinstance(a, Array) for a in scalars):
             return flat(np.asarray(scalars), size)
         if view := view_of(scalars, (size,)):
             return view
-        if len(arrays) < size:
+        if not all(isinstance(a, Array) for a in scalars):
             return super().stack(scalars, kind, (size,))
-        key = tuple((a.node.id, a.first) for a in arrays)
+        key = tuple((a.node.id, a.first) for a in scalars)
         if key not in self._gathers:
-            self._gathers[key] = self._vectorised(arrays, kind)
+            self._gathers[key] = self._vectorised(scalars, kind)
         return self._gathers[key]
 
-    def _vectorised(self, scalars: list[Array], kind: str) -> Array:
+    def _vectorised(self, scalars: tuple[Array, ...], kind: str) -> Array:
         """Vectorise a gather of scalars: apply their common operation to gathered operands."""
-        size, nodes = len(scalars), dict.fromkeys(nodes_of(scalars))
-        (first, *_), operations = nodes, {(node.op, len(node.operands)) for node in nodes}
+        first, size, nodes = scalars[0].node, len(scalars), {a.node for a in scalars}
+        operations = {(node.op, len(node.operands)) for node in nodes}
         are_elements = all(node.is_fusible for node in nodes) and isinstance(first.op, Call)
         if len(operations) > 1 or not are_elements:
             return super().stack(scalars, kind, (size,))

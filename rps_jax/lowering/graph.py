@@ -96,6 +96,8 @@ Operation: TypeAlias = (
     Input | Call | Reduce | Gather | DynamicSlice | MatrixProduct | Carried | LoopResult
 )
 
+_FUSIBLE = (Call, Reduce)
+
 # --- nodes -------------------------------------------------------------------------------------
 
 
@@ -133,14 +135,15 @@ class Node:
     @property
     def is_fusible(self) -> bool:
         """Whether it is computed in a loop over elements, which other nodes may share."""
-        return self.size > 1 and isinstance(self.op, Call | Reduce)
+        return self.size > 1 and isinstance(self.op, _FUSIBLE)
 
     @functools.cached_property
     def fusion_barriers(self) -> set[Node]:
         """Predecessors that cannot be computed in the same loop over elements."""
+        if not self.is_fusible:
+            return set(self.predecessors)
         arrays = (a for a in self.operands if isinstance(a, Array))
-        barriers = (a.node for a in arrays if not (self.is_fusible and a.covers(self.size)))
-        return {*barriers, *self.captured}
+        return {a.node for a in arrays if not a.covers(self.size)}
 
 
 @dataclass(eq=False)

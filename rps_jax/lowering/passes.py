@@ -173,17 +173,20 @@ def _move_into_block(
 
 def cross_thread_arrays(nodes: Iterable[Node], results: Iterable[Result]) -> set[Node]:
     """Return the arrays of which a thread reads elements that another thread computes."""
-    reads: list[tuple[Value, int]] = [(result.value, result.size) for result in results]
+    reads: list[tuple[Sequence[Value], int]] = [([x.value], x.size) for x in results]
     waiting = list(nodes)
     while waiting:
         node = waiting.pop()
         if isinstance(node, LoopNode):
             waiting += node.body
-            sizes = [x.size for x in node.carried] * 2
-            reads += zip((*node.operands, *node.results), sizes, strict=True)
-            reads.append((node.condition, 1))
+            values = zip(node.operands, node.results, strict=True)
+            reads += zip(values, [x.size for x in node.carried], strict=True)
+            reads.append(([node.condition], 1))
         else:
             size = 0 if isinstance(node.op, Gather | DynamicSlice) else node.size
-            reads += [(a, size) for a in node.operands]
-    arrays = ((a, size) for a, size in reads if isinstance(a, Array) and a.node.width > 1)
-    return {a.node.storage for a, size in arrays if not a.covers(size)}
+            reads.append((node.operands, size))
+    shared: set[Node] = set()
+    for values, size in reads:
+        arrays = (a for a in values if isinstance(a, Array) and a.node.width > 1)
+        shared |= {a.node.storage for a in arrays if not a.covers(size)}
+    return shared
