@@ -57,8 +57,8 @@ class GpuBuilder(SimdBuilder):
         """Vectorise a gather of scalars: apply their common operation to gathered operands."""
         first, size, nodes = scalars[0].node, len(scalars), {a.node for a in scalars}
         operations = {(node.op, len(node.operands)) for node in nodes}
-        are_elements = all(node.is_fusible for node in nodes) and isinstance(first.op, Call)
-        if len(operations) > 1 or not are_elements:
+        op, are_elements = first.op, all(node.is_fusible for node in nodes)
+        if len(operations) > 1 or not are_elements or not isinstance(op, Call):
             return super().stack(scalars, kind, (size,))
         operands = [
             self._stacked(
@@ -66,7 +66,7 @@ class GpuBuilder(SimdBuilder):
             )
             for j, template in enumerate(first.operands)
         ]
-        return Array(self.node(first.op, operands, kind, size), 0, 1, (size,))
+        return Array(self.node(op, operands, kind, size), 0, 1, (size,))
 
     def apply(self, name: str, values: Values, params: Params, out: Typed) -> Value:
         """Apply a primitive; sums over threads are added before they are exchanged."""

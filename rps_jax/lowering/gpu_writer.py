@@ -42,7 +42,9 @@ extern "C" __global__ void __launch_bounds__(32) step(const __grid_constant__ Ar
 }}
 """
 # Reductions over threads; `gpu.h` has the sum of reals.
-_FOLDS = "\n".join(f"FOLD({name}, {kind}, {TYPES[kind]})" for name, kind in [*INITIAL][1:])
+_FOLDS = "\n".join(
+    f"FOLD({name}, {kind}, {TYPES[kind]})" for name, kind in INITIAL if (name, kind) != ("add", "f")
+)
 
 
 class GpuWriter(SimdWriter):

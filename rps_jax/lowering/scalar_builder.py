@@ -52,8 +52,8 @@ class ScalarBuilder(GraphBuilder):
     def _times_matrix(self, rows: list[list[Value]], matrix: np.ndarray) -> Value:
         """Multiply rows with a constant matrix, in one loop over the matrix.
 
-        The learned laws have pairs of rows (a, b), (b, a). Sum and difference halve their
-        arithmetic: (a + b) (P + Q) / 2 plus or minus (a - b) (P - Q) / 2 of the halves P and Q.
+        Networks with a mirror symmetry have pairs of rows (a, b), (b, a). Sum and difference halve
+        their arithmetic: (a + b) (P + Q) / 2 plus or minus (a - b) (P - Q) / 2 of the halves P, Q.
         """
         matrix = np.ascontiguousarray(matrix, float)
         columns, (half, odd) = matrix.shape[1], divmod(matrix.shape[0], 2)

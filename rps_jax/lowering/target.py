@@ -159,7 +159,9 @@ def kind_of(dtype: object, name: str = "", kinds: str = "fibu") -> str:
       UnsupportedError: it is none of `kinds`, or has fewer than 4 bytes; `name` is the operation in
         the message.
     """
-    kind = dtype.kind if isinstance(dtype, np.dtype) else "?"
-    if kind not in kinds or (kind != "b" and np.dtype(dtype).itemsize < 4):
+    kind = "?"
+    if isinstance(dtype, np.dtype) and (dtype.kind == "b" or dtype.itemsize > 3):
+        kind = dtype.kind
+    if kind not in kinds:
         raise UnsupportedError(f"{name} of {dtype}".strip())
     return kind

@@ -46,8 +46,8 @@ def check(results: Sequence[Result]) -> None:
     """
     if enabled:
         _check_region(live_nodes(nodes_of(result.value for result in results)), set())
-        for position, *value in results:
-            _check_value(*value, f"result {position}")
+        for position, value, size, kind in results:
+            _check_value(value, size, kind, f"result {position}")
 
 
 def signature(function: str) -> tuple[str, str]:
