@@ -465,7 +465,8 @@ def _value_and_slopes(
 
     def single(shots: Any, world: World, params: LawParams) -> tuple[jax.Array, Any]:
         snapshots, state = shots if options.states else (shots, None)
-        return _score(options, Trajectory(*snapshots, world, params, state), args)
+        columns = snapshots._asdict()
+        return _score(options, Trajectory(**columns, world=world, params=params, state=state), args)
 
     def scores(leaves: Mapping[str, Leaf]) -> tuple[jax.Array, Any]:
         moved = registry.replace_leaves(inputs, leaves)
@@ -518,7 +519,7 @@ def _sizes(coordinates: Sequence[Coordinate], drawn: Draw, leaves: Mapping[str, 
         if x.is_parameter:
             value = leaves[f"params.{x.name}"][(slice(None), *x.entry)]
         elif x.name in _VECTORS:
-            value = named_leaves(drawn)[_VECTORS[x.name]][:, x.entry[0]]
+            value = np.asarray(named_leaves(drawn)[_VECTORS[x.name]])[:, x.entry[0]]
         columns.append(np.maximum(np.abs(value), _SMALLEST))
     return np.stack(columns, axis=1)
 
@@ -526,7 +527,7 @@ def _sizes(coordinates: Sequence[Coordinate], drawn: Draw, leaves: Mapping[str, 
 def _moved_scores(
     run: Callable[..., Any],
     inputs: Any,
-    leaves: Mapping[str, np.ndarray],
+    leaves: Mapping[str, Any],
     coordinates: Sequence[Coordinate],
     slopes: Sequence[Arrays],
     tested: np.ndarray,

@@ -209,7 +209,7 @@ class TuneGrad(Descent):
             worlds = self.worlds if generation < self.steps else 0
             results, slopes = self.try_step(proposal, generation, score, worlds)
             return {**nothing, **results, **gradient_results(slopes)}
-        times = dict.fromkeys(("compile", "run", "simulated"), 0.0)
+        times: dict[str, float] = dict.fromkeys(("compile", "run", "simulated"), 0.0)
         anchor = int(proposal["anchor"])
         states = self._states(anchor, jnp.asarray(proposal["anchors"][0]), times)
         coefficients, extra = proposal["coefficients"], dict[str, Any]()

@@ -23,7 +23,7 @@ def fixed_length(
     A derivative of a chaotic push has a useful direction and a useless norm.
     """
 
-    def normalise(updates: jax.Array, params: Any = None) -> jax.Array:
+    def normalise(updates: Any, params: Any = None) -> Any:
         size = jnp.sqrt(jnp.mean(updates**2))
         return updates / jnp.where(size > 0, size, 1.0)
 

@@ -235,7 +235,9 @@ def law_of(row: pd.Series, start: Any = RPSParams.paper()) -> Any:
     leaves = {k: np.array(x, float) for k, x in registry.named_leaves(start).items()}
     for column in (x for x in row.index if x.startswith("params.")):
         name, _, at = column.removeprefix("params.").partition("[")
-        leaves[name][tuple(map(int, at.rstrip("]").split(","))) if at else ()] = float(row[column])
+        leaves[name][tuple(map(int, at.rstrip("]").split(","))) if at else ()] = np.asarray(
+            row[column], float
+        )
     if "l_mr" in leaves:
         leaves["l_mr"] = np.minimum(leaves["l_mr"], leaves["l_cr"])  # as in the tuning: see `Space`
     single = {k: x if x.ndim else float(x) for k, x in leaves.items()}
