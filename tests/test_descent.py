@@ -149,10 +149,10 @@ def test_windows_start_at_the_states_of_their_trials(monkeypatch):
 
 # --- derivatives of windows ----------------------------------------------------------------
 
-BRIEF = Setting("quasistatic", rules=Rules(40.0, 20.0))
+BRIEF = Setting("quasistatic", rules=Rules(60.0, 30.0))
 DRUMS = {"objects": ("random_cylinder",), "setting": BRIEF}
 SLOW = {"law": "rps,K_v=0.03", "tuned": ("K_v", "K_h", "L"), **DRUMS}
-BATCHES = {"worlds": 16, "validation": 16, "windows": 16, "trials": 16, "checks": 8, "slots": 16}
+BATCHES = {"worlds": 16, "validation": 16, "windows": 32, "trials": 16, "checks": 8, "slots": 16}
 
 
 def test_20_steps_of_adam_lower_the_loss_beyond_its_interval_in_fresh_worlds():
