@@ -36,9 +36,27 @@ KILLED = COMMANDS | {
     "table": ("table", *SHORT, "--objects", "cylinder", "--friction", "S1"),
     "sensitivity": ("sensitivity", *SHORT, *DRUMS, "--worlds", "100"),
     "attack": (
-        *("attack", *SHORT, *DRUMS, "--axes", "size", "mass", "friction_robot", "--cells", "3"),
-        *("--batch", "8", "--generations", "4", "--minutes", "30", "--drawn", "8"),
-        *("--check-again", "0", "--repeats", "1"),
+        "attack",
+        *SHORT,
+        *DRUMS,
+        "--axes",
+        "size",
+        "mass",
+        "friction_robot",
+        "--cells",
+        "3",
+        "--batch",
+        "8",
+        "--generations",
+        "4",
+        "--minutes",
+        "30",
+        "--drawn",
+        "8",
+        "--check-again",
+        "0",
+        "--repeats",
+        "1",
     ),
 }
 # Durations of a tuner's generation; other clocks have "wall clock" in their long name.
@@ -212,8 +230,10 @@ def machine(home: Path) -> Iterator[tuple[str, str, int, str]]:
         process.stdout.close()  # type: ignore[union-attr]
         process.stdout = None
         yield f"closed pipe: {words[0]} {words[1:2]}", "0 or 1 or 141", *ended(process)
-    for locale in ({"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"},
-                   {"LC_ALL": "POSIX", "PYTHONIOENCODING": "ascii"}):  # fmt: skip
+    for locale in (
+        {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"},
+        {"LC_ALL": "POSIX", "PYTHONIOENCODING": "ascii"},
+    ):
         how = {"env": locale, "errors": "replace"}
         yield f"locale {locale}", "0", *swept(f"locale-{len(locale)}-\N{SNOWMAN}", **how)
         yield f"help, locale {locale}", "0", *run("sweep", "--help", **how)

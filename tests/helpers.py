@@ -174,9 +174,11 @@ def moved(
     side, (c, s) = jnp.array([1.0, -1.0 if mirror else 1.0]), (np.cos(turn), np.sin(turn))
     place = lambda p: (p * side) @ jnp.array([[c, s], [-s, c]]) + jnp.asarray(shift)  # noqa: E731
     return touch._replace(
-        p_world_robot=place(touch.p_world_robot), yaw=side[1] * touch.yaw + turn,
-        p_robot_contact=touch.p_robot_contact * side, p_world_target=place(touch.p_world_target),
-    )  # fmt: skip
+        p_world_robot=place(touch.p_world_robot),
+        yaw=side[1] * touch.yaw + turn,
+        p_robot_contact=touch.p_robot_contact * side,
+        p_world_target=place(touch.p_world_target),
+    )
 
 
 @contextlib.contextmanager

@@ -227,8 +227,15 @@ def test_the_papers_numbers_are_beside_ours_under_each_friction(drawn):
     np.testing.assert_allclose(time.lines[0].get_xdata(), [85, 70])
     assert [list(line.get_xdata()) for line in d.lines[1::2]] == [[0.032], [0.059]]
     _, box, cylinder = hardware.table(results)
-    assert box == ["hardware box", "3 of 4 [30, 95]", "8 of 8", "0.033 m (by friction 0.020-0.040)",
-                   "0.032 m", "80 s (by friction 70-85)", "89 s"]  # fmt: skip
+    assert box == [
+        "hardware box",
+        "3 of 4 [30, 95]",
+        "8 of 8",
+        "0.033 m (by friction 0.020-0.040)",
+        "0.032 m",
+        "80 s (by friction 70-85)",
+        "89 s",
+    ]
     _, marked, _ = hardware.table(results, "fitted; ")
     assert marked[3:6:2] == [
         "0.033 m (fitted; by friction 0.020-0.040)",

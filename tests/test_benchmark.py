@@ -73,8 +73,18 @@ def test_nsight_counters_become_a_row():
     (table,) = kernel.Kernel(families=("box",)).report_tables(whole)
     _, row = table.rows
     assert row == [
-        *("box", "16,384", "134 µs", "2,000", "251", "5.0"),
-        *("1.6", "1.1", "0.5", "0.4", "0.0", "1.4"),
+        "box",
+        "16,384",
+        "134 µs",
+        "2,000",
+        "251",
+        "5.0",
+        "1.6",
+        "1.1",
+        "0.5",
+        "0.4",
+        "0.0",
+        "1.4",
     ]
     with pytest.raises(InputError, match="profiled no launch: ==ERROR== No kernels"):
         kernel.counts("==ERROR== No kernels")

@@ -73,12 +73,21 @@ def test_costs_by_hand():
     away = pose.copy()
     away[2, 0] = 2.0
     outcome = Outcome(
-        success=np.array([True, False, False, False]), time=np.array([30.0, 300, 300, 150]),
-        min_distance=np.array([0.04, 0.5, np.inf, 0.5]), contact_lost_time=zero, path_length=zero,
-        mean_abs_l=zero, tilt=zero, tipped=np.array([False, False, False, True]),
-        diverged=np.zeros(4, bool), nan_twist=np.zeros(4, bool), stalled=np.zeros(4, bool),
-        unfelt=np.zeros(4, bool), base_pose=pose, object_pose=away,
-    )  # fmt: skip
+        success=np.array([True, False, False, False]),
+        time=np.array([30.0, 300, 300, 150]),
+        min_distance=np.array([0.04, 0.5, np.inf, 0.5]),
+        contact_lost_time=zero,
+        path_length=zero,
+        mean_abs_l=zero,
+        tilt=zero,
+        tipped=np.array([False, False, False, True]),
+        diverged=np.zeros(4, bool),
+        nan_twist=np.zeros(4, bool),
+        stalled=np.zeros(4, bool),
+        unfelt=np.zeros(4, bool),
+        base_pose=pose,
+        object_pose=away,
+    )
     np.testing.assert_allclose(score.plan_costs(outcome, Rules()), [0.1, 1.5, 6.2, 2.0])
 
 

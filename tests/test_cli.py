@@ -94,8 +94,11 @@ def test_every_question_offers_and_every_call_accepts_overwrite(tmp_path):
     for name in names.known():
         question = names.question_type(name)
         expected = ["--overwrite"] if issubclass(question, Question) else []
-        flag_names = [flag for kind in (question, flags.session_type(question))
-                      for flag in flags._flag_names(kind)]  # fmt: skip
+        flag_names = [
+            flag
+            for kind in (question, flags.session_type(question))
+            for flag in flags._flag_names(kind)
+        ]
         assert [flag for flag in flag_names if flag == "--overwrite"] == expected, name
     setting = Setting("quasistatic", rules=Rules(horizon=1.0))
     first = rps_jax.push("cylinder", target=(1.0, 0.0), setting=setting, out=tmp_path)

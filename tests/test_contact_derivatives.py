@@ -125,8 +125,9 @@ def test_a_step_has_the_derivative_of_its_difference(name, monkeypatch):
 
         def differences(h):
             results = [run(step)[0] for step in (h, 0.0, -h)]
-            sides = [jax.tree.map(lambda a, b: (a - b) / h, *pair)
-                     for pair in (results[:2], results[1:])]  # fmt: skip
+            sides = [
+                jax.tree.map(lambda a, b: (a - b) / h, *pair) for pair in (results[:2], results[1:])
+            ]
             return [np.array(side[1]) for side in sides]
 
         up, down = differences(1e-7)
@@ -148,11 +149,16 @@ def products(a, b):
     return np.sum(np.reshape(np.asarray(a) * np.asarray(b), (len(a), -1)), axis=1)
 
 
-@pytest.mark.parametrize("domain", [
-    "real,objects=random_cylinder",
-    *(pytest.param(x, marks=pytest.mark.slow)
-      for x in ("wide,objects=random_box", "real,objects=random_prism")),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "domain",
+    [
+        "real,objects=random_cylinder",
+        *(
+            pytest.param(x, marks=pytest.mark.slow)
+            for x in ("wide,objects=random_box", "real,objects=random_prism")
+        ),
+    ],
+)
 def test_derivatives_are_finite_and_both_modes_agree(domain):
     """Check 10,000 states, up to far from any contact, in float32 and native functions."""
     count = 1120

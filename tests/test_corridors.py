@@ -76,8 +76,15 @@ def test_each_failure_has_the_kind_of_its_end() -> None:
         "out of time": {"time": 600.0},
         "diverged": {"diverged": 1},
     }
-    defaults = {"success": 0, "wall_touch": 0, "contact_lost_time": 1.0, "min_distance": 0.5,
-             "tipped": 0, "diverged": 0, "time": 90.0}  # fmt: skip
+    defaults = {
+        "success": 0,
+        "wall_touch": 0,
+        "contact_lost_time": 1.0,
+        "min_distance": 0.5,
+        "tipped": 0,
+        "diverged": 0,
+        "time": 90.0,
+    }
     columns = {
         name: [end.get(name, value) for end in changes.values()] for name, value in defaults.items()
     }

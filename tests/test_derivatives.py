@@ -121,9 +121,17 @@ def test_the_results_are_labelled(results):
     assert results["mean"].dims == results.error.dims == ("law", "quantity")
     units = dict(zip(results.quantity.values, results.unit.values, strict=True))
     assert units == {
-        "v_max": "m/s", "friction_robot": "1", "com_offset": "1", "noise": "1", "distance": "m",
-        "target_x": "m", "target_y": "m", "com_x": "m", "com_y": "m", "mass": "kg",
-    }  # fmt: skip
+        "v_max": "m/s",
+        "friction_robot": "1",
+        "com_offset": "1",
+        "noise": "1",
+        "distance": "m",
+        "target_x": "m",
+        "target_y": "m",
+        "com_x": "m",
+        "com_y": "m",
+        "mass": "kg",
+    }
     assert (results.kind == "parameter").values.tolist() == [True] + [False] * 9
     assert results.map_error.values.max() < 3e-4
     attrs = {"engine": "quasistatic", "horizon": 1.0, "seed": 0}
@@ -143,10 +151,15 @@ def test_a_mass_without_influence_is_told(results):
     assert re.search("mass has no influence.*robot='kairos'.*domain='real'", results.notes)
     notes = lambda name, domain, value=np.zeros((1, 2)): " ".join(  # noqa: E731
         derivatives._notes(
-            parse_domain(domain), "fused", derivatives.coordinates_of(name, RPSParams(), TOUCHING),
-            np.array([True]), value, np.ones((1, 2, 1)), np.zeros((2, 1)),
+            parse_domain(domain),
+            "fused",
+            derivatives.coordinates_of(name, RPSParams(), TOUCHING),
+            np.array([True]),
+            value,
+            np.ones((1, 2, 1)),
+            np.zeros((2, 1)),
         )
-    )  # fmt: skip
+    )
     assert "mass has no influence" in notes("mass", "wide")
     assert not notes("mass", "real")
     assert not notes("friction_ground", "wide")

@@ -31,8 +31,16 @@ EXAMPLE = ROOT / "notebooks/examples/custom_law.py"
 CUSTOM = f"{EXAMPLE}:PParams"
 STRICT = ["-std=c99", "-Wall", "-Wextra", "-Werror", "-pedantic"]
 LAWS = [
-    *("rps", "nps", "rps_plus", "aps", "pursuit", "dipole", "force_push", "force_push_published"),
-    *("learned_small", "learned"),
+    "rps",
+    "nps",
+    "rps_plus",
+    "aps",
+    "pursuit",
+    "dipole",
+    "force_push",
+    "force_push_published",
+    "learned_small",
+    "learned",
 ]
 
 

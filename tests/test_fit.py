@@ -159,8 +159,11 @@ def test_parquet_is_read_as_csv_is(tmp_path):
         variant.to_parquet(path)
         same(logs.read(path, SHELL).columns, expected, atol=1e-6)
     for column, value, cell in (
-        *(("yaw", None, "an empty cell"), ("yaw", "1,2.5", "'1,2.5'"), ("yaw", "left", "'left'")),
-        *(("contact_type", True, "'True'"), ("x", np.nan, "an empty cell")),
+        ("yaw", None, "an empty cell"),
+        ("yaw", "1,2.5", "'1,2.5'"),
+        ("yaw", "left", "'left'"),
+        ("contact_type", True, "'True'"),
+        ("x", np.nan, "an empty cell"),
     ):
         table.assign(**{column: value}).to_parquet(path)
         with pytest.raises(InputError, match=f"{cell}.*row 1|row 1, column {column}, but {cell}"):
@@ -188,11 +191,16 @@ def bagged(path, table, **changes):
     """Write a log as a bag."""
     steps = [
         bag.Step(
-            row[0], row[1:4], row[10:12], int(row[4]), row[5:7], row[7:10],
+            row[0],
+            row[1:4],
+            row[10:12],
+            int(row[4]),
+            row[5:7],
+            row[7:10],
             **{name: values[i] for name, values in changes.items()},
         )
         for i, row in enumerate(table.to_numpy(float))
-    ]  # fmt: skip
+    ]
     return bag.write(path, steps, {})
 
 

@@ -79,18 +79,35 @@ BOX, BALL = fp.rectangle(0.3, 0.2), fp.circle(0.25)
 SQUARE = np.float32([[1, -1], [1, 1], [-1, 1], [-1, -1]])
 DISTANCES = {
     # The centre: to the nearer side; on a side, on a corner, and off a corner: 3-4-5.
-    "box": (BOX, {(0, 0): -0.2, (0.25, 0): -0.05, (0.3, 0.1): 0, (0.3, 0.2): 0, (0.5, 0.1): 0.2,
-                  (0, -0.9): 0.7, (0.6, 0.6): 0.5, (-0.6, -0.6): 0.5}),
+    "box": (
+        BOX,
+        {
+            (0, 0): -0.2,
+            (0.25, 0): -0.05,
+            (0.3, 0.1): 0,
+            (0.3, 0.2): 0,
+            (0.5, 0.1): 0.2,
+            (0, -0.9): 0.7,
+            (0.6, 0.6): 0.5,
+            (-0.6, -0.6): 0.5,
+        },
+    ),
     "circle": (BALL, {(0, 0): -0.25, (0.1, 0): -0.15, (0, -0.25): 0, (0.3, 0.4): 0.25}),
-    "box with a radius": (BOX._replace(radius=jnp.float32(0.1)),
-                          {(0, 0): -0.3, (0.5, 0): 0.1, (0.6, 0.6): 0.4}),
-    "stadium": (Footprint(jnp.array([[-0.3, 0.0], [0.3, 0.0]]), jnp.float32(0.1)),
-                {(0, 0): -0.1, (0.2, 0.3): 0.2, (0.6, 0.4): 0.4}),
+    "box with a radius": (
+        BOX._replace(radius=jnp.float32(0.1)),
+        {(0, 0): -0.3, (0.5, 0): 0.1, (0.6, 0.6): 0.4},
+    ),
+    "stadium": (
+        Footprint(jnp.array([[-0.3, 0.0], [0.3, 0.0]]), jnp.float32(0.1)),
+        {(0, 0): -0.1, (0.2, 0.3): 0.2, (0.6, 0.4): 0.4},
+    ),
     # A prism and a circle are filled up to one number of corners by repeated ones.
-    "square": (Footprint(jnp.array(0.2 * SQUARE[[0, 1, 2, 3, 3, 3, 3, 3]]), jnp.float32(0)),
-               {(0, 0): -0.2, (0.19, 0): -0.01, (0.3, 0.1): 0.1, (-0.25, -0.25): 0.05 * 2**0.5}),
+    "square": (
+        Footprint(jnp.array(0.2 * SQUARE[[0, 1, 2, 3, 3, 3, 3, 3]]), jnp.float32(0)),
+        {(0, 0): -0.2, (0.19, 0): -0.01, (0.3, 0.1): 0.1, (-0.25, -0.25): 0.05 * 2**0.5},
+    ),
     "point": (Footprint(jnp.zeros((4, 2)), jnp.float32(0.1)), {(0, 0): -0.1, (0.3, 0.4): 0.4}),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("shape", DISTANCES)

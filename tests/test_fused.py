@@ -92,8 +92,10 @@ def test_a_contacts_force_and_stiffness_are_derivatives_of_its_cost(cone):
 
     xs = np.random.default_rng(0).normal(size=(40, 3)).astype(np.float32)
     functions = (
-        lambda x: newton.contact_force(point, tuple(x), physics), jax.grad(cost), jax.hessian(cost)
-    )  # fmt: skip
+        lambda x: newton.contact_force(point, tuple(x), physics),
+        jax.grad(cost),
+        jax.hessian(cost),
+    )
     (force, k), slope, curvature = (jitted(jax.vmap(function))(xs) for function in functions)
     np.testing.assert_allclose(np.transpose(force), -slope, rtol=1e-3, atol=1e-3)
     nn, nt, ns, tt, ts, ss = k

@@ -130,7 +130,8 @@ MECHANISMS = {
     "a tilt": (MOVING | {"tilt": np.deg2rad(12)}, {"tilt of the object": "12 deg"}),
     "a small tilt": (MOVING | {"tilt": np.deg2rad(4)}, {}),
     "a fall": (
-        MOVING | {"roll": np.deg2rad(20 * np.maximum(TIME - 57.75, 0)), "tipped": 1}
+        MOVING
+        | {"roll": np.deg2rad(20 * np.maximum(TIME - 57.75, 0)), "tipped": 1}
         | {"tilt": np.deg2rad(46)},
         {"tilt of the object": "46 deg", "fall of the object": "2.0 s from 5 deg on"},
     ),
@@ -140,7 +141,7 @@ MECHANISMS = {
         MOVING | {"nan_twist": 1},
         {"command that is not finite": "at 60.00 s"},
     ),
-}  # fmt: skip
+}
 OUTCOMES = ("contact_lost_time", "tilt", "tipped", "nan_twist")
 
 
@@ -168,7 +169,10 @@ def test_title_and_legend_of_the_maps_are_inside_of_the_figure(count):
     figure.draw_without_rendering()
     (legend,), page = figure.legends, figure.bbox
     assert [text.get_text() for text in legend.get_texts()] == [
-        *("base", "contact point", "object", "target"),
+        "base",
+        "contact point",
+        "object",
+        "target",
     ]
     boxes = [figure._suptitle.get_window_extent(), legend.get_window_extent()]
     for box in boxes:

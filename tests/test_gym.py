@@ -267,11 +267,17 @@ def test_spawned_workers_run():
 
 
 STRICT = {
-    "jax_numpy_dtype_promotion": "strict", "jax_numpy_rank_promotion": "raise",
-    "jax_transfer_guard": "disallow", "jax_debug_infs": True, "jax_debug_nans": True,
-    "jax_disable_jit": True, "jax_check_tracer_leaks": True, "jax_legacy_prng_key": "error",
-    "jax_no_tracing": True, "jax_enable_custom_prng": True,
-}  # fmt: skip
+    "jax_numpy_dtype_promotion": "strict",
+    "jax_numpy_rank_promotion": "raise",
+    "jax_transfer_guard": "disallow",
+    "jax_debug_infs": True,
+    "jax_debug_nans": True,
+    "jax_disable_jit": True,
+    "jax_check_tracer_leaks": True,
+    "jax_legacy_prng_key": "error",
+    "jax_no_tracing": True,
+    "jax_enable_custom_prng": True,
+}
 
 
 @pytest.mark.parametrize(("option", "value"), STRICT.items())

@@ -69,12 +69,25 @@ def test_kernels_run_concurrently_and_later_work_waits_for_all(folder):
     np.testing.assert_array_equal(results[1], 5 * np.arange(20))
     loaded = ["mode 2", "load 3", "kernel step", "load 5", "kernel step", "mode 1"]
     assert first == [
-        *(*loaded, "context", "push 7", "mode 2", "event 201", "record 201 on 7"),
+        *loaded,
+        "context",
+        "push 7",
+        "mode 2",
+        "event 201",
+        "record 201 on 7",
         "launch 3 on 7: 1 of 32",  # 8 worlds in a block of 32 threads
         # Earlier work of XLA's stream comes first.
-        *("stream 101", "event 202", "await 201 on 101", "launch 5 on 101: 3 of 32"),
-        *("record 202 on 101", "await 202 on 7"),
-        *("end event 202", "end stream 101", "end event 201", "mode 1", "pop"),
+        "stream 101",
+        "event 202",
+        "await 201 on 101",
+        "launch 5 on 101: 3 of 32",
+        "record 202 on 101",
+        "await 202 on 7",
+        "end event 202",
+        "end stream 101",
+        "end event 201",
+        "mode 1",
+        "pop",
     ]
     assert [line.split()[0] for line in second] == [line.split()[0] for line in first[6:]]
 
@@ -89,13 +102,16 @@ def test_a_single_kernel_can_be_captured_in_a_cuda_graph(folder):
     assert second == call
 
 
-@pytest.mark.parametrize(("fails", "error"), [
-    ("load", "the GPU's driver cannot load a kernel"),
-    ("context", "no GPU is available"),
-    ("stream", "a kernel could not be launched"),
-    ("event", "a kernel could not be launched"),
-    ("launch", "a kernel could not be launched"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("fails", "error"),
+    [
+        ("load", "the GPU's driver cannot load a kernel"),
+        ("context", "no GPU is available"),
+        ("stream", "a kernel could not be launched"),
+        ("event", "a kernel could not be launched"),
+        ("launch", "a kernel could not be launched"),
+    ],
+)
 def test_a_failure_is_reported_and_releases_resources(fails, error, folder):
     for message, notes in launched(folder, fails)[0]:
         assert message == error

@@ -101,9 +101,12 @@ def test_an_action_is_held_and_bounded():
 def test_the_position_of_a_lost_contact_is_remembered():
     """Touch at (1, 0.1) in the world; then the base is at (0.5, 0.1), turned left."""
     touch = random_obs(1).touch._replace(
-        p_world_robot=jnp.array([0.6, 0.0]), yaw=jnp.zeros(()), in_contact=jnp.array(True),
-        p_robot_contact=jnp.array([0.4, 0.1]), p_world_target=jnp.array([1.0, 1.1]),
-    )  # fmt: skip
+        p_world_robot=jnp.array([0.6, 0.0]),
+        yaw=jnp.zeros(()),
+        in_contact=jnp.array(True),
+        p_robot_contact=jnp.array([0.4, 0.1]),
+        p_world_target=jnp.array([1.0, 1.1]),
+    )
     obs = random_obs(1)._replace(touch=touch)
     felt = TouchState.initial().update(obs)
     np.testing.assert_allclose(felt.p_robot_contact(obs), [0.4, 0.1], atol=1e-6)
@@ -236,9 +239,13 @@ def test_advantages_by_hand():
     alone. delta_2 = 0 + 0.5 * 1 - 2 = -1.5, and A_2 = -1.5 + 0.25 * 5 = -0.25. delta_1 =
     1 + 0.5 * 2 - 1 = 1, and A_1 = 1 + 0.25 * -0.25 = 0.9375.
     """
-    columns = {"reward": [1.0, 0.0, 2.0, 1.0], "value": [1.0, 2.0, 1.0, 3.0],
-               "next_value": [2.0, 1.0, 8.0, 9.0], "done": [False, False, True, True],
-               "terminated": [False, False, False, True]}  # fmt: skip
+    columns = {
+        "reward": [1.0, 0.0, 2.0, 1.0],
+        "value": [1.0, 2.0, 1.0, 3.0],
+        "next_value": [2.0, 1.0, 8.0, 9.0],
+        "done": [False, False, True, True],
+        "terminated": [False, False, False, True],
+    }
     blank = jnp.zeros((4, 1))
     columns = {name: jnp.array(values)[:, None] for name, values in columns.items()}
     advantages = ppo.advantages(transitions_of(blank, blank, blank > 0, **columns), 0.5, 0.5)
@@ -357,10 +364,18 @@ def test_the_best_action_of_one_step_is_learned(kind):
 # --- runs ----------------------------------------------------------------------------------
 
 TINY = {
-    "network": "gru", "width": 6, "num_envs": 6, "num_steps": 4, "update_epochs": 2,
-    "num_minibatches": 2, "hold": 0.1, "minutes": 0, "drawn": 6, "validation": 3,
+    "network": "gru",
+    "width": 6,
+    "num_envs": 6,
+    "num_steps": 4,
+    "update_epochs": 2,
+    "num_minibatches": 2,
+    "hold": 0.1,
+    "minutes": 0,
+    "drawn": 6,
+    "validation": 3,
     "setting": Setting("quasistatic", fidelity="fast", rules=Rules(horizon=4.0, max_lost=30.0)),
-}  # fmt: skip
+}
 
 
 @pytest.fixture(scope="module")
@@ -419,9 +434,11 @@ def test_an_initial_law_has_the_network_of_the_options(learned, tmp_path):
 def test_worlds_that_sometimes_fail_are_drawn_most():
     options = PPO(hard=0.5)
     rates = rollout.failure_rates(
-        jnp.array([0.0, 0.5, 1.0, 0.0]), jnp.array([3, 3, 2]), jnp.array([True, False, False]),
+        jnp.array([0.0, 0.5, 1.0, 0.0]),
+        jnp.array([3, 3, 2]),
+        jnp.array([True, False, False]),
         jnp.array([False, False, False]),
-    )  # fmt: skip
+    )
     np.testing.assert_allclose(rates, [0, 0.5, 1, 0.3], atol=1e-6)
     draw = partial(rollout.draw_indices, failures=rates, key=jax.random.PRNGKey(0), shape=(200, 50))
     counts = np.bincount(np.array(draw(options)).ravel(), minlength=4) / 10_000
@@ -495,10 +512,12 @@ def test_an_easier_world_has_its_target_nearer_and_more_ahead():
 def test_rewards_of_privileged_quantities():
     """The rewards are the changes of distance to the target and of the alignment of the base."""
     env = PushEnv(
-        "random_cylinder", CYLINDERS, worlds=3,
+        "random_cylinder",
+        CYLINDERS,
+        worlds=3,
         setting=Setting("fused", fidelity="fast"),
         weights=Reward(progress=0.0, no_contact=0.0, success=0.0, object=1.0, behind=0.0),
-    )  # fmt: skip
+    )
     state = jax.jit(env.begin)(row(jax.device_get(env.table), 0), jnp.array(0))
     previous = state.data
     shift = jnp.array([0.01, -0.02])

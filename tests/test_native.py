@@ -35,8 +35,9 @@ def cache(tmp_path):
     jax.config.update("jax_compilation_cache_dir", previous)
 
 
-def batch(shape, skin="capacitive", count=21, law="rps_tuned", engine="fused", domain="wide",
-          **drawn):  # fmt: skip
+def batch(
+    shape, skin="capacitive", count=21, law="rps_tuned", engine="fused", domain="wide", **drawn
+):
     """Return stage, (worlds, params) and loop of random objects at different positions."""
     _, params = registry.resolve_law(law)
     domain = replace(DOMAINS[domain], objects=(f"random_{shape}",), skin=skin, **drawn)
@@ -82,8 +83,9 @@ def close(actual, desired, warm, rest):
 
 PAIRS = [
     pytest.param("box", "capacitive", marks=pytest.mark.slow),
-    ("cylinder", "ideal"), ("prism", "capacitive"),
-]  # fmt: skip
+    ("cylinder", "ideal"),
+    ("prism", "capacitive"),
+]
 
 
 @pytest.mark.parametrize(("shape", "skin"), PAIRS)
@@ -293,9 +295,11 @@ def test_a_scan_of_worlds_is_that_of_jax_and_so_are_its_derivatives(monkeypatch)
 
     inputs = jnp.linspace(0.1, 1, 4), jnp.linspace(0.2, 0.5, 4), jnp.full((4, 3), 0.3)
     for transform in (
-        lambda f: jax.grad(f, argnums=(0, 1, 2)), lambda f: jax.grad(f, argnums=1),
-        lambda f: jax.jacfwd(f, argnums=2), lambda f: f,
-    ):  # fmt: skip
+        lambda f: jax.grad(f, argnums=(0, 1, 2)),
+        lambda f: jax.grad(f, argnums=1),
+        lambda f: jax.jacfwd(f, argnums=2),
+        lambda f: f,
+    ):
         native_result, expected = (
             jax.jit(transform(lambda *x, scan=scan: score(*x, scan)))(*inputs)
             for scan in (native.scan, by_jax)
@@ -332,12 +336,15 @@ def test_the_loop_of_a_base_with_slip_is_compiled_as_a_whole(monkeypatch):
 
 FALLBACKS = {
     "large products, as of a learned law": (lambda x: jnp.ones((99, 3)) * x @ jnp.ones(3), []),
-    "an unsupported operation": (lambda x: jax.lax.lgamma(x + 1) * 3 * x, [
-        "operation `lgamma` cannot be translated; use arithmetic, comparisons, jnp.where and "
-        "elementary functions. XLA compiles this law, which is some ten times slower."
-    ]),
+    "an unsupported operation": (
+        lambda x: jax.lax.lgamma(x + 1) * 3 * x,
+        [
+            "operation `lgamma` cannot be translated; use arithmetic, comparisons, jnp.where and "
+            "elementary functions. XLA compiles this law, which is some ten times slower."
+        ],
+    ),
     "code that cannot be printed": (None, ["cannot be printed, so XLA compiles: KeyError"]),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("name", FALLBACKS)

@@ -187,8 +187,11 @@ def toy():
 def test_the_closest_draw_agrees_with_the_paper(toy):
     assert evidence.closest(toy) == 1
     rows = {row[0]: row for row in evidence.numbers_table(toy)}
-    assert rows["hardware, box: D"][1:4] == ["0.032 m", "0.016 [0.016, 0.032]",
-                                             "0.032 [0.032, 0.032]"]  # fmt: skip
+    assert rows["hardware, box: D"][1:4] == [
+        "0.032 m",
+        "0.016 [0.016, 0.032]",
+        "0.032 [0.032, 0.032]",
+    ]
     assert rows["Table II, RPS, cylinder S1"][-2:] == ["19 of 24", "yes"]
     assert rows["inside the interval: cells of Table II"][5] == "18 of 18"
     assert rows["inside the interval: all of these"][5] == "32 of 32"

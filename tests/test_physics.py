@@ -183,10 +183,13 @@ def test_a_box_pushed_at_the_papers_speed_stays_on_the_ground(friction):
     assert film.qvel[25:, 5].std() < 1e-3
 
 
-@pytest.mark.parametrize(("engine", "name", "way", "yaw"), [
-    *(("mujoco", name, 1.5e-3, math.radians(0.1)) for name in OBJECTS),
-    *(("fused", name, 1e-5, 1e-6) for name in MASS),  # in float32
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("engine", "name", "way", "yaw"),
+    [
+        *(("mujoco", name, 1.5e-3, math.radians(0.1)) for name in OBJECTS),
+        *(("fused", name, 1e-5, 1e-6) for name in MASS),  # in float32
+    ],
+)
 def test_an_object_at_rest_hardly_creeps_in_a_minute(engine, name, way, yaw):
     calm = replace(STANDARD, control_period=1.0)
     (film,) = films_in_engine(engine, [World(gap=1.0, name=name)], calm, seconds=60.0)

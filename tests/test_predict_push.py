@@ -107,8 +107,9 @@ def test_motions_are_similar():
         np.testing.assert_allclose(large.object_pose, first.object_pose * [k, k, 1], rtol=1e-6)
     pose = np.array([0.3, -0.2, 2.0])
     turned = moved(pose[:2] + rotate(pose[2], path), feet=FEET, pose=pose)
-    expected = pose + np.column_stack([rotate(2.0, first.object_pose.values[:, :2]),
-                                       first.object_pose.values[:, 2]])  # fmt: skip
+    expected = pose + np.column_stack(
+        [rotate(2.0, first.object_pose.values[:, :2]), first.object_pose.values[:, 2]]
+    )
     np.testing.assert_allclose(turned.object_pose, expected, atol=1e-5)
 
 
@@ -245,8 +246,9 @@ def test_nearest_is_the_edge_or_the_corner():
     gap, normal = fingers.nearest(pushes.OUTLINE, points)
     root = np.sqrt(0.5)
     np.testing.assert_allclose(gap, [0.01, 0.05, 0.05 * root, -0.05 * root], atol=1e-12)
-    np.testing.assert_allclose(normal, [[0, -1], [-0.6, -0.8], [root, root], [root, root]],
-                               atol=1e-12)  # fmt: skip
+    np.testing.assert_allclose(
+        normal, [[0, -1], [-0.6, -0.8], [root, root], [root, root]], atol=1e-12
+    )
 
 
 @pytest.mark.parametrize("corners", [3, 7, 72])

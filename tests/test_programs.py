@@ -91,8 +91,12 @@ def test_a_damaged_program_is_dropped_with_one_line(damage, cache, compiler):
     content = file.read_bytes()
     run(n=2)
     (other,) = {*cache.iterdir()} - {file}
-    contents = {"cut": content[:100], "empty": b"", "of another program": other.read_bytes(),
-                "flipped": content[:-1] + bytes([content[-1] ^ 1])}  # fmt: skip
+    contents = {
+        "cut": content[:100],
+        "empty": b"",
+        "of another program": other.read_bytes(),
+        "flipped": content[:-1] + bytes([content[-1] ^ 1]),
+    }
     file.write_bytes(contents[damage])
     count = len(traced)
     with pytest.warns(UserWarning, match="is dropped, and traced again: it") as warnings:
@@ -179,9 +183,14 @@ def test_small_sweeps_run_on_the_cpu(monkeypatch):
         jax.config.update("jax_platforms", previous)
 
 
-@pytest.mark.parametrize(("release", "machine", "needs_avx"), [
-    ("0.11.2", "x86_64", False), ("0.12.0.1", "x86_64", True), ("0.13.1", "arm64", False),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("release", "machine", "needs_avx"),
+    [
+        ("0.11.2", "x86_64", False),
+        ("0.12.0.1", "x86_64", True),
+        ("0.13.1", "arm64", False),
+    ],
+)
 def test_jax_with_fusion_by_slot_gets_the_avx_flag(release, machine, needs_avx, monkeypatch):
     monkeypatch.setenv("XLA_FLAGS", "--xla_of_ones_own")
     monkeypatch.setattr(device.metadata, "version", lambda _: release)

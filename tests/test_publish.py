@@ -46,12 +46,17 @@ def recipe_folder(tmp_path, monkeypatch):
     """Folder with the data files of three recipes; the second recipe fails."""
     shutil.copytree(SWEEPS / "table" / "results", tmp_path / "study" / "results")
     recipes = {
-        "first": Recipe((f"{PUSH} --laws rps --out runs/one",), 1, None, "Success", ("drums",),
-                        ("", "all")),
+        "first": Recipe(
+            (f"{PUSH} --laws rps --out runs/one",), 1, None, "Success", ("drums",), ("", "all")
+        ),
         "broken": Recipe((f"{PUSH} --laws none",), 1, None, "Success"),
-        "second": Recipe((f"{PUSH} --laws rps --out runs/one",), 1, None,
-                         lambda results: [["worlds"], [str(results.sizes["world"])]]),
-    }  # fmt: skip
+        "second": Recipe(
+            (f"{PUSH} --laws rps --out runs/one",),
+            1,
+            None,
+            lambda results: [["worlds"], [str(results.sizes["world"])]],
+        ),
+    }
     monkeypatch.setattr(study, "RECIPES", recipes)
     monkeypatch.setattr(study, "_SWEEPS", tmp_path)
     return tmp_path
@@ -63,8 +68,9 @@ def test_failed_recipes_are_named_and_the_others_are_run(recipe_folder, capsys):
     output = capsys.readouterr()
     assert "1 of the files could not be computed: broken." in output.err
     assert "unknown law 'none'" in output.out
-    first, second = (json.loads((recipe_folder / f"results/{n}.json").read_text())
-                     for n in ("first", "second"))  # fmt: skip
+    first, second = (
+        json.loads((recipe_folder / f"results/{n}.json").read_text()) for n in ("first", "second")
+    )
     assert [column["name"] for column in first["columns"]] == ["", "law", "all"]
     assert first["rows"][0][:2] == ["drums", "rps"]
     assert second["rows"] == [["3"]]
@@ -159,8 +165,13 @@ def test_a_small_run_gives_its_record_again(tmp_path, monkeypatch):
 
 
 def test_the_note_of_a_table_says_that_its_numbers_are_stale(monkeypatch):
-    data = {"command": ["rps table"], "versions": {"rps_jax": "0.3.0"},
-            "device": "", "date": "", "rows": [["x"]]}  # fmt: skip
+    data = {
+        "command": ["rps table"],
+        "versions": {"rps_jax": "0.3.0"},
+        "device": "",
+        "date": "",
+        "rows": [["x"]],
+    }
     cited = {"command": None, "rows": [["x", {"from": "table"}], ["y", {"from": "ladder"}]]}
     monkeypatch.setattr(render_tables, "STALE", {})
     assert render_tables.caption("table", data, "t.json") == (
@@ -203,9 +214,13 @@ def test_a_comparison_names_laws_by_the_runs_that_tuned_them():
 def test_success_is_grouped_by_force_lag_and_acceleration():
     rng = np.random.default_rng(3)
     limits = {
-        "robot_force": (150, 800), "robot_traction": (0.3, 0.8), "robot_lag": (0, 0.5),
-        "robot_acceleration": (0.1, 1), "friction_ground": (0.1, 0.7), "mass": (3, 60),
-    }  # fmt: skip
+        "robot_force": (150, 800),
+        "robot_traction": (0.3, 0.8),
+        "robot_lag": (0, 0.5),
+        "robot_acceleration": (0.1, 1),
+        "friction_ground": (0.1, 0.7),
+        "mass": (3, 60),
+    }
     drawn = {name: ("world", rng.uniform(*interval, 4000)) for name, interval in limits.items()}
     results = xr.Dataset(drawn, {"law": ["rps"]})
     force = np.minimum(results.robot_force, results.robot_traction * 130 * 9.81)
@@ -224,9 +239,13 @@ def test_success_is_grouped_by_force_lag_and_acceleration():
 
 
 def test_speeds_are_grouped_by_engine_and_batch():
-    measured = [("C in closed loop", 64, "box", 100.0), ("C in closed loop", 64, "prism", 50.0),
-                ("fused", 4096, "box", 200_000.0), ("fused", 8, "box", 50.0),
-                ("fused", 8, "prism", 25.0)]  # fmt: skip
+    measured = [
+        ("C in closed loop", 64, "box", 100.0),
+        ("C in closed loop", 64, "prism", 50.0),
+        ("fused", 4096, "box", 200_000.0),
+        ("fused", 8, "box", 50.0),
+        ("fused", 8, "prism", 25.0),
+    ]
     fields = zip(("name", "worlds", "family", "rate"), zip(*measured, strict=True), strict=True)
     results = xr.Dataset({name: ("measurement", list(values)) for name, values in fields})
     assert speed.table(results) == [
@@ -238,8 +257,13 @@ def test_speeds_are_grouped_by_engine_and_batch():
 
 
 def test_rare_failures_have_rows_of_the_median_and_of_all_repetitions():
-    repetitions = {"p": [0.1, 0.2, 0.6], "low": [0.0, 0.1, 0.3], "high": [0.2, 0.3, 0.9],
-            "variation": [0.5, 0.4, 0.3], "trials": [100, 200, 300]}  # fmt: skip
+    repetitions = {
+        "p": [0.1, 0.2, 0.6],
+        "low": [0.0, 0.1, 0.3],
+        "high": [0.2, 0.3, 0.9],
+        "variation": [0.5, 0.4, 0.3],
+        "trials": [100, 200, 300],
+    }
     results = xr.Dataset({name: ("repetition", values) for name, values in repetitions.items()})
     drawn = {"p": 0.25, "low": 0.2, "high": 0.3, "variation": 0.1, "trials": 400}
     with_drawn = results.assign({f"drawn_{name}": value for name, value in drawn.items()})

@@ -150,12 +150,13 @@ def test_a_drawn_path_is_a_task_of_the_command_line(paused, tmp_path):
 
 BAD_DRAWINGS = {
     "path starts inside the robot: start it at the front of the base, (0.36, 0.00) m.": [
-        [0.1, 0.1], [2, 0],
+        [0.1, 0.1],
+        [2, 0],
     ],
     "start it within 0.5 m of the base's front": [[2, 2], [3, 2]],
     "draw at least 0.5 m.": [[0.5, 0], [0.6, 0]],
     "draw wider turns, or narrow the corridor.": [[0.5, 0], [3, 0], [1, 1]],
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("sentence", BAD_DRAWINGS)
@@ -334,9 +335,14 @@ def test_the_template_says_how_to_build_the_page(tmp_path):
     assert text.strip().endswith("python docs/push/make.py --open")
 
 
-@pytest.mark.parametrize(("args", "expected"), [
-    (["--help"], "--record"), (["--hlp"], "unrecognized"), (["page"], "must end with .html"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("args", "expected"),
+    [
+        (["--help"], "--record"),
+        (["--hlp"], "unrecognized"),
+        (["page"], "must end with .html"),
+    ],
+)
 def test_options_of_the_builder_write_no_page(args, expected, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("sys.argv", ["make.py", *args])

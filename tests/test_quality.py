@@ -110,18 +110,33 @@ def test_learning_curves_are_summed_up_by_hand(tmp_path):
     results = xr.concat(rows, xr.IndexVariable("run", ["a", "b"]), join="outer")
     results = results.assign_coords(time=list(network.TIMES))
     assert network.table(results)[1:] == [
-        ["ppo", "1", "10.0 %", "10.0 %", "37.5 %", "", "", "25.0 % [20.9, 29.6]", "20 %",
-         "0.5 min", "3", "75.00 s", "1 h", "50 %"],
+        [
+            "ppo",
+            "1",
+            "10.0 %",
+            "10.0 %",
+            "37.5 %",
+            "",
+            "",
+            "25.0 % [20.9, 29.6]",
+            "20 %",
+            "0.5 min",
+            "3",
+            "75.00 s",
+            "1 h",
+            "50 %",
+        ],
         ["windows", "1", *[""] * 8, "0", "", "0 h", ""],
-    ]  # fmt: skip
+    ]
     network.figure_of(results)
 
 
 def test_a_cosine_without_a_sign_is_undecided():
     random = np.random.default_rng(2)
     noise, drift = random.normal(size=(2, 64, 2))
-    results = compare(samples(truth=drift + np.array([3, 0]), exact=noise, forward=noise + 1),
-                      "exact", "forward")  # fmt: skip
+    results = compare(
+        samples(truth=drift + np.array([3, 0]), exact=noise, forward=noise + 1), "exact", "forward"
+    )
     head, noisy, decided, _ = rows(results)
     column = head.index("1 s")
     assert noisy[column].endswith("], undecided")
@@ -146,8 +161,7 @@ def test_the_interval_of_a_cosine_holds_the_true_one():
     ways = np.array([[0.8, 0], [0.4, 0.4 * 3**0.5]])
     for _ in range(60):
         true, drawn = random.normal(size=(2, 100, 2))
-        results = compare(samples(truth=true + ways[0], forward=drawn + ways[1]),
-                          "forward")  # fmt: skip
+        results = compare(samples(truth=true + ways[0], forward=drawn + ways[1]), "forward")
         inside.append(results.low.item() <= 0.5 <= results.high.item())
     assert 0.8 <= np.mean(inside) <= 0.99
 

@@ -170,8 +170,13 @@ CORNERS = {
     "sliding 1": (0.2, -0.03, 0.2, 0.28),
     "sliding 2": (0.3, 0.0, 0.05, 0.2),
 }
-ROLLING = Push((0.04, 0.03, 0.0), (FRONT + RADIUS, 0.0, 0.0), arm=ARM["cylinder"], friction=0.8,
-               outline=fp.circle(RADIUS))  # fmt: skip
+ROLLING = Push(
+    (0.04, 0.03, 0.0),
+    (FRONT + RADIUS, 0.0, 0.0),
+    arm=ARM["cylinder"],
+    friction=0.8,
+    outline=fp.circle(RADIUS),
+)
 SLIPPING = ROLLING._replace(friction=0.1)
 _ROUND = {"outline": box(1e-4, RADIUS - 1e-4)}
 CASES = {
@@ -197,8 +202,9 @@ CASES["there"] = BASE_CASE._replace(
 _rng = np.random.default_rng(1)
 for _i in range(24):  # flat on the face
     _s, _mu, _y = _rng.uniform([-0.03, 0.1, -0.1], [0.03, 0.8, 0.1])
-    CASES[f"flat {_i}"] = Push((0.03, _s, _rng.uniform(-0.08, 0.08)), (FRONT + HALF, _y, 0.0),
-                               friction=_mu)  # fmt: skip
+    CASES[f"flat {_i}"] = Push(
+        (0.03, _s, _rng.uniform(-0.08, 0.08)), (FRONT + HALF, _y, 0.0), friction=_mu
+    )
 
 
 @functools.cache
@@ -478,8 +484,15 @@ def test_feet_balance_the_centre_of_mass_without_pulling():
 
     def arm(x):
         com = np.array([[x, 0.0, 0.0]])
-        rows = Solid(solid.rectangles(np.array([0.2]), np.array([0.1])), np.zeros(1), np.ones(1),
-                    np.ones(1), com, np.ones((1, 3)), np.array([[1.0, 0, 0, 0]]))  # fmt: skip
+        rows = Solid(
+            solid.rectangles(np.array([0.2]), np.array([0.1])),
+            np.zeros(1),
+            np.ones(1),
+            np.ones(1),
+            com,
+            np.ones((1, 3)),
+            np.array([[1.0, 0, 0, 0]]),
+        )
         return solid.friction_arm(rows)[0]
 
     assert arm(0.1) == pytest.approx(0.75 * math.hypot(0.1, 0.1) + 0.25 * math.hypot(0.3, 0.1))

@@ -29,8 +29,10 @@ def test_the_data_agree_with_their_page():
     assert len(table) == 1271
     assert table.id.is_unique
     assert table.kind.value_counts().to_dict() == {
-        "two_point_rotation": 683, "point": 548, "two_point_translation": 40,
-    }  # fmt: skip
+        "two_point_rotation": 683,
+        "point": 548,
+        "two_point_translation": 40,
+    }
     assert np.isfinite(pushes.measured(table)).all()
     assert "Apache License" in (FOLDER / "data" / "LICENSE-MLab_EXP.txt").read_text()
     assert sum(path.stat().st_size for path in (FOLDER / "data").iterdir()) < 1.5e6
@@ -120,8 +122,14 @@ def test_a_small_study_resumes_and_lists_every_model(tmp_path):
     again = question()
     assert results.drop_attrs().identical(again.drop_attrs())
     assert set(study.tables(results)) == {
-        "models", "mujoco", "friction", "layouts", "series", "heading", "forces",
-    }  # fmt: skip
+        "models",
+        "mujoco",
+        "friction",
+        "layouts",
+        "series",
+        "heading",
+        "forces",
+    }
     ran = np.isfinite(results.predicted.sel(model="mujoco_ours")).all("pose")
     assert ran.any()
     assert not (results.fits & ran).any()
@@ -134,8 +142,12 @@ def validated(values, tried, layouts, series):
     """Return errors of samples (tried, sample) [m] with the friction of other layouts."""
     off = (("fitted", "tried", "sample"), np.asarray(values)[None])
     count = len(layouts)
-    labels = {"support": list(layouts), "series": list(series), "finger": ["point"] * count,
-              "group": [study.GROUPS[0]] * count}  # fmt: skip
+    labels = {
+        "support": list(layouts),
+        "series": list(series),
+        "finger": ["point"] * count,
+        "group": [study.GROUPS[0]] * count,
+    }
     coordinates = {f"sample_{name}": ("sample", x) for name, x in labels.items()}
     coordinates |= {"fitted": ["rigid_feet"], "tried": tried}
     names = ("sample_place", "sample_turn", "sample_both")
@@ -147,8 +159,9 @@ def test_a_layout_is_judged_with_the_friction_of_the_others():
     both = np.repeat([[1.0, 4.0], [3.0, 2.0]], 3, axis=1) / 1e3  # [m] at 0.2 and 0.4
     rows = list(study._layout_rows(validated(both, [0.2, 0.4], "aaabbb", "aaabbb")))
     assert [(row[1], row[4], row[5][0], row[-1]) for row in rows] == [
-        ("a", 0.4, 3.0, 1.0), ("b", 0.2, 4.0, 2.0),
-    ]  # fmt: skip
+        ("a", 0.4, 3.0, 1.0),
+        ("b", 0.2, 4.0, 2.0),
+    ]
 
 
 def test_a_new_series_lies_in_its_interval():
@@ -188,11 +201,13 @@ def test_repetitions_are_pushes_with_the_same_command(sample):
     initial = pushes.initial_poses(rows)
     moved = np.column_stack([rotate(initial[:, 2], np.full((len(rows), 2), 0.01)), initial[:, 2]])
     measured = np.column_stack([initial[:, :2], np.zeros(len(rows))]) + moved
-    results = xr.Dataset({
-        "initial": (("push", "pose"), initial),
-        "measured": (("push", "pose"), measured),
-        "action": ("push", np.zeros(len(rows), int)),
-    })  # fmt: skip
+    results = xr.Dataset(
+        {
+            "initial": (("push", "pose"), initial),
+            "measured": (("push", "pose"), measured),
+            "action": ("push", np.zeros(len(rows), int)),
+        }
+    )
     off, repeated = pushes.repetitions(results)
     np.testing.assert_allclose(off, 0, atol=1e-12)
     assert list(repeated) == list(range(len(rows)))

@@ -80,13 +80,16 @@ def test_a_twist_from_the_velocity_of_a_point_of_the_base():
     np.testing.assert_allclose(bounded, [0.03, -0.04, -0.15], rtol=1e-6)
 
 
-@pytest.mark.parametrize(("observation", "expected"), [
-    (observe((0.36, 0.1), (2.36, 0.1)), (0.05, 0.0, 0.0)),
-    (observe((0.36, 0.1), (0.42, 0.1)), (0.03, 0.0, 0.0)),  # K_v d of 6 cm
-    # Sideways: 0.05 (press, 1), less the contact's velocity of turning at the bound.
-    (observe((0.36, 0.1), (0.36, 1.1)), (0.01 + 0.015, 0.05 - 0.054, 0.15)),
-    (observe(touching=False), (0.01, 0.0, 0.0)),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("observation", "expected"),
+    [
+        (observe((0.36, 0.1), (2.36, 0.1)), (0.05, 0.0, 0.0)),
+        (observe((0.36, 0.1), (0.42, 0.1)), (0.03, 0.0, 0.0)),  # K_v d of 6 cm
+        # Sideways: 0.05 (press, 1), less the contact's velocity of turning at the bound.
+        (observe((0.36, 0.1), (0.36, 1.1)), (0.01 + 0.015, 0.05 - 0.054, 0.15)),
+        (observe(touching=False), (0.01, 0.0, 0.0)),
+    ],
+)
 def test_pursuit_moves_the_contact_straight_to_the_target(observation, expected):
     follow(pursuit, PursuitParams(), (observation, expected))
 
@@ -101,7 +104,8 @@ def test_force_push_steers_by_the_drift_of_the_contact():
     angle = 1.3 * math.pi / 4 + 0.5 * 0.1
     lost = observe((0.36, 0.22), (2.36, 0.12), touching=False)
     follow(
-        force_push, ForcePushParams(),
+        force_push,
+        ForcePushParams(),
         (observe(touching=False), (0.01, 0.0, 0.0)),
         # The path starts at the first contact: no offset, no drift, and the base faces along it.
         (AT_PATH, (0.05, 0.0, 0.0), 0.0),
@@ -110,7 +114,7 @@ def test_force_push_steers_by_the_drift_of_the_contact():
         (lost, None, angle - 0.1),
         *19 * [(lost,)],
         (lost, None, -0.5 * 0.1),
-    )  # fmt: skip
+    )
 
 
 def test_force_push_forgets_a_drift_over_the_length_lambda():
@@ -130,10 +134,13 @@ def test_force_push_plans_a_new_path_behind_the_target():
     np.testing.assert_allclose(state.path.p_world_start, (2.46, 0.0), atol=1e-6)
 
 
-@pytest.mark.parametrize(("law", "params", "sense"), [
-    (force_push, ForcePushParams(), lambda obs: obs),
-    (force_push_published, PublishedForcePushParams(), lambda obs: with_force(obs)),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("law", "params", "sense"),
+    [
+        (force_push, ForcePushParams(), lambda obs: obs),
+        (force_push_published, PublishedForcePushParams(), lambda obs: with_force(obs)),
+    ],
+)
 def test_force_push_follows_a_target_that_moves_along_a_path(law, params, sense):
     # The contact is on the x axis. The target moves ahead, then to the left, then jumps backwards.
     targets = [(1.0, 0.0), (2.0, 0.0), (2.0, 0.005), (2.0, 0.02), (1.5, 1.0), (-2.0, 0.0)]
@@ -154,7 +161,8 @@ def test_the_published_force_push_steers_by_the_angle_of_the_force():
     angle = 1.3 * math.atan2(3, 4)
     along = (0.05 * math.cos(angle), 0.05 * math.sin(angle), 0.0)
     follow(
-        force_push_published, PublishedForcePushParams(),
+        force_push_published,
+        PublishedForcePushParams(),
         (with_force(observe(touching=False)), (0.01, 0.0, 0.0)),
         # Contact without force: along the path.
         (with_force(AT_PATH, (0.0, 0.9)), (0.05, 0.0, 0.0)),
@@ -165,7 +173,7 @@ def test_the_published_force_push_steers_by_the_angle_of_the_force():
         (with_force(OUTSIDE, (0.0, 0.0)), None, angle + 0.05 - 0.2),
         *9 * [(with_force(OUTSIDE, (-0.6, 0.6)),)],
         (with_force(OUTSIDE, (-0.6, 0.6)), None, -0.05),
-    )  # fmt: skip
+    )
 
 
 def test_the_published_force_push_yields_to_a_large_force():
@@ -187,12 +195,13 @@ def test_the_published_force_push_turns_to_face_along_its_path():
     angle = 1.3 * 0.1 + 0.5 * 0.36 * math.sin(0.1)
     forward, sideways = 0.2 * math.cos(angle - 0.1) - 0.01, 0.2 * math.sin(angle - 0.1)
     state = follow(
-        force_push_published, params,
+        force_push_published,
+        params,
         (with_force(observe()),),
         (with_force(turned, (-20.0, 0.0)), (forward, sideways + 0.1 * 0.36, -0.1), angle),
         # 10 cm past the target a new path leads back.
         (with_force(observe((0.36, 0.0), (0.26, 0.0))),),
-    )  # fmt: skip
+    )
     assert abs(float(state.path.theta_d)) == pytest.approx(math.pi)
 
 
@@ -201,13 +210,16 @@ def step_rps(params, observation):
     return rps.step_with_details(params.law, RPSState.init(params.law), observation)
 
 
-@pytest.mark.parametrize(("contact", "target", "expected"), [
-    ((0.36, 0.05), (0.46, 0.05), (0.03, 0.0, 0.0)),  # 10 cm ahead: K_v d
-    ((0.36, 0.05), (0.36, 0.15), (0.2 * 0.03, 0.03, 0.0)),  # sideways, pressing
-    ((0.36, 0.05), (0.26, 0.05), (0.2 * 0.03, 0.0, 0.0)),  # back, where a skin cannot pull
-    ((0.36, 0.05), (0.42, 0.13), (0.018, 0.024, 0.0)),  # to the left, 3-4-5
-    ((0.36, 0.28), (0.46, 0.28), (0.03, 0.0, 0.0)),  # even while it realigns
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("contact", "target", "expected"),
+    [
+        ((0.36, 0.05), (0.46, 0.05), (0.03, 0.0, 0.0)),  # 10 cm ahead: K_v d
+        ((0.36, 0.05), (0.36, 0.15), (0.2 * 0.03, 0.03, 0.0)),  # sideways, pressing
+        ((0.36, 0.05), (0.26, 0.05), (0.2 * 0.03, 0.0, 0.0)),  # back, where a skin cannot pull
+        ((0.36, 0.05), (0.42, 0.13), (0.018, 0.024, 0.0)),  # to the left, 3-4-5
+        ((0.36, 0.28), (0.46, 0.28), (0.03, 0.0, 0.0)),  # even while it realigns
+    ],
+)
 def test_rps_plus_translates_near_its_target(contact, target, expected):
     params = RPSPlusParams(RPSParams.tuned()._replace(K_v=0.3))
     _, twist, details = step_once(rps_plus, params, observe(contact, target))
@@ -244,14 +256,15 @@ def test_rps_plus_searches_at_its_last_contact():
         same(twist, expected)
     behind = observe(robot=(-0.5, 0.0), target=(3.0, 0.0), touching=False)
     state = follow(
-        rps_plus, params,
+        rps_plus,
+        params,
         # The bearing atan2(-0.2, 0.36), 0.41 m away, is off the front: it moves only to the right.
         (lost, (0.0, -0.025, 0.0)),
         # From 0.5 m behind, the bearing is -0.23 rad: ahead, to the right, and turning right.
         (behind, (0.035, -0.025, -0.15)),
         (observe((0.36, 0.0), (3.0, 0.0)),),  # a new contact ends the search
         state=state,
-    )  # fmt: skip
+    )
     assert int(state.steps_lost) == 0
 
 
@@ -261,12 +274,15 @@ def test_rps_plus_does_not_search_before_its_first_contact():
     assert int(follow(rps_plus, params, *3 * [ahead]).steps_lost) == 0
 
 
-@pytest.mark.parametrize(("robot", "yaw", "expected"), [
-    ((0.0, 0.0), 0.0, (0.05, 0.0, 0.0)),  # behind the object: straight ahead
-    ((1.0, -1.0), math.pi / 2, (0.0, 0.05, 0.0)),  # beside it: to the robot's left
-    ((2.0, 0.0), math.pi, (-0.05, 0.0, 0.0)),  # in front of it: away from it, with the field
-    ((0.0, 0.0), 0.4, (0.05 * math.cos(0.4), -0.05 * math.sin(0.4), -0.15)),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("robot", "yaw", "expected"),
+    [
+        ((0.0, 0.0), 0.0, (0.05, 0.0, 0.0)),  # behind the object: straight ahead
+        ((1.0, -1.0), math.pi / 2, (0.0, 0.05, 0.0)),  # beside it: to the robot's left
+        ((2.0, 0.0), math.pi, (-0.05, 0.0, 0.0)),  # in front of it: away from it, with the field
+        ((0.0, 0.0), 0.4, (0.05 * math.cos(0.4), -0.05 * math.sin(0.4), -0.15)),
+    ],
+)
 def test_the_dipole_leads_around_the_object(robot, yaw, expected):
     observation = observe(target=(3.0, 0.0), robot=robot, yaw=yaw, touching=False)
     follow(dipole, DipoleParams(), (with_pose(observation), expected))

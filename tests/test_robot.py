@@ -56,7 +56,9 @@ RESPONSES = {
     "first-order lag": (Robot(lag=0.3), (0.05, -0.02, 0.1), None, lambda t: 1 - np.exp(-t / 0.3)),
     # A speed of 0.05 m/s takes 0.1 s, the turn as long.
     "acceleration": (
-        *(Robot(acceleration_max=(0.5, 1.0)), (0.03, 0.04, -0.1), None),
+        Robot(acceleration_max=(0.5, 1.0)),
+        (0.03, 0.04, -0.1),
+        None,
         lambda t: np.minimum(t / 0.1, 1.0),
     ),
     "no lag": (Robot(lag=0.0), AHEAD, None, np.ones_like),
@@ -260,8 +262,9 @@ TEMPLATES = [*product(("real", "wide"), ("fused", "mjx")), ("wide", "quasistatic
 def test_worlds_by_template_equal_recompiled_ones(domain, engine):
     """Bases differ in size, and those with a limited force in mass."""
     drawn = draws.draw(replace(DOMAINS[domain], objects=("random_box",)), 3, np.arange(3))
-    bases = replace(drawn.robot, half_length=np.array([0.3, 0.4, 0.5]),
-                    half_width=np.array([0.2, 0.25, 0.4]))  # fmt: skip
+    bases = replace(
+        drawn.robot, half_length=np.array([0.3, 0.4, 0.5]), half_width=np.array([0.2, 0.25, 0.4])
+    )
     if bases.driven:
         bases = replace(bases, mass=np.array([60.0, 130.0, 200.0]))
     inputs = WorldInputs("box", drawn.solid, drawn.friction, STANDARD, bases)

@@ -120,9 +120,15 @@ def test_walls_of_an_image_are_within_the_tolerance(tmp_path):
     counts = []
     for tolerance in (0.05, 0.1, 0.2):
         task = tasks.parse_task(
-            {"image": str(tmp_path / "blob.png"), "resolution": 0.05, "tolerance": tolerance,
-             "start": [2, 4, 0], "goal": [5, 4], "object_radius": 0.1}
-        )  # fmt: skip
+            {
+                "image": str(tmp_path / "blob.png"),
+                "resolution": 0.05,
+                "tolerance": tolerance,
+                "start": [2, 4, 0],
+                "goal": [5, 4],
+                "object_radius": 0.1,
+            }
+        )
         walls = MultiLineString(lines_of(task)[:-4]).segmentize(0.02)
         assert walls.hausdorff_distance(blob.boundary.segmentize(0.02)) < tolerance + 0.05
         counts.append(len(task.walls) // 2)
@@ -202,8 +208,12 @@ def test_starts_goals_and_corners_may_coincide():
 def test_a_path_around_a_wall_is_almost_the_shortest():
     """Two tangents and an arc about each end of a wall of no more than 1 mm."""
     wall = [[5, -1], [5.001, -1], [5.001, 1], [5, 1]]
-    task = room(outline=[[-9, -9], [19, -9], [19, 9], [-9, 9]], polygons=[wall], start=[0, 0, 0],
-                goal=[10, 0])  # fmt: skip
+    task = room(
+        outline=[[-9, -9], [19, -9], [19, 9], [-9, 9]],
+        polygons=[wall],
+        start=[0, 0, 0],
+        goal=[10, 0],
+    )
     (path,), _, _ = world(task)
     ahead, clearance = 0.5, 0.75
     tangents = [np.sqrt((5 - x) ** 2 + 1 - clearance**2) for x in (ahead, 0)]
@@ -224,8 +234,13 @@ def test_a_path_keeps_the_clearance_and_no_corner_can_be_left_out():
         ]
         hulls = [MultiPoint(c).convex_hull for c in corners]
         polygons = [np.array(h.exterior.coords).tolist() for h in hulls]
-        task = room(outline=[[-2, -2], [13, -2], [13, 10], [-2, 10]], polygons=polygons,
-                    start=[-1, -1, 0.7], goal=[12, 8.9 - k], object_radius=0.2)  # fmt: skip
+        task = room(
+            outline=[[-2, -2], [13, -2], [13, 10], [-2, 10]],
+            polygons=polygons,
+            start=[-1, -1, 0.7],
+            goal=[12, 8.9 - k],
+            object_radius=0.2,
+        )
         (path,), (walls,), _ = world(task)
         path = path[: len(np.unique(path, axis=0))]
         obstacles = MultiLineString(list(walls))
@@ -294,8 +309,9 @@ def test_a_trial_ends_at_a_wall_and_a_wide_door_lets_it_pass(tmp_path):
 
 @pytest.mark.slow
 def test_a_sweep_of_rooms_is_stored_and_replayed(tmp_path):
-    path = files.write_json(tmp_path / "map.json", HALL | {"polygons": DOOR, "scale": [1.0, 1.4],
-                                                           "object_radius": 0.1})  # fmt: skip
+    path = files.write_json(
+        tmp_path / "map.json", HALL | {"polygons": DOOR, "scale": [1.0, 1.4], "object_radius": 0.1}
+    )
     out = tmp_path / "run"
     options = f"--domain {DOMAIN} --engine quasistatic --horizon 40 --laws rps --worlds 4"
     assert rps(f"sweep --task {path} {options} --out {out}") == 0

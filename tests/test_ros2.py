@@ -214,9 +214,13 @@ def test_a_path_replaces_the_target_until_it_ends(driven):
 def test_the_nodes_name_the_same_topics_and_parameters():
     cpp, python, config, cmake = (
         (FOLDER / path).read_text()
-        for path in ("src/push_node.cpp", "scripts/push_node.py", "config/push.yaml",
-                     "CMakeLists.txt")
-    )  # fmt: skip
+        for path in (
+            "src/push_node.cpp",
+            "scripts/push_node.py",
+            "config/push.yaml",
+            "CMakeLists.txt",
+        )
+    )
     ast.parse(python)
     for topic in ("odom", "taxels", "target", "path", "cmd_vel"):
         assert f'"{topic}"' in cpp

@@ -62,13 +62,16 @@ def test_the_stripped_model_moves_as_the_whole_scene(name):
     np.testing.assert_allclose(stripped.qpos, whole.qpos, atol=5e-5)
 
 
-@pytest.mark.parametrize(("name", "mass", "half_extents"), [
-    ("box", 20.0, (0.20, 0.20)),
-    ("nonuniform_box", 15.0, (0.225, 0.225)),
-    ("cylinder", 25.0, (0.25, 0.25)),
-    ("hardware_box", 25.0, (0.16, 0.13)),
-    ("hardware_cylinder", 12.0, (0.115, 0.115)),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("name", "mass", "half_extents"),
+    [
+        ("box", 20.0, (0.20, 0.20)),
+        ("nonuniform_box", 15.0, (0.225, 0.225)),
+        ("cylinder", 25.0, (0.25, 0.25)),
+        ("hardware_box", 25.0, (0.16, 0.13)),
+        ("hardware_cylinder", 12.0, (0.115, 0.115)),
+    ],
+)
 def test_objects_have_the_papers_mass_and_size_and_stand_on_the_ground(name, mass, half_extents):
     loaded = load(name)
     assert loaded.physics.body("object").mass[0] == pytest.approx(mass)

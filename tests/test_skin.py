@@ -366,15 +366,18 @@ def signals(gap: float, period: float, steps: int, sensor=CAPACITIVE):
     return np.array(values), touch
 
 
-@pytest.mark.parametrize(("gap", "change"), [
-    (0.005, 1.0),  # 10 mm / 5 mm - 1
-    (0.008, 0.25),
-    (0.002, 4.0),
-    (0.0, 9.0),  # nine tenths of the foam can give way: 10 mm / 1 mm - 1
-    (-0.02, 9.0),
-    (0.01, 0.0),
-    (0.5, 0.0),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("gap", "change"),
+    [
+        (0.005, 1.0),  # 10 mm / 5 mm - 1
+        (0.008, 0.25),
+        (0.002, 4.0),
+        (0.0, 9.0),  # nine tenths of the foam can give way: 10 mm / 1 mm - 1
+        (-0.02, 9.0),
+        (0.01, 0.0),
+        (0.5, 0.0),
+    ],
+)
 def test_the_capacitance_is_inverse_to_the_gap_the_object_leaves(gap, change):
     assert signals(gap, SETTLED, 1)[0] == pytest.approx(change, rel=1e-4, abs=1e-5)
 

@@ -171,8 +171,12 @@ def test_a_reading_that_a_law_has_already_is_no_row():
 
 def test_the_cells_of_table_ii_are_judged_by_their_intervals():
     success = np.repeat([[1], [0], [0]], 3 * 2 * 24, axis=1).reshape(1, 3, 3, 2, 24)
-    labels = {"condition": ["paper_gazebo"], "law": list(paper.LAWS), "friction": ["S1", "S2"],
-              "object": list(PAPER_OBJECTS)}  # fmt: skip
+    labels = {
+        "condition": ["paper_gazebo"],
+        "law": list(paper.LAWS),
+        "friction": ["S1", "S2"],
+        "object": list(PAPER_OBJECTS),
+    }
     results = xr.Dataset({"success": (("condition", *DIMS), success)}, labels)
     rows = {row[0]: row for row in readings.cells(results)[1:]}
     # Of 24: the paper's 24 gives 20.7-24, its 19 14.3-21.8, its 0 0-3.3, its 2 0.6-6.2.

@@ -376,8 +376,18 @@ def test_sweep_merge_and_replay_on_the_command_line(tmp_path, capsys):
     tuned.write_text(json.dumps({"L": 0.3, "saturate_first": 0}))
     drums.write_text(json.dumps({"objects": ["random_cylinder"], "distance": [1, 2]}))
     words = "--fidelity fast --worlds 12 --horizon 6 --part 5 --slots"
-    command = ["sweep", *words.split(), SLOTS, "--domain", drums, "--out", run,
-               "--laws", "rps", f"rps,{tuned}"]  # fmt: skip
+    command = [
+        "sweep",
+        *words.split(),
+        SLOTS,
+        "--domain",
+        drums,
+        "--out",
+        run,
+        "--laws",
+        "rps",
+        f"rps,{tuned}",
+    ]
     assert [rps(*command, "--shard", f"{k}/2") for k in (1, 2)] == [0, 0]
     assert rps("merge", run, "--out", run) == 0
     text = capsys.readouterr().out

@@ -150,14 +150,14 @@ def test_doors_leave_an_opening() -> None:
 def positions_at(contact: tuple[float, float], touches: bool = True) -> Positions:
     """Return positions with a contact point, and a base and an object about the origin."""
     return Positions(
-        *(
-            jnp.zeros(2),
-            jnp.array(contact),
-            jnp.asarray(touches),
-            jnp.zeros(3),
-            fp.rectangle(0.3, 0.2),
-        ),
-        *(jnp.array([0.8, 0.0]), 0.0, fp.rectangle(0.2, 0.2)),
+        jnp.zeros(2),
+        jnp.array(contact),
+        jnp.asarray(touches),
+        jnp.zeros(3),
+        fp.rectangle(0.3, 0.2),
+        jnp.array([0.8, 0.0]),
+        0.0,
+        fp.rectangle(0.2, 0.2),
     )
 
 

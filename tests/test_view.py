@@ -169,9 +169,15 @@ def test_an_invalid_disturbance_is_refused(live, wrong):
 # --- the page ------------------------------------------------------------------------------
 
 FLAGS = (
-    *("--headless", "--disable-quic", "--no-first-run"),
-    *("--disable-background-networking", "--disable-component-update", "--disable-sync"),
-    *("--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--window-size=800,640"),
+    "--headless",
+    "--disable-quic",
+    "--no-first-run",
+    "--disable-background-networking",
+    "--disable-component-update",
+    "--disable-sync",
+    "--use-angle=swiftshader",
+    "--enable-unsafe-swiftshader",
+    "--window-size=800,640",
 )
 REQUEST = viewer.PushRequest("cylinder", "S1", "rps", (0.0, 2.0))
 make = viewer.View(setting=replace(SETTING, rules=Rules())).push_of
@@ -280,10 +286,17 @@ def value(control, new):
 
 
 CAMERA = {
-    "type": "ViewerCameraMessage", "wxyz": [1.0, 0.0, 0.0, 0.0], "position": [0.0, 0.0, 1.0],
-    "fov": 1.0, "near": 0.1, "far": 100.0, "image_height": 100, "image_width": 100,
-    "look_at": [0.0, 0.0, 0.0], "up_direction": [0.0, 0.0, 1.0],
-}  # fmt: skip
+    "type": "ViewerCameraMessage",
+    "wxyz": [1.0, 0.0, 0.0, 0.0],
+    "position": [0.0, 0.0, 1.0],
+    "fov": 1.0,
+    "near": 0.1,
+    "far": 100.0,
+    "image_height": 100,
+    "image_width": 100,
+    "look_at": [0.0, 0.0, 0.0],
+    "up_direction": [0.0, 0.0, 1.0],
+}
 
 
 @pytest.mark.parametrize("origin", ["https://evil.example", "http://127.0.0.1:1", "null", None])
@@ -309,10 +322,15 @@ def test_only_valid_values_of_controls_are_accepted(page, capfd):
     request = page.request
     infinite, huge = math.inf, 1e300
     values = (
-        (page._law, "/some/path/evil.py:P"), (page._law, ["rps"]), (page._object, "crate"),
-        (page._time, infinite), (page._speed, 1e6), (page._target, [infinite, 0.0]),
-        (page._target, [0.0]), (page._friction, "1" * 10_000),
-    )  # fmt: skip
+        (page._law, "/some/path/evil.py:P"),
+        (page._law, ["rps"]),
+        (page._object, "crate"),
+        (page._time, infinite),
+        (page._speed, 1e6),
+        (page._target, [infinite, 0.0]),
+        (page._target, [0.0]),
+        (page._friction, "1" * 10_000),
+    )
     update = {"type": "GuiUpdateMessage"}
     target = {"type": "TransformControlsUpdateMessage", "name": "/push/target"}
     send_messages(
@@ -320,11 +338,17 @@ def test_only_valid_values_of_controls_are_accepted(page, capfd):
         *(value(control, new) for control, new in values),
         update | {"uuid": page._speed._impl.uuid, "updates": {"removed": True}},
         update | {"uuid": "nobody", "updates": {"value": 1}},
-        CAMERA | {"fov": infinite}, CAMERA | {"position": [huge, 0, 0]}, CAMERA | {"position": [0]},
-        {"type": "ShareUrlRequest"}, {"type": "Nothing"},
+        CAMERA | {"fov": infinite},
+        CAMERA | {"position": [huge, 0, 0]},
+        CAMERA | {"position": [0]},
+        {"type": "ShareUrlRequest"},
+        {"type": "Nothing"},
         target | {"wxyz": [1, 0, 0, 0], "position": [infinite, 0, 0]},
-        b"\xc1", b"", "a text", b"\x91" * 100_000,
-    )  # fmt: skip
+        b"\xc1",
+        b"",
+        "a text",
+        b"\x91" * 100_000,
+    )
     assert page.request == request
     assert page._time.value == 0.0
     assert page._speed.value == 5.0

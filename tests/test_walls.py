@@ -66,7 +66,9 @@ def slid(family: str, engine: str, physics: Physics) -> Recording:
 
 
 PAIRS = [
-    *(("box", "fused"), ("cylinder", "fused"), ("prism", "fused")),
+    ("box", "fused"),
+    ("cylinder", "fused"),
+    ("prism", "fused"),
     *(
         pytest.param(family, "mjx", marks=pytest.mark.slow)
         for family in ("box", "cylinder", "prism")

@@ -18,7 +18,12 @@ from rps_jax.world import tasks
 from rps_jax.world.domain import LABELS
 
 FAILURES = (
-    *("never touched", "lost contact", "timeout", "fell over", "diverged", "stalled"),
+    "never touched",
+    "lost contact",
+    "timeout",
+    "fell over",
+    "diverged",
+    "stalled",
     "contact not felt",
 )
 MODES = (*FAILURES, *tasks.FAILURES.values())  # with those of tasks
