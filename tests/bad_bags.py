@@ -27,6 +27,7 @@ from mcap.reader import NonSeekingReader
 from mcap.writer import CompressionType, IndexType
 from mcap.writer import Writer as McapWriter
 from mcap_ros2.writer import Writer as EncodingWriter
+from numpy.random import default_rng
 from rosbags import rosbag1, rosbag2
 from rosbags.typesys import Stores, get_typestore
 
@@ -75,7 +76,7 @@ class Case(NamedTuple):
 
 def push() -> list[Step]:
     """Return steps in which each field changes at each step."""
-    rng = np.random.default_rng(0)
+    rng = default_rng(0)
     steps = []
     for i in range(COUNT):
         kind = (0, 1, 2, 1)[i % 4]

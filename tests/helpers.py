@@ -19,6 +19,7 @@ import pandas as pd
 import pytest
 import xarray as xr
 from hypothesis import strategies
+from numpy.testing import assert_allclose, assert_array_equal
 
 from rps_jax.app import cli
 from rps_jax.control import registry
@@ -269,7 +270,7 @@ def central_differences(function: Callable[..., Any], x: np.ndarray, h: float) -
 
 def same(a: Any, b: Any, **tolerances: float) -> None:
     """Assert that two trees are equal, bit for bit or within tolerances."""
-    check = np.testing.assert_allclose if tolerances else np.testing.assert_array_equal
+    check = assert_allclose if tolerances else assert_array_equal
     for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True):
         check(x, y, **tolerances)
 

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import xarray as xr
+from numpy.testing import assert_allclose
 
 from rps_jax.control.observation import Twist
 from rps_jax.engines import mjx_colliders
@@ -111,7 +112,7 @@ def test_without_physics_the_base_moves_and_the_object_stays():
     twists = Twist(*(np.full(1, x) for x in (0.05, 0.0, 0.0)))
     driven = levers.Unmoved().drive(worlds.fields, start, ControlPeriod(twists, preset()))
     moved = np.asarray(driven.motion.qpos - start.qpos)[0]
-    np.testing.assert_allclose(moved, [0.05 * 0.02, *[0] * 9], atol=1e-9)
+    assert_allclose(moved, [0.05 * 0.02, *[0] * 9], atol=1e-9)
 
 
 def test_a_program_is_retraced_for_each_lever():
@@ -154,7 +155,7 @@ def test_contacts_of_a_box_as_a_prism_equal_those_of_mjx():
     ours, theirs = contacts_of(mjx_colliders.collision), contacts_of(mjx.collision)
     assert ours.dist.shape == theirs.dist.shape == (2, 8)
     for mine, reference in zip(deepest(ours), deepest(theirs), strict=True):
-        np.testing.assert_allclose(mine, reference, atol=1e-6)
+        assert_allclose(mine, reference, atol=1e-6)
 
 
 def test_whole_commands_are_timed_twice_per_gpu_count(monkeypatch):

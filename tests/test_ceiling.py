@@ -8,6 +8,7 @@ import pytest
 import xarray as xr
 from helpers import CYLINDERS, observation, refusal, refusals
 from helpers import rps as command
+from numpy.testing import assert_allclose, assert_array_equal
 
 import rps_jax
 from rps_jax import InputError, RPSParams, Rules, Setting
@@ -51,9 +52,9 @@ def test_offsets_are_added_in_turn_and_bounded():
     _, unguided, _ = rps.step_with_details(params.law, RPSState.init(params.law), observe(False))
     unguided = [float(x) for x in unguided]
     slower = [unguided[0] - 0.5 * float(params.law.v_max), *unguided[1:]]
-    np.testing.assert_allclose(twists[:2], [slower] * 2, rtol=1e-5, atol=1e-7)
+    assert_allclose(twists[:2], [slower] * 2, rtol=1e-5, atol=1e-7)
     turning = float(np.clip(unguided[2] + params.law.omega_max, None, params.law.omega_max))
-    np.testing.assert_allclose(twists[2:4], [[*unguided[:2], turning]] * 2, rtol=1e-5, atol=1e-7)
+    assert_allclose(twists[2:4], [[*unguided[:2], turning]] * 2, rtol=1e-5, atol=1e-7)
     assert twists[4] == unguided
 
 
@@ -88,22 +89,22 @@ def test_costs_by_hand():
         base_pose=pose,
         object_pose=away,
     )
-    np.testing.assert_allclose(score.plan_costs(outcome, Rules()), [0.1, 1.5, 6.2, 2.0])
+    assert_allclose(score.plan_costs(outcome, Rules()), [0.1, 1.5, 6.2, 2.0])
 
 
 def test_the_temperature_weights_from_the_best_to_all_samples():
     cost = np.array([[1.0, 2.0, 3.0]])
-    np.testing.assert_allclose(ceiling._weights(cost, 1e-3)[0], [1, 0, 0], atol=1e-12)
-    np.testing.assert_allclose(ceiling._weights(cost, 1e6)[0], [1, 1, 1], rtol=1e-5)
+    assert_allclose(ceiling._weights(cost, 1e-3)[0], [1, 0, 0], atol=1e-12)
+    assert_allclose(ceiling._weights(cost, 1e6)[0], [1, 1, 1], rtol=1e-5)
     spread = np.sqrt(2 / 3)
-    np.testing.assert_allclose(ceiling._weights(cost, 1.0)[0, 1], np.exp(-1 / spread))
-    np.testing.assert_allclose(ceiling._weights(np.ones((1, 3)), 0.2)[0], [1, 1, 1])
+    assert_allclose(ceiling._weights(cost, 1.0)[0, 1], np.exp(-1 / spread))
+    assert_allclose(ceiling._weights(np.ones((1, 3)), 0.2)[0], [1, 1, 1])
 
 
 def test_perturbations_depend_on_world_and_round_and_fill_one_window():
     both = SMALL.perturbations(np.array([4, 9]), 1, np.array([300.0, 60.0]))
     single = SMALL.perturbations(np.array([9]), 1, np.array([60.0]))
-    np.testing.assert_array_equal(both[1], single[0])
+    assert_array_equal(both[1], single[0])
     assert not both[:, :2].any()
     # Window 10 s, knots of 5 s, in the second of three rounds: from 100 s and from 20 s on.
     for row, first in ((0, 20), (1, 4)):
@@ -131,7 +132,7 @@ def test_a_search_resumes_and_its_plans_succeed_in_a_sweep(tmp_path):
     for i in (0, 1):
         trial, search = sweep.sel(law=f"{i}").isel(world=i), whole.sel(world=i)
         assert int(trial.success) == int(search.solved)
-        np.testing.assert_allclose(float(trial.time), float(search.time), atol=0.021)
+        assert_allclose(float(trial.time), float(search.time), atol=0.021)
 
 
 test_searches_without_worlds_or_perturbations_are_refused = refusals(

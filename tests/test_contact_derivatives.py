@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.random import default_rng
 
 from rps_jax.control.observation import Twist
 from rps_jax.engines.base import ControlPeriod, Motion
@@ -34,7 +35,7 @@ def in_contact(domain, count, seed=0, spread=1.0):
     drawn = draws.draw(parse_domain(domain), seed, np.arange(count))
     drawn.values["yaw"][::2] *= 1e-3  # half of them lie flat on the base
     batch = drawn_worlds(parse_domain(domain), drawn, Setting())
-    random, worlds = np.random.default_rng(seed), jax.tree.map(jnp.asarray, batch.worlds)
+    random, worlds = default_rng(seed), jax.tree.map(jnp.asarray, batch.worlds)
     qpos = np.array(worlds.qpos, float)
     qpos[:, 3] -= drawn.values["gap"] + 3e-4 * spread * random.random(count)
     qpos[:, 5] -= 2e-4 * spread * random.random(count)
@@ -68,7 +69,7 @@ def inputs(x):
 
 def random_like(tree, seed=0):
     """Return random numbers of the shapes of a pytree, of the size of each number or of 1e-3."""
-    random = np.random.default_rng(seed)
+    random = default_rng(seed)
     return jax.tree.map(
         lambda a: jnp.asarray(random.normal(size=a.shape) * (np.abs(a) + 1e-3), a.dtype), tree
     )

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import xarray as xr
 from helpers import PAPER, results_of
+from numpy.random import default_rng
 
 from rps_jax.runs import execution
 from rps_jax.runs.plan import Plan
@@ -19,7 +20,7 @@ from sweeps.corridors import costs, parity, study
 from sweeps.corridors.widths import fit
 from sweeps.study_base import run_together
 
-RANDOM = np.random.default_rng(4)
+RANDOM = default_rng(4)
 
 
 def drawn(plateau: float, middle: float, spread: float) -> tuple[np.ndarray, np.ndarray]:

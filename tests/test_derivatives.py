@@ -10,6 +10,7 @@ import jax
 import numpy as np
 import pytest
 from helpers import ROOT, refusals, row
+from numpy.testing import assert_allclose
 
 import rps_jax
 from rps_jax.control.laws.rps import RPSParams
@@ -74,21 +75,19 @@ def test_gradients_are_central_differences(results, name):
     up, down = (gradients_of(*side).value.values[0] for side in sides)
     differences = (up - down) / (2 * h)
     assert np.abs(differences).max() > 1e-4
-    np.testing.assert_allclose(slope(results, name), differences, rtol=1e-5, atol=1e-8)
+    assert_allclose(slope(results, name), differences, rtol=1e-5, atol=1e-8)
 
 
 def test_vectors_agree_with_the_quantities_that_turn_and_stretch_them(results):
     bearing = results.bearing.values
     along = np.cos(bearing) * slope(results, "target_x")
     along += np.sin(bearing) * slope(results, "target_y")
-    np.testing.assert_allclose(along, slope(results, "distance"), rtol=1e-6)
+    assert_allclose(along, slope(results, "distance"), rtol=1e-6)
     drawn = draws.draw(TOUCHING, 0, np.arange(4))
     x, y, _ = drawn.solid.p_object_com.T
     along = x * slope(results, "com_x") + y * slope(results, "com_y")
     # The quasi-static engine uses no inertia, which a moving load changes.
-    np.testing.assert_allclose(
-        along, drawn.values["com_offset"] * slope(results, "com_offset"), 1e-6
-    )
+    assert_allclose(along, drawn.values["com_offset"] * slope(results, "com_offset"), 1e-6)
 
 
 def test_the_mirrored_world_has_mirrored_gradients():
@@ -107,12 +106,10 @@ def test_the_mirrored_world_has_mirrored_gradients():
     plain = gradients_of(domain(1))
     with mock.patch.object(draws, "random_numbers", mirrored):
         mirror_image = gradients_of(domain(-1))
-    np.testing.assert_allclose(plain.value, mirror_image.value, rtol=1e-9)
+    assert_allclose(plain.value, mirror_image.value, rtol=1e-9)
     for name, sign in {"target_x": 1, "target_y": -1, "com_x": 1, "com_y": -1, "v_max": 1}.items():
         assert np.abs(slope(plain, name)).max() > 1e-5, name
-        np.testing.assert_allclose(
-            slope(plain, name), sign * slope(mirror_image, name), rtol=1e-6, atol=1e-9
-        )
+        assert_allclose(slope(plain, name), sign * slope(mirror_image, name), rtol=1e-6, atol=1e-9)
 
 
 def test_the_results_are_labelled(results):
@@ -140,10 +137,10 @@ def test_the_results_are_labelled(results):
     assert {"mass", "friction_robot", "object"} <= set(results.coords)
     assert (results.finite == 1).all()
     norm = np.linalg.norm(results.gradient.values, axis=-1)
-    np.testing.assert_allclose(results.norm, norm)
-    np.testing.assert_allclose(results["mean"], results.gradient.mean("world"), rtol=1e-6)
+    assert_allclose(results.norm, norm)
+    assert_allclose(results["mean"], results.gradient.mean("world"), rtol=1e-6)
     spread = results.gradient.std("world", ddof=1) / 2
-    np.testing.assert_allclose(results.error, spread, rtol=1e-5)
+    assert_allclose(results.error, spread, rtol=1e-5)
 
 
 def test_a_mass_without_influence_is_told(results):
@@ -215,13 +212,13 @@ def test_the_examples_of_the_page_agree():
     exec(route, space)
     expected = space["results"].gradient.sel(quantity="K_h").values[0]
     assert np.isfinite(expected).all()
-    np.testing.assert_allclose(space["slopes"], expected, rtol=0.05, atol=1e-4)
+    assert_allclose(space["slopes"], expected, rtol=0.05, atol=1e-4)
 
 
 def test_worlds_are_those_of_a_sweep_and_one_object_each():
     batch = rps_jax.draw_worlds("wide,objects=random_cylinder", 3, setting=Setting(seed=5))
     drawn = draws.draw(parse_domain("wide,objects=random_cylinder"), 5, np.arange(3))
-    np.testing.assert_allclose(batch.worlds.p_world_target, drawn.p_world_target, rtol=1e-6)
+    assert_allclose(batch.worlds.p_world_target, drawn.p_world_target, rtol=1e-6)
     with pytest.raises(rps_jax.InputError, match="worlds of one program have one object"):
         rps_jax.draw_worlds("wide", 3)
 

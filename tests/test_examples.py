@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from helpers import observation, refusal, refusals, rps, same
+from numpy.testing import assert_allclose
 from staging import recompiled
 
 import rps_jax
@@ -84,7 +85,7 @@ def test_a_hexagon_has_the_mass_of_its_geoms_and_its_registered_outline(hexagon)
     assert 2 * body.pos[2] == pytest.approx(0.5)
     assert hexagon.model.ngeom > hexagon.physics.ngeom  # with visual geoms
     heavy = scene.load("hexagon", mass=24.0).physics.body("object")
-    np.testing.assert_allclose(heavy.inertia, 2 * body.inertia, rtol=1e-6)
+    assert_allclose(heavy.inertia, 2 * body.inertia, rtol=1e-6)
 
 
 def test_all_engines_have_an_equal_hexagon(hexagon):
@@ -107,7 +108,7 @@ def test_a_registered_object_of_the_paper_gives_an_equal_world(name):
         worlds = pushes.build(cases, Setting(engine=engine)).worlds
         for leaf in jax.tree.leaves(worlds._replace(key=None, shift=None)):
             leaf = np.asarray(leaf)
-            np.testing.assert_allclose(leaf[:2], leaf[2:], rtol=1e-6, atol=1e-6)
+            assert_allclose(leaf[:2], leaf[2:], rtol=1e-6, atol=1e-6)
 
 
 def test_a_custom_object_can_be_in_a_domain(hexagon):
@@ -180,7 +181,7 @@ def test_an_object_file_has_the_outline_of_its_solid(tmp_path):
     assert loaded.family == "prism"
     corners = np.unique(np.round(np.asarray(loaded.footprint.vertices), 6), axis=0)
     expected = np.array(L_CORNERS.split(), float).reshape(-1, 2)
-    np.testing.assert_allclose(corners, np.unique(expected, axis=0), atol=1e-6)
+    assert_allclose(corners, np.unique(expected, axis=0), atol=1e-6)
     with pytest.raises(InputError, match=r"reach of the footprint = 0.7 m .* have the mass"):
         objects.parse_object(str(l_shape(tmp_path, "0.7").rename(tmp_path / "wide.xml")))
     text = (objects.mjcf_folder() / "cylinder.xml").read_text()
@@ -467,9 +468,9 @@ def test_the_law_runs_on_a_robot_without_compilation_in_the_loop(compiled, capsy
     contact = [0.3625, 0.29 - 0.58 * (1.5 + 4.5) / 2 / 12]
     obs = observation((0.0, 0.0), 0.0, contact, True, target)
     _, expected = step(RPSParams.paper(), RPSState.init(RPSParams.paper()), obs)
-    np.testing.assert_allclose(states[1].p_robot_contact, contact, atol=1e-6)
+    assert_allclose(states[1].p_robot_contact, contact, atol=1e-6)
     assert float(expected.v_y) > 0.01
-    np.testing.assert_allclose(np.asarray(twist)[:2], [expected.v_x, expected.v_y], atol=2e-3)
+    assert_allclose(np.asarray(twist)[:2], [expected.v_x, expected.v_y], atol=2e-3)
     latency = names["main"](names["Options"](seconds=0.3))
     assert latency.shape == (300,)
     assert on_a_robot.PRINTED.search(capsys.readouterr().out)

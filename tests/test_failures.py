@@ -4,6 +4,8 @@ import numpy as np
 import pytest
 import xarray as xr
 from helpers import CYLINDERS, PAPER, ROOT, refusal, results_of, rps
+from numpy.random import default_rng
+from numpy.testing import assert_allclose, assert_array_equal
 from scipy import stats
 
 import rps_jax
@@ -37,15 +39,15 @@ def severity_of(success, time, missed, lost, tilt, rules=RULES):
 def test_severity_by_hand():
     still = [0.0, 0.002, 0.001]
     success = severity_of([1, 1, 1], [5.0, 2.0, 10.0], [0.05] * 3, [0.0, 4.0, 0.0], still)
-    np.testing.assert_allclose(success, [0.5, 0.8, 1.0])
+    assert_allclose(success, [0.5, 0.8, 1.0])
     assert (success < 1).all()  # also a success at the last moment
     # 2 mrad to pi / 4 is a factor of 392.7; its root is half way in the logarithm.
     tilt = [0.002 * 392.7**0.5, 0.79]
     leaning = severity_of([1, 1], [1.0, 1.0], [0.05] * 2, [0.0] * 2, tilt)
-    np.testing.assert_allclose(leaning, [0.5, 1.0], rtol=1e-4)
+    assert_allclose(leaning, [0.5, 1.0], rtol=1e-4)
     assert (leaning < 1).all()
     failed = severity_of([0, 0], [10.0, 3.0], [0.3, 0.0], [0.0, 5.0], [0.9, 0.0])
-    np.testing.assert_allclose(failed, [1.3, 1.0])
+    assert_allclose(failed, [1.3, 1.0])
 
 
 def probe_in(folder):
@@ -57,9 +59,9 @@ def test_a_probe_agrees_with_a_sweep_and_resumes(tmp_path, monkeypatch):
     probe = probe_in(tmp_path)
     trials = probe(u)
     sweep = rps_jax.sweep({"law": PAPER}, CYLINDERS, points=u, setting=BRIEF, slots=8)
-    np.testing.assert_allclose(trials.time, sweep.time[0], atol=0.3)
-    np.testing.assert_array_equal(trials.severity >= 1, sweep.success[0] == 0)
-    np.testing.assert_allclose(probe.simulated, trials.time.sum())
+    assert_allclose(trials.time, sweep.time[0], atol=0.3)
+    assert_array_equal(trials.severity >= 1, sweep.success[0] == 0)
+    assert_allclose(probe.simulated, trials.time.sum())
     monkeypatch.setattr(Probe, "_simulate", None)  # a resumed probe runs no trial
     xr.testing.assert_identical(probe_in(tmp_path)(u), trials)
     with pytest.raises(InputError, match="step 0 is of another search"):
@@ -213,7 +215,7 @@ def test_a_killed_attack_resumes_with_the_same_results(synthetic, tmp_path):
 def test_an_elite_fails_whatever_the_noise(synthetic):
     """A fifth of a severity depends on the noise; four trials remove most accidental failures."""
     probe = Probe(DOMAINS["wide"], PAPER, BRIEF)
-    rng = np.random.default_rng(0)
+    rng = default_rng(0)
 
     def failure_rate(results):
         u = np.repeat(results.u.values, 8, axis=0)
@@ -281,8 +283,8 @@ def test_two_quantities_that_only_matter_together_have_only_total_indices():
     u = design.u()
     a, b = (u[:, design.groups.index(name)] > 0.5 for name in ("mass", "gap"))
     results = analyzed(design, a == b).sel(output="success", factor=["mass", "gap"])
-    np.testing.assert_allclose(results.first, 0, atol=0.1)
-    np.testing.assert_allclose(results.total, 1, atol=0.1)
+    assert_allclose(results.first, 0, atol=0.1)
+    assert_allclose(results.total, 1, atol=0.1)
 
 
 def test_a_design_needs_four_worlds_for_each_factor():

@@ -5,6 +5,7 @@ import re
 import numpy as np
 import pytest
 from helpers import same
+from numpy.testing import assert_allclose, assert_array_equal
 from staging import FINE, simulate, staged, step_in_c
 
 from rps_jax import engines
@@ -71,8 +72,8 @@ def test_feet_change_the_final_pose_and_engines_agree_with_c_mujoco(engine):
     feet, corners = (pushed_in_c(name) for name in ("on_feet", "on_corners"))
     assert feet[Y] - corners[Y] > 0.01
     qpos = driven(engine, ["on_feet", "on_both"], 300)
-    np.testing.assert_allclose(qpos[0], feet, atol=2e-3)
-    np.testing.assert_allclose(qpos[1, :6], corners[:6], atol=3e-3)
+    assert_allclose(qpos[0], feet, atol=2e-3)
+    assert_allclose(qpos[1, :6], corners[:6], atol=3e-3)
 
 
 def test_quasistatic_is_nearer_to_c_mujoco_with_equal_feet():
@@ -84,8 +85,8 @@ def test_quasistatic_is_nearer_to_c_mujoco_with_equal_feet():
 
 def test_a_scene_returns_its_feet():
     row = scene.solid_of(scene.load("on_feet", FINE, FRICTION))
-    np.testing.assert_array_equal(row.feet[0, :3], np.column_stack([FEET, np.ones(3)]))
-    np.testing.assert_array_equal(row.feet[0, 3:, 2], 0)
+    assert_array_equal(row.feet[0, :3], np.column_stack([FEET, np.ones(3)]))
+    assert_array_equal(row.feet[0, 3:, 2], 0)
     assert row.feet.shape == (1, SIDES, 3)
     assert scene.solid_of(scene.load("on_corners", FINE, FRICTION)).feet is None
 
@@ -109,9 +110,9 @@ def test_the_arm_of_friction_is_that_of_the_feet():
 def test_the_rigid_solver_supports_feet():
     row = scene.solid_of(scene.load("on_feet", FINE, FRICTION))
     feet = rigid.supports(row, np.zeros(1), np.zeros((1, 2)))
-    np.testing.assert_allclose(feet[0, :3], FEET, atol=1e-9)
+    assert_allclose(feet[0, :3], FEET, atol=1e-9)
     load = rigid.supported_load(feet, np.zeros((1, 2)), np.zeros((1, 1)), row.feet[..., 2])
-    np.testing.assert_allclose(load[0], [*LOADS, *np.zeros(SIDES - 3)], atol=1e-9)
+    assert_allclose(load[0], [*LOADS, *np.zeros(SIDES - 3)], atol=1e-9)
 
 
 @pytest.mark.parametrize(
@@ -166,7 +167,7 @@ def test_drawn_feet_change_nothing_else_and_bear_the_object(name):
     plain, drawn, _ = drawn_on_feet(name, 64)
     assert plain.solid.feet is None
     same(*(x._replace(solid=None, values=None) for x in (plain, drawn)))
-    np.testing.assert_array_equal(plain.solid.mass, drawn.solid.mass)
+    assert_array_equal(plain.solid.mass, drawn.solid.mass)
     assert set(drawn.values) - set(plain.values) == {"feet"}
     feet, com = drawn.solid.feet, drawn.solid.p_object_com[:, :2]
     assert set(feet[..., 2].sum(axis=1)) == {3.0, 4.0}
@@ -176,7 +177,7 @@ def test_drawn_feet_change_nothing_else_and_bear_the_object(name):
         # Stretched by the share, a foot lies on the outline.
         edge = com[i] + reach[feet[i, :, 2] > 0] / share
         outline = Footprint(drawn.solid.vertices[i], drawn.solid.radius[i])
-        np.testing.assert_allclose(footprint.signed_distance(outline, edge), 0, atol=1e-6)
+        assert_allclose(footprint.signed_distance(outline, edge), 0, atol=1e-6)
         assert (reach @ [np.cos(bearing), np.sin(bearing)]).max(axis=0).min() > 0
 
 
@@ -219,4 +220,4 @@ def test_feet_are_drawn_only_for_random_objects():
     u = points.points_of(ranges, np.arange(6), 1)
     again = points.draw(ranges, 1, points.check_points(ranges, u), [0, 3])
     drawn = draws.draw(ranges, 1, [0, 3])
-    np.testing.assert_array_equal(again.solid.feet, drawn.solid.feet)
+    assert_array_equal(again.solid.feet, drawn.solid.feet)

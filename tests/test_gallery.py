@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import xarray as xr
 from helpers import refusal, results_of, rps
+from numpy.random import default_rng
 
 import rps_jax
 from rps_jax import Law
@@ -34,7 +35,7 @@ def test_each_failure_has_one_mode():
 
 
 def test_common_quantities_differ_from_all_worlds():
-    random = np.random.default_rng(0)
+    random = default_rng(0)
     size, mass = random.uniform(size=(2, 8000))
     trials = xr.Dataset({"size": ("world", size), "mass": ("world", mass)})
     ((name, masked, overall),) = gallery.common_quantities(trials, size > 0.8)

@@ -11,6 +11,7 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode
 from helpers import NEAR, refusals, row, same
+from numpy.testing import assert_allclose, assert_array_equal
 
 from rps_jax.errors import InputError
 from rps_jax.runs.evaluate import evaluate
@@ -52,13 +53,13 @@ def test_a_step_is_an_action_of_push_env_held(single):
     push, worlds = single.unwrapped.push_env, single.unwrapped._vector
     state = row(worlds._state, 0)
     assert int(state.info["index"]) == info["world"]
-    np.testing.assert_array_equal(obs, state.obs)
+    assert_array_equal(obs, state.obs)
     step, total = jax.jit(push.step), 0.0
     for _ in range(round(1.0 / push.dt)):
         state = step(state, AHEAD[0])
         total += float(state.reward)
     obs, reward, terminated, truncated, info = single.step(AHEAD[0])
-    np.testing.assert_allclose(obs, state.obs, atol=1e-4)
+    assert_allclose(obs, state.obs, atol=1e-4)
     assert reward == pytest.approx(total, abs=1e-4)
     assert not any((terminated, truncated, info["is_success"]))
     assert info["time"] == pytest.approx(1.0)
@@ -100,7 +101,7 @@ def test_a_success_terminates_and_resets_in_the_next_step(vector):
     assert (infos["time"][~ended] >= previous[~ended]).all()
     assert infos["_time"].all()
     start = np.linalg.norm(obs[ended, 42:], axis=1)
-    np.testing.assert_allclose(start, 0.71, atol=0.03)  # far again
+    assert_allclose(start, 0.71, atol=0.03)  # far again
     assert (vector.step(AHEAD)[4]["time"][ended] == 1).all()
 
 
@@ -111,9 +112,9 @@ def test_autoreset_in_the_same_step_is_optional(vector):
         setattr(envs.unwrapped, name, getattr(vector.unwrapped, name))
     assert envs.metadata["autoreset_mode"] is AutoresetMode.SAME_STEP
     obs, same, terminated, _, infos = step_until_success(envs)
-    np.testing.assert_array_equal(terminated, ended)
-    np.testing.assert_array_equal(same, rewards)
-    np.testing.assert_array_equal(infos["_final_obs"], ended)
+    assert_array_equal(terminated, ended)
+    assert_array_equal(same, rewards)
+    assert_array_equal(infos["_final_obs"], ended)
     assert (infos["time"][ended] == 0).all()
     assert infos["final_info"]["is_success"][ended].all()
     i = int(np.argmax(ended))

@@ -5,6 +5,7 @@ import pandas as pd
 import pytest
 import xarray as xr
 from helpers import CYLINDERS, ROOT, refusals, results_of, rps
+from numpy.testing import assert_allclose, assert_array_equal
 
 from rps_jax import ladder as climb
 from rps_jax.analysis import statistics, tables
@@ -23,8 +24,8 @@ QUASISTATIC = "--engine quasistatic --slots 8 --workers 1"
 
 def test_holms_adjustment_by_hand():
     # Sorted 0.01, 0.03, 0.04 times 3, 2, 1: 0.03, 0.06, 0.04, which is raised to 0.06.
-    np.testing.assert_allclose(statistics.holm([0.01, 0.04, 0.03]), [0.03, 0.06, 0.06])
-    np.testing.assert_allclose(statistics.holm([0.6, 0.9]), [1.0, 1.0])
+    assert_allclose(statistics.holm([0.01, 0.04, 0.03]), [0.03, 0.06, 0.06])
+    assert_allclose(statistics.holm([0.6, 0.9]), [1.0, 1.0])
     assert statistics.holm([]).size == 0
 
 
@@ -85,10 +86,10 @@ def test_all_laws_meet_the_same_test_worlds():
     assert results.senses.values.tolist() == ["touch", "touch", "pose"]
     assert results.mass.dims == ("world",)
     drawn = draws.table(draws.draw(CYLINDERS, seed_of(0, "test"), np.arange(6)))
-    np.testing.assert_allclose(results.mass, drawn["mass"][0], rtol=1e-6)
+    assert_allclose(results.mass, drawn["mass"][0], rtol=1e-6)
     renamed = climb({"mine": RPSParams.tuned()}, CYLINDERS, 6, **options)
-    np.testing.assert_array_equal(renamed.time.sel(law="mine"), results.time.sel(law="rps_tuned"))
-    np.testing.assert_array_equal(renamed.mass, results.mass)
+    assert_array_equal(renamed.time.sel(law="mine"), results.time.sel(law="rps_tuned"))
+    assert_array_equal(renamed.mass, results.mass)
 
 
 def test_several_domains_are_several_ladders(tmp_path, capsys):
@@ -99,7 +100,7 @@ def test_several_domains_are_several_ladders(tmp_path, capsys):
     for domain in domains:
         alone = climb(("rps", "dipole"), domain, 6, setting=setting, slots=8)
         xr.testing.assert_identical(tree[domain].to_dataset(), alone)
-        np.testing.assert_array_equal(load(tmp_path / domain).success, alone.success)
+        assert_array_equal(load(tmp_path / domain).success, alone.success)
     command = f"ladder --laws rps dipole --worlds 6 {QUASISTATIC} --horizon 2 --out {tmp_path}"
     assert rps(command, "--domain", *domains) == 0  # reads the finished sweeps
     text = capsys.readouterr().out
@@ -137,7 +138,7 @@ def test_outcomes_are_written_as_a_long_table(tmp_path, monkeypatch):
             assert row[name] == pytest.approx(float(trial[name]), rel=1e-6), name
         poses = row[["base_x", "base_y", "base_yaw", "object_x", "object_y", "object_yaw"]]
         expected = np.concatenate([trial.base_pose, trial.object_pose])
-        np.testing.assert_allclose(poses.astype(float), expected, rtol=1e-5)
+        assert_allclose(poses.astype(float), expected, rtol=1e-5)
         assert row.senses == str(trial.senses.values)
     columns = pd.read_csv(tmp_path / "results.columns.csv", keep_default_na=False)
     assert columns.column.tolist() == list(table)
@@ -189,8 +190,8 @@ def test_a_custom_law_is_scored_in_the_worlds_of_the_ladder(tmp_path, capsys, re
     assert rows[at - 2] == ["law", "success", "median time", "rps", "rps_plus", "worlds"]
     assert rps(f"ladder --laws rps rps_plus {options}", tmp_path / "ladder") == 0
     same = load(tmp_path / "ladder")
-    np.testing.assert_array_equal(same.mass, results.mass)
-    np.testing.assert_array_equal(same.time, results.time.sel(law=same.law))
+    assert_array_equal(same.mass, results.mass)
+    assert_array_equal(same.time, results.time.sel(law=same.law))
 
 
 def test_a_file_of_one_law_is_named_without_its_class(tmp_path, registries):

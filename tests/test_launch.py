@@ -10,6 +10,7 @@ import jax
 import numpy as np
 import pytest
 from helpers import output_of
+from numpy.testing import assert_array_equal
 
 from rps_jax.engines import device, native
 from rps_jax.lowering import nvrtc
@@ -65,8 +66,8 @@ def launched(folder, fails="nothing", library="launcher"):
 def test_kernels_run_concurrently_and_later_work_waits_for_all(folder):
     ((error, first), (_, second)), *results, traits = launched(folder)
     assert (error, traits) == ("", 0)
-    np.testing.assert_array_equal(results[0], 3 * np.arange(2))
-    np.testing.assert_array_equal(results[1], 5 * np.arange(20))
+    assert_array_equal(results[0], 3 * np.arange(2))
+    assert_array_equal(results[1], 5 * np.arange(20))
     loaded = ["mode 2", "load 3", "kernel step", "load 5", "kernel step", "mode 1"]
     assert first == [
         *loaded,
@@ -96,7 +97,7 @@ def test_a_single_kernel_can_be_captured_in_a_cuda_graph(folder):
     """Its call is one launch; the driver also loads kernels while a stream is captured."""
     ((error, first), (_, second)), result, _, traits = launched(folder, library="single")
     assert (error, traits) == ("", 1)
-    np.testing.assert_array_equal(result, 3 * np.arange(2))
+    assert_array_equal(result, 3 * np.arange(2))
     call = ["context", "push 7", "mode 2", "launch 3 on 7: 1 of 32", "mode 1", "pop"]
     assert first == ["mode 2", "load 3", "kernel step", "mode 1", *call]
     assert second == call

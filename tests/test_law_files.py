@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from helpers import ROOT, rps
+from numpy.testing import assert_allclose
 
 from rps_jax import evaluate, push, sweep
 from rps_jax.app.shadow import shadowed
@@ -77,7 +78,7 @@ def step(params, state, obs):
         results = sweep(["rps", str(path)], Domain(("box",)), worlds=2, setting=setting)
     ended = results.sel(law="mine")
     assert ended.nan_twist.values.tolist() == ended.diverged.values.tolist() == [1, 1]
-    np.testing.assert_allclose(ended.time, 3 * setting.physics.control_period, rtol=1e-6)
+    assert_allclose(ended.time, 3 * setting.physics.control_period, rtol=1e-6)
     assert not results.sel(law="rps").nan_twist.any()
     sentence = nan_twists(results)
     assert sentence.startswith("mine returned a twist that is not finite (NaN or infinite) in 2 of")

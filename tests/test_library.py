@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import xarray as xr
 from helpers import PAPER, ROOT, SLOTS, addresses, decode, rps
+from numpy.testing import assert_array_equal
 
 import rps_jax
 from rps_jax.errors import InputError
@@ -28,7 +29,7 @@ def identical(a, b):
     xr.testing.assert_identical(a, b)
     for name in a.variables:
         assert a[name].dtype == b[name].dtype, name
-        np.testing.assert_array_equal(a[name].values, b[name].values, err_msg=name)
+        assert_array_equal(a[name].values, b[name].values, err_msg=name)
 
 
 # --- sweeps --------------------------------------------------------------------------------
@@ -110,7 +111,7 @@ def test_a_world_of_a_sweep_is_replayed(run):
     again = rps_jax.replay(folder, 3, "slow")
     expected = results.sel(law="slow", world=3)
     assert int(again.outcome.success) == int(expected.success)
-    np.testing.assert_array_equal(again.outcome.base_pose, expected.base_pose)
+    assert_array_equal(again.outcome.base_pose, expected.base_pose)
     assert "world 3" in again.title
 
 

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from helpers import same
+from numpy.testing import assert_allclose, assert_array_equal
 
 from rps_jax import Details, Law, Twist, replay, sweep
 from rps_jax.control import registry
@@ -75,10 +76,10 @@ def build_push(*arguments, **drawn):
 
 def close(actual, desired, warm, rest):
     """Assert that trials agree; accelerations [m/s^2] to the solver's tolerance of 1e-4."""
-    np.testing.assert_allclose(actual.warmstart, desired.warmstart, atol=warm)
+    assert_allclose(actual.warmstart, desired.warmstart, atol=warm)
     pairs = zip(*(jax.tree.leaves(x._replace(warmstart=0)) for x in (actual, desired)), strict=True)
     for a, b in pairs:
-        np.testing.assert_allclose(a, b, rtol=1e-4, atol=rest)
+        assert_allclose(a, b, rtol=1e-4, atol=rest)
 
 
 PAIRS = [
@@ -234,7 +235,7 @@ def test_an_operation_agrees_with_jax(name):
     run = native.batched(function, lambda _: pytest.fail("it was not compiled"))
     for a, b in zip(*map(jax.tree.leaves, (jax.jit(run)(x), jax.vmap(function)(x))), strict=True):
         assert a.dtype == b.dtype
-        np.testing.assert_allclose(a, b, rtol=3e-6, atol=1e-6)
+        assert_allclose(a, b, rtol=3e-6, atol=1e-6)
 
 
 @pytest.mark.parametrize("reverse", [False, True])
@@ -249,7 +250,7 @@ def test_a_scan_with_a_large_body_is_a_loop(reverse, monkeypatch):
     x = jnp.arange(5.0)
     run = native.batched(function, lambda _: pytest.fail("it was not compiled"))
     for a, b in zip(*map(jax.tree.leaves, (jax.jit(run)(x), jax.vmap(function)(x))), strict=True):
-        np.testing.assert_allclose(a, b, rtol=1e-6)
+        assert_allclose(a, b, rtol=1e-6)
 
 
 def test_constants_are_moved_as_jax_moves_them():
@@ -261,7 +262,7 @@ def test_constants_are_moved_as_jax_moves_them():
     x = np.arange(12, dtype=np.float32).reshape(3, 4)
     results = walk.walk(jax.make_jaxpr(function)(x), [x], nodes.SimdNodes())
     for a, b in zip(results, function(jnp.asarray(x)), strict=True):
-        np.testing.assert_array_equal(a, b)
+        assert_array_equal(a, b)
 
 
 def test_a_scan_of_worlds_is_that_of_jax_and_so_are_its_derivatives(monkeypatch):
@@ -305,7 +306,7 @@ def test_a_scan_of_worlds_is_that_of_jax_and_so_are_its_derivatives(monkeypatch)
             for scan in (native.scan, by_jax)
         )
         for a, b in zip(*map(jax.tree.leaves, (native_result, expected)), strict=True):
-            np.testing.assert_allclose(a, b, rtol=1e-5)
+            assert_allclose(a, b, rtol=1e-5)
     assert len(compiled) == 7  # forward, and backward or a tangent map
 
 

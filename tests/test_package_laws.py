@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from helpers import rps
+from numpy.testing import assert_array_equal
 
 import rps_jax
 from rps_jax.control import registry
@@ -123,4 +124,4 @@ def test_laws_that_ran_keep_their_results_when_another_fails(registries, tmp_pat
     results = rps_jax.load(tmp_path)
     assert results.law.values.tolist() == ["rps"]
     expected = rps_jax.sweep("rps", domain, worlds=3, setting=setting)
-    np.testing.assert_array_equal(results.base_pose, expected.base_pose)
+    assert_array_equal(results.base_pose, expected.base_pose)

@@ -14,6 +14,7 @@ import jax
 import mujoco
 import numpy as np
 import pytest
+from numpy.random import default_rng
 from scipy.optimize import minimize_scalar
 from staging import simulate, staged
 from test_quasistatic import stuck
@@ -266,7 +267,7 @@ def test_a_nearly_upright_cylinder_touches_only_with_its_rim_in_mjx():
     loaded = scene.load("cylinder")
     model, data = mjx.put_model(loaded.physics), mjx.make_data(loaded.physics)
     tilt = np.repeat([0.0, 1e-7, 1e-6, 1e-5, 1e-4], 40)
-    yaw, towards = np.random.default_rng(0).uniform(-3, 3, (2, tilt.size))
+    yaw, towards = default_rng(0).uniform(-3, 3, (2, tilt.size))
     qpos = np.tile(scene.initial_qpos(loaded, gap=1.0), (tilt.size, 1))
     (qpos[:, 6], qpos[:, 9]), leaning = (np.cos(yaw / 2), np.sin(yaw / 2)), np.sin(tilt / 2)
     qpos[:, 7], qpos[:, 8] = leaning * np.cos(towards), leaning * np.sin(towards)

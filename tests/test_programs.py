@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.testing import assert_array_equal
 
 from rps_jax.control import registry
 from rps_jax.control.laws import rps
@@ -72,7 +73,7 @@ def test_a_recorded_trial_is_traced_once_for_all_processes(cache, monkeypatch):
     assert len(traced) == 1
     assert jax.tree.structure(first.snapshots) == jax.tree.structure(again.snapshots)
     assert jax.tree.structure(first.outcome) == jax.tree.structure(again.outcome)
-    np.testing.assert_array_equal(first.snapshots.qpos, again.snapshots.qpos)
+    assert_array_equal(first.snapshots.qpos, again.snapshots.qpos)
 
 
 def test_a_program_with_results_of_unknown_type_is_not_cached(cache, compiler):

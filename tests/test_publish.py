@@ -11,6 +11,8 @@ import numpy as np
 import pytest
 import xarray as xr
 from helpers import ROOT, rps
+from numpy.random import default_rng
+from numpy.testing import assert_allclose, assert_array_equal
 
 from rps_jax import sweep
 from rps_jax.app.cli import names
@@ -212,7 +214,7 @@ def test_a_comparison_names_laws_by_the_runs_that_tuned_them():
 
 
 def test_success_is_grouped_by_force_lag_and_acceleration():
-    rng = np.random.default_rng(3)
+    rng = default_rng(3)
     limits = {
         "robot_force": (150, 800),
         "robot_traction": (0.3, 0.8),
@@ -306,15 +308,15 @@ def test_the_code_of_the_page_reads_a_million_outcomes(tmp_path, monkeypatch, ca
     assert results.attrs["seed"] == seeded.seed  # with which the page draws the worlds again
     swept = sweep(laws, near, 19, setting=seeded, slots=32)
     bits = np.unpackbits(results.success.values, axis=1, count=19)
-    np.testing.assert_array_equal(bits, swept.success)
-    np.testing.assert_array_equal(results.how == 0, swept.success)
+    assert_array_equal(bits, swept.success)
+    assert_array_equal(results.how == 0, swept.success)
     assert 0 < bits.sum() < bits.size
     period = results.attrs["control_period"]
-    np.testing.assert_allclose(results.steps * period, swept.time, atol=1e-4)
+    assert_allclose(results.steps * period, swept.time, atol=1e-4)
     distance = 1000 * swept.min_distance.values
     touched = np.isfinite(distance)
-    np.testing.assert_array_equal(results.missed.values < million.UNTOUCHED, touched)
-    np.testing.assert_allclose(results.missed.values[touched], distance[touched], atol=0.51)
+    assert_array_equal(results.missed.values < million.UNTOUCHED, touched)
+    assert_allclose(results.missed.values[touched], distance[touched], atol=0.51)
     page = (SWEEPS / "random_worlds" / "README.md").read_text()
     (code,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
     monkeypatch.chdir(tmp_path)

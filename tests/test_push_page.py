@@ -11,6 +11,8 @@ import jax
 import numpy as np
 import pytest
 from helpers import ROOT
+from numpy.random import default_rng
+from numpy.testing import assert_allclose
 from selenium.webdriver.common.action_chains import ActionChains
 from selenium.webdriver.common.by import By
 from shapely import LineString, Point
@@ -77,7 +79,7 @@ def test_a_whole_push_has_the_twists_of_python(law, browser):
     success, computed = browser.execute_script(WHOLE_PUSH, law, "box")
     assert success
     assert len(computed) == len(expected) > 5000
-    np.testing.assert_allclose(computed, expected, rtol=0, atol=1e-5)
+    assert_allclose(computed, expected, rtol=0, atol=1e-5)
 
 
 ROUTE = [[0.4, 0.0], [1.5, 0.0], [2.5, 0.7], [4.0, 0.8]]
@@ -108,11 +110,11 @@ def test_a_task_has_the_outcomes_of_python(kind, width, door, touched, browser):
     count, who, outcomes, twist = browser.execute_script(IN_A_TASK, kind, ROUTE, width, door)
     assert (who, bool(expected.success)) == (touched, not touched)
     assert abs(count - steps) <= 1
-    np.testing.assert_allclose(twist, last, atol=1e-6)
+    assert_allclose(twist, last, atol=1e-6)
     assert set(outcomes) == set(expected.task)
     for name, value in expected.task.items():
         computed = np.nan if outcomes[name] is None else outcomes[name]
-        np.testing.assert_allclose(computed, value, atol=1e-6, err_msg=name)
+        assert_allclose(computed, value, atol=1e-6, err_msg=name)
 
 
 def drawn(browser, points):
@@ -196,8 +198,8 @@ def test_each_state_of_a_push_gives_the_twist_of_python(law, browser):
         next_qpos = np.array([live.past[i + 1].snapshot.qpos for i in shown])
     batches = [states[i : i + 500] for i in range(0, len(states), 500)]
     computed = np.concatenate([browser.execute_script(SINGLE_STEPS, law, x) for x in batches])
-    np.testing.assert_allclose(computed[:, :3], expected[list(shown)], rtol=0, atol=1e-5)
-    np.testing.assert_allclose(computed[:, 3:], next_qpos, rtol=0, atol=1e-7)
+    assert_allclose(computed[:, :3], expected[list(shown)], rtol=0, atol=1e-5)
+    assert_allclose(computed[:, 3:], next_qpos, rtol=0, atol=1e-7)
 
 
 def leaves_by_name(trees):
@@ -211,7 +213,7 @@ def leaves_by_name(trees):
 @pytest.mark.parametrize("corners", [1, 4, 6])
 def test_the_support_of_an_object_equals_that_of_the_package(corners):
     """The page recomputes centre of mass and arm when a slider changes their inputs."""
-    rng = np.random.default_rng(0)
+    rng = default_rng(0)
     offset, bearing = rng.uniform(0, 0.4, 20), rng.uniform(-3, 3, 20)
     size = rng.uniform(0.1, 0.4, 20)
     if corners == 1:
@@ -224,8 +226,8 @@ def test_the_support_of_an_object_equals_that_of_the_package(corners):
     with jax.enable_x64(True):
         outlines = MAKE["Outline"](vertices, radius, offset, bearing)
         com, arm = jax.jit(jax.vmap(MAKE["support"]))(outlines)
-    np.testing.assert_allclose(com, solids.p_object_com[:, :2], atol=1e-12)
-    np.testing.assert_allclose(arm, solid.friction_arm(solids), atol=1e-9)
+    assert_allclose(com, solids.p_object_com[:, :2], atol=1e-12)
+    assert_allclose(arm, solid.friction_arm(solids), atol=1e-9)
 
 
 def test_the_recorded_push_is_upright_and_visible_from_any_side(browser):
@@ -235,7 +237,7 @@ def test_the_recorded_push_is_upright_and_visible_from_any_side(browser):
     # The contact is at the target, and the middle within half a diagonal.
     assert np.hypot(x + 2, y) < 0.05 + 0.2 * math.sqrt(2)
     assert abs(z - 0.4) < 4e-3
-    np.testing.assert_allclose(tilt, 0, atol=2e-3)
+    assert_allclose(tilt, 0, atol=2e-3)
     look = """
     eye.playing = false; eye.at = 100; eye.turn = arguments[0]; drawRecorded();
     return by("view").toDataURL();

@@ -7,6 +7,8 @@ import numpy as np
 import pandas as pd
 import pytest
 import xarray as xr
+from numpy.random import default_rng
+from numpy.testing import assert_allclose
 
 from rps_jax.errors import InputError
 from rps_jax.trials.setting import Setting
@@ -73,7 +75,7 @@ def test_derivatives_are_compared_in_each_world():
     slopes = [[0.0, 1.0], [2.0, 0.0], [-2.0, 0.0], [0.0, -90.0], [0.0, 0.0]]
     truth = [[0.0, 1.0], [2.0, 0.0], [-2.0, 0.0], [0.0, -100.0], [0.0, 0.0]]
     results = check.Check().combine(samples(exact=slopes, differences=truth))
-    np.testing.assert_allclose(results.error[:, 0], [0.0, 0.0, 0.0, 0.1, np.nan])
+    assert_allclose(results.error[:, 0], [0.0, 0.0, 0.0, 0.1, np.nan])
     _, median, right, *_, largest = check.table(results.expand_dims(object=["random_box"]))
     assert median == ["boxes", "median error", "0.0e+00"]
     assert right == ["boxes", "share of worlds with an error below 1 %", "0.75"]
@@ -132,7 +134,7 @@ def test_learning_curves_are_summed_up_by_hand(tmp_path):
 
 
 def test_a_cosine_without_a_sign_is_undecided():
-    random = np.random.default_rng(2)
+    random = default_rng(2)
     noise, drift = random.normal(size=(2, 64, 2))
     results = compare(
         samples(truth=drift + np.array([3, 0]), exact=noise, forward=noise + 1), "exact", "forward"
@@ -145,7 +147,7 @@ def test_a_cosine_without_a_sign_is_undecided():
 
 def test_a_cosine_of_one_dominant_world_is_undecided():
     """Its interval is narrow, since every resample without that world has the next in line."""
-    random = np.random.default_rng(4)
+    random = default_rng(4)
     true, drawn = random.normal(size=(2, 64, 2)) + np.array([3, 0])
     heavy = drawn * 2.0 ** np.arange(64)[:, None]
     results = compare(
@@ -157,7 +159,7 @@ def test_a_cosine_of_one_dominant_world_is_undecided():
 
 def test_the_interval_of_a_cosine_holds_the_true_one():
     """The mean directions are 60 degrees apart; both have noise."""
-    random, inside = np.random.default_rng(3), []
+    random, inside = default_rng(3), []
     ways = np.array([[0.8, 0], [0.4, 0.4 * 3**0.5]])
     for _ in range(60):
         true, drawn = random.normal(size=(2, 100, 2))

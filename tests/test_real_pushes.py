@@ -7,6 +7,8 @@ import pandas as pd
 import pytest
 import xarray as xr
 from helpers import ROOT
+from numpy.random import default_rng
+from numpy.testing import assert_allclose
 
 from rps_jax.errors import InputError
 from rps_jax.geometry.solid import rotate
@@ -73,7 +75,7 @@ def test_mujoco_with_stiff_fingers_comes_near_the_rigid_body(sample):
     subset = sample[sample.support != pushes.FLAT].groupby("kind").head(2).reset_index(drop=True)
     rigid, soft = (study.predict_all(subset, x).pose for x in ("rigid_feet", "mujoco_ours_stiff"))
     median = np.median(np.abs(rigid - soft), axis=0)
-    np.testing.assert_allclose(median / [2e-3, 2e-3, 0.03], 0, atol=1)
+    assert_allclose(median / [2e-3, 2e-3, 0.03], 0, atol=1)
     assert contact.KINDS["mujoco_ours"].scale == 4
 
 
@@ -84,7 +86,7 @@ def test_a_table_may_be_a_file_or_a_dataset_without_final_poses(sample, tmp_path
     first = study.predict_all(sample, "ellipsoid", steps=10).pose
     for table in (path, str(path), inputs, inputs.to_xarray()):
         again = study.predict_all(pushes.read(table), "ellipsoid", steps=10).pose
-        np.testing.assert_allclose(again, first, rtol=1e-12)
+        assert_allclose(again, first, rtol=1e-12)
     assert np.isnan(pushes.measured(pushes.read(path))).all()
 
 
@@ -103,10 +105,10 @@ def test_errors_by_hand():
     measured = np.array([0.0, 0.0, 0.0])
     about = np.array([*(COM - rotate(np.array(0.2), COM)), 0.2])  # turned about the centroid
     off = pushes.errors_of(np.stack([about, np.array([0.003, 0.004, 0.0])]), measured)
-    np.testing.assert_allclose(off.place, [0, 5e-3], atol=1e-12)
-    np.testing.assert_allclose(off.turn, [0.2, 0], atol=1e-12)
+    assert_allclose(off.place, [0, 5e-3], atol=1e-12)
+    assert_allclose(off.turn, [0.2, 0], atol=1e-12)
     # Over the area of the triangle, root of the mean square.
-    grid = np.random.default_rng(0).random((200_000, 2))
+    grid = default_rng(0).random((200_000, 2))
     grid = 0.15 * grid[grid.sum(axis=1) < 1]
     moved = rotate(np.full(len(grid), 0.2), grid) + about[:2]
     truth = np.sqrt(np.mean(np.sum((moved - grid) ** 2, axis=1)))
@@ -166,7 +168,7 @@ def test_a_layout_is_judged_with_the_friction_of_the_others():
 
 def test_a_new_series_lies_in_its_interval():
     """Seven series with lognormal medians predict the eighth in 95 % of the draws."""
-    rng = np.random.default_rng(0)
+    rng = default_rng(0)
     inside = []
     for _ in range(400):
         *known, new = np.exp(rng.normal(0.3, 0.5, (8, 4)))
@@ -178,7 +180,7 @@ def test_a_new_series_lies_in_its_interval():
 
 def test_the_interval_over_layouts_is_wider_than_that_over_pushes():
     """Layouts whose errors differ more than those of their pushes."""
-    rng = np.random.default_rng(0)
+    rng = default_rng(0)
     off = np.exp(rng.normal(0, 0.1, 400) + np.repeat([0.0, 0.5, 0.1, 0.9], 100)) / 1e3
     rows = validated(off[None], [0.4], np.repeat(list("abcd"), 100), np.repeat(list("efgh"), 100))
     series = [[study._errors_in(x)] for _, x in rows.groupby("layout")]
@@ -209,7 +211,7 @@ def test_repetitions_are_pushes_with_the_same_command(sample):
         }
     )
     off, repeated = pushes.repetitions(results)
-    np.testing.assert_allclose(off, 0, atol=1e-12)
+    assert_allclose(off, 0, atol=1e-12)
     assert list(repeated) == list(range(len(rows)))
 
 

@@ -8,6 +8,7 @@ import jax
 import numpy as np
 import pytest
 from helpers import rps
+from numpy.testing import assert_array_equal
 
 import rps_jax
 from rps_jax.app import film
@@ -38,7 +39,7 @@ def assert_equal_bits(outcomes, results):
     assert {"time", "success", "object_pose", "min_distance"} <= outcomes.keys()
     for name, values in outcomes.items():
         expected = results[name].values
-        np.testing.assert_array_equal(np.asarray(values, expected.dtype), expected, err_msg=name)
+        assert_array_equal(np.asarray(values, expected.dtype), expected, err_msg=name)
 
 
 def replayed(run, law):
@@ -169,4 +170,4 @@ def test_a_gpu_stops_at_any_number_of_steps(monkeypatch):
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
     on_gpu = stepped(7)
     assert on_gpu.steps == 7
-    jax.tree.map(np.testing.assert_array_equal, on_gpu, on_cpu)
+    jax.tree.map(assert_array_equal, on_gpu, on_cpu)

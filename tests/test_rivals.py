@@ -9,6 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from helpers import moved, same
+from numpy.random import default_rng
+from numpy.testing import assert_allclose
 
 from rps_jax.control import registry
 from rps_jax.control.laws import dipole, force_push, force_push_published, pursuit, rps, rps_plus
@@ -48,7 +50,7 @@ def follow(law, params, *script, state=None):
         twist, gamma = (*expected, None, None)[:2]
         state, *outputs = law.step(params, state, observation)
         if twist is not None:
-            np.testing.assert_allclose(outputs[0], twist, atol=1e-6)
+            assert_allclose(outputs[0], twist, atol=1e-6)
         if gamma is not None:
             assert float(outputs[1].gamma) == pytest.approx(gamma, abs=3e-6)
     return state
@@ -75,9 +77,9 @@ def with_force(observation, force=(-20.0, 0.0)):
 def test_a_twist_from_the_velocity_of_a_point_of_the_base():
     p, v = jnp.array([0.36, 0.1]), jnp.array([0.01, 0.05])
     twist = Twist.from_point_velocity(p, v, jnp.asarray(0.15))
-    np.testing.assert_allclose(twist, [0.01 + 0.015, 0.05 - 0.054, 0.15], rtol=1e-5)
+    assert_allclose(twist, [0.01 + 0.015, 0.05 - 0.054, 0.15], rtol=1e-5)
     bounded = Twist(*map(jnp.asarray, (0.06, -0.08, -0.3))).saturate(0.05, 0.15)
-    np.testing.assert_allclose(bounded, [0.03, -0.04, -0.15], rtol=1e-6)
+    assert_allclose(bounded, [0.03, -0.04, -0.15], rtol=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -131,7 +133,7 @@ def test_force_push_plans_a_new_path_behind_the_target():
     for x, angle in ((0.0, 0.0), (1.9, 0.0), (2.1, math.pi)):  # the last is behind it
         state = follow(force_push, params, (observe(robot=(x, 0.0)),), state=state)
         assert abs(float(state.path.theta_d)) == pytest.approx(angle)
-    np.testing.assert_allclose(state.path.p_world_start, (2.46, 0.0), atol=1e-6)
+    assert_allclose(state.path.p_world_start, (2.46, 0.0), atol=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -184,7 +186,7 @@ def test_the_published_force_push_yields_to_a_large_force():
         pressed = with_force(observe(), (-force, 0.0))
         follow(force_push_published, params, (pressed, (speed, 0.0, 0.0)), state=state)
     v = force_push_published.yield_to_force(params, jnp.array([0.03, 0.0]), jnp.array([0.0, 70.0]))
-    np.testing.assert_allclose(v, (0.03, -0.03), atol=1e-6)
+    assert_allclose(v, (0.03, -0.03), atol=1e-6)
 
 
 def test_the_published_force_push_turns_to_face_along_its_path():
@@ -223,7 +225,7 @@ def step_rps(params, observation):
 def test_rps_plus_translates_near_its_target(contact, target, expected):
     params = RPSPlusParams(RPSParams.tuned()._replace(K_v=0.3))
     _, twist, details = step_once(rps_plus, params, observe(contact, target))
-    np.testing.assert_allclose(twist, expected, atol=1e-6)
+    assert_allclose(twist, expected, atol=1e-6)
     assert bool(details.realigning) == (contact[1] > 0.24)
 
 
@@ -247,7 +249,7 @@ def test_rps_plus_searches_at_its_last_contact():
     """P3 with v_max = 0.05 m/s: ahead 0.035, sideways 0.025, and at most 0.15 rad/s."""
     params = RPSPlusParams(n_lost=3)
     state = follow(rps_plus, params, (observe((0.36, -0.2), (3.0, 0.0)),))
-    np.testing.assert_allclose(state.p_world_contact, (0.36, -0.2), atol=1e-6)
+    assert_allclose(state.p_world_contact, (0.36, -0.2), atol=1e-6)
     lost = observe(target=(3.0, 0.0), touching=False)
     for n in (1, 2, 3):
         _, expected, _ = rps.step_with_details(params.law, state.law, lost)
@@ -300,7 +302,7 @@ def test_the_dipole_aims_along_its_path_and_plans_a_new_one_behind_the_target():
         (with_pose(observe(target=(3.0, 0.0)), (3.41, 0.0)), None, 3.41),  # two radii past it
     ):
         state = follow(dipole, params, (observation, twist), state=state)
-        np.testing.assert_allclose(state.p_world_start, (start, 0.0), atol=1e-6)
+        assert_allclose(state.p_world_start, (start, 0.0), atol=1e-6)
 
 
 def with_taxels(observation):
@@ -332,7 +334,7 @@ def twist_of(name, touch, p_object, force=(-20.0, 5.0)):
 
 @pytest.mark.parametrize("name", RIVALS)
 def test_a_law_is_symmetric_and_does_not_depend_on_the_frame(name):
-    rng, flip = np.random.default_rng(3), np.array([1.0, -1.0])
+    rng, flip = default_rng(3), np.array([1.0, -1.0])
     for _ in range(8):
         contact, robot, target, p_object = rng.uniform(-1, 1, (4, 2))
         contact = np.array([0.36, 0.3 * contact[1]])
@@ -340,17 +342,17 @@ def test_a_law_is_symmetric_and_does_not_depend_on_the_frame(name):
         touch = observe(contact, 2 * target, robot, yaw)
         plain = twist_of(name, touch, p_object)
         mirrored = twist_of(name, moved(touch, mirror=True), p_object * flip, (-20.0, -5.0))
-        np.testing.assert_allclose(mirrored, plain * [1, -1, -1], atol=1e-5)
+        assert_allclose(mirrored, plain * [1, -1, -1], atol=1e-5)
         shift = jnp.array([0.3, -0.7])
         p_object = planar.rotate(jnp.asarray(turn), jnp.asarray(p_object)) + shift
         elsewhere = twist_of(name, moved(touch, turn, shift), p_object)
-        np.testing.assert_allclose(elsewhere, plain, atol=1e-5)
+        assert_allclose(elsewhere, plain, atol=1e-5)
 
 
 @pytest.mark.parametrize("name", RIVALS)
 def test_a_twist_is_within_the_speed_limits(name):
     limits = getattr(RIVALS[name], "law", RIVALS[name])
-    for x, y, z in np.random.default_rng(4).uniform(-1, 1, (16, 3)):
+    for x, y, z in default_rng(4).uniform(-1, 1, (16, 3)):
         for touching in (True, False):
             touch = observe((0.36, 0.3 * y), (3 * x, 3 * z), (y, z), 3 * x, touching)
             v_x, v_y, omega = twist_of(name, touch, (z, x))

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from helpers import NEAR, SHORT, case, refusal, same
+from numpy.testing import assert_allclose, assert_array_equal
 from staging import push_object, recompiled
 
 import rps_jax
@@ -72,7 +73,7 @@ def test_the_twist_is_bounded_as_a_vector_and_reached_by_lag_and_acceleration(na
     robot, twist, bounded, share = RESPONSES[name]
     velocities = reference_velocities(robot, twist, 60)
     expected = share(PERIOD * np.arange(1, 61)[:, None]) * (bounded or twist)
-    np.testing.assert_allclose(velocities, expected, atol=1e-7)
+    assert_allclose(velocities, expected, atol=1e-7)
 
 
 # Robot, and the shares of v_x, v_y and omega that its wheels lose.
@@ -91,7 +92,7 @@ def test_wheels_that_slip_lose_their_share_of_each_axis(name):
     robot, shares = SLIPS[name]
     assert not robot.ideal
     expected = TWIST * (1 - np.array(shares))
-    np.testing.assert_allclose(drive.apply_slip(robot, TWIST), expected, rtol=1e-6)
+    assert_allclose(drive.apply_slip(robot, TWIST), expected, rtol=1e-6)
 
 
 def test_slip_alone_is_that_of_all_axes_and_none_costs_nothing():
@@ -146,8 +147,8 @@ def test_a_base_turns_and_strafes_less_than_commanded_in_all_engines(engine):
     outcome, _ = pushes.run(cases, Setting(engine, rules=Rules(horizon=0.4)))
     executed = [np.array(command) * (1 - np.array(share)) for command, share in pairs]
     expected = np.array([position_after(twist, outcome.time[0]) for twist in executed])
-    np.testing.assert_allclose(outcome.base_pose[:, 2], expected[:, 2], rtol=1e-4, atol=1e-6)
-    np.testing.assert_allclose(outcome.base_pose[:, :2], expected[:, :2], atol=4e-4)
+    assert_allclose(outcome.base_pose[:, 2], expected[:, 2], rtol=1e-4, atol=1e-6)
+    assert_allclose(outcome.base_pose[:, :2], expected[:, :2], atol=4e-4)
     assert not outcome.stalled.any()
 
 
@@ -160,13 +161,13 @@ def test_the_environment_and_a_single_trial_turn_by_the_share_that_is_left():
     for _ in range(5):
         state = step(state, jnp.array([0.0, 0.5, 1.0]))
     turn = 0.55 * 0.15 * 5 * push.dt
-    np.testing.assert_allclose(state.data.qpos[2], turn, rtol=1e-4)
-    np.testing.assert_allclose(state.data.qpos[1], 0.5 * 0.05 * 5 * push.dt, rtol=1e-3)
+    assert_allclose(state.data.qpos[2], turn, rtol=1e-4)
+    assert_allclose(state.data.qpos[1], 0.5 * 0.05 * 5 * push.dt, rtol=1e-3)
     trace = rps_jax.push("box", target=(0.6, 0.3), setting=setting, robot="ideal,slip_yaw=0.45")
     steady = (trace.data.omega.values == np.float32(0.15))[:-1] & (np.diff(trace.data.omega) == 0)
     turned = np.diff(trace.data.qpos.values[:, 2])[steady]  # in 0.1 s
     assert steady.sum() > 20
-    np.testing.assert_allclose(turned, 0.55 * 0.15 * 0.1, atol=1e-6)
+    assert_allclose(turned, 0.55 * 0.15 * 0.1, atol=1e-6)
 
 
 def test_a_base_with_slip_stalls_at_its_own_speed():
@@ -197,7 +198,7 @@ def test_the_force_is_bounded_in_its_direction_by_drive_traction_and_rolling():
         assert np.hypot(*force[:2]) == pytest.approx(robot.push_max)
         c, s = turn
         along = (c * force[0] + s * force[1], c * force[1] - s * force[0])
-        np.testing.assert_allclose(along, np.array([0.6, 0.8]) * robot.push_max)
+        assert_allclose(along, np.array([0.6, 0.8]) * robot.push_max)
         assert force[2] == pytest.approx(robot.turn_max)
 
 
@@ -245,14 +246,14 @@ def test_engines_agree_on_a_small_base_that_contact_slows():
     weak = replace(ideal, mass=60.0, force_max=70.0, torque_max=5.0)
     qpos = {name: push(name, weak).qpos[-1] for name in ("fused", "mujoco", "mjx")}
     for name in ("fused", "mjx"):
-        np.testing.assert_allclose(qpos[name], qpos["mujoco"], atol=1e-3, err_msg=name)
+        assert_allclose(qpos[name], qpos["mujoco"], atol=1e-3, err_msg=name)
     assert np.abs(push("fused", ideal).qpos[-1] - qpos["fused"])[:6].max() > 0.01  # it did slow
 
 
 def test_a_strong_base_is_as_good_as_a_velocity_source():
     push = partial(push_object, "fused", seconds=3.0, twist=(0.05, 0.02, 0.0))
     strong, source = push(Robot(mass=2000.0, force_max=1e5)), push(Robot())
-    np.testing.assert_allclose(strong.qpos[-1], source.qpos[-1], atol=4e-3)
+    assert_allclose(strong.qpos[-1], source.qpos[-1], atol=4e-3)
 
 
 TEMPLATES = [*product(("real", "wide"), ("fused", "mjx")), ("wide", "quasistatic")]
@@ -271,7 +272,7 @@ def test_worlds_by_template_equal_recompiled_ones(domain, engine):
     _, fields = engines.get(engine).stage(inputs)
     theirs = recompiled(engine, [scene.compile_row(inputs, i) for i in range(3)])
     for ours, compiled in zip(*map(jax.tree.leaves, (fields, theirs)), strict=True):
-        np.testing.assert_allclose(ours, compiled, rtol=2e-5, atol=2e-6)
+        assert_allclose(ours, compiled, rtol=2e-5, atol=2e-6)
 
 
 # --- trials --------------------------------------------------------------------------------
@@ -302,7 +303,7 @@ def test_random_robots_are_drawn_last_and_change_no_other_draw():
     assert set(columns) - set(draws.table(wide)) == limits
     fixed = replace(DOMAINS["wide"], robot=ROBOTS["kairos"])
     again = draws.draw(fixed, 5, index).robot
-    np.testing.assert_array_equal(again.mass, 158.0)
+    assert_array_equal(again.mass, 158.0)
     assert again.lag is None
 
 

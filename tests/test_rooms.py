@@ -9,6 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 from helpers import refusal, rps
+from numpy.random import default_rng
+from numpy.testing import assert_array_equal
 from PIL import Image
 from shapely import LineString, MultiLineString, MultiPoint, Point, Polygon, box
 
@@ -112,7 +114,7 @@ def test_a_ros_map_and_polygons_of_a_room_have_equal_walls(name, tmp_path):
 
 
 def test_walls_of_an_image_are_within_the_tolerance(tmp_path):
-    rng = np.random.default_rng(3)
+    rng = default_rng(3)
     blob = MultiPoint(rng.uniform(2, 6, (12, 2))).buffer(0.7).union(box(0.5, 3, 7, 5))
     (blob,) = (part for part in getattr(blob, "geoms", [blob]) if part.contains(Point(2, 4)))
     free = cells(blob, 0.05, 170, 170)
@@ -225,7 +227,7 @@ def test_a_path_around_a_wall_is_almost_the_shortest():
 
 
 def test_a_path_keeps_the_clearance_and_no_corner_can_be_left_out():
-    rng = np.random.default_rng(5)
+    rng = default_rng(5)
     for k in range(4):
         corners = [
             2 + 2.5 * np.array([i, j]) + rng.uniform(-0.4, 0.4, (3, 2))
@@ -284,7 +286,7 @@ def test_a_room_is_a_point_of_the_cube_and_has_a_text_and_a_json():
     at = points.check_points(domain, points.points_of(domain, index))
     drawn, again = (points.draw(domain, 0, x, index).course.lines() for x in (None, at))
     for name in ("path", "walls"):
-        np.testing.assert_array_equal(drawn[name], again[name])
+        assert_array_equal(drawn[name], again[name])
 
 
 # --- trials --------------------------------------------------------------------------------------
@@ -433,9 +435,9 @@ def folder(tmp_path_factory):
     """Folder of good and bad images."""
     path = tmp_path_factory.mktemp("maps")
     Image.fromarray(GREY).save(path / "room.png")
-    noise = np.random.default_rng(0).uniform(size=(80, 80)) < 0.9
+    noise = default_rng(0).uniform(size=(80, 80)) < 0.9
     Image.fromarray(np.where(noise, 255, 0).astype(np.uint8)).save(path / "noise.png")
-    specks = np.random.default_rng(0).uniform(size=(2000, 2000)) < 0.9
+    specks = default_rng(0).uniform(size=(2000, 2000)) < 0.9
     jagged = np.full((1000, 1000), True)
     jagged[100:900:8, 100:] = False  # one obstacle of long teeth
     jagged[100:900, 990:] = False

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from helpers import box, jitted, observation, refusals, sense
+from numpy.testing import assert_allclose
 from staging import FINE, simulate, staged
 
 from rps_jax.control.laws import rps
@@ -64,9 +65,9 @@ def test_taxels_are_evenly_spaced_along_the_front_270_degrees() -> None:
     taxels = np.asarray(ROUND.shell.taxels()[:, 0])
     bearing = np.arctan2(taxels[:, 1], taxels[:, 0])
     assert len(taxels) == 42
-    np.testing.assert_allclose(np.hypot(*taxels.T), 0.3, rtol=1e-6)
-    np.testing.assert_allclose(np.diff(bearing), -1.5 * np.pi / 42, rtol=1e-4)
-    np.testing.assert_allclose(bearing, -bearing[::-1], atol=1e-6)
+    assert_allclose(np.hypot(*taxels.T), 0.3, rtol=1e-6)
+    assert_allclose(np.diff(bearing), -1.5 * np.pi / 42, rtol=1e-4)
+    assert_allclose(bearing, -bearing[::-1], atol=1e-6)
     assert ROUND.shell.rows()[-1].offset + ROUND.shell.rows()[-1].length == pytest.approx(ARC)
 
 
@@ -84,7 +85,7 @@ def test_taxels_are_evenly_spaced_along_the_front_270_degrees() -> None:
 def test_contact(shape: Footprint, normal: Any, point: Any, gap: float) -> None:
     result = meet(shape)
     for value, expected in zip(result, (normal, point, gap), strict=True):
-        np.testing.assert_allclose(value, expected, atol=1e-6)
+        assert_allclose(value, expected, atol=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -97,7 +98,7 @@ def test_turning_the_base_changes_nothing_in_contact(shape: Footprint) -> None:
         turn = np.array([[c, -s], [s, c]])
         expected = turn @ normal, turn @ point, gap
         for value, other in zip(meet(turned(shape, angle)), expected, strict=True):
-            np.testing.assert_allclose(value, other, atol=1e-6)
+            assert_allclose(value, other, atol=1e-6)
 
 
 def test_a_large_round_base_is_flat() -> None:
@@ -107,7 +108,7 @@ def test_a_large_round_base_is_flat() -> None:
     nearest = int(np.argmin(gaps))
     moved = fp.place(shape, jnp.array([1000.0 - half, 0.0]), 0.0)
     normal, point, gap = meet(moved, 1000.0)
-    np.testing.assert_allclose(normal, flat, atol=1e-3)
+    assert_allclose(normal, flat, atol=1e-3)
     assert gap == pytest.approx(float(gaps[nearest]), abs=2e-4)
     assert point[1] == pytest.approx(float(points[nearest][1]), abs=1e-3)
 
@@ -123,7 +124,7 @@ def test_skin_senses_the_arc_length(name: str, bearing: float) -> None:
     l = obs._replace(base_radius=0.3).l  # noqa: E741
     assert float(l) == pytest.approx(0.3 * bearing, abs=tolerance)  # positive to the left
     mirrored = read(SKINS[name], turned(ahead, -bearing)).p_robot_contact
-    np.testing.assert_allclose(mirrored, reading.p_robot_contact * jnp.array([1, -1]), atol=1e-5)
+    assert_allclose(mirrored, reading.p_robot_contact * jnp.array([1, -1]), atol=1e-5)
 
 
 def test_skin_ends_with_its_boards() -> None:
@@ -171,7 +172,7 @@ def test_engines_agree(name: str, engine: str) -> None:
         ends[stepped] = moved.qpos[-1, 0]
     assert ends["mujoco"][4] - start[0, 4] > 0.02
     tolerance = 0.0125 if engine == "quasistatic" else 2e-4
-    np.testing.assert_allclose(ends[engine][3:5], ends["mujoco"][3:5], atol=tolerance)
+    assert_allclose(ends[engine][3:5], ends["mujoco"][3:5], atol=tolerance)
 
 
 def test_a_low_object_touches_below_its_top() -> None:

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import xarray as xr
+from numpy.testing import assert_allclose, assert_array_equal
 from staging import step_in_c
 
 import rps_jax
@@ -63,7 +64,7 @@ def test_a_study_labels_its_conditions_and_compares_them(folder):
     results = conditions.run_conditions(CONDITIONS, GRID, folder)
     assert results.success.dims == ("condition", *DIMS)
     successes = results.success.sum(DIMS).values
-    np.testing.assert_array_equal(successes, [2, 0, 2])
+    assert_array_equal(successes, [2, 0, 2])
     rows = conditions.condition_rows(results, "default")
     assert [row[0] for row in rows] == ["reading", "the defaults", "slow", "thin skin"]
     assert rows[1][1:3] == ["2", "2 of 2"]
@@ -104,8 +105,8 @@ def test_c_mujoco_driven_by_periods_matches_c_mujoco_driven_by_steps():
         batch.drive(np.array([0]), twist, physics.substeps)
     data = step_in_c(at.physics, qpos, twist[0], 100 * physics.substeps)
     batch.close()
-    np.testing.assert_allclose(batch.qpos[0, :3], data.qpos[:3], atol=3e-6)
-    np.testing.assert_allclose(batch.qpos[0, 3:], data.qpos[3:], atol=2e-4)
+    assert_allclose(batch.qpos[0, :3], data.qpos[:3], atol=3e-6)
+    assert_allclose(batch.qpos[0, 3:], data.qpos[3:], atol=2e-4)
     assert batch.qpos[0, 3] > qpos[3] + 0.08  # it was pushed
 
 
@@ -119,7 +120,7 @@ def test_a_shove_moves_the_object_along_the_front_of_the_robot():
     outcome, _ = pushes.run(cases, setting)
     x = 0.3625 + 0.02 + 0.2
     expected = [[x, 0.1], [x, -0.1], [-0.1, x]]
-    np.testing.assert_allclose(outcome.object_pose[:, :2], expected, atol=1e-3)
+    assert_allclose(outcome.object_pose[:, :2], expected, atol=1e-3)
 
 
 @pytest.mark.slow
@@ -147,7 +148,7 @@ def test_the_papers_base_slips_by_default_most_when_it_turns():
 
 def test_the_hardware_targets_are_2_1_m_from_the_start():
     distance = np.linalg.norm(paper.HARDWARE_LAYOUTS["circle"], axis=1)
-    np.testing.assert_allclose(distance, 2.1)
+    assert_allclose(distance, 2.1)
     assert len(set(paper.HARDWARE_LAYOUTS["grid"])) == 8
 
 

@@ -33,6 +33,7 @@ from helpers import (
     same,
     swept,
 )
+from numpy.testing import assert_allclose, assert_array_equal
 
 from rps_jax.analysis import statistics
 from rps_jax.app.cli import running
@@ -112,10 +113,10 @@ def test_latency_of_poses_and_commands_is_exact(error):
         commanded.append([float(x) for x in snapshot.twist])
         applied.append([float(x) for x in twist])
     if error == "command_delay":
-        np.testing.assert_allclose(applied[steps:], commanded[:-steps], rtol=1e-6)
-        np.testing.assert_array_equal(applied[:steps], 0.0)
+        assert_allclose(applied[steps:], commanded[:-steps], rtol=1e-6)
+        assert_array_equal(applied[:steps], 0.0)
     else:
-        np.testing.assert_allclose(applied, commanded)
+        assert_allclose(applied, commanded)
         change = np.abs(np.array(commanded) - commanded[0]).max(axis=1)
         assert not change[: steps + 1].any()  # nothing seen yet
         assert change[steps + 1] > 0
@@ -135,7 +136,7 @@ def test_a_base_without_errors_is_perfect():
     for i in range(6):
         mine, theirs = a[i].columns(), b[i].columns()
         for name in mine:
-            np.testing.assert_allclose(mine[name], theirs[name], atol=1e-4, err_msg=name)
+            assert_allclose(mine[name], theirs[name], atol=1e-4, err_msg=name)
 
 
 def test_flat_boxes_without_contact_do_not_move():
@@ -220,7 +221,7 @@ def test_results_hold_every_world_with_its_drawn_quantities(whole, tmp_path):
     assert dict(results.sizes) == {"law": 2, "world": 20, "pose": 3}
     columns = draws.table(draws.draw(BOXES, 0, np.arange(20)))
     for name, (values, unit) in columns.items():
-        np.testing.assert_allclose(results[name], values, rtol=1e-6)
+        assert_allclose(results[name], values, rtol=1e-6)
         assert results[name].attrs["units"] == unit
     undrawn = {name for name in QUANTITIES if BOXES.range_of(name) is None}
     floors = {"slope", "slope_bearing", "boundary_factor", "boundary"}

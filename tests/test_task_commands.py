@@ -13,6 +13,7 @@ import pandas as pd
 import pytest
 from gymnasium.utils.env_checker import check_env
 from helpers import ROOT, refusal, rps
+from numpy.testing import assert_allclose, assert_array_equal
 
 import rps_jax
 from rps_jax.analysis import statistics, tables
@@ -72,7 +73,7 @@ def test_worlds_with_paths_are_points_of_the_cube(task):
         at = points.check_points(domain, points.points_of(domain, index))
         drawn, again = (points.draw(domain, 0, x, index).course for x in (None, at))
         for a, b in zip(jax.tree.leaves(drawn), jax.tree.leaves(again), strict=True):
-            np.testing.assert_array_equal(a, b)
+            assert_array_equal(a, b)
 
 
 def test_a_table_of_worlds_has_the_measures_of_their_paths():
@@ -84,7 +85,7 @@ def test_a_table_of_worlds_has_the_measures_of_their_paths():
         for x, y in np.moveaxis(headings, -1, 1)
         for n in [np.hypot(x, y) > 0]
     ]
-    np.testing.assert_allclose(table["length"], np.hypot(*np.moveaxis(headings, -1, 0)).sum(axis=1))
+    assert_allclose(table["length"], np.hypot(*np.moveaxis(headings, -1, 0)).sum(axis=1))
     turned = table["turns"] > 0
     assert (table["turn_angle"][turned] > 0.29).all()
     assert (table["turn_angle"] < 0.81).all()
@@ -108,7 +109,7 @@ def test_the_example_of_a_task_is_complete():
     assert world.step(progress, touch._replace(p_world_contact=point + 0.3))[1].failed
     assert set(progress.outcomes()) == set(task.OUTCOMES)
     assert float(world.remaining(progress, touch.p_world_goal, point)) == 1.0
-    np.testing.assert_array_equal(goals, targets)
+    assert_array_equal(goals, targets)
 
 
 # --- runs --------------------------------------------------------------------------------------
@@ -166,7 +167,7 @@ def test_a_corridor_is_resumed_sharded_merged_and_replayed(run, capsys):
     assert rps(f"merge {run}/1 {run}/2 --out {run}/merged") == 0
     for again in ("run", "merged"):
         for name in ("progress", "wall_touch", "touch_x", "success"):
-            np.testing.assert_array_equal(rps_jax.load(run / again)[name], results[name])
+            assert_array_equal(rps_jax.load(run / again)[name], results[name])
     assert load_plan(run / "run").domain.task == tasks.parse_task(TASK)
     touched = int(np.flatnonzero(results.wall_touch[0])[0])
     trace = rps_jax.replay(run / "run", touched)
@@ -289,7 +290,7 @@ def test_an_environment_ends_at_a_wall_and_counts_the_way_along_the_path():
     check_env(single.unwrapped, skip_render_check=True)
     obs, info = single.reset(seed=0)
     front = float(single.unwrapped.push_env.table.skin.shell.half[0][0])
-    np.testing.assert_allclose(obs[-2], front + 0.8, atol=0.1)
+    assert_allclose(obs[-2], front + 0.8, atol=0.1)
     assert "error_mean" not in info
     total, terminated = 0.0, False
     for i in range(300):
@@ -341,7 +342,7 @@ def test_shadow_follows_the_path_of_a_bag_without_a_target(frame, tmp_path, monk
     path = bag.write(tmp_path / "push.mcap", steps, {})
     read = bag.read(path)
     assert "target" not in read
-    np.testing.assert_allclose(read["path"], np.tile(PATH, (len(read["time"]), 1, 1)), atol=1e-9)
+    assert_allclose(read["path"], np.tile(PATH, (len(read["time"]), 1, 1)), atol=1e-9)
     course = PathCourse(jax.tree.map(jnp.asarray, Polyline.through(PATH)), jnp.asarray(0.3))
     progress, targets = course.start(), []
     for (x, y, yaw), point, kind in zip(
@@ -351,7 +352,7 @@ def test_shadow_follows_the_path_of_a_bag_without_a_target(frame, tmp_path, monk
         contact = jnp.asarray([x + c * point[0] - s * point[1], y + s * point[0] + c * point[1]])
         progress, aim = course.follow(progress, contact, jnp.asarray(kind > 0))
         targets.append(aim.p_world_target)
-    np.testing.assert_allclose(pursued(read, 0.3), targets, atol=1e-5)
+    assert_allclose(pursued(read, 0.3), targets, atol=1e-5)
     assert np.isfinite(shadow(path, "rps", lookahead=0.3).v_x.values).all()
     with pytest.raises(InputError, match="lookahead = 9 is not allowed"):
         Shadow(path, lookahead=9).validate()

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from helpers import jitted
+from numpy.random import default_rng
 from shapely import LineString, Point, Polygon
 from shapely.affinity import translate
 
@@ -50,7 +51,7 @@ def outlines(rng: np.random.Generator) -> list[tuple[Footprint, Any]]:
 
 
 def test_the_clearance_from_walls_is_exact() -> None:
-    rng = np.random.default_rng(0)
+    rng = default_rng(0)
     crossings = 0
     for outline, shape in outlines(rng):
         for _ in range(60):
@@ -70,7 +71,7 @@ def test_the_clearance_from_walls_is_exact() -> None:
 
 
 def test_the_way_out_of_a_wall_ends_its_crossing() -> None:
-    rng = np.random.default_rng(1)
+    rng = default_rng(1)
     _, (outline, shape), _ = outlines(rng)
     inside = 0
     for _ in range(40):
@@ -90,7 +91,7 @@ def test_the_way_out_of_a_wall_ends_its_crossing() -> None:
 
 
 def test_points_of_a_path_are_shapelys() -> None:
-    rng = np.random.default_rng(2)
+    rng = default_rng(2)
     for vertices in np.cumsum(rng.normal(size=(30, 6, 2)), axis=1):
         line, whole = Polyline.through(vertices), LineString(vertices)
         assert line.arcs[-1] == pytest.approx(whole.length)
@@ -164,7 +165,7 @@ def positions_at(contact: tuple[float, float], touches: bool = True) -> Position
 def test_cross_track_errors_are_those_of_the_contact_points() -> None:
     line = Polyline.through(np.array([[0.0, 0.0], [4.0, 0.0], [4.0, 4.0]]))
     course = path.PathCourse(jax.tree.map(jnp.asarray, line), jnp.asarray(0.5))
-    rng = np.random.default_rng(4)
+    rng = default_rng(4)
     errors = np.abs(rng.normal(0, 0.08, 400))
     progress, step = course.start(), jax.jit(course.step)
     for x, y in zip(np.linspace(0, 3, 400), errors, strict=True):
@@ -331,7 +332,7 @@ def strips(points: np.ndarray, half: float) -> list[Polygon]:
 
 def test_a_corridor_is_accepted_exactly_if_its_walls_leave_its_width() -> None:
     """Of random paths; in a refused one, parts that do not follow each other overlap."""
-    rng, counts = np.random.default_rng(1), {True: 0, False: 0}
+    rng, counts = default_rng(1), {True: 0, False: 0}
     one = np.zeros(1)
     u = {"width": one, "door_width": one, "lookahead": one}
     while min(counts.values()) < 50:

@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 import viser
 from helpers import ROOT, SHORT, case, refusal
+from numpy.testing import assert_allclose, assert_array_equal
 from PIL import Image
 from selenium.webdriver.common.by import By
 from websockets.exceptions import InvalidStatus
@@ -88,7 +89,7 @@ def test_an_undisturbed_push_ends_like_any_other_trial(live):
     assert live.done
     expected = results.columns()
     for name, value in live.outcome.columns().items():
-        np.testing.assert_allclose(value, expected[name][0], atol=1e-5, err_msg=name)
+        assert_allclose(value, expected[name][0], atol=1e-5, err_msg=name)
     assert live.past[-1].snapshot.time == pytest.approx(float(results.time[0]), abs=1e-4)
 
 
@@ -117,7 +118,7 @@ def test_a_shove_moves_the_object_once_in_the_frame_of_the_robot(live):
     live.shove((0.3, -0.2))
     live.step(1)
     moved = p_robot_object(live.past[-1].snapshot) - previous
-    np.testing.assert_allclose(moved, (0.3, -0.2), atol=3e-3)
+    assert_allclose(moved, (0.3, -0.2), atol=3e-3)
     shoved = live.past[-1].snapshot.qpos[3:5]
     live.step(2)
     assert math.dist(live.past[-1].snapshot.qpos[3:5], shoved) < 3e-3
@@ -145,7 +146,7 @@ def test_rewinding_discards_later_states(live):
     live.step(5)
     live.rewind(20)
     live.step(39)
-    np.testing.assert_array_equal(last, live.past[-1].snapshot.qpos)
+    assert_array_equal(last, live.past[-1].snapshot.qpos)
 
 
 def test_the_foam_is_compressed_only_at_the_contact(live):

@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 from staging import Recording, drive, simulate
 
 import rps_jax
@@ -81,11 +82,11 @@ def test_slides_along_walls_agree_with_c_mujoco(family, engine):
     computed, expected = slid(family, engine, STANDARD), slid(family, "mujoco", REFERENCE)
     away = np.linalg.norm(computed.qpos[..., 3:5] - expected.qpos[..., 3:5], axis=-1)
     assert away.max() < (7e-3 if family == "prism" else 3e-3)  # a prism turns, and differences grow
-    np.testing.assert_allclose(computed.qpos[-1, :, 6:], expected.qpos[-1, :, 6:], atol=0.07)
+    assert_allclose(computed.qpos[-1, :, 6:], expected.qpos[-1, :, 6:], atol=0.07)
     *_, solid = staged(family, engine, STANDARD)
     for qpos in (computed.qpos, expected.qpos):
         if family != "prism":
-            np.testing.assert_allclose(qpos[:, 3, 3:5], qpos[:, 0, 3:5] * [1, -1], atol=2e-3)
+            assert_allclose(qpos[:, 3, 3:5], qpos[:, 0, 3:5] * [1, -1], atol=2e-3)
         beyond = outermost(solid, qpos)[:, :2] - Y
         assert -0.0011 < beyond.max() < -0.0005  # at the face of a sheet of 2 mm
 
@@ -100,7 +101,7 @@ def test_the_force_of_a_slide_is_that_of_coulombs_law():
         for engine, physics in (("fused", STANDARD), ("mujoco", REFERENCE))
     )
     assert expected[1] == pytest.approx(GROUND * MASS * 9.81, rel=0.16)
-    np.testing.assert_allclose(computed, expected, rtol=0.15)
+    assert_allclose(computed, expected, rtol=0.15)
     for rough, smooth in (computed, expected):
         assert 1.01 < rough / smooth < 1 / (1 - ROBOT * FRICTION[0]) + 0.01
 
@@ -133,8 +134,8 @@ def test_derivatives_of_a_slide_are_those_of_its_wall(monkeypatch):
     monkeypatch.setenv("RPS_COMPILER", "none")
     assert (np.asarray(slope)[:2] > 0.3).all(), slope
     by_xla, xlas = derivative()
-    np.testing.assert_allclose(compiled, by_xla, atol=1e-5)
-    np.testing.assert_allclose(slope, xlas, atol=0.02)
+    assert_allclose(compiled, by_xla, atol=1e-5)
+    assert_allclose(slope, xlas, atol=0.02)
 
 
 REFUSED = {
