@@ -19,7 +19,11 @@ from rps_jax.control.observation import Details, Twist
 from rps_jax.errors import InputError
 from rps_jax.runs import evaluate as room
 from rps_jax.runs.evaluate import Candidates, evaluate
+from rps_jax.runs.plan import Plan
 from rps_jax.runs.run import Run
+from rps_jax.runs.sweep import describe_plan
+from rps_jax.trials import pushes
+from rps_jax.trials.case import Case
 from rps_jax.trials.env import PushEnv
 from rps_jax.trials.progress import no_progress
 from rps_jax.trials.score import Objective
@@ -120,6 +124,12 @@ def test_a_split_of_a_setting_is_that_of_its_worlds_and_of_its_record():
     env = PushEnv("random_cylinder", setting=tuning, worlds=2)
     drawn = draws.draw(CYLINDERS, seed_of(3, "tune"), np.arange(2))
     assert_allclose(env.table.p_world_target, drawn.p_world_target, rtol=1e-6)
+    case, sweeps = Case(task="path"), replace(tuning, split=None)
+    pushed = [pushes.build([case], setting).worlds for setting in (sweeps, tuning)]
+    assert (pushed[0].key != pushed[1].key).any()
+    assert (pushed[0].p_world_target != pushed[1].p_world_target).any()
+    plans = [Plan(CYLINDERS, 2, {"rps": RPSParams()}, setting) for setting in (sweeps, tuning)]
+    assert [", split tune," in describe_plan(plan) for plan in plans] == [False, True]
     assert tuning.attributes == {"seed": 3, "engine": "quasistatic", "split": "tune"}
     with pytest.raises(InputError, match="choose from tune, validate, test"):
         Setting(split="train")

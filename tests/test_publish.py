@@ -154,16 +154,23 @@ def test_a_stale_file_must_be_listed_and_a_current_one_must_not(
     assert state in output.out
 
 
-def test_a_small_run_gives_its_record_again(tmp_path, monkeypatch):
-    monkeypatch.setattr(probes, "FILE", tmp_path / "probes.json")
+def test_a_small_run_gives_its_record_again_and_unused_records_are_removed(tmp_path, monkeypatch):
+    for name in ("publish", "results"):
+        (tmp_path / name).mkdir()
+    monkeypatch.setattr(probes, "FILE", tmp_path / "publish" / "probes.json")
     probe = "export_js"
     id = probes.store(probe, probes.run(probe))
     probes.run.cache_clear()
     assert probes.differences({probe: id}) == []
     (row,) = probes.stored()[probe][id]["variables"].values()
     assert row[2] > abs(row[1]) > 0  # root mean square, and mean
-    assert probes.used([{probe: id}]) == probes.stored()
-    assert probes.used([{probe: "other"}]) == {}
+    table = files.write_json(tmp_path / "results" / "js.json", {"probes": {probe: id}})
+    probes.store(probe, RECORD)
+    probes.remove_unused()
+    assert [*probes.stored()[probe]] == [id]
+    table.unlink()
+    probes.remove_unused()
+    assert probes.stored() == {}
 
 
 def test_the_note_of_a_table_says_that_its_numbers_are_stale(monkeypatch):

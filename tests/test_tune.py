@@ -15,6 +15,8 @@ from numpy.testing import assert_allclose, assert_array_equal
 from rps_jax.control.laws import rps
 from rps_jax.control.laws.rps import BOUNDS, RPSParams
 from rps_jax.errors import InputError
+from rps_jax.record import files
+from rps_jax.record.checkpoint import Checkpoints
 from rps_jax.runs import evaluate
 from rps_jax.runs.evaluate import CandidateScores
 from rps_jax.runs.question import Run
@@ -286,6 +288,18 @@ def test_generations_that_the_seed_does_not_propose_are_refused(tmp_path, preten
     foreign.rename(tmp_path / "one" / "parts" / foreign.name)
     with pytest.raises(InputError, match="generation 1 is of another search"):
         tuned(tmp_path / "one", evolution(3))
+
+
+@pytest.mark.parametrize(("part", "name"), [("000001", "simulated"), ("test-", "test_success")])
+def test_a_generation_with_an_odd_column_is_refused(part, name, tmp_path, pretended):
+    tuned(tmp_path, evolution(2))
+    stored = Checkpoints(tmp_path)
+    (part,) = (key for key in stored.paths() if key.startswith(part))
+    results = files.decode_results(stored.get(part), part)
+    for odd in (results.assign({name: results[name] + 0j}), results.drop_vars(name)):
+        stored.put(part, bytes(odd.to_netcdf(engine="h5netcdf", invalid_netcdf=True)))
+        with pytest.raises(InputError, match=rf"is corrupt \(.*{name}"):
+            tuned(tmp_path, evolution(2))
 
 
 def test_finished_generations_stay_when_fewer_are_requested(tmp_path, pretended):
