@@ -30,6 +30,8 @@ from pathlib import Path
 from typing import Any, NamedTuple
 from unittest import mock
 
+from helpers import setting_of
+
 PATIENCE = 10.0  # [s] after which a command hangs
 
 
@@ -277,7 +279,7 @@ def small_run(folder: Path, **changes: Any) -> None:
 
     drums = rps_jax.Domain(("random_cylinder",))
     laws = {"rps": rps_jax.RPSParams.paper(), "rps tuned": rps_jax.RPSParams.tuned()}
-    setting = rps_jax.Setting("quasistatic", rules=rps_jax.Rules(horizon=2.0))
+    setting = setting_of(2.0)
     options = {"worlds": 12, "setting": setting, "out": folder, "part": 4, "progress": False}
     rps_jax.sweep(laws, drums, **options | changes)
 

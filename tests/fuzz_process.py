@@ -27,6 +27,7 @@ from pathlib import Path
 from typing import Any
 
 from fuzz import COMMANDS, DRUMS, SHORT, main
+from helpers import setting_of
 
 RPS = (sys.executable, "-m", "rps_jax")
 HOME = Path(__file__).parents[1]
@@ -263,7 +264,7 @@ def run_memory(num_calls: int, seed: int, tell: Callable[[str], None]) -> Counte
     import rps_jax
 
     drums = rps_jax.Domain(("random_cylinder",))
-    setting = rps_jax.Setting("quasistatic", rules=rps_jax.Rules(horizon=2.0))
+    setting = setting_of(2.0)
     used = []  # [MB]
     for call in range(num_calls):
         seeded = dataclasses.replace(setting, seed=call)

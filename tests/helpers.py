@@ -52,6 +52,12 @@ def rps(first: Any, *rest: Any) -> int:
     return cli.main([str(word) for word in (*words, *rest)])
 
 
+def printed(capsys, *arguments: Any) -> str:
+    """Return what a command prints, which succeeds."""
+    assert rps(*arguments) == 0
+    return capsys.readouterr().out
+
+
 def refusal(capsys, *arguments: Any) -> str:
     """Return the single-sentence error with which a command refuses its input."""
     capsys.readouterr()
@@ -67,12 +73,17 @@ def one_sentence(error: str) -> str:
     return error
 
 
+def refusing(pattern: str) -> Any:
+    """Expect an InputError whose sentence has a pattern."""
+    return pytest.raises(InputError, match=pattern)
+
+
 def refusals(call: Callable[..., object], *cases: tuple[Any, str]) -> Callable[..., None]:
     """Return a test of a call's errors by its arguments, which are a tuple or keywords."""
 
     @pytest.mark.parametrize(("arguments", "message"), cases)
     def test(arguments: Any, message: str) -> None:
-        with pytest.raises(InputError, match=message):
+        with refusing(message):
             call(**arguments) if isinstance(arguments, dict) else call(*arguments)
 
     return test
@@ -97,6 +108,7 @@ def jitted(function: Callable[..., Any]) -> Callable[..., Any]:
     return lambda *arguments: jax.device_get(program(*arguments))
 
 
+slow = partial(pytest.param, marks=pytest.mark.slow)  # values of a test that runs in .ci/slow
 SEEDS = strategies.integers(0, 2**32 - 1)
 
 
@@ -117,6 +129,11 @@ def advance(
 ) -> Trial:
     """Step one batch of worlds by up to `steps` control steps."""
     return trial.advance([(stage, worlds, params, trials)], loop, steps)[0]
+
+
+def setting_of(horizon: float, engine: Any = "quasistatic") -> Setting:
+    """Return a setting of trials that end after `horizon` [s]."""
+    return Setting(engine, rules=Rules(horizon=horizon))
 
 
 # The fused engine compiles fastest among the engines with contact dynamics.

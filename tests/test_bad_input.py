@@ -7,12 +7,11 @@ import sys
 import time
 
 import pytest
-from helpers import one_sentence, refusal, rps
+from helpers import one_sentence, refusal, refusing, rps
 
 from rps_jax.control import registry
 from rps_jax.control.laws.rps import RPSParams
 from rps_jax.engines import ENGINES
-from rps_jax.errors import InputError
 from rps_jax.record import files
 from rps_jax.record.folder import claim
 from rps_jax.runs.plan import Plan, open_run
@@ -313,7 +312,7 @@ def test_bad_input_is_one_sentence(case, folder, compiled, capsys, monkeypatch):
 
 def test_a_corrupt_results_file_is_named(tmp_path):
     (tmp_path / "results.nc").write_bytes(b"not a file of results")
-    with pytest.raises(InputError, match=r"results\.nc is corrupt"):
+    with refusing(r"results\.nc is corrupt"):
         files.read_results(tmp_path)
 
 

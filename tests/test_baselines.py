@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import moved, observation, refusals
+from helpers import moved, observation, refusals, setting_of
 from numpy.random import default_rng
 from numpy.testing import assert_allclose, assert_array_equal
 
@@ -13,8 +13,6 @@ from rps_jax.control.laws.aps import APSParams, APSState
 from rps_jax.control.observation import PoseObservation
 from rps_jax.trials import pushes
 from rps_jax.trials.case import Case
-from rps_jax.trials.setting import Setting
-from rps_jax.trials.trial import Rules
 
 APS = APSParams()
 PLAIN = APS._replace(aim_beyond=0.0)  # as published: the object's centre to the target
@@ -149,7 +147,7 @@ def test_it_turns_on_the_spot_until_it_faces_the_object():
 
 def test_it_reaches_targets_ahead_only_if_it_aims_beyond_them():
     cases = [Case("box", "S1", (1.0, 0.0), params) for params in (APS, PLAIN)]
-    outcome, _ = pushes.run(cases, Setting(engine="mujoco", rules=Rules(horizon=60.0)))
+    outcome, _ = pushes.run(cases, setting_of(60.0, "mujoco"))
     assert_array_equal(outcome.success, [True, False])
     # As published, the object's centre stays near the target, half a side (0.2 m) from the contact.
     assert_allclose(outcome.object_pose[1, :2], (1.0, 0.0), atol=0.04)

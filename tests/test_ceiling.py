@@ -6,12 +6,19 @@ from functools import partial
 import numpy as np
 import pytest
 import xarray as xr
-from helpers import CYLINDERS, observation, refusal, refusals
+from helpers import (
+    CYLINDERS,
+    observation,
+    refusal,
+    refusals,
+    refusing,
+    setting_of,
+)
 from helpers import rps as command
 from numpy.testing import assert_allclose, assert_array_equal
 
 import rps_jax
-from rps_jax import InputError, RPSParams, Rules, Setting
+from rps_jax import RPSParams, Rules
 from rps_jax.control.laws import guided, rps
 from rps_jax.control.laws.guided import GuidedParams
 from rps_jax.control.laws.rps import RPSState
@@ -22,7 +29,7 @@ from rps_jax.trials import score
 from rps_jax.trials.setting import seed_of
 from rps_jax.trials.trial import Outcome
 
-SHORT = Setting("quasistatic", rules=Rules(horizon=20.0))
+SHORT = setting_of(20.0)
 SIZES = {"samples": 6, "rounds": 3, "window": 10.0}
 SMALL = Ceiling(CYLINDERS, **SIZES)
 
@@ -153,7 +160,7 @@ def test_the_first_worlds_and_common_failures_are_tried(monkeypatch):
     assert worlds("a", "b", sample=1) == [0, 1, 3]
     assert worlds(sample=0) == worlds("a", sample=0) == [0, 1, 3, 4]
     assert worlds("a", sample=0, most=2) == [0, 1]
-    with pytest.raises(InputError, match="unknown law of the run 'c'"):
+    with refusing("unknown law of the run 'c'"):
         worlds("c", sample=0)
 
 

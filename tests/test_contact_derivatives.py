@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from helpers import slow
 from numpy.random import default_rng
 
 from rps_jax.control.observation import Twist
@@ -98,9 +99,7 @@ def classes(fields, motion, twists, physics):
     return states
 
 
-@pytest.mark.parametrize(
-    "name", ["random_box", pytest.param("random_cylinder", marks=pytest.mark.slow)]
-)
+@pytest.mark.parametrize("name", ["random_box", slow("random_cylinder")])
 def test_a_step_has_the_derivative_of_its_difference(name, monkeypatch):
     """Vary 24 inputs and more at once, in 200 states of contact of each class."""
     monkeypatch.setattr(newton, "_TOLERANCE", 1e-13)
@@ -154,10 +153,7 @@ def products(a, b):
     "domain",
     [
         "real,objects=random_cylinder",
-        *(
-            pytest.param(x, marks=pytest.mark.slow)
-            for x in ("wide,objects=random_box", "real,objects=random_prism")
-        ),
+        *(slow(x) for x in ("wide,objects=random_box", "real,objects=random_prism")),
     ],
 )
 def test_derivatives_are_finite_and_both_modes_agree(domain):

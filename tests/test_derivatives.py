@@ -9,7 +9,7 @@ from unittest import mock
 import jax
 import numpy as np
 import pytest
-from helpers import ROOT, refusals, row
+from helpers import ROOT, refusals, refusing, row
 from numpy.testing import assert_allclose
 
 import rps_jax
@@ -219,7 +219,7 @@ def test_worlds_are_those_of_a_sweep_and_one_object_each():
     batch = rps_jax.draw_worlds("wide,objects=random_cylinder", 3, setting=Setting(seed=5))
     drawn = draws.draw(parse_domain("wide,objects=random_cylinder"), 5, np.arange(3))
     assert_allclose(batch.worlds.p_world_target, drawn.p_world_target, rtol=1e-6)
-    with pytest.raises(rps_jax.InputError, match="worlds of one program have one object"):
+    with refusing("worlds of one program have one object"):
         rps_jax.draw_worlds("wide", 3)
 
 
@@ -285,7 +285,7 @@ test_invalid_rollouts_are_refused = refusals(
 def test_what_has_no_gradient_is_refused(changes, message):
     options = {"score": final_distance, "laws": "rps_tuned", "domain": TOUCHING, "worlds": 2}
     options |= {"wrt": "K_h", "horizon": 0.1, "setting": QUASISTATIC}
-    with pytest.raises(rps_jax.InputError, match=message):
+    with refusing(message):
         rps_jax.value_and_grad(**options | changes)
 
 
@@ -302,7 +302,7 @@ def test_what_has_no_gradient_is_refused(changes, message):
 )
 def test_a_score_must_return_a_number(score, message):
     snapshots = SimpleNamespace(done=np.zeros(5, bool))
-    with pytest.raises(rps_jax.InputError, match=message):
+    with refusing(message):
         derivatives._score(score, QUASISTATIC, snapshots, RPSParams())
 
 
@@ -317,16 +317,16 @@ def test_a_score_must_return_a_number(score, message):
 )
 def test_functions_that_return_numbers_of_the_host_cannot_be_transformed(transform, compiled):
     words = "call it outside of jit, vmap and grad, or transform a function that calls rps_jax.roll"
-    with pytest.raises(rps_jax.InputError, match=f"value_and_grad returns .*{words}"):
+    with refusing(f"value_and_grad returns .*{words}"):
         transform(lambda law: rps_jax.value_and_grad(final_distance, law).value.values)
-    with pytest.raises(rps_jax.InputError, match=f"evaluate returns .*{words}"):
+    with refusing(f"evaluate returns .*{words}"):
         transform(lambda law: rps_jax.evaluate(law).score.values)
     assert not compiled
 
 
 def test_an_engine_without_a_mode_is_refused_before_anything_compiles(monkeypatch, compiled):
     monkeypatch.setattr("rps_jax.engines.fused.Fused.modes", ("forward",))
-    with pytest.raises(rps_jax.InputError, match=r"engine = fused .* it has no reverse-mode"):
+    with refusing(r"engine = fused .* it has no reverse-mode"):
         rps_jax.value_and_grad(setting=Setting("fused"))
     assert not compiled
 

@@ -7,11 +7,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import read_curve, refusal, rps
+from helpers import read_curve, refusal, refusing, rps
 from numpy.testing import assert_allclose, assert_array_equal
 
 from rps_jax.control.laws.rps import RPSParams
-from rps_jax.errors import InputError
 from rps_jax.runs.evaluate import CandidateScores
 from rps_jax.trials.score import Objective
 from rps_jax.trials.setting import Setting
@@ -71,16 +70,16 @@ def test_the_first_start_is_the_base():
 
 
 def test_windows_need_a_law_with_a_smooth_form():
-    with pytest.raises(InputError, match="no smooth form"):
+    with refusing("no smooth form"):
         WindowTuning("pursuit", tuned=("K_v",)).validate()
     TuneGrad("pursuit", tuned=("K_v",)).validate()
 
 
 def test_windows_need_an_estimator_and_an_engine_with_derivatives():
-    with pytest.raises(InputError, match="unknown estimator 'reverse': choose from exact, clipped"):
+    with refusing("unknown estimator 'reverse': choose from exact, clipped"):
         WindowTuning("rps", estimator="reverse").validate()
     mujoco = Setting("mujoco")
-    with pytest.raises(InputError, match="engine = mujoco is not allowed: it has no reverse-mode"):
+    with refusing("engine = mujoco is not allowed: it has no reverse-mode"):
         WindowTuning("rps", setting=mujoco).validate()
     TuneGrad("rps", setting=mujoco).validate()
 

@@ -10,12 +10,11 @@ import jax
 import mujoco
 import numpy as np
 import pytest
-from helpers import refusals, row, same
+from helpers import refusals, refusing, row, same
 from numpy.testing import assert_allclose
 from staging import recompiled
 
 from rps_jax import engines
-from rps_jax.errors import InputError
 from rps_jax.geometry import solid
 from rps_jax.geometry.footprint import polygon
 from rps_jax.trials import pushes
@@ -207,7 +206,7 @@ def test_the_largest_load_fits_and_a_larger_one_is_refused():
     refused = (
         r"domain load_size \(high\) = 0.31 .* with com_offset up to 0.7 its high is at most 0.3"
     )
-    with pytest.raises(InputError, match=refused):
+    with refusing(refused):
         replace(WIDE, com_offset=Range(0, 0.7), load_size=Range(0.1, 0.31))
 
 

@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from helpers import refusing, setting_of
 from numpy.testing import assert_allclose, assert_array_equal
 
 from rps_jax.app.cli.names import known, question_type
@@ -16,7 +17,6 @@ from rps_jax.control import registry
 from rps_jax.control.base import Law
 from rps_jax.control.laws.rps import RPSParams
 from rps_jax.control.observation import Details, Twist
-from rps_jax.errors import InputError
 from rps_jax.runs import evaluate as room
 from rps_jax.runs.evaluate import Candidates, evaluate
 from rps_jax.runs.plan import Plan
@@ -28,7 +28,6 @@ from rps_jax.trials.env import PushEnv
 from rps_jax.trials.progress import no_progress
 from rps_jax.trials.score import Objective
 from rps_jax.trials.setting import Setting, seed_of
-from rps_jax.trials.trial import Rules
 from rps_jax.tuning.fit import Bank, Fit
 from rps_jax.tuning.learn import Learn
 from rps_jax.tuning.space import Space
@@ -36,7 +35,7 @@ from rps_jax.world import draws
 from rps_jax.world.domain import DOMAINS, Range
 
 CYLINDERS = replace(DOMAINS["wide"], objects=("random_cylinder",))
-BRIEF = Setting("quasistatic", rules=Rules(horizon=8.0))
+BRIEF = setting_of(8.0)
 SHORT: Any = {"setting": BRIEF, "slots": 8}
 
 
@@ -131,7 +130,7 @@ def test_a_split_of_a_setting_is_that_of_its_worlds_and_of_its_record():
     plans = [Plan(CYLINDERS, 2, {"rps": RPSParams()}, setting) for setting in (sweeps, tuning)]
     assert [", split tune," in describe_plan(plan) for plan in plans] == [False, True]
     assert tuning.attributes == {"seed": 3, "engine": "quasistatic", "split": "tune"}
-    with pytest.raises(InputError, match="choose from tune, validate, test"):
+    with refusing("choose from tune, validate, test"):
         Setting(split="train")
 
 
@@ -177,7 +176,7 @@ def test_candidates_are_given_as_a_list_or_as_one_law():
     assert_allclose(several.K_h, [*alone.K_h, 0.3])
     params = paper(3)
     assert room.candidates(params) is params
-    with pytest.raises(InputError, match="2 classes"):
+    with refusing("2 classes"):
         room.candidates(["rps", "pursuit"])
 
 
@@ -199,7 +198,7 @@ def test_candidates_are_given_as_a_list_or_as_one_law():
 )
 def test_bad_input_is_refused_before_anything_compiles(bad, why, compiled):
     count = len(compiled)
-    with pytest.raises(InputError, match=why) as caught:
+    with refusing(why) as caught:
         evaluate(**{"law": paper(3), "worlds": 4} | SHORT | bad)
     assert "\n" not in str(caught.value)
     assert len(compiled) == count
@@ -256,7 +255,7 @@ def test_scores_are_those_of_the_first_version():
     away = np.array([[0, 0, 0], [0.5, -0.5, 0.3], [-0.7, 0.4, -0.2]], np.float32)
     params = space.params(away + np.asarray(space.vector(space.base)))
     near = replace(CYLINDERS, distance=Range(0.7, 0.9), gap=Range(0, 0))
-    setting = Setting(rules=Rules(horizon=20.0), engine="fused")
+    setting = setting_of(20.0, "fused")
     ask = Candidates(params, [near], 1, np.arange(6))
     (answer,), _ = room.score_candidates([ask], setting, Objective())
     expected = [

@@ -8,7 +8,14 @@ import subprocess
 import jax
 import numpy as np
 import pytest
-from helpers import ROOT, output_of, refusal, rps
+from helpers import (
+    ROOT,
+    output_of,
+    refusal,
+    rps,
+    setting_of,
+    slow,
+)
 from numpy.random import default_rng
 from numpy.testing import assert_allclose, assert_array_equal
 
@@ -16,8 +23,6 @@ from rps_jax.app.export import c, folder, js, onnx_model, program
 from rps_jax.robot import robot as robots
 from rps_jax.robot.skin import SKINS
 from rps_jax.trials.case import Case
-from rps_jax.trials.setting import Setting
-from rps_jax.trials.trial import Rules
 from sweeps.export.loop import recorded
 from sweeps.export.native import (
     COMPILERS,
@@ -222,7 +227,7 @@ def test_the_skin_in_c_agrees_with_jax(tmp_path):
 
 @pytest.mark.parametrize(
     ("name", "tolerance"),
-    [("rps_plus", 2e-5), pytest.param("learned", 4e-4, marks=pytest.mark.slow)],
+    [("rps_plus", 2e-5), slow("learned", 4e-4)],
 )
 def test_a_whole_trial_step_by_step(name, tolerance, tmp_path):
     """The C law keeps its memory; observations are those of the trial in JAX.
@@ -230,7 +235,7 @@ def test_a_whole_trial_step_by_step(name, tolerance, tmp_path):
     The memory of a network amplifies the rounding of floats.
     """
     case = Case("box", "S1", (-1.0, 0.5), law=name)
-    setting = Setting("quasistatic", rules=Rules(horizon=20.0))
+    setting = setting_of(20.0)
     trials = recorded([case], setting)
     assert len(trials[0][0]) > 900
     (errors,) = trial_errors(name, "double", trials, tmp_path).free

@@ -14,7 +14,7 @@ import sys
 import fuzz
 import numpy as np
 import pytest
-from helpers import ROOT, one_sentence, output_of
+from helpers import ROOT, one_sentence, output_of, refusing, slow
 
 import rps_jax
 from rps_jax.app.cli import environment
@@ -97,12 +97,12 @@ def test_values_of_a_wrong_type_are_refused_in_one_sentence(name, value):
     ],
 )
 def test_a_wrong_type_is_named_with_the_right_one(arguments, message):
-    with pytest.raises(InputError, match=message):
+    with refusing(message):
         rps_jax.push(**arguments)
 
 
 def test_one_name_for_several_is_refused_with_an_example():
-    with pytest.raises(InputError, match=r"objects = 'box' .*: give several texts, as \['box'\]"):
+    with refusing(r"objects = 'box' .*: give several texts, as \['box'\]"):
         rps_jax.table(objects="box")
 
 
@@ -213,7 +213,7 @@ SHORT = "push --object cylinder --target 1 0 --engine quasistatic --horizon 1 --
 
 @pytest.mark.parametrize(
     ("line", "code", "output"),
-    [*SHELL, *(pytest.param(*case, marks=pytest.mark.slow) for case in MORE)],
+    [*SHELL, *(slow(*case) for case in MORE)],
 )
 def test_a_command_survives_its_environment(folder, line, code, output):
     line = re.sub(r"\bfilm\b(?=[^:]*$)", f"rps {SHORT} --film-length 0.2", line)

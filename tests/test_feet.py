@@ -4,12 +4,11 @@ import re
 
 import numpy as np
 import pytest
-from helpers import same
+from helpers import refusing, same, slow
 from numpy.testing import assert_allclose, assert_array_equal
 from staging import FINE, simulate, staged, step_in_c
 
 from rps_jax import engines
-from rps_jax.errors import InputError
 from rps_jax.geometry import footprint, solid
 from rps_jax.geometry.footprint import Footprint
 from rps_jax.geometry.solid import SIDES
@@ -67,7 +66,7 @@ def driven(engine, names, steps):
 Y = 4  # of the object, along the base's front, on which it comes to lie
 
 
-@pytest.mark.parametrize("engine", ["fused", pytest.param("mjx", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("engine", ["fused", slow("mjx")])
 def test_feet_change_the_final_pose_and_engines_agree_with_c_mujoco(engine):
     feet, corners = (pushed_in_c(name) for name in ("on_feet", "on_corners"))
     assert feet[Y] - corners[Y] > 0.01
@@ -125,7 +124,7 @@ def test_the_rigid_solver_supports_feet():
     ],
 )
 def test_feet_without_sense_are_refused(registered_boxes, feet, message):
-    with pytest.raises(InputError, match=message):
+    with refusing(message):
         objects.register_object("wrong", registered_boxes, feet=feet)
     assert "wrong" not in objects.REGISTERED
 
@@ -135,7 +134,7 @@ def test_engines_that_ignore_weights_of_feet_refuse_them(registered_boxes, engin
     weighted = np.column_stack([FEET, [1.0, 1.0, 2.0]])
     objects.register_object("weighted", registered_boxes, feet=weighted)
     objects.register_object("even", registered_boxes, feet=weighted * [1, 1, 0] + [0, 0, 2])
-    with pytest.raises(InputError, match=r"it ignores the weights of feet.*quasistatic"):
+    with refusing(r"it ignores the weights of feet.*quasistatic"):
         pushes.build([Case("weighted")], Setting(engine))
     pushes.build([Case("weighted")], Setting("quasistatic"))
     pushes.build([Case("even")], Setting(engine))
@@ -186,7 +185,7 @@ def test_drawn_feet_change_nothing_else_and_bear_the_object(name):
     [
         ("fused", "random_box"),
         ("fused", "random_cylinder"),
-        pytest.param("mjx", "random_cylinder", marks=pytest.mark.slow),
+        slow("mjx", "random_cylinder"),
     ],
 )
 def test_objects_on_drawn_feet_end_where_those_of_c_mujoco_do(engine, name):
@@ -212,7 +211,7 @@ def test_quasistatic_slides_on_drawn_feet():
 
 
 def test_feet_are_drawn_only_for_random_objects():
-    with pytest.raises(InputError, match="only random objects have drawn feet"):
+    with refusing("only random objects have drawn feet"):
         domains.parse_domain("wide,objects=box,feet=0.5:0.9")
     ranges, plain = (domains.parse_domain(f"wide{feet}") for feet in (",feet=0.5:0.9", ""))
     names = {"feet", "feet_number", "feet_turn"}

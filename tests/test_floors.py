@@ -6,13 +6,12 @@ import math
 
 import numpy as np
 import pytest
-from helpers import same
+from helpers import refusing, same, slow
 from numpy.testing import assert_allclose, assert_array_equal
 from staging import FINE, simulate, staged
 
 import rps_jax
 from rps_jax import engines
-from rps_jax.errors import InputError
 from rps_jax.geometry import footprint, solid
 from rps_jax.geometry.footprint import Footprint
 from rps_jax.geometry.solid import SIDES
@@ -44,7 +43,7 @@ WORLDS = {
     "carpet left": (0.0, 0, 0.1, (0.0, 1.0, 0.0, 3.0), 0.0, 0.5),
     "carpet right": (0.0, 0, 0.1, (0.0, -1.0, 0.0, 3.0), 0.0, 0.5),
 }
-ENGINES = ("mujoco", "fused", pytest.param("mjx", marks=pytest.mark.slow))
+ENGINES = ("mujoco", "fused", slow("mjx"))
 
 
 def surroundings_of(rows):
@@ -244,7 +243,7 @@ def test_ranges_of_floors_that_are_left_out_have_defaults():
     ],
 )
 def test_floors_without_sense_are_refused(changes, message):
-    with pytest.raises(InputError, match=message):
+    with refusing(message):
         domains.parse_domain(f"wide,{changes}")
 
 
@@ -254,7 +253,7 @@ def test_floors_without_sense_are_refused(changes, message):
 def test_quasistatic_refuses_floors_before_it_compiles(changes, name):
     setting = rps_jax.Setting("quasistatic")
     message = f"engine = quasistatic is not allowed: it has no {name}; choose mjx"
-    with pytest.raises(InputError, match=message):
+    with refusing(message):
         rps_jax.sweep("rps", f"wide,{changes}", worlds=4, setting=setting)
 
 
@@ -273,5 +272,5 @@ def test_floors_have_derivatives_except_by_the_position_of_the_boundary():
     assert_allclose(gravity["world.fields.gravity"][:, 2], G * np.sin(steep), rtol=1e-6)
     assert_allclose(factor["world.fields.boundary"], [[0, 0, 0, 1]] * 3, atol=1e-8)
     assert bends.max() < 1e-3
-    with pytest.raises(InputError, match="boundary is not allowed: it has no derivative"):
+    with refusing("boundary is not allowed: it has no derivative"):
         derivatives.coordinates_of(("boundary",), rps_jax.RPSParams.tuned(), domain)

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import refusals
+from helpers import refusals, setting_of, slow
 from numpy.testing import assert_allclose, assert_array_equal
 from staging import push_object, staged
 
@@ -18,7 +18,6 @@ from rps_jax.robot.robot import Robot
 from rps_jax.trials import pushes, trial
 from rps_jax.trials.pushes import Case
 from rps_jax.trials.setting import Setting
-from rps_jax.trials.trial import Rules
 from rps_jax.world import scene
 from rps_jax.world.physics import Physics
 from rps_jax.world.scene import FRICTION, JOINTS, Friction
@@ -29,7 +28,7 @@ WEIGHT = 20 * GRAVITY  # [N] of the box
 S1, SLIPPERY = FRICTION["S1"], Friction(1e-4, 0.35)
 
 
-@pytest.mark.parametrize("engine", ["fused", pytest.param("mjx", marks=pytest.mark.slow), "mujoco"])
+@pytest.mark.parametrize("engine", ["fused", slow("mjx"), "mujoco"])
 def test_a_box_pushed_straight_ahead_pushes_back_with_the_friction_of_its_weight(engine):
     """They agree within some per cent: MuJoCo's soft friction lifts a sliding object."""
     steady = push_object(engine).force[50:].mean(axis=0)
@@ -126,7 +125,7 @@ def test_a_law_observes_the_force_of_its_push(engine):
     """Straight ahead, the law reads the force that slides a box of 10 kg."""
     gains = PublishedForcePushParams(k_theta=-1.0, k_y=0.0)
     case = Case("box", FRICTION["S1"], (1.6, 0.0), gains, gap=0.0, mass=10.0)
-    setting = Setting(engine=engine, rules=Rules(horizon=4.0))
+    setting = setting_of(4.0, engine)
     if engine == "mujoco":
         outcome, _ = pushes.run([case], setting, workers=1)
         assert outcome.base_pose[0][0] == pytest.approx(0.2, rel=0.1)  # 0.05 m/s: it was felt

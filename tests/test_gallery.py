@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 import xarray as xr
-from helpers import refusal, results_of, rps
+from helpers import printed, refusal, results_of, setting_of
 from numpy.random import default_rng
 
 import rps_jax
@@ -199,13 +199,12 @@ def step_backwards(params, state, obs):
 @pytest.mark.usefixtures("registries")
 def test_the_command_plots_each_mode_and_prints_a_replay_command(tmp_path, capsys):
     run = tmp_path / "run"
-    brief = rps_jax.Setting("quasistatic", rules=rps_jax.Rules(horizon=30.0))
+    brief = setting_of(30.0)
     rps_jax.register_law("backwards", Law(lambda params: (), step_backwards), Backwards())
     drums = parse_domain("wide,objects=random_cylinder,bearing=-0.5:0.5,gap=0.05:0.06")
     laws = {"mine law": "backwards"}
     rps_jax.sweep(laws, drums, 3, setting=brief, slots=8, out=run)
-    assert rps("gallery", run, "--each", 2) == 0
-    text = capsys.readouterr().out
+    text = printed(capsys, "gallery", run, "--each", 2)
     assert "never touched: 3 of 3" in text
     assert f"rps replay {run} 0 --law 'mine law'`" in text
     for world in (0, 1):
@@ -226,8 +225,7 @@ def test_worlds_in_which_only_one_law_fails_are_listed(tmp_path, capsys):
     assert 0 < expected.size < (~nps).sum()
     results = rps_jax.gallery(run, law="nps", against="rps")
     assert np.flatnonzero(results.kind != "").tolist() == expected.tolist()
-    assert rps("gallery --law nps --against rps --each 1", run) == 0
-    text = capsys.readouterr().out
+    text = printed(capsys, "gallery --law nps --against rps --each 1", run)
     assert text.startswith("# Failures of nps where rps succeeds")
     table = text.partition("## Worlds in which only nps fails")[2].partition("##")[0]
     worlds = re.findall(rf"^\| (\d+) .*`rps replay {run} \1 --law nps` +\|$", table, re.MULTILINE)

@@ -9,12 +9,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import output_of
+from helpers import output_of, refusing, slow
 from numpy.testing import assert_allclose
 from test_native import OPERATIONS, advanced, build_push, close, same
 
 from rps_jax.engines.base import ControlPeriod
-from rps_jax.errors import InputError
 from rps_jax.geometry import vectors
 from rps_jax.lowering import nvrtc
 from rps_jax.lowering.gpu_writer import GPU_HEADER, GpuWriter
@@ -112,7 +111,7 @@ def test_tables_hold_numbers_that_are_not_finite(monkeypatch):
 PAIRS = [
     ("box", "capacitive"),
     ("cylinder", "ideal"),
-    pytest.param("prism", "ideal", marks=pytest.mark.slow),
+    slow("prism", "ideal"),
 ]
 
 
@@ -157,5 +156,5 @@ def test_shared_memory_is_bounded(tmp_path):
     def world_step(x):
         return jax.lax.dynamic_slice(x * jnp.arange(3000.0), (x.astype(int),), (2,))
 
-    with pytest.raises(InputError, match="exceed the shared memory"):
+    with refusing("exceed the shared memory"):
         Emulated(world_step, (jnp.float32(1.0),), tmp_path, 4)

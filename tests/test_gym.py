@@ -10,10 +10,16 @@ import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode
-from helpers import NEAR, refusals, row, same
+from helpers import (
+    NEAR,
+    refusals,
+    refusing,
+    row,
+    same,
+    setting_of,
+)
 from numpy.testing import assert_allclose, assert_array_equal
 
-from rps_jax.errors import InputError
 from rps_jax.runs.evaluate import evaluate
 from rps_jax.trials import gym
 from rps_jax.trials.setting import Setting
@@ -174,7 +180,7 @@ test_invalid_options_of_several_environments_are_refused = refusals(
 )
 def test_invalid_actions_are_refused(single, action, message):
     single.reset(seed=0)
-    with pytest.raises(InputError, match=message):
+    with refusing(message):
         single.unwrapped.step(action)
 
 
@@ -189,13 +195,13 @@ def test_greater_actions_are_reduced_to_the_bounds(single):
 def test_a_step_needs_a_running_episode(single):
     alone = gymnasium.make_vec("rps_jax/Push-v0", num_envs=1, render_mode="rgb_array", **HOW)
     for call in (lambda: alone.step(AHEAD[:1]), alone.unwrapped.render):
-        with pytest.raises(InputError, match="no episode has started: call reset before step"):
+        with refusing("no episode has started: call reset before step"):
             call()
     single.reset(seed=0)
     single.unwrapped._vector._ended[:] = True
-    with pytest.raises(InputError, match=r"worlds \[0\] have ended: call reset before step"):
+    with refusing(r"worlds \[0\] have ended: call reset before step"):
         single.step(AHEAD[0])
-    with pytest.raises(InputError, match=r"options = \{'world': 3\} is not allowed"):
+    with refusing(r"options = \{'world': 3\} is not allowed"):
         single.reset(options={"world": 3})
     single.reset()
     single.step(AHEAD[0])
@@ -237,7 +243,7 @@ def test_a_mask_restarts_ended_worlds_without_autoreset(vector):
     for name in ("_start", "_act", "_select"):  # whose programs are compiled
         setattr(envs.unwrapped, name, getattr(vector.unwrapped, name))
     _, _, ended, *_ = step_until_success(envs)
-    with pytest.raises(InputError, match=rf"worlds \[{np.flatnonzero(ended)[0]}.* have ended"):
+    with refusing(rf"worlds \[{np.flatnonzero(ended)[0]}.* have ended"):
         envs.step(AHEAD)
     _, infos = envs.reset(options={"reset_mask": ended})
     assert (infos["time"][ended] == 0).all()
@@ -250,14 +256,14 @@ def test_a_forked_worker_says_why_it_cannot_run(single):
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # JAX and Python warn of the fork
         envs = gymnasium.vector.AsyncVectorEnv([lambda: single.unwrapped] * 2, context="fork")
-        with pytest.raises(InputError, match=r"is a fork .* 'spawn', as multiprocessing.get_con"):
+        with refusing(r"is a fork .* 'spawn', as multiprocessing.get_con"):
             envs.reset(seed=0)
         envs.close(terminate=True)
 
 
 @pytest.mark.slow
 def test_spawned_workers_run():
-    how = HOW | {"setting": Setting("quasistatic", rules=Rules(horizon=20.0)), "domain": "wide"}
+    how = HOW | {"setting": setting_of(20.0), "domain": "wide"}
     options = {"vectorization_mode": "async", "vector_kwargs": {"context": "spawn"}}
     envs = gymnasium.make_vec("rps_jax/Push-v0", num_envs=2, **options, **how)
     obs, _ = envs.reset(seed=7)
@@ -285,7 +291,7 @@ STRICT = {
 def test_checks_that_a_user_asks_of_jax_do_not_stop_it(vector, option, value):
     vector.reset(seed=5)
     expected = vector.step(AHEAD)
-    case = {"worlds": 2, "setting": Setting("quasistatic", rules=Rules(horizon=0.1))}
+    case = {"worlds": 2, "setting": setting_of(0.1)}
     default = getattr(jax.config, option)
     jax.config.update(option, value)
     try:
@@ -328,12 +334,12 @@ def test_a_film_is_recorded(kind, tmp_path):
 )
 def test_invalid_resets_are_refused(vector, reset, message):
     vector.reset(seed=0)
-    with pytest.raises(InputError, match=message):
+    with refusing(message):
         vector.reset(**reset)
 
 
 def test_without_gymnasium_the_error_names_the_package(monkeypatch):
     monkeypatch.setitem(sys.modules, "gymnasium", None)
     monkeypatch.delitem(sys.modules, "rps_jax.trials.gym")
-    with pytest.raises(InputError, match=r"run pip install 'rps_jax\[gym\]'"):
+    with refusing(r"run pip install 'rps_jax\[gym\]'"):
         importlib.import_module("rps_jax.trials.gym")

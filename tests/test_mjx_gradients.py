@@ -9,10 +9,11 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
+from helpers import refusing
 from numpy.random import default_rng
 from numpy.testing import assert_allclose, assert_array_equal
 
-from rps_jax import engines, errors
+from rps_jax import engines
 from rps_jax.control.observation import Twist
 from rps_jax.engines import mjx_gradients
 from rps_jax.engines.base import ControlPeriod, Motion
@@ -409,7 +410,7 @@ def test_derivatives_of_a_leg_are_central_differences(condim, options):
 
 def test_models_without_derivatives_are_refused(box):
     rk4 = box.model.tree_replace({"opt.integrator": types.IntegratorType.RK4})
-    with pytest.raises(errors.InputError, match=r"integrator = RK4 .* Euler or implicitfast"):
+    with refusing(r"integrator = RK4 .* Euler or implicitfast"):
         mjx_gradients.step(rk4, box.data)
-    with pytest.raises(errors.InputError, match=r"model = mjmodel .*put_model\(model, impl='jax'"):
+    with refusing(r"model = mjmodel .*put_model\(model, impl='jax'"):
         mjx_gradients.solve(box.plain, box.data)

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import same
+from helpers import same, setting_of, slow
 from numpy.testing import assert_allclose, assert_array_equal
 
 from rps_jax import Details, Law, Twist, replay, sweep
@@ -17,7 +17,7 @@ from rps_jax.engines.base import ControlPeriod
 from rps_jax.lowering import compounds, nodes, walk
 from rps_jax.trials import law_check, trial
 from rps_jax.trials.setting import Setting
-from rps_jax.trials.trial import ControlLoop, Rules
+from rps_jax.trials.trial import ControlLoop
 from rps_jax.trials.worlds import drawn_worlds
 from rps_jax.world import draws
 from rps_jax.world.domain import DOMAINS, Range
@@ -83,7 +83,7 @@ def close(actual, desired, warm, rest):
 
 
 PAIRS = [
-    pytest.param("box", "capacitive", marks=pytest.mark.slow),
+    slow("box", "capacitive"),
     ("cylinder", "ideal"),
     ("prism", "capacitive"),
 ]
@@ -99,7 +99,7 @@ def test_a_control_step_agrees_with_xla(shape, skin, monkeypatch):
 
 
 @pytest.mark.parity
-@pytest.mark.parametrize("shape", ["prism", pytest.param("cylinder", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("shape", ["prism", slow("cylinder")])
 def test_the_bits_of_a_world_depend_on_no_other_world(shape):
     stage, inputs, loop = batch(shape)
     together = advanced(stage, inputs, start_trials(inputs, loop), loop, 300)
@@ -361,9 +361,7 @@ def test_xla_compiles_other_functions_and_the_reason_is_named_once(name, monkeyp
         assert reason in str(warning.message)
 
 
-@pytest.mark.parametrize(
-    "engine", ["fused", "quasistatic", pytest.param("mjx", marks=pytest.mark.slow)]
-)
+@pytest.mark.parametrize("engine", ["fused", "quasistatic", slow("mjx")])
 def test_only_the_fused_engine_calls_compiled_functions(engine, monkeypatch):
     monkeypatch.setattr(native, "load", lambda name: True)
     stage, inputs, loop = batch("box", "ideal", 2, "rps", engine)
@@ -412,7 +410,7 @@ def test_a_custom_law_is_compared_with_xla_before_a_run_once(mine, cache, monkey
 
 @pytest.mark.parity
 def test_a_sweep_of_a_custom_law_is_a_push_in_xla(mine, tmp_path, monkeypatch):
-    setting = Setting("fused", rules=Rules(horizon=8.0))
+    setting = setting_of(8.0, "fused")
     swept = sweep("mine", "wide,objects=box,gap=0.01", worlds=2, setting=setting, out=tmp_path)
     monkeypatch.setenv("RPS_COMPILER", "none")
     pushed = replay(tmp_path, 1)

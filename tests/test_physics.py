@@ -14,6 +14,7 @@ import jax
 import mujoco
 import numpy as np
 import pytest
+from helpers import slow
 from numpy.random import default_rng
 from scipy.optimize import minimize_scalar
 from staging import simulate, staged
@@ -143,7 +144,7 @@ def all_films(request):
 
 
 # MJX compiles for long; in other tests, and in few steps, it agrees with C MuJoCo.
-MJX = pytest.param("mjx", marks=pytest.mark.slow)
+MJX = slow("mjx")
 IN_ALL = pytest.mark.parametrize("all_films", [MJX, "fused", "mujoco"], indirect=True)
 
 

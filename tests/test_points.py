@@ -8,11 +8,19 @@ import jax
 import numpy as np
 import pytest
 import xarray as xr
-from helpers import CYLINDERS, PAPER, SHORT, SLOTS, refusal, rps, same
+from helpers import (
+    CYLINDERS,
+    PAPER,
+    SHORT,
+    SLOTS,
+    refusal,
+    refusing,
+    rps,
+    same,
+)
 from numpy.testing import assert_allclose, assert_array_equal
 
 import rps_jax
-from rps_jax.errors import InputError
 from rps_jax.record import files
 from rps_jax.runs.plan import load_plan
 from rps_jax.world import draws, points
@@ -89,11 +97,11 @@ def test_sweeps_and_evaluations_take_points_as_they_take_drawn_worlds(tmp_path):
     assert_allclose(tried.mass, drawn.mass.values[::-1], rtol=1e-6)
     assert_allclose(tried.time[0], drawn.time[0, ::-1], atol=0.5)
     # A folder of other points, and a folder with damaged points.
-    with pytest.raises(InputError, match="holds another run"):
+    with refusing("holds another run"):
         rps_jax.sweep("rps", CYLINDERS, points=u[::-1], out=folder, **SWEPT)
     shutil.copy(folder / "points.nc", tmp_path / "good.nc")
     (folder / "points.nc").write_bytes(b"noise")
-    with pytest.raises(InputError, match=r"points\.nc is corrupt"):
+    with refusing(r"points\.nc is corrupt"):
         rps_jax.replay(folder, 4)
     again = rps_jax.sweep("rps", CYLINDERS, points=u, out=folder, **SWEPT)
     xr.testing.assert_identical(again, swept)
@@ -132,7 +140,7 @@ def test_points_that_are_none_are_refused(tmp_path, capsys):
         (xr.Dataset(), "has no u"),
         ([["a"]], "give an array"),
     ):
-        with pytest.raises(InputError, match=words):
+        with refusing(words):
             rps_jax.sweep("rps", "wide", points=wrong)
     files.write_results(tmp_path / "some.nc", points.worlds_at("wide", u))
     for options, words in (

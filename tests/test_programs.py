@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from helpers import setting_of
 from numpy.testing import assert_array_equal
 
 from rps_jax.control import registry
@@ -20,7 +21,6 @@ from rps_jax.runs.sweep import Sweep
 from rps_jax.trials import pushes, trial
 from rps_jax.trials.case import Case
 from rps_jax.trials.setting import Setting
-from rps_jax.trials.trial import Rules
 
 
 @pytest.fixture
@@ -67,7 +67,7 @@ def test_a_recorded_trial_is_traced_once_for_all_processes(cache, monkeypatch):
     """A cached trial returns the same named tuples as a traced one."""
     traced, advance = [], trial.advance
     monkeypatch.setattr(trial, "advance", lambda *a: traced.append(1) or advance(*a))
-    setting = Setting("quasistatic", rules=Rules(horizon=0.2))
+    setting = setting_of(0.2)
     worlds = pushes.build([Case("box")], setting)
     first, again = (pushes.record_batch(worlds, setting)[0] for _ in range(2))
     assert len(traced) == 1

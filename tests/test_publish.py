@@ -10,7 +10,7 @@ from fnmatch import fnmatch
 import numpy as np
 import pytest
 import xarray as xr
-from helpers import ROOT, rps
+from helpers import ROOT, rps, setting_of
 from numpy.random import default_rng
 from numpy.testing import assert_allclose, assert_array_equal
 
@@ -208,7 +208,7 @@ def test_laws_with_default_and_tuned_parameters_are_compared():
 def test_a_comparison_names_laws_by_the_runs_that_tuned_them():
     objects = ("random_cylinder", "random_box")
     domain = replace(DOMAINS["wide"], objects=objects, distance=Range(0.7, 0.8))
-    setting = Setting("quasistatic", rules=Rules(horizon=20.0))
+    setting = setting_of(20.0)
     laws = {"rps": "rps", "rps,a/runs/gradient/tuned.json": "rps_tuned"}
     results = xr.DataTree.from_dict({"near": sweep(laws, domain, 12, setting=setting, slots=32)})
     head, first, second = rows.comparison(results)

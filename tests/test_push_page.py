@@ -10,7 +10,7 @@ import chromium
 import jax
 import numpy as np
 import pytest
-from helpers import ROOT
+from helpers import ROOT, slow
 from numpy.random import default_rng
 from numpy.testing import assert_allclose
 from selenium.webdriver.common.action_chains import ActionChains
@@ -71,7 +71,7 @@ def twists(live):
     return np.array([np.stack(step.snapshot.twist) for step in live.past])
 
 
-@pytest.mark.parametrize("law", ["rps_plus", pytest.param("rps_tuned", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("law", ["rps_plus", slow("rps_tuned")])
 def test_a_whole_push_has_the_twists_of_python(law, browser):
     with python_push(law) as live:
         expected = twists(live)
@@ -95,9 +95,9 @@ return [push.trial.steps, push.touched(), push.outcomes, [twist.v_x, twist.v_y, 
 @pytest.mark.parametrize(
     ("kind", "width", "door", "touched"),
     [
-        pytest.param("corridor", 1.0, 0.9, "base", marks=pytest.mark.slow),
-        pytest.param("corridor", 1.8, 0.9, "", marks=pytest.mark.slow),
-        pytest.param("path", 2, 1, "", marks=pytest.mark.slow),
+        slow("corridor", 1.0, 0.9, "base"),
+        slow("corridor", 1.8, 0.9, ""),
+        slow("path", 2, 1, ""),
     ],
 )
 def test_a_task_has_the_outcomes_of_python(kind, width, door, touched, browser):
@@ -182,7 +182,7 @@ def test_a_corridor_that_is_too_narrow_is_refused(paused):
     assert paused.execute_script(script, 1.6) == ["", True]
 
 
-@pytest.mark.parametrize("law", ["rps", pytest.param("learned", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("law", ["rps", slow("learned")])
 def test_each_state_of_a_push_gives_the_twist_of_python(law, browser):
     """At the bound of tan(gamma), the paper's law amplifies a difference fourfold per step.
 

@@ -6,11 +6,10 @@ import numpy as np
 import pandas as pd
 import pytest
 import xarray as xr
-from helpers import ROOT
+from helpers import ROOT, refusing
 from numpy.random import default_rng
 from numpy.testing import assert_allclose
 
-from rps_jax.errors import InputError
 from rps_jax.geometry.solid import rotate
 from sweeps.real_pushes import contact, fingers, pushes, study
 from sweeps.real_pushes.pushes import COM, OUTLINE
@@ -97,7 +96,7 @@ def test_an_invalid_table_is_refused(sample):
         (sample.assign(support="round"), "support = round is not allowed"),
         (sample.assign(usable=0), "without a usable row"),
     ):
-        with pytest.raises(InputError, match=message):
+        with refusing(message):
             pushes.read(table)
 
 

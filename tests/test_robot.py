@@ -11,7 +11,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import NEAR, SHORT, case, refusal, same
+from helpers import (
+    NEAR,
+    SHORT,
+    case,
+    refusal,
+    same,
+    setting_of,
+    slow,
+)
 from numpy.testing import assert_allclose, assert_array_equal
 from staging import push_object, recompiled
 
@@ -131,9 +139,7 @@ def position_after(twist, seconds):
 
 
 @pytest.mark.usefixtures("steady")
-@pytest.mark.parametrize(
-    "engine", ["fused", pytest.param("mjx", marks=pytest.mark.slow), "mujoco", "quasistatic"]
-)
+@pytest.mark.parametrize("engine", ["fused", slow("mjx"), "mujoco", "quasistatic"])
 def test_a_base_turns_and_strafes_less_than_commanded_in_all_engines(engine):
     """Away from the object; the fused engine is compiled C."""
     commands = ((0.1, 0.0, 0.5), (0.1, 0.0, 0.0), (0.1, 0.05, 0.5))
@@ -144,7 +150,7 @@ def test_a_base_turns_and_strafes_less_than_commanded_in_all_engines(engine):
         Case("box", "S1", (2.0, 0.0), Steady(*command), gap=0.3, robot=base)
         for (command, _), base in zip(pairs, bases, strict=True)
     ]
-    outcome, _ = pushes.run(cases, Setting(engine, rules=Rules(horizon=0.4)))
+    outcome, _ = pushes.run(cases, setting_of(0.4, engine))
     executed = [np.array(command) * (1 - np.array(share)) for command, share in pairs]
     expected = np.array([position_after(twist, outcome.time[0]) for twist in executed])
     assert_allclose(outcome.base_pose[:, 2], expected[:, 2], rtol=1e-4, atol=1e-6)
@@ -345,7 +351,7 @@ def test_robots_are_named_in_the_library_and_in_files(tmp_path):
     mine = parse_robot(str(path))
     assert mine == Robot(mass=50, force_max=120, acceleration_max=(0.5, 1))
     drums = replace(DOMAINS["real"], objects=("random_cylinder",), robot_force=None)
-    setting = Setting(rules=Rules(horizon=1.0))
+    setting = setting_of(1.0, "fused")
     rows = rps_jax.sweep("rps", drums, worlds=3, robot=mine, setting=setting)
     assert np.unique(rows.robot_force) == 120
     assert "stalled" in rows

@@ -10,9 +10,8 @@ from functools import partial
 
 import numpy as np
 import pytest
-from helpers import ROOT
+from helpers import ROOT, setting_of
 
-import rps_jax
 from rps_jax.app.export import c, program
 from rps_jax.record import bag
 from rps_jax.runs.push import push
@@ -159,7 +158,7 @@ def test_a_stopped_clock_commands_zero(driven):
 def test_cpp_and_python_agree_on_a_recorded_bag(binary, tmp_path, python):
     pytest.importorskip("mcap_ros2")
     path = tmp_path / "push.mcap"
-    setting = rps_jax.Setting("quasistatic", rules=rps_jax.Rules(horizon=10.0))
+    setting = setting_of(10.0)
     push("box", target=(-1.0, 0.5), law="rps_plus", bag=path, setting=setting)
     read = bag.read(path)
     messages = []
@@ -178,7 +177,7 @@ def test_cpp_and_python_agree_on_a_recorded_bag(binary, tmp_path, python):
 def test_cpp_and_python_follow_a_path_as_the_task_does(binary, tmp_path, python):
     pytest.importorskip("mcap_ros2")
     path = tmp_path / "push.mcap"
-    setting = rps_jax.Setting("quasistatic", rules=rps_jax.Rules(horizon=80.0))
+    setting = setting_of(80.0)
     task = "corridor,width=1.5,turns=2,length=4"
     push("cylinder", task=task, law="rps_plus", skin="capacitive", bag=path, setting=setting)
     read = bag.read(path)

@@ -7,7 +7,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import box, jitted, observation, refusals, sense
+from helpers import (
+    box,
+    jitted,
+    observation,
+    refusals,
+    sense,
+    slow,
+)
 from numpy.testing import assert_allclose
 from staging import FINE, simulate, staged
 
@@ -156,10 +163,8 @@ def test_rps_gets_the_arc_length() -> None:
     assert bool(details.realigning)  # beyond l_cr
 
 
-@pytest.mark.parametrize(
-    "engine", ["fused", "quasistatic", pytest.param("mjx", marks=pytest.mark.slow)]
-)
-@pytest.mark.parametrize("name", [pytest.param("box", marks=pytest.mark.slow), "cylinder"])
+@pytest.mark.parametrize("engine", ["fused", "quasistatic", slow("mjx")])
+@pytest.mark.parametrize("name", [slow("box"), "cylinder"])
 def test_engines_agree(name: str, engine: str) -> None:
     """Compare pushes in which an object slides and turns on the arc."""
     loaded = scene.load(name, FINE, FRICTION["S1"], robot=ROUND)

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
-from helpers import extent
+from helpers import extent, slow
 from numpy.testing import assert_allclose, assert_array_equal
 from staging import simulate, stack, staged, step_in_c
 
@@ -30,7 +30,7 @@ def touching(loaded):
     return scene.initial_qpos(loaded, gap=-0.0005)
 
 
-@pytest.mark.parametrize("family", [pytest.param("box", marks=pytest.mark.slow), "cylinder"])
+@pytest.mark.parametrize("family", [slow("box"), "cylinder"])
 def test_mjx_agrees_with_c_mujoco_at_one_step_and_over_0_4_seconds(family):
     names = [name for name in OBJECTS if FAMILIES[name] == family]
     scenes = [load(name, friction=f) for name in names for f in FRICTION.values()]

@@ -7,7 +7,7 @@ from functools import partial
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import box, case, refusal, sense
+from helpers import box, case, refusal, sense, setting_of
 from numpy.testing import assert_allclose, assert_array_equal
 from staging import push_object
 
@@ -18,7 +18,6 @@ from rps_jax.robot.shell import BOARDS, Boards
 from rps_jax.robot.skin import LINE, NONE, CapacitiveSkin, IdealSkin
 from rps_jax.trials import pushes
 from rps_jax.trials.setting import Setting
-from rps_jax.trials.trial import Rules
 from rps_jax.world.domain import DOMAINS
 from rps_jax.world.scene import JOINTS
 
@@ -118,7 +117,7 @@ def test_engines_agree_on_a_base_of_another_size():
 def test_a_sweep_uses_the_base_of_its_robot():
     """A base is as wide as its boards: a narrow base loses objects that the default one keeps."""
     domain = replace(DOMAINS["wide"], objects=("random_cylinder",))
-    setting = Setting("quasistatic", rules=Rules(horizon=20.0))
+    setting = setting_of(20.0)
     wide, narrow, same = (
         rps_jax.sweep("rps", domain, worlds=8, robot=base, setting=setting)
         for base in (None, Robot(half_length=0.5, half_width=0.2), Robot())

@@ -25,6 +25,8 @@ from helpers import (
     jitted,
     moved,
     property_test,
+    refusing,
+    setting_of,
 )
 from helpers import box as box_at
 from jax.flatten_util import ravel_pytree
@@ -32,7 +34,6 @@ from numpy.random import default_rng
 from numpy.testing import assert_allclose, assert_array_equal
 from test_skin import BATCH, mirrored, random_shapes, sense_all
 
-from rps_jax import errors
 from rps_jax.control import registry
 from rps_jax.control.laws import rps, rps_plus
 from rps_jax.control.laws.pursuit import PursuitParams
@@ -43,8 +44,7 @@ from rps_jax.geometry.footprint import Footprint
 from rps_jax.robot.skin import NONE, CapacitiveSkin, IdealSkin
 from rps_jax.trials import host, pushes
 from rps_jax.trials.pushes import Case
-from rps_jax.trials.setting import Setting
-from rps_jax.trials.trial import ControlLoop, Rules
+from rps_jax.trials.trial import ControlLoop
 
 WARM = Temperatures()
 COLD = Temperatures(1e-6, 1e-6, 1e-6, 1e-6)
@@ -456,7 +456,7 @@ def test_the_derivatives_of_a_smooth_reading_agree_with_finite_differences(skin)
 
 def push(case: Case, law, horizon: float):
     """Return the trial of a case after `horizon` [s], or at its end."""
-    setting = Setting(engine="mujoco", rules=Rules(horizon=horizon))
+    setting = setting_of(horizon, "mujoco")
     _, worlds, models, params = pushes.build([case], setting)
     loop = ControlLoop(setting.physics, setting.rules, law)
     *_, trials = host.run(models, worlds, params, loop, threads=1)
@@ -546,5 +546,5 @@ def test_rps_and_rps_plus_alone_have_a_smooth_form_one_for_equal_temperatures():
         assert registry.smooth_law(law, COLD) is not smooth_law
     assert registry.smooth_law(rps.LAW) != registry.smooth_law(rps_plus.LAW)
     words = "this law has no smooth form.* choose rps, rps_tuned, nps, rps_unsaturated, rps_plus"
-    with pytest.raises(errors.InputError, match=words):
+    with refusing(words):
         registry.smooth_law(registry.law_of(PursuitParams()))

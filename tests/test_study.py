@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 import xarray as xr
+from helpers import refusing, setting_of
 from numpy.testing import assert_allclose, assert_array_equal
 from staging import step_in_c
 
 import rps_jax
-from rps_jax import errors
 from rps_jax.control import registry
 from rps_jax.control.laws.aps import APSParams
 from rps_jax.control.laws.pursuit import PursuitParams
@@ -21,8 +21,7 @@ from rps_jax.studies import hardware
 from rps_jax.trials import pushes
 from rps_jax.trials.case import Case
 from rps_jax.trials.results import DIMS
-from rps_jax.trials.setting import Setting
-from rps_jax.trials.trial import Rules, Shift
+from rps_jax.trials.trial import Shift
 from rps_jax.world import paper, scene
 from rps_jax.world.objects import PAPER_OBJECTS
 from rps_jax.world.physics import preset
@@ -34,7 +33,7 @@ from sweeps.conditions import Condition, Grid
 from sweeps.fidelity import study as fidelity
 
 NEAR = ((0.6, 0.0), (0.62, 0.03))
-SHORT = Setting(engine="mujoco", rules=Rules(horizon=18.0))
+SHORT = setting_of(18.0, "mujoco")
 GRID = Grid(objects=("box",), friction={"S1": FRICTION["S1"]}, targets=NEAR)
 CONDITIONS = {
     "default": Condition("the defaults", SHORT),
@@ -91,7 +90,7 @@ def test_a_study_resumes_and_repeats_only_corrupt_parts(folder, monkeypatch):
 
 def test_a_study_refuses_a_folder_of_other_conditions(folder):
     changed = {"slow": Condition("slow", SHORT, params={"v_max": 0.002})}
-    with pytest.raises(errors.InputError, match=r"slow.* was run with other options"):
+    with refusing(r"slow.* was run with other options"):
         conditions.run_conditions(changed, GRID, folder)
 
 
@@ -116,7 +115,7 @@ def test_a_shove_moves_the_object_along_the_front_of_the_robot():
         Case("box", FRICTION["S1"], (2.0, 0.0), shift=Shift(0.5, (0.0, y)), bearing=bearing)
         for y, bearing in ((0.1, 0.0), (-0.1, 0.0), (0.1, np.pi / 2))
     ]
-    setting = Setting(engine="mujoco", rules=Rules(horizon=1.0))
+    setting = setting_of(1.0, "mujoco")
     outcome, _ = pushes.run(cases, setting)
     x = 0.3625 + 0.02 + 0.2
     expected = [[x, 0.1], [x, -0.1], [-0.1, x]]
@@ -125,7 +124,7 @@ def test_a_shove_moves_the_object_along_the_front_of_the_robot():
 
 @pytest.mark.slow
 def test_the_hardware_experiments_cover_friction_targets_and_shoves():
-    setting = Setting(rules=Rules(horizon=3.0))
+    setting = setting_of(3.0, "fused")
     results = rps_jax.hardware(shifts=(0.1,), setting=setting)
     assert results.sizes["friction"] == len(paper.HARDWARE_GROUND) * len(paper.HARDWARE_ROBOT)
     assert results.sizes["target"] == 8

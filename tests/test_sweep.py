@@ -27,7 +27,9 @@ from helpers import (
     SLOTS,
     one_sentence,
     parts_of,
+    printed,
     refusal,
+    refusing,
     row,
     rps,
     same,
@@ -37,7 +39,6 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from rps_jax.analysis import statistics
 from rps_jax.app.cli import running
-from rps_jax.errors import InputError
 from rps_jax.geometry import planar
 from rps_jax.record import cache, files
 from rps_jax.runs import execution, sweep
@@ -340,7 +341,7 @@ def test_a_part_of_an_older_version_is_named(whole, tmp_path):
     del columns["tipped"]
     victim.unlink()
     execution.store_chunk(folder, 0, files.encode_arrays(**columns))
-    with pytest.raises(InputError, match=r"part 0 .* another version .it lacks tipped"):
+    with refusing(r"part 0 .* another version .it lacks tipped"):
         merge([folder], out=folder)
 
 
@@ -356,19 +357,19 @@ def test_the_report_of_one_world_has_the_command_that_replays_its_failure(whole,
 
 def test_shards_merge_to_the_whole(whole, tmp_path):
     folders = [swept(tmp_path / f"{k}", shard=Shard(k, 3)) for k in (1, 2, 3)]
-    with pytest.raises(InputError, match="lacks 2 of 6 parts"):
+    with refusing("lacks 2 of 6 parts"):
         merge(folders[:2], out=tmp_path)
     (tmp_path / "direct").mkdir()
     direct = merged([whole], tmp_path / "direct")
     xr.testing.assert_identical(merged(folders, tmp_path), direct)
     open_run(tmp_path / "other", replace(PLAN, setting=replace(SHORT, seed=5)))
-    with pytest.raises(InputError, match="seed = 0 there, 5 asked for"):
+    with refusing("seed = 0 there, 5 asked for"):
         merge([folders[0], tmp_path / "other"], out=tmp_path)
 
 
 def test_another_configuration_is_refused_with_its_differences(whole):
     changed_plan = replace(PLAN, worlds=30, domain=replace(BOXES, mass=Range(1, 2)))
-    with pytest.raises(InputError, match=r"domain.mass = .*there, .* asked for; worlds = 20 there"):
+    with refusing(r"domain.mass = .*there, .* asked for; worlds = 20 there"):
         open_run(whole, changed_plan)
 
 
@@ -390,8 +391,7 @@ def test_sweep_merge_and_replay_on_the_command_line(tmp_path, capsys):
         f"rps,{tuned}",
     ]
     assert [rps(*command, "--shard", f"{k}/2") for k in (1, 2)] == [0, 0]
-    assert rps("merge", run, "--out", run) == 0
-    text = capsys.readouterr().out
+    text = printed(capsys, "merge", run, "--out", run)
     assert "rps,tuned against rps" in text
     results = files.read_results(run)
     assert results.law.values.tolist() == ["rps", "rps,tuned"]

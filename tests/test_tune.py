@@ -7,14 +7,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import xarray as xr
-from helpers import PAPER, read_curve, refusal
+from helpers import PAPER, read_curve, refusal, refusing
 from helpers import rps as command
 from numpy.random import default_rng
 from numpy.testing import assert_allclose, assert_array_equal
 
 from rps_jax.control.laws import rps
 from rps_jax.control.laws.rps import BOUNDS, RPSParams
-from rps_jax.errors import InputError
 from rps_jax.record import files
 from rps_jax.record.checkpoint import Checkpoints
 from rps_jax.runs import evaluate
@@ -286,7 +285,7 @@ def test_generations_that_the_seed_does_not_propose_are_refused(tmp_path, preten
         path.unlink()
     (foreign,) = (tmp_path / "other" / "parts").glob("000001*")
     foreign.rename(tmp_path / "one" / "parts" / foreign.name)
-    with pytest.raises(InputError, match="generation 1 is of another search"):
+    with refusing("generation 1 is of another search"):
         tuned(tmp_path / "one", evolution(3))
 
 
@@ -298,7 +297,7 @@ def test_a_generation_with_an_odd_column_is_refused(part, name, tmp_path, preten
     results = files.decode_results(stored.get(part), part)
     for odd in (results.assign({name: results[name] + 0j}), results.drop_vars(name)):
         stored.put(part, bytes(odd.to_netcdf(engine="h5netcdf", invalid_netcdf=True)))
-        with pytest.raises(InputError, match=rf"is corrupt \(.*{name}"):
+        with refusing(rf"is corrupt \(.*{name}"):
             tuned(tmp_path, evolution(2))
 
 
@@ -338,9 +337,9 @@ def test_another_configuration_is_refused_with_the_difference(tmp_path, pretende
     first = TuneES("rps", **calls, generations=1)()
     longer = TuneES("rps", **calls, generations=3)()  # of which the first is there
     assert first.params.equals(longer.params[:1])
-    with pytest.raises(InputError, match=r"spread = 0.5 there, 0.4 asked for"):
+    with refusing(r"spread = 0.5 there, 0.4 asked for"):
         TuneES("rps", **calls, spread=0.4)()
-    with pytest.raises(InputError, match="holds another run"):
+    with refusing("holds another run"):
         TuneGrad("rps", **SMALL, out=tmp_path)()
 
 

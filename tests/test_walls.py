@@ -6,13 +6,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from helpers import refusing, slow
 from numpy.testing import assert_allclose
 from staging import Recording, drive, simulate
 
 import rps_jax
 from rps_jax import engines
 from rps_jax.engines.base import Motion
-from rps_jax.errors import InputError
 from rps_jax.geometry import footprint
 from rps_jax.geometry import solid as solids
 from rps_jax.geometry.solid import Solid
@@ -70,10 +70,7 @@ PAIRS = [
     ("box", "fused"),
     ("cylinder", "fused"),
     ("prism", "fused"),
-    *(
-        pytest.param(family, "mjx", marks=pytest.mark.slow)
-        for family in ("box", "cylinder", "prism")
-    ),
+    *(slow(family, "mjx") for family in ("box", "cylinder", "prism")),
 ]
 
 
@@ -148,12 +145,12 @@ REFUSED = {
 
 @pytest.mark.parametrize("text", REFUSED)
 def test_a_wrong_wall_is_refused(text):
-    with pytest.raises(InputError, match=REFUSED[text]):
+    with refusing(REFUSED[text]):
         parse_task(text)
 
 
 def test_the_quasistatic_engine_has_no_walls():
-    with pytest.raises(InputError, match="it has no walls; choose mjx or fused or mujoco"):
+    with refusing("it has no walls; choose mjx or fused or mujoco"):
         rps_jax.draw_worlds(
             "wide,objects=random_box", task="corridor,touch=object", setting=Setting("quasistatic")
         )
