@@ -70,59 +70,17 @@ def pytest_configure(config):
 
 
 # Slow files start first; a slow file at the end would leave processors idle.
-LONGEST = (
-    "learning",
-    "library",
-    "failures",
-    "cli",
-    "native",
-    "contact_derivatives",
-    "fit",
-    "rivals",
-    "smooth",
-    "trial",
-    "robot",
-    "examples",
-    "tune",
-    "ladder",
-    "export",
-    "sweep",
-    "shell",
-    "view",
-    "push_page",
-    "replay",
-    "package_laws",
-    "derivatives",
-    "rooms",
-    "cluster",
-    "walls",
-    "mjx_gradients",
-    "gpu_writer",
-    "video",
-    "points",
-    "faults",
-    "bags",
-    "ground",
-    "force_push_grid",
-    "feet",
-    "house",
-    "film",
-    "footprint",
-    "arena",
-    "force",
-    "evaluate",
-    "gradients",
-    "publish",
-    "study",
-    "quasistatic",
-    "physics",
-    "notebooks",
-    "quality",
-)
+LONGEST = """
+    learning library failures cli native contact_derivatives fit rivals smooth trial robot
+    examples tune ladder export sweep shell view push_page replay package_laws derivatives rooms
+    cluster walls mjx_gradients gpu_writer video points faults bags ground force_push_grid feet
+    house film footprint arena force evaluate gradients publish study quasistatic physics
+    notebooks quality
+"""
 
 
 def pytest_collection_modifyitems(items):
-    rank = {f"test_{name}": i for i, name in enumerate(LONGEST)}
+    rank = {f"test_{name}": i for i, name in enumerate(LONGEST.split())}
     items.sort(key=lambda item: rank.get(item.path.stem, len(rank)))
 
 

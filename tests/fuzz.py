@@ -128,22 +128,15 @@ def inject(
 
 # --- bad values of options -----------------------------------------------------------------
 
+
+def _words(text: str) -> list[str]:
+    return text.split()
+
+
 VALUES = (
     "",
     " ",
-    "nan",
-    "-nan",
-    "inf",
-    "-inf",
-    "1e400",
-    "-1e400",
-    "1e-320",
-    "-1",
-    "0",
-    "-0",
-    "0.5",
-    "1e9",
-    "1e308",
+    *_words("nan -nan inf -inf 1e400 -1e400 1e-320 -1 0 -0 0.5 1e9 1e308"),
     "9" * 60,
     "-" + "9" * 60,
     "9" * 5000,
@@ -151,75 +144,20 @@ VALUES = (
     "1_000",
     "\u0661",
     "\u00b2",
-    "None",
-    "null",
-    "true",
-    "[]",
-    "{}",
-    "()",
-    "[[[[",
-    "{]",
-    "a=b",
-    "=",
-    "L=",
-    "=1",
-    "L=nan",
-    "L=1e400",
-    "mass=3",
-    "mass=3,nan",
-    "mass=9,3",
-    "mass=,",
-    "1/0",
-    "0/1",
-    "2/1",
-    "-1/3",
-    "a/b",
+    *_words("""
+    None null true [] {} () [[[[ {] a=b = L= =1 L=nan L=1e400 mass=3 mass=3,nan mass=9,3
+    mass=, 1/0 0/1 2/1 -1/3 a/b
+    """),
     "1/" + "9" * 60,
-    "S1,S2",
-    "0.3,0.3,0.3",
-    "0,0",
-    "nan,nan",
-    "rps",
-    "rps,rps",
-    "RPS",
+    *_words("S1,S2 0.3,0.3,0.3 0,0 nan,nan rps rps,rps RPS"),
     "aps ",
-    "nowhere.json",
-    "nowhere.py:P",
-    "nowhere.npz",
-    ".json",
-    ".py:",
-    ".npz",
-    ":",
-    "..",
-    "/",
-    ".",
-    "/dev/null",
-    "/dev/zero",
-    "/dev/zero.json",
-    "/proc/self/mem",
-    "/etc/passwd",
-    "~",
-    "$HOME",
-    "list.json",
-    "null.json",
-    "deep.json",
-    "text.json",
-    "binary.json",
-    "empty.json",
-    "number.json",
-    "big.json",
-    "pipe.json",
-    "pipe.npz",
-    "pipe.py:P",
-    "folder.json",
-    "pipe",
-    "folder.npz",
-    "broken.py:P",
-    "syntax.py:P",
-    "text.npz",
-    "encrypted.npz",
-    "zip.npz",
-    "exit.py:P",
+    *_words("""
+    nowhere.json nowhere.py:P nowhere.npz .json .py: .npz : .. / . /dev/null /dev/zero
+    /dev/zero.json /proc/self/mem /etc/passwd ~ $HOME list.json null.json deep.json
+    text.json binary.json empty.json number.json big.json pipe.json pipe.npz pipe.py:P
+    folder.json pipe folder.npz broken.py:P syntax.py:P text.npz encrypted.npz zip.npz
+    exit.py:P
+    """),
     "\N{SNOWMAN}",
     "\N{PILE OF POO}" * 40,
     "\u202eabc",
@@ -232,13 +170,7 @@ VALUES = (
     "'",
     '"',
     "\\",
-    "%s",
-    "{0}",
-    "`id`",
-    ";ls",
-    "&&",
-    "*",
-    "?",
+    *_words("%s {0} `id` ;ls && * ?"),
     "\t",
     "--help",
     "-1.5",
@@ -368,20 +300,28 @@ MEMORY = "{}, Twist(0.0, 0.0, 0.0), Details.from_obs(seen)"
 TWIST = "memory, {}, Details.from_obs(seen)"
 DETAILS = "memory, Twist(0.0, 0.0, 0.0), {}"
 REGISTER = "rps_jax.register_law({}, rps_jax.Law({}), {})"
+
+
+def _lines(text: str) -> list[str]:
+    return [line.strip() for line in text.strip().splitlines()]
+
+
 _WRONG: dict[str, Sequence[str]] = {
     "returns": (
-        "None",
-        "'text'",
-        "memory",
-        "(memory, Twist(0.0, 0.0, 0.0))",
-        "{}",
-        "()",
-        "iter(())",
-        "Twist(0.0, 0.0, 0.0)",
-        "step",
-        "seen",
-        "{'memory': memory}",
-        "[memory, Twist(0.0, 0.0, 0.0), Details.from_obs(seen)]",
+        *_lines("""
+            None
+            'text'
+            memory
+            (memory, Twist(0.0, 0.0, 0.0))
+            {}
+            ()
+            iter(())
+            Twist(0.0, 0.0, 0.0)
+            step
+            seen
+            {'memory': memory}
+            [memory, Twist(0.0, 0.0, 0.0), Details.from_obs(seen)]
+        """),
         *map(DETAILS.format, ("None", "Details(0, 0, 0, 0, here)", "Details.from_obs(seen), 1")),
         *map(DETAILS.format, ("Details(*5 * [None])",)),
         *map(TWIST.format, ("None", "'left'", "(0.0, 0.0)", "here", "[0, 0, 0]", "jnp.zeros(3)")),
@@ -391,77 +331,83 @@ _WRONG: dict[str, Sequence[str]] = {
         *map(MEMORY.format, ("(memory, memory)", "{'x': memory}", "memory.astype(int)")),
     ),
     "body": (
-        "if seen.in_contact: pass",
-        "float(seen.yaw)",
-        "1 / 0",
-        "int(seen.yaw)",
-        "nothing",
-        "np.sin(seen.yaw)",
-        "math.sin(seen.yaw)",
-        "np.asarray(here)",
-        "seen.yaw.item()",
-        "range(seen.yaw)",
-        "here.tolist()",
-        "here[9.0]",
-        "jnp.arange(seen.yaw)",
-        "[1, 2][seen.yaw]",
-        "seen.nothing",
-        "memory['a']",
-        "raise ValueError",
-        "step()",
-        "raise RuntimeError('a\\nb')",
-        "assert seen.in_contact",
-        "step(params, memory, seen)",
-        "import nothing",
-        "open('/nowhere')",
-        "sys.exit(3)",
-        "here[0] = 1.0",
-        "min(here)",
-        "here + jnp.zeros(3)",
-        "jnp.reshape(here, 5)",
-        "here[seen.in_contact]",
-        "(lambda: 1)(2)",
-        "jax.lax.cond(here, None, None)",
-        "sum(here, 'a')",
-        "here.astype('nothing')",
-        "jnp.linalg.inv(here)",
-        "jax.lax.scan(lambda c, x: (c, c, x), 0, here)",
-        "seen.yaw = 3",
-        "jax.grad(lambda x: here)(1.0)",
-        "np.random.default_rng(seen.yaw)",
-        "jnp.where(1, 2)",
-        "jax.random.key(seen.yaw)",
-        "here.at[9].nothing(1)",
-        "f'{seen.yaw:.2f}'",
-        "jnp.concatenate([here, seen.yaw])",
+        *_lines("""
+            if seen.in_contact: pass
+            float(seen.yaw)
+            1 / 0
+            int(seen.yaw)
+            nothing
+            np.sin(seen.yaw)
+            math.sin(seen.yaw)
+            np.asarray(here)
+            seen.yaw.item()
+            range(seen.yaw)
+            here.tolist()
+            here[9.0]
+            jnp.arange(seen.yaw)
+            [1, 2][seen.yaw]
+            seen.nothing
+            memory['a']
+            raise ValueError
+            step()
+            raise RuntimeError('a\\nb')
+            assert seen.in_contact
+            step(params, memory, seen)
+            import nothing
+            open('/nowhere')
+            sys.exit(3)
+            here[0] = 1.0
+            min(here)
+            here + jnp.zeros(3)
+            jnp.reshape(here, 5)
+            here[seen.in_contact]
+            (lambda: 1)(2)
+            jax.lax.cond(here, None, None)
+            sum(here, 'a')
+            here.astype('nothing')
+            jnp.linalg.inv(here)
+            jax.lax.scan(lambda c, x: (c, c, x), 0, here)
+            seen.yaw = 3
+            jax.grad(lambda x: here)(1.0)
+            np.random.default_rng(seen.yaw)
+            jnp.where(1, 2)
+            jax.random.key(seen.yaw)
+            here.at[9].nothing(1)
+            f'{seen.yaw:.2f}'
+            jnp.concatenate([here, seen.yaw])
+        """),
     ),
     "starts": (
-        "raise ValueError('no')",
-        "1 / 0",
-        "params.nothing",
-        "if params.v > 0: pass",
-        "nothing",
-        "float(params.v)",
-        "np.sin(params.v)",
-        "sys.exit(3)",
-        "assert False",
-        "jnp.zeros(params.v)",
+        *_lines("""
+            raise ValueError('no')
+            1 / 0
+            params.nothing
+            if params.v > 0: pass
+            nothing
+            float(params.v)
+            np.sin(params.v)
+            sys.exit(3)
+            assert False
+            jnp.zeros(params.v)
+        """),
     ),
     "memory": (
-        "'text'",
-        "object()",
-        "[1, 'a']",
-        "step",
-        "jnp.zeros",
-        "{'a': 'b'}",
-        "0",
-        "None",
-        "1j",
-        "np.array([1, 'a'])",
-        "np.zeros(2, int)",
-        "[jnp.zeros(2)]",
-        "np.array([None])",
-        "b'bytes'",
+        *_lines("""
+            'text'
+            object()
+            [1, 'a']
+            step
+            jnp.zeros
+            {'a': 'b'}
+            0
+            None
+            1j
+            np.array([1, 'a'])
+            np.zeros(2, int)
+            [jnp.zeros(2)]
+            np.array([None])
+            b'bytes'
+        """),
     ),
     "field": tuple(
         f"gain: {kind} = {value}"
@@ -482,7 +428,14 @@ _WRONG: dict[str, Sequence[str]] = {
     ),
     "takes": ("", "params", "params, memory", "params, memory, seen, more", "*, params", "**seen"),
     "takes_init": ("", "params, more", "*, params"),
-    "head": ("def :", "raise RuntimeError('head')", "import nothing", "sys.exit(3)", "1 / 0", "P"),
+    "head": _lines("""
+            def :
+            raise RuntimeError('head')
+            import nothing
+            sys.exit(3)
+            1 / 0
+            P
+        """),
     "register": (
         "",
         "rps_jax.register_law('{name}')",
@@ -736,57 +689,20 @@ def _instead(file: Path, make: Callable[[Path], Any]) -> None:
     make(file)
 
 
-SHORT = ("--engine", "quasistatic", "--horizon", "2")
-DRUMS = ("--domain", "wide,objects=random_cylinder")
+SHORT = "--engine quasistatic --horizon 2"
+DRUMS = "--domain wide,objects=random_cylinder"
 # Commands that make a run folder quickly.
-COMMANDS: dict[str, tuple[str, ...]] = {
-    "sweep": ("sweep", *SHORT, *DRUMS, "--laws", "rps", "nps", "--worlds", "24", "--part", "4"),
-    "tune": (
-        "tune",
-        "es",
-        "--quick",
-        *SHORT,
-        *DRUMS,
-        "--generations",
-        "4",
-        "--population",
-        "4",
-        "--worlds",
-        "2",
-        "--validation",
-        "2",
-        "--tuned",
-        "K_h",
-        "L",
-    ),
-    "learn": (
-        "learn",
-        "--quick",
-        "--engine",
-        "quasistatic",
-        *DRUMS,
-        "--updates",
-        "3",
-        "--minutes",
-        "0",
-        "--num-envs",
-        "4",
-        "--drawn",
-        "4",
-        "--validation",
-        "2",
-        "--width",
-        "4",
-        "--num-steps",
-        "2",
-        "--num-minibatches",
-        "1",
-    ),
+COMMANDS = {
+    "sweep": f"sweep {SHORT} {DRUMS} --laws rps nps --worlds 24 --part 4",
+    "tune": f"tune es --quick {SHORT} {DRUMS} --generations 4 --population 4 --worlds 2 "
+    "--validation 2 --tuned K_h L",
+    "learn": f"learn --quick --engine quasistatic {DRUMS} --updates 3 --minutes 0 --num-envs 4 "
+    "--drawn 4 --validation 2 --width 4 --num-steps 2 --num-minibatches 1",
 }
 
 
 @functools.cache
-def _furnished(complete: bool) -> tuple[Path, dict[str, list[tuple[str, ...]]]]:
+def _furnished(complete: bool) -> tuple[Path, dict[str, list[str]]]:
     """Return a temporary folder with small runs, and the commands that read them."""
     home = Path(tempfile.mkdtemp())
     atexit.register(shutil.rmtree, home, ignore_errors=True)
@@ -794,7 +710,7 @@ def _furnished(complete: bool) -> tuple[Path, dict[str, list[tuple[str, ...]]]]:
         return home, furnish_runs(home, complete)
 
 
-def furnish_runs(folder: Path, complete: bool) -> dict[str, list[tuple[str, ...]]]:
+def furnish_runs(folder: Path, complete: bool) -> dict[str, list[str]]:
     """Write small runs of several kinds, and return the commands that read each of them.
 
     A complete set has a tuned and a learned law, which take a minute.
@@ -810,24 +726,24 @@ def furnish_runs(folder: Path, complete: bool) -> dict[str, list[tuple[str, ...]
     shutil.copy(
         Path(policy.__file__).parent / "learned_small.npz", folder / "policy" / "policy.npz"
     )
-    runs = {name: (*words, "--out", name) for name, words in COMMANDS.items()}
+    runs = {name: f"{words} --out {name}" for name, words in COMMANDS.items()}
     for command in [runs[name] for name in runs if complete or name == "sweep"]:
-        if (result := attempt(command, 300)).how != "told":
-            raise RuntimeError(f"rps {' '.join(command)} made no run ({result.how}): {result.text}")
+        if (result := attempt(command.split(), 300)).how != "told":
+            raise RuntimeError(f"rps {command} made no run ({result.how}): {result.text}")
     reads = {
         "sweep": [
-            ("merge", "sweep", "--out", "merged"),
-            ("replay", "sweep", "0"),
-            ("film", "sweep"),
-            ("gallery", "sweep", "--each", "1"),
-            ("view", "sweep", "0"),
-            ("ceiling", "sweep", "--lost-by", "rps", "--sample", "1"),
+            "merge sweep --out merged",
+            "replay sweep 0",
+            "film sweep",
+            "gallery sweep --each 1",
+            "view sweep 0",
+            "ceiling sweep --lost-by rps --sample 1",
             runs["sweep"],
         ],
-        "points": [("merge", "points", "--out", "merged"), ("replay", "points", "0")],
-        "tune": [runs["tune"], ("push", "--law", "rps,tune/tuned.json")],
-        "policy": [("push", "--skin", "capacitive", "--law", "policy/policy.npz")],
-        "learn": [runs["learn"], ("export", "c", "--law", "learn/policy.npz")],
+        "points": ["merge points --out merged", "replay points 0"],
+        "tune": [runs["tune"], "push --law rps,tune/tuned.json"],
+        "policy": ["push --skin capacitive --law policy/policy.npz"],
+        "learn": [runs["learn"], "export c --law learn/policy.npz"],
     }
     return {
         name: words for name, words in reads.items() if complete or name not in ("tune", "learn")
@@ -853,7 +769,7 @@ def edited_folders(limit: int, seed: int, damaged: bool) -> Iterator[Fault]:
             make(path)
             if not damaged:
                 _sign(path)
-            yield f"{path}: {title}", rng.choice(reads[name]), ("accepted", "told")
+            yield f"{path}: {title}", rng.choice(reads[name]).split(), ("accepted", "told")
             shutil.rmtree(name)
             shutil.move(f"{name}.sound", name)
 

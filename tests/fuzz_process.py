@@ -31,35 +31,18 @@ from helpers import setting_of
 
 RPS = (sys.executable, "-m", "rps_jax")
 HOME = Path(__file__).parents[1]
-SWEEP = COMMANDS["sweep"]
-KILLED = COMMANDS | {
-    "ladder": ("ladder", *SWEEP[1:]),
-    "table": ("table", *SHORT, "--objects", "cylinder", "--friction", "S1"),
-    "sensitivity": ("sensitivity", *SHORT, *DRUMS, "--worlds", "100"),
-    "attack": (
-        "attack",
-        *SHORT,
-        *DRUMS,
-        "--axes",
-        "size",
-        "mass",
-        "friction_robot",
-        "--cells",
-        "3",
-        "--batch",
-        "8",
-        "--generations",
-        "4",
-        "--minutes",
-        "30",
-        "--drawn",
-        "8",
-        "--check-again",
-        "0",
-        "--repeats",
-        "1",
-    ),
+KILLED = {
+    name: tuple(words.split())
+    for name, words in {
+        **COMMANDS,
+        "ladder": COMMANDS["sweep"].replace("sweep", "ladder"),
+        "table": f"table {SHORT} --objects cylinder --friction S1",
+        "sensitivity": f"sensitivity {SHORT} {DRUMS} --worlds 100",
+        "attack": f"attack {SHORT} {DRUMS} --axes size mass friction_robot --cells 3 --batch 8 "
+        "--generations 4 --minutes 30 --drawn 8 --check-again 0 --repeats 1",
+    }.items()
 }
+SWEEP = KILLED["sweep"]
 # Durations of a tuner's generation; other clocks have "wall clock" in their long name.
 _CLOCKS = ("compile", "run")
 
