@@ -45,6 +45,10 @@ KINDS = bag.TOPICS | {
 MS, SECOND = 10**6, 10**9
 
 
+Writer = Callable[[Path], Path]  # writes a bag into a folder, and returns its path
+Edit = Callable[[dict[str, Any]], object]  # of the fields of a message
+
+
 class Row(NamedTuple):
     """A message as fields, with its time of receipt [ns]."""
 
@@ -67,7 +71,7 @@ class Case(NamedTuple):
     """Bag and its expected outcome."""
 
     kind: str
-    source: list[Row] | Callable[[Path], Path]  # messages, or what writes a file into a folder
+    source: list[Row] | Writer  # messages, or what writes a file into a folder
     expected: str = ""  # words of the sentence, or nothing if the steps are those of the plain bag
     topics: Mapping[str, str] | Sequence[str] = ()
     atol: float = 0.0
@@ -97,7 +101,7 @@ def rows() -> list[Row]:
 
 def edited(
     topic: str,
-    edit: Callable[[dict[str, Any]], object],
+    edit: Edit,
     at: Iterable[int] | None = None,
     source: Iterable[Row] | None = None,
 ) -> list[Row]:
@@ -150,7 +154,7 @@ def without(*topics: str) -> list[Row]:
     return [row for row in rows() if row.topic not in topics]
 
 
-def set_(path: str, value: object) -> Callable[[dict[str, Any]], object]:
+def set_(path: str, value: object) -> Edit:
     """Return an edit of one field, as `pose.pose.position.x`."""
 
     def edit(message: dict[str, Any]) -> None:
@@ -228,7 +232,7 @@ def mcap(
     profile: str = "ros2",
     text: Callable[[Record], str] = lambda r: r.text,
     **options: Any,
-) -> Callable[[Path], Path]:
+) -> Writer:
     """Return what writes an MCAP file."""
 
     def write(folder: Path) -> Path:
@@ -248,14 +252,12 @@ def mcap(
     return write
 
 
-def plain(messages: Iterable[Row], **options: Any) -> Callable[[Path], Path]:
+def plain(messages: Iterable[Row], **options: Any) -> Writer:
     """Return what writes rows as an MCAP file."""
     return lambda folder: mcap(encode(messages), **options)(folder)
 
 
-def folder_of(
-    plugin: str = "MCAP", compression: str = "NONE", parts: int = 1
-) -> Callable[[Path], Path]:
+def folder_of(plugin: str = "MCAP", compression: str = "NONE", parts: int = 1) -> Writer:
     """Return what writes a folder as `ros2 bag record` does, split into files."""
 
     def write(folder: Path) -> Path:
@@ -290,7 +292,7 @@ def folder_of(
     return write
 
 
-def file_of(write: Callable[[Path], Path], name: str = "") -> Callable[[Path], Path]:
+def file_of(write: Writer, name: str = "") -> Writer:
     """Return what writes a folder, and gives its only file of messages, as `name`."""
 
     def inner(folder: Path) -> Path:
@@ -300,7 +302,7 @@ def file_of(write: Callable[[Path], Path], name: str = "") -> Callable[[Path], P
     return inner
 
 
-def cut(write: Callable[[Path], Path], share: float) -> Callable[[Path], Path]:
+def cut(write: Writer, share: float) -> Writer:
     """Return what writes the first part of a file."""
 
     def inner(folder: Path) -> Path:
@@ -311,7 +313,7 @@ def cut(write: Callable[[Path], Path], share: float) -> Callable[[Path], Path]:
     return inner
 
 
-def content(data: bytes, name: str = "bag.mcap") -> Callable[[Path], Path]:
+def content(data: bytes, name: str = "bag.mcap") -> Writer:
     def write(folder: Path) -> Path:
         (folder / name).write_bytes(data)
         return folder / name
@@ -396,7 +398,7 @@ def big_endian(record: Record) -> Record:
     return record._replace(data=bytes(data))
 
 
-def changed(change: Callable[[Record], Record]) -> Callable[[Path], Path]:
+def changed(change: Callable[[Record], Record]) -> Writer:
     """Return what writes an MCAP file with changed records."""
     return lambda folder: mcap(map(change, encode(rows())))(folder)
 
@@ -429,7 +431,7 @@ def several(folder: Path) -> Path:
     return folder / "push"
 
 
-def changed_folder(change: Callable[[Path], object], parts: int = 1) -> Callable[[Path], Path]:
+def changed_folder(change: Callable[[Path], object], parts: int = 1) -> Writer:
     def write(folder: Path) -> Path:
         path = folder_of(parts=parts)(folder)
         change(path)

@@ -308,7 +308,7 @@ def test_checks_that_a_user_asks_of_jax_do_not_stop_it(vector, option, value):
 def test_a_film_is_recorded(kind, tmp_path):
     pytest.importorskip("moviepy")
     wrappers = gymnasium.wrappers if kind is gymnasium.make else gymnasium.wrappers.vector
-    env = kind("rps_jax/Push-v0", render_mode="rgb_array", **HOW | {"hold": 0.2})
+    env = kind("rps_jax/Push-v0", render_mode="rgb_array", **HOW)
     env = wrappers.RecordVideo(env, str(tmp_path), episode_trigger=lambda _: True, video_length=2)
     env.reset(seed=0)
     for _ in range(3):

@@ -297,9 +297,10 @@ def test_a_trial_ends_at_a_wall_and_a_wide_door_lets_it_pass(tmp_path):
     assert trace.data.outcome_wall_touch == 0
     assert 0.1 < trace.data.outcome_clearance < 0.6
     assert trace.data.walls.shape == (16, 2, 2)
-    low = [[3.6, 0], [3.7, 0], [3.7, 2.5], [3.6, 2.5]]
-    task = HALL | {"polygons": [low], "base_radius": 0.3, "object_radius": 0}
-    touched = rps_jax.push("box", task=task, skin="ideal", setting=SETTING)
+    low = [[3.2, 0], [3.3, 0], [3.3, 2.5], [3.2, 2.5]]
+    far = [[8.5, 3.5], [8.6, 3.5], [8.6, 3.6], [8.5, 3.6]]  # for equal numbers of walls
+    task = HALL | {"polygons": [low, far], "base_radius": 0.3, "object_radius": 0}
+    touched = rps_jax.push("cylinder", task=task, skin="ideal", setting=SETTING)
     assert touched.data.outcome_wall_touch > 0
     assert not touched.outcome.success
     point = Point(touched.data.outcome_touch_x + 1.5, touched.data.outcome_touch_y + 2)

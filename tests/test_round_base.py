@@ -57,7 +57,7 @@ def meet(shape: Footprint, radius: float = 0.3) -> tuple[np.ndarray, np.ndarray,
     return np.array(normal), np.array(point), float(gap)
 
 
-def test_outline_and_sizes() -> None:
+def test_outline_and_sizes():
     shell = ROUND.shell
     assert shell.sizes == (0.3,)
     assert shell.half == (0.3, 0.3)
@@ -68,7 +68,7 @@ def test_outline_and_sizes() -> None:
     assert parse_robot("round").sizes[0] == parse_robot("ideal").half_width
 
 
-def test_taxels_are_evenly_spaced_along_the_front_270_degrees() -> None:
+def test_taxels_are_evenly_spaced_along_the_front_270_degrees():
     taxels = np.asarray(ROUND.shell.taxels()[:, 0])
     bearing = np.arctan2(taxels[:, 1], taxels[:, 0])
     assert len(taxels) == 42
@@ -89,7 +89,7 @@ def test_taxels_are_evenly_spaced_along_the_front_270_degrees() -> None:
         (box(0.1, 0.0), (1, 0), (0.1, 0), -0.4),  # around the middle of the base
     ],
 )
-def test_contact(shape: Footprint, normal: Any, point: Any, gap: float) -> None:
+def test_contact(shape, normal, point, gap):
     result = meet(shape)
     for value, expected in zip(result, (normal, point, gap), strict=True):
         assert_allclose(value, expected, atol=1e-6)
@@ -98,7 +98,7 @@ def test_contact(shape: Footprint, normal: Any, point: Any, gap: float) -> None:
 @pytest.mark.parametrize(
     "shape", [box(0.52, 0.1, yaw=0.3), fp.place(fp.circle(0.2), jnp.array([0.51, 0]), 0.0)]
 )
-def test_turning_the_base_changes_nothing_in_contact(shape: Footprint) -> None:
+def test_turning_the_base_changes_nothing_in_contact(shape):
     normal, point, gap = meet(shape)
     for angle in (0.5, 2.0, -3.0):
         c, s = math.cos(angle), math.sin(angle)
@@ -108,7 +108,7 @@ def test_turning_the_base_changes_nothing_in_contact(shape: Footprint) -> None:
             assert_allclose(value, other, atol=1e-6)
 
 
-def test_a_large_round_base_is_flat() -> None:
+def test_a_large_round_base_is_flat():
     shape, half = box(0.52, 0.05, yaw=0.01), 0.3
     x, y = shape.vertices.T
     flat, points, gaps = polygon_contact((x, y), (jnp.roll(x, -1), jnp.roll(y, -1)), (half, half))
@@ -122,7 +122,7 @@ def test_a_large_round_base_is_flat() -> None:
 
 @pytest.mark.parametrize("name", ["ideal", "capacitive"])
 @pytest.mark.parametrize("bearing", [0.0, 0.6, -1.2, 2.2])
-def test_skin_senses_the_arc_length(name: str, bearing: float) -> None:
+def test_skin_senses_the_arc_length(name, bearing):
     ahead = box(0.503, 0.0)
     reading = read(SKINS[name], turned(ahead, bearing))
     assert reading.contact_type != NONE
@@ -134,7 +134,7 @@ def test_skin_senses_the_arc_length(name: str, bearing: float) -> None:
     assert_allclose(mirrored, reading.p_robot_contact * jnp.array([1, -1]), atol=1e-5)
 
 
-def test_skin_ends_with_its_boards() -> None:
+def test_skin_ends_with_its_boards():
     ideal = SKINS["ideal"]
     assert read(ideal, turned(box(0.503, 0.0), 3.0)).contact_type == NONE
     assert read(ideal, turned(box(0.507, 0.0), 0.0)).contact_type == NONE  # 7 mm away
@@ -155,7 +155,7 @@ def test_drawn_worlds_have_round_bases():
     assert np.all(batch.worlds.skin.shell.radius == ROBOTS["round"].radius)
 
 
-def test_rps_gets_the_arc_length() -> None:
+def test_rps_gets_the_arc_length():
     params, point = rps.RPSParams.paper(), (0.3 * math.cos(1.0), 0.3 * math.sin(1.0))
     obs = observation([0, 0], 0.0, point, True, [2, 0])._replace(base_radius=0.3)
     details = rps.step_with_details(params, rps.RPSState.init(params), obs)[2]
@@ -165,7 +165,7 @@ def test_rps_gets_the_arc_length() -> None:
 
 @pytest.mark.parametrize("engine", ["fused", "quasistatic", slow("mjx")])
 @pytest.mark.parametrize("name", [slow("box"), "cylinder"])
-def test_engines_agree(name: str, engine: str) -> None:
+def test_engines_agree(name, engine):
     """Compare pushes in which an object slides and turns on the arc."""
     loaded = scene.load(name, FINE, FRICTION["S1"], robot=ROUND)
     start = scene.initial_qpos(loaded, gap=0.001)[None]
@@ -180,7 +180,7 @@ def test_engines_agree(name: str, engine: str) -> None:
     assert_allclose(ends[engine][3:5], ends["mujoco"][3:5], atol=tolerance)
 
 
-def test_a_low_object_touches_below_its_top() -> None:
+def test_a_low_object_touches_below_its_top():
     loaded = scene.load("box", robot=ROUND)
     spheres = [loaded.physics.geom(f"base_{name}") for name in ("low", "high")]
     assert [geom.pos[2] for geom in spheres] == pytest.approx([0.06, 0.34])
