@@ -310,26 +310,20 @@ def test_a_scan_of_worlds_is_that_of_jax_and_so_are_its_derivatives(monkeypatch)
     assert len(compiled) == 7  # forward, and backward or a tangent map
 
 
+SLIPS = dict.fromkeys(("robot_slip", "robot_slip_sideways", "robot_slip_yaw"), Range(0, 0.5))
+
+
 @pytest.mark.parametrize(
-    ("law", "skin"),
+    ("law", "options"),
     [
-        ("rps", "ideal"),
-        *((x, "capacitive") for x in ("rps", "aps", "rps_plus", "pursuit", "dipole")),
+        ("rps", {"skin": "ideal"}),
+        *((x, {}) for x in ("rps", "aps", "rps_plus", "pursuit", "dipole")),
+        slow("rps", {"domain": "real", **SLIPS}),
     ],
 )
-def test_the_loop_of_an_equation_is_compiled_as_a_whole(law, skin, monkeypatch):
+def test_the_loop_of_an_equation_is_compiled_as_a_whole(law, options, monkeypatch):
     monkeypatch.setattr(native, "load", lambda name: True)  # no compiler runs
-    stage, inputs, loop = batch("box", skin, 2, law)
-    primitives = str(jax.make_jaxpr(advance(stage, loop, 3))(*inputs, start_trials(inputs, loop)))
-    assert "rps_native" in primitives
-    assert "while" not in primitives
-
-
-@pytest.mark.slow
-def test_the_loop_of_a_base_with_slip_is_compiled_as_a_whole(monkeypatch):
-    monkeypatch.setattr(native, "load", lambda name: True)
-    slips = dict.fromkeys(("robot_slip", "robot_slip_sideways", "robot_slip_yaw"), Range(0, 0.5))
-    stage, inputs, loop = batch("box", count=2, law="rps", domain="real", **slips)
+    stage, inputs, loop = batch("box", count=2, law=law, **options)
     primitives = str(jax.make_jaxpr(advance(stage, loop, 3))(*inputs, start_trials(inputs, loop)))
     assert "rps_native" in primitives
     assert "while" not in primitives
