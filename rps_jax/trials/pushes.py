@@ -70,8 +70,8 @@ def build(
 ) -> WorldBatch:
     """Return the worlds of n cases of one kind (see `kind`), on the host.
 
-    (setting.world_seed, index) is the key of the imperfections of the skin of a world; by default the
-    indices count from 0.
+    (setting.world_seed, index) is the key of the imperfections of the skin of a world; by default
+    the indices count from 0.
     """
     trials = np.arange(len(cases)) if indices is None else np.asarray(indices)
     for case in cases:
