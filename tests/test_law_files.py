@@ -95,7 +95,7 @@ def test_the_commands_print_that_the_law_returned_nan(tmp_path, capsys):
 
 def test_a_push_says_that_the_law_returned_nan(tmp_path):
     path = write_law(tmp_path, "v_y = jnp.sqrt(-details.distance)")
-    trace = push("box", law=str(path), setting=setting_of(0.2, "fused"))
+    trace = push("box", law=str(path), setting=setting_of(0.2))
     assert trace.summary == "diverged at 0.00 s, since the law returned NaN"
 
 
