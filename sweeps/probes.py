@@ -184,13 +184,13 @@ def remove_unused() -> None:
     for path in FILE.parents[1].rglob("results/*.json"):
         named |= json.loads(path.read_text(encoding="utf-8")).get("probes", {}).items()
     records = stored()
-    kept = {
+    current = {
         probe: rows
         for probe, ids in records.items()
         if (rows := {id: x for id, x in ids.items() if (probe, id) in named})
     }
-    if kept != records:
-        write(kept)
+    if current != records:
+        write(current)
 
 
 @functools.cache
