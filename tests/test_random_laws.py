@@ -45,6 +45,7 @@ OPERATIONS = {
         lambda x, y: x * y,
         lambda x, y: jnp.where(y == 0, x, x / 2),
         lambda x, y: x[::-1] + y,
+        lambda x, y: (x + y) - (x + y)[2],
         lambda x, y: jnp.interp(x, jnp.arange(4.0), y),
     ],
     "f f": [
@@ -82,6 +83,9 @@ OPERATIONS = {
         lambda x, k: x.at[indices(k)].set(-1.5),
         lambda x, k: lax.dynamic_update_slice(x, x[:2], (k,)),
         lambda x, k: lax.fori_loop(0, 3, lambda n, y: jnp.where(n < k, y[::-1] + 0.5, y), x),
+        lambda x, k: lax.fori_loop(
+            0, 2, lambda _, y: (jnp.broadcast_to(y[0][1], (COUNT,)), y[1] + k), (x, x)
+        )[0],
         lambda x, k: lax.while_loop(
             lambda c: (c[0] < k & 7) & (c[1][0] < 9), lambda c: (c[0] + 1, c[1] + 1.25), (0, x)
         )[1],
