@@ -74,7 +74,7 @@ def solve(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     or starts to slide, the derivative is one-sided.
 
     Derivatives are those of the minimum: if `model.opt.iterations` is below 100, Newton's method
-    goes on from the returned accelerations, which stay MJX's. After one iteration, derivatives are
+    continues from the returned accelerations, which stay MJX's. After one iteration, derivatives are
     those of this iteration, as MJX has them.
 
     Args:
