@@ -74,8 +74,8 @@ def solve(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     or starts to slide, the derivative is one-sided.
 
     Derivatives are those of the minimum: if `model.opt.iterations` is below 100, Newton's method
-    continues from the returned accelerations, which stay MJX's. After one iteration, derivatives are
-    those of this iteration, as MJX has them.
+    continues from the returned accelerations, which stay MJX's. After one iteration, derivatives
+    are those of this iteration, as MJX has them.
 
     Args:
       model: of MJX, with its implementation in JAX.
