@@ -34,8 +34,8 @@ from rps_jax.runs import execution
 from rps_jax.runs.plan import Plan
 from rps_jax.runs.question import Question, Run, TrialQuestion
 from rps_jax.runs.results import Results
+from rps_jax.trials.batch_run import run_batch
 from rps_jax.trials.progress import Progress, ProgressCallback, SequentialProgress, no_progress
-from rps_jax.trials.rollout import rollout
 from rps_jax.trials.trial import Outcome
 from sweeps import probes, render_tables
 
@@ -298,7 +298,7 @@ def run_together(plans: Sequence[Plan], run: Run) -> list[xr.Dataset]:
             columns = {name: x[mask] for name, x in outcomes.columns().items()}
             requests[owner].collect(indices[mask] - first, Outcome.of_columns(columns))
 
-    rollout(requests, plans[0].setting, collect, **run.batch_options)
+    run_batch(requests, plans[0].setting, collect, **run.batch_options)
     return [request.dataset() for request in requests]
 
 

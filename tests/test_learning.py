@@ -30,7 +30,7 @@ from rps_jax.runs.plan import Plan, load_plan, open_run
 from rps_jax.trials.env import PushEnv, Reward
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import Rules
-from rps_jax.tuning import ppo, rollout
+from rps_jax.tuning import collection, ppo
 from rps_jax.tuning.learn import UNITS
 from rps_jax.tuning.ppo import PPO, TrainState, Transition
 
@@ -418,12 +418,14 @@ def test_an_initial_law_has_the_network_of_the_options(learned, tmp_path):
 
 def test_worlds_that_sometimes_fail_are_drawn_most():
     options = PPO(hard=0.5)
-    rates = rollout.failure_rates(
+    rates = collection.failure_rates(
         jnp.array([0.0, 0.5, 1.0, 0.0]), jnp.array([3, 3, 2]), jnp.array([True, False, False]),
         jnp.array([False, False, False]),
     )  # fmt: skip
     np.testing.assert_allclose(rates, [0, 0.5, 1, 0.3], atol=1e-6)
-    draw = partial(rollout.draw_indices, failures=rates, key=jax.random.PRNGKey(0), shape=(200, 50))
+    draw = partial(
+        collection.draw_indices, failures=rates, key=jax.random.PRNGKey(0), shape=(200, 50)
+    )
     counts = np.bincount(np.array(draw(options)).ravel(), minlength=4) / 10_000
     weights = np.array([0, 0.275, 0.05, 0.225])
     np.testing.assert_allclose(counts, 0.125 + 0.5 * weights / weights.sum(), atol=0.02)
@@ -476,7 +478,7 @@ def test_a_sweep_agrees_with_the_environment(learned, registries):
     results = run_sweep({name: params}, CYLINDERS, worlds=4, setting=setting)
     policy = policies.decode((learned[0] / "policy.npz").read_bytes(), "policy")
     env = PushEnv("random_cylinder", CYLINDERS, setting=setting, worlds=4)
-    run = jax.jit(partial(rollout.rollouts, policy.network, [env]))
+    run = jax.jit(partial(collection.run_policy, policy.network, [env]))
     (states,) = run([env.table], policy.weights)
     np.testing.assert_array_equal(states.data.steps * env.dt, np.float32(results.time[0]))
     np.testing.assert_array_equal(states.data.success, results.success[0] > 0)
@@ -487,9 +489,9 @@ def test_a_sweep_agrees_with_the_environment(learned, registries):
 def test_an_easier_world_has_its_target_nearer_and_more_ahead():
     env = PushEnv("random_cylinder", CYLINDERS, setting=Setting(engine="fused"), worlds=3)
     world = row(jax.device_get(env.table), 0)._replace(p_world_target=jnp.array([0.0, 2.0]))
-    half = rollout.ease(world, jnp.array(0.5)).p_world_target
+    half = collection.ease(world, jnp.array(0.5)).p_world_target
     np.testing.assert_allclose(half, 1.4 * np.array([1, 1]) / np.sqrt(2), rtol=1e-6)
-    np.testing.assert_array_equal(rollout.ease(world, jnp.array(1.0)).p_world_target, [0.0, 2.0])
+    np.testing.assert_array_equal(collection.ease(world, jnp.array(1.0)).p_world_target, [0.0, 2.0])
 
 
 def test_rewards_of_privileged_quantities():

@@ -165,18 +165,18 @@ def runs_on_devices(folder, counts):
     run the others fail.
     """
     cache.use_cache(folder / "cache")
-    devices, plain = jax.local_devices(), batch._Slots.arguments
+    devices, plain = jax.local_devices(), batch._SlotData.inputs.fget
     missing, segments, fails, rest_ended = [], {}, [], threading.Event()
     jax.monitoring.register_event_listener(lambda name, **_: missing.append(name))
 
-    def arguments(self):
+    def inputs(self):
         if self._device is devices[0]:
             assert rest_ended.wait(60)
         elif fails:
             raise OSError("no memory")
         return plain(self)
 
-    batch._Slots.arguments = arguments
+    batch._SlotData.inputs = property(inputs)
     for count in counts:
         if count == "as on GPUs":  # which run a segment while the host reads another
             batch._tail_slots, count = lambda: SLOTS, 3

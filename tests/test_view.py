@@ -26,8 +26,8 @@ from rps_jax.app import gate, viewer
 from rps_jax.control import learned
 from rps_jax.errors import InputError
 from rps_jax.trials import pushes
+from rps_jax.trials.live import Live
 from rps_jax.trials.setting import Setting
-from rps_jax.trials.stepper import Live
 from rps_jax.trials.trial import Rules
 
 SETTING = replace(SHORT, rules=Rules(horizon=12.0))

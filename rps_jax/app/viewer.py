@@ -34,9 +34,9 @@ from rps_jax.runs.push import case_options, end_in_words, program_slots, select_
 from rps_jax.runs.question import Action, call_of
 from rps_jax.trials import pushes
 from rps_jax.trials.case import Case, label_of
+from rps_jax.trials.live import CHUNK, Live
 from rps_jax.trials.progress import ProgressCallback
 from rps_jax.trials.setting import Setting
-from rps_jax.trials.stepper import CHUNK, Live
 from rps_jax.world import objects, tasks
 from rps_jax.world.scene import Scene
 

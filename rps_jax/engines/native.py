@@ -63,6 +63,11 @@ _COMPILATIONS = ThreadPoolExecutor(4, "compiler")
 _locks: defaultdict[str, threading.RLock] = defaultdict(threading.RLock)
 
 
+def steps(*stages: object) -> bool:
+    """Return whether this module can compile the steps of stages."""
+    return all(getattr(stage, "native", False) for stage in stages) and is_available()
+
+
 def is_available() -> bool:
     """Whether functions are compiled here: with a compiler, in float, and not within another.
 

@@ -22,8 +22,8 @@ from rps_jax.record.checkpoint import Checkpoints
 from rps_jax.runs.plan import Plan, Shard, open_run, shard_chunks
 from rps_jax.runs.results import Results, name_of
 from rps_jax.trials.batch import BatchSize
+from rps_jax.trials.batch_run import run_batch
 from rps_jax.trials.progress import Progress, ProgressCallback, no_progress
-from rps_jax.trials.rollout import rollout
 
 # Runs the missing chunks of a shard in a folder, and may return their results.
 RunMissing = Callable[..., Results | None]
@@ -54,7 +54,7 @@ def run_missing(
         callback(replace(progress, finished=finished + progress.finished))
 
     results = Results(plan, missing, partial(store_chunk, folder))
-    rollout([results], plan.setting, results.collect, callback=add_finished, **size)
+    run_batch([results], plan.setting, results.collect, callback=add_finished, **size)
     return results
 
 
@@ -83,7 +83,7 @@ def run_plan(
     """
     if folder is None:
         results = Results(plan, list(plan.chunks))
-        rollout([results], plan.setting, results.collect, **options)
+        run_batch([results], plan.setting, results.collect, **options)
         return label(results.dataset())
     open_run(folder, plan)
     with run_folder.lock(folder, shard.index, shard.count):

@@ -43,9 +43,9 @@ def name_of(chunk: int) -> str:
 class Results:
     """Results of a plan, which fill as trials end or as stored chunks are inserted.
 
-    It is the request of a rollout of some chunks, and collects their outcomes. The number of slots
-    depends on the whole plan alone. So a chunk has the same bits whoever runs it, and whichever
-    other chunks run beside it.
+    It is the request of a batch run of some chunks, and collects their outcomes. The number of
+    slots depends on the whole plan alone. So a chunk has the same bits whoever runs it, and
+    whichever other chunks run beside it.
     """
 
     def __init__(self, plan: Plan, chunks: Sequence[int] = (), store: StoreChunk | None = None):
@@ -70,7 +70,7 @@ class Results:
             chunk_of[trials] = chunk
         return chunk_of
 
-    # --- a rollout -------------------------------------------------------------------------
+    # --- a batch run -----------------------------------------------------------------------
 
     def jobs(self, setting: Setting) -> Iterator[Job]:
         """Yield the chunks to run; their worlds are built chunk by chunk."""

@@ -21,7 +21,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from rps_jax import errors
+from rps_jax import engines, errors
 from rps_jax.control import soft
 from rps_jax.control.base import check_finite_leaves
 from rps_jax.control.laws import rps
@@ -30,7 +30,6 @@ from rps_jax.control.learned import features
 from rps_jax.control.observation import Observation, TaxelObservation, Twist
 from rps_jax.engines import device, native
 from rps_jax.engines.base import ControlPeriod
-from rps_jax.engines.mjx_colliders import mjx
 from rps_jax.geometry import footprint as fp
 from rps_jax.geometry import planar
 from rps_jax.geometry.arrays import Pair
@@ -280,7 +279,7 @@ class PushEnv:
     @property
     def is_native(self) -> bool:
         """Whether `engines.native` can compile its functions of one world."""
-        return getattr(self._batch.stage, "native", False) and native.is_available()
+        return native.steps(self._batch.stage)
 
     @property
     def dt(self) -> float:
@@ -314,9 +313,10 @@ class PushEnv:
         return self._scene(0).model
 
     @property
-    def mjx_model(self) -> mjx.Model:
-        """Collision model of world 0, which the engine `mjx` steps."""
-        return mjx.put_model(self._scene(0).physics)
+    def mjx_model(self) -> Any:
+        """Collision model of world 0, an `mjx.Model`, which the engine `mjx` steps."""
+        engine: Any = engines.get("mjx")
+        return engine.put_model(self._scene(0).physics)
 
     @functools.cached_property
     def _alone(self) -> Domain:

@@ -36,8 +36,7 @@ def warn_of_difference(batch: WorldBatch, setting: Setting) -> None:
     It runs in the first worlds of a batch. The result is cached with the compiled law.
     """
     law, physics = batch.law, setting.physics
-    is_native = getattr(batch.stage, "native", False) and native.is_available()
-    if not is_native or programs.identity(law) is not None:
+    if not native.steps(batch.stage) or programs.identity(law) is not None:
         return
     worlds, params = jax.tree.map(lambda x: jnp.asarray(x[:_WORLDS]), batch.inputs)
 

@@ -8,10 +8,11 @@ that has ended stays as it is, and a batch stops when all its trials have ended.
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import functools
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from types import MappingProxyType
@@ -35,7 +36,7 @@ from rps_jax.control.observation import (
     displacement,
 )
 from rps_jax.engines import native
-from rps_jax.engines.base import ControlPeriod, Driven, Motion, Stage
+from rps_jax.engines.base import ControlPeriod, Driven, Engine, Motion, Stage
 from rps_jax.geometry import footprint as fp
 from rps_jax.geometry import planar
 from rps_jax.geometry.arrays import Array, Bool, Bools, Float, Floats, Ints, Scalar, Vector
@@ -441,7 +442,7 @@ def unroll(
         step = stage, world, params, trial, world_loop, lambda f, *_: f
         return _solved_step(*step, solutions)
 
-    if mapped is native.mapped and getattr(stage, "native", False) and native.is_available():
+    if mapped is native.mapped and native.steps(stage):
         rules = jax.tree.map(lambda x: jnp.broadcast_to(x, trials.done.shape), loop.rules)
         return native.scan(single, trials, (worlds, params, rules), steps)
 
@@ -534,7 +535,7 @@ def advance(
     so that the same program runs a whole trial and stops wherever a trial is recorded.
     """
     stages = [stage for stage, *_ in batches]
-    if not (all(getattr(stage, "native", False) for stage in stages) and native.is_available()):
+    if not native.steps(*stages):
         return _advance_in_xla(batches, loop, steps)
 
     def single(
@@ -593,3 +594,42 @@ def _advance_in_xla(
         return step(0, carry) if on_cpu else jax.lax.fori_loop(0, _UNCHECKED, step, carry)
 
     return jax.lax.while_loop(any_runs, body, (0, tuple(batch[-1] for batch in batches)))[1]
+
+
+# --- engines that JAX does not trace -------------------------------------------------------
+
+_decide = jax.jit(jax.vmap(decide, (0, 0, 0, None)))
+_settle = jax.jit(jax.vmap(settle))
+compiled_outcome = jax.jit(outcome)
+
+
+def run_on_host(
+    engine: Engine, stage: Any, worlds: World, params: LawParams, loop: ControlLoop, threads: int
+) -> Iterator[Trial]:
+    """Run a batch of worlds to their ends with an engine that JAX does not trace.
+
+    Sensing, laws and rules run in JAX. The engine gets positions in the precision of JAX and steps
+    them in its own precision. `threads` is its number of threads.
+
+    Yields:
+      Trials at the start and after each control step.
+    """
+    worlds, params = jax.device_put((worlds, params), jax.devices("cpu")[0])
+    trials = start_all(worlds, params, np.ones(len(worlds.qpos), bool), law=loop.law)
+    dtype, qpos = trials.qpos.dtype, np.asarray(trials.qpos, float)
+    yield trials
+    opened = engine.open_batch(stage, qpos, threads, pushing(worlds), worlds.fields)
+    with contextlib.closing(opened) as batch:
+        while not np.asarray(trials.done).all():
+            decided, twist, _ = _decide(worlds, params, trials, loop)
+            qpos, running = np.asarray(decided.qpos), np.flatnonzero(~np.asarray(decided.done))
+            # Only a scripted shift moves the object outside of the engine.
+            moved = np.flatnonzero(np.any(qpos != np.asarray(trials.qpos), axis=1))
+            batch.place(moved, qpos[moved])
+            if running.size:
+                twists = np.stack(twist, axis=1)[running].astype(float)
+                batch.drive(running, twists, loop.physics.substeps)
+            driven = jax.tree.map(lambda x: x.astype(dtype), batch.driven)
+            driven = driven if loop.law.senses == "force" else driven._replace(force=None)
+            trials = _settle(worlds, trials, decided, driven)
+            yield trials

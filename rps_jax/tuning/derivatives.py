@@ -33,7 +33,7 @@ from rps_jax.trials import trial
 from rps_jax.trials.results import WORLD, labelled
 from rps_jax.trials.score import Objective
 from rps_jax.trials.setting import Setting
-from rps_jax.trials.single import control_loop, count_steps
+from rps_jax.trials.trajectory import control_loop, count_steps
 from rps_jax.trials.trial import ControlLoop, Snapshot
 from rps_jax.trials.worlds import drawn_worlds, soften_skins
 from rps_jax.tuning import gradients

@@ -37,9 +37,9 @@ from rps_jax.trials.progress import Bar, Progress, ProgressCallback
 from rps_jax.trials.results import labelled
 from rps_jax.trials.setting import Setting, Split, seed_of
 from rps_jax.trials.trial import Rules
-from rps_jax.tuning import rollout
+from rps_jax.tuning import collection
+from rps_jax.tuning.collection import RunnerState
 from rps_jax.tuning.ppo import PPO
-from rps_jax.tuning.rollout import RunnerState
 from rps_jax.tuning.run import Domains, parse_domains
 from rps_jax.world.domain import Domain, to_json
 
@@ -127,8 +127,8 @@ class Learn(PPO, TaskOption, SimulationQuestion[xr.Dataset]):
     """Run folder, with `policy.npz`; a killed run resumes there."""
 
     # Functions of the algorithm, which a subclass may replace.
-    start: ClassVar[Callable[..., RunnerState]] = staticmethod(rollout.start)
-    update: ClassVar[Callable[..., tuple[RunnerState, Any]]] = staticmethod(rollout.update)
+    start: ClassVar[Callable[..., RunnerState]] = staticmethod(collection.start)
+    update: ClassVar[Callable[..., tuple[RunnerState, Any]]] = staticmethod(collection.update)
 
     @functools.cached_property
     def domains(self) -> tuple[Domain, ...]:
@@ -231,12 +231,12 @@ class _Learner:
         envs, validation_envs = (options.environments(split) for split in ("tune", "validate"))
         self._num_worlds = options.num_envs * len(envs)
         self._tables = tables = [env.table for env in envs]
-        self.network = network = rollout.network_of(options, envs)
+        self.network = network = collection.network_of(options, envs)
         compile_start = time.perf_counter()
         self._validation_tables = [env.table for env in validation_envs]
         start = partial(options.start, options, network, envs, seed=options.setting.seed)
         update = partial(options.update, options, network, envs)
-        evaluate = partial(rollout.evaluate_policy, network, validation_envs)
+        evaluate = partial(collection.evaluate_policy, network, validation_envs)
         shapes = jax.eval_shape(start, tables)
         lowered = (
             jax.jit(update, donate_argnums=1).lower(tables, shapes),

@@ -1,4 +1,4 @@
-"""Rollouts: the one way to run laws in worlds and to collect the outcomes of the trials.
+"""Batch runs: the one way to run laws in worlds and to collect the outcomes of the trials.
 
 A `Request` has the worlds of its trials, by the program that steps them. There are three kinds:
 named cases (`pushes.Cases`), the chunks of a sweep (`runs.results.Results`), and here `Candidates`:
@@ -54,13 +54,13 @@ class Request(Protocol):
         ...
 
 
-class RolloutOptions(BatchOptions, total=False):
-    """Keyword arguments of `rollout`."""
+class RunOptions(BatchOptions, total=False):
+    """Keyword arguments of `run_batch`."""
 
     capacity: Callable[[int], int]
 
 
-def rollout(
+def run_batch(
     requests: Sequence[Request],
     setting: Setting,
     collect: Collect,
@@ -94,9 +94,9 @@ def rollout(
 
 
 def outcomes(
-    requests: Sequence[Request], setting: Setting, **options: Unpack[RolloutOptions]
+    requests: Sequence[Request], setting: Setting, **options: Unpack[RunOptions]
 ) -> tuple[list[Outcome], Timing]:
-    """Run every trial of every request by `rollout`, and collect the outcomes in arrays.
+    """Run every trial of every request by `run_batch`, and collect the outcomes in arrays.
 
     Returns:
       The outcomes of each request, on the host with leaves (*shape, ...); and where the time went.
@@ -110,7 +110,7 @@ def outcomes(
                 columns[name] = np.empty((count, *leaf.shape[1:]), leaf.dtype)
             columns[name][indices] = leaf
 
-    timing = rollout(requests, setting, collect, **options)
+    timing = run_batch(requests, setting, collect, **options)
     whole = Outcome.of_columns(columns)
     trials = (np.arange(math.prod(x.shape)).reshape(x.shape) for x in requests)
     pairs = zip(firsts, trials, strict=True)

@@ -376,7 +376,7 @@ def _raise_level(ppo: PPO, runner: RunnerState, stats: Stats) -> RunnerState:
     return runner._replace(level=level, ended=ended, succeeded=succeeded)
 
 
-def rollouts(
+def run_policy(
     network: Network, envs: Sequence[PushEnv], tables: Sequence[World], actor: Weights
 ) -> list[State]:
     """Push without noise in all worlds of all environments; return the last states."""
@@ -399,6 +399,6 @@ def evaluate_policy(
     network: Network, envs: Sequence[PushEnv], tables: Sequence[World], actor: Weights
 ) -> Pair:
     """Return success (N,) bool and time (N,) [s] of the law in all worlds of all environments."""
-    states = rollouts(network, envs, tables, actor)
+    states = run_policy(network, envs, tables, actor)
     pairs = zip(envs, states, strict=True)
     return _join([(x.data.success, x.data.steps * env.dt) for env, x in pairs])
