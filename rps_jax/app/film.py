@@ -25,7 +25,7 @@ from rps_jax.runs.plan import Plan, build_batch, scene_of
 from rps_jax.runs.push import find_differences, program_slots, select_law
 from rps_jax.runs.question import Action, call_of
 from rps_jax.trials import pushes, trial
-from rps_jax.trials.batch import WorldBatch, rows
+from rps_jax.trials.jobs import WorldBatch, rows
 from rps_jax.trials.progress import Bar, Progress, ProgressCallback
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import Outcome

@@ -13,7 +13,7 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, TypeVar, get_args
+from typing import Annotated, Any, TypeVar, get_args
 
 import jax
 import numpy as np
@@ -25,12 +25,20 @@ from rps_jax.control.learned import policy
 from rps_jax.errors import InputError
 from rps_jax.record import files
 from rps_jax.record.files import JsonObject
+from rps_jax.record.manifest import Stored
 from rps_jax.record.options import parse_changes
 
 T = TypeVar("T")  # a pytree
 # Both are `Any` for the command line, which reads a text; a program may pass parameters.
-LawLike = str | Any  # text that names a law, or parameters of its class
-LawsLike = str | Any | Sequence[Any] | Mapping[str, Any]  # one law or several, or labelled laws
+# A text that names a law, or parameters of its class.
+LawLike = Annotated[
+    str | Any, Stored(lambda name, law: {name: params_to_json(resolve_law(law)[1])})
+]
+# One law or several, or labelled laws.
+LawsLike = Annotated[
+    str | Any | Sequence[Any] | Mapping[str, Any],
+    Stored(lambda name, laws: {name: laws_to_json(resolve_laws(laws))}),
+]
 
 LAWS: dict[str, LawParams] = {}  # parameters of all offered laws, by name
 _HIDDEN: dict[str, LawParams] = {}  # of laws that are not offered: names with an underscore
@@ -304,6 +312,11 @@ def params_to_json(params: LawParams) -> JsonObject:
     """
     kind = type(params)
     return {"law": kind.__name__} | _SOURCES.get(kind, {}) | leaves_to_json(params)
+
+
+def laws_to_json(laws: Mapping[str, LawParams]) -> JsonObject:
+    """Return the parameters of laws as JSON, by their labels."""
+    return {label: params_to_json(params) for label, params in laws.items()}
 
 
 def params_from_json(values: Mapping[str, Any], run: Path | None = None) -> LawParams:

@@ -32,9 +32,7 @@ from rps_jax.record import folder as run_folder
 from rps_jax.record.files import JsonObject
 from rps_jax.runs import execution
 from rps_jax.runs.plan import Plan, Shard, chunks_by_key
-from rps_jax.runs.results import Results
-from rps_jax.trials.batch import BatchOptions
-from rps_jax.trials.batch_run import run_batch
+from rps_jax.trials.jobs import BatchOptions
 from rps_jax.trials.progress import Progress, ProgressCallback, no_progress
 
 PATIENCE = 10.0  # [s] to reach a cluster
@@ -65,8 +63,7 @@ def _work(
         )
     contents, progress = dict[int, bytes](), [Progress(0, 0.0)]
     options = BatchOptions(callback=progress.append, slots=slots, workers=threads)
-    results = Results(plan, chunks, contents.__setitem__)
-    run_batch([results], plan.setting, results.collect, **options)
+    execution.run_chunks(plan, chunks, contents.__setitem__, **options)
     return contents, progress[-1], environment
 
 

@@ -86,6 +86,10 @@ class Ceiling(DomainQuestion[xr.Dataset]):
     hold: float = option(5.0, above=0, unit="s")
     """Time between two knots of a plan [s]."""
 
+    @property
+    def sources(self) -> Sequence[str | Path]:
+        return () if self.run is None else (self.run,)
+
     @functools.cached_property
     def results(self) -> xr.Dataset | None:
         """Outcomes (law, world) of the run, if there is one."""

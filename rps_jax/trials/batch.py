@@ -3,7 +3,6 @@
 A job holds the trials that one program can step: one law, one shape family. Its worlds are built
 batch by batch when slots become free, so that memory does not grow with the number of trials.
 
-- `WorldBatch`: worlds and law parameters of some trials of a job.
 - `_TrialQueue`: the trials of a job that wait for a slot.
 - `_Program`: a program for the slots of one queue, or of several queues side by side.
 - `_SlotData`: the inputs and trials in the slots of one queue, on one worker; `segments` decides
@@ -27,24 +26,23 @@ import threading
 import time
 import warnings
 from collections import defaultdict, deque
-from collections.abc import Callable, Hashable, Iterable, Sequence
+from collections.abc import Callable, Hashable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, as_completed
 from functools import partial
-from typing import TYPE_CHECKING, Any, NamedTuple, TypedDict, TypeVar
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from rps_jax import engines, errors
-from rps_jax.control import registry, soft
-from rps_jax.control.base import Law, LawParams
+from rps_jax.control.base import Law
 from rps_jax.engines import device, programs
 from rps_jax.trials import law_check, segments, trial
+from rps_jax.trials.jobs import Collect, Inputs, Job, Tree, WorldBatch, rows
 from rps_jax.trials.progress import Progress, ProgressCallback, Segment, Timing, no_progress
 from rps_jax.trials.segments import Ended, Fill, Filled, Launch, Read, Report, Slots
 from rps_jax.trials.setting import Setting
-from rps_jax.trials.trial import ControlLoop, Outcome, Rules, Trial, World
+from rps_jax.trials.trial import ControlLoop, Outcome, SegmentState, Trial
 from rps_jax.world.physics import Physics
 
 if TYPE_CHECKING:
@@ -55,72 +53,6 @@ _REPORT_STEPS = 500  # control steps between two reports of an engine outside of
 _FIRST_TRIALS = 16384  # of a job on a GPU in the first segment, while more are built
 _TAIL_SLOTS = 8192  # of a job, on a GPU on which no trial waits
 _MAX_SIDE_BY_SIDE = 4  # jobs in one program; more would take long to compile
-
-Tree = TypeVar("Tree")  # a pytree
-
-
-class WorldBatch(NamedTuple):
-    """Worlds and law parameters of some trials of a job."""
-
-    indices: np.ndarray  # (n,) indices of the trials in the run
-    worlds: World  # leaves (n, ...), on the host
-    stage: Any  # a `Stage`, or the models of an engine outside of JAX
-    params: Any = ()  # `LawParams` with leaves (n, ...), on the host; () if not yet known
-
-    def with_params(self, params: LawParams) -> WorldBatch:
-        """Return the trials with the same law parameters in every world."""
-        count, dtype = self.indices.size, jnp.result_type(float)
-        same = jax.tree.map(lambda x: np.full((count, *np.shape(x)), x, dtype), params)
-        return self._replace(params=same)
-
-    @property
-    def law(self) -> Law:
-        """Law of the parameters."""
-        return registry.law_of(self.params)
-
-    @property
-    def inputs(self) -> Inputs:
-        """Inputs of the program, which differ from trial to trial."""
-        return self.worlds, self.params
-
-    def split(self, count: int) -> tuple[WorldBatch, WorldBatch | None]:
-        """Return the first `count` trials, and the rest if there is one."""
-        arrays = self._replace(stage=None)
-        parts = slice(count), slice(count, None)
-        first, rest = (rows(arrays, part)._replace(stage=self.stage) for part in parts)
-        return first, rest if rest.indices.size else None
-
-
-Inputs = tuple[World, LawParams]
-
-
-class Job(NamedTuple):
-    """Trials that one compiled program can step."""
-
-    program: Hashable  # key of the program; jobs with equal keys can be joined
-    num_trials: int  # at most; there are no more slots than that
-    batches: Iterable[WorldBatch]  # of one law, and of one stage if JAX traces the engine
-
-    def shifted(self, first: int) -> Job:
-        """Return the job with indices of trials that count from `first`."""
-        batches = (batch._replace(indices=first + batch.indices) for batch in self.batches)
-        return self._replace(batches=batches)
-
-
-Collect = Callable[[np.ndarray, Outcome], object]  # indices (m,) of trials and their outcomes
-
-
-class BatchSize(TypedDict, total=False):
-    """Resources of functions that run trials."""
-
-    slots: int | None  # worlds that one worker steps at once on each device of the host
-    workers: int | None  # host threads for each device
-
-
-class BatchOptions(BatchSize, total=False):
-    """Keyword arguments of functions that run trials."""
-
-    callback: ProgressCallback
 
 
 def run(
@@ -192,11 +124,6 @@ def slots_of(setting: Setting, slots: int | None = None, trials: int | None = No
     """Return the number of slots of a program, or of the program of a job with so many trials."""
     slots = engines.get(setting.engine).slots(jax.default_backend()) if slots is None else slots
     return slots if trials is None else min(slots, -(-trials // len(_devices())))
-
-
-def rows(tree: Tree, index: Any) -> Tree:
-    """Return the rows `index` of every leaf; an index is whatever arrays take."""
-    return jax.tree.map(lambda leaf: leaf[index], tree)
 
 
 def _run_in_threads(tasks: Sequence[Callable[[], object]], count: int, monitor: _Monitor) -> None:
@@ -405,15 +332,7 @@ class _Program:
         return jax.tree.map(shape, self.queues[index].shapes)
 
 
-class _State(NamedTuple):
-    """State of the slots of one queue after a segment."""
-
-    steps: Any  # (slots,) int: control steps of each trial in this segment
-    done: Any  # (slots,) bool
-    outcome: Outcome  # (slots, ...)
-
-
-_Advance = Callable[..., tuple[tuple[Trial, ...], tuple[_State, ...]]]
+_Advance = Callable[..., tuple[tuple[Trial, ...], tuple[SegmentState, ...]]]
 _Ended = tuple[np.ndarray, Outcome, float]  # indices of trials, outcomes, and [s] that all advanced
 
 
@@ -424,31 +343,11 @@ def _trace_advance(
     structure: pytree.PyTreeDef,
     leaves: tuple[jax.ShapeDtypeStruct, ...],
 ) -> Callable[[Device], _Advance]:
-    """Trace `trial.advance` for arguments of these shapes; cached."""
-
-    def advance(
-        stages: tuple[Any, ...],
-        inputs: tuple[Inputs, ...],
-        trials: tuple[Trial, ...],
-        fresh: tuple[jax.Array, ...],
-        live: tuple[jax.Array, ...],
-        rules: Rules,
-        steps: jax.Array,
-    ) -> tuple[tuple[Trial, ...], tuple[_State, ...]]:
-        pairs = zip(inputs, live, strict=True)
-        started = [trial.start_all(*leaves, mask, law=law) for leaves, mask in pairs]
-        current = tuple(map(jax.vmap(soft.tree_where), fresh, started, trials))
-        loop = ControlLoop(physics, rules, law)
-        batches = zip(stages, inputs, current, strict=True)
-        advanced = trial.advance([(stage, *x, state) for stage, x, state in batches], loop, steps)
-        # Outcomes are in the same program: another one would wait for other workers' segments.
-        return advanced, tuple(
-            _State(b.steps - a.steps, b.done, trial.outcome(b, worlds, loop))
-            for a, b, (worlds, _) in zip(current, advanced, inputs, strict=True)
-        )
+    """Trace `trial.segment_of` for arguments of these shapes; cached."""
 
     arguments = jax.tree.unflatten(structure, leaves)
-    return programs.trace_function(advance, arguments, law=law, donate=2, static=(physics,))
+    segment = trial.segment_of(physics, law)
+    return programs.trace_function(segment, arguments, law=law, donate=2, static=(physics,))
 
 
 class _SlotData:
@@ -534,8 +433,8 @@ def _run(
     ahead, at_first = (0, None) if _tail_slots() is None else (1, _FIRST_TRIALS)
     state, following = segments.start([x.slots for x in data], limits, ahead, at_first)
     actions, advance, end = deque(following), None, 0.0
-    unread = deque[tuple[float, list[int], tuple[_State, ...]]]()  # start, trials and results
-    results: Sequence[_State] = ()  # of the segment that was read
+    unread = deque[tuple[float, list[int], tuple[SegmentState, ...]]]()  # start, trials and results
+    results: Sequence[SegmentState] = ()  # of the segment that was read
     segment: Segment | None = None  # that was read
     with ThreadPoolExecutor(1) as reporter:  # reports a segment while the next one runs
         report: Future[object] = reporter.submit(int)  # of the last segment that was read
@@ -580,7 +479,7 @@ def _load(program: _Program, device: Device, monitor: _Monitor) -> _Advance:
     return lambda *arguments: advance(stages, *arguments, rules, steps)
 
 
-def _ended(at: np.ndarray, indices: np.ndarray, state: _State, period: float) -> _Ended:
+def _ended(at: np.ndarray, indices: np.ndarray, state: SegmentState, period: float) -> _Ended:
     """Return the trials in the slots `at`, and the time [s] that all trials advanced."""
     return indices, rows(state.outcome, at), float(state.steps.sum()) * period
 

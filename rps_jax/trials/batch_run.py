@@ -17,7 +17,6 @@ planner sets `per_world` and gives leaves (P, W, ...), its own parameters for ea
 from __future__ import annotations
 
 import functools
-import itertools
 import math
 from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
@@ -30,7 +29,7 @@ import numpy as np
 from rps_jax.control.base import LawParams
 from rps_jax.record.files import Arrays
 from rps_jax.trials import batch
-from rps_jax.trials.batch import BatchOptions, Collect, Job, WorldBatch, rows
+from rps_jax.trials.jobs import BatchOptions, Collect, Job, WorldBatch, rows
 from rps_jax.trials.progress import Timing
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import Outcome
@@ -85,11 +84,7 @@ def run_batch(
     for request, first in zip(requests, _first_trials(requests), strict=False):
         for job in request.jobs(setting):
             groups.setdefault(job.program, []).append(job.shifted(first))
-    jobs = []
-    for program, group in groups.items():
-        trials = capacity(sum(job.num_trials for job in group))
-        batches = itertools.chain.from_iterable(job.batches for job in group)
-        jobs.append(Job(program, trials, batches))
+    jobs = [Job.joined(group, capacity) for group in groups.values()]
     return batch.run(jobs, setting, collect=collect, **options)
 
 

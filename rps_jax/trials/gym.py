@@ -27,8 +27,8 @@ from rps_jax import errors
 from rps_jax.control import soft
 from rps_jax.engines import device
 from rps_jax.record.files import Arrays
-from rps_jax.trials.batch import rows
 from rps_jax.trials.env import SHAPED_REWARD, PushEnv, State
+from rps_jax.trials.jobs import rows
 from rps_jax.world import domain as domains
 from rps_jax.world.domain import DomainLike
 

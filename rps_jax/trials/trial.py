@@ -569,6 +569,48 @@ def advance(
     return tuple(native.concurrent(singles, in_xla, phase)(*inputs))
 
 
+class SegmentState(NamedTuple):
+    """State of a batch of trials after a segment."""
+
+    steps: Any  # (B,) int: control steps of each trial in this segment
+    done: Any  # (B,) bool
+    outcome: Outcome  # (B, ...)
+
+
+def segment_of(
+    physics: Physics, law: Law
+) -> Callable[..., tuple[tuple[Trial, ...], tuple[SegmentState, ...]]]:
+    """Return a function that starts fresh trials of batches, and runs some control steps of all.
+
+    Its arguments are stages, inputs and trials of the batches; masks (B,) of the trials that start
+    and of those that are no padding; rules, and a number of steps. It returns the trials and their
+    states.
+    """
+
+    def segment(
+        stages: tuple[Stage, ...],
+        inputs: tuple[tuple[World, LawParams], ...],
+        trials: tuple[Trial, ...],
+        fresh: tuple[jax.Array, ...],
+        live: tuple[jax.Array, ...],
+        rules: Rules,
+        steps: jax.Array,
+    ) -> tuple[tuple[Trial, ...], tuple[SegmentState, ...]]:
+        pairs = zip(inputs, live, strict=True)
+        started = [start_all(*leaves, mask, law=law) for leaves, mask in pairs]
+        current = tuple(map(jax.vmap(soft.tree_where), fresh, started, trials))
+        loop = ControlLoop(physics, rules, law)
+        batches = zip(stages, inputs, current, strict=True)
+        advanced = advance([(stage, *x, state) for stage, x, state in batches], loop, steps)
+        # Outcomes are in the same program: another one would wait for other workers' segments.
+        return advanced, tuple(
+            SegmentState(b.steps - a.steps, b.done, outcome(b, worlds, loop))
+            for a, b, (worlds, _) in zip(current, advanced, inputs, strict=True)
+        )
+
+    return segment
+
+
 def _advance_in_xla(
     batches: Sequence[Batch], loop: ControlLoop, steps: int | jax.Array
 ) -> tuple[Trial, ...]:

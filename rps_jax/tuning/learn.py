@@ -41,7 +41,7 @@ from rps_jax.tuning import collection
 from rps_jax.tuning.collection import RunnerState
 from rps_jax.tuning.ppo import PPO
 from rps_jax.tuning.run import Domains, parse_domains
-from rps_jax.world.domain import Domain, to_json
+from rps_jax.world.domain import Domain, task_attribute, to_json
 
 _CHECKPOINT = "learner"
 _VALIDATION_RATIO = 10  # learning time between two validations, as a multiple of their time
@@ -157,6 +157,9 @@ class Learn(PPO, TaskOption, SimulationQuestion[xr.Dataset]):
                 raise errors.not_allowed("initial", self.initial, rule)
         period = self.setting.physics.control_period
         errors.check_number("hold", self.hold, at_least=0.999 * period, unit="s")
+
+    def attributes(self) -> dict[str, str | int]:
+        return super().attributes() | task_attribute(self.domains[0])
 
     def fields_as_json(self) -> JsonObject:
         """Fields as JSON, with domains by their ranges."""
