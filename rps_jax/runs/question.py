@@ -21,6 +21,7 @@ import dataclasses
 import functools
 import itertools
 import re
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from operator import attrgetter
@@ -79,11 +80,23 @@ def call_of(command: Callable[P, Command[T]]) -> Callable[P, T]:
 
     @functools.wraps(command, assigned=("__module__", "__doc__"), updated=())
     def call(*args: P.args, **kwargs: P.kwargs) -> T:
-        return command(*args, **kwargs)()
+        current: Any = current_names(command, kwargs)
+        return command(*args, **current)()  # pyright: ignore[reportCallIssue]
 
     call.__name__ = call.__qualname__ = snake_case(command.__name__)
     call.__doc__ = f"{command.__doc__}\n\nFields of `{command.__name__}` are its arguments.\n"
     return call
+
+
+def current_names(command: Any, values: Mapping[str, T]) -> dict[str, T]:
+    """Return values by the present names of fields of a command; warn of former names."""
+    current = dict(values)
+    for former, name in getattr(command, "RENAMED", {}).items():
+        if former in current:
+            text = f"{former} of {snake_case(command.__name__)} will be removed: write {name}"
+            warnings.warn(text, FutureWarning, stacklevel=3)
+            current[name] = current.pop(former)
+    return current
 
 
 def snake_case(name: str) -> str:
@@ -103,6 +116,7 @@ class Command(Generic[T]):
     """Callback that receives the progress instead of a bar."""
 
     QUICK: ClassVar[Mapping[str, Any]] = {}  # values of `quick`, by the field's name
+    RENAMED: ClassVar[Mapping[str, str]] = {}  # present names of fields by their former ones
     # Fields of a class on which the answer does not depend, beside those of its base classes.
     IGNORED_FIELDS: ClassVar[tuple[str, ...]] = ("out", "progress", "report_to")
 

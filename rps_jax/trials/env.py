@@ -44,7 +44,7 @@ from rps_jax.world import domain, draws, objects, video
 from rps_jax.world.domain import DOMAINS, Domain, DomainLike
 from rps_jax.world.draws import Draw
 from rps_jax.world.opengl import mujoco
-from rps_jax.world.scene import Scene
+from rps_jax.world.scene import JOINTS, Scene
 from rps_jax.world.tasks import TaskLike
 
 
@@ -195,7 +195,8 @@ class PushEnv:
         )
         targets = state.info["observation"].touch, measured.observation
         terms = self._true_state_terms(world, previous, current, *targets)
-        for weight, term in zip(self.weights[3:5], terms, strict=True):
+        weights = self.weights.object, self.weights.behind
+        for weight, term in zip(weights, terms, strict=True):
             reward += weight * term if weight else 0.0
         obs = self._observation(world, current, measured)
         return state.replace(
@@ -229,7 +230,8 @@ class PushEnv:
             p_object, _ = trial.object_pose(state.qpos)
             way = world.task.remaining(state.task, world.p_world_target, p_object)
             gap = way - fp.circumradius(world.footprint)
-            ways = p_object - state.qpos[:2], touch.p_world_target - state.qpos[:2]
+            p_base = state.qpos[JOINTS.base_position]
+            ways = p_object - p_base, touch.p_world_target - p_base
             lengths = jnp.maximum(planar.norm(ways[0]) * planar.norm(ways[1]), 1e-6)
             return jnp.maximum(gap, 0.0), jnp.dot(*ways) / lengths
 
@@ -260,8 +262,8 @@ class PushEnv:
 
     def has_timed_out(self, data: Trial) -> jax.Array:
         """Return whether trials (...) ended by a time limit, and not by success or failure."""
-        horizon, max_lost, _ = self.setting.rules
-        late = (data.steps * self.dt >= horizon) | (data.lost_steps * self.dt > max_lost)
+        rules, lost = self.setting.rules, data.lost_steps * self.dt
+        late = (data.steps * self.dt >= rules.horizon) | (lost > rules.max_lost)
         return data.done & late & ~(data.success | data.tipped | data.diverged)
 
     # --- properties ---

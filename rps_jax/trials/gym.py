@@ -208,10 +208,12 @@ class GymPushVector(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         """Return observations (num_envs, T + 2), terminated and truncated flags, and infos."""
         data, metrics = self.state.data, self.state.metrics
         infos = {
-            "is_success": data.success, "time": data.steps * self.push_env.dt,
-            "in_contact": metrics["in_contact"] > 0, "world": self.state.info["index"],
+            "is_success": data.success,
+            "time": data.steps * self.push_env.dt,
+            "in_contact": metrics["in_contact"] > 0,
+            "world": self.state.info["index"],
             **data.task.outcomes(),
-        }  # fmt: skip
+        }
         infos = {name: np.array(values) for name, values in infos.items()}
         done, late = np.array(data.done), np.array(self.push_env.has_timed_out(data))
         return np.array(self.state.obs, np.float32), done & ~late, late, infos

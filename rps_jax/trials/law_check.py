@@ -77,7 +77,9 @@ def warn_of_difference(batch: WorldBatch, setting: Setting) -> None:
 def _move(state: Trial, period: float) -> Trial:
     """Return a trial after a control period in which its base moves on a curve."""
     time = state.steps * period
-    forward = planar.rotate(state.qpos[2], jnp.stack([0.05, 0.02 * jnp.sin(3 * time)]))
+    forward = planar.rotate(
+        state.qpos[JOINTS.base_yaw], jnp.stack([0.05, 0.02 * jnp.sin(3 * time)])
+    )
     velocity = jnp.stack([*forward, 0.1 * jnp.cos(2 * time)])
     qpos = state.qpos.at[JOINTS.base].add(period * velocity)
     return state._replace(qpos=qpos, steps=state.steps + 1)

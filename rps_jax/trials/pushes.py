@@ -60,9 +60,11 @@ def _start_of(case: Case, at: Scene) -> tuple[np.ndarray, np.ndarray]:
     c, s = math.cos(case.bearing), math.sin(case.bearing)
     turn = np.array([[c, -s], [s, c]])
     x = JOINTS.object.start
-    qpos[:3] = [*(turn @ qpos[:2]), qpos[2] + case.bearing]
-    qpos[x : x + 2] = turn @ qpos[x : x + 2]
-    qpos[x + 3 : x + 7] = [math.cos(case.bearing / 2), 0.0, 0.0, math.sin(case.bearing / 2)]
+    for position in (JOINTS.base_position, slice(x, x + 2)):
+        qpos[position] = turn @ qpos[position]
+    qpos[JOINTS.base_yaw] += case.bearing
+    quaternion = [math.cos(case.bearing / 2), 0.0, 0.0, math.sin(case.bearing / 2)]
+    qpos[JOINTS.object_quaternion] = quaternion
     return qpos, turn @ np.array(case.target)
 
 

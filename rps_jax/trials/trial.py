@@ -186,7 +186,9 @@ def object_pose(qpos: Float[Array, "10"]) -> tuple[Vector, Float[Array, ""]]:
 def p_world_contact(snapshots: Snapshot) -> Float[Array, "T 2"]:
     """Return the contact points of snapshots (T, ...) in the world [m]; NaN without contact."""
     qpos, reading = snapshots.qpos, snapshots.reading
-    point = qpos[:, :2] + planar.rotate(qpos[:, 2], reading.p_robot_contact)
+    point = qpos[:, JOINTS.base_position] + planar.rotate(
+        qpos[:, JOINTS.base_yaw], reading.p_robot_contact
+    )
     return jnp.where((reading.contact_type != NONE)[:, None], point, jnp.nan)
 
 
@@ -216,14 +218,14 @@ def shifted(world: World, trial: Trial, period: float) -> Trial:
     """Return the trial with the world's scripted shift, if it is due in this control step."""
     # Compare step numbers: rounded times could be equal twice or never.
     due = trial.steps == jnp.round(world.shift.time / period)
-    offset = planar.rotate(trial.qpos[2], jnp.asarray(world.shift.p_robot))
+    offset = planar.rotate(trial.qpos[JOINTS.base_yaw], jnp.asarray(world.shift.p_robot))
     x = JOINTS.object.start
     return trial._replace(qpos=trial.qpos.at[x : x + 2].add(jnp.where(due, offset, 0.0)))
 
 
 def outline(world: World, qpos: Float[Array, "10"]) -> Footprint:
     """Return the object's outline in the robot frame, at the positions qpos."""
-    p_world_robot, yaw = qpos[:2], qpos[2]
+    p_world_robot, yaw = qpos[JOINTS.base_position], qpos[JOINTS.base_yaw]
     p_world_object, object_yaw = object_pose(qpos)
     p_robot_object = planar.rotate(-yaw, p_world_object - p_world_robot)
     return fp.place(world.footprint, p_robot_object, object_yaw - yaw)
@@ -231,7 +233,7 @@ def outline(world: World, qpos: Float[Array, "10"]) -> Footprint:
 
 def contact_of(qpos: Float[Array, "10"], p_robot_contact: Vector) -> Vector:
     """Return a contact point in the world [m]."""
-    return qpos[:2] + planar.rotate(qpos[2], p_robot_contact)
+    return qpos[JOINTS.base_position] + planar.rotate(qpos[JOINTS.base_yaw], p_robot_contact)
 
 
 def positions_of(
@@ -272,7 +274,8 @@ def observe(
     trial = shifted(world, trial, period)
     skin, reading = world.skin.sense(trial.skin, outline(world, trial.qpos), period)
     touched = reading.p_robot_contact, reading.in_contact
-    observation = Observation(trial.qpos[:2], trial.qpos[2], *touched, world.p_world_target, period)
+    pose = trial.qpos[JOINTS.base_position], trial.qpos[JOINTS.base_yaw]
+    observation = Observation(*pose, *touched, world.p_world_target, period)
     observation = observation._replace(base_radius=world.skin.shell.radius)
     distance = planar.norm(displacement(observation))
     motion = trial.poses, trial.qpos[JOINTS.base], world.key, trial.steps, period
@@ -285,7 +288,7 @@ def observe(
     task, aim = world.task.step(trial.task, positions)
     observation = observation._replace(p_world_target=aim.p_world_target)
     success = touch & (distance < params.d_success) & aim.at_end
-    tilt = planar.tilt(trial.qpos[JOINTS.object][3:])
+    tilt = planar.tilt(trial.qpos[JOINTS.object_quaternion])
     tipped = tilt > rules.max_tilt
     over = (time >= rules.horizon) | (lost_steps * period > rules.max_lost) | tipped | aim.failed
     judged = trial._replace(
@@ -367,11 +370,13 @@ def settle(world: World, previous: Trial, decided: Trial, driven: Driven) -> Tri
     A trial that had ended before, as `previous` says, is returned as it was.
     """
     (qpos, qvel, warmstart, integral), force, *_ = driven
+    xy = JOINTS.base_position
     sane = (
         ~decided.nan_twist
         & jnp.all(jnp.isfinite(qpos))
         & jnp.all(jnp.abs(qvel) < _MAX_SPEED)
-        & jnp.all(jnp.abs(qpos.at[2].set(0.0)) < _MAX_DISTANCE)  # the base may turn without limit
+        # The base may turn without limit.
+        & jnp.all(jnp.abs(qpos.at[JOINTS.base_yaw].set(0.0)) < _MAX_DISTANCE)
     )
     state = decided.drive
     if world.robot is not None and state is not None:
@@ -381,7 +386,7 @@ def settle(world: World, previous: Trial, decided: Trial, driven: Driven) -> Tri
         qpos=qpos,
         qvel=qvel,
         warmstart=warmstart,
-        path_length=decided.path_length + planar.norm(qpos[:2] - decided.qpos[:2]),
+        path_length=decided.path_length + planar.norm(qpos[xy] - decided.qpos[xy]),
         steps=decided.steps + 1,
         drive=state,
         load=decided.load and decided.load._replace(wrench=force),
@@ -407,9 +412,14 @@ def control_step(
 
 
 def _solved_step(
-    stage: Stage, worlds: World, params: LawParams, trials: Trial, loop: ControlLoop,
-    mapped: Callable[..., Any], solutions: Any,
-) -> tuple[tuple[Trial, Snapshot], Any]:  # fmt: skip
+    stage: Stage,
+    worlds: World,
+    params: LawParams,
+    trials: Trial,
+    loop: ControlLoop,
+    mapped: Callable[..., Any],
+    solutions: Any,
+) -> tuple[tuple[Trial, Snapshot], Any]:
     """Run `control_step` with the solutions of `ControlPeriod`; return also those of `Driven`."""
     decided, twists, snapshots = mapped(decide, (0, 0, 0, None))(worlds, params, trials, loop)
     force = loop.law.senses == "force"

@@ -88,6 +88,13 @@ class Learn(PPO, TaskOption, SimulationQuestion[xr.Dataset]):
     TITLE = "A learned law"
     IGNORED_FIELDS = ("minutes", "updates", "every", "task")
     REPORTS_TIMES = True
+    RENAMED: ClassVar[Mapping[str, str]] = {
+        "hard": "prioritised",
+        "enough": "success_threshold",
+        "level": "initial_level",
+        "spread": "action_std",
+        "average": "ema_updates",
+    }
     QUICK: ClassVar[Mapping[str, Any]] = {
         "domain": ("wide,objects=random_box",),
         "network": "mlp",
