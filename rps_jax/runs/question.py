@@ -128,7 +128,7 @@ class Command(Generic[T]):
     @property
     def default_folder(self) -> Path:
         """Run folder of the shell, if no other is named."""
-        return Path(next(iter(self.sources), "runs")) / self.name
+        return Path(next(filter(None, self.sources), "runs")) / self.name
 
     @property
     def sources(self) -> Sequence[str | Path]:
@@ -327,7 +327,10 @@ class Question(Command[T]):
     def fields_as_json(self) -> JsonObject:
         """Return the fields as JSON, with laws by their parameters and a domain by its ranges."""
         kinds = (vars(kind).get("IGNORED_FIELDS", ()) for kind in type(self).__mro__)
-        return manifest.fields_to_json(self, set(itertools.chain.from_iterable(kinds)))
+        record = manifest.fields_to_json(self, set(itertools.chain.from_iterable(kinds)))
+        # Manifests keep former names, so that runs of earlier versions are continued.
+        former = {name: previous for previous, name in self.RENAMED.items()}
+        return {former.get(name, name): value for name, value in record.items()}
 
 
 # --- base classes with shared options ------------------------------------------------------

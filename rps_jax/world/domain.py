@@ -353,15 +353,12 @@ def task_in_words(domain: Domain) -> str:
     return "" if domain.task == Reach() else f", task {text}"
 
 
-# A domain or its text: see `parse_domain`.
-DomainLike = Annotated[
-    Domain | str,
-    Stored(
-        lambda name, domain: {name: to_json(parse_domain(domain))},
-        kinds=(str, Domain),
-        label=name_or_custom,
-    ),
-]
+STORED = Stored(
+    lambda name, domain: {name: to_json(parse_domain(domain))},
+    kinds=(str, Domain),
+    label=name_or_custom,
+)
+DomainLike = Annotated[Domain | str, STORED]  # or its text: see `parse_domain`
 
 
 def parse_domain(

@@ -49,6 +49,7 @@ class Costs(SpeedStudy[xr.Dataset]):
     """
 
     TITLE: ClassVar[str] = "Cost of tasks"
+    IGNORED_FIELDS: ClassVar[tuple[str, ...]] = ("workers",)
     CHOICES: ClassVar = {"tasks": TASKS}
     GROWS: ClassVar[tuple[str, ...]] = ("tasks",)
     PRESETS: ClassVar = {"tasks": TASKS, "domain": DOMAIN}
