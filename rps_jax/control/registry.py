@@ -30,15 +30,16 @@ from rps_jax.record.options import parse_changes
 
 T = TypeVar("T")  # a pytree
 # Both are `Any` for the command line, which reads a text; a program may pass parameters.
-# A text that names a law, or parameters of its class.
-LawLike = Annotated[
-    str | Any, Stored(lambda name, law: {name: params_to_json(resolve_law(law)[1])})
-]
+STORED_LAW = Stored(lambda name, law: {name: params_to_json(resolve_law(law)[1])})
+STORED_LAWS = Stored(
+    lambda name, laws: {name: {k: params_to_json(x) for k, x in resolve_laws(laws).items()}},
+    lambda name, entries, folder: {
+        label: params_from_json(values, folder) for label, values in dict(entries[name]).items()
+    },
+)
+LawLike = Annotated[str | Any, STORED_LAW]  # text that names a law, or parameters of its class
 # One law or several, or labelled laws.
-LawsLike = Annotated[
-    str | Any | Sequence[Any] | Mapping[str, Any],
-    Stored(lambda name, laws: {name: laws_to_json(resolve_laws(laws))}),
-]
+LawsLike = Annotated[str | Any | Sequence[Any] | Mapping[str, Any], STORED_LAWS]
 
 LAWS: dict[str, LawParams] = {}  # parameters of all offered laws, by name
 _HIDDEN: dict[str, LawParams] = {}  # of laws that are not offered: names with an underscore
@@ -312,11 +313,6 @@ def params_to_json(params: LawParams) -> JsonObject:
     """
     kind = type(params)
     return {"law": kind.__name__} | _SOURCES.get(kind, {}) | leaves_to_json(params)
-
-
-def laws_to_json(laws: Mapping[str, LawParams]) -> JsonObject:
-    """Return the parameters of laws as JSON, by their labels."""
-    return {label: params_to_json(params) for label, params in laws.items()}
 
 
 def params_from_json(values: Mapping[str, Any], run: Path | None = None) -> LawParams:

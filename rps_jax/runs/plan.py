@@ -32,45 +32,21 @@ from rps_jax.record.manifest import Stored
 from rps_jax.trials.jobs import WorldBatch
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.worlds import drawn_scene, drawn_worlds
-from rps_jax.world import domain, draws, points
+from rps_jax.world import draws, points
+from rps_jax.world.domain import STORED as STORED_DOMAIN
 from rps_jax.world.domain import Domain, name_or_custom, task_attribute
 from rps_jax.world.draws import Draw
 from rps_jax.world.points import Points
 from rps_jax.world.scene import Scene
 
-# How manifests store the fields of a plan.
-_Domain = Annotated[
-    Domain,
-    Stored(
-        lambda name, ranges: {name: domain.to_json(ranges)},
-        lambda name, entries, folder: domain.from_json(dict(entries[name])),
-    ),
-]
-_Laws = Annotated[
-    Mapping[str, LawParams],
-    Stored(
-        lambda name, laws: {name: registry.laws_to_json(laws)},
-        lambda name, entries, folder: {
-            label: registry.params_from_json(values, folder)
-            for label, values in dict(entries[name]).items()
-        },
-    ),
-]
-_Setting = Annotated[
-    Setting,
-    Stored(
-        lambda name, setting: setting.to_json(),
-        lambda name, entries, folder: Setting.from_json(entries),
-    ),
-]
-_Points = Annotated[
-    Points | None,
-    Stored(
-        lambda name, at: {} if at is None else {name: at.digest},
-        lambda name, entries, folder: None,  # `load_plan` reads their file
-    ),
-]
-
+_SETTING = Stored(
+    lambda name, setting: setting.to_json(),
+    lambda name, entries, folder: Setting.from_json(entries),
+)
+_POINTS = Stored(
+    lambda name, at: {} if at is None else {name: at.digest},
+    lambda name, entries, folder: None,  # `load_plan` reads their file
+)
 ProgramKey = tuple[Any, ...]  # index of the object, class and shapes of the law's parameters
 
 
@@ -81,12 +57,14 @@ class Plan:
     Trial a * `worlds` + i is that of law a in world i.
     """
 
-    domain: _Domain
+    domain: Annotated[Domain, STORED_DOMAIN]
     worlds: int
-    laws: _Laws
-    setting: _Setting = Setting()  # its seed draws the worlds, too
+    laws: Annotated[Mapping[str, LawParams], registry.STORED_LAWS]
+    setting: Annotated[Setting, _SETTING] = Setting()  # its seed draws the worlds, too
     part: int = 1024  # trials of a chunk, at most
-    points: _Points = None  # of the unit cube at which the worlds lie; None: drawn worlds
+    points: Annotated[Points | None, _POINTS] = (
+        None  # of the unit cube at which the worlds lie; None: drawn worlds
+    )
 
     def __post_init__(self) -> None:
         errors.check_count("worlds", self.worlds, at_most=1_000_000_000)

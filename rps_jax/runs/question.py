@@ -5,7 +5,8 @@ strings below them their help, and `option` holds their bounds. There are two ki
 
 - `Question`: has an answer, labelled data. `answer(run)` computes it, step by step so that it can
   be resumed, and `report(results, run)` describes it in prose, tables and figures.
-- `Action`: does something else, such as write a film or serve a page; `execute(callback)` does it.
+- Any other `Command` writes a film or serves a page, for example; `execute(callback)` does it. The
+  shell prints a path that it returns.
 
     results = rps_jax.Rare("rps_tuned", "wide")()   # or rps_jax.rare("rps_tuned", "wide")
     rps rare --law rps_tuned --domain wide          # from the shell
@@ -106,7 +107,7 @@ def snake_case(name: str) -> str:
 
 @dataclass(frozen=True, kw_only=True)
 class Command(Generic[T]):
-    """Base class of questions and actions: options, their checks, and progress."""
+    """Base class of all commands: options, their checks, and progress."""
 
     out: Path | str | None = None
     """Run folder, in the shell by default runs/NAME; a run that was killed is continued there."""
@@ -226,14 +227,6 @@ def _replace_field(record: D, name: str, value: object) -> D:
     new = _replace_field(getattr(record, owner), inner, value) if inner else value
     values = {f.name: vars(record)[f.name] for f in fields(record)}  # as the user gave them
     return type(record)(**values | {owner: new})
-
-
-@dataclass(frozen=True, kw_only=True)
-class Action(Command[T]):
-    """Command that has no report, such as one that writes a film or serves a page.
-
-    The shell prints a path that `execute` returns.
-    """
 
 
 @dataclass(frozen=True, kw_only=True)

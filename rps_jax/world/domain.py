@@ -355,6 +355,7 @@ def task_in_words(domain: Domain) -> str:
 
 STORED = Stored(
     lambda name, domain: {name: to_json(parse_domain(domain))},
+    lambda name, entries, folder: from_json(dict(entries[name])),
     kinds=(str, Domain),
     label=name_or_custom,
 )
