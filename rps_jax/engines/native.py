@@ -34,6 +34,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 
 from rps_jax.engines import device
+from rps_jax.engines.base import Stage
 from rps_jax.engines.linear_map import linear_map, restrict, varied_indices
 from rps_jax.geometry import vectors
 from rps_jax.lowering import nvrtc
@@ -63,9 +64,9 @@ _COMPILATIONS = ThreadPoolExecutor(4, "compiler")
 _locks: defaultdict[str, threading.RLock] = defaultdict(threading.RLock)
 
 
-def steps(*stages: object) -> bool:
-    """Return whether this module can compile the steps of stages."""
-    return all(getattr(stage, "native", False) for stage in stages) and is_available()
+def compiles(*stages: Stage) -> bool:
+    """Whether worlds of these stages are compiled one by one here."""
+    return all(stage.native for stage in stages) and is_available()
 
 
 def is_available() -> bool:

@@ -281,7 +281,7 @@ class PushEnv:
     @property
     def is_native(self) -> bool:
         """Whether `engines.native` can compile its functions of one world."""
-        return native.steps(self._batch.stage)
+        return native.compiles(self._batch.stage)
 
     @property
     def dt(self) -> float:

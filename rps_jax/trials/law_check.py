@@ -23,7 +23,7 @@ from rps_jax.trials.trial import ControlLoop, Trial
 from rps_jax.world.scene import JOINTS
 
 if TYPE_CHECKING:
-    from rps_jax.trials.jobs import WorldBatch
+    from rps_jax.trials.batch import WorldBatch
 
 _WORLDS, _STEPS = 2, 150
 _TOLERANCE = 1e-3  # of the largest number
@@ -36,7 +36,8 @@ def warn_of_difference(batch: WorldBatch, setting: Setting) -> None:
     It runs in the first worlds of a batch. The result is cached with the compiled law.
     """
     law, physics = batch.law, setting.physics
-    if not native.steps(batch.stage) or programs.identity(law) is not None:
+    is_native = getattr(batch.stage, "native", False) and native.is_available()
+    if not is_native or programs.identity(law) is not None:
         return
     worlds, params = jax.tree.map(lambda x: jnp.asarray(x[:_WORLDS]), batch.inputs)
 
@@ -77,9 +78,7 @@ def warn_of_difference(batch: WorldBatch, setting: Setting) -> None:
 def _move(state: Trial, period: float) -> Trial:
     """Return a trial after a control period in which its base moves on a curve."""
     time = state.steps * period
-    forward = planar.rotate(
-        state.qpos[JOINTS.base_yaw], jnp.stack([0.05, 0.02 * jnp.sin(3 * time)])
-    )
+    forward = planar.rotate(state.qpos[2], jnp.stack([0.05, 0.02 * jnp.sin(3 * time)]))
     velocity = jnp.stack([*forward, 0.1 * jnp.cos(2 * time)])
     qpos = state.qpos.at[JOINTS.base].add(period * velocity)
     return state._replace(qpos=qpos, steps=state.steps + 1)

@@ -452,7 +452,7 @@ def unroll(
         step = stage, world, params, trial, world_loop, lambda f, *_: f
         return _solved_step(*step, solutions)
 
-    if mapped is native.mapped and native.steps(stage):
+    if mapped is native.mapped and native.compiles(stage):
         rules = jax.tree.map(lambda x: jnp.broadcast_to(x, trials.done.shape), loop.rules)
         return native.scan(single, trials, (worlds, params, rules), steps)
 
@@ -467,6 +467,7 @@ def unroll(
 class SingleWorld(NamedTuple):
     """Stage that steps one world without a batch axis; under `jax.vmap` it steps a batch."""
 
+    native = False
     stage: Stage
 
     def drive(self, fields: Any, motion: Motion, period: ControlPeriod) -> Driven:
@@ -545,7 +546,7 @@ def advance(
     so that the same program runs a whole trial and stops wherever a trial is recorded.
     """
     stages = [stage for stage, *_ in batches]
-    if not native.steps(*stages):
+    if not native.compiles(*stages):
         return _advance_in_xla(batches, loop, steps)
 
     def single(
