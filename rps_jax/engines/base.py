@@ -89,7 +89,7 @@ class Stage(Protocol):
 class HostBatch(Protocol):
     """Worlds that an engine steps on the host, in double precision."""
 
-    def place(self, rows: np.ndarray, qpos: np.ndarray) -> None:
+    def set_positions(self, rows: np.ndarray, qpos: np.ndarray) -> None:
         """Set the positions (n, 10) of the worlds `rows` (n,)."""
         ...
 

@@ -34,8 +34,8 @@ class Stored:
 def stored_types(kind: type) -> dict[str, Stored]:
     """Return the annotations of the fields of a dataclass that have one, by name."""
     hints = typing.get_type_hints(kind, include_extras=True)
-    found = {f.name: _annotation(hints[f.name]) for f in dataclasses.fields(kind)}
-    return {name: stored for name, stored in found.items() if stored is not None}
+    pairs = ((f.name, _annotation(hints[f.name])) for f in dataclasses.fields(kind))
+    return {name: stored for name, stored in pairs if stored is not None}
 
 
 def _annotation(hint: Any) -> Stored | None:

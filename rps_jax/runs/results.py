@@ -123,7 +123,7 @@ class Results:
         return complete
 
     def encode(self, chunk: int) -> bytes:
-        """Return the columns of a chunk as they are stored."""
+        """Return the content of a chunk's file."""
         trials = self.plan.chunks[chunk]
         law, worlds = at = np.unravel_index(trials, self.shape)
         outcomes = {name: column[at] for name, column in self._outcomes.items()}

@@ -20,7 +20,7 @@ import numpy as np
 
 
 class Slots(NamedTuple):
-    """Slots of one queue; arrays (S,), which do not change."""
+    """Slots of one queue: arrays (S,) that no function changes."""
 
     trials: np.ndarray  # indices of the trials in the run
     first: np.ndarray  # segments with which the trials start; -1: they have started elsewhere

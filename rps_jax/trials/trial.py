@@ -678,7 +678,7 @@ def run_on_host(
             qpos, running = np.asarray(decided.qpos), np.flatnonzero(~np.asarray(decided.done))
             # Only a scripted shift moves the object outside of the engine.
             moved = np.flatnonzero(np.any(qpos != np.asarray(trials.qpos), axis=1))
-            batch.place(moved, qpos[moved])
+            batch.set_positions(moved, qpos[moved])
             if running.size:
                 twists = np.stack(twist, axis=1)[running].astype(float)
                 batch.drive(running, twists, loop.physics.substeps)
