@@ -43,13 +43,15 @@ class Device:
             case Launch(fresh, live):
                 done = []
                 for held, mask in zip(self.held, live, strict=True):
-                    for at in np.flatnonzero(mask):
+                    for at in np.flatnonzero(mask).tolist():
                         self.left[held[at]] -= 1
                     ended = [at in held and self.left[held[at]] <= 0 for at in range(mask.size)]
                     done.append(np.array(ended))
                 self.unread.append(done)
                 pairs = zip(self.held, fresh, strict=True)
-                self.order.append([held[i] for held, mask in pairs for i in np.flatnonzero(mask)])
+                self.order.append(
+                    [held[i] for held, mask in pairs for i in np.flatnonzero(mask).tolist()]
+                )
                 return None
             case Read():
                 return Ended(self.unread.pop(0))
