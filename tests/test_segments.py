@@ -49,9 +49,10 @@ class Device:
                     done.append(np.array(ended))
                 self.unread.append(done)
                 pairs = zip(self.held, fresh, strict=True)
-                self.order.append(
-                    [held[i] for held, mask in pairs for i in np.flatnonzero(mask).tolist()]
-                )
+                starts = [
+                    held.get(i) for held, mask in pairs for i in np.flatnonzero(mask).tolist()
+                ]
+                self.order.append([trial for trial in starts if trial is not None])
                 return None
             case Read():
                 return Ended(self.unread.pop(0))
@@ -93,6 +94,17 @@ def test_no_trial_ends_by_results_of_a_segment_before_its_first():
     state, (report, _) = segments.step(state, Ended([np.array([True])]))
     assert report.trials[0].size == 0
     assert state.slots[0].live.all()
+
+
+def test_empty_slots_start_as_ended_in_the_first_segment_alone():
+    """Otherwise a program would step their blank trials."""
+    state, _ = segments.start([occupied(3, np.array([5]), np.array([False]))], [0])
+    state, (launch, _) = segments.step(state, Filled([np.array([6])]))
+    assert launch.fresh[0].tolist() == [False, True, True]
+    assert launch.live[0].tolist() == [True, True, False]
+    state, _ = segments.step(state, Ended([np.array([True, False, True])]))
+    state, (launch, _) = segments.step(state, Filled([np.zeros(0, int)]))
+    assert not launch.fresh[0].any()
 
 
 @pytest.mark.parametrize("ahead", [0, 1])

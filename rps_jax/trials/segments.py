@@ -65,7 +65,8 @@ class Fill(NamedTuple):
 class Launch(NamedTuple):
     """Action: start a segment."""
 
-    fresh: Sequence[np.ndarray]  # (S,) whether trials start with it, of each queue
+    # (S,) whether trials start with it, of each queue; with the first, empty slots start as ended.
+    fresh: Sequence[np.ndarray]
     live: Sequence[np.ndarray]  # (S,) whether slots hold trials
 
 
@@ -106,7 +107,7 @@ def step(state: State, event: Filled | Ended) -> tuple[State, tuple[Action, ...]
     slots = tuple(map(_fill, state.slots, event.trials, [state.launched] * len(state.slots)))
     runs = [np.count_nonzero(x.live) > limit for x, limit in zip(slots, state.limits, strict=True)]
     launches = any(runs) and not event.stop
-    launch = Launch([x.live & (x.first == state.launched) for x in slots], [x.live for x in slots])
+    launch = Launch([x.first == state.launched for x in slots], [x.live for x in slots])
     state = replace(state, slots=slots, launched=state.launched + launches)
     waiting = state.launched - state.read
     if not waiting:
