@@ -441,7 +441,10 @@ def _run(
         while actions:
             match actions.popleft():
                 case Launch(fresh, live):
-                    advance = advance or _load(program, device, monitor)
+                    if advance is None:
+                        advance = _load(program, device, monitor)
+                        if monitor.stops(program):
+                            break
                     masks = jax.device_put((tuple(fresh), tuple(live)), device)
                     inputs, trials = zip(*((x.inputs, x.trials) for x in data), strict=True)
                     start_time = monitor.elapsed
