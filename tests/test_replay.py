@@ -18,8 +18,8 @@ from rps_jax.runs.plan import build_batch, load_plan
 from rps_jax.studies import gallery
 from rps_jax.trials import pushes, trial
 from rps_jax.trials.case import Case
+from rps_jax.trials.live import Live
 from rps_jax.trials.progress import SequentialProgress, no_progress
-from rps_jax.trials.stepper import Live
 from rps_jax.trials.trial import ControlLoop
 from rps_jax.world.domain import DOMAINS
 
