@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from helpers import read_curve, refusal, refusals, rps
+from numpy.testing import assert_array_equal
 
 from rps_jax.control.laws.rps import RPSParams
 from rps_jax.errors import InputError
@@ -132,7 +133,7 @@ def test_the_tail_alone_counts_for_a_risk_averse_objective():
     step = 1e-3
     values = [objective.value((1.0 + side * step) * slopes) for side in (1, -1)]
     assert (values[0] - values[1]) / (2 * step) == pytest.approx(8.5, rel=1e-3)
-    np.testing.assert_array_equal(Objective().linearise(slopes), slopes)
+    assert_array_equal(Objective().linearise(slopes), slopes)
 
 
 def test_windows_start_at_the_states_of_their_trials(monkeypatch):
@@ -144,7 +145,7 @@ def test_windows_start_at_the_states_of_their_trials(monkeypatch):
     for within, steps in ((10.0, [0, 250, 500]), (0.0, [0, 0, 0])):
         question = Windows("rps", tuned=("L", "K_h"), within=within, setting=SETTING)
         trials = windows.window_starts(question, None, jnp.zeros(2), late, late)
-        np.testing.assert_array_equal(trials, steps)
+        assert_array_equal(trials, steps)
 
 
 # --- derivatives of windows ----------------------------------------------------------------

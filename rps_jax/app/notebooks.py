@@ -9,19 +9,27 @@ from rps_jax.errors import InputError
 from rps_jax.record import files
 from rps_jax.record import folder as run_folder
 from rps_jax.record.options import option
-from rps_jax.runs.question import Action, call_of
+from rps_jax.runs.question import Command, call_of
 from rps_jax.trials.progress import ProgressCallback
 from rps_jax.world import objects
 
 NAMES = (  # of those that need the package alone; all others read results of the repository
-    *("01_the_law", "02_one_push", "03_paper", "04_robustness", "06_fitting", "07_custom_law"),
-    *("08_analysis", "09_gymnasium", "10_gradients", "11_rooms"),
+    "01_the_law",
+    "02_one_push",
+    "03_paper",
+    "04_robustness",
+    "06_fitting",
+    "07_custom_law",
+    "08_analysis",
+    "09_gymnasium",
+    "10_gradients",
+    "11_rooms",
 )
 _METADATA = {"kernelspec": {"name": "python3", "display_name": "Python 3", "language": "python"}}
 
 
 @dataclass(frozen=True)
-class Notebooks(Action[Path]):
+class Notebooks(Command[Path]):
     """Copy the notebooks that need the package alone, without outputs, into a folder."""
 
     out: Path | str | None = option("notebooks", positional=True)

@@ -32,12 +32,11 @@ from rps_jax.record.files import Arrays
 from rps_jax.record.options import check_arguments
 from rps_jax.robot import base
 from rps_jax.robot.robot import RobotLike
-from rps_jax.runs.question import name_or_custom, task_attribute
-from rps_jax.trials import batch, trial
+from rps_jax.trials import jobs, trial
 from rps_jax.trials.results import WORLD, labelled
 from rps_jax.trials.score import Objective
 from rps_jax.trials.setting import Setting
-from rps_jax.trials.single import control_loop, count_steps
+from rps_jax.trials.trajectory import control_loop, count_steps
 from rps_jax.trials.trial import ControlLoop, Snapshot, Trial, World
 from rps_jax.trials.worlds import drawn_worlds, soften_skins
 from rps_jax.tuning import gradients
@@ -47,7 +46,9 @@ from rps_jax.world.domain import (
     VELOCITY_ERRORS,
     Domain,
     DomainLike,
+    name_or_custom,
     parse_domain,
+    task_attribute,
     unit_of,
 )
 from rps_jax.world.draws import Draw
@@ -550,7 +551,7 @@ def _moved_scores(
                 moved[f"params.{x.name}"][(slot, *x.entry)] += change[i, k]
             for name, slope in slopes[k].items():
                 moved[name][slot] += change[i, k] * slope[tested[i]]
-        (scores, _), _ = jax.device_get(run(batch.rows(inputs, index), moved))
+        (scores, _), _ = jax.device_get(run(jobs.rows(inputs, index), moved))
         values[tuple(np.transpose(chunk))] = scores[: len(chunk)]
     return values
 

@@ -35,7 +35,7 @@ from rps_jax.geometry import planar
 from rps_jax.record.options import option
 from rps_jax.runs.question import call_of
 from rps_jax.trials import trial
-from rps_jax.trials.batch import rows
+from rps_jax.trials.jobs import rows
 from rps_jax.trials.trial import ControlLoop, Snapshot, Trial, World
 from rps_jax.trials.worlds import soften_skins
 from rps_jax.tuning import gradients

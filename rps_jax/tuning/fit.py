@@ -53,7 +53,7 @@ from rps_jax.runs.question import (
     call_of,
 )
 from rps_jax.trials import trial
-from rps_jax.trials.batch import rows
+from rps_jax.trials.jobs import rows
 from rps_jax.trials.progress import Progress, set_phase
 from rps_jax.trials.setting import Setting, Split, seed_of
 from rps_jax.trials.trial import ControlLoop, Trial, World, object_pose
@@ -478,7 +478,10 @@ def correlations(data: xr.Dataset) -> Rows:
     """Return a header and the pairs of quantities that the logs determine only in combination."""
     correlation = data.correlation.values
     names = [str(q) for q in data.quantity.values]
-    pairs = [(i, j) for i, j in np.argwhere(np.tril(abs(correlation), -1) > 0.5)
-             if not DERIVED.keys() & {names[i], names[j]}]  # fmt: skip
+    pairs = [
+        (i, j)
+        for i, j in np.argwhere(np.tril(abs(correlation), -1) > 0.5)
+        if not DERIVED.keys() & {names[i], names[j]}
+    ]
     rows = [[quantity(names[i]), quantity(names[j]), f"{correlation[i, j]:.2f}"] for i, j in pairs]
     return [["", "", "correlation"], *rows]

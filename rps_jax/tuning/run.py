@@ -13,7 +13,7 @@ from collections.abc import Callable, Generator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Annotated, Any, ClassVar
 
 import jax
 import numpy as np
@@ -37,7 +37,8 @@ from rps_jax.trials.score import Objective
 from rps_jax.trials.setting import seed_of
 from rps_jax.trials.trial import Rules
 from rps_jax.tuning.space import Space, expand_subsets
-from rps_jax.world.domain import Domain, DomainLike, parse_domain, to_json
+from rps_jax.world.domain import Domain, DomainLike, parse_domain, task_attribute, to_json
+from rps_jax.world.objects import STORED
 from rps_jax.world.tasks import TaskLike
 
 TUNED = "tuned.json"  # file of a run folder: the parameters with the best validation
@@ -84,7 +85,7 @@ class Tuning(TaskOption, LawQuestion[xr.Dataset]):
     domain: Domains = ("wide",)
     """Domains to tune in: paper, hardware, wide, real, prisms, hostile, or JSON files of ranges;
     changes follow each, as wide,mass=3:10."""
-    objects: tuple[str, ...] = ("random_box", "random_cylinder")
+    objects: Annotated[tuple[str, ...], STORED] = ("random_box", "random_cylinder")
     """Objects of these domains; random_prism is held out by default."""
     tuned: tuple[str, ...] = ("full",)
     """Parameters to tune: names, or logistic (eta, zeta, beta, k), or full (all parameters of the
@@ -170,6 +171,9 @@ class Tuning(TaskOption, LawQuestion[xr.Dataset]):
         for domain in self.domains:
             self.setting.check_domain(domain, [self.space.base])
 
+    def attributes(self) -> dict[str, str | int]:
+        return super().attributes() | task_attribute(self.domains[0])
+
     def fields_as_json(self) -> JsonObject:
         """Fields as JSON, with the names of all tuned parameters and the ranges of all domains."""
         ranges, seed = list(map(to_json, self.domains)), seed_of(self.setting.seed, "tune")
@@ -207,6 +211,9 @@ class Tuning(TaskOption, LawQuestion[xr.Dataset]):
             return self._try_proposal(proposal, generation, run._replace(callback=report))
 
         for results in run.steps(compute, proceed):
+            names = {*map(str, results), "vectors", "center", "validation", "simulated"}
+            dims = {name: DIMS.get(name, ()) for name in names}
+            files.check_columns(results, run.folder, dims, {})
             if not _is_of_proposal(results, proposal["vectors"]):
                 reason = f"generation {count} is of another search or version"
                 raise files.CorruptFileError(run.folder, reason)
@@ -235,7 +242,9 @@ class Tuning(TaskOption, LawQuestion[xr.Dataset]):
             variables = {"test_success": (("tested", "test_world"), success, attrs)}
             return xr.Dataset(variables, {"tested": ["start", "tuned"]})
 
-        return run.checkpoint(f"test-{files.sha256(best.tobytes())[:8]}", compute)
+        results = run.checkpoint(f"test-{files.sha256(best.tobytes())[:8]}", compute)
+        dims = {"test_success": ("tested", "test_world")}
+        return files.check_columns(results, run.folder, dims, {})
 
     def _score(self, tried: list[Candidates], run: Run) -> tuple[list[CandidateScores], Timing]:
         """Run candidates; return their outcomes and scores, and where the time went."""
@@ -334,9 +343,9 @@ def _is_of_proposal(results: xr.Dataset, vectors: np.ndarray) -> bool:
     The tolerance allows for other rounding on another machine; the search uses the vectors that
     were tried.
     """
-    if "vectors" not in results or results.vectors.shape != vectors.shape:
-        return False
-    return np.allclose(results.vectors, vectors, rtol=1e-4, atol=1e-4, equal_nan=True)
+    return results.vectors.shape == vectors.shape and np.allclose(
+        results.vectors, vectors, rtol=1e-4, atol=1e-4, equal_nan=True
+    )
 
 
 def parse_domains(domain: Domains, task: TaskLike | None = None) -> tuple[Domain, ...]:
