@@ -21,8 +21,9 @@ from rps_jax.record.checkpoint import Checkpoints
 from rps_jax.record.files import Arrays
 from rps_jax.record.table import check_parquet
 from rps_jax.runs.plan import Plan, chunks_by_key, draw
+from rps_jax.spec import specs_of
 from rps_jax.trials.batch import Job, WorldBatch
-from rps_jax.trials.results import POSE, UNITS, WORLD, labelled, variable
+from rps_jax.trials.results import POSE, WORLD, labelled, variable
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import Outcome
 from rps_jax.trials.worlds import drawn_worlds
@@ -52,7 +53,7 @@ class Results:
         """Prepare to run chunks; each is passed to `store` when it is complete."""
         self.plan, self._chunks, self._store = plan, chunks, store
         self.shape = len(plan.laws), plan.worlds
-        self._names = (*UNITS, *plan.domain.task.OUTCOMES)
+        self._names = (*specs_of(Outcome), *plan.domain.task.OUTCOMES)
         self._outcomes = {name: self._empty(name) for name in self._names}  # (law, world, ...)
         self._drawn: Arrays = {}  # (world,) drawn quantities
         self._running = {chunk: plan.chunks[chunk].size for chunk in chunks}  # trials
