@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import inspect
 import math
 import re
 import typing
@@ -207,19 +208,34 @@ def spec_at(tree: object, path: str) -> Spec | None:
 
 
 def check(record: T, prefix: str = "") -> T:
-    """Return a record if all its declared numbers are within their limits, or None.
+    """Return a record if all its declared numbers are within their limits.
 
     Raises:
-      InputError: one is not; the error has its name after the prefix.
+      InputError: one is not, or is None without a type that allows it; the error has its name after
+        the prefix.
     """
-    for name, spec in specs_of(type(record)).items():
-        if (value := getattr(record, name)) is not None:
+    kind = type(record)
+    for name, spec in specs_of(kind).items():
+        value = getattr(record, name)
+        if value is not None or name not in _optional_fields(kind):
             spec.check(f"{prefix}{name}", value)
     return record
 
 
+@functools.cache
+def _optional_fields(kind: type) -> frozenset[str]:
+    """Return the names of the fields of a class whose type allows None."""
+    hints = typing.get_type_hints(kind).items()
+    return frozenset(name for name, hint in hints if type(None) in typing.get_args(hint))
+
+
 def document(kind: type[T]) -> type[T]:
-    """Return a NamedTuple class whose fields have their declarations as docstrings."""
-    for name, spec in specs_of(kind).items():
-        getattr(kind, name).__doc__ = str(spec)
+    """Return a NamedTuple class whose fields have their declarations as docstrings.
+
+    A field with a record has the first line of the record's docstring.
+    """
+    declared = specs_of(kind)
+    for name, hint in _annotations_of(kind).items():
+        text = str(declared.get(name) or inspect.getdoc(hint) or "")
+        getattr(kind, name).__doc__ = text.partition("\n")[0]
     return kind

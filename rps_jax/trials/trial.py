@@ -92,9 +92,9 @@ class ControlLoop:
 class Shift(NamedTuple):
     """The object is moved by a hand during the push, as in the paper's video."""
 
-    time: Annotated[float | Float[Array | np.ndarray, "*B"], Spec("s", "time of the shift")] = (
-        jnp.inf
-    )
+    time: Annotated[
+        float | Float[Array | np.ndarray, "*B"], Spec("s", "time of the shift", le=math.inf)
+    ] = jnp.inf
     p_robot: Annotated[
         tuple[float, float] | Float[Array | np.ndarray, "*B 2"],
         Spec("m", "length and direction in the robot frame"),
