@@ -497,7 +497,7 @@ _FORMS: dict[str, tuple[Callable[[Any], Any], str]] = {
 def to_json(domain: Domain) -> JsonObject:
     """Return a domain as JSON, with the solids of custom objects; without the task `reach`."""
     record = asdict(domain) | {"objects": tuple(map(text_of, domain.objects))}
-    record |= dict(record.pop("custom"))
+    record |= {name: tuple(interval) for name, interval in record.pop("custom")}
     if solids := custom_solids(domain.objects):
         record["solids"] = solids
     return record if domain.task != Reach() else {k: x for k, x in record.items() if k != "task"}
