@@ -206,7 +206,7 @@ def _fields(info: StructTypeInfo) -> StructConstructorSpec | None:
 def _help_of(spec: Spec) -> str:
     """Return the help of a declared number, with its unit."""
     has_unit = spec.unit in ("", "1") or f"[{spec.unit}]" in spec.about
-    return spec.about if has_unit else f"{spec.about} [{spec.unit}]"
+    return spec.about if has_unit else str(spec)
 
 
 def _offered(kind: type) -> list[dataclasses.Field[object]]:
