@@ -133,7 +133,7 @@ class Spec:
     @property
     def attributes(self) -> dict[str, str]:
         """Attributes of a variable of a dataset."""
-        return {"units": self.unit or "1", "long_name": self.about}
+        return {"units": self.unit or "1"} | ({"long_name": self.about} if self.about else {})
 
     def check(self, name: str, value: Any) -> float:
         """Return a value as a float if it is within the limits, or raise InputError.
