@@ -89,6 +89,25 @@ def test_a_quantity_of_another_owner_says_what_it_sets(registries):
         Domain(custom={"drift": Range(0.2, 0.9)})
 
 
+@pytest.mark.parametrize(
+    ("changes", "sentence"),
+    [
+        ({"custom": {"treshold": Range(0.1, 0.5)}}, "unknown registered quantity 'treshold'"),
+        ({"custom": {"threshold": (0.1, 0.5)}}, "domain custom = "),
+        ({"custom": 0.3}, "domain custom = 0.3 is not allowed: give ranges by name"),
+        ({"custom": {"threshold": Range(0.5, 0.1)}}, "domain threshold = 0.5 to 0.1"),
+        (
+            {"custom": {"threshold": Range(0.1, 0.5)}, "skin": "ideal"},
+            "its ideal skin leaves no threshold to draw",
+        ),
+    ],
+)
+def test_bad_ranges_of_registered_quantities_are_refused(registries, changes, sentence):
+    register_quantity("threshold", THRESHOLD)
+    with pytest.raises(InputError, match=sentence):
+        Domain(**changes)
+
+
 TAKEN = ["mass", "com_bearing", "corner_3", "feet_number", "key_0", "v_x_error", "velocity_error",
          "route", "turn_angle_2", "width", "objects", "corners", "success", "time"]  # fmt: skip
 
@@ -105,6 +124,12 @@ def test_a_name_that_another_owner_has_is_refused(registries, name):
         ("threshold", Quantity("m", "another", ge=0, le=1, owner="skin"), "choose another name"),
         ("grip", THRESHOLD, "unknown quantity of the skin 'grip': choose from foam, "),
         ("two words", THRESHOLD, "write a name of Python"),
+        ("idler", Quantity("1", "idler", ge=0, le=1, owner="floor"), "without a function `apply`"),
+        (
+            "noise_2",
+            Quantity("1", "noise", ge=0, le=1, owner="skin", numbers=("mass",)),
+            "leave numbers out",
+        ),
         ("robot_grip", Quantity("1", "grip", ge=0, le=1, owner="robot"), "robot_bandwidth"),
         (
             "robot_force_max",

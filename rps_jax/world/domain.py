@@ -209,7 +209,11 @@ class Domain:
     custom: tuple[tuple[str, Range], ...] = ()
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "custom", tuple(sorted(dict(self.custom).items())))
+        try:
+            object.__setattr__(self, "custom", tuple(sorted(dict(self.custom).items())))
+        except (TypeError, ValueError) as error:
+            rule = f"give ranges by name, as {{'threshold': {Range.EXAMPLE}}}"
+            raise errors.not_allowed("domain custom", self.custom, rule) from error
         check_fields(self, "domain ")
         object.__setattr__(self, "objects", tuple(map(parse_object, self.objects)))
         for name in self.objects:
@@ -226,6 +230,9 @@ class Domain:
         for name, interval in self.custom:
             errors.check_name("registered quantity", name, REGISTERED)
             QUANTITIES[name].check_range(f"domain {name}", interval)
+            if name in (idle := self.idle):
+                rule = f"{idle[name]} no {name} to draw; leave it out"
+                raise errors.not_allowed(f"domain {name}", f"{interval.low:g}", rule)
         for name, owner in _IMPLIED.items():
             if getattr(self, name) is not None and getattr(self, owner) is None:
                 raise errors.not_allowed(f"domain {name}", getattr(self, name), f"give {owner} too")

@@ -39,6 +39,12 @@ def register_quantity(name: str, quantity: Quantity) -> None:
     if known is not None and replace(known, apply=quantity.apply) != quantity:
         rule = f"it is registered as {known}; choose another name"
         raise errors.not_allowed("name of a quantity", name, rule)
+    if quantity.numbers is not None:
+        rule = "its random number has its own name; leave numbers out"
+        raise errors.not_allowed(f"numbers of the quantity {name}", quantity.numbers, rule)
+    if quantity.apply is None and quantity.owner not in ("skin", "base", "robot"):
+        rule = "without a function `apply` it sets nothing; give one"
+        raise errors.not_allowed(f"owner of the quantity {name}", quantity.owner, rule)
     targets = {"skin": CapacitiveSkin._fields, "base": Odometry._fields}
     if quantity.owner in targets and quantity.apply is None:
         errors.check_name(f"quantity of the {quantity.owner}", name, targets[quantity.owner])
