@@ -206,7 +206,7 @@ class Domain:
     # What is asked of the law; the ranges of a path are the task's own.
     task: Task = Reach()
     # Ranges of registered quantities by name; as pairs, since a domain is hashable.
-    custom: tuple[tuple[str, Range], ...] = ()
+    custom: Mapping[str, Range] | tuple[tuple[str, Range], ...] = ()
 
     def __post_init__(self) -> None:
         try:
@@ -227,7 +227,7 @@ class Domain:
             raise errors.not_allowed("domain feet", objects, "only random objects have drawn feet")
         unused = {name: cause for name, cause in self.idle.items() if name in _DECLARED}
         check_unused(self, "domain ", unused, PERFECT, _HARDWARE, _HOSTILE)
-        for name, interval in self.custom:
+        for name, interval in dict(self.custom).items():
             errors.check_name("registered quantity", name, REGISTERED)
             QUANTITIES[name].check_range(f"domain {name}", interval)
             if name in (idle := self.idle):
