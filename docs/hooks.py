@@ -34,7 +34,7 @@ ROOMS = (
     *("record", "geometry", "robot", "control", "world", "lowering", "engines"),
     *("analysis", "trials", "runs", "tuning", "studies", "app"),
 )
-PAGES = (*ROOMS, "errors")  # of the reference
+PAGES = (*ROOMS, "spec", "errors")  # of the reference
 # Sections of a page that are separate pages: title of the section, by path.
 SECTIONS = {"rps_jax/law.md": "The law", "rps_jax/adding.md": "How to add"}
 # Pages by tab; studies that no tab names are in `Studies`.

@@ -21,6 +21,7 @@ import xarray as xr
 from hypothesis import strategies
 from numpy.testing import assert_allclose, assert_array_equal
 
+from rps_jax import engines
 from rps_jax.app import cli
 from rps_jax.control import registry
 from rps_jax.control.laws.rps import RPSParams
@@ -35,7 +36,7 @@ from rps_jax.trials import trial
 from rps_jax.trials.case import Case
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import ControlLoop, Rules, Trial
-from rps_jax.world import domain, objects
+from rps_jax.world import domain, objects, streams, tasks
 from rps_jax.world.domain import Range, parse_domain
 from rps_jax.world.physics import preset
 
@@ -201,9 +202,14 @@ def moved(
 
 @contextlib.contextmanager
 def temporary_names() -> Iterator[None]:
-    """Restore the registries of objects and laws at the end of the block."""
-    tables = (objects.FAMILIES, objects.REGISTERED, registry.LAWS, registry._LAWS_BY_CLASS)
-    saved = [dict(table) for table in tables]
+    """Restore the registries at the end of the block."""
+    tables = (
+        *(objects.FAMILIES, objects.REGISTERED, registry.LAWS, registry._LAWS_BY_CLASS),
+        *(domain.QUANTITIES, domain.LABELS, domain.REGISTERED, domain.OBJECT_QUANTITIES),
+        *(tasks.TASKS, tasks.QUANTITIES, tasks.UNRANGED, tasks.OUTCOMES, tasks.FAILURES),
+        *(streams._OWNERS, engines._REGISTERED),
+    )
+    saved: list[Any] = [table.copy() for table in tables]
     try:
         yield
     finally:

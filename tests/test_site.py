@@ -19,6 +19,8 @@ import rps_jax
 
 pytest.importorskip("mkdocs", reason="the extra docs is not installed")
 pytest.importorskip("latex2mathml", reason="the extra docs is not installed")
+griffe = pytest.importorskip("griffe", reason="the extra docs is not installed")
+
 HOOKS = runpy.run_path(str(ROOT / "docs" / "hooks.py"))
 
 
@@ -245,3 +247,12 @@ def test_pages_are_readable_without_other_hosts_at_two_widths(site, scheme, tmp_
                 assert not any(faults.values()), (page, width, faults)
                 errors = [x["message"] for x in browser.get_log("browser")]
                 assert errors == [], (page, width)
+
+
+def test_a_declared_number_has_its_meaning_unit_and_limits_on_its_page():
+    extensions = griffe.load_extensions(str(ROOT / "docs" / "specs.py"))
+    where = {"extensions": extensions, "search_paths": [str(ROOT)]}
+    pursuit = griffe.load("rps_jax.control.laws.pursuit", **where)
+    gain = pursuit["PursuitParams.K_v"]
+    assert gain.docstring.value == "Speed over distance [1/s]; above 0."
+    assert str(gain.annotation) == "Parameter"

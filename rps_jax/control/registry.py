@@ -20,7 +20,15 @@ import numpy as np
 
 from rps_jax import errors
 from rps_jax.control import laws, sources, validation
-from rps_jax.control.base import Law, LawParams, Params, Senses, Smoothing, named_leaves
+from rps_jax.control.base import (
+    Law,
+    LawParams,
+    Params,
+    Senses,
+    Smoothing,
+    bounds_of,
+    named_leaves,
+)
 from rps_jax.control.learned import policy
 from rps_jax.errors import InputError
 from rps_jax.record import files
@@ -166,6 +174,7 @@ def register_law(name: str, law: Law, params: LawParams) -> None:
         raise errors.not_allowed(f"params of law '{name}'", params, rule)
     errors.check_finite(f"d_success of law '{name}'", params.d_success, above=0, unit="m")
     law.check(params)
+    law = law if law.bounds else replace(law, bounds=bounds_of(kind))
     for parameter in dict(law.bounds):
         errors.check_name(f"bound of law '{name}'", parameter, named_leaves(params))
     for label, known in (_HIDDEN | LAWS).items():

@@ -36,7 +36,7 @@ NEAR = 0.2  # [m] least distance below which a timeout is near the target
 
 def failure_modes(trials: xr.Dataset, max_lost: float) -> np.ndarray:
     """Return the failure mode (world,) of the trials of one law; "" for a success."""
-    modes = np.array([*statistics.MODES, ""])[statistics.failure_modes(trials, max_lost)]
+    modes = np.array([*statistics.modes(), ""])[statistics.failure_modes(trials, max_lost)]
     near = (trials.min_distance < NEAR) & (trials.get("progress", 1.0) > _PASSED)
     timeouts = np.where(near, "timeout near the target", "timeout far from the target")
     return np.where(modes == "timeout", timeouts, modes)

@@ -32,6 +32,7 @@ from rps_jax.record.options import option
 from rps_jax.runs import evaluate
 from rps_jax.runs.evaluate import Candidates, CandidateScores
 from rps_jax.runs.question import LawQuestion, Run, TaskOption, count_true
+from rps_jax.spec import Spec
 from rps_jax.trials.progress import Bar, Progress, Timing
 from rps_jax.trials.score import Objective
 from rps_jax.trials.setting import seed_of
@@ -42,7 +43,11 @@ from rps_jax.world.objects import STORED
 from rps_jax.world.tasks import TaskLike
 
 TUNED = "tuned.json"  # file of a run folder: the parameters with the best validation
-UNITS = {"compile": "s", "run": "s", "simulated": "s"}
+TIMES = {  # of a generation
+    "compile": Spec("s", "time of compilation"),
+    "run": Spec("s", "wall clock without compilation"),
+    "simulated": Spec("s", "simulated time, summed over worlds"),
+}
 # Dimensions of those results of a generation that are arrays.
 DIMS = {
     **dict.fromkeys(("vectors", "gradients", "slopes", "anchors"), ("candidate", "parameter")),
@@ -265,7 +270,7 @@ class Tuning(TaskOption, LawQuestion[xr.Dataset]):
             times[name] += float(results.pop(name, 0.0))
         results |= times | {"params": self.space.values(results["center"])}
         variables = {
-            name: (DIMS.get(name, ()), np.asarray(x, float), {"units": UNITS.get(name, "1")})
+            name: (DIMS.get(name, ()), np.asarray(x, float), TIMES.get(name, Spec()).attributes)
             for name, x in results.items()
         }
         return xr.Dataset(variables, {"parameter": list(self.space.parameters)})
@@ -295,7 +300,7 @@ class Tuning(TaskOption, LawQuestion[xr.Dataset]):
         success = np.nan_to_num(results.validation_success.values)  # NaN without a validation
         counts = np.rint(worlds * success).astype(int).tolist()
         rates = [tables.share(count, worlds) for count in counts]
-        totals = (f"{x} {float(results[x].sum()):,.1f} s" for x in UNITS if x in results)
+        totals = (f"{x} {float(results[x].sum()):,.1f} s" for x in TIMES if x in results)
         text = (
             f"{test_sentences(results.test_success)} The worlds have the objects "
             f"{', '.join(self.objects)}, the engine {self.setting.engine} and the horizon "

@@ -170,14 +170,12 @@ class Coverage(FitStudy):
         def compute() -> xr.Dataset:
             index, seed = np.arange(self.logs), seed_of(self.setting.seed, "test")
             objects, values = self.ranges.object_of(index), np.empty((self.logs, 3, len(names)))
-            task = [draws.USES[name] for name in _TASK]
             for push in range(3):
                 for i in np.unique(objects):
                     rows = index[objects == i]
-                    uniform = draws.random_numbers(seed, rows)
-                    new = draws.random_numbers(seed, rows + (push + 1) * 1_000_000)
-                    uniform[:, task] = new[:, task]
-                    draw = draws.draw_at(self.ranges, rows, uniform)
+                    new = draws.numbers(seed, rows + (push + 1) * 1_000_000)
+                    u = draws.numbers(seed, rows) | {name: new[name] for name in _TASK}
+                    draw = draws.draw_at(self.ranges, rows, u)
                     values[rows, push] = self.bank.statistics(draw)[0][names]
             return xr.Dataset({"statistics": (("log", "more", "statistic"), values)})
 
