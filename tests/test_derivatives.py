@@ -418,7 +418,7 @@ def test_a_check_compares_with_central_differences_in_double_precision():
 
 # --- continued rollouts --------------------------------------------------------------------
 
-TRACED = [name for name in engines.ENGINES if engines.get(name).traced]
+TRACED = [name for name in engines.names() if engines.get(name).traced]
 NOISY = "wide,objects=random_cylinder,gap=0:0.01"  # with latencies and drift of the odometry
 BY_CLASS = {type(params): name for name, params in LAWS.items()}
 
