@@ -10,13 +10,12 @@ import jax.numpy as jnp
 import numpy as np
 import xarray as xr
 
+from rps_jax import Details, Observation, RPSParams, RPSState, Twist, step
 from rps_jax.analysis import statistics
 from rps_jax.analysis.figures.style import SHADES, Figure, shade
 from rps_jax.analysis.figures.style import quantity as quantity
 from rps_jax.analysis.figures.style import words as words
 from rps_jax.control.laws import rps
-from rps_jax.control.laws.rps import RPSParams, RPSState
-from rps_jax.control.observation import Details, Observation, Twist
 from rps_jax.robot import shell
 
 
@@ -42,7 +41,7 @@ def _in_front(l: Any, error: Any, distance: Any) -> Observation:  # noqa: E741
 @jax.jit
 def _twists(params: RPSParams, state: RPSState, observations: Observation) -> Twist:
     """Return the law's twists (n,) for one state and observations (n, ...)."""
-    return jax.vmap(lambda obs: rps.step(params, state, obs)[1])(observations)
+    return jax.vmap(lambda obs: step(params, state, obs)[1])(observations)
 
 
 def twist_field(sets: Mapping[str, RPSParams], distance: float) -> Figure:

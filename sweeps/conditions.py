@@ -15,25 +15,23 @@ import jax
 import numpy as np
 import xarray as xr
 
+from rps_jax import InputError, RPSParams, Setting
 from rps_jax.analysis import statistics
 from rps_jax.control import registry
-from rps_jax.control.base import LawParams
-from rps_jax.control.laws.rps import RPSParams
-from rps_jax.errors import InputError
+from rps_jax.laws import LawParams, law_of
+from rps_jax.physics import FRICTION, PHYSICS
+from rps_jax.questions import Run
 from rps_jax.record import files
 from rps_jax.record.checkpoint import Checkpoints
-from rps_jax.runs.question import Run
 from rps_jax.trials.batch import BatchSize
-from rps_jax.trials.case import Case
 from rps_jax.trials.progress import Progress, ProgressCallback, SequentialProgress, no_progress
 from rps_jax.trials.pushes import Cases
 from rps_jax.trials.results import outcome_dataset
 from rps_jax.trials.rollout import outcomes
-from rps_jax.trials.setting import Setting
 from rps_jax.world import paper
 from rps_jax.world.objects import PAPER_OBJECTS
-from rps_jax.world.physics import PHYSICS
-from rps_jax.world.scene import FRICTION, Friction
+from rps_jax.world.scene import Friction
+from rps_jax.worlds import Case
 from sweeps.study_base import TrialStudy, load_part
 
 # Number of trials per call: more keep the device busier, fewer are lost when the run is killed.
@@ -78,7 +76,7 @@ class Condition:
         """Return whether all laws accept the changed parameters."""
         try:
             for params in (self._changed(registry.LAWS[name]) for name in laws):
-                registry.law_of(params).check(params)
+                law_of(params).check(params)
         except InputError:
             return False
         return True

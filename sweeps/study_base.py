@@ -24,15 +24,13 @@ import jax
 import numpy as np
 import xarray as xr
 
-from rps_jax import errors
-from rps_jax.analysis.report import Picture, Section
+from rps_jax import InputError, errors
 from rps_jax.engines import device
-from rps_jax.errors import InputError
+from rps_jax.questions import Picture, Plan, Question, Run, Section
 from rps_jax.record import files, options, provenance
 from rps_jax.record.checkpoint import Checkpoints
 from rps_jax.runs import execution
-from rps_jax.runs.plan import Plan
-from rps_jax.runs.question import Question, Run, TrialQuestion
+from rps_jax.runs.question import TrialQuestion
 from rps_jax.runs.results import Results
 from rps_jax.trials.progress import Progress, ProgressCallback, SequentialProgress, no_progress
 from rps_jax.trials.rollout import rollout

@@ -14,12 +14,11 @@ from typing import Any
 import xarray as xr
 from scipy import stats
 
+from rps_jax import Robot, Setting
 from rps_jax.analysis import statistics
-from rps_jax.robot.robot import Robot
-from rps_jax.robot.skin import CapacitiveSkin, IdealSkin
-from rps_jax.trials.setting import Setting
+from rps_jax.physics import PHYSICS, Physics
 from rps_jax.world import paper
-from rps_jax.world.physics import PHYSICS, Physics
+from rps_jax.worlds import CapacitiveSkin, IdealSkin
 from sweeps.conditions import Condition
 
 DEFAULT = "default"

@@ -14,9 +14,9 @@ from typing import Any, ClassVar
 
 import xarray as xr
 
-from rps_jax import errors
+from rps_jax import InputError, errors
 from rps_jax.control import registry
-from rps_jax.runs.question import call_of
+from rps_jax.questions import call_of
 from rps_jax.world import paper
 from sweeps.ambiguities import readings
 from sweeps.conditions import Condition, ConditionStudy, Grid, condition_rows
@@ -76,7 +76,7 @@ class Ambiguities(ConditionStudy):
         """Check the names."""
         super().check()
         if self.gazebo and self.curve:
-            raise errors.InputError("gazebo and curve are not allowed together: choose one.")
+            raise InputError("gazebo and curve are not allowed together: choose one.")
         for name in self.readings:
             errors.check_name("reading", name, self.known)
         for name in self.grid.laws:

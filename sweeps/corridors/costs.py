@@ -18,15 +18,13 @@ import jax
 import numpy as np
 import xarray as xr
 
+from rps_jax import Domain, Rules, Setting
 from rps_jax.control import registry
-from rps_jax.record.options import option
-from rps_jax.runs.question import Run, call_of
+from rps_jax.questions import Run, call_of, option
 from rps_jax.trials.progress import Progress
 from rps_jax.trials.rollout import Candidates, outcomes
-from rps_jax.trials.setting import Setting
-from rps_jax.trials.trial import Rules
-from rps_jax.world.domain import Domain, parse_domain
 from rps_jax.world.tasks import parse_task
+from rps_jax.worlds import parse_domain
 from sweeps.study_base import SpeedStudy, Table
 
 _BOXES = "wide,objects=random_box"

@@ -14,15 +14,13 @@ from typing import ClassVar, NamedTuple
 
 import xarray as xr
 
+from rps_jax import Setting
 from rps_jax.analysis import statistics, tables
-from rps_jax.control import registry
-from rps_jax.engines import EngineName
-from rps_jax.record.options import option
-from rps_jax.runs.plan import Plan
-from rps_jax.runs.question import Run, call_of
-from rps_jax.trials.setting import Setting
-from rps_jax.world.domain import parse_domain
-from rps_jax.world.physics import PHYSICS, Fidelity, preset
+from rps_jax.laws import resolve_law
+from rps_jax.physics import PHYSICS, EngineName, preset
+from rps_jax.questions import Plan, Run, call_of, option
+from rps_jax.world.physics import Fidelity
+from rps_jax.worlds import parse_domain
 from sweeps.study_base import Study, Table, run_plans
 
 
@@ -80,7 +78,7 @@ class Parity(Study[xr.DataTree]):
 
     def _plan(self, row: Row, engine: str) -> Plan:
         """Return the plan of a row in an engine."""
-        label, params = registry.resolve_law(row.law)
+        label, params = resolve_law(row.law)
         fidelity = row.fidelity if engine == "fused" else "reference"
         setting = Setting(ENGINES[engine], physics=preset(fidelity=fidelity), seed=self.seed)
         domain = parse_domain(row.domain, row.robot, row.task)

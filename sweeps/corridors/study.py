@@ -19,20 +19,15 @@ from typing import ClassVar
 import numpy as np
 import xarray as xr
 
+from rps_jax import Range, Rules, Setting
 from rps_jax.analysis import statistics, tables
 from rps_jax.analysis.figures.style import Figure, success_rates, tiles
-from rps_jax.analysis.report import Picture
-from rps_jax.control.base import LawParams
-from rps_jax.control.registry import LawsLike
-from rps_jax.record.options import option
-from rps_jax.runs.plan import Plan
-from rps_jax.runs.question import MultiLawQuestion, Run, call_of
-from rps_jax.trials.setting import Setting, Split
-from rps_jax.trials.trial import Rules
-from rps_jax.world.domain import DomainLike, parse_domain
-from rps_jax.world.quantity import Range
+from rps_jax.laws import LawParams, LawsLike
+from rps_jax.questions import MultiLawQuestion, Picture, Plan, Run, call_of, option
+from rps_jax.trials.setting import Split
 from rps_jax.world.tasks.corridor import BASE, OBJECT, Corridor
 from rps_jax.world.tasks.path import Path
+from rps_jax.worlds import DomainLike, parse_domain
 from sweeps.corridors.widths import Curve, fit
 from sweeps.study_base import Rows, Study, Table, run_together
 

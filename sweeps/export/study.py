@@ -24,16 +24,14 @@ import jax
 import numpy as np
 import xarray as xr
 
+from rps_jax import InputError, Setting
 from rps_jax.app.export import program
 from rps_jax.control.learned import policy
-from rps_jax.errors import InputError
-from rps_jax.record.options import option
-from rps_jax.runs.question import Run, call_of
-from rps_jax.trials.case import Case
-from rps_jax.trials.setting import Setting
+from rps_jax.physics import PHYSICS
+from rps_jax.questions import Run, call_of, option
 from rps_jax.world import paper
 from rps_jax.world.objects import PAPER_OBJECTS
-from rps_jax.world.physics import PHYSICS
+from rps_jax.worlds import Case
 from sweeps.export import loop, native
 from sweeps.study_base import QuickStudy, Table, records, run_parts, text_table
 

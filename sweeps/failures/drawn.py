@@ -15,10 +15,8 @@ import numpy as np
 import xarray as xr
 
 from rps_jax.analysis import statistics
-from rps_jax.analysis.report import Section
-from rps_jax.record.options import option
-from rps_jax.runs.plan import Plan
-from rps_jax.runs.question import Run, call_of, count_true
+from rps_jax.questions import Plan, Run, Section, call_of, option
+from rps_jax.runs.question import count_true
 from rps_jax.studies.rare import Estimate, Rare, estimate_row, estimate_table
 from rps_jax.trials.progress import set_phase
 from rps_jax.trials.score import severity_of

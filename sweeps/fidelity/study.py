@@ -16,13 +16,11 @@ from typing import Any, ClassVar
 import numpy as np
 import xarray as xr
 
+from rps_jax import Rules, Setting
 from rps_jax.analysis import statistics
-from rps_jax.engines import EngineName
-from rps_jax.runs.question import Run, call_of
-from rps_jax.trials.setting import Setting
-from rps_jax.trials.trial import Rules
+from rps_jax.physics import MUJOCO_GROUND, EngineName, Physics, preset
+from rps_jax.questions import Run, call_of
 from rps_jax.world import paper
-from rps_jax.world.physics import MUJOCO_GROUND, Physics, preset
 from sweeps.conditions import Condition, ConditionStudy, Grid, run_conditions
 from sweeps.study_base import Rows, Table
 

@@ -20,12 +20,11 @@ import numpy as np
 import xarray as xr
 
 import rps_jax
-from rps_jax.control.registry import LawLike
+from rps_jax.laws import LawLike
+from rps_jax.questions import Run, call_of, option
 from rps_jax.record import bag
-from rps_jax.record.options import option
-from rps_jax.runs.question import Run, call_of
 from rps_jax.tuning import fit, logs
-from rps_jax.world import domain as domains
+from rps_jax.worlds import DomainLike
 from sweeps.fit.study import FitStudy, within
 from sweeps.study_base import Rows, Table
 
@@ -41,7 +40,7 @@ class Bagged(FitStudy):
     TITLE: ClassVar[str] = "Worlds fitted to bags"
     QUICK: ClassVar[Mapping[str, object]] = {"worlds": 192, "logs": 2, "window": 6.0}
 
-    domain: domains.DomainLike = "real"
+    domain: DomainLike = "real"
     """Ranges from which worlds are drawn, by name or as a JSON file; changes follow."""
     law: LawLike = "rps_plus"
     worlds: int = option(3072, 96, 1_000_000, kw_only=True)

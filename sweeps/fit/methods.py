@@ -24,14 +24,13 @@ import xarray as xr
 
 from rps_jax.analysis.figures.style import quantity
 from rps_jax.engines import device
-from rps_jax.record.options import option
-from rps_jax.runs.question import Run, call_of
+from rps_jax.questions import Run, call_of, option
 from rps_jax.trials.progress import no_progress, set_phase
 from rps_jax.trials.setting import seed_of
 from rps_jax.tuning import fit, posterior
 from rps_jax.tuning.logs import Log
-from rps_jax.world import domain as domains
 from rps_jax.world import points
+from rps_jax.worlds import DomainLike
 from sweeps.fit import least_squares
 from sweeps.fit.least_squares import Replay, Track
 from sweeps.fit.study import FitStudy, within
@@ -54,7 +53,7 @@ class Methods(FitStudy):
     GROWS: ClassVar[tuple[str, ...]] = ("evolution_logs",)
     QUICK: ClassVar[Mapping[str, object]] = {"worlds": 192, "logs": 2, "window": 12.0}
 
-    domain: domains.DomainLike = "wide,objects=random_box"
+    domain: DomainLike = "wide,objects=random_box"
     """Ranges from which worlds are drawn, by name or as a JSON file; changes follow."""
     worlds: int = option(4096, 96, 1_000_000, kw_only=True)
     """Number of worlds from which the networks learn."""

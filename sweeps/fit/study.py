@@ -20,16 +20,14 @@ import xarray as xr
 
 import rps_jax
 from rps_jax.analysis.figures.style import Figure, quantity
-from rps_jax.analysis.report import Picture
-from rps_jax.control import registry
-from rps_jax.control.registry import LawLike
-from rps_jax.record.options import option
-from rps_jax.runs.question import DomainQuestion, LawQuestion, Run, call_of
+from rps_jax.laws import LawLike, law_of
+from rps_jax.questions import DomainQuestion, LawQuestion, Picture, Run, call_of, option
 from rps_jax.trials.progress import Progress, no_progress, set_phase
 from rps_jax.trials.setting import seed_of
 from rps_jax.tuning import fit, posterior
 from rps_jax.world import domain as domains
 from rps_jax.world import draws, points
+from rps_jax.worlds import DomainLike
 from sweeps.study_base import Rows, Study, Table
 
 KINDS: dict[str, tuple[str, ...]] = {  # optional fields of each kind of log
@@ -65,7 +63,7 @@ class FitStudy(Study[xr.Dataset], DomainQuestion[xr.Dataset], LawQuestion[xr.Dat
     def check(self) -> None:
         """Check the law and the engine."""
         self.check_engine([self.params])
-        fit.check_law(self.label, registry.law_of(self.params), self.setting)
+        fit.check_law(self.label, law_of(self.params), self.setting)
 
     def train(self, training: xr.Dataset, names: Sequence[str]) -> posterior.Posterior:
         """Return networks for some statistics of the logs."""
@@ -114,7 +112,7 @@ class Coverage(FitStudy):
         "worlds": 960, "logs": 48, "window": 20.0, "worth": 2, "tasks": 8,
     }  # fmt: skip
 
-    domain: domains.DomainLike = (
+    domain: DomainLike = (
         "wide,robot_lag=0:0.4,robot_slip=0:0.1,foam=0.005:0.02,time_constant=0.02:0.15"
     )
     """Ranges from which worlds are drawn, by name or as a JSON file; changes follow."""

@@ -17,14 +17,12 @@ import mujoco
 import numpy as np
 import xarray as xr
 
+from rps_jax import Setting
 from rps_jax.analysis import statistics, tables
-from rps_jax.control.registry import LawsLike
-from rps_jax.record.options import option
-from rps_jax.runs.plan import Plan
-from rps_jax.runs.question import MultiLawQuestion, Run, call_of
-from rps_jax.trials.setting import Setting
-from rps_jax.world.domain import DomainLike, parse_domain
-from rps_jax.world.physics import MUJOCO_GROUND, Physics
+from rps_jax.laws import LawsLike
+from rps_jax.physics import MUJOCO_GROUND, Physics
+from rps_jax.questions import MultiLawQuestion, Plan, Run, call_of, option
+from rps_jax.worlds import DomainLike, parse_domain
 from sweeps.study_base import QuickStudy, Rows, Table, run_together
 
 SLOPES = (0, 2, 4, 6)  # [deg]

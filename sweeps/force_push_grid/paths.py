@@ -26,18 +26,13 @@ from typing import ClassVar
 import numpy as np
 import xarray as xr
 
+from rps_jax import Range, Robot, Rules, Setting
 from rps_jax.analysis import tables
 from rps_jax.analysis.figures.style import Figure, tiles
-from rps_jax.analysis.report import Picture
-from rps_jax.control.registry import LawsLike
-from rps_jax.record.options import option
-from rps_jax.robot.robot import Robot
-from rps_jax.runs.plan import Plan
-from rps_jax.runs.question import MultiLawQuestion, Run, call_of
-from rps_jax.trials.setting import Setting
-from rps_jax.trials.trial import Rules
-from rps_jax.world.domain import Range, parse_domain
+from rps_jax.laws import LawsLike
+from rps_jax.questions import MultiLawQuestion, Picture, Plan, Run, call_of, option
 from rps_jax.world.tasks.path import Path
+from rps_jax.worlds import parse_domain
 from sweeps.force_push_grid import grid
 from sweeps.study_base import QuickStudy, Rows, Table, part_name, run_plans
 

@@ -15,11 +15,9 @@ from typing import ClassVar
 
 import xarray as xr
 
-from rps_jax import engines
 from rps_jax.control.laws import force_push_published
-from rps_jax.engines import EngineName
-from rps_jax.record.options import option
-from rps_jax.runs.question import Run, call_of
+from rps_jax.physics import EngineName, get_engine
+from rps_jax.questions import Run, call_of, option
 from rps_jax.trials.progress import SequentialProgress
 from sweeps.force_push_grid import grid
 from sweeps.study_base import QuickStudy, Table
@@ -52,7 +50,7 @@ class ForcePushGrid(QuickStudy[xr.Dataset]):
         """Check the names, and that the engine supports these pushes."""
         super().check()
         force_push_published.check(grid.PARAMS)
-        engine = engines.get(self.engine)
+        engine = get_engine(self.engine)
         engine.check_senses("force")
         engine.check_traced()
         engine.check_physics(grid.PHYSICS)

@@ -13,8 +13,7 @@ from typing import ClassVar
 
 import xarray as xr
 
-from rps_jax.record.options import option
-from rps_jax.runs.question import call_of
+from rps_jax.questions import call_of, option
 from rps_jax.tuning.gradients import Options
 from sweeps.gradients.study import Gradients, label_of, norms
 from sweeps.study_base import Rows, Table

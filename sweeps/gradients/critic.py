@@ -19,11 +19,11 @@ import numpy as np
 import optax
 
 from rps_jax.control import registry
-from rps_jax.control.base import LawParams
 from rps_jax.engines import native
 from rps_jax.engines.base import Stage
 from rps_jax.geometry import footprint as fp
 from rps_jax.geometry import planar
+from rps_jax.laws import LawParams, law_of
 from rps_jax.trials import trial
 from rps_jax.trials.trial import ControlLoop, Snapshot, Trial, World, advance, start_all
 from rps_jax.trials.worlds import soften_skins
@@ -170,7 +170,7 @@ def features(world: World, params: LawParams, state: Trial, loop: ControlLoop) -
 
 def _loop(tuning: WindowTuning) -> ControlLoop:
     """Return the loop of softened trials under the rules of the setting."""
-    law = registry.smooth_law(registry.law_of(tuning.space.base))
+    law = registry.smooth_law(law_of(tuning.space.base))
     return ControlLoop(tuning.setting.physics, tuning.setting.rules, law)
 
 

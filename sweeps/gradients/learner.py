@@ -25,13 +25,12 @@ import jax.numpy as jnp
 import optax
 from jax.flatten_util import ravel_pytree
 
-from rps_jax import engines, errors
+from rps_jax import PushEnv, errors
 from rps_jax.control.learned import network as networks
 from rps_jax.control.learned.network import Network, Weights
 from rps_jax.engines import native
-from rps_jax.record.options import option
-from rps_jax.runs.question import call_of
-from rps_jax.trials.env import PushEnv
+from rps_jax.physics import get_engine
+from rps_jax.questions import call_of, option
 from rps_jax.trials.setting import Split
 from rps_jax.trials.trial import World
 from rps_jax.tuning import gradients, ppo, rollout
@@ -75,7 +74,7 @@ class WindowLearner(Learn):
         super().check()
         errors.check_name("estimator", self.estimator, estimators.ESTIMATORS)
         if self.estimator != "evolution":
-            engine = engines.get(self.setting.engine)
+            engine = get_engine(self.setting.engine)
             engine.check_derivatives("reverse")
 
     def environments(self, split: Split = "tune") -> list[PushEnv]:

@@ -15,8 +15,7 @@ import jax
 import xarray as xr
 
 from rps_jax.engines import mjx_gradients
-from rps_jax.record.options import option
-from rps_jax.runs.question import Run, call_of
+from rps_jax.questions import Run, call_of, option
 from sweeps.gradients import mjx_upstream
 from sweeps.study_base import Study, Table
 

@@ -24,11 +24,9 @@ import xarray as xr
 
 from rps_jax.analysis import tables
 from rps_jax.analysis.figures.style import Figure, tiles
-from rps_jax.analysis.report import Picture
+from rps_jax.physics import PHYSICS
+from rps_jax.questions import Picture, Run, call_of, option
 from rps_jax.record import files
-from rps_jax.record.options import option
-from rps_jax.runs.question import Run, call_of
-from rps_jax.world.physics import PHYSICS
 from sweeps.gradients.race import run_commands
 from sweeps.study_base import QuickStudy, Rows, Table, part_name, text_table
 

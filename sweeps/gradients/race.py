@@ -29,14 +29,11 @@ import numpy as np
 import pandas as pd
 import xarray as xr
 
-from rps_jax import errors
+from rps_jax import InputError, RPSParams, Setting, errors, evaluate
 from rps_jax.analysis import statistics
 from rps_jax.control import registry
-from rps_jax.control.laws.rps import RPSParams
-from rps_jax.record.options import option
-from rps_jax.runs.evaluate import evaluate
-from rps_jax.runs.question import Run, SimulationQuestion, call_of
-from rps_jax.trials.setting import Setting
+from rps_jax.questions import Run, call_of, option
+from rps_jax.runs.question import SimulationQuestion
 from sweeps.study_base import Rows, Study, Table, part_name
 
 COUNTS = {6: "K_h K_v L beta l_cr d_th", 13: "full"}  # tuned parameters by their number
@@ -131,7 +128,7 @@ class Race(Study[xr.Dataset], SimulationQuestion[xr.Dataset]):
         """Return the success of the best law of a tuning within each budget."""
         if not (folder / "curve.csv").exists():
             reason = f"{folder.with_suffix('.log')} tells why; or raise minutes"
-            raise errors.InputError(f"{folder} has no generation: {reason}.")
+            raise InputError(f"{folder} has no generation: {reason}.")
         curve = pd.read_csv(folder / "curve.csv")
         chosen = [best_within(curve, name, getattr(self, name)) for name in BUDGETS]
         laws = [RPSParams.paper(), *map(law_of, chosen)]

@@ -19,12 +19,12 @@ import jax.numpy as jnp
 import numpy as np
 import xarray as xr
 
-from rps_jax.record.options import option
+from rps_jax import Rules, Setting
+from rps_jax.questions import Run, call_of, option
 from rps_jax.runs import evaluate
 from rps_jax.runs.evaluate import Candidates, CandidateScores
-from rps_jax.runs.question import Run, SimulationQuestion, call_of
-from rps_jax.trials.setting import Setting, seed_of
-from rps_jax.trials.trial import Rules
+from rps_jax.runs.question import SimulationQuestion
+from rps_jax.trials.setting import seed_of
 from rps_jax.tuning import descent
 from rps_jax.tuning.gradients import Estimate, estimate
 from sweeps.gradients import critic

@@ -20,10 +20,10 @@ import numpy.typing as npt
 
 from rps_jax.geometry import solid
 from rps_jax.geometry.solid import GRAVITY, Solid
+from rps_jax.physics import FRICTION, Physics
 from rps_jax.robot import shell
 from rps_jax.world import scene
-from rps_jax.world.physics import Physics
-from rps_jax.world.scene import FRICTION, JOINTS, Scene
+from rps_jax.world.scene import JOINTS, Scene
 from sweeps.ground import rigid
 from sweeps.ground.rigid import Pushed, Rounding
 

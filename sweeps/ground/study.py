@@ -18,9 +18,8 @@ import xarray as xr
 from matplotlib.lines import Line2D
 
 from rps_jax.analysis.figures.style import Figure, words
-from rps_jax.analysis.report import Picture
-from rps_jax.runs.question import Run, call_of
-from rps_jax.world.physics import PHYSICS
+from rps_jax.physics import PHYSICS
+from rps_jax.questions import Picture, Run, call_of
 from sweeps.ground import grounds
 from sweeps.study_base import QuickStudy, Table
 

@@ -11,10 +11,10 @@ import jax.numpy as jnp
 import numpy as np
 import xarray as xr
 
+from rps_jax import RPSParams
 from rps_jax.analysis import tables
-from rps_jax.control.laws.rps import RPSParams
+from rps_jax.laws import Space
 from rps_jax.trials.trial import Outcome
-from rps_jax.tuning.space import Space
 from sweeps.study_base import records
 
 _EDGE = 0.03  # distance of varied parameters from their bounds, as a share of the range

@@ -17,12 +17,10 @@ import jax
 import numpy as np
 import xarray as xr
 
-from rps_jax import errors
+from rps_jax import Domain, RPSParams, errors
 from rps_jax.analysis.figures.style import Figure, success_rates, tiles
-from rps_jax.analysis.report import Picture, Section
-from rps_jax.control.laws.rps import BOUNDS, RPSParams
-from rps_jax.record.options import option
-from rps_jax.runs.question import MultiLawQuestion, Run, call_of
+from rps_jax.control.laws.rps import BOUNDS
+from rps_jax.questions import MultiLawQuestion, Picture, Run, Section, call_of, option
 from rps_jax.trials.batch import BatchOptions
 from rps_jax.trials.progress import SequentialProgress
 from rps_jax.trials.rollout import Candidates, outcomes
@@ -30,7 +28,7 @@ from rps_jax.trials.setting import Split, seed_of
 from rps_jax.trials.trial import Outcome
 from rps_jax.tuning.run import parse_domains
 from rps_jax.tuning.space import SUBSETS
-from rps_jax.world.domain import Domain, DomainLike
+from rps_jax.worlds import DomainLike
 from sweeps.landscape.candidates import aims, cloud, front_table, lines, undominated
 
 

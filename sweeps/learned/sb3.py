@@ -22,15 +22,11 @@ from typing import Any, ClassVar
 import numpy as np
 import xarray as xr
 
-from rps_jax import errors
+from rps_jax import InputError, Rules, Setting
 from rps_jax.analysis import statistics, tables
 from rps_jax.analysis.figures.style import Figure, panel
-from rps_jax.analysis.report import Picture
-from rps_jax.record.options import option
-from rps_jax.runs.question import Run, call_of
-from rps_jax.trials.setting import Setting
-from rps_jax.trials.trial import Rules
-from rps_jax.world import domain as domains
+from rps_jax.questions import Picture, Run, call_of, option
+from rps_jax.worlds import parse_domain
 from sweeps.study_base import Rows, Study, Table, records
 
 _VARIABLES = {
@@ -70,10 +66,10 @@ class SB3(Study[xr.Dataset]):
 
     def check(self) -> None:
         """Check the domain, and that the libraries are there."""
-        domains.parse_domain(self.domain)
+        parse_domain(self.domain)
         for name in ("gymnasium", "stable_baselines3"):
             if not importlib.util.find_spec(name):
-                raise errors.InputError(
+                raise InputError(
                     f"{name} is not installed: run pip install gymnasium stable-baselines3."
                 )
 

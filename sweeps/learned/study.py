@@ -18,11 +18,9 @@ import numpy as np
 
 from rps_jax import errors
 from rps_jax.analysis import statistics
-from rps_jax.analysis.report import Picture
+from rps_jax.questions import Picture, Run, call_of, option
 from rps_jax.record import files, provenance
 from rps_jax.record import folder as run_folder
-from rps_jax.record.options import option
-from rps_jax.runs.question import Run, call_of
 from rps_jax.tuning import learn
 from sweeps.study_base import Study, Table, write_table
 

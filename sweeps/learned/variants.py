@@ -20,13 +20,11 @@ from typing import Any, ClassVar
 import numpy as np
 import xarray as xr
 
+from rps_jax import Setting, evaluate
 from rps_jax.analysis import statistics
 from rps_jax.app.cli import flags
+from rps_jax.questions import Run, call_of, option
 from rps_jax.record import files, provenance
-from rps_jax.record.options import option
-from rps_jax.runs.evaluate import evaluate
-from rps_jax.runs.question import Run, call_of
-from rps_jax.trials.setting import Setting
 from rps_jax.tuning.learn import Learn
 from sweeps.study_base import QuickStudy, Table, write_table
 

@@ -18,23 +18,16 @@ import numpy as np
 import xarray as xr
 from scipy import optimize
 
-from rps_jax import errors
+from rps_jax import Domain, Range, Robot, Rules, Setting, errors
 from rps_jax.analysis import statistics, tables
 from rps_jax.analysis.figures.style import Figure, success_rates, tiles
-from rps_jax.analysis.report import Picture, Section
-from rps_jax.control.base import LawParams
 from rps_jax.geometry.solid import GRAVITY
-from rps_jax.record.options import option
-from rps_jax.robot.robot import Robot
+from rps_jax.laws import LawParams
+from rps_jax.questions import MultiLawQuestion, Picture, Plan, Run, Section, call_of, option
 from rps_jax.robot.shell import BOARDS, HALF_WIDTH
-from rps_jax.runs.plan import Plan
-from rps_jax.runs.question import MultiLawQuestion, Run, call_of
 from rps_jax.runs.sweep import Sweep
 from rps_jax.trials import pushes
-from rps_jax.trials.case import Case
-from rps_jax.trials.setting import Setting
-from rps_jax.trials.trial import Rules
-from rps_jax.world.domain import Domain, DomainLike, Range, parse_domain
+from rps_jax.worlds import Case, DomainLike, parse_domain
 from sweeps.study_base import Rows, run_plans
 
 LOSSES = (0.01, 0.10)  # [1] of success, whose limits are looked for

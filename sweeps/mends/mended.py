@@ -10,11 +10,9 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from rps_jax.control import registry
-from rps_jax.control.base import Law
+from rps_jax import Details, Law, Observation, RPSParams, RPSState, Twist, register_law
 from rps_jax.control.laws import rps, rps_plus
-from rps_jax.control.laws.rps import RPSParams, RPSState
-from rps_jax.control.observation import Details, Observation, Twist, displacement
+from rps_jax.control.observation import displacement
 from rps_jax.geometry import planar
 
 TUNED = RPSParams.tuned()
@@ -126,4 +124,4 @@ MENDS = {
     ),
 }  # fmt: skip
 
-registry.register_law("_mended", Law(init, step), Mended())
+register_law("_mended", Law(init, step), Mended())

@@ -12,22 +12,21 @@ import jax.numpy as jnp
 import numpy as np
 import xarray as xr
 
-from rps_jax.control.base import LawParams
-from rps_jax.control.laws.rps import RPSParams
-from rps_jax.robot.skin import LINE, POINT, IdealSkin
-from rps_jax.runs.question import Run
+from rps_jax import Domain, Range, RPSParams, Setting
+from rps_jax.laws import LawParams
+from rps_jax.physics import FRICTION, PHYSICS
+from rps_jax.questions import Run
+from rps_jax.robot.skin import LINE, POINT
 from rps_jax.trials import pushes
 from rps_jax.trials.batch import WorldBatch
 from rps_jax.trials.progress import ProgressCallback
 from rps_jax.trials.results import trace_dataset
 from rps_jax.trials.rollout import Candidates, outcomes
-from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import Outcome
 from rps_jax.world import paper, points, scene
-from rps_jax.world.domain import DOMAINS, Domain, Range
+from rps_jax.world.domain import DOMAINS
 from rps_jax.world.draws import Draw
-from rps_jax.world.physics import PHYSICS
-from rps_jax.world.scene import FRICTION
+from rps_jax.worlds import IdealSkin
 from sweeps.paper_reading import printed
 from sweeps.paper_reading.printed import SHORT
 from sweeps.paper_reading.unknowns import NAMES, UNKNOWNS, aps_params, params, texts, values

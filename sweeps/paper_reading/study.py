@@ -18,13 +18,11 @@ from typing import ClassVar
 import numpy as np
 import xarray as xr
 
-from rps_jax.analysis.report import Picture
-from rps_jax.record.options import option
-from rps_jax.runs.question import Run, call_of
+from rps_jax import Setting
+from rps_jax.physics import PHYSICS
+from rps_jax.questions import Picture, Run, call_of, option
 from rps_jax.trials.progress import SequentialProgress
-from rps_jax.trials.setting import Setting
 from rps_jax.world import paper
-from rps_jax.world.physics import PHYSICS
 from sweeps.paper_reading import drawing, evidence, experiments, printed
 from sweeps.paper_reading.experiments import Target
 from sweeps.paper_reading.unknowns import Proposal, redraw_hardware

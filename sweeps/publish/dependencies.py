@@ -26,7 +26,7 @@ import xarray as xr
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
-from rps_jax.runs.question import Run, call_of
+from rps_jax.questions import Run, call_of
 from sweeps.study_base import Rows, Study, Table, run_parts, run_process
 
 ROOT = Path(__file__).parents[2]

@@ -9,12 +9,11 @@ from pathlib import Path
 import numpy as np
 import xarray as xr
 
+from rps_jax import Robot, Rules
 from rps_jax.analysis import statistics, tables
 from rps_jax.geometry.solid import GRAVITY
-from rps_jax.robot.robot import Robot
 from rps_jax.studies import rare, sensitivity
 from rps_jax.studies.attack import yields
-from rps_jax.trials.trial import Rules
 from sweeps.study_base import Rows
 
 _MAX_LOST = float(Rules().max_lost)  # [s] in all published commands

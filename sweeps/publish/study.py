@@ -23,12 +23,10 @@ from typing import Any, ClassVar, Literal
 
 import xarray as xr
 
-from rps_jax import errors
-from rps_jax.analysis.report import Section
+from rps_jax import InputError, errors
 from rps_jax.app.cli import flags, names
-from rps_jax.errors import InputError
+from rps_jax.questions import Run, Section, call_of
 from rps_jax.record import provenance
-from rps_jax.runs.question import Run, call_of
 from sweeps import probes
 from sweeps.publish.recipes import HISTORY, RECIPES, Recipe
 from sweeps.render_tables import STALE

@@ -22,8 +22,7 @@ import pandas as pd
 import xarray as xr
 from scipy.optimize import least_squares
 
-from rps_jax.record.options import option
-from rps_jax.runs.question import Run, call_of
+from rps_jax.questions import Run, call_of, option
 from rps_jax.tuning import posterior
 from sweeps.real_pushes import pushes, study
 from sweeps.real_pushes.problem import HIGH, LOW, QUANTITIES, Cell

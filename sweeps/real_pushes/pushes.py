@@ -14,8 +14,7 @@ import numpy as np
 import pandas as pd
 import xarray as xr
 
-from rps_jax import errors
-from rps_jax.errors import InputError
+from rps_jax import InputError, errors
 from rps_jax.geometry.solid import rotate
 from sweeps.real_pushes import fingers
 from sweeps.real_pushes.fingers import Ground

@@ -23,11 +23,9 @@ import pandas as pd
 import xarray as xr
 from scipy.stats import t as t_distribution
 
-from rps_jax.analysis.report import Picture
+from rps_jax.physics import PHYSICS
+from rps_jax.questions import Picture, Run, call_of, option
 from rps_jax.record import files
-from rps_jax.record.options import option
-from rps_jax.runs.question import Run, call_of
-from rps_jax.world.physics import PHYSICS
 from sweeps.real_pushes import contact, pushes
 from sweeps.real_pushes.drawing import figure
 from sweeps.real_pushes.pushes import Errors

@@ -12,15 +12,12 @@ from typing import ClassVar
 import numpy as np
 import xarray as xr
 
+from rps_jax import Setting
 from rps_jax.analysis import statistics, tables
-from rps_jax.analysis.report import Section
-from rps_jax.control.registry import LawsLike
-from rps_jax.record.options import option
-from rps_jax.runs.plan import Plan
-from rps_jax.runs.question import MultiLawQuestion, Run, call_of
+from rps_jax.laws import LawsLike
+from rps_jax.questions import MultiLawQuestion, Plan, Run, Section, call_of, option
 from rps_jax.runs.sweep import Sweep
-from rps_jax.trials.setting import Setting
-from rps_jax.world.domain import DomainLike
+from rps_jax.worlds import DomainLike
 from sweeps.study_base import Rows, run_plans
 
 BASES = {"flat": "ideal", "round": "round"}  # robots, 0.58 m wide

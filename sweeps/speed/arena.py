@@ -24,11 +24,10 @@ import mujoco
 import numpy as np
 import xarray as xr
 
-from rps_jax.record.options import option
-from rps_jax.runs.question import Run, call_of
+from rps_jax.physics import preset
+from rps_jax.questions import Run, call_of, option
 from rps_jax.trials.progress import Progress
 from rps_jax.world import scene
-from rps_jax.world.physics import preset
 from sweeps.speed import racers
 from sweeps.speed.racers import ON_CORES, RACERS
 from sweeps.study_base import (

@@ -25,9 +25,8 @@ from typing import ClassVar
 
 import xarray as xr
 
-from rps_jax.errors import InputError
-from rps_jax.record.options import option
-from rps_jax.runs.question import Run, call_of
+from rps_jax import InputError
+from rps_jax.questions import Run, call_of, option
 from sweeps.study_base import SpeedStudy, Table, records, text_table
 
 TIMING = re.compile(r"compile ([\d.]+) s, run ([\d.]+) s \((\d+) simulated s per s\)")

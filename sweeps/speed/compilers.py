@@ -21,9 +21,8 @@ import numpy as np
 import xarray as xr
 
 import rps_jax
-from rps_jax.errors import InputError
-from rps_jax.record.options import option
-from rps_jax.runs.question import Run, call_of
+from rps_jax import InputError
+from rps_jax.questions import Run, call_of, option
 from sweeps.speed.commands import TIMING, printed
 from sweeps.study_base import SpeedStudy, Table, records, text_table
 

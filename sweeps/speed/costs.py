@@ -24,8 +24,7 @@ from typing import Any, ClassVar, Literal, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from rps_jax.record.options import option
-from rps_jax.runs.question import Run, call_of
+from rps_jax.questions import Run, call_of, option
 from rps_jax.trials.progress import Progress
 from sweeps import programs
 from sweeps.programs import FAMILIES

@@ -20,16 +20,15 @@ import jax.numpy as jnp
 import numpy as np
 import xarray as xr
 
-from rps_jax import RPSParams
+from rps_jax import RPSParams, Setting
 from rps_jax.control import registry
 from rps_jax.engines import native
-from rps_jax.record.options import option
-from rps_jax.runs.question import Run, call_of
+from rps_jax.laws import law_of
+from rps_jax.questions import Run, call_of, option
 from rps_jax.trials.rollout import Candidates
-from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import ControlLoop, advance, start_all, unroll
 from rps_jax.trials.worlds import soften_skins
-from rps_jax.world.domain import parse_domain
+from rps_jax.worlds import parse_domain
 from sweeps.study_base import SpeedStudy, Table, records, text_table
 
 _ROUNDS = 5  # of which the fastest counts
@@ -87,7 +86,7 @@ class Derivatives(SpeedStudy[xr.Dataset]):
         (batch,) = Candidates(single, [domain], 0, np.arange(self.worlds)).batches(setting)
         worlds = jax.tree.map(jnp.asarray, soften_skins(batch.worlds))
         repeated = jax.tree.map(lambda x: jnp.full(self.worlds, x, float), params)
-        law = registry.smooth_law(registry.law_of(params))
+        law = registry.smooth_law(law_of(params))
         loop = ControlLoop(setting.physics, law=law)
         steps = round(self.horizon / setting.physics.control_period)
         live = jnp.ones(self.worlds, bool)

@@ -22,12 +22,10 @@ from typing import ClassVar
 import numpy as np
 import xarray as xr
 
+from rps_jax import InputError
 from rps_jax.analysis.figures.style import Figure, words
-from rps_jax.analysis.report import Picture
-from rps_jax.errors import InputError
-from rps_jax.record.options import option
-from rps_jax.runs.question import Run, call_of
-from rps_jax.world.domain import parse_domain
+from rps_jax.questions import Picture, Run, call_of, option
+from rps_jax.worlds import parse_domain
 from sweeps.speed.commands import TIMING, printed
 from sweeps.study_base import SpeedStudy, Table, records, run_process, text_table
 

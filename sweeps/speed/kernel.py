@@ -20,11 +20,9 @@ from typing import ClassVar, Literal
 
 import xarray as xr
 
-from rps_jax.errors import InputError
-from rps_jax.record.options import option
-from rps_jax.runs.question import Run, call_of
+from rps_jax import InputError, Setting
+from rps_jax.questions import Run, call_of, option
 from rps_jax.trials.batch import SEGMENT
-from rps_jax.trials.setting import Setting
 from sweeps.programs import FAMILIES
 from sweeps.study_base import SpeedStudy, Table, records, run_process, text_table
 

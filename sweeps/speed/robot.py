@@ -16,8 +16,7 @@ from typing import ClassVar
 
 import xarray as xr
 
-from rps_jax.record.options import option
-from rps_jax.runs.question import Run, call_of
+from rps_jax.questions import Run, call_of, option
 from sweeps.study_base import Study, Table, records, run_process, text_table
 
 _ROOT = Path(__file__).parents[2]

@@ -19,16 +19,14 @@ import jax
 import numpy as np
 import xarray as xr
 
+from rps_jax import Rules, Setting
 from rps_jax.analysis.figures.style import Figure, words
-from rps_jax.analysis.report import Picture
 from rps_jax.engines import device
 from rps_jax.engines.mujoco import Batch
-from rps_jax.record.options import option
-from rps_jax.runs.question import Run, call_of
+from rps_jax.physics import preset
+from rps_jax.questions import Picture, Run, call_of, option
 from rps_jax.trials import host
-from rps_jax.trials.setting import Setting
-from rps_jax.trials.trial import ControlLoop, Rules
-from rps_jax.world.physics import preset
+from rps_jax.trials.trial import ControlLoop
 from sweeps import programs
 from sweeps.programs import BATCHED, FAMILIES, Program
 from sweeps.study_base import (
