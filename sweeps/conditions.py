@@ -17,8 +17,7 @@ import xarray as xr
 
 from rps_jax import InputError, RPSParams, Setting
 from rps_jax.analysis import statistics
-from rps_jax.control import registry
-from rps_jax.laws import LawParams, law_of
+from rps_jax.laws import LawParams, law_of, resolve_law
 from rps_jax.physics import FRICTION, PHYSICS
 from rps_jax.questions import Run
 from rps_jax.record import files
@@ -63,7 +62,7 @@ class Condition:
 
     def cases(self, grid: Grid) -> list[Case]:
         """Return the trials of a grid under this condition."""
-        changed = {name: self._changed(registry.LAWS[name]) for name in grid.laws}
+        changed = {name: self._changed(resolve_law(name)[1]) for name in grid.laws}
         return [
             Case(name, friction, target, changed[law], **self.case)
             for law in grid.laws
@@ -75,7 +74,7 @@ class Condition:
     def is_allowed(self, laws: Sequence[str]) -> bool:
         """Return whether all laws accept the changed parameters."""
         try:
-            for params in (self._changed(registry.LAWS[name]) for name in laws):
+            for params in (self._changed(resolve_law(name)[1]) for name in laws):
                 law_of(params).check(params)
         except InputError:
             return False
@@ -83,7 +82,7 @@ class Condition:
 
     def is_default(self, laws: Sequence[str]) -> bool:
         """Return whether it changes only parameters, to values that all laws have already."""
-        unchanged = (self._changed(registry.LAWS[x]) == registry.LAWS[x] for x in laws)
+        unchanged = (self._changed(x) == x for _, x in map(resolve_law, laws))
         return bool(self.params) and not self.case and all(unchanged)
 
     def _changed(self, params: LawParams) -> LawParams:

@@ -22,12 +22,14 @@ from rps_jax.trials.batch import WorldBatch, rows
 from rps_jax.trials.trial import ControlLoop, Trial, World
 from rps_jax.trials.worlds import drawn_worlds
 from rps_jax.world import draws, paper
-from rps_jax.world.domain import DOMAINS
-from rps_jax.worlds import Case
+from rps_jax.worlds import Case, parse_domain
 
 FAMILIES = ("box", "cylinder", "prism")
 _PRISMS = replace(
-    DOMAINS["paper"], objects=("random_prism",), frictions=(FRICTION["S1"],), gap=Range(0.0, 0.0)
+    parse_domain("paper"),
+    objects=("random_prism",),
+    frictions=(FRICTION["S1"],),
+    gap=Range(0.0, 0.0),
 )
 _MUJOCO_DEFAULTS = Physics(
     timestep=0.002,

@@ -39,6 +39,7 @@ from sweeps import probes, render_tables
 
 T = TypeVar("T", covariant=True)
 Rows = list[list[str]]
+RANDOM_OBJECTS = ("random_box", "random_cylinder", "random_prism")
 _PACKAGES = ("rps_jax", "jax", "mujoco", "mujoco-mjx")  # whose versions a data file has
 
 

@@ -324,8 +324,9 @@ def function(name: str, routine: Routine, tables: dict[str, str]) -> str:
     """Return a routine of a page as a function of its groups of fields."""
     groups = {group: f"{group}." for group in routine.inputs}
     lines = js.statements(routine, groups, tables, PageWriter)
-    results = ", ".join(f"{group}: {js.object_of(group, routine.outputs)}"
-                        for group in routine.outputs)  # fmt: skip
+    results = ", ".join(
+        f"{group}: {js.object_of(group, routine.outputs)}" for group in routine.outputs
+    )
     head = f"function {name}({', '.join(routine.inputs)}) {{"
     return f"{head}\n{lines}\n  return {{ {results} }};\n}}\n"
 

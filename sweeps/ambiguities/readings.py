@@ -128,10 +128,14 @@ def cells(results: xr.Dataset) -> list[list[str]]:
         theirs = paper.TABLE_II[str(law), str(name), str(friction)]
         low, high = statistics.wilson(theirs, in_paper)
         table = [[ours, trials - ours], [theirs, in_paper - theirs]]
-        rows.append([
-            f"{str(law).upper()} {name} {friction}", f"{ours} of {trials}",
-            f"{theirs} of {in_paper}", f"{in_paper * low:.1f}-{in_paper * high:.1f}",
-            "yes" if low <= ours / trials <= high else "no",
-            f"{stats.fisher_exact(table).pvalue:.2g}",
-        ])  # fmt: skip
+        rows.append(
+            [
+                f"{str(law).upper()} {name} {friction}",
+                f"{ours} of {trials}",
+                f"{theirs} of {in_paper}",
+                f"{in_paper * low:.1f}-{in_paper * high:.1f}",
+                "yes" if low <= ours / trials <= high else "no",
+                f"{stats.fisher_exact(table).pvalue:.2g}",
+            ]
+        )
     return rows

@@ -15,7 +15,7 @@ from typing import Any, ClassVar
 import xarray as xr
 
 from rps_jax import InputError, errors
-from rps_jax.control import registry
+from rps_jax.laws import resolve_law
 from rps_jax.questions import call_of
 from rps_jax.world import paper
 from sweeps.ambiguities import readings
@@ -80,7 +80,7 @@ class Ambiguities(ConditionStudy):
         for name in self.readings:
             errors.check_name("reading", name, self.known)
         for name in self.grid.laws:
-            errors.check_name("law", name, registry.LAWS)
+            resolve_law(name)
 
     def intro(self, results: xr.Dataset) -> str:
         """Trials, tests and left-out readings."""

@@ -19,7 +19,7 @@ import numpy as np
 import xarray as xr
 
 from rps_jax import Domain, Rules, Setting
-from rps_jax.control import registry
+from rps_jax.laws import resolve_law
 from rps_jax.questions import Run, call_of, option
 from rps_jax.trials.progress import Progress
 from rps_jax.trials.rollout import Candidates, outcomes
@@ -69,7 +69,7 @@ class Costs(SpeedStudy[xr.Dataset]):
     def answer(self, run: Run) -> xr.Dataset:
         """Measure all tasks in turn, round by round."""
         setting = Setting("fused", rules=Rules(horizon=self.horizon, max_lost=1e4))
-        params = jax.tree.map(lambda x: np.asarray(x)[None], registry.LAWS["rps"])
+        params = jax.tree.map(lambda x: np.asarray(x)[None], resolve_law("rps")[1])
         costs = np.zeros((len(self.tasks), self.rounds + 1))
         for i in range(self.rounds + 1):
             for j, name in enumerate(self.tasks):

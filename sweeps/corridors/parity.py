@@ -73,8 +73,11 @@ class Parity(Study[xr.DataTree]):
     @cached_property
     def plans(self) -> dict[str, Plan]:
         """Plans by row and engine."""
-        return {f"{row} {engine}": self._plan(ROWS[row], engine)
-                for row in self.rows for engine in ENGINES}  # fmt: skip
+        return {
+            f"{row} {engine}": self._plan(ROWS[row], engine)
+            for row in self.rows
+            for engine in ENGINES
+        }
 
     def _plan(self, row: Row, engine: str) -> Plan:
         """Return the plan of a row in an engine."""

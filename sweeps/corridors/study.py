@@ -41,8 +41,13 @@ DOOR = "0°, a door"
 _DOOR_WIDTH = 0.7  # [1] of the corridor's width
 _PATH_TURNS = (0, 30, 60, 90)  # [deg] edges of the classes of a path's turns
 KINDS = (
-    *("base touched", "object touched", "lost contact", "never touched", "fell over"),
-    *("out of time", "diverged"),
+    "base touched",
+    "object touched",
+    "lost contact",
+    "never touched",
+    "fell over",
+    "out of time",
+    "diverged",
 )
 _BORDERS = 0.1, 0.95  # [1] of the path, before and beyond which a failure is one of its ends
 _IN_TIME = 300.0  # [s] default horizon of trials
@@ -70,8 +75,13 @@ class Corridors(Study[xr.DataTree], MultiLawQuestion[xr.DataTree]):
     }
 
     laws: LawsLike = (
-        *("rps", "rps_tuned", "rps_plus", "learned"),
-        *("force_push", "dipole", "aps"),
+        "rps",
+        "rps_tuned",
+        "rps_plus",
+        "learned",
+        "force_push",
+        "dipole",
+        "aps",
     )
     domain: DomainLike = "wide"
     """Ranges from which worlds are drawn: paper, hardware, wide, real, prisms or hostile, or a JSON
@@ -172,19 +182,39 @@ class Corridors(Study[xr.DataTree], MultiLawQuestion[xr.DataTree]):
         curves = fit_all(corridors)
         figure = Picture("corridors", partial(figure_of, corridors, curves))
         return [
-            Table(width_table(corridors, curves), name="corridors_widths", merge="turn",
-                  title="Width that laws need", picture=figure),
-            Table(object_table(corridors), name="corridors_objects", merge="turn",
-                  title="Width that 90 % need, by object"),
-            Table(failure_table(corridors), name="corridors_failures", merge="turn",
-                  title="Failures"),
-            Table(lookahead_table(choice), name="corridors_lookaheads",
-                  title="Success in corridors by lookahead"),
-            Table(lookahead_table(paths, _IN_TIME), name="corridors_open",
-                  title="Success on paths within 300 s, by lookahead"),
-            Table(error_table(paths), name="corridors_paths", merge="law",
-                  title="Cross-track error on paths"),
-        ]  # fmt: skip
+            Table(
+                width_table(corridors, curves),
+                name="corridors_widths",
+                merge="turn",
+                title="Width that laws need",
+                picture=figure,
+            ),
+            Table(
+                object_table(corridors),
+                name="corridors_objects",
+                merge="turn",
+                title="Width that 90 % need, by object",
+            ),
+            Table(
+                failure_table(corridors), name="corridors_failures", merge="turn", title="Failures"
+            ),
+            Table(
+                lookahead_table(choice),
+                name="corridors_lookaheads",
+                title="Success in corridors by lookahead",
+            ),
+            Table(
+                lookahead_table(paths, _IN_TIME),
+                name="corridors_open",
+                title="Success on paths within 300 s, by lookahead",
+            ),
+            Table(
+                error_table(paths),
+                name="corridors_paths",
+                merge="law",
+                title="Cross-track error on paths",
+            ),
+        ]
 
 
 corridors = call_of(Corridors)
@@ -327,8 +357,10 @@ def failure_table(results: xr.Dataset) -> Rows:
             trials = started.sel(row=row, law=law)
             kinds = failure_kinds(trials)
             failed = kinds >= 0
-            shares = [100 * np.mean(kinds[failed] == i) if failed.any() else 0.0
-                      for i in range(len(KINDS))]  # fmt: skip
+            shares = [
+                100 * np.mean(kinds[failed] == i) if failed.any() else 0.0
+                for i in range(len(KINDS))
+            ]
             progress = trials.progress.values[failed]
             first, last = _BORDERS
             where = [100 * np.mean(m) for m in (progress < first, progress > last) if m.size]
@@ -401,6 +433,7 @@ def figure_of(results: xr.Dataset, curves: Mapping[tuple[str, str], Curve]) -> F
         ax.set_xlabel("narrowest width [m]")
     for ax in axes[:, 0]:
         ax.set_ylabel("success [%]")
-    figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=7,
-                  fontsize=8)  # fmt: skip
+    figure.legend(
+        *axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=7, fontsize=8
+    )
     return figure

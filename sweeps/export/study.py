@@ -124,9 +124,9 @@ class Export(QuickStudy[xr.DataTree]):
             free, synchronised, in_jax = errors
             parted = [(x > native.JUMP).sum() for x in (free, in_jax)]
             beyond = (free > native.TOLERANCE[form]).sum()
-            rows.append(_Trials(
-                len(trials), free.size, free.max(), synchronised.max(), beyond, *parted
-            ))  # fmt: skip
+            rows.append(
+                _Trials(len(trials), free.size, free.max(), synchronised.max(), beyond, *parted)
+            )
         return _columns(rows, "form", _FORMS)
 
     def _paper(self, law: str, folder: Path) -> xr.Dataset:
@@ -160,10 +160,14 @@ class Export(QuickStudy[xr.DataTree]):
     def report_tables(self, results: xr.DataTree) -> Sequence[Table]:
         """Return all tables."""
         functions = {
-            "speed": _speed_table, "inputs": _input_table, "trials": _trial_table,
-            "paper": _paper_table, "worlds": partial(_world_table, self.domain),
-            "bags": partial(_bag_table, self.domain), "odd": _odd_table,
-        }  # fmt: skip
+            "speed": _speed_table,
+            "inputs": _input_table,
+            "trials": _trial_table,
+            "paper": _paper_table,
+            "worlds": partial(_world_table, self.domain),
+            "bags": partial(_bag_table, self.domain),
+            "odd": _odd_table,
+        }
         return [
             functions[name](node.to_dataset())._replace(name=f"export_{name}")
             for name, node in results.children.items()
@@ -193,18 +197,34 @@ def _share(part: float, whole: float) -> str:
 
 def _input_table(results: xr.Dataset) -> Table:
     rows = [
-        ["law", "form", "inputs", "greatest difference", "beyond the goal", "flips", "unexplained",
-         "beyond 1e-6 of float64", "JAX's float32 is"],
-    ]  # fmt: skip
+        [
+            "law",
+            "form",
+            "inputs",
+            "greatest difference",
+            "beyond the goal",
+            "flips",
+            "unexplained",
+            "beyond 1e-6 of float64",
+            "JAX's float32 is",
+        ],
+    ]
     for row in records(results, "law", "form"):
         beyond, *in_float = (
             _share(row[name], row["inputs"]) for name in ("beyond", "off", "off_in_jax")
         )
-        rows.append([
-            row["law"], _WORDS[row["form"]], f"{row['inputs']:,.0f}", f"{row['greatest']:.1e}",
-            beyond, f"{row['flips']:.0f}", f"{row['unexplained']:.0f}",
-            *(in_float if row["form"] != "double" else ["", ""]),
-        ])  # fmt: skip
+        rows.append(
+            [
+                row["law"],
+                _WORDS[row["form"]],
+                f"{row['inputs']:,.0f}",
+                f"{row['greatest']:.1e}",
+                beyond,
+                f"{row['flips']:.0f}",
+                f"{row['unexplained']:.0f}",
+                *(in_float if row["form"] != "double" else ["", ""]),
+            ]
+        )
     note = (
         "The goal is 1e-12 in double and 1e-6 in float. Differences are shares of the greatest "
         "speed and turning rate, or of the memory."
@@ -213,16 +233,33 @@ def _input_table(results: xr.Dataset) -> Table:
 
 
 def _trial_table(results: xr.Dataset) -> Table:
-    rows = [["law", "form", "steps", "greatest difference", "from JAX's memory",
-             "steps beyond the goal", "beyond 1e-3", "JAX's float32 is"]]  # fmt: skip
+    rows = [
+        [
+            "law",
+            "form",
+            "steps",
+            "greatest difference",
+            "from JAX's memory",
+            "steps beyond the goal",
+            "beyond 1e-3",
+            "JAX's float32 is",
+        ]
+    ]
     for row in records(results, "law", "form"):
         *shares, in_jax = (
             _share(row[name], row["steps"]) for name in ("beyond", "parted", "in_jax")
         )
-        rows.append([
-            row["law"], _WORDS[row["form"]], f"{row['steps']:,.0f}", f"{row['greatest']:.1e}",
-            f"{row['told']:.1e}", *shares, in_jax if row["form"] != "double" else "",
-        ])  # fmt: skip
+        rows.append(
+            [
+                row["law"],
+                _WORDS[row["form"]],
+                f"{row['steps']:,.0f}",
+                f"{row['greatest']:.1e}",
+                f"{row['told']:.1e}",
+                *shares,
+                in_jax if row["form"] != "double" else "",
+            ]
+        )
     note = (
         f"{int(results.trials.max())} trials of each law. Each law remembers by itself from "
         "the first step to the last; from JAX's memory, it is given that before each step. JAX's "

@@ -143,8 +143,9 @@ def table(results: xr.Dataset) -> Rows:
     The cost is wall clock for a simulated second of one world while the trials ran.
     """
     base = results.success.sel(condition=REFERENCE)
-    rows = [["setting", "equal outcomes", "95 %", "+/-", "McNemar p", "5 s error: median, 95 %",
-             "cost"]]  # fmt: skip
+    rows = [
+        ["setting", "equal outcomes", "95 %", "+/-", "McNemar p", "5 s error: median, 95 %", "cost"]
+    ]
     for name in map(str, results.condition.values):
         condition = results.sel(condition=name)
         c = statistics.compare(base, condition.success)
@@ -153,10 +154,15 @@ def table(results: xr.Dataset) -> Rows:
         low, high = statistics.wilson(equal, total)
         median, worst = 1000 * np.quantile(condition.early_error.values, (0.5, 0.95))
         cost = float(condition.run_time) / float(condition.simulated)
-        rows.append([
-            str(condition.what.values),
-            f"{100 * (equal / total):.1f} %", f"{100 * low:.0f}-{100 * high:.0f} %",
-            c.changes, f"{c.p:.2g}", f"{median:.1f}, {worst:.1f} mm",
-            f"{1000 * cost:.3g} ms",
-        ])  # fmt: skip
+        rows.append(
+            [
+                str(condition.what.values),
+                f"{100 * (equal / total):.1f} %",
+                f"{100 * low:.0f}-{100 * high:.0f} %",
+                c.changes,
+                f"{c.p:.2g}",
+                f"{median:.1f}, {worst:.1f} mm",
+                f"{1000 * cost:.3g} ms",
+            ]
+        )
     return rows

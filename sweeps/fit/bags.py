@@ -96,8 +96,16 @@ def table(results: xr.Dataset) -> Rows:
     logs = results.sel(source=_SOURCES[1])
     errors = [abs(results[k] - logs[k]) / (logs.high - logs.low) for k in ("low", "high")]
     is_near = np.maximum(*errors) <= _TOLERANCE
-    rows = [["log", "logs", "90 % intervals hold the truth", "those of told quantities",
-             "as the log itself holds it", "ends within 2 % of its width"]]  # fmt: skip
+    rows = [
+        [
+            "log",
+            "logs",
+            "90 % intervals hold the truth",
+            "those of told quantities",
+            "as the log itself holds it",
+            "ends within 2 % of its width",
+        ]
+    ]
 
     def share(mask: xr.DataArray, where: xr.DataArray | None = None) -> str:
         values = mask if where is None else mask.where(where)

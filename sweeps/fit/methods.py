@@ -41,8 +41,17 @@ METHODS = ("neural", "gradient", "evolution")
 _PART = 25  # logs that one process fits
 _POPULATION, _GENERATIONS = 24, 64  # of CMA-ES: about as many seconds as the derivatives
 _SPREAD = 0.2  # standard deviation of its first generation, in units of the cube
-_QUANTITIES = ("friction_robot", "friction_ground", "mass", "ground_force", "size", "aspect",
-               "height", "com_offset", "pose_latency")  # fmt: skip
+_QUANTITIES = (
+    "friction_robot",
+    "friction_ground",
+    "mass",
+    "ground_force",
+    "size",
+    "aspect",
+    "height",
+    "com_offset",
+    "pose_latency",
+)
 
 
 @dataclass(frozen=True)
@@ -235,9 +244,19 @@ def evolved(replay: Replay, u: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.n
 
 def method_rows(results: xr.Dataset, study: Methods) -> Rows:
     """Return a header and rows for each kind of log and method: all logs, and those of CMA-ES."""
-    rows = [["log", "method", "logs", "90 % intervals hold the truth",
-             "those of determined quantities", "determined", "error of determined quantities",
-             "processor seconds a log", "simulated"]]  # fmt: skip
+    rows = [
+        [
+            "log",
+            "method",
+            "logs",
+            "90 % intervals hold the truth",
+            "those of determined quantities",
+            "determined",
+            "error of determined quantities",
+            "processor seconds a log",
+            "simulated",
+        ]
+    ]
     replays = {
         "gradient": (study.starts // 6 + 16) * 6,
         "evolution": study.starts + _POPULATION * _GENERATIONS,

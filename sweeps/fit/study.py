@@ -109,8 +109,12 @@ class Coverage(FitStudy):
 
     TITLE: ClassVar[str] = "Worlds fitted to logs"
     QUICK: ClassVar[Mapping[str, object]] = {
-        "worlds": 960, "logs": 48, "window": 20.0, "worth": 2, "tasks": 8,
-    }  # fmt: skip
+        "worlds": 960,
+        "logs": 48,
+        "window": 20.0,
+        "worth": 2,
+        "tasks": 8,
+    }
 
     domain: DomainLike = (
         "wide,robot_lag=0:0.4,robot_slip=0:0.1,foam=0.005:0.02,time_constant=0.02:0.15"
@@ -214,8 +218,9 @@ class Coverage(FitStudy):
         labels = {"source": ["truth", "domain", "fit"], "law": list(_LAWS)}
         shape = ("world", "source", "law")
         values = np.array(predictions)
-        return xr.Dataset({"won": (shape, values[..., 0]), "duration": (shape, values[..., 1])},
-                          labels)  # fmt: skip
+        return xr.Dataset(
+            {"won": (shape, values[..., 0]), "duration": (shape, values[..., 1])}, labels
+        )
 
     # --- report ---
 
@@ -241,8 +246,16 @@ def within(fits: xr.Dataset) -> xr.DataArray:
 
 def coverage_rows(results: xr.Dataset) -> Rows:
     """Return a header and one row for each kind of log."""
-    rows = [["log", "90 % intervals hold the truth", "those of told quantities",
-             "least, greatest of a quantity", "told", "right object's probability"]]  # fmt: skip
+    rows = [
+        [
+            "log",
+            "90 % intervals hold the truth",
+            "those of told quantities",
+            "least, greatest of a quantity",
+            "told",
+            "right object's probability",
+        ]
+    ]
     for kind in map(str, results.kind.values):
         fits = results.sel(kind=kind)
         covered, determined = within(fits), fits.undetermined == 0
@@ -272,8 +285,15 @@ def quantity_rows(results: xr.Dataset) -> Rows:
 
 def worth_rows(results: xr.Dataset) -> Rows:
     """Return a header and one row for each law: mean absolute error of the predictions."""
-    rows = [["law", "success, from the domain", "success, from the fit", "time, from the domain",
-             "time, from the fit"]]  # fmt: skip
+    rows = [
+        [
+            "law",
+            "success, from the domain",
+            "success, from the fit",
+            "time, from the domain",
+            "time, from the fit",
+        ]
+    ]
     truth = results.sel(source="truth")
     error = abs(results.drop_sel(source="truth") - truth).mean("world")
     for law in results.law.values:
@@ -301,8 +321,9 @@ def figure(results: xr.Dataset) -> Figure:
         right.plot(100 * shrink[i], np.arange(len(names)) + 0.1 * (i - 2.5), "o", ms=4, label=kind)
     right.axvline(100 * (1 - fit.UNDETERMINED), color="0.6", lw=1, ls=":")
     right.set_yticks(range(len(names)), [quantity(name) for name in names], fontsize=8)
-    right.set(xlabel="how much narrower than the prior's [%], mean over logs",
-              title="What logs tell")  # fmt: skip
+    right.set(
+        xlabel="how much narrower than the prior's [%], mean over logs", title="What logs tell"
+    )
     right.grid(axis="y", alpha=0.3)
     right.invert_yaxis()
     return drawn

@@ -104,12 +104,17 @@ class Floors(QuickStudy[xr.DataTree], MultiLawQuestion[xr.DataTree]):
             for name, (low, high) in DIRECTIONS.items()
         }
         return [
-            Table(cost_table(slopes, "0°", masks), name="floors_slopes", merge="floor",
-                  title="Slopes"),
-            Table(cost_table(boundaries, "1", {}), name="floors_boundaries", merge="floor",
-                  title="Changes of the floor half way to the target, by the factor of friction"),
+            Table(
+                cost_table(slopes, "0°", masks), name="floors_slopes", merge="floor", title="Slopes"
+            ),
+            Table(
+                cost_table(boundaries, "1", {}),
+                name="floors_boundaries",
+                merge="floor",
+                title="Changes of the floor half way to the target, by the factor of friction",
+            ),
             Table(step_table(), name="floors_steps", merge="step", title="A push against a step"),
-        ]  # fmt: skip
+        ]
 
 
 floors = call_of(Floors)

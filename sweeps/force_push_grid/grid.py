@@ -322,10 +322,14 @@ def table(results: xr.Dataset) -> Rows:
         outcomes = results.sel(law=law, slider=slider)
         deviation, completion = np.abs(outcomes.deviation.values), 100 * outcomes.completion.values
         by_friction = [str(int(outcomes.success.sel(friction=mu).sum())) for mu in FRICTIONS]
-        rows.append([
-            str(law), str(slider), f"{int(outcomes.success.sum())} of {outcomes.success.size}",
-            ", ".join(by_friction),
-            f"{np.median(completion):.1f} % (least {completion.min():.1f})",
-            f"{np.median(deviation):.2f} m (most {deviation.max():.2f})",
-        ])  # fmt: skip
+        rows.append(
+            [
+                str(law),
+                str(slider),
+                f"{int(outcomes.success.sum())} of {outcomes.success.size}",
+                ", ".join(by_friction),
+                f"{np.median(completion):.1f} % (least {completion.min():.1f})",
+                f"{np.median(deviation):.2f} m (most {deviation.max():.2f})",
+            ]
+        )
     return rows

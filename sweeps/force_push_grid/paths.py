@@ -64,7 +64,11 @@ class Paths(QuickStudy[xr.DataTree], MultiLawQuestion[xr.DataTree]):
     }
 
     laws: LawsLike = (
-        *("force_push", "force_push_published", "rps", "rps_tuned", "rps_plus"),
+        "force_push",
+        "force_push_published",
+        "rps",
+        "rps_tuned",
+        "rps_plus",
         "learned",
     )
     worlds: int = option(243, 2, 10_000_000)
@@ -110,9 +114,11 @@ class Paths(QuickStudy[xr.DataTree], MultiLawQuestion[xr.DataTree]):
             run.checkpoint(
                 part_name(POINT, name, slider),
                 partial(grid.run_grid, "force_push", slider, duration=duration, radius=radius),
-            ).stack(world=grid.DIMS).reset_index("world", drop=True)
+            )
+            .stack(world=grid.DIMS)
+            .reset_index("world", drop=True)
             for (name, radius), slider in itertools.product(RADII.items(), _OBJECTS)
-        ]  # fmt: skip
+        ]
         ours = list(run_plans(run, self._plans()).values())
         trees = {"point": _arranged(points, shapes, ("path", "slider"))}
         shapes, dims = [len(LOOKAHEADS), *shapes], ("lookahead", "path", "slider")
@@ -130,8 +136,15 @@ class Paths(QuickStudy[xr.DataTree], MultiLawQuestion[xr.DataTree]):
         """Return success and error by law, path and slider."""
         by_law = best_lookaheads(results)
         picture = Picture("paths", partial(figure_of, by_law))
-        return [Table(table(by_law), name="force_push_paths", title="Success and error by path",
-                      merge="law", picture=picture)]  # fmt: skip
+        return [
+            Table(
+                table(by_law),
+                name="force_push_paths",
+                title="Success and error by path",
+                merge="law",
+                picture=picture,
+            )
+        ]
 
 
 paths = call_of(Paths)
@@ -198,12 +211,24 @@ def figure_of(by_law: Mapping[str, xr.Dataset]) -> Figure:
         for i, (law, outcomes) in enumerate(by_law.items()):
             errors = outcomes.error_mean.sel(slider=slider)
             middle, low, high = np.array([median(errors.sel(path=x).values) for x in RADII]).T
-            ax.errorbar(np.add(curvature, 0.008 * i), middle, [middle - low, high - middle],
-                        color=f"C{i}", marker="o", ms=3, lw=1, label=law)  # fmt: skip
+            ax.errorbar(
+                np.add(curvature, 0.008 * i),
+                middle,
+                [middle - low, high - middle],
+                color=f"C{i}",
+                marker="o",
+                ms=3,
+                lw=1,
+                label=law,
+            )
         ax.set_title(slider, fontsize=9, loc="left")
         ax.set_xlabel("curvature of the turn [1/m]")
         ax.grid(alpha=0.3)
     axes.ravel()[0].set_ylabel("mean cross-track error [m]")
-    figure.legend(*axes.ravel()[0].get_legend_handles_labels(), loc="outside lower center", ncols=4,
-                  fontsize=8)  # fmt: skip
+    figure.legend(
+        *axes.ravel()[0].get_legend_handles_labels(),
+        loc="outside lower center",
+        ncols=4,
+        fontsize=8,
+    )
     return figure

@@ -25,8 +25,8 @@ import xarray as xr
 from rps_jax import Law, RPSParams, Setting
 from rps_jax.analysis.figures.style import Figure, tiles
 from rps_jax.control import registry
-from rps_jax.control.laws import rps
 from rps_jax.geometry import planar
+from rps_jax.laws import law_of
 from rps_jax.physics import PHYSICS, ControlPeriod, EngineName, get_engine
 from rps_jax.questions import Picture, Run, call_of, option
 from rps_jax.trials import trial
@@ -34,11 +34,10 @@ from rps_jax.trials.progress import Progress, set_phase
 from rps_jax.trials.trial import ControlLoop, Snapshot, Trial, World
 from rps_jax.trials.worlds import drawn_worlds, soften_skins
 from rps_jax.world import draws
-from rps_jax.world.domain import RANDOM
 from rps_jax.world.physics import Fidelity
 from rps_jax.worlds import DomainLike, parse_domain
 from sweeps.gradients.study import WARM, label_of
-from sweeps.study_base import QuickStudy, Rows, Table, part_name
+from sweeps.study_base import RANDOM_OBJECTS, QuickStudy, Rows, Table, part_name
 
 # Parts of the derivative, each of which a variant removes.
 PARTS = ("contact point", "contact weight", "odometry", "law", "velocities", "tilt")
@@ -77,7 +76,7 @@ class Growth(QuickStudy[xr.Dataset]):
 
     TITLE: ClassVar[str] = "Growth of derivatives along pushes"
     QUICK: ClassVar = {"worlds": 4, "horizon": 4.0, "engine": "quasistatic"}
-    CHOICES: ClassVar = {"objects": RANDOM}
+    CHOICES: ClassVar = {"objects": RANDOM_OBJECTS}
     GROWS: ClassVar[tuple[str, ...]] = ("objects",)
     PRESETS: ClassVar = {"physics": PHYSICS["default"], "laws": ("rps",)}
 
@@ -222,11 +221,12 @@ def propagate(
     the components, whether the law or the skin is within a switch, and the sharpness [m/m] of the
     contact: the derivative of the offset that is felt by the object's offset aside.
     """
-    law = gated(registry.smooth_law(rps.LAW), gains)
+    smooth = registry.smooth_law(law_of(RPSParams))
+    law = gated(smooth, gains)
     loop = ControlLoop(setting.physics, law=law)
     count = worlds.qpos.shape[0]
     params = jax.vmap(lambda _: RPSParams())(jnp.arange(count))
-    start = trial.start_all(worlds, params, jnp.ones(count, bool), law=registry.smooth_law(rps.LAW))
+    start = trial.start_all(worlds, params, jnp.ones(count, bool), law=smooth)
 
     def step(trials: Trial) -> tuple[Trial, Snapshot]:
         """Run `trial.control_step` with gates."""

@@ -22,11 +22,11 @@ import numpy as np
 import pandas as pd
 import xarray as xr
 
+from rps_jax import load
 from rps_jax.analysis import tables
 from rps_jax.analysis.figures.style import Figure, tiles
 from rps_jax.physics import PHYSICS
 from rps_jax.questions import Picture, Run, call_of, option
-from rps_jax.record import files
 from sweeps.gradients.race import run_commands
 from sweeps.study_base import QuickStudy, Rows, Table, part_name, text_table
 
@@ -111,7 +111,7 @@ networks = call_of(Networks)
 def read_curve(folder: Path) -> xr.Dataset:
     """Return the learning curve of a run folder; of a killed run, that of its last checkpoint."""
     if (folder / "results.nc").exists():
-        return files.read_results(folder)
+        return load(folder)
     if (folder / "curve.csv").exists():
         return pd.read_csv(folder / "curve.csv", index_col="update").to_xarray()
     columns = dict.fromkeys(("time", "validation", *_COLUMNS), np.zeros(0))

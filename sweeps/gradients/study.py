@@ -25,8 +25,7 @@ import xarray as xr
 from rps_jax import RPSParams, Setting, errors
 from rps_jax.analysis.figures.style import Axes, Figure, tiles, words
 from rps_jax.control import registry
-from rps_jax.control.laws import rps
-from rps_jax.laws import Space
+from rps_jax.laws import Space, law_of
 from rps_jax.physics import PHYSICS, EngineName, get_engine
 from rps_jax.questions import Picture, Run, call_of, option
 from rps_jax.trials import trial
@@ -37,11 +36,10 @@ from rps_jax.trials.worlds import drawn_worlds, soften_skins
 from rps_jax.tuning.gradients import Options, Scores, estimate
 from rps_jax.tuning.space import expand_subsets
 from rps_jax.world import draws
-from rps_jax.world.domain import RANDOM
 from rps_jax.world.physics import Fidelity
 from rps_jax.worlds import DomainLike, parse_domain
 from sweeps.gradients import estimators
-from sweeps.study_base import QuickStudy, Rows, Table, part_name
+from sweeps.study_base import RANDOM_OBJECTS, QuickStudy, Rows, Table, part_name
 
 TRUTH = "truth"
 HORIZONS = (0.5, 2.0, 8.0, 30.0)  # [s]
@@ -71,7 +69,7 @@ class Gradients(QuickStudy[xr.Dataset]):
         "truth": 64,
         "engine": "quasistatic",
     }
-    CHOICES: ClassVar = {"estimators": tuple(estimators.ESTIMATORS), "objects": RANDOM}
+    CHOICES: ClassVar = {"estimators": tuple(estimators.ESTIMATORS), "objects": RANDOM_OBJECTS}
     GROWS: ClassVar[tuple[str, ...]] = ("estimators", "objects")
     PRESETS: ClassVar = {"physics": PHYSICS["default"], "laws": ("rps",)}
     DOUBLE: ClassVar = False  # whether trials have double precision
@@ -201,7 +199,7 @@ def _distances(study: Gradients, stage: Any, smooth: bool) -> Scores:
     """Return scores (n, H) [m]: the distances at the horizons."""
     physics = study.setting.physics
     at = np.round(np.array(study.horizons) / physics.control_period).astype(int) - 1
-    law = registry.smooth_law(rps.LAW) if smooth else rps.LAW
+    law = registry.smooth_law(law_of(RPSParams)) if smooth else law_of(RPSParams)
     score = estimators.distances_at(at, stage, study.space.params, physics, law)
 
     def scores(thetas: jax.Array, worlds: World) -> jax.Array:

@@ -21,7 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from rps_jax import errors
-from rps_jax.control import registry, soft
+from rps_jax.control import registry
 from rps_jax.engines.base import Stage
 from rps_jax.laws import law_of
 from rps_jax.physics import get_engine
@@ -141,7 +141,8 @@ def window_starts(
     def proceed(i: jax.Array, trials: tuple[Trial, Trial]) -> tuple[Trial, Trial]:
         running, chosen = trials
         (running,) = advance([(stage, worlds, params, running)], loop, steps)
-        return running, jax.vmap(soft.tree_where)(i < start * _START_TIMES, running, chosen)
+        select = jax.vmap(lambda mask, x, y: jax.tree.map(partial(jnp.where, mask), x, y))
+        return running, select(i < start * _START_TIMES, running, chosen)
 
     return jax.lax.fori_loop(0, _START_TIMES if steps else 0, proceed, (trials, trials))[1]
 

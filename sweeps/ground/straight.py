@@ -31,9 +31,9 @@ from rps_jax.physics import (
 from rps_jax.questions import Run, call_of, option
 from rps_jax.trials.worlds import starts
 from rps_jax.world import draws
-from rps_jax.world.domain import DOMAINS
 from rps_jax.world.draws import Draw
 from rps_jax.world.scene import WorldInputs
+from rps_jax.worlds import parse_domain
 from sweeps.ground.pushes import DISTANCE, GAP
 from sweeps.study_base import QuickStudy, Rows, Table, run_parts, text_table
 
@@ -41,7 +41,9 @@ SPEED = 0.05  # [m/s] of the base, as of the laws
 _SETTLE = 1.0  # [s] that objects stand before the push
 _STEADY = 0.05  # [1] standard deviation over mean of a force without chatter, at most
 _ZERO = Range(0, 0)
-CENTRED = replace(DOMAINS["wide"], com_offset=_ZERO, lateral=_ZERO, yaw=_ZERO, gap=Range(GAP, GAP))
+CENTRED = replace(
+    parse_domain("wide"), com_offset=_ZERO, lateral=_ZERO, yaw=_ZERO, gap=Range(GAP, GAP)
+)
 FRICTIONS = ((0.1, 0.3), (0.3, 0.6), (0.6, 0.7))
 
 

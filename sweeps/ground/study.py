@@ -107,9 +107,11 @@ def figure_of(results: xr.Dataset, names: Collection[str]) -> Figure:
     style: dict[str, Any] = {"color": "0.3", "ls": "none", "mfc": "none"}
     handles = [
         Line2D([], [], color="k", lw=1, label="rigid object, at three offsets"),
-        *(Line2D([], [], marker=mark, label=f"{100 * speed:g} cm/s", **style)
-          for mark, speed in zip(marks, speeds, strict=False)),
+        *(
+            Line2D([], [], marker=mark, label=f"{100 * speed:g} cm/s", **style)
+            for mark, speed in zip(marks, speeds, strict=False)
+        ),
         *below[0].get_legend_handles_labels()[0],
-    ]  # fmt: skip
+    ]
     figure.legend(handles=handles, loc="outside lower center", ncols=4, fontsize=8)
     return figure

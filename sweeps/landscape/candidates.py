@@ -93,8 +93,13 @@ def front_table(results: xr.Dataset) -> list[list[str]]:
     shown = results.isel(candidate=np.flatnonzero(results.front | named))
     ordered = shown.isel(candidate=np.argsort(-shown.success.values, kind="stable"))
     for row in records(ordered, "candidate"):
-        rows.append([
-            row["candidate"], f"{tables.percent(row['success'])} %", f"{row['time']:.1f} s",
-            f"{row['path']:.2f} m", "yes" if row["front"] else "no",
-        ])  # fmt: skip
+        rows.append(
+            [
+                row["candidate"],
+                f"{tables.percent(row['success'])} %",
+                f"{row['time']:.1f} s",
+                f"{row['path']:.2f} m",
+                "yes" if row["front"] else "no",
+            ]
+        )
     return rows

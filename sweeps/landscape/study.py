@@ -19,7 +19,7 @@ import xarray as xr
 
 from rps_jax import Domain, RPSParams, errors
 from rps_jax.analysis.figures.style import Figure, success_rates, tiles
-from rps_jax.control.laws.rps import BOUNDS
+from rps_jax.laws import law_of
 from rps_jax.questions import MultiLawQuestion, Picture, Run, Section, call_of, option
 from rps_jax.trials.batch import BatchOptions
 from rps_jax.trials.progress import SequentialProgress
@@ -145,7 +145,7 @@ class Landscape(MultiLawQuestion[xr.DataTree]):
     def report(self, results: xr.DataTree, run: Run) -> Sequence[Section]:
         """Return sections with success over each parameter, and the Pareto front."""
         alone, front = (results[name].to_dataset() for name in ("alone", "front"))
-        log = [name for name, bound in BOUNDS.items() if bound.log]
+        log = [name for name, bound in law_of(RPSParams).bounds.items() if bound.log]
         lines = Picture("landscape", partial(parameters_figure, alone, log))
         return [
             Section("Success against each parameter", "", (), lines),

@@ -172,15 +172,29 @@ def batched(base: Any, envs: Any) -> Any:
 
 def table(results: xr.Dataset) -> Rows:
     """Return header and rows of the curve."""
-    rows = [["worlds", "wall clock", "steps of all worlds", "trials that ended",
-             "reward of these", "success"]]  # fmt: skip
+    rows = [
+        [
+            "worlds",
+            "wall clock",
+            "steps of all worlds",
+            "trials that ended",
+            "reward of these",
+            "success",
+        ]
+    ]
     for row in records(results, "envs", "row"):
         trials = int(row["episodes"])
         successes = round(row["success"] * trials) if trials else 0
-        rows.append([
-            f"{row['envs']:,}", f"{row['time']:.0f} s", f"{int(row['steps']):,}", f"{trials:,}",
-            f"{row['reward']:.2f}" if trials else "-", tables.share(successes, trials),
-        ])  # fmt: skip
+        rows.append(
+            [
+                f"{row['envs']:,}",
+                f"{row['time']:.0f} s",
+                f"{int(row['steps']):,}",
+                f"{trials:,}",
+                f"{row['reward']:.2f}" if trials else "-",
+                tables.share(successes, trials),
+            ]
+        )
     return rows
 
 

@@ -16,11 +16,11 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from rps_jax import errors
+from rps_jax import errors, load
 from rps_jax.analysis import statistics
 from rps_jax.questions import Picture, Run, call_of, option
-from rps_jax.record import files, provenance
 from rps_jax.record import folder as run_folder
+from rps_jax.record import provenance
 from rps_jax.tuning import learn
 from sweeps.study_base import Study, Table, write_table
 
@@ -74,7 +74,7 @@ class Learned(Study[list[list[Any]]]):
         """Return the rows, and the curve of each run."""
         tables = [Table(results, _NOTE, COLUMNS, title="Runs")]
         for folder, (network, *_) in zip(self.runs, results, strict=True):
-            draw = partial(learn.figure_of, files.read_results(Path(folder)))
+            draw = partial(learn.figure_of, load(folder))
             picture = Picture(f"learned_{network.strip('`')}", draw)
             tables.append(Table((), title=str(folder), picture=picture))
         return tables
@@ -85,7 +85,7 @@ learned = call_of(Learned)
 
 def row(folder: Path) -> list[Any]:
     """Return the row of a run, for the law with the best validation."""
-    curve, manifest = files.read_results(folder), run_folder.read_manifest(folder)
+    curve, manifest = load(folder), run_folder.read_manifest(folder)
     environment = provenance.read_environment(folder)
     judged = curve.dropna("update", subset=["validation"])
     rates = judged.validation.values

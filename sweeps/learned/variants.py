@@ -20,11 +20,11 @@ from typing import Any, ClassVar
 import numpy as np
 import xarray as xr
 
-from rps_jax import Setting, evaluate
+from rps_jax import Setting, evaluate, load
 from rps_jax.analysis import statistics
 from rps_jax.app.cli import flags
 from rps_jax.questions import Run, call_of, option
-from rps_jax.record import files, provenance
+from rps_jax.record import provenance
 from rps_jax.tuning.learn import Learn
 from sweeps.study_base import QuickStudy, Table, write_table
 
@@ -128,7 +128,7 @@ class Variants(QuickStudy[xr.Dataset]):
     def answer(self, run: Run) -> xr.Dataset:
         """Run the variants, or collect the results of other run folders."""
         if self.runs:
-            return xr.concat([files.read_results(Path(x)) for x in self.runs], "variant")
+            return xr.concat([load(x) for x in self.runs], "variant")
         return super().answer(run)
 
     def _learn(self, name: str, folder: Path) -> xr.Dataset:

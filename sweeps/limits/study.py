@@ -24,7 +24,6 @@ from rps_jax.analysis.figures.style import Figure, success_rates, tiles
 from rps_jax.geometry.solid import GRAVITY
 from rps_jax.laws import LawParams
 from rps_jax.questions import MultiLawQuestion, Picture, Plan, Run, Section, call_of, option
-from rps_jax.robot.shell import BOARDS, HALF_WIDTH
 from rps_jax.runs.sweep import Sweep
 from rps_jax.trials import pushes
 from rps_jax.worlds import Case, DomainLike, parse_domain
@@ -66,10 +65,11 @@ class Limit:
 def _with_front(count: int) -> Robot:
     """Return the paper's base with `count` boards across its front, and sides in proportion."""
     return Robot(
-        boards=tuple(replace(row, count=math.ceil(row.count * count / 4)) for row in BOARDS)
+        boards=tuple(replace(row, count=math.ceil(row.count * count / 4)) for row in Robot().boards)
     )
 
 
+_HALF_WIDTH = Robot().half_width
 LIMITS = {
     "force": Limit(
         "greatest force over the object's friction with the ground [1]",
@@ -83,11 +83,13 @@ LIMITS = {
     ),
     "half_width": Limit(
         "half width of the base [m]",
-        robots={half: Robot(half_width=half) for half in (0.15, 0.2, 0.25, HALF_WIDTH, 0.35, 0.45)},
+        robots={
+            half: Robot(half_width=half) for half in (0.15, 0.2, 0.25, _HALF_WIDTH, 0.35, 0.45)
+        },
     ),
     "pitch": Limit(
         "pitch of the taxels of the front [mm]",
-        robots={1e3 * 2 * HALF_WIDTH / (3 * n): _with_front(n) for n in (8, 4, 3, 2, 1)},
+        robots={1e3 * 2 * _HALF_WIDTH / (3 * n): _with_front(n) for n in (8, 4, 3, 2, 1)},
         harms=1,
     ),
 }

@@ -24,9 +24,8 @@ from rps_jax.trials.results import trace_dataset
 from rps_jax.trials.rollout import Candidates, outcomes
 from rps_jax.trials.trial import Outcome
 from rps_jax.world import paper, points, scene
-from rps_jax.world.domain import DOMAINS
 from rps_jax.world.draws import Draw
-from rps_jax.worlds import IdealSkin
+from rps_jax.worlds import IdealSkin, parse_domain
 from sweeps.paper_reading import printed
 from sweeps.paper_reading.printed import SHORT
 from sweeps.paper_reading.unknowns import NAMES, UNKNOWNS, aps_params, params, texts, values
@@ -45,7 +44,7 @@ def _ranges(part: str) -> dict[str, Range]:
     return {
         name: unknown.range
         for name, unknown in UNKNOWNS.items()
-        if unknown.part == part and hasattr(DOMAINS["hardware"], name)
+        if unknown.part == part and hasattr(parse_domain("hardware"), name)
     }
 
 
@@ -55,7 +54,7 @@ def _by_object(prefix: str) -> Range:
 
 
 HARDWARE: Domain = replace(
-    DOMAINS["hardware"],
+    parse_domain("hardware"),
     targets=paper.HARDWARE_LAYOUTS["circle"],
     lateral=Range(-0.02, 0.02),
     yaw=Range(-0.05, 0.05),
@@ -66,7 +65,7 @@ HARDWARE: Domain = replace(
 
 def _simulated_domain(targets: tuple[Target, ...]) -> Domain:
     ranges = {quantity: UNKNOWNS[name].range for quantity, name in _SIMULATED.items()}
-    return replace(DOMAINS["paper"], targets=targets, **ranges)
+    return replace(parse_domain("paper"), targets=targets, **ranges)
 
 
 @dataclass(frozen=True, eq=False)

@@ -43,9 +43,13 @@ class PaperReading(TrialStudy[xr.Dataset]):
 
     TITLE: ClassVar[str] = "Which reading of the paper gives its numbers"
     QUICK: ClassVar[Mapping[str, object]] = {
-        "draws": 2, "rounds": 1, "samples": 2, "first": 4, "repeats": 1,
+        "draws": 2,
+        "rounds": 1,
+        "samples": 2,
+        "first": 4,
+        "repeats": 1,
         "targets": paper.FEW_TARGETS,
-    }  # fmt: skip
+    }
     PRESETS: ClassVar = {"physics": PHYSICS, "laws": paper.LAWS}
 
     draws: int = option(450, 2, 100_000)
@@ -122,19 +126,35 @@ class PaperReading(TrialStudy[xr.Dataset]):
     def report_tables(self, results: xr.Dataset) -> Sequence[Table]:
         """Return posterior, predictions, the closest draw and its Fig. 6."""
         return [
-            Table(evidence.readings_table(results), name="reading_evidence",
-                  title="Evidence for each reading"),
-            Table(evidence.unknowns_table(results), name="reading_posterior", title="Posterior",
-                  picture=Picture("posterior", partial(drawing.posterior, results))),
-            Table(evidence.numbers_table(results), name="reading_numbers",
-                  title="Printed numbers and their predictions",
-                  picture=Picture("predictions", partial(drawing.predictions, results))),
-            Table(evidence.checks_table(results), name="reading_checks",
-                  title="The closest draw again, in two engines"),
-            Table(evidence.figure_6_table(results), name="reading_figure_6",
-                  title="Fig. 6, point by point",
-                  picture=Picture("figure_6", partial(drawing.figure_6, results))),
-        ]  # fmt: skip
+            Table(
+                evidence.readings_table(results),
+                name="reading_evidence",
+                title="Evidence for each reading",
+            ),
+            Table(
+                evidence.unknowns_table(results),
+                name="reading_posterior",
+                title="Posterior",
+                picture=Picture("posterior", partial(drawing.posterior, results)),
+            ),
+            Table(
+                evidence.numbers_table(results),
+                name="reading_numbers",
+                title="Printed numbers and their predictions",
+                picture=Picture("predictions", partial(drawing.predictions, results)),
+            ),
+            Table(
+                evidence.checks_table(results),
+                name="reading_checks",
+                title="The closest draw again, in two engines",
+            ),
+            Table(
+                evidence.figure_6_table(results),
+                name="reading_figure_6",
+                title="Fig. 6, point by point",
+                picture=Picture("figure_6", partial(drawing.figure_6, results)),
+            ),
+        ]
 
 
 paper_reading = call_of(PaperReading)

@@ -28,12 +28,12 @@ from rps_jax.questions import Picture, Run, call_of, option
 from rps_jax.trials.trial import World, object_pose
 from rps_jax.trials.worlds import drawn_worlds
 from rps_jax.world import draws
-from rps_jax.world.domain import DOMAINS, RANDOM
+from rps_jax.worlds import parse_domain
 from sweeps.planning import plans
 from sweeps.planning.plans import KNOTS, METHODS, Method, Problem, Simulator
-from sweeps.study_base import QuickStudy, Rows, Table
+from sweeps.study_base import RANDOM_OBJECTS, QuickStudy, Rows, Table
 
-TOUCHING = replace(DOMAINS["wide"], gap=Range(0, 0))
+TOUCHING = replace(parse_domain("wide"), gap=Range(0, 0))
 # All that the model of the second table does not know has one value.
 _NOMINAL = {
     "com_offset": Range(0, 0),
@@ -60,11 +60,11 @@ class Planning(QuickStudy[xr.Dataset]):
 
     TITLE: ClassVar[str] = "Plans of pushes to a pose"
     QUICK: ClassVar = {"objects": ("random_box",), "horizons": (5.0,), "pushes": 8, "budget": 0.02}
-    CHOICES: ClassVar = {"objects": RANDOM, "methods": METHODS}
+    CHOICES: ClassVar = {"objects": RANDOM_OBJECTS, "methods": METHODS}
     DIMENSION: ClassVar[str] = "case"
     PRESETS: ClassVar = {"physics": PHYSICS["default"]}
 
-    objects: tuple[str, ...] = tuple(RANDOM)
+    objects: tuple[str, ...] = RANDOM_OBJECTS
     """Objects to push: random_box, random_cylinder and random_prism."""
     horizons: tuple[float, ...] = option((5.0, 20.0), 0.2, 60, unit="s")
     """Durations of the pushes [s]."""

@@ -102,10 +102,11 @@ def descend(cell: Cell, worlds: int) -> Fitted:
 
     options: dict[str, Any] = {"jac": slopes, "bounds": (0, 1), "loss": "soft_l1"}
     fits = [
-        least_squares(values, np.array([x, 0.5, 0.5, 0.5]), xtol=1e-3, ftol=1e-3, max_nfev=12,
-                      **options)
+        least_squares(
+            values, np.array([x, 0.5, 0.5, 0.5]), xtol=1e-3, ftol=1e-3, max_nfev=12, **options
+        )
         for x in _STARTS
-    ]  # fmt: skip
+    ]
     best = min(fits, key=lambda fit: fit.cost)
     return _laplace(cell, best.x, sum(fit.nfev + fit.njev for fit in fits))
 
@@ -123,8 +124,11 @@ def _laplace(cell: Cell, x: np.ndarray, simulations: int) -> Fitted:
 
 
 METHODS: Mapping[str, Callable[[Cell, int], Fitted]] = {
-    "scan of one friction": scan, "networks": learn, "CMA-ES": evolve, "least squares": descend,
-}  # fmt: skip
+    "scan of one friction": scan,
+    "networks": learn,
+    "CMA-ES": evolve,
+    "least squares": descend,
+}
 
 
 def known(cell: Cell) -> np.ndarray:
@@ -213,9 +217,14 @@ class Real(QuickStudy[xr.Dataset]):
             "known": known(test),
         }
         return xr.Dataset(
-            {**padded, **{k: ("quantity", x) for k, x in values.items()}, "seconds": seconds,
-             "simulated": fitted.simulated}, {"quantity": list(QUANTITIES)},
-        )  # fmt: skip
+            {
+                **padded,
+                **{k: ("quantity", x) for k, x in values.items()},
+                "seconds": seconds,
+                "simulated": fitted.simulated,
+            },
+            {"quantity": list(QUANTITIES)},
+        )
 
     def report_tables(self, results: xr.Dataset) -> Sequence[Table]:
         """Return errors by group of pushes, and quantities by method."""
@@ -232,17 +241,28 @@ class Real(QuickStudy[xr.Dataset]):
 real = call_of(Real)
 
 _ERRORS = {
-    "pushes": "{group}", "method": "{method}", "predicted": "{count}",
-    "place": "{place:.2f} mm", "turn": "{turn:.2f}°", "both": "{both:.2f} mm",
-    "both, 90 %": "{most:.1f} mm", "90 % intervals hold the pose": "{covered:.0f} %",
-    "processor seconds a fit": "{seconds:.1f}", "simulated pushes a fit": "{simulated:,.0f}",
-}  # fmt: skip
+    "pushes": "{group}",
+    "method": "{method}",
+    "predicted": "{count}",
+    "place": "{place:.2f} mm",
+    "turn": "{turn:.2f}°",
+    "both": "{both:.2f} mm",
+    "both, 90 %": "{most:.1f} mm",
+    "90 % intervals hold the pose": "{covered:.0f} %",
+    "processor seconds a fit": "{seconds:.1f}",
+    "simulated pushes a fit": "{simulated:,.0f}",
+}
 _FITTED = {
-    "quantity": "{quantity}", "method": "{method}", "cells": "{cells}", "median": "{median:.3g}",
-    "standard deviation": "{deviation:.2g}", "difference of halves": "{apart:.2g}",
-    "90 % intervals hold it": "{holds:.0f} %", "difference from the known value": "{off:.2g}",
+    "quantity": "{quantity}",
+    "method": "{method}",
+    "cells": "{cells}",
+    "median": "{median:.3g}",
+    "standard deviation": "{deviation:.2g}",
+    "difference of halves": "{apart:.2g}",
+    "90 % intervals hold it": "{holds:.0f} %",
+    "difference from the known value": "{off:.2g}",
     "90 % intervals hold the known value": "{holds_known:.0f} %",
-}  # fmt: skip
+}
 
 
 def _error_rows(results: xr.Dataset) -> Iterator[dict[str, object]]:

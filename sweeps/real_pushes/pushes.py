@@ -38,9 +38,16 @@ POSE = ("x", "y", "yaw")
 _NEEDED = {
     "point": ("tip_x0", "tip_y0", "tip_x1", "tip_y1"),
     "two_point_translation": ("tip_x0", "tip_y0", "tip_x1", "tip_y1", "edge"),
-    "two_point_rotation": ("cor_bx", "cor_by", "commanded", "close", "point_bx", "point_by",
-                           "edge"),
-}  # fmt: skip
+    "two_point_rotation": (
+        "cor_bx",
+        "cor_by",
+        "commanded",
+        "close",
+        "point_bx",
+        "point_by",
+        "edge",
+    ),
+}
 
 
 def read(table: PushTable | None = None) -> pd.DataFrame:

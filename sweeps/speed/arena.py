@@ -290,11 +290,17 @@ def _row(process: _Process, output: Mapping[str, Any], truth: np.ndarray) -> xr.
         true = truth[np.arange(len(poses)) % len(truth)]
         error = np.linalg.norm(poses[:, :2] - true[:, :2], axis=1)
         turned = np.abs((_yaw(poses) - _yaw(true) + np.pi) % (2 * np.pi) - np.pi)
-    return xr.Dataset({
-        **{name: output[name] for name in ("version", "worlds", "rate")},
-        "error": np.median(error), "largest": np.max(error), "turned": np.median(turned),
-        "engine": process.name, "ready": process.ready, "why": process.failed,
-    })  # fmt: skip
+    return xr.Dataset(
+        {
+            **{name: output[name] for name in ("version", "worlds", "rate")},
+            "error": np.median(error),
+            "largest": np.max(error),
+            "turned": np.median(turned),
+            "engine": process.name,
+            "ready": process.ready,
+            "why": process.failed,
+        }
+    )
 
 
 def _yaw(poses: np.ndarray) -> np.ndarray:

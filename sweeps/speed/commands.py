@@ -113,10 +113,17 @@ def timed(command: str, limit: float, gpus: int | None = None) -> xr.Dataset:
             memory.append(peak)
     match = TIMING.search(output)
     compile_, run, rate = map(float, match.groups() if match else ("nan",) * 3)
-    return xr.Dataset({
-        "empty": seconds[0], "again": seconds[1], "compile": compile_, "run": run, "rate": rate,
-        "memory_empty": memory[0], "memory_again": memory[1],
-    })  # fmt: skip
+    return xr.Dataset(
+        {
+            "empty": seconds[0],
+            "again": seconds[1],
+            "compile": compile_,
+            "run": run,
+            "rate": rate,
+            "memory_empty": memory[0],
+            "memory_again": memory[1],
+        }
+    )
 
 
 def _call(worlds: int) -> str:

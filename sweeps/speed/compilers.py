@@ -84,10 +84,15 @@ class Compilers(SpeedStudy[xr.Dataset]):
         with tempfile.TemporaryDirectory() as folder:
             first, rate_here = _swept(command, Path(folder), "here", {})
             second, rate_other = _swept(command + options, Path(folder), "other", environment)
-        return xr.Dataset({
-            "equal": np.mean(first == second), "here": np.mean(first), "other": np.mean(second),
-            "rate_here": rate_here, "rate_other": rate_other,
-        })  # fmt: skip
+        return xr.Dataset(
+            {
+                "equal": np.mean(first == second),
+                "here": np.mean(first),
+                "other": np.mean(second),
+                "rate_here": rate_here,
+                "rate_other": rate_other,
+            }
+        )
 
 
 compilers = call_of(Compilers)

@@ -195,8 +195,15 @@ def table(profiles: Sequence[Profile], count: int = 12) -> Rows:
     """Return a header and the most expensive functions of each program."""
     rows = [["what", "family", "worlds", "where", "us a control step", "share", "operations"]]
     return rows + [
-        [p.name, p.family, f"{p.worlds:,}", c.where, f"{1e6 * c.time:.1f}",
-         f"{100 * c.share:.0f} %", f"{c.operations:.1f}"]
+        [
+            p.name,
+            p.family,
+            f"{p.worlds:,}",
+            c.where,
+            f"{1e6 * c.time:.1f}",
+            f"{100 * c.share:.0f} %",
+            f"{c.operations:.1f}",
+        ]
         for p in profiles
         for c in p.costs[:count]
-    ]  # fmt: skip
+    ]

@@ -112,12 +112,14 @@ class Derivatives(SpeedStudy[xr.Dataset]):
             memory = usage.temp_size_in_bytes
         leaves = [np.asarray(x).reshape(self.worlds, -1) for x in jax.tree.leaves(results["law"])]
         finite = np.isfinite(np.concatenate(leaves, axis=1)).all(axis=1)
-        return xr.Dataset({
-            **{name: times[f"run_{name}"] for name in ("forward", "law", "all")},
-            "compile": times["all"],
-            "memory": memory / self.worlds / steps / 1e3,
-            "finite": 100 * finite.mean(),
-        })  # fmt: skip
+        return xr.Dataset(
+            {
+                **{name: times[f"run_{name}"] for name in ("forward", "law", "all")},
+                "compile": times["all"],
+                "memory": memory / self.worlds / steps / 1e3,
+                "finite": 100 * finite.mean(),
+            }
+        )
 
 
 derivatives = call_of(Derivatives)

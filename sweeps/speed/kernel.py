@@ -129,7 +129,9 @@ def counts(text: str) -> xr.Dataset:
     if len(rows) < 3:  # names, units and one launch
         raise InputError(f"Nsight Compute profiled no launch: {' '.join(text.split()[-20:])}.")
     values = dict(zip(rows[0], rows[-1], strict=True))
-    return xr.Dataset({
-        ours: ((), float(values[name].replace(",", "")), {"long_name": meaning})
-        for name, (ours, meaning) in _COUNTERS.items()
-    })  # fmt: skip
+    return xr.Dataset(
+        {
+            ours: ((), float(values[name].replace(",", "")), {"long_name": meaning})
+            for name, (ours, meaning) in _COUNTERS.items()
+        }
+    )

@@ -275,11 +275,18 @@ def newton(task: Task) -> Racer:
     all_worlds.replicate(single_world, worlds)
     model = all_worlds.finalize()
     solver = SolverMuJoCo(
-        model, nconmax=CONTACTS, njmax=ROWS, iterations=option.iterations,
-        ls_iterations=option.ls_iterations, cone="elliptic", impratio=option.impratio,
-        tolerance=option.tolerance, integrator="euler", solver="newton",
+        model,
+        nconmax=CONTACTS,
+        njmax=ROWS,
+        iterations=option.iterations,
+        ls_iterations=option.ls_iterations,
+        cone="elliptic",
+        impratio=option.impratio,
+        tolerance=option.tolerance,
+        integrator="euler",
+        solver="newton",
         kinematic_switchable_roots=False,  # otherwise each body has an unused weld
-    )  # fmt: skip
+    )
     solver.mjw_model.opt.warn_overflow = False
     states, control = [model.state(), model.state()], model.control()
     q = task.qpos.copy()
