@@ -28,9 +28,8 @@ from rps_jax.trials.pushes import Cases
 from rps_jax.trials.results import outcome_dataset
 from rps_jax.trials.rollout import outcomes
 from rps_jax.world import paper
-from rps_jax.world.objects import PAPER_OBJECTS
 from rps_jax.world.scene import Friction
-from rps_jax.worlds import Case
+from rps_jax.worlds import Case, parse_domain
 from sweeps.study_base import TrialStudy, load_part
 
 # Number of trials per call: more keep the device busier, fewer are lost when the run is killed.
@@ -41,7 +40,7 @@ class Grid(NamedTuple):
     """Trials of a study, in the nesting order of `outcome_dataset`."""
 
     laws: tuple[str, ...] = ("rps",)
-    objects: tuple[str, ...] = PAPER_OBJECTS
+    objects: tuple[str, ...] = parse_domain("paper").objects
     friction: Mapping[str, Friction] = FRICTION
     targets: tuple[tuple[float, float], ...] = paper.TARGETS
 

@@ -128,7 +128,7 @@ class Study(Question[T]):
             path = self.folder / self.RESULTS / f"{table.name}.json"
             write_table(path, runs, self.machine, table)
             if table.picture:
-                files.write_bytes(self.folder / f"{table.picture.name}.png", table.picture.png())
+                (self.folder / f"{table.picture.name}.png").write_bytes(table.picture.png())
 
     # --- as questions ----------------------------------------------------------------------
 
@@ -329,7 +329,8 @@ def write_table(path: Path, runs: Sequence[Mapping[str, Any]], device: str, tabl
         "rows": rows,
     }
     path.parent.mkdir(exist_ok=True)
-    return files.write_text(path, json.dumps(data, indent=1) + "\n")
+    path.write_text(json.dumps(data, indent=1) + "\n", encoding="utf-8")
+    return path
 
 
 def split_folder(command: Sequence[str]) -> tuple[list[str], str]:

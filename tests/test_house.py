@@ -15,7 +15,7 @@ from helpers import ROOT, addresses, inner_names, output_of
 import rps_jax
 
 PACKAGE = ROOT / "rps_jax"
-MAX_INNER = 195  # names; it only goes down
+MAX_INNER = 178  # names; it only goes down
 
 
 def test_each_private_interface_has_a_test_that_notices_a_change():
@@ -89,7 +89,7 @@ def test_studies_use_public_names_and_listed_exceptions():
 
 
 def test_there_are_few_public_names_and_all_are_in_the_tables():
-    rows = re.findall(r"^\| `(\w+)` \|", (PACKAGE / "README.md").read_text(), re.M)
+    rows = re.findall(r"^\| `(?!rps_jax)(\w+)` \|", (PACKAGE / "README.md").read_text(), re.M)
     assert sorted(rows) == rps_jax.__all__
     assert len(rows) + len(set(addresses())) <= 90
     for name in ("questions", "laws", "worlds", "physics"):

@@ -20,8 +20,9 @@ ENGINES: tuple[EngineName, ...] = get_args(EngineName)
 def get(name: str) -> Engine:
     """Return the engine of a name, or raise InputError.
 
-    >>> get("quasistatic").name
-    'quasistatic'
+    Examples:
+      >>> get("quasistatic").name
+      'quasistatic'
     """
     errors.check_name("engine", name, ENGINES)
     return importlib.import_module(f"{__name__}.{name}").ENGINE

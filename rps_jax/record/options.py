@@ -43,8 +43,9 @@ def option(
     The command line has a `positional` field without a flag, and does not offer a `hidden` one. A
     field with a `flag` has a tuple of texts, one for each time that the flag of this name is given.
 
-    >>> dict(option(0.05, above=0, at_most=1, unit="m/s").metadata["bounds"])
-    {'at_most': 1, 'above': 0, 'unit': 'm/s'}
+    Examples:
+      >>> dict(option(0.05, above=0, at_most=1, unit="m/s").metadata["bounds"])
+      {'at_most': 1, 'above': 0, 'unit': 'm/s'}
     """
     bounds = {"at_least": at_least, "at_most": at_most, "above": above, "unit": unit or None}
     bounds = {name: bound for name, bound in bounds.items() if bound is not None}

@@ -76,14 +76,15 @@ _EXECUTION_OPTIONS = (
 def call_of(command: Callable[P, Command[T]]) -> Callable[P, T]:
     """Return a function with the fields of a command as arguments, which executes it.
 
-    >>> @dataclass(frozen=True)
-    ... class CountWorlds(Question[int]):
-    ...     worlds: int = option(100, 1)
-    ...
-    ...     def answer(self, run):
-    ...         return self.worlds
-    >>> call_of(CountWorlds)(worlds=8)
-    8
+    Examples:
+      >>> @dataclass(frozen=True)
+      ... class CountWorlds(Question[int]):
+      ...     worlds: int = option(100, 1)
+      ...
+      ...     def answer(self, run):
+      ...         return self.worlds
+      >>> call_of(CountWorlds)(worlds=8)
+      8
     """
 
     @functools.wraps(command, assigned=("__module__", "__doc__"), updated=())

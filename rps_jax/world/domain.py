@@ -345,8 +345,9 @@ def parse_domain(
     the domain's, except for its drawn limits. A `task` that has no single target replaces the
     domain's targets.
 
-    >>> parse_domain("wide,mass=3:10").mass
-    Range(low=3.0, high=10.0, log=True)
+    Examples:
+      >>> parse_domain("wide,mass=3:10").mass
+      Range(low=3.0, high=10.0, log=True)
     """
     if task is not None:
         base, parsed = parse_domain(domain, robot), parse_task(task)

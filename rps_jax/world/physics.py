@@ -81,8 +81,9 @@ def preset(name: PhysicsName = "default", fidelity: Fidelity = "standard") -> Ph
         whose steps of 20 ms double the time constant of the base's contact: MuJoCo lifts it to two
         steps.
 
-    >>> preset("default", "fast").timestep
-    0.02
+    Examples:
+      >>> preset("default", "fast").timestep
+      0.02
     """
     errors.check_name("physics", name, PHYSICS)
     return PHYSICS[name][errors.check_name("fidelity", fidelity, PHYSICS[name])]

@@ -14,7 +14,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import ClassVar
+from typing import ClassVar, Literal
 
 import numpy as np
 import xarray as xr
@@ -24,7 +24,6 @@ from rps_jax.analysis import statistics, tables
 from rps_jax.analysis.figures.style import Figure, success_rates, tiles
 from rps_jax.laws import LawParams, LawsLike
 from rps_jax.questions import MultiLawQuestion, Picture, Plan, Run, call_of, option
-from rps_jax.trials.setting import Split
 from rps_jax.world.tasks.corridor import BASE, OBJECT, Corridor
 from rps_jax.world.tasks.path import Path
 from rps_jax.worlds import DomainLike, parse_domain
@@ -132,7 +131,11 @@ class Corridors(Study[xr.DataTree], MultiLawQuestion[xr.DataTree]):
         return Corridor(length=LENGTH, turn_angle=angle, width=width, doors=1, door_width=opening)
 
     def _plan(
-        self, task: Path, worlds: int, laws: Mapping[str, LawParams], split: Split = "test"
+        self,
+        task: Path,
+        worlds: int,
+        laws: Mapping[str, LawParams],
+        split: Literal["tune", "test"] = "test",
     ) -> Plan:
         """Return the plan of a task; worlds of one split depend on the seed alone."""
         setting = replace(self.setting, split=split)

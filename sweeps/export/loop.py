@@ -20,8 +20,7 @@ from rps_jax.physics import FRICTION
 from rps_jax.runs.push import recorded_law
 from rps_jax.trials import pushes
 from rps_jax.world import paper
-from rps_jax.world.objects import PAPER_OBJECTS
-from rps_jax.worlds import Case
+from rps_jax.worlds import Case, parse_domain
 from sweeps.export.native import TOLERANCE, Native, scale_of
 
 ROUNDINGS = (1, -1, 2, -2, 4, -4, 8, -8)  # rounding errors of a twist, in units of 2^-23
@@ -124,7 +123,9 @@ def _compare(name: str, folder: Path, run: Any, roundings: Sequence[int]) -> Out
 
 def papers_trials(name: str, setting: Setting, folder: Path) -> Outcomes:
     """Return the outcomes of the paper's 144 trials."""
-    cases = [(o, f, t) for o in PAPER_OBJECTS for f in FRICTION for t in paper.TARGETS]
+    cases = [
+        (o, f, t) for o in parse_domain("paper").objects for f in FRICTION for t in paper.TARGETS
+    ]
 
     def run(params: Any) -> Any:
         return pushes.run([Case(*options, law=params) for options in cases], setting)[0]

@@ -30,8 +30,7 @@ from rps_jax.control.learned import policy
 from rps_jax.physics import PHYSICS
 from rps_jax.questions import Run, call_of, option
 from rps_jax.world import paper
-from rps_jax.world.objects import PAPER_OBJECTS
-from rps_jax.worlds import Case
+from rps_jax.worlds import Case, parse_domain
 from sweeps.export import loop, native
 from sweeps.study_base import QuickStudy, Table, records, run_parts, text_table
 
@@ -115,7 +114,7 @@ class Export(QuickStudy[xr.DataTree]):
     def _trials(self, law: str, folder: Path) -> xr.Dataset:
         cases = [
             [Case(name, "S1", target, law=law) for target in paper.FEW_TARGETS]
-            for name in PAPER_OBJECTS
+            for name in parse_domain("paper").objects
         ]
         trials = [trial for group in cases for trial in loop.recorded(group, Setting("fused"))]
         rows = []

@@ -18,7 +18,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Literal
 
 import jax
 import jax.numpy as jnp
@@ -31,7 +31,6 @@ from rps_jax.control.learned.network import Network, Weights
 from rps_jax.engines import native
 from rps_jax.physics import get_engine
 from rps_jax.questions import call_of, option
-from rps_jax.trials.setting import Split
 from rps_jax.trials.trial import World
 from rps_jax.tuning import gradients, ppo, rollout
 from rps_jax.tuning.gradients import Options
@@ -77,7 +76,7 @@ class WindowLearner(Learn):
             engine = get_engine(self.setting.engine)
             engine.check_derivatives("reverse")
 
-    def environments(self, split: Split = "tune") -> list[PushEnv]:
+    def environments(self, split: Literal["test", "tune", "validate"] = "tune") -> list[PushEnv]:
         """Return the environments of a split; those to learn in have a smooth contact."""
         envs = super().environments(split)
         return [replace(env, smooth=True) for env in envs] if split == "tune" else envs

@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
-from typing import ClassVar, Unpack
+from typing import ClassVar, Literal, Unpack
 
 import jax
 import numpy as np
@@ -24,7 +24,7 @@ from rps_jax.questions import MultiLawQuestion, Picture, Run, Section, call_of, 
 from rps_jax.trials.batch import BatchOptions
 from rps_jax.trials.progress import SequentialProgress
 from rps_jax.trials.rollout import Candidates, outcomes
-from rps_jax.trials.setting import Split, seed_of
+from rps_jax.trials.setting import seed_of
 from rps_jax.trials.trial import Outcome
 from rps_jax.tuning.run import parse_domains
 from rps_jax.tuning.space import SUBSETS
@@ -93,7 +93,10 @@ class Landscape(MultiLawQuestion[xr.DataTree]):
         return xr.DataTree.from_dict(results)
 
     def _outcomes(
-        self, params: RPSParams, *splits: Split, **options: Unpack[BatchOptions]
+        self,
+        params: RPSParams,
+        *splits: Literal["validate", "test"],
+        **options: Unpack[BatchOptions],
     ) -> list[Outcome]:
         """Return the outcomes (P, D * W) of candidates (P,) in the worlds of each split."""
         seeds, worlds = [seed_of(self.setting.seed, x) for x in splits], np.arange(self.worlds)

@@ -25,7 +25,6 @@ from scipy.stats import t as t_distribution
 
 from rps_jax.physics import PHYSICS
 from rps_jax.questions import Picture, Run, call_of, option
-from rps_jax.record import files
 from sweeps.real_pushes import contact, pushes
 from sweeps.real_pushes.drawing import figure
 from sweeps.real_pushes.pushes import Errors
@@ -202,7 +201,7 @@ class RealPushes(QuickStudy[xr.Dataset]):
         if friction is not None:
             results = results.merge(friction)
         if run.folder is not None:
-            files.write_text(run.folder / "predictions.csv", _csv(results))
+            (run.folder / "predictions.csv").write_text(_csv(results), encoding="utf-8")
         return results
 
     def _fitted(self, run: Run) -> xr.Dataset:
