@@ -187,6 +187,26 @@ class TrialStudy(Study[T], TrialQuestion[T]):
 
 
 @dataclass(frozen=True, kw_only=True)
+class PlanStudy(Question[T]):
+    """Base class of questions whose trials are those of several plans."""
+
+    @property
+    def plans(self) -> Mapping[str, Plan]:
+        """Plans by name."""
+        raise NotImplementedError
+
+    def check(self) -> None:
+        """Check that the engines can step these worlds here."""
+        super().check()
+        for plan in self.plans.values():
+            plan.check_here()
+
+    def num_trials(self) -> int | None:
+        """Return the number of trials."""
+        return sum(plan.num_trials for plan in self.plans.values())
+
+
+@dataclass(frozen=True, kw_only=True)
 class SpeedStudy(Study[T]):
     """Base class of studies that measure this machine."""
 

@@ -21,7 +21,7 @@ from rps_jax.physics import PHYSICS, EngineName, preset
 from rps_jax.questions import Plan, Run, call_of, option
 from rps_jax.world.physics import Fidelity
 from rps_jax.worlds import parse_domain
-from sweeps.study_base import Study, Table, run_plans
+from sweeps.study_base import PlanStudy, Study, Table, run_plans
 
 
 class Row(NamedTuple):
@@ -50,7 +50,7 @@ ENGINES: dict[str, EngineName] = {"reference": "mujoco", "fused": "fused"}
 
 
 @dataclass(frozen=True)
-class Parity(Study[xr.DataTree]):
+class Parity(PlanStudy[xr.DataTree], Study[xr.DataTree]):
     """Compare the outcomes of tasks in the fused engine with those of converged C MuJoCo.
 
     The answer is a tree with the outcomes (law, world) of each row in both engines.
@@ -86,16 +86,6 @@ class Parity(Study[xr.DataTree]):
         setting = Setting(ENGINES[engine], physics=preset(fidelity=fidelity), seed=self.seed)
         domain = parse_domain(row.domain, row.robot, row.task)
         return Plan(domain, self.worlds, {label: params}, setting, self.part)
-
-    def check(self) -> None:
-        """Check the names, and that the engines can step these worlds here."""
-        super().check()
-        for plan in self.plans.values():
-            plan.check_here()
-
-    def num_trials(self) -> int | None:
-        """Return the number of trials."""
-        return sum(plan.num_trials for plan in self.plans.values())
 
     def answer(self, run: Run) -> xr.DataTree:
         """Run the missing trials."""

@@ -21,7 +21,7 @@ from rps_jax.laws import LawLike, resolve_law
 from rps_jax.physics import PHYSICS, preset
 from rps_jax.questions import Plan, Run, call_of, option
 from rps_jax.worlds import DomainLike, parse_domain
-from sweeps.study_base import Rows, Table, TrialStudy, run_plans
+from sweeps.study_base import PlanStudy, Rows, Table, TrialStudy, run_plans
 
 _CONVERGED = Setting(physics=preset(fidelity="reference"), engine="mujoco")
 _MOVED = 1e-6  # [m]
@@ -40,7 +40,7 @@ ENGINES = {
 
 
 @dataclass(frozen=True)
-class Engines(TrialStudy[xr.DataTree]):
+class Engines(PlanStudy[xr.DataTree], TrialStudy[xr.DataTree]):
     """Compare the outcomes of engines in random worlds.
 
     The answer is a tree with the outcomes (world) of each engine.
@@ -86,16 +86,6 @@ class Engines(TrialStudy[xr.DataTree]):
             )
             for name in self.engines or ENGINES
         }
-
-    def check(self) -> None:
-        """Check the names, and that the engines can step these worlds here."""
-        super().check()
-        for plan in self.plans.values():
-            plan.check_here()
-
-    def num_trials(self) -> int | None:
-        """Return the number of trials."""
-        return sum(plan.num_trials for plan in self.plans.values())
 
     def answer(self, run: Run) -> xr.DataTree:
         """Run the missing trials of each engine."""

@@ -34,7 +34,7 @@ from rps_jax.questions import MultiLawQuestion, Picture, Plan, Run, call_of, opt
 from rps_jax.world.tasks.path import Path
 from rps_jax.worlds import parse_domain
 from sweeps.force_push_grid import grid
-from sweeps.study_base import QuickStudy, Rows, Table, part_name, run_plans
+from sweeps.study_base import PlanStudy, QuickStudy, Rows, Table, part_name, run_plans
 
 POINT = "force_push, with a point"  # their law with their pusher
 RADII = {"straight": math.inf, "4 m": 4.0, "2 m": 2.0, "1 m": 1.0}  # [m] of the turn
@@ -49,7 +49,7 @@ _SLIDER = (
 
 
 @dataclass(frozen=True)
-class Paths(QuickStudy[xr.DataTree], MultiLawQuestion[xr.DataTree]):
+class Paths(PlanStudy[xr.DataTree], QuickStudy[xr.DataTree], MultiLawQuestion[xr.DataTree]):
     """Follow the paths of Heins and Schoellig, by their law and by laws that sense touch.
 
     The answer is a tree: `success`, `error_mean` and `error_95` [m] of the contact (path, slider,
@@ -77,18 +77,13 @@ class Paths(QuickStudy[xr.DataTree], MultiLawQuestion[xr.DataTree]):
         default=Setting("fused", seed=5209, rules=Rules(horizon=600.0)), kw_only=True
     )
 
-    def check(self) -> None:
-        """Check that the engine can step these worlds here."""
-        super().check()
-        for plan in self._plans().values():
-            plan.check_here()
-
     def num_trials(self) -> int | None:
         """Return the number of pushes."""
-        count = sum(plan.num_trials for plan in self._plans().values())
+        count = sum(plan.num_trials for plan in self.plans.values())
         return count + len(RADII) * len(_OBJECTS) * grid.cells().angle.size
 
-    def _plans(self) -> dict[str, Plan]:
+    @property
+    def plans(self) -> dict[str, Plan]:
         """Return the plans of laws with a base, by lookahead, path and slider."""
         plans: dict[str, Plan] = {}
         front = float(Robot().shell.half[0])
@@ -119,7 +114,7 @@ class Paths(QuickStudy[xr.DataTree], MultiLawQuestion[xr.DataTree]):
             .reset_index("world", drop=True)
             for (name, radius), slider in itertools.product(RADII.items(), _OBJECTS)
         ]
-        ours = list(run_plans(run, self._plans()).values())
+        ours = list(run_plans(run, self.plans).values())
         trees = {"point": _arranged(points, shapes, ("path", "slider"))}
         shapes, dims = [len(LOOKAHEADS), *shapes], ("lookahead", "path", "slider")
         return xr.DataTree.from_dict(trees | {"base": _arranged(ours, shapes, dims)})

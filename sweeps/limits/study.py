@@ -27,7 +27,7 @@ from rps_jax.questions import MultiLawQuestion, Picture, Plan, Run, Section, cal
 from rps_jax.runs.sweep import Sweep
 from rps_jax.trials import pushes
 from rps_jax.worlds import Case, DomainLike, parse_domain
-from sweeps.study_base import Rows, run_plans
+from sweeps.study_base import PlanStudy, Rows, run_plans
 
 LOSSES = (0.01, 0.10)  # [1] of success, whose limits are looked for
 _RESAMPLES = 200  # of a bootstrap
@@ -96,7 +96,7 @@ LIMITS = {
 
 
 @dataclass(frozen=True)
-class Limits(MultiLawQuestion[xr.DataTree]):
+class Limits(PlanStudy[xr.DataTree], MultiLawQuestion[xr.DataTree]):
     """Tell what each limit of a robot costs a law: force, lag, acceleration, size, skin.
 
     Every robot meets the worlds that the ideal base meets. The answer is a tree: for each limit its
@@ -122,10 +122,6 @@ class Limits(MultiLawQuestion[xr.DataTree]):
         for name in self.limits:
             errors.check_name("limit", name, LIMITS)
         self._plan(parse_domain(self.domain)).check_here()
-
-    def num_trials(self) -> int | None:
-        """Return the number of trials."""
-        return sum(plan.num_trials for plan in self.plans.values())
 
     def _plan(self, ranges: Domain, robot: Robot | None = None) -> Plan:
         """Return the sweep of a robot."""

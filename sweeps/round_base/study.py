@@ -18,13 +18,13 @@ from rps_jax.laws import LawsLike
 from rps_jax.questions import MultiLawQuestion, Plan, Run, Section, call_of, option
 from rps_jax.runs.sweep import Sweep
 from rps_jax.worlds import DomainLike
-from sweeps.study_base import Rows, run_plans
+from sweeps.study_base import PlanStudy, Rows, run_plans
 
 BASES = {"flat": "ideal", "round": "round"}  # robots, 0.58 m wide
 
 
 @dataclass(frozen=True)
-class RoundBase(MultiLawQuestion[xr.Dataset]):
+class RoundBase(PlanStudy[xr.Dataset], MultiLawQuestion[xr.Dataset]):
     """Compare a flat and a round base of equal width, in equal worlds.
 
     The results hold `success` and `time` (base, law, world).
@@ -50,15 +50,6 @@ class RoundBase(MultiLawQuestion[xr.Dataset]):
             ).plan
             for base, robot in BASES.items()
         }
-
-    def check(self) -> None:
-        """Check that the engine can step these worlds here."""
-        for plan in self.plans.values():
-            plan.check_here()
-
-    def num_trials(self) -> int | None:
-        """Return the number of trials."""
-        return len(BASES) * len(self.chosen) * self.worlds
 
     def answer(self, run: Run) -> xr.Dataset:
         """Sweep with both bases."""
