@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, ClassVar, NamedTuple, Unpack
+from typing import Any, ClassVar, NamedTuple
 
 import jax
 import numpy as np
@@ -22,7 +22,6 @@ from rps_jax.physics import FRICTION, PHYSICS
 from rps_jax.questions import Run
 from rps_jax.record import files
 from rps_jax.record.checkpoint import Checkpoints
-from rps_jax.trials.batch import BatchSize
 from rps_jax.trials.progress import Progress, ProgressCallback, SequentialProgress, no_progress
 from rps_jax.trials.pushes import Cases
 from rps_jax.trials.results import outcome_dataset
@@ -100,7 +99,7 @@ def run_conditions(
     folder: Path | None,
     *,
     callback: ProgressCallback = no_progress,
-    **size: Unpack[BatchSize],
+    **size: Any,
 ) -> xr.Dataset:
     """Return outcomes (condition, law, object, friction, target).
 

@@ -70,9 +70,11 @@ def test_a_notebook_keeps_its_words_code_tables_and_pictures():
 
 def test_the_index_has_a_link_and_a_sentence_for_each_public_name():
     pages = HOOKS["reference"]()
-    names = pages["README.md"].partition("## Modules")[0]
-    row = r"^\| \[`rps_jax\.(\w+)`\]\((\w+\.md)#rps_jax\.[\w.]+\) \| (.+) \|$"
-    rows = re.findall(row, names, re.MULTILINE)
+    rows = re.findall(
+        r"^\| \[`rps_jax\.(\w+)`\]\((\w+\.md)#rps_jax\.[\w.]+\) \| (.+) \|$",
+        pages["README.md"].partition("## Modules")[0],
+        re.MULTILINE,
+    )
     assert {name for name, _, _ in rows} == set(rps_jax.__all__)
     for name, page, sentence in rows:
         assert page in pages

@@ -31,7 +31,6 @@ import xarray as xr
 
 from rps_jax import InputError, RPSParams, Setting, errors, evaluate
 from rps_jax.analysis import statistics
-from rps_jax.control import registry
 from rps_jax.questions import Run, call_of, option
 from rps_jax.runs.question import SimulationQuestion
 from sweeps.study_base import Rows, Study, Table, part_name
@@ -204,7 +203,7 @@ def law_of(row: pd.Series) -> RPSParams:
     """Return the parameters of a generation."""
     names = [name for name in row.index if name.startswith("params.")]
     changes = {name.removeprefix("params."): float(np.asarray(row[name])) for name in names}
-    params = registry.replace_leaves(RPSParams.paper(), changes)
+    params = RPSParams.paper()._replace(**changes)
     return params._replace(l_mr=min(params.l_mr, params.l_cr))  # as in the tuning: see `Space`
 
 

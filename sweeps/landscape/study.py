@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
-from typing import ClassVar, Literal, Unpack
+from typing import Any, ClassVar, Literal
 
 import jax
 import numpy as np
@@ -21,7 +21,6 @@ from rps_jax import Domain, RPSParams, errors
 from rps_jax.analysis.figures.style import Figure, success_rates, tiles
 from rps_jax.laws import law_of
 from rps_jax.questions import MultiLawQuestion, Picture, Run, Section, call_of, option
-from rps_jax.trials.batch import BatchOptions
 from rps_jax.trials.progress import SequentialProgress
 from rps_jax.trials.rollout import Candidates, outcomes
 from rps_jax.trials.setting import seed_of
@@ -96,14 +95,14 @@ class Landscape(MultiLawQuestion[xr.DataTree]):
         self,
         params: RPSParams,
         *splits: Literal["validate", "test"],
-        **options: Unpack[BatchOptions],
+        **options: Any,
     ) -> list[Outcome]:
         """Return the outcomes (P, D * W) of candidates (P,) in the worlds of each split."""
         seeds, worlds = [seed_of(self.setting.seed, x) for x in splits], np.arange(self.worlds)
         requests = [Candidates(params, self.domains, seed, worlds) for seed in seeds]
         return outcomes(requests, self.setting, **options)[0]
 
-    def vary_each(self, **options: Unpack[BatchOptions]) -> xr.Dataset:
+    def vary_each(self, **options: Any) -> xr.Dataset:
         """Compute success, time and path length over each parameter alone, in validation worlds.
 
         Return labelled results (set, parameter, step), with the parameter's `value` at each step.
@@ -121,7 +120,7 @@ class Landscape(MultiLawQuestion[xr.DataTree]):
             {"worlds": outcome.success.shape[1]},
         )
 
-    def select_front(self, **options: Unpack[BatchOptions]) -> xr.Dataset:
+    def select_front(self, **options: Any) -> xr.Dataset:
         """Run candidates between and around the sets, and select the Pareto-optimal ones.
 
         The selection uses validation worlds. The objectives (candidate,) are then measured in test
