@@ -8,9 +8,9 @@ skin. The readings are in `readings`.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import xarray as xr
 
@@ -30,9 +30,9 @@ class Ambiguities(ConditionStudy):
     The result has the outcomes (condition, law, object, friction, target).
     """
 
-    TITLE: ClassVar[str] = "What the paper leaves open"
-    QUICK: ClassVar[Mapping[str, Any]] = {"targets": paper.FEW_TARGETS}
-    GROWS: ClassVar[tuple[str, ...]] = ("readings", "gazebo", "curve")
+    TITLE = "What the paper leaves open"
+    QUICK: ClassVar = {"targets": paper.FEW_TARGETS}
+    GROWS = ("readings", "gazebo", "curve")
 
     laws: tuple[str, ...] = ()
     """Names of laws; by default rps, and with --gazebo also nps and aps."""

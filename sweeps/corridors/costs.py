@@ -46,9 +46,9 @@ class Costs(SpeedStudy[xr.Dataset]):
     The answer has `cost` (task, round), in seconds per simulated second.
     """
 
-    TITLE: ClassVar[str] = "Cost of tasks"
+    TITLE = "Cost of tasks"
     CHOICES: ClassVar = {"tasks": TASKS}
-    GROWS: ClassVar[tuple[str, ...]] = ("tasks",)
+    GROWS = ("tasks",)
     PRESETS: ClassVar = {"tasks": TASKS, "domain": DOMAIN}
 
     tasks: tuple[str, ...] = tuple(TASKS)

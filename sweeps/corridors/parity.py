@@ -56,9 +56,9 @@ class Parity(PlanStudy[xr.DataTree], Study[xr.DataTree]):
     The answer is a tree with the outcomes (law, world) of each row in both engines.
     """
 
-    TITLE: ClassVar[str] = "Tasks in the fused engine and in converged C MuJoCo"
+    TITLE = "Tasks in the fused engine and in converged C MuJoCo"
     CHOICES: ClassVar = {"rows": ROWS}
-    GROWS: ClassVar[tuple[str, ...]] = ("rows",)
+    GROWS = ("rows",)
     PRESETS: ClassVar = PHYSICS["default"]
 
     rows: tuple[str, ...] = tuple(ROWS)

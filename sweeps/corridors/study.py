@@ -61,8 +61,8 @@ class Corridors(Study[xr.DataTree], MultiLawQuestion[xr.DataTree]):
     `corridors` (turn, law, world) with the lookahead of each law, and `paths` (law, world).
     """
 
-    TITLE: ClassVar[str] = "Pushing through corridors"
-    QUICK: ClassVar[Mapping[str, object]] = {
+    TITLE = "Pushing through corridors"
+    QUICK: ClassVar = {
         "laws": ("rps", "rps_tuned"),
         "choice": 60,
         "worlds": 48,

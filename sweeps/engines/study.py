@@ -46,14 +46,14 @@ class Engines(PlanStudy[xr.DataTree], TrialStudy[xr.DataTree]):
     The answer is a tree with the outcomes (world) of each engine.
     """
 
-    TITLE: ClassVar[str] = "Do the engines agree in random worlds?"
-    QUICK: ClassVar[Mapping[str, object]] = {
+    TITLE = "Do the engines agree in random worlds?"
+    QUICK: ClassVar = {
         "worlds": 16,
         "objects": ("random_cylinder",),
         "engines": ("C, standard", "fused, standard"),
     }
     CHOICES: ClassVar = {"engines": ENGINES}
-    GROWS: ClassVar[tuple[str, ...]] = ("engines",)
+    GROWS = ("engines",)
     PRESETS: ClassVar = PHYSICS["default"]
 
     law: LawLike = "rps"

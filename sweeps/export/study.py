@@ -13,7 +13,7 @@ import os
 import shutil
 import tempfile
 from collections import namedtuple
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from itertools import product
@@ -51,10 +51,10 @@ class Export(QuickStudy[xr.DataTree]):
     The answer is a tree with the values of each table by law.
     """
 
-    TITLE: ClassVar[str] = "Laws in C and ONNX beside those in JAX"
-    GROWS: ClassVar[tuple[str, ...]] = ("laws", "tables", "in_worlds")
+    TITLE = "Laws in C and ONNX beside those in JAX"
+    GROWS = ("laws", "tables", "in_worlds")
     PRESETS: ClassVar = PHYSICS["default"]
-    QUICK: ClassVar[Mapping[str, object]] = {
+    QUICK: ClassVar = {
         "laws": ("rps_plus",),
         **{"inputs": 20_000, "states": 20_000, "worlds": 4, "bags": 1},
     }

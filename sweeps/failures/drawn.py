@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -29,8 +29,8 @@ class Drawn(Rare):
     The results are those of `rps_jax.rare`, with the estimate from drawn worlds as `drawn_p`.
     """
 
-    TITLE: ClassVar[str] = "Rare failures, and drawn worlds"
-    IGNORED_FIELDS: ClassVar[tuple[str, ...]] = ("brute",)
+    TITLE = "Rare failures, and drawn worlds"
+    IGNORED_FIELDS = ("brute",)
 
     brute: int = option(1000, 1, 1_000_000_000)
     """Number of drawn worlds for the comparison."""

@@ -37,8 +37,8 @@ STEPS: Mapping[str, Physics] = {
 class Rest(QuickStudy[xr.Dataset]):
     """Leave random objects alone, and tell how far they have moved (domain, step, world) [m]."""
 
-    TITLE: ClassVar[str] = "Do objects at rest stay?"
-    QUICK: ClassVar[Mapping[str, object]] = {"worlds": 9, "seconds": 1.0}
+    TITLE = "Do objects at rest stay?"
+    QUICK: ClassVar = {"worlds": 9, "seconds": 1.0}
     PRESETS: ClassVar = PHYSICS["default"]
 
     worlds: int = option(150, 3, 100_000)

@@ -87,10 +87,10 @@ class Fidelity(ConditionStudy):
     far the object is, 5 s after the start, from where it is in the reference, for RPS alone.
     """
 
-    TITLE: ClassVar[str] = "Is the physics converged?"
-    QUICK: ClassVar[Mapping[str, object]] = {"conditions": QUICK, "targets": paper.FEW_TARGETS}
+    TITLE = "Is the physics converged?"
+    QUICK: ClassVar = {"conditions": QUICK, "targets": paper.FEW_TARGETS}
     CHOICES: ClassVar = {"conditions": CONDITIONS}
-    GROWS: ClassVar[tuple[str, ...]] = ("conditions",)
+    GROWS = ("conditions",)
 
     conditions: tuple[str, ...] = tuple(CONDITIONS)
     """Names of the settings, the reference always among them; by default all."""

@@ -10,7 +10,7 @@ value. It does the same with the simulated logs of these worlds.
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -37,8 +37,8 @@ _TOLERANCE = 0.02  # [1] of the interval's width, within which two limits are eq
 class Bagged(FitStudy):
     """Compare the coverage of intervals fitted to bags with that of fits to logs."""
 
-    TITLE: ClassVar[str] = "Worlds fitted to bags"
-    QUICK: ClassVar[Mapping[str, object]] = {"worlds": 192, "logs": 2, "window": 6.0}
+    TITLE = "Worlds fitted to bags"
+    QUICK: ClassVar = {"worlds": 192, "logs": 2, "window": 6.0}
 
     domain: DomainLike = "real"
     """Ranges from which worlds are drawn, by name or as a JSON file; changes follow."""

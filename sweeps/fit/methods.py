@@ -12,7 +12,7 @@ from __future__ import annotations
 import functools
 import multiprocessing
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
 from typing import ClassVar
@@ -58,9 +58,9 @@ _QUANTITIES = (
 class Methods(FitStudy):
     """Compare methods of fitting worlds to logs, in worlds whose true values are known."""
 
-    TITLE: ClassVar[str] = "Methods of fitting worlds to logs"
-    GROWS: ClassVar[tuple[str, ...]] = ("evolution_logs",)
-    QUICK: ClassVar[Mapping[str, object]] = {"worlds": 192, "logs": 2, "window": 12.0}
+    TITLE = "Methods of fitting worlds to logs"
+    GROWS = ("evolution_logs",)
+    QUICK: ClassVar = {"worlds": 192, "logs": 2, "window": 12.0}
 
     domain: DomainLike = "wide,objects=random_box"
     """Ranges from which worlds are drawn, by name or as a JSON file; changes follow."""

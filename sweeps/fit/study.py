@@ -10,7 +10,7 @@ the fitted domain, and compares both with trials in the true worlds.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property, partial
 from typing import ClassVar
@@ -107,8 +107,8 @@ class FitStudy(Study[xr.Dataset], DomainQuestion[xr.Dataset], LawQuestion[xr.Dat
 class Coverage(FitStudy):
     """Measure the coverage of fitted intervals, and the value of a fit for predictions."""
 
-    TITLE: ClassVar[str] = "Worlds fitted to logs"
-    QUICK: ClassVar[Mapping[str, object]] = {
+    TITLE = "Worlds fitted to logs"
+    QUICK: ClassVar = {
         "worlds": 960,
         "logs": 48,
         "window": 20.0,

@@ -9,10 +9,10 @@ it. `rps fit`, whose intervals are better calibrated, needs both. `methods` comp
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 import xarray as xr
@@ -39,8 +39,8 @@ class FitWindows(Fit):
     law has no influence.
     """
 
-    TITLE: ClassVar[str] = "A domain fitted to windows of logs"
-    QUICK: ClassVar[Mapping[str, Any]] = {"worlds": 12, "window": 20.0}
+    TITLE = "A domain fitted to windows of logs"
+    QUICK: ClassVar = {"worlds": 12, "window": 20.0}
 
     worlds: int = option(96, 6, 1_000_000)
     """Number of worlds of the domain from which the minimisation starts; at least 6 of each object

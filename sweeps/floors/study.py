@@ -42,8 +42,8 @@ class Floors(QuickStudy[xr.DataTree], MultiLawQuestion[xr.DataTree]):
     world), in the same worlds.
     """
 
-    TITLE: ClassVar[str] = "Pushing on slopes and over changes of the floor"
-    QUICK: ClassVar[Mapping[str, object]] = {"laws": ("rps", "rps_tuned"), "worlds": 12}
+    TITLE = "Pushing on slopes and over changes of the floor"
+    QUICK: ClassVar = {"laws": ("rps", "rps_tuned"), "worlds": 12}
     PRESETS: ClassVar = {"slopes": list(SLOPES), "factors": list(FACTORS)}
 
     laws: LawsLike = ("rps", "rps_tuned", "rps_plus", "learned")

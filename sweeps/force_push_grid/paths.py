@@ -56,8 +56,8 @@ class Paths(PlanStudy[xr.DataTree], QuickStudy[xr.DataTree], MultiLawQuestion[xr
     world) for their law with a point, and (lookahead, path, slider, law, world) for other laws.
     """
 
-    TITLE: ClassVar[str] = "Paths of Force Push"
-    QUICK: ClassVar[Mapping[str, object]] = {"laws": ("force_push", "rps_tuned"), "worlds": 12}
+    TITLE = "Paths of Force Push"
+    QUICK: ClassVar = {"laws": ("force_push", "rps_tuned"), "worlds": 12}
     PRESETS: ClassVar = {
         **{"radii": list(RADII.values()), "length": LENGTH, "lookaheads": LOOKAHEADS},
         **{"slider": _SLIDER, "law": grid.PARAMS},

@@ -8,7 +8,7 @@ and in their open loop, from every start of their grid, which stands in `grid`.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import ClassVar
@@ -31,10 +31,10 @@ class ForcePushGrid(QuickStudy[xr.Dataset]):
     their criterion, `silent` [s], `apart` [m], `deviation` [m] and `completion` [1].
     """
 
-    TITLE: ClassVar[str] = "Force Push on its authors' ground"
-    QUICK: ClassVar[Mapping[str, object]] = {"duration": 60.0, "sliders": ("box",)}
+    TITLE = "Force Push on its authors' ground"
+    QUICK: ClassVar = {"duration": 60.0, "sliders": ("box",)}
     CHOICES: ClassVar = {"laws": grid.LAWS, "sliders": grid.SLIDERS}
-    GROWS: ClassVar[tuple[str, ...]] = ("laws", "sliders")
+    GROWS = ("laws", "sliders")
     PRESETS: ClassVar = {"physics": grid.PHYSICS, "law": grid.PARAMS}
 
     laws: tuple[grid.LawName, ...] = grid.LAWS

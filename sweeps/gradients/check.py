@@ -28,7 +28,7 @@ class Check(Gradients):
     The answer has the relative `error` (object, world, horizon) of the derivatives.
     """
 
-    TITLE: ClassVar[str] = "Derivatives against central differences"
+    TITLE = "Derivatives against central differences"
     QUICK: ClassVar = {"horizons": (0.5, 2.0), "worlds": 4, "engine": "quasistatic"}
     DOUBLE: ClassVar = True
 

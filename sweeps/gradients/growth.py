@@ -74,10 +74,10 @@ class Growth(QuickStudy[xr.Dataset]):
     derivative of its offset by the object's offset aside.
     """
 
-    TITLE: ClassVar[str] = "Growth of derivatives along pushes"
+    TITLE = "Growth of derivatives along pushes"
     QUICK: ClassVar = {"worlds": 4, "horizon": 4.0, "engine": "quasistatic"}
     CHOICES: ClassVar = {"objects": RANDOM_OBJECTS}
-    GROWS: ClassVar[tuple[str, ...]] = ("objects",)
+    GROWS = ("objects",)
     PRESETS: ClassVar = {"physics": PHYSICS["default"], "laws": ("rps",)}
 
     domain: DomainLike = "wide,gap=0:0"

@@ -14,7 +14,7 @@ Reference: Xu et al., "Accelerated policy learning with parallel differentiable 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -46,8 +46,8 @@ class WindowLearner(Learn):
     The answer and the run folder are those of `rps learn`.
     """
 
-    TITLE: ClassVar[str] = "A law learned by gradients of short windows"
-    QUICK: ClassVar[Mapping[str, Any]] = {**Learn.QUICK, "setting.engine": "quasistatic"}
+    TITLE = "A law learned by gradients of short windows"
+    QUICK: ClassVar = {**Learn.QUICK, "setting.engine": "quasistatic"}
 
     estimator: str = field(default="clipped", kw_only=True)
     """Estimator of the gradient: exact, clipped, bundled, evolution or mixed."""

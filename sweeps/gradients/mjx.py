@@ -29,10 +29,10 @@ class MJXGradients(Study[xr.Dataset]):
     finite entries of MJX's forward mode from rest; and the error `reverse` of its reverse mode.
     """
 
-    TITLE: ClassVar[str] = "Exact derivatives of MJX in custom models"
-    DIMENSION: ClassVar[str] = "case"
+    TITLE = "Exact derivatives of MJX in custom models"
+    DIMENSION = "case"
     CHOICES: ClassVar = {"models": mjx_upstream.MODELS}
-    GROWS: ClassVar[tuple[str, ...]] = ("models",)
+    GROWS = ("models",)
 
     models: tuple[str, ...] = tuple(mjx_upstream.MODELS)
     """Models to step, each with both friction cones."""

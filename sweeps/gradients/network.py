@@ -52,11 +52,11 @@ class Networks(QuickStudy[xr.Dataset]):
     The answer has the best `validation` [1] up to each time (run, time), and the `test` (run).
     """
 
-    TITLE: ClassVar[str] = "Networks learned by several methods"
+    TITLE = "Networks learned by several methods"
     CHOICES: ClassVar = {"methods": METHODS}
-    QUICK: ClassVar[Mapping[str, Any]] = {"seeds": (1,)}
+    QUICK: ClassVar = {"seeds": (1,)}
     PRESETS: ClassVar = {"physics": PHYSICS["default"], "domains": ("wide",)}
-    IGNORED_FIELDS: ClassVar[tuple[str, ...]] = ("minutes", "lanes", "gpus")
+    IGNORED_FIELDS = ("minutes", "lanes", "gpus")
 
     methods: tuple[str, ...] = tuple(METHODS)
     """ppo, windows (derivatives of windows with a value function at their ends) or evolution

@@ -56,12 +56,12 @@ class Race(Study[xr.Dataset], SimulationQuestion[xr.Dataset]):
     of the paper's law, `start_success` (world).
     """
 
-    TITLE: ClassVar[str] = "Gradients against evolution"
+    TITLE = "Gradients against evolution"
     CHOICES: ClassVar = {"methods": METHODS}
-    QUICK: ClassVar[Mapping[str, Any]] = {"worlds": 4, "counts": (6,), "seeds": (1,)}
-    IGNORED_FIELDS: ClassVar[tuple[str, ...]] = ("minutes", "lanes", "gpus")
-    DIMENSION: ClassVar[str] = "tuning"
-    REPORTS_TIMES: ClassVar[bool] = True
+    QUICK: ClassVar = {"worlds": 4, "counts": (6,), "seeds": (1,)}
+    IGNORED_FIELDS = ("minutes", "lanes", "gpus")
+    DIMENSION = "tuning"
+    REPORTS_TIMES = True
 
     methods: tuple[str, ...] = ("slopes", "evolution")
     """slopes (antithetic steps in whole trials), windows (derivatives of windows) or evolution."""

@@ -42,8 +42,8 @@ class ScoreStudy(QuickStudy[xr.Dataset], SimulationQuestion[xr.Dataset]):
     that of whole trials with the interval `low` to `high`, and the `cost` [s] in simulated time.
     """
 
-    TITLE: ClassVar[str] = "Scores of windows against whole trials"
-    QUICK: ClassVar[Mapping[str, Any]] = {
+    TITLE = "Scores of windows against whole trials"
+    QUICK: ClassVar = {
         "windows": (2.0,),
         "critics": (2.0,),
         "taxels": (0.03,),
@@ -116,7 +116,7 @@ class ScoreStudy(QuickStudy[xr.Dataset], SimulationQuestion[xr.Dataset]):
             parts[label] = partial(self._critic, tuning)
         return parts
 
-    DIMENSION: ClassVar[str] = "score"
+    DIMENSION = "score"
 
     def answer(self, run: Run) -> xr.Dataset:
         """Compute the gradients that are missing, and compare them with the truth."""

@@ -62,7 +62,7 @@ class Gradients(QuickStudy[xr.Dataset]):
     the gradients [m] in each world (world, parameter, horizon); `truth` has other worlds.
     """
 
-    TITLE: ClassVar[str] = "Gradients against finite differences"
+    TITLE = "Gradients against finite differences"
     QUICK: ClassVar = {
         "horizons": (0.5, 2.0, 8.0),
         "worlds": 8,
@@ -70,7 +70,7 @@ class Gradients(QuickStudy[xr.Dataset]):
         "engine": "quasistatic",
     }
     CHOICES: ClassVar = {"estimators": tuple(estimators.ESTIMATORS), "objects": RANDOM_OBJECTS}
-    GROWS: ClassVar[tuple[str, ...]] = ("estimators", "objects")
+    GROWS = ("estimators", "objects")
     PRESETS: ClassVar = {"physics": PHYSICS["default"], "laws": ("rps",)}
     DOUBLE: ClassVar = False  # whether trials have double precision
 

@@ -14,7 +14,7 @@ import time
 from collections.abc import Callable, Hashable
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, ClassVar
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -46,7 +46,7 @@ class WindowTuning(TuneGrad):
     The answer is that of `rps tune grad`.
     """
 
-    TITLE: ClassVar[str] = "A law tuned by derivatives of windows"
+    TITLE = "A law tuned by derivatives of windows"
 
     estimator: str = "clipped"
     """Estimator of the gradient: exact, clipped (exact with a bound in each world), bundled,

@@ -77,10 +77,10 @@ KINDS = {
 class Straight(QuickStudy[xr.Dataset]):
     """Push random objects straight ahead: `force` over mu m g and its `spread` (kind, world)."""
 
-    TITLE: ClassVar[str] = "Force of straight pushes"
-    QUICK: ClassVar[dict[str, object]] = {"worlds": 9, "kinds": ("standard", "lower")}
+    TITLE = "Force of straight pushes"
+    QUICK: ClassVar = {"worlds": 9, "kinds": ("standard", "lower")}
     CHOICES: ClassVar = {"kinds": KINDS}
-    GROWS: ClassVar[tuple[str, ...]] = ("kinds",)
+    GROWS = ("kinds",)
     PRESETS: ClassVar = PHYSICS["default"]
 
     kinds: tuple[str, ...] = tuple(KINDS)

@@ -8,7 +8,7 @@ rigid limit, and `grounds` runs them on many grounds and compares.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, ClassVar
@@ -32,10 +32,10 @@ class Ground(QuickStudy[xr.Dataset]):
     objects (object, offset, at_height), and their distance from each push, `error` [m].
     """
 
-    TITLE: ClassVar[str] = "Which ground is dry friction?"
-    QUICK: ClassVar[Mapping[str, object]] = {"grounds": grounds.QUICK}
+    TITLE = "Which ground is dry friction?"
+    QUICK: ClassVar = {"grounds": grounds.QUICK}
     CHOICES: ClassVar = {"grounds": grounds.GROUNDS}
-    GROWS: ClassVar[tuple[str, ...]] = ("grounds",)
+    GROWS = ("grounds",)
     PRESETS: ClassVar = PHYSICS["default"]
 
     grounds: tuple[str, ...] = tuple(grounds.GROUNDS)

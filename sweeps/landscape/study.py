@@ -8,7 +8,7 @@ and around sets of parameters. Both push with a few hundred candidates: for a GP
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
 from typing import Any, ClassVar, Literal
@@ -39,8 +39,8 @@ class Landscape(MultiLawQuestion[xr.DataTree]):
     with those of candidates between the laws' parameters and around them (candidate).
     """
 
-    TITLE: ClassVar[str] = "Effect of each parameter"
-    QUICK: ClassVar[Mapping[str, object]] = {"worlds": 32, "values": 3, "candidates": 16}
+    TITLE = "Effect of each parameter"
+    QUICK: ClassVar = {"worlds": 32, "values": 3, "candidates": 16}
 
     domain: Sequence[DomainLike] = ("wide",)
     """Domains: paper, hardware, wide, real, prisms or hostile, or JSON files of ranges; changes

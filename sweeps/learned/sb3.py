@@ -17,7 +17,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -45,8 +45,8 @@ class SB3(Study[xr.Dataset]):
     The answer holds `time` [s], `steps`, `episodes`, `reward` and `success` (envs, row).
     """
 
-    TITLE: ClassVar[str] = "PPO of Stable-Baselines3"
-    DIMENSION: ClassVar[str] = "envs"
+    TITLE = "PPO of Stable-Baselines3"
+    DIMENSION = "envs"
 
     domain: str = "wide,distance=0.7:1,bearing=-0.3:0.3"
     """Ranges from which worlds are drawn."""

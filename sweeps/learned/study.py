@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 
@@ -51,7 +51,7 @@ class Learned(Study[list[list[Any]]]):
     The results are the rows.
     """
 
-    TITLE: ClassVar[str] = "A law learned from touch"
+    TITLE = "A law learned from touch"
 
     runs: tuple[str, ...] = option((), positional=True)
     """Run folders of `rps learn`."""

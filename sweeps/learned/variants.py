@@ -86,11 +86,11 @@ class Variants(QuickStudy[xr.Dataset]):
     numbers of its run (variant).
     """
 
-    TITLE: ClassVar[str] = "Variants of learning"
+    TITLE = "Variants of learning"
     CHOICES: ClassVar = {"variants": VARIANTS}
-    QUICK: ClassVar[Mapping[str, Any]] = {"variants": ("scratch", "mlp"), "worlds": 4}
-    DIMENSION: ClassVar[str] = "variant"
-    REPORTS_TIMES: ClassVar[bool] = True
+    QUICK: ClassVar = {"variants": ("scratch", "mlp"), "worlds": 4}
+    DIMENSION = "variant"
+    REPORTS_TIMES = True
 
     runs: tuple[str, ...] = option((), positional=True)
     """Run folders of this study, to collect their results."""

@@ -118,7 +118,7 @@ class Levers(SpeedStudy[xr.Dataset]):
     The answer holds, for each lever, how many times as fast the program is with it, `times` [1].
     """
 
-    TITLE: ClassVar[str] = "What each choice for speed is worth"
+    TITLE = "What each choice for speed is worth"
     CHOICES: ClassVar = {"program": programs.BATCHED}
 
     program: str = "mjx standard"

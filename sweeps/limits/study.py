@@ -103,8 +103,8 @@ class Limits(PlanStudy[xr.DataTree], MultiLawQuestion[xr.DataTree]):
     `value` and the `world` (case), `success` with it and with the ideal base, `usual` (law, case).
     """
 
-    TITLE: ClassVar[str] = "What each limit costs"
-    IGNORED_FIELDS: ClassVar[tuple[str, ...]] = ("limits",)  # later calls may add limits
+    TITLE = "What each limit costs"
+    IGNORED_FIELDS = ("limits",)  # later calls may add limits
     QUICK: ClassVar = {"worlds": 64}
 
     domain: DomainLike = "wide"

@@ -10,7 +10,7 @@ realigns), and the first with one more addition, in the same worlds, and compare
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import ClassVar
@@ -34,8 +34,8 @@ class Mends(SweepQuestion):
     The results hold outcomes (law, world), like those of `rps_jax.sweep`.
     """
 
-    TITLE: ClassVar[str] = "Mends of the tuned law"
-    QUICK: ClassVar[Mapping[str, object]] = {"worlds": 32}
+    TITLE = "Mends of the tuned law"
+    QUICK: ClassVar = {"worlds": 32}
 
     laws: LawsLike = ()
     """Additions, by their names in the table; by default all. The addition of comparison is always

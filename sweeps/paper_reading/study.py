@@ -10,7 +10,7 @@ has the numbers and their likelihood, `evidence` the posterior, and `drawing` th
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import ClassVar
@@ -41,8 +41,8 @@ class PaperReading(TrialStudy[xr.Dataset]):
     (engine, repeat, number), and its Fig. 6 over time.
     """
 
-    TITLE: ClassVar[str] = "Which reading of the paper gives its numbers"
-    QUICK: ClassVar[Mapping[str, object]] = {
+    TITLE = "Which reading of the paper gives its numbers"
+    QUICK: ClassVar = {
         "draws": 2,
         "rounds": 1,
         "samples": 2,

@@ -58,10 +58,10 @@ class Planning(QuickStudy[xr.Dataset]):
     (case, push) and `replanned` (case, method, push) are 1 if a push ends at its target.
     """
 
-    TITLE: ClassVar[str] = "Plans of pushes to a pose"
+    TITLE = "Plans of pushes to a pose"
     QUICK: ClassVar = {"objects": ("random_box",), "horizons": (5.0,), "pushes": 8, "budget": 0.02}
     CHOICES: ClassVar = {"objects": RANDOM_OBJECTS, "methods": METHODS}
-    DIMENSION: ClassVar[str] = "case"
+    DIMENSION = "case"
     PRESETS: ClassVar = {"physics": PHYSICS["default"]}
 
     objects: tuple[str, ...] = RANDOM_OBJECTS

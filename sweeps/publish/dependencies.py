@@ -78,10 +78,10 @@ class Dependencies(Study[xr.Dataset]):
     the packages of the core, and those that each extra adds. Size 0: not installed.
     """
 
-    TITLE: ClassVar[str] = "Packages of the dependencies"
+    TITLE = "Packages of the dependencies"
     CHOICES: ClassVar = {"extras": EXTRAS}
-    GROWS: ClassVar[tuple[str, ...]] = ("extras",)
-    RESULTS: ClassVar[str] = "../results"
+    GROWS = ("extras",)
+    RESULTS = "../results"
 
     extras: tuple[str, ...] = tuple(EXTRAS)
     """Extras to measure; by default all."""

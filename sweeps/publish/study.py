@@ -19,7 +19,7 @@ import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar, Literal
+from typing import Any, Literal
 
 import xarray as xr
 
@@ -52,8 +52,8 @@ class Publish(Study[xr.Dataset]):
     The results hold version, commit, date, state and duration (file), in words.
     """
 
-    TITLE: ClassVar[str] = "Published numbers and their dependencies"
-    GROWS: ClassVar[tuple[str, ...]] = ("only", "needs", "check_probes")
+    TITLE = "Published numbers and their dependencies"
+    GROWS = ("only", "needs", "check_probes")
 
     only: tuple[str, ...] = ()
     """Data files to compute again, as fit_coverage or fit_*; by default none. With --check-probes,

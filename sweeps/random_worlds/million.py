@@ -44,9 +44,9 @@ class Million(TrialStudy[xr.Dataset]):
     The results hold `success` (law, byte), `how`, `steps` and `missed` (law, world).
     """
 
-    TITLE: ClassVar[str] = "A million outcomes"
+    TITLE = "A million outcomes"
     QUICK: ClassVar = {"worlds": 64}
-    GROWS: ClassVar[tuple[str, ...]] = ("laws",)
+    GROWS = ("laws",)
 
     laws: tuple[str, ...] = ("rps_tuned", "rps_plus", "learned")
     """Laws to run in the same worlds."""

@@ -37,9 +37,9 @@ class RandomWorlds(TrialStudy[xr.Dataset]):
     a model did not run.
     """
 
-    TITLE: ClassVar[str] = "Four laws in random worlds"
-    QUICK: ClassVar[Mapping[str, object]] = {"worlds": 24, "panel": 0, "in_c": 0}
-    GROWS: ClassVar[tuple[str, ...]] = (
+    TITLE = "Four laws in random worlds"
+    QUICK: ClassVar = {"worlds": 24, "panel": 0, "in_c": 0}
+    GROWS = (
         "against",
         "domains",
         "panel",

@@ -150,11 +150,11 @@ class Real(QuickStudy[xr.Dataset]):
     the 90 % intervals; by method, cell and half, the quantities and their standard deviations.
     """
 
-    TITLE: ClassVar[str] = "Friction and centre of pressure of real pushes"
+    TITLE = "Friction and centre of pressure of real pushes"
     CHOICES: ClassVar = {"groups": GROUPS}
-    GROWS: ClassVar[tuple[str, ...]] = ("groups",)
-    DIMENSION: ClassVar[str] = "cell"
-    QUICK: ClassVar[Mapping[str, object]] = {"few": 6, "worlds": 32, "cells": 1}
+    GROWS = ("groups",)
+    DIMENSION = "cell"
+    QUICK: ClassVar = {"few": 6, "worlds": 32, "cells": 1}
 
     few: int = option(12, 6, 1000)
     """Greatest number of pushes of each half of a cell."""

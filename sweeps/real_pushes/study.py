@@ -122,9 +122,9 @@ class RealPushes(QuickStudy[xr.Dataset]):
     did not run, those `measured`, and the errors `place` [m], `turn` [rad] and `both` [m].
     """
 
-    TITLE: ClassVar[str] = "Does the physics predict real pushes?"
+    TITLE = "Does the physics predict real pushes?"
     CHOICES: ClassVar = {"models": WORDS}
-    QUICK: ClassVar[Mapping[str, object]] = {"few": 60, "mujoco": 6}
+    QUICK: ClassVar = {"few": 60, "mujoco": 6}
     PRESETS: ClassVar = PHYSICS["default"]
 
     pushes: Path | None = None

@@ -30,7 +30,7 @@ class RoundBase(PlanStudy[xr.Dataset], MultiLawQuestion[xr.Dataset]):
     The results hold `success` and `time` (base, law, world).
     """
 
-    TITLE: ClassVar[str] = "Flat and round bases"
+    TITLE = "Flat and round bases"
     QUICK: ClassVar = {"worlds": 32}
 
     laws: LawsLike = ("rps", "rps_tuned", "aps", "dipole", "force_push")

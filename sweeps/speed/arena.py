@@ -75,16 +75,16 @@ class Arena(SpeedStudy[xr.Dataset], QuickStudy[xr.Dataset]):
     has no rate.
     """
 
-    TITLE: ClassVar[str] = "Engines on one scene"
+    TITLE = "Engines on one scene"
     CHOICES: ClassVar = {"names": RACERS}
-    QUICK: ClassVar[Mapping[str, object]] = {
+    QUICK: ClassVar = {
         "names": ("C MuJoCo, rollout", "fused"),
         "worlds": (8,),
         "starts": 4,
         "seconds": 0.5,
         "step": 1e-3,
     }
-    GROWS: ClassVar[tuple[str, ...]] = ("names", "worlds", "peers", "limit")
+    GROWS = ("names", "worlds", "peers", "limit")
 
     names: tuple[str, ...] = tuple(RACERS)
     """Engines to run; by default all."""

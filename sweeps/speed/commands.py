@@ -21,7 +21,6 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import ClassVar
 
 import xarray as xr
 
@@ -50,9 +49,9 @@ class Commands(SpeedStudy[xr.Dataset]):
     that the second one prints.
     """
 
-    TITLE: ClassVar[str] = "Duration of whole commands"
-    DIMENSION: ClassVar[str] = "command"
-    GROWS: ClassVar[tuple[str, ...]] = ("commands", "warm", "gpus")
+    TITLE = "Duration of whole commands"
+    DIMENSION = "command"
+    GROWS = ("commands", "warm", "gpus")
 
     commands: tuple[str, ...] = (
         "push --object box --target -2 0 --no-video",

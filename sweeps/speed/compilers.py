@@ -15,7 +15,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import ClassVar, Literal
+from typing import Literal
 
 import numpy as np
 import xarray as xr
@@ -42,9 +42,9 @@ class Compilers(SpeedStudy[xr.Dataset]):
     seconds per second of both.
     """
 
-    TITLE: ClassVar[str] = "The loop compiled here, and by XLA"
-    DIMENSION: ClassVar[str] = "skin"
-    GROWS: ClassVar[tuple[str, ...]] = ("skins", "file")
+    TITLE = "The loop compiled here, and by XLA"
+    DIMENSION = "skin"
+    GROWS = ("skins", "file")
 
     law: str = "rps_tuned"
     """Law to run."""

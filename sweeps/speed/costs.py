@@ -63,7 +63,7 @@ class Costs(SpeedStudy[list[Profile]]):
     The results hold a profile of each program.
     """
 
-    TITLE: ClassVar[str] = "Time of a control step by function"
+    TITLE = "Time of a control step by function"
     CHOICES: ClassVar = {"families": FAMILIES, "names": programs.BATCHED}
 
     names: tuple[str, ...] = ("fused standard",)

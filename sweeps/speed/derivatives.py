@@ -13,7 +13,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, ClassVar, Literal
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
@@ -55,9 +55,9 @@ class Derivatives(SpeedStudy[xr.Dataset]):
     one by all inputs, the time to compile one [s], its memory and the share of finite worlds.
     """
 
-    TITLE: ClassVar[str] = "Time of derivatives"
-    DIMENSION: ClassVar[str] = "family"
-    GROWS: ClassVar[tuple[str, ...]] = ("families", "file")
+    TITLE = "Time of derivatives"
+    DIMENSION = "family"
+    GROWS = ("families", "file")
 
     families: tuple[Literal["box", "cylinder", "prism"], ...] = ("box", "cylinder")
     """Families of the objects: box, cylinder, prism."""

@@ -17,7 +17,6 @@ from dataclasses import dataclass
 from functools import cached_property, partial
 from itertools import product
 from pathlib import Path
-from typing import ClassVar
 
 import numpy as np
 import xarray as xr
@@ -60,9 +59,9 @@ class Gpus(SpeedStudy[xr.Dataset]):
     the fewest and on the most GPUs, its `segments`: device, start, end and live trials by object.
     """
 
-    TITLE: ClassVar[str] = "Sweeps on several GPUs"
-    DIMENSION: ClassVar[str] = "sweep"
-    GROWS: ClassVar[tuple[str, ...]] = ("worlds", "gpus")
+    TITLE = "Sweeps on several GPUs"
+    DIMENSION = "sweep"
+    GROWS = ("worlds", "gpus")
 
     law: str = "rps_tuned"
     """Law to run."""

@@ -16,7 +16,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import ClassVar, Literal
+from typing import Literal
 
 import xarray as xr
 
@@ -64,9 +64,9 @@ class Kernel(SpeedStudy[xr.Dataset]):
     The results hold the counters of Nsight Compute for 10 simulated seconds, by shape family.
     """
 
-    TITLE: ClassVar[str] = "Stall reasons of the kernel"
-    DIMENSION: ClassVar[str] = "family"
-    GROWS: ClassVar[tuple[str, ...]] = ("families",)
+    TITLE = "Stall reasons of the kernel"
+    DIMENSION = "family"
+    GROWS = ("families",)
 
     law: str = "rps_tuned"
     """Law to run."""

@@ -12,7 +12,6 @@ import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import ClassVar
 
 import xarray as xr
 
@@ -44,10 +43,10 @@ class OnARobot(Study[xr.Dataset]):
     The results hold `median`, `slow`, `worst` [us] and `late` [%] by run.
     """
 
-    TITLE: ClassVar[str] = "Time of a step on a robot"
-    DIMENSION: ClassVar[str] = "run"
-    GROWS: ClassVar[tuple[str, ...]] = ("runs", "core")
-    RESULTS: ClassVar[str] = "../results"
+    TITLE = "Time of a step on a robot"
+    DIMENSION = "run"
+    GROWS = ("runs", "core")
+    RESULTS = "../results"
 
     runs: int = option(2, 1, 100)
     """Number of runs."""

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import time
 from collections import deque
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
 from itertools import product
@@ -67,14 +67,14 @@ class Speed(SpeedStudy[xr.Dataset], QuickStudy[xr.Dataset]):
     The results hold simulated seconds per second of wall clock, `rate` [1], of each measurement.
     """
 
-    TITLE: ClassVar[str] = "Speed"
+    TITLE = "Speed"
     CHOICES: ClassVar = {"names": NAMES, "families": FAMILIES}
-    QUICK: ClassVar[Mapping[str, object]] = {
+    QUICK: ClassVar = {
         "names": ("C in closed loop", "fused standard", "quasistatic"),
         "families": ("box",),
         "worlds": (64,),
     }
-    GROWS: ClassVar[tuple[str, ...]] = ("names", "families", "worlds", "at_once")
+    GROWS = ("names", "families", "worlds", "at_once")
 
     names: tuple[str, ...] = ()
     """Engines and fidelities; by default all."""
