@@ -39,6 +39,7 @@ from sweeps import probes, render_tables
 
 T = TypeVar("T", covariant=True)
 Rows = list[list[str]]
+Parts = Mapping[Any, Callable[[], xr.Dataset]]  # functions that compute the parts of results
 RANDOM_OBJECTS = ("random_box", "random_cylinder", "random_prism")
 _PACKAGES = ("rps_jax", "jax", "mujoco", "mujoco-mjx")  # whose versions a data file has
 
@@ -113,7 +114,7 @@ class Study(Question[T]):
 
     # --- for subclasses to override --------------------------------------------------------
 
-    def parts(self, run: Run) -> Mapping[Any, Callable[[], xr.Dataset]]:
+    def parts(self, run: Run) -> Parts:
         """Return the function that computes each part of the results, by its coordinate."""
         return {}
 
@@ -252,9 +253,7 @@ def stored_parts(run: Run) -> Collection[str]:
     return () if run.checkpoints is None else run.checkpoints.paths()
 
 
-def run_parts(
-    run: Run, dim: str, parts: Mapping[Any, Callable[[], xr.Dataset]], trials: int = 1
-) -> xr.Dataset:
+def run_parts(run: Run, dim: str, parts: Parts, trials: int = 1) -> xr.Dataset:
     """Compute the parts that the run folder lacks, and join all of them along a dimension.
 
     Each part counts as a number of `trials` in the progress.

@@ -18,7 +18,7 @@ import os
 import shlex
 import subprocess
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from functools import partial
@@ -33,7 +33,7 @@ from rps_jax import InputError, RPSParams, Setting, errors, evaluate
 from rps_jax.analysis import statistics
 from rps_jax.questions import Run, call_of, option
 from rps_jax.runs.question import SimulationQuestion
-from sweeps.study_base import Rows, Study, Table, part_name
+from sweeps.study_base import Parts, Rows, Study, Table, part_name
 
 COUNTS = {6: "K_h K_v L beta l_cr d_th", 13: "full"}  # tuned parameters by their number
 _COMMON = "--horizon 150 --validation 256"
@@ -115,7 +115,7 @@ class Race(Study[xr.Dataset], SimulationQuestion[xr.Dataset]):
         run_commands(commands, self.minutes, self.lanes, self.gpus)
         return super().answer(run)
 
-    def parts(self, run: Run) -> Mapping[Any, Callable[[], xr.Dataset]]:
+    def parts(self, run: Run) -> Parts:
         """Return the test of each tuning, by its label."""
         folder = run.folder or Path(str(self.out))
         return {

@@ -10,10 +10,10 @@ whole trials under the original law, by central differences in other worlds.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import partial
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import jax.numpy as jnp
 import numpy as np
@@ -29,7 +29,7 @@ from rps_jax.tuning import descent
 from rps_jax.tuning.gradients import Estimate, estimate
 from sweeps.gradients import critic
 from sweeps.gradients.windows import WindowTuning, window_gradients
-from sweeps.study_base import QuickStudy, Rows, Table
+from sweeps.study_base import Parts, QuickStudy, Rows, Table
 
 _DRAWS = 4000  # of the errors of both gradients
 
@@ -100,7 +100,7 @@ class ScoreStudy(QuickStudy[xr.Dataset], SimulationQuestion[xr.Dataset]):
         for name in self.estimators:
             self.tuning(name).validate()
 
-    def parts(self, run: Run) -> Mapping[Any, Callable[[], xr.Dataset]]:
+    def parts(self, run: Run) -> Parts:
         """Return the function of each gradient by its label."""
         parts = {"truth": partial(self._truth, run)}
         parts["evolution, whole trials"] = partial(self._evolution, run)

@@ -14,7 +14,7 @@ import importlib
 import importlib.metadata
 import importlib.util
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
@@ -27,7 +27,7 @@ from rps_jax.analysis import statistics, tables
 from rps_jax.analysis.figures.style import Figure, panel
 from rps_jax.questions import Picture, Run, call_of, option
 from rps_jax.worlds import parse_domain
-from sweeps.study_base import Rows, Study, Table, records
+from sweeps.study_base import Parts, Rows, Study, Table, records
 
 _VARIABLES = {
     "time": {"units": "s", "long_name": "wall clock since learning began"},
@@ -73,7 +73,7 @@ class SB3(Study[xr.Dataset]):
                     f"{name} is not installed: run pip install gymnasium stable-baselines3."
                 )
 
-    def parts(self, run: Run) -> Mapping[int, Callable[[], xr.Dataset]]:
+    def parts(self, run: Run) -> Parts:
         """Return the function that learns with each number of worlds."""
         return {n: partial(self._learned, n) for n in self.num_envs}
 

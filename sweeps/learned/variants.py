@@ -11,7 +11,7 @@ validation. The last command collects the results of other run folders.
 from __future__ import annotations
 
 import shlex
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -26,7 +26,7 @@ from rps_jax.app.cli import flags
 from rps_jax.questions import Run, call_of, option
 from rps_jax.record import provenance
 from rps_jax.tuning.learn import Learn
-from sweeps.study_base import QuickStudy, Table, write_table
+from sweeps.study_base import Parts, QuickStudy, Table, write_table
 
 # `learned_gru.npz` and `learned_mlp.npz` are the laws of 0.3, with which variants start.
 DOMAINS = ("wide", "hostile", "real")
@@ -119,7 +119,7 @@ class Variants(QuickStudy[xr.Dataset]):
         words = [*shlex.split(self.command(name))[2:], *options]
         return flags.parse(Learn, "learn", words)[0]
 
-    def parts(self, run: Run) -> Mapping[str, Callable[[], xr.Dataset]]:
+    def parts(self, run: Run) -> Parts:
         """Return the run of each variant, by its name."""
         folder = Path(str(self.out))
         names = () if self.runs else self.variants

@@ -26,7 +26,7 @@ from rps_jax.questions import Run, call_of, option
 from rps_jax.tuning import posterior
 from sweeps.real_pushes import pushes, study
 from sweeps.real_pushes.problem import HIGH, LOW, QUANTITIES, Cell
-from sweeps.study_base import QuickStudy, Table, text_table
+from sweeps.study_base import Parts, QuickStudy, Table, text_table
 
 GROUPS = ("point, three feet", "two-point, three feet", "point, flat", "two-point, flat")
 _PRIOR = np.sqrt(12)  # inverse standard deviation in the unit cube
@@ -179,7 +179,7 @@ class Real(QuickStudy[xr.Dataset]):
         }
         return dict(list(cells.items())[: self.cells])
 
-    def parts(self, run: Run) -> Mapping[str, Callable[[], xr.Dataset]]:
+    def parts(self, run: Run) -> Parts:
         """Return the function that fits the pushes of each cell."""
         return {label: partial(self._fit, rows) for label, rows in self.tables.items()}
 

@@ -17,7 +17,7 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -26,7 +26,7 @@ import xarray as xr
 
 from rps_jax import InputError
 from rps_jax.questions import Run, call_of, option
-from sweeps.study_base import SpeedStudy, Table, records, text_table
+from sweeps.study_base import Parts, SpeedStudy, Table, records, text_table
 
 TIMING = re.compile(r"compile ([\d.]+) s, run ([\d.]+) s \((\d+) simulated s per s\)")
 _COLUMNS = {
@@ -74,7 +74,7 @@ class Commands(SpeedStudy[xr.Dataset]):
     file: str = "commands"
     """Name of the data file."""
 
-    def parts(self, run: Run) -> Mapping[str, Callable[[], xr.Dataset]]:
+    def parts(self, run: Run) -> Parts:
         """Return the function that times each command with each number of GPUs."""
         suffix = {None: "", 1: ", one GPU"} | {n: f", {n} GPUs" for n in self.gpus if n > 1}
         parts = {

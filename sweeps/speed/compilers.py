@@ -11,7 +11,7 @@ processors.
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -24,7 +24,7 @@ import rps_jax
 from rps_jax import InputError
 from rps_jax.questions import Run, call_of, option
 from sweeps.speed.commands import TIMING, printed
-from sweeps.study_base import SpeedStudy, Table, records, text_table
+from sweeps.study_base import Parts, SpeedStudy, Table, records, text_table
 
 _LIMIT = 3600.0  # [s] of a sweep
 # Comparisons: names of both, and environment and options of the second.
@@ -57,7 +57,7 @@ class Compilers(SpeedStudy[xr.Dataset]):
     file: str = "compilers"
     """Name of the data file."""
 
-    def parts(self, run: Run) -> Mapping[str, Callable[[], xr.Dataset]]:
+    def parts(self, run: Run) -> Parts:
         """Return the function that compares both sweeps with each skin."""
         return {skin: partial(self._compared, skin) for skin in self.skins}
 

@@ -10,7 +10,7 @@ reverse mode through all control steps, and includes its own forward run.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, Literal
@@ -29,7 +29,7 @@ from rps_jax.trials.rollout import Candidates
 from rps_jax.trials.trial import ControlLoop, advance, start_all, unroll
 from rps_jax.trials.worlds import soften_skins
 from rps_jax.worlds import parse_domain
-from sweeps.study_base import SpeedStudy, Table, records, text_table
+from sweeps.study_base import Parts, SpeedStudy, Table, records, text_table
 
 _ROUNDS = 5  # of which the fastest counts
 _COLUMNS = {
@@ -68,7 +68,7 @@ class Derivatives(SpeedStudy[xr.Dataset]):
     file: str = "derivatives"
     """Name of the data file."""
 
-    def parts(self, run: Run) -> Mapping[str, Callable[[], xr.Dataset]]:
+    def parts(self, run: Run) -> Parts:
         """Return the function that measures each family."""
         return {family: partial(self._measured, family) for family in self.families}
 

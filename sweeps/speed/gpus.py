@@ -11,7 +11,7 @@ from __future__ import annotations
 import json
 import tempfile
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property, partial
@@ -26,7 +26,7 @@ from rps_jax.analysis.figures.style import Figure, words
 from rps_jax.questions import Picture, Run, call_of, option
 from rps_jax.worlds import parse_domain
 from sweeps.speed.commands import TIMING, printed
-from sweeps.study_base import SpeedStudy, Table, records, run_process, text_table
+from sweeps.study_base import Parts, SpeedStudy, Table, records, run_process, text_table
 
 _LIMIT = 600.0  # [s] of a sweep
 _MAX_SEGMENTS = 10_000  # of a sweep
@@ -76,7 +76,7 @@ class Gpus(SpeedStudy[xr.Dataset]):
         listed = run_process(["nvidia-smi", "-L"], "gpus are not available")
         return list(product(self.worlds, filter(listed.count("GPU ").__ge__, self.gpus)))
 
-    def parts(self, run: Run) -> Mapping[str, Callable[[], xr.Dataset]]:
+    def parts(self, run: Run) -> Parts:
         """Return the function that times each sweep."""
         return {
             f"{x} worlds, {gpus} GPUs": partial(self._timed, x, gpus) for x, gpus in self.sweeps

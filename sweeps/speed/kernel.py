@@ -12,7 +12,7 @@ import csv
 import shutil
 import sys
 import tempfile
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -24,7 +24,7 @@ from rps_jax import InputError, Setting
 from rps_jax.questions import Run, call_of, option
 from rps_jax.trials.batch import SEGMENT
 from sweeps.programs import FAMILIES
-from sweeps.study_base import SpeedStudy, Table, records, run_process, text_table
+from sweeps.study_base import Parts, SpeedStudy, Table, records, run_process, text_table
 
 _STALLED = "smsp__average_warps_issue_stalled_{}_per_issue_active.ratio"
 # Counters: name of Nsight Compute, variable, description.
@@ -80,7 +80,7 @@ class Kernel(SpeedStudy[xr.Dataset]):
         if shutil.which("ncu") is None:
             raise InputError("ncu is not installed: install NVIDIA's CUDA toolkit, which has it.")
 
-    def parts(self, run: Run) -> Mapping[str, Callable[[], xr.Dataset]]:
+    def parts(self, run: Run) -> Parts:
         """Return the function that profiles each family."""
         return {family: partial(self._profiled, family) for family in self.families}
 
