@@ -17,6 +17,7 @@ import shlex
 import subprocess
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any, ClassVar, NamedTuple, TypeVar
 
@@ -191,8 +192,8 @@ class TrialStudy(Study[T], TrialQuestion[T]):
 class PlanStudy(Question[T]):
     """Base class of questions whose trials are those of several plans."""
 
-    @property
-    def plans(self) -> Mapping[str, Plan]:
+    @cached_property
+    def plans(self) -> dict[str, Plan]:
         """Plans by name."""
         raise NotImplementedError
 

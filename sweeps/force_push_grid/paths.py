@@ -20,7 +20,7 @@ import itertools
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import partial
+from functools import cached_property, partial
 from typing import ClassVar
 
 import numpy as np
@@ -82,7 +82,7 @@ class Paths(PlanStudy[xr.DataTree], QuickStudy[xr.DataTree], MultiLawQuestion[xr
         count = sum(plan.num_trials for plan in self.plans.values())
         return count + len(RADII) * len(_OBJECTS) * grid.cells().angle.size
 
-    @property
+    @cached_property
     def plans(self) -> dict[str, Plan]:
         """Return the plans of laws with a base, by lookahead, path and slider."""
         plans: dict[str, Plan] = {}

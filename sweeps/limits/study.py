@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
+from functools import cached_property, partial
 from typing import ClassVar
 
 import numpy as np
@@ -128,7 +128,7 @@ class Limits(PlanStudy[xr.DataTree], MultiLawQuestion[xr.DataTree]):
         sweep = Sweep(self.chosen, ranges, self.worlds, robot=robot, setting=self.setting)
         return sweep.plan
 
-    @property
+    @cached_property
     def plans(self) -> dict[str, Plan]:
         """Sweep with the ideal base, and the sweeps of each limit: LIMIT, or LIMIT_INDEX."""
         base = parse_domain(self.domain)

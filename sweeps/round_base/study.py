@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import ClassVar
 
 import numpy as np
@@ -41,7 +42,7 @@ class RoundBase(PlanStudy[xr.Dataset], MultiLawQuestion[xr.Dataset]):
     """Number of worlds."""
     setting: Setting = field(default=Setting(seed=11), kw_only=True)
 
-    @property
+    @cached_property
     def plans(self) -> dict[str, Plan]:
         """The sweep of each base."""
         return {
