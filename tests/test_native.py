@@ -7,16 +7,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import same
+from helpers import same, setting_of, slow
+from numpy.testing import assert_allclose, assert_array_equal
 
 from rps_jax import Details, Law, Twist, replay, sweep
 from rps_jax.control import registry
 from rps_jax.engines import native
 from rps_jax.engines.base import ControlPeriod
-from rps_jax.lowering import compounds, nodes, walk
+from rps_jax.lowering import builder, compounds, passes, walk
 from rps_jax.trials import law_check, trial
 from rps_jax.trials.setting import Setting
-from rps_jax.trials.trial import ControlLoop, Rules
+from rps_jax.trials.trial import ControlLoop
 from rps_jax.trials.worlds import drawn_worlds
 from rps_jax.world import draws
 from rps_jax.world.domain import DOMAINS, Range
@@ -35,8 +36,9 @@ def cache(tmp_path):
     jax.config.update("jax_compilation_cache_dir", previous)
 
 
-def batch(shape, skin="capacitive", count=21, law="rps_tuned", engine="fused", domain="wide",
-          **drawn):  # fmt: skip
+def batch(
+    shape, skin="capacitive", count=21, law="rps_tuned", engine="fused", domain="wide", **drawn
+):
     """Return stage, (worlds, params) and loop of random objects at different positions."""
     _, params = registry.resolve_law(law)
     domain = replace(DOMAINS[domain], objects=(f"random_{shape}",), skin=skin, **drawn)
@@ -74,16 +76,17 @@ def build_push(*arguments, **drawn):
 
 def close(actual, desired, warm, rest):
     """Assert that trials agree; accelerations [m/s^2] to the solver's tolerance of 1e-4."""
-    np.testing.assert_allclose(actual.warmstart, desired.warmstart, atol=warm)
+    assert_allclose(actual.warmstart, desired.warmstart, atol=warm)
     pairs = zip(*(jax.tree.leaves(x._replace(warmstart=0)) for x in (actual, desired)), strict=True)
     for a, b in pairs:
-        np.testing.assert_allclose(a, b, rtol=1e-4, atol=rest)
+        assert_allclose(a, b, rtol=1e-4, atol=rest)
 
 
 PAIRS = [
-    pytest.param("box", "capacitive", marks=pytest.mark.slow),
-    ("cylinder", "ideal"), ("prism", "capacitive"),
-]  # fmt: skip
+    slow("box", "capacitive"),
+    ("cylinder", "ideal"),
+    ("prism", "capacitive"),
+]
 
 
 @pytest.mark.parametrize(("shape", "skin"), PAIRS)
@@ -96,7 +99,7 @@ def test_a_control_step_agrees_with_xla(shape, skin, monkeypatch):
 
 
 @pytest.mark.parity
-@pytest.mark.parametrize("shape", ["prism", pytest.param("cylinder", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("shape", ["prism", slow("cylinder")])
 def test_the_bits_of_a_world_depend_on_no_other_world(shape):
     stage, inputs, loop = batch(shape)
     together = advanced(stage, inputs, start_trials(inputs, loop), loop, 300)
@@ -232,7 +235,7 @@ def test_an_operation_agrees_with_jax(name):
     run = native.batched(function, lambda _: pytest.fail("it was not compiled"))
     for a, b in zip(*map(jax.tree.leaves, (jax.jit(run)(x), jax.vmap(function)(x))), strict=True):
         assert a.dtype == b.dtype
-        np.testing.assert_allclose(a, b, rtol=3e-6, atol=1e-6)
+        assert_allclose(a, b, rtol=3e-6, atol=1e-6)
 
 
 @pytest.mark.parametrize("reverse", [False, True])
@@ -247,7 +250,7 @@ def test_a_scan_with_a_large_body_is_a_loop(reverse, monkeypatch):
     x = jnp.arange(5.0)
     run = native.batched(function, lambda _: pytest.fail("it was not compiled"))
     for a, b in zip(*map(jax.tree.leaves, (jax.jit(run)(x), jax.vmap(function)(x))), strict=True):
-        np.testing.assert_allclose(a, b, rtol=1e-6)
+        assert_allclose(a, b, rtol=1e-6)
 
 
 def test_constants_are_moved_as_jax_moves_them():
@@ -257,9 +260,9 @@ def test_constants_are_moved_as_jax_moves_them():
         return [*rows, jax.lax.pad(x, jnp.float32(3), ((1, 0, 1), (-1, 0, 0))), *x]
 
     x = np.arange(12, dtype=np.float32).reshape(3, 4)
-    results = walk.walk(jax.make_jaxpr(function)(x), [x], nodes.SimdNodes())
+    results = walk.walk(jax.make_jaxpr(function)(x), [x], builder.SimdBuilder())
     for a, b in zip(results, function(jnp.asarray(x)), strict=True):
-        np.testing.assert_array_equal(a, b)
+        assert_array_equal(a, b)
 
 
 def test_a_scan_of_worlds_is_that_of_jax_and_so_are_its_derivatives(monkeypatch):
@@ -293,59 +296,52 @@ def test_a_scan_of_worlds_is_that_of_jax_and_so_are_its_derivatives(monkeypatch)
 
     inputs = jnp.linspace(0.1, 1, 4), jnp.linspace(0.2, 0.5, 4), jnp.full((4, 3), 0.3)
     for transform in (
-        lambda f: jax.grad(f, argnums=(0, 1, 2)), lambda f: jax.grad(f, argnums=1),
-        lambda f: jax.jacfwd(f, argnums=2), lambda f: f,
-    ):  # fmt: skip
+        lambda f: jax.grad(f, argnums=(0, 1, 2)),
+        lambda f: jax.grad(f, argnums=1),
+        lambda f: jax.jacfwd(f, argnums=2),
+        lambda f: f,
+    ):
         native_result, expected = (
             jax.jit(transform(lambda *x, scan=scan: score(*x, scan)))(*inputs)
             for scan in (native.scan, by_jax)
         )
         for a, b in zip(*map(jax.tree.leaves, (native_result, expected)), strict=True):
-            np.testing.assert_allclose(a, b, rtol=1e-5)
+            assert_allclose(a, b, rtol=1e-5)
     assert len(compiled) == 7  # forward, and backward or a tangent map
 
 
+SLIPS = dict.fromkeys(("robot_slip", "robot_slip_sideways", "robot_slip_yaw"), Range(0, 0.5))
+
+
 @pytest.mark.parametrize(
-    ("law", "skin"),
+    ("law", "options"),
     [
-        ("rps", "ideal"),
-        *((x, "capacitive") for x in ("rps", "aps", "rps_plus", "pursuit", "dipole")),
+        ("rps", {"skin": "ideal"}),
+        *((x, {}) for x in ("rps", "aps", "rps_plus", "pursuit", "dipole")),
+        slow("rps", {"domain": "real", **SLIPS}),
     ],
 )
-def test_the_loop_of_an_equation_is_compiled_as_a_whole(law, skin, monkeypatch):
+def test_the_loop_of_an_equation_is_compiled_as_a_whole(law, options, monkeypatch):
     monkeypatch.setattr(native, "load", lambda name: True)  # no compiler runs
-    stage, inputs, loop = batch("box", skin, 2, law)
+    stage, inputs, loop = batch("box", count=2, law=law, **options)
     primitives = str(jax.make_jaxpr(advance(stage, loop, 3))(*inputs, start_trials(inputs, loop)))
     assert "rps_native" in primitives
     assert "while" not in primitives
 
 
-@pytest.mark.slow
-def test_the_loop_of_a_base_with_slip_is_compiled_as_a_whole(monkeypatch):
-    monkeypatch.setattr(native, "load", lambda name: True)
-    slips = dict.fromkeys(("robot_slip", "robot_slip_sideways", "robot_slip_yaw"), Range(0, 0.5))
-    stage, inputs, loop = batch("box", count=2, law="rps", domain="real", **slips)
-    primitives = str(jax.make_jaxpr(advance(stage, loop, 3))(*inputs, start_trials(inputs, loop)))
-    assert "rps_native" in primitives
-    assert "while" not in primitives
-
-
+UNSUPPORTED = (
+    "operation `lgamma` cannot be translated; use arithmetic, comparisons, jnp.where and "
+    "elementary functions. XLA compiles this law, which is some ten times slower."
+)
 FALLBACKS = {
     "large products, as of a learned law": (lambda x: jnp.ones((99, 3)) * x @ jnp.ones(3), []),
-    "an unsupported operation": (lambda x: jax.lax.lgamma(x + 1) * 3 * x, [
-        "operation `lgamma` cannot be translated; use arithmetic, comparisons, jnp.where and "
-        "elementary functions. XLA compiles this law, which is some ten times slower."
-    ]),
-    "code that cannot be printed": (None, ["cannot be printed, so XLA compiles: KeyError"]),
-}  # fmt: skip
+    "an unsupported operation": (lambda x: jax.lax.lgamma(x + 1) * 3 * x, [UNSUPPORTED]),
+}
 
 
 @pytest.mark.parametrize("name", FALLBACKS)
-def test_xla_compiles_other_functions_and_the_reason_is_named_once(name, monkeypatch, recwarn):
+def test_xla_compiles_other_functions_and_the_reason_is_named_once(name, recwarn):
     function, reasons = FALLBACKS[name]
-    if function is None:
-        function = jnp.sin
-        monkeypatch.setattr(nodes, "walk", lambda *_: {}["num_consts"])
     run = native.batched(function, lambda x: 3 * x)
     for _ in range(2):
         assert np.asarray(run(jnp.arange(2.0))).tolist() == [0.0, 3.0]
@@ -353,9 +349,17 @@ def test_xla_compiles_other_functions_and_the_reason_is_named_once(name, monkeyp
         assert reason in str(warning.message)
 
 
-@pytest.mark.parametrize(
-    "engine", ["fused", "quasistatic", pytest.param("mjx", marks=pytest.mark.slow)]
-)
+@pytest.mark.parametrize("owner", [builder, passes])
+def test_an_error_of_the_compiler_itself_is_raised(owner, monkeypatch):
+    """A fault of a builder or a pass must not make a run ten times slower in silence."""
+    name = "walk" if owner is builder else "_next_group"
+    monkeypatch.setattr(owner, name, lambda *_: {}["num_consts"])
+    run = native.batched(jnp.sin, lambda x: pytest.fail("XLA compiled it"))
+    with pytest.raises(KeyError, match="num_consts"):
+        run(jnp.arange(2.0))
+
+
+@pytest.mark.parametrize("engine", ["fused", "quasistatic", slow("mjx")])
 def test_only_the_fused_engine_calls_compiled_functions(engine, monkeypatch):
     monkeypatch.setattr(native, "load", lambda name: True)
     stage, inputs, loop = batch("box", "ideal", 2, "rps", engine)
@@ -404,7 +408,7 @@ def test_a_custom_law_is_compared_with_xla_before_a_run_once(mine, cache, monkey
 
 @pytest.mark.parity
 def test_a_sweep_of_a_custom_law_is_a_push_in_xla(mine, tmp_path, monkeypatch):
-    setting = Setting("fused", rules=Rules(horizon=8.0))
+    setting = setting_of(8.0, "fused")
     swept = sweep("mine", "wide,objects=box,gap=0.01", worlds=2, setting=setting, out=tmp_path)
     monkeypatch.setenv("RPS_COMPILER", "none")
     pushed = replay(tmp_path, 1)

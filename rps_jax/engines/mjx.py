@@ -23,7 +23,6 @@ from rps_jax.engines.mjx_colliders import (
     collision,
     constraint,
     corners_of,
-    forward,
     geoms,
     mjx,
     smooth,
@@ -58,6 +57,7 @@ class MJXStage(NamedTuple):
 
     model: mjx.Model
     data: mjx.Data  # a template for the state of each world
+    native = False
     engine = "mjx"
 
     def drive(self, fields: dict[str, jax.Array], motion: Motion, period: ControlPeriod) -> Driven:
@@ -139,8 +139,7 @@ def step(model: mjx.Model, data: mjx.Data, *extra: Extra) -> mjx.Data:
     force = data.qfrc_applied - data.qfrc_bias
     free = smooth.solve_m(model, data, force)
     data = mjx_gradients.solve(model, data.replace(qfrc_smooth=force, qacc_smooth=free))
-    after = forward._advance(model, data, data.act_dot, data.qacc)
-    return mjx_gradients.with_turns(model, data, after)
+    return mjx_gradients.forward._advance(model, data, data.act_dot, data.qacc)
 
 
 class MJX(Engine):
