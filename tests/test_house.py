@@ -5,14 +5,16 @@ import os
 import pkgutil
 import re
 import sys
+import tomllib
 from importlib import import_module
 
 import pytest
-from helpers import ROOT, addresses, imported, output_of
+from helpers import ROOT, addresses, inner_names, output_of
 
 import rps_jax
 
 PACKAGE = ROOT / "rps_jax"
+MAX_INNER = 177  # names; it only goes down
 
 
 def test_each_private_interface_has_a_test_that_notices_a_change():
@@ -53,17 +55,47 @@ def test_ci_runs_the_test_command_of_the_readme_without_variables():
     assert re.findall(r"^ *export (.*)", of_ci, re.M) == exports  # of other processes
 
 
-@pytest.mark.parametrize(
-    "path", sorted((ROOT / "notebooks").glob("examples/*.py")), ids=lambda path: path.stem
-)
-def test_examples_import_only_public_names(path):
-    assert set(imported(path)) <= {"rps_jax", *dict(addresses())}
+def test_notebooks_and_examples_use_only_public_names():
+    scripts = sorted((ROOT / "notebooks").rglob("*.py"))
+    assert len(scripts) > 20
+    assert {str(path): names for path in scripts if (names := inner_names(path))} == {}
 
 
-def test_there_are_few_public_names_and_all_are_in_the_table():
-    rows = re.findall(r"^\| `(\w+)` \|", (PACKAGE / "README.md").read_text(), re.M)
+def exceptions():
+    """Inner names that a folder of studies may use, by folder."""
+    file = tomllib.loads((ROOT / "sweeps" / "inner_names.toml").read_text())
+    reasons = {folder: entry.pop("reason") for folder, entry in file.items()}
+    assert all(len(reason.split()) > 4 for reason in reasons.values())
+    return {
+        folder: {f"rps_jax.{module}.{name}" for module, names in entry.items() for name in names}
+        for folder, entry in file.items()
+    }
+
+
+def test_studies_use_public_names_and_listed_exceptions():
+    """The list is exact: a name that a study no longer uses is removed from it."""
+    listed, used = exceptions(), {}
+    for path in (ROOT / "sweeps").rglob("*.py"):
+        folder = f"sweeps/{path.relative_to(ROOT / 'sweeps').parts[0]}"
+        shared = {x for x in inner_names(path) if x in listed["sweeps"]}
+        used["sweeps"] = used.get("sweeps", set()) | shared
+        used[folder] = used.get(folder, set()) | (inner_names(path) - shared)
+    for path in (PACKAGE / "studies").glob("*.py"):
+        names = {x for x in inner_names(path) if not x.startswith("rps_jax.studies.")}
+        used["rps_jax/studies"] = used.get("rps_jax/studies", set()) | names
+    assert {folder: names for folder, names in used.items() if names} == listed
+    assert len(set().union(*(listed[x] for x in listed if x != "rps_jax/studies"))) <= MAX_INNER
+
+
+def test_there_are_few_public_names_and_all_are_in_the_tables():
+    rows = re.findall(r"^\| `(?!rps_jax)(\w+)` \|", (PACKAGE / "README.md").read_text(), re.M)
     assert sorted(rows) == rps_jax.__all__
-    assert len(rows) <= 90
+    assert len(rows) + len(set(addresses())) <= 90
+    for name in ("questions", "laws", "worlds", "physics"):
+        module = import_module(f"rps_jax.{name}")
+        listed = {entry for home, entry in addresses() if home == module.__name__}
+        gathered = re.findall(r" as (\w+)$|^(\w+) = ", inspect.getsource(module), re.M)
+        assert listed == {first or second for first, second in gathered}
     entries = [getattr(rps_jax, name) for name in rps_jax.__all__]
     assert all(entry.__doc__ or not callable(entry) for entry in entries)
 

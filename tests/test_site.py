@@ -4,6 +4,7 @@ import ast
 import functools
 import http.server
 import os
+import pkgutil
 import re
 import runpy
 import sys
@@ -13,7 +14,7 @@ from types import SimpleNamespace
 
 import chromium
 import pytest
-from helpers import ROOT, output_of
+from helpers import ROOT, addresses, output_of
 
 import rps_jax
 
@@ -80,6 +81,22 @@ def test_the_index_has_a_link_and_a_sentence_for_each_public_name():
     for name, page, sentence in rows:
         assert page in pages
         assert re.fullmatch(r"[A-Z].{15,}\.", sentence), name
+
+
+def test_the_index_has_one_line_for_each_module():
+    index = HOOKS["reference"]()["README.md"].partition("## Modules")[2]
+    rows = dict(re.findall(r"^\| \[`([\w.]+)`\]\(.*?\) \| ([A-Z`].*[.?]) \|$", index, re.MULTILINE))
+    walked = pkgutil.walk_packages(rps_jax.__path__, "rps_jax.")
+    modules = {x.name for x in walked if not x.name.endswith("__main__")}
+    assert set(rows) == modules
+    assert len(re.findall(r"^\| \[", index, re.MULTILINE)) == len(modules)
+
+
+@pytest.mark.parametrize("name", ["questions", "laws", "worlds", "physics"])
+def test_a_module_of_public_names_has_a_page(name):
+    listed = {entry for module, entry in addresses() if module == f"rps_jax.{name}"}
+    page = HOOKS["reference"]()[f"{name}.md"]
+    assert set(re.findall(rf"^\| \[`rps_jax\.{name}\.(\w+)`\]", page, re.MULTILINE)) == listed
 
 
 def test_each_way_to_add_something_has_a_heading():

@@ -93,7 +93,12 @@ def replace_leaves(tree: T, changes: Mapping[str, Any]) -> T:
 
 
 def law_of(params: LawParams | type) -> Law:
-    """Return the law of parameters, or of their class; InputError if there is none."""
+    """Return the law of parameters, or of their class; InputError if there is none.
+
+    Examples:
+      >>> law_of(resolve_law("rps_plus")[1]).senses
+      'touch'
+    """
     kind = params if isinstance(params, type) else type(params)
     if kind not in _LAWS_BY_CLASS:
         known = ", ".join(known.__name__ for known in _LAWS_BY_CLASS)
@@ -285,6 +290,11 @@ def resolve_law(law: LawLike, index: int = 0) -> tuple[str, LawParams]:
 
     The label of parameters is the name of the law; with a number, `index` + 1, unless they are one
     of its presets.
+
+    Examples:
+      >>> label, params = resolve_law("rps,K_h=0.5")
+      >>> label, params.K_h
+      ('rps,K_h=0.5', 0.5)
     """
     if isinstance(law, str):
         return parse_law(law)

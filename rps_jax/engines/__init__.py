@@ -24,7 +24,12 @@ def names() -> tuple[str, ...]:
 
 
 def get(name: str) -> Engine:
-    """Return the engine of a name, or raise InputError."""
+    """Return the engine of a name, or raise InputError.
+
+    Examples:
+      >>> get("quasistatic").name
+      'quasistatic'
+    """
     errors.check_name("engine", name, names())
     if name in _REGISTERED:
         return _REGISTERED[name]

@@ -476,6 +476,10 @@ def parse_domain(
     Changes may follow a name or a file, as `wide,mass=3:10,objects=random_box`. A `robot` replaces
     the domain's, except for its drawn limits. A `task` that has no single target replaces the
     domain's targets.
+
+    Examples:
+      >>> parse_domain("wide,mass=3:10").mass
+      Range(low=3.0, high=10.0, log=True)
     """
     if task is not None:
         base, parsed = parse_domain(domain, robot), parse_task(task)

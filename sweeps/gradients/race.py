@@ -19,7 +19,7 @@ import os
 import shlex
 import subprocess
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from functools import partial
@@ -30,15 +30,12 @@ import numpy as np
 import pandas as pd
 import xarray as xr
 
-from rps_jax import errors
+from rps_jax import InputError, RPSParams, Setting, errors, evaluate
 from rps_jax.analysis import statistics
 from rps_jax.control import registry
-from rps_jax.control.laws.rps import RPSParams
-from rps_jax.record.options import option
-from rps_jax.runs.evaluate import evaluate
-from rps_jax.runs.question import Run, SimulationQuestion, call_of
-from rps_jax.trials.setting import Setting
-from sweeps.study_base import Rows, Study, Table, part_name
+from rps_jax.questions import Run, call_of, option
+from rps_jax.runs.question import SimulationQuestion
+from sweeps.study_base import Parts, Rows, Study, Table, part_name
 
 TABLES = Path(__file__).with_name("tables.py")
 # Laws and tuned parameters by the number of these.
@@ -137,7 +134,7 @@ class Race(Study[xr.Dataset], SimulationQuestion[xr.Dataset]):
         run_commands(commands, self.minutes, self.lanes, self.gpus)
         return super().answer(run)
 
-    def parts(self, run: Run) -> Mapping[Any, Callable[[], xr.Dataset]]:
+    def parts(self, run: Run) -> Parts:
         """Return the test of each tuning, by its label."""
         folder = run.folder or Path(str(self.out))
         return {
@@ -149,7 +146,7 @@ class Race(Study[xr.Dataset], SimulationQuestion[xr.Dataset]):
         """Return the success of the best law of a tuning within each budget."""
         if not (folder / "curve.csv").exists():
             reason = f"{folder.with_suffix('.log')} tells why; or raise minutes"
-            raise errors.InputError(f"{folder} has no generation: {reason}.")
+            raise InputError(f"{folder} has no generation: {reason}.")
         curve = pd.read_csv(folder / "curve.csv")
         budgets = [(name, amount) for name in BUDGETS for amount in getattr(self, name)]
         chosen = [best_within(curve, *budget) for budget in budgets]
