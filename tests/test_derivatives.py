@@ -17,6 +17,8 @@ from numpy.testing import assert_allclose
 
 import rps_jax
 from rps_jax import engines
+from rps_jax.control import registry
+from rps_jax.control.base import Bound
 from rps_jax.control.laws.rps import RPSParams
 from rps_jax.control.registry import LAWS, law_of
 from rps_jax.engines import quasistatic
@@ -25,6 +27,7 @@ from rps_jax.trials import trajectory, trial
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.trajectory import control_loop
 from rps_jax.tuning import derivatives
+from rps_jax.tuning.space import Space
 from rps_jax.world import draws
 from rps_jax.world.domain import PERFECT, QUANTITIES, VELOCITY_ERRORS, Range, parse_domain
 
@@ -161,6 +164,7 @@ def test_a_mass_without_influence_is_told(results):
             value,
             np.ones((1, 2, 1)),
             np.zeros((2, 1)),
+            np.ones((1, 1)),
         )
     )
     assert "mass has no influence" in notes("mass", "wide")
@@ -180,7 +184,7 @@ def test_a_kink_of_the_world_has_no_derivative_and_is_told():
     assert ["world.fields.height" in slope for slope in slopes] == [False, True]
     gradient = np.where(bends > 0.01, np.nan, 1.0)[None]
     notes = derivatives._notes(
-        square, "fused", coordinates, np.ones(2, bool), bends, gradient, bends
+        square, "fused", coordinates, np.ones(2, bool), bends, gradient, bends, np.ones((1, 2))
     )
     notes = list(notes)
     assert "No world of 3 has a finite derivative, so the mean is NaN: aspect." in notes
@@ -344,6 +348,57 @@ def test_a_law_with_arrays_has_a_number_for_each_entry():
     assert labels == ["K_h[0,0]", "K_h[1,0]", "L"]
     units = [x.unit for x in derivatives.coordinates_of(("K_h", "L", "K_v"), RPSParams(), TOUCHING)]
     assert units == ["1", "m", "1/s"]
+
+
+@jax.tree_util.register_pytree_node_class
+class Module:
+    """A module as those of Equinox: one of its leaves is a function."""
+
+    d_success = 0.05
+
+    def __init__(self, weight, activation=jnp.tanh):
+        self.weight, self.activation = weight, activation
+
+    def __call__(self, x):
+        return self.activation(self.weight * x)
+
+    def tree_flatten(self):
+        return (self.weight, self.activation), None
+
+    @classmethod
+    def tree_unflatten(cls, _, leaves):
+        return cls(*leaves)
+
+
+@pytest.fixture
+def module():
+    """A law that drives ahead at 1 cm/s x activation(weight); its leaves have no names."""
+
+    def step(params, state, obs):
+        return state, rps_jax.Twist(0.01 * params(1.0), 0.0, 0.0), rps_jax.Details.from_obs(obs)
+
+    law = rps_jax.Law(lambda params: (), step, bounds={"0": Bound(0.1, 2.0)})
+    rps_jax.register_law("module", law, Module(0.5))
+    yield Module(0.5)
+    registry.LAWS.pop("module")
+    del registry._LAWS_BY_CLASS[Module]
+
+
+def test_functions_in_the_parameters_of_a_law_are_static(module):
+    speed = lambda trajectory: trajectory.twist.v_x[-1]  # noqa: E731
+    expected, domain = 0.01 * (1 - np.tanh(0.5) ** 2), "wide,objects=random_cylinder"
+    options = {"domain": domain, "worlds": 2, "setting": QUASISTATIC, "horizon": 0.1}
+    results = rps_jax.value_and_grad(speed, module, wrt="0", smooth=False, **options)
+    np.testing.assert_allclose(results.gradient, expected, rtol=1e-5)
+    batch = rps_jax.draw_worlds(domain, 1, setting=QUASISTATIC)
+
+    def value(weight, activation):
+        inputs = row(batch.worlds, 0), Module(weight, activation), batch.stage, QUASISTATIC
+        return speed(rps_jax.rollout(*inputs, horizon=0.1))
+
+    np.testing.assert_allclose(jax.grad(value)(0.5, jnp.tanh), expected, rtol=1e-5)
+    np.testing.assert_allclose(value(0.5, jnp.square), 0.01 * 0.25, rtol=1e-5)
+    assert Space(("0",), registry.LAWS["module"]).params(np.zeros(1)).weight == pytest.approx(1.05)
 
 
 # --- scores and checks -----------------------------------------------------------------------

@@ -2,23 +2,30 @@
 
 import json
 from types import SimpleNamespace
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optax
 import pytest
 from helpers import read_curve, refusal, refusals, rps
 from numpy.testing import assert_array_equal
 
-from rps_jax.control.laws.rps import RPSParams
+from rps_jax.control import registry
+from rps_jax.control.base import Bound, Law
+from rps_jax.control.laws import rps as rps_law
+from rps_jax.control.laws.rps import RPSParams, RPSState
+from rps_jax.control.observation import Twist
 from rps_jax.errors import InputError
 from rps_jax.runs.evaluate import CandidateScores, evaluate
 from rps_jax.trials.score import Objective
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import Rules
 from rps_jax.tuning import derivatives, descent, optimisers
-from rps_jax.tuning.descent import FEATURES, TuneGrad
+from rps_jax.tuning.descent import TuneGrad
 from rps_jax.tuning.evolution import TuneES
+from rps_jax.tuning.gradients import Estimate
 from sweeps.gradients import windows
 from sweeps.gradients.windows import Windows
 
@@ -88,7 +95,8 @@ def test_steps_go_downhill_and_shrink_to_zero():
     start = next(search)["vectors"]
     length = 0.5 * np.sqrt(2)  # of a step, and half of it in the middle of the cosine
     for gradient, change in (([30, 40], [0.6, 0.8]), ([0, 10], [4.8, 8.4])):
-        results = {"vectors": start, "base": np.array(0.5), "gradients": np.array([gradient])}
+        results = {"vectors": start, "base": np.array(0.5), "validation": np.array(0.5)}
+        results["gradients"] = np.array([gradient])
         moved = search.send(results)["vectors"]
         change = -length * np.array([change]) / np.linalg.norm(change)
         np.testing.assert_allclose(moved - start, change, rtol=1e-5)
@@ -115,7 +123,8 @@ def test_a_descent_names_slopes_without_a_sample_and_steps_without_them():
     assert np.isnan(slopes.gradient).all()
     search = question.search()
     start = next(search)["vectors"]
-    results = {"vectors": start, "base": np.array(1.0), "gradients": np.array([[np.nan, 3.0]])}
+    results = {"vectors": start, "base": np.array(1.0), "validation": np.array(1.0)}
+    results["gradients"] = np.array([[np.nan, 3.0]])
     moved = search.send(results)["vectors"] - start
     assert moved[0, 0] == 0
     assert moved[0, 1] < 0
@@ -150,61 +159,112 @@ def test_windows_start_at_the_states_of_their_trials(monkeypatch):
 
 # --- derivatives of windows ----------------------------------------------------------------
 
-BRIEF = Setting("quasistatic", rules=Rules(60.0, 30.0))
-DRUMS = {"objects": ("random_cylinder",), "setting": BRIEF}
-SLOW = {"law": "rps,K_v=0.03", "tuned": ("K_v", "K_h", "L"), **DRUMS}
-BATCHES = {"worlds": 16, "validation": 16, "windows": 32, "trials": 16, "checks": 8, "slots": 16}
+
+class Throttled(NamedTuple):
+    """Parameters of RPS at a share of its speed."""
+
+    rps: RPSParams
+    share: Any = 0.3
+
+    @property
+    def d_success(self):
+        return self.rps.d_success
 
 
-def test_20_steps_of_adam_lower_the_loss_beyond_its_interval_in_fresh_worlds():
-    """All steps follow derivatives; a law that turns too slowly is the start."""
-    options = {"optimiser": "adam", "steps": 20, "window_steps": 20, "refresh": 10}
-    results = TuneGrad(**SLOW, **BATCHES, **options)()
+@pytest.fixture
+def throttled():
+    def step(params, state, obs):
+        state, twist, details = rps_law.step_with_details(params.rps, state, obs)
+        return state, Twist(*(params.share * x for x in twist)), details
+
+    init = lambda params: RPSState.init(params.rps)  # noqa: E731
+    law = Law(init, step, bounds={"share": Bound(0.05, 1.0)})
+    params = Throttled(RPSParams.paper())
+    registry.register_law("throttled", law, params)
+    yield params
+    registry.LAWS.pop("throttled")
+    del registry._LAWS_BY_CLASS[Throttled]
+
+
+@pytest.mark.slow
+def test_20_steps_of_adam_lower_the_loss_beyond_its_interval_in_fresh_worlds(throttled):
+    """The law starts at 30 % of the speed of RPS, and all steps follow derivatives."""
+    domain = "wide,distance=0.7:0.8,bearing=-0.4:0.4,objects=random_cylinder"
+    setting = Setting("quasistatic", rules=Rules(150.0, 150.0))
+    options = {"worlds": 8, "validation": 8, "windows": 16, "trials": 8, "slots": 16}
+    options |= {"optimiser": "adam", "steps": 20, "window_steps": 20, "refresh": 10, "checks": 0}
+    options |= {"domain": domain, "objects": ("random_cylinder",), "setting": setting}
+    results = TuneGrad("throttled", **options)()
     assert results.windows.sum() == 20
-    changes = dict(zip(results.parameter.values, results.tuned.values.tolist(), strict=True))
-    tuned = RPSParams.paper()._replace(**changes)
-    laws = [RPSParams.paper()._replace(K_v=0.03), tuned]
-    domain = "wide,objects=random_cylinder"
-    scores = evaluate(laws, domain, 128, split="test", setting=BRIEF).score.values
+    laws = [throttled, throttled._replace(share=float(results.tuned[0]))]
+    scores = evaluate(laws, domain, 32, split="test", setting=setting, slots=16).score.values
     gain = scores[0] - scores[1]
-    assert gain.mean() > 1.96 * gain.std(ddof=1) / np.sqrt(gain.size)
+    assert gain.mean() > 4 * gain.std(ddof=1) / np.sqrt(gain.size)
 
 
-def fake_results(question, cosine, validations):
+SMALL = {"tuned": ("L", "K_h"), "steps": 9}
+
+
+def fake_results(question, validations):
     """Return the vectors and kinds of the steps of a search with fixed results."""
     search, kinds, vectors = question.search(), [], []
     proposal = next(search)
     for value in validations:
         kinds.append(int(proposal["windows"]))
         vectors.append(proposal["vectors"][0].copy())
-        size = proposal["moments"].shape[0]
         results = proposal | {"base": np.array(1.0), "validation": np.array(value)}
-        results |= {"gradients": np.ones((1, 2)), "slopes": -np.ones((1, 2))}
-        results |= {"cosine": np.array(cosine), "new_moments": np.eye(size)}
-        proposal = search.send(results)
+        proposal = search.send(results | {"gradients": np.ones((1, 2))})
     return kinds, vectors, proposal
 
 
+@pytest.mark.parametrize("optimiser", ["adam", "fixed_length", optax.sgd(0.3)])
+def test_five_steps_lower_a_loss(optimiser):
+    """The loss is the squared distance from a vector, and windows have its derivatives."""
+    search = TuneGrad("rps", **SMALL, optimiser=optimiser, window_steps=9).search()
+    proposal, losses = next(search), []
+    target = proposal["vectors"][0] + np.array([1.0, -2.0])
+    for _ in range(5):
+        away = proposal["vectors"] - target
+        losses.append(0.5 * np.sum(away**2))
+        results = {"validation": np.array(losses[-1]), "gradients": away}
+        proposal = search.send(proposal | results)
+    assert (np.diff(losses) < 0).all()
+
+
 def test_steps_by_derivatives_end_and_return_to_the_best_vector():
-    question = TuneGrad("rps", tuned=("L", "K_h"), steps=9, window_steps=4, refresh=3)
+    question = TuneGrad("rps", **SMALL, window_steps=4, refresh=3)
     nan = np.nan
-    kinds, vectors, following = fake_results(question, 0.5, [1.0, nan, nan, 0.5, 0.8, 0.9])
+    kinds, vectors, following = fake_results(question, [1.0, nan, nan, 0.5, 0.8, 0.9])
     assert kinds == [1, 1, 1, 1, 0, 0]
-    np.testing.assert_array_equal(vectors[5], vectors[3])  # 0.8 is worse than 0.5
+    np.testing.assert_array_equal(vectors[4], vectors[3])
     assert (following["vectors"][0] < vectors[3]).all()
 
 
-def test_derivatives_that_oppose_the_slopes_of_whole_trials_are_dropped():
-    question = TuneGrad("rps", tuned=("L", "K_h"), steps=9)
-    kinds, vectors, _ = fake_results(question, -0.1, [1.0, 0.9])
-    assert kinds == [1, 0]
-    assert (vectors[1] > vectors[0]).all()  # along the slopes, and not the derivatives
+@pytest.mark.parametrize(("slope", "checks", "windows"), [(1.0, 4, 1), (-1.0, 4, 0), (-1.0, 0, 1)])
+def test_derivatives_that_oppose_the_slopes_of_whole_trials_are_dropped(
+    monkeypatch, slope, checks, windows
+):
+    """With checks=0 they are used without a comparison."""
+    question = TuneGrad("rps", **SMALL, checks=checks)
+    ones, none = np.ones(2), np.zeros(2)
+    size = len(next(question.search())["moments"])
+    states = SimpleNamespace(moments=np.eye(size))
+    estimate = lambda x: Estimate(jnp.asarray(x * ones), jnp.ones(2), jnp.ones(2))  # noqa: E731
+    monkeypatch.setattr(TuneGrad, "_collect", lambda *_: [states])
+    monkeypatch.setattr(TuneGrad, "_derivatives", lambda *_: estimate(1.0))
+    slopes = slope if checks else np.nan
+    monkeypatch.setattr(TuneGrad, "try_step", lambda *_: ({"validation": 0.5}, estimate(slopes)))
+    results = question.judge(next(question.search()), 0, lambda *_: none)
+    assert results["windows"] == windows
+    expected = ones if windows else slope * ones
+    np.testing.assert_array_equal(results["gradients"][0], expected)
+    np.testing.assert_allclose(results["cosine"], np.sign(slopes), rtol=1e-6)
 
 
 def test_the_value_function_has_the_coefficients_of_its_data():
     random = np.random.default_rng(0)
-    x = random.normal(size=(500, len(FEATURES)))
-    truth = np.concatenate([[2.0], random.normal(size=len(FEATURES))])
+    x = random.normal(size=(500, 16))
+    truth = np.concatenate([[2.0], random.normal(size=16)])
     data = np.column_stack([np.ones(500), x, truth[0] + x @ truth[1:]])
     np.testing.assert_allclose(descent.fit(data.T @ data, 0.0), truth, atol=1e-9)
     shrunk = descent.fit(data.T @ data, 1e6)
@@ -214,11 +274,13 @@ def test_the_value_function_has_the_coefficients_of_its_data():
 
 def test_optimisers_are_those_of_optax_and_one_that_needs_more_is_refused():
     assert {"adam", "adamw", "sgd", "lion", "fixed_length"} <= set(optimisers.optimisers())
-    for name in optimisers.schedules(0.1, 20):
+    for name in optimisers.SCHEDULES:
         rule = optimisers.optimiser("sgd", name, 0.1, 20)
         change, _ = rule.update(jnp.ones(3), rule.init(jnp.zeros(3)), jnp.zeros(3))
         assert (change <= 0).all()
-    with pytest.raises(InputError, match=r"optimiser = lbfgs .* needs more than gradients"):
+    with pytest.raises(
+        InputError, match=r"optimiser = lbfgs .* needs more than gradients and a learning rate"
+    ):
         optimisers.optimiser("lbfgs", "constant", 0.1, 20)
 
 
@@ -246,6 +308,15 @@ def test_the_former_flags_say_where_random_steps_are(capsys):
 RUN = "--engine quasistatic --objects random_cylinder --worlds 2 --validation 2 "
 RUN += "--horizon 5 --tuned L K_h v_lost --slots 8"
 GRAD = "tune grad --optimiser sgd --windows 4 --trials 2 --checks 2 --window 1 --refresh 2 --steps"
+
+
+@pytest.mark.slow
+def test_the_command_line_tunes_by_derivatives_of_mjx(tmp_path, capsys):
+    words = "--engine mjx --objects random_cylinder --worlds 2 --validation 2 --horizon 1 --out"
+    assert rps(f"{GRAD} 2 --tuned L K_h --slots 4 --window 0.2 {words}", tmp_path) == 0
+    curve = read_curve(tmp_path)
+    assert np.isfinite(curve.gradient[:2]).all()
+    assert (curve["params.L"][1:].to_numpy() != curve["params.L"][0]).any()
 
 
 @pytest.mark.slow

@@ -1,5 +1,6 @@
 """Types of a control law: its two functions, its parameters, and the bounds for tuning them."""
 
+import functools
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import (
@@ -66,6 +67,31 @@ def entries(name: str, leaf: Leaf) -> list[tuple[str, tuple[int, ...]]]:
     return [(f"{name}[{','.join(map(str, at))}]" if at else name, at) for at in indices]
 
 
+@jax.tree_util.register_static
+@dataclass(frozen=True)
+class StaticLeaf:
+    """Function in parameters, as an activation of a module; it is part of the program."""
+
+    value: Any
+
+
+def freeze_functions(tree: Any) -> Any:
+    """Replace functions in a pytree by static leaves, so that all of its leaves are numbers."""
+    return jax.tree.map(lambda x: StaticLeaf(x) if callable(x) else x, tree)
+
+
+def thawing(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Return a function that restores the functions in its first argument."""
+    is_static = lambda x: isinstance(x, StaticLeaf)  # noqa: E731
+
+    @functools.wraps(function)
+    def call(tree: Any, *arguments: Any, **options: Any) -> Any:
+        tree = jax.tree.map(lambda x: x.value if is_static(x) else x, tree, is_leaf=is_static)
+        return function(tree, *arguments, **options)
+
+    return call
+
+
 def unit_of_leaf(params: object, path: str) -> str:
     """Return the declared unit of a parameter; empty if it has none."""
     declaration = spec_at(params, path)
@@ -89,7 +115,8 @@ class Law(Generic[Params, State, Obs]):
     """Control law: two pure functions of one world.
 
     A law is static: each law is compiled to its own program. Its parameters are a pytree of
-    numbers, which may be nested, and their class selects the law. The field or property
+    numbers, which may be nested, and their class selects the law. Functions in them, as in modules
+    of Equinox, are static. The field or property
     `d_success` [m] of the parameters is the distance to the target at which a trial succeeds.
     """
 

@@ -27,7 +27,9 @@ from rps_jax.control.base import (
     Senses,
     Smoothing,
     bounds_of,
+    freeze_functions,
     named_leaves,
+    thawing,
 )
 from rps_jax.control.learned import policy
 from rps_jax.errors import InputError
@@ -173,10 +175,15 @@ def register_law(name: str, law: Law, params: LawParams) -> None:
         raise errors.not_allowed("name of a law", name, rule)
     kind, leaves = type(params), jax.tree.leaves(params)
     is_custom = kind not in (dict, list, tuple) and leaves != [params]
-    is_numeric = all(np.issubdtype(np.asarray(leaf).dtype, np.number) for leaf in leaves)
+    numbers = [leaf for leaf in leaves if not callable(leaf)]
+    is_numeric = all(np.issubdtype(np.asarray(leaf).dtype, np.number) for leaf in numbers)
     if not (is_custom and is_numeric and isinstance(params, LawParams)):
         rule = "pass a pytree of numbers of a custom class with a field or property d_success [m]"
         raise errors.not_allowed(f"params of law '{name}'", params, rule)
+    if len(numbers) < len(leaves):
+        names = [x for x in ("init", "step", "observe_sent") if getattr(law, x)]
+        law = replace(law, **{name: thawing(getattr(law, name)) for name in names})
+    params = freeze_functions(params)
     errors.check_finite(f"d_success of law '{name}'", params.d_success, above=0, unit="m")
     law.check(params)
     law = law if law.bounds else replace(law, bounds=bounds_of(kind))
@@ -302,6 +309,7 @@ def resolve_law(law: LawLike, index: int = 0) -> tuple[str, LawParams]:
         rule = f"give parameters, as {law.__name__}()"
         raise errors.not_allowed("law", f"the class {law.__name__}", rule)
     law_of(law)
+    law = freeze_functions(law)
     presets = {name: params for name, params in LAWS.items() if type(params) is type(law)}
     for name, params in presets.items():
         if leaves_to_json(params) == leaves_to_json(law):

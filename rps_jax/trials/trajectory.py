@@ -17,7 +17,7 @@ import numpy as np
 
 from rps_jax import errors
 from rps_jax.control import registry
-from rps_jax.control.base import LawParams, named_leaves
+from rps_jax.control.base import LawParams, freeze_functions, named_leaves
 from rps_jax.engines import device, native
 from rps_jax.engines.base import Stage
 from rps_jax.record.options import check_arguments
@@ -133,6 +133,7 @@ def rollout(
     if np.ndim(world.p_world_target) != 1:
         rule = "give one world, and map over several by jax.vmap"
         raise errors.not_allowed("world", f"of shape {np.shape(world.p_world_target)}", rule)
+    params = freeze_functions(params)
     _check_scalars(params)
     engine.check_stage(stage)
     world = soften_skins(world) if smooth else world

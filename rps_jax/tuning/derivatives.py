@@ -12,6 +12,7 @@ import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
+from types import SimpleNamespace
 from typing import Any, NamedTuple
 
 import jax
@@ -61,6 +62,10 @@ _SMALLEST = 0.01  # in its unit, below which the step is not relative
 _NOISE = 1e-12  # relative change of a number of a world that is rounding
 _TESTED = 4  # worlds of an object in which gradients are compared with secants
 _MAX_BEND = 0.01  # [1] relative difference of one-sided derivatives beyond which there is none
+_USELESS = (
+    "Gradients do not predict the effect of a change by 1 % within 10 % in most of the tested "
+    "worlds (see useful), so shorten the horizon:"
+)
 _VECTORS = {"target": "p_world_target", "com": "solid.p_object_com"}  # [m], leaves of a draw
 _DISCRETE = ("corners", "sides", "feet_number", "object", "seed", "key_0", "key_1", "world")
 
@@ -73,6 +78,11 @@ class Coordinate(NamedTuple):
     name: str  # of a drawn quantity or a vector, or of a leaf of the parameters
     entry: tuple[int, ...] = ()  # of a vector or a leaf
     is_parameter: bool = False
+
+    @property
+    def index(self) -> tuple[Any, ...]:
+        """Index of the scalar in a batch of its leaf."""
+        return (slice(None), *self.entry) if self.is_parameter else ()
 
 
 @device.standard_jax()
@@ -97,10 +107,9 @@ def value_and_grad(
     Gradients are those of the engine's own equations, by the implicit function theorem at the
     solution of each physics step. Where contacts, cones or rules switch they are one-sided, and
     jumps of the score are not in them. Pushes are chaotic: with time fewer gradients predict the
-    effect of a small change. `useful` is the share of some worlds in which they do: in `wide` a
-    change of 1 % is predicted within 10 % for 67 % of the entries at 0.5 s, 61 % at 2 s and 33 % at
-    5 s. Law and skin have their smooth forms by default, so that what the law feels has
-    derivatives. Where a step of the engine quasistatic has not converged, they err by some 1e-3.
+    effect of a small change. `useful` is the share of some worlds in which they do. Law and skin
+    have their smooth forms by default, so that what the law feels has derivatives. Where a step of
+    the engine quasistatic has not converged, they err by some 1e-3.
 
     Args:
       score: function of the `Trajectory` (T, ...) of one trial and of `args`, which returns one
@@ -151,135 +160,116 @@ def value_and_grad(
     inputs = dict(locals())
     device.check_eager("value_and_grad", inputs)
     check_arguments(value_and_grad, inputs)
-    results, aux = _gradients(**inputs)
+    results, aux = _gradients(inputs)
     return (results, aux) if has_aux else results
 
 
 def _gradients(
-    score: ScoreLike,
-    laws: LawsLike,
-    domain: DomainLike,
-    worlds: int,
-    wrt: Sequence[str] | str,
-    horizon: float,
-    smooth: bool,
-    args: tuple[Any, ...],
-    has_aux: bool,
-    states: bool,
-    robot: RobotLike | None,
-    task: TaskLike | None,
-    setting: Setting,
-    change: float = 0.01,
-    central: bool = False,
+    inputs: Mapping[str, Any], change: float = 0.01, central: bool = False
 ) -> tuple[Gradients, Any]:
     """Return the answer of `value_and_grad`, and the auxiliary outputs (law, world, ...).
 
     Secants are those of a relative `change` of a quantity, one-sided or `central`.
     """
-    inputs = dict(locals())
+    i = SimpleNamespace(**inputs)
+    setting, score, is_objective = i.setting, i.score, isinstance(i.score, Objective)
     device.check_process()
-    ranges, chosen = parse_domain(domain, robot, task), registry.resolve_laws(laws)
-    errors.check_count("worlds", worlds, at_most=1_000_000)
-    steps, engine = count_steps(horizon, setting), setting.simulator
+    ranges = parse_domain(i.domain, i.robot, i.task)
+    chosen = registry.resolve_laws(i.laws)
+    errors.check_count("worlds", i.worlds, at_most=1_000_000)
+    steps, engine = count_steps(i.horizon, setting), setting.simulator
     engine.check_traced()
     engine.check_derivatives("reverse")
     setting.check_domain(ranges, chosen.values())
-    loops = [control_loop(params, setting, smooth=smooth) for params in chosen.values()]
-    several = [coordinates_of(wrt, params, ranges) for params in chosen.values()]
-    if any(coordinates != several[0] for coordinates in several):
+    loops = [control_loop(params, setting, smooth=i.smooth) for params in chosen.values()]
+    coordinates, *others = (coordinates_of(i.wrt, x, ranges) for x in chosen.values())
+    if any(x != coordinates for x in others):
         rule = "parameters of wrt must have the same shapes and units in all laws"
         raise errors.not_allowed("laws", ", ".join(chosen), rule)
-    if isinstance(score, Objective) and not all(hasattr(p, "v_max") for p in chosen.values()):
+    if is_objective and not all(hasattr(p, "v_max") for p in chosen.values()):
         rule = "a law without a parameter v_max needs a function of the snapshots"
         raise errors.not_allowed("score", "an Objective", rule)
-    if isinstance(score, Objective):
+    if is_objective:
         ranges.task.check_target("task", ranges.task, "give a function as score")
     cache.use_cache_if_requested()
-    coordinates, index = several[0], np.arange(worlds)
-    value, bend = np.empty((len(chosen), worlds)), np.empty((worlds, len(coordinates)))
-    gradient = np.empty((*value.shape, len(coordinates)))
-    useful: list[list[np.ndarray]] = [[] for _ in chosen]
-    secant, aux = np.full(gradient.shape, np.nan), dict[int, list[Any]]()
-    options = _Options(score, steps, replace(setting, seed=0), has_aux, states)
-    used, temperature = np.array([x.is_parameter for x in coordinates]), 0.0
+    index, labels = np.arange(i.worlds), [x.label for x in coordinates]
+    value, bend = np.empty((len(chosen), i.worlds)), np.empty((i.worlds, len(labels)))
+    gradient = np.empty((*value.shape, len(labels)))
+    secant, size = np.full_like(gradient, np.nan), np.ones_like(gradient)
+    tested, aux = list[np.ndarray](), [list[Any]() for _ in chosen]
+    options = _Options(score, steps, replace(setting, seed=0), i.has_aux, i.states)
+    used, temperature, order = np.zeros(len(labels), bool), 0.0, list[np.ndarray]()
     for at, drawn in points.draw_by_object(ranges, setting.world_seed, None, index):
         family = drawn_worlds(ranges, drawn, setting)
-        if smooth:
+        if i.smooth:
             family = family._replace(worlds=soften_skins(family.worlds))
             skin: Any = family.worlds.skin
             temperature = float(skin.temperature[0])
         slopes, bend[at] = world_slopes(ranges, drawn, setting, coordinates)
         used |= list(map(bool, slopes))
-        names = {name for slope in slopes for name in slope}
-        names |= {f"params.{x.name}" for x in coordinates if x.is_parameter}
-        for i, (params, loop) in enumerate(zip(chosen.values(), loops, strict=True)):
+        names, first = set(itertools.chain(*slopes)), at[:_TESTED]
+        order.append(at)
+        tested.append(first)
+        for law, (params, loop) in enumerate(zip(chosen.values(), loops, strict=True)):
             trees = {"world": family.worlds, "params": family.with_params(params).params}
             leaves = {name: x for name, x in named_leaves(trees).items() if name in names}
-            run = partial(_value_and_slopes, family.stage, loop=loop, options=options, args=args)
-            (value[i, at], extra), by_leaf = jax.device_get(run(trees, leaves))
-            aux.setdefault(i, []).append((at, extra))
+            run = partial(_value_and_slopes, family.stage, loop=loop, options=options, args=i.args)
+            (value[law, at], extra), by_leaf = jax.device_get(run(trees, leaves))
+            aux[law].append(extra)
             for k, (x, slope) in enumerate(zip(coordinates, slopes, strict=True)):
-                products = [y * by_leaf[name] for name, y in slope.items()]
-                if x.is_parameter:
-                    products = [by_leaf[f"params.{x.name}"][(slice(None), *x.entry)]]
-                gradient[i, at, k] = sum(y.reshape(at.size, -1).sum(axis=1) for y in products)
-            tested = np.arange(min(_TESTED, at.size))
-            size = change * _sizes(coordinates, drawn, leaves)[tested]
-            move = partial(_moved_scores, run, trees, leaves, coordinates, slopes, tested)
-            middle = value[i, at[tested], None]
-            rise = move(size) - (move(-size) if central else middle)
-            secant[i, at[tested]] = rise / (size * (1 + central))
-            error = np.abs(gradient[i, at[tested]] * size * (1 + central) - rise)
-            # Rounding of the score is no change.
-            near = error <= 0.1 * np.abs(rise) + 3e-6 * np.abs(middle)
-            useful[i].append(np.where(np.isnan(rise), np.nan, near))
+                products = (y * by_leaf[name][x.index] for name, y in slope.items())
+                gradient[law, at, k] = sum(y.reshape(at.size, -1).sum(axis=1) for y in products)
+            size[law, first] = change * _sizes(coordinates, drawn, leaves)[: first.size]
+            move = partial(_moved_scores, run, trees, leaves, coordinates, slopes)
+            above = move(size[law, first])
+            below = move(-size[law, first]) if central else value[law, first, None]
+            secant[law, first] = (above - below) / (size[law, first] * (1 + central))
     gradient = np.where(bend > _MAX_BEND, np.nan, gradient)
-    mean = [gradients.estimate(jnp.asarray(x)) for x in gradient]
+    # Rounding of the score is no change.
+    near = (
+        np.abs(gradient - secant) <= 0.1 * np.abs(secant) + 3e-6 * np.abs(value)[..., None] / size
+    )
+    useful = np.where(np.isnan(secant), np.nan, near)[:, np.concatenate(tested)].mean(axis=1)
+    useful[:, (bend > _MAX_BEND).any(axis=0)] = np.nan
+    mean = gradients.estimate(jnp.asarray(gradient.swapaxes(0, 1)))
     dims, mean_dims = ("law", "world", "quantity"), ("law", "quantity")
-    error = [np.sqrt(x.variance) for x in mean]
-    shares = np.array([np.concatenate(x).mean(axis=0) for x in useful])
-    shares[:, (bend > _MAX_BEND).any(axis=0)] = np.nan
     variables = labelled(
         value=(dims[:2], value, "1", "score"),
         gradient=(dims, gradient, "1 / unit", "derivative of the score"),
         finite=(dims, np.isfinite(gradient), "1", "whether the derivative is finite"),
         norm=(dims[:2], np.linalg.norm(gradient, axis=-1), "1 / unit", "norm of the gradient"),
-        mean=(mean_dims, [x.gradient for x in mean], "1 / unit", "mean over finite derivatives"),
-        error=(mean_dims, error, "1 / unit", "standard error of the mean"),
+        mean=(mean_dims, mean.gradient, "1 / unit", "mean over finite derivatives"),
+        error=(mean_dims, np.sqrt(mean.variance), "1 / unit", "standard error of the mean"),
         secant=(dims, secant, "1 / unit", "slope along a change by 1 %"),
-        useful=(mean_dims, shares, "1", "share of worlds with a gradient near the secant"),
+        useful=(mean_dims, useful, "1", "share of worlds with a gradient near the secant"),
     )
     coords: dict[str, Any] = {
         "law": list(chosen),
         "world": ("world", index, {"long_name": WORLD}),
-        "quantity": [x.label for x in coordinates],
+        "quantity": labels,
         "unit": ("quantity", [x.unit for x in coordinates]),
         "kind": ("quantity", ["parameter" if x.is_parameter else "world" for x in coordinates]),
         "map_error": ("quantity", bend.max(axis=0), {"units": "1"}),
     }
     coords |= points.drawn_columns(ranges, setting.world_seed, None, index)
-    notes = [*_notes(ranges, setting.engine, coordinates, used, value, gradient, bend)]
-    if doubtful := [x.label for x, y in zip(coordinates, shares.T, strict=True) if (y < 0.5).any()]:
-        notes.append(
-            f"Gradients by {', '.join(doubtful)} do not predict the effect of a change by 1 % "
-            f"within 10 % in most of the first {min(_TESTED, worlds)} worlds (see useful): shorten "
-            "the horizon."
-        )
-    if notes := " ".join(notes):
+    notes = " ".join(
+        _notes(ranges, setting.engine, coordinates, used, value, gradient, bend, useful)
+    )
+    if notes:
         notes = f"Score {getattr(score, '__name__', 'objective')}: {notes}"
         warnings.warn(notes, stacklevel=4)
     attrs = provenance.attributes() | {
-        "domain": name_or_custom(domain), **setting.attributes,
+        "domain": name_or_custom(i.domain),
+        **setting.attributes,
         "horizon": steps * setting.physics.control_period,
-        "skin_temperature": temperature, "notes": notes, **task_attribute(ranges),
-    }  # fmt: skip
+        "skin_temperature": temperature,
+        "notes": notes,
+        **task_attribute(ranges),
+    }
     results = Gradients(variables, coords, attrs)
     results.inputs = inputs
-    order = np.argsort(np.concatenate([at for at, _ in aux[0]]))
-    by_law = [
-        jax.tree.map(lambda *x: np.concatenate(x)[order], *(tree for _, tree in parts))
-        for parts in aux.values()
-    ]
+    rank = np.argsort(np.concatenate(order))
+    by_law = [jax.tree.map(lambda *x: np.concatenate(x)[rank], *parts) for parts in aux]
     return results, jax.tree.map(lambda *x: np.stack(x), *by_law)
 
 
@@ -300,10 +290,9 @@ class Gradients(xr.Dataset):
         Returns:
           `gradient`, `differences` and their relative `error` (law, world, quantity).
         """
-        inputs = self.inputs | {"worlds": worlds, "change": step, "central": True}
         with jax.enable_x64(True), warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            results, _ = _gradients(**inputs)
+            results, _ = _gradients(self.inputs | {"worlds": worlds}, step, central=True)
         size = np.maximum(np.abs(results.gradient), np.abs(results.secant))
         error = np.abs(results.gradient - results.secant) / size.where(size > 0, 1.0)
         return xr.Dataset(
@@ -362,8 +351,8 @@ def world_slopes(
 
     Returns:
       For each coordinate, derivatives (n, ...) of those leaves of the worlds that depend on it, by
-      their names; and relative differences (n, q) [1] of the one-sided derivatives, which bound
-      the relative errors of the central ones.
+      their names, or ones (n,) for a parameter; and relative differences (n, q) [1] of the
+      one-sided derivatives, which bound the relative errors of the central ones.
     """
 
     def leaves(draw: Draw) -> dict[str, Any]:
@@ -385,6 +374,7 @@ def world_slopes(
         middle = leaves(drawn)
         for i, coordinate in enumerate(coordinates):
             if coordinate.is_parameter:
+                slopes[i][f"params.{coordinate.name}"] = np.ones(count)
                 continue
             value = drawn.values.get(coordinate.name, np.ones(count))
             step = _STEP * np.maximum(np.abs(value), _SMALLEST)
@@ -518,7 +508,7 @@ def _sizes(coordinates: Sequence[Coordinate], drawn: Draw, leaves: Mapping[str, 
     for x in coordinates:
         value: Any = drawn.values.get(x.name, np.ones(drawn.indices.size))
         if x.is_parameter:
-            value = leaves[f"params.{x.name}"][(slice(None), *x.entry)]
+            value = leaves[f"params.{x.name}"][x.index]
         elif x.name in _VECTORS:
             value = np.asarray(named_leaves(drawn)[_VECTORS[x.name]])[:, x.entry[0]]
         columns.append(np.maximum(np.abs(value), _SMALLEST))
@@ -531,29 +521,25 @@ def _moved_scores(
     leaves: Mapping[str, Any],
     coordinates: Sequence[Coordinate],
     slopes: Sequence[Arrays],
-    tested: np.ndarray,
     change: np.ndarray,
 ) -> np.ndarray:
-    """Return the scores (m, q) of tested worlds (m,), each with one changed quantity (m, q).
+    """Return the scores (m, q) of the first worlds, each with one changed quantity (m, q).
 
     They run in batches of the size of `leaves`, and so compile nothing. Beyond the first 64
     quantities they are NaN.
     """
-    (count, *_), values = next(iter(leaves.values())).shape, np.full(change.shape, np.nan)
-    pairs = [(i, k) for i in range(tested.size) for k in range(min(64, len(coordinates)))]
+    (count, *_), scores = next(iter(leaves.values())).shape, np.full(change.shape, np.nan)
+    pairs = np.argwhere(np.ones_like(change[:, :64]))
     for first in range(0, len(pairs), count):
         chunk = pairs[first : first + count]
-        index = np.resize(tested[[i for i, _ in chunk]], count)
+        index = np.resize(chunk[:, 0], count)
         moved = {name: np.array(leaf[index]) for name, leaf in leaves.items()}
         for slot, (i, k) in enumerate(chunk):
-            x = coordinates[k]
-            if x.is_parameter:
-                moved[f"params.{x.name}"][(slot, *x.entry)] += change[i, k]
             for name, slope in slopes[k].items():
-                moved[name][slot] += change[i, k] * slope[tested[i]]
-        (scores, _), _ = jax.device_get(run(jobs.rows(inputs, index), moved))
-        values[tuple(np.transpose(chunk))] = scores[: len(chunk)]
-    return values
+                moved[name][(slot, *coordinates[k].index[1:])] += change[i, k] * slope[i]
+        (values, _), _ = jax.device_get(run(jobs.rows(inputs, index), moved))
+        scores[tuple(chunk.T)] = values[: len(chunk)]
+    return scores
 
 
 def soft_score(
@@ -603,8 +589,9 @@ def _notes(
     value: np.ndarray,
     gradient: np.ndarray,
     bend: np.ndarray,
+    useful: np.ndarray,
 ) -> Iterator[str]:
-    """Yield sentences on coordinates without influence and on worlds without finite numbers."""
+    """Yield sentences on coordinates whose derivatives are zero, not finite or of no use."""
     if invalid := np.sum(~np.isfinite(value)):
         yield f"The score is not finite in {invalid} of {value.size} trials."
     is_mass = np.array([x.name == "mass" and not x.is_parameter for x in coordinates])
@@ -623,6 +610,7 @@ def _notes(
         (used & is_zero & ~is_mass, "Derivatives of zero in every world within the horizon:"),
         (bent, "No derivatives in worlds whose numbers have a kink (see finite):"),
         (is_empty, f"No world of {len(bend)} has a finite derivative, so the mean is NaN:"),
+        ((useful < 0.5).any(axis=0), _USELESS),
     ):
         labels = [x.label for x, chosen in zip(coordinates, mask, strict=True) if chosen]
         if labels:

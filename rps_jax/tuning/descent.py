@@ -15,9 +15,8 @@ gradients?", ICML 2022 (why derivatives of long, stiff trials mislead).
 from __future__ import annotations
 
 import functools
-import itertools
 import time
-from collections.abc import Callable, Hashable
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, ClassVar, NamedTuple
@@ -43,7 +42,7 @@ from rps_jax.tuning.derivatives import soft_times
 from rps_jax.tuning.evolution import Descent, gradient_results
 from rps_jax.tuning.gradients import Estimate
 from rps_jax.tuning.optimisers import OptimiserLike, optimiser
-from rps_jax.tuning.run import Proposal, Results, ScoreCandidates, Search, Tuning
+from rps_jax.tuning.run import TIMES, Proposal, Results, ScoreCandidates, Search, Tuning
 
 _DERIVATIVE_COST = 4.0  # [1] simulated seconds for which a differentiated second counts
 
@@ -51,6 +50,9 @@ _DERIVATIVE_COST = 4.0  # [1] simulated seconds for which a differentiated secon
 @dataclass(frozen=True)
 class TuneGrad(Descent):
     """Tune a law by exact derivatives of the smooth trial, in mini-batches of random worlds.
+
+    Use `rps tune es` by default, and this for hundreds of parameters and an engine with
+    derivatives; where these oppose the slopes of whole trials, they are dropped and slopes remain.
 
     A step follows the derivatives of windows of some seconds, which start at states of trials of
     the original law; a value function, fitted to these trials, counts what follows a window. After
@@ -62,9 +64,10 @@ class TuneGrad(Descent):
     of the derivatives and the slopes; `windows` (generation) is 1 for steps by derivatives. Steps
     without a validation have NaN there. A differentiated second counts as four simulated ones.
 
-    The defaults are those of a study with 6 to 2,048 parameters. With windows of 1, 2 and 5 s the
-    cosine of the derivatives with the true slope was 0.01, 0.40 and 0.64. A network as value, or
-    the distance that is left, had negative ones.
+    Derivatives of windows often have another direction than those of whole trials: with 6
+    parameters the first cosine of a small quasi-static run was -0.52. Windows are then dropped, and
+    the run goes on by slopes. Windows of 5 s, and no more than some ten steps by them, are from a
+    prototype; no study of this package compares them yet.
 
     Examples:
       >>> import rps_jax
@@ -114,17 +117,12 @@ class TuneGrad(Descent):
     """Number of trials of the original law, in each domain, whose states start windows."""
     refresh: int = option(3, 1, 1_000_000)
     """Number of steps between new trials, with which the validation comes."""
-    checks: int = option(32, 1, 1_000_000)
-    """Number of worlds of the slopes that are compared with the derivatives, in each domain."""
+    checks: int = option(32, 0, 1_000_000)
+    """Number of worlds of the slopes that are compared with the derivatives, in each domain; 0: no
+    comparison, so that windows are not dropped."""
     clip: float = option(2.0, above=0)
     """Bound on the norm of the derivatives of one window, as a multiple of the median norm [1];
     without it a few chaotic windows dominate."""
-    ridge: float = option(1.0, 0)
-    """Weight of the squared coefficients of the value function, of standardised features [1]."""
-    history: int = option(4, 1, 1000)
-    """Number of the last batches of trials to which the value function is fitted."""
-    taxels: float = option(0.03, above=0, at_most=1)
-    """Temperature of the taxels of a smooth skin [1]."""
 
     @property
     def num_generations(self) -> int:
@@ -152,107 +150,61 @@ class TuneGrad(Descent):
         return optimiser(self.optimiser, self.schedule, self.learning_rate, self.steps)
 
     def search(self) -> Search:
-        """Search by steps of the optimiser, first by derivatives of windows and then by slopes.
-
-        If the steps by derivatives end at a worse validation than an earlier one, the search goes
-        back to the best vector.
-        """
-        step, start = self._optimiser(), jnp.asarray(self.base)
-        vector, state, base = self.base, step.init(start), np.array(np.nan)
-        best, least, cosines = vector, np.inf, list[float]()
-        uses_windows, anchor, size = self.window_steps > 0, 0, len(FEATURES) + 2
-        moments, coefficients, anchored = list[np.ndarray](), np.zeros(size - 1), vector
-        for generation in itertools.count():
-            returns = uses_windows and generation == self.window_steps
-            uses_windows &= not returns
-            if uses_windows and (generation - anchor) % self.refresh == 0:
-                anchor, anchored = generation, vector
-            results = yield {
-                "vectors": vector[None],
-                "base": base,
-                "windows": np.array(float(uses_windows)),
-                "anchor": np.array(float(anchor)),
-                "anchors": anchored[None],
-                "moments": sum(moments, np.zeros((size, size))),
-                "coefficients": coefficients,
-            }
-            base, vector, value = results["base"], results["vectors"][0], results["validation"]
-            slopes = results["gradients"][0]
-            if uses_windows and generation == anchor:
-                moments = [*moments, results["new_moments"]][1 - self.history :]
-                moments = moments if self.history > 1 else []
-                coefficients, anchored = results["coefficients"], results["anchors"][0]
-                cosines.append(float(results["cosine"]))
-                if not np.mean(cosines) > 0:
-                    uses_windows, slopes = False, results["slopes"][0]
-            if value < least:
-                best, least = vector, float(value)
-            elif returns and value > least:
-                vector = best
-                continue
-            finite = jnp.nan_to_num(jnp.asarray(slopes), posinf=0.0, neginf=0.0)
-            value = jnp.nan_to_num(jnp.asarray(value), nan=least)
-            change, state = step.update(
-                finite, state, jnp.asarray(vector), value=value, grad=finite
-            )
-            vector = vector + np.asarray(change)
+        """Search by steps of the optimiser, first by derivatives of windows and then by slopes."""
+        windows = {
+            "windows": np.array(float(self.window_steps > 0)),
+            "cosines": np.array(0.0),
+            "anchors": self.base[None],
+            "moments": np.zeros((_NUM_FEATURES + 2,) * 2),
+        }
+        return self.descend(self._optimiser(), windows, self.refresh, self.window_steps)
 
     def judge(self, proposal: Proposal, generation: int, score: ScoreCandidates) -> Results:
         """Validate and estimate slopes; or differentiate windows, with both every few steps."""
-        vector, size = jnp.asarray(proposal["vectors"][0]), len(FEATURES) + 2
-        nothing: Results = {
-            "cosine": np.nan,
-            "slopes": 0 * proposal["vectors"] + np.nan,
-            "new_moments": np.zeros((size, size)),
-        }
         if not proposal["windows"] or generation == self.steps:
             worlds = self.worlds if generation < self.steps else 0
             results, slopes = self.try_step(proposal, generation, score, worlds)
-            return {**nothing, **results, **gradient_results(slopes)}
-        times: dict[str, float] = dict.fromkeys(("compile", "run", "simulated"), 0.0)
-        anchor = int(proposal["anchor"])
-        states = self._states(anchor, jnp.asarray(proposal["anchors"][0]), times)
-        coefficients, extra = proposal["coefficients"], dict[str, Any]()
+            return {**results, **gradient_results(slopes), "cosine": np.nan}
+        vector, moments = jnp.asarray(proposal["vectors"][0]), proposal["moments"]
+        times: dict[str, float] = dict.fromkeys(TIMES, 0.0)
+        anchor = generation - generation % self.refresh
+        if anchor not in self._states:
+            self._states.clear()
+            self._states[anchor] = self._collect(proposal["anchors"], anchor, times)
+        states, results = self._states[anchor], self.step_results(proposal)
         if anchor == generation:
-            new = sum(x.moments for x in states)
-            coefficients = fit(proposal["moments"] + new, self.ridge)
-            extra = {"new_moments": new, "coefficients": coefficients}
-        estimate = self._derivatives(vector, states, coefficients, generation, times)
-        times["simulated"] += _DERIVATIVE_COST * self.windows * self.window
-        results: Results = self.step_results(proposal)
+            moments = _REMEMBERED * moments + sum(x.moments for x in states)
+        followed = self._derivatives(vector, states, fit(moments), generation, times)
+        windows, cosine, cosines = 1.0, np.nan, proposal["cosines"]
         if anchor == generation:
             results, slopes = self.try_step(proposal, generation, score, self.checks)
-            cosine = gradients.cosine(estimate.gradient, slopes.gradient)
-            extra |= {"slopes": slopes.gradient[None], "cosine": cosine}
-        return {**nothing, **results, **extra, **gradient_results(estimate), **times}
+            cosine = float(gradients.cosine(followed.gradient, slopes.gradient))
+            cosines = cosines + cosine
+            if self.checks and not cosines > 0:
+                windows, followed = 0.0, slopes
+        more = {"windows": windows, "cosine": cosine, "cosines": cosines, "moments": moments}
+        return {**results, **gradient_results(followed), **more, **times}
 
     @functools.cached_property
-    def _cache(self) -> dict[int, list[_States]]:
-        """States of the trials of a generation."""
+    def _states(self) -> dict[int, list[_States]]:
+        """States of the trials of a generation, by shape family."""
         return {}
 
-    def _states(self, generation: int, vector: jax.Array, times: dict[str, float]) -> list[_States]:
-        """Return states of trials of the original law with a vector (p,), by shape family."""
-        if generation not in self._cache:
-            self._cache.clear()
-            tried = self.tried(vector[None], generation, self.trials)
-            self._cache[generation] = [
-                self._collect(vector, x.stage, x.worlds, times) for x in tried.batches(self.setting)
-            ]
-        return self._cache[generation]
-
     def _collect(
-        self, vector: jax.Array, stage: Stage, worlds: World, times: dict[str, float]
-    ) -> _States:
-        soft = soften_skins(worlds, self.taxels)
-        results = self._call(_run_trials, times, vector, stage, worlds, soft)
-        trials, inputs, scores, live, seconds = results
-        times["simulated"] += float(np.sum(seconds))
-        live, contact = np.asarray(live), np.asarray(inputs)[..., _CONTACT] > 0
-        columns = np.ones((*live.shape, 1)), np.asarray(inputs), np.asarray(scores)[..., None]
-        data = np.concatenate(columns, axis=-1, dtype=float)[live]
-        chosen = np.argwhere(live & contact) if (live & contact).any() else np.argwhere(live)
-        return _States(stage, soft, trials, chosen, data.T @ data)
+        self, vectors: np.ndarray, generation: int, times: dict[str, float]
+    ) -> list[_States]:
+        """Run trials of the original law with a vector (1, p)."""
+        families, tried = [], self.tried(jnp.asarray(vectors), generation, self.trials)
+        for batch in tried.batches(self.setting):
+            stage, soft = batch.stage, soften_skins(batch.worlds)
+            inputs = jnp.asarray(vectors[0]), stage, batch.worlds, soft
+            trials, table, live, seconds = self._call(_run_trials, times, *inputs)
+            times["simulated"] += float(np.sum(seconds))
+            live, table = np.asarray(live), np.asarray(table, float)
+            touched = live & (table[..., 1] > 0)  # by the feature `contact`
+            chosen = np.argwhere(touched if touched.any() else live)
+            families.append(_States(stage, soft, trials, chosen, table[live].T @ table[live]))
+        return families
 
     def _derivatives(
         self,
@@ -273,24 +225,22 @@ class TuneGrad(Descent):
                 inputs = family.stage, family.worlds, family.trials, jnp.asarray(at)
                 value = jnp.asarray(coefficients, float)
                 samples.append(self._call(_differentiate, times, vector, value, *inputs))
+        times["simulated"] += _DERIVATIVE_COST * self.windows * self.window
         return gradients.estimate(gradients.clip(jnp.concatenate(samples), self.clip))
 
     @functools.cached_property
-    def _programs(self) -> dict[Hashable, Callable[..., Any]]:
-        """Compiled functions of the shape families."""
+    def _programs(self) -> dict[Callable[..., Any], Any]:
+        """Functions that JAX compiles once for each shape family."""
         return {}
 
     def _call(self, function: Callable[..., Any], times: dict[str, float], *inputs: Any) -> Any:
         """Call a function of the options and some arrays; add the wall clock to `times` [s]."""
-        leaves, structure = jax.tree.flatten(inputs)
-        key, start_time = (function, structure, *map(jnp.shape, leaves)), time.perf_counter()
-        if key not in self._programs:
-            lowered = jax.jit(partial(function, self)).lower(*inputs)
-            self._programs[key] = lowered.compile()
-            times["compile"] += time.perf_counter() - start_time
-            start_time = time.perf_counter()
-        result = jax.block_until_ready(self._programs[key](*inputs))
-        times["run"] += time.perf_counter() - start_time
+        program = self._programs.setdefault(function, jax.jit(partial(function, self)))
+        count, start_time = program._cache_size(), time.perf_counter()
+        result = jax.block_until_ready(program(*inputs))
+        # The first run of a program counts as its compilation.
+        name = "run" if program._cache_size() == count else "compile"
+        times[name] += time.perf_counter() - start_time
         return result
 
     @property
@@ -315,19 +265,18 @@ class _States(NamedTuple):
 
 def _run_trials(
     options: TuneGrad, vector: jax.Array, stage: Stage, worlds: World, soft: World
-) -> tuple[Trial, jax.Array, jax.Array, jax.Array, jax.Array]:
+) -> tuple[Trial, jax.Array, jax.Array, jax.Array]:
     """Run trials of the original law.
 
     Returns:
-      Their states (K, n, ...), one per length of a window; features (K, n, F) and remaining scores
-      (K, n) of these; whether the trial runs there (K, n); and the times (n,) [s] of the trials.
+      Their states (K, n, ...), one per length of a window; columns (K, n, F + 2) of these: 1,
+      features and remaining score; whether the trial runs there (K, n); and the times (n,) [s] of
+      the trials.
     """
     setting, objective, law = options.setting, options.objective, registry.law_of(options.params)
     loop = ControlLoop(setting.physics, setting.rules, law)
     period, rules = setting.physics.control_period, setting.rules
-    thetas = gradients.per_world(vector, worlds)
-    params = jax.vmap(options.space.params)(thetas)
-    live = jnp.ones(worlds.qpos.shape[0], bool)
+    params = jax.vmap(options.space.params)(gradients.per_world(vector, worlds))
 
     def score(state: Trial, success: Any, missed: Any) -> Any:
         times = state.steps * period, state.lost_steps * period
@@ -339,12 +288,12 @@ def _run_trials(
         (moved,) = trial.advance([batch], loop, round(options.window / period))
         return moved, (state, inputs, score(state, 1.0, 0.0), ~state.done)
 
-    first = trial.start_all(worlds, params, live, law=law)
+    first = trial.start_all(worlds, params, jnp.ones(len(worlds.qpos), bool), law=law)
     count = max(1, round(float(rules.horizon) / options.window))
     last, (states, inputs, scores, live) = jax.lax.scan(proceed, first, length=count)
-    missed = jnp.where(jnp.isfinite(last.min_distance), last.min_distance, _FAR)
-    whole = score(last, 1.0 * last.success, missed)
-    return states, inputs, whole - scores, live, last.steps * period
+    rest = score(last, 1.0 * last.success, jnp.minimum(last.min_distance, _FAR)) - scores
+    table = jnp.concatenate([jnp.ones_like(rest)[..., None], inputs, rest[..., None]], axis=-1)
+    return states, table, live, last.steps * period
 
 
 def _differentiate(
@@ -384,19 +333,16 @@ def _differentiate(
 # --- the value function --------------------------------------------------------------------
 
 _FAR = 5.0  # [m] beyond which distances count equally
-FEATURES = (
-    "contact", "distance", "distance^2", "contact distance", "aside", "aside^2", "distance aside",
-    "offset^2", "offset turn", "ahead", "centre^2", "centre turn", "centre offset", "speed",
-    "time", "time lost",
-)  # fmt: skip
-_CONTACT = FEATURES.index("contact")
+_NUM_FEATURES = 16
+_REMEMBERED = 0.75  # [1] weight of former trials at each refresh
 
 
 def features(world: World, params: LawParams, state: Trial, loop: ControlLoop) -> jax.Array:
     """Return the physical features (F,) of a state, which are equal for mirrored worlds.
 
-    They are products of the contact's weight and offset, its distance and bearing from the target,
-    the object's centre and velocity, all in the robot frame, and of the times of the trial.
+    The first is whether there is contact. The others are products of the contact's weight and
+    offset, its distance and bearing from the target, the object's centre and velocity, all in the
+    robot frame, and of the times of the trial.
     """
     _, measured = trial.observe(world, params, state, loop)
     contact, distance = 1.0 * measured.reading.in_contact, measured.distance
@@ -423,15 +369,14 @@ def features(world: World, params: LawParams, state: Trial, loop: ControlLoop) -
     )  # fmt: skip
 
 
-def fit(moments: np.ndarray, ridge: float) -> np.ndarray:
+def fit(moments: np.ndarray, ridge: float = 1.0) -> np.ndarray:
     """Return the coefficients (F + 1,) of ridge regression, that of the constant first.
 
     `moments` are sums of products of 1, the features and the value. The weight `ridge` is that of
     standardised features; that of the constant is 0.
     """
     gram, product = moments[:-1, :-1], moments[:-1, -1]
-    count = max(gram[0, 0], 1.0)
-    variance = np.diag(gram) / count - (gram[0] / count) ** 2
+    variance = np.diag(gram) / gram[0, 0] - (gram[0] / gram[0, 0]) ** 2
     weights = ridge * np.maximum(variance, 1e-9)
     weights[0] = 0.0
     return np.linalg.lstsq(gram + np.diag(weights), product, rcond=None)[0]

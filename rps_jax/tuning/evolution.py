@@ -20,6 +20,7 @@ import cmaes
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optax
 
 from rps_jax.record.files import JsonObject
 from rps_jax.record.options import option
@@ -87,6 +88,34 @@ class Descent(Tuning):
         answer, checked = score([tried, check])
         return self.step_results(proposal, checked), estimate(answer)
 
+    def descend(
+        self,
+        rule: optax.GradientTransformation,
+        windows: Proposal,
+        refresh: int = 1,
+        window_steps: int = 0,
+    ) -> Search:
+        """Search by steps of an optimiser along the `gradients` of the results.
+
+        The arrays of `windows` are those of `TuneGrad`, and come back with the results. The steps
+        after those by windows start at the vector with the best validation.
+        """
+        vector, state, base = self.base, rule.init(jnp.asarray(self.base)), np.array(np.nan)
+        best, least = vector, np.inf
+        for following in itertools.count(1):
+            results = yield {"vectors": vector[None], "base": base, **windows}
+            base, vector = results["base"], results["vectors"][0]
+            if results["validation"] < least:
+                best, least = vector, float(results["validation"])
+            slopes = jnp.nan_to_num(jnp.asarray(results["gradients"][0]), posinf=0.0, neginf=0.0)
+            change, state = rule.update(slopes, state, jnp.asarray(vector))
+            vector = vector + np.asarray(change)
+            windows = {name: results[name] for name in windows}
+            if following == window_steps and windows["windows"]:
+                windows, vector = windows | {"windows": np.array(0.0)}, best
+            if windows and following % refresh == 0:
+                windows = windows | {"anchors": vector[None]}
+
     def step_results(self, proposal: Proposal, check: CandidateScores | None = None) -> Results:
         """Return the results of a step without its gradient; NaN without a validation."""
         value = success = np.nan
@@ -117,6 +146,9 @@ def gradient_results(estimate: Estimate) -> dict[str, jax.Array]:
 @dataclass(frozen=True)
 class TuneES(Descent):
     """Tune a law's parameters by evolution, in many worlds.
+
+    It is the tuner to use by default; `rps tune grad` is for hundreds of parameters and an engine
+    with derivatives.
 
     The answer has, by generation, the objective of the candidates, the objective of the mean of
     their distribution in the worlds for validation, and the `params` (generation, parameter) of
@@ -171,7 +203,11 @@ class TuneES(Descent):
 
     def search(self) -> Search:
         """Search by CMA-ES of the package cmaes, or by a descent; `center` is the mean."""
-        return self._search_by_slopes() if self.estimator == "antithetic" else self._search()
+        if self.estimator == "cma":
+            return self._search()
+        rate = self.learning_rate
+        rule = optimiser("fixed_length", "cosine_decay", rate, self.generations)
+        return self.descend(rule, {})
 
     def _search(self) -> Search:
         seed = int(np.random.SeedSequence((self.setting.seed, 0)).generate_state(1)[0])
@@ -184,16 +220,6 @@ class TuneES(Descent):
             ranked = np.where(np.isnan(values), worst + 1.0, values)
             strategy.tell([(x, float(value)) for x, value in zip(vectors, ranked, strict=True)])
 
-    def _search_by_slopes(self) -> Search:
-        step = optimiser("fixed_length", "cosine_decay", self.learning_rate, self.generations)
-        vector, state, base = self.base, step.init(jnp.asarray(self.base)), np.array(np.nan)
-        for _ in itertools.count():
-            results = yield {"vectors": vector[None], "base": base}
-            base, vector = results["base"], results["vectors"][0]
-            slopes = jnp.nan_to_num(jnp.asarray(results["gradients"][0]))
-            change, state = step.update(slopes, state)
-            vector = vector + np.asarray(change)
-
     def judge(self, proposal: Proposal, generation: int, score: ScoreCandidates) -> Results:
         if self.estimator == "antithetic":
             worlds = self.worlds if generation < self.generations else 0
@@ -204,17 +230,15 @@ class TuneES(Descent):
         center = self.validation_candidates(space.params(proposal["center"][None]))
         candidates, check = score([tried, center])
         *values, base_value = np.asarray(self.objective.value(candidates.score))
-        (validation,) = np.asarray(self.objective.value(check.score))
         distances = np.mean((vectors - self.base) ** 2, axis=-1)
+        start = {"vectors": proposal["center"][None], "base": base_value}
         return {
+            **self.step_results(start, check),
             "values": values + self.prior * distances,
             "best": np.nanmin(values),
             "mean": float(np.nanmean(values)),
             "spread": float(np.nanstd(values)),
             "not_finite": np.isnan(values).sum(),
-            "base": base_value,
-            "validation": validation,
-            "validation_success": check.outcome.success.mean(),
         }
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -13,6 +13,15 @@ import optax
 from rps_jax import errors
 
 OptimiserLike = str | Any  # name, or a transformation of optax; a text in the command line
+SCHEDULES: dict[str, Callable[[float, int], optax.ScalarOrSchedule]] = {
+    "constant": lambda rate, steps: rate,
+    "cosine_decay": optax.cosine_decay_schedule,
+    "exponential_decay": lambda rate, steps: optax.exponential_decay(rate, steps, 0.1),
+    "linear": lambda rate, steps: optax.linear_schedule(rate, 0.0, steps),
+    "warmup_cosine_decay": lambda rate, steps: optax.warmup_cosine_decay_schedule(
+        0.0, rate, max(1, steps // 10), steps
+    ),
+}
 
 
 def fixed_length(
@@ -24,8 +33,7 @@ def fixed_length(
     """
 
     def normalise(updates: Any, params: Any = None) -> Any:
-        size = jnp.sqrt(jnp.mean(updates**2))
-        return updates / jnp.where(size > 0, size, 1.0)
+        return updates / jnp.maximum(jnp.sqrt(jnp.mean(updates**2)), 1e-30)
 
     mean, scale = optax.ema(momentum, debias=False), optax.scale_by_learning_rate(learning_rate)
     return optax.chain(mean, optax.stateless(normalise), scale)
@@ -33,63 +41,31 @@ def fixed_length(
 
 def optimisers() -> dict[str, Callable[..., optax.GradientTransformation]]:
     """Return `fixed_length` and the functions of optax whose first argument is a learning rate."""
-    functions = {
-        name: function
-        for name, function in inspect.getmembers(optax, inspect.isfunction)
-        if next(iter(inspect.signature(function).parameters), "") == "learning_rate"
-        and not name.startswith(("_", "scale_"))
-    }
-    return {"fixed_length": fixed_length} | functions
-
-
-def schedules(rate: float, steps: int) -> dict[str, Callable[[], optax.Schedule]]:
-    """Return the schedules of optax that a learning rate and a number of steps determine.
-
-    A warm-up takes a tenth of the steps, and a decay ends at zero or a tenth of the rate.
-    """
-    values: Mapping[str, Any] = {
-        "value": rate,
-        "peak_value": rate,
-        "end_value": 0.0,
-        "decay_steps": steps,
-        "transition_steps": steps,
-        "warmup_steps": max(1, steps // 10),
-        "decay_rate": 0.1,
-        "power": 2.0,
-    }
-    result: dict[str, Callable[[], optax.Schedule]] = {}
-    for name, function in inspect.getmembers(optax.schedules, inspect.isfunction):
-        parameters = inspect.signature(function).parameters
-        known = values | {"init_value": 0.0 if "peak_value" in parameters else rate}
-        needed = {k: known.get(k) for k, x in parameters.items() if x.default is x.empty}
-        if needed and None not in needed.values():
-            result[name.removesuffix("_schedule")] = lambda f=function, x=needed: f(**x)
+    result: dict[str, Callable[..., Any]] = {"fixed_length": fixed_length}
+    for name, function in inspect.getmembers(optax, inspect.isfunction):
+        if [*inspect.signature(function).parameters][:1] == ["learning_rate"]:
+            result[name] = function
     return result
 
 
 def optimiser(
     name: OptimiserLike, schedule: str, learning_rate: float, steps: int
-) -> optax.GradientTransformationExtraArgs:
-    """Return an optimiser of vectors, for gradients and values.
+) -> optax.GradientTransformation:
+    """Return an optimiser of vectors.
 
     Raises:
-      InputError: optax has none of this name, or it needs more than gradients and values.
+      InputError: optax has none of this name, or it needs more than gradients and a rate.
     """
-    rate = schedules(learning_rate, steps)
-    rate = rate[errors.check_name("schedule", schedule, rate)]()
+    rate = SCHEDULES[errors.check_name("schedule", schedule, SCHEDULES)](learning_rate, steps)
+    rule, known = name, optimisers()
     if isinstance(name, str):
-        known = optimisers()
-        function = known[errors.check_name("optimiser", name, known)]
-        rule = optax.inject_hyperparams(function)(learning_rate=rate)
-    elif isinstance(name, optax.GradientTransformation):
-        rule = name
-    else:
+        rule = known[errors.check_name("optimiser", name, known)]
+    elif not isinstance(name, optax.GradientTransformation):
         raise errors.not_allowed("optimiser", name, "give a name or a transformation of optax")
-    rule = optax.with_extra_args_support(rule)
-    vector = jnp.zeros(2)
     try:
-        jax.eval_shape(lambda x: rule.update(x, rule.init(x), x, value=0.0, grad=x), vector)
+        rule = rule(rate) if isinstance(name, str) else rule
+        jax.eval_shape(lambda x: rule.update(x, rule.init(x), x), jnp.zeros(2))
     except Exception as error:
-        reason = "it needs more than gradients and values; choose another, as adam"
+        reason = "it needs more than gradients and a learning rate; choose another, as adam"
         raise errors.not_allowed("optimiser", name, reason) from error
     return rule

@@ -50,10 +50,9 @@ TIMES = {  # of a generation
 }
 # Dimensions of those results of a generation that are arrays.
 DIMS = {
-    **dict.fromkeys(("vectors", "gradients", "slopes", "anchors"), ("candidate", "parameter")),
-    **dict.fromkeys(("moments", "new_moments"), ("feature", "other_feature")),
+    **dict.fromkeys(("vectors", "gradients", "anchors"), ("candidate", "parameter")),
+    "moments": ("feature", "other_feature"),
     "values": ("candidate",),
-    "coefficients": ("coefficient",),
     **dict.fromkeys(("center", "params"), ("parameter",)),
 }
 
@@ -284,9 +283,7 @@ class Tuning(TaskOption, LawQuestion[xr.Dataset]):
             files.write_csv(folder / "curve.csv", table)
         units = [unit_of_leaf(self.params, x) for x in self.space.parameters.values()]
         log = log.assign_coords(unit=("parameter", units))
-        leaves = registry.named_leaves(self.space.params(best))
-        tuned = np.concatenate([np.ravel(leaves[x]) for x in self.space.names])
-        return log.assign(tuned=("parameter", tuned.astype(float)))
+        return log.assign(tuned=("parameter", self.space.values(best)))
 
     def intro(self, results: xr.Dataset) -> str:
         names = ", ".join(self.space.names)

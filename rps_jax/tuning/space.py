@@ -1,7 +1,8 @@
 """Map between the tuned parameters of a law, which have bounds, and vectors without bounds."""
 
 import math
-from collections.abc import Mapping, Sequence
+import operator
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -25,8 +26,11 @@ def expand_subsets(names: Sequence[str], base: LawParams = RPSParams()) -> tuple
     """
     bounded = tuple(dict(registry.law_of(base).bounds))
     subsets = {"full": bounded} | (SUBSETS if isinstance(base, RPSParams) else {})
-    members = {text: tuple(x for x in bounded if x.startswith(f"{text}.")) for text in names}
-    return tuple(x for text in names for x in subsets.get(text) or members[text] or (text,))
+    return tuple(
+        x
+        for text in names
+        for x in subsets.get(text) or [x for x in bounded if x.startswith(f"{text}.")] or [text]
+    )
 
 
 @dataclass(frozen=True)
@@ -64,16 +68,13 @@ class Space:
         values, base = registry.named_leaves(params), registry.named_leaves(self.base)
         columns = []
         for name in self.names:
-            x = self._coordinates(values, name)
+            low, high, log, _ = bound = self._bounds[name]
+            value = jnp.asarray(_share(bound, values, name), float)
+            if log:
+                low, high, value = math.log(low), math.log(high), jnp.log(value)
+            x = jax.scipy.special.logit((value - low) / (high - low))
             columns.append(x.reshape(*x.shape[: x.ndim - np.ndim(base[name])], -1))
         return jnp.concatenate(columns, axis=-1)
-
-    def _coordinates(self, values: Mapping[str, Leaf], name: str) -> jax.Array:
-        low, high, log, _ = bound = self._bounds[name]
-        value = jnp.asarray(_share(bound, values, name), float)
-        if log:
-            low, high, value = math.log(low), math.log(high), jnp.log(value)
-        return jax.scipy.special.logit((value - low) / (high - low))
 
     def params(self, vector: ArrayLike) -> LawParams:
         """Return the parameters, leaves (..., *shape), of vectors (..., p)."""
@@ -89,11 +90,10 @@ class Space:
             low, high, log, whole = bounds[name]
             u = jax.nn.sigmoid(coordinates[name]).reshape(values[name].shape)
             value = low * (high / low) ** u if log else low + (high - low) * u
-            values[name] = value * _widen(values[whole], value) if whole else value
+            values[name] = _aligned(jnp.multiply, value, values[whole]) if whole else value
         for name, bound in bounds.items():
-            if bound.relative_to:  # a fixed parameter must not exceed the tuned one that bounds it
-                whole = _widen(values[bound.relative_to], values[name])
-                values[name] = jnp.minimum(values[name], whole)
+            if whole := bound.relative_to:  # a fixed parameter must not exceed the tuned bound
+                values[name] = _aligned(jnp.minimum, values[name], values[whole])
         return registry.replace_leaves(self.base, values)
 
     def changed_values(self, vector: ArrayLike) -> dict[str, Any]:
@@ -116,14 +116,13 @@ class Space:
 
 def _share(bound: Bound, values: Mapping[str, Leaf], name: str) -> Leaf:
     """Return a parameter, or its ratio to the parameter that bounds it."""
-    value, whole = values[name], bound.relative_to
-    return value / _widen(values[whole], value) if whole else value
+    whole = bound.relative_to
+    return _aligned(operator.truediv, values[name], values[whole]) if whole else values[name]
 
 
-def _widen(whole: Leaf, value: Leaf) -> Leaf:
-    """Return numbers (...) with axes of length 1 for the shape of entries (..., *shape)."""
-    added = np.ndim(value) - np.ndim(whole)
-    return jnp.reshape(whole, (*np.shape(whole), *(1,) * added)) if added else whole
+def _aligned(function: Callable[..., Any], value: Leaf, whole: Leaf) -> Any:
+    """Apply a function to entries (..., *shape) and numbers (...)."""
+    return np.transpose(function(np.transpose(value), np.transpose(whole)))
 
 
 def _rounded(leaf: Leaf) -> Any:
