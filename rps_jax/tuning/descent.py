@@ -27,7 +27,7 @@ import numpy as np
 
 from rps_jax import errors
 from rps_jax.control import registry
-from rps_jax.control.base import Law, LawParams
+from rps_jax.control.base import LawParams
 from rps_jax.engines import native
 from rps_jax.engines.base import Stage
 from rps_jax.geometry import planar
@@ -35,6 +35,7 @@ from rps_jax.record.options import option
 from rps_jax.runs.question import call_of
 from rps_jax.trials import trial
 from rps_jax.trials.jobs import rows
+from rps_jax.trials.trajectory import control_loop
 from rps_jax.trials.trial import ControlLoop, Snapshot, Trial, World
 from rps_jax.trials.worlds import soften_skins
 from rps_jax.tuning import gradients
@@ -99,8 +100,8 @@ class TuneGrad(Descent):
     """Optimiser: fixed_length (steps of a fixed root mean square along the momentum), or a function
     of optax with a learning rate, as adam, adamw or sgd; in Python any transformation of optax."""
     schedule: str = "cosine_decay"
-    """Schedule of the learning rate, of optax: constant, cosine_decay, exponential_decay, linear,
-    polynomial, warmup_cosine_decay, ... over all steps."""
+    """Schedule of the learning rate over all steps, of optax: constant, cosine_decay,
+    exponential_decay (to a tenth), linear (to zero), warmup_cosine_decay (a tenth is warm-up)."""
     learning_rate: float = option(0.15, above=0)
     """Learning rate of the optimiser, in units of the bounded map [1]; of fixed_length the root
     mean square change of the parameters."""
@@ -243,12 +244,6 @@ class TuneGrad(Descent):
         times[name] += time.perf_counter() - start_time
         return result
 
-    @property
-    def smooth(self) -> Law:
-        """Smooth form of the law; a law without one has the derivatives between its switches."""
-        law = registry.law_of(self.params)
-        return law if law.temperatures is None else registry.smooth_law(law)
-
 
 tune_grad = call_of(TuneGrad)
 
@@ -273,8 +268,8 @@ def _run_trials(
       features and remaining score; whether the trial runs there (K, n); and the times (n,) [s] of
       the trials.
     """
-    setting, objective, law = options.setting, options.objective, registry.law_of(options.params)
-    loop = ControlLoop(setting.physics, setting.rules, law)
+    setting, objective = options.setting, options.objective
+    loop = control_loop(options.params, setting, smooth=False)
     period, rules = setting.physics.control_period, setting.rules
     params = jax.vmap(options.space.params)(gradients.per_world(vector, worlds))
 
@@ -288,7 +283,7 @@ def _run_trials(
         (moved,) = trial.advance([batch], loop, round(options.window / period))
         return moved, (state, inputs, score(state, 1.0, 0.0), ~state.done)
 
-    first = trial.start_all(worlds, params, jnp.ones(len(worlds.qpos), bool), law=law)
+    first = trial.start_all(worlds, params, jnp.ones(len(worlds.qpos), bool), law=loop.law)
     count = max(1, round(float(rules.horizon) / options.window))
     last, (states, inputs, scores, live) = jax.lax.scan(proceed, first, length=count)
     rest = score(last, 1.0 * last.success, jnp.minimum(last.min_distance, _FAR)) - scores
@@ -301,12 +296,14 @@ def _differentiate(
     trials: Trial, at: jax.Array,
 ) -> jax.Array:  # fmt: skip
     """Return the derivatives (m, p) of the scores of windows from the states `at` (m, 2)."""
-    setting, law, objective = options.setting, options.smooth, options.objective
+    setting, objective = options.setting, options.objective
+    # A law without a smooth form has the derivatives between its switches.
+    smooth = registry.law_of(options.params).temperatures is not None
+    loop = control_loop(options.params, setting, smooth=smooth)
     period, rules = setting.physics.control_period, setting.rules
-    loop = ControlLoop(setting.physics, rules, law)
     worlds, states = rows(worlds, at[:, 1]), rows(trials, (at[:, 0], at[:, 1]))
     thetas = gradients.per_world(vector, at)
-    start = partial(trial.start, law=law)
+    start = partial(trial.start, law=loop.law)
     fresh = jax.eval_shape(jax.vmap(start), worlds, jax.vmap(options.space.params)(thetas))
     states = jax.tree.map(lambda x, y: x.astype(y.dtype), states, fresh)
 
@@ -354,19 +351,23 @@ def features(world: World, params: LawParams, state: Trial, loop: ControlLoop) -
     cosine, turn = way / jnp.maximum(planar.norm(way), 1e-3)
     position, _ = trial.object_pose(state.qpos)
     ahead, centre = planar.rotate(-yaw, position - state.qpos[:2])
-    offset = contact * point[1]
+    turned = 1 - cosine
     period, rules = loop.physics.control_period, loop.rules
-    return jnp.stack(
-        [
-            contact, distance, distance**2, contact * distance,
-            1 - cosine, turn**2, distance * (1 - cosine),
-            offset**2, offset * turn, jnp.clip(ahead, 0.0, _FAR),
-            jnp.clip(centre, -1.0, 1.0) ** 2, jnp.clip(centre, -1.0, 1.0) * turn,
-            jnp.clip(centre, -1.0, 1.0) * offset, jnp.clip(state.qvel[8], -1.0, 1.0) ** 2,
-            state.steps * period / rules.horizon,
-            state.lost_steps * period / max(float(rules.max_lost), 1e-6),
-        ]
-    )  # fmt: skip
+    even = [
+        contact,
+        distance,
+        turned,
+        distance**2,
+        contact * distance,
+        distance * turned,
+        jnp.clip(ahead, 0.0, _FAR),
+        jnp.clip(state.qvel[8], -1.0, 1.0) ** 2,
+        state.steps * period / rules.horizon,
+        state.lost_steps * period / max(float(rules.max_lost), 1e-6),
+    ]
+    odd = jnp.stack([contact * point[1], turn, jnp.clip(centre, -1.0, 1.0)])
+    pairs = jnp.outer(odd, odd)[jnp.triu_indices(3)]  # which mirrored worlds share
+    return jnp.concatenate([jnp.stack(even), pairs])
 
 
 def fit(moments: np.ndarray, ridge: float = 1.0) -> np.ndarray:
