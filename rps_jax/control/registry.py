@@ -309,12 +309,12 @@ def resolve_law(law: LawLike, index: int = 0) -> tuple[str, LawParams]:
         rule = f"give parameters, as {law.__name__}()"
         raise errors.not_allowed("law", f"the class {law.__name__}", rule)
     law_of(law)
-    law = freeze_functions(law)
+    frozen: LawParams = freeze_functions(law)
     presets = {name: params for name, params in LAWS.items() if type(params) is type(law)}
     for name, params in presets.items():
-        if leaves_to_json(params) == leaves_to_json(law):
-            return name, law
-    return f"{next(iter(presets), type(law).__name__)}_{index + 1}", law
+        if leaves_to_json(params) == leaves_to_json(frozen):
+            return name, frozen
+    return f"{next(iter(presets), type(law).__name__)}_{index + 1}", frozen
 
 
 def resolve_laws(laws: LawsLike) -> dict[str, LawParams]:

@@ -80,7 +80,7 @@ class Coordinate(NamedTuple):
     is_parameter: bool = False
 
     @property
-    def index(self) -> tuple[Any, ...]:
+    def leaf_index(self) -> tuple[Any, ...]:
         """Index of the scalar in a batch of its leaf."""
         return (slice(None), *self.entry) if self.is_parameter else ()
 
@@ -217,7 +217,7 @@ def _gradients(
             (value[law, at], extra), by_leaf = jax.device_get(run(trees, leaves))
             aux[law].append(extra)
             for k, (x, slope) in enumerate(zip(coordinates, slopes, strict=True)):
-                products = (y * by_leaf[name][x.index] for name, y in slope.items())
+                products = (y * by_leaf[name][x.leaf_index] for name, y in slope.items())
                 gradient[law, at, k] = sum(y.reshape(at.size, -1).sum(axis=1) for y in products)
             size[law, first] = change * _sizes(coordinates, drawn, leaves)[: first.size]
             move = partial(_moved_scores, run, trees, leaves, coordinates, slopes)
@@ -508,7 +508,7 @@ def _sizes(coordinates: Sequence[Coordinate], drawn: Draw, leaves: Mapping[str, 
     for x in coordinates:
         value: Any = drawn.values.get(x.name, np.ones(drawn.indices.size))
         if x.is_parameter:
-            value = leaves[f"params.{x.name}"][x.index]
+            value = leaves[f"params.{x.name}"][x.leaf_index]
         elif x.name in _VECTORS:
             value = np.asarray(named_leaves(drawn)[_VECTORS[x.name]])[:, x.entry[0]]
         columns.append(np.maximum(np.abs(value), _SMALLEST))
@@ -536,7 +536,7 @@ def _moved_scores(
         moved = {name: np.array(leaf[index]) for name, leaf in leaves.items()}
         for slot, (i, k) in enumerate(chunk):
             for name, slope in slopes[k].items():
-                moved[name][(slot, *coordinates[k].index[1:])] += change[i, k] * slope[i]
+                moved[name][(slot, *coordinates[k].leaf_index[1:])] += change[i, k] * slope[i]
         (values, _), _ = jax.device_get(run(jobs.rows(inputs, index), moved))
         scores[tuple(chunk.T)] = values[: len(chunk)]
     return scores
@@ -602,6 +602,7 @@ def _notes(
             "pushes with any force: limit it by robot='kairos' or domain='real', with an engine "
             "other than quasistatic."
         )
+    useless: Any = (useful < 0.5).any(axis=0)
     is_zero: Any = ~gradient.any(axis=(0, 1))
     bent: Any = (bend > _MAX_BEND).any(axis=0)
     is_empty: Any = ~np.isfinite(gradient).any(axis=1).all(axis=0)
@@ -610,7 +611,7 @@ def _notes(
         (used & is_zero & ~is_mass, "Derivatives of zero in every world within the horizon:"),
         (bent, "No derivatives in worlds whose numbers have a kink (see finite):"),
         (is_empty, f"No world of {len(bend)} has a finite derivative, so the mean is NaN:"),
-        ((useful < 0.5).any(axis=0), _USELESS),
+        (useless, _USELESS),
     ):
         labels = [x.label for x, chosen in zip(coordinates, mask, strict=True) if chosen]
         if labels:

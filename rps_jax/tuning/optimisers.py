@@ -57,8 +57,9 @@ def optimiser(
       InputError: optax has none of this name, or it needs more than gradients and a rate.
     """
     rate = SCHEDULES[errors.check_name("schedule", schedule, SCHEDULES)](learning_rate, steps)
-    rule, known = name, optimisers()
+    rule: Any = name
     if isinstance(name, str):
+        known = optimisers()
         rule = known[errors.check_name("optimiser", name, known)]
     elif not isinstance(name, optax.GradientTransformation):
         raise errors.not_allowed("optimiser", name, "give a name or a transformation of optax")
