@@ -165,7 +165,7 @@ class TuneGrad(Descent):
         if not proposal["windows"] or generation == self.steps:
             worlds = self.worlds if generation < self.steps else 0
             results, slopes = self.try_step(proposal, generation, score, worlds)
-            return {**results, **gradient_results(slopes), "cosine": np.nan}
+            return {**results, **gradient_results(slopes), "cosine": np.nan, "windows": 0.0}
         vector, moments = jnp.asarray(proposal["vectors"][0]), proposal["moments"]
         times: dict[str, float] = dict.fromkeys(TIMES, 0.0)
         anchor = generation - generation % self.refresh
