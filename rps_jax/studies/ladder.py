@@ -21,7 +21,8 @@ from rps_jax.analysis import statistics, tables
 from rps_jax.analysis.figures.style import WIDTH, Figure, panel, styled
 from rps_jax.control import registry
 from rps_jax.control.base import Senses
-from rps_jax.laws import LawLike, LawParams, LawsLike, law_of, resolve_law
+from rps_jax.control.registry import LawLike
+from rps_jax.laws import LawParams, LawsLike, law_of, resolve_law
 from rps_jax.questions import MultiLawQuestion, Picture, Run, Section, call_of, option
 from rps_jax.record.files import JsonObject
 from rps_jax.robot.robot import RobotLike
