@@ -30,10 +30,9 @@ import rps_jax
 from rps_jax import RPSParams
 from rps_jax.analysis import tables
 from rps_jax.analysis.figures import tuning as figures
-from rps_jax.robot.skin import IdealSkin
-from rps_jax.trials.case import Case
+from rps_jax.laws import Space
 from rps_jax.tuning import gradients
-from rps_jax.tuning.space import Space
+from rps_jax.worlds import Case, IdealSkin
 from sweeps import render_tables
 from sweeps.gradients import estimators
 
@@ -211,5 +210,5 @@ drawing.races(logs)
 # One step by gradients gains as much as the first generation of evolution, at equal cost. Further
 # steps by gradients gain nothing and steer ever more, perhaps because 8 s do not contain the later
 # effect on the contact. Evolution that continues from there, with a small spread, needs many
-# generations to improve. Today `rps tune grad` follows slopes of whole trials instead:
-# `sweeps/gradients` has its race.
+# generations to improve. Today `rps tune grad` follows derivatives of windows with a value function
+# that knows failures, and then slopes of whole trials. `sweeps/gradients` has a race of slopes.

@@ -13,24 +13,41 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, TypeVar, get_args
+from typing import Annotated, Any, TypeVar, get_args
 
 import jax
 import numpy as np
 
 from rps_jax import errors
 from rps_jax.control import laws, sources, validation
-from rps_jax.control.base import Law, LawParams, Params, Senses, Smoothing, named_leaves
+from rps_jax.control.base import (
+    Law,
+    LawParams,
+    Params,
+    Senses,
+    Smoothing,
+    bounds_of,
+    named_leaves,
+)
 from rps_jax.control.learned import policy
 from rps_jax.errors import InputError
 from rps_jax.record import files
 from rps_jax.record.files import JsonObject
+from rps_jax.record.manifest import Stored
 from rps_jax.record.options import parse_changes
 
 T = TypeVar("T")  # a pytree
 # Both are `Any` for the command line, which reads a text; a program may pass parameters.
-LawLike = str | Any  # text that names a law, or parameters of its class
-LawsLike = str | Any | Sequence[Any] | Mapping[str, Any]  # one law or several, or labelled laws
+STORED_LAW = Stored(lambda name, law: {name: params_to_json(resolve_law(law)[1])})
+STORED_LAWS = Stored(
+    lambda name, laws: {name: {k: params_to_json(x) for k, x in resolve_laws(laws).items()}},
+    lambda name, entries, folder: {
+        label: params_from_json(values, folder) for label, values in dict(entries[name]).items()
+    },
+)
+LawLike = Annotated[str | Any, STORED_LAW]  # text that names a law, or parameters of its class
+# One law or several, or labelled laws.
+LawsLike = Annotated[str | Any | Sequence[Any] | Mapping[str, Any], STORED_LAWS]
 
 LAWS: dict[str, LawParams] = {}  # parameters of all offered laws, by name
 _HIDDEN: dict[str, LawParams] = {}  # of laws that are not offered: names with an underscore
@@ -76,7 +93,12 @@ def replace_leaves(tree: T, changes: Mapping[str, Any]) -> T:
 
 
 def law_of(params: LawParams | type) -> Law:
-    """Return the law of parameters, or of their class; InputError if there is none."""
+    """Return the law of parameters, or of their class; InputError if there is none.
+
+    Examples:
+      >>> law_of(resolve_law("rps_plus")[1]).senses
+      'touch'
+    """
     kind = params if isinstance(params, type) else type(params)
     if kind not in _LAWS_BY_CLASS:
         known = ", ".join(known.__name__ for known in _LAWS_BY_CLASS)
@@ -157,6 +179,7 @@ def register_law(name: str, law: Law, params: LawParams) -> None:
         raise errors.not_allowed(f"params of law '{name}'", params, rule)
     errors.check_finite(f"d_success of law '{name}'", params.d_success, above=0, unit="m")
     law.check(params)
+    law = law if law.bounds else replace(law, bounds=bounds_of(kind))
     for parameter in dict(law.bounds):
         errors.check_name(f"bound of law '{name}'", parameter, named_leaves(params))
     for label, known in (_HIDDEN | LAWS).items():
@@ -185,7 +208,8 @@ def parse_law(text: str) -> tuple[str, LawParams]:
     """
     label, params = _parse_head(str(text).partition(",")[0])
     head, changes = parse_changes("law", str(text))
-    values = {name: errors.check_number(f"{head} {name}", x) for name, x in changes.items()}
+    shapes = {name: np.shape(leaf) for name, leaf in named_leaves(params).items()}
+    values = {k: _parse_leaf(f"{head} {k}", x, shapes.get(k, ())) for k, x in changes.items()}
     words = str(text).split(",")[1:]
     parts = (Path(x).stem if files.suffix_of(x) == ".json" else x for x in words)
     label = ",".join([label, *parts])
@@ -200,6 +224,16 @@ def parse_law(text: str) -> tuple[str, LawParams]:
                 )
                 raise errors.not_allowed("law", text, rule)
     return label, changed
+
+
+def _parse_leaf(field: str, value: Any, shape: tuple[int, ...]) -> Any:
+    """Return a number, or an array of this shape of nested lists, or raise InputError."""
+    if not shape:
+        return errors.check_number(field, value)
+    several = np.array(value, object)
+    if several.shape != shape:
+        raise errors.not_allowed(field, f"of shape {several.shape}", f"give numbers {shape}")
+    return np.reshape([errors.check_number(field, x) for x in several.flat], shape)
 
 
 def _parse_head(text: str) -> tuple[str, LawParams]:
@@ -256,6 +290,11 @@ def resolve_law(law: LawLike, index: int = 0) -> tuple[str, LawParams]:
 
     The label of parameters is the name of the law; with a number, `index` + 1, unless they are one
     of its presets.
+
+    Examples:
+      >>> label, params = resolve_law("rps,K_h=0.5")
+      >>> label, params.K_h
+      ('rps,K_h=0.5', 0.5)
     """
     if isinstance(law, str):
         return parse_law(law)

@@ -2,7 +2,7 @@
 
 All worlds of a batch share the engine's stage; each world has a row of its fields, a pytree. JAX
 traces most engines: their stage drives a batch in a compiled program. An engine that JAX does not
-trace (`traced = False`) steps worlds on the host: see `mujoco.Batch`.
+trace (`traced = False`) steps worlds on the host: see `HostBatch`.
 """
 
 from __future__ import annotations
@@ -87,6 +87,27 @@ class Stage(Protocol):
         ...
 
 
+class HostBatch(Protocol):
+    """Worlds that an engine steps on the host, in double precision."""
+
+    def set_positions(self, rows: np.ndarray, qpos: np.ndarray) -> None:
+        """Set the positions (n, 10) of the worlds `rows` (n,)."""
+        ...
+
+    def drive(self, rows: np.ndarray, twist: np.ndarray, substeps: int) -> None:
+        """Step the worlds `rows` (n,) with their bases at `twist` (n, 3), in the base's frame."""
+        ...
+
+    @property
+    def driven(self) -> Driven:
+        """Motion and force of all worlds, as arrays of NumPy."""
+        ...
+
+    def close(self) -> None:
+        """Release what the batch uses."""
+        ...
+
+
 class Engine(abc.ABC):
     """Base class of engines; class variables declare their abilities."""
 
@@ -133,7 +154,7 @@ class Engine(abc.ABC):
         """Raise InputError unless the engine can step worlds with these surroundings."""
         for name, value in surroundings._asdict().items():
             if value is not None and name not in self.surroundings:
-                known = [x for x in engines.ENGINES if name in engines.get(x).surroundings]
+                known = [x for x in engines.names() if name in engines.get(x).surroundings]
                 raise self._refused(f"it has no {name}; choose {' or '.join(known)}")
 
     def check_senses(self, senses: str) -> None:
@@ -149,7 +170,7 @@ class Engine(abc.ABC):
     def check_derivatives(self, mode: Mode) -> None:
         """Raise InputError unless a trial can be differentiated in this mode."""
         if mode not in self.modes:
-            known = [name for name in engines.ENGINES if mode in engines.get(name).modes]
+            known = [name for name in engines.names() if mode in engines.get(name).modes]
             raise self._refused(f"it has no {mode}-mode derivatives; choose {' or '.join(known)}")
 
     def guard_derivatives(self, tree: T) -> T:
@@ -176,6 +197,15 @@ class Engine(abc.ABC):
         The constants that MuJoCo derives when it compiles a model are computed for all worlds at
         once.
         """
+
+    def open_batch(
+        self, stage: Any, qpos: np.ndarray, threads: int, robots: Robot | None, fields: Any
+    ) -> HostBatch:
+        """Return worlds at rest at `qpos` (n, 10), of an engine that JAX does not trace.
+
+        `robots` (n,) have a limited force; `stage` and `fields` (n, ...) are those of `stage()`.
+        """
+        raise NotImplementedError
 
     def slots(self, backend: str) -> int:
         """Return the number of worlds that one worker steps at once on a backend."""

@@ -8,20 +8,21 @@ that has ended stays as it is, and a batch stops when all its trials have ended.
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import functools
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from types import MappingProxyType
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from rps_jax import errors
+from rps_jax import spec
 from rps_jax.control import soft
 from rps_jax.control.base import Law, LawParams
 from rps_jax.control.laws import rps
@@ -35,7 +36,7 @@ from rps_jax.control.observation import (
     displacement,
 )
 from rps_jax.engines import native
-from rps_jax.engines.base import ControlPeriod, Driven, Motion, Stage
+from rps_jax.engines.base import ControlPeriod, Driven, Engine, Motion, Stage
 from rps_jax.geometry import footprint as fp
 from rps_jax.geometry import planar
 from rps_jax.geometry.arrays import Array, Bool, Bools, Float, Floats, Ints, Scalar, Vector
@@ -45,6 +46,7 @@ from rps_jax.robot.base import Load, Odometry
 from rps_jax.robot.drive import Drive
 from rps_jax.robot.robot import Robot
 from rps_jax.robot.skin import NONE, IdealSkin, Reading, Skin, SkinState
+from rps_jax.spec import Spec
 from rps_jax.world.physics import Physics
 from rps_jax.world.scene import JOINTS
 from rps_jax.world.tasks import reach
@@ -58,18 +60,24 @@ _MAX_DISTANCE = 100.0  # [m]
 class Rules(NamedTuple):
     """When a trial ends (Sec. III-B); of objects that fall over the paper says nothing."""
 
-    horizon: Scalar = 300.0
-    """Time after which a trial has failed [s]."""
-    max_lost: Scalar = 150.0
-    """Time without contact, in all after the first touch, after which it has failed [s]."""
-    max_tilt: Scalar = math.pi / 4
-    """Tilt from which on an object has fallen over [rad]."""
+    horizon: Annotated[
+        Scalar, Spec("s", "Time after which a trial has failed [s].", gt=0, le=1e5)
+    ] = 300.0
+    max_lost: Annotated[
+        Scalar,
+        Spec(
+            "s",
+            "Time without contact, in all after the first touch, after which it has failed [s].",
+            ge=0,
+        ),
+    ] = 150.0
+    max_tilt: Annotated[
+        Scalar, Spec("rad", "Tilt from which on an object has fallen over [rad].", gt=0, le=1.4)
+    ] = math.pi / 4
 
     def check(self) -> None:
-        """Raises InputError for times that are not positive and finite, or no tilt."""
-        errors.check_finite("horizon", self.horizon, above=0, at_most=1e5, unit="s")
-        errors.check_finite("max_lost", self.max_lost, at_least=0, unit="s")
-        errors.check_finite("max_tilt", self.max_tilt, above=0, at_most=1.4, unit="rad")
+        """Raise InputError for times that are not positive and finite, or no tilt."""
+        spec.check(self)
 
 
 @partial(jax.tree_util.register_dataclass, data_fields=["rules"], meta_fields=["physics", "law"])
@@ -85,9 +93,13 @@ class ControlLoop:
 class Shift(NamedTuple):
     """The object is moved by a hand during the push, as in the paper's video."""
 
-    time: float | Float[Array | np.ndarray, "*B"] = jnp.inf  # [s]
-    # [m] how far, in the robot frame
-    p_robot: tuple[float, float] | Float[Array | np.ndarray, "*B 2"] = (0.0, 0.0)
+    time: Annotated[
+        float | Float[Array | np.ndarray, "*B"], Spec("s", "time of the shift", le=math.inf)
+    ] = jnp.inf
+    p_robot: Annotated[
+        tuple[float, float] | Float[Array | np.ndarray, "*B 2"],
+        Spec("m", "length and direction in the robot frame"),
+    ] = (0.0, 0.0)
 
 
 class World(NamedTuple):
@@ -148,20 +160,30 @@ class Snapshot(NamedTuple):
 class Outcome(NamedTuple):
     """The result of one trial."""
 
-    success: Bools
-    time: Floats  # [s] at which it ended
-    min_distance: Floats  # [m] contact point to target; inf if never touched
-    contact_lost_time: Floats  # [s]
-    path_length: Floats  # [m] of the base's way
-    mean_abs_l: Floats  # [m] the paper's D; NaN if never touched
-    tilt: Floats  # [rad] greatest tilt of the object
-    tipped: Bools  # the object has fallen over
-    diverged: Bools
-    nan_twist: Bools  # it diverged since the law returned a twist that is not finite
-    stalled: Bools  # it ended with the base standing still against the object
-    unfelt: Bools  # it ended without contact on the skin, but against the object
-    base_pose: Float[Array, "*B 3"]  # [m, m, rad] in the world, at the end
-    object_pose: Float[Array, "*B 3"]  # [m, m, rad] of the object in the world, at the end
+    success: Annotated[Bools, Spec("1", "target reached within the rules")]
+    time: Annotated[Floats, Spec("s", "simulated time at which the trial ended")]
+    # Infinite if it never touched.
+    min_distance: Annotated[Floats, Spec("m", "least distance of the contact point to the target")]
+    contact_lost_time: Annotated[Floats, Spec("s", "time without contact after the first touch")]
+    path_length: Annotated[Floats, Spec("m", "length of the base's way")]
+    # NaN if it never touched.
+    mean_abs_l: Annotated[Floats, Spec("m", "mean |l| while in contact, the paper's D")]
+    tilt: Annotated[Floats, Spec("rad", "greatest tilt of the object")]
+    tipped: Annotated[Bools, Spec("1", "the object fell over")]
+    diverged: Annotated[Bools, Spec("1", "physics became NaN or ran away")]
+    nan_twist: Annotated[
+        Bools, Spec("1", "it diverged since the law returned a twist that is not finite")
+    ]
+    stalled: Annotated[
+        Bools, Spec("1", "it ended with the base standing still, whose force was too small")
+    ]
+    unfelt: Annotated[Bools, Spec("1", "it ended against the object, but the skin felt no contact")]
+    base_pose: Annotated[
+        Float[Array, "*B 3"], Spec("m, m, rad", "x, y, yaw of the base in the world at the end")
+    ]
+    object_pose: Annotated[
+        Float[Array, "*B 3"], Spec("m, m, rad", "x, y, yaw of the object in the world at the end")
+    ]
     task: Mapping[str, Array] = MappingProxyType({})  # by name: see `Task.OUTCOMES`
 
     def columns(self) -> dict[str, Any]:
@@ -185,7 +207,9 @@ def object_pose(qpos: Float[Array, "10"]) -> tuple[Vector, Float[Array, ""]]:
 def p_world_contact(snapshots: Snapshot) -> Float[Array, "T 2"]:
     """Return the contact points of snapshots (T, ...) in the world [m]; NaN without contact."""
     qpos, reading = snapshots.qpos, snapshots.reading
-    point = qpos[:, :2] + planar.rotate(qpos[:, 2], reading.p_robot_contact)
+    point = qpos[:, JOINTS.base_position] + planar.rotate(
+        qpos[:, JOINTS.base_yaw], reading.p_robot_contact
+    )
     return jnp.where((reading.contact_type != NONE)[:, None], point, jnp.nan)
 
 
@@ -215,14 +239,14 @@ def shifted(world: World, trial: Trial, period: float) -> Trial:
     """Return the trial with the world's scripted shift, if it is due in this control step."""
     # Compare step numbers: rounded times could be equal twice or never.
     due = trial.steps == jnp.round(world.shift.time / period)
-    offset = planar.rotate(trial.qpos[2], jnp.asarray(world.shift.p_robot))
+    offset = planar.rotate(trial.qpos[JOINTS.base_yaw], jnp.asarray(world.shift.p_robot))
     x = JOINTS.object.start
     return trial._replace(qpos=trial.qpos.at[x : x + 2].add(jnp.where(due, offset, 0.0)))
 
 
 def outline(world: World, qpos: Float[Array, "10"]) -> Footprint:
     """Return the object's outline in the robot frame, at the positions qpos."""
-    p_world_robot, yaw = qpos[:2], qpos[2]
+    p_world_robot, yaw = qpos[JOINTS.base_position], qpos[JOINTS.base_yaw]
     p_world_object, object_yaw = object_pose(qpos)
     p_robot_object = planar.rotate(-yaw, p_world_object - p_world_robot)
     return fp.place(world.footprint, p_robot_object, object_yaw - yaw)
@@ -230,7 +254,7 @@ def outline(world: World, qpos: Float[Array, "10"]) -> Footprint:
 
 def contact_of(qpos: Float[Array, "10"], p_robot_contact: Vector) -> Vector:
     """Return a contact point in the world [m]."""
-    return qpos[:2] + planar.rotate(qpos[2], p_robot_contact)
+    return qpos[JOINTS.base_position] + planar.rotate(qpos[JOINTS.base_yaw], p_robot_contact)
 
 
 def positions_of(
@@ -271,7 +295,8 @@ def observe(
     trial = shifted(world, trial, period)
     skin, reading = world.skin.sense(trial.skin, outline(world, trial.qpos), period)
     touched = reading.p_robot_contact, reading.in_contact
-    observation = Observation(trial.qpos[:2], trial.qpos[2], *touched, world.p_world_target, period)
+    pose = trial.qpos[JOINTS.base_position], trial.qpos[JOINTS.base_yaw]
+    observation = Observation(*pose, *touched, world.p_world_target, period)
     observation = observation._replace(base_radius=world.skin.shell.radius)
     distance = planar.norm(displacement(observation))
     motion = trial.poses, trial.qpos[JOINTS.base], world.key, trial.steps, period
@@ -284,7 +309,7 @@ def observe(
     task, aim = world.task.step(trial.task, positions)
     observation = observation._replace(p_world_target=aim.p_world_target)
     success = touch & (distance < params.d_success) & aim.at_end
-    tilt = planar.tilt(trial.qpos[JOINTS.object][3:])
+    tilt = planar.tilt(trial.qpos[JOINTS.object_quaternion])
     tipped = tilt > rules.max_tilt
     over = (time >= rules.horizon) | (lost_steps * period > rules.max_lost) | tipped | aim.failed
     judged = trial._replace(
@@ -334,7 +359,7 @@ def perceive(
     if law.senses == "taxels":
         skin = world.skin, judged.skin, outline(world, judged.qpos)
         obs = features.taxel_observation(obs, measured.reading, *skin)
-    if judged.load is not None:
+    if judged.load is not None and law.senses == "force":
         load, force = law.cell.read(
             judged.load, world.key, judged.steps, loop.physics.control_period
         )
@@ -366,11 +391,13 @@ def settle(world: World, previous: Trial, decided: Trial, driven: Driven) -> Tri
     A trial that had ended before, as `previous` says, is returned as it was.
     """
     (qpos, qvel, warmstart, integral), force, *_ = driven
+    xy = JOINTS.base_position
     sane = (
         ~decided.nan_twist
         & jnp.all(jnp.isfinite(qpos))
         & jnp.all(jnp.abs(qvel) < _MAX_SPEED)
-        & jnp.all(jnp.abs(qpos.at[2].set(0.0)) < _MAX_DISTANCE)  # the base may turn without limit
+        # The base may turn without limit.
+        & jnp.all(jnp.abs(qpos.at[JOINTS.base_yaw].set(0.0)) < _MAX_DISTANCE)
     )
     state = decided.drive
     if world.robot is not None and state is not None:
@@ -380,7 +407,7 @@ def settle(world: World, previous: Trial, decided: Trial, driven: Driven) -> Tri
         qpos=qpos,
         qvel=qvel,
         warmstart=warmstart,
-        path_length=decided.path_length + planar.norm(qpos[:2] - decided.qpos[:2]),
+        path_length=decided.path_length + planar.norm(qpos[xy] - decided.qpos[xy]),
         steps=decided.steps + 1,
         drive=state,
         load=decided.load and decided.load._replace(wrench=force),
@@ -406,12 +433,17 @@ def control_step(
 
 
 def _solved_step(
-    stage: Stage, worlds: World, params: LawParams, trials: Trial, loop: ControlLoop,
-    mapped: Callable[..., Any], solutions: Any,
-) -> tuple[tuple[Trial, Snapshot], Any]:  # fmt: skip
+    stage: Stage,
+    worlds: World,
+    params: LawParams,
+    trials: Trial,
+    loop: ControlLoop,
+    mapped: Callable[..., Any],
+    solutions: Any,
+) -> tuple[tuple[Trial, Snapshot], Any]:
     """Run `control_step` with the solutions of `ControlPeriod`; return also those of `Driven`."""
     decided, twists, snapshots = mapped(decide, (0, 0, 0, None))(worlds, params, trials, loop)
-    force = loop.law.senses == "force"
+    force = trials.load is not None
     period = ControlPeriod(twists, loop.physics, pushing(worlds), force, solutions)
     driven = stage.drive(worlds.fields, motion(decided), period)
     result = driven._replace(solutions=None)
@@ -427,19 +459,26 @@ def unroll(
     loop: ControlLoop,
     steps: int,
     mapped: Callable[..., Any] = jax.vmap,
-) -> tuple[Trial, Snapshot]:
+    states: bool = False,
+) -> tuple[Trial, Any]:
     """Run `steps` control steps of a batch; return also snapshots (steps, B, ...).
 
-    In reverse mode it stores the state of each step, some 1 kB. `mapped` is that of
-    `control_step`; with `native.mapped`, derivatives are fastest.
+    With `states`, these are pairs of a snapshot and the state after the step. In reverse mode it
+    stores the state of each step, some 1 kB. `mapped` is that of `control_step`; with
+    `native.mapped`, derivatives are fastest.
     """
 
-    def single(trial: Trial, inputs: Any, solutions: Any) -> tuple[tuple[Trial, Snapshot], Any]:
+    def output(stepped: tuple[Trial, Snapshot]) -> tuple[Trial, Any]:
+        trials, snapshots = stepped
+        return trials, (snapshots, trials) if states else snapshots
+
+    def single(trial: Trial, inputs: Any, solutions: Any) -> tuple[tuple[Trial, Any], Any]:
         """Run one control step of one world."""
         world, params, rules = inputs
         world_loop = dataclasses.replace(loop, rules=rules)
         step = stage, world, params, trial, world_loop, lambda f, *_: f
-        return _solved_step(*step, solutions)
+        stepped, solutions = _solved_step(*step, solutions)
+        return output(stepped), solutions
 
     if mapped is native.mapped and native.compiles(stage):
         rules = jax.tree.map(lambda x: jnp.broadcast_to(x, trials.done.shape), loop.rules)
@@ -447,8 +486,8 @@ def unroll(
 
     # Without a checkpoint, XLA would store all intermediate numbers.
     @partial(jax.checkpoint, prevent_cse=False)
-    def step(trials: Trial, _: None) -> tuple[Trial, Snapshot]:
-        return control_step(stage, worlds, params, trials, loop, mapped)
+    def step(trials: Trial, _: None) -> tuple[Trial, Any]:
+        return output(control_step(stage, worlds, params, trials, loop, mapped))
 
     return jax.lax.scan(step, trials, length=steps)
 
@@ -569,6 +608,48 @@ def advance(
     return tuple(native.concurrent(singles, in_xla, phase)(*inputs))
 
 
+class SegmentState(NamedTuple):
+    """State of a batch of trials after a segment."""
+
+    steps: Any  # (B,) int: control steps of each trial in this segment
+    done: Any  # (B,) bool
+    outcome: Outcome  # (B, ...)
+
+
+def segment_of(
+    physics: Physics, law: Law
+) -> Callable[..., tuple[tuple[Trial, ...], tuple[SegmentState, ...]]]:
+    """Return a function that starts fresh trials of batches, and runs some control steps of all.
+
+    Its arguments are stages, inputs and trials of the batches; masks (B,) of the trials that start
+    and of those that are no padding; rules, and a number of steps. It returns the trials and their
+    states.
+    """
+
+    def segment(
+        stages: tuple[Stage, ...],
+        inputs: tuple[tuple[World, LawParams], ...],
+        trials: tuple[Trial, ...],
+        fresh: tuple[jax.Array, ...],
+        live: tuple[jax.Array, ...],
+        rules: Rules,
+        steps: jax.Array,
+    ) -> tuple[tuple[Trial, ...], tuple[SegmentState, ...]]:
+        pairs = zip(inputs, live, strict=True)
+        started = [start_all(*leaves, mask, law=law) for leaves, mask in pairs]
+        current = tuple(map(jax.vmap(soft.tree_where), fresh, started, trials))
+        loop = ControlLoop(physics, rules, law)
+        batches = zip(stages, inputs, current, strict=True)
+        advanced = advance([(stage, *x, state) for stage, x, state in batches], loop, steps)
+        # Outcomes are in the same program: another one would wait for other workers' segments.
+        return advanced, tuple(
+            SegmentState(b.steps - a.steps, b.done, outcome(b, worlds, loop))
+            for a, b, (worlds, _) in zip(current, advanced, inputs, strict=True)
+        )
+
+    return segment
+
+
 def _advance_in_xla(
     batches: Sequence[Batch], loop: ControlLoop, steps: int | jax.Array
 ) -> tuple[Trial, ...]:
@@ -594,3 +675,42 @@ def _advance_in_xla(
         return step(0, carry) if on_cpu else jax.lax.fori_loop(0, _UNCHECKED, step, carry)
 
     return jax.lax.while_loop(any_runs, body, (0, tuple(batch[-1] for batch in batches)))[1]
+
+
+# --- engines that JAX does not trace -------------------------------------------------------
+
+_decide = jax.jit(jax.vmap(decide, (0, 0, 0, None)))
+_settle = jax.jit(jax.vmap(settle))
+compiled_outcome = jax.jit(outcome)
+
+
+def run_on_host(
+    engine: Engine, stage: Any, worlds: World, params: LawParams, loop: ControlLoop, threads: int
+) -> Iterator[Trial]:
+    """Run a batch of worlds to their ends with an engine that JAX does not trace.
+
+    Sensing, laws and rules run in JAX. The engine gets positions in the precision of JAX and steps
+    them in its own precision. `threads` is its number of threads.
+
+    Yields:
+      Trials at the start and after each control step.
+    """
+    worlds, params = jax.device_put((worlds, params), jax.devices("cpu")[0])
+    trials = start_all(worlds, params, np.ones(len(worlds.qpos), bool), law=loop.law)
+    dtype, qpos = trials.qpos.dtype, np.asarray(trials.qpos, float)
+    yield trials
+    opened = engine.open_batch(stage, qpos, threads, pushing(worlds), worlds.fields)
+    with contextlib.closing(opened) as batch:
+        while not np.asarray(trials.done).all():
+            decided, twist, _ = _decide(worlds, params, trials, loop)
+            qpos, running = np.asarray(decided.qpos), np.flatnonzero(~np.asarray(decided.done))
+            # Only a scripted shift moves the object outside of the engine.
+            moved = np.flatnonzero(np.any(qpos != np.asarray(trials.qpos), axis=1))
+            batch.set_positions(moved, qpos[moved])
+            if running.size:
+                twists = np.stack(twist, axis=1)[running].astype(float)
+                batch.drive(running, twists, loop.physics.substeps)
+            driven = jax.tree.map(lambda x: x.astype(dtype), batch.driven)
+            driven = driven if loop.law.senses == "force" else driven._replace(force=None)
+            trials = _settle(worlds, trials, decided, driven)
+            yield trials

@@ -11,7 +11,7 @@ from rps_jax.geometry import solid
 from rps_jax.geometry.footprint import Footprint
 from rps_jax.robot.base import Odometry
 from rps_jax.robot.skin import CapacitiveSkin, IdealSkin, Skin
-from rps_jax.trials.batch import WorldBatch
+from rps_jax.trials.jobs import WorldBatch
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import Shift, World
 from rps_jax.world import scene
@@ -111,7 +111,7 @@ def starts(drawn: Draw) -> np.ndarray:
 
 def remembered_steps(domain: Domain, period: float) -> int:
     """Return the number of control steps of `period` [s] that the odometry remembers."""
-    if all(getattr(domain, name) == Range(0, 0) for name in quantities_of("base")):
+    if all(domain.range_of(name) in (None, Range(0, 0)) for name in quantities_of("base")):
         return 0
     return 1 + round(max(domain.pose_latency.high, domain.command_delay.high) / period)
 

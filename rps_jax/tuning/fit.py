@@ -11,7 +11,6 @@ floor.
 
 from __future__ import annotations
 
-import dataclasses
 import math
 import textwrap
 from collections.abc import Callable, Mapping, Sequence
@@ -53,7 +52,7 @@ from rps_jax.runs.question import (
     call_of,
 )
 from rps_jax.trials import trial
-from rps_jax.trials.batch import rows
+from rps_jax.trials.jobs import rows
 from rps_jax.trials.progress import Progress, set_phase
 from rps_jax.trials.setting import Setting, Split, seed_of
 from rps_jax.trials.trial import ControlLoop, Trial, World, object_pose
@@ -446,17 +445,17 @@ def fitted_domain(domain: Domain, data: xr.Dataset) -> Domain:
     """
     intervals = data[["low", "high"]].isel(quantity=data.undetermined.values == 0).to_dataframe()
     changes: dict[str, Any] = {
-        str(name): Range(float(row.low), float(row.high), getattr(domain, str(name)).log)
+        str(name): Range(float(row.low), float(row.high), interval.log)
         for name, row in intervals.iterrows()
-        if name in QUANTITIES
+        if name in QUANTITIES and (interval := domain.range_of(str(name))) is not None
     }
     velocity = intervals.reindex(VELOCITY_ERRORS)
     if velocity.low.notna().all():
         changes["velocity_error"] = Range(float(velocity.low.min()), float(velocity.high.max()))
     objects = tuple(map(str, data.object.values[data.probability.values >= 0.05]))
     if not set(objects) & domains.RANDOM.keys():  # these draw no mass
-        changes |= {name: getattr(Domain, name) for name in domains.OBJECT_QUANTITIES}
-    return dataclasses.replace(domain, objects=objects, **changes)
+        changes |= {name: getattr(Domain, name, None) for name in domains.OBJECT_QUANTITIES}
+    return domain.with_changes(changes | {"objects": objects})
 
 
 # --- report --------------------------------------------------------------------------------

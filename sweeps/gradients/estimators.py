@@ -15,17 +15,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from rps_jax import Law, Setting
 from rps_jax.control import registry
-from rps_jax.control.base import Law, LawParams
 from rps_jax.engines import native
 from rps_jax.engines.base import Stage
+from rps_jax.laws import LawParams, law_of
+from rps_jax.physics import Physics
 from rps_jax.trials import pushes, trial
-from rps_jax.trials.case import Case
-from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import ControlLoop, Snapshot, Trial, World
 from rps_jax.tuning import gradients
-from rps_jax.tuning.gradients import Options, Scores, per_world, random_steps, repeat
-from rps_jax.world.physics import Physics
+from rps_jax.tuning.gradients import Options, Scores, clip, per_world, random_steps, repeat
+from rps_jax.worlds import Case
 
 
 class Estimator(Protocol):
@@ -129,20 +129,6 @@ ESTIMATORS: dict[str, Estimator] = {
 }
 
 
-def clip(samples: jax.Array, bound: float) -> jax.Array:
-    """Scale samples (n, p, ...) whose norm over p exceeds `bound` times the median norm down to it.
-
-    This biases the mean but keeps a few samples from dominating it. Samples of norm 0 do not count.
-    """
-    scale = jnp.max(jnp.abs(samples), axis=1, keepdims=True)
-    scaled = samples / jnp.where(scale > 0, scale, 1.0)  # whose squares do not overflow
-    size = scale * jnp.sqrt(jnp.sum(scaled**2, axis=1, keepdims=True))
-    # The median of the worlds with a gradient; trials that have ended have none.
-    counted = jnp.where(jnp.isfinite(size) & (size > 0), size, jnp.nan)
-    limit = bound * jnp.nan_to_num(jnp.nanmedian(counted, axis=0))
-    return samples * jnp.where(size == 0, 1.0, jnp.minimum(1.0, limit / size))
-
-
 def mix(first: jax.Array, zeroth: jax.Array) -> jax.Array:
     """Mix samples (n, p, ...) of derivatives and of slopes for the least mean squared error.
 
@@ -212,7 +198,7 @@ def distances(
       (1, 2, 2)
     """
     part = pushes.build(cases, setting)
-    law = registry.smooth_law(registry.law_of(cases[0].params))
+    law = registry.smooth_law(law_of(cases[0].params))
     at = np.round(np.asarray(horizons) / setting.physics.control_period).astype(int)
     scores = jax.jit(distances_at(at, part.stage, params_of, setting.physics, law))
     start = trial.start_all(part.worlds, part.params, np.ones(len(cases), bool), law=law)

@@ -14,30 +14,28 @@ Reference: Xu et al., "Accelerated policy learning with parallel differentiable 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Literal
 
 import jax
 import jax.numpy as jnp
 import optax
 from jax.flatten_util import ravel_pytree
 
-from rps_jax import engines, errors
+from rps_jax import PushEnv, errors
 from rps_jax.control.learned import network as networks
 from rps_jax.control.learned.network import Network, Weights
 from rps_jax.engines import native
-from rps_jax.record.options import option
-from rps_jax.runs.question import call_of
-from rps_jax.trials.env import PushEnv
-from rps_jax.trials.setting import Split
+from rps_jax.physics import get_engine
+from rps_jax.questions import call_of, option
 from rps_jax.trials.trial import World
-from rps_jax.tuning import gradients, ppo, rollout
+from rps_jax.tuning import collection, gradients, ppo
+from rps_jax.tuning.collection import EnvBatch, RunnerState
 from rps_jax.tuning.gradients import Options
 from rps_jax.tuning.learn import Learn
-from rps_jax.tuning.rollout import EnvBatch, RunnerState
 from sweeps.gradients import estimators
 
 
@@ -48,8 +46,8 @@ class WindowLearner(Learn):
     The answer and the run folder are those of `rps learn`.
     """
 
-    TITLE: ClassVar[str] = "A law learned by gradients of short windows"
-    QUICK: ClassVar[Mapping[str, Any]] = {**Learn.QUICK, "setting.engine": "quasistatic"}
+    TITLE = "A law learned by gradients of short windows"
+    QUICK: ClassVar = {**Learn.QUICK, "setting.engine": "quasistatic"}
 
     estimator: str = field(default="clipped", kw_only=True)
     """Estimator of the gradient: exact, clipped, bundled, evolution or mixed."""
@@ -75,18 +73,18 @@ class WindowLearner(Learn):
         super().check()
         errors.check_name("estimator", self.estimator, estimators.ESTIMATORS)
         if self.estimator != "evolution":
-            engine = engines.get(self.setting.engine)
+            engine = get_engine(self.setting.engine)
             engine.check_derivatives("reverse")
 
-    def environments(self, split: Split = "tune") -> list[PushEnv]:
+    def environments(self, split: Literal["test", "tune", "validate"] = "tune") -> list[PushEnv]:
         """Return the environments of a split; those to learn in have a smooth contact."""
         envs = super().environments(split)
         return [replace(env, smooth=True) for env in envs] if split == "tune" else envs
 
     @staticmethod
     def start(options: WindowLearner, *inputs: Any, seed: int = 0) -> RunnerState:
-        """Return the state of `rollout.start` with a second optimiser, of the policy."""
-        runner = rollout.start(options, *inputs, seed=seed)
+        """Return the state of `collection.start` with a second optimiser, of the policy."""
+        runner = collection.start(options, *inputs, seed=seed)
         weights = runner.train.weights | {"log_std": jnp.full(3, math.log(options.noise))}
         optimiser = runner.train.optimiser, _rule(options).init(weights["actor"])
         return runner._replace(train=runner.train._replace(weights=weights, optimiser=optimiser))
@@ -99,7 +97,7 @@ class WindowLearner(Learn):
         tables: Sequence[World],
         runner: RunnerState,
     ) -> tuple[RunnerState, dict[str, jax.Array]]:
-        """Make one update: a step of the policy; then `rollout.update` for all else."""
+        """Make one update: a step of the policy; then `collection.update` for all else."""
         train = runner.train
         states: Any = train.optimiser
         inner, outer = states
@@ -116,7 +114,7 @@ class WindowLearner(Learn):
         change, outer = _rule(options).update(gradient, outer)
         actor = optax.apply_updates(train.weights["actor"], change)
         plain = runner._replace(train=train._replace(optimiser=inner))
-        moved, metrics = rollout.update(options, network, envs, tables, plain)
+        moved, metrics = collection.update(options, network, envs, tables, plain)
         fixed = {"actor": actor, "log_std": train.weights["log_std"]}
         ema = jax.tree.map(lambda a, b: 0.9 * a + 0.1 * b, train.ema, actor)
         next_train = moved.train._replace(
@@ -151,15 +149,15 @@ def window_scores(
 
         @partial(jax.checkpoint, prevent_cse=False)
         def step(batch: EnvBatch, _: None) -> tuple[EnvBatch, jax.Array]:
-            inputs = rollout._inputs(env, batch)[0]
+            inputs = collection._inputs(env, batch)[0]
             hidden, mean = jax.vmap(network.apply)(weights, batch.memory.hidden, inputs)
-            return rollout.act(env, network, batch, hidden, mean, mapped=native.mapped)
+            return collection.act(env, network, batch, hidden, mean, mapped=native.mapped)
 
         last, rewards = jax.lax.scan(step, worlds, length=options.num_steps)
-        _, terminated = rollout._episode_stats(env, last)
+        _, terminated = collection._episode_stats(env, last)
         qpos = last.states.data.qpos
         distance = jnp.linalg.norm(qpos[:, 3:5] - qpos[:, :2], axis=1)
-        value = networks.critic(critic, ppo.critic_inputs(*rollout._inputs(env, last)))
+        value = networks.critic(critic, ppo.critic_inputs(*collection._inputs(env, last)))
         value -= options.approach * distance
         discounts = options.gamma ** jnp.arange(options.num_steps)
         end = options.gamma**options.num_steps * jnp.where(terminated, 0.0, value)

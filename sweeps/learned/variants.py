@@ -11,7 +11,7 @@ validation. The last command collects the results of other run folders.
 from __future__ import annotations
 
 import shlex
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -20,49 +20,48 @@ from typing import Any, ClassVar
 import numpy as np
 import xarray as xr
 
+from rps_jax import Setting, evaluate, load
 from rps_jax.analysis import statistics
 from rps_jax.app.cli import flags
-from rps_jax.record import files, provenance
-from rps_jax.record.options import option
-from rps_jax.runs.evaluate import evaluate
-from rps_jax.runs.question import Run, call_of
-from rps_jax.trials.setting import Setting
+from rps_jax.questions import Run, call_of, option
+from rps_jax.record import provenance
 from rps_jax.tuning.learn import Learn
-from sweeps.study_base import QuickStudy, Table, write_table
+from sweeps.study_base import Parts, QuickStudy, Table, write_table
 
 # `learned_gru.npz` and `learned_mlp.npz` are the laws of 0.3, with which variants start.
 DOMAINS = ("wide", "hostile", "real")
 SHARED = (
     "rps learn --domain wide hostile real --num-envs 1024 --drawn 8192 --validation 128 --every 1.5"
-    " --horizon 300 --max-lost 150 --hard 0.5 --success 2 --failure 1 --anneal 0.4 --average 100"
+    " --horizon 300 --max-lost 150 --prioritised 0.5 --success 2 --failure 1 --anneal 0.4"
+    " --ema-updates 100"
 )
-_WARM = "--initial sweeps/learned/learned_gru.npz --spread 0.25 --learning-rate 2e-4"
+_WARM = "--initial sweeps/learned/learned_gru.npz --action-std 0.25 --learning-rate 2e-4"
 _LIMITS = "robot_force=150:800,robot_traction=0.3:0.8,robot_lag=0:0.5,robot_acceleration=0.1:1"
 _HARD = f"--domain hostile real hostile,{_LIMITS}"
-_CONTINUED = f"--initial learned --spread 0.2 --learning-rate 2e-4 {_HARD}"
+_CONTINUED = f"--initial learned --action-std 0.2 --learning-rate 2e-4 {_HARD}"
 VARIANTS = {  # options after the shared ones
     "scratch": "",
     "warm": _WARM,
     "wide and hostile": f"{_WARM} --domain wide hostile",
     "hard domains": f"{_WARM} {_HARD}",
     "with tasks": f"{_WARM} --domain wide hostile real wide,task=path wide,task=corridor",
-    "uniform worlds": f"{_WARM} --hard 0",
+    "uniform worlds": f"{_WARM} --prioritised 0",
     "reward of 0.2.0": f"{_WARM} --success 1 --failure 0",
     "failures cost 3": f"{_WARM} --failure 3",
     "trials of 120 s": f"{_WARM} --horizon 120 --max-lost 30",
-    "not annealed": f"{_WARM} --anneal 0 --average 20",
+    "not annealed": f"{_WARM} --anneal 0 --ema-updates 20",
     "4,096 worlds": f"{_WARM} --num-envs 4096 --num-minibatches 16",
     "long credit": f"{_WARM} --discount-time 100 --gae-time 10",
     "small steps": f"{_WARM} --target-kl 0.004",
     "width 128": "--width 128",
     "hold 0.1 s": "--hold 0.1",
-    "mlp": "--network mlp --initial sweeps/learned/learned_mlp.npz --spread 0.25"
+    "mlp": "--network mlp --initial sweeps/learned/learned_mlp.npz --action-std 0.25"
     " --learning-rate 2e-4",
     "mlp, width 32": "--network mlp --width 32",
     "continued": _CONTINUED,
     "continued, 4,096 worlds": f"{_CONTINUED} --num-envs 4096 --num-minibatches 16 --seed 1",
     "continued, failures cost 2": f"{_CONTINUED} --num-envs 4096 --num-minibatches 16 --seed 2"
-    " --failure 2 --hard 0.7",
+    " --failure 2 --prioritised 0.7",
 }
 _QUICK_DOMAIN = "wide,objects=random_cylinder"  # also for judging
 QUICK = (
@@ -88,11 +87,11 @@ class Variants(QuickStudy[xr.Dataset]):
     numbers of its run (variant).
     """
 
-    TITLE: ClassVar[str] = "Variants of learning"
+    TITLE = "Variants of learning"
     CHOICES: ClassVar = {"variants": VARIANTS}
-    QUICK: ClassVar[Mapping[str, Any]] = {"variants": ("scratch", "mlp"), "worlds": 4}
-    DIMENSION: ClassVar[str] = "variant"
-    REPORTS_TIMES: ClassVar[bool] = True
+    QUICK: ClassVar = {"variants": ("scratch", "mlp"), "worlds": 4}
+    DIMENSION = "variant"
+    REPORTS_TIMES = True
 
     runs: tuple[str, ...] = option((), positional=True)
     """Run folders of this study, to collect their results."""
@@ -121,7 +120,7 @@ class Variants(QuickStudy[xr.Dataset]):
         words = [*shlex.split(self.command(name))[2:], *options]
         return flags.parse(Learn, "learn", words)[0]
 
-    def parts(self, run: Run) -> Mapping[str, Callable[[], xr.Dataset]]:
+    def parts(self, run: Run) -> Parts:
         """Return the run of each variant, by its name."""
         folder = Path(str(self.out))
         names = () if self.runs else self.variants
@@ -130,7 +129,7 @@ class Variants(QuickStudy[xr.Dataset]):
     def answer(self, run: Run) -> xr.Dataset:
         """Run the variants, or collect the results of other run folders."""
         if self.runs:
-            return xr.concat([files.read_results(Path(x)) for x in self.runs], "variant")
+            return xr.concat([load(x) for x in self.runs], "variant")
         return super().answer(run)
 
     def _learn(self, name: str, folder: Path) -> xr.Dataset:

@@ -31,7 +31,8 @@ from rps_jax.errors import InputError, check_name, suggest
 from rps_jax.record import options
 from rps_jax.record.options import option
 from rps_jax.runs.push import FILM_LENGTH, TraceQuestion
-from rps_jax.runs.question import Command, SimulationQuestion
+from rps_jax.runs.question import Command, SimulationQuestion, current_names
+from rps_jax.spec import Spec, specs_of
 from rps_jax.trials.setting import PhysicsField, Setting
 from rps_jax.trials.trial import Rules
 
@@ -85,6 +86,7 @@ def parse(question_type: type[Q], command: str, words: Sequence[str]) -> tuple[Q
       InputError: an option is unknown, lacks its value, or has one that is not allowed.
       SystemExit: the help was printed.
     """
+    words = [_current_flag(question_type, word) for word in words]
     question, session = _parse(question_type(), command, words)
     if getattr(question, "quick", False):
         quick = dataclasses.replace(question_type(), quick=True).with_quick_values()
@@ -94,11 +96,24 @@ def parse(question_type: type[Q], command: str, words: Sequence[str]) -> tuple[Q
     return question, session
 
 
+def _current_flag(question_type: type[Q], word: str) -> str:
+    """Return a word of the command line, with the present name of a flag that was renamed."""
+    flag, equals, value = word.partition("=")
+    name = flag.removeprefix("--").replace("-", "_") if flag.startswith("--") else ""
+    if name not in question_type.RENAMED:
+        return word
+    (current,) = current_names(question_type, {name: value})
+    return f"--{current.replace('_', '-')}{equals}{value}"
+
+
 def _parse(defaults: Q, command: str, words: Sequence[str]) -> tuple[Q, Session]:
     kinds = type(defaults), session_type(type(defaults))
 
     def raise_sentence(event: _errors.ParseErrorEvent) -> None:
         known = [name for kind in kinds for name in _flag_names(kind)]
+        match event:
+            case _errors.UnrecognizedArgs(tokens=[token, *_]) if token in kinds[0].MOVED:
+                raise InputError(f"unknown option '{token}': {kinds[0].MOVED[token]}.")
         raise InputError(_sentence(event, command, known))
 
     with _errors.on_parse_error(raise_sentence):
@@ -174,9 +189,14 @@ _field_docs = functools.cache(_docstrings.get_field_docstring)
 @_REGISTRY.struct_rule
 def _fields(info: StructTypeInfo) -> StructConstructorSpec | None:
     """Offer the fields of a dataclass, without the hidden ones."""
-    if not dataclasses.is_dataclass(info.type):
+    is_tuple = hasattr(info.type, "_fields")
+    if not (is_tuple or dataclasses.is_dataclass(info.type)):
         return None
-    types_ = options.field_types(info.type)
+    types_, declared = options.field_types(info.type), specs_of(info.type)
+    if is_tuple:
+        rows = ((x, types_[x], getattr(info.default, x)) for x in info.type._fields)
+        fields = (StructFieldSpec(*row, _help_of(declared[row[0]])) for row in rows)
+        return StructConstructorSpec(info.type, tuple(fields))
     specs = []
     for field in _offered(info.type):
         default = vars(info.default)[field.name]  # as it was given: a property may convert it
@@ -191,8 +211,16 @@ def _fields(info: StructTypeInfo) -> StructConstructorSpec | None:
             kind = tuple[get_args(kind)[0], ...]
         marked = typing.cast(type, Annotated[(kind, *marks)] if marks else kind)
         text = partial(_field_docs, info.type, field.name, info.markers)
+        if (spec := declared.get(field.name)) is not None and spec.about:
+            text = _help_of(spec)
         specs.append(StructFieldSpec(field.name, marked, default, text))
     return StructConstructorSpec(info.type, tuple(specs))
+
+
+def _help_of(spec: Spec) -> str:
+    """Return the help of a declared number, with its unit."""
+    has_unit = spec.unit in ("", "1") or f"[{spec.unit}]" in spec.about
+    return spec.about if has_unit else str(spec)
 
 
 def _offered(kind: type) -> list[dataclasses.Field[object]]:

@@ -13,10 +13,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from rps_jax import Observation
-from rps_jax.control import registry
-from rps_jax.geometry.polyline import Polyline
-from rps_jax.robot.skin import CapacitiveSkin
-from rps_jax.world.tasks.path import PathCourse
+from rps_jax.laws import law_of, resolve_law
+from rps_jax.worlds import CapacitiveSkin, PathCourse, Polyline
 
 _VERTICES = 1024  # of a path, at most
 
@@ -53,8 +51,8 @@ class Controller:
     ) -> None:
         """Compile skin and law before the first step; the law must sense touch."""
         self.limits, self._skin = limits, skin
-        self._params = registry.resolve_law(law)[1]
-        self._law = registry.law_of(self._params)
+        self._params = resolve_law(law)[1]
+        self._law = law_of(self._params)
         self._scan, self._step = jax.jit(skin.read), jax.jit(self._law.step)
         self._follow = jax.jit(PathCourse.follow)
         self.reset()
