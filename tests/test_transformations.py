@@ -53,7 +53,7 @@ def test_rollouts_of_all_tasks_and_engines_have_all_transformations(engine, task
         assert {x.shape for x in jax.tree.leaves(shapes)} == {(2,)}
 
 
-@pytest.mark.parametrize("engine", ["fused", "quasistatic"])
+@pytest.mark.parametrize("engine", SETTINGS)
 @pytest.mark.parametrize("first", [jax.grad, jax.jacfwd])
 def test_second_derivatives_of_rollouts_are_refused_with_and_without_a_compiler(
     engine, first, monkeypatch
@@ -90,17 +90,15 @@ def test_value_and_grad_differentiates_scores_of_all_tasks(engine, task):
         {"law": LAW},
         DOMAIN,
         2,
-        ("K_v", "v_approach"),
+        "v_approach",
         horizon=0.2,
         smooth=False,
         task=EXAMPLES.get(task, task),
         setting=SETTINGS[engine],
     )
-    expected = np.stack([expected.K_v, expected.v_approach], axis=1)
-    assert np.abs(expected).max() > 0
-    np.testing.assert_allclose(
-        results.gradient[0], expected, rtol=1e-3, atol=1e-4 * np.abs(expected).max()
-    )
+    slopes = results.gradient[0, :, 0]
+    assert np.abs(slopes).max() > 0
+    np.testing.assert_allclose(slopes, expected.v_approach, rtol=1e-3)
 
 
 @pytest.mark.parametrize("due", [True, False])
