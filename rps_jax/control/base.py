@@ -24,6 +24,7 @@ import numpy as np
 from rps_jax import errors
 from rps_jax.control.observation import Details, Twist
 from rps_jax.robot.base import LoadCell
+from rps_jax.robot.robot import DriveKind
 
 # What a law observes in addition to odometry and the target: the contact point (`Observation`),
 # the signal of each taxel as well (`TaxelObservation`), the contact force as well
@@ -144,6 +145,7 @@ class Law(Generic[Params, State, Obs]):
     temperatures: Smoothing | None = None
     smooth: bool = False  # whether this is the smooth form; it observes `in_contact` as a weight
     cell: LoadCell = LoadCell()  # the sensor of a law that senses force
+    drives: tuple[DriveKind, ...] = ("omni",)  # whose bases can follow its twists
     # (params, state, obs, sent twist) -> state, for a law whose state holds its last command.
     observe_sent: Callable[[Params, State, Obs, Twist], State] | None = None
 

@@ -21,6 +21,7 @@ from rps_jax.geometry.arrays import (
     Scalar,
     Vector,
 )
+from rps_jax.robot.robot import Robot
 
 # Displacements are clipped to this distance [m], so that no finite float32 overflows.
 _WORLD_SIZE = 1e9
@@ -36,6 +37,11 @@ class Observation(NamedTuple):
     p_world_target: Vector  # [m]
     period: Scalar = 0.02  # [s] since the last control step
     base_radius: Number | None = None  # [m] of a round base; None: a rectangle
+    # [m] position, behind the base's middle, of an axle that cannot move sideways; None: an
+    # omnidirectional base
+    axle: Number | None = None
+    turning_radius: Number | None = None  # [m] least, of the axle of a car; None: it may be 0
+    half_length: Number | None = None  # [m] of a rectangle with such an axle
 
     @property
     def l(self) -> Floats:  # noqa: E743
@@ -75,11 +81,18 @@ AnyObservation = Observation | TaxelObservation | ForceObservation | PoseObserva
 Observed = TypeVar("Observed", bound=AnyObservation)
 
 
-def with_base_radius(obs: Observed, radius: Number | None) -> Observed:
-    """Return an observation on a round base of a radius [m]; None: on a rectangular one."""
+def with_base(obs: Observed, radius: Number | None, robot: Robot | None = None) -> Observed:
+    """Return an observation with the static facts of a base.
+
+    They are the `radius` [m] of a round base, None for a rectangle, and the drive of the robot.
+    """
+    facts = {"base_radius": radius}
+    if robot is not None and robot.drive != "omni":
+        facts |= {"axle": robot.axle_behind, "turning_radius": robot.turning_radius}
+        facts |= {"half_length": robot.half_length}
     if isinstance(obs, Observation):
-        return obs._replace(base_radius=radius)
-    return obs._replace(touch=obs.touch._replace(base_radius=radius))
+        return obs._replace(**facts)
+    return obs._replace(touch=obs.touch._replace(**facts))
 
 
 class Twist(NamedTuple):

@@ -26,6 +26,7 @@ from rps_jax.errors import InputError
 from rps_jax.record import files
 from rps_jax.record.files import JsonObject
 from rps_jax.record.options import parse_changes
+from rps_jax.robot.robot import DriveKind
 
 T = TypeVar("T")  # a pytree
 # Both are `Any` for the command line, which reads a text; a program may pass parameters.
@@ -83,6 +84,19 @@ def law_of(params: LawParams | type) -> Law:
         fix = f"use {known}, or register the law with register_law"
         raise InputError(f"params of class {kind.__name__} belong to no law: {fix}.")
     return _LAWS_BY_CLASS[kind]
+
+
+def check_drive(params: LawParams, drive: DriveKind) -> None:
+    """Raise InputError unless a base with this drive can follow the law's twists."""
+    if drive in law_of(params).drives:
+        return
+    known = " or ".join(name for name, x in LAWS.items() if drive in law_of(x).drives)
+    rule = f"it moves sideways, which a base with drive = {drive} cannot; choose {known}"
+    kind = type(params)
+    name = next((x for x, known in LAWS.items() if type(known) is kind), kind.__name__)
+    if kind.__module__.startswith("rps_jax."):
+        raise errors.not_allowed("law", name, rule)
+    raise errors.not_allowed("law", name, f"{rule}, or declare Law(drives=...) of this one")
 
 
 def check_params(params: Params) -> Params:

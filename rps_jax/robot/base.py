@@ -30,7 +30,9 @@ class Odometry(NamedTuple):
     yaw_noise: Number = 0.0  # () [rad] standard deviation of each heading reading
     pose_latency: Number = 0.0  # () [s] age of the pose that the law observes
     command_delay: Number = 0.0  # () [s] between a command and its execution
-    velocity_error: Number = 0.0  # (3,) [1] of each component of the twist
+    # (3,) [1] of each component of the twist; of a differential drive, the first and the last are
+    # those of the left and the right wheel
+    velocity_error: Number = 0.0
     past: np.ndarray | jax.Array = np.zeros(0)  # (K,)
 
 
@@ -56,10 +58,10 @@ def observe_pose(
 
 
 def delay_twist(odometry: Odometry, twists: jax.Array, twist: jax.Array, period: float) -> Pair:
-    """Return the latest commanded twists (K, 3), `twist` (3,) first, and the executed one (3,)."""
+    """Return the latest commanded twists (K, 3), `twist` (3,) first, and the delayed one (3,)."""
     twists = jnp.concatenate([twist[None], twists[:-1]])
     delayed = twists[_steps_of(odometry.command_delay, period)]
-    return twists, delayed * (1 + odometry.velocity_error)
+    return twists, delayed
 
 
 def _steps_of(time: Number, period: float) -> jax.Array:

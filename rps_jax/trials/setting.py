@@ -105,6 +105,7 @@ class Setting:
         self.simulator.check_robot(robot)
         for params in laws:
             law = registry.law_of(params)
+            registry.check_drive(params, robot.drive)
             self.simulator.check_senses(law.senses)
             if law.senses == "taxels":
                 check_law(law.init, law.step, law.senses, params, robot.shell.count)

@@ -15,6 +15,7 @@ from rps_jax.geometry import solid
 from rps_jax.geometry.footprint import Footprint
 from rps_jax.geometry.solid import Solid
 from rps_jax.record.files import Arrays
+from rps_jax.robot.drive import GRIP
 from rps_jax.robot.robot import Robot
 from rps_jax.robot.shell import Shell
 from rps_jax.world import objects
@@ -330,6 +331,12 @@ def _set_robot(spec: mujoco.MjSpec, robot: Robot) -> None:
     base.inertia[:] = float(robot.inertia)  # about the other axes it never turns
     for joint in base.joints:
         joint.armature = 0.0
+    if (
+        robot.drive != "omni"
+    ):  # the engine sets its coefficients, the direction of `Tyres`, in steps
+        tyres = spec.add_tendon(name="tyres", armature=GRIP * float(robot.mass))
+        for joint, coefficient in zip(base.joints, (0.0, 1.0, 0.0), strict=True):
+            tyres.wrap_joint(joint.name, coefficient)
 
 
 def _draw_round(spec: mujoco.MjSpec, shell: Shell, radius: float) -> None:

@@ -1,0 +1,274 @@
+"""Push and reposition: a law for bases whose axle cannot move sideways.
+
+A flush face sticks to the front only for omega <= mu v / x_o, with x_o from the axle to the
+object's centre of friction. At a rolling contact l + k theta is constant, with k = 0.47 m/rad for
+the paper's drum, whatever the base does: one pass over a front of 0.58 m turns the push by 1.2 rad
+at most. So the law leaves the object when its contact is spent, drives around it, and pushes anew.
+
+It remembers the last contact C and the object's middle M in the world. T is the target, theta the
+heading, u(x) the unit vector at an angle x, and A the axle, a behind the base's middle.
+
+  D1  M = C + r u(theta + n), with n the direction of the base's normal at the contact
+  D2  psi = direction of T - M; the opposite if |T - M| < r and the base stands beyond M
+  D3  e = angle of T - C minus theta;  x_C: of C ahead of the axle
+
+Push at v_max until the contact leaves the front, or is lost for t_lost, or, after t_push of
+contact, |l| > l_edge; within d_near of T, |e| > e_near replaces the last.
+
+  D4  omega = K_e e + K_l (l - l_dead sgn l where |l| > l_dead, else 0), within w_push
+  D5  omega = K_near v_max sin(e) / x_C   within d_near;  0 without contact
+
+Retreat straight, until C is `back` ahead of the front. Drive around M, in reverse unless that turns
+the base much more. With phi the angle of A - M, and turn the angle from phi to psi + pi:
+
+  D6  W = M - (R_s + a) u(psi)  where turn < CARROT,  else  M + (R_c + a) u(phi +- CARROT)
+  D7  omega = angle of W - A (in reverse, of A - W) minus theta,  v = +-v_max cos(omega)
+
+Where this angle is large, the base turns on the spot, and a car in reverse. Align: at the last W,
+turn to psi. Then approach M, which is a push without contact:
+
+  D8  omega = angle of M - A minus theta
+
+The twist is (v, a omega, omega), with |omega| <= |v| / R of a car. The law senses touch, odometry
+and target; axle and turning radius R are static facts. The smooth law mixes the four modes.
+"""
+
+from functools import partial
+from typing import Annotated, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from rps_jax import errors
+from rps_jax.control import soft
+from rps_jax.control.base import Bound, Law, bounds_of, check_signs, document_fields
+from rps_jax.control.observation import Details, Observation, Twist, displacement
+from rps_jax.geometry import planar
+from rps_jax.geometry.arrays import Number, Parameter
+from rps_jax.robot.shell import HALF_LENGTH
+
+_SIDE = 0.02  # [m] behind the front, where a contact is on a side
+_ROUND_SIDE = 1.2  # [rad] from the front of a round base
+CARROT = 1.26  # [rad] by which the base aims ahead on the circle
+_LARGE = 0.5  # [rad] heading error above which the base turns on the spot
+_ARRIVED, _ALIGNED = 0.22, 0.26  # [m], [rad] errors at the staging point
+_CLOSE, _ASIDE = 0.2, 1.2  # [m], [rad] distance and bearing of a staging point that is passed
+_PAST = 0.5  # [m] of the front beyond M at which an approach has failed
+_SAVED = 1.5  # [rad] of turning for which driving forwards replaces reverse
+_OVERSHOOT = 1.5  # [rad] on the circle, after which the base drives back
+_BRIEF = 1e-3  # [s] of contact below which a push is an approach
+_LEAST_ARM = 0.2  # [m] of x_C
+
+
+@document_fields
+class UnicycleParams(NamedTuple):
+    """Parameters of the law: bounds of robot and task, and those that are tuned."""
+
+    v_max: Parameter = 0.05  # [m/s] speed of the base's middle
+    omega_max: Parameter = 0.15  # [rad/s] bound on |omega|
+    d_success: Parameter = 0.05  # [m] target reached
+    v_approach: Parameter = 0.03  # [m/s] speed before the first contact
+    # [m] from the contact to the object's middle, D1
+    r: Annotated[Parameter, Bound(0.08, 0.4)] = 0.236
+    K_e: Annotated[Parameter, Bound(0.1, 3, log=True)] = 0.92  # [1/s] turn to the target, D4
+    K_l: Annotated[Parameter, Bound(0.2, 8, log=True)] = 4.7  # [rad/s/m] turn to the contact, D4
+    l_dead: Annotated[Parameter, Bound(0.0, 0.28)] = 0.12  # [m] where it does not, D4
+    # [rad/s] bound on |omega| while pushing, D4
+    w_push: Annotated[Parameter, Bound(0.02, 0.15, log=True)] = 0.0865
+    l_edge: Annotated[Parameter, Bound(0.1, 0.35)] = 0.273  # [m] |l| of a spent contact
+    d_near: Annotated[Parameter, Bound(0.05, 1)] = 0.604  # [m] distance of D5
+    e_near: Annotated[Parameter, Bound(0.5, 2.5)] = 1.83  # [rad] |e| of a spent contact there
+    K_near: Annotated[Parameter, Bound(0.3, 3)] = 1.67  # [1] gain of D5
+    t_push: Annotated[Parameter, Bound(0.3, 8, log=True)] = 4.53  # [s] least contact of a push
+    t_lost: Annotated[Parameter, Bound(0.2, 8, log=True)] = 1.14  # [s] without contact: lost
+    back: Annotated[Parameter, Bound(0.01, 0.6)] = 0.1  # [m] retreat
+    R_c: Annotated[Parameter, Bound(0.5, 1.4)] = 0.98  # [m] circle around M, D6
+    R_s: Annotated[Parameter, Bound(0.5, 1.4)] = 0.83  # [m] staging point behind M, D6
+
+
+class Widths(NamedTuple):
+    """Widths of the switches of the smooth law; its choices of side and gear stay hard."""
+
+    length: Parameter = 0.01  # [m]
+    angle: Parameter = 0.02  # [rad]
+    time: Parameter = 0.1  # [s]
+
+    def check(self) -> None:
+        """Raise InputError for a width that is not positive."""
+        for name, value in self._asdict().items():
+            errors.check_finite(f"temperature {name}", value, above=0, at_most=1)
+
+
+class UnicycleState(NamedTuple):
+    """State of the law; the modes are bools, or weights of the smooth law, and no mode: push."""
+
+    retreat: jax.Array
+    around: jax.Array
+    align: jax.Array
+    p_world_object: jax.Array  # (2,) [m] M
+    p_world_contact: jax.Array  # (2,) [m] C
+    l: jax.Array  # noqa: E741  [m] contact offset at C
+    touched: jax.Array  # bool or weight: whether there was a contact
+    t_lost: jax.Array  # [s] since the last contact
+    t_push: jax.Array  # [s] of contact in this push
+    side: jax.Array  # [1] 1: counter-clockwise around M, or -1
+    gear: jax.Array  # [1] 1: forwards, or -1
+
+
+check = partial(
+    check_signs, "unicycle", ("v_max", "omega_max", "d_success", "r", "R_c", "R_s", "t_lost")
+)
+
+
+def init(params: UnicycleParams, temperatures: Widths | None = None) -> UnicycleState:
+    """Return the state before the first contact."""
+    zero = jnp.zeros_like(jnp.asarray(params.r, float))
+    no = zero > 0 if temperatures is None else zero
+    point = jnp.zeros(2, zero.dtype)
+    return UnicycleState(no, no, no, point, point, zero, no, zero, zero, zero + 1, zero + 1)
+
+
+class _Contact(NamedTuple):
+    """Contact of one control step, or the last one."""
+
+    touches: jax.Array
+    p_robot: jax.Array  # (2,) [m]
+    normal: jax.Array  # [rad] direction of the base's normal there, in its frame
+    on_front: jax.Array  # bool or weight
+    half_length: Number  # [m] from the base's middle to its front
+
+
+def _contact(state: UnicycleState, obs: Observation, widths: Widths | None) -> _Contact:
+    """Return the current or the last contact."""
+    touches = jnp.asarray(obs.in_contact)
+    last = planar.rotate(-obs.yaw, state.p_world_contact - obs.p_world_robot)
+    point = soft.where(touches, obs.p_robot_contact, last)
+    if obs.base_radius is not None:
+        normal = planar.direction(point)
+        on_front = soft.greater(_ROUND_SIDE, jnp.abs(normal), widths and widths.angle)
+        return _Contact(touches, point, normal, on_front, obs.base_radius)
+    half_length = HALF_LENGTH if obs.half_length is None else obs.half_length
+    on_front = soft.greater(point[0], half_length - _SIDE, widths and widths.length)
+    normal = soft.where(on_front, 0.0, jnp.sign(point[1]) * jnp.pi / 2)
+    return _Contact(touches, point, normal, on_front, half_length)
+
+
+def _is(condition: jax.Array) -> jax.Array:
+    """Return a condition as a bool."""
+    return condition if condition.dtype == bool else condition > 0.5
+
+
+def _turns(error: jax.Array, final: jax.Array) -> jax.Array:
+    """Return the angle [rad] that the base turns before and after a straight way."""
+    return jnp.abs(planar.wrap(error)) + jnp.abs(planar.wrap(final))
+
+
+def step(
+    params: UnicycleParams,
+    state: UnicycleState,
+    obs: Observation,
+    temperatures: Widths | None = None,
+) -> tuple[UnicycleState, Twist, Details]:
+    """Compute one control step; with `temperatures`, the modes and the contact are weights."""
+    length, angle, time = temperatures or (None, None, None)
+    above, and_, or_, not_, where = soft.greater, soft.and_, soft.or_, soft.not_, soft.where
+    axle = 0.0 if obs.axle is None else obs.axle
+    yaw, u = obs.yaw, planar.unit(obs.yaw)
+    p_world_axle = obs.p_world_robot - axle * u
+    push = not_(or_(or_(state.retreat, state.around), state.align))
+    touches, contact, normal, on_front, half_length = _contact(state, obs, temperatures)
+    touched = or_(state.touched, touches)
+    here = obs._replace(p_robot_contact=contact)
+    l = where(touches, here.l, state.l)  # noqa: E741
+
+    # D1, and an approach that passes M without contact: then the last contact is a better guess.
+    p_world_contact = obs.p_world_robot + planar.rotate(yaw, contact)
+    middle = p_world_contact + params.r * planar.unit(yaw + normal)
+    middle = where(touches, middle, state.p_world_object)
+    t_lost = where(touches, 0.0, state.t_lost + obs.period)
+    t_push = where(push, state.t_push + where(touches, obs.period, 0.0), 0.0)
+    is_new = above(_BRIEF, state.t_push, time)
+    front = obs.p_world_robot + half_length * u
+    past = above(jnp.sum((front - middle) * u), _PAST, length)
+    missed = and_(and_(and_(push, touched), and_(is_new, not_(touches))), past)
+    middle = where(missed, p_world_contact, middle)
+
+    # D2 and D3.
+    d = displacement(here)
+    distance, e = planar.norm(d), planar.wrap(planar.direction(d) - yaw)
+    to_target, offset = obs.p_world_target - middle, p_world_axle - middle
+    flips = (planar.norm(to_target) < params.r) & (jnp.sum(to_target * offset) > 0)
+    psi = planar.direction(to_target) + jnp.where(flips, jnp.pi, 0.0)
+
+    # The end of a push.
+    near = above(params.d_near, distance, length)
+    spent_near = above(jnp.abs(e), params.e_near, angle)
+    spent = where(near, spent_near, above(jnp.abs(l), params.l_edge, length))
+    spent = or_(spent, not_(on_front))
+    is_spent = and_(and_(touches, spent), above(t_push, params.t_push, time))
+    is_lost = and_(above(t_lost, params.t_lost, time), not_(is_new))
+    ends = and_(and_(push, touched), or_(or_(is_spent, is_lost), missed))
+
+    # D6: the side and the gear are chosen before the base leaves, and kept on the way.
+    phi = planar.direction(offset)
+    turn, chooses = planar.wrap(psi + jnp.pi - phi), _is(or_(push, state.retreat))
+    side = jnp.where(chooses, jnp.where(turn >= 0, 1.0, -1.0), state.side)
+    turn = jnp.mod(side * turn, 2 * jnp.pi)
+    turn = jnp.where(turn > 2 * jnp.pi - _OVERSHOOT, turn - 2 * jnp.pi, turn)
+    is_direct = above(CARROT, turn, angle)
+    staging = middle - (params.R_s + axle) * planar.unit(psi)
+    carrot = middle + (params.R_c + axle) * planar.unit(phi + side * CARROT)
+    way = planar.direction(where(is_direct, staging, carrot) - p_world_axle)
+    final = jnp.where(_is(is_direct), psi - way, jnp.pi / 2)
+    saved = _turns(way + jnp.pi - yaw, final + jnp.pi) - _turns(way - yaw, final)
+    gear = jnp.where(chooses, jnp.where(saved > _SAVED, 1.0, -1.0), state.gear)
+    error = planar.wrap(way - yaw + jnp.where(gear > 0, 0.0, jnp.pi))
+    left = planar.norm(staging - p_world_axle)
+    passed = and_(above(_CLOSE, left, length), above(jnp.abs(error), _ASIDE, angle))
+    is_there = and_(is_direct, or_(above(_ARRIVED, left, length), passed))
+    face = planar.wrap(psi - yaw)
+
+    # The next modes. A touch of the front on the way is a push, unless it is spent.
+    arrived, aligned = and_(state.around, is_there), above(_ALIGNED, jnp.abs(face), angle)
+    gap = jnp.sum((p_world_contact - front) * u)
+    gone = and_(state.retreat, above(gap, params.back, length))
+    hits = and_(or_(state.around, state.align), and_(touches, on_front))
+    retreat = or_(or_(ends, and_(hits, spent)), and_(state.retreat, not_(gone)))
+    around = and_(or_(gone, and_(state.around, not_(arrived))), not_(hits))
+    align = and_(or_(arrived, and_(state.align, not_(aligned))), not_(hits))
+
+    # D4, D5, D7 and D8.
+    v_max, is_car = jnp.asarray(params.v_max), obs.turning_radius is not None
+    far = params.K_e * e + params.K_l * (l - jnp.clip(l, -params.l_dead, params.l_dead))
+    far = jnp.clip(far, -params.w_push, params.w_push)
+    arm = jnp.maximum(contact[0], _LEAST_ARM) + axle
+    steer = where(near, params.K_near * v_max * jnp.sin(e) / arm, far)
+    approach = planar.wrap(planar.direction(middle - p_world_axle) - yaw)
+    steer = where(touches, steer, where(and_(is_new, touched), approach, 0.0))
+    on_spot = -v_max if is_car else 0.0
+    is_large = above(jnp.abs(error), _LARGE, angle)
+    drive = where(is_large, on_spot, gear * v_max * jnp.cos(error))
+    v = where(around, drive, where(touched, v_max, params.v_approach))
+    v = where(align, on_spot, where(retreat, -v_max, v))
+    omega = where(align, face, where(around, error, where(retreat, 0.0, steer)))
+    omega = jnp.clip(omega, -jnp.asarray(params.omega_max), params.omega_max)
+    bound = planar.safe_sqrt(jnp.maximum(v_max**2 - (axle * omega) ** 2, 1e-8))
+    v = jnp.clip(v, -bound, bound)
+    if is_car:
+        omega = jnp.clip(omega, -jnp.abs(v) / obs.turning_radius, jnp.abs(v) / obs.turning_radius)
+    memory = UnicycleState(
+        retreat, around, align, middle, p_world_contact, l, touched, t_lost, t_push, side, gear
+    )
+    details = Details(l, distance, jnp.zeros_like(distance), e, or_(or_(retreat, around), align))
+    return memory, Twist(v, axle * omega, omega), details
+
+
+LAW = Law(
+    init,
+    step,
+    check=check,
+    bounds=bounds_of(UnicycleParams),
+    temperatures=Widths(),
+    drives=("omni", "differential", "car"),
+)
+PRESETS = {"unicycle": UnicycleParams()}
