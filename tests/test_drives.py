@@ -207,6 +207,12 @@ def test_a_law_that_moves_sideways_is_refused_with_those_that_do_not():
         pushes.build([Case(law="rps_plus", robot="turtlebot4")], Setting())
 
 
+test_a_task_without_room_for_detours_is_refused = refusals(
+    lambda task: Case(law="unicycle", task=task),
+    (("corridor,width=2",), "task = corridor with the law unicycle is not allowed: .* 1.5 m"),
+)
+
+
 # --- the law -------------------------------------------------------------------------------
 
 SMALL = unicycle.Widths(1e-6, 1e-6, 1e-6)

@@ -83,7 +83,7 @@ class View(Action[None], Case):
     @property
     def case(self) -> Case:
         """The options' push; its law is `rps` if the options name a run."""
-        law = "rps" if self.law is None or self.run is not None else self.law
+        law = None if self.run is not None else self.law
         return Case(**dict(case_options(self, self.setting, Case), law=law))
 
     def note(self) -> str:

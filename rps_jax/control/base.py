@@ -146,6 +146,7 @@ class Law(Generic[Params, State, Obs]):
     smooth: bool = False  # whether this is the smooth form; it observes `in_contact` as a weight
     cell: LoadCell = LoadCell()  # the sensor of a law that senses force
     drives: tuple[DriveKind, ...] = ("omni",)  # whose bases can follow its twists
+    room: float = 0.0  # [m] without walls around the object, for its detours
     # (params, state, obs, sent twist) -> state, for a law whose state holds its last command.
     observe_sent: Callable[[Params, State, Obs, Twist], State] | None = None
 

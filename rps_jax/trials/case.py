@@ -59,9 +59,10 @@ class Case(TrialOptions):
     """Friction: a set of the paper's Table I (S1, S2), or coefficients GROUND,ROBOT."""
     target: tuple[float, float] = _TARGET
     """Target X Y [m] in the world, where the base starts at the origin."""
-    law: LawLike = "rps"
+    law: LawLike | None = None
     """The law: its name, as rps, rps_tuned or rps_plus, or a file's, as my_law.py:MyParams or
-    policy.npz; changes follow, as rps,K_h=0.3 or rps,tuned.json."""
+    policy.npz; changes follow, as rps,K_h=0.3 or rps,tuned.json. By default rps, or unicycle on a
+    base that cannot move sideways."""
     task: TaskLike = option("reach", kw_only=True)
     """The task: reach (one target, as in the paper), path (follow a path by a lookahead),
     corridor (a path between walls that end a trial when touched) or rooms (a planned path among the
@@ -74,9 +75,12 @@ class Case(TrialOptions):
 
     def __post_init__(self) -> None:
         check_fields(self)
+        if self.law is None:
+            object.__setattr__(self, "law", registry.default_law(self.base.drive))
         name = objects.parse_object(self.object)
         objects.check_object("object", name)
         registry.check_params(self.params)
+        registry.check_room(self.params, self.challenge.kind, self.challenge.free_room)
         scene.check_contact(self.contact, self.mass)
         skins.parse_skin(self.skin or "ideal")
         errors.check_number("shift time", self.shift.time, at_least=0, unit="s")

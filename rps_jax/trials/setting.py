@@ -114,6 +114,8 @@ class Setting:
         """Raise InputError unless the engine can step the worlds of a domain with these laws."""
         self.simulator.check_surroundings(domain.surroundings)
         self.check_here(domain.weakest, laws)
+        for params in laws:
+            registry.check_room(params, domain.task.kind, domain.task.free_room)
 
     def to_json(self) -> JsonObject:
         """Return the setting as manifests have it; `from_json` reads it."""

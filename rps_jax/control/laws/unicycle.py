@@ -270,5 +270,6 @@ LAW = Law(
     bounds=bounds_of(UnicycleParams),
     temperatures=Widths(),
     drives=("omni", "differential", "car"),
+    room=1.5,
 )
 PRESETS = {"unicycle": UnicycleParams()}
