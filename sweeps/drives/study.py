@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import ClassVar, NamedTuple
 
 import numpy as np
@@ -30,6 +31,7 @@ class Base(NamedTuple):
     law: str
 
 
+FRONT_SKIN = Path(__file__).with_name("front_skin.json")
 CAR = "ideal,drive=car,turning_radius=0.5"
 DIFFERENTIAL = "ideal,drive=differential"
 BASES: dict[str, Base] = {
@@ -41,7 +43,7 @@ BASES: dict[str, Base] = {
     "car, R 0.5 m, axle 0.3 m behind": Base(f"{CAR},axle=0.3", "unicycle_car"),
     "round, holonomic, rps_plus": Base("round", "rps_plus"),
     "round, differential": Base("round,drive=differential", "unicycle_round"),
-    "skin on the front only": Base("front_skin", "unicycle_front"),
+    "skin on the front only": Base(str(FRONT_SKIN), "unicycle_front"),
 }
 DOMAINS = ("wide", "real", "hostile")
 

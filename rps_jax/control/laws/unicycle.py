@@ -272,4 +272,25 @@ LAW = Law(
     drives=("omni", "differential", "car"),
     room=1.5,
 )
-PRESETS = {"unicycle": UnicycleParams()}
+_TUNED = UnicycleParams()
+PRESETS = {
+    "unicycle": _TUNED,
+    "unicycle_car": _TUNED._replace(
+        r=0.277,
+        K_e=0.473,
+        K_l=2.15,
+        l_dead=0.174,
+        w_push=0.092,
+        l_edge=0.277,
+        d_near=0.867,
+        e_near=1.06,
+        K_near=2.09,
+        t_push=3.76,
+        t_lost=0.293,
+        back=0.042,
+        R_c=0.886,
+        R_s=0.735,
+    ),
+    "unicycle_round": _TUNED._replace(t_push=1.0, l_edge=0.2, K_e=0.2),
+    "unicycle_front": _TUNED._replace(r=0.3, t_push=1.0, l_edge=0.22, back=0.25, R_c=1.2, R_s=1.0),
+}
