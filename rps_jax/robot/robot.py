@@ -71,6 +71,11 @@ class Robot:
     track: Number = option(None, above=0, at_most=4, unit="m")
     wheel_speed_max: Number = option(None, _POSITIVE, 20, unit="m/s")  # () at the rim
     wheel_acceleration_max: Number = option(None, _POSITIVE, 100, unit="m/s^2")  # () at the rim
+    # () of software: age of the pose that laws observe, delay of commands, time constant of the
+    # skin; None: those of the domain
+    pose_latency: Number = option(None, 0, 1, unit="s")
+    command_delay: Number = option(None, 0, 1, unit="s")
+    time_constant: Number = option(None, _POSITIVE, 1, unit="s")
 
     @property
     def half_track(self) -> Number:
@@ -201,9 +206,11 @@ _SHAPES = {  # allowed shapes of limits that are no single number
 _FIELDS = [field.name for field in dataclasses.fields(Robot)]
 _SLIPS = ("slip", "slip_sideways", "slip_yaw")
 _WHEELS = ("axle", "turning_radius", "track", "wheel_speed_max", "wheel_acceleration_max")
-_AIM_LIMITS = ("v_max", "omega_max", "lag", "acceleration_max", *_SLIPS, *_WHEELS[3:])
+LATENCIES = ("pose_latency", "command_delay", "time_constant")  # also names of a domain's ranges
+_AIM_LIMITS = ("v_max", "omega_max", "lag", "acceleration_max", *_SLIPS, *_WHEELS[3:], *LATENCIES)
 _BODY = ("half_length", "half_width", "radius", "boards", "mass", "bandwidth", "resistance")
-LIMITS = tuple(name for name in _FIELDS if name not in (*_BODY, "drive", *_WHEELS))
+_STATIC = (*_BODY, "drive", *_WHEELS, *LATENCIES)
+LIMITS = tuple(name for name in _FIELDS if name not in _STATIC)
 _DATA = [name for name in _FIELDS if name != "drive"]
 jax.tree_util.register_dataclass(Robot, data_fields=_DATA, meta_fields=["drive"])
 

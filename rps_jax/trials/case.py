@@ -75,8 +75,6 @@ class Case(TrialOptions):
 
     def __post_init__(self) -> None:
         check_fields(self)
-        if self.law is None:
-            object.__setattr__(self, "law", registry.default_law(self.base.drive))
         name = objects.parse_object(self.object)
         objects.check_object("object", name)
         registry.check_params(self.params)
@@ -100,7 +98,8 @@ class Case(TrialOptions):
     @cached_property
     def params(self) -> LawParams:
         """Parameters of the law."""
-        return registry.resolve_law(self.law)[1]
+        law = registry.default_law(self.base.drive) if self.law is None else self.law
+        return registry.resolve_law(law)[1]
 
     @cached_property
     def contact(self) -> Friction:
