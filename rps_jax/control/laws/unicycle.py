@@ -18,14 +18,16 @@ contact, |l| > l_edge; within d_near of T, |e| > e_near replaces the last.
   D4  omega = K_e e + K_l (l - l_dead sgn l where |l| > l_dead, else 0), within w_push
   D5  omega = K_near v_max sin(e) / x_C   within d_near;  0 without contact
 
-Retreat straight, until C is `back` ahead of the front. Drive around M, in reverse unless that turns
-the base much more. With phi the angle of A - M, and turn the angle from phi to psi + pi:
+Retreat straight, until C is `back` ahead of the front. Drive around M in reverse, so that the base
+need not turn away from the object and back. With phi the angle of A - M, and turn the angle from
+phi to psi + pi, which decides the side:
 
-  D6  W = M - (R_s + a) u(psi)  where turn < CARROT,  else  M + (R_c + a) u(phi +- CARROT)
-  D7  omega = angle of W - A (in reverse, of A - W) minus theta,  v = +-v_max cos(omega)
+  D6  W = M - (R + a) u(psi)  where turn < CARROT,  else  M + (R + a) u(phi +- CARROT)
+  D7  omega = angle of A - W minus theta,  v = -v_max cos(omega)
 
 Where this angle is large, the base turns on the spot, and a car in reverse. Align: at the last W,
-turn to psi. Then approach M, which is a push without contact:
+turn to psi; a car does so in reverse, on an arc that begins its turning radius before. Then
+approach M, which is a push without contact:
 
   D8  omega = angle of M - A minus theta
 
@@ -54,7 +56,6 @@ _LARGE = 0.5  # [rad] heading error above which the base turns on the spot
 _ARRIVED, _ALIGNED = 0.22, 0.26  # [m], [rad] errors at the staging point
 _CLOSE, _ASIDE = 0.2, 1.2  # [m], [rad] distance and bearing of a staging point that is passed
 _PAST = 0.5  # [m] of the front beyond M at which an approach has failed
-_SAVED = 1.5  # [rad] of turning for which driving forwards replaces reverse
 _OVERSHOOT = 1.5  # [rad] on the circle, after which the base drives back
 _BRIEF = 1e-3  # [s] of contact below which a push is an approach
 _LEAST_ARM = 0.2  # [m] of x_C
@@ -82,12 +83,11 @@ class UnicycleParams(NamedTuple):
     t_push: Annotated[Parameter, Bound(0.3, 8, log=True)] = 4.53  # [s] least contact of a push
     t_lost: Annotated[Parameter, Bound(0.2, 8, log=True)] = 1.14  # [s] without contact: lost
     back: Annotated[Parameter, Bound(0.01, 0.6)] = 0.1  # [m] retreat
-    R_c: Annotated[Parameter, Bound(0.5, 1.4)] = 0.98  # [m] circle around M, D6
-    R_s: Annotated[Parameter, Bound(0.5, 1.4)] = 0.83  # [m] staging point behind M, D6
+    R: Annotated[Parameter, Bound(0.5, 1.4)] = 0.87  # [m] circle around M, D6
 
 
 class Widths(NamedTuple):
-    """Widths of the switches of the smooth law; its choices of side and gear stay hard."""
+    """Widths of the switches of the smooth law; its choice of the side stays hard."""
 
     length: Parameter = 0.01  # [m]
     angle: Parameter = 0.02  # [rad]
@@ -112,12 +112,9 @@ class UnicycleState(NamedTuple):
     t_lost: jax.Array  # [s] since the last contact
     t_push: jax.Array  # [s] of contact in this push
     side: jax.Array  # [1] 1: counter-clockwise around M, or -1
-    gear: jax.Array  # [1] 1: forwards, or -1
 
 
-check = partial(
-    check_signs, "unicycle", ("v_max", "omega_max", "d_success", "r", "R_c", "R_s", "t_lost")
-)
+check = partial(check_signs, "unicycle", ("v_max", "omega_max", "d_success", "r", "R", "t_lost"))
 
 
 def init(params: UnicycleParams, temperatures: Widths | None = None) -> UnicycleState:
@@ -125,7 +122,7 @@ def init(params: UnicycleParams, temperatures: Widths | None = None) -> Unicycle
     zero = jnp.zeros_like(jnp.asarray(params.r, float))
     no = zero > 0 if temperatures is None else zero
     point = jnp.zeros(2, zero.dtype)
-    return UnicycleState(no, no, no, point, point, zero, no, zero, zero, zero + 1, zero + 1)
+    return UnicycleState(no, no, no, point, point, zero, no, zero, zero, zero + 1)
 
 
 class _Contact(NamedTuple):
@@ -156,11 +153,6 @@ def _contact(state: UnicycleState, obs: Observation, widths: Widths | None) -> _
 def _is(condition: jax.Array) -> jax.Array:
     """Return a condition as a bool."""
     return condition if condition.dtype == bool else condition > 0.5
-
-
-def _turns(error: jax.Array, final: jax.Array) -> jax.Array:
-    """Return the angle [rad] that the base turns before and after a straight way."""
-    return jnp.abs(planar.wrap(error)) + jnp.abs(planar.wrap(final))
 
 
 def step(
@@ -209,20 +201,20 @@ def step(
     is_lost = and_(above(t_lost, params.t_lost, time), not_(is_new))
     ends = and_(and_(push, touched), or_(or_(is_spent, is_lost), missed))
 
-    # D6: the side and the gear are chosen before the base leaves, and kept on the way.
+    # D6: the side is chosen before the base leaves, and kept on the way.
     phi = planar.direction(offset)
     turn, chooses = planar.wrap(psi + jnp.pi - phi), _is(or_(push, state.retreat))
     side = jnp.where(chooses, jnp.where(turn >= 0, 1.0, -1.0), state.side)
     turn = jnp.mod(side * turn, 2 * jnp.pi)
     turn = jnp.where(turn > 2 * jnp.pi - _OVERSHOOT, turn - 2 * jnp.pi, turn)
     is_direct = above(CARROT, turn, angle)
-    staging = middle - (params.R_s + axle) * planar.unit(psi)
-    carrot = middle + (params.R_c + axle) * planar.unit(phi + side * CARROT)
+    radius = params.R + axle
+    staging = middle - radius * planar.unit(psi)
+    if obs.turning_radius is not None:  # a car also moves while it aligns
+        staging = staging - side * obs.turning_radius * planar.unit(psi - jnp.pi / 2)
+    carrot = middle + radius * planar.unit(phi + side * CARROT)
     way = planar.direction(where(is_direct, staging, carrot) - p_world_axle)
-    final = jnp.where(_is(is_direct), psi - way, jnp.pi / 2)
-    saved = _turns(way + jnp.pi - yaw, final + jnp.pi) - _turns(way - yaw, final)
-    gear = jnp.where(chooses, jnp.where(saved > _SAVED, 1.0, -1.0), state.gear)
-    error = planar.wrap(way - yaw + jnp.where(gear > 0, 0.0, jnp.pi))
+    error = planar.wrap(way + jnp.pi - yaw)
     left = planar.norm(staging - p_world_axle)
     passed = and_(above(_CLOSE, left, length), above(jnp.abs(error), _ASIDE, angle))
     is_there = and_(is_direct, or_(above(_ARRIVED, left, length), passed))
@@ -247,7 +239,7 @@ def step(
     steer = where(touches, steer, where(and_(is_new, touched), approach, 0.0))
     on_spot = -v_max if is_car else 0.0
     is_large = above(jnp.abs(error), _LARGE, angle)
-    drive = where(is_large, on_spot, gear * v_max * jnp.cos(error))
+    drive = where(is_large, on_spot, -v_max * jnp.cos(error))
     v = where(around, drive, where(touched, v_max, params.v_approach))
     v = where(align, on_spot, where(retreat, -v_max, v))
     omega = where(align, face, where(around, error, where(retreat, 0.0, steer)))
@@ -257,7 +249,7 @@ def step(
     if is_car:
         omega = jnp.clip(omega, -jnp.abs(v) / obs.turning_radius, jnp.abs(v) / obs.turning_radius)
     memory = UnicycleState(
-        retreat, around, align, middle, p_world_contact, l, touched, t_lost, t_push, side, gear
+        retreat, around, align, middle, p_world_contact, l, touched, t_lost, t_push, side
     )
     details = Details(l, distance, jnp.zeros_like(distance), e, or_(or_(retreat, around), align))
     return memory, Twist(v, axle * omega, omega), details
@@ -288,9 +280,8 @@ PRESETS = {
         t_push=3.76,
         t_lost=0.293,
         back=0.042,
-        R_c=0.886,
-        R_s=0.735,
+        R=0.85,
     ),
     "unicycle_round": _TUNED._replace(t_push=1.0, l_edge=0.2, K_e=0.2),
-    "unicycle_front": _TUNED._replace(r=0.3, t_push=1.0, l_edge=0.22, back=0.25, R_c=1.2, R_s=1.0),
+    "unicycle_front": _TUNED._replace(r=0.3, t_push=1.0, l_edge=0.22, back=0.25, R=1.2),
 }
