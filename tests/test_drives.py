@@ -37,7 +37,12 @@ BASES = {
     "car": replace(CAR, lag=0.2),
     "car with traction": replace(CAR, traction=0.5),
 }
-AXLES = [(name, engine) for name in BASES for engine in engines.ENGINES]
+_COMPILED = "differential with a limited force"  # the only base in mjx that no slow test has
+AXLES = [
+    pytest.param(name, engine, marks=[pytest.mark.slow] * (engine == "mjx" and name != _COMPILED))
+    for name in BASES
+    for engine in engines.ENGINES
+]
 
 
 class Weave(NamedTuple):
@@ -155,11 +160,19 @@ def test_the_motor_does_not_resist_a_sideways_velocity_and_the_tyres_stop_it():
     assert abs(velocity @ tyres.sideways) < 5e-5
 
 
+def test_an_action_for_an_axle_is_two_numbers():
+    env = PushEnv("random_cylinder", robot=DIFFERENTIAL, worlds=4)
+    assert env.action_size == 2
+    np.testing.assert_allclose(env.twist(jnp.array([0.5, -0.2])), [0.025, 0.0, -0.03], rtol=1e-6)
+    with pytest.raises(InputError, match="it must be 2 numbers: v_x and omega"):
+        env.twist(jnp.zeros(3))
+
+
+@pytest.mark.slow
 def test_derivatives_of_a_driven_axle_are_central_differences():
     robot = replace(DIFFERENTIAL, force_max=300.0, lag=0.1)
     env = PushEnv("random_cylinder", robot=robot, setting=Setting("fused"), worlds=4)
     state = env.reset(jax.random.key(0))
-    assert env.action_size == 2
 
     def end(speed):
         moved = state
@@ -218,7 +231,7 @@ test_a_task_without_room_for_detours_is_refused = refusals(
 SMALL = unicycle.Widths(1e-6, 1e-6, 1e-6)
 
 
-def follow(robot_facts, temperatures=None, steps=3000):
+def follow(robot_facts, temperatures=None, steps=6000):
     """Run the law without an object: a touch at the start, and none later; return its path."""
     params = unicycle.UnicycleParams()
     touch = jnp.asarray(True) if temperatures is None else jnp.ones(())
@@ -246,20 +259,22 @@ FACTS = {
 @pytest.mark.parametrize("name", FACTS)
 def test_after_a_lost_contact_the_base_drives_behind_the_object_and_faces_the_target(name):
     facts = FACTS[name]
-    poses, twists, around, align = jax.jit(lambda: follow(facts))()
+    poses, twists, around, align = map(np.asarray, jax.jit(lambda: follow(facts))())
     np.testing.assert_allclose(twists[:, 1], facts["axle"] * twists[:, 2], atol=1e-7)
-    speed = np.hypot(twists[:, 0], twists[:, 1])
-    assert speed.max() < 0.05001
+    assert np.hypot(twists[:, 0], twists[:, 1]).max() < 0.05001
     assert np.abs(twists[:, 2]).max() < 0.15001
     if "turning_radius" in facts:
         assert (np.abs(twists[:, 2]) * 0.5 <= np.abs(twists[:, 0]) + 1e-6).all()
-    assert np.asarray(around).any()
-    done = int(np.flatnonzero(np.asarray(align))[-1]) + 1  # it is aligned, and approaches
-    _, y, yaw = np.asarray(poses)[done]
-    assert abs(math.remainder(yaw + math.pi / 2, 2 * math.pi)) < 0.6  # to the target
-    assert y > 0.4
+    first = int(np.flatnonzero(around)[0])
+    end = int(np.flatnonzero(align[:-1] & ~align[1:])[0]) + 1  # it approaches the object
+    yaw = poses[first, 2]
+    middle = poses[first, :2] + 0.8 * np.array([math.cos(yaw), math.sin(yaw)])  # roughly
+    to_target, behind = np.array([0.0, -2.0]) - middle, poses[end, :2] - middle
+    error = math.remainder(poses[end, 2] - math.atan2(*to_target[::-1]), 2 * math.pi)
+    assert abs(error) < 0.6
+    assert to_target @ behind < -0.8 * np.linalg.norm(to_target) * np.linalg.norm(behind)
 
 
 def test_the_smooth_law_tends_to_the_hard_one():
     hard, smooth = (follow(FACTS["differential"], x, 1200)[0] for x in (None, SMALL))
-    np.testing.assert_allclose(smooth[:900], hard[:900], atol=2e-3)
+    np.testing.assert_allclose(smooth[:900], hard[:900], atol=1e-2)

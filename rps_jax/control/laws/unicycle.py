@@ -35,7 +35,7 @@ The twist is (v, a omega, omega), with |omega| <= |v| / R of a car. The law sens
 and target; axle and turning radius R are static facts. The smooth law mixes the four modes.
 """
 
-from functools import partial
+from functools import partial, reduce
 from typing import Annotated, NamedTuple
 
 import jax
@@ -125,7 +125,7 @@ def init(params: UnicycleParams, temperatures: Widths | None = None) -> Unicycle
     return UnicycleState(no, no, no, point, point, zero, no, zero, zero, zero + 1)
 
 
-class _Contact(NamedTuple):
+class Contact(NamedTuple):
     """Contact of one control step, or the last one."""
 
     touches: jax.Array
@@ -135,19 +135,64 @@ class _Contact(NamedTuple):
     half_length: Number  # [m] from the base's middle to its front
 
 
-def _contact(state: UnicycleState, obs: Observation, widths: Widths | None) -> _Contact:
-    """Return the current or the last contact."""
+def contact_of(p_world_last: jax.Array, obs: Observation, widths: Widths | None = None) -> Contact:
+    """Return the current contact, or the last one at `p_world_last` (2,) [m]."""
     touches = jnp.asarray(obs.in_contact)
-    last = planar.rotate(-obs.yaw, state.p_world_contact - obs.p_world_robot)
+    last = planar.rotate(-obs.yaw, p_world_last - obs.p_world_robot)
     point = soft.where(touches, obs.p_robot_contact, last)
     if obs.base_radius is not None:
         normal = planar.direction(point)
         on_front = soft.greater(_ROUND_SIDE, jnp.abs(normal), widths and widths.angle)
-        return _Contact(touches, point, normal, on_front, obs.base_radius)
+        return Contact(touches, point, normal, on_front, obs.base_radius)
     half_length = HALF_LENGTH if obs.half_length is None else obs.half_length
     on_front = soft.greater(point[0], half_length - _SIDE, widths and widths.length)
     normal = soft.where(on_front, 0.0, jnp.sign(point[1]) * jnp.pi / 2)
-    return _Contact(touches, point, normal, on_front, half_length)
+    return Contact(touches, point, normal, on_front, half_length)
+
+
+def push_direction(middle: jax.Array, base: jax.Array, target: jax.Array, r: Number) -> jax.Array:
+    """Compute D2 [rad] from the positions (2,) [m] of object, base and target in the world."""
+    to_target = target - middle
+    flips = (planar.norm(to_target) < r) & (jnp.sum(to_target * (base - middle)) > 0)
+    return planar.direction(to_target) + jnp.where(flips, jnp.pi, 0.0)
+
+
+class Way(NamedTuple):
+    """Way around the object, D6."""
+
+    side: jax.Array  # [1] 1: counter-clockwise, or -1
+    is_direct: jax.Array  # bool or weight: whether W is the staging point
+    staging: jax.Array  # (2,) [m]
+    aim: jax.Array  # (2,) [m] W
+
+
+def way_around(
+    middle: jax.Array,  # (2,) [m] M
+    psi: jax.Array,  # [rad]
+    offset: jax.Array,  # (2,) [m] from M to the axle, or to the middle of the base
+    side: jax.Array,  # [1] the last choice
+    chooses: jax.Array,  # bool: whether the side is chosen anew
+    radius: Number,  # [m] of the circle
+    turning_radius: Number | None = None,  # [m] of a car, which also moves while it aligns
+    width: Number | None = None,  # [rad] of the smooth switch
+) -> Way:
+    """Compute D6: the point that the base drives to, on its way to the staging point."""
+    phi = planar.direction(offset)
+    turn = planar.wrap(psi + jnp.pi - phi)
+    side = jnp.where(chooses, jnp.where(turn >= 0, 1.0, -1.0), side)
+    turn = jnp.mod(side * turn, 2 * jnp.pi)
+    turn = jnp.where(turn > 2 * jnp.pi - _OVERSHOOT, turn - 2 * jnp.pi, turn)
+    is_direct = soft.greater(CARROT, turn, width)
+    staging = middle - radius * planar.unit(psi)
+    if turning_radius is not None:
+        staging = staging - side * turning_radius * planar.unit(psi - jnp.pi / 2)
+    carrot = middle + radius * planar.unit(phi + side * CARROT)
+    return Way(side, is_direct, staging, soft.where(is_direct, staging, carrot))
+
+
+def _either(*conditions: jax.Array) -> jax.Array:
+    """Return whether one of several conditions holds that exclude each other; a sum of weights."""
+    return reduce(lambda a, b: a | b if a.dtype == b.dtype == bool else a + b, conditions)
 
 
 def _is(condition: jax.Array) -> jax.Array:
@@ -167,8 +212,9 @@ def step(
     axle = 0.0 if obs.axle is None else obs.axle
     yaw, u = obs.yaw, planar.unit(obs.yaw)
     p_world_axle = obs.p_world_robot - axle * u
-    push = not_(or_(or_(state.retreat, state.around), state.align))
-    touches, contact, normal, on_front, half_length = _contact(state, obs, temperatures)
+    push = not_(_either(state.retreat, state.around, state.align))
+    current = contact_of(state.p_world_contact, obs, temperatures)
+    touches, contact, normal, on_front, half_length = current
     touched = or_(state.touched, touches)
     here = obs._replace(p_robot_contact=contact)
     l = where(touches, here.l, state.l)  # noqa: E741
@@ -188,9 +234,7 @@ def step(
     # D2 and D3.
     d = displacement(here)
     distance, e = planar.norm(d), planar.wrap(planar.direction(d) - yaw)
-    to_target, offset = obs.p_world_target - middle, p_world_axle - middle
-    flips = (planar.norm(to_target) < params.r) & (jnp.sum(to_target * offset) > 0)
-    psi = planar.direction(to_target) + jnp.where(flips, jnp.pi, 0.0)
+    psi = push_direction(middle, p_world_axle, obs.p_world_target, params.r)
 
     # The end of a push.
     near = above(params.d_near, distance, length)
@@ -202,32 +246,25 @@ def step(
     ends = and_(and_(push, touched), or_(or_(is_spent, is_lost), missed))
 
     # D6: the side is chosen before the base leaves, and kept on the way.
-    phi = planar.direction(offset)
-    turn, chooses = planar.wrap(psi + jnp.pi - phi), _is(or_(push, state.retreat))
-    side = jnp.where(chooses, jnp.where(turn >= 0, 1.0, -1.0), state.side)
-    turn = jnp.mod(side * turn, 2 * jnp.pi)
-    turn = jnp.where(turn > 2 * jnp.pi - _OVERSHOOT, turn - 2 * jnp.pi, turn)
-    is_direct = above(CARROT, turn, angle)
-    radius = params.R + axle
-    staging = middle - radius * planar.unit(psi)
-    if obs.turning_radius is not None:  # a car also moves while it aligns
-        staging = staging - side * obs.turning_radius * planar.unit(psi - jnp.pi / 2)
-    carrot = middle + radius * planar.unit(phi + side * CARROT)
-    way = planar.direction(where(is_direct, staging, carrot) - p_world_axle)
-    error = planar.wrap(way + jnp.pi - yaw)
+    offset, chooses = p_world_axle - middle, _is(or_(push, state.retreat))
+    circle = middle, psi, offset, state.side, chooses, params.R + axle
+    side, is_direct, staging, aim = way_around(*circle, obs.turning_radius, angle)
+    error = planar.wrap(planar.direction(aim - p_world_axle) + jnp.pi - yaw)
     left = planar.norm(staging - p_world_axle)
     passed = and_(above(_CLOSE, left, length), above(jnp.abs(error), _ASIDE, angle))
     is_there = and_(is_direct, or_(above(_ARRIVED, left, length), passed))
     face = planar.wrap(psi - yaw)
 
     # The next modes. A touch of the front on the way is a push, unless it is spent.
-    arrived, aligned = and_(state.around, is_there), above(_ALIGNED, jnp.abs(face), angle)
+    aligned, hits = above(_ALIGNED, jnp.abs(face), angle), and_(touches, on_front)
     gap = jnp.sum((p_world_contact - front) * u)
-    gone = and_(state.retreat, above(gap, params.back, length))
-    hits = and_(or_(state.around, state.align), and_(touches, on_front))
-    retreat = or_(or_(ends, and_(hits, spent)), and_(state.retreat, not_(gone)))
-    around = and_(or_(gone, and_(state.around, not_(arrived))), not_(hits))
-    align = and_(or_(arrived, and_(state.align, not_(aligned))), not_(hits))
+    is_clear = above(gap, params.back, length)
+    stopped = and_(and_(_either(state.around, state.align), hits), spent)
+    retreat = _either(ends, stopped, and_(state.retreat, not_(is_clear)))
+    gone = and_(state.retreat, is_clear)
+    around = _either(gone, and_(and_(state.around, not_(is_there)), not_(hits)))
+    align = _either(and_(state.around, is_there), and_(state.align, not_(aligned)))
+    align = and_(align, not_(hits))
 
     # D4, D5, D7 and D8.
     v_max, is_car = jnp.asarray(params.v_max), obs.turning_radius is not None
@@ -251,7 +288,7 @@ def step(
     memory = UnicycleState(
         retreat, around, align, middle, p_world_contact, l, touched, t_lost, t_push, side
     )
-    details = Details(l, distance, jnp.zeros_like(distance), e, or_(or_(retreat, around), align))
+    details = Details(l, distance, jnp.zeros_like(distance), e, _either(retreat, around, align))
     return memory, Twist(v, axle * omega, omega), details
 
 

@@ -1,0 +1,131 @@
+"""RPS+ that repositions: where a push makes no progress, the base drives around and pushes anew.
+
+RPS+ keeps the contact that it has. On a round front, or with an object that it cannot turn, it may
+circle until the time is over. With the last contact C, the object's middle M, the direction psi of
+its push and the notation of `unicycle` (D1, D2):
+
+  G1  stuck: the distance of C to the target has not fallen by `progress` for t_stuck
+  G2  M = C + r u(theta + n);  phi the angle from M to the base, turn that from phi to psi + pi
+  G3  W = M - R u(psi) where turn < CARROT,  else M + R u(phi +- CARROT)
+
+While stuck, the base moves at v_max towards W, straight away from M where it is nearer than R, and
+from the last W to M. It always turns to face M, omega = angle of M - P minus theta. The next touch
+on the way to M starts RPS+ afresh. It senses what RPS+ senses.
+"""
+
+from typing import Annotated, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from rps_jax import errors
+from rps_jax.control import soft
+from rps_jax.control.base import Bound, Law, bounds_of, document_fields
+from rps_jax.control.laws import rps_plus, unicycle
+from rps_jax.control.laws.rps_plus import RPSPlusParams, RPSPlusState
+from rps_jax.control.observation import Details, Observation, Twist
+from rps_jax.geometry import planar
+from rps_jax.geometry.arrays import Number, Parameter
+
+_ARRIVED, _CLEAR = 0.1, 0.1  # [m] errors at the staging point, and of the circle
+
+
+@document_fields
+class RPSRepositionParams(NamedTuple):
+    """Parameters of RPS+, and those of G1 to G3."""
+
+    law: RPSPlusParams = RPSPlusParams()  # of RPS+
+    # [s] without progress before the base repositions, G1
+    t_stuck: Annotated[Parameter, Bound(3, 100, log=True)] = 20.0
+    progress: Annotated[Parameter, Bound(0.005, 0.3, log=True)] = 0.05  # [m] of G1
+    r: Annotated[Parameter, Bound(0.08, 0.4)] = 0.236  # [m] from the contact to M, G2
+    R: Annotated[Parameter, Bound(0.5, 1.4)] = 0.9  # [m] circle around M, G3
+
+    @property
+    def d_success(self) -> Number:
+        """Distance at which the target is reached [m]."""
+        return self.law.d_success
+
+
+class RPSRepositionState(NamedTuple):
+    """State of the law between two control steps."""
+
+    law: RPSPlusState
+    p_world_object: jax.Array  # (2,) [m] M
+    best: jax.Array  # [m] least distance of C to the target, at the last progress
+    t_stuck: jax.Array  # [s] since then
+    away: jax.Array  # bool: the base repositions
+    approach: jax.Array  # bool: from the last W to M
+    side: jax.Array  # [1] 1: counter-clockwise around M, or -1
+
+
+def check(params: RPSRepositionParams) -> RPSRepositionParams:
+    """Return the parameters if they are scalars in range; otherwise raise InputError."""
+    rps_plus.check(params.law)
+    for name in ("t_stuck", "progress", "r", "R"):
+        errors.check_finite(f"rps_reposition.{name}", getattr(params, name), above=0, at_most=1e6)
+    return params
+
+
+def init(params: RPSRepositionParams) -> RPSRepositionState:
+    """Return the state before the first contact."""
+    state = rps_plus.init(params.law)
+    zero = jnp.zeros_like(state.law.l_th)
+    no = zero > 0
+    point = jnp.zeros_like(state.p_world_contact)
+    return RPSRepositionState(state, point, zero + jnp.inf, zero, no, no, zero + 1)
+
+
+def step(
+    params: RPSRepositionParams, state: RPSRepositionState, obs: Observation
+) -> tuple[RPSRepositionState, Twist, Details]:
+    """Compute one control step: RPS+, or a part of a reposition."""
+    law, twist, details = rps_plus.step(params.law, state.law, obs)
+    touches, base, yaw = obs.in_contact, obs.p_world_robot, obs.yaw
+    _, _, normal, _, half_length = unicycle.contact_of(law.p_world_contact, obs)
+    middle = law.p_world_contact + params.r * planar.unit(yaw + normal)
+    middle = jnp.where(touches, middle, state.p_world_object)
+
+    # G1; the time counts from the first touch.
+    distance = planar.norm(obs.p_world_target - law.p_world_contact)
+    gains = touches & (distance < state.best - params.progress)
+    waits = ~gains & law.law.touched & ~state.away
+    t_stuck = jnp.where(waits, state.t_stuck + obs.period, 0.0)
+    starts = waits & (t_stuck > params.t_stuck)
+    best = jnp.where(gains, distance, state.best)
+
+    # G2 and G3.
+    psi = unicycle.push_direction(middle, base, obs.p_world_target, params.r)
+    offset = base - middle
+    way = unicycle.way_around(middle, psi, offset, state.side, ~state.away, params.R)
+    away = state.away | starts
+    clear = planar.norm(offset) > params.R - _CLEAR
+    at_staging = away & clear & way.is_direct & (planar.norm(way.staging - base) < _ARRIVED)
+    approach = away & (state.approach | at_staging)
+    ends = approach & touches
+    front = base + half_length * planar.unit(yaw)
+    missed = approach & (jnp.sum((front - middle) * planar.unit(yaw)) > params.r)
+    approach, away = approach & ~ends & ~missed, away & ~ends
+
+    heading = planar.direction(jnp.where(approach, middle, way.aim) - base)
+    heading = jnp.where(clear | approach, heading, planar.direction(offset)) - yaw
+    face = planar.wrap(planar.direction(-offset) - yaw)
+    limits = params.law.law
+    v_max, omega_max = jnp.asarray(limits.v_max), jnp.asarray(limits.omega_max)
+    v = v_max * planar.unit(heading)
+    drive = Twist(v[0], v[1], jnp.clip(face, -omega_max, omega_max))
+    fresh = rps_plus.init(params.law)
+    fresh = fresh._replace(p_world_contact=law.p_world_contact)
+    law = soft.tree_where(ends, fresh, law)
+    best = jnp.where(ends, distance, best)
+    twist = soft.tree_where(away, drive, Twist(*map(jnp.asarray, twist)))
+    details = details._replace(realigning=details.realigning | away)
+    memory = RPSRepositionState(law, middle, best, t_stuck, away, approach, way.side)
+    return memory, twist, details
+
+
+BOUNDS = {f"law.{name}": bound for name, bound in rps_plus.BOUNDS.items() if not bound.relative_to}
+BOUNDS["law.law.l_mr"] = rps_plus.BOUNDS["law.l_mr"]._replace(relative_to="law.law.l_cr")
+BOUNDS |= bounds_of(RPSRepositionParams)
+LAW = Law(init, step, check=check, bounds=BOUNDS, room=1.5)
+PRESETS = {"rps_reposition": RPSRepositionParams()}
