@@ -9,7 +9,7 @@ import dataclasses
 import re
 import textwrap
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from typing import Any, ClassVar, get_args
 
@@ -26,7 +26,6 @@ from rps_jax.control.registry import LawLike, LawsLike
 from rps_jax.errors import InputError
 from rps_jax.record.files import JsonObject
 from rps_jax.record.options import option
-from rps_jax.robot.robot import RobotLike
 from rps_jax.runs.question import (
     MultiLawQuestion,
     Rows,
@@ -97,9 +96,6 @@ class Ladder(SweepOptions, TaskOption, MultiLawQuestion[xr.Dataset | xr.DataTree
     worlds: int | None = option(None, 1, 1_000_000_000)
     """Number of worlds of each domain; by default 1000, or the grid of a domain with listed targets
     (paper: 144). With several domains it is at most that grid."""
-    robot: RobotLike | None = field(default=None, kw_only=True)
-    """The robot: ideal, slipping, kairos (the paper's), ridgeback, mpo_500 or round, or a JSON
-    file of its size, boards and limits. By default the domain's."""
     part: int | None = option(None, 1, 1_000_000, kw_only=True)
     """Checkpoint interval: at most this many trials per law and object are repeated after a kill.
     By default 1024, and with many worlds a 16th of them, up to 16384."""

@@ -39,7 +39,8 @@ class TrialOptions:
     robot: RobotLike = "ideal"
     """The robot: ideal (it follows every twist at once, with any force), slipping (its wheels lose
     shares of the twist), kairos (the paper's), ridgeback, mpo_500 or round (a disc as wide as
-    the paper's base), or a JSON file of its size, boards and limits. Changes follow, as
+    the paper's base); turtlebot4, jackal, husky, mir100, pioneer_3dx or f1tenth, which cannot move
+    sideways; or a JSON file of its size, boards, drive and limits. Changes follow, as
     kairos,force_max=300."""
 
 
