@@ -32,7 +32,7 @@ CUSTOM = f"{EXAMPLE}:PParams"
 STRICT = ["-std=c99", "-Wall", "-Wextra", "-Werror", "-pedantic"]
 LAWS = [
     *("rps", "nps", "rps_plus", "aps", "pursuit", "dipole", "force_push", "force_push_published"),
-    *("learned_small", "learned"),
+    *("learned_small", "learned", "unicycle"),
 ]
 
 
