@@ -88,10 +88,10 @@ def law_of(params: LawParams | type) -> Law:
 
 def default_law(drive: DriveKind) -> str:
     """Return the name of the law for a base with this drive, if none is named."""
-    return "rps" if drive == "omni" else _laws_for(drive)[0]
+    return "rps" if drive == "omni" else laws_for(drive)[0]
 
 
-def _laws_for(drive: DriveKind) -> list[str]:
+def laws_for(drive: DriveKind) -> list[str]:
     """Return the names of the offered laws whose twists such a base can follow."""
     return [name for name, params in LAWS.items() if drive in law_of(params).drives]
 
@@ -108,7 +108,7 @@ def check_drive(params: LawParams, drive: DriveKind) -> None:
     """Raise InputError unless a base with this drive can follow the law's twists."""
     if drive in law_of(params).drives:
         return
-    known = " or ".join(_laws_for(drive))
+    known = " or ".join(laws_for(drive))
     rule = f"it moves sideways, which a base with drive = {drive} cannot; choose {known}"
     if not type(params).__module__.startswith("rps_jax."):
         rule += ", or declare Law(drives=...) of this one"

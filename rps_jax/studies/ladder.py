@@ -26,6 +26,7 @@ from rps_jax.control.registry import LawLike, LawsLike
 from rps_jax.errors import InputError
 from rps_jax.record.files import JsonObject
 from rps_jax.record.options import option
+from rps_jax.robot.robot import parse_robot
 from rps_jax.runs.question import (
     MultiLawQuestion,
     Rows,
@@ -87,9 +88,9 @@ class Ladder(SweepOptions, TaskOption, MultiLawQuestion[xr.Dataset | xr.DataTree
     QUICK: ClassVar[Mapping[str, Any]] = {"worlds": 64, "domain": ("wide,objects=random_box",)}
 
     laws: LawsLike = ()
-    """The laws, by default all laws of the package: names, as rps, rps_tuned or rps_plus, or a
-    file's, as my_law.py:MyParams or policy.npz; changes follow each, as rps,K_h=0.3 or
-    rps,tuned.json."""
+    """The laws, by default all laws of the package that the robot can follow: names, as rps,
+    rps_tuned or rps_plus, or a file's, as my_law.py:MyParams or policy.npz; changes follow each, as
+    rps,K_h=0.3 or rps,tuned.json."""
     domain: DomainLike | Sequence[DomainLike] = ("wide",)
     """Domains: paper, hardware, wide, real (wide, but with limited robots), prisms or hostile, or
     JSON files of ranges. Changes follow each, as wide,mass=3:10."""
@@ -102,8 +103,10 @@ class Ladder(SweepOptions, TaskOption, MultiLawQuestion[xr.Dataset | xr.DataTree
 
     @cached_property
     def chosen(self) -> dict[str, LawParams]:
-        is_default = isinstance(self.laws, tuple) and not self.laws
-        return registry.resolve_laws(all_laws() if is_default else self.laws)
+        if not isinstance(self.laws, tuple) or self.laws:
+            return registry.resolve_laws(self.laws)
+        drive = parse_robot(self.robot or "ideal").drive
+        return registry.resolve_laws([x for x in all_laws() if x in registry.laws_for(drive)])
 
     @cached_property
     def sweeps(self) -> dict[str, _TestSweep]:
