@@ -59,7 +59,10 @@ def pytest_configure(config):
     import jax
 
     from rps_jax.engines import device
+    from rps_jax.lowering import verifier
     from rps_jax.world import rendering
+
+    verifier.enabled = True
 
     rendering.choose_gl()
     device.configure_xla()

@@ -109,6 +109,8 @@ def test_a_program_is_retraced_for_each_lever():
     calls = []
 
     class RecordingStage(NamedTuple):
+        native = False
+
         def drive(self, *args):
             calls.append(args)
             return Quasistatic().drive(*args)

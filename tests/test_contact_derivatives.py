@@ -80,7 +80,7 @@ def classes(fields, motion, twists, physics):
 
     It is 0 for an open contact, 1 for one that slides and 2 for one that sticks: (n, C) each.
     """
-    body, state = fused.spread(fields), fused.enter(fields, motion)
+    body, state = fused.split_entries(fields), fused.from_mujoco(fields, motion)
     m = sp.matrix(state.q)
     both = [
         contacts.on_ground(body, state, m, physics),

@@ -122,9 +122,11 @@ def test_the_contact_of_a_leaning_object_is_at_its_lower_edge(name, degrees):
     body = body_of(loaded.physics, np.asarray(loaded.footprint.vertices))
     body = jax.tree.map(lambda leaf: jnp.asarray(leaf, float)[None], body)
     still = jnp.zeros((1, 9))
-    state = fused.enter(body, Motion(jnp.asarray(qpos, float)[None], still, still))
+    state = fused.from_mujoco(body, Motion(jnp.asarray(qpos, float)[None], still, still))
     ahead = jnp.ones(1), jnp.zeros(1)
-    contact = contacts.meetings(fused.spread(body), state, vectors.matrix(state.q), ahead)
+    contact = contacts.side_contacts(
+        fused.split_entries(body), state, vectors.matrix(state.q), ahead
+    )
     heights, _, _, distances = (np.asarray(x) for x in contact)
     corner = z - tall * c + half * s
     assert heights.min() >= max(0.06, corner) - 1e-5

@@ -109,9 +109,10 @@ def test_tables_hold_numbers_that_are_not_finite(monkeypatch):
 
 
 PAIRS = [
-    ("box", "capacitive"), ("cylinder", "ideal"),
+    ("box", "capacitive"),
+    ("cylinder", "ideal"),
     pytest.param("prism", "ideal", marks=pytest.mark.slow),
-]  # fmt: skip
+]
 
 
 @pytest.mark.parametrize(("shape", "skin"), PAIRS)

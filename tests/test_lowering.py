@@ -20,13 +20,13 @@ from test_gpu_writer import Emulated
 
 from rps_jax.engines import device, native
 from rps_jax.lowering import c, js, operations, target, walk
+from rps_jax.lowering.builder import SimdBuilder
 from rps_jax.lowering.compounds import COMPOUNDS
 from rps_jax.lowering.gpu_writer import GpuWriter
-from rps_jax.lowering.nodes import SimdNodes
 from rps_jax.lowering.onnx import Graph, Tensor
 from rps_jax.lowering.routine import routine
+from rps_jax.lowering.simd_writer import SimdWriter
 from rps_jax.lowering.target import UnsupportedError
-from rps_jax.lowering.writer import SimdWriter
 
 MAKE = runpy.run_path(str(ROOT / "docs" / "push" / "make.py"))  # with the printer of a page
 REALS = [0.0, -0.0, 0.5, -1.5, 2.5, 7.0, 1e30, -1e30, np.inf, -np.inf, np.nan]
@@ -96,6 +96,18 @@ CASES = {
         x.at[i].get(mode="fill", fill_value=-1),
     ),
     "changes": lambda x, i: (x.at[i].set(7), x.at[i % 3].add(i), x.at[i[0] % 3].mul(2)),
+    "an array and one of its elements": lambda x, i: (
+        y := 0.5 * jnp.tile(x, 3) + 1,
+        y + y[4],
+        2 * x - (2 * x)[0],
+        jnp.tile(i + 1, 3) * (i + 1)[2],
+    ),
+    "one of the carried numbers": lambda x, i: lax.fori_loop(
+        0, 3, lambda _, y: (jnp.broadcast_to(y[0][1], (3,)), y[1] + i[0]), (x, i + 1)
+    ),
+    "a loop of no iterations": lambda x, i: lax.fori_loop(0, 0, lambda _, y: y + i[0], x),
+    "small reals": lambda x, i: x.astype(jnp.float16).astype(x.dtype),
+    "small integers": lambda x, i: i.astype(jnp.int8).astype(jnp.int32),
     "further changes": lambda x, i: (
         x.at[i % 3].subtract(i),
         x.at[i[1] % 3].max(1),
@@ -219,11 +231,13 @@ SPECIAL |= {
 BITS_OF_REALS = {
     f"bitcast_convert_type {kinds}" for kinds in ("int32 of f", "float32 of i", "float32 of f")
 }
+SMALL = {"small reals", "small integers"}
 UNSIGNED = {"searches", "interpolation"}
-ENDLESS = UNSIGNED | {"a loop with a condition"}
+ENDLESS = UNSIGNED | SMALL | {"a loop with a condition"}
 REFUSED = {
+    **dict.fromkeys(("simd", "gpu"), SMALL),
     **dict.fromkeys(("c float", "c double"), BITS_OF_REALS | {"erf_inv"} | ENDLESS),
-    "js": BITS_OF_REALS | UNSIGNED | {"erf_inv", "erf", "erfc", "erf of a real"},
+    "js": BITS_OF_REALS | UNSIGNED | SMALL | {"erf_inv", "erf", "erfc", "erf of a real"},
     "onnx": BITS_OF_REALS
     | {"erf_inv", "erfc", "log1p", "expm1", "cbrt"}
     | ENDLESS
@@ -447,7 +461,7 @@ def test_the_languages_have_the_operations_of_the_headers():
     excluded = re.compile(
         r"bits_|all_|threefry|shift_|u_of|lt_to|in_total|.*(_u|_of_u)$|(erf_inv_f|truncate_f|quotient_i|any)$"
     )
-    names = {name for name in SimdNodes.operations if not excluded.match(name)}
+    names = {name for name in SimdBuilder.operations if not excluded.match(name)}
     assert names <= set(operations.spelled("c"))
     assert names - {"erf_f", "erfc_f"} <= {*operations.spelled("js"), "exp2_f", "round_f"}
 
@@ -462,7 +476,7 @@ def primitive_names(jaxpr):
 
 def test_each_primitive_of_jax_that_the_compiler_knows_has_a_case():
     known = {*COMPOUNDS, *walk._MOVES, *walk._IDENTITIES, *target.REDUCTIONS}
-    known |= {operation.rpartition("_")[0] for operation in {*SimdNodes.operations, *COMPOUNDS}}
+    known |= {operation.rpartition("_")[0] for operation in {*SimdBuilder.operations, *COMPOUNDS}}
     primitives = {x.name for x in vars(lax).values() if isinstance(x, Primitive)}
     closed, *_ = jaxpr([*CASES, *generated()])
     assert known & primitives <= primitive_names(closed.jaxpr)

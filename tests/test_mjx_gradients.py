@@ -315,8 +315,8 @@ def sunk(worlds):
     if family == "cylinder":
         qpos[:, 3] += 0.5
         qpos[kinds == 0, 7:9] += 1e-4 * rng.normal(size=(sum(kinds == 0), 2))
-    state = fused.enter(fields, Motion(qpos, qvel, np.zeros_like(qvel)))
-    r, exists = contacts._lower_face(fused.spread(fields), sp.matrix(state.q))
+    state = fused.from_mujoco(fields, Motion(qpos, qvel, np.zeros_like(qvel)))
+    r, exists = contacts._lower_face(fused.split_entries(fields), sp.matrix(state.q))
     depth = 4e-4 * rng.random(len(qpos))
     qpos[:, 5] -= np.min(np.where(exists, state.p[2] + r[2], 1.0), axis=0) + depth
     qvel[kinds == 2, 3:] *= 0.1

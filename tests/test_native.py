@@ -13,7 +13,7 @@ from rps_jax import Details, Law, Twist, replay, sweep
 from rps_jax.control import registry
 from rps_jax.engines import native
 from rps_jax.engines.base import ControlPeriod
-from rps_jax.lowering import compounds, nodes, walk
+from rps_jax.lowering import builder, compounds, passes, walk
 from rps_jax.trials import law_check, trial
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import ControlLoop, Rules
@@ -35,8 +35,9 @@ def cache(tmp_path):
     jax.config.update("jax_compilation_cache_dir", previous)
 
 
-def batch(shape, skin="capacitive", count=21, law="rps_tuned", engine="fused", domain="wide",
-          **drawn):  # fmt: skip
+def batch(
+    shape, skin="capacitive", count=21, law="rps_tuned", engine="fused", domain="wide", **drawn
+):
     """Return stage, (worlds, params) and loop of random objects at different positions."""
     _, params = registry.resolve_law(law)
     domain = replace(DOMAINS[domain], objects=(f"random_{shape}",), skin=skin, **drawn)
@@ -82,8 +83,9 @@ def close(actual, desired, warm, rest):
 
 PAIRS = [
     pytest.param("box", "capacitive", marks=pytest.mark.slow),
-    ("cylinder", "ideal"), ("prism", "capacitive"),
-]  # fmt: skip
+    ("cylinder", "ideal"),
+    ("prism", "capacitive"),
+]
 
 
 @pytest.mark.parametrize(("shape", "skin"), PAIRS)
@@ -257,7 +259,7 @@ def test_constants_are_moved_as_jax_moves_them():
         return [*rows, jax.lax.pad(x, jnp.float32(3), ((1, 0, 1), (-1, 0, 0))), *x]
 
     x = np.arange(12, dtype=np.float32).reshape(3, 4)
-    results = walk.walk(jax.make_jaxpr(function)(x), [x], nodes.SimdNodes())
+    results = walk.walk(jax.make_jaxpr(function)(x), [x], builder.SimdBuilder())
     for a, b in zip(results, function(jnp.asarray(x)), strict=True):
         np.testing.assert_array_equal(a, b)
 
@@ -293,9 +295,11 @@ def test_a_scan_of_worlds_is_that_of_jax_and_so_are_its_derivatives(monkeypatch)
 
     inputs = jnp.linspace(0.1, 1, 4), jnp.linspace(0.2, 0.5, 4), jnp.full((4, 3), 0.3)
     for transform in (
-        lambda f: jax.grad(f, argnums=(0, 1, 2)), lambda f: jax.grad(f, argnums=1),
-        lambda f: jax.jacfwd(f, argnums=2), lambda f: f,
-    ):  # fmt: skip
+        lambda f: jax.grad(f, argnums=(0, 1, 2)),
+        lambda f: jax.grad(f, argnums=1),
+        lambda f: jax.jacfwd(f, argnums=2),
+        lambda f: f,
+    ):
         native_result, expected = (
             jax.jit(transform(lambda *x, scan=scan: score(*x, scan)))(*inputs)
             for scan in (native.scan, by_jax)
@@ -330,27 +334,34 @@ def test_the_loop_of_a_base_with_slip_is_compiled_as_a_whole(monkeypatch):
     assert "while" not in primitives
 
 
+UNSUPPORTED = (
+    "operation `lgamma` cannot be translated; use arithmetic, comparisons, jnp.where and "
+    "elementary functions. XLA compiles this law, which is some ten times slower."
+)
 FALLBACKS = {
     "large products, as of a learned law": (lambda x: jnp.ones((99, 3)) * x @ jnp.ones(3), []),
-    "an unsupported operation": (lambda x: jax.lax.lgamma(x + 1) * 3 * x, [
-        "operation `lgamma` cannot be translated; use arithmetic, comparisons, jnp.where and "
-        "elementary functions. XLA compiles this law, which is some ten times slower."
-    ]),
-    "code that cannot be printed": (None, ["cannot be printed, so XLA compiles: KeyError"]),
-}  # fmt: skip
+    "an unsupported operation": (lambda x: jax.lax.lgamma(x + 1) * 3 * x, [UNSUPPORTED]),
+}
 
 
 @pytest.mark.parametrize("name", FALLBACKS)
-def test_xla_compiles_other_functions_and_the_reason_is_named_once(name, monkeypatch, recwarn):
+def test_xla_compiles_other_functions_and_the_reason_is_named_once(name, recwarn):
     function, reasons = FALLBACKS[name]
-    if function is None:
-        function = jnp.sin
-        monkeypatch.setattr(nodes, "walk", lambda *_: {}["num_consts"])
     run = native.batched(function, lambda x: 3 * x)
     for _ in range(2):
         assert np.asarray(run(jnp.arange(2.0))).tolist() == [0.0, 3.0]
     for warning, reason in zip(recwarn, reasons, strict=True):
         assert reason in str(warning.message)
+
+
+@pytest.mark.parametrize("owner", [builder, passes])
+def test_an_error_of_the_compiler_itself_is_raised(owner, monkeypatch):
+    """A fault of a builder or a pass must not make a run ten times slower in silence."""
+    name = "walk" if owner is builder else "_next_group"
+    monkeypatch.setattr(owner, name, lambda *_: {}["num_consts"])
+    run = native.batched(jnp.sin, lambda x: pytest.fail("XLA compiled it"))
+    with pytest.raises(KeyError, match="num_consts"):
+        run(jnp.arange(2.0))
 
 
 @pytest.mark.parametrize(

@@ -29,10 +29,11 @@ from rps_jax.engines import quasistatic
 from rps_jax.engines.base import ControlPeriod
 from rps_jax.geometry.polyline import Polyline
 from rps_jax.lowering import js
+from rps_jax.lowering.builder import GraphBuilder
+from rps_jax.lowering.graph import Array, Gather, Node
 from rps_jax.lowering.js import JsWriter
-from rps_jax.lowering.nodes import Array, Node, SimdNodes
 from rps_jax.lowering.routine import Group, Routine, fields_of, identifier, routine
-from rps_jax.lowering.scalar_nodes import ScalarNodes
+from rps_jax.lowering.scalar_builder import ScalarBuilder
 from rps_jax.robot.robot import Robot
 from rps_jax.robot.skin import NONE
 from rps_jax.runs.push import push
@@ -296,23 +297,23 @@ def routes(count: int = 6) -> list[list[list[float]]]:
 _LISTED = 12  # elements of an array that is printed as a list, at most
 
 
-class _LoopNodes(ScalarNodes):
+class _LoopBuilder(ScalarBuilder):
     """Target whose loops may run until a condition fails: a page has no deadline."""
 
-    while_loop = SimdNodes.while_loop
+    while_loop = GraphBuilder.while_loop
 
 
 class PageWriter(JsWriter):
     """Printer of a routine of a page."""
 
-    nodes = _LoopNodes
+    builder = _LoopBuilder
     leave = "if (!goes) break;"
 
     def single(self, node: Node) -> list[str]:
         """Return the statements of a node; many numbers of one array are picked by a table."""
-        views = [a for a in node.args if isinstance(a, Array)]
-        sources = {view.node for view in views}
-        if node.op != "move" or not _LISTED < node.size == len(views) or len(sources) > 1:
+        views = [a for a in node.operands if isinstance(a, Array)]
+        sources, is_gather = {view.node for view in views}, isinstance(node.op, Gather)
+        if not is_gather or not _LISTED < node.size == len(views) or len(sources) > 1:
             return super().single(node)
         first = min(view.first for view in views)
         table = self.table(np.array([view.first - first for view in views]))
@@ -324,8 +325,9 @@ def function(name: str, routine: Routine, tables: dict[str, str]) -> str:
     """Return a routine of a page as a function of its groups of fields."""
     groups = {group: f"{group}." for group in routine.inputs}
     lines = js.statements(routine, groups, tables, PageWriter)
-    results = ", ".join(f"{group}: {js.object_of(group, routine.outputs)}"
-                        for group in routine.outputs)  # fmt: skip
+    results = ", ".join(
+        f"{group}: {js.object_of(group, routine.outputs)}" for group in routine.outputs
+    )
     head = f"function {name}({', '.join(routine.inputs)}) {{"
     return f"{head}\n{lines}\n  return {{ {results} }};\n}}\n"
 

@@ -75,6 +75,8 @@ class Driven(NamedTuple):
 class Stage(Protocol):
     """Shared part of all worlds of a batch, with the function that steps them."""
 
+    native: ClassVar[bool]  # whether `engines.native` can compile the step of one world
+
     def drive(self, fields: Any, motion: Motion, period: ControlPeriod) -> Driven:
         """Step a batch of worlds with these fields (B, ...) for one control period.
 

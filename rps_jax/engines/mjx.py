@@ -58,6 +58,7 @@ class MJXStage(NamedTuple):
 
     model: mjx.Model
     data: mjx.Data  # a template for the state of each world
+    native = False
     engine = "mjx"
 
     def drive(self, fields: dict[str, jax.Array], motion: Motion, period: ControlPeriod) -> Driven:

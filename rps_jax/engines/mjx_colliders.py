@@ -24,7 +24,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from rps_jax.engines.fused.contacts import Corners, meetings
+from rps_jax.engines.fused.contacts import Corners, side_contacts
 from rps_jax.geometry import vectors
 from rps_jax.world import opengl as opengl  # imports MuJoCo
 
@@ -120,7 +120,7 @@ def upright(model: Model, data: Data, base: int, prism: int, corners: jax.Array)
     )
     state: Any = SimpleNamespace(base=middle, p=data.xpos[body])
     m: Any = [tuple(row) for row in data.xmat[body]]
-    contacts: Any = meetings(solid, state, m, (turn[0], turn[1]))
+    contacts: Any = side_contacts(solid, state, m, (turn[0], turn[1]))
     z, normal, point, distance = contacts
     back = jnp.array([[turn[0], turn[1]], [-turn[1], turn[0]]])
     n = jnp.stack(normal) @ back

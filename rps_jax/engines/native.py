@@ -26,7 +26,7 @@ from collections import defaultdict
 from collections.abc import Callable, Collection, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, Literal, NamedTuple, TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -34,12 +34,14 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 
 from rps_jax.engines import device
+from rps_jax.engines.base import Stage
 from rps_jax.engines.linear_map import linear_map, restrict, varied_indices
 from rps_jax.geometry import vectors
 from rps_jax.lowering import nvrtc
-from rps_jax.lowering.gpu_writer import WARP, GpuWriter
-from rps_jax.lowering.target import TooLargeError, UnsupportedError, first_array
-from rps_jax.lowering.writer import HANDLER, SimdWriter
+from rps_jax.lowering.gpu_builder import WARP
+from rps_jax.lowering.gpu_writer import GpuWriter
+from rps_jax.lowering.simd_writer import HANDLER, SimdWriter
+from rps_jax.lowering.target import CompilerError, TooLargeError, UnsupportedError, first_array
 from rps_jax.record import cache
 
 Pytree: TypeAlias = Any  # of arrays; functions of this module take any
@@ -61,6 +63,11 @@ libraries: dict[str, ctypes.CDLL] = {}  # of the functions that XLA can call, by
 # Compilers run while JAX traces the next functions.
 _COMPILATIONS = ThreadPoolExecutor(4, "compiler")
 _locks: defaultdict[str, threading.RLock] = defaultdict(threading.RLock)
+
+
+def compiles(*stages: Stage) -> bool:
+    """Whether worlds of these stages are compiled one by one here."""
+    return all(stage.native for stage in stages) and is_available()
 
 
 def is_available() -> bool:
@@ -98,9 +105,8 @@ def target() -> str | None:
 
 def batched(
     function: Function,
-    whole: Function,
-    saves: bool = False,
-    always: bool = False,
+    fallback: Function,
+    residuals: Literal["none", "derivatives", "always"] = "none",
 ) -> Function:
     """Return a function of a batch of worlds (B, ...) that runs world by world.
 
@@ -108,35 +114,35 @@ def batched(
 
     Args:
       function: the function of one world; pure.
-      whole: the same function of a batch, which XLA compiles where `function` is not compiled.
-      saves: whether `function` is a function of a tuple of arguments and of `saved`, and returns
-        results and `saved`: numbers that it computes if it gets (), and from which, as constants,
-        its derivatives are faster. Where it is not differentiated, it gets None.
-      always: whether it gets () there, too, so that no other function is compiled.
+      fallback: the same function of a batch, which XLA compiles where `function` is not compiled.
+      residuals: unless `none`, `function` is a function of a tuple of arguments and of residuals,
+        and returns results and residuals: numbers that it computes if it gets (), and from which,
+        as constants, its derivatives are faster. With `derivatives` it gets None where it is not
+        differentiated; with `always` it gets () there, too, so that no other function is compiled.
     """
     if not is_available():
-        return whole
+        return fallback
+    has_residuals = residuals != "none"
 
-    def save(arguments: Pytree, saved: Pytree) -> tuple[Pytree, Pytree]:
-        return function(arguments, saved) if saves else (function(*arguments), ())
+    def evaluate(arguments: Pytree, residuals: Pytree) -> tuple[Pytree, Pytree]:
+        return function(arguments, residuals) if has_residuals else (function(*arguments), ())
 
-    def start(*arguments: Pytree) -> tuple[Pytree, Pytree]:
-        return save(arguments, ())
+    def with_residuals(*arguments: Pytree) -> tuple[Pytree, Pytree]:
+        return evaluate(arguments, ())
 
     def plain(*arguments: Pytree) -> Pytree:
-        return save(arguments, None)[0]
+        return evaluate(arguments, None)[0]
 
-    run_plain = concurrent([plain], lambda arguments: [whole(*arguments)])
-    in_xla = jax.vmap(start) if saves else lambda *arguments: (whole(*arguments), ())
-    run = concurrent([start], lambda arguments: [in_xla(*arguments)])
+    run_plain = concurrent([plain], lambda arguments: [fallback(*arguments)])
+    run = concurrent([with_residuals], lambda arguments: [jax.vmap(with_residuals)(*arguments)])
 
     @jax.custom_jvp
     def call(*arguments: Pytree) -> Pytree:
-        return run(arguments)[0][0] if always else run_plain(arguments)[0]
+        return run(arguments)[0][0] if residuals == "always" else run_plain(arguments)[0]
 
     def rule(primals: Pytree, tangents: Pytree) -> tuple[Pytree, Pytree]:
-        results, saved = run(primals)[0] if saves else (call(*primals), ())
-        return results, _tangents(lambda *x: save(*x)[0], primals, saved, tangents, results)
+        results, saved = run(primals)[0] if has_residuals else (call(*primals), ())
+        return results, _tangents(lambda *x: evaluate(*x)[0], primals, saved, tangents, results)
 
     call.defjvp(rule, symbolic_zeros=True)
     return call
@@ -174,16 +180,14 @@ def mapped(function: Function, axes: Sequence[int | None]) -> Function:
         size = len(jax.tree.leaves(arguments[0])[0])
         trees = list(map(jax.tree.structure, arguments))
 
-        def repeat(x: Any) -> jax.Array:
-            return jnp.broadcast_to(x, (size, *jnp.shape(x)))
-
         # Records check the shapes of a world: a batch is passed as leaves.
         def single(*leaves: Sequence[Any]) -> Pytree:
             return function(*(tree.unflatten(x) for tree, x in zip(trees, leaves, strict=True)))
 
-        inputs = [jax.tree.leaves(x) for x in arguments]
-        pairs = zip(inputs, axes, strict=True)
-        inputs = [x if axis == 0 else list(map(repeat, x)) for x, axis in pairs]
+        inputs = [
+            [x if axis == 0 else jnp.broadcast_to(x, (size, *jnp.shape(x))) for x in leaves]
+            for leaves, axis in zip(map(jax.tree.leaves, arguments), axes, strict=True)
+        ]
         return batched(single, jax.vmap(single))(*inputs)
 
     return call
@@ -191,16 +195,18 @@ def mapped(function: Function, axes: Sequence[int | None]) -> Function:
 
 def scan(
     step: Callable[[Pytree, Pytree, Pytree], tuple[tuple[Pytree, Pytree], Pytree]],
-    state: Pytree, constants: Pytree, length: int,
-) -> tuple[Pytree, Pytree]:  # fmt: skip
+    state: Pytree,
+    constants: Pytree,
+    length: int,
+) -> tuple[Pytree, Pytree]:
     """Return `jax.lax.scan` of a batch of worlds (B, ...) by one native function for each step.
 
     A loop reads and writes few arrays: those of the state and of the constants, each with one array
     for each type of number, and one more of the constants that are differentiated.
 
     Args:
-      step: of one world, from state, constants and the saved numbers of `batched`'s `saving`. It
-        returns state and output, and these numbers.
+      step: of one world, from state, constants and the residuals of `batched`. It returns state
+        and output, and the residuals.
       state: first state.
       constants: pytree of arrays that do not change.
       length: number of steps.
@@ -226,13 +232,14 @@ def scan(
 
         indices = list(groups.values())
 
-        def saving(arguments: Pytree, saved: Pytree) -> tuple[Pytree, Pytree]:
+        def packed_step(arguments: Pytree, residuals: Pytree) -> tuple[Pytree, Pytree]:
             state, constants = tree.unflatten(unpacked([*arguments[0], *arguments[1]], indices))
-            (state, output), saved = step(state, constants, saved)
-            return (packed(jax.tree.leaves(state), indices[:carried]), output), saved
+            (state, output), residuals = step(state, constants, residuals)
+            return (packed(jax.tree.leaves(state), indices[:carried]), output), residuals
 
         arrays = jax.vmap(lambda x: packed(x, indices))(values)
-        call = batched(saving, jax.vmap(lambda *x: saving(x, None)[0]), True, varied is not None)
+        residuals = "derivatives" if varied is None else "always"
+        call = batched(packed_step, jax.vmap(lambda *x: packed_step(x, None)[0]), residuals)
         end, outputs = jax.lax.scan(
             lambda x, _: call(x, arrays[carried:]), arrays[:carried], length=length
         )
@@ -252,13 +259,16 @@ def scan(
 
 def _tangents(
     function: Callable[[Pytree, Pytree], Pytree],
-    arguments: Pytree, saved: Pytree, tangents: Pytree, results: Pytree,
-) -> Pytree:  # fmt: skip
+    arguments: Pytree,
+    residuals: Pytree,
+    tangents: Pytree,
+    results: Pytree,
+) -> Pytree:
     """Return the tangents of the results of a function of one world, in a batch of worlds.
 
-    The function's second argument, `saved`, is constant.
+    The function's second argument, the residuals, is constant.
     """
-    leaves, tree = jax.tree.flatten((arguments, saved))
+    leaves, tree = jax.tree.flatten((arguments, residuals))
     result_leaves, result_tree = jax.tree.flatten(results)
     directions = jax.tree.leaves(tangents)
     varied = varied_indices(directions)
@@ -276,31 +286,30 @@ def _tangents(
         of_varied, point = restrict(real_results, values, varied)
         return jax.vjp(of_varied, point)[1](list(vectors))[0]
 
-    moved = linear_map(
-        batched(push, jax.vmap(push)), batched(pull, jax.vmap(pull)),
-        leaves, [directions[i] for i in varied], [result_leaves[i] for i in real],
-    )  # fmt: skip
-    values = dict(zip(real, moved, strict=True))
+    forward, transpose = (batched(f, jax.vmap(f)) for f in (push, pull))
+    vectors, templates = [directions[i] for i in varied], [result_leaves[i] for i in real]
+    outputs = linear_map(forward, transpose, leaves, vectors, templates)
+    values = dict(zip(real, outputs, strict=True))
     zeros = [np.zeros(x.shape, jax.dtypes.float0) for x in result_leaves]
     return result_tree.unflatten([values.get(i, x) for i, x in enumerate(zeros)])
 
 
 def concurrent(
     functions: Sequence[Function],
-    whole: Callable[..., Sequence[Pytree]],
+    fallback: Callable[..., Sequence[Pytree]],
     sort_by: Callable[..., jax.Array] | None = None,
 ) -> Callable[..., Any]:
     """Return functions of batches of worlds as one function; a GPU runs them at the same time.
 
     Args:
       functions: of one world each; pure.
-      whole: all their results from a tuple of arguments for each; XLA compiles it where
+      fallback: all their results from a tuple of arguments for each; XLA compiles it where
         `functions` are not compiled.
       sort_by: returns keys (B,) of a batch's worlds. Worlds with similar keys are computed side by
         side, which changes only how long it takes.
     """
     if not is_available():
-        return whole
+        return fallback
 
     @functools.cache
     def compiled(types: Sequence[tuple[Any, Sequence[Any]]]) -> tuple[list[_Function], Any]:
@@ -314,25 +323,24 @@ def concurrent(
         types = tuple((tree, tuple((x.shape, x.dtype) for x in leaves)) for leaves, tree in flat)
         calls, groups = compiled(types)
         if any(library is None for _, library in groups):
-            return list(whole(*arguments))
+            return list(fallback(*arguments))
         inputs = [leaves for leaves, _ in flat]
         if sort_by is not None:
             orders = [jnp.argsort(sort_by(*x)).astype(jnp.int32) for x in arguments]
             inputs = [[*x, order] for x, order in zip(inputs, orders, strict=True)]
-        sizes = [len(x) for x in inputs]
+        flat_inputs, inputs_tree = jax.tree.flatten(inputs)
 
         def run_libraries(values: Sequence[Any], _: Any) -> list[jax.Array]:
             """Call the libraries, for which it waits until they are compiled."""
-            rest = iter(values)
-            leaves = [[next(rest) for _ in range(size)] for size in sizes]
+            leaves = inputs_tree.unflatten(values)
             try:
                 names = [library.ready() for _, library in groups]
-            except RuntimeError as error:
+            except CompilerError as error:
                 compiler, reason = error.args
                 warnings.warn(f"{compiler} fails, so XLA compiles: {reason}", stacklevel=2)
                 pairs = zip(types, leaves, strict=True)
                 trees = [tree.unflatten(x[: len(kinds)]) for (tree, kinds), x in pairs]
-                return jax.tree.leaves(list(whole(*trees)))
+                return jax.tree.leaves(list(fallback(*trees)))
             owners, results = iter(leaves), list[jax.Array]()
             for (group, _), name in zip(groups, names, strict=True):
                 shapes = [x for call in group for x in call.shapes]
@@ -343,11 +351,10 @@ def concurrent(
         shapes = [x for call in calls for x in call.shapes]
         # As a map of no vectors it has a message where it is differentiated twice.
         label = " ".join(library.name for _, library in groups)
-        leaves = [x for call in inputs for x in call]
-        results = iter(linear_map(run_libraries, None, leaves, [], shapes, label))
+        results = iter(linear_map(run_libraries, None, flat_inputs, [], shapes, label))
         return [call.structure.unflatten([next(results) for _ in call.results]) for call in calls]
 
-    run.defjvp(lambda primals, tangents: jax.jvp(lambda *x: list(whole(*x)), primals, tangents))
+    run.defjvp(lambda primals, tangents: jax.jvp(lambda *x: list(fallback(*x)), primals, tangents))
     return run
 
 
@@ -361,7 +368,7 @@ class _Library(NamedTuple):
         """Return its name when it is compiled.
 
         Raises:
-          RuntimeError: the compiler that fails, and its first message.
+          CompilerError: the compiler fails.
         """
         if self.compilation is not None:
             self.compilation.result()
@@ -372,9 +379,12 @@ class _Function:
     """The jaxpr of a function of one world, and the shapes of the results of a batch."""
 
     def __init__(
-        self, function: Function, tree: Any, types: Sequence[tuple[Any, Any]],
+        self,
+        function: Function,
+        tree: Any,
+        types: Sequence[tuple[Any, Any]],
         sort_by: Callable[..., jax.Array] | None,
-    ) -> None:  # fmt: skip
+    ) -> None:
         self.inputs = [jax.ShapeDtypeStruct(shape[1:], dtype) for shape, dtype in types]
         with vectors.trace_one_world():
             world = tree.unflatten(self.inputs)
@@ -395,10 +405,6 @@ def _compiled(functions: Sequence[_Function]) -> _Library | None:
         return None
     except (TooLargeError, jax.errors.TracerArrayConversionError):
         return None  # XLA is faster, or the law holds a value that is being traced
-    except Exception as error:  # a version of JAX with other jaxprs
-        message = f"{type(error).__name__}: {error}"
-        warnings.warn(f"the code cannot be printed, so XLA compiles: {message}", stacklevel=2)
-        return None
     key = repr((texts, on_gpu and (nvrtc.LAUNCH, nvrtc.FLAGS), target(), jax.__version__))
     name = _NAME + hashlib.sha256(key.encode()).hexdigest()[:32]
 
@@ -406,8 +412,10 @@ def _compiled(functions: Sequence[_Function]) -> _Library | None:
         with _locks[name]:
             if name in libraries:
                 return
-            body = _kernels(name, texts, functions, WARP // threads) if on_gpu else _library(
-                texts[0].replace(HANDLER, name), name)  # fmt: skip
+            if on_gpu:
+                body = _kernels(name, texts, functions, WARP // threads)
+            else:
+                body = _library(texts[0].replace(HANDLER, name), name)
             cache.write(_cache_path(name), body)
             _register(name, body)
 
@@ -437,7 +445,7 @@ def _library(text: str, name: str) -> bytes:
     """Compile C to a shared library.
 
     Raises:
-      RuntimeError: the compiler that fails, and its first message.
+      CompilerError: the compiler fails.
     """
     with tempfile.TemporaryDirectory() as folder:
         source, library = Path(folder) / f"{name}.c", Path(folder) / f"{name}.so"
@@ -446,7 +454,7 @@ def _library(text: str, name: str) -> bytes:
         command += [f"-I{jax.ffi.include_dir()}", str(source), "-o", str(library), "-lm", "-ldl"]
         process = subprocess.run(command, capture_output=True, text=True)
         if process.returncode:
-            raise RuntimeError(command[0], [*process.stderr.splitlines(), "no message"][0])
+            raise CompilerError(command[0], [*process.stderr.splitlines(), "no message"][0])
         return library.read_bytes()
 
 
@@ -454,7 +462,7 @@ def _kernels(name: str, texts: Sequence[str], functions: Sequence[_Function], wo
     """Compile kernels with so many `worlds` in a block, and the library that launches them.
 
     Raises:
-      RuntimeError: the compiler that fails, and its first message.
+      CompilerError: the compiler fails.
     """
     counts = [(len(x.inputs) + x.is_sorted, len(x.results)) for x in functions]
     shapes = [(*n, *first_array(x.inputs)) for n, x in zip(counts, functions, strict=True)]

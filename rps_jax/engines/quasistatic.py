@@ -76,6 +76,7 @@ class Problem(NamedTuple):
 class Quasistatic(NamedTuple):
     """Stage of quasi-static worlds, which share nothing."""
 
+    native = False
     engine = "quasistatic"
 
     def drive(self, fields: Slider, motion: Motion, period: ControlPeriod) -> Driven:

@@ -44,17 +44,17 @@ class CWriter(ScalarWriter):
     def literal(self, value: float, kind: str) -> str:
         return literal(self.prefix, value, kind)
 
-    def listed(self, texts: Iterable[str]) -> str:
+    def array_literal(self, texts: Iterable[str]) -> str:
         text = " ".join(", ".join(texts).split())
         lines = textwrap.wrap(text, 92, break_long_words=False, break_on_hyphens=False)
         return "{" + (text if len(lines) < 2 else "\n    " + "\n    ".join(lines)) + "}"
 
-    def packed(self, name: str, array: np.ndarray) -> str:
+    def table_declaration(self, name: str, array: np.ndarray) -> str:
         kind = kind_of(array.dtype)
 
         def text(value: np.ndarray) -> str:
             if value.ndim:
-                return self.listed(map(text, value))
+                return self.array_literal(map(text, value))
             return table_entry(self.prefix, value, kind)
 
         sized = sized_name(name, array.shape)
@@ -99,9 +99,12 @@ def struct(prefix: str, name: str, group: Group) -> str:
 
 
 def statements(
-    routine: Routine, inputs: Mapping[str, str], outputs: Mapping[str, str],
-    tables: dict[str, str], prefix: str,
-) -> str:  # fmt: skip
+    routine: Routine,
+    inputs: Mapping[str, str],
+    outputs: Mapping[str, str],
+    tables: dict[str, str],
+    prefix: str,
+) -> str:
     """Return the statements that compute and store the results of a routine.
 
     Args:
@@ -116,7 +119,7 @@ def statements(
     for group, field, value in writer.outputs:
         name = f"{outputs[group]}{field.name}"
         if len(field.shape) == 1 and field.size > 1:
-            line = f"  {name}[i] = {writer.value(value, field.kind, field.size)};"
+            line = f"  {name}[i] = {writer.read(value, field.size)};"
             lines += writer.elements(field.size, [line])
         else:
             lines += [

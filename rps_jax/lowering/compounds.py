@@ -40,7 +40,11 @@ def _primitive(name: str, dtype: np.dtype | None = None) -> Function:
 _quotient = _primitive("quotient")  # of integers, whose divisor is neither 0 nor -1
 _truncation = _primitive("truncate", np.dtype(np.int32))  # of reals within the bounds of integers
 _shift_up, _shift_down = map(_primitive, ("shift_up", "shift_down"))  # by less than all bits
-_precedes = _primitive("lt_to", np.dtype(np.bool_))  # in the total order of numbers
+_lt_to = _primitive("lt_to", np.dtype(np.bool_))  # in the total order of numbers
+
+
+def _is_real(x: jax.Array) -> bool:
+    return jnp.issubdtype(x.dtype, jnp.floating)
 
 
 def _sign(x: jax.Array) -> jax.Array:
@@ -69,12 +73,12 @@ def _remainder(x: jax.Array, y: jax.Array) -> jax.Array:
 
 def _shift(shift: Function) -> Function:
     """Return the function that shifts integers; by all bits or more, the result is 0."""
-    return lambda x, by: jnp.where((by >= 0) & (by < 32), shift(x, by & 31), 0)
+    return lambda x, count: jnp.where((count >= 0) & (count < 32), shift(x, count & 31), 0)
 
 
-def _shift_arithmetic(x: jax.Array, by: jax.Array) -> jax.Array:
+def _shift_arithmetic(x: jax.Array, count: jax.Array) -> jax.Array:
     """Shift with the sign; bits of unsigned integers are read as of signed ones."""
-    bits, count, shift = x.astype(np.int32), by.astype(np.int32), lax.shift_right_logical
+    bits, count, shift = x.astype(np.int32), count.astype(np.int32), lax.shift_right_logical
     return jnp.where(bits < 0, ~shift(~bits, count), shift(bits, count)).astype(x.dtype)
 
 
@@ -131,7 +135,7 @@ def _argument(is_better: Function) -> Function:
         best, index = first, jnp.zeros(first.shape, index_dtype)
         for k, row in enumerate(rows, 1):
             better = is_better(row, best)
-            if jnp.issubdtype(x.dtype, jnp.floating):
+            if _is_real(x):
                 better |= (row != row) & (best == best)
             best, index = jnp.where(better, row, best), jnp.where(better, k, index)
         return index
@@ -186,9 +190,14 @@ def fill_of(dtype: np.dtype, fill_value: Any) -> np.ndarray:
 
 
 def _gather(
-    x: jax.Array, indices: jax.Array, dimension_numbers: lax.GatherDimensionNumbers,
-    slice_sizes: Sequence[int], mode: object, fill_value: Any = None, **_: object,
-) -> jax.Array:  # fmt: skip
+    x: jax.Array,
+    indices: jax.Array,
+    dimension_numbers: lax.GatherDimensionNumbers,
+    slice_sizes: Sequence[int],
+    mode: object,
+    fill_value: Any = None,
+    **_: object,
+) -> jax.Array:
     """Gather slices at indices that are known at run time."""
     axes, blocks = dimension_numbers, []
     single = axes.collapsed_slice_dims + axes.operand_batching_dims
@@ -233,27 +242,22 @@ def _scatter(combine: Function | None) -> Function:
     return scatter
 
 
-def _is_before(x: jax.Array, y: jax.Array) -> jax.Array:
-    """Return whether a number comes first in ascending order, in which NaN is last."""
-    before = lax.lt(x, y)
-    if jnp.issubdtype(x.dtype, jnp.floating):
-        before |= (x == x) & (y != y)
-    return before
+def _less(x: jax.Array, y: jax.Array) -> jax.Array:
+    """Compare in ascending order, in which NaN is last."""
+    return lax.lt(x, y) | ((x == x) & (y != y)) if _is_real(x) else lax.lt(x, y)
 
 
-def _precedes_in_any_language(x: jax.Array, y: jax.Array) -> jax.Array:
-    """Return whether a number comes first in total order, in which -0.0 is before 0.0."""
-    before = _is_before(x, y)
-    if jnp.issubdtype(x.dtype, jnp.floating):
-        before |= (x == 0) & (y == 0) & (1 / x < 1 / y)
-    return before
+def _less_in_total_order(x: jax.Array, y: jax.Array) -> jax.Array:
+    """Compare in total order, in which -0.0 is less than 0.0."""
+    less = _less(x, y)
+    return less | ((x == 0) & (y == 0) & (1 / x < 1 / y)) if _is_real(x) else less
 
 
 def _sort(
     *operands: jax.Array,
     dimension: int,
     num_keys: int,
-    is_before: Function = _is_before,
+    less: Function = _less,
     **_: object,
 ) -> list[jax.Array]:
     """Sort operands by the first ones; equal keys stay in their order."""
@@ -271,19 +275,19 @@ def _sort(
             low = (index & width == rest) & (index < size - distance)
             high = np.roll(low, distance)
             pairs = [(x, jnp.roll(x, distance, -1), jnp.roll(x, -distance, -1)) for x in columns]
-            others = [jnp.where(low, up, jnp.where(high, down, x)) for x, down, up in pairs]
-            swaps = others[-1] < columns[-1]
-            for x, y in reversed([*zip(columns[:num_keys], others, strict=False)]):
-                swaps = is_before(y, x) | (~is_before(x, y) & swaps)
+            partners = [jnp.where(low, up, jnp.where(high, down, x)) for x, down, up in pairs]
+            swaps = partners[-1] < columns[-1]
+            for x, y in reversed([*zip(columns[:num_keys], partners, strict=False)]):
+                swaps = less(y, x) | (~less(x, y) & swaps)
             swaps ^= high
-            columns = [jnp.where(swaps, y, x) for x, y in zip(columns, others, strict=True)]
+            columns = [jnp.where(swaps, y, x) for x, y in zip(columns, partners, strict=True)]
     return [jnp.moveaxis(x, -1, dimension) for x in columns[:-1]]
 
 
 def _top_k(x: jax.Array, k: int, axis: int, **_: object) -> list[jax.Array]:
     """Return the largest numbers and their indices; equal ones keep their order."""
     index = lax.broadcasted_iota(np.int32, x.shape, axis)
-    columns = _sort(x, index, dimension=axis, num_keys=1, is_before=lambda x, y: _precedes(y, x))
+    columns = _sort(x, index, dimension=axis, num_keys=1, less=lambda x, y: _lt_to(y, x))
     return [lax.slice_in_dim(column, 0, k, axis=axis) for column in columns]
 
 
@@ -311,8 +315,8 @@ COMPOUNDS: dict[str, Function] = {
     "min_b": lambda x, y: x & y,
     "reduce_max_b": lambda x, axes, **_: jnp.any(x, axes),
     "reduce_min_b": lambda x, axes, **_: jnp.all(x, axes),
-    "lt_to": _precedes_in_any_language,
-    "le_to": lambda x, y: ~_precedes(y, x),
+    "lt_to": _less_in_total_order,
+    "le_to": lambda x, y: ~_lt_to(y, x),
     "abs_i": lambda x: jnp.maximum(x, -x),
     "sign": _sign,
     "sign_u": lambda x: jnp.minimum(x, 1),
@@ -357,4 +361,4 @@ COMPOUNDS: dict[str, Function] = {
     "sort": _sort,
     "top_k": _top_k,
     "dynamic_update_slice": _update,
-}  # fmt: skip
+}

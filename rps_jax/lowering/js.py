@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from rps_jax.lowering.nodes import Node
+from rps_jax.lowering.graph import Node
 from rps_jax.lowering.operations import spelled
 from rps_jax.lowering.routine import Group, Routine
 from rps_jax.lowering.scalar_writer import ScalarWriter
@@ -30,16 +30,16 @@ class JsWriter(ScalarWriter):
     def declaration(self, kind: str, name: str, size: int = 1, constant: bool = True) -> str:
         return f"{'const' if constant or size > 1 else 'let'} {name}"
 
-    def declared(self, node: Node) -> str:
+    def declare(self, node: Node) -> str:
         return f"const {node.name} = Array({node.size});" if node.size > 1 else f"let {node.name};"
 
     def literal(self, value: float, kind: str) -> str:
         return text_of(np.asarray(value).item())
 
-    def listed(self, texts: Iterable[str]) -> str:
+    def array_literal(self, texts: Iterable[str]) -> str:
         return f"[{', '.join(texts)}]"
 
-    def packed(self, name: str, array: np.ndarray) -> str:
+    def table_declaration(self, name: str, array: np.ndarray) -> str:
         """Return a table; a matrix is packed in as few bytes as are exact."""
         if array.ndim < 2:
             return f"const {name} = {text_of(array.tolist())};"

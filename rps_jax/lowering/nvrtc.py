@@ -12,6 +12,7 @@ from pathlib import Path
 import jax
 
 from rps_jax.lowering.operations import XLA_CALL
+from rps_jax.lowering.target import CompilerError
 
 # Quotients and square roots within two roundings, and zero for numbers below 1e-38.
 FLAGS = ("--prec-div=false", "--prec-sqrt=false", "--ftz=true")
@@ -48,7 +49,7 @@ def images(texts: Sequence[str]) -> list[bytes]:
     """Compile kernels in parallel, and return their machine code.
 
     Raises:
-      RuntimeError: the compiler that fails, and its first error.
+      CompilerError: NVRTC fails.
     """
     with ThreadPoolExecutor(len(texts)) as pool:
         return list(pool.map(_image, texts))
@@ -57,7 +58,7 @@ def images(texts: Sequence[str]) -> list[bytes]:
 def _image(text: str) -> bytes:
     library, program = _library(), ctypes.c_void_p()
     if library is None:
-        raise RuntimeError("NVRTC", "it is not installed")
+        raise CompilerError("NVRTC", "it is not installed")
     flags = [*FLAGS, f"--gpu-architecture={str(target()).split()[-1]}"]
     options = (ctypes.c_char_p * len(flags))(*(x.encode() for x in flags))
 
@@ -72,7 +73,7 @@ def _image(text: str) -> bytes:
     try:
         if library.nvrtcCompileProgram(program, len(flags), options):
             lines = [x for x in output("ProgramLog").decode().splitlines() if "error" in x]
-            raise RuntimeError("NVRTC", (lines or ["no message"])[0])
+            raise CompilerError("NVRTC", (lines or ["no message"])[0])
         return output("CUBIN")
     finally:
         library.nvrtcDestroyProgram(ctypes.byref(program))

@@ -77,9 +77,13 @@ class Graph(Target):
         return Tensor(self.constants[key].name, array.shape, kind)
 
     def node(
-        self, op: str, inputs: Sequence[Tensor], shape: Sequence[int], kind: str,
+        self,
+        op: str,
+        inputs: Sequence[Tensor],
+        shape: Sequence[int],
+        kind: str,
         **attributes: object,
-    ) -> Tensor:  # fmt: skip
+    ) -> Tensor:
         """Return the result of an operator."""
         out = Tensor(f"value_{len(self.nodes)}", tuple(shape), kind)
         names = [tensor.name for tensor in inputs]
@@ -94,7 +98,7 @@ class Graph(Target):
         to = self.constant(np.array(shape, np.int64))
         return self.node("Reshape", [tensor, to], shape, tensor.kind)
 
-    def moved(self, values: Values, indices: np.ndarray, template: Typed) -> Value:
+    def gather(self, values: Values, indices: np.ndarray, template: Typed) -> Value:
         """Gather numbers at constant indices: a reshape or an expansion where that suffices."""
         if not indices.size:
             return np.zeros(indices.shape, template.dtype)
@@ -166,9 +170,12 @@ class Graph(Target):
         return self.node("Where", [any_nan, nan, reduced], shape, "f")
 
     def model(
-        self, name: str, inputs: Sequence[Tensor], outputs: Sequence[tuple[Tensor, Value]],
+        self,
+        name: str,
+        inputs: Sequence[Tensor],
+        outputs: Sequence[tuple[Tensor, Value]],
         **names: str,
-    ) -> Any:  # fmt: skip
+    ) -> Any:
         """Return the graph as a model of ONNX; `names` are its text fields."""
         make = self.onnx.helper
         for out, value in outputs:
@@ -181,9 +188,13 @@ class Graph(Target):
             ]
 
         graph = make.make_graph(
-            self.nodes, name, infos(inputs), infos([out for out, _ in outputs]),
-            list(self.constants.values()), doc_string=names.pop("doc_string", ""),
-        )  # fmt: skip
+            self.nodes,
+            name,
+            infos(inputs),
+            infos([out for out, _ in outputs]),
+            list(self.constants.values()),
+            doc_string=names.pop("doc_string", ""),
+        )
         opset = make.make_opsetid("", _OPSET)
         return make.make_model(graph, opset_imports=[opset], ir_version=_FORMAT, **names)
 

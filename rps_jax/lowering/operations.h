@@ -1,6 +1,72 @@
-/* Operations of JAX on numbers of several worlds that `operations.py` does not define; `simd.h` and
-   `gpu.h` define the types. */
+/* Operations of JAX on numbers of several worlds; `simd.h` and `gpu.h` define the types, and the
+   functions of a real (EACH) or of two (EACH_OF_TWO) by those of math.h. */
 
+EACH(sqrt)
+EACH(exp)
+EACH(log)
+EACH(sin)
+EACH(cos)
+EACH(tan)
+EACH(asin)
+EACH(acos)
+EACH(atan)
+EACH(sinh)
+EACH(cosh)
+EACH(asinh)
+EACH(acosh)
+EACH(atanh)
+EACH(floor)
+EACH(ceil)
+EACH(log1p)
+EACH(expm1)
+EACH(cbrt)
+EACH_OF_TWO(rem, fmodf)
+EACH(tanh)
+EACH(erf)
+EACH(erfc)
+EACH(exp2)
+EACH(round)
+EACH(rint)
+EACH_OF_TWO(atan2, atan2f)
+EACH_OF_TWO(pow, powf)
+
+FUNCTION V add_f(V a, V b) { return a + b; }
+FUNCTION I add_i(I a, I b) { return (I)((U)a + (U)b); }
+FUNCTION U add_u(U a, U b) { return a + b; }
+FUNCTION V sub_f(V a, V b) { return a - b; }
+FUNCTION I sub_i(I a, I b) { return (I)((U)a - (U)b); }
+FUNCTION U sub_u(U a, U b) { return a - b; }
+FUNCTION V mul_f(V a, V b) { return a * b; }
+FUNCTION I mul_i(I a, I b) { return (I)((U)a * (U)b); }
+FUNCTION U mul_u(U a, U b) { return a * b; }
+FUNCTION I lt_f(V a, V b) { return a < b; }
+FUNCTION I lt_i(I a, I b) { return a < b; }
+FUNCTION I lt_u(U a, U b) { return a < b; }
+FUNCTION I le_f(V a, V b) { return a <= b; }
+FUNCTION I le_i(I a, I b) { return a <= b; }
+FUNCTION I le_u(U a, U b) { return a <= b; }
+FUNCTION I eq_f(V a, V b) { return a == b; }
+FUNCTION I eq_i(I a, I b) { return a == b; }
+FUNCTION I eq_u(U a, U b) { return a == b; }
+FUNCTION I gt_f(V a, V b) { return a > b; }
+FUNCTION I gt_i(I a, I b) { return a > b; }
+FUNCTION I gt_u(U a, U b) { return a > b; }
+FUNCTION I ge_f(V a, V b) { return a >= b; }
+FUNCTION I ge_i(I a, I b) { return a >= b; }
+FUNCTION I ge_u(U a, U b) { return a >= b; }
+FUNCTION I ne_f(V a, V b) { return a != b; }
+FUNCTION I ne_i(I a, I b) { return a != b; }
+FUNCTION I ne_u(U a, U b) { return a != b; }
+FUNCTION I eq_b(I a, I b) { return a == b; }
+FUNCTION I and_i(I a, I b) { return a & b; }
+FUNCTION U and_u(U a, U b) { return a & b; }
+FUNCTION I or_i(I a, I b) { return a | b; }
+FUNCTION U or_u(U a, U b) { return a | b; }
+FUNCTION I xor_i(I a, I b) { return a ^ b; }
+FUNCTION U xor_u(U a, U b) { return a ^ b; }
+FUNCTION I and_b(I a, I b) { return a & b; }
+FUNCTION I or_b(I a, I b) { return a | b; }
+FUNCTION I xor_b(I a, I b) { return a ^ b; }
 FUNCTION I not_i(I x) { return ~x; }
 FUNCTION I choose_b(I m, I a, I b) { return choose_i(m, a, b); }
 FUNCTION U choose_u(I m, U a, U b) { return (U)choose_i(m, (I)a, (I)b); }

@@ -2,7 +2,7 @@
 
 An operation is named by the primitive of JAX and the kind of its first operand. A language that
 does not spell an operation uses its compound, see `compounds`. SIMD C and CUDA share the functions
-of this table and of `operations.h`, on the types of `simd.h` and `gpu.h`.
+of `operations.h`, on the types of `simd.h` and `gpu.h`; the other languages are in `TABLE`.
 """
 
 from __future__ import annotations
@@ -24,91 +24,94 @@ class Operation(NamedTuple):
     c: str = ""
     js: str = ""
     onnx: str = ""  # operator
-    simd: str = ""  # definition in SIMD C and CUDA, if it is not in a header
 
 
 def _function(name: str, onnx: str = "") -> Operation:
     """Return a function of a real that math.h and JavaScript have by the same name."""
-    return Operation(f"{{P}}_F({name})({{0}})", f"Math.{name}({{0}})", onnx, f"EACH({name})")
+    return Operation(f"{{P}}_F({name})({{0}})", f"Math.{name}({{0}})", onnx)
 
 
-def _infix(name: str, kind: str, sign: str, onnx: str = "", js: str = "") -> Operation:
-    """Return a binary operation that C writes with a sign; integers wrap around."""
-    type_, text, simd = TYPES[kind], f"{{0}} {sign} {{1}}", f"a {sign} b"
-    if kind == "i" and js:
-        text, simd = f"(int)((unsigned)({{0}}) {sign} (unsigned)({{1}}))", f"(I)((U)a {sign} (U)b)"
-    result = "I" if name in _COMPARISONS else type_
-    line = f"FUNCTION {result} {name}_{kind}({type_} a, {type_} b) {{ return {simd}; }}"
-    return Operation(text, js or text, onnx, line)
+def _both(text: str, onnx: str = "") -> Operation:
+    """Return an operation that C and JavaScript spell alike."""
+    return Operation(text, text, onnx)
 
 
-# Functions that the three languages have, and those that ONNX lacks.
-_FUNCTIONS = ("sqrt", "exp", "log", "sin", "cos", "tan", "asin", "acos", "atan", "sinh", "cosh",
-              "asinh", "acosh", "atanh", "floor", "ceil")  # fmt: skip
-_BEYOND_ONNX = ("log1p", "expm1", "cbrt")
-# Signs and operators of ONNX; the integer arithmetic of JavaScript.
+def _wrapping(sign: str, js: str, onnx: str) -> Operation:
+    """Return an operation on integers that wraps around."""
+    return Operation(f"(int)((unsigned)({{0}}) {sign} (unsigned)({{1}}))", js, onnx)
+
+
+# Functions of a real that all languages have.
+_FUNCTIONS = "sqrt exp log sin cos tan asin acos atan sinh cosh asinh acosh atanh floor ceil"
 _COMPARISONS = {
-    **{"lt": ("<", "Less"), "le": ("<=", "LessOrEqual"), "eq": ("==", "Equal")},
-    **{"gt": (">", "Greater"), "ge": (">=", "GreaterOrEqual"), "ne": ("!=", "")},
+    "lt": ("<", "Less"),
+    "le": ("<=", "LessOrEqual"),
+    "eq": ("==", "Equal"),
+    "gt": (">", "Greater"),
+    "ge": (">=", "GreaterOrEqual"),
+    "ne": ("!=", ""),
 }
-_ARITHMETIC = {"add": ("+", "({0} + {1}) | 0"), "sub": ("-", "({0} - {1}) | 0"),
-               "mul": ("*", "Math.imul({0}, {1})")}  # fmt: skip
-_BITS = {"and": "&", "or": "|", "xor": "^"}
-_CHOICE = "{0} ? {1} : {2}"
 TABLE = {
-    **{f"{x}_f": _function(x, x.capitalize()) for x in _FUNCTIONS},
-    **{f"{x}_f": _function(x) for x in _BEYOND_ONNX},
-    **{f"{x}_{kind}": _infix(x, kind, sign, x.capitalize(), js if kind == "i" else "")
-       for x, (sign, js) in _ARITHMETIC.items() for kind in "fiu"},
-    **{f"{x}_{kind}": _infix(x, kind, *spelling)
-       for x, spelling in _COMPARISONS.items() for kind in "fiu"},
-    "eq_b": _infix("eq", "b", *_COMPARISONS["eq"]),
-    **{f"{x}_{kind}": _infix(x, kind, sign, f"Bitwise{x.capitalize()}")
-       for x, sign in _BITS.items() for kind in "iu"},
-    "and_b": _infix("and", "b", "&", "And")._replace(c="{0} && {1}", js="{0} && {1}"),
-    "or_b": _infix("or", "b", "|", "Or")._replace(c="{0} || {1}", js="{0} || {1}"),
-    "xor_b": _infix("xor", "b", "^", "Xor")._replace(c="{0} != {1}", js="{0} != {1}"),
-    "not_b": Operation("!{0}", "!{0}", "Not"),
-    "not_i": Operation("~{0}", "~{0}", "BitwiseNot"),
-    "choose_f": Operation(_CHOICE, _CHOICE, "Where"),
-    "choose_i": Operation(_CHOICE, _CHOICE, "Where"),
-    "choose_b": Operation(_CHOICE, _CHOICE),
-    "div_f": Operation("{0} / {1}", "{0} / {1}", "Div"),
-    "rem_f": Operation("{P}_F(fmod)({0}, {1})", "{0} % {1}", "Mod", "EACH_OF_TWO(rem, fmodf)"),
-    "quotient_i": Operation("{0} / {1}", "({0} / {1}) | 0", "Div"),
-    "shift_up_i": Operation("(int)((unsigned)({0}) << {1})", "{0} << {1}", "BitShift"),
-    "shift_down_i": Operation("(int)((unsigned)({0}) >> {1})", "{0} >>> {1} | 0", "BitShift"),
-    "neg_f": Operation("-{0}", "-{0}", "Neg"),
-    "neg_i": Operation("(int)(0u - (unsigned)({0}))", "-{0} | 0", "Neg"),
+    **{f"{x}_f": _function(x, x.capitalize()) for x in _FUNCTIONS.split()},
+    **{
+        f"{x}_{kind}": _both(f"{{0}} {sign} {{1}}", onnx)
+        for x, (sign, onnx) in _COMPARISONS.items()
+        for kind in "fi"
+    },
+    "log1p_f": _function("log1p"),
+    "expm1_f": _function("expm1"),
+    "cbrt_f": _function("cbrt"),
+    "tanh_f": Operation("{p}_tanh({0})", "Math.tanh({0})", "Tanh"),
+    "erf_f": Operation("{P}_F(erf)({0})", "", "Erf"),
+    "erfc_f": Operation("{P}_F(erfc)({0})"),
+    "exp2_f": Operation("{P}_F(exp2)({0})"),
+    "round_f": Operation("{P}_F(round)({0})"),
+    "rint_f": Operation("{P}_F(rint)({0})", "rint({0})", "Round"),
+    "logistic_f": Operation(onnx="Sigmoid"),
+    "atan2_f": Operation("{P}_F(atan2)({0}, {1})", "Math.atan2({0}, {1})"),
+    "pow_f": Operation("{P}_F(pow)({0}, {1})", "Math.pow({0}, {1})", "Pow"),
+    "rem_f": Operation("{P}_F(fmod)({0}, {1})", "{0} % {1}", "Mod"),
+    "add_f": _both("{0} + {1}", "Add"),
+    "sub_f": _both("{0} - {1}", "Sub"),
+    "mul_f": _both("{0} * {1}", "Mul"),
+    "div_f": _both("{0} / {1}", "Div"),
+    "neg_f": _both("-{0}", "Neg"),
     "abs_f": Operation("{P}_F(fabs)({0})", "Math.abs({0})", "Abs"),
     "sign_f": Operation(onnx="Sign"),
     "max_f": Operation("{p}_max({0}, {1})", "Math.max({0}, {1})", "Max"),
     "min_f": Operation("{p}_min({0}, {1})", "Math.min({0}, {1})", "Min"),
+    "add_i": _wrapping("+", "({0} + {1}) | 0", "Add"),
+    "sub_i": _wrapping("-", "({0} - {1}) | 0", "Sub"),
+    "mul_i": _wrapping("*", "Math.imul({0}, {1})", "Mul"),
+    "quotient_i": Operation("{0} / {1}", "({0} / {1}) | 0", "Div"),
+    "neg_i": Operation("(int)(0u - (unsigned)({0}))", "-{0} | 0", "Neg"),
     "max_i": Operation("{0} > {1} ? {0} : {1}", "Math.max({0}, {1})", "Max"),
     "min_i": Operation("{0} < {1} ? {0} : {1}", "Math.min({0}, {1})", "Min"),
-    "tanh_f": _function("tanh", "Tanh")._replace(c="{p}_tanh({0})"),
-    "erf_f": _function("erf", "Erf")._replace(js=""),
-    "erfc_f": _function("erfc")._replace(js=""),
-    "exp2_f": _function("exp2")._replace(js=""),
-    "round_f": _function("round")._replace(js=""),
-    "rint_f": _function("rint", "Round")._replace(js="rint({0})"),
-    "logistic_f": Operation(onnx="Sigmoid"),
-    "atan2_f": Operation("{P}_F(atan2)({0}, {1})", "Math.atan2({0}, {1})", "",
-                         "EACH_OF_TWO(atan2, atan2f)"),
-    "pow_f": Operation("{P}_F(pow)({0}, {1})", "Math.pow({0}, {1})", "Pow",
-                       "EACH_OF_TWO(pow, powf)"),
+    "and_i": _both("{0} & {1}", "BitwiseAnd"),
+    "or_i": _both("{0} | {1}", "BitwiseOr"),
+    "xor_i": _both("{0} ^ {1}", "BitwiseXor"),
+    "not_i": _both("~{0}", "BitwiseNot"),
+    "shift_up_i": Operation("(int)((unsigned)({0}) << {1})", "{0} << {1}", "BitShift"),
+    "shift_down_i": Operation("(int)((unsigned)({0}) >> {1})", "{0} >>> {1} | 0", "BitShift"),
+    "eq_b": _both("{0} == {1}", "Equal"),
+    "and_b": _both("{0} && {1}", "And"),
+    "or_b": _both("{0} || {1}", "Or"),
+    "xor_b": _both("{0} != {1}", "Xor"),
+    "not_b": _both("!{0}", "Not"),
+    "choose_f": _both("{0} ? {1} : {2}", "Where"),
+    "choose_i": _both("{0} ? {1} : {2}", "Where"),
+    "choose_b": _both("{0} ? {1} : {2}"),
     "f_of_i": Operation("({p}_real){0}", "{0}", "Cast"),
     "f_of_b": Operation("({p}_real){0}", "{0} ? 1 : 0", "Cast"),
     "i_of_b": Operation("{0}", "{0} ? 1 : 0", "Cast"),
     "truncate_f": Operation("(int){0}", "Math.trunc({0})", "Cast"),
-}  # fmt: skip
+}
 
 _FOLDER = Path(__file__).parent
-_COMMON = "\n".join([*(row.simd for row in TABLE.values() if row.simd),
-                     (_FOLDER / "operations.h").read_text()])  # fmt: skip
+_OPERATIONS = (_FOLDER / "operations.h").read_text()
 XLA_CALL = (_FOLDER / "xla_call.h").read_text()
-SIMD_HEADER = XLA_CALL + (_FOLDER / "simd.h").read_text() + _COMMON
-GPU_HEADER = (_FOLDER / "gpu.h").read_text() + _COMMON
+SIMD_HEADER = XLA_CALL + (_FOLDER / "simd.h").read_text() + _OPERATIONS
+GPU_HEADER = (_FOLDER / "gpu.h").read_text() + _OPERATIONS
 
 
 def spelled(language: str) -> dict[str, str]:

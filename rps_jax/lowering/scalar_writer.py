@@ -7,9 +7,21 @@ from typing import ClassVar
 
 import numpy as np
 
-from rps_jax.lowering.nodes import LoopNode, Node, results
+from rps_jax.lowering import verifier
+from rps_jax.lowering.builder import results
+from rps_jax.lowering.graph import (
+    Call,
+    DynamicSlice,
+    If,
+    Input,
+    LoopNode,
+    MatrixProduct,
+    Node,
+    Reduce,
+)
+from rps_jax.lowering.passes import sink_products
 from rps_jax.lowering.routine import Routine
-from rps_jax.lowering.scalar_nodes import ScalarNodes, conditional
+from rps_jax.lowering.scalar_builder import ScalarBuilder
 from rps_jax.lowering.writer import Writer
 
 _UNROLLED = 4  # elements of an array that is printed without a loop, at most
@@ -26,7 +38,7 @@ class ScalarWriter(Writer):
     alias: ClassVar[str]  # declaration of a flattened input array
     zeros: ClassVar[str]  # array of zeros of a size
     pointer: ClassVar[str] = ""  # mark of a pointer in a declaration
-    nodes: ClassVar[type[ScalarNodes]] = ScalarNodes
+    builder: ClassVar[type[ScalarBuilder]] = ScalarBuilder
 
     def __init__(
         self, routine: Routine, groups: Mapping[str, str], tables: dict[str, str], prefix: str = ""
@@ -44,11 +56,13 @@ class ScalarWriter(Writer):
         fields = [(groups[group], x) for group, fields in routine.inputs.items() for x in fields]
         self._inputs = [(f"{text}{field.name}", field) for text, field in fields]
         outputs = [(group, x) for group, fields in routine.outputs.items() for x in fields]
-        target = self.nodes(self.spelling)
+        target = self.builder(self.spelling)
         values, roots = results(
             routine.jaxpr, [x.type for _, x in fields], [x.type for _, x in outputs], target
         )
-        self.body = self.lines(conditional(roots), roots, set())
+        nodes = sink_products(roots)
+        verifier.check(values)
+        self.body = self.lines(nodes, roots)
         known = {result.position: result.value for result in values}
         # Group, field and value of each result.
         self.outputs = [(*x, known.get(i, ())) for i, x in enumerate(outputs)]
@@ -58,13 +72,13 @@ class ScalarWriter(Writer):
     def constant(self, text: str, kind: str) -> str:
         return f"({text})" if "-" in text.split("e")[0] else text
 
-    def call(self, op: str, operands: Sequence[str]) -> str:
-        return self.spelling[op].format(*operands, p=self.prefix, P=self.prefix.upper())
+    def call(self, function: str, operands: Sequence[str]) -> str:
+        return self.spelling[function].format(*operands, p=self.prefix, P=self.prefix.upper())
 
     def item(self, node: Node, index: int | str) -> str:
-        if node.op != "input":
+        if not isinstance(node.op, Input):
             return super().item(node, index)
-        name, field = self._inputs[node.extra]
+        name, field = self._inputs[node.op.index]
         if node.size == 1:
             text = name + "[0]" * len(field.shape)
         else:
@@ -73,38 +87,39 @@ class ScalarWriter(Writer):
 
     # --- statements ---
 
-    def together(self, group: Sequence[Node], stored: set[Node]) -> list[str]:
+    def fused(self, group: Sequence[Node], stored: set[Node]) -> list[str]:
         size = group[0].size
         if size > _UNROLLED:
-            return super().together(group, stored)
+            return super().fused(group, stored)
         lines = []
         for node in group:
-            if node.op.startswith("fold"):
-                text, *rest = [self.operand(node.args[0], k) for k in range(size)]
-                for item in rest:
-                    text = f"({self.call(node.op[5:], [text, item])})"
+            rows = [[self.operand(a, k) for a in node.operands] for k in range(size)]
+            if isinstance(node.op, Call):
+                function = node.op.function
+                lines.append(self.array(node, [self.call(function, row) for row in rows]))
+            elif isinstance(node.op, Reduce):
+                function = f"{node.op.binary}_{node.kind}"
+                (text,), *rest = rows
+                for row in rest:
+                    text = f"({self.call(function, [text, *row])})"
                 lines.append(f"{self.declaration(node.kind, node.name)} = {text};")
-            else:
-                rows = [[self.operand(a, k) for a in node.args] for k in range(size)]
-                lines.append(self.array(node, [self.call(node.op, row) for row in rows]))
         return lines
 
     def single(self, node: Node) -> list[str]:
-        if node.op == "input":
-            name, field = self._inputs[node.extra]
+        if isinstance(node.op, Input):
+            name, field = self._inputs[node.op.index]
             if node.size == 1 or len(field.shape) == 1:
                 return []
             corner = name + "[0]" * len(field.shape)
             head = self.declaration(node.kind, f"{self.pointer}{node.name}")
             return [self.alias.format(head=head, name=name, corner=corner)]
-        if node.op == "product":
-            return self._product(node)
-        if node.op == "take":
-            index, source = node.args
-            row, table = self.operand(index, 0), np.array(node.extra)
-            return [self.array(node, [
-                self.item(source.node, self._entry(table[:, k], row)) for k in range(node.size)
-            ])]  # fmt: skip
+        if isinstance(node.op, MatrixProduct):
+            return self._product(node, node.op)
+        if isinstance(node.op, DynamicSlice):
+            index, source = node.operands
+            row, columns = self.operand(index, 0), np.array(node.op.windows).T
+            items = [self.item(source.node, self._entry(column, row)) for column in columns]
+            return [self.array(node, items)]
         return super().single(node)
 
     def _entry(self, column: np.ndarray, row: str) -> str:
@@ -115,23 +130,23 @@ class ScalarWriter(Writer):
             return f"{first} + {text}" if first else text
         return f"{self.table(column)}[{row}]"
 
-    def head(self, loop: LoopNode) -> str:
-        if loop.op != "if":
-            return super().head(loop)
-        return f"if ({'' if loop.extra else '!'}{self.operand(loop.condition, 0)}) {{"
+    def loop_head(self, loop: LoopNode) -> str:
+        if not isinstance(loop.op, If):
+            return super().loop_head(loop)
+        return f"if ({'!' * (not loop.op.expected)}{self.operand(loop.condition, 0)}) {{"
 
-    def _product(self, node: Node) -> list[str]:
+    def _product(self, node: Node, op: MatrixProduct) -> list[str]:
         """Return a product of rows with a matrix, which is padded with zeros."""
-        n, ((inputs, columns), content) = node.id, node.extra
-        matrix = np.frombuffer(content).reshape(inputs, columns)
+        n, (inputs, columns) = node.id, op.shape
+        matrix = np.frombuffer(op.content).reshape(inputs, columns)
         padded = inputs + -inputs % _ROWS
         table = self.table(np.pad(matrix, ((0, padded - inputs), (0, 0))))
-        items = [self.operand(a, 0) for a in node.args]
+        items = [self.operand(a, 0) for a in node.operands]
         zeros = [self.literal(0.0, "f")] * (padded - inputs)
         rows = [[*items[i : i + inputs], *zeros] for i in range(0, len(items), inputs)]
         flat = [text for row in rows for text in row]
         lines = [
-            f"{self.declaration('f', f'x{n}', len(flat))} = {self.listed(flat)};",
+            f"{self.declaration('f', f'x{n}', len(flat))} = {self.array_literal(flat)};",
             f"{self.declaration('f', node.name, node.size, constant=False)} = "
             f"{self.zeros.format(node.size)};",
             f"for ({self.index} i = 0; i < {padded}; i += {_ROWS}) {{",

@@ -19,8 +19,13 @@ Body: TypeAlias = Callable[[Values], list[Value]]  # of a loop, from its carry
 
 # Binary operation that each reduction repeats.
 REDUCTIONS = {
-    **{"reduce_sum": "add", "reduce_prod": "mul", "reduce_max": "max", "reduce_min": "min"},
-    **{"reduce_and": "and", "reduce_or": "or", "reduce_xor": "xor"},
+    "reduce_sum": "add",
+    "reduce_prod": "mul",
+    "reduce_max": "max",
+    "reduce_min": "min",
+    "reduce_and": "and",
+    "reduce_or": "or",
+    "reduce_xor": "xor",
 }
 DTYPES = {"f": "float32", "i": "int32", "u": "uint32", "b": "bool"}  # by kind
 
@@ -49,19 +54,23 @@ class UnsupportedError(InputError):
         )
 
 
+class CompilerError(Exception):
+    """A C compiler or NVRTC that fails: its name, and its first message."""
+
+
 class TooLargeError(InputError):
     """A function that XLA compiles better than this package: its arrays are too large."""
 
 
 class Target:
-    """Back end of a jaxpr: subclasses implement `moved` and `apply`."""
+    """Back end of a jaxpr: subclasses implement `gather` and `apply`."""
 
     operations: Collection[str] = ()  # that it spells; others are compounds
     kinds = "fib"  # kinds of numbers that it supports, see `kind_of`
 
     # --- what each back end implements ---
 
-    def moved(self, values: Values, indices: np.ndarray, template: Typed) -> Value:
+    def gather(self, values: Values, indices: np.ndarray, template: Typed) -> Value:
         """Gather numbers of the concatenated, flattened values at constant indices."""
         raise NotImplementedError
 
@@ -83,9 +92,9 @@ class Target:
         rest = [i for i in range(len(shape)) if i not in axes]
         indices = np.transpose(np.arange(size_of(shape)).reshape(shape), [*axes, *rest])
         first, *rows = indices.reshape(-1, *out.shape)
-        result = self.moved([value], first, out)
+        result = self.gather([value], first, out)
         for row in rows:
-            result = self.apply(binary, [result, self.moved([value], row, out)], {}, out)
+            result = self.apply(binary, [result, self.gather([value], row, out)], {}, out)
         return result
 
     def windows(
@@ -147,9 +156,12 @@ def kind_of(dtype: object, name: str = "", kinds: str = "fibu") -> str:
     """Return the kind of a dtype: `f` real, `i` signed, `u` unsigned, `b` bool.
 
     Raises:
-      UnsupportedError: it is none of `kinds`; `name` is the operation in the message.
+      UnsupportedError: it is none of `kinds`, or has fewer than 4 bytes; `name` is the operation in
+        the message.
     """
-    kind = dtype.kind if isinstance(dtype, np.dtype) else "?"
+    kind = "?"
+    if isinstance(dtype, np.dtype) and (dtype.kind == "b" or dtype.itemsize > 3):
+        kind = dtype.kind
     if kind not in kinds:
         raise UnsupportedError(f"{name} of {dtype}".strip())
     return kind

@@ -2,13 +2,13 @@
 
 Values are NumPy arrays where they are constant, and otherwise what a `Target` returns. Operations
 that only move numbers (slices, reshapes, stacks, gathers at constant indices) are one operation of
-a target, `moved`: they are applied to flat indices, which gives the source of each number.
+a target, `gather`: they are applied to flat indices, which gives the source of each number.
 """
 
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import jax
@@ -35,26 +35,24 @@ from rps_jax.lowering.target import (
 
 _MAX_STEPS = 256  # of a scan that is unrolled
 _MAX_UNROLLED = 500  # equations of the body of a scan that is unrolled
-# Primitives that only move numbers, with the number of operands that are moved; None: all. The
-# operands behind them are indices.
+# Primitives that only move numbers, with the indices of the operands that have these numbers;
+# empty: all operands.
 _MOVES = {
-    **dict.fromkeys(("broadcast_in_dim", "reshape", "squeeze", "expand_dims", "slice", "rev"), 1),
-    **dict.fromkeys(("transpose", "split", "unstack", "tile", "dynamic_slice", "gather"), 1),
-    "scatter": 1,
-    **dict.fromkeys(("pad", "dynamic_update_slice"), 2),
-    **dict.fromkeys(("stack", "concatenate")),
+    **dict.fromkeys(
+        ("broadcast_in_dim", "reshape", "squeeze", "expand_dims", "slice", "rev"), (0,)
+    ),
+    **dict.fromkeys(("transpose", "split", "unstack", "tile", "dynamic_slice", "gather"), (0,)),
+    **dict.fromkeys(("pad", "dynamic_update_slice"), (0, 1)),
+    **dict.fromkeys(("stack", "concatenate"), ()),
+    "scatter": (0, 2),
 }
 # Random primitives, with the method of the key's implementation that expresses them.
 _RANDOM = {
-    **dict.fromkeys(("random_wrap", "random_unwrap")),
-    **{"random_bits": "random_bits", "random_split": "split", "random_fold_in": "fold_in"},
-}
-# Further primitives that only move numbers, by NumPy.
-_BY_NUMPY: dict[str, Callable[[np.ndarray, Params], Sequence[np.ndarray]]] = {
-    "split": lambda x, p: np.split(x, np.cumsum(p["sizes"])[:-1], p["axis"]),
-    "unstack": lambda x, p: list(np.moveaxis(x, p["axis"], 0)),
-    "transpose": lambda x, p: [np.transpose(x, p["permutation"])],
-    "rev": lambda x, p: [np.flip(x, p["dimensions"])],
+    "random_wrap": "",
+    "random_unwrap": "",
+    "random_bits": "random_bits",
+    "random_split": "split",
+    "random_fold_in": "fold_in",
 }
 _IDENTITIES = ("stop_gradient", "copy", "copy_p", "optimization_barrier", "pvary", "name")
 
@@ -98,9 +96,7 @@ def _results(eqn: JaxprEqn, values: list[Value], target: Target) -> Values:
     if name in _IDENTITIES:
         return values
     if all(map(is_constant, values)):
-        if (moved := _moved_by_numpy(eqn, values)) is not None:
-            return moved
-        return [x if _is_key(x) else np.asarray(x) for x in _bind(eqn, values)]
+        return _fold(eqn, values)
     if name in _RANDOM and "u" in target.kinds:
         return _random(eqn, values, target)
     for out in outs:
@@ -127,11 +123,9 @@ def _results(eqn: JaxprEqn, values: list[Value], target: Target) -> Values:
         expand = functools.partial(eqn.primitive.to_lojax, **params)
         return _expanded(expand, values, types, target)
     if name in _MOVES:
-        count = len(values) if _MOVES[name] is None else _MOVES[name]
-        # The updates of a scatter, its third operand, are moved as well.
-        sources = [0, 2] if name == "scatter" else list(range(count))
+        sources = _MOVES[name] or range(len(values))
         if all(is_constant(v) for i, v in enumerate(values) if i not in sources):
-            return _moved(eqn, values, sources, target)
+            return _gather(eqn, values, sources, target)
     if name == "threefry2x32":  # one operation for each of its two results
         return [target.apply(f"{name}_{i}", values, params, out) for i, out in enumerate(outs)]
     if len(outs) == 1:
@@ -147,9 +141,13 @@ def _types(atoms: Sequence[Any]) -> list[Typed]:
 
 
 def _apply(
-    name: str, values: Values, types: Sequence[Typed], params: Params, out: Typed,
+    name: str,
+    values: Values,
+    types: Sequence[Typed],
+    params: Params,
+    out: Typed,
     target: Target,
-) -> Value:  # fmt: skip
+) -> Value:
     """Apply a primitive: by the target if it spells the operation, else as a compound."""
     operation = operation_of(name, types, params, out)
     if not size_of(out.shape):
@@ -180,16 +178,10 @@ def _is_key(value: Value) -> bool:
     return isinstance(value, jax.Array) and jnp.issubdtype(value.dtype, jax.dtypes.prng_key)
 
 
-def _bind(eqn: JaxprEqn, values: Values) -> Sequence[jax.Array]:
-    """Apply the primitive of an equation by JAX."""
-    result = eqn.primitive.bind(*map(jnp.asarray, values), **eqn.params)
-    return result if eqn.primitive.multiple_results else [result]
-
-
 def _random(eqn: JaxprEqn, values: list[Value], target: Target) -> Values:
     """Return the results of a random primitive, by the algorithm of its key."""
     name, params = eqn.primitive.name, dict(eqn.params)
-    if name in ("random_wrap", "random_unwrap"):
+    if not _RANDOM[name]:
         return values
     values = [np.asarray(jax.random.key_data(x)) if _is_key(x) else x for x in values]
     key: Any = eqn.invars[0].aval
@@ -197,7 +189,9 @@ def _random(eqn: JaxprEqn, values: list[Value], target: Target) -> Values:
     return _expanded(functools.partial(algorithm, **params), values, values, target)
 
 
-def _moved(eqn: JaxprEqn, values: list[Value], sources: list[int], target: Target) -> list[Value]:
+def _gather(
+    eqn: JaxprEqn, values: list[Value], sources: Sequence[int], target: Target
+) -> list[Value]:
     """Apply a primitive to flat indices, and gather the numbers of the values there."""
     start, indices = 0, list(values)
     for i in sources:
@@ -208,16 +202,14 @@ def _moved(eqn: JaxprEqn, values: list[Value], sources: list[int], target: Targe
         values = [*values, fill_of(eqn.outvars[0].aval.dtype, eqn.params.get("fill_value"))]
         sources = [*sources, len(values) - 1]
         eqn = eqn.replace(params={**eqn.params, "fill_value": start})
-    moved = _moved_by_numpy(eqn, indices)
-    moved = _bind(eqn, indices) if moved is None else moved
     return [
-        target.moved([values[i] for i in sources], np.asarray(x), out)
-        for x, out in zip(moved, _types(eqn.outvars), strict=True)
+        target.gather([values[i] for i in sources], x, out)
+        for x, out in zip(_fold(eqn, indices), _types(eqn.outvars), strict=True)
     ]
 
 
-def _moved_by_numpy(eqn: JaxprEqn, arrays: list[Value]) -> list[np.ndarray] | None:
-    """Apply a primitive by NumPy, which is faster than a compilation by JAX; None: a rare one."""
+def _fold(eqn: JaxprEqn, arrays: list[Value]) -> list[Value]:
+    """Apply a primitive to constants: by NumPy, or if it is rare by JAX, which compiles it."""
     name, params, out = eqn.primitive.name, eqn.params, eqn.outvars[0].aval
     shape: Shape = out.shape
     if name == "broadcast_in_dim":
@@ -238,9 +230,17 @@ def _moved_by_numpy(eqn: JaxprEqn, arrays: list[Value]) -> list[np.ndarray] | No
     if name == "pad" and all(min(a, b) >= 0 == c for a, b, c in params["padding_config"]):
         widths = [(a, b) for a, b, _ in params["padding_config"]]
         return [np.pad(arrays[0], widths, constant_values=arrays[1])]
-    if name in _BY_NUMPY:
-        return list(_BY_NUMPY[name](arrays[0], params))
-    return None
+    if name == "split":
+        return np.split(arrays[0], np.cumsum(params["sizes"])[:-1], params["axis"])
+    if name == "unstack":
+        return list(np.moveaxis(arrays[0], params["axis"], 0))
+    if name == "transpose":
+        return [np.transpose(arrays[0], params["permutation"])]
+    if name == "rev":
+        return [np.flip(arrays[0], params["dimensions"])]
+    result = eqn.primitive.bind(*map(jnp.asarray, arrays), **params)
+    results = result if eqn.primitive.multiple_results else [result]
+    return [x if _is_key(x) else np.asarray(x) for x in results]
 
 
 def _scan(eqn: JaxprEqn, values: list[Value], target: Target) -> list[Value]:
@@ -264,19 +264,19 @@ def _scan(eqn: JaxprEqn, values: list[Value], target: Target) -> list[Value]:
         counts = {"length": length, "fixed": fixed, "carried": carried}
         function = functools.partial(_scan_loop, jaxpr=body, reverse=params["reverse"], **counts)
         return list(_expanded(function, values, _types(eqn.invars), target))
-    scanned = list(zip(values[fixed + carried :], body.jaxpr.invars[fixed + carried :],
-                       strict=True))  # fmt: skip
+    scanned = zip(values[fixed + carried :], body.jaxpr.invars[fixed + carried :], strict=True)
+    scanned = [(value, var.aval) for value, var in scanned]
     rows: list[list[Value]] = [[]] * length
     order = range(length)
     for step in reversed(order) if params["reverse"] else order:
-        row = [_row(value, step, var.aval, target) for value, var in scanned]
+        row = [_row(value, step, out, target) for value, out in scanned]
         results = _walk(body, [*consts, *carry, *row], target)
         carry, rows[step] = results[:carried], results[carried:]
     stacked = []
     for i, var in enumerate(body.jaxpr.outvars[carried:]):
         out = jax.ShapeDtypeStruct((length, *var.aval.shape), var.aval.dtype)
         indices = np.arange(size_of(out.shape)).reshape(out.shape)
-        stacked.append(target.moved([row[i] for row in rows], indices, out))
+        stacked.append(target.gather([row[i] for row in rows], indices, out))
     return [*carry, *stacked]
 
 
@@ -285,7 +285,7 @@ def _row(value: Value, step: int, out: Any, target: Target) -> Value:
     if is_constant(value):
         return np.asarray(value[step])
     size = size_of(out.shape)
-    return target.moved([value], (step * size + np.arange(size)).reshape(out.shape), out)
+    return target.gather([value], (step * size + np.arange(size)).reshape(out.shape), out)
 
 
 def _scan_loop(

@@ -285,7 +285,7 @@ class PushEnv:
     @property
     def is_native(self) -> bool:
         """Whether `engines.native` can compile its functions of one world."""
-        return getattr(self._batch.stage, "native", False) and native.is_available()
+        return native.compiles(self._batch.stage)
 
     @property
     def dt(self) -> float:

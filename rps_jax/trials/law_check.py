@@ -16,7 +16,6 @@ import jax.numpy as jnp
 import numpy as np
 
 from rps_jax.engines import native, programs
-from rps_jax.geometry import planar
 from rps_jax.trials import trial
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import ControlLoop, Trial
@@ -35,29 +34,32 @@ def warn_of_difference(batch: WorldBatch, setting: Setting) -> None:
 
     It runs in the first worlds of a batch. The result is cached with the compiled law.
     """
-    law, physics = batch.law, setting.physics
-    is_native = getattr(batch.stage, "native", False) and native.is_available()
-    if not is_native or programs.identity(law) is not None:
+    law, period = batch.law, setting.physics.control_period
+    if not native.compiles(batch.stage) or programs.identity(law) is not None:
         return
     worlds, params = jax.tree.map(lambda x: jnp.asarray(x[:_WORLDS]), batch.inputs)
+    loop = ControlLoop(setting.physics, law=law)
+
+    def step(*arguments: Any) -> Any:
+        return law.step(*arguments)[:2]
 
     def turn(trials: Trial, _: None) -> tuple[Trial, Any]:
         """Run the law once, and move the bases on a curve, without physics."""
-        axes, loop = (0, 0, 0, None), ControlLoop(physics, law=law)
+        axes = (0, 0, 0, None)
         judged, _measured, obs = jax.vmap(trial.perceive, axes)(worlds, params, trials, loop)
         arguments = params, judged.law_state, obs
-        states, twists, _details = jax.vmap(law.step)(*arguments)
-        moved = jax.vmap(functools.partial(_move, period=physics.control_period))(judged)
-        return moved._replace(law_state=states), (arguments, (states, twists))
+        states, twists = jax.vmap(step)(*arguments)
+        time = judged.steps * period
+        curve = jnp.stack([0.05 + 0 * time, 0.02 * jnp.sin(3 * time), 0.1 * jnp.cos(2 * time)], -1)
+        qpos = judged.qpos.at[:, JOINTS.base].add(period * curve)
+        trials = judged._replace(qpos=qpos, steps=judged.steps + 1, law_state=states)
+        return trials, (arguments, (states, twists))
 
     def run() -> Any:
         """Return arguments and results of the law in each control step (steps * worlds, ...)."""
         start = jax.vmap(functools.partial(trial.start, law=law))(worlds, params)
         records = jax.lax.scan(turn, start, length=_STEPS)[1]
         return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), records)
-
-    def step(*arguments: Any) -> Any:
-        return law.step(*arguments)[:2]
 
     def compare() -> str:
         arguments, expected = jax.jit(run)()
@@ -73,15 +75,6 @@ def warn_of_difference(batch: WorldBatch, setting: Setting) -> None:
             "and report this law",
             stacklevel=2,
         )
-
-
-def _move(state: Trial, period: float) -> Trial:
-    """Return a trial after a control period in which its base moves on a curve."""
-    time = state.steps * period
-    forward = planar.rotate(state.qpos[2], jnp.stack([0.05, 0.02 * jnp.sin(3 * time)]))
-    velocity = jnp.stack([*forward, 0.1 * jnp.cos(2 * time)])
-    qpos = state.qpos.at[JOINTS.base].add(period * velocity)
-    return state._replace(qpos=qpos, steps=state.steps + 1)
 
 
 def _differs(computed: np.ndarray, expected: np.ndarray) -> np.ndarray:

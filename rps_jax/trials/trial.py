@@ -443,7 +443,7 @@ def unroll(
         step = stage, world, params, trial, world_loop, lambda f, *_: f
         return _solved_step(*step, solutions)
 
-    if mapped is native.mapped and getattr(stage, "native", False) and native.is_available():
+    if mapped is native.mapped and native.compiles(stage):
         rules = jax.tree.map(lambda x: jnp.broadcast_to(x, trials.done.shape), loop.rules)
         return native.scan(single, trials, (worlds, params, rules), steps)
 
@@ -458,6 +458,7 @@ def unroll(
 class SingleWorld(NamedTuple):
     """Stage that steps one world without a batch axis; under `jax.vmap` it steps a batch."""
 
+    native = False
     stage: Stage
 
     def drive(self, fields: Any, motion: Motion, period: ControlPeriod) -> Driven:
@@ -536,7 +537,7 @@ def advance(
     so that the same program runs a whole trial and stops wherever a trial is recorded.
     """
     stages = [stage for stage, *_ in batches]
-    if not (all(getattr(stage, "native", False) for stage in stages) and native.is_available()):
+    if not native.compiles(*stages):
         return _advance_in_xla(batches, loop, steps)
 
     def single(

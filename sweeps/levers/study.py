@@ -44,6 +44,8 @@ class Lever(NamedTuple):
 class Unmoved(NamedTuple):
     """An engine without physics: the base goes, the object stays. What is left is the law's."""
 
+    native = False
+
     def drive(self, fields: Any, motion: Motion, period: ControlPeriod) -> Driven:
         """Step a batch for one control period."""
         turn = jax.vmap(lambda twist, yaw: twist.in_world(yaw))

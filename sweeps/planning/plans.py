@@ -49,8 +49,7 @@ class Simulator:
 
     def __init__(self, stage: Any, physics: Physics, hold: int) -> None:
         def batched(function: Callable[..., Any]) -> Callable[..., Any]:
-            is_native = getattr(stage, "native", False)
-            return native.batched(function, function) if is_native else function
+            return native.batched(function, function) if stage.native else function
 
         def knot(fields: Any, motion: Motion, theta: jax.Array) -> Motion:
             """Step one world, or a batch, while one twist is held."""

@@ -61,7 +61,7 @@ class Fused(Engine):
         )
         if solids.feet is not None:
             feet = lower(solids.feet[..., :2])
-            bodies = bodies._replace(feet=feet, bears=np.sign(solids.feet[..., 2:]))
+            bodies = bodies._replace(feet=feet, is_foot=np.sign(solids.feet[..., 2:]))
         around = inputs.surroundings
         if around.walls is not None:
             ends = around.walls.reshape(inputs.num_worlds, -1, 4)

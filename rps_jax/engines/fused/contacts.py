@@ -46,7 +46,7 @@ class Body(NamedTuple):
     base_size: Entries  # (2,) [m] half length and width of the base, or (1,) its radius
     base_z: Entries  # (2,) [m] heights of the base's lower and upper edge
     feet: Entries = None  # (N, 3) [m] of a prism that does not stand on its vertices; later a `Vec`
-    bears: Entries = None  # (N, 1) [1] 1 for a foot, 0 for an unused entry
+    is_foot: Entries = None  # (N, 1) [1] 1 for a foot, 0 for an unused entry
     gravity: Entries = None  # (3,) [m/s^2] of a floor that is not level
     # (4,) unit normal of a line, its distance [m], and the factor [1] of the friction beyond it
     boundary: Entries = None
@@ -81,7 +81,7 @@ class State(NamedTuple):
     alpha: Vec  # [rad/s^2]
     driven: DrivenBase | None = None  # of a base with a limited force
     # [N, N, N m] of the object on the base, in the base's frame, summed over steps, if requested
-    felt: Vec | None = None
+    wrench_sum: Vec | None = None
 
     @property
     def accelerations(self) -> list[Vec]:
@@ -151,7 +151,7 @@ def on_ground(body: Body, state: State, m: Sequence[Vec], physics: Physics) -> C
 def _lower_face(body: Body, m: Sequence[Vec]) -> tuple[Vec, Array]:
     """Return points that may touch the ground, from the centre of mass, and whether they exist."""
     if body.feet is not None:
-        return sp.to_world(m, body.feet), body.bears[0] > 0
+        return sp.to_world(m, body.feet), body.is_foot[0] > 0
     if isinstance(body.vertices, Corners):
         return sp.to_world(m, body.vertices.at), body.vertices.real
     # Three points of a cylinder's rim, the lowest first; the fourth is padding.
@@ -177,7 +177,7 @@ def on_base(body: Body, state: State, m: Sequence[Vec], twist: Vec, physics: Phy
     """Return the contacts of the object's side with the base, at the lower and upper edge."""
     k, b = _stiffness(physics.base_solref, _D_MAX, physics.timestep)
     c, s = jnp.cos(state.base[2]), jnp.sin(state.base[2])
-    z, normal, q, distance = meetings(body, state, m, (c, s))
+    z, normal, q, distance = side_contacts(body, state, m, (c, s))
     n = (c * normal[0] - s * normal[1], s * normal[0] + c * normal[1], 0.0)
     t = (-n[1], n[0], 0.0)
     arm = (c * q[0] - s * q[1], s * q[0] + c * q[1])  # from the base's origin
@@ -243,7 +243,7 @@ def on_wall(body: Body, state: State, m: Sequence[Vec], wall: Wall, physics: Phy
     return on_base(body, state, m, (0.0, 0.0, 0.0), physics)
 
 
-def meetings(
+def side_contacts(
     body: Body, state: State, m: Sequence[Vec], turn: Point
 ) -> tuple[Number, Point, Point, Number]:
     """Return heights, normals, points and distances [m] of contacts (C, ...), in the base's frame.

@@ -44,7 +44,9 @@ def _split(array: Entries, at: slice = slice(None)) -> Entries:
     return tuple(array[..., i] for i in range(array.shape[-1]))[at]
 
 
-def enter(body: Body, motion: Motion, robot: Robot | None = None, force: bool = False) -> State:
+def from_mujoco(
+    body: Body, motion: Motion, robot: Robot | None = None, force: bool = False
+) -> State:
     """Return the state of worlds from MuJoCo's; with `force`, the wrench on the base is summed."""
     qpos, qvel, warmstart, integral = motion
     free, spin = _split(qpos, JOINTS.object), _split(qvel, slice(6, 9))
@@ -64,12 +66,12 @@ def enter(body: Body, motion: Motion, robot: Robot | None = None, force: bool = 
         a=_split(warmstart, slice(3, 6)),
         alpha=_split(warmstart, slice(6, 9)),
         driven=driven,
-        felt=_split(jnp.zeros_like(qpos[..., JOINTS.base])) if force else None,
+        wrench_sum=_split(jnp.zeros_like(qpos[..., JOINTS.base])) if force else None,
     )
 
 
-def leave(body: Body, state: State, twist: Vec) -> Motion:
-    """Return MuJoCo's state of worlds after a period at `twist`: the inverse of `enter`."""
+def to_mujoco(body: Body, state: State, twist: Vec) -> Motion:
+    """Return MuJoCo's state of worlds after a period at `twist`: the inverse of `from_mujoco`."""
     com, axes = _split(body.p_object_com), _split(body.q_object_body)
     q = sp.times(state.q, (axes[0], -axes[1], -axes[2], -axes[3]))
     m = sp.matrix(q)
@@ -120,11 +122,11 @@ def step(
     a, alpha, *b = x
     if driven is not None:
         driven = driven._replace(v=sp.add(driven.v, sp.scale(dt, b[0])), a=b[0])
-    felt = state.felt
-    if felt is not None:
+    wrench_sum = state.wrench_sum
+    if wrench_sum is not None:
         offset = (state.p[0] - state.base[0], state.p[1] - state.base[1])
         arm = (contacts[1].r[0] + offset[0], contacts[1].r[1] + offset[1])
-        felt = sp.add(felt, wrench_on_base(contacts[1], arm, x, turn, physics))
+        wrench_sum = sp.add(wrench_sum, wrench_on_base(contacts[1], arm, x, turn, physics))
     v = sp.add(state.v, sp.scale(dt, a))
     w = sp.add(state.w, sp.scale(dt, sp.to_body(m, alpha)))
     angle = sp.scale(dt, w)
@@ -144,7 +146,7 @@ def step(
         base = sp.add(state.base, sp.scale(dt, driven.v))
     p = sp.add(state.p, sp.scale(dt, v))
     q = tuple(x * length for x in q)
-    return State(base, p, q, v, w, a, alpha, driven, felt)  # type: ignore[arg-type]
+    return State(base, p, q, v, w, a, alpha, driven, wrench_sum)  # type: ignore[arg-type]
 
 
 class FusedStage(NamedTuple):
@@ -163,24 +165,30 @@ class FusedStage(NamedTuple):
         def steps(*inputs: Any) -> Driven:
             return _drive(*inputs, physics=period.physics, force=period.force)
 
-        def saving(inputs: Any, solutions: Any) -> tuple[Driven, Any]:
+        def with_solutions(inputs: Any, solutions: Any) -> tuple[Driven, Any]:
             driven = steps(*inputs, solutions)
             return driven._replace(solutions=None), driven.solutions
 
         inputs = fields, motion, period.twists, period.robot
         if motion.qpos.ndim != 2:
             return steps(*inputs, period.solutions)
-        return native.batched(saving, steps, saves=True)(*inputs)
+        return native.batched(with_solutions, steps, "derivatives")(*inputs)
 
 
 def _drive(
-    body: Body, motion: Motion, twist: Vec, robot: Robot | None, solutions: Any = None,
-    *, physics: Physics, force: bool,
-) -> Driven:  # fmt: skip
+    body: Body,
+    motion: Motion,
+    twist: Vec,
+    robot: Robot | None,
+    solutions: Any = None,
+    *,
+    physics: Physics,
+    force: bool,
+) -> Driven:
     """Step a batch of worlds, or one world, for one control period."""
-    scalars = spread(body)
+    scalars = split_entries(body)
 
-    start = enter(body, motion, robot, force)
+    start = from_mujoco(body, motion, robot, force)
     if scalars.walls is not None:
         corners = _split(jnp.moveaxis(body.vertices, -2, 0))
         near = nearest_walls(scalars.walls, start.p, start.q, corners)
@@ -199,20 +207,20 @@ def _drive(
         state = jax.lax.fori_loop(0, physics.substeps, lambda _, x: next_state(x), start)
     else:
         state, solutions = jax.lax.scan(solve, start, solutions or None, physics.substeps)
-    felt = state.felt and jnp.stack(state.felt, axis=-1) / physics.substeps
-    return Driven(leave(body, state, twist), felt, solutions)
+    wrench = state.wrench_sum and jnp.stack(state.wrench_sum, axis=-1) / physics.substeps
+    return Driven(to_mujoco(body, state, twist), wrench, solutions)
 
 
-def spread(body: Body) -> Body:
+def split_entries(body: Body) -> Body:
     """Return bodies (...) with each entry as a separate array, the input of `step`."""
-    leaves = body._replace(vertices=None, feet=None, bears=None, walls=None)
+    leaves = body._replace(vertices=None, feet=None, is_foot=None, walls=None)
     entries = {
         name: _split(leaf) if jnp.ndim(leaf) > jnp.ndim(body.mass) else leaf
         for name, leaf in leaves._asdict().items()
         if leaf is not None
     }
     corners = _split(jnp.moveaxis(body.vertices, -2, 0))
-    for name in ("feet", "bears", "walls"):
+    for name in ("feet", "is_foot", "walls"):
         if (leaf := getattr(body, name)) is not None:
             entries[name] = _split(jnp.moveaxis(leaf, -2, 0))
     if body.vertices.shape[-2] == 1:
