@@ -36,12 +36,14 @@ CAR = "ideal,drive=car,turning_radius=0.5"
 DIFFERENTIAL = "ideal,drive=differential"
 BASES: dict[str, Base] = {
     OMNI: Base("ideal", "rps_plus"),
+    "holonomic, rps_reposition": Base("ideal", "rps_reposition"),
     "differential": Base(DIFFERENTIAL, "unicycle"),
     "differential, axle 0.15 m behind": Base(f"{DIFFERENTIAL},axle=0.15", "unicycle"),
     "differential, axle 0.3 m behind": Base(f"{DIFFERENTIAL},axle=0.3", "unicycle"),
     "car, R 0.5 m": Base(CAR, "unicycle_car"),
     "car, R 0.5 m, axle 0.3 m behind": Base(f"{CAR},axle=0.3", "unicycle_car"),
     "round, holonomic, rps_plus": Base("round", "rps_plus"),
+    "round, holonomic, rps_reposition": Base("round", "rps_reposition"),
     "round, differential": Base("round,drive=differential", "unicycle_round"),
     "skin on the front only": Base(str(FRONT_SKIN), "unicycle_front"),
 }
