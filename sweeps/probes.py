@@ -178,14 +178,19 @@ def write(records: Mapping[str, Mapping[str, Record]]) -> None:
     files.write_text(FILE, "{\n" + ",\n".join(lines) + "\n}\n")
 
 
-def used(ids: Iterable[Mapping[str, str]]) -> dict[str, dict[str, Record]]:
-    """Return the stored records that data files name."""
-    pairs = {pair for of_file in ids for pair in of_file.items()}
-    return {
+def remove_unused() -> None:
+    """Remove the records that no data file names."""
+    named = set[tuple[str, str]]()
+    for path in FILE.parents[1].rglob("results/*.json"):
+        named |= json.loads(path.read_text(encoding="utf-8")).get("probes", {}).items()
+    records = stored()
+    current = {
         probe: rows
-        for probe, records in stored().items()
-        if (rows := {id: x for id, x in records.items() if (probe, id) in pairs})
+        for probe, ids in records.items()
+        if (rows := {id: x for id, x in ids.items() if (probe, id) in named})
     }
+    if current != records:
+        write(current)
 
 
 @functools.cache

@@ -27,6 +27,7 @@ from mcap.reader import NonSeekingReader
 from mcap.writer import CompressionType, IndexType
 from mcap.writer import Writer as McapWriter
 from mcap_ros2.writer import Writer as EncodingWriter
+from numpy.random import default_rng
 from rosbags import rosbag1, rosbag2
 from rosbags.typesys import Stores, get_typestore
 
@@ -42,6 +43,10 @@ KINDS = bag.TOPICS | {
     "/pose": "geometry_msgs/PoseStamped",
 }
 MS, SECOND = 10**6, 10**9
+
+
+Writer = Callable[[Path], Path]  # writes a bag into a folder, and returns its path
+Edit = Callable[[dict[str, Any]], object]  # of the fields of a message
 
 
 class Row(NamedTuple):
@@ -66,7 +71,7 @@ class Case(NamedTuple):
     """Bag and its expected outcome."""
 
     kind: str
-    source: list[Row] | Callable[[Path], Path]  # messages, or what writes a file into a folder
+    source: list[Row] | Writer  # messages, or what writes a file into a folder
     expected: str = ""  # words of the sentence, or nothing if the steps are those of the plain bag
     topics: Mapping[str, str] | Sequence[str] = ()
     atol: float = 0.0
@@ -75,7 +80,7 @@ class Case(NamedTuple):
 
 def push() -> list[Step]:
     """Return steps in which each field changes at each step."""
-    rng = np.random.default_rng(0)
+    rng = default_rng(0)
     steps = []
     for i in range(COUNT):
         kind = (0, 1, 2, 1)[i % 4]
@@ -96,7 +101,7 @@ def rows() -> list[Row]:
 
 def edited(
     topic: str,
-    edit: Callable[[dict[str, Any]], object],
+    edit: Edit,
     at: Iterable[int] | None = None,
     source: Iterable[Row] | None = None,
 ) -> list[Row]:
@@ -149,7 +154,7 @@ def without(*topics: str) -> list[Row]:
     return [row for row in rows() if row.topic not in topics]
 
 
-def set_(path: str, value: object) -> Callable[[dict[str, Any]], object]:
+def set_(path: str, value: object) -> Edit:
     """Return an edit of one field, as `pose.pose.position.x`."""
 
     def edit(message: dict[str, Any]) -> None:
@@ -179,9 +184,14 @@ def moved(topic: str, x: float, y: float, frame: str, field: str = "point") -> l
 
 
 def transform(
-    parent: str, child: str, x: float, y: float, yaw: float = 0.0, topic: str = "/tf_static",
+    parent: str,
+    child: str,
+    x: float,
+    y: float,
+    yaw: float = 0.0,
+    topic: str = "/tf_static",
     stamp: int = 0,
-) -> Row:  # fmt: skip
+) -> Row:
     frame = bag._frame(bag._header(stamp, parent), child, x, y, yaw)
     return Row(topic, max(stamp, SECOND), {"transforms": [frame]})
 
@@ -222,7 +232,7 @@ def mcap(
     profile: str = "ros2",
     text: Callable[[Record], str] = lambda r: r.text,
     **options: Any,
-) -> Callable[[Path], Path]:
+) -> Writer:
     """Return what writes an MCAP file."""
 
     def write(folder: Path) -> Path:
@@ -242,14 +252,12 @@ def mcap(
     return write
 
 
-def plain(messages: Iterable[Row], **options: Any) -> Callable[[Path], Path]:
+def plain(messages: Iterable[Row], **options: Any) -> Writer:
     """Return what writes rows as an MCAP file."""
     return lambda folder: mcap(encode(messages), **options)(folder)
 
 
-def folder_of(
-    plugin: str = "MCAP", compression: str = "NONE", parts: int = 1
-) -> Callable[[Path], Path]:
+def folder_of(plugin: str = "MCAP", compression: str = "NONE", parts: int = 1) -> Writer:
     """Return what writes a folder as `ros2 bag record` does, split into files."""
 
     def write(folder: Path) -> Path:
@@ -284,7 +292,7 @@ def folder_of(
     return write
 
 
-def file_of(write: Callable[[Path], Path], name: str = "") -> Callable[[Path], Path]:
+def file_of(write: Writer, name: str = "") -> Writer:
     """Return what writes a folder, and gives its only file of messages, as `name`."""
 
     def inner(folder: Path) -> Path:
@@ -294,7 +302,7 @@ def file_of(write: Callable[[Path], Path], name: str = "") -> Callable[[Path], P
     return inner
 
 
-def cut(write: Callable[[Path], Path], share: float) -> Callable[[Path], Path]:
+def cut(write: Writer, share: float) -> Writer:
     """Return what writes the first part of a file."""
 
     def inner(folder: Path) -> Path:
@@ -305,7 +313,7 @@ def cut(write: Callable[[Path], Path], share: float) -> Callable[[Path], Path]:
     return inner
 
 
-def content(data: bytes, name: str = "bag.mcap") -> Callable[[Path], Path]:
+def content(data: bytes, name: str = "bag.mcap") -> Writer:
     def write(folder: Path) -> Path:
         (folder / name).write_bytes(data)
         return folder / name
@@ -390,7 +398,7 @@ def big_endian(record: Record) -> Record:
     return record._replace(data=bytes(data))
 
 
-def changed(change: Callable[[Record], Record]) -> Callable[[Path], Path]:
+def changed(change: Callable[[Record], Record]) -> Writer:
     """Return what writes an MCAP file with changed records."""
     return lambda folder: mcap(map(change, encode(rows())))(folder)
 
@@ -423,7 +431,7 @@ def several(folder: Path) -> Path:
     return folder / "push"
 
 
-def changed_folder(change: Callable[[Path], object], parts: int = 1) -> Callable[[Path], Path]:
+def changed_folder(change: Callable[[Path], object], parts: int = 1) -> Writer:
     def write(folder: Path) -> Path:
         path = folder_of(parts=parts)(folder)
         change(path)
@@ -521,8 +529,13 @@ STATIC = {
     "same": transform("base_footprint", "base_link", 0.0, 0.0),
     "turned": transform("base_link", "turned", 0.0, 0.0, math.pi / 2),
 }
-NO_INDEX = {"index_types": IndexType.NONE, "use_statistics": False, "repeat_channels": False,
-            "repeat_schemas": False, "use_summary_offsets": False}  # fmt: skip
+NO_INDEX = {
+    "index_types": IndexType.NONE,
+    "use_statistics": False,
+    "repeat_channels": False,
+    "repeat_schemas": False,
+    "use_summary_offsets": False,
+}
 TOUCH = ("contact_type", "p_robot_contact", "target")  # fields that laws of touch sense
 LINE = ((0.0, 0.0), (3.0, 1.0), (6.0, 2.0))  # [m] a path
 POINTER = b"version https://git-lfs.github.com/spec/v1\noid sha256:4d7a2146\nsize 12345\n"
@@ -551,8 +564,11 @@ def _order() -> dict[str, tuple[Any, ...]]:
     whole, sorted_ = rows(), sorted(rows(), key=lambda r: r.topic)
     by_system = stamped(lambda t: t + late, ["/cmd_vel"])
     by_two = received(lambda r, i: r.time + i % 2 * hour)
-    ends = [r._replace(time=r.time * 10) for r in stamped(lambda t: 10 * t)
-            if r.topic != "/odom" or r.time < 1.4 * SECOND]  # fmt: skip
+    ends = [
+        r._replace(time=r.time * 10)
+        for r in stamped(lambda t: 10 * t)
+        if r.topic != "/odom" or r.time < 1.4 * SECOND
+    ]
     return {
         "as written": (whole,),
         "topic after topic": (sorted_,),
@@ -571,12 +587,17 @@ def _order() -> dict[str, tuple[Any, ...]]:
         "receipts late by 80 ms": (received(lambda r, _: r.time + 80 * MS),),
         "receipts by another clock": (received(lambda r, _: r.time + late),),
         "receipts of stamped topics late by 0 to 9 ms": (
-            [r._replace(time=r.time + (i * 7 % 10 if r.topic in STAMPED else 4) * MS)
-             for i, r in enumerate(whole)],
+            [
+                r._replace(time=r.time + (i * 7 % 10 if r.topic in STAMPED else 4) * MS)
+                for i, r in enumerate(whole)
+            ],
         ),
         "each message twice, the last counts": (repeated(),),
         "stamps of the system clock": (
-            [r._replace(time=r.time + late) for r in stamped(lambda t: t + late)], "", (), 1e-6,
+            [r._replace(time=r.time + late) for r in stamped(lambda t: t + late)],
+            "",
+            (),
+            1e-6,
         ),
         "no stamps": (stamped(lambda t: 0),),
         "no stamps, shuffled": (random.Random(1).sample(stamped(lambda t: 0), len(whole)),),
@@ -587,22 +608,27 @@ def _order() -> dict[str, tuple[Any, ...]]:
         "commands without header": (as_twist(whole), "", {"cmd_vel": "/plain"}),
         "commands without header, reversed": (as_twist(whole[::-1]), "", ["cmd_vel=/plain"]),
         "commands without header, receipts by another clock": (
-            as_twist(received(lambda r, _: r.time + late)), "", "cmd_vel=plain",
+            as_twist(received(lambda r, _: r.time + late)),
+            "",
+            "cmd_vel=plain",
         ),
         "a target as a pose": (as_pose(whole), "", {"target": "/pose"}),
         "only commands": (sorted_[:COUNT], "has no messages on /odom"),
         "header stamps begin anew": (
-            [*whole, *received(lambda r, _: r.time + 2 * SECOND)], "a header stamp that goes back",
+            [*whole, *received(lambda r, _: r.time + 2 * SECOND)],
+            "a header stamp that goes back",
         ),
         "a header stamp of odom goes back": (
             edited("/odom", set_("header.stamp", {"sec": 1}), [9]),
             "a header stamp that goes back on /odom at 1.000 s",
         ),
         "a header stamp of a command is 0": (
-            edited("/cmd_vel", set_("header.stamp", {}), [9]), "goes back on /cmd_vel at 0.000 s",
+            edited("/cmd_vel", set_("header.stamp", {}), [9]),
+            "goes back on /cmd_vel at 0.000 s",
         ),
         "sim time and system time mixed": (
-            [r for r in by_system if r.topic != "/taxels"], "in the 1 s before that on /cmd_vel",
+            [r for r in by_system if r.topic != "/taxels"],
+            "in the 1 s before that on /cmd_vel",
         ),
         "sim time and system time mixed, taxels": (by_system, "of other topics, on /taxels"),
         "a simulation 20 times slower than the clock": (received(lambda r, _: 20 * r.time),),
@@ -614,10 +640,14 @@ def _order() -> dict[str, tuple[Any, ...]]:
         "receipts by two clocks": (by_two, "no header stamp, nor times of receipt"),
         "receipts by two clocks, of taxels that a law does not sense": (by_two, "", (), 0.0, TOUCH),
         "an object of another clock, which a law does not sense": (
-            stamped(lambda t: t + late, ["/object"]), "", (), 0.0, TOUCH,
+            stamped(lambda t: t + late, ["/object"]),
+            "",
+            (),
+            0.0,
+            TOUCH,
         ),
         "odom ends early": (ends, "no message on /odom in the 1 s before that on /cmd_vel at 15"),
-    }  # fmt: skip
+    }
 
 
 def _formats() -> dict[str, tuple[Any, ...]]:
@@ -669,7 +699,7 @@ def _formats() -> dict[str, tuple[Any, ...]]:
         "other topics of unknown types": (
             lambda f: mcap([*encode(whole), Record("/raw", "x/msg/Y", "~?", SECOND, b"?")])(f),
         ),
-    }  # fmt: skip
+    }
 
 
 def _invalid_files() -> dict[str, tuple[Any, ...]]:
@@ -682,12 +712,14 @@ def _invalid_files() -> dict[str, tuple[Any, ...]]:
         "a zip archive": (zipped, "is no bag"),
         "a pointer of Git LFS": (content(POINTER), "fetch the file itself by `git lfs pull`"),
         "a folder of pointers of Git LFS": (
-            changed_folder(lambda p: (p / "push 0.mcap").write_bytes(POINTER)), "`git lfs pull`",
+            changed_folder(lambda p: (p / "push 0.mcap").write_bytes(POINTER)),
+            "`git lfs pull`",
         ),
         "a path that is missing": (lambda f: f / "none.mcap", "No such file"),
         "a cut MCAP file": (cut(plain(whole), 0.5), "is cut off or damaged, save the rest"),
         "a cut MCAP file without chunks": (
-            cut(plain(whole, use_chunking=False), 0.5), "is cut off or damaged, save the rest",
+            cut(plain(whole, use_chunking=False), 0.5),
+            "is cut off or damaged, save the rest",
         ),
         "an MCAP file without end": (cut(plain(whole, **NO_INDEX), 0.99), "is cut off"),
         "a wrong bit": (flipped, "cannot be read (crc validation failed"),
@@ -698,7 +730,8 @@ def _invalid_files() -> dict[str, tuple[Any, ...]]:
         "ROS 1": (ros1_bag, "convert this ROS 1 bag by `rosbags-convert --src"),
         "messages in JSON": (plain(whole, encoding="json"), "in the encoding json"),
         "messages in protobuf": (
-            plain(whole, encoding="protobuf", schema="protobuf"), "in the encoding protobuf",
+            plain(whole, encoding="protobuf", schema="protobuf"),
+            "in the encoding protobuf",
         ),
         "messages of odd bytes": (
             changed(lambda r: r._replace(data=b"odd")),
@@ -709,30 +742,36 @@ def _invalid_files() -> dict[str, tuple[Any, ...]]:
         "an empty folder": (lambda f: f, "metadata.yaml'): give FILE.mcap"),
         "a folder of two bags": (several, "a folder of them (`ros2 bag reindex FOLDER`"),
         "a folder that lacks a file": (
-            changed_folder(lambda p: (p / "push 1.mcap").unlink(), 3), "push 1.mcap'): give",
+            changed_folder(lambda p: (p / "push 1.mcap").unlink(), 3),
+            "push 1.mcap'): give",
         ),
         "a folder with odd metadata": (
-            changed_folder(lambda p: (p / "metadata.yaml").write_text("a: [")), "ros2 bag reindex",
+            changed_folder(lambda p: (p / "metadata.yaml").write_text("a: [")),
+            "ros2 bag reindex",
         ),
         "a chunk larger than it says, zstd": (
-            content(chunked(zstandard.compress(bomb), 100, "zstd")), "more than 67108864 bytes",
+            content(chunked(zstandard.compress(bomb), 100, "zstd")),
+            "more than 67108864 bytes",
         ),
         "a chunk larger than it says, lz4": (
-            content(chunked(lz4.frame.compress(bomb), 100, "lz4")), "more than 67108864 bytes",
+            content(chunked(lz4.frame.compress(bomb), 100, "lz4")),
+            "more than 67108864 bytes",
         ),
         "an unknown compression": (content(chunked(b"?", 100, "br")), "the compression br, "),
         "a receipt as text": (odd_sqlite, "cannot be decoded"),
         "a receipt beyond 64 bits": (
-            changed(lambda r: r._replace(time=2**64 - 1)), "cannot be decoded",
+            changed(lambda r: r._replace(time=2**64 - 1)),
+            "cannot be decoded",
         ),
-    }  # fmt: skip
+    }
 
 
 def _frames() -> dict[str, tuple[Any, ...]]:
     """Return bags in other frames."""
     late_map = transform("map", "odom", 2.0, -1.0, topic="/tf", stamp=9 * SECOND)
-    no_rotation = edited("/tf_static", set_("transforms.0.transform.rotation", {"w": 0.0}),
-                         source=[STATIC["map"]])  # fmt: skip
+    no_rotation = edited(
+        "/tf_static", set_("transforms.0.transform.rotation", {"w": 0.0}), source=[STATIC["map"]]
+    )
     from_map, turned = moved("/target", 2.0, -1.0, "map"), framed("/cmd_vel", "turned")
     no_path = "has {} in the frame {}, and no transform from it to {}".format
     return {
@@ -748,8 +787,11 @@ def _frames() -> dict[str, tuple[Any, ...]]:
             [Row("/tf", SECOND, {"transforms": []}), *from_map, STATIC["map"]],
         ),
         "a target in map, over two transforms": (
-            [*moved("/target", 3.0, 1.0, "earth"), STATIC["map"],
-             transform("earth", "map", 1.0, 2.0)],
+            [
+                *moved("/target", 3.0, 1.0, "earth"),
+                STATIC["map"],
+                transform("earth", "map", 1.0, 2.0),
+            ],
         ),
         "a target below odom": (
             [*moved("/target", -2.0, 1.0, "hall"), transform("odom", "hall", 2.0, -1.0)],
@@ -757,13 +799,21 @@ def _frames() -> dict[str, tuple[Any, ...]]:
         "a target in map, moving": (moving_map(),),
         "a target in base_link, once": (
             [r for r in base_target() if r.time >= 1.04 * SECOND or r.topic != "/cmd_vel"],
-            "", (), 1e-12,
+            "",
+            (),
+            1e-12,
         ),
         "a contact in another frame": (
-            [*moved("/contact", -0.25, -0.5, "skin", "points"), STATIC["skin"]], "", (), 1e-7,
+            [*moved("/contact", -0.25, -0.5, "skin", "points"), STATIC["skin"]],
+            "",
+            (),
+            1e-7,
         ),
         "a force in another frame": (
-            [*edited("/force", turned_force), STATIC["turned"]], "", (), 1e-12,
+            [*edited("/force", turned_force), STATIC["turned"]],
+            "",
+            (),
+            1e-12,
         ),
         "commands in a frame at the base": (
             [*framed("/cmd_vel", "base_footprint"), STATIC["same"]],
@@ -774,27 +824,33 @@ def _frames() -> dict[str, tuple[Any, ...]]:
             "no transform of odom to base_link at the time of the message on /target at 1.040 s",
         ),
         "a contact in a camera": (
-            framed("/contact", "camera"), no_path("/contact", "camera", "base_link"),
+            framed("/contact", "camera"),
+            no_path("/contact", "camera", "base_link"),
         ),
         "a force in a wheel": (framed("/force", "wheel"), no_path("/force", "wheel", "base_link")),
         "an object in map": (framed("/object", "map"), no_path("/object", "map", "odom")),
         "commands in odom": (framed("/cmd_vel", "odom"), "publish commands in base_link"),
         "commands in a tool": (
-            framed("/cmd_vel", "tool"), no_path("/cmd_vel", "tool", "base_link"),
+            framed("/cmd_vel", "tool"),
+            no_path("/cmd_vel", "tool", "base_link"),
         ),
         "commands in a turned frame": (
-            [*turned, STATIC["turned"]], "publish commands in base_link",
+            [*turned, STATIC["turned"]],
+            "publish commands in base_link",
         ),
         "frames of odom change": (
-            edited("/odom", set_("header.frame_id", "map"), range(9)), "a change of frames on",
+            edited("/odom", set_("header.frame_id", "map"), range(9)),
+            "a change of frames on",
         ),
         "a transform too late": (
-            [*from_map, late_map], "no transform of map to odom at the time of the message",
+            [*from_map, late_map],
+            "no transform of map to odom at the time of the message",
         ),
         "a transform that is no rotation": (
-            [*from_map, *no_rotation], "whose norm is not 1 on /tf_static",
+            [*from_map, *no_rotation],
+            "whose norm is not 1 on /tf_static",
         ),
-    }  # fmt: skip
+    }
 
 
 def _topics() -> dict[str, tuple[Any, ...]]:
@@ -809,18 +865,22 @@ def _topics() -> dict[str, tuple[Any, ...]]:
         "other names, in one text": (other, "", ",".join(texts)),
         "names without slash": ([r._replace(topic=r.topic[1:]) for r in whole],),
         "names that are not told": (
-            other, "has no messages on /odom, /target, /cmd_vel; its topics are "
+            other,
+            "has no messages on /odom, /target, /cmd_vel; its topics are "
             "/ridgeback/cmd_vel (geometry_msgs/TwistStamped)",
         ),
         "a wrong name": (
-            whole, "has no messages on /odometry; its topics are /cmd_vel", {"odom": "/odometry"},
+            whole,
+            "has no messages on /odometry; its topics are /cmd_vel",
+            {"odom": "/odometry"},
         ),
         "a wrong name of an optional topic": (whole, "no messages on /ft", {"force": "/ft"}),
         "a wrong key": (whole, "unknown key of a topic 'odometry'", {"odometry": "/odom"}),
         "a key twice": (whole, "name each once", ["odom=/odom", "odom=/o"]),
         "a key alone": (whole, "topic = odom is not allowed", ["odom"]),
         "a topic of another type": (
-            whole, "has a std_msgs/Float32MultiArray in the encoding cdr on /taxels that cannot",
+            whole,
+            "has a std_msgs/Float32MultiArray in the encoding cdr on /taxels that cannot",
             {"odom": "/taxels"},
         ),
         "no contacts and taxels": (
@@ -832,19 +892,26 @@ def _topics() -> dict[str, tuple[Any, ...]]:
         "a path without poses before the path": (on_path({0: (), 20: LINE}),),
         "a path without poses, and a target": (on_path({0: (), 20: ()}),),
         "a path without poses, and no target": (
-            on_path({0: (), 20: ()}, "/target"), "has no messages on /path with poses",
+            on_path({0: (), 20: ()}, "/target"),
+            "has no messages on /path with poses",
         ),
         "a path that is shortened": (
-            on_path({0: LINE, 20: LINE[1:]}), "Path of 6 numbers on /path after one of 9, received",
+            on_path({0: LINE, 20: LINE[1:]}),
+            "Path of 6 numbers on /path after one of 9, received",
         ),
         "a path that is shortened, beside a target": (
-            on_path({0: LINE, 20: LINE[1:]}), "", (), 0.0, TOUCH,
+            on_path({0: LINE, 20: LINE[1:]}),
+            "",
+            (),
+            0.0,
+            TOUCH,
         ),
         "a path again after its end": (
-            on_path({0: LINE, 20: (), 30: LINE}), "a path after one without poses on /path at 1.6",
+            on_path({0: LINE, 20: (), 30: LINE}),
+            "a path after one without poses on /path at 1.6",
         ),
         "one command": (one, "has too few commands, 1, on /cmd_vel"),
-    }  # fmt: skip
+    }
 
 
 def _values() -> dict[str, tuple[Any, ...]]:
@@ -861,13 +928,19 @@ def _values() -> dict[str, tuple[Any, ...]]:
         "a quaternion with w first": ({"x": 1.0}, tilt),
     }
     fields = (
-        ("/odom", "pose.pose.position.x", NAN), ("/odom", "pose.pose.position.y", INF),
-        ("/target", "point.x", NAN), ("/target", "point.y", -INF),
-        ("/contact", "polygon.points", [{"x": NAN}]), ("/contact", "polygon.points", [{"y": INF}]),
-        ("/taxels", "data", [NAN] * 42), ("/force", "wrench.force.x", NAN),
-        ("/object", "pose.position.y", NAN), ("/object", "scale.x", NAN),
-        ("/cmd_vel", "twist.linear.x", NAN), ("/cmd_vel", "twist.angular.z", INF),
-    )  # fmt: skip
+        ("/odom", "pose.pose.position.x", NAN),
+        ("/odom", "pose.pose.position.y", INF),
+        ("/target", "point.x", NAN),
+        ("/target", "point.y", -INF),
+        ("/contact", "polygon.points", [{"x": NAN}]),
+        ("/contact", "polygon.points", [{"y": INF}]),
+        ("/taxels", "data", [NAN] * 42),
+        ("/force", "wrench.force.x", NAN),
+        ("/object", "pose.position.y", NAN),
+        ("/object", "scale.x", NAN),
+        ("/cmd_vel", "twist.linear.x", NAN),
+        ("/cmd_vel", "twist.angular.z", INF),
+    )
 
     def opposite(message: dict[str, Any]) -> None:
         q = message["pose"]["pose"]["orientation"]
@@ -878,24 +951,38 @@ def _values() -> dict[str, tuple[Any, ...]]:
         message["polygon"] = {"points": [p | {"y": p["y"] + shift} for p, shift in ends]}
 
     return {
-        **{kind: (edited("/odom", set_("pose.pose.orientation", zero | q), [5]),
-                  f"{words} on /odom at 1.100 s")
-           for kind, (q, words) in quaternions.items()},
-        **{f"{path} of {topic} = {str(value)[:20]}": (edited(topic, set_(path, value), [5]),
-                                                      f"not finite on {topic} at 1.100 s")
-           for topic, path, value in fields},
+        **{
+            kind: (
+                edited("/odom", set_("pose.pose.orientation", zero | q), [5]),
+                f"{words} on /odom at 1.100 s",
+            )
+            for kind, (q, words) in quaternions.items()
+        },
+        **{
+            f"{path} of {topic} = {str(value)[:20]}": (
+                edited(topic, set_(path, value), [5]),
+                f"not finite on {topic} at 1.100 s",
+            )
+            for topic, path, value in fields
+        },
         "a quaternion of the opposite sign": (edited("/odom", opposite, [5]), "", (), 1e-12),
         "a contact with both ends": (edited("/contact", apart, [2, 6, 10]), "", (), 1e-7),
         "a contact of 4 points": (
-            edited("/contact", set_("polygon.points", [{}] * 4), [5]), "a contact of 4 points",
+            edited("/contact", set_("polygon.points", [{}] * 4), [5]),
+            "a contact of 4 points",
         ),
         "taxels of two counts": (
-            edited("/taxels", set_("data", [0.0] * 41), [5]), "of 41 numbers on /taxels after one",
+            edited("/taxels", set_("data", [0.0] * 41), [5]),
+            "of 41 numbers on /taxels after one",
         ),
         "taxels of two counts, which a law does not sense": (
-            edited("/taxels", set_("data", [0.0] * 41), [5]), "", (), 0.0, TOUCH,
+            edited("/taxels", set_("data", [0.0] * 41), [5]),
+            "",
+            (),
+            0.0,
+            TOUCH,
         ),
-    }  # fmt: skip
+    }
 
 
 ALL = cases()

@@ -73,18 +73,19 @@ def pytest_configure(config):
 
 
 # Slow files start first; a slow file at the end would leave processors idle.
-LONGEST = (
-    *("learning", "library", "failures", "cli", "native", "contact_derivatives", "fit", "rivals"),
-    *("smooth", "trial", "robot", "examples", "tune", "ladder", "export", "sweep", "shell"),
-    *("view", "push_page", "replay", "package_laws", "derivatives", "rooms", "cluster", "walls"),
-    *("mjx_gradients", "gpu_writer", "video", "points", "faults", "bags", "ground"),
-    *("force_push_grid", "feet", "house", "film", "footprint", "arena", "force", "evaluate"),
-    *("gradients", "publish", "study", "quasistatic", "physics", "notebooks", "quality"),
-)
+LONGEST = """
+    learning publish library task_commands replay gym export benchmark bags faults native law
+    fit evaluate law_files round_base scene push_page failures sweep contact_derivatives
+    lowering random_laws rivals smooth examples tasks cli tune trial robot gallery ladder view
+    planning limits rooms walls skin mjx_gradients gpu_writer package_laws ground footprint
+    video points programs study gradients quality force derivatives physics feet shell notebooks
+    env film quasistatic baselines descent landscape ros2 project_studies house real_pushes
+    cluster
+"""
 
 
 def pytest_collection_modifyitems(items):
-    rank = {f"test_{name}": i for i, name in enumerate(LONGEST)}
+    rank = {f"test_{name}": i for i, name in enumerate(LONGEST.split())}
     items.sort(key=lambda item: rank.get(item.path.stem, len(rank)))
 
 

@@ -30,6 +30,8 @@ from pathlib import Path
 from typing import Any, NamedTuple
 from unittest import mock
 
+from helpers import setting_of
+
 PATIENCE = 10.0  # [s] after which a command hangs
 
 
@@ -126,33 +128,74 @@ def inject(
 
 # --- bad values of options -----------------------------------------------------------------
 
+
+def _words(text: str) -> list[str]:
+    return text.split()
+
+
 VALUES = (
-    *("", " ", "nan", "-nan", "inf", "-inf", "1e400", "-1e400", "1e-320", "-1", "0", "-0", "0.5"),
-    *("1e9", "1e308", "9" * 60, "-" + "9" * 60, "9" * 5000, "0x10", "1_000", "\u0661", "\u00b2"),
-    *("None", "null", "true", "[]", "{}", "()", "[[[[", "{]", "a=b", "=", "L=", "=1", "L=nan"),
-    *("L=1e400", "mass=3", "mass=3,nan", "mass=9,3", "mass=,", "1/0", "0/1", "2/1", "-1/3", "a/b"),
-    *("1/" + "9" * 60, "S1,S2", "0.3,0.3,0.3", "0,0", "nan,nan", "rps", "rps,rps", "RPS", "aps "),
-    *("nowhere.json", "nowhere.py:P", "nowhere.npz", ".json", ".py:", ".npz", ":", "..", "/", "."),
-    *("/dev/null", "/dev/zero", "/dev/zero.json", "/proc/self/mem", "/etc/passwd", "~", "$HOME"),
-    *("list.json", "null.json", "deep.json", "text.json", "binary.json", "empty.json"),
-    *("number.json", "big.json", "pipe.json", "pipe.npz", "pipe.py:P", "folder.json", "pipe"),
-    *("folder.npz", "broken.py:P", "syntax.py:P", "text.npz", "encrypted.npz", "zip.npz"),
-    *("exit.py:P", "\N{SNOWMAN}", "\N{PILE OF POO}" * 40, "\u202eabc", "\x1b[31m", "a\nb"),
-    *("x" * 4000, "-", "--", "a b", "'", '"', "\\", "%s", "{0}", "`id`", ";ls", "&&", "*", "?"),
-    *("\t", "--help", "-1.5", "+5"),
+    "",
+    " ",
+    *_words("nan -nan inf -inf 1e400 -1e400 1e-320 -1 0 -0 0.5 1e9 1e308"),
+    "9" * 60,
+    "-" + "9" * 60,
+    "9" * 5000,
+    "0x10",
+    "1_000",
+    "\u0661",
+    "\u00b2",
+    *_words("""
+    None null true [] {} () [[[[ {] a=b = L= =1 L=nan L=1e400 mass=3 mass=3,nan mass=9,3
+    mass=, 1/0 0/1 2/1 -1/3 a/b
+    """),
+    "1/" + "9" * 60,
+    *_words("S1,S2 0.3,0.3,0.3 0,0 nan,nan rps rps,rps RPS"),
+    "aps ",
+    *_words("""
+    nowhere.json nowhere.py:P nowhere.npz .json .py: .npz : .. / . /dev/null /dev/zero
+    /dev/zero.json /proc/self/mem /etc/passwd ~ $HOME list.json null.json deep.json
+    text.json binary.json empty.json number.json big.json pipe.json pipe.npz pipe.py:P
+    folder.json pipe folder.npz broken.py:P syntax.py:P text.npz encrypted.npz zip.npz
+    exit.py:P
+    """),
+    "\N{SNOWMAN}",
+    "\N{PILE OF POO}" * 40,
+    "\u202eabc",
+    "\x1b[31m",
+    "a\nb",
+    "x" * 4000,
+    "-",
+    "--",
+    "a b",
+    "'",
+    '"',
+    "\\",
+    *_words("%s {0} `id` ;ls && * ?"),
+    "\t",
+    "--help",
+    "-1.5",
+    "+5",
 )
 
 
 def furnish(folder: Path) -> None:
     """Write the files that `VALUES` names."""
     contents = {
-        "list.json": b"[1, 2]", "null.json": b"null", "number.json": b"7",
-        "deep.json": b"[" * 100_000, "text.json": b"a note", "binary.json": bytes(range(256)),
-        "empty.json": b"", "big.json": b'{"a": ' + b"9" * 10_000 + b"}",
-        "broken.py": b"raise RuntimeError('broken')\n", "syntax.py": b"def :\n",
-        "exit.py": b"import sys\nsys.exit(3)\n", "text.npz": b"a note",
-        "zip.npz": b"PK\x05\x06" + bytes(18), "encrypted.npz": encrypted(),
-    }  # fmt: skip
+        "list.json": b"[1, 2]",
+        "null.json": b"null",
+        "number.json": b"7",
+        "deep.json": b"[" * 100_000,
+        "text.json": b"a note",
+        "binary.json": bytes(range(256)),
+        "empty.json": b"",
+        "big.json": b'{"a": ' + b"9" * 10_000 + b"}",
+        "broken.py": b"raise RuntimeError('broken')\n",
+        "syntax.py": b"def :\n",
+        "exit.py": b"import sys\nsys.exit(3)\n",
+        "text.npz": b"a note",
+        "zip.npz": b"PK\x05\x06" + bytes(18),
+        "encrypted.npz": encrypted(),
+    }
     for name, content in contents.items():
         (folder / name).write_bytes(content)
     for name in ("pipe", "pipe.json", "pipe.npz", "pipe.py"):
@@ -168,7 +211,7 @@ def small_run(folder: Path, **changes: Any) -> None:
 
     drums = rps_jax.Domain(("random_cylinder",))
     laws = {"rps": rps_jax.RPSParams.paper(), "rps tuned": rps_jax.RPSParams.tuned()}
-    setting = rps_jax.Setting("quasistatic", rules=rps_jax.Rules(horizon=2.0))
+    setting = setting_of(2.0)
     options = {"worlds": 12, "setting": setting, "out": folder, "part": 4, "progress": False}
     rps_jax.sweep(laws, drums, **options | changes)
 
@@ -242,20 +285,43 @@ def step({takes}):
 {register}
 """
 DEFAULTS = {
-    "head": "", "field": "", "before": "", "takes_init": "params", "starts": "pass",
-    "memory": "jnp.zeros(2)", "takes": "params, memory, seen", "body": "pass",
+    "head": "",
+    "field": "",
+    "before": "",
+    "takes_init": "params",
+    "starts": "pass",
+    "memory": "jnp.zeros(2)",
+    "takes": "params, memory, seen",
+    "body": "pass",
     "returns": "memory, Twist(params.v, 0.0, 0.0), Details.from_obs(seen)",
     "register": "rps_jax.register_law('{name}', rps_jax.Law(init, step), {P}())",
-}  # fmt: skip
+}
 MEMORY = "{}, Twist(0.0, 0.0, 0.0), Details.from_obs(seen)"
 TWIST = "memory, {}, Details.from_obs(seen)"
 DETAILS = "memory, Twist(0.0, 0.0, 0.0), {}"
 REGISTER = "rps_jax.register_law({}, rps_jax.Law({}), {})"
+
+
+def _lines(text: str) -> list[str]:
+    return [line.strip() for line in text.strip().splitlines()]
+
+
 _WRONG: dict[str, Sequence[str]] = {
     "returns": (
-        *("None", "'text'", "memory", "(memory, Twist(0.0, 0.0, 0.0))", "{}", "()", "iter(())"),
-        *("Twist(0.0, 0.0, 0.0)", "step", "seen", "{'memory': memory}"),
-        "[memory, Twist(0.0, 0.0, 0.0), Details.from_obs(seen)]",
+        *_lines("""
+            None
+            'text'
+            memory
+            (memory, Twist(0.0, 0.0, 0.0))
+            {}
+            ()
+            iter(())
+            Twist(0.0, 0.0, 0.0)
+            step
+            seen
+            {'memory': memory}
+            [memory, Twist(0.0, 0.0, 0.0), Details.from_obs(seen)]
+        """),
         *map(DETAILS.format, ("None", "Details(0, 0, 0, 0, here)", "Details.from_obs(seen), 1")),
         *map(DETAILS.format, ("Details(*5 * [None])",)),
         *map(TWIST.format, ("None", "'left'", "(0.0, 0.0)", "here", "[0, 0, 0]", "jnp.zeros(3)")),
@@ -265,28 +331,83 @@ _WRONG: dict[str, Sequence[str]] = {
         *map(MEMORY.format, ("(memory, memory)", "{'x': memory}", "memory.astype(int)")),
     ),
     "body": (
-        *("if seen.in_contact: pass", "float(seen.yaw)", "1 / 0", "int(seen.yaw)", "nothing"),
-        *("np.sin(seen.yaw)", "math.sin(seen.yaw)", "np.asarray(here)", "seen.yaw.item()"),
-        *("range(seen.yaw)", "here.tolist()", "here[9.0]", "jnp.arange(seen.yaw)"),
-        *("[1, 2][seen.yaw]", "seen.nothing", "memory['a']", "raise ValueError", "step()"),
-        *("raise RuntimeError('a\\nb')", "assert seen.in_contact", "step(params, memory, seen)"),
-        *("import nothing", "open('/nowhere')", "sys.exit(3)", "here[0] = 1.0", "min(here)"),
-        *("here + jnp.zeros(3)", "jnp.reshape(here, 5)", "here[seen.in_contact]", "(lambda: 1)(2)"),
-        *("jax.lax.cond(here, None, None)", "sum(here, 'a')", "here.astype('nothing')"),
-        *("jnp.linalg.inv(here)", "jax.lax.scan(lambda c, x: (c, c, x), 0, here)", "seen.yaw = 3"),
-        *("jax.grad(lambda x: here)(1.0)", "np.random.default_rng(seen.yaw)", "jnp.where(1, 2)"),
-        *("jax.random.key(seen.yaw)", "here.at[9].nothing(1)", "f'{seen.yaw:.2f}'"),
-        "jnp.concatenate([here, seen.yaw])",
+        *_lines("""
+            if seen.in_contact: pass
+            float(seen.yaw)
+            1 / 0
+            int(seen.yaw)
+            nothing
+            np.sin(seen.yaw)
+            math.sin(seen.yaw)
+            np.asarray(here)
+            seen.yaw.item()
+            range(seen.yaw)
+            here.tolist()
+            here[9.0]
+            jnp.arange(seen.yaw)
+            [1, 2][seen.yaw]
+            seen.nothing
+            memory['a']
+            raise ValueError
+            step()
+            raise RuntimeError('a\\nb')
+            assert seen.in_contact
+            step(params, memory, seen)
+            import nothing
+            open('/nowhere')
+            sys.exit(3)
+            here[0] = 1.0
+            min(here)
+            here + jnp.zeros(3)
+            jnp.reshape(here, 5)
+            here[seen.in_contact]
+            (lambda: 1)(2)
+            jax.lax.cond(here, None, None)
+            sum(here, 'a')
+            here.astype('nothing')
+            jnp.linalg.inv(here)
+            jax.lax.scan(lambda c, x: (c, c, x), 0, here)
+            seen.yaw = 3
+            jax.grad(lambda x: here)(1.0)
+            np.random.default_rng(seen.yaw)
+            jnp.where(1, 2)
+            jax.random.key(seen.yaw)
+            here.at[9].nothing(1)
+            f'{seen.yaw:.2f}'
+            jnp.concatenate([here, seen.yaw])
+        """),
     ),
     "starts": (
-        *("raise ValueError('no')", "1 / 0", "params.nothing", "if params.v > 0: pass", "nothing"),
-        *("float(params.v)", "np.sin(params.v)", "sys.exit(3)", "assert False"),
-        "jnp.zeros(params.v)",
+        *_lines("""
+            raise ValueError('no')
+            1 / 0
+            params.nothing
+            if params.v > 0: pass
+            nothing
+            float(params.v)
+            np.sin(params.v)
+            sys.exit(3)
+            assert False
+            jnp.zeros(params.v)
+        """),
     ),
     "memory": (
-        *("'text'", "object()", "[1, 'a']", "step", "jnp.zeros", "{'a': 'b'}", "0", "None", "1j"),
-        *("np.array([1, 'a'])", "np.zeros(2, int)", "[jnp.zeros(2)]", "np.array([None])"),
-        "b'bytes'",
+        *_lines("""
+            'text'
+            object()
+            [1, 'a']
+            step
+            jnp.zeros
+            {'a': 'b'}
+            0
+            None
+            1j
+            np.array([1, 'a'])
+            np.zeros(2, int)
+            [jnp.zeros(2)]
+            np.array([None])
+            b'bytes'
+        """),
     ),
     "field": tuple(
         f"gain: {kind} = {value}"
@@ -295,25 +416,48 @@ _WRONG: dict[str, Sequence[str]] = {
             "str": ("'high'",),
             "list": ("[1, 'a']", "[[1, 2], [None]]"),
             "bytes": ("b''",),
-            "object": ("object()", "np.array([1, None])", "len", "np.array(['a'])",
-                       "jnp.array([jnp.nan])"),
+            "object": (
+                "object()",
+                "np.array([1, None])",
+                "len",
+                "np.array(['a'])",
+                "jnp.array([jnp.nan])",
+            ),
         }.items()
         for value in defaults
     ),
     "takes": ("", "params", "params, memory", "params, memory, seen, more", "*, params", "**seen"),
     "takes_init": ("", "params, more", "*, params"),
-    "head": ("def :", "raise RuntimeError('head')", "import nothing", "sys.exit(3)", "1 / 0", "P"),
+    "head": _lines("""
+            def :
+            raise RuntimeError('head')
+            import nothing
+            sys.exit(3)
+            1 / 0
+            P
+        """),
     "register": (
-        *("", "rps_jax.register_law('{name}')", "rps_jax.register_law('{name}', None, {P}())"),
-        *(REGISTER.format("'{name}'", "init, step", params)
-          for params in ("None", "3.0", "[1.0]", "{P}", "rps_jax.RPSParams()")),
-        *(REGISTER.format("'{name}'", law, "{P}()")
-          for law in ("None, None", "init, 'step'", "init, step, 'smell'",
-                      "init, step, check=1", "init, step, check=init")),
+        "",
+        "rps_jax.register_law('{name}')",
+        "rps_jax.register_law('{name}', None, {P}())",
+        *(
+            REGISTER.format("'{name}'", "init, step", params)
+            for params in ("None", "3.0", "[1.0]", "{P}", "rps_jax.RPSParams()")
+        ),
+        *(
+            REGISTER.format("'{name}'", law, "{P}()")
+            for law in (
+                "None, None",
+                "init, 'step'",
+                "init, step, 'smell'",
+                "init, step, check=1",
+                "init, step, check=init",
+            )
+        ),
         *(REGISTER.format(name, "init, step", "{P}()") for name in ("'rps'", "3")),
         "{P}.d_success = None\n" + REGISTER.format("'{name}'", "init, step", "{P}()"),
     ),
-}  # fmt: skip
+}
 # Fragments above that give a valid law.
 _VALID_LAWS = {
     *(f"memory: {value}" for value in ("0", "1j", "None", "[jnp.zeros(2)]", "np.zeros(2, int)")),
@@ -340,8 +484,26 @@ def wrong_laws(limit: int, seed: int) -> Iterator[Fault]:
 # --- run folders that somebody edited or damaged ---------------------------------------------
 
 ODD: tuple[Any, ...] = (
-    *(None, True, -1, 0, 1.5, 10**30, float("inf"), float("nan"), "", "text", "1", [], {}, [[]]),
-    *([None], ["a", "b"], [1, 2, 3], {"a": 1}, "x" * 1000, [[[[[[[[0]]]]]]]]),
+    None,
+    True,
+    -1,
+    0,
+    1.5,
+    10**30,
+    float("inf"),
+    float("nan"),
+    "",
+    "text",
+    "1",
+    [],
+    {},
+    [[]],
+    [None],
+    ["a", "b"],
+    [1, 2, 3],
+    {"a": 1},
+    "x" * 1000,
+    [[[[[[[[0]]]]]]]],
 )
 
 
@@ -496,18 +658,27 @@ def damages(path: Path, rng: random.Random) -> list[Edit]:
     at = rng.randrange(max(1, len(content)))
     flipped = content[:at] + bytes([content[at] ^ 1 << rng.randrange(8)]) + content[at + 1 :]
     contents = {
-        "empty": b"", f"cut at {at}": content[:at], "twice": content * 2, f"bit at {at}": flipped,
-        "zeros": bytes(len(content)), "random": rng.randbytes(len(content)),
-        "HDF5 in name": b"\x89HDF\r\n\x1a\n", "zip in name": b"PK\x03\x04" + bytes(500),
-        "deep": b"[" * 100_000, "text": b"a note\n", "backwards": content[::-1],
-    }  # fmt: skip
+        "empty": b"",
+        f"cut at {at}": content[:at],
+        "twice": content * 2,
+        f"bit at {at}": flipped,
+        "zeros": bytes(len(content)),
+        "random": rng.randbytes(len(content)),
+        "HDF5 in name": b"\x89HDF\r\n\x1a\n",
+        "zip in name": b"PK\x03\x04" + bytes(500),
+        "deep": b"[" * 100_000,
+        "text": b"a note\n",
+        "backwards": content[::-1],
+    }
     replacements = {
-        "is gone": lambda file: None, "a pipe": os.mkfifo, "a folder": Path.mkdir,
+        "is gone": lambda file: None,
+        "a pipe": os.mkfifo,
+        "a folder": Path.mkdir,
         "zeros for ever": lambda file: file.symlink_to("/dev/zero"),
         "a circle": lambda file: file.symlink_to(file),
         "a link to nothing": lambda file: file.symlink_to("/nowhere"),
         "memory": lambda file: file.symlink_to("/proc/self/mem"),
-    }  # fmt: skip
+    }
     edits = [(title, partial(Path.write_bytes, data=new)) for title, new in contents.items()]
     return edits + [(title, partial(_instead, make=make)) for title, make in replacements.items()]
 
@@ -518,25 +689,20 @@ def _instead(file: Path, make: Callable[[Path], Any]) -> None:
     make(file)
 
 
-SHORT = ("--engine", "quasistatic", "--horizon", "2")
-DRUMS = ("--domain", "wide,objects=random_cylinder")
+SHORT = "--engine quasistatic --horizon 2"
+DRUMS = "--domain wide,objects=random_cylinder"
 # Commands that make a run folder quickly.
-COMMANDS: dict[str, tuple[str, ...]] = {
-    "sweep": ("sweep", *SHORT, *DRUMS, "--laws", "rps", "nps", "--worlds", "24", "--part", "4"),
-    "tune": (
-        *("tune", "es", "--quick", *SHORT, *DRUMS, "--generations", "4", "--population", "4"),
-        *("--worlds", "2", "--validation", "2", "--tuned", "K_h", "L"),
-    ),
-    "learn": (
-        *("learn", "--quick", "--engine", "quasistatic", *DRUMS, "--updates", "3"),
-        *("--minutes", "0", "--num-envs", "4", "--drawn", "4", "--validation", "2"),
-        *("--width", "4", "--num-steps", "2", "--num-minibatches", "1"),
-    ),
+COMMANDS = {
+    "sweep": f"sweep {SHORT} {DRUMS} --laws rps nps --worlds 24 --part 4",
+    "tune": f"tune es --quick {SHORT} {DRUMS} --generations 4 --population 4 --worlds 2 "
+    "--validation 2 --tuned K_h L",
+    "learn": f"learn --quick --engine quasistatic {DRUMS} --updates 3 --minutes 0 --num-envs 4 "
+    "--drawn 4 --validation 2 --width 4 --num-steps 2 --num-minibatches 1",
 }
 
 
 @functools.cache
-def _furnished(complete: bool) -> tuple[Path, dict[str, list[tuple[str, ...]]]]:
+def _furnished(complete: bool) -> tuple[Path, dict[str, list[str]]]:
     """Return a temporary folder with small runs, and the commands that read them."""
     home = Path(tempfile.mkdtemp())
     atexit.register(shutil.rmtree, home, ignore_errors=True)
@@ -544,7 +710,7 @@ def _furnished(complete: bool) -> tuple[Path, dict[str, list[tuple[str, ...]]]]:
         return home, furnish_runs(home, complete)
 
 
-def furnish_runs(folder: Path, complete: bool) -> dict[str, list[tuple[str, ...]]]:
+def furnish_runs(folder: Path, complete: bool) -> dict[str, list[str]]:
     """Write small runs of several kinds, and return the commands that read each of them.
 
     A complete set has a tuned and a learned law, which take a minute.
@@ -560,21 +726,25 @@ def furnish_runs(folder: Path, complete: bool) -> dict[str, list[tuple[str, ...]
     shutil.copy(
         Path(policy.__file__).parent / "learned_small.npz", folder / "policy" / "policy.npz"
     )
-    runs = {name: (*words, "--out", name) for name, words in COMMANDS.items()}
+    runs = {name: f"{words} --out {name}" for name, words in COMMANDS.items()}
     for command in [runs[name] for name in runs if complete or name == "sweep"]:
-        if (result := attempt(command, 300)).how != "told":
-            raise RuntimeError(f"rps {' '.join(command)} made no run ({result.how}): {result.text}")
+        if (result := attempt(command.split(), 300)).how != "told":
+            raise RuntimeError(f"rps {command} made no run ({result.how}): {result.text}")
     reads = {
         "sweep": [
-            ("merge", "sweep", "--out", "merged"), ("replay", "sweep", "0"), ("film", "sweep"),
-            ("gallery", "sweep", "--each", "1"), ("view", "sweep", "0"),
-            ("ceiling", "sweep", "--lost-by", "rps", "--sample", "1"), runs["sweep"],
+            "merge sweep --out merged",
+            "replay sweep 0",
+            "film sweep",
+            "gallery sweep --each 1",
+            "view sweep 0",
+            "ceiling sweep --lost-by rps --sample 1",
+            runs["sweep"],
         ],
-        "points": [("merge", "points", "--out", "merged"), ("replay", "points", "0")],
-        "tune": [runs["tune"], ("push", "--law", "rps,tune/tuned.json")],
-        "policy": [("push", "--skin", "capacitive", "--law", "policy/policy.npz")],
-        "learn": [runs["learn"], ("export", "c", "--law", "learn/policy.npz")],
-    }  # fmt: skip
+        "points": ["merge points --out merged", "replay points 0"],
+        "tune": [runs["tune"], "push --law rps,tune/tuned.json"],
+        "policy": ["push --skin capacitive --law policy/policy.npz"],
+        "learn": [runs["learn"], "export c --law learn/policy.npz"],
+    }
     return {
         name: words for name, words in reads.items() if complete or name not in ("tune", "learn")
     }
@@ -599,7 +769,7 @@ def edited_folders(limit: int, seed: int, damaged: bool) -> Iterator[Fault]:
             make(path)
             if not damaged:
                 _sign(path)
-            yield f"{path}: {title}", rng.choice(reads[name]), ("accepted", "told")
+            yield f"{path}: {title}", rng.choice(reads[name]).split(), ("accepted", "told")
             shutil.rmtree(name)
             shutil.move(f"{name}.sound", name)
 

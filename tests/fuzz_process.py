@@ -27,20 +27,22 @@ from pathlib import Path
 from typing import Any
 
 from fuzz import COMMANDS, DRUMS, SHORT, main
+from helpers import setting_of
 
 RPS = (sys.executable, "-m", "rps_jax")
 HOME = Path(__file__).parents[1]
-SWEEP = COMMANDS["sweep"]
-KILLED = COMMANDS | {
-    "ladder": ("ladder", *SWEEP[1:]),
-    "table": ("table", *SHORT, "--objects", "cylinder", "--friction", "S1"),
-    "sensitivity": ("sensitivity", *SHORT, *DRUMS, "--worlds", "100"),
-    "attack": (
-        *("attack", *SHORT, *DRUMS, "--axes", "size", "mass", "friction_robot", "--cells", "3"),
-        *("--batch", "8", "--generations", "4", "--minutes", "30", "--drawn", "8"),
-        *("--check-again", "0", "--repeats", "1"),
-    ),
+KILLED = {
+    name: tuple(words.split())
+    for name, words in {
+        **COMMANDS,
+        "ladder": COMMANDS["sweep"].replace("sweep", "ladder"),
+        "table": f"table {SHORT} --objects cylinder --friction S1",
+        "sensitivity": f"sensitivity {SHORT} {DRUMS} --worlds 100",
+        "attack": f"attack {SHORT} {DRUMS} --axes size mass friction_robot --cells 3 --batch 8 "
+        "--generations 4 --minutes 30 --drawn 8 --check-again 0 --repeats 1",
+    }.items()
 }
+SWEEP = KILLED["sweep"]
 # Durations of a tuner's generation; other clocks have "wall clock" in their long name.
 _CLOCKS = ("compile", "run")
 
@@ -212,8 +214,10 @@ def machine(home: Path) -> Iterator[tuple[str, str, int, str]]:
         process.stdout.close()  # type: ignore[union-attr]
         process.stdout = None
         yield f"closed pipe: {words[0]} {words[1:2]}", "0 or 1 or 141", *ended(process)
-    for locale in ({"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"},
-                   {"LC_ALL": "POSIX", "PYTHONIOENCODING": "ascii"}):  # fmt: skip
+    for locale in (
+        {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"},
+        {"LC_ALL": "POSIX", "PYTHONIOENCODING": "ascii"},
+    ):
         how = {"env": locale, "errors": "replace"}
         yield f"locale {locale}", "0", *swept(f"locale-{len(locale)}-\N{SNOWMAN}", **how)
         yield f"help, locale {locale}", "0", *run("sweep", "--help", **how)
@@ -243,7 +247,7 @@ def run_memory(num_calls: int, seed: int, tell: Callable[[str], None]) -> Counte
     import rps_jax
 
     drums = rps_jax.Domain(("random_cylinder",))
-    setting = rps_jax.Setting("quasistatic", rules=rps_jax.Rules(horizon=2.0))
+    setting = setting_of(2.0)
     used = []  # [MB]
     for call in range(num_calls):
         seeded = dataclasses.replace(setting, seed=call)

@@ -19,6 +19,7 @@ import pandas as pd
 import pytest
 import xarray as xr
 from hypothesis import strategies
+from numpy.testing import assert_allclose, assert_array_equal
 
 from rps_jax.app import cli
 from rps_jax.control import registry
@@ -51,6 +52,12 @@ def rps(first: Any, *rest: Any) -> int:
     return cli.main([str(word) for word in (*words, *rest)])
 
 
+def printed(capsys, *arguments: Any) -> str:
+    """Return what a command prints, which succeeds."""
+    assert rps(*arguments) == 0
+    return capsys.readouterr().out
+
+
 def refusal(capsys, *arguments: Any) -> str:
     """Return the single-sentence error with which a command refuses its input."""
     capsys.readouterr()
@@ -66,12 +73,17 @@ def one_sentence(error: str) -> str:
     return error
 
 
+def refusing(pattern: str) -> Any:
+    """Expect an InputError whose sentence has a pattern."""
+    return pytest.raises(InputError, match=pattern)
+
+
 def refusals(call: Callable[..., object], *cases: tuple[Any, str]) -> Callable[..., None]:
     """Return a test of a call's errors by its arguments, which are a tuple or keywords."""
 
     @pytest.mark.parametrize(("arguments", "message"), cases)
     def test(arguments: Any, message: str) -> None:
-        with pytest.raises(InputError, match=message):
+        with refusing(message):
             call(**arguments) if isinstance(arguments, dict) else call(*arguments)
 
     return test
@@ -96,6 +108,7 @@ def jitted(function: Callable[..., Any]) -> Callable[..., Any]:
     return lambda *arguments: jax.device_get(program(*arguments))
 
 
+slow = partial(pytest.param, marks=pytest.mark.slow)  # values of a test that runs in .ci/slow
 SEEDS = strategies.integers(0, 2**32 - 1)
 
 
@@ -116,6 +129,11 @@ def advance(
 ) -> Trial:
     """Step one batch of worlds by up to `steps` control steps."""
     return trial.advance([(stage, worlds, params, trials)], loop, steps)[0]
+
+
+def setting_of(horizon: float, engine: Any = "quasistatic") -> Setting:
+    """Return a setting of trials that end after `horizon` [s]."""
+    return Setting(engine, rules=Rules(horizon=horizon))
 
 
 # The fused engine compiles fastest among the engines with contact dynamics.
@@ -174,9 +192,11 @@ def moved(
     side, (c, s) = jnp.array([1.0, -1.0 if mirror else 1.0]), (np.cos(turn), np.sin(turn))
     place = lambda p: (p * side) @ jnp.array([[c, s], [-s, c]]) + jnp.asarray(shift)  # noqa: E731
     return touch._replace(
-        p_world_robot=place(touch.p_world_robot), yaw=side[1] * touch.yaw + turn,
-        p_robot_contact=touch.p_robot_contact * side, p_world_target=place(touch.p_world_target),
-    )  # fmt: skip
+        p_world_robot=place(touch.p_world_robot),
+        yaw=side[1] * touch.yaw + turn,
+        p_robot_contact=touch.p_robot_contact * side,
+        p_world_target=place(touch.p_world_target),
+    )
 
 
 @contextlib.contextmanager
@@ -267,7 +287,7 @@ def central_differences(function: Callable[..., Any], x: np.ndarray, h: float) -
 
 def same(a: Any, b: Any, **tolerances: float) -> None:
     """Assert that two trees are equal, bit for bit or within tolerances."""
-    check = np.testing.assert_allclose if tolerances else np.testing.assert_array_equal
+    check = assert_allclose if tolerances else assert_array_equal
     for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True):
         check(x, y, **tolerances)
 

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
+from numpy.testing import assert_array_equal
 
 from rps_jax import engines
 from rps_jax.control.observation import Twist
@@ -64,7 +65,7 @@ def stack(models: Sequence[mujoco.MjModel]) -> tuple[Any, dict[str, np.ndarray]]
     fields = [mjx_engine.fields_of(model) for model in models]
     rows = [{k: np.asarray(v, np.float32) for k, v in row.items()} for row in fields]
     for tree in trees:
-        jax.tree.map(np.testing.assert_array_equal, mjx_engine.apply(tree, rows[0]), trees[0])
+        jax.tree.map(assert_array_equal, mjx_engine.apply(tree, rows[0]), trees[0])
     return trees[0], {name: np.stack([row[name] for row in rows]) for name in rows[0]}
 
 

@@ -7,6 +7,8 @@ import numpy as np
 import pytest
 import xarray as xr
 from helpers import results_of
+from numpy.random import default_rng
+from numpy.testing import assert_allclose
 from scipy import stats
 
 from rps_jax.analysis import report, statistics, tables
@@ -158,7 +160,7 @@ def test_chance_alone_has_no_excess_variance_on_average():
 
 def test_the_figure_shows_the_influential_quantities_and_names_the_rest(drawn):
     """Yaw decides for law b and mass for law a; six other quantities have no influence."""
-    index, random = np.arange(400), np.random.default_rng(0)
+    index, random = np.arange(400), default_rng(0)
     noise = ("size", "height", "gap", "noise", "distance", "lateral")
     columns = {name: random.permutation(400) * 1.0 for name in noise}
     columns |= {"mass": index * 1.0, "yaw": index * 7 % 100 * 1.0}
@@ -190,7 +192,7 @@ def test_coinciding_curves_are_all_visible(drawn):
     assert low < 30 < 370 < high
     assert len({line.get_marker() for line in marks}) == 2
     first, second = (line.get_transform().transform((100.0, 50.0)) for line in marks)
-    np.testing.assert_allclose((second - first) * 72 / figure.dpi, [2.5, 0], atol=1e-6)
+    assert_allclose((second - first) * 72 / figure.dpi, [2.5, 0], atol=1e-6)
 
 
 def test_a_path_is_drawn_with_its_target_and_its_last_contact(drawn):
@@ -223,12 +225,19 @@ def test_the_papers_numbers_are_beside_ours_under_each_friction(drawn):
     }
     results = xr.Dataset({name: (dims, x) for name, x in columns.items()}, {"object": objects})
     d, time = drawn(hardware.numbers_figure, results).axes
-    np.testing.assert_allclose(d.lines[0].get_xdata(), [0.04, 0.02])
-    np.testing.assert_allclose(time.lines[0].get_xdata(), [85, 70])
+    assert_allclose(d.lines[0].get_xdata(), [0.04, 0.02])
+    assert_allclose(time.lines[0].get_xdata(), [85, 70])
     assert [list(line.get_xdata()) for line in d.lines[1::2]] == [[0.032], [0.059]]
     _, box, cylinder = hardware.table(results)
-    assert box == ["hardware box", "3 of 4 [30, 95]", "8 of 8", "0.033 m (by friction 0.020-0.040)",
-                   "0.032 m", "80 s (by friction 70-85)", "89 s"]  # fmt: skip
+    assert box == [
+        "hardware box",
+        "3 of 4 [30, 95]",
+        "8 of 8",
+        "0.033 m (by friction 0.020-0.040)",
+        "0.032 m",
+        "80 s (by friction 70-85)",
+        "89 s",
+    ]
     _, marked, _ = hardware.table(results, "fitted; ")
     assert marked[3:6:2] == [
         "0.033 m (fitted; by friction 0.020-0.040)",
@@ -367,7 +376,7 @@ def test_exact_bounds_by_hand():
 
 def test_the_bound_of_the_best_of_many_holds_where_the_plain_one_fails():
     """The best of twenty candidates, all of which fail in a tenth of the worlds."""
-    rng = np.random.default_rng(0)
+    rng = default_rng(0)
     least = rng.binomial(200, 0.1, (2000, 20)).min(axis=1)
     counts, times = np.unique(least, return_counts=True)
 
@@ -381,7 +390,7 @@ def test_the_bound_of_the_best_of_many_holds_where_the_plain_one_fails():
 
 def test_the_interval_of_cvar_covers():
     """The CVaR of the tail t of an exponential distribution is 1 - log t."""
-    rng = np.random.default_rng(0)
+    rng = default_rng(0)
     intervals = np.array([statistics.cvar_interval(rng.exponential(size=400)) for _ in range(400)])
     truth = 1 - np.log(0.05)
     assert np.mean((intervals[:, 0] <= truth) & (truth <= intervals[:, 1])) > 0.9
@@ -390,23 +399,23 @@ def test_the_interval_of_cvar_covers():
 
 
 def test_statistics_equal_those_of_scipy():
-    rng = np.random.default_rng(0)
+    rng = default_rng(0)
     methods = {"wilson": statistics.wilson, "exact": statistics.clopper_pearson}
     for trials, (method, function) in itertools.product((1, 2, 7, 60, 4096), methods.items()):
         for successes in {0, trials, *rng.integers(0, trials + 1, 5).tolist()}:
             for level in ((), (0.9,)):
                 interval = stats.binomtest(successes, trials).proportion_ci(*level, method=method)
                 ours = function(successes, trials, *level)
-                np.testing.assert_allclose(ours, interval, atol=1e-12)
+                assert_allclose(ours, interval, atol=1e-12)
     for count in (2, 3, 12):
         trials = rng.integers(5, 50, count)
         binned = Bins(np.zeros(count), rng.binomial(trials, 0.8), trials)
         table = np.stack([binned.successes, trials - binned.successes])
         expected = stats.chi2_contingency(table).pvalue
-        np.testing.assert_allclose(statistics.equal_rates_p(binned), expected, rtol=1e-9)
+        assert_allclose(statistics.equal_rates_p(binned), expected, rtol=1e-9)
     p = rng.uniform(size=20) ** 3
     expected = stats.false_discovery_control(p)
-    np.testing.assert_allclose(statistics.false_discovery(p), expected, rtol=1e-12)
+    assert_allclose(statistics.false_discovery(p), expected, rtol=1e-12)
     assert statistics.false_discovery([]).size == 0
     first = xr.DataArray([True] * 9 + [False] * 3)
     second = xr.DataArray([False] * 7 + [True] * 5)

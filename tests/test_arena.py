@@ -3,6 +3,7 @@
 import mujoco
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 from rps_jax.world import scene
 from sweeps.speed import arena
@@ -14,7 +15,7 @@ def test_the_exported_scene_equals_that_of_the_engines():
     for kind in ("body", "geom", "jnt", "dof", "pair"):
         looks = ("geom_matid", "body_sameframe")
         for name in (n for n in dir(ours) if n.startswith(f"{kind}_") and n not in looks):
-            np.testing.assert_allclose(getattr(theirs, name), getattr(ours, name), err_msg=name)
+            assert_allclose(getattr(theirs, name), getattr(ours, name), err_msg=name)
     for name in ("timestep", "cone", "impratio", "iterations", "ls_iterations", "tolerance"):
         assert getattr(theirs.opt, name) == getattr(ours.opt, name)
 

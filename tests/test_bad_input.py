@@ -7,12 +7,11 @@ import sys
 import time
 
 import pytest
-from helpers import one_sentence, refusal, rps
+from helpers import one_sentence, refusal, refusing, rps
 
 from rps_jax.control import registry
 from rps_jax.control.laws.rps import RPSParams
 from rps_jax.engines import ENGINES
-from rps_jax.errors import InputError
 from rps_jax.record import files
 from rps_jax.record.folder import claim
 from rps_jax.runs.plan import Plan, open_run
@@ -48,6 +47,7 @@ DOMAIN_FILES = {
     "twice": ({"objects": ["random_box"] * 2}, "objects = .* is not allowed: name each once"),
 }
 PARAMS_FILES = {
+    "no_path": {},
     "L": {"L": -1, "saturate_first": 1},
     "L_word": {"L": "x"},
     "good": {"L": 0.3, "saturate_first": 1},
@@ -257,8 +257,27 @@ COMMANDS = {
     "fit": {"none.csv": "none.csv cannot be read"},
     "puhs": {"": "puhs"},
 }
+TASKS = {
+    "push --task nofile.json": "nofile.json cannot be read",
+    "push --task path,nofile.json": "nofile.json cannot be read",
+    "push --task no_path.json": "waypoints as [[0.4, 0], [2, 1]], or a map",
+    "push --task corridor,width=0.5": "the base is 0.58 m wide",
+    "push --task corridor,width=0.6,doors=1,door_width=0.6": "the base is 0.58 m wide",
+    "push --task path --target 1 1": "target = (1.0, 1.0) is not allowed: the task path has",
+    "push --task pathh": "did you mean 'path'?",
+    "push --task path,lookahed=2": "did you mean 'lookahead'?",
+    "push --task path,spline=maybe": "write true or false",
+    "push --task corridor,doors=x": "write a whole number",
+    "push --task path,turns=1.5": "give whole numbers",
+    "sweep --task corridor,width=0.8": "the widest object is 0.99 m wide",
+    "ladder --task pathh": "did you mean 'path'?",
+    "learn --task pathh": "did you mean 'path'?",
+    "tune es --task pathh": "did you mean 'path'?",
+    "table --task path": "unknown option '--task'",
+}
 CASES = {f"{name} {more}": says for name, cases in COMMANDS.items() for more, says in cases.items()}
 CASES |= {f"sweep --domain {name}.json": says for name, (_, says) in DOMAIN_FILES.items()}
+CASES |= {command: re.escape(words) for command, words in TASKS.items()}
 for name, (_, reason) in CORRUPT.items():
     CASES[f"replay {name} 0"] = f"{name}/manifest.json is corrupt .{reason}"
 for key, pattern in SHARED.items():
@@ -313,7 +332,7 @@ def test_bad_input_is_one_sentence(case, folder, compiled, capsys, monkeypatch):
 
 def test_a_corrupt_results_file_is_named(tmp_path):
     (tmp_path / "results.nc").write_bytes(b"not a file of results")
-    with pytest.raises(InputError, match=r"results\.nc is corrupt"):
+    with refusing(r"results\.nc is corrupt"):
         files.read_results(tmp_path)
 
 

@@ -12,7 +12,16 @@ import numpy as np
 import pytest
 import xarray as xr
 import zstandard
-from helpers import SLOTS, refusal, rps
+from helpers import (
+    SLOTS,
+    printed,
+    refusal,
+    refusing,
+    rps,
+    setting_of,
+)
+from numpy.random import default_rng
+from numpy.testing import assert_allclose, assert_array_equal
 
 import rps_jax
 from rps_jax.app.shadow import Shadow, shadow
@@ -23,8 +32,8 @@ from rps_jax.robot.skin import with_contacts
 from rps_jax.runs.push import push
 
 pytest.importorskip("mcap_ros2")
-BRIEF = rps_jax.Setting("quasistatic", rules=rps_jax.Rules(horizon=6.0))
-FUSED = rps_jax.Setting("fused", rules=rps_jax.Rules(horizon=10.0))
+BRIEF = setting_of(6.0)
+FUSED = setting_of(10.0, "fused")
 TWIST = ("v_x", "v_y", "omega")
 
 
@@ -50,18 +59,18 @@ def test_a_law_reproduces_every_twist_from_the_bag_of_a_simulation(law, tmp_path
     results = shadow(path, law)
     assert results.sizes == {"source": 2, "time": 501 if law == "force_push_published" else 301}
     for name in TWIST:
-        np.testing.assert_allclose(results[name][1], results[name][0], atol=1e-6)
+        assert_allclose(results[name][1], results[name][0], atol=1e-6)
     assert float(np.abs(results.v_x).max()) > 0.005
 
 
 def test_a_bag_does_not_change_the_trial(recorded):
     path, trace = recorded
     without_bag = push("cylinder", target=(-1.0, 0.5), law="rps_plus", setting=BRIEF)
-    np.testing.assert_array_equal(trace.data.time, without_bag.data.time)
+    assert_array_equal(trace.data.time, without_bag.data.time)
     for name in ("v_x", "l", "distance"):
-        np.testing.assert_allclose(trace.data[name], without_bag.data[name], atol=1e-5)
+        assert_allclose(trace.data[name], without_bag.data[name], atol=1e-5)
     read = bag.read(path)
-    np.testing.assert_allclose(read["twist"][::5, 0], trace.data.v_x, atol=1e-7)
+    assert_allclose(read["twist"][::5, 0], trace.data.v_x, atol=1e-7)
 
 
 def test_another_law_gives_other_twists(recorded):
@@ -86,7 +95,7 @@ def test_a_third_party_reader_opens_the_bag(recorded):
     assert len(messages["/target_marker"]) == 7
     position = messages["/odom"][250].pose.pose.position
     qpos = trace.snapshots.qpos[50, :2]
-    np.testing.assert_allclose((position.x, position.y), qpos, atol=1e-7)
+    assert_allclose((position.x, position.y), qpos, atol=1e-7)
 
 
 def test_the_commands_write_and_shadow_a_bag(tmp_path, capsys):
@@ -97,8 +106,7 @@ def test_the_commands_write_and_shadow_a_bag(tmp_path, capsys):
     assert rps(f"replay {run} 1 --bag {path} --no-video --out", tmp_path / "replay") == 0
     mine = tmp_path / "mine.json"
     mine.write_text(json.dumps({"d_near": 0.3}))
-    assert rps(f"shadow {path} --law rps_plus,{mine} --out", out) == 0
-    output = capsys.readouterr().out
+    output = printed(capsys, f"shadow {path} --law rps_plus,{mine} --out", out)
     assert "151 commands in 3.0 s" in output
     assert "omega [rad/s]" in output
 
@@ -207,8 +215,8 @@ def error_of(path):
 def test_a_bag_stores_pose_period_and_contact(tmp_path):
     rows = [step._replace(pose=(1, 2, 2.5 * i)) for i, step in enumerate(steps(4, contact_type=2))]
     columns = bag.read(bag.write(tmp_path / "a.mcap", rows, {}))
-    np.testing.assert_allclose(columns["pose"], [[1, 2, 2.5 * i] for i in range(4)], atol=1e-12)
-    np.testing.assert_allclose(columns["period"], 0.02, atol=1e-9)
+    assert_allclose(columns["pose"], [[1, 2, 2.5 * i] for i in range(4)], atol=1e-12)
+    assert_allclose(columns["period"], 0.02, atol=1e-9)
     assert columns["contact_type"].tolist() == [2] * 4
     assert "signal" not in columns
 
@@ -229,7 +237,7 @@ def test_invalid_files_are_refused_in_one_sentence(tmp_path, recorded):
 def test_damage_anywhere_is_refused_or_read(tmp_path):
     """Any error of a reader becomes a single-sentence error."""
     whole = bag.write(tmp_path / "a.mcap", steps(30), {}).read_bytes()
-    rng, path, refused = np.random.default_rng(0), tmp_path / "b.mcap", 0
+    rng, path, refused = default_rng(0), tmp_path / "b.mcap", 0
     for _ in range(150):
         odd = bytearray(whole)
         for _ in range(4):
@@ -261,14 +269,14 @@ def test_the_skin_feels_the_taxels_of_a_bag_without_contacts(tmp_path, capsys, m
     columns = with_contacts(bag.read(path), Robot().shell, "bag")
     assert columns["contact_type"].tolist() == [0, 0] + [1] * 7
     p_robot_contact = [0.3625, 0.29 - 0.58 * 5.5 / 12]  # the sixth of the front's twelve
-    np.testing.assert_allclose(columns["p_robot_contact"][2:], [p_robot_contact] * 7, atol=1e-6)
-    np.testing.assert_allclose(columns["signal"][1, 20], 0.4 * (1 - np.exp(-0.8)), rtol=1e-5)
+    assert_allclose(columns["p_robot_contact"][2:], [p_robot_contact] * 7, atol=1e-6)
+    assert_allclose(columns["signal"][1, 20], 0.4 * (1 - np.exp(-0.8)), rtol=1e-5)
     alone = shadow(path, "rps")
     touched = steps(9, signal=signal, p_robot_contact=p_robot_contact)
     touched = [step._replace(contact_type=int(i > 1)) for i, step in enumerate(touched)]
     same = shadow(bag.write(tmp_path / "b.mcap", touched, {}), "rps")
-    np.testing.assert_allclose(alone.v_x[1], same.v_x[1], atol=1e-6)
-    np.testing.assert_allclose(alone.v_y[1], same.v_y[1], atol=1e-6)
+    assert_allclose(alone.v_x[1], same.v_x[1], atol=1e-6)
+    assert_allclose(alone.v_y[1], same.v_y[1], atol=1e-6)
     error = refusal(capsys, "shadow", path, "--robot", "ridgeback", "--out", tmp_path / "run")
     assert "has 42 taxels, and the robot 51: name the log's robot by --robot" in error
 
@@ -276,7 +284,7 @@ def test_the_skin_feels_the_taxels_of_a_bag_without_contacts(tmp_path, capsys, m
 def test_steps_begin_with_the_first_contact(tmp_path, monkeypatch):
     rows = steps(6, signal=np.zeros(42))
     columns = bag.read(without_contacts(tmp_path / "a.mcap", rows, monkeypatch, until=0.05))
-    np.testing.assert_allclose(columns["time"], [0.06, 0.08, 0.1])
+    assert_allclose(columns["time"], [0.06, 0.08, 0.1])
     assert columns["contact_type"].tolist() == [1, 1, 1]
 
 
@@ -305,5 +313,5 @@ def test_oversized_content_is_refused_before_decompression(tmp_path, monkeypatch
 def test_a_missing_column_is_named(tmp_path):
     path = bag.write(tmp_path / "a.mcap", steps(), {})
     for law, column in (("learned_small", "signal"), ("aps", "p_world_object")):
-        with pytest.raises(rps_jax.InputError, match=f"has no {column}, which the law senses"):
+        with refusing(f"has no {column}, which the law senses"):
             Shadow(path, law)()

@@ -4,15 +4,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import moved, observation, refusals
+from helpers import moved, observation, refusals, setting_of
+from numpy.random import default_rng
+from numpy.testing import assert_allclose, assert_array_equal
 
 from rps_jax.control.laws import aps
 from rps_jax.control.laws.aps import APSParams, APSState
 from rps_jax.control.observation import PoseObservation
 from rps_jax.trials import pushes
 from rps_jax.trials.case import Case
-from rps_jax.trials.setting import Setting
-from rps_jax.trials.trial import Rules
 
 APS = APSParams()
 PLAIN = APS._replace(aim_beyond=0.0)  # as published: the object's centre to the target
@@ -92,7 +92,7 @@ def in_world(observation, **changes):
 
 def test_the_law_depends_on_neither_the_side_nor_the_frame():
     """Compare twists over several steps, of which it learns."""
-    rng = np.random.default_rng(0)
+    rng = default_rng(0)
     frame = {"turn": 0.8, "shift": np.array([3.0, -2.0])}
     states = [START] * 3
     for _ in range(5):
@@ -104,8 +104,8 @@ def test_the_law_depends_on_neither_the_side_nor_the_frame():
         states = [state for state, *_ in steps]
         plain, mirrored, elsewhere = (np.stack(twist) for _, twist, _ in steps)
         assert np.hypot(*plain[:2]) > 0.005
-        np.testing.assert_allclose(mirrored, plain * [1, -1, -1], atol=1e-4)
-        np.testing.assert_allclose(elsewhere, plain, atol=1e-4)
+        assert_allclose(mirrored, plain * [1, -1, -1], atol=1e-4)
+        assert_allclose(elsewhere, plain, atol=1e-4)
 
 
 def test_a_motion_error_is_learned_and_compensated():
@@ -147,10 +147,10 @@ def test_it_turns_on_the_spot_until_it_faces_the_object():
 
 def test_it_reaches_targets_ahead_only_if_it_aims_beyond_them():
     cases = [Case("box", "S1", (1.0, 0.0), params) for params in (APS, PLAIN)]
-    outcome, _ = pushes.run(cases, Setting(engine="mujoco", rules=Rules(horizon=60.0)))
-    np.testing.assert_array_equal(outcome.success, [True, False])
+    outcome, _ = pushes.run(cases, setting_of(60.0, "mujoco"))
+    assert_array_equal(outcome.success, [True, False])
     # As published, the object's centre stays near the target, half a side (0.2 m) from the contact.
-    np.testing.assert_allclose(outcome.object_pose[1, :2], (1.0, 0.0), atol=0.04)
+    assert_allclose(outcome.object_pose[1, :2], (1.0, 0.0), atol=0.04)
     assert outcome.min_distance[1] == pytest.approx(0.2, abs=0.04)
 
 

@@ -13,18 +13,15 @@ import command_line
 import numpy as np
 import pytest
 import xarray as xr
-from helpers import refusal, rps
+from helpers import printed, refusal, refusing, rps, setting_of
 
 import rps_jax
 from rps_jax.app.cli import flags, names, running
 from rps_jax.control import registry
-from rps_jax.errors import InputError
 from rps_jax.record import files
 from rps_jax.runs.question import Question
 from rps_jax.runs.sweep import merge
 from rps_jax.trials.results import DIMS
-from rps_jax.trials.setting import Setting
-from rps_jax.trials.trial import Rules
 from rps_jax.tuning.evolution import TuneES
 from rps_jax.world import paper
 
@@ -79,8 +76,7 @@ QUASISTATIC = "--engine quasistatic --horizon 8 --slots 8 --workers 1"
 def test_other_options_get_a_numbered_folder(tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
     for target, folder in (("1 0", "push"), ("2 0", "push-2"), ("1 0", "push"), ("2 1", "push-3")):
-        assert rps(f"{QUICK_PUSH} {target}") == 0
-        text = capsys.readouterr().out
+        text = printed(capsys, f"{QUICK_PUSH} {target}")
         assert text.splitlines()[-1] == f"run folder: runs/{folder}"
         assert ("holds another run" in text) == (folder != "push")
     (first,) = tmp_path.glob("runs/push/results.nc")
@@ -94,17 +90,20 @@ def test_every_question_offers_and_every_call_accepts_overwrite(tmp_path):
     for name in names.known():
         question = names.question_type(name)
         expected = ["--overwrite"] if issubclass(question, Question) else []
-        flag_names = [flag for kind in (question, flags.session_type(question))
-                      for flag in flags._flag_names(kind)]  # fmt: skip
+        flag_names = [
+            flag
+            for kind in (question, flags.session_type(question))
+            for flag in flags._flag_names(kind)
+        ]
         assert [flag for flag in flag_names if flag == "--overwrite"] == expected, name
-    setting = Setting("quasistatic", rules=Rules(horizon=1.0))
+    setting = setting_of(1.0)
     first = rps_jax.push("cylinder", target=(1.0, 0.0), setting=setting, out=tmp_path)
-    with pytest.raises(InputError, match=r"holds another run .* overwrite=True"):
+    with refusing(r"holds another run .* overwrite=True"):
         rps_jax.push("cylinder", target=(2.0, 0.0), setting=setting, out=tmp_path)
     second = {"target": (2.0, 0.0), "setting": setting, "out": tmp_path, "overwrite": True}
     assert not rps_jax.push("cylinder", **second).data.equals(first.data)
     (tmp_path / "inner").mkdir()
-    with pytest.raises(InputError, match="overwrite would remove the run that is read"):
+    with refusing("overwrite would remove the run that is read"):
         merge((tmp_path / "inner",), out=tmp_path, overwrite=True)
     assert rps_jax.load(tmp_path).sizes["time"]
 
@@ -120,8 +119,7 @@ def test_the_commands_of_a_report_reproduce_the_run(tmp_path, capsys, monkeypatc
         "gallery a --each 1 --law rps,v_max=0.02 --out c",
     ):
         monkeypatch.setattr(sys, "argv", ["rps", *command.split()])
-        assert rps(command) == 0
-        text = capsys.readouterr().out
+        text = printed(capsys, command)
         seeds = re.findall(r"seed (\d+)", text)
         assert set(seeds) == set(re.findall(r"--seed (\d+)", command)), seeds
         out = Path(command.split()[-1])
@@ -168,10 +166,9 @@ PUSH = "push --target 0.6 0 --engine fused --horizon 18 --film-length 0.4 --out"
 
 
 def test_a_push_draws_and_films_a_trial(tmp_path, capsys):
-    assert rps(PUSH, tmp_path) == 0
-    printed = capsys.readouterr().out
-    assert "reached at" in printed
-    assert "Stepped by the engine fused." in printed
+    text = printed(capsys, PUSH, tmp_path)
+    assert "reached at" in text
+    assert "Stepped by the engine fused." in text
     trace = xr.load_dataset(tmp_path / "results.nc", engine="h5netcdf")
     assert trace.sizes["time"] > 100
     assert int(trace.outcome_success) == 1
@@ -187,19 +184,17 @@ def test_a_push_draws_and_films_a_trial(tmp_path, capsys):
 
 def test_a_push_without_ffmpeg_explains_the_fix_and_does_the_rest(tmp_path, capsys, monkeypatch):
     monkeypatch.setenv("IMAGEIO_FFMPEG_EXE", "/bin/false")
-    assert rps(PUSH, tmp_path) == 0
-    printed = capsys.readouterr().out
-    assert "There is no film: " in printed
-    assert "pip install imageio-ffmpeg" in printed
+    text = printed(capsys, PUSH, tmp_path)
+    assert "There is no film: " in text
+    assert "pip install imageio-ffmpeg" in text
     assert (tmp_path / "trial.png").exists()
     assert not (tmp_path / "push.mp4").exists()
 
 
 def test_the_doctor_names_versions_device_cache_rendering_and_ffmpeg(capsys):
-    assert rps("doctor") == 0
-    printed = capsys.readouterr().out
+    text = printed(capsys, "doctor")
     for word in ("python", "mujoco-mjx", "device", "cache", "rendering", "ffmpeg"):
-        assert word in printed
+        assert word in text
 
 
 def test_commands_flags_and_defaults_equal_the_record():
@@ -253,7 +248,7 @@ def test_a_quick_run_keeps_an_explicit_value_that_equals_the_default():
     assert quick.population == small["population"] < default.population
     robot = ["--domain", "real,robot=ridgeback"]
     flags.parse(TuneES, "tune es", [*words[:3], *robot])[0].validate()
-    with pytest.raises(InputError, match=f"engine = {small['setting.engine']}"):
+    with refusing(f"engine = {small['setting.engine']}"):
         flags.parse(TuneES, "tune es", ["--quick", *robot])[0].validate()
     # From Python a value that equals the default is no explicit one.
     called = TuneES(quick=True, worlds=7, tuned=("logistic",)).with_quick_values()

@@ -9,10 +9,17 @@ from dataclasses import replace
 
 import jax
 import pytest
-from helpers import PLAN, SLOTS, one_sentence, parts_of, rps, swept
+from helpers import (
+    PLAN,
+    SLOTS,
+    one_sentence,
+    parts_of,
+    refusing,
+    rps,
+    swept,
+)
 
 from rps_jax.engines import device
-from rps_jax.errors import InputError
 from rps_jax.record import files
 from rps_jax.record.cache import use_cache
 from rps_jax.runs import cluster
@@ -46,7 +53,7 @@ def test_room_for_workers_by_hand():
     assert cluster._count_workers(hosts, 1, 0) == 11
     assert cluster._count_workers(hosts, 3, 0) == 3
     assert cluster._count_workers(hosts, 1, 1) == 3
-    with pytest.raises(InputError, match=r"workers = 9 .* so many processors"):
+    with refusing(r"workers = 9 .* so many processors"):
         cluster._count_workers(hosts, 9, 0)
 
 
@@ -133,10 +140,10 @@ def test_an_error_of_a_worker_ends_the_run_unchanged(opened, two_workers):
 
 
 def test_workers_with_other_software_or_without_room_are_refused(opened, two_workers, monkeypatch):
-    with pytest.raises(InputError, match=r"workers = 3 .* so many processors"):
+    with refusing(r"workers = 3 .* so many processors"):
         cluster.run_on_cluster(*opened, address="local", prepare=int, workers=3)
     environment = device.collect_environment() | {"commit": "another"}
     monkeypatch.setattr(device, "collect_environment", lambda: environment)
     message = r"other software \(commit = .* there, .another. asked for"
-    with pytest.raises(InputError, match=message):
+    with refusing(message):
         cluster.run_on_cluster(*opened, address="local", prepare=int)

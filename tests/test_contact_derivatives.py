@@ -7,6 +7,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from helpers import slow
+from numpy.random import default_rng
 
 from rps_jax.control.observation import Twist
 from rps_jax.engines.base import ControlPeriod, Motion
@@ -34,7 +36,7 @@ def in_contact(domain, count, seed=0, spread=1.0):
     drawn = draws.draw(parse_domain(domain), seed, np.arange(count))
     drawn.values["yaw"][::2] *= 1e-3  # half of them lie flat on the base
     batch = drawn_worlds(parse_domain(domain), drawn, Setting())
-    random, worlds = np.random.default_rng(seed), jax.tree.map(jnp.asarray, batch.worlds)
+    random, worlds = default_rng(seed), jax.tree.map(jnp.asarray, batch.worlds)
     qpos = np.array(worlds.qpos, float)
     qpos[:, 3] -= drawn.values["gap"] + 3e-4 * spread * random.random(count)
     qpos[:, 5] -= 2e-4 * spread * random.random(count)
@@ -68,7 +70,7 @@ def inputs(x):
 
 def random_like(tree, seed=0):
     """Return random numbers of the shapes of a pytree, of the size of each number or of 1e-3."""
-    random = np.random.default_rng(seed)
+    random = default_rng(seed)
     return jax.tree.map(
         lambda a: jnp.asarray(random.normal(size=a.shape) * (np.abs(a) + 1e-3), a.dtype), tree
     )
@@ -97,9 +99,7 @@ def classes(fields, motion, twists, physics):
     return states
 
 
-@pytest.mark.parametrize(
-    "name", ["random_box", pytest.param("random_cylinder", marks=pytest.mark.slow)]
-)
+@pytest.mark.parametrize("name", ["random_box", slow("random_cylinder")])
 def test_a_step_has_the_derivative_of_its_difference(name, monkeypatch):
     """Vary 24 inputs and more at once, in 200 states of contact of each class."""
     monkeypatch.setattr(newton, "_TOLERANCE", 1e-13)
@@ -125,8 +125,9 @@ def test_a_step_has_the_derivative_of_its_difference(name, monkeypatch):
 
         def differences(h):
             results = [run(step)[0] for step in (h, 0.0, -h)]
-            sides = [jax.tree.map(lambda a, b: (a - b) / h, *pair)
-                     for pair in (results[:2], results[1:])]  # fmt: skip
+            sides = [
+                jax.tree.map(lambda a, b: (a - b) / h, *pair) for pair in (results[:2], results[1:])
+            ]
             return [np.array(side[1]) for side in sides]
 
         up, down = differences(1e-7)
@@ -148,11 +149,13 @@ def products(a, b):
     return np.sum(np.reshape(np.asarray(a) * np.asarray(b), (len(a), -1)), axis=1)
 
 
-@pytest.mark.parametrize("domain", [
-    "real,objects=random_cylinder",
-    *(pytest.param(x, marks=pytest.mark.slow)
-      for x in ("wide,objects=random_box", "real,objects=random_prism")),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "domain",
+    [
+        "real,objects=random_cylinder",
+        *(slow(x) for x in ("wide,objects=random_box", "real,objects=random_prism")),
+    ],
+)
 def test_derivatives_are_finite_and_both_modes_agree(domain):
     """Check 10,000 states, up to far from any contact, in float32 and native functions."""
     count = 1120

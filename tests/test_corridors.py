@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import xarray as xr
 from helpers import PAPER, results_of
+from numpy.random import default_rng
 
 from rps_jax.runs import execution
 from rps_jax.runs.plan import Plan
@@ -19,7 +20,7 @@ from sweeps.corridors import costs, parity, study
 from sweeps.corridors.widths import fit
 from sweeps.study_base import run_together
 
-RANDOM = np.random.default_rng(4)
+RANDOM = default_rng(4)
 
 
 def drawn(plateau: float, middle: float, spread: float) -> tuple[np.ndarray, np.ndarray]:
@@ -32,9 +33,7 @@ def drawn(plateau: float, middle: float, spread: float) -> tuple[np.ndarray, np.
     ("curve", "level"),
     [((0.998, 1.4, 0.1), 0.9), ((0.999, 1.4, 0.1), 0.99), ((0.8, 1.3, 0.05), 0.7)],
 )
-def test_a_fitted_width_is_that_of_the_curve(
-    curve: tuple[float, float, float], level: float
-) -> None:
+def test_a_fitted_width_is_that_of_the_curve(curve, level):
     plateau, middle, spread = curve
     at, low, high = fit(*drawn(*curve), 1.1, 2.5).needed(level)
     true = middle + spread * math.log(level / (plateau - level))
@@ -43,13 +42,13 @@ def test_a_fitted_width_is_that_of_the_curve(
     assert low - 0.03 <= true <= high + 0.03  # the step of the grid is 2.2 cm
 
 
-def test_a_width_beyond_the_worlds_is_infinite_and_one_below_is_the_least() -> None:
+def test_a_width_beyond_the_worlds_is_infinite_and_one_below_is_the_least():
     assert fit(*drawn(0.93, 1.3, 0.1), 1.1, 2.5).needed(0.99) == (math.inf,) * 3
     assert fit(*drawn(1.0, 2.6, 0.1), 1.1, 2.5).needed(0.9)[0] == math.inf
     assert fit(*drawn(1.0, 0.3, 0.02), 1.1, 2.5).needed(0.9) == (1.1,) * 3
 
 
-def test_the_best_lookahead_is_chosen_in_worlds_that_begin_free() -> None:
+def test_the_best_lookahead_is_chosen_in_worlds_that_begin_free():
     count = study.CENTRES.size
     lookahead = np.repeat(study.CENTRES, 20)
     success = np.zeros((2, lookahead.size), int)
@@ -66,7 +65,7 @@ def test_the_best_lookahead_is_chosen_in_worlds_that_begin_free() -> None:
     assert first[2].startswith("75.0 %")
 
 
-def test_each_failure_has_the_kind_of_its_end() -> None:
+def test_each_failure_has_the_kind_of_its_end():
     changes = {
         "base touched": {"wall_touch": BASE},
         "object touched": {"wall_touch": OBJECT},
@@ -76,8 +75,15 @@ def test_each_failure_has_the_kind_of_its_end() -> None:
         "out of time": {"time": 600.0},
         "diverged": {"diverged": 1},
     }
-    defaults = {"success": 0, "wall_touch": 0, "contact_lost_time": 1.0, "min_distance": 0.5,
-             "tipped": 0, "diverged": 0, "time": 90.0}  # fmt: skip
+    defaults = {
+        "success": 0,
+        "wall_touch": 0,
+        "contact_lost_time": 1.0,
+        "min_distance": 0.5,
+        "tipped": 0,
+        "diverged": 0,
+        "time": 90.0,
+    }
     columns = {
         name: [end.get(name, value) for end in changes.values()] for name, value in defaults.items()
     }
@@ -87,7 +93,7 @@ def test_each_failure_has_the_kind_of_its_end() -> None:
 
 
 @pytest.mark.slow
-def test_plans_that_run_together_have_the_results_of_each_alone() -> None:
+def test_plans_that_run_together_have_the_results_of_each_alone():
     setting = Setting("quasistatic", seed=3, rules=Rules(horizon=20.0))
     plans = [
         Plan(parse_domain("wide,objects=random_cylinder", None, task), 4, {"rps": PAPER}, setting)
@@ -98,14 +104,14 @@ def test_plans_that_run_together_have_the_results_of_each_alone() -> None:
         xr.testing.assert_allclose(together, alone, rtol=1e-3, atol=1e-3)
 
 
-def test_an_interval_is_shown_unless_it_is_a_point() -> None:
+def test_an_interval_is_shown_unless_it_is_a_point():
     width, success = drawn(0.92, 1.3, 0.1)
     text = study.width_text(fit(width[:200], success[:200], 1.1, 2.5), 0.93)
     assert text.startswith("not within the widths [1.")
     assert study.width_text(fit(*drawn(1.0, 0.3, 0.02), 1.1, 2.5), 0.9) == "at most 1.10 m"
 
 
-def test_the_table_of_parity_counts_equal_outcomes() -> None:
+def test_the_table_of_parity_counts_equal_outcomes():
     reference = results_of(("rps_tuned",), success=np.array([[1, 1, 0, 0]]))
     fused = results_of(("rps_tuned",), success=np.array([[1, 0, 0, 0]]))
     outcomes = xr.DataTree.from_dict({"path reference": reference, "path fused": fused})
@@ -115,13 +121,13 @@ def test_the_table_of_parity_counts_equal_outcomes() -> None:
     assert [rate.split()[0] for rate in rates] == ["50.0", "25.0", "75.0"]
 
 
-def test_all_rows_of_tasks_can_be_run() -> None:
+def test_all_rows_of_tasks_can_be_run():
     parity.Parity().validate()
     for task in costs.TASKS.values():
         costs.domain_of(task)
 
 
-def test_costs_are_relative_to_reach() -> None:
+def test_costs_are_relative_to_reach():
     cost = np.array([[2e-5, 1e-5], [2e-5, 3e-5]])
     results = xr.Dataset({"cost": (("task", "round"), cost)})
     (table,) = costs.Costs(tasks=("reach", "path")).report_tables(results)

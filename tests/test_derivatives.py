@@ -9,7 +9,8 @@ from unittest import mock
 import jax
 import numpy as np
 import pytest
-from helpers import ROOT, refusals, row
+from helpers import ROOT, refusals, refusing, row
+from numpy.testing import assert_allclose
 
 import rps_jax
 from rps_jax.control.laws.rps import RPSParams
@@ -74,21 +75,19 @@ def test_gradients_are_central_differences(results, name):
     up, down = (gradients_of(*side).value.values[0] for side in sides)
     differences = (up - down) / (2 * h)
     assert np.abs(differences).max() > 1e-4
-    np.testing.assert_allclose(slope(results, name), differences, rtol=1e-5, atol=1e-8)
+    assert_allclose(slope(results, name), differences, rtol=1e-5, atol=1e-8)
 
 
 def test_vectors_agree_with_the_quantities_that_turn_and_stretch_them(results):
     bearing = results.bearing.values
     along = np.cos(bearing) * slope(results, "target_x")
     along += np.sin(bearing) * slope(results, "target_y")
-    np.testing.assert_allclose(along, slope(results, "distance"), rtol=1e-6)
+    assert_allclose(along, slope(results, "distance"), rtol=1e-6)
     drawn = draws.draw(TOUCHING, 0, np.arange(4))
     x, y, _ = drawn.solid.p_object_com.T
     along = x * slope(results, "com_x") + y * slope(results, "com_y")
     # The quasi-static engine uses no inertia, which a moving load changes.
-    np.testing.assert_allclose(
-        along, drawn.values["com_offset"] * slope(results, "com_offset"), 1e-6
-    )
+    assert_allclose(along, drawn.values["com_offset"] * slope(results, "com_offset"), 1e-6)
 
 
 def test_the_mirrored_world_has_mirrored_gradients():
@@ -107,12 +106,10 @@ def test_the_mirrored_world_has_mirrored_gradients():
     plain = gradients_of(domain(1))
     with mock.patch.object(draws, "random_numbers", mirrored):
         mirror_image = gradients_of(domain(-1))
-    np.testing.assert_allclose(plain.value, mirror_image.value, rtol=1e-9)
+    assert_allclose(plain.value, mirror_image.value, rtol=1e-9)
     for name, sign in {"target_x": 1, "target_y": -1, "com_x": 1, "com_y": -1, "v_max": 1}.items():
         assert np.abs(slope(plain, name)).max() > 1e-5, name
-        np.testing.assert_allclose(
-            slope(plain, name), sign * slope(mirror_image, name), rtol=1e-6, atol=1e-9
-        )
+        assert_allclose(slope(plain, name), sign * slope(mirror_image, name), rtol=1e-6, atol=1e-9)
 
 
 def test_the_results_are_labelled(results):
@@ -121,9 +118,17 @@ def test_the_results_are_labelled(results):
     assert results["mean"].dims == results.error.dims == ("law", "quantity")
     units = dict(zip(results.quantity.values, results.unit.values, strict=True))
     assert units == {
-        "v_max": "m/s", "friction_robot": "1", "com_offset": "1", "noise": "1", "distance": "m",
-        "target_x": "m", "target_y": "m", "com_x": "m", "com_y": "m", "mass": "kg",
-    }  # fmt: skip
+        "v_max": "m/s",
+        "friction_robot": "1",
+        "com_offset": "1",
+        "noise": "1",
+        "distance": "m",
+        "target_x": "m",
+        "target_y": "m",
+        "com_x": "m",
+        "com_y": "m",
+        "mass": "kg",
+    }
     assert (results.kind == "parameter").values.tolist() == [True] + [False] * 9
     assert results.map_error.values.max() < 3e-4
     attrs = {"engine": "quasistatic", "horizon": 1.0, "seed": 0}
@@ -132,10 +137,10 @@ def test_the_results_are_labelled(results):
     assert {"mass", "friction_robot", "object"} <= set(results.coords)
     assert (results.finite == 1).all()
     norm = np.linalg.norm(results.gradient.values, axis=-1)
-    np.testing.assert_allclose(results.norm, norm)
-    np.testing.assert_allclose(results["mean"], results.gradient.mean("world"), rtol=1e-6)
+    assert_allclose(results.norm, norm)
+    assert_allclose(results["mean"], results.gradient.mean("world"), rtol=1e-6)
     spread = results.gradient.std("world", ddof=1) / 2
-    np.testing.assert_allclose(results.error, spread, rtol=1e-5)
+    assert_allclose(results.error, spread, rtol=1e-5)
 
 
 def test_a_mass_without_influence_is_told(results):
@@ -143,10 +148,15 @@ def test_a_mass_without_influence_is_told(results):
     assert re.search("mass has no influence.*robot='kairos'.*domain='real'", results.notes)
     notes = lambda name, domain, value=np.zeros((1, 2)): " ".join(  # noqa: E731
         derivatives._notes(
-            parse_domain(domain), "fused", derivatives.coordinates_of(name, RPSParams(), TOUCHING),
-            np.array([True]), value, np.ones((1, 2, 1)), np.zeros((2, 1)),
+            parse_domain(domain),
+            "fused",
+            derivatives.coordinates_of(name, RPSParams(), TOUCHING),
+            np.array([True]),
+            value,
+            np.ones((1, 2, 1)),
+            np.zeros((2, 1)),
         )
-    )  # fmt: skip
+    )
     assert "mass has no influence" in notes("mass", "wide")
     assert not notes("mass", "real")
     assert not notes("friction_ground", "wide")
@@ -202,14 +212,14 @@ def test_the_examples_of_the_page_agree():
     exec(route, space)
     expected = space["results"].gradient.sel(quantity="K_h").values[0]
     assert np.isfinite(expected).all()
-    np.testing.assert_allclose(space["slopes"], expected, rtol=0.05, atol=1e-4)
+    assert_allclose(space["slopes"], expected, rtol=0.05, atol=1e-4)
 
 
 def test_worlds_are_those_of_a_sweep_and_one_object_each():
     batch = rps_jax.draw_worlds("wide,objects=random_cylinder", 3, setting=Setting(seed=5))
     drawn = draws.draw(parse_domain("wide,objects=random_cylinder"), 5, np.arange(3))
-    np.testing.assert_allclose(batch.worlds.p_world_target, drawn.p_world_target, rtol=1e-6)
-    with pytest.raises(rps_jax.InputError, match="worlds of one program have one object"):
+    assert_allclose(batch.worlds.p_world_target, drawn.p_world_target, rtol=1e-6)
+    with refusing("worlds of one program have one object"):
         rps_jax.draw_worlds("wide", 3)
 
 
@@ -275,7 +285,7 @@ test_invalid_rollouts_are_refused = refusals(
 def test_what_has_no_gradient_is_refused(changes, message):
     options = {"score": final_distance, "laws": "rps_tuned", "domain": TOUCHING, "worlds": 2}
     options |= {"wrt": "K_h", "horizon": 0.1, "setting": QUASISTATIC}
-    with pytest.raises(rps_jax.InputError, match=message):
+    with refusing(message):
         rps_jax.value_and_grad(**options | changes)
 
 
@@ -292,7 +302,7 @@ def test_what_has_no_gradient_is_refused(changes, message):
 )
 def test_a_score_must_return_a_number(score, message):
     snapshots = SimpleNamespace(done=np.zeros(5, bool))
-    with pytest.raises(rps_jax.InputError, match=message):
+    with refusing(message):
         derivatives._score(score, QUASISTATIC, snapshots, RPSParams())
 
 
@@ -307,16 +317,16 @@ def test_a_score_must_return_a_number(score, message):
 )
 def test_functions_that_return_numbers_of_the_host_cannot_be_transformed(transform, compiled):
     words = "call it outside of jit, vmap and grad, or transform a function that calls rps_jax.roll"
-    with pytest.raises(rps_jax.InputError, match=f"value_and_grad returns .*{words}"):
+    with refusing(f"value_and_grad returns .*{words}"):
         transform(lambda law: rps_jax.value_and_grad(final_distance, law).value.values)
-    with pytest.raises(rps_jax.InputError, match=f"evaluate returns .*{words}"):
+    with refusing(f"evaluate returns .*{words}"):
         transform(lambda law: rps_jax.evaluate(law).score.values)
     assert not compiled
 
 
 def test_an_engine_without_a_mode_is_refused_before_anything_compiles(monkeypatch, compiled):
     monkeypatch.setattr("rps_jax.engines.fused.Fused.modes", ("forward",))
-    with pytest.raises(rps_jax.InputError, match=r"engine = fused .* it has no reverse-mode"):
+    with refusing(r"engine = fused .* it has no reverse-mode"):
         rps_jax.value_and_grad(setting=Setting("fused"))
     assert not compiled
 

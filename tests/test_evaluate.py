@@ -9,21 +9,25 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from helpers import refusing, setting_of
+from numpy.testing import assert_allclose, assert_array_equal
 
 from rps_jax.app.cli.names import known, question_type
 from rps_jax.control import registry
 from rps_jax.control.base import Law
 from rps_jax.control.laws.rps import RPSParams
 from rps_jax.control.observation import Details, Twist
-from rps_jax.errors import InputError
 from rps_jax.runs import evaluate as room
 from rps_jax.runs.evaluate import Candidates, evaluate
+from rps_jax.runs.plan import Plan
 from rps_jax.runs.run import Run
+from rps_jax.runs.sweep import describe_plan
+from rps_jax.trials import pushes
+from rps_jax.trials.case import Case
 from rps_jax.trials.env import PushEnv
 from rps_jax.trials.progress import no_progress
 from rps_jax.trials.score import Objective
 from rps_jax.trials.setting import Setting, seed_of
-from rps_jax.trials.trial import Rules
 from rps_jax.tuning.fit import Bank, Fit
 from rps_jax.tuning.learn import Learn
 from rps_jax.tuning.space import Space
@@ -31,7 +35,7 @@ from rps_jax.world import draws
 from rps_jax.world.domain import DOMAINS, Range
 
 CYLINDERS = replace(DOMAINS["wide"], objects=("random_cylinder",))
-BRIEF = Setting("quasistatic", rules=Rules(horizon=8.0))
+BRIEF = setting_of(8.0)
 SHORT: Any = {"setting": BRIEF, "slots": 8}
 
 
@@ -109,7 +113,7 @@ def test_a_sweep_and_the_test_split_have_the_worlds_of_earlier_versions():
     assert seed_of(7, "test") == 23
     assert Setting(seed=5).world_seed == 5
     drawn = draws.draw(CYLINDERS, 0, np.arange(2)).values["mass"]
-    np.testing.assert_allclose(drawn, [3.10558863261133, 29.18796442491775], rtol=1e-12)
+    assert_allclose(drawn, [3.10558863261133, 29.18796442491775], rtol=1e-12)
 
 
 def test_a_split_of_a_setting_is_that_of_its_worlds_and_of_its_record():
@@ -118,9 +122,15 @@ def test_a_split_of_a_setting_is_that_of_its_worlds_and_of_its_record():
     assert "split" not in Setting(seed=3).to_json()
     env = PushEnv("random_cylinder", setting=tuning, worlds=2)
     drawn = draws.draw(CYLINDERS, seed_of(3, "tune"), np.arange(2))
-    np.testing.assert_allclose(env.table.p_world_target, drawn.p_world_target, rtol=1e-6)
+    assert_allclose(env.table.p_world_target, drawn.p_world_target, rtol=1e-6)
+    case, sweeps = Case(task="path"), replace(tuning, split=None)
+    pushed = [pushes.build([case], setting).worlds for setting in (sweeps, tuning)]
+    assert (pushed[0].key != pushed[1].key).any()
+    assert (pushed[0].p_world_target != pushed[1].p_world_target).any()
+    plans = [Plan(CYLINDERS, 2, {"rps": RPSParams()}, setting) for setting in (sweeps, tuning)]
+    assert [", split tune," in describe_plan(plan) for plan in plans] == [False, True]
     assert tuning.attributes == {"seed": 3, "engine": "quasistatic", "split": "tune"}
-    with pytest.raises(InputError, match="choose from tune, validate, test"):
+    with refusing("choose from tune, validate, test"):
         Setting(split="train")
 
 
@@ -140,7 +150,7 @@ def test_results_are_labelled_as_those_of_a_sweep():
     away = np.where(np.isfinite(results.min_distance), results.min_distance, results.distance)
     missed = 0.5 * np.minimum(away, 1.0)
     assert (results.success == 0).all()
-    np.testing.assert_allclose(results.score, expected + missed, rtol=1e-5)
+    assert_allclose(results.score, expected + missed, rtol=1e-5)
 
 
 def test_another_call_of_the_same_shape_compiles_nothing(compiled):
@@ -155,7 +165,7 @@ def test_another_call_of_the_same_shape_compiles_nothing(compiled):
 def test_candidates_differ_only_in_their_parameters():
     results = evaluate(paper(3, v_approach=np.array([0.01, 0.05, 0.01])), CYLINDERS, 4, **SHORT)
     first, faster, again = results.transpose("candidate", ...).path_length.values
-    np.testing.assert_array_equal(first, again)
+    assert_array_equal(first, again)
     assert (first != faster).any()
 
 
@@ -163,10 +173,10 @@ def test_candidates_are_given_as_a_list_or_as_one_law():
     alone, several = room.candidates("rps"), room.candidates(["rps", "rps,K_h=0.3"])
     for single in (alone, room.candidates(RPSParams.paper())):
         assert {np.shape(leaf) for leaf in single} == {(1,)}
-    np.testing.assert_allclose(several.K_h, [*alone.K_h, 0.3])
+    assert_allclose(several.K_h, [*alone.K_h, 0.3])
     params = paper(3)
     assert room.candidates(params) is params
-    with pytest.raises(InputError, match="2 classes"):
+    with refusing("2 classes"):
         room.candidates(["rps", "pursuit"])
 
 
@@ -188,7 +198,7 @@ def test_candidates_are_given_as_a_list_or_as_one_law():
 )
 def test_bad_input_is_refused_before_anything_compiles(bad, why, compiled):
     count = len(compiled)
-    with pytest.raises(InputError, match=why) as caught:
+    with refusing(why) as caught:
         evaluate(**{"law": paper(3), "worlds": 4} | SHORT | bad)
     assert "\n" not in str(caught.value)
     assert len(compiled) == count
@@ -220,7 +230,7 @@ def test_any_registered_law_with_nested_parameters(nested):
     prompt = replace(CYLINDERS, velocity_error=Range(0, 0), command_delay=Range(0, 0))
     results = evaluate(params, prompt, 2, **SHORT)
     expected = np.array([[0.08], [0.16], [0.0]])  # [m] in 8 s
-    np.testing.assert_allclose(results.path_length, expected + np.zeros((3, 2)), rtol=0.01)
+    assert_allclose(results.path_length, expected + np.zeros((3, 2)), rtol=0.01)
 
 
 def test_candidates_have_equal_worlds_in_any_batch():
@@ -230,13 +240,13 @@ def test_candidates_have_equal_worlds_in_any_batch():
     asks = [Candidates(x, domains, 3, np.arange(3)) for x in (faster, params)]
     (first, second), _ = room.score_candidates(asks, BRIEF, Objective(), slots=8)
     assert first.score.shape == (2, 6)
-    np.testing.assert_array_equal(first.score[0], second.score[0])
-    np.testing.assert_array_equal(second.score[0], second.score[1])
+    assert_array_equal(first.score[0], second.score[0])
+    assert_array_equal(second.score[0], second.score[1])
     assert (first.score[1] != first.score[0]).any()
     (alone,), _ = room.score_candidates(
         [Candidates(paper(3), domains, 3, np.arange(1, 2))], BRIEF, Objective(), slots=8
     )
-    np.testing.assert_allclose(alone.score[0], second.score[0, [1, 4]], rtol=1e-4)
+    assert_allclose(alone.score[0], second.score[0, [1, 4]], rtol=1e-4)
 
 
 def test_scores_are_those_of_the_first_version():
@@ -245,7 +255,7 @@ def test_scores_are_those_of_the_first_version():
     away = np.array([[0, 0, 0], [0.5, -0.5, 0.3], [-0.7, 0.4, -0.2]], np.float32)
     params = space.params(away + np.asarray(space.vector(space.base)))
     near = replace(CYLINDERS, distance=Range(0.7, 0.9), gap=Range(0, 0))
-    setting = Setting(rules=Rules(horizon=20.0), engine="fused")
+    setting = setting_of(20.0, "fused")
     ask = Candidates(params, [near], 1, np.arange(6))
     (answer,), _ = room.score_candidates([ask], setting, Objective())
     expected = [
@@ -253,4 +263,4 @@ def test_scores_are_those_of_the_first_version():
         [1.5611727238, 1.6000000238, 1.3189700842, 1.5676416159, 1.3648886681, 1.6000000238],
         [1.5615780354, 1.6000000238, 1.3576272726, 1.5680555105, 1.3642046452, 1.6000000238],
     ]
-    np.testing.assert_allclose(answer.score, expected, rtol=2e-3)
+    assert_allclose(answer.score, expected, rtol=2e-3)

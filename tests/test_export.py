@@ -8,14 +8,21 @@ import subprocess
 import jax
 import numpy as np
 import pytest
-from helpers import ROOT, output_of, refusal, rps
+from helpers import (
+    ROOT,
+    output_of,
+    refusal,
+    rps,
+    setting_of,
+    slow,
+)
+from numpy.random import default_rng
+from numpy.testing import assert_allclose, assert_array_equal
 
 from rps_jax.app.export import c, folder, js, onnx_model, program
 from rps_jax.robot import robot as robots
 from rps_jax.robot.skin import SKINS
 from rps_jax.trials.case import Case
-from rps_jax.trials.setting import Setting
-from rps_jax.trials.trial import Rules
 from sweeps.export.loop import recorded
 from sweeps.export.native import (
     COMPILERS,
@@ -31,8 +38,17 @@ EXAMPLE = ROOT / "notebooks/examples/custom_law.py"
 CUSTOM = f"{EXAMPLE}:PParams"
 STRICT = ["-std=c99", "-Wall", "-Wextra", "-Werror", "-pedantic"]
 LAWS = [
-    *("rps", "nps", "rps_plus", "aps", "pursuit", "dipole", "force_push", "force_push_published"),
-    *("learned_small", "learned", "unicycle"),
+    "rps",
+    "nps",
+    "rps_plus",
+    "aps",
+    "pursuit",
+    "dipole",
+    "force_push",
+    "force_push_published",
+    "learned_small",
+    "learned",
+    "unicycle",
 ]
 
 
@@ -182,7 +198,7 @@ def test_a_law_of_a_users_file_is_exported(tmp_path, registries):
 def test_the_skin_in_c_agrees_with_jax(tmp_path):
     native = Native(program.program("rps", "ridgeback"), tmp_path, "float")
     skin = SKINS["capacitive"]._replace(shell=robots.parse_robot("ridgeback").shell)
-    count, rng = skin.shell.count, np.random.default_rng(0)
+    count, rng = skin.shell.count, default_rng(0)
     state, worlds = skin.init(jax.random.PRNGKey(0)), 400
     alive = rng.random((worlds, count)) > 0.1
     read = jax.jit(jax.vmap(lambda s, a, x, p: skin.read(state._replace(signal=s, alive=a), x, p)))
@@ -197,14 +213,14 @@ def test_the_skin_in_c_agrees_with_jax(tmp_path):
         contact, code = native.touch(mine, taxels, period)
         assert not code.any()
         signal = np.asarray(next_state.signal)
-        np.testing.assert_allclose(mine["signal"], signal, rtol=1e-6, atol=1e-6)
+        assert_allclose(mine["signal"], signal, rtol=1e-6, atol=1e-6)
         near = (np.abs(signal - 0.25) < 1e-5).any(-1)  # of the threshold
         assert near.mean() < 0.05
         ours, theirs = contact[~near], jax.tree.map(lambda leaf, near=near: leaf[~near], reading)
-        np.testing.assert_array_equal(ours["contact_type"], theirs.contact_type)
-        np.testing.assert_array_equal(ours["line"], theirs.contact_type == 2)
-        np.testing.assert_allclose(ours["p_robot_contact"], theirs.p_robot_contact, atol=1e-6)
-        np.testing.assert_allclose(contact["signal"], np.where(alive, signal, 0), atol=1e-6)
+        assert_array_equal(ours["contact_type"], theirs.contact_type)
+        assert_array_equal(ours["line"], theirs.contact_type == 2)
+        assert_allclose(ours["p_robot_contact"], theirs.p_robot_contact, atol=1e-6)
+        assert_allclose(contact["signal"], np.where(alive, signal, 0), atol=1e-6)
         kinds |= set(contact["contact_type"].tolist())
         mine["signal"] = signal
     assert kinds == {0, 1, 2}
@@ -212,7 +228,7 @@ def test_the_skin_in_c_agrees_with_jax(tmp_path):
 
 @pytest.mark.parametrize(
     ("name", "tolerance"),
-    [("rps_plus", 2e-5), pytest.param("learned", 4e-4, marks=pytest.mark.slow)],
+    [("rps_plus", 2e-5), slow("learned", 4e-4)],
 )
 def test_a_whole_trial_step_by_step(name, tolerance, tmp_path):
     """The C law keeps its memory; observations are those of the trial in JAX.
@@ -220,7 +236,7 @@ def test_a_whole_trial_step_by_step(name, tolerance, tmp_path):
     The memory of a network amplifies the rounding of floats.
     """
     case = Case("box", "S1", (-1.0, 0.5), law=name)
-    setting = Setting("quasistatic", rules=Rules(horizon=20.0))
+    setting = setting_of(20.0)
     trials = recorded([case], setting)
     assert len(trials[0][0]) > 900
     (errors,) = trial_errors(name, "double", trials, tmp_path).free
@@ -289,7 +305,7 @@ console.log(JSON.stringify({ twists, odd, short, felt: felt.contact }));
 def test_javascript_agrees_with_c(name, tmp_path, registries):
     exported = program.program(name)
     native = Native(exported, tmp_path, "double")
-    leaves = observations(exported, np.random.default_rng(0), 300, np.float64)
+    leaves = observations(exported, default_rng(0), 300, np.float64)
     obs = native.filled("observation", leaves, 300)
     memory = native.begin(1)
     expected = np.concatenate([native.step(memory, obs[i : i + 1])[0] for i in range(300)])
@@ -301,12 +317,12 @@ def test_javascript_agrees_with_c(name, tmp_path, registries):
     result = json.loads(output_of("node", "run.mjs", "seen.json", cwd=tmp_path))
     twists = np.array(result["twists"])
     assert not twists[:, 3].any()
-    np.testing.assert_allclose(twists[:, :3], expected, rtol=1e-9, atol=1e-12)
+    assert_allclose(twists[:, :3], expected, rtol=1e-9, atol=1e-12)
     assert result["odd"]["code"] == 1
     assert result["odd"]["twist"] == {"v_x": 0, "v_y": 0, "omega": 0}
     assert result["short"] == [2, 1]  # too few taxels; null, as JSON has a number that is not one
     assert result["felt"]["in_contact"] is True
-    np.testing.assert_allclose(result["felt"]["p_robot_contact"], [0.3625, 0], atol=1e-9)
+    assert_allclose(result["felt"]["p_robot_contact"], [0.3625, 0], atol=1e-9)
 
 
 @pytest.mark.parametrize("name", ["rps_plus", "learned_small", "aps", "force_push_published"])
@@ -317,7 +333,7 @@ def test_onnx_agrees_with_c(name, tmp_path):
     session = runtime.InferenceSession(model, providers=["CPUExecutionProvider"])
     about = {entry.key: entry.value for entry in onnx.load_from_string(model).metadata_props}
     assert json.loads(about["units"])["yaw"] == "[rad] heading of the robot in the world"
-    native, rng = Native(exported, tmp_path, "float"), np.random.default_rng(0)
+    native, rng = Native(exported, tmp_path, "float"), default_rng(0)
     mine, start = native.begin(count), json.loads(about["memory_at_the_start"])
     types = {entry.name: entry.type for entry in session.get_inputs()}
     dtypes = {"tensor(float)": np.float32, "tensor(bool)": bool, "tensor(int32)": np.int32}

@@ -4,11 +4,11 @@ import re
 
 import numpy as np
 import pytest
-from helpers import same
+from helpers import refusing, same, slow
+from numpy.testing import assert_allclose, assert_array_equal
 from staging import FINE, simulate, staged, step_in_c
 
 from rps_jax import engines
-from rps_jax.errors import InputError
 from rps_jax.geometry import footprint, solid
 from rps_jax.geometry.footprint import Footprint
 from rps_jax.geometry.solid import SIDES
@@ -66,13 +66,13 @@ def driven(engine, names, steps):
 Y = 4  # of the object, along the base's front, on which it comes to lie
 
 
-@pytest.mark.parametrize("engine", ["fused", pytest.param("mjx", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("engine", ["fused", slow("mjx")])
 def test_feet_change_the_final_pose_and_engines_agree_with_c_mujoco(engine):
     feet, corners = (pushed_in_c(name) for name in ("on_feet", "on_corners"))
     assert feet[Y] - corners[Y] > 0.01
     qpos = driven(engine, ["on_feet", "on_both"], 300)
-    np.testing.assert_allclose(qpos[0], feet, atol=2e-3)
-    np.testing.assert_allclose(qpos[1, :6], corners[:6], atol=3e-3)
+    assert_allclose(qpos[0], feet, atol=2e-3)
+    assert_allclose(qpos[1, :6], corners[:6], atol=3e-3)
 
 
 def test_quasistatic_is_nearer_to_c_mujoco_with_equal_feet():
@@ -84,8 +84,8 @@ def test_quasistatic_is_nearer_to_c_mujoco_with_equal_feet():
 
 def test_a_scene_returns_its_feet():
     row = scene.solid_of(scene.load("on_feet", FINE, FRICTION))
-    np.testing.assert_array_equal(row.feet[0, :3], np.column_stack([FEET, np.ones(3)]))
-    np.testing.assert_array_equal(row.feet[0, 3:, 2], 0)
+    assert_array_equal(row.feet[0, :3], np.column_stack([FEET, np.ones(3)]))
+    assert_array_equal(row.feet[0, 3:, 2], 0)
     assert row.feet.shape == (1, SIDES, 3)
     assert scene.solid_of(scene.load("on_corners", FINE, FRICTION)).feet is None
 
@@ -109,9 +109,9 @@ def test_the_arm_of_friction_is_that_of_the_feet():
 def test_the_rigid_solver_supports_feet():
     row = scene.solid_of(scene.load("on_feet", FINE, FRICTION))
     feet = rigid.supports(row, np.zeros(1), np.zeros((1, 2)))
-    np.testing.assert_allclose(feet[0, :3], FEET, atol=1e-9)
+    assert_allclose(feet[0, :3], FEET, atol=1e-9)
     load = rigid.supported_load(feet, np.zeros((1, 2)), np.zeros((1, 1)), row.feet[..., 2])
-    np.testing.assert_allclose(load[0], [*LOADS, *np.zeros(SIDES - 3)], atol=1e-9)
+    assert_allclose(load[0], [*LOADS, *np.zeros(SIDES - 3)], atol=1e-9)
 
 
 @pytest.mark.parametrize(
@@ -124,7 +124,7 @@ def test_the_rigid_solver_supports_feet():
     ],
 )
 def test_feet_without_sense_are_refused(registered_boxes, feet, message):
-    with pytest.raises(InputError, match=message):
+    with refusing(message):
         objects.register_object("wrong", registered_boxes, feet=feet)
     assert "wrong" not in objects.REGISTERED
 
@@ -134,7 +134,7 @@ def test_engines_that_ignore_weights_of_feet_refuse_them(registered_boxes, engin
     weighted = np.column_stack([FEET, [1.0, 1.0, 2.0]])
     objects.register_object("weighted", registered_boxes, feet=weighted)
     objects.register_object("even", registered_boxes, feet=weighted * [1, 1, 0] + [0, 0, 2])
-    with pytest.raises(InputError, match=r"it ignores the weights of feet.*quasistatic"):
+    with refusing(r"it ignores the weights of feet.*quasistatic"):
         pushes.build([Case("weighted")], Setting(engine))
     pushes.build([Case("weighted")], Setting("quasistatic"))
     pushes.build([Case("even")], Setting(engine))
@@ -166,7 +166,7 @@ def test_drawn_feet_change_nothing_else_and_bear_the_object(name):
     plain, drawn, _ = drawn_on_feet(name, 64)
     assert plain.solid.feet is None
     same(*(x._replace(solid=None, values=None) for x in (plain, drawn)))
-    np.testing.assert_array_equal(plain.solid.mass, drawn.solid.mass)
+    assert_array_equal(plain.solid.mass, drawn.solid.mass)
     assert set(drawn.values) - set(plain.values) == {"feet"}
     feet, com = drawn.solid.feet, drawn.solid.p_object_com[:, :2]
     assert set(feet[..., 2].sum(axis=1)) == {3.0, 4.0}
@@ -176,7 +176,7 @@ def test_drawn_feet_change_nothing_else_and_bear_the_object(name):
         # Stretched by the share, a foot lies on the outline.
         edge = com[i] + reach[feet[i, :, 2] > 0] / share
         outline = Footprint(drawn.solid.vertices[i], drawn.solid.radius[i])
-        np.testing.assert_allclose(footprint.signed_distance(outline, edge), 0, atol=1e-6)
+        assert_allclose(footprint.signed_distance(outline, edge), 0, atol=1e-6)
         assert (reach @ [np.cos(bearing), np.sin(bearing)]).max(axis=0).min() > 0
 
 
@@ -185,7 +185,7 @@ def test_drawn_feet_change_nothing_else_and_bear_the_object(name):
     [
         ("fused", "random_box"),
         ("fused", "random_cylinder"),
-        pytest.param("mjx", "random_cylinder", marks=pytest.mark.slow),
+        slow("mjx", "random_cylinder"),
     ],
 )
 def test_objects_on_drawn_feet_end_where_those_of_c_mujoco_do(engine, name):
@@ -211,7 +211,7 @@ def test_quasistatic_slides_on_drawn_feet():
 
 
 def test_feet_are_drawn_only_for_random_objects():
-    with pytest.raises(InputError, match="only random objects have drawn feet"):
+    with refusing("only random objects have drawn feet"):
         domains.parse_domain("wide,objects=box,feet=0.5:0.9")
     ranges, plain = (domains.parse_domain(f"wide{feet}") for feet in (",feet=0.5:0.9", ""))
     names = {"feet", "feet_number", "feet_turn"}
@@ -219,4 +219,4 @@ def test_feet_are_drawn_only_for_random_objects():
     u = points.points_of(ranges, np.arange(6), 1)
     again = points.draw(ranges, 1, points.check_points(ranges, u), [0, 3])
     drawn = draws.draw(ranges, 1, [0, 3])
-    np.testing.assert_array_equal(again.solid.feet, drawn.solid.feet)
+    assert_array_equal(again.solid.feet, drawn.solid.feet)

@@ -8,6 +8,7 @@ import xarray as xr
 from helpers import results_of
 from matplotlib.colors import to_rgb
 from matplotlib.text import Text
+from numpy.random import default_rng
 
 from rps_jax import RPSParams
 from rps_jax.analysis import report
@@ -23,7 +24,7 @@ from rps_jax.tuning import learn
 from rps_jax.tuning.fit import Fitted
 from rps_jax.world.domain import LABELS, Domain, unit_of
 
-RANDOM = np.random.default_rng(0)
+RANDOM = default_rng(0)
 AXES = ("size", "com_offset", "friction_robot")
 
 

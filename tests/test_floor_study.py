@@ -7,7 +7,7 @@ from rps_jax.world.physics import Physics
 from sweeps.floors import study
 
 
-def test_floors_share_worlds_but_for_slope_and_factor() -> None:
+def test_floors_share_worlds_but_for_slope_and_factor():
     question = study.Floors(laws=("rps",), worlds=2)
     plans = [question._plan(f"slope={x}") for x in (0.0, 0.1)]
     level, steep = (plan.domain for plan in plans)
@@ -16,7 +16,7 @@ def test_floors_share_worlds_but_for_slope_and_factor() -> None:
     assert question.num_trials() == 2 * (len(study.SLOPES) + len(study.FACTORS))
 
 
-def test_costs_are_those_of_equal_worlds() -> None:
+def test_costs_are_those_of_equal_worlds():
     success = np.array([[[1, 1, 0, 1]], [[1, 0, 1, 1]]])  # (floor, law, world)
     time = np.array([[[10.0, 20, 300, 40]], [[20.0, 300, 60, 80]]])
     results = results_of(("a",), success=success[0], time=time[0]).expand_dims(floor=["0°", "6°"])
@@ -31,7 +31,7 @@ def test_costs_are_those_of_equal_worlds() -> None:
     assert steep[4:] == ["60 s", "+1 -1, p = 1", "2.00"]
 
 
-def test_the_force_on_a_step_is_that_of_the_soft_contact() -> None:
+def test_the_force_on_a_step_is_that_of_the_soft_contact():
     """Rigid bodies tip at 115 N; here the softness of the ground and the edge decide."""
     soft, hard = (
         study.push_against_step(0.002, 0.01, Physics(**ground)) for ground in study.GROUNDS.values()

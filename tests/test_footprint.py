@@ -9,6 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from helpers import SEEDS, extent, property_test, refusals
+from numpy.random import default_rng
+from numpy.testing import assert_allclose, assert_array_equal
 from scipy.spatial import ConvexHull, cKDTree
 
 from rps_jax.geometry import footprint as fp
@@ -79,31 +81,48 @@ BOX, BALL = fp.rectangle(0.3, 0.2), fp.circle(0.25)
 SQUARE = np.float32([[1, -1], [1, 1], [-1, 1], [-1, -1]])
 DISTANCES = {
     # The centre: to the nearer side; on a side, on a corner, and off a corner: 3-4-5.
-    "box": (BOX, {(0, 0): -0.2, (0.25, 0): -0.05, (0.3, 0.1): 0, (0.3, 0.2): 0, (0.5, 0.1): 0.2,
-                  (0, -0.9): 0.7, (0.6, 0.6): 0.5, (-0.6, -0.6): 0.5}),
+    "box": (
+        BOX,
+        {
+            (0, 0): -0.2,
+            (0.25, 0): -0.05,
+            (0.3, 0.1): 0,
+            (0.3, 0.2): 0,
+            (0.5, 0.1): 0.2,
+            (0, -0.9): 0.7,
+            (0.6, 0.6): 0.5,
+            (-0.6, -0.6): 0.5,
+        },
+    ),
     "circle": (BALL, {(0, 0): -0.25, (0.1, 0): -0.15, (0, -0.25): 0, (0.3, 0.4): 0.25}),
-    "box with a radius": (BOX._replace(radius=jnp.float32(0.1)),
-                          {(0, 0): -0.3, (0.5, 0): 0.1, (0.6, 0.6): 0.4}),
-    "stadium": (Footprint(jnp.array([[-0.3, 0.0], [0.3, 0.0]]), jnp.float32(0.1)),
-                {(0, 0): -0.1, (0.2, 0.3): 0.2, (0.6, 0.4): 0.4}),
+    "box with a radius": (
+        BOX._replace(radius=jnp.float32(0.1)),
+        {(0, 0): -0.3, (0.5, 0): 0.1, (0.6, 0.6): 0.4},
+    ),
+    "stadium": (
+        Footprint(jnp.array([[-0.3, 0.0], [0.3, 0.0]]), jnp.float32(0.1)),
+        {(0, 0): -0.1, (0.2, 0.3): 0.2, (0.6, 0.4): 0.4},
+    ),
     # A prism and a circle are filled up to one number of corners by repeated ones.
-    "square": (Footprint(jnp.array(0.2 * SQUARE[[0, 1, 2, 3, 3, 3, 3, 3]]), jnp.float32(0)),
-               {(0, 0): -0.2, (0.19, 0): -0.01, (0.3, 0.1): 0.1, (-0.25, -0.25): 0.05 * 2**0.5}),
+    "square": (
+        Footprint(jnp.array(0.2 * SQUARE[[0, 1, 2, 3, 3, 3, 3, 3]]), jnp.float32(0)),
+        {(0, 0): -0.2, (0.19, 0): -0.01, (0.3, 0.1): 0.1, (-0.25, -0.25): 0.05 * 2**0.5},
+    ),
     "point": (Footprint(jnp.zeros((4, 2)), jnp.float32(0.1)), {(0, 0): -0.1, (0.3, 0.4): 0.4}),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("shape", DISTANCES)
 def test_the_distance_by_hand(shape):
     outline, expected = DISTANCES[shape]
     distance = fp.signed_distance(outline, jnp.array(list(expected), float))
-    np.testing.assert_allclose(distance, list(expected.values()), atol=1e-6)
+    assert_allclose(distance, list(expected.values()), atol=1e-6)
 
 
 def test_place_turns_and_then_moves():
     placed = fp.place(BOX, jnp.array([1.0, 2.0]), jnp.float32(math.pi / 2))
     expected = [[0.8, 2.3], [0.8, 1.7], [1.2, 1.7], [1.2, 2.3]]
-    np.testing.assert_allclose(placed.vertices, expected, atol=1e-6)
+    assert_allclose(placed.vertices, expected, atol=1e-6)
     assert fp.place(BALL, jnp.ones(2), 1.0).radius == 0.25
 
 
@@ -112,16 +131,14 @@ def test_place_turns_and_then_moves():
 
 @every_kind
 def test_the_signed_distance_agrees_with_brute_force(kind):
-    rng = np.random.default_rng(0)
+    rng = default_rng(0)
     for _ in range(4):
         footprints = KINDS[kind](rng)
         points = rng.uniform(-1.2, 1.2, (BATCH, POINTS, 2)).astype(np.float32)
         got = distances(footprints, points)
         for b in range(BATCH):
             shape = jax.tree.map(lambda v, b=b: np.asarray(v)[b], footprints)
-            np.testing.assert_allclose(
-                got[b], brute_force_distance(*shape, points[b]), rtol=1e-5, atol=2e-4
-            )
+            assert_allclose(got[b], brute_force_distance(*shape, points[b]), rtol=1e-5, atol=2e-4)
         assert (got < -1e-3).any()
         assert (got > 1e-3).any()
 
@@ -129,20 +146,20 @@ def test_the_signed_distance_agrees_with_brute_force(kind):
 @every_kind
 @property_test(SEEDS)
 def test_the_signed_distance_does_not_depend_on_the_frame(kind, seed):
-    rng = np.random.default_rng(seed)
+    rng = default_rng(seed)
     footprints = KINDS[kind](rng)
     points = rng.uniform(-1, 1, (BATCH, POINTS, 2)).astype(np.float32)
     position = rng.uniform(-2, 2, (BATCH, 2)).astype(np.float32)
     yaw = rng.uniform(-4, 4, BATCH).astype(np.float32)
     moved = planar.rotate(yaw[:, None], points) + position[:, None]
     got = distances(place(footprints, position, yaw), moved)
-    np.testing.assert_allclose(got, distances(footprints, points), atol=3e-6)
+    assert_allclose(got, distances(footprints, points), atol=3e-6)
 
 
 @every_kind
 def test_the_derivative_of_the_distance_is_the_unit_normal(kind):
     """It agrees with finite differences, except on the ridges inside, where there is none."""
-    rng = np.random.default_rng(1)
+    rng = default_rng(1)
     h = 1e-6
     with jax.enable_x64(True):
         footprints = jax.tree.map(lambda v: jnp.asarray(v, jnp.float64), KINDS[kind](rng))
@@ -156,13 +173,13 @@ def test_the_derivative_of_the_distance_is_the_unit_normal(kind):
         )
     smooth = (np.abs(up - 2 * distance + down) < 1e-3 * h).all(axis=-1)
     assert smooth.mean() > 0.98
-    np.testing.assert_allclose(gradient[smooth], ((up - down) / (2 * h))[smooth], atol=1e-4)
-    np.testing.assert_allclose(np.linalg.norm(gradient, axis=-1), 1, rtol=1e-6)
+    assert_allclose(gradient[smooth], ((up - down) / (2 * h))[smooth], atol=1e-4)
+    assert_allclose(np.linalg.norm(gradient, axis=-1), 1, rtol=1e-6)
 
 
 @every_kind
 def test_derivatives_are_finite_on_vertices_edges_and_the_centre(kind):
-    footprints = KINDS[kind](np.random.default_rng(2))
+    footprints = KINDS[kind](default_rng(2))
     vertices = np.asarray(footprints.vertices)  # (B, N, 2)
     middles = 0.5 * (vertices + np.roll(vertices, -1, axis=1))
     centre = vertices.mean(axis=1, keepdims=True)
@@ -223,7 +240,7 @@ X_AXIS, NOTHING = (1.0, 0.0), (math.inf, -math.inf)
 )
 def test_the_crossing_by_hand(shape, origin, along, tolerance, expected):
     got = fp.crossing(shape, jnp.array(origin), jnp.array(along), tolerance)
-    np.testing.assert_allclose(got, expected, atol=1e-6)
+    assert_allclose(got, expected, atol=1e-6)
 
 
 def random_lines(rng, footprints: Footprint) -> tuple[np.ndarray, np.ndarray]:
@@ -246,7 +263,7 @@ def random_lines(rng, footprints: Footprint) -> tuple[np.ndarray, np.ndarray]:
 @property_test(SEEDS)
 def test_a_crossing_holds_exactly_the_points_within_the_tolerance(kind, seed):
     """Its ends are at the tolerance."""
-    rng = np.random.default_rng(seed)
+    rng = default_rng(seed)
     footprints = KINDS[kind](rng)
     origin, along = random_lines(rng, footprints)
     tolerance = rng.choice([0.0, 0.006, 0.1], BATCH).astype(np.float32)
@@ -262,7 +279,7 @@ def test_a_crossing_holds_exactly_the_points_within_the_tolerance(kind, seed):
     within = (low <= s) & (s <= high)
     assert margin[within].max(initial=-1) < 2e-6
     assert -margin[~within].min() < 2e-6
-    np.testing.assert_allclose(margin[hit[:, 0], -6:-4], 0, atol=2e-6)
+    assert_allclose(margin[hit[:, 0], -6:-4], 0, atol=2e-6)
 
 
 def test_derivatives_of_a_crossing_are_finite_if_the_line_only_grazes():
@@ -300,7 +317,7 @@ def test_the_extent_by_hand(shape, along, expected):
 
 @every_kind
 def test_the_extent_is_the_furthest_point_of_the_outline(kind):
-    rng = np.random.default_rng(4)
+    rng = default_rng(4)
     footprints = KINDS[kind](rng)
     angle = rng.uniform(-4, 4, BATCH)
     along = np.stack([np.cos(angle), np.sin(angle)], -1).astype(np.float32)
@@ -322,10 +339,10 @@ def test_outlines_are_counter_clockwise_and_of_the_given_size():
     area = 0.5 * (x * np.roll(y, -1) - np.roll(x, -1) * y).sum()
     assert area == pytest.approx(0.6 * 0.4)
     assert (BOX.radius, BALL.radius) == (0, 0.25)
-    np.testing.assert_array_equal(BALL.vertices, [[0, 0]])
+    assert_array_equal(BALL.vertices, [[0, 0]])
     triangle = [[0.0, 0.0], [1.0, 0.0], [0.25, 0.5]]
     built = fp.polygon(triangle)
-    np.testing.assert_array_equal(built.vertices, triangle)
+    assert_array_equal(built.vertices, triangle)
     assert built.radius == 0
 
 

@@ -4,7 +4,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import refusals
+from helpers import refusals, setting_of, slow
+from numpy.testing import assert_allclose, assert_array_equal
 from staging import push_object, staged
 
 from rps_jax.control import registry
@@ -17,7 +18,6 @@ from rps_jax.robot.robot import Robot
 from rps_jax.trials import pushes, trial
 from rps_jax.trials.pushes import Case
 from rps_jax.trials.setting import Setting
-from rps_jax.trials.trial import Rules
 from rps_jax.world import scene
 from rps_jax.world.physics import Physics
 from rps_jax.world.scene import FRICTION, JOINTS, Friction
@@ -28,18 +28,18 @@ WEIGHT = 20 * GRAVITY  # [N] of the box
 S1, SLIPPERY = FRICTION["S1"], Friction(1e-4, 0.35)
 
 
-@pytest.mark.parametrize("engine", ["fused", pytest.param("mjx", marks=pytest.mark.slow), "mujoco"])
+@pytest.mark.parametrize("engine", ["fused", slow("mjx"), "mujoco"])
 def test_a_box_pushed_straight_ahead_pushes_back_with_the_friction_of_its_weight(engine):
     """They agree within some per cent: MuJoCo's soft friction lifts a sliding object."""
     steady = push_object(engine).force[50:].mean(axis=0)
-    np.testing.assert_allclose(steady, (-0.3 * WEIGHT, 0.0, 0.0), atol=0.08 * 0.3 * WEIGHT)
+    assert_allclose(steady, (-0.3 * WEIGHT, 0.0, 0.0), atol=0.08 * 0.3 * WEIGHT)
 
 
 def test_a_base_of_limited_force_feels_the_object_and_not_its_own_drive():
     strong = Robot(force_max=400.0)
     for engine in ("fused", "mujoco"):
         force = push_object(engine, strong).force
-        np.testing.assert_allclose(force[50:].mean(axis=0)[0], -0.3 * WEIGHT, rtol=0.08)
+        assert_allclose(force[50:].mean(axis=0)[0], -0.3 * WEIGHT, rtol=0.08)
 
 
 @pytest.mark.parametrize("engine", ["fused", "mujoco"])
@@ -53,19 +53,19 @@ def test_on_ground_without_friction_a_push_is_the_momentum_that_the_box_gains(en
     gained = 20.0 * qvel[-1][JOINTS.object.start]
     assert gained > 0.9 * 20 * 0.05
     expected = gained + 1e-4 * WEIGHT * 2.0
-    np.testing.assert_allclose(impulse[:2], (-expected, 0.0), atol=0.003 * gained)
-    np.testing.assert_allclose(force[-20:], 0.0, atol=1e-3)
+    assert_allclose(impulse[:2], (-expected, 0.0), atol=0.003 * gained)
+    assert_allclose(force[-20:], 0.0, atol=1e-3)
 
 
 def test_the_fused_engine_tells_the_force_of_c_mujoco():
     """Over a push of a corner that turns, step by step and in the mean."""
     start = {"yaw": 0.3, "lateral": 0.05}
     fused, mujoco = (push_object(x, twist=TURNING, **start) for x in ("fused", "mujoco"))
-    np.testing.assert_allclose(fused.qpos[-1], mujoco.qpos[-1], atol=2e-3)
+    assert_allclose(fused.qpos[-1], mujoco.qpos[-1], atol=2e-3)
     force, expected = (recording.force[25:].mean(axis=0) for recording in (fused, mujoco))
     size = np.hypot(*expected[:2])
     assert size > 20
-    np.testing.assert_allclose(force, expected, atol=0.1 * size)
+    assert_allclose(force, expected, atol=0.1 * size)
 
 
 def test_force_is_computed_only_on_request():
@@ -97,10 +97,10 @@ def read_cell(cell, forces, period=0.02):
 def test_a_load_cell_follows_a_step_and_reads_zero_below_its_threshold():
     readings = read_cell(LoadCell(noise=0.0, threshold=0.0), [(-30.0, 10.0)] * 5)
     share = 1 - np.exp(-0.02 * np.arange(1, 21) / 0.05)[:, None]
-    np.testing.assert_allclose(readings, share[:5] * (-30.0, 10.0), rtol=1e-5)
+    assert_allclose(readings, share[:5] * (-30.0, 10.0), rtol=1e-5)
     readings = read_cell(LoadCell(noise=0.0, threshold=5.0), [(-3.0, 4.2)] * 20)
     size = np.hypot(*(share * (-3.0, 4.2)).T)
-    np.testing.assert_array_equal(np.hypot(*readings.T) > 0, size >= 5)
+    assert_array_equal(np.hypot(*readings.T) > 0, size >= 5)
     assert 0 < np.count_nonzero(readings[:, 0]) < 20
 
 
@@ -110,7 +110,7 @@ def test_the_noise_of_a_load_cell_is_filtered_too():
     period, count = 0.02, 400
     readings = read_cell(cell, [(0.0, 0.0)] * count, period)[20:]
     share = 1 - np.exp(-period / cell.time_constant)
-    np.testing.assert_allclose(readings.std(axis=0), np.sqrt(share / (2 - share)), rtol=0.2)
+    assert_allclose(readings.std(axis=0), np.sqrt(share / (2 - share)), rtol=0.2)
     assert abs(np.corrcoef(readings.T)[0, 1]) < 0.6  # five standard errors
 
 
@@ -125,7 +125,7 @@ def test_a_law_observes_the_force_of_its_push(engine):
     """Straight ahead, the law reads the force that slides a box of 10 kg."""
     gains = PublishedForcePushParams(k_theta=-1.0, k_y=0.0)
     case = Case("box", FRICTION["S1"], (1.6, 0.0), gains, gap=0.0, mass=10.0)
-    setting = Setting(engine=engine, rules=Rules(horizon=4.0))
+    setting = setting_of(4.0, engine)
     if engine == "mujoco":
         outcome, _ = pushes.run([case], setting, workers=1)
         assert outcome.base_pose[0][0] == pytest.approx(0.2, rel=0.1)  # 0.05 m/s: it was felt
@@ -137,8 +137,8 @@ def test_a_law_observes_the_force_of_its_push(engine):
     trials, _ = jax.jit(trial.unroll, static_argnames="steps")(
         stage, worlds, params, trials, loop, steps=200
     )
-    np.testing.assert_allclose(trials.load.wrench[0, 0], -0.3 * 10 * GRAVITY, rtol=0.1)
-    np.testing.assert_allclose(trials.load.signal[0, 0], -0.3 * 10 * GRAVITY, rtol=0.1)
+    assert_allclose(trials.load.wrench[0, 0], -0.3 * 10 * GRAVITY, rtol=0.1)
+    assert_allclose(trials.load.signal[0, 0], -0.3 * 10 * GRAVITY, rtol=0.1)
 
 
 test_engines_that_tell_no_force_refuse_laws_that_ask_for_it = refusals(

@@ -11,6 +11,8 @@ import numpy as np
 import pytest
 from helpers import SEEDS, property_test
 from hypothesis import strategies as st
+from numpy.random import default_rng
+from numpy.testing import assert_allclose, assert_array_equal
 from scipy.spatial.transform import Rotation
 
 from rps_jax.geometry import planar
@@ -36,16 +38,16 @@ def ordinary(v: np.ndarray) -> np.ndarray:
 
 def test_a_rotation_by_a_quarter_turn_takes_x_to_y_and_y_to_minus_x():
     got = planar.rotate(jnp.float32(math.pi / 2), jnp.array([[2.0, 0.0], [0.0, 3.0], [1.0, 1.0]]))
-    np.testing.assert_allclose(got, [[0, 2], [-3, 0], [-1, 1]], atol=1e-6)
+    assert_allclose(got, [[0, 2], [-3, 0], [-1, 1]], atol=1e-6)
 
 
 def test_rotations_compose_by_adding_their_angles_and_keep_lengths():
-    rng = np.random.default_rng(0)
+    rng = default_rng(0)
     a, b = rng.uniform(-4, 4, (2, 100)).astype(np.float32)
     v = rng.normal(size=(100, 2)).astype(np.float32)
     twice = planar.rotate(a, planar.rotate(b, v))
-    np.testing.assert_allclose(twice, planar.rotate(a + b, v), atol=3e-6)
-    np.testing.assert_allclose(np.hypot(*np.asarray(twice).T), np.hypot(*v.T), rtol=1e-6)
+    assert_allclose(twice, planar.rotate(a + b, v), atol=3e-6)
+    assert_allclose(np.hypot(*np.asarray(twice).T), np.hypot(*v.T), rtol=1e-6)
 
 
 # wrap
@@ -89,7 +91,7 @@ def test_wrap_excludes_pi_whatever_the_rounding_near_its_odd_multiples():
     angle = np.resize(np.concatenate([*near, tiny, -PI + tiny, PI + tiny]), 512)
     wrapped = np.asarray(wrap(angle))
     check_range(wrapped)
-    np.testing.assert_allclose(np.cos(np.float64(wrapped)), np.cos(np.float64(angle)), atol=1e-4)
+    assert_allclose(np.cos(np.float64(wrapped)), np.cos(np.float64(angle)), atol=1e-4)
 
 
 def test_wrap_excludes_pi_in_float64_where_the_modulus_rounds_up_to_a_turn():
@@ -109,7 +111,7 @@ def test_wrap_changes_no_angle_beyond_rounding(angle):
 
 def test_the_derivative_of_wrap_is_one_even_at_the_jump():
     angle = jnp.array([0.0, 1.0, PI, -PI, 100.0, -3.0])
-    np.testing.assert_array_equal(jax.vmap(jax.grad(planar.wrap))(angle), np.ones(6))
+    assert_array_equal(jax.vmap(jax.grad(planar.wrap))(angle), np.ones(6))
 
 
 # norm
@@ -122,23 +124,23 @@ def test_norm_and_its_derivative_are_right_if_squares_overflow_or_vanish(scale, 
     """The largest has a reciprocal below 2^-126, which XLA flushes to zero; zero has no slope."""
     v = np.float32(scale) * np.float32([[3, 4], [-4, 3], [0, -5]])
     value, gradient = norm_and_gradient(v)
-    np.testing.assert_allclose(value, np.full(3, lengths * np.float32(scale)), rtol=1e-6)
+    assert_allclose(value, np.full(3, lengths * np.float32(scale)), rtol=1e-6)
     slope = np.float32([[0.6, 0.8], [-0.8, 0.6], [0, -1]]) * (scale > 0)
-    np.testing.assert_allclose(gradient, slope, rtol=1e-6)
+    assert_allclose(gradient, slope, rtol=1e-6)
 
 
 @property_test(hnp.arrays(np.float32, (64, 2), elements=finite32))
 def test_norm_agrees_with_hypot_and_its_derivative_is_a_unit_vector(v):
     v = ordinary(v)
     value, gradient = norm_and_gradient(v)
-    np.testing.assert_allclose(value, np.hypot(*np.float64(v).T), rtol=1e-6)
+    assert_allclose(value, np.hypot(*np.float64(v).T), rtol=1e-6)
     lengths = np.hypot(*np.float64(gradient).T)
-    np.testing.assert_allclose(lengths, v.any(axis=1), atol=1e-6)
+    assert_allclose(lengths, v.any(axis=1), atol=1e-6)
 
 
 def test_norm_is_over_the_last_axis_and_hides_no_nan():
-    v = np.random.default_rng(0).normal(size=(4, 3, 5))
-    np.testing.assert_allclose(planar.norm(jnp.asarray(v)), np.linalg.norm(v, axis=-1), rtol=1e-6)
+    v = default_rng(0).normal(size=(4, 3, 5))
+    assert_allclose(planar.norm(jnp.asarray(v)), np.linalg.norm(v, axis=-1), rtol=1e-6)
     assert np.isnan(planar.norm(jnp.array([jnp.nan, 1.0])))
 
 
@@ -150,7 +152,7 @@ def test_direction_is_the_angle_from_x_to_y_at_any_length(scale):
     unit = np.float32([[1, 0], [1, 1], [0, 1], [-1, 1], [-1, 0], [-1, -1], [0, -1]])
     expected = math.pi / 4 * np.array([0, 1, 2, 3, 4, -3, -2])
     value, gradient = direction_and_gradient(np.float32(scale) * unit)
-    np.testing.assert_allclose(value, expected, rtol=1e-6, atol=1e-6)
+    assert_allclose(value, expected, rtol=1e-6, atol=1e-6)
     assert np.isfinite(gradient).all()
 
 
@@ -160,13 +162,13 @@ def test_the_derivative_of_direction_is_across_and_inverse_to_the_length():
         v = np.float32(scale) * np.float32([[3, 4], [-4, 3], [-5, 0], [0, -5]])
         gradient = np.float64(direction_and_gradient(v)[1]) * scale
         expected = [[-0.16, 0.12], [-0.12, -0.16], [0, -0.2], [0.2, 0]]
-        np.testing.assert_allclose(gradient, expected, rtol=1e-5, atol=1e-9)
+        assert_allclose(gradient, expected, rtol=1e-5, atol=1e-9)
 
 
 def test_direction_is_zero_with_zero_derivative_at_zero():
     value, gradient = direction_and_gradient(jnp.zeros((4, 2)))
-    np.testing.assert_array_equal(value, np.zeros(4))
-    np.testing.assert_array_equal(gradient, np.zeros((4, 2)))
+    assert_array_equal(value, np.zeros(4))
+    assert_array_equal(gradient, np.zeros((4, 2)))
 
 
 @property_test(hnp.arrays(np.float32, (64, 2), elements=finite32))
@@ -185,8 +187,8 @@ def test_direction_agrees_with_atan2_for_every_finite_vector(v):
 
 def test_safe_sqrt_is_the_root_or_zero_with_zero_derivative():
     value, gradient = sqrt_and_gradient(jnp.array([4.0, 0.25, 1e-30, 0.0, -1.0, -1e30]))
-    np.testing.assert_allclose(value, [2, 0.5, 1e-15, 0, 0, 0], rtol=1e-6)
-    np.testing.assert_allclose(gradient, [0.25, 1, 5e14, 0, 0, 0], rtol=1e-6)
+    assert_allclose(value, [2, 0.5, 1e-15, 0, 0, 0], rtol=1e-6)
+    assert_allclose(gradient, [0.25, 1, 5e14, 0, 0, 0], rtol=1e-6)
 
 
 # greatest
@@ -196,7 +198,7 @@ def test_the_greatest_has_the_derivative_of_one_entry_also_of_equal_ones():
     for x, expected in (([1.0, 3.0, 2.0], [0, 1, 0]), ([2.0, 2.0, 1.0], [1, 0, 0])):
         value, gradient = jax.value_and_grad(planar.greatest)(jnp.array(x))
         assert value == max(x)
-        np.testing.assert_array_equal(gradient, expected)
+        assert_array_equal(gradient, expected)
 
 
 # yaw_of_quaternion
@@ -206,21 +208,21 @@ def test_yaw_of_quaternion_by_hand():
     half = math.sqrt(0.5)
     quaternions = jnp.array([[1, 0, 0, 0], [half, 0, 0, half], [half, 0, 0, -half], [0, 1, 0, 0]])
     got = planar.yaw_of_quaternion(quaternions)
-    np.testing.assert_allclose(got, [0, math.pi / 2, -math.pi / 2, 0], atol=1e-6)
+    assert_allclose(got, [0, math.pi / 2, -math.pi / 2, 0], atol=1e-6)
 
 
 @property_test(SEEDS)
 def test_yaw_of_quaternion_is_where_the_tilted_body_heads(seed):
-    rng = np.random.default_rng(seed)
+    rng = default_rng(seed)
     yaw = rng.uniform(-3.14, 3.14, 256)
     tilt = rng.uniform(-1.4, 1.4, (256, 2))
     rotation = Rotation.from_euler("ZYX", np.column_stack([yaw, tilt]))
     quaternion = np.float32(rotation.as_quat(scalar_first=True))
     heading = rotation.apply([1.0, 0.0, 0.0])
-    np.testing.assert_allclose(np.arctan2(heading[:, 1], heading[:, 0]), yaw, atol=1e-9)
+    assert_allclose(np.arctan2(heading[:, 1], heading[:, 0]), yaw, atol=1e-9)
     for q in (quaternion, -quaternion):  # both are the same rotation
         # The heading's shadow is cos(tilt) >= 0.17 long, which magnifies rounding.
-        np.testing.assert_allclose(yaw_of_quaternion(q), yaw, atol=3e-6)
+        assert_allclose(yaw_of_quaternion(q), yaw, atol=3e-6)
 
 
 def test_the_yaw_of_a_body_on_its_nose_is_finite_with_finite_derivatives():
@@ -235,7 +237,7 @@ def test_tilt_is_the_angle_to_the_vertical_and_differentiable_at_zero():
     lean = np.array([np.cos(half), np.sin(half) * 0.6, np.sin(half) * 0.8, 0.0], np.float32)
     turned = np.array([np.cos(half), 0.0, 0.0, np.sin(half)], np.float32)
     tilts = planar.tilt(jnp.stack([lean, turned, np.array([0.0, 1.0, 0.0, 0.0])]))
-    np.testing.assert_allclose(tilts, [0.6, 0.0, math.pi], atol=1e-3)
+    assert_allclose(tilts, [0.6, 0.0, math.pi], atol=1e-3)
     tiny = jnp.array([1.0, 5e-6, 0.0, 0.0])
     assert float(planar.tilt(tiny)) == pytest.approx(1e-5, rel=1e-4)
     assert np.isfinite(jax.grad(lambda q: planar.tilt(q))(jnp.array([1.0, 0.0, 0.0, 0.0]))).all()

@@ -8,6 +8,8 @@ import mujoco
 import numpy as np
 import pytest
 from helpers import jitted, row
+from numpy.random import default_rng
+from numpy.testing import assert_allclose
 from staging import FINE, simulate, staged, step_in_c
 from staging import body as body_of
 
@@ -58,9 +60,9 @@ def test_a_step_agrees_with_c_mujoco(name, yaw, offset, cone):
     pose, velocity, expected = pushed(*start(name, yaw, offset, physics), 1, physics)
     # C MuJoCo finds one contact of the cylinder with the base, of which the fused engine has two.
     near, slow = (1e-3, 0.2) if (name, offset) == ("cylinder", 0.08) else (1e-6, 3e-4)
-    np.testing.assert_allclose(pose, expected.qpos, atol=near)
-    np.testing.assert_allclose(velocity[:3], expected.qvel[:3], atol=1e-3)
-    np.testing.assert_allclose(velocity[3:], expected.qvel[3:], atol=slow)
+    assert_allclose(pose, expected.qpos, atol=near)
+    assert_allclose(velocity[:3], expected.qvel[:3], atol=1e-3)
+    assert_allclose(velocity[3:], expected.qvel[3:], atol=slow)
 
 
 @pytest.mark.parametrize(("name", "yaw", "offset"), [STARTS[1], STARTS[3], STARTS[4]])
@@ -69,7 +71,7 @@ def test_a_push_of_three_seconds_agrees_with_c_mujoco(name, yaw, offset):
     loaded, qpos = start(name, yaw, offset)
     pose, _, expected = pushed(loaded, qpos, 300)
     assert np.hypot(*(expected.qpos - qpos)[3:5]) > 0.1
-    np.testing.assert_allclose(pose, expected.qpos, atol=3e-3)
+    assert_allclose(pose, expected.qpos, atol=3e-3)
 
 
 @pytest.mark.parametrize("cone", ["elliptic", "pyramidal"])
@@ -90,15 +92,17 @@ def test_a_contacts_force_and_stiffness_are_derivatives_of_its_cost(cone):
         sliding = d / (mu**2 * (1 + mu**2)) / 2 * (n - mu * slip) ** 2
         return jnp.where(n >= mu * slip, 0.0, jnp.where(mu * n + slip <= 0, sticking, sliding))
 
-    xs = np.random.default_rng(0).normal(size=(40, 3)).astype(np.float32)
+    xs = default_rng(0).normal(size=(40, 3)).astype(np.float32)
     functions = (
-        lambda x: newton.contact_force(point, tuple(x), physics), jax.grad(cost), jax.hessian(cost)
-    )  # fmt: skip
+        lambda x: newton.contact_force(point, tuple(x), physics),
+        jax.grad(cost),
+        jax.hessian(cost),
+    )
     (force, k), slope, curvature = (jitted(jax.vmap(function))(xs) for function in functions)
-    np.testing.assert_allclose(np.transpose(force), -slope, rtol=1e-3, atol=1e-3)
+    assert_allclose(np.transpose(force), -slope, rtol=1e-3, atol=1e-3)
     nn, nt, ns, tt, ts, ss = k
     full = np.transpose([[nn, nt, ns], [nt, tt, ts], [ns, ts, ss]])
-    np.testing.assert_allclose(full, curvature, rtol=1e-3, atol=2e-3)
+    assert_allclose(full, curvature, rtol=1e-3, atol=2e-3)
     assert len(set(zip(force[0] == 0, np.linalg.matrix_rank(full) == 3, strict=True))) > 1
 
 

@@ -6,7 +6,8 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 import xarray as xr
-from helpers import refusal, results_of, rps
+from helpers import printed, refusal, results_of, setting_of
+from numpy.random import default_rng
 
 import rps_jax
 from rps_jax import Law
@@ -34,7 +35,7 @@ def test_each_failure_has_one_mode():
 
 
 def test_common_quantities_differ_from_all_worlds():
-    random = np.random.default_rng(0)
+    random = default_rng(0)
     size, mass = random.uniform(size=(2, 8000))
     trials = xr.Dataset({"size": ("world", size), "mass": ("world", mass)})
     ((name, masked, overall),) = gallery.common_quantities(trials, size > 0.8)
@@ -130,7 +131,8 @@ MECHANISMS = {
     "a tilt": (MOVING | {"tilt": np.deg2rad(12)}, {"tilt of the object": "12 deg"}),
     "a small tilt": (MOVING | {"tilt": np.deg2rad(4)}, {}),
     "a fall": (
-        MOVING | {"roll": np.deg2rad(20 * np.maximum(TIME - 57.75, 0)), "tipped": 1}
+        MOVING
+        | {"roll": np.deg2rad(20 * np.maximum(TIME - 57.75, 0)), "tipped": 1}
         | {"tilt": np.deg2rad(46)},
         {"tilt of the object": "46 deg", "fall of the object": "2.0 s from 5 deg on"},
     ),
@@ -140,7 +142,7 @@ MECHANISMS = {
         MOVING | {"nan_twist": 1},
         {"command that is not finite": "at 60.00 s"},
     ),
-}  # fmt: skip
+}
 OUTCOMES = ("contact_lost_time", "tilt", "tipped", "nan_twist")
 
 
@@ -168,7 +170,10 @@ def test_title_and_legend_of_the_maps_are_inside_of_the_figure(count):
     figure.draw_without_rendering()
     (legend,), page = figure.legends, figure.bbox
     assert [text.get_text() for text in legend.get_texts()] == [
-        *("base", "contact point", "object", "target"),
+        "base",
+        "contact point",
+        "object",
+        "target",
     ]
     boxes = [figure._suptitle.get_window_extent(), legend.get_window_extent()]
     for box in boxes:
@@ -194,13 +199,12 @@ def step_backwards(params, state, obs):
 @pytest.mark.usefixtures("registries")
 def test_the_command_plots_each_mode_and_prints_a_replay_command(tmp_path, capsys):
     run = tmp_path / "run"
-    brief = rps_jax.Setting("quasistatic", rules=rps_jax.Rules(horizon=30.0))
+    brief = setting_of(30.0)
     rps_jax.register_law("backwards", Law(lambda params: (), step_backwards), Backwards())
     drums = parse_domain("wide,objects=random_cylinder,bearing=-0.5:0.5,gap=0.05:0.06")
     laws = {"mine law": "backwards"}
     rps_jax.sweep(laws, drums, 3, setting=brief, slots=8, out=run)
-    assert rps("gallery", run, "--each", 2) == 0
-    text = capsys.readouterr().out
+    text = printed(capsys, "gallery", run, "--each", 2)
     assert "never touched: 3 of 3" in text
     assert f"rps replay {run} 0 --law 'mine law'`" in text
     for world in (0, 1):
@@ -221,8 +225,7 @@ def test_worlds_in_which_only_one_law_fails_are_listed(tmp_path, capsys):
     assert 0 < expected.size < (~nps).sum()
     results = rps_jax.gallery(run, law="nps", against="rps")
     assert np.flatnonzero(results.kind != "").tolist() == expected.tolist()
-    assert rps("gallery --law nps --against rps --each 1", run) == 0
-    text = capsys.readouterr().out
+    text = printed(capsys, "gallery --law nps --against rps --each 1", run)
     assert text.startswith("# Failures of nps where rps succeeds")
     table = text.partition("## Worlds in which only nps fails")[2].partition("##")[0]
     worlds = re.findall(rf"^\| (\d+) .*`rps replay {run} \1 --law nps` +\|$", table, re.MULTILINE)

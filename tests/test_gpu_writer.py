@@ -9,11 +9,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import output_of
+from helpers import output_of, refusing, slow
+from numpy.testing import assert_allclose
 from test_native import OPERATIONS, advanced, build_push, close, same
 
 from rps_jax.engines.base import ControlPeriod
-from rps_jax.errors import InputError
 from rps_jax.geometry import vectors
 from rps_jax.lowering import nvrtc
 from rps_jax.lowering.gpu_writer import GPU_HEADER, GpuWriter
@@ -90,7 +90,7 @@ def test_operations_agree_with_jax(threads, tmp_path):
     for name, a, b in zip(OPERATIONS, computed, expected, strict=True):
         for actual, desired in zip(*map(jax.tree.leaves, (a, b)), strict=True):
             assert actual.dtype == desired.dtype
-            np.testing.assert_allclose(actual, desired, rtol=3e-6, atol=1e-6, err_msg=name)
+            assert_allclose(actual, desired, rtol=3e-6, atol=1e-6, err_msg=name)
 
 
 def test_tables_hold_numbers_that_are_not_finite(monkeypatch):
@@ -111,7 +111,7 @@ def test_tables_hold_numbers_that_are_not_finite(monkeypatch):
 PAIRS = [
     ("box", "capacitive"),
     ("cylinder", "ideal"),
-    pytest.param("prism", "ideal", marks=pytest.mark.slow),
+    slow("prism", "ideal"),
 ]
 
 
@@ -145,9 +145,9 @@ def test_a_control_period_is_the_processors(tmp_path):
     run = Emulated(world_step, jax.tree.map(lambda x: jnp.asarray(x)[0], inputs), tmp_path, 4)
     computed, expected = run(*inputs), jax.jit(world_step)(*inputs)
     assert np.mean(np.linalg.norm(expected.force[:, :2], axis=1) > 1) > 0.5  # [N]
-    np.testing.assert_allclose(computed.force, expected.force, rtol=1e-3, atol=2e-2)
-    np.testing.assert_allclose(computed.motion.qpos, expected.motion.qpos, rtol=1e-4, atol=1e-5)
-    np.testing.assert_allclose(computed.motion.qvel, expected.motion.qvel, rtol=1e-3, atol=1e-4)
+    assert_allclose(computed.force, expected.force, rtol=1e-3, atol=2e-2)
+    assert_allclose(computed.motion.qpos, expected.motion.qpos, rtol=1e-4, atol=1e-5)
+    assert_allclose(computed.motion.qvel, expected.motion.qvel, rtol=1e-3, atol=1e-4)
 
 
 def test_shared_memory_is_bounded(tmp_path):
@@ -156,5 +156,5 @@ def test_shared_memory_is_bounded(tmp_path):
     def world_step(x):
         return jax.lax.dynamic_slice(x * jnp.arange(3000.0), (x.astype(int),), (2,))
 
-    with pytest.raises(InputError, match="exceed the shared memory"):
+    with refusing("exceed the shared memory"):
         Emulated(world_step, (jnp.float32(1.0),), tmp_path, 4)

@@ -9,6 +9,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.random import default_rng
+from numpy.testing import assert_allclose, assert_array_equal
 
 from rps_jax.control import registry
 from rps_jax.control.laws import rps
@@ -79,11 +81,11 @@ def test_the_gradient_of_a_quadratic_is_unbiased_and_within_its_interval(name):
             (1.7, 1.7) if name == "mixed" else (0.6, 0.25)
         )  # without its weight's
         ratio = estimate.variance.mean(0) / estimate.gradient.var(0)
-        np.testing.assert_allclose(np.log(ratio), 0, atol=change)
+        assert_allclose(np.log(ratio), 0, atol=change)
     within = np.abs(error) < 1.96 * np.sqrt(estimate.variance)
     assert np.abs(within.mean(axis=0) - 0.95).max() < 0.08 or name == "mixed"
     share = repeat(name, 32).variance.mean(0) / estimate.variance.mean(0)
-    np.testing.assert_allclose(np.log(share / 16), 0, atol=share_change)
+    assert_allclose(np.log(share / 16), 0, atol=share_change)
 
 
 def test_derivatives_are_those_in_each_world():
@@ -91,10 +93,10 @@ def test_derivatives_are_those_in_each_world():
     slopes = STIFF * (THETA - worlds)  # (32, 3)
     for name in DERIVATIVES:
         samples = jax.jit(functools.partial(sampled, name, bowls))(THETA, worlds, None)
-        np.testing.assert_allclose(samples, slopes, rtol=1e-4, atol=1e-5)
+        assert_allclose(samples, slopes, rtol=1e-4, atol=1e-5)
         estimate = found_by(name, bowls, None, worlds)
-        np.testing.assert_allclose(estimate.gradient, slopes.mean(axis=0), rtol=1e-5)
-        np.testing.assert_allclose(estimate.variance, slopes.var(axis=0, ddof=1) / 32, rtol=1e-4)
+        assert_allclose(estimate.gradient, slopes.mean(axis=0), rtol=1e-5)
+        assert_allclose(estimate.variance, slopes.var(axis=0, ddof=1) / 32, rtol=1e-4)
 
 
 def test_random_steps_give_the_gradient_of_the_smoothed_score():
@@ -123,7 +125,7 @@ def test_only_evolution_estimates_gradients_across_jumps():
     hurdles = jax.random.uniform(jax.random.key(4), (20_000,), minval=-1, maxval=2)
     for name in ("forward", "exact", "clipped", "bundled"):
         estimate = found_by(name, wins, jax.random.key(5), hurdles)
-        np.testing.assert_array_equal(estimate.gradient, np.zeros(3))
+        assert_array_equal(estimate.gradient, np.zeros(3))
     for name in ("evolution", "mixed"):  # the mixture gives the biased derivative no weight
         estimate = found_by(name, wins, jax.random.key(5), hurdles)
         assert estimate.gradient[0] > 0.2
@@ -136,7 +138,7 @@ def test_the_mixture_takes_derivatives_of_a_smooth_score():
     mixed, exact, evolution = (
         found_by(name, bowls, key, worlds) for name in ("mixed", "exact", "evolution")
     )
-    np.testing.assert_allclose(mixed.gradient, exact.gradient, atol=0.02)
+    assert_allclose(mixed.gradient, exact.gradient, atol=0.02)
     assert mixed.variance.sum() < 1.1 * exact.variance.sum()
     assert (exact.variance < 0.1 * evolution.variance).all()
 
@@ -178,7 +180,7 @@ def test_common_worlds_cancel_what_does_not_depend_on_the_parameters():
 
     worlds, key = some_worlds(jax.random.key(6)), jax.random.key(7)
     plain, noisy = (found_by("evolution", scores, key, worlds) for scores in (bowls, shifted))
-    np.testing.assert_allclose(noisy.gradient, plain.gradient, atol=2e-3)
+    assert_allclose(noisy.gradient, plain.gradient, atol=2e-3)
 
 
 @every_estimator
@@ -187,41 +189,41 @@ def test_worlds_that_are_not_finite_are_dropped_and_counted(name):
     broken = worlds.at[::8].set(jnp.nan).at[4::8].set(jnp.inf)
     rest = jnp.delete(worlds, np.arange(0, 32, 4), axis=0)
     estimate = found_by(name, bowls, jax.random.key(9), broken)
-    np.testing.assert_allclose(estimate.finite, 0.75)
+    assert_allclose(estimate.finite, 0.75)
     assert np.isfinite(estimate.gradient).all()
     if name in DERIVATIVES:  # others try other directions in another number of worlds
         expected = found_by(name, bowls, None, rest)
-        np.testing.assert_allclose(estimate.gradient, expected.gradient, rtol=1e-5)
-        np.testing.assert_allclose(estimate.variance, expected.variance, rtol=1e-5)
+        assert_allclose(estimate.gradient, expected.gradient, rtol=1e-5)
+        assert_allclose(estimate.variance, expected.variance, rtol=1e-5)
 
 
 def test_entries_are_dropped_one_by_one():
     samples = jnp.array([[1.0, jnp.nan], [3.0, 2.0], [jnp.inf, 4.0], [5.0, 6.0]])
     estimate = gradients.estimate(samples)
-    np.testing.assert_allclose(estimate.gradient, [3.0, 4.0])
-    np.testing.assert_allclose(estimate.variance, [4 / 3, 4 / 3])  # of 1 3 5 and 2 4 6: 4 in 3
-    np.testing.assert_allclose(estimate.finite, [0.75, 0.75])
+    assert_allclose(estimate.gradient, [3.0, 4.0])
+    assert_allclose(estimate.variance, [4 / 3, 4 / 3])  # of 1 3 5 and 2 4 6: 4 in 3
+    assert_allclose(estimate.finite, [0.75, 0.75])
 
 
 def test_a_sample_beyond_the_bound_is_scaled_down_to_it_by_hand():
     # Norms 5, 0.5, 1e30 and none: of those that are, the median is 5, and twice that 10.
     samples = jnp.array([[3.0, 4.0], [0.3, 0.4], [0.0, -1e30], [0.0, 0.0]])
     bounded = estimators.clip(samples, 2.0)
-    np.testing.assert_allclose(bounded, [[3, 4], [0.3, 0.4], [0, -10], [0, 0]], rtol=1e-5)
+    assert_allclose(bounded, [[3, 4], [0.3, 0.4], [0, -10], [0, 0]], rtol=1e-5)
     # Each score of a world has a separate bound.
     two = jnp.stack([samples, samples[::-1] / 10], axis=-1)
     both = estimators.clip(two, 2.0)
-    np.testing.assert_allclose(both[..., 1], bounded[::-1] / 10, rtol=1e-5)
+    assert_allclose(both[..., 1], bounded[::-1] / 10, rtol=1e-5)
     broken = estimators.clip(samples.at[1, 0].set(jnp.nan), 2.0)
-    np.testing.assert_allclose(gradients.estimate(broken).finite, 0.75)
-    np.testing.assert_array_equal(estimators.clip(jnp.zeros((3, 2)), 2.0), np.zeros((3, 2)))
+    assert_allclose(gradients.estimate(broken).finite, 0.75)
+    assert_array_equal(estimators.clip(jnp.zeros((3, 2)), 2.0), np.zeros((3, 2)))
 
 
 def test_a_mean_of_no_samples_is_nan_with_infinite_variance():
     estimate = gradients.estimate(jnp.array([[jnp.nan, 1.0], [jnp.nan, jnp.nan]]))
-    np.testing.assert_array_equal(estimate.gradient, [np.nan, 1.0])
-    np.testing.assert_array_equal(estimate.variance, [np.inf, np.inf])
-    np.testing.assert_array_equal(estimate.finite, [0.0, 0.5])
+    assert_array_equal(estimate.gradient, [np.nan, 1.0])
+    assert_array_equal(estimate.variance, [np.inf, np.inf])
+    assert_array_equal(estimate.finite, [0.0, 0.5])
 
 
 @pytest.mark.slow
@@ -229,7 +231,7 @@ def test_a_critic_is_fitted_to_remaining_scores(monkeypatch):
     monkeypatch.setattr(critic, "_UPDATES", 500)
     monkeypatch.setattr(critic, "_BATCH", 64)
     monkeypatch.setattr(critic, "_WIDTH", 16)
-    x = np.random.default_rng(0).normal(size=(500, 3)).astype(np.float32)
+    x = default_rng(0).normal(size=(500, 3)).astype(np.float32)
     y = np.tanh(x[:, 0]) + 0.5 * x[:, 1]
     error = np.asarray(critic.fit(x, y)(jnp.asarray(x))) - y
     assert np.std(error) < 0.2 * np.std(y)
@@ -269,4 +271,4 @@ def test_the_derivative_of_a_window_of_fused_trials_is_its_finite_difference():
     slopes, differences = np.array(slopes), np.array(differences)
     assert np.isfinite(slopes).all()
     assert (np.abs(slopes).max(axis=1) > 1e-3).all()  # each parameter matters somewhere
-    np.testing.assert_allclose(slopes, differences, rtol=0.02, atol=2e-4)
+    assert_allclose(slopes, differences, rtol=0.02, atol=2e-4)

@@ -3,6 +3,7 @@
 import jax
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 
 from rps_jax.control.laws.rps import BOUNDS, RPSParams
 from rps_jax.trials.setting import seed_of
@@ -29,8 +30,8 @@ def test_aims_by_hand():
     )
     result = candidates.aims(outcome)
     assert result.success.tolist() == [0.75, 0.0]
-    np.testing.assert_array_equal(result.time, [20, np.nan])
-    np.testing.assert_array_equal(result.path, [2, np.nan])
+    assert_array_equal(result.time, [20, np.nan])
+    assert_array_equal(result.path, [2, np.nan])
 
 
 def test_the_undominated_by_hand():
@@ -58,7 +59,7 @@ def test_a_line_varies_one_parameter_within_its_bounds_and_no_other():
                 assert (bound.low * scale < values).all()
                 assert (values < bound.high * scale).all()
             elif (name, second) != ("l_cr", "l_mr"):  # l_mr must not pass a small l_cr
-                np.testing.assert_allclose(values, getattr(base, second), rtol=1e-5)
+                assert_allclose(values, getattr(base, second), rtol=1e-5)
     assert (np.asarray(grid.l_mr) <= np.asarray(grid.l_cr)).all()
 
 
@@ -67,14 +68,14 @@ def test_candidates_start_with_the_sets_and_without_spread_interpolate_two_sets(
     space = Space(FULL)
     z = space.vector(result)
     for i, params in enumerate(SETS.values()):
-        np.testing.assert_allclose(z[i], space.vector(params), rtol=1e-4, atol=1e-4)
+        assert_allclose(z[i], space.vector(params), rtol=1e-4, atol=1e-4)
     way = z[1] - z[0]
     share = (z[2:] - z[0]) @ way / (way @ way)
     assert (share > -1e-3).all()
     assert (share < 1 + 1e-3).all()
-    np.testing.assert_allclose(z[2:], z[0] + share[:, None] * way, rtol=1e-3, atol=1e-3)
+    assert_allclose(z[2:], z[0] + share[:, None] * way, rtol=1e-3, atol=1e-3)
     # The switch that differs between the sets, from the nearer one.
-    np.testing.assert_array_equal(result.keep_contact[2:], share > 0.5)
+    assert_array_equal(result.keep_contact[2:], share > 0.5)
 
 
 @pytest.fixture
@@ -101,9 +102,9 @@ def test_each_parameter_alone_is_labelled_and_from_worlds_for_validation(pretend
     assert dict(result.sizes) == {"set": 2, "parameter": len(FULL), "step": 3}
     assert [ask.seed for ask in pretended] == [seed_of(0, "validate")]
     first = result.sel(set="paper", parameter="L")
-    np.testing.assert_allclose(first.time, 100 * first.value, rtol=1e-5)
+    assert_allclose(first.time, 100 * first.value, rtol=1e-5)
     second = result.sel(set="tuned", parameter="K_h")
-    np.testing.assert_allclose(second.time, 100 * RPSParams.tuned().L, rtol=1e-4)
+    assert_allclose(second.time, 100 * RPSParams.tuned().L, rtol=1e-4)
     assert result.attrs["worlds"] == 8
 
 
@@ -111,7 +112,7 @@ def test_the_front_is_chosen_by_validation_and_measured_by_test_worlds(pretended
     result = Landscape(SETS, candidates=6, worlds=8).select_front()
     assert [ask.seed for ask in pretended] == [seed_of(0, s) for s in ("validate", "test")]
     params = [jax.tree.map(np.asarray, ask.params) for ask in pretended]
-    jax.tree.map(np.testing.assert_array_equal, *params)
+    jax.tree.map(assert_array_equal, *params)
     # All succeed alike and drive as far: the quickest alone is undominated.
     assert result.front.values.sum() == 1
     assert np.argmax(result.front.values) == np.argmin(result.L.values)

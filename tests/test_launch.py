@@ -10,6 +10,7 @@ import jax
 import numpy as np
 import pytest
 from helpers import output_of
+from numpy.testing import assert_array_equal
 
 from rps_jax.engines import device, native
 from rps_jax.lowering import nvrtc
@@ -65,16 +66,29 @@ def launched(folder, fails="nothing", library="launcher"):
 def test_kernels_run_concurrently_and_later_work_waits_for_all(folder):
     ((error, first), (_, second)), *results, traits = launched(folder)
     assert (error, traits) == ("", 0)
-    np.testing.assert_array_equal(results[0], 3 * np.arange(2))
-    np.testing.assert_array_equal(results[1], 5 * np.arange(20))
+    assert_array_equal(results[0], 3 * np.arange(2))
+    assert_array_equal(results[1], 5 * np.arange(20))
     loaded = ["mode 2", "load 3", "kernel step", "load 5", "kernel step", "mode 1"]
     assert first == [
-        *(*loaded, "context", "push 7", "mode 2", "event 201", "record 201 on 7"),
+        *loaded,
+        "context",
+        "push 7",
+        "mode 2",
+        "event 201",
+        "record 201 on 7",
         "launch 3 on 7: 1 of 32",  # 8 worlds in a block of 32 threads
         # Earlier work of XLA's stream comes first.
-        *("stream 101", "event 202", "await 201 on 101", "launch 5 on 101: 3 of 32"),
-        *("record 202 on 101", "await 202 on 7"),
-        *("end event 202", "end stream 101", "end event 201", "mode 1", "pop"),
+        "stream 101",
+        "event 202",
+        "await 201 on 101",
+        "launch 5 on 101: 3 of 32",
+        "record 202 on 101",
+        "await 202 on 7",
+        "end event 202",
+        "end stream 101",
+        "end event 201",
+        "mode 1",
+        "pop",
     ]
     assert [line.split()[0] for line in second] == [line.split()[0] for line in first[6:]]
 
@@ -83,19 +97,22 @@ def test_a_single_kernel_can_be_captured_in_a_cuda_graph(folder):
     """Its call is one launch; the driver also loads kernels while a stream is captured."""
     ((error, first), (_, second)), result, _, traits = launched(folder, library="single")
     assert (error, traits) == ("", 1)
-    np.testing.assert_array_equal(result, 3 * np.arange(2))
+    assert_array_equal(result, 3 * np.arange(2))
     call = ["context", "push 7", "mode 2", "launch 3 on 7: 1 of 32", "mode 1", "pop"]
     assert first == ["mode 2", "load 3", "kernel step", "mode 1", *call]
     assert second == call
 
 
-@pytest.mark.parametrize(("fails", "error"), [
-    ("load", "the GPU's driver cannot load a kernel"),
-    ("context", "no GPU is available"),
-    ("stream", "a kernel could not be launched"),
-    ("event", "a kernel could not be launched"),
-    ("launch", "a kernel could not be launched"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("fails", "error"),
+    [
+        ("load", "the GPU's driver cannot load a kernel"),
+        ("context", "no GPU is available"),
+        ("stream", "a kernel could not be launched"),
+        ("event", "a kernel could not be launched"),
+        ("launch", "a kernel could not be launched"),
+    ],
+)
 def test_a_failure_is_reported_and_releases_resources(fails, error, folder):
     for message, notes in launched(folder, fails)[0]:
         assert message == error

@@ -4,6 +4,8 @@ import math
 
 import numpy as np
 from helpers import PAPER, refusals, results_of
+from numpy.random import default_rng
+from numpy.testing import assert_array_equal
 
 from rps_jax.robot.robot import Robot
 from rps_jax.trials.progress import Progress
@@ -28,7 +30,7 @@ def test_a_crossing_is_where_losses_begin():
 
 
 def test_a_bootstrap_interval_holds_the_crossing():
-    value = np.random.default_rng(1).uniform(0, 1, 400)
+    value = default_rng(1).uniform(0, 1, 400)
     success = (value < 0.5).astype(np.int8)[None]
     results = results_of(["rps"], success=success, usual=np.ones_like(success), value=value)
     results = results.rename(world="case").assign_attrs(harms=1)
@@ -50,10 +52,10 @@ def test_every_robot_meets_the_worlds_of_the_ideal_one(monkeypatch):
     results = study()
     assert progress[-1].finished == study.num_trials() == 9
     rows = results["half_width"]
-    np.testing.assert_array_equal(rows.success, rows.usual)  # it is the ideal base itself
-    np.testing.assert_array_equal(rows.value, [half_width] * 3)
+    assert_array_equal(rows.success, rows.usual)  # it is the ideal base itself
+    assert_array_equal(rows.value, [half_width] * 3)
     assert ((results["lag"].value >= 0) & (results["lag"].value <= 2)).all()
-    np.testing.assert_array_equal(results["lag"].world, np.arange(3))
+    assert_array_equal(results["lag"].world, np.arange(3))
 
 
 def test_a_bounded_acceleration_makes_ramps_of_the_laws_turns():

@@ -114,7 +114,10 @@ CASES = {
         i.at[i].max(2),
     ),
     "further moves": lambda x, i: (
-        *(jnp.stack([x, -x]).T, jnp.split(x, [1]), jnp.copy(x), lax.optimization_barrier(x)),
+        jnp.stack([x, -x]).T,
+        jnp.split(x, [1]),
+        jnp.copy(x),
+        lax.optimization_barrier(x),
         lax.dynamic_update_slice(jnp.stack([x, -x]), x[None, :2], (i[0], i[1])),
     ),
     "changed rows": lambda x, i: jnp.stack([x, -x]).at[i % 2, i[::-1] % 3].min(i),

@@ -7,7 +7,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import same
+from helpers import same, setting_of, slow
+from numpy.testing import assert_allclose, assert_array_equal
 
 from rps_jax import Details, Law, Twist, replay, sweep
 from rps_jax.control import registry
@@ -16,7 +17,7 @@ from rps_jax.engines.base import ControlPeriod
 from rps_jax.lowering import builder, compounds, passes, walk
 from rps_jax.trials import law_check, trial
 from rps_jax.trials.setting import Setting
-from rps_jax.trials.trial import ControlLoop, Rules
+from rps_jax.trials.trial import ControlLoop
 from rps_jax.trials.worlds import drawn_worlds
 from rps_jax.world import draws
 from rps_jax.world.domain import DOMAINS, Range
@@ -75,14 +76,14 @@ def build_push(*arguments, **drawn):
 
 def close(actual, desired, warm, rest):
     """Assert that trials agree; accelerations [m/s^2] to the solver's tolerance of 1e-4."""
-    np.testing.assert_allclose(actual.warmstart, desired.warmstart, atol=warm)
+    assert_allclose(actual.warmstart, desired.warmstart, atol=warm)
     pairs = zip(*(jax.tree.leaves(x._replace(warmstart=0)) for x in (actual, desired)), strict=True)
     for a, b in pairs:
-        np.testing.assert_allclose(a, b, rtol=1e-4, atol=rest)
+        assert_allclose(a, b, rtol=1e-4, atol=rest)
 
 
 PAIRS = [
-    pytest.param("box", "capacitive", marks=pytest.mark.slow),
+    slow("box", "capacitive"),
     ("cylinder", "ideal"),
     ("prism", "capacitive"),
 ]
@@ -98,7 +99,7 @@ def test_a_control_step_agrees_with_xla(shape, skin, monkeypatch):
 
 
 @pytest.mark.parity
-@pytest.mark.parametrize("shape", ["prism", pytest.param("cylinder", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("shape", ["prism", slow("cylinder")])
 def test_the_bits_of_a_world_depend_on_no_other_world(shape):
     stage, inputs, loop = batch(shape)
     together = advanced(stage, inputs, start_trials(inputs, loop), loop, 300)
@@ -234,7 +235,7 @@ def test_an_operation_agrees_with_jax(name):
     run = native.batched(function, lambda _: pytest.fail("it was not compiled"))
     for a, b in zip(*map(jax.tree.leaves, (jax.jit(run)(x), jax.vmap(function)(x))), strict=True):
         assert a.dtype == b.dtype
-        np.testing.assert_allclose(a, b, rtol=3e-6, atol=1e-6)
+        assert_allclose(a, b, rtol=3e-6, atol=1e-6)
 
 
 @pytest.mark.parametrize("reverse", [False, True])
@@ -249,7 +250,7 @@ def test_a_scan_with_a_large_body_is_a_loop(reverse, monkeypatch):
     x = jnp.arange(5.0)
     run = native.batched(function, lambda _: pytest.fail("it was not compiled"))
     for a, b in zip(*map(jax.tree.leaves, (jax.jit(run)(x), jax.vmap(function)(x))), strict=True):
-        np.testing.assert_allclose(a, b, rtol=1e-6)
+        assert_allclose(a, b, rtol=1e-6)
 
 
 def test_constants_are_moved_as_jax_moves_them():
@@ -261,7 +262,7 @@ def test_constants_are_moved_as_jax_moves_them():
     x = np.arange(12, dtype=np.float32).reshape(3, 4)
     results = walk.walk(jax.make_jaxpr(function)(x), [x], builder.SimdBuilder())
     for a, b in zip(results, function(jnp.asarray(x)), strict=True):
-        np.testing.assert_array_equal(a, b)
+        assert_array_equal(a, b)
 
 
 def test_a_scan_of_worlds_is_that_of_jax_and_so_are_its_derivatives(monkeypatch):
@@ -305,30 +306,24 @@ def test_a_scan_of_worlds_is_that_of_jax_and_so_are_its_derivatives(monkeypatch)
             for scan in (native.scan, by_jax)
         )
         for a, b in zip(*map(jax.tree.leaves, (native_result, expected)), strict=True):
-            np.testing.assert_allclose(a, b, rtol=1e-5)
+            assert_allclose(a, b, rtol=1e-5)
     assert len(compiled) == 7  # forward, and backward or a tangent map
 
 
+SLIPS = dict.fromkeys(("robot_slip", "robot_slip_sideways", "robot_slip_yaw"), Range(0, 0.5))
+
+
 @pytest.mark.parametrize(
-    ("law", "skin"),
+    ("law", "options"),
     [
-        ("rps", "ideal"),
-        *((x, "capacitive") for x in ("rps", "aps", "rps_plus", "pursuit", "dipole")),
+        ("rps", {"skin": "ideal"}),
+        *((x, {}) for x in ("rps", "aps", "rps_plus", "pursuit", "dipole")),
+        slow("rps", {"domain": "real", **SLIPS}),
     ],
 )
-def test_the_loop_of_an_equation_is_compiled_as_a_whole(law, skin, monkeypatch):
+def test_the_loop_of_an_equation_is_compiled_as_a_whole(law, options, monkeypatch):
     monkeypatch.setattr(native, "load", lambda name: True)  # no compiler runs
-    stage, inputs, loop = batch("box", skin, 2, law)
-    primitives = str(jax.make_jaxpr(advance(stage, loop, 3))(*inputs, start_trials(inputs, loop)))
-    assert "rps_native" in primitives
-    assert "while" not in primitives
-
-
-@pytest.mark.slow
-def test_the_loop_of_a_base_with_slip_is_compiled_as_a_whole(monkeypatch):
-    monkeypatch.setattr(native, "load", lambda name: True)
-    slips = dict.fromkeys(("robot_slip", "robot_slip_sideways", "robot_slip_yaw"), Range(0, 0.5))
-    stage, inputs, loop = batch("box", count=2, law="rps", domain="real", **slips)
+    stage, inputs, loop = batch("box", count=2, law=law, **options)
     primitives = str(jax.make_jaxpr(advance(stage, loop, 3))(*inputs, start_trials(inputs, loop)))
     assert "rps_native" in primitives
     assert "while" not in primitives
@@ -364,9 +359,7 @@ def test_an_error_of_the_compiler_itself_is_raised(owner, monkeypatch):
         run(jnp.arange(2.0))
 
 
-@pytest.mark.parametrize(
-    "engine", ["fused", "quasistatic", pytest.param("mjx", marks=pytest.mark.slow)]
-)
+@pytest.mark.parametrize("engine", ["fused", "quasistatic", slow("mjx")])
 def test_only_the_fused_engine_calls_compiled_functions(engine, monkeypatch):
     monkeypatch.setattr(native, "load", lambda name: True)
     stage, inputs, loop = batch("box", "ideal", 2, "rps", engine)
@@ -415,7 +408,7 @@ def test_a_custom_law_is_compared_with_xla_before_a_run_once(mine, cache, monkey
 
 @pytest.mark.parity
 def test_a_sweep_of_a_custom_law_is_a_push_in_xla(mine, tmp_path, monkeypatch):
-    setting = Setting("fused", rules=Rules(horizon=8.0))
+    setting = setting_of(8.0, "fused")
     swept = sweep("mine", "wide,objects=box,gap=0.01", worlds=2, setting=setting, out=tmp_path)
     monkeypatch.setenv("RPS_COMPILER", "none")
     pushed = replay(tmp_path, 1)

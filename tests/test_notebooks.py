@@ -100,8 +100,9 @@ def test_notebooks_are_copied_without_outputs_and_overwrite_nothing(tmp_path, ca
     for name in notebooks.NAMES:
         copy = nbformat.read(folder / f"{name}.ipynb", as_version=4)
         nbformat.validate(copy)
-        code, expected = ([c.source for c in x.cells if c.cell_type == "code"]
-                          for x in (copy, stored(name)))  # fmt: skip
+        code, expected = (
+            [c.source for c in x.cells if c.cell_type == "code"] for x in (copy, stored(name))
+        )
         assert code == expected
         assert not any(cell.get("outputs") for cell in copy.cells)
         assert "](../" not in "".join(cell.source for cell in copy.cells)

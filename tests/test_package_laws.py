@@ -8,7 +8,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import rps
+from helpers import refusing, rps, setting_of, slow
+from numpy.testing import assert_array_equal
 
 import rps_jax
 from rps_jax.control import registry
@@ -16,13 +17,12 @@ from rps_jax.control.base import Law
 from rps_jax.control.observation import Details, Twist
 from rps_jax.control.registry import register_law
 from rps_jax.engines import native
-from rps_jax.errors import InputError
 from rps_jax.robot.robot import ROBOTS
 from rps_jax.robot.skin import SKINS
 from rps_jax.trials import pushes, trial
 from rps_jax.trials.case import Case
 from rps_jax.trials.setting import Setting
-from rps_jax.trials.trial import ControlLoop, Rules
+from rps_jax.trials.trial import ControlLoop
 
 ROOM = {"kind": "rooms", "outline": [[-1, -1], [4, -1], [4, 2], [-1, 2]], "goal": [2, 1]}
 TASKS = {"reach": "reach", "path": "path", "corridor": "corridor", "rooms": ROOM}
@@ -40,7 +40,7 @@ PAIRS = [
     for a, b in itertools.product(CHOICES[i], CHOICES[j])
     if (case := [a if k == i else b if k == j else x[-1] for k, x in enumerate(CHOICES)])
 ]
-MORE = [pytest.param(*x, marks=pytest.mark.slow) for x in dict.fromkeys(PAIRS) if x not in FEW]
+MORE = [slow(*x) for x in dict.fromkeys(PAIRS) if x not in FEW]
 
 
 @pytest.mark.parametrize(NAMES, [*FEW, *MORE])
@@ -56,7 +56,7 @@ def test_no_law_of_the_package_warns_that_it_is_slow(law, robot, task, skin, mon
         return
     case = Case("cylinder", **options)
     if law.startswith("learned") and case.base.shell.count != 42:
-        with pytest.raises(InputError, match="the law was learned with 42"):
+        with refusing("the law was learned with 42"):
             pushes.build([case], setting)
         return
     worlds = pushes.build([case], setting)
@@ -104,7 +104,7 @@ def test_a_custom_law_for_another_skin_is_refused_with_its_line(registries):
 
     register_law("fragile", Law(lambda params: (), step, "taxels"), Fragile())
     pushes.build([Case(law="fragile")], Setting())
-    with pytest.raises(InputError, match=r"step, for a robot with 51 taxels, of the law in .*42"):
+    with refusing(r"step, for a robot with 51 taxels, of the law in .*42"):
         pushes.build([Case(law="fragile", robot="ridgeback")], Setting())
 
 
@@ -118,7 +118,7 @@ def test_laws_that_ran_keep_their_results_when_another_fails(registries, tmp_pat
         return state, Twist(v, v, v), Details.from_obs(obs)
 
     register_law("fragile", Law(lambda params: (), step), Fragile())
-    setting = Setting("quasistatic", rules=Rules(horizon=1.0))
+    setting = setting_of(1.0)
     domain = "wide,objects=random_cylinder"
     options = {"worlds": 3, "setting": setting, "out": tmp_path}
     with (
@@ -129,4 +129,4 @@ def test_laws_that_ran_keep_their_results_when_another_fails(registries, tmp_pat
     results = rps_jax.load(tmp_path)
     assert results.law.values.tolist() == ["rps"]
     expected = rps_jax.sweep("rps", domain, worlds=3, setting=setting)
-    np.testing.assert_array_equal(results.base_pose, expected.base_pose)
+    assert_array_equal(results.base_pose, expected.base_pose)

@@ -54,8 +54,10 @@ def table(columns, rows):
 
 
 def test_a_table_follows_its_data_and_those_it_cites(rendered, tmp_path):
-    columns = [{"name": "what", "merge": True},
-               {"name": "rate", "format": "{:.1f} %", "rest": " [{}]"}]  # fmt: skip
+    columns = [
+        {"name": "what", "merge": True},
+        {"name": "rate", "format": "{:.1f} %", "rest": " [{}]"},
+    ]
     citation = {"from": "one", "row": ["a", 1.0], "column": "rate"}
     derived = {"columns": columns, "rows": [["b", citation]]}  # without a command
 
@@ -66,9 +68,12 @@ def test_a_table_follows_its_data_and_those_it_cites(rendered, tmp_path):
 
     text = page([["a", 1.0], ["a", [2.26, 3]]])
     for part in (
-        "| a | 1.0 % |\n|  | 2.3 % [3] |\n", "| b | 1.0 % |", "Device: a core",
-        "[from which table](two/results/two.json)", "(one/results/one.json)",
-    ):  # fmt: skip
+        "| a | 1.0 % |\n|  | 2.3 % [3] |\n",
+        "| b | 1.0 % |",
+        "Device: a core",
+        "[from which table](two/results/two.json)",
+        "(one/results/one.json)",
+    ):
         assert part in text
     with pytest.raises(ValueError, match=r"does not name one cell of one\.json"):
         page([["a", 1.5]])
@@ -87,8 +92,10 @@ def test_a_number_in_a_sentence_follows_its_data(rendered):
     rows = [["wide", "rps", "93.1 % [92.6, 93.6]", *rest], ["wide", "nps", "16.7 %", *rest]]
 
     def sentence(*numbers, cells=("rps | rate", "nps | rate", "nps | 90 %", "nps | way / 90 %")):
-        filled = [f"<!-- cell: one | wide | {at} -->{x}<!-- end -->"
-                  for at, x in zip(cells, numbers, strict=True)]  # fmt: skip
+        filled = [
+            f"<!-- cell: one | wide | {at} -->{x}<!-- end -->"
+            for at, x in zip(cells, numbers, strict=True)
+        ]
         return f"It wins {', and '.join(filled)}."
 
     text = rendered(sentence("9 %", "", "", ""), one=table(columns, rows))
@@ -104,29 +111,64 @@ def test_no_page_has_a_measured_number_without_a_cell_or_an_exception():
     assert TABLES["number_problems"]() == []
 
 
-@pytest.mark.parametrize("number", [
-    "99.34 %", "0.7 to 1.1 mm", "12 s", "26 µs", "1.7x", "1.7 x", "4.6 times", "30-fold",
-    "93 of 100", "140 out of 144", "3 minutes", "[92.6, 93.6]", "p = 0.003", "p < 1e-9",
-    "+12 -3", "3e-13", "a factor of 3.1", "1,525 kB", "2 hours", "93 percent", "1 %, 2 % and 3 %",
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "number",
+    [
+        "99.34 %",
+        "0.7 to 1.1 mm",
+        "12 s",
+        "26 µs",
+        "1.7x",
+        "1.7 x",
+        "4.6 times",
+        "30-fold",
+        "93 of 100",
+        "140 out of 144",
+        "3 minutes",
+        "[92.6, 93.6]",
+        "p = 0.003",
+        "p < 1e-9",
+        "+12 -3",
+        "3e-13",
+        "a factor of 3.1",
+        "1,525 kB",
+        "2 hours",
+        "93 percent",
+        "1 %, 2 % and 3 %",
+    ],
+)
 def test_a_measured_number_in_a_sentence_needs_a_cell(number, tmp_path):
     page = tmp_path / "page.md"
     page.write_text(f"# Result\n\nThe law reaches\n{number} here.\n")
     assert TABLES["loose_numbers"](TABLES["prose"](page))
     assert not TABLES["loose_numbers"](TABLES["prose"](page), [number, "1 %", "2 % and 3 %"])
-    for shown in (f"<!-- cell: a | b -->{number}<!-- end -->", f"`{number}`", f"```\n{number}\n```",
-                  f"[page](x_{number.replace(' ', '_')}.md)",
-                  f"<!-- table: x -->\n| {number} |\n<!-- end -->"):  # fmt: skip
+    for shown in (
+        f"<!-- cell: a | b -->{number}<!-- end -->",
+        f"`{number}`",
+        f"```\n{number}\n```",
+        f"[page](x_{number.replace(' ', '_')}.md)",
+        f"<!-- table: x -->\n| {number} |\n<!-- end -->",
+    ):
         page.write_text(f"It is\n{shown}\n here.\n")
         assert not TABLES["loose_numbers"](TABLES["prose"](page))
 
 
-@pytest.mark.parametrize("text", [
-    "in 2024", "Eq. 5, Fig. 6, Table 2 and Sec. 3",
-    "MuJoCo 3.17, Python 3.11 to 3.14, ROS 2 and C99",
-    "Wilson 95 % intervals", "90 % intervals", "5 and 95 % quantiles", "steps of 10 ms", "at 50 Hz",
-    "the 432 trials of three laws", "1. Choose the law", "a mass of 3 to 60 kg, 0.5 m ahead",
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "text",
+    [
+        "in 2024",
+        "Eq. 5, Fig. 6, Table 2 and Sec. 3",
+        "MuJoCo 3.17, Python 3.11 to 3.14, ROS 2 and C99",
+        "Wilson 95 % intervals",
+        "90 % intervals",
+        "5 and 95 % quantiles",
+        "steps of 10 ms",
+        "at 50 Hz",
+        "the 432 trials of three laws",
+        "1. Choose the law",
+        "a mass of 3 to 60 kg, 0.5 m ahead",
+    ],
+)
 def test_a_definition_needs_no_cell(text, tmp_path):
     (tmp_path / "page.md").write_text(f"It is {text}.\n")
     assert not TABLES["loose_numbers"](TABLES["prose"](tmp_path / "page.md"))

@@ -4,6 +4,8 @@ import numpy as np
 import pytest
 import xarray as xr
 from helpers import ROOT
+from numpy.random import default_rng
+from numpy.testing import assert_allclose, assert_array_equal
 
 from rps_jax.control.laws.rps import RPSParams
 from rps_jax.robot.robot import ROBOTS
@@ -15,7 +17,7 @@ from sweeps.paper_reading import drawing, evidence, experiments, printed
 from sweeps.paper_reading.printed import NUMBERS, Printed
 from sweeps.paper_reading.unknowns import NAMES, UNKNOWNS, Proposal, redraw_hardware, texts
 
-RNG = np.random.default_rng(0)
+RNG = default_rng(0)
 
 
 @pytest.mark.parametrize(
@@ -35,7 +37,7 @@ RNG = np.random.default_rng(0)
 def test_the_likelihood_of_a_number_equals_one_by_hand(number, simulated, trials, likelihood):
     with np.errstate(divide="ignore"):
         ours = number.log_likelihood(np.array([simulated]), trials)
-    np.testing.assert_allclose(np.exp(ours), [likelihood], rtol=1e-6)
+    assert_allclose(np.exp(ours), [likelihood], rtol=1e-6)
 
 
 def test_the_papers_numbers_are_all_there():
@@ -76,8 +78,8 @@ def test_d_and_time_count_from_the_start_or_in_contact():
     trials = {name: np.full(shape, x) for name, x in trials.items()}
     trials["success"][:, 1] = 0
     found = experiments._hardware_numbers(u, trials)
-    np.testing.assert_allclose(found["hardware, box: D"], [0.04, 0.04 * (63 - approach) / 80])
-    np.testing.assert_allclose(found["hardware, box: time"], [80, 80 - approach])
+    assert_allclose(found["hardware, box: D"], [0.04, 0.04 * (63 - approach) / 80])
+    assert_allclose(found["hardware, box: time"], [80, 80 - approach])
     assert list(found["hardware, cylinder: successes"]) == [0, 0]
     assert np.isnan(found["hardware, cylinder: D"]).all()
 
@@ -86,10 +88,10 @@ def test_proposals_are_densities_whose_weights_recover_a_posterior():
     at = NAMES.index("saturate_first")
     weights = dict.fromkeys(("text", "hardware", "simulation"), np.ones(400))
     fitted = Proposal.fitted(RNG.random((400, len(NAMES))) ** 1.5, weights)
-    np.testing.assert_allclose(fitted.shares.sum(1), 1)
+    assert_allclose(fitted.shares.sum(1), 1)
     assert (fitted.shares[:, 0] > 1.2 * fitted.shares[:, -1]).all()
     u = Proposal.prior().sample(50, RNG)
-    np.testing.assert_allclose(Proposal.prior().log_density(u), 0, atol=1e-12)
+    assert_allclose(Proposal.prior().log_density(u), 0, atol=1e-12)
     # The likelihood of "yes" is four times that of "no", whatever the proposal.
     tilted = Proposal(np.where(np.arange(len(NAMES))[:, None] == at, fitted.shares, 1 / 6))
     u = tilted.sample(20_000, RNG)
@@ -119,7 +121,7 @@ def test_redrawn_hardware_leaves_the_text_and_the_simulation():
         if unknown.part == "hardware":
             assert len(np.unique(redrawn[:, i])) == 12
         else:
-            np.testing.assert_array_equal(redrawn[:, i], np.repeat(u[:, i], 4))
+            assert_array_equal(redrawn[:, i], np.repeat(u[:, i], 4))
 
 
 AS_TOLD = {  # a trial as the text tells of Fig. 6
@@ -187,8 +189,11 @@ def toy():
 def test_the_closest_draw_agrees_with_the_paper(toy):
     assert evidence.closest(toy) == 1
     rows = {row[0]: row for row in evidence.numbers_table(toy)}
-    assert rows["hardware, box: D"][1:4] == ["0.032 m", "0.016 [0.016, 0.032]",
-                                             "0.032 [0.032, 0.032]"]  # fmt: skip
+    assert rows["hardware, box: D"][1:4] == [
+        "0.032 m",
+        "0.016 [0.016, 0.032]",
+        "0.032 [0.032, 0.032]",
+    ]
     assert rows["Table II, RPS, cylinder S1"][-2:] == ["19 of 24", "yes"]
     assert rows["inside the interval: cells of Table II"][5] == "18 of 18"
     assert rows["inside the interval: all of these"][5] == "32 of 32"

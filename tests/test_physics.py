@@ -14,6 +14,8 @@ import jax
 import mujoco
 import numpy as np
 import pytest
+from helpers import slow
+from numpy.random import default_rng
 from scipy.optimize import minimize_scalar
 from staging import simulate, staged
 from test_quasistatic import stuck
@@ -142,7 +144,7 @@ def all_films(request):
 
 
 # MJX compiles for long; in other tests, and in few steps, it agrees with C MuJoCo.
-MJX = pytest.param("mjx", marks=pytest.mark.slow)
+MJX = slow("mjx")
 IN_ALL = pytest.mark.parametrize("all_films", [MJX, "fused", "mujoco"], indirect=True)
 
 
@@ -183,10 +185,13 @@ def test_a_box_pushed_at_the_papers_speed_stays_on_the_ground(friction):
     assert film.qvel[25:, 5].std() < 1e-3
 
 
-@pytest.mark.parametrize(("engine", "name", "way", "yaw"), [
-    *(("mujoco", name, 1.5e-3, math.radians(0.1)) for name in OBJECTS),
-    *(("fused", name, 1e-5, 1e-6) for name in MASS),  # in float32
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("engine", "name", "way", "yaw"),
+    [
+        *(("mujoco", name, 1.5e-3, math.radians(0.1)) for name in OBJECTS),
+        *(("fused", name, 1e-5, 1e-6) for name in MASS),  # in float32
+    ],
+)
 def test_an_object_at_rest_hardly_creeps_in_a_minute(engine, name, way, yaw):
     calm = replace(STANDARD, control_period=1.0)
     (film,) = films_in_engine(engine, [World(gap=1.0, name=name)], calm, seconds=60.0)
@@ -263,7 +268,7 @@ def test_a_nearly_upright_cylinder_touches_only_with_its_rim_in_mjx():
     loaded = scene.load("cylinder")
     model, data = mjx.put_model(loaded.physics), mjx.make_data(loaded.physics)
     tilt = np.repeat([0.0, 1e-7, 1e-6, 1e-5, 1e-4], 40)
-    yaw, towards = np.random.default_rng(0).uniform(-3, 3, (2, tilt.size))
+    yaw, towards = default_rng(0).uniform(-3, 3, (2, tilt.size))
     qpos = np.tile(scene.initial_qpos(loaded, gap=1.0), (tilt.size, 1))
     (qpos[:, 6], qpos[:, 9]), leaning = (np.cos(yaw / 2), np.sin(yaw / 2)), np.sin(tilt / 2)
     qpos[:, 7], qpos[:, 8] = leaning * np.cos(towards), leaning * np.sin(towards)

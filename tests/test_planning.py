@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 
 from rps_jax.trials.setting import Setting
 from sweeps.planning import plans, study
@@ -27,11 +28,11 @@ def test_exact_derivatives_equal_differences(problem):
     theta = plans.straight(3) + 0.1
     errors, exact = problem.jacobian(theta)
     same, differences = problem.differences(theta)
-    np.testing.assert_allclose(errors, same, atol=1e-4)
-    np.testing.assert_allclose(exact, differences, atol=0.1 * np.abs(exact).max())
+    assert_allclose(errors, same, atol=1e-4)
+    assert_allclose(exact, differences, atol=0.1 * np.abs(exact).max())
     cost, gradient = problem.gradient(theta)
     expected = np.einsum("ni,nik->nk", cost, exact).reshape(gradient.shape)
-    np.testing.assert_allclose(gradient, expected, rtol=1e-4, atol=1e-4 * np.abs(expected).max())
+    assert_allclose(gradient, expected, rtol=1e-4, atol=1e-4 * np.abs(expected).max())
     # Twists before the first knot have no effect.
     _, late = problem._replace(first=KNOTS - 1).jacobian(theta)
     late = late.reshape(3, 3, KNOTS, 3)
@@ -46,7 +47,7 @@ def test_methods_yield_their_best_plans(name, problem):
     assert (np.diff(costs, axis=0) <= 0).all()
     assert costs[-1].sum() < costs[0].sum()
     theta, errors, _ = steps[-1]
-    np.testing.assert_allclose(problem.samples(theta[:, None])[:, 0], errors, atol=1e-3)
+    assert_allclose(problem.samples(theta[:, None])[:, 0], errors, atol=1e-3)
     assert np.diff([count for _, _, count in steps]).min() > 0
 
 
@@ -65,10 +66,8 @@ def test_a_model_knows_the_shape_alone():
     """Same objects and starts, with other friction and another centre of mass."""
     nominal = replace(study.TOUCHING, **study._NOMINAL)
     (model, _), (true, _) = (study.worlds_of(x, *DRUMS) for x in (nominal, study.TOUCHING))
-    np.testing.assert_array_equal(model.qpos, true.qpos)
-    np.testing.assert_array_equal(model.footprint.radius, true.footprint.radius)
+    assert_array_equal(model.qpos, true.qpos)
+    assert_array_equal(model.footprint.radius, true.footprint.radius)
     outlines = study.outlines(true)
     size = np.linalg.norm(outlines, axis=-1)
-    np.testing.assert_allclose(
-        size, np.asarray(true.footprint.radius)[:, None] + 0 * size, rtol=1e-5
-    )
+    assert_allclose(size, np.asarray(true.footprint.radius)[:, None] + 0 * size, rtol=1e-5)

@@ -4,8 +4,9 @@ import doctest
 
 import numpy as np
 import pytest
+from helpers import refusing
+from numpy.testing import assert_allclose
 
-from rps_jax.errors import InputError
 from rps_jax.geometry import solid
 from rps_jax.geometry.solid import rotate
 from sweeps.real_pushes import fingers, pushes, study
@@ -34,10 +35,10 @@ def test_a_push_through_the_centre_of_friction_translates(model, friction):
         options = {"feet": feet, "com": com, "time": [2.0, 3.0, 5.0], "friction_finger": friction}
         result = moved(path, model=model, **options)
         x, y, yaw = result.object_pose.values.T
-        np.testing.assert_allclose(x, [0, 0.019, 0.039], atol=1e-6)
-        np.testing.assert_allclose([y, yaw], 0, atol=1e-6)
-        np.testing.assert_allclose(result.force[-1], [FORCE, 0], atol=2e-3 * FORCE)
-        np.testing.assert_allclose(result.gap[1:], 0, atol=1e-6)
+        assert_allclose(x, [0, 0.019, 0.039], atol=1e-6)
+        assert_allclose([y, yaw], 0, atol=1e-6)
+        assert_allclose(result.force[-1], [FORCE, 0], atol=2e-3 * FORCE)
+        assert_allclose(result.gap[1:], 0, atol=1e-6)
         assert result.object_pose.dims == ("time", "pose")
         assert list(result.time.values) == [2.0, 3.0, 5.0]
         assert result.force.attrs["units"] == "N"
@@ -47,7 +48,7 @@ def test_a_push_through_the_centre_of_friction_translates(model, friction):
 def test_two_fingers_about_the_centre_do_not_turn_it(model):
     two = np.stack([np.add(AHEAD, (0, 0.03)), np.subtract(AHEAD, (0, 0.03))], axis=1)
     result = moved(two, model=model, friction_finger=0.05)
-    np.testing.assert_allclose(result.object_pose[-1], [0.039, 0, 0], atol=2e-5)
+    assert_allclose(result.object_pose[-1], [0.039, 0, 0], atol=2e-5)
     assert result.gap.dims == ("time", "finger")
 
 
@@ -58,7 +59,7 @@ def test_mirrored_pushes_have_mirrored_motions():
     assert poses[0, -1, 2] < -0.1
     assert (force > 0.1 * FORCE).all()
     assert (force < 0.98 * FORCE).all()  # a turning object resists less
-    np.testing.assert_allclose(poses[1], poses[0] * [1, -1, -1], atol=1e-5)
+    assert_allclose(poses[1], poses[0] * [1, -1, -1], atol=1e-5)
 
 
 def test_an_off_centre_push_turns_about_the_point_of_the_limit_surface():
@@ -74,7 +75,7 @@ def test_an_off_centre_push_turns_about_the_point_of_the_limit_surface():
     cross = np.array([[1, 0, -r[1]], [0, 1, r[0]]])
     inverse = np.diag([1, 1, 1 / arm**2])
     twist = inverse @ cross.T @ np.linalg.solve(cross @ inverse @ cross.T, [way, 0])
-    np.testing.assert_allclose(result.object_pose[-1], twist, atol=2e-5)
+    assert_allclose(result.object_pose[-1], twist, atol=2e-5)
 
 
 def test_friction_decides_between_sticking_and_sliding():
@@ -100,16 +101,17 @@ def test_motions_are_similar():
     path = np.array([[-0.101, 0.04], [-0.06, 0.05]])
     first = moved(path, feet=FEET)
     light = moved(path, feet=FEET, mass=0.5, friction_ground=0.9, time=[0.0, 100.0])
-    np.testing.assert_allclose(light.object_pose, first.object_pose, atol=1e-12)
+    assert_allclose(light.object_pose, first.object_pose, atol=1e-12)
     assert light.force.values == pytest.approx(first.force.values * 0.75)
     for k in (0.1, 10.0):
         large = moved(k * path, k * SQUARE, feet=k * FEET)
-        np.testing.assert_allclose(large.object_pose, first.object_pose * [k, k, 1], rtol=1e-6)
+        assert_allclose(large.object_pose, first.object_pose * [k, k, 1], rtol=1e-6)
     pose = np.array([0.3, -0.2, 2.0])
     turned = moved(pose[:2] + rotate(pose[2], path), feet=FEET, pose=pose)
-    expected = pose + np.column_stack([rotate(2.0, first.object_pose.values[:, :2]),
-                                       first.object_pose.values[:, 2]])  # fmt: skip
-    np.testing.assert_allclose(turned.object_pose, expected, atol=1e-5)
+    expected = pose + np.column_stack(
+        [rotate(2.0, first.object_pose.values[:, :2]), first.object_pose.values[:, 2]]
+    )
+    assert_allclose(turned.object_pose, expected, atol=1e-5)
 
 
 def test_many_pushes_are_those_of_single_calls():
@@ -119,7 +121,7 @@ def test_many_pushes_are_those_of_single_calls():
     assert batch.object_pose.dims == ("push", "time", "pose")
     for i in range(2):
         single = moved(path[i], pose=pose[i], friction_finger=friction[i])
-        np.testing.assert_allclose(single.object_pose, batch.object_pose[i], atol=1e-6)
+        assert_allclose(single.object_pose, batch.object_pose[i], atol=1e-6)
 
 
 def test_a_missed_object_stays():
@@ -132,7 +134,7 @@ def test_a_missed_object_stays():
 def test_height_moves_the_load_and_may_tip():
     low, high = (moved(np.add(AHEAD, (0, 0.03)), feet=FEET, height=z) for z in (0.0, 0.1))
     assert abs(float((high - low).object_pose[-1, 2])) > 0.01
-    with pytest.raises(InputError, match=r"height = 0\.5 m is not allowed: the object would tip"):
+    with refusing(r"height = 0\.5 m is not allowed: the object would tip"):
         moved(feet=FEET, height=0.5)
 
 
@@ -201,7 +203,7 @@ REFUSED = {
 
 @pytest.mark.parametrize(("options", "message"), REFUSED.values(), ids=REFUSED)
 def test_invalid_input_is_refused_in_one_sentence(options, message):
-    with pytest.raises(InputError, match=message) as refusal:
+    with refusing(message) as refusal:
         moved(**options)
     assert "\n" not in str(refusal.value)
 
@@ -237,16 +239,15 @@ def test_feet_bear_the_weight_about_its_centre():
     load = solid.supported_load(at, weight, centre)
     assert load.sum() == pytest.approx(1)
     assert (load >= 0).all()
-    np.testing.assert_allclose(np.einsum("bs,bsi->bi", load, at), centre, atol=1e-12)
+    assert_allclose(np.einsum("bs,bsi->bi", load, at), centre, atol=1e-12)
 
 
 def test_nearest_is_the_edge_or_the_corner():
     points = np.array([[0.05, -0.01], [-0.03, -0.04], [0.1, 0.1], [0.05, 0.05]])
     gap, normal = fingers.nearest(pushes.OUTLINE, points)
     root = np.sqrt(0.5)
-    np.testing.assert_allclose(gap, [0.01, 0.05, 0.05 * root, -0.05 * root], atol=1e-12)
-    np.testing.assert_allclose(normal, [[0, -1], [-0.6, -0.8], [root, root], [root, root]],
-                               atol=1e-12)  # fmt: skip
+    assert_allclose(gap, [0.01, 0.05, 0.05 * root, -0.05 * root], atol=1e-12)
+    assert_allclose(normal, [[0, -1], [-0.6, -0.8], [root, root], [root, root]], atol=1e-12)
 
 
 @pytest.mark.parametrize("corners", [3, 7, 72])
@@ -256,5 +257,5 @@ def test_a_uniform_pressure_has_the_area_and_the_centre_of_its_outline(corners):
     points = uniform_pressure(outline, np.array([0.3, 0.1]))
     area = 0.01 * corners * np.sin(2 * np.pi / corners) / 2
     assert points[:, 2].sum() == pytest.approx(area)
-    np.testing.assert_allclose(points[:, 2] @ points[:, :2] / area, [0.3, 0.1])
+    assert_allclose(points[:, 2] @ points[:, :2] / area, [0.3, 0.1])
     assert (fingers.nearest(outline, points[:, :2])[0] < 0).all()

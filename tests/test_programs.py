@@ -9,6 +9,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from helpers import setting_of
+from numpy.testing import assert_array_equal
 
 from rps_jax.control import registry
 from rps_jax.control.laws import rps
@@ -19,7 +21,6 @@ from rps_jax.runs.sweep import Sweep
 from rps_jax.trials import pushes, trial
 from rps_jax.trials.case import Case
 from rps_jax.trials.setting import Setting
-from rps_jax.trials.trial import Rules
 
 
 @pytest.fixture
@@ -66,13 +67,13 @@ def test_a_recorded_trial_is_traced_once_for_all_processes(cache, monkeypatch):
     """A cached trial returns the same named tuples as a traced one."""
     traced, advance = [], trial.advance
     monkeypatch.setattr(trial, "advance", lambda *a: traced.append(1) or advance(*a))
-    setting = Setting("quasistatic", rules=Rules(horizon=0.2))
+    setting = setting_of(0.2)
     worlds = pushes.build([Case("box")], setting)
     first, again = (pushes.record_batch(worlds, setting)[0] for _ in range(2))
     assert len(traced) == 1
     assert jax.tree.structure(first.snapshots) == jax.tree.structure(again.snapshots)
     assert jax.tree.structure(first.outcome) == jax.tree.structure(again.outcome)
-    np.testing.assert_array_equal(first.snapshots.qpos, again.snapshots.qpos)
+    assert_array_equal(first.snapshots.qpos, again.snapshots.qpos)
 
 
 def test_a_program_with_results_of_unknown_type_is_not_cached(cache, compiler):
@@ -91,8 +92,12 @@ def test_a_damaged_program_is_dropped_with_one_line(damage, cache, compiler):
     content = file.read_bytes()
     run(n=2)
     (other,) = {*cache.iterdir()} - {file}
-    contents = {"cut": content[:100], "empty": b"", "of another program": other.read_bytes(),
-                "flipped": content[:-1] + bytes([content[-1] ^ 1])}  # fmt: skip
+    contents = {
+        "cut": content[:100],
+        "empty": b"",
+        "of another program": other.read_bytes(),
+        "flipped": content[:-1] + bytes([content[-1] ^ 1]),
+    }
     file.write_bytes(contents[damage])
     count = len(traced)
     with pytest.warns(UserWarning, match="is dropped, and traced again: it") as warnings:
@@ -179,9 +184,14 @@ def test_small_sweeps_run_on_the_cpu(monkeypatch):
         jax.config.update("jax_platforms", previous)
 
 
-@pytest.mark.parametrize(("release", "machine", "needs_avx"), [
-    ("0.11.2", "x86_64", False), ("0.12.0.1", "x86_64", True), ("0.13.1", "arm64", False),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("release", "machine", "needs_avx"),
+    [
+        ("0.11.2", "x86_64", False),
+        ("0.12.0.1", "x86_64", True),
+        ("0.13.1", "arm64", False),
+    ],
+)
 def test_jax_with_fusion_by_slot_gets_the_avx_flag(release, machine, needs_avx, monkeypatch):
     monkeypatch.setenv("XLA_FLAGS", "--xla_of_ones_own")
     monkeypatch.setattr(device.metadata, "version", lambda _: release)

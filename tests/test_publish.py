@@ -10,7 +10,9 @@ from fnmatch import fnmatch
 import numpy as np
 import pytest
 import xarray as xr
-from helpers import ROOT, rps
+from helpers import ROOT, rps, setting_of
+from numpy.random import default_rng
+from numpy.testing import assert_allclose, assert_array_equal
 
 from rps_jax import sweep
 from rps_jax.app.cli import names
@@ -46,12 +48,17 @@ def recipe_folder(tmp_path, monkeypatch):
     """Folder with the data files of three recipes; the second recipe fails."""
     shutil.copytree(SWEEPS / "table" / "results", tmp_path / "study" / "results")
     recipes = {
-        "first": Recipe((f"{PUSH} --laws rps --out runs/one",), 1, None, "Success", ("drums",),
-                        ("", "all")),
+        "first": Recipe(
+            (f"{PUSH} --laws rps --out runs/one",), 1, None, "Success", ("drums",), ("", "all")
+        ),
         "broken": Recipe((f"{PUSH} --laws none",), 1, None, "Success"),
-        "second": Recipe((f"{PUSH} --laws rps --out runs/one",), 1, None,
-                         lambda results: [["worlds"], [str(results.sizes["world"])]]),
-    }  # fmt: skip
+        "second": Recipe(
+            (f"{PUSH} --laws rps --out runs/one",),
+            1,
+            None,
+            lambda results: [["worlds"], [str(results.sizes["world"])]],
+        ),
+    }
     monkeypatch.setattr(study, "RECIPES", recipes)
     monkeypatch.setattr(study, "_SWEEPS", tmp_path)
     return tmp_path
@@ -63,8 +70,9 @@ def test_failed_recipes_are_named_and_the_others_are_run(recipe_folder, capsys):
     output = capsys.readouterr()
     assert "1 of the files could not be computed: broken." in output.err
     assert "unknown law 'none'" in output.out
-    first, second = (json.loads((recipe_folder / f"results/{n}.json").read_text())
-                     for n in ("first", "second"))  # fmt: skip
+    first, second = (
+        json.loads((recipe_folder / f"results/{n}.json").read_text()) for n in ("first", "second")
+    )
     assert [column["name"] for column in first["columns"]] == ["", "law", "all"]
     assert first["rows"][0][:2] == ["drums", "rps"]
     assert second["rows"] == [["3"]]
@@ -146,21 +154,33 @@ def test_a_stale_file_must_be_listed_and_a_current_one_must_not(
     assert state in output.out
 
 
-def test_a_small_run_gives_its_record_again(tmp_path, monkeypatch):
-    monkeypatch.setattr(probes, "FILE", tmp_path / "probes.json")
+def test_a_small_run_gives_its_record_again_and_unused_records_are_removed(tmp_path, monkeypatch):
+    for name in ("publish", "results"):
+        (tmp_path / name).mkdir()
+    monkeypatch.setattr(probes, "FILE", tmp_path / "publish" / "probes.json")
     probe = "export_js"
     id = probes.store(probe, probes.run(probe))
     probes.run.cache_clear()
     assert probes.differences({probe: id}) == []
     (row,) = probes.stored()[probe][id]["variables"].values()
     assert row[2] > abs(row[1]) > 0  # root mean square, and mean
-    assert probes.used([{probe: id}]) == probes.stored()
-    assert probes.used([{probe: "other"}]) == {}
+    table = files.write_json(tmp_path / "results" / "js.json", {"probes": {probe: id}})
+    probes.store(probe, RECORD)
+    probes.remove_unused()
+    assert [*probes.stored()[probe]] == [id]
+    table.unlink()
+    probes.remove_unused()
+    assert probes.stored() == {}
 
 
 def test_the_note_of_a_table_says_that_its_numbers_are_stale(monkeypatch):
-    data = {"command": ["rps table"], "versions": {"rps_jax": "0.3.0"},
-            "device": "", "date": "", "rows": [["x"]]}  # fmt: skip
+    data = {
+        "command": ["rps table"],
+        "versions": {"rps_jax": "0.3.0"},
+        "device": "",
+        "date": "",
+        "rows": [["x"]],
+    }
     cited = {"command": None, "rows": [["x", {"from": "table"}], ["y", {"from": "ladder"}]]}
     monkeypatch.setattr(render_tables, "STALE", {})
     assert render_tables.caption("table", data, "t.json") == (
@@ -188,7 +208,7 @@ def test_laws_with_default_and_tuned_parameters_are_compared():
 def test_a_comparison_names_laws_by_the_runs_that_tuned_them():
     objects = ("random_cylinder", "random_box")
     domain = replace(DOMAINS["wide"], objects=objects, distance=Range(0.7, 0.8))
-    setting = Setting("quasistatic", rules=Rules(horizon=20.0))
+    setting = setting_of(20.0)
     laws = {"rps": "rps", "rps,a/runs/gradient/tuned.json": "rps_tuned"}
     results = xr.DataTree.from_dict({"near": sweep(laws, domain, 12, setting=setting, slots=32)})
     head, first, second = rows.comparison(results)
@@ -201,11 +221,15 @@ def test_a_comparison_names_laws_by_the_runs_that_tuned_them():
 
 
 def test_success_is_grouped_by_force_lag_and_acceleration():
-    rng = np.random.default_rng(3)
+    rng = default_rng(3)
     limits = {
-        "robot_force": (150, 800), "robot_traction": (0.3, 0.8), "robot_lag": (0, 0.5),
-        "robot_acceleration": (0.1, 1), "friction_ground": (0.1, 0.7), "mass": (3, 60),
-    }  # fmt: skip
+        "robot_force": (150, 800),
+        "robot_traction": (0.3, 0.8),
+        "robot_lag": (0, 0.5),
+        "robot_acceleration": (0.1, 1),
+        "friction_ground": (0.1, 0.7),
+        "mass": (3, 60),
+    }
     drawn = {name: ("world", rng.uniform(*interval, 4000)) for name, interval in limits.items()}
     results = xr.Dataset(drawn, {"law": ["rps"]})
     force = np.minimum(results.robot_force, results.robot_traction * 130 * 9.81)
@@ -224,9 +248,13 @@ def test_success_is_grouped_by_force_lag_and_acceleration():
 
 
 def test_speeds_are_grouped_by_engine_and_batch():
-    measured = [("C in closed loop", 64, "box", 100.0), ("C in closed loop", 64, "prism", 50.0),
-                ("fused", 4096, "box", 200_000.0), ("fused", 8, "box", 50.0),
-                ("fused", 8, "prism", 25.0)]  # fmt: skip
+    measured = [
+        ("C in closed loop", 64, "box", 100.0),
+        ("C in closed loop", 64, "prism", 50.0),
+        ("fused", 4096, "box", 200_000.0),
+        ("fused", 8, "box", 50.0),
+        ("fused", 8, "prism", 25.0),
+    ]
     fields = zip(("name", "worlds", "family", "rate"), zip(*measured, strict=True), strict=True)
     results = xr.Dataset({name: ("measurement", list(values)) for name, values in fields})
     assert speed.table(results) == [
@@ -238,8 +266,13 @@ def test_speeds_are_grouped_by_engine_and_batch():
 
 
 def test_rare_failures_have_rows_of_the_median_and_of_all_repetitions():
-    repetitions = {"p": [0.1, 0.2, 0.6], "low": [0.0, 0.1, 0.3], "high": [0.2, 0.3, 0.9],
-            "variation": [0.5, 0.4, 0.3], "trials": [100, 200, 300]}  # fmt: skip
+    repetitions = {
+        "p": [0.1, 0.2, 0.6],
+        "low": [0.0, 0.1, 0.3],
+        "high": [0.2, 0.3, 0.9],
+        "variation": [0.5, 0.4, 0.3],
+        "trials": [100, 200, 300],
+    }
     results = xr.Dataset({name: ("repetition", values) for name, values in repetitions.items()})
     drawn = {"p": 0.25, "low": 0.2, "high": 0.3, "variation": 0.1, "trials": 400}
     with_drawn = results.assign({f"drawn_{name}": value for name, value in drawn.items()})
@@ -282,15 +315,15 @@ def test_the_code_of_the_page_reads_a_million_outcomes(tmp_path, monkeypatch, ca
     assert results.attrs["seed"] == seeded.seed  # with which the page draws the worlds again
     swept = sweep(laws, near, 19, setting=seeded, slots=32)
     bits = np.unpackbits(results.success.values, axis=1, count=19)
-    np.testing.assert_array_equal(bits, swept.success)
-    np.testing.assert_array_equal(results.how == 0, swept.success)
+    assert_array_equal(bits, swept.success)
+    assert_array_equal(results.how == 0, swept.success)
     assert 0 < bits.sum() < bits.size
     period = results.attrs["control_period"]
-    np.testing.assert_allclose(results.steps * period, swept.time, atol=1e-4)
+    assert_allclose(results.steps * period, swept.time, atol=1e-4)
     distance = 1000 * swept.min_distance.values
     touched = np.isfinite(distance)
-    np.testing.assert_array_equal(results.missed.values < million.UNTOUCHED, touched)
-    np.testing.assert_allclose(results.missed.values[touched], distance[touched], atol=0.51)
+    assert_array_equal(results.missed.values < million.UNTOUCHED, touched)
+    assert_allclose(results.missed.values[touched], distance[touched], atol=0.51)
     page = (SWEEPS / "random_worlds" / "README.md").read_text()
     (code,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
     monkeypatch.chdir(tmp_path)

@@ -10,7 +10,9 @@ import chromium
 import jax
 import numpy as np
 import pytest
-from helpers import ROOT
+from helpers import ROOT, slow
+from numpy.random import default_rng
+from numpy.testing import assert_allclose
 from selenium.webdriver.common.action_chains import ActionChains
 from selenium.webdriver.common.by import By
 from shapely import LineString, Point
@@ -69,7 +71,7 @@ def twists(live):
     return np.array([np.stack(step.snapshot.twist) for step in live.past])
 
 
-@pytest.mark.parametrize("law", ["rps_plus", pytest.param("rps_tuned", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("law", ["rps_plus", slow("rps_tuned")])
 def test_a_whole_push_has_the_twists_of_python(law, browser):
     with python_push(law) as live:
         expected = twists(live)
@@ -77,7 +79,7 @@ def test_a_whole_push_has_the_twists_of_python(law, browser):
     success, computed = browser.execute_script(WHOLE_PUSH, law, "box")
     assert success
     assert len(computed) == len(expected) > 5000
-    np.testing.assert_allclose(computed, expected, rtol=0, atol=1e-5)
+    assert_allclose(computed, expected, rtol=0, atol=1e-5)
 
 
 ROUTE = [[0.4, 0.0], [1.5, 0.0], [2.5, 0.7], [4.0, 0.8]]
@@ -93,9 +95,9 @@ return [push.trial.steps, push.touched(), push.outcomes, [twist.v_x, twist.v_y, 
 @pytest.mark.parametrize(
     ("kind", "width", "door", "touched"),
     [
-        pytest.param("corridor", 1.0, 0.9, "base", marks=pytest.mark.slow),
-        pytest.param("corridor", 1.8, 0.9, "", marks=pytest.mark.slow),
-        pytest.param("path", 2, 1, "", marks=pytest.mark.slow),
+        slow("corridor", 1.0, 0.9, "base"),
+        slow("corridor", 1.8, 0.9, ""),
+        slow("path", 2, 1, ""),
     ],
 )
 def test_a_task_has_the_outcomes_of_python(kind, width, door, touched, browser):
@@ -108,11 +110,11 @@ def test_a_task_has_the_outcomes_of_python(kind, width, door, touched, browser):
     count, who, outcomes, twist = browser.execute_script(IN_A_TASK, kind, ROUTE, width, door)
     assert (who, bool(expected.success)) == (touched, not touched)
     assert abs(count - steps) <= 1
-    np.testing.assert_allclose(twist, last, atol=1e-6)
+    assert_allclose(twist, last, atol=1e-6)
     assert set(outcomes) == set(expected.task)
     for name, value in expected.task.items():
         computed = np.nan if outcomes[name] is None else outcomes[name]
-        np.testing.assert_allclose(computed, value, atol=1e-6, err_msg=name)
+        assert_allclose(computed, value, atol=1e-6, err_msg=name)
 
 
 def drawn(browser, points):
@@ -150,12 +152,13 @@ def test_a_drawn_path_is_a_task_of_the_command_line(paused, tmp_path):
 
 BAD_DRAWINGS = {
     "path starts inside the robot: start it at the front of the base, (0.36, 0.00) m.": [
-        [0.1, 0.1], [2, 0],
+        [0.1, 0.1],
+        [2, 0],
     ],
     "start it within 0.5 m of the base's front": [[2, 2], [3, 2]],
     "draw at least 0.5 m.": [[0.5, 0], [0.6, 0]],
     "draw wider turns, or narrow the corridor.": [[0.5, 0], [3, 0], [1, 1]],
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("sentence", BAD_DRAWINGS)
@@ -179,7 +182,7 @@ def test_a_corridor_that_is_too_narrow_is_refused(paused):
     assert paused.execute_script(script, 1.6) == ["", True]
 
 
-@pytest.mark.parametrize("law", ["rps", pytest.param("learned", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("law", ["rps", slow("learned")])
 def test_each_state_of_a_push_gives_the_twist_of_python(law, browser):
     """At the bound of tan(gamma), the paper's law amplifies a difference fourfold per step.
 
@@ -195,8 +198,8 @@ def test_each_state_of_a_push_gives_the_twist_of_python(law, browser):
         next_qpos = np.array([live.past[i + 1].snapshot.qpos for i in shown])
     batches = [states[i : i + 500] for i in range(0, len(states), 500)]
     computed = np.concatenate([browser.execute_script(SINGLE_STEPS, law, x) for x in batches])
-    np.testing.assert_allclose(computed[:, :3], expected[list(shown)], rtol=0, atol=1e-5)
-    np.testing.assert_allclose(computed[:, 3:], next_qpos, rtol=0, atol=1e-7)
+    assert_allclose(computed[:, :3], expected[list(shown)], rtol=0, atol=1e-5)
+    assert_allclose(computed[:, 3:], next_qpos, rtol=0, atol=1e-7)
 
 
 def leaves_by_name(trees):
@@ -210,7 +213,7 @@ def leaves_by_name(trees):
 @pytest.mark.parametrize("corners", [1, 4, 6])
 def test_the_support_of_an_object_equals_that_of_the_package(corners):
     """The page recomputes centre of mass and arm when a slider changes their inputs."""
-    rng = np.random.default_rng(0)
+    rng = default_rng(0)
     offset, bearing = rng.uniform(0, 0.4, 20), rng.uniform(-3, 3, 20)
     size = rng.uniform(0.1, 0.4, 20)
     if corners == 1:
@@ -223,8 +226,8 @@ def test_the_support_of_an_object_equals_that_of_the_package(corners):
     with jax.enable_x64(True):
         outlines = MAKE["Outline"](vertices, radius, offset, bearing)
         com, arm = jax.jit(jax.vmap(MAKE["support"]))(outlines)
-    np.testing.assert_allclose(com, solids.p_object_com[:, :2], atol=1e-12)
-    np.testing.assert_allclose(arm, solid.friction_arm(solids), atol=1e-9)
+    assert_allclose(com, solids.p_object_com[:, :2], atol=1e-12)
+    assert_allclose(arm, solid.friction_arm(solids), atol=1e-9)
 
 
 def test_the_recorded_push_is_upright_and_visible_from_any_side(browser):
@@ -234,7 +237,7 @@ def test_the_recorded_push_is_upright_and_visible_from_any_side(browser):
     # The contact is at the target, and the middle within half a diagonal.
     assert np.hypot(x + 2, y) < 0.05 + 0.2 * math.sqrt(2)
     assert abs(z - 0.4) < 4e-3
-    np.testing.assert_allclose(tilt, 0, atol=2e-3)
+    assert_allclose(tilt, 0, atol=2e-3)
     look = """
     eye.playing = false; eye.at = 100; eye.turn = arguments[0]; drawRecorded();
     return by("view").toDataURL();
@@ -334,9 +337,14 @@ def test_the_template_says_how_to_build_the_page(tmp_path):
     assert text.strip().endswith("python docs/push/make.py --open")
 
 
-@pytest.mark.parametrize(("args", "expected"), [
-    (["--help"], "--record"), (["--hlp"], "unrecognized"), (["page"], "must end with .html"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("args", "expected"),
+    [
+        (["--help"], "--record"),
+        (["--hlp"], "unrecognized"),
+        (["page"], "must end with .html"),
+    ],
+)
 def test_options_of_the_builder_write_no_page(args, expected, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("sys.argv", ["make.py", *args])

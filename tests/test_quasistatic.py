@@ -15,6 +15,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.random import default_rng
+from numpy.testing import assert_allclose
 from scipy.optimize import nnls
 from staging import drive, staged
 
@@ -170,8 +172,13 @@ CORNERS = {
     "sliding 1": (0.2, -0.03, 0.2, 0.28),
     "sliding 2": (0.3, 0.0, 0.05, 0.2),
 }
-ROLLING = Push((0.04, 0.03, 0.0), (FRONT + RADIUS, 0.0, 0.0), arm=ARM["cylinder"], friction=0.8,
-               outline=fp.circle(RADIUS))  # fmt: skip
+ROLLING = Push(
+    (0.04, 0.03, 0.0),
+    (FRONT + RADIUS, 0.0, 0.0),
+    arm=ARM["cylinder"],
+    friction=0.8,
+    outline=fp.circle(RADIUS),
+)
 SLIPPING = ROLLING._replace(friction=0.1)
 _ROUND = {"outline": box(1e-4, RADIUS - 1e-4)}
 CASES = {
@@ -194,11 +201,12 @@ BASE_CASE = CASES["here"]
 CASES["there"] = BASE_CASE._replace(
     base=MOVE, pose=(*(turn(MOVE[2], BASE_CASE.pose[:2]) + MOVE[:2]), BASE_CASE.pose[2] + MOVE[2])
 )
-_rng = np.random.default_rng(1)
+_rng = default_rng(1)
 for _i in range(24):  # flat on the face
     _s, _mu, _y = _rng.uniform([-0.03, 0.1, -0.1], [0.03, 0.8, 0.1])
-    CASES[f"flat {_i}"] = Push((0.03, _s, _rng.uniform(-0.08, 0.08)), (FRONT + HALF, _y, 0.0),
-                               friction=_mu)  # fmt: skip
+    CASES[f"flat {_i}"] = Push(
+        (0.03, _s, _rng.uniform(-0.08, 0.08)), (FRONT + HALF, _y, 0.0), friction=_mu
+    )
 
 
 @functools.cache
@@ -208,7 +216,7 @@ def boxes():
 
 def test_a_box_pushed_through_its_centre_moves_as_the_base_does_and_one_apart_does_not():
     assert np.abs(boxes()["apart"].moved).max() < 1e-12
-    np.testing.assert_allclose(boxes()["centre"].moved, [0.05 * STEPS * PERIOD, 0, 0], atol=2e-4)
+    assert_allclose(boxes()["centre"].moved, [0.05 * STEPS * PERIOD, 0, 0], atol=2e-4)
 
 
 def test_the_base_moves_at_its_commanded_twist():
@@ -217,7 +225,7 @@ def test_the_base_moves_at_its_commanded_twist():
     assert base[-1, 2] == pytest.approx(twist[2] * STEPS * PERIOD)
     way = np.diff(base[:, :2], axis=0)
     back = np.array([turn(-yaw, d) for yaw, d in zip(base[:-1, 2], way, strict=True)])
-    np.testing.assert_allclose(back, np.tile(twist[:2], (STEPS, 1)) * PERIOD, atol=1e-12)
+    assert_allclose(back, np.tile(twist[:2], (STEPS, 1)) * PERIOD, atol=1e-12)
 
 
 @pytest.mark.parametrize("name", CORNERS)
@@ -227,7 +235,7 @@ def test_a_corner_sticks_as_in_lynch_or_slides_along_the_edge_of_the_cone(name):
     recorded = boxes()[name]
     moved = pose - recorded.object_pose[0]
     assert abs(moved[2]) > 0.03
-    np.testing.assert_allclose(recorded.moved, moved, rtol=0.02, atol=1e-3)
+    assert_allclose(recorded.moved, moved, rtol=0.02, atol=1e-3)
 
 
 def can_be_carried(push):
@@ -267,20 +275,20 @@ def test_a_flat_contact_holds_if_and_only_if_forces_within_its_cones_can():
 
 def test_mirrored_pushes_are_mirrored():
     a, b = boxes()["mirror"], boxes()["mirrored"]
-    np.testing.assert_allclose(a.moved, b.moved * [1, -1, -1], atol=1e-9)
+    assert_allclose(a.moved, b.moved * [1, -1, -1], atol=1e-9)
 
 
 def test_twice_the_speed_is_the_same_path_in_half_the_time():
     """Only the length of a step doubles."""
     a, b = boxes()["once"], boxes()["twice"]
     assert np.hypot(*a.moved[:2]) > 0.03
-    np.testing.assert_allclose(a.object_pose[::2], b.object_pose[: STEPS // 2 + 1], atol=5e-4)
+    assert_allclose(a.object_pose[::2], b.object_pose[: STEPS // 2 + 1], atol=5e-4)
 
 
 def test_where_it_happens_does_not_matter():
     a, b = boxes()["here"], boxes()["there"]
     moved = [*turn(MOVE[2], a.moved[:2]), a.moved[2]]
-    np.testing.assert_allclose(b.moved, moved, atol=1e-9)
+    assert_allclose(b.moved, moved, atol=1e-9)
 
 
 # --- round objects --------------------------------------------------------------------------
@@ -312,7 +320,7 @@ def test_a_cylinder_slips_along_a_slippery_face():
 
 def test_a_tiny_box_with_a_round_edge_is_a_cylinder():
     for name, disc in zip(("rolling", "slipping"), discs(), strict=True):
-        np.testing.assert_allclose(boxes()[name].moved, disc.moved, atol=1e-3)
+        assert_allclose(boxes()[name].moved, disc.moved, atol=1e-3)
 
 
 # --- the problem that is solved -------------------------------------------------------------
@@ -320,7 +328,7 @@ def test_a_tiny_box_with_a_round_edge_is_a_cylinder():
 
 def some_problems(count=500):
     """Problems of one or two contacts at the front face, near, deep or far, and any base twist."""
-    rng = np.random.default_rng(0)
+    rng = default_rng(0)
     speed, angle = np.exp(rng.uniform(-7, -3, count)), rng.uniform(-1.5, 1.5, count)
     v_x, v_y, omega = speed * np.cos(angle), speed * np.sin(angle), rng.uniform(-0.15, 0.15, count)
     p = np.stack([FRONT + rng.uniform(0.1, 0.3, count), rng.uniform(-0.4, 0.4, count)])
@@ -369,11 +377,11 @@ def test_newtons_method_has_the_correct_derivatives_and_finds_the_minimum():
             return written, (gradient(problem, v, dt), hessian(problem, v, dt))
 
         (g, h), (g_true, h_true) = both(v)
-        np.testing.assert_allclose(g, g_true, atol=1e-9)
+        assert_allclose(g, g_true, atol=1e-9)
         upper = [h_true[i][j] for i in range(3) for j in range(i, 3)]
-        np.testing.assert_allclose(np.stack(h), upper, rtol=1e-6, atol=1e-6)
+        assert_allclose(np.stack(h), upper, rtol=1e-6, atol=1e-6)
         product = np.einsum("ij...,j...->i...", np.array(h_true), np.stack(solved(g, h)))
-        np.testing.assert_allclose(product, g_true, atol=1e-6)
+        assert_allclose(product, g_true, atol=1e-6)
         solution = jax.jit(partial(quasistatic.solve, dt=dt))(problem, v)
         (step, matrix), _ = both(solution)
         short = np.abs(np.stack(solved(step, matrix)))[:2].max(axis=0) / problem.speed
@@ -386,7 +394,7 @@ def test_newtons_method_has_the_correct_derivatives_and_finds_the_minimum():
 
 def moved_both_ways(inputs, seed):
     """Trees (7, ...) of `inputs` moved along a random direction in each of its three parts."""
-    rng = np.random.default_rng(seed)
+    rng = default_rng(seed)
     ways = [jax.tree.map(lambda x: rng.normal(size=x.shape), part) for part in inputs]
     rows = [(0.0, 0)] + [(e, part) for part in range(3) for e in (1e-6, -1e-6)]
     stacked = []
@@ -478,8 +486,15 @@ def test_feet_balance_the_centre_of_mass_without_pulling():
 
     def arm(x):
         com = np.array([[x, 0.0, 0.0]])
-        rows = Solid(solid.rectangles(np.array([0.2]), np.array([0.1])), np.zeros(1), np.ones(1),
-                    np.ones(1), com, np.ones((1, 3)), np.array([[1.0, 0, 0, 0]]))  # fmt: skip
+        rows = Solid(
+            solid.rectangles(np.array([0.2]), np.array([0.1])),
+            np.zeros(1),
+            np.ones(1),
+            np.ones(1),
+            com,
+            np.ones((1, 3)),
+            np.array([[1.0, 0, 0, 0]]),
+        )
         return solid.friction_arm(rows)[0]
 
     assert arm(0.1) == pytest.approx(0.75 * math.hypot(0.1, 0.1) + 0.25 * math.hypot(0.3, 0.1))
@@ -492,10 +507,10 @@ def test_every_scene_has_a_slider(name):
     loaded = scene.load(name, friction=scene.Friction(0.3, 0.4), robot=base)
     stage, slider = staged("quasistatic", [loaded], preset(), base)
     assert isinstance(stage, Quasistatic)
-    np.testing.assert_allclose(slider.friction_robot, [0.4])
-    np.testing.assert_allclose(slider.base_size, [[0.3, SIDE]])
+    assert_allclose(slider.friction_robot, [0.4])
+    assert_allclose(slider.base_size, [[0.3, SIDE]])
     com = loaded.physics.body("object").ipos[:2]
-    np.testing.assert_allclose(slider.p_object_com[0], com, atol=1e-5)
+    assert_allclose(slider.p_object_com[0], com, atol=1e-5)
 
 
 @pytest.mark.slow

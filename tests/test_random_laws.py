@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from jax import lax
+from numpy.random import default_rng
 
 from rps_jax.engines import native
 
@@ -161,7 +162,7 @@ OPERATIONS = {
 
 def program(seed, x, i, length=16):
     """Return all values that a random program of `length` operations computes."""
-    rng = np.random.default_rng(seed)
+    rng = default_rng(seed)
     values = {"f": [x], "i": [i], "b": [x > 0], "F": [x[1]], "I": [i[0]], "B": [i[1] > 0]}
     for _ in range(length):
         kinds = [*OPERATIONS][rng.integers(len(OPERATIONS))]
@@ -179,7 +180,7 @@ def program(seed, x, i, length=16):
 
 def batch(seed, count=32):
     """Return reals (count, 4) and integers (count, 4)."""
-    rng = np.random.default_rng(seed)
+    rng = default_rng(seed)
     x = rng.integers(-40, 40, (count, COUNT)) / 8
     x[rng.random(x.shape) < 0.05] = rng.choice(SPECIAL)
     i = rng.integers(-9, 9, (count, COUNT))

@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import xarray as xr
-from helpers import ROOT
+from helpers import ROOT, refusing
 
 import rps_jax
 from rps_jax import engines
@@ -286,7 +286,7 @@ def test_the_newest_valid_file_of_a_part_is_read(tmp_path):
 
 
 def refused(folder, shard=1, num_shards=1):
-    with pytest.raises(InputError, match="in use by another process"):
+    with refusing("in use by another process"):
         run_folder.lock(folder, shard, num_shards).__enter__()
 
 

@@ -4,12 +4,11 @@ import math
 from functools import partial
 
 import pytest
-from helpers import case
+from helpers import case, refusing
 
 from rps_jax.control import registry
 from rps_jax.control.laws import rps
 from rps_jax.control.laws.rps import RPSParams, Temperatures
-from rps_jax.errors import InputError
 from rps_jax.robot.robot import Robot, parse_robot
 from rps_jax.robot.shell import Boards
 from rps_jax.robot.skin import CapacitiveSkin, IdealSkin
@@ -128,5 +127,5 @@ REFUSED = {
     [(build, *refused) for build, cases in REFUSED.items() for refused in cases],
 )
 def test_a_bad_value_is_refused_with_its_field(build, options, message):
-    with pytest.raises(InputError, match=message):
+    with refusing(message):
         build(**options)

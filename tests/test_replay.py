@@ -7,11 +7,11 @@ from functools import partial
 import jax
 import numpy as np
 import pytest
-from helpers import rps
+from helpers import refusing, rps, setting_of, slow
+from numpy.testing import assert_array_equal
 
 import rps_jax
 from rps_jax.app import film
-from rps_jax.errors import InputError
 from rps_jax.record import files
 from rps_jax.runs import push
 from rps_jax.runs.plan import build_batch, load_plan
@@ -28,7 +28,7 @@ SLOTS = 3  # two batches, and a number that only the record of the run has
 
 
 def sweep(folder, law, domain, task="reach", engine="fused", horizon=4.0, **options):
-    setting = rps_jax.Setting(engine, rules=rps_jax.Rules(horizon=horizon))
+    setting = setting_of(horizon, engine)
     names = {"task": task, "setting": setting, "worlds": WORLDS, "slots": SLOTS}
     return rps_jax.sweep(law, domain, out=folder, **names | options)
 
@@ -38,7 +38,7 @@ def assert_equal_bits(outcomes, results):
     assert {"time", "success", "object_pose", "min_distance"} <= outcomes.keys()
     for name, values in outcomes.items():
         expected = results[name].values
-        np.testing.assert_array_equal(np.asarray(values, expected.dtype), expected, err_msg=name)
+        assert_array_equal(np.asarray(values, expected.dtype), expected, err_msg=name)
 
 
 def replayed(run, law):
@@ -72,7 +72,7 @@ SLOW_CASES = {
 }
 
 
-SLOW = [pytest.param(x, marks=pytest.mark.slow) for x in SLOW_CASES.values()]
+SLOW = [slow(x) for x in SLOW_CASES.values()]
 
 
 @pytest.mark.parity
@@ -150,7 +150,7 @@ def test_a_trial_that_ends_otherwise_is_named(run, monkeypatch, tmp_path, capsys
 
 def test_an_unknown_law_or_world_is_refused(run):
     folder, _ = run
-    with pytest.raises(InputError, match="unknown law of the run"):
+    with refusing("unknown law of the run"):
         rps_jax.replay(folder, 0, "aps")
 
 
@@ -169,4 +169,4 @@ def test_a_gpu_stops_at_any_number_of_steps(monkeypatch):
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
     on_gpu = stepped(7)
     assert on_gpu.steps == 7
-    jax.tree.map(np.testing.assert_array_equal, on_gpu, on_cpu)
+    jax.tree.map(assert_array_equal, on_gpu, on_cpu)

@@ -11,7 +11,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import NEAR, SHORT, case, refusal, same
+from helpers import (
+    NEAR,
+    SHORT,
+    case,
+    refusal,
+    same,
+    setting_of,
+    slow,
+)
+from numpy.testing import assert_allclose, assert_array_equal
 from staging import push_object, recompiled
 
 import rps_jax
@@ -56,7 +65,9 @@ RESPONSES = {
     "first-order lag": (Robot(lag=0.3), (0.05, -0.02, 0.1), None, lambda t: 1 - np.exp(-t / 0.3)),
     # A speed of 0.05 m/s takes 0.1 s, the turn as long.
     "acceleration": (
-        *(Robot(acceleration_max=(0.5, 1.0)), (0.03, 0.04, -0.1), None),
+        Robot(acceleration_max=(0.5, 1.0)),
+        (0.03, 0.04, -0.1),
+        None,
         lambda t: np.minimum(t / 0.1, 1.0),
     ),
     "no lag": (Robot(lag=0.0), AHEAD, None, np.ones_like),
@@ -70,7 +81,7 @@ def test_the_twist_is_bounded_as_a_vector_and_reached_by_lag_and_acceleration(na
     robot, twist, bounded, share = RESPONSES[name]
     velocities = reference_velocities(robot, twist, 60)
     expected = share(PERIOD * np.arange(1, 61)[:, None]) * (bounded or twist)
-    np.testing.assert_allclose(velocities, expected, atol=1e-7)
+    assert_allclose(velocities, expected, atol=1e-7)
 
 
 # Robot, and the shares of v_x, v_y and omega that its wheels lose.
@@ -89,7 +100,7 @@ def test_wheels_that_slip_lose_their_share_of_each_axis(name):
     robot, shares = SLIPS[name]
     assert not robot.ideal
     expected = TWIST * (1 - np.array(shares))
-    np.testing.assert_allclose(drive.apply_slip(robot, TWIST), expected, rtol=1e-6)
+    assert_allclose(drive.apply_slip(robot, TWIST), expected, rtol=1e-6)
 
 
 def test_slip_alone_is_that_of_all_axes_and_none_costs_nothing():
@@ -128,9 +139,7 @@ def position_after(twist, seconds):
 
 
 @pytest.mark.usefixtures("steady")
-@pytest.mark.parametrize(
-    "engine", ["fused", pytest.param("mjx", marks=pytest.mark.slow), "mujoco", "quasistatic"]
-)
+@pytest.mark.parametrize("engine", ["fused", slow("mjx"), "mujoco", "quasistatic"])
 def test_a_base_turns_and_strafes_less_than_commanded_in_all_engines(engine):
     """Away from the object; the fused engine is compiled C."""
     commands = ((0.1, 0.0, 0.5), (0.1, 0.0, 0.0), (0.1, 0.05, 0.5))
@@ -141,11 +150,11 @@ def test_a_base_turns_and_strafes_less_than_commanded_in_all_engines(engine):
         Case("box", "S1", (2.0, 0.0), Steady(*command), gap=0.3, robot=base)
         for (command, _), base in zip(pairs, bases, strict=True)
     ]
-    outcome, _ = pushes.run(cases, Setting(engine, rules=Rules(horizon=0.4)))
+    outcome, _ = pushes.run(cases, setting_of(0.4, engine))
     executed = [np.array(command) * (1 - np.array(share)) for command, share in pairs]
     expected = np.array([position_after(twist, outcome.time[0]) for twist in executed])
-    np.testing.assert_allclose(outcome.base_pose[:, 2], expected[:, 2], rtol=1e-4, atol=1e-6)
-    np.testing.assert_allclose(outcome.base_pose[:, :2], expected[:, :2], atol=4e-4)
+    assert_allclose(outcome.base_pose[:, 2], expected[:, 2], rtol=1e-4, atol=1e-6)
+    assert_allclose(outcome.base_pose[:, :2], expected[:, :2], atol=4e-4)
     assert not outcome.stalled.any()
 
 
@@ -158,13 +167,13 @@ def test_the_environment_and_a_single_trial_turn_by_the_share_that_is_left():
     for _ in range(5):
         state = step(state, jnp.array([0.0, 0.5, 1.0]))
     turn = 0.55 * 0.15 * 5 * push.dt
-    np.testing.assert_allclose(state.data.qpos[2], turn, rtol=1e-4)
-    np.testing.assert_allclose(state.data.qpos[1], 0.5 * 0.05 * 5 * push.dt, rtol=1e-3)
+    assert_allclose(state.data.qpos[2], turn, rtol=1e-4)
+    assert_allclose(state.data.qpos[1], 0.5 * 0.05 * 5 * push.dt, rtol=1e-3)
     trace = rps_jax.push("box", target=(0.6, 0.3), setting=setting, robot="ideal,slip_yaw=0.45")
     steady = (trace.data.omega.values == np.float32(0.15))[:-1] & (np.diff(trace.data.omega) == 0)
     turned = np.diff(trace.data.qpos.values[:, 2])[steady]  # in 0.1 s
     assert steady.sum() > 20
-    np.testing.assert_allclose(turned, 0.55 * 0.15 * 0.1, atol=1e-6)
+    assert_allclose(turned, 0.55 * 0.15 * 0.1, atol=1e-6)
 
 
 def test_a_base_with_slip_stalls_at_its_own_speed():
@@ -195,7 +204,7 @@ def test_the_force_is_bounded_in_its_direction_by_drive_traction_and_rolling():
         assert np.hypot(*force[:2]) == pytest.approx(robot.push_max)
         c, s = turn
         along = (c * force[0] + s * force[1], c * force[1] - s * force[0])
-        np.testing.assert_allclose(along, np.array([0.6, 0.8]) * robot.push_max)
+        assert_allclose(along, np.array([0.6, 0.8]) * robot.push_max)
         assert force[2] == pytest.approx(robot.turn_max)
 
 
@@ -243,14 +252,14 @@ def test_engines_agree_on_a_small_base_that_contact_slows():
     weak = replace(ideal, mass=60.0, force_max=70.0, torque_max=5.0)
     qpos = {name: push(name, weak).qpos[-1] for name in ("fused", "mujoco", "mjx")}
     for name in ("fused", "mjx"):
-        np.testing.assert_allclose(qpos[name], qpos["mujoco"], atol=1e-3, err_msg=name)
+        assert_allclose(qpos[name], qpos["mujoco"], atol=1e-3, err_msg=name)
     assert np.abs(push("fused", ideal).qpos[-1] - qpos["fused"])[:6].max() > 0.01  # it did slow
 
 
 def test_a_strong_base_is_as_good_as_a_velocity_source():
     push = partial(push_object, "fused", seconds=3.0, twist=(0.05, 0.02, 0.0))
     strong, source = push(Robot(mass=2000.0, force_max=1e5)), push(Robot())
-    np.testing.assert_allclose(strong.qpos[-1], source.qpos[-1], atol=4e-3)
+    assert_allclose(strong.qpos[-1], source.qpos[-1], atol=4e-3)
 
 
 TEMPLATES = [*product(("real", "wide"), ("fused", "mjx")), ("wide", "quasistatic")]
@@ -260,15 +269,16 @@ TEMPLATES = [*product(("real", "wide"), ("fused", "mjx")), ("wide", "quasistatic
 def test_worlds_by_template_equal_recompiled_ones(domain, engine):
     """Bases differ in size, and those with a limited force in mass."""
     drawn = draws.draw(replace(DOMAINS[domain], objects=("random_box",)), 3, np.arange(3))
-    bases = replace(drawn.robot, half_length=np.array([0.3, 0.4, 0.5]),
-                    half_width=np.array([0.2, 0.25, 0.4]))  # fmt: skip
+    bases = replace(
+        drawn.robot, half_length=np.array([0.3, 0.4, 0.5]), half_width=np.array([0.2, 0.25, 0.4])
+    )
     if bases.driven:
         bases = replace(bases, mass=np.array([60.0, 130.0, 200.0]))
     inputs = WorldInputs("box", drawn.solid, drawn.friction, STANDARD, bases)
     _, fields = engines.get(engine).stage(inputs)
     theirs = recompiled(engine, [scene.compile_row(inputs, i) for i in range(3)])
     for ours, compiled in zip(*map(jax.tree.leaves, (fields, theirs)), strict=True):
-        np.testing.assert_allclose(ours, compiled, rtol=2e-5, atol=2e-6)
+        assert_allclose(ours, compiled, rtol=2e-5, atol=2e-6)
 
 
 # --- trials --------------------------------------------------------------------------------
@@ -299,7 +309,7 @@ def test_random_robots_are_drawn_last_and_change_no_other_draw():
     assert set(columns) - set(draws.table(wide)) == limits
     fixed = replace(DOMAINS["wide"], robot=ROBOTS["kairos"])
     again = draws.draw(fixed, 5, index).robot
-    np.testing.assert_array_equal(again.mass, 158.0)
+    assert_array_equal(again.mass, 158.0)
     assert again.lag is None
 
 
@@ -341,7 +351,7 @@ def test_robots_are_named_in_the_library_and_in_files(tmp_path):
     mine = parse_robot(str(path))
     assert mine == Robot(mass=50, force_max=120, acceleration_max=(0.5, 1))
     drums = replace(DOMAINS["real"], objects=("random_cylinder",), robot_force=None)
-    setting = Setting(rules=Rules(horizon=1.0))
+    setting = setting_of(1.0, "fused")
     rows = rps_jax.sweep("rps", drums, worlds=3, robot=mine, setting=setting)
     assert np.unique(rows.robot_force) == 120
     assert "stalled" in rows

@@ -10,9 +10,8 @@ from functools import partial
 
 import numpy as np
 import pytest
-from helpers import ROOT
+from helpers import ROOT, setting_of, slow
 
-import rps_jax
 from rps_jax.app.export import c, program
 from rps_jax.record import bag
 from rps_jax.runs.push import push
@@ -156,43 +155,32 @@ def test_a_stopped_clock_commands_zero(driven):
     assert not twists[-1].any()
 
 
-def test_cpp_and_python_agree_on_a_recorded_bag(binary, tmp_path, python):
+PUSHES = {
+    "target": (10.0, "box", {"target": (-1.0, 0.5)}),
+    "path": (80.0, "cylinder", {"task": "corridor,width=1.5,turns=2,length=4"}),
+}
+
+
+@pytest.mark.parametrize("goal", ["target", slow("path")])
+def test_cpp_and_python_agree_on_a_recorded_bag(goal, binary, tmp_path, python):
+    """On the way to a target, and along a path, which they follow as the task does."""
     pytest.importorskip("mcap_ros2")
-    path = tmp_path / "push.mcap"
-    setting = rps_jax.Setting("quasistatic", rules=rps_jax.Rules(horizon=10.0))
-    push("box", target=(-1.0, 0.5), law="rps_plus", bag=path, setting=setting)
+    path, (seconds, name, options) = tmp_path / "push.mcap", PUSHES[goal]
+    push(name, law="rps_plus", skin="capacitive", bag=path, setting=setting_of(seconds), **options)
     read = bag.read(path)
     messages = []
     for i, time in enumerate(read["time"]):
-        messages += [("odometry", time, *read["pose"][i]), ("target", time, *read["target"][i])]
+        messages += [("odometry", time, *read["pose"][i]), (goal, time, *read[goal][i].ravel())]
         messages += [("skin", time, *read["signal"][i]), ("tick", time)]
-    cpp, _ = driven_in_cpp(binary, messages)
+    cpp, statuses = driven_in_cpp(binary, messages)
     python_twists, _ = driven_in_python(python, messages)
     assert np.mean(np.abs(cpp - python_twists).max(-1) > 1e-5) < 0.01
     # The bag's law felt contact at once, and these through foam, a filter and bounds.
     near = np.abs(cpp - read["twist"])[:, :2].max(-1)
     assert np.mean(near < 0.02) > 0.8
-
-
-@pytest.mark.slow
-def test_cpp_and_python_follow_a_path_as_the_task_does(binary, tmp_path, python):
-    pytest.importorskip("mcap_ros2")
-    path = tmp_path / "push.mcap"
-    setting = rps_jax.Setting("quasistatic", rules=rps_jax.Rules(horizon=80.0))
-    task = "corridor,width=1.5,turns=2,length=4"
-    push("cylinder", task=task, law="rps_plus", skin="capacitive", bag=path, setting=setting)
-    read = bag.read(path)
-    assert np.ptp(read["target"], axis=0).min() > 0.2
-    messages = []
-    for i, time in enumerate(read["time"]):
-        messages += [("odometry", time, *read["pose"][i]), ("skin", time, *read["signal"][i])]
-        messages += [("path", time, *read["path"][i].ravel()), ("tick", time)]
-    cpp, statuses = driven_in_cpp(binary, messages)
-    python_twists, _ = driven_in_python(python, messages)
-    assert set(statuses) == {"pushing"}
-    assert np.mean(np.abs(cpp - python_twists).max(-1) > 1e-5) < 0.01
-    near = np.abs(cpp - read["twist"])[:, :2].max(-1)
-    assert np.mean(near < 0.02) > 0.8
+    if goal == "path":
+        assert np.ptp(read["target"], axis=0).min() > 0.2
+        assert set(statuses) == {"pushing"}
 
 
 def test_a_path_replaces_the_target_until_it_ends(driven):
@@ -214,9 +202,13 @@ def test_a_path_replaces_the_target_until_it_ends(driven):
 def test_the_nodes_name_the_same_topics_and_parameters():
     cpp, python, config, cmake = (
         (FOLDER / path).read_text()
-        for path in ("src/push_node.cpp", "scripts/push_node.py", "config/push.yaml",
-                     "CMakeLists.txt")
-    )  # fmt: skip
+        for path in (
+            "src/push_node.cpp",
+            "scripts/push_node.py",
+            "config/push.yaml",
+            "CMakeLists.txt",
+        )
+    )
     ast.parse(python)
     for topic in ("odom", "taxels", "target", "path", "cmd_vel"):
         assert f'"{topic}"' in cpp

@@ -7,7 +7,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import box, jitted, observation, refusals, sense
+from helpers import (
+    box,
+    jitted,
+    observation,
+    refusals,
+    sense,
+    slow,
+)
+from numpy.testing import assert_allclose
 from staging import FINE, simulate, staged
 
 from rps_jax.control.laws import rps
@@ -49,7 +57,7 @@ def meet(shape: Footprint, radius: float = 0.3) -> tuple[np.ndarray, np.ndarray,
     return np.array(normal), np.array(point), float(gap)
 
 
-def test_outline_and_sizes() -> None:
+def test_outline_and_sizes():
     shell = ROUND.shell
     assert shell.sizes == (0.3,)
     assert shell.half == (0.3, 0.3)
@@ -60,13 +68,13 @@ def test_outline_and_sizes() -> None:
     assert parse_robot("round").sizes[0] == parse_robot("ideal").half_width
 
 
-def test_taxels_are_evenly_spaced_along_the_front_270_degrees() -> None:
+def test_taxels_are_evenly_spaced_along_the_front_270_degrees():
     taxels = np.asarray(ROUND.shell.taxels()[:, 0])
     bearing = np.arctan2(taxels[:, 1], taxels[:, 0])
     assert len(taxels) == 42
-    np.testing.assert_allclose(np.hypot(*taxels.T), 0.3, rtol=1e-6)
-    np.testing.assert_allclose(np.diff(bearing), -1.5 * np.pi / 42, rtol=1e-4)
-    np.testing.assert_allclose(bearing, -bearing[::-1], atol=1e-6)
+    assert_allclose(np.hypot(*taxels.T), 0.3, rtol=1e-6)
+    assert_allclose(np.diff(bearing), -1.5 * np.pi / 42, rtol=1e-4)
+    assert_allclose(bearing, -bearing[::-1], atol=1e-6)
     assert ROUND.shell.rows()[-1].offset + ROUND.shell.rows()[-1].length == pytest.approx(ARC)
 
 
@@ -81,40 +89,40 @@ def test_taxels_are_evenly_spaced_along_the_front_270_degrees() -> None:
         (box(0.1, 0.0), (1, 0), (0.1, 0), -0.4),  # around the middle of the base
     ],
 )
-def test_contact(shape: Footprint, normal: Any, point: Any, gap: float) -> None:
+def test_contact(shape, normal, point, gap):
     result = meet(shape)
     for value, expected in zip(result, (normal, point, gap), strict=True):
-        np.testing.assert_allclose(value, expected, atol=1e-6)
+        assert_allclose(value, expected, atol=1e-6)
 
 
 @pytest.mark.parametrize(
     "shape", [box(0.52, 0.1, yaw=0.3), fp.place(fp.circle(0.2), jnp.array([0.51, 0]), 0.0)]
 )
-def test_turning_the_base_changes_nothing_in_contact(shape: Footprint) -> None:
+def test_turning_the_base_changes_nothing_in_contact(shape):
     normal, point, gap = meet(shape)
     for angle in (0.5, 2.0, -3.0):
         c, s = math.cos(angle), math.sin(angle)
         turn = np.array([[c, -s], [s, c]])
         expected = turn @ normal, turn @ point, gap
         for value, other in zip(meet(turned(shape, angle)), expected, strict=True):
-            np.testing.assert_allclose(value, other, atol=1e-6)
+            assert_allclose(value, other, atol=1e-6)
 
 
-def test_a_large_round_base_is_flat() -> None:
+def test_a_large_round_base_is_flat():
     shape, half = box(0.52, 0.05, yaw=0.01), 0.3
     x, y = shape.vertices.T
     flat, points, gaps = polygon_contact((x, y), (jnp.roll(x, -1), jnp.roll(y, -1)), (half, half))
     nearest = int(np.argmin(gaps))
     moved = fp.place(shape, jnp.array([1000.0 - half, 0.0]), 0.0)
     normal, point, gap = meet(moved, 1000.0)
-    np.testing.assert_allclose(normal, flat, atol=1e-3)
+    assert_allclose(normal, flat, atol=1e-3)
     assert gap == pytest.approx(float(gaps[nearest]), abs=2e-4)
     assert point[1] == pytest.approx(float(points[nearest][1]), abs=1e-3)
 
 
 @pytest.mark.parametrize("name", ["ideal", "capacitive"])
 @pytest.mark.parametrize("bearing", [0.0, 0.6, -1.2, 2.2])
-def test_skin_senses_the_arc_length(name: str, bearing: float) -> None:
+def test_skin_senses_the_arc_length(name, bearing):
     ahead = box(0.503, 0.0)
     reading = read(SKINS[name], turned(ahead, bearing))
     assert reading.contact_type != NONE
@@ -123,10 +131,10 @@ def test_skin_senses_the_arc_length(name: str, bearing: float) -> None:
     l = obs._replace(base_radius=0.3).l  # noqa: E741
     assert float(l) == pytest.approx(0.3 * bearing, abs=tolerance)  # positive to the left
     mirrored = read(SKINS[name], turned(ahead, -bearing)).p_robot_contact
-    np.testing.assert_allclose(mirrored, reading.p_robot_contact * jnp.array([1, -1]), atol=1e-5)
+    assert_allclose(mirrored, reading.p_robot_contact * jnp.array([1, -1]), atol=1e-5)
 
 
-def test_skin_ends_with_its_boards() -> None:
+def test_skin_ends_with_its_boards():
     ideal = SKINS["ideal"]
     assert read(ideal, turned(box(0.503, 0.0), 3.0)).contact_type == NONE
     assert read(ideal, turned(box(0.507, 0.0), 0.0)).contact_type == NONE  # 7 mm away
@@ -147,7 +155,7 @@ def test_drawn_worlds_have_round_bases():
     assert np.all(batch.worlds.skin.shell.radius == ROBOTS["round"].radius)
 
 
-def test_rps_gets_the_arc_length() -> None:
+def test_rps_gets_the_arc_length():
     params, point = rps.RPSParams.paper(), (0.3 * math.cos(1.0), 0.3 * math.sin(1.0))
     obs = observation([0, 0], 0.0, point, True, [2, 0])._replace(base_radius=0.3)
     details = rps.step_with_details(params, rps.RPSState.init(params), obs)[2]
@@ -155,11 +163,9 @@ def test_rps_gets_the_arc_length() -> None:
     assert bool(details.realigning)  # beyond l_cr
 
 
-@pytest.mark.parametrize(
-    "engine", ["fused", "quasistatic", pytest.param("mjx", marks=pytest.mark.slow)]
-)
-@pytest.mark.parametrize("name", [pytest.param("box", marks=pytest.mark.slow), "cylinder"])
-def test_engines_agree(name: str, engine: str) -> None:
+@pytest.mark.parametrize("engine", ["fused", "quasistatic", slow("mjx")])
+@pytest.mark.parametrize("name", [slow("box"), "cylinder"])
+def test_engines_agree(name, engine):
     """Compare pushes in which an object slides and turns on the arc."""
     loaded = scene.load(name, FINE, FRICTION["S1"], robot=ROUND)
     start = scene.initial_qpos(loaded, gap=0.001)[None]
@@ -171,10 +177,10 @@ def test_engines_agree(name: str, engine: str) -> None:
         ends[stepped] = moved.qpos[-1, 0]
     assert ends["mujoco"][4] - start[0, 4] > 0.02
     tolerance = 0.0125 if engine == "quasistatic" else 2e-4
-    np.testing.assert_allclose(ends[engine][3:5], ends["mujoco"][3:5], atol=tolerance)
+    assert_allclose(ends[engine][3:5], ends["mujoco"][3:5], atol=tolerance)
 
 
-def test_a_low_object_touches_below_its_top() -> None:
+def test_a_low_object_touches_below_its_top():
     loaded = scene.load("box", robot=ROUND)
     spheres = [loaded.physics.geom(f"base_{name}") for name in ("low", "high")]
     assert [geom.pos[2] for geom in spheres] == pytest.approx([0.06, 0.34])

@@ -5,7 +5,8 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
-from helpers import extent
+from helpers import extent, slow
+from numpy.testing import assert_allclose, assert_array_equal
 from staging import simulate, stack, staged, step_in_c
 
 from rps_jax.engines import mjx as mjx_engine
@@ -29,7 +30,7 @@ def touching(loaded):
     return scene.initial_qpos(loaded, gap=-0.0005)
 
 
-@pytest.mark.parametrize("family", [pytest.param("box", marks=pytest.mark.slow), "cylinder"])
+@pytest.mark.parametrize("family", [slow("box"), "cylinder"])
 def test_mjx_agrees_with_c_mujoco_at_one_step_and_over_0_4_seconds(family):
     names = [name for name in OBJECTS if FAMILIES[name] == family]
     scenes = [load(name, friction=f) for name in names for f in FRICTION.values()]
@@ -43,15 +44,15 @@ def test_mjx_agrees_with_c_mujoco_at_one_step_and_over_0_4_seconds(family):
         simulate(engine, *staged(engine, 2 * scenes, physics), starts, TWIST, physics, 40)
         for engine in ("mjx", "mujoco")
     )
-    np.testing.assert_allclose(ours.qpos[1, near], theirs.qpos[1, near], atol=2e-6)
-    np.testing.assert_allclose(ours.qvel[1, near], theirs.qvel[1, near], atol=1e-3)
+    assert_allclose(ours.qpos[1, near], theirs.qpos[1, near], atol=2e-6)
+    assert_allclose(ours.qvel[1, near], theirs.qvel[1, near], atol=1e-3)
 
     # After a push of 20 mm the x position is sharp; y depends on stick and slip at a corner.
     qpos, want = ours.qpos[40, pushed], theirs.qpos[40, pushed]
     assert (want[:, 3] - starts[pushed, 3] > 0.02).all(), "the base must have pushed every object"
-    np.testing.assert_allclose(qpos[:, 3], want[:, 3], atol=1e-3)
-    np.testing.assert_allclose(qpos[:, 4], want[:, 4], atol=3e-3)
-    np.testing.assert_allclose(qpos[:, JOINTS.base], want[:, JOINTS.base], atol=5e-5)
+    assert_allclose(qpos[:, 3], want[:, 3], atol=1e-3)
+    assert_allclose(qpos[:, 4], want[:, 4], atol=3e-3)
+    assert_allclose(qpos[:, JOINTS.base], want[:, JOINTS.base], atol=5e-5)
 
 
 @pytest.mark.parametrize("name", OBJECTS)
@@ -59,16 +60,19 @@ def test_the_stripped_model_moves_as_the_whole_scene(name):
     loaded = load(name)
     models = (loaded.model, loaded.physics)
     whole, stripped = (step_in_c(model, touching(loaded), TWIST, 20) for model in models)
-    np.testing.assert_allclose(stripped.qpos, whole.qpos, atol=5e-5)
+    assert_allclose(stripped.qpos, whole.qpos, atol=5e-5)
 
 
-@pytest.mark.parametrize(("name", "mass", "half_extents"), [
-    ("box", 20.0, (0.20, 0.20)),
-    ("nonuniform_box", 15.0, (0.225, 0.225)),
-    ("cylinder", 25.0, (0.25, 0.25)),
-    ("hardware_box", 25.0, (0.16, 0.13)),
-    ("hardware_cylinder", 12.0, (0.115, 0.115)),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("name", "mass", "half_extents"),
+    [
+        ("box", 20.0, (0.20, 0.20)),
+        ("nonuniform_box", 15.0, (0.225, 0.225)),
+        ("cylinder", 25.0, (0.25, 0.25)),
+        ("hardware_box", 25.0, (0.16, 0.13)),
+        ("hardware_cylinder", 12.0, (0.115, 0.115)),
+    ],
+)
 def test_objects_have_the_papers_mass_and_size_and_stand_on_the_ground(name, mass, half_extents):
     loaded = load(name)
     assert loaded.physics.body("object").mass[0] == pytest.approx(mass)
@@ -84,7 +88,7 @@ def test_the_nonuniform_boxs_centre_of_mass_follows_from_its_two_parts():
     expected = np.array([-0.125, 0.125, 0.45]) * 10 / 15
     for rear, x in (("near", 1), ("far", -1)):
         ipos = load("nonuniform_box", rear=rear).physics.body("object").ipos
-        np.testing.assert_allclose(ipos, expected * [x, 1, 1], atol=5e-6)
+        assert_allclose(ipos, expected * [x, 1, 1], atol=5e-6)
 
 
 @pytest.mark.parametrize("name", OBJECTS)
@@ -104,8 +108,8 @@ def test_a_given_mass_scales_the_inertia_and_keeps_the_centre():
     plain, heavy = load("nonuniform_box"), load("nonuniform_box", mass=30.0)
     a, b = plain.physics.body("object"), heavy.physics.body("object")
     assert b.mass[0] == pytest.approx(30.0)
-    np.testing.assert_allclose(b.inertia, 2 * a.inertia, rtol=1e-6)
-    np.testing.assert_allclose(b.ipos, a.ipos, atol=1e-9)
+    assert_allclose(b.inertia, 2 * a.inertia, rtol=1e-6)
+    assert_allclose(b.ipos, a.ipos, atol=1e-9)
 
 
 @pytest.mark.parametrize("yaw", [0.0, 0.3, np.pi / 4])
@@ -124,11 +128,11 @@ def test_a_stack_holds_every_field_of_each_recompiled_model():
     for i, loaded in enumerate(scenes):
         applied = mjx_engine.apply(model, {name: values[i] for name, values in fields.items()})
         alone, _ = stack([loaded.physics])  # recompiled by itself
-        jax.tree.map(np.testing.assert_array_equal, applied, alone)
+        jax.tree.map(assert_array_equal, applied, alone)
 
 
 def test_the_base_keeps_its_commanded_speed_against_the_heaviest_object():
     loaded = load("cylinder")
     data = step_in_c(loaded.physics, touching(loaded), (*TWIST[:2], 0.0), 100)
     # 25 kg x 9.81 m/s^2 x 0.3 = 74 N against an armature of 1e6 kg.
-    np.testing.assert_allclose(data.qpos[:2], TWIST[:2] * 1.0, atol=5e-6)
+    assert_allclose(data.qpos[:2], TWIST[:2] * 1.0, atol=5e-6)

@@ -7,7 +7,8 @@ from functools import partial
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import box, case, refusal, sense
+from helpers import box, case, refusal, sense, setting_of
+from numpy.testing import assert_allclose, assert_array_equal
 from staging import push_object
 
 import rps_jax
@@ -17,7 +18,6 @@ from rps_jax.robot.shell import BOARDS, Boards
 from rps_jax.robot.skin import LINE, NONE, CapacitiveSkin, IdealSkin
 from rps_jax.trials import pushes
 from rps_jax.trials.setting import Setting
-from rps_jax.trials.trial import Rules
 from rps_jax.world.domain import DOMAINS
 from rps_jax.world.scene import JOINTS
 
@@ -37,10 +37,10 @@ def test_taxels_lie_on_their_boards():
     assert shell.count == 3
     # The strip runs to the right across the front: 5 cm along it is at y = -0.05.
     middles = [[0.5, 0.05], [0.5, -0.05], [0.5, -0.15]]
-    np.testing.assert_allclose(shell.taxels()[:, 0], middles, atol=1e-7)
+    assert_allclose(shell.taxels()[:, 0], middles, atol=1e-7)
     for side, start in (("left", [-0.15, 0.2]), ("right", [0.15, -0.2])):
         (board,) = Robot(0.5, 0.2, (Boards(side, 1, 0.1),)).shell.rows()
-        np.testing.assert_allclose(board.start, start, atol=1e-7)
+        assert_allclose(board.start, start, atol=1e-7)
 
 
 @pytest.mark.parametrize("boards", [BOARDS, FRONT_ONLY, ROBOTS["ridgeback"].boards])
@@ -49,7 +49,7 @@ def test_rows_lie_on_the_strip(boards):
     for row in shell.rows():
         for s in (0.0, 0.3, 1.0):
             point = shell.on_strip(jnp.asarray(row.offset + s * row.length))
-            np.testing.assert_allclose(point, row.start + s * row.length * row.along, atol=1e-6)
+            assert_allclose(point, row.start + s * row.length * row.along, atol=1e-6)
 
 
 def test_taxels_are_sampled_a_centimetre_apart():
@@ -66,7 +66,7 @@ def test_boards_at_the_papers_pitch_give_the_papers_readings():
             expected = read(sensor, square(0.46, y))
             reading = read(sensor._replace(shell=Robot(boards=sides).shell), square(0.46, y))
             for a, b in zip(expected, reading, strict=True):
-                np.testing.assert_allclose(a, b, atol=1e-5)
+                assert_allclose(a, b, atol=1e-5)
 
 
 @pytest.mark.parametrize("sensor", [IdealSkin(), CapacitiveSkin()])
@@ -76,10 +76,10 @@ def test_nothing_is_felt_without_a_board(sensor):
     assert int(read(worn, square(0.46, 0.26)).contact_type) == NONE
     half = read(worn, square(0.46, 0.15))  # of an object from 0.05 to 0.25
     assert int(half.contact_type) == LINE
-    np.testing.assert_allclose(half.p_robot_contact, [0.3625, 0.10], atol=0.01)
+    assert_allclose(half.p_robot_contact, [0.3625, 0.10], atol=0.01)
     smooth = worn._replace(temperature=0.0005 if isinstance(worn, IdealSkin) else 0.01)
     contact = read(smooth, square(0.46, 0.15)).p_robot_contact
-    np.testing.assert_allclose(contact, half.p_robot_contact, atol=0.01)
+    assert_allclose(contact, half.p_robot_contact, atol=0.01)
 
 
 def test_a_corner_must_press_harder_on_coarser_taxels():
@@ -109,7 +109,7 @@ def test_engines_agree_on_a_base_of_another_size():
     qpos = {name: push_object(name, slim, twist=twist).qpos[-1] for name in names}
     for name, final in qpos.items():
         bound = 0.02 if name == "quasistatic" else 3e-3
-        np.testing.assert_allclose(final, qpos["mujoco"], atol=bound, err_msg=name)
+        assert_allclose(final, qpos["mujoco"], atol=bound, err_msg=name)
     wide = push_object("fused", replace(slim, half_width=0.29), twist=twist).qpos[-1]
     assert np.abs(wide - qpos["fused"])[:9].max() > 0.005
 
@@ -117,14 +117,14 @@ def test_engines_agree_on_a_base_of_another_size():
 def test_a_sweep_uses_the_base_of_its_robot():
     """A base is as wide as its boards: a narrow base loses objects that the default one keeps."""
     domain = replace(DOMAINS["wide"], objects=("random_cylinder",))
-    setting = Setting("quasistatic", rules=Rules(horizon=20.0))
+    setting = setting_of(20.0)
     wide, narrow, same = (
         rps_jax.sweep("rps", domain, worlds=8, robot=base, setting=setting)
         for base in (None, Robot(half_length=0.5, half_width=0.2), Robot())
     )
     assert (narrow.base_pose.values != wide.base_pose.values).any()
     assert np.isfinite(narrow.path_length).all()
-    np.testing.assert_array_equal(same.base_pose, wide.base_pose)
+    assert_array_equal(same.base_pose, wide.base_pose)
 
 
 def test_presets_have_as_many_boards_as_fit():

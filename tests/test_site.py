@@ -69,8 +69,11 @@ def test_a_notebook_keeps_its_words_code_tables_and_pictures():
 
 def test_the_index_has_a_link_and_a_sentence_for_each_public_name():
     pages = HOOKS["reference"]()
-    rows = re.findall(r"^\| \[`rps_jax\.(\w+)`\]\((\w+\.md)#rps_jax\.[\w.]+\) \| (.+) \|$",
-                      pages["README.md"].partition("## Modules")[0], re.MULTILINE)  # fmt: skip
+    rows = re.findall(
+        r"^\| \[`rps_jax\.(\w+)`\]\((\w+\.md)#rps_jax\.[\w.]+\) \| (.+) \|$",
+        pages["README.md"].partition("## Modules")[0],
+        re.MULTILINE,
+    )
     assert {name for name, _, _ in rows} == set(rps_jax.__all__)
     for name, page, sentence in rows:
         assert page in pages
@@ -84,12 +87,21 @@ def test_each_way_to_add_something_has_a_heading():
     assert "**..." not in page
 
 
-@pytest.mark.parametrize(("origin", "address"), [
-    ("git@github.com:lab/rps_jax.git", "https://github.com/lab/rps_jax"),
-    ("https://user:secret@gitlab.example.org/a/b/rps_jax.git/", "https://gitlab.example.org/a/b/rps_jax"),
-    ("ssh://git@host.example:2222/lab/rps_jax", "https://host.example/lab/rps_jax"),
-    ("/srv/git/rps_jax.git", None), ("../rps_jax", None), ("file:///srv/rps_jax", None), ("", None),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("origin", "address"),
+    [
+        ("git@github.com:lab/rps_jax.git", "https://github.com/lab/rps_jax"),
+        (
+            "https://user:secret@gitlab.example.org/a/b/rps_jax.git/",
+            "https://gitlab.example.org/a/b/rps_jax",
+        ),
+        ("ssh://git@host.example:2222/lab/rps_jax", "https://host.example/lab/rps_jax"),
+        ("/srv/git/rps_jax.git", None),
+        ("../rps_jax", None),
+        ("file:///srv/rps_jax", None),
+        ("", None),
+    ],
+)
 def test_the_site_links_the_web_address_of_a_remote(origin, address):
     assert HOOKS["web_address"](origin) == address
 

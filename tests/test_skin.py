@@ -25,6 +25,8 @@ from helpers import (
     row,
 )
 from hypothesis import strategies as st
+from numpy.random import default_rng
+from numpy.testing import assert_allclose, assert_array_equal
 
 from rps_jax.geometry import footprint as fp
 from rps_jax.geometry.footprint import Footprint
@@ -74,7 +76,7 @@ def approx_reading(kind: int, x: float, y: float, abs=1e-6):
 
 def random_shapes(seed: int, gap=(-0.004, 0.012)) -> Footprint:
     """Return boxes and circles near the front at any yaw, some flush, some around its corners."""
-    rng = np.random.default_rng(seed)
+    rng = default_rng(seed)
     yaw = rng.choice([0.0, 1.0], BATCH, p=[0.2, 0.8]) * rng.uniform(-4, 4, BATCH)
     where = (yaw, rng.uniform(-0.35, 0.35, BATCH), rng.uniform(*gap, BATCH))
     half = rng.uniform(0.1, 0.35, (BATCH, 1, 2))
@@ -100,16 +102,16 @@ def test_42_taxels_run_from_left_rear_across_the_front_to_right_rear_at_48_3_mm(
     side, front = (PITCH * (np.arange(count) + 0.5) for count in (15, 12))  # [m] along a face
     left_face = np.column_stack([side - FRONT, np.full(15, SIDE)])
     front_face = np.column_stack([np.full(12, FRONT), SIDE - front])
-    np.testing.assert_allclose(TAXELS, [*left_face, *front_face, *-left_face], atol=1e-7)
+    assert_allclose(TAXELS, [*left_face, *front_face, *-left_face], atol=1e-7)
     assert sum(row.count for row in shell.BOARDS) == 14
     assert {row.electrodes for row in shell.BOARDS} == {3}
 
 
 def test_the_faces_of_the_strip_follow_each_other_around_the_corners():
     lengths = [face.length for face in FACES]
-    np.testing.assert_allclose(lengths, np.array([15, 12, 15]) * PITCH, atol=1e-12)
+    assert_allclose(lengths, np.array([15, 12, 15]) * PITCH, atol=1e-12)
     for face, following in itertools.pairwise(FACES):
-        np.testing.assert_allclose(face.start + face.length * face.along, following.start)
+        assert_allclose(face.start + face.length * face.along, following.start)
 
 
 def test_the_base_is_0_725_m_by_0_58_m_and_the_critical_region_ends_5_cm_beyond_l_cr():
@@ -118,9 +120,9 @@ def test_the_base_is_0_725_m_by_0_58_m_and_the_critical_region_ends_5_cm_beyond_
 
 
 def test_the_samples_of_a_taxel_are_spread_evenly_about_its_middle():
-    np.testing.assert_allclose(TAXEL_SAMPLES.mean(axis=1), TAXELS, atol=1e-7)
+    assert_allclose(TAXEL_SAMPLES.mean(axis=1), TAXELS, atol=1e-7)
     steps = np.linalg.norm(np.diff(TAXEL_SAMPLES, axis=1), axis=-1)
-    np.testing.assert_allclose(steps, PITCH / TAXEL_SAMPLES.shape[1], rtol=1e-4)
+    assert_allclose(steps, PITCH / TAXEL_SAMPLES.shape[1], rtol=1e-4)
 
 
 # The ideal sensor
@@ -261,7 +263,7 @@ def test_derivatives_of_a_reading_are_finite_even_if_nothing_is_felt():
     assert np.isfinite(ideal).all()
     assert np.isfinite(capacitive).all()
     # A flush box that moves to the left moves its contact as far.
-    np.testing.assert_allclose(ideal[0, :, 1], [0.0, 1.0], atol=1e-5)
+    assert_allclose(ideal[0, :, 1], [0.0, 1.0], atol=1e-5)
 
 
 # Both sensors
@@ -288,9 +290,9 @@ def test_a_mirrored_object_gives_the_mirrored_reading(sensor, seed):
     sure = clear_cut(*SIMILAR[sensor], shapes)
     assert sure.mean() > 0.5
     plain, flipped = (row(sense_all(sensor, x, KEY), sure) for x in (shapes, mirrored(shapes)))
-    np.testing.assert_array_equal(flipped.contact_type, plain.contact_type)
+    assert_array_equal(flipped.contact_type, plain.contact_type)
     expected = plain.p_robot_contact * np.array([1, -1])
-    np.testing.assert_allclose(flipped.p_robot_contact, expected, atol=1e-5)
+    assert_allclose(flipped.p_robot_contact, expected, atol=1e-5)
 
 
 @any_seed
@@ -332,17 +334,17 @@ def test_several_taxels_give_a_line_at_the_mean_of_the_outermost_two(active):
     kind, contact = active_taxels(active)
     assert kind == LINE
     expected = (TAXELS[min(active)] + TAXELS[max(active)]) / 2
-    np.testing.assert_allclose(contact, expected, atol=1e-6)
+    assert_allclose(contact, expected, atol=1e-6)
 
 
 def test_one_taxel_is_a_point_contact_at_its_position_and_none_is_no_contact():
     for i in range(42):
         kind, contact = active_taxels({i})
         assert kind == POINT
-        np.testing.assert_allclose(contact, TAXELS[i], rtol=1e-5)
+        assert_allclose(contact, TAXELS[i], rtol=1e-5)
     kind, contact = active_taxels(set())
     assert kind == NONE
-    np.testing.assert_array_equal(contact, [0, 0])
+    assert_array_equal(contact, [0, 0])
 
 
 def test_a_small_object_pressed_onto_one_taxel_is_felt_there():
@@ -360,21 +362,24 @@ def signals(gap: float, period: float, steps: int, sensor=CAPACITIVE):
     values, touch = [], []
     for _ in range(steps):
         state, reading = sense_one(sensor, state, shape, period)
-        np.testing.assert_allclose(state.signal[FLUSH_TAXELS], state.signal[20], rtol=1e-5)
+        assert_allclose(state.signal[FLUSH_TAXELS], state.signal[20], rtol=1e-5)
         values.append(float(state.signal[20]))
         touch.append(bool(reading.in_contact))
     return np.array(values), touch
 
 
-@pytest.mark.parametrize(("gap", "change"), [
-    (0.005, 1.0),  # 10 mm / 5 mm - 1
-    (0.008, 0.25),
-    (0.002, 4.0),
-    (0.0, 9.0),  # nine tenths of the foam can give way: 10 mm / 1 mm - 1
-    (-0.02, 9.0),
-    (0.01, 0.0),
-    (0.5, 0.0),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("gap", "change"),
+    [
+        (0.005, 1.0),  # 10 mm / 5 mm - 1
+        (0.008, 0.25),
+        (0.002, 4.0),
+        (0.0, 9.0),  # nine tenths of the foam can give way: 10 mm / 1 mm - 1
+        (-0.02, 9.0),
+        (0.01, 0.0),
+        (0.5, 0.0),
+    ],
+)
 def test_the_capacitance_is_inverse_to_the_gap_the_object_leaves(gap, change):
     assert signals(gap, SETTLED, 1)[0] == pytest.approx(change, rel=1e-4, abs=1e-5)
 
@@ -382,15 +387,15 @@ def test_the_capacitance_is_inverse_to_the_gap_the_object_leaves(gap, change):
 def test_the_signal_follows_a_step_with_the_time_constant_and_fades_with_it():
     # 5 mm of compression: change 1. After t it has grown to 1 - exp(-t / 50 ms).
     values, _ = signals(0.005, 0.01, 10)
-    np.testing.assert_allclose(values[[4, 9]], [0.6321206, 0.8646647], rtol=1e-4)
-    np.testing.assert_allclose(values, 1 - np.exp(-np.arange(1, 11) / 5), rtol=1e-4)
+    assert_allclose(values[[4, 9]], [0.6321206, 0.8646647], rtol=1e-4)
+    assert_allclose(values, 1 - np.exp(-np.arange(1, 11) / 5), rtol=1e-4)
     # The response does not depend on the period.
     assert signals(0.005, 0.02, 1)[0][-1] == pytest.approx(
         signals(0.005, 0.001, 20)[0][-1], rel=1e-5
     )
     state, _ = sense_one(CAPACITIVE, CAPACITIVE.init(KEY), box(FRONT + 0.205, 0.0), SETTLED)
     next_state, _ = sense_one(CAPACITIVE, state, ball(9.0, 0.0), 0.05)
-    np.testing.assert_allclose(next_state.signal, state.signal / math.e, rtol=1e-5, atol=1e-7)
+    assert_allclose(next_state.signal, state.signal / math.e, rtol=1e-5, atol=1e-7)
 
 
 def test_touch_begins_when_the_signal_passes_the_threshold():
@@ -415,7 +420,7 @@ def test_the_more_an_object_presses_the_more_capacitance():
 
     signal = np.asarray(jax.jit(jax.vmap(settled))(jnp.linspace(0.012, -0.05, 200)))
     assert (np.diff(signal, axis=0) >= -1e-6).all()
-    np.testing.assert_allclose(signal[0], np.zeros(42), atol=1e-7)
+    assert_allclose(signal[0], np.zeros(42), atol=1e-7)
     assert (signal[-1] > 1).sum() >= 3
 
 
@@ -449,10 +454,10 @@ def test_noise_is_drawn_afresh_for_every_reading_and_taxel_then_filtered():
 def test_noise_depends_on_the_key_alone():
     noisy = CAPACITIVE._replace(noise=0.1)
     first, again, different = (np.asarray(long_record(noisy, jax.random.key(k))) for k in (1, 1, 2))
-    np.testing.assert_array_equal(first, again)
+    assert_array_equal(first, again)
     assert (first != different).mean() > 0.99
     # Without noise a sensor that feels nothing is silent.
-    np.testing.assert_allclose(long_record(CAPACITIVE, jax.random.key(1)), 0.0, atol=1e-7)
+    assert_allclose(long_record(CAPACITIVE, jax.random.key(1)), 0.0, atol=1e-7)
 
 
 @jax.jit
@@ -467,7 +472,7 @@ def test_gains_spread_about_one_from_taxel_to_taxel_and_sensor_to_sensor():
     assert gain.std() == pytest.approx(0.2, rel=0.03)
     assert gain.std(axis=0).min() > 0.15
     assert gain.std(axis=1).min() > 0.1
-    np.testing.assert_array_equal(batch_of(CAPACITIVE).gain, np.ones((500, 42)))
+    assert_array_equal(batch_of(CAPACITIVE).gain, np.ones((500, 42)))
 
 
 def test_a_signal_is_proportional_to_the_gain():
@@ -476,7 +481,7 @@ def test_a_signal_is_proportional_to_the_gain():
     shape = box(FRONT + 0.205, 0.0)
     plain, _ = sense_one(CAPACITIVE, state, shape, 0.02)
     scaled, _ = sense_one(CAPACITIVE, state._replace(gain=gain), shape, 0.02)
-    np.testing.assert_allclose(scaled.signal, gain * plain.signal, rtol=1e-6)
+    assert_allclose(scaled.signal, gain * plain.signal, rtol=1e-6)
 
 
 def test_the_share_of_dead_taxels_is_as_requested():
@@ -499,4 +504,4 @@ def test_a_dead_taxel_at_the_end_of_a_contact_shifts_it_by_half_a_pitch():
     one_dead = state._replace(alive=jnp.arange(42) != first)
     _, shifted = sense_one(CAPACITIVE, one_dead, shape, SETTLED)
     moved = shifted.p_robot_contact - reading.p_robot_contact
-    np.testing.assert_allclose(moved, [0, -PITCH / 2], atol=1e-6)
+    assert_allclose(moved, [0, -PITCH / 2], atol=1e-6)

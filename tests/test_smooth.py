@@ -25,12 +25,15 @@ from helpers import (
     jitted,
     moved,
     property_test,
+    refusing,
+    setting_of,
 )
 from helpers import box as box_at
 from jax.flatten_util import ravel_pytree
+from numpy.random import default_rng
+from numpy.testing import assert_allclose, assert_array_equal
 from test_skin import BATCH, mirrored, random_shapes, sense_all
 
-from rps_jax import errors
 from rps_jax.control import registry
 from rps_jax.control.laws import rps, rps_plus
 from rps_jax.control.laws.pursuit import PursuitParams
@@ -41,8 +44,7 @@ from rps_jax.geometry.footprint import Footprint
 from rps_jax.robot.skin import NONE, CapacitiveSkin, IdealSkin
 from rps_jax.trials import host, pushes
 from rps_jax.trials.pushes import Case
-from rps_jax.trials.setting import Setting
-from rps_jax.trials.trial import ControlLoop, Rules
+from rps_jax.trials.trial import ControlLoop
 
 WARM = Temperatures()
 COLD = Temperatures(1e-6, 1e-6, 1e-6, 1e-6)
@@ -72,7 +74,7 @@ def one_step(state, observation):
 
 def random_worlds(seed: int, dtype=np.float32):
     """Plausible (params, state, observation), batched; contacts are 0 or 1, or in between."""
-    rng, n = np.random.default_rng(seed), WORLDS
+    rng, n = default_rng(seed), WORLDS
     cast = lambda x: jnp.asarray(x, dtype)  # noqa: E731
     params = test_law.random_params(seed, n, dtype)
     params = params._replace(keep_contact=cast(rng.choice([0.0, 1.0], n)), sgn_0=0 * params.sgn_0)
@@ -116,7 +118,7 @@ def test_without_heat_the_smooth_law_is_the_law_away_from_its_switches(seed):
     exact, cold = hard(*worlds), smooth(*worlds, COLD)
     sure = clear(*worlds, exact[2])
     soft, plain = (flat_numbers(outputs)[sure] for outputs in (cold, exact))
-    np.testing.assert_allclose(soft, plain, rtol=1e-4, atol=1e-5)
+    assert_allclose(soft, plain, rtol=1e-4, atol=1e-5)
 
 
 @any_seed
@@ -204,9 +206,9 @@ def test_the_smooth_speed_is_still_v_star_split_by_the_slope(seed):
     _, twist, details = smooth(params, state, observation, WARM)
     away = details.distance > 0.12
     speed, v_star = np.hypot(twist.v_x, twist.v_y), params.K_v * details.distance
-    np.testing.assert_allclose(speed[away], v_star[away], rtol=1e-4)
+    assert_allclose(speed[away], v_star[away], rtol=1e-4)
     expected = details.a_r * twist.v_x
-    np.testing.assert_allclose(twist.v_y[away], expected[away], rtol=1e-3, atol=1e-6)
+    assert_allclose(twist.v_y[away], expected[away], rtol=1e-3, atol=1e-6)
 
 
 def test_the_weight_of_a_contact_mixes_pushing_with_going_ahead():
@@ -218,8 +220,8 @@ def test_the_weight_of_a_contact_mixes_pushing_with_going_ahead():
     felt = observation._replace(p_robot_contact=jnp.array([FRONT, -0.05]), in_contact=jnp.ones(()))
     pushed, push, _ = one_step(start, felt)
     expected = 0.25 * np.stack(push) + 0.75 * np.array([0.01, 0.0, 0.0])
-    np.testing.assert_allclose(np.stack(twist), expected, rtol=1e-5)
-    np.testing.assert_allclose(state.l_th, 0.25 * pushed.l_th + 0.75 * start.l_th, rtol=1e-5)
+    assert_allclose(np.stack(twist), expected, rtol=1e-5)
+    assert_allclose(state.l_th, 0.25 * pushed.l_th + 0.75 * start.l_th, rtol=1e-5)
     assert state.touched == 1.0
 
 
@@ -239,12 +241,12 @@ def test_a_mirrored_world_gives_the_mirrored_smooth_twist(seed):
     next_state, twist, details = smooth(params, state, observation, WARM)
     next_state_m, twist_m, details_m = smooth(params, mirrored_state, mirrored, WARM)
     behind = np.abs(np.abs(details.gamma) - params.gamma_max) < 1e-6  # at +-pi it chooses a side
-    np.testing.assert_allclose(next_state_m.l_th, next_state.l_th, rtol=1e-5)
-    np.testing.assert_allclose(details_m.a_r, -details.a_r, rtol=1e-4, atol=1e-5)
-    np.testing.assert_allclose(twist_m.v_x, twist.v_x, rtol=1e-4, atol=1e-6)
-    np.testing.assert_allclose(twist_m.v_y, -twist.v_y, rtol=1e-4, atol=1e-6)
+    assert_allclose(next_state_m.l_th, next_state.l_th, rtol=1e-5)
+    assert_allclose(details_m.a_r, -details.a_r, rtol=1e-4, atol=1e-5)
+    assert_allclose(twist_m.v_x, twist.v_x, rtol=1e-4, atol=1e-6)
+    assert_allclose(twist_m.v_y, -twist.v_y, rtol=1e-4, atol=1e-6)
     omega, omega_m = (np.asarray(x.omega)[~behind] for x in (twist, twist_m))
-    np.testing.assert_allclose(omega_m, -omega, atol=2e-4)
+    assert_allclose(omega_m, -omega, atol=2e-4)
 
 
 _, unravel = ravel_pytree((PAPER, state_with(), observe((1.0, 0.0)), WARM))
@@ -285,7 +287,7 @@ def test_derivatives_agree_with_finite_differences():
     h = 1e-7
     with jax.enable_x64(True):
         params, state, observation = random_worlds(1, np.float64)
-        touched, weight = np.random.default_rng(2).uniform(0.05, 0.95, (2, WORLDS))
+        touched, weight = default_rng(2).uniform(0.05, 0.95, (2, WORLDS))
         state = state._replace(touched=touched)
         heat = jax.tree.map(partial(np.full, WORLDS), WARM)
         x = flatten((params, state, observation._replace(in_contact=weight), heat))
@@ -337,13 +339,13 @@ def test_without_heat_the_smooth_skin_is_the_skin(sensor, dull, keen, seed):
     cold = sense_all(sensor._replace(temperature=1e-6), shapes, key)
     sure = np.asarray(less.in_contact == more.in_contact)
     assert sure.mean() > 0.7
-    np.testing.assert_allclose(cold.in_contact[sure], exact.in_contact[sure], atol=1e-6)
+    assert_allclose(cold.in_contact[sure], exact.in_contact[sure], atol=1e-6)
     assert ((cold.contact_type == NONE) == (exact.contact_type == NONE))[sure].all()
     # Of a slanted edge the end moves by many times the change of tolerance.
     moved = np.abs(less.p_robot_contact - more.p_robot_contact).max(axis=1)
     felt = sure & np.asarray(exact.in_contact) & (moved < 1e-3)
     assert felt.sum() > 8
-    np.testing.assert_allclose(cold.p_robot_contact[felt], exact.p_robot_contact[felt], atol=4e-4)
+    assert_allclose(cold.p_robot_contact[felt], exact.p_robot_contact[felt], atol=4e-4)
 
 
 @pytest.mark.parametrize("sensor", [IdealSkin(), IMPERFECT], ids=["ideal", "capacitive"])
@@ -374,7 +376,7 @@ def test_a_contact_grows_as_the_object_nears_and_is_half_at_the_threshold(skin):
     assert weight[0] < 1e-3
     assert weight[-1] > 0.99
     assert reading.in_contact[-1] == pytest.approx(0.5, abs=0.01)
-    np.testing.assert_array_equal(reading.contact_type != NONE, reading.in_contact > 0.5)
+    assert_array_equal(reading.contact_type != NONE, reading.in_contact > 0.5)
 
 
 def differences(skin, poses, step, h: float) -> np.ndarray:
@@ -388,7 +390,7 @@ def test_an_ideal_contact_moves_with_the_object():
     """The contact of a flush box moves sideways with the box."""
     poses = [flush(0.001, y) for y in np.linspace(-0.07, 0.07, 40)]
     slopes = differences(SENSORS["ideal"], poses, (0, 1, 0), 1e-3)
-    np.testing.assert_allclose(slopes, np.tile([0.0, 1.0], (40, 1)), atol=5e-3)
+    assert_allclose(slopes, np.tile([0.0, 1.0], (40, 1)), atol=5e-3)
 
 
 def test_a_flush_box_that_turns_moves_its_contact_at_once():
@@ -404,9 +406,9 @@ def test_a_flush_box_that_turns_moves_its_contact_at_once():
 def test_a_mirrored_object_gives_the_mirrored_smooth_reading(skin, seed):
     shapes, key = random_shapes(seed, NEAR), jax.random.key(0)
     reading, mirrored_reading = (sense_all(skin, x, key) for x in (shapes, mirrored(shapes)))
-    np.testing.assert_allclose(mirrored_reading.in_contact, reading.in_contact, atol=1e-3)
+    assert_allclose(mirrored_reading.in_contact, reading.in_contact, atol=1e-3)
     expected = reading.p_robot_contact * np.array([1, -1])
-    np.testing.assert_allclose(mirrored_reading.p_robot_contact, expected, atol=2e-3)
+    assert_allclose(mirrored_reading.p_robot_contact, expected, atol=2e-3)
 
 
 POSES = [
@@ -446,7 +448,7 @@ def test_the_derivatives_of_a_smooth_reading_agree_with_finite_differences(skin)
     assert np.abs(slopes).max() > 0.1
     for axis, step in enumerate(np.eye(3)):
         expected = differences(skin, poses[:2], step, 3e-5)
-        np.testing.assert_allclose(slopes[:, :2, axis], expected, rtol=0.02, atol=0.02)
+        assert_allclose(slopes[:, :2, axis], expected, rtol=0.02, atol=0.02)
 
 
 # Whole trials in C MuJoCo, without compilation
@@ -454,7 +456,7 @@ def test_the_derivatives_of_a_smooth_reading_agree_with_finite_differences(skin)
 
 def push(case: Case, law, horizon: float):
     """Return the trial of a case after `horizon` [s], or at its end."""
-    setting = Setting(engine="mujoco", rules=Rules(horizon=horizon))
+    setting = setting_of(horizon, "mujoco")
     _, worlds, models, params = pushes.build([case], setting)
     loop = ControlLoop(setting.physics, setting.rules, law)
     *_, trials = host.run(models, worlds, params, loop, threads=1)
@@ -469,7 +471,7 @@ def test_without_heat_a_smooth_trial_is_the_hard_one(name):
     exact = push(start, rps.LAW, 10.0)
     got = push(cold, registry.smooth_law(rps.LAW, COLD), 10.0)
     assert abs(exact.qpos[2]) > 0.2  # it turned
-    np.testing.assert_allclose(got.qpos, exact.qpos, atol=2e-3)
+    assert_allclose(got.qpos, exact.qpos, atol=2e-3)
     assert got.contact_steps == pytest.approx(exact.contact_steps, abs=1)
     assert got.sum_abs_l == pytest.approx(exact.sum_abs_l, rel=0.02)
     assert got.min_distance == pytest.approx(exact.min_distance, abs=2e-3)
@@ -489,7 +491,7 @@ def test_with_a_warm_skin_a_push_arrives(law):
 
 def plus_moments(count=40):
     """Random observations for RPS+, with and without contact; every tenth starts a push."""
-    rng = np.random.default_rng(8)
+    rng = default_rng(8)
     for i in range(count):
         x, y, far, side = rng.uniform(-1, 1, 4)
         contact, target = jnp.array([0.36, 0.3 * y]), jnp.array([0.5 + 0.3 * far, 0.3 * side])
@@ -508,7 +510,7 @@ def test_without_heat_smooth_rps_plus_is_the_hard_one(monkeypatch):
             states = [hard.init(params), cold.init(params)]
         (states[0], twist, _) = hard.step(params, states[0], observation)
         (states[1], mixed, _) = cold.step(params, states[1], weight)
-        np.testing.assert_allclose(jnp.stack(mixed), jnp.stack(twist), atol=1e-5)
+        assert_allclose(jnp.stack(mixed), jnp.stack(twist), atol=1e-5)
         assert float(states[1].steps_lost) == pytest.approx(float(states[0].steps_lost))
 
 
@@ -531,7 +533,7 @@ def test_a_smooth_rps_plus_can_be_differentiated_by_its_own_parameters():
         slope, steps = jax.grad(driven)(base), 1e-5 * jnp.eye(len(names))
         expected = [(driven(base + step) - driven(base - step)) / 2e-5 for step in steps]
     assert (abs(slope) > 1e-4).all()
-    np.testing.assert_allclose(slope, expected, rtol=1e-3)
+    assert_allclose(slope, expected, rtol=1e-3)
 
 
 def test_rps_and_rps_plus_alone_have_a_smooth_form_one_for_equal_temperatures():
@@ -544,5 +546,5 @@ def test_rps_and_rps_plus_alone_have_a_smooth_form_one_for_equal_temperatures():
         assert registry.smooth_law(law, COLD) is not smooth_law
     assert registry.smooth_law(rps.LAW) != registry.smooth_law(rps_plus.LAW)
     words = "this law has no smooth form.* choose rps, rps_tuned, nps, rps_unsaturated, rps_plus"
-    with pytest.raises(errors.InputError, match=words):
+    with refusing(words):
         registry.smooth_law(registry.law_of(PursuitParams()))

@@ -3,10 +3,11 @@
 import numpy as np
 import pytest
 import xarray as xr
+from helpers import refusing, setting_of
+from numpy.testing import assert_allclose, assert_array_equal
 from staging import step_in_c
 
 import rps_jax
-from rps_jax import errors
 from rps_jax.control import registry
 from rps_jax.control.laws.aps import APSParams
 from rps_jax.control.laws.pursuit import PursuitParams
@@ -20,8 +21,7 @@ from rps_jax.studies import hardware
 from rps_jax.trials import pushes
 from rps_jax.trials.case import Case
 from rps_jax.trials.results import DIMS
-from rps_jax.trials.setting import Setting
-from rps_jax.trials.trial import Rules, Shift
+from rps_jax.trials.trial import Shift
 from rps_jax.world import paper, scene
 from rps_jax.world.objects import PAPER_OBJECTS
 from rps_jax.world.physics import preset
@@ -33,7 +33,7 @@ from sweeps.conditions import Condition, Grid
 from sweeps.fidelity import study as fidelity
 
 NEAR = ((0.6, 0.0), (0.62, 0.03))
-SHORT = Setting(engine="mujoco", rules=Rules(horizon=18.0))
+SHORT = setting_of(18.0, "mujoco")
 GRID = Grid(objects=("box",), friction={"S1": FRICTION["S1"]}, targets=NEAR)
 CONDITIONS = {
     "default": Condition("the defaults", SHORT),
@@ -63,7 +63,7 @@ def test_a_study_labels_its_conditions_and_compares_them(folder):
     results = conditions.run_conditions(CONDITIONS, GRID, folder)
     assert results.success.dims == ("condition", *DIMS)
     successes = results.success.sum(DIMS).values
-    np.testing.assert_array_equal(successes, [2, 0, 2])
+    assert_array_equal(successes, [2, 0, 2])
     rows = conditions.condition_rows(results, "default")
     assert [row[0] for row in rows] == ["reading", "the defaults", "slow", "thin skin"]
     assert rows[1][1:3] == ["2", "2 of 2"]
@@ -90,7 +90,7 @@ def test_a_study_resumes_and_repeats_only_corrupt_parts(folder, monkeypatch):
 
 def test_a_study_refuses_a_folder_of_other_conditions(folder):
     changed = {"slow": Condition("slow", SHORT, params={"v_max": 0.002})}
-    with pytest.raises(errors.InputError, match=r"slow.* was run with other options"):
+    with refusing(r"slow.* was run with other options"):
         conditions.run_conditions(changed, GRID, folder)
 
 
@@ -104,8 +104,8 @@ def test_c_mujoco_driven_by_periods_matches_c_mujoco_driven_by_steps():
         batch.drive(np.array([0]), twist, physics.substeps)
     data = step_in_c(at.physics, qpos, twist[0], 100 * physics.substeps)
     batch.close()
-    np.testing.assert_allclose(batch.qpos[0, :3], data.qpos[:3], atol=3e-6)
-    np.testing.assert_allclose(batch.qpos[0, 3:], data.qpos[3:], atol=2e-4)
+    assert_allclose(batch.qpos[0, :3], data.qpos[:3], atol=3e-6)
+    assert_allclose(batch.qpos[0, 3:], data.qpos[3:], atol=2e-4)
     assert batch.qpos[0, 3] > qpos[3] + 0.08  # it was pushed
 
 
@@ -115,16 +115,16 @@ def test_a_shove_moves_the_object_along_the_front_of_the_robot():
         Case("box", FRICTION["S1"], (2.0, 0.0), shift=Shift(0.5, (0.0, y)), bearing=bearing)
         for y, bearing in ((0.1, 0.0), (-0.1, 0.0), (0.1, np.pi / 2))
     ]
-    setting = Setting(engine="mujoco", rules=Rules(horizon=1.0))
+    setting = setting_of(1.0, "mujoco")
     outcome, _ = pushes.run(cases, setting)
     x = 0.3625 + 0.02 + 0.2
     expected = [[x, 0.1], [x, -0.1], [-0.1, x]]
-    np.testing.assert_allclose(outcome.object_pose[:, :2], expected, atol=1e-3)
+    assert_allclose(outcome.object_pose[:, :2], expected, atol=1e-3)
 
 
 @pytest.mark.slow
 def test_the_hardware_experiments_cover_friction_targets_and_shoves():
-    setting = Setting(rules=Rules(horizon=3.0))
+    setting = setting_of(3.0, "fused")
     results = rps_jax.hardware(shifts=(0.1,), setting=setting)
     assert results.sizes["friction"] == len(paper.HARDWARE_GROUND) * len(paper.HARDWARE_ROBOT)
     assert results.sizes["target"] == 8
@@ -147,7 +147,7 @@ def test_the_papers_base_slips_by_default_most_when_it_turns():
 
 def test_the_hardware_targets_are_2_1_m_from_the_start():
     distance = np.linalg.norm(paper.HARDWARE_LAYOUTS["circle"], axis=1)
-    np.testing.assert_allclose(distance, 2.1)
+    assert_allclose(distance, 2.1)
     assert len(set(paper.HARDWARE_LAYOUTS["grid"])) == 8
 
 
@@ -171,8 +171,12 @@ def test_a_reading_that_a_law_has_already_is_no_row():
 
 def test_the_cells_of_table_ii_are_judged_by_their_intervals():
     success = np.repeat([[1], [0], [0]], 3 * 2 * 24, axis=1).reshape(1, 3, 3, 2, 24)
-    labels = {"condition": ["paper_gazebo"], "law": list(paper.LAWS), "friction": ["S1", "S2"],
-              "object": list(PAPER_OBJECTS)}  # fmt: skip
+    labels = {
+        "condition": ["paper_gazebo"],
+        "law": list(paper.LAWS),
+        "friction": ["S1", "S2"],
+        "object": list(PAPER_OBJECTS),
+    }
     results = xr.Dataset({"success": (("condition", *DIMS), success)}, labels)
     rows = {row[0]: row for row in readings.cells(results)[1:]}
     # Of 24: the paper's 24 gives 20.7-24, its 19 14.3-21.8, its 0 0-3.3, its 2 0.6-6.2.

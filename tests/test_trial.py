@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import xarray as xr
 from helpers import advance, case, jitted
+from numpy.testing import assert_allclose, assert_array_equal
 
 from rps_jax.analysis import statistics
 from rps_jax.engines.base import Driven
@@ -111,9 +112,9 @@ def test_trials_end_alike_in_the_merged_batches_of_a_gpu(monkeypatch, sequential
     assert segments[0].live == {0: SLOTS, 1: 3}
     assert sequential.success.sum() > 0
     for name in ("success", "time"):
-        np.testing.assert_array_equal(getattr(results, name), getattr(sequential, name))
+        assert_array_equal(getattr(results, name), getattr(sequential, name))
     # Programs of other shapes round otherwise.
-    np.testing.assert_allclose(results.object_pose, sequential.object_pose, atol=1e-3)
+    assert_allclose(results.object_pose, sequential.object_pose, atol=1e-3)
 
 
 @pytest.fixture(scope="module")
@@ -143,7 +144,7 @@ def test_a_shove_happens_once_however_its_time_is_rounded(single):
     times = np.concatenate([np.arange(0, 10, 0.01), [np.inf]]).astype(np.float32)
     for period in (0.005, 0.02, 0.05):
         total = np.asarray(moved_by_all(times, period, np.arange(2100))).sum(axis=1)
-        np.testing.assert_allclose(total[:-1], 0.1, atol=1e-4)
+        assert_allclose(total[:-1], 0.1, atol=1e-4)
         assert total[-1] == 0
 
 
@@ -151,7 +152,7 @@ def test_a_trial_is_bit_identical_alone_or_among_others(outcomes):
     for index in (1, 3, 5):
         alone = run([CASES[index]] * SLOTS)
         expected = jax.tree.map(lambda leaf, index=index: np.stack([leaf[index]] * SLOTS), outcomes)
-        jax.tree.map(np.testing.assert_array_equal, alone, expected)
+        jax.tree.map(assert_array_equal, alone, expected)
 
 
 def test_contact_lost_for_too_long_ends_a_trial(outcomes):
@@ -205,12 +206,12 @@ def advanced():
 
 def test_a_diverged_world_freezes_and_others_are_unchanged_bit_for_bit(advanced):
     healthy, mixed, _ = advanced
-    np.testing.assert_array_equal(mixed.diverged, [False, True, False, False])
+    assert_array_equal(mixed.diverged, [False, True, False, False])
     assert mixed.steps[1] == 0
     assert mixed.done[1]
     rest = np.array([0, 2, 3])
-    np.testing.assert_array_equal(mixed.qpos[rest], healthy.qpos[rest])
-    np.testing.assert_array_equal(mixed.qvel[rest], healthy.qvel[rest])
+    assert_array_equal(mixed.qpos[rest], healthy.qpos[rest])
+    assert_array_equal(mixed.qvel[rest], healthy.qvel[rest])
     assert (np.asarray(healthy.steps) == 20).all()
 
 
@@ -229,7 +230,7 @@ def test_an_object_that_tilts_too_far_ends_its_trial():
 
     ended = observed()
     assert ended.tipped.tolist() == ended.done.tolist() == [False, False, True, True]
-    np.testing.assert_array_equal(ended.tipped, ended.tilt > Rules().max_tilt)
+    assert_array_equal(ended.tipped, ended.tilt > Rules().max_tilt)
     assert not ended.success.any()
     assert not observed(rules=Rules(max_tilt=3)).tipped.any()
 
@@ -242,13 +243,13 @@ def test_the_path_length_of_the_base_is_its_speed_times_time(outcomes):
 
 def test_padding_never_moves_and_a_finished_batch_stops_at_once(advanced):
     padded = advanced[2]
-    np.testing.assert_array_equal(padded.qpos, world_batch(SLOTS)[1].qpos)
+    assert_array_equal(padded.qpos, world_batch(SLOTS)[1].qpos)
     assert (np.asarray(padded.steps) == 0).all()
 
 
 def test_before_the_first_touch_the_base_creeps_without_lost_contact(advanced):
     healthy, *_ = advanced  # 0.4 s at 1 cm/s
-    np.testing.assert_allclose(healthy.path_length, 0.004, rtol=1e-3)
+    assert_allclose(healthy.path_length, 0.004, rtol=1e-3)
     assert float(healthy.qpos[0, 0]) == pytest.approx(0.4 * 0.01, rel=1e-4)
     assert int(healthy.lost_steps[0]) == 0
     assert np.isinf(healthy.min_distance[0])

@@ -181,7 +181,9 @@ def test_an_ffmpeg_that_fails_is_one_sentence(box, tmp_path, monkeypatch):
 INVALID = [
     *({"frames": frames} for frames in ([], [np.full(10, np.nan)], [np.zeros(3)])),
     *({"size": size} for size in ((161, 120), (8000, 120))),
-    *({"p_world_target": (np.nan, 0.0)}, {"camera": "abov"}, {"fps": 0}),
+    {"p_world_target": (np.nan, 0.0)},
+    {"camera": "abov"},
+    {"fps": 0},
 ]
 
 

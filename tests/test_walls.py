@@ -6,12 +6,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from helpers import refusing, slow
+from numpy.testing import assert_allclose
 from staging import Recording, drive, simulate
 
 import rps_jax
 from rps_jax import engines
 from rps_jax.engines.base import Motion
-from rps_jax.errors import InputError
 from rps_jax.geometry import footprint
 from rps_jax.geometry import solid as solids
 from rps_jax.geometry.solid import Solid
@@ -66,11 +67,10 @@ def slid(family: str, engine: str, physics: Physics) -> Recording:
 
 
 PAIRS = [
-    *(("box", "fused"), ("cylinder", "fused"), ("prism", "fused")),
-    *(
-        pytest.param(family, "mjx", marks=pytest.mark.slow)
-        for family in ("box", "cylinder", "prism")
-    ),
+    ("box", "fused"),
+    ("cylinder", "fused"),
+    ("prism", "fused"),
+    *(slow(family, "mjx") for family in ("box", "cylinder", "prism")),
 ]
 
 
@@ -79,11 +79,11 @@ def test_slides_along_walls_agree_with_c_mujoco(family, engine):
     computed, expected = slid(family, engine, STANDARD), slid(family, "mujoco", REFERENCE)
     away = np.linalg.norm(computed.qpos[..., 3:5] - expected.qpos[..., 3:5], axis=-1)
     assert away.max() < (7e-3 if family == "prism" else 3e-3)  # a prism turns, and differences grow
-    np.testing.assert_allclose(computed.qpos[-1, :, 6:], expected.qpos[-1, :, 6:], atol=0.07)
+    assert_allclose(computed.qpos[-1, :, 6:], expected.qpos[-1, :, 6:], atol=0.07)
     *_, solid = staged(family, engine, STANDARD)
     for qpos in (computed.qpos, expected.qpos):
         if family != "prism":
-            np.testing.assert_allclose(qpos[:, 3, 3:5], qpos[:, 0, 3:5] * [1, -1], atol=2e-3)
+            assert_allclose(qpos[:, 3, 3:5], qpos[:, 0, 3:5] * [1, -1], atol=2e-3)
         beyond = outermost(solid, qpos)[:, :2] - Y
         assert -0.0011 < beyond.max() < -0.0005  # at the face of a sheet of 2 mm
 
@@ -98,7 +98,7 @@ def test_the_force_of_a_slide_is_that_of_coulombs_law():
         for engine, physics in (("fused", STANDARD), ("mujoco", REFERENCE))
     )
     assert expected[1] == pytest.approx(GROUND * MASS * 9.81, rel=0.16)
-    np.testing.assert_allclose(computed, expected, rtol=0.15)
+    assert_allclose(computed, expected, rtol=0.15)
     for rough, smooth in (computed, expected):
         assert 1.01 < rough / smooth < 1 / (1 - ROBOT * FRICTION[0]) + 0.01
 
@@ -131,8 +131,8 @@ def test_derivatives_of_a_slide_are_those_of_its_wall(monkeypatch):
     monkeypatch.setenv("RPS_COMPILER", "none")
     assert (np.asarray(slope)[:2] > 0.3).all(), slope
     by_xla, xlas = derivative()
-    np.testing.assert_allclose(compiled, by_xla, atol=1e-5)
-    np.testing.assert_allclose(slope, xlas, atol=0.02)
+    assert_allclose(compiled, by_xla, atol=1e-5)
+    assert_allclose(slope, xlas, atol=0.02)
 
 
 REFUSED = {
@@ -145,12 +145,12 @@ REFUSED = {
 
 @pytest.mark.parametrize("text", REFUSED)
 def test_a_wrong_wall_is_refused(text):
-    with pytest.raises(InputError, match=REFUSED[text]):
+    with refusing(REFUSED[text]):
         parse_task(text)
 
 
 def test_the_quasistatic_engine_has_no_walls():
-    with pytest.raises(InputError, match="it has no walls; choose mjx or fused or mujoco"):
+    with refusing("it has no walls; choose mjx or fused or mujoco"):
         rps_jax.draw_worlds(
             "wide,objects=random_box", task="corridor,touch=object", setting=Setting("quasistatic")
         )

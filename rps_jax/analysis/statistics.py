@@ -18,7 +18,12 @@ from rps_jax.world import tasks
 from rps_jax.world.domain import LABELS
 
 FAILURES = (
-    *("never touched", "lost contact", "timeout", "fell over", "diverged", "stalled"),
+    "never touched",
+    "lost contact",
+    "timeout",
+    "fell over",
+    "diverged",
+    "stalled",
     "contact not felt",
 )
 MODES = (*FAILURES, *tasks.FAILURES.values())  # with those of tasks
@@ -209,7 +214,7 @@ def bins(values: np.ndarray, success: np.ndarray, count: int = 8) -> Bins:
     """
     if not (finite := np.isfinite(values)).all():
         values, success = values[finite], success[..., finite]
-    order = ascending_order(values)
+    order = np.argsort(values, kind="stable")
     changes = np.flatnonzero(np.diff(values[order])) + 1
     parts = changes if changes.size < count else count
     groups = [group for group in np.array_split(order, parts) if group.size]
@@ -219,18 +224,6 @@ def bins(values: np.ndarray, success: np.ndarray, count: int = 8) -> Bins:
         np.moveaxis(successes.reshape(len(groups), *success.shape[:-1]), 0, -1),
         np.array([g.size for g in groups]),
     )
-
-
-def ascending_order(values: np.ndarray) -> np.ndarray:
-    """Return the indices (n,) that sort numbers without NaN, stable.
-
-    Equals NumPy's stable `argsort`, and takes a fifth of its time for float32.
-    """
-    if values.dtype != np.float32:
-        return np.argsort(values, kind="stable")
-    bits = (values + np.float32(0)).view(np.int32).astype(np.int64)  # a zero without a sign
-    bits = np.where(bits < 0, bits ^ 0x7FFFFFFF, bits)  # in the order of the numbers
-    return np.sort((bits << 32) | np.arange(values.size)) & 0xFFFFFFFF
 
 
 def equal_rates_p(binned: Bins) -> float:

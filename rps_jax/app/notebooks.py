@@ -14,8 +14,16 @@ from rps_jax.trials.progress import ProgressCallback
 from rps_jax.world import objects
 
 NAMES = (  # of those that need the package alone; all others read results of the repository
-    *("01_the_law", "02_one_push", "03_paper", "04_robustness", "06_fitting", "07_custom_law"),
-    *("08_analysis", "09_gymnasium", "10_gradients", "11_rooms"),
+    "01_the_law",
+    "02_one_push",
+    "03_paper",
+    "04_robustness",
+    "06_fitting",
+    "07_custom_law",
+    "08_analysis",
+    "09_gymnasium",
+    "10_gradients",
+    "11_rooms",
 )
 _METADATA = {"kernelspec": {"name": "python3", "display_name": "Python 3", "language": "python"}}
 

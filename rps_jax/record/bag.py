@@ -122,17 +122,21 @@ _POSITION = _floats("pose.position.xyz")
 _TF = {"tf2_msgs/TFMessage": _floats("transform.translation.xyz", "transform.rotation.xyzw")}
 _READERS: dict[str, dict[str, Callable[[Any], Floats]]] = {  # of messages, by topic and type
     "odom": {"nav_msgs/Odometry": _floats("pose.pose.position.xyz", "pose.pose.orientation.xyzw")},
-    "target": {"geometry_msgs/PointStamped": _floats("point.xyz"),
-               "geometry_msgs/PoseStamped": _POSITION},
+    "target": {
+        "geometry_msgs/PointStamped": _floats("point.xyz"),
+        "geometry_msgs/PoseStamped": _POSITION,
+    },
     "path": {"nav_msgs/Path": lambda m: [x for pose in m.poses for x in _POSITION(pose)]},
     "contact": {"geometry_msgs/PolygonStamped": _contact},
     "taxels": {"std_msgs/Float32MultiArray": attrgetter("data")},
     "force": {"geometry_msgs/WrenchStamped": _floats("wrench.force.xyz")},
     "object": {"visualization_msgs/Marker": _floats("pose.position.xyz", "scale.x")},
-    "cmd_vel": {"geometry_msgs/TwistStamped": _floats("twist.linear.xy", "twist.angular.z"),
-                "geometry_msgs/Twist": _floats("linear.xy", "angular.z")},
+    "cmd_vel": {
+        "geometry_msgs/TwistStamped": _floats("twist.linear.xy", "twist.angular.z"),
+        "geometry_msgs/Twist": _floats("linear.xy", "angular.z"),
+    },
     **dict.fromkeys(_TREE, _TF),
-}  # fmt: skip
+}
 _FIELDS: dict[str, tuple[str, Callable[[np.ndarray], np.ndarray]]] = {  # of values (N, k)
     "pose": ("odom", _plane_pose),
     "target": ("target", _xy),

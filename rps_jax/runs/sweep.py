@@ -107,6 +107,8 @@ class SweepQuestion(PlanQuestion, DomainQuestion[xr.Dataset], MultiLawQuestion[x
 def describe_plan(plan: Plan) -> str:
     """Return the number and source of the worlds and the engine, in words."""
     source = f"seed {plan.setting.seed}" if plan.points is None else "points of the unit cube"
+    if plan.setting.split:
+        source += f", split {plan.setting.split}"
     return (
         f"{plan.worlds:,} worlds{task_in_words(plan.domain)}, {source}, "
         f"engine {plan.setting.engine}, steps of {1000 * plan.setting.physics.timestep:g} ms; "

@@ -71,8 +71,8 @@ def build(
 ) -> WorldBatch:
     """Return the worlds of n cases of one kind (see `kind`), on the host.
 
-    (setting.seed, index) is the key of the imperfections of the skin of a world; by default the
-    indices count from 0.
+    (setting.world_seed, index) is the key of the imperfections of the skin of a world; by default
+    the indices count from 0.
     """
     trials = np.arange(len(cases)) if indices is None else np.asarray(indices)
     for case in cases:
@@ -85,7 +85,7 @@ def build(
     starts = [_start_of(case, scenes[key]) for case, key in zip(cases, keys, strict=True)]
     qpos, targets = (np.array(column) for column in zip(*starts, strict=True))
     courses, final = [], []
-    uniform = draws.random_numbers(setting.seed, trials)
+    uniform = draws.random_numbers(setting.world_seed, trials)
     for case, row, target in zip(cases, uniform, targets, strict=True):
         u = draws.by_name(row[None])
         front = np.array([float(case.base.sizes[0])])
@@ -93,7 +93,9 @@ def build(
         final.append(end[0])
         courses.append(rows(course, 0))
     shifts = zip(*(case.shift for case in cases), strict=True)
-    root = jax.random.PRNGKey(setting.seed)
+    high, low = divmod(setting.world_seed, 2**32)
+    root = jax.random.PRNGKey(low)
+    root = jax.random.fold_in(root, high) if high else root
     inputs = WorldInputs(
         FAMILIES[cases[0].object_name],
         solid.stack([solids[key] for key in keys]),

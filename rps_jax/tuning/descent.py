@@ -47,8 +47,10 @@ class TuneGrad(Tuning):
     """
 
     QUICK = Tuning.QUICK | {
-        "worlds": 64, "steps": 8, "learning_rate": 0.3,
-    }  # fmt: skip
+        "worlds": 64,
+        "steps": 8,
+        "learning_rate": 0.3,
+    }
 
     worlds: int = option(512, 1, 10_000_000)
     """Number of worlds of a step, in each domain; every step has other worlds."""

@@ -34,8 +34,11 @@ class TuneES(Tuning):
     """
 
     QUICK = Tuning.QUICK | {
-        "worlds": 32, "population": 12, "generations": 8, "spread": 1.0,
-    }  # fmt: skip
+        "worlds": 32,
+        "population": 12,
+        "generations": 8,
+        "spread": 1.0,
+    }
 
     population: int = option(64, 4, 100_000)
     """Number of candidates in a generation."""

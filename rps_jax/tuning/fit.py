@@ -478,7 +478,10 @@ def correlations(data: xr.Dataset) -> Rows:
     """Return a header and the pairs of quantities that the logs determine only in combination."""
     correlation = data.correlation.values
     names = [str(q) for q in data.quantity.values]
-    pairs = [(i, j) for i, j in np.argwhere(np.tril(abs(correlation), -1) > 0.5)
-             if not DERIVED.keys() & {names[i], names[j]}]  # fmt: skip
+    pairs = [
+        (i, j)
+        for i, j in np.argwhere(np.tril(abs(correlation), -1) > 0.5)
+        if not DERIVED.keys() & {names[i], names[j]}
+    ]
     rows = [[quantity(names[i]), quantity(names[j]), f"{correlation[i, j]:.2f}"] for i, j in pairs]
     return [["", "", "correlation"], *rows]

@@ -207,6 +207,9 @@ class Tuning(TaskOption, LawQuestion[xr.Dataset]):
             return self._try_proposal(proposal, generation, run._replace(callback=report))
 
         for results in run.steps(compute, proceed):
+            names = {*map(str, results), "vectors", "center", "validation", "simulated"}
+            dims = {name: DIMS.get(name, ()) for name in names}
+            files.check_columns(results, run.folder, dims, {})
             if not _is_of_proposal(results, proposal["vectors"]):
                 reason = f"generation {count} is of another search or version"
                 raise files.CorruptFileError(run.folder, reason)
@@ -234,7 +237,9 @@ class Tuning(TaskOption, LawQuestion[xr.Dataset]):
             variables = {"test_success": (("tested", "test_world"), success, attrs)}
             return xr.Dataset(variables, {"tested": ["start", "tuned"]})
 
-        return run.checkpoint(f"test-{files.sha256(best.tobytes())[:8]}", compute)
+        results = run.checkpoint(f"test-{files.sha256(best.tobytes())[:8]}", compute)
+        dims = {"test_success": ("tested", "test_world")}
+        return files.check_columns(results, run.folder, dims, {})
 
     def _score(self, tried: list[Candidates], run: Run) -> tuple[list[CandidateScores], Timing]:
         """Run candidates; return their outcomes and scores, and where the time went."""
@@ -330,9 +335,9 @@ def _is_of_proposal(results: xr.Dataset, vectors: np.ndarray) -> bool:
     The tolerance allows for other rounding on another machine; the search uses the vectors that
     were tried.
     """
-    if "vectors" not in results or results.vectors.shape != vectors.shape:
-        return False
-    return np.allclose(results.vectors, vectors, rtol=1e-4, atol=1e-4, equal_nan=True)
+    return results.vectors.shape == vectors.shape and np.allclose(
+        results.vectors, vectors, rtol=1e-4, atol=1e-4, equal_nan=True
+    )
 
 
 def parse_domains(

@@ -77,6 +77,7 @@ class Publish(Study[xr.Dataset]):
         """Compute selected data files again, and return the state of all data files."""
         if self.only and not self.check_probes:
             self._compute_again(run)
+            probes.remove_unused()
         descriptions = list[xr.Dataset]()
         for path in published():
             checked = self.check_probes and self._selects(path.stem)

@@ -28,6 +28,7 @@ from rps_jax.analysis.figures.style import (
 )
 from rps_jax.control.laws import rps
 from rps_jax.control.laws.rps import RPSParams
+from rps_jax.geometry import solid
 from rps_jax.robot import shell, skin
 
 _BASE, _OBJECT = "0.35", "#8a5a2b"
@@ -105,9 +106,7 @@ def one_trial(trace: xr.Dataset, title: str) -> Figure:
 def _object(trace: xr.Dataset, index: int) -> np.ndarray:
     """Return the outline (N, 2) [m] of the object in the world at one time step."""
     x, y, w, _, _, z = trace.qpos.values[index, [3, 4, 6, 7, 8, 9]]
-    yaw = 2 * np.arctan2(z, w)
-    turn = np.array([[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]])
-    return trace.outline.values @ turn.T + [x, y]
+    return np.array([x, y]) + solid.rotate(2 * np.arctan2(z, w), trace.outline.values)
 
 
 def draw_path(ax: Axes, trace: xr.Dataset, snapshots: int = 7) -> None:

@@ -13,6 +13,7 @@ from matplotlib.colors import Normalize as Normalize
 from matplotlib.colors import TwoSlopeNorm as TwoSlopeNorm
 
 from rps_jax.analysis import statistics
+from rps_jax.geometry import solid
 from rps_jax.robot import shell
 from rps_jax.world.domain import LABELS
 
@@ -106,11 +107,9 @@ def base_patch(
     """
     corners = np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]])
     if len(sizes) == 1:
-        angle = np.linspace(0, 2 * np.pi, 49)
-        corners = np.append(np.stack([np.cos(angle), np.sin(angle)], axis=-1), [[0, 0]], axis=0)
+        corners = np.append(solid.unit(np.linspace(0, 2 * np.pi, 49)), [[0, 0]], axis=0)
     corners = corners * np.asarray(sizes)
-    c, s = np.cos(pose[2]), np.sin(pose[2])
-    world = corners @ np.array([[c, s], [-s, c]]) + pose[:2]
+    world = solid.rotate(pose[2], corners) + pose[:2]
     return patches.Polygon(world, facecolor="0.35" if fill else "none", edgecolor="0.35")
 
 

@@ -11,7 +11,10 @@ import warnings
 from rps_jax.errors import InputError, not_allowed
 
 _MIN_COLUMNS = 40  # of a terminal: tyro never ends the help of a narrower one
-_START_XLA = "import jaxlib.xla_client as client; client.make_cpu_client()"
+# XLA parses its flags, and no backend starts.
+_PARSE_FLAGS = (
+    "import jaxlib.xla_client as xla; xla.CompileOptions().executable_build_options.debug_options"
+)
 _FATAL = re.compile(r"^F\d{4} .*?\] (.*)$", re.MULTILINE)  # line of XLA before it aborts
 
 
@@ -64,12 +67,12 @@ def _unset_bad_flags() -> str:
     flags = os.environ.get("XLA_FLAGS", "")
     if not flags or device.has_started():
         return ""
-    command = [sys.executable, "-c", _START_XLA]
-    started = subprocess.run(command, capture_output=True, text=True, errors="replace")
-    if not started.returncode:
+    command = [sys.executable, "-c", _PARSE_FLAGS]
+    parsed = subprocess.run(command, capture_output=True, text=True, errors="replace")
+    if not parsed.returncode:
         return ""
     del os.environ["XLA_FLAGS"]
-    match = _FATAL.search(started.stderr)
+    match = _FATAL.search(parsed.stderr)
     reason = match[1].partition(". (")[0] if match else "Check failed"
     rule = "XLA cannot read the value of a flag" if "Check failed" in reason else reason
     return str(not_allowed("XLA_FLAGS", flags, f"{rule}; correct or unset it"))

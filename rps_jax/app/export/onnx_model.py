@@ -36,9 +36,13 @@ def models(program: Program, prefix: str, batch: int | None = None) -> dict[str,
     inputs = [x for x in inputs if 0 not in x.shape]
     pairs = [(x, value) for x, value in zip(outputs, results, strict=True) if 0 not in x.shape]
     model = target.model(
-        prefix, inputs, pairs, producer_name="rps_jax", producer_version=__version__,
+        prefix,
+        inputs,
+        pairs,
+        producer_name="rps_jax",
+        producer_version=__version__,
         doc_string=f"One control step of the law {program.label}; it checks no input.",
-    )  # fmt: skip
+    )
     memory = [field for field in groups["memory"] if field.size]
     start = {f"memory_{x.name}": np.asarray(x.value).tolist() for x in memory}
     units = {x.name: x.about for x in (*inputs, *(x for x, _ in pairs))}
