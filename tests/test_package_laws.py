@@ -51,7 +51,7 @@ def test_no_law_of_the_package_warns_that_it_is_slow(law, robot, task, skin, mon
     kind, has_walls = registry.law_of(registry.LAWS[law]), task in ("corridor", "rooms")
     options = {"law": law, "robot": robot, "task": TASKS[task], "skin": skin}
     if ROBOTS[robot].drive not in kind.drives or (kind.room and has_walls):
-        with pytest.raises(InputError, match=r"it moves sideways|its detours need"):
+        with refusing(r"it moves sideways|its detours need"):
             pushes.build([Case("cylinder", **options)], setting)
         return
     case = Case("cylinder", **options)
