@@ -23,12 +23,12 @@ from rps_jax.errors import InputError
 from rps_jax.record import files
 from rps_jax.record.checkpoint import Checkpoints
 from rps_jax.runs.question import Run
-from rps_jax.trials.batch import BatchSize
+from rps_jax.trials.batch_run import outcomes
 from rps_jax.trials.case import Case
+from rps_jax.trials.jobs import BatchSize
 from rps_jax.trials.progress import Progress, ProgressCallback, SequentialProgress, no_progress
 from rps_jax.trials.pushes import Cases
 from rps_jax.trials.results import outcome_dataset
-from rps_jax.trials.rollout import outcomes
 from rps_jax.trials.setting import Setting
 from rps_jax.world import paper
 from rps_jax.world.objects import PAPER_OBJECTS

@@ -17,8 +17,8 @@ import numpy as np
 from rps_jax.control.base import LawParams
 from rps_jax.control.laws.rps import RPSParams
 from rps_jax.trials import pushes, trial
-from rps_jax.trials.batch import WorldBatch, rows
 from rps_jax.trials.case import Case
+from rps_jax.trials.jobs import WorldBatch, rows
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import ControlLoop, Trial, World
 from rps_jax.trials.worlds import drawn_worlds

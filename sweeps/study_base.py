@@ -18,7 +18,7 @@ import subprocess
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar, NamedTuple, TypeVar
+from typing import Any, ClassVar, NamedTuple, Self, TypeVar
 
 import jax
 import numpy as np
@@ -32,10 +32,10 @@ from rps_jax.record import files, options, provenance
 from rps_jax.record.checkpoint import Checkpoints
 from rps_jax.runs import execution
 from rps_jax.runs.plan import Plan
-from rps_jax.runs.question import Question, Run, TrialQuestion
-from rps_jax.runs.results import Results
+from rps_jax.runs.question import Question, Run, TrialQuestion, quick_command, quick_note
+from rps_jax.runs.results import PlanRequest, Results
+from rps_jax.trials.batch_run import run_batch
 from rps_jax.trials.progress import Progress, ProgressCallback, SequentialProgress, no_progress
-from rps_jax.trials.rollout import rollout
 from rps_jax.trials.trial import Outcome
 from sweeps import probes, render_tables
 
@@ -181,6 +181,16 @@ class QuickStudy(Study[T]):
     quick: bool = False
     """Whether to make a small run of minutes on two cores; explicit options keep their values."""
 
+    IGNORED_FIELDS: ClassVar[tuple[str, ...]] = ("quick",)
+
+    def with_quick_values(self) -> Self:
+        """Return the study with its quick values, if `quick` is set."""
+        return quick_command(self) if self.quick else self
+
+    def quick_note(self) -> str:
+        """Return the first line of the report of a quick run."""
+        return quick_note(self) if self.quick else ""
+
 
 @dataclass(frozen=True, kw_only=True)
 class TrialStudy(Study[T], TrialQuestion[T]):
@@ -288,7 +298,8 @@ def run_plans(run: Run, plans: Mapping[str, Plan]) -> dict[str, xr.Dataset]:
 
 def run_together(plans: Sequence[Plan], run: Run) -> list[xr.Dataset]:
     """Run plans of one setting and equal shapes in one rollout; return the results of each."""
-    requests = [Results(plan, list(plan.chunks)) for plan in plans]
+    results = list(map(Results, plans))
+    requests = [PlanRequest(x.plan, list(x.plan.chunks), x) for x in results]
     last = np.cumsum([plan.num_trials for plan in plans])
 
     def collect(indices: np.ndarray, outcomes: Outcome) -> None:
@@ -296,10 +307,10 @@ def run_together(plans: Sequence[Plan], run: Run) -> list[xr.Dataset]:
         for owner in np.unique(owners).tolist():
             mask, first = owners == owner, last[owner] - plans[owner].num_trials
             columns = {name: x[mask] for name, x in outcomes.columns().items()}
-            requests[owner].collect(indices[mask] - first, Outcome.of_columns(columns))
+            results[owner].put(indices[mask] - first, Outcome.of_columns(columns))
 
-    rollout(requests, plans[0].setting, collect, **run.batch_options)
-    return [request.dataset() for request in requests]
+    run_batch(requests, plans[0].setting, collect, **run.batch_options)
+    return [x.dataset() for x in results]
 
 
 # --- data files -----------------------------------------------------------------------------

@@ -15,7 +15,7 @@ from numpy.testing import assert_allclose
 import rps_jax
 from rps_jax.control.laws.rps import RPSParams
 from rps_jax.engines import quasistatic
-from rps_jax.trials import single
+from rps_jax.trials import trajectory
 from rps_jax.trials.setting import Setting
 from rps_jax.tuning import derivatives
 from rps_jax.world import draws
@@ -223,7 +223,7 @@ def test_worlds_are_those_of_a_sweep_and_one_object_each():
         rps_jax.draw_worlds("wide", 3)
 
 
-BATCH = single.draw_worlds(TOUCHING, 2, setting=QUASISTATIC)
+BATCH = trajectory.draw_worlds(TOUCHING, 2, setting=QUASISTATIC)
 ROUTE = {"world": row(BATCH.worlds, 0), "params": RPSParams(), "stage": BATCH.stage}
 ROUTE |= {"setting": QUASISTATIC}
 test_invalid_rollouts_are_refused = refusals(

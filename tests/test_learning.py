@@ -25,6 +25,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from rps_jax import learn
 from rps_jax import sweep as run_sweep
+from rps_jax.app.cli import flags
 from rps_jax.control import registry
 from rps_jax.control.learned import features
 from rps_jax.control.learned import network as networks
@@ -40,8 +41,8 @@ from rps_jax.runs.plan import Plan, load_plan, open_run
 from rps_jax.trials.env import PushEnv, Reward
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import Rules
-from rps_jax.tuning import ppo, rollout
-from rps_jax.tuning.learn import UNITS
+from rps_jax.tuning import collection, ppo
+from rps_jax.tuning.learn import UNITS, Learn
 from rps_jax.tuning.ppo import PPO, TrainState, Transition
 
 SMALL = {"width": 6, "hold": 0.1}
@@ -235,10 +236,12 @@ def test_a_run_of_a_policy_is_loaded_with_its_copy_of_a_changed_file(tmp_path, r
 # --- the algorithm -------------------------------------------------------------------------
 
 
-def transitions_of(obs, private, flags, **columns):
+def transitions_of(obs, privileged, flags, **columns):
     """Return transitions (T, n) of observations; the columns that are not given are zero."""
     zero = jnp.zeros(flags.shape)
-    blank = Transition(obs, private, flags, jnp.zeros((*flags.shape, 3)), *[zero] * 4, flags, flags)
+    blank = Transition(
+        obs, privileged, flags, jnp.zeros((*flags.shape, 3)), *[zero] * 4, flags, flags
+    )
     return blank._replace(**columns)
 
 
@@ -275,14 +278,14 @@ def init_state(config, network):
 def batch(network, state, seed=0, steps=5, worlds=4):
     """Return random transitions with actions of the policy."""
     rng = default_rng(seed)
-    size, extra = features.feature_count(network.taxels), ppo.PRIVATE_SIGNS.size
+    size, extra = features.feature_count(network.taxels), ppo.PRIVILEGED_SIGNS.size
     obs = jnp.asarray(rng.normal(size=(steps, worlds, size)), jnp.float32)
-    private = jnp.asarray(rng.normal(size=(steps, worlds, extra)), jnp.float32)
+    privileged = jnp.asarray(rng.normal(size=(steps, worlds, extra)), jnp.float32)
     fresh = jnp.asarray(rng.uniform(size=(steps, worlds)) < 0.2)
     hidden = jnp.asarray(
         rng.normal(size=(worlds, *PolicyState.init(network).hidden.shape)), jnp.float32
     )
-    transitions = transitions_of(obs, private, fresh)
+    transitions = transitions_of(obs, privileged, fresh)
     means = jitted(partial(ppo.means, network))
     mean = means(state.weights["actor"], hidden, transitions)
     action = mean + 0.5 * jnp.asarray(rng.normal(size=mean.shape), mean.dtype)
@@ -298,7 +301,7 @@ def test_the_loss_of_the_policy_that_acted(kind):
     hidden, transitions = batch(network, state)
     advantage = jnp.arange(20.0).reshape(5, 4)
     value = networks.critic(
-        state.weights["critic"], ppo.critic_inputs(transitions.obs, transitions.private)
+        state.weights["critic"], ppo.critic_inputs(transitions.obs, transitions.privileged)
     )
     loss, kl = jax.jit(partial(ppo.loss, config, network))(
         state.weights, hidden, transitions, advantage, value + 2
@@ -323,10 +326,10 @@ def test_a_mirrored_world_has_an_equal_value():
     config, network = PPO(network="mlp", width=6), network_of("mlp")
     state = init_state(config, network)
     _, rows = batch(network, state)
-    mirrored = features.mirror(rows.obs), ppo.PRIVATE_SIGNS * rows.private
+    mirrored = features.mirror(rows.obs), ppo.PRIVILEGED_SIGNS * rows.privileged
     value, mirrored_value = (
         networks.critic(state.weights["critic"], ppo.critic_inputs(*pair))
-        for pair in ((rows.obs, rows.private), mirrored)
+        for pair in ((rows.obs, rows.privileged), mirrored)
     )
     assert_allclose(value, mirrored_value, atol=1e-6)
     assert np.std(value) > 0.01
@@ -338,7 +341,7 @@ def test_the_best_action_of_one_step_is_learned(kind):
     options = {"update_epochs": 4, "num_minibatches": 2, "learning_rate": 3e-3, "target_kl": 0.02}
     config, network = PPO(network=kind, width=6, ent_coef=0.0, **options), network_of(kind)
     state = init_state(config, network)
-    flags, private = jnp.ones((4, 64), bool), jnp.zeros((4, 64, ppo.PRIVATE_SIGNS.size))
+    flags, privileged = jnp.ones((4, 64), bool), jnp.zeros((4, 64, ppo.PRIVILEGED_SIGNS.size))
     blank = jnp.zeros((4, 64, features.feature_count(network.taxels)))
 
     def best(obs):
@@ -350,14 +353,14 @@ def test_the_best_action_of_one_step_is_learned(kind):
         key_seen, key_act, key_pass = jax.random.split(key, 3)
         obs = blank.at[..., [0, 41, 47]].set(jax.random.normal(key_seen, (4, 64, 3)))
         hidden = jnp.zeros((64, *PolicyState.init(network).hidden.shape))
-        transitions = transitions_of(obs, private, flags)
+        transitions = transitions_of(obs, privileged, flags)
         mean = ppo.means(network, state.weights["actor"], hidden, transitions)
         noise = jax.random.normal(key_act, mean.shape)
         action = mean + jnp.exp(state.weights["log_std"]) * noise
         transitions = transitions._replace(
             action=action,
             log_prob=ppo.log_prob(action, mean, state.weights["log_std"]),
-            value=networks.critic(state.weights["critic"], ppo.critic_inputs(obs, private)),
+            value=networks.critic(state.weights["critic"], ppo.critic_inputs(obs, privileged)),
             reward=-jnp.sum((action - best(obs)) ** 2, axis=-1),
         )
         wrong = jnp.mean(jnp.sum((mean - best(obs)) ** 2, axis=-1))
@@ -421,13 +424,26 @@ def test_the_value_function_of_an_initial_law_is_learned_first(learned, tmp_path
     """The first two updates do not change the law."""
     initial = policies.read(str(learned[0] / "policy.npz"))
     options = TINY | {"initial": str(learned[0] / "policy.npz"), "value_updates": 2}
-    options |= {"hard": 0.5, "anneal": 0.5, "average": 1, "failure": 1.0, "success": 2.0}
+    options |= {"prioritised": 0.5, "anneal": 0.5, "ema_updates": 1}
+    options |= {"failure": 1.0, "success": 2.0}
     curve = learn(CYLINDERS, **options, updates=4, out=tmp_path / "run")
     policy = policies.read(str(tmp_path / "run" / "policy.npz"))
     assert np.abs(policy.weights["action.w"] - initial.weights["action.w"]).max() > 0
     assert curve.level.values.tolist() == [1.0] * 4
     assert curve.kl.values[:2].max() < 1e-7 < curve.kl.values[2:].min()
     assert np.isfinite(curve.value).all()
+
+
+def test_former_names_of_options_are_accepted_with_a_warning():
+    message = "average of learn will be removed: write ema_updates"
+    with pytest.warns(FutureWarning, match=message), refusing("ema_updates"):
+        learn(CYLINDERS, average=0)
+    words = ["--hard", "0.5", "--average=7", "--enough", "0.6", "--spread", "0.3", "--level=0.2"]
+    with pytest.warns(FutureWarning, match="hard of learn will be removed: write prioritised"):
+        question, _ = flags.parse(Learn, "learn", words)
+    assert (question.prioritised, question.ema_updates) == (0.5, 7)
+    assert (question.success_threshold, question.action_std) == (0.6, 0.3)
+    assert question.initial_level == 0.2
 
 
 def test_an_initial_law_has_the_network_of_the_options(learned, tmp_path):
@@ -442,15 +458,16 @@ def test_an_initial_law_has_the_network_of_the_options(learned, tmp_path):
 
 
 def test_worlds_that_sometimes_fail_are_drawn_most():
-    options = PPO(hard=0.5)
-    rates = rollout.failure_rates(
+    options = PPO(prioritised=0.5)
+    rates = collection.failure_rates(
         jnp.array([0.0, 0.5, 1.0, 0.0]),
         jnp.array([3, 3, 2]),
         jnp.array([True, False, False]),
         jnp.array([False, False, False]),
     )
     assert_allclose(rates, [0, 0.5, 1, 0.3], atol=1e-6)
-    draw = partial(rollout.draw_indices, failures=rates, key=jax.random.PRNGKey(0), shape=(200, 50))
+    key, shape = jax.random.PRNGKey(0), (200, 50)
+    draw = partial(collection.draw_indices, failures=rates, key=key, shape=shape)
     counts = np.bincount(np.array(draw(options)).ravel(), minlength=4) / 10_000
     weights = np.array([0, 0.275, 0.05, 0.225])
     assert_allclose(counts, 0.125 + 0.5 * weights / weights.sum(), atol=0.02)
@@ -499,7 +516,7 @@ def test_a_sweep_agrees_with_the_environment(learned, registries):
     results = run_sweep({name: params}, CYLINDERS, worlds=4, setting=setting)
     policy = policies.decode((learned[0] / "policy.npz").read_bytes(), "policy")
     env = PushEnv("random_cylinder", CYLINDERS, setting=setting, worlds=4)
-    run = jax.jit(partial(rollout.rollouts, policy.network, [env]))
+    run = jax.jit(partial(collection.run_policy, policy.network, [env]))
     (states,) = run([env.table], policy.weights)
     assert_array_equal(states.data.steps * env.dt, np.float32(results.time[0]))
     assert_array_equal(states.data.success, results.success[0] > 0)
@@ -510,9 +527,9 @@ def test_a_sweep_agrees_with_the_environment(learned, registries):
 def test_an_easier_world_has_its_target_nearer_and_more_ahead():
     env = PushEnv("random_cylinder", CYLINDERS, setting=Setting(engine="fused"), worlds=3)
     world = row(jax.device_get(env.table), 0)._replace(p_world_target=jnp.array([0.0, 2.0]))
-    half = rollout.ease(world, jnp.array(0.5)).p_world_target
+    half = collection.ease(world, jnp.array(0.5)).p_world_target
     assert_allclose(half, 1.4 * np.array([1, 1]) / np.sqrt(2), rtol=1e-6)
-    assert_array_equal(rollout.ease(world, jnp.array(1.0)).p_world_target, [0.0, 2.0])
+    assert_array_equal(collection.ease(world, jnp.array(1.0)).p_world_target, [0.0, 2.0])
 
 
 def test_rewards_of_privileged_quantities():

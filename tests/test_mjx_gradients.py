@@ -1,7 +1,17 @@
 """Exact derivatives through MJX: of models that are not ours, and of our worlds."""
 
+import contextlib
+import importlib.metadata
+import importlib.util
 import itertools
+import os
+import re
+import shutil
+import subprocess
+import sys
+import tomllib
 from functools import cache, partial
+from pathlib import Path
 from types import SimpleNamespace
 
 import jax
@@ -9,7 +19,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
-from helpers import refusing
+from helpers import ROOT
 from numpy.random import default_rng
 from numpy.testing import assert_allclose, assert_array_equal
 
@@ -19,7 +29,7 @@ from rps_jax.engines import mjx_gradients
 from rps_jax.engines.base import ControlPeriod, Motion
 from rps_jax.engines.fused import contacts, newton
 from rps_jax.engines.fused import step as fused
-from rps_jax.engines.mjx_colliders import mjx, types
+from rps_jax.engines.mjx_colliders import mjx
 from rps_jax.geometry import solid
 from rps_jax.geometry import vectors as sp
 from rps_jax.robot.robot import Robot
@@ -388,6 +398,7 @@ def test_gradients_of_all_objects_are_finite(name, driven, cone, feet):
         (4, {"cone": "pyramidal"}),
         (1, {"cone": "pyramidal"}),
         (3, {"solver": "CG", "iterations": 3000}),
+        (3, {"integrator": "RK4"}),
     ],
 )
 def test_derivatives_of_a_leg_are_central_differences(condim, options):
@@ -408,9 +419,199 @@ def test_derivatives_of_a_leg_are_central_differences(condim, options):
                 assert (np.abs(jacobian(x) - expected) < atol).all()
 
 
+# --- models of others ---
+
+QUICK_JIT = partial(jax.jit, compiler_options=QUICK)
+PENDULUM = """<body pos="2 0 1"><joint axis="0 1 0" range="-30 30" limited="true" damping="0.1"
+frictionloss="0.01"/><geom type="capsule" fromto="0 0 0 0 0 -0.4" size="0.03" mass="1"/></body>"""
+BALL = """<body pos="0 0 0.098"><freejoint/><geom size="0.1" mass="1" friction="0.6"/></body>"""
+
+
+def second_derivatives(case, steps=2):
+    """Return a function of states (N, n): gradients (N, n) and second derivatives (N, n, n)."""
+    weights = default_rng(0).normal(size=case.plain.nq + case.plain.nv)
+
+    def value(x):
+        states = jax.lax.scan(
+            lambda x, _: (case.next_state(mjx_gradients.step, x), None), x, length=steps
+        )[0]
+        return states[:-1] @ weights
+
+    def derivatives(x):
+        gradient, push = jax.linearize(jax.grad(value), x)
+        return gradient, jax.vmap(push)(jnp.eye(x.size))
+
+    return QUICK_JIT(jax.vmap(derivatives))
+
+
+def check_second_derivatives(case, states, atol=1e-5):
+    """Compare with differences of the gradient, relative to the largest entry."""
+    function = second_derivatives(case)
+    for x in states:
+        sides = x + 1e-6 * np.concatenate([0 * x[None], np.eye(x.size), -np.eye(x.size)])
+        gradients, (second, *_) = map(np.asarray, function(sides))
+        up, down = gradients[1:].reshape(2, x.size, -1)
+        largest = np.abs(second).max()
+        assert_allclose(second, (up - down) / 2e-6, rtol=0, atol=atol * largest)
+        assert_allclose(second, second.T, rtol=0, atol=1e-6 / 3 * largest)
+
+
+def test_second_derivatives_of_a_pendulum_beyond_its_limit():
+    with jax.enable_x64(True):
+        case = Case(PENDULUM)
+        check_second_derivatives(case, [np.array([x, 0.3, 1.0]) for x in (0.0, 0.5238, 0.55)])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("cone", ["elliptic", "pyramidal"])
+@pytest.mark.parametrize("integrator", ["Euler", "RK4"])
+def test_second_derivatives_of_a_ball_on_a_plane(cone, integrator):
+    """The ball slides, rolls, and sticks."""
+    with jax.enable_x64(True):
+        case = Case(BALL, cone, integrator=integrator)
+        speeds = [0.5, 0.2, -0.1, 1.0, 2.0, 3.0], [0.01, 0.02, -0.1, 0.2, -0.1, 0.3]
+        check_second_derivatives(case, [case.state(*x) for x in speeds])
+
+
+@pytest.mark.parametrize("solver", ["Newton", pytest.param("CG", marks=pytest.mark.slow)])
+def test_after_few_iterations_derivatives_are_those_of_the_minimum(solver):
+    """Values stay those of MJX."""
+    with jax.enable_x64(True):
+        few, exact = Case(BALL, solver=solver, iterations=2), Case(BALL)
+        x = few.state(0.5, 0.2, -0.5, 1.0, 2.0, 3.0)
+        ours, theirs = (partial(few.next_state, x.step) for x in (mjx_gradients, mjx))
+        value, slopes = QUICK_JIT(lambda x: (ours(x), jax.jacfwd(ours)(x)))(x)
+        assert_array_equal(value, QUICK_JIT(theirs)(x))
+        expected = differences(QUICK_JIT(jax.vmap(partial(exact.next_state, mjx.step))), x)
+        atol = 3e-6 * np.abs(expected).max()
+        assert_allclose(slopes, expected, rtol=0, atol=atol)
+
+
+def test_after_one_iteration_derivatives_are_those_of_mjx():
+    with jax.enable_x64(True):
+        case = Case(PENDULUM, iterations=1)
+        x = np.array([0.55, 0.3, 1.0])
+        ours, theirs = (
+            QUICK_JIT(jax.jacrev(partial(case.next_state, f.step))) for f in (mjx_gradients, mjx)
+        )
+        assert_array_equal(ours(x), theirs(x))
+
+
+def assets():
+    """Return the MJCF files of MuJoCo, Gymnasium and MuJoCo Menagerie that are installed."""
+    files = {"humanoid of MJX": Path(mjx.__file__).parent / "test_data/humanoid/humanoid.xml"}
+    gym = Path(importlib.util.find_spec("gymnasium").origin).parent / "envs/mujoco/assets"
+    names = "ant", "half_cheetah", "hopper", "humanoid", "inverted_pendulum", "walker2d"
+    files |= {name: gym / f"{name}.xml" for name in names}
+    folder = os.environ.get("MENAGERIE_PATH", "~/.cache/robot_descriptions/mujoco_menagerie")
+    names = "unitree_go2", "anybotics_anymal_c"
+    return files | {name: Path(folder).expanduser() / name / "scene_mjx.xml" for name in names}
+
+
+def tangents(model, qpos):
+    """Return the derivative (nq, nv) of a position by a motion."""
+    columns = []
+    for direction in np.eye(model.nv):
+        sides = qpos.copy(), qpos.copy()
+        mujoco.mj_integratePos(model, sides[0], direction, 1e-6)
+        mujoco.mj_integratePos(model, sides[1], direction, -1e-6)
+        columns.append((sides[0] - sides[1]) / 2e-6)
+    return np.stack(columns, axis=1)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("integrator", ["Euler", "RK4"])
+@pytest.mark.parametrize("name", assets())
+def test_derivatives_of_models_of_others_are_those_of_c_mujoco_and_differences(name, integrator):
+    """Compare the Jacobian of a step after a fall, by state and controls, in double precision.
+
+    C MuJoCo has no derivatives of RK4.
+    """
+    if not assets()[name].is_file():
+        pytest.skip(f"{name} is not installed: set MENAGERIE_PATH")
+    plain = mujoco.MjModel.from_xml_path(str(assets()[name]))
+    plain.opt.solver, plain.opt.tolerance = mujoco.mjtSolver.mjSOL_NEWTON, 1e-15
+    plain.opt.iterations, plain.opt.ls_iterations = 100, 50
+    plain.opt.integrator = getattr(mujoco.mjtIntegrator, f"mjINT_{integrator.upper()}")
+    data, rng = mujoco.MjData(plain), default_rng(0)
+    data.ctrl[:] = 0.1 * rng.normal(size=plain.nu)
+    data.qvel[:] = 0.1 * rng.normal(size=plain.nv)
+    mujoco.mj_step(plain, data, round(0.6 / plain.opt.timestep))
+    mujoco.mj_normalizeQuat(plain, data.qpos)
+    with jax.enable_x64(True):
+        model, start = mjx.put_model(plain), mjx.make_data(plain)
+        start = start.replace(qacc_warmstart=jnp.array(data.qacc_warmstart))
+
+        def next_state(step, x):
+            qpos, qvel, ctrl = jnp.split(x, (plain.nq, plain.nq + plain.nv))
+            after = step(model, start.replace(qpos=qpos, qvel=qvel, ctrl=ctrl))
+            return jnp.concatenate([after.qpos, after.qvel])
+
+        x = np.concatenate([data.qpos, data.qvel, data.ctrl])
+        slopes = np.asarray(QUICK_JIT(jax.jacrev(partial(next_state, mjx_gradients.step)))(x))
+        theirs = QUICK_JIT(jax.vmap(partial(next_state, mjx.step)))
+        expected = differences(theirs, x)
+        after = np.asarray(theirs(x[None]))[0]
+    largest = np.abs(expected).max()
+    assert_allclose(slopes, expected, rtol=0, atol=1e-3 * largest)
+    if integrator == "RK4":
+        return
+    rows, columns = 2 * plain.nv, 2 * plain.nv + plain.nu
+    a, b = np.zeros((rows, rows)), np.zeros((rows, plain.nu))
+    mujoco.mjd_transitionFD(plain, data, 1e-6, True, a, b, None, None)
+    nq, inward = plain.nq, np.eye(x.size, columns)
+    inward[:nq], inward[nq:] = 0, np.eye(x.size - nq, columns, plain.nv)
+    inward[:nq, : plain.nv] = tangents(plain, data.qpos)
+    outward = np.linalg.pinv(tangents(plain, after[:nq]))
+    motion = slopes @ inward
+    ours = np.concatenate([outward @ motion[:nq], motion[nq:]])
+    assert_allclose(ours, np.hstack([a, b]), rtol=0, atol=1e-3 * largest)
+
+
+def visible(*names):
+    """Return the folders and files of packages and of all that they require."""
+    paths, needs = set(), [(x, "") for x in names]
+    for name, extra in needs:
+        with contextlib.suppress(importlib.metadata.PackageNotFoundError):
+            package = importlib.metadata.distribution(name)
+            tops = {x.parts[0] for x in package.files} - {"..", "__pycache__"}
+            paths |= {package.locate_file(x) for x in tops}
+            for line in package.requires or ():
+                need = re.match(r"([\w.-]+)(?:\[(\w+))?", line).groups(default="")
+                needed = "extra ==" not in line or f'extra == "{extra}"' in line
+                if needed and need not in needs:
+                    needs.append(need)
+    return paths
+
+
+def test_the_file_alone_is_a_module(tmp_path):
+    """Copy it where only its four packages, and what they require, can be imported."""
+    shutil.copy(mjx_gradients.__file__, tmp_path)
+    for path in visible("numpy", "jax", "mujoco", "mujoco-mjx"):
+        (tmp_path / path.name).symlink_to(path)
+    assert not (tmp_path / "rps_jax").exists()
+    code = "import sys; sys.path.append(sys.argv[1]); import mjx_gradients as m; print(m.step)"
+    command = [sys.executable, "-I", "-S", "-B", "-c", code, tmp_path]
+    result = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert result.stdout.startswith("<function step"), result.stderr
+
+
+def test_the_package_of_the_file_has_the_versions_of_this_package():
+    single, whole = (
+        tomllib.loads((ROOT / folder / "pyproject.toml").read_text())["project"]
+        for folder in ("docs/mjx_gradients", ".")
+    )
+    assert set(single["dependencies"]) <= set(whole["dependencies"])
+    assert single["requires-python"].startswith(whole["requires-python"].partition(",")[0])
+
+
 def test_models_without_derivatives_are_refused(box):
-    rk4 = box.model.tree_replace({"opt.integrator": types.IntegratorType.RK4})
-    with refusing(r"integrator = RK4 .* Euler or implicitfast"):
-        mjx_gradients.step(rk4, box.data)
-    with refusing(r"model = mjmodel .*put_model\(model, impl='jax'"):
+    with pytest.raises(ValueError, match=r"model = mjmodel .*put_model\(model, impl='jax'"):
         mjx_gradients.solve(box.plain, box.data)
+
+
+def test_third_derivatives_are_refused():
+    case = Case(PENDULUM)
+    third = jax.jacfwd(jax.hessian(partial(case.next_state, mjx_gradients.step)))
+    with pytest.raises(NotImplementedError, match="order = 3 is not allowed"):
+        jax.eval_shape(third, np.array([0.5, 0.3, 1.0], np.float32))

@@ -21,8 +21,8 @@ from rps_jax.geometry import solid
 from rps_jax.lowering.routine import fields_of
 from rps_jax.trials import pushes
 from rps_jax.trials.case import Case
+from rps_jax.trials.live import Live
 from rps_jax.trials.setting import Setting
-from rps_jax.trials.stepper import Live
 
 MAKE = runpy.run_path(str(ROOT / "docs" / "push" / "make.py"))
 WHOLE_PUSH = """

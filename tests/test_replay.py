@@ -18,8 +18,8 @@ from rps_jax.runs.plan import build_batch, load_plan
 from rps_jax.studies import gallery
 from rps_jax.trials import pushes, trial
 from rps_jax.trials.case import Case
+from rps_jax.trials.live import Live
 from rps_jax.trials.progress import SequentialProgress, no_progress
-from rps_jax.trials.stepper import Live
 from rps_jax.trials.trial import ControlLoop
 from rps_jax.world.domain import DOMAINS
 
@@ -61,10 +61,12 @@ CASES = {
     "a planar engine": ("rps", "hostile,objects=random_prism", "reach", "quasistatic"),
     "an engine outside of JAX": ("rps", "hostile,objects=random_box", "reach", "mujoco", 1.0),
 }
+HALL = {"outline": [[0, 0], [9, 0], [9, 6], [0, 6]], "start": [1.5, 3, 0], "goal": [7, 3]}
+TASKS = {"corridor": "corridor,width=2:2.4", "rooms": HALL}  # with places for the widest object
 SLOW_CASES = {
     "MJX": ("rps", "wide,objects=random_box", "reach", "mjx", 1.0),
     **{
-        f"{law}, {domain}, {task}": (law, domain, task)
+        f"{law}, {domain}, {task}": (law, domain, TASKS.get(task, task))
         for law in ("rps", "aps", "learned_small")
         for domain in ("hostile", "real", "paper")
         for task in ("reach", "path", "corridor", "rooms")

@@ -16,9 +16,8 @@ from shapely import LineString, MultiLineString, MultiPoint, Point, Polygon, box
 
 import rps_jax
 from rps_jax.record import files
-from rps_jax.runs.question import task_in_words
 from rps_jax.world import draws, points, tasks
-from rps_jax.world.domain import from_json, parse_domain, to_json
+from rps_jax.world.domain import from_json, parse_domain, task_in_words, to_json
 from rps_jax.world.tasks.rooms import Rooms
 
 DOMAIN = "wide,objects=random_cylinder"

@@ -42,7 +42,7 @@ from rps_jax.control.laws.rps_plus import RPSPlusParams
 from rps_jax.control.observation import Observation
 from rps_jax.geometry.footprint import Footprint
 from rps_jax.robot.skin import NONE, CapacitiveSkin, IdealSkin
-from rps_jax.trials import host, pushes
+from rps_jax.trials import pushes, trial
 from rps_jax.trials.pushes import Case
 from rps_jax.trials.trial import ControlLoop
 
@@ -459,7 +459,8 @@ def push(case: Case, law, horizon: float):
     setting = setting_of(horizon, "mujoco")
     _, worlds, models, params = pushes.build([case], setting)
     loop = ControlLoop(setting.physics, setting.rules, law)
-    *_, trials = host.run(models, worlds, params, loop, threads=1)
+    engine = setting.simulator
+    *_, trials = trial.run_on_host(engine, models, worlds, params, loop, threads=1)
     return jax.tree.map(lambda x: np.asarray(x)[0], trials)
 
 

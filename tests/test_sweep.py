@@ -45,7 +45,7 @@ from rps_jax.runs import execution, sweep
 from rps_jax.runs.plan import Shard, load_plan, open_run
 from rps_jax.runs.sweep import merge
 from rps_jax.trials import batch, trial
-from rps_jax.trials.batch import Job
+from rps_jax.trials.jobs import Job
 from rps_jax.trials.trial import Rules
 from rps_jax.trials.worlds import drawn_worlds
 from rps_jax.world import domain, draws
@@ -167,18 +167,18 @@ def runs_on_devices(folder, counts):
     run the others fail.
     """
     cache.use_cache(folder / "cache")
-    devices, plain = jax.local_devices(), batch._Slots.arguments
+    devices, plain = jax.local_devices(), batch._SlotData.inputs.fget
     missing, segments, fails, rest_ended = [], {}, [], threading.Event()
     jax.monitoring.register_event_listener(lambda name, **_: missing.append(name))
 
-    def arguments(self):
+    def inputs(self):
         if self._device is devices[0]:
             assert rest_ended.wait(60)
         elif fails:
             raise OSError("no memory")
         return plain(self)
 
-    batch._Slots.arguments = arguments
+    batch._SlotData.inputs = property(inputs)
     for count in counts:
         if count == "as on GPUs":  # which run a segment while the host reads another
             batch._tail_slots, count = lambda: SLOTS, 3

@@ -27,8 +27,8 @@ from rps_jax.studies.sensitivity import Sensitivity
 from rps_jax.trials import env, gym
 from rps_jax.trials.case import Case
 from rps_jax.trials.trial import Rules
+from rps_jax.tuning.collection import ease
 from rps_jax.tuning.evolution import TuneES
-from rps_jax.tuning.rollout import ease
 from rps_jax.world import draws, points, tasks
 from rps_jax.world.domain import DOMAINS, from_json, parse_domain, to_json
 from rps_jax.world.tasks.base import CourseInputs, Positions, Task

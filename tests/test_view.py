@@ -33,7 +33,7 @@ from websockets.sync.client import connect
 from rps_jax.app import gate, viewer
 from rps_jax.control import learned
 from rps_jax.trials import pushes
-from rps_jax.trials.stepper import Live
+from rps_jax.trials.live import Live
 from rps_jax.trials.trial import Rules
 
 SETTING = replace(SHORT, rules=Rules(horizon=12.0))

@@ -11,13 +11,13 @@ from rps_jax.lowering import nvrtc
 from rps_jax.record import cache
 from rps_jax.record import folder as run_folder
 from rps_jax.record.options import option
-from rps_jax.runs.question import Action, call_of
+from rps_jax.runs.question import Command, call_of
 from rps_jax.trials.progress import ProgressCallback
 from rps_jax.world import video
 
 
 @dataclass(frozen=True)
-class Doctor(Action[None]):
+class Doctor(Command[None]):
     """Print versions, devices and folders, and a fix for each check that fails."""
 
     out: Path | str | None = option(None, kw_only=True, hidden=True)

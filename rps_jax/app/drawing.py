@@ -12,7 +12,7 @@ import numpy as np
 from rps_jax.geometry import solid
 from rps_jax.robot.shell import Shell
 from rps_jax.robot.skin import NONE
-from rps_jax.trials.stepper import Moment
+from rps_jax.trials.live import Moment
 from rps_jax.world import rendering
 from rps_jax.world.opengl import mujoco
 from rps_jax.world.scene import Scene

@@ -14,12 +14,12 @@ from rps_jax.record import files, folder
 from rps_jax.record.options import option
 from rps_jax.robot.robot import RobotLike
 from rps_jax.robot.skin import SkinLike
-from rps_jax.runs.question import Action, call_of
+from rps_jax.runs.question import Command, call_of
 from rps_jax.trials.progress import ProgressCallback
 
 
 @dataclass(frozen=True)
-class Export(Action[Path]):
+class Export(Command[Path]):
     """Export of a law with its parameters, and of the skin of a robot, to another language."""
 
     law: LawLike = "rps_plus"

@@ -23,9 +23,9 @@ from rps_jax.record import files, folder
 from rps_jax.record.options import option
 from rps_jax.runs.plan import Plan, build_batch, scene_of
 from rps_jax.runs.push import find_differences, program_slots, select_law
-from rps_jax.runs.question import Action, call_of
+from rps_jax.runs.question import Command, call_of
 from rps_jax.trials import pushes, trial
-from rps_jax.trials.batch import WorldBatch, rows
+from rps_jax.trials.jobs import WorldBatch, rows
 from rps_jax.trials.progress import Bar, Progress, ProgressCallback
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import Outcome
@@ -43,7 +43,7 @@ _FPS = 12  # frames per second
 
 
 @dataclass(frozen=True)
-class Film(Action[Path]):
+class Film(Command[Path]):
     """Film many worlds of a sweep side by side."""
 
     run: str | Path = option("", positional=True)

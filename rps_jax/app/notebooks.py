@@ -9,7 +9,7 @@ from rps_jax.errors import InputError
 from rps_jax.record import files
 from rps_jax.record import folder as run_folder
 from rps_jax.record.options import option
-from rps_jax.runs.question import Action, call_of
+from rps_jax.runs.question import Command, call_of
 from rps_jax.trials.progress import ProgressCallback
 from rps_jax.world import objects
 
@@ -29,7 +29,7 @@ _METADATA = {"kernelspec": {"name": "python3", "display_name": "Python 3", "lang
 
 
 @dataclass(frozen=True)
-class Notebooks(Action[Path]):
+class Notebooks(Command[Path]):
     """Copy the notebooks that need the package alone, without outputs, into a folder."""
 
     out: Path | str | None = option("notebooks", positional=True)

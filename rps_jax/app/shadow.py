@@ -18,6 +18,7 @@ from rps_jax.analysis.report import Section
 from rps_jax.control import registry, validation
 from rps_jax.control.base import Law, LawParams, named_leaves
 from rps_jax.control.observation import Twist, with_base
+from rps_jax.control.registry import LawLike
 from rps_jax.errors import InputError
 from rps_jax.geometry import planar
 from rps_jax.geometry.polyline import Polyline
@@ -41,7 +42,7 @@ class Shadow(BagQuestion[xr.Dataset]):
     file: str | Path = option("", positional=True)
     """Bag with what a robot observed, as `rps push --bag` or `ros2 bag record` writes it: an MCAP
     file, a .db3 file or a folder."""
-    law: str | Any = "rps_plus"
+    law: LawLike = "rps_plus"
     """The law, by its name or its file, with changes, as rps_plus,mine.json."""
     robot: RobotLike = "ideal"
     """The robot of a bag that has taxels but no contacts: ideal, kairos, ridgeback, mpo_500 or

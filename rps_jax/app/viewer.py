@@ -31,12 +31,12 @@ from rps_jax.record import files
 from rps_jax.record.options import option
 from rps_jax.runs.plan import Plan, build_batch, load_plan, scene_of, world_title
 from rps_jax.runs.push import case_options, end_in_words, program_slots, select_law
-from rps_jax.runs.question import Action, call_of
+from rps_jax.runs.question import Command, call_of
 from rps_jax.trials import pushes
 from rps_jax.trials.case import Case, label_of
+from rps_jax.trials.live import CHUNK, Live
 from rps_jax.trials.progress import ProgressCallback
 from rps_jax.trials.setting import Setting
-from rps_jax.trials.stepper import CHUNK, Live
 from rps_jax.world import objects, tasks
 from rps_jax.world.scene import Scene
 
@@ -60,7 +60,7 @@ class Push(NamedTuple):
 
 
 @dataclass(frozen=True)
-class View(Action[None], Case):
+class View(Command[None], Case):
     """Push in the browser: watch, drag the target, shove the object, push again."""
 
     law: LawLike | None = None

@@ -13,7 +13,7 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, TypeVar, get_args
+from typing import Annotated, Any, TypeVar, get_args
 
 import jax
 import numpy as np
@@ -25,13 +25,22 @@ from rps_jax.control.learned import policy
 from rps_jax.errors import InputError
 from rps_jax.record import files
 from rps_jax.record.files import JsonObject
+from rps_jax.record.manifest import Stored
 from rps_jax.record.options import parse_changes
 from rps_jax.robot.robot import DriveKind
 
 T = TypeVar("T")  # a pytree
 # Both are `Any` for the command line, which reads a text; a program may pass parameters.
-LawLike = str | Any  # text that names a law, or parameters of its class
-LawsLike = str | Any | Sequence[Any] | Mapping[str, Any]  # one law or several, or labelled laws
+STORED_LAW = Stored(lambda name, law: {name: params_to_json(resolve_law(law)[1])})
+STORED_LAWS = Stored(
+    lambda name, laws: {name: {k: params_to_json(x) for k, x in resolve_laws(laws).items()}},
+    lambda name, entries, folder: {
+        label: params_from_json(values, folder) for label, values in dict(entries[name]).items()
+    },
+)
+LawLike = Annotated[str | Any, STORED_LAW]  # text that names a law, or parameters of its class
+# One law or several, or labelled laws.
+LawsLike = Annotated[str | Any | Sequence[Any] | Mapping[str, Any], STORED_LAWS]
 
 LAWS: dict[str, LawParams] = {}  # parameters of all offered laws, by name
 _HIDDEN: dict[str, LawParams] = {}  # of laws that are not offered: names with an underscore

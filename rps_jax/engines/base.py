@@ -2,7 +2,7 @@
 
 All worlds of a batch share the engine's stage; each world has a row of its fields, a pytree. JAX
 traces most engines: their stage drives a batch in a compiled program. An engine that JAX does not
-trace (`traced = False`) steps worlds on the host: see `mujoco.Batch`.
+trace (`traced = False`) steps worlds on the host: see `HostBatch`.
 """
 
 from __future__ import annotations
@@ -83,6 +83,27 @@ class Stage(Protocol):
         A base is a velocity source at its twist. If its force is limited, it is a body that its
         drive pushes towards the twist: see `robot.drive.push`.
         """
+        ...
+
+
+class HostBatch(Protocol):
+    """Worlds that an engine steps on the host, in double precision."""
+
+    def set_positions(self, rows: np.ndarray, qpos: np.ndarray) -> None:
+        """Set the positions (n, 10) of the worlds `rows` (n,)."""
+        ...
+
+    def drive(self, rows: np.ndarray, twist: np.ndarray, substeps: int) -> None:
+        """Step the worlds `rows` (n,) with their bases at `twist` (n, 3), in the base's frame."""
+        ...
+
+    @property
+    def driven(self) -> Driven:
+        """Motion and force of all worlds, as arrays of NumPy."""
+        ...
+
+    def close(self) -> None:
+        """Release what the batch uses."""
         ...
 
 
@@ -175,6 +196,15 @@ class Engine(abc.ABC):
         The constants that MuJoCo derives when it compiles a model are computed for all worlds at
         once.
         """
+
+    def open_batch(
+        self, stage: Any, qpos: np.ndarray, threads: int, robots: Robot | None, fields: Any
+    ) -> HostBatch:
+        """Return worlds at rest at `qpos` (n, 10), of an engine that JAX does not trace.
+
+        `robots` (n,) have a limited force; `stage` and `fields` (n, ...) are those of `stage()`.
+        """
+        raise NotImplementedError
 
     def slots(self, backend: str) -> int:
         """Return the number of worlds that one worker steps at once on a backend."""

@@ -23,7 +23,6 @@ from rps_jax.engines.mjx_colliders import (
     collision,
     constraint,
     corners_of,
-    forward,
     geoms,
     mjx,
     smooth,
@@ -151,8 +150,7 @@ def step(
     force = data.qfrc_applied - data.qfrc_bias
     free = smooth.solve_m(model, data, force)
     data = mjx_gradients.solve(model, data.replace(qfrc_smooth=force, qacc_smooth=free))
-    after = forward._advance(model, data, data.act_dot, data.qacc)
-    return mjx_gradients.with_turns(model, data, after)
+    return mjx_gradients.forward._advance(model, data, data.act_dot, data.qacc)
 
 
 class MJX(Engine):
@@ -160,6 +158,10 @@ class MJX(Engine):
 
     name = "mjx"
     modes = ("forward", "reverse")
+
+    def put_model(self, physics: mujoco.MjModel) -> mjx.Model:
+        """Return the model of a scene on the device."""
+        return mjx.put_model(physics)
 
     def stage(self, inputs: WorldInputs) -> tuple[MJXStage, Arrays]:
         """Return the stage of the first of the worlds, and fields (n, ...) of all."""

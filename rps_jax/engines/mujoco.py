@@ -11,7 +11,7 @@ import jax
 import numpy as np
 
 from rps_jax.engines import device
-from rps_jax.engines.base import Engine
+from rps_jax.engines.base import Driven, Engine, Motion
 from rps_jax.record.files import Arrays
 from rps_jax.robot import drive as drives
 from rps_jax.robot.robot import Robot
@@ -81,6 +81,16 @@ class Batch:
         self._warning = mujoco.get_mju_user_warning()
         # A diverged world is an outcome; MuJoCo would write its warnings to a file.
         mujoco.set_mju_user_warning(lambda _: None)
+
+    def set_positions(self, rows: np.ndarray, qpos: np.ndarray) -> None:
+        """Set the positions (n, 10) of the worlds `rows` (n,)."""
+        self.qpos[rows] = qpos
+
+    @property
+    def driven(self) -> Driven:
+        """Motion and force of all worlds."""
+        motion = Motion(self.qpos, self.qvel, self.warmstart, self.integral)
+        return Driven(motion, force=self.force)
 
     def drive(self, rows: np.ndarray, twist: np.ndarray, substeps: int) -> None:
         """Step the worlds `rows` (n,) with their bases at `twist` (n, 3), in the base's frame.
@@ -201,6 +211,17 @@ class MuJoCo(Engine):
         """Return the models of the worlds; equal worlds share one."""
         boundary = inputs.surroundings.boundary
         return compile_rows(inputs), {} if boundary is None else {"boundary": boundary}
+
+    def open_batch(
+        self,
+        stage: Sequence[mujoco.MjModel],
+        qpos: np.ndarray,
+        threads: int,
+        robots: Robot | None,
+        fields: Arrays,
+    ) -> Batch:
+        """Return a batch that a pool of threads steps."""
+        return Batch(stage, qpos, threads, robots, **fields)
 
 
 ENGINE = MuJoCo()

@@ -32,10 +32,8 @@ from rps_jax.record import folder as run_folder
 from rps_jax.record.files import JsonObject
 from rps_jax.runs import execution
 from rps_jax.runs.plan import Plan, Shard, chunks_by_key
-from rps_jax.runs.results import Results
-from rps_jax.trials.batch import BatchOptions
+from rps_jax.trials.jobs import BatchOptions
 from rps_jax.trials.progress import Progress, ProgressCallback, no_progress
-from rps_jax.trials.rollout import rollout
 
 PATIENCE = 10.0  # [s] to reach a cluster
 RETRIES = 16  # of a task
@@ -65,8 +63,7 @@ def _work(
         )
     contents, progress = dict[int, bytes](), [Progress(0, 0.0)]
     options = BatchOptions(callback=progress.append, slots=slots, workers=threads)
-    results = Results(plan, chunks, contents.__setitem__)
-    rollout([results], plan.setting, results.collect, **options)
+    execution.run_chunks(plan, chunks, contents.__setitem__, **options)
     return contents, progress[-1], environment
 
 

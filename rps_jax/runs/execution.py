@@ -20,15 +20,33 @@ from rps_jax.record import files, provenance
 from rps_jax.record import folder as run_folder
 from rps_jax.record.checkpoint import Checkpoints
 from rps_jax.runs.plan import Plan, Shard, open_run, shard_chunks
-from rps_jax.runs.results import Results, name_of
-from rps_jax.trials.batch import BatchSize
+from rps_jax.runs.results import PlanRequest, Results, name_of
+from rps_jax.trials.batch_run import run_batch
+from rps_jax.trials.jobs import BatchOptions, BatchSize
 from rps_jax.trials.progress import Progress, ProgressCallback, no_progress
-from rps_jax.trials.rollout import rollout
+from rps_jax.trials.trial import Outcome
 
+StoreChunk = Callable[[int, bytes], object]  # called with the number of a chunk and its content
 # Runs the missing chunks of a shard in a folder, and may return their results.
 RunMissing = Callable[..., Results | None]
-# Adds attributes and other labels to the outcomes of all trials.
-Label = Callable[[xr.Dataset], xr.Dataset]
+
+
+def run_chunks(
+    plan: Plan,
+    chunks: Sequence[int],
+    store: StoreChunk | None = None,
+    **options: Unpack[BatchOptions],
+) -> Results:
+    """Run chunks of a plan and return their results; each is stored when it is complete."""
+    results = Results(plan)
+
+    def collect(indices: np.ndarray, outcomes: Outcome) -> None:
+        for chunk in results.put(indices, outcomes):
+            if store is not None:
+                store(chunk, results.encode(chunk))
+
+    run_batch([PlanRequest(plan, chunks, results)], plan.setting, collect, **options)
+    return results
 
 
 def run_missing(
@@ -53,28 +71,24 @@ def run_missing(
     def add_finished(progress: Progress) -> None:
         callback(replace(progress, finished=finished + progress.finished))
 
-    results = Results(plan, missing, partial(store_chunk, folder))
-    rollout([results], plan.setting, results.collect, callback=add_finished, **size)
-    return results
+    return run_chunks(plan, missing, partial(store_chunk, folder), callback=add_finished, **size)
 
 
-def run_plan(
+def run_trials(
     plan: Plan,
     folder: Path | None,
     shard: Shard = Shard(),
     *,
     execute: RunMissing = run_missing,
-    label: Label = lambda outcomes: outcomes,
     **options: Any,
 ) -> xr.Dataset:
     """Run a plan in memory, or what a run folder lacks of it or of a shard.
 
     Args:
       plan: the trials.
-      folder: run folder, which gets the chunks and `results.nc`; None: in memory.
+      folder: run folder, which gets the chunks; None: in memory.
       shard: part of the plan that is run in the folder.
       execute: `run_missing` or `cluster.run_on_cluster`.
-      label: completes the outcomes of all trials before they are written; not those of a shard.
       options: slots, workers and callback.
 
     Returns:
@@ -82,9 +96,7 @@ def run_plan(
       outcomes (row), with the law and the world of each.
     """
     if folder is None:
-        results = Results(plan, list(plan.chunks))
-        rollout([results], plan.setting, results.collect, **options)
-        return label(results.dataset())
+        return run_chunks(plan, list(plan.chunks), **options).dataset()
     open_run(folder, plan)
     with run_folder.lock(folder, shard.index, shard.count):
         try:
@@ -93,36 +105,35 @@ def run_plan(
             _write_finished_laws(plan, folder)
             raise
         if shard.count == 1:
-            return write_dataset(results, [folder], folder, label)
+            return results.read_all([folder])
         chunks = shard_chunks(plan, shard)
-        results.read(folder, list(chunks))
+        results.read(folder, set(chunks) & set(results.missing))
         trials = np.unravel_index(np.concatenate(list(chunks.values())), results.shape)
         law, world = (xr.DataArray(index, dims="row") for index in trials)
         return results.dataset().isel(law=law, world=world)
 
 
+def run_plan(plan: Plan, folder: Path | None, **options: Any) -> xr.Dataset:
+    """Run what a run folder lacks of a plan; return the outcomes and write them there."""
+    return write_dataset(run_trials(plan, folder, **options), folder)
+
+
+def write_dataset(outcomes: xr.Dataset, folder: Path | None) -> xr.Dataset:
+    """Write the outcomes of all trials into a run folder, if there is one, and return them."""
+    if folder is not None:
+        files.write_results(folder / "results.nc", outcomes)
+    return outcomes
+
+
 def _write_finished_laws(plan: Plan, folder: Path) -> None:
     """Write the results of the laws of which no chunk is missing, and name them in a warning."""
     results, laws = Results(plan), list(plan.laws)
-    missing = results.read(folder, list(plan.chunks))
-    failed = {laws[plan.chunks[chunk][0] // plan.worlds] for chunk in missing}
+    results.read(folder, list(plan.chunks))
+    failed = {laws[plan.chunks[chunk][0] // plan.worlds] for chunk in results.missing}
     if finished := [law for law in laws if law not in failed]:
-        files.write_results(folder / "results.nc", results.dataset().sel(law=finished))
+        write_dataset(results.dataset().sel(law=finished), folder)
         text = f"{folder / 'results.nc'} has the results of the laws that ran: "
         warnings.warn(text + ", ".join(finished), stacklevel=2)
-
-
-def write_dataset(
-    results: Results, folders: Sequence[Path], out: Path, label: Label = lambda outcomes: outcomes
-) -> xr.Dataset:
-    """Add the chunks of run folders to results, and write `results.nc` into the folder `out`.
-
-    Raises:
-      InputError: chunks are missing.
-    """
-    dataset = label(results.read_all(folders))
-    files.write_results(out / "results.nc", dataset)
-    return dataset
 
 
 def missing_chunks(folder: Path, plan: Plan, shard: Shard) -> tuple[list[int], int]:

@@ -15,7 +15,7 @@ import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import jax
 import numpy as np
@@ -25,19 +25,28 @@ from rps_jax import errors
 from rps_jax.control import registry
 from rps_jax.control.base import LawParams
 from rps_jax.errors import InputError
-from rps_jax.record import files, provenance
+from rps_jax.record import files, manifest, provenance
 from rps_jax.record import folder as run_folder
 from rps_jax.record.files import JsonObject
-from rps_jax.runs.question import name_or_custom, task_attribute
-from rps_jax.trials.batch import WorldBatch
+from rps_jax.record.manifest import Stored
+from rps_jax.trials.jobs import WorldBatch
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.worlds import drawn_scene, drawn_worlds
-from rps_jax.world import domain, draws, points
-from rps_jax.world.domain import Domain
+from rps_jax.world import draws, points
+from rps_jax.world.domain import STORED as STORED_DOMAIN
+from rps_jax.world.domain import Domain, name_or_custom, task_attribute
 from rps_jax.world.draws import Draw
 from rps_jax.world.points import Points
 from rps_jax.world.scene import Scene
 
+_SETTING = Stored(
+    lambda name, setting: setting.to_json(),
+    lambda name, entries, folder: Setting.from_json(entries),
+)
+_POINTS = Stored(
+    lambda name, at: {} if at is None else {name: at.digest},
+    lambda name, entries, folder: None,  # `load_plan` reads their file
+)
 ProgramKey = tuple[Any, ...]  # index of the object, class and shapes of the law's parameters
 
 
@@ -48,12 +57,14 @@ class Plan:
     Trial a * `worlds` + i is that of law a in world i.
     """
 
-    domain: Domain
+    domain: Annotated[Domain, STORED_DOMAIN]
     worlds: int
-    laws: Mapping[str, LawParams]
-    setting: Setting = Setting()  # its seed draws the worlds, too
+    laws: Annotated[Mapping[str, LawParams], registry.STORED_LAWS]
+    setting: Annotated[Setting, _SETTING] = Setting()  # its seed draws the worlds, too
     part: int = 1024  # trials of a chunk, at most
-    points: Points | None = None  # of the unit cube at which the worlds lie; None: drawn worlds
+    points: Annotated[Points | None, _POINTS] = (
+        None  # of the unit cube at which the worlds lie; None: drawn worlds
+    )
 
     def __post_init__(self) -> None:
         errors.check_count("worlds", self.worlds, at_most=1_000_000_000)
@@ -115,15 +126,7 @@ class Plan:
 
     def configuration(self) -> JsonObject:
         """Return everything that the results depend on, as JSON."""
-        record = {
-            "domain": domain.to_json(self.domain),
-            "worlds": self.worlds,
-            "laws": {name: registry.params_to_json(params) for name, params in self.laws.items()},
-            "part": self.part,
-        } | self.setting.to_json()
-        if self.points is not None:
-            record["points"] = self.points.digest
-        return record
+        return manifest.fields_to_json(self)
 
 
 @dataclass(frozen=True)
@@ -177,13 +180,7 @@ def load_plan(folder: Path) -> Plan:
     if "laws" not in record:
         raise InputError(f"run = {folder} does not hold a sweep: give the folder of `rps sweep`.")
     try:
-        plan = Plan(
-            domain.from_json(dict(record["domain"])),
-            record["worlds"],
-            {k: registry.params_from_json(x, folder) for k, x in dict(record["laws"]).items()},
-            Setting.from_json(record),
-            record["part"],
-        )
+        plan = Plan(**manifest.fields_from_json(Plan, record, folder))
     except (LookupError, TypeError, ValueError, ArithmeticError) as error:
         raise files.CorruptFileError(folder / run_folder.MANIFEST, error) from error
     if "points" in record:

@@ -40,8 +40,9 @@ from rps_jax.runs.plan import (
 )
 from rps_jax.runs.question import Question, Run, SimulationQuestion, call_of
 from rps_jax.trials import pushes
-from rps_jax.trials.batch import WorldBatch, rows, slots_of
+from rps_jax.trials.batch import slots_of
 from rps_jax.trials.case import Case, TrialOptions
+from rps_jax.trials.jobs import WorldBatch, rows
 from rps_jax.trials.progress import Bar
 from rps_jax.trials.pushes import Trajectory
 from rps_jax.trials.results import trace_dataset
@@ -166,6 +167,8 @@ class Trace(Trajectory):
 @dataclass(frozen=True)
 class TraceQuestion(Question[Trace]):
     """Base class of questions whose answer is one trial over time."""
+
+    IGNORED_FIELDS = ("bag",)
 
     bag: str | Path | None = option(None, kw_only=True)
     """MCAP file to write: the trial as messages of ROS 2, which Foxglove shows (extra bags)."""
@@ -318,6 +321,10 @@ class Replay(TraceQuestion):
     """Index of the world."""
     law: str | None = None
     """Law of the sweep, by its label; by default the first."""
+
+    @property
+    def sources(self) -> Sequence[str | Path]:
+        return (self.run,)
 
     @property
     def default_folder(self) -> Path:

@@ -5,7 +5,8 @@ strings below them their help, and `option` holds their bounds. There are two ki
 
 - `Question`: has an answer, labelled data. `answer(run)` computes it, step by step so that it can
   be resumed, and `report(results, run)` describes it in prose, tables and figures.
-- `Action`: does something else, such as write a film or serve a page; `execute(callback)` does it.
+- Any other `Command` writes a film or serves a page, for example; `execute(callback)` does it. The
+  shell prints a path that it returns.
 
     results = rps_jax.Rare("rps_tuned", "wide")()   # or rps_jax.rare("rps_tuned", "wide")
     rps rare --law rps_tuned --domain wide          # from the shell
@@ -21,6 +22,7 @@ import dataclasses
 import functools
 import itertools
 import re
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from operator import attrgetter
@@ -45,7 +47,7 @@ from rps_jax.control import registry
 from rps_jax.control.base import LawParams
 from rps_jax.control.registry import LawLike, LawsLike
 from rps_jax.engines import device
-from rps_jax.record import cache, files, folder, options, provenance
+from rps_jax.record import cache, files, folder, manifest, options, provenance
 from rps_jax.record.bag import TopicsLike
 from rps_jax.record.files import JsonObject
 from rps_jax.record.options import option
@@ -55,10 +57,14 @@ from rps_jax.trials.progress import Bar, ProgressCallback, is_interactive
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import Rules
 from rps_jax.world import domain as domains
-from rps_jax.world.domain import Domain, DomainLike
-from rps_jax.world.objects import custom_solids, parse_object
-from rps_jax.world.tasks import TaskLike, parse_task
-from rps_jax.world.tasks.reach import Reach
+from rps_jax.world.domain import (
+    Domain,
+    DomainLike,
+    name_or_custom,
+    task_attribute,
+    task_in_words,
+)
+from rps_jax.world.tasks import TaskLike
 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
@@ -66,11 +72,8 @@ if TYPE_CHECKING:
 P = ParamSpec("P")
 D = TypeVar("D", bound="DataclassInstance")
 T = TypeVar("T", covariant=True)
+C = TypeVar("C", bound="Command[Any]")
 Rows = list[list[str]]  # of a table in a report, with a header
-# Options that say how a run is executed; results do not depend on them.
-_EXECUTION_OPTIONS = (
-    *("out", "overwrite", "bag", "slots", "workers", "quick", "progress", "report_to"),
-)
 
 
 def call_of(command: Callable[P, Command[T]]) -> Callable[P, T]:
@@ -78,11 +81,23 @@ def call_of(command: Callable[P, Command[T]]) -> Callable[P, T]:
 
     @functools.wraps(command, assigned=("__module__", "__doc__"), updated=())
     def call(*args: P.args, **kwargs: P.kwargs) -> T:
-        return command(*args, **kwargs)()
+        current: Any = current_names(command, kwargs)
+        return command(*args, **current)()  # pyright: ignore[reportCallIssue]
 
     call.__name__ = call.__qualname__ = snake_case(command.__name__)
     call.__doc__ = f"{command.__doc__}\n\nFields of `{command.__name__}` are its arguments.\n"
     return call
+
+
+def current_names(command: Any, values: Mapping[str, T]) -> dict[str, T]:
+    """Return values by the present names of fields of a command; warn of former names."""
+    current = dict(values)
+    for former, name in getattr(command, "RENAMED", {}).items():
+        if former in current:
+            text = f"{former} of {snake_case(command.__name__)} will be removed: write {name}"
+            warnings.warn(text, FutureWarning, stacklevel=3)
+            current[name] = current.pop(former)
+    return current
 
 
 def snake_case(name: str) -> str:
@@ -92,7 +107,7 @@ def snake_case(name: str) -> str:
 
 @dataclass(frozen=True, kw_only=True)
 class Command(Generic[T]):
-    """Base class of questions and actions: options, their checks, and progress."""
+    """Base class of all commands: options, their checks, and progress."""
 
     out: Path | str | None = None
     """Run folder, in the shell by default runs/NAME; a run that was killed is continued there."""
@@ -102,6 +117,9 @@ class Command(Generic[T]):
     """Callback that receives the progress instead of a bar."""
 
     QUICK: ClassVar[Mapping[str, Any]] = {}  # values of `quick`, by the field's name
+    RENAMED: ClassVar[Mapping[str, str]] = {}  # present names of fields by their former ones
+    # Fields of a class on which the answer does not depend, beside those of its base classes.
+    IGNORED_FIELDS: ClassVar[tuple[str, ...]] = ("out", "progress", "report_to")
 
     @property
     def name(self) -> str:
@@ -111,7 +129,12 @@ class Command(Generic[T]):
     @property
     def default_folder(self) -> Path:
         """Run folder of the shell, if no other is named."""
-        return Path(getattr(self, "run", None) or "runs") / self.name
+        return Path(next(filter(None, self.sources), "runs")) / self.name
+
+    @property
+    def sources(self) -> Sequence[str | Path]:
+        """Run folders that the command reads."""
+        return ()
 
     # --- for subclasses to override --------------------------------------------------------
 
@@ -166,12 +189,7 @@ class Command(Generic[T]):
 
     def with_quick_values(self) -> Self:
         """Return the command with the values of `quick`, if it is set, for options at defaults."""
-        command, default = self, type(self)()
-        if getattr(self, "quick", False):
-            for name, value in self.quick_values().items():
-                if attrgetter(name)(self) == attrgetter(name)(default):
-                    command = _replace_field(command, name, value)
-        return command
+        return self
 
     def progress_bar(self) -> Bar:
         """Return a bar over the trials."""
@@ -184,10 +202,23 @@ class Command(Generic[T]):
 
     def suits_processors(self) -> bool:
         """Return whether processors finish sooner than a GPU, by engine and number of trials."""
-        setting = getattr(self, "setting", None)
-        if setting is None or jax.config.jax_platforms:
+        if self._setting is None or jax.config.jax_platforms:
             return False
-        return setting.simulator.suits_processors(self.num_trials())
+        return self._setting.simulator.suits_processors(self.num_trials())
+
+    @property
+    def _setting(self) -> Setting | None:
+        """Setting of the trials, if a field has it."""
+        return next((value for value in vars(self).values() if isinstance(value, Setting)), None)
+
+
+def quick_command(command: C) -> C:
+    """Return a command with its quick values for options at their defaults."""
+    quick, default = command, type(command)()
+    for name, value in command.quick_values().items():
+        if attrgetter(name)(command) == attrgetter(name)(default):
+            quick = _replace_field(quick, name, value)
+    return quick
 
 
 def _replace_field(record: D, name: str, value: object) -> D:
@@ -199,14 +230,6 @@ def _replace_field(record: D, name: str, value: object) -> D:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Action(Command[T]):
-    """Command that has no report, such as one that writes a film or serves a page.
-
-    The shell prints a path that `execute` returns.
-    """
-
-
-@dataclass(frozen=True, kw_only=True)
 class Question(Command[T]):
     """Command with an answer, which is labelled data with a report."""
 
@@ -214,7 +237,7 @@ class Question(Command[T]):
     """Whether a run that the folder already holds is removed first."""
 
     TITLE: ClassVar[str] = ""  # of the report
-    IGNORED_FIELDS: ClassVar[tuple[str, ...]] = ()  # fields on which the answer does not depend
+    IGNORED_FIELDS: ClassVar[tuple[str, ...]] = ("overwrite",)
     # Whether the report has the times of all processes of the run.
     REPORTS_TIMES: ClassVar[bool] = False
     # Whether `answer` opens the run folder and stores results.
@@ -241,13 +264,7 @@ class Question(Command[T]):
 
     def quick_note(self) -> str:
         """Return the first line of the report of a quick run, or nothing."""
-        if not getattr(self, "quick", False) or not self.quick_values():
-            return ""
-        values = (_value_in_words(name, attrgetter(name)(self)) for name in self.quick_values())
-        return (
-            f"**This is a quick run** ({'; '.join(values)}). It tests that the command works here; "
-            "for results leave out --quick."
-        )
+        return ""
 
     def configuration(self) -> JsonObject:
         """Return everything that the answer depends on, as JSON."""
@@ -255,23 +272,16 @@ class Question(Command[T]):
 
     def attributes(self) -> dict[str, str | int]:
         """Return the attributes of the results: command, version, seed, engine and domain."""
-        record: dict[str, str | int] = {**provenance.attributes()}
-        if isinstance(setting := getattr(self, "setting", None), Setting):
-            record |= setting.attributes
-        if (domain := getattr(self, "domain", None)) is not None:
-            several = [domain] if isinstance(domain, str | Domain) else domain
-            record["domain"] = " ".join(map(name_or_custom, several))
-        ranges = getattr(self, "ranges", None) or next(iter(getattr(self, "domains", ())), None)
-        return record | (task_attribute(ranges) if isinstance(ranges, Domain) else {})
+        setting = {} if self._setting is None else self._setting.attributes
+        return {**provenance.attributes(), **setting, **manifest.labels(self)}
 
     # --- execution -------------------------------------------------------------------------
 
     def validate(self) -> None:
         super().validate()
         if self.overwrite and self.out is not None:
-            sources = [getattr(self, "run", None), *getattr(self, "folders", ())]
             out = Path(self.out).resolve()
-            if any(Path(x).resolve().is_relative_to(out) for x in sources if x is not None):
+            if any(Path(x).resolve().is_relative_to(out) for x in self.sources):
                 rule = "overwrite would remove the run that is read; choose another folder"
                 raise errors.not_allowed("out", self.out, rule)
 
@@ -305,31 +315,15 @@ class Question(Command[T]):
 
     def create_run(self, out: Path | None, callback: ProgressCallback) -> Run:
         """Return the run folder and the resources of the run."""
-        size = getattr(self, "slots", None), getattr(self, "workers", None)
-        return Run(out, callback, *size)
+        return Run(out, callback)
 
     def fields_as_json(self) -> JsonObject:
         """Return the fields as JSON, with laws by their parameters and a domain by its ranges."""
-        names = [f.name for f in fields(self)]
-        ignored = [*_EXECUTION_OPTIONS, *self.IGNORED_FIELDS]
-        if parse_task(getattr(self, "task", None) or "reach") == Reach():
-            ignored.append("task")  # as in the manifests of earlier versions
-        record = {name: self._field_as_json(name) for name in names if name not in ignored}
-        texts = getattr(self, "object", ""), *getattr(self, "objects", ())
-        solids = custom_solids(map(parse_object, texts))
-        return record | ({"solids": solids} if solids else {})
-
-    def _field_as_json(self, name: str) -> object:
-        value = getattr(self, name)
-        if name == "law" and (params := getattr(self, "params", None)) is not None:
-            return registry.params_to_json(params)
-        if name == "laws" and isinstance(self, MultiLawQuestion):
-            return {k: registry.params_to_json(v) for k, v in self.chosen.items()}
-        if name == "task":
-            return dataclasses.asdict(parse_task(value))
-        if name == "domain" and isinstance(value, str | Domain):
-            return domains.to_json(domains.parse_domain(value))
-        return value.to_json() if isinstance(value, Setting) else options.to_json(value)
+        kinds = (vars(kind).get("IGNORED_FIELDS", ()) for kind in type(self).__mro__)
+        record = manifest.fields_to_json(self, set(itertools.chain.from_iterable(kinds)))
+        # Manifests keep former names, so that runs of earlier versions are continued.
+        former = {name: previous for previous, name in self.RENAMED.items()}
+        return {former.get(name, name): value for name, value in record.items()}
 
 
 # --- base classes with shared options ------------------------------------------------------
@@ -355,6 +349,17 @@ class TrialQuestion(Question[T]):
     """Number of host threads that step worlds; by default as suits engine and device."""
     quick: bool = False
     """Whether to make a small run of minutes on two cores; explicit options keep their values."""
+
+    IGNORED_FIELDS: ClassVar[tuple[str, ...]] = ("slots", "workers", "quick")
+
+    def with_quick_values(self) -> Self:
+        return quick_command(self) if self.quick else self
+
+    def quick_note(self) -> str:
+        return quick_note(self) if self.quick else ""
+
+    def create_run(self, out: Path | None, callback: ProgressCallback) -> Run:
+        return Run(out, callback, self.slots, self.workers)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -436,12 +441,27 @@ class DomainQuestion(TaskOption, SimulationQuestion[T]):
         record = super().fields_as_json() | {"domain": domains.to_json(self.ranges)}
         return {name: x for name, x in record.items() if name not in ("robot", "task")}
 
+    def attributes(self) -> dict[str, str | int]:
+        return super().attributes() | task_attribute(self.ranges)
+
     def check_engine(self, laws: Sequence[LawParams] = ()) -> None:
         """Raise InputError unless the engine can step these worlds with these laws here."""
         self.setting.check_domain(self.ranges, laws)
 
 
 # --- small helpers of reports --------------------------------------------------------------
+
+
+def quick_note(question: Question[Any]) -> str:
+    """Return the first line of the report of a quick run, or nothing if it has no quick values."""
+    names = question.quick_values()
+    values = (_value_in_words(name, attrgetter(name)(question)) for name in names)
+    if not names:
+        return ""
+    return (
+        f"**This is a quick run** ({'; '.join(values)}). It tests that the command works here; "
+        "for results leave out --quick."
+    )
 
 
 def _value_in_words(name: str, value: object) -> str:
@@ -453,24 +473,6 @@ def _value_in_words(name: str, value: object) -> str:
     items = value if isinstance(value, tuple | list) else [value]
     words = (name_or_custom(x) if isinstance(x, Domain) else str(x) for x in items)
     return f"{name.rpartition('.')[2].replace('_', ' ')} {', '.join(words)}"
-
-
-def name_or_custom(item: object) -> str:
-    """Return the name of a domain or a skin, or `custom` if it has none."""
-    if isinstance(item, str):
-        return item
-    return next((name for name, domain in domains.DOMAINS.items() if domain == item), "custom")
-
-
-def task_attribute(domain: Domain) -> dict[str, str]:
-    """Return the task of a domain as an attribute of results; nothing for `reach`."""
-    return {} if domain.task == Reach() else {"task": str(domain.task)}
-
-
-def task_in_words(domain: Domain) -> str:
-    """Return the task of a domain for a report, after a comma, without its long fields."""
-    text = re.sub("=[^,]{60,}", "=...", str(domain.task))
-    return "" if domain.task == Reach() else f", task {text}"
 
 
 def count_true(mask: np.ndarray) -> int:

@@ -1,13 +1,17 @@
-"""Results of a plan: outcomes collected into chunks, chunks joined into a labelled dataset, tables.
+"""Request and results of a plan: chunks of trials to run, and their outcomes as a dataset.
 
-A chunk is a NumPy archive of the columns of its trials, which is much faster to write than NetCDF.
-`Results` runs chunks, inserts stored ones and returns the dataset, and `load` reads `results.nc`.
+`PlanRequest` yields the worlds of chunks, `Results` collects outcomes, and `load` reads
+`results.nc`. A chunk is stored as a NumPy archive of the columns of its trials, which is much
+faster to write than NetCDF.
 """
+
+from __future__ import annotations
 
 import functools
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -21,14 +25,13 @@ from rps_jax.record.checkpoint import Checkpoints
 from rps_jax.record.files import Arrays
 from rps_jax.record.table import check_parquet
 from rps_jax.runs.plan import Plan, chunks_by_key, draw
-from rps_jax.trials.batch import Job, WorldBatch
+from rps_jax.trials.jobs import Job, WorldBatch
 from rps_jax.trials.results import POSE, UNITS, WORLD, labelled, variable
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import Outcome
 from rps_jax.trials.worlds import drawn_worlds
 from rps_jax.world import draws, points
 
-StoreChunk = Callable[[int, bytes], object]  # called with the number of a chunk and its content
 # Types of an outcome's columns; the rest are float32.
 _FLAGS = ("success", "tipped", "diverged", "nan_twist", "stalled", "unfelt")
 _TYPES: dict[str, type] = dict.fromkeys(_FLAGS, np.int8)
@@ -40,27 +43,58 @@ def name_of(chunk: int) -> str:
     return f"{chunk:07d}"
 
 
-class Results:
-    """Results of a plan, which fill as trials end or as stored chunks are inserted.
+@dataclass(frozen=True)
+class PlanRequest:
+    """Request of a batch run of some chunks of a plan.
 
-    It is the request of a rollout of some chunks, and collects their outcomes. The number of slots
-    depends on the whole plan alone. So a chunk has the same bits whoever runs it, and whichever
-    other chunks run beside it.
+    The number of slots depends on the whole plan alone. So a chunk has the same bits whoever runs
+    it, and whichever other chunks run beside it.
     """
 
-    def __init__(self, plan: Plan, chunks: Sequence[int] = (), store: StoreChunk | None = None):
-        """Prepare to run chunks; each is passed to `store` when it is complete."""
-        self.plan, self._chunks, self._store = plan, chunks, store
-        self.shape = len(plan.laws), plan.worlds
-        self._names = (*UNITS, *plan.domain.task.OUTCOMES)
-        self._outcomes = {name: self._empty(name) for name in self._names}  # (law, world, ...)
-        self._drawn: Arrays = {}  # (world,) drawn quantities
-        self._running = {chunk: plan.chunks[chunk].size for chunk in chunks}  # trials
+    plan: Plan
+    chunks: Sequence[int]
+    results: Results  # which get the drawn quantities
 
-    def _empty(self, name: str) -> np.ndarray:
-        """Return an empty column of outcomes; its memory is claimed when it is filled."""
-        axes = (3,) if name.endswith("_pose") else ()
-        return np.zeros((*self.shape, *axes), _TYPES.get(name, np.float32))
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Shape (law, world) of the outcomes."""
+        return self.results.shape
+
+    def jobs(self, setting: Setting) -> Iterator[Job]:
+        """Yield the chunks to run; their worlds are built chunk by chunk."""
+        ahead = max(1, _PREFETCH // self.plan.part)
+        by_key = chunks_by_key(self.plan, self.plan.chunks)
+        for key, chunks in chunks_by_key(self.plan, self.chunks).items():
+            trials = sum(self.plan.chunks[chunk].size for chunk in by_key[key])
+            yield Job(key, trials, _prefetch(map(self._build, chunks), ahead))
+
+    def _build(self, chunk: int) -> WorldBatch:
+        """Build the worlds of a chunk; those of the first law record the drawn quantities."""
+        law, worlds = np.divmod(self.plan.chunks[chunk], self.plan.worlds)
+        drawn = draw(self.plan, worlds)
+        if law[0] == 0:
+            table = draws.table(drawn)
+            self.results.put_drawn(worlds, {name: values for name, (values, _) in table.items()})
+        batch = drawn_worlds(self.plan.domain, drawn, self.plan.setting)
+        params = list(self.plan.laws.values())[law[0]]
+        return batch._replace(indices=self.plan.chunks[chunk]).with_params(params)
+
+
+class Results:
+    """Outcomes and drawn quantities of a plan, which fill as trials end or stored chunks are read.
+
+    The memory of a column is claimed when it is filled.
+    """
+
+    def __init__(self, plan: Plan):
+        """Prepare the columns of all trials."""
+        self.plan, self.shape = plan, (len(plan.laws), plan.worlds)
+        self._outcomes: Arrays = {}  # (law, world, ...)
+        for name in (*UNITS, *plan.domain.task.OUTCOMES):
+            axes = (3,) if name.endswith("_pose") else ()
+            self._outcomes[name] = np.zeros((*self.shape, *axes), _TYPES.get(name, np.float32))
+        self._drawn: Arrays = {}  # (world,) drawn quantities
+        self.missing = {chunk: trials.size for chunk, trials in plan.chunks.items()}  # trials
 
     @functools.cached_property
     def _chunk_of(self) -> np.ndarray:
@@ -70,56 +104,39 @@ class Results:
             chunk_of[trials] = chunk
         return chunk_of
 
-    # --- a rollout -------------------------------------------------------------------------
+    def put_drawn(self, worlds: np.ndarray, columns: Arrays) -> None:
+        """Insert the drawn quantities of worlds."""
+        for name, values in columns.items():
+            self._drawn.setdefault(name, np.zeros(self.plan.worlds, np.float32))[worlds] = values
 
-    def jobs(self, setting: Setting) -> Iterator[Job]:
-        """Yield the chunks to run; their worlds are built chunk by chunk."""
-        ahead = max(1, _PREFETCH // self.plan.part)
-        by_key = chunks_by_key(self.plan, self.plan.chunks)
-        for key, chunks in chunks_by_key(self.plan, self._chunks).items():
-            trials = sum(self.plan.chunks[chunk].size for chunk in by_key[key])
-            yield Job(key, trials, _prefetch(map(self._build, chunks), ahead))
-
-    def _build(self, chunk: int) -> WorldBatch:
-        """Build the worlds of a chunk; those of the first law record the drawn quantities."""
-        law, worlds = np.divmod(self.plan.chunks[chunk], self.plan.worlds)
-        drawn = draw(self.plan, worlds)
-        if law[0] == 0:
-            for name, (values, _) in draws.table(drawn).items():
-                self._put_drawn(name, worlds, values)
-        batch = drawn_worlds(self.plan.domain, drawn, self.plan.setting)
-        params = list(self.plan.laws.values())[law[0]]
-        return batch._replace(indices=self.plan.chunks[chunk]).with_params(params)
-
-    def _put_drawn(self, name: str, worlds: np.ndarray, values: np.ndarray) -> None:
-        self._drawn.setdefault(name, np.zeros(self.plan.worlds, np.float32))[worlds] = values
-
-    def collect(self, indices: np.ndarray, outcomes: Outcome) -> None:
-        """Add the outcomes of trials, and store the chunks that are complete with them."""
+    def put(self, indices: np.ndarray, outcomes: Outcome) -> list[int]:
+        """Insert the outcomes of trials; return the chunks that are complete with them."""
         at = np.unravel_index(indices, self.shape)
         for name, leaf in outcomes.columns().items():
             self._outcomes[name][at] = leaf
-        for chunk in self._chunk_of[indices].tolist():
-            self._running[chunk] -= 1
-            if not self._running[chunk] and self._store is not None:
-                self._store(chunk, files.encode_arrays(**self._columns(chunk)))
+        chunks, counts = np.unique(self._chunk_of[indices], return_counts=True)
+        for chunk, count in zip(chunks.tolist(), counts.tolist(), strict=True):
+            self.missing[chunk] -= count
+        complete = [chunk for chunk in chunks.tolist() if not self.missing[chunk]]
+        for chunk in complete:
+            del self.missing[chunk]
+        return complete
 
-    def _columns(self, chunk: int) -> Arrays:
-        """Return the columns of a chunk to store."""
+    def encode(self, chunk: int) -> bytes:
+        """Return the content of a chunk's file."""
         trials = self.plan.chunks[chunk]
         law, worlds = at = np.unravel_index(trials, self.shape)
-        drawn = self._drawn if law[0] == 0 else {}
         outcomes = {name: column[at] for name, column in self._outcomes.items()}
-        return {"trial": trials, **outcomes, **{name: x[worlds] for name, x in drawn.items()}}
+        drawn = {name: x[worlds] for name, x in self._drawn.items() if law[0] == 0}
+        return files.encode_arrays(trial=trials, **outcomes, **drawn)
 
     # --- stored chunks ---------------------------------------------------------------------
 
-    def read(self, folder: Path, chunks: Sequence[int]) -> list[int]:
-        """Insert those of some chunks that a run folder holds; return the numbers of the rest."""
-        missing = dict(zip(map(name_of, chunks), chunks, strict=True))
-        for name, content in Checkpoints(folder).items(missing):
-            self._insert(missing.pop(name), content)
-        return list(missing.values())
+    def read(self, folder: Path, chunks: Iterable[int]) -> None:
+        """Insert those of some chunks that a run folder holds."""
+        names = {name_of(chunk): chunk for chunk in chunks}
+        for name, content in Checkpoints(folder).items(names):
+            self._insert(names[name], content)
 
     def read_all(self, folders: Sequence[Path]) -> xr.Dataset:
         """Insert the chunks that were not run, from run folders, and return the dataset.
@@ -127,12 +144,11 @@ class Results:
         Raises:
           InputError: chunks are missing.
         """
-        missing = [chunk for chunk in self.plan.chunks if chunk not in self._running]
         for folder in folders:
-            missing = self.read(folder, missing)
-        if missing:
+            self.read(folder, list(self.missing))
+        if self.missing:
             raise InputError(
-                f"run = {', '.join(map(str, folders))} lacks {len(missing)} of "
+                f"run = {', '.join(map(str, folders))} lacks {len(self.missing)} of "
                 f"{len(self.plan.chunks)} parts: run the same command again, or give the folders "
                 "of all shards."
             )
@@ -146,7 +162,7 @@ class Results:
             columns = files.decode_arrays(content)
         except ValueError as error:
             raise files.CorruptFileError(source, error) from error
-        known = {"trial", *self._names}
+        known = {"trial", *self._outcomes}
         drawn = set(columns) - known
         if missing := {*known, *(() if law[0] or drawn else ("drawn",))} - set(columns):
             raise InputError(
@@ -154,18 +170,16 @@ class Results:
                 f"{', '.join(sorted(missing))}): use that version."
             )
         for name, values in columns.items():
-            shape = worlds.shape + (
-                self._outcomes[name].shape[2:] if name in self._outcomes else ()
-            )
-            if values.shape != shape or values.dtype.kind not in "biuf":
+            axes = self._outcomes[name].shape[2:] if name in self._outcomes else ()
+            if values.shape != worlds.shape + axes or values.dtype.kind not in "biuf":
+                shape = worlds.shape + axes
                 raise files.CorruptFileError(source, f"{name} is not numbers of {shape}")
         if not np.array_equal(columns["trial"], self.plan.chunks[chunk]):
             raise files.CorruptFileError(source, "it holds other trials")
-        for name in self._names:
-            self._outcomes[name][at] = columns[name]
-        for name in columns:
-            if name in drawn:
-                self._put_drawn(name, worlds, columns[name])
+        for name, column in self._outcomes.items():
+            column[at] = columns[name]
+        self.put_drawn(worlds, {name: columns[name] for name in columns if name in drawn})
+        self.missing.pop(chunk, None)
 
     # --- the dataset -----------------------------------------------------------------------
 

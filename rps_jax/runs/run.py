@@ -11,7 +11,7 @@ from typing import NamedTuple
 import xarray as xr
 
 from rps_jax.record.checkpoint import Checkpoints
-from rps_jax.trials.batch import BatchOptions
+from rps_jax.trials.jobs import BatchOptions
 from rps_jax.trials.progress import ProgressCallback
 
 

@@ -24,26 +24,28 @@ from rps_jax.record import folder as run_folder
 from rps_jax.record.files import JsonObject
 from rps_jax.record.options import option
 from rps_jax.runs import cluster, model_panel
-from rps_jax.runs.execution import run_missing, run_plan, write_dataset
+from rps_jax.runs.execution import run_missing, run_trials, write_dataset
 from rps_jax.runs.plan import Plan, Shard, attributes_of, load_plan, open_run, shard_chunks
 from rps_jax.runs.question import (
     DomainQuestion,
     MultiLawQuestion,
     Question,
     Run,
-    SimulationQuestion,
     call_of,
     count_true,
-    task_in_words,
 )
 from rps_jax.runs.results import Results, check_table, write_table
 from rps_jax.trials.progress import ProgressCallback
 from rps_jax.world import points
+from rps_jax.world.domain import task_in_words
 from rps_jax.world.points import Points
 
 
-class _StoredPlan(Question[xr.Dataset]):
-    """Base class of questions whose run folder has a `plan` as its manifest."""
+class PlanQuestion(Question[xr.Dataset]):
+    """Base class of questions whose trials are those of a `plan`, the manifest of the run folder.
+
+    The answer has the outcomes (law, world), and the drawn quantities (world) as coordinates.
+    """
 
     STORES_ITSELF = True  # chunk by chunk, see `execution`
     plan: Plan | functools.cached_property[Plan]
@@ -57,13 +59,6 @@ class _StoredPlan(Question[xr.Dataset]):
     def report(self, results: xr.Dataset, run: Run) -> Sequence[Section]:
         return plan_sections(self.plan, results, run.folder)
 
-
-class PlanQuestion(_StoredPlan, SimulationQuestion[xr.Dataset]):
-    """Base class of questions whose trials are those of a `plan`, the manifest of the run folder.
-
-    The answer has the outcomes (law, world), and the drawn quantities (world) as coordinates.
-    """
-
     def check(self) -> None:
         self.plan.check_here()
 
@@ -71,8 +66,8 @@ class PlanQuestion(_StoredPlan, SimulationQuestion[xr.Dataset]):
         return self.plan.num_trials
 
     def answer(self, run: Run) -> xr.Dataset:
-        label = partial(self.labelled, run=run)
-        return run_plan(self.plan, run.folder, label=label, **run.batch_options)
+        outcomes = run_trials(self.plan, run.folder, **run.batch_options)
+        return write_dataset(self.labelled(outcomes, run), run.folder)
 
     def labelled(self, outcomes: xr.Dataset, run: Run) -> xr.Dataset:
         """Return the outcomes of all trials with the attributes of the results."""
@@ -229,8 +224,11 @@ class Sweep(SweepOptions, SweepQuestion):
     def answer(self, run: Run) -> xr.Dataset:
         """Run the plan; of a single shard, return its own trials (row)."""
         execute = cluster.on_cluster(self.ray, self.ray_device) if self.ray else run_missing
-        label, inputs = partial(self.labelled, run=run), (self.plan, run.folder, self.parsed_shard)
-        return run_plan(*inputs, execute=execute, label=label, **run.batch_options)
+        inputs = self.plan, run.folder, self.parsed_shard
+        outcomes = run_trials(*inputs, execute=execute, **run.batch_options)
+        if "row" in outcomes.dims:
+            return outcomes
+        return write_dataset(self.labelled(outcomes, run), run.folder)
 
     def labelled(self, outcomes: xr.Dataset, run: Run) -> xr.Dataset:
         outcomes = super().labelled(outcomes, run)
@@ -261,7 +259,7 @@ sweep = call_of(Sweep)
 
 
 @dataclass(frozen=True)
-class Merge(_StoredPlan):
+class Merge(PlanQuestion):
     """Merge the shards of a sweep into one run folder, with its results and its report."""
 
     TITLE = Sweep.TITLE
@@ -270,6 +268,14 @@ class Merge(_StoredPlan):
     """Run folders of the shards; one, if they share it."""
     out: Path | str | None = option(None, kw_only=True)
     """Run folder for the merged sweep."""
+
+    @property
+    def sources(self) -> Sequence[Path]:
+        return self.folders
+
+    @property
+    def default_folder(self) -> Path:
+        return Path("runs") / self.name
 
     @functools.cached_property
     def plan(self) -> Plan:
@@ -282,6 +288,9 @@ class Merge(_StoredPlan):
         if self.out is None:
             raise InputError("out = None is not allowed: name the run folder of the merged sweep.")
 
+    def num_trials(self) -> int | None:
+        return None
+
     def answer(self, run: Run) -> xr.Dataset:
         first, *rest = folders = [Path(folder) for folder in self.folders]
         out = run_folder.ensure_writable(Path(str(self.out)))
@@ -293,8 +302,8 @@ class Merge(_StoredPlan):
                     f"({run_folder.describe_difference(manifest, shard)}): merge shards of one run."
                 )
         attrs = self.attributes() | attributes_of(self.plan)
-        label = partial(xr.Dataset.assign_attrs, **attrs)
-        merged = write_dataset(Results(self.plan), folders, open_run(out, self.plan), label)
+        merged = Results(self.plan).read_all(folders).assign_attrs(attrs)
+        write_dataset(merged, open_run(out, self.plan))
         for folder in folders:
             provenance.write_environment(out, provenance.read_environment(folder))
         return merged

@@ -37,9 +37,9 @@ from rps_jax.runs.plan import Plan, attributes_of, load_plan
 from rps_jax.runs.question import DomainQuestion, Rows, Run, call_of, count_true
 from rps_jax.studies.gallery import failure_modes
 from rps_jax.trials import score
+from rps_jax.trials.batch_run import Candidates, outcomes
 from rps_jax.trials.progress import SequentialProgress
 from rps_jax.trials.results import labelled
-from rps_jax.trials.rollout import Candidates, outcomes
 from rps_jax.trials.trial import Outcome
 
 
@@ -85,6 +85,10 @@ class Ceiling(DomainQuestion[xr.Dataset]):
     """lambda of M1, in units of the standard deviation of the costs [1]."""
     hold: float = option(5.0, above=0, unit="s")
     """Time between two knots of a plan [s]."""
+
+    @property
+    def sources(self) -> Sequence[str | Path]:
+        return () if self.run is None else (self.run,)
 
     @functools.cached_property
     def results(self) -> xr.Dataset | None:

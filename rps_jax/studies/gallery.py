@@ -93,6 +93,10 @@ class Gallery(Question[xr.Dataset]):
     """Maximum number of trials of each failure mode to simulate again and plot."""
 
     @property
+    def sources(self) -> Sequence[str | Path]:
+        return (self.run,)
+
+    @property
     def title(self) -> str:
         only = f" where {self.against} succeeds" if self.against else ""
         return f"Failures of {self.plan_and_law[1]}{only}"

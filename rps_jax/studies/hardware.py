@@ -20,13 +20,14 @@ from rps_jax.control.registry import LawLike
 from rps_jax.record.options import option
 from rps_jax.robot.robot import RobotLike
 from rps_jax.robot.skin import SkinLike
-from rps_jax.runs.question import LawQuestion, Rows, Run, call_of, name_or_custom
+from rps_jax.runs.question import LawQuestion, Rows, Run, call_of
 from rps_jax.studies.table import Table
 from rps_jax.trials import pushes
 from rps_jax.trials.case import Case
 from rps_jax.trials.progress import SequentialProgress
 from rps_jax.trials.results import labelled, trace_dataset
 from rps_jax.trials.trial import Shift
+from rps_jax.world.domain import name_or_custom
 from rps_jax.world.paper import (
     HARDWARE_GROUND,
     HARDWARE_LAYOUTS,

@@ -13,8 +13,8 @@ from rps_jax.record import files
 from rps_jax.runs.evaluate import stack
 from rps_jax.runs.question import Run
 from rps_jax.trials import score
+from rps_jax.trials.batch_run import Candidates, outcomes
 from rps_jax.trials.progress import SequentialProgress, no_progress
-from rps_jax.trials.rollout import Candidates, outcomes
 from rps_jax.trials.setting import Setting
 from rps_jax.world import points
 from rps_jax.world.domain import Domain

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from functools import cached_property, partial
 from itertools import product
 from pathlib import Path
-from typing import ClassVar
+from typing import Annotated, ClassVar
 
 import xarray as xr
 
@@ -21,7 +21,7 @@ from rps_jax.trials import pushes
 from rps_jax.trials.case import Case, FrictionLike, TrialOptions, label_of
 from rps_jax.trials.results import outcome_dataset
 from rps_jax.world import paper
-from rps_jax.world.objects import PAPER_OBJECTS
+from rps_jax.world.objects import PAPER_OBJECTS, STORED
 
 
 @dataclass(frozen=True)
@@ -43,7 +43,7 @@ class Table(TrialOptions, MultiLawQuestion[xr.Dataset]):
     QUICK: ClassVar[Mapping[str, object]] = {"targets": paper.FEW_TARGETS}
 
     laws: LawsLike = paper.LAWS
-    objects: Sequence[str] = PAPER_OBJECTS
+    objects: Annotated[Sequence[str], STORED] = PAPER_OBJECTS
     """Objects to push: their names, or custom MJCF files, FILE.xml, as of `rps push --object`."""
     friction: Sequence[FrictionLike] = ("S1", "S2")
     """Frictions: sets of the paper's Table I (S1, S2), or coefficients GROUND,ROBOT."""

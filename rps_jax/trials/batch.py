@@ -3,10 +3,10 @@
 A job holds the trials that one program can step: one law, one shape family. Its worlds are built
 batch by batch when slots become free, so that memory does not grow with the number of trials.
 
-- `WorldBatch`: worlds and law parameters of some trials of a job.
 - `_TrialQueue`: the trials of a job that wait for a slot.
 - `_Program`: a program for the slots of one queue, or of several queues side by side.
-- `_Slots`: the trials in the slots of one queue, on one worker.
+- `_SlotData`: the inputs and trials in the slots of one queue, on one worker; `segments` decides
+  when they are filled, stepped and read.
 - `_Monitor`: what all workers report to: finished trials, progress and the signal to stop.
 
 Each worker is a host thread with its own slots on one device. The workers of all devices take
@@ -22,28 +22,27 @@ from __future__ import annotations
 
 import functools
 import itertools
-import operator
 import threading
 import time
 import warnings
 from collections import defaultdict, deque
-from collections.abc import Callable, Hashable, Iterable, Sequence
+from collections.abc import Callable, Hashable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, as_completed
 from functools import partial
-from typing import TYPE_CHECKING, Any, NamedTuple, TypedDict, TypeVar
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from rps_jax import engines, errors
-from rps_jax.control import registry, soft
-from rps_jax.control.base import Law, LawParams
+from rps_jax.control.base import Law
 from rps_jax.engines import device, programs
-from rps_jax.trials import host, law_check, trial
+from rps_jax.trials import law_check, segments, trial
+from rps_jax.trials.jobs import Collect, Inputs, Job, Tree, WorldBatch, rows
 from rps_jax.trials.progress import Progress, ProgressCallback, Segment, Timing, no_progress
+from rps_jax.trials.segments import Ended, Fill, Filled, Launch, Read, Report, Slots
 from rps_jax.trials.setting import Setting
-from rps_jax.trials.trial import ControlLoop, Outcome, Rules, Trial, World
+from rps_jax.trials.trial import ControlLoop, Outcome, SegmentState, Trial
 from rps_jax.world.physics import Physics
 
 if TYPE_CHECKING:
@@ -54,72 +53,6 @@ _REPORT_STEPS = 500  # control steps between two reports of an engine outside of
 _FIRST_TRIALS = 16384  # of a job on a GPU in the first segment, while more are built
 _TAIL_SLOTS = 8192  # of a job, on a GPU on which no trial waits
 _MAX_SIDE_BY_SIDE = 4  # jobs in one program; more would take long to compile
-
-Tree = TypeVar("Tree")  # a pytree
-
-
-class WorldBatch(NamedTuple):
-    """Worlds and law parameters of some trials of a job."""
-
-    indices: np.ndarray  # (n,) indices of the trials in the run
-    worlds: World  # leaves (n, ...), on the host
-    stage: Any  # a `Stage`, or the models of an engine outside of JAX
-    params: Any = ()  # `LawParams` with leaves (n, ...), on the host; () if not yet known
-
-    def with_params(self, params: LawParams) -> WorldBatch:
-        """Return the trials with the same law parameters in every world."""
-        count, dtype = self.indices.size, jnp.result_type(float)
-        same = jax.tree.map(lambda x: np.full((count, *np.shape(x)), x, dtype), params)
-        return self._replace(params=same)
-
-    @property
-    def law(self) -> Law:
-        """Law of the parameters."""
-        return registry.law_of(self.params)
-
-    @property
-    def inputs(self) -> Inputs:
-        """Inputs of the program, which differ from trial to trial."""
-        return self.worlds, self.params
-
-    def split(self, count: int) -> tuple[WorldBatch, WorldBatch | None]:
-        """Return the first `count` trials, and the rest if there is one."""
-        arrays = self._replace(stage=None)
-        parts = slice(count), slice(count, None)
-        first, rest = (rows(arrays, part)._replace(stage=self.stage) for part in parts)
-        return first, rest if rest.indices.size else None
-
-
-Inputs = tuple[World, LawParams]
-
-
-class Job(NamedTuple):
-    """Trials that one compiled program can step."""
-
-    program: Hashable  # key of the program; jobs with equal keys can be joined
-    num_trials: int  # at most; there are no more slots than that
-    batches: Iterable[WorldBatch]  # of one law, and of one stage if JAX traces the engine
-
-    def shifted(self, first: int) -> Job:
-        """Return the job with indices of trials that count from `first`."""
-        batches = (batch._replace(indices=first + batch.indices) for batch in self.batches)
-        return self._replace(batches=batches)
-
-
-Collect = Callable[[np.ndarray, Outcome], object]  # indices (m,) of trials and their outcomes
-
-
-class BatchSize(TypedDict, total=False):
-    """Resources of functions that run trials."""
-
-    slots: int | None  # worlds that one worker steps at once on each device of the host
-    workers: int | None  # host threads for each device
-
-
-class BatchOptions(BatchSize, total=False):
-    """Keyword arguments of functions that run trials."""
-
-    callback: ProgressCallback
 
 
 def run(
@@ -191,11 +124,6 @@ def slots_of(setting: Setting, slots: int | None = None, trials: int | None = No
     """Return the number of slots of a program, or of the program of a job with so many trials."""
     slots = engines.get(setting.engine).slots(jax.default_backend()) if slots is None else slots
     return slots if trials is None else min(slots, -(-trials // len(_devices())))
-
-
-def rows(tree: Tree, index: Any) -> Tree:
-    """Return the rows `index` of every leaf; an index is whatever arrays take."""
-    return jax.tree.map(lambda leaf: leaf[index], tree)
 
 
 def _run_in_threads(tasks: Sequence[Callable[[], object]], count: int, monitor: _Monitor) -> None:
@@ -292,14 +220,15 @@ def _run_on_host(job: Job, setting: Setting, threads: int, monitor: _Monitor) ->
     period = setting.physics.control_period
     for batch in job.batches:
         loop = ControlLoop(setting.physics, setting.rules, batch.law)
-        steps = host.run(batch.stage, *batch.inputs, loop, max(1, threads))
+        inputs = setting.simulator, batch.stage, *batch.inputs
+        steps = trial.run_on_host(*inputs, loop, max(1, threads))
         reported, previous = np.zeros(batch.indices.size, bool), 0
         for index, trials in enumerate(steps):
             done = np.asarray(trials.done)
             if index % _REPORT_STEPS and not done.all():
                 continue
             ended, total = np.flatnonzero(done & ~reported), int(np.asarray(trials.steps).sum())
-            outcomes = jax.device_get(host.outcome(trials, batch.worlds, loop))
+            outcomes = jax.device_get(trial.compiled_outcome(trials, batch.worlds, loop))
             simulated = (total - previous) * period
             monitor.add((batch.indices[ended], rows(outcomes, ended), simulated))
             reported, previous = done, total
@@ -319,7 +248,8 @@ def _devices() -> list[Device]:
 class _Running(NamedTuple):
     """Running trials of a job that left the slots of a program."""
 
-    batch: WorldBatch
+    indices: np.ndarray  # (n,) of the trials in the run
+    inputs: Inputs  # leaves (n, ...), on the host
     trials: Trial  # leaves (n, ...), on the host
     fresh: np.ndarray  # (n,) whether a trial has yet to start
 
@@ -379,6 +309,7 @@ class _Program:
     def __init__(self, queues: Sequence[_TrialQueue], slots: Sequence[int], setting: Setting):
         self.queues, self.slots, self.setting = queues, slots, setting
         self.law, self.key = queues[0].example.law, queues[0].index  # the key of its group
+        self.period = setting.physics.control_period
         self.stages = tuple(queue.example.stage for queue in queues)
         self._locks: defaultdict[object, threading.Lock] = defaultdict(threading.Lock)
 
@@ -401,15 +332,7 @@ class _Program:
         return jax.tree.map(shape, self.queues[index].shapes)
 
 
-class _State(NamedTuple):
-    """State of the slots of one queue after a segment."""
-
-    steps: Any  # (slots,) int: control steps of each trial in this segment
-    done: Any  # (slots,) bool
-    outcome: Outcome  # (slots, ...)
-
-
-_Advance = Callable[..., tuple[tuple[Trial, ...], tuple[_State, ...]]]
+_Advance = Callable[..., tuple[tuple[Trial, ...], tuple[SegmentState, ...]]]
 _Ended = tuple[np.ndarray, Outcome, float]  # indices of trials, outcomes, and [s] that all advanced
 
 
@@ -420,97 +343,56 @@ def _trace_advance(
     structure: pytree.PyTreeDef,
     leaves: tuple[jax.ShapeDtypeStruct, ...],
 ) -> Callable[[Device], _Advance]:
-    """Trace `trial.advance` for arguments of these shapes; cached."""
-
-    def advance(
-        stages: tuple[Any, ...],
-        inputs: tuple[Inputs, ...],
-        trials: tuple[Trial, ...],
-        fresh: tuple[jax.Array, ...],
-        live: tuple[jax.Array, ...],
-        rules: Rules,
-        steps: jax.Array,
-    ) -> tuple[tuple[Trial, ...], tuple[_State, ...]]:
-        pairs = zip(inputs, live, strict=True)
-        started = [trial.start_all(*leaves, mask, law=law) for leaves, mask in pairs]
-        current = tuple(map(jax.vmap(soft.tree_where), fresh, started, trials))
-        loop = ControlLoop(physics, rules, law)
-        batches = zip(stages, inputs, current, strict=True)
-        advanced = trial.advance([(stage, *x, state) for stage, x, state in batches], loop, steps)
-        # Outcomes are in the same program: another one would wait for other workers' segments.
-        return advanced, tuple(
-            _State(b.steps - a.steps, b.done, trial.outcome(b, worlds, loop))
-            for a, b, (worlds, _) in zip(current, advanced, inputs, strict=True)
-        )
+    """Trace `trial.segment_of` for arguments of these shapes; cached."""
 
     arguments = jax.tree.unflatten(structure, leaves)
-    return programs.trace_function(advance, arguments, law=law, donate=2, static=(physics,))
+    segment = trial.segment_of(physics, law)
+    return programs.trace_function(segment, arguments, law=law, donate=2, static=(physics,))
 
 
-class _Slots:
-    """Slots of one queue in a program of one worker, and the trials in them."""
+class _SlotData:
+    """Inputs and trials in the slots of one queue, on the host and on a device."""
 
     def __init__(self, program: _Program, index: int, running: _Running | None, device: Device):
-        """Fill slots of the queue `index` with the running trials, and others with waiting ones."""
-        queue, slots = program.queues[index], program.slots[index]
-        self._queue, self._device = queue, device
-        self._period = program.setting.physics.control_period
-        self._indices = np.zeros(slots, np.int64)  # of the trials in the run
-        self.live = np.zeros(slots, bool)  # whether a slot holds a trial that has not ended
-        self._first = np.zeros(slots, int)  # segment with which each trial starts, or -1
-        self._count = 0  # segments that were launched
-        example = queue.example.inputs
-        self._host = jax.tree.map(lambda leaf: np.repeat(leaf[:1], slots, axis=0), example)
+        """Prepare the slots of the queue `index`, of which the first hold the running trials."""
+        self.queue, self._device = program.queues[index], device
+        size, example = program.slots[index], self.queue.example.inputs
+        self._host = jax.tree.map(lambda leaf: np.repeat(leaf[:1], size, axis=0), example)
         self._inputs: Inputs | None = None  # on the device, if they are those on the host
         trials = jax.tree.map(lambda x: np.zeros(x.shape, x.dtype), program.shapes(index)[1])
+        indices, fresh = np.zeros(0, int), np.zeros(0, bool)
         if running is not None:
-            at = np.arange(running.fresh.size)
-            self._write(at, running.batch)
-            self._first[at] = np.where(running.fresh, 0, -1)
+            indices, fresh, at = running.indices, running.fresh, slice(running.indices.size)
+            _write(self._host, at, running.inputs)
             _write(trials, at, running.trials)
+        self.slots = segments.occupied(size, indices, fresh)
         self.trials = jax.device_put(trials, device)
-        self.fill(None if _tail_slots() is None else _FIRST_TRIALS)
 
-    def _write(self, at: np.ndarray, batch: WorldBatch) -> None:
-        """Write trials into the slots `at`, in which they start with the next segment."""
-        self._indices[at], self._first[at], self.live[at] = batch.indices, self._count, True
-        _write(self._host, at, batch.inputs)
-        self._inputs = None
+    def fill(self, free: np.ndarray) -> np.ndarray:
+        """Write waiting trials into the first of the free slots; return their indices."""
+        indices = [np.zeros(0, int)]
+        for batch in self.queue.take(free.size) if free.size else ():
+            _write(self._host, free[: batch.indices.size], batch.inputs)
+            free, self._inputs = free[batch.indices.size :], None
+            indices.append(batch.indices)
+        return np.concatenate(indices)
 
-    def fill(self, count: int | None = None) -> None:
-        """Fill free slots with at most `count` waiting trials."""
-        at = np.flatnonzero(~self.live)[:count]
-        for batch in self._queue.take(at.size) if at.size else ():
-            self._write(at[: batch.indices.size], batch)
-            at = at[batch.indices.size :]
-
-    def arguments(self) -> tuple[Inputs, Trial, jax.Array, jax.Array]:
-        """Return the arguments of the program for the next segment, in which fresh trials start."""
+    @property
+    def inputs(self) -> Inputs:
+        """Inputs of the program on the device."""
         if (inputs := self._inputs) is None:
             # A copy: the device may share the host's memory, which `fill` changes.
             inputs = jax.device_put(jax.tree.map(np.copy, self._host), self._device)
             self._inputs = inputs
-        masks = self._first == self._count, self.live.copy()
-        self._count += 1
-        fresh, live = jax.device_put(masks, self._device)
-        return inputs, self.trials, fresh, live
+        return inputs
 
-    def free(self, segment: int, state: _State) -> _Ended:
-        """Free the slots of the trials that ended in a segment; return these."""
-        steps, done, outcomes = state
-        at = np.flatnonzero(done & self.live & (self._first <= segment))
-        ended = self._indices[at], rows(outcomes, at), float(steps.sum()) * self._period
-        self.live[at] = False
-        return ended
-
-    def remove(self) -> _Running:
-        """Return the trials that run; none if there is none."""
-        at = np.flatnonzero(self.live)
-        worlds, params = rows(self._host, at)
-        batch = WorldBatch(self._indices[at], worlds, self._queue.example.stage, params)
-        return _Running(
-            batch, rows(jax.device_get(self.trials), at), self._first[at] >= self._count
-        )
+    def remove(self, slots: Slots, launched: int) -> _Running | None:
+        """Return the trials that run after so many segments, if there are any."""
+        at = np.flatnonzero(slots.live)
+        if not at.size:
+            return None
+        inputs, trials = rows(self._host, at), rows(jax.device_get(self.trials), at)
+        return _Running(slots.trials[at], inputs, trials, slots.first[at] >= launched)
 
 
 def _write(tree: Tree, index: Any, values: Tree) -> None:
@@ -531,55 +413,78 @@ def _work(
 def _run_group(group: Sequence[_Program], device: Device, monitor: _Monitor) -> None:
     """Run a group of programs on a device until no trial waits or runs."""
     running: list[_Running | None] = [None] * len(group[0].queues)
-    for program, limits in itertools.zip_longest(group, [x.slots for x in group[1:]]):
-        running = [*_run(program, limits, running, device, monitor)]
+    for program, following in itertools.zip_longest(group, group[1:]):
+        limits = [0] * len(running) if following is None else following.slots
+        if monitor.stops(program):
+            return
+        running = _run(program, limits, running, device, monitor)
 
 
 def _run(
-    program: _Program, limits: Sequence[int] | None, running: Sequence[_Running | None],
-    device: Device, monitor: _Monitor,
-) -> Sequence[_Running | None]:  # fmt: skip
+    program: _Program,
+    limits: Sequence[int],
+    running: Sequence[_Running | None],
+    device: Device,
+    monitor: _Monitor,
+) -> list[_Running | None]:
     """Run segments until no trial waits and at most `limits` of each queue run; return these."""
-    if monitor.stops(program):
-        return running
-    queues = [_Slots(program, *trials, device) for trials in enumerate(running)]
-    if not any(slots.live.any() for slots in queues):
-        return running
+    data = [_SlotData(program, *trials, device) for trials in enumerate(running)]
+    # A GPU runs a segment while the host reads another.
+    ahead, at_first = (0, None) if _tail_slots() is None else (1, _FIRST_TRIALS)
+    state, following = segments.start([x.slots for x in data], limits, ahead, at_first)
+    actions, advance, end = deque(following), None, 0.0
+    unread = deque[tuple[float, list[int], tuple[SegmentState, ...]]]()  # start, trials and results
+    results: Sequence[SegmentState] = ()  # of the segment that was read
+    segment: Segment | None = None  # that was read
+    with ThreadPoolExecutor(1) as reporter:  # reports a segment while the next one runs
+        report: Future[object] = reporter.submit(int)  # of the last segment that was read
+        while actions:
+            match actions.popleft():
+                case Launch(fresh, live):
+                    if advance is None:
+                        advance = _load(program, device, monitor)
+                        if monitor.stops(program):
+                            break
+                    masks = jax.device_put((tuple(fresh), tuple(live)), device)
+                    inputs, trials = zip(*((x.inputs, x.trials) for x in data), strict=True)
+                    start_time = monitor.elapsed
+                    advanced, states = advance(inputs, trials, *masks)
+                    for slots, moved in zip(data, advanced, strict=True):
+                        slots.trials = moved
+                    unread.append((start_time, [*map(np.count_nonzero, live)], states))
+                case Report(at, indices):
+                    ended = map(_ended, at, indices, results, [program.period] * len(data))
+                    report.result()
+                    report = reporter.submit(partial(monitor.add, *list(ended), segment=segment))
+                case Fill(free):
+                    filled = [x.fill(slots) for x, slots in zip(data, free, strict=True)]
+                    state, following = segments.step(state, Filled(filled, monitor.stops(program)))
+                    actions.extend(following)
+                case Read():
+                    start, counts, states = unread.popleft()
+                    results = jax.device_get(states)
+                    start, end = max(start, end), monitor.elapsed
+                    live = dict(zip((x.queue.index for x in data), counts, strict=True))
+                    segment = Segment(device.id, start, end, live)
+                    state, following = segments.step(state, Ended([x.done for x in results]))
+                    actions.extend(following)
+        report.result()
+    return [x.remove(slots, state.launched) for x, slots in zip(data, state.slots, strict=True)]
+
+
+def _load(program: _Program, device: Device, monitor: _Monitor) -> _Advance:
+    """Return the compiled program with its constants on the device, for one segment."""
     start_time = monitor.elapsed
     advance = program.compiled(device)
     stages, rules = jax.device_put((program.stages, program.setting.rules), device)
-    steps = np.int32(max(1, round(SEGMENT / program.setting.physics.control_period)))
+    steps = np.int32(max(1, round(SEGMENT / program.period)))
     monitor.add_compile_time((program, device), monitor.elapsed - start_time)
-    end, unread = 0.0, deque[tuple[float, list[int], tuple[_State, ...]]]()
-    delay = 0 if _tail_slots() is None else 1  # segments that run while the host reads another
-    with ThreadPoolExecutor(1) as reporter:  # reports a segment while the next one runs
-        report: Future[object] = reporter.submit(int)  # of the last segment that was read
-        for index in itertools.count(-delay):  # of the segment that is read
-            counts = [int(np.count_nonzero(slots.live)) for slots in queues]
-            if not monitor.stops(program) and any(
-                map(operator.gt, counts, limits or [0] * len(queues))
-            ):
-                arguments = zip(*(slots.arguments() for slots in queues), strict=True)
-                start_time = monitor.elapsed
-                advanced, states = advance(stages, *arguments, rules, steps)
-                for slots, trials in zip(queues, advanced, strict=True):
-                    slots.trials = trials
-                unread.append((start_time, counts, states))
-            elif not unread:
-                break
-            if index >= 0:
-                start, counts, states = unread.popleft()
-                pairs = zip(queues, jax.device_get(states), strict=True)
-                start, end = max(start, end), monitor.elapsed
-                live = dict(zip((queue.index for queue in program.queues), counts, strict=True))
-                segment = Segment(device.id, start, end, live)
-                ended = [slots.free(index, state) for slots, state in pairs]
-                report.result()
-                report = reporter.submit(partial(monitor.add, *ended, segment=segment))
-            for slots in queues:
-                slots.fill()
-        report.result()
-    return [] if limits is None else [slots.remove() for slots in queues]
+    return lambda *arguments: advance(stages, *arguments, rules, steps)
+
+
+def _ended(at: np.ndarray, indices: np.ndarray, state: SegmentState, period: float) -> _Ended:
+    """Return the trials in the slots `at`, and the time [s] that all trials advanced."""
+    return indices, rows(state.outcome, at), float(state.steps.sum()) * period
 
 
 # --- trials on demand ----------------------------------------------------------------------

@@ -14,6 +14,7 @@ from rps_jax.robot.robot import Robot, RobotLike
 from rps_jax.robot.skin import Skin, SkinLike
 from rps_jax.trials.trial import Shift
 from rps_jax.world import objects, scene
+from rps_jax.world.objects import ObjectLike
 from rps_jax.world.scene import FRICTION, Friction, Side
 from rps_jax.world.tasks import Task, TaskLike, parse_task
 
@@ -52,7 +53,7 @@ class Case(TrialOptions):
       InputError: a name or value is not valid.
     """
 
-    object: str = "box"
+    object: ObjectLike = "box"
     """Object to push: its name, or a custom MJCF file, FILE.xml, of an upright box or cylinder. For
     another convex outline the file has its corners, counter-clockwise from above [m], as
     <custom><numeric name="footprint" data="X Y X Y X Y"/></custom>."""

@@ -21,7 +21,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from rps_jax import errors
+from rps_jax import engines, errors
 from rps_jax.control import soft
 from rps_jax.control.base import check_finite_leaves
 from rps_jax.control.laws import rps
@@ -30,14 +30,13 @@ from rps_jax.control.learned import features
 from rps_jax.control.observation import Observation, TaxelObservation, Twist
 from rps_jax.engines import device, native
 from rps_jax.engines.base import ControlPeriod
-from rps_jax.engines.mjx_colliders import mjx
 from rps_jax.geometry import footprint as fp
 from rps_jax.geometry import planar
 from rps_jax.geometry.arrays import Pair
 from rps_jax.record.options import check_fields, option
 from rps_jax.robot.robot import RobotLike
 from rps_jax.trials import trial
-from rps_jax.trials.batch import WorldBatch, rows
+from rps_jax.trials.jobs import WorldBatch, rows
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import ControlLoop, Measurement, SingleWorld, Trial, World
 from rps_jax.trials.worlds import drawn_scene, drawn_worlds, soften_skins
@@ -45,7 +44,7 @@ from rps_jax.world import domain, draws, objects, video
 from rps_jax.world.domain import DOMAINS, Domain, DomainLike
 from rps_jax.world.draws import Draw
 from rps_jax.world.opengl import mujoco
-from rps_jax.world.scene import Scene
+from rps_jax.world.scene import JOINTS, Scene
 from rps_jax.world.tasks import TaskLike
 
 
@@ -197,7 +196,8 @@ class PushEnv:
         )
         targets = state.info["observation"].touch, measured.observation
         terms = self._true_state_terms(world, previous, current, *targets)
-        for weight, term in zip(self.weights[3:5], terms, strict=True):
+        weights = self.weights.object, self.weights.behind
+        for weight, term in zip(weights, terms, strict=True):
             reward += weight * term if weight else 0.0
         obs = self._observation(world, current, measured)
         return state.replace(
@@ -235,7 +235,8 @@ class PushEnv:
             p_object, _ = trial.object_pose(state.qpos)
             way = world.task.remaining(state.task, world.p_world_target, p_object)
             gap = way - fp.circumradius(world.footprint)
-            ways = p_object - state.qpos[:2], touch.p_world_target - state.qpos[:2]
+            p_base = state.qpos[JOINTS.base_position]
+            ways = p_object - p_base, touch.p_world_target - p_base
             lengths = jnp.maximum(planar.norm(ways[0]) * planar.norm(ways[1]), 1e-6)
             return jnp.maximum(gap, 0.0), jnp.dot(*ways) / lengths
 
@@ -266,8 +267,8 @@ class PushEnv:
 
     def has_timed_out(self, data: Trial) -> jax.Array:
         """Return whether trials (...) ended by a time limit, and not by success or failure."""
-        horizon, max_lost, _ = self.setting.rules
-        late = (data.steps * self.dt >= horizon) | (data.lost_steps * self.dt > max_lost)
+        rules, lost = self.setting.rules, data.lost_steps * self.dt
+        late = (data.steps * self.dt >= rules.horizon) | (lost > rules.max_lost)
         return data.done & late & ~(data.success | data.tipped | data.diverged)
 
     # --- properties ---
@@ -319,9 +320,10 @@ class PushEnv:
         return self._scene(0).model
 
     @property
-    def mjx_model(self) -> mjx.Model:
-        """Collision model of world 0, which the engine `mjx` steps."""
-        return mjx.put_model(self._scene(0).physics)
+    def mjx_model(self) -> Any:
+        """Collision model of world 0, an `mjx.Model`, which the engine `mjx` steps."""
+        engine: Any = engines.get("mjx")
+        return engine.put_model(self._scene(0).physics)
 
     @functools.cached_property
     def _alone(self) -> Domain:

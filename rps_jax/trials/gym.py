@@ -27,8 +27,8 @@ from rps_jax import errors
 from rps_jax.control import soft
 from rps_jax.engines import device
 from rps_jax.record.files import Arrays
-from rps_jax.trials.batch import rows
 from rps_jax.trials.env import SHAPED_REWARD, PushEnv, State
+from rps_jax.trials.jobs import rows
 from rps_jax.world import domain as domains
 from rps_jax.world.domain import DomainLike
 
@@ -208,10 +208,12 @@ class GymPushVector(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         """Return observations (num_envs, T + 2), terminated and truncated flags, and infos."""
         data, metrics = self.state.data, self.state.metrics
         infos = {
-            "is_success": data.success, "time": data.steps * self.push_env.dt,
-            "in_contact": metrics["in_contact"] > 0, "world": self.state.info["index"],
+            "is_success": data.success,
+            "time": data.steps * self.push_env.dt,
+            "in_contact": metrics["in_contact"] > 0,
+            "world": self.state.info["index"],
             **data.task.outcomes(),
-        }  # fmt: skip
+        }
         infos = {name: np.array(values) for name, values in infos.items()}
         done, late = np.array(data.done), np.array(self.push_env.has_timed_out(data))
         return np.array(self.state.obs, np.float32), done & ~late, late, infos

@@ -11,18 +11,19 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from rps_jax import engines, errors
+from rps_jax import errors
 from rps_jax.control.base import Law, LawParams
 from rps_jax.control.laws.rps import RPSParams
 from rps_jax.engines import device
 from rps_jax.geometry import solid
 from rps_jax.robot.base import Odometry
 from rps_jax.robot.robot import Robot
-from rps_jax.trials import host, trial, worlds
-from rps_jax.trials.batch import BatchOptions, Job, WorldBatch, rows, stepper
+from rps_jax.trials import trial, worlds
+from rps_jax.trials.batch import stepper
+from rps_jax.trials.batch_run import outcomes
 from rps_jax.trials.case import Case
+from rps_jax.trials.jobs import BatchOptions, Job, WorldBatch, rows
 from rps_jax.trials.progress import Progress, ProgressCallback, Timing, no_progress
-from rps_jax.trials.rollout import outcomes
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import ControlLoop, Outcome, Shift, Snapshot, Trial, World
 from rps_jax.world import draws, scene
@@ -60,9 +61,11 @@ def _start_of(case: Case, at: Scene) -> tuple[np.ndarray, np.ndarray]:
     c, s = math.cos(case.bearing), math.sin(case.bearing)
     turn = np.array([[c, -s], [s, c]])
     x = JOINTS.object.start
-    qpos[:3] = [*(turn @ qpos[:2]), qpos[2] + case.bearing]
-    qpos[x : x + 2] = turn @ qpos[x : x + 2]
-    qpos[x + 3 : x + 7] = [math.cos(case.bearing / 2), 0.0, 0.0, math.sin(case.bearing / 2)]
+    for position in (JOINTS.base_position, slice(x, x + 2)):
+        qpos[position] = turn @ qpos[position]
+    qpos[JOINTS.base_yaw] += case.bearing
+    quaternion = [math.cos(case.bearing / 2), 0.0, 0.0, math.sin(case.bearing / 2)]
+    qpos[JOINTS.object_quaternion] = quaternion
     return qpos, turn @ np.array(case.target)
 
 
@@ -80,7 +83,7 @@ def build(
     keys = [(case.object_name, case.mass, case.rear, case.base) for case in cases]
     different = dict(zip(keys, cases, strict=True))
     scenes = {key: scene_of(case, setting.physics) for key, case in different.items()}
-    traced = engines.get(setting.engine).traced
+    traced = setting.simulator.traced
     solids = {key: x.rounded_solid if traced else x.solid for key, x in scenes.items()}
     starts = [_start_of(case, scenes[key]) for case, key in zip(cases, keys, strict=True)]
     qpos, targets = (np.array(column) for column in zip(*starts, strict=True))
@@ -170,7 +173,7 @@ class Cases(NamedTuple):
 def run(
     cases: Sequence[Case], setting: Setting = Setting(engine="mjx"), **options: Unpack[BatchOptions]
 ) -> tuple[Outcome, Timing]:
-    """Run every case to its end, by `rollout` with its options.
+    """Run every case to its end, by `run_batch` with its options.
 
     Results are bit-identical for equal slots on one kind of device, whatever shares the batch.
 
@@ -235,12 +238,13 @@ def _states(
     worlds: WorldBatch, setting: Setting, stride: int, slots: int
 ) -> Iterator[tuple[Trial, Outcome]]:
     """Yield trials and their outcomes at the start, after every `stride` steps and at the end."""
-    if not engines.get(setting.engine).traced:
+    if not setting.simulator.traced:
         threads = 1 if worlds.indices.size == 1 else device.count_processors()
         loop = ControlLoop(setting.physics, setting.rules, worlds.law)
-        for step, trials in enumerate(host.run(worlds.stage, *worlds.inputs, loop, threads)):
+        steps = trial.run_on_host(setting.simulator, worlds.stage, *worlds.inputs, loop, threads)
+        for step, trials in enumerate(steps):
             if step % stride == 0 or trials.done.all():
-                outcomes = host.outcome(trials, worlds.worlds, loop)
+                outcomes = trial.compiled_outcome(trials, worlds.worlds, loop)
                 yield jax.device_get((trials, outcomes))
         return
     advance = stepper(worlds, setting, slots)

@@ -35,8 +35,17 @@ UNITS = {
     "base_pose": ("m, m, rad", "x, y, yaw of the base in the world at the end"),
     "object_pose": ("m, m, rad", "x, y, yaw of the object in the world at the end"),
 }
-_TRACED = {"v_x": "m/s", "v_y": "m/s", "omega": "rad/s", "l": "m", "distance": "m", "a_r": "1",
-           "gamma": "rad", "realigning": "1"}  # fmt: skip  # units of numbers of a trace
+# Units of numbers of a trace.
+_TRACED = {
+    "v_x": "m/s",
+    "v_y": "m/s",
+    "omega": "rad/s",
+    "l": "m",
+    "distance": "m",
+    "a_r": "1",
+    "gamma": "rad",
+    "realigning": "1",
+}
 
 
 def nan_twists(results: xr.Dataset) -> str:

@@ -8,10 +8,11 @@ that has ended stays as it is, and a batch stops when all its trials have ended.
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import functools
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from types import MappingProxyType
@@ -36,7 +37,7 @@ from rps_jax.control.observation import (
     with_base,
 )
 from rps_jax.engines import native
-from rps_jax.engines.base import ControlPeriod, Driven, Motion, Stage
+from rps_jax.engines.base import ControlPeriod, Driven, Engine, Motion, Stage
 from rps_jax.geometry import footprint as fp
 from rps_jax.geometry import planar
 from rps_jax.geometry.arrays import Array, Bool, Bools, Float, Floats, Ints, Scalar, Vector
@@ -186,7 +187,9 @@ def object_pose(qpos: Float[Array, "10"]) -> tuple[Vector, Float[Array, ""]]:
 def p_world_contact(snapshots: Snapshot) -> Float[Array, "T 2"]:
     """Return the contact points of snapshots (T, ...) in the world [m]; NaN without contact."""
     qpos, reading = snapshots.qpos, snapshots.reading
-    point = qpos[:, :2] + planar.rotate(qpos[:, 2], reading.p_robot_contact)
+    point = qpos[:, JOINTS.base_position] + planar.rotate(
+        qpos[:, JOINTS.base_yaw], reading.p_robot_contact
+    )
     return jnp.where((reading.contact_type != NONE)[:, None], point, jnp.nan)
 
 
@@ -216,14 +219,14 @@ def shifted(world: World, trial: Trial, period: float) -> Trial:
     """Return the trial with the world's scripted shift, if it is due in this control step."""
     # Compare step numbers: rounded times could be equal twice or never.
     due = trial.steps == jnp.round(world.shift.time / period)
-    offset = planar.rotate(trial.qpos[2], jnp.asarray(world.shift.p_robot))
+    offset = planar.rotate(trial.qpos[JOINTS.base_yaw], jnp.asarray(world.shift.p_robot))
     x = JOINTS.object.start
     return trial._replace(qpos=trial.qpos.at[x : x + 2].add(jnp.where(due, offset, 0.0)))
 
 
 def outline(world: World, qpos: Float[Array, "10"]) -> Footprint:
     """Return the object's outline in the robot frame, at the positions qpos."""
-    p_world_robot, yaw = qpos[:2], qpos[2]
+    p_world_robot, yaw = qpos[JOINTS.base_position], qpos[JOINTS.base_yaw]
     p_world_object, object_yaw = object_pose(qpos)
     p_robot_object = planar.rotate(-yaw, p_world_object - p_world_robot)
     return fp.place(world.footprint, p_robot_object, object_yaw - yaw)
@@ -231,7 +234,7 @@ def outline(world: World, qpos: Float[Array, "10"]) -> Footprint:
 
 def contact_of(qpos: Float[Array, "10"], p_robot_contact: Vector) -> Vector:
     """Return a contact point in the world [m]."""
-    return qpos[:2] + planar.rotate(qpos[2], p_robot_contact)
+    return qpos[JOINTS.base_position] + planar.rotate(qpos[JOINTS.base_yaw], p_robot_contact)
 
 
 def positions_of(
@@ -272,7 +275,8 @@ def observe(
     trial = shifted(world, trial, period)
     skin, reading = world.skin.sense(trial.skin, outline(world, trial.qpos), period)
     touched = reading.p_robot_contact, reading.in_contact
-    observation = Observation(trial.qpos[:2], trial.qpos[2], *touched, world.p_world_target, period)
+    pose = trial.qpos[JOINTS.base_position], trial.qpos[JOINTS.base_yaw]
+    observation = Observation(*pose, *touched, world.p_world_target, period)
     observation = with_base(observation, world.skin.shell.radius, world.robot)
     distance = planar.norm(displacement(observation))
     motion = trial.poses, trial.qpos[JOINTS.base], world.key, trial.steps, period
@@ -285,7 +289,7 @@ def observe(
     task, aim = world.task.step(trial.task, positions)
     observation = observation._replace(p_world_target=aim.p_world_target)
     success = touch & (distance < params.d_success) & aim.at_end
-    tilt = planar.tilt(trial.qpos[JOINTS.object][3:])
+    tilt = planar.tilt(trial.qpos[JOINTS.object_quaternion])
     tipped = tilt > rules.max_tilt
     over = (time >= rules.horizon) | (lost_steps * period > rules.max_lost) | tipped | aim.failed
     judged = trial._replace(
@@ -368,11 +372,13 @@ def settle(world: World, previous: Trial, decided: Trial, driven: Driven) -> Tri
     A trial that had ended before, as `previous` says, is returned as it was.
     """
     (qpos, qvel, warmstart, integral), force, *_ = driven
+    xy = JOINTS.base_position
     sane = (
         ~decided.nan_twist
         & jnp.all(jnp.isfinite(qpos))
         & jnp.all(jnp.abs(qvel) < _MAX_SPEED)
-        & jnp.all(jnp.abs(qpos.at[2].set(0.0)) < _MAX_DISTANCE)  # the base may turn without limit
+        # The base may turn without limit.
+        & jnp.all(jnp.abs(qpos.at[JOINTS.base_yaw].set(0.0)) < _MAX_DISTANCE)
     )
     state = decided.drive
     if world.robot is not None and state is not None:
@@ -382,7 +388,7 @@ def settle(world: World, previous: Trial, decided: Trial, driven: Driven) -> Tri
         qpos=qpos,
         qvel=qvel,
         warmstart=warmstart,
-        path_length=decided.path_length + planar.norm(qpos[:2] - decided.qpos[:2]),
+        path_length=decided.path_length + planar.norm(qpos[xy] - decided.qpos[xy]),
         steps=decided.steps + 1,
         drive=state,
         load=decided.load and decided.load._replace(wrench=force),
@@ -408,9 +414,14 @@ def control_step(
 
 
 def _solved_step(
-    stage: Stage, worlds: World, params: LawParams, trials: Trial, loop: ControlLoop,
-    mapped: Callable[..., Any], solutions: Any,
-) -> tuple[tuple[Trial, Snapshot], Any]:  # fmt: skip
+    stage: Stage,
+    worlds: World,
+    params: LawParams,
+    trials: Trial,
+    loop: ControlLoop,
+    mapped: Callable[..., Any],
+    solutions: Any,
+) -> tuple[tuple[Trial, Snapshot], Any]:
     """Run `control_step` with the solutions of `ControlPeriod`; return also those of `Driven`."""
     decided, twists, snapshots = mapped(decide, (0, 0, 0, None))(worlds, params, trials, loop)
     force = loop.law.senses == "force"
@@ -571,6 +582,48 @@ def advance(
     return tuple(native.concurrent(singles, in_xla, phase)(*inputs))
 
 
+class SegmentState(NamedTuple):
+    """State of a batch of trials after a segment."""
+
+    steps: Any  # (B,) int: control steps of each trial in this segment
+    done: Any  # (B,) bool
+    outcome: Outcome  # (B, ...)
+
+
+def segment_of(
+    physics: Physics, law: Law
+) -> Callable[..., tuple[tuple[Trial, ...], tuple[SegmentState, ...]]]:
+    """Return a function that starts fresh trials of batches, and runs some control steps of all.
+
+    Its arguments are stages, inputs and trials of the batches; masks (B,) of the trials that start
+    and of those that are no padding; rules, and a number of steps. It returns the trials and their
+    states.
+    """
+
+    def segment(
+        stages: tuple[Stage, ...],
+        inputs: tuple[tuple[World, LawParams], ...],
+        trials: tuple[Trial, ...],
+        fresh: tuple[jax.Array, ...],
+        live: tuple[jax.Array, ...],
+        rules: Rules,
+        steps: jax.Array,
+    ) -> tuple[tuple[Trial, ...], tuple[SegmentState, ...]]:
+        pairs = zip(inputs, live, strict=True)
+        started = [start_all(*leaves, mask, law=law) for leaves, mask in pairs]
+        current = tuple(map(jax.vmap(soft.tree_where), fresh, started, trials))
+        loop = ControlLoop(physics, rules, law)
+        batches = zip(stages, inputs, current, strict=True)
+        advanced = advance([(stage, *x, state) for stage, x, state in batches], loop, steps)
+        # Outcomes are in the same program: another one would wait for other workers' segments.
+        return advanced, tuple(
+            SegmentState(b.steps - a.steps, b.done, outcome(b, worlds, loop))
+            for a, b, (worlds, _) in zip(current, advanced, inputs, strict=True)
+        )
+
+    return segment
+
+
 def _advance_in_xla(
     batches: Sequence[Batch], loop: ControlLoop, steps: int | jax.Array
 ) -> tuple[Trial, ...]:
@@ -596,3 +649,42 @@ def _advance_in_xla(
         return step(0, carry) if on_cpu else jax.lax.fori_loop(0, _UNCHECKED, step, carry)
 
     return jax.lax.while_loop(any_runs, body, (0, tuple(batch[-1] for batch in batches)))[1]
+
+
+# --- engines that JAX does not trace -------------------------------------------------------
+
+_decide = jax.jit(jax.vmap(decide, (0, 0, 0, None)))
+_settle = jax.jit(jax.vmap(settle))
+compiled_outcome = jax.jit(outcome)
+
+
+def run_on_host(
+    engine: Engine, stage: Any, worlds: World, params: LawParams, loop: ControlLoop, threads: int
+) -> Iterator[Trial]:
+    """Run a batch of worlds to their ends with an engine that JAX does not trace.
+
+    Sensing, laws and rules run in JAX. The engine gets positions in the precision of JAX and steps
+    them in its own precision. `threads` is its number of threads.
+
+    Yields:
+      Trials at the start and after each control step.
+    """
+    worlds, params = jax.device_put((worlds, params), jax.devices("cpu")[0])
+    trials = start_all(worlds, params, np.ones(len(worlds.qpos), bool), law=loop.law)
+    dtype, qpos = trials.qpos.dtype, np.asarray(trials.qpos, float)
+    yield trials
+    opened = engine.open_batch(stage, qpos, threads, pushing(worlds), worlds.fields)
+    with contextlib.closing(opened) as batch:
+        while not np.asarray(trials.done).all():
+            decided, twist, _ = _decide(worlds, params, trials, loop)
+            qpos, running = np.asarray(decided.qpos), np.flatnonzero(~np.asarray(decided.done))
+            # Only a scripted shift moves the object outside of the engine.
+            moved = np.flatnonzero(np.any(qpos != np.asarray(trials.qpos), axis=1))
+            batch.set_positions(moved, qpos[moved])
+            if running.size:
+                twists = np.stack(twist, axis=1)[running].astype(float)
+                batch.drive(running, twists, loop.physics.substeps)
+            driven = jax.tree.map(lambda x: x.astype(dtype), batch.driven)
+            driven = driven if loop.law.senses == "force" else driven._replace(force=None)
+            trials = _settle(worlds, trials, decided, driven)
+            yield trials

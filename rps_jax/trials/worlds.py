@@ -11,7 +11,7 @@ from rps_jax.geometry import solid
 from rps_jax.geometry.footprint import Footprint
 from rps_jax.robot.base import Odometry
 from rps_jax.robot.skin import CapacitiveSkin, IdealSkin, Skin
-from rps_jax.trials.batch import WorldBatch
+from rps_jax.trials.jobs import WorldBatch
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import Shift, World
 from rps_jax.world import scene

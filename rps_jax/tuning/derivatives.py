@@ -28,12 +28,11 @@ from rps_jax.record import cache, provenance
 from rps_jax.record.files import Arrays
 from rps_jax.record.options import check_arguments
 from rps_jax.robot.robot import RobotLike
-from rps_jax.runs.question import name_or_custom, task_attribute
 from rps_jax.trials import trial
 from rps_jax.trials.results import WORLD, labelled
 from rps_jax.trials.score import Objective
 from rps_jax.trials.setting import Setting
-from rps_jax.trials.single import control_loop, count_steps
+from rps_jax.trials.trajectory import control_loop, count_steps
 from rps_jax.trials.trial import ControlLoop, Snapshot
 from rps_jax.trials.worlds import drawn_worlds, soften_skins
 from rps_jax.tuning import gradients
@@ -43,7 +42,9 @@ from rps_jax.world.domain import (
     VELOCITY_ERRORS,
     Domain,
     DomainLike,
+    name_or_custom,
     parse_domain,
+    task_attribute,
     unit_of,
 )
 from rps_jax.world.draws import Draw

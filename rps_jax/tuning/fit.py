@@ -53,7 +53,7 @@ from rps_jax.runs.question import (
     call_of,
 )
 from rps_jax.trials import trial
-from rps_jax.trials.batch import rows
+from rps_jax.trials.jobs import rows
 from rps_jax.trials.progress import Progress, set_phase
 from rps_jax.trials.setting import Setting, Split, seed_of
 from rps_jax.trials.trial import ControlLoop, Trial, World, object_pose

@@ -37,11 +37,11 @@ from rps_jax.trials.progress import Bar, Progress, ProgressCallback
 from rps_jax.trials.results import labelled
 from rps_jax.trials.setting import Setting, Split, seed_of
 from rps_jax.trials.trial import Rules
-from rps_jax.tuning import rollout
+from rps_jax.tuning import collection
+from rps_jax.tuning.collection import RunnerState
 from rps_jax.tuning.ppo import PPO
-from rps_jax.tuning.rollout import RunnerState
 from rps_jax.tuning.run import Domains, parse_domains
-from rps_jax.world.domain import Domain, to_json
+from rps_jax.world.domain import Domain, task_attribute, to_json
 
 _CHECKPOINT = "learner"
 _VALIDATION_RATIO = 10  # learning time between two validations, as a multiple of their time
@@ -88,6 +88,13 @@ class Learn(PPO, TaskOption, SimulationQuestion[xr.Dataset]):
     TITLE = "A learned law"
     IGNORED_FIELDS = ("minutes", "updates", "every", "task")
     REPORTS_TIMES = True
+    RENAMED: ClassVar[Mapping[str, str]] = {
+        "hard": "prioritised",
+        "enough": "success_threshold",
+        "level": "initial_level",
+        "spread": "action_std",
+        "average": "ema_updates",
+    }
     QUICK: ClassVar[Mapping[str, Any]] = {
         "domain": ("wide,objects=random_box",),
         "network": "mlp",
@@ -127,8 +134,8 @@ class Learn(PPO, TaskOption, SimulationQuestion[xr.Dataset]):
     """Run folder, with `policy.npz`; a killed run resumes there."""
 
     # Functions of the algorithm, which a subclass may replace.
-    start: ClassVar[Callable[..., RunnerState]] = staticmethod(rollout.start)
-    update: ClassVar[Callable[..., tuple[RunnerState, Any]]] = staticmethod(rollout.update)
+    start: ClassVar[Callable[..., RunnerState]] = staticmethod(collection.start)
+    update: ClassVar[Callable[..., tuple[RunnerState, Any]]] = staticmethod(collection.update)
 
     @functools.cached_property
     def domains(self) -> tuple[Domain, ...]:
@@ -158,6 +165,9 @@ class Learn(PPO, TaskOption, SimulationQuestion[xr.Dataset]):
                 raise errors.not_allowed("initial", self.initial, rule)
         period = self.setting.physics.control_period
         errors.check_number("hold", self.hold, at_least=0.999 * period, unit="s")
+
+    def attributes(self) -> dict[str, str | int]:
+        return super().attributes() | task_attribute(self.domains[0])
 
     def fields_as_json(self) -> JsonObject:
         """Fields as JSON, with domains by their ranges."""
@@ -233,12 +243,12 @@ class _Learner:
         envs, validation_envs = (options.environments(split) for split in ("tune", "validate"))
         self._num_worlds = options.num_envs * len(envs)
         self._tables = tables = [env.table for env in envs]
-        self.network = network = rollout.network_of(options, envs)
+        self.network = network = collection.network_of(options, envs)
         compile_start = time.perf_counter()
         self._validation_tables = [env.table for env in validation_envs]
         start = partial(options.start, options, network, envs, seed=options.setting.seed)
         update = partial(options.update, options, network, envs)
-        evaluate = partial(rollout.evaluate_policy, network, validation_envs)
+        evaluate = partial(collection.evaluate_policy, network, validation_envs)
         shapes = jax.eval_shape(start, tables)
         lowered = (
             jax.jit(update, donate_argnums=1).lower(tables, shapes),

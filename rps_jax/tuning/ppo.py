@@ -1,9 +1,8 @@
 """Proximal policy optimisation (Schulman et al. 2017) of a law that senses taxels.
 
-Each update makes several passes over transitions from many worlds. The value function has
-privileged inputs that the law cannot observe: position, size and tilt of the object, and the
-remaining time. The learning rate follows the KL divergence between the acting policy and the
-updated one.
+Each update makes several passes over transitions from many worlds. The value function has inputs
+that the law cannot observe (`Privileged`). The learning rate follows the KL divergence between the
+acting policy and the updated one.
 """
 
 from __future__ import annotations
@@ -25,11 +24,26 @@ from rps_jax.control.learned.policy import read
 from rps_jax.geometry.arrays import Pair
 from rps_jax.record.options import option
 
-# Of `private` inputs in the mirror image.
-PRIVATE_SIGNS = np.array([1, -1, 1, 1, 1, 1, -1, 1], np.float32)
 _LOG_STD = (-2.5, 0.5)  # bounds on the log standard deviation of an action
 _CRITIC_RATE = 1e-3  # learning rate while the value function alone is learned
 UpdateCarry = tuple[Weights, optax.OptState, jax.Array]  # weights, optimiser, learning rate
+
+
+class Privileged(NamedTuple):
+    """Inputs of the value function that the law cannot observe; all are ()."""
+
+    ahead: jax.Array  # [m] of the object in the robot frame, within 3 m
+    left: jax.Array  # [m]
+    radius: jax.Array  # [0.3 m] circumradius of the object
+    remaining: jax.Array  # [1] share of the horizon
+    lost: jax.Array  # [1] time without contact, as a share of what the rules allow
+    tilt_ahead: jax.Array  # [1] of the object's axis, three times its component
+    tilt_left: jax.Array  # [1]
+    height: jax.Array  # [m] of the object's centre at the start
+
+
+_MIRRORED = ("left", "tilt_left")  # they change their signs in the mirror image
+PRIVILEGED_SIGNS = np.array([-1 if x in _MIRRORED else 1 for x in Privileged._fields], np.float32)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -63,25 +77,25 @@ class PPO:
     """Learning rate of the first step; it follows the KL divergence of the policies."""
     target_kl: float = option(0.01, above=0, at_most=1)
     """KL divergence of the updated policy from the acting one that the learning rate maintains."""
-    level: float = option(0.15, above=0, at_most=1)
+    initial_level: float = option(0.15, above=0, at_most=1)
     """Initial level of the curriculum: share of the domain's bearings and distances, up to 1. With
     an initial law it is 1."""
-    enough: float = option(0.7, 0, 1)
+    success_threshold: float = option(0.7, 0, 1)
     """Success rate at which the level rises."""
     initial: str | None = None
     """Initial law: learned, learned_small or the file of a policy. By default random weights."""
     value_updates: int = option(30, 0, 10**6)
     """Number of first updates that change the value function alone; only with an initial law."""
-    spread: float = option(0.6, 0.09, 1.6)
+    action_std: float = option(0.6, 0.09, 1.6)
     """Initial standard deviation of the actions [1]; of an initial law rather 0.25."""
-    hard: float = option(0.0, 0, 1)
-    """Share of trials whose worlds are drawn by their recent failures: most often those that
+    prioritised: float = option(0.0, 0, 1)
+    """Share of trials whose worlds are drawn by prioritised sampling: most often those that
     sometimes fail."""
     anneal: float = option(0.0, 0, 1)
     """Share of the run, at its end, in which target_kl, ent_coef and the greatest learning rate
     fall to a twentieth."""
-    average: int = option(20, 1, 100_000)
-    """Number of updates over which the weights of the law are averaged."""
+    ema_updates: int = option(20, 1, 100_000)
+    """Number of updates over which the weights of the law are averaged, with exponential decay."""
 
     @property
     def gamma(self) -> float:
@@ -112,11 +126,11 @@ class TrainState(NamedTuple):
     def init(cls, ppo: PPO, network: Network, key: jax.Array) -> TrainState:
         """State before the first update."""
         actor, critic = jax.random.split(key)
-        inputs = features.feature_count(network.taxels) + PRIVATE_SIGNS.size
+        inputs = features.feature_count(network.taxels) + PRIVILEGED_SIGNS.size
         weights: Weights = {
             "actor": read(ppo.initial).weights if ppo.initial else network.init(actor),
             "critic": networks.init_weights(networks.critic_shapes(inputs, ppo.width), critic),
-            "log_std": jnp.full(3, math.log(ppo.spread)),
+            "log_std": jnp.full(3, math.log(ppo.action_std)),
         }
         ema = jax.tree.map(jnp.copy, weights["actor"])
         return cls(weights, ema, _optimiser().init(weights), jnp.asarray(ppo.learning_rate, float))
@@ -126,7 +140,7 @@ class Transition(NamedTuple):
     """Transitions of N worlds in T actions; leaves (T, N, ...)."""
 
     obs: jax.Array  # (F,) inputs of the network
-    private: jax.Array  # (P,) inputs of the value function alone
+    privileged: jax.Array  # (P,) inputs of the value function alone
     first: jax.Array  # () bool: first of its trial
     action: jax.Array  # (3,) [1] unbounded
     log_prob: jax.Array  # ()
@@ -156,10 +170,10 @@ def advantages(steps: Transition, gamma: float, gae_lambda: float) -> jax.Array:
     return jax.lax.scan(backward, jnp.zeros_like(delta[0]), (delta, steps.done), reverse=True)[1]
 
 
-def critic_inputs(obs: jax.Array, private: jax.Array) -> jax.Array:
+def critic_inputs(obs: jax.Array, privileged: jax.Array) -> jax.Array:
     """Return inputs (..., 2, F + P) of the value function, for the world and its mirror image."""
-    signs = jnp.asarray(PRIVATE_SIGNS, private.dtype)
-    both = jnp.stack([private, signs * private], axis=-2)
+    signs = jnp.asarray(PRIVILEGED_SIGNS, privileged.dtype)
+    both = jnp.stack([privileged, signs * privileged], axis=-2)
     return jnp.concatenate([networks.mirror_pairs(obs), both], axis=-1)
 
 
@@ -203,7 +217,7 @@ def loss(
     change = log_prob(steps.action, mean, weights["log_std"]) - steps.log_prob
     ratio = jnp.exp(change)
     gain = jnp.mean(surrogate(ratio, advantage, ppo.clip_eps))
-    value = networks.critic(weights["critic"], critic_inputs(steps.obs, steps.private))
+    value = networks.critic(weights["critic"], critic_inputs(steps.obs, steps.privileged))
     value_loss = jnp.mean((value - target) ** 2)
     entropy = jnp.sum(weights["log_std"])
     kl = jnp.mean(ratio - 1 - change)  # always positive, with little variance
@@ -250,7 +264,7 @@ def update_policy(
 
     carry = state.weights, state.optimiser, state.learning_rate
     (weights, optimiser, rate), kl = jax.lax.scan(step, carry, batches)
-    ema = jax.tree.map(lambda a, b: a + (b - a) / ppo.average, state.ema, weights["actor"])
+    ema = jax.tree.map(lambda a, b: a + (b - a) / ppo.ema_updates, state.ema, weights["actor"])
     return TrainState(weights, ema, optimiser, rate), jnp.mean(kl)
 
 

@@ -13,7 +13,7 @@ from collections.abc import Callable, Generator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Annotated, Any, ClassVar
 
 import jax
 import numpy as np
@@ -38,7 +38,8 @@ from rps_jax.trials.score import Objective
 from rps_jax.trials.setting import seed_of
 from rps_jax.trials.trial import Rules
 from rps_jax.tuning.space import Space, expand_subsets
-from rps_jax.world.domain import Domain, DomainLike, parse_domain, to_json
+from rps_jax.world.domain import Domain, DomainLike, parse_domain, task_attribute, to_json
+from rps_jax.world.objects import STORED
 from rps_jax.world.tasks import TaskLike
 
 TUNED = "tuned.json"  # file of a run folder: the parameters with the best validation
@@ -82,7 +83,7 @@ class Tuning(TaskOption, LawQuestion[xr.Dataset]):
     domain: Domains = ("wide",)
     """Domains to tune in: paper, hardware, wide, real, prisms, hostile, or JSON files of ranges;
     changes follow each, as wide,mass=3:10."""
-    objects: tuple[str, ...] = ("random_box", "random_cylinder")
+    objects: Annotated[tuple[str, ...], STORED] = ("random_box", "random_cylinder")
     """Objects of these domains; random_prism is held out by default."""
     tuned: tuple[str, ...] = ("full",)
     """Parameters to tune: names, or logistic (eta, zeta, beta, k), or full (all parameters of the
@@ -168,6 +169,9 @@ class Tuning(TaskOption, LawQuestion[xr.Dataset]):
             raise errors.not_allowed("law", self.label, rule)
         for domain in self.domains:
             self.setting.check_domain(domain, [self.space.base])
+
+    def attributes(self) -> dict[str, str | int]:
+        return super().attributes() | task_attribute(self.domains[0])
 
     def fields_as_json(self) -> JsonObject:
         """Fields as JSON, with the names of all tuned parameters and the ranges of all domains."""

@@ -1,10 +1,11 @@
 """Domains: the ranges from which random worlds are drawn (see `draws`), by name and as JSON."""
 
 import math
+import re
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -13,6 +14,7 @@ from rps_jax import errors
 from rps_jax.record import files
 from rps_jax.record.files import JsonObject
 from rps_jax.record.folder import describe_difference
+from rps_jax.record.manifest import Stored
 from rps_jax.record.options import check_fields, parse_changes
 from rps_jax.robot.robot import LATENCIES, Robot, RobotLike, parse_robot
 from rps_jax.world import paper, scene, tasks
@@ -333,7 +335,31 @@ DOMAINS = {
 }
 
 
-DomainLike = Domain | str  # or its text: see `parse_domain`
+def name_or_custom(item: object) -> str:
+    """Return the name of a domain or a skin, or `custom` if it has none."""
+    if isinstance(item, str):
+        return item
+    return next((name for name, domain in DOMAINS.items() if domain == item), "custom")
+
+
+def task_attribute(domain: Domain) -> dict[str, str]:
+    """Return the task of a domain as an attribute of results; nothing for `reach`."""
+    return {} if domain.task == Reach() else {"task": str(domain.task)}
+
+
+def task_in_words(domain: Domain) -> str:
+    """Return the task of a domain for a report, after a comma, without its long fields."""
+    text = re.sub("=[^,]{60,}", "=...", str(domain.task))
+    return "" if domain.task == Reach() else f", task {text}"
+
+
+STORED = Stored(
+    lambda name, domain: {name: to_json(parse_domain(domain))},
+    lambda name, entries, folder: from_json(dict(entries[name])),
+    kinds=(str, Domain),
+    label=name_or_custom,
+)
+DomainLike = Annotated[Domain | str, STORED]  # or its text: see `parse_domain`
 
 
 def parse_domain(

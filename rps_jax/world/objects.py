@@ -6,9 +6,9 @@ use the upright solid over the footprint, in all engines.
 
 import math
 import os
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -23,6 +23,7 @@ from rps_jax.geometry.footprint import Footprint
 from rps_jax.geometry.solid import SIDES, Solid
 from rps_jax.record import files, options
 from rps_jax.record.files import JsonObject
+from rps_jax.record.manifest import Stored
 from rps_jax.record.options import check_arguments
 from rps_jax.world.opengl import mujoco
 
@@ -111,6 +112,17 @@ def custom_solids(names: Iterable[str]) -> JsonObject:
     """
     solids = {text_of(name): REGISTERED[name].solid for name in names if name in REGISTERED}
     return options.to_json(jax.tree.map(lambda x: np.round(x, 9), solids))
+
+
+def _stored(name: str, objects: str | Sequence[str]) -> JsonObject:
+    """Return the entries of a field with objects, with the solids of custom ones."""
+    texts = [objects] if isinstance(objects, str) else objects
+    solids = custom_solids(map(parse_object, texts))
+    return {name: options.to_json(objects)} | ({"solids": solids} if solids else {})
+
+
+STORED = Stored(_stored)
+ObjectLike = Annotated[str, STORED]  # name of an object, or its file
 
 
 def read(path: Path) -> mujoco.MjSpec:

@@ -101,6 +101,11 @@ class Joints(NamedTuple):
 
     base: slice = slice(0, 3)  # x, y [m], yaw [rad] in the world
     object: slice = slice(3, 10)  # position [m] and quaternion, scalar first
+    # Of qpos alone:
+    base_position: slice = slice(0, 2)
+    base_yaw: int = 2
+    object_height: int = 5
+    object_quaternion: slice = slice(6, 10)
 
 
 JOINTS = Joints()

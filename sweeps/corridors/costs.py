@@ -21,8 +21,8 @@ import xarray as xr
 from rps_jax.control import registry
 from rps_jax.record.options import option
 from rps_jax.runs.question import Run, call_of
+from rps_jax.trials.batch_run import Candidates, outcomes
 from rps_jax.trials.progress import Progress
-from rps_jax.trials.rollout import Candidates, outcomes
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import Rules
 from rps_jax.world.domain import Domain, parse_domain
@@ -49,6 +49,7 @@ class Costs(SpeedStudy[xr.Dataset]):
     """
 
     TITLE: ClassVar[str] = "Cost of tasks"
+    IGNORED_FIELDS: ClassVar[tuple[str, ...]] = ("workers",)
     CHOICES: ClassVar = {"tasks": TASKS}
     GROWS: ClassVar[tuple[str, ...]] = ("tasks",)
     PRESETS: ClassVar = {"tasks": TASKS, "domain": DOMAIN}

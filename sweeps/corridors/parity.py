@@ -21,7 +21,7 @@ from rps_jax.record.options import option
 from rps_jax.runs.plan import Plan
 from rps_jax.runs.question import Run, call_of
 from rps_jax.trials.setting import Setting
-from rps_jax.world.domain import parse_domain
+from rps_jax.world.domain import DomainLike, parse_domain
 from rps_jax.world.physics import PHYSICS, Fidelity, preset
 from sweeps.study_base import Study, Table, run_plans
 
@@ -30,7 +30,7 @@ class Row(NamedTuple):
     """Worlds of one row of the table, and the law in them."""
 
     task: str
-    domain: str = "wide"
+    domain: DomainLike = "wide"
     law: str = "rps_tuned"
     robot: str | None = None
     fidelity: Fidelity = "standard"  # of the fused engine

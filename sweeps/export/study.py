@@ -18,7 +18,7 @@ from dataclasses import dataclass
 from functools import partial
 from itertools import product
 from pathlib import Path
-from typing import Any, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 import jax
 import numpy as np
@@ -32,6 +32,7 @@ from rps_jax.runs.question import Run, call_of
 from rps_jax.trials.case import Case
 from rps_jax.trials.setting import Setting
 from rps_jax.world import paper
+from rps_jax.world.domain import STORED
 from rps_jax.world.objects import PAPER_OBJECTS
 from rps_jax.world.physics import PHYSICS
 from sweeps.export import loop, native
@@ -77,7 +78,7 @@ class Export(QuickStudy[xr.DataTree]):
     """Number of random worlds with C in the loop."""
     bags: int = option(4, 1, 1000)
     """Number of random worlds that are recorded as bags, for each law."""
-    domain: str = "real"
+    domain: Annotated[str, STORED] = "real"
     """Domain of these worlds."""
 
     def check(self) -> None:

@@ -40,7 +40,7 @@ from rps_jax.robot.robot import Robot
 from rps_jax.robot.shell import Boards
 from rps_jax.robot.skin import IdealSkin
 from rps_jax.trials import trial
-from rps_jax.trials.batch import WorldBatch
+from rps_jax.trials.jobs import WorldBatch
 from rps_jax.trials.progress import Progress, ProgressCallback, no_progress
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import ControlLoop, Rules, Shift, Snapshot, Trial

@@ -107,6 +107,10 @@ class Growth(QuickStudy[xr.Dataset]):
         """Setting of all trials."""
         return Setting(engine=self.engine, fidelity=self.fidelity)
 
+    def attributes(self) -> dict[str, str | int]:
+        """Return the attributes of the results, with those of the setting."""
+        return super().attributes() | self.setting.attributes
+
     def check(self) -> None:
         super().check()
         engines.get(self.engine).check_derivatives("forward")

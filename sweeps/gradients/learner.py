@@ -34,10 +34,10 @@ from rps_jax.runs.question import call_of
 from rps_jax.trials.env import PushEnv
 from rps_jax.trials.setting import Split
 from rps_jax.trials.trial import World
-from rps_jax.tuning import gradients, ppo, rollout
+from rps_jax.tuning import collection, gradients, ppo
+from rps_jax.tuning.collection import EnvBatch, RunnerState
 from rps_jax.tuning.gradients import Options
 from rps_jax.tuning.learn import Learn
-from rps_jax.tuning.rollout import EnvBatch, RunnerState
 from sweeps.gradients import estimators
 
 
@@ -85,8 +85,8 @@ class WindowLearner(Learn):
 
     @staticmethod
     def start(options: WindowLearner, *inputs: Any, seed: int = 0) -> RunnerState:
-        """Return the state of `rollout.start` with a second optimiser, of the policy."""
-        runner = rollout.start(options, *inputs, seed=seed)
+        """Return the state of `collection.start` with a second optimiser, of the policy."""
+        runner = collection.start(options, *inputs, seed=seed)
         weights = runner.train.weights | {"log_std": jnp.full(3, math.log(options.noise))}
         optimiser = runner.train.optimiser, _rule(options).init(weights["actor"])
         return runner._replace(train=runner.train._replace(weights=weights, optimiser=optimiser))
@@ -99,7 +99,7 @@ class WindowLearner(Learn):
         tables: Sequence[World],
         runner: RunnerState,
     ) -> tuple[RunnerState, dict[str, jax.Array]]:
-        """Make one update: a step of the policy; then `rollout.update` for all else."""
+        """Make one update: a step of the policy; then `collection.update` for all else."""
         train = runner.train
         states: Any = train.optimiser
         inner, outer = states
@@ -116,7 +116,7 @@ class WindowLearner(Learn):
         change, outer = _rule(options).update(gradient, outer)
         actor = optax.apply_updates(train.weights["actor"], change)
         plain = runner._replace(train=train._replace(optimiser=inner))
-        moved, metrics = rollout.update(options, network, envs, tables, plain)
+        moved, metrics = collection.update(options, network, envs, tables, plain)
         fixed = {"actor": actor, "log_std": train.weights["log_std"]}
         ema = jax.tree.map(lambda a, b: 0.9 * a + 0.1 * b, train.ema, actor)
         next_train = moved.train._replace(
@@ -151,15 +151,15 @@ def window_scores(
 
         @partial(jax.checkpoint, prevent_cse=False)
         def step(batch: EnvBatch, _: None) -> tuple[EnvBatch, jax.Array]:
-            inputs = rollout._inputs(env, batch)[0]
+            inputs = collection._inputs(env, batch)[0]
             hidden, mean = jax.vmap(network.apply)(weights, batch.memory.hidden, inputs)
-            return rollout.act(env, network, batch, hidden, mean, mapped=native.mapped)
+            return collection.act(env, network, batch, hidden, mean, mapped=native.mapped)
 
         last, rewards = jax.lax.scan(step, worlds, length=options.num_steps)
-        _, terminated = rollout._episode_stats(env, last)
+        _, terminated = collection._episode_stats(env, last)
         qpos = last.states.data.qpos
         distance = jnp.linalg.norm(qpos[:, 3:5] - qpos[:, :2], axis=1)
-        value = networks.critic(critic, ppo.critic_inputs(*rollout._inputs(env, last)))
+        value = networks.critic(critic, ppo.critic_inputs(*collection._inputs(env, last)))
         value -= options.approach * distance
         discounts = options.gamma ** jnp.arange(options.num_steps)
         end = options.gamma**options.num_steps * jnp.where(terminated, 0.0, value)

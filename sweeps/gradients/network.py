@@ -152,7 +152,7 @@ def summary(curve: xr.Dataset) -> xr.Dataset:
 def table(results: xr.Dataset, tested: bool = True) -> Rows:
     """Return a header and a row per racer; intervals of tests, unless they had few worlds."""
     columns = {"method": "{method}", "seed": "{seed:.0f}"}
-    columns |= {f"validation, {t:g} min": f"{{v{t:g}:.1f}} %" for t in TIMES}
+    columns |= {f"{t:g} min": f"{{v{t:g}:.1f}} %" for t in TIMES}
     columns |= {"test": "{share}", "curriculum": "{level:.0f} %", "first update": "{first:.1f} min"}
     columns |= {"updates": "{updates:,.0f}", "time of an update": "{pace:.2f} s"}
     columns |= {"simulated": "{hours:,.0f} h", "actions in contact": "{contact:.0f} %"}

@@ -120,6 +120,10 @@ class Gradients(QuickStudy[xr.Dataset]):
         """Setting of all trials."""
         return Setting(engine=self.engine, fidelity=self.fidelity)
 
+    def attributes(self) -> dict[str, str | int]:
+        """Return the attributes of the results, with those of the setting."""
+        return super().attributes() | self.setting.attributes
+
     def check(self) -> None:
         """Check the names, the derivatives of the engine, and that the horizons increase."""
         super().check()

@@ -23,9 +23,9 @@ from rps_jax.analysis.report import Picture, Section
 from rps_jax.control.laws.rps import BOUNDS, RPSParams
 from rps_jax.record.options import option
 from rps_jax.runs.question import MultiLawQuestion, Run, call_of
-from rps_jax.trials.batch import BatchOptions
+from rps_jax.trials.batch_run import Candidates, outcomes
+from rps_jax.trials.jobs import BatchOptions
 from rps_jax.trials.progress import SequentialProgress
-from rps_jax.trials.rollout import Candidates, outcomes
 from rps_jax.trials.setting import Split, seed_of
 from rps_jax.trials.trial import Outcome
 from rps_jax.tuning.run import parse_domains

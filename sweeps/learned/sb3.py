@@ -31,6 +31,7 @@ from rps_jax.runs.question import Run, call_of
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import Rules
 from rps_jax.world import domain as domains
+from rps_jax.world.domain import DomainLike
 from sweeps.study_base import Rows, Study, Table, records
 
 _VARIABLES = {
@@ -52,7 +53,7 @@ class SB3(Study[xr.Dataset]):
     TITLE: ClassVar[str] = "PPO of Stable-Baselines3"
     DIMENSION: ClassVar[str] = "envs"
 
-    domain: str = "wide,distance=0.7:1,bearing=-0.3:0.3"
+    domain: DomainLike = "wide,distance=0.7:1,bearing=-0.3:0.3"
     """Ranges from which worlds are drawn."""
     object: str = "random_cylinder"
     """Object of all worlds."""

@@ -34,35 +34,36 @@ from sweeps.study_base import QuickStudy, Table, write_table
 DOMAINS = ("wide", "hostile", "real")
 SHARED = (
     "rps learn --domain wide hostile real --num-envs 1024 --drawn 8192 --validation 128 --every 1.5"
-    " --horizon 300 --max-lost 150 --hard 0.5 --success 2 --failure 1 --anneal 0.4 --average 100"
+    " --horizon 300 --max-lost 150 --prioritised 0.5 --success 2 --failure 1 --anneal 0.4"
+    " --ema-updates 100"
 )
-_WARM = "--initial sweeps/learned/learned_gru.npz --spread 0.25 --learning-rate 2e-4"
+_WARM = "--initial sweeps/learned/learned_gru.npz --action-std 0.25 --learning-rate 2e-4"
 _LIMITS = "robot_force=150:800,robot_traction=0.3:0.8,robot_lag=0:0.5,robot_acceleration=0.1:1"
 _HARD = f"--domain hostile real hostile,{_LIMITS}"
-_CONTINUED = f"--initial learned --spread 0.2 --learning-rate 2e-4 {_HARD}"
+_CONTINUED = f"--initial learned --action-std 0.2 --learning-rate 2e-4 {_HARD}"
 VARIANTS = {  # options after the shared ones
     "scratch": "",
     "warm": _WARM,
     "wide and hostile": f"{_WARM} --domain wide hostile",
     "hard domains": f"{_WARM} {_HARD}",
     "with tasks": f"{_WARM} --domain wide hostile real wide,task=path wide,task=corridor",
-    "uniform worlds": f"{_WARM} --hard 0",
+    "uniform worlds": f"{_WARM} --prioritised 0",
     "reward of 0.2.0": f"{_WARM} --success 1 --failure 0",
     "failures cost 3": f"{_WARM} --failure 3",
     "trials of 120 s": f"{_WARM} --horizon 120 --max-lost 30",
-    "not annealed": f"{_WARM} --anneal 0 --average 20",
+    "not annealed": f"{_WARM} --anneal 0 --ema-updates 20",
     "4,096 worlds": f"{_WARM} --num-envs 4096 --num-minibatches 16",
     "long credit": f"{_WARM} --discount-time 100 --gae-time 10",
     "small steps": f"{_WARM} --target-kl 0.004",
     "width 128": "--width 128",
     "hold 0.1 s": "--hold 0.1",
-    "mlp": "--network mlp --initial sweeps/learned/learned_mlp.npz --spread 0.25"
+    "mlp": "--network mlp --initial sweeps/learned/learned_mlp.npz --action-std 0.25"
     " --learning-rate 2e-4",
     "mlp, width 32": "--network mlp --width 32",
     "continued": _CONTINUED,
     "continued, 4,096 worlds": f"{_CONTINUED} --num-envs 4096 --num-minibatches 16 --seed 1",
     "continued, failures cost 2": f"{_CONTINUED} --num-envs 4096 --num-minibatches 16 --seed 2"
-    " --failure 2 --hard 0.7",
+    " --failure 2 --prioritised 0.7",
 }
 _QUICK_DOMAIN = "wide,objects=random_cylinder"  # also for judging
 QUICK = (

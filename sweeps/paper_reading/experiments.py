@@ -17,10 +17,10 @@ from rps_jax.control.laws.rps import RPSParams
 from rps_jax.robot.skin import LINE, POINT, IdealSkin
 from rps_jax.runs.question import Run
 from rps_jax.trials import pushes
-from rps_jax.trials.batch import WorldBatch
+from rps_jax.trials.batch_run import Candidates, outcomes
+from rps_jax.trials.jobs import WorldBatch
 from rps_jax.trials.progress import ProgressCallback
 from rps_jax.trials.results import trace_dataset
-from rps_jax.trials.rollout import Candidates, outcomes
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import Outcome
 from rps_jax.world import paper, points, scene

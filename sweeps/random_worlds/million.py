@@ -27,6 +27,7 @@ from rps_jax.runs.plan import Plan
 from rps_jax.runs.question import Run, call_of
 from rps_jax.trials.setting import Setting
 from rps_jax.world import domain as domains
+from rps_jax.world.domain import DomainLike
 from sweeps.study_base import Rows, Table, TrialStudy, run_parts, run_plans
 
 ENDS = ("success", *statistics.FAILURES)  # `how` is an index into these
@@ -52,7 +53,7 @@ class Million(TrialStudy[xr.Dataset]):
 
     laws: tuple[str, ...] = ("rps_tuned", "rps_plus", "learned")
     """Laws to run in the same worlds."""
-    domain: str = "wide"
+    domain: DomainLike = "wide"
     """Ranges from which worlds are drawn."""
     worlds: int = option(2**20, 1, 2**30)
     """Number of worlds."""

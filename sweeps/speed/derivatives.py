@@ -25,7 +25,7 @@ from rps_jax.control import registry
 from rps_jax.engines import native
 from rps_jax.record.options import option
 from rps_jax.runs.question import Run, call_of
-from rps_jax.trials.rollout import Candidates
+from rps_jax.trials.batch_run import Candidates
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import ControlLoop, advance, start_all, unroll
 from rps_jax.trials.worlds import soften_skins

@@ -25,7 +25,7 @@ from rps_jax.engines import device
 from rps_jax.engines.mujoco import Batch
 from rps_jax.record.options import option
 from rps_jax.runs.question import Run, call_of
-from rps_jax.trials import host
+from rps_jax.trials import trial
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import ControlLoop, Rules
 from rps_jax.world.physics import preset
@@ -162,7 +162,8 @@ def in_c(name: str, family: str, simulated: float = 2.0) -> Measurement:
         loop = ControlLoop(physics, Rules(horizon=simulated))
 
         def once() -> None:
-            deque(host.run(stage, batch, part.params, loop, threads), maxlen=0)
+            steps = trial.run_on_host(setting.simulator, stage, batch, part.params, loop, threads)
+            deque(steps, maxlen=0)
 
     else:
         stepper = Batch(stage, np.asarray(batch.qpos, float), threads)

@@ -31,7 +31,7 @@ from rps_jax.errors import InputError, check_name, suggest
 from rps_jax.record import options
 from rps_jax.record.options import option
 from rps_jax.runs.push import FILM_LENGTH, TraceQuestion
-from rps_jax.runs.question import Command, SimulationQuestion
+from rps_jax.runs.question import Command, SimulationQuestion, current_names
 from rps_jax.trials.setting import PhysicsField, Setting
 from rps_jax.trials.trial import Rules
 
@@ -85,6 +85,7 @@ def parse(question_type: type[Q], command: str, words: Sequence[str]) -> tuple[Q
       InputError: an option is unknown, lacks its value, or has one that is not allowed.
       SystemExit: the help was printed.
     """
+    words = [_current_flag(question_type, word) for word in words]
     question, session = _parse(question_type(), command, words)
     if getattr(question, "quick", False):
         quick = dataclasses.replace(question_type(), quick=True).with_quick_values()
@@ -92,6 +93,16 @@ def parse(question_type: type[Q], command: str, words: Sequence[str]) -> tuple[Q
         question, session = _parse(defaults, command, words)
     options.check_fields(session)
     return question, session
+
+
+def _current_flag(question_type: type[Q], word: str) -> str:
+    """Return a word of the command line, with the present name of a flag that was renamed."""
+    flag, equals, value = word.partition("=")
+    name = flag.removeprefix("--").replace("-", "_") if flag.startswith("--") else ""
+    if name not in question_type.RENAMED:
+        return word
+    (current,) = current_names(question_type, {name: value})
+    return f"--{current.replace('_', '-')}{equals}{value}"
 
 
 def _parse(defaults: Q, command: str, words: Sequence[str]) -> tuple[Q, Session]:

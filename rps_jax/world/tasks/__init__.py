@@ -5,14 +5,16 @@ from __future__ import annotations
 import importlib
 import pkgutil
 from collections.abc import Mapping
-from dataclasses import fields
+from dataclasses import asdict, fields
 from pathlib import Path
-from typing import Any, get_args
+from typing import Annotated, Any, get_args
 
 import numpy as np
 
 from rps_jax import errors
 from rps_jax.record import files
+from rps_jax.record.files import JsonObject
+from rps_jax.record.manifest import Stored
 from rps_jax.record.options import field_types, parse_changes
 from rps_jax.world.quantity import Quantity, declared, range_of
 from rps_jax.world.tasks.base import Task
@@ -34,7 +36,16 @@ _SUBJECTS = {1: "the base ", 2: "the object "}
 # For errors: of ranges, of types, and of tuples of tuples by their sizes.
 _RANGE = "a number, or low and high as [0.3, 0.6]"
 _FORMS = {bool: "true or false", int: "a whole number", 2: "pairs of x, y [m]", 3: "x, y, yaw"}
-TaskLike = Task | str | Mapping[str, Any]  # or its text: see `parse_task`
+
+
+def _stored(name: str, task: Any) -> JsonObject:
+    """Return the entries of a task; none for `reach`, as in the manifests of earlier versions."""
+    parsed = parse_task("reach" if task is None else task)
+    return {} if parsed == TASKS["reach"]() else {name: asdict(parsed)}
+
+
+_KINDS = (Task, str, Mapping, type(None))
+TaskLike = Annotated[Task | str | Mapping[str, Any], Stored(_stored, kinds=_KINDS)]
 
 
 def failures_of(outcomes: Mapping[str, Any]) -> list[str]:

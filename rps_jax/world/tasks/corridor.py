@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Hashable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, ClassVar, Literal, NamedTuple, TypeVar
 
 import jax
@@ -169,16 +170,33 @@ class _Measured(NamedTuple):
 
 
 def _where_due(due: Array, function: Callable[[Array, _T], _T], poses: Array, last: _T) -> _T:
-    """Return `function(poses, last)` if it is due, else `last`.
+    """Return `function(poses, last)` if it is due, else `last`."""
+    function, inputs = jax.closure_convert(function, poses, last)
+    return _if_due(function, due, poses, last, inputs)
+
+
+@partial(jax.custom_jvp, nondiff_argnums=(0,))
+def _if_due(function: Callable[..., _T], due: Array, poses: Array, last: _T, inputs: Any) -> _T:
+    """Return `function(poses, last, *inputs)` if it is due, else `last`.
 
     It is a loop of at most one pass: a program for many worlds skips the pass if no world needs it.
+    Reverse mode does not support such loops, so the derivatives are those of a selection.
     """
 
     def once(carry: tuple[Array, Array, _T]) -> tuple[Array, Array, _T]:
         _, poses, last = carry  # changed by the pass: what does not change is computed before
-        return jnp.zeros((), bool), jnp.zeros_like(poses), function(poses, last)
+        return jnp.zeros((), bool), jnp.zeros_like(poses), function(poses, last, *inputs)
 
     return jax.lax.while_loop(lambda carry: carry[0], once, (due, poses, last))[-1]
+
+
+@_if_due.defjvp
+def _(function: Callable[..., _T], primals: Any, tangents: Any) -> tuple[_T, _T]:
+    def select(due: Array, poses: Array, last: _T, inputs: Any) -> _T:
+        result = function(poses, last, *inputs)
+        return jax.tree.map(partial(jnp.where, due), result, last)
+
+    return _if_due(function, *primals), jax.jvp(select, primals, tangents)[1]
 
 
 @dataclass(frozen=True)

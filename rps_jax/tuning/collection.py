@@ -1,4 +1,4 @@
-"""Rollouts for PPO: the policy pushes in many worlds, and worlds restart when their trials end.
+"""Collection of transitions for PPO in many worlds, which restart when their trials end.
 
 One update is one program. Every world of every environment takes several actions, each of them
 held for several control steps; then `ppo` updates the network. A GPU runs an action in all worlds
@@ -28,17 +28,20 @@ from rps_jax.geometry import footprint as fp
 from rps_jax.geometry import planar
 from rps_jax.geometry.arrays import Pair
 from rps_jax.trials import trial
-from rps_jax.trials.batch import rows
 from rps_jax.trials.env import PushEnv, State
+from rps_jax.trials.jobs import rows
 from rps_jax.trials.trial import World
 from rps_jax.tuning import ppo as ppo_
-from rps_jax.tuning.ppo import PPO, TrainState, Transition
+from rps_jax.tuning.ppo import PPO, Privileged, TrainState, Transition
+from rps_jax.world.scene import JOINTS
 from rps_jax.world.tasks.reach import Nothing
 
 T = TypeVar("T")
 ActCarry = tuple[State, TouchState, jax.Array]  # states, touch states, rewards (N,)
+_RADIUS = 0.3  # [m] unit of the circumradius
+_TILT_SCALE = 6.0  # of half of the components of the object's axis
 _FAILURE_DECAY = 0.7  # of a world's failure rate, per trial in it
-_UNSOLVED = 0.05  # [1] of the weight of a world that always fails, in draws of hard worlds
+_UNSOLVED = 0.05  # [1] of the weight of a world that always fails, in prioritised draws
 
 
 class EnvBatch(NamedTuple):
@@ -83,7 +86,7 @@ def start(
 ) -> RunnerState:
     """Return the state before the first update, with every trial at a random time."""
     key, first, *keys = jax.random.split(jax.random.PRNGKey(seed), 2 + len(envs))
-    level = jnp.asarray(1.0 if ppo.initial else ppo.level, float)
+    level = jnp.asarray(1.0 if ppo.initial else ppo.initial_level, float)
     failures = tuple(jnp.full(env.worlds, 0.5) for env in envs)
     indices = [draw_indices(ppo, *x, (ppo.num_envs,)) for x in zip(failures, keys, strict=True)]
     draws = list(map(_draw_worlds, tables, itertools.repeat(level), keys, indices))
@@ -170,18 +173,19 @@ def _draw_worlds(
 def draw_indices(
     ppo: PPO, failures: jax.Array, key: jax.Array, shape: tuple[int, ...]
 ) -> jax.Array:
-    """Return random indices of worlds; a share of them, `ppo.hard`, by their failure rates.
+    """Return random indices of worlds; a share of them, `ppo.prioritised`, by their failure rates.
 
     The weight of a world is greatest where it sometimes fails; it is small where it always does.
     """
     keys, worlds = jax.random.split(key, 3), failures.size
     indices = jax.random.randint(keys[0], shape, 0, worlds)
-    if not ppo.hard:
+    if not ppo.prioritised:
         return indices
     total = jnp.cumsum(failures * (1 + _UNSOLVED - failures) + 1e-6)
-    hard = jnp.searchsorted(total, jax.random.uniform(keys[1], shape) * total[-1])
-    is_hard = jax.random.uniform(keys[2], shape) < ppo.hard
-    return jnp.where(is_hard, jnp.minimum(hard, worlds - 1).astype(indices.dtype), indices)
+    prioritised = jnp.searchsorted(total, jax.random.uniform(keys[1], shape) * total[-1])
+    prioritised = jnp.minimum(prioritised, worlds - 1).astype(indices.dtype)
+    chosen = jax.random.uniform(keys[2], shape) < ppo.prioritised
+    return jnp.where(chosen, prioritised, indices)
 
 
 def failure_rates(
@@ -192,31 +196,45 @@ def failure_rates(
     return jnp.clip(rates.at[index].add(change), 0, 1)
 
 
-def _private(env: PushEnv, state: State) -> jax.Array:
-    """Return the privileged inputs (P,): position, size and tilt of the object, remaining time."""
+def _privileged(env: PushEnv, state: State) -> Privileged:
+    """Return the privileged inputs of one world."""
     data, world, rules = state.data, state.info["world"], env.setting.rules
+    p_world_base, yaw = data.qpos[JOINTS.base_position], data.qpos[JOINTS.base_yaw]
     p_world_object, _ = trial.object_pose(data.qpos)
-    p_robot_object = planar.rotate(-data.qpos[2], p_world_object - data.qpos[:2])
-    remaining = 1 - data.steps * env.dt / rules.horizon
-    lost = data.lost_steps * env.dt / jnp.maximum(rules.max_lost, 1.0)
-    radius = fp.circumradius(world.footprint) / 0.3
-    w, x, y, z = data.qpos[6:]
-    up = planar.rotate(-data.qpos[2], jnp.stack([x * z + w * y, y * z - w * x]))  # half the axis
-    position = *jnp.clip(p_robot_object, -3, 3), radius
-    return jnp.stack([*position, remaining, lost, *(6 * up), world.qpos[5]])
+    p_robot_object = planar.rotate(-yaw, p_world_object - p_world_base)
+    w, x, y, z = data.qpos[JOINTS.object_quaternion]
+    half_axis = planar.rotate(-yaw, jnp.stack([x * z + w * y, y * z - w * x]))
+    ahead, left = jnp.clip(p_robot_object, -3, 3)
+    tilt_ahead, tilt_left = _TILT_SCALE * half_axis
+    return Privileged(
+        ahead,
+        left,
+        fp.circumradius(world.footprint) / _RADIUS,
+        1 - data.steps * env.dt / rules.horizon,
+        data.lost_steps * env.dt / jnp.maximum(rules.max_lost, 1.0),
+        tilt_ahead,
+        tilt_left,
+        world.qpos[JOINTS.object_height],
+    )
 
 
 def _inputs(env: PushEnv, batch: EnvBatch) -> Pair:
     """Return the inputs of the network (N, F) and the privileged inputs (N, P)."""
     memory, obs = batch.memory, batch.states.info["observation"]
     inputs = jax.vmap(features.compute_features)(memory.touch_state, memory.action, obs)
-    return inputs, jax.vmap(partial(_private, env))(batch.states)
+    privileged = jax.vmap(lambda state: jnp.stack(_privileged(env, state)))(batch.states)
+    return inputs, privileged
 
 
 def act(
-    env: PushEnv, network: Network, batch: EnvBatch, hidden: jax.Array, action: jax.Array,
-    vmap: Callable[..., Any] = jax.vmap, mapped: Callable[..., Any] | None = None,
-) -> tuple[EnvBatch, jax.Array]:  # fmt: skip
+    env: PushEnv,
+    network: Network,
+    batch: EnvBatch,
+    hidden: jax.Array,
+    action: jax.Array,
+    vmap: Callable[..., Any] = jax.vmap,
+    mapped: Callable[..., Any] | None = None,
+) -> tuple[EnvBatch, jax.Array]:
     """Execute an action (N, 3) in each world; return the batch and the rewards (N,).
 
     `vmap` maps a function of one world over the batch; `_unmapped` is for one world. `mapped` does
@@ -241,9 +259,12 @@ def act(
 
 
 def _act_together(
-    envs: Sequence[PushEnv], network: Network, batches: Sequence[EnvBatch], hidden: jax.Array,
+    envs: Sequence[PushEnv],
+    network: Network,
+    batches: Sequence[EnvBatch],
+    hidden: jax.Array,
     action: jax.Array,
-) -> list[tuple[EnvBatch, jax.Array]]:  # fmt: skip
+) -> list[tuple[EnvBatch, jax.Array]]:
     """Execute the joined actions (sum of N, 3) in the worlds of all environments: see `act`."""
 
     def single(
@@ -314,7 +335,7 @@ def update(
         key, noise_key, *start_keys = jax.random.split(key, 2 + len(envs))
         pairs = zip(envs, batches, strict=True)
         inputs = [(*_inputs(env, x), x.memory.hidden, x.first) for env, x in pairs]
-        obs, private, previous_hidden, first = _join(inputs)
+        obs, privileged, previous_hidden, first = _join(inputs)
         hidden, mean = network.apply(weights["actor"], previous_hidden, obs)
         noise = jax.random.normal(noise_key, mean.shape, mean.dtype)
         action = mean + jnp.exp(weights["log_std"]) * noise
@@ -332,7 +353,7 @@ def update(
         next_inputs, reward, stats, terminated, index = _join(results)
         log_prob = ppo_.log_prob(action, mean, weights["log_std"])
         zero = jnp.zeros_like(reward)
-        decision = obs, private, first, action, log_prob, zero
+        decision = obs, privileged, first, action, log_prob, zero
         steps = Transition(*decision, zero, reward, stats["ended"], terminated)
         return (restarted, key), (steps, next_inputs, stats, index)
 
@@ -341,7 +362,7 @@ def update(
     (batches, _), (steps, next_inputs, step_stats, index) = jax.lax.scan(
         take_action, carry, indices
     )
-    pairs = (ppo_.critic_inputs(*x) for x in ((steps.obs, steps.private), next_inputs))
+    pairs = (ppo_.critic_inputs(*x) for x in ((steps.obs, steps.privileged), next_inputs))
     value, next_value = (networks.critic(weights["critic"], x) for x in pairs)
     steps = steps._replace(value=value, next_value=next_value)
     stats = jax.tree.map(jnp.sum, step_stats)
@@ -370,13 +391,13 @@ def _raise_level(ppo: PPO, runner: RunnerState, stats: Stats) -> RunnerState:
     ended = 0.9 * runner.ended + stats["ended"]
     succeeded = 0.9 * runner.succeeded + stats["succeeded"]
     worlds = ppo.num_envs * len(runner.batches)
-    up = (ended > 0.2 * worlds) & (succeeded > ppo.enough * ended) & (runner.level < 1)
+    up = (ended > 0.2 * worlds) & (succeeded > ppo.success_threshold * ended) & (runner.level < 1)
     level = jnp.where(up, jnp.minimum(runner.level + 0.05, 1.0), runner.level)
     ended, succeeded = (jnp.where(up, 0.5 * x, x) for x in (ended, succeeded))
     return runner._replace(level=level, ended=ended, succeeded=succeeded)
 
 
-def rollouts(
+def run_policy(
     network: Network, envs: Sequence[PushEnv], tables: Sequence[World], actor: Weights
 ) -> list[State]:
     """Push without noise in all worlds of all environments; return the last states."""
@@ -399,6 +420,6 @@ def evaluate_policy(
     network: Network, envs: Sequence[PushEnv], tables: Sequence[World], actor: Weights
 ) -> Pair:
     """Return success (N,) bool and time (N,) [s] of the law in all worlds of all environments."""
-    states = rollouts(network, envs, tables, actor)
+    states = run_policy(network, envs, tables, actor)
     pairs = zip(envs, states, strict=True)
     return _join([(x.data.success, x.data.steps * env.dt) for env, x in pairs])

@@ -1,4 +1,4 @@
-"""Rollouts: the one way to run laws in worlds and to collect the outcomes of the trials.
+"""Batch runs: the one way to run laws in worlds and to collect the outcomes of the trials.
 
 A `Request` has the worlds of its trials, by the program that steps them. There are three kinds:
 named cases (`pushes.Cases`), the chunks of a sweep (`runs.results.Results`), and here `Candidates`:
@@ -17,7 +17,6 @@ planner sets `per_world` and gives leaves (P, W, ...), its own parameters for ea
 from __future__ import annotations
 
 import functools
-import itertools
 import math
 from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
@@ -30,7 +29,7 @@ import numpy as np
 from rps_jax.control.base import LawParams
 from rps_jax.record.files import Arrays
 from rps_jax.trials import batch
-from rps_jax.trials.batch import BatchOptions, Collect, Job, WorldBatch, rows
+from rps_jax.trials.jobs import BatchOptions, Collect, Job, WorldBatch, rows
 from rps_jax.trials.progress import Timing
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import Outcome
@@ -54,13 +53,13 @@ class Request(Protocol):
         ...
 
 
-class RolloutOptions(BatchOptions, total=False):
-    """Keyword arguments of `rollout`."""
+class RunOptions(BatchOptions, total=False):
+    """Keyword arguments of `run_batch`."""
 
     capacity: Callable[[int], int]
 
 
-def rollout(
+def run_batch(
     requests: Sequence[Request],
     setting: Setting,
     collect: Collect,
@@ -85,18 +84,14 @@ def rollout(
     for request, first in zip(requests, _first_trials(requests), strict=False):
         for job in request.jobs(setting):
             groups.setdefault(job.program, []).append(job.shifted(first))
-    jobs = []
-    for program, group in groups.items():
-        trials = capacity(sum(job.num_trials for job in group))
-        batches = itertools.chain.from_iterable(job.batches for job in group)
-        jobs.append(Job(program, trials, batches))
+    jobs = [Job.joined(group, capacity) for group in groups.values()]
     return batch.run(jobs, setting, collect=collect, **options)
 
 
 def outcomes(
-    requests: Sequence[Request], setting: Setting, **options: Unpack[RolloutOptions]
+    requests: Sequence[Request], setting: Setting, **options: Unpack[RunOptions]
 ) -> tuple[list[Outcome], Timing]:
-    """Run every trial of every request by `rollout`, and collect the outcomes in arrays.
+    """Run every trial of every request by `run_batch`, and collect the outcomes in arrays.
 
     Returns:
       The outcomes of each request, on the host with leaves (*shape, ...); and where the time went.
@@ -110,7 +105,7 @@ def outcomes(
                 columns[name] = np.empty((count, *leaf.shape[1:]), leaf.dtype)
             columns[name][indices] = leaf
 
-    timing = rollout(requests, setting, collect, **options)
+    timing = run_batch(requests, setting, collect, **options)
     whole = Outcome.of_columns(columns)
     trials = (np.arange(math.prod(x.shape)).reshape(x.shape) for x in requests)
     pairs = zip(firsts, trials, strict=True)

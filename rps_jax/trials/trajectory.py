@@ -21,7 +21,7 @@ from rps_jax.engines.base import Stage
 from rps_jax.record.options import check_arguments
 from rps_jax.robot.robot import RobotLike
 from rps_jax.trials import trial
-from rps_jax.trials.batch import WorldBatch
+from rps_jax.trials.jobs import WorldBatch
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import ControlLoop, Snapshot, World
 from rps_jax.trials.worlds import drawn_worlds, soften_skins

@@ -20,7 +20,8 @@ from rps_jax.control.base import LawParams
 from rps_jax.geometry.footprint import Footprint
 from rps_jax.robot.skin import CapacitiveSkin, Skin
 from rps_jax.trials import trial
-from rps_jax.trials.batch import WorldBatch, rows, stepper
+from rps_jax.trials.batch import stepper
+from rps_jax.trials.jobs import WorldBatch, rows
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import ControlLoop, Outcome, Shift, Snapshot, Trial, World
 
