@@ -75,8 +75,14 @@ class Case(TrialOptions):
     shift: Shift = option(Shift(), kw_only=True, hidden=True)
     """Scripted shift of the object during the push."""
 
+    def choose_law(self) -> None:
+        """Set the law that is used if none is named."""
+        if self.law is None:
+            object.__setattr__(self, "law", registry.default_law(self.base.drive))
+
     def __post_init__(self) -> None:
         check_fields(self)
+        self.choose_law()
         name = objects.parse_object(self.object)
         objects.check_object("object", name)
         registry.check_params(self.params)
@@ -100,8 +106,7 @@ class Case(TrialOptions):
     @cached_property
     def params(self) -> LawParams:
         """Parameters of the law."""
-        law = registry.default_law(self.base.drive) if self.law is None else self.law
-        return registry.resolve_law(law)[1]
+        return registry.resolve_law(self.law)[1]
 
     @cached_property
     def contact(self) -> Friction:

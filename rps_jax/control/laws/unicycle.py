@@ -12,11 +12,11 @@ heading, u(x) the unit vector at an angle x, and A the axle, a behind the base's
   D2  psi = direction of T - M; the opposite if |T - M| < r and the base stands beyond M
   D3  e = angle of T - C minus theta;  x_C: of C ahead of the axle
 
-Push at v_max until the contact leaves the front, or is lost for t_lost, or, after t_push of
-contact, |l| > l_edge; within d_near of T, |e| > e_near replaces the last.
+Push at v_max until the contact is lost for t_lost, or spent: it leaves the front, or |l| > l_edge;
+within d_near of T, |e| > e_near replaces the last.
 
-  D4  omega = K_e e + K_l (l - l_dead sgn l where |l| > l_dead, else 0), within w_push
-  D5  omega = K_near v_max sin(e) / x_C   within d_near;  0 without contact
+  D4  omega = K_e e + K_l (l - l_dead sgn l where |l| > l_dead, else 0)
+  D5  omega = v_max sin(e) / x_C   within d_near, where C moves to T;  0 without contact
 
 Retreat straight, until C is `back` ahead of the front. Drive around M in reverse, so that the base
 need not turn away from the object and back. With phi the angle of A - M, and turn the angle from
@@ -57,7 +57,6 @@ _ARRIVED, _ALIGNED = 0.22, 0.26  # [m], [rad] errors at the staging point
 _CLOSE, _ASIDE = 0.2, 1.2  # [m], [rad] distance and bearing of a staging point that is passed
 _PAST = 0.5  # [m] of the front beyond M at which an approach has failed
 _OVERSHOOT = 1.5  # [rad] on the circle, after which the base drives back
-_BRIEF = 1e-3  # [s] of contact below which a push is an approach
 _LEAST_ARM = 0.2  # [m] of x_C
 
 
@@ -74,13 +73,9 @@ class UnicycleParams(NamedTuple):
     K_e: Annotated[Parameter, Bound(0.1, 3, log=True)] = 0.92  # [1/s] turn to the target, D4
     K_l: Annotated[Parameter, Bound(0.2, 8, log=True)] = 4.7  # [rad/s/m] turn to the contact, D4
     l_dead: Annotated[Parameter, Bound(0.0, 0.28)] = 0.12  # [m] where it does not, D4
-    # [rad/s] bound on |omega| while pushing, D4
-    w_push: Annotated[Parameter, Bound(0.02, 0.15, log=True)] = 0.0865
     l_edge: Annotated[Parameter, Bound(0.1, 0.35)] = 0.273  # [m] |l| of a spent contact
     d_near: Annotated[Parameter, Bound(0.05, 1)] = 0.604  # [m] distance of D5
     e_near: Annotated[Parameter, Bound(0.5, 2.5)] = 1.83  # [rad] |e| of a spent contact there
-    K_near: Annotated[Parameter, Bound(0.3, 3)] = 1.67  # [1] gain of D5
-    t_push: Annotated[Parameter, Bound(0.3, 8, log=True)] = 4.53  # [s] least contact of a push
     t_lost: Annotated[Parameter, Bound(0.2, 8, log=True)] = 1.14  # [s] without contact: lost
     back: Annotated[Parameter, Bound(0.01, 0.6)] = 0.1  # [m] retreat
     R: Annotated[Parameter, Bound(0.5, 1.4)] = 0.87  # [m] circle around M, D6
@@ -110,7 +105,7 @@ class UnicycleState(NamedTuple):
     l: jax.Array  # noqa: E741  [m] contact offset at C
     touched: jax.Array  # bool or weight: whether there was a contact
     t_lost: jax.Array  # [s] since the last contact
-    t_push: jax.Array  # [s] of contact in this push
+    pushed: jax.Array  # bool or weight: whether this push had a contact, or is an approach
     side: jax.Array  # [1] 1: counter-clockwise around M, or -1
 
 
@@ -122,7 +117,7 @@ def init(params: UnicycleParams, temperatures: Widths | None = None) -> Unicycle
     zero = jnp.zeros_like(jnp.asarray(params.r, float))
     no = zero > 0 if temperatures is None else zero
     point = jnp.zeros(2, zero.dtype)
-    return UnicycleState(no, no, no, point, point, zero, no, zero, zero, zero + 1)
+    return UnicycleState(no, no, no, point, point, zero, no, zero, no, zero + 1)
 
 
 class Contact(NamedTuple):
@@ -224,8 +219,7 @@ def step(
     middle = p_world_contact + params.r * planar.unit(yaw + normal)
     middle = where(touches, middle, state.p_world_object)
     t_lost = where(touches, 0.0, state.t_lost + obs.period)
-    t_push = where(push, state.t_push + where(touches, obs.period, 0.0), 0.0)
-    is_new = above(_BRIEF, state.t_push, time)
+    pushed, is_new = and_(push, or_(state.pushed, touches)), not_(state.pushed)
     front = obs.p_world_robot + half_length * u
     past = above(jnp.sum((front - middle) * u), _PAST, length)
     missed = and_(and_(and_(push, touched), and_(is_new, not_(touches))), past)
@@ -241,9 +235,8 @@ def step(
     spent_near = above(jnp.abs(e), params.e_near, angle)
     spent = where(near, spent_near, above(jnp.abs(l), params.l_edge, length))
     spent = or_(spent, not_(on_front))
-    is_spent = and_(and_(touches, spent), above(t_push, params.t_push, time))
     is_lost = and_(above(t_lost, params.t_lost, time), not_(is_new))
-    ends = and_(and_(push, touched), or_(or_(is_spent, is_lost), missed))
+    ends = and_(and_(push, touched), or_(or_(and_(touches, spent), is_lost), missed))
 
     # D6: the side is chosen before the base leaves, and kept on the way.
     offset, chooses = p_world_axle - middle, _is(or_(push, state.retreat))
@@ -269,9 +262,8 @@ def step(
     # D4, D5, D7 and D8.
     v_max, is_car = jnp.asarray(params.v_max), obs.turning_radius is not None
     far = params.K_e * e + params.K_l * (l - jnp.clip(l, -params.l_dead, params.l_dead))
-    far = jnp.clip(far, -params.w_push, params.w_push)
     arm = jnp.maximum(contact[0], _LEAST_ARM) + axle
-    steer = where(near, params.K_near * v_max * jnp.sin(e) / arm, far)
+    steer = where(near, v_max * jnp.sin(e) / arm, far)
     approach = planar.wrap(planar.direction(middle - p_world_axle) - yaw)
     steer = where(touches, steer, where(and_(is_new, touched), approach, 0.0))
     on_spot = -v_max if is_car else 0.0
@@ -286,7 +278,7 @@ def step(
     if is_car:
         omega = jnp.clip(omega, -jnp.abs(v) / obs.turning_radius, jnp.abs(v) / obs.turning_radius)
     memory = UnicycleState(
-        retreat, around, align, middle, p_world_contact, l, touched, t_lost, t_push, side
+        retreat, around, align, middle, p_world_contact, l, touched, t_lost, pushed, side
     )
     details = Details(l, distance, jnp.zeros_like(distance), e, _either(retreat, around, align))
     return memory, Twist(v, axle * omega, omega), details
@@ -309,16 +301,12 @@ PRESETS = {
         K_e=0.473,
         K_l=2.15,
         l_dead=0.174,
-        w_push=0.092,
-        l_edge=0.277,
         d_near=0.867,
         e_near=1.06,
-        K_near=2.09,
-        t_push=3.76,
         t_lost=0.293,
         back=0.042,
         R=0.85,
     ),
-    "unicycle_round": _TUNED._replace(t_push=1.0, l_edge=0.2, K_e=0.2),
-    "unicycle_front": _TUNED._replace(r=0.3, t_push=1.0, l_edge=0.22, back=0.25, R=1.2),
+    "unicycle_round": _TUNED._replace(r=0.2, K_e=2.0, l_edge=0.15, d_near=0.3),
+    "unicycle_front": _TUNED._replace(r=0.3, l_edge=0.22, back=0.25, R=1.1),
 }
