@@ -6,7 +6,7 @@ its push and the notation of `unicycle` (D1, D2):
 
   G1  stuck: the distance of C to the target has not fallen by `progress` for t_stuck
   G2  M = C + r u(theta + n);  phi the angle from M to the base, turn that from phi to psi + pi
-  G3  W = M - R u(psi) where turn < CARROT,  else M + R u(phi +- CARROT)
+  G3  W = M - R u(psi) where turn < ahead,  else M + R u(phi +- ahead)
 
 While stuck, the base moves at v_max towards W, straight away from M where it is nearer than R, and
 from the last W to M. It always turns to face M, omega = angle of M - P minus theta. The next touch
@@ -27,6 +27,7 @@ from rps_jax.control.observation import Details, Observation, Twist
 from rps_jax.geometry import planar
 from rps_jax.geometry.arrays import Number, Parameter
 
+_AHEAD = 1.26  # [rad] by which the base aims ahead on the circle
 _ARRIVED, _CLEAR = 0.1, 0.1  # [m] errors at the staging point, and of the circle
 
 
@@ -97,7 +98,7 @@ def step(
     # G2 and G3.
     psi = unicycle.push_direction(middle, base, obs.p_world_target, params.r)
     offset = base - middle
-    way = unicycle.way_around(middle, psi, offset, state.side, ~state.away, params.R)
+    way = unicycle.way_around(middle, psi, offset, state.side, ~state.away, params.R, _AHEAD)
     away = state.away | starts
     clear = planar.norm(offset) > params.R - _CLEAR
     at_staging = away & clear & way.is_direct & (planar.norm(way.staging - base) < _ARRIVED)

@@ -22,7 +22,7 @@ Retreat straight, until C is `back` ahead of the front. Drive around M in revers
 need not turn away from the object and back. With phi the angle of A - M, and turn the angle from
 phi to psi + pi, which decides the side:
 
-  D6  W = M - (R + a) u(psi)  where turn < CARROT,  else  M + (R + a) u(phi +- CARROT)
+  D6  W = M - (R + a) u(psi)  where turn < carrot,  else  M + (R + a) u(phi +- carrot)
   D7  omega = angle of A - W minus theta,  v = -v_max cos(omega)
 
 Where this angle is large, the base turns on the spot, and a car in reverse. Align: at the last W,
@@ -51,7 +51,6 @@ from rps_jax.robot.shell import HALF_LENGTH
 
 _SIDE = 0.02  # [m] behind the front, where a contact is on a side
 _ROUND_SIDE = 1.2  # [rad] from the front of a round base
-CARROT = 1.26  # [rad] by which the base aims ahead on the circle
 _LARGE = 0.5  # [rad] heading error above which the base turns on the spot
 _ARRIVED, _ALIGNED = 0.22, 0.26  # [m], [rad] errors at the staging point
 _CLOSE, _ASIDE = 0.2, 1.2  # [m], [rad] distance and bearing of a staging point that is passed
@@ -79,6 +78,7 @@ class UnicycleParams(NamedTuple):
     t_lost: Annotated[Parameter, Bound(0.2, 8, log=True)] = 1.14  # [s] without contact: lost
     back: Annotated[Parameter, Bound(0.01, 0.6)] = 0.1  # [m] retreat
     R: Annotated[Parameter, Bound(0.5, 1.4)] = 0.87  # [m] circle around M, D6
+    carrot: Annotated[Parameter, Bound(0.4, 1.5)] = 0.8  # [rad] of the aim ahead on the circle, D6
 
 
 class Widths(NamedTuple):
@@ -109,7 +109,9 @@ class UnicycleState(NamedTuple):
     side: jax.Array  # [1] 1: counter-clockwise around M, or -1
 
 
-check = partial(check_signs, "unicycle", ("v_max", "omega_max", "d_success", "r", "R", "t_lost"))
+check = partial(
+    check_signs, "unicycle", ("v_max", "omega_max", "d_success", "r", "R", "carrot", "t_lost")
+)
 
 
 def init(params: UnicycleParams, temperatures: Widths | None = None) -> UnicycleState:
@@ -168,6 +170,7 @@ def way_around(
     side: jax.Array,  # [1] the last choice
     chooses: jax.Array,  # bool: whether the side is chosen anew
     radius: Number,  # [m] of the circle
+    ahead: Number,  # [rad] of the aim on the circle
     turning_radius: Number | None = None,  # [m] of a car, which also moves while it aligns
     width: Number | None = None,  # [rad] of the smooth switch
 ) -> Way:
@@ -177,11 +180,11 @@ def way_around(
     side = jnp.where(chooses, jnp.where(turn >= 0, 1.0, -1.0), side)
     turn = jnp.mod(side * turn, 2 * jnp.pi)
     turn = jnp.where(turn > 2 * jnp.pi - _OVERSHOOT, turn - 2 * jnp.pi, turn)
-    is_direct = soft.greater(CARROT, turn, width)
+    is_direct = soft.greater(ahead, turn, width)
     staging = middle - radius * planar.unit(psi)
     if turning_radius is not None:
         staging = staging - side * turning_radius * planar.unit(psi - jnp.pi / 2)
-    carrot = middle + radius * planar.unit(phi + side * CARROT)
+    carrot = middle + radius * planar.unit(phi + side * ahead)
     return Way(side, is_direct, staging, soft.where(is_direct, staging, carrot))
 
 
@@ -240,7 +243,7 @@ def step(
 
     # D6: the side is chosen before the base leaves, and kept on the way.
     offset, chooses = p_world_axle - middle, _is(or_(push, state.retreat))
-    circle = middle, psi, offset, state.side, chooses, params.R + axle
+    circle = middle, psi, offset, state.side, chooses, params.R + axle, params.carrot
     side, is_direct, staging, aim = way_around(*circle, obs.turning_radius, angle)
     error = planar.wrap(planar.direction(aim - p_world_axle) + jnp.pi - yaw)
     left = planar.norm(staging - p_world_axle)
@@ -306,7 +309,8 @@ PRESETS = {
         t_lost=0.293,
         back=0.042,
         R=0.85,
+        carrot=1.26,
     ),
-    "unicycle_round": _TUNED._replace(r=0.2, K_e=2.0, l_edge=0.15, d_near=0.3),
-    "unicycle_front": _TUNED._replace(r=0.3, l_edge=0.22, back=0.25, R=1.1),
+    "unicycle_round": _TUNED._replace(r=0.2, K_e=2.0, l_edge=0.15, d_near=0.3, carrot=1.26),
+    "unicycle_front": _TUNED._replace(r=0.3, l_edge=0.22, R=1.25),
 }
