@@ -16,6 +16,7 @@ import re
 import runpy
 import subprocess
 import tomllib
+from collections.abc import Mapping
 from functools import cache
 from html import unescape
 from pathlib import Path
@@ -30,40 +31,65 @@ from mkdocs.structure.files import File
 import rps_jax
 
 ROOT = Path(__file__).parents[1]
-ROOMS = (
-    *("record", "geometry", "robot", "control", "world", "lowering", "engines"),
-    *("analysis", "trials", "runs", "tuning", "studies", "app"),
-)
-PAGES = (*ROOMS, "errors")  # of the reference
+_PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))
+_LAYERS = _PROJECT["tool"]["importlinter"]["contracts"][0]["layers"]
+# Pages of the reference, from the lowest layer to the highest.
+PAGES = [
+    module.removeprefix("rps_jax.") for layer in reversed(_LAYERS) for module in layer.split(" | ")
+]
 # Sections of a page that are separate pages: title of the section, by path.
 SECTIONS = {"rps_jax/law.md": "The law", "rps_jax/adding.md": "How to add"}
 # Pages by tab; studies that no tab names are in `Studies`.
 TABS: dict[str, list[Any]] = {
     "Start": [
-        *("README.md", {"Push it yourself": "push.html"}, "docs/gallery.md"),
-        *("docs/not_supported.md", "CHANGELOG.md"),
+        "README.md",
+        {"Push it yourself": "push.html"},
+        "docs/gallery.md",
+        "docs/not_supported.md",
+        "CHANGELOG.md",
     ],
     "Tutorials": [
-        *("notebooks/README.md", "notebooks/07_custom_law.md", "notebooks/08_analysis.md"),
-        *("notebooks/09_gymnasium.md", "notebooks/11_rooms.md"),
+        "notebooks/README.md",
+        "notebooks/07_custom_law.md",
+        "notebooks/08_analysis.md",
+        "notebooks/09_gymnasium.md",
+        "notebooks/11_rooms.md",
     ],
     "The law": ["rps_jax/law.md", "notebooks/01_the_law.md", "notebooks/02_one_push.md"],
     "The paper": [
-        *("notebooks/03_paper.md", "table", "hardware", "paper_reading", "ambiguities"),
+        "notebooks/03_paper.md",
+        "table",
+        "hardware",
+        "paper_reading",
+        "ambiguities",
     ],
     "Random worlds": ["notebooks/04_robustness.md", "random_worlds", "models"],
     "Tuning": [
-        *("notebooks/05_tuning.md", "notebooks/10_gradients.md", "tuned", "landscape"),
+        "notebooks/05_tuning.md",
+        "notebooks/10_gradients.md",
+        "tuned",
+        "landscape",
         "gradients",
     ],
     "Laws": ["ladder", "rps_plus", "mends", "learned", "force_push_grid", "failures"],
     "Robots": [
-        *("docs/my_robot.md", "docs/on_a_robot.md", "robots", "drives", "limits", "export"),
+        "docs/my_robot.md",
+        "docs/on_a_robot.md",
+        "robots",
+        "drives",
+        "limits",
+        "export",
         "notebooks/examples/ros2/rps_push/README.md",
     ],
     "Physics": [
-        *("mjcf/README.md", "ground", "real_pushes", "notebooks/06_fitting.md", "fit"),
-        *("engines", "fidelity", "docs/mjx_gradients.md"),
+        "mjcf/README.md",
+        "ground",
+        "real_pushes",
+        "notebooks/06_fitting.md",
+        "fit",
+        "engines",
+        "fidelity",
+        "docs/mjx_gradients.md",
     ],
     "Studies": ["sweeps/README.md"],
     "Make it yours": ["rps_jax/README.md", "rps_jax/adding.md", "CONTRIBUTING.md"],
@@ -215,37 +241,73 @@ def listing(path: Path) -> str:
     return f"# {path.relative_to(ROOT)}\n\n" + "".join(f"- {link}\n" for link in links)
 
 
-def reference() -> dict[str, str]:
-    """Return an index with one sentence for each name, and a page for each subpackage."""
-    names = []
-    for name, home in sorted(rps_jax._HOMES.items()):
-        value = getattr(rps_jax, name)
+def gathered(module: str) -> dict[str, str]:
+    """Return the modules that define the names of the top level, or of a module of public names."""
+    path = ROOT / "rps_jax" / module
+    path = path / "__init__.pyi" if path.is_dir() else path.with_suffix(".py")
+    text = path.read_text("utf-8")
+    homes = {name: home for home, name in re.findall(r"^from (\S+) import (\w+) as", text, re.M)}
+    renamed = re.findall(r"^(\w+) = (\w+)\.\w+$", text, re.M)
+    return homes | {name: f"rps_jax.{home}" for name, home in renamed}
+
+
+def name_table(module: str, homes: Mapping[str, str]) -> str:
+    """Return a table of public names, each with a link to its definition and a sentence."""
+    rows = ["| name | description |", "|---|---|"]
+    for name, home in sorted(homes.items()):
+        value = getattr(importlib.import_module(module), name)
         source = inspect.unwrap(value) if callable(value) else value  # the class of a command
-        anchor = f"{getattr(source, '__module__', home)}.{getattr(source, '__qualname__', name)}"
-        names += [
-            f"| [`rps_jax.{name}`]({anchor.split('.')[1]}.md#{anchor}) | "
-            f"{summary(inspect.getdoc(value))} |"
-        ]
-    modules = []
-    for room in PAGES:
-        paths = sorted((ROOT / "rps_jax" / room).glob("[a-z]*.py"))
-        home = f"rps_jax.{room}"
-        modules += [f"| [`{home}`]({room}.md) | {summary(importlib.import_module(home).__doc__)} |"]
-        modules += [
-            f"| [`{home}.{path.stem}`]({room}.md#{home}.{path.stem}) | {about(path)} |"
-            for path in paths
-        ]
-    index = [
-        "# Reference", "",
-        "This index and its pages are generated from docstrings and signatures. The "
-        "[table of public names](../rps_jax/README.md#public-names) groups the names by purpose.",
-        "", "## Public names", "", "| name | description |", "|---|---|", *names,
-        "", "## Modules", "",
-        "Names that the table of public names does not list may move between versions.",
-        "", "| module | description |", "|---|---|", *modules, "",
-    ]  # fmt: skip
-    pages = {f"{room}.md": f"# rps_jax.{room}\n\n::: rps_jax.{room}\n" for room in PAGES}
-    return {"README.md": "\n".join(index)} | pages
+        described = inspect.isclass(source) or inspect.isfunction(source)
+        page, anchor = home.split(".")[1], f"#{home}" if home.count(".") > 1 else ""
+        if described:
+            page = source.__module__.split(".")[1]
+            anchor = f"#{source.__module__}.{source.__qualname__}"
+        text = summary(inspect.getdoc(value)) if described else f"Defined in `{home}`."
+        rows += [f"| [`{module}.{name}`]({page}.md{anchor}) | {text} |"]
+    return "\n".join(rows)
+
+
+def module_table() -> str:
+    """Return a table of all modules of the package, each with the summary of its docstring."""
+    rows = ["| module | description |", "|---|---|"]
+    for page in PAGES:
+        folder = ROOT / "rps_jax" / page
+        for path in (
+            sorted(folder.rglob("*.py")) if folder.is_dir() else [folder.with_suffix(".py")]
+        ):
+            parts = path.relative_to(ROOT).with_suffix("").parts
+            name = ".".join(part for part in parts if part != "__init__")
+            anchor = f"#{name}" if name.count(".") > 1 else ""
+            rows += [f"| [`{name}`]({page}.md{anchor}) | {about(path)} |"]
+    return "\n".join(rows)
+
+
+def reference() -> dict[str, str]:
+    """Return an index with one sentence for each name, and a page for each module of PAGES."""
+    index = f"""# Reference
+
+This index and its pages are generated from docstrings and signatures. The [table of public
+names](../rps_jax/README.md#public-names) groups the names by purpose.
+
+## Public names
+
+{name_table("rps_jax", gathered(""))}
+
+## Modules
+
+Names that the tables of public names do not list may move between versions.
+
+{module_table()}
+"""
+    pages = {"README.md": index}
+    for page in PAGES:
+        module = f"rps_jax.{page}"
+        path = ROOT / "rps_jax" / f"{page}.py"
+        text = f"::: {module}"
+        if path.exists() and (names := gathered(page)):
+            text = f"{about(path)}\n\n{name_table(module, names)}"
+        pages[f"{page}.md"] = f"# {module}\n\n{text}\n"
+    return pages
 
 
 # --- hooks of mkdocs -----------------------------------------------------------------------
@@ -253,8 +315,7 @@ def reference() -> dict[str, str]:
 
 def repository() -> str | None:
     """Return the web address of the repository: of pyproject, GitHub's runner or git's `origin`."""
-    project = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
-    if url := project.get("urls", {}).get("Repository"):
+    if url := _PROJECT["project"].get("urls", {}).get("Repository"):
         return url
     if name := os.environ.get("GITHUB_REPOSITORY"):
         return f"{os.environ.get('GITHUB_SERVER_URL', 'https://github.com')}/{name}"

@@ -30,10 +30,9 @@ import rps_jax
 from rps_jax import RPSParams
 from rps_jax.analysis import tables
 from rps_jax.analysis.figures import tuning as figures
-from rps_jax.robot.skin import IdealSkin
-from rps_jax.trials.case import Case
+from rps_jax.laws import Space
 from rps_jax.tuning import gradients
-from rps_jax.tuning.space import Space
+from rps_jax.worlds import Case, IdealSkin
 from sweeps import render_tables
 from sweeps.gradients import estimators
 

@@ -120,7 +120,7 @@ print(table)
 # ## Next steps
 #
 # - `Law(..., bounds={"lean": Bound(2.0, 20.0)})` declares the range of a parameter, and
-#   `rps tune es --law my_law.py:LeanParams` searches in it (`rps_jax.control.base` has `Bound`).
+#   `rps tune es --law my_law.py:LeanParams` searches in it (`rps_jax.laws` has `Bound`).
 # - `senses="taxels"` gives the law the signal of each taxel.
 # - `rps gallery RUN` and `rps replay RUN WORLD` show worlds in which a law fails, and
 #   `rps export c --law my_law.py` writes the law as C.

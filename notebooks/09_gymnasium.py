@@ -25,9 +25,11 @@ import rps_jax.trials.gym  # registers rps_jax/Push-v0
 rps_jax.use_cache()  # store compiled programs for the next process
 rules = rps_jax.Rules(horizon=60.0, max_lost=20.0)
 options = {
-    "object": "random_cylinder", "domain": "wide,distance=0.7:1,bearing=-0.3:0.3",
-    "hold": 0.5, "setting": rps_jax.Setting(fidelity="fast", rules=rules),
-}  # fmt: skip
+    "object": "random_cylinder",
+    "domain": "wide,distance=0.7:1,bearing=-0.3:0.3",
+    "hold": 0.5,
+    "setting": rps_jax.Setting(fidelity="fast", rules=rules),
+}
 env = gymnasium.make("rps_jax/Push-v0", render_mode="rgb_array", **options)
 obs, info = env.reset(seed=0)
 print(env.observation_space, env.action_space, info)

@@ -10,14 +10,12 @@ import jax.numpy as jnp
 import numpy as np
 import xarray as xr
 
+from rps_jax import Details, Observation, Robot, RPSParams, RPSState, Twist, step
 from rps_jax.analysis import statistics
 from rps_jax.analysis.figures.style import SHADES, Figure, shade
 from rps_jax.analysis.figures.style import quantity as quantity
 from rps_jax.analysis.figures.style import words as words
-from rps_jax.control.laws import rps
-from rps_jax.control.laws.rps import RPSParams, RPSState
-from rps_jax.control.observation import Details, Observation, Twist
-from rps_jax.robot import shell
+from rps_jax.laws import law_of
 
 
 def listed(names: Iterable[str]) -> str:
@@ -32,7 +30,7 @@ def listed(names: Iterable[str]) -> str:
 def _in_front(l: Any, error: Any, distance: Any) -> Observation:  # noqa: E741
     """Return observations (n,) of contact offsets `l` [m] on the front and heading errors [rad]."""
     offset, angle = jnp.asarray(l), jnp.asarray(error)
-    contact = jnp.stack([jnp.full_like(offset, shell.HALF_LENGTH), offset], axis=-1)
+    contact = jnp.stack([jnp.full_like(offset, Robot().half_length), offset], axis=-1)
     d = distance * jnp.stack([jnp.cos(angle), jnp.sin(angle)], axis=-1)
     in_contact = jnp.ones(offset.shape, bool)
     yaw, period = jnp.zeros_like(offset), jnp.full(offset.shape, 0.02)
@@ -42,7 +40,7 @@ def _in_front(l: Any, error: Any, distance: Any) -> Observation:  # noqa: E741
 @jax.jit
 def _twists(params: RPSParams, state: RPSState, observations: Observation) -> Twist:
     """Return the law's twists (n,) for one state and observations (n, ...)."""
-    return jax.vmap(lambda obs: rps.step(params, state, obs)[1])(observations)
+    return jax.vmap(lambda obs: step(params, state, obs)[1])(observations)
 
 
 def twist_field(sets: Mapping[str, RPSParams], distance: float) -> Figure:
@@ -51,7 +49,8 @@ def twist_field(sets: Mapping[str, RPSParams], distance: float) -> Figure:
     Arrows are (v_x, v_y), forward upwards; the colour is omega. The upper row starts outside the
     Realignment State, which |l| > l_cr enters; the lower row inside, which |l| <= l_mr leaves.
     """
-    l = np.linspace(-shell.HALF_WIDTH, shell.HALF_WIDTH, 117)  # noqa: E741
+    half_width = float(Robot().half_width)
+    l = np.linspace(-half_width, half_width, 117)  # noqa: E741
     error = np.radians(np.linspace(-180, 180, 120, endpoint=False) + 1.5)
     offsets, angles = (axis.ravel() for axis in np.meshgrid(l, error))
     observations = _in_front(offsets, angles, distance)
@@ -75,8 +74,13 @@ def twist_field(sets: Mapping[str, RPSParams], distance: float) -> Figure:
                 vmax=limit,
             )
             rows = np.s_[10::20, 4::12]
-            ax.quiver(*np.meshgrid(l[rows[1]], np.degrees(error[rows[0]])), -v_y[rows], v_x[rows],
-                      scale=0.7, width=0.006)  # fmt: skip
+            ax.quiver(
+                *np.meshgrid(l[rows[1]], np.degrees(error[rows[0]])),
+                -v_y[rows],
+                v_x[rows],
+                scale=0.7,
+                width=0.006,
+            )
             for side in (-1, 1):
                 ax.axvline(side * float(threshold), color="0.3", lw=0.8, ls="--")
         column[0].set_title(f"{name}: $l_{{th}} = l_{{cr}}$", fontsize=9)
@@ -125,10 +129,13 @@ def _swept(params: RPSParams, l: jax.Array) -> Details:  # noqa: E741
     """Return the details (n,) of consecutive steps, far from a target straight ahead."""
 
     def step(state: RPSState, obs: Observation) -> tuple[RPSState, Details]:
-        state, _, details = rps.step_with_details(params, state, obs)
+        state, _, details = law.step(params, state, obs)
         return state, details
 
-    observations = _in_front(l, jnp.zeros_like(l), 2 * jnp.asarray(params.d_th))
+    law, observations = (
+        law_of(params),
+        _in_front(l, jnp.zeros_like(l), 2 * jnp.asarray(params.d_th)),
+    )
     return jax.lax.scan(step, RPSState.init(params), observations)[1]
 
 

@@ -8,6 +8,7 @@ and no time, so that a difference is one of cells or results.
 """
 
 import argparse
+import os
 import sys
 import tempfile
 from collections.abc import Sequence
@@ -19,8 +20,6 @@ from jupyter_client.kernelspec import KernelSpec
 from jupyter_client.manager import AsyncKernelManager
 from nbclient import NotebookClient
 from nbformat import NotebookNode
-
-from rps_jax.world import rendering
 
 FOLDER = Path(__file__).resolve().parent
 TEXTS = tuple(sorted(FOLDER.glob("[0-9]*.py")))
@@ -84,7 +83,8 @@ def main() -> None:
     names = parser.parse_args().names
     if unknown := set(names) - set(stems):
         parser.error(f"unknown notebook {', '.join(sorted(unknown))}: choose of {', '.join(stems)}")
-    rendering.choose_gl()  # before the kernel imports MuJoCo for any of them
+    if sys.platform == "linux" and not os.environ.get("DISPLAY"):
+        os.environ.setdefault("MUJOCO_GL", "egl")  # before the kernel imports MuJoCo
     with tempfile.TemporaryDirectory() as empty:
         for group, folder in ((set(TEXTS) - set(TUTORIALS), FOLDER), (TUTORIALS, Path(empty))):
             texts = [text for text in TEXTS if text in group and (not names or text.stem in names)]

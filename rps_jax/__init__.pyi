@@ -46,10 +46,15 @@ from rps_jax.control.laws.rps import step as step
 from rps_jax.world.domain import Domain as Domain
 from rps_jax.world.domain import Range as Range
 from rps_jax.world.objects import register_object as register_object
+from rps_jax.world.quantity import Quantity as Quantity
+from rps_jax.world.registry import register_quantity as register_quantity
+from rps_jax.world.registry import register_task as register_task
 
 # --- how it is sensed and stepped --------------------------------------------------------------
 from rps_jax.robot.robot import Robot as Robot
 from rps_jax.trials.setting import Setting as Setting
 from rps_jax.trials.trial import Rules as Rules
+from rps_jax.engines import register_engine as register_engine
 from rps_jax.record.cache import use_cache as use_cache
+from rps_jax.spec import Spec as Spec
 from rps_jax.errors import InputError as InputError

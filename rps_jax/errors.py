@@ -42,6 +42,7 @@ def check_number(
     above: float = -math.inf,
     at_least: float = -math.inf,
     at_most: float = math.inf,
+    below: float = math.inf,
     unit: str = "",
     text: bool = False,
 ) -> float:
@@ -53,13 +54,14 @@ def check_number(
       above: exclusive lower bound.
       at_least: lower bound.
       at_most: upper bound.
+      below: exclusive upper bound.
       unit: of the value, for the error.
       text: whether a text with a number is allowed.
 
     Raises:
       InputError: the value is NaN, not a number, or out of bounds.
     """
-    limits = {"above": above, "at least": at_least, "at most": at_most}
+    limits = {"above": above, "at least": at_least, "at most": at_most, "below": below}
     bounds = [f"{words} {limit:g}" for words, limit in limits.items() if math.isfinite(limit)]
     allowed = " and ".join(["a number", *bounds]) + (f" [{unit}]" if unit else "")
     try:
@@ -68,7 +70,8 @@ def check_number(
         scalar = math.nan if refused else float(value)
     except (TypeError, ValueError, OverflowError):
         scalar = math.nan
-    if math.isnan(scalar) or not (above < scalar and at_least <= scalar <= at_most):
+    is_inside = above < scalar and at_least <= scalar <= at_most
+    if math.isnan(scalar) or not is_inside or scalar >= below < math.inf:
         raise not_allowed(name, value, f"it must be {allowed}")
     return scalar
 

@@ -9,31 +9,26 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, ClassVar, NamedTuple, Unpack
+from typing import Any, ClassVar, NamedTuple
 
 import jax
 import numpy as np
 import xarray as xr
 
+from rps_jax import InputError, RPSParams, Setting
 from rps_jax.analysis import statistics
-from rps_jax.control import registry
-from rps_jax.control.base import LawParams
-from rps_jax.control.laws.rps import RPSParams
-from rps_jax.errors import InputError
+from rps_jax.laws import LawParams, law_of, resolve_law
+from rps_jax.physics import FRICTION, PHYSICS
+from rps_jax.questions import Run
 from rps_jax.record import files
 from rps_jax.record.checkpoint import Checkpoints
-from rps_jax.runs.question import Run
 from rps_jax.trials.batch_run import outcomes
-from rps_jax.trials.case import Case
-from rps_jax.trials.jobs import BatchSize
 from rps_jax.trials.progress import Progress, ProgressCallback, SequentialProgress, no_progress
 from rps_jax.trials.pushes import Cases
 from rps_jax.trials.results import outcome_dataset
-from rps_jax.trials.setting import Setting
 from rps_jax.world import paper
-from rps_jax.world.objects import PAPER_OBJECTS
-from rps_jax.world.physics import PHYSICS
-from rps_jax.world.scene import FRICTION, Friction
+from rps_jax.world.scene import Friction
+from rps_jax.worlds import Case, parse_domain
 from sweeps.study_base import TrialStudy, load_part
 
 # Number of trials per call: more keep the device busier, fewer are lost when the run is killed.
@@ -44,7 +39,7 @@ class Grid(NamedTuple):
     """Trials of a study, in the nesting order of `outcome_dataset`."""
 
     laws: tuple[str, ...] = ("rps",)
-    objects: tuple[str, ...] = PAPER_OBJECTS
+    objects: tuple[str, ...] = parse_domain("paper").objects
     friction: Mapping[str, Friction] = FRICTION
     targets: tuple[tuple[float, float], ...] = paper.TARGETS
 
@@ -65,7 +60,7 @@ class Condition:
 
     def cases(self, grid: Grid) -> list[Case]:
         """Return the trials of a grid under this condition."""
-        changed = {name: self._changed(registry.LAWS[name]) for name in grid.laws}
+        changed = {name: self._changed(resolve_law(name)[1]) for name in grid.laws}
         return [
             Case(name, friction, target, changed[law], **self.case)
             for law in grid.laws
@@ -77,15 +72,15 @@ class Condition:
     def is_allowed(self, laws: Sequence[str]) -> bool:
         """Return whether all laws accept the changed parameters."""
         try:
-            for params in (self._changed(registry.LAWS[name]) for name in laws):
-                registry.law_of(params).check(params)
+            for params in (self._changed(resolve_law(name)[1]) for name in laws):
+                law_of(params).check(params)
         except InputError:
             return False
         return True
 
     def is_default(self, laws: Sequence[str]) -> bool:
         """Return whether it changes only parameters, to values that all laws have already."""
-        unchanged = (self._changed(registry.LAWS[x]) == registry.LAWS[x] for x in laws)
+        unchanged = (self._changed(x) == x for _, x in map(resolve_law, laws))
         return bool(self.params) and not self.case and all(unchanged)
 
     def _changed(self, params: LawParams) -> LawParams:
@@ -104,7 +99,7 @@ def run_conditions(
     folder: Path | None,
     *,
     callback: ProgressCallback = no_progress,
-    **size: Unpack[BatchSize],
+    **size: Any,
 ) -> xr.Dataset:
     """Return outcomes (condition, law, object, friction, target).
 

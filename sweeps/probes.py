@@ -27,8 +27,6 @@ from typing import Any, TypeAlias
 import numpy as np
 import xarray as xr
 
-from rps_jax.record import files
-
 Record: TypeAlias = dict[str, Any]  # processor, versions, variables: digest, mean, size of each
 
 FILE = Path(__file__).with_name("publish") / "probes.json"
@@ -175,7 +173,7 @@ def write(records: Mapping[str, Mapping[str, Record]]) -> None:
         + "\n }"
         for probe, rows in sorted(records.items())
     ]
-    files.write_text(FILE, "{\n" + ",\n".join(lines) + "\n}\n")
+    FILE.write_text("{\n" + ",\n".join(lines) + "\n}\n", encoding="utf-8")
 
 
 def remove_unused() -> None:

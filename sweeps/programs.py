@@ -14,22 +14,22 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from rps_jax.control.base import LawParams
-from rps_jax.control.laws.rps import RPSParams
+from rps_jax import Range, RPSParams, Setting
+from rps_jax.laws import LawParams
+from rps_jax.physics import FRICTION, MUJOCO_GROUND, Physics, preset
 from rps_jax.trials import pushes, trial
-from rps_jax.trials.case import Case
 from rps_jax.trials.jobs import WorldBatch, rows
-from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import ControlLoop, Trial, World
 from rps_jax.trials.worlds import drawn_worlds
 from rps_jax.world import draws, paper
-from rps_jax.world.domain import DOMAINS, Range
-from rps_jax.world.physics import MUJOCO_GROUND, Physics, preset
-from rps_jax.world.scene import FRICTION
+from rps_jax.worlds import Case, parse_domain
 
 FAMILIES = ("box", "cylinder", "prism")
 _PRISMS = replace(
-    DOMAINS["paper"], objects=("random_prism",), frictions=(FRICTION["S1"],), gap=Range(0.0, 0.0)
+    parse_domain("paper"),
+    objects=("random_prism",),
+    frictions=(FRICTION["S1"],),
+    gap=Range(0.0, 0.0),
 )
 _MUJOCO_DEFAULTS = Physics(
     timestep=0.002,

@@ -90,9 +90,15 @@ _DEFINED = re.compile(
     rf"|(?:steps|period) of {_NUMBER} ms|at {_NUMBER} k?Hz|20\d\d"
 )
 _UNREAD = (  # parts of a page that are no prose
-    r"<!-- (table|command): (\S+) -->\n.*?<!-- end -->", r"<!-- cell: [^>]*? -->.*?<!-- end -->",
-    r"```.*?```", r"`[^`]*`", r"\$\$.*?\$\$|\$[^$]*?\$", r"\]\([^)]*\)", r"<[^>]*>", r"https?://\S+",
-)  # fmt: skip
+    r"<!-- (table|command): (\S+) -->\n.*?<!-- end -->",
+    r"<!-- cell: [^>]*? -->.*?<!-- end -->",
+    r"```.*?```",
+    r"`[^`]*`",
+    r"\$\$.*?\$\$|\$[^$]*?\$",
+    r"\]\([^)]*\)",
+    r"<[^>]*>",
+    r"https?://\S+",
+)
 _SKIPPED = {"runs", "build", "dist"}  # folders of the root that hold no pages of the repository
 
 

@@ -17,6 +17,7 @@ import shlex
 import subprocess
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any, ClassVar, NamedTuple, Self, TypeVar
 
@@ -24,15 +25,13 @@ import jax
 import numpy as np
 import xarray as xr
 
-from rps_jax import errors
-from rps_jax.analysis.report import Picture, Section
+from rps_jax import InputError, errors
 from rps_jax.engines import device
-from rps_jax.errors import InputError
+from rps_jax.questions import Picture, Plan, Question, Run, Section
 from rps_jax.record import files, options, provenance
 from rps_jax.record.checkpoint import Checkpoints
 from rps_jax.runs import execution
-from rps_jax.runs.plan import Plan
-from rps_jax.runs.question import Question, Run, TrialQuestion, quick_command, quick_note
+from rps_jax.runs.question import TrialQuestion, quick_command, quick_note
 from rps_jax.runs.results import PlanRequest, Results
 from rps_jax.trials.batch_run import run_batch
 from rps_jax.trials.progress import Progress, ProgressCallback, SequentialProgress, no_progress
@@ -41,6 +40,8 @@ from sweeps import probes, render_tables
 
 T = TypeVar("T", covariant=True)
 Rows = list[list[str]]
+Parts = Mapping[Any, Callable[[], xr.Dataset]]  # functions that compute the parts of results
+RANDOM_OBJECTS = ("random_box", "random_cylinder", "random_prism")
 _PACKAGES = ("rps_jax", "jax", "mujoco", "mujoco-mjx")  # whose versions a data file has
 
 
@@ -114,7 +115,7 @@ class Study(Question[T]):
 
     # --- for subclasses to override --------------------------------------------------------
 
-    def parts(self, run: Run) -> Mapping[Any, Callable[[], xr.Dataset]]:
+    def parts(self, run: Run) -> Parts:
         """Return the function that computes each part of the results, by its coordinate."""
         return {}
 
@@ -129,7 +130,7 @@ class Study(Question[T]):
             path = self.folder / self.RESULTS / f"{table.name}.json"
             write_table(path, runs, self.machine, table)
             if table.picture:
-                files.write_bytes(self.folder / f"{table.picture.name}.png", table.picture.png())
+                (self.folder / f"{table.picture.name}.png").write_bytes(table.picture.png())
 
     # --- as questions ----------------------------------------------------------------------
 
@@ -198,6 +199,26 @@ class TrialStudy(Study[T], TrialQuestion[T]):
 
 
 @dataclass(frozen=True, kw_only=True)
+class PlanStudy(Question[T]):
+    """Base class of questions whose trials are those of several plans."""
+
+    @cached_property
+    def plans(self) -> dict[str, Plan]:
+        """Plans by name."""
+        raise NotImplementedError
+
+    def check(self) -> None:
+        """Check that the engines can step these worlds here."""
+        super().check()
+        for plan in self.plans.values():
+            plan.check_here()
+
+    def num_trials(self) -> int | None:
+        """Return the number of trials."""
+        return sum(plan.num_trials for plan in self.plans.values())
+
+
+@dataclass(frozen=True, kw_only=True)
 class SpeedStudy(Study[T]):
     """Base class of studies that measure this machine."""
 
@@ -243,9 +264,7 @@ def stored_parts(run: Run) -> Collection[str]:
     return () if run.checkpoints is None else run.checkpoints.paths()
 
 
-def run_parts(
-    run: Run, dim: str, parts: Mapping[Any, Callable[[], xr.Dataset]], trials: int = 1
-) -> xr.Dataset:
+def run_parts(run: Run, dim: str, parts: Parts, trials: int = 1) -> xr.Dataset:
     """Compute the parts that the run folder lacks, and join all of them along a dimension.
 
     Each part counts as a number of `trials` in the progress.
@@ -341,7 +360,8 @@ def write_table(path: Path, runs: Sequence[Mapping[str, Any]], device: str, tabl
         "rows": rows,
     }
     path.parent.mkdir(exist_ok=True)
-    return files.write_text(path, json.dumps(data, indent=1) + "\n")
+    path.write_text(json.dumps(data, indent=1) + "\n", encoding="utf-8")
+    return path
 
 
 def split_folder(command: Sequence[str]) -> tuple[list[str], str]:

@@ -145,7 +145,7 @@ def optimised():
 
 @pytest.fixture
 def registries():
-    """Restore the registries of objects and laws after a test."""
+    """Restore the registries of extensions after a test."""
     from helpers import temporary_names
 
     with temporary_names():

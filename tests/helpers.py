@@ -21,6 +21,8 @@ import xarray as xr
 from hypothesis import strategies
 from numpy.testing import assert_allclose, assert_array_equal
 
+import rps_jax
+from rps_jax import engines
 from rps_jax.app import cli
 from rps_jax.control import registry
 from rps_jax.control.laws.rps import RPSParams
@@ -35,7 +37,7 @@ from rps_jax.trials import trial
 from rps_jax.trials.case import Case
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import ControlLoop, Rules, Trial
-from rps_jax.world import domain, objects
+from rps_jax.world import domain, objects, streams, tasks
 from rps_jax.world.domain import Range, parse_domain
 from rps_jax.world.physics import preset
 
@@ -201,9 +203,14 @@ def moved(
 
 @contextlib.contextmanager
 def temporary_names() -> Iterator[None]:
-    """Restore the registries of objects and laws at the end of the block."""
-    tables = (objects.FAMILIES, objects.REGISTERED, registry.LAWS, registry._LAWS_BY_CLASS)
-    saved = [dict(table) for table in tables]
+    """Restore the registries at the end of the block."""
+    tables = (
+        *(objects.FAMILIES, objects.REGISTERED, registry.LAWS, registry._LAWS_BY_CLASS),
+        *(domain.QUANTITIES, domain.LABELS, domain.REGISTERED, domain.OBJECT_QUANTITIES),
+        *(tasks.TASKS, tasks.QUANTITIES, tasks.UNRANGED, tasks.OUTCOMES, tasks.FAILURES),
+        *(streams._OWNERS, engines._REGISTERED),
+    )
+    saved: list[Any] = [table.copy() for table in tables]
     try:
         yield
     finally:
@@ -257,8 +264,39 @@ def imported(path: Path) -> Iterator[str]:
 def addresses() -> Iterator[tuple[str, str]]:
     """Yield module and name of each entry below the top level in the table of public names."""
     for line in (ROOT / "rps_jax" / "README.md").read_text().splitlines():
-        if match := re.match(r"\| `(rps_jax\.[\w.]+)` \| (.*?) \|", line):
+        if match := re.match(r"\| `(rps_jax[\w.]*)` \| (.*?) \|", line):
             yield from ((match[1], name) for name in re.findall(r"`(\w+)`", match[2]))
+
+
+def inner_names(path: Path) -> set[str]:
+    """Return the addresses of the package that a script uses and that are not public.
+
+    Public are the names of the top level, the addresses of the README, and all members of a module
+    that it lists.
+    """
+    public = {f"{module}.{name}" for module, name in addresses()}
+    public |= {f"rps_jax.{name}" for name in rps_jax.__all__}
+    nodes = list(ast.walk(ast.parse(path.read_text())))
+    names, modules = set(), {}
+    for node in nodes:
+        if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("rps_jax"):
+            for alias in node.names:
+                name = f"{node.module}.{alias.name}"
+                if name not in public and _is_module(name):
+                    modules[alias.asname or alias.name] = name
+                else:
+                    names.add(name)
+    for node in nodes:
+        if isinstance(node, ast.Attribute):
+            owner = ast.unparse(node.value)
+            if owner in modules or (owner.startswith("rps_jax.") and _is_module(owner)):
+                names.add(f"{modules.get(owner, owner)}.{node.attr}")
+    return {x for x in names if x not in public and x.rpartition(".")[0] not in public}
+
+
+def _is_module(address: str) -> bool:
+    path = ROOT / address.replace(".", "/")
+    return path.is_dir() or path.with_suffix(".py").exists()
 
 
 # --- comparisons ---------------------------------------------------------------------------

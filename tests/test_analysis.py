@@ -76,7 +76,7 @@ def test_statistics_and_tables_of_a_sweep_by_hand():
         distance=[1.0, 2.0, 3.0, 1.0],
     ).assign_coords(object=("world", ["box", "box", "drum", "drum"]), world=range(4))
     first, second = (results.sel(law=law) for law in "ab")
-    names = np.array([*statistics.MODES, ""])
+    names = np.array([*statistics.modes(), ""])
     modes = [names[statistics.failure_modes(trials, 150)].tolist() for trials in (first, second)]
     assert modes[0] == ["", "timeout", "never touched", "diverged"]
     assert modes[1] == ["", "", "lost contact", "fell over"]
@@ -119,7 +119,7 @@ def test_rates_of_more_than_99_percent_have_two_decimals():
 
 
 def test_a_validated_law_has_two_decimals_above_99_percent():
-    columns = {name: ("update", [0.9937]) for name in learn.UNITS}
+    columns = {name: ("update", [0.9937]) for name in learn.METRICS}
     curve = xr.Dataset(columns, {"update": [7]}, {"compile": 1.0, "run": 2.0})
     (section,) = learn.Learn().report(curve, Run(None, no_progress))
     rate = "99.48 % [98.12, 99.86]"  # of whole trials, with its interval

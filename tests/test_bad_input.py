@@ -9,9 +9,9 @@ import time
 import pytest
 from helpers import one_sentence, refusal, refusing, rps
 
+from rps_jax import engines
 from rps_jax.control import registry
 from rps_jax.control.laws.rps import RPSParams
-from rps_jax.engines import ENGINES
 from rps_jax.record import files
 from rps_jax.record.folder import claim
 from rps_jax.runs.plan import Plan, open_run
@@ -76,7 +76,7 @@ SHARED = {
     "table, sweep, tune es, view: --horizon 0": "horizon = 0.0 is not allowed: .* above 0 and at",
     "sweep, tune es, ladder: --worlds 0": "worlds = 0 is not allowed: .* a whole number from 1 to",
     "push, sweep: --seed -1": "seed = -1 is not allowed",
-    "table, sweep, tune es: --engine ode": unlike("--engine", "ode", *ENGINES),
+    "table, sweep, tune es: --engine ode": unlike("--engine", "ode", *engines.names()),
     "sweep, tune es, ladder: --domain narrow": "unknown domain 'narrow': choose from paper, .*",
     "table, sweep: --laws": r"laws = \[\] is not allowed: name each once, at least one",
     "table, sweep: --laws rps rps": "laws = .* is not allowed: name each once",

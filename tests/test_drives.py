@@ -40,7 +40,7 @@ _COMPILED = "differential with a limited force"  # the only base in mjx that no 
 AXLES = [
     pytest.param(name, engine, marks=[pytest.mark.slow] * (engine == "mjx" and name != _COMPILED))
     for name in BASES
-    for engine in engines.ENGINES
+    for engine in engines.names()
 ]
 
 

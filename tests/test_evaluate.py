@@ -65,7 +65,7 @@ def tuner_keys(command):
         return [{env.setting.world_seed} for env in splits]
     if isinstance(command, Fit):
         keys, bank = set(), Bank(CYLINDERS, RPSParams(), command.setting, 1.0, 0.1)
-        patched = mock.patch.object(draws, "random_numbers", partial(stopped, keys))
+        patched = mock.patch.object(draws, "numbers", partial(stopped, keys))
         with patched, pytest.raises(StoppedError):
             bank.worlds(4, Run(None, no_progress))
         return keys, set()
@@ -97,7 +97,7 @@ def test_no_command_meets_the_worlds_of_a_tuner(monkeypatch):
             tuned |= tune
             validated |= validate
         with monkeypatch.context() as patch:
-            patch.setattr(draws, "random_numbers", partial(stopped, rest))
+            patch.setattr(draws, "numbers", partial(stopped, rest))
             for name in sorted(seeded - TUNERS - SEARCHES):
                 law = {"law": "rps"} if name == "score" else {}
                 with pytest.raises(StoppedError):

@@ -39,7 +39,7 @@ def search():
 
 
 def curve():
-    columns = {name: ("update", RANDOM.random(60)) for name in learn.UNITS}
+    columns = {name: ("update", RANDOM.random(60)) for name in learn.METRICS}
     return learn.figure_of(xr.Dataset(columns, {"update": np.arange(60)}))
 
 
@@ -176,7 +176,7 @@ def test_curves_differ_for_the_colour_blind(kind):
 
 
 def test_learning_without_an_update_has_a_report():
-    columns = {name: ("update", np.zeros(0)) for name in learn.UNITS}
+    columns = {name: ("update", np.zeros(0)) for name in learn.METRICS}
     curve = xr.Dataset(columns, {"update": np.zeros(0, int)}, {"compile": 1.0, "run": 2.0})
     (section,) = learn.Learn().report(curve, Run(None, no_progress))
     assert section.picture is None

@@ -1,19 +1,20 @@
-"""The package as a whole: its rooms, docstrings, public names and examples, and a custom engine."""
+"""The package as a whole: its docstrings, public names, and examples of extensions."""
 
 import inspect
 import os
 import pkgutil
 import re
-import shutil
 import sys
+import tomllib
 from importlib import import_module
 
 import pytest
-from helpers import ROOT, addresses, imported, output_of
+from helpers import ROOT, addresses, inner_names, output_of
 
 import rps_jax
 
 PACKAGE = ROOT / "rps_jax"
+MAX_INNER = 177  # names; it only goes down
 
 
 def test_each_private_interface_has_a_test_that_notices_a_change():
@@ -54,90 +55,137 @@ def test_ci_runs_the_test_command_of_the_readme_without_variables():
     assert re.findall(r"^ *export (.*)", of_ci, re.M) == exports  # of other processes
 
 
-@pytest.mark.parametrize(
-    "path", sorted((ROOT / "notebooks").glob("examples/*.py")), ids=lambda path: path.stem
-)
-def test_examples_import_only_public_names(path):
-    assert set(imported(path)) <= {"rps_jax", *dict(addresses())}
+def test_notebooks_and_examples_use_only_public_names():
+    scripts = sorted((ROOT / "notebooks").rglob("*.py"))
+    assert len(scripts) > 20
+    assert {str(path): names for path in scripts if (names := inner_names(path))} == {}
 
 
-def test_there_are_few_public_names_and_all_are_in_the_table():
-    rows = re.findall(r"^\| `(\w+)` \|", (PACKAGE / "README.md").read_text(), re.M)
+def exceptions():
+    """Inner names that a folder of studies may use, by folder."""
+    file = tomllib.loads((ROOT / "sweeps" / "inner_names.toml").read_text())
+    reasons = {folder: entry.pop("reason") for folder, entry in file.items()}
+    assert all(len(reason.split()) > 4 for reason in reasons.values())
+    return {
+        folder: {f"rps_jax.{module}.{name}" for module, names in entry.items() for name in names}
+        for folder, entry in file.items()
+    }
+
+
+def test_studies_use_public_names_and_listed_exceptions():
+    """The list is exact: a name that a study no longer uses is removed from it."""
+    listed, used = exceptions(), {}
+    for path in (ROOT / "sweeps").rglob("*.py"):
+        folder = f"sweeps/{path.relative_to(ROOT / 'sweeps').parts[0]}"
+        shared = {x for x in inner_names(path) if x in listed["sweeps"]}
+        used["sweeps"] = used.get("sweeps", set()) | shared
+        used[folder] = used.get(folder, set()) | (inner_names(path) - shared)
+    for path in (PACKAGE / "studies").glob("*.py"):
+        names = {x for x in inner_names(path) if not x.startswith("rps_jax.studies.")}
+        used["rps_jax/studies"] = used.get("rps_jax/studies", set()) | names
+    assert {folder: names for folder, names in used.items() if names} == listed
+    assert len(set().union(*(listed[x] for x in listed if x != "rps_jax/studies"))) <= MAX_INNER
+
+
+def test_there_are_few_public_names_and_all_are_in_the_tables():
+    rows = re.findall(r"^\| `(?!rps_jax)(\w+)` \|", (PACKAGE / "README.md").read_text(), re.M)
     assert sorted(rows) == rps_jax.__all__
-    assert len(rows) <= 42
+    assert len(rows) + len(set(addresses())) <= 90
+    for name in ("questions", "laws", "worlds", "physics"):
+        module = import_module(f"rps_jax.{name}")
+        listed = {entry for home, entry in addresses() if home == module.__name__}
+        gathered = re.findall(r" as (\w+)$|^(\w+) = ", inspect.getsource(module), re.M)
+        assert listed == {first or second for first, second in gathered}
     entries = [getattr(rps_jax, name) for name in rps_jax.__all__]
     assert all(entry.__doc__ or not callable(entry) for entry in entries)
 
 
-DUMMY = '''"""The quasi-static engine under another name."""
+# --- extensions, executed from the README --------------------------------------------------------
 
-from rps_jax.engines.quasistatic import QuasistaticEngine
-
-
-class Dummy(QuasistaticEngine):
-    """A custom engine."""
-
-    name = "dummy"
-
-
-ENGINE = Dummy()
-'''
-QUANTITY = """    max_compression: Range | None = drawn(
-        None, 46, "1", 0.01, 0.99, "greatest compression", "skin", "max_compression"
-    )
-
-"""
+EXTENSIONS = {  # by heading: the file, whose name is in the command of the README
+    "A law": "my_law.py",
+    "A question": "my_study.py",
+    "An engine": "my_engine.py",
+    "A drawn quantity": "my_quantity.py",
+    "A task": "band.py",
+}
 EVERYWHERE = """
+import my_engine, my_quantity, my_law, band
+import numpy as np
 import rps_jax
-from rps_jax.app import cli
 from rps_jax.studies.ladder import Ladder
+from rps_jax.world import domain, points
+
 print(rps_jax.__file__)
-setting = rps_jax.Setting("dummy", rules=rps_jax.Rules(horizon=0.5))
-drums = "wide,objects=random_cylinder,max_compression=0.3:0.9"
-found = rps_jax.sweep("straight,K_h=0.5", drums, worlds=8, setting=setting)
-drawn = found.max_compression
-assert drawn.attrs["units"] == "1" and drawn.attrs["long_name"] == "greatest compression"
-assert ((drawn >= 0.3) & (drawn <= 0.9)).all() and drawn.std() > 0.1, drawn
-assert "straight" in Ladder(domain="wide").chosen
-for ask in (lambda: rps_jax.sweep("strait", "wide", 1), lambda: rps_jax.attack("strait", "wide")):
+rules = rps_jax.Rules(horizon=0.5)
+dummy, default = rps_jax.Setting("dummy", rules=rules), rps_jax.Setting(rules=rules)
+drums = "wide,objects=random_cylinder,threshold=0.1:0.5"
+options = {"worlds": 8, "task": "band,half_width=0.2"}
+found = rps_jax.sweep("ahead,gain=0.2", drums, setting=dummy, **options)
+drawn = found.threshold
+assert drawn.attrs == {"units": "1", "long_name": "threshold of the skin"}
+assert ((drawn >= 0.1) & (drawn <= 0.5)).all() and drawn.std() > 0.05, drawn
+assert found.off_line.attrs["long_name"] == "largest distance from the line to the target"
+fused = rps_jax.sweep("ahead,gain=0.2", drums, setting=default, **options)
+np.testing.assert_array_equal(found.min_distance, fused.min_distance)
+ranges = domain.parse_domain(drums)
+worlds = points.worlds_at(ranges, points.points_of(ranges, np.arange(8)))
+again = rps_jax.sweep("ahead", drums, points=worlds, setting=default)
+np.testing.assert_array_equal(again.threshold, drawn)
+assert domain.from_json(domain.to_json(ranges)) == ranges
+custom = rps_jax.Domain(custom={"threshold": rps_jax.Range(0.1, 0.5)})
+assert custom.range_of("threshold").high == 0.5
+skins = rps_jax.draw_worlds(drums, 8).worlds.skin
+np.testing.assert_allclose(skins.threshold, drawn, rtol=1e-6)
+assert "ahead" in Ladder(domain="wide").chosen
+for bad in ("wide,threshold=0.01:0.5", "wide,treshold=0.1:0.5"):
     try:
-        ask()
+        rps_jax.sweep("ahead", bad, 1)
     except rps_jax.InputError as error:
         print(error)
-cli.main(["sweep", "--help"])
 """
 
 
 @pytest.fixture(scope="module")
-def printed(tmp_path_factory):
-    """Output of a copy of the package with another law, quantity and engine."""
-    folder = tmp_path_factory.mktemp("copy")
-    package = folder / "rps_jax"
-    shutil.copytree(PACKAGE, package, ignore=shutil.ignore_patterns("__pycache__"))
-    shutil.copytree(ROOT / "mjcf", folder / "mjcf")
-    laws = package / "control" / "laws"
-    law = (laws / "pursuit.py").read_text().replace("PursuitParams", "StraightParams")
-    (laws / "straight.py").write_text(law.replace('"pursuit"', '"straight"'))
-    (package / "engines" / "dummy.py").write_text(DUMMY)
-    for path, anchor, more in (
-        ("world/domain.py", "    def __post_init__(self) -> None:\n", QUANTITY + "{}"),
-        ("engines/__init__.py", '"quasistatic"]', '"quasistatic", "dummy"]'),
-    ):
-        text = (package / path).read_text()
-        (package / path).write_text(text.replace(anchor, more.format(anchor), 1))
-    environment = os.environ | {"PYTHONPATH": str(folder)}
-    first, _, rest = output_of(
-        sys.executable, "-c", EVERYWHERE, cwd=folder, env=environment
-    ).partition("\n")
-    assert first == str(package / "__init__.py")
-    return rest
+def extensions(tmp_path_factory):
+    """Folder with the examples of the package's README, outside of the package."""
+    folder = tmp_path_factory.mktemp("extensions")
+    page = (PACKAGE / "README.md").read_text().partition("## How to add\n")[2]
+    for heading, name in EXTENSIONS.items():
+        section = page.partition(f"### {heading}\n")[2].partition("\n### ")[0]
+        code = section.partition("```python\n")[2].partition("```")[0]
+        assert name in section, heading
+        (folder / name).write_text(code)
+    return folder
 
 
-def test_a_law_is_one_file_and_a_quantity_one_declaration(printed):
-    """Sweeps, ladders, attacks and errors know them with no other change."""
-    assert printed.partition("usage:")[0].count("straight") == 4
+def process(folder, *words):
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    return output_of(sys.executable, *words, cwd=folder, env=environment)
 
 
-def test_a_custom_engine_is_one_file_and_one_line(printed):
-    """It then works from Python and on the command line, which lists it."""
-    assert "quasistatic,dummy}" in re.sub(r"\s", "", printed)
+def test_examples_of_extensions_work_from_python(extensions):
+    """A law, an engine, a quantity and a task are used together, in sweeps and in points."""
+    printed = process(extensions, "-c", EVERYWHERE)
+    assert printed.startswith(str(PACKAGE))
+    assert (
+        "domain threshold (low) = 0.01 is not allowed: it must be a number and at least" in printed
+    )
+    assert "did you mean 'threshold'?" in printed
+
+
+def test_examples_of_extensions_work_on_the_command_line(extensions):
+    """Files before the command register what its options name, and its help lists them."""
+    files = "my_engine.py", "my_quantity.py", "band.py"
+    shell = "-m", "rps_jax", *files, "sweep"
+    helped = process(extensions, *shell, "--help")
+    assert "quasistatic,dummy}" in re.sub(r"\s", "", helped)
+    options = "--worlds 4 --horizon 0.3 --engine dummy --task band --out run"
+    domain = "wide,objects=random_cylinder,threshold=0.1:0.5"
+    laws = "my_law.py:AheadParams,gain=0.2"
+    process(extensions, *shell, "--laws", laws, "--domain", domain, *options.split())
+    results = rps_jax.load(extensions / "run")
+    assert {"off_line", "threshold"} <= {*map(str, results.variables)}
+    studied = "my_study.py", "--law", "rps", "--worlds", "2", "--horizon", "0.3", "--engine"
+    printed = process(extensions, "-m", "rps_jax", *studied, "quasistatic")
+    assert "of 2 succeeded" in printed

@@ -42,7 +42,7 @@ from rps_jax.trials.env import PushEnv, Reward
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import Rules
 from rps_jax.tuning import collection, ppo
-from rps_jax.tuning.learn import UNITS, Learn
+from rps_jax.tuning.learn import METRICS, Learn
 from rps_jax.tuning.ppo import PPO, TrainState, Transition
 
 SMALL = {"width": 6, "hold": 0.1}
@@ -494,7 +494,7 @@ def test_the_results_of_a_run_and_their_table(learned):
     assert policy.learned["updates"] == 4
     table = pd.read_csv(folder / "curve.csv", index_col="update")
     assert table.index.tolist() == curve["update"].values.tolist() == [1, 2, 3, 4]
-    assert list(table) == list(UNITS)
+    assert list(table) == list(METRICS)
     for name in table:
         assert_array_equal(table[name], curve[name], err_msg=name)
     assert table.validation.isna().tolist() == [True, True, True, False]

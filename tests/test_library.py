@@ -157,12 +157,20 @@ def test_a_table_equals_that_of_the_command(tmp_path):
 
 # --- examples ------------------------------------------------------------------------------
 
-API = {name: pkgutil.resolve_name(f"{module}.{name}") for module, name in addresses()}
+LISTED = [(name, pkgutil.resolve_name(f"{module}.{name}")) for module, name in addresses()]
+API = {  # with the members of public modules that have an example
+    name: member
+    for _, module in LISTED
+    if inspect.ismodule(module)
+    for name, member in vars(module).items()
+    if getattr(member, "__module__", "") == module.__name__ and ">>>" in (member.__doc__ or "")
+}
+API |= {name: entry for name, entry in LISTED if not inspect.ismodule(entry)}
 API |= {
     name: getattr(rps_jax, name) for name in rps_jax.__all__
 }  # such as `paper`, before a module
 API["polygon"] = polygon
-PUBLIC = [name for name, entry in API.items() if callable(entry)]
+PUBLIC = [x for x, entry in API.items() if inspect.isclass(entry) or inspect.isroutine(entry)]
 OPTIONS = doctest.ELLIPSIS | doctest.IGNORE_EXCEPTION_DETAIL
 
 

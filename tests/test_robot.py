@@ -37,10 +37,9 @@ from rps_jax.trials.env import PushEnv
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import Rules
 from rps_jax.tuning import fit
-from rps_jax.world import domain, draws, scene, tasks
+from rps_jax.world import domain, draws, scene
 from rps_jax.world.domain import DOMAINS, Range
 from rps_jax.world.physics import preset
-from rps_jax.world.quantity import declared
 from rps_jax.world.scene import JOINTS, WorldInputs
 
 PERIOD = 0.02
@@ -327,11 +326,6 @@ def test_slips_are_drawn_apart_and_by_columns_of_their_own():
     same(drawn.robot.slip_yaw, turning.robot.slip_yaw)
     assert set(draws.table(turning)) & set(names) == {"robot_slip_yaw"}
     assert len({domain.LABELS[name] for name in names}) == 3
-    of_tasks = {*tasks.QUANTITIES, *tasks.MORE_NUMBERS}
-    others = [column for name, column in draws.USES.items() if name not in of_tasks]
-    for kind in tasks.TASKS.values():  # a world has one task
-        own = [draws.USES[x] for x in {*declared(kind), *kind.MORE_NUMBERS} if x in draws.USES]
-        assert len({*others, *own}) == len(others) + len(own)
     assert set(names) <= set(fit.coordinates(all_three))
 
 

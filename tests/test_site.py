@@ -4,6 +4,7 @@ import ast
 import functools
 import http.server
 import os
+import pkgutil
 import re
 import runpy
 import sys
@@ -13,12 +14,14 @@ from types import SimpleNamespace
 
 import chromium
 import pytest
-from helpers import ROOT, output_of
+from helpers import ROOT, addresses, output_of
 
 import rps_jax
 
 pytest.importorskip("mkdocs", reason="the extra docs is not installed")
 pytest.importorskip("latex2mathml", reason="the extra docs is not installed")
+griffe = pytest.importorskip("griffe", reason="the extra docs is not installed")
+
 HOOKS = runpy.run_path(str(ROOT / "docs" / "hooks.py"))
 
 
@@ -78,6 +81,22 @@ def test_the_index_has_a_link_and_a_sentence_for_each_public_name():
     for name, page, sentence in rows:
         assert page in pages
         assert re.fullmatch(r"[A-Z].{15,}\.", sentence), name
+
+
+def test_the_index_has_one_line_for_each_module():
+    index = HOOKS["reference"]()["README.md"].partition("## Modules")[2]
+    rows = dict(re.findall(r"^\| \[`([\w.]+)`\]\(.*?\) \| ([A-Z`].*[.?]) \|$", index, re.MULTILINE))
+    walked = pkgutil.walk_packages(rps_jax.__path__, "rps_jax.")
+    modules = {x.name for x in walked if not x.name.endswith("__main__")}
+    assert set(rows) == modules
+    assert len(re.findall(r"^\| \[", index, re.MULTILINE)) == len(modules)
+
+
+@pytest.mark.parametrize("name", ["questions", "laws", "worlds", "physics"])
+def test_a_module_of_public_names_has_a_page(name):
+    listed = {entry for module, entry in addresses() if module == f"rps_jax.{name}"}
+    page = HOOKS["reference"]()[f"{name}.md"]
+    assert set(re.findall(rf"^\| \[`rps_jax\.{name}\.(\w+)`\]", page, re.MULTILINE)) == listed
 
 
 def test_each_way_to_add_something_has_a_heading():
@@ -245,3 +264,12 @@ def test_pages_are_readable_without_other_hosts_at_two_widths(site, scheme, tmp_
                 assert not any(faults.values()), (page, width, faults)
                 errors = [x["message"] for x in browser.get_log("browser")]
                 assert errors == [], (page, width)
+
+
+def test_a_declared_number_has_its_meaning_unit_and_limits_on_its_page():
+    extensions = griffe.load_extensions(str(ROOT / "docs" / "specs.py"))
+    where = {"extensions": extensions, "search_paths": [str(ROOT)]}
+    pursuit = griffe.load("rps_jax.control.laws.pursuit", **where)
+    gain = pursuit["PursuitParams.K_v"]
+    assert gain.docstring.value == "Speed over distance [1/s]; above 0."
+    assert str(gain.annotation) == "Parameter"

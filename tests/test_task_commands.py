@@ -1,8 +1,9 @@
 """Tasks in commands, environments and bags, and bad tasks on the command line."""
 
 import json
+import sys
+import types
 from dataclasses import replace
-from typing import Any
 
 import bad_bags
 import gymnasium
@@ -29,7 +30,7 @@ from rps_jax.trials.case import Case
 from rps_jax.trials.trial import Rules
 from rps_jax.tuning.collection import ease
 from rps_jax.tuning.evolution import TuneES
-from rps_jax.world import draws, points, tasks
+from rps_jax.world import draws, points, streams, tasks
 from rps_jax.world.domain import DOMAINS, from_json, parse_domain, to_json
 from rps_jax.world.tasks.base import CourseInputs, Positions, Task
 from rps_jax.world.tasks.path import Path, PathCourse
@@ -90,13 +91,13 @@ def test_a_table_of_worlds_has_the_measures_of_their_paths():
     assert not table["turn_angle"][~turned].any()
 
 
-def test_the_example_of_a_task_is_complete():
+def test_the_example_of_a_task_is_complete(registries, monkeypatch):
     page = (ROOT / "rps_jax" / "README.md").read_text().partition("### A task\n")[2]
-    names: dict[str, Any] = {"__name__": "band"}
-    code = page.partition("```python\n")[2].partition("```")[0]
-    exec(code, names)
-    task: Task = names["TASK"](half_width=0.2)
-    targets = 1 + draws.random_numbers(0, np.arange(2))[:, :2]
+    band = types.ModuleType("band")
+    monkeypatch.setitem(sys.modules, "band", band)  # whose annotations are evaluated
+    exec(page.partition("```python\n")[2].partition("```")[0], vars(band))
+    task: Task = tasks.TASKS["band"](half_width=0.2)  # pyright: ignore[reportCallIssue]
+    targets = 1 + streams.random_numbers(0, np.arange(2))[:, :2]
     goals, course = task.courses(CourseInputs({}, targets, np.full(2, 0.36)))
     world = jax.tree.map(lambda x: jnp.asarray(x[0]), course)
     off, point = jnp.zeros(2), jnp.array([1.0, 0.0])
@@ -127,7 +128,7 @@ def test_a_sweep_records_and_reports_the_outcomes_of_its_task(run):
     results = rps_jax.load(run / "run")
     assert results.attrs["task"] == str(tasks.parse_task(TASK))
     trials = results.sel(law="rps")
-    modes = np.array([*statistics.MODES, ""])[statistics.failure_modes(trials, 150.0)]
+    modes = np.array([*statistics.modes(), ""])[statistics.failure_modes(trials, 150.0)]
     touched = trials.wall_touch.values > 0
     assert 0 < touched.sum() < 12
     assert ((modes == "touched a wall") == touched).all()

@@ -20,6 +20,7 @@ from rps_jax.geometry import polyline
 from rps_jax.geometry.footprint import Footprint
 from rps_jax.geometry.polyline import Polyline
 from rps_jax.runs.push import Push
+from rps_jax.spec import Spec
 from rps_jax.trials.trial import Rules
 from rps_jax.world import draws, tasks
 from rps_jax.world.domain import Range, parse_domain
@@ -279,15 +280,14 @@ class Timed(Task):
 
     kind: str = "timed"
     HAS_TARGET: ClassVar[bool] = True
-    OUTCOMES: ClassVar[dict[str, tuple[str, str]]] = {"count": ("1", "control steps")}
+    OUTCOMES: ClassVar[dict[str, Spec]] = {"count": Spec("1", "control steps")}
 
     def courses(self, inputs: CourseInputs) -> tuple[np.ndarray, Timer]:
         return inputs.p_world_target, Timer(np.zeros(inputs.front.size))
 
 
-def test_a_task_is_one_declaration(monkeypatch):
-    monkeypatch.setitem(tasks.TASKS, "timed", Timed)
-    monkeypatch.setitem(tasks.OUTCOMES, "count", ("1", "control steps"))
+def test_a_task_is_one_declaration(registries):
+    rps_jax.register_task(Timed)
     domain = replace(parse_domain("wide,objects=random_cylinder"), task=Timed())
     results = rps_jax.sweep("rps", domain, worlds=3, setting=BRIEF)
     assert results["count"].values.tolist() == [[10, 10, 10]]

@@ -14,7 +14,7 @@ from rps_jax.control.laws.rps import RPSParams
 from rps_jax.trials.setting import Setting
 from rps_jax.world.tasks import TASKS, corridor
 
-SETTINGS = {name: Setting(name) for name in engines.ENGINES if engines.get(name).modes}
+SETTINGS = {name: Setting(name) for name in engines.names() if engines.get(name).modes}
 LAW = RPSParams.tuned()
 ROOM = {"kind": "rooms", "outline": [[-1, -1], [4, -1], [4, 2], [-1, 2]], "goal": [2, 1]}
 EXAMPLES = {"rooms": ROOM}  # of tasks that need more than their name

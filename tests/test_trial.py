@@ -171,7 +171,7 @@ def test_a_contact_on_dead_taxels_is_no_lost_contact(outcomes):
     assert np.isinf(results.min_distance).all()
     columns = {k: ("world", v) for k, v in results.columns().items() if np.ndim(v) == 1}
     modes = statistics.failure_modes(xr.Dataset(columns), 150.0)
-    assert {statistics.MODES[mode] for mode in modes.tolist()} == {"contact not felt"}
+    assert {statistics.modes()[mode] for mode in modes.tolist()} == {"contact not felt"}
     assert not outcomes.unfelt.any()
     # After 5 s without contact a trial ends, and the base stands against the object or not.
     _, worlds, params = world_batch(2)

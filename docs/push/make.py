@@ -286,7 +286,7 @@ def values_of(tree: Any) -> dict[str, Any]:
 
 def routes(count: int = 6) -> list[list[list[float]]]:
     """Return the vertices of paths that the package draws."""
-    u = draws.by_name(draws.random_numbers(0, np.arange(count)))
+    u = draws.numbers(0, np.arange(count))
     front = np.full(count, float(Robot().half_length))
     vertices = path.Path().vertices(CourseInputs(u, np.zeros((count, 2)), front)).round(3)
     return [[p for p, q in zip(x, [None, *x], strict=False) if p != q] for x in vertices.tolist()]

@@ -30,9 +30,16 @@ def scores(vectors, worlds, horizon):
 def main(worlds: int = 64, generations: int = 10, horizon: float = 300.0):
     """Search, and compare with the paper's parameters in test worlds."""
     optimum = differential_evolution(
-        scores, list(BOUNDS.values()), args=(worlds, horizon), maxiter=generations, popsize=8,
-        seed=0, vectorized=True, updating="deferred", polish=False,
-    )  # fmt: skip
+        scores,
+        list(BOUNDS.values()),
+        args=(worlds, horizon),
+        maxiter=generations,
+        popsize=8,
+        seed=0,
+        vectorized=True,
+        updating="deferred",
+        polish=False,
+    )
     best = PARAMS._replace(**dict(zip(BOUNDS, optimum.x, strict=True)))
     setting = setting_of(horizon)
     tested = rps_jax.evaluate([PARAMS, best], "wide", 8 * worlds, split="test", setting=setting)

@@ -19,7 +19,7 @@ import numpy as np
 import tyro
 
 from rps_jax import Observation, RPSParams, RPSState, step
-from rps_jax.robot.skin import CapacitiveSkin
+from rps_jax.worlds import CapacitiveSkin
 
 PERIOD = 0.001  # [s]
 

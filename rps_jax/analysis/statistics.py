@@ -26,7 +26,6 @@ FAILURES = (
     "stalled",
     "contact not felt",
 )
-MODES = (*FAILURES, *tasks.FAILURES.values())  # with those of tasks
 # Failure modes in order of precedence, after those of tasks.
 _PRECEDENCE = (
     "diverged",
@@ -180,8 +179,13 @@ def distance_left(trials: xr.Dataset) -> np.ndarray:
     return miss_distance(trials.min_distance.values, trials.distance.values)
 
 
+def modes() -> tuple[str, ...]:
+    """Return the failure modes, also those of tasks."""
+    return (*FAILURES, *tasks.FAILURES.values())
+
+
 def failure_modes(trials: xr.Dataset, max_lost: float) -> np.ndarray:
-    """Return indices (world,) into `MODES` of the trials of one law, -1 for a success."""
+    """Return indices (world,) into `modes()` of the trials of one law, -1 for a success."""
     none = xr.zeros_like(trials.success)
     return np.select(
         [
@@ -194,8 +198,8 @@ def failure_modes(trials: xr.Dataset, max_lost: float) -> np.ndarray:
             ~np.isfinite(trials.min_distance.values),
             trials.contact_lost_time.values > max_lost,
         ],
-        [-1, *map(MODES.index, (*tasks.FAILURES.values(), *_PRECEDENCE))],
-        MODES.index("timeout"),
+        [-1, *map(modes().index, (*tasks.FAILURES.values(), *_PRECEDENCE))],
+        modes().index("timeout"),
     )
 
 

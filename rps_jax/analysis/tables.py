@@ -89,7 +89,7 @@ def success_table(results: xr.Dataset, max_lost: float) -> list[list[str]]:
     groups = statistics.worlds_by_object(results)
     recorded = {"stalled": "stalled", "contact not felt": "unfelt"}
     recorded |= {text: name for name, text in tasks.FAILURES.items()}
-    modes = [mode for mode in statistics.MODES if recorded.get(mode, "success") in results]
+    modes = [mode for mode in statistics.modes() if recorded.get(mode, "success") in results]
     laws = results.sizes["law"]
     bound = "fails at most" + f" (best of {laws})" * (laws > 1)
     header = ["", *groups, "all", bound, "CVaR 5 % of distance"]
@@ -109,7 +109,7 @@ def success_table(results: xr.Dataset, max_lost: float) -> list[list[str]]:
                 _cvar(statistics.distance_left(trials)),
                 f"{np.median(trials.time.values[success]):.1f} s" if success.any() else "-",
                 f"{np.median(trials.path_length.values[success]):.2f} m" if success.any() else "-",
-                *(str(int((mode_index == statistics.MODES.index(mode)).sum())) for mode in modes),
+                *(str(int((mode_index == statistics.modes().index(mode)).sum())) for mode in modes),
             ]
         )
     return rows
@@ -130,15 +130,17 @@ def task_table(results: xr.Dataset) -> list[list[str]]:
     """Return a row for each outcome that the task adds: its values by law, and its meaning."""
     rows = [["", *map(str, results.law.values), "meaning"]]
     for name in (x for x in tasks.OUTCOMES if x in results and not x.endswith(("_x", "_y"))):
-        unit, meaning = tasks.OUTCOMES[name]
+        spec = tasks.OUTCOMES[name]
         values = results[name].transpose("world", "law").to_pandas()  # whose quantiles skip NaN
         low, *middle, high = values.quantile([0.05, 0.5, 0.95]).round(3).to_numpy()
         spreads = zip(*middle, low, high, strict=True)
-        cells = [f"{m:g}{f' {unit}' * (unit != '1')} [{a:g}, {b:g}]" for m, a, b in spreads]
+        cells = [
+            f"{m:g}{f' {spec.unit}' * (spec.unit != '1')} [{a:g}, {b:g}]" for m, a, b in spreads
+        ]
         if name in tasks.FAILURES:
             counts = [values[law][values[law] > 0].value_counts() for law in values]
             cells = [", ".join(f"{k:g}: {n}" for k, n in x.items()) or "none" for x in counts]
-        rows.append([name.replace("_", " "), *cells, meaning])
+        rows.append([name.replace("_", " "), *cells, spec.about])
     return rows if len(rows) > 1 else []
 
 

@@ -1,30 +1,24 @@
 """Types of a control law: its two functions, its parameters, and the bounds for tuning them."""
 
-import contextlib
-import re
-import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from typing import (
     Any,
     Generic,
     Literal,
-    NamedTuple,
     Protocol,
     TypeVar,
-    get_args,
-    get_type_hints,
     runtime_checkable,
 )
 
 import jax
 import numpy as np
 
-from rps_jax import errors
 from rps_jax.control.observation import Details, Twist
 from rps_jax.robot.base import LoadCell
 from rps_jax.robot.robot import DriveKind
+from rps_jax.spec import Bound as Bound
+from rps_jax.spec import Spec, spec_at, specs_of
 
 # What a law observes in addition to odometry and the target: the contact point (`Observation`),
 # the signal of each taxel as well (`TaxelObservation`), the contact force as well
@@ -56,30 +50,9 @@ State = TypeVar("State")  # a pytree of arrays
 Obs = TypeVar("Obs")
 
 
-class Bound(NamedTuple):
-    """Interval in which a parameter is tuned."""
-
-    low: float
-    high: float
-    log: bool = False  # whether the scale is logarithmic
-    relative_to: str = ""  # name of a parameter; the interval is then a fraction of its value
-
-
-def document_fields(kind: type[T]) -> type[T]:
-    """Copy the comment at each field of a NamedTuple into its docstring, for `help`."""
-    with contextlib.suppress(OSError):  # there is no source
-        source = Path(str(sys.modules[kind.__module__].__file__)).read_text("utf-8")
-        body = source.partition(f"\nclass {kind.__name__}(")[2].partition("\n\n\n")[0]
-        pattern = r"^(?:    # (.+)\n)?    (\w+): .*?(?:  # (.+))?$"
-        for above, name, behind in re.findall(pattern, body, re.MULTILINE):
-            getattr(kind, name).__doc__ = behind or above
-    return kind
-
-
 def bounds_of(kind: type) -> tuple[tuple[str, Bound], ...]:
-    """Return the names of parameters and the bounds in their annotations."""
-    hints = get_type_hints(kind, include_extras=True).items()
-    return tuple((name, x) for name, hint in hints for x in get_args(hint) if isinstance(x, Bound))
+    """Return the names of parameters and the intervals of tuners in their declarations."""
+    return tuple((name, x.tune) for name, x in specs_of(kind).items() if x.tune is not None)
 
 
 def named_leaves(tree: object, is_leaf: Callable[[object], bool] | None = None) -> dict[str, Leaf]:
@@ -89,38 +62,21 @@ def named_leaves(tree: object, is_leaf: Callable[[object], bool] | None = None) 
 
 
 def unit_of_leaf(params: object, path: str) -> str:
-    """Return the unit in the comment of a parameter; empty if it has none."""
-    *owners, name = path.split(".")
-    for owner in owners:
-        params = getattr(params, owner, None)
-    doc = getattr(getattr(type(params), name, None), "__doc__", None) or ""
-    return "".join(re.findall(r"^\[([^\]]*)\]", doc))
+    """Return the declared unit of a parameter; empty if it has none."""
+    declaration = spec_at(params, path)
+    return "" if declaration is None else declaration.unit
 
 
 def check_finite_leaves(tree: T) -> T:
-    """Return the pytree if all its leaves are finite numbers; otherwise raise InputError."""
-    for name, leaf in named_leaves(tree).items():
-        for value in np.ravel(leaf):
-            errors.check_finite(name, value)
-    return tree
-
-
-def check_signs(
-    law: str, positive: Sequence[str], params: Params, free: Sequence[str] = ()
-) -> Params:
-    """Return flat parameters if all are finite scalars of the right sign.
-
-    Parameters named in `positive` must be above 0, those in `free` may have any sign, and all
-    others must be at least 0.
+    """Return the pytree if all its leaves are finite and within their declared limits.
 
     Raises:
-      InputError: a parameter is out of range; the error names the `law` and the parameter.
+      InputError: one is not.
     """
-    for name, value in named_leaves(params, is_leaf=lambda x: x is not params).items():
-        bounds = {} if name in free else {"at_least": 0}
-        bounds = {"above": 0} if name in positive else bounds
-        errors.check_finite(f"{law}.{name}", value, **bounds)
-    return params
+    for name, leaf in named_leaves(tree).items():
+        for value in np.ravel(leaf):
+            (spec_at(tree, name) or Spec()).check(name, value)
+    return tree
 
 
 @dataclass(frozen=True)
@@ -136,7 +92,7 @@ class Law(Generic[Params, State, Obs]):
     step: Callable[[Params, State, Obs], tuple[State, Twist, Details]]
     senses: Senses = "touch"
     check: Callable[[Params], Params] = check_finite_leaves  # raises InputError for bad params
-    # Of the parameters that may be tuned, by name.
+    # Of the parameters that may be tuned, by name; a registered law has those of its declarations.
     bounds: Mapping[str, Bound] | tuple[tuple[str, Bound], ...] = ()
     # Defaults of an earlier version that differ; a file of changes must name these parameters.
     earlier: tuple[tuple[str, float], ...] = ()

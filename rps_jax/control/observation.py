@@ -5,7 +5,7 @@ Frames: W is the world, R the robot (origin at the centre of the base, x forward
 
 from __future__ import annotations
 
-from typing import NamedTuple, TypeVar
+from typing import Annotated, NamedTuple, TypeVar
 
 import jax.numpy as jnp
 
@@ -22,6 +22,7 @@ from rps_jax.geometry.arrays import (
     Vector,
 )
 from rps_jax.robot.robot import Robot
+from rps_jax.spec import Spec
 
 # Displacements are clipped to this distance [m], so that no finite float32 overflows.
 _WORLD_SIZE = 1e9
@@ -30,18 +31,30 @@ _WORLD_SIZE = 1e9
 class Observation(NamedTuple):
     """Observation of a law that senses touch: odometry, the contact and the target."""
 
-    p_world_robot: Vector  # [m]
-    yaw: Scalar  # [rad] heading of the robot in the world
-    p_robot_contact: Vector  # [m] contact point; ignored unless in_contact
-    in_contact: Bool[Array, ""] | Float[Array, ""]  # for a smooth law also a weight from 0 to 1
-    p_world_target: Vector  # [m]
-    period: Scalar = 0.02  # [s] since the last control step
-    base_radius: Number | None = None  # [m] of a round base; None: a rectangle
-    # [m] position, behind the base's middle, of an axle that cannot move sideways; None: an
-    # omnidirectional base
-    axle: Number | None = None
-    turning_radius: Number | None = None  # [m] least, of the axle of a car; None: it may be 0
-    half_length: Number | None = None  # [m] of a rectangle with such an axle
+    p_world_robot: Annotated[Vector, Spec("m", "position of the robot in the world")]
+    yaw: Annotated[Scalar, Spec("rad", "heading of the robot in the world")]
+    p_robot_contact: Annotated[
+        Vector, Spec("m", "contact point in the robot frame; ignored unless in_contact")
+    ]
+    in_contact: Annotated[
+        Bool[Array, ""] | Float[Array, ""],
+        Spec("1", "whether there is a contact; for a smooth law also a weight from 0 to 1"),
+    ]
+    p_world_target: Annotated[Vector, Spec("m", "target in the world")]
+    period: Annotated[Scalar, Spec("s", "time since the last control step")] = 0.02
+    base_radius: Annotated[
+        Number | None, Spec("m", "radius of a round base; None: a rectangle")
+    ] = None
+    axle: Annotated[
+        Number | None,
+        Spec("m", "axle that cannot move sideways, behind the base's middle; None: there is none"),
+    ] = None
+    turning_radius: Annotated[
+        Number | None, Spec("m", "least turning radius of a car's axle; None: it may be 0")
+    ] = None
+    half_length: Annotated[
+        Number | None, Spec("m", "half length of a rectangle with such an axle")
+    ] = None
 
     @property
     def l(self) -> Floats:  # noqa: E743
@@ -56,23 +69,29 @@ class TaxelObservation(NamedTuple):
     """Observation of a law that also senses the signal of each taxel."""
 
     touch: Observation  # `in_contact` is a bool
-    signal: Float[Array, " T"]  # [1] filtered relative change of capacitance; 0 for a dead taxel
-    line: Bool[Array, ""]  # whether the contact is a line, longer than a point
+    signal: Annotated[
+        Float[Array, " T"], Spec("1", "filtered relative change of capacitance; 0 for a dead taxel")
+    ]
+    line: Annotated[
+        Bool[Array, ""], Spec("1", "whether the contact is a line, longer than a point")
+    ]
 
 
 class ForceObservation(NamedTuple):
     """Observation of a law that also senses the contact force."""
 
     touch: Observation
-    f_robot: Vector  # [N] of the object on the base, in its frame: see `LoadCell`
+    f_robot: Annotated[
+        Vector, Spec("N", "force of the object on the base, in the robot frame: see `LoadCell`")
+    ]
 
 
 class PoseObservation(NamedTuple):
     """Observation of a law that also senses the object's position and size."""
 
     touch: Observation
-    p_world_object: Vector  # [m]
-    r_object: Scalar  # [m] radius of the object's outline
+    p_world_object: Annotated[Vector, Spec("m", "position of the object in the world")]
+    r_object: Annotated[Scalar, Spec("m", "radius of the object's outline")]
 
 
 AnyObservation = Observation | TaxelObservation | ForceObservation | PoseObservation
@@ -98,9 +117,9 @@ def with_base(obs: Observed, radius: Number | None, robot: Robot | None = None) 
 class Twist(NamedTuple):
     """Commanded velocity of the base, in the robot frame."""
 
-    v_x: PerWorld  # [m/s] forward
-    v_y: PerWorld  # [m/s] left
-    omega: PerWorld  # [rad/s] counter-clockwise
+    v_x: Annotated[PerWorld, Spec("m/s", "forward velocity")]
+    v_y: Annotated[PerWorld, Spec("m/s", "velocity to the left")]
+    omega: Annotated[PerWorld, Spec("rad/s", "turning rate, counter-clockwise")]
 
     @classmethod
     def from_point_velocity(cls, p_robot: Vector, v_robot: Vector, omega: Scalar) -> Twist:
@@ -125,11 +144,13 @@ class Twist(NamedTuple):
 class Details(NamedTuple):
     """Intermediate quantities of one control step, for plots and tests."""
 
-    l: Floats  # noqa: E741  [m] contact offset, the paper's symbol
-    distance: Floats  # [m] ||d||, contact point to target
-    a_r: Floats  # [1] adaptive rate
-    gamma: Floats  # [rad] steering angle
-    realigning: Bools | Floats  # in the Realignment State; or a weight
+    l: Annotated[Floats, Spec("m", "contact offset, the paper's symbol")]  # noqa: E741
+    distance: Annotated[Floats, Spec("m", "||d||, contact point to target")]
+    a_r: Annotated[Floats, Spec("1", "adaptive rate")]
+    gamma: Annotated[Floats, Spec("rad", "steering angle")]
+    realigning: Annotated[
+        Bools | Floats, Spec("1", "whether the law is in the Realignment State; or a weight")
+    ]
 
     @classmethod
     def from_obs(cls, obs: Observation) -> Details:

@@ -20,7 +20,15 @@ import numpy as np
 
 from rps_jax import errors
 from rps_jax.control import laws, sources, validation
-from rps_jax.control.base import Law, LawParams, Params, Senses, Smoothing, named_leaves
+from rps_jax.control.base import (
+    Law,
+    LawParams,
+    Params,
+    Senses,
+    Smoothing,
+    bounds_of,
+    named_leaves,
+)
 from rps_jax.control.learned import policy
 from rps_jax.errors import InputError
 from rps_jax.record import files
@@ -86,7 +94,12 @@ def replace_leaves(tree: T, changes: Mapping[str, Any]) -> T:
 
 
 def law_of(params: LawParams | type) -> Law:
-    """Return the law of parameters, or of their class; InputError if there is none."""
+    """Return the law of parameters, or of their class; InputError if there is none.
+
+    Examples:
+      >>> law_of(resolve_law("rps_plus")[1]).senses
+      'touch'
+    """
     kind = params if isinstance(params, type) else type(params)
     if kind not in _LAWS_BY_CLASS:
         known = ", ".join(known.__name__ for known in _LAWS_BY_CLASS)
@@ -202,6 +215,7 @@ def register_law(name: str, law: Law, params: LawParams) -> None:
         raise errors.not_allowed(f"params of law '{name}'", params, rule)
     errors.check_finite(f"d_success of law '{name}'", params.d_success, above=0, unit="m")
     law.check(params)
+    law = law if law.bounds else replace(law, bounds=bounds_of(kind))
     for parameter in dict(law.bounds):
         errors.check_name(f"bound of law '{name}'", parameter, named_leaves(params))
     for label, known in (_HIDDEN | LAWS).items():
@@ -301,6 +315,11 @@ def resolve_law(law: LawLike, index: int = 0) -> tuple[str, LawParams]:
 
     The label of parameters is the name of the law; with a number, `index` + 1, unless they are one
     of its presets.
+
+    Examples:
+      >>> label, params = resolve_law("rps,K_h=0.5")
+      >>> label, params.K_h
+      ('rps,K_h=0.5', 0.5)
     """
     if isinstance(law, str):
         return parse_law(law)

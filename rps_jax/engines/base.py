@@ -153,7 +153,7 @@ class Engine(abc.ABC):
         """Raise InputError unless the engine can step worlds with these surroundings."""
         for name, value in surroundings._asdict().items():
             if value is not None and name not in self.surroundings:
-                known = [x for x in engines.ENGINES if name in engines.get(x).surroundings]
+                known = [x for x in engines.names() if name in engines.get(x).surroundings]
                 raise self._refused(f"it has no {name}; choose {' or '.join(known)}")
 
     def check_senses(self, senses: str) -> None:
@@ -169,7 +169,7 @@ class Engine(abc.ABC):
     def check_derivatives(self, mode: Mode) -> None:
         """Raise InputError unless a trial can be differentiated in this mode."""
         if mode not in self.modes:
-            known = [name for name in engines.ENGINES if mode in engines.get(name).modes]
+            known = [name for name in engines.names() if mode in engines.get(name).modes]
             raise self._refused(f"it has no {mode}-mode derivatives; choose {' or '.join(known)}")
 
     def guard_derivatives(self, tree: T) -> T:

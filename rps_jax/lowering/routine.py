@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
 import re
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple, TypeAlias
@@ -14,6 +13,7 @@ from jax.extend.core import ClosedJaxpr
 from rps_jax import errors
 from rps_jax.lowering.target import Shape, kind_of, size_of
 from rps_jax.lowering.walk import traced
+from rps_jax.spec import spec_at
 
 Pytree: TypeAlias = Any  # of arrays or of `jax.ShapeDtypeStruct`
 _DTYPES = {"f": np.float64, "i": np.int64, "b": np.bool_}
@@ -82,16 +82,8 @@ def fields_of(tree: Pytree, values: Pytree = None) -> Group:
 
 
 def _about(tree: Pytree, path: str) -> str:
-    """Return the comment behind a field in the source of its class."""
-    *steps, last = path.split(".")
-    for step in steps:
-        tree = getattr(tree, step, None)
-    try:
-        source = inspect.getsource(type(tree))
-    except (OSError, TypeError):
-        return ""
-    line = re.search(rf"^    {re.escape(last)}:[^#\n]*(?:# noqa\S* \S*)?# *(.*)$", source, re.M)
-    return re.sub(r"^(\(\d*T?,?\) |noqa: \S+ +)", "", line[1]).replace("*/", "") if line else ""
+    """Return the declared unit and meaning of a leaf."""
+    return str(spec_at(tree, path) or "").replace("*/", "")
 
 
 def identifier(text: str) -> str:

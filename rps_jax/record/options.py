@@ -1,4 +1,4 @@
-"""Options: dataclass fields with a type, bounds, a unit, and a docstring as their help.
+"""Options: dataclass fields with a type, the declaration of their number, and help.
 
 The command line, the checks and the manifests of runs are derived from these declarations.
 """
@@ -17,8 +17,9 @@ import numpy as np
 
 from rps_jax import errors
 from rps_jax.record import files
+from rps_jax.spec import SPEC, Choices, Spec, specs_of
 
-HIDDEN, POSITIONAL, FLAG, _BOUNDS = "hidden", "positional", "flag", "bounds"  # metadata of fields
+HIDDEN, POSITIONAL, FLAG = "hidden", "positional", "flag"  # metadata of fields
 _MAX_SHOWN = 200  # characters of a value in an error
 _NOUNS: dict[Any, str] = {  # of types, for errors
     str: "a text", Path: "a path", bool: "True or False", float: "a number", int: "a whole number",
@@ -42,17 +43,34 @@ def option(
 
     The command line has a `positional` field without a flag, and does not offer a `hidden` one. A
     field with a `flag` has a tuple of texts, one for each time that the flag of this name is given.
+
+    Examples:
+      >>> dict(option(0.05, above=0, at_most=1, unit="m/s").metadata["bounds"])
+      {'at_most': 1, 'above': 0, 'unit': 'm/s'}
     """
-    bounds = {"at_least": at_least, "at_most": at_most, "above": above, "unit": unit or None}
-    bounds = {name: bound for name, bound in bounds.items() if bound is not None}
-    metadata = {_BOUNDS: bounds, HIDDEN: hidden, POSITIONAL: positional, FLAG: flag}
+    metadata = {HIDDEN: hidden, POSITIONAL: positional, FLAG: flag}
+    if unit or not at_least is at_most is above is None:
+        metadata[SPEC] = Spec(unit, ge=at_least, le=at_most, gt=above)
     return dataclasses.field(default=default, metadata=metadata, kw_only=kw_only)
 
 
+def field_types(kind: Any) -> dict[str, Any]:
+    """Return the types of a dataclass's fields, or of a function's arguments, by name."""
+    types_, choices = _types_of(kind)
+    return types_ | {name: Literal[open_.names()] for name, open_ in choices.items()}
+
+
 @functools.cache
-def field_types(kind: type) -> dict[str, Any]:
-    """Return the types of a dataclass's fields, by name."""
-    return typing.get_type_hints(kind)
+def _types_of(kind: Any) -> tuple[dict[str, Any], dict[str, Choices]]:
+    """Return types by name, and the choices of those that a registry extends."""
+    hints = typing.get_type_hints(kind, include_extras=True)
+    choices = {
+        name: x
+        for name, hint in hints.items()
+        for x in getattr(hint, "__metadata__", ())
+        if isinstance(x, Choices)
+    }
+    return typing.get_type_hints(kind), choices
 
 
 def check_fields(record: object, prefix: str = "") -> None:
@@ -62,26 +80,26 @@ def check_fields(record: object, prefix: str = "") -> None:
     `None`. Fields of other types are checked by their types, and by their bounds, if these are
     declared, number by number; their default is always allowed.
     """
-    types_ = field_types(type(record))
+    types_, specs = field_types(type(record)), specs_of(type(record))
     for field in dataclasses.fields(typing.cast(Any, record)):
         # As the user gave it: a property may convert it.
         if (value := vars(record)[field.name]) is not field.default:
-            _check(f"{prefix}{field.name}", value, types_[field.name], field.metadata)
+            _check(f"{prefix}{field.name}", value, types_[field.name], specs.get(field.name))
 
 
 def check_arguments(function: Callable[..., object], values: Mapping[str, object]) -> None:
     """Check the arguments of a function by their types, as `check_fields` checks fields."""
     for name, value in values.items():
-        _check(name, value, field_types(function)[name], {})
+        _check(name, value, field_types(function)[name], None)
 
 
-def _check(name: str, value: Any, kind: Any, metadata: Mapping[str, Any]) -> None:
-    """Check a value by its type, and by the bounds in the metadata of its field."""
+def _check(name: str, value: Any, kind: Any, spec: Spec | None) -> None:
+    """Check a value by its type, and by the limits of its declaration."""
     kinds = _alternatives(kind)
     if value is None and type(None) in kinds:
         return
     kinds = [inner for inner in kinds if inner is not type(None)]
-    bounds = metadata.get(_BOUNDS)
+    bounds = None if spec is None else spec.bounds
     kind = kinds[0] if len(kinds) == 1 else None
     if get_origin(kind) is Literal:
         errors.check_name(name, str(value), get_args(kind))
@@ -96,13 +114,13 @@ def _check(name: str, value: Any, kind: Any, metadata: Mapping[str, Any]) -> Non
         if Ellipsis not in get_args(kind) and len(items) != len(get_args(kind)):
             raise errors.not_allowed(name, value, f"give {len(get_args(kind))} numbers")
         for item in items:
-            _check(name, item, get_args(kind)[0], metadata)
+            _check(name, item, get_args(kind)[0], spec)
     elif not any(_is_of(value, inner) for inner in kinds):
         nouns = list(dict.fromkeys(map(_noun, kinds)))
         example = f", as [{value!r}]" if isinstance(value, str) and "several" in nouns[0] else ""
         shown = text if len(text := repr(value)) <= _MAX_SHOWN else _noun(type(value))
         raise errors.not_allowed(name, shown, f"give {' or '.join(nouns)}{example}")
-    elif bounds:
+    elif bounds and not hasattr(value, "_fields"):  # a record checks itself
         for number in np.ravel(np.asarray(value, object)):
             errors.check_finite(name, number, **bounds)
 
@@ -123,7 +141,8 @@ def _is_of(value: Any, kind: Any) -> bool:
         items = list(value)
         if origin is tuple and Ellipsis not in inner and len(items) != len(inner):
             return False
-        return all(_is_of(item, inner[0]) for item in items)
+        inner = inner[:1] * len(items) if origin is Sequence or Ellipsis in inner else inner
+        return all(map(_is_of, items, inner))
     if kind is float or kind is int:
         base: Any = numbers.Real if kind is float else numbers.Integral
         is_scalar = np.ndim(value) == 0 and hasattr(value, "dtype") and value.dtype.kind in "iuf"

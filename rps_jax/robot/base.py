@@ -7,14 +7,15 @@ the size that data sheets of wrist sensors give.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from rps_jax import errors
+from rps_jax import spec
 from rps_jax.geometry.arrays import Number, Pair
+from rps_jax.spec import Spec
 
 _ODOMETRY, _FORCE = 7, 11  # folded into a world's key; the skin splits it into fewer
 
@@ -26,13 +27,19 @@ class Odometry(NamedTuple):
     remembered steps, more than the longest latency or delay; with K = 0 the base is perfect.
     """
 
-    pose_noise: Number = 0.0  # () [m] standard deviation of each position reading
-    yaw_noise: Number = 0.0  # () [rad] standard deviation of each heading reading
-    pose_latency: Number = 0.0  # () [s] age of the pose that the law observes
-    command_delay: Number = 0.0  # () [s] between a command and its execution
-    # (3,) [1] of each component of the twist; of a differential drive, the first and the last are
-    # those of the left and the right wheel
-    velocity_error: Number = 0.0
+    pose_noise: Annotated[
+        Number, Spec("m", "standard deviation of each position reading", ge=0)
+    ] = 0.0  # ()
+    yaw_noise: Annotated[
+        Number, Spec("rad", "standard deviation of each heading reading", ge=0)
+    ] = 0.0  # ()
+    pose_latency: Annotated[Number, Spec("s", "age of the pose that the law observes", ge=0)] = 0.0
+    command_delay: Annotated[
+        Number, Spec("s", "time between a command and its execution", ge=0)
+    ] = 0.0  # ()
+    velocity_error: Annotated[
+        Number, Spec("1", "error of each component of the twist, or of two wheels")
+    ] = 0.0  # (3,)
     past: np.ndarray | jax.Array = np.zeros(0)  # (K,)
 
 
@@ -74,16 +81,18 @@ def _steps_of(time: Number, period: float) -> jax.Array:
 class LoadCell(NamedTuple):
     """A sensor of the planar force on the base; static, and so plain numbers."""
 
-    noise: float = 1.0  # [N] standard deviation of each raw reading, of both components
-    # [s] of the low-pass filter, from Heins and Schoellig (2024)
-    time_constant: float = 0.05
-    threshold: float = 2.0  # [N] of the filtered force, below which the reading is zero
+    noise: Annotated[
+        float, Spec("N", "standard deviation of each raw reading, of both components", ge=0)
+    ] = 1.0
+    # From Heins and Schoellig (2024).
+    time_constant: Annotated[float, Spec("s", "time constant of the low-pass filter", gt=0)] = 0.05
+    threshold: Annotated[
+        float, Spec("N", "filtered force below which the reading is zero", ge=0)
+    ] = 2.0
 
     def check(self) -> None:
         """Raise InputError for noise, filter or threshold that no sensor can have."""
-        errors.check_finite("load cell noise", self.noise, at_least=0, unit="N")
-        errors.check_finite("load cell time_constant", self.time_constant, above=0, unit="s")
-        errors.check_finite("load cell threshold", self.threshold, at_least=0, unit="N")
+        spec.check(self, "load cell ")
 
     def read(
         self, load: Load, key: jax.Array, steps: jax.Array, period: float
@@ -103,8 +112,11 @@ class LoadCell(NamedTuple):
 class Load(NamedTuple):
     """State of a load cell between two readings."""
 
-    wrench: jax.Array  # (3,) [N, N, N m] of the object on the base in the last period, its frame
-    signal: jax.Array  # (2,) [N] the filtered force
+    # In the base's frame.
+    wrench: Annotated[
+        jax.Array, Spec("N, N, N m", "wrench of the object on the base in the last period")
+    ]  # (3,)
+    signal: Annotated[jax.Array, Spec("N", "filtered force")]  # (2,)
 
 
 def init_load(template: jax.Array) -> Load:

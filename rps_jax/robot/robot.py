@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import reduce
 from pathlib import Path
-from typing import Any, Literal, TypeAlias
+from typing import Annotated, Any, Literal, TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -20,8 +20,9 @@ import numpy as np
 from rps_jax import errors
 from rps_jax.geometry.solid import GRAVITY
 from rps_jax.record import files
-from rps_jax.record.options import check_fields, option, parse_changes
+from rps_jax.record.options import check_fields, parse_changes
 from rps_jax.robot.shell import BOARDS, HALF_LENGTH, HALF_WIDTH, Boards, Shell
+from rps_jax.spec import Spec
 
 # A number or an array of a batch, on the host or traced. `Any`: NumPy's, JAX's and Python's numbers
 # have no common type with arithmetic.
@@ -40,42 +41,75 @@ class Robot:
     `omni` has an axle that cannot move sideways: see `robot.drive`.
     """
 
-    half_length: Number = HALF_LENGTH  # () [m]
-    half_width: Number = HALF_WIDTH  # () [m]
+    half_length: Annotated[Number, Spec("m", "half length of the base")] = HALF_LENGTH  # ()
+    half_width: Annotated[Number, Spec("m", "half width of the base")] = HALF_WIDTH  # ()
     boards: tuple[Boards, ...] = BOARDS  # of the skin
-    # () of the whole robot; used if the force is limited
-    mass: Number = option(130.0, above=0, at_most=1e4, unit="kg")
-    # () maximum speed in any direction, or (2,) forward and sideways
-    v_max: Number = option(None, _POSITIVE, 10, unit="m/s")
-    omega_max: Number = option(None, _POSITIVE, 20, unit="rad/s")  # () maximum turning rate
-    lag: Number = option(None, 0, 5, unit="s")  # () time constant with which it follows a twist
-    acceleration_max: Number = option(None, _POSITIVE, 100)  # (2,) [m/s^2, rad/s^2] maximum
-    force_max: Number = option(None, 0, 1e5, unit="N")  # () of the drive, in any direction
-    torque_max: Number = option(None, _POSITIVE, 1e5, unit="N m")  # () about the vertical
-    # () of the drive's velocity servo; used if the force is limited
-    bandwidth: Number = option(5.0, 0.1, 100, unit="Hz")
-    # () [1] friction coefficient of the wheels; bounds force and torque
-    traction: Number = option(None, _POSITIVE, 5)
-    resistance: Number = option(None, 0, 1)  # () [1] rolling resistance over the weight
-    slip: Number = option(None, 0, 0.9)  # () [1] share of the velocity that the wheels lose
-    # () [1] shares of v_y and of omega, as rollers lose more of these; None: equal to `slip`
-    slip_sideways: Number = option(None, 0, 0.9)
-    slip_yaw: Number = option(None, 0, 0.9)
-    # () of a round base, in place of half length and half width; None: a rectangle
-    radius: Number = option(None, 0.1, 2, unit="m")
+    # Used if the force is limited.
+    mass: Annotated[Number, Spec("kg", "mass of the whole robot", gt=0, le=1e4)] = 130.0  # ()
+    # (2,): forward and sideways
+    v_max: Annotated[
+        Number, Spec("m/s", "greatest speed in any direction", ge=_POSITIVE, le=10)
+    ] = None  # () or (2,)
+    omega_max: Annotated[Number, Spec("rad/s", "greatest turning rate", ge=_POSITIVE, le=20)] = None
+    lag: Annotated[Number, Spec("s", "time constant with which it follows a twist", ge=0, le=5)] = (
+        None  # ()
+    )
+    acceleration_max: Annotated[
+        Number, Spec("m/s^2, rad/s^2", "greatest accelerations", ge=_POSITIVE, le=100)
+    ] = None  # (2,)
+    force_max: Annotated[
+        Number, Spec("N", "greatest force of the drive, in any direction", ge=0, le=1e5)
+    ] = None  # ()
+    torque_max: Annotated[
+        Number, Spec("N m", "greatest torque about the vertical", ge=_POSITIVE, le=1e5)
+    ] = None  # ()
+    # Used if the force is limited.
+    bandwidth: Annotated[
+        Number, Spec("Hz", "bandwidth of the drive's velocity servo", ge=0.1, le=100)
+    ] = 5.0  # ()
+    # It bounds force and torque.
+    traction: Annotated[
+        Number, Spec("1", "friction coefficient of the wheels", ge=_POSITIVE, le=5)
+    ] = None  # ()
+    resistance: Annotated[Number, Spec("1", "rolling resistance over the weight", ge=0, le=1)] = (
+        None  # ()
+    )
+    slip: Annotated[
+        Number, Spec("1", "share of the velocity that the wheels lose", ge=0, le=0.9)
+    ] = None  # ()
+    # Rollers lose more of these; None: equal to `slip`.
+    slip_sideways: Annotated[Number, Spec("1", "share of v_y that is lost", ge=0, le=0.9)] = None
+    slip_yaw: Annotated[Number, Spec("1", "share of omega that is lost", ge=0, le=0.9)] = None
+    # In place of half length and half width; None: a rectangle.
+    radius: Annotated[Number, Spec("m", "radius of a round base", ge=0.1, le=2)] = None  # ()
     drive: DriveKind = "omni"  # static
-    # () of the wheels that cannot move sideways, behind the middle of the base; None: 0
-    axle: Number = option(None, -2, 2, unit="m")
-    turning_radius: Number = option(None, _POSITIVE, 20, unit="m")  # () least, of a car's axle
-    # () distance between left and right wheel; None: the width of the base
-    track: Number = option(None, above=0, at_most=4, unit="m")
-    wheel_speed_max: Number = option(None, _POSITIVE, 20, unit="m/s")  # () at the rim
-    wheel_acceleration_max: Number = option(None, _POSITIVE, 100, unit="m/s^2")  # () at the rim
-    # () of software: age of the pose that laws observe, delay of commands, time constant of the
-    # skin; None: those of the domain
-    pose_latency: Number = option(None, 0, 1, unit="s")
-    command_delay: Number = option(None, 0, 1, unit="s")
-    time_constant: Number = option(None, _POSITIVE, 1, unit="s")
+    # None: 0
+    axle: Annotated[
+        Number, Spec("m", "wheels that cannot move sideways, behind the middle", ge=-2, le=2)
+    ] = None  # ()
+    turning_radius: Annotated[
+        Number, Spec("m", "least turning radius of a car's axle", ge=_POSITIVE, le=20)
+    ] = None  # ()
+    # None: the width of the base.
+    track: Annotated[Number, Spec("m", "distance between left and right wheel", gt=0, le=4)] = (
+        None  # ()
+    )
+    wheel_speed_max: Annotated[
+        Number, Spec("m/s", "greatest speed of a wheel's rim", ge=_POSITIVE, le=20)
+    ] = None  # ()
+    wheel_acceleration_max: Annotated[
+        Number, Spec("m/s^2", "greatest acceleration of a wheel's rim", ge=_POSITIVE, le=100)
+    ] = None  # ()
+    # Of software; None: those of the domain.
+    pose_latency: Annotated[Number, Spec("s", "age of the pose that laws observe", ge=0, le=1)] = (
+        None  # ()
+    )
+    command_delay: Annotated[
+        Number, Spec("s", "time between a command and its execution", ge=0, le=1)
+    ] = None  # ()
+    time_constant: Annotated[Number, Spec("s", "time constant of the skin", ge=_POSITIVE, le=1)] = (
+        None  # ()
+    )
 
     @property
     def half_track(self) -> Number:

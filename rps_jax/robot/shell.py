@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
-from typing import Literal, NamedTuple
+from typing import Annotated, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -23,7 +23,8 @@ from rps_jax.geometry import footprint as fp
 from rps_jax.geometry import planar
 from rps_jax.geometry.arrays import Number
 from rps_jax.geometry.footprint import Footprint
-from rps_jax.record.options import check_fields, option
+from rps_jax.record.options import check_fields
+from rps_jax.spec import Spec
 
 HALF_LENGTH = 0.3625  # [m] of the paper's base: 15 taxels of 48.3 mm make 0.725 m
 HALF_WIDTH = 0.29  # [m] of the paper's base: l_cr + 5 cm, Sec. III-A
@@ -41,12 +42,14 @@ class Boards:
     """A row of equal boards on one side, end to end; each taxel is an electrode of a board."""
 
     side: Side
-    count: int = option(at_least=1, at_most=100)  # boards
-    # () of the taxels; None: the row covers the whole side
-    pitch: Number | None = option(None, 0.002, 1, unit="m")
-    # () along the strip, from the middle of the side; None: 0
-    middle: Number | None = option(None, -4, 4, unit="m")
-    electrodes: int = option(3, 1, 100)  # on each board
+    count: Annotated[int, Spec("1", "number of boards", ge=1, le=100)]
+    # None: the row covers the whole side.
+    pitch: Annotated[Number | None, Spec("m", "pitch of the taxels", ge=0.002, le=1)] = None  # ()
+    # None: 0.
+    middle: Annotated[
+        Number | None, Spec("m", "middle along the strip, from that of the side", ge=-4, le=4)
+    ] = None  # ()
+    electrodes: Annotated[int, Spec("1", "number of electrodes of a board", ge=1, le=100)] = 3
 
     @property
     def taxels(self) -> int:
@@ -74,14 +77,14 @@ class Row(NamedTuple):
 class Shell:
     """Outline of a base about its origin, and its boards in the strip's order."""
 
-    half_length: Number = option(HALF_LENGTH, 0.1, 2, unit="m")  # ()
-    # (); None: the paper's, constant in compiled programs
-    half_width: Number | None = option(None, 0.1, 2, unit="m")
+    half_length: Annotated[Number, Spec("m", "half length of the base", ge=0.1, le=2)] = HALF_LENGTH
+    # None: the paper's, constant in compiled programs.
+    half_width: Annotated[Number | None, Spec("m", "half width", ge=0.1, le=2)] = None  # ()
     boards: tuple[Boards, ...] = BOARDS
     # Sample points of each taxel for the compression of foam; 1 cm apart they resolve a corner.
     samples: int = field(default=5, metadata={"static": True})
-    # () of a round base, whose half sizes are unused; None: a rectangle
-    radius: Number | None = option(None, 0.1, 2, unit="m")
+    # Its half sizes are unused then; None: a rectangle.
+    radius: Annotated[Number | None, Spec("m", "radius of a round base", ge=0.1, le=2)] = None  # ()
 
     @classmethod
     def of(cls, boards: tuple[Boards, ...], *sizes: Number) -> Shell:

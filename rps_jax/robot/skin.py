@@ -17,13 +17,13 @@ the threshold, or the skin senses contact without an object.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from rps_jax import errors
+from rps_jax import errors, spec
 from rps_jax.geometry import footprint as fp
 from rps_jax.geometry import planar
 from rps_jax.geometry.arrays import (
@@ -41,6 +41,7 @@ from rps_jax.geometry.footprint import Footprint
 from rps_jax.record.files import Arrays
 from rps_jax.record.options import parse_changes
 from rps_jax.robot.shell import HALF_WIDTH, Row, Shell
+from rps_jax.spec import Spec
 
 _NODES = 16  # points on each row of boards of the smooth ideal sensor
 _REACH = 8.0  # [1] temperatures beyond the tolerance at which the points end: weight 3e-4
@@ -52,19 +53,27 @@ NONE, POINT, LINE = 0, 1, 2  # contact types, Fig. 6c
 class Reading(NamedTuple):
     """Contact that a skin measures; that of a smooth skin has a weight from 0 to 1."""
 
-    contact_type: Ints  # NONE, also up to a weight of 1/2, POINT or LINE
-    # [m] contact location in the robot frame; 0 if NONE, but of a smooth skin at any weight
-    p_robot_contact: Float[Array, "*B 2"]
-    in_contact: Bools | Floats  # whether there is contact, or the weight
+    # NONE also up to a weight of 1/2.
+    contact_type: Annotated[Ints, Spec("1", "type of the contact: 0 none, 1 a point, 2 a line")]
+    # 0 if NONE, but of a smooth skin at any weight.
+    p_robot_contact: Annotated[
+        Float[Array, "*B 2"], Spec("m", "location of the contact in the robot frame")
+    ]
+    in_contact: Annotated[Bools | Floats, Spec("1", "whether there is contact, or the weight")]
 
 
 class SkinState(NamedTuple):
     """State of a sensor between two readings; empty for the ideal one."""
 
-    key: jax.Array  # of the noise of later readings
-    signal: Float[Array, "*B T"]  # [1] filtered relative change of capacitance
-    gain: Float[Array, "*B T"]  # [1] of each taxel
-    alive: Bool[Array, "*B T"] | Float[Array, "*B 0"]  # empty for the ideal sensor
+    key: Annotated[jax.Array, Spec("1", "key of the noise of later readings")]
+    signal: Annotated[
+        Float[Array, "*B T"], Spec("1", "filtered relative change of capacitance of each taxel")
+    ]
+    gain: Annotated[Float[Array, "*B T"], Spec("1", "gain of each taxel")]
+    # Empty for the ideal sensor.
+    alive: Annotated[
+        Bool[Array, "*B T"] | Float[Array, "*B 0"], Spec("1", "whether each taxel works")
+    ]
 
 
 class IdealSkin(NamedTuple):
@@ -75,19 +84,22 @@ class IdealSkin(NamedTuple):
     chatters.
     """
 
-    tolerance: Parameter = 0.006  # [m]
-    point_length: Parameter = 2 * HALF_WIDTH / 12  # [m] one taxel: longest POINT contact
+    tolerance: Annotated[Parameter, Spec("m", "gap that counts as contact", ge=0, le=0.1)] = 0.006
+    # One taxel.
+    point_length: Annotated[Parameter, Spec("m", "longest POINT contact", ge=0, le=0.1)] = (
+        2 * HALF_WIDTH / 12
+    )
     shell: Shell = Shell()  # outline and boards; in a trial, the robot's
-    temperature: Parameter | None = None  # [m]
+    temperature: Annotated[
+        Parameter | None, Spec("m", "width of the smooth threshold", gt=0, le=1)
+    ] = None
 
     SMOOTH = 0.001  # [m] a good temperature
 
     def check(self) -> None:
         """Raise InputError for fields that are no lengths."""
-        for name in ("tolerance", "point_length"):
-            length = getattr(self, name)
-            errors.check_finite(f"skin {name}", length, at_least=0, at_most=0.1, unit="m")
-        _check(self)
+        spec.check(self, "skin ")
+        self.shell.check()
 
     def init(self, key: Array) -> SkinState:
         """Return the empty state."""
@@ -186,27 +198,34 @@ class CapacitiveSkin(NamedTuple):
     eps / gap over its length, where the gap is the thickness of the compressed foam.
     """
 
-    foam: Parameter = 0.010  # [m] uncompressed thickness
-    max_compression: Parameter = 0.9  # [1] share of the thickness that can be compressed
-    time_constant: Parameter = 0.05  # [s] of the low-pass filter
-    threshold: Parameter = 0.25  # [1] relative change of capacitance at contact
-    noise: Parameter = 0.0  # [1] standard deviation of each raw reading
-    gain_spread: Parameter = 0.0  # [1] standard deviation of the taxels' gains about 1
-    dead_share: Parameter = 0.0  # [1] probability that a taxel is dead
+    foam: Annotated[Parameter, Spec("m", "thickness of uncompressed foam", gt=0, le=0.1)] = 0.010
+    max_compression: Annotated[
+        Parameter, Spec("1", "share of the thickness that can be compressed", gt=0, le=0.99)
+    ] = 0.9
+    time_constant: Annotated[Parameter, Spec("s", "time constant of the low-pass filter", gt=0)] = (
+        0.05
+    )
+    threshold: Annotated[
+        Parameter, Spec("1", "relative change of capacitance at contact", ge=0)
+    ] = 0.25
+    noise: Annotated[Parameter, Spec("1", "standard deviation of each raw reading", ge=0)] = 0.0
+    gain_spread: Annotated[
+        Parameter, Spec("1", "standard deviation of the taxels' gains about 1", ge=0)
+    ] = 0.0
+    dead_share: Annotated[Parameter, Spec("1", "probability that a taxel is dead", ge=0, le=1)] = (
+        0.0
+    )
     shell: Shell = Shell()  # outline and boards; in a trial, the robot's
-    temperature: Parameter | None = None  # [1]
+    temperature: Annotated[
+        Parameter | None, Spec("1", "width of the smooth threshold", gt=0, le=1)
+    ] = None
 
     SMOOTH = 0.03  # [1] a good temperature
 
     def check(self) -> None:
         """Raise InputError for foam, filter or imperfections that no skin can have."""
-        errors.check_finite("skin foam", self.foam, above=0, at_most=0.1, unit="m")
-        errors.check_finite("skin max_compression", self.max_compression, above=0, at_most=0.99)
-        errors.check_finite("skin time_constant", self.time_constant, above=0, unit="s")
-        for name in ("threshold", "noise", "gain_spread"):
-            errors.check_finite(f"skin {name}", getattr(self, name), at_least=0)
-        errors.check_finite("skin dead_share", self.dead_share, at_least=0, at_most=1)
-        _check(self)
+        spec.check(self, "skin ")
+        self.shell.check()
 
     def init(self, key: Array) -> SkinState:
         """Draw the gain of each taxel, and whether it is dead."""
@@ -289,13 +308,6 @@ def signals(skin: Skin, state: SkinState, footprint: Footprint) -> Float[Array, 
         return jnp.where(state.alive, state.signal, 0.0)
     perfect = CapacitiveSkin(shell=skin.shell)
     return perfect._scan(perfect.init(state.key), footprint)[1]
-
-
-def _check(skin: Skin) -> None:
-    """Raise InputError for an invalid shell or temperature."""
-    skin.shell.check()
-    if skin.temperature is not None:
-        errors.check_finite("skin temperature", skin.temperature, above=0, at_most=1)
 
 
 def check_taxels(signal: np.ndarray, shell: Shell, source: str) -> None:

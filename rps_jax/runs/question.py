@@ -77,7 +77,18 @@ Rows = list[list[str]]  # of a table in a report, with a header
 
 
 def call_of(command: Callable[P, Command[T]]) -> Callable[P, T]:
-    """Return a function with the fields of a command as arguments, which executes it."""
+    """Return a function with the fields of a command as arguments, which executes it.
+
+    Examples:
+      >>> @dataclass(frozen=True)
+      ... class CountWorlds(Question[int]):
+      ...     worlds: int = option(100, 1)
+      ...
+      ...     def answer(self, run):
+      ...         return self.worlds
+      >>> call_of(CountWorlds)(worlds=8)
+      8
+    """
 
     @functools.wraps(command, assigned=("__module__", "__doc__"), updated=())
     def call(*args: P.args, **kwargs: P.kwargs) -> T:

@@ -25,8 +25,9 @@ from rps_jax.record.checkpoint import Checkpoints
 from rps_jax.record.files import Arrays
 from rps_jax.record.table import check_parquet
 from rps_jax.runs.plan import Plan, chunks_by_key, draw
+from rps_jax.spec import specs_of
 from rps_jax.trials.jobs import Job, WorldBatch
-from rps_jax.trials.results import POSE, UNITS, WORLD, labelled, variable
+from rps_jax.trials.results import POSE, WORLD, labelled, variable
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import Outcome
 from rps_jax.trials.worlds import drawn_worlds
@@ -90,7 +91,7 @@ class Results:
         """Prepare the columns of all trials."""
         self.plan, self.shape = plan, (len(plan.laws), plan.worlds)
         self._outcomes: Arrays = {}  # (law, world, ...)
-        for name in (*UNITS, *plan.domain.task.OUTCOMES):
+        for name in (*specs_of(Outcome), *plan.domain.task.OUTCOMES):
             axes = (3,) if name.endswith("_pose") else ()
             self._outcomes[name] = np.zeros((*self.shape, *axes), _TYPES.get(name, np.float32))
         self._drawn: Arrays = {}  # (world,) drawn quantities

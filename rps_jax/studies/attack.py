@@ -21,7 +21,7 @@ import pandas as pd
 import xarray as xr
 from scipy import stats
 
-from rps_jax import errors
+from rps_jax import InputError, errors, load
 from rps_jax.analysis import statistics, tables
 from rps_jax.analysis.figures.style import (
     WIDTH,
@@ -33,15 +33,20 @@ from rps_jax.analysis.figures.style import (
     tiles,
     words,
 )
-from rps_jax.analysis.report import Picture, Section
 from rps_jax.engines import device
-from rps_jax.errors import InputError
+from rps_jax.questions import (
+    DomainQuestion,
+    LawQuestion,
+    Picture,
+    Plan,
+    Run,
+    Section,
+    call_of,
+    option,
+)
 from rps_jax.record.files import Arrays
-from rps_jax.record.options import option
 from rps_jax.runs import execution
-from rps_jax.runs.plan import Plan
-from rps_jax.runs.question import DomainQuestion, LawQuestion, Run, call_of, count_true
-from rps_jax.runs.results import load
+from rps_jax.runs.question import count_true
 from rps_jax.studies.probe import Probe
 from rps_jax.trials.progress import Bar, set_phase
 from rps_jax.trials.setting import seed_of

@@ -18,12 +18,11 @@ from rps_jax import errors
 from rps_jax.analysis import mechanisms, statistics, tables
 from rps_jax.analysis.figures.paper import draw_path
 from rps_jax.analysis.figures.style import WIDTH, Figure, styled, tiles
-from rps_jax.analysis.report import Picture, Section
+from rps_jax.questions import Picture, Plan, Question, Run, Section, call_of, option
 from rps_jax.record import files
-from rps_jax.record.options import option
-from rps_jax.runs.plan import Plan, build_batch
+from rps_jax.runs.plan import build_batch
 from rps_jax.runs.push import find_differences, program_slots, select_law
-from rps_jax.runs.question import Question, Rows, Run, call_of
+from rps_jax.runs.question import Rows
 from rps_jax.trials import pushes
 from rps_jax.trials.progress import SequentialProgress
 from rps_jax.trials.results import trace_dataset
@@ -36,7 +35,7 @@ NEAR = 0.2  # [m] least distance below which a timeout is near the target
 
 def failure_modes(trials: xr.Dataset, max_lost: float) -> np.ndarray:
     """Return the failure mode (world,) of the trials of one law; "" for a success."""
-    modes = np.array([*statistics.MODES, ""])[statistics.failure_modes(trials, max_lost)]
+    modes = np.array([*statistics.modes(), ""])[statistics.failure_modes(trials, max_lost)]
     near = (trials.min_distance < NEAR) & (trials.get("progress", 1.0) > _PASSED)
     timeouts = np.where(near, "timeout near the target", "timeout far from the target")
     return np.where(modes == "timeout", timeouts, modes)

@@ -15,15 +15,13 @@ import xarray as xr
 
 from rps_jax.analysis import tables
 from rps_jax.analysis.figures.style import WIDTH, Figure, base_patch, styled, tiles, words
-from rps_jax.analysis.report import Picture, Section
-from rps_jax.control.registry import LawLike
-from rps_jax.record.options import option
+from rps_jax.laws import LawLike
+from rps_jax.questions import LawQuestion, Picture, Run, Section, call_of, option
 from rps_jax.robot.robot import RobotLike
 from rps_jax.robot.skin import SkinLike
-from rps_jax.runs.question import LawQuestion, Rows, Run, call_of
+from rps_jax.runs.question import Rows
 from rps_jax.studies.table import Table
 from rps_jax.trials import pushes
-from rps_jax.trials.case import Case
 from rps_jax.trials.progress import SequentialProgress
 from rps_jax.trials.results import labelled, trace_dataset
 from rps_jax.trials.trial import Shift
@@ -36,6 +34,7 @@ from rps_jax.world.paper import (
     HARDWARE_ROBOT,
 )
 from rps_jax.world.scene import Friction
+from rps_jax.worlds import Case
 
 MIDDLE = Friction(HARDWARE_GROUND[1], HARDWARE_ROBOT[1])  # friction of the paths and of the shove
 _FRICTIONS = tuple(starmap(Friction, product(HARDWARE_GROUND, HARDWARE_ROBOT)))

@@ -16,28 +16,19 @@ from typing import Any, ClassVar, get_args
 import numpy as np
 import xarray as xr
 
-from rps_jax import errors
+from rps_jax import Domain, InputError, errors
 from rps_jax.analysis import statistics, tables
 from rps_jax.analysis.figures.style import WIDTH, Figure, panel, styled
-from rps_jax.analysis.report import Picture, Section
 from rps_jax.control import registry
-from rps_jax.control.base import LawParams, Senses
-from rps_jax.control.registry import LawLike, LawsLike
-from rps_jax.errors import InputError
+from rps_jax.control.base import Senses
+from rps_jax.laws import LawLike, LawParams, LawsLike, law_of, resolve_law
+from rps_jax.questions import MultiLawQuestion, Picture, Run, Section, call_of, option
 from rps_jax.record.files import JsonObject
-from rps_jax.record.options import option
 from rps_jax.robot.robot import parse_robot
-from rps_jax.runs.question import (
-    MultiLawQuestion,
-    Rows,
-    Run,
-    TaskOption,
-    call_of,
-    count_true,
-)
+from rps_jax.runs.question import Rows, TaskOption, count_true
 from rps_jax.runs.sweep import Sweep, SweepOptions, describe_plan
 from rps_jax.trials.progress import ProgressCallback, SequentialProgress
-from rps_jax.world.domain import Domain, DomainLike
+from rps_jax.worlds import DomainLike
 
 REFERENCE = "rps_tuned"  # the law that all others are compared with
 _MARKS = "osD^"  # of the senses in the figure
@@ -50,7 +41,7 @@ def all_laws() -> tuple[str, ...]:
 
 
 def _senses(params: LawParams) -> Senses:
-    return registry.law_of(params).senses
+    return law_of(params).senses
 
 
 @dataclass(frozen=True)
@@ -221,7 +212,7 @@ class Score(Ladder, _ScoredLaw):
 
     @cached_property
     def chosen(self) -> dict[str, LawParams]:
-        label, params = registry.resolve_law(self.law)
+        label, params = resolve_law(self.law)
         scored = {label: registry.check_params(params)}
         return scored | registry.resolve_laws(self.laws) | scored
 

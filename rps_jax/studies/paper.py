@@ -11,19 +11,19 @@ from functools import cached_property, partial
 import numpy as np
 import xarray as xr
 
+from rps_jax import RPSParams
 from rps_jax.analysis.figures import paper as figures
-from rps_jax.analysis.report import Picture, Section
-from rps_jax.control.laws.rps import RPSParams
+from rps_jax.physics import FRICTION
+from rps_jax.questions import Picture, Run, Section, call_of
 from rps_jax.record import files
 from rps_jax.runs.push import Push
-from rps_jax.runs.question import Run, SimulationQuestion, call_of
+from rps_jax.runs.question import SimulationQuestion
 from rps_jax.studies import table
 from rps_jax.studies.hardware import Hardware
 from rps_jax.studies.table import Table
 from rps_jax.trials.progress import SequentialProgress
 from rps_jax.world import scene, video
 from rps_jax.world.objects import PAPER_OBJECTS
-from rps_jax.world.scene import FRICTION
 
 
 @dataclass(frozen=True)

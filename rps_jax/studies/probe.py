@@ -7,17 +7,15 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
+from rps_jax import Domain, Setting, stack
 from rps_jax.analysis import statistics
-from rps_jax.control.base import LawParams
+from rps_jax.laws import LawParams
+from rps_jax.questions import Run
 from rps_jax.record import files
-from rps_jax.runs.evaluate import stack
-from rps_jax.runs.question import Run
 from rps_jax.trials import score
 from rps_jax.trials.batch_run import Candidates, outcomes
 from rps_jax.trials.progress import SequentialProgress, no_progress
-from rps_jax.trials.setting import Setting
 from rps_jax.world import points
-from rps_jax.world.domain import Domain
 from rps_jax.world.points import Points
 
 _SLOTS = 64  # least size of a program, a power of four

@@ -16,15 +16,13 @@ from typing import Literal
 import numpy as np
 import xarray as xr
 
-from rps_jax.analysis.report import Section
-from rps_jax.control.registry import LawsLike
+from rps_jax import Rules
+from rps_jax.laws import LawsLike
+from rps_jax.questions import MultiLawQuestion, Plan, Run, Section, call_of, option
 from rps_jax.record import files
-from rps_jax.record.options import option
-from rps_jax.runs.plan import Plan
-from rps_jax.runs.question import MultiLawQuestion, Rows, Run, call_of
+from rps_jax.runs.question import Rows
 from rps_jax.runs.sweep import PlanQuestion
 from rps_jax.trials.score import severity_of
-from rps_jax.trials.trial import Rules
 from rps_jax.world import points
 from rps_jax.world.domain import DOMAINS
 

@@ -29,17 +29,17 @@ from rps_jax.analysis.figures.style import (
     styled,
     tiles,
 )
-from rps_jax.analysis.report import Picture, Section
-from rps_jax.record.options import option
-from rps_jax.runs.plan import Plan
-from rps_jax.runs.question import (
+from rps_jax.questions import (
     DomainQuestion,
     LawQuestion,
-    Rows,
+    Picture,
+    Plan,
     Run,
+    Section,
     call_of,
-    count_true,
+    option,
 )
+from rps_jax.runs.question import Rows, count_true
 from rps_jax.runs.sweep import PlanQuestion
 from rps_jax.world import points
 

@@ -9,19 +9,19 @@ from typing import Annotated, ClassVar
 
 import xarray as xr
 
-from rps_jax import errors
+from rps_jax import InputError, errors
 from rps_jax.analysis import tables
 from rps_jax.analysis.figures.paper import min_distance
-from rps_jax.analysis.report import Picture, Section
-from rps_jax.control.registry import LawsLike
+from rps_jax.laws import LawsLike
+from rps_jax.questions import MultiLawQuestion, Picture, Run, Section, call_of
 from rps_jax.record import files
 from rps_jax.runs.push import case_options
-from rps_jax.runs.question import MultiLawQuestion, Run, call_of
 from rps_jax.trials import pushes
-from rps_jax.trials.case import Case, FrictionLike, TrialOptions, label_of
+from rps_jax.trials.case import FrictionLike, TrialOptions, label_of
 from rps_jax.trials.results import outcome_dataset
 from rps_jax.world import paper
 from rps_jax.world.objects import PAPER_OBJECTS, STORED
+from rps_jax.worlds import Case
 
 
 @dataclass(frozen=True)
@@ -62,7 +62,7 @@ class Table(TrialOptions, MultiLawQuestion[xr.Dataset]):
 
     def check(self) -> None:
         if not self.cases:
-            raise errors.InputError("targets = () is not allowed: name at least one.")
+            raise InputError("targets = () is not allowed: name at least one.")
         self.setting.check_here(self.cases[0].base, self.chosen.values())
 
     def num_trials(self) -> int | None:

@@ -22,7 +22,7 @@ from rps_jax.trials.trial import ControlLoop, Trial
 from rps_jax.world.scene import JOINTS
 
 if TYPE_CHECKING:
-    from rps_jax.trials.batch import WorldBatch
+    from rps_jax.trials.jobs import WorldBatch
 
 _WORLDS, _STEPS = 2, 150
 _TOLERANCE = 1e-3  # of the largest number

@@ -88,9 +88,9 @@ def build(
     starts = [_start_of(case, scenes[key]) for case, key in zip(cases, keys, strict=True)]
     qpos, targets = (np.array(column) for column in zip(*starts, strict=True))
     courses, final = [], []
-    uniform = draws.random_numbers(setting.world_seed, trials)
-    for case, row, target in zip(cases, uniform, targets, strict=True):
-        u = draws.by_name(row[None])
+    numbers = draws.numbers(setting.world_seed, trials)
+    for i, (case, target) in enumerate(zip(cases, targets, strict=True)):
+        u = {name: values[i : i + 1] for name, values in numbers.items()}
         front = np.array([float(case.base.sizes[0])])
         end, course = case.challenge.courses(CourseInputs(u, target[None], front))
         final.append(end[0])

@@ -8,44 +8,21 @@ import xarray as xr
 from numpy.typing import ArrayLike
 
 from rps_jax.control.laws.rps import RPSParams
+from rps_jax.control.observation import Details, Twist
 from rps_jax.engines import device
 from rps_jax.geometry import solid
 from rps_jax.geometry.footprint import Footprint
+from rps_jax.spec import specs_of
 from rps_jax.trials import trial
 from rps_jax.trials.pushes import Trajectory
 from rps_jax.trials.trial import Outcome
-from rps_jax.world import tasks
+from rps_jax.world import streams, tasks
 
 DIMS = ("law", "object", "friction", "target")
 WORLD = "index of the world"
 POSE = xr.Variable("pose", ["x", "y", "yaw"], {"long_name": "x [m], y [m] and yaw [rad]"})
-UNITS = {
-    "success": ("1", "target reached within the rules"),
-    "time": ("s", "simulated time at which the trial ended"),
-    "min_distance": ("m", "least distance of the contact point to the target"),
-    "contact_lost_time": ("s", "time without contact after the first touch"),
-    "path_length": ("m", "length of the base's way"),
-    "mean_abs_l": ("m", "mean |l| while in contact, the paper's D"),
-    "tilt": ("rad", "greatest tilt of the object"),
-    "tipped": ("1", "the object fell over"),
-    "diverged": ("1", "physics became NaN or ran away"),
-    "nan_twist": ("1", "it diverged since the law returned a twist that is not finite"),
-    "stalled": ("1", "it ended with the base standing still, whose force was too small"),
-    "unfelt": ("1", "it ended against the object, but the skin felt no contact"),
-    "base_pose": ("m, m, rad", "x, y, yaw of the base in the world at the end"),
-    "object_pose": ("m, m, rad", "x, y, yaw of the object in the world at the end"),
-}
-# Units of numbers of a trace.
-_TRACED = {
-    "v_x": "m/s",
-    "v_y": "m/s",
-    "omega": "rad/s",
-    "l": "m",
-    "distance": "m",
-    "a_r": "1",
-    "gamma": "rad",
-    "realigning": "1",
-}
+streams.claim("an outcome", *specs_of(Outcome), "law", "world")
+_TRACED = {**specs_of(Twist), **specs_of(Details)}  # numbers of a trace
 
 
 def nan_twists(results: xr.Dataset) -> str:
@@ -97,9 +74,8 @@ def labelled(**columns: tuple[str | Sequence[str], ArrayLike, str, str]) -> dict
 
 def variable(name: str, dims: Sequence[str], values: np.ndarray) -> xr.Variable:
     """Return one field of outcomes with its unit; poses (..., 3) have one more dimension."""
-    unit, meaning = (UNITS | tasks.OUTCOMES)[name]
-    attrs = {"units": unit, "long_name": meaning}
-    return xr.Variable((*dims, "pose")[: values.ndim], _plain(values), attrs)
+    spec = specs_of(Outcome).get(name) or tasks.OUTCOMES[name]
+    return xr.Variable((*dims, "pose")[: values.ndim], _plain(values), spec.attributes)
 
 
 def _plain(values: ArrayLike) -> np.ndarray:
@@ -122,7 +98,7 @@ def trace_dataset(trajectory: Trajectory) -> xr.Dataset:
         "p_robot_contact": over_time(snapshots.reading.p_robot_contact, "m", "axis"),
     }
     scalars = snapshots.twist._asdict() | snapshots.details._asdict()
-    variables |= {name: over_time(scalars[name], unit) for name, unit in _TRACED.items()}
+    variables |= {name: over_time(scalars[name], x.unit) for name, x in _TRACED.items()}
     for name, value in trajectory.outcome.columns().items():
         variables[f"outcome_{name}"] = variable(name, (), np.asarray(value))
     variables["p_world_contact"] = over_time(trial.p_world_contact(snapshots), "m", "axis")

@@ -16,13 +16,13 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from types import MappingProxyType
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from rps_jax import errors
+from rps_jax import spec
 from rps_jax.control import soft
 from rps_jax.control.base import Law, LawParams
 from rps_jax.control.laws import rps
@@ -47,6 +47,7 @@ from rps_jax.robot.base import Load, Odometry
 from rps_jax.robot.drive import Drive
 from rps_jax.robot.robot import Robot
 from rps_jax.robot.skin import NONE, IdealSkin, Reading, Skin, SkinState
+from rps_jax.spec import Spec
 from rps_jax.world.physics import Physics
 from rps_jax.world.scene import JOINTS
 from rps_jax.world.tasks import reach
@@ -60,18 +61,24 @@ _MAX_DISTANCE = 100.0  # [m]
 class Rules(NamedTuple):
     """When a trial ends (Sec. III-B); of objects that fall over the paper says nothing."""
 
-    horizon: Scalar = 300.0
-    """Time after which a trial has failed [s]."""
-    max_lost: Scalar = 150.0
-    """Time without contact, in all after the first touch, after which it has failed [s]."""
-    max_tilt: Scalar = math.pi / 4
-    """Tilt from which on an object has fallen over [rad]."""
+    horizon: Annotated[
+        Scalar, Spec("s", "Time after which a trial has failed [s].", gt=0, le=1e5)
+    ] = 300.0
+    max_lost: Annotated[
+        Scalar,
+        Spec(
+            "s",
+            "Time without contact, in all after the first touch, after which it has failed [s].",
+            ge=0,
+        ),
+    ] = 150.0
+    max_tilt: Annotated[
+        Scalar, Spec("rad", "Tilt from which on an object has fallen over [rad].", gt=0, le=1.4)
+    ] = math.pi / 4
 
     def check(self) -> None:
-        """Raises InputError for times that are not positive and finite, or no tilt."""
-        errors.check_finite("horizon", self.horizon, above=0, at_most=1e5, unit="s")
-        errors.check_finite("max_lost", self.max_lost, at_least=0, unit="s")
-        errors.check_finite("max_tilt", self.max_tilt, above=0, at_most=1.4, unit="rad")
+        """Raise InputError for times that are not positive and finite, or no tilt."""
+        spec.check(self)
 
 
 @partial(jax.tree_util.register_dataclass, data_fields=["rules"], meta_fields=["physics", "law"])
@@ -87,9 +94,13 @@ class ControlLoop:
 class Shift(NamedTuple):
     """The object is moved by a hand during the push, as in the paper's video."""
 
-    time: float | Float[Array | np.ndarray, "*B"] = jnp.inf  # [s]
-    # [m] how far, in the robot frame
-    p_robot: tuple[float, float] | Float[Array | np.ndarray, "*B 2"] = (0.0, 0.0)
+    time: Annotated[
+        float | Float[Array | np.ndarray, "*B"], Spec("s", "time of the shift", le=math.inf)
+    ] = jnp.inf
+    p_robot: Annotated[
+        tuple[float, float] | Float[Array | np.ndarray, "*B 2"],
+        Spec("m", "length and direction in the robot frame"),
+    ] = (0.0, 0.0)
 
 
 class World(NamedTuple):
@@ -150,20 +161,30 @@ class Snapshot(NamedTuple):
 class Outcome(NamedTuple):
     """The result of one trial."""
 
-    success: Bools
-    time: Floats  # [s] at which it ended
-    min_distance: Floats  # [m] contact point to target; inf if never touched
-    contact_lost_time: Floats  # [s]
-    path_length: Floats  # [m] of the base's way
-    mean_abs_l: Floats  # [m] the paper's D; NaN if never touched
-    tilt: Floats  # [rad] greatest tilt of the object
-    tipped: Bools  # the object has fallen over
-    diverged: Bools
-    nan_twist: Bools  # it diverged since the law returned a twist that is not finite
-    stalled: Bools  # it ended with the base standing still against the object
-    unfelt: Bools  # it ended without contact on the skin, but against the object
-    base_pose: Float[Array, "*B 3"]  # [m, m, rad] in the world, at the end
-    object_pose: Float[Array, "*B 3"]  # [m, m, rad] of the object in the world, at the end
+    success: Annotated[Bools, Spec("1", "target reached within the rules")]
+    time: Annotated[Floats, Spec("s", "simulated time at which the trial ended")]
+    # Infinite if it never touched.
+    min_distance: Annotated[Floats, Spec("m", "least distance of the contact point to the target")]
+    contact_lost_time: Annotated[Floats, Spec("s", "time without contact after the first touch")]
+    path_length: Annotated[Floats, Spec("m", "length of the base's way")]
+    # NaN if it never touched.
+    mean_abs_l: Annotated[Floats, Spec("m", "mean |l| while in contact, the paper's D")]
+    tilt: Annotated[Floats, Spec("rad", "greatest tilt of the object")]
+    tipped: Annotated[Bools, Spec("1", "the object fell over")]
+    diverged: Annotated[Bools, Spec("1", "physics became NaN or ran away")]
+    nan_twist: Annotated[
+        Bools, Spec("1", "it diverged since the law returned a twist that is not finite")
+    ]
+    stalled: Annotated[
+        Bools, Spec("1", "it ended with the base standing still, whose force was too small")
+    ]
+    unfelt: Annotated[Bools, Spec("1", "it ended against the object, but the skin felt no contact")]
+    base_pose: Annotated[
+        Float[Array, "*B 3"], Spec("m, m, rad", "x, y, yaw of the base in the world at the end")
+    ]
+    object_pose: Annotated[
+        Float[Array, "*B 3"], Spec("m, m, rad", "x, y, yaw of the object in the world at the end")
+    ]
     task: Mapping[str, Array] = MappingProxyType({})  # by name: see `Task.OUTCOMES`
 
     def columns(self) -> dict[str, Any]:

@@ -111,7 +111,7 @@ def starts(drawn: Draw) -> np.ndarray:
 
 def remembered_steps(domain: Domain, period: float) -> int:
     """Return the number of control steps of `period` [s] that the odometry remembers."""
-    if all(getattr(domain, name) == Range(0, 0) for name in quantities_of("base")):
+    if all(domain.range_of(name) in (None, Range(0, 0)) for name in quantities_of("base")):
         return 0
     return 1 + round(max(domain.pose_latency.high, domain.command_delay.high) / period)
 

@@ -11,7 +11,6 @@ floor.
 
 from __future__ import annotations
 
-import dataclasses
 import math
 import textwrap
 from collections.abc import Callable, Mapping, Sequence
@@ -446,17 +445,17 @@ def fitted_domain(domain: Domain, data: xr.Dataset) -> Domain:
     """
     intervals = data[["low", "high"]].isel(quantity=data.undetermined.values == 0).to_dataframe()
     changes: dict[str, Any] = {
-        str(name): Range(float(row.low), float(row.high), getattr(domain, str(name)).log)
+        str(name): Range(float(row.low), float(row.high), interval.log)
         for name, row in intervals.iterrows()
-        if name in QUANTITIES
+        if name in QUANTITIES and (interval := domain.range_of(str(name))) is not None
     }
     velocity = intervals.reindex(VELOCITY_ERRORS)
     if velocity.low.notna().all():
         changes["velocity_error"] = Range(float(velocity.low.min()), float(velocity.high.max()))
     objects = tuple(map(str, data.object.values[data.probability.values >= 0.05]))
     if not set(objects) & domains.RANDOM.keys():  # these draw no mass
-        changes |= {name: getattr(Domain, name) for name in domains.OBJECT_QUANTITIES}
-    return dataclasses.replace(domain, objects=objects, **changes)
+        changes |= {name: getattr(Domain, name, None) for name in domains.OBJECT_QUANTITIES}
+    return domain.with_changes(changes | {"objects": objects})
 
 
 # --- report --------------------------------------------------------------------------------

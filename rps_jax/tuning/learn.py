@@ -32,6 +32,7 @@ from rps_jax.record.checkpoint import Checkpoints
 from rps_jax.record.files import JsonObject
 from rps_jax.record.options import option
 from rps_jax.runs.question import Run, SimulationQuestion, TaskOption, call_of
+from rps_jax.spec import Spec
 from rps_jax.trials.env import SHAPED_REWARD, PushEnv
 from rps_jax.trials.progress import Bar, Progress, ProgressCallback
 from rps_jax.trials.results import labelled
@@ -47,23 +48,23 @@ _CHECKPOINT = "learner"
 _VALIDATION_RATIO = 10  # learning time between two validations, as a multiple of their time
 Metrics = dict[str, float]  # results of an update, by name
 
-UNITS = {
-    "time": ("s", "wall clock since the start of the run, with compilation"),
-    "simulated": ("s", "simulated time, summed over worlds"),
-    "success": ("1", "success rate of the trials that ended, at the level of the curriculum"),
-    "ended": ("1", "trials that ended"),
-    "tipped": ("1", "number of them whose object fell over"),
-    "lost": ("1", "number of them that lost contact for too long"),
-    "earned": ("1", "mean reward of the trials that ended"),
-    "touching": ("1", "share of the actions that end in contact"),
-    "level": ("1", "level of the curriculum"),
-    "reward": ("1", "mean reward of an action"),
-    "value": ("1", "mean of the value function"),
-    "kl": ("1", "mean KL divergence between the acting policy and the updated ones"),
-    "learning_rate": ("1", "learning rate"),
-    "spread": ("1", "standard deviation of the actions"),
-    "validation": ("1", "success rate in worlds for validation, without noise; NaN between them"),
-    "validation_time": ("s", "mean time of these successes"),
+METRICS = {  # of an update, by name
+    "time": Spec("s", "wall clock since the start of the run, with compilation"),
+    "simulated": Spec("s", "simulated time, summed over worlds"),
+    "success": Spec("1", "success rate of the trials that ended, at the level of the curriculum"),
+    "ended": Spec("1", "trials that ended"),
+    "tipped": Spec("1", "number of them whose object fell over"),
+    "lost": Spec("1", "number of them that lost contact for too long"),
+    "earned": Spec("1", "mean reward of the trials that ended"),
+    "touching": Spec("1", "share of the actions that end in contact"),
+    "level": Spec("1", "level of the curriculum"),
+    "reward": Spec("1", "mean reward of an action"),
+    "value": Spec("1", "mean of the value function"),
+    "kl": Spec("1", "mean KL divergence between the acting policy and the updated ones"),
+    "learning_rate": Spec("1", "learning rate"),
+    "spread": Spec("1", "standard deviation of the actions"),
+    "validation": Spec("1", "success rate in worlds for validation, without noise, or NaN"),
+    "validation_time": Spec("s", "mean time of these successes"),
 }
 
 
@@ -309,7 +310,7 @@ class _Learner:
         metrics["simulated"] = simulated + steps * options.hold
         metrics["time"] = self.elapsed
         metrics["validation"] = metrics["validation_time"] = float("nan")
-        self.curve.append({name: metrics[name] for name in UNITS})
+        self.curve.append({name: metrics[name] for name in METRICS})
         total = int(sum(metrics["ended"] for metrics in self.curve))
         self.callback(Progress(total, metrics["simulated"], self.compile, len(self.curve)))
 
@@ -346,7 +347,7 @@ class _Learner:
         """Runner, best weights, best rate with both times, and curve (updates, metrics)."""
         rows = [list(metrics.values()) for metrics in self.curve]
         scalars = np.array([self.best_rate, self.compile, self.elapsed])
-        return self.runner, self.best, scalars, np.array(rows, float).reshape(-1, len(UNITS))
+        return self.runner, self.best, scalars, np.array(rows, float).reshape(-1, len(METRICS))
 
     def checkpoint(self) -> xr.Dataset:
         """Write the checkpoint, the law and the curve, and return the curve."""
@@ -354,8 +355,10 @@ class _Learner:
         leaves = {f"leaf_{i:04d}": leaf for i, leaf in enumerate(jax.tree.leaves(state))}
         Checkpoints(self.folder).put(_CHECKPOINT, files.encode_arrays(**leaves), ".npz")
         files.write_bytes(self.folder / "policy.npz", policies.encode(self.policy()))
-        columns = zip(UNITS, state[-1].T, strict=True)
-        variables = labelled(**{name: ("update", x, *UNITS[name]) for name, x in columns})
+        columns = zip(METRICS, state[-1].T, strict=True)
+        variables = labelled(
+            **{name: ("update", x, METRICS[name].unit, METRICS[name].about) for name, x in columns}
+        )
         times = {"compile": self.compile, "run": self.elapsed - self.compile}
         curve = xr.Dataset(variables, {"update": np.arange(len(self.curve)) + 1}, times)
         files.write_csv(self.folder / "curve.csv", curve.to_dataframe())
@@ -370,7 +373,7 @@ class _Learner:
         try:
             leaves = [leaf for _, leaf in sorted(files.decode_arrays(content).items())]
             kinds = [[(x.dtype, x.shape) for x in several[:-1]] for several in (leaves, expected)]
-            if kinds[0] != kinds[1] or leaves[-1].shape[1:] != (len(UNITS),):
+            if kinds[0] != kinds[1] or leaves[-1].shape[1:] != (len(METRICS),):
                 raise ValueError("another version wrote it")
         except ValueError as error:
             raise files.CorruptFileError(self.folder / "parts", error) from error
@@ -379,7 +382,7 @@ class _Learner:
         self.best_rate, compile_time, elapsed = scalars.tolist()
         self.compile += compile_time
         self._start_time -= elapsed
-        self.curve = [dict(zip(UNITS, row, strict=True)) for row in curve.tolist()]
+        self.curve = [dict(zip(METRICS, row, strict=True)) for row in curve.tolist()]
 
 
 @styled

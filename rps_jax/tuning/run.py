@@ -33,6 +33,7 @@ from rps_jax.robot.robot import RobotLike
 from rps_jax.runs import evaluate
 from rps_jax.runs.evaluate import Candidates, CandidateScores
 from rps_jax.runs.question import LawQuestion, Run, TaskOption, count_true
+from rps_jax.spec import Spec
 from rps_jax.trials.progress import Bar, Progress, Timing
 from rps_jax.trials.score import Objective
 from rps_jax.trials.setting import seed_of
@@ -43,7 +44,11 @@ from rps_jax.world.objects import STORED
 from rps_jax.world.tasks import TaskLike
 
 TUNED = "tuned.json"  # file of a run folder: the parameters with the best validation
-UNITS = {"compile": "s", "run": "s", "simulated": "s"}
+TIMES = {  # of a generation
+    "compile": Spec("s", "time of compilation"),
+    "run": Spec("s", "wall clock without compilation"),
+    "simulated": Spec("s", "simulated time, summed over worlds"),
+}
 # Dimensions of those results of a generation that are arrays.
 DIMS = {
     **dict.fromkeys(("vectors", "gradients"), ("candidate", "parameter")),
@@ -265,7 +270,7 @@ class Tuning(TaskOption, LawQuestion[xr.Dataset]):
         values = self.space.changed_values(results["center"])
         results |= times | {"params": np.array([values[name] for name in self.space.names])}
         variables = {
-            name: (DIMS.get(name, ()), np.asarray(x, float), {"units": UNITS.get(name, "1")})
+            name: (DIMS.get(name, ()), np.asarray(x, float), TIMES.get(name, Spec()).attributes)
             for name, x in results.items()
         }
         return xr.Dataset(variables, {"parameter": list(self.space.names)})
@@ -293,7 +298,7 @@ class Tuning(TaskOption, LawQuestion[xr.Dataset]):
         best, worlds = int(results.validation.argmin("generation")), results.sizes["test_world"]
         counts = np.rint(worlds * results.validation_success.values).astype(int).tolist()
         rates = [tables.share(count, worlds) for count in counts]
-        totals = (f"{x} {float(results[x].sum()):,.1f} s" for x in UNITS if x in results)
+        totals = (f"{x} {float(results[x].sum()):,.1f} s" for x in TIMES if x in results)
         text = (
             f"{test_sentences(results.test_success)} The worlds have the objects "
             f"{', '.join(self.objects)}, the engine {self.setting.engine} and the horizon "

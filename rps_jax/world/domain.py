@@ -11,13 +11,14 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from rps_jax import errors
+from rps_jax.geometry.solid import SIDES
 from rps_jax.record import files
 from rps_jax.record.files import JsonObject
 from rps_jax.record.folder import describe_difference
 from rps_jax.record.manifest import Stored
 from rps_jax.record.options import check_fields, parse_changes
 from rps_jax.robot.robot import LATENCIES, Robot, RobotLike, parse_robot
-from rps_jax.world import paper, scene, tasks
+from rps_jax.world import paper, scene, streams, tasks
 from rps_jax.world.objects import (
     FAMILIES,
     PAPER_OBJECTS,
@@ -33,22 +34,12 @@ from rps_jax.world.quantity import (
     check_ranges,
     check_unused,
     declared,
-    drawn,
+    numbers_of,
     range_of,
 )
 from rps_jax.world.scene import FRICTION, Friction, Surroundings
 from rps_jax.world.tasks import Task, TaskLike, parse_task
 from rps_jax.world.tasks.reach import Reach
-
-
-def limit(*declaration: Any) -> Any:
-    """Declare a drawn limit of the robot, which has its own value by default."""
-    return drawn(None, *declaration, "robot")
-
-
-def floor(*declaration: Any) -> Any:
-    """Declare a drawn quantity of the floor, which is level and uniform by default."""
-    return drawn(None, *declaration, "floor")
 
 
 def robot_field(name: str) -> str:
@@ -58,6 +49,8 @@ def robot_field(name: str) -> str:
 
 
 _POSITIVE = 1e-3
+# Labels of the three draws of the velocity error.
+VELOCITY_ERRORS = {f"{name}_error": f"error of {name}" for name in ("v_x", "v_y", "omega")}
 
 
 @dataclass(frozen=True)
@@ -73,73 +66,156 @@ class Domain:
 
     # The object: a scene of `mjcf/`, a custom one by name or FILE.xml, or a random one of a family.
     objects: tuple[str, ...] = ("random_box", "random_cylinder", "random_prism")
-    mass: Range = drawn(Range(3, 60, log=True), 0, "kg", 0.1, 1e3, "mass of the object")
+    mass: Annotated[Range, Quantity("kg", "mass of the object", ge=0.1, le=1e3)] = Range(
+        3, 60, log=True
+    )
     # Half width: the square root of half depth times half breadth.
-    size: Range = drawn(Range(0.1, 0.35), 1, "m", 0.03, 1.0, "half width of the object")
-    aspect: Range = drawn(Range(0.5, 2.0, log=True), 2, "1", 0.1, 10, "")  # breadth over depth
-    height: Range = drawn(Range(0.3, 0.8), 3, "m", 0.1, 2.0, "height of the object")
+    size: Annotated[Range, Quantity("m", "half width of the object", ge=0.03, le=1)] = Range(
+        0.1, 0.35
+    )
+    aspect: Annotated[Range, Quantity("1", "breadth over depth", ge=0.1, le=10, reported=False)] = (
+        Range(0.5, 2.0, log=True)
+    )
+    height: Annotated[Range, Quantity("m", "height of the object", ge=0.1, le=2)] = Range(0.3, 0.8)
     # As a share of the way from the middle to the outline.
-    com_offset: Range = drawn(Range(0, 0.4), 4, "1", 0, 0.75, "centre of mass off the middle")
+    com_offset: Annotated[Range, Quantity("1", "centre of mass off the middle", ge=0, le=0.75)] = (
+        Range(0, 0.4)
+    )
     # Of the load that moves the centre of mass: a copy of the object, of equal height, with an
     # outline of this share of its width that touches the object's from inside. The rest is uniform.
-    load_size: Range = drawn(Range(0.1, 0.25), 46, "1", 0.01, 0.9, "size of the load")
+    load_size: Annotated[Range, Quantity("1", "size of the load", ge=0.01, le=0.9)] = Range(
+        0.1, 0.25
+    )
     # Three or four feet, at this share of the way from the centre of mass to the outline; None: it
     # stands on its corners or its rim.
-    feet: Range | None = drawn(None, 43, "1", 0.1, 1, "feet, of the way to the outline")
-    friction_ground: Range = drawn(Range(0.1, 0.7), 6, "1", _POSITIVE, 10, "friction object-ground")
-    friction_robot: Range = drawn(Range(0.1, 0.8), 7, "1", _POSITIVE, 10, "friction object-robot")
+    feet: Annotated[
+        Range | None, Quantity("1", "feet, of the way to the outline", ge=0.1, le=1)
+    ] = None
+    friction_ground: Annotated[
+        Range, Quantity("1", "friction object-ground", ge=_POSITIVE, le=10)
+    ] = Range(0.1, 0.7)
+    friction_robot: Annotated[
+        Range, Quantity("1", "friction object-robot", ge=_POSITIVE, le=10)
+    ] = Range(0.1, 0.8)
     frictions: tuple[Friction, ...] = ()
     # The floor; None: level and uniform. It falls in a direction of the world (None: in any).
-    slope: Range | None = floor(61, "rad", 0, 0.105, "slope of the floor")
-    slope_bearing: Range | None = floor(62, "rad", -math.pi, math.pi, "downhill bearing")
+    slope: Annotated[
+        Range | None, Quantity("rad", "slope of the floor", ge=0, le=0.105, owner="floor")
+    ] = None
+    slope_bearing: Annotated[
+        Range | None, Quantity("rad", "downhill bearing", ge=-math.pi, le=math.pi, owner="floor")
+    ] = None
     # Factor of the object's friction with the ground beyond a line. The line is at right angles to
     # the direction from the base to the end of the trial, at this share of it (None: at any).
-    boundary_factor: Range | None = floor(63, "1", 0.05, 20, "factor of friction at the boundary")
-    boundary: Range | None = drawn(None, 39, "1", 0, 1, "boundary, of the way", "floor", True)
+    boundary_factor: Annotated[
+        Range | None,
+        Quantity("1", "factor of friction at the boundary", ge=0.05, le=20, owner="floor"),
+    ] = None
+    boundary: Annotated[
+        Range | None, Quantity("1", "boundary, of the way", ge=0, le=1, owner="floor", jumps=True)
+    ] = None
     # The task: object and target at the start, in the frame of the base.
-    lateral: Range = drawn(Range(-0.12, 0.12), 8, "m", -0.5, 0.5, "lateral offset", "task")
-    yaw: Range = drawn(Range(-0.6, 0.6), 9, "rad", -math.pi, math.pi, "yaw of the object", "task")
-    gap: Range = drawn(Range(0, 0.05), 10, "m", 0, 1, "gap at the start", "task")
-    distance: Range = drawn(Range(1, 3), 11, "m", 0.7, 20, "distance of the target", "task")
-    bearing: Range = drawn(
-        Range(-math.pi, math.pi), 12, "rad", -math.pi, math.pi, "bearing of the target", "task"
+    lateral: Annotated[Range, Quantity("m", "lateral offset", ge=-0.5, le=0.5, owner="task")] = (
+        Range(-0.12, 0.12)
     )
+    yaw: Annotated[
+        Range, Quantity("rad", "yaw of the object", ge=-math.pi, le=math.pi, owner="task")
+    ] = Range(-0.6, 0.6)
+    gap: Annotated[Range, Quantity("m", "gap at the start", ge=0, le=1, owner="task")] = Range(
+        0, 0.05
+    )
+    distance: Annotated[
+        Range, Quantity("m", "distance of the target", ge=0.7, le=20, owner="task")
+    ] = Range(1, 3)
+    bearing: Annotated[
+        Range, Quantity("rad", "bearing of the target", ge=-math.pi, le=math.pi, owner="task")
+    ] = Range(-math.pi, math.pi)
     targets: tuple[tuple[float, float], ...] = ()  # [m]
     # The skin: ideal, or 42 capacitive taxels with these imperfections.
     skin: str = "capacitive"
     # Of each raw reading, as a change of capacitance.
-    noise: Range = drawn(Range(0, 0.05), 13, "1", 0, 1, "noise of the skin", "skin")
-    gain_spread: Range = drawn(Range(0, 0.1), 14, "1", 0, 1, "spread of the taxels' gains", "skin")
-    dead_share: Range = drawn(Range(0, 0.05), 15, "1", 0, 1, "dead taxels", "skin", True)
-    # None: the skin's default.
-    foam: Range | None = drawn(None, 40, "m", 0.002, 0.05, "foam of the skin", "skin")
-    time_constant: Range | None = drawn(
-        None, 41, "s", _POSITIVE, 1, "time constant of the skin", "skin"
+    noise: Annotated[Range, Quantity("1", "noise of the skin", ge=0, le=1, owner="skin")] = Range(
+        0, 0.05
     )
+    gain_spread: Annotated[
+        Range, Quantity("1", "spread of the taxels' gains", ge=0, le=1, owner="skin")
+    ] = Range(0, 0.1)
+    dead_share: Annotated[
+        Range, Quantity("1", "dead taxels", ge=0, le=1, owner="skin", jumps=True)
+    ] = Range(0, 0.05)
+    # None: the skin's default.
+    foam: Annotated[
+        Range | None, Quantity("m", "foam of the skin", ge=0.002, le=0.05, owner="skin")
+    ] = None
+    time_constant: Annotated[
+        Range | None, Quantity("s", "time constant of the skin", ge=_POSITIVE, le=1, owner="skin")
+    ] = None
     # The base: errors of its odometry and of the executed twist.
-    pose_noise: Range = drawn(Range(0, 0.005), 16, "m", 0, 1, "noise of the position", "base")
-    yaw_noise: Range = drawn(Range(0, 0.01), 17, "rad", 0, 1, "noise of the heading", "base")
-    pose_latency: Range = drawn(Range(0, 0.1), 18, "s", 0, 1, "latency of the pose", "base", True)
-    command_delay: Range = drawn(Range(0, 0.1), 19, "s", 0, 1, "delay of the command", "base", True)
-    # Of each component of the command, constant in a trial and of either sign: columns 20, 21 and
-    # 22. The robot's limits bound the wrong command; wheels lose their slip after the limits.
-    velocity_error: Range = drawn(Range(-0.03, 0.03), 20, "1", -0.9, 0.9, "", "base")
+    pose_noise: Annotated[
+        Range, Quantity("m", "noise of the position", ge=0, le=1, owner="base")
+    ] = Range(0, 0.005)
+    yaw_noise: Annotated[
+        Range, Quantity("rad", "noise of the heading", ge=0, le=1, owner="base")
+    ] = Range(0, 0.01)
+    pose_latency: Annotated[
+        Range, Quantity("s", "latency of the pose", ge=0, le=1, owner="base", jumps=True)
+    ] = Range(0, 0.1)
+    command_delay: Annotated[
+        Range, Quantity("s", "delay of the command", ge=0, le=1, owner="base", jumps=True)
+    ] = Range(0, 0.1)
+    # Of each component of the command, constant in a trial and of either sign. The robot's limits
+    # bound the wrong command; wheels lose their slip after the limits.
+    velocity_error: Annotated[
+        Range,
+        Quantity(
+            "1",
+            "error of the velocity",
+            ge=-0.9,
+            le=0.9,
+            owner="base",
+            numbers=tuple(VELOCITY_ERRORS),
+            reported=False,
+        ),
+    ] = Range(-0.03, 0.03)
     # The robot and its drawn limits; None: the robot's own value.
     robot: Robot = Robot()
-    robot_force: Range | None = limit(35, "N", 1, 1e5, "greatest force of the robot")
-    robot_traction: Range | None = limit(36, "1", _POSITIVE, 5, "traction of the robot's wheels")
-    robot_lag: Range | None = limit(37, "s", 0, 5, "lag of the robot")
+    robot_force: Annotated[
+        Range | None, Quantity("N", "greatest force of the robot", ge=1, le=1e5, owner="robot")
+    ] = None
+    robot_traction: Annotated[
+        Range | None,
+        Quantity("1", "traction of the robot's wheels", ge=_POSITIVE, le=5, owner="robot"),
+    ] = None
+    robot_lag: Annotated[
+        Range | None, Quantity("s", "lag of the robot", ge=0, le=5, owner="robot")
+    ] = None
     # Also of the wheels when turning.
-    robot_acceleration: Range | None = limit(
-        38, "m/s^2", _POSITIVE, 100, "greatest acceleration of the robot"
-    )
-    robot_slip: Range | None = limit(42, "1", 0, 0.9, "slip of the wheels")
-    robot_slip_sideways: Range | None = limit(47, "1", 0, 0.9, "slip of the wheels sideways")
-    robot_slip_yaw: Range | None = limit(48, "1", 0, 0.9, "slip of the wheels when turning")
+    robot_acceleration: Annotated[
+        Range | None,
+        Quantity(
+            "m/s^2", "greatest acceleration of the robot", ge=_POSITIVE, le=100, owner="robot"
+        ),
+    ] = None
+    robot_slip: Annotated[
+        Range | None, Quantity("1", "slip of the wheels", ge=0, le=0.9, owner="robot")
+    ] = None
+    robot_slip_sideways: Annotated[
+        Range | None, Quantity("1", "slip of the wheels sideways", ge=0, le=0.9, owner="robot")
+    ] = None
+    robot_slip_yaw: Annotated[
+        Range | None, Quantity("1", "slip of the wheels when turning", ge=0, le=0.9, owner="robot")
+    ] = None
     # What is asked of the law; the ranges of a path are the task's own.
     task: Task = Reach()
+    # Ranges of registered quantities by name; as pairs, since a domain is hashable.
+    custom: Mapping[str, Range] | tuple[tuple[str, Range], ...] = ()
 
     def __post_init__(self) -> None:
+        try:
+            object.__setattr__(self, "custom", tuple(sorted(dict(self.custom).items())))
+        except (TypeError, ValueError) as error:
+            rule = f"give ranges by name, as {{'threshold': {Range.EXAMPLE}}}"
+            raise errors.not_allowed("domain custom", self.custom, rule) from error
         check_fields(self, "domain ")
         object.__setattr__(self, "objects", tuple(map(parse_object, self.objects)))
         for name in self.objects:
@@ -153,6 +229,12 @@ class Domain:
             raise errors.not_allowed("domain feet", objects, "only random objects have drawn feet")
         unused = {name: cause for name, cause in self.idle.items() if name in _DECLARED}
         check_unused(self, "domain ", unused, PERFECT, _HARDWARE, _HOSTILE)
+        for name, interval in dict(self.custom).items():
+            errors.check_name("registered quantity", name, REGISTERED)
+            QUANTITIES[name].check_range(f"domain {name}", interval)
+            if name in (idle := self.idle):
+                rule = f"{idle[name]} no {name} to draw; leave it out"
+                raise errors.not_allowed(f"domain {name}", f"{interval.low:g}", rule)
         for name, owner in _IMPLIED.items():
             if getattr(self, name) is not None and getattr(self, owner) is None:
                 raise errors.not_allowed(f"domain {name}", getattr(self, name), f"give {owner} too")
@@ -182,10 +264,20 @@ class Domain:
 
     def range_of(self, name: str) -> Range | None:
         """Return the range of a quantity, of the domain itself or of its task; None: not drawn."""
+        if name in REGISTERED:
+            return dict(self.custom).get(name)
         interval = getattr(self if name in _DECLARED else self.task, name, None)
         if interval is None and name in _IMPLIED and getattr(self, _IMPLIED[name]) is not None:
             return Range(QUANTITIES[name].low, QUANTITIES[name].high)
         return interval
+
+    def with_changes(self, changes: Mapping[str, Any]) -> "Domain":
+        """Return the domain with other fields, or ranges of registered quantities."""
+        fields_ = {name: x for name, x in changes.items() if name not in REGISTERED}
+        custom = dict(fields_.pop("custom", self.custom))
+        custom |= {name: x for name, x in changes.items() if name in REGISTERED}
+        drawn = tuple((name, x) for name, x in custom.items() if x is not None)
+        return replace(self, custom=drawn, **fields_)
 
     @property
     def surroundings(self) -> Surroundings:
@@ -249,6 +341,7 @@ class Domain:
 
 RANDOM = {"random_box": "box", "random_cylinder": "cylinder", "random_prism": "prism"}
 _DECLARED = declared(Domain)
+REGISTERED: set[str] = set()  # names of custom quantities: see `registry`
 # Quantities that another one requires; without a range, they are anywhere within their bounds.
 _IMPLIED = {"slope_bearing": "slope", "boundary": "boundary_factor"}
 QUANTITIES: dict[str, Quantity] = _DECLARED | tasks.QUANTITIES
@@ -261,21 +354,34 @@ def quantities_of(*owners: Owner) -> tuple[str, ...]:
 
 # Quantities that only random objects draw.
 OBJECT_QUANTITIES = {*quantities_of("object")} - {"friction_ground", "friction_robot"}
-# Labels of the three draws of the velocity error.
-VELOCITY_ERRORS = {f"{name}_error": f"error of {name}" for name in ("v_x", "v_y", "omega")}
 # Columns of a table of worlds, with their labels.
 LABELS: dict[str, str] = {
-    **{name: quantity.label for name, quantity in QUANTITIES.items() if quantity.label},
+    **{name: quantity.about for name, quantity in QUANTITIES.items() if quantity.reported},
     "corners": "corners of the object",
     **VELOCITY_ERRORS,
 }
+# Random numbers of a world that belong to no range.
+UNRANGED = (
+    *("com_bearing", "key_0", "key_1", "sides", "turn"),
+    *(f"corner_{i}" for i in range(SIDES)),
+    *("feet_number", "feet_turn"),
+)
+streams.claim("a domain", *(x.name for x in fields(Domain)), *VELOCITY_ERRORS)
+streams.claim("an object", *UNRANGED, "object", "corners")
 
-_UNITS = {"com_bearing": "rad"}  # of numbers that belong to no range
+
+def number_names() -> tuple[str, ...]:
+    """Return the names of the random numbers of a world: the old ones by column, then by name."""
+    current = {*numbers_of(QUANTITIES), *UNRANGED, *tasks.UNRANGED}
+    return (*streams.COLUMNS, *sorted(current - streams.COLUMNS.keys()))
 
 
 def unit_of(name: str) -> str:
     """Return the unit of a drawn quantity, or of a column of a table of worlds."""
     return QUANTITIES[name].unit if name in QUANTITIES else _UNITS.get(name, "1")
+
+
+_UNITS = {"com_bearing": "rad"}  # of numbers that belong to no range
 
 
 def _constant(value: float) -> Range:
@@ -370,6 +476,10 @@ def parse_domain(
     Changes may follow a name or a file, as `wide,mass=3:10,objects=random_box`. A `robot` replaces
     the domain's, except for its drawn limits; its latencies replace ranges. A `task` that has no
     single target replaces the domain's targets.
+
+    Examples:
+      >>> parse_domain("wide,mass=3:10").mass
+      Range(low=3.0, high=10.0, log=True)
     """
     if task is not None:
         base, parsed = parse_domain(domain, robot), parse_task(task)
@@ -390,7 +500,7 @@ def parse_domain(
         base = from_json(files.read_json(Path(head)))
     else:
         base = DOMAINS[errors.check_name("domain", head, DOMAINS, "FILE.json")]
-    changed = replace(base, **_from_json(changes, base))
+    changed = base.with_changes(_from_json(changes, base))
     for name in changes:
         if name in changed.idle:  # and has the default
             rule = f"{changed.idle[name]} no {name} to draw; leave it out"
@@ -417,6 +527,10 @@ _FORMS: dict[str, tuple[Callable[[Any], Any], str]] = {
         "pairs of x and y [m], as [[2, 0]]",
     ),
     "skin": (str, "its name"),
+    "custom": (
+        lambda pairs: tuple((str(k), range_of(None, x)) for k, x in dict(pairs).items()),
+        "ranges by name",
+    ),
     "task": (parse_task, 'its name, as "path"'),
     "robot": (parse_robot, 'a robot\'s name or numbers, as {"force_max": 300}'),
 }
@@ -425,6 +539,7 @@ _FORMS: dict[str, tuple[Callable[[Any], Any], str]] = {
 def to_json(domain: Domain) -> JsonObject:
     """Return a domain as JSON, with the solids of custom objects; without the task `reach`."""
     record = asdict(domain) | {"objects": tuple(map(text_of, domain.objects))}
+    record |= {name: tuple(interval) for name, interval in record.pop("custom")}
     if solids := custom_solids(domain.objects):
         record["solids"] = solids
     return record if domain.task != Reach() else {k: x for k, x in record.items() if k != "task"}
@@ -434,7 +549,7 @@ def from_json(values: JsonObject) -> Domain:
     """Return the domain of the JSON of `to_json`, or raise InputError."""
     ranges = dict(values)
     stored = ranges.pop("solids", None)
-    domain = Domain(**_from_json(ranges, DOMAINS["wide"]))
+    domain = DOMAINS["wide"].with_changes(_from_json(ranges, DOMAINS["wide"]))
     if words := describe_difference(stored, stored and custom_solids(domain.objects)):
         raise errors.InputError(f"objects have changed since the run ({words}): restore the files.")
     return domain
@@ -443,12 +558,12 @@ def from_json(values: JsonObject) -> Domain:
 def _from_json(values: Mapping[str, Any], base: Domain) -> dict[str, Any]:
     """Return fields of a domain; a range without a scale has that of the `base` domain."""
     parsed = {}
-    known = {f.name: f for f in fields(Domain)}
+    known = [f.name for f in fields(Domain)]
     for name, value in values.items():
-        errors.check_name("domain quantity", name, known)
-        if value is None and name in QUANTITIES and known[name].default is None:
+        errors.check_name("domain quantity", name, [*known, *sorted(REGISTERED)])
+        if value is None and name in QUANTITIES and getattr(Domain, name, None) is None:
             continue
-        default = getattr(base, name)
+        default = base.range_of(name)
         read, form = _FORMS.get(name, (None, "low and high, as [0.1, 0.5]"))
         try:
             parsed[name] = range_of(default, value) if read is None else read(value)

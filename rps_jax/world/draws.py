@@ -16,12 +16,13 @@ from rps_jax.geometry import solid
 from rps_jax.geometry.solid import GRAVITY, SIDES, Solid
 from rps_jax.record.files import Arrays
 from rps_jax.robot.robot import Robot
-from rps_jax.world import scene, tasks
+from rps_jax.world import scene, streams
 from rps_jax.world.domain import (
     QUANTITIES,
     RANDOM,
     VELOCITY_ERRORS,
     Domain,
+    number_names,
     quantities_of,
     robot_field,
     unit_of,
@@ -29,8 +30,6 @@ from rps_jax.world.domain import (
 from rps_jax.world.physics import Physics
 from rps_jax.world.scene import Friction, Surroundings, WorldInputs
 from rps_jax.world.tasks.base import Course, CourseInputs
-
-COLUMNS = 64  # random numbers of a world; unused ones are for new quantities
 
 
 class Draw(NamedTuple):
@@ -54,39 +53,23 @@ class Draw(NamedTuple):
         return WorldInputs(domain.family_of(self.cases[0]), *columns)
 
 
-# Columns of random numbers that belong to no range.
-_UNRANGED = {
-    "com_bearing": 5,
-    **{name: 20 + i for i, name in enumerate(VELOCITY_ERRORS)},
-    **{"key_0": 23, "key_1": 24, "sides": 25, "turn": 26},
-    **{f"corner_{i}": 27 + i for i in range(SIDES)},
-    **{"feet_number": 44, "feet_turn": 45},
-    **tasks.MORE_NUMBERS,
-}
-# A range with the column of another number is drawn by several numbers, as the velocity error.
-_FIXED = set(_UNRANGED.values())
-_RANGED = {name: item.column for name, item in QUANTITIES.items() if item.column not in _FIXED}
-if _RANGED.keys() & _UNRANGED:
-    raise ValueError(f"two quantities are named {_RANGED.keys() & _UNRANGED}")
-# Columns of the random numbers of a world by name, in their order.
-USES: dict[str, int] = dict(sorted((_RANGED | _UNRANGED).items(), key=lambda item: item[1]))
-
-
 def draw(
     domain: Domain, seed: int, index: ArrayLike, moves: Mapping[str, np.ndarray] | None = None
 ) -> Draw:
     """Return the worlds `index` (n,), all of one object of the domain: see `draw_at`."""
     index = np.asarray(index, np.int64)
-    return draw_at(domain, index, random_numbers(seed, index), moves)
+    return draw_at(domain, index, numbers(seed, index), moves)
+
+
+def numbers(seed: int, index: np.ndarray) -> Arrays:
+    """Return the random numbers (n,) in [0, 1) of the worlds `index` (n,), by name."""
+    return streams.numbers(seed, index, number_names())
 
 
 def draw_at(
-    domain: Domain,
-    index: np.ndarray,
-    uniform: np.ndarray,
-    moves: Mapping[str, np.ndarray] | None = None,
+    domain: Domain, index: np.ndarray, u: Arrays, moves: Mapping[str, np.ndarray] | None = None
 ) -> Draw:
-    """Return worlds of one object from their random numbers (n, columns) in [0, 1).
+    """Return worlds of one object from their random numbers (n,) in [0, 1) by name.
 
     Numbers (n,) of `moves`, by name, are added to drawn quantities.
 
@@ -96,7 +79,6 @@ def draw_at(
     objects = domain.object_of(index)
     if (objects != objects[0]).any():
         raise ValueError("worlds of several objects cannot be batched")
-    u = by_name(uniform)
     name = domain.objects[int(objects[0])]
     ranges = {name: domain.range_of(name) for name in QUANTITIES if name in u}
     at = {name: item.at(u[name]) for name, item in ranges.items() if item is not None}
@@ -118,7 +100,7 @@ def draw_at(
     solids, surroundings = _solid(name, at, u), _surroundings(at, targets)
     if surroundings.boundary is not None:  # each foot has the friction of its side
         solids = solid.standing(solids)
-    return Draw(
+    drawn = Draw(
         indices=index,
         cases=index,
         solid=solids,
@@ -132,25 +114,10 @@ def draw_at(
         key=np.stack(key, axis=-1),
         surroundings=surroundings,
     )
-
-
-def by_name(uniform: np.ndarray) -> Arrays:
-    """Return the columns (n,) of random numbers (n, COLUMNS) by name."""
-    return {name: uniform[:, column] for name, column in USES.items()}
-
-
-def random_numbers(seed: int, index: np.ndarray) -> np.ndarray:
-    """Return the random numbers (n, COLUMNS) in [0, 1) of the worlds `index` (n,)."""
-    rows = np.empty((index.size, COLUMNS))
-    order = np.argsort(index)
-    far = np.flatnonzero(np.diff(index[order]) > 100) + 1
-    for near in np.split(order, far):
-        first, last = int(index[near[0]]), int(index[near[-1]])
-        # Philox counts in steps of four numbers.
-        bits = np.random.Philox(key=seed).advance(first * COLUMNS // 4)
-        block = np.random.Generator(bits).random((last - first + 1, COLUMNS))
-        rows[near] = block[index[near] - first]
-    return rows
+    for name, values in at.items():
+        if name in QUANTITIES and (apply := QUANTITIES[name].apply) is not None:
+            drawn = apply(drawn, values)
+    return drawn
 
 
 def _solid(name: str, at: Arrays, u: Arrays) -> Solid:
@@ -234,9 +201,9 @@ def table(drawn: Draw) -> dict[str, tuple[np.ndarray, str]]:
     columns = {}
     for name, quantity in QUANTITIES.items():
         values = derived.get(name, drawn.values.get(name))
-        if quantity.owner == "robot":
+        if quantity.owner == "robot" and hasattr(Domain, name):
             values = getattr(drawn.robot, robot_field(name))
-        if quantity.label and values is not None:  # the first number of a limit with several
+        if quantity.reported and values is not None:  # the first number of a limit with several
             columns[name] = values.reshape(len(values), -1)[:, 0]
     columns["corners"] = solid.corners(shape)
     columns |= dict(zip(VELOCITY_ERRORS, drawn.velocity_error.T, strict=True))

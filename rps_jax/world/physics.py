@@ -80,6 +80,10 @@ def preset(name: PhysicsName = "default", fidelity: Fidelity = "standard") -> Ph
       fidelity: `reference`, converged, for the engine `mujoco`; `standard`, for tables; or `fast`,
         whose steps of 20 ms double the time constant of the base's contact: MuJoCo lifts it to two
         steps.
+
+    Examples:
+      >>> preset("default", "fast").timestep
+      0.02
     """
     errors.check_name("physics", name, PHYSICS)
     return PHYSICS[name][errors.check_name("fidelity", fidelity, PHYSICS[name])]

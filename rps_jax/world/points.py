@@ -31,12 +31,13 @@ from rps_jax.world.domain import (
     Domain,
     Range,
     from_json,
+    number_names,
     parse_domain,
     to_json,
     unit_of,
 )
 from rps_jax.world.draws import Draw
-from rps_jax.world.tasks import MORE_NUMBERS, TaskLike
+from rps_jax.world.tasks import UNRANGED, TaskLike
 
 CoordinateKind = Literal["range", "choice", "shape", "path", "noise"]
 FILE = "points.nc"  # in a run folder whose worlds are points
@@ -67,11 +68,11 @@ def coordinates(domain: Domain) -> tuple[Coordinate, ...]:
     idle = set(domain.idle) | ({"aspect"} if random == {"random_cylinder"} else set())
     if not random or domain.com_offset.high == 0:
         idle |= {"com_bearing", "load_size"}
-    for name in draws.USES:
+    for name in number_names():
         if name in idle:
             continue
-        if name in MORE_NUMBERS:
-            if name in domain.task.MORE_NUMBERS and name not in domain.task.idle:
+        if name in UNRANGED:
+            if name in domain.task.NUMBERS and name not in domain.task.idle:
                 labels.append(Coordinate(name, "path", Range(0, 1), "1"))
         elif name in (*_OF_PRISMS, *_OF_FEET):
             if domain.feet is not None if name in _OF_FEET else "random_prism" in random:
@@ -173,11 +174,9 @@ def draw(domain: Domain, seed: int, points: Points | None, index: Any) -> Draw:
     if points is None:
         return draws.draw(domain, seed, index)
     index = np.asarray(index, np.int64)
-    uniform = np.full((index.size, draws.COLUMNS), 0.5)
-    pairs = [(i, draws.USES[x]) for i, x in enumerate(names(domain)) if x in draws.USES]
-    ours, theirs = (list(column) for column in zip(*pairs, strict=True))
-    uniform[:, theirs] = points.u[index][:, ours]
-    return draws.draw_at(domain, cases(domain, points, index), uniform)._replace(indices=index)
+    u = dict.fromkeys(number_names(), np.full(index.size, 0.5))
+    u |= dict(zip(names(domain), points.u[index].T, strict=True))
+    return draws.draw_at(domain, cases(domain, points, index), u)._replace(indices=index)
 
 
 def draw_by_object(
@@ -198,11 +197,10 @@ def points_of(domain: Domain | str, index: ArrayLike, seed: int = 0) -> np.ndarr
     domain = parse_domain(domain)
     errors.check_count("seed", seed, at_least=0, at_most=2**63)
     index = np.atleast_1d(np.asarray(index, np.int64))
-    uniform = draws.random_numbers(seed, index)
-    by_name = draws.by_name(uniform)
+    numbers = draws.numbers(seed, index)
     positions = zip(_CHOICES, domain.choices(index), domain.counts, strict=True)
     of_lists = {name: (choice + 0.5) / count for name, choice, count in positions}
-    return np.stack([(by_name | of_lists)[name] for name in names(domain)], axis=-1)
+    return np.stack([(numbers | of_lists)[name] for name in names(domain)], axis=-1)
 
 
 def worlds_at(

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import field, fields
-from typing import Any, Literal, NamedTuple
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
 
 from rps_jax import errors
-
-KEY = "quantity"  # in the metadata of a field
+from rps_jax.spec import Spec, specs_of
 
 
 class Range(NamedTuple):
@@ -29,43 +29,56 @@ class Range(NamedTuple):
         return self.low + u * (self.high - self.low)
 
 
-Owner = Literal["object", "floor", "task", "course", "skin", "base", "robot"]  # of a quantity
+# Of a quantity; one of the skin, the base or the robot sets their field of the same name.
+Owner = Literal["object", "floor", "task", "course", "skin", "base", "robot"]
 
 
-class Quantity(NamedTuple):
-    """Declaration of a drawn quantity, without its range."""
+@dataclass(frozen=True, kw_only=True)
+class Quantity(Spec):
+    """Declaration of a drawn quantity, at the field with its range; the limits are of the range."""
 
-    column: int  # of a world's random numbers; a new quantity takes the next free one
-    unit: str
-    low: float  # bounds of its range
-    high: float
-    label: str  # in reports; empty: not reported
     owner: Owner = "object"
     jumps: bool = False  # whether a world changes in steps with it, so that it has no derivative
+    numbers: tuple[str, ...] | None = None  # its random numbers; None: one, of its own name
+    reported: bool = True  # whether reports have it
+    # Of a registered quantity: sets its values (n,) in the `draws.Draw` of n worlds.
+    apply: Callable[[Any, np.ndarray], Any] | None = None
 
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        errors.check_name(f"owner of '{self.about}'", self.owner, get_args(Owner))
+        if not math.isfinite(self.high - self.low):
+            rule = "a drawn quantity has two finite limits"
+            raise errors.not_allowed(
+                f"limits of '{self.about}'", f"{self.low:g} to {self.high:g}", rule
+            )
 
-def drawn(default: Range | None, *declaration: Any) -> Any:
-    """Declare a drawn quantity by its default range, and the values of a `Quantity`."""
-    return field(default=default, metadata={KEY: Quantity(*declaration)})
+    def check_range(self, name: str, interval: Range) -> None:
+        """Raise InputError unless a range of this quantity is within its limits."""
+        low, high, log = interval
+        for side, value in (("low", low), ("high", high)):
+            self.check(f"{name} ({side})", value)
+        if low > high or (log and low <= 0):
+            rule = "low must not exceed high" + (", and be above 0" if log else "")
+            raise errors.not_allowed(name, f"{low:g} to {high:g}", rule)
 
 
 def declared(kind: type) -> dict[str, Quantity]:
     """Return the quantities that a dataclass declares, by name."""
-    return {x.name: x.metadata[KEY] for x in fields(kind) if KEY in x.metadata}
+    return {name: x for name, x in specs_of(kind).items() if isinstance(x, Quantity)}
+
+
+def numbers_of(quantities: Mapping[str, Quantity]) -> tuple[str, ...]:
+    """Return the names of the random numbers from which quantities are drawn."""
+    items = quantities.items()
+    return tuple(x for k, q in items for x in ((k,) if q.numbers is None else q.numbers))
 
 
 def check_ranges(record: Any, prefix: str) -> None:
-    """Raise InputError unless the ranges of a dataclass are within the bounds of its quantities."""
+    """Raise InputError unless the ranges of a dataclass are within the limits of its quantities."""
     for name, quantity in declared(type(record)).items():
-        if (interval := getattr(record, name)) is None:
-            continue
-        low, high, log = interval
-        bounds = {"at_least": quantity.low, "at_most": quantity.high, "unit": quantity.unit}
-        for side, value in (("low", low), ("high", high)):
-            errors.check_finite(f"{prefix}{name} ({side})", value, **bounds)
-        if low > high or (log and low <= 0):
-            rule = "low must not exceed high" + (", and be above 0" if log else "")
-            raise errors.not_allowed(f"{prefix}{name}", f"{low:g} to {high:g}", rule)
+        if (interval := getattr(record, name)) is not None:
+            quantity.check_range(f"{prefix}{name}", interval)
 
 
 def check_unused(

@@ -14,12 +14,11 @@ from typing import Any
 import xarray as xr
 from scipy import stats
 
+from rps_jax import Robot, Setting
 from rps_jax.analysis import statistics
-from rps_jax.robot.robot import Robot
-from rps_jax.robot.skin import CapacitiveSkin, IdealSkin
-from rps_jax.trials.setting import Setting
+from rps_jax.physics import PHYSICS, Physics
 from rps_jax.world import paper
-from rps_jax.world.physics import PHYSICS, Physics
+from rps_jax.worlds import CapacitiveSkin, IdealSkin
 from sweeps.conditions import Condition
 
 DEFAULT = "default"
@@ -129,10 +128,14 @@ def cells(results: xr.Dataset) -> list[list[str]]:
         theirs = paper.TABLE_II[str(law), str(name), str(friction)]
         low, high = statistics.wilson(theirs, in_paper)
         table = [[ours, trials - ours], [theirs, in_paper - theirs]]
-        rows.append([
-            f"{str(law).upper()} {name} {friction}", f"{ours} of {trials}",
-            f"{theirs} of {in_paper}", f"{in_paper * low:.1f}-{in_paper * high:.1f}",
-            "yes" if low <= ours / trials <= high else "no",
-            f"{stats.fisher_exact(table).pvalue:.2g}",
-        ])  # fmt: skip
+        rows.append(
+            [
+                f"{str(law).upper()} {name} {friction}",
+                f"{ours} of {trials}",
+                f"{theirs} of {in_paper}",
+                f"{in_paper * low:.1f}-{in_paper * high:.1f}",
+                "yes" if low <= ours / trials <= high else "no",
+                f"{stats.fisher_exact(table).pvalue:.2g}",
+            ]
+        )
     return rows

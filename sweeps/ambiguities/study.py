@@ -8,15 +8,15 @@ skin. The readings are in `readings`.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import xarray as xr
 
-from rps_jax import errors
-from rps_jax.control import registry
-from rps_jax.runs.question import call_of
+from rps_jax import InputError, errors
+from rps_jax.laws import resolve_law
+from rps_jax.questions import call_of
 from rps_jax.world import paper
 from sweeps.ambiguities import readings
 from sweeps.conditions import Condition, ConditionStudy, Grid, condition_rows
@@ -30,9 +30,9 @@ class Ambiguities(ConditionStudy):
     The result has the outcomes (condition, law, object, friction, target).
     """
 
-    TITLE: ClassVar[str] = "What the paper leaves open"
-    QUICK: ClassVar[Mapping[str, Any]] = {"targets": paper.FEW_TARGETS}
-    GROWS: ClassVar[tuple[str, ...]] = ("readings", "gazebo", "curve")
+    TITLE = "What the paper leaves open"
+    QUICK: ClassVar = {"targets": paper.FEW_TARGETS}
+    GROWS = ("readings", "gazebo", "curve")
 
     laws: tuple[str, ...] = ()
     """Names of laws; by default rps, and with --gazebo also nps and aps."""
@@ -76,11 +76,11 @@ class Ambiguities(ConditionStudy):
         """Check the names."""
         super().check()
         if self.gazebo and self.curve:
-            raise errors.InputError("gazebo and curve are not allowed together: choose one.")
+            raise InputError("gazebo and curve are not allowed together: choose one.")
         for name in self.readings:
             errors.check_name("reading", name, self.known)
         for name in self.grid.laws:
-            errors.check_name("law", name, registry.LAWS)
+            resolve_law(name)
 
     def intro(self, results: xr.Dataset) -> str:
         """Trials, tests and left-out readings."""

@@ -18,15 +18,13 @@ import jax
 import numpy as np
 import xarray as xr
 
-from rps_jax.control import registry
-from rps_jax.record.options import option
-from rps_jax.runs.question import Run, call_of
+from rps_jax import Domain, Rules, Setting
+from rps_jax.laws import resolve_law
+from rps_jax.questions import Run, call_of, option
 from rps_jax.trials.batch_run import Candidates, outcomes
 from rps_jax.trials.progress import Progress
-from rps_jax.trials.setting import Setting
-from rps_jax.trials.trial import Rules
-from rps_jax.world.domain import Domain, parse_domain
 from rps_jax.world.tasks import parse_task
+from rps_jax.worlds import parse_domain
 from sweeps.study_base import SpeedStudy, Table
 
 _BOXES = "wide,objects=random_box"
@@ -48,10 +46,9 @@ class Costs(SpeedStudy[xr.Dataset]):
     The answer has `cost` (task, round), in seconds per simulated second.
     """
 
-    TITLE: ClassVar[str] = "Cost of tasks"
-    IGNORED_FIELDS: ClassVar[tuple[str, ...]] = ("workers",)
+    TITLE = "Cost of tasks"
     CHOICES: ClassVar = {"tasks": TASKS}
-    GROWS: ClassVar[tuple[str, ...]] = ("tasks",)
+    GROWS = ("tasks",)
     PRESETS: ClassVar = {"tasks": TASKS, "domain": DOMAIN}
 
     tasks: tuple[str, ...] = tuple(TASKS)
@@ -72,7 +69,7 @@ class Costs(SpeedStudy[xr.Dataset]):
     def answer(self, run: Run) -> xr.Dataset:
         """Measure all tasks in turn, round by round."""
         setting = Setting("fused", rules=Rules(horizon=self.horizon, max_lost=1e4))
-        params = jax.tree.map(lambda x: np.asarray(x)[None], registry.LAWS["rps"])
+        params = jax.tree.map(lambda x: np.asarray(x)[None], resolve_law("rps")[1])
         costs = np.zeros((len(self.tasks), self.rounds + 1))
         for i in range(self.rounds + 1):
             for j, name in enumerate(self.tasks):

@@ -14,16 +14,14 @@ from typing import ClassVar, NamedTuple
 
 import xarray as xr
 
+from rps_jax import Setting
 from rps_jax.analysis import statistics, tables
-from rps_jax.control import registry
-from rps_jax.engines import EngineName
-from rps_jax.record.options import option
-from rps_jax.runs.plan import Plan
-from rps_jax.runs.question import Run, call_of
-from rps_jax.trials.setting import Setting
-from rps_jax.world.domain import DomainLike, parse_domain
-from rps_jax.world.physics import PHYSICS, Fidelity, preset
-from sweeps.study_base import Study, Table, run_plans
+from rps_jax.laws import resolve_law
+from rps_jax.physics import PHYSICS, EngineName, preset
+from rps_jax.questions import Plan, Run, call_of, option
+from rps_jax.world.physics import Fidelity
+from rps_jax.worlds import DomainLike, parse_domain
+from sweeps.study_base import PlanStudy, Study, Table, run_plans
 
 
 class Row(NamedTuple):
@@ -52,15 +50,15 @@ ENGINES: dict[str, EngineName] = {"reference": "mujoco", "fused": "fused"}
 
 
 @dataclass(frozen=True)
-class Parity(Study[xr.DataTree]):
+class Parity(PlanStudy[xr.DataTree], Study[xr.DataTree]):
     """Compare the outcomes of tasks in the fused engine with those of converged C MuJoCo.
 
     The answer is a tree with the outcomes (law, world) of each row in both engines.
     """
 
-    TITLE: ClassVar[str] = "Tasks in the fused engine and in converged C MuJoCo"
+    TITLE = "Tasks in the fused engine and in converged C MuJoCo"
     CHOICES: ClassVar = {"rows": ROWS}
-    GROWS: ClassVar[tuple[str, ...]] = ("rows",)
+    GROWS = ("rows",)
     PRESETS: ClassVar = PHYSICS["default"]
 
     rows: tuple[str, ...] = tuple(ROWS)
@@ -75,26 +73,19 @@ class Parity(Study[xr.DataTree]):
     @cached_property
     def plans(self) -> dict[str, Plan]:
         """Plans by row and engine."""
-        return {f"{row} {engine}": self._plan(ROWS[row], engine)
-                for row in self.rows for engine in ENGINES}  # fmt: skip
+        return {
+            f"{row} {engine}": self._plan(ROWS[row], engine)
+            for row in self.rows
+            for engine in ENGINES
+        }
 
     def _plan(self, row: Row, engine: str) -> Plan:
         """Return the plan of a row in an engine."""
-        label, params = registry.resolve_law(row.law)
+        label, params = resolve_law(row.law)
         fidelity = row.fidelity if engine == "fused" else "reference"
         setting = Setting(ENGINES[engine], physics=preset(fidelity=fidelity), seed=self.seed)
         domain = parse_domain(row.domain, row.robot, row.task)
         return Plan(domain, self.worlds, {label: params}, setting, self.part)
-
-    def check(self) -> None:
-        """Check the names, and that the engines can step these worlds here."""
-        super().check()
-        for plan in self.plans.values():
-            plan.check_here()
-
-    def num_trials(self) -> int | None:
-        """Return the number of trials."""
-        return sum(plan.num_trials for plan in self.plans.values())
 
     def answer(self, run: Run) -> xr.DataTree:
         """Run the missing trials."""

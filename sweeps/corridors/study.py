@@ -14,25 +14,19 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import ClassVar
+from typing import ClassVar, Literal
 
 import numpy as np
 import xarray as xr
 
+from rps_jax import Range, Rules, Setting
 from rps_jax.analysis import statistics, tables
 from rps_jax.analysis.figures.style import Figure, success_rates, tiles
-from rps_jax.analysis.report import Picture
-from rps_jax.control.base import LawParams
-from rps_jax.control.registry import LawsLike
-from rps_jax.record.options import option
-from rps_jax.runs.plan import Plan
-from rps_jax.runs.question import MultiLawQuestion, Run, call_of
-from rps_jax.trials.setting import Setting, Split
-from rps_jax.trials.trial import Rules
-from rps_jax.world.domain import DomainLike, parse_domain
-from rps_jax.world.quantity import Range
+from rps_jax.laws import LawParams, LawsLike
+from rps_jax.questions import MultiLawQuestion, Picture, Plan, Run, call_of, option
 from rps_jax.world.tasks.corridor import BASE, OBJECT, Corridor
 from rps_jax.world.tasks.path import Path
+from rps_jax.worlds import DomainLike, parse_domain
 from sweeps.corridors.widths import Curve, fit
 from sweeps.study_base import Rows, Study, Table, run_together
 
@@ -46,8 +40,13 @@ DOOR = "0°, a door"
 _DOOR_WIDTH = 0.7  # [1] of the corridor's width
 _PATH_TURNS = (0, 30, 60, 90)  # [deg] edges of the classes of a path's turns
 KINDS = (
-    *("base touched", "object touched", "lost contact", "never touched", "fell over"),
-    *("out of time", "diverged"),
+    "base touched",
+    "object touched",
+    "lost contact",
+    "never touched",
+    "fell over",
+    "out of time",
+    "diverged",
 )
 _BORDERS = 0.1, 0.95  # [1] of the path, before and beyond which a failure is one of its ends
 _IN_TIME = 300.0  # [s] default horizon of trials
@@ -62,8 +61,8 @@ class Corridors(Study[xr.DataTree], MultiLawQuestion[xr.DataTree]):
     `corridors` (turn, law, world) with the lookahead of each law, and `paths` (law, world).
     """
 
-    TITLE: ClassVar[str] = "Pushing through corridors"
-    QUICK: ClassVar[Mapping[str, object]] = {
+    TITLE = "Pushing through corridors"
+    QUICK: ClassVar = {
         "laws": ("rps", "rps_tuned"),
         "choice": 60,
         "worlds": 48,
@@ -75,8 +74,13 @@ class Corridors(Study[xr.DataTree], MultiLawQuestion[xr.DataTree]):
     }
 
     laws: LawsLike = (
-        *("rps", "rps_tuned", "rps_plus", "learned"),
-        *("force_push", "dipole", "aps"),
+        "rps",
+        "rps_tuned",
+        "rps_plus",
+        "learned",
+        "force_push",
+        "dipole",
+        "aps",
     )
     domain: DomainLike = "wide"
     """Ranges from which worlds are drawn: paper, hardware, wide, real, prisms or hostile, or a JSON
@@ -127,7 +131,11 @@ class Corridors(Study[xr.DataTree], MultiLawQuestion[xr.DataTree]):
         return Corridor(length=LENGTH, turn_angle=angle, width=width, doors=1, door_width=opening)
 
     def _plan(
-        self, task: Path, worlds: int, laws: Mapping[str, LawParams], split: Split = "test"
+        self,
+        task: Path,
+        worlds: int,
+        laws: Mapping[str, LawParams],
+        split: Literal["tune", "test"] = "test",
     ) -> Plan:
         """Return the plan of a task; worlds of one split depend on the seed alone."""
         setting = replace(self.setting, split=split)
@@ -177,19 +185,39 @@ class Corridors(Study[xr.DataTree], MultiLawQuestion[xr.DataTree]):
         curves = fit_all(corridors)
         figure = Picture("corridors", partial(figure_of, corridors, curves))
         return [
-            Table(width_table(corridors, curves), name="corridors_widths", merge="turn",
-                  title="Width that laws need", picture=figure),
-            Table(object_table(corridors), name="corridors_objects", merge="turn",
-                  title="Width that 90 % need, by object"),
-            Table(failure_table(corridors), name="corridors_failures", merge="turn",
-                  title="Failures"),
-            Table(lookahead_table(choice), name="corridors_lookaheads",
-                  title="Success in corridors by lookahead"),
-            Table(lookahead_table(paths, _IN_TIME), name="corridors_open",
-                  title="Success on paths within 300 s, by lookahead"),
-            Table(error_table(paths), name="corridors_paths", merge="law",
-                  title="Cross-track error on paths"),
-        ]  # fmt: skip
+            Table(
+                width_table(corridors, curves),
+                name="corridors_widths",
+                merge="turn",
+                title="Width that laws need",
+                picture=figure,
+            ),
+            Table(
+                object_table(corridors),
+                name="corridors_objects",
+                merge="turn",
+                title="Width that 90 % need, by object",
+            ),
+            Table(
+                failure_table(corridors), name="corridors_failures", merge="turn", title="Failures"
+            ),
+            Table(
+                lookahead_table(choice),
+                name="corridors_lookaheads",
+                title="Success in corridors by lookahead",
+            ),
+            Table(
+                lookahead_table(paths, _IN_TIME),
+                name="corridors_open",
+                title="Success on paths within 300 s, by lookahead",
+            ),
+            Table(
+                error_table(paths),
+                name="corridors_paths",
+                merge="law",
+                title="Cross-track error on paths",
+            ),
+        ]
 
 
 corridors = call_of(Corridors)
@@ -332,8 +360,10 @@ def failure_table(results: xr.Dataset) -> Rows:
             trials = started.sel(row=row, law=law)
             kinds = failure_kinds(trials)
             failed = kinds >= 0
-            shares = [100 * np.mean(kinds[failed] == i) if failed.any() else 0.0
-                      for i in range(len(KINDS))]  # fmt: skip
+            shares = [
+                100 * np.mean(kinds[failed] == i) if failed.any() else 0.0
+                for i in range(len(KINDS))
+            ]
             progress = trials.progress.values[failed]
             first, last = _BORDERS
             where = [100 * np.mean(m) for m in (progress < first, progress > last) if m.size]
@@ -406,6 +436,7 @@ def figure_of(results: xr.Dataset, curves: Mapping[tuple[str, str], Curve]) -> F
         ax.set_xlabel("narrowest width [m]")
     for ax in axes[:, 0]:
         ax.set_ylabel("success [%]")
-    figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=7,
-                  fontsize=8)  # fmt: skip
+    figure.legend(
+        *axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=7, fontsize=8
+    )
     return figure

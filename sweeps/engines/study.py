@@ -15,17 +15,13 @@ from typing import ClassVar
 
 import xarray as xr
 
+from rps_jax import Range, Setting
 from rps_jax.analysis import statistics
-from rps_jax.control import registry
-from rps_jax.control.registry import LawLike
-from rps_jax.record.options import option
-from rps_jax.runs.plan import Plan
-from rps_jax.runs.question import Run, call_of
-from rps_jax.trials.setting import Setting
-from rps_jax.world import domain as domains
-from rps_jax.world.domain import DomainLike, Range
-from rps_jax.world.physics import PHYSICS, preset
-from sweeps.study_base import Rows, Table, TrialStudy, run_plans
+from rps_jax.laws import LawLike, resolve_law
+from rps_jax.physics import PHYSICS, preset
+from rps_jax.questions import Plan, Run, call_of, option
+from rps_jax.worlds import DomainLike, parse_domain
+from sweeps.study_base import PlanStudy, Rows, Table, TrialStudy, run_plans
 
 _CONVERGED = Setting(physics=preset(fidelity="reference"), engine="mujoco")
 _MOVED = 1e-6  # [m]
@@ -44,20 +40,20 @@ ENGINES = {
 
 
 @dataclass(frozen=True)
-class Engines(TrialStudy[xr.DataTree]):
+class Engines(PlanStudy[xr.DataTree], TrialStudy[xr.DataTree]):
     """Compare the outcomes of engines in random worlds.
 
     The answer is a tree with the outcomes (world) of each engine.
     """
 
-    TITLE: ClassVar[str] = "Do the engines agree in random worlds?"
-    QUICK: ClassVar[Mapping[str, object]] = {
+    TITLE = "Do the engines agree in random worlds?"
+    QUICK: ClassVar = {
         "worlds": 16,
         "objects": ("random_cylinder",),
         "engines": ("C, standard", "fused, standard"),
     }
     CHOICES: ClassVar = {"engines": ENGINES}
-    GROWS: ClassVar[tuple[str, ...]] = ("engines",)
+    GROWS = ("engines",)
     PRESETS: ClassVar = PHYSICS["default"]
 
     law: LawLike = "rps"
@@ -78,9 +74,9 @@ class Engines(TrialStudy[xr.DataTree]):
     @cached_property
     def plans(self) -> dict[str, Plan]:
         """Plans by name of the engine."""
-        ranges = domains.parse_domain(self.domain)
+        ranges = parse_domain(self.domain)
         ranges = replace(ranges, objects=self.objects or ranges.objects)
-        label, params = registry.resolve_law(self.law)
+        label, params = resolve_law(self.law)
         low, high, log = ranges.gap
         moved = replace(ranges, gap=Range(low + _MOVED, high + _MOVED, log))
         plan = Plan(ranges, self.worlds, {label: params}, _CONVERGED, self.part)
@@ -90,16 +86,6 @@ class Engines(TrialStudy[xr.DataTree]):
             )
             for name in self.engines or ENGINES
         }
-
-    def check(self) -> None:
-        """Check the names, and that the engines can step these worlds here."""
-        super().check()
-        for plan in self.plans.values():
-            plan.check_here()
-
-    def num_trials(self) -> int | None:
-        """Return the number of trials."""
-        return sum(plan.num_trials for plan in self.plans.values())
 
     def answer(self, run: Run) -> xr.DataTree:
         """Run the missing trials of each engine."""

@@ -11,19 +11,16 @@ import jax
 import numpy as np
 
 import rps_jax
+from rps_jax import Details, Law, Setting, Twist, register_law
 from rps_jax.app.export import program
 from rps_jax.app.shadow import shadow
-from rps_jax.control import registry
-from rps_jax.control.base import Law
-from rps_jax.control.observation import Details, Twist
+from rps_jax.laws import law_of, resolve_law
 from rps_jax.lowering.routine import identifier
+from rps_jax.physics import FRICTION
 from rps_jax.runs.push import recorded_law
 from rps_jax.trials import pushes
-from rps_jax.trials.case import Case
-from rps_jax.trials.setting import Setting
 from rps_jax.world import paper
-from rps_jax.world.objects import PAPER_OBJECTS
-from rps_jax.world.scene import FRICTION
+from rps_jax.worlds import Case, parse_domain
 from sweeps.export.native import TOLERANCE, Native, scale_of
 
 ROUNDINGS = (1, -1, 2, -2, 4, -4, 8, -8)  # rounding errors of a twist, in units of 2^-23
@@ -31,7 +28,7 @@ ROUNDINGS = (1, -1, 2, -2, 4, -4, 8, -8)  # rounding errors of a twist, in units
 
 def recorded(cases: Sequence[Case], setting: Setting) -> list[Any]:
     """Return the observations of each case in each control step: leaves (T, ...), by trial."""
-    law = registry.law_of(cases[0].params)
+    law = law_of(cases[0].params)
     worlds = pushes.build(cases, setting)
     period, trials = setting.physics.control_period, []
     for trace in pushes.record_batch(worlds, setting, recorded_law(law), interval=period):
@@ -44,8 +41,8 @@ def recorded(cases: Sequence[Case], setting: Setting) -> list[Any]:
 
 def in_the_loop(name: str, folder: Path) -> Any:
     """Register a law whose step runs in C with floats; return its parameters."""
-    label, params = registry.resolve_law(name)
-    law, native = registry.law_of(params), Native(program.program(name), folder, "float")
+    label, params = resolve_law(name)
+    law, native = law_of(params), Native(program.program(name), folder, "float")
 
     def call_native(state: Any, obs: Any) -> Any:
         shape = np.shape(obs[0])[:-1]
@@ -78,8 +75,8 @@ def in_the_loop(name: str, folder: Path) -> Any:
 
 def nudged(name: str, roundings: int) -> Any:
     """Register a law with rounding errors added to its twists; return its parameters."""
-    label, params = registry.resolve_law(name)
-    law = registry.law_of(params)
+    label, params = resolve_law(name)
+    law = law_of(params)
 
     def step(params: Any, state: Any, obs: Any) -> Any:
         state, twist, details = law.step(params.law, state, obs)
@@ -94,7 +91,7 @@ def _registered(name: str, law: Law, step: Any, params: Any) -> Any:
     """Register a law with another step; return parameters of a new class."""
     params_class = namedtuple(name, "law d_success")
     wrapped = params_class(params, params.d_success)
-    registry.register_law(name, Law(lambda p: law.init(p.law), step, senses=law.senses), wrapped)
+    register_law(name, Law(lambda p: law.init(p.law), step, senses=law.senses), wrapped)
     return wrapped
 
 
@@ -112,7 +109,7 @@ class Outcomes(NamedTuple):
 
 def _compare(name: str, folder: Path, run: Any, roundings: Sequence[int]) -> Outcomes:
     """Return the outcomes of `run`, a function of the parameters of a law."""
-    laws = [registry.resolve_law(name)[1], in_the_loop(name, folder)]
+    laws = [resolve_law(name)[1], in_the_loop(name, folder)]
     outcomes = [run(p) for p in [*laws, *(nudged(name, n) for n in roundings)]]
     succeeded = np.array([np.asarray(outcome.success).ravel() for outcome in outcomes], bool)
     times = [np.asarray(outcome.time).ravel() for outcome in outcomes[:2]]
@@ -126,7 +123,9 @@ def _compare(name: str, folder: Path, run: Any, roundings: Sequence[int]) -> Out
 
 def papers_trials(name: str, setting: Setting, folder: Path) -> Outcomes:
     """Return the outcomes of the paper's 144 trials."""
-    cases = [(o, f, t) for o in PAPER_OBJECTS for f in FRICTION for t in paper.TARGETS]
+    cases = [
+        (o, f, t) for o in parse_domain("paper").objects for f in FRICTION for t in paper.TARGETS
+    ]
 
     def run(params: Any) -> Any:
         return pushes.run([Case(*options, law=params) for options in cases], setting)[0]
@@ -159,7 +158,7 @@ def bags(name: str, domain: str, worlds: int, setting: Setting, folder: Path) ->
     from rosbags.highlevel import AnyReader
     from rosbags.typesys import Stores, get_typestore
 
-    law = registry.resolve_law(name)[1]
+    law = resolve_law(name)[1]
     rps_jax.sweep({"law": law}, domain, worlds, setting=setting, out=folder / "run", progress=False)
     errors, strange = [], 0
     for world in range(worlds):

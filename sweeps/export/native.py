@@ -26,11 +26,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from rps_jax import Law, Twist
 from rps_jax.app.export import c, folder, onnx_model, program
 from rps_jax.app.export.program import Program
-from rps_jax.control import registry, validation
-from rps_jax.control.base import Law
-from rps_jax.control.observation import Twist
+from rps_jax.control import validation
+from rps_jax.laws import law_of, resolve_law
 from rps_jax.lowering.routine import Group
 
 Precision = Literal["float", "double"]
@@ -224,8 +224,8 @@ class Agreement(NamedTuple):
 
 def agreement(name: str, form: Form, inputs: int, path: Path, seed: int = 0) -> Agreement:
     """Compare a law's twist and memory in C or ONNX and in JAX."""
-    label, params = registry.resolve_law(name)
-    law, exported = registry.law_of(params), program.program(name)
+    label, params = resolve_law(name)
+    law, exported = law_of(params), program.program(name)
     worlds, real = max(1, min(inputs // STEPS, 5000)), REAL[form]
     native = build_law(form, exported, path, worlds)
     with jax.enable_x64(form == "double"):
@@ -368,8 +368,8 @@ class TrialErrors(NamedTuple):
 
 def trial_errors(name: str, form: Form, trials: Sequence[Any], path: Path) -> TrialErrors:
     """Return errors of the twists over whole trials, with observations of `loop.recorded`."""
-    law_params = registry.resolve_law(name)[1]
-    law, exported, real = registry.law_of(law_params), program.program(name), REAL[form]
+    law_params = resolve_law(name)[1]
+    law, exported, real = law_of(law_params), program.program(name), REAL[form]
     native = build_law(form, exported, path, len(trials))
     longest = max(len(trial[0]) for trial in trials)
     fields, scale = exported.groups["observation"], scale_of(law_params)

@@ -13,7 +13,7 @@ import os
 import shutil
 import tempfile
 from collections import namedtuple
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from itertools import product
@@ -24,17 +24,14 @@ import jax
 import numpy as np
 import xarray as xr
 
+from rps_jax import InputError, Setting
 from rps_jax.app.export import program
 from rps_jax.control.learned import policy
-from rps_jax.errors import InputError
-from rps_jax.record.options import option
-from rps_jax.runs.question import Run, call_of
-from rps_jax.trials.case import Case
-from rps_jax.trials.setting import Setting
+from rps_jax.physics import PHYSICS
+from rps_jax.questions import Run, call_of, option
 from rps_jax.world import paper
 from rps_jax.world.domain import STORED
-from rps_jax.world.objects import PAPER_OBJECTS
-from rps_jax.world.physics import PHYSICS
+from rps_jax.worlds import Case, parse_domain
 from sweeps.export import loop, native
 from sweeps.study_base import QuickStudy, Table, records, run_parts, text_table
 
@@ -55,10 +52,10 @@ class Export(QuickStudy[xr.DataTree]):
     The answer is a tree with the values of each table by law.
     """
 
-    TITLE: ClassVar[str] = "Laws in C and ONNX beside those in JAX"
-    GROWS: ClassVar[tuple[str, ...]] = ("laws", "tables", "in_worlds")
+    TITLE = "Laws in C and ONNX beside those in JAX"
+    GROWS = ("laws", "tables", "in_worlds")
     PRESETS: ClassVar = PHYSICS["default"]
-    QUICK: ClassVar[Mapping[str, object]] = {
+    QUICK: ClassVar = {
         "laws": ("rps_plus",),
         **{"inputs": 20_000, "states": 20_000, "worlds": 4, "bags": 1},
     }
@@ -118,7 +115,7 @@ class Export(QuickStudy[xr.DataTree]):
     def _trials(self, law: str, folder: Path) -> xr.Dataset:
         cases = [
             [Case(name, "S1", target, law=law) for target in paper.FEW_TARGETS]
-            for name in PAPER_OBJECTS
+            for name in parse_domain("paper").objects
         ]
         trials = [trial for group in cases for trial in loop.recorded(group, Setting("fused"))]
         rows = []
@@ -127,9 +124,9 @@ class Export(QuickStudy[xr.DataTree]):
             free, synchronised, in_jax = errors
             parted = [(x > native.JUMP).sum() for x in (free, in_jax)]
             beyond = (free > native.TOLERANCE[form]).sum()
-            rows.append(_Trials(
-                len(trials), free.size, free.max(), synchronised.max(), beyond, *parted
-            ))  # fmt: skip
+            rows.append(
+                _Trials(len(trials), free.size, free.max(), synchronised.max(), beyond, *parted)
+            )
         return _columns(rows, "form", _FORMS)
 
     def _paper(self, law: str, folder: Path) -> xr.Dataset:
@@ -163,10 +160,14 @@ class Export(QuickStudy[xr.DataTree]):
     def report_tables(self, results: xr.DataTree) -> Sequence[Table]:
         """Return all tables."""
         functions = {
-            "speed": _speed_table, "inputs": _input_table, "trials": _trial_table,
-            "paper": _paper_table, "worlds": partial(_world_table, self.domain),
-            "bags": partial(_bag_table, self.domain), "odd": _odd_table,
-        }  # fmt: skip
+            "speed": _speed_table,
+            "inputs": _input_table,
+            "trials": _trial_table,
+            "paper": _paper_table,
+            "worlds": partial(_world_table, self.domain),
+            "bags": partial(_bag_table, self.domain),
+            "odd": _odd_table,
+        }
         return [
             functions[name](node.to_dataset())._replace(name=f"export_{name}")
             for name, node in results.children.items()
@@ -196,18 +197,34 @@ def _share(part: float, whole: float) -> str:
 
 def _input_table(results: xr.Dataset) -> Table:
     rows = [
-        ["law", "form", "inputs", "greatest difference", "beyond the goal", "flips", "unexplained",
-         "beyond 1e-6 of float64", "JAX's float32 is"],
-    ]  # fmt: skip
+        [
+            "law",
+            "form",
+            "inputs",
+            "greatest difference",
+            "beyond the goal",
+            "flips",
+            "unexplained",
+            "beyond 1e-6 of float64",
+            "JAX's float32 is",
+        ],
+    ]
     for row in records(results, "law", "form"):
         beyond, *in_float = (
             _share(row[name], row["inputs"]) for name in ("beyond", "off", "off_in_jax")
         )
-        rows.append([
-            row["law"], _WORDS[row["form"]], f"{row['inputs']:,.0f}", f"{row['greatest']:.1e}",
-            beyond, f"{row['flips']:.0f}", f"{row['unexplained']:.0f}",
-            *(in_float if row["form"] != "double" else ["", ""]),
-        ])  # fmt: skip
+        rows.append(
+            [
+                row["law"],
+                _WORDS[row["form"]],
+                f"{row['inputs']:,.0f}",
+                f"{row['greatest']:.1e}",
+                beyond,
+                f"{row['flips']:.0f}",
+                f"{row['unexplained']:.0f}",
+                *(in_float if row["form"] != "double" else ["", ""]),
+            ]
+        )
     note = (
         "The goal is 1e-12 in double and 1e-6 in float. Differences are shares of the greatest "
         "speed and turning rate, or of the memory."
@@ -216,16 +233,33 @@ def _input_table(results: xr.Dataset) -> Table:
 
 
 def _trial_table(results: xr.Dataset) -> Table:
-    rows = [["law", "form", "steps", "greatest difference", "from JAX's memory",
-             "steps beyond the goal", "beyond 1e-3", "JAX's float32 is"]]  # fmt: skip
+    rows = [
+        [
+            "law",
+            "form",
+            "steps",
+            "greatest difference",
+            "from JAX's memory",
+            "steps beyond the goal",
+            "beyond 1e-3",
+            "JAX's float32 is",
+        ]
+    ]
     for row in records(results, "law", "form"):
         *shares, in_jax = (
             _share(row[name], row["steps"]) for name in ("beyond", "parted", "in_jax")
         )
-        rows.append([
-            row["law"], _WORDS[row["form"]], f"{row['steps']:,.0f}", f"{row['greatest']:.1e}",
-            f"{row['told']:.1e}", *shares, in_jax if row["form"] != "double" else "",
-        ])  # fmt: skip
+        rows.append(
+            [
+                row["law"],
+                _WORDS[row["form"]],
+                f"{row['steps']:,.0f}",
+                f"{row['greatest']:.1e}",
+                f"{row['told']:.1e}",
+                *shares,
+                in_jax if row["form"] != "double" else "",
+            ]
+        )
     note = (
         f"{int(results.trials.max())} trials of each law. Each law remembers by itself from "
         "the first step to the last; from JAX's memory, it is given that before each step. JAX's "

@@ -9,16 +9,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 import xarray as xr
 
 from rps_jax.analysis import statistics
-from rps_jax.analysis.report import Section
-from rps_jax.record.options import option
-from rps_jax.runs.plan import Plan
-from rps_jax.runs.question import Run, call_of, count_true
+from rps_jax.questions import Plan, Run, Section, call_of, option
 from rps_jax.studies.rare import Estimate, Rare, estimate_row, estimate_table
 from rps_jax.trials.progress import set_phase
 from rps_jax.trials.score import severity_of
@@ -32,8 +29,8 @@ class Drawn(Rare):
     The results are those of `rps_jax.rare`, with the estimate from drawn worlds as `drawn_p`.
     """
 
-    TITLE: ClassVar[str] = "Rare failures, and drawn worlds"
-    IGNORED_FIELDS: ClassVar[tuple[str, ...]] = ("brute",)
+    TITLE = "Rare failures, and drawn worlds"
+    IGNORED_FIELDS = ("brute",)
 
     brute: int = option(1000, 1, 1_000_000_000)
     """Number of drawn worlds for the comparison."""
@@ -49,7 +46,7 @@ class Drawn(Rare):
         set_phase(run.callback, "drawn worlds")
         results = run_plans(run, {"drawn": plan})["drawn"]
         failed = severity_of(results.sel(law="law"), self.setting.rules) >= self.level
-        estimate = of_drawn(count_true(failed), failed.size)._asdict()
+        estimate = of_drawn(int(failed.sum()), failed.size)._asdict()
         return estimates.assign({f"drawn_{name}": value for name, value in estimate.items()})
 
     def report(self, results: xr.Dataset, run: Run) -> Sequence[Section]:
@@ -60,7 +57,7 @@ class Drawn(Rare):
         text = f"{section.text} Those of drawn worlds are by Clopper and Pearson."
         if against.p:
             off = 100 * (float(results.p.mean()) / against.p - 1)
-            held = count_true(((results.low <= against.p) & (against.p <= results.high)).values)
+            held = int(((results.low <= against.p) & (against.p <= results.high)).sum())
             text += (
                 f" {held} of {self.repetitions} intervals hold the rate of the drawn worlds, and "
                 f"the mean of all is {off:+.1f} % off it."

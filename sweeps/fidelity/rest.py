@@ -14,15 +14,14 @@ from typing import Any, ClassVar
 import numpy as np
 import xarray as xr
 
-from rps_jax import engines
+from rps_jax import Domain
 from rps_jax.engines.mujoco import Batch
-from rps_jax.record.options import option
-from rps_jax.runs.question import Run, call_of
+from rps_jax.physics import PHYSICS, Physics, get_engine, preset
+from rps_jax.questions import Run, call_of, option
 from rps_jax.trials.progress import Progress
 from rps_jax.trials.worlds import starts
-from rps_jax.world import domain as domains
 from rps_jax.world import draws
-from rps_jax.world.physics import PHYSICS, Physics, preset
+from rps_jax.worlds import parse_domain
 from sweeps.study_base import QuickStudy, Rows, Table
 
 DOMAINS = ("wide", "hostile", "hostile,friction_ground=0.05:0.1,com_offset=0.5:0.7")
@@ -38,8 +37,8 @@ STEPS: Mapping[str, Physics] = {
 class Rest(QuickStudy[xr.Dataset]):
     """Leave random objects alone, and tell how far they have moved (domain, step, world) [m]."""
 
-    TITLE: ClassVar[str] = "Do objects at rest stay?"
-    QUICK: ClassVar[Mapping[str, object]] = {"worlds": 9, "seconds": 1.0}
+    TITLE = "Do objects at rest stay?"
+    QUICK: ClassVar = {"worlds": 9, "seconds": 1.0}
     PRESETS: ClassVar = PHYSICS["default"]
 
     worlds: int = option(150, 3, 100_000)
@@ -57,7 +56,7 @@ class Rest(QuickStudy[xr.Dataset]):
         """Step the worlds that are missing."""
         parts = []
         for i, step in product(range(len(DOMAINS)), STEPS):
-            compute = partial(self._moved, domains.parse_domain(DOMAINS[i]), STEPS[step])
+            compute = partial(self._moved, parse_domain(DOMAINS[i]), STEPS[step])
             part = run.checkpoint(f"{i}-{STEPS[step].timestep:g}", compute)
             parts.append(part.expand_dims(domain=[DOMAINS[i]], step=[step]))
             run.callback(
@@ -70,8 +69,8 @@ class Rest(QuickStudy[xr.Dataset]):
         """Return the counts of moved objects, by domain, step and shape."""
         return [Table(table(results), merge="domain", name="rest", title="Objects that wander off")]
 
-    def _moved(self, ranges: domains.Domain, physics: Physics) -> xr.Dataset:
-        index, c = np.arange(self.worlds), engines.get("mujoco")
+    def _moved(self, ranges: Domain, physics: Physics) -> xr.Dataset:
+        index, c = np.arange(self.worlds), get_engine("mujoco")
         moved, family = np.zeros(self.worlds), np.empty(self.worlds, object)
         for i in range(len(ranges.objects)):
             rows = index[ranges.object_of(index) == i]

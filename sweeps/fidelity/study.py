@@ -16,13 +16,11 @@ from typing import Any, ClassVar
 import numpy as np
 import xarray as xr
 
+from rps_jax import Rules, Setting
 from rps_jax.analysis import statistics
-from rps_jax.engines import EngineName
-from rps_jax.runs.question import Run, call_of
-from rps_jax.trials.setting import Setting
-from rps_jax.trials.trial import Rules
+from rps_jax.physics import MUJOCO_GROUND, EngineName, Physics, preset
+from rps_jax.questions import Run, call_of
 from rps_jax.world import paper
-from rps_jax.world.physics import MUJOCO_GROUND, Physics, preset
 from sweeps.conditions import Condition, ConditionStudy, Grid, run_conditions
 from sweeps.study_base import Rows, Table
 
@@ -89,10 +87,10 @@ class Fidelity(ConditionStudy):
     far the object is, 5 s after the start, from where it is in the reference, for RPS alone.
     """
 
-    TITLE: ClassVar[str] = "Is the physics converged?"
-    QUICK: ClassVar[Mapping[str, object]] = {"conditions": QUICK, "targets": paper.FEW_TARGETS}
+    TITLE = "Is the physics converged?"
+    QUICK: ClassVar = {"conditions": QUICK, "targets": paper.FEW_TARGETS}
     CHOICES: ClassVar = {"conditions": CONDITIONS}
-    GROWS: ClassVar[tuple[str, ...]] = ("conditions",)
+    GROWS = ("conditions",)
 
     conditions: tuple[str, ...] = tuple(CONDITIONS)
     """Names of the settings, the reference always among them; by default all."""
@@ -145,8 +143,9 @@ def table(results: xr.Dataset) -> Rows:
     The cost is wall clock for a simulated second of one world while the trials ran.
     """
     base = results.success.sel(condition=REFERENCE)
-    rows = [["setting", "equal outcomes", "95 %", "+/-", "McNemar p", "5 s error: median, 95 %",
-             "cost"]]  # fmt: skip
+    rows = [
+        ["setting", "equal outcomes", "95 %", "+/-", "McNemar p", "5 s error: median, 95 %", "cost"]
+    ]
     for name in map(str, results.condition.values):
         condition = results.sel(condition=name)
         c = statistics.compare(base, condition.success)
@@ -155,10 +154,15 @@ def table(results: xr.Dataset) -> Rows:
         low, high = statistics.wilson(equal, total)
         median, worst = 1000 * np.quantile(condition.early_error.values, (0.5, 0.95))
         cost = float(condition.run_time) / float(condition.simulated)
-        rows.append([
-            str(condition.what.values),
-            f"{100 * (equal / total):.1f} %", f"{100 * low:.0f}-{100 * high:.0f} %",
-            c.changes, f"{c.p:.2g}", f"{median:.1f}, {worst:.1f} mm",
-            f"{1000 * cost:.3g} ms",
-        ])  # fmt: skip
+        rows.append(
+            [
+                str(condition.what.values),
+                f"{100 * (equal / total):.1f} %",
+                f"{100 * low:.0f}-{100 * high:.0f} %",
+                c.changes,
+                f"{c.p:.2g}",
+                f"{median:.1f}, {worst:.1f} mm",
+                f"{1000 * cost:.3g} ms",
+            ]
+        )
     return rows

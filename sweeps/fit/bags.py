@@ -10,7 +10,7 @@ value. It does the same with the simulated logs of these worlds.
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -20,12 +20,11 @@ import numpy as np
 import xarray as xr
 
 import rps_jax
-from rps_jax.control.registry import LawLike
+from rps_jax.laws import LawLike
+from rps_jax.questions import Run, call_of, option
 from rps_jax.record import bag
-from rps_jax.record.options import option
-from rps_jax.runs.question import Run, call_of
 from rps_jax.tuning import fit, logs
-from rps_jax.world import domain as domains
+from rps_jax.worlds import DomainLike
 from sweeps.fit.study import FitStudy, within
 from sweeps.study_base import Rows, Table
 
@@ -38,10 +37,10 @@ _TOLERANCE = 0.02  # [1] of the interval's width, within which two limits are eq
 class Bagged(FitStudy):
     """Compare the coverage of intervals fitted to bags with that of fits to logs."""
 
-    TITLE: ClassVar[str] = "Worlds fitted to bags"
-    QUICK: ClassVar[Mapping[str, object]] = {"worlds": 192, "logs": 2, "window": 6.0}
+    TITLE = "Worlds fitted to bags"
+    QUICK: ClassVar = {"worlds": 192, "logs": 2, "window": 6.0}
 
-    domain: domains.DomainLike = "real"
+    domain: DomainLike = "real"
     """Ranges from which worlds are drawn, by name or as a JSON file; changes follow."""
     law: LawLike = "rps_plus"
     worlds: int = option(3072, 96, 1_000_000, kw_only=True)
@@ -97,8 +96,16 @@ def table(results: xr.Dataset) -> Rows:
     logs = results.sel(source=_SOURCES[1])
     errors = [abs(results[k] - logs[k]) / (logs.high - logs.low) for k in ("low", "high")]
     is_near = np.maximum(*errors) <= _TOLERANCE
-    rows = [["log", "logs", "90 % intervals hold the truth", "those of told quantities",
-             "as the log itself holds it", "ends within 2 % of its width"]]  # fmt: skip
+    rows = [
+        [
+            "log",
+            "logs",
+            "90 % intervals hold the truth",
+            "those of told quantities",
+            "as the log itself holds it",
+            "ends within 2 % of its width",
+        ]
+    ]
 
     def share(mask: xr.DataArray, where: xr.DataArray | None = None) -> str:
         values = mask if where is None else mask.where(where)

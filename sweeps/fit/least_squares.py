@@ -23,18 +23,16 @@ import numpy as np
 from scipy.interpolate import make_smoothing_spline
 from scipy.special import softmax
 
-from rps_jax import engines
-from rps_jax.control.observation import Twist
-from rps_jax.engines.base import ControlPeriod, Motion, Stage
+from rps_jax import Domain, Setting, Twist
+from rps_jax.engines.base import Stage
 from rps_jax.geometry import planar
 from rps_jax.geometry.solid import rotate
+from rps_jax.physics import ControlPeriod, Motion, Physics, get_engine
 from rps_jax.robot.robot import LIMITS
-from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import object_pose
 from rps_jax.tuning.logs import Log
 from rps_jax.world import points
-from rps_jax.world.domain import Domain, quantities_of
-from rps_jax.world.physics import Physics
+from rps_jax.world.domain import quantities_of
 from rps_jax.world.points import Points
 
 WINDOW, _SETTLING = 2.0, 0.4  # [s] of a window, and of its start, in which contacts settle
@@ -186,7 +184,7 @@ class Replay(NamedTuple):
         drawn = points.draw(self.domain, 0, Points(moved), np.arange(len(moved)))
         robots = dataclasses.replace(drawn.robot, **dict.fromkeys(LIMITS))
         inputs = drawn.inputs(self.domain, self.setting.physics)._replace(robots=robots)
-        stage, fields = engines.get(self.setting.engine).stage(inputs)
+        stage, fields = get_engine(self.setting.engine).stage(inputs)
         latency = np.zeros(len(moved)) if self.exact else drawn.values["pose_latency"]
         windows = [track.windows(x) for x in latency for track in self.tracks]
         constants = fields, drawn.solid.height

@@ -12,7 +12,7 @@ from __future__ import annotations
 import functools
 import multiprocessing
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
 from typing import ClassVar
@@ -24,14 +24,13 @@ import xarray as xr
 
 from rps_jax.analysis.figures.style import quantity
 from rps_jax.engines import device
-from rps_jax.record.options import option
-from rps_jax.runs.question import Run, call_of
+from rps_jax.questions import Run, call_of, option
 from rps_jax.trials.progress import no_progress, set_phase
 from rps_jax.trials.setting import seed_of
 from rps_jax.tuning import fit, posterior
 from rps_jax.tuning.logs import Log
-from rps_jax.world import domain as domains
 from rps_jax.world import points
+from rps_jax.worlds import DomainLike
 from sweeps.fit import least_squares
 from sweeps.fit.least_squares import Replay, Track
 from sweeps.fit.study import FitStudy, within
@@ -42,19 +41,28 @@ METHODS = ("neural", "gradient", "evolution")
 _PART = 25  # logs that one process fits
 _POPULATION, _GENERATIONS = 24, 64  # of CMA-ES: about as many seconds as the derivatives
 _SPREAD = 0.2  # standard deviation of its first generation, in units of the cube
-_QUANTITIES = ("friction_robot", "friction_ground", "mass", "ground_force", "size", "aspect",
-               "height", "com_offset", "pose_latency")  # fmt: skip
+_QUANTITIES = (
+    "friction_robot",
+    "friction_ground",
+    "mass",
+    "ground_force",
+    "size",
+    "aspect",
+    "height",
+    "com_offset",
+    "pose_latency",
+)
 
 
 @dataclass(frozen=True)
 class Methods(FitStudy):
     """Compare methods of fitting worlds to logs, in worlds whose true values are known."""
 
-    TITLE: ClassVar[str] = "Methods of fitting worlds to logs"
-    GROWS: ClassVar[tuple[str, ...]] = ("evolution_logs",)
-    QUICK: ClassVar[Mapping[str, object]] = {"worlds": 192, "logs": 2, "window": 12.0}
+    TITLE = "Methods of fitting worlds to logs"
+    GROWS = ("evolution_logs",)
+    QUICK: ClassVar = {"worlds": 192, "logs": 2, "window": 12.0}
 
-    domain: domains.DomainLike = "wide,objects=random_box"
+    domain: DomainLike = "wide,objects=random_box"
     """Ranges from which worlds are drawn, by name or as a JSON file; changes follow."""
     worlds: int = option(4096, 96, 1_000_000, kw_only=True)
     """Number of worlds from which the networks learn."""
@@ -236,9 +244,19 @@ def evolved(replay: Replay, u: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.n
 
 def method_rows(results: xr.Dataset, study: Methods) -> Rows:
     """Return a header and rows for each kind of log and method: all logs, and those of CMA-ES."""
-    rows = [["log", "method", "logs", "90 % intervals hold the truth",
-             "those of determined quantities", "determined", "error of determined quantities",
-             "processor seconds a log", "simulated"]]  # fmt: skip
+    rows = [
+        [
+            "log",
+            "method",
+            "logs",
+            "90 % intervals hold the truth",
+            "those of determined quantities",
+            "determined",
+            "error of determined quantities",
+            "processor seconds a log",
+            "simulated",
+        ]
+    ]
     replays = {
         "gradient": (study.starts // 6 + 16) * 6,
         "evolution": study.starts + _POPULATION * _GENERATIONS,

@@ -10,7 +10,7 @@ the fitted domain, and compares both with trials in the true worlds.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property, partial
 from typing import ClassVar
@@ -20,16 +20,14 @@ import xarray as xr
 
 import rps_jax
 from rps_jax.analysis.figures.style import Figure, quantity
-from rps_jax.analysis.report import Picture
-from rps_jax.control import registry
-from rps_jax.control.registry import LawLike
-from rps_jax.record.options import option
-from rps_jax.runs.question import DomainQuestion, LawQuestion, Run, call_of
+from rps_jax.laws import LawLike, law_of
+from rps_jax.questions import DomainQuestion, LawQuestion, Picture, Run, call_of, option
 from rps_jax.trials.progress import Progress, no_progress, set_phase
 from rps_jax.trials.setting import seed_of
 from rps_jax.tuning import fit, posterior
 from rps_jax.world import domain as domains
 from rps_jax.world import draws, points
+from rps_jax.worlds import DomainLike
 from sweeps.study_base import Rows, Study, Table
 
 KINDS: dict[str, tuple[str, ...]] = {  # optional fields of each kind of log
@@ -65,7 +63,7 @@ class FitStudy(Study[xr.Dataset], DomainQuestion[xr.Dataset], LawQuestion[xr.Dat
     def check(self) -> None:
         """Check the law and the engine."""
         self.check_engine([self.params])
-        fit.check_law(self.label, registry.law_of(self.params), self.setting)
+        fit.check_law(self.label, law_of(self.params), self.setting)
 
     def train(self, training: xr.Dataset, names: Sequence[str]) -> posterior.Posterior:
         """Return networks for some statistics of the logs."""
@@ -109,12 +107,16 @@ class FitStudy(Study[xr.Dataset], DomainQuestion[xr.Dataset], LawQuestion[xr.Dat
 class Coverage(FitStudy):
     """Measure the coverage of fitted intervals, and the value of a fit for predictions."""
 
-    TITLE: ClassVar[str] = "Worlds fitted to logs"
-    QUICK: ClassVar[Mapping[str, object]] = {
-        "worlds": 960, "logs": 48, "window": 20.0, "worth": 2, "tasks": 8,
-    }  # fmt: skip
+    TITLE = "Worlds fitted to logs"
+    QUICK: ClassVar = {
+        "worlds": 960,
+        "logs": 48,
+        "window": 20.0,
+        "worth": 2,
+        "tasks": 8,
+    }
 
-    domain: domains.DomainLike = (
+    domain: DomainLike = (
         "wide,robot_lag=0:0.4,robot_slip=0:0.1,foam=0.005:0.02,time_constant=0.02:0.15"
     )
     """Ranges from which worlds are drawn, by name or as a JSON file; changes follow."""
@@ -170,14 +172,12 @@ class Coverage(FitStudy):
         def compute() -> xr.Dataset:
             index, seed = np.arange(self.logs), seed_of(self.setting.seed, "test")
             objects, values = self.ranges.object_of(index), np.empty((self.logs, 3, len(names)))
-            task = [draws.USES[name] for name in _TASK]
             for push in range(3):
                 for i in np.unique(objects):
                     rows = index[objects == i]
-                    uniform = draws.random_numbers(seed, rows)
-                    new = draws.random_numbers(seed, rows + (push + 1) * 1_000_000)
-                    uniform[:, task] = new[:, task]
-                    draw = draws.draw_at(self.ranges, rows, uniform)
+                    new = draws.numbers(seed, rows + (push + 1) * 1_000_000)
+                    u = draws.numbers(seed, rows) | {name: new[name] for name in _TASK}
+                    draw = draws.draw_at(self.ranges, rows, u)
                     values[rows, push] = self.bank.statistics(draw)[0][names]
             return xr.Dataset({"statistics": (("log", "more", "statistic"), values)})
 
@@ -216,8 +216,9 @@ class Coverage(FitStudy):
         labels = {"source": ["truth", "domain", "fit"], "law": list(_LAWS)}
         shape = ("world", "source", "law")
         values = np.array(predictions)
-        return xr.Dataset({"won": (shape, values[..., 0]), "duration": (shape, values[..., 1])},
-                          labels)  # fmt: skip
+        return xr.Dataset(
+            {"won": (shape, values[..., 0]), "duration": (shape, values[..., 1])}, labels
+        )
 
     # --- report ---
 
@@ -243,8 +244,16 @@ def within(fits: xr.Dataset) -> xr.DataArray:
 
 def coverage_rows(results: xr.Dataset) -> Rows:
     """Return a header and one row for each kind of log."""
-    rows = [["log", "90 % intervals hold the truth", "those of told quantities",
-             "least, greatest of a quantity", "told", "right object's probability"]]  # fmt: skip
+    rows = [
+        [
+            "log",
+            "90 % intervals hold the truth",
+            "those of told quantities",
+            "least, greatest of a quantity",
+            "told",
+            "right object's probability",
+        ]
+    ]
     for kind in map(str, results.kind.values):
         fits = results.sel(kind=kind)
         covered, determined = within(fits), fits.undetermined == 0
@@ -274,8 +283,15 @@ def quantity_rows(results: xr.Dataset) -> Rows:
 
 def worth_rows(results: xr.Dataset) -> Rows:
     """Return a header and one row for each law: mean absolute error of the predictions."""
-    rows = [["law", "success, from the domain", "success, from the fit", "time, from the domain",
-             "time, from the fit"]]  # fmt: skip
+    rows = [
+        [
+            "law",
+            "success, from the domain",
+            "success, from the fit",
+            "time, from the domain",
+            "time, from the fit",
+        ]
+    ]
     truth = results.sel(source="truth")
     error = abs(results.drop_sel(source="truth") - truth).mean("world")
     for law in results.law.values:
@@ -303,8 +319,9 @@ def figure(results: xr.Dataset) -> Figure:
         right.plot(100 * shrink[i], np.arange(len(names)) + 0.1 * (i - 2.5), "o", ms=4, label=kind)
     right.axvline(100 * (1 - fit.UNDETERMINED), color="0.6", lw=1, ls=":")
     right.set_yticks(range(len(names)), [quantity(name) for name in names], fontsize=8)
-    right.set(xlabel="how much narrower than the prior's [%], mean over logs",
-              title="What logs tell")  # fmt: skip
+    right.set(
+        xlabel="how much narrower than the prior's [%], mean over logs", title="What logs tell"
+    )
     right.grid(axis="y", alpha=0.3)
     right.invert_yaxis()
     return drawn

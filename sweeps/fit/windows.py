@@ -9,19 +9,18 @@ it. `rps fit`, whose intervals are better calibrated, needs both. `methods` comp
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 import xarray as xr
 
-from rps_jax import engines, errors
-from rps_jax.analysis.report import Section
+from rps_jax import errors
 from rps_jax.engines import device
-from rps_jax.record.options import option
-from rps_jax.runs.question import Run, call_of
+from rps_jax.physics import get_engine
+from rps_jax.questions import Run, Section, call_of, option
 from rps_jax.trials.progress import set_phase
 from rps_jax.tuning.fit import SAMPLES, Fit, Fitted, coordinates, summary
 from rps_jax.world import points
@@ -40,8 +39,8 @@ class FitWindows(Fit):
     law has no influence.
     """
 
-    TITLE: ClassVar[str] = "A domain fitted to windows of logs"
-    QUICK: ClassVar[Mapping[str, Any]] = {"worlds": 12, "window": 20.0}
+    TITLE = "A domain fitted to windows of logs"
+    QUICK: ClassVar = {"worlds": 12, "window": 20.0}
 
     worlds: int = option(96, 6, 1_000_000)
     """Number of worlds of the domain from which the minimisation starts; at least 6 of each object
@@ -51,14 +50,14 @@ class FitWindows(Fit):
     def replay(self) -> Replay:
         """Least-squares problem of the logs."""
         logs, fields = self.observed
-        force = "f_robot" in fields and engines.get(self.setting.engine).computes_force
+        force = "f_robot" in fields and get_engine(self.setting.engine).computes_force
         exact, interval = self.bank.exact, self.bank.interval
         tracks = [Track.of(log, interval, exact, force) for log in logs]
         return Replay(self.ranges, tracks, self.setting, exact)
 
     def check_method(self) -> None:
         """Raise InputError unless the logs can be replayed and differentiated."""
-        engines.get(self.setting.engine).check_derivatives("forward")
+        get_engine(self.setting.engine).check_derivatives("forward")
         if any(self.ranges.surroundings):
             rule = "windows are replayed on a level, uniform floor: draw no other, or use rps fit"
             raise errors.not_allowed("domain", self.domain, rule)

@@ -17,14 +17,12 @@ import mujoco
 import numpy as np
 import xarray as xr
 
+from rps_jax import Setting
 from rps_jax.analysis import statistics, tables
-from rps_jax.control.registry import LawsLike
-from rps_jax.record.options import option
-from rps_jax.runs.plan import Plan
-from rps_jax.runs.question import MultiLawQuestion, Run, call_of
-from rps_jax.trials.setting import Setting
-from rps_jax.world.domain import DomainLike, parse_domain
-from rps_jax.world.physics import MUJOCO_GROUND, Physics
+from rps_jax.laws import LawsLike
+from rps_jax.physics import MUJOCO_GROUND, Physics
+from rps_jax.questions import MultiLawQuestion, Plan, Run, call_of, option
+from rps_jax.worlds import DomainLike, parse_domain
 from sweeps.study_base import QuickStudy, Rows, Table, run_together
 
 SLOPES = (0, 2, 4, 6)  # [deg]
@@ -44,8 +42,8 @@ class Floors(QuickStudy[xr.DataTree], MultiLawQuestion[xr.DataTree]):
     world), in the same worlds.
     """
 
-    TITLE: ClassVar[str] = "Pushing on slopes and over changes of the floor"
-    QUICK: ClassVar[Mapping[str, object]] = {"laws": ("rps", "rps_tuned"), "worlds": 12}
+    TITLE = "Pushing on slopes and over changes of the floor"
+    QUICK: ClassVar = {"laws": ("rps", "rps_tuned"), "worlds": 12}
     PRESETS: ClassVar = {"slopes": list(SLOPES), "factors": list(FACTORS)}
 
     laws: LawsLike = ("rps", "rps_tuned", "rps_plus", "learned")
@@ -106,12 +104,17 @@ class Floors(QuickStudy[xr.DataTree], MultiLawQuestion[xr.DataTree]):
             for name, (low, high) in DIRECTIONS.items()
         }
         return [
-            Table(cost_table(slopes, "0°", masks), name="floors_slopes", merge="floor",
-                  title="Slopes"),
-            Table(cost_table(boundaries, "1", {}), name="floors_boundaries", merge="floor",
-                  title="Changes of the floor half way to the target, by the factor of friction"),
+            Table(
+                cost_table(slopes, "0°", masks), name="floors_slopes", merge="floor", title="Slopes"
+            ),
+            Table(
+                cost_table(boundaries, "1", {}),
+                name="floors_boundaries",
+                merge="floor",
+                title="Changes of the floor half way to the target, by the factor of friction",
+            ),
             Table(step_table(), name="floors_steps", merge="step", title="A push against a step"),
-        ]  # fmt: skip
+        ]
 
 
 floors = call_of(Floors)

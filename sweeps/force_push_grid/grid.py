@@ -26,27 +26,23 @@ import jax.numpy as jnp
 import numpy as np
 import xarray as xr
 
-from rps_jax.control.base import Law
+from rps_jax import Details, Law, Robot, Rules, Setting, Twist
 from rps_jax.control.laws import force_push_published as force_push
 from rps_jax.control.laws.force_push import steer
 from rps_jax.control.laws.force_push_published import PublishedForcePushParams
-from rps_jax.control.observation import Details, ForceObservation, Twist
-from rps_jax.engines import EngineName
+from rps_jax.control.observation import ForceObservation
 from rps_jax.geometry import planar, polyline, solid
-from rps_jax.geometry.polyline import Polyline
 from rps_jax.geometry.solid import Solid
+from rps_jax.physics import EngineName, Physics
 from rps_jax.robot.base import LoadCell, Odometry
-from rps_jax.robot.robot import Robot
 from rps_jax.robot.shell import Boards
-from rps_jax.robot.skin import IdealSkin
 from rps_jax.trials import trial
 from rps_jax.trials.jobs import WorldBatch
 from rps_jax.trials.progress import Progress, ProgressCallback, no_progress
-from rps_jax.trials.setting import Setting
-from rps_jax.trials.trial import ControlLoop, Rules, Shift, Snapshot, Trial
+from rps_jax.trials.trial import ControlLoop, Shift, Snapshot, Trial
 from rps_jax.trials.worlds import build
-from rps_jax.world.physics import Physics
 from rps_jax.world.scene import JOINTS, Friction, WorldInputs
+from rps_jax.worlds import IdealSkin, Polyline
 from sweeps.study_base import Rows
 
 SliderName = Literal["box", "cylinder"]
@@ -326,10 +322,14 @@ def table(results: xr.Dataset) -> Rows:
         outcomes = results.sel(law=law, slider=slider)
         deviation, completion = np.abs(outcomes.deviation.values), 100 * outcomes.completion.values
         by_friction = [str(int(outcomes.success.sel(friction=mu).sum())) for mu in FRICTIONS]
-        rows.append([
-            str(law), str(slider), f"{int(outcomes.success.sum())} of {outcomes.success.size}",
-            ", ".join(by_friction),
-            f"{np.median(completion):.1f} % (least {completion.min():.1f})",
-            f"{np.median(deviation):.2f} m (most {deviation.max():.2f})",
-        ])  # fmt: skip
+        rows.append(
+            [
+                str(law),
+                str(slider),
+                f"{int(outcomes.success.sum())} of {outcomes.success.size}",
+                ", ".join(by_friction),
+                f"{np.median(completion):.1f} % (least {completion.min():.1f})",
+                f"{np.median(deviation):.2f} m (most {deviation.max():.2f})",
+            ]
+        )
     return rows

@@ -20,26 +20,21 @@ import itertools
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import partial
+from functools import cached_property, partial
 from typing import ClassVar
 
 import numpy as np
 import xarray as xr
 
+from rps_jax import Range, Robot, Rules, Setting
 from rps_jax.analysis import tables
 from rps_jax.analysis.figures.style import Figure, tiles
-from rps_jax.analysis.report import Picture
-from rps_jax.control.registry import LawsLike
-from rps_jax.record.options import option
-from rps_jax.robot.robot import Robot
-from rps_jax.runs.plan import Plan
-from rps_jax.runs.question import MultiLawQuestion, Run, call_of
-from rps_jax.trials.setting import Setting
-from rps_jax.trials.trial import Rules
-from rps_jax.world.domain import Range, parse_domain
+from rps_jax.laws import LawsLike
+from rps_jax.questions import MultiLawQuestion, Picture, Plan, Run, call_of, option
 from rps_jax.world.tasks.path import Path
+from rps_jax.worlds import parse_domain
 from sweeps.force_push_grid import grid
-from sweeps.study_base import QuickStudy, Rows, Table, part_name, run_plans
+from sweeps.study_base import PlanStudy, QuickStudy, Rows, Table, part_name, run_plans
 
 POINT = "force_push, with a point"  # their law with their pusher
 RADII = {"straight": math.inf, "4 m": 4.0, "2 m": 2.0, "1 m": 1.0}  # [m] of the turn
@@ -54,22 +49,26 @@ _SLIDER = (
 
 
 @dataclass(frozen=True)
-class Paths(QuickStudy[xr.DataTree], MultiLawQuestion[xr.DataTree]):
+class Paths(PlanStudy[xr.DataTree], QuickStudy[xr.DataTree], MultiLawQuestion[xr.DataTree]):
     """Follow the paths of Heins and Schoellig, by their law and by laws that sense touch.
 
     The answer is a tree: `success`, `error_mean` and `error_95` [m] of the contact (path, slider,
     world) for their law with a point, and (lookahead, path, slider, law, world) for other laws.
     """
 
-    TITLE: ClassVar[str] = "Paths of Force Push"
-    QUICK: ClassVar[Mapping[str, object]] = {"laws": ("force_push", "rps_tuned"), "worlds": 12}
+    TITLE = "Paths of Force Push"
+    QUICK: ClassVar = {"laws": ("force_push", "rps_tuned"), "worlds": 12}
     PRESETS: ClassVar = {
         **{"radii": list(RADII.values()), "length": LENGTH, "lookaheads": LOOKAHEADS},
         **{"slider": _SLIDER, "law": grid.PARAMS},
     }
 
     laws: LawsLike = (
-        *("force_push", "force_push_published", "rps", "rps_tuned", "rps_plus"),
+        "force_push",
+        "force_push_published",
+        "rps",
+        "rps_tuned",
+        "rps_plus",
         "learned",
     )
     worlds: int = option(243, 2, 10_000_000)
@@ -78,18 +77,13 @@ class Paths(QuickStudy[xr.DataTree], MultiLawQuestion[xr.DataTree]):
         default=Setting("fused", seed=5209, rules=Rules(horizon=600.0)), kw_only=True
     )
 
-    def check(self) -> None:
-        """Check that the engine can step these worlds here."""
-        super().check()
-        for plan in self._plans().values():
-            plan.check_here()
-
     def num_trials(self) -> int | None:
         """Return the number of pushes."""
-        count = sum(plan.num_trials for plan in self._plans().values())
+        count = sum(plan.num_trials for plan in self.plans.values())
         return count + len(RADII) * len(_OBJECTS) * grid.cells().angle.size
 
-    def _plans(self) -> dict[str, Plan]:
+    @cached_property
+    def plans(self) -> dict[str, Plan]:
         """Return the plans of laws with a base, by lookahead, path and slider."""
         plans: dict[str, Plan] = {}
         front = float(Robot().shell.half[0])
@@ -115,10 +109,12 @@ class Paths(QuickStudy[xr.DataTree], MultiLawQuestion[xr.DataTree]):
             run.checkpoint(
                 part_name(POINT, name, slider),
                 partial(grid.run_grid, "force_push", slider, duration=duration, radius=radius),
-            ).stack(world=grid.DIMS).reset_index("world", drop=True)
+            )
+            .stack(world=grid.DIMS)
+            .reset_index("world", drop=True)
             for (name, radius), slider in itertools.product(RADII.items(), _OBJECTS)
-        ]  # fmt: skip
-        ours = list(run_plans(run, self._plans()).values())
+        ]
+        ours = list(run_plans(run, self.plans).values())
         trees = {"point": _arranged(points, shapes, ("path", "slider"))}
         shapes, dims = [len(LOOKAHEADS), *shapes], ("lookahead", "path", "slider")
         return xr.DataTree.from_dict(trees | {"base": _arranged(ours, shapes, dims)})
@@ -135,8 +131,15 @@ class Paths(QuickStudy[xr.DataTree], MultiLawQuestion[xr.DataTree]):
         """Return success and error by law, path and slider."""
         by_law = best_lookaheads(results)
         picture = Picture("paths", partial(figure_of, by_law))
-        return [Table(table(by_law), name="force_push_paths", title="Success and error by path",
-                      merge="law", picture=picture)]  # fmt: skip
+        return [
+            Table(
+                table(by_law),
+                name="force_push_paths",
+                title="Success and error by path",
+                merge="law",
+                picture=picture,
+            )
+        ]
 
 
 paths = call_of(Paths)
@@ -203,12 +206,24 @@ def figure_of(by_law: Mapping[str, xr.Dataset]) -> Figure:
         for i, (law, outcomes) in enumerate(by_law.items()):
             errors = outcomes.error_mean.sel(slider=slider)
             middle, low, high = np.array([median(errors.sel(path=x).values) for x in RADII]).T
-            ax.errorbar(np.add(curvature, 0.008 * i), middle, [middle - low, high - middle],
-                        color=f"C{i}", marker="o", ms=3, lw=1, label=law)  # fmt: skip
+            ax.errorbar(
+                np.add(curvature, 0.008 * i),
+                middle,
+                [middle - low, high - middle],
+                color=f"C{i}",
+                marker="o",
+                ms=3,
+                lw=1,
+                label=law,
+            )
         ax.set_title(slider, fontsize=9, loc="left")
         ax.set_xlabel("curvature of the turn [1/m]")
         ax.grid(alpha=0.3)
     axes.ravel()[0].set_ylabel("mean cross-track error [m]")
-    figure.legend(*axes.ravel()[0].get_legend_handles_labels(), loc="outside lower center", ncols=4,
-                  fontsize=8)  # fmt: skip
+    figure.legend(
+        *axes.ravel()[0].get_legend_handles_labels(),
+        loc="outside lower center",
+        ncols=4,
+        fontsize=8,
+    )
     return figure

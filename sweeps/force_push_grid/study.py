@@ -8,18 +8,16 @@ and in their open loop, from every start of their grid, which stands in `grid`.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import ClassVar
 
 import xarray as xr
 
-from rps_jax import engines
 from rps_jax.control.laws import force_push_published
-from rps_jax.engines import EngineName
-from rps_jax.record.options import option
-from rps_jax.runs.question import Run, call_of
+from rps_jax.physics import EngineName, get_engine
+from rps_jax.questions import Run, call_of, option
 from rps_jax.trials.progress import SequentialProgress
 from sweeps.force_push_grid import grid
 from sweeps.study_base import QuickStudy, Table
@@ -33,10 +31,10 @@ class ForcePushGrid(QuickStudy[xr.Dataset]):
     their criterion, `silent` [s], `apart` [m], `deviation` [m] and `completion` [1].
     """
 
-    TITLE: ClassVar[str] = "Force Push on its authors' ground"
-    QUICK: ClassVar[Mapping[str, object]] = {"duration": 60.0, "sliders": ("box",)}
+    TITLE = "Force Push on its authors' ground"
+    QUICK: ClassVar = {"duration": 60.0, "sliders": ("box",)}
     CHOICES: ClassVar = {"laws": grid.LAWS, "sliders": grid.SLIDERS}
-    GROWS: ClassVar[tuple[str, ...]] = ("laws", "sliders")
+    GROWS = ("laws", "sliders")
     PRESETS: ClassVar = {"physics": grid.PHYSICS, "law": grid.PARAMS}
 
     laws: tuple[grid.LawName, ...] = grid.LAWS
@@ -52,7 +50,7 @@ class ForcePushGrid(QuickStudy[xr.Dataset]):
         """Check the names, and that the engine supports these pushes."""
         super().check()
         force_push_published.check(grid.PARAMS)
-        engine = engines.get(self.engine)
+        engine = get_engine(self.engine)
         engine.check_senses("force")
         engine.check_traced()
         engine.check_physics(grid.PHYSICS)

@@ -13,8 +13,7 @@ from typing import ClassVar
 
 import xarray as xr
 
-from rps_jax.record.options import option
-from rps_jax.runs.question import call_of
+from rps_jax.questions import call_of, option
 from rps_jax.tuning.gradients import Options
 from sweeps.gradients.study import Gradients, label_of, norms
 from sweeps.study_base import Rows, Table
@@ -29,7 +28,7 @@ class Check(Gradients):
     The answer has the relative `error` (object, world, horizon) of the derivatives.
     """
 
-    TITLE: ClassVar[str] = "Derivatives against central differences"
+    TITLE = "Derivatives against central differences"
     QUICK: ClassVar = {"horizons": (0.5, 2.0), "worlds": 4, "engine": "quasistatic"}
     DOUBLE: ClassVar = True
 

@@ -19,11 +19,11 @@ import numpy as np
 import optax
 
 from rps_jax.control import registry
-from rps_jax.control.base import LawParams
 from rps_jax.engines import native
 from rps_jax.engines.base import Stage
 from rps_jax.geometry import footprint as fp
 from rps_jax.geometry import planar
+from rps_jax.laws import LawParams, law_of
 from rps_jax.trials import trial
 from rps_jax.trials.trial import ControlLoop, Snapshot, Trial, World, advance, start_all
 from rps_jax.trials.worlds import soften_skins
@@ -157,11 +157,17 @@ def features(world: World, params: LawParams, state: Trial, loop: ControlLoop) -
     angles = jnp.array([1.0, 2.0, 4.0]) * (yaw - heading)
     law, rules, period = state.law_state, loop.rules, loop.physics.control_period
     scalars = [
-        1.0 * measured.reading.in_contact, measured.distance, law.l_th, 1.0 * law.touched,
-        jnp.abs(law.p_robot_contact[1]), fp.circumradius(world.footprint),
-        state.steps * period / rules.horizon, state.lost_steps * period / rules.max_lost,
-        jnp.minimum(state.min_distance, 5.0), 5 * state.qvel[8],
-    ]  # fmt: skip
+        1.0 * measured.reading.in_contact,
+        measured.distance,
+        law.l_th,
+        1.0 * law.touched,
+        jnp.abs(law.p_robot_contact[1]),
+        fp.circumradius(world.footprint),
+        state.steps * period / rules.horizon,
+        state.lost_steps * period / rules.max_lost,
+        jnp.minimum(state.min_distance, 5.0),
+        5 * state.qvel[8],
+    ]
     speed = 20 * planar.rotate(-heading, state.qvel[3:5])
     vectors = (p_robot_object, p_robot_target, law.p_robot_contact, speed)
     joined = [*vectors, jnp.cos(angles), jnp.sin(angles), jnp.stack(scalars)]
@@ -170,7 +176,7 @@ def features(world: World, params: LawParams, state: Trial, loop: ControlLoop) -
 
 def _loop(tuning: WindowTuning) -> ControlLoop:
     """Return the loop of softened trials under the rules of the setting."""
-    law = registry.smooth_law(registry.law_of(tuning.space.base))
+    law = registry.smooth_law(law_of(tuning.space.base))
     return ControlLoop(tuning.setting.physics, tuning.setting.rules, law)
 
 

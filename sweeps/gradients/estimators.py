@@ -15,17 +15,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from rps_jax import Law, Setting
 from rps_jax.control import registry
-from rps_jax.control.base import Law, LawParams
 from rps_jax.engines import native
 from rps_jax.engines.base import Stage
+from rps_jax.laws import LawParams, law_of
+from rps_jax.physics import Physics
 from rps_jax.trials import pushes, trial
-from rps_jax.trials.case import Case
-from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import ControlLoop, Snapshot, Trial, World
 from rps_jax.tuning import gradients
 from rps_jax.tuning.gradients import Options, Scores, per_world, random_steps, repeat
-from rps_jax.world.physics import Physics
+from rps_jax.worlds import Case
 
 
 class Estimator(Protocol):
@@ -212,7 +212,7 @@ def distances(
       (1, 2, 2)
     """
     part = pushes.build(cases, setting)
-    law = registry.smooth_law(registry.law_of(cases[0].params))
+    law = registry.smooth_law(law_of(cases[0].params))
     at = np.round(np.asarray(horizons) / setting.physics.control_period).astype(int)
     scores = jax.jit(distances_at(at, part.stage, params_of, setting.physics, law))
     start = trial.start_all(part.worlds, part.params, np.ones(len(cases), bool), law=law)

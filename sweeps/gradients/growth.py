@@ -22,29 +22,22 @@ import jax.numpy as jnp
 import numpy as np
 import xarray as xr
 
-from rps_jax import engines
+from rps_jax import Law, RPSParams, Setting
 from rps_jax.analysis.figures.style import Figure, tiles
-from rps_jax.analysis.report import Picture
 from rps_jax.control import registry
-from rps_jax.control.base import Law
-from rps_jax.control.laws import rps
-from rps_jax.control.laws.rps import RPSParams
-from rps_jax.engines import EngineName
-from rps_jax.engines.base import ControlPeriod
 from rps_jax.geometry import planar
-from rps_jax.record.options import option
-from rps_jax.runs.question import Run, call_of
+from rps_jax.laws import law_of
+from rps_jax.physics import PHYSICS, ControlPeriod, EngineName, get_engine
+from rps_jax.questions import Picture, Run, call_of, option
 from rps_jax.trials import trial
 from rps_jax.trials.progress import Progress, set_phase
-from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import ControlLoop, Snapshot, Trial, World
 from rps_jax.trials.worlds import drawn_worlds, soften_skins
-from rps_jax.world import domain as domains
 from rps_jax.world import draws
-from rps_jax.world.domain import RANDOM, DomainLike
-from rps_jax.world.physics import PHYSICS, Fidelity
+from rps_jax.world.physics import Fidelity
+from rps_jax.worlds import DomainLike, parse_domain
 from sweeps.gradients.study import WARM, label_of
-from sweeps.study_base import QuickStudy, Rows, Table, part_name
+from sweeps.study_base import RANDOM_OBJECTS, QuickStudy, Rows, Table, part_name
 
 # Parts of the derivative, each of which a variant removes.
 PARTS = ("contact point", "contact weight", "odometry", "law", "velocities", "tilt")
@@ -81,10 +74,10 @@ class Growth(QuickStudy[xr.Dataset]):
     derivative of its offset by the object's offset aside.
     """
 
-    TITLE: ClassVar[str] = "Growth of derivatives along pushes"
+    TITLE = "Growth of derivatives along pushes"
     QUICK: ClassVar = {"worlds": 4, "horizon": 4.0, "engine": "quasistatic"}
-    CHOICES: ClassVar = {"objects": RANDOM}
-    GROWS: ClassVar[tuple[str, ...]] = ("objects",)
+    CHOICES: ClassVar = {"objects": RANDOM_OBJECTS}
+    GROWS = ("objects",)
     PRESETS: ClassVar = {"physics": PHYSICS["default"], "laws": ("rps",)}
 
     domain: DomainLike = "wide,gap=0:0"
@@ -113,7 +106,7 @@ class Growth(QuickStudy[xr.Dataset]):
 
     def check(self) -> None:
         super().check()
-        engines.get(self.engine).check_derivatives("forward")
+        get_engine(self.engine).check_derivatives("forward")
 
     def num_trials(self) -> int | None:
         """Number of measurements."""
@@ -192,7 +185,7 @@ def gated(law: Law, gains: Gains) -> Law:
 
 def _program(study: Growth, name: str, skin: str = "") -> Any:
     """Return the compiled function of gains that propagates changes in the worlds of an object."""
-    alone = replace(domains.parse_domain(study.domain), objects=(name,))
+    alone = replace(parse_domain(study.domain), objects=(name,))
     alone = replace(alone, skin="ideal") if skin == "ideal skin" else alone
     drawn = draws.draw(alone, study.seed, np.arange(study.worlds))
     with jax.enable_x64(True):
@@ -232,11 +225,12 @@ def propagate(
     the components, whether the law or the skin is within a switch, and the sharpness [m/m] of the
     contact: the derivative of the offset that is felt by the object's offset aside.
     """
-    law = gated(registry.smooth_law(rps.LAW), gains)
+    smooth = registry.smooth_law(law_of(RPSParams))
+    law = gated(smooth, gains)
     loop = ControlLoop(setting.physics, law=law)
     count = worlds.qpos.shape[0]
     params = jax.vmap(lambda _: RPSParams())(jnp.arange(count))
-    start = trial.start_all(worlds, params, jnp.ones(count, bool), law=registry.smooth_law(rps.LAW))
+    start = trial.start_all(worlds, params, jnp.ones(count, bool), law=smooth)
 
     def step(trials: Trial) -> tuple[Trial, Snapshot]:
         """Run `trial.control_step` with gates."""

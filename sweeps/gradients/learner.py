@@ -14,25 +14,23 @@ Reference: Xu et al., "Accelerated policy learning with parallel differentiable 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Literal
 
 import jax
 import jax.numpy as jnp
 import optax
 from jax.flatten_util import ravel_pytree
 
-from rps_jax import engines, errors
+from rps_jax import PushEnv, errors
 from rps_jax.control.learned import network as networks
 from rps_jax.control.learned.network import Network, Weights
 from rps_jax.engines import native
-from rps_jax.record.options import option
-from rps_jax.runs.question import call_of
-from rps_jax.trials.env import PushEnv
-from rps_jax.trials.setting import Split
+from rps_jax.physics import get_engine
+from rps_jax.questions import call_of, option
 from rps_jax.trials.trial import World
 from rps_jax.tuning import collection, gradients, ppo
 from rps_jax.tuning.collection import EnvBatch, RunnerState
@@ -48,8 +46,8 @@ class WindowLearner(Learn):
     The answer and the run folder are those of `rps learn`.
     """
 
-    TITLE: ClassVar[str] = "A law learned by gradients of short windows"
-    QUICK: ClassVar[Mapping[str, Any]] = {**Learn.QUICK, "setting.engine": "quasistatic"}
+    TITLE = "A law learned by gradients of short windows"
+    QUICK: ClassVar = {**Learn.QUICK, "setting.engine": "quasistatic"}
 
     estimator: str = field(default="clipped", kw_only=True)
     """Estimator of the gradient: exact, clipped, bundled, evolution or mixed."""
@@ -75,10 +73,10 @@ class WindowLearner(Learn):
         super().check()
         errors.check_name("estimator", self.estimator, estimators.ESTIMATORS)
         if self.estimator != "evolution":
-            engine = engines.get(self.setting.engine)
+            engine = get_engine(self.setting.engine)
             engine.check_derivatives("reverse")
 
-    def environments(self, split: Split = "tune") -> list[PushEnv]:
+    def environments(self, split: Literal["test", "tune", "validate"] = "tune") -> list[PushEnv]:
         """Return the environments of a split; those to learn in have a smooth contact."""
         envs = super().environments(split)
         return [replace(env, smooth=True) for env in envs] if split == "tune" else envs

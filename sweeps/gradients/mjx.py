@@ -5,20 +5,19 @@ rps sweeps/gradients/mjx.py
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from itertools import product
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import jax
 import xarray as xr
 
 from rps_jax.engines import mjx_gradients
-from rps_jax.record.options import option
-from rps_jax.runs.question import Run, call_of
+from rps_jax.questions import Run, call_of, option
 from sweeps.gradients import mjx_upstream
-from sweeps.study_base import Study, Table
+from sweeps.study_base import Parts, Study, Table
 
 
 @dataclass(frozen=True)
@@ -30,17 +29,17 @@ class MJXGradients(Study[xr.Dataset]):
     finite entries of MJX's forward mode from rest; and the error `reverse` of its reverse mode.
     """
 
-    TITLE: ClassVar[str] = "Exact derivatives of MJX in custom models"
-    DIMENSION: ClassVar[str] = "case"
+    TITLE = "Exact derivatives of MJX in custom models"
+    DIMENSION = "case"
     CHOICES: ClassVar = {"models": mjx_upstream.MODELS}
-    GROWS: ClassVar[tuple[str, ...]] = ("models",)
+    GROWS = ("models",)
 
     models: tuple[str, ...] = tuple(mjx_upstream.MODELS)
     """Models to step, each with both friction cones."""
     steps: int = option(100, 2, 10_000)
     """Number of steps of the longer path; the shorter has one."""
 
-    def parts(self, run: Run) -> Mapping[Any, Callable[[], xr.Dataset]]:
+    def parts(self, run: Run) -> Parts:
         """Return the function that measures each model with each cone."""
         cases = product(self.models, mjx_upstream.CONES)
         return {f"{name}, {cone}": partial(self._measure, name, cone) for name, cone in cases}

@@ -22,13 +22,11 @@ import numpy as np
 import pandas as pd
 import xarray as xr
 
+from rps_jax import load
 from rps_jax.analysis import tables
 from rps_jax.analysis.figures.style import Figure, tiles
-from rps_jax.analysis.report import Picture
-from rps_jax.record import files
-from rps_jax.record.options import option
-from rps_jax.runs.question import Run, call_of
-from rps_jax.world.physics import PHYSICS
+from rps_jax.physics import PHYSICS
+from rps_jax.questions import Picture, Run, call_of, option
 from sweeps.gradients.race import run_commands
 from sweeps.study_base import QuickStudy, Rows, Table, part_name, text_table
 
@@ -54,11 +52,11 @@ class Networks(QuickStudy[xr.Dataset]):
     The answer has the best `validation` [1] up to each time (run, time), and the `test` (run).
     """
 
-    TITLE: ClassVar[str] = "Networks learned by several methods"
+    TITLE = "Networks learned by several methods"
     CHOICES: ClassVar = {"methods": METHODS}
-    QUICK: ClassVar[Mapping[str, Any]] = {"seeds": (1,)}
+    QUICK: ClassVar = {"seeds": (1,)}
     PRESETS: ClassVar = {"physics": PHYSICS["default"], "domains": ("wide",)}
-    IGNORED_FIELDS: ClassVar[tuple[str, ...]] = ("minutes", "lanes", "gpus")
+    IGNORED_FIELDS = ("minutes", "lanes", "gpus")
 
     methods: tuple[str, ...] = tuple(METHODS)
     """ppo, windows (derivatives of windows with a value function at their ends) or evolution
@@ -113,7 +111,7 @@ networks = call_of(Networks)
 def read_curve(folder: Path) -> xr.Dataset:
     """Return the learning curve of a run folder; of a killed run, that of its last checkpoint."""
     if (folder / "results.nc").exists():
-        return files.read_results(folder)
+        return load(folder)
     if (folder / "curve.csv").exists():
         return pd.read_csv(folder / "curve.csv", index_col="update").to_xarray()
     columns = dict.fromkeys(("time", "validation", *_COLUMNS), np.zeros(0))

@@ -18,7 +18,7 @@ import os
 import shlex
 import subprocess
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from functools import partial
@@ -29,15 +29,11 @@ import numpy as np
 import pandas as pd
 import xarray as xr
 
-from rps_jax import errors
+from rps_jax import InputError, RPSParams, Setting, errors, evaluate
 from rps_jax.analysis import statistics
-from rps_jax.control import registry
-from rps_jax.control.laws.rps import RPSParams
-from rps_jax.record.options import option
-from rps_jax.runs.evaluate import evaluate
-from rps_jax.runs.question import Run, SimulationQuestion, call_of
-from rps_jax.trials.setting import Setting
-from sweeps.study_base import Rows, Study, Table, part_name
+from rps_jax.questions import Run, call_of, option
+from rps_jax.runs.question import SimulationQuestion
+from sweeps.study_base import Parts, Rows, Study, Table, part_name
 
 COUNTS = {6: "K_h K_v L beta l_cr d_th", 13: "full"}  # tuned parameters by their number
 _COMMON = "--horizon 150 --validation 256"
@@ -60,12 +56,12 @@ class Race(Study[xr.Dataset], SimulationQuestion[xr.Dataset]):
     of the paper's law, `start_success` (world).
     """
 
-    TITLE: ClassVar[str] = "Gradients against evolution"
+    TITLE = "Gradients against evolution"
     CHOICES: ClassVar = {"methods": METHODS}
-    QUICK: ClassVar[Mapping[str, Any]] = {"worlds": 4, "counts": (6,), "seeds": (1,)}
-    IGNORED_FIELDS: ClassVar[tuple[str, ...]] = ("minutes", "lanes", "gpus")
-    DIMENSION: ClassVar[str] = "tuning"
-    REPORTS_TIMES: ClassVar[bool] = True
+    QUICK: ClassVar = {"worlds": 4, "counts": (6,), "seeds": (1,)}
+    IGNORED_FIELDS = ("minutes", "lanes", "gpus")
+    DIMENSION = "tuning"
+    REPORTS_TIMES = True
 
     methods: tuple[str, ...] = ("slopes", "evolution")
     """slopes (antithetic steps in whole trials), windows (derivatives of windows) or evolution."""
@@ -119,7 +115,7 @@ class Race(Study[xr.Dataset], SimulationQuestion[xr.Dataset]):
         run_commands(commands, self.minutes, self.lanes, self.gpus)
         return super().answer(run)
 
-    def parts(self, run: Run) -> Mapping[Any, Callable[[], xr.Dataset]]:
+    def parts(self, run: Run) -> Parts:
         """Return the test of each tuning, by its label."""
         folder = run.folder or Path(str(self.out))
         return {
@@ -131,7 +127,7 @@ class Race(Study[xr.Dataset], SimulationQuestion[xr.Dataset]):
         """Return the success of the best law of a tuning within each budget."""
         if not (folder / "curve.csv").exists():
             reason = f"{folder.with_suffix('.log')} tells why; or raise minutes"
-            raise errors.InputError(f"{folder} has no generation: {reason}.")
+            raise InputError(f"{folder} has no generation: {reason}.")
         curve = pd.read_csv(folder / "curve.csv")
         chosen = [best_within(curve, name, getattr(self, name)) for name in BUDGETS]
         laws = [RPSParams.paper(), *map(law_of, chosen)]
@@ -207,7 +203,7 @@ def law_of(row: pd.Series) -> RPSParams:
     """Return the parameters of a generation."""
     names = [name for name in row.index if name.startswith("params.")]
     changes = {name.removeprefix("params."): float(np.asarray(row[name])) for name in names}
-    params = registry.replace_leaves(RPSParams.paper(), changes)
+    params = RPSParams.paper()._replace(**changes)
     return params._replace(l_mr=min(params.l_mr, params.l_cr))  # as in the tuning: see `Space`
 
 

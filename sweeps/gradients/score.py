@@ -10,26 +10,26 @@ whole trials under the original law, by central differences in other worlds.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import partial
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import jax.numpy as jnp
 import numpy as np
 import xarray as xr
 
-from rps_jax.record.options import option
+from rps_jax import Rules, Setting
+from rps_jax.questions import Run, call_of, option
 from rps_jax.runs import evaluate
 from rps_jax.runs.evaluate import Candidates, CandidateScores
-from rps_jax.runs.question import Run, SimulationQuestion, call_of
-from rps_jax.trials.setting import Setting, seed_of
-from rps_jax.trials.trial import Rules
+from rps_jax.runs.question import SimulationQuestion
+from rps_jax.trials.setting import seed_of
 from rps_jax.tuning import descent
 from rps_jax.tuning.gradients import Estimate, estimate
 from sweeps.gradients import critic
 from sweeps.gradients.windows import WindowTuning, window_gradients
-from sweeps.study_base import QuickStudy, Rows, Table
+from sweeps.study_base import Parts, QuickStudy, Rows, Table
 
 _DRAWS = 4000  # of the errors of both gradients
 
@@ -42,8 +42,8 @@ class ScoreStudy(QuickStudy[xr.Dataset], SimulationQuestion[xr.Dataset]):
     that of whole trials with the interval `low` to `high`, and the `cost` [s] in simulated time.
     """
 
-    TITLE: ClassVar[str] = "Scores of windows against whole trials"
-    QUICK: ClassVar[Mapping[str, Any]] = {
+    TITLE = "Scores of windows against whole trials"
+    QUICK: ClassVar = {
         "windows": (2.0,),
         "critics": (2.0,),
         "taxels": (0.03,),
@@ -100,7 +100,7 @@ class ScoreStudy(QuickStudy[xr.Dataset], SimulationQuestion[xr.Dataset]):
         for name in self.estimators:
             self.tuning(name).validate()
 
-    def parts(self, run: Run) -> Mapping[Any, Callable[[], xr.Dataset]]:
+    def parts(self, run: Run) -> Parts:
         """Return the function of each gradient by its label."""
         parts = {"truth": partial(self._truth, run)}
         parts["evolution, whole trials"] = partial(self._evolution, run)
@@ -116,7 +116,7 @@ class ScoreStudy(QuickStudy[xr.Dataset], SimulationQuestion[xr.Dataset]):
             parts[label] = partial(self._critic, tuning)
         return parts
 
-    DIMENSION: ClassVar[str] = "score"
+    DIMENSION = "score"
 
     def answer(self, run: Run) -> xr.Dataset:
         """Compute the gradients that are missing, and compare them with the truth."""

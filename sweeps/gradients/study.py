@@ -22,28 +22,24 @@ import jax.numpy as jnp
 import numpy as np
 import xarray as xr
 
-from rps_jax import engines, errors
+from rps_jax import RPSParams, Setting, errors
 from rps_jax.analysis.figures.style import Axes, Figure, tiles, words
-from rps_jax.analysis.report import Picture
 from rps_jax.control import registry
-from rps_jax.control.laws import rps
-from rps_jax.control.laws.rps import RPSParams
-from rps_jax.engines import EngineName
-from rps_jax.record.options import option
-from rps_jax.runs.question import Run, call_of
+from rps_jax.laws import Space, law_of
+from rps_jax.physics import PHYSICS, EngineName, get_engine
+from rps_jax.questions import Picture, Run, call_of, option
 from rps_jax.trials import trial
 from rps_jax.trials.progress import Progress, set_phase
-from rps_jax.trials.setting import Setting, seed_of
+from rps_jax.trials.setting import seed_of
 from rps_jax.trials.trial import World
 from rps_jax.trials.worlds import drawn_worlds, soften_skins
 from rps_jax.tuning.gradients import Options, Scores, estimate
-from rps_jax.tuning.space import Space, expand_subsets
-from rps_jax.world import domain as domains
+from rps_jax.tuning.space import expand_subsets
 from rps_jax.world import draws
-from rps_jax.world.domain import RANDOM, DomainLike
-from rps_jax.world.physics import PHYSICS, Fidelity
+from rps_jax.world.physics import Fidelity
+from rps_jax.worlds import DomainLike, parse_domain
 from sweeps.gradients import estimators
-from sweeps.study_base import QuickStudy, Rows, Table, part_name
+from sweeps.study_base import RANDOM_OBJECTS, QuickStudy, Rows, Table, part_name
 
 TRUTH = "truth"
 HORIZONS = (0.5, 2.0, 8.0, 30.0)  # [s]
@@ -66,15 +62,15 @@ class Gradients(QuickStudy[xr.Dataset]):
     the gradients [m] in each world (world, parameter, horizon); `truth` has other worlds.
     """
 
-    TITLE: ClassVar[str] = "Gradients against finite differences"
+    TITLE = "Gradients against finite differences"
     QUICK: ClassVar = {
         "horizons": (0.5, 2.0, 8.0),
         "worlds": 8,
         "truth": 64,
         "engine": "quasistatic",
     }
-    CHOICES: ClassVar = {"estimators": tuple(estimators.ESTIMATORS), "objects": RANDOM}
-    GROWS: ClassVar[tuple[str, ...]] = ("estimators", "objects")
+    CHOICES: ClassVar = {"estimators": tuple(estimators.ESTIMATORS), "objects": RANDOM_OBJECTS}
+    GROWS = ("estimators", "objects")
     PRESETS: ClassVar = {"physics": PHYSICS["default"], "laws": ("rps",)}
     DOUBLE: ClassVar = False  # whether trials have double precision
 
@@ -133,7 +129,7 @@ class Gradients(QuickStudy[xr.Dataset]):
         _ = self.space
         for name in {"exact", "warm", "bundled", "forward"}.intersection(self.measurements):
             mode = "forward" if name == "forward" else "reverse"
-            engines.get(self.engine).check_derivatives(mode)
+            get_engine(self.engine).check_derivatives(mode)
 
     @property
     def measurements(self) -> tuple[str, ...]:
@@ -207,7 +203,7 @@ def _distances(study: Gradients, stage: Any, smooth: bool) -> Scores:
     """Return scores (n, H) [m]: the distances at the horizons."""
     physics = study.setting.physics
     at = np.round(np.array(study.horizons) / physics.control_period).astype(int) - 1
-    law = registry.smooth_law(rps.LAW) if smooth else rps.LAW
+    law = registry.smooth_law(law_of(RPSParams)) if smooth else law_of(RPSParams)
     score = estimators.distances_at(at, stage, study.space.params, physics, law)
 
     def scores(thetas: jax.Array, worlds: World) -> jax.Array:
@@ -224,7 +220,7 @@ def _measure(study: Gradients, name: str, measurement: str) -> xr.Dataset:
     smooth = measurement not in (TRUTH, "evolution")
     seed = seed_of(study.seed, "test") if is_true else study.seed
     count = study.truth if is_true else study.worlds
-    alone = replace(domains.parse_domain(study.domain), objects=(name,))
+    alone = replace(parse_domain(study.domain), objects=(name,))
     drawn = draws.draw(alone, seed, np.arange(count))
     estimator = estimators.ESTIMATORS["differences" if is_true else measurement]
     with jax.enable_x64(study.DOUBLE):

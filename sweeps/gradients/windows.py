@@ -14,18 +14,19 @@ import time
 from collections.abc import Callable, Hashable
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, ClassVar
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from rps_jax import engines, errors
-from rps_jax.control import registry, soft
+from rps_jax import errors
+from rps_jax.control import registry
 from rps_jax.engines.base import Stage
-from rps_jax.record.options import option
+from rps_jax.laws import law_of
+from rps_jax.physics import get_engine
+from rps_jax.questions import call_of, option
 from rps_jax.runs.evaluate import Candidates, CandidateScores
-from rps_jax.runs.question import call_of
 from rps_jax.trials.trial import ControlLoop, Snapshot, Trial, World, advance, start_all
 from rps_jax.trials.worlds import soften_skins
 from rps_jax.tuning import gradients
@@ -45,7 +46,7 @@ class WindowTuning(TuneGrad):
     The answer is that of `rps tune grad`.
     """
 
-    TITLE: ClassVar[str] = "A law tuned by derivatives of windows"
+    TITLE = "A law tuned by derivatives of windows"
 
     estimator: str = "clipped"
     """Estimator of the gradient: exact, clipped (exact with a bound in each world), bundled,
@@ -67,8 +68,8 @@ class WindowTuning(TuneGrad):
         """Check the common options, and that law and engine have derivatives."""
         super().check()
         errors.check_name("estimator", self.estimator, estimators.ESTIMATORS)
-        registry.smooth_law(registry.law_of(self.params))
-        engines.get(self.setting.engine).check_derivatives("reverse")
+        registry.smooth_law(law_of(self.params))
+        get_engine(self.setting.engine).check_derivatives("reverse")
 
     def slopes(
         self, thetas: jax.Array, step: int, check: Candidates, score: ScoreCandidates
@@ -131,7 +132,7 @@ def window_starts(
     `start` (n,) is the share of `within` at which a window starts, rounded up to tenths.
     """
     setting = options.setting
-    law = registry.smooth_law(registry.law_of(options.space.base))
+    law = registry.smooth_law(law_of(options.space.base))
     loop = ControlLoop(setting.physics, setting.rules, law)
     params = jax.vmap(options.space.params)(gradients.per_world(theta, worlds))
     trials = start_all(worlds, params, jnp.ones(len(start), bool), law=law)
@@ -140,7 +141,8 @@ def window_starts(
     def proceed(i: jax.Array, trials: tuple[Trial, Trial]) -> tuple[Trial, Trial]:
         running, chosen = trials
         (running,) = advance([(stage, worlds, params, running)], loop, steps)
-        return running, jax.vmap(soft.tree_where)(i < start * _START_TIMES, running, chosen)
+        select = jax.vmap(lambda mask, x, y: jax.tree.map(partial(jnp.where, mask), x, y))
+        return running, select(i < start * _START_TIMES, running, chosen)
 
     return jax.lax.fori_loop(0, _START_TIMES if steps else 0, proceed, (trials, trials))[1]
 
@@ -151,7 +153,7 @@ def window_scores(options: WindowTuning, stage: Stage) -> gradients.Scores:
     The worlds are pairs of a World and the Trial at which its window starts.
     """
     space, setting = options.space, options.setting
-    law = registry.smooth_law(registry.law_of(space.base))
+    law = registry.smooth_law(law_of(space.base))
     loop = ControlLoop(setting.physics, law=law)
 
     def cost(snapshots: Snapshot) -> jax.Array:

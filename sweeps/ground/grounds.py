@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
+from rps_jax.physics import MUJOCO_GROUND, Physics, preset
 from rps_jax.record.checkpoint import Checkpoints
 from rps_jax.trials.progress import Progress, ProgressCallback, SequentialProgress, no_progress
-from rps_jax.world.physics import MUJOCO_GROUND, Physics, preset
 from sweeps.ground import pushes
 from sweeps.ground.pushes import DISTANCE, OFFSETS, SPEEDS, STEPS, Pushes
 from sweeps.study_base import Rows, load_or_compute, records, text_table
@@ -70,15 +70,21 @@ STEPPED = {
 # Ever stiffer: first with damping that grows along, then with hops that last as long as ours.
 STIFFER = {
     f"critical_{1000 * constant:g}": _on(
-        _DEFAULT, f"MuJoCo's own, time constant {1000 * constant:g} ms",
-        timestep=timestep, solref=(constant, 1.0),
+        _DEFAULT,
+        f"MuJoCo's own, time constant {1000 * constant:g} ms",
+        timestep=timestep,
+        solref=(constant, 1.0),
     )
     for constant, timestep in ((0.01, 5e-4), (0.005, 2.5e-4), (0.002, 1e-4))
 } | {
-    f"damping_{name}": _on(_C, f"ours, damping ratio {ratio}: {times} times as stiff",
-                           timestep=timestep, solref=(0.1, ratio))
+    f"damping_{name}": _on(
+        _C,
+        f"ours, damping ratio {ratio}: {times} times as stiff",
+        timestep=timestep,
+        solref=(0.1, ratio),
+    )
     for name, ratio, times, timestep in (("01", 0.1, 4, 5e-4), ("003", 0.03, 44, 1e-4))
-}  # fmt: skip
+}
 # Lifted less by MuJoCo's cones: the lower the impedance, the deeper an object rests.
 _LOW = {"solref": (0.1, 0.2), "ground_impedance": 0.3}
 LOWER = {
@@ -195,17 +201,23 @@ def table(results: xr.Dataset, speeds: Sequence[float] = SPEEDS) -> Rows:
         ["rigid object", *["0", f"{force:.3f}"] * len(speeds), "all", "0", "0"],
     ]
     chosen = results.sel(speed=list(speeds))
-    at_speed = xr.Dataset({
-        "error": 1000 * np.sqrt((chosen.error**2).mean(over)), "force": chosen.force.mean(over),
-    })  # fmt: skip
+    at_speed = xr.Dataset(
+        {
+            "error": 1000 * np.sqrt((chosen.error**2).mean(over)),
+            "force": chosen.force.mean(over),
+        }
+    )
     for name in map(str, results.ground.values):
         ground = chosen.sel(ground=name)
+        height = ground.height
         _, *cells = text_table(_AT_SPEED, records(at_speed.sel(ground=name), "speed"))
-        rows.append([
-            str(ground.what.values),
-            *itertools.chain(*cells),
-            f"{100 * float(ground.height.min()):.0f} to {100 * float(ground.height.max()):.0f} cm",
-            f"{1000 * float(ground.hop.max()):.2f} mm",
-            f"{100 * float(ground.aloft.max()):.0f} %",
-        ])  # fmt: skip
+        rows.append(
+            [
+                str(ground.what.values),
+                *itertools.chain(*cells),
+                " to ".join(f"{100 * float(x):.0f}" for x in (height.min(), height.max())) + " cm",
+                f"{1000 * float(ground.hop.max()):.2f} mm",
+                f"{100 * float(ground.aloft.max()):.0f} %",
+            ]
+        )
     return rows

@@ -18,12 +18,12 @@ import mujoco
 import numpy as np
 import numpy.typing as npt
 
+from rps_jax import Robot
 from rps_jax.geometry import solid
 from rps_jax.geometry.solid import GRAVITY, Solid
-from rps_jax.robot import shell
+from rps_jax.physics import FRICTION, Physics
 from rps_jax.world import scene
-from rps_jax.world.physics import Physics
-from rps_jax.world.scene import FRICTION, JOINTS, Scene
+from rps_jax.world.scene import JOINTS, Scene
 from sweeps.ground import rigid
 from sweeps.ground.rigid import Pushed, Rounding
 
@@ -122,7 +122,7 @@ def in_mujoco(target: Target, offset: float, speed: float, physics: Physics) -> 
     free = JOINTS.object
     data.qpos[:] = scene.initial_qpos(chosen)
     quaternion = [math.cos(yaw / 2), 0.0, 0.0, math.sin(yaw / 2)]
-    data.qpos[free] = [x + shell.HALF_LENGTH, y, height / 2, *quaternion]
+    data.qpos[free] = [x + Robot().half_length, y, height / 2, *quaternion]
     for _ in range(round(_SETTLE / dt)):
         data.qvel[JOINTS.base] = 0.0
         mujoco.mj_step(model, data)

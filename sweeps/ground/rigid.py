@@ -25,10 +25,11 @@ from typing import NamedTuple
 
 import numpy as np
 
+from rps_jax import Robot
 from rps_jax.geometry.solid import Solid, rotate
-from rps_jax.robot.shell import HALF_WIDTH
 
 _FAR = 1.0  # [m] gap of an impossible contact
+_HALF_WIDTH = Robot().half_width  # [m]
 _FACING = 0.5  # cosine of the angle to the base within which its corners may touch a side
 _ALPHAS = 0.25 ** np.arange(5)  # steps of a line search
 _NEAR = 0.1  # gap, over the step, below which a contact might close in it
@@ -216,14 +217,14 @@ def contacts(solids: Solid, pose: np.ndarray) -> Contacts:
     centre = position + rotate(yaw, solids.p_object_com[:, :2])[:, None]
     if solids.vertices.shape[1] == 1:
         nearest = np.zeros_like(position)
-        nearest[..., 1] = np.clip(position[..., 1], -HALF_WIDTH, HALF_WIDTH)
+        nearest[..., 1] = np.clip(position[..., 1], -_HALF_WIDTH, _HALF_WIDTH)
         away = position - nearest
         far = np.linalg.norm(away, axis=-1)
         return Contacts(away / far[..., None], nearest - centre, far - solids.radius[:, None])
     corners = position + rotate(yaw[:, None], solids.vertices)
     ahead = np.broadcast_to([1.0, 0.0], corners.shape)
-    gap = np.where(np.abs(corners[..., 1]) <= HALF_WIDTH, corners[..., 0], _FAR)
-    edges = np.array([[0.0, -HALF_WIDTH], [0.0, HALF_WIDTH]])
+    gap = np.where(np.abs(corners[..., 1]) <= _HALF_WIDTH, corners[..., 0], _FAR)
+    edges = np.array([[0.0, -_HALF_WIDTH], [0.0, _HALF_WIDTH]])
     along = np.roll(corners, -1, axis=1) - corners
     length = np.linalg.norm(along, axis=-1)
     unit = along / length[..., None]

@@ -15,20 +15,25 @@ import jax.numpy as jnp
 import numpy as np
 import xarray as xr
 
-from rps_jax import engines
-from rps_jax.control.observation import Twist
-from rps_jax.engines import EngineName
-from rps_jax.engines.base import ControlPeriod, Motion
+from rps_jax import Range, Twist
 from rps_jax.engines.mujoco import Batch
 from rps_jax.geometry.solid import GRAVITY
-from rps_jax.record.options import option
-from rps_jax.runs.question import Run, call_of
+from rps_jax.physics import (
+    MUJOCO_GROUND,
+    PHYSICS,
+    ControlPeriod,
+    EngineName,
+    Motion,
+    Physics,
+    get_engine,
+    preset,
+)
+from rps_jax.questions import Run, call_of, option
 from rps_jax.trials.worlds import starts
 from rps_jax.world import draws
-from rps_jax.world.domain import DOMAINS, Range
 from rps_jax.world.draws import Draw
-from rps_jax.world.physics import MUJOCO_GROUND, PHYSICS, Physics, preset
 from rps_jax.world.scene import WorldInputs
+from rps_jax.worlds import parse_domain
 from sweeps.ground.pushes import DISTANCE, GAP
 from sweeps.study_base import QuickStudy, Rows, Table, run_parts, text_table
 
@@ -36,7 +41,9 @@ SPEED = 0.05  # [m/s] of the base, as of the laws
 _SETTLE = 1.0  # [s] that objects stand before the push
 _STEADY = 0.05  # [1] standard deviation over mean of a force without chatter, at most
 _ZERO = Range(0, 0)
-CENTRED = replace(DOMAINS["wide"], com_offset=_ZERO, lateral=_ZERO, yaw=_ZERO, gap=Range(GAP, GAP))
+CENTRED = replace(
+    parse_domain("wide"), com_offset=_ZERO, lateral=_ZERO, yaw=_ZERO, gap=Range(GAP, GAP)
+)
 FRICTIONS = ((0.1, 0.3), (0.3, 0.6), (0.6, 0.7))
 
 
@@ -70,10 +77,10 @@ KINDS = {
 class Straight(QuickStudy[xr.Dataset]):
     """Push random objects straight ahead: `force` over mu m g and its `spread` (kind, world)."""
 
-    TITLE: ClassVar[str] = "Force of straight pushes"
-    QUICK: ClassVar[dict[str, object]] = {"worlds": 9, "kinds": ("standard", "lower")}
+    TITLE = "Force of straight pushes"
+    QUICK: ClassVar = {"worlds": 9, "kinds": ("standard", "lower")}
     CHOICES: ClassVar = {"kinds": KINDS}
-    GROWS: ClassVar[tuple[str, ...]] = ("kinds",)
+    GROWS = ("kinds",)
     PRESETS: ClassVar = PHYSICS["default"]
 
     kinds: tuple[str, ...] = tuple(KINDS)
@@ -130,7 +137,7 @@ def push(family: str, drawn: Draw, kind: Kind) -> np.ndarray:
     physics = replace(kind.physics, control_period=kind.physics.timestep)
     if family == "prism":
         drawn.values["yaw"] = yaw_of_side(drawn.solid.vertices)
-    engine, qpos = engines.get(kind.engine), starts(drawn)
+    engine, qpos = get_engine(kind.engine), starts(drawn)
     stage, fields = engine.stage(WorldInputs(family, drawn.solid, drawn.friction, physics))
     count, pushed = len(qpos), round(DISTANCE / kind.speed / physics.timestep)
     speeds = np.repeat([0.0, kind.speed], [round(_SETTLE / physics.timestep), pushed])

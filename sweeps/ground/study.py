@@ -8,7 +8,7 @@ rigid limit, and `grounds` runs them on many grounds and compares.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, ClassVar
@@ -18,9 +18,8 @@ import xarray as xr
 from matplotlib.lines import Line2D
 
 from rps_jax.analysis.figures.style import Figure, words
-from rps_jax.analysis.report import Picture
-from rps_jax.runs.question import Run, call_of
-from rps_jax.world.physics import PHYSICS
+from rps_jax.physics import PHYSICS
+from rps_jax.questions import Picture, Run, call_of
 from sweeps.ground import grounds
 from sweeps.study_base import QuickStudy, Table
 
@@ -33,10 +32,10 @@ class Ground(QuickStudy[xr.Dataset]):
     objects (object, offset, at_height), and their distance from each push, `error` [m].
     """
 
-    TITLE: ClassVar[str] = "Which ground is dry friction?"
-    QUICK: ClassVar[Mapping[str, object]] = {"grounds": grounds.QUICK}
+    TITLE = "Which ground is dry friction?"
+    QUICK: ClassVar = {"grounds": grounds.QUICK}
     CHOICES: ClassVar = {"grounds": grounds.GROUNDS}
-    GROWS: ClassVar[tuple[str, ...]] = ("grounds",)
+    GROWS = ("grounds",)
     PRESETS: ClassVar = PHYSICS["default"]
 
     grounds: tuple[str, ...] = tuple(grounds.GROUNDS)
@@ -108,9 +107,11 @@ def figure_of(results: xr.Dataset, names: Collection[str]) -> Figure:
     style: dict[str, Any] = {"color": "0.3", "ls": "none", "mfc": "none"}
     handles = [
         Line2D([], [], color="k", lw=1, label="rigid object, at three offsets"),
-        *(Line2D([], [], marker=mark, label=f"{100 * speed:g} cm/s", **style)
-          for mark, speed in zip(marks, speeds, strict=False)),
+        *(
+            Line2D([], [], marker=mark, label=f"{100 * speed:g} cm/s", **style)
+            for mark, speed in zip(marks, speeds, strict=False)
+        ),
         *below[0].get_legend_handles_labels()[0],
-    ]  # fmt: skip
+    ]
     figure.legend(handles=handles, loc="outside lower center", ncols=4, fontsize=8)
     return figure

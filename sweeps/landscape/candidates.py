@@ -11,10 +11,10 @@ import jax.numpy as jnp
 import numpy as np
 import xarray as xr
 
+from rps_jax import RPSParams
 from rps_jax.analysis import tables
-from rps_jax.control.laws.rps import RPSParams
+from rps_jax.laws import Space
 from rps_jax.trials.trial import Outcome
-from rps_jax.tuning.space import Space
 from sweeps.study_base import records
 
 _EDGE = 0.03  # distance of varied parameters from their bounds, as a share of the range
@@ -93,8 +93,13 @@ def front_table(results: xr.Dataset) -> list[list[str]]:
     shown = results.isel(candidate=np.flatnonzero(results.front | named))
     ordered = shown.isel(candidate=np.argsort(-shown.success.values, kind="stable"))
     for row in records(ordered, "candidate"):
-        rows.append([
-            row["candidate"], f"{tables.percent(row['success'])} %", f"{row['time']:.1f} s",
-            f"{row['path']:.2f} m", "yes" if row["front"] else "no",
-        ])  # fmt: skip
+        rows.append(
+            [
+                row["candidate"],
+                f"{tables.percent(row['success'])} %",
+                f"{row['time']:.1f} s",
+                f"{row['path']:.2f} m",
+                "yes" if row["front"] else "no",
+            ]
+        )
     return rows

@@ -8,29 +8,26 @@ and around sets of parameters. Both push with a few hundred candidates: for a GP
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
-from typing import ClassVar, Unpack
+from typing import Any, ClassVar, Literal
 
 import jax
 import numpy as np
 import xarray as xr
 
-from rps_jax import errors
+from rps_jax import Domain, RPSParams, errors
 from rps_jax.analysis.figures.style import Figure, success_rates, tiles
-from rps_jax.analysis.report import Picture, Section
-from rps_jax.control.laws.rps import BOUNDS, RPSParams
-from rps_jax.record.options import option
-from rps_jax.runs.question import MultiLawQuestion, Run, call_of
+from rps_jax.laws import law_of
+from rps_jax.questions import MultiLawQuestion, Picture, Run, Section, call_of, option
 from rps_jax.trials.batch_run import Candidates, outcomes
-from rps_jax.trials.jobs import BatchOptions
 from rps_jax.trials.progress import SequentialProgress
-from rps_jax.trials.setting import Split, seed_of
+from rps_jax.trials.setting import seed_of
 from rps_jax.trials.trial import Outcome
 from rps_jax.tuning.run import parse_domains
 from rps_jax.tuning.space import SUBSETS
-from rps_jax.world.domain import Domain, DomainLike
+from rps_jax.worlds import DomainLike
 from sweeps.landscape.candidates import aims, cloud, front_table, lines, undominated
 
 
@@ -42,8 +39,8 @@ class Landscape(MultiLawQuestion[xr.DataTree]):
     with those of candidates between the laws' parameters and around them (candidate).
     """
 
-    TITLE: ClassVar[str] = "Effect of each parameter"
-    QUICK: ClassVar[Mapping[str, object]] = {"worlds": 32, "values": 3, "candidates": 16}
+    TITLE = "Effect of each parameter"
+    QUICK: ClassVar = {"worlds": 32, "values": 3, "candidates": 16}
 
     domain: Sequence[DomainLike] = ("wide",)
     """Domains: paper, hardware, wide, real, prisms or hostile, or JSON files of ranges; changes
@@ -95,14 +92,17 @@ class Landscape(MultiLawQuestion[xr.DataTree]):
         return xr.DataTree.from_dict(results)
 
     def _outcomes(
-        self, params: RPSParams, *splits: Split, **options: Unpack[BatchOptions]
+        self,
+        params: RPSParams,
+        *splits: Literal["validate", "test"],
+        **options: Any,
     ) -> list[Outcome]:
         """Return the outcomes (P, D * W) of candidates (P,) in the worlds of each split."""
         seeds, worlds = [seed_of(self.setting.seed, x) for x in splits], np.arange(self.worlds)
         requests = [Candidates(params, self.domains, seed, worlds) for seed in seeds]
         return outcomes(requests, self.setting, **options)[0]
 
-    def vary_each(self, **options: Unpack[BatchOptions]) -> xr.Dataset:
+    def vary_each(self, **options: Any) -> xr.Dataset:
         """Compute success, time and path length over each parameter alone, in validation worlds.
 
         Return labelled results (set, parameter, step), with the parameter's `value` at each step.
@@ -120,7 +120,7 @@ class Landscape(MultiLawQuestion[xr.DataTree]):
             {"worlds": outcome.success.shape[1]},
         )
 
-    def select_front(self, **options: Unpack[BatchOptions]) -> xr.Dataset:
+    def select_front(self, **options: Any) -> xr.Dataset:
         """Run candidates between and around the sets, and select the Pareto-optimal ones.
 
         The selection uses validation worlds. The objectives (candidate,) are then measured in test
@@ -147,7 +147,7 @@ class Landscape(MultiLawQuestion[xr.DataTree]):
     def report(self, results: xr.DataTree, run: Run) -> Sequence[Section]:
         """Return sections with success over each parameter, and the Pareto front."""
         alone, front = (results[name].to_dataset() for name in ("alone", "front"))
-        log = [name for name, bound in BOUNDS.items() if bound.log]
+        log = [name for name, bound in law_of(RPSParams).bounds.items() if bound.log]
         lines = Picture("landscape", partial(parameters_figure, alone, log))
         return [
             Section("Success against each parameter", "", (), lines),

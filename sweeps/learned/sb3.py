@@ -14,25 +14,20 @@ import importlib
 import importlib.metadata
 import importlib.util
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import partial
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 import xarray as xr
 
-from rps_jax import errors
+from rps_jax import InputError, Rules, Setting
 from rps_jax.analysis import statistics, tables
 from rps_jax.analysis.figures.style import Figure, panel
-from rps_jax.analysis.report import Picture
-from rps_jax.record.options import option
-from rps_jax.runs.question import Run, call_of
-from rps_jax.trials.setting import Setting
-from rps_jax.trials.trial import Rules
-from rps_jax.world import domain as domains
-from rps_jax.world.domain import DomainLike
-from sweeps.study_base import Rows, Study, Table, records
+from rps_jax.questions import Picture, Run, call_of, option
+from rps_jax.worlds import DomainLike, parse_domain
+from sweeps.study_base import Parts, Rows, Study, Table, records
 
 _VARIABLES = {
     "time": {"units": "s", "long_name": "wall clock since learning began"},
@@ -50,8 +45,8 @@ class SB3(Study[xr.Dataset]):
     The answer holds `time` [s], `steps`, `episodes`, `reward` and `success` (envs, row).
     """
 
-    TITLE: ClassVar[str] = "PPO of Stable-Baselines3"
-    DIMENSION: ClassVar[str] = "envs"
+    TITLE = "PPO of Stable-Baselines3"
+    DIMENSION = "envs"
 
     domain: DomainLike = "wide,distance=0.7:1,bearing=-0.3:0.3"
     """Ranges from which worlds are drawn."""
@@ -71,14 +66,14 @@ class SB3(Study[xr.Dataset]):
 
     def check(self) -> None:
         """Check the domain, and that the libraries are there."""
-        domains.parse_domain(self.domain)
+        parse_domain(self.domain)
         for name in ("gymnasium", "stable_baselines3"):
             if not importlib.util.find_spec(name):
-                raise errors.InputError(
+                raise InputError(
                     f"{name} is not installed: run pip install gymnasium stable-baselines3."
                 )
 
-    def parts(self, run: Run) -> Mapping[int, Callable[[], xr.Dataset]]:
+    def parts(self, run: Run) -> Parts:
         """Return the function that learns with each number of worlds."""
         return {n: partial(self._learned, n) for n in self.num_envs}
 
@@ -177,15 +172,29 @@ def batched(base: Any, envs: Any) -> Any:
 
 def table(results: xr.Dataset) -> Rows:
     """Return header and rows of the curve."""
-    rows = [["worlds", "wall clock", "steps of all worlds", "trials that ended",
-             "reward of these", "success"]]  # fmt: skip
+    rows = [
+        [
+            "worlds",
+            "wall clock",
+            "steps of all worlds",
+            "trials that ended",
+            "reward of these",
+            "success",
+        ]
+    ]
     for row in records(results, "envs", "row"):
         trials = int(row["episodes"])
         successes = round(row["success"] * trials) if trials else 0
-        rows.append([
-            f"{row['envs']:,}", f"{row['time']:.0f} s", f"{int(row['steps']):,}", f"{trials:,}",
-            f"{row['reward']:.2f}" if trials else "-", tables.share(successes, trials),
-        ])  # fmt: skip
+        rows.append(
+            [
+                f"{row['envs']:,}",
+                f"{row['time']:.0f} s",
+                f"{int(row['steps']):,}",
+                f"{trials:,}",
+                f"{row['reward']:.2f}" if trials else "-",
+                tables.share(successes, trials),
+            ]
+        )
     return rows
 
 

@@ -12,17 +12,15 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 
-from rps_jax import errors
+from rps_jax import errors, load
 from rps_jax.analysis import statistics
-from rps_jax.analysis.report import Picture
-from rps_jax.record import files, provenance
+from rps_jax.questions import Picture, Run, call_of, option
 from rps_jax.record import folder as run_folder
-from rps_jax.record.options import option
-from rps_jax.runs.question import Run, call_of
+from rps_jax.record import provenance
 from rps_jax.tuning import learn
 from sweeps.study_base import Study, Table, write_table
 
@@ -53,7 +51,7 @@ class Learned(Study[list[list[Any]]]):
     The results are the rows.
     """
 
-    TITLE: ClassVar[str] = "A law learned from touch"
+    TITLE = "A law learned from touch"
 
     runs: tuple[str, ...] = option((), positional=True)
     """Run folders of `rps learn`."""
@@ -76,7 +74,7 @@ class Learned(Study[list[list[Any]]]):
         """Return the rows, and the curve of each run."""
         tables = [Table(results, _NOTE, COLUMNS, title="Runs")]
         for folder, (network, *_) in zip(self.runs, results, strict=True):
-            draw = partial(learn.figure_of, files.read_results(Path(folder)))
+            draw = partial(learn.figure_of, load(folder))
             picture = Picture(f"learned_{network.strip('`')}", draw)
             tables.append(Table((), title=str(folder), picture=picture))
         return tables
@@ -87,7 +85,7 @@ learned = call_of(Learned)
 
 def row(folder: Path) -> list[Any]:
     """Return the row of a run, for the law with the best validation."""
-    curve, manifest = files.read_results(folder), run_folder.read_manifest(folder)
+    curve, manifest = load(folder), run_folder.read_manifest(folder)
     environment = provenance.read_environment(folder)
     judged = curve.dropna("update", subset=["validation"])
     rates = judged.validation.values

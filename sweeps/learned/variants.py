@@ -11,7 +11,7 @@ validation. The last command collects the results of other run folders.
 from __future__ import annotations
 
 import shlex
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -20,15 +20,13 @@ from typing import Any, ClassVar
 import numpy as np
 import xarray as xr
 
+from rps_jax import Setting, evaluate, load
 from rps_jax.analysis import statistics
 from rps_jax.app.cli import flags
-from rps_jax.record import files, provenance
-from rps_jax.record.options import option
-from rps_jax.runs.evaluate import evaluate
-from rps_jax.runs.question import Run, call_of
-from rps_jax.trials.setting import Setting
+from rps_jax.questions import Run, call_of, option
+from rps_jax.record import provenance
 from rps_jax.tuning.learn import Learn
-from sweeps.study_base import QuickStudy, Table, write_table
+from sweeps.study_base import Parts, QuickStudy, Table, write_table
 
 # `learned_gru.npz` and `learned_mlp.npz` are the laws of 0.3, with which variants start.
 DOMAINS = ("wide", "hostile", "real")
@@ -89,11 +87,11 @@ class Variants(QuickStudy[xr.Dataset]):
     numbers of its run (variant).
     """
 
-    TITLE: ClassVar[str] = "Variants of learning"
+    TITLE = "Variants of learning"
     CHOICES: ClassVar = {"variants": VARIANTS}
-    QUICK: ClassVar[Mapping[str, Any]] = {"variants": ("scratch", "mlp"), "worlds": 4}
-    DIMENSION: ClassVar[str] = "variant"
-    REPORTS_TIMES: ClassVar[bool] = True
+    QUICK: ClassVar = {"variants": ("scratch", "mlp"), "worlds": 4}
+    DIMENSION = "variant"
+    REPORTS_TIMES = True
 
     runs: tuple[str, ...] = option((), positional=True)
     """Run folders of this study, to collect their results."""
@@ -122,7 +120,7 @@ class Variants(QuickStudy[xr.Dataset]):
         words = [*shlex.split(self.command(name))[2:], *options]
         return flags.parse(Learn, "learn", words)[0]
 
-    def parts(self, run: Run) -> Mapping[str, Callable[[], xr.Dataset]]:
+    def parts(self, run: Run) -> Parts:
         """Return the run of each variant, by its name."""
         folder = Path(str(self.out))
         names = () if self.runs else self.variants
@@ -131,7 +129,7 @@ class Variants(QuickStudy[xr.Dataset]):
     def answer(self, run: Run) -> xr.Dataset:
         """Run the variants, or collect the results of other run folders."""
         if self.runs:
-            return xr.concat([files.read_results(Path(x)) for x in self.runs], "variant")
+            return xr.concat([load(x) for x in self.runs], "variant")
         return super().answer(run)
 
     def _learn(self, name: str, folder: Path) -> xr.Dataset:

@@ -20,11 +20,11 @@ import jax
 import jax.numpy as jnp
 import xarray as xr
 
-from rps_jax.engines.base import ControlPeriod, Driven, Motion
+from rps_jax.engines.base import Driven
 from rps_jax.engines.mjx import MJXStage
 from rps_jax.engines.mjx_colliders import COLLIDERS, GeomType, mjx
-from rps_jax.record.options import option
-from rps_jax.runs.question import Run, call_of
+from rps_jax.physics import ControlPeriod, Motion
+from rps_jax.questions import Run, call_of, option
 from rps_jax.trials.progress import Progress
 from sweeps import programs
 from sweeps.programs import Program
@@ -120,7 +120,7 @@ class Levers(SpeedStudy[xr.Dataset]):
     The answer holds, for each lever, how many times as fast the program is with it, `times` [1].
     """
 
-    TITLE: ClassVar[str] = "What each choice for speed is worth"
+    TITLE = "What each choice for speed is worth"
     CHOICES: ClassVar = {"program": programs.BATCHED}
 
     program: str = "mjx standard"

@@ -36,8 +36,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rps_jax import errors
-from rps_jax.control.laws.rps import RPSParams
+from rps_jax import RPSParams, errors
 
 
 class Touch(NamedTuple):

@@ -11,31 +11,23 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
+from functools import cached_property, partial
 from typing import ClassVar
 
 import numpy as np
 import xarray as xr
 from scipy import optimize
 
-from rps_jax import errors
+from rps_jax import Domain, Range, Robot, Rules, Setting, errors
 from rps_jax.analysis import statistics, tables
 from rps_jax.analysis.figures.style import Figure, success_rates, tiles
-from rps_jax.analysis.report import Picture, Section
-from rps_jax.control.base import LawParams
 from rps_jax.geometry.solid import GRAVITY
-from rps_jax.record.options import option
-from rps_jax.robot.robot import Robot
-from rps_jax.robot.shell import BOARDS, HALF_WIDTH
-from rps_jax.runs.plan import Plan
-from rps_jax.runs.question import MultiLawQuestion, Run, call_of
+from rps_jax.laws import LawParams
+from rps_jax.questions import MultiLawQuestion, Picture, Plan, Run, Section, call_of, option
 from rps_jax.runs.sweep import Sweep
 from rps_jax.trials import pushes
-from rps_jax.trials.case import Case
-from rps_jax.trials.setting import Setting
-from rps_jax.trials.trial import Rules
-from rps_jax.world.domain import Domain, DomainLike, Range, parse_domain
-from sweeps.study_base import Rows, run_plans
+from rps_jax.worlds import Case, DomainLike, parse_domain
+from sweeps.study_base import PlanStudy, Rows, run_plans
 
 LOSSES = (0.01, 0.10)  # [1] of success, whose limits are looked for
 _RESAMPLES = 200  # of a bootstrap
@@ -73,10 +65,11 @@ class Limit:
 def _with_front(count: int) -> Robot:
     """Return the paper's base with `count` boards across its front, and sides in proportion."""
     return Robot(
-        boards=tuple(replace(row, count=math.ceil(row.count * count / 4)) for row in BOARDS)
+        boards=tuple(replace(row, count=math.ceil(row.count * count / 4)) for row in Robot().boards)
     )
 
 
+_HALF_WIDTH = Robot().half_width
 LIMITS = {
     "force": Limit(
         "greatest force over the object's friction with the ground [1]",
@@ -90,26 +83,28 @@ LIMITS = {
     ),
     "half_width": Limit(
         "half width of the base [m]",
-        robots={half: Robot(half_width=half) for half in (0.15, 0.2, 0.25, HALF_WIDTH, 0.35, 0.45)},
+        robots={
+            half: Robot(half_width=half) for half in (0.15, 0.2, 0.25, _HALF_WIDTH, 0.35, 0.45)
+        },
     ),
     "pitch": Limit(
         "pitch of the taxels of the front [mm]",
-        robots={1e3 * 2 * HALF_WIDTH / (3 * n): _with_front(n) for n in (8, 4, 3, 2, 1)},
+        robots={1e3 * 2 * _HALF_WIDTH / (3 * n): _with_front(n) for n in (8, 4, 3, 2, 1)},
         harms=1,
     ),
 }
 
 
 @dataclass(frozen=True)
-class Limits(MultiLawQuestion[xr.DataTree]):
+class Limits(PlanStudy[xr.DataTree], MultiLawQuestion[xr.DataTree]):
     """Tell what each limit of a robot costs a law: force, lag, acceleration, size, skin.
 
     Every robot meets the worlds that the ideal base meets. The answer is a tree: for each limit its
     `value` and the `world` (case), `success` with it and with the ideal base, `usual` (law, case).
     """
 
-    TITLE: ClassVar[str] = "What each limit costs"
-    IGNORED_FIELDS: ClassVar[tuple[str, ...]] = ("limits",)  # later calls may add limits
+    TITLE = "What each limit costs"
+    IGNORED_FIELDS = ("limits",)  # later calls may add limits
     QUICK: ClassVar = {"worlds": 64}
 
     domain: DomainLike = "wide"
@@ -128,16 +123,12 @@ class Limits(MultiLawQuestion[xr.DataTree]):
             errors.check_name("limit", name, LIMITS)
         self._plan(parse_domain(self.domain)).check_here()
 
-    def num_trials(self) -> int | None:
-        """Return the number of trials."""
-        return sum(plan.num_trials for plan in self.plans.values())
-
     def _plan(self, ranges: Domain, robot: Robot | None = None) -> Plan:
         """Return the sweep of a robot."""
         sweep = Sweep(self.chosen, ranges, self.worlds, robot=robot, setting=self.setting)
         return sweep.plan
 
-    @property
+    @cached_property
     def plans(self) -> dict[str, Plan]:
         """Sweep with the ideal base, and the sweeps of each limit: LIMIT, or LIMIT_INDEX."""
         base = parse_domain(self.domain)

@@ -10,12 +10,11 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from rps_jax.control import registry
-from rps_jax.control.base import Law
+from rps_jax import Details, Law, Observation, RPSParams, RPSState, Twist, register_law
 from rps_jax.control.laws import rps, rps_plus
-from rps_jax.control.laws.rps import RPSParams, RPSState
-from rps_jax.control.observation import Details, Observation, Twist, displacement
+from rps_jax.control.observation import displacement
 from rps_jax.geometry import planar
+from rps_jax.laws import law_of
 
 TUNED = RPSParams.tuned()
 
@@ -62,7 +61,7 @@ def step(
     params: Mended, state: MendedState, obs: Observation
 ) -> tuple[MendedState, Twist, Details]:
     """Return state, twist and details of one control step."""
-    rps_state, twist, details = rps.step_with_details(params.law, state.law, obs)
+    rps_state, twist, details = law_of(params.law).step(params.law, state.law, obs)
     contact, l = rps_state.p_robot_contact, details.l  # noqa: E741
     touching, realigning = jnp.asarray(obs.in_contact), details.realigning
     d = displacement(obs._replace(p_robot_contact=contact))
@@ -118,12 +117,10 @@ MENDS = {
     "P3 straight back after 10 s": Mended(n_lost=500, ahead=1.0),
     "P3 back and aside after 2 s": Mended(n_lost=100, ahead=0.7, aside=0.5),
     "P1 while realigning to 0.25 m": Mended(over=0.3, d_near=0.25),
-    "that, and P3 back and aside": Mended(
-        over=0.3, d_near=0.25, n_lost=100, ahead=0.7, aside=0.5
-    ),
+    "that, and P3 back and aside": Mended(over=0.3, d_near=0.25, n_lost=100, ahead=0.7, aside=0.5),
     "that, and approach at 0.03 m/s": Mended(
         TUNED._replace(v_approach=0.03), 0.25, over=0.3, n_lost=100, ahead=0.7, aside=0.5
     ),
-}  # fmt: skip
+}
 
-registry.register_law("_mended", Law(init, step), Mended())
+register_law("_mended", Law(init, step), Mended())

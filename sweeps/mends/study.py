@@ -10,25 +10,20 @@ realigns), and the first with one more addition, in the same worlds, and compare
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import ClassVar
 
 import xarray as xr
 
-from rps_jax import errors
+from rps_jax import Setting, errors
 from rps_jax.analysis import tables
-from rps_jax.analysis.report import Section
-from rps_jax.control.base import LawParams
-from rps_jax.control.registry import LawsLike
-from rps_jax.record.options import option
+from rps_jax.laws import LawParams, LawsLike
+from rps_jax.questions import Plan, Run, Section, call_of, option
 from rps_jax.runs import sweep as sweeps
-from rps_jax.runs.plan import Plan
-from rps_jax.runs.question import Run, call_of
 from rps_jax.runs.sweep import SweepQuestion
-from rps_jax.trials.setting import Setting
-from rps_jax.world.domain import DomainLike
+from rps_jax.worlds import DomainLike
 from sweeps.mends.mended import FIRST, MENDS
 
 
@@ -39,8 +34,8 @@ class Mends(SweepQuestion):
     The results hold outcomes (law, world), like those of `rps_jax.sweep`.
     """
 
-    TITLE: ClassVar[str] = "Mends of the tuned law"
-    QUICK: ClassVar[Mapping[str, object]] = {"worlds": 32}
+    TITLE = "Mends of the tuned law"
+    QUICK: ClassVar = {"worlds": 32}
 
     laws: LawsLike = ()
     """Additions, by their names in the table; by default all. The addition of comparison is always

@@ -102,8 +102,12 @@ def summary(results: xr.Dataset) -> str:
 
 def readings_table(results: xr.Dataset) -> list[list[str]]:
     """Return a row for each reading: its posterior probability by parts of the numbers, and all."""
-    columns = {"hardware": ("hardware",), "Table II and targets": ("Table II", "targets"),
-               "Fig. 6": ("Fig. 6",), "all": PARTS}  # fmt: skip
+    columns = {
+        "hardware": ("hardware",),
+        "Table II and targets": ("Table II", "targets"),
+        "Fig. 6": ("Fig. 6",),
+        "all": PARTS,
+    }
     rows = [[*(UNKNOWNS[name].label for name in _READINGS), *columns]]
     chosen = [np.array(texts(results.u.values, name)) for name in _READINGS]
     weights = [normalised(log_weights(results, parts=parts)) for parts in columns.values()]
@@ -244,15 +248,18 @@ def checks_table(results: xr.Dataset) -> list[list[str]]:
 
 
 _STATEMENTS = {
-    "Fig. 6: the right corner touches first":
-        "the sensor initially detected only the right corner, 0.2 m from the center",
+    "Fig. 6: the right corner touches first": (
+        "the sensor initially detected only the right corner, 0.2 m from the center"
+    ),
     "Fig. 6: a_r starts near its highest": "a_r started from nearly at its highest value",
-    "Fig. 6: line contact before Realignment":
-        "a line contact occurred with the side edge of the box",
-    "Fig. 6: one Realignment State":
-        "the Realignment State ... remained active until ... the center of the robot",
+    "Fig. 6: line contact before Realignment": (
+        "a line contact occurred with the side edge of the box"
+    ),
+    "Fig. 6: one Realignment State": (
+        "the Realignment State ... remained active until ... the center of the robot"
+    ),
     "Fig. 6: success": "the robot successfully pushed the object to the target",
-}  # fmt: skip
+}
 
 
 def figure_6_table(results: xr.Dataset) -> list[list[str]]:

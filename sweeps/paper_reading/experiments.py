@@ -12,22 +12,20 @@ import jax.numpy as jnp
 import numpy as np
 import xarray as xr
 
-from rps_jax.control.base import LawParams
-from rps_jax.control.laws.rps import RPSParams
-from rps_jax.robot.skin import LINE, POINT, IdealSkin
-from rps_jax.runs.question import Run
+from rps_jax import Domain, Range, RPSParams, Setting
+from rps_jax.laws import LawParams
+from rps_jax.physics import FRICTION, PHYSICS
+from rps_jax.questions import Run
+from rps_jax.robot.skin import LINE, POINT
 from rps_jax.trials import pushes
 from rps_jax.trials.batch_run import Candidates, outcomes
 from rps_jax.trials.jobs import WorldBatch
 from rps_jax.trials.progress import ProgressCallback
 from rps_jax.trials.results import trace_dataset
-from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import Outcome
 from rps_jax.world import paper, points, scene
-from rps_jax.world.domain import DOMAINS, Domain, Range
 from rps_jax.world.draws import Draw
-from rps_jax.world.physics import PHYSICS
-from rps_jax.world.scene import FRICTION
+from rps_jax.worlds import IdealSkin, parse_domain
 from sweeps.paper_reading import printed
 from sweeps.paper_reading.printed import SHORT
 from sweeps.paper_reading.unknowns import NAMES, UNKNOWNS, aps_params, params, texts, values
@@ -46,7 +44,7 @@ def _ranges(part: str) -> dict[str, Range]:
     return {
         name: unknown.range
         for name, unknown in UNKNOWNS.items()
-        if unknown.part == part and hasattr(DOMAINS["hardware"], name)
+        if unknown.part == part and hasattr(parse_domain("hardware"), name)
     }
 
 
@@ -56,7 +54,7 @@ def _by_object(prefix: str) -> Range:
 
 
 HARDWARE: Domain = replace(
-    DOMAINS["hardware"],
+    parse_domain("hardware"),
     targets=paper.HARDWARE_LAYOUTS["circle"],
     lateral=Range(-0.02, 0.02),
     yaw=Range(-0.05, 0.05),
@@ -67,7 +65,7 @@ HARDWARE: Domain = replace(
 
 def _simulated_domain(targets: tuple[Target, ...]) -> Domain:
     ranges = {quantity: UNKNOWNS[name].range for quantity, name in _SIMULATED.items()}
-    return replace(DOMAINS["paper"], targets=targets, **ranges)
+    return replace(parse_domain("paper"), targets=targets, **ranges)
 
 
 @dataclass(frozen=True, eq=False)

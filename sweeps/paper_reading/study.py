@@ -10,7 +10,7 @@ has the numbers and their likelihood, `evidence` the posterior, and `drawing` th
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import ClassVar
@@ -18,13 +18,11 @@ from typing import ClassVar
 import numpy as np
 import xarray as xr
 
-from rps_jax.analysis.report import Picture
-from rps_jax.record.options import option
-from rps_jax.runs.question import Run, call_of
+from rps_jax import Setting
+from rps_jax.physics import PHYSICS
+from rps_jax.questions import Picture, Run, call_of, option
 from rps_jax.trials.progress import SequentialProgress
-from rps_jax.trials.setting import Setting
 from rps_jax.world import paper
-from rps_jax.world.physics import PHYSICS
 from sweeps.paper_reading import drawing, evidence, experiments, printed
 from sweeps.paper_reading.experiments import Target
 from sweeps.paper_reading.unknowns import Proposal, redraw_hardware
@@ -43,11 +41,15 @@ class PaperReading(TrialStudy[xr.Dataset]):
     (engine, repeat, number), and its Fig. 6 over time.
     """
 
-    TITLE: ClassVar[str] = "Which reading of the paper gives its numbers"
-    QUICK: ClassVar[Mapping[str, object]] = {
-        "draws": 2, "rounds": 1, "samples": 2, "first": 4, "repeats": 1,
+    TITLE = "Which reading of the paper gives its numbers"
+    QUICK: ClassVar = {
+        "draws": 2,
+        "rounds": 1,
+        "samples": 2,
+        "first": 4,
+        "repeats": 1,
         "targets": paper.FEW_TARGETS,
-    }  # fmt: skip
+    }
     PRESETS: ClassVar = {"physics": PHYSICS, "laws": paper.LAWS}
 
     draws: int = option(450, 2, 100_000)
@@ -124,19 +126,35 @@ class PaperReading(TrialStudy[xr.Dataset]):
     def report_tables(self, results: xr.Dataset) -> Sequence[Table]:
         """Return posterior, predictions, the closest draw and its Fig. 6."""
         return [
-            Table(evidence.readings_table(results), name="reading_evidence",
-                  title="Evidence for each reading"),
-            Table(evidence.unknowns_table(results), name="reading_posterior", title="Posterior",
-                  picture=Picture("posterior", partial(drawing.posterior, results))),
-            Table(evidence.numbers_table(results), name="reading_numbers",
-                  title="Printed numbers and their predictions",
-                  picture=Picture("predictions", partial(drawing.predictions, results))),
-            Table(evidence.checks_table(results), name="reading_checks",
-                  title="The closest draw again, in two engines"),
-            Table(evidence.figure_6_table(results), name="reading_figure_6",
-                  title="Fig. 6, point by point",
-                  picture=Picture("figure_6", partial(drawing.figure_6, results))),
-        ]  # fmt: skip
+            Table(
+                evidence.readings_table(results),
+                name="reading_evidence",
+                title="Evidence for each reading",
+            ),
+            Table(
+                evidence.unknowns_table(results),
+                name="reading_posterior",
+                title="Posterior",
+                picture=Picture("posterior", partial(drawing.posterior, results)),
+            ),
+            Table(
+                evidence.numbers_table(results),
+                name="reading_numbers",
+                title="Printed numbers and their predictions",
+                picture=Picture("predictions", partial(drawing.predictions, results)),
+            ),
+            Table(
+                evidence.checks_table(results),
+                name="reading_checks",
+                title="The closest draw again, in two engines",
+            ),
+            Table(
+                evidence.figure_6_table(results),
+                name="reading_figure_6",
+                title="Fig. 6, point by point",
+                picture=Picture("figure_6", partial(drawing.figure_6, results)),
+            ),
+        ]
 
 
 paper_reading = call_of(PaperReading)

@@ -11,9 +11,8 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
+from rps_jax import Range, RPSParams
 from rps_jax.control.laws.aps import APSParams
-from rps_jax.control.laws.rps import RPSParams
-from rps_jax.world.domain import Range
 
 Part = Literal["text", "hardware", "simulation"]
 

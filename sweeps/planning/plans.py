@@ -20,12 +20,11 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
-from rps_jax.control.observation import Twist
+from rps_jax import Twist
 from rps_jax.engines import native
-from rps_jax.engines.base import ControlPeriod, Motion
 from rps_jax.geometry import planar
+from rps_jax.physics import ControlPeriod, Motion, Physics
 from rps_jax.trials.trial import object_pose
-from rps_jax.world.physics import Physics
 
 KNOTS = 10
 LIMITS = np.array([0.05, 0.05, 0.15])  # [m/s, m/s, rad/s] of each component of a twist

@@ -21,24 +21,19 @@ import jax.numpy as jnp
 import numpy as np
 import xarray as xr
 
-from rps_jax import engines
+from rps_jax import Domain, Range, Setting
 from rps_jax.analysis.figures.style import Figure, base_patch, tiles, words
-from rps_jax.analysis.report import Picture
-from rps_jax.engines import EngineName
-from rps_jax.engines.base import Motion
-from rps_jax.record.options import option
-from rps_jax.runs.question import Run, call_of
-from rps_jax.trials.setting import Setting
+from rps_jax.physics import PHYSICS, EngineName, Motion, get_engine
+from rps_jax.questions import Picture, Run, call_of, option
 from rps_jax.trials.trial import World, object_pose
 from rps_jax.trials.worlds import drawn_worlds
 from rps_jax.world import draws
-from rps_jax.world.domain import DOMAINS, RANDOM, Domain, Range
-from rps_jax.world.physics import PHYSICS
+from rps_jax.worlds import parse_domain
 from sweeps.planning import plans
 from sweeps.planning.plans import KNOTS, METHODS, Method, Problem, Simulator
-from sweeps.study_base import QuickStudy, Rows, Table
+from sweeps.study_base import RANDOM_OBJECTS, QuickStudy, Rows, Table
 
-TOUCHING = replace(DOMAINS["wide"], gap=Range(0, 0))
+TOUCHING = replace(parse_domain("wide"), gap=Range(0, 0))
 # All that the model of the second table does not know has one value.
 _NOMINAL = {
     "com_offset": Range(0, 0),
@@ -63,13 +58,13 @@ class Planning(QuickStudy[xr.Dataset]):
     (case, push) and `replanned` (case, method, push) are 1 if a push ends at its target.
     """
 
-    TITLE: ClassVar[str] = "Plans of pushes to a pose"
+    TITLE = "Plans of pushes to a pose"
     QUICK: ClassVar = {"objects": ("random_box",), "horizons": (5.0,), "pushes": 8, "budget": 0.02}
-    CHOICES: ClassVar = {"objects": RANDOM, "methods": METHODS}
-    DIMENSION: ClassVar[str] = "case"
+    CHOICES: ClassVar = {"objects": RANDOM_OBJECTS, "methods": METHODS}
+    DIMENSION = "case"
     PRESETS: ClassVar = {"physics": PHYSICS["default"]}
 
-    objects: tuple[str, ...] = tuple(RANDOM)
+    objects: tuple[str, ...] = RANDOM_OBJECTS
     """Objects to push: random_box, random_cylinder and random_prism."""
     horizons: tuple[float, ...] = option((5.0, 20.0), 0.2, 60, unit="s")
     """Durations of the pushes [s]."""
@@ -88,7 +83,7 @@ class Planning(QuickStudy[xr.Dataset]):
     def check(self) -> None:
         """Check the names, and that the engine has derivatives."""
         super().check()
-        engines.get(self.engine).check_derivatives("reverse")
+        get_engine(self.engine).check_derivatives("reverse")
 
     def parts(self, run: Run) -> Mapping[str, Any]:
         """Return the function that computes each case."""

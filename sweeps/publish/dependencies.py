@@ -26,7 +26,7 @@ import xarray as xr
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
-from rps_jax.runs.question import Run, call_of
+from rps_jax.questions import Run, call_of
 from sweeps.study_base import Rows, Study, Table, run_parts, run_process
 
 ROOT = Path(__file__).parents[2]
@@ -78,10 +78,10 @@ class Dependencies(Study[xr.Dataset]):
     the packages of the core, and those that each extra adds. Size 0: not installed.
     """
 
-    TITLE: ClassVar[str] = "Packages of the dependencies"
+    TITLE = "Packages of the dependencies"
     CHOICES: ClassVar = {"extras": EXTRAS}
-    GROWS: ClassVar[tuple[str, ...]] = ("extras",)
-    RESULTS: ClassVar[str] = "../results"
+    GROWS = ("extras",)
+    RESULTS = "../results"
 
     extras: tuple[str, ...] = tuple(EXTRAS)
     """Extras to measure; by default all."""

@@ -79,14 +79,21 @@ _REAL = "rps sweep --domain real --worlds 4096 --seed 11 --laws rps rps_tuned"
 _LEARNED = _each(
     "rps sweep --domain {0} --worlds 10000 --seed 5301 "
     "--laws rps_plus sweeps/learned/learned_gru.npz learned --out runs/learned_{0}",
-    *(*_WIDE, "real"),
+    *_WIDE,
+    "real",
 )
 _VARIANTS = tuple(
     f"rps sweeps/learned/variants.py --variants '{name}' --minutes 4.5 --out runs/variant_{i}"
     for i, name in enumerate(
         (
-            *("warm", "hard domains", "long credit", "4,096 worlds"),
-            *("scratch", "uniform worlds", "reward of 0.2.0", "with tasks"),
+            "warm",
+            "hard domains",
+            "long credit",
+            "4,096 worlds",
+            "scratch",
+            "uniform worlds",
+            "reward of 0.2.0",
+            "with tasks",
         )
     )
 )

@@ -9,12 +9,11 @@ from pathlib import Path
 import numpy as np
 import xarray as xr
 
+from rps_jax import Robot, Rules
 from rps_jax.analysis import statistics, tables
 from rps_jax.geometry.solid import GRAVITY
-from rps_jax.robot.robot import Robot
 from rps_jax.studies import rare, sensitivity
 from rps_jax.studies.attack import yields
-from rps_jax.trials.trial import Rules
 from sweeps.study_base import Rows
 
 _MAX_LOST = float(Rules().max_lost)  # [s] in all published commands
@@ -24,8 +23,16 @@ def by_bearing(results: xr.Dataset) -> Rows:
     """Return a header and one row per law of a ladder: success by the bearing of the target."""
     limits, bearing = (0.0, 0.3, 0.8, 1.6, np.inf), np.abs(results.bearing.values)
     masks = [(bearing >= low) & (bearing < high) for low, high in itertools.pairwise(limits)]
-    rows = [["law", "senses", "target within 0.3 rad of ahead", "0.3 to 0.8 rad", "0.8 to 1.6 rad",
-             "beside and behind, above 1.6 rad"]]  # fmt: skip
+    rows = [
+        [
+            "law",
+            "senses",
+            "target within 0.3 rad of ahead",
+            "0.3 to 0.8 rad",
+            "0.8 to 1.6 rad",
+            "beside and behind, above 1.6 rad",
+        ]
+    ]
     mean = results.success.mean("world")
     for law in sorted(map(str, results.law.values), key=lambda name: -float(mean.sel(law=name))):
         outcomes = results.sel(law=law)
@@ -39,15 +46,31 @@ def attack_table(results: xr.Dataset) -> Rows:
     per_hour, repeated = yields(results), np.isfinite(results.again.values)
     failed_again = int((results.again.values == 1).sum())
     return [
-        ["", "trials", "simulated [h]", "cells with a failure", "such cells for each simulated "
-         "hour", "elites that fail again in converged C MuJoCo"],
-        ["search", f"{int(results.trials[-1]):,}", f"{float(results.simulated[-1]) / 3600:.1f}",
-         str(int(results.failing[-1])), f"{per_hour['search']:.2g}",
-         f"{failed_again} of {int(repeated.sum())}"],
-        ["drawn worlds", f"{results.attrs['drawn_trials']:,}",
-         f"{results.attrs['drawn_simulated'] / 3600:.1f}", str(results.attrs["drawn_failing"]),
-         f"{per_hour['drawn']:.2g}", ""],
-    ]  # fmt: skip
+        [
+            "",
+            "trials",
+            "simulated [h]",
+            "cells with a failure",
+            "such cells for each simulated hour",
+            "elites that fail again in converged C MuJoCo",
+        ],
+        [
+            "search",
+            f"{int(results.trials[-1]):,}",
+            f"{float(results.simulated[-1]) / 3600:.1f}",
+            str(int(results.failing[-1])),
+            f"{per_hour['search']:.2g}",
+            f"{failed_again} of {int(repeated.sum())}",
+        ],
+        [
+            "drawn worlds",
+            f"{results.attrs['drawn_trials']:,}",
+            f"{results.attrs['drawn_simulated'] / 3600:.1f}",
+            str(results.attrs["drawn_failing"]),
+            f"{per_hour['drawn']:.2g}",
+            "",
+        ],
+    ]
 
 
 def comparison(results: object) -> Rows:
@@ -89,8 +112,13 @@ _FAILURES = (
     "contact not felt",
 )
 _HEADER = (
-    *("law", "success", "by object [%]", "median time", ", ".join(_FAILURES)),
-    *("gained, lost", "p"),
+    "law",
+    "success",
+    "by object [%]",
+    "median time",
+    ", ".join(_FAILURES),
+    "gained, lost",
+    "p",
 )
 
 

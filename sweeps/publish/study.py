@@ -19,16 +19,14 @@ import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar, Literal
+from typing import Any, Literal
 
 import xarray as xr
 
-from rps_jax import errors
-from rps_jax.analysis.report import Section
+from rps_jax import InputError, errors
 from rps_jax.app.cli import flags, names
-from rps_jax.errors import InputError
+from rps_jax.questions import Run, Section, call_of
 from rps_jax.record import provenance
-from rps_jax.runs.question import Run, call_of
 from sweeps import probes
 from sweeps.publish.recipes import HISTORY, RECIPES, Recipe
 from sweeps.render_tables import STALE
@@ -54,8 +52,8 @@ class Publish(Study[xr.Dataset]):
     The results hold version, commit, date, state and duration (file), in words.
     """
 
-    TITLE: ClassVar[str] = "Published numbers and their dependencies"
-    GROWS: ClassVar[tuple[str, ...]] = ("only", "needs", "check_probes")
+    TITLE = "Published numbers and their dependencies"
+    GROWS = ("only", "needs", "check_probes")
 
     only: tuple[str, ...] = ()
     """Data files to compute again, as fit_coverage or fit_*; by default none. With --check-probes,

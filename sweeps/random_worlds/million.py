@@ -19,15 +19,12 @@ from typing import ClassVar
 import numpy as np
 import xarray as xr
 
+from rps_jax import Setting
 from rps_jax.analysis import statistics, tables
 from rps_jax.control import registry
+from rps_jax.questions import Plan, Run, call_of, option
 from rps_jax.record import files
-from rps_jax.record.options import option
-from rps_jax.runs.plan import Plan
-from rps_jax.runs.question import Run, call_of
-from rps_jax.trials.setting import Setting
-from rps_jax.world import domain as domains
-from rps_jax.world.domain import DomainLike
+from rps_jax.worlds import DomainLike, parse_domain
 from sweeps.study_base import Rows, Table, TrialStudy, run_parts, run_plans
 
 ENDS = ("success", *statistics.FAILURES)  # `how` is an index into these
@@ -47,9 +44,9 @@ class Million(TrialStudy[xr.Dataset]):
     The results hold `success` (law, byte), `how`, `steps` and `missed` (law, world).
     """
 
-    TITLE: ClassVar[str] = "A million outcomes"
+    TITLE = "A million outcomes"
     QUICK: ClassVar = {"worlds": 64}
-    GROWS: ClassVar[tuple[str, ...]] = ("laws",)
+    GROWS = ("laws",)
 
     laws: tuple[str, ...] = ("rps_tuned", "rps_plus", "learned")
     """Laws to run in the same worlds."""
@@ -62,7 +59,7 @@ class Million(TrialStudy[xr.Dataset]):
     def check(self) -> None:
         """Check that the laws and the domain exist."""
         registry.resolve_laws(self.laws)
-        domains.parse_domain(self.domain)
+        parse_domain(self.domain)
 
     def num_trials(self) -> int | None:
         """Return the number of trials."""
@@ -80,7 +77,7 @@ class Million(TrialStudy[xr.Dataset]):
         for name, long_name in _LONG_NAMES.items():
             results[name].attrs["long_name"] = long_name
         results.attrs = {
-            "objects": " ".join(domains.parse_domain(self.domain).objects),
+            "objects": " ".join(parse_domain(self.domain).objects),
             "control_period": self.setting.physics.control_period,
             "max_lost": float(self.setting.rules.max_lost),
         }
@@ -102,7 +99,7 @@ class Million(TrialStudy[xr.Dataset]):
     def _outcomes(self, law: str, run: Run) -> xr.Dataset:
         """Return the outcomes of one law in compact types."""
         laws = registry.resolve_laws([law])
-        plan = Plan(domains.parse_domain(self.domain), self.worlds, laws, self.test_setting, 16_384)
+        plan = Plan(parse_domain(self.domain), self.worlds, laws, self.test_setting, 16_384)
         (outcomes,) = run_plans(run, {f"sweep_{law}": plan}).values()
         outcomes = outcomes.isel(law=0)
         how = 1 + statistics.failure_modes(outcomes, float(self.setting.rules.max_lost))

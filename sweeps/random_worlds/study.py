@@ -18,14 +18,12 @@ from typing import Any, ClassVar
 import numpy as np
 import xarray as xr
 
+from rps_jax import Setting
 from rps_jax.analysis import statistics, tables
 from rps_jax.control import registry
-from rps_jax.record.options import option
+from rps_jax.questions import Plan, Run, call_of, option
 from rps_jax.runs import execution, model_panel
-from rps_jax.runs.plan import Plan
-from rps_jax.runs.question import Run, call_of
-from rps_jax.trials.setting import Setting
-from rps_jax.world import domain as domains
+from rps_jax.worlds import parse_domain
 from sweeps.study_base import Rows, Table, TrialStudy, stored_parts
 
 IN_C = "C MuJoCo, this ground, 10 ms"
@@ -39,9 +37,9 @@ class RandomWorlds(TrialStudy[xr.Dataset]):
     a model did not run.
     """
 
-    TITLE: ClassVar[str] = "Four laws in random worlds"
-    QUICK: ClassVar[Mapping[str, object]] = {"worlds": 24, "panel": 0, "in_c": 0}
-    GROWS: ClassVar[tuple[str, ...]] = (
+    TITLE = "Four laws in random worlds"
+    QUICK: ClassVar = {"worlds": 24, "panel": 0, "in_c": 0}
+    GROWS = (
         "against",
         "domains",
         "panel",
@@ -73,7 +71,7 @@ class RandomWorlds(TrialStudy[xr.Dataset]):
         """Check that the laws and the domains exist."""
         registry.resolve_laws(self.laws)
         for name in self.domains:
-            domains.parse_domain(name)
+            parse_domain(name)
 
     def answer(self, run: Run) -> xr.Dataset:
         """Run the models that are missing in each domain."""
@@ -91,7 +89,7 @@ class RandomWorlds(TrialStudy[xr.Dataset]):
     def plans(self, name: str) -> dict[str, Plan]:
         """Return the plan of each model in a domain, the default model first."""
         laws = registry.resolve_laws(self.laws)
-        plan = Plan(domains.parse_domain(name), self.worlds, laws, self.setting, 4096)
+        plan = Plan(parse_domain(name), self.worlds, laws, self.setting, 4096)
         plans = {model_panel.REQUESTED: plan}
         if self.panel:
             small = replace(plan, worlds=min(self.panel, self.worlds))

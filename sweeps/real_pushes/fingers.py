@@ -23,7 +23,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rps_jax.errors import InputError
+from rps_jax import InputError
 from rps_jax.geometry.solid import mean_arm, rotate, supported_load
 
 SLIP = 1e-3  # slip, as a share of a step, above which friction is dry

@@ -22,12 +22,11 @@ import pandas as pd
 import xarray as xr
 from scipy.optimize import least_squares
 
-from rps_jax.record.options import option
-from rps_jax.runs.question import Run, call_of
+from rps_jax.questions import Run, call_of, option
 from rps_jax.tuning import posterior
 from sweeps.real_pushes import pushes, study
 from sweeps.real_pushes.problem import HIGH, LOW, QUANTITIES, Cell
-from sweeps.study_base import QuickStudy, Table, text_table
+from sweeps.study_base import Parts, QuickStudy, Table, text_table
 
 GROUPS = ("point, three feet", "two-point, three feet", "point, flat", "two-point, flat")
 _PRIOR = np.sqrt(12)  # inverse standard deviation in the unit cube
@@ -103,10 +102,11 @@ def descend(cell: Cell, worlds: int) -> Fitted:
 
     options: dict[str, Any] = {"jac": slopes, "bounds": (0, 1), "loss": "soft_l1"}
     fits = [
-        least_squares(values, np.array([x, 0.5, 0.5, 0.5]), xtol=1e-3, ftol=1e-3, max_nfev=12,
-                      **options)
+        least_squares(
+            values, np.array([x, 0.5, 0.5, 0.5]), xtol=1e-3, ftol=1e-3, max_nfev=12, **options
+        )
         for x in _STARTS
-    ]  # fmt: skip
+    ]
     best = min(fits, key=lambda fit: fit.cost)
     return _laplace(cell, best.x, sum(fit.nfev + fit.njev for fit in fits))
 
@@ -124,8 +124,11 @@ def _laplace(cell: Cell, x: np.ndarray, simulations: int) -> Fitted:
 
 
 METHODS: Mapping[str, Callable[[Cell, int], Fitted]] = {
-    "scan of one friction": scan, "networks": learn, "CMA-ES": evolve, "least squares": descend,
-}  # fmt: skip
+    "scan of one friction": scan,
+    "networks": learn,
+    "CMA-ES": evolve,
+    "least squares": descend,
+}
 
 
 def known(cell: Cell) -> np.ndarray:
@@ -147,11 +150,11 @@ class Real(QuickStudy[xr.Dataset]):
     the 90 % intervals; by method, cell and half, the quantities and their standard deviations.
     """
 
-    TITLE: ClassVar[str] = "Friction and centre of pressure of real pushes"
+    TITLE = "Friction and centre of pressure of real pushes"
     CHOICES: ClassVar = {"groups": GROUPS}
-    GROWS: ClassVar[tuple[str, ...]] = ("groups",)
-    DIMENSION: ClassVar[str] = "cell"
-    QUICK: ClassVar[Mapping[str, object]] = {"few": 6, "worlds": 32, "cells": 1}
+    GROWS = ("groups",)
+    DIMENSION = "cell"
+    QUICK: ClassVar = {"few": 6, "worlds": 32, "cells": 1}
 
     few: int = option(12, 6, 1000)
     """Greatest number of pushes of each half of a cell."""
@@ -176,7 +179,7 @@ class Real(QuickStudy[xr.Dataset]):
         }
         return dict(list(cells.items())[: self.cells])
 
-    def parts(self, run: Run) -> Mapping[str, Callable[[], xr.Dataset]]:
+    def parts(self, run: Run) -> Parts:
         """Return the function that fits the pushes of each cell."""
         return {label: partial(self._fit, rows) for label, rows in self.tables.items()}
 
@@ -214,9 +217,14 @@ class Real(QuickStudy[xr.Dataset]):
             "known": known(test),
         }
         return xr.Dataset(
-            {**padded, **{k: ("quantity", x) for k, x in values.items()}, "seconds": seconds,
-             "simulated": fitted.simulated}, {"quantity": list(QUANTITIES)},
-        )  # fmt: skip
+            {
+                **padded,
+                **{k: ("quantity", x) for k, x in values.items()},
+                "seconds": seconds,
+                "simulated": fitted.simulated,
+            },
+            {"quantity": list(QUANTITIES)},
+        )
 
     def report_tables(self, results: xr.Dataset) -> Sequence[Table]:
         """Return errors by group of pushes, and quantities by method."""
@@ -233,17 +241,28 @@ class Real(QuickStudy[xr.Dataset]):
 real = call_of(Real)
 
 _ERRORS = {
-    "pushes": "{group}", "method": "{method}", "predicted": "{count}",
-    "place": "{place:.2f} mm", "turn": "{turn:.2f}°", "both": "{both:.2f} mm",
-    "both, 90 %": "{most:.1f} mm", "90 % intervals hold the pose": "{covered:.0f} %",
-    "processor seconds a fit": "{seconds:.1f}", "simulated pushes a fit": "{simulated:,.0f}",
-}  # fmt: skip
+    "pushes": "{group}",
+    "method": "{method}",
+    "predicted": "{count}",
+    "place": "{place:.2f} mm",
+    "turn": "{turn:.2f}°",
+    "both": "{both:.2f} mm",
+    "both, 90 %": "{most:.1f} mm",
+    "90 % intervals hold the pose": "{covered:.0f} %",
+    "processor seconds a fit": "{seconds:.1f}",
+    "simulated pushes a fit": "{simulated:,.0f}",
+}
 _FITTED = {
-    "quantity": "{quantity}", "method": "{method}", "cells": "{cells}", "median": "{median:.3g}",
-    "standard deviation": "{deviation:.2g}", "difference of halves": "{apart:.2g}",
-    "90 % intervals hold it": "{holds:.0f} %", "difference from the known value": "{off:.2g}",
+    "quantity": "{quantity}",
+    "method": "{method}",
+    "cells": "{cells}",
+    "median": "{median:.3g}",
+    "standard deviation": "{deviation:.2g}",
+    "difference of halves": "{apart:.2g}",
+    "90 % intervals hold it": "{holds:.0f} %",
+    "difference from the known value": "{off:.2g}",
     "90 % intervals hold the known value": "{holds_known:.0f} %",
-}  # fmt: skip
+}
 
 
 def _error_rows(results: xr.Dataset) -> Iterator[dict[str, object]]:

@@ -80,8 +80,16 @@ class Cell(NamedTuple):
         shift = theta[1] * pushes.PUSHED_AT * rotate(-yaw, force).reshape(-1, 2)
         all_at = np.broadcast_to(at, (len(shift), *at.shape))
         load = supported_load(all_at, np.ones(all_at.shape[:2]), shift).reshape(*yaw.shape, -1)
-        steps = (start, self.paths[1:], twist, length[..., 0], nearest, outward,
-                 (gap > 1e-9) & (to_corner < 1e-9), load > 0)  # fmt: skip
+        steps = (
+            start,
+            self.paths[1:],
+            twist,
+            length[..., 0],
+            nearest,
+            outward,
+            (gap > 1e-9) & (to_corner < 1e-9),
+            load > 0,
+        )
         with jax.enable_x64(True):
             by_push = [np.swapaxes(x, 0, 1) for x in steps]
             j = np.array(_jacobians(theta, self.feet, pose[0], by_push))

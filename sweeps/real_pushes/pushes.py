@@ -14,8 +14,7 @@ import numpy as np
 import pandas as pd
 import xarray as xr
 
-from rps_jax import errors
-from rps_jax.errors import InputError
+from rps_jax import InputError, errors
 from rps_jax.geometry.solid import rotate
 from sweeps.real_pushes import fingers
 from sweeps.real_pushes.fingers import Ground
@@ -39,9 +38,16 @@ POSE = ("x", "y", "yaw")
 _NEEDED = {
     "point": ("tip_x0", "tip_y0", "tip_x1", "tip_y1"),
     "two_point_translation": ("tip_x0", "tip_y0", "tip_x1", "tip_y1", "edge"),
-    "two_point_rotation": ("cor_bx", "cor_by", "commanded", "close", "point_bx", "point_by",
-                           "edge"),
-}  # fmt: skip
+    "two_point_rotation": (
+        "cor_bx",
+        "cor_by",
+        "commanded",
+        "close",
+        "point_bx",
+        "point_by",
+        "edge",
+    ),
+}
 
 
 def read(table: PushTable | None = None) -> pd.DataFrame:

@@ -23,11 +23,8 @@ import pandas as pd
 import xarray as xr
 from scipy.stats import t as t_distribution
 
-from rps_jax.analysis.report import Picture
-from rps_jax.record import files
-from rps_jax.record.options import option
-from rps_jax.runs.question import Run, call_of
-from rps_jax.world.physics import PHYSICS
+from rps_jax.physics import PHYSICS
+from rps_jax.questions import Picture, Run, call_of, option
 from sweeps.real_pushes import contact, pushes
 from sweeps.real_pushes.drawing import figure
 from sweeps.real_pushes.pushes import Errors
@@ -125,9 +122,9 @@ class RealPushes(QuickStudy[xr.Dataset]):
     did not run, those `measured`, and the errors `place` [m], `turn` [rad] and `both` [m].
     """
 
-    TITLE: ClassVar[str] = "Does the physics predict real pushes?"
+    TITLE = "Does the physics predict real pushes?"
     CHOICES: ClassVar = {"models": WORDS}
-    QUICK: ClassVar[Mapping[str, object]] = {"few": 60, "mujoco": 6}
+    QUICK: ClassVar = {"few": 60, "mujoco": 6}
     PRESETS: ClassVar = PHYSICS["default"]
 
     pushes: Path | None = None
@@ -204,7 +201,7 @@ class RealPushes(QuickStudy[xr.Dataset]):
         if friction is not None:
             results = results.merge(friction)
         if run.folder is not None:
-            files.write_text(run.folder / "predictions.csv", _csv(results))
+            (run.folder / "predictions.csv").write_text(_csv(results), encoding="utf-8")
         return results
 
     def _fitted(self, run: Run) -> xr.Dataset:
@@ -327,10 +324,15 @@ _MEDIANS = {
 }
 _PUSHES, _MODEL = _column("pushes", merge=True), _column("model")
 _COLUMNS = [
-    *(_PUSHES, _MODEL, _NUMBER),
-    *(_MEDIANS["place"], _column("90 %", "{:.1f} mm")),
-    *(_MEDIANS["turn"], _column("90 %", "{:.1f}°")),
-    *(_MEDIANS["both"], _column("90 %", "{:.1f} mm")),
+    _PUSHES,
+    _MODEL,
+    _NUMBER,
+    _MEDIANS["place"],
+    _column("90 %", "{:.1f} mm"),
+    _MEDIANS["turn"],
+    _column("90 %", "{:.1f}°"),
+    _MEDIANS["both"],
+    _column("90 %", "{:.1f} mm"),
 ]
 _FRICTION_COLUMNS = [
     _column("pusher", merge=True),
@@ -343,25 +345,31 @@ _FRICTION_COLUMNS = [
 _LAYOUT_COLUMNS = [
     _PUSHES,
     _column("feet that nothing was fitted on"),
-    *(_MODEL, _NUMBER),
+    _MODEL,
+    _NUMBER,
     _column("friction, fitted on other feet", "{:.2f}"),
     *_COLUMNS[3:],
     _column("both, fitted on these feet", "{:.2f} mm"),
 ]
 _NEW = "of a new series"
 _SERIES_COLUMNS = [
-    *(_PUSHES, _MODEL, _NUMBER),
+    _PUSHES,
+    _MODEL,
+    _NUMBER,
     _column("series", "{:d}"),
-    *(_MEDIANS["place"], _column(_NEW, "{:.2f}", " to {:.2f} mm")),
-    *(_MEDIANS["turn"], _column(_NEW, "{:.2f}", " to {:.2f}°")),
-    *(_MEDIANS["both"], _column(_NEW, "{:.2f}", " to {:.2f} mm")),
-    *(
-        _column("both, 90 %", "{:.1f} mm", " [{:.1f}, {:.1f}]"),
-        _column(_NEW, "{:.1f}", " to {:.1f} mm"),
-    ),
+    _MEDIANS["place"],
+    _column(_NEW, "{:.2f}", " to {:.2f} mm"),
+    _MEDIANS["turn"],
+    _column(_NEW, "{:.2f}", " to {:.2f}°"),
+    _MEDIANS["both"],
+    _column(_NEW, "{:.2f}", " to {:.2f} mm"),
+    _column("both, 90 %", "{:.1f} mm", " [{:.1f}, {:.1f}]"),
+    _column(_NEW, "{:.1f}", " to {:.1f} mm"),
 ]
 _HEADING_COLUMNS = [
-    *(_PUSHES, _column("pushed edge"), _NUMBER),
+    _PUSHES,
+    _column("pushed edge"),
+    _NUMBER,
     _column("predicted heading minus measured", "{:+.2f}°", " [{:+.2f}, {:+.2f}]"),
     _column("turn", "{:.2f}°"),
     _column("turn without the offset of all", "{:.2f}°"),
@@ -442,8 +450,12 @@ def _friction_rows(results: xr.Dataset) -> Iterator[list[Any]]:
             near = tried[off <= np.nanmin(off) + 0.1]
             mu = float(results.friction.sel(fitted=model, finger_kind=name))
             other_half = _errors(results, model, clear & (finger == name)).both
-            cells = [mu, float(np.nanmin(off)), [float(near.min()), float(near.max())],
-                     [1e3 * x for x in median_interval(other_half)]]  # fmt: skip
+            cells = [
+                mu,
+                float(np.nanmin(off)),
+                [float(near.min()), float(near.max())],
+                [1e3 * x for x in median_interval(other_half)],
+            ]
             yield [name, WORDS[model], *_rounded(cells)]
 
 
@@ -491,8 +503,9 @@ def _series_rows(results: xr.Dataset, validated: pd.DataFrame) -> Iterator[list[
         ["group", "model"], sort=False
     ):
         group, model = rows[["group", "model"]].iloc[0]
-        series = [[_errors_in(x) for _, x in part.groupby("series")]
-                  for _, part in rows.groupby("layout")]  # fmt: skip
+        series = [
+            [_errors_in(x) for _, x in part.groupby("series")] for _, part in rows.groupby("layout")
+        ]
         limits = np.quantile([_summary(x) for x in _resampled(series)], [0.025, 0.975], axis=0)
         new = new_interval([_summary(x) for part in series for x in part if len(x) >= _SERIES])
         cells: list[Any] = []

@@ -7,33 +7,31 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import ClassVar
 
 import numpy as np
 import xarray as xr
 
+from rps_jax import Setting
 from rps_jax.analysis import statistics, tables
-from rps_jax.analysis.report import Section
-from rps_jax.control.registry import LawsLike
-from rps_jax.record.options import option
-from rps_jax.runs.plan import Plan
-from rps_jax.runs.question import MultiLawQuestion, Run, call_of
+from rps_jax.laws import LawsLike
+from rps_jax.questions import MultiLawQuestion, Plan, Run, Section, call_of, option
 from rps_jax.runs.sweep import Sweep
-from rps_jax.trials.setting import Setting
-from rps_jax.world.domain import DomainLike
-from sweeps.study_base import Rows, run_plans
+from rps_jax.worlds import DomainLike
+from sweeps.study_base import PlanStudy, Rows, run_plans
 
 BASES = {"flat": "ideal", "round": "round"}  # robots, 0.58 m wide
 
 
 @dataclass(frozen=True)
-class RoundBase(MultiLawQuestion[xr.Dataset]):
+class RoundBase(PlanStudy[xr.Dataset], MultiLawQuestion[xr.Dataset]):
     """Compare a flat and a round base of equal width, in equal worlds.
 
     The results hold `success` and `time` (base, law, world).
     """
 
-    TITLE: ClassVar[str] = "Flat and round bases"
+    TITLE = "Flat and round bases"
     QUICK: ClassVar = {"worlds": 32}
 
     laws: LawsLike = ("rps", "rps_tuned", "aps", "dipole", "force_push")
@@ -44,7 +42,7 @@ class RoundBase(MultiLawQuestion[xr.Dataset]):
     """Number of worlds."""
     setting: Setting = field(default=Setting(seed=11), kw_only=True)
 
-    @property
+    @cached_property
     def plans(self) -> dict[str, Plan]:
         """The sweep of each base."""
         return {
@@ -53,15 +51,6 @@ class RoundBase(MultiLawQuestion[xr.Dataset]):
             ).plan
             for base, robot in BASES.items()
         }
-
-    def check(self) -> None:
-        """Check that the engine can step these worlds here."""
-        for plan in self.plans.values():
-            plan.check_here()
-
-    def num_trials(self) -> int | None:
-        """Return the number of trials."""
-        return len(BASES) * len(self.chosen) * self.worlds
 
     def answer(self, run: Run) -> xr.Dataset:
         """Sweep with both bases."""

@@ -24,11 +24,10 @@ import mujoco
 import numpy as np
 import xarray as xr
 
-from rps_jax.record.options import option
-from rps_jax.runs.question import Run, call_of
+from rps_jax.physics import preset
+from rps_jax.questions import Run, call_of, option
 from rps_jax.trials.progress import Progress
 from rps_jax.world import scene
-from rps_jax.world.physics import preset
 from sweeps.speed import racers
 from sweeps.speed.racers import ON_CORES, RACERS
 from sweeps.study_base import (
@@ -76,16 +75,16 @@ class Arena(SpeedStudy[xr.Dataset], QuickStudy[xr.Dataset]):
     has no rate.
     """
 
-    TITLE: ClassVar[str] = "Engines on one scene"
+    TITLE = "Engines on one scene"
     CHOICES: ClassVar = {"names": RACERS}
-    QUICK: ClassVar[Mapping[str, object]] = {
+    QUICK: ClassVar = {
         "names": ("C MuJoCo, rollout", "fused"),
         "worlds": (8,),
         "starts": 4,
         "seconds": 0.5,
         "step": 1e-3,
     }
-    GROWS: ClassVar[tuple[str, ...]] = ("names", "worlds", "peers", "limit")
+    GROWS = ("names", "worlds", "peers", "limit")
 
     names: tuple[str, ...] = tuple(RACERS)
     """Engines to run; by default all."""
@@ -291,11 +290,17 @@ def _row(process: _Process, output: Mapping[str, Any], truth: np.ndarray) -> xr.
         true = truth[np.arange(len(poses)) % len(truth)]
         error = np.linalg.norm(poses[:, :2] - true[:, :2], axis=1)
         turned = np.abs((_yaw(poses) - _yaw(true) + np.pi) % (2 * np.pi) - np.pi)
-    return xr.Dataset({
-        **{name: output[name] for name in ("version", "worlds", "rate")},
-        "error": np.median(error), "largest": np.max(error), "turned": np.median(turned),
-        "engine": process.name, "ready": process.ready, "why": process.failed,
-    })  # fmt: skip
+    return xr.Dataset(
+        {
+            **{name: output[name] for name in ("version", "worlds", "rate")},
+            "error": np.median(error),
+            "largest": np.max(error),
+            "turned": np.median(turned),
+            "engine": process.name,
+            "ready": process.ready,
+            "why": process.failed,
+        }
+    )
 
 
 def _yaw(poses: np.ndarray) -> np.ndarray:

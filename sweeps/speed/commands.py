@@ -17,18 +17,16 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import ClassVar
 
 import xarray as xr
 
-from rps_jax.errors import InputError
-from rps_jax.record.options import option
-from rps_jax.runs.question import Run, call_of
-from sweeps.study_base import SpeedStudy, Table, records, text_table
+from rps_jax import InputError
+from rps_jax.questions import Run, call_of, option
+from sweeps.study_base import Parts, SpeedStudy, Table, records, text_table
 
 TIMING = re.compile(r"compile ([\d.]+) s, run ([\d.]+) s \((\d+) simulated s per s\)")
 _COLUMNS = {
@@ -51,9 +49,9 @@ class Commands(SpeedStudy[xr.Dataset]):
     that the second one prints.
     """
 
-    TITLE: ClassVar[str] = "Duration of whole commands"
-    DIMENSION: ClassVar[str] = "command"
-    GROWS: ClassVar[tuple[str, ...]] = ("commands", "warm", "gpus")
+    TITLE = "Duration of whole commands"
+    DIMENSION = "command"
+    GROWS = ("commands", "warm", "gpus")
 
     commands: tuple[str, ...] = (
         "push --object box --target -2 0 --no-video",
@@ -76,7 +74,7 @@ class Commands(SpeedStudy[xr.Dataset]):
     file: str = "commands"
     """Name of the data file."""
 
-    def parts(self, run: Run) -> Mapping[str, Callable[[], xr.Dataset]]:
+    def parts(self, run: Run) -> Parts:
         """Return the function that times each command with each number of GPUs."""
         suffix = {None: "", 1: ", one GPU"} | {n: f", {n} GPUs" for n in self.gpus if n > 1}
         parts = {
@@ -114,10 +112,17 @@ def timed(command: str, limit: float, gpus: int | None = None) -> xr.Dataset:
             memory.append(peak)
     match = TIMING.search(output)
     compile_, run, rate = map(float, match.groups() if match else ("nan",) * 3)
-    return xr.Dataset({
-        "empty": seconds[0], "again": seconds[1], "compile": compile_, "run": run, "rate": rate,
-        "memory_empty": memory[0], "memory_again": memory[1],
-    })  # fmt: skip
+    return xr.Dataset(
+        {
+            "empty": seconds[0],
+            "again": seconds[1],
+            "compile": compile_,
+            "run": run,
+            "rate": rate,
+            "memory_empty": memory[0],
+            "memory_again": memory[1],
+        }
+    )
 
 
 def _call(worlds: int) -> str:

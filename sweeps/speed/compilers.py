@@ -11,21 +11,20 @@ processors.
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import ClassVar, Literal
+from typing import Literal
 
 import numpy as np
 import xarray as xr
 
 import rps_jax
-from rps_jax.errors import InputError
-from rps_jax.record.options import option
-from rps_jax.runs.question import Run, call_of
+from rps_jax import InputError
+from rps_jax.questions import Run, call_of, option
 from sweeps.speed.commands import TIMING, printed
-from sweeps.study_base import SpeedStudy, Table, records, text_table
+from sweeps.study_base import Parts, SpeedStudy, Table, records, text_table
 
 _LIMIT = 3600.0  # [s] of a sweep
 # Comparisons: names of both, and environment and options of the second.
@@ -43,9 +42,9 @@ class Compilers(SpeedStudy[xr.Dataset]):
     seconds per second of both.
     """
 
-    TITLE: ClassVar[str] = "The loop compiled here, and by XLA"
-    DIMENSION: ClassVar[str] = "skin"
-    GROWS: ClassVar[tuple[str, ...]] = ("skins", "file")
+    TITLE = "The loop compiled here, and by XLA"
+    DIMENSION = "skin"
+    GROWS = ("skins", "file")
 
     law: str = "rps_tuned"
     """Law to run."""
@@ -58,7 +57,7 @@ class Compilers(SpeedStudy[xr.Dataset]):
     file: str = "compilers"
     """Name of the data file."""
 
-    def parts(self, run: Run) -> Mapping[str, Callable[[], xr.Dataset]]:
+    def parts(self, run: Run) -> Parts:
         """Return the function that compares both sweeps with each skin."""
         return {skin: partial(self._compared, skin) for skin in self.skins}
 
@@ -85,10 +84,15 @@ class Compilers(SpeedStudy[xr.Dataset]):
         with tempfile.TemporaryDirectory() as folder:
             first, rate_here = _swept(command, Path(folder), "here", {})
             second, rate_other = _swept(command + options, Path(folder), "other", environment)
-        return xr.Dataset({
-            "equal": np.mean(first == second), "here": np.mean(first), "other": np.mean(second),
-            "rate_here": rate_here, "rate_other": rate_other,
-        })  # fmt: skip
+        return xr.Dataset(
+            {
+                "equal": np.mean(first == second),
+                "here": np.mean(first),
+                "other": np.mean(second),
+                "rate_here": rate_here,
+                "rate_other": rate_other,
+            }
+        )
 
 
 compilers = call_of(Compilers)

@@ -24,8 +24,7 @@ from typing import Any, ClassVar, Literal, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from rps_jax.record.options import option
-from rps_jax.runs.question import Run, call_of
+from rps_jax.questions import Run, call_of, option
 from rps_jax.trials.progress import Progress
 from sweeps import programs
 from sweeps.programs import FAMILIES
@@ -64,7 +63,7 @@ class Costs(SpeedStudy[list[Profile]]):
     The results hold a profile of each program.
     """
 
-    TITLE: ClassVar[str] = "Time of a control step by function"
+    TITLE = "Time of a control step by function"
     CHOICES: ClassVar = {"families": FAMILIES, "names": programs.BATCHED}
 
     names: tuple[str, ...] = ("fused standard",)
@@ -196,8 +195,15 @@ def table(profiles: Sequence[Profile], count: int = 12) -> Rows:
     """Return a header and the most expensive functions of each program."""
     rows = [["what", "family", "worlds", "where", "us a control step", "share", "operations"]]
     return rows + [
-        [p.name, p.family, f"{p.worlds:,}", c.where, f"{1e6 * c.time:.1f}",
-         f"{100 * c.share:.0f} %", f"{c.operations:.1f}"]
+        [
+            p.name,
+            p.family,
+            f"{p.worlds:,}",
+            c.where,
+            f"{1e6 * c.time:.1f}",
+            f"{100 * c.share:.0f} %",
+            f"{c.operations:.1f}",
+        ]
         for p in profiles
         for c in p.costs[:count]
-    ]  # fmt: skip
+    ]

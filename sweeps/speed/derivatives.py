@@ -10,27 +10,26 @@ reverse mode through all control steps, and includes its own forward run.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, ClassVar, Literal
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import xarray as xr
 
-from rps_jax import RPSParams
+from rps_jax import RPSParams, Setting
 from rps_jax.control import registry
 from rps_jax.engines import native
-from rps_jax.record.options import option
-from rps_jax.runs.question import Run, call_of
+from rps_jax.laws import law_of
+from rps_jax.questions import Run, call_of, option
 from rps_jax.trials.batch_run import Candidates
-from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import ControlLoop, advance, start_all, unroll
 from rps_jax.trials.worlds import soften_skins
-from rps_jax.world.domain import parse_domain
-from sweeps.study_base import SpeedStudy, Table, records, text_table
+from rps_jax.worlds import parse_domain
+from sweeps.study_base import Parts, SpeedStudy, Table, records, text_table
 
 _ROUNDS = 5  # of which the fastest counts
 _COLUMNS = {
@@ -56,9 +55,9 @@ class Derivatives(SpeedStudy[xr.Dataset]):
     one by all inputs, the time to compile one [s], its memory and the share of finite worlds.
     """
 
-    TITLE: ClassVar[str] = "Time of derivatives"
-    DIMENSION: ClassVar[str] = "family"
-    GROWS: ClassVar[tuple[str, ...]] = ("families", "file")
+    TITLE = "Time of derivatives"
+    DIMENSION = "family"
+    GROWS = ("families", "file")
 
     families: tuple[Literal["box", "cylinder", "prism"], ...] = ("box", "cylinder")
     """Families of the objects: box, cylinder, prism."""
@@ -69,7 +68,7 @@ class Derivatives(SpeedStudy[xr.Dataset]):
     file: str = "derivatives"
     """Name of the data file."""
 
-    def parts(self, run: Run) -> Mapping[str, Callable[[], xr.Dataset]]:
+    def parts(self, run: Run) -> Parts:
         """Return the function that measures each family."""
         return {family: partial(self._measured, family) for family in self.families}
 
@@ -87,7 +86,7 @@ class Derivatives(SpeedStudy[xr.Dataset]):
         (batch,) = Candidates(single, [domain], 0, np.arange(self.worlds)).batches(setting)
         worlds = jax.tree.map(jnp.asarray, soften_skins(batch.worlds))
         repeated = jax.tree.map(lambda x: jnp.full(self.worlds, x, float), params)
-        law = registry.smooth_law(registry.law_of(params))
+        law = registry.smooth_law(law_of(params))
         loop = ControlLoop(setting.physics, law=law)
         steps = round(self.horizon / setting.physics.control_period)
         live = jnp.ones(self.worlds, bool)
@@ -113,12 +112,14 @@ class Derivatives(SpeedStudy[xr.Dataset]):
             memory = usage.temp_size_in_bytes
         leaves = [np.asarray(x).reshape(self.worlds, -1) for x in jax.tree.leaves(results["law"])]
         finite = np.isfinite(np.concatenate(leaves, axis=1)).all(axis=1)
-        return xr.Dataset({
-            **{name: times[f"run_{name}"] for name in ("forward", "law", "all")},
-            "compile": times["all"],
-            "memory": memory / self.worlds / steps / 1e3,
-            "finite": 100 * finite.mean(),
-        })  # fmt: skip
+        return xr.Dataset(
+            {
+                **{name: times[f"run_{name}"] for name in ("forward", "law", "all")},
+                "compile": times["all"],
+                "memory": memory / self.worlds / steps / 1e3,
+                "finite": 100 * finite.mean(),
+            }
+        )
 
 
 derivatives = call_of(Derivatives)

@@ -11,25 +11,22 @@ from __future__ import annotations
 import json
 import tempfile
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property, partial
 from itertools import product
 from pathlib import Path
-from typing import ClassVar
 
 import numpy as np
 import xarray as xr
 
+from rps_jax import InputError
 from rps_jax.analysis.figures.style import Figure, words
-from rps_jax.analysis.report import Picture
-from rps_jax.errors import InputError
-from rps_jax.record.options import option
-from rps_jax.runs.question import Run, call_of
-from rps_jax.world.domain import parse_domain
+from rps_jax.questions import Picture, Run, call_of, option
+from rps_jax.worlds import parse_domain
 from sweeps.speed.commands import TIMING, printed
-from sweeps.study_base import SpeedStudy, Table, records, run_process, text_table
+from sweeps.study_base import Parts, SpeedStudy, Table, records, run_process, text_table
 
 _LIMIT = 600.0  # [s] of a sweep
 _MAX_SEGMENTS = 10_000  # of a sweep
@@ -62,9 +59,9 @@ class Gpus(SpeedStudy[xr.Dataset]):
     the fewest and on the most GPUs, its `segments`: device, start, end and live trials by object.
     """
 
-    TITLE: ClassVar[str] = "Sweeps on several GPUs"
-    DIMENSION: ClassVar[str] = "sweep"
-    GROWS: ClassVar[tuple[str, ...]] = ("worlds", "gpus")
+    TITLE = "Sweeps on several GPUs"
+    DIMENSION = "sweep"
+    GROWS = ("worlds", "gpus")
 
     law: str = "rps_tuned"
     """Law to run."""
@@ -79,7 +76,7 @@ class Gpus(SpeedStudy[xr.Dataset]):
         listed = run_process(["nvidia-smi", "-L"], "gpus are not available")
         return list(product(self.worlds, filter(listed.count("GPU ").__ge__, self.gpus)))
 
-    def parts(self, run: Run) -> Mapping[str, Callable[[], xr.Dataset]]:
+    def parts(self, run: Run) -> Parts:
         """Return the function that times each sweep."""
         return {
             f"{x} worlds, {gpus} GPUs": partial(self._timed, x, gpus) for x, gpus in self.sweeps

@@ -12,21 +12,19 @@ import csv
 import shutil
 import sys
 import tempfile
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import ClassVar, Literal
+from typing import Literal
 
 import xarray as xr
 
-from rps_jax.errors import InputError
-from rps_jax.record.options import option
-from rps_jax.runs.question import Run, call_of
+from rps_jax import InputError, Setting
+from rps_jax.questions import Run, call_of, option
 from rps_jax.trials.batch import SEGMENT
-from rps_jax.trials.setting import Setting
 from sweeps.programs import FAMILIES
-from sweeps.study_base import SpeedStudy, Table, records, run_process, text_table
+from sweeps.study_base import Parts, SpeedStudy, Table, records, run_process, text_table
 
 _STALLED = "smsp__average_warps_issue_stalled_{}_per_issue_active.ratio"
 # Counters: name of Nsight Compute, variable, description.
@@ -66,9 +64,9 @@ class Kernel(SpeedStudy[xr.Dataset]):
     The results hold the counters of Nsight Compute for 10 simulated seconds, by shape family.
     """
 
-    TITLE: ClassVar[str] = "Stall reasons of the kernel"
-    DIMENSION: ClassVar[str] = "family"
-    GROWS: ClassVar[tuple[str, ...]] = ("families",)
+    TITLE = "Stall reasons of the kernel"
+    DIMENSION = "family"
+    GROWS = ("families",)
 
     law: str = "rps_tuned"
     """Law to run."""
@@ -82,7 +80,7 @@ class Kernel(SpeedStudy[xr.Dataset]):
         if shutil.which("ncu") is None:
             raise InputError("ncu is not installed: install NVIDIA's CUDA toolkit, which has it.")
 
-    def parts(self, run: Run) -> Mapping[str, Callable[[], xr.Dataset]]:
+    def parts(self, run: Run) -> Parts:
         """Return the function that profiles each family."""
         return {family: partial(self._profiled, family) for family in self.families}
 
@@ -131,7 +129,9 @@ def counts(text: str) -> xr.Dataset:
     if len(rows) < 3:  # names, units and one launch
         raise InputError(f"Nsight Compute profiled no launch: {' '.join(text.split()[-20:])}.")
     values = dict(zip(rows[0], rows[-1], strict=True))
-    return xr.Dataset({
-        ours: ((), float(values[name].replace(",", "")), {"long_name": meaning})
-        for name, (ours, meaning) in _COUNTERS.items()
-    })  # fmt: skip
+    return xr.Dataset(
+        {
+            ours: ((), float(values[name].replace(",", "")), {"long_name": meaning})
+            for name, (ours, meaning) in _COUNTERS.items()
+        }
+    )

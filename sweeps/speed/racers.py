@@ -142,19 +142,17 @@ def jax_engine(task: Task, name: str) -> Racer:
     import jax
     import jax.numpy as jnp
 
-    from rps_jax import engines
-    from rps_jax.control.observation import Twist
-    from rps_jax.engines.base import ControlPeriod, Motion
+    from rps_jax import Twist
     from rps_jax.geometry import solid
+    from rps_jax.physics import FRICTION, ControlPeriod, Motion, get_engine, preset
     from rps_jax.world import scene
-    from rps_jax.world.physics import preset
 
     physics = preset()
     worlds, periods = len(task.qpos), round(task.seconds / physics.control_period)
     box = solid.stack([scene.load("box", physics).solid])
     boxes = jax.tree.map(lambda leaf: np.repeat(leaf, worlds, axis=0), box)
-    friction = scene.Friction(*(np.full(worlds, x) for x in scene.FRICTION["S1"]))
-    stage, fields = engines.get(name).stage(scene.WorldInputs("box", boxes, friction, physics))
+    friction = scene.Friction(*(np.full(worlds, x) for x in FRICTION["S1"]))
+    stage, fields = get_engine(name).stage(scene.WorldInputs("box", boxes, friction, physics))
     fields, qpos = jax.device_put((fields, task.qpos.astype(np.float32)))
     twists = Twist(*(jnp.full(worlds, v, jnp.float32) for v in (SPEED, 0.0, 0.0)))
 
@@ -277,11 +275,18 @@ def newton(task: Task) -> Racer:
     all_worlds.replicate(single_world, worlds)
     model = all_worlds.finalize()
     solver = SolverMuJoCo(
-        model, nconmax=CONTACTS, njmax=ROWS, iterations=option.iterations,
-        ls_iterations=option.ls_iterations, cone="elliptic", impratio=option.impratio,
-        tolerance=option.tolerance, integrator="euler", solver="newton",
+        model,
+        nconmax=CONTACTS,
+        njmax=ROWS,
+        iterations=option.iterations,
+        ls_iterations=option.ls_iterations,
+        cone="elliptic",
+        impratio=option.impratio,
+        tolerance=option.tolerance,
+        integrator="euler",
+        solver="newton",
         kinematic_switchable_roots=False,  # otherwise each body has an unused weld
-    )  # fmt: skip
+    )
     solver.mjw_model.opt.warn_overflow = False
     states, control = [model.state(), model.state()], model.control()
     q = task.qpos.copy()

@@ -9,16 +9,14 @@ from __future__ import annotations
 
 import re
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import ClassVar
 
 import xarray as xr
 
-from rps_jax.record.options import option
-from rps_jax.runs.question import Run, call_of
-from sweeps.study_base import Study, Table, records, run_process, text_table
+from rps_jax.questions import Run, call_of, option
+from sweeps.study_base import Parts, Study, Table, records, run_process, text_table
 
 _ROOT = Path(__file__).parents[2]
 _EXAMPLE = "notebooks/examples/on_a_robot.py"
@@ -45,10 +43,10 @@ class OnARobot(Study[xr.Dataset]):
     The results hold `median`, `slow`, `worst` [us] and `late` [%] by run.
     """
 
-    TITLE: ClassVar[str] = "Time of a step on a robot"
-    DIMENSION: ClassVar[str] = "run"
-    GROWS: ClassVar[tuple[str, ...]] = ("runs", "core")
-    RESULTS: ClassVar[str] = "../results"
+    TITLE = "Time of a step on a robot"
+    DIMENSION = "run"
+    GROWS = ("runs", "core")
+    RESULTS = "../results"
 
     runs: int = option(2, 1, 100)
     """Number of runs."""
@@ -57,7 +55,7 @@ class OnARobot(Study[xr.Dataset]):
     core: int = option(0, 0, 4095)
     """Processor core of the process."""
 
-    def parts(self, run: Run) -> Mapping[int, Callable[[], xr.Dataset]]:
+    def parts(self, run: Run) -> Parts:
         """Return the function that times each run."""
         return dict.fromkeys(range(self.runs), self._timed)
 

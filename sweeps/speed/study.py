@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import time
 from collections import deque
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
 from itertools import product
@@ -19,16 +19,14 @@ import jax
 import numpy as np
 import xarray as xr
 
+from rps_jax import Rules, Setting
 from rps_jax.analysis.figures.style import Figure, words
-from rps_jax.analysis.report import Picture
 from rps_jax.engines import device
 from rps_jax.engines.mujoco import Batch
-from rps_jax.record.options import option
-from rps_jax.runs.question import Run, call_of
+from rps_jax.physics import preset
+from rps_jax.questions import Picture, Run, call_of, option
 from rps_jax.trials import trial
-from rps_jax.trials.setting import Setting
-from rps_jax.trials.trial import ControlLoop, Rules
-from rps_jax.world.physics import preset
+from rps_jax.trials.trial import ControlLoop
 from sweeps import programs
 from sweeps.programs import BATCHED, FAMILIES, Program
 from sweeps.study_base import (
@@ -69,14 +67,14 @@ class Speed(SpeedStudy[xr.Dataset], QuickStudy[xr.Dataset]):
     The results hold simulated seconds per second of wall clock, `rate` [1], of each measurement.
     """
 
-    TITLE: ClassVar[str] = "Speed"
+    TITLE = "Speed"
     CHOICES: ClassVar = {"names": NAMES, "families": FAMILIES}
-    QUICK: ClassVar[Mapping[str, object]] = {
+    QUICK: ClassVar = {
         "names": ("C in closed loop", "fused standard", "quasistatic"),
         "families": ("box",),
         "worlds": (64,),
     }
-    GROWS: ClassVar[tuple[str, ...]] = ("names", "families", "worlds", "at_once")
+    GROWS = ("names", "families", "worlds", "at_once")
 
     names: tuple[str, ...] = ()
     """Engines and fidelities; by default all."""

@@ -40,11 +40,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _run(words: list[str]) -> None:
     """Find the question of a command, parse its options, and execute it."""
+    extensions, words = names.extensions(words)
     name, rest = names.split(words)
     faults = environment.unset_bad_variables()
     from rps_jax.app.cli import flags
     from rps_jax.engines import device
 
     device.configure_xla()
+    for path in extensions:
+        names.import_file(path)
     with device.standard_jax():
         running.execute(*flags.parse(names.question_type(name), name, rest), faults)

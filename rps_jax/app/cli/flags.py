@@ -32,6 +32,7 @@ from rps_jax.record import options
 from rps_jax.record.options import option
 from rps_jax.runs.push import FILM_LENGTH, TraceQuestion
 from rps_jax.runs.question import Command, SimulationQuestion, current_names
+from rps_jax.spec import Spec, specs_of
 from rps_jax.trials.setting import PhysicsField, Setting
 from rps_jax.trials.trial import Rules
 
@@ -185,9 +186,14 @@ _field_docs = functools.cache(_docstrings.get_field_docstring)
 @_REGISTRY.struct_rule
 def _fields(info: StructTypeInfo) -> StructConstructorSpec | None:
     """Offer the fields of a dataclass, without the hidden ones."""
-    if not dataclasses.is_dataclass(info.type):
+    is_tuple = hasattr(info.type, "_fields")
+    if not (is_tuple or dataclasses.is_dataclass(info.type)):
         return None
-    types_ = options.field_types(info.type)
+    types_, declared = options.field_types(info.type), specs_of(info.type)
+    if is_tuple:
+        rows = ((x, types_[x], getattr(info.default, x)) for x in info.type._fields)
+        fields = (StructFieldSpec(*row, _help_of(declared[row[0]])) for row in rows)
+        return StructConstructorSpec(info.type, tuple(fields))
     specs = []
     for field in _offered(info.type):
         default = vars(info.default)[field.name]  # as it was given: a property may convert it
@@ -202,8 +208,16 @@ def _fields(info: StructTypeInfo) -> StructConstructorSpec | None:
             kind = tuple[get_args(kind)[0], ...]
         marked = typing.cast(type, Annotated[(kind, *marks)] if marks else kind)
         text = partial(_field_docs, info.type, field.name, info.markers)
+        if (spec := declared.get(field.name)) is not None and spec.about:
+            text = _help_of(spec)
         specs.append(StructFieldSpec(field.name, marked, default, text))
     return StructConstructorSpec(info.type, tuple(specs))
+
+
+def _help_of(spec: Spec) -> str:
+    """Return the help of a declared number, with its unit."""
+    has_unit = spec.unit in ("", "1") or f"[{spec.unit}]" in spec.about
+    return spec.about if has_unit else str(spec)
 
 
 def _offered(kind: type) -> list[dataclasses.Field[object]]:

@@ -7,6 +7,7 @@ question, or `study.py` of a folder.
 import ast
 import functools
 import importlib
+import itertools
 import re
 import sys
 import textwrap
@@ -59,6 +60,7 @@ def overview() -> str:
     lines = [
         "usage: rps NAME [OPTIONS]      run one of the commands below",
         "       rps PATH [OPTIONS]      run that of a file, or of study.py of a folder",
+        "       rps FILE.py NAME ...    run one after a file that registers tasks or engines",
         "       rps NAME --help         list its options",
         "       rps --version",
         "",
@@ -72,6 +74,18 @@ def overview() -> str:
         lines += ["", f"{heading}:"]
         lines += [textwrap.fill(text, 100, subsequent_indent=indent) for text in texts]
     return "\n".join(lines)
+
+
+def extensions(words: list[str]) -> tuple[list[Path], list[str]]:
+    """Return the Python files before the name of a command, and the words from this name on.
+
+    They register laws, objects, quantities, tasks or engines.
+    """
+    files = list(itertools.takewhile(lambda word: word.endswith(".py"), words))
+    rest = words[len(files) :]
+    if not rest or rest[0] not in {name.split()[0] for name in known()}:
+        return [], words  # the first file is a question
+    return [*map(Path, files)], rest
 
 
 def split(words: list[str]) -> tuple[str, list[str]]:
@@ -102,13 +116,16 @@ def question_type(name: str) -> "type[Question[object]]":
             f"study = {path} defines {len(definitions)} commands: write `name = call_of(Class)` "
             "once."
         )
-    return getattr(_import_file(path.resolve()), definitions[0][1])
+    return getattr(import_file(path), definitions[0][1])
 
 
-def _import_file(path: Path) -> ModuleType:
+def import_file(path: Path) -> ModuleType:
     """Import a file, as a module of its package if it is in one."""
     from rps_jax.control import sources
+    from rps_jax.record import files
 
+    files.read_regular(path, "python")  # or InputError
+    path = path.resolve()
     root = path.parent
     while (root / "__init__.py").exists():
         root = root.parent

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 from string import Template
-from typing import Any, NamedTuple, TypeAlias
+from typing import Annotated, Any, NamedTuple, TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -17,6 +17,7 @@ from rps_jax.lowering.routine import Group, Pytree, Routine, fields_of, routine
 from rps_jax.robot import robot as robots
 from rps_jax.robot import skin as skins
 from rps_jax.robot.skin import LINE, CapacitiveSkin
+from rps_jax.spec import Spec
 
 Leaf: TypeAlias = Any  # an array of JAX or NumPy, or its type
 _REAL = jax.ShapeDtypeStruct((), np.float64)
@@ -47,32 +48,36 @@ class Program(NamedTuple):
 class SkinParams(NamedTuple):
     """Parameters of a skin."""
 
-    time_constant: Leaf  # [s] of the low-pass filter
-    threshold: Leaf  # [1] relative change of capacitance that counts as touch
+    time_constant: Annotated[Leaf, Spec("s", "time constant of the low-pass filter")]
+    threshold: Annotated[Leaf, Spec("1", "relative change of capacitance that counts as touch")]
 
 
 class Skin(NamedTuple):
     """State of a skin."""
 
-    signal: Leaf  # (T,) [1] filtered, of each taxel
-    alive: Leaf  # (T,) 0 of a taxel that is to be ignored
+    signal: Annotated[Leaf, Spec("1", "filtered signal of each taxel")]  # (T,)
+    alive: Annotated[Leaf, Spec("1", "0 of a taxel that is to be ignored")]  # (T,)
 
 
 class Scan(NamedTuple):
     """Reading of all taxels."""
 
-    taxels: Leaf  # (T,) [1] relative change of capacitance of each taxel, along the strip
-    period: Leaf  # [s] since the last step
+    taxels: Annotated[
+        Leaf, Spec("1", "relative change of capacitance of each taxel, along the strip")
+    ]  # (T,)
+    period: Annotated[Leaf, Spec("s", "time since the last step")]
 
 
 class Contact(NamedTuple):
     """Contact that a skin detects."""
 
-    contact_type: Leaf  # 0 none, 1 a point, 2 a line
-    p_robot_contact: Leaf  # [m] in the robot frame; 0 without contact
-    in_contact: Leaf  # whether there is a contact
-    line: Leaf  # whether the contact is a line
-    signal: Leaf  # (T,) [1] filtered, 0 of a dead taxel
+    contact_type: Annotated[Leaf, Spec("1", "type of the contact: 0 none, 1 a point, 2 a line")]
+    p_robot_contact: Annotated[
+        Leaf, Spec("m", "contact in the robot frame; 0 without contact")
+    ]  # (2,)
+    in_contact: Annotated[Leaf, Spec("1", "whether there is a contact")]
+    line: Annotated[Leaf, Spec("1", "whether the contact is a line")]
+    signal: Annotated[Leaf, Spec("1", "filtered signal of each taxel, 0 of a dead one")]  # (T,)
 
 
 def program(law: registry.LawLike, robot: Any = "ideal", skin: Any = "capacitive") -> Program:

@@ -16,55 +16,67 @@ the robot is behind the object, as seen from the target.
 from __future__ import annotations
 
 from functools import partial
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import jax
 import jax.numpy as jnp
 
-from rps_jax.control.base import Law, check_signs, document_fields
+from rps_jax import spec
+from rps_jax.control.base import Law
 from rps_jax.control.observation import Details, PoseObservation, Twist, displacement
 from rps_jax.geometry import planar
 from rps_jax.geometry.arrays import Pair, Parameter
 from rps_jax.robot.shell import HALF_LENGTH
+from rps_jax.spec import Spec, document
 
 
-@document_fields
+@document
 class APSParams(NamedTuple):
-    """Parameters of APS; those marked * are ours, since the publication does not give them."""
+    """Parameters of APS; those marked (ours) are ours, since the publication does not give them."""
 
-    K1: Parameter = 0.05  # [1] gain of the mean motion error
-    K2: Parameter = 0.1  # [1] gain of the motion error
-    K_p: Parameter = 0.6  # [1/s] heading gain
-    K_d: Parameter = 0.4  # [1] heading rate gain
-    yaw_error_max: Parameter = 0.3  # [rad] above it the robot turns in place
-    margin: Parameter = 0.10  # [m] gap above which the robot approaches straight
-    r_robot: Parameter = HALF_LENGTH  # [m] * equivalent radius of a rectangular base
-    gamma_drop: Parameter = 0.01  # [rad] decrease of |gamma| after which alpha is good
-    alpha_mean: Parameter = jnp.pi  # [rad] prior mean of good alphas
-    alpha_variance: Parameter = jnp.pi / 4  # [rad^2] prior variance
-    alpha_count: Parameter = 100.0  # [1] weight of the prior
-    aim_beyond: Parameter = 1.0  # [1] * object radii beyond the target; 0: as published
-    min_motion: Parameter = 0.001  # [m] * least motion of the object
-    v_max: Parameter = 0.05  # [m/s] bound on the speed
-    v_min: Parameter = 0.01  # [m/s] * least speed
-    omega_max: Parameter = 0.15  # [rad/s] bound on |omega|
-    d_success: Parameter = 0.05  # [m] target reached
+    K1: Annotated[Parameter, Spec("1", "gain of the mean motion error", ge=0)] = 0.05
+    K2: Annotated[Parameter, Spec("1", "gain of the motion error", ge=0)] = 0.1
+    K_p: Annotated[Parameter, Spec("1/s", "heading gain", ge=0)] = 0.6
+    K_d: Annotated[Parameter, Spec("1", "heading rate gain", ge=0)] = 0.4
+    yaw_error_max: Annotated[
+        Parameter, Spec("rad", "heading error above which the robot turns in place", ge=0)
+    ] = 0.3
+    margin: Annotated[
+        Parameter, Spec("m", "gap above which the robot approaches straight", ge=0)
+    ] = 0.10
+    r_robot: Annotated[
+        Parameter, Spec("m", "equivalent radius of a rectangular base (ours)", ge=0)
+    ] = HALF_LENGTH
+    gamma_drop: Annotated[
+        Parameter, Spec("rad", "decrease of |gamma| after which alpha is good", ge=0)
+    ] = 0.01
+    alpha_mean: Annotated[Parameter, Spec("rad", "prior mean of good alphas", ge=0)] = jnp.pi
+    alpha_variance: Annotated[Parameter, Spec("rad^2", "prior variance", gt=0)] = jnp.pi / 4
+    alpha_count: Annotated[Parameter, Spec("1", "weight of the prior", gt=0)] = 100.0
+    aim_beyond: Annotated[
+        Parameter, Spec("1", "object radii beyond the target (ours); 0: as published", ge=0)
+    ] = 1.0
+    min_motion: Annotated[Parameter, Spec("m", "least motion of the object (ours)", ge=0)] = 0.001
+    v_max: Annotated[Parameter, Spec("m/s", "bound on the speed", gt=0)] = 0.05
+    v_min: Annotated[Parameter, Spec("m/s", "least speed (ours)", ge=0)] = 0.01
+    omega_max: Annotated[Parameter, Spec("rad/s", "bound on |omega|", gt=0)] = 0.15
+    d_success: Annotated[Parameter, Spec("m", "target reached", gt=0)] = 0.05
 
 
 class APSState(NamedTuple):
     """State of APS between two control steps."""
 
-    p_world_object: jax.Array  # (2,) [m] O at its last motion
-    a_OT: jax.Array  # () [rad] direction from there to T
-    started: jax.Array  # () bool: whether the fields above are set
-    alpha: jax.Array  # () [rad] of the last step
-    gamma: jax.Array  # () [rad] the last motion error
-    gamma_mean: jax.Array  # () [rad] m_gamma
-    gamma_count: jax.Array  # () [1]
-    mean: jax.Array  # () [rad] m, running mean of good alphas
-    variance: jax.Array  # () [rad^2] s2, running variance of good alphas
-    weight: jax.Array  # () [1] number of alphas in mean and variance
-    yaw_error: jax.Array  # () [rad] of the last step
+    p_world_object: Annotated[jax.Array, Spec("m", "O at its last motion")]  # (2,)
+    a_OT: Annotated[jax.Array, Spec("rad", "direction from there to T")]  # ()
+    started: Annotated[jax.Array, Spec("1", "whether the fields above are set")]  # () bool
+    alpha: Annotated[jax.Array, Spec("rad", "alpha of the last step")]  # ()
+    gamma: Annotated[jax.Array, Spec("rad", "the last motion error")]  # ()
+    gamma_mean: Annotated[jax.Array, Spec("rad", "m_gamma, mean motion error")]  # ()
+    gamma_count: Annotated[jax.Array, Spec("1", "number of motion errors in gamma_mean")]  # ()
+    mean: Annotated[jax.Array, Spec("rad", "m, running mean of good alphas")]  # ()
+    variance: Annotated[jax.Array, Spec("rad^2", "s2, running variance of good alphas")]  # ()
+    weight: Annotated[jax.Array, Spec("1", "number of alphas in mean and variance")]  # ()
+    yaw_error: Annotated[jax.Array, Spec("rad", "heading error of the last step")]  # ()
 
     @classmethod
     def init(cls, params: APSParams) -> APSState:
@@ -78,8 +90,7 @@ class APSState(NamedTuple):
         )
 
 
-_POSITIVE = ("alpha_variance", "alpha_count", "v_max", "omega_max", "d_success")
-check = partial(check_signs, "aps", _POSITIVE)
+check = partial(spec.check, prefix="aps.")
 
 
 def predictive(params: APSParams, state: APSState) -> Pair:

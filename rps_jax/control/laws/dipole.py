@@ -19,35 +19,44 @@ from typing import Annotated, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from rps_jax.control.base import Bound, Law, bounds_of, check_signs, document_fields
+from rps_jax import spec
+from rps_jax.control.base import Law, bounds_of
 from rps_jax.control.observation import Details, PoseObservation, Twist
 from rps_jax.geometry import planar
 from rps_jax.geometry.arrays import Parameter
+from rps_jax.spec import Bound, Spec, document
 
 
-@document_fields
+@document
 class DipoleParams(NamedTuple):
     """Parameters of the dipole law; the lookahead is that of Heins and Schoellig."""
 
-    # [1/s] turning rate over heading error
-    K_h: Annotated[Parameter, Bound(0.02, 5, log=True)] = 1.0
-    # [m] distance along the path from object to aim
-    lookahead: Annotated[Parameter, Bound(0.05, 3, log=True)] = 1.0
-    # [1] object radii after which a target is passed
-    beyond: Annotated[Parameter, Bound(0, 5)] = 2.0
-    v_max: Parameter = 0.05  # [m/s] speed, the bound of RPS
-    omega_max: Parameter = 0.15  # [rad/s] bound on |omega|
-    d_success: Parameter = 0.05  # [m] target reached
+    K_h: Annotated[
+        Parameter,
+        Spec("1/s", "turning rate over heading error", gt=0, tune=Bound(0.02, 5, log=True)),
+    ] = 1.0
+    lookahead: Annotated[
+        Parameter,
+        Spec(
+            "m", "distance along the path from object to aim", gt=0, tune=Bound(0.05, 3, log=True)
+        ),
+    ] = 1.0
+    beyond: Annotated[
+        Parameter, Spec("1", "object radii after which a target is passed", ge=0, tune=Bound(0, 5))
+    ] = 2.0
+    v_max: Annotated[Parameter, Spec("m/s", "speed, the bound of RPS", gt=0)] = 0.05
+    omega_max: Annotated[Parameter, Spec("rad/s", "bound on |omega|", gt=0)] = 0.15
+    d_success: Annotated[Parameter, Spec("m", "target reached", gt=0)] = 0.05
 
 
 class DipoleState(NamedTuple):
     """State of the law between two control steps."""
 
-    p_world_start: jax.Array  # (2,) [m] start of the path
-    started: jax.Array  # () bool
+    p_world_start: Annotated[jax.Array, Spec("m", "start of the path")]  # (2,)
+    started: Annotated[jax.Array, Spec("1", "whether there is a path")]  # () bool
 
 
-check = partial(check_signs, "dipole", ("K_h", "lookahead", "v_max", "omega_max", "d_success"))
+check = partial(spec.check, prefix="dipole.")
 
 
 def init(params: DipoleParams) -> DipoleState:

@@ -28,44 +28,67 @@ from typing import Annotated, Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
+from rps_jax import spec
 from rps_jax.control import soft
-from rps_jax.control.base import Bound, Law, bounds_of, check_signs, document_fields
+from rps_jax.control.base import Law, bounds_of
 from rps_jax.control.observation import Details, Observation, Twist, displacement
 from rps_jax.geometry import planar
 from rps_jax.geometry.arrays import Parameter, Scalar
+from rps_jax.spec import Bound, Spec, document
 
 _TOLERANCE = 0.01  # [m] beside a path, beyond which a target has left it
-_POSITIVE = ("drift", "angle_max", "v_max", "omega_max", "d_success")
 
 
-@document_fields
+@document
 class ForcePushParams(NamedTuple):
     """Parameters of Force Push; the gains are those of its authors' experiments."""
 
-    # [1] gain of the force's angle, beyond 1
-    k_theta: Annotated[Parameter, Bound(-2, 4)] = 0.3
-    k_y: Annotated[Parameter, Bound(-2, 2)] = 0.5  # [rad/m] gain of the path
-    # [1/s] gain of the heading
-    k_omega: Annotated[Parameter, Bound(0.005, 2, log=True)] = 1.0
-    # [rad] largest change of theta_p in a step without contact
-    converge: Annotated[Parameter, Bound(0.001, 1, log=True)] = 0.1
-    # [m] lambda, length of motion over which drift is estimated
-    drift: Annotated[Parameter, Bound(0.01, 1, log=True)] = 0.1
-    # [rad] largest angle between push and heading
-    angle_max: Annotated[Parameter, Bound(0.2, 1.57)] = 1.2
-    v_max: Parameter = 0.05  # [m/s] speed of the contact, and bound for the base
-    omega_max: Parameter = 0.15  # [rad/s] bound on |omega|
-    v_approach: Parameter = 0.01  # [m/s] forward speed before the first contact
-    d_success: Parameter = 0.05  # [m] target reached
+    k_theta: Annotated[
+        Parameter, Spec("1", "gain of the force's angle, beyond 1", tune=Bound(-2, 4))
+    ] = 0.3
+    k_y: Annotated[Parameter, Spec("rad/m", "gain of the path", tune=Bound(-2, 2))] = 0.5
+    k_omega: Annotated[
+        Parameter, Spec("1/s", "gain of the heading", ge=0, tune=Bound(0.005, 2, log=True))
+    ] = 1.0
+    converge: Annotated[
+        Parameter,
+        Spec(
+            "rad",
+            "largest change of theta_p in a step without contact",
+            ge=0,
+            tune=Bound(0.001, 1, log=True),
+        ),
+    ] = 0.1
+    drift: Annotated[
+        Parameter,
+        Spec(
+            "m",
+            "lambda, length of motion over which drift is estimated",
+            gt=0,
+            tune=Bound(0.01, 1, log=True),
+        ),
+    ] = 0.1
+    angle_max: Annotated[
+        Parameter,
+        Spec("rad", "largest angle between push and heading", gt=0, tune=Bound(0.2, 1.57)),
+    ] = 1.2
+    v_max: Annotated[
+        Parameter, Spec("m/s", "speed of the contact, and bound for the base", gt=0)
+    ] = 0.05
+    omega_max: Annotated[Parameter, Spec("rad/s", "bound on |omega|", gt=0)] = 0.15
+    v_approach: Annotated[
+        Parameter, Spec("m/s", "forward speed before the first contact", ge=0)
+    ] = 0.01
+    d_success: Annotated[Parameter, Spec("m", "target reached", gt=0)] = 0.05
 
 
 class Path(NamedTuple):
     """Path of the contact: a straight line from a contact through the target."""
 
-    p_world_start: jax.Array  # (2,) [m] start of the path
-    theta_d: jax.Array  # () [rad] direction of the path in the world
-    p_robot_contact: jax.Array  # (2,) [m] the last contact
-    touched: jax.Array  # () bool: whether there was a contact
+    p_world_start: Annotated[jax.Array, Spec("m", "start of the path")]  # (2,)
+    theta_d: Annotated[jax.Array, Spec("rad", "direction of the path in the world")]  # ()
+    p_robot_contact: Annotated[jax.Array, Spec("m", "the last contact")]  # (2,)
+    touched: Annotated[jax.Array, Spec("1", "whether there was a contact")]  # () bool
 
     @classmethod
     def initial(cls, dtype: jax.typing.DTypeLike) -> Path:
@@ -111,12 +134,12 @@ class ForcePushState(NamedTuple):
     """State of the law between two control steps."""
 
     path: Path
-    theta_p: jax.Array  # () [rad] angle of the last push from the path
-    l_mean: jax.Array  # () [m] mean of l over the last motion
-    p_world_robot: jax.Array  # (2,) [m] at the last step
+    theta_p: Annotated[jax.Array, Spec("rad", "angle of the last push from the path")]  # ()
+    l_mean: Annotated[jax.Array, Spec("m", "mean of l over the last motion")]  # ()
+    p_world_robot: Annotated[jax.Array, Spec("m", "position of the base at the last step")]  # (2,)
 
 
-check = partial(check_signs, "force_push", _POSITIVE, free=("k_theta", "k_y"))
+check = partial(spec.check, prefix="force_push.")
 
 
 def init(params: ForcePushParams) -> ForcePushState:

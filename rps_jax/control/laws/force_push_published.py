@@ -27,49 +27,76 @@ from typing import Annotated, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from rps_jax.control.base import Bound, Law, bounds_of, check_signs, document_fields
+from rps_jax import spec
+from rps_jax.control.base import Law, bounds_of
 from rps_jax.control.laws import force_push
 from rps_jax.control.laws.force_push import Path
 from rps_jax.control.observation import Details, ForceObservation, Twist
 from rps_jax.geometry import planar
 from rps_jax.geometry.arrays import Parameter
+from rps_jax.spec import Bound, Spec, document
 
-_POSITIVE = ("v_max", "omega_max", "d_success")
 
-
-@document_fields
+@document
 class PublishedForcePushParams(NamedTuple):
     """Parameters of Force Push, as in its authors' experiments; f_min as in their simulations."""
 
-    # [1] gain of the force's angle, beyond 1
-    k_theta: Annotated[Parameter, Bound(-2, 4)] = 0.3
-    # [rad/m] gain of the path; 0.1 in their simulations
-    k_y: Annotated[Parameter, Bound(-2, 2)] = 0.5
-    # [1/s] gain of the heading
-    k_omega: Annotated[Parameter, Bound(0.005, 2, log=True)] = 1.0
-    # [rad/s] largest rate of theta_p without a force
-    converge: Annotated[Parameter, Bound(0.1, 100, log=True)] = 10.0
-    # [N] least force of a contact; 5 N in their experiments
-    f_min: Annotated[Parameter, Bound(0.1, 20, log=True)] = 1.0
-    # [N] above which the base yields
-    f_max: Annotated[Parameter, Bound(10, 1000, log=True)] = 50.0
-    # [m/s/N] admittance; 0.003 at their speed of 0.1 m/s
-    k_f: Annotated[Parameter, Bound(1e-5, 0.02, log=True)] = 0.0015
-    v_max: Parameter = 0.05  # [m/s] speed of the contact, and bound for the base
-    omega_max: Parameter = 0.15  # [rad/s] bound on |omega|
-    v_approach: Parameter = 0.01  # [m/s] forward speed before the first contact
-    d_success: Parameter = 0.05  # [m] target reached
+    k_theta: Annotated[
+        Parameter, Spec("1", "gain of the force's angle, beyond 1", tune=Bound(-2, 4))
+    ] = 0.3
+    k_y: Annotated[
+        Parameter, Spec("rad/m", "gain of the path; 0.1 in their simulations", tune=Bound(-2, 2))
+    ] = 0.5
+    k_omega: Annotated[
+        Parameter, Spec("1/s", "gain of the heading", ge=0, tune=Bound(0.005, 2, log=True))
+    ] = 1.0
+    converge: Annotated[
+        Parameter,
+        Spec(
+            "rad/s", "largest rate of theta_p without a force", ge=0, tune=Bound(0.1, 100, log=True)
+        ),
+    ] = 10.0
+    f_min: Annotated[
+        Parameter,
+        Spec(
+            "N",
+            "least force of a contact; 5 N in their experiments",
+            ge=0,
+            tune=Bound(0.1, 20, log=True),
+        ),
+    ] = 1.0
+    f_max: Annotated[
+        Parameter,
+        Spec("N", "force above which the base yields", ge=0, tune=Bound(10, 1000, log=True)),
+    ] = 50.0
+    k_f: Annotated[
+        Parameter,
+        Spec(
+            "m/s/N",
+            "admittance; 0.003 at their speed of 0.1 m/s",
+            ge=0,
+            tune=Bound(1e-5, 0.02, log=True),
+        ),
+    ] = 0.0015
+    v_max: Annotated[
+        Parameter, Spec("m/s", "speed of the contact, and bound for the base", gt=0)
+    ] = 0.05
+    omega_max: Annotated[Parameter, Spec("rad/s", "bound on |omega|", gt=0)] = 0.15
+    v_approach: Annotated[
+        Parameter, Spec("m/s", "forward speed before the first contact", ge=0)
+    ] = 0.01
+    d_success: Annotated[Parameter, Spec("m", "target reached", gt=0)] = 0.05
 
 
 class PublishedForcePushState(NamedTuple):
     """State of the law between two control steps."""
 
     path: Path
-    theta_p: jax.Array  # () [rad] angle of the last push from the path
-    pushed: jax.Array  # () bool: whether a contact and a force were sensed
+    theta_p: Annotated[jax.Array, Spec("rad", "angle of the last push from the path")]  # ()
+    pushed: Annotated[jax.Array, Spec("1", "whether a contact and a force were sensed")]  # () bool
 
 
-check = partial(check_signs, "force_push_published", _POSITIVE, free=("k_theta", "k_y"))
+check = partial(spec.check, prefix="force_push_published.")
 
 
 def init(params: PublishedForcePushParams) -> PublishedForcePushState:

@@ -9,7 +9,7 @@ where sat is the saturation of Sec. III. After the last offset the law is RPS. I
 the contacts that occur under the offsets.
 """
 
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -18,22 +18,27 @@ from numpy.typing import ArrayLike
 
 from rps_jax import errors
 from rps_jax.control import soft
-from rps_jax.control.base import Law, check_finite_leaves, document_fields
+from rps_jax.control.base import Law, check_finite_leaves
 from rps_jax.control.laws import rps
 from rps_jax.control.laws.rps import RPSParams, RPSState
 from rps_jax.control.observation import Details, Observation, Twist
 from rps_jax.geometry.arrays import Number, Parameter
+from rps_jax.spec import Spec, document
 
 KNOTS = 60  # default number of offsets
 
 
-@document_fields
+@document
 class GuidedParams(NamedTuple):
     """Parameters of RPS, and the planned offsets."""
 
     law: RPSParams = RPSParams.tuned()
-    offsets: ArrayLike = np.zeros((KNOTS, 3))  # (J, 3) [1] of v_x, v_y, omega, in units of bounds
-    hold: Parameter = 250  # [1] control steps per offset: 5 s, so that 60 take 300 s
+    offsets: Annotated[ArrayLike, Spec("1", "offsets of v_x, v_y, omega, in units of bounds")] = (
+        np.zeros((KNOTS, 3))
+    )  # (J, 3)
+    hold: Annotated[
+        Parameter, Spec("1", "control steps per offset: 5 s, so that 60 take 300 s", ge=1)
+    ] = 250
 
     @property
     def d_success(self) -> Number:
@@ -45,7 +50,7 @@ class GuidedState(NamedTuple):
     """State of RPS, and the number of control steps."""
 
     law: RPSState
-    steps: jax.Array  # () int32 finished control steps
+    steps: Annotated[jax.Array, Spec("1", "finished control steps")]  # () int32
 
 
 def check(params: GuidedParams) -> GuidedParams:

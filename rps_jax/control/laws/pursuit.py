@@ -12,28 +12,35 @@ from typing import Annotated, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from rps_jax.control.base import Bound, Law, bounds_of, check_signs, document_fields
+from rps_jax import spec
+from rps_jax.control.base import Law, bounds_of
 from rps_jax.control.observation import Details, Observation, Twist, displacement
 from rps_jax.geometry import planar
 from rps_jax.geometry.arrays import Parameter
+from rps_jax.spec import Bound, Spec, document
 
 
-@document_fields
+@document
 class PursuitParams(NamedTuple):
     """Parameters of pursuit; the bounds are those of RPS."""
 
-    K_v: Annotated[Parameter, Bound(0.02, 2, log=True)] = 0.5  # [1/s] speed over distance
-    # [1/s] turning rate over heading error
-    K_h: Annotated[Parameter, Bound(0.005, 2, log=True)] = 1.0
-    # [1] least share of the speed that is forward
-    press: Annotated[Parameter, Bound(0, 2)] = 0.2
-    v_max: Parameter = 0.05  # [m/s] bound on the speed
-    omega_max: Parameter = 0.15  # [rad/s] bound on |omega|
-    v_approach: Parameter = 0.01  # [m/s] forward speed without contact
-    d_success: Parameter = 0.05  # [m] target reached
+    K_v: Annotated[
+        Parameter, Spec("1/s", "speed over distance", gt=0, tune=Bound(0.02, 2, log=True))
+    ] = 0.5
+    K_h: Annotated[
+        Parameter,
+        Spec("1/s", "turning rate over heading error", gt=0, tune=Bound(0.005, 2, log=True)),
+    ] = 1.0
+    press: Annotated[
+        Parameter, Spec("1", "least share of the speed that is forward", ge=0, tune=Bound(0, 2))
+    ] = 0.2
+    v_max: Annotated[Parameter, Spec("m/s", "bound on the speed", gt=0)] = 0.05
+    omega_max: Annotated[Parameter, Spec("rad/s", "bound on |omega|", gt=0)] = 0.15
+    v_approach: Annotated[Parameter, Spec("m/s", "forward speed without contact", ge=0)] = 0.01
+    d_success: Annotated[Parameter, Spec("m", "target reached", gt=0)] = 0.05
 
 
-check = partial(check_signs, "pursuit", ("K_v", "K_h", "v_max", "omega_max", "d_success"))
+check = partial(spec.check, prefix="pursuit.")
 
 
 def init(params: PursuitParams) -> tuple[()]:

@@ -20,61 +20,113 @@ alternatives (see `soft`), so that the law is smooth. Without them it is the pap
 
 from __future__ import annotations
 
+import math
 from typing import Annotated, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jax.typing import ArrayLike
 
-from rps_jax import errors
+from rps_jax import errors, spec
 from rps_jax.control import soft
-from rps_jax.control.base import Bound, Law, bounds_of, check_signs, document_fields
+from rps_jax.control.base import Law, bounds_of
 from rps_jax.control.observation import Details, Observation, Twist, displacement
 from rps_jax.geometry import planar
 from rps_jax.geometry.arrays import Array, Bools, Float, Floats, Parameter, PerWorld
+from rps_jax.spec import Bound, Spec, document
 
 
-@document_fields
+@document
 class RPSParams(NamedTuple):
     """Parameters of RPS: floats, the leaves of a pytree, any of which may be batched.
 
     The first block is given in the paper. The second is not; its defaults are ours.
     """
 
-    # [1] upper asymptote of the adaptive rate, Eq. 5
-    eta: Annotated[Parameter, Bound(1, 100, log=True)] = 10.0
-    zeta: Annotated[Parameter, Bound(-2, 5)] = 0.0  # [1] lower asymptote, Eq. 5
-    # [m] inflection point of |l|, Eq. 5
-    beta: Annotated[Parameter, Bound(0.01, 0.3)] = 0.12
-    k: Annotated[Parameter, Bound(5, 500, log=True)] = 60.0  # [1/m] steepness, Eq. 5
-    K_h: Annotated[Parameter, Bound(0.1, 5, log=True)] = 1.0  # [1] heading gain, Eq. 7
-    K_v: Annotated[Parameter, Bound(0.02, 2, log=True)] = 0.1  # [1/s] velocity gain, Eq. 3
-    # [m] turning length, Eqs. 6 and 9
-    L: Annotated[Parameter, Bound(0.03, 1.5, log=True)] = 0.2
-    # [m] start of the critical region; the half width of the base is 0.29
-    l_cr: Annotated[Parameter, Bound(0.1, 0.289)] = 0.24
-    # [m] no lateral motion nearer than this, Eq. 5
-    d_th: Annotated[Parameter, Bound(0.02, 2, log=True)] = 0.5
-    v_max: Parameter = 0.05  # [m/s] bound on the norm of (v_x, v_y)
-    omega_max: Parameter = 0.15  # [rad/s] bound on |omega|
-    d_success: Parameter = 0.05  # [m] target reached, Algorithm 1
-    v_approach: Parameter = 0.01  # [m/s] forward speed without contact (Sec. III-B)
+    eta: Annotated[
+        Parameter,
+        Spec(
+            "1", "upper asymptote of the adaptive rate, Eq. 5", ge=0, tune=Bound(1, 100, log=True)
+        ),
+    ] = 10.0
+    zeta: Annotated[Parameter, Spec("1", "lower asymptote, Eq. 5", tune=Bound(-2, 5))] = 0.0
+    beta: Annotated[
+        Parameter, Spec("m", "inflection point of |l|, Eq. 5", ge=0, tune=Bound(0.01, 0.3))
+    ] = 0.12
+    k: Annotated[Parameter, Spec("1/m", "steepness, Eq. 5", ge=0, tune=Bound(5, 500, log=True))] = (
+        60.0
+    )
+    K_h: Annotated[
+        Parameter, Spec("1", "heading gain, Eq. 7", gt=0, tune=Bound(0.1, 5, log=True))
+    ] = 1.0
+    K_v: Annotated[
+        Parameter, Spec("1/s", "velocity gain, Eq. 3", gt=0, tune=Bound(0.02, 2, log=True))
+    ] = 0.1
+    L: Annotated[
+        Parameter, Spec("m", "turning length, Eqs. 6 and 9", gt=0, tune=Bound(0.03, 1.5, log=True))
+    ] = 0.2
+    l_cr: Annotated[
+        Parameter,
+        Spec(
+            "m",
+            "start of the critical region; the half width of the base is 0.29",
+            gt=0,
+            tune=Bound(0.1, 0.289),
+        ),
+    ] = 0.24
+    d_th: Annotated[
+        Parameter,
+        Spec("m", "no lateral motion nearer than this, Eq. 5", ge=0, tune=Bound(0.02, 2, log=True)),
+    ] = 0.5
+    v_max: Annotated[Parameter, Spec("m/s", "bound on the norm of (v_x, v_y)", gt=0)] = 0.05
+    omega_max: Annotated[Parameter, Spec("rad/s", "bound on |omega|", gt=0)] = 0.15
+    d_success: Annotated[Parameter, Spec("m", "target reached, Algorithm 1", gt=0)] = 0.05
+    v_approach: Annotated[
+        Parameter, Spec("m/s", "forward speed without contact (Sec. III-B)", ge=0)
+    ] = 0.01
 
-    # [m] end of the middle region, where Realignment stops
-    l_mr: Annotated[Parameter, Bound(0.02, 0.98, relative_to="l_cr")] = 0.15
-    # [1] adaptive rate in Realignment; eta's value
-    a_r_max: Annotated[Parameter, Bound(1, 100, log=True)] = 10.0
-    # [rad] bound on |gamma|; inf is the tangent as printed
-    gamma_max: Annotated[Parameter, Bound(0.5, 1.57)] = 1.56
-    # [m/s] forward speed after contact is lost
-    v_lost: Annotated[Parameter, Bound(0.001, 0.05, log=True)] = 0.01
-    sgn_0: Parameter = 0.0  # [1] sgn(0), from 0 to 1
+    l_mr: Annotated[
+        Parameter,
+        Spec(
+            "m",
+            "end of the middle region, where Realignment stops",
+            ge=0,
+            tune=Bound(0.02, 0.98, relative_to="l_cr"),
+        ),
+    ] = 0.15
+    a_r_max: Annotated[
+        Parameter,
+        Spec("1", "adaptive rate in Realignment; eta's value", ge=0, tune=Bound(1, 100, log=True)),
+    ] = 10.0
+    gamma_max: Annotated[
+        Parameter,
+        Spec(
+            "rad",
+            "bound on |gamma|; inf is the tangent as printed",
+            gt=0,
+            le=math.inf,
+            tune=Bound(0.5, 1.57),
+        ),
+    ] = 1.56
+    v_lost: Annotated[
+        Parameter,
+        Spec("m/s", "forward speed after contact is lost", ge=0, tune=Bound(0.001, 0.05, log=True)),
+    ] = 0.01
+    sgn_0: Annotated[Parameter, Spec("1", "sgn(0), from 0 to 1", ge=0, le=1)] = 0.0
 
     # Switches, each 0 or 1.
-    reactive: Parameter = 1.0  # 1: RPS; 0: NPS (a_r = 0 and no Realignment)
-    keep_contact: Parameter = 0.0  # 1: after a loss the last contact is used
-    saturate_first: Parameter = 1.0  # 1: omega from the saturated v_x; 0: the unsaturated
-    clip_each: Parameter = 0.0  # 1: v_x and v_y clipped one by one, not as a vector
+    reactive: Annotated[
+        Parameter, Spec("1", "1: RPS; 0: NPS (a_r = 0 and no Realignment)", ge=0, le=1)
+    ] = 1.0
+    keep_contact: Annotated[
+        Parameter, Spec("1", "1: after a loss the last contact is used", ge=0, le=1)
+    ] = 0.0
+    saturate_first: Annotated[
+        Parameter, Spec("1", "1: omega from the saturated v_x; 0: the unsaturated", ge=0, le=1)
+    ] = 1.0
+    clip_each: Annotated[
+        Parameter, Spec("1", "1: v_x and v_y clipped one by one, not as a vector", ge=0, le=1)
+    ] = 0.0
 
     @classmethod
     def paper(cls) -> RPSParams:
@@ -133,24 +185,26 @@ class Temperatures(NamedTuple):
     (l_cr - l_mr) / 4; above this width l_th has one equilibrium for each l.
     """
 
-    realign: Parameter = 0.01  # Algorithm 1's |l| > l_th
-    d_th: Parameter = 0.02  # Eq. 5's ||d|| > d_th
-    sgn: Parameter = 0.01  # sgn(l)
-    arrive: Parameter = 0.002  # ||d|| < d_success
+    realign: Annotated[Parameter, Spec("m", "Algorithm 1's |l| > l_th", gt=0, le=1)] = 0.01
+    d_th: Annotated[Parameter, Spec("m", "Eq. 5's ||d|| > d_th", gt=0, le=1)] = 0.02
+    sgn: Annotated[Parameter, Spec("m", "sgn(l)", gt=0, le=1)] = 0.01
+    arrive: Annotated[Parameter, Spec("m", "||d|| < d_success", gt=0, le=1)] = 0.002
 
     def check(self) -> None:
         """Raise InputError for a temperature that is not a positive length."""
-        for name, value in self._asdict().items():
-            errors.check_finite(f"temperature {name}", value, above=0, at_most=1, unit="m")
+        spec.check(self, "temperature ")
 
 
 class RPSState(NamedTuple):
     """State of the law between two control steps."""
 
-    l_th: Floats  # [m] dynamic threshold: l_cr normally, l_mr while realigning
-    p_robot_contact: Float[Array, "*B 2"]  # [m] the last contact, in the robot frame
-    # Whether there was a contact; a weight in the smooth law.
-    touched: Bools | Floats
+    l_th: Annotated[Floats, Spec("m", "dynamic threshold: l_cr normally, l_mr while realigning")]
+    p_robot_contact: Annotated[
+        Float[Array, "*B 2"], Spec("m", "the last contact, in the robot frame")
+    ]
+    touched: Annotated[
+        Bools | Floats, Spec("1", "whether there was a contact; a weight in the smooth law")
+    ]
 
     @classmethod
     def init(cls, params: RPSParams, temperatures: Temperatures | None = None) -> RPSState:
@@ -167,12 +221,8 @@ def check(params: RPSParams) -> RPSParams:
       InputError: a value is not a number, is out of range, or is infinite (only gamma_max may be,
         for the tangent as printed).
     """
-    positive = ("K_h", "K_v", "L", "l_cr", "v_max", "omega_max", "d_success")
-    check_signs("rps", positive, params._replace(gamma_max=0.0), free=("zeta",))
-    errors.check_number("rps.gamma_max", params.gamma_max, above=0)
+    spec.check(params, "rps.")
     errors.check_finite("rps.l_mr", params.l_mr, at_most=params.l_cr)
-    for name in ("sgn_0", "reactive", "keep_contact", "saturate_first", "clip_each"):
-        errors.check_finite(f"rps.{name}", getattr(params, name), at_most=1)
     return params
 
 

@@ -28,20 +28,20 @@ parameters. RPS+ has the observations of RPS. Its state adds the position of the
 world, and the number of control steps since.
 """
 
-import math
 from typing import Annotated, NamedTuple
 
 import jax
 import jax.numpy as jnp
 
-from rps_jax import errors
+from rps_jax import spec
 from rps_jax.control import soft
-from rps_jax.control.base import Bound, Law, bounds_of, document_fields
+from rps_jax.control.base import Law, bounds_of
 from rps_jax.control.laws import rps
 from rps_jax.control.laws.rps import RPSParams, RPSState, Temperatures
 from rps_jax.control.observation import Details, Observation, Twist, displacement
 from rps_jax.geometry import planar
 from rps_jax.geometry.arrays import Number, Parameter, Scalar
+from rps_jax.spec import Bound, Spec, document
 
 FACING = 0.3  # [rad] P3's facing
 REACH = 0.45  # [m] P3's reach: the base's front is 0.36 m ahead of its centre
@@ -50,20 +50,40 @@ _FACING_WIDTH = 0.03  # [rad] P3's |angle of p| < facing
 _LOST_WIDTH = 5.0  # [1] control steps, n_lost
 
 
-@document_fields
+@document
 class RPSPlusParams(NamedTuple):
     """Parameters of RPS+: the tuned ones of RPS with a faster approach, and those of P1 to P3."""
 
     law: RPSParams = RPSParams.tuned()._replace(v_approach=0.03)  # of Eqs. 1-10
-    # [m] distance within which the base translates, P1
-    d_near: Annotated[Parameter, Bound(0.05, 1, log=True)] = 0.25
-    # [1] least share of the speed that is forward, P2
-    press: Annotated[Parameter, Bound(0, 1)] = 0.2
-    # [1] control steps without contact before P3: 2 s
-    n_lost: Annotated[Parameter, Bound(10, 2000, log=True)] = 100
-    # [1] share of v_max towards the last contact, P3
-    ahead: Annotated[Parameter, Bound(0, 1)] = 0.7
-    aside: Annotated[Parameter, Bound(0, 1)] = 0.5  # [1] share of v_max to the side, P3
+    d_near: Annotated[
+        Parameter,
+        Spec(
+            "m",
+            "distance within which the base translates, P1",
+            ge=0,
+            tune=Bound(0.05, 1, log=True),
+        ),
+    ] = 0.25
+    press: Annotated[
+        Parameter,
+        Spec("1", "least share of the speed that is forward, P2", ge=0, le=1, tune=Bound(0, 1)),
+    ] = 0.2
+    n_lost: Annotated[
+        Parameter,
+        Spec(
+            "1",
+            "control steps without contact before P3: 2 s",
+            ge=0,
+            tune=Bound(10, 2000, log=True),
+        ),
+    ] = 100
+    ahead: Annotated[
+        Parameter,
+        Spec("1", "share of v_max towards the last contact, P3", ge=0, le=1, tune=Bound(0, 1)),
+    ] = 0.7
+    aside: Annotated[
+        Parameter, Spec("1", "share of v_max to the side, P3", ge=0, le=1, tune=Bound(0, 1))
+    ] = 0.5
 
     @property
     def d_success(self) -> Number:
@@ -80,8 +100,10 @@ class RPSPlusState(NamedTuple):
     """State of RPS+ between two control steps."""
 
     law: RPSState
-    p_world_contact: jax.Array  # (2,) [m] the last contact
-    steps_lost: jax.Array  # () int32 control steps since then; a float in the smooth law
+    p_world_contact: Annotated[jax.Array, Spec("m", "the last contact")]  # (2,)
+    steps_lost: Annotated[
+        jax.Array, Spec("1", "control steps since then; a float in the smooth law")
+    ]  # () int32
 
 
 BOUNDS = {f"law.{name}": bound for name, bound in rps.BOUNDS.items() if not bound.relative_to}
@@ -92,10 +114,7 @@ BOUNDS |= bounds_of(RPSPlusParams)
 def check(params: RPSPlusParams) -> RPSPlusParams:
     """Return the parameters if they are scalars in range; otherwise raise InputError."""
     rps.check(params.law)
-    for name in ("d_near", "n_lost", "press", "ahead", "aside"):
-        at_most = math.inf if name in ("d_near", "n_lost") else 1
-        errors.check_finite(f"rps_plus.{name}", getattr(params, name), at_least=0, at_most=at_most)
-    return params
+    return spec.check(params, "rps_plus.")
 
 
 def init(params: RPSPlusParams, temperatures: Temperatures | None = None) -> RPSPlusState:

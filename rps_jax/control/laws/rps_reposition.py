@@ -18,29 +18,38 @@ from typing import Annotated, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from rps_jax import errors
+from rps_jax import spec
 from rps_jax.control import soft
-from rps_jax.control.base import Bound, Law, bounds_of, document_fields
+from rps_jax.control.base import Law, bounds_of
 from rps_jax.control.laws import rps_plus, unicycle
 from rps_jax.control.laws.rps_plus import RPSPlusParams, RPSPlusState
 from rps_jax.control.observation import Details, Observation, Twist
 from rps_jax.geometry import planar
 from rps_jax.geometry.arrays import Number, Parameter
+from rps_jax.spec import Bound, Spec, document
 
 _AHEAD = 1.26  # [rad] by which the base aims ahead on the circle
 _ARRIVED, _CLEAR = 0.1, 0.1  # [m] errors at the staging point, and of the circle
 
 
-@document_fields
+@document
 class RPSRepositionParams(NamedTuple):
     """Parameters of RPS+, and those of G1 to G3."""
 
     law: RPSPlusParams = RPSPlusParams()  # of RPS+
-    # [s] without progress before the base repositions, G1
-    t_stuck: Annotated[Parameter, Bound(3, 100, log=True)] = 20.0
-    progress: Annotated[Parameter, Bound(0.005, 0.3, log=True)] = 0.05  # [m] of G1
-    r: Annotated[Parameter, Bound(0.08, 0.4)] = 0.236  # [m] from the contact to M, G2
-    R: Annotated[Parameter, Bound(0.5, 1.4)] = 0.9  # [m] circle around M, G3
+    t_stuck: Annotated[
+        Parameter,
+        Spec("s", "without progress until it repositions, G1", gt=0, tune=Bound(3, 100, log=True)),
+    ] = 30.0
+    progress: Annotated[
+        Parameter, Spec("m", "progress of G1", gt=0, tune=Bound(0.005, 0.3, log=True))
+    ] = 0.05
+    r: Annotated[Parameter, Spec("m", "from the contact to M, G2", gt=0, tune=Bound(0.08, 0.4))] = (
+        0.236
+    )
+    R: Annotated[
+        Parameter, Spec("m", "radius of the circle around M, G3", gt=0, tune=Bound(0.5, 1.4))
+    ] = 0.9
 
     @property
     def d_success(self) -> Number:
@@ -63,9 +72,7 @@ class RPSRepositionState(NamedTuple):
 def check(params: RPSRepositionParams) -> RPSRepositionParams:
     """Return the parameters if they are scalars in range; otherwise raise InputError."""
     rps_plus.check(params.law)
-    for name in ("t_stuck", "progress", "r", "R"):
-        errors.check_finite(f"rps_reposition.{name}", getattr(params, name), above=0, at_most=1e6)
-    return params
+    return spec.check(params, "rps_reposition.")
 
 
 def init(params: RPSRepositionParams) -> RPSRepositionState:

@@ -41,13 +41,14 @@ from typing import Annotated, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from rps_jax import errors
+from rps_jax import spec
 from rps_jax.control import soft
-from rps_jax.control.base import Bound, Law, bounds_of, check_signs, document_fields
+from rps_jax.control.base import Law, bounds_of
 from rps_jax.control.observation import Details, Observation, Twist, displacement
 from rps_jax.geometry import planar
 from rps_jax.geometry.arrays import Number, Parameter
 from rps_jax.robot.shell import HALF_LENGTH
+from rps_jax.spec import Bound, Spec, document
 
 _SIDE = 0.02  # [m] behind the front, where a contact is on a side
 _ROUND_SIDE = 1.2  # [rad] from the front of a round base
@@ -59,39 +60,57 @@ _OVERSHOOT = 1.5  # [rad] on the circle, after which the base drives back
 _LEAST_ARM = 0.2  # [m] of x_C
 
 
-@document_fields
+@document
 class UnicycleParams(NamedTuple):
     """Parameters of the law: bounds of robot and task, and those that are tuned."""
 
-    v_max: Parameter = 0.05  # [m/s] speed of the base's middle
-    omega_max: Parameter = 0.15  # [rad/s] bound on |omega|
-    d_success: Parameter = 0.05  # [m] target reached
-    v_approach: Parameter = 0.03  # [m/s] speed before the first contact
-    # [m] from the contact to the object's middle, D1
-    r: Annotated[Parameter, Bound(0.08, 0.4)] = 0.236
-    K_e: Annotated[Parameter, Bound(0.1, 3, log=True)] = 0.92  # [1/s] turn to the target, D4
-    K_l: Annotated[Parameter, Bound(0.2, 8, log=True)] = 4.7  # [rad/s/m] turn to the contact, D4
-    l_dead: Annotated[Parameter, Bound(0.0, 0.28)] = 0.12  # [m] where it does not, D4
-    l_edge: Annotated[Parameter, Bound(0.1, 0.35)] = 0.273  # [m] |l| of a spent contact
-    d_near: Annotated[Parameter, Bound(0.05, 1)] = 0.604  # [m] distance of D5
-    e_near: Annotated[Parameter, Bound(0.5, 2.5)] = 1.83  # [rad] |e| of a spent contact there
-    t_lost: Annotated[Parameter, Bound(0.2, 8, log=True)] = 1.14  # [s] without contact: lost
-    back: Annotated[Parameter, Bound(0.01, 0.6)] = 0.1  # [m] retreat
-    R: Annotated[Parameter, Bound(0.5, 1.4)] = 0.87  # [m] circle around M, D6
-    carrot: Annotated[Parameter, Bound(0.4, 1.5)] = 0.8  # [rad] of the aim ahead on the circle, D6
+    v_max: Annotated[Parameter, Spec("m/s", "speed of the base's middle", gt=0)] = 0.05
+    omega_max: Annotated[Parameter, Spec("rad/s", "bound on |omega|", gt=0)] = 0.15
+    d_success: Annotated[Parameter, Spec("m", "target reached", gt=0)] = 0.05
+    v_approach: Annotated[Parameter, Spec("m/s", "speed before the first contact", ge=0)] = 0.03
+    r: Annotated[
+        Parameter,
+        Spec("m", "from the contact to the object's middle, D1", gt=0, tune=Bound(0.08, 0.4)),
+    ] = 0.236
+    K_e: Annotated[
+        Parameter, Spec("1/s", "turn to the target, D4", ge=0, tune=Bound(0.1, 3, log=True))
+    ] = 0.92
+    K_l: Annotated[
+        Parameter, Spec("rad/s/m", "turn to the contact, D4", ge=0, tune=Bound(0.2, 8, log=True))
+    ] = 4.7
+    l_dead: Annotated[
+        Parameter, Spec("m", "offset up to which it does not, D4", ge=0, tune=Bound(0, 0.28))
+    ] = 0.12
+    l_edge: Annotated[
+        Parameter, Spec("m", "offset of a spent contact", ge=0, tune=Bound(0.1, 0.35))
+    ] = 0.273
+    d_near: Annotated[Parameter, Spec("m", "distance of D5", ge=0, tune=Bound(0.05, 1))] = 0.604
+    e_near: Annotated[
+        Parameter, Spec("rad", "error of a spent contact there", ge=0, tune=Bound(0.5, 2.5))
+    ] = 1.83
+    t_lost: Annotated[
+        Parameter,
+        Spec("s", "without contact until it is lost", gt=0, tune=Bound(0.2, 8, log=True)),
+    ] = 1.14
+    back: Annotated[Parameter, Spec("m", "retreat", ge=0, tune=Bound(0.01, 0.6))] = 0.1
+    carrot: Annotated[
+        Parameter, Spec("rad", "aim ahead on the circle, D6", gt=0, tune=Bound(0.4, 1.5))
+    ] = 0.8
+    R: Annotated[
+        Parameter, Spec("m", "radius of the circle around M, D6", gt=0, tune=Bound(0.5, 1.4))
+    ] = 0.87
 
 
 class Widths(NamedTuple):
     """Widths of the switches of the smooth law; its choice of the side stays hard."""
 
-    length: Parameter = 0.01  # [m]
-    angle: Parameter = 0.02  # [rad]
-    time: Parameter = 0.1  # [s]
+    length: Annotated[Parameter, Spec("m", "of lengths", gt=0, le=1)] = 0.01
+    angle: Annotated[Parameter, Spec("rad", "of angles", gt=0, le=1)] = 0.02
+    time: Annotated[Parameter, Spec("s", "of times", gt=0, le=1)] = 0.1
 
     def check(self) -> None:
         """Raise InputError for a width that is not positive."""
-        for name, value in self._asdict().items():
-            errors.check_finite(f"temperature {name}", value, above=0, at_most=1)
+        spec.check(self, "temperature ")
 
 
 class UnicycleState(NamedTuple):
@@ -109,9 +128,7 @@ class UnicycleState(NamedTuple):
     side: jax.Array  # [1] 1: counter-clockwise around M, or -1
 
 
-check = partial(
-    check_signs, "unicycle", ("v_max", "omega_max", "d_success", "r", "R", "carrot", "t_lost")
-)
+check = partial(spec.check, prefix="unicycle.")
 
 
 def init(params: UnicycleParams, temperatures: Widths | None = None) -> UnicycleState:

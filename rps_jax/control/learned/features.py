@@ -9,7 +9,7 @@ Mirroring a world about the robot's x axis (y to -y) mirrors its features.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -20,6 +20,7 @@ from rps_jax.geometry import planar
 from rps_jax.geometry.footprint import Footprint
 from rps_jax.robot import skin as skins
 from rps_jax.robot.skin import LINE, NONE, Reading, Skin, SkinState
+from rps_jax.spec import Spec
 
 _BASE = 0.36  # [m] scale of positions on the base
 _NEAR, _FAR = 0.05, 3.0  # [m] distances that map to 0 and 1 on the logarithmic scale
@@ -46,12 +47,16 @@ def taxel_observation(
 class TouchState(NamedTuple):
     """Record of touch, with positions by odometry."""
 
-    p_world_contact: jax.Array  # (2,) [m] the last contact
-    touched: jax.Array  # () bool: whether there was a contact
-    time_since_contact: jax.Array  # () [s]
-    in_contact: jax.Array  # () bool: in this control step
-    p_robot_decision: jax.Array  # (2,) [m] the contact at the last decision
-    has_decided: jax.Array  # () bool: whether the last decision was made in contact
+    p_world_contact: Annotated[jax.Array, Spec("m", "the last contact")]  # (2,)
+    touched: Annotated[jax.Array, Spec("1", "whether there was a contact")]  # () bool
+    time_since_contact: Annotated[jax.Array, Spec("s", "time since the last contact")]  # ()
+    in_contact: Annotated[
+        jax.Array, Spec("1", "whether there is a contact in this control step")
+    ]  # () bool
+    p_robot_decision: Annotated[jax.Array, Spec("m", "the contact at the last decision")]  # (2,)
+    has_decided: Annotated[
+        jax.Array, Spec("1", "whether the last decision was made in contact")
+    ]  # () bool
 
     @classmethod
     def initial(cls, dtype: jax.typing.DTypeLike = float) -> TouchState:

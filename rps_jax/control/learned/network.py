@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from functools import partial
-from typing import Any, Literal, NamedTuple, get_args
+from typing import Annotated, Any, Literal, NamedTuple, get_args
 
 import jax
 import jax.numpy as jnp
@@ -21,6 +21,7 @@ from rps_jax.control.learned import features
 from rps_jax.control.learned.features import TouchState
 from rps_jax.control.observation import Details, TaxelObservation, Twist
 from rps_jax.geometry.arrays import Pair, Parameter
+from rps_jax.spec import Spec, specs_of
 
 NetworkKind = Literal["mlp", "gru"]
 Shapes = dict[str, tuple[int, ...]]  # of weights, by name
@@ -33,16 +34,16 @@ class Network(NamedTuple):
     """Architecture of a network, without its weights. Static."""
 
     kind: NetworkKind = "gru"  # mlp: two hidden layers; gru: one, and a recurrent layer
-    width: int = 64  # pairs of units in a hidden layer
-    taxels: int = 42  # of the skin
-    hold: float = 0.2  # [s] duration of an action
+    width: Annotated[int, Spec("1", "pairs of units in a hidden layer")] = 64
+    taxels: Annotated[int, Spec("1", "taxels of the skin")] = 42
+    hold: Annotated[float, Spec("s", "duration of an action", gt=0, le=10)] = 0.2
 
     def check(self) -> Network:
         """Return the network; raise InputError for a field that is out of range."""
         errors.check_name("network", self.kind, get_args(NetworkKind))
         errors.check_count("network width", self.width, at_most=1024)
         errors.check_count("network taxels", self.taxels, at_most=10_000)
-        errors.check_finite("network hold", self.hold, above=0, at_most=10, unit="s")
+        specs_of(Network)["hold"].check("network hold", self.hold)
         return self
 
     @property
@@ -130,9 +131,11 @@ class PolicyState(NamedTuple):
     """State of a learned law between two control steps."""
 
     touch_state: TouchState
-    hidden: jax.Array  # (2, H) of the network; H = 0 for an MLP
-    action: jax.Array  # (3,) [1] the current one
-    waiting: jax.Array  # () [s] until the next decision
+    hidden: Annotated[
+        jax.Array, Spec("1", "hidden state of the network")
+    ]  # (2, H), H = 0 for an MLP
+    action: Annotated[jax.Array, Spec("1", "current action")]  # (3,)
+    waiting: Annotated[jax.Array, Spec("s", "time until the next decision")]  # ()
 
     @classmethod
     def init(cls, network: Network, dtype: jax.typing.DTypeLike = float) -> PolicyState:
@@ -149,9 +152,9 @@ class PolicyState(NamedTuple):
 class LearnedParams(NamedTuple):
     """Parameters of a learned law. The weights are no parameters, but constants of the program."""
 
-    d_success: Parameter = 0.05  # [m] target reached
-    v_max: Parameter = 0.05  # [m/s] bound on the speed
-    omega_max: Parameter = 0.15  # [rad/s] bound on |omega|
+    d_success: Annotated[Parameter, Spec("m", "target reached", gt=0)] = 0.05
+    v_max: Annotated[Parameter, Spec("m/s", "bound on the speed", gt=0)] = 0.05
+    omega_max: Annotated[Parameter, Spec("rad/s", "bound on |omega|", gt=0)] = 0.15
 
 
 def observe_sent(

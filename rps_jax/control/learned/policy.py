@@ -13,8 +13,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rps_jax import errors
-from rps_jax.control.base import Law, check_signs
+from rps_jax import errors, spec
+from rps_jax.control.base import Law
 from rps_jax.control.learned import network as networks
 from rps_jax.control.learned.network import LearnedParams, Network, Weights
 from rps_jax.record import files
@@ -101,7 +101,7 @@ def _check_weights(network: Network, weights: Weights) -> None:
             raise ValueError(f"its {name} must hold finite numbers of 32 bits")
 
 
-check = partial(check_signs, "learned", LearnedParams._fields)
+check = partial(spec.check, prefix="learned.")
 
 
 def build_law(policy: Policy) -> tuple[str, Law, LearnedParams]:

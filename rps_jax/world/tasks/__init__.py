@@ -16,21 +16,51 @@ from rps_jax.record import files
 from rps_jax.record.files import JsonObject
 from rps_jax.record.manifest import Stored
 from rps_jax.record.options import field_types, parse_changes
-from rps_jax.world.quantity import Quantity, declared, range_of
+from rps_jax.spec import Spec
+from rps_jax.world import streams
+from rps_jax.world.quantity import Quantity, declared, numbers_of, range_of
 from rps_jax.world.tasks.base import Task
 
 TASKS: dict[str, type[Task]] = {}  # by name
-for _file in sorted(x.name for x in pkgutil.iter_modules(__path__) if x.name != "base"):
-    _kind: type[Task] = importlib.import_module(f"{__name__}.{_file}").TASK
-    TASKS[_kind.kind] = _kind
+QUANTITIES: dict[str, Quantity] = {}  # drawn quantities of all tasks
+UNRANGED: set[str] = set()  # random numbers of all tasks without a range
+OUTCOMES: dict[str, Spec] = {}
+FAILURES: dict[str, str] = {}
 
-QUANTITIES: dict[str, Quantity] = {
-    name: quantity for kind in TASKS.values() for name, quantity in declared(kind).items()
-}
-# Columns of random numbers without ranges.
-MORE_NUMBERS = {name: i for kind in TASKS.values() for name, i in kind.MORE_NUMBERS.items()}
-OUTCOMES = {name: text for kind in TASKS.values() for name, text in kind.OUTCOMES.items()}
-FAILURES = {name: text for kind in TASKS.values() for name, text in kind.FAILURES.items()}
+
+def add(task: type[Task]) -> None:
+    """Add a class of tasks, and claim the names of its random numbers; see `register_task`."""
+    quantities = declared(task)
+    names = {*numbers_of(quantities), *task.NUMBERS}
+    for name in {*quantities, *names}:  # the first class that declares it owns it
+        owner = next(x for x in reversed(task.__mro__) if name in _names_of(x))
+        streams.claim(f"the task {getattr(owner, 'kind', '') or owner.__name__}", name)
+        new = quantities.get(name)
+        if owner is not task and new is not None and QUANTITIES.get(name, new) != new:
+            rule = f"{owner.__name__} declares it as {QUANTITIES[name]}; choose another name"
+            raise errors.not_allowed(f"quantity of the task {task.kind}", name, rule)
+    streams.claim("an outcome of tasks", *task.OUTCOMES)
+    for name, outcome in task.OUTCOMES.items():
+        if OUTCOMES.get(name, outcome) != outcome:
+            rule = f"another task has it as {OUTCOMES[name]}; choose another name"
+            raise errors.not_allowed(f"outcome of the task {task.kind}", name, rule)
+    TASKS[task.kind] = task
+    QUANTITIES.update(quantities)
+    UNRANGED.update(names - quantities.keys())
+    OUTCOMES.update(task.OUTCOMES)
+    FAILURES.update(task.FAILURES)
+
+
+def _names_of(kind: type) -> set[str]:
+    """Return the names that a class, or a base class of it, declares."""
+    if not issubclass(kind, Task):
+        return set()
+    return {*(quantities := declared(kind)), *numbers_of(quantities), *kind.NUMBERS}
+
+
+for _file in sorted(x.name for x in pkgutil.iter_modules(__path__) if x.name != "base"):
+    add(importlib.import_module(f"{__name__}.{_file}").TASK)
+PACKAGE_TASKS = tuple(TASKS)
 _SUBJECTS = {1: "the base ", 2: "the object "}
 
 # For errors: of ranges, of types, and of tuples of tuples by their sizes.

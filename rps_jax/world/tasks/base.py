@@ -19,6 +19,7 @@ from rps_jax.geometry.footprint import Footprint
 from rps_jax.record.files import Arrays
 from rps_jax.record.options import check_fields
 from rps_jax.robot.shell import Shell
+from rps_jax.spec import Spec
 from rps_jax.world.quantity import Range, check_ranges
 
 
@@ -79,13 +80,11 @@ class Task:
     """Declaration of a task: its ranges are fields, its bounds are in their declarations."""
 
     kind: str = ""  # name of the task
-    # Units and meanings of the outcomes that it adds.
-    OUTCOMES: ClassVar[dict[str, tuple[str, str]]] = {}
+    OUTCOMES: ClassVar[Mapping[str, Spec]] = {}  # those that it adds, by name
     HAS_TARGET: ClassVar[bool] = False  # whether trials end at the domain's targets
     # Names of which one identifies a mapping without a kind; `read` turns them into fields.
     MARKS: ClassVar[tuple[str, ...]] = ()
-    MORE_NUMBERS: ClassVar[dict[str, int]] = {}  # columns of random numbers without a range
-
+    NUMBERS: ClassVar[tuple[str, ...]] = ()  # names of random numbers without a range
     # Outcomes that are not 0 in a trial that the task has failed, 1 by the base and 2 by the
     # object, with the failure in words.
     FAILURES: ClassVar[dict[str, str]] = {}

@@ -8,10 +8,10 @@ by contact forces, and a trial fails where the base presses it into one.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable
+from collections.abc import Callable, Hashable, Mapping
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, ClassVar, Literal, NamedTuple, TypeVar
+from typing import Annotated, Any, ClassVar, Literal, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -26,7 +26,8 @@ from rps_jax.geometry.polyline import Polyline, distances
 from rps_jax.record.files import Arrays
 from rps_jax.record.options import option
 from rps_jax.robot.shell import Shell
-from rps_jax.world.quantity import Range, check_unused, drawn
+from rps_jax.spec import Spec
+from rps_jax.world.quantity import Quantity, Range, check_unused
 from rps_jax.world.tasks.base import Aim, CourseInputs, Positions
 from rps_jax.world.tasks.path import LOOKAHEAD, Path, PathCourse, PathProgress, turns_of, units_of
 
@@ -204,23 +205,30 @@ class Corridor(Path):
     """Follow a path between walls."""
 
     kind: str = "corridor"
-    OUTCOMES = Path.OUTCOMES | {
-        "clearance": (
-            "m",
-            "least distance of base and object from the walls, every eighth control step",
+    OUTCOMES: ClassVar[Mapping[str, Spec]] = {
+        **Path.OUTCOMES,
+        "clearance": Spec(
+            "m", "least distance of base and object from the walls, every eighth control step"
         ),
-        "wall_touch": ("1", "what touched a wall and ended the trial: 1 the base, 2 the object"),
-        "touch_x": ("m", "x of the touch in the world"),
-        "touch_y": ("m", "y of the touch in the world"),
+        "wall_touch": Spec(
+            "1", "what touched a wall and ended the trial: 1 the base, 2 the object"
+        ),
+        "touch_x": Spec("m", "x of the touch in the world"),
+        "touch_y": Spec("m", "y of the touch in the world"),
     }
 
     MARKS = ()
     FAILURES: ClassVar[dict[str, str]] = {"wall_touch": "touched a wall"}
 
-    lookahead: Range = drawn(Range(0.6, 0.6), *LOOKAHEAD)  # short, since long ones cut corners
-    width: Range = drawn(Range(1.4, 2.2), 59, "m", 0.3, 20, "width of the corridor", "course")
+    # Short, since long ones cut corners.
+    lookahead: Annotated[Range, LOOKAHEAD] = Range(0.6, 0.6)
+    width: Annotated[
+        Range, Quantity("m", "width of the corridor", ge=0.3, le=20, owner="course")
+    ] = Range(1.4, 2.2)
     doors: int = option(0, 0, 4)  # narrower places along the path
-    door_width: Range = drawn(Range(0.8, 0.8), 60, "1", 0.1, 1, "doors, of the width", "course")
+    door_width: Annotated[
+        Range, Quantity("1", "doors, of the width", ge=0.1, le=1, owner="course")
+    ] = Range(0.8, 0.8)
     touch: Literal["nothing", "object"] = "nothing"  # what may touch walls
     friction_wall: float = option(0.3, 0, 10)  # [1] of an object that may touch them
 

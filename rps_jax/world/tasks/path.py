@@ -6,9 +6,9 @@ laws do not change. A trial succeeds at the path's end.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable
+from collections.abc import Callable, Hashable, Mapping
 from dataclasses import dataclass
-from typing import Any, ClassVar, NamedTuple
+from typing import Annotated, Any, ClassVar, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -20,10 +20,11 @@ from rps_jax.geometry.arrays import Array, Entries, Floats, Int, namespace_of
 from rps_jax.geometry.polyline import Polyline
 from rps_jax.record.files import Arrays
 from rps_jax.robot.shell import Shell
-from rps_jax.world.quantity import Range, check_unused, drawn
+from rps_jax.spec import Spec
+from rps_jax.world.quantity import Quantity, Range, check_unused
 from rps_jax.world.tasks.base import Aim, CourseInputs, Positions, Task
 
-LOOKAHEAD = 49, "m", 0.05, 5, "lookahead on the path", "course"  # as `drawn` takes it
+LOOKAHEAD = Quantity("m", "lookahead on the path", ge=0.05, le=5, owner="course")
 _SEGMENTS = 8  # of a drawn path
 _PER_SPAN = 6  # segments of a spline between two waypoints
 _REACH = 1.0  # [m] along the path, either way, in which the nearest point is sought
@@ -116,15 +117,15 @@ class PathCourse(NamedTuple):
 class Following(Task):
     """Tasks that follow a path; their courses are a `PathCourse`, or have it as `path`."""
 
-    OUTCOMES: ClassVar[dict[str, tuple[str, str]]] = {
-        "progress": ("1", "share of the path that the contact point has passed"),
-        "error_mean": ("m", "mean cross-track error of the contact point"),
-        "error_95": ("m", "95 % quantile over time of the cross-track error"),
-        "error_max": ("m", "largest cross-track error"),
+    OUTCOMES: ClassVar[Mapping[str, Spec]] = {
+        "progress": Spec("1", "share of the path that the contact point has passed"),
+        "error_mean": Spec("m", "mean cross-track error of the contact point"),
+        "error_95": Spec("m", "95 % quantile over time of the cross-track error"),
+        "error_max": Spec("m", "largest cross-track error"),
     }
 
     # Along the path, from its nearest point to the law's target.
-    lookahead: Range = drawn(Range(1.6, 1.6), *LOOKAHEAD)
+    lookahead: Annotated[Range, LOOKAHEAD] = Range(1.6, 1.6)
 
     def measures(self, course: Any) -> Arrays:
         """Return length, number of turns and their mean angle."""
@@ -141,13 +142,18 @@ class Path(Following):
 
     kind: str = "path"
     MARKS = ("waypoints",)
-    MORE_NUMBERS: ClassVar[dict[str, int]] = {
-        f"turn_angle_{i}": 52 + i for i in range(_SEGMENTS - 1)
-    }
+    NUMBERS = tuple(f"turn_angle_{i}" for i in range(_SEGMENTS - 1))
 
-    length: Range = drawn(Range(4, 8), 50, "m", 0.5, 40, "length of the path", "course")
-    turns: Range = drawn(Range(1, 3), 51, "1", 0, _SEGMENTS - 1, "number of turns", "course", True)
-    turn_angle: Range = drawn(Range(0.3, 0.8), 52, "rad", 0, 1.6, "angle of the turns", "course")
+    length: Annotated[Range, Quantity("m", "length of the path", ge=0.5, le=40, owner="course")] = (
+        Range(4, 8)
+    )
+    turns: Annotated[
+        Range,
+        Quantity("1", "number of turns", ge=0, le=_SEGMENTS - 1, owner="course", jumps=True),
+    ] = Range(1, 3)
+    turn_angle: Annotated[
+        Range, Quantity("rad", "angle of the turns", ge=0, le=1.6, owner="course", numbers=NUMBERS)
+    ] = Range(0.3, 0.8)
     # [m] in the world, where the base starts at the origin; then nothing but the lookahead is drawn
     waypoints: tuple[tuple[float, float], ...] = ()
     spline: bool = False  # whether a cubic spline joins the waypoints, instead of straight lines
@@ -155,7 +161,7 @@ class Path(Following):
     @property
     def idle(self) -> frozenset[str]:
         """Names of the quantities that are not drawn; each turn draws its angle."""
-        unused = ("length", "turns", *self.MORE_NUMBERS) if self.waypoints else ()
+        unused = ("length", "turns", *self.NUMBERS) if self.waypoints else ()
         return frozenset(("turn_angle", *unused))
 
     @property
@@ -218,7 +224,7 @@ class Path(Following):
         count = np.minimum(np.floor(low + (high + 1 - low) * u["turns"]), high)[:, None]
         # A half of each random number is the sign of a turn. Beyond 90 degrees it turns back.
         heading, headings = np.zeros(front.size), [np.zeros(front.size)]
-        for name in self.MORE_NUMBERS:
+        for name in self.NUMBERS:
             angle = self.turn_angle.at((2 * u[name]) % 1) * np.where(u[name] < 0.5, -1, 1)
             angle = np.where(np.abs(heading + angle) > np.pi / 2 + 1e-9, -angle, angle)
             heading = heading + angle

@@ -13,7 +13,7 @@ import warnings
 from collections.abc import Callable, Hashable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Annotated, Any
 
 import contourpy
 import jax.numpy as jnp
@@ -28,7 +28,7 @@ from rps_jax.geometry.polyline import Polyline, distances, is_inside, to_segment
 from rps_jax.record import files
 from rps_jax.record.options import option
 from rps_jax.robot.shell import Shell
-from rps_jax.world.quantity import Range, drawn
+from rps_jax.world.quantity import Quantity, Range
 from rps_jax.world.tasks.base import CourseInputs
 from rps_jax.world.tasks.corridor import Corridor, CorridorCourse
 from rps_jax.world.tasks.path import LOOKAHEAD, Following, PathCourse
@@ -58,11 +58,12 @@ class Rooms(Following):
     OUTCOMES = Corridor.OUTCOMES
     FAILURES = Corridor.FAILURES
     MARKS = ("polygons", "outline", *_ROS, "tolerance", *_IGNORED)
-    # Tasks may share columns of random numbers: a world has one task.
-    MORE_NUMBERS: ClassVar[dict[str, int]] = {"route": 58}
+    NUMBERS = ("route",)
 
-    lookahead: Range = drawn(Corridor.lookahead, *LOOKAHEAD)
-    scale: Range = drawn(Range(1, 1), 59, "1", 0.1, 10, "scale of the map", "course")
+    lookahead: Annotated[Range, LOOKAHEAD] = Corridor.lookahead
+    scale: Annotated[Range, Quantity("1", "scale of the map", ge=0.1, le=10, owner="course")] = (
+        Range(1, 1)
+    )
     # [m] both ends of each edge of closed outlines
     walls: tuple[tuple[float, float], ...] = option((), -1000, 1000, unit="m")
     # [m, m, rad] of the base, and [m] of the contact; of several, each world draws one of each

@@ -13,12 +13,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from rps_jax import Observation
-from rps_jax.control import registry
 from rps_jax.control.observation import with_base
-from rps_jax.geometry.polyline import Polyline
+from rps_jax.control.registry import check_drive
+from rps_jax.laws import law_of, resolve_law
 from rps_jax.robot.robot import parse_robot
-from rps_jax.robot.skin import CapacitiveSkin
-from rps_jax.world.tasks.path import PathCourse
+from rps_jax.worlds import CapacitiveSkin, PathCourse, Polyline
 
 _VERTICES = 1024  # of a path, at most
 
@@ -62,9 +61,9 @@ class Controller:
         The skin has the shell of the base; `robot` is the base itself, whose drive the law knows.
         """
         self.limits, self._skin, self._robot = limits, skin, parse_robot(robot)
-        self._params = registry.resolve_law(law)[1]
-        registry.check_drive(self._params, self._robot.drive)
-        self._law = registry.law_of(self._params)
+        self._params = resolve_law(law)[1]
+        check_drive(self._params, self._robot.drive)
+        self._law = law_of(self._params)
         self._scan, self._step = jax.jit(skin.read), jax.jit(self._law.step)
         self._follow = jax.jit(PathCourse.follow)
         self.reset()
