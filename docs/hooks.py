@@ -89,6 +89,7 @@ TABS: dict[str, list[Any]] = {
         "fit",
         "engines",
         "fidelity",
+        "docs/environments.md",
         "docs/mjx_gradients.md",
     ],
     "Studies": ["sweeps/README.md"],

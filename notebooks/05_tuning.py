@@ -210,5 +210,5 @@ drawing.races(logs)
 # One step by gradients gains as much as the first generation of evolution, at equal cost. Further
 # steps by gradients gain nothing and steer ever more, perhaps because 8 s do not contain the later
 # effect on the contact. Evolution that continues from there, with a small spread, needs many
-# generations to improve. Today `rps tune grad` follows slopes of whole trials instead:
-# `sweeps/gradients` has its race.
+# generations to improve. Today `rps tune grad` follows derivatives of windows with a value function
+# that knows failures, and then slopes of whole trials. `sweeps/gradients` has a race of slopes.

@@ -142,9 +142,11 @@ print(f"median error {np.median(error):.4f}, in {np.sum(error < 2 * precision**-
 # %% [markdown]
 # ## Tuning
 #
-# Derivatives of short windows do not tune a law: windows do not contain whether a push fails later.
-# `rps tune grad` follows slopes of whole trials along random steps instead, and `rps tune es`
-# evolution ([the race](../sweeps/gradients/README.md)). Success in held-out worlds by number of
+# Derivatives of short windows alone do not tune a law: windows do not contain whether a push fails
+# later. `rps tune grad` adds a value function of their last states, which is fitted to whole trials
+# with their failures, and after some steps it follows slopes of whole trials along random steps.
+# `rps tune es` is evolution, or these slopes alone with `--estimator antithetic`
+# ([the race](../sweeps/gradients/README.md)). Success in held-out worlds by number of
 # tuned parameters, after equal wall time, from <!-- cell: gradients_race |  | success, mean -->89.0 %<!-- end --> at the
 # start:
 #

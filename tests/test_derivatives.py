@@ -1,22 +1,29 @@
 """Gradients by laws and worlds: exact, labelled, and refused where they do not exist."""
 
+import contextlib
 import re
 import warnings
 from dataclasses import replace
+from functools import partial
 from types import SimpleNamespace
 from unittest import mock
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from helpers import ROOT, refusals, refusing, row
 from numpy.testing import assert_allclose
 
 import rps_jax
+from rps_jax import engines
 from rps_jax.control.laws.rps import RPSParams
+from rps_jax.control.registry import LAWS, law_of
 from rps_jax.engines import quasistatic
-from rps_jax.trials import trajectory
+from rps_jax.errors import InputError
+from rps_jax.trials import trajectory, trial
 from rps_jax.trials.setting import Setting
+from rps_jax.trials.trajectory import control_loop
 from rps_jax.tuning import derivatives
 from rps_jax.world import draws
 from rps_jax.world.domain import PERFECT, QUANTITIES, VELOCITY_ERRORS, Range, parse_domain
@@ -176,7 +183,7 @@ def test_a_kink_of_the_world_has_no_derivative_and_is_told():
         square, "fused", coordinates, np.ones(2, bool), bends, gradient, bends
     )
     notes = list(notes)
-    assert "No world has a finite derivative, so the mean is NaN: aspect." in notes
+    assert "No world of 3 has a finite derivative, so the mean is NaN: aspect." in notes
     assert [x for x in notes if "kink" in x] == [
         "No derivatives in worlds whose numbers have a kink (see finite): aspect."
     ]
@@ -301,8 +308,9 @@ def test_what_has_no_gradient_is_refused(changes, message):
 )
 def test_a_score_must_return_a_number(score, message):
     snapshots = SimpleNamespace(done=np.zeros(5, bool))
-    with refusing(message):
-        derivatives._score(score, QUASISTATIC, snapshots, RPSParams())
+    options = derivatives._Options(score, 5, QUASISTATIC, False, False)
+    with pytest.raises(rps_jax.InputError, match=message):
+        derivatives._score(options, snapshots)
 
 
 @pytest.mark.parametrize(
@@ -336,3 +344,143 @@ def test_a_law_with_arrays_has_a_number_for_each_entry():
     assert labels == ["K_h[0,0]", "K_h[1,0]", "L"]
     units = [x.unit for x in derivatives.coordinates_of(("K_h", "L", "K_v"), RPSParams(), TOUCHING)]
     assert units == ["1", "m", "1/s"]
+
+
+# --- scores and checks -----------------------------------------------------------------------
+
+DRUMS = {"domain": TOUCHING, "worlds": 4, "setting": QUASISTATIC, "horizon": 0.2}
+
+
+def test_a_gradient_is_useful_if_it_predicts_a_change_of_one_percent():
+    # v^2 changes by 2.01 %, and v^40 by 48.9 % where its gradient says 40 %.
+    def score(trajectory, power):
+        return (20 * trajectory.params.v_max) ** power
+
+    for power, useful, ratio in ((2, 1.0, 2.01 / 2), (40, 0.0, 48.886 / 40)):
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            results = rps_jax.value_and_grad(score, wrt="v_max", args=(power,), **DRUMS)
+        assert results.useful.values.tolist() == [[useful]]
+        np.testing.assert_allclose(results.secant / results.gradient, ratio, rtol=1e-3)
+        assert any("do not predict the effect" in str(x.message) for x in caught) == (not useful)
+
+
+def test_other_arguments_and_another_seed_compile_nothing_and_more_is_returned():
+    def score(trajectory, goal):
+        distance = final_distance(trajectory) - goal["distance"]
+        return distance, {"end": trajectory.qpos[-1], "radius": trajectory.world.footprint.radius}
+
+    def value(goal, seed):
+        options = DRUMS | {"has_aux": True, "setting": Setting("quasistatic", seed=seed)}
+        results, aux = rps_jax.value_and_grad(
+            score, wrt="v_max", args=({"distance": goal},), **options
+        )
+        return results.value.values, aux
+
+    first, aux = value(0.0, 0)
+    count = derivatives._value_and_slopes._cache_size()
+    np.testing.assert_allclose(value(0.5, 0)[0], first - 0.5, rtol=1e-5)
+    assert (value(0.0, 1)[0] != first).all()
+    assert derivatives._value_and_slopes._cache_size() == count
+    assert aux["end"].shape == (1, 4, 10)
+    assert (aux["radius"] > 0).all()
+
+
+def test_a_score_sees_velocities_forces_and_the_state_of_the_law():
+    def score(x):
+        seen = {"executed": x.executed, "qpos": x.state.qpos, "force": x.force}
+        return jnp.sum(x.executed[:, 0]), seen | {"l_th": x.state.law_state.l_th}
+
+    options = DRUMS | {"setting": Setting("fused"), "horizon": 0.4, "has_aux": True}
+    results, aux = rps_jax.value_and_grad(score, wrt="v_max", states=True, **options)
+    steps = np.diff(aux["qpos"][0], axis=1)
+    way = np.linalg.norm(steps[..., :2], axis=-1) / 0.02
+    speed = np.linalg.norm(aux["executed"][0][..., :2], axis=-1)[:, 1:]
+    np.testing.assert_allclose(way, speed, atol=3e-4)
+    assert (results.gradient > 0).all()
+    assert aux["force"][0, ..., 0].min(axis=1).max() < -1.0  # [N] each object resists
+    assert (aux["l_th"] > 0).all()
+    with pytest.raises(InputError, match=r"states = False .* the score needs states=True"):
+        rps_jax.value_and_grad(lambda x: x.executed[-1, 0], wrt="v_max", **DRUMS)
+
+
+def test_a_check_compares_with_central_differences_in_double_precision():
+    iterations = mock.patch.multiple(quasistatic, _ITERATIONS=14, _SHARP=7)
+    with iterations, warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        results = rps_jax.value_and_grad(final_distance, wrt=("v_max", "target", "noise"), **DRUMS)
+        checked = results.check(2)
+    assert checked.error.shape == (1, 2, 4)
+    assert checked.error.max() < 1e-4
+    same = results.gradient.isel(world=[0, 1])
+    np.testing.assert_allclose(checked.gradient, same, rtol=2e-2, atol=1e-5)
+
+
+# --- continued rollouts --------------------------------------------------------------------
+
+TRACED = [name for name in engines.names() if engines.get(name).traced]
+NOISY = "wide,objects=random_cylinder,gap=0:0.01"  # with latencies and drift of the odometry
+BY_CLASS = {type(params): name for name, params in LAWS.items()}
+
+
+def halves_and_whole(setting, domain, law, smooth=False):
+    """Return the trajectories of two joined halves of 0.6 s, and of one whole of 1.2 s."""
+    batch = rps_jax.draw_worlds(domain, 2, setting=setting)
+
+    @partial(jax.jit, static_argnums=2)
+    def run(worlds, state, horizon):
+        options = {"horizon": horizon, "smooth": smooth, "return_state": True}
+        route = partial(rps_jax.rollout, stage=batch.stage, setting=setting, **options)
+        return jax.vmap(lambda world, x: route(world, law, start=x))(worlds, state)
+
+    loop = control_loop(law, setting, smooth=smooth)
+    fresh = jax.vmap(lambda world: trial.start(world, law, loop.law))(batch.worlds)
+    first, state = run(batch.worlds, fresh, 0.6)
+    second, last = run(batch.worlds, state, 0.6)
+    joined = jax.tree.map(lambda *x: np.concatenate(x, axis=1), first, second)
+    return (joined, last), run(batch.worlds, fresh, 1.2)
+
+
+@pytest.mark.parametrize("name", BY_CLASS.values())
+def test_a_continued_rollout_of_any_law_is_the_whole_one_bit_for_bit(name):
+    law = LAWS[name]
+    engine = "fused" if law_of(law).senses == "force" else "quasistatic"
+    halves, whole = halves_and_whole(rps_jax.Setting(engine), NOISY, law)
+    jax.tree.map(np.testing.assert_array_equal, halves, whole)
+
+
+@pytest.mark.parametrize(("engine", "smooth"), [*((x, False) for x in TRACED), ("fused", True)])
+def test_a_continued_rollout_in_any_engine_is_the_whole_one_bit_for_bit(engine, smooth):
+    domain = "real,objects=random_box,gap=0:0.01" if engine != "quasistatic" else NOISY
+    law = LAWS["rps_plus"]
+    halves, whole = halves_and_whole(rps_jax.Setting(engine), domain, law, smooth)
+    jax.tree.map(np.testing.assert_array_equal, halves, whole)
+
+
+def test_a_state_of_another_law_is_refused():
+    setting = rps_jax.Setting("quasistatic")
+    batch = rps_jax.draw_worlds(NOISY, 1, setting=setting)
+    world, pursuit = row(batch.worlds, 0), LAWS["pursuit"]
+    start = trial.start(world, LAWS["rps"])
+    message = "start = .* is not allowed: give the last state of a rollout of the same law"
+    with pytest.raises(InputError, match=message):
+        rps_jax.rollout(world, pursuit, batch.stage, setting, start=start)
+
+
+# --- the page of environments --------------------------------------------------------------
+
+
+@pytest.mark.slow
+def test_the_programs_of_the_page_push_boxes():
+    """Raw MJX, its engine and the fused one; the latter two step the same worlds."""
+    page = (ROOT / "docs" / "environments.md").read_text()
+    names = {}
+    with contextlib.chdir(ROOT):
+        for code in re.findall(r"```python\n(.*?)```", page, re.DOTALL):
+            exec(code, names)
+    poses = np.asarray(names["poses"])
+    moved = poses[:, -1, :5] - poses[:, 0, :5]  # [m] in a second, in which some realign
+    assert (moved[:, 0] > 0.002).all()
+    assert moved[:, 0].max() > 0.02
+    assert (np.linalg.norm(moved[:, 3:], axis=1) > 1e-3).all()
+    np.testing.assert_allclose(names["in_mjx"], names["in_fused"], atol=5e-3)

@@ -1,6 +1,7 @@
 """Tuning: the bounded map, the objective, evolution, and resumed runs."""
 
 import json
+from typing import Any, NamedTuple
 from unittest import mock
 
 import jax.numpy as jnp
@@ -12,8 +13,12 @@ from helpers import rps as command
 from numpy.random import default_rng
 from numpy.testing import assert_allclose, assert_array_equal
 
+from rps_jax.control import registry
+from rps_jax.control.base import Bound, Law
 from rps_jax.control.laws import rps
 from rps_jax.control.laws.rps import BOUNDS, RPSParams
+from rps_jax.control.observation import Details, Twist
+from rps_jax.errors import InputError
 from rps_jax.record import files
 from rps_jax.record.checkpoint import Checkpoints
 from rps_jax.runs import evaluate
@@ -76,6 +81,58 @@ def test_parameters_that_are_not_tuned_stay():
     params = Space(("L",)).params(jnp.array([1.7]))
     assert_allclose(params._replace(L=PAPER.L), PAPER, rtol=1e-6)
     assert params.L != PAPER.L
+
+
+class Table(NamedTuple):
+    """Parameters of a law with a table."""
+
+    gain: float = 1.0
+    table: Any = np.full((2, 3), 0.5)
+    d_success: float = 0.05
+
+
+@pytest.fixture
+def table_law():
+    def step(params, state, obs):
+        speed = 0.05 * params.gain * jnp.mean(params.table)
+        return state, Twist(speed, 0.0, 0.0), Details.from_obs(obs)
+
+    bounds = {"table": Bound(0.1, 10.0, log=True), "gain": Bound(0.0, 2.0)}
+    registry.register_law("tabled", Law(lambda params: (), step, bounds=bounds), Table())
+    yield Table()
+    kind = registry.LAWS.pop("tabled")
+    del registry._LAWS_BY_CLASS[type(kind)]
+
+
+def test_each_entry_of_a_table_is_a_coordinate(table_law, tmp_path):
+    # log(0.5) between log(0.1) and log(10): logit(log(5) / log(100)).
+    space = Space(("table", "gain"), table_law)
+    share = np.log(5) / np.log(100)
+    expected = [*[np.log(share / (1 - share))] * 6, 0.0]
+    vector = np.asarray(space.vector(table_law))
+    np.testing.assert_allclose(vector, expected, rtol=1e-5)
+    assert list(space.parameters)[4:] == ["table[1,1]", "table[1,2]", "gain"]
+    vectors = vector + np.arange(21.0).reshape(3, 7) / 10
+    params = space.params(vectors)
+    assert params.table.shape == (3, 2, 3)
+    assert params.gain.shape == (3,)
+    np.testing.assert_allclose(space.vector(params), vectors, atol=1e-5)
+    (tmp_path / "t.json").write_text(json.dumps(space.changed_values(vectors[2])))
+    _, written = registry.parse_law(f"tabled,{tmp_path / 't.json'}")
+    np.testing.assert_allclose(written.table, params.table[2], rtol=1e-6)
+    (tmp_path / "t.json").write_text(json.dumps({"table": [1, 2, 3]}))
+    with pytest.raises(InputError, match=r"table = of shape \(3,\) .* give numbers \(2, 3\)"):
+        registry.parse_law(f"tabled,{tmp_path / 't.json'}")
+
+
+@pytest.mark.slow
+def test_a_table_of_a_custom_law_is_tuned_by_derivatives(table_law):
+    options = {"worlds": 2, "validation": 2, "trials": 2, "windows": 4, "checks": 2, "slots": 8}
+    setting = Setting("quasistatic", rules=Rules(horizon=4.0, max_lost=4.0))
+    question = TuneGrad("tabled", objects=("random_cylinder",), setting=setting, steps=2, **options)
+    results = question()
+    assert results.sizes["parameter"] == 7
+    assert (results.params[1] != results.params[0]).any()
 
 
 def test_scores_worked_out_by_hand():
@@ -222,9 +279,9 @@ def evolution(generations=6, **options):
 
 
 def descents(generations=6):
-    """Return descents by antithetic steps; worlds need no derivatives."""
-    options = {"steps": 5, "starts": 2, "pairs": 3}
-    return TuneGrad("rps", **options, **SMALL), generations
+    """Return a descent by antithetic steps; worlds need no derivatives."""
+    options = {"estimator": "antithetic", "generations": 5, "pairs": 3}
+    return TuneES("rps", **options, **SMALL), generations
 
 
 def tune(folder, search):
@@ -339,12 +396,12 @@ def test_another_configuration_is_refused_with_the_difference(tmp_path, pretende
     assert first.params.equals(longer.params[:1])
     with refusing(r"spread = 0.5 there, 0.4 asked for"):
         TuneES("rps", **calls, spread=0.4)()
-    with refusing("holds another run"):
-        TuneGrad("rps", **SMALL, out=tmp_path)()
+    with pytest.raises(InputError, match="holds another run"):
+        TuneES("rps", **SMALL, estimator="antithetic", out=tmp_path)()
 
 
 def test_the_report_of_a_descent_tells_its_times_and_parameters(pretended):
-    calls = TuneGrad("rps", **SMALL, steps=2)
+    calls = TuneES("rps", **SMALL, estimator="antithetic", generations=2)
     (section,) = calls.report(calls(), Run(None, no_progress))
     assert "after" in section.text
     assert "simulated" in section.text

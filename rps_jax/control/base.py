@@ -61,6 +61,12 @@ def named_leaves(tree: object, is_leaf: Callable[[object], bool] | None = None) 
     return {jax.tree_util.keystr(path, simple=True, separator="."): leaf for path, leaf in leaves}
 
 
+def entries(name: str, leaf: Leaf) -> list[tuple[str, tuple[int, ...]]]:
+    """Return label and index of each entry of a leaf: `K` of a number, `K[0,1]` of an array."""
+    indices = np.ndindex(np.shape(leaf))
+    return [(f"{name}[{','.join(map(str, at))}]" if at else name, at) for at in indices]
+
+
 def unit_of_leaf(params: object, path: str) -> str:
     """Return the declared unit of a parameter; empty if it has none."""
     declaration = spec_at(params, path)

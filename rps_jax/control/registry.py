@@ -244,7 +244,8 @@ def parse_law(text: str) -> tuple[str, LawParams]:
     """
     label, params = _parse_head(str(text).partition(",")[0])
     head, changes = parse_changes("law", str(text))
-    values = {name: errors.check_number(f"{head} {name}", x) for name, x in changes.items()}
+    shapes = {name: np.shape(leaf) for name, leaf in named_leaves(params).items()}
+    values = {k: _parse_leaf(f"{head} {k}", x, shapes.get(k, ())) for k, x in changes.items()}
     words = str(text).split(",")[1:]
     parts = (Path(x).stem if files.suffix_of(x) == ".json" else x for x in words)
     label = ",".join([label, *parts])
@@ -259,6 +260,16 @@ def parse_law(text: str) -> tuple[str, LawParams]:
                 )
                 raise errors.not_allowed("law", text, rule)
     return label, changed
+
+
+def _parse_leaf(field: str, value: Any, shape: tuple[int, ...]) -> Any:
+    """Return a number, or an array of this shape of nested lists, or raise InputError."""
+    if not shape:
+        return errors.check_number(field, value)
+    several = np.array(value, object)
+    if several.shape != shape:
+        raise errors.not_allowed(field, f"of shape {several.shape}", f"give numbers {shape}")
+    return np.reshape([errors.check_number(field, x) for x in several.flat], shape)
 
 
 def _parse_head(text: str) -> tuple[str, LawParams]:

@@ -7,7 +7,7 @@ the size that data sheets of wrist sensors give.
 
 from __future__ import annotations
 
-from typing import Annotated, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -61,7 +61,12 @@ def observe_pose(
     delayed = poses[_steps_of(odometry.pose_latency, period)]
     noise = jax.random.fold_in(jax.random.fold_in(key, _ODOMETRY), steps)
     sigma = jnp.stack([odometry.pose_noise] * 2 + [odometry.yaw_noise])
-    return poses, delayed + sigma * jax.random.normal(noise, (3,), pose.dtype)
+    return poses, delayed + sigma * normal(noise, (3,), pose.dtype)
+
+
+def normal(key: jax.Array, shape: tuple[int, ...], dtype: Any) -> jax.Array:
+    """Return normal numbers that are equal in single and double precision."""
+    return jax.random.normal(key, shape, jnp.float32).astype(dtype)
 
 
 def delay_twist(odometry: Odometry, twists: jax.Array, twist: jax.Array, period: float) -> Pair:
@@ -103,7 +108,7 @@ class LoadCell(NamedTuple):
         """
         noise = jax.random.fold_in(jax.random.fold_in(key, _FORCE), steps)
         signal = load.signal
-        raw = load.wrench[:2] + self.noise * jax.random.normal(noise, (2,), signal.dtype)
+        raw = load.wrench[:2] + self.noise * normal(noise, (2,), signal.dtype)
         signal = signal + (1 - jnp.exp(-period / self.time_constant)) * (raw - signal)
         above = jnp.sum(signal * signal) >= self.threshold**2
         return load._replace(signal=signal), jnp.where(above, signal, 0.0)

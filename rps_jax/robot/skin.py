@@ -40,6 +40,7 @@ from rps_jax.geometry.arrays import (
 from rps_jax.geometry.footprint import Footprint
 from rps_jax.record.files import Arrays
 from rps_jax.record.options import parse_changes
+from rps_jax.robot.base import normal
 from rps_jax.robot.shell import HALF_WIDTH, Row, Shell
 from rps_jax.spec import Spec
 
@@ -231,8 +232,8 @@ class CapacitiveSkin(NamedTuple):
         """Draw the gain of each taxel, and whether it is dead."""
         key, key_gain, key_dead = jax.random.split(key, 3)
         n = self.shell.count
-        gain = 1 + self.gain_spread * jax.random.normal(key_gain, (n,))
-        alive = jax.random.uniform(key_dead, (n,)) >= self.dead_share
+        gain = 1 + self.gain_spread * normal(key_gain, (n,), float)
+        alive = jax.random.uniform(key_dead, (n,), jnp.float32) >= self.dead_share
         return SkinState(key, jnp.zeros(n), gain, alive)
 
     def compression(self, footprint: Footprint) -> Float[Array, "T S"]:
@@ -249,7 +250,7 @@ class CapacitiveSkin(NamedTuple):
         # A loop over samples: reductions of such short axes are slow on every device.
         change = sum(share[:, i] for i in range(self.shell.samples)) / self.shell.samples - 1.0
         key, key_noise = jax.random.split(state.key)
-        noise = self.noise * jax.random.normal(key_noise, change.shape, change.dtype)
+        noise = self.noise * normal(key_noise, change.shape, change.dtype)
         return state._replace(key=key), state.gain * change + noise
 
     def _filtered(self, state: SkinState, raw: jax.Array, period: Scalar) -> SkinState:

@@ -128,6 +128,7 @@ class Command(Generic[T]):
     """Callback that receives the progress instead of a bar."""
 
     QUICK: ClassVar[Mapping[str, Any]] = {}  # values of `quick`, by the field's name
+    MOVED: ClassVar[Mapping[str, str]] = {}  # what replaces a former flag, by the flag
     RENAMED: ClassVar[Mapping[str, str]] = {}  # present names of fields by their former ones
     # Fields of a class on which the answer does not depend, beside those of its base classes.
     IGNORED_FIELDS: ClassVar[tuple[str, ...]] = ("out", "progress", "report_to")

@@ -9,6 +9,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -23,7 +25,7 @@ from rps_jax.robot.robot import RobotLike
 from rps_jax.trials import trial
 from rps_jax.trials.jobs import WorldBatch
 from rps_jax.trials.setting import Setting
-from rps_jax.trials.trial import ControlLoop, Snapshot, World
+from rps_jax.trials.trial import ControlLoop, Trial, World
 from rps_jax.trials.worlds import drawn_worlds, soften_skins
 from rps_jax.world import draws
 from rps_jax.world.domain import DomainLike, parse_domain
@@ -82,7 +84,9 @@ def rollout(
     *,
     horizon: float = 2.0,
     smooth: bool = False,
-) -> Snapshot:
+    start: Trial | None = None,
+    return_state: bool = False,
+) -> Any:  # `Snapshot`, or (`Snapshot`, `Trial`)
     """Return the trajectory of one world, as a pure function of the world and the law's parameters.
 
     Derivatives are those of the engine, by any number of the world or of the parameters. They are
@@ -97,9 +101,15 @@ def rollout(
       horizon: duration [s].
       smooth: whether law and skin have their smooth forms: `registry.smooth_law` and a temperature
         of the skin, which is `skin.SMOOTH` unless the world has one.
+      start: last state of another rollout of this law in this world, which is continued with the
+        same bits: poses, velocities, and the states of law, skin, odometry and drive. (Programs
+        that differ in more than the horizon may round differently.) A state of the law itself also
+        starts its smooth form. None: the trial starts.
+      return_state: whether the last state is returned, too.
 
     Returns:
       Snapshots (T, ...), one for each control step; after the trial's end they repeat the last one.
+      With `return_state`, these and the last state.
 
     Raises:
       InputError: an argument is not allowed, the law has no smooth form, or the engine is not
@@ -126,11 +136,22 @@ def rollout(
     _check_scalars(params)
     engine.check_stage(stage)
     world = soften_skins(world) if smooth else world
-    world, params = engine.guard_derivatives((world, params))
-    start = trial.start(world, params, loop.law)
-    inputs = jax.tree.map(lambda x: jnp.asarray(x)[None], (world, params, start))
-    _, snapshots = trial.unroll(stage, *inputs, loop=loop, steps=steps, mapped=native.mapped)
-    return jax.tree.map(lambda x: x[:, 0], snapshots)
+    world, params, start = engine.guard_derivatives((world, params, start))
+    fresh = trial.start(world, params, loop.law)
+    first = fresh if start is None else _resumed(start, fresh)
+    inputs = jax.tree.map(lambda x: jnp.asarray(x)[None], (world, params, first))
+    last, snapshots = trial.unroll(stage, *inputs, loop=loop, steps=steps, mapped=native.mapped)
+    snapshots = jax.tree.map(lambda x: x[:, 0], snapshots)
+    return (snapshots, jax.tree.map(lambda x: x[0], last)) if return_state else snapshots
+
+
+def _resumed(start: Trial, fresh: Trial) -> Trial:
+    """Return a state with the number types of a fresh one, or raise InputError."""
+    shapes = [[np.shape(x) for x in jax.tree.leaves(state)] for state in (start, fresh)]
+    if jax.tree.structure(start) != jax.tree.structure(fresh) or shapes[0] != shapes[1]:
+        rule = "give the last state of a rollout of the same law in the same world"
+        raise errors.not_allowed("start", f"a state of shapes {shapes[0]}", rule)
+    return jax.tree.map(lambda x, y: jnp.asarray(x, y.dtype), start, fresh)
 
 
 def _check_scalars(params: LawParams) -> None:

@@ -361,7 +361,7 @@ def perceive(
     if law.senses == "taxels":
         skin = world.skin, judged.skin, outline(world, judged.qpos)
         obs = features.taxel_observation(obs, measured.reading, *skin)
-    if judged.load is not None:
+    if judged.load is not None and law.senses == "force":
         load, force = law.cell.read(
             judged.load, world.key, judged.steps, loop.physics.control_period
         )
@@ -445,7 +445,7 @@ def _solved_step(
 ) -> tuple[tuple[Trial, Snapshot], Any]:
     """Run `control_step` with the solutions of `ControlPeriod`; return also those of `Driven`."""
     decided, twists, snapshots = mapped(decide, (0, 0, 0, None))(worlds, params, trials, loop)
-    force = loop.law.senses == "force"
+    force = trials.load is not None
     period = ControlPeriod(twists, loop.physics, pushing(worlds), force, solutions)
     driven = stage.drive(worlds.fields, motion(decided), period)
     result = driven._replace(solutions=None)
@@ -461,19 +461,26 @@ def unroll(
     loop: ControlLoop,
     steps: int,
     mapped: Callable[..., Any] = jax.vmap,
-) -> tuple[Trial, Snapshot]:
+    states: bool = False,
+) -> tuple[Trial, Any]:
     """Run `steps` control steps of a batch; return also snapshots (steps, B, ...).
 
-    In reverse mode it stores the state of each step, some 1 kB. `mapped` is that of
-    `control_step`; with `native.mapped`, derivatives are fastest.
+    With `states`, these are pairs of a snapshot and the state after the step. In reverse mode it
+    stores the state of each step, some 1 kB. `mapped` is that of `control_step`; with
+    `native.mapped`, derivatives are fastest.
     """
 
-    def single(trial: Trial, inputs: Any, solutions: Any) -> tuple[tuple[Trial, Snapshot], Any]:
+    def output(stepped: tuple[Trial, Snapshot]) -> tuple[Trial, Any]:
+        trials, snapshots = stepped
+        return trials, (snapshots, trials) if states else snapshots
+
+    def single(trial: Trial, inputs: Any, solutions: Any) -> tuple[tuple[Trial, Any], Any]:
         """Run one control step of one world."""
         world, params, rules = inputs
         world_loop = dataclasses.replace(loop, rules=rules)
         step = stage, world, params, trial, world_loop, lambda f, *_: f
-        return _solved_step(*step, solutions)
+        stepped, solutions = _solved_step(*step, solutions)
+        return output(stepped), solutions
 
     if mapped is native.mapped and native.compiles(stage):
         rules = jax.tree.map(lambda x: jnp.broadcast_to(x, trials.done.shape), loop.rules)
@@ -481,8 +488,8 @@ def unroll(
 
     # Without a checkpoint, XLA would store all intermediate numbers.
     @partial(jax.checkpoint, prevent_cse=False)
-    def step(trials: Trial, _: None) -> tuple[Trial, Snapshot]:
-        return control_step(stage, worlds, params, trials, loop, mapped)
+    def step(trials: Trial, _: None) -> tuple[Trial, Any]:
+        return output(control_step(stage, worlds, params, trials, loop, mapped))
 
     return jax.lax.scan(step, trials, length=steps)
 

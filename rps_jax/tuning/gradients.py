@@ -46,6 +46,25 @@ def estimate(samples: jax.Array) -> Estimate:
     return Estimate(mean, jnp.where(count > 1, variance, jnp.inf), count / len(samples))
 
 
+def clip(samples: jax.Array, bound: float) -> jax.Array:
+    """Scale samples (n, p, ...) whose norm over p exceeds `bound` times the median norm down to it.
+
+    This biases the mean but keeps a few samples from dominating it. Samples of norm 0 do not count.
+    """
+    scale = jnp.max(jnp.abs(samples), axis=1, keepdims=True)
+    scaled = samples / jnp.where(scale > 0, scale, 1.0)  # whose squares do not overflow
+    size = scale * jnp.sqrt(jnp.sum(scaled**2, axis=1, keepdims=True))
+    # The median of the worlds with a gradient; trials that have ended have none.
+    counted = jnp.where(jnp.isfinite(size) & (size > 0), size, jnp.nan)
+    limit = bound * jnp.nan_to_num(jnp.nanmedian(counted, axis=0))
+    return samples * jnp.where(size == 0, 1.0, jnp.minimum(1.0, limit / size))
+
+
+def cosine(a: jax.Array, b: jax.Array) -> jax.Array:
+    """Return the cosine of the angle between two vectors (p,); NaN if one is zero."""
+    return jnp.dot(a, b) / (jnp.linalg.norm(a) * jnp.linalg.norm(b))
+
+
 def evolution(
     scores: Scores, theta: jax.Array, worlds: Any, key: jax.Array, options: Options = Options()
 ) -> jax.Array:
@@ -58,11 +77,7 @@ def evolution(
     Foundations of Computational Mathematics 17, 2017.
     """
     directions, thetas, repeated = random_steps(theta, worlds, key, options)
-    values = scores(thetas, repeated)
-    values = values.reshape(2, options.pairs, -1, 1, *values.shape[1:])
-    along = directions / (2 * options.sigma)
-    along = along.reshape(*along.shape, *(1,) * (values.ndim - 4))
-    return jnp.mean((values[0] - values[1]) * along, axis=0)
+    return slopes_along(directions, scores(thetas, repeated), options)
 
 
 def random_steps(
@@ -80,6 +95,14 @@ def random_steps(
         (thetas + offsets).reshape(-1, thetas.shape[-1]),
         repeat(worlds, 2 * options.pairs),
     )
+
+
+def slopes_along(directions: jax.Array, values: jax.Array, options: Options) -> jax.Array:
+    """Return the slopes (n, p, ...) of the scores (2 pairs n, ...) of `random_steps`."""
+    values = values.reshape(2, options.pairs, -1, 1, *values.shape[1:])
+    along = directions / (2 * options.sigma)
+    along = along.reshape(*along.shape, *(1,) * (values.ndim - 4))
+    return jnp.mean((values[0] - values[1]) * along, axis=0)
 
 
 def per_world(theta: jax.Array, worlds: Any) -> jax.Array:

@@ -51,11 +51,14 @@ TIMES = {  # of a generation
 }
 # Dimensions of those results of a generation that are arrays.
 DIMS = {
-    **dict.fromkeys(("vectors", "gradients"), ("candidate", "parameter")),
-    **dict.fromkeys(("values", "validations"), ("candidate",)),
+    **dict.fromkeys(("vectors", "gradients", "slopes", "anchors"), ("candidate", "parameter")),
+    **dict.fromkeys(("moments", "new_moments"), ("feature", "other_feature")),
+    "values": ("candidate",),
+    "coefficients": ("coefficient",),
     **dict.fromkeys(("center", "params"), ("parameter",)),
 }
 
+_SHOWN = 100  # rows of the table of parameters in a report
 Domains = DomainLike | Sequence[DomainLike]
 Results = Mapping[str, np.ndarray | jax.Array | float]  # of a generation, by name
 Proposal = Mapping[str, np.ndarray]  # arrays by name, `vectors` (P, p) among them
@@ -224,7 +227,8 @@ class Tuning(TaskOption, LawQuestion[xr.Dataset]):
                 raise files.CorruptFileError(run.folder, reason)
             if results.validation < least:
                 best, least = results.center.values, float(results.validation)
-            row = results.drop_dims("candidate").drop_vars("center")
+            names = [x for x, v in results.items() if set(v.dims) <= {"parameter"}]
+            row = results[names].drop_vars("center")
             row = row.expand_dims(generation=[count])
             log = xr.concat([log, row], "generation") if count else row
             count, simulated = count + 1, simulated + float(results.simulated)
@@ -267,25 +271,25 @@ class Tuning(TaskOption, LawQuestion[xr.Dataset]):
         results = {**proposal, **self.judge(proposal, generation, score)}
         for name in times:
             times[name] += float(results.pop(name, 0.0))
-        values = self.space.changed_values(results["center"])
-        results |= times | {"params": np.array([values[name] for name in self.space.names])}
+        results |= times | {"params": self.space.values(results["center"])}
         variables = {
             name: (DIMS.get(name, ()), np.asarray(x, float), TIMES.get(name, Spec()).attributes)
             for name, x in results.items()
         }
-        return xr.Dataset(variables, {"parameter": list(self.space.names)})
+        return xr.Dataset(variables, {"parameter": list(self.space.parameters)})
 
     def _write(self, folder: Path | None, best: np.ndarray, log: xr.Dataset) -> xr.Dataset:
         """Return the log (generation) with the best parameters, and write both."""
-        params = registry.named_leaves(self.space.params(best))
         if folder is not None:
             files.write_json(folder / TUNED, self.space.changed_values(best))
             columns = log.params.to_pandas().add_prefix("params.")
             table = log.drop_dims("parameter").to_dataframe().join(columns)
             files.write_csv(folder / "curve.csv", table)
-        names = self.space.names
-        log = log.assign_coords(unit=("parameter", [unit_of_leaf(self.params, x) for x in names]))
-        return log.assign(tuned=("parameter", [float(params[x]) for x in names]))
+        units = [unit_of_leaf(self.params, x) for x in self.space.parameters.values()]
+        log = log.assign_coords(unit=("parameter", units))
+        leaves = registry.named_leaves(self.space.params(best))
+        tuned = np.concatenate([np.ravel(leaves[x]) for x in self.space.names])
+        return log.assign(tuned=("parameter", tuned.astype(float)))
 
     def intro(self, results: xr.Dataset) -> str:
         names = ", ".join(self.space.names)
@@ -296,7 +300,8 @@ class Tuning(TaskOption, LawQuestion[xr.Dataset]):
 
     def report(self, results: xr.Dataset, run: Run) -> Sequence[Section]:
         best, worlds = int(results.validation.argmin("generation")), results.sizes["test_world"]
-        counts = np.rint(worlds * results.validation_success.values).astype(int).tolist()
+        success = np.nan_to_num(results.validation_success.values)  # NaN without a validation
+        counts = np.rint(worlds * success).astype(int).tolist()
         rates = [tables.share(count, worlds) for count in counts]
         totals = (f"{x} {float(results[x].sum()):,.1f} s" for x in TIMES if x in results)
         text = (
@@ -317,9 +322,11 @@ class Tuning(TaskOption, LawQuestion[xr.Dataset]):
                 f"`rps ladder --laws {shlex.join([start, law])}` tests it on all objects."
             )
         rows = [["parameter", "start", "tuned"]]
-        start = registry.named_leaves(self.space.base)
-        for name, value in zip(results.parameter.values, results.tuned.values, strict=True):
-            rows.append([str(name), f"{float(start[str(name)]):.4g}", f"{float(value):.4g}"])
+        columns = results.parameter.values, self.space.values(self.base), results.tuned.values
+        for name, start, tuned in zip(*columns, strict=True):
+            rows.append([str(name), f"{start:.4g}", f"{tuned:.4g}"])
+        if len(rows) > _SHOWN:
+            rows = [*rows[:_SHOWN], [f"and {len(rows) - _SHOWN} more", "", ""]]
         picture = Picture("tuning", partial(figures.search, results))
         return [Section("Results", text, rows, picture)]
 

@@ -3,25 +3,30 @@
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from numpy.typing import ArrayLike
 
 from rps_jax import errors
 from rps_jax.control import registry
-from rps_jax.control.base import Bound, LawParams, Leaf
+from rps_jax.control.base import Bound, LawParams, Leaf, entries
 from rps_jax.control.laws.rps import BOUNDS, RPSParams
 
 SUBSETS = {"logistic": ("eta", "zeta", "beta", "k"), "full": tuple(BOUNDS)}  # of RPS
 
 
 def expand_subsets(names: Sequence[str], base: LawParams = RPSParams()) -> tuple[str, ...]:
-    """Replace the names of subsets by their members; `full` means all parameters with bounds."""
-    subsets = {"full": tuple(dict(registry.law_of(base).bounds))}
-    if isinstance(base, RPSParams):
-        subsets |= SUBSETS
-    return tuple(name for text in names for name in subsets.get(text, (text,)))
+    """Replace the names of subsets by their members; `full` means all parameters with bounds.
+
+    The name of a pytree in the parameters, as `weights`, means all of its leaves with bounds.
+    """
+    bounded = tuple(dict(registry.law_of(base).bounds))
+    subsets = {"full": bounded} | (SUBSETS if isinstance(base, RPSParams) else {})
+    members = {text: tuple(x for x in bounded if x.startswith(f"{text}.")) for text in names}
+    return tuple(x for text in names for x in subsets.get(text) or members[text] or (text,))
 
 
 @dataclass(frozen=True)
@@ -29,7 +34,7 @@ class Space:
     """Tuned parameters as vectors (p,) without bounds; all other parameters are fixed.
 
     A coordinate is the logit of the relative position of a parameter, or of its logarithm, between
-    its bounds.
+    its bounds. Each entry of an array is a coordinate, and all have the bounds of the array.
     """
 
     names: tuple[str, ...] = SUBSETS["logistic"]
@@ -40,20 +45,30 @@ class Space:
         values = registry.named_leaves(self.base)
         for name in self.names:
             bound = self._bounds[errors.check_name("tuned parameter", name, self._bounds)]
-            share = _share(bound, values, name)
             below = math.nextafter(bound.high, -math.inf)
-            errors.check_finite(f"{name}, to be tuned", share, above=bound.low, at_most=below)
+            for share in np.ravel(_share(bound, values, name)):
+                errors.check_finite(f"{name}, to be tuned", share, above=bound.low, at_most=below)
 
     @property
     def _bounds(self) -> dict[str, Bound]:
         return dict(registry.law_of(self.base).bounds)
 
+    @property
+    def parameters(self) -> dict[str, str]:
+        """Name of the parameter of each coordinate by label, such as `L` or `table[0,1]`."""
+        leaves = registry.named_leaves(self.base)
+        return {label: name for name in self.names for label, _ in entries(name, leaves[name])}
+
     def vector(self, params: LawParams) -> jax.Array:
         """Return the vector (..., p) of parameters with leaves (...)."""
-        values = registry.named_leaves(params)
-        return jnp.stack([self._coordinate(values, name) for name in self.names], axis=-1)
+        values, base = registry.named_leaves(params), registry.named_leaves(self.base)
+        columns = []
+        for name in self.names:
+            x = self._coordinates(values, name)
+            columns.append(x.reshape(*x.shape[: x.ndim - np.ndim(base[name])], -1))
+        return jnp.concatenate(columns, axis=-1)
 
-    def _coordinate(self, values: Mapping[str, Leaf], name: str) -> jax.Array:
+    def _coordinates(self, values: Mapping[str, Leaf], name: str) -> jax.Array:
         low, high, log, _ = bound = self._bounds[name]
         value = jnp.asarray(_share(bound, values, name), float)
         if log:
@@ -61,35 +76,57 @@ class Space:
         return jax.scipy.special.logit((value - low) / (high - low))
 
     def params(self, vector: ArrayLike) -> LawParams:
-        """Return the parameters, leaves (...), of vectors (..., p)."""
+        """Return the parameters, leaves (..., *shape), of vectors (..., p)."""
         vector, bounds = jnp.asarray(vector, float), self._bounds
-        base, shape = registry.named_leaves(self.base), vector.shape[:-1]
-        values = {k: jnp.broadcast_to(jnp.asarray(x, vector.dtype), shape) for k, x in base.items()}
+        base, batch = registry.named_leaves(self.base), vector.shape[:-1]
+        values = {
+            k: jnp.broadcast_to(jnp.asarray(x, vector.dtype), (*batch, *np.shape(x)))
+            for k, x in base.items()
+        }
+        cuts = np.cumsum([np.size(base[name]) for name in self.names])[:-1]
+        coordinates = dict(zip(self.names, jnp.split(vector, cuts, axis=-1), strict=True))
         for name in sorted(self.names, key=lambda name: bool(bounds[name].relative_to)):
             low, high, log, whole = bounds[name]
-            u = jax.nn.sigmoid(vector[..., self.names.index(name)])
+            u = jax.nn.sigmoid(coordinates[name]).reshape(values[name].shape)
             value = low * (high / low) ** u if log else low + (high - low) * u
-            values[name] = value * values[whole] if whole else value
+            values[name] = value * _widen(values[whole], value) if whole else value
         for name, bound in bounds.items():
             if bound.relative_to:  # a fixed parameter must not exceed the tuned one that bounds it
-                values[name] = jnp.minimum(values[name], values[bound.relative_to])
+                whole = _widen(values[bound.relative_to], values[name])
+                values[name] = jnp.minimum(values[name], whole)
         return registry.replace_leaves(self.base, values)
 
-    def changed_values(self, vector: ArrayLike) -> dict[str, float]:
+    def changed_values(self, vector: ArrayLike) -> dict[str, Any]:
         """Return the tuned parameters of a vector (p,), and all others that differ from the preset.
 
         The preset is the first of the law; that of RPS has the paper's parameters. Parameters whose
-        default has changed between versions are included.
+        default has changed between versions are included. Arrays are lists.
         """
         preset = next(p for p in registry.LAWS.values() if type(p) is type(self.base))
         both = map(registry.named_leaves, (self.params(vector), preset))
-        rounded = ({k: float(f"{float(x):.7g}") for k, x in leaves.items()} for leaves in both)
-        values, defaults = rounded
+        values, defaults = ({k: _rounded(x) for k, x in leaves.items()} for leaves in both)
         names = (*self.names, *dict(registry.law_of(self.base).earlier))
         return {n: x for n, x in values.items() if n in names or x != defaults[n]}
+
+    def values(self, vector: ArrayLike) -> np.ndarray:
+        """Return the rounded parameters (p,) of a vector (p,)."""
+        changed = self.changed_values(vector)
+        return np.concatenate([np.ravel(changed[name]) for name in self.names])
 
 
 def _share(bound: Bound, values: Mapping[str, Leaf], name: str) -> Leaf:
     """Return a parameter, or its ratio to the parameter that bounds it."""
-    value = values[name]
-    return value / values[bound.relative_to] if bound.relative_to else value
+    value, whole = values[name], bound.relative_to
+    return value / _widen(values[whole], value) if whole else value
+
+
+def _widen(whole: Leaf, value: Leaf) -> Leaf:
+    """Return numbers (...) with axes of length 1 for the shape of entries (..., *shape)."""
+    added = np.ndim(value) - np.ndim(whole)
+    return jnp.reshape(whole, (*np.shape(whole), *(1,) * added)) if added else whole
+
+
+def _rounded(leaf: Leaf) -> Any:
+    """Return a number, or nested lists of numbers, with seven digits."""
+    rounded = [float(f"{float(x):.7g}") for x in np.ravel(leaf)]
+    return np.reshape(rounded, np.shape(leaf)).tolist()

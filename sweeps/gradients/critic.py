@@ -28,9 +28,10 @@ from rps_jax.trials import trial
 from rps_jax.trials.trial import ControlLoop, Snapshot, Trial, World, advance, start_all
 from rps_jax.trials.worlds import soften_skins
 from rps_jax.tuning import gradients
+from rps_jax.tuning.derivatives import soft_times
 from rps_jax.tuning.gradients import Estimate
 from sweeps.gradients import estimators
-from sweeps.gradients.windows import WindowTuning, window_starts
+from sweeps.gradients.windows import Windows, window_starts
 
 Layers = list[tuple[jax.Array, jax.Array]]  # weights and biases
 Fit = tuple[Layers, optax.OptState]
@@ -39,7 +40,7 @@ _INTERVAL = 4.0  # [s] between the states of a trial to which a critic is fitted
 _UPDATES, _BATCH, _WIDTH = 3000, 512, 64  # of the fit; units of its two hidden layers
 
 
-def critic_gradient(tuning: WindowTuning, generations: int = 6) -> tuple[Estimate, float, float]:
+def critic_gradient(tuning: Windows, generations: int = 6) -> tuple[Estimate, float, float]:
     """Return the gradient (p,) at the start with a critic for each object.
 
     The critics are fitted to trials in the worlds of several generations, and tested in the worlds
@@ -72,7 +73,7 @@ def critic_gradient(tuning: WindowTuning, generations: int = 6) -> tuple[Estimat
             trials = window_starts(tuning, batch.stage, theta, worlds, jnp.asarray(start))
             scores = window_scores(tuning, batch.stage, critic)
             samples = jax.jit(partial(estimators.exact, scores))(theta, (worlds, trials))
-            x = gradients.estimate(estimators.clip(samples, tuning.world_clip))
+            x = gradients.estimate(gradients.clip(samples, tuning.world_clip))
             scale = share * horizon / tuning.window  # windows in a trial
             estimates.append(Estimate(scale * x.gradient, scale**2 * x.variance, share * x.finite))
             simulated += batch.indices.size * (tuning.window + tuning.within)
@@ -117,7 +118,7 @@ def fit(x: np.ndarray, y: np.ndarray) -> Critic:
     return partial(value, layers)
 
 
-def window_scores(tuning: WindowTuning, stage: Stage, critic: Critic) -> gradients.Scores:
+def window_scores(tuning: Windows, stage: Stage, critic: Critic) -> gradients.Scores:
     """Return the scores of windows with a critic at their ends, as `windows.window_scores`."""
     space, setting, objective = tuning.space, tuning.setting, tuning.objective
     loop = _loop(tuning)
@@ -126,12 +127,10 @@ def window_scores(tuning: WindowTuning, stage: Stage, critic: Critic) -> gradien
     def cost(
         snapshots: Snapshot, world: World, params: LawParams, first: Trial, last: Trial
     ) -> jax.Array:
-        contact, distance = 1.0 * snapshots.reading.in_contact, snapshots.details.distance
-        arrival = contact * jax.nn.sigmoid((params.d_success - distance) / tuning.arrive)
-        under_way = jnp.cumprod(1 - arrival) * (1 - snapshots.done)
-        touched = jnp.maximum(jax.lax.cummax(contact), first.contact_steps > 0)
-        lost = period * jnp.sum(under_way * touched * (1 - contact))
-        score = objective.score(1.0, period * jnp.sum(under_way), lost, 0.0, setting.rules)
+        weights = first.contact_steps > 0, 1 - snapshots.done, tuning.arrive
+        under_way, lost = soft_times(snapshots, params.d_success, *weights)
+        times = period * jnp.sum(under_way), period * lost
+        score = objective.score(1.0, *times, 0.0, setting.rules)
         rest = critic(features(world, params, last, loop))
         return jnp.asarray(score + under_way[-1] * jnp.where(last.done, 0.0, rest))
 
@@ -174,14 +173,14 @@ def features(world: World, params: LawParams, state: Trial, loop: ControlLoop) -
     return jnp.clip(jnp.concatenate(joined), -6, 6)
 
 
-def _loop(tuning: WindowTuning) -> ControlLoop:
+def _loop(tuning: Windows) -> ControlLoop:
     """Return the loop of softened trials under the rules of the setting."""
     law = registry.smooth_law(law_of(tuning.space.base))
     return ControlLoop(tuning.setting.physics, tuning.setting.rules, law)
 
 
 def _collect(
-    tuning: WindowTuning, theta: jax.Array, stage: Stage, worlds: World
+    tuning: Windows, theta: jax.Array, stage: Stage, worlds: World
 ) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
     """Return features (K, n, F), remaining scores and liveness (K, n), and times (n,) of trials."""
     setting, objective, loop = tuning.setting, tuning.objective, _loop(tuning)

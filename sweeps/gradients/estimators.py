@@ -24,7 +24,7 @@ from rps_jax.physics import Physics
 from rps_jax.trials import pushes, trial
 from rps_jax.trials.trial import ControlLoop, Snapshot, Trial, World
 from rps_jax.tuning import gradients
-from rps_jax.tuning.gradients import Options, Scores, per_world, random_steps, repeat
+from rps_jax.tuning.gradients import Options, Scores, clip, per_world, random_steps, repeat
 from rps_jax.worlds import Case
 
 
@@ -127,20 +127,6 @@ ESTIMATORS: dict[str, Estimator] = {
     "forward": forward,
     "differences": differences,
 }
-
-
-def clip(samples: jax.Array, bound: float) -> jax.Array:
-    """Scale samples (n, p, ...) whose norm over p exceeds `bound` times the median norm down to it.
-
-    This biases the mean but keeps a few samples from dominating it. Samples of norm 0 do not count.
-    """
-    scale = jnp.max(jnp.abs(samples), axis=1, keepdims=True)
-    scaled = samples / jnp.where(scale > 0, scale, 1.0)  # whose squares do not overflow
-    size = scale * jnp.sqrt(jnp.sum(scaled**2, axis=1, keepdims=True))
-    # The median of the worlds with a gradient; trials that have ended have none.
-    counted = jnp.where(jnp.isfinite(size) & (size > 0), size, jnp.nan)
-    limit = bound * jnp.nan_to_num(jnp.nanmedian(counted, axis=0))
-    return samples * jnp.where(size == 0, 1.0, jnp.minimum(1.0, limit / size))
 
 
 def mix(first: jax.Array, zeroth: jax.Array) -> jax.Array:

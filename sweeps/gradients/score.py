@@ -25,10 +25,9 @@ from rps_jax.runs import evaluate
 from rps_jax.runs.evaluate import Candidates, CandidateScores
 from rps_jax.runs.question import SimulationQuestion
 from rps_jax.trials.setting import seed_of
-from rps_jax.tuning import descent
 from rps_jax.tuning.gradients import Estimate, estimate
 from sweeps.gradients import critic
-from sweeps.gradients.windows import WindowTuning, window_gradients
+from sweeps.gradients.windows import Windows, window_gradient
 from sweeps.study_base import Parts, QuickStudy, Rows, Table
 
 _DRAWS = 4000  # of the errors of both gradients
@@ -81,9 +80,9 @@ class ScoreStudy(QuickStudy[xr.Dataset], SimulationQuestion[xr.Dataset]):
         arrive: float = 0.005,
         taxels: float = 0.03,
         within: float = 100.0,
-    ) -> WindowTuning:
+    ) -> Windows:
         """Return the tuning whose gradient is estimated."""
-        return WindowTuning(
+        return Windows(
             "rps",
             tuned=self.tuned,
             worlds=self.worlds,
@@ -159,37 +158,27 @@ class ScoreStudy(QuickStudy[xr.Dataset], SimulationQuestion[xr.Dataset]):
 
     def _evolution(self, run: Run) -> xr.Dataset:
         """Return the gradient by evolution in whole trials."""
-        tuning, simulated = self.tuning("evolution"), 0.0
+        tuning = self.tuning("evolution")
+        tried, slopes = tuning.antithetic(jnp.asarray(tuning.base), 0, tuning.worlds)
+        scores, simulated = self._scores(run, tried)
+        return self._row(slopes(scores), simulated)
 
-        def score(requests: list[Candidates]) -> list[CandidateScores]:
-            nonlocal simulated
-            scores, seconds = self._scores(run, requests[0])
-            simulated += seconds
-            return [scores]
-
-        thetas = jnp.asarray(tuning.base)[None]
-        gradient = descent.evolution_gradients(thetas, tuning, 0, score)
-        return self._row(gradient, simulated, 0)
-
-    def _window(self, tuning: WindowTuning) -> xr.Dataset:
+    def _window(self, tuning: Windows) -> xr.Dataset:
         """Return the gradient of windows."""
-        gradient, cost, _ = window_gradients(jnp.asarray(tuning.base)[None], tuning, 0)
-        return self._row(gradient, cost, 0)
+        return self._row(*window_gradient(tuning))
 
-    def _critic(self, tuning: WindowTuning) -> xr.Dataset:
+    def _critic(self, tuning: Windows) -> xr.Dataset:
         """Return the gradient of windows with a critic."""
         gradient, cost, explained = critic.critic_gradient(tuning)
         return self._row(gradient, cost, explained=explained)
 
-    def _row(
-        self, x: Estimate, cost: float, index: int | None = None, explained: float = np.nan
-    ) -> xr.Dataset:
-        """Return a gradient (p,), or that of a start, with its standard error and its cost.
+    def _row(self, x: Estimate, cost: float, explained: float = np.nan) -> xr.Dataset:
+        """Return a gradient (p,) with its standard error and its cost.
 
         `explained` is the share of the variance of remaining scores that a critic explains [1].
         """
-        values = (np.asarray(x.gradient, float), np.sqrt(np.asarray(x.variance, float)))
-        gradient, error = values if index is None else (value[index] for value in values)
+        gradient = np.asarray(x.gradient, float)
+        error = np.sqrt(np.asarray(x.variance, float))
         names = list(self.tuning("evolution").space.names)
         variables = {"gradient": ("parameter", gradient), "error": ("parameter", error)}
         variables |= {"cost": ((), cost, {"units": "s"}), "explained": ((), explained)}

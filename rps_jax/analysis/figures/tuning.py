@@ -7,8 +7,8 @@ from rps_jax.analysis.figures.style import WIDTH, Figure, legend_above, styled
 
 @styled
 def search(results: xr.Dataset) -> Figure:
-    """Draw a search by generation: objective of candidates, validation and parameters."""
-    generation, names = results.generation.values, list(map(str, results.parameter.values))
+    """Draw a search by generation: objective of candidates, validation and 24 parameters."""
+    generation, names = results.generation.values, list(map(str, results.parameter.values))[:24]
     units = results.unit.values.tolist() if "unit" in results.coords else [""] * len(names)
 
     columns = 4
@@ -30,7 +30,7 @@ def search(results: xr.Dataset) -> Figure:
         ax = figure.add_subplot(grid[0, column])
         ax.plot(generation, values, "C2")
         ax.set(xlabel="generation", ylabel=label, title="validation")
-    for i, (name, unit) in enumerate(zip(names, units, strict=True)):
+    for i, (name, unit) in enumerate(zip(names, units, strict=False)):
         ax = figure.add_subplot(grid[1 + i // columns, i % columns])
         ax.plot(generation, results.params.values[:, i])
         ax.set_title(f"{name} [{unit}]" if unit else name)

@@ -111,6 +111,9 @@ def _parse(defaults: Q, command: str, words: Sequence[str]) -> tuple[Q, Session]
 
     def raise_sentence(event: _errors.ParseErrorEvent) -> None:
         known = [name for kind in kinds for name in _flag_names(kind)]
+        match event:
+            case _errors.UnrecognizedArgs(tokens=[token, *_]) if token in kinds[0].MOVED:
+                raise InputError(f"unknown option '{token}': {kinds[0].MOVED[token]}.")
         raise InputError(_sentence(event, command, known))
 
     with _errors.on_parse_error(raise_sentence):
