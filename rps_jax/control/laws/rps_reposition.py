@@ -40,7 +40,7 @@ class RPSRepositionParams(NamedTuple):
     t_stuck: Annotated[
         Parameter,
         Spec("s", "without progress until it repositions, G1", gt=0, tune=Bound(3, 100, log=True)),
-    ] = 30.0
+    ] = 20.0
     progress: Annotated[
         Parameter, Spec("m", "progress of G1", gt=0, tune=Bound(0.005, 0.3, log=True))
     ] = 0.05
