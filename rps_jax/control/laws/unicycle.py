@@ -16,7 +16,7 @@ Push at v_max until the contact is lost for t_lost, or spent: it leaves the fron
 within d_near of T, |e| > e_near replaces the last.
 
   D4  omega = K_e e + K_l (l - l_dead sgn l where |l| > l_dead, else 0)
-  D5  omega = v_max sin(e) / x_C   within d_near, where C moves to T;  0 without contact
+  D5  omega = K_near v_max sin(e) / x_C   within d_near;  0 without contact
 
 Retreat straight, until C is `back` ahead of the front. Drive around M in reverse, so that the base
 need not turn away from the object and back. With phi the angle of A - M, and turn the angle from
@@ -26,8 +26,7 @@ phi to psi + pi, which decides the side:
   D7  omega = angle of A - W minus theta,  v = -v_max cos(omega)
 
 Where this angle is large, the base turns on the spot, and a car in reverse. Align: at the last W,
-turn to psi; a car does so in reverse, on an arc that begins its turning radius before. Then
-approach M, which is a push without contact:
+turn to psi, a car in reverse. Then approach M, which is a push without contact:
 
   D8  omega = angle of M - A minus theta
 
@@ -88,6 +87,7 @@ class UnicycleParams(NamedTuple):
     e_near: Annotated[
         Parameter, Spec("rad", "error of a spent contact there", ge=0, tune=Bound(0.5, 2.5))
     ] = 1.83
+    K_near: Annotated[Parameter, Spec("1", "gain of D5", ge=0, tune=Bound(0.3, 3))] = 1.67
     t_lost: Annotated[
         Parameter,
         Spec("s", "without contact until it is lost", gt=0, tune=Bound(0.2, 8, log=True)),
@@ -188,7 +188,6 @@ def way_around(
     chooses: jax.Array,  # bool: whether the side is chosen anew
     radius: Number,  # [m] of the circle
     ahead: Number,  # [rad] of the aim on the circle
-    turning_radius: Number | None = None,  # [m] of a car, which also moves while it aligns
     width: Number | None = None,  # [rad] of the smooth switch
 ) -> Way:
     """Compute D6: the point that the base drives to, on its way to the staging point."""
@@ -199,8 +198,6 @@ def way_around(
     turn = jnp.where(turn > 2 * jnp.pi - _OVERSHOOT, turn - 2 * jnp.pi, turn)
     is_direct = soft.greater(ahead, turn, width)
     staging = middle - radius * planar.unit(psi)
-    if turning_radius is not None:
-        staging = staging - side * turning_radius * planar.unit(psi - jnp.pi / 2)
     carrot = middle + radius * planar.unit(phi + side * ahead)
     return Way(side, is_direct, staging, soft.where(is_direct, staging, carrot))
 
@@ -261,7 +258,7 @@ def step(
     # D6: the side is chosen before the base leaves, and kept on the way.
     offset, chooses = p_world_axle - middle, _is(or_(push, state.retreat))
     circle = middle, psi, offset, state.side, chooses, params.R + axle, params.carrot
-    side, is_direct, staging, aim = way_around(*circle, obs.turning_radius, angle)
+    side, is_direct, staging, aim = way_around(*circle, angle)
     error = planar.wrap(planar.direction(aim - p_world_axle) + jnp.pi - yaw)
     left = planar.norm(staging - p_world_axle)
     passed = and_(above(_CLOSE, left, length), above(jnp.abs(error), _ASIDE, angle))
@@ -283,7 +280,7 @@ def step(
     v_max, is_car = jnp.asarray(params.v_max), obs.turning_radius is not None
     far = params.K_e * e + params.K_l * (l - jnp.clip(l, -params.l_dead, params.l_dead))
     arm = jnp.maximum(contact[0], _LEAST_ARM) + axle
-    steer = where(near, v_max * jnp.sin(e) / arm, far)
+    steer = where(near, params.K_near * v_max * jnp.sin(e) / arm, far)
     approach = planar.wrap(planar.direction(middle - p_world_axle) - yaw)
     steer = where(touches, steer, where(and_(is_new, touched), approach, 0.0))
     on_spot = -v_max if is_car else 0.0
@@ -323,6 +320,7 @@ PRESETS = {
         l_dead=0.174,
         d_near=0.867,
         e_near=1.06,
+        K_near=2.09,
         t_lost=0.293,
         back=0.042,
         R=0.85,
