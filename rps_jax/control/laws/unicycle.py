@@ -326,6 +326,6 @@ PRESETS = {
         R=0.85,
         carrot=1.26,
     ),
-    "unicycle_round": _TUNED._replace(r=0.2, K_e=2.0, l_edge=0.15, d_near=0.3, carrot=1.26),
+    "unicycle_round": _TUNED._replace(K_e=2.0, l_edge=0.15, carrot=1.26),
     "unicycle_front": _TUNED._replace(r=0.3, l_edge=0.22, R=1.25),
 }
