@@ -95,7 +95,7 @@ class UnicycleParams(NamedTuple):
     back: Annotated[Parameter, Spec("m", "retreat", ge=0, tune=Bound(0.01, 0.6))] = 0.1
     carrot: Annotated[
         Parameter, Spec("rad", "aim ahead on the circle, D6", gt=0, tune=Bound(0.4, 1.5))
-    ] = 0.8
+    ] = 1.26
     R: Annotated[
         Parameter, Spec("m", "radius of the circle around M, D6", gt=0, tune=Bound(0.5, 1.4))
     ] = 0.87
@@ -324,8 +324,7 @@ PRESETS = {
         t_lost=0.293,
         back=0.042,
         R=0.85,
-        carrot=1.26,
     ),
-    "unicycle_round": _TUNED._replace(K_e=2.0, l_edge=0.15, carrot=1.26),
-    "unicycle_front": _TUNED._replace(r=0.3, l_edge=0.22, R=1.25),
+    "unicycle_round": _TUNED._replace(K_e=2.0, l_edge=0.15),
+    "unicycle_front": _TUNED._replace(r=0.3, l_edge=0.22, carrot=0.8, R=1.2),
 }
