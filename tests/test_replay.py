@@ -62,7 +62,10 @@ CASES = {
     "an engine outside of JAX": ("rps", "hostile,objects=random_box", "reach", "mujoco", 1.0),
 }
 HALL = {"outline": [[0, 0], [9, 0], [9, 6], [0, 6]], "start": [1.5, 3, 0], "goal": [7, 3]}
-TASKS = {"corridor": "corridor,width=2:2.2,length=8:10", "rooms": HALL}  # with places for the widest object
+TASKS = {
+    "corridor": "corridor,width=2:2.2,length=8:10",
+    "rooms": HALL,
+}  # with places for the widest object
 SLOW_CASES = {
     "MJX": ("rps", "wide,objects=random_box", "reach", "mjx", 1.0),
     **{

@@ -116,7 +116,8 @@ class MJXStage(NamedTuple):
             if robot.drive != "omni":
                 tyres = drives.Tyres.of(robot, tuple(base), turn, timestep)
                 applied = applied + jnp.stack(tyres.force)
-                sideways = tyres.mass * jnp.outer(*2 * (jnp.stack(tyres.sideways),))
+                direction = jnp.stack(tyres.sideways)
+                sideways = jnp.asarray(tyres.mass) * jnp.outer(direction, direction)
             applied = data.qfrc_applied.at[JOINTS.base].set(applied)
             data, integral = data.replace(qfrc_applied=applied), jnp.stack(servo)
         data = data.replace(qpos=qpos, qvel=qvel, qacc_warmstart=warmstart)
@@ -140,8 +141,9 @@ def step(
     data = smooth.com_pos(model, data)
     data = smooth.crb(model, data)
     if inertia is not None:
-        held = {"_impl.M": data._impl.M.at[JOINTS.base, JOINTS.base].add(inertia)}  # dense
-        data = data.tree_replace(held)
+        mass = data._impl.M.at[JOINTS.base, JOINTS.base].add(inertia)  # dense
+        held: Any = data.tree_replace({"_impl.M": mass})
+        data = held
     data = smooth.factor_m(model, data)
     data = collision(model, data, *extra)
     data = constraint.make_constraint(model, data)

@@ -78,7 +78,7 @@ def aim(robot: Robot, previous: jax.Array, twist: jax.Array, period: float) -> j
 def _aim_axle(robot: Robot, previous: jax.Array, twist: jax.Array, period: float) -> jax.Array:
     """Return the aim of a base whose axle cannot move sideways: see `aim`."""
 
-    def scaled(motion: jax.Array, *limits: Number) -> jax.Array:
+    def scaled(motion: jax.Array, *limits: Number | None) -> jax.Array:
         """Return (v, omega) with bounded |v|, |omega| and speeds of both wheels."""
         v, omega = jnp.abs(motion)
         sizes = v, omega, v + robot.half_track * omega
@@ -113,8 +113,8 @@ def apply_errors(robot: Robot | None, twist: jax.Array, errors: Number) -> jax.A
     """
     if robot is None or robot.drive != "differential":
         return twist * (1 + errors)
-    turn = robot.half_track * twist[2]
-    left, right = (twist[0] - turn) * (1 + errors[0]), (twist[0] + turn) * (1 + errors[2])
+    turn, (of_left, _, of_right) = robot.half_track * twist[2], jnp.asarray(errors)
+    left, right = (twist[0] - turn) * (1 + of_left), (twist[0] + turn) * (1 + of_right)
     omega = (right - left) / (2 * robot.half_track)
     return jnp.stack([(left + right) / 2, robot.axle_behind * omega, omega])
 

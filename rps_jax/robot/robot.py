@@ -374,7 +374,9 @@ def parse_robot(robot: RobotLike) -> Robot:
     if isinstance(robot, Mapping):
         for name in robot:
             errors.check_name("robot quantity", name, _FIELDS)
-        values = {k: tuple(v) if isinstance(v, list | tuple) else v for k, v in robot.items()}
+        values: dict[str, Any] = {
+            k: tuple(v) if isinstance(v, list | tuple) else v for k, v in robot.items()
+        }
         if "boards" in values:
             values["boards"] = _parse_boards(values["boards"])
         robot = Robot(**values)

@@ -89,7 +89,7 @@ def step(
 ) -> tuple[RPSRepositionState, Twist, Details]:
     """Compute one control step: RPS+, or a part of a reposition."""
     law, twist, details = rps_plus.step(params.law, state.law, obs)
-    touches, base, yaw = obs.in_contact, obs.p_world_robot, obs.yaw
+    touches, base, yaw = obs.in_contact, obs.p_world_robot, jnp.asarray(obs.yaw)
     _, _, normal, _, half_length = unicycle.contact_of(law.p_world_contact, obs)
     middle = law.p_world_contact + params.r * planar.unit(yaw + normal)
     middle = jnp.where(touches, middle, state.p_world_object)

@@ -221,8 +221,9 @@ def step(
     """Compute one control step; with `temperatures`, the modes and the contact are weights."""
     length, angle, time = temperatures or (None, None, None)
     above, and_, or_, not_, where = soft.greater, soft.and_, soft.or_, soft.not_, soft.where
-    axle = 0.0 if obs.axle is None else obs.axle
-    yaw, u = obs.yaw, planar.unit(obs.yaw)
+    axle = jnp.asarray(0.0 if obs.axle is None else obs.axle)
+    yaw = jnp.asarray(obs.yaw)
+    u = planar.unit(yaw)
     p_world_axle = obs.p_world_robot - axle * u
     push = not_(_either(state.retreat, state.around, state.align))
     current = contact_of(state.p_world_contact, obs, temperatures)
@@ -277,13 +278,13 @@ def step(
     align = and_(align, not_(hits))
 
     # D4, D5, D7 and D8.
-    v_max, is_car = jnp.asarray(params.v_max), obs.turning_radius is not None
+    v_max, least = jnp.asarray(params.v_max), obs.turning_radius
     far = params.K_e * e + params.K_l * (l - jnp.clip(l, -params.l_dead, params.l_dead))
     arm = jnp.maximum(contact[0], _LEAST_ARM) + axle
     steer = where(near, params.K_near * v_max * jnp.sin(e) / arm, far)
     approach = planar.wrap(planar.direction(middle - p_world_axle) - yaw)
     steer = where(touches, steer, where(and_(is_new, touched), approach, 0.0))
-    on_spot = -v_max if is_car else 0.0
+    on_spot = 0.0 if least is None else -v_max
     is_large = above(jnp.abs(error), _LARGE, angle)
     drive = where(is_large, on_spot, -v_max * jnp.cos(error))
     v = where(around, drive, where(touched, v_max, params.v_approach))
@@ -292,8 +293,8 @@ def step(
     omega = jnp.clip(omega, -jnp.asarray(params.omega_max), params.omega_max)
     bound = planar.safe_sqrt(jnp.maximum(v_max**2 - (axle * omega) ** 2, 1e-8))
     v = jnp.clip(v, -bound, bound)
-    if is_car:
-        omega = jnp.clip(omega, -jnp.abs(v) / obs.turning_radius, jnp.abs(v) / obs.turning_radius)
+    if least is not None:
+        omega = jnp.clip(omega, -jnp.abs(v) / least, jnp.abs(v) / least)
     memory = UnicycleState(
         retreat, around, align, middle, p_world_contact, l, touched, t_lost, pushed, side
     )
