@@ -110,10 +110,10 @@ def step(
     clear = planar.norm(offset) > params.R - _CLEAR
     at_staging = away & clear & way.is_direct & (planar.norm(way.staging - base) < _ARRIVED)
     approach = away & (state.approach | at_staging)
-    ends = approach & touches
+    is_finished = approach & touches
     front = base + half_length * planar.unit(yaw)
     missed = approach & (jnp.sum((front - middle) * planar.unit(yaw)) > params.r)
-    approach, away = approach & ~ends & ~missed, away & ~ends
+    approach, away = approach & ~is_finished & ~missed, away & ~is_finished
 
     heading = planar.direction(jnp.where(approach, middle, way.aim) - base)
     heading = jnp.where(clear | approach, heading, planar.direction(offset)) - yaw
@@ -124,8 +124,8 @@ def step(
     drive = Twist(v[0], v[1], jnp.clip(face, -omega_max, omega_max))
     fresh = rps_plus.init(params.law)
     fresh = fresh._replace(p_world_contact=law.p_world_contact)
-    law = soft.tree_where(ends, fresh, law)
-    best = jnp.where(ends, distance, best)
+    law = soft.tree_where(is_finished, fresh, law)
+    best = jnp.where(is_finished, distance, best)
     twist = soft.tree_where(away, drive, Twist(*map(jnp.asarray, twist)))
     details = details._replace(realigning=details.realigning | away)
     memory = RPSRepositionState(law, middle, best, t_stuck, away, approach, way.side)

@@ -53,7 +53,7 @@ _SIDE = 0.02  # [m] behind the front, where a contact is on a side
 _ROUND_SIDE = 1.2  # [rad] from the front of a round base
 _LARGE = 0.5  # [rad] heading error above which the base turns on the spot
 _ARRIVED, _ALIGNED = 0.22, 0.26  # [m], [rad] errors at the staging point
-_CLOSE, _ASIDE = 0.2, 1.2  # [m], [rad] distance and bearing of a staging point that is passed
+_CLOSE, _BEARING = 0.2, 1.2  # [m], [rad] distance and bearing of a staging point that is passed
 _PAST = 0.5  # [m] of the front beyond M at which an approach has failed
 _OVERSHOOT = 1.5  # [rad] on the circle, after which the base drives back
 _LEAST_ARM = 0.2  # [m] of x_C
@@ -229,8 +229,8 @@ def step(
     current = contact_of(state.p_world_contact, obs, temperatures)
     touches, contact, normal, on_front, half_length = current
     touched = or_(state.touched, touches)
-    here = obs._replace(p_robot_contact=contact)
-    l = where(touches, here.l, state.l)  # noqa: E741
+    sensed = obs._replace(p_robot_contact=contact)
+    l = where(touches, sensed.l, state.l)  # noqa: E741
 
     # D1, and an approach that passes M without contact: then the last contact is a better guess.
     p_world_contact = obs.p_world_robot + planar.rotate(yaw, contact)
@@ -244,7 +244,7 @@ def step(
     middle = where(missed, p_world_contact, middle)
 
     # D2 and D3.
-    d = displacement(here)
+    d = displacement(sensed)
     distance, e = planar.norm(d), planar.wrap(planar.direction(d) - yaw)
     psi = push_direction(middle, p_world_axle, obs.p_world_target, params.r)
 
@@ -254,16 +254,16 @@ def step(
     spent = where(near, spent_near, above(jnp.abs(l), params.l_edge, length))
     spent = or_(spent, not_(on_front))
     is_lost = and_(above(t_lost, params.t_lost, time), not_(is_new))
-    ends = and_(and_(push, touched), or_(or_(and_(touches, spent), is_lost), missed))
+    is_finished = and_(and_(push, touched), or_(or_(and_(touches, spent), is_lost), missed))
 
     # D6: the side is chosen before the base leaves, and kept on the way.
     offset, chooses = p_world_axle - middle, _is(or_(push, state.retreat))
     circle = middle, psi, offset, state.side, chooses, params.R + axle, params.carrot
     side, is_direct, staging, aim = way_around(*circle, angle)
     error = planar.wrap(planar.direction(aim - p_world_axle) + jnp.pi - yaw)
-    left = planar.norm(staging - p_world_axle)
-    passed = and_(above(_CLOSE, left, length), above(jnp.abs(error), _ASIDE, angle))
-    is_there = and_(is_direct, or_(above(_ARRIVED, left, length), passed))
+    remaining = planar.norm(staging - p_world_axle)
+    passed = and_(above(_CLOSE, remaining, length), above(jnp.abs(error), _BEARING, angle))
+    is_there = and_(is_direct, or_(above(_ARRIVED, remaining, length), passed))
     face = planar.wrap(psi - yaw)
 
     # The next modes. A touch of the front on the way is a push, unless it is spent.
@@ -271,9 +271,9 @@ def step(
     gap = jnp.sum((p_world_contact - front) * u)
     is_clear = above(gap, params.back, length)
     stopped = and_(and_(_either(state.around, state.align), hits), spent)
-    retreat = _either(ends, stopped, and_(state.retreat, not_(is_clear)))
-    gone = and_(state.retreat, is_clear)
-    around = _either(gone, and_(and_(state.around, not_(is_there)), not_(hits)))
+    retreat = _either(is_finished, stopped, and_(state.retreat, not_(is_clear)))
+    leaves = and_(state.retreat, is_clear)
+    around = _either(leaves, and_(and_(state.around, not_(is_there)), not_(hits)))
     align = _either(and_(state.around, is_there), and_(state.align, not_(aligned)))
     align = and_(align, not_(hits))
 
