@@ -73,8 +73,10 @@ TABS: dict[str, list[Any]] = {
     ],
     "Laws": ["ladder", "rps_plus", "mends", "learned", "force_push_grid", "failures"],
     "Robots": [
+        "docs/my_robot.md",
         "docs/on_a_robot.md",
         "robots",
+        "drives",
         "limits",
         "export",
         "notebooks/examples/ros2/rps_push/README.md",

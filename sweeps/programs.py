@@ -16,12 +16,13 @@ import numpy as np
 
 from rps_jax import Range, RPSParams, Setting
 from rps_jax.laws import LawParams
-from rps_jax.physics import FRICTION, MUJOCO_GROUND, Physics, preset
+from rps_jax.physics import FRICTION, Physics, preset
 from rps_jax.trials import pushes, trial
 from rps_jax.trials.jobs import WorldBatch, rows
 from rps_jax.trials.trial import ControlLoop, Trial, World
 from rps_jax.trials.worlds import drawn_worlds
 from rps_jax.world import draws, paper
+from rps_jax.world.physics import MUJOCO_GROUND
 from rps_jax.worlds import Case, parse_domain
 
 FAMILIES = ("box", "cylinder", "prism")

@@ -27,11 +27,11 @@ import xarray as xr
 
 from rps_jax import InputError, errors
 from rps_jax.engines import device
-from rps_jax.questions import Picture, Plan, Question, Run, Section
+from rps_jax.questions import Picture, Plan, Run, Section
 from rps_jax.record import files, options, provenance
 from rps_jax.record.checkpoint import Checkpoints
 from rps_jax.runs import execution
-from rps_jax.runs.question import TrialQuestion, quick_command, quick_note
+from rps_jax.runs.question import Question, TrialQuestion, quick_command, quick_note
 from rps_jax.runs.results import PlanRequest, Results
 from rps_jax.trials.batch_run import run_batch
 from rps_jax.trials.progress import Progress, ProgressCallback, SequentialProgress, no_progress

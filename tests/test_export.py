@@ -48,6 +48,7 @@ LAWS = [
     "force_push_published",
     "learned_small",
     "learned",
+    "unicycle",
 ]
 
 

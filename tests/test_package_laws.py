@@ -48,7 +48,13 @@ def test_no_law_of_the_package_warns_that_it_is_slow(law, robot, task, skin, mon
     """The code is printed, but not compiled."""
     monkeypatch.setattr(native, "load", lambda name: True)
     setting = Setting()
-    case = Case("cylinder", law=law, robot=robot, task=TASKS[task], skin=skin)
+    kind, has_walls = registry.law_of(registry.LAWS[law]), task in ("corridor", "rooms")
+    options = {"law": law, "robot": robot, "task": TASKS[task], "skin": skin}
+    if ROBOTS[robot].drive not in kind.drives or (kind.room and has_walls):
+        with refusing(r"it moves sideways|its detours need"):
+            pushes.build([Case("cylinder", **options)], setting)
+        return
+    case = Case("cylinder", **options)
     if law.startswith("learned") and case.base.shell.count != 42:
         with refusing("the law was learned with 42"):
             pushes.build([case], setting)

@@ -18,7 +18,7 @@ from rps_jax.engines import device, programs
 from rps_jax.record import cache as program_cache
 from rps_jax.runs.push import Push
 from rps_jax.runs.sweep import Sweep
-from rps_jax.trials import pushes, trial
+from rps_jax.trials import batch, pushes, trial
 from rps_jax.trials.case import Case
 from rps_jax.trials.setting import Setting
 
@@ -28,6 +28,7 @@ def cache(tmp_path):
     """The folder of traced programs in a temporary cache."""
     previous = jax.config.jax_compilation_cache_dir
     jax.config.update("jax_compilation_cache_dir", str(tmp_path))
+    batch._trace_advance.cache_clear()
     yield tmp_path / "traced"
     jax.config.update("jax_compilation_cache_dir", previous)
 

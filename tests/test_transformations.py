@@ -11,11 +11,13 @@ import pytest
 import rps_jax
 from rps_jax import engines
 from rps_jax.control.laws.rps import RPSParams
+from rps_jax.engines import native
 from rps_jax.trials.setting import Setting
 from rps_jax.world.tasks import TASKS, corridor
 
 SETTINGS = {name: Setting(name) for name in engines.names() if engines.get(name).modes}
 LAW = RPSParams.tuned()
+DOMAIN = "wide,objects=random_box,gap=0:0.01"
 ROOM = {"kind": "rooms", "outline": [[-1, -1], [4, -1], [4, 2], [-1, 2]], "goal": [2, 1]}
 EXAMPLES = {"rooms": ROOM}  # of tasks that need more than their name
 
@@ -23,8 +25,7 @@ EXAMPLES = {"rooms": ROOM}  # of tasks that need more than their name
 def final_distances(engine, task):
     """Return the distance [m] after 0.2 s as a function of law and worlds, and two worlds."""
     setting = SETTINGS[engine]
-    domain = "wide,objects=random_box,gap=0:0.01"
-    batch = rps_jax.draw_worlds(domain, 2, task=EXAMPLES.get(task, task), setting=setting)
+    batch = rps_jax.draw_worlds(DOMAIN, 2, task=EXAMPLES.get(task, task), setting=setting)
 
     def distance(law, world):
         trajectory = rps_jax.rollout(world, law, batch.stage, setting, horizon=0.2)
@@ -52,6 +53,18 @@ def test_rollouts_of_all_tasks_and_engines_have_all_transformations(engine, task
         assert {x.shape for x in jax.tree.leaves(shapes)} == {(2,)}
 
 
+@pytest.mark.parametrize("engine", SETTINGS)
+@pytest.mark.parametrize("first", [jax.grad, jax.jacfwd])
+def test_second_derivatives_of_rollouts_are_refused_with_and_without_a_compiler(
+    engine, first, monkeypatch
+):
+    distance, worlds = final_distances(engine, "reach")
+    for is_available in (native.is_available, lambda: False):
+        monkeypatch.setattr(native, "is_available", is_available)
+        with pytest.raises(NotImplementedError, match="trials have no second derivatives"):
+            jax.eval_shape(over_worlds(jax.jacfwd(first(distance))), LAW, worlds)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("task", TASKS)
 def test_both_modes_agree_in_all_tasks(task):
@@ -63,6 +76,29 @@ def test_both_modes_agree_in_all_tasks(task):
     jax.tree.map(
         partial(np.testing.assert_allclose, rtol=1e-3, atol=1e-4 * largest), result, expected
     )
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("engine", ["fused", "quasistatic"])
+@pytest.mark.parametrize("task", TASKS)
+def test_value_and_grad_differentiates_scores_of_all_tasks(engine, task):
+    """Compare with the gradient of the rollouts."""
+    distance, worlds = final_distances(engine, task)
+    expected = over_worlds(jax.grad(distance))(LAW, worlds)
+    results = rps_jax.value_and_grad(
+        lambda trajectory: trajectory.details.distance[-1],
+        {"law": LAW},
+        DOMAIN,
+        2,
+        "v_approach",
+        horizon=0.2,
+        smooth=False,
+        task=EXAMPLES.get(task, task),
+        setting=SETTINGS[engine],
+    )
+    slopes = results.gradient[0, :, 0]
+    assert np.abs(slopes).max() > 0
+    np.testing.assert_allclose(slopes, expected.v_approach, rtol=1e-3)
 
 
 @pytest.mark.parametrize("due", [True, False])

@@ -43,14 +43,6 @@ def measured(trace: xr.Dataset) -> dict[str, str]:
 
     Returns:
       Names and measures; empty if no measure reaches its threshold.
-
-    Examples:
-      >>> import rps_jax
-      >>> from rps_jax.analysis import mechanisms
-      >>> brief = rps_jax.Setting("quasistatic", rules=rps_jax.Rules(horizon=30.0))
-      >>> trace = rps_jax.push("cylinder", target=(-1.0, 0.5), setting=brief)
-      >>> mechanisms.measured(trace.data)["Realignment State"]
-      'once, 23 s in all'
     """
     time, qpos = trace.time.values, trace.qpos.values
     touching = trace.contact_type.values != skin.NONE

@@ -17,7 +17,7 @@ from rps_jax import errors
 from rps_jax.analysis.report import Section
 from rps_jax.control import registry, validation
 from rps_jax.control.base import Law, LawParams, named_leaves
-from rps_jax.control.observation import Twist, with_base_radius
+from rps_jax.control.observation import Twist, with_base
 from rps_jax.control.registry import LawLike
 from rps_jax.errors import InputError
 from rps_jax.geometry import planar
@@ -26,7 +26,7 @@ from rps_jax.record import bag as bags
 from rps_jax.record.files import Arrays
 from rps_jax.record.options import option
 from rps_jax.robot import robot as robots
-from rps_jax.robot.robot import RobotLike
+from rps_jax.robot.robot import Robot, RobotLike
 from rps_jax.robot.skin import with_contacts
 from rps_jax.runs.question import BagQuestion, Run, call_of
 from rps_jax.tuning.logs import COLUMNS, motion_faults
@@ -66,7 +66,7 @@ class Shadow(BagQuestion[xr.Dataset]):
 
     def check(self) -> None:
         """Check the law, the robot and the bag."""
-        _ = self.params, robots.parse_robot(self.robot)
+        registry.check_drive(self.params, robots.parse_robot(self.robot).drive)
         if not bags.is_bag(Path(self.file)):
             rule = "give an MCAP file, a .db3 file, or a folder of `ros2 bag record`"
             raise errors.not_allowed("bag", self.file, rule)
@@ -74,15 +74,14 @@ class Shadow(BagQuestion[xr.Dataset]):
 
     def answer(self, run: Run) -> xr.Dataset:
         """Run the law over the bag."""
-        shell = robots.parse_robot(self.robot).shell
+        robot = robots.parse_robot(self.robot)
+        shell = robot.shell
         recorded = with_contacts(self.steps, shell, f"bag = {self.file}")
         if "target" not in recorded:
             recorded |= {"target": pursued(recorded, self.lookahead)}
         motion = (recorded[name] for name in ("time", "pose", "twist"))
         doubts = "; it ".join(motion_faults(*motion))  # the base may follow other commands
-        if shell.radius is not None:
-            recorded["base_radius"] = np.asarray(shell.radius)
-        twists = shadowed(registry.law_of(self.params), self.params, recorded)
+        twists = shadowed(registry.law_of(self.params), self.params, recorded, robot)
         both = np.stack([recorded["twist"], twists])
         pairs = zip(COLUMNS["twist"].items(), np.moveaxis(both, -1, 0), strict=True)
         columns = {name: (("source", "time"), x, {"units": unit}) for (name, unit), x in pairs}
@@ -142,8 +141,8 @@ def pursued(recorded: Arrays, lookahead: float) -> np.ndarray:
     return np.asarray(aims.p_world_target)
 
 
-def shadowed(law: Law, params: LawParams, recorded: Arrays) -> np.ndarray:
-    """Return the twists (N, 3) [m/s, m/s, rad/s] of a law for the observations of a bag.
+def shadowed(law: Law, params: LawParams, recorded: Arrays, robot: Robot = Robot()) -> np.ndarray:
+    """Return the twists (N, 3) [m/s, m/s, rad/s] of a law on a robot for observations of a bag.
 
     A law that observes its last twist gets the recorded one, which moved the base. Rounding errors
     therefore do not grow from step to step.
@@ -169,7 +168,7 @@ def shadowed(law: Law, params: LawParams, recorded: Arrays) -> np.ndarray:
     def run(params: LawParams, observations: Any) -> jax.Array:
         def step(state: Any, row: Any) -> Any:
             sensed, last = row
-            obs = with_base_radius(sensed, recorded.get("base_radius"))
+            obs = with_base(sensed, robot.radius, robot)
             if law.observe_sent is not None:
                 state = law.observe_sent(params, state, obs, Twist(*last))
             state, twist, _ = law.step(params, state, obs)

@@ -83,7 +83,7 @@ class View(Command[None], Case):
     @property
     def case(self) -> Case:
         """The options' push; its law is `rps` if the options name a run."""
-        law = "rps" if self.law is None or self.run is not None else self.law
+        law = None if self.run is not None else self.law
         return Case(**dict(case_options(self, self.setting, Case), law=law))
 
     def note(self) -> str:
@@ -112,7 +112,8 @@ class View(Command[None], Case):
 
     def execute(self, callback: ProgressCallback) -> None:
         """Serve the page until it is ended."""
-        law = self.case.law if isinstance(self.case.law, str) else "rps"
+        law = registry.resolve_law(self.case.params)[0]
+        law = self.case.law if isinstance(self.case.law, str) else law
         request = PushRequest(self.object, label_of(self.friction), law, self.target)
         first = partial(self.push_of, request)
         if self.run is not None:

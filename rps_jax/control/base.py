@@ -17,6 +17,7 @@ import numpy as np
 
 from rps_jax.control.observation import Details, Twist
 from rps_jax.robot.base import LoadCell
+from rps_jax.robot.robot import DriveKind
 from rps_jax.spec import Bound as Bound
 from rps_jax.spec import Spec, spec_at, specs_of
 
@@ -133,6 +134,8 @@ class Law(Generic[Params, State, Obs]):
     temperatures: Smoothing | None = None
     smooth: bool = False  # whether this is the smooth form; it observes `in_contact` as a weight
     cell: LoadCell = LoadCell()  # the sensor of a law that senses force
+    drives: tuple[DriveKind, ...] = ("omni",)  # whose bases can follow its twists
+    room: float = 0.0  # [m] without walls around the object, for its detours
     # (params, state, obs, sent twist) -> state, for a law whose state holds its last command.
     observe_sent: Callable[[Params, State, Obs, Twist], State] | None = None
 

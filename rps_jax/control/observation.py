@@ -21,6 +21,7 @@ from rps_jax.geometry.arrays import (
     Scalar,
     Vector,
 )
+from rps_jax.robot.robot import Robot
 from rps_jax.spec import Spec
 
 # Displacements are clipped to this distance [m], so that no finite float32 overflows.
@@ -43,6 +44,16 @@ class Observation(NamedTuple):
     period: Annotated[Scalar, Spec("s", "time since the last control step")] = 0.02
     base_radius: Annotated[
         Number | None, Spec("m", "radius of a round base; None: a rectangle")
+    ] = None
+    axle: Annotated[
+        Number | None,
+        Spec("m", "axle that cannot move sideways, behind the base's middle; None: there is none"),
+    ] = None
+    turning_radius: Annotated[
+        Number | None, Spec("m", "least turning radius of a car's axle; None: it may be 0")
+    ] = None
+    half_length: Annotated[
+        Number | None, Spec("m", "half length of a rectangle with such an axle")
     ] = None
 
     @property
@@ -89,11 +100,18 @@ AnyObservation = Observation | TaxelObservation | ForceObservation | PoseObserva
 Observed = TypeVar("Observed", bound=AnyObservation)
 
 
-def with_base_radius(obs: Observed, radius: Number | None) -> Observed:
-    """Return an observation on a round base of a radius [m]; None: on a rectangular one."""
+def with_base(obs: Observed, radius: Number | None, robot: Robot | None = None) -> Observed:
+    """Return an observation with the static facts of a base.
+
+    They are the `radius` [m] of a round base, None for a rectangle, and the drive of the robot.
+    """
+    facts = {"base_radius": radius}
+    if robot is not None and robot.drive != "omni":
+        facts |= {"axle": robot.axle_behind, "turning_radius": robot.turning_radius}
+        facts |= {"half_length": robot.half_length}
     if isinstance(obs, Observation):
-        return obs._replace(base_radius=radius)
-    return obs._replace(touch=obs.touch._replace(base_radius=radius))
+        return obs._replace(**facts)
+    return obs._replace(touch=obs.touch._replace(**facts))
 
 
 class Twist(NamedTuple):

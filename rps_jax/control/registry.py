@@ -37,6 +37,7 @@ from rps_jax.record import files
 from rps_jax.record.files import JsonObject
 from rps_jax.record.manifest import Stored
 from rps_jax.record.options import parse_changes
+from rps_jax.robot.robot import DriveKind
 
 T = TypeVar("T")  # a pytree
 # Both are `Any` for the command line, which reads a text; a program may pass parameters.
@@ -107,6 +108,41 @@ def law_of(params: LawParams | type) -> Law:
         fix = f"use {known}, or register the law with register_law"
         raise InputError(f"params of class {kind.__name__} belong to no law: {fix}.")
     return _LAWS_BY_CLASS[kind]
+
+
+def default_law(drive: DriveKind) -> str:
+    """Return the name of the law for a base with this drive, if none is named."""
+    return "rps" if drive == "omni" else laws_for(drive)[0]
+
+
+def laws_for(drive: DriveKind) -> list[str]:
+    """Return the names of the offered laws whose twists such a base can follow."""
+    return [name for name, params in LAWS.items() if drive in law_of(params).drives]
+
+
+def check_room(params: LawParams, task: str, room: float) -> None:
+    """Raise InputError unless a task leaves the law `room` [m] around the object."""
+    if (needed := law_of(params).room) > room:
+        name = f"{task} with the law {_name_of(params)}"
+        rule = f"its detours need {needed:g} m without walls around the object, not {room:g} m"
+        raise errors.not_allowed("task", name, f"{rule}; choose a wider one, or another law")
+
+
+def check_drive(params: LawParams, drive: DriveKind) -> None:
+    """Raise InputError unless a base with this drive can follow the law's twists."""
+    if drive in law_of(params).drives:
+        return
+    known = " or ".join(laws_for(drive))
+    rule = f"it moves sideways, which a base with drive = {drive} cannot; choose {known}"
+    if not type(params).__module__.startswith("rps_jax."):
+        rule += ", or declare Law(drives=...) of this one"
+    raise errors.not_allowed("law", _name_of(params), rule)
+
+
+def _name_of(params: LawParams) -> str:
+    """Return the name of the first law of a class of parameters."""
+    kind = type(params)
+    return next((name for name, x in LAWS.items() if type(x) is kind), kind.__name__)
 
 
 def check_params(params: Params) -> Params:

@@ -41,6 +41,15 @@ def register_engine(engine: Engine) -> None:
 
     Raises:
       InputError: it is no `engines.base.Engine`, or its name is an engine of this package.
+
+    Examples:
+      >>> from rps_jax import register_engine
+      >>> from rps_jax.engines.quasistatic import QuasistaticEngine
+      >>> class Planar(QuasistaticEngine):
+      ...     name = "planar"
+      >>> register_engine(Planar())
+      >>> get("planar").name
+      'planar'
     """
     from rps_jax.engines.base import Engine
 

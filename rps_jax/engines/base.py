@@ -26,6 +26,7 @@ import numpy as np
 from rps_jax import engines, errors
 from rps_jax.control.observation import Twist
 from rps_jax.engines import device
+from rps_jax.engines.linear_map import once_differentiable
 from rps_jax.geometry.arrays import Float
 from rps_jax.robot.robot import Robot
 from rps_jax.world.physics import Physics
@@ -173,14 +174,14 @@ class Engine(abc.ABC):
             raise self._refused(f"it has no {mode}-mode derivatives; choose {' or '.join(known)}")
 
     def guard_derivatives(self, tree: T) -> T:
-        """Return a pytree unchanged; where it is differentiated in a missing mode, refuse that."""
+        """Return a pytree unchanged, of which missing modes and second derivatives are refused."""
         try:
             for mode in get_args(Mode):
                 self.check_derivatives(mode)
         except errors.InputError as error:
             refusal = str(error)
         else:
-            return tree
+            return jax.tree.map(once_differentiable, tree)
 
         def refuse(primals: Any, tangents: Any) -> Any:
             raise errors.InputError(refusal)

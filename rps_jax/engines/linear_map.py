@@ -1,5 +1,7 @@
 """Linear maps with given transposes: derivatives of functions that JAX does not differentiate.
 
+`once_differentiable` refuses second derivatives where they would be wrong.
+
 `jax.custom_jvp` alone cannot say how a tangent map is transposed, and `jax.custom_vjp` has no
 forward mode. The primitive of this module has both, and `jax.vmap` maps it.
 """
@@ -61,6 +63,12 @@ def restrict(
     return restricted, [values[i] for i in indices]
 
 
+def once_differentiable(x: Any) -> Any:
+    """Return a leaf of a pytree by which JAX refuses second derivatives."""
+    is_real = isinstance(x, jax.core.Tracer) and jnp.issubdtype(x.dtype, jnp.inexact)
+    return _once.bind(x, derived=False) if is_real else x
+
+
 _primitive = Primitive("linear_map")
 _primitive.multiple_results = True
 
@@ -107,3 +115,15 @@ ad.primitive_jvps[_primitive] = _refuse
 ad.primitive_transposes[_primitive] = _transpose
 batching.primitive_batchers[_primitive] = _batch
 mlir.register_lowering(_primitive, mlir.lower_fun(_run, multiple_results=True))
+
+
+def _jvp_once(primals: Any, tangents: Any, derived: bool) -> tuple[jax.Array, Any]:
+    return _refuse() if derived else (_once.bind(*primals, derived=True), *tangents)
+
+
+_once = Primitive("once_differentiable")
+_once.def_impl(lambda x, **_: x)
+_once.def_abstract_eval(lambda x, **_: x)
+ad.primitive_jvps[_once] = _jvp_once
+batching.defvectorized(_once)
+mlir.register_lowering(_once, lambda _, x, **__: [x])

@@ -104,7 +104,7 @@ class MJXStage(NamedTuple):
     ) -> tuple[Motion, jax.Array]:
         """Return a world after one step, and the wrench (3,) on its base, in the base's frame."""
         model, (qpos, qvel, warmstart, integral) = apply(self.model, fields), state
-        data = self.data
+        data, sideways = self.data, None
         if robot is None:
             qvel = qvel.at[JOINTS.base].set(twist.in_world(qpos[2]))
         else:
@@ -112,25 +112,38 @@ class MJXStage(NamedTuple):
             turn, base = (jnp.cos(qpos[2]), jnp.sin(qpos[2])), qvel[JOINTS.base]
             servo: Any = tuple(integral)
             force, servo = drives.push(robot, servo, twist, tuple(base), turn, timestep)
-            applied = data.qfrc_applied.at[JOINTS.base].set(jnp.stack(force))
+            applied = jnp.stack(force)
+            if robot.drive != "omni":
+                tyres = drives.Tyres.of(robot, tuple(base), turn, timestep)
+                applied = applied + jnp.stack(tyres.force)
+                direction = jnp.stack(tyres.sideways)
+                sideways = jnp.asarray(tyres.mass) * jnp.outer(direction, direction)
+            applied = data.qfrc_applied.at[JOINTS.base].set(applied)
             data, integral = data.replace(qfrc_applied=applied), jnp.stack(servo)
         data = data.replace(qpos=qpos, qvel=qvel, qacc_warmstart=warmstart)
         with jax.default_matmul_precision("float32"):  # GPUs would round products to TF32
-            data = step(model, data, fields.get(OUTLINE), fields.get(BOUNDARY))
+            data = step(model, data, fields.get(OUTLINE), fields.get(BOUNDARY), inertia=sideways)
         wrench = data.qfrc_constraint[JOINTS.base]  # of the contacts, without the drive
         wrench = wrench.at[:2].set(planar.rotate(-qpos[2], wrench[:2]))
         return Motion(data.qpos, data.qvel, data.qacc_warmstart, integral), wrench
 
 
-def step(model: mjx.Model, data: mjx.Data, *extra: Extra) -> mjx.Data:
+def step(
+    model: mjx.Model, data: mjx.Data, *extra: Extra, inertia: jax.Array | None = None
+) -> mjx.Data:
     """Compute one step by functions of MJX and our colliders; `extra` is that of `collision`.
 
-    Unused features are left out: tendons, actuators, sensors, springs, dampers, cameras and lights.
-    As in C MuJoCo, without dampers no velocity is integrated implicitly.
+    An `inertia` (3, 3) of tyres is added to that of the base's joints. Unused features are left
+    out: tendons, actuators, sensors, springs, dampers, cameras and lights. As in C MuJoCo, without
+    dampers no velocity is integrated implicitly.
     """
     data = smooth.kinematics(model, data)
     data = smooth.com_pos(model, data)
     data = smooth.crb(model, data)
+    if inertia is not None:
+        mass = data._impl.M.at[JOINTS.base, JOINTS.base].add(inertia)  # dense
+        held: Any = data.tree_replace({"_impl.M": mass})
+        data = held
     data = smooth.factor_m(model, data)
     data = collision(model, data, *extra)
     data = constraint.make_constraint(model, data)

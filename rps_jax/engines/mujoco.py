@@ -134,9 +134,18 @@ class Batch:
             turn, base = (np.cos(yaw), np.sin(yaw)), tuple(qvel[:, JOINTS.base].T)
             force, integral = drives.push(robots, integral, tuple(twist.T), base, turn, dt, np)
             applied[:, 0, JOINTS.base] = np.stack(force, axis=1)
+            tyres = None
+            if robots.drive != "omni":
+                tyres = drives.Tyres.of(robots, base, turn, dt)
+                applied[:, 0, JOINTS.base] += np.stack(tyres.force, axis=1)
+                for i, *sideways in zip(rows, *np.broadcast_arrays(*tyres.sideways), strict=True):
+                    self.models[i].wrap_prm[:] = sideways
             following = self._rollout(rows, state, warmstart, control=applied, nstep=1)[:, -1]
             warmstart = (following[:, 1 + nq :] - qvel) / dt
             contact = self._inertia[rows] * warmstart[:, JOINTS.base] - np.stack(force, axis=1)
+            if tyres is not None:  # what the tyres hold is not of the contact
+                held = sum(a * b for a, b in zip(tyres.sideways, warmstart.T, strict=False))
+                contact += np.stack(tyres.along(tyres.mass * (held - tyres.rest)), axis=1)
             wrench += _in_base(contact - self._weight[rows], turn) / substeps
             state = following
         self.state[rows], self.warmstart[rows] = state, warmstart

@@ -54,7 +54,15 @@ _RANDOM = {
     "random_split": "split",
     "random_fold_in": "fold_in",
 }
-_IDENTITIES = ("stop_gradient", "copy", "copy_p", "optimization_barrier", "pvary", "name")
+_IDENTITIES = (
+    "stop_gradient",
+    "copy",
+    "copy_p",
+    "optimization_barrier",
+    "pvary",
+    "name",
+    "once_differentiable",
+)
 
 
 def traced(function: Function, *arguments: Any) -> tuple[ClosedJaxpr, Any]:

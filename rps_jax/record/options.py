@@ -45,8 +45,8 @@ def option(
     field with a `flag` has a tuple of texts, one for each time that the flag of this name is given.
 
     Examples:
-      >>> dict(option(0.05, above=0, at_most=1, unit="m/s").metadata["bounds"])
-      {'at_most': 1, 'above': 0, 'unit': 'm/s'}
+      >>> option(0.05, above=0, at_most=1, unit="m/s").metadata["spec"].bounds
+      {'above': 0, 'at_most': 1, 'unit': 'm/s'}
     """
     metadata = {HIDDEN: hidden, POSITIONAL: positional, FLAG: flag}
     if unit or not at_least is at_most is above is None:

@@ -37,9 +37,9 @@ class Odometry(NamedTuple):
     command_delay: Annotated[
         Number, Spec("s", "time between a command and its execution", ge=0)
     ] = 0.0  # ()
-    velocity_error: Annotated[Number, Spec("1", "error of each component of the twist")] = (
-        0.0  # (3,)
-    )
+    velocity_error: Annotated[
+        Number, Spec("1", "error of each component of the twist, or of two wheels")
+    ] = 0.0  # (3,)
     past: np.ndarray | jax.Array = np.zeros(0)  # (K,)
 
 
@@ -70,10 +70,10 @@ def normal(key: jax.Array, shape: tuple[int, ...], dtype: Any) -> jax.Array:
 
 
 def delay_twist(odometry: Odometry, twists: jax.Array, twist: jax.Array, period: float) -> Pair:
-    """Return the latest commanded twists (K, 3), `twist` (3,) first, and the executed one (3,)."""
+    """Return the latest commanded twists (K, 3), `twist` (3,) first, and the delayed one (3,)."""
     twists = jnp.concatenate([twist[None], twists[:-1]])
     delayed = twists[_steps_of(odometry.command_delay, period)]
-    return twists, delayed * (1 + odometry.velocity_error)
+    return twists, delayed
 
 
 def _steps_of(time: Number, period: float) -> jax.Array:

@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import reduce
 from pathlib import Path
-from typing import Annotated, Any, TypeAlias
+from typing import Annotated, Any, Literal, TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -30,11 +30,15 @@ Number: TypeAlias = Any
 _POSITIVE = 1e-3  # lower bound of limits that would stop the base
 
 
+DriveKind = Literal["omni", "differential", "car"]
+
+
 @dataclass(frozen=True)
 class Robot:
-    """An omnidirectional base and its limits. A pytree whose numbers may be batched.
+    """A base, its drive and its limits. A pytree whose numbers may be batched.
 
-    Twists and limits are in the robot frame, x forward and y left.
+    Twists and limits are in the robot frame, x forward and y left. A base with another drive than
+    `omni` has an axle that cannot move sideways: see `robot.drive`.
     """
 
     half_length: Annotated[Number, Spec("m", "half length of the base")] = HALF_LENGTH  # ()
@@ -78,6 +82,44 @@ class Robot:
     slip_yaw: Annotated[Number, Spec("1", "share of omega that is lost", ge=0, le=0.9)] = None
     # In place of half length and half width; None: a rectangle.
     radius: Annotated[Number, Spec("m", "radius of a round base", ge=0.1, le=2)] = None  # ()
+    drive: DriveKind = "omni"  # static
+    # None: 0
+    axle: Annotated[
+        Number, Spec("m", "wheels that cannot move sideways, behind the middle", ge=-2, le=2)
+    ] = None  # ()
+    turning_radius: Annotated[
+        Number, Spec("m", "least turning radius of a car's axle", ge=_POSITIVE, le=20)
+    ] = None  # ()
+    # None: the width of the base.
+    track: Annotated[Number, Spec("m", "distance between left and right wheel", gt=0, le=4)] = (
+        None  # ()
+    )
+    wheel_speed_max: Annotated[
+        Number, Spec("m/s", "greatest speed of a wheel's rim", ge=_POSITIVE, le=20)
+    ] = None  # ()
+    wheel_acceleration_max: Annotated[
+        Number, Spec("m/s^2", "greatest acceleration of a wheel's rim", ge=_POSITIVE, le=100)
+    ] = None  # ()
+    # Of software; None: those of the domain.
+    pose_latency: Annotated[Number, Spec("s", "age of the pose that laws observe", ge=0, le=1)] = (
+        None  # ()
+    )
+    command_delay: Annotated[
+        Number, Spec("s", "time between a command and its execution", ge=0, le=1)
+    ] = None  # ()
+    time_constant: Annotated[Number, Spec("s", "time constant of the skin", ge=_POSITIVE, le=1)] = (
+        None  # ()
+    )
+
+    @property
+    def half_track(self) -> Number:
+        """Half of the distance () [m] between the left and the right wheel of an axle."""
+        return self.sizes[-1] if self.track is None else self.track / 2
+
+    @property
+    def axle_behind(self) -> Number:
+        """Position () [m] of the axle behind the middle of the base."""
+        return 0.0 if self.axle is None else self.axle
 
     @property
     def driven(self) -> bool:
@@ -87,7 +129,7 @@ class Robot:
     @property
     def ideal(self) -> bool:
         """Whether the base has no limits: it follows every twist at once, with any force."""
-        return all(getattr(self, name) is None for name in LIMITS)
+        return self.drive == "omni" and all(getattr(self, name) is None for name in LIMITS)
 
     @property
     def inertia(self) -> Number:
@@ -96,7 +138,9 @@ class Robot:
 
     @property
     def arm(self) -> Number:
-        """Distance () [m] from the middle to the wheels, at the rim or the corners."""
+        """Distance () [m] from the middle to the wheels, at the rim or the corners, or the axle."""
+        if self.drive == "differential":
+            return self.half_track
         square = self._square
         return jnp.sqrt(square) if isinstance(square, jax.Array) else np.sqrt(square)
 
@@ -144,7 +188,7 @@ class Robot:
     def check(self) -> None:
         """Raise InputError for numbers that no robot has; each is one number, or None."""
         check_fields(self, "robot ")
-        for name in [field for field in _FIELDS if field != "boards"]:
+        for name in [field for field in _FIELDS if field not in ("boards", "drive")]:
             shapes, form = _SHAPES.get(name, (((),), "one number"))
             if (value := getattr(self, name)) is not None and np.shape(value) not in shapes:
                 raise errors.not_allowed(f"robot {name}", value, f"give {form}")
@@ -154,11 +198,31 @@ class Robot:
             rule = "a base is round or a rectangle: leave out radius, or the half sizes"
             raise errors.not_allowed("robot radius", sizes, rule)
         Shell(self.half_length, self.half_width, self.boards, radius=self.radius).check()
+        self._check_drive()
         if self.push_max is not None and self.push_max <= 0:
             rolling = (self.resistance or 0) * self.mass * GRAVITY
             rule = f"rolling resistance takes {rolling:.0f} N, so that no force is left to push"
             limits = f"{self.force_max} N and robot traction = {self.traction}"
             raise errors.not_allowed("robot force_max", limits, rule)
+
+    def _check_drive(self) -> None:
+        """Raise InputError for numbers of wheels that do not belong to the drive."""
+        wheels = {name: getattr(self, name) for name in _WHEELS}
+        for name, value in wheels.items():
+            if value is not None and self.drive == "omni":
+                rule = "it is of an axle: choose drive = differential or car, or leave it out"
+                raise errors.not_allowed(f"robot {name}", f"{value:g}", rule)
+        if (self.turning_radius is None) == (self.drive == "car"):
+            rule = "a car needs one, as turning_radius=0.5 [m]"
+            if self.drive != "car":
+                rule = "other bases than those with drive = car turn on the spot: leave it out"
+            raise errors.not_allowed("robot turning_radius", self.turning_radius, rule)
+        if abs(self.axle_behind) > self.sizes[0]:
+            rule = f"it lies outside the base, which ends at {self.sizes[0]:g} m"
+            raise errors.not_allowed("robot axle", f"{self.axle_behind:g} m", rule)
+        if self.drive != "omni" and self.slip_sideways is not None:
+            rule = f"the axle of a {self.drive} drive does not move sideways: leave it out"
+            raise errors.not_allowed("robot slip_sideways", f"{self.slip_sideways:g}", rule)
 
 
 def _minimum(a: Number, b: Number) -> Number:
@@ -175,10 +239,14 @@ _SHAPES = {  # allowed shapes of limits that are no single number
 }
 _FIELDS = [field.name for field in dataclasses.fields(Robot)]
 _SLIPS = ("slip", "slip_sideways", "slip_yaw")
-_AIM_LIMITS = ("v_max", "omega_max", "lag", "acceleration_max", *_SLIPS)
-_NOT_LIMITS = ("half_length", "half_width", "radius", "boards", "mass", "bandwidth", "resistance")
-LIMITS = tuple(name for name in _FIELDS if name not in _NOT_LIMITS)
-jax.tree_util.register_dataclass(Robot, data_fields=_FIELDS, meta_fields=[])
+_WHEELS = ("axle", "turning_radius", "track", "wheel_speed_max", "wheel_acceleration_max")
+LATENCIES = ("pose_latency", "command_delay", "time_constant")  # also names of a domain's ranges
+_AIM_LIMITS = ("v_max", "omega_max", "lag", "acceleration_max", *_SLIPS, *_WHEELS[3:], *LATENCIES)
+_BODY = ("half_length", "half_width", "radius", "boards", "mass", "bandwidth", "resistance")
+_STATIC = (*_BODY, "drive", *_WHEELS, *LATENCIES)
+LIMITS = tuple(name for name in _FIELDS if name not in _STATIC)
+_DATA = [name for name in _FIELDS if name != "drive"]
+jax.tree_util.register_dataclass(Robot, data_fields=_DATA, meta_fields=["drive"])
 
 
 def _covered(half_length: float, half_width: float, mass: float, **limits: Any) -> Robot:
@@ -218,6 +286,73 @@ ROBOTS: dict[str, Robot] = {
     "mpo_500": _covered(
         0.494, 0.331, 130.0, v_max=0.9, acceleration_max=(2.4, 6.47), **_GEARED_MOTORS
     ),
+    # Bases that cannot move sideways. No source gives the friction of their wheels, so that their
+    # force has no limit: append ,traction=0.6, for example.
+    # TurtleBot 4, with a flat plate 0.30 m wide before its round body, which is our choice. Its
+    # manual: 341 mm, 3.945 kg, 0.31 m/s (safe mode), 1.9 rad/s. Create 3: wheels 233 mm apart
+    # (create3.urdf.xacro), at most 0.9 m/s^2 (its API).
+    "turtlebot4": _covered(
+        0.1705,
+        0.15,
+        3.945,
+        drive="differential",
+        track=0.233,
+        v_max=0.31,
+        omega_max=1.9,
+        wheel_acceleration_max=0.9,
+    ),
+    # Clearpath Jackal: its manual gives 508 by 430 mm and 17 kg, jackal_control/config/control.yaml
+    # speeds, accelerations, and the factor 1.5 by which skidding widens its track of 0.3756 m
+    # (jackal.urdf.xacro).
+    "jackal": _covered(
+        0.254,
+        0.215,
+        17.0,
+        drive="differential",
+        track=0.5634,
+        v_max=2.0,
+        omega_max=4.0,
+        acceleration_max=(20.0, 25.0),
+    ),
+    # Clearpath Husky A200: its data sheet gives 990 by 670 mm, 50 kg and 1 m/s,
+    # husky_control/config/control.yaml the rest, with the factor 1.875 for its track of 0.5708 m.
+    "husky": _covered(
+        0.495,
+        0.335,
+        50.0,
+        drive="differential",
+        track=1.0703,
+        v_max=1.0,
+        omega_max=2.0,
+        acceleration_max=(3.0, 6.0),
+    ),
+    # MiR100: its data sheet gives 890 by 580 mm, 70 kg and 1.5 m/s. Accelerations, track and axle
+    # are unknown: those of the width and the middle.
+    "mir100": _covered(0.445, 0.29, 70.0, drive="differential", v_max=1.5),
+    # Pioneer 3-DX: its data sheet gives 455 by 381 mm, 9 kg, 1.2 m/s and 300 degrees per second,
+    # and a swing radius of 267 mm behind the axle, which is that far from the rear. The track is
+    # unknown: that of the width.
+    "pioneer_3dx": _covered(
+        0.2275,
+        0.1905,
+        9.0,
+        drive="differential",
+        axle=-0.0395,
+        v_max=1.2,
+        omega_max=5.24,
+    ),
+    # A racing car of 1:10: sizes, mass and acceleration of f1tenth_gym; its axles are 0.3302 m
+    # apart and steer by 0.4189 rad, which gives the turning radius. That they lie evenly about the
+    # middle is our choice. The track is unknown.
+    "f1tenth": _covered(
+        0.29,
+        0.155,
+        3.74,
+        drive="car",
+        axle=0.1651,
+        turning_radius=0.742,
+        wheel_acceleration_max=9.51,
+    ),
 }
 
 
@@ -239,7 +374,9 @@ def parse_robot(robot: RobotLike) -> Robot:
     if isinstance(robot, Mapping):
         for name in robot:
             errors.check_name("robot quantity", name, _FIELDS)
-        values = {k: tuple(v) if isinstance(v, list | tuple) else v for k, v in robot.items()}
+        values: dict[str, Any] = {
+            k: tuple(v) if isinstance(v, list | tuple) else v for k, v in robot.items()
+        }
         if "boards" in values:
             values["boards"] = _parse_boards(values["boards"])
         robot = Robot(**values)

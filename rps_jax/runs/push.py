@@ -271,6 +271,7 @@ class Push(Case, TraceQuestion, SimulationQuestion[Trace]):
 
     def __post_init__(self) -> None:
         """Defer the checks of `Case` to `check`."""
+        self.choose_law()
 
     @property
     def horizon(self) -> float:

@@ -24,7 +24,7 @@ import itertools
 import re
 import warnings
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, fields
 from operator import attrgetter
 from pathlib import Path
 from typing import (
@@ -416,8 +416,13 @@ class MultiLawQuestion(SimulationQuestion[T]):
 
 @dataclass(frozen=True, kw_only=True)
 class TaskOption:
-    """Option of questions about random worlds."""
+    """Options of questions about random worlds."""
 
+    robot: RobotLike | None = None
+    """The robot: ideal, slipping, kairos (the paper's), ridgeback, mpo_500 or round; turtlebot4,
+    jackal, husky, mir100, pioneer_3dx or f1tenth, which cannot move sideways; or a JSON file of its
+    size, boards, drive and limits. By default the domain's, which is ideal but in the domain
+    real."""
     task: TaskLike | None = None
     """The task: reach (one target, as in the paper), path (follow a path by a lookahead),
     corridor (a path between walls that end a trial when touched) or rooms (a planned path among the
@@ -432,10 +437,6 @@ class DomainQuestion(TaskOption, SimulationQuestion[T]):
     domain: DomainLike = "wide"
     """Ranges from which worlds are drawn: paper, hardware, wide, real (wide, but with limited
     robots), prisms or hostile, or a JSON file of ranges. Changes follow, as wide,mass=3:10."""
-    robot: RobotLike | None = field(default=None, kw_only=True)
-    """The robot: ideal, slipping, kairos (the paper's), ridgeback, mpo_500 or round, or a JSON
-    file of its size, boards and limits. By default the domain's, which is ideal but in the domain
-    real."""
 
     @functools.cached_property
     def ranges(self) -> Domain:

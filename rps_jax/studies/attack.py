@@ -34,19 +34,10 @@ from rps_jax.analysis.figures.style import (
     words,
 )
 from rps_jax.engines import device
-from rps_jax.questions import (
-    DomainQuestion,
-    LawQuestion,
-    Picture,
-    Plan,
-    Run,
-    Section,
-    call_of,
-    option,
-)
+from rps_jax.questions import LawQuestion, Picture, Plan, Run, Section, call_of, option
 from rps_jax.record.files import Arrays
 from rps_jax.runs import execution
-from rps_jax.runs.question import count_true
+from rps_jax.runs.question import DomainQuestion, count_true
 from rps_jax.studies.probe import Probe
 from rps_jax.trials.progress import Bar, set_phase
 from rps_jax.trials.setting import seed_of

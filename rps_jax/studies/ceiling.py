@@ -28,11 +28,11 @@ import xarray as xr
 from rps_jax import RPSParams, errors
 from rps_jax.analysis import statistics, tables
 from rps_jax.control.laws.guided import KNOTS, GuidedParams
-from rps_jax.questions import DomainQuestion, Plan, Run, Section, call_of, option
+from rps_jax.questions import Plan, Run, Section, call_of, option
 from rps_jax.record import files
 from rps_jax.record.files import JsonObject
 from rps_jax.runs.plan import attributes_of, load_plan
-from rps_jax.runs.question import Rows, count_true
+from rps_jax.runs.question import DomainQuestion, Rows, count_true
 from rps_jax.studies.gallery import failure_modes
 from rps_jax.trials import score
 from rps_jax.trials.batch_run import Candidates, outcomes

@@ -18,11 +18,11 @@ from rps_jax import errors
 from rps_jax.analysis import mechanisms, statistics, tables
 from rps_jax.analysis.figures.paper import draw_path
 from rps_jax.analysis.figures.style import WIDTH, Figure, styled, tiles
-from rps_jax.questions import Picture, Plan, Question, Run, Section, call_of, option
+from rps_jax.questions import Picture, Plan, Run, Section, call_of, option
 from rps_jax.record import files
 from rps_jax.runs.plan import build_batch
 from rps_jax.runs.push import find_differences, program_slots, select_law
-from rps_jax.runs.question import Rows
+from rps_jax.runs.question import Question, Rows
 from rps_jax.trials import pushes
 from rps_jax.trials.progress import SequentialProgress
 from rps_jax.trials.results import trace_dataset

@@ -15,7 +15,7 @@ import xarray as xr
 
 from rps_jax.analysis import tables
 from rps_jax.analysis.figures.style import WIDTH, Figure, base_patch, styled, tiles, words
-from rps_jax.laws import LawLike
+from rps_jax.control.registry import LawLike
 from rps_jax.questions import LawQuestion, Picture, Run, Section, call_of, option
 from rps_jax.robot.robot import RobotLike
 from rps_jax.robot.skin import SkinLike

@@ -9,7 +9,7 @@ import dataclasses
 import re
 import textwrap
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from typing import Any, ClassVar, get_args
 
@@ -21,10 +21,11 @@ from rps_jax.analysis import statistics, tables
 from rps_jax.analysis.figures.style import WIDTH, Figure, panel, styled
 from rps_jax.control import registry
 from rps_jax.control.base import Senses
-from rps_jax.laws import LawLike, LawParams, LawsLike, law_of, resolve_law
+from rps_jax.control.registry import LawLike
+from rps_jax.laws import LawParams, LawsLike, law_of, resolve_law
 from rps_jax.questions import MultiLawQuestion, Picture, Run, Section, call_of, option
 from rps_jax.record.files import JsonObject
-from rps_jax.robot.robot import RobotLike
+from rps_jax.robot.robot import parse_robot
 from rps_jax.runs.question import Rows, TaskOption, count_true
 from rps_jax.runs.sweep import Sweep, SweepOptions, describe_plan
 from rps_jax.trials.progress import ProgressCallback, SequentialProgress
@@ -79,26 +80,25 @@ class Ladder(SweepOptions, TaskOption, MultiLawQuestion[xr.Dataset | xr.DataTree
     QUICK: ClassVar[Mapping[str, Any]] = {"worlds": 64, "domain": ("wide,objects=random_box",)}
 
     laws: LawsLike = ()
-    """The laws, by default all laws of the package: names, as rps, rps_tuned or rps_plus, or a
-    file's, as my_law.py:MyParams or policy.npz; changes follow each, as rps,K_h=0.3 or
-    rps,tuned.json."""
+    """The laws, by default all laws of the package that the robot can follow: names, as rps,
+    rps_tuned or rps_plus, or a file's, as my_law.py:MyParams or policy.npz; changes follow each, as
+    rps,K_h=0.3 or rps,tuned.json."""
     domain: DomainLike | Sequence[DomainLike] = ("wide",)
     """Domains: paper, hardware, wide, real (wide, but with limited robots), prisms or hostile, or
     JSON files of ranges. Changes follow each, as wide,mass=3:10."""
     worlds: int | None = option(None, 1, 1_000_000_000)
     """Number of worlds of each domain; by default 1000, or the grid of a domain with listed targets
     (paper: 144). With several domains it is at most that grid."""
-    robot: RobotLike | None = field(default=None, kw_only=True)
-    """The robot: ideal, slipping, kairos (the paper's), ridgeback, mpo_500 or round, or a JSON
-    file of its size, boards and limits. By default the domain's."""
     part: int | None = option(None, 1, 1_000_000, kw_only=True)
     """Checkpoint interval: at most this many trials per law and object are repeated after a kill.
     By default 1024, and with many worlds a 16th of them, up to 16384."""
 
     @cached_property
     def chosen(self) -> dict[str, LawParams]:
-        is_default = isinstance(self.laws, tuple) and not self.laws
-        return registry.resolve_laws(all_laws() if is_default else self.laws)
+        if not isinstance(self.laws, tuple) or self.laws:
+            return registry.resolve_laws(self.laws)
+        drive = parse_robot(self.robot or "ideal").drive
+        return registry.resolve_laws([x for x in all_laws() if x in registry.laws_for(drive)])
 
     @cached_property
     def sweeps(self) -> dict[str, _TestSweep]:

@@ -24,8 +24,8 @@ import xarray as xr
 from scipy import stats
 
 from rps_jax import errors
-from rps_jax.questions import DomainQuestion, LawQuestion, Run, Section, call_of, option
-from rps_jax.runs.question import Rows
+from rps_jax.questions import LawQuestion, Run, Section, call_of, option
+from rps_jax.runs.question import DomainQuestion, Rows
 from rps_jax.studies.probe import Probe
 from rps_jax.world import points
 

@@ -29,17 +29,8 @@ from rps_jax.analysis.figures.style import (
     styled,
     tiles,
 )
-from rps_jax.questions import (
-    DomainQuestion,
-    LawQuestion,
-    Picture,
-    Plan,
-    Run,
-    Section,
-    call_of,
-    option,
-)
-from rps_jax.runs.question import Rows, count_true
+from rps_jax.questions import LawQuestion, Picture, Plan, Run, Section, call_of, option
+from rps_jax.runs.question import DomainQuestion, Rows, count_true
 from rps_jax.runs.sweep import PlanQuestion
 from rps_jax.world import points
 

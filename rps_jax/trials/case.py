@@ -40,7 +40,8 @@ class TrialOptions:
     robot: RobotLike = "ideal"
     """The robot: ideal (it follows every twist at once, with any force), slipping (its wheels lose
     shares of the twist), kairos (the paper's), ridgeback, mpo_500 or round (a disc as wide as
-    the paper's base), or a JSON file of its size, boards and limits. Changes follow, as
+    the paper's base); turtlebot4, jackal, husky, mir100, pioneer_3dx or f1tenth, which cannot move
+    sideways; or a JSON file of its size, boards, drive and limits. Changes follow, as
     kairos,force_max=300."""
 
 
@@ -60,9 +61,10 @@ class Case(TrialOptions):
     """Friction: a set of the paper's Table I (S1, S2), or coefficients GROUND,ROBOT."""
     target: tuple[float, float] = _TARGET
     """Target X Y [m] in the world, where the base starts at the origin."""
-    law: LawLike = "rps"
+    law: LawLike | None = None
     """The law: its name, as rps, rps_tuned or rps_plus, or a file's, as my_law.py:MyParams or
-    policy.npz; changes follow, as rps,K_h=0.3 or rps,tuned.json."""
+    policy.npz; changes follow, as rps,K_h=0.3 or rps,tuned.json. By default rps, or unicycle on a
+    base that cannot move sideways."""
     task: TaskLike = option("reach", kw_only=True)
     """The task: reach (one target, as in the paper), path (follow a path by a lookahead),
     corridor (a path between walls that end a trial when touched) or rooms (a planned path among the
@@ -73,11 +75,18 @@ class Case(TrialOptions):
     shift: Shift = option(Shift(), kw_only=True, hidden=True)
     """Scripted shift of the object during the push."""
 
+    def choose_law(self) -> None:
+        """Set the law that is used if none is named."""
+        if self.law is None:
+            object.__setattr__(self, "law", registry.default_law(self.base.drive))
+
     def __post_init__(self) -> None:
         check_fields(self)
+        self.choose_law()
         name = objects.parse_object(self.object)
         objects.check_object("object", name)
         registry.check_params(self.params)
+        registry.check_room(self.params, self.challenge.kind, self.challenge.free_room)
         scene.check_contact(self.contact, self.mass)
         skins.parse_skin(self.skin or "ideal")
         errors.check_number("shift time", self.shift.time, at_least=0, unit="s")

@@ -95,6 +95,7 @@ class PushEnv:
 
     Action (3,): the twist (v_x, v_y, omega) in the robot's frame, in units of the parameters'
     v_max, v_max and omega_max. (v_x, v_y) is scaled down to a norm of 1, omega is clipped to +-1.
+    Action (2,) of a base that cannot move sideways: (v_x, omega).
 
     Reward: see `Reward`. There is no progress without contact; after a new contact, progress counts
     from where the contact was lost. So the sum of rewards measures how much nearer the object is.
@@ -209,14 +210,18 @@ class PushEnv:
         )
 
     def twist(self, action: jax.Array) -> Twist:
-        """Return the twist [m/s, m/s, rad/s] of an action (3,), within the bounds."""
-        rule = "it must be 3 numbers: v_x, v_y and omega; map step over several worlds by jax.vmap"
+        """Return the twist [m/s, m/s, rad/s] of an action (3,) or (2,), within the bounds."""
+        size = self.action_size
+        names = "v_x, v_y and omega" if size == 3 else "v_x and omega"
+        rule = f"it must be {size} numbers: {names}; map step over several worlds by jax.vmap"
         try:
             action = jnp.asarray(action)
         except (TypeError, ValueError) as error:
             raise errors.not_allowed("action", repr(action), rule) from error
-        if action.shape != (3,) or jnp.iscomplexobj(action):
+        if action.shape != (size,) or jnp.iscomplexobj(action):
             raise errors.not_allowed("action", f"{action.dtype}{[*action.shape]}", rule)
+        if size == 2:
+            action = jnp.stack([action[0], jnp.zeros_like(action[0]), action[1]])
         v_max, omega_max = self.params.v_max, self.params.omega_max
         twist = Twist(v_max * action[0], v_max * action[1], omega_max * action[2])
         return rps.saturate(self.params, twist)
@@ -276,7 +281,7 @@ class PushEnv:
     @property
     def action_size(self) -> int:
         """Length of an action."""
-        return len(Twist._fields)
+        return len(Twist._fields) - (self._alone.robot.drive != "omni")
 
     @property
     def is_native(self) -> bool:

@@ -17,6 +17,7 @@ from rps_jax.control.laws.rps import RPSParams
 from rps_jax.engines import device
 from rps_jax.geometry import solid
 from rps_jax.robot.base import Odometry
+from rps_jax.robot.robot import Robot
 from rps_jax.trials import trial, worlds
 from rps_jax.trials.batch import stepper
 from rps_jax.trials.batch_run import outcomes
@@ -115,7 +116,7 @@ def build(
         shift=Shift(*(np.array(column, float) for column in shifts)),
         qpos=qpos,
         key=jax.device_get(jax.vmap(partial(jax.random.fold_in, root))(trials)),
-        odometry=_stack([Odometry()] * len(cases)),
+        odometry=_odometry([case.base for case in cases], setting.physics.control_period),
     )
     has_end = not cases[0].challenge.HAS_TARGET
     for i in np.flatnonzero(trial.fails_at_start(batch.worlds) if has_end else ()).tolist():
@@ -123,6 +124,15 @@ def build(
         raise errors.not_allowed("task", cases[i].challenge, rule)
     params = _stack([case.params for case in cases], jnp.result_type(float))
     return batch._replace(params=params)
+
+
+def _odometry(robots: Sequence[Robot], period: float) -> Odometry:
+    """Return odometry without noise, with the latencies of robots."""
+    pairs = np.array([[x.pose_latency or 0.0, x.command_delay or 0.0] for x in robots], float)
+    steps = 1 + round(float(pairs.max()) / period) if pairs.any() else 0
+    still = Odometry(velocity_error=np.zeros(3), past=np.zeros(steps)) if steps else Odometry()
+    rows = [still._replace(pose_latency=age, command_delay=delay) for age, delay in pairs]
+    return _stack(rows)
 
 
 def kind(case: Case) -> Hashable:

@@ -105,6 +105,7 @@ class Setting:
         self.simulator.check_robot(robot)
         for params in laws:
             law = registry.law_of(params)
+            registry.check_drive(params, robot.drive)
             self.simulator.check_senses(law.senses)
             if law.senses == "taxels":
                 check_law(law.init, law.step, law.senses, params, robot.shell.count)
@@ -113,6 +114,8 @@ class Setting:
         """Raise InputError unless the engine can step the worlds of a domain with these laws."""
         self.simulator.check_surroundings(domain.surroundings)
         self.check_here(domain.weakest, laws)
+        for params in laws:
+            registry.check_room(params, domain.task.kind, domain.task.free_room)
 
     def to_json(self) -> JsonObject:
         """Return the setting as manifests have it; `from_json` reads it."""

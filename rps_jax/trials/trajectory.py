@@ -114,6 +114,7 @@ def rollout(
     Raises:
       InputError: an argument is not allowed, the law has no smooth form, or the engine is not
         traced by JAX, or is differentiated and has no derivatives.
+      NotImplementedError: it is differentiated twice.
 
     Examples:
       >>> import jax

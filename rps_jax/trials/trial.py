@@ -34,6 +34,7 @@ from rps_jax.control.observation import (
     PoseObservation,
     Twist,
     displacement,
+    with_base,
 )
 from rps_jax.engines import native
 from rps_jax.engines.base import ControlPeriod, Driven, Engine, Motion, Stage
@@ -297,7 +298,7 @@ def observe(
     touched = reading.p_robot_contact, reading.in_contact
     pose = trial.qpos[JOINTS.base_position], trial.qpos[JOINTS.base_yaw]
     observation = Observation(*pose, *touched, world.p_world_target, period)
-    observation = observation._replace(base_radius=world.skin.shell.radius)
+    observation = with_base(observation, world.skin.shell.radius, world.robot)
     distance = planar.norm(displacement(observation))
     motion = trial.poses, trial.qpos[JOINTS.base], world.key, trial.steps, period
     poses, believed = base.observe_pose(world.odometry, *motion)
@@ -337,6 +338,7 @@ def execute(world: World, trial: Trial, twist: Twist, period: float) -> tuple[Tr
     """
     if trial.twists.shape[0]:
         twists, delayed = base.delay_twist(world.odometry, trial.twists, jnp.stack(twist), period)
+        delayed = drive.apply_errors(world.robot, delayed, world.odometry.velocity_error)
         trial, twist = trial._replace(twists=twists), Twist(*delayed)
     if world.robot is None or trial.drive is None:
         return trial, twist

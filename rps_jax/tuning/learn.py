@@ -141,7 +141,7 @@ class Learn(PPO, TaskOption, SimulationQuestion[xr.Dataset]):
     @functools.cached_property
     def domains(self) -> tuple[Domain, ...]:
         """Domains to learn in."""
-        return parse_domains(self.domain, self.task)
+        return parse_domains(self.domain, self.task, self.robot)
 
     def check(self) -> None:
         if self.out is None:
@@ -151,6 +151,7 @@ class Learn(PPO, TaskOption, SimulationQuestion[xr.Dataset]):
         errors.check_each_once("domain", self.domains)
         for domain in self.domains:
             errors.check_name("skin of a domain to learn in", domain.skin, ("capacitive",))
+            errors.check_name("drive of a robot to learn with", domain.robot.drive, ("omni",))
         self.setting.simulator.check_traced()
         count = self.num_envs * sum(len(domain.objects) for domain in self.domains)
         if self.num_minibatches > count:
@@ -173,7 +174,8 @@ class Learn(PPO, TaskOption, SimulationQuestion[xr.Dataset]):
         """Fields as JSON, with domains by their ranges."""
         seed = seed_of(self.setting.seed, "tune")
         ranges = list(map(to_json, self.domains))
-        return super().fields_as_json() | {"domain": ranges, "tune_seed": seed}
+        record = {name: x for name, x in super().fields_as_json().items() if name != "robot"}
+        return record | {"domain": ranges, "tune_seed": seed}
 
     def environments(self, split: Split = "tune") -> list[PushEnv]:
         """Return the environments of a split; those for validation have the paper's rules."""

@@ -29,6 +29,7 @@ from rps_jax.control.registry import LawLike
 from rps_jax.record import files
 from rps_jax.record.files import JsonObject
 from rps_jax.record.options import option
+from rps_jax.robot.robot import RobotLike
 from rps_jax.runs import evaluate
 from rps_jax.runs.evaluate import Candidates, CandidateScores
 from rps_jax.runs.question import LawQuestion, Run, TaskOption, count_true
@@ -115,7 +116,8 @@ class Tuning(TaskOption, LawQuestion[xr.Dataset]):
     def domains(self) -> tuple[Domain, ...]:
         """Domains of the worlds in which candidates are tried."""
         ranges = tuple(
-            replace(d, objects=self.objects) for d in parse_domains(self.domain, self.task)
+            replace(d, objects=self.objects)
+            for d in parse_domains(self.domain, self.task, self.robot)
         )
         errors.check_each_once("domain", ranges)
         return ranges
@@ -182,7 +184,8 @@ class Tuning(TaskOption, LawQuestion[xr.Dataset]):
         """Fields as JSON, with the names of all tuned parameters and the ranges of all domains."""
         ranges, seed = list(map(to_json, self.domains)), seed_of(self.setting.seed, "tune")
         record = {"tuned": self.space.names, "domain": ranges, "tune_seed": seed}
-        return super().fields_as_json() | record
+        fields = super().fields_as_json()
+        return {name: x for name, x in fields.items() if name != "robot"} | record
 
     def progress_bar(self) -> Bar:
         name = self.name.replace("_", " ")
@@ -350,7 +353,9 @@ def _is_of_proposal(results: xr.Dataset, vectors: np.ndarray) -> bool:
     )
 
 
-def parse_domains(domain: Domains, task: TaskLike | None = None) -> tuple[Domain, ...]:
+def parse_domains(
+    domain: Domains, task: TaskLike | None = None, robot: RobotLike | None = None
+) -> tuple[Domain, ...]:
     """Return one or several domains by their names, files or ranges."""
     several = [domain] if isinstance(domain, str | Domain) else domain
-    return tuple(parse_domain(item, task=task) for item in several)
+    return tuple(parse_domain(item, robot, task) for item in several)

@@ -17,7 +17,7 @@ from rps_jax.record.files import JsonObject
 from rps_jax.record.folder import describe_difference
 from rps_jax.record.manifest import Stored
 from rps_jax.record.options import check_fields, parse_changes
-from rps_jax.robot.robot import Robot, RobotLike, parse_robot
+from rps_jax.robot.robot import LATENCIES, Robot, RobotLike, parse_robot
 from rps_jax.world import paper, scene, streams, tasks
 from rps_jax.world.objects import (
     FAMILIES,
@@ -474,8 +474,8 @@ def parse_domain(
     """Return a domain from its name, as wide, or from a JSON file of ranges.
 
     Changes may follow a name or a file, as `wide,mass=3:10,objects=random_box`. A `robot` replaces
-    the domain's, except for its drawn limits. A `task` that has no single target replaces the
-    domain's targets.
+    the domain's, except for its drawn limits; its latencies replace ranges. A `task` that has no
+    single target replaces the domain's targets.
 
     Examples:
       >>> parse_domain("wide,mass=3:10").mass
@@ -485,7 +485,12 @@ def parse_domain(
         base, parsed = parse_domain(domain, robot), parse_task(task)
         return replace(base, task=parsed, targets=base.targets if parsed.HAS_TARGET else ())
     if robot is not None:
-        return replace(parse_domain(domain), robot=parse_robot(robot))
+        base, parsed = parse_domain(domain), parse_robot(robot)
+        known = {name: getattr(parsed, name) for name in LATENCIES}
+        if base.skin == "ideal":
+            del known["time_constant"]
+        ranges = {name: _constant(x) for name, x in known.items() if x is not None}
+        return replace(base, robot=parsed, **ranges)
     if isinstance(domain, Domain):
         return domain
     if not isinstance(domain, str):

@@ -70,6 +70,17 @@ def register_task(task: type[Task]) -> None:
     Raises:
       InputError: it is no such class, its kind is a task of this package, or another task, domain
         or object has the name of one of its quantities, numbers or outcomes.
+
+    Examples:
+      >>> from dataclasses import dataclass
+      >>> from rps_jax import Domain, register_task
+      >>> from rps_jax.world.tasks.reach import Reach
+      >>> @dataclass(frozen=True)
+      ... class Arrive(Reach):
+      ...     kind: str = "arrive"
+      >>> register_task(Arrive)
+      >>> Domain(task=Arrive()).task.kind
+      'arrive'
     """
     if not (isinstance(task, type) and issubclass(task, Task) and is_dataclass(task)):
         raise errors.not_allowed("task", repr(task), "give a dataclass that extends Task")

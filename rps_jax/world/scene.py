@@ -15,6 +15,7 @@ from rps_jax.geometry import solid
 from rps_jax.geometry.footprint import Footprint
 from rps_jax.geometry.solid import Solid
 from rps_jax.record.files import Arrays
+from rps_jax.robot.drive import GRIP
 from rps_jax.robot.robot import Robot
 from rps_jax.robot.shell import Shell
 from rps_jax.world import objects
@@ -328,6 +329,8 @@ def _set_robot(spec: mujoco.MjSpec, robot: Robot) -> None:
             spec.geom(f"skin_{side}").pos[1] = sign * y
     else:
         _draw_round(spec, robot.shell, x)
+    if robot.drive != "omni":
+        _draw_axle(spec, robot)
     if not robot.driven:
         return
     base = spec.body("base")
@@ -335,6 +338,27 @@ def _set_robot(spec: mujoco.MjSpec, robot: Robot) -> None:
     base.inertia[:] = float(robot.inertia)  # about the other axes it never turns
     for joint in base.joints:
         joint.armature = 0.0
+    if (
+        robot.drive != "omni"
+    ):  # the engine sets its coefficients, the direction of `Tyres`, in steps
+        tyres = spec.add_tendon(name="tyres", armature=GRIP * float(robot.mass))
+        for joint, coefficient in zip(base.joints, (0.0, 1.0, 0.0), strict=True):
+            tyres.wrap_joint(joint.name, coefficient)
+
+
+def _draw_axle(spec: mujoco.MjSpec, robot: Robot) -> None:
+    """Draw the wheels of an axle in place of omnidirectional ones."""
+    base, kind = spec.body("base"), mujoco.mjtGeom
+    for item in list(base.geoms):
+        if item.material in ("wheel", "hub") and item.type != kind.mjGEOM_CAPSULE:
+            spec.delete(item)
+    half = float(robot.half_track)
+    looks: dict[str, Any] = {"mass": 0, "group": 2, "type": kind.mjGEOM_CYLINDER}
+    looks["quat"] = [math.sqrt(0.5), math.sqrt(0.5), 0, 0]  # along y
+    parts = ((half, [0.1, 0.03, 0]), (-half, [0.1, 0.03, 0]), (0.0, [0.02, half, 0]))
+    for y, size in parts:
+        at = [-float(robot.axle_behind), y, 0.1]
+        base.add_geom(pos=at, size=size, material="hub" if y == 0 else "wheel", **looks)
 
 
 def _draw_round(spec: mujoco.MjSpec, shell: Shell, radius: float) -> None:

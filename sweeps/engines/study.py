@@ -17,7 +17,8 @@ import xarray as xr
 
 from rps_jax import Range, Setting
 from rps_jax.analysis import statistics
-from rps_jax.laws import LawLike, resolve_law
+from rps_jax.control.registry import LawLike
+from rps_jax.laws import resolve_law
 from rps_jax.physics import PHYSICS, preset
 from rps_jax.questions import Plan, Run, call_of, option
 from rps_jax.worlds import DomainLike, parse_domain

@@ -18,9 +18,10 @@ import xarray as xr
 
 from rps_jax import Rules, Setting
 from rps_jax.analysis import statistics
-from rps_jax.physics import MUJOCO_GROUND, EngineName, Physics, preset
+from rps_jax.physics import EngineName, Physics, preset
 from rps_jax.questions import Run, call_of
 from rps_jax.world import paper
+from rps_jax.world.physics import MUJOCO_GROUND
 from sweeps.conditions import Condition, ConditionStudy, Grid, run_conditions
 from sweeps.study_base import Rows, Table
 

@@ -20,7 +20,7 @@ import numpy as np
 import xarray as xr
 
 import rps_jax
-from rps_jax.laws import LawLike
+from rps_jax.control.registry import LawLike
 from rps_jax.questions import Run, call_of, option
 from rps_jax.record import bag
 from rps_jax.tuning import fit, logs

@@ -20,8 +20,10 @@ import xarray as xr
 
 import rps_jax
 from rps_jax.analysis.figures.style import Figure, quantity
-from rps_jax.laws import LawLike, law_of
-from rps_jax.questions import DomainQuestion, LawQuestion, Picture, Run, call_of, option
+from rps_jax.control.registry import LawLike
+from rps_jax.laws import law_of
+from rps_jax.questions import LawQuestion, Picture, Run, call_of, option
+from rps_jax.runs.question import DomainQuestion
 from rps_jax.trials.progress import Progress, no_progress, set_phase
 from rps_jax.trials.setting import seed_of
 from rps_jax.tuning import fit, posterior

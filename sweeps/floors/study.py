@@ -20,8 +20,9 @@ import xarray as xr
 from rps_jax import Setting
 from rps_jax.analysis import statistics, tables
 from rps_jax.laws import LawsLike
-from rps_jax.physics import MUJOCO_GROUND, Physics
+from rps_jax.physics import Physics
 from rps_jax.questions import MultiLawQuestion, Plan, Run, call_of, option
+from rps_jax.world.physics import MUJOCO_GROUND
 from rps_jax.worlds import DomainLike, parse_domain
 from sweeps.study_base import QuickStudy, Rows, Table, run_together
 

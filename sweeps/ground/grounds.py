@@ -12,9 +12,10 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from rps_jax.physics import MUJOCO_GROUND, Physics, preset
+from rps_jax.physics import Physics, preset
 from rps_jax.record.checkpoint import Checkpoints
 from rps_jax.trials.progress import Progress, ProgressCallback, SequentialProgress, no_progress
+from rps_jax.world.physics import MUJOCO_GROUND
 from sweeps.ground import pushes
 from sweeps.ground.pushes import DISTANCE, OFFSETS, SPEEDS, STEPS, Pushes
 from sweeps.study_base import Rows, load_or_compute, records, text_table

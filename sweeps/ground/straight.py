@@ -18,20 +18,12 @@ import xarray as xr
 from rps_jax import Range, Twist
 from rps_jax.engines.mujoco import Batch
 from rps_jax.geometry.solid import GRAVITY
-from rps_jax.physics import (
-    MUJOCO_GROUND,
-    PHYSICS,
-    ControlPeriod,
-    EngineName,
-    Motion,
-    Physics,
-    get_engine,
-    preset,
-)
+from rps_jax.physics import PHYSICS, ControlPeriod, EngineName, Motion, Physics, get_engine, preset
 from rps_jax.questions import Run, call_of, option
 from rps_jax.trials.worlds import starts
 from rps_jax.world import draws
 from rps_jax.world.draws import Draw
+from rps_jax.world.physics import MUJOCO_GROUND
 from rps_jax.world.scene import WorldInputs
 from rps_jax.worlds import parse_domain
 from sweeps.ground.pushes import DISTANCE, GAP

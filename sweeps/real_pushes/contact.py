@@ -16,7 +16,8 @@ import numpy as np
 import pandas as pd
 
 from rps_jax.geometry.solid import rotate
-from rps_jax.physics import MUJOCO_GROUND, Physics, preset
+from rps_jax.physics import Physics, preset
+from rps_jax.world.physics import MUJOCO_GROUND
 from sweeps.real_pushes import fingers, pushes
 
 _FINE = 400  # parts of a way, between which fingers go straight

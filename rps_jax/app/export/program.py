@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from rps_jax.control import registry, validation
-from rps_jax.control.observation import TaxelObservation, Twist, with_base_radius
+from rps_jax.control.observation import TaxelObservation, Twist, with_base
 from rps_jax.errors import not_allowed
 from rps_jax.lowering.routine import Group, Pytree, Routine, fields_of, routine
 from rps_jax.robot import robot as robots
@@ -89,6 +89,7 @@ def program(law: registry.LawLike, robot: Any = "ideal", skin: Any = "capacitive
     label, params = registry.resolve_law(law)
     params = registry.check_params(params)
     functions, base = registry.law_of(params), robots.parse_robot(robot)
+    registry.check_drive(params, base.drive)
     sensor = skins.parse_skin(skin)._replace(shell=base.shell)
     if not isinstance(sensor, CapacitiveSkin) or not sensor.shell.count:
         rule = "name one with taxels, as capacitive, on a robot with boards"
@@ -104,7 +105,7 @@ def program(law: registry.LawLike, robot: Any = "ideal", skin: Any = "capacitive
         start = functions.init(jax.tree.map(lambda x: np.asarray(x, float), params))
 
     def step(params: Pytree, memory: Pytree, observation: Pytree) -> tuple[Pytree, Twist]:
-        sensed = with_base_radius(observation, base.radius)
+        sensed = with_base(observation, base.radius, base)
         memory, twist, _ = functions.step(params, memory, sensed)
         return memory, Twist(*twist)
 

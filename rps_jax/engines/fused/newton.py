@@ -26,6 +26,7 @@ from rps_jax.geometry import vectors as sp
 from rps_jax.geometry.arrays import Number
 from rps_jax.geometry.solid import GRAVITY
 from rps_jax.geometry.vectors import Vec
+from rps_jax.robot.drive import Tyres
 from rps_jax.world.physics import Physics
 
 SOLUTION = "accelerations"  # name of the solver's results, for policies of `jax.checkpoint`
@@ -93,6 +94,7 @@ class Base(NamedTuple):
 
     inertia: Vec = (0.0, 0.0, 0.0)  # [kg, kg, kg m^2]
     force: Vec = (0.0, 0.0, 0.0)  # [N, N, N m] of the drive, about the vertical the last
+    tyres: Tyres | None = None  # of an axle that does not move sideways
 
 
 def _rows(contact: Contact, x: Sequence[Vec]) -> Vec:
@@ -155,8 +157,12 @@ class Problem(NamedTuple):
         a, alpha, *b = x
         linear = sp.scale(self.mass, sp.add(a, self.lift))
         angular = sp.to_world(self.spin, sp.sub(alpha, self.free))
-        inertia, force = self.base
-        return [linear, angular, *(sp.sub(_times(inertia, y), force) for y in b)]
+        inertia, force, tyres = self.base
+        rows = [sp.sub(_times(inertia, y), force) for y in b]
+        if tyres is not None:
+            excess = sp.dot(tyres.sideways, b[0]) - tyres.rest
+            rows = [sp.add(rows[0], tyres.along(tyres.mass * excess))]
+        return [linear, angular, *rows]
 
     def gradient(
         self, x: Sequence[Vec], physics: Physics
@@ -170,6 +176,9 @@ class Problem(NamedTuple):
             h[row][row] = self.mass
             for column in range(row + 1):
                 h[3 + row][3 + column] = self.spin[row][column]
+                if (tyres := self.base.tyres) is not None:
+                    added = tyres.mass * tyres.sideways[row] * tyres.sideways[column]
+                    h[6 + row][6 + column] = h[6 + row][6 + column] + added
         for c in self.contacts:
             force, k = contact_force(c, sp.add(_rows(c, x), c.bias), physics)
             f = sp.combine(force, (c.n, c.t, c.s))
@@ -252,6 +261,8 @@ def _minimise(problem: Problem, physics: Physics) -> list[Vec]:
         bend = mass * sp.dot(d[0], d[0]) + sp.dot(d[1], sp.to_world(problem.spin, d[1]))
         for e in d[2:]:
             bend = bend + sp.dot(base.inertia, _times(e, e))
+            if base.tyres is not None:
+                bend = bend + base.tyres.mass * sp.dot(base.tyres.sideways, e) ** 2
         lines = [(c, sp.add(_rows(c, x), c.bias), _rows(c, d)) for c in problem.contacts]
         # Inner product of step and gradient: twice the decrease of a quadratic cost.
         gain = -sp.dot(step, g)

@@ -114,7 +114,9 @@ def step(
         force, integral = drives.push(robot, driven.integral, twist, driven.v, turn, dt)
         if body.gravity is not None:
             force = sp.add(force, sp.scale(robot.mass, (*body.gravity[:2], 0.0)))
-        base = Base((robot.mass, robot.mass, robot.inertia), force)
+        is_omni = robot.drive == "omni"
+        tyres = None if is_omni else drives.Tyres.of(robot, driven.v, turn, dt)
+        base = Base((robot.mass, robot.mass, robot.inertia), force, tyres)
         driven = driven._replace(integral=integral)
     x = accelerations(Problem.of(body, state, m, contacts, base), physics, solution)
     a, alpha, *b = x

@@ -6,6 +6,7 @@ all drawn quantities, and a pytree that is a `Course`, with the parameters of on
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Hashable, Mapping
 from dataclasses import dataclass, fields
 from typing import Any, ClassVar, NamedTuple, Protocol
@@ -107,6 +108,11 @@ class Task:
     def has_contact_walls(self) -> bool:
         """Whether the object touches walls by contact forces."""
         return False
+
+    @property
+    def free_room(self) -> float:
+        """Distance [m] from the object within which no wall ends the trial of a detour."""
+        return math.inf
 
     @property
     def idle(self) -> frozenset[str]:

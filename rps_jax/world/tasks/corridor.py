@@ -268,6 +268,10 @@ class Corridor(Path):
                 raise errors.not_allowed("task waypoints", route[away.argmin()].tolist(), rule)
 
     @property
+    def free_room(self) -> float:
+        return self.width.low / 2 * (self.door_width.low if self.doors else 1)
+
+    @property
     def has_contact_walls(self) -> bool:
         """Whether the object may touch walls."""
         return self.touch == "object"

@@ -135,6 +135,10 @@ class Rooms(Following):
             errors.check_finite("yaw of task start", yaw, **_TURN_BOUNDS)
         _ = self._routes
 
+    @property
+    def free_room(self) -> float:
+        return 0.0  # the map does not promise any
+
     def check_room(self, shell: Shell, object_width: Callable[[], float]) -> None:
         """Raise InputError for a path that is narrower than the base, or a wall at its start."""
         if self.base_radius < float(shell.half[1]):

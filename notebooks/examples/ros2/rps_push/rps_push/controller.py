@@ -13,7 +13,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from rps_jax import Observation
+from rps_jax.control.observation import with_base
+from rps_jax.control.registry import check_drive
 from rps_jax.laws import law_of, resolve_law
+from rps_jax.robot.robot import parse_robot
 from rps_jax.worlds import CapacitiveSkin, PathCourse, Polyline
 
 _VERTICES = 1024  # of a path, at most
@@ -47,11 +50,19 @@ class Controller:
     """Controller with skin, law, watchdog and limits."""
 
     def __init__(
-        self, limits: Limits = Limits(), law: str = "rps_plus", skin: Any = CapacitiveSkin()
+        self,
+        limits: Limits = Limits(),
+        law: str = "rps_plus",
+        skin: Any = CapacitiveSkin(),
+        robot: Any = "ideal",
     ) -> None:
-        """Compile skin and law before the first step; the law must sense touch."""
-        self.limits, self._skin = limits, skin
+        """Compile skin and law before the first step; the law must sense touch.
+
+        The skin has the shell of the base; `robot` is the base itself, whose drive the law knows.
+        """
+        self.limits, self._skin, self._robot = limits, skin, parse_robot(robot)
         self._params = resolve_law(law)[1]
+        check_drive(self._params, self._robot.drive)
         self._law = law_of(self._params)
         self._scan, self._step = jax.jit(skin.read), jax.jit(self._law.step)
         self._follow = jax.jit(PathCourse.follow)
@@ -126,7 +137,7 @@ class Controller:
 
     def _decide(self, period: float) -> tuple[Any, Any]:
         obs = Observation(self._pose[:2], self._pose[2], *self._contact, self._target, period)
-        obs = obs._replace(base_radius=self._skin.shell.radius)
+        obs = with_base(obs, self._skin.shell.radius, self._robot)
         return self._step(self._params, self._law_state, obs)[:2]
 
     def tick(self, time: float) -> Command:

@@ -1,0 +1,139 @@
+"""RPS+ that repositions: where a push makes no progress, the base drives around and pushes anew.
+
+RPS+ keeps the contact that it has. On a round front, or with an object that it cannot turn, it may
+circle until the time is over. With the last contact C, the object's middle M, the direction psi of
+its push and the notation of `unicycle` (D1, D2):
+
+  G1  stuck: the distance of C to the target has not fallen by `progress` for t_stuck
+  G2  M = C + r u(theta + n);  phi the angle from M to the base, turn that from phi to psi + pi
+  G3  W = M - R u(psi) where turn < ahead,  else M + R u(phi +- ahead)
+
+While stuck, the base moves at v_max towards W, straight away from M where it is nearer than R, and
+from the last W to M. It always turns to face M, omega = angle of M - P minus theta. The next touch
+on the way to M starts RPS+ afresh. It senses what RPS+ senses.
+"""
+
+from typing import Annotated, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from rps_jax import spec
+from rps_jax.control import soft
+from rps_jax.control.base import Law, bounds_of
+from rps_jax.control.laws import rps_plus, unicycle
+from rps_jax.control.laws.rps_plus import RPSPlusParams, RPSPlusState
+from rps_jax.control.observation import Details, Observation, Twist
+from rps_jax.geometry import planar
+from rps_jax.geometry.arrays import Number, Parameter
+from rps_jax.spec import Bound, Spec, document
+
+_AHEAD = 1.26  # [rad] by which the base aims ahead on the circle
+_ARRIVED, _CLEAR = 0.1, 0.1  # [m] errors at the staging point, and of the circle
+
+
+@document
+class RPSRepositionParams(NamedTuple):
+    """Parameters of RPS+, and those of G1 to G3."""
+
+    law: RPSPlusParams = RPSPlusParams()  # of RPS+
+    t_stuck: Annotated[
+        Parameter,
+        Spec("s", "without progress until it repositions, G1", gt=0, tune=Bound(3, 100, log=True)),
+    ] = 20.0
+    progress: Annotated[
+        Parameter, Spec("m", "progress of G1", gt=0, tune=Bound(0.005, 0.3, log=True))
+    ] = 0.05
+    r: Annotated[Parameter, Spec("m", "from the contact to M, G2", gt=0, tune=Bound(0.08, 0.4))] = (
+        0.236
+    )
+    R: Annotated[
+        Parameter, Spec("m", "radius of the circle around M, G3", gt=0, tune=Bound(0.5, 1.4))
+    ] = 0.9
+
+    @property
+    def d_success(self) -> Number:
+        """Distance at which the target is reached [m]."""
+        return self.law.d_success
+
+
+class RPSRepositionState(NamedTuple):
+    """State of the law between two control steps."""
+
+    law: RPSPlusState
+    p_world_object: jax.Array  # (2,) [m] M
+    best: jax.Array  # [m] least distance of C to the target, at the last progress
+    t_stuck: jax.Array  # [s] since then
+    away: jax.Array  # bool: the base repositions
+    approach: jax.Array  # bool: from the last W to M
+    side: jax.Array  # [1] 1: counter-clockwise around M, or -1
+
+
+def check(params: RPSRepositionParams) -> RPSRepositionParams:
+    """Return the parameters if they are scalars in range; otherwise raise InputError."""
+    rps_plus.check(params.law)
+    return spec.check(params, "rps_reposition.")
+
+
+def init(params: RPSRepositionParams) -> RPSRepositionState:
+    """Return the state before the first contact."""
+    state = rps_plus.init(params.law)
+    zero = jnp.zeros_like(state.law.l_th)
+    no = zero > 0
+    point = jnp.zeros_like(state.p_world_contact)
+    return RPSRepositionState(state, point, zero + jnp.inf, zero, no, no, zero + 1)
+
+
+def step(
+    params: RPSRepositionParams, state: RPSRepositionState, obs: Observation
+) -> tuple[RPSRepositionState, Twist, Details]:
+    """Compute one control step: RPS+, or a part of a reposition."""
+    law, twist, details = rps_plus.step(params.law, state.law, obs)
+    touches, base, yaw = obs.in_contact, obs.p_world_robot, jnp.asarray(obs.yaw)
+    _, _, normal, _, half_length = unicycle.contact_of(law.p_world_contact, obs)
+    middle = law.p_world_contact + params.r * planar.unit(yaw + normal)
+    middle = jnp.where(touches, middle, state.p_world_object)
+
+    # G1; the time counts from the first touch.
+    distance = planar.norm(obs.p_world_target - law.p_world_contact)
+    gains = touches & (distance < state.best - params.progress)
+    waits = ~gains & law.law.touched & ~state.away
+    t_stuck = jnp.where(waits, state.t_stuck + obs.period, 0.0)
+    starts = waits & (t_stuck > params.t_stuck)
+    best = jnp.where(gains, distance, state.best)
+
+    # G2 and G3.
+    psi = unicycle.push_direction(middle, base, obs.p_world_target, params.r)
+    offset = base - middle
+    way = unicycle.way_around(middle, psi, offset, state.side, ~state.away, params.R, _AHEAD)
+    away = state.away | starts
+    clear = planar.norm(offset) > params.R - _CLEAR
+    at_staging = away & clear & way.is_direct & (planar.norm(way.staging - base) < _ARRIVED)
+    approach = away & (state.approach | at_staging)
+    is_finished = approach & touches
+    front = base + half_length * planar.unit(yaw)
+    missed = approach & (jnp.sum((front - middle) * planar.unit(yaw)) > params.r)
+    approach, away = approach & ~is_finished & ~missed, away & ~is_finished
+
+    heading = planar.direction(jnp.where(approach, middle, way.aim) - base)
+    heading = jnp.where(clear | approach, heading, planar.direction(offset)) - yaw
+    face = planar.wrap(planar.direction(-offset) - yaw)
+    limits = params.law.law
+    v_max, omega_max = jnp.asarray(limits.v_max), jnp.asarray(limits.omega_max)
+    v = v_max * planar.unit(heading)
+    drive = Twist(v[0], v[1], jnp.clip(face, -omega_max, omega_max))
+    fresh = rps_plus.init(params.law)
+    fresh = fresh._replace(p_world_contact=law.p_world_contact)
+    law = soft.tree_where(is_finished, fresh, law)
+    best = jnp.where(is_finished, distance, best)
+    twist = soft.tree_where(away, drive, Twist(*map(jnp.asarray, twist)))
+    details = details._replace(realigning=details.realigning | away)
+    memory = RPSRepositionState(law, middle, best, t_stuck, away, approach, way.side)
+    return memory, twist, details
+
+
+BOUNDS = {f"law.{name}": bound for name, bound in rps_plus.BOUNDS.items() if not bound.relative_to}
+BOUNDS["law.law.l_mr"] = rps_plus.BOUNDS["law.l_mr"]._replace(relative_to="law.law.l_cr")
+BOUNDS |= bounds_of(RPSRepositionParams)
+LAW = Law(init, step, check=check, bounds=BOUNDS, room=1.5)
+PRESETS = {"rps_reposition": RPSRepositionParams()}

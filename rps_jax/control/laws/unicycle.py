@@ -1,0 +1,331 @@
+"""Push and reposition: a law for bases whose axle cannot move sideways.
+
+A flush face sticks to the front only for omega <= mu v / x_o, with x_o from the axle to the
+object's centre of friction. At a rolling contact l + k theta is constant, with k = 0.47 m/rad for
+the paper's drum, whatever the base does: one pass over a front of 0.58 m turns the push by 1.2 rad
+at most. So the law leaves the object when its contact is spent, drives around it, and pushes anew.
+
+It remembers the last contact C and the object's middle M in the world. T is the target, theta the
+heading, u(x) the unit vector at an angle x, and A the axle, a behind the base's middle.
+
+  D1  M = C + r u(theta + n), with n the direction of the base's normal at the contact
+  D2  psi = direction of T - M; the opposite if |T - M| < r and the base stands beyond M
+  D3  e = angle of T - C minus theta;  x_C: of C ahead of the axle
+
+Push at v_max until the contact is lost for t_lost, or spent: it leaves the front, or |l| > l_edge;
+within d_near of T, |e| > e_near replaces the last.
+
+  D4  omega = K_e e + K_l (l - l_dead sgn l where |l| > l_dead, else 0)
+  D5  omega = K_near v_max sin(e) / x_C   within d_near;  0 without contact
+
+Retreat straight, until C is `back` ahead of the front. Drive around M in reverse, so that the base
+need not turn away from the object and back. With phi the angle of A - M, and turn the angle from
+phi to psi + pi, which decides the side:
+
+  D6  W = M - (R + a) u(psi)  where turn < carrot,  else  M + (R + a) u(phi +- carrot)
+  D7  omega = angle of A - W minus theta,  v = -v_max cos(omega)
+
+Where this angle is large, the base turns on the spot, and a car in reverse. Align: at the last W,
+turn to psi, a car in reverse. Then approach M, which is a push without contact:
+
+  D8  omega = angle of M - A minus theta
+
+The twist is (v, a omega, omega), with |omega| <= |v| / R of a car. The law senses touch, odometry
+and target; axle and turning radius R are static facts. The smooth law mixes the four modes.
+"""
+
+from functools import partial, reduce
+from typing import Annotated, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from rps_jax import spec
+from rps_jax.control import soft
+from rps_jax.control.base import Law, bounds_of
+from rps_jax.control.observation import Details, Observation, Twist, displacement
+from rps_jax.geometry import planar
+from rps_jax.geometry.arrays import Number, Parameter
+from rps_jax.robot.shell import HALF_LENGTH
+from rps_jax.spec import Bound, Spec, document
+
+_SIDE = 0.02  # [m] behind the front, where a contact is on a side
+_ROUND_SIDE = 1.2  # [rad] from the front of a round base
+_LARGE = 0.5  # [rad] heading error above which the base turns on the spot
+_ARRIVED, _ALIGNED = 0.22, 0.26  # [m], [rad] errors at the staging point
+_CLOSE, _BEARING = 0.2, 1.2  # [m], [rad] distance and bearing of a staging point that is passed
+_PAST = 0.5  # [m] of the front beyond M at which an approach has failed
+_OVERSHOOT = 1.5  # [rad] on the circle, after which the base drives back
+_LEAST_ARM = 0.2  # [m] of x_C
+
+
+@document
+class UnicycleParams(NamedTuple):
+    """Parameters of the law: bounds of robot and task, and those that are tuned."""
+
+    v_max: Annotated[Parameter, Spec("m/s", "speed of the base's middle", gt=0)] = 0.05
+    omega_max: Annotated[Parameter, Spec("rad/s", "bound on |omega|", gt=0)] = 0.15
+    d_success: Annotated[Parameter, Spec("m", "target reached", gt=0)] = 0.05
+    v_approach: Annotated[Parameter, Spec("m/s", "speed before the first contact", ge=0)] = 0.03
+    r: Annotated[
+        Parameter,
+        Spec("m", "from the contact to the object's middle, D1", gt=0, tune=Bound(0.08, 0.4)),
+    ] = 0.236
+    K_e: Annotated[
+        Parameter, Spec("1/s", "turn to the target, D4", ge=0, tune=Bound(0.1, 3, log=True))
+    ] = 0.92
+    K_l: Annotated[
+        Parameter, Spec("rad/s/m", "turn to the contact, D4", ge=0, tune=Bound(0.2, 8, log=True))
+    ] = 4.7
+    l_dead: Annotated[
+        Parameter, Spec("m", "offset up to which it does not, D4", ge=0, tune=Bound(0, 0.28))
+    ] = 0.12
+    l_edge: Annotated[
+        Parameter, Spec("m", "offset of a spent contact", ge=0, tune=Bound(0.1, 0.35))
+    ] = 0.273
+    d_near: Annotated[Parameter, Spec("m", "distance of D5", ge=0, tune=Bound(0.05, 1))] = 0.604
+    e_near: Annotated[
+        Parameter, Spec("rad", "error of a spent contact there", ge=0, tune=Bound(0.5, 2.5))
+    ] = 1.83
+    K_near: Annotated[Parameter, Spec("1", "gain of D5", ge=0, tune=Bound(0.3, 3))] = 1.67
+    t_lost: Annotated[
+        Parameter,
+        Spec("s", "without contact until it is lost", gt=0, tune=Bound(0.2, 8, log=True)),
+    ] = 1.14
+    back: Annotated[Parameter, Spec("m", "retreat", ge=0, tune=Bound(0.01, 0.6))] = 0.1
+    carrot: Annotated[
+        Parameter, Spec("rad", "aim ahead on the circle, D6", gt=0, tune=Bound(0.4, 1.5))
+    ] = 1.26
+    R: Annotated[
+        Parameter, Spec("m", "radius of the circle around M, D6", gt=0, tune=Bound(0.5, 1.4))
+    ] = 0.87
+
+
+class Widths(NamedTuple):
+    """Widths of the switches of the smooth law; its choice of the side stays hard."""
+
+    length: Annotated[Parameter, Spec("m", "of lengths", gt=0, le=1)] = 0.01
+    angle: Annotated[Parameter, Spec("rad", "of angles", gt=0, le=1)] = 0.02
+    time: Annotated[Parameter, Spec("s", "of times", gt=0, le=1)] = 0.1
+
+    def check(self) -> None:
+        """Raise InputError for a width that is not positive."""
+        spec.check(self, "temperature ")
+
+
+class UnicycleState(NamedTuple):
+    """State of the law; the modes are bools, or weights of the smooth law, and no mode: push."""
+
+    retreat: jax.Array
+    around: jax.Array
+    align: jax.Array
+    p_world_object: jax.Array  # (2,) [m] M
+    p_world_contact: jax.Array  # (2,) [m] C
+    l: jax.Array  # noqa: E741  [m] contact offset at C
+    touched: jax.Array  # bool or weight: whether there was a contact
+    t_lost: jax.Array  # [s] since the last contact
+    pushed: jax.Array  # bool or weight: whether this push had a contact, or is an approach
+    side: jax.Array  # [1] 1: counter-clockwise around M, or -1
+
+
+check = partial(spec.check, prefix="unicycle.")
+
+
+def init(params: UnicycleParams, temperatures: Widths | None = None) -> UnicycleState:
+    """Return the state before the first contact."""
+    zero = jnp.zeros_like(jnp.asarray(params.r, float))
+    no = zero > 0 if temperatures is None else zero
+    point = jnp.zeros(2, zero.dtype)
+    return UnicycleState(no, no, no, point, point, zero, no, zero, no, zero + 1)
+
+
+class Contact(NamedTuple):
+    """Contact of one control step, or the last one."""
+
+    touches: jax.Array
+    p_robot: jax.Array  # (2,) [m]
+    normal: jax.Array  # [rad] direction of the base's normal there, in its frame
+    on_front: jax.Array  # bool or weight
+    half_length: Number  # [m] from the base's middle to its front
+
+
+def contact_of(p_world_last: jax.Array, obs: Observation, widths: Widths | None = None) -> Contact:
+    """Return the current contact, or the last one at `p_world_last` (2,) [m]."""
+    touches = jnp.asarray(obs.in_contact)
+    last = planar.rotate(-obs.yaw, p_world_last - obs.p_world_robot)
+    point = soft.where(touches, obs.p_robot_contact, last)
+    if obs.base_radius is not None:
+        normal = planar.direction(point)
+        on_front = soft.greater(_ROUND_SIDE, jnp.abs(normal), widths and widths.angle)
+        return Contact(touches, point, normal, on_front, obs.base_radius)
+    half_length = HALF_LENGTH if obs.half_length is None else obs.half_length
+    on_front = soft.greater(point[0], half_length - _SIDE, widths and widths.length)
+    normal = soft.where(on_front, 0.0, jnp.sign(point[1]) * jnp.pi / 2)
+    return Contact(touches, point, normal, on_front, half_length)
+
+
+def push_direction(middle: jax.Array, base: jax.Array, target: jax.Array, r: Number) -> jax.Array:
+    """Compute D2 [rad] from the positions (2,) [m] of object, base and target in the world."""
+    to_target = target - middle
+    flips = (planar.norm(to_target) < r) & (jnp.sum(to_target * (base - middle)) > 0)
+    return planar.direction(to_target) + jnp.where(flips, jnp.pi, 0.0)
+
+
+class Way(NamedTuple):
+    """Way around the object, D6."""
+
+    side: jax.Array  # [1] 1: counter-clockwise, or -1
+    is_direct: jax.Array  # bool or weight: whether W is the staging point
+    staging: jax.Array  # (2,) [m]
+    aim: jax.Array  # (2,) [m] W
+
+
+def way_around(
+    middle: jax.Array,  # (2,) [m] M
+    psi: jax.Array,  # [rad]
+    offset: jax.Array,  # (2,) [m] from M to the axle, or to the middle of the base
+    side: jax.Array,  # [1] the last choice
+    chooses: jax.Array,  # bool: whether the side is chosen anew
+    radius: Number,  # [m] of the circle
+    ahead: Number,  # [rad] of the aim on the circle
+    width: Number | None = None,  # [rad] of the smooth switch
+) -> Way:
+    """Compute D6: the point that the base drives to, on its way to the staging point."""
+    phi = planar.direction(offset)
+    turn = planar.wrap(psi + jnp.pi - phi)
+    side = jnp.where(chooses, jnp.where(turn >= 0, 1.0, -1.0), side)
+    turn = jnp.mod(side * turn, 2 * jnp.pi)
+    turn = jnp.where(turn > 2 * jnp.pi - _OVERSHOOT, turn - 2 * jnp.pi, turn)
+    is_direct = soft.greater(ahead, turn, width)
+    staging = middle - radius * planar.unit(psi)
+    carrot = middle + radius * planar.unit(phi + side * ahead)
+    return Way(side, is_direct, staging, soft.where(is_direct, staging, carrot))
+
+
+def _either(*conditions: jax.Array) -> jax.Array:
+    """Return whether one of several conditions holds that exclude each other; a sum of weights."""
+    return reduce(lambda a, b: a | b if a.dtype == b.dtype == bool else a + b, conditions)
+
+
+def _is(condition: jax.Array) -> jax.Array:
+    """Return a condition as a bool."""
+    return condition if condition.dtype == bool else condition > 0.5
+
+
+def step(
+    params: UnicycleParams,
+    state: UnicycleState,
+    obs: Observation,
+    temperatures: Widths | None = None,
+) -> tuple[UnicycleState, Twist, Details]:
+    """Compute one control step; with `temperatures`, the modes and the contact are weights."""
+    length, angle, time = temperatures or (None, None, None)
+    above, and_, or_, not_, where = soft.greater, soft.and_, soft.or_, soft.not_, soft.where
+    axle = jnp.asarray(0.0 if obs.axle is None else obs.axle)
+    yaw = jnp.asarray(obs.yaw)
+    u = planar.unit(yaw)
+    p_world_axle = obs.p_world_robot - axle * u
+    push = not_(_either(state.retreat, state.around, state.align))
+    current = contact_of(state.p_world_contact, obs, temperatures)
+    touches, contact, normal, on_front, half_length = current
+    touched = or_(state.touched, touches)
+    sensed = obs._replace(p_robot_contact=contact)
+    l = where(touches, sensed.l, state.l)  # noqa: E741
+
+    # D1, and an approach that passes M without contact: then the last contact is a better guess.
+    p_world_contact = obs.p_world_robot + planar.rotate(yaw, contact)
+    middle = p_world_contact + params.r * planar.unit(yaw + normal)
+    middle = where(touches, middle, state.p_world_object)
+    t_lost = where(touches, 0.0, state.t_lost + obs.period)
+    pushed, is_new = and_(push, or_(state.pushed, touches)), not_(state.pushed)
+    front = obs.p_world_robot + half_length * u
+    past = above(jnp.sum((front - middle) * u), _PAST, length)
+    missed = and_(and_(and_(push, touched), and_(is_new, not_(touches))), past)
+    middle = where(missed, p_world_contact, middle)
+
+    # D2 and D3.
+    d = displacement(sensed)
+    distance, e = planar.norm(d), planar.wrap(planar.direction(d) - yaw)
+    psi = push_direction(middle, p_world_axle, obs.p_world_target, params.r)
+
+    # The end of a push.
+    near = above(params.d_near, distance, length)
+    spent_near = above(jnp.abs(e), params.e_near, angle)
+    spent = where(near, spent_near, above(jnp.abs(l), params.l_edge, length))
+    spent = or_(spent, not_(on_front))
+    is_lost = and_(above(t_lost, params.t_lost, time), not_(is_new))
+    is_finished = and_(and_(push, touched), or_(or_(and_(touches, spent), is_lost), missed))
+
+    # D6: the side is chosen before the base leaves, and kept on the way.
+    offset, chooses = p_world_axle - middle, _is(or_(push, state.retreat))
+    circle = middle, psi, offset, state.side, chooses, params.R + axle, params.carrot
+    side, is_direct, staging, aim = way_around(*circle, angle)
+    error = planar.wrap(planar.direction(aim - p_world_axle) + jnp.pi - yaw)
+    remaining = planar.norm(staging - p_world_axle)
+    passed = and_(above(_CLOSE, remaining, length), above(jnp.abs(error), _BEARING, angle))
+    is_there = and_(is_direct, or_(above(_ARRIVED, remaining, length), passed))
+    face = planar.wrap(psi - yaw)
+
+    # The next modes. A touch of the front on the way is a push, unless it is spent.
+    aligned, hits = above(_ALIGNED, jnp.abs(face), angle), and_(touches, on_front)
+    gap = jnp.sum((p_world_contact - front) * u)
+    is_clear = above(gap, params.back, length)
+    stopped = and_(and_(_either(state.around, state.align), hits), spent)
+    retreat = _either(is_finished, stopped, and_(state.retreat, not_(is_clear)))
+    leaves = and_(state.retreat, is_clear)
+    around = _either(leaves, and_(and_(state.around, not_(is_there)), not_(hits)))
+    align = _either(and_(state.around, is_there), and_(state.align, not_(aligned)))
+    align = and_(align, not_(hits))
+
+    # D4, D5, D7 and D8.
+    v_max, least = jnp.asarray(params.v_max), obs.turning_radius
+    far = params.K_e * e + params.K_l * (l - jnp.clip(l, -params.l_dead, params.l_dead))
+    arm = jnp.maximum(contact[0], _LEAST_ARM) + axle
+    steer = where(near, params.K_near * v_max * jnp.sin(e) / arm, far)
+    approach = planar.wrap(planar.direction(middle - p_world_axle) - yaw)
+    steer = where(touches, steer, where(and_(is_new, touched), approach, 0.0))
+    on_spot = 0.0 if least is None else -v_max
+    is_large = above(jnp.abs(error), _LARGE, angle)
+    drive = where(is_large, on_spot, -v_max * jnp.cos(error))
+    v = where(around, drive, where(touched, v_max, params.v_approach))
+    v = where(align, on_spot, where(retreat, -v_max, v))
+    omega = where(align, face, where(around, error, where(retreat, 0.0, steer)))
+    omega = jnp.clip(omega, -jnp.asarray(params.omega_max), params.omega_max)
+    bound = planar.safe_sqrt(jnp.maximum(v_max**2 - (axle * omega) ** 2, 1e-8))
+    v = jnp.clip(v, -bound, bound)
+    if least is not None:
+        omega = jnp.clip(omega, -jnp.abs(v) / least, jnp.abs(v) / least)
+    memory = UnicycleState(
+        retreat, around, align, middle, p_world_contact, l, touched, t_lost, pushed, side
+    )
+    details = Details(l, distance, jnp.zeros_like(distance), e, _either(retreat, around, align))
+    return memory, Twist(v, axle * omega, omega), details
+
+
+LAW = Law(
+    init,
+    step,
+    check=check,
+    bounds=bounds_of(UnicycleParams),
+    temperatures=Widths(),
+    drives=("omni", "differential", "car"),
+    room=1.5,
+)
+_TUNED = UnicycleParams()
+PRESETS = {
+    "unicycle": _TUNED,
+    "unicycle_car": _TUNED._replace(
+        r=0.277,
+        K_e=0.473,
+        K_l=2.15,
+        l_dead=0.174,
+        d_near=0.867,
+        e_near=1.06,
+        K_near=2.09,
+        t_lost=0.293,
+        back=0.042,
+        R=0.85,
+    ),
+    "unicycle_round": _TUNED._replace(K_e=2.0, l_edge=0.15),
+    "unicycle_front": _TUNED._replace(r=0.3, l_edge=0.22, carrot=0.8, R=1.2),
+}

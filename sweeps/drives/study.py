@@ -1,0 +1,135 @@
+"""Bases that cannot move sideways: success and time by drive, axle and domain, in equal worlds.
+
+rps sweeps/drives --worlds 10000
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import ClassVar, NamedTuple
+
+import numpy as np
+import xarray as xr
+
+from rps_jax.analysis import statistics, tables
+from rps_jax.record.options import option
+from rps_jax.runs.plan import Plan
+from rps_jax.runs.question import Run, TrialQuestion, call_of
+from rps_jax.runs.sweep import Sweep
+from rps_jax.trials.setting import Setting
+from sweeps.study_base import Rows, Study, Table, run_plans
+
+OMNI = "holonomic, rps_plus"
+
+
+class Base(NamedTuple):
+    """Robot of a row of the table, and its law."""
+
+    robot: str
+    law: str
+
+
+FRONT_SKIN = Path(__file__).with_name("front_skin.json")
+CAR = "ideal,drive=car,turning_radius=0.5"
+DIFFERENTIAL = "ideal,drive=differential"
+BASES: dict[str, Base] = {
+    OMNI: Base("ideal", "rps_plus"),
+    "holonomic, rps_reposition": Base("ideal", "rps_reposition"),
+    "differential": Base(DIFFERENTIAL, "unicycle"),
+    "differential, axle 0.15 m behind": Base(f"{DIFFERENTIAL},axle=0.15", "unicycle"),
+    "differential, axle 0.3 m behind": Base(f"{DIFFERENTIAL},axle=0.3", "unicycle"),
+    "car, R 0.5 m": Base(CAR, "unicycle_car"),
+    "car, R 0.5 m, axle 0.3 m behind": Base(f"{CAR},axle=0.3", "unicycle_car"),
+    "round, holonomic, rps_plus": Base("round", "rps_plus"),
+    "round, holonomic, rps_reposition": Base("round", "rps_reposition"),
+    "round, differential": Base("round,drive=differential", "unicycle_round"),
+    "skin on the front only": Base(str(FRONT_SKIN), "unicycle_front"),
+}
+DOMAINS = ("wide", "real", "hostile")
+
+
+@dataclass(frozen=True)
+class Drives(TrialQuestion[xr.Dataset], Study[xr.Dataset]):
+    """Compare bases with an omnidirectional one, in equal worlds of several domains.
+
+    The results hold the outcomes (row, world); a row is a domain and a base.
+    """
+
+    TITLE: ClassVar[str] = "Bases that cannot move sideways"
+    QUICK: ClassVar[Mapping[str, object]] = {"worlds": 32}
+    CHOICES: ClassVar = {"bases": BASES, "domains": DOMAINS}
+
+    bases: Sequence[str] = tuple(BASES)
+    """Names of bases."""
+    domains: Sequence[str] = DOMAINS
+    """Names of domains."""
+    worlds: int = option(10000, 2, 10_000_000)
+    """Number of worlds of each domain."""
+    setting: Setting = field(default=Setting("fused", seed=7017), kw_only=True)
+
+    @property
+    def plans(self) -> dict[str, Plan]:
+        """The sweep of each row."""
+        return {
+            f"{domain} | {name}": Sweep(
+                BASES[name].law, domain, self.worlds, robot=BASES[name].robot, setting=self.setting
+            ).plan
+            for domain in self.domains
+            for name in self.bases
+        }
+
+    def check(self) -> None:
+        """Check that the engine can step these worlds here."""
+        super().check()
+        for plan in self.plans.values():
+            plan.check_here()
+
+    def num_trials(self) -> int | None:
+        """Return the number of trials."""
+        return len(self.domains) * len(self.bases) * self.worlds
+
+    def answer(self, run: Run) -> xr.Dataset:
+        """Sweep each row."""
+        names = ["success", "time", "contact_lost_time", "path_length", "tipped", "stalled"]
+        rows = {row: part[names].isel(law=0, drop=True) for row, part in self.results(run).items()}
+        return xr.concat(rows.values(), xr.IndexVariable("row", list(rows)), join="override")
+
+    def results(self, run: Run) -> dict[str, xr.Dataset]:
+        """Run what the run folder lacks of all rows."""
+        return run_plans(run, self.plans)
+
+    def intro(self, results: xr.Dataset) -> str:
+        """Describe the worlds."""
+        return (
+            f"{self.worlds:,} worlds of each domain, seed {self.setting.seed}, equal for all "
+            "bases. Intervals: Wilson 95 %."
+        )
+
+    def report_tables(self, results: xr.Dataset) -> Sequence[Table]:
+        """Return success and times of each row."""
+        limit = float(self.setting.rules.max_lost)
+        return [Table(drive_table(results, limit), name="drives", merge="domain", title="Drives")]
+
+
+drives = call_of(Drives)
+
+
+def drive_table(results: xr.Dataset, max_lost: float) -> Rows:
+    """Return a header and a row for each domain and base."""
+    header = ["domain", "base", "success", "against holonomic", "median time", "95 %"]
+    rows = [[*header, "median without contact", f"more than {max_lost:g} s without contact"]]
+    for row in map(str, results.row.values):
+        domain, _, base = row.partition(" | ")
+        trials, reference = results.sel(row=row), f"{domain} | {OMNI}"
+        success, lost = trials.success.values > 0, trials.contact_lost_time.values
+        change = ""
+        if reference in results.row.values and row != reference:
+            change = statistics.compare(results.sel(row=reference).success, trials.success).changes
+        times = trials.time.values[success]
+        quantiles = [f"{x:.0f} s" for x in np.quantile(times, (0.5, 0.95))] if times.size else "--"
+        cells = f"{np.median(lost):.0f} s", str(int(np.count_nonzero(lost > max_lost)))
+        share = tables.share(int(success.sum()), success.size)
+        rows.append([domain, base, share, change, *quantiles, *cells])
+    return rows

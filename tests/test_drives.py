@@ -1,0 +1,279 @@
+"""Bases that cannot move sideways: their drives in all engines, their presets, and their law."""
+
+import json
+import math
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import observation, refusals, refusing
+
+from rps_jax import engines
+from rps_jax.control import registry
+from rps_jax.control.base import Law
+from rps_jax.control.laws import unicycle
+from rps_jax.control.observation import Details, Twist
+from rps_jax.robot import drive
+from rps_jax.robot.drive import Tyres
+from rps_jax.robot.robot import ROBOTS, Robot, parse_robot
+from rps_jax.trials import pushes
+from rps_jax.trials.case import Case
+from rps_jax.trials.env import PushEnv
+from rps_jax.trials.setting import Setting
+from rps_jax.trials.trial import Rules
+
+PERIOD = 0.02
+DIFFERENTIAL = Robot(drive="differential", axle=0.2, track=0.5)
+CAR = Robot(drive="car", axle=0.3, turning_radius=0.5)
+BASES = {
+    "differential": DIFFERENTIAL,
+    "differential with a limited force": replace(
+        DIFFERENTIAL, force_max=300.0, lag=0.1, wheel_acceleration_max=0.5, slip=0.1, slip_yaw=0.3
+    ),
+    "car": replace(CAR, lag=0.2),
+    "car with traction": replace(CAR, traction=0.5),
+}
+_COMPILED = "differential with a limited force"  # the only base in mjx that no slow test has
+AXLES = [
+    pytest.param(name, engine, marks=[pytest.mark.slow] * (engine == "mjx" and name != _COMPILED))
+    for name in BASES
+    for engine in engines.names()
+]
+
+
+class Weave(NamedTuple):
+    """Parameters of a law that weaves, and commands a sideways velocity as well."""
+
+    v: Any = 0.05  # [m/s]
+    d_success: Any = 0.05
+
+
+@pytest.fixture
+def weave(registries):
+    """Register the law for one test."""
+
+    def step(params, state, obs):
+        turn = 0.15 * jnp.sin(0.05 * state)
+        return state + 1, Twist(params.v, 0.03, turn), Details.from_obs(obs)
+
+    law = Law(lambda params: jnp.zeros(()), step, drives=("omni", "differential", "car"))
+    registry.register_law("weave", law, Weave())
+
+
+def motion_of_axle(qpos, axle):
+    """Return the velocity (T, 2) [m/s] of the axle, ahead and to the left, and omega (T,)."""
+    x, y, yaw = np.asarray(qpos, float)[:, :3].T
+    point = np.stack([x - axle * np.cos(yaw), y - axle * np.sin(yaw)])
+    v, middle = np.diff(point) / PERIOD, (yaw[1:] + yaw[:-1]) / 2
+    ahead = np.cos(middle) * v[0] + np.sin(middle) * v[1]
+    return ahead, np.cos(middle) * v[1] - np.sin(middle) * v[0], np.diff(yaw) / PERIOD
+
+
+def trace(case, engine, seconds=2.0):
+    """Return the positions of a push, one for each control period."""
+    setting = Setting(engine, rules=Rules(horizon=seconds))
+    batch = pushes.build([case], setting)
+    return pushes.record_batch(batch, setting, interval=PERIOD)[0].snapshots.qpos
+
+
+# --- the axle ------------------------------------------------------------------------------
+
+
+@pytest.mark.usefixtures("weave")
+@pytest.mark.parametrize(("name", "engine"), AXLES)
+def test_the_axle_does_not_move_sideways(name, engine):
+    robot = BASES[name]
+    if robot.driven and not engines.get(engine).forces:
+        return
+    qpos = trace(Case(law="weave", robot=robot), engine)
+    ahead, aside, omega = motion_of_axle(qpos, robot.axle)
+    assert np.abs(aside).max() < 1e-4
+    assert ahead.max() > 0.03
+    assert np.abs(omega).max() > 0.03
+    if robot.turning_radius is not None:
+        assert np.abs(omega[20:] * 0.5).max() < np.abs(ahead[20:]).max() * 1.01
+
+
+@pytest.mark.parametrize(
+    "law", [x for x, params in registry.LAWS.items() if "car" in registry.law_of(params).drives]
+)
+def test_no_law_moves_the_axle_sideways(law):
+    qpos = trace(Case(law=law, robot=DIFFERENTIAL, target=(0.5, 1.5)), "fused", 30.0)
+    _, aside, omega = motion_of_axle(qpos, DIFFERENTIAL.axle)
+    assert np.abs(aside).max() < 1e-4
+    assert np.abs(omega).max() > 0.05
+
+
+TWIST = jnp.array([0.4, 0.3, -1.0])
+
+
+def test_the_twist_of_an_axle_keeps_speed_and_turn():
+    aim = drive.aim(DIFFERENTIAL, jnp.zeros(3), TWIST, PERIOD)
+    np.testing.assert_allclose(aim, [0.4, -0.2, -1.0], rtol=1e-6)
+    aim = drive.aim(CAR, jnp.zeros(3), TWIST, PERIOD)
+    np.testing.assert_allclose(aim, [0.4, -0.24, -0.8], rtol=1e-6)
+
+
+LIMITS = {
+    "wheel speed": ({"wheel_speed_max": 0.325}, 0.5),
+    "speed": ({"v_max": 0.1}, 0.25),
+    "turning rate": ({"omega_max": 0.2}, 0.2),
+    "wheel acceleration": ({"wheel_acceleration_max": 3.25}, 0.1),
+    "acceleration": ({"acceleration_max": (2.0, 10.0)}, 0.1),
+    "lag": ({"lag": PERIOD / math.log(2)}, 0.5),
+}
+
+
+@pytest.mark.parametrize("name", LIMITS)
+def test_a_limit_keeps_the_curvature(name):
+    limits, share = LIMITS[name]
+    robot = replace(DIFFERENTIAL, **limits)
+    aim = jax.jit(drive.aim, static_argnums=3)(robot, jnp.zeros(3), TWIST, PERIOD)
+    np.testing.assert_allclose(aim, share * np.array([0.4, -0.2, -1.0]), rtol=1e-5)
+
+
+def test_errors_and_slip_are_those_of_wheels():
+    twist = jnp.array([0.4, -0.2, -1.0])
+    wrong = drive.apply_errors(DIFFERENTIAL, twist, jnp.array([0.1, 0.5, -0.1]))
+    # The left wheel has 0.65 m/s, the right one 0.15 m/s.
+    left, right = 0.65 * 1.1, 0.15 * 0.9
+    omega = (right - left) / 0.5
+    np.testing.assert_allclose(wrong, [(left + right) / 2, 0.2 * omega, omega], rtol=1e-5)
+    np.testing.assert_allclose(drive.apply_errors(None, twist, jnp.zeros(3)), twist)
+    slips = drive.apply_slip(replace(DIFFERENTIAL, slip=0.1, slip_yaw=0.4), twist)
+    np.testing.assert_allclose(slips, [0.36, -0.12, -0.6], rtol=1e-6)
+
+
+def test_the_motor_does_not_resist_a_sideways_velocity_and_the_tyres_stop_it():
+    robot = replace(DIFFERENTIAL, force_max=300.0)
+    still, turn = (0.0, 0.0, 0.0), (1.0, 0.0)
+    force, _ = drive.push(robot, still, still, (0.0, 0.05, 0.0), turn, 0.01)
+    assert force == (0.0, 0.0, 0.0)
+    tyres = Tyres.of(robot, (0.0, 0.05, 0.0), turn, 0.01)
+    inertia = np.diag([robot.mass, robot.mass, robot.inertia])
+    held = inertia + tyres.mass * np.outer(tyres.sideways, tyres.sideways)
+    velocity = np.array([0.0, 0.05, 0.0]) + 0.01 * np.linalg.solve(held, tyres.force)
+    assert abs(velocity @ tyres.sideways) < 5e-5
+
+
+def test_an_action_for_an_axle_is_two_numbers():
+    env = PushEnv("random_cylinder", robot=DIFFERENTIAL, worlds=4)
+    assert env.action_size == 2
+    np.testing.assert_allclose(env.twist(jnp.array([0.5, -0.2])), [0.025, 0.0, -0.03], rtol=1e-6)
+    with refusing("it must be 2 numbers: v_x and omega"):
+        env.twist(jnp.zeros(3))
+
+
+@pytest.mark.slow
+def test_derivatives_of_a_driven_axle_are_central_differences():
+    robot = replace(DIFFERENTIAL, force_max=300.0, lag=0.1)
+    env = PushEnv("random_cylinder", robot=robot, setting=Setting("fused"), worlds=4)
+    state = env.reset(jax.random.key(0))
+
+    def end(speed):
+        moved = state
+        for _ in range(3):
+            moved = env.step(moved, jnp.array([speed, 0.5]))
+        return moved.data.qpos[:3]
+
+    slope, delta = jax.jacfwd(end)(0.5), 0.05
+    expected = (end(0.5 + delta) - end(0.5 - delta)) / (2 * delta)
+    np.testing.assert_allclose(slope, expected, atol=1e-5)
+
+
+# --- robots and refusals -------------------------------------------------------------------
+
+
+def test_presets_and_files_of_robots_are_valid(tmp_path):
+    for name, robot in ROBOTS.items():
+        assert parse_robot(name) == robot
+    mine = {"half_length": 0.3, "half_width": 0.2, "drive": "car", "turning_radius": 0.6}
+    mine |= {"boards": [{"side": "front", "count": 2}]}
+    path = tmp_path / "mine.json"
+    path.write_text(json.dumps(mine))
+    parsed = parse_robot(f"{path},axle=0.1")
+    assert (parsed.drive, parsed.axle, parsed.turning_radius) == ("car", 0.1, 0.6)
+    assert not parsed.ideal
+    assert not ROBOTS["turtlebot4"].ideal
+
+
+test_a_drive_is_refused = refusals(
+    parse_robot,
+    (("turtlebot4,axle=0.3",), "robot axle = 0.3 m is not allowed: it lies outside the base"),
+    (("ideal,axle=0.1",), "robot axle = 0.1 is not allowed: .* choose drive"),
+    (("ideal,turning_radius=0.5",), "robot turning_radius = 0.5 is not allowed"),
+    (("jackal,turning_radius=0.5",), "robot turning_radius = 0.5 is not allowed: .* drive = car"),
+    (("ideal,drive=car",), "robot turning_radius = None is not allowed: a car needs"),
+    (("jackal,track=0",), "robot track = 0.0 is not allowed"),
+    (("ideal,drive=tank",), "unknown robot drive 'tank': choose from omni, differential, car"),
+    (("jackal,slip_sideways=0.1",), "robot slip_sideways = 0.1 is not allowed"),
+)
+
+
+def test_a_law_that_moves_sideways_is_refused_with_those_that_do_not():
+    expected = r"law = rps_plus is not allowed: it moves sideways, .*differential.* unicycle"
+    with refusing(expected):
+        pushes.build([Case(law="rps_plus", robot="turtlebot4")], Setting())
+
+
+test_a_task_without_room_for_detours_is_refused = refusals(
+    lambda task: Case(law="unicycle", task=task),
+    (("corridor,width=2",), "task = corridor with the law unicycle is not allowed: .* 1.5 m"),
+)
+
+
+# --- the law -------------------------------------------------------------------------------
+
+SMALL = unicycle.Widths(1e-6, 1e-6, 1e-6)
+
+
+def follow(robot_facts, temperatures=None, steps=6000):
+    """Run the law without an object: a touch at the start, and none later; return its path."""
+    params = unicycle.UnicycleParams()
+    touch = jnp.asarray(True) if temperatures is None else jnp.ones(())
+    away = jnp.logical_not(touch) if temperatures is None else jnp.zeros(())
+
+    def body(carry, step):
+        state, pose = carry
+        obs = observation(pose[:2], pose[2], [0.3625, 0.1], True, [0.0, -2.0])
+        obs = obs._replace(in_contact=jnp.where(step < 300, touch, away), **robot_facts)
+        state, twist, _ = unicycle.step(params, state, obs, temperatures)
+        pose = pose + PERIOD * twist.in_world(pose[2])
+        return (state, pose), (pose, jnp.stack(twist), state.around, state.align)
+
+    start = unicycle.init(params, temperatures), jnp.zeros(3)
+    return jax.lax.scan(body, start, jnp.arange(steps))[1]
+
+
+FACTS = {
+    "differential": {"axle": 0.2},
+    "car": {"axle": 0.2, "turning_radius": 0.5},
+    "round": {"axle": 0.0, "base_radius": 0.29},
+}
+
+
+@pytest.mark.parametrize("name", FACTS)
+def test_after_a_lost_contact_the_base_drives_behind_the_object_and_faces_the_target(name):
+    facts = FACTS[name]
+    poses, twists, around, align = map(np.asarray, jax.jit(lambda: follow(facts))())
+    np.testing.assert_allclose(twists[:, 1], facts["axle"] * twists[:, 2], atol=1e-7)
+    assert np.hypot(twists[:, 0], twists[:, 1]).max() < 0.05001
+    assert np.abs(twists[:, 2]).max() < 0.15001
+    if "turning_radius" in facts:
+        assert (np.abs(twists[:, 2]) * 0.5 <= np.abs(twists[:, 0]) + 1e-6).all()
+    first = int(np.flatnonzero(around)[0])
+    end = int(np.flatnonzero(align[:-1] & ~align[1:])[0]) + 1  # it approaches the object
+    yaw = poses[first, 2]
+    middle = poses[first, :2] + 0.8 * np.array([math.cos(yaw), math.sin(yaw)])  # roughly
+    to_target, behind = np.array([0.0, -2.0]) - middle, poses[end, :2] - middle
+    error = math.remainder(poses[end, 2] - math.atan2(*to_target[::-1]), 2 * math.pi)
+    assert abs(error) < 0.6
+    assert to_target @ behind < -0.8 * np.linalg.norm(to_target) * np.linalg.norm(behind)
+
+
+def test_the_smooth_law_tends_to_the_hard_one():
+    hard, smooth = (follow(FACTS["differential"], x, 1200)[0] for x in (None, SMALL))
+    np.testing.assert_allclose(smooth[:900], hard[:900], atol=1e-2)
