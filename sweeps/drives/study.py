@@ -43,7 +43,7 @@ BASES: dict[str, Base] = {
     "car, R 0.5 m": Base(CAR, "unicycle_car"),
     "car, R 0.5 m, axle 0.3 m behind": Base(f"{CAR},axle=0.3", "unicycle_car"),
     "round, holonomic, rps_plus": Base("round", "rps_plus"),
-    "round, holonomic, rps_reposition": Base("round", "rps_reposition"),
+    "round, holonomic, rps_reposition": Base("round", "rps_reposition_round"),
     "round, differential": Base("round,drive=differential", "unicycle_round"),
     "skin on the front only": Base(str(FRONT_SKIN), "unicycle_front"),
 }

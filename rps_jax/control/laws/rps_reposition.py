@@ -40,16 +40,16 @@ class RPSRepositionParams(NamedTuple):
     t_stuck: Annotated[
         Parameter,
         Spec("s", "without progress until it repositions, G1", gt=0, tune=Bound(3, 100, log=True)),
-    ] = 20.0
+    ] = 48.7
     progress: Annotated[
         Parameter, Spec("m", "progress of G1", gt=0, tune=Bound(0.005, 0.3, log=True))
-    ] = 0.05
+    ] = 0.04189
     r: Annotated[Parameter, Spec("m", "from the contact to M, G2", gt=0, tune=Bound(0.08, 0.4))] = (
-        0.236
+        0.3235
     )
     R: Annotated[
         Parameter, Spec("m", "radius of the circle around M, G3", gt=0, tune=Bound(0.5, 1.4))
-    ] = 0.9
+    ] = 0.7371
 
     @property
     def d_success(self) -> Number:
@@ -136,4 +136,9 @@ BOUNDS = {f"law.{name}": bound for name, bound in rps_plus.BOUNDS.items() if not
 BOUNDS["law.law.l_mr"] = rps_plus.BOUNDS["law.l_mr"]._replace(relative_to="law.law.l_cr")
 BOUNDS |= bounds_of(RPSRepositionParams)
 LAW = Law(init, step, check=check, bounds=BOUNDS, room=1.5)
-PRESETS = {"rps_reposition": RPSRepositionParams()}
+PRESETS = {
+    "rps_reposition": RPSRepositionParams(),  # tuned in `hostile`
+    "rps_reposition_round": RPSRepositionParams(  # tuned in `wide` with a round base
+        t_stuck=7.537, progress=0.08164, r=0.1897, R=0.576
+    ),
+}

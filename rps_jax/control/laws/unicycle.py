@@ -70,35 +70,35 @@ class UnicycleParams(NamedTuple):
     r: Annotated[
         Parameter,
         Spec("m", "from the contact to the object's middle, D1", gt=0, tune=Bound(0.08, 0.4)),
-    ] = 0.236
+    ] = 0.2501
     K_e: Annotated[
         Parameter, Spec("1/s", "turn to the target, D4", ge=0, tune=Bound(0.1, 3, log=True))
-    ] = 0.92
+    ] = 2.558
     K_l: Annotated[
         Parameter, Spec("rad/s/m", "turn to the contact, D4", ge=0, tune=Bound(0.2, 8, log=True))
-    ] = 4.7
+    ] = 7.61
     l_dead: Annotated[
         Parameter, Spec("m", "offset up to which it does not, D4", ge=0, tune=Bound(0, 0.28))
-    ] = 0.12
+    ] = 0.07387
     l_edge: Annotated[
         Parameter, Spec("m", "offset of a spent contact", ge=0, tune=Bound(0.1, 0.35))
-    ] = 0.273
-    d_near: Annotated[Parameter, Spec("m", "distance of D5", ge=0, tune=Bound(0.05, 1))] = 0.604
+    ] = 0.3263
+    d_near: Annotated[Parameter, Spec("m", "distance of D5", ge=0, tune=Bound(0.05, 1))] = 0.5245
     e_near: Annotated[
         Parameter, Spec("rad", "error of a spent contact there", ge=0, tune=Bound(0.5, 2.5))
-    ] = 1.83
-    K_near: Annotated[Parameter, Spec("1", "gain of D5", ge=0, tune=Bound(0.3, 3))] = 1.67
+    ] = 1.461
+    K_near: Annotated[Parameter, Spec("1", "gain of D5", ge=0, tune=Bound(0.3, 3))] = 1.974
     t_lost: Annotated[
         Parameter,
         Spec("s", "without contact until it is lost", gt=0, tune=Bound(0.2, 8, log=True)),
-    ] = 1.14
-    back: Annotated[Parameter, Spec("m", "retreat", ge=0, tune=Bound(0.01, 0.6))] = 0.1
+    ] = 0.3644
+    back: Annotated[Parameter, Spec("m", "retreat", ge=0, tune=Bound(0.01, 0.6))] = 0.02443
     carrot: Annotated[
         Parameter, Spec("rad", "aim ahead on the circle, D6", gt=0, tune=Bound(0.4, 1.5))
-    ] = 1.26
+    ] = 1.124
     R: Annotated[
         Parameter, Spec("m", "radius of the circle around M, D6", gt=0, tune=Bound(0.5, 1.4))
-    ] = 0.87
+    ] = 0.8454
 
 
 class Widths(NamedTuple):
@@ -315,17 +315,45 @@ _TUNED = UnicycleParams()
 PRESETS = {
     "unicycle": _TUNED,
     "unicycle_car": _TUNED._replace(
-        r=0.277,
-        K_e=0.473,
-        K_l=2.15,
-        l_dead=0.174,
-        d_near=0.867,
-        e_near=1.06,
-        K_near=2.09,
-        t_lost=0.293,
-        back=0.042,
-        R=0.85,
+        r=0.09363,
+        K_e=1.341,
+        K_l=7.964,
+        l_dead=0.1695,
+        l_edge=0.3247,
+        d_near=0.2774,
+        e_near=2.405,
+        K_near=1.359,
+        t_lost=0.2291,
+        back=0.01655,
+        carrot=1.19,
+        R=0.9113,
     ),
-    "unicycle_round": _TUNED._replace(K_e=2.0, l_edge=0.15),
-    "unicycle_front": _TUNED._replace(r=0.3, l_edge=0.22, carrot=0.8, R=1.2),
+    "unicycle_round": _TUNED._replace(
+        r=0.2088,
+        K_e=2.067,
+        K_l=4.204,
+        l_dead=0.2045,
+        l_edge=0.2063,
+        d_near=0.3938,
+        e_near=2.133,
+        K_near=2.303,
+        t_lost=1.861,
+        back=0.01947,
+        carrot=1.419,
+        R=0.9152,
+    ),
+    "unicycle_front": _TUNED._replace(
+        r=0.2494,
+        K_e=1.542,
+        K_l=4.546,
+        l_dead=0.1136,
+        l_edge=0.2288,
+        d_near=0.6886,
+        e_near=1.758,
+        K_near=1.469,
+        t_lost=1.179,
+        back=0.103,
+        carrot=0.8061,
+        R=1.267,
+    ),
 }
