@@ -56,6 +56,17 @@ class Observation(NamedTuple):
         Number | None, Spec("m", "half length of a rectangle with such an axle")
     ] = None
 
+    def with_base(self, radius: Number | None, robot: Robot | None = None) -> Observation:
+        """Return it with the static facts of a base.
+
+        They are the `radius` [m] of a round base, None for a rectangle, and the drive of the robot.
+        """
+        facts = {"base_radius": radius}
+        if robot is not None and robot.drive != "omni":
+            facts |= {"axle": robot.axle_behind, "turning_radius": robot.turning_radius}
+            facts |= {"half_length": robot.half_length}
+        return self._replace(**facts)
+
     @property
     def l(self) -> Floats:  # noqa: E743
         """Contact offset [m] to the left: p^R_C,y, or the arc length from a round base's front."""
@@ -101,17 +112,10 @@ Observed = TypeVar("Observed", bound=AnyObservation)
 
 
 def with_base(obs: Observed, radius: Number | None, robot: Robot | None = None) -> Observed:
-    """Return an observation with the static facts of a base.
-
-    They are the `radius` [m] of a round base, None for a rectangle, and the drive of the robot.
-    """
-    facts = {"base_radius": radius}
-    if robot is not None and robot.drive != "omni":
-        facts |= {"axle": robot.axle_behind, "turning_radius": robot.turning_radius}
-        facts |= {"half_length": robot.half_length}
+    """Return an observation with the static facts of a base: see `Observation.with_base`."""
     if isinstance(obs, Observation):
-        return obs._replace(**facts)
-    return obs._replace(touch=obs.touch._replace(**facts))
+        return obs.with_base(radius, robot)
+    return obs._replace(touch=obs.touch.with_base(radius, robot))
 
 
 class Twist(NamedTuple):

@@ -121,6 +121,11 @@ class Robot:
         """Position () [m] of the axle behind the middle of the base."""
         return 0.0 if self.axle is None else self.axle
 
+    @classmethod
+    def parse(cls, robot: RobotLike) -> Robot:
+        """Return a robot by its name, file or text of changes: see `parse_robot`."""
+        return parse_robot(robot)
+
     @property
     def driven(self) -> bool:
         """Whether the force is limited, so that contact can slow and stop the base."""

@@ -12,11 +12,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from rps_jax import Observation
-from rps_jax.control.observation import with_base
-from rps_jax.control.registry import check_drive
+from rps_jax import InputError, Observation, Robot
 from rps_jax.laws import law_of, resolve_law
-from rps_jax.robot.robot import parse_robot
 from rps_jax.worlds import CapacitiveSkin, PathCourse, Polyline
 
 _VERTICES = 1024  # of a path, at most
@@ -60,9 +57,13 @@ class Controller:
 
         The skin has the shell of the base; `robot` is the base itself, whose drive the law knows.
         """
-        self.limits, self._skin, self._robot = limits, skin, parse_robot(robot)
+        self.limits, self._skin, self._robot = limits, skin, Robot.parse(robot)
         self._params = resolve_law(law)[1]
-        check_drive(self._params, self._robot.drive)
+        if self._robot.drive not in law_of(self._params).drives:
+            sentence = (
+                f"this law moves sideways, which a base with drive = {self._robot.drive} cannot"
+            )
+            raise InputError(f"{sentence}: choose law unicycle.")
         self._law = law_of(self._params)
         self._scan, self._step = jax.jit(skin.read), jax.jit(self._law.step)
         self._follow = jax.jit(PathCourse.follow)
@@ -137,7 +138,7 @@ class Controller:
 
     def _decide(self, period: float) -> tuple[Any, Any]:
         obs = Observation(self._pose[:2], self._pose[2], *self._contact, self._target, period)
-        obs = with_base(obs, self._skin.shell.radius, self._robot)
+        obs = obs.with_base(self._skin.shell.radius, self._robot)
         return self._step(self._params, self._law_state, obs)[:2]
 
     def tick(self, time: float) -> Command:
