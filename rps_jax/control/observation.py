@@ -5,7 +5,7 @@ Frames: W is the world, R the robot (origin at the centre of the base, x forward
 
 from __future__ import annotations
 
-from typing import Annotated, NamedTuple, TypeVar
+from typing import Annotated, NamedTuple, Self, TypeVar
 
 import jax.numpy as jnp
 
@@ -56,7 +56,7 @@ class Observation(NamedTuple):
         Number | None, Spec("m", "half length of a rectangle with such an axle")
     ] = None
 
-    def with_base(self, radius: Number | None, robot: Robot | None = None) -> Observation:
+    def with_base(self, radius: Number | None, robot: Robot | None = None) -> Self:
         """Return it with the static facts of a base.
 
         They are the `radius` [m] of a round base, None for a rectangle, and the drive of the robot.
