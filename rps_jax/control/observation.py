@@ -5,7 +5,7 @@ Frames: W is the world, R the robot (origin at the centre of the base, x forward
 
 from __future__ import annotations
 
-from typing import Annotated, NamedTuple, Self, TypeVar
+from typing import Annotated, NamedTuple, TypeVar, cast
 
 import jax.numpy as jnp
 
@@ -56,7 +56,7 @@ class Observation(NamedTuple):
         Number | None, Spec("m", "half length of a rectangle with such an axle")
     ] = None
 
-    def with_base(self, radius: Number | None, robot: Robot | None = None) -> Self:
+    def with_base(self, radius: Number | None, robot: Robot | None = None) -> Observation:
         """Return it with the static facts of a base.
 
         They are the `radius` [m] of a round base, None for a rectangle, and the drive of the robot.
@@ -114,7 +114,7 @@ Observed = TypeVar("Observed", bound=AnyObservation)
 def with_base(obs: Observed, radius: Number | None, robot: Robot | None = None) -> Observed:
     """Return an observation with the static facts of a base: see `Observation.with_base`."""
     if isinstance(obs, Observation):
-        return obs.with_base(radius, robot)
+        return cast(Observed, obs.with_base(radius, robot))
     return obs._replace(touch=obs.touch.with_base(radius, robot))
 
 
