@@ -419,7 +419,7 @@ _WRONG: dict[str, Sequence[str]] = {
             "object": (
                 "object()",
                 "np.array([1, None])",
-                "len",
+                "slice(3)",
                 "np.array(['a'])",
                 "jnp.array([jnp.nan])",
             ),

@@ -609,8 +609,9 @@ def test_tuned_laws_keep_the_order_of_saturation_of_their_tuning(tmp_path):
         for path, value in values.items()
         if path.endswith("saturate_first")
     }
-    names = ("rps_tuned", "rps_unsaturated", "rps_plus", "rps_reposition", "_guided")
-    unsaturated = dict.fromkeys(names, 0.0)
+    tuned = ("rps_tuned", "rps_unsaturated", "rps_plus", "_guided")
+    repositions = ("rps_reposition", "rps_reposition_round")
+    unsaturated = dict.fromkeys((*tuned, *repositions), 0.0)
     assert orders == {"rps": 1.0, "nps": 1.0} | unsaturated
     path = tmp_path / "tuned.json"
     path.write_text('{"K_h": 0.3}')
