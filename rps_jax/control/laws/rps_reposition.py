@@ -61,12 +61,12 @@ class RPSRepositionState(NamedTuple):
     """State of the law between two control steps."""
 
     law: RPSPlusState
-    p_world_object: jax.Array  # (2,) [m] M
-    best: jax.Array  # [m] least distance of C to the target, at the last progress
-    t_stuck: jax.Array  # [s] since then
-    away: jax.Array  # bool: the base repositions
-    approach: jax.Array  # bool: from the last W to M
-    side: jax.Array  # [1] 1: counter-clockwise around M, or -1
+    p_world_object: Annotated[jax.Array, Spec("m", "M, middle of the object")]  # (2,)
+    best: Annotated[jax.Array, Spec("m", "distance of C to the target at the last progress")]
+    t_stuck: Annotated[jax.Array, Spec("s", "time since the last progress")]
+    away: Annotated[jax.Array, Spec("1", "whether the base repositions")]  # () bool
+    approach: Annotated[jax.Array, Spec("1", "whether it moves from the last W to M")]  # () bool
+    side: Annotated[jax.Array, Spec("1", "1: counter-clockwise around M; -1: clockwise")]
 
 
 def check(params: RPSRepositionParams) -> RPSRepositionParams:

@@ -116,16 +116,16 @@ class Widths(NamedTuple):
 class UnicycleState(NamedTuple):
     """State of the law; the modes are bools, or weights of the smooth law, and no mode: push."""
 
-    retreat: jax.Array
-    around: jax.Array
-    align: jax.Array
-    p_world_object: jax.Array  # (2,) [m] M
-    p_world_contact: jax.Array  # (2,) [m] C
-    l: jax.Array  # noqa: E741  [m] contact offset at C
-    touched: jax.Array  # bool or weight: whether there was a contact
-    t_lost: jax.Array  # [s] since the last contact
-    pushed: jax.Array  # bool or weight: whether this push had a contact, or is an approach
-    side: jax.Array  # [1] 1: counter-clockwise around M, or -1
+    retreat: Annotated[jax.Array, Spec("1", "whether the base retreats")]
+    around: Annotated[jax.Array, Spec("1", "whether it drives around the object")]
+    align: Annotated[jax.Array, Spec("1", "whether it turns at the staging point")]
+    p_world_object: Annotated[jax.Array, Spec("m", "M, middle of the object")]  # (2,)
+    p_world_contact: Annotated[jax.Array, Spec("m", "C, the last contact")]  # (2,)
+    l: Annotated[jax.Array, Spec("m", "contact offset at C")]  # noqa: E741
+    touched: Annotated[jax.Array, Spec("1", "whether there was a contact")]
+    t_lost: Annotated[jax.Array, Spec("s", "time since the last contact")]
+    pushed: Annotated[jax.Array, Spec("1", "whether this push had a contact; 0 in an approach")]
+    side: Annotated[jax.Array, Spec("1", "1: counter-clockwise around M; -1: clockwise")]
 
 
 check = partial(spec.check, prefix="unicycle.")
