@@ -4,6 +4,7 @@ import functools
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import (
+    Annotated,
     Any,
     Generic,
     Literal,
@@ -16,6 +17,7 @@ import jax
 import numpy as np
 
 from rps_jax.control.observation import Details, Twist
+from rps_jax.geometry.arrays import Parameter
 from rps_jax.robot.base import LoadCell
 from rps_jax.robot.robot import DriveKind
 from rps_jax.spec import Bound as Bound
@@ -44,6 +46,12 @@ class Smoothing(Protocol):
         """Raise InputError for a width that is not allowed."""
 
 
+# Parameters of several laws.
+SpeedMax = Annotated[Parameter, Spec("m/s", "bound on the speed", gt=0)]
+OmegaMax = Annotated[Parameter, Spec("rad/s", "bound on |omega|", gt=0)]
+ApproachSpeed = Annotated[Parameter, Spec("m/s", "forward speed before the first contact", ge=0)]
+SuccessDistance = Annotated[Parameter, Spec("m", "target reached", gt=0)]
+
 T = TypeVar("T")
 Leaf = float | np.ndarray | jax.Array  # of a pytree of parameters
 Params = TypeVar("Params", bound=LawParams)
@@ -54,6 +62,15 @@ Obs = TypeVar("Obs")
 def bounds_of(kind: type) -> tuple[tuple[str, Bound], ...]:
     """Return the names of parameters and the intervals of tuners in their declarations."""
     return tuple((name, x.tune) for name, x in specs_of(kind).items() if x.tune is not None)
+
+
+def nested_bounds(name: str, bounds: Mapping[str, Bound]) -> dict[str, Bound]:
+    """Return the bounds of parameters that are the field `name` of others; relative ones last."""
+    nested = {}
+    for key, bound in sorted(bounds.items(), key=lambda item: bool(item[1].relative_to)):
+        whole = f"{name}.{bound.relative_to}" if bound.relative_to else ""
+        nested[f"{name}.{key}"] = bound._replace(relative_to=whole)
+    return nested
 
 
 def named_leaves(tree: object, is_leaf: Callable[[object], bool] | None = None) -> dict[str, Leaf]:

@@ -22,7 +22,7 @@ import jax
 import jax.numpy as jnp
 
 from rps_jax import spec
-from rps_jax.control.base import Law
+from rps_jax.control.base import Law, OmegaMax, SpeedMax, SuccessDistance
 from rps_jax.control.observation import Details, PoseObservation, Twist, displacement
 from rps_jax.geometry import planar
 from rps_jax.geometry.arrays import Pair, Parameter
@@ -57,10 +57,10 @@ class APSParams(NamedTuple):
         Parameter, Spec("1", "object radii beyond the target (ours); 0: as published", ge=0)
     ] = 1.0
     min_motion: Annotated[Parameter, Spec("m", "least motion of the object (ours)", ge=0)] = 0.001
-    v_max: Annotated[Parameter, Spec("m/s", "bound on the speed", gt=0)] = 0.05
+    v_max: SpeedMax = 0.05
     v_min: Annotated[Parameter, Spec("m/s", "least speed (ours)", ge=0)] = 0.01
-    omega_max: Annotated[Parameter, Spec("rad/s", "bound on |omega|", gt=0)] = 0.15
-    d_success: Annotated[Parameter, Spec("m", "target reached", gt=0)] = 0.05
+    omega_max: OmegaMax = 0.15
+    d_success: SuccessDistance = 0.05
 
 
 class APSState(NamedTuple):

@@ -20,7 +20,7 @@ import jax
 import jax.numpy as jnp
 
 from rps_jax import spec
-from rps_jax.control.base import Law, bounds_of
+from rps_jax.control.base import Law, OmegaMax, SuccessDistance, bounds_of
 from rps_jax.control.observation import Details, PoseObservation, Twist
 from rps_jax.geometry import planar
 from rps_jax.geometry.arrays import Parameter
@@ -45,8 +45,8 @@ class DipoleParams(NamedTuple):
         Parameter, Spec("1", "object radii after which a target is passed", ge=0, tune=Bound(0, 5))
     ] = 2.0
     v_max: Annotated[Parameter, Spec("m/s", "speed, the bound of RPS", gt=0)] = 0.05
-    omega_max: Annotated[Parameter, Spec("rad/s", "bound on |omega|", gt=0)] = 0.15
-    d_success: Annotated[Parameter, Spec("m", "target reached", gt=0)] = 0.05
+    omega_max: OmegaMax = 0.15
+    d_success: SuccessDistance = 0.05
 
 
 class DipoleState(NamedTuple):

@@ -30,12 +30,22 @@ import jax.numpy as jnp
 
 from rps_jax import spec
 from rps_jax.control import soft
-from rps_jax.control.base import Law, bounds_of
+from rps_jax.control.base import ApproachSpeed, Law, OmegaMax, SuccessDistance, bounds_of
 from rps_jax.control.observation import Details, Observation, Twist, displacement
 from rps_jax.geometry import planar
 from rps_jax.geometry.arrays import Parameter, Scalar
 from rps_jax.spec import Bound, Spec, document
 
+# Parameters of both forms of Force Push.
+AngleGain = Annotated[
+    Parameter, Spec("1", "gain of the force's angle, beyond 1", tune=Bound(-2, 4))
+]
+HeadingGain = Annotated[
+    Parameter, Spec("1/s", "gain of the heading", ge=0, tune=Bound(0.005, 2, log=True))
+]
+ContactSpeed = Annotated[
+    Parameter, Spec("m/s", "speed of the contact, and bound for the base", gt=0)
+]
 _TOLERANCE = 0.01  # [m] beside a path, beyond which a target has left it
 
 
@@ -43,13 +53,9 @@ _TOLERANCE = 0.01  # [m] beside a path, beyond which a target has left it
 class ForcePushParams(NamedTuple):
     """Parameters of Force Push; the gains are those of its authors' experiments."""
 
-    k_theta: Annotated[
-        Parameter, Spec("1", "gain of the force's angle, beyond 1", tune=Bound(-2, 4))
-    ] = 0.3
+    k_theta: AngleGain = 0.3
     k_y: Annotated[Parameter, Spec("rad/m", "gain of the path", tune=Bound(-2, 2))] = 0.5
-    k_omega: Annotated[
-        Parameter, Spec("1/s", "gain of the heading", ge=0, tune=Bound(0.005, 2, log=True))
-    ] = 1.0
+    k_omega: HeadingGain = 1.0
     converge: Annotated[
         Parameter,
         Spec(
@@ -72,14 +78,10 @@ class ForcePushParams(NamedTuple):
         Parameter,
         Spec("rad", "largest angle between push and heading", gt=0, tune=Bound(0.2, 1.57)),
     ] = 1.2
-    v_max: Annotated[
-        Parameter, Spec("m/s", "speed of the contact, and bound for the base", gt=0)
-    ] = 0.05
-    omega_max: Annotated[Parameter, Spec("rad/s", "bound on |omega|", gt=0)] = 0.15
-    v_approach: Annotated[
-        Parameter, Spec("m/s", "forward speed before the first contact", ge=0)
-    ] = 0.01
-    d_success: Annotated[Parameter, Spec("m", "target reached", gt=0)] = 0.05
+    v_max: ContactSpeed = 0.05
+    omega_max: OmegaMax = 0.15
+    v_approach: ApproachSpeed = 0.01
+    d_success: SuccessDistance = 0.05
 
 
 class Path(NamedTuple):

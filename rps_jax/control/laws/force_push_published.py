@@ -28,9 +28,9 @@ import jax
 import jax.numpy as jnp
 
 from rps_jax import spec
-from rps_jax.control.base import Law, bounds_of
+from rps_jax.control.base import ApproachSpeed, Law, OmegaMax, SuccessDistance, bounds_of
 from rps_jax.control.laws import force_push
-from rps_jax.control.laws.force_push import Path
+from rps_jax.control.laws.force_push import AngleGain, ContactSpeed, HeadingGain, Path
 from rps_jax.control.observation import Details, ForceObservation, Twist
 from rps_jax.geometry import planar
 from rps_jax.geometry.arrays import Parameter
@@ -41,15 +41,11 @@ from rps_jax.spec import Bound, Spec, document
 class PublishedForcePushParams(NamedTuple):
     """Parameters of Force Push, as in its authors' experiments; f_min as in their simulations."""
 
-    k_theta: Annotated[
-        Parameter, Spec("1", "gain of the force's angle, beyond 1", tune=Bound(-2, 4))
-    ] = 0.3
+    k_theta: AngleGain = 0.3
     k_y: Annotated[
         Parameter, Spec("rad/m", "gain of the path; 0.1 in their simulations", tune=Bound(-2, 2))
     ] = 0.5
-    k_omega: Annotated[
-        Parameter, Spec("1/s", "gain of the heading", ge=0, tune=Bound(0.005, 2, log=True))
-    ] = 1.0
+    k_omega: HeadingGain = 1.0
     converge: Annotated[
         Parameter,
         Spec(
@@ -78,14 +74,10 @@ class PublishedForcePushParams(NamedTuple):
             tune=Bound(1e-5, 0.02, log=True),
         ),
     ] = 0.0015
-    v_max: Annotated[
-        Parameter, Spec("m/s", "speed of the contact, and bound for the base", gt=0)
-    ] = 0.05
-    omega_max: Annotated[Parameter, Spec("rad/s", "bound on |omega|", gt=0)] = 0.15
-    v_approach: Annotated[
-        Parameter, Spec("m/s", "forward speed before the first contact", ge=0)
-    ] = 0.01
-    d_success: Annotated[Parameter, Spec("m", "target reached", gt=0)] = 0.05
+    v_max: ContactSpeed = 0.05
+    omega_max: OmegaMax = 0.15
+    v_approach: ApproachSpeed = 0.01
+    d_success: SuccessDistance = 0.05
 
 
 class PublishedForcePushState(NamedTuple):

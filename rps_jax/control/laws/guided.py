@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rps_jax import errors
+from rps_jax import errors, spec
 from rps_jax.control import soft
 from rps_jax.control.base import Law, check_finite_leaves
 from rps_jax.control.laws import rps
@@ -56,7 +56,7 @@ class GuidedState(NamedTuple):
 def check(params: GuidedParams) -> GuidedParams:
     """Return the parameters if they are in range; otherwise raise InputError."""
     rps.check(params.law)
-    errors.check_finite("guided.hold", params.hold, at_least=1)
+    spec.specs_of(GuidedParams)["hold"].check("guided.hold", params.hold)
     shape = np.shape(params.offsets)
     if len(shape) != 2 or shape[1] != 3 or not shape[0]:
         raise errors.not_allowed("shape of guided.offsets", shape, "pass (J, 3), J at least 1")

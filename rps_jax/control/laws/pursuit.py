@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 
 from rps_jax import spec
-from rps_jax.control.base import Law, bounds_of
+from rps_jax.control.base import Law, OmegaMax, SpeedMax, SuccessDistance, bounds_of
 from rps_jax.control.observation import Details, Observation, Twist, displacement
 from rps_jax.geometry import planar
 from rps_jax.geometry.arrays import Parameter
@@ -34,10 +34,10 @@ class PursuitParams(NamedTuple):
     press: Annotated[
         Parameter, Spec("1", "least share of the speed that is forward", ge=0, tune=Bound(0, 2))
     ] = 0.2
-    v_max: Annotated[Parameter, Spec("m/s", "bound on the speed", gt=0)] = 0.05
-    omega_max: Annotated[Parameter, Spec("rad/s", "bound on |omega|", gt=0)] = 0.15
+    v_max: SpeedMax = 0.05
+    omega_max: OmegaMax = 0.15
     v_approach: Annotated[Parameter, Spec("m/s", "forward speed without contact", ge=0)] = 0.01
-    d_success: Annotated[Parameter, Spec("m", "target reached", gt=0)] = 0.05
+    d_success: SuccessDistance = 0.05
 
 
 check = partial(spec.check, prefix="pursuit.")

@@ -29,7 +29,7 @@ from jax.typing import ArrayLike
 
 from rps_jax import errors, spec
 from rps_jax.control import soft
-from rps_jax.control.base import Law, bounds_of
+from rps_jax.control.base import Law, OmegaMax, bounds_of
 from rps_jax.control.observation import Details, Observation, Twist, displacement
 from rps_jax.geometry import planar
 from rps_jax.geometry.arrays import Array, Bools, Float, Floats, Parameter, PerWorld
@@ -79,7 +79,7 @@ class RPSParams(NamedTuple):
         Spec("m", "no lateral motion nearer than this, Eq. 5", ge=0, tune=Bound(0.02, 2, log=True)),
     ] = 0.5
     v_max: Annotated[Parameter, Spec("m/s", "bound on the norm of (v_x, v_y)", gt=0)] = 0.05
-    omega_max: Annotated[Parameter, Spec("rad/s", "bound on |omega|", gt=0)] = 0.15
+    omega_max: OmegaMax = 0.15
     d_success: Annotated[Parameter, Spec("m", "target reached, Algorithm 1", gt=0)] = 0.05
     v_approach: Annotated[
         Parameter, Spec("m/s", "forward speed without contact (Sec. III-B)", ge=0)

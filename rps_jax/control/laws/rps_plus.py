@@ -35,7 +35,7 @@ import jax.numpy as jnp
 
 from rps_jax import spec
 from rps_jax.control import soft
-from rps_jax.control.base import Law, bounds_of
+from rps_jax.control.base import Law, bounds_of, nested_bounds
 from rps_jax.control.laws import rps
 from rps_jax.control.laws.rps import RPSParams, RPSState, Temperatures
 from rps_jax.control.observation import Details, Observation, Twist, displacement
@@ -106,9 +106,7 @@ class RPSPlusState(NamedTuple):
     ]  # () int32
 
 
-BOUNDS = {f"law.{name}": bound for name, bound in rps.BOUNDS.items() if not bound.relative_to}
-BOUNDS["law.l_mr"] = rps.BOUNDS["l_mr"]._replace(relative_to="law.l_cr")
-BOUNDS |= bounds_of(RPSPlusParams)
+BOUNDS = nested_bounds("law", rps.BOUNDS) | dict(bounds_of(RPSPlusParams))
 
 
 def check(params: RPSPlusParams) -> RPSPlusParams:

@@ -20,7 +20,7 @@ import jax.numpy as jnp
 
 from rps_jax import spec
 from rps_jax.control import soft
-from rps_jax.control.base import Law, bounds_of
+from rps_jax.control.base import Law, bounds_of, nested_bounds
 from rps_jax.control.laws import rps_plus, unicycle
 from rps_jax.control.laws.rps_plus import RPSPlusParams, RPSPlusState
 from rps_jax.control.observation import Details, Observation, Twist
@@ -132,9 +132,7 @@ def step(
     return memory, twist, details
 
 
-BOUNDS = {f"law.{name}": bound for name, bound in rps_plus.BOUNDS.items() if not bound.relative_to}
-BOUNDS["law.law.l_mr"] = rps_plus.BOUNDS["law.l_mr"]._replace(relative_to="law.law.l_cr")
-BOUNDS |= bounds_of(RPSRepositionParams)
+BOUNDS = nested_bounds("law", rps_plus.BOUNDS) | dict(bounds_of(RPSRepositionParams))
 LAW = Law(init, step, check=check, bounds=BOUNDS, room=1.5)
 PRESETS = {
     "rps_reposition": RPSRepositionParams(),  # tuned in `hostile`

@@ -42,7 +42,7 @@ import jax.numpy as jnp
 
 from rps_jax import spec
 from rps_jax.control import soft
-from rps_jax.control.base import Law, bounds_of
+from rps_jax.control.base import ApproachSpeed, Law, OmegaMax, SuccessDistance, bounds_of
 from rps_jax.control.observation import Details, Observation, Twist, displacement
 from rps_jax.geometry import planar
 from rps_jax.geometry.arrays import Number, Parameter
@@ -64,9 +64,9 @@ class UnicycleParams(NamedTuple):
     """Parameters of the law: bounds of robot and task, and those that are tuned."""
 
     v_max: Annotated[Parameter, Spec("m/s", "speed of the base's middle", gt=0)] = 0.05
-    omega_max: Annotated[Parameter, Spec("rad/s", "bound on |omega|", gt=0)] = 0.15
-    d_success: Annotated[Parameter, Spec("m", "target reached", gt=0)] = 0.05
-    v_approach: Annotated[Parameter, Spec("m/s", "speed before the first contact", ge=0)] = 0.03
+    omega_max: OmegaMax = 0.15
+    d_success: SuccessDistance = 0.05
+    v_approach: ApproachSpeed = 0.03
     r: Annotated[
         Parameter,
         Spec("m", "from the contact to the object's middle, D1", gt=0, tune=Bound(0.08, 0.4)),

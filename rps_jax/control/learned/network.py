@@ -17,10 +17,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from rps_jax import errors
+from rps_jax.control.base import OmegaMax, SpeedMax, SuccessDistance
 from rps_jax.control.learned import features
 from rps_jax.control.learned.features import TouchState
 from rps_jax.control.observation import Details, TaxelObservation, Twist
-from rps_jax.geometry.arrays import Pair, Parameter
+from rps_jax.geometry.arrays import Pair
 from rps_jax.spec import Spec, specs_of
 
 NetworkKind = Literal["mlp", "gru"]
@@ -152,9 +153,9 @@ class PolicyState(NamedTuple):
 class LearnedParams(NamedTuple):
     """Parameters of a learned law. The weights are no parameters, but constants of the program."""
 
-    d_success: Annotated[Parameter, Spec("m", "target reached", gt=0)] = 0.05
-    v_max: Annotated[Parameter, Spec("m/s", "bound on the speed", gt=0)] = 0.05
-    omega_max: Annotated[Parameter, Spec("rad/s", "bound on |omega|", gt=0)] = 0.15
+    d_success: SuccessDistance = 0.05
+    v_max: SpeedMax = 0.05
+    omega_max: OmegaMax = 0.15
 
 
 def observe_sent(
