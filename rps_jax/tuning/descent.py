@@ -42,7 +42,7 @@ from rps_jax.tuning import gradients
 from rps_jax.tuning.derivatives import soft_times
 from rps_jax.tuning.evolution import Descent, gradient_results
 from rps_jax.tuning.gradients import Estimate
-from rps_jax.tuning.optimisers import OptimiserLike, optimiser
+from rps_jax.tuning.optimisers import OptimiserLike, ScheduleName, optimiser
 from rps_jax.tuning.run import TIMES, Proposal, Results, ScoreCandidates, Search, Tuning
 
 _DERIVATIVE_COST = 4.0  # [1] simulated seconds for which a differentiated second counts
@@ -65,10 +65,9 @@ class TuneGrad(Descent):
     of the derivatives and the slopes; `windows` (generation) is 1 for steps by derivatives. Steps
     without a validation have NaN there. A differentiated second counts as four simulated ones.
 
-    Derivatives of windows often have another direction than those of whole trials: with 6
-    parameters the first cosine of a small quasi-static run was -0.52. Windows are then dropped, and
-    the run goes on by slopes. Windows of 5 s, and no more than some ten steps by them, are from a
-    prototype; no study of this package compares them yet.
+    Derivatives of windows may have another direction than those of whole trials, as `cosine` shows.
+    Windows are then dropped, and the run goes on by slopes. Windows of 5 s, and no more than some
+    ten steps by them, are from a prototype; no study of this package compares them yet.
 
     Examples:
       >>> import rps_jax
@@ -99,7 +98,7 @@ class TuneGrad(Descent):
     optimiser: OptimiserLike = "fixed_length"
     """Optimiser: fixed_length (steps of a fixed root mean square along the momentum), or a function
     of optax with a learning rate, as adam, adamw or sgd; in Python any transformation of optax."""
-    schedule: str = "cosine_decay"
+    schedule: ScheduleName = "cosine_decay"
     """Schedule of the learning rate over all steps, of optax: constant, cosine_decay,
     exponential_decay (to a tenth), linear (to zero), warmup_cosine_decay (a tenth is warm-up)."""
     learning_rate: float = option(0.15, above=0)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable
-from typing import Any
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
@@ -13,7 +13,10 @@ import optax
 from rps_jax import errors
 
 OptimiserLike = str | Any  # name, or a transformation of optax; a text in the command line
-SCHEDULES: dict[str, Callable[[float, int], optax.ScalarOrSchedule]] = {
+ScheduleName = Literal[
+    "constant", "cosine_decay", "exponential_decay", "linear", "warmup_cosine_decay"
+]
+SCHEDULES: dict[ScheduleName, Callable[[float, int], optax.ScalarOrSchedule]] = {
     "constant": lambda rate, steps: rate,
     "cosine_decay": optax.cosine_decay_schedule,
     "exponential_decay": lambda rate, steps: optax.exponential_decay(rate, steps, 0.1),
@@ -49,14 +52,14 @@ def optimisers() -> dict[str, Callable[..., optax.GradientTransformation]]:
 
 
 def optimiser(
-    name: OptimiserLike, schedule: str, learning_rate: float, steps: int
+    name: OptimiserLike, schedule: ScheduleName, learning_rate: float, steps: int
 ) -> optax.GradientTransformation:
     """Return an optimiser of vectors.
 
     Raises:
       InputError: optax has none of this name, or it needs more than gradients and a rate.
     """
-    rate = SCHEDULES[errors.check_name("schedule", schedule, SCHEDULES)](learning_rate, steps)
+    rate = SCHEDULES[schedule](learning_rate, steps)
     rule: Any = name
     if isinstance(name, str):
         known = optimisers()
