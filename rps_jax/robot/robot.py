@@ -293,9 +293,9 @@ ROBOTS: dict[str, Robot] = {
     ),
     # Bases that cannot move sideways. No source gives the friction of their wheels, so that their
     # force has no limit: append ,traction=0.6, for example.
-    # TurtleBot 4, with a flat plate 0.30 m wide before its round body, which is our choice. Its
-    # manual: 341 mm, 3.945 kg, 0.31 m/s (safe mode), 1.9 rad/s. Create 3: wheels 233 mm apart
-    # (create3.urdf.xacro), at most 0.9 m/s^2 (its API).
+    # TurtleBot 4, with a flat plate 0.30 m wide before its round body, which is our choice. Create
+    # 3: wheels 233 mm apart (create3.urdf.xacro). Not checked against the manuals: 341 mm, 3.945
+    # kg, 0.31 m/s (safe mode), 1.9 rad/s, and 0.9 m/s^2.
     "turtlebot4": _covered(
         0.1705,
         0.15,
@@ -306,9 +306,9 @@ ROBOTS: dict[str, Robot] = {
         omega_max=1.9,
         wheel_acceleration_max=0.9,
     ),
-    # Clearpath Jackal: its manual gives 508 by 430 mm and 17 kg, jackal_control/config/control.yaml
-    # speeds, accelerations, and the factor 1.5 by which skidding widens its track of 0.3756 m
-    # (jackal.urdf.xacro).
+    # Clearpath Jackal: jackal_control/config/control.yaml gives speeds, accelerations, and the
+    # factor 1.5 by which skidding widens its track of 0.3756 m (jackal.urdf.xacro). Not checked
+    # against the manual: 508 by 430 mm and 17 kg.
     "jackal": _covered(
         0.254,
         0.215,
@@ -319,8 +319,8 @@ ROBOTS: dict[str, Robot] = {
         omega_max=4.0,
         acceleration_max=(20.0, 25.0),
     ),
-    # Clearpath Husky A200: its data sheet gives 990 by 670 mm, 50 kg and 1 m/s,
-    # husky_control/config/control.yaml the rest, with the factor 1.875 for its track of 0.5708 m.
+    # Clearpath Husky A200: husky_control/config/control.yaml, with the factor 1.875 for its track
+    # of 0.5708 m. Not checked against the data sheet: 990 by 670 mm, 50 kg and 1 m/s.
     "husky": _covered(
         0.495,
         0.335,
@@ -331,12 +331,12 @@ ROBOTS: dict[str, Robot] = {
         omega_max=2.0,
         acceleration_max=(3.0, 6.0),
     ),
-    # MiR100: its data sheet gives 890 by 580 mm, 70 kg and 1.5 m/s. Accelerations, track and axle
-    # are unknown: those of the width and the middle.
+    # MiR100. Not checked against the data sheet: 890 by 580 mm, 70 kg and 1.5 m/s. Accelerations,
+    # track and axle are unknown: no limit, the width and the middle.
     "mir100": _covered(0.445, 0.29, 70.0, drive="differential", v_max=1.5),
-    # Pioneer 3-DX: its data sheet gives 455 by 381 mm, 9 kg, 1.2 m/s and 300 degrees per second,
-    # and a swing radius of 267 mm behind the axle, which is that far from the rear. The track is
-    # unknown: that of the width.
+    # Pioneer 3-DX. Not checked against the data sheet: 455 by 381 mm, 9 kg, 1.2 m/s and 300 degrees
+    # per second, and a swing radius of 267 mm behind the axle, which is that far from the rear. The
+    # track is unknown: the width.
     "pioneer_3dx": _covered(
         0.2275,
         0.1905,
