@@ -106,10 +106,13 @@ class MJXStage(NamedTuple):
         model, (qpos, qvel, warmstart, integral) = apply(self.model, fields), state
         data, sideways = self.data, None
         if robot is None:
-            qvel = qvel.at[JOINTS.base].set(twist.in_world(qpos[2]))
+            qvel = qvel.at[JOINTS.base].set(twist.in_world(qpos[JOINTS.base_yaw]))
         else:
             assert integral is not None  # of a base with a limited force
-            turn, base = (jnp.cos(qpos[2]), jnp.sin(qpos[2])), qvel[JOINTS.base]
+            turn, base = (
+                (jnp.cos(qpos[JOINTS.base_yaw]), jnp.sin(qpos[JOINTS.base_yaw])),
+                qvel[JOINTS.base],
+            )
             servo: Any = tuple(integral)
             force, servo = drives.push(robot, servo, twist, tuple(base), turn, timestep)
             applied = jnp.stack(force)
@@ -124,7 +127,7 @@ class MJXStage(NamedTuple):
         with jax.default_matmul_precision("float32"):  # GPUs would round products to TF32
             data = step(model, data, fields.get(OUTLINE), fields.get(BOUNDARY), inertia=sideways)
         wrench = data.qfrc_constraint[JOINTS.base]  # of the contacts, without the drive
-        wrench = wrench.at[:2].set(planar.rotate(-qpos[2], wrench[:2]))
+        wrench = wrench.at[:2].set(planar.rotate(-qpos[JOINTS.base_yaw], wrench[:2]))
         return Motion(data.qpos, data.qvel, data.qacc_warmstart, integral), wrench
 
 

@@ -44,6 +44,7 @@ from rps_jax.tuning.evolution import Descent, gradient_results
 from rps_jax.tuning.gradients import Estimate
 from rps_jax.tuning.optimisers import OptimiserLike, ScheduleName, optimiser
 from rps_jax.tuning.run import TIMES, Proposal, Results, ScoreCandidates, Search, Tuning
+from rps_jax.world.scene import JOINTS
 
 _DERIVATIVE_COST = 4.0  # [1] simulated seconds for which a differentiated second counts
 
@@ -343,7 +344,7 @@ def features(world: World, params: LawParams, state: Trial, loop: ControlLoop) -
     _, measured = trial.observe(world, params, state, loop)
     contact, distance = 1.0 * measured.reading.in_contact, measured.distance
     distance = _FAR * jnp.tanh(distance / _FAR)
-    point, yaw = measured.reading.p_robot_contact, state.qpos[2]
+    point, yaw = measured.reading.p_robot_contact, state.qpos[JOINTS.base_yaw]
     point = jnp.where(contact > 0, jnp.nan_to_num(point), 0.0)
     target = measured.observation.p_world_target
     way = planar.rotate(-yaw, target - trial.contact_of(state.qpos, point))
@@ -360,7 +361,7 @@ def features(world: World, params: LawParams, state: Trial, loop: ControlLoop) -
         contact * distance,
         distance * turned,
         jnp.clip(ahead, 0.0, _FAR),
-        jnp.clip(state.qvel[8], -1.0, 1.0) ** 2,
+        jnp.clip(state.qvel[JOINTS.object_yaw_rate], -1.0, 1.0) ** 2,
         state.steps * period / rules.horizon,
         state.lost_steps * period / max(float(rules.max_lost), 1e-6),
     ]

@@ -106,6 +106,8 @@ class Joints(NamedTuple):
     base_yaw: int = 2
     object_height: int = 5
     object_quaternion: slice = slice(6, 10)
+    # Of qvel alone:
+    object_yaw_rate: int = 8
 
 
 JOINTS = Joints()
