@@ -13,12 +13,11 @@ from typing import ClassVar, NamedTuple
 import numpy as np
 import xarray as xr
 
+from rps_jax import Setting
 from rps_jax.analysis import statistics, tables
-from rps_jax.record.options import option
-from rps_jax.runs.plan import Plan
-from rps_jax.runs.question import Run, TrialQuestion, call_of
+from rps_jax.questions import Plan, Run, call_of, option
+from rps_jax.runs.question import TrialQuestion
 from rps_jax.runs.sweep import Sweep
-from rps_jax.trials.setting import Setting
 from sweeps.study_base import Rows, Study, Table, run_plans
 
 OMNI = "holonomic, rps_plus"

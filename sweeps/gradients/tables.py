@@ -14,12 +14,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from rps_jax.control import registry
-from rps_jax.control.base import Bound, Law
+from rps_jax import Law, RPSParams, RPSState, register_law
 from rps_jax.control.laws import rps
-from rps_jax.control.laws.rps import RPSParams
 from rps_jax.control.observation import displacement
 from rps_jax.geometry import planar
+from rps_jax.laws import Bound
 
 _NEAR, _FAR, _WIDE = 0.05, 3.0, 0.3  # [m]
 
@@ -68,12 +67,12 @@ def interpolate(table: jax.Array, u: jax.Array, v: jax.Array) -> jax.Array:
     return jnp.sum(table * weights[0][:, None] * weights[1][None, :])
 
 
-def init(params: Tables, temperatures: Any = None) -> rps.RPSState:
+def init(params: Tables, temperatures: Any = None) -> RPSState:
     """Return the initial state of RPS."""
-    return rps.RPSState.init(params.rps, temperatures)
+    return RPSState.init(params.rps, temperatures)
 
 
-def step(params: Tables, state: rps.RPSState, obs: Any, temperatures: Any = None) -> Any:
+def step(params: Tables, state: RPSState, obs: Any, temperatures: Any = None) -> Any:
     """Run RPS with eta and K_h of the tables at the last contact."""
     contact = jnp.where(jnp.asarray(obs.in_contact) > 0, obs.p_robot_contact, state.p_robot_contact)
     filled = obs._replace(p_robot_contact=contact)
@@ -93,4 +92,4 @@ LAW = Law(
 )
 for kind, shape in ((Table64, (8, 4)), (Table512, (16, 16)), (Table2048, (32, 32))):
     zeros = np.zeros(shape)
-    registry.register_law(kind.__name__.lower(), LAW, kind(RPSParams.paper(), zeros, zeros))
+    register_law(kind.__name__.lower(), LAW, kind(RPSParams.paper(), zeros, zeros))
