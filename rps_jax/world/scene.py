@@ -93,7 +93,8 @@ class Scene(NamedTuple):
     @property
     def rounded_solid(self) -> Solid:
         """The solid with its outline in JAX's precision, that of the footprint."""
-        return self.solid._replace(vertices=np.asarray(self.footprint.vertices, float))
+        rounded = np.asarray(self.solid.vertices, jnp.result_type(float))
+        return self.solid._replace(vertices=np.asarray(rounded, float))
 
 
 class Joints(NamedTuple):
