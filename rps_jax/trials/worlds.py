@@ -35,7 +35,8 @@ def build(indices: np.ndarray, inputs: WorldInputs, setting: Setting, **fields: 
     """
     engine, dtype = setting.simulator, jnp.result_type(float)
     engine.check_robot(inputs.robots)
-    engine.check_feet(inputs.solids.feet)
+    inputs = inputs.supported
+    engine.check_pads(inputs.solids, setting.physics)
     added = getattr(fields.get("task"), "surroundings", None) or {}
     inputs = inputs._replace(surroundings=inputs.surroundings._replace(**added))
     engine.check_surroundings(inputs.surroundings)
