@@ -8,6 +8,7 @@ whether later code gives the same numbers.
 
 from __future__ import annotations
 
+import hashlib
 import inspect
 import json
 import os
@@ -28,8 +29,7 @@ import xarray as xr
 from rps_jax import InputError, errors
 from rps_jax.engines import device
 from rps_jax.questions import Picture, Plan, Run, Section
-from rps_jax.record import files, options, provenance
-from rps_jax.record.checkpoint import Checkpoints
+from rps_jax.record import options, provenance
 from rps_jax.runs import execution
 from rps_jax.runs.question import Question, TrialQuestion, quick_command, quick_note
 from rps_jax.runs.results import PlanRequest, Results
@@ -259,6 +259,11 @@ def part_name(*labels: object) -> str:
     return re.sub(r"\W+", "_", "_".join(map(str, labels)))
 
 
+def part_of(label: str, *options: object) -> str:
+    """Return the name of a part of a run folder that other options would not give."""
+    return part_name(label, hashlib.sha256(repr(options).encode()).hexdigest()[:8])
+
+
 def stored_parts(run: Run) -> Collection[str]:
     """Return the names of the parts that the run folder has."""
     return () if run.checkpoints is None else run.checkpoints.paths()
@@ -274,34 +279,6 @@ def run_parts(run: Run, dim: str, parts: Parts, trials: int = 1) -> xr.Dataset:
         computed.append(run.checkpoint(part_name(label), compute))
         run.callback(Progress(trials * len(computed), 0.0))
     return xr.concat(computed, xr.IndexVariable(dim, list(parts)))
-
-
-def load_part(parts: Checkpoints | None, name: str, options: str) -> xr.Dataset | None:
-    """Return the results of a part if they are stored.
-
-    Raises:
-      InputError: their attribute `run_as` differs from the options.
-    """
-    if parts is None or (content := parts.get(name)) is None:
-        return None
-    results = files.decode_results(content, parts.folder / name)
-    if results.attrs.get("run_as") != options:
-        raise InputError(
-            f"{parts.folder / name}-*.nc was run with other options: choose another folder, or "
-            "delete the file to run the part again."
-        )
-    return results
-
-
-def load_or_compute(
-    parts: Checkpoints | None, name: str, options: str, compute: Callable[[], xr.Dataset]
-) -> xr.Dataset:
-    """Return a part that is stored with the same options, or compute and store it."""
-    if (results := load_part(parts, name, options)) is None:
-        results = compute().assign_attrs(run_as=options)
-        if parts is not None:
-            parts.put(name, files.encode_results(results))
-    return results.drop_attrs(deep=False)
 
 
 def run_plans(run: Run, plans: Mapping[str, Plan]) -> dict[str, xr.Dataset]:

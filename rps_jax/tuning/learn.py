@@ -5,7 +5,7 @@
 
 import functools
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, fields, replace
 from functools import partial
@@ -89,14 +89,14 @@ class Learn(PPO, TaskOption, SimulationQuestion[xr.Dataset]):
     TITLE = "A learned law"
     IGNORED_FIELDS = ("minutes", "updates", "every", "task")
     REPORTS_TIMES = True
-    RENAMED: ClassVar[Mapping[str, str]] = {
+    RENAMED: ClassVar = {
         "hard": "prioritised",
         "enough": "success_threshold",
         "level": "initial_level",
         "spread": "action_std",
         "average": "ema_updates",
     }
-    QUICK: ClassVar[Mapping[str, Any]] = {
+    QUICK: ClassVar = {
         "domain": ("wide,objects=random_box",),
         "network": "mlp",
         "width": 32,

@@ -163,7 +163,7 @@ def parameters_figure(results: xr.Dataset, log: Collection[str]) -> Figure:
 
     Intervals are Wilson's, of 95 %.
     """
-    names = list(map(str, results.parameter.values))
+    names = results.parameter.values.tolist()
     figure, axes = tiles(len(names), 4, (3, 2.5), (0, 0), sharey=True)
     worlds = int(results.attrs["worlds"])
     for ax, name in zip(axes.ravel(), names, strict=False):

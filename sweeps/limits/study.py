@@ -244,8 +244,7 @@ def successes(results: Mapping[str, xr.Dataset]) -> Rows:
     for name in (name for name in results if LIMITS[name].robots):
         for value in np.unique(results[name].value.values):
             success = results[name].success.values[:, results[name].value.values == value] > 0
-            rates = [tables.share(int(succeeded.sum()), succeeded.size) for succeeded in success]
-            rows.append([LIMITS[name].label, f"{value:.3g}", *rates])
+            rows.append([LIMITS[name].label, f"{value:.3g}", *map(tables.rate, success)])
     return rows
 
 
@@ -294,7 +293,7 @@ def figure_of(results: Mapping[str, xr.Dataset]) -> Figure:
 
 def turning_figure(results: xr.Dataset) -> Figure:
     """Draw the turning rate that a law asks for, and what each robot makes of it, over time."""
-    names = list(map(str, results.robot.values))
+    names = results.robot.values.tolist()
     figure, axes = tiles(len(names), 1, (8, 1.7), (0, 0), sharex=True, sharey=True)
     for ax, name in zip(axes[:, 0], names, strict=True):
         rates, label = results.sel(robot=name), "asked by the law"

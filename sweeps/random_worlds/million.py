@@ -133,8 +133,7 @@ def table(results: xr.Dataset) -> Rows:
     for law in map(str, results.law.values):
         how = results.how.sel(law=law).values
         counts = np.bincount(how, minlength=len(ENDS))
-        steps, period = results.steps.sel(law=law).values[how == 0], results.attrs["control_period"]
-        median = f"{np.median(steps) * period:.1f} s" if steps.size else "-"
-        share = tables.share(int(counts[0]), how.size)
-        rows.append([law, share, *(f"{int(n):,}" for n in counts[1:]), median])
+        steps = results.steps.sel(law=law).values[how == 0]
+        median = tables.median(steps * results.attrs["control_period"])
+        rows.append([law, tables.rate(how == 0), *(f"{int(n):,}" for n in counts[1:]), median])
     return rows

@@ -188,7 +188,7 @@ def _rate_range(by_model: Mapping[str, tuple[int, int]]) -> str:
 
 def panel_table(results: xr.Dataset) -> Rows:
     """Return a header and one row per domain and law: its rate with each model, and their range."""
-    names = [str(name) for name in results.model.values]
+    names = results.model.values.tolist()
     rows = [["domain", "law", *names, "over these models"]]
     for domain, law in _domains_and_laws(results):
         by_model = rates(results, domain, law)

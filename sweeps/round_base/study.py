@@ -82,11 +82,11 @@ def compared(results: xr.Dataset) -> Rows:
         trials = results.sel(law=law)
         flat, curved = (trials.success.sel(base=base) for base in BASES)
         comparison = statistics.compare(flat, curved)
-        rates = (tables.share(int(x.sum()), x.size) for x in (flat, curved))
+        rates = (tables.rate(x.values) for x in (flat, curved))
         points = 100 * (curved.values.astype(float) - flat.values)
         times = [trials.time.sel(base=base).values for base in BASES]
         medians = (
-            f"{np.median(time[x.values > 0]):.0f} s" if x.any() else "-"
+            tables.median(time[x.values > 0], "{:.0f} s")
             for time, x in zip(times, (flat, curved), strict=True)
         )
         both = (flat.values > 0) & (curved.values > 0)
