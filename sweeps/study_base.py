@@ -20,18 +20,17 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, S
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any, ClassVar, NamedTuple, Self, TypeVar
+from typing import Any, ClassVar, NamedTuple, TypeVar
 
 import jax
 import numpy as np
 import xarray as xr
 
 from rps_jax import InputError, errors
-from rps_jax.engines import device
 from rps_jax.questions import Picture, Plan, Run, Section
 from rps_jax.record import options, provenance
 from rps_jax.runs import execution
-from rps_jax.runs.question import Question, TrialQuestion, quick_command, quick_note
+from rps_jax.runs.question import Question, QuickQuestion, TrialQuestion
 from rps_jax.runs.results import PlanRequest, Results
 from rps_jax.trials.batch_run import run_batch
 from rps_jax.trials.progress import Progress, ProgressCallback, SequentialProgress, no_progress
@@ -176,21 +175,8 @@ class Study(Question[T]):
 
 
 @dataclass(frozen=True, kw_only=True)
-class QuickStudy(Study[T]):
+class QuickStudy(Study[T], QuickQuestion[T]):
     """Base class of studies that have a small run."""
-
-    quick: bool = False
-    """Whether to make a small run of minutes on two cores; explicit options keep their values."""
-
-    IGNORED_FIELDS: ClassVar[tuple[str, ...]] = ("quick",)
-
-    def with_quick_values(self) -> Self:
-        """Return the study with its quick values, if `quick` is set."""
-        return quick_command(self) if self.quick else self
-
-    def quick_note(self) -> str:
-        """Return the first line of the report of a quick run."""
-        return quick_note(self) if self.quick else ""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -242,7 +228,7 @@ def run_process(words: Sequence[str | Path], problem: str, folder: Path | None =
 
 def machine() -> str:
     """Return a description of the device of this process."""
-    used, count = jax.devices()[0], device.count_processors()
+    used, count = jax.devices()[0], len(os.sched_getaffinity(0))
     if used.platform != "cpu":
         return f"one {used.device_kind} and {count} processors"
     model = platform.processor() or platform.machine()

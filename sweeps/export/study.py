@@ -18,7 +18,7 @@ from dataclasses import dataclass
 from functools import partial
 from itertools import product
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Any, ClassVar, Literal
 
 import jax
 import numpy as np
@@ -30,8 +30,7 @@ from rps_jax.control.learned import policy
 from rps_jax.physics import PHYSICS
 from rps_jax.questions import Run, call_of, option
 from rps_jax.world import paper
-from rps_jax.world.domain import STORED
-from rps_jax.worlds import Case, parse_domain
+from rps_jax.worlds import Case, DomainLike, parse_domain
 from sweeps.export import loop, native
 from sweeps.study_base import QuickStudy, Table, records, run_parts, text_table
 
@@ -75,7 +74,7 @@ class Export(QuickStudy[xr.DataTree]):
     """Number of random worlds with C in the loop."""
     bags: int = option(4, 1, 1000)
     """Number of random worlds that are recorded as bags, for each law."""
-    domain: Annotated[str, STORED] = "real"
+    domain: DomainLike = "real"
     """Domain of these worlds."""
 
     def check(self) -> None:

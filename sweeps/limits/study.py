@@ -24,7 +24,6 @@ from rps_jax.analysis.figures.style import Figure, success_rates, tiles
 from rps_jax.geometry.solid import GRAVITY
 from rps_jax.laws import LawParams
 from rps_jax.questions import MultiLawQuestion, Picture, Plan, Run, Section, call_of, option
-from rps_jax.runs.sweep import Sweep
 from rps_jax.trials import pushes
 from rps_jax.worlds import Case, DomainLike, parse_domain
 from sweeps.study_base import PlanStudy, Rows, run_plans
@@ -125,8 +124,7 @@ class Limits(PlanStudy[xr.DataTree], MultiLawQuestion[xr.DataTree]):
 
     def _plan(self, ranges: Domain, robot: Robot | None = None) -> Plan:
         """Return the sweep of a robot."""
-        sweep = Sweep(self.chosen, ranges, self.worlds, robot=robot, setting=self.setting)
-        return sweep.plan
+        return Plan(parse_domain(ranges, robot), self.worlds, self.chosen, self.setting)
 
     @cached_property
     def plans(self) -> dict[str, Plan]:
