@@ -26,7 +26,6 @@ import xarray as xr
 
 from rps_jax import InputError, Setting
 from rps_jax.app.export import program
-from rps_jax.control.learned import policy
 from rps_jax.physics import PHYSICS
 from rps_jax.questions import Run, call_of, option
 from rps_jax.world import paper
@@ -105,7 +104,7 @@ class Export(QuickStudy[xr.DataTree]):
 
     def _inputs(self, law: str, folder: Path) -> xr.Dataset:
         counts: dict[native.Form, int] = {
-            form: self.states if form == "onnx" or law in policy.SHIPPED else self.inputs
+            form: self.states if form == "onnx" or law.startswith("learned") else self.inputs
             for form in _FORMS
         }
         rows = [native.agreement(law, form, count, folder) for form, count in counts.items()]
