@@ -287,7 +287,7 @@ def _paper_table(results: xr.Dataset) -> Table:
     return Table(rows, note, title="The paper's trials")
 
 
-def _world_table(domain: str, results: xr.Dataset) -> Table:
+def _world_table(domain: DomainLike, results: xr.Dataset) -> Table:
     note = f"The same worlds of `{domain}` for both; one rounding off; fused engine, float."
     return Table(text_table(_ENDS, records(results, "law")), note, title="Random worlds")
 
@@ -303,7 +303,7 @@ _BAGS = {
 }
 
 
-def _bag_table(domain: str, results: xr.Dataset) -> Table:
+def _bag_table(domain: DomainLike, results: xr.Dataset) -> Table:
     note = (
         f"Worlds of `{domain}`, fused engine. Each law is fed its own bag. The goal is 1e-6, of "
         "differences as shares of the greatest speed and turning rate."
