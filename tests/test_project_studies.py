@@ -45,7 +45,6 @@ REFUSED = [
     ("landscape --laws pursuit", "law = pursuit is not allowed"),
     ("speed --families cone", "cone"),
     ("levers --family cone", "cone"),
-    ("ambiguities --gazebo --curve", "gazebo and curve are not allowed together"),
     ("limits --limits leg", "did you mean 'lag'"),
     ("mends --laws none", "unknown mend 'none'"),
     ("ground --grounds our", "did you mean 'ours'"),
