@@ -29,7 +29,7 @@ from IPython.display import Markdown
 import rps_jax
 from rps_jax import RPSParams
 from rps_jax.analysis import tables
-from rps_jax.analysis.figures import tuning as figures
+from rps_jax.analysis.figures import sweeps as figures
 from rps_jax.laws import Space
 from rps_jax.tuning import gradients
 from rps_jax.worlds import Case, IdealSkin
