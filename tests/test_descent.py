@@ -26,8 +26,6 @@ from rps_jax.tuning import derivatives, descent, optimisers
 from rps_jax.tuning.descent import TuneGrad
 from rps_jax.tuning.evolution import TuneES
 from rps_jax.tuning.gradients import Estimate
-from sweeps.gradients import windows
-from sweeps.gradients.windows import Windows
 
 SETTING = Setting("quasistatic", rules=Rules(horizon=20.0, max_lost=10.0))
 OBJECTIVE = Objective(time=0.3, lost=0.1, miss=0.5)
@@ -69,20 +67,6 @@ def test_the_soft_score_has_a_slope_where_the_hard_score_jumps():
 
     slope = float(jax.grad(at)(0.05))
     assert slope > 10 * OBJECTIVE.time / SETTING.rules.horizon  # [1/m] more than a way's own
-
-
-def test_windows_need_a_law_with_a_smooth_form():
-    with pytest.raises(InputError, match="no smooth form"):
-        Windows("pursuit", tuned=("K_v",)).validate()
-
-
-def test_windows_need_an_estimator_and_an_engine_with_derivatives():
-    with pytest.raises(InputError, match="unknown estimator 'reverse': choose from exact, clipped"):
-        Windows("rps", estimator="reverse").validate()
-    mujoco = Setting("mujoco")
-    with pytest.raises(InputError, match="engine = mujoco is not allowed: it has no reverse-mode"):
-        Windows("rps", setting=mujoco).validate()
-    TuneES("rps", setting=mujoco, estimator="antithetic").validate()
 
 
 def by_slopes(**options):
@@ -143,18 +127,6 @@ def test_the_tail_alone_counts_for_a_risk_averse_objective():
     values = [objective.value((1.0 + side * step) * slopes) for side in (1, -1)]
     assert (values[0] - values[1]) / (2 * step) == pytest.approx(8.5, rel=1e-3)
     assert_array_equal(Objective().linearise(slopes), slopes)
-
-
-def test_windows_start_at_the_states_of_their_trials(monkeypatch):
-    """Trials are replaced by counts of their steps of 20 ms."""
-
-    monkeypatch.setattr(windows, "start_all", lambda *arguments, law: jnp.zeros(arguments[-1].size))
-    monkeypatch.setattr(windows, "advance", lambda batches, loop, steps: [batches[0][-1] + steps])
-    late = jnp.array([0.0, 0.5, 1.0])
-    for within, steps in ((10.0, [0, 250, 500]), (0.0, [0, 0, 0])):
-        question = Windows("rps", tuned=("L", "K_h"), within=within, setting=SETTING)
-        trials = windows.window_starts(question, None, jnp.zeros(2), late, late)
-        assert_array_equal(trials, steps)
 
 
 # --- derivatives of windows ----------------------------------------------------------------

@@ -34,9 +34,8 @@ OUT_OF_BOUNDS = [
     "real_pushes/fit.py --few 5",
 ]
 UNKNOWN = [
-    "gradients --objects box",
-    "gradients --estimators backward",
-    "gradients --tuned v_max",
+    "gradients/race.py --methods newton",
+    "gradients/race.py --counts 7",
     "landscape --domain wyde",
     "engines --domain wyde",
     "random_worlds --domains wyde",
@@ -54,7 +53,6 @@ UNKNOWN = [
     "planning --methods newton",
 ]
 REFUSED = [
-    ("gradients --horizons 2 1", r"horizons = \(2\.0, 1\.0\) is not allowed"),
     ("landscape --laws rps,tund.json", r"tund\.json cannot be read"),
     ("landscape --laws pursuit", "law = pursuit is not allowed"),
     ("speed --families cone", "cone"),

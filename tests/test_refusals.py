@@ -19,7 +19,6 @@ from rps_jax.tuning.evolution import TuneES
 from rps_jax.tuning.space import Space
 from rps_jax.world import scene
 from rps_jax.world.physics import Physics, preset
-from sweeps.gradients.study import Gradients
 
 NAN, INF = math.nan, math.inf
 BOARDS = Boards("front", 2, 0.05)
@@ -114,10 +113,6 @@ REFUSED = {
     Objective: each(risk="worst", time=-1.0, tail=0.0, miss=NAN),
     then("validate", partial(TuneES, "rps")): [
         *each(population=3, spread=0.0, generations=0, prior=-1.0)
-    ],
-    then("validate", Gradients): [
-        *each(objects=("box",), worlds=1, delta=0.0),
-        *(({"horizons": horizons}, "horizons") for horizons in ((), (2.0, 1.0))),
     ],
 }
 

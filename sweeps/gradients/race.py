@@ -1,15 +1,14 @@
-"""Race derivatives, slopes and evolution: equal wall time and equal simulated time.
+"""Race derivatives, slopes and evolution: equal simulated time and equal wall time.
 
 Each tuning is a run of `rps tune grad` or `rps tune es`, in a separate folder, and is killed after
 some minutes; a second call continues it, up to these minutes. Runs with other seeds, methods or
 problems share the folder, so that a race can be split. The generation with the best validation
 within a budget is tested in worlds that no tuning has met.
 
-    rps sweeps/gradients/race.py --lanes 2 --minutes 5 --seeds 1
+    rps sweeps/gradients/race.py --lanes 15 --minutes 1.5
 
-The default race has 84 tunings of four minutes, and takes six to seven hours on two cores.
-Several tunings run at once on one GPU and share it equally. Then a budget of wall time is that of a
-loaded GPU.
+Several tunings run at once, each on a processor of its own with JAX_PLATFORMS=cpu, or share a GPU
+equally. Budgets of wall time are those of such a tuning.
 """
 
 from __future__ import annotations
@@ -24,37 +23,42 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
+from queue import SimpleQueue
 from typing import Any, ClassVar
 
 import numpy as np
 import pandas as pd
+import scipy
 import xarray as xr
 
 from rps_jax import InputError, RPSParams, Setting, errors, evaluate
 from rps_jax.analysis import statistics
+from rps_jax.analysis.figures.style import Figure, tiles
 from rps_jax.control import registry
-from rps_jax.questions import Run, call_of, option
+from rps_jax.questions import Picture, Run, call_of, option
 from rps_jax.runs.question import SimulationQuestion
-from sweeps.study_base import Parts, Rows, Study, Table, part_name
+from sweeps.study_base import Parts, Study, Table, part_name
 
-TABLES = Path(__file__).with_name("tables.py")
-# Laws and tuned parameters by the number of these.
-COUNTS = {
-    6: "--tuned K_h K_v L beta l_cr d_th",
-    13: "--tuned full",
-    18: "--tuned full --law rps_plus --domain real --objects random_box",
+TABLES = "sweeps/gradients/tables.py"  # from the root of the repository
+# Options of tunings by the number of tuned parameters: those of RPS, or the entries of tables.
+COUNTS: dict[int, dict[str, tuple[str, ...]]] = {
+    6: {"tuned": ("K_h", "K_v", "L", "beta", "l_cr", "d_th")},
+    13: {"tuned": ("full",)},
     **{
-        n: f"--tuned full --law {TABLES}:Table{n} --objects random_cylinder"
+        n: {"law": (f"{TABLES}:Table{n}",), "objects": ("random_cylinder",)}
         for n in (64, 512, 2048)
     },
 }
-_COMMON = "--horizon 150 --validation 256"
-_ES = f"rps tune es {_COMMON} --generations 1000 --worlds"
+_COMMON = "--horizon 150 --validation 96"
+_SLOPES = f"rps tune es --estimator antithetic {_COMMON} --worlds 128 --generations 16"
+_EVOLUTION = f"rps tune es {_COMMON} --worlds 32 --population 16 --generations 1000"
 METHODS = {  # commands that are compared
-    "derivatives": f"rps tune grad {_COMMON}",
-    "slopes": f"rps tune es --estimator antithetic {_COMMON}",
-    "evolution": f"{_ES} 64 --population 16",
+    "derivatives": f"rps tune grad {_COMMON} --steps 20",
+    "slopes": _SLOPES,
+    "evolution": _EVOLUTION,
 }
+FIRST = "derivatives"  # method with which the others are compared
+_LARGE = 500  # parameters from which evolution has a diagonal covariance
 QUICK_SIZES = (
     " --objects random_cylinder --engine quasistatic --horizon 20 --validation 4 --worlds 4"
 )
@@ -65,14 +69,14 @@ BUDGETS = ("wall", "simulated")
 class Race(Study[xr.Dataset], SimulationQuestion[xr.Dataset]):
     """Race derivatives, slopes and evolution: equal wall time and equal simulated time.
 
-    The answer has the `success` (tuning, budget, world) of the tuned laws in test worlds, and that
-    of the law at the start, `start_success` (tuning, world). Budgets are `wall` or `simulated` with
-    an amount [s].
+    The answer has the `success` (count, seed, method, budget, world) of the tuned laws in test
+    worlds, and that of the law at the start, `start_success` (count, world). Budgets are `wall` or
+    `simulated` with an amount [s].
     """
 
     TITLE: ClassVar[str] = "Derivatives against evolution"
     CHOICES: ClassVar = {"methods": METHODS}
-    GROWS: ClassVar[tuple[str, ...]] = ("methods", "counts", "seeds")
+    GROWS: ClassVar[tuple[str, ...]] = ("counts",)
     QUICK: ClassVar[Mapping[str, Any]] = {
         "worlds": 4,
         "counts": (64,),
@@ -80,28 +84,27 @@ class Race(Study[xr.Dataset], SimulationQuestion[xr.Dataset]):
         "methods": ("derivatives",),
     }
     IGNORED_FIELDS: ClassVar[tuple[str, ...]] = ("minutes", "lanes", "gpus")
-    DIMENSION: ClassVar[str] = "tuning"
+    DIMENSION: ClassVar[str] = "count"
     REPORTS_TIMES: ClassVar[bool] = True
 
     methods: tuple[str, ...] = tuple(METHODS)
     """derivatives (`rps tune grad`), slopes (antithetic steps in whole trials) or evolution."""
-    counts: tuple[int, ...] = (6, 13, 64, 2048)
-    """Numbers of tuned parameters: 6 and 13 of RPS, 18 of RPS+ in `real`, or the 64, 512 and
-    2,048 entries of tables."""
+    counts: tuple[int, ...] = (6, 13, 64, 512, 2048)
+    """Numbers of tuned parameters: 6 and 13 of RPS, or the 64, 512 and 2,048 entries of tables."""
     seeds: tuple[int, ...] = (1, 2, 3, 4, 5, 6, 7)
     """Seeds of the tunings."""
     minutes: float = option(4.0, above=0, at_most=1e4, unit="min")
     """Wall clock after which a tuning is killed [min], with compilation."""
-    wall: tuple[float, ...] = option((10.0, 30.0, 120.0), above=0, unit="s")
+    wall: tuple[float, ...] = option((10.0, 30.0), above=0, unit="s")
     """Budgets of wall time without compilation [s]."""
-    simulated: tuple[float, ...] = option((6e4, 2e5, 6e5), above=0, unit="s")
+    simulated: tuple[float, ...] = option((1e5, 4e5), above=0, unit="s")
     """Budgets of simulated time [s]; a differentiated second counts as four."""
-    worlds: int = option(2000, 1, 1_000_000)
+    worlds: int = option(1000, 1, 1_000_000)
     """Number of test worlds of `wide`."""
     lanes: int = option(1, 1, 64)
     """Number of tunings that run at once."""
     gpus: int = option(0, 0, 8)
-    """Number of GPUs for the tunings; 0 leaves the choice to them."""
+    """Number of GPUs for the tunings; with 0 each has a processor core."""
     setting: Setting = field(default=Setting(), kw_only=True)
     out: Path | str | None = field(default="runs/race", kw_only=True)
     """Run folder; the tunings have folders there."""
@@ -116,54 +119,55 @@ class Race(Study[xr.Dataset], SimulationQuestion[xr.Dataset]):
         commands = {name: METHODS[name] for name in self.methods}
         return super().configuration() | {"commands": commands}
 
-    def tunings(self) -> dict[tuple[str, int, int], str]:
-        """Return the commands of the tunings by method, count and seed."""
-        labels = itertools.product(self.methods, self.counts, self.seeds)
+    def tunings(self) -> dict[tuple[int, int, str], str]:
+        """Return the commands of the tunings by seed, count and method."""
+        labels = itertools.product(self.seeds, self.counts, self.methods)
         sizes = QUICK_SIZES if self.quick else ""
-        return {(m, n, s): f"{METHODS[m]} {COUNTS[n]} --seed {s}{sizes}" for m, n, s in labels}
+        return {(s, n, m): f"{command(m, n)} --seed {s}{sizes}" for s, n, m in labels}
 
     def answer(self, run: Run) -> xr.Dataset:
-        """Run the tunings that lack a test, and test all."""
+        """Run the tunings of the counts that lack a test, and test all."""
         assert run.folder is not None
         stored = () if run.checkpoints is None else run.checkpoints.paths()
         commands = {
             run.folder / part_name(*label): command
             for label, command in self.tunings().items()
-            if part_name(*label) not in stored
+            if part_name(label[1]) not in stored
         }
         run_commands(commands, self.minutes, self.lanes, self.gpus)
         return super().answer(run)
 
     def parts(self, run: Run) -> Parts:
-        """Return the test of each tuning, by its label."""
+        """Return the test of the tunings of each count."""
         folder = run.folder or Path(str(self.out))
-        return {
-            part_name(*label): partial(self._test, folder / part_name(*label), label)
-            for label in self.tunings()
-        }
+        return {n: partial(self._test, folder, n) for n in self.counts}
 
-    def _test(self, folder: Path, label: tuple[str, int, int]) -> xr.Dataset:
-        """Return the success of the best law of a tuning within each budget."""
-        if not (folder / "curve.csv").exists():
-            reason = f"{folder.with_suffix('.log')} tells why; or raise minutes"
-            raise InputError(f"{folder} has no generation: {reason}.")
-        curve = pd.read_csv(folder / "curve.csv")
+    def _test(self, folder: Path, count: int) -> xr.Dataset:
+        """Return the success of the best laws of all tunings of a count within each budget."""
+        labels = itertools.product(self.seeds, (count,), self.methods)
+        curves = [read_curve(folder / part_name(*label)) for label in labels]
         budgets = [(name, amount) for name in BUDGETS for amount in getattr(self, name)]
-        chosen = [best_within(curve, *budget) for budget in budgets]
-        start, domain = problem(label[1])
-        laws = [start, *(law_of(row, start) for row in chosen)]
+        start, domain = problem(count)
+        chosen = [law_of(best_within(x, *y), start) for x in curves for y in budgets]
         options = {"split": "test", "setting": self.setting, "progress": False}
-        scores = evaluate(laws, domain, self.worlds, **options)
+        scores = evaluate([start, *chosen], domain, self.worlds, **options)
         start_success, *tuned = scores.success.values.astype(np.int8)
-        columns = {"method": label[0], "count": label[1], "seed": label[2]}
-        variables = {name: ((), value) for name, value in columns.items()}
-        totals = {"generations": len(curve), "wall": spent(curve, "wall").iloc[-1]}
-        totals |= {"simulated": spent(curve, "simulated").iloc[-1]}
-        variables |= {name: ((), float(value)) for name, value in totals.items()}
-        variables |= {"start_success": ("world", start_success)}
+        dims, shape = ("seed", "method"), (len(self.seeds), len(self.methods))
+        by_tuning = {
+            "generations": [len(curve) for curve in curves],
+            "windows": [curve.get("windows", pd.Series([0.0])).sum() for curve in curves],
+            **{name: [float(spent(x, name).iloc[-1]) for x in curves] for name in BUDGETS},
+        }
+        variables = {name: (dims, np.reshape(x, shape)) for name, x in by_tuning.items()}
+        success = np.reshape(tuned, (*shape, len(budgets), -1))
+        names = [f"{name} {amount:g} s" for name, amount in budgets]
         return xr.Dataset(
-            variables | {"success": (("budget", "world"), np.stack(tuned))},
-            {"budget": [f"{name} {amount:g} s" for name, amount in budgets]},
+            variables
+            | {
+                "start_success": ("world", start_success),
+                "success": ((*dims, "budget", "world"), success),
+            },
+            {"seed": list(self.seeds), "method": list(self.methods), "budget": names},
         )
 
     def intro(self, results: xr.Dataset) -> str:
@@ -175,25 +179,49 @@ class Race(Study[xr.Dataset], SimulationQuestion[xr.Dataset]):
 
     def report_tables(self, results: xr.Dataset) -> Sequence[Table]:
         """Return the success of the tunings."""
-        return [Table(table(results), merge="parameters", name="gradients_race", title="Success")]
+        picture = Picture("race", partial(draw, results))
+        columns = [
+            {"name": "parameters", "merge": True},
+            {"name": "equal", "merge": True},
+            {"name": "method"},
+            {"name": "success", "format": "{:.1%}", "rest": "{:.1%}"},
+            {"name": "derivatives ahead by", "format": "{:+.1%}", "rest": "{:+.1%}"},
+            {"name": "by seed"},
+            {"name": "gained, lost"},
+            {"name": "generations"},
+        ]
+        text = "Square brackets: 95 % intervals over the seeds, by Student's t."
+        named = {"name": "gradients_race", "title": "Success", "picture": picture}
+        return [Table(table(results), text, columns, **named)]
 
 
 race = call_of(Race)
 
 
+def command(method: str, count: int) -> str:
+    """Return the command of a method for a number of parameters."""
+    diagonal = " --estimator sep_cma" if method == "evolution" and count >= _LARGE else ""
+    flags = (f"--{name} {' '.join(values)}" for name, values in COUNTS[count].items())
+    return " ".join([f"{METHODS[method]}{diagonal}", *flags])
+
+
 def run_commands(commands: Mapping[Path, str], minutes: float, lanes: int, gpus: int) -> None:
     """Run or continue the command of each folder until it ends or its time is up.
 
-    So many `lanes` run at once. They take turns at the GPUs; with 0 GPUs they choose themselves.
+    So many `lanes` run at once. They share the GPUs; with 0 GPUs each has a processor core.
     Each writes to the folder and to a log beside it.
     """
+    free, cores = SimpleQueue[int](), sorted(os.sched_getaffinity(0))
+    for lane in range(lanes):
+        free.put(lane)
 
-    def run(index: int, folder: Path) -> None:
-        environment = dict(os.environ, XLA_PYTHON_CLIENT_PREALLOCATE="false")
+    def run(folder: Path) -> None:
+        lane, environment = free.get(), dict(os.environ, XLA_PYTHON_CLIENT_PREALLOCATE="false")
+        pinned = ["taskset", "--cpu-list", str(cores[lane % len(cores)])] if not gpus else []
         if gpus:
-            environment["CUDA_VISIBLE_DEVICES"] = str(index % gpus)
+            environment["CUDA_VISIBLE_DEVICES"] = str(lane % gpus)
         words = shlex.split(commands[folder])[1:]
-        program = [sys.executable, "-m", "rps_jax", *words, "--out", str(folder)]
+        program = [*pinned, sys.executable, "-m", "rps_jax", *words, "--out", str(folder)]
         with open(folder.with_suffix(".log"), "a", encoding="utf-8") as log:
             process = subprocess.Popen(program, env=environment, stdout=log, stderr=log)
             try:
@@ -201,10 +229,19 @@ def run_commands(commands: Mapping[Path, str], minutes: float, lanes: int, gpus:
             except subprocess.TimeoutExpired:
                 process.kill()
                 process.wait()
+        free.put(lane)
 
     with ThreadPoolExecutor(lanes) as pool:
-        for future in [pool.submit(run, *item) for item in enumerate(commands)]:
+        for future in [pool.submit(run, folder) for folder in commands]:
             future.result()
+
+
+def read_curve(folder: Path) -> pd.DataFrame:
+    """Return the generations of a tuning, or raise InputError."""
+    if not (folder / "curve.csv").exists():
+        reason = f"{folder.with_suffix('.log')} tells why; or raise minutes"
+        raise InputError(f"{folder} has no generation: {reason}.")
+    return pd.read_csv(folder / "curve.csv")
 
 
 def spent(curve: pd.DataFrame, budget: str) -> pd.Series:
@@ -220,11 +257,14 @@ def best_within(curve: pd.DataFrame, budget: str, amount: float) -> pd.Series:
 
 def problem(count: int) -> tuple[Any, str]:
     """Return the law at the start and the domain of the test worlds of a problem."""
-    words = shlex.split(COUNTS[count])
-    values = dict(itertools.pairwise(words))
-    _, start = registry.parse_law(values.get("--law", "rps"))
-    objects = f",objects={values['--objects']}" if "--objects" in values else ""
-    return start, f"{values.get('--domain', 'wide')}{objects}"
+    _, start = registry.parse_law(tuning(count).get("law", "rps"))
+    objects = COUNTS[count].get("objects", ())
+    return start, ",".join(["wide", *(f"objects={name}" for name in objects)])
+
+
+def tuning(count: int) -> dict[str, Any]:
+    """Return the options of a tuning in Python."""
+    return {k: values[0] if k == "law" else values for k, values in COUNTS[count].items()}
 
 
 def law_of(row: pd.Series, start: Any = RPSParams.paper()) -> Any:
@@ -241,25 +281,53 @@ def law_of(row: pd.Series, start: Any = RPSParams.paper()) -> Any:
     return registry.replace_leaves(start, single)
 
 
-def table(results: xr.Dataset) -> Rows:
-    """Return a header and a row per number of parameters, budget and method."""
-    head = ["parameters", "equal", "method", "success, mean", "by seed [%]", "gained, lost"]
-    rows = [[*head, "generations"]]
-    for count in sorted(set(results["count"].values.tolist())):
-        of_count = results.isel(tuning=np.flatnonzero(results["count"] == count))
-        start = of_count.start_success.isel(tuning=0)
-        rows.append([str(count), "", "start", f"{100 * float(start.mean()):.1f} %", "", "", ""])
-        for budget, method in itertools.product(results.budget.values, METHODS):
-            chosen = of_count.isel(tuning=np.flatnonzero(of_count.method == method))
-            if not chosen.sizes["tuning"]:
-                continue
-            success = chosen.success.sel(budget=budget)
-            rates = 100 * success.mean("world").values
-            compared = [statistics.compare(start, x) for x in success]
-            gained, lost = (sum(getattr(c, name) for c in compared) for name in ("gained", "lost"))
-            seeds = ", ".join(f"{x:.1f}" for x in rates)
-            generations = f"{chosen.generations.values.mean():.0f}"
-            label, mean = str(budget).replace(" ", " time, "), f"{rates.mean():.1f} %"
-            counts = f"+{gained} -{lost}"
-            rows.append([str(count), label, method, mean, seeds, counts, generations])
+def interval(values: np.ndarray) -> list[float]:
+    """Return the mean of independent values (n,) and the limits of its 95 % interval."""
+    mean, count = float(values.mean()), values.size
+    if count < 2:
+        return [mean]
+    half = values.std(ddof=1) / np.sqrt(count) * float(scipy.special.stdtrit(count - 1, 0.975))
+    return [mean, mean - half, mean + half]
+
+
+def table(results: xr.Dataset) -> list[list[Any]]:
+    """Return a row per number of parameters, budget and method."""
+    rows: list[list[Any]] = []
+    for count, budget in itertools.product(results["count"].values, results.budget.values):
+        of_count = results.sel(count=count)
+        start = of_count.start_success
+        if budget == results.budget.values[0]:
+            rows.append([str(count), "", "start", float(start.mean()), None, "", "", ""])
+        means = of_count.success.sel(budget=budget).mean("world")
+        for method in map(str, results.method.values):
+            chosen = of_count.sel(method=method)
+            values, ahead = means.sel(method=method).values, None
+            if method != FIRST and FIRST in means.method:
+                ahead = interval(means.sel(method=FIRST).values - values)
+            compared = [statistics.compare(start, x) for x in chosen.success.sel(budget=budget)]
+            gained, lost = (sum(getattr(c, x) for c in compared) for x in ("gained", "lost"))
+            seeds = ", ".join(f"{100 * x:.1f}" for x in values)
+            counts = f"+{gained} -{lost}", f"{float(chosen.generations.mean()):.0f}"
+            label = str(budget).replace(" ", " time, ")
+            rows.append([str(count), label, method, interval(values), ahead, seeds, *counts])
     return rows
+
+
+def draw(results: xr.Dataset) -> Figure:
+    """Return the success against the number of parameters, with a panel for each budget."""
+    sheet, axes = tiles(
+        results.sizes["budget"], 2, (3.5, 2.2), (0.0, 0.0), sharex=True, sharey=True
+    )
+    counts, means = results["count"].values, results.success.mean("world")
+    for ax, budget in zip(axes.ravel(), results.budget.values, strict=False):
+        ax.plot(counts, results.start_success.mean("world"), "k:", label="start")
+        for at, method in enumerate(results.method.values):
+            values = means.sel(budget=budget, method=method)
+            mean, *limits = np.transpose([interval(x) for x in values.values])
+            error = np.abs(np.array(limits) - mean) if limits else None
+            marks = {"marker": "o", "markersize": 3, "capsize": 2}
+            ax.errorbar(counts * 1.08**at, mean, error, label=method, **marks)
+        ax.set(xscale="log", xlabel="tuned parameters", ylabel="success", title=f"equal {budget}")
+        ax.grid(alpha=0.3)
+    axes[0, 0].legend()
+    return sheet
