@@ -5,10 +5,10 @@ some minutes; a second call continues it, up to these minutes. Runs with other s
 problems share the folder, so that a race can be split. The generation with the best validation
 within a budget is tested in worlds that no tuning has met.
 
-    rps sweeps/gradients/race.py --lanes 15 --minutes 1.5
+    rps sweeps/gradients/race.py --lanes 15 --minutes 1
 
-Several tunings run at once, each on a processor of its own with JAX_PLATFORMS=cpu, or share a GPU
-equally. Budgets of wall time are those of such a tuning.
+Several tunings run at once, each on one processor core, or share GPUs equally. Budgets of wall time
+are those of such a tuning. Seeds come first, so that the first tunings compile for all others.
 """
 
 from __future__ import annotations
@@ -217,9 +217,10 @@ def run_commands(commands: Mapping[Path, str], minutes: float, lanes: int, gpus:
 
     def run(folder: Path) -> None:
         lane, environment = free.get(), dict(os.environ, XLA_PYTHON_CLIENT_PREALLOCATE="false")
-        pinned = ["taskset", "--cpu-list", str(cores[lane % len(cores)])] if not gpus else []
-        if gpus:
-            environment["CUDA_VISIBLE_DEVICES"] = str(lane % gpus)
+        pinned = [] if gpus else ["taskset", "--cpu-list", str(cores[lane % len(cores)])]
+        environment |= (
+            {"CUDA_VISIBLE_DEVICES": str(lane % gpus)} if gpus else {"JAX_PLATFORMS": "cpu"}
+        )
         words = shlex.split(commands[folder])[1:]
         program = [*pinned, sys.executable, "-m", "rps_jax", *words, "--out", str(folder)]
         with open(folder.with_suffix(".log"), "a", encoding="utf-8") as log:

@@ -335,7 +335,7 @@ RECIPES: dict[str, Recipe] = {
     "gradients_mjx": recipe(f"rps sweeps/gradients/mjx.py {_MACHINE}", cores=6),
     "gradients_direction": recipe(f"rps sweeps/gradients/direction.py {_MACHINE}", cores=30),
     "gradients_race": recipe(
-        f"rps sweeps/gradients/race.py --lanes 15 --minutes 1.5 {_MACHINE}", cores=160
+        f"rps sweeps/gradients/race.py --lanes 15 --minutes 1 {_MACHINE}", cores=160
     ),
     "robot": recipe(f"rps sweeps/speed/robot.py {_MACHINE}", cores=1),
     "dependencies": recipe(f"rps sweeps/publish/dependencies.py {_MACHINE}", cores=15),
