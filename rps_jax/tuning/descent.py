@@ -182,7 +182,7 @@ class TuneGrad(Descent):
         windows, results, checked = 1.0, self.step_results(proposal), none
         if anchor == generation:
             results, checked = self._check(proposal, generation, score, followed.gradient)
-            if checked["slope"] >= 0:
+            if checked["slope"] <= 0:  # NaN without a check
                 tried, estimate = self.antithetic(vector, generation, self.worlds)
                 windows, followed = 0.0, estimate(*score([tried]))
         more = {"windows": windows, "moments": moments} | checked

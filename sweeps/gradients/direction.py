@@ -22,7 +22,7 @@ from rps_jax.runs.question import SimulationQuestion
 from rps_jax.tuning import gradients
 from rps_jax.tuning.descent import TuneGrad
 from rps_jax.tuning.evolution import Descent, TuneES
-from sweeps.gradients.race import COUNTS, interval, tuning
+from sweeps.gradients.race import COUNTS, interval
 from sweeps.study_base import Parts, Study, Table
 
 
@@ -59,11 +59,11 @@ class Direction(Study[xr.Dataset], SimulationQuestion[xr.Dataset]):
         return {n: partial(self._measure, n) for n in self.counts}
 
     def _measure(self, count: int) -> xr.Dataset:
-        options = tuning(count)
-        slopes, windows = partial(TuneES, estimator="antithetic", **options), TuneGrad
+        options: Any = COUNTS[count]
+        slopes = partial(TuneES, estimator="antithetic", **options)
         truth, error, _ = self._gradient(slopes(worlds=self.truth, setting=self._with_seed(0)))
         estimates = {
-            "derivatives": partial(windows, checks=0, **options),
+            "derivatives": partial(TuneGrad, checks=0, **options),
             "slopes": partial(slopes, worlds=128),
         }
         cosines, times = [], []

@@ -1,29 +1,21 @@
 """Race derivatives, slopes and evolution: equal simulated time and equal wall time.
 
-Each tuning is a run of `rps tune grad` or `rps tune es`, in a separate folder, and is killed after
-some minutes; a second call continues it, up to these minutes. Runs with other seeds, methods or
-problems share the folder, so that a race can be split. The generation with the best validation
-within a budget is tested in worlds that no tuning has met.
+All tunings of a problem run in lockstep: their trials form one batch. Each has a separate folder
+with its generations, so a killed race resumes. The generation with the best validation within a
+budget is tested in worlds that no tuning has met.
 
-    rps sweeps/gradients/race.py --lanes 15 --minutes 1
-
-Several tunings run at once, each on one processor core, or share GPUs equally. Budgets of wall time
-are those of such a tuning. Seeds come first, so that the first tunings compile for all others.
+rps sweeps/gradients/race.py
 """
 
 from __future__ import annotations
 
 import itertools
-import os
-import shlex
-import subprocess
-import sys
-from collections.abc import Mapping, Sequence
+import threading
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from queue import SimpleQueue
 from typing import Any, ClassVar
 
 import numpy as np
@@ -31,43 +23,118 @@ import pandas as pd
 import scipy
 import xarray as xr
 
-from rps_jax import InputError, RPSParams, Setting, errors, evaluate
+from rps_jax import RPSParams, Rules, Setting, errors, evaluate
 from rps_jax.analysis import statistics
 from rps_jax.analysis.figures.style import Figure, tiles
 from rps_jax.control import registry
 from rps_jax.questions import Picture, Run, call_of, option
+from rps_jax.runs.evaluate import Candidates, CandidateScores, score_candidates
 from rps_jax.runs.question import SimulationQuestion
+from rps_jax.trials.progress import Timing, no_progress
+from rps_jax.tuning.descent import TuneGrad
+from rps_jax.tuning.evolution import TuneES
+from rps_jax.tuning.run import Tuning
 from sweeps.study_base import Parts, Study, Table, part_name
 
 TABLES = "sweeps/gradients/tables.py"  # from the root of the repository
 # Options of tunings by the number of tuned parameters: those of RPS, or the entries of tables.
-COUNTS: dict[int, dict[str, tuple[str, ...]]] = {
+COUNTS: dict[int, dict[str, Any]] = {
     6: {"tuned": ("K_h", "K_v", "L", "beta", "l_cr", "d_th")},
     13: {"tuned": ("full",)},
-    **{
-        n: {"law": (f"{TABLES}:Table{n}",), "objects": ("random_cylinder",)}
-        for n in (64, 512, 2048)
-    },
-}
-_COMMON = "--horizon 150 --validation 96"
-_SLOPES = f"rps tune es --estimator antithetic {_COMMON} --worlds 128 --generations 16"
-_EVOLUTION = f"rps tune es {_COMMON} --worlds 32 --population 16 --generations 1000"
-METHODS = {  # commands that are compared
-    "derivatives": f"rps tune grad {_COMMON} --steps 20",
-    "slopes": _SLOPES,
-    "evolution": _EVOLUTION,
+    **{n: {"law": f"{TABLES}:Table{n}", "objects": ("random_cylinder",)} for n in (64, 512, 2048)},
 }
 FIRST = "derivatives"  # method with which the others are compared
 _LARGE = 500  # parameters from which evolution has a diagonal covariance
-QUICK_SIZES = (
-    " --objects random_cylinder --engine quasistatic --horizon 20 --validation 4 --worlds 4"
-)
-BUDGETS = ("wall", "simulated")
+_QUICK = {"worlds": 4, "validation": 4, "objects": ("random_cylinder",)}
+BUDGETS = ("simulated", "wall")
+
+
+class Lockstep:
+    """Batch of the trials of several tunings, each in a thread."""
+
+    def __init__(self, count: int) -> None:
+        """Wait for `count` tunings before each batch."""
+        self.count = count
+        self.device = threading.Lock()  # one tuning differentiates at a time
+        self.programs: dict[Callable[..., Any], Any] = {}  # of all tunings
+        self._waiting: list[tuple[Tuning, list[Candidates], list[Any]]] = []
+        self._changed = threading.Condition()
+
+    def score(self, question: Tuning, tried: list[Candidates]) -> tuple[Any, Timing]:
+        """Return the scores of candidates, once all tunings ask for some.
+
+        A tuning has the share of the wall clock that its trials have of the simulated time.
+        """
+        answer: list[Any] = []
+        with self._changed:
+            self._waiting.append((question, tried, answer))
+            self._run()
+            self._changed.wait_for(lambda: bool(answer))
+        if isinstance(answer[0], BaseException):
+            raise RuntimeError("the batch of all tunings failed") from answer[0]
+        return answer[0]
+
+    def leave(self) -> None:
+        """Wait for a tuning less."""
+        with self._changed:
+            self.count -= 1
+            self._run()
+
+    def _run(self) -> None:
+        if not self._waiting or len(self._waiting) < self.count:
+            return
+        waiting, self._waiting = self._waiting, []
+        requests = [x for _, tried, _ in waiting for x in tried]
+        question, *_ = (question for question, _, _ in waiting)
+        try:
+            scores, timing = score_candidates(requests, question.setting, question.objective)
+            for _, tried, answer in waiting:
+                own, scores = scores[: len(tried)], scores[len(tried) :]
+                time = sum(float(np.sum(x.outcome.time)) for x in own)
+                share = time / max(timing.simulated, 1e-9)
+                answer.append((own, Timing(timing.compile * share, timing.run * share, time)))
+        except BaseException as error:
+            for _, _, answer in waiting:
+                answer.append(error)
+        self._changed.notify_all()
+
+
+class _Paced(Tuning):
+    """Tuning in lockstep with others."""
+
+    pool: ClassVar[Lockstep]
+
+    def _score(self, tried: list[Candidates], run: Run) -> tuple[list[CandidateScores], Timing]:
+        return self.pool.score(self, tried)
+
+    def _test(self, best: np.ndarray, run: Run) -> xr.Dataset:
+        return xr.Dataset()
+
+
+class _Grad(_Paced, TuneGrad):
+    @property
+    def _programs(self) -> dict[Callable[..., Any], Any]:
+        return self.pool.programs
+
+    def _call(self, *inputs: Any) -> Any:
+        with self.pool.device:
+            return super()._call(*inputs)
+
+
+class _ES(_Paced, TuneES):
+    pass
+
+
+METHODS: dict[str, tuple[type[Tuning], dict[str, Any]]] = {
+    "derivatives": (_Grad, {"steps": 16}),
+    "slopes": (_ES, {"estimator": "antithetic", "worlds": 128, "generations": 10}),
+    "evolution": (_ES, {"worlds": 32, "population": 16, "generations": 1000}),
+}
 
 
 @dataclass(frozen=True)
 class Race(Study[xr.Dataset], SimulationQuestion[xr.Dataset]):
-    """Race derivatives, slopes and evolution: equal wall time and equal simulated time.
+    """Race derivatives, slopes and evolution: equal simulated time and equal wall time.
 
     The answer has the `success` (count, seed, method, budget, world) of the tuned laws in test
     worlds, and that of the law at the start, `start_success` (count, world). Budgets are `wall` or
@@ -82,30 +149,27 @@ class Race(Study[xr.Dataset], SimulationQuestion[xr.Dataset]):
         "counts": (64,),
         "seeds": (1,),
         "methods": ("derivatives",),
+        "simulated": (100.0,),
+        "setting.engine": "quasistatic",
+        "setting.rules": Rules(horizon=20.0),
     }
-    IGNORED_FIELDS: ClassVar[tuple[str, ...]] = ("minutes", "lanes", "gpus")
     DIMENSION: ClassVar[str] = "count"
     REPORTS_TIMES: ClassVar[bool] = True
 
     methods: tuple[str, ...] = tuple(METHODS)
     """derivatives (`rps tune grad`), slopes (antithetic steps in whole trials) or evolution."""
-    counts: tuple[int, ...] = (6, 13, 64, 512, 2048)
+    counts: tuple[int, ...] = tuple(COUNTS)
     """Numbers of tuned parameters: 6 and 13 of RPS, or the 64, 512 and 2,048 entries of tables."""
     seeds: tuple[int, ...] = (1, 2, 3, 4, 5, 6, 7)
     """Seeds of the tunings."""
-    minutes: float = option(4.0, above=0, at_most=1e4, unit="min")
-    """Wall clock after which a tuning is killed [min], with compilation."""
+    simulated: tuple[float, ...] = option((1e5, 3e5), above=0, unit="s")
+    """Budgets of simulated time [s]; a differentiated second counts as four. After the largest no
+    generation starts."""
     wall: tuple[float, ...] = option((10.0, 30.0), above=0, unit="s")
     """Budgets of wall time without compilation [s]."""
-    simulated: tuple[float, ...] = option((1e5, 4e5), above=0, unit="s")
-    """Budgets of simulated time [s]; a differentiated second counts as four."""
-    worlds: int = option(1000, 1, 1_000_000)
+    worlds: int = option(400, 1, 1_000_000)
     """Number of test worlds of `wide`."""
-    lanes: int = option(1, 1, 64)
-    """Number of tunings that run at once."""
-    gpus: int = option(0, 0, 8)
-    """Number of GPUs for the tunings; with 0 each has a processor core."""
-    setting: Setting = field(default=Setting(), kw_only=True)
+    setting: Setting = field(default=Setting(rules=Rules(horizon=150.0)), kw_only=True)
     out: Path | str | None = field(default="runs/race", kw_only=True)
     """Run folder; the tunings have folders there."""
 
@@ -114,38 +178,39 @@ class Race(Study[xr.Dataset], SimulationQuestion[xr.Dataset]):
         for count in self.counts:
             errors.check_name("count", str(count), [str(x) for x in COUNTS])
 
-    def configuration(self) -> dict[str, Any]:
-        """Return all inputs of the answer, with the commands of the tunings."""
-        commands = {name: METHODS[name] for name in self.methods}
-        return super().configuration() | {"commands": commands}
-
-    def tunings(self) -> dict[tuple[int, int, str], str]:
-        """Return the commands of the tunings by seed, count and method."""
-        labels = itertools.product(self.seeds, self.counts, self.methods)
-        sizes = QUICK_SIZES if self.quick else ""
-        return {(s, n, m): f"{command(m, n)} --seed {s}{sizes}" for s, n, m in labels}
-
-    def answer(self, run: Run) -> xr.Dataset:
-        """Run the tunings of the counts that lack a test, and test all."""
-        assert run.folder is not None
-        stored = () if run.checkpoints is None else run.checkpoints.paths()
-        commands = {
-            run.folder / part_name(*label): command
-            for label, command in self.tunings().items()
-            if part_name(label[1]) not in stored
-        }
-        run_commands(commands, self.minutes, self.lanes, self.gpus)
-        return super().answer(run)
-
     def parts(self, run: Run) -> Parts:
-        """Return the test of the tunings of each count."""
-        folder = run.folder or Path(str(self.out))
-        return {n: partial(self._test, folder, n) for n in self.counts}
+        """Return the function that runs and tests the tunings of each count."""
+        return {
+            n: partial(self._compete, run.folder or Path(str(self.out)), n) for n in self.counts
+        }
 
-    def _test(self, folder: Path, count: int) -> xr.Dataset:
-        """Return the success of the best laws of all tunings of a count within each budget."""
-        labels = itertools.product(self.seeds, (count,), self.methods)
-        curves = [read_curve(folder / part_name(*label)) for label in labels]
+    def tuning(self, seed: int, count: int, method: str) -> Tuning:
+        """Return a tuning of the race."""
+        kind, options = METHODS[method]
+        diagonal = {"estimator": "sep_cma"} if method == "evolution" and count >= _LARGE else {}
+        sizes = _QUICK if self.quick else {}
+        limits = {"validation": 64, "budget": max(self.simulated)}
+        setting = replace(self.setting, seed=seed)
+        return kind(**{**COUNTS[count], **limits, **options, **diagonal, **sizes}, setting=setting)
+
+    def _compete(self, folder: Path, count: int) -> xr.Dataset:
+        """Run the tunings of a count, and test their best laws within each budget."""
+        labels = list(itertools.product(self.seeds, (count,), self.methods))
+        pool = Lockstep(len(labels))
+
+        def run(label: tuple[int, int, str]) -> pd.DataFrame:
+            at = folder / part_name(*label)
+            at.mkdir(exist_ok=True)
+            try:
+                question = self.tuning(*label)
+                object.__setattr__(question, "pool", pool)
+                question.answer(Run(at, no_progress))
+                return pd.read_csv(at / "curve.csv")
+            finally:
+                pool.leave()
+
+        with ThreadPoolExecutor(len(labels)) as threads:
+            curves = list(threads.map(run, labels))
         budgets = [(name, amount) for name in BUDGETS for amount in getattr(self, name)]
         start, domain = problem(count)
         chosen = [law_of(best_within(x, *y), start) for x in curves for y in budgets]
@@ -198,53 +263,6 @@ class Race(Study[xr.Dataset], SimulationQuestion[xr.Dataset]):
 race = call_of(Race)
 
 
-def command(method: str, count: int) -> str:
-    """Return the command of a method for a number of parameters."""
-    diagonal = " --estimator sep_cma" if method == "evolution" and count >= _LARGE else ""
-    flags = (f"--{name} {' '.join(values)}" for name, values in COUNTS[count].items())
-    return " ".join([f"{METHODS[method]}{diagonal}", *flags])
-
-
-def run_commands(commands: Mapping[Path, str], minutes: float, lanes: int, gpus: int) -> None:
-    """Run or continue the command of each folder until it ends or its time is up.
-
-    So many `lanes` run at once. They share the GPUs; with 0 GPUs each has a processor core.
-    Each writes to the folder and to a log beside it.
-    """
-    free, cores = SimpleQueue[int](), sorted(os.sched_getaffinity(0))
-    for lane in range(lanes):
-        free.put(lane)
-
-    def run(folder: Path) -> None:
-        lane, environment = free.get(), dict(os.environ, XLA_PYTHON_CLIENT_PREALLOCATE="false")
-        pinned = [] if gpus else ["taskset", "--cpu-list", str(cores[lane % len(cores)])]
-        environment |= (
-            {"CUDA_VISIBLE_DEVICES": str(lane % gpus)} if gpus else {"JAX_PLATFORMS": "cpu"}
-        )
-        words = shlex.split(commands[folder])[1:]
-        program = [*pinned, sys.executable, "-m", "rps_jax", *words, "--out", str(folder)]
-        with open(folder.with_suffix(".log"), "a", encoding="utf-8") as log:
-            process = subprocess.Popen(program, env=environment, stdout=log, stderr=log)
-            try:
-                process.wait(60 * minutes)
-            except subprocess.TimeoutExpired:
-                process.kill()
-                process.wait()
-        free.put(lane)
-
-    with ThreadPoolExecutor(lanes) as pool:
-        for future in [pool.submit(run, folder) for folder in commands]:
-            future.result()
-
-
-def read_curve(folder: Path) -> pd.DataFrame:
-    """Return the generations of a tuning, or raise InputError."""
-    if not (folder / "curve.csv").exists():
-        reason = f"{folder.with_suffix('.log')} tells why; or raise minutes"
-        raise InputError(f"{folder} has no generation: {reason}.")
-    return pd.read_csv(folder / "curve.csv")
-
-
 def spent(curve: pd.DataFrame, budget: str) -> pd.Series:
     """Return what each generation of a log has used of a budget, with all before it [s]."""
     return pd.Series(curve["run" if budget == "wall" else "simulated"]).cumsum()
@@ -258,14 +276,9 @@ def best_within(curve: pd.DataFrame, budget: str, amount: float) -> pd.Series:
 
 def problem(count: int) -> tuple[Any, str]:
     """Return the law at the start and the domain of the test worlds of a problem."""
-    _, start = registry.parse_law(tuning(count).get("law", "rps"))
+    _, start = registry.parse_law(COUNTS[count].get("law", "rps"))
     objects = COUNTS[count].get("objects", ())
     return start, ",".join(["wide", *(f"objects={name}" for name in objects)])
-
-
-def tuning(count: int) -> dict[str, Any]:
-    """Return the options of a tuning in Python."""
-    return {k: values[0] if k == "law" else values for k, values in COUNTS[count].items()}
 
 
 def law_of(row: pd.Series, start: Any = RPSParams.paper()) -> Any:
