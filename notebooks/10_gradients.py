@@ -145,4 +145,4 @@ print(f"median error {np.median(error):.4f}, in {np.sum(error < 2 * precision**-
 # [The race](../sweeps/gradients/README.md) compares it with these slopes alone and with evolution.
 # Success in held-out worlds after equal simulated time, by number of tuned parameters:
 #
-RACE_CELLS
+# RACE_CELLS

@@ -129,6 +129,5 @@ def drive_table(results: xr.Dataset, max_lost: float) -> Rows:
         times = trials.time.values[success]
         quantiles = [f"{x:.0f} s" for x in np.quantile(times, (0.5, 0.95))] if times.size else "--"
         cells = f"{np.median(lost):.0f} s", str(int(np.count_nonzero(lost > max_lost)))
-        share = tables.share(int(success.sum()), success.size)
-        rows.append([domain, base, share, change, *quantiles, *cells])
+        rows.append([domain, base, tables.rate(success), change, *quantiles, *cells])
     return rows
