@@ -64,9 +64,10 @@ class TuneGrad(Descent):
 
     A step follows the derivatives of windows of some seconds, which start at states of trials of
     the original law; a value function, fitted to these trials, counts what follows a window. After
-    `window_steps` steps, or once the score of whole trials does not fall along the derivatives, a
-    step follows slopes along random steps, as `rps tune es --estimator antithetic` does. The
-    generation with the best validation in trials of the original law is the answer.
+    `window_steps` steps, or once the score of whole trials does not fall along the derivatives, the
+    run goes on from the best vector by slopes along random steps, as `rps tune es --estimator
+    antithetic` does. The generation with the best validation in trials of the original law is the
+    answer.
 
     The answer is that of `TuneES`, with a step as a generation. Its `slope` (generation) is the
     change of the score of whole trials for a unit step along the derivatives, with its
@@ -182,9 +183,7 @@ class TuneGrad(Descent):
         windows, results, checked = 1.0, self.step_results(proposal), none
         if anchor == generation:
             results, checked = self._check(proposal, generation, score, followed.gradient)
-            if checked["slope"] <= 0:  # NaN without a check
-                tried, estimate = self.antithetic(vector, generation, self.worlds)
-                windows, followed = 0.0, estimate(*score([tried]))
+            windows = float(not checked["slope"] <= 0)  # NaN without a check
         more = {"windows": windows, "moments": moments} | checked
         return {**results, **gradient_results(followed), **more, **times}
 

@@ -97,8 +97,9 @@ class Descent(Tuning):
     ) -> Search:
         """Search by steps of an optimiser along the `gradients` of the results.
 
-        The arrays of `windows` are those of `TuneGrad`, and come back with the results. The steps
-        after those by windows start at the vector with the best validation.
+        The arrays of `windows` are those of `TuneGrad`, and come back with the results. After
+        `window_steps`, or once the results drop windows, slopes start at the vector with the best
+        validation.
         """
         vector, state, base = self.base, rule.init(jnp.asarray(self.base)), np.array(np.nan)
         best, least = vector, np.inf
@@ -107,11 +108,12 @@ class Descent(Tuning):
             base, vector = results["base"], results["vectors"][0]
             if results["validation"] < least:
                 best, least = vector, float(results["validation"])
+            was_windows = bool(windows and windows["windows"])
             slopes = jnp.nan_to_num(jnp.asarray(results["gradients"][0]), posinf=0.0, neginf=0.0)
             change, state = rule.update(slopes, state, jnp.asarray(vector))
             vector = vector + np.asarray(change)
             windows = {name: results[name] for name in windows}
-            if following == window_steps and windows["windows"]:
+            if was_windows and (following == window_steps or not windows["windows"]):
                 windows, vector = windows | {"windows": np.array(0.0)}, best
             if windows and following % refresh == 0:
                 windows = windows | {"anchors": vector[None]}

@@ -196,24 +196,29 @@ class Race(Study[xr.Dataset], SimulationQuestion[xr.Dataset]):
     def _compete(self, folder: Path, count: int) -> xr.Dataset:
         """Run the tunings of a count, and test their best laws within each budget."""
         labels = list(itertools.product(self.seeds, (count,), self.methods))
+        folders = [folder / part_name(*label) for label in labels]
         pool = Lockstep(len(labels))
 
-        def run(label: tuple[int, int, str]) -> pd.DataFrame:
-            at = folder / part_name(*label)
-            at.mkdir(exist_ok=True)
+        def run(question: Tuning, at: Path) -> pd.DataFrame:
             try:
-                question = self.tuning(*label)
-                object.__setattr__(question, "pool", pool)
                 question.answer(Run(at, no_progress))
                 return pd.read_csv(at / "curve.csv")
             finally:
                 pool.leave()
 
+        questions = [self.tuning(*label) for label in labels]
+        for question, at in zip(questions, folders, strict=True):
+            object.__setattr__(question, "pool", pool)
+            at.mkdir(exist_ok=True)
         with ThreadPoolExecutor(len(labels)) as threads:
-            curves = list(threads.map(run, labels))
+            curves = list(threads.map(run, questions, folders))
         budgets = [(name, amount) for name in BUDGETS for amount in getattr(self, name)]
         start, domain = problem(count)
-        chosen = [law_of(best_within(x, *y), start) for x in curves for y in budgets]
+        best = [best_within(x, *y) for x in curves for y in budgets]
+        columns = [x for x in best[0].index if x.startswith("params.")]
+        values = np.array([row[columns] for row in best], float)
+        _, firsts, inverse = np.unique(values, axis=0, return_index=True, return_inverse=True)
+        chosen = [law_of(best[at], start) for at in firsts]
         options = {"split": "test", "setting": self.setting, "progress": False}
         scores = evaluate([start, *chosen], domain, self.worlds, **options)
         start_success, *tuned = scores.success.values.astype(np.int8)
@@ -224,7 +229,7 @@ class Race(Study[xr.Dataset], SimulationQuestion[xr.Dataset]):
             **{name: [float(spent(x, name).iloc[-1]) for x in curves] for name in BUDGETS},
         }
         variables = {name: (dims, np.reshape(x, shape)) for name, x in by_tuning.items()}
-        success = np.reshape(tuned, (*shape, len(budgets), -1))
+        success = np.array(tuned)[inverse.ravel()].reshape(*shape, len(budgets), -1)
         names = [f"{name} {amount:g} s" for name, amount in budgets]
         return xr.Dataset(
             variables
