@@ -334,9 +334,7 @@ RECIPES: dict[str, Recipe] = {
     "replans": recipe(f"rps sweeps/planning {_MACHINE}", cores=15),
     "gradients_mjx": recipe(f"rps sweeps/gradients/mjx.py {_MACHINE}", cores=6),
     "gradients_direction": recipe(f"rps sweeps/gradients/direction.py {_MACHINE}", cores=30),
-    "gradients_race": recipe(
-        f"rps sweeps/gradients/race.py --lanes 15 --minutes 1 {_MACHINE}", cores=160
-    ),
+    "gradients_race": recipe(f"rps sweeps/gradients/race.py {_MACHINE}", cores=160),
     "robot": recipe(f"rps sweeps/speed/robot.py {_MACHINE}", cores=1),
     "dependencies": recipe(f"rps sweeps/publish/dependencies.py {_MACHINE}", cores=15),
     "extras": recipe(f"rps sweeps/publish/dependencies.py {_MACHINE}", cores=15),
@@ -410,6 +408,12 @@ RECIPES: dict[str, Recipe] = {
     # After the installation of the third-party engines: see `speed/arena.py`.
     "arena": recipe(f"rps sweeps/speed/arena.py --peers peers {_MACHINE}", gpu=5),
     "derivatives": recipe(f"rps sweeps/speed/derivatives.py {_MACHINE}", cores=2),
+    "environments": recipe(f"rps sweeps/speed/environments.py --worlds 64 {_MACHINE}", cores=3),
+    "environments_gpu": recipe(
+        "rps sweeps/speed/environments.py --worlds 4096 --programs 'raw MJX' fused "
+        f"--file environments_gpu {_MACHINE}",
+        gpu=2,
+    ),
     "derivatives_gpu": recipe(
         f"rps sweeps/speed/derivatives.py --worlds 4096 --file derivatives_gpu {_MACHINE}", gpu=2
     ),
