@@ -410,9 +410,7 @@ RECIPES: dict[str, Recipe] = {
     "derivatives": recipe(f"rps sweeps/speed/derivatives.py {_MACHINE}", cores=2),
     "environments": recipe(f"rps sweeps/speed/environments.py --worlds 64 {_MACHINE}", cores=3),
     "environments_gpu": recipe(
-        "rps sweeps/speed/environments.py --worlds 4096 --programs 'raw MJX' fused "
-        f"--file environments_gpu {_MACHINE}",
-        gpu=2,
+        f"rps sweeps/speed/environments.py --worlds 4096 --file environments_gpu {_MACHINE}", gpu=2
     ),
     "derivatives_gpu": recipe(
         f"rps sweeps/speed/derivatives.py --worlds 4096 --file derivatives_gpu {_MACHINE}", gpu=2
