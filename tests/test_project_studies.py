@@ -20,9 +20,8 @@ STUDIES = sorted(path.parent for path in SWEEPS.glob("*/study.py"))
 
 # Options of studies whose value is none of their choices.
 UNKNOWN = [
-    "gradients --objects box",
-    "gradients --estimators backward",
-    "gradients --tuned v_max",
+    "gradients/race.py --methods newton",
+    "gradients/race.py --counts 7",
     "landscape --domain wyde",
     "engines --domain wyde",
     "random_worlds --domains wyde",
@@ -40,7 +39,6 @@ UNKNOWN = [
     "planning --methods newton",
 ]
 REFUSED = [
-    ("gradients --horizons 2 1", r"horizons = \(2\.0, 1\.0\) is not allowed"),
     ("landscape --laws rps,tund.json", r"tund\.json cannot be read"),
     ("landscape --laws pursuit", "law = pursuit is not allowed"),
     ("speed --families cone", "cone"),
