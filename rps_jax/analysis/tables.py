@@ -81,6 +81,9 @@ def summary(results: xr.Dataset) -> str:
     return "\n".join(lines)
 
 
+_MEDIANS = {"time", "path_length", "repositions", "contact_lost_time", "contact_lost_path"}
+
+
 def success_table(results: xr.Dataset, max_lost: float) -> list[list[str]]:
     """Return a row for each law: success by object, distance left, time, path and failures.
 
@@ -93,13 +96,18 @@ def success_table(results: xr.Dataset, max_lost: float) -> list[list[str]]:
     laws = results.sizes["law"]
     bound = "fails at most" + f" (best of {laws})" * (laws > 1)
     header = ["", *groups, "all", bound, "CVaR 5 % of distance"]
-    header += ["median time", "median path", *modes]
+    medians = {"time": "{time:.1f} s", "path": "{path_length:.2f} m"}
+    if "repositions" in results and results.repositions.values.any():
+        way = "{repositions:g}, {contact_lost_time:.1f} s, {contact_lost_path:.2f} m"
+        medians["repositions, time and path without contact"] = way
+    header += [*(f"median {text}" for text in medians), *modes]
     rows = [header]
     for law in map(str, results.law.values):
         trials = results.sel(law=law)
         success = trials.success.values > 0
         mode_index = statistics.failure_modes(trials, max_lost)
         failures = int((~success).sum())
+        middle = {name: np.median(trials[name].values[success]) for name in _MEDIANS & set(trials)}
         rows.append(
             [
                 law,
@@ -107,8 +115,7 @@ def success_table(results: xr.Dataset, max_lost: float) -> list[list[str]]:
                 _rate(success),
                 _at_most(statistics.fails_at_most(failures, success.size, laws)),
                 _cvar(statistics.distance_left(trials)),
-                f"{np.median(trials.time.values[success]):.1f} s" if success.any() else "-",
-                f"{np.median(trials.path_length.values[success]):.2f} m" if success.any() else "-",
+                *(text.format_map(middle) if success.any() else "-" for text in medians.values()),
                 *(str(int((mode_index == statistics.modes().index(mode)).sum())) for mode in modes),
             ]
         )
