@@ -27,8 +27,7 @@ import xarray as xr
 
 from rps_jax import errors
 from rps_jax.analysis import statistics, tables
-from rps_jax.control.laws import unicycle
-from rps_jax.control.laws.guided import KNOTS, Guided, GuidedParams, GuidedUnicycleParams
+from rps_jax.control.laws.guided import KNOTS, unplanned
 from rps_jax.questions import Plan, Run, Section, call_of, option
 from rps_jax.record import files
 from rps_jax.record.files import JsonObject
@@ -40,7 +39,6 @@ from rps_jax.trials.batch_run import Candidates, outcomes
 from rps_jax.trials.progress import SequentialProgress
 from rps_jax.trials.results import labelled
 from rps_jax.trials.trial import Outcome
-from rps_jax.world.domain import Domain
 
 
 @dataclass(frozen=True)
@@ -116,9 +114,9 @@ class Ceiling(DomainQuestion[xr.Dataset]):
         count = int(self.world_indices.max(initial=0)) + 1
         if self.run is None:
             setting = replace(self.setting, split="test")
-            return Plan(self.ranges, count, {"guided": guided(self.ranges)}, setting)
+            return Plan(self.ranges, count, {"guided": unplanned(self.ranges.robot.drive)}, setting)
         sweep = load_plan(Path(self.run))
-        law = {"guided": guided(sweep.domain)}
+        law = {"guided": unplanned(sweep.domain.robot.drive)}
         return Plan(sweep.domain, count, law, sweep.setting, points=sweep.points)
 
     def check(self) -> None:
@@ -249,15 +247,6 @@ class Ceiling(DomainQuestion[xr.Dataset]):
 _SEARCH_OPTIONS = ("samples", "rounds", "window", "spread", "temperature", "hold")
 
 ceiling = call_of(Ceiling)
-
-
-def guided(domain: Domain) -> Guided:
-    """Return the law without a plan for the robot of a domain."""
-    if (drive := domain.robot.drive) == "omni":
-        return GuidedParams()
-    return GuidedUnicycleParams(
-        unicycle.PRESETS.get(f"unicycle_{drive}", unicycle.UnicycleParams())
-    )
 
 
 def _initial_state(worlds: np.ndarray) -> xr.Dataset:

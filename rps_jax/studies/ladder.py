@@ -283,7 +283,7 @@ def draw_ladder(results: xr.Dataset) -> Figure:
         index, rate = kinds.index(senses[law]), 100 * counts[law] / total
         low, high = statistics.wilson(counts[law], total)
         ax.plot([100 * low, 100 * high], [y, y], color=f"C{index}", lw=3, alpha=0.4)
-        fill = "none" if drives[law].count(" ") else "full"
+        fill = "none" if " " in str(drives[law]) else "full"
         ax.plot(rate, y, _MARKS[index], color=f"C{index}", fillstyle=fill)
         ax.annotate(tables.percent(counts[law], total), (rate, y), **above)
     for kind in sorted(set(senses.values()), key=kinds.index):

@@ -96,12 +96,7 @@ class Setting:
             rule = f"the period of the robot is {robot.period:g} s: leave it out"
             period = f"{self.physics.control_period:g} s"
             raise errors.not_allowed("control_period", period, rule)
-        physics: Any = vars(self)["physics"]
-        if isinstance(physics, str):  # whose other options depend on the fidelity
-            physics += f",control_period={robot.period}"
-        else:
-            physics = replace(physics, control_period=robot.period)
-        return replace(self, physics=physics)
+        return replace(self, physics=replace(self.physics, control_period=robot.period))
 
     @property
     def simulator(self) -> Engine:

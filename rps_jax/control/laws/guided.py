@@ -25,6 +25,7 @@ from rps_jax.control.laws.rps import RPSParams, RPSState
 from rps_jax.control.laws.unicycle import UnicycleParams, UnicycleState
 from rps_jax.control.observation import Details, Observation, Twist
 from rps_jax.geometry.arrays import Number, Parameter
+from rps_jax.robot.robot import DriveKind
 from rps_jax.spec import Spec, document
 
 KNOTS = 60  # default number of offsets
@@ -63,6 +64,12 @@ class GuidedUnicycleParams(NamedTuple):
 
 
 Guided = GuidedParams | GuidedUnicycleParams
+
+
+def unplanned(drive: DriveKind) -> Guided:
+    """Return the parameters without a plan for bases with a drive."""
+    known = unicycle.PRESETS | {"unicycle_differential": UnicycleParams()}
+    return GuidedParams() if drive == "omni" else GuidedUnicycleParams(known[f"unicycle_{drive}"])
 
 
 class GuidedState(NamedTuple):
