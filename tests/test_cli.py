@@ -332,10 +332,10 @@ def test_an_interrupt_during_garbage_collection_is_raised_again(capsys):
     def action():
         gc.callbacks.append(swallowed)
         gc.collect()
-        for _ in range(500):
+        for _ in range(2000):
             time.sleep(0.01)
 
     start_time = time.monotonic()
     assert running.exit_code(action) == 130
-    assert time.monotonic() - start_time < 4
+    assert time.monotonic() - start_time < 15
     assert capsys.readouterr().err.endswith("rps: interrupted.\n")

@@ -353,23 +353,31 @@ class BagQuestion(Question[T]):
 
 
 @dataclass(frozen=True, kw_only=True)
-class TrialQuestion(Question[T]):
-    """Base class of questions that run trials."""
+class QuickQuestion(Question[T]):
+    """Base class of questions that have a small run."""
 
-    slots: int | None = option(None, 1, 10_000_000, kw_only=True)
-    """Number of worlds that one worker steps at once; by default as suits engine and device."""
-    workers: int | None = option(None, 1, 1024, kw_only=True)
-    """Number of host threads that step worlds; by default as suits engine and device."""
     quick: bool = False
     """Whether to make a small run of minutes on two cores; explicit options keep their values."""
 
-    IGNORED_FIELDS: ClassVar[tuple[str, ...]] = ("slots", "workers", "quick")
+    IGNORED_FIELDS = ("quick",)
 
     def with_quick_values(self) -> Self:
         return quick_command(self) if self.quick else self
 
     def quick_note(self) -> str:
         return quick_note(self) if self.quick else ""
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrialQuestion(QuickQuestion[T]):
+    """Base class of questions that run trials."""
+
+    slots: int | None = option(None, 1, 10_000_000, kw_only=True)
+    """Number of worlds that one worker steps at once; by default as suits engine and device."""
+    workers: int | None = option(None, 1, 1024, kw_only=True)
+    """Number of host threads that step worlds; by default as suits engine and device."""
+
+    IGNORED_FIELDS = ("slots", "workers")
 
     def create_run(self, out: Path | None, callback: ProgressCallback) -> Run:
         return Run(out, callback, self.slots, self.workers)

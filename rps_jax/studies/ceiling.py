@@ -15,7 +15,7 @@ can be solved; a failure after all rounds proves nothing.
 """
 
 import functools
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -59,7 +59,7 @@ class Ceiling(DomainQuestion[xr.Dataset]):
     """
 
     TITLE = "Ceiling"
-    QUICK: ClassVar[Mapping[str, object]] = {"sample": 2, "most": 2, "samples": 12, "rounds": 3}
+    QUICK: ClassVar = {"sample": 2, "most": 2, "samples": 12, "rounds": 3}
 
     run: str | Path | None = option(None, positional=True)
     """Run folder of a sweep or a ladder that gives domain, worlds and setting."""

@@ -8,12 +8,11 @@ seed is one that no tuner uses.
 import dataclasses
 import re
 import textwrap
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from typing import Any, ClassVar, get_args
 
-import numpy as np
 import xarray as xr
 
 from rps_jax import Domain, InputError, errors
@@ -81,7 +80,7 @@ class Ladder(SweepOptions, TaskOption, MultiLawQuestion[xr.Dataset | xr.DataTree
     """
 
     TITLE = "Laws in the same worlds"
-    QUICK: ClassVar[Mapping[str, Any]] = {"worlds": 64, "domain": ("wide,objects=random_box",)}
+    QUICK: ClassVar = {"worlds": 64, "domain": ("wide,objects=random_box",)}
 
     laws: LawsLike = ()
     """The laws, by default all laws of the package that the robot can follow: names, as rps,
@@ -243,14 +242,13 @@ score = call_of(Score)
 def score_row(sweep: Sweep, results: xr.Dataset, seed: int) -> Rows:
     """Return a header and the row of the first law: rates of all laws, median time and worlds."""
     successes = results.success.values > 0
-    rates = [tables.share(int(success.sum()), success.size) for success in successes]
+    first, *rates = map(tables.rate, successes)
     law, *rest = map(str, results.law.values)
-    times = results.time.values[0][successes[0]]
-    median = f"{np.median(times):.1f} s" if times.size else "-"
+    median = tables.median(results.time.values[0][successes[0]])
     source = f"seed {seed}" if sweep.points is None else "given points"
     worlds = f"{successes.shape[1]:,} test worlds of {sweep.worlds_in_words}, {source}"
     header = ["law", "success", "median time", *rest, "worlds"]
-    return [header, [law, rates[0], median, *rates[1:], f"{worlds}, {sweep.setting.engine}"]]
+    return [header, [law, first, median, *rates, f"{worlds}, {sweep.setting.engine}"]]
 
 
 def _comparison(results: xr.Dataset) -> list[Section]:

@@ -88,7 +88,7 @@ class Fitted:
     @styled
     def plot(self) -> Figure:
         """Draw each quantity's posterior and prior; pale if undetermined."""
-        names = list(map(str, self.data.quantity.values))
+        names = self.data.quantity.values.tolist()
         figure, axes = tiles(len(names), 4, (WIDTH / 4, 1.25), (0, 0.4))
         for ax, name in zip(axes.ravel(), names, strict=False):
             column = self.data.sel(quantity=name)
@@ -136,7 +136,7 @@ class Fit(LawQuestion[Fitted], DomainQuestion[Fitted], LogsQuestion):
     """
 
     TITLE = "A domain fitted to logs"
-    QUICK: ClassVar[Mapping[str, Any]] = {"worlds": 768, "window": 20.0}
+    QUICK: ClassVar = {"worlds": 768, "window": 20.0}
     # The values of the logs matter.
     IGNORED_FIELDS = ("logs", "topics", "columns")
 
@@ -480,7 +480,7 @@ def table(data: xr.Dataset) -> Rows:
 def correlations(data: xr.Dataset) -> Rows:
     """Return a header and the pairs of quantities that the logs determine only in combination."""
     correlation = data.correlation.values
-    names = [str(q) for q in data.quantity.values]
+    names = data.quantity.values.tolist()
     pairs = [
         (i, j)
         for i, j in np.argwhere(np.tril(abs(correlation), -1) > 0.5)

@@ -72,7 +72,7 @@ class Tuning(TaskOption, LawQuestion[xr.Dataset]):
 
     IGNORED_FIELDS = ("budget", "generations", "task")
     REPORTS_TIMES = True
-    QUICK: ClassVar[dict[str, Any]] = {
+    QUICK: ClassVar = {
         # The few parameters that matter most, since few trials cannot determine more; cylinders on
         # the quasi-static model, which compile and run fastest.
         "tuned": ("K_h", "K_v", "l_cr", "d_th"),

@@ -137,6 +137,5 @@ def drive_table(results: xr.Dataset, max_lost: float) -> Rows:
         quantiles = [f"{x:.0f} s" for x in np.quantile(times, (0.5, 0.95))] if times.size else "--"
         cells = [f"{float(trials.repositions.mean()):.1f}", f"{np.median(lost):.0f} s"]
         cells.append(str(int(np.count_nonzero(lost > max_lost))))
-        share = tables.share(int(success.sum()), success.size)
-        rows.append([domain, base, share, change, *quantiles, *cells])
+        rows.append([domain, base, tables.rate(success), change, *quantiles, *cells])
     return rows

@@ -32,7 +32,6 @@ from rps_jax.app.export import c, folder, onnx_model, program
 from rps_jax.app.export.program import Program
 from rps_jax.control import validation
 from rps_jax.laws import law_of, resolve_law
-from rps_jax.lowering.routine import Group
 
 Precision = Literal["float", "double"]
 Result = tuple[np.ndarray, np.ndarray]  # twists (n, 3) and memories (n,) of steps
@@ -78,7 +77,7 @@ class Structs:
         self.program, self.real = exported, REAL[form]
         self.dtypes = {name: self._dtype(group) for name, group in exported.groups.items()}
 
-    def _dtype(self, group: Group) -> np.dtype:
+    def _dtype(self, group: Sequence[Any]) -> np.dtype:
         kinds = {"f": self.real, "i": np.int32, "b": np.int32}
         fields: list[Any] = [
             (field.name, kinds[field.kind], field.shape) for field in group if field.size

@@ -447,5 +447,5 @@ RECIPES: dict[str, Recipe] = {
 # Files of old versions, which are not computed again.
 HISTORY = {
     "tuning_runs": "the runs of 0.1.0 and 0.2.0 that tuned the law",
-    "learned": "the runs of 0.2.0 that trained the laws; `rps sweeps/learned` reads such runs",
+    "learned": "the runs of 0.2.0 that trained the laws",
 }

@@ -7,6 +7,7 @@
 
 from __future__ import annotations
 
+import os
 import time
 from collections import deque
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
@@ -21,7 +22,6 @@ import xarray as xr
 
 from rps_jax import Rules, Setting
 from rps_jax.analysis.figures.style import Figure, words
-from rps_jax.engines import device
 from rps_jax.engines.mujoco import Batch
 from rps_jax.physics import preset
 from rps_jax.questions import Picture, Run, call_of, option
@@ -151,7 +151,7 @@ def in_c(name: str, family: str, simulated: float = 2.0) -> Measurement:
     """Time C MuJoCo on all cores with or without the law, or one trial on one core."""
     physics = preset()
     how = IN_C[name]
-    threads = 1 if how == "serial" else device.count_processors()
+    threads = 1 if how == "serial" else len(os.sched_getaffinity(0))
     worlds = 1 if how == "serial" else 64 * threads
     setting = Setting(engine="mujoco", physics=physics)
     part = programs.timed_worlds(family, worlds, setting)

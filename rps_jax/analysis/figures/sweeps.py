@@ -39,7 +39,7 @@ def success_curves(results: xr.Dataset, count: int = 6) -> Figure:
         "Flat within the noise": _names([x for x in rest if _is_flat(x)]),
     }
     caption = "\n".join(_filled(f"{k}: {v}.", columns * width) for k, v in parts.items() if v)
-    laws = list(map(str, results.law.values))
+    laws = results.law.values.tolist()
     lines = len(caption.splitlines()) + len(laws) / columns + 4
     figure, axes = tiles(len(shown), columns, (width, 1.9), (0, 0.14 * lines), sharey=True)
     for ax, influence in zip(axes.ravel(), shown, strict=False):

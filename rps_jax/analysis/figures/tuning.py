@@ -8,7 +8,7 @@ from rps_jax.analysis.figures.style import WIDTH, Figure, legend_above, styled
 @styled
 def search(results: xr.Dataset) -> Figure:
     """Draw a search by generation: objective of candidates, validation and 24 parameters."""
-    generation, names = results.generation.values, list(map(str, results.parameter.values))[:24]
+    generation, names = results.generation.values, results.parameter.values.tolist()[:24]
     units = results.unit.values.tolist() if "unit" in results.coords else [""] * len(names)
 
     columns = 4
