@@ -93,7 +93,12 @@ def success_table(results: xr.Dataset, max_lost: float) -> list[list[str]]:
     laws = results.sizes["law"]
     bound = "fails at most" + f" (best of {laws})" * (laws > 1)
     header = ["", *groups, "all", bound, "CVaR 5 % of distance"]
-    header += ["median time", "median path", *modes]
+    medians = {"time": ("time", "{:.1f} s"), "path": ("path_length", "{:.2f} m")}
+    if "repositions" in results and results.repositions.values.any():
+        lost = {"time": "contact_lost_time", "path": "contact_lost_path"}
+        medians |= {f"{x} without contact": (lost[x], medians[x][1]) for x in lost}
+        medians["repositions"] = "repositions", "{:g}"
+    header += [*(f"median {text}" for text in medians), *modes]
     rows = [header]
     for law in map(str, results.law.values):
         trials = results.sel(law=law)
@@ -107,8 +112,7 @@ def success_table(results: xr.Dataset, max_lost: float) -> list[list[str]]:
                 rate(success),
                 _at_most(statistics.fails_at_most(failures, success.size, laws)),
                 _cvar(statistics.distance_left(trials)),
-                median(trials.time.values[success]),
-                median(trials.path_length.values[success], "{:.2f} m"),
+                *(median(trials[name].values[success], text) for name, text in medians.values()),
                 *(str(int((mode_index == statistics.modes().index(mode)).sum())) for mode in modes),
             ]
         )

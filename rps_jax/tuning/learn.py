@@ -150,18 +150,19 @@ class Learn(PPO, TaskOption, SimulationQuestion[xr.Dataset]):
         errors.check_each_once("domain", self.domains)
         for domain in self.domains:
             errors.check_name("skin of a domain to learn in", domain.skin, ("capacitive",))
-            errors.check_name("drive of a robot to learn with", domain.robot.drive, ("omni",))
         self.setting.simulator.check_traced()
         count = self.num_envs * sum(len(domain.objects) for domain in self.domains)
         if self.num_minibatches > count:
             rule = f"there are only {count} worlds; raise num_envs"
             raise errors.not_allowed("num_minibatches", self.num_minibatches, rule)
         if self.initial:
-            kind, width, taxels, hold = initial = policies.read(self.initial).network
-            counts = (domain.robot.shell.count for domain in self.domains)
-            if {Network(self.network, self.width, x, self.hold) for x in counts} != {initial}:
+            initial = policies.read(self.initial).network
+            kind, width, taxels, hold, actions = initial
+            sizes = {(x.robot.shell.count, 2 + (x.robot.drive == "omni")) for x in self.domains}
+            if {Network(self.network, self.width, x, self.hold, n) for x, n in sizes} != {initial}:
                 options = f"network = {kind}, width = {width} and hold = {hold:g} s"
                 rule = f"its network needs {options}, and robots with {taxels} taxels"
+                rule += ", which move sideways" if actions == 3 else ", which do not move sideways"
                 raise errors.not_allowed("initial", self.initial, rule)
         period = self.setting.physics.control_period
         errors.check_number("hold", self.hold, at_least=0.999 * period, unit="s")

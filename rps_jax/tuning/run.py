@@ -8,7 +8,6 @@ runs the search and checkpoints every generation, so a killed run resumes.
 from __future__ import annotations
 
 import functools
-import shlex
 from collections.abc import Callable, Generator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -316,7 +315,8 @@ class Tuning(TaskOption, LawQuestion[xr.Dataset]):
             law = f"{start},{run.folder / TUNED}"
             text += (
                 f" The law with these parameters is `{law}`; "
-                f"`rps ladder --laws {shlex.join([start, law])}` tests it on all objects."
+                f"`{self.next_command('ladder', laws=[start, law], domain=self.domain)}` tests it "
+                "on all objects."
             )
         rows = [["parameter", "start", "tuned"]]
         columns = results.parameter.values, self.space.values(self.base), results.tuned.values
