@@ -19,15 +19,17 @@ from rps_jax.control.laws.rps import RPSParams, RPSState
 from rps_jax.control.observation import Twist
 from rps_jax.errors import InputError
 from rps_jax.runs.evaluate import CandidateScores, evaluate
+from rps_jax.trials import trial
+from rps_jax.trials.jobs import rows
 from rps_jax.trials.score import Objective
 from rps_jax.trials.setting import Setting
+from rps_jax.trials.trajectory import control_loop, draw_worlds
 from rps_jax.trials.trial import Rules
+from rps_jax.trials.worlds import soften_skins
 from rps_jax.tuning import derivatives, descent, optimisers
 from rps_jax.tuning.descent import TuneGrad
 from rps_jax.tuning.evolution import TuneES
 from rps_jax.tuning.gradients import Estimate
-from sweeps.gradients import windows
-from sweeps.gradients.windows import Windows
 
 SETTING = Setting("quasistatic", rules=Rules(horizon=20.0, max_lost=10.0))
 OBJECTIVE = Objective(time=0.3, lost=0.1, miss=0.5)
@@ -69,20 +71,6 @@ def test_the_soft_score_has_a_slope_where_the_hard_score_jumps():
 
     slope = float(jax.grad(at)(0.05))
     assert slope > 10 * OBJECTIVE.time / SETTING.rules.horizon  # [1/m] more than a way's own
-
-
-def test_windows_need_a_law_with_a_smooth_form():
-    with pytest.raises(InputError, match="no smooth form"):
-        Windows("pursuit", tuned=("K_v",)).validate()
-
-
-def test_windows_need_an_estimator_and_an_engine_with_derivatives():
-    with pytest.raises(InputError, match="unknown estimator 'reverse': choose from exact, clipped"):
-        Windows("rps", estimator="reverse").validate()
-    mujoco = Setting("mujoco")
-    with pytest.raises(InputError, match="engine = mujoco is not allowed: it has no reverse-mode"):
-        Windows("rps", setting=mujoco).validate()
-    TuneES("rps", setting=mujoco, estimator="antithetic").validate()
 
 
 def by_slopes(**options):
@@ -143,18 +131,6 @@ def test_the_tail_alone_counts_for_a_risk_averse_objective():
     values = [objective.value((1.0 + side * step) * slopes) for side in (1, -1)]
     assert (values[0] - values[1]) / (2 * step) == pytest.approx(8.5, rel=1e-3)
     assert_array_equal(Objective().linearise(slopes), slopes)
-
-
-def test_windows_start_at_the_states_of_their_trials(monkeypatch):
-    """Trials are replaced by counts of their steps of 20 ms."""
-
-    monkeypatch.setattr(windows, "start_all", lambda *arguments, law: jnp.zeros(arguments[-1].size))
-    monkeypatch.setattr(windows, "advance", lambda batches, loop, steps: [batches[0][-1] + steps])
-    late = jnp.array([0.0, 0.5, 1.0])
-    for within, steps in ((10.0, [0, 250, 500]), (0.0, [0, 0, 0])):
-        question = Windows("rps", tuned=("L", "K_h"), within=within, setting=SETTING)
-        trials = windows.window_starts(question, None, jnp.zeros(2), late, late)
-        assert_array_equal(trials, steps)
 
 
 # --- derivatives of windows ----------------------------------------------------------------
@@ -240,31 +216,76 @@ def test_steps_by_derivatives_end_and_return_to_the_best_vector():
     assert (following["vectors"][0] < vectors[3]).all()
 
 
-@pytest.mark.parametrize(("slope", "checks", "windows"), [(1.0, 4, 1), (-1.0, 4, 0), (-1.0, 0, 1)])
-def test_derivatives_that_oppose_the_slopes_of_whole_trials_are_dropped(
-    monkeypatch, slope, checks, windows
-):
-    """With checks=0 they are used without a comparison."""
-    question = TuneGrad("rps", **SMALL, checks=checks)
-    ones, none = np.ones(2), np.zeros(2)
-    size = len(next(question.search())["moments"])
-    states = SimpleNamespace(moments=np.eye(size))
-    estimate = lambda x: Estimate(jnp.asarray(x * ones), jnp.ones(2), jnp.ones(2))  # noqa: E731
-    monkeypatch.setattr(TuneGrad, "_collect", lambda *_: [states])
-    monkeypatch.setattr(TuneGrad, "_derivatives", lambda *_: estimate(1.0))
-    slopes = slope if checks else np.nan
-    monkeypatch.setattr(TuneGrad, "try_step", lambda *_: ({"validation": 0.5}, estimate(slopes)))
-    results = question.judge(next(question.search()), 0, lambda *_: none)
+@pytest.fixture
+def checked(monkeypatch):
+    """Return the results of the first step, whose derivatives are ones, for a rise along them.
+
+    The score of whole trials rises by a number for a unit step of the parameters along (1, 1).
+    Slopes along random steps are twos.
+    """
+    estimate = lambda x: Estimate(jnp.full(2, x), jnp.ones(2), jnp.ones(2))  # noqa: E731
+
+    def judge(rise, checks):
+        question = TuneGrad("rps", **SMALL, checks=checks, sigma=0.5)
+        proposal = next(question.search())
+        states = SimpleNamespace(moments=np.eye(len(proposal["moments"])))
+        monkeypatch.setattr(TuneGrad, "_collect", lambda *_: [states])
+        monkeypatch.setattr(TuneGrad, "_derivatives", lambda *_: estimate(1.0))
+        monkeypatch.setattr(TuneGrad, "antithetic", lambda *_: ("steps", lambda _: estimate(2.0)))
+
+        def score(requests):
+            if requests == ["steps"]:
+                return [None]
+            answers = []
+            for request in requests:
+                moved = np.asarray(question.space.vector(request.params)) - proposal["vectors"]
+                scores = rise * moved.mean(axis=1)[:, None] + np.arange(request.shape[1])
+                outcome = SimpleNamespace(success=np.ones(1))
+                answers.append(CandidateScores(outcome, scores))
+            return answers
+
+        return question.judge(proposal, 0, score)
+
+    return judge
+
+
+@pytest.mark.parametrize(("rise", "checks", "windows"), [(3.0, 4, 1), (-3.0, 4, 0), (-3.0, 0, 1)])
+def test_derivatives_along_which_no_score_falls_are_dropped(checked, rise, checks, windows):
+    """A step goes against the derivatives. With checks=0 they are used without a check."""
+    results = checked(rise, checks)
     assert results["windows"] == windows
-    expected = ones if windows else slope * ones
-    np.testing.assert_array_equal(results["gradients"][0], expected)
-    np.testing.assert_allclose(results["cosine"], np.sign(slopes), rtol=1e-6)
+    np.testing.assert_array_equal(results["gradients"][0], np.full(2, 1.0 if windows else 2.0))
+    np.testing.assert_allclose(results["slope"], rise if checks else np.nan, rtol=1e-4)
+    np.testing.assert_allclose(results["slope_error"], 0.0 if checks else np.nan, atol=1e-4)
+
+
+def test_derivatives_are_dropped_with_a_warning_where_all_scores_are_alike(checked):
+    with pytest.warns(UserWarning, match="All trials along the derivatives have equal scores"):
+        assert checked(0.0, 4)["windows"] == 0
+
+
+def test_features_have_the_target_and_not_the_pose_of_the_object():
+    """Pose and offset of the contact predict failures by what both share with the world."""
+    batch = draw_worlds("wide,objects=random_box,gap=0.3:0.3", setting=SETTING)
+    world, params = soften_skins(rows(batch.worlds, 0)), RPSParams.paper()
+    loop = control_loop(params, SETTING, smooth=True)
+    first, still = trial.start(world, params, loop.law), world
+
+    def change(world, qpos):
+        values = (
+            descent.features(x, params, first._replace(qpos=y), loop)
+            for x, y in ((world, qpos), (still, first.qpos))
+        )
+        return np.abs(np.subtract(*values)).max()
+
+    assert change(world, first.qpos.at[3:5].add(0.1)) < 1e-6
+    assert change(world._replace(p_world_target=world.p_world_target + 1.0), first.qpos) > 0.1
 
 
 def test_the_value_function_has_the_coefficients_of_its_data():
     random = np.random.default_rng(0)
-    x = random.normal(size=(500, 16))
-    truth = np.concatenate([[2.0], random.normal(size=16)])
+    x = random.normal(size=(500, 6))
+    truth = np.concatenate([[2.0], random.normal(size=6)])
     data = np.column_stack([np.ones(500), x, truth[0] + x @ truth[1:]])
     np.testing.assert_allclose(descent.fit(data.T @ data, 0.0), truth, atol=1e-9)
     shrunk = descent.fit(data.T @ data, 1e6)

@@ -89,6 +89,8 @@ class Trace(Trajectory):
         parts = [f"least distance {float(outcome.min_distance):.3f} m"]
         contact = "not felt" if outcome.unfelt else "lost"
         parts.append(f"contact {contact} for {float(outcome.contact_lost_time):.1f} s")
+        if outcome.repositions:
+            parts[-1] += f" in {int(outcome.repositions)} repositions"
         if np.isinf(outcome.min_distance):
             parts = ["never touched"]
         elif "progress" in outcome.task:
@@ -272,6 +274,7 @@ class Push(Case, TraceQuestion, SimulationQuestion[Trace]):
     def __post_init__(self) -> None:
         """Defer the checks of `Case` to `check`."""
         self.choose_law()
+        SimulationQuestion.__post_init__(self)
 
     @property
     def horizon(self) -> float:

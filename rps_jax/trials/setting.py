@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Annotated, Any, Literal, get_args
 
 from rps_jax import engines, errors
@@ -84,6 +84,20 @@ class Setting:
         if self.physics.cone != "elliptic":  # all engines have this one: import no engine
             self.simulator.check_physics(self.physics)
 
+    def with_robot(self, robot: Robot) -> Setting:
+        """Return the setting with the control period of a robot, if it has one.
+
+        Raises:
+          InputError: the physics has another one, which is not the default.
+        """
+        if robot.period in (None, self.physics.control_period):
+            return self
+        if self.physics.control_period != Physics().control_period:
+            rule = f"the period of the robot is {robot.period:g} s: leave it out"
+            period = f"{self.physics.control_period:g} s"
+            raise errors.not_allowed("control_period", period, rule)
+        return replace(self, physics=replace(self.physics, control_period=robot.period))
+
     @property
     def simulator(self) -> Engine:
         """The engine itself."""
@@ -102,6 +116,9 @@ class Setting:
 
     def check_here(self, robot: Robot, laws: Iterable[LawParams] = ()) -> None:
         """Raise InputError unless the engine can step such a robot with these laws."""
+        if self.with_robot(robot) is not self:
+            rule = f"the period of the robot is {robot.period:g} s: use setting.with_robot(robot)"
+            raise errors.not_allowed("control_period", f"{self.physics.control_period:g} s", rule)
         self.simulator.check_robot(robot)
         for params in laws:
             law = registry.law_of(params)

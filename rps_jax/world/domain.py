@@ -50,7 +50,11 @@ def robot_field(name: str) -> str:
 
 _POSITIVE = 1e-3
 # Labels of the three draws of the velocity error.
-VELOCITY_ERRORS = {f"{name}_error": f"error of {name}" for name in ("v_x", "v_y", "omega")}
+VELOCITY_ERRORS = {
+    "v_x_error": "error of v_x or left wheel",
+    "v_y_error": "error of v_y",
+    "omega_error": "error of omega or right wheel",
+}
 
 
 @dataclass(frozen=True)
