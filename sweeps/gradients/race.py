@@ -269,13 +269,16 @@ race = call_of(Race)
 
 
 def spent(curve: pd.DataFrame, budget: str) -> pd.Series:
-    """Return what each generation of a log has used of a budget, with all before it [s]."""
-    return pd.Series(curve["run" if budget == "wall" else "simulated"]).cumsum()
+    """Return what the vector of each generation of a log has cost: all generations before it [s].
+
+    Its own trials are for the next vector, except for its validation.
+    """
+    return pd.Series(curve["run" if budget == "wall" else "simulated"]).cumsum().shift(fill_value=0)
 
 
 def best_within(curve: pd.DataFrame, budget: str, amount: float) -> pd.Series:
-    """Return the generation with the best validation within a budget; at least the first."""
-    within = curve[(spent(curve, budget) <= amount) | (curve.index == 0)]
+    """Return the generation with the best validation within a budget."""
+    within = curve[spent(curve, budget) <= amount]
     return within.loc[within.validation.idxmin()]
 
 
