@@ -12,7 +12,7 @@ def test_the_best_validation_within_a_budget_is_tested():
     columns = {"validation": [0.4, 0.3, 0.2, 0.1], "simulated": [10.0, 10.0, 20.0, 20.0]}
     columns |= {"run": [1.0, 10.0, 1.0, 1.0], "params.L": [1, 2, 3, 4]}
     curve = pd.DataFrame(columns)
-    choices = {("simulated", 40.0): 3, ("simulated", 25.0): 2, ("wall", 11.5): 2, ("wall", 0.1): 1}
+    choices = {("simulated", 40.0): 4, ("simulated", 25.0): 3, ("wall", 11.5): 3, ("wall", 0.1): 1}
     for (budget, amount), L in choices.items():
         assert race.law_of(race.best_within(curve, budget, amount)).L == L
     law = race.law_of(pd.Series({"params.l_cr": 0.12}))

@@ -269,13 +269,16 @@ race = call_of(Race)
 
 
 def spent(curve: pd.DataFrame, budget: str) -> pd.Series:
-    """Return what each generation of a log has used of a budget, with all before it [s]."""
-    return pd.Series(curve["run" if budget == "wall" else "simulated"]).cumsum()
+    """Return what the vector of each generation of a log has cost: all generations before it [s].
+
+    Its own trials are for the next vector, except for its validation.
+    """
+    return pd.Series(curve["run" if budget == "wall" else "simulated"]).cumsum().shift(fill_value=0)
 
 
 def best_within(curve: pd.DataFrame, budget: str, amount: float) -> pd.Series:
-    """Return the generation with the best validation within a budget; at least the first."""
-    within = curve[(spent(curve, budget) <= amount) | (curve.index == 0)]
+    """Return the generation with the best validation within a budget."""
+    within = curve[spent(curve, budget) <= amount]
     return within.loc[within.validation.idxmin()]
 
 
@@ -319,10 +322,10 @@ def table(results: xr.Dataset) -> list[list[Any]]:
             rows.append([str(count), "", "start", float(start.mean()), None, "", "", ""])
         means = of_count.success.sel(budget=budget).mean("world")
         for method in map(str, results.method.values):
-            chosen = of_count.sel(method=method)
-            values, ahead = means.sel(method=method).values, None
+            chosen = of_count.sel({"method": method})  # `method` is an argument of `sel`
+            values, ahead = means.sel({"method": method}).values, None
             if method != FIRST and FIRST in means.method:
-                ahead = interval(means.sel(method=FIRST).values - values)
+                ahead = interval(means.sel({"method": FIRST}).values - values)
             compared = [statistics.compare(start, x) for x in chosen.success.sel(budget=budget)]
             gained, lost = (sum(getattr(c, x) for c in compared) for x in ("gained", "lost"))
             seeds = ", ".join(f"{100 * x:.1f}" for x in values)
@@ -341,7 +344,7 @@ def draw(results: xr.Dataset) -> Figure:
     for ax, budget in zip(axes.ravel(), results.budget.values, strict=False):
         ax.plot(counts, results.start_success.mean("world"), "k:", label="start")
         for at, method in enumerate(results.method.values):
-            values = means.sel(budget=budget, method=method)
+            values = means.sel({"budget": budget, "method": method})
             mean, *limits = np.transpose([interval(x) for x in values.values])
             error = np.abs(np.array(limits) - mean) if limits else None
             marks = {"marker": "o", "markersize": 3, "capsize": 2}
