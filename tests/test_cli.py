@@ -268,42 +268,7 @@ def test_files_of_equal_names_are_distinguished_by_their_folders(tmp_path):
     assert list(registry.resolve_laws(["rps", *texts])) == ["rps", *texts]
 
 
-STUDY = """
-from dataclasses import dataclass
-import xarray as xr
-from rps_jax.runs.question import LawQuestion, call_of
-from rps_jax.analysis.report import Section
-from rps_jax.record.options import option
-import rps_jax
-
-@dataclass(frozen=True)
-class Crowd(LawQuestion[xr.Dataset]):
-    'Count what a law wins among drums.'
-
-    worlds: int = option(16, 1, 1000)
-    'Number of drums.'
-
-    def answer(self, run):
-        drums = rps_jax.Domain(("random_cylinder",))
-        return rps_jax.sweep(self.law, drums, self.worlds, setting=self.setting, progress=False)
-
-    def report(self, results, run):
-        return [Section("Drums", f"{int(results.success.sum())} of {self.worlds} were won.")]
-
-crowd = call_of(Crowd)
-"""
 BRIEF = "--engine quasistatic --horizon 2"
-
-
-def test_a_custom_question_is_one_file(tmp_path, capsys):
-    path = tmp_path / "my_study.py"
-    path.write_text(STUDY)
-    assert rps(f"{path} --worlds 8 {BRIEF} --law rps --out", tmp_path / "run") == 0
-    assert "0 of 8 were won" in capsys.readouterr().out
-    assert files.read_results(tmp_path / "run").sizes["world"] == 8
-    assert "worlds = 0 is not allowed" in refusal(capsys, path, "--worlds", 0)
-    assert rps(path, "--help") == 0
-    assert "Number of drums." in capsys.readouterr().out
 
 
 def test_an_interrupted_run_prints_one_line(tmp_path):

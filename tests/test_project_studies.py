@@ -20,9 +20,8 @@ STUDIES = sorted(path.parent for path in SWEEPS.glob("*/study.py"))
 
 # Options of studies whose value is none of their choices.
 UNKNOWN = [
-    "gradients --objects box",
-    "gradients --estimators backward",
-    "gradients --tuned v_max",
+    "gradients/race.py --methods newton",
+    "gradients/race.py --counts 7",
     "landscape --domain wyde",
     "engines --domain wyde",
     "random_worlds --domains wyde",
@@ -40,12 +39,10 @@ UNKNOWN = [
     "planning --methods newton",
 ]
 REFUSED = [
-    ("gradients --horizons 2 1", r"horizons = \(2\.0, 1\.0\) is not allowed"),
     ("landscape --laws rps,tund.json", r"tund\.json cannot be read"),
     ("landscape --laws pursuit", "law = pursuit is not allowed"),
     ("speed --families cone", "cone"),
     ("levers --family cone", "cone"),
-    ("ambiguities --gazebo --curve", "gazebo and curve are not allowed together"),
     ("limits --limits leg", "did you mean 'lag'"),
     ("mends --laws none", "unknown mend 'none'"),
     ("ground --grounds our", "did you mean 'ours'"),

@@ -20,7 +20,6 @@ from rps_jax.trials.trial import Rules, Shift
 from rps_jax.tuning.space import Space
 from rps_jax.world import scene
 from rps_jax.world.physics import Physics, preset
-from sweeps.gradients.study import Gradients
 
 NAN, INF = math.nan, math.inf
 BOARDS = Boards("front", 2, 0.05)
@@ -113,10 +112,6 @@ REFUSED = {
         ({"names": ("gamma_max",), "base": RPSParams(gamma_max=INF)}, "gamma_max"),
     ],
     Objective: each(risk="worst", time=-1.0, tail=0.0, miss=NAN),
-    then("validate", Gradients): [
-        *each(objects=("box",)),
-        *(({"horizons": horizons}, "horizons") for horizons in ((), (2.0, 1.0))),
-    ],
 }
 
 

@@ -6,7 +6,9 @@ ellipsoid f^2 / f_max^2 + m^2 / m_max^2 = 1, so that V is proportional to L^-1 (
 L = diag(1, 1, c^2) and c = m_max / f_max (Goyal, Ruina and Papadopoulos 1991; Howe and Cutkosky
 1996; Lynch and Mason 1996). The base, a velocity source, determines the speed of the object, so
 that the results depend neither on the size of the force, nor on the mass, nor on the friction with
-the ground. In each step V minimises
+the ground. Of an object on pads, as with even pressure, the limit surface is that of their Coulomb
+friction: D(V) = sum over pads of N_i |(v_i, r_i omega)|, with loads N_i, velocities v_i and radii
+r_i, replaces the square root of V L V. In each step V minimises
 
     V L V / (2 S) + sum over contacts of P(gap + dt (v_n - mu |v_t|)),
 
@@ -41,6 +43,8 @@ DEPTH = 1e-4  # [m] approximate penetration of a push
 SLIP = 0.01  # [1] share of the base's speed at which friction is 0.7 of its maximum
 _ITERATIONS = 10  # of Newton's method
 _SHARP = 3  # final steps of Newton's method with the final slip; earlier ones have a wider slip
+_LEAST_RADIUS = 0.05  # [1] of pads, of the arm: at a point, the limit surface is not smooth
+_LEAST_PACE = 1e-3  # [1] share of the base's speed below which friction of pads is smooth
 _ENTRIES = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))  # of a symmetric matrix
 
 
@@ -53,6 +57,8 @@ class Slider(NamedTuple):
     base_size: Entries  # (2,) [m] half length and width of the base, or (1,) its radius
     vertices: Entries  # (N, 2) [m] of the outline, counter-clockwise, in the object's frame
     radius: Number  # () [m] of the outline
+    # (S, 4) x, y [m] of pads from the centre of mass, share of the friction [1], radius [m]
+    pads: Entries = None
 
 
 class Contact(NamedTuple):
@@ -71,6 +77,7 @@ class Problem(NamedTuple):
     speed: Number  # [m/s] of the base
     arm: Number  # [m]
     friction: Number  # [1]
+    pads: tuple[Number, ...] | None = None  # rows of `Slider.pads`, in the base's axes
 
 
 class Quasistatic(NamedTuple):
@@ -90,7 +97,10 @@ class Quasistatic(NamedTuple):
         p = free[:, :2] + planar.rotate(yaw, com)
         # The batch axis comes last, as in `contacts`.
         corners = jnp.moveaxis(fields.vertices - com[:, None], (0, 1), (2, 1))
-        sliders = fields._replace(base_size=tuple(fields.base_size.T), vertices=tuple(corners))
+        pads = None if fields.pads is None else tuple(jnp.moveaxis(fields.pads, (0, 1), (2, 1)))
+        sliders = fields._replace(
+            base_size=tuple(fields.base_size.T), vertices=tuple(corners), pads=pads
+        )
         poses = (tuple(qpos[:, JOINTS.base].T), (*p.T, yaw))
         twist = (period.twists.v_x, period.twists.v_y, period.twists.omega)
         step = partial(_step, sliders, twist, physics.timestep)
@@ -124,6 +134,7 @@ def _step(slider: Slider, twist: Vec, dt: float, poses: tuple[Vec, Vec]) -> tupl
         jnp.sqrt(v_x * v_x + v_y * v_y + reach * omega * omega + _MIN_SPEED**2),
         slider.arm,
         slider.friction_robot,
+        None if slider.pads is None else _turned(slider.pads, pushed[2] - base[2]),
     )
     v = solve(problem, (v_x - omega * p[1], v_y + omega * p[0], omega), dt)
 
@@ -157,9 +168,13 @@ def derivatives(problem: Problem, v: Vec, slip: Number, dt: float) -> tuple[Vec,
     """Return the gradient and the upper entries of the Hessian of the cost."""
     tiny, friction = slip * problem.speed, problem.friction
     stiff = 1 / problem.speed
-    inertia = (stiff, stiff, stiff * problem.arm * problem.arm)
-    gradient: Vec = (inertia[0] * v[0], inertia[1] * v[1], inertia[2] * v[2])
-    hessian: list[Number] = [inertia[i] if i == j else 0.0 for i, j in _ENTRIES]
+    if problem.pads is None:
+        inertia = (stiff, stiff, stiff * problem.arm * problem.arm)
+        gradient: Vec = (inertia[0] * v[0], inertia[1] * v[1], inertia[2] * v[2])
+        hessian: list[Number] = [inertia[i] if i == j else 0.0 for i, j in _ENTRIES]
+    else:
+        gradient, hessian = friction_of_pads(problem.pads, v, _LEAST_PACE * problem.speed)
+        gradient, hessian = sp.scale(stiff, gradient), [stiff * entry for entry in hessian]
     for contact in problem.contacts:
         n, r = contact.normal, contact.r
         t = (-n[1], n[0])
@@ -177,6 +192,29 @@ def derivatives(problem: Problem, v: Vec, slip: Number, dt: float) -> tuple[Vec,
             for h, (i, j) in zip(hessian, _ENTRIES, strict=True)
         ]
     return gradient, hessian
+
+
+def friction_of_pads(pads: tuple[Number, ...], v: Vec, pace: Number) -> tuple[Vec, list[Number]]:
+    """Return gradient and upper Hessian of D^2 / 2, with D the power of friction over its force."""
+    x, y, share, radius = pads
+    u = v[0] - v[2] * y, v[1] + v[2] * x, v[2] * radius
+    speed = jnp.sqrt(sp.dot(u, u) + pace * pace)
+    load, total = share / speed, sp.total(share * speed)
+    flow = u[0], u[1], x * u[1] - y * u[0] + radius * u[2]
+    slope: Vec = tuple(sp.total(load * f) for f in flow)  # pyright: ignore[reportAssignmentType]
+    one = jnp.ones_like(x)
+    metric = one, 0 * x, -y, one, x, x * x + y * y + radius * radius
+    hessian = [
+        total * sp.total(load * (g - flow[i] * flow[j] / (speed * speed))) + slope[i] * slope[j]
+        for g, (i, j) in zip(metric, _ENTRIES, strict=True)
+    ]
+    return sp.scale(total, slope), hessian
+
+
+def _turned(pads: tuple[Number, ...], yaw: Number) -> tuple[Number, ...]:
+    """Return the rows of pads turned by an angle [rad]."""
+    (x, y, *rest), c, s = pads, jnp.cos(yaw), jnp.sin(yaw)
+    return c * x - s * y, s * x + c * y, *rest
 
 
 def _contacts(slider: Slider, pose: Vec, twist: Vec) -> list[Contact]:
@@ -239,7 +277,6 @@ class QuasistaticEngine(Engine):
     cones = ("elliptic",)  # its friction is the same in all directions
     modes = ("forward", "reverse")
     forces = False
-    weighs_feet = True
     surroundings = ()
     computes_force = False  # only the direction of the force is known, not its size
 
@@ -247,13 +284,24 @@ class QuasistaticEngine(Engine):
         """Return the stage, and the sliders (n, ...) of the worlds; bases follow every twist."""
         solids, count = inputs.solids, inputs.num_worlds
         assert not inputs.robots.driven, "checked by check_robot"
+        arm, pads = solid.friction_arm(solids), None
+        if solids.feet is not None and solids.pads is not None:
+            at, weight = (
+                solids.feet[..., :2] - solids.p_object_com[:, None, :2],
+                solids.feet[..., 2],
+            )
+            share = solid.supported_load(at, weight, np.zeros((count, 2))) * solids.pads[..., 0]
+            share = share / share.sum(axis=1, keepdims=True)
+            radius = np.maximum(solids.pads[..., 1], _LEAST_RADIUS * arm[:, None])
+            pads = np.concatenate([at, np.stack([share, radius], axis=2)], axis=2)
         return Quasistatic(), Slider(
             p_object_com=solids.p_object_com[:, :2],
-            arm=solid.friction_arm(solids),
+            arm=arm,
             friction_robot=np.broadcast_to(inputs.friction.robot, count),
             base_size=scene.base_size(inputs.robots, count),
             vertices=solids.vertices,
             radius=solids.radius,
+            pads=pads,
         )
 
 

@@ -66,8 +66,8 @@ class Setting:
     cores) or quasistatic (planar, without inertia; its derivatives are those of that model)."""
     physics: PhysicsField = PhysicsField()
     """How friction is modelled: default is isotropic Coulomb friction; paper_gazebo is a friction
-    pyramid, as in the paper's simulator. Changes follow, as default,timestep=0.005 or
-    default,control_period=0.05 [s]."""
+    pyramid, as in the paper's simulator. Changes follow, as default,timestep=0.005,
+    default,control_period=0.05 [s], or default,support=even or rim: the pressure under objects."""
     fidelity: Fidelity = "standard"
     """How finely the physics is solved: reference is converged and meant for the engine mujoco,
     standard (steps of 10 ms) is for results, and fast (20 ms) has 2 to 3 times its error, since
@@ -137,7 +137,10 @@ class Setting:
     def to_json(self) -> JsonObject:
         """Return the setting as manifests have it; `from_json` reads it."""
         rules = registry.leaves_to_json(self.rules)
-        return {"physics": asdict(self.physics), "rules": rules} | self.attributes
+        physics = asdict(self.physics)
+        if physics["support"] == "corners":  # as records without a support
+            del physics["support"]
+        return {"physics": physics, "rules": rules} | self.attributes
 
     @classmethod
     def from_json(cls, record: Mapping[str, Any]) -> Setting:

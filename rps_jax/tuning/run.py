@@ -20,7 +20,7 @@ import xarray as xr
 
 from rps_jax import errors
 from rps_jax.analysis import statistics, tables
-from rps_jax.analysis.figures import tuning as figures
+from rps_jax.analysis.figures import sweeps as figures
 from rps_jax.analysis.report import Picture, Section
 from rps_jax.control import registry
 from rps_jax.control.base import LawParams, unit_of_leaf
