@@ -111,10 +111,10 @@ class UnicycleParams(NamedTuple):
     ] = 1.124
     R: Annotated[
         Parameter, Spec("m", "radius of the circle around M, D6", gt=0, tune=Bound(0.5, 1.4))
-    ] = 0.8454
+    ] = 0.95
     R_s: Annotated[
         Parameter, Spec("m", "distance of the last W from M, D6", gt=0, tune=Bound(0.4, 1.4))
-    ] = 0.8454
+    ] = 0.7
 
 
 class Widths(NamedTuple):
@@ -357,7 +357,9 @@ PRESETS = {
         t_lost=0.2291,
         back=0.01655,
         carrot=1.19,
+        e_far=3.2,
         R=0.9113,
+        R_s=1.1,
     ),
     "unicycle_round": _TUNED._replace(
         r=0.2088,
@@ -371,7 +373,9 @@ PRESETS = {
         t_lost=1.861,
         back=0.01947,
         carrot=1.419,
+        e_far=3.2,
         R=0.9152,
+        R_s=0.9152,
     ),
     "unicycle_front": _TUNED._replace(
         r=0.2494,
@@ -385,6 +389,8 @@ PRESETS = {
         t_lost=1.179,
         back=0.103,
         carrot=0.8061,
+        e_far=3.2,
         R=1.267,
+        R_s=1.267,
     ),
 }
