@@ -326,7 +326,7 @@ def test_pages_name_options_that_exist():
     unknown = list[str]()
     for name, options in sorted(line for line in lines if "--help" not in line[1]):
         try:
-            flags.parse(names.question_type(name), name, shlex.split(options))
+            flags.parse(names.question_type(name), name, shlex.split(options, comments=True))
         except InputError as error:
             unknown += [str(error)] * str(error).startswith("unknown option")
     assert not unknown
