@@ -330,7 +330,8 @@ def table(results: xr.Dataset) -> list[list[Any]]:
             gained, lost = (sum(getattr(c, x) for c in compared) for x in ("gained", "lost"))
             seeds = ", ".join(f"{100 * x:.1f}" for x in values)
             counts = f"+{gained} -{lost}", f"{float(chosen.generations.mean()):.0f}"
-            label = str(budget).replace(" ", " time, ")
+            name, amount, unit = str(budget).split()
+            label = f"{name} time, {float(amount):,g} {unit}"
             rows.append([str(count), label, method, interval(values), ahead, seeds, *counts])
     return rows
 
