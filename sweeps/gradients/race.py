@@ -143,7 +143,7 @@ class Race(Study[xr.Dataset], SimulationQuestion[xr.Dataset]):
 
     TITLE: ClassVar[str] = "Derivatives against evolution"
     CHOICES: ClassVar = {"methods": METHODS}
-    GROWS: ClassVar[tuple[str, ...]] = ("counts",)
+    GROWS: ClassVar[tuple[str, ...]] = ("counts", "file")
     QUICK: ClassVar[Mapping[str, Any]] = {
         "worlds": 4,
         "counts": (64,),
@@ -169,6 +169,8 @@ class Race(Study[xr.Dataset], SimulationQuestion[xr.Dataset]):
     """Budgets of wall time without compilation [s]."""
     worlds: int = option(400, 1, 1_000_000)
     """Number of test worlds of `wide`."""
+    file: str = "gradients_race"
+    """Name of the data file."""
     setting: Setting = field(default=Setting(rules=Rules(horizon=150.0)), kw_only=True)
     out: Path | str | None = field(default="runs/race", kw_only=True)
     """Run folder; the tunings have folders there."""
@@ -249,7 +251,7 @@ class Race(Study[xr.Dataset], SimulationQuestion[xr.Dataset]):
 
     def report_tables(self, results: xr.Dataset) -> Sequence[Table]:
         """Return the success of the tunings."""
-        picture = Picture("race", partial(draw, results))
+        picture = Picture(self.file.removeprefix("gradients_"), partial(draw, results))
         columns = [
             {"name": "parameters", "merge": True},
             {"name": "equal", "merge": True},
@@ -265,7 +267,7 @@ class Race(Study[xr.Dataset], SimulationQuestion[xr.Dataset]):
             {"name": "generations"},
         ]
         text = "Square brackets: 95 % intervals over the seeds, by Student's t."
-        named = {"name": "gradients_race", "title": "Success", "picture": picture}
+        named = {"name": self.file, "title": "Success", "picture": picture}
         return [Table(table(results), text, columns, **named)]
 
 
