@@ -9,6 +9,7 @@ rps sweeps/gradients/race.py
 
 from __future__ import annotations
 
+import functools
 import itertools
 import threading
 from collections.abc import Callable, Mapping, Sequence
@@ -112,13 +113,13 @@ class _Paced(Tuning):
 
 
 class _Grad(_Paced, TuneGrad):
-    @property
+    @functools.cached_property
     def _programs(self) -> dict[Callable[..., Any], Any]:
         return self.pool.programs
 
-    def _call(self, *inputs: Any) -> Any:
+    def _call(self, function: Callable[..., Any], times: dict[str, float], *inputs: Any) -> Any:
         with self.pool.device:
-            return super()._call(*inputs)
+            return super()._call(function, times, *inputs)
 
 
 class _ES(_Paced, TuneES):
@@ -227,7 +228,9 @@ class Race(Study[xr.Dataset], SimulationQuestion[xr.Dataset]):
         dims, shape = ("seed", "method"), (len(self.seeds), len(self.methods))
         by_tuning = {
             "generations": [len(curve) for curve in curves],
-            "windows": [curve.get("windows", pd.Series([0.0])).sum() for curve in curves],
+            "windows": [
+                float(curve["windows"].sum()) if "windows" in curve else 0.0 for curve in curves
+            ],
             **{name: [float(spent(x, name).iloc[-1]) for x in curves] for name in BUDGETS},
         }
         variables = {name: (dims, np.reshape(x, shape)) for name, x in by_tuning.items()}
@@ -285,7 +288,7 @@ def spent(curve: pd.DataFrame, budget: str) -> pd.Series:
 def best_within(curve: pd.DataFrame, budget: str, amount: float) -> pd.Series:
     """Return the generation with the best validation within a budget."""
     within = curve[spent(curve, budget) <= amount]
-    return within.loc[within.validation.idxmin()]
+    return within.iloc[int(np.nanargmin(within.validation))]
 
 
 def problem(count: int) -> tuple[Any, str]:
