@@ -59,8 +59,8 @@ _ALIKE = (
 class TuneGrad(Descent):
     """Tune a law by exact derivatives of the smooth trial, in mini-batches of random worlds.
 
-    Use `rps tune es` by default, and this for hundreds of parameters and an engine with
-    derivatives; where whole trials do not improve along these, they are dropped and slopes remain.
+    Use `rps tune es` for the parameters of a law, and this for tables and networks of some hundred
+    numbers and more, with an engine that has derivatives.
 
     A step follows the derivatives of windows of some seconds, which start at states of trials of
     the original law; a value function, fitted to these trials, counts what follows a window. After
