@@ -13,6 +13,7 @@ from staging import FINE, simulate, step_in_c
 from rps_jax import engines
 from rps_jax.engines import quasistatic
 from rps_jax.geometry import solid
+from rps_jax.geometry.friction import friction_of_pads, solved
 from rps_jax.trials import pushes, worlds
 from rps_jax.trials.case import Case
 from rps_jax.trials.setting import Setting
@@ -78,8 +79,8 @@ def twists_under(at, share, radius, wrench, arm):
     pads = tuple(jnp.asarray(x)[:, None] for x in (*at.T, share, np.maximum(radius, 1e-4)))
     v = tuple(jnp.asarray(x) for x in (wrench / [1, 1, arm * arm]).T)
     for i in range(80):
-        g, h = quasistatic.friction_of_pads(pads, v, 1e-5)
-        step = quasistatic.solved(tuple(a - b for a, b in zip(g, wrench.T, strict=True)), h)
+        g, h = friction_of_pads(pads, v, 1e-5)
+        step = solved(tuple(a - b for a, b in zip(g, wrench.T, strict=True)), h)
         v = tuple(a - (0.5 if i < 60 else 1.0) * b for a, b in zip(v, step, strict=True))
     return np.stack(v, axis=1)
 

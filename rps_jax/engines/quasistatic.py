@@ -34,6 +34,7 @@ from rps_jax.engines.fused.contacts import Point, circle_and_base, polygon_and_b
 from rps_jax.geometry import planar, solid
 from rps_jax.geometry import vectors as sp
 from rps_jax.geometry.arrays import Entries, Number
+from rps_jax.geometry.friction import ENTRIES, friction_of_pads, solved
 from rps_jax.geometry.vectors import Vec
 from rps_jax.world import scene
 from rps_jax.world.scene import JOINTS, WorldInputs
@@ -45,7 +46,6 @@ _ITERATIONS = 10  # of Newton's method
 _SHARP = 3  # final steps of Newton's method with the final slip; earlier ones have a wider slip
 _LEAST_RADIUS = 0.05  # [1] of pads, of the arm: at a point, the limit surface is not smooth
 _LEAST_PACE = 1e-3  # [1] share of the base's speed below which friction of pads is smooth
-_ENTRIES = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))  # of a symmetric matrix
 
 
 class Slider(NamedTuple):
@@ -171,7 +171,7 @@ def derivatives(problem: Problem, v: Vec, slip: Number, dt: float) -> tuple[Vec,
     if problem.pads is None:
         inertia = (stiff, stiff, stiff * problem.arm * problem.arm)
         gradient: Vec = (inertia[0] * v[0], inertia[1] * v[1], inertia[2] * v[2])
-        hessian: list[Number] = [inertia[i] if i == j else 0.0 for i, j in _ENTRIES]
+        hessian: list[Number] = [inertia[i] if i == j else 0.0 for i, j in ENTRIES]
     else:
         gradient, hessian = friction_of_pads(problem.pads, v, _LEAST_PACE * problem.speed)
         gradient, hessian = sp.scale(stiff, gradient), [stiff * entry for entry in hessian]
@@ -189,26 +189,9 @@ def derivatives(problem: Problem, v: Vec, slip: Number, dt: float) -> tuple[Vec,
         bend = force * friction * tiny * tiny / (slide * slide * slide)
         hessian = [
             h + dt * stiffness * push[i] * push[j] + bend * along[i] * along[j]
-            for h, (i, j) in zip(hessian, _ENTRIES, strict=True)
+            for h, (i, j) in zip(hessian, ENTRIES, strict=True)
         ]
     return gradient, hessian
-
-
-def friction_of_pads(pads: tuple[Number, ...], v: Vec, pace: Number) -> tuple[Vec, list[Number]]:
-    """Return gradient and upper Hessian of D^2 / 2, with D the power of friction over its force."""
-    x, y, share, radius = pads
-    u = v[0] - v[2] * y, v[1] + v[2] * x, v[2] * radius
-    speed = jnp.sqrt(sp.dot(u, u) + pace * pace)
-    load, total = share / speed, sp.total(share * speed)
-    flow = u[0], u[1], x * u[1] - y * u[0] + radius * u[2]
-    slope: Vec = tuple(sp.total(load * f) for f in flow)  # pyright: ignore[reportAssignmentType]
-    one = jnp.ones_like(x)
-    metric = one, 0 * x, -y, one, x, x * x + y * y + radius * radius
-    hessian = [
-        total * sp.total(load * (g - flow[i] * flow[j] / (speed * speed))) + slope[i] * slope[j]
-        for g, (i, j) in zip(metric, _ENTRIES, strict=True)
-    ]
-    return sp.scale(total, slope), hessian
 
 
 def _turned(pads: tuple[Number, ...], yaw: Number) -> tuple[Number, ...]:
@@ -257,17 +240,6 @@ def _spring(inside: Number) -> tuple[Number, Number]:
     bent = jnp.clip(inside + DEPTH, 0.0, 2 * DEPTH)
     force = bent * bent / (4 * DEPTH) + jnp.maximum(inside - DEPTH, 0.0)
     return force / DEPTH, bent / (2 * DEPTH * DEPTH)
-
-
-def solved(g: Vec, h: Sequence[Number]) -> Vec:
-    """Solve h x = g for a symmetric 3 x 3 matrix with the upper entries h."""
-    a, b, c, d, e, f = h
-    l_1, l_2 = b / a, c / a
-    d, e = d - l_1 * b, e - l_1 * c
-    y = g[1] - l_1 * g[0]
-    z = (g[2] - l_2 * g[0] - e / d * y) / (f - l_2 * c - e * e / d)
-    y = (y - e * z) / d
-    return (g[0] - b * y - c * z) / a, y, z
 
 
 class QuasistaticEngine(Engine):
