@@ -364,8 +364,8 @@ def features(world: World, params: LawParams, state: Trial, loop: ControlLoop) -
     and of the bearing of the target from there in the robot frame.
 
     The offset of the contact and the pose of the object are none. They predict failures best, but
-    by what both share with the world: its friction and centre of mass keep the contact off the
-    middle, and no law can change them. A value function of them points the wrong way.
+    with them the derivatives point against the slopes of whole trials. Probably they stand for the
+    friction and the centre of mass of a world, which no law can change.
     """
     _, measured = trial.observe(world, params, state, loop)
     distance = _FAR * jnp.tanh(measured.distance / _FAR)

@@ -255,6 +255,7 @@ class Race(Study[xr.Dataset], SimulationQuestion[xr.Dataset]):
     def report_tables(self, results: xr.Dataset) -> Sequence[Table]:
         """Return the success of the tunings."""
         picture = Picture(self.file.removeprefix("gradients_"), partial(draw, results))
+        several = results.sizes["count"] > 1
         columns = [
             {"name": "parameters", "merge": True},
             {"name": "equal", "merge": True},
@@ -270,7 +271,7 @@ class Race(Study[xr.Dataset], SimulationQuestion[xr.Dataset]):
             {"name": "generations"},
         ]
         text = "Square brackets: 95 % intervals over the seeds, by Student's t."
-        named = {"name": self.file, "title": "Success", "picture": picture}
+        named = {"name": self.file, "title": "Success", "picture": picture if several else None}
         return [Table(table(results), text, columns, **named)]
 
 
