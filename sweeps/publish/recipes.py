@@ -341,8 +341,12 @@ RECIPES: dict[str, Recipe] = {
     "plans": recipe(f"rps sweeps/planning {_MACHINE}", cores=15),
     "replans": recipe(f"rps sweeps/planning {_MACHINE}", cores=15),
     "gradients_mjx": recipe(f"rps sweeps/gradients/mjx.py {_MACHINE}", cores=6),
-    "gradients_direction": recipe(f"rps sweeps/gradients/direction.py {_MACHINE}", cores=30),
-    "gradients_race": recipe(f"rps sweeps/gradients/race.py {_MACHINE}", cores=160),
+    "gradients_race": recipe(f"rps sweeps/gradients/race.py --counts 64 2048 {_MACHINE}", cores=80),
+    "gradients_race_13": recipe(
+        "rps sweeps/gradients/race.py --counts 13 --simulated 1e5 --wall 10 "
+        f"--file gradients_race_13 {_MACHINE}",
+        cores=20,
+    ),
     "robot": recipe(f"rps sweeps/speed/robot.py {_MACHINE}", cores=1),
     "dependencies": recipe(f"rps sweeps/publish/dependencies.py {_MACHINE}", cores=15),
     "extras": recipe(f"rps sweeps/publish/dependencies.py {_MACHINE}", cores=15),
