@@ -91,6 +91,8 @@ PROBES_OF: Mapping[str, tuple[str, ...]] = {
     "force_push_grid": ("real", "push_mujoco"),
     "floors_*": ("floor",),
     "drives": ("drives", "wide", "hostile", "real"),
+    "drives_omni": ("wide", "hostile", "real"),
+    "drives_engines": ("drives", "push_mujoco"),
     "engines_*": ("wide", "mujoco", "mjx", "quasistatic"),
     "export_*": ("export_c", "export_js", "wide"),
     "attack": ("attack", "tune_es"),

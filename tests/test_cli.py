@@ -3,6 +3,7 @@
 import gc
 import json
 import re
+import shlex
 import signal
 import subprocess
 import sys
@@ -13,11 +14,12 @@ import command_line
 import numpy as np
 import pytest
 import xarray as xr
-from helpers import printed, refusal, refusing, rps, setting_of
+from helpers import ROOT, printed, refusal, refusing, rps, setting_of
 
 import rps_jax
 from rps_jax.app.cli import flags, names, running
 from rps_jax.control import registry
+from rps_jax.errors import InputError
 from rps_jax.record import files
 from rps_jax.runs.question import Question
 from rps_jax.runs.sweep import merge
@@ -25,6 +27,14 @@ from rps_jax.trials.results import DIMS
 from rps_jax.tuning.evolution import TuneES
 from rps_jax.world import paper
 
+PAGES = [
+    page
+    for folder in ("docs", "notebooks", "rps_jax", "sweeps")
+    for page in (ROOT / folder).rglob("*.md")
+]
+COMMAND = re.compile(
+    r"(?:^|`|&& )(?:\.venv/bin/)?rps ((?:tune |export )?[a-z]+) (-[^`\n|>]*)(?:`|$)", re.M
+)
 SMALL = "table --targets 0.6 0 0.62 0.03 --horizon 18 --slots 8 --workers 1 --laws rps nps"
 SMALL += " --objects box nonuniform_box --out"
 
@@ -304,3 +314,19 @@ def test_an_interrupt_during_garbage_collection_is_raised_again(capsys):
     assert running.exit_code(action) == 130
     assert time.monotonic() - start_time < 15
     assert capsys.readouterr().err.endswith("rps: interrupted.\n")
+
+
+def test_pages_name_options_that_exist():
+    lines = {
+        line
+        for page in [ROOT / "README.md", *PAGES]
+        for line in COMMAND.findall(page.read_text(encoding="utf-8").replace("\\\n", " "))
+    }
+    assert len(lines) > 50
+    unknown = list[str]()
+    for name, options in sorted(line for line in lines if "--help" not in line[1]):
+        try:
+            flags.parse(names.question_type(name), name, shlex.split(options, comments=True))
+        except InputError as error:
+            unknown += [str(error)] * str(error).startswith("unknown option")
+    assert not unknown

@@ -181,14 +181,19 @@ def test_20_steps_of_adam_lower_the_loss_beyond_its_interval_in_fresh_worlds(thr
 SMALL = {"tuned": ("L", "K_h"), "steps": 9}
 
 
-def fake_results(question, validations):
-    """Return the vectors and kinds of the steps of a search with fixed results."""
+def fake_results(question, validations, dropped=None):
+    """Return the vectors and kinds of the steps of a search with fixed results.
+
+    The result of the step `dropped` drops windows.
+    """
     search, kinds, vectors = question.search(), [], []
     proposal = next(search)
     for value in validations:
         kinds.append(int(proposal["windows"]))
         vectors.append(proposal["vectors"][0].copy())
         results = proposal | {"base": np.array(1.0), "validation": np.array(value)}
+        if len(kinds) - 1 == dropped:
+            results["windows"] = np.array(0.0)
         proposal = search.send(results | {"gradients": np.ones((1, 2))})
     return kinds, vectors, proposal
 
@@ -216,26 +221,30 @@ def test_steps_by_derivatives_end_and_return_to_the_best_vector():
     assert (following["vectors"][0] < vectors[3]).all()
 
 
+def test_a_search_that_drops_windows_goes_on_from_the_best_vector():
+    question = TuneGrad("rps", **SMALL, window_steps=8, refresh=3)
+    nan = np.nan
+    kinds, vectors, _ = fake_results(question, [0.5, nan, nan, 0.8, 0.6], dropped=3)
+    assert kinds == [1, 1, 1, 1, 0]
+    np.testing.assert_array_equal(vectors[4], vectors[0])
+
+
 @pytest.fixture
 def checked(monkeypatch):
     """Return the results of the first step, whose derivatives are ones, for a rise along them.
 
     The score of whole trials rises by a number for a unit step of the parameters along (1, 1).
-    Slopes along random steps are twos.
     """
-    estimate = lambda x: Estimate(jnp.full(2, x), jnp.ones(2), jnp.ones(2))  # noqa: E731
+    ones = Estimate(*jnp.ones((3, 2)))
 
     def judge(rise, checks):
         question = TuneGrad("rps", **SMALL, checks=checks, sigma=0.5)
         proposal = next(question.search())
         states = SimpleNamespace(moments=np.eye(len(proposal["moments"])))
         monkeypatch.setattr(TuneGrad, "_collect", lambda *_: [states])
-        monkeypatch.setattr(TuneGrad, "_derivatives", lambda *_: estimate(1.0))
-        monkeypatch.setattr(TuneGrad, "antithetic", lambda *_: ("steps", lambda _: estimate(2.0)))
+        monkeypatch.setattr(TuneGrad, "_derivatives", lambda *_: ones)
 
         def score(requests):
-            if requests == ["steps"]:
-                return [None]
             answers = []
             for request in requests:
                 moved = np.asarray(question.space.vector(request.params)) - proposal["vectors"]
@@ -254,7 +263,7 @@ def test_derivatives_along_which_no_score_falls_are_dropped(checked, rise, check
     """A step goes against the derivatives. With checks=0 they are used without a check."""
     results = checked(rise, checks)
     assert results["windows"] == windows
-    np.testing.assert_array_equal(results["gradients"][0], np.full(2, 1.0 if windows else 2.0))
+    np.testing.assert_array_equal(results["gradients"][0], np.ones(2))
     np.testing.assert_allclose(results["slope"], rise if checks else np.nan, rtol=1e-4)
     np.testing.assert_allclose(results["slope_error"], 0.0 if checks else np.nan, atol=1e-4)
 
@@ -267,7 +276,8 @@ def test_derivatives_are_dropped_with_a_warning_where_all_scores_are_alike(check
 def test_features_have_the_target_and_not_the_pose_of_the_object():
     """Pose and offset of the contact predict failures by what both share with the world."""
     batch = draw_worlds("wide,objects=random_box,gap=0.3:0.3", setting=SETTING)
-    world, params = soften_skins(rows(batch.worlds, 0)), RPSParams.paper()
+    world = jax.tree.map(jnp.asarray, soften_skins(rows(batch.worlds, 0)))
+    params = RPSParams.paper()
     loop = control_loop(params, SETTING, smooth=True)
     first, still = trial.start(world, params, loop.law), world
 

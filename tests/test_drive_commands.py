@@ -58,6 +58,14 @@ def test_without_a_law_for_the_base_a_command_names_one_or_uses_it(name, drive, 
     assert not message or ("choose unicycle" in message and {"law", "laws"} & FIELDS[name])
 
 
+@pytest.mark.parametrize("drive", ROBOTS)
+def test_a_push_without_a_law_has_one_for_the_base(drive, tmp_path):
+    push = command("push", drive, tmp_path, law=False)
+    push.validate()
+    assert push.case.named_law == "unicycle"
+    assert push.configuration()["law"]["law"] == "UnicycleParams"
+
+
 def test_the_ladder_and_the_score_use_the_laws_that_the_base_can_follow():
     robot = ROBOTS["differential"]
     options = {"domain": DRUMS, "worlds": 2, "robot": robot, "setting": BRIEF}

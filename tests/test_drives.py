@@ -285,6 +285,56 @@ def test_the_smooth_law_tends_to_the_hard_one():
     np.testing.assert_allclose(smooth[:900], hard[:900], atol=1e-2)
 
 
+def stepped(contact, in_contact, base=0.0, **state):
+    """Return the state after one control step of a base on the x axis, with the target ahead."""
+    params = unicycle.UnicycleParams()
+    start = unicycle.init(params)._replace(**{k: jnp.asarray(x) for k, x in state.items()})
+    obs = observation([base, 0.0], 0.0, contact, in_contact, [5.0, 0.0])
+    return unicycle.step(params, start, obs._replace(axle=0.2))[0], params
+
+
+WAY = {  # contact on the way around the object, and whether the base then retreats or goes on
+    "middle of the front": ((0.3625, 0.1), False, False),
+    "end of the front": ((0.3625, 0.28), True, False),
+    "side near the front": ((0.3, 0.29), True, False),
+    "side": ((0.0, 0.29), False, True),
+}
+
+
+@pytest.mark.parametrize("name", WAY)
+def test_a_touch_on_the_way_is_a_push_a_retreat_or_moves_the_circle(name):
+    contact, retreats, goes_on = WAY[name]
+    state, _ = stepped(contact, True, touched=True, around=True, p_world_object=[-0.5, 0.8])
+    assert (bool(state.retreat), bool(state.around)) == (retreats, goes_on)
+    assert not state.align
+
+
+@pytest.mark.parametrize(
+    ("misses", "offset", "expected"),
+    [(0, 0.1, "contact"), (1, 0.1, "ahead"), (1, 0.28, "beside"), (2, 0.1, "beside")],
+)
+def test_after_approaches_that_miss_the_law_looks_where_an_object_is_not_felt(
+    misses, offset, expected
+):
+    known = {"touched": True, "p_world_object": [1.0, 0.0], "p_world_contact": [0.8, 0.1]}
+    state, params = stepped([0.0, 0.0], False, base=1.2, l=offset, misses=float(misses), **known)
+    front = 1.2 + 0.3625
+    guesses = {"contact": [0.8, 0.1], "ahead": [front + params.r, 0.0], "beside": [0.7, -0.75]}
+    np.testing.assert_allclose(state.p_world_object, guesses[expected], atol=1e-6)
+    assert state.retreat
+    assert state.misses == misses + 1
+
+
+def test_a_target_far_aside_ends_a_push_at_once():
+    params = unicycle.UnicycleParams()
+    for bearing in (0.9 * params.e_far, 1.1 * params.e_far):
+        contact = np.array([0.3625, 0.0])
+        target = contact + 3.0 * np.array([math.cos(bearing), math.sin(bearing)])
+        obs = observation([0.0, 0.0], 0.0, contact, True, target)._replace(axle=0.0)
+        state = unicycle.step(params, unicycle.init(params), obs)[0]
+        assert bool(state.retreat) == (bearing > params.e_far)
+
+
 def test_repositions_are_counted_with_their_time_and_way():
     """By hand, from the readings of each control step of a push that repositions."""
     setting = Setting(rules=Rules(horizon=60.0))

@@ -85,6 +85,19 @@ def test_a_whole_push_has_the_twists_of_python(law, browser):
     assert_allclose(computed, expected, rtol=0, atol=1e-5)
 
 
+def test_the_switch_of_the_base_offers_the_laws_that_it_can_follow(browser):
+    switch = """
+    by("base").value = arguments[0];
+    by("base").dispatchEvent(new Event("change"));
+    for (let i = 0; i < 50; i++) push.step();
+    return [push.options.law, [...by("law").options].map((x) => x.value)];
+    """
+    for base in [*MAKE["BASES"], "omni"]:
+        law, offered = browser.execute_script(switch, base)
+        assert offered == list(MAKE["LAWS"][base])
+        assert law == offered[0]
+
+
 ROUTE = [[0.4, 0.0], [1.5, 0.0], [2.5, 0.7], [4.0, 0.8]]
 IN_A_TASK = """
 const [task, route, corridor, door] = arguments;

@@ -12,7 +12,7 @@ def test_the_best_validation_within_a_budget_is_tested():
     columns = {"validation": [0.4, 0.3, 0.2, 0.1], "simulated": [10.0, 10.0, 20.0, 20.0]}
     columns |= {"run": [1.0, 10.0, 1.0, 1.0], "params.L": [1, 2, 3, 4]}
     curve = pd.DataFrame(columns)
-    choices = {("simulated", 40.0): 3, ("simulated", 25.0): 2, ("wall", 11.5): 2, ("wall", 0.1): 1}
+    choices = {("simulated", 40.0): 4, ("simulated", 25.0): 3, ("wall", 11.5): 3, ("wall", 0.1): 1}
     for (budget, amount), L in choices.items():
         assert race.law_of(race.best_within(curve, budget, amount)).L == L
     law = race.law_of(pd.Series({"params.l_cr": 0.12}))
@@ -30,9 +30,9 @@ def test_the_table_has_intervals_over_the_seeds():
     }
     coords = {"count": [64], "seed": [1, 2], "method": methods, "budget": ["wall 10 s"]}
     start, first, second = race.table(xr.Dataset(variables, coords))
-    assert start[:4] == ["64", "", "start", 0.5]
+    assert start[:4] == ["64", "", "start", 50.0]
     assert first[1:3] == ["wall time, 10 s", "derivatives"]
-    half = 12.7062 * 0.125  # of Student's t with 1 degree of freedom
-    assert_allclose(first[3], [0.875, 0.875 - half, 0.875 + half], rtol=1e-4)
+    half = 12.7062 * 12.5  # of Student's t with 1 degree of freedom
+    assert_allclose(first[3], [87.5, 87.5 - half, 87.5 + half], rtol=1e-4)
     assert first[5:] == ["75.0, 100.0", "+3 -0", "6"]
-    assert_allclose(second[4], [0.25, 0.25, 0.25])
+    assert_allclose(second[4], [25.0, 25.0, 25.0])

@@ -123,7 +123,7 @@ class View(Command[None], Case):
     def execute(self, callback: ProgressCallback) -> None:
         """Serve the page until it is ended."""
         law = registry.resolve_law(self.case.params)[0]
-        law = self.case.law if isinstance(self.case.law, str) else law
+        law = named if isinstance(named := self.case.named_law, str) else law
         request = PushRequest(self.object, label_of(self.friction), law, self.target)
         first = partial(self.push_of, request)
         if self.run is not None:

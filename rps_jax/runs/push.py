@@ -29,6 +29,7 @@ from rps_jax.errors import InputError
 from rps_jax.record import bag as bags
 from rps_jax.record import files, folder, provenance
 from rps_jax.record.bag import Step
+from rps_jax.record.files import JsonObject
 from rps_jax.record.options import option
 from rps_jax.runs.plan import (
     Plan,
@@ -273,7 +274,6 @@ class Push(Case, TraceQuestion, SimulationQuestion[Trace]):
 
     def __post_init__(self) -> None:
         """Defer the checks of `Case` to `check`."""
-        self.choose_law()
         SimulationQuestion.__post_init__(self)
 
     @property
@@ -284,6 +284,10 @@ class Push(Case, TraceQuestion, SimulationQuestion[Trace]):
     def case(self) -> Case:
         """The trial."""
         return Case(**case_options(self, self.setting, Case))
+
+    def fields_as_json(self) -> JsonObject:
+        named = self if self.law is not None else dataclasses.replace(self, law=self.named_law)
+        return super(Push, named).fields_as_json()
 
     def check(self) -> None:
         super().check()
