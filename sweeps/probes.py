@@ -104,6 +104,7 @@ PROBES_OF: Mapping[str, tuple[str, ...]] = {
     "real_pushes_*": ("real_pushes",),
     "gradients_*": ("planning", "tune_grad", "learn"),
     **dict.fromkeys(("ground", "straight"), ("push_mujoco", "push_fused")),
+    "support*": ("wide", "hardware"),
     "ceiling": ("ladder", "ceiling"),
     **dict.fromkeys(("ladder", "bearings", "plus", "saturation", "tuned"), ("ladder", *_TRIALS)),
     "rivals_tuned": ("ladder", "tune_es"),
