@@ -55,6 +55,9 @@ class Observation(NamedTuple):
     half_length: Annotated[
         Number | None, Spec("m", "half length of a rectangle with such an axle")
     ] = None
+    yaw_target: Annotated[
+        Scalar | None, Spec("rad", "heading of the goal, the direction of the last push; or None")
+    ] = None
 
     def with_base(self, radius: Number | None, robot: Robot | None = None) -> Observation:
         """Return it with the static facts of a base.
@@ -88,6 +91,25 @@ class TaxelObservation(NamedTuple):
     ]
 
 
+class EndsObservation(NamedTuple):
+    """Observation of a law that also senses where the contact on the front ends."""
+
+    touch: Observation  # `in_contact` is a bool
+    signal: Annotated[
+        Float[Array, " T"], Spec("1", "filtered relative change of capacitance; 0 for a dead taxel")
+    ]
+    alive: Annotated[Bool[Array, " T"], Spec("1", "whether each taxel works")]
+    ends: Annotated[
+        Float[Array, "2"], Spec("m", "offsets of the contact's left and right end; 0 without one")
+    ]
+    seen: Annotated[
+        Bool[Array, "2"], Spec("1", "whether the object ends there, not the front or its taxels")
+    ]
+    even: Annotated[
+        Bool[Array, ""], Spec("1", "whether a face lies flush on the front, over 3 taxels or more")
+    ]
+
+
 class ForceObservation(NamedTuple):
     """Observation of a law that also senses the contact force."""
 
@@ -105,7 +127,9 @@ class PoseObservation(NamedTuple):
     r_object: Annotated[Scalar, Spec("m", "radius of the object's outline")]
 
 
-AnyObservation = Observation | TaxelObservation | ForceObservation | PoseObservation
+AnyObservation = (
+    Observation | TaxelObservation | EndsObservation | ForceObservation | PoseObservation
+)
 
 
 Observed = TypeVar("Observed", bound=AnyObservation)

@@ -153,7 +153,7 @@ def check_params(params: Params) -> Params:
         of their law do not return what a trial needs.
     """
     law = law_of(params)
-    validation.check_law(law.init, law.step, law.senses, params)
+    validation.check_law(law.init, law.step, law.senses, params, heading=law.heading)
     law.check(params)
     return params
 
