@@ -48,7 +48,7 @@ from rps_jax import spec
 from rps_jax.control.base import ApproachSpeed, Law, OmegaMax, SpeedMax, SuccessDistance
 from rps_jax.control.observation import Details, EndsObservation, Twist
 from rps_jax.geometry import planar
-from rps_jax.geometry.arrays import Array, Number, Parameter
+from rps_jax.geometry.arrays import Array, Parameter
 from rps_jax.robot.shell import HALF_LENGTH
 from rps_jax.spec import Bound, Spec, document
 
@@ -446,6 +446,11 @@ def _turned2(values: Array, leg: Array) -> Array:
     return jnp.where(leg % 2 == 1, values[::-1], values)
 
 
+def is_done(state: PoseState) -> Array:
+    """Return whether the law is done."""
+    return state.done
+
+
 LAW = Law(
     init,
     step,
@@ -454,6 +459,6 @@ LAW = Law(
     drives=("omni", "differential"),
     room=1.5,
     heading=True,
-    is_done=lambda state: state.done,
+    is_done=is_done,
 )
 PRESETS = {"pose": PoseParams()}
