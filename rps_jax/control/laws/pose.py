@@ -56,7 +56,7 @@ PUSH, BACK, AROUND = 0, 1, 2  # modes
 _SIDE = 0.02  # [m] behind the front, where a contact is on a side
 _EDGE = 0.05  # [m] of contact beyond a known end, which contradicts it
 _FACING = 0.25  # [rad] between base and leg, up to which it feels the box
-_FLUSH, _UNEVEN = 0.4, -0.4  # [s] of even contact, and of uneven contact
+_FLUSH, _UNEVEN = 0.4, -1.0  # [s] of even contact, and of uneven contact
 _HALF = 0.07, 0.5  # [m] half widths of objects
 _CARROT, _AHEAD = 0.5, 1.0  # [rad] of the aim on the circle: omnidirectional or not
 _PAST = 0.5  # [m] of the front beyond m, at which an approach has failed
@@ -94,7 +94,7 @@ class PoseParams(NamedTuple):
     tries: Annotated[Parameter, Spec("1", "number of repetitions", ge=0)] = 3.0
     slope: Annotated[
         Parameter, Spec("1", "sideways over forward speed, Q6", ge=0, tune=Bound(0.02, 0.6))
-    ] = 0.2
+    ] = 0.12
     K_y: Annotated[
         Parameter,
         Spec("1/s", "gain of the sideways speed, Q6", ge=0, tune=Bound(0.02, 2, log=True)),
@@ -281,7 +281,7 @@ def step(
     is_off = (
         last_leg & feels & settled & (jnp.abs(y) > room + 0.01) & may_try & (left > s_min - 0.1)
     )
-    passed = last_leg & pushing & touched & (left < -0.03)
+    passed = last_leg & pushing & state.touched & (left < -0.03)
     at_end = last_leg & feels & (left < params.stop)
     misses = at_end & may_try & ((t_even < 0.3) | (both & (jnp.abs(y) > params.y_miss)))
     repeats = is_off | misses | (passed & may_try)
@@ -301,7 +301,8 @@ def step(
     ahead, box_left, behind, box_right = _turned(h, leg)
     along, across = _turned(fronts, leg)[0], _turned(bases, leg)[1]
     middle_across, middle_along = (box_left - box_right) / 2, (ahead - behind) / 2
-    wants = last_leg & feels & ~chooses & (t_even > 0.6) & ~has_looked & (left > 0.2)
+    wants = last_leg & feels & ~chooses & (t_even > 0.6) & ~has_looked & (left > 0.03)
+    wants = wants & (state.t_push > 0.6)
     target = jnp.where(
         known[1], h[1] - params.reach, jnp.where(known[3], params.reach - h[3], across + 0.4)
     )
