@@ -108,6 +108,7 @@ class EndsObservation(NamedTuple):
     even: Annotated[
         Bool[Array, ""], Spec("1", "whether a face lies flush on the front, over 3 taxels or more")
     ]
+    front: Annotated[Scalar, Spec("m", "distance of the front from the base's middle")]
 
 
 class ForceObservation(NamedTuple):

@@ -62,7 +62,7 @@ def observation_shapes(
     observations: dict[Senses, AnyObservation] = {
         "touch": touch,
         "taxels": TaxelObservation(touch, signal, flag),
-        "ends": EndsObservation(touch, signal, flags(taxels), shape(2), flags(2), flag),
+        "ends": EndsObservation(touch, signal, flags(taxels), shape(2), flags(2), flag, shape()),
         "force": ForceObservation(touch, shape(2)),
         "pose": PoseObservation(touch, shape(2), shape()),
     }

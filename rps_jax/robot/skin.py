@@ -320,6 +320,7 @@ class Ends(NamedTuple):
     ends: Float[Array, "2"]  # [m] offsets of the left and the right end; 0 without contact
     seen: Bool[Array, "2"]  # whether the object ends there, not the front or its taxels
     even: Bool[Array, ""]  # whether a face lies flush on the front
+    front: Floats  # [m] of the front from the base's middle
 
 
 def ends_of(
@@ -334,6 +335,7 @@ def ends_of(
     ahead, without force; a real one needs force, and its ends are blurred.
     """
     rows, length = shell.rows(), sum(side_lengths(*shell.sizes).values())
+    front = jnp.asarray(shell.half[0], signal.dtype)
     first = sum(x.taxels for x in shell.boards if x.side == "left")
     parts, counts = [], [x.taxels for x in shell.boards if x.side == "front"]
     for boards, row in zip(shell.boards, rows, strict=True):
@@ -343,7 +345,8 @@ def ends_of(
             parts.append(jnp.stack([length / 2 - middles, jnp.full(boards.taxels, pitch)], axis=-1))
     count = sum(counts)
     if not count:
-        return Ends(jnp.zeros(2, signal.dtype), jnp.zeros(2, bool), jnp.zeros((), bool))
+        nothing = jnp.zeros(2, signal.dtype), jnp.zeros(2, bool), jnp.zeros((), bool)
+        return Ends(*nothing, front)
     signal, alive = signal[first : first + count], alive[first : first + count]
     active = (signal > threshold) & alive
     border = jnp.ones(1, bool)
@@ -363,7 +366,7 @@ def ends_of(
     half = jnp.stack([left[1], -right[1]]) * (share - 0.5)
     ends = jnp.where(touches, jnp.stack([left[0], right[0]]) + half, 0.0)
     seen = (jnp.stack([left[3], right[4]]) < 0.5) | (share < _COVERED)
-    return Ends(ends, seen & is_even, is_even)
+    return Ends(ends, seen & is_even, is_even, front)
 
 
 def check_taxels(signal: np.ndarray, shell: Shell, source: str) -> None:

@@ -12,6 +12,7 @@ _TAXELS = """\
 """
 _ENDS = """\
       seen.even = contact.even;
+      seen.front = contact.front;
       for (int k = 0; k < 2; k++) seen.ends[k] = contact.ends[k];
       for (int k = 0; k < 2; k++) seen.seen[k] = contact.seen[k];
       for (int k = 0; k < {P}_TAXELS; k++) seen.signal[k] = contact.signal[k];

@@ -83,6 +83,7 @@ class Contact(NamedTuple):
     ends: Annotated[Leaf, Spec("m", "offsets of the contact's left and right end")] = None  # (2,)
     seen: Annotated[Leaf, Spec("1", "whether the object ends there")] = None  # (2,)
     even: Annotated[Leaf, Spec("1", "whether a face lies flush on the front")] = None
+    front: Annotated[Leaf, Spec("m", "distance of the front from the base's middle")] = None
 
 
 def program(law: registry.LawLike, robot: Any = "ideal", skin: Any = "capacitive") -> Program:

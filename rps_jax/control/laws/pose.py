@@ -2,40 +2,43 @@
 
 The goal is a point T with a heading theta. A box that a flat front pushes straight becomes flush by
 way alone. Once flush it stays in the grid of the goal if the base pushes only along theta + k pi/2,
-k = 0 to 3. So the law pushes in legs: back (k = 2) if there is too little way left, sideways (k = 1,
-3) onto the goal's line, and along theta (k = 0) onto T.
+k = 0 to 3. So the law pushes in legs: back (k = 2) where too little way is left, sideways (k = 1
+or 3) onto the goal's line, and along theta (k = 0) onto T.
 
-The law remembers the box that it feels in the grid: for d_j = u(theta + j pi/2), with u(x) the unit
-vector at the angle x, the supports h_j = max (p - T) . d_j over the points p of the box, and whether
-each is known. With the leg psi = theta + k pi/2, the front at F, the base at P, and the offsets
-e_left and e_right of the ends of an even contact:
+The law remembers the box that it feels, in the grid. With u(x) the unit vector at the angle x and
+d_j = u(theta + j pi/2), the box has the supports h_j = max (p - T) . d_j over its points p. Each is
+known or not. In a leg along d_k, with the middle F of the front, the base's middle P, and the
+offsets e_left and e_right of the ends of an even contact:
 
-  Q1  h_(k+2) = -(F - T) . d_k    the pushed face
-  Q2  h_(k+1) = (P - T) . d_(k+1) + e_left    where this end is seen
-      h_(k+3) = -(P - T) . d_(k+1) - e_right    where this one is
-  Q3  Both sides of an axis move by the change of a known one. An unknown side is where the contact
-      ends; the first touch of a face that was not known keeps the middle m of its axis.
+  Q1  h_(k+2) = -(F - T) . d_k,  the pushed face
+  Q2  h_(k+1) = (P - T) . d_(k+1) + e_left  and  h_(k+3) = -(P - T) . d_(k+1) - e_right,  if seen
+  Q3  the box moves with the front that touches it; both sides of an axis move by the change of a
+      known one; an unknown side is where the contact ends; the first touch of an unknown face keeps
+      the middle of its axis, if that was felt
 
-A contact that is uneven for 0.4 s forgets all sides: then the box is a square of half width r behind
-the contact. m is the middle of the box, in the grid; g = h_2 is the way that is left, y = m . d_1.
+A contact that is uneven for a second forgets all sides: then the box is a square of half width r
+behind the contact. Let g = h_2 be the way that is left, and m the middle of the box, left of the
+goal's line by y.
 
-  Q4  choice of a leg: k = 2 if g < s_min;  else k = 1, 3 towards y = 0 if |y| > y_tol + cap g;  else 0
-  Q5  end of a leg: k = 2 at g > s_min + s_back;  k = 1, 3 at y = 0;  k = 0 at g < stop
+  Q4  leg: k = 1 or 3 towards y = 0 if |y| > y_tol + cap g;  else k = 2 if g < s_min (s_flush if a
+      side is known);  else k = 0
+  Q5  its end: k = 2 at g > s_min + s_back;  k = 1 and 3 at y = 0;  k = 0 at g < stop
 
-The law is done where the last leg ends, unless the contact is uneven or |y| > y_miss; then it chooses
-again, up to `tries` times. It is also done at the time t_end.
+The law is done where the last leg ends, unless the contact is uneven or |y| > y_miss. Then it
+chooses again, up to `tries` times. It is also done at the time t_end. With the offset c to the left
+of the base of m, or of the goal's line in a last leg that touches:
 
-Within a leg, with the offset c of the aim to the left of the base, which is y of the last leg while
-the base touches, and m else:
+  Q6  push: v_x = v_max, slower near the end;  v_y = K_y c within slope v_x;  omega towards the leg
+  Q7  back off by `back`: contact lost or off the front, |c| > l_edge before the last 0.2 m, or a
+      new leg
+  Q8  around m on a circle R beyond the box to a point `gap` behind its face, turned to d_k; push
+  Q9  look: where the last leg does not know an end of its face, c is that of the point `beyond` the
+      end of the contact there; a base that stays in front of the face shifts sideways
 
-  Q6  push: v_x = v_max, slower near the end, v_y = K_y c within slope v_x, omega towards psi
-  Q7  back off, by `back`: contact lost, off the front, |m| > l_edge off the base, or a new leg
-  Q8  around m on a circle of radius R to m - R_s u(psi), turned to psi, then push
-  Q9  look: where an end of the last leg's face is not known, the next aim lies where this end is
-      expected, `reach` from the known one. A base that stays in front of the face shifts sideways.
-
-Back and around have the bounds v_free and omega_free. A base that cannot move sideways steers:
-omega = angle of psi + K_h c minus theta in Q6, as in `unicycle` in Q8, and does not look.
+Without contact v_free and omega_free are the bounds. A base that cannot move sideways steers in Q6:
+omega towards the leg + K_h c, within h_max; in Q8 it drives forwards or in reverse. The law needs a
+flat front. In its smooth form the contact is a weight that mixes the twists of Q6; modes and legs
+switch.
 """
 
 from functools import partial
@@ -49,7 +52,6 @@ from rps_jax.control.base import ApproachSpeed, Law, OmegaMax, SpeedMax, Success
 from rps_jax.control.observation import Details, EndsObservation, Twist
 from rps_jax.geometry import planar
 from rps_jax.geometry.arrays import Array, Parameter
-from rps_jax.robot.shell import HALF_LENGTH
 from rps_jax.spec import Bound, Spec, document
 
 PUSH, BACK, AROUND = 0, 1, 2  # modes
@@ -59,7 +61,7 @@ _FACING = 0.25  # [rad] between base and leg, up to which it feels the box
 _FLUSH, _UNEVEN = 0.4, -1.0  # [s] of even contact, and of uneven contact
 _HALF = 0.07, 0.5  # [m] half widths of objects
 _CARROT, _AHEAD = 0.5, 1.0  # [rad] of the aim on the circle: omnidirectional or not
-_PAST = 0.5  # [m] of the front beyond m, at which an approach has failed
+_PAST = 0.35  # [m] of the front beyond the face, at which an approach has failed
 _WIDER = 0.1  # [m] of the circle, after a touch on the way
 _TURNS = 0.8  # [rad] between base and leg, up to which the base turns while it touches
 
@@ -80,6 +82,9 @@ class PoseParams(NamedTuple):
     s_min: Annotated[
         Parameter, Spec("m", "least way of the last leg, Q4", ge=0, tune=Bound(0.1, 1))
     ] = 0.4
+    s_flush: Annotated[
+        Parameter, Spec("m", "the same, once the box was flush, Q4", ge=0, tune=Bound(0.02, 1))
+    ] = 0.15
     s_back: Annotated[Parameter, Spec("m", "more way, Q5", ge=0, tune=Bound(0, 0.5))] = 0.1
     y_tol: Annotated[Parameter, Spec("m", "error of a last leg, Q4", ge=0, tune=Bound(0, 0.1))] = (
         0.02
@@ -113,15 +118,15 @@ class PoseParams(NamedTuple):
         Parameter, Spec("m", "offset of a bad contact, Q7", ge=0, tune=Bound(0.05, 0.3))
     ] = 0.17
     back: Annotated[Parameter, Spec("m", "retreat, Q7", ge=0, tune=Bound(0.02, 0.6))] = 0.25
-    R: Annotated[Parameter, Spec("m", "radius of the circle, Q8", gt=0, tune=Bound(0.6, 1.4))] = (
-        0.95
-    )
-    R_s: Annotated[
-        Parameter, Spec("m", "distance of the staging point, Q8", gt=0, tune=Bound(0.5, 1.2))
-    ] = 0.78
-    reach: Annotated[
-        Parameter, Spec("m", "from the known end to the base, Q9", gt=0, tune=Bound(0.3, 0.8))
-    ] = 0.58
+    R: Annotated[
+        Parameter, Spec("m", "radius of the circle beyond the box, Q8", gt=0, tune=Bound(0.4, 1))
+    ] = 0.53
+    gap: Annotated[
+        Parameter, Spec("m", "gap at the staging point, Q8", gt=0, tune=Bound(0.03, 0.6))
+    ] = 0.12
+    beyond: Annotated[
+        Parameter, Spec("m", "of the base beyond the felt end, Q9", ge=-0.2, tune=Bound(-0.1, 0.2))
+    ] = 0.05
     looks: Annotated[Parameter, Spec("1", "number of looks in a leg, Q9", ge=0)] = 3.0
     t_end: Annotated[Parameter, Spec("s", "time at which the law gives up", gt=0)] = 290.0
 
@@ -228,7 +233,7 @@ def step(
     """Compute one control step."""
     touch, omni = obs.touch, obs.touch.axle is None
     axle = jnp.asarray(0.0 if touch.axle is None else touch.axle)
-    half_length = HALF_LENGTH if touch.half_length is None else touch.half_length
+    half_length = obs.front
     base, yaw, goal = touch.p_world_robot, jnp.asarray(touch.yaw), touch.p_world_target
     theta, touches = jnp.asarray(touch.yaw_target), jnp.asarray(touch.in_contact)
     u = planar.unit(yaw)
@@ -270,12 +275,12 @@ def step(
     y, way, left = (h[1] - h[3]) / 2, h[2], -fronts[0]
     both = known[1] & known[3]
     last_leg = leg == 0
-    s_min = jnp.where(state.tries > 0, 0.5, 1.0) * params.s_min
+    s_min = jnp.where(jnp.any(known), params.s_flush, params.s_min)
     may_try = state.tries < params.tries
     is_back = (leg == 2) & feels & (way > s_min + params.s_back)
     beside = jnp.where(leg == 1, y, -y)  # positive beyond the line
     is_beside = (leg % 2 == 1) & feels & (beside > -0.004)
-    has_looked = both | (state.looks >= params.looks) | (not omni)
+    has_looked = both | (state.looks >= params.looks)
     settled = (state.t_push > 2) & has_looked & ((t_even > 1) | (state.t_push > 6))
     room = params.y_tol + params.cap * jnp.maximum(left, 0.0)
     is_off = (
@@ -289,7 +294,7 @@ def step(
     chooses = first | is_back | is_beside | repeats
     room = params.y_tol + params.cap * jnp.maximum(way, 0.0)
     sideways = jnp.where((jnp.abs(y) > room) & ~is_beside, jnp.where(y > 0, 3, 1), 0)
-    leg_next = jnp.where((way < s_min) & ~is_off & ~is_beside, 2, sideways)
+    leg_next = jnp.where((sideways == 0) & (way < s_min) & ~is_off, 2, sideways)
     leg = jnp.where(chooses, leg_next, leg)
     tries = state.tries + repeats
     psi = theta + leg * (jnp.pi / 2)
@@ -303,9 +308,7 @@ def step(
     middle_across, middle_along = (box_left - box_right) / 2, (ahead - behind) / 2
     wants = last_leg & feels & ~chooses & (t_even > 0.6) & ~has_looked & (left > 0.03)
     wants = wants & (state.t_push > 0.6)
-    target = jnp.where(
-        known[1], h[1] - params.reach, jnp.where(known[3], params.reach - h[3], across + 0.4)
-    )
+    target = jnp.where(known[1], -h[3] - params.beyond, h[1] + params.beyond)
     look = jnp.where(wants, target, state.look)
     looking = (state.looking & ~(feels & (state.t_push > 0.5)) & ~turns) | wants
     looks = jnp.where(turns, 0.0, state.looks) + wants
@@ -316,9 +319,9 @@ def step(
     is_bad = ~on_front | ((jnp.abs(offset) > params.l_edge) & (~last_leg | (left > 0.2)))
     t_push = jnp.where(pushing, state.t_push + jnp.where(touches, touch.period, 0.0), 0.0)
     is_lost = (t_lost > 0.6) & (state.t_push > 0)
-    failed = pushing & touched & (state.t_push == 0) & ~touches & (along > middle_along + _PAST)
+    failed = pushing & touched & (state.t_push == 0) & ~touches & (along > _PAST - behind)
     h = jnp.where(failed, grid @ (p_world_contact - goal) + params.r, h)
-    known = known & ~failed
+    known, looking = known & ~failed, looking & ~failed
     patience = jnp.where(looks > 0, 0.1, 0.4)
     leaves = (touches & is_bad & (t_push > patience)) | is_lost | failed | turns | wants
     leaves = pushing & touched & leaves
@@ -347,7 +350,11 @@ def step(
     carrot = _CARROT if omni else _AHEAD
     behind_face = omni & (jnp.abs(face) < 0.1) & (along < -behind - 0.02) & (jnp.abs(offset) < 0.7)
     is_direct = (jnp.abs(turn) < carrot) | behind_face if omni else turn < carrot
-    R_s, R = params.R_s + axle + wider, params.R + axle + wider
+    half_along, half_across = (
+        jnp.clip(x, *_HALF) for x in ((ahead + behind) / 2, (box_left + box_right) / 2)
+    )
+    R_s = half_along + half_length + params.gap + axle + wider
+    R = params.R + jnp.hypot(half_along, half_across) + axle + wider
     staging = m - jnp.where(behind_face, -jnp.sum(away * ahead_u), R_s) * ahead_u
     aim = jnp.where(is_direct, staging, m + R * planar.unit(phi + side * carrot))
     to_aim = aim - p_world_axle
