@@ -311,6 +311,7 @@ RECIPES: dict[str, Recipe] = {
         section="Flat against round",
     ),
     "drives": recipe(f"rps sweeps/drives {_MACHINE}", cores=600, gpu=20),
+    "pose*": recipe(f"rps sweeps/pose {_MACHINE}", cores=120, gpu=5),
     "corridors_*": recipe(
         "rps sweeps/corridors --laws rps rps_tuned rps_plus learned force_push dipole aps "
         f"rps_tuned,sweeps/corridors/tuned.json {_MACHINE}",

@@ -13,15 +13,15 @@ offsets e_left and e_right of the ends of an even contact:
   Q1  h_(k+2) = -(F - T) . d_k,  the pushed face
   Q2  h_(k+1) = (P - T) . d_(k+1) + e_left  and  h_(k+3) = -(P - T) . d_(k+1) - e_right,  if seen
   Q3  the box moves with the front that touches it; both sides of an axis move by the change of a
-      known one; an unknown side is where the contact ends; the first touch of an unknown face keeps
-      the middle of its axis, if that was felt
+      known one, up to 3 cm; an unknown side is where the contact ends; the first touch of another
+      face keeps the middle of its axis, if that was felt
 
 A contact that is uneven for a second forgets all sides: then the box is a square of half width r
 behind the contact. Let g = h_2 be the way that is left, and m the middle of the box, left of the
 goal's line by y.
 
-  Q4  leg: k = 1 or 3 towards y = 0 if |y| > y_tol + cap g;  else k = 2 if g < s_min (s_flush if a
-      side is known);  else k = 0
+  Q4  leg: k = 2 if g < s_min, or s_flush where a side is known;  else k = 1 or 3 towards y = 0 if
+      |y| > y_tol + cap g;  else k = 0
   Q5  its end: k = 2 at g > s_min + s_back;  k = 1 and 3 at y = 0;  k = 0 at g < stop
 
 The law is done where the last leg ends, unless the contact is uneven or |y| > y_miss. Then it
@@ -49,7 +49,7 @@ import jax.numpy as jnp
 
 from rps_jax import spec
 from rps_jax.control.base import ApproachSpeed, Law, OmegaMax, SpeedMax, SuccessDistance
-from rps_jax.control.observation import Details, EndsObservation, Twist
+from rps_jax.control.observation import Details, EndsObservation, Observation, Twist
 from rps_jax.geometry import planar
 from rps_jax.geometry.arrays import Array, Parameter
 from rps_jax.spec import Bound, Spec, document
@@ -57,6 +57,7 @@ from rps_jax.spec import Bound, Spec, document
 PUSH, BACK, AROUND = 0, 1, 2  # modes
 _SIDE = 0.02  # [m] behind the front, where a contact is on a side
 _EDGE = 0.05  # [m] of contact beyond a known end, which contradicts it
+_SAME = 0.03  # [m] by which a face or an end may have moved between two contacts
 _FACING = 0.25  # [rad] between base and leg, up to which it feels the box
 _FLUSH, _UNEVEN = 0.4, -1.0  # [s] of even contact, and of uneven contact
 _HALF = 0.07, 0.5  # [m] half widths of objects
@@ -78,20 +79,20 @@ class PoseParams(NamedTuple):
     omega_free: Annotated[Parameter, Spec("rad/s", "bound on |omega| without contact", gt=0)] = 0.15
     r: Annotated[
         Parameter, Spec("m", "half width of an unknown object", gt=0, tune=Bound(0.1, 0.4))
-    ] = 0.2772
+    ] = 0.22
     s_min: Annotated[
         Parameter, Spec("m", "least way of the last leg, Q4", ge=0, tune=Bound(0.1, 1))
     ] = 0.4
     s_flush: Annotated[
         Parameter, Spec("m", "the same, once the box was flush, Q4", ge=0, tune=Bound(0.02, 1))
-    ] = 0.15
+    ] = 0.3
     s_back: Annotated[Parameter, Spec("m", "more way, Q5", ge=0, tune=Bound(0, 0.5))] = 0.1
     y_tol: Annotated[Parameter, Spec("m", "error of a last leg, Q4", ge=0, tune=Bound(0, 0.1))] = (
         0.02
     )
     cap: Annotated[
         Parameter, Spec("1", "error that the last leg corrects, Q4", ge=0, tune=Bound(0, 0.5))
-    ] = 0.08
+    ] = 0.05
     y_miss: Annotated[
         Parameter, Spec("m", "error of a last leg that is repeated", ge=0, tune=Bound(0, 0.1))
     ] = 0.025
@@ -120,7 +121,7 @@ class PoseParams(NamedTuple):
     back: Annotated[Parameter, Spec("m", "retreat, Q7", ge=0, tune=Bound(0.02, 0.6))] = 0.25
     R: Annotated[
         Parameter, Spec("m", "radius of the circle beyond the box, Q8", gt=0, tune=Bound(0.4, 1))
-    ] = 0.53
+    ] = 0.6
     gap: Annotated[
         Parameter, Spec("m", "gap at the staging point, Q8", gt=0, tune=Bound(0.03, 0.6))
     ] = 0.12
@@ -128,6 +129,9 @@ class PoseParams(NamedTuple):
         Parameter, Spec("m", "of the base beyond the felt end, Q9", ge=-0.2, tune=Bound(-0.1, 0.2))
     ] = 0.05
     looks: Annotated[Parameter, Spec("1", "number of looks in a leg, Q9", ge=0)] = 3.0
+    tau: Annotated[
+        Parameter, Spec("s", "time constant of the filter of the pose", ge=0, tune=Bound(0, 2))
+    ] = 0.5
     t_end: Annotated[Parameter, Spec("s", "time at which the law gives up", gt=0)] = 290.0
 
 
@@ -141,6 +145,9 @@ class PoseState(NamedTuple):
     centred: Annotated[jax.Array, Spec("1", "whether the middle of each axis was felt")]  # (2,)
     p_world_contact: Annotated[jax.Array, Spec("m", "the last contact")]  # (2,)
     p_world_front: Annotated[jax.Array, Spec("m", "middle of the front, a step before")]  # (2,)
+    p_world_base: Annotated[jax.Array, Spec("m", "filtered position of the base")]  # (2,)
+    yaw: Annotated[jax.Array, Spec("rad", "filtered heading of the base")]
+    twist: Annotated[jax.Array, Spec("m/s, m/s, rad/s", "last command")]  # (3,)
     touched: Annotated[jax.Array, Spec("1", "whether there was a contact")]
     time: Annotated[jax.Array, Spec("s", "time since the start")]
     t_lost: Annotated[jax.Array, Spec("s", "time since the last contact")]
@@ -172,8 +179,10 @@ def init(params: PoseParams) -> PoseState:
         centred=point > 0,
         p_world_contact=point,
         p_world_front=point,
+        p_world_base=point,
+        twist=jnp.zeros(3, zero.dtype),
         **dict.fromkeys(("touched", "looking", "done"), no),
-        **dict.fromkeys(("time", "t_lost", "t_push", "t_even", "look"), zero),
+        **dict.fromkeys(("yaw", "time", "t_lost", "t_push", "t_even", "look"), zero),
         **dict.fromkeys(("looks", "tries", "wider"), zero),
         **dict.fromkeys(("side", "gear"), zero + 1),
     )
@@ -185,6 +194,11 @@ def _turned(values: Array, leg: Array) -> Array:
     for k in (1, 2, 3):
         turned = jnp.where(leg == k, jnp.roll(values, -k), turned)
     return turned
+
+
+def _turned2(values: Array, leg: Array) -> Array:
+    """Return values (2,) of the two axes, from that of a leg on."""
+    return jnp.where(leg % 2 == 1, values[::-1], values)
 
 
 class Box(NamedTuple):
@@ -204,27 +218,49 @@ def feel(
     """
     (ahead, left, behind, right), known, centred = box
     flush = obs.even & (t_even > _FLUSH)
-    # The pushed face.
-    middle = jnp.where(centred[0], (ahead - behind) / 2, front + params.r)
+    # The pushed face: the box moves with it, or another face is there and the middle stays.
     near = -front
-    half = jnp.clip(middle - front, *_HALF)
-    moved = ahead - (near - behind)
-    far = jnp.where(known[2], moved, jnp.where(known[0], ahead, front + 2 * half))
+    same = known[2] & (jnp.abs(near - behind) < _SAME)
+    middle = jnp.where(centred[0], (ahead - behind) / 2, front + params.r)
+    mirrored = front + 2 * jnp.clip(middle - front, *_HALF)
+    keeps = known[0] & ~known[2]
+    far = jnp.where(same, ahead + behind - near, jnp.where(keeps, ahead, mirrored))
     ahead, behind = jnp.where(obs.even, far, ahead), jnp.where(obs.even, near, behind)
+    far_known = known[0] & (same | keeps | ~obs.even)
     # Its ends, as supports to the left and to the right.
     felt = jnp.stack([lateral + obs.ends[0], -(lateral + obs.ends[1])])
-    sides, is_known, seen = jnp.stack([left, right]), known[1::2], obs.seen & flush
-    is_known = is_known & (felt < sides + _EDGE)
+    sides, seen = jnp.stack([left, right]), obs.seen & flush
+    is_known = known[1::2] & (felt < sides + _EDGE)
+    is_same = is_known & (jnp.abs(felt - sides) < _SAME)
     share = jnp.where(t_even > 2 * _FLUSH, 0.1, 0.5)
-    measured = jnp.where(is_known, sides + share * (felt - sides), felt)
-    both = is_known[0] & is_known[1]
-    change = measured - sides
-    carried = jnp.where(both & seen[::-1], sides - change[::-1], sides)
+    measured = jnp.where(is_same, sides + share * (felt - sides), felt)
+    # Where one end is seen and not the other, this moves along if the face is the same.
+    is_known = is_known & (~seen[::-1] | is_same[::-1] | ~known[1::2][::-1])
+    change = jnp.where(known[1::2], measured - sides, 0.0)
+    carried = sides - jnp.where(seen[::-1], change[::-1], 0.0)
     sides = jnp.where(seen, measured, jnp.where(is_known, carried, felt))
     is_known = is_known | seen
-    known = jnp.stack([known[0], is_known[0], known[2] | flush, is_known[1]])
+    known = jnp.stack([far_known, is_known[0], known[2] | flush, is_known[1]])
     centred = jnp.stack([centred[0], centred[1] | flush])
     return Box(jnp.stack([ahead, sides[0], behind, sides[1]]), known, centred)
+
+
+def filtered_pose(params: PoseParams, state: PoseState, obs: Observation) -> tuple[Array, Array]:
+    """Return position (2,) [m] and yaw [rad] of the base, filtered by its last command."""
+    v, omega = state.twist[:2], state.twist[2]
+    guess = state.p_world_base + obs.period * planar.rotate(state.yaw, v)
+    yaw = state.yaw + obs.period * omega
+    share = jnp.where(state.time > 0, obs.period / (params.tau + obs.period), 1.0)
+    error = planar.wrap(jnp.asarray(obs.yaw) - yaw)
+    return guess + share * (obs.p_world_robot - guess), planar.wrap(yaw + share * error)
+
+
+def observe_sent(
+    params: PoseParams, state: PoseState, obs: EndsObservation, sent: Twist
+) -> PoseState:
+    """Return the state with the twist that moved the base."""
+    del params, obs
+    return state._replace(twist=jnp.stack([jnp.asarray(x, state.twist.dtype) for x in sent]))
 
 
 def step(
@@ -234,7 +270,7 @@ def step(
     touch, omni = obs.touch, obs.touch.axle is None
     axle = jnp.asarray(0.0 if touch.axle is None else touch.axle)
     half_length = obs.front
-    base, yaw, goal = touch.p_world_robot, jnp.asarray(touch.yaw), touch.p_world_target
+    base, yaw, goal = *filtered_pose(params, state, touch), touch.p_world_target
     theta, touches = jnp.asarray(touch.yaw_target), jnp.asarray(touch.in_contact)
     u = planar.unit(yaw)
     grid = planar.unit(theta + jnp.arange(4) * (jnp.pi / 2))  # (4, 2) d_j
@@ -288,13 +324,17 @@ def step(
     )
     passed = last_leg & pushing & state.touched & (left < -0.03)
     at_end = last_leg & feels & (left < params.stop)
-    misses = at_end & may_try & ((t_even < 0.3) | (both & (jnp.abs(y) > params.y_miss)))
+    # A drum is never flush: a long push and a repetition are enough.
+    is_uneven = (t_even < 0.3) & ((state.tries < 1) | (state.t_push < 20))
+    is_blind = (t_even >= 0.3) & ~has_looked
+    off_line = both & (jnp.abs(y) > params.y_miss)
+    misses = at_end & may_try & (is_uneven | is_blind | off_line)
     repeats = is_off | misses | (passed & may_try)
     done = state.done | (at_end & ~misses) | (passed & ~may_try) | (time > params.t_end)
     chooses = first | is_back | is_beside | repeats
     room = params.y_tol + params.cap * jnp.maximum(way, 0.0)
     sideways = jnp.where((jnp.abs(y) > room) & ~is_beside, jnp.where(y > 0, 3, 1), 0)
-    leg_next = jnp.where((sideways == 0) & (way < s_min) & ~is_off, 2, sideways)
+    leg_next = jnp.where((way < s_min) & ~is_off & ~is_beside, 2, sideways)
     leg = jnp.where(chooses, leg_next, leg)
     tries = state.tries + repeats
     psi = theta + leg * (jnp.pi / 2)
@@ -423,35 +463,34 @@ def step(
         for a, b in ((params.v_max, params.v_free), (params.omega_max, params.omega_free))
     ]
     twist = Twist(v, v_y, omega).saturate(*bounds)
-    details = Details(offset, left, mode + 10.0 * leg + 100.0 * tries, y, mode != PUSH)
+    distance = planar.norm(jnp.stack([left, y]))
+    details = Details(offset, distance, jnp.zeros_like(distance), face, mode != PUSH)
     memory = PoseState(
-        mode,
-        leg,
-        h,
-        known,
-        centred,
-        p_world_contact,
-        p_world_front,
-        touched,
-        time,
-        t_lost,
-        t_push,
-        t_even,
-        look,
-        looking,
-        looks,
-        tries,
-        wider,
-        side,
-        gear,
-        done,
+        mode=mode,
+        leg=leg,
+        h=h,
+        known=known,
+        centred=centred,
+        p_world_contact=p_world_contact,
+        p_world_front=p_world_front,
+        p_world_base=base,
+        yaw=yaw,
+        twist=jnp.stack(twist),
+        touched=touched,
+        time=time,
+        t_lost=t_lost,
+        t_push=t_push,
+        t_even=t_even,
+        look=look,
+        looking=looking,
+        looks=looks,
+        tries=tries,
+        wider=wider,
+        side=side,
+        gear=gear,
+        done=done,
     )
     return memory, twist, details
-
-
-def _turned2(values: Array, leg: Array) -> Array:
-    """Return values (2,) of the two axes, from that of a leg on."""
-    return jnp.where(leg % 2 == 1, values[::-1], values)
 
 
 def is_done(state: PoseState) -> Array:
@@ -468,5 +507,6 @@ LAW = Law(
     room=1.5,
     heading=True,
     is_done=is_done,
+    observe_sent=observe_sent,
 )
 PRESETS = {"pose": PoseParams()}
