@@ -329,10 +329,10 @@ def ends_of(
     """Return the ends of the contact on the front, from the signals [1] of the taxels.
 
     A contact is even if no inner taxel is much below the mean of the inner ones, which are pressed.
-    The object covers a share of the outermost taxels, which their signals give. An end is seen if
-    the contact is even, and the next taxel works and feels nothing, or the outermost one is not
-    covered. Offsets are those of `Observation.l`. The simulated foam senses an object up to 8 mm
-    ahead, without force; a real one needs force, and its ends are blurred.
+    The object covers a share of the outermost taxels: their signals over those of their inner
+    neighbours. An end is seen if the contact is even, and the next taxel works and feels nothing,
+    or the outermost one is not covered. Offsets are those of `Observation.l`. The simulated foam
+    senses an object up to 8 mm ahead, without force; a real one needs force, and blurs the ends.
     """
     rows, length = shell.rows(), sum(side_lengths(*shell.sizes).values())
     front = jnp.asarray(shell.half[0], signal.dtype)
@@ -349,9 +349,10 @@ def ends_of(
         return Ends(*nothing, front)
     signal, alive = signal[first : first + count], alive[first : first + count]
     active = (signal > threshold) & alive
-    border = jnp.ones(1, bool)
+    border, empty = jnp.ones(1, bool), jnp.zeros(1, signal.dtype)
     hidden = jnp.concatenate([border, ~alive[:-1]]), jnp.concatenate([~alive[1:], border])
-    columns = [*jnp.concatenate(parts).T, signal, *hidden]
+    beside = jnp.concatenate([signal[1:], empty]), jnp.concatenate([empty, signal[:-1]])
+    columns = [*jnp.concatenate(parts).T, signal, *hidden, *beside]
     table = jnp.stack([x.astype(signal.dtype) for x in columns], axis=-1)
     left, right = _extremes(active, table)
     inner = active & (table[:, 0] < left[0]) & (table[:, 0] > right[0])
@@ -361,7 +362,10 @@ def ends_of(
     top = jnp.maximum(jnp.where(total > 0, mean, outer), threshold)
     least = jnp.min(jnp.where(inner, signal, jnp.inf))
     is_even = (least > _EVEN * top) & (outer < _PROUD * top) & (top > _PRESSED) & (total > 0)
-    share = jnp.clip(jnp.stack([left[2], right[2]]) / top, 0.0, 1.0)
+    # Over the inner neighbour, so that a slight tilt is no end; this may be dead.
+    inside = jnp.stack([left[5], right[6]])
+    inside = jnp.where(inside > threshold, jnp.minimum(inside, top), top)
+    share = jnp.clip(jnp.stack([left[2], right[2]]) / inside, 0.0, 1.0)
     touches = jnp.any(active)
     half = jnp.stack([left[1], -right[1]]) * (share - 0.5)
     ends = jnp.where(touches, jnp.stack([left[0], right[0]]) + half, 0.0)
