@@ -42,12 +42,8 @@ CASES: dict[str, Case] = {
         "wide,objects=random_cylinder", OMNI, f"pose{FREE}"
     ),
     "wide, boxes | omnidirectional | 0.05 m/s": Case("wide,objects=random_box", OMNI, "pose"),
-    "wide, prisms | omnidirectional | 0.05 m/s": Case("wide,objects=random_prism", OMNI, "pose"),
     "wide, boxes | differential | 0.2 m/s": Case(
         "wide,objects=random_box", DIFFERENTIAL, f"pose_drive{FREE}"
-    ),
-    "wide, prisms | differential | 0.2 m/s": Case(
-        "wide,objects=random_prism", DIFFERENTIAL, f"pose_drive{FREE}"
     ),
     "real, boxes | omnidirectional | 0.2 m/s": Case("real,objects=random_box", None, f"pose{FREE}"),
     "hostile, boxes | omnidirectional | 0.2 m/s": Case(

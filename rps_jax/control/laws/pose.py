@@ -513,4 +513,15 @@ LAW = Law(
     is_done=is_done,
     observe_sent=observe_sent,
 )
-PRESETS = {"pose": PoseParams()}
+PRESETS = {
+    "pose": PoseParams(),
+    "pose_drive": PoseParams(  # for bases that cannot move sideways
+        s_min=0.6,
+        s_back=0.15,
+        l_edge=0.25,
+        back=0.3,
+        R=0.7,
+        gap=0.3,
+        looks=0.0,
+    ),
+}
