@@ -48,7 +48,7 @@ _NODES = 16  # points on each row of boards of the smooth ideal sensor
 _REACH = 8.0  # [1] temperatures beyond the tolerance at which the points end: weight 3e-4
 # [1] of an even contact: the least and the greatest signal over the mean, and the least mean.
 _EVEN, _PROUD, _PRESSED = 0.6, 1.35, 2.0
-_COVERED = 0.7  # [1] signal over the mean of a taxel that the object covers
+_COVERED = 0.5  # [1] signal over that of the neighbour, of a taxel that the object covers
 _NEVER = -1e9  # excess of a dead taxel over the threshold, in temperatures
 
 NONE, POINT, LINE = 0, 1, 2  # contact types, Fig. 6c

@@ -119,13 +119,13 @@ class PoseParams(NamedTuple):
     l_edge: Annotated[
         Parameter, Spec("m", "offset of a bad contact, Q7", ge=0, tune=Bound(0.05, 0.3))
     ] = 0.17
-    back: Annotated[Parameter, Spec("m", "retreat, Q7", ge=0, tune=Bound(0.02, 0.6))] = 0.25
+    back: Annotated[Parameter, Spec("m", "retreat, Q7", ge=0, tune=Bound(0.02, 0.6))] = 0.12
     R: Annotated[
         Parameter, Spec("m", "radius of the circle beyond the box, Q8", gt=0, tune=Bound(0.4, 1))
-    ] = 0.6
+    ] = 0.52
     gap: Annotated[
         Parameter, Spec("m", "gap at the staging point, Q8", gt=0, tune=Bound(0.03, 0.6))
-    ] = 0.12
+    ] = 0.06
     beyond: Annotated[
         Parameter, Spec("m", "of the base beyond the felt end, Q9", ge=-0.2, tune=Bound(-0.1, 0.2))
     ] = 0.05
