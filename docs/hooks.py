@@ -43,6 +43,7 @@ SECTIONS = {"rps_jax/law.md": "The law", "rps_jax/adding.md": "How to add"}
 TABS: dict[str, list[Any]] = {
     "Start": [
         "README.md",
+        "docs/start.md",
         {"Push it yourself": "push.html"},
         "docs/gallery.md",
         "docs/not_supported.md",

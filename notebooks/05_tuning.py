@@ -15,7 +15,7 @@
 # has their commands, and `runs/coarse`, `runs/fine` and `runs/robots` their logs.
 # `runs/compare/wide` has both sets of parameters in 1000 worlds that no tuner has used. After the
 # fine run we set one switch by hand: after a loss, the tuned law uses the last contact
-# (`keep_contact`). Only the section about gradients runs simulations.
+# (`keep_contact`).
 
 # %%
 import json
@@ -29,12 +29,9 @@ from IPython.display import Markdown
 import rps_jax
 from rps_jax import RPSParams
 from rps_jax.analysis import tables
-from rps_jax.analysis.figures import tuning as figures
+from rps_jax.analysis.figures import sweeps as figures
 from rps_jax.laws import Space
-from rps_jax.tuning import gradients
-from rps_jax.worlds import Case, IdealSkin
 from sweeps import render_tables
-from sweeps.gradients import estimators
 
 
 def read_log(run):
@@ -152,63 +149,7 @@ drawing.paired(results)
 # (above the diagonal).
 # `04_robustness` shows which objects gained.
 #
-# ## Usefulness of gradients
+# ## Gradients
 #
-# Evolution needs no derivatives. Are those of the simulator useful? Here the distance to the
-# target at three times, in the quasi-static model with smooth law and skin, is differentiated
-# with respect to four parameters (in the coordinates of tuning), and averaged over the paper's 24
-# targets. The estimators are automatic differentiation (forward mode, which compiles fastest),
-# central differences, and antithetic random steps in all four parameters at once. The last two
-# use equal numbers of trials.
-
-# %%
-names = ("L", "K_h", "K_v", "beta")
-space = Space(names)
-targets = rps_jax.load("runs/table")[["target_x", "target_y"]].to_dataframe().to_numpy()
-cases = [
-    Case("box", "S1", target, gap=0.004, skin=IdealSkin(temperature=0.001)) for target in targets
-]
-horizons = (1.0, 3.0, 10.0)  # [s]
-distances, starts = estimators.distances(cases, space.params, horizons)  # at all three times
-theta, key = space.vector(RPSParams.paper()), jax.random.key(0)
-options = gradients.Options
-estimates = {
-    "derivative": estimators.forward(distances, theta, starts),
-    "differences": estimators.differences(distances, theta, starts, options=options(sigma=0.01)),
-    "evolution": gradients.evolution(distances, theta, starts, key, options(sigma=0.15, pairs=4)),
-}
-means = {name: gradients.estimate(slopes) for name, slopes in estimates.items()}
-bars = {name: (mean.gradient.T, mean.variance.T) for name, mean in means.items()}
-drawing.estimates(horizons, bars, names)
-
-# %% [markdown]
-# Bars are two standard errors over the targets, so they contain the differences between targets
-# and the noise of an estimate. Derivatives and differences are equal at all times, and so are their
-# bars, which grow with the time. Evolution agrees within its bars, which are wider: many times
-# where a parameter matters little, as $K_v$ and $\beta$ in the first seconds, since all parameters
-# change at once, and up to five times at 10 s.
-#
-# A success takes about 80 s, and in the engine `fused` the derivatives of some random worlds
-# explode within 8 s (`10_gradients`). We tuned the law over whole trials by evolution. With one
-# box, 24 worlds and four parameters, this is an example and not a benchmark; `sweeps/gradients` has
-# the study.
-#
-# ## Gradients and evolution at equal cost
-#
-# In version 0.1.0 `rps tune grad` used windows of 8 s, which started at any time of a trial. The
-# cost of the remaining distance after a window was the time to drive it. `runs/race` has the logs
-# of four runs from the paper's parameters, in the same worlds: evolution and gradients with 2.4
-# million simulated seconds each, half of the run by gradients, and evolution that continued this
-# half.
-
-# %%
-logs = {name: read_log(f"race/{name}") for name in ("evolution", "gradient")}
-logs["gradient, then evolution"] = read_log("race/half") + read_log("race/hybrid")
-drawing.races(logs)
-
-# %% [markdown]
-# One step by gradients gains as much as the first generation of evolution, at equal cost. Further
-# steps by gradients gain nothing and steer ever more, perhaps because 8 s do not contain the later
-# effect on the contact. Evolution that continues from there, with a small spread, needs many
-# generations to improve. Today `rps tune grad` follows derivatives of windows with a value function
-# that knows failures, and then slopes of whole trials. `sweeps/gradients` has a race of slopes.
+# Evolution needs no derivatives. `10_gradients` and
+# [the race of the tuners](../sweeps/gradients/README.md) show when derivatives help.

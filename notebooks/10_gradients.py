@@ -93,11 +93,8 @@ axes[1].set(xlabel="horizon [s]", ylabel="median relative error [1]")
 _ = axes[0].legend(*axes[1].get_legend_handles_labels(), title="temperature of taxels")
 
 # %% [markdown]
-# A change of a box grows up to <!-- cell: gradients_growth | boxes | whole derivative | largest -->1.8e+13<!-- end -->-fold, without
-# the felt contact point <!-- cell: gradients_growth | boxes | without contact point | largest -->1.9e+02<!-- end -->-fold.
-#
-# The cause is this loop: the contact point moves along the face, the law turns the base, and the
-# object turns. A few worlds then dominate a mean over worlds. A bound on their norms (`clipped`) is
+# A change grows in this loop: the contact point moves along the face, the law turns the base, and
+# the object turns. A few worlds then dominate a mean over worlds. A bound on their norms (`clipped`) is
 # biased, wider taxels are another skin, and short windows lack later effects. Mean derivatives by
 # `K_h`, with their standard errors:
 
@@ -145,12 +142,7 @@ print(f"median error {np.median(error):.4f}, in {np.sum(error < 2 * precision**-
 # Derivatives of short windows alone do not tune a law: windows do not contain whether a push fails
 # later. `rps tune grad` adds a value function of their last states, which is fitted to whole trials
 # with their failures, and after some steps it follows slopes of whole trials along random steps.
-# `rps tune es` is evolution, or these slopes alone with `--estimator antithetic`
-# ([the race](../sweeps/gradients/README.md)). Success in held-out worlds by number of
-# tuned parameters, after equal wall time, from <!-- cell: gradients_race |  | success, mean -->89.0 %<!-- end --> at the
-# start:
+# [The race](../sweeps/gradients/README.md) compares it with these slopes alone and with evolution.
+# Success in held-out worlds after equal simulated time, by number of tuned parameters:
 #
-# - 13 parameters, slopes: <!-- cell: gradients_race | 13 | wall time | slopes | success, mean -->98.0 %<!-- end -->
-# - 13 parameters, evolution: <!-- cell: gradients_race | 13 | wall time | evolution | success, mean -->96.9 %<!-- end -->
-# - 6 parameters, slopes: <!-- cell: gradients_race | 6 | wall time | slopes | success, mean -->96.0 %<!-- end -->
-# - 6 parameters, evolution: <!-- cell: gradients_race | 6 | wall time | evolution | success, mean -->93.7 %<!-- end -->
+# RACE_CELLS

@@ -235,27 +235,6 @@ def paired(results: xr.Dataset) -> Figure:
 # --- tuning ----------------------------------------------------------------------------------
 
 
-def races(runs: Mapping[str, Sequence[Mapping]]) -> Figure:
-    """Plot the best validation so far of tuners' runs over the simulated time.
-
-    The log of a run that continues another is the concatenation of both logs.
-    """
-    figure = Figure(figsize=(9, 3.4), layout="constrained")
-    axes = figure.subplots(1, 2)
-    for name, log in runs.items():
-        simulated = np.cumsum([0.0] + [line["simulated"] for line in log[:-1]]) / 1e6
-        value = np.array([line["validation"] for line in log], float)
-        best = np.fmin.accumulate(value)
-        success = np.array([line["validation_success"] for line in log], float)
-        chosen = np.maximum.accumulate(np.where(value == best, np.arange(len(log)), 0))
-        for ax, values in zip(axes, (best, 100 * success[chosen]), strict=True):
-            ax.step(simulated, values, where="post", label=name)
-    for ax, label in zip(axes, ("objective [1]", "success [%]"), strict=True):
-        ax.set(xlabel="simulated [10$^6$ s]", ylabel=f"{label}, best mean so far")
-    axes[0].legend(fontsize=8)
-    return figure
-
-
 def between_bounds(fractions: Mapping[str, np.ndarray], names: Sequence[str]) -> Figure:
     """Plot sets of parameters (p,) as fractions between the bounds of tuning, from 0 to 1."""
     figure = Figure(figsize=(6, 0.8 + 0.27 * len(names)), layout="constrained")
@@ -269,30 +248,4 @@ def between_bounds(fractions: Mapping[str, np.ndarray], names: Sequence[str]) ->
     ax.set(xlim=(-0.02, 1.02), xlabel="position between the bounds of tuning [1]")
     ax.grid(alpha=0.3, axis="x")
     ax.legend(fontsize=8)
-    return figure
-
-
-def estimates(
-    horizons: Sequence[float],
-    bars: Mapping[str, tuple[np.ndarray, np.ndarray]],
-    names: Sequence[str],
-) -> Figure:
-    """Plot gradients (H, p) of estimators, with their variances, over horizons (H,) [s].
-
-    Bars are two standard errors to either side.
-    """
-    figure = Figure(figsize=(1 + 2.8 * len(names), 3.2), layout="constrained")
-    axes = figure.subplots(1, len(names), squeeze=False)[0]
-    for p, (ax, name) in enumerate(zip(axes, names, strict=True)):
-        for i, (label, (gradient, variance)) in enumerate(bars.items()):
-            x = np.asarray(horizons) * 1.06 ** (i - 1)
-            errors = 2 * np.sqrt(variance[:, p])
-            ax.errorbar(x, gradient[:, p], errors, fmt="o", ms=4, capsize=2, label=label)
-        ax.axhline(0, color="0.5", lw=0.8)
-        ax.set(xscale="log", xlabel="horizon [s]", title=name)
-        ax.set_xticks(horizons, [f"{h:g}" for h in horizons])
-        ax.minorticks_off()
-        ax.grid(alpha=0.3)
-    axes[0].set_ylabel("gradient [m]")
-    axes[0].legend(fontsize=8)
     return figure

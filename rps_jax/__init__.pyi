@@ -28,6 +28,7 @@ from rps_jax.tuning.descent import tune_grad as tune_grad
 from rps_jax.tuning.derivatives import value_and_grad as value_and_grad
 from rps_jax.tuning.learn import learn as learn
 from rps_jax.tuning.fit import fit as fit
+from rps_jax.tuning.objects import fit_object as fit_object
 from rps_jax.trials.env import PushEnv as PushEnv
 from rps_jax.trials.trajectory import draw_worlds as draw_worlds
 from rps_jax.trials.trajectory import rollout as rollout

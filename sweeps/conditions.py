@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from pathlib import Path
+from functools import partial
 from typing import Any, ClassVar, NamedTuple
 
 import jax
@@ -16,20 +16,18 @@ import numpy as np
 import xarray as xr
 
 from rps_jax import InputError, RPSParams, Setting
-from rps_jax.analysis import statistics
+from rps_jax.analysis import statistics, tables
 from rps_jax.laws import LawParams, law_of, resolve_law
 from rps_jax.physics import FRICTION, PHYSICS
 from rps_jax.questions import Run
-from rps_jax.record import files
-from rps_jax.record.checkpoint import Checkpoints
 from rps_jax.trials.batch_run import outcomes
-from rps_jax.trials.progress import Progress, ProgressCallback, SequentialProgress, no_progress
+from rps_jax.trials.progress import Progress, SequentialProgress
 from rps_jax.trials.pushes import Cases
 from rps_jax.trials.results import outcome_dataset
 from rps_jax.world import paper
 from rps_jax.world.scene import Friction
 from rps_jax.worlds import Case, parse_domain
-from sweeps.study_base import TrialStudy, load_part
+from sweeps.study_base import TrialStudy, part_of, stored_parts
 
 # Number of trials per call: more keep the device busier, fewer are lost when the run is killed.
 _TRIALS_AT_ONCE = {"cpu": 600, "gpu": 100_000}
@@ -93,33 +91,25 @@ class Condition:
         return params
 
 
-def run_conditions(
-    conditions: Mapping[str, Condition],
-    grid: Grid,
-    folder: Path | None,
-    *,
-    callback: ProgressCallback = no_progress,
-    **size: Any,
-) -> xr.Dataset:
+def run_conditions(conditions: Mapping[str, Condition], grid: Grid, run: Run) -> xr.Dataset:
     """Return outcomes (condition, law, object, friction, target).
 
-    A finished condition is a part of `folder`; only missing conditions are run. Without a folder
-    all conditions are run and nothing is stored.
-
-    Raises:
-      InputError: the folder has a condition of the same name with other options.
+    A finished condition is a part of the run folder; only missing conditions are run.
     """
-    parts = None if folder is None else Checkpoints(folder)
-    options = {name: _fingerprint(condition, grid) for name, condition in conditions.items()}
-    stored = {name: load_part(parts, name, options[name]) for name in conditions}
-    done = {name: results for name, results in stored.items() if results is not None}
-    progress = SequentialProgress(callback)
-    progress.finish(grid.size * len(done))
+    parts = {name: _part(name, condition, grid) for name, condition in conditions.items()}
+    stored, done = stored_parts(run), dict[str, xr.Dataset]()
+    missing = [name for name in conditions if parts[name] not in stored]
+    progress = SequentialProgress(run.callback)
+    progress.finish(grid.size * (len(conditions) - len(missing)))
     progress(Progress(0, 0.0))
-    for chunk in _chunks([name for name in conditions if name not in done], conditions, grid):
+    options = run._replace(callback=progress).batch_options
+
+    def checkpoint(name: str) -> xr.Dataset:
+        return run.checkpoint(parts[name], partial(done.__getitem__, name))
+
+    for chunk in _chunks(missing, conditions, grid):
         requests = [Cases(conditions[name].cases(grid)) for name in chunk]
-        setting = conditions[chunk[0]].setting
-        by_condition, timing = outcomes(requests, setting, callback=progress, **size)
+        by_condition, timing = outcomes(requests, conditions[chunk[0]].setting, **options)
         progress.finish(grid.size * len(chunk))
         share = 1 / len(chunk)  # of the time of the whole call
         for name, outcome in zip(chunk, by_condition, strict=True):
@@ -127,20 +117,17 @@ def run_conditions(
                 outcome, grid.laws, grid.objects, tuple(grid.friction), grid.targets
             )
             costs = {"run_time": timing.run * share, "simulated": timing.simulated * share}
-            results = results.assign_coords(costs).assign_attrs(run_as=options[name])
-            if parts is not None:
-                parts.put(name, files.encode_results(results))
-            done[name] = results
-    chosen = [done[name].drop_attrs(deep=False) for name in conditions]
+            done[name] = results.assign_coords(costs)
+            checkpoint(name)
     index = xr.IndexVariable("condition", list(conditions))
-    joined = xr.concat(chosen, index, coords=["run_time", "simulated"])
+    joined = xr.concat(map(checkpoint, conditions), index, coords=["run_time", "simulated"])
     return joined.assign_coords(what=("condition", [c.what for c in conditions.values()]))
 
 
-def _fingerprint(condition: Condition, grid: Grid) -> str:
-    """Return everything that the outcomes depend on, as text."""
+def _part(name: str, condition: Condition, grid: Grid) -> str:
+    """Return the name of a part by all that its outcomes depend on."""
     plain = replace(condition, what="", params=dict(condition.params), case=dict(condition.case))
-    return f"{plain!r} {grid._replace(friction=dict(grid.friction))!r}"
+    return part_of(name, plain, grid._replace(friction=dict(grid.friction)))
 
 
 def _chunks(
@@ -164,12 +151,12 @@ def condition_rows(results: xr.Dataset, baseline: str, law: str = "rps") -> list
     """
     part = results.sel(law=law)
     base = part.success.sel(condition=baseline)
-    names = [str(name) for name in part.condition.values]
+    names = part.condition.values.tolist()
     comparisons = [statistics.compare(base, part.success.sel(condition=name)) for name in names]
     compared = [i for i, name in enumerate(names) if name != baseline]
     q = np.ones(len(names))
     q[compared] = statistics.false_discovery([comparisons[i].p for i in compared])
-    objects = [str(o) for o in part.object.values]
+    objects = part.object.values.tolist()
     table = [["reading", *objects, "all", "median time", "against the first"]]
     for i, name in enumerate(names):
         trials = part.sel(condition=name)
@@ -183,7 +170,7 @@ def condition_rows(results: xr.Dataset, baseline: str, law: str = "rps") -> list
                 str(trials.what.values),
                 *(" ".join(map(str, row)) for row in counts),
                 f"{succeeded.sum()} of {succeeded.size}",
-                f"{np.median(time):.1f} s" if time.size else "-",
+                tables.median(time),
                 difference,
             ]
         )
@@ -218,4 +205,4 @@ class ConditionStudy(TrialStudy[xr.Dataset]):
 
     def answer(self, run: Run) -> xr.Dataset:
         """Run the conditions that are missing."""
-        return run_conditions(self.chosen, self.grid, run.folder, **run.batch_options)
+        return run_conditions(self.chosen, self.grid, run)

@@ -16,13 +16,12 @@ import numpy as np
 
 from rps_jax import Range, RPSParams, Setting
 from rps_jax.laws import LawParams
-from rps_jax.physics import FRICTION, Physics, preset
+from rps_jax.physics import FRICTION, preset
 from rps_jax.trials import pushes, trial
 from rps_jax.trials.jobs import WorldBatch, rows
 from rps_jax.trials.trial import ControlLoop, Trial, World
 from rps_jax.trials.worlds import drawn_worlds
 from rps_jax.world import draws, paper
-from rps_jax.world.physics import MUJOCO_GROUND
 from rps_jax.worlds import Case, parse_domain
 
 FAMILIES = ("box", "cylinder", "prism")
@@ -32,23 +31,12 @@ _PRISMS = replace(
     frictions=(FRICTION["S1"],),
     gap=Range(0.0, 0.0),
 )
-_MUJOCO_DEFAULTS = Physics(
-    timestep=0.002,
-    cone="pyramidal",
-    impratio=1.0,
-    iterations=100,
-    ls_iterations=50,
-    tolerance=1e-8,
-    **MUJOCO_GROUND,
-)
 # Timed programs, batched on JAX's device.
 BATCHED = {
     "fused standard": Setting(engine="fused"),
     "fused fast": Setting(engine="fused", physics=preset(fidelity="fast")),
     "quasistatic": Setting(engine="quasistatic"),
     "mjx standard": Setting(engine="mjx"),
-    "mjx fast": Setting(physics=preset(fidelity="fast"), engine="mjx"),
-    "mjx, MuJoCo's defaults": Setting(physics=_MUJOCO_DEFAULTS, engine="mjx"),
 }
 
 

@@ -8,6 +8,7 @@ whether later code gives the same numbers.
 
 from __future__ import annotations
 
+import hashlib
 import inspect
 import json
 import os
@@ -19,19 +20,17 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, S
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any, ClassVar, NamedTuple, Self, TypeVar
+from typing import Any, ClassVar, NamedTuple, TypeVar
 
 import jax
 import numpy as np
 import xarray as xr
 
 from rps_jax import InputError, errors
-from rps_jax.engines import device
 from rps_jax.questions import Picture, Plan, Run, Section
-from rps_jax.record import files, options, provenance
-from rps_jax.record.checkpoint import Checkpoints
+from rps_jax.record import options, provenance
 from rps_jax.runs import execution
-from rps_jax.runs.question import Question, TrialQuestion, quick_command, quick_note
+from rps_jax.runs.question import Question, QuickQuestion, TrialQuestion
 from rps_jax.runs.results import PlanRequest, Results
 from rps_jax.trials.batch_run import run_batch
 from rps_jax.trials.progress import Progress, ProgressCallback, SequentialProgress, no_progress
@@ -176,21 +175,8 @@ class Study(Question[T]):
 
 
 @dataclass(frozen=True, kw_only=True)
-class QuickStudy(Study[T]):
+class QuickStudy(Study[T], QuickQuestion[T]):
     """Base class of studies that have a small run."""
-
-    quick: bool = False
-    """Whether to make a small run of minutes on two cores; explicit options keep their values."""
-
-    IGNORED_FIELDS: ClassVar[tuple[str, ...]] = ("quick",)
-
-    def with_quick_values(self) -> Self:
-        """Return the study with its quick values, if `quick` is set."""
-        return quick_command(self) if self.quick else self
-
-    def quick_note(self) -> str:
-        """Return the first line of the report of a quick run."""
-        return quick_note(self) if self.quick else ""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -242,7 +228,7 @@ def run_process(words: Sequence[str | Path], problem: str, folder: Path | None =
 
 def machine() -> str:
     """Return a description of the device of this process."""
-    used, count = jax.devices()[0], device.count_processors()
+    used, count = jax.devices()[0], len(os.sched_getaffinity(0))
     if used.platform != "cpu":
         return f"one {used.device_kind} and {count} processors"
     model = platform.processor() or platform.machine()
@@ -257,6 +243,11 @@ def machine() -> str:
 def part_name(*labels: object) -> str:
     """Return the name of a part of a run folder."""
     return re.sub(r"\W+", "_", "_".join(map(str, labels)))
+
+
+def part_of(label: str, *options: object) -> str:
+    """Return the name of a part of a run folder that other options would not give."""
+    return part_name(label, hashlib.sha256(repr(options).encode()).hexdigest()[:8])
 
 
 def stored_parts(run: Run) -> Collection[str]:
@@ -274,34 +265,6 @@ def run_parts(run: Run, dim: str, parts: Parts, trials: int = 1) -> xr.Dataset:
         computed.append(run.checkpoint(part_name(label), compute))
         run.callback(Progress(trials * len(computed), 0.0))
     return xr.concat(computed, xr.IndexVariable(dim, list(parts)))
-
-
-def load_part(parts: Checkpoints | None, name: str, options: str) -> xr.Dataset | None:
-    """Return the results of a part if they are stored.
-
-    Raises:
-      InputError: their attribute `run_as` differs from the options.
-    """
-    if parts is None or (content := parts.get(name)) is None:
-        return None
-    results = files.decode_results(content, parts.folder / name)
-    if results.attrs.get("run_as") != options:
-        raise InputError(
-            f"{parts.folder / name}-*.nc was run with other options: choose another folder, or "
-            "delete the file to run the part again."
-        )
-    return results
-
-
-def load_or_compute(
-    parts: Checkpoints | None, name: str, options: str, compute: Callable[[], xr.Dataset]
-) -> xr.Dataset:
-    """Return a part that is stored with the same options, or compute and store it."""
-    if (results := load_part(parts, name, options)) is None:
-        results = compute().assign_attrs(run_as=options)
-        if parts is not None:
-            parts.put(name, files.encode_results(results))
-    return results.drop_attrs(deep=False)
 
 
 def run_plans(run: Run, plans: Mapping[str, Plan]) -> dict[str, xr.Dataset]:

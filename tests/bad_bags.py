@@ -1,7 +1,5 @@
 """Bags of many kinds: reordered, of other formats, frames and names, and invalid.
 
-    python tests/bad_bags.py            # print the table: kind, expected, result
-
 Each case writes a bag of the same push, and expects either the steps of the plain bag or a sentence
 that contains some words. `tests/test_bags.py` runs all cases.
 """
@@ -14,13 +12,10 @@ import math
 import random
 import sqlite3
 import struct
-import tempfile
-import zipfile
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import lz4.frame
 import numpy as np
 import zstandard
 from mcap.reader import NonSeekingReader
@@ -403,27 +398,6 @@ def changed(change: Callable[[Record], Record]) -> Writer:
     return lambda folder: mcap(map(change, encode(rows())))(folder)
 
 
-def idl(record: Record) -> str:
-    """Return the definition of a type, and of those in it, as IDL."""
-    names, parts = [record.kind], []
-    bases = {"float64": "double", "float32": "float", "uint8": "octet", "bool": "boolean"}
-    for name in names:
-        package, _, short = name.split("/")
-        fields = []
-        for field, (node, desc) in STORE.fielddefs[name][1]:
-            inner, size = (desc[0], desc[1]) if node.value > 2 else ((node, desc), None)
-            if inner[0].value == 2 and inner[1] not in names:
-                names.append(inner[1])
-            word = inner[1].replace("/", "::") if inner[0].value == 2 else inner[1][0]
-            word = bases.get(word, word)
-            word = f"sequence<{word}>" if node.value == 4 else word
-            fields.append(f"{word} {field}{f'[{size}]' if node.value == 3 else ''};")
-        struct_ = f"struct {short} {{ {' '.join(fields)} }};"
-        module = f"module {package} {{ module msg {{ {struct_} }}; }};"
-        parts.append(f"{'=' * 80}\nIDL: {name}\n{module}\n")
-    return "".join(parts)
-
-
 def several(folder: Path) -> Path:
     """Write a folder of two bags without metadata."""
     for name in ("push/a.mcap", "push/b.mcap"):
@@ -440,19 +414,7 @@ def changed_folder(change: Callable[[Path], object], parts: int = 1) -> Writer:
     return write
 
 
-def zipped(folder: Path) -> Path:
-    with zipfile.ZipFile(folder / "bag.zip", "w") as archive:
-        archive.write(plain(rows())(folder), "bag.mcap")
-    return folder / "bag.zip"
-
-
 # --- cases ---------------------------------------------------------------------------------
-
-
-def shuffled(seed: int) -> list[Row]:
-    result = rows()
-    random.Random(seed).shuffle(result)
-    return result
 
 
 def repeated() -> list[Row]:
@@ -540,7 +502,7 @@ TOUCH = ("contact_type", "p_robot_contact", "target")  # fields that laws of tou
 LINE = ((0.0, 0.0), (3.0, 1.0), (6.0, 2.0))  # [m] a path
 POINTER = b"version https://git-lfs.github.com/spec/v1\noid sha256:4d7a2146\nsize 12345\n"
 STAMPED = ("/odom", "/target", "/object", "/contact", "/force", "/cmd_vel")
-NAN, INF = float("nan"), float("inf")
+NAN = float("nan")
 
 
 def turned_force(message: dict[str, Any]) -> None:
@@ -572,18 +534,16 @@ def _order() -> dict[str, tuple[Any, ...]]:
     return {
         "as written": (whole,),
         "topic after topic": (sorted_,),
-        "topics in the reverse order": (sorted(rows(), key=lambda r: r.topic, reverse=True),),
         "commands before observations of the same stamp": (
             sorted(rows(), key=lambda r: (r.time, r.topic != "/cmd_vel")),
         ),
         "the whole file reversed": (whole[::-1],),
-        **{f"shuffled, {seed}": (shuffled(seed),) for seed in range(3)},
-        "shuffled, small chunks": (plain(shuffled(3), chunk_size=500),),
+        "shuffled, small chunks": (
+            plain(random.Random(3).sample(whole, len(whole)), chunk_size=500),
+        ),
         "a receipt back by 5 s": (received(lambda r, _: r.time - 5 * SECOND, "/odom", [9]),),
-        "a receipt at 0": (received(lambda r, _: 0, "/cmd_vel", [9]),),
         "a receipt ahead by an hour": (received(lambda r, _: r.time + hour, "/cmd_vel", [9]),),
         "receipts repeated": (received(lambda r, i: SECOND + i // 2 * 40 * MS, "/cmd_vel"),),
-        "all receipts of a topic equal": (received(lambda r, _: SECOND, "/target"),),
         "receipts late by 80 ms": (received(lambda r, _: r.time + 80 * MS),),
         "receipts by another clock": (received(lambda r, _: r.time + late),),
         "receipts of stamped topics late by 0 to 9 ms": (
@@ -599,13 +559,10 @@ def _order() -> dict[str, tuple[Any, ...]]:
             (),
             1e-6,
         ),
-        "no stamps": (stamped(lambda t: 0),),
         "no stamps, shuffled": (random.Random(1).sample(stamped(lambda t: 0), len(whole)),),
-        "no stamps of the target": (stamped(lambda t: 0, ["/target"]),),
         "no stamps of the target, receipts late by 80 ms": (
             [r._replace(time=r.time + 80 * MS) for r in stamped(lambda t: 0, ["/target"])],
         ),
-        "commands without header": (as_twist(whole), "", {"cmd_vel": "/plain"}),
         "commands without header, reversed": (as_twist(whole[::-1]), "", ["cmd_vel=/plain"]),
         "commands without header, receipts by another clock": (
             as_twist(received(lambda r, _: r.time + late)),
@@ -622,18 +579,12 @@ def _order() -> dict[str, tuple[Any, ...]]:
             edited("/odom", set_("header.stamp", {"sec": 1}), [9]),
             "a header stamp that goes back on /odom at 1.000 s",
         ),
-        "a header stamp of a command is 0": (
-            edited("/cmd_vel", set_("header.stamp", {}), [9]),
-            "goes back on /cmd_vel at 0.000 s",
-        ),
         "sim time and system time mixed": (
             [r for r in by_system if r.topic != "/taxels"],
             "in the 1 s before that on /cmd_vel",
         ),
         "sim time and system time mixed, taxels": (by_system, "of other topics, on /taxels"),
         "a simulation 20 times slower than the clock": (received(lambda r, _: 20 * r.time),),
-        "a simulation slower than the clock": (received(lambda r, _: r.time * 5 // 4),),
-        "a simulation 10 times faster than the clock": (received(lambda r, _: r.time // 10),),
         "a simulation that pauses, and then is slower": (
             received(lambda r, _: r.time if r.time < 1400 * MS else 3 * r.time + hour),
         ),
@@ -665,20 +616,10 @@ def _formats() -> dict[str, tuple[Any, ...]]:
         }.items()
     }
     return folders | {
-        "MCAP without compression": (plain(whole, compression=CompressionType.NONE),),
         "MCAP with lz4": (plain(whole, compression=CompressionType.LZ4),),
-        "MCAP without chunks": (plain(whole, use_chunking=False),),
-        "MCAP without summary": (plain(whole, **NO_INDEX),),
         "MCAP without chunks and summary": (plain(whole, use_chunking=False, **NO_INDEX),),
         "MCAP without checksums": (plain(whole, enable_crcs=False),),
-        "MCAP with small chunks": (plain(whole, chunk_size=300),),
-        "MCAP without profile": (plain(whole, profile=""),),
-        "suffix .MCAP": (plain(whole, name="BAG.MCAP"),),
         "suffix .txt": (plain(whole, name="bag.txt"),),
-        "suffix .db3 of an MCAP file": (plain(whole, name="bag.db3"),),
-        "schemas in IDL": (plain(whole, schema="ros2idl", text=idl),),
-        "schemas in OMG IDL": (plain(whole, schema="omgidl", text=idl),),
-        "schemas without text": (plain(whole, text=lambda r: ""),),
         "schemas without text and language": (plain(whole, schema="", text=lambda r: ""),),
         "types without msg": (changed(lambda r: r._replace(kind=r.kind.replace("/msg/", "/"))),),
         "big endian": (changed(big_endian),),
@@ -692,7 +633,6 @@ def _formats() -> dict[str, tuple[Any, ...]]:
         "a file .mcap.zstd": (file_of(folder_of("MCAP", "FILE")),),
         "a file .db3.zstd": (file_of(folder_of("SQLITE3", "FILE")),),
         "a file .db3": (file_of(folder_of("SQLITE3")),),
-        "a file .DB3": (file_of(folder_of("SQLITE3"), "PUSH.DB3"),),
         "a file .db3 named .mcap": (file_of(folder_of("SQLITE3"), "push.mcap"),),
         "a file .db3, messages compressed": (file_of(folder_of("SQLITE3", "MESSAGE")),),
         "a file .db3 without definitions": (old_sqlite,),
@@ -704,12 +644,9 @@ def _formats() -> dict[str, tuple[Any, ...]]:
 
 def _invalid_files() -> dict[str, tuple[Any, ...]]:
     """Return files that are no bags, or damaged."""
-    whole, bomb = rows(), bytes(2**27)
+    whole = rows()
     return {
         "an empty file": (content(b""), "is no bag of ROS 2): give FILE.mcap"),
-        "an empty file .db3": (content(b"", "bag.db3"), "is no bag of ROS 2"),
-        "a text": (content(b"time,x,y\n"), "is no bag of ROS 2): give FILE.mcap"),
-        "a zip archive": (zipped, "is no bag"),
         "a pointer of Git LFS": (content(POINTER), "fetch the file itself by `git lfs pull`"),
         "a folder of pointers of Git LFS": (
             changed_folder(lambda p: (p / "push 0.mcap").write_bytes(POINTER)),
@@ -717,10 +654,6 @@ def _invalid_files() -> dict[str, tuple[Any, ...]]:
         ),
         "a path that is missing": (lambda f: f / "none.mcap", "No such file"),
         "a cut MCAP file": (cut(plain(whole), 0.5), "is cut off or damaged, save the rest"),
-        "a cut MCAP file without chunks": (
-            cut(plain(whole, use_chunking=False), 0.5),
-            "is cut off or damaged, save the rest",
-        ),
         "an MCAP file without end": (cut(plain(whole, **NO_INDEX), 0.99), "is cut off"),
         "a wrong bit": (flipped, "cannot be read (crc validation failed"),
         "a cut file .db3": (cut(file_of(folder_of("SQLITE3")), 0.5), ".recover | sqlite3"),
@@ -728,7 +661,6 @@ def _invalid_files() -> dict[str, tuple[Any, ...]]:
         "zstd of no bag": (content(zstandard.compress(b"no"), "a.zstd"), "is no bag of ROS 2"),
         "another sqlite3 file": (other_sqlite, "no such table: topics"),
         "ROS 1": (ros1_bag, "convert this ROS 1 bag by `rosbags-convert --src"),
-        "messages in JSON": (plain(whole, encoding="json"), "in the encoding json"),
         "messages in protobuf": (
             plain(whole, encoding="protobuf", schema="protobuf"),
             "in the encoding protobuf",
@@ -738,7 +670,6 @@ def _invalid_files() -> dict[str, tuple[Any, ...]]:
             "has a nav_msgs/Odometry in the encoding cdr on /odom that cannot be decoded",
         ),
         "a schema of odd text": (plain(whole, text=lambda r: "~?"),),
-        "a schema of other fields": (plain(whole, text=lambda r: "byte x"),),
         "an empty folder": (lambda f: f, "metadata.yaml'): give FILE.mcap"),
         "a folder of two bags": (several, "a folder of them (`ros2 bag reindex FOLDER`"),
         "a folder that lacks a file": (
@@ -750,12 +681,12 @@ def _invalid_files() -> dict[str, tuple[Any, ...]]:
             "ros2 bag reindex",
         ),
         "a chunk larger than it says, zstd": (
-            content(chunked(zstandard.compress(bomb), 100, "zstd")),
+            content(chunked(zstandard.compress(bytes(2**27)), 100, "zstd")),
             "more than 67108864 bytes",
         ),
-        "a chunk larger than it says, lz4": (
-            content(chunked(lz4.frame.compress(bomb), 100, "lz4")),
-            "more than 67108864 bytes",
+        "a record of a terabyte": (
+            content(b"\x89MCAP0\r\n" + struct.pack("<BQ", 5, 2**40) + bytes(1000)),
+            "cannot be read",
         ),
         "an unknown compression": (content(chunked(b"?", 100, "br")), "the compression br, "),
         "a receipt as text": (odd_sqlite, "cannot be decoded"),
@@ -776,13 +707,11 @@ def _frames() -> dict[str, tuple[Any, ...]]:
     no_path = "has {} in the frame {}, and no transform from it to {}".format
     return {
         "frames with a slash": (framed("/target", "/odom", framed("/contact", "/base_link")),),
-        "odom with a slash": (framed("/odom", "/odom"),),
         "empty frames": (framed("/target", "", framed("/contact", "", framed("/cmd_vel", ""))),),
         "empty frames of odom": (
             edited("/odom", set_("child_frame_id", ""), source=framed("/odom", "")),
         ),
         "frames with a prefix": (prefixed(),),
-        "a target in map, static": ([*from_map, STATIC["map"]],),
         "a target in map, static, and a message without transforms": (
             [Row("/tf", SECOND, {"transforms": []}), *from_map, STATIC["map"]],
         ),
@@ -823,17 +752,8 @@ def _frames() -> dict[str, tuple[Any, ...]]:
             [r for r in base_target() if r.topic != "/odom" or r.time > 1.2 * SECOND],
             "no transform of odom to base_link at the time of the message on /target at 1.040 s",
         ),
-        "a contact in a camera": (
-            framed("/contact", "camera"),
-            no_path("/contact", "camera", "base_link"),
-        ),
         "a force in a wheel": (framed("/force", "wheel"), no_path("/force", "wheel", "base_link")),
-        "an object in map": (framed("/object", "map"), no_path("/object", "map", "odom")),
         "commands in odom": (framed("/cmd_vel", "odom"), "publish commands in base_link"),
-        "commands in a tool": (
-            framed("/cmd_vel", "tool"),
-            no_path("/cmd_vel", "tool", "base_link"),
-        ),
         "commands in a turned frame": (
             [*turned, STATIC["turned"]],
             "publish commands in base_link",
@@ -860,8 +780,6 @@ def _topics() -> dict[str, tuple[Any, ...]]:
     texts = [f"{key}={name}" for key, name in names.items()]
     one = [r for r in whole if r.topic != "/cmd_vel" or r.time < 1.01 * SECOND]
     return {
-        "other names": (other, "", names),
-        "other names, as texts": (other, "", texts),
         "other names, in one text": (other, "", ",".join(texts)),
         "names without slash": ([r._replace(topic=r.topic[1:]) for r in whole],),
         "names that are not told": (
@@ -877,7 +795,6 @@ def _topics() -> dict[str, tuple[Any, ...]]:
         "a wrong name of an optional topic": (whole, "no messages on /ft", {"force": "/ft"}),
         "a wrong key": (whole, "unknown key of a topic 'odometry'", {"odometry": "/odom"}),
         "a key twice": (whole, "name each once", ["odom=/odom", "odom=/o"]),
-        "a key alone": (whole, "topic = odom is not allowed", ["odom"]),
         "a topic of another type": (
             whole,
             "has a std_msgs/Float32MultiArray in the encoding cdr on /taxels that cannot",
@@ -920,26 +837,20 @@ def _values() -> dict[str, tuple[Any, ...]]:
     norm, tilt = "whose norm is not 1", "that tilts beyond 0.1 rad"
     quaternions = {
         "a quaternion of zeros": ({}, norm),
-        "a quaternion of norm 2": ({"w": 2.0}, norm),
         "a quaternion of norm 1.01": ({"w": 1.01}, norm),
-        "a quaternion as Euler angles": ({"z": 1.3}, norm),
         "a quaternion with NaN": ({"z": NAN, "w": 1.0}, "a number that is not finite"),
         "a base on its side": ({"x": 0.7071068, "w": 0.7071068}, tilt),
         "a quaternion with w first": ({"x": 1.0}, tilt),
     }
     fields = (
         ("/odom", "pose.pose.position.x", NAN),
-        ("/odom", "pose.pose.position.y", INF),
         ("/target", "point.x", NAN),
-        ("/target", "point.y", -INF),
         ("/contact", "polygon.points", [{"x": NAN}]),
-        ("/contact", "polygon.points", [{"y": INF}]),
         ("/taxels", "data", [NAN] * 42),
         ("/force", "wrench.force.x", NAN),
-        ("/object", "pose.position.y", NAN),
         ("/object", "scale.x", NAN),
         ("/cmd_vel", "twist.linear.x", NAN),
-        ("/cmd_vel", "twist.angular.z", INF),
+        ("/cmd_vel", "twist.angular.z", float("inf")),
     )
 
     def opposite(message: dict[str, Any]) -> None:
@@ -1014,24 +925,3 @@ def result_of(case: Case, folder: Path, expected: dict[str, np.ndarray]) -> str:
         if not difference <= case.atol:
             return f"{name} differs by {difference:.3g}"
     return ""
-
-
-def main() -> None:
-    """Print the table of all cases."""
-    print("| kind | expected | result |\n|---|---|---|")
-    with tempfile.TemporaryDirectory() as name:
-        expected = reference(Path(name))
-        for i, case in enumerate(ALL):
-            folder = Path(name) / str(i)
-            folder.mkdir()
-            result = result_of(case, folder, expected)
-            fine = case.expected in result if case.expected else not result
-            words = f"a sentence: {case.expected}" if case.expected else "the same steps"
-            verdict = "" if fine else "WRONG: "
-            cells = case.kind, words, verdict + (result or "the same steps")
-            print("|", " | ".join(x.replace(name, "").replace("|", "\\|") for x in cells), "|")
-    print(f"\n{len(ALL)} bags")
-
-
-if __name__ == "__main__":
-    main()

@@ -1,17 +1,12 @@
 """Tables of one push as users write them, each with the result that is expected of a fit's reader.
 
-    python tests/bad_tables.py
-
-prints kind, expected result and result of each. A table is equal to the reference, or is refused
-with words that the sentence must contain.
+A table is equal to the reference, or is refused with words that the sentence must contain.
 """
 
 import bz2
 import gzip
 import io
 import lzma
-import sys
-import tempfile
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
@@ -159,20 +154,15 @@ CASES: dict[str, Case] = {
     # What pandas, Excel, R, NumPy and ROS write.
     "plain": Case(text()),
     "semicolons": Case(text(sep=";")),
-    "tabs": Case(text(sep="\t"), suffix=".tsv"),
     "bars": Case(text(sep="|")),
     "blanks": Case(lambda: push().to_string(index=False).encode(), suffix=".txt"),
     "comma and blank": Case(lines(lambda rows: [row.replace(",", ", ") for row in rows])),
-    "decimal commas": Case(text(sep=";", decimal=",")),
     "decimal commas after tabs": Case(text(sep="\t", decimal=",")),
     "decimal commas in quotes": Case(text(decimal=",")),
     "quotes": Case(text(quoting=1)),
     "BOM": Case(text(encoding="utf-8-sig")),
-    "UTF-16": Case(text(encoding="utf-16", sep="\t")),
     "UTF-16 without BOM": Case(text(encoding="utf-16-le")),
     "Latin-1": Case(text(units(yaw=("yaw [°]", DEG)), encoding="latin-1")),
-    "CRLF": Case(lines(list, "\r\n")),
-    "CR": Case(lines(list, "\r")),
     "CRCRLF": Case(lines(list, "\r\r\n")),
     "blank lines": Case(lines(lambda rows: ["", *rows[:50], "", ",,,,,,,,,,,", *rows[50:]])),
     "comments": Case(lines(lambda rows: ["# of robot 3", "% a;b", *rows[:9], "#,,", *rows[9:]])),
@@ -180,7 +170,6 @@ CASES: dict[str, Case] = {
     "numpy.savetxt": Case(lambda: savetxt(header=" ".join(TITLES)), suffix=".dat"),
     "numpy.savetxt without header": Case(lambda: savetxt(delimiter=","), "has no header"),
     "sep= of Excel": Case(lines(lambda rows: ["sep=;", *rows], sep=";", decimal=",")),
-    "index column": Case(text(index=True)),
     "named index": Case(text(index=True, index_label="step")),
     "row names of R": Case(
         lines(
@@ -189,22 +178,17 @@ CASES: dict[str, Case] = {
             quoting=2,
         )
     ),
-    "trailing commas": Case(lines(lambda rows: [row + "," for row in rows])),
     "trailing commas below": Case(lines(lambda rows: [rows[0], *(r + "," for r in rows[1:])])),
     "additional columns": Case(text(lambda t: t.assign(note="a, b", battery=np.nan))),
     "order": Case(text(lambda t: t[t.columns[::-1]])),
     "capitals": Case(text(CAPITALS)),
     "surrounding blanks": Case(lines(lambda rows: [r.replace(",", " , ") for r in rows])),
     "minus sign": Case(lines(lambda rows: [r.replace("-", "\N{MINUS SIGN}") for r in rows])),
-    "upper suffix": Case(text(), suffix=".CSV"),
-    "gzip": Case(lambda: gzip.compress(text()()), suffix=".csv.gz"),
     "gzip, upper suffix": Case(lambda: gzip.compress(text()()), suffix=".CSV.GZ"),
-    "gzip named CSV": Case(lambda: gzip.compress(text()())),
     "bzip2": Case(lambda: bz2.compress(text()()), suffix=".csv.bz2"),
     "xz": Case(lambda: lzma.compress(text()()), suffix=".csv.xz"),
     "zip": Case(zipped, suffix=".csv.zip"),
     "cut gzip": Case(lambda: gzip.compress(text()())[:900], "cannot be unpacked", suffix=".csv.gz"),
-    "Excel": Case(lambda: zipped("xl/workbook.xml"), "save its sheet as CSV"),
     "Excel by name": Case(
         lambda: zipped("xl/workbook.xml"), "save its sheet as CSV", suffix=".xlsx"
     ),
@@ -227,26 +211,20 @@ CASES: dict[str, Case] = {
         "row 9, column x, but '1.234,5'",
     ),
     "empty": Case(lambda: b"", "is empty"),
-    "delimiters alone": Case(lambda: b",,,\n,,\n", "is empty"),
     "lines above the header": Case(
         lines(lambda rows: ["Log of robot 3", *rows]), "write # before lines of text"
     ),
-    "header alone": Case(lines(lambda rows: rows[:1]), "is empty"),
     "binary": Case(lambda: bytes(range(1, 256)) * 9, "has no header"),
     # Titles and units.
-    "units": Case(text(UNITS)),
     "other units": Case(text(units(**OTHER))),
-    "nanoseconds": Case(text(units(time=("time [ns]", 1e9)))),
     "unknown unit": Case(
         text(renamed(x="x [px]")), r"unit of the column 'x \[px\]' in .*: 'px': choose from m, cm"
     ),
-    "--columns": Case(text(renamed(**SHORT)), columns=PAIRS),
     "columns as a mapping": Case(
         text(renamed(**SHORT)), columns={k: f" {x}" for k, x in SHORT.items()}
     ),
     "--columns with a unit": Case(text(units(yaw=("heading", DEG))), columns="yaw=heading[deg]"),
     "--columns of a title with a unit": Case(text(units(yaw=("h [deg]", DEG))), columns="yaw=h"),
-    "--columns of a suffix": Case(text(units(yaw=("yaw_deg", DEG))), columns="yaw=yaw_deg"),
     "--columns of SI suffixes": Case(
         text(renamed(x="x_m", yaw="a_rad")), columns="x=x_m,yaw=a_rad"
     ),
@@ -256,16 +234,11 @@ CASES: dict[str, Case] = {
     "--columns of an unknown title": Case(
         text(), "unknown title for yaw in .*: 'yow': .*did you mean 'yaw'", "yaw=yow"
     ),
-    "--columns of an unknown name": Case(text(), "unknown column of a log 'yow'", "yow=yaw"),
     "--columns without =": Case(text(), "columns = yaw is not allowed", "yaw"),
     "--columns twice": Case(text(), "name each once", "yaw=x,yaw=y"),
     "missing columns": Case(
         text(lambda t: renamed(yaw="yaw_rad", omega="Omega_z")(t.drop(columns="y"))),
         "lacks the columns y, yaw, omega: .*write --columns 'y=TITLE,yaw=yaw_rad,omega=Omega_z'",
-    ),
-    "missing column": Case(
-        text(renamed(time="t")),
-        "lacks the column time: .*write --columns 'time=t' with its titles, as t",
     ),
     "titles of another program": Case(
         text(
@@ -301,7 +274,6 @@ CASES: dict[str, Case] = {
         "row 2, column contact_x, but an empty cell and 9 more",
     ),
     "nan": Case(text(cell(7, "yaw", "nan")), "row 9, column yaw, but 'nan'"),
-    "inf": Case(text(cell(7, "v_x", "inf")), "row 9, column v_x, but 'inf'"),
     "text": Case(
         text(lambda t: CAPITALS(cell(7, "yaw", "left")(t))), "row 9, column Yaw, but 'left'"
     ),
@@ -333,9 +305,6 @@ CASES: dict[str, Case] = {
         "row 52, column time, but '1,000' and 349 more",
         "time=time[ms]",
     ),
-    "short row": Case(
-        lines(lambda rows: [*rows[:8], "1,2,3", *rows[9:]]), "row 9, column yaw, but an empty cell"
-    ),
     "cut file": Case(lambda: text()()[:-40], "row 401, column contact_y, but an empty"),
     "long row": Case(
         lines(lambda rows: [*rows[:8], rows[8] + ",5", *rows[9:]]), "has 13 cells in row 9"
@@ -344,7 +313,6 @@ CASES: dict[str, Case] = {
     "kind of contact": Case(text(lambda t: t.assign(contact_type=3)), "contact_type = 3 in row 2"),
     # Times.
     "ISO date-times": Case(text(stamps("%Y-%m-%dT%H:%M:%S.%f%z"))),
-    "date-times": Case(text(stamps("%Y-%m-%d %H:%M:%S.%f"))),
     "durations": Case(text(stamps(""))),
     "Unix stamps": Case(text(lambda t: t.assign(time=t.time + 1_772_360_100)), "later"),
     "Unix stamps [ns]": Case(
@@ -362,15 +330,12 @@ CASES: dict[str, Case] = {
         "row 9, column time, but 'soon'",
     ),
     "milliseconds": Case(text(scaled(time=1e3)), r"a row every 20 s.*'time \[ms\]'"),
-    "nanoseconds as seconds": Case(text(scaled(time=1e9)), "a row every 2e[+]07 s.*name the unit"),
     "time falls": Case(text(cell(9, "time", 0)), "its time must rise, and is 0 s in row 11"),
     "time repeated": Case(text(lambda t: t.assign(time=t.time.round(1))), "its time must rise"),
     # Units that no title names.
-    "wrapped yaw": Case(text(lambda t: t.assign(yaw=(t.yaw + np.pi) % (2 * np.pi) - np.pi))),
     "wrapped yaw in degrees": Case(
         text(lambda t: t.assign(yaw=(DEG * t.yaw + 180) % 360 - 180)), columns="yaw=yaw[deg]"
     ),
-    "yaw in degrees": Case(text(scaled(yaw=DEG)), "yaw may be in deg"),
     "wrapped degrees": Case(
         text(lambda t: t.assign(yaw=(DEG * t.yaw + 180) % 360 - 180)),
         "pose that jumps: yaw from .* 'yaw .deg.'",
@@ -381,14 +346,11 @@ CASES: dict[str, Case] = {
     "yaw and omega in degrees": Case(text(scaled(yaw=DEG, omega=0.5 * DEG)), "yaw may be in deg"),
     "omega in degrees": Case(text(scaled(omega=DEG)), "omega may be in deg/s"),
     "position in mm": Case(text(scaled(x=MM, y=MM)), "x and y may be in mm"),
-    "position in cm": Case(text(scaled(x=100, y=100)), "x and y may be in mm or cm"),
     "speed in mm/s": Case(text(scaled(v_x=MM)), "v_x and v_y may be in mm/s"),
-    "speed in cm/s": Case(text(scaled(v_x=100)), "v_x and v_y may be in mm/s or cm/s"),
     "all lengths in mm": Case(
         text(scaled(x=10, y=10, v_x=10, contact_x=MM, contact_y=MM)),
         "contact_x and contact_y may be in mm",
     ),
-    "contact in mm": Case(text(scaled(contact_x=MM, contact_y=MM)), "contact_y may be in mm"),
     "contact in cm": Case(
         text(scaled(contact_x=100, contact_y=100)), "contact_y may be in mm or cm"
     ),
@@ -447,9 +409,3 @@ def result_of(case: Case, folder: Path) -> str:
 def reference(folder: Path) -> Path:
     """Write the reference table."""
     return write(Case(text()), folder)
-
-
-if __name__ == "__main__":
-    with tempfile.TemporaryDirectory() as name:
-        for kind, case in CASES.items():
-            sys.stdout.write(f"{kind} | {case.expected} | {result_of(case, Path(name))}\n")

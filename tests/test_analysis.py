@@ -40,15 +40,6 @@ def drawn(tmp_path):
     return draw
 
 
-def test_mcnemars_exact_test_by_hand():
-    a = xr.DataArray([1, 1, 1, 1, 1, 1, 0, 0])
-    b = xr.DataArray([0, 0, 0, 0, 0, 1, 0, 0])
-    c = statistics.compare(a, b)
-    # Five of five differences have one sign: 2 / 2^5.
-    assert (c.gained, c.lost, c.p) == (0, 5, pytest.approx(0.0625))
-    assert statistics.compare(a, a).p == 1.0
-
-
 @pytest.mark.parametrize(("gains", "losses"), [(0.1, 0.1), (0.05, 0.3), (0.01, 0.0), (0.5, 0.2)])
 def test_the_interval_of_a_paired_difference_covers(gains, losses):
     """Exactly, over all counts of gains and losses in 40 pairs; the least coverage is 94 %."""
@@ -363,15 +354,6 @@ def test_fig_6_shows_contact_on_the_side_and_covers_nothing_by_a_legend(drawn):
 
 
 # --- bounds --------------------------------------------------------------------------------
-
-
-def test_exact_bounds_by_hand():
-    # No failure in n worlds: the upper end solves (1 - p)^n = 0.025.
-    assert statistics.clopper_pearson(0, 50) == (0, pytest.approx(1 - 0.025 ** (1 / 50)))
-    assert statistics.clopper_pearson(0, 0) == statistics.wilson(0, 0) == (0, 1)
-    # One-sided, and for the best of ten: (1 - p)^n = 0.05 and 0.005.
-    assert statistics.fails_at_most(0, 50) == pytest.approx(1 - 0.05 ** (1 / 50))
-    assert statistics.fails_at_most(0, 50, 10) == pytest.approx(1 - 0.005 ** (1 / 50))
 
 
 def test_the_bound_of_the_best_of_many_holds_where_the_plain_one_fails():

@@ -5,13 +5,11 @@
 
 import json
 import math
-import struct
 
 import bad_bags
 import numpy as np
 import pytest
 import xarray as xr
-import zstandard
 from helpers import (
     SLOTS,
     printed,
@@ -126,18 +124,6 @@ def test_a_bag_gives_the_same_steps_or_one_sentence(case, tmp_path, plain_steps)
     assert case.expected in result if case.expected else not result
 
 
-def test_the_twists_of_a_law_do_not_depend_on_the_order_of_a_bag(recorded, tmp_path):
-    """Nor on the names of its topics."""
-    expected = shadow(recorded[0], "rps_plus")
-    records = bad_bags.records_of(recorded[0].read_bytes())
-    by_topic = sorted(records, key=lambda r: r.topic)
-    moved = [r._replace(topic=f"/r1{r.topic}") for r in records[::-1]]
-    topics = {key: f"/r1/{key}" for key in ("odom", "target", "contact", "taxels", "cmd_vel")}
-    for i, (reordered, names) in enumerate(((by_topic, {}), (records[::-1], {}), (moved, topics))):
-        path = bad_bags.mcap(reordered, name=f"{i}.mcap")(tmp_path)
-        xr.testing.assert_identical(shadow(path, "rps_plus", topics=names), expected)
-
-
 def test_the_commands_take_the_names_of_topics(recorded, tmp_path, capsys):
     moved = [
         r._replace(topic=f"/r1{r.topic}") for r in bad_bags.records_of(recorded[0].read_bytes())
@@ -205,13 +191,6 @@ def steps(count=3, **changes):
     return [step._replace(time=0.02 * i) for i in range(count)]
 
 
-def error_of(path):
-    with pytest.raises(rps_jax.InputError) as error:
-        bag.read(path)
-    assert str(error.value).count("\n") == 0
-    return str(error.value)
-
-
 def test_a_bag_stores_pose_period_and_contact(tmp_path):
     rows = [step._replace(pose=(1, 2, 2.5 * i)) for i, step in enumerate(steps(4, contact_type=2))]
     columns = bag.read(bag.write(tmp_path / "a.mcap", rows, {}))
@@ -219,19 +198,6 @@ def test_a_bag_stores_pose_period_and_contact(tmp_path):
     assert_allclose(columns["period"], 0.02, atol=1e-9)
     assert columns["contact_type"].tolist() == [2] * 4
     assert "signal" not in columns
-
-
-def test_invalid_files_are_refused_in_one_sentence(tmp_path, recorded):
-    content = recorded[0].read_bytes()
-    path = tmp_path / "odd.mcap"
-    for odd in (b"", b"no bag", content[: len(content) // 2], content[:8] + content[200:]):
-        path.write_bytes(odd)
-        assert "odd.mcap" in error_of(path)
-    for rows, words in (
-        (steps(1), "at least two"),
-        ([], "no messages on /odom, /target, /cmd_vel, /contact or /taxels"),
-    ):
-        assert words in error_of(bag.write(path, rows, {}))
 
 
 def test_damage_anywhere_is_refused_or_read(tmp_path):
@@ -288,26 +254,12 @@ def test_steps_begin_with_the_first_contact(tmp_path, monkeypatch):
     assert columns["contact_type"].tolist() == [1, 1, 1]
 
 
-def record(opcode, content):
-    return struct.pack("<BQ", opcode, len(content)) + content
-
-
-def test_oversized_content_is_refused_before_decompression(tmp_path, monkeypatch):
-    magic = bytes((137, 77, 67, 65, 80, 48, 13, 10))
-    header = record(1, struct.pack("<I", 4) + b"ros2" + struct.pack("<I", 0))
-    bomb = zstandard.compress(bytes(300 * 2**20), 19)
-    chunk = struct.pack("<QQQII", 0, 0, 300 * 2**20, 0, 4) + b"zstd"
-    chunk = record(6, chunk + struct.pack("<Q", len(bomb)) + bomb)
-    path = tmp_path / "bomb.mcap"
-    path.write_bytes(magic + header + chunk + magic)
-    assert path.stat().st_size < 10**6
-    assert "more than 67108864 bytes" in error_of(path)
-    path.write_bytes(magic + header + struct.pack("<BQ", 5, 2**40) + bytes(1000))
-    assert "bomb.mcap" in error_of(path)
+def test_too_many_numbers_are_refused(tmp_path, monkeypatch):
+    path = tmp_path / "a.mcap"
     monkeypatch.setattr(bag, "_MAX_NUMBERS", 3000)
     bag.read(bag.write(path, steps(12), {}))  # 12 times 17 numbers in 4 messages
-    rows = steps(12, signal=np.zeros(500))
-    assert "more than 3000 numbers" in error_of(bag.write(path, rows, {}))
+    with refusing("more than 3000 numbers"):
+        bag.read(bag.write(path, steps(12, signal=np.zeros(500)), {}))
 
 
 def test_a_missing_column_is_named(tmp_path):

@@ -86,6 +86,8 @@ def test_costs_by_hand():
         min_distance=np.array([0.04, 0.5, np.inf, 0.5]),
         contact_lost_time=zero,
         path_length=zero,
+        repositions=zero,
+        contact_lost_path=zero,
         mean_abs_l=zero,
         tilt=zero,
         tipped=np.array([False, False, False, True]),

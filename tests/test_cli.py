@@ -3,6 +3,7 @@
 import gc
 import json
 import re
+import shlex
 import signal
 import subprocess
 import sys
@@ -13,11 +14,12 @@ import command_line
 import numpy as np
 import pytest
 import xarray as xr
-from helpers import printed, refusal, refusing, rps, setting_of
+from helpers import ROOT, printed, refusal, refusing, rps, setting_of
 
 import rps_jax
 from rps_jax.app.cli import flags, names, running
 from rps_jax.control import registry
+from rps_jax.errors import InputError
 from rps_jax.record import files
 from rps_jax.runs.question import Question
 from rps_jax.runs.sweep import merge
@@ -25,6 +27,14 @@ from rps_jax.trials.results import DIMS
 from rps_jax.tuning.evolution import TuneES
 from rps_jax.world import paper
 
+PAGES = [
+    page
+    for folder in ("docs", "notebooks", "rps_jax", "sweeps")
+    for page in (ROOT / folder).rglob("*.md")
+]
+COMMAND = re.compile(
+    r"(?:^|`|&& )(?:\.venv/bin/)?rps ((?:tune |export )?[a-z]+) (-[^`\n|>]*)(?:`|$)", re.M
+)
 SMALL = "table --targets 0.6 0 0.62 0.03 --horizon 18 --slots 8 --workers 1 --laws rps nps"
 SMALL += " --objects box nonuniform_box --out"
 
@@ -268,42 +278,7 @@ def test_files_of_equal_names_are_distinguished_by_their_folders(tmp_path):
     assert list(registry.resolve_laws(["rps", *texts])) == ["rps", *texts]
 
 
-STUDY = """
-from dataclasses import dataclass
-import xarray as xr
-from rps_jax.runs.question import LawQuestion, call_of
-from rps_jax.analysis.report import Section
-from rps_jax.record.options import option
-import rps_jax
-
-@dataclass(frozen=True)
-class Crowd(LawQuestion[xr.Dataset]):
-    'Count what a law wins among drums.'
-
-    worlds: int = option(16, 1, 1000)
-    'Number of drums.'
-
-    def answer(self, run):
-        drums = rps_jax.Domain(("random_cylinder",))
-        return rps_jax.sweep(self.law, drums, self.worlds, setting=self.setting, progress=False)
-
-    def report(self, results, run):
-        return [Section("Drums", f"{int(results.success.sum())} of {self.worlds} were won.")]
-
-crowd = call_of(Crowd)
-"""
 BRIEF = "--engine quasistatic --horizon 2"
-
-
-def test_a_custom_question_is_one_file(tmp_path, capsys):
-    path = tmp_path / "my_study.py"
-    path.write_text(STUDY)
-    assert rps(f"{path} --worlds 8 {BRIEF} --law rps --out", tmp_path / "run") == 0
-    assert "0 of 8 were won" in capsys.readouterr().out
-    assert files.read_results(tmp_path / "run").sizes["world"] == 8
-    assert "worlds = 0 is not allowed" in refusal(capsys, path, "--worlds", 0)
-    assert rps(path, "--help") == 0
-    assert "Number of drums." in capsys.readouterr().out
 
 
 def test_an_interrupted_run_prints_one_line(tmp_path):
@@ -332,10 +307,26 @@ def test_an_interrupt_during_garbage_collection_is_raised_again(capsys):
     def action():
         gc.callbacks.append(swallowed)
         gc.collect()
-        for _ in range(500):
+        for _ in range(2000):
             time.sleep(0.01)
 
     start_time = time.monotonic()
     assert running.exit_code(action) == 130
-    assert time.monotonic() - start_time < 4
+    assert time.monotonic() - start_time < 15
     assert capsys.readouterr().err.endswith("rps: interrupted.\n")
+
+
+def test_pages_name_options_that_exist():
+    lines = {
+        line
+        for page in [ROOT / "README.md", *PAGES]
+        for line in COMMAND.findall(page.read_text(encoding="utf-8").replace("\\\n", " "))
+    }
+    assert len(lines) > 50
+    unknown = list[str]()
+    for name, options in sorted(line for line in lines if "--help" not in line[1]):
+        try:
+            flags.parse(names.question_type(name), name, shlex.split(options, comments=True))
+        except InputError as error:
+            unknown += [str(error)] * str(error).startswith("unknown option")
+    assert not unknown

@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import ROOT, refusals, refusing, row
+from helpers import ROOT, refusals, refusing, row, slow
 from numpy.testing import assert_allclose
 
 import rps_jax
@@ -496,7 +496,10 @@ def halves_and_whole(setting, domain, law, smooth=False):
     return (joined, last), run(batch.worlds, fresh, 1.2)
 
 
-@pytest.mark.parametrize("name", BY_CLASS.values())
+ROLLED = ("rps_plus", "unicycle_front", "dipole")  # the other laws are slow tests
+
+
+@pytest.mark.parametrize("name", [x if x in ROLLED else slow(x) for x in BY_CLASS.values()])
 def test_a_continued_rollout_of_any_law_is_the_whole_one_bit_for_bit(name):
     law = LAWS[name]
     engine = "fused" if law_of(law).senses == "force" else "quasistatic"
@@ -504,7 +507,10 @@ def test_a_continued_rollout_of_any_law_is_the_whole_one_bit_for_bit(name):
     jax.tree.map(np.testing.assert_array_equal, halves, whole)
 
 
-@pytest.mark.parametrize(("engine", "smooth"), [*((x, False) for x in TRACED), ("fused", True)])
+@pytest.mark.parametrize(
+    ("engine", "smooth"),
+    [slow(x, False) if x == "mjx" else (x, False) for x in TRACED] + [("fused", True)],
+)
 def test_a_continued_rollout_in_any_engine_is_the_whole_one_bit_for_bit(engine, smooth):
     domain = "real,objects=random_box,gap=0:0.01" if engine != "quasistatic" else NOISY
     law = LAWS["rps_plus"]

@@ -19,15 +19,17 @@ from rps_jax.control.laws.rps import RPSParams, RPSState
 from rps_jax.control.observation import Twist
 from rps_jax.errors import InputError
 from rps_jax.runs.evaluate import CandidateScores, evaluate
+from rps_jax.trials import trial
+from rps_jax.trials.jobs import rows
 from rps_jax.trials.score import Objective
 from rps_jax.trials.setting import Setting
+from rps_jax.trials.trajectory import control_loop, draw_worlds
 from rps_jax.trials.trial import Rules
+from rps_jax.trials.worlds import soften_skins
 from rps_jax.tuning import derivatives, descent, optimisers
 from rps_jax.tuning.descent import TuneGrad
 from rps_jax.tuning.evolution import TuneES
 from rps_jax.tuning.gradients import Estimate
-from sweeps.gradients import windows
-from sweeps.gradients.windows import Windows
 
 SETTING = Setting("quasistatic", rules=Rules(horizon=20.0, max_lost=10.0))
 OBJECTIVE = Objective(time=0.3, lost=0.1, miss=0.5)
@@ -69,20 +71,6 @@ def test_the_soft_score_has_a_slope_where_the_hard_score_jumps():
 
     slope = float(jax.grad(at)(0.05))
     assert slope > 10 * OBJECTIVE.time / SETTING.rules.horizon  # [1/m] more than a way's own
-
-
-def test_windows_need_a_law_with_a_smooth_form():
-    with pytest.raises(InputError, match="no smooth form"):
-        Windows("pursuit", tuned=("K_v",)).validate()
-
-
-def test_windows_need_an_estimator_and_an_engine_with_derivatives():
-    with pytest.raises(InputError, match="unknown estimator 'reverse': choose from exact, clipped"):
-        Windows("rps", estimator="reverse").validate()
-    mujoco = Setting("mujoco")
-    with pytest.raises(InputError, match="engine = mujoco is not allowed: it has no reverse-mode"):
-        Windows("rps", setting=mujoco).validate()
-    TuneES("rps", setting=mujoco, estimator="antithetic").validate()
 
 
 def by_slopes(**options):
@@ -145,18 +133,6 @@ def test_the_tail_alone_counts_for_a_risk_averse_objective():
     assert_array_equal(Objective().linearise(slopes), slopes)
 
 
-def test_windows_start_at_the_states_of_their_trials(monkeypatch):
-    """Trials are replaced by counts of their steps of 20 ms."""
-
-    monkeypatch.setattr(windows, "start_all", lambda *arguments, law: jnp.zeros(arguments[-1].size))
-    monkeypatch.setattr(windows, "advance", lambda batches, loop, steps: [batches[0][-1] + steps])
-    late = jnp.array([0.0, 0.5, 1.0])
-    for within, steps in ((10.0, [0, 250, 500]), (0.0, [0, 0, 0])):
-        question = Windows("rps", tuned=("L", "K_h"), within=within, setting=SETTING)
-        trials = windows.window_starts(question, None, jnp.zeros(2), late, late)
-        assert_array_equal(trials, steps)
-
-
 # --- derivatives of windows ----------------------------------------------------------------
 
 
@@ -205,14 +181,19 @@ def test_20_steps_of_adam_lower_the_loss_beyond_its_interval_in_fresh_worlds(thr
 SMALL = {"tuned": ("L", "K_h"), "steps": 9}
 
 
-def fake_results(question, validations):
-    """Return the vectors and kinds of the steps of a search with fixed results."""
+def fake_results(question, validations, dropped=None):
+    """Return the vectors and kinds of the steps of a search with fixed results.
+
+    The result of the step `dropped` drops windows.
+    """
     search, kinds, vectors = question.search(), [], []
     proposal = next(search)
     for value in validations:
         kinds.append(int(proposal["windows"]))
         vectors.append(proposal["vectors"][0].copy())
         results = proposal | {"base": np.array(1.0), "validation": np.array(value)}
+        if len(kinds) - 1 == dropped:
+            results["windows"] = np.array(0.0)
         proposal = search.send(results | {"gradients": np.ones((1, 2))})
     return kinds, vectors, proposal
 
@@ -240,31 +221,81 @@ def test_steps_by_derivatives_end_and_return_to_the_best_vector():
     assert (following["vectors"][0] < vectors[3]).all()
 
 
-@pytest.mark.parametrize(("slope", "checks", "windows"), [(1.0, 4, 1), (-1.0, 4, 0), (-1.0, 0, 1)])
-def test_derivatives_that_oppose_the_slopes_of_whole_trials_are_dropped(
-    monkeypatch, slope, checks, windows
-):
-    """With checks=0 they are used without a comparison."""
-    question = TuneGrad("rps", **SMALL, checks=checks)
-    ones, none = np.ones(2), np.zeros(2)
-    size = len(next(question.search())["moments"])
-    states = SimpleNamespace(moments=np.eye(size))
-    estimate = lambda x: Estimate(jnp.asarray(x * ones), jnp.ones(2), jnp.ones(2))  # noqa: E731
-    monkeypatch.setattr(TuneGrad, "_collect", lambda *_: [states])
-    monkeypatch.setattr(TuneGrad, "_derivatives", lambda *_: estimate(1.0))
-    slopes = slope if checks else np.nan
-    monkeypatch.setattr(TuneGrad, "try_step", lambda *_: ({"validation": 0.5}, estimate(slopes)))
-    results = question.judge(next(question.search()), 0, lambda *_: none)
+def test_a_search_that_drops_windows_goes_on_from_the_best_vector():
+    question = TuneGrad("rps", **SMALL, window_steps=8, refresh=3)
+    nan = np.nan
+    kinds, vectors, _ = fake_results(question, [0.5, nan, nan, 0.8, 0.6], dropped=3)
+    assert kinds == [1, 1, 1, 1, 0]
+    np.testing.assert_array_equal(vectors[4], vectors[0])
+
+
+@pytest.fixture
+def checked(monkeypatch):
+    """Return the results of the first step, whose derivatives are ones, for a rise along them.
+
+    The score of whole trials rises by a number for a unit step of the parameters along (1, 1).
+    """
+    ones = Estimate(*jnp.ones((3, 2)))
+
+    def judge(rise, checks):
+        question = TuneGrad("rps", **SMALL, checks=checks, sigma=0.5)
+        proposal = next(question.search())
+        states = SimpleNamespace(moments=np.eye(len(proposal["moments"])))
+        monkeypatch.setattr(TuneGrad, "_collect", lambda *_: [states])
+        monkeypatch.setattr(TuneGrad, "_derivatives", lambda *_: ones)
+
+        def score(requests):
+            answers = []
+            for request in requests:
+                moved = np.asarray(question.space.vector(request.params)) - proposal["vectors"]
+                scores = rise * moved.mean(axis=1)[:, None] + np.arange(request.shape[1])
+                outcome = SimpleNamespace(success=np.ones(1))
+                answers.append(CandidateScores(outcome, scores))
+            return answers
+
+        return question.judge(proposal, 0, score)
+
+    return judge
+
+
+@pytest.mark.parametrize(("rise", "checks", "windows"), [(3.0, 4, 1), (-3.0, 4, 0), (-3.0, 0, 1)])
+def test_derivatives_along_which_no_score_falls_are_dropped(checked, rise, checks, windows):
+    """A step goes against the derivatives. With checks=0 they are used without a check."""
+    results = checked(rise, checks)
     assert results["windows"] == windows
-    expected = ones if windows else slope * ones
-    np.testing.assert_array_equal(results["gradients"][0], expected)
-    np.testing.assert_allclose(results["cosine"], np.sign(slopes), rtol=1e-6)
+    np.testing.assert_array_equal(results["gradients"][0], np.ones(2))
+    np.testing.assert_allclose(results["slope"], rise if checks else np.nan, rtol=1e-4)
+    np.testing.assert_allclose(results["slope_error"], 0.0 if checks else np.nan, atol=1e-4)
+
+
+def test_derivatives_are_dropped_with_a_warning_where_all_scores_are_alike(checked):
+    with pytest.warns(UserWarning, match="All trials along the derivatives have equal scores"):
+        assert checked(0.0, 4)["windows"] == 0
+
+
+def test_features_have_the_target_and_not_the_pose_of_the_object():
+    """Pose and offset of the contact predict failures by what both share with the world."""
+    batch = draw_worlds("wide,objects=random_box,gap=0.3:0.3", setting=SETTING)
+    world = jax.tree.map(jnp.asarray, soften_skins(rows(batch.worlds, 0)))
+    params = RPSParams.paper()
+    loop = control_loop(params, SETTING, smooth=True)
+    first, still = trial.start(world, params, loop.law), world
+
+    def change(world, qpos):
+        values = (
+            descent.features(x, params, first._replace(qpos=y), loop)
+            for x, y in ((world, qpos), (still, first.qpos))
+        )
+        return np.abs(np.subtract(*values)).max()
+
+    assert change(world, first.qpos.at[3:5].add(0.1)) < 1e-6
+    assert change(world._replace(p_world_target=world.p_world_target + 1.0), first.qpos) > 0.1
 
 
 def test_the_value_function_has_the_coefficients_of_its_data():
     random = np.random.default_rng(0)
-    x = random.normal(size=(500, 16))
-    truth = np.concatenate([[2.0], random.normal(size=16)])
+    x = random.normal(size=(500, 6))
+    truth = np.concatenate([[2.0], random.normal(size=6)])
     data = np.column_stack([np.ones(500), x, truth[0] + x @ truth[1:]])
     np.testing.assert_allclose(descent.fit(data.T @ data, 0.0), truth, atol=1e-9)
     shrunk = descent.fit(data.T @ data, 1e6)

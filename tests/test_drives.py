@@ -2,6 +2,7 @@
 
 import json
 import math
+import shlex
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -11,19 +12,24 @@ import numpy as np
 import pytest
 from helpers import observation, refusals, refusing
 
-from rps_jax import engines
+from rps_jax import draw_worlds, engines, rollout
+from rps_jax.app.cli import flags, names
 from rps_jax.control import registry
 from rps_jax.control.base import Law
 from rps_jax.control.laws import unicycle
 from rps_jax.control.observation import Details, Twist
+from rps_jax.record import files
 from rps_jax.robot import drive
 from rps_jax.robot.drive import Tyres
 from rps_jax.robot.robot import ROBOTS, Robot, parse_robot
+from rps_jax.robot.skin import NONE
+from rps_jax.runs.sweep import Sweep
 from rps_jax.trials import pushes
 from rps_jax.trials.case import Case
 from rps_jax.trials.env import PushEnv
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import Rules
+from rps_jax.world import domain as domains
 
 PERIOD = 0.02
 DIFFERENTIAL = Robot(drive="differential", axle=0.2, track=0.5)
@@ -277,3 +283,134 @@ def test_after_a_lost_contact_the_base_drives_behind_the_object_and_faces_the_ta
 def test_the_smooth_law_tends_to_the_hard_one():
     hard, smooth = (follow(FACTS["differential"], x, 1200)[0] for x in (None, SMALL))
     np.testing.assert_allclose(smooth[:900], hard[:900], atol=1e-2)
+
+
+def stepped(contact, in_contact, base=0.0, **state):
+    """Return the state after one control step of a base on the x axis, with the target ahead."""
+    params = unicycle.UnicycleParams()
+    start = unicycle.init(params)._replace(**{k: jnp.asarray(x) for k, x in state.items()})
+    obs = observation([base, 0.0], 0.0, contact, in_contact, [5.0, 0.0])
+    return unicycle.step(params, start, obs._replace(axle=0.2))[0], params
+
+
+WAY = {  # contact on the way around the object, and whether the base then retreats or goes on
+    "middle of the front": ((0.3625, 0.1), False, False),
+    "end of the front": ((0.3625, 0.28), True, False),
+    "side near the front": ((0.3, 0.29), True, False),
+    "side": ((0.0, 0.29), False, True),
+}
+
+
+@pytest.mark.parametrize("name", WAY)
+def test_a_touch_on_the_way_is_a_push_a_retreat_or_moves_the_circle(name):
+    contact, retreats, goes_on = WAY[name]
+    state, _ = stepped(contact, True, touched=True, around=True, p_world_object=[-0.5, 0.8])
+    assert (bool(state.retreat), bool(state.around)) == (retreats, goes_on)
+    assert not state.align
+
+
+@pytest.mark.parametrize(
+    ("misses", "offset", "expected"),
+    [(0, 0.1, "contact"), (1, 0.1, "ahead"), (1, 0.28, "beside"), (2, 0.1, "beside")],
+)
+def test_after_approaches_that_miss_the_law_looks_where_an_object_is_not_felt(
+    misses, offset, expected
+):
+    known = {"touched": True, "p_world_object": [1.0, 0.0], "p_world_contact": [0.8, 0.1]}
+    state, params = stepped([0.0, 0.0], False, base=1.2, l=offset, misses=float(misses), **known)
+    front = 1.2 + 0.3625
+    guesses = {"contact": [0.8, 0.1], "ahead": [front + params.r, 0.0], "beside": [0.7, -0.75]}
+    np.testing.assert_allclose(state.p_world_object, guesses[expected], atol=1e-6)
+    assert state.retreat
+    assert state.misses == misses + 1
+
+
+def test_a_target_far_aside_ends_a_push_at_once():
+    params = unicycle.UnicycleParams()
+    for bearing in (0.9 * params.e_far, 1.1 * params.e_far):
+        contact = np.array([0.3625, 0.0])
+        target = contact + 3.0 * np.array([math.cos(bearing), math.sin(bearing)])
+        obs = observation([0.0, 0.0], 0.0, contact, True, target)._replace(axle=0.0)
+        state = unicycle.step(params, unicycle.init(params), obs)[0]
+        assert bool(state.retreat) == (bearing > params.e_far)
+
+
+def test_repositions_are_counted_with_their_time_and_way():
+    """By hand, from the readings of each control step of a push that repositions."""
+    setting = Setting(rules=Rules(horizon=60.0))
+    batch = pushes.build([Case(law="unicycle", robot=DIFFERENTIAL, target=(0.5, 1.5))], setting)
+    trajectory = pushes.record_batch(batch, setting, interval=PERIOD)[0]
+    snapshots, outcome = trajectory.snapshots, trajectory.outcome
+    touches = np.asarray(snapshots.reading.contact_type) != NONE
+    lost = ~touches & (np.cumsum(touches) > 0)
+    way = np.linalg.norm(np.diff(np.asarray(snapshots.qpos, float)[:, :2], axis=0), axis=1)
+    lengths = [len(x) for x in "".join("ny"[int(x)] for x in ~lost).split("y")]
+    assert outcome.repositions == sum(x * PERIOD >= 2 - 1e-9 for x in lengths) > 0
+    assert outcome.contact_lost_time == pytest.approx(lost.sum() * PERIOD)
+    assert outcome.contact_lost_path == pytest.approx(way[lost[:-1]].sum(), rel=1e-3)
+
+
+# --- one file of a robot -------------------------------------------------------------------
+
+COMMANDS = [
+    name
+    for name, command in names.known().items()
+    if {"robot", "setting"} <= set(names.question_type(name).__dataclass_fields__)
+]
+WITH_PERIOD = {"drive": "differential", "axle": 0.2, "period": 0.1}
+
+
+def with_robot_of(folder, name) -> Any:
+    """Return a command with the file of a robot."""
+    files.write_json(folder / "mine.json", WITH_PERIOD)
+    words = ["--robot", str(folder / "mine.json"), *(["unicycle"] if name == "score" else [])]
+    return flags.parse(names.question_type(name), name, words)[0]
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_the_file_of_a_robot_sets_the_control_period_of_a_command(name, tmp_path):
+    question = with_robot_of(tmp_path, name)
+    assert question.setting.physics.control_period == 0.1
+    assert question.setting.fidelity == Setting().fidelity or name == "learn"
+
+
+def test_another_period_than_that_of_the_robot_is_refused():
+    robot = Robot(period=0.1)
+    assert Setting(physics="default,control_period=0.1").with_robot(robot).physics.substeps == 10
+    with refusing("control_period.* period of the robot"):
+        Setting(physics="default,control_period=0.05").with_robot(robot)
+    with refusing("control_period.* multiple of timestep"):
+        Setting(fidelity="fast").with_robot(Robot(period=0.05))
+    with refusing("with_robot"):
+        Setting().check_here(robot)
+    with refusing("period"):
+        parse_robot("ideal,period=0")
+
+
+def test_calls_of_the_library_take_the_period_of_the_robot():
+    env = PushEnv(robot="ideal,period=0.1", worlds=2)
+    assert env.dt == 0.1
+    batch = draw_worlds("wide,objects=random_cylinder", robot="ideal,period=0.1")
+    world = jax.tree.map(lambda x: x[0], batch.worlds)
+    law = registry.LAWS["rps"]
+    assert rollout(world, law, batch.stage, horizon=0.5).time.shape == (5,)
+
+
+@pytest.mark.parametrize("following", ["sweep", "ladder"])
+@pytest.mark.parametrize(
+    "name", [x for x in COMMANDS if hasattr(names.question_type(x), "next_command")]
+)
+def test_a_command_that_is_printed_keeps_robot_domain_and_period(name, following, tmp_path):
+    first, laws = with_robot_of(tmp_path, name), ["unicycle", "unicycle,r=0.2"]
+    words = shlex.split(first.next_command(following, laws=laws, domain="wide,mass=3:9"))
+    assert words[:2] == ["rps", following]
+    second: Any = flags.parse(names.question_type(following), following, words[2:])[0]
+    assert (second.robot, np.ravel(second.domain)) == (first.robot, ["wide,mass=3:9"])
+    assert second.setting.physics.control_period == 0.1
+    assert list(second.chosen) == laws
+
+
+def test_the_file_of_a_domain_keeps_the_period_of_its_robot(tmp_path):
+    path = tmp_path / "fitted.json"
+    files.write_json(path, domains.to_json(domains.parse_domain("wide", WITH_PERIOD)))
+    assert Sweep("unicycle", str(path)).setting.physics.control_period == 0.1

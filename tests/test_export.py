@@ -51,6 +51,8 @@ LAWS = [
     "unicycle",
     "pose",
 ]
+# Law and robot, one that cannot move sideways.
+DRIVEN = "unicycle_car ideal,drive=car,turning_radius=0.5,axle=0.3"
 
 
 def compiled(compiler, source, *options):
@@ -71,6 +73,14 @@ def test_a_law_in_c_agrees_with_jax(name, tmp_path):
         result = agreement(name, "float", 20_000, tmp_path)
         assert (result.inputs, result.unexplained) == (20_000, 0)
         assert result.beyond < 200
+
+
+def test_a_law_of_a_base_with_an_axle_agrees_with_jax(tmp_path):
+    law, robot = DRIVEN.split()
+    for form, most in (("double", 10), ("onnx", 200)):
+        result = agreement(law, form, 10_000, tmp_path, robot=robot)
+        assert (result.inputs, result.unexplained) == (10_000, 0)
+        assert result.beyond < most
 
 
 @pytest.mark.slow
@@ -302,9 +312,9 @@ console.log(JSON.stringify({ twists, odd, short, felt: felt.contact }));
 
 
 @pytest.mark.skipif(shutil.which("node") is None, reason="Node.js is not there")
-@pytest.mark.parametrize("name", ["rps_plus", "learned_small", CUSTOM])
+@pytest.mark.parametrize("name", ["rps_plus", "learned_small", DRIVEN, CUSTOM])
 def test_javascript_agrees_with_c(name, tmp_path, registries):
-    exported = program.program(name)
+    exported = program.program(*name.split())
     native = Native(exported, tmp_path, "double")
     leaves = observations(exported, default_rng(0), 300, np.float64)
     obs = native.filled("observation", leaves, 300)
@@ -313,7 +323,8 @@ def test_javascript_agrees_with_c(name, tmp_path, registries):
     names = [field.name for field in exported.groups["observation"]]
     rows = [dict(zip(names, (x[i].tolist() for x in leaves), strict=True)) for i in range(300)]
     (tmp_path / "seen.json").write_text(json.dumps(rows))
-    (tmp_path / "law.mjs").write_text(js.module(exported, "law"))
+    (tmp_path / "law.mjs").write_text(module := js.module(exported, "law"))
+    assert ("export const AXLE = 0.3;" in module) == (name == DRIVEN)
     (tmp_path / "run.mjs").write_text(NODE)
     result = json.loads(output_of("node", "run.mjs", "seen.json", cwd=tmp_path))
     twists = np.array(result["twists"])
@@ -326,10 +337,12 @@ def test_javascript_agrees_with_c(name, tmp_path, registries):
     assert_allclose(result["felt"]["p_robot_contact"], [0.3625, 0], atol=1e-9)
 
 
-@pytest.mark.parametrize("name", ["rps_plus", "learned_small", "aps", "force_push_published"])
+@pytest.mark.parametrize(
+    "name", ["rps_plus", "learned_small", "aps", "force_push_published", DRIVEN]
+)
 def test_onnx_agrees_with_c(name, tmp_path):
     onnx, runtime = pytest.importorskip("onnx"), pytest.importorskip("onnxruntime")
-    count, exported = 200, program.program(name)
+    count, exported = 200, program.program(*name.split())
     model = onnx_model.models(exported, "law", count)["law.onnx"]
     session = runtime.InferenceSession(model, providers=["CPUExecutionProvider"])
     about = {entry.key: entry.value for entry in onnx.load_from_string(model).metadata_props}

@@ -22,7 +22,7 @@ from rps_jax.engines import device
 from rps_jax.errors import InputError
 from rps_jax.record import options
 
-SHARE = {"values": 30, "laws": 500, "edits": 3, "damages": 12}
+SHARE = {"values": 30, "laws": 500, "edits": 3}
 
 
 @pytest.mark.parametrize("name", SHARE)
@@ -140,56 +140,33 @@ SHELL = [
 ]
 MORE = [
     ("MUJOCO_GL=vulkan rps doctor >&2", 0, "FAILS: MUJOCO_GL = vulkan is not allowed"),
-    ("rps --version >&-", 0, ""),
-    ("rps sweep --help >&-", 0, ""),
     ("rps sweep --help | head -1 >&2", 0, "usage"),
     ("rps doctor >&-", 0, ""),
-    ("rps doctor 2>&-", 0, ""),
-    ("push >&-", 0, ""),
-    ("push 2>&-", 0, ""),
     ("push >&- 2>&- <&-", 0, ""),
     ("push | true", 0, ""),
     ("push >/dev/full", 2, "No space left on device"),
-    *(
-        (f"MPLBACKEND={name} push", 0, "")
-        for name in ("QtAgg", "GTK4Agg", "nonsense", "module://x")
-    ),
-    *((f"MUJOCO_GL={name} push", 2, f"MUJOCO_GL = {name} is not allowed") for name in ("x", "wgl")),
-    *((f"MUJOCO_GL={name} push", 0, "") for name in ("disable", "off", "EGL")),
+    ("MPLBACKEND=nonsense push", 0, ""),
+    ("MUJOCO_GL=wgl push", 2, "MUJOCO_GL = wgl is not allowed"),
+    ("MUJOCO_GL=disable push", 0, ""),
     ("PYOPENGL_PLATFORM=x film >&2", 0, "no film: MuJoCo cannot draw"),
     ("IMAGEIO_FFMPEG_EXE=/nowhere/x film >&2", 0, "no film: IMAGEIO_FFMPEG_EXE = /nowhere/x"),
     ("XLA_FLAGS=nonsense push", 2, 'XLA_FLAGS = nonsense .*Could not open file "nonsense"'),
     ("XLA_FLAGS=--xla_force_host_platform_device_count=abc push", 2, "cannot read the value of a"),
     ("XLA_FLAGS=--xla_nonsense=1 rps doctor >&2", 0, "FAILS: XLA_FLAGS = --xla_nonsense"),
     ("XLA_FLAGS=flags.txt push", 0, ""),
-    *(
-        (f"JAX_PLATFORMS={name} push", 2, f"JAX_PLATFORMS = {name} is not available")
-        for name in ("tpu", "cuda", "nonsense", "cpu,nonsense")
-    ),
+    ("JAX_PLATFORMS=cpu,nonsense push", 2, "JAX_PLATFORMS = cpu,nonsense is not available"),
     ("JAX_PLATFORMS=nonsense rps doctor >&2", 0, "FAILS: JAX_PLATFORMS = nonsense"),
     ("JAX_NUMPY_DTYPE_PROMOTION=maybe push", 2, "jax cannot be imported"),
     ("TQDM_MININTERVAL=abc push", 2, "tqdm cannot be imported .*: correct or unset"),
-    *(
-        (f"JAX_{name} push", 0, "")
-        for name in (
-            "NUMPY_DTYPE_PROMOTION=strict",
-            "NUMPY_RANK_PROMOTION=raise",
-            "TRANSFER_GUARD=disallow",
-            "DEBUG_NANS=1",
-            "DEBUG_INFS=1",
-            "DISABLE_JIT=1",
-            "CHECK_TRACER_LEAKS=1",
-            "ENABLE_X64=1",
-            "LEGACY_PRNG_KEY=error",
-            "ENABLE_CUSTOM_PRNG=1",
-            "NO_TRACING=1",
-            "ENABLE_CHECKS=1",
-        )
-    ),
-    *((f"RPS_CACHE={name} push", 0, "") for name in ("/proc/x", "/etc/passwd", "''", "'~x/y'")),
-    *((f"HOME={name} RPS_CACHE= push", 0, "") for name in ("/nowhere", "/proc", "''")),
-    *((f"TMPDIR={name} film", 0, "") for name in ("/nowhere", "/proc", "/etc/passwd")),
-    *((f"COLUMNS={name} rps push --help >&2", 0, "--target") for name in ("0", "1", "-5", "abc")),
+    ("JAX_NUMPY_DTYPE_PROMOTION=strict JAX_NUMPY_RANK_PROMOTION=raise push", 0, ""),
+    ("JAX_TRANSFER_GUARD=disallow JAX_DEBUG_NANS=1 JAX_DEBUG_INFS=1 push", 0, ""),
+    ("JAX_CHECK_TRACER_LEAKS=1 JAX_ENABLE_CHECKS=1 JAX_LEGACY_PRNG_KEY=error push", 0, ""),
+    ("JAX_ENABLE_X64=1 JAX_ENABLE_CUSTOM_PRNG=1 JAX_NO_TRACING=1 push", 0, ""),
+    ("JAX_DISABLE_JIT=1 push", 0, ""),
+    ("RPS_CACHE=/etc/passwd push", 0, ""),
+    ("HOME=/nowhere RPS_CACHE= push", 0, ""),
+    ("TMPDIR=/nowhere film", 0, ""),
+    ("COLUMNS=-5 rps push --help >&2", 0, "--target"),
     ("LC_ALL=C PYTHONUTF8=0 rps push --object Ö.xml", 2, "cannot be read"),
     ("MPLCONFIGDIR=/proc/x push", 0, ""),
     ("RPS_COMPILER=/nowhere/cc rps doctor", 0, ""),

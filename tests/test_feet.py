@@ -12,9 +12,6 @@ from rps_jax import engines
 from rps_jax.geometry import footprint, solid
 from rps_jax.geometry.footprint import Footprint
 from rps_jax.geometry.solid import SIDES
-from rps_jax.trials import pushes
-from rps_jax.trials.case import Case
-from rps_jax.trials.setting import Setting
 from rps_jax.trials.worlds import starts
 from rps_jax.world import domain as domains
 from rps_jax.world import draws, objects, points, scene
@@ -118,7 +115,7 @@ def test_the_rigid_solver_supports_feet():
     ("feet", "message"),
     [
         (FEET[:2], "give 3 to 8 rows"),
-        (np.column_stack([FEET, [1, -1, 1]]), "weights must be positive"),
+        (np.column_stack([FEET, [1, -1, 1]]), "must be positive"),
         (FEET + 0.3, "it tips over"),
         (FEET * np.nan, "must be finite"),
     ],
@@ -127,17 +124,6 @@ def test_feet_without_sense_are_refused(registered_boxes, feet, message):
     with refusing(message):
         objects.register_object("wrong", registered_boxes, feet=feet)
     assert "wrong" not in objects.REGISTERED
-
-
-@pytest.mark.parametrize("engine", ["fused", "mjx", "mujoco"])
-def test_engines_that_ignore_weights_of_feet_refuse_them(registered_boxes, engine, registries):
-    weighted = np.column_stack([FEET, [1.0, 1.0, 2.0]])
-    objects.register_object("weighted", registered_boxes, feet=weighted)
-    objects.register_object("even", registered_boxes, feet=weighted * [1, 1, 0] + [0, 0, 2])
-    with refusing(r"it ignores the weights of feet.*quasistatic"):
-        pushes.build([Case("weighted")], Setting(engine))
-    pushes.build([Case("weighted")], Setting("quasistatic"))
-    pushes.build([Case("even")], Setting(engine))
 
 
 # --- feet that are drawn ---

@@ -12,7 +12,8 @@ from numpy.random import default_rng
 
 from rps_jax import RPSParams
 from rps_jax.analysis import report
-from rps_jax.analysis.figures import style, tuning
+from rps_jax.analysis.figures import style
+from rps_jax.analysis.figures import sweeps as sweep_figures
 from rps_jax.analysis.figures.paper import min_distance, profile
 from rps_jax.analysis.figures.sweeps import success_curves
 from rps_jax.control.base import unit_of_leaf
@@ -35,7 +36,7 @@ def search():
     columns["params"] = (("generation", "parameter"), RANDOM.random((count, len(names))))
     units = [unit_of_leaf(RPSParams(), name) for name in names]
     labels = {"generation": np.arange(count), "parameter": names, "unit": ("parameter", units)}
-    return tuning.search(xr.Dataset(columns, labels))
+    return sweep_figures.search(xr.Dataset(columns, labels))
 
 
 def curve():

@@ -227,25 +227,6 @@ def test_a_bag_is_the_log_that_a_table_is(tmp_path):
     assert_array_equal(result.columns["signal"], signal)
 
 
-def test_bags_that_are_no_log_are_refused_before_anything_compiles(tmp_path, compiled, capsys):
-    rows, path = log_table(), tmp_path / "log.mcap"
-    moving = put("target_x", 1.0, slice(200, None))
-    for message, make in {
-        "a target that moves": lambda: bagged(path, moving(rows.copy())),
-        "has 41 taxels, and the robot 42": lambda: bagged(path, rows, signal=np.zeros((400, 41))),
-        "lasts 1.9 s: it must last 5 s": lambda: bagged(path, rows[:95]),
-        "no messages on /odom": lambda: bag.write(path, [], {}),
-        "is no bag of ROS 2): give FILE.mcap": lambda: path.write_bytes(b"no bag"),
-        "cut off or damaged, save the rest": lambda: path.write_bytes(
-            bagged(path, rows).read_bytes()[:20_000]
-        ),
-    }.items():
-        make()
-        assert message in refusal(capsys, "fit", path, "--out", tmp_path / "run")
-    assert not compiled
-    assert not (tmp_path / "run").exists()
-
-
 def test_traces_and_odometry_are_exclusive_and_one_is_required(tmp_path):
     with refusing("give at least one"):
         rps_jax.fit(())

@@ -53,24 +53,6 @@ def test_rotations_compose_by_adding_their_angles_and_keep_lengths():
 # wrap
 
 
-@pytest.mark.parametrize(
-    ("angle", "expected"),
-    [
-        (0.0, 0.0),
-        (1.5, 1.5),
-        (-3.0, -3.0),
-        (3.5, 3.5 - 2 * math.pi),
-        (-3.5, 2 * math.pi - 3.5),
-        (7.0, 7.0 - 2 * math.pi),
-        (-20.0, -20.0 + 6 * math.pi),
-        (PI, -math.pi),  # the excluded end is the included one
-        (-PI, -math.pi),
-    ],
-)
-def test_wrap_gives_the_same_angle_within_half_a_turn(angle, expected):
-    assert planar.wrap(jnp.float32(angle)) == pytest.approx(expected, abs=2e-6)
-
-
 def check_range(wrapped):
     assert (wrapped >= -PI).all()
     assert (wrapped < PI).all()
@@ -147,15 +129,6 @@ def test_norm_is_over_the_last_axis_and_hides_no_nan():
 # direction
 
 
-@pytest.mark.parametrize("scale", [1.0, 1e-36, 1e-20, 1e20, 5e37, 3e38])
-def test_direction_is_the_angle_from_x_to_y_at_any_length(scale):
-    unit = np.float32([[1, 0], [1, 1], [0, 1], [-1, 1], [-1, 0], [-1, -1], [0, -1]])
-    expected = math.pi / 4 * np.array([0, 1, 2, 3, 4, -3, -2])
-    value, gradient = direction_and_gradient(np.float32(scale) * unit)
-    assert_allclose(value, expected, rtol=1e-6, atol=1e-6)
-    assert np.isfinite(gradient).all()
-
-
 def test_the_derivative_of_direction_is_across_and_inverse_to_the_length():
     # d atan2(y, x) = (-y, x) / (x^2 + y^2)
     for scale in (1.0, 1e-30, 1e-20, 1e20, 1e30):
@@ -202,13 +175,6 @@ def test_the_greatest_has_the_derivative_of_one_entry_also_of_equal_ones():
 
 
 # yaw_of_quaternion
-
-
-def test_yaw_of_quaternion_by_hand():
-    half = math.sqrt(0.5)
-    quaternions = jnp.array([[1, 0, 0, 0], [half, 0, 0, half], [half, 0, 0, -half], [0, 1, 0, 0]])
-    got = planar.yaw_of_quaternion(quaternions)
-    assert_allclose(got, [0, math.pi / 2, -math.pi / 2, 0], atol=1e-6)
 
 
 @property_test(SEEDS)

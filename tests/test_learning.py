@@ -335,6 +335,15 @@ def test_a_mirrored_world_has_an_equal_value():
     assert np.std(value) > 0.01
 
 
+def test_an_update_of_a_frozen_policy_changes_the_value_function_alone():
+    config, network = PPO(network="mlp", width=6, num_minibatches=2), network_of("mlp")
+    state, key = init_state(config, network), jax.random.PRNGKey(0)
+    update = jax.jit(partial(ppo.update_policy, config, network, frozen=True))
+    weights = update(state, key, *batch(network, state))[0].weights
+    same(weights["actor"], state.weights["actor"])
+    assert any((weights["critic"][x] != old).any() for x, old in state.weights["critic"].items())
+
+
 @pytest.mark.parametrize("kind", KINDS)
 def test_the_best_action_of_one_step_is_learned(kind):
     """The reward of an action falls with its distance to a function of the observation."""
@@ -420,6 +429,7 @@ def test_a_killed_and_resumed_run_equals_an_uninterrupted_one(learned, tmp_path)
     same(mine.weights, theirs.weights)
 
 
+@pytest.mark.slow
 def test_the_value_function_of_an_initial_law_is_learned_first(learned, tmp_path):
     """The first two updates do not change the law."""
     initial = policies.read(str(learned[0] / "policy.npz"))

@@ -5,7 +5,6 @@ import doctest
 import inspect
 import pkgutil
 
-import numpy as np
 import pytest
 import xarray as xr
 from helpers import (
@@ -13,8 +12,6 @@ from helpers import (
     ROOT,
     SLOTS,
     addresses,
-    decode,
-    refusing,
     rps,
     setting_of,
 )
@@ -109,36 +106,6 @@ def test_candidates_are_labelled_by_their_parameters():
     attrs = {"seed": 0, "split": "validate", "engine": "quasistatic", "law": "RPSParams"}
     assert attrs.items() <= results.attrs.items()
     assert results.mass.attrs == {"units": "kg", "long_name": "mass of the object"}
-
-
-# --- one trial -----------------------------------------------------------------------------
-
-
-def test_a_world_of_a_sweep_is_replayed(run):
-    folder, results = run
-    again = rps_jax.replay(folder, 3, "slow")
-    expected = results.sel(law="slow", world=3)
-    assert int(again.outcome.success) == int(expected.success)
-    assert_array_equal(again.outcome.base_pose, expected.base_pose)
-    assert "world 3" in again.title
-
-
-@pytest.mark.filterwarnings("ignore:os.fork")  # by the reader of the film
-def test_a_push_is_plotted_and_filmed(tmp_path):
-    setting = setting_of(3.0)
-    trace = rps_jax.push("cylinder", target=(1.0, 0.5), setting=setting)
-    assert trace.data.time[-1] == pytest.approx(3.0, abs=0.11)
-    assert trace.data.l.dims == ("time",)
-    figure = trace.plot()
-    assert len(figure.axes) >= 2
-    trace.plot(tmp_path / "push.png")
-    assert (tmp_path / "push.png").stat().st_size > 10_000
-    assert trace.film(tmp_path / "push.mp4", 0.4) == tmp_path / "push.mp4"
-    images = decode(tmp_path / "push.mp4")
-    assert len(images) == 8
-    assert np.abs(images[0].astype(int) - images[-1]).max() > 60
-    with refusing("film_length = 0 is not allowed"):
-        trace.film(tmp_path / "none.mp4", 0)
 
 
 # --- a table -------------------------------------------------------------------------------

@@ -10,7 +10,7 @@ from fnmatch import fnmatch
 import numpy as np
 import pytest
 import xarray as xr
-from helpers import ROOT, rps, setting_of
+from helpers import ROOT, rps
 from numpy.random import default_rng
 from numpy.testing import assert_allclose, assert_array_equal
 
@@ -19,7 +19,6 @@ from rps_jax.app.cli import names
 from rps_jax.record import files
 from rps_jax.trials.setting import Setting, seed_of
 from rps_jax.trials.trial import Rules
-from rps_jax.world.domain import DOMAINS, Range
 from sweeps import probes, render_tables
 from sweeps.publish import dependencies, rows, study
 from sweeps.publish.recipes import HISTORY, RECIPES, Recipe
@@ -206,18 +205,16 @@ def test_laws_with_default_and_tuned_parameters_are_compared():
 
 
 def test_a_comparison_names_laws_by_the_runs_that_tuned_them():
-    objects = ("random_cylinder", "random_box")
-    domain = replace(DOMAINS["wide"], objects=objects, distance=Range(0.7, 0.8))
-    setting = setting_of(20.0)
-    laws = {"rps": "rps", "rps,a/runs/gradient/tuned.json": "rps_tuned"}
-    results = xr.DataTree.from_dict({"near": sweep(laws, domain, 12, setting=setting, slots=32)})
-    head, first, second = rows.comparison(results)
-    assert (first[0], first[1], second[1]) == ("`near`, 12", "rps", "gradient")
-    assert len(first[head.index("by object [%]")].split(", ")) == 2
-    assert first[-2:] == ["", ""]
-    assert re.fullmatch(r"\+\d+ -\d+", second[-2])
-    lost = 12 - sum(map(int, first[5].split(", ")))
-    assert first[2].startswith(f"{100 * lost / 12:.1f} %")
+    zero, laws = np.zeros((2, 3)), ["rps", "rps,a/runs/gradient/tuned.json"]
+    columns = dict.fromkeys(("diverged", "tipped", "contact_lost_time", "min_distance"), zero)
+    columns |= {"success": np.array([[1, 0, 0], [1, 1, 0]]), "time": zero + 50}
+    variables = {name: (("law", "world"), values) for name, values in columns.items()}
+    results = xr.Dataset(variables, {"law": laws, "object": ("world", ["a", "a", "b"])})
+    head, first, second = rows.comparison(xr.DataTree.from_dict({"near": results}))
+    assert (first[0], first[1], second[1]) == ("`near`, 3", "rps", "gradient")
+    assert first[head.index("by object [%]")] == "50.0, 0.0"
+    assert (first[2][:6], second[2][:6]) == ("33.3 %", "66.7 %")
+    assert (first[-2:], second[-2]) == (["", ""], "+1 -0")
 
 
 def test_success_is_grouped_by_force_lag_and_acceleration():

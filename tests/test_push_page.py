@@ -71,15 +71,31 @@ def twists(live):
     return np.array([np.stack(step.snapshot.twist) for step in live.past])
 
 
-@pytest.mark.parametrize("law", ["rps_plus", slow("rps_tuned")])
+BASE_OF = {law: base for base, laws in MAKE["LAWS"].items() for law in laws}
+
+
+@pytest.mark.parametrize("law", ["rps_plus", slow("rps_tuned"), "unicycle", slow("unicycle_car")])
 def test_a_whole_push_has_the_twists_of_python(law, browser):
-    with python_push(law) as live:
+    with python_push(law, robot=MAKE["BASES"][BASE_OF[law]][1]) as live:
         expected = twists(live)
     assert expected.dtype == np.float64
     success, computed = browser.execute_script(WHOLE_PUSH, law, "box")
     assert success
-    assert len(computed) == len(expected) > 5000
+    assert len(computed) == len(expected) > 2000
     assert_allclose(computed, expected, rtol=0, atol=1e-5)
+
+
+def test_the_switch_of_the_base_offers_the_laws_that_it_can_follow(browser):
+    switch = """
+    by("base").value = arguments[0];
+    by("base").dispatchEvent(new Event("change"));
+    for (let i = 0; i < 50; i++) push.step();
+    return [push.options.law, [...by("law").options].map((x) => x.value)];
+    """
+    for base in [*MAKE["BASES"], "omni"]:
+        law, offered = browser.execute_script(switch, base)
+        assert offered == list(MAKE["LAWS"][base])
+        assert law == offered[0]
 
 
 ROUTE = [[0.4, 0.0], [1.5, 0.0], [2.5, 0.7], [4.0, 0.8]]

@@ -53,9 +53,13 @@ FELT[16:20] = 0.6
 def binary(tmp_path_factory):
     if shutil.which("g++") is None:
         pytest.skip("there is no g++: run `apt-get install -y g++`")
-    folder = tmp_path_factory.mktemp("ros2")
+    return built(tmp_path_factory.mktemp("ros2"), program.program("rps_plus"))
+
+
+def built(folder, exported):
+    """Return the controller in C++ with an exported law."""
     (folder / "rps_push").mkdir()
-    (folder / "rps_push" / "law.h").write_text(c.header(program.program("rps_plus"), "law"))
+    (folder / "rps_push" / "law.h").write_text(c.header(exported, "law"))
     (folder / "driver.cpp").write_text(DRIVER)
     include = ["-I", str(folder), "-I", str(FOLDER / "include")]
     warned = ["-std=c++17", "-O1", "-Wall", "-Wextra", "-Werror", "-fsanitize=address,undefined"]
@@ -181,6 +185,28 @@ def test_cpp_and_python_agree_on_a_recorded_bag(goal, binary, tmp_path, python):
     if goal == "path":
         assert np.ptp(read["target"], axis=0).min() > 0.2
         assert set(statuses) == {"pushing"}
+
+
+ROBOT = "ideal,drive=differential,axle=0.2"
+
+
+def test_a_base_with_an_axle_is_driven_in_the_frame_of_its_axle(tmp_path):
+    """Odometry of the axle is moved ahead to the middle; the command has no sideways velocity."""
+    controller = PYTHON["Controller"](law="unicycle", robot=ROBOT)
+    inputs = list(events(4.0))
+    for i, (name, time, *_) in enumerate(inputs):
+        if name == "odometry":  # of an axle on a straight way, which turns
+            inputs[i] = name, time, 0.1 * time, 0.0, 0.1 * time
+    twists, statuses = driven_in_python(controller, inputs)
+    assert set(statuses) == {"pushing"}
+    assert not twists[:, 1].any()
+    assert np.abs(twists[:, 2]).max() > 0.05
+    middle = [0.4 + 0.2 * np.cos(0.4), 0.2 * np.sin(0.4), 0.4]
+    np.testing.assert_allclose(controller._pose, middle, atol=1e-6)
+    if shutil.which("g++"):
+        exported = program.program("unicycle", ROBOT)
+        cpp, _ = driven_in_cpp(built(tmp_path, exported), inputs)
+        np.testing.assert_allclose(cpp, twists, atol=1e-5)
 
 
 def test_a_path_replaces_the_target_until_it_ends(driven):

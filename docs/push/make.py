@@ -24,7 +24,7 @@ import numpy as np
 from rps_jax import __version__
 from rps_jax.control import registry, validation
 from rps_jax.control.learned import features
-from rps_jax.control.observation import TaxelObservation, Twist
+from rps_jax.control.observation import TaxelObservation, Twist, with_base
 from rps_jax.engines import quasistatic
 from rps_jax.engines.base import ControlPeriod
 from rps_jax.geometry.polyline import Polyline
@@ -50,11 +50,21 @@ from rps_jax.world.tasks.corridor import CorridorCourse
 HERE = Path(__file__).parent
 RECORDED = HERE / "recorded.json"
 SITE = HERE.parents[1] / "site"
+# Bases with their titles and texts, and their laws with titles.
+BASES = {
+    "omni": ("omnidirectional", "ideal"),
+    "differential": ("differential", "ideal,drive=differential,axle=0.15"),
+    "car": ("car", "ideal,drive=car,axle=0.15,turning_radius=0.5"),
+}
 LAWS = {
-    "rps": "RPS, the paper's",
-    "rps_tuned": "RPS, tuned by evolution",
-    "rps_plus": "RPS+",
-    "learned": "a network that learned from touch",
+    "omni": {
+        "rps": "RPS, the paper's",
+        "rps_tuned": "RPS, tuned by evolution",
+        "rps_plus": "RPS+",
+        "learned": "a network that learned from touch",
+    },
+    "differential": {"unicycle": "push and reposition"},
+    "car": {"unicycle_car": "push and reposition, for cars"},
 }
 NUM_CORNERS = {"cylinder": 1, "prism": 6}  # by family; a box repeats two corners
 # Tasks of the page, with their names in words.
@@ -242,10 +252,11 @@ def family_routines(family: str) -> list[Routine]:
     ]
 
 
-def law_routines(name: str) -> tuple[list[Routine], dict[str, Any]]:
-    """Return the routines `init` and `step` of a law, and its parameters with their bounds."""
+def law_routines(base: str, name: str, title: str) -> tuple[list[Routine], dict[str, Any]]:
+    """Return the routines `init` and `step` of a law on a base, and its parameters with bounds."""
     label, params = registry.resolve_law(name)
-    law, kind = registry.law_of(params), type(params).__name__
+    law, kind = registry.law_of(params), f"{type(params).__name__}_{base}"
+    robot = Robot.parse(BASES[base][1])
     observation = validation.observation_shapes(law.senses)
     if isinstance(observation, TaxelObservation):
         count = Robot().shell.count
@@ -254,8 +265,8 @@ def law_routines(name: str) -> tuple[list[Routine], dict[str, Any]]:
     memory = jax.eval_shape(law.init, shapes)
     arguments = {"params": shapes, "memory": memory, "observation": observation}
 
-    def step(*inputs: Any) -> Any:
-        memory, twist, details = law.step(*inputs)
+    def step(params: Any, memory: Any, observation: Any) -> Any:
+        memory, twist, details = law.step(params, memory, with_base(observation, None, robot))
         return memory, Twist(*twist), details
 
     routines = [
@@ -275,8 +286,8 @@ def law_routines(name: str) -> tuple[list[Routine], dict[str, Any]]:
         scale = bounds[bound.relative_to].high if bound.relative_to else 1.0
         about = next(field.about for field in fields if field.name == name_in_js)
         sliders[name_in_js] = [bound.low * scale, bound.high * scale, bound.log, about]
-    description = {"title": LAWS[name], "kind": kind, "params": values, "sliders": sliders}
-    return routines, {label: description}
+    description = {"title": title, "base": base, "kind": kind}
+    return routines, {label: description | {"params": values, "sliders": sliders}}
 
 
 def values_of(tree: Any) -> dict[str, Any]:
@@ -341,20 +352,26 @@ def scripts() -> str:
             routines |= {item.name: item for item in family_routines(family)}
         for kind in TASKS:
             routines |= {item.name: item for item in task_routines(kind)}
-        for name in LAWS:
-            of_law, description = law_routines(name)
-            routines |= {item.name: item for item in of_law}
-            laws |= description
+        for base, names in LAWS.items():
+            for name, title in names.items():
+                of_law, description = law_routines(base, name, title)
+                routines |= {item.name: item for item in of_law}
+                laws |= description
         functions = [function(name, item, tables) for name, item in routines.items()]
         start = world_of("prism")[2]._replace(**UNTRACED)
-    base = Robot().shell
-    taxels = np.asarray(base.taxels(2)).tolist()  # two points of each, a quarter from its ends
+    shell = Robot().shell
+    taxels = np.asarray(shell.taxels(2)).tolist()  # two points of each, a quarter from its ends
     constants = {
         "VERSION": __version__,
         "LAWS": laws,
         "START": values_of(start),
         "PERIOD": SETTING.physics.control_period,
-        "BASE": [float(x) for x in base.half],
+        "BASE": [float(x) for x in shell.half],
+        "BASES": {
+            name: {"title": title, "axle": robot.axle, "half_track": float(robot.half_track)}
+            for name, (title, text) in BASES.items()
+            for robot in [Robot.parse(text)]
+        },
         "TAXELS": taxels,
         "FRICTION": {name: list(friction) for name, friction in FRICTION.items()},
         "GAP": Case().gap,

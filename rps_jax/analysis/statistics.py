@@ -26,15 +26,6 @@ FAILURES = (
     "stalled",
     "contact not felt",
 )
-# Failure modes in order of precedence, after those of tasks.
-_PRECEDENCE = (
-    "diverged",
-    "fell over",
-    "stalled",
-    "contact not felt",
-    "never touched",
-    "lost contact",
-)
 _TAIL = 0.05  # share of the worlds in the tail of the CVaR
 # Limits of all intervals of a report.
 NOT_PROMISED = (
@@ -186,21 +177,15 @@ def modes() -> tuple[str, ...]:
 
 def failure_modes(trials: xr.Dataset, max_lost: float) -> np.ndarray:
     """Return indices (world,) into `modes()` of the trials of one law, -1 for a success."""
+    outcomes = {"diverged": "diverged", "tipped": "fell over", "stalled": "stalled"}
+    outcomes = tasks.FAILURES | outcomes | {"unfelt": "contact not felt"}
     none = xr.zeros_like(trials.success)
-    return np.select(
-        [
-            trials.success.values > 0,
-            *(trials.get(name, none).values > 0 for name in tasks.FAILURES),
-            trials.diverged.values > 0,
-            trials.tipped.values > 0,
-            trials.get("stalled", none).values > 0,
-            trials.get("unfelt", none).values > 0,
-            ~np.isfinite(trials.min_distance.values),
-            trials.contact_lost_time.values > max_lost,
-        ],
-        [-1, *map(modes().index, (*tasks.FAILURES.values(), *_PRECEDENCE))],
-        modes().index("timeout"),
-    )
+    masks = {mode: trials.get(name, none).values > 0 for name, mode in outcomes.items()}
+    masks["never touched"] = ~np.isfinite(trials.min_distance.values)
+    masks["lost contact"] = trials.contact_lost_time.values > max_lost
+    # The first failure mode that holds.
+    failed = np.select([*masks.values()], [*map(modes().index, masks)], modes().index("timeout"))
+    return np.where(trials.success.values > 0, -1, failed)
 
 
 def hardest(results: xr.Dataset, count: int = 10) -> np.ndarray:

@@ -93,7 +93,12 @@ def success_table(results: xr.Dataset, max_lost: float) -> list[list[str]]:
     laws = results.sizes["law"]
     bound = "fails at most" + f" (best of {laws})" * (laws > 1)
     header = ["", *groups, "all", bound, "CVaR 5 % of distance"]
-    header += ["median time", "median path", *modes]
+    medians = {"time": ("time", "{:.1f} s"), "path": ("path_length", "{:.2f} m")}
+    if "repositions" in results and results.repositions.values.any():
+        lost = {"time": "contact_lost_time", "path": "contact_lost_path"}
+        medians |= {f"{x} without contact": (lost[x], medians[x][1]) for x in lost}
+        medians["repositions"] = "repositions", "{:g}"
+    header += [*(f"median {text}" for text in medians), *modes]
     rows = [header]
     for law in map(str, results.law.values):
         trials = results.sel(law=law)
@@ -103,12 +108,11 @@ def success_table(results: xr.Dataset, max_lost: float) -> list[list[str]]:
         rows.append(
             [
                 law,
-                *(_rate(success[mask]) for mask in groups.values()),
-                _rate(success),
+                *(rate(success[mask]) for mask in groups.values()),
+                rate(success),
                 _at_most(statistics.fails_at_most(failures, success.size, laws)),
                 _cvar(statistics.distance_left(trials)),
-                f"{np.median(trials.time.values[success]):.1f} s" if success.any() else "-",
-                f"{np.median(trials.path_length.values[success]):.2f} m" if success.any() else "-",
+                *(median(trials[name].values[success], text) for name, text in medians.values()),
                 *(str(int((mode_index == statistics.modes().index(mode)).sum())) for mode in modes),
             ]
         )
@@ -151,19 +155,25 @@ def models_table(results: xr.Dataset) -> list[list[str]]:
     equal those on the first model.
     """
     success = results.model_success
-    names = list(map(str, success.model.values))
+    names = success.model.values.tolist()
     rows = [["", *names, "over all models", "outcomes equal to the first"]]
     for law in map(str, success.law.values):
         by_model = success.sel(law=law).values > 0
         rates = by_model.mean(axis=1)
         equal = 100 * (by_model == by_model[0]).mean(axis=1)[1:]
         least = f"{equal.min():.1f} % and more" if equal.size else "-"
-        rows.append([law, *map(_rate, by_model), rate_range(rates), least])
+        rows.append([law, *map(rate, by_model), rate_range(rates), least])
     return rows
 
 
-def _rate(success: np.ndarray) -> str:
+def rate(success: np.ndarray) -> str:
+    """Format the success rate of trials (...) bool with its Wilson 95 % interval."""
     return share(int(success.sum()), success.size)
+
+
+def median(values: np.ndarray, form: str = "{:.1f} s") -> str:
+    """Format the median of values (n,); "-" without any."""
+    return form.format(np.median(values)) if values.size else "-"
 
 
 def percent(successes: float, trials: int = 1) -> str:
@@ -232,13 +242,13 @@ def against_table(results: xr.Dataset, reference: str) -> list[list[str]]:
         if c := tests.get(law):
             difference = f"{_difference(c, base.size)} ({c.changes})"
             cells = [difference, p[law], str(c.gained)]
-        rows.append([law, _rate(success.values > 0), *cells])
+        rows.append([law, rate(success.values > 0), *cells])
     return rows
 
 
 def worlds_table(results: xr.Dataset, run: str, worlds: np.ndarray) -> list[list[str]]:
     """Return a row for each of some failed worlds, with the command that replays it."""
-    laws = [str(law) for law in results.law.values]
+    laws = results.law.values.tolist()
     rows = [["world", "object", *laws, "mass", "friction", "target", "replay"]]
     for world in worlds.tolist():
         trials = results.isel(world=world)

@@ -78,6 +78,7 @@ class Shadow(BagQuestion[xr.Dataset]):
         robot = robots.parse_robot(self.robot)
         shell = robot.shell
         recorded = with_contacts(self.steps, shell, f"bag = {self.file}")
+        recorded |= {"twist": robot.twist_of_middle(recorded["twist"])}
         if "target" not in recorded:
             recorded |= {"target": pursued(recorded, self.lookahead)}
         motion = (recorded[name] for name in ("time", "pose", "twist"))
@@ -86,6 +87,8 @@ class Shadow(BagQuestion[xr.Dataset]):
         both = np.stack([recorded["twist"], twists])
         pairs = zip(COLUMNS["twist"].items(), np.moveaxis(both, -1, 0), strict=True)
         columns = {name: (("source", "time"), x, {"units": unit}) for (name, unit), x in pairs}
+        if robot.drive != "omni":  # of which v_y follows from omega
+            del columns["v_y"]
         coords = {"source": ["commanded", "law"], "time": recorded["time"]}
         attrs = {"law": registry.resolve_law(self.law)[0], "doubts": doubts}
         return xr.Dataset(columns, coords, attrs)
@@ -95,7 +98,7 @@ class Shadow(BagQuestion[xr.Dataset]):
         rows = [["", "root mean square", "greatest", "at time [s]"]]
         is_nan = ~np.isfinite(results.to_array().sel(source="law")).all("variable").values
         finite = results.isel(time=~is_nan)
-        for name, unit in COLUMNS["twist"].items():
+        for name, unit in ((name, COLUMNS["twist"][name]) for name in map(str, results)):
             error = np.abs(finite[name].sel(source="law") - finite[name].sel(source="commanded"))
             if not error.size:
                 continue

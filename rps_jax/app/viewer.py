@@ -29,6 +29,7 @@ from rps_jax.control.registry import LawLike
 from rps_jax.errors import InputError
 from rps_jax.record import files
 from rps_jax.record.options import option
+from rps_jax.robot import robot as robots
 from rps_jax.runs.plan import Plan, build_batch, load_plan, scene_of, world_title
 from rps_jax.runs.push import case_options, end_in_words, program_slots, select_law
 from rps_jax.runs.question import Command, call_of
@@ -48,6 +49,13 @@ _PANEL_TICK = 0.25  # [s] between two updates of the panel, which browsers are s
 _MAX_ELAPSED = 0.5  # [s] between two ticks, also if a push was built in the first
 _BUDGET = 0.15  # [s] of simulation between two updates of the page
 _DRAGGING = [f"TransformControls{event}Message" for event in ("Update", "DragStart", "DragEnd")]
+# Modes of laws, by the fields of their states.
+_MODES = {
+    "retreat": "backing off",
+    "around": "driving around the object",
+    "align": "turning towards the target",
+    "away": "repositioning",
+}
 _CONTACTS = ("no contact", "point contact", "line contact")
 
 
@@ -78,7 +86,9 @@ class View(Command[None], Case):
     progress: bool | None = option(False, kw_only=True, hidden=True)
 
     def __post_init__(self) -> None:
-        """Defer the checks of `Case` to `check`."""
+        """Set the control period of the robot; defer the checks of `Case` to `check`."""
+        setting = self.setting.with_robot(robots.parse_robot(self.robot))
+        object.__setattr__(self, "setting", setting)
 
     @property
     def case(self) -> Case:
@@ -113,7 +123,7 @@ class View(Command[None], Case):
     def execute(self, callback: ProgressCallback) -> None:
         """Serve the page until it is ended."""
         law = registry.resolve_law(self.case.params)[0]
-        law = self.case.law if isinstance(self.case.law, str) else law
+        law = named if isinstance(named := self.case.named_law, str) else law
         request = PushRequest(self.object, label_of(self.friction), law, self.target)
         first = partial(self.push_of, request)
         if self.run is not None:
@@ -301,8 +311,9 @@ class Page:
             way = f"{float(task['progress']):.0%} of the path, {error:.2f} m off it in the mean"
         contact = _CONTACTS[int(moment.reading.contact_type)]
         words = [f"{index * live.period:.1f} s", way, contact]
-        if moment.details.realigning:
-            words.append("realigning")
+        state = live.past[index].trial.law_state
+        modes = [text for name, text in _MODES.items() if np.any(getattr(state, name, 0.0) > 0.5)]
+        words += modes or ["realigning"] * bool(moment.details.realigning)
         if self._is_over(live):
             words.append("**reached**" if live.outcome.success else "**not reached**")
             words += tasks.failures_of(task)

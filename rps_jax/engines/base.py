@@ -28,6 +28,7 @@ from rps_jax.control.observation import Twist
 from rps_jax.engines import device
 from rps_jax.engines.linear_map import once_differentiable
 from rps_jax.geometry.arrays import Float
+from rps_jax.geometry.solid import Solid
 from rps_jax.robot.robot import Robot
 from rps_jax.world.physics import Physics
 from rps_jax.world.scene import Surroundings, WorldInputs
@@ -118,7 +119,6 @@ class Engine(abc.ABC):
     modes: ClassVar[tuple[Mode, ...]] = ()  # supported modes of differentiation
     forces: ClassVar[bool] = True  # contact can slow and stop a base with a limited force
     computes_force: ClassVar[bool] = True  # it computes the force of a contact
-    weighs_feet: ClassVar[bool] = False  # it distributes the load by the weights of feet
     surroundings: ClassVar[tuple[str, ...]] = Surroundings._fields  # those that it supports
 
     def _refused(self, rule: str) -> errors.InputError:
@@ -141,14 +141,11 @@ class Engine(abc.ABC):
         if robot.driven and not self.forces:
             raise self._refused("a robot with a limited force needs fused, mjx or mujoco")
 
-    def check_feet(self, feet: np.ndarray | None) -> None:
-        """Raise InputError unless the engine uses the weights of feet (n, S, 3)."""
-        if feet is None or self.weighs_feet:
-            return
-        weights = feet[..., 2]
-        if np.any((weights > 0) & (weights != weights.max(axis=-1, keepdims=True))):
-            rule = "it ignores the weights of feet, which the object has"
-            raise self._refused(f"{rule}; choose quasistatic, or register feet without weights")
+    def check_pads(self, solids: Solid, physics: Physics) -> None:
+        """Raise InputError unless the cone can be that of solids on pads."""
+        if solids.pads is not None and physics.cone == "pyramidal":
+            rule = "objects with weights of feet or a distributed support need elliptic"
+            raise errors.not_allowed("cone", physics.cone, rule)
 
     def check_surroundings(self, surroundings: Surroundings) -> None:
         """Raise InputError unless the engine can step worlds with these surroundings."""

@@ -6,6 +6,7 @@ batch of them: `fields_of` returns the fields that differ, `apply` sets those of
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import partial
 from operator import attrgetter
 from typing import Any, NamedTuple
@@ -45,6 +46,8 @@ FIELDS = (
     *(".geom_pos", ".geom_size", ".geom_aabb", ".geom_rbound", ".pair_friction"),
 )
 
+# The same of objects on pads.
+PADS = ".pair_solref", ".pair_solimp"
 # Field of prisms on explicit feet: (N, 2) [m]; other prisms stand on their outline.
 OUTLINE = "outline"
 BOUNDARY = "boundary"  # field of floors with two frictions: (4,) as of `Surroundings`
@@ -175,8 +178,9 @@ class MJX(Engine):
             slots = inputs.surroundings._replace(walls=walls[:, :AT_ONCE])
             inputs = inputs._replace(surroundings=slots)
         template = scene.compile_row(inputs, 0).physics
-        rows = compile_rows(inputs, fields_of)
-        fields = {name: np.stack([row[name] for row in rows]) for name in FIELDS}
+        names = FIELDS if inputs.solids.pads is None else FIELDS + PADS
+        rows = compile_rows(inputs, partial(fields_of, names=names))
+        fields = {name: np.stack([row[name] for row in rows]) for name in names}
         if inputs.solids.feet is not None:
             fields[OUTLINE] = inputs.solids.vertices
         around = {".opt.gravity": inputs.surroundings.slope, BOUNDARY: inputs.surroundings.boundary}
@@ -196,12 +200,12 @@ def put(model: mujoco.MjModel) -> mjx.Model:
     return mjx.put_model(model).tree_replace(unused)  # pyright: ignore[reportReturnType]
 
 
-def fields_of(model: mujoco.MjModel) -> Arrays:
-    """Return `FIELDS` of a model, which include all constants that MuJoCo derives from a mass.
+def fields_of(model: mujoco.MjModel, names: Sequence[str] = FIELDS) -> Arrays:
+    """Return fields of a model, which include all constants that MuJoCo derives from a mass.
 
     They are always the same fields, so that the numbers of a world do not depend on the batch.
     """
-    return {name: np.array(attrgetter(name[1:])(model), float) for name in FIELDS}
+    return {name: np.array(attrgetter(name[1:])(model), float) for name in names}
 
 
 def apply(model: mjx.Model, fields: dict[str, jax.Array]) -> mjx.Model:

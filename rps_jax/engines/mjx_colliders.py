@@ -82,7 +82,7 @@ def corners_of(model: Model, outline: jax.Array | None = None) -> jax.Array:
         return jnp.zeros((1, 3))
     corners = model.geom_pos[geoms(model, _OBJECT, GeomType.SPHERE)]
     if outline is not None:
-        corners = jnp.concatenate([outline, corners[:, 2:]], axis=1)
+        corners = jnp.concatenate([outline, corners[: len(outline), 2:]], axis=1)
     return corners
 
 
@@ -161,7 +161,7 @@ def collision(model: Model, data: Data, outline: Extra = None, boundary: Extra =
         contact = jax.tree.map(lambda x, n=count: jnp.repeat(x, n, axis=0), contact)
         if boundary is not None and pair[0] == GeomType.PLANE:
             beyond = (point[..., :2] @ boundary[:2] > boundary[2]).reshape(-1, 1)
-            slide = contact.friction.at[:, :2].multiply(jnp.where(beyond, boundary[3], 1.0))
+            slide = contact.friction.at[:, :3].multiply(jnp.where(beyond, boundary[3], 1.0))
             contact = contact.replace(friction=slide)
         contacts.append(contact.replace(dist=distance, pos=point, frame=frame))
     whole = jax.tree.map(lambda *x: jnp.concatenate(x), *contacts)

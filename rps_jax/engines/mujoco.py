@@ -74,7 +74,7 @@ class Batch:
         self._weight = np.array([[*m.body("base").mass * m.opt.gravity[:2], 0] for m in models])
         self._boundary = boundary
         self._ground = np.flatnonzero(models[0].pair_geom1 == models[0].geom("ground").id)
-        self._friction = np.array([model.pair_friction[self._ground, :2] for model in models])
+        self._friction = np.array([model.pair_friction[self._ground, :3] for model in models])
         self._timestep = models[0].opt.timestep
         self._data = [mujoco.MjData(models[0]) for _ in range(threads)]
         self._pool = rollout.Rollout(nthread=threads)
@@ -163,7 +163,7 @@ class Batch:
             mujoco.mj_kinematics(model, data)
             feet = data.geom_xpos[model.pair_geom2[self._ground], :2]
             factors = np.where(feet @ normal > border, factor, 1.0)[:, None]
-            model.pair_friction[self._ground, :2] = self._friction[i] * factors
+            model.pair_friction[self._ground, :3] = self._friction[i] * factors
 
     def _rollout(
         self, rows: np.ndarray, state: np.ndarray, warmstart: np.ndarray, **options: Any

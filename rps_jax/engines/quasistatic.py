@@ -6,7 +6,9 @@ ellipsoid f^2 / f_max^2 + m^2 / m_max^2 = 1, so that V is proportional to L^-1 (
 L = diag(1, 1, c^2) and c = m_max / f_max (Goyal, Ruina and Papadopoulos 1991; Howe and Cutkosky
 1996; Lynch and Mason 1996). The base, a velocity source, determines the speed of the object, so
 that the results depend neither on the size of the force, nor on the mass, nor on the friction with
-the ground. In each step V minimises
+the ground. Of an object on pads, as with even pressure, the limit surface is that of their Coulomb
+friction: D(V) = sum over pads of N_i |(v_i, r_i omega)|, with loads N_i, velocities v_i and radii
+r_i, replaces the square root of V L V. In each step V minimises
 
     V L V / (2 S) + sum over contacts of P(gap + dt (v_n - mu |v_t|)),
 
@@ -32,6 +34,7 @@ from rps_jax.engines.fused.contacts import Point, circle_and_base, polygon_and_b
 from rps_jax.geometry import planar, solid
 from rps_jax.geometry import vectors as sp
 from rps_jax.geometry.arrays import Entries, Number
+from rps_jax.geometry.friction import ENTRIES, friction_of_pads, solved
 from rps_jax.geometry.vectors import Vec
 from rps_jax.world import scene
 from rps_jax.world.scene import JOINTS, WorldInputs
@@ -41,7 +44,8 @@ DEPTH = 1e-4  # [m] approximate penetration of a push
 SLIP = 0.01  # [1] share of the base's speed at which friction is 0.7 of its maximum
 _ITERATIONS = 10  # of Newton's method
 _SHARP = 3  # final steps of Newton's method with the final slip; earlier ones have a wider slip
-_ENTRIES = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))  # of a symmetric matrix
+_LEAST_RADIUS = 0.05  # [1] of pads, of the arm: at a point, the limit surface is not smooth
+_LEAST_PACE = 1e-3  # [1] share of the base's speed below which friction of pads is smooth
 
 
 class Slider(NamedTuple):
@@ -53,6 +57,8 @@ class Slider(NamedTuple):
     base_size: Entries  # (2,) [m] half length and width of the base, or (1,) its radius
     vertices: Entries  # (N, 2) [m] of the outline, counter-clockwise, in the object's frame
     radius: Number  # () [m] of the outline
+    # (S, 4) x, y [m] of pads from the centre of mass, share of the friction [1], radius [m]
+    pads: Entries = None
 
 
 class Contact(NamedTuple):
@@ -71,6 +77,7 @@ class Problem(NamedTuple):
     speed: Number  # [m/s] of the base
     arm: Number  # [m]
     friction: Number  # [1]
+    pads: tuple[Number, ...] | None = None  # rows of `Slider.pads`, in the base's axes
 
 
 class Quasistatic(NamedTuple):
@@ -90,7 +97,10 @@ class Quasistatic(NamedTuple):
         p = free[:, :2] + planar.rotate(yaw, com)
         # The batch axis comes last, as in `contacts`.
         corners = jnp.moveaxis(fields.vertices - com[:, None], (0, 1), (2, 1))
-        sliders = fields._replace(base_size=tuple(fields.base_size.T), vertices=tuple(corners))
+        pads = None if fields.pads is None else tuple(jnp.moveaxis(fields.pads, (0, 1), (2, 1)))
+        sliders = fields._replace(
+            base_size=tuple(fields.base_size.T), vertices=tuple(corners), pads=pads
+        )
         poses = (tuple(qpos[:, JOINTS.base].T), (*p.T, yaw))
         twist = (period.twists.v_x, period.twists.v_y, period.twists.omega)
         step = partial(_step, sliders, twist, physics.timestep)
@@ -124,6 +134,7 @@ def _step(slider: Slider, twist: Vec, dt: float, poses: tuple[Vec, Vec]) -> tupl
         jnp.sqrt(v_x * v_x + v_y * v_y + reach * omega * omega + _MIN_SPEED**2),
         slider.arm,
         slider.friction_robot,
+        None if slider.pads is None else _turned(slider.pads, pushed[2] - base[2]),
     )
     v = solve(problem, (v_x - omega * p[1], v_y + omega * p[0], omega), dt)
 
@@ -157,9 +168,13 @@ def derivatives(problem: Problem, v: Vec, slip: Number, dt: float) -> tuple[Vec,
     """Return the gradient and the upper entries of the Hessian of the cost."""
     tiny, friction = slip * problem.speed, problem.friction
     stiff = 1 / problem.speed
-    inertia = (stiff, stiff, stiff * problem.arm * problem.arm)
-    gradient: Vec = (inertia[0] * v[0], inertia[1] * v[1], inertia[2] * v[2])
-    hessian: list[Number] = [inertia[i] if i == j else 0.0 for i, j in _ENTRIES]
+    if problem.pads is None:
+        inertia = (stiff, stiff, stiff * problem.arm * problem.arm)
+        gradient: Vec = (inertia[0] * v[0], inertia[1] * v[1], inertia[2] * v[2])
+        hessian: list[Number] = [inertia[i] if i == j else 0.0 for i, j in ENTRIES]
+    else:
+        gradient, hessian = friction_of_pads(problem.pads, v, _LEAST_PACE * problem.speed)
+        gradient, hessian = sp.scale(stiff, gradient), [stiff * entry for entry in hessian]
     for contact in problem.contacts:
         n, r = contact.normal, contact.r
         t = (-n[1], n[0])
@@ -174,9 +189,15 @@ def derivatives(problem: Problem, v: Vec, slip: Number, dt: float) -> tuple[Vec,
         bend = force * friction * tiny * tiny / (slide * slide * slide)
         hessian = [
             h + dt * stiffness * push[i] * push[j] + bend * along[i] * along[j]
-            for h, (i, j) in zip(hessian, _ENTRIES, strict=True)
+            for h, (i, j) in zip(hessian, ENTRIES, strict=True)
         ]
     return gradient, hessian
+
+
+def _turned(pads: tuple[Number, ...], yaw: Number) -> tuple[Number, ...]:
+    """Return the rows of pads turned by an angle [rad]."""
+    (x, y, *rest), c, s = pads, jnp.cos(yaw), jnp.sin(yaw)
+    return c * x - s * y, s * x + c * y, *rest
 
 
 def _contacts(slider: Slider, pose: Vec, twist: Vec) -> list[Contact]:
@@ -221,17 +242,6 @@ def _spring(inside: Number) -> tuple[Number, Number]:
     return force / DEPTH, bent / (2 * DEPTH * DEPTH)
 
 
-def solved(g: Vec, h: Sequence[Number]) -> Vec:
-    """Solve h x = g for a symmetric 3 x 3 matrix with the upper entries h."""
-    a, b, c, d, e, f = h
-    l_1, l_2 = b / a, c / a
-    d, e = d - l_1 * b, e - l_1 * c
-    y = g[1] - l_1 * g[0]
-    z = (g[2] - l_2 * g[0] - e / d * y) / (f - l_2 * c - e * e / d)
-    y = (y - e * z) / d
-    return (g[0] - b * y - c * z) / a, y, z
-
-
 class QuasistaticEngine(Engine):
     """Planar engine without inertia, differentiable in both modes."""
 
@@ -239,7 +249,6 @@ class QuasistaticEngine(Engine):
     cones = ("elliptic",)  # its friction is the same in all directions
     modes = ("forward", "reverse")
     forces = False
-    weighs_feet = True
     surroundings = ()
     computes_force = False  # only the direction of the force is known, not its size
 
@@ -247,13 +256,24 @@ class QuasistaticEngine(Engine):
         """Return the stage, and the sliders (n, ...) of the worlds; bases follow every twist."""
         solids, count = inputs.solids, inputs.num_worlds
         assert not inputs.robots.driven, "checked by check_robot"
+        arm, pads = solid.friction_arm(solids), None
+        if solids.feet is not None and solids.pads is not None:
+            at, weight = (
+                solids.feet[..., :2] - solids.p_object_com[:, None, :2],
+                solids.feet[..., 2],
+            )
+            share = solid.supported_load(at, weight, np.zeros((count, 2))) * solids.pads[..., 0]
+            share = share / share.sum(axis=1, keepdims=True)
+            radius = np.maximum(solids.pads[..., 1], _LEAST_RADIUS * arm[:, None])
+            pads = np.concatenate([at, np.stack([share, radius], axis=2)], axis=2)
         return Quasistatic(), Slider(
             p_object_com=solids.p_object_com[:, :2],
-            arm=solid.friction_arm(solids),
+            arm=arm,
             friction_robot=np.broadcast_to(inputs.friction.robot, count),
             base_size=scene.base_size(inputs.robots, count),
             vertices=solids.vertices,
             radius=solids.radius,
+            pads=pads,
         )
 
 

@@ -43,7 +43,7 @@ from types import SimpleNamespace
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.spatial.transform import Rotation
+import scipy
 
 from rps_jax import errors
 from rps_jax.errors import InputError
@@ -589,7 +589,8 @@ def _transform(row: _Series, frame: str, goal: str, edges: _Edges, static: str) 
         row.refuse(late, f"no transform of {parent} to {child} at the time of the message")
         poses.check(math.inf)
         edge = np.tile(np.eye(4), (len(late), 1, 1))
-        edge[:, :3, :3] = Rotation.from_quat(poses.values[:, 3:]).as_matrix()
+        rotations = scipy.spatial.transform.Rotation.from_quat(poses.values[:, 3:])
+        edge[:, :3, :3] = rotations.as_matrix()
         edge[:, :3, 3] = poses.values[:, :3]
         matrices = (np.linalg.inv(edge) if frame == parent else edge) @ matrices
         frame = child if frame == parent else parent

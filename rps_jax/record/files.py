@@ -15,6 +15,7 @@ import json
 import os
 import stat
 import zipfile
+import zlib
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
@@ -43,6 +44,8 @@ POINTER = b"version https://"  # first bytes of a pointer of Git LFS
 FETCH = "it is a pointer of Git LFS: fetch the file itself by `git lfs pull`"
 FIELD_FILES = (".json", ".yaml", ".yml")  # suffixes of files with names and values
 _PACKED = (".gz", ".bz2", ".xz", ".zip")
+_SAMPLE = 4096  # values of a column of results
+_COMPRESSION = {"compression": "gzip", "compression_opts": 1, "shuffle": True}
 Arrays = dict[str, np.ndarray]  # by name
 JsonObject = dict[str, Any]  # parsed JSON has values of any type
 
@@ -259,8 +262,20 @@ def encode_results(results: xr.Dataset) -> bytes:
     It is built in memory, since HDF5 crashes the process when its disk is full.
     """
     # A view that Python's garbage collector finds first crashes Python before 3.12.2.
-    with results.to_netcdf(engine="h5netcdf") as view:
+    encoding = {name: _packed(column.values) for name, column in results.variables.items()}
+    with results.to_netcdf(engine="h5netcdf", encoding=encoding) as view:
         return bytes(view)
+
+
+def _packed(values: np.ndarray) -> Mapping[str, object]:
+    """Return the encoding of a column: compressed if that saves 15 %, by a sample."""
+    if values.size < _SAMPLE:
+        return {}
+    if values.dtype.kind in "OU":
+        return {"dtype": "S1"} | _COMPRESSION
+    bytes_of_sample = values.reshape(-1)[:_SAMPLE].view(np.uint8).reshape(_SAMPLE, -1)
+    size = len(zlib.compress(bytes_of_sample.T.tobytes(), 1))
+    return _COMPRESSION if size < 0.85 * bytes_of_sample.size else {}
 
 
 def decode_results(content: bytes, source: object) -> xr.Dataset:
@@ -268,9 +283,11 @@ def decode_results(content: bytes, source: object) -> xr.Dataset:
     try:
         with xr.open_dataset(io.BytesIO(content), engine="h5netcdf") as results:
             size = sum(variable.nbytes for variable in results.variables.values())
-            if size > 8 * len(content) + 2**20:  # HDF5 does not store values never written
+            if size > 1024 * len(content) + 2**20:  # HDF5 does not store values never written
                 raise ValueError(f"it claims {size} bytes of numbers")
             results.load()
+        names = [name for name, column in results.variables.items() if column.dtype.kind == "O"]
+        results = results.assign({name: results[name].astype(str) for name in names})
     except Exception as error:  # of any kind, by HDF5 on damaged files
         raise CorruptFileError(source, error) from error
     return results

@@ -100,7 +100,8 @@ class Robot:
     wheel_acceleration_max: Annotated[
         Number, Spec("m/s^2", "greatest acceleration of a wheel's rim", ge=_POSITIVE, le=100)
     ] = None  # ()
-    # Of software; None: those of the domain.
+    # Of software; None: those of the physics and of the domain.
+    period: Annotated[Number, Spec("s", "control period", gt=0, le=1)] = None  # () static
     pose_latency: Annotated[Number, Spec("s", "age of the pose that laws observe", ge=0, le=1)] = (
         None  # ()
     )
@@ -121,6 +122,15 @@ class Robot:
         """Position () [m] of the axle behind the middle of the base."""
         return 0.0 if self.axle is None else self.axle
 
+    def twist_of_middle(self, twist: np.ndarray) -> np.ndarray:
+        """Return twists (N, 3) of the axle or of the middle as those of the base's middle.
+
+        With an axle, v_y of the middle is that of its turn about the axle.
+        """
+        if self.drive == "omni":
+            return twist
+        return np.stack([twist[:, 0], self.axle_behind * twist[:, 2], twist[:, 2]], axis=-1)
+
     @classmethod
     def parse(cls, robot: RobotLike) -> Robot:
         """Return a robot by its name, file or text of changes: see `parse_robot`."""
@@ -134,7 +144,7 @@ class Robot:
     @property
     def ideal(self) -> bool:
         """Whether the base has no limits: it follows every twist at once, with any force."""
-        return self.drive == "omni" and all(getattr(self, name) is None for name in LIMITS)
+        return self.drive == "omni" and all(getattr(self, x) is None for x in (*LIMITS, "period"))
 
     @property
     def inertia(self) -> Number:
@@ -188,7 +198,7 @@ class Robot:
     @property
     def body(self) -> Robot:
         """The fields that a physics step needs: without the skin and the limits of the aim."""
-        return dataclasses.replace(self, boards=(), **dict.fromkeys(_AIM_LIMITS))
+        return dataclasses.replace(self, boards=(), period=None, **dict.fromkeys(_AIM_LIMITS))
 
     def check(self) -> None:
         """Raise InputError for numbers that no robot has; each is one number, or None."""
@@ -248,10 +258,11 @@ _WHEELS = ("axle", "turning_radius", "track", "wheel_speed_max", "wheel_accelera
 LATENCIES = ("pose_latency", "command_delay", "time_constant")  # also names of a domain's ranges
 _AIM_LIMITS = ("v_max", "omega_max", "lag", "acceleration_max", *_SLIPS, *_WHEELS[3:], *LATENCIES)
 _BODY = ("half_length", "half_width", "radius", "boards", "mass", "bandwidth", "resistance")
-_STATIC = (*_BODY, "drive", *_WHEELS, *LATENCIES)
+_META = ["drive", "period"]
+_STATIC = (*_BODY, *_META, *_WHEELS, *LATENCIES)
 LIMITS = tuple(name for name in _FIELDS if name not in _STATIC)
-_DATA = [name for name in _FIELDS if name != "drive"]
-jax.tree_util.register_dataclass(Robot, data_fields=_DATA, meta_fields=["drive"])
+_DATA = [name for name in _FIELDS if name not in _META]
+jax.tree_util.register_dataclass(Robot, data_fields=_DATA, meta_fields=_META)
 
 
 def _covered(half_length: float, half_width: float, mass: float, **limits: Any) -> Robot:

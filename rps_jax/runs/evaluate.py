@@ -94,6 +94,7 @@ def evaluate(
     options_.check_arguments(evaluate, locals())
     device.check_process()
     ranges, params = parse_domain(domain, robot, task), candidates(law)
+    setting = setting.with_robot(ranges.robot)
     at = None if points is None else points_.check_points(ranges, points)
     count = worlds if at is None else len(at.u)
     errors.check_count("worlds", count, at_most=10_000_000)

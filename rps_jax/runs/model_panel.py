@@ -1,8 +1,8 @@
 """Runs of one plan on a panel of physics models, for the option `models` of a sweep.
 
-The models are grounds, friction cones and time steps between which measurements do not decide. A
-success rate has two errors: its statistical interval is the effect of other worlds, and its range
-over the models is the effect of another simulation.
+The models are grounds, supports, friction cones and time steps between which measurements do not
+decide. A success rate has two errors: its statistical interval is the effect of other worlds, and
+its range over the models is the effect of another simulation.
 """
 
 import contextlib
@@ -30,6 +30,8 @@ MODELS = {
     "MuJoCo's ground, 5 ms": replace(_HALVED, **MUJOCO_GROUND),
     "MuJoCo's ground, 2 ms": _FINE,
     "MuJoCo's ground, impratio 1, 2 ms": replace(_FINE, impratio=1.0),
+    "even pressure": replace(preset(), support="even"),
+    "pressure on the rim": replace(preset(), support="rim"),
     "quasi-static": preset(),
     "friction pyramid, 1 ms": preset("paper_gazebo"),
 }

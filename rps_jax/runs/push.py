@@ -29,6 +29,7 @@ from rps_jax.errors import InputError
 from rps_jax.record import bag as bags
 from rps_jax.record import files, folder, provenance
 from rps_jax.record.bag import Step
+from rps_jax.record.files import JsonObject
 from rps_jax.record.options import option
 from rps_jax.runs.plan import (
     Plan,
@@ -89,6 +90,8 @@ class Trace(Trajectory):
         parts = [f"least distance {float(outcome.min_distance):.3f} m"]
         contact = "not felt" if outcome.unfelt else "lost"
         parts.append(f"contact {contact} for {float(outcome.contact_lost_time):.1f} s")
+        if outcome.repositions:
+            parts[-1] += f" in {int(outcome.repositions)} repositions"
         if np.isinf(outcome.min_distance):
             parts = ["never touched"]
         elif "progress" in outcome.task:
@@ -276,7 +279,7 @@ class Push(Case, TraceQuestion, SimulationQuestion[Trace]):
 
     def __post_init__(self) -> None:
         """Defer the checks of `Case` to `check`."""
-        self.choose_law()
+        SimulationQuestion.__post_init__(self)
 
     @property
     def horizon(self) -> float:
@@ -286,6 +289,10 @@ class Push(Case, TraceQuestion, SimulationQuestion[Trace]):
     def case(self) -> Case:
         """The trial."""
         return Case(**case_options(self, self.setting, Case))
+
+    def fields_as_json(self) -> JsonObject:
+        named = self if self.law is not None else dataclasses.replace(self, law=self.named_law)
+        return super(Push, named).fields_as_json()
 
     def check(self) -> None:
         super().check()

@@ -22,6 +22,7 @@ import dataclasses
 import functools
 import itertools
 import re
+import shlex
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields
@@ -51,7 +52,7 @@ from rps_jax.record import cache, files, folder, manifest, options, provenance
 from rps_jax.record.bag import TopicsLike
 from rps_jax.record.files import JsonObject
 from rps_jax.record.options import option
-from rps_jax.robot.robot import RobotLike
+from rps_jax.robot.robot import RobotLike, parse_robot
 from rps_jax.runs.run import Run
 from rps_jax.trials.progress import Bar, ProgressCallback, is_interactive
 from rps_jax.trials.setting import Setting
@@ -352,23 +353,31 @@ class BagQuestion(Question[T]):
 
 
 @dataclass(frozen=True, kw_only=True)
-class TrialQuestion(Question[T]):
-    """Base class of questions that run trials."""
+class QuickQuestion(Question[T]):
+    """Base class of questions that have a small run."""
 
-    slots: int | None = option(None, 1, 10_000_000, kw_only=True)
-    """Number of worlds that one worker steps at once; by default as suits engine and device."""
-    workers: int | None = option(None, 1, 1024, kw_only=True)
-    """Number of host threads that step worlds; by default as suits engine and device."""
     quick: bool = False
     """Whether to make a small run of minutes on two cores; explicit options keep their values."""
 
-    IGNORED_FIELDS: ClassVar[tuple[str, ...]] = ("slots", "workers", "quick")
+    IGNORED_FIELDS = ("quick",)
 
     def with_quick_values(self) -> Self:
         return quick_command(self) if self.quick else self
 
     def quick_note(self) -> str:
         return quick_note(self) if self.quick else ""
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrialQuestion(QuickQuestion[T]):
+    """Base class of questions that run trials."""
+
+    slots: int | None = option(None, 1, 10_000_000, kw_only=True)
+    """Number of worlds that one worker steps at once; by default as suits engine and device."""
+    workers: int | None = option(None, 1, 1024, kw_only=True)
+    """Number of host threads that step worlds; by default as suits engine and device."""
+
+    IGNORED_FIELDS = ("slots", "workers")
 
     def create_run(self, out: Path | None, callback: ProgressCallback) -> Run:
         return Run(out, callback, self.slots, self.workers)
@@ -379,6 +388,26 @@ class SimulationQuestion(TrialQuestion[T]):
     """Base class of questions that run trials with one setting."""
 
     setting: Setting = Setting()
+
+    def __post_init__(self) -> None:
+        """Set the control period of the robot."""
+        if (robot := self._robot) is not None:
+            object.__setattr__(self, "setting", self.setting.with_robot(parse_robot(robot)))
+
+    @property
+    def _robot(self) -> RobotLike | None:
+        return getattr(self, "robot", None)
+
+    def next_command(self, command: str, **values: object) -> str:
+        """Return a command of the shell with values, and with robot, task and physics of this."""
+        same = {name: getattr(self, name, None) for name in ("robot", "task")}
+        options_ = same | {"physics": vars(self.setting)["physics"]} | values
+        words = ["rps", *command.split()]
+        for name, value in options_.items():
+            several = value if isinstance(value, tuple | list) else (value,)
+            if all(isinstance(x, str) for x in several) and value != "default":
+                words += [f"--{name}", *map(str, several)]
+        return shlex.join(words)
 
 
 @dataclass(frozen=True)
@@ -428,6 +457,14 @@ class TaskOption:
     corridor (a path between walls that end a trial when touched) or rooms (a planned path among the
     obstacles of a map), or a file, as JSON of waypoints or of polygons, or a ROS map.yaml.
     Changes follow, as corridor,width=1.2:1.6. By default the domain's, reach."""
+
+    @property
+    def _robot(self) -> RobotLike:
+        if self.robot is not None:
+            return self.robot
+        domain: Any = getattr(self, "domain", "wide")
+        single = isinstance(domain, str | Domain)
+        return domains.parse_domain(domain if single else next(iter(domain), "wide")).robot
 
 
 @dataclass(frozen=True)

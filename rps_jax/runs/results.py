@@ -36,6 +36,7 @@ from rps_jax.world import draws, points
 # Types of an outcome's columns; the rest are float32.
 _FLAGS = ("success", "tipped", "diverged", "nan_twist", "stalled", "unfelt")
 _TYPES: dict[str, type] = dict.fromkeys(_FLAGS, np.int8)
+_LATER = {"repositions", "contact_lost_path"}  # outcomes that version 0.4.0 does not store
 _PREFETCH = 16384  # worlds of one program that are built before they are needed, about
 
 
@@ -165,7 +166,8 @@ class Results:
             raise files.CorruptFileError(source, error) from error
         known = {"trial", *self._outcomes}
         drawn = set(columns) - known
-        if missing := {*known, *(() if law[0] or drawn else ("drawn",))} - set(columns):
+        needed = {*known, *(() if law[0] or drawn else ("drawn",))} - _LATER
+        if missing := needed - set(columns):
             raise InputError(
                 f"part {chunk} of the run was written by another version (it lacks "
                 f"{', '.join(sorted(missing))}): use that version."
@@ -178,7 +180,7 @@ class Results:
         if not np.array_equal(columns["trial"], self.plan.chunks[chunk]):
             raise files.CorruptFileError(source, "it holds other trials")
         for name, column in self._outcomes.items():
-            column[at] = columns[name]
+            column[at] = columns.get(name, np.nan)
         self.put_drawn(worlds, {name: columns[name] for name in columns if name in drawn})
         self.missing.pop(chunk, None)
 

@@ -5,11 +5,11 @@ The design is paired: every law meets the same worlds. `execution` runs the plan
 
 import functools
 import shlex
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 import xarray as xr
@@ -182,7 +182,7 @@ class Sweep(SweepOptions, SweepQuestion):
     """
 
     TITLE = "Sweep over random worlds"
-    QUICK: ClassVar[Mapping[str, Any]] = {"worlds": 64}
+    QUICK: ClassVar = {"worlds": 64}
 
     laws: LawsLike = ("rps", "nps", "aps")
 

@@ -78,7 +78,7 @@ class Attack(DomainQuestion[xr.Dataset], LawQuestion[xr.Dataset]):
 
     TITLE = "Search for failures"
     IGNORED_FIELDS = ("minutes", "generations", "check_again", "worst")
-    QUICK: ClassVar[Mapping[str, Any]] = {"minutes": 2.0, "drawn": 128, "check_again": 4}
+    QUICK: ClassVar = {"minutes": 2.0, "drawn": 128, "check_again": 4}
 
     axes: tuple[str, ...] = ("size", "com_offset", "friction_robot")
     """Three drawn quantities whose ranges the cells of the archive divide."""

@@ -15,7 +15,7 @@ can be solved; a failure after all rounds proves nothing.
 """
 
 import functools
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -25,9 +25,9 @@ import jax
 import numpy as np
 import xarray as xr
 
-from rps_jax import RPSParams, errors
+from rps_jax import errors
 from rps_jax.analysis import statistics, tables
-from rps_jax.control.laws.guided import KNOTS, GuidedParams
+from rps_jax.control.laws.guided import KNOTS, unplanned
 from rps_jax.questions import Plan, Run, Section, call_of, option
 from rps_jax.record import files
 from rps_jax.record.files import JsonObject
@@ -59,7 +59,7 @@ class Ceiling(DomainQuestion[xr.Dataset]):
     """
 
     TITLE = "Ceiling"
-    QUICK: ClassVar[Mapping[str, object]] = {"sample": 2, "most": 2, "samples": 12, "rounds": 3}
+    QUICK: ClassVar = {"sample": 2, "most": 2, "samples": 12, "rounds": 3}
 
     run: str | Path | None = option(None, positional=True)
     """Run folder of a sweep or a ladder that gives domain, worlds and setting."""
@@ -111,12 +111,12 @@ class Ceiling(DomainQuestion[xr.Dataset]):
     @functools.cached_property
     def plan(self) -> Plan:
         """Plan of a sweep that has the worlds."""
-        law = {"guided": GuidedParams()}
         count = int(self.world_indices.max(initial=0)) + 1
         if self.run is None:
             setting = replace(self.setting, split="test")
-            return Plan(self.ranges, count, law, setting)
+            return Plan(self.ranges, count, {"guided": unplanned(self.ranges.robot.drive)}, setting)
         sweep = load_plan(Path(self.run))
+        law = {"guided": unplanned(sweep.domain.robot.drive)}
         return Plan(sweep.domain, count, law, sweep.setting, points=sweep.points)
 
     def check(self) -> None:
@@ -201,6 +201,8 @@ class Ceiling(DomainQuestion[xr.Dataset]):
             size = self.samples - 2, min(window, KNOTS - first), 3
             random = np.random.default_rng((self.plan.setting.world_seed, world, r))
             noise[row, 2:, first : first + size[1]] = random.normal(scale=self.spread, size=size)
+        if self.plan.domain.robot.drive != "omni":
+            noise[..., 1] = 0.0
         return noise
 
     def _simulate(self, worlds: np.ndarray, plans: np.ndarray, run: Run) -> Outcome:
@@ -211,9 +213,9 @@ class Ceiling(DomainQuestion[xr.Dataset]):
         plan, slots = self.plan, self.world_indices.size * self.samples
         offsets = np.swapaxes(plans, 0, 1)  # (K, W, J, 3)
         steps = max(1, round(self.hold / plan.setting.physics.control_period))
-        same = RPSParams.tuned(), float(steps)
-        law, hold = jax.tree.map(partial(np.full, offsets.shape[:2]), same)
-        params = GuidedParams(law, offsets, hold)
+        known = plan.laws["guided"]
+        law, hold = jax.tree.map(partial(np.full, offsets.shape[:2]), (known.law, float(steps)))
+        params = known._replace(law=law, offsets=offsets, hold=hold)
         seed, domains = plan.setting.world_seed, [plan.domain]
         request = Candidates(params, domains, seed, worlds, plan.points, per_world=True)
         options = run.batch_options

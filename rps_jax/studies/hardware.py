@@ -4,7 +4,7 @@ The object is also shoved, as in the paper's video. The paper does not give the 
 range is run. By default the base loses the shares of its twist that `sweeps/paper_reading` infers.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from itertools import product, starmap
@@ -60,7 +60,7 @@ class Hardware(LawQuestion[xr.Dataset]):
     """
 
     TITLE = "Hardware experiments"
-    QUICK: ClassVar[Mapping[str, object]] = {"shifts": (0.1, 0.2, 0.3)}
+    QUICK: ClassVar = {"shifts": (0.1, 0.2, 0.3)}
 
     law: LawLike = "rps"
     skin: SkinLike = "hardware"
@@ -258,7 +258,7 @@ def shift_table(results: xr.Dataset) -> Rows:
 @styled
 def paths_figure(results: xr.Dataset) -> Figure:
     """Draw Fig. 7: the paths of the base to all targets, and the last contact points."""
-    names = list(map(str, results.object.values))
+    names = results.object.values.tolist()
     figure, axes = tiles(len(names), len(names), (WIDTH / 2, 3.5), (0, 0.2), sharey=True)
     for ax, name in zip(axes[0], names, strict=True):
         trials = results.sel(object=name)

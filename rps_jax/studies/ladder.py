@@ -8,12 +8,11 @@ seed is one that no tuner uses.
 import dataclasses
 import re
 import textwrap
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from typing import Any, ClassVar, get_args
 
-import numpy as np
 import xarray as xr
 
 from rps_jax import Domain, InputError, errors
@@ -51,8 +50,12 @@ class _TestSweep(Sweep):
 
     def labelled(self, outcomes: xr.Dataset, run: Run) -> xr.Dataset:
         outcomes = super().labelled(outcomes, run)
-        senses = [_senses(self.chosen[str(law)]) for law in outcomes.law.values]
-        return outcomes.assign_coords(senses=("law", senses, {"long_name": "what the law senses"}))
+        laws = [registry.law_of(self.chosen[str(law)]) for law in outcomes.law.values]
+        about = {"senses": "what the law senses", "drives": "bases that can follow the law"}
+        columns = [law.senses for law in laws], [" ".join(law.drives) for law in laws]
+        pairs = zip(about.items(), columns, strict=True)
+        coords = {name: ("law", x, {"long_name": text}) for (name, text), x in pairs}
+        return outcomes.assign_coords(coords)
 
     def report(self, results: xr.Dataset, run: Run) -> Sequence[Section]:
         first, *rest = super().report(results, run)
@@ -77,7 +80,7 @@ class Ladder(SweepOptions, TaskOption, MultiLawQuestion[xr.Dataset | xr.DataTree
     """
 
     TITLE = "Laws in the same worlds"
-    QUICK: ClassVar[Mapping[str, Any]] = {"worlds": 64, "domain": ("wide,objects=random_box",)}
+    QUICK: ClassVar = {"worlds": 64, "domain": ("wide,objects=random_box",)}
 
     laws: LawsLike = ()
     """The laws, by default all laws of the package that the robot can follow: names, as rps,
@@ -97,8 +100,12 @@ class Ladder(SweepOptions, TaskOption, MultiLawQuestion[xr.Dataset | xr.DataTree
     def chosen(self) -> dict[str, LawParams]:
         if not isinstance(self.laws, tuple) or self.laws:
             return registry.resolve_laws(self.laws)
-        drive = parse_robot(self.robot or "ideal").drive
-        return registry.resolve_laws([x for x in all_laws() if x in registry.laws_for(drive)])
+        return registry.resolve_laws([x for x in all_laws() if x in self.laws_for_base])
+
+    @property
+    def laws_for_base(self) -> list[str]:
+        """Names of the laws whose twists the base can follow."""
+        return registry.laws_for(parse_robot(self._robot).drive)
 
     @cached_property
     def sweeps(self) -> dict[str, _TestSweep]:
@@ -208,14 +215,17 @@ class Score(Ladder, _ScoredLaw):
 
     TITLE = "Score of a law"
 
-    laws: LawsLike = ("rps", "rps_plus")
-    """The laws beside it; changes follow each, as rps,K_h=0.3 or rps,tuned.json."""
+    laws: LawsLike = ()
+    """The laws beside it, by default rps and rps_plus, or the first law for a base that cannot move
+    sideways; changes follow each, as rps,K_h=0.3 or rps,tuned.json."""
 
     @cached_property
     def chosen(self) -> dict[str, LawParams]:
         label, params = resolve_law(self.law)
         scored = {label: registry.check_params(params)}
-        return scored | registry.resolve_laws(self.laws) | scored
+        known = self.laws_for_base
+        default = ("rps", "rps_plus") if "rps" in known else known[:1]
+        return scored | registry.resolve_laws(self.laws or default) | scored
 
     def sections(self, sweep: Sweep, results: xr.Dataset, run: Run) -> Sequence[Section]:
         sections = super().sections(sweep, results, run)
@@ -232,14 +242,13 @@ score = call_of(Score)
 def score_row(sweep: Sweep, results: xr.Dataset, seed: int) -> Rows:
     """Return a header and the row of the first law: rates of all laws, median time and worlds."""
     successes = results.success.values > 0
-    rates = [tables.share(int(success.sum()), success.size) for success in successes]
+    first, *rates = map(tables.rate, successes)
     law, *rest = map(str, results.law.values)
-    times = results.time.values[0][successes[0]]
-    median = f"{np.median(times):.1f} s" if times.size else "-"
+    median = tables.median(results.time.values[0][successes[0]])
     source = f"seed {seed}" if sweep.points is None else "given points"
     worlds = f"{successes.shape[1]:,} test worlds of {sweep.worlds_in_words}, {source}"
     header = ["law", "success", "median time", *rest, "worlds"]
-    return [header, [law, rates[0], median, *rates[1:], f"{worlds}, {sweep.setting.engine}"]]
+    return [header, [law, first, median, *rates, f"{worlds}, {sweep.setting.engine}"]]
 
 
 def _comparison(results: xr.Dataset) -> list[Section]:
@@ -247,7 +256,7 @@ def _comparison(results: xr.Dataset) -> list[Section]:
     text = (
         "Senses of the laws: `touch` is where the skin is touched, `taxels` adds the signal "
         "of each taxel, `force` adds the contact force, and `pose` adds the object's position and "
-        "size."
+        "size. Bases that cannot move sideways can follow the laws with open marks."
     )
     picture = Picture("ladder", partial(draw_ladder, results))
     sections = [Section("Information against success", text, (), picture)]
@@ -261,6 +270,7 @@ def _comparison(results: xr.Dataset) -> list[Section]:
 def draw_ladder(results: xr.Dataset) -> Figure:
     """Draw the success of each law, grouped by senses, with Wilson's 95 % intervals."""
     senses = dict(zip(results.law.values.tolist(), results.senses.values.tolist(), strict=True))
+    drives = results.get("drives", results.senses).to_series()
     kinds, total = get_args(Senses), results.sizes["world"]
     counts = {law: count_true(results.success.sel(law=law).values > 0) for law in senses}
     order = sorted(senses, key=lambda law: (-kinds.index(senses[law]), counts[law]))
@@ -271,7 +281,8 @@ def draw_ladder(results: xr.Dataset) -> Figure:
         index, rate = kinds.index(senses[law]), 100 * counts[law] / total
         low, high = statistics.wilson(counts[law], total)
         ax.plot([100 * low, 100 * high], [y, y], color=f"C{index}", lw=3, alpha=0.4)
-        ax.plot(rate, y, _MARKS[index], color=f"C{index}")
+        fill = "none" if " " in str(drives[law]) else "full"
+        ax.plot(rate, y, _MARKS[index], color=f"C{index}", fillstyle=fill)
         ax.annotate(tables.percent(counts[law], total), (rate, y), **above)
     for kind in sorted(set(senses.values()), key=kinds.index):
         index = kinds.index(kind)

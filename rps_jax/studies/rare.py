@@ -14,7 +14,7 @@ does not cover failures that no group has reached.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Generator, Mapping, Sequence
+from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass
 from itertools import zip_longest
 from typing import ClassVar, NamedTuple
@@ -184,7 +184,7 @@ class Rare(DomainQuestion[xr.Dataset], LawQuestion[xr.Dataset]):
     """
 
     TITLE = "Rare failures"
-    QUICK: ClassVar[Mapping[str, object]] = {
+    QUICK: ClassVar = {
         "particles": 200,
         "groups": 4,
         "domain": "wide,objects=random_box",

@@ -9,7 +9,7 @@ The design of Saltelli has blocks of worlds at points of the unit cube, which ru
 """
 
 import functools
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from itertools import combinations
@@ -64,7 +64,7 @@ class Sensitivity(PlanQuestion, DomainQuestion[xr.Dataset], LawQuestion[xr.Datas
     """
 
     TITLE = "Sensitivity of success"
-    QUICK: ClassVar[Mapping[str, object]] = {"worlds": 256}
+    QUICK: ClassVar = {"worlds": 256}
 
     worlds: int = option(1024, 1, 100_000_000)
     """Maximum number of worlds: a power of two times the number of factors plus two."""

@@ -1,6 +1,6 @@
 """The paper's Table II: all laws push all objects to all targets, under each friction."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
 from itertools import product
@@ -40,7 +40,7 @@ class Table(TrialOptions, MultiLawQuestion[xr.Dataset]):
     """
 
     TITLE = "Table II: successes"
-    QUICK: ClassVar[Mapping[str, object]] = {"targets": paper.FEW_TARGETS}
+    QUICK: ClassVar = {"targets": paper.FEW_TARGETS}
 
     laws: LawsLike = paper.LAWS
     objects: Annotated[Sequence[str], STORED] = PAPER_OBJECTS

@@ -76,14 +76,8 @@ class Case(TrialOptions):
     shift: Shift = option(Shift(), kw_only=True, hidden=True)
     """Scripted shift of the object during the push."""
 
-    def choose_law(self) -> None:
-        """Set the law that is used if none is named."""
-        if self.law is None:
-            object.__setattr__(self, "law", registry.default_law(self.base.drive))
-
     def __post_init__(self) -> None:
         check_fields(self)
-        self.choose_law()
         name = objects.parse_object(self.object)
         objects.check_object("object", name)
         registry.check_params(self.params)
@@ -105,10 +99,15 @@ class Case(TrialOptions):
         """Name of the object."""
         return objects.parse_object(self.object)
 
+    @property
+    def named_law(self) -> LawLike:
+        """The law, or that for the robot's drive if none is named."""
+        return registry.default_law(self.base.drive) if self.law is None else self.law
+
     @cached_property
     def params(self) -> LawParams:
         """Parameters of the law."""
-        return registry.resolve_law(self.law)[1]
+        return registry.resolve_law(self.named_law)[1]
 
     @cached_property
     def contact(self) -> Friction:

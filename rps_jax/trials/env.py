@@ -137,6 +137,7 @@ class PushEnv:
     def __post_init__(self) -> None:
         """Check the options, and draw the worlds before a loop is traced."""
         check_fields(self)
+        object.__setattr__(self, "setting", self.setting.with_robot(self._alone.robot))
         self.setting.simulator.check_traced()
         errors.check_name("skin of an environment", self._alone.skin, ("capacitive",))
         rps.check(self.params)

@@ -44,7 +44,7 @@ _SEEDS = 2**32  # of one word of a key
 
 
 def _hold(env: PushEnv, steps: int, state: State, action: jax.Array) -> tuple[State, jax.Array]:
-    """Hold an action (3,) for `steps` control steps; return the state and the sum of rewards."""
+    """Hold an action for `steps` control steps; return the state and the sum of rewards."""
 
     def step(carry: tuple[State, jax.Array], _: None) -> tuple[tuple[State, jax.Array], None]:
         state = env.step(carry[0], action)
@@ -70,7 +70,8 @@ class GymPush(gymnasium.Env[np.ndarray, np.ndarray]):
 
     Action, Box (3,) float32 within -1 and 1: the twist (v_x, v_y, omega) in the robot's frame, in
     units of v_max [m/s], v_max and omega_max [rad/s] of `params`. It is held for `hold` [s]. A
-    greater one is reduced: (v_x, v_y) to a norm of 1, omega to +-1.
+    greater one is reduced: (v_x, v_y) to a norm of 1, omega to +-1. On a base that cannot move
+    sideways, Box (2,): (v_x, omega).
 
     Reward [1]: `weights`, a `Reward` of `rps_jax.trials.env`; by default that of `rps learn`.
 
@@ -117,7 +118,7 @@ class GymPush(gymnasium.Env[np.ndarray, np.ndarray]):
         return obs[0], self._info(info)
 
     def step(self, action: Any) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
-        """Execute an action (3,)."""
+        """Execute an action (3,), or (2,) on a base that cannot move sideways."""
         *results, infos = self._vector.step([action])
         obs, reward, terminated, truncated = (values[0] for values in results)
         return obs, float(reward), bool(terminated), bool(truncated), self._info(infos)
@@ -272,7 +273,7 @@ class GymPushVector(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
     def step(
         self, actions: Any
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
-        """Execute actions (num_envs, 3)."""
+        """Execute actions (num_envs, 3), or (num_envs, 2)."""
         device.check_process()
         mode = self.metadata["autoreset_mode"]
         same = mode is AutoresetMode.SAME_STEP

@@ -101,7 +101,7 @@ def build(
     root = jax.random.fold_in(root, high) if high else root
     inputs = WorldInputs(
         FAMILIES[cases[0].object_name],
-        solid.stack([solids[key] for key in keys]),
+        solid.stack([solids[key] for key in keys], setting.physics.support),
         Friction(*np.array([case.contact for case in cases], float).T),
         setting.physics,
         _stack([case.base for case in cases]),

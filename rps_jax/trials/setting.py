@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Annotated, Any, Literal, get_args
 
 from rps_jax import engines, errors
@@ -66,8 +66,8 @@ class Setting:
     cores) or quasistatic (planar, without inertia; its derivatives are those of that model)."""
     physics: PhysicsField = PhysicsField()
     """How friction is modelled: default is isotropic Coulomb friction; paper_gazebo is a friction
-    pyramid, as in the paper's simulator. Changes follow, as default,timestep=0.005 or
-    default,control_period=0.05 [s]."""
+    pyramid, as in the paper's simulator. Changes follow, as default,timestep=0.005,
+    default,control_period=0.05 [s], or default,support=even or rim: the pressure under objects."""
     fidelity: Fidelity = "standard"
     """How finely the physics is solved: reference is converged and meant for the engine mujoco,
     standard (steps of 10 ms) is for results, and fast (20 ms) has 2 to 3 times its error, since
@@ -83,6 +83,20 @@ class Setting:
         self.rules.check()
         if self.physics.cone != "elliptic":  # all engines have this one: import no engine
             self.simulator.check_physics(self.physics)
+
+    def with_robot(self, robot: Robot) -> Setting:
+        """Return the setting with the control period of a robot, if it has one.
+
+        Raises:
+          InputError: the physics has another one, which is not the default.
+        """
+        if robot.period in (None, self.physics.control_period):
+            return self
+        if self.physics.control_period != Physics().control_period:
+            rule = f"the period of the robot is {robot.period:g} s: leave it out"
+            period = f"{self.physics.control_period:g} s"
+            raise errors.not_allowed("control_period", period, rule)
+        return replace(self, physics=replace(self.physics, control_period=robot.period))
 
     @property
     def simulator(self) -> Engine:
@@ -102,6 +116,9 @@ class Setting:
 
     def check_here(self, robot: Robot, laws: Iterable[LawParams] = ()) -> None:
         """Raise InputError unless the engine can step such a robot with these laws."""
+        if self.with_robot(robot) is not self:
+            rule = f"the period of the robot is {robot.period:g} s: use setting.with_robot(robot)"
+            raise errors.not_allowed("control_period", f"{self.physics.control_period:g} s", rule)
         self.simulator.check_robot(robot)
         for params in laws:
             law = registry.law_of(params)
@@ -121,7 +138,10 @@ class Setting:
     def to_json(self) -> JsonObject:
         """Return the setting as manifests have it; `from_json` reads it."""
         rules = registry.leaves_to_json(self.rules)
-        return {"physics": asdict(self.physics), "rules": rules} | self.attributes
+        physics = asdict(self.physics)
+        if physics["support"] == "corners":  # as records without a support
+            del physics["support"]
+        return {"physics": physics, "rules": rules} | self.attributes
 
     @classmethod
     def from_json(cls, record: Mapping[str, Any]) -> Setting:

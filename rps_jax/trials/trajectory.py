@@ -69,6 +69,7 @@ def draw_worlds(
     if len(ranges.objects) != 1:
         rule = "worlds of one program have one object; name it, as wide,objects=random_box"
         raise errors.not_allowed("domain objects", ranges.objects, rule)
+    setting = setting.with_robot(ranges.robot)
     setting.simulator.check_traced()
     setting.check_domain(ranges)
     drawn = draws.draw(ranges, setting.world_seed, np.arange(worlds))
@@ -128,6 +129,7 @@ def rollout(
       (3,)
     """
     check_arguments(rollout, locals())
+    setting = setting if world.robot is None else setting.with_robot(world.robot)
     engine = setting.simulator
     engine.check_traced()
     steps, loop = count_steps(horizon, setting), control_loop(params, setting, smooth=smooth)

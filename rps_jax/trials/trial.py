@@ -56,6 +56,7 @@ from rps_jax.world.tasks.base import Positions
 # A world is a runaway beyond these, far outside anything a base at 0.05 m/s can cause.
 _MAX_SPEED = 20.0  # [m/s], [rad/s]
 _MAX_DISTANCE = 100.0  # [m]
+_REPOSITION = 2.0  # [s] without contact from which on a base has repositioned
 
 
 class Rules(NamedTuple):
@@ -136,6 +137,9 @@ class Trial(NamedTuple):
     sum_abs_l: Floats  # [m] over the steps in contact
     min_distance: Floats  # [m] contact point to target; inf before the first touch
     path_length: Floats  # [m] of the base's way
+    absent_steps: Ints  # since the last contact; 0 before the first touch
+    repositions: Ints  # times without contact for `_REPOSITION`
+    lost_path: Floats  # [m] of the base's way without contact after the first touch
     done: Bools
     success: Bools
     tilt: Floats  # [rad] greatest tilt of the object so far
@@ -167,6 +171,12 @@ class Outcome(NamedTuple):
     min_distance: Annotated[Floats, Spec("m", "least distance of the contact point to the target")]
     contact_lost_time: Annotated[Floats, Spec("s", "time without contact after the first touch")]
     path_length: Annotated[Floats, Spec("m", "length of the base's way")]
+    repositions: Annotated[
+        Ints, Spec("1", "times without contact for 2 s or longer after the first touch")
+    ]
+    contact_lost_path: Annotated[
+        Floats, Spec("m", "length of the base's way without contact after the first touch")
+    ]
     # NaN if it never touched.
     mean_abs_l: Annotated[Floats, Spec("m", "mean |l| while in contact, the paper's D")]
     tilt: Annotated[Floats, Spec("rad", "greatest tilt of the object")]
@@ -227,8 +237,9 @@ def start(world: World, params: LawParams, law: Law = rps.LAW) -> Trial:
         poses=jnp.tile(world.qpos[JOINTS.base], (*world.odometry.past.shape, 1)),
         twists=jnp.zeros((*world.odometry.past.shape, 3), world.qpos.dtype),
         min_distance=jnp.full_like(zero, jnp.inf),
-        **dict.fromkeys(("sum_abs_l", "path_length", "tilt"), zero),
+        **dict.fromkeys(("sum_abs_l", "path_length", "lost_path", "tilt"), zero),
         **dict.fromkeys(("steps", "contact_steps", "lost_steps"), count),
+        **dict.fromkeys(("absent_steps", "repositions"), count),
         **dict.fromkeys(("done", "success", "tipped", "diverged", "nan_twist"), false),
         drive=None if world.robot is None else drive.init_drive(world.qpos),
         load=base.init_load(world.qpos) if law.senses == "force" else None,
@@ -309,7 +320,9 @@ def observe(
     observation = observation._replace(p_world_robot=believed[:2], yaw=believed[2])
 
     touch = reading.contact_type != NONE
-    lost_steps = trial.lost_steps + (~touch & (trial.contact_steps > 0))
+    is_lost = ~touch & (trial.contact_steps > 0)
+    lost_steps = trial.lost_steps + is_lost
+    absent_steps = jnp.where(is_lost, trial.absent_steps + 1, 0)
     declared = None if loop.law.is_done is None else loop.law.is_done(trial.law_state)
     positions = positions_of(world, trial.qpos, reading.p_robot_contact, touch, declared)
     task, aim = world.task.step(trial.task, positions)
@@ -326,6 +339,8 @@ def observe(
         poses=poses,
         contact_steps=trial.contact_steps + touch,
         lost_steps=lost_steps,
+        absent_steps=absent_steps,
+        repositions=trial.repositions + (absent_steps == math.ceil(_REPOSITION / period)),
         sum_abs_l=trial.sum_abs_l + jnp.where(touch, jnp.abs(observation.l), 0.0),
         min_distance=jnp.where(
             touch, jnp.minimum(trial.min_distance, distance), trial.min_distance
@@ -416,11 +431,13 @@ def settle(world: World, previous: Trial, decided: Trial, driven: Driven) -> Tri
     if world.robot is not None and state is not None:
         state = state if integral is None else state._replace(integral=integral)
         state = drive.count_stalled_steps(world.robot, state, qvel)
+    way = planar.norm(qpos[xy] - decided.qpos[xy])
     moved = decided._replace(
         qpos=qpos,
         qvel=qvel,
         warmstart=warmstart,
-        path_length=decided.path_length + planar.norm(qpos[xy] - decided.qpos[xy]),
+        path_length=decided.path_length + way,
+        lost_path=decided.lost_path + jnp.where(decided.absent_steps > 0, way, 0.0),
         steps=decided.steps + 1,
         drive=state,
         load=decided.load and decided.load._replace(wrench=force),
@@ -547,6 +564,8 @@ def outcome(trial: Trial, worlds: World, loop: ControlLoop) -> Outcome:
         min_distance=trial.min_distance,
         contact_lost_time=trial.lost_steps * period,
         path_length=trial.path_length,
+        repositions=trial.repositions,
+        contact_lost_path=trial.lost_path,
         mean_abs_l=jnp.where(
             trial.contact_steps > 0, trial.sum_abs_l / jnp.maximum(trial.contact_steps, 1), jnp.nan
         ),

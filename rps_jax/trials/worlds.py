@@ -35,7 +35,8 @@ def build(indices: np.ndarray, inputs: WorldInputs, setting: Setting, **fields: 
     """
     engine, dtype = setting.simulator, jnp.result_type(float)
     engine.check_robot(inputs.robots)
-    engine.check_feet(inputs.solids.feet)
+    inputs = inputs.supported
+    engine.check_pads(inputs.solids, setting.physics)
     added = getattr(fields.get("task"), "surroundings", None) or {}
     inputs = inputs._replace(surroundings=inputs.surroundings._replace(**added))
     engine.check_surroundings(inputs.surroundings)
@@ -88,16 +89,12 @@ def _skin(domain: Domain, drawn: Draw) -> Skin:
     return repeated._replace(shell=drawn.robot.shell, **quantities)
 
 
-def soften_skins(worlds: World, taxels: float = CapacitiveSkin.SMOOTH) -> World:
-    """Return worlds, or one, with smooth skins, unless these have a temperature.
-
-    `taxels` is the temperature of taxels [1].
-    """
+def soften_skins(worlds: World) -> World:
+    """Return worlds, or one, with smooth skins, unless these have a temperature."""
     skin, shape = worlds.skin, jnp.shape(worlds.p_world_target)[:-1]
     if skin.temperature is not None:
         return worlds
-    temperature = taxels if isinstance(skin, CapacitiveSkin) else skin.SMOOTH
-    return worlds._replace(skin=skin._replace(temperature=jnp.full(shape, temperature)))
+    return worlds._replace(skin=skin._replace(temperature=jnp.full(shape, skin.SMOOTH)))
 
 
 def starts(drawn: Draw) -> np.ndarray:

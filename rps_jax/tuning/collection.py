@@ -74,11 +74,13 @@ class RunnerState(NamedTuple):
 
 
 def network_of(ppo: PPO, envs: Sequence[PushEnv]) -> Network:
-    """Return the network for these environments; their skins must have equally many taxels."""
-    counts = {env.observation_size - 2 for env in envs}
-    if len(counts) > 1:
-        raise errors.not_allowed("taxels of the domains", sorted(counts), "learn in one domain")
-    return Network(ppo.network, ppo.width, counts.pop(), ppo.hold).check()
+    """Return the network for these environments, whose skins have equally many taxels."""
+    sizes = {(env.observation_size - 2, env.action_size) for env in envs}
+    if len(sizes) > 1:
+        rule = "learn in one domain"
+        raise errors.not_allowed("taxels and actions of the domains", sorted(sizes), rule)
+    taxels, actions = sizes.pop()
+    return Network(ppo.network, ppo.width, taxels, ppo.hold, actions).check()
 
 
 def start(
@@ -235,18 +237,19 @@ def act(
     vmap: Callable[..., Any] = jax.vmap,
     mapped: Callable[..., Any] | None = None,
 ) -> tuple[EnvBatch, jax.Array]:
-    """Execute an action (N, 3) in each world; return the batch and the rewards (N,).
+    """Execute an action (N, A) in each world; return the batch and the rewards (N,).
 
     `vmap` maps a function of one world over the batch; `_unmapped` is for one world. `mapped` does
     so for the environment's steps, by default `vmap`; derivatives are fastest with `native.mapped`.
     """
     bounded, map_step = features.clip_action(action), mapped or vmap
+    pair = bounded[..., ::2]  # v_x and omega
     inputs = batch.memory.touch_state, batch.states.info["observation"]
     touch_state = vmap(TouchState.mark_decision)(*inputs)
 
     def step(carry: ActCarry, _: None) -> tuple[ActCarry, None]:
         states, touch_state, reward = carry
-        states = map_step(env.step, (0, 0))(states, bounded)
+        states = map_step(env.step, (0, 0))(states, bounded if network.actions == 3 else pair)
         touch_state = vmap(TouchState.update)(touch_state, states.info["observation"])
         return (states, touch_state, reward + states.reward), None
 
@@ -265,7 +268,7 @@ def _act_together(
     hidden: jax.Array,
     action: jax.Array,
 ) -> list[tuple[EnvBatch, jax.Array]]:
-    """Execute the joined actions (sum of N, 3) in the worlds of all environments: see `act`."""
+    """Execute the joined actions (sum of N, A) in the worlds of all environments: see `act`."""
 
     def single(
         env: PushEnv, batch: EnvBatch, _: jax.Array, action: jax.Array

@@ -172,9 +172,10 @@ def _gradients(
     Secants are those of a relative `change` of a quantity, one-sided or `central`.
     """
     i = SimpleNamespace(**inputs)
-    setting, score, is_objective = i.setting, i.score, isinstance(i.score, Objective)
+    score, is_objective = i.score, isinstance(i.score, Objective)
     device.check_process()
     ranges = parse_domain(i.domain, i.robot, i.task)
+    setting = i.setting.with_robot(ranges.robot)
     chosen = registry.resolve_laws(i.laws)
     errors.check_count("worlds", i.worlds, at_most=1_000_000)
     steps, engine = count_steps(i.horizon, setting), setting.simulator

@@ -4,8 +4,9 @@ Whole pushes are chaotic, and a push that fails has no derivative that says so. 
 are of windows of some seconds under the smooth law and skin. Windows start at states of trials of
 the original law. A linear value function of their last states, fitted to the rest of these trials
 with their failures, says what a window is worth. `TuneGrad` runs trials of the original law every
-few steps: for new states, for the value function, to validate, and to compare the derivatives with
-slopes of whole trials. Windows stall after some steps, and slopes then replace them.
+few steps: for new states, for the value function, to validate, and to measure the slope of whole
+trials along the derivatives. Windows stall after some steps, and then slopes along random steps
+replace them.
 
 References: Xu et al., "Accelerated policy learning with parallel differentiable simulation", ICLR
 2022 (windows with a value function); Suh et al., "Do differentiable simulators give better policy
@@ -16,8 +17,9 @@ from __future__ import annotations
 
 import functools
 import time
+import warnings
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, ClassVar, NamedTuple
 
@@ -47,6 +49,10 @@ from rps_jax.tuning.run import TIMES, Proposal, Results, ScoreCandidates, Search
 from rps_jax.world.scene import JOINTS
 
 _DERIVATIVE_COST = 4.0  # [1] simulated seconds for which a differentiated second counts
+_ALIKE = (
+    "All trials along the derivatives have equal scores, so slopes of whole trials replace them: "
+    "raise checks, sigma or the horizon."
+)
 
 
 @dataclass(frozen=True)
@@ -54,21 +60,19 @@ class TuneGrad(Descent):
     """Tune a law by exact derivatives of the smooth trial, in mini-batches of random worlds.
 
     Use `rps tune es` by default, and this for hundreds of parameters and an engine with
-    derivatives; where these oppose the slopes of whole trials, they are dropped and slopes remain.
+    derivatives; where whole trials do not improve along these, they are dropped and slopes remain.
 
     A step follows the derivatives of windows of some seconds, which start at states of trials of
     the original law; a value function, fitted to these trials, counts what follows a window. After
-    `window_steps` steps, or once the derivatives do not agree with slopes of whole trials, a step
-    follows these slopes, as `rps tune es --estimator antithetic` does. The generation with the best
-    validation in trials of the original law is the answer.
+    `window_steps` steps, or once the score of whole trials does not fall along the derivatives, the
+    run goes on from the best vector by slopes along random steps, as `rps tune es --estimator
+    antithetic` does. The generation with the best validation in trials of the original law is the
+    answer.
 
-    The answer is that of `TuneES`, with a step as a generation. Its `cosine` (generation) is that
-    of the derivatives and the slopes; `windows` (generation) is 1 for steps by derivatives. Steps
-    without a validation have NaN there. A differentiated second counts as four simulated ones.
-
-    Derivatives of windows may have another direction than those of whole trials, as `cosine` shows.
-    Windows are then dropped, and the run goes on by slopes. Windows of 5 s, and no more than some
-    ten steps by them, are from a prototype; no study of this package compares them yet.
+    The answer is that of `TuneES`, with a step as a generation. Its `slope` (generation) is the
+    change of the score of whole trials for a unit step along the derivatives, with its
+    `slope_error`; `windows` (generation) is 1 for steps by derivatives. Steps without a validation
+    have NaN there. A differentiated second counts as four simulated ones.
 
     Examples:
       >>> import rps_jax
@@ -119,8 +123,8 @@ class TuneGrad(Descent):
     refresh: int = option(3, 1, 1_000_000)
     """Number of steps between new trials, with which the validation comes."""
     checks: int = option(32, 0, 1_000_000)
-    """Number of worlds of the slopes that are compared with the derivatives, in each domain; 0: no
-    comparison, so that windows are not dropped."""
+    """Number of worlds in which a step of `sigma` along the derivatives and its opposite are tried,
+    in each domain; 0: none, so that windows are not dropped."""
     clip: float = option(2.0, above=0)
     """Bound on the norm of the derivatives of one window, as a multiple of the median norm [1];
     without it a few chaotic windows dominate."""
@@ -154,7 +158,6 @@ class TuneGrad(Descent):
         """Search by steps of the optimiser, first by derivatives of windows and then by slopes."""
         windows = {
             "windows": np.array(float(self.window_steps > 0)),
-            "cosines": np.array(0.0),
             "anchors": self.base[None],
             "moments": np.zeros((_NUM_FEATURES + 2,) * 2),
         }
@@ -162,29 +165,49 @@ class TuneGrad(Descent):
 
     def judge(self, proposal: Proposal, generation: int, score: ScoreCandidates) -> Results:
         """Validate and estimate slopes; or differentiate windows, with both every few steps."""
+        none = {"slope": np.nan, "slope_error": np.nan}
         if not proposal["windows"] or generation == self.steps:
             worlds = self.worlds if generation < self.steps else 0
             results, slopes = self.try_step(proposal, generation, score, worlds)
-            return {**results, **gradient_results(slopes), "cosine": np.nan, "windows": 0.0}
+            return {**results, **gradient_results(slopes), **none, "windows": 0.0}
         vector, moments = jnp.asarray(proposal["vectors"][0]), proposal["moments"]
         times: dict[str, float] = dict.fromkeys(TIMES, 0.0)
         anchor = generation - generation % self.refresh
         if anchor not in self._states:
             self._states.clear()
             self._states[anchor] = self._collect(proposal["anchors"], anchor, times)
-        states, results = self._states[anchor], self.step_results(proposal)
+        states = self._states[anchor]
         if anchor == generation:
             moments = _REMEMBERED * moments + sum(x.moments for x in states)
         followed = self._derivatives(vector, states, fit(moments), generation, times)
-        windows, cosine, cosines = 1.0, np.nan, proposal["cosines"]
+        windows, results, checked = 1.0, self.step_results(proposal), none
         if anchor == generation:
-            results, slopes = self.try_step(proposal, generation, score, self.checks)
-            cosine = float(gradients.cosine(followed.gradient, slopes.gradient))
-            cosines = cosines + cosine
-            if self.checks and not cosines > 0:
-                windows, followed = 0.0, slopes
-        more = {"windows": windows, "cosine": cosine, "cosines": cosines, "moments": moments}
+            results, checked = self._check(proposal, generation, score, followed.gradient)
+            windows = float(not checked["slope"] <= 0)  # NaN without a check
+        more = {"windows": windows, "moments": moments} | checked
         return {**results, **gradient_results(followed), **more, **times}
+
+    def _check(
+        self, proposal: Proposal, generation: int, score: ScoreCandidates, gradient: jax.Array
+    ) -> tuple[Results, dict[str, float]]:
+        """Validate, and measure the slope of whole trials along a gradient (p,)."""
+        vector, way = jnp.asarray(proposal["vectors"][0]), jnp.nan_to_num(gradient)
+        way = way / jnp.maximum(jnp.sqrt(jnp.mean(way**2)), 1e-30)
+        tried = [self.validation_candidates(self.space.params(vector[None]))]
+        if self.checks:
+            pair = vector + self.sigma * jnp.stack([way, -way])
+            fresh = self.tried(pair, generation, self.checks)
+            tried.append(replace(fresh, worlds=fresh.worlds + self.trials))
+        validation, *pairs = score(tried)
+        slope = variance = np.nan
+        for answer in pairs:
+            ahead, back = self.objective.linearise(jnp.asarray(answer.score))
+            slopes = gradients.estimate((ahead - back)[:, None] / (2 * self.sigma))
+            slope, variance = slopes.gradient[0], slopes.variance[0]
+            if (ahead == back).all():
+                warnings.warn(_ALIKE, stacklevel=2)
+        checked = {"slope": float(slope), "slope_error": float(np.sqrt(variance))}
+        return self.step_results(proposal, validation), checked
 
     @functools.cached_property
     def _states(self) -> dict[int, list[_States]]:
@@ -202,7 +225,7 @@ class TuneGrad(Descent):
             trials, table, live, seconds = self._call(_run_trials, times, *inputs)
             times["simulated"] += float(np.sum(seconds))
             live, table = np.asarray(live), np.asarray(table, float)
-            touched = live & (table[..., 1] > 0)  # by the feature `contact`
+            touched = live & (table[..., 1] > 0.5)  # by the feature `contact`
             chosen = np.argwhere(touched if touched.any() else live)
             families.append(_States(stage, soft, trials, chosen, table[live].T @ table[live]))
         return families
@@ -330,44 +353,29 @@ def _differentiate(
 # --- the value function --------------------------------------------------------------------
 
 _FAR = 5.0  # [m] beyond which distances count equally
-_NUM_FEATURES = 16
+_NUM_FEATURES = 6
 _REMEMBERED = 0.75  # [1] weight of former trials at each refresh
 
 
 def features(world: World, params: LawParams, state: Trial, loop: ControlLoop) -> jax.Array:
     """Return the physical features (F,) of a state, which are equal for mirrored worlds.
 
-    The first is whether there is contact. The others are products of the contact's weight and
-    offset, its distance and bearing from the target, the object's centre and velocity, all in the
-    robot frame, and of the times of the trial.
+    The first is whether there is contact. The others are of the distance from contact to target,
+    and of the bearing of the target from there in the robot frame.
+
+    The offset of the contact and the pose of the object are none. They predict failures best, but
+    by what both share with the world: its friction and centre of mass keep the contact off the
+    middle, and no law can change them. A value function of them points the wrong way.
     """
     _, measured = trial.observe(world, params, state, loop)
-    contact, distance = 1.0 * measured.reading.in_contact, measured.distance
-    distance = _FAR * jnp.tanh(distance / _FAR)
-    point, yaw = measured.reading.p_robot_contact, state.qpos[JOINTS.base_yaw]
+    distance = _FAR * jnp.tanh(measured.distance / _FAR)
+    contact, point = 1.0 * measured.reading.in_contact, measured.reading.p_robot_contact
     point = jnp.where(contact > 0, jnp.nan_to_num(point), 0.0)
     target = measured.observation.p_world_target
-    way = planar.rotate(-yaw, target - trial.contact_of(state.qpos, point))
-    cosine, turn = way / jnp.maximum(planar.norm(way), 1e-3)
-    position, _ = trial.object_pose(state.qpos)
-    ahead, centre = planar.rotate(-yaw, position - state.qpos[:2])
+    way = planar.rotate(-state.qpos[JOINTS.base_yaw], target - trial.contact_of(state.qpos, point))
+    cosine, sine = way / jnp.maximum(planar.norm(way), 1e-3)
     turned = 1 - cosine
-    period, rules = loop.physics.control_period, loop.rules
-    even = [
-        contact,
-        distance,
-        turned,
-        distance**2,
-        contact * distance,
-        distance * turned,
-        jnp.clip(ahead, 0.0, _FAR),
-        jnp.clip(state.qvel[JOINTS.object_yaw_rate], -1.0, 1.0) ** 2,
-        state.steps * period / rules.horizon,
-        state.lost_steps * period / max(float(rules.max_lost), 1e-6),
-    ]
-    odd = jnp.stack([contact * point[1], turn, jnp.clip(centre, -1.0, 1.0)])
-    pairs = jnp.outer(odd, odd)[jnp.triu_indices(3)]  # which mirrored worlds share
-    return jnp.concatenate([jnp.stack(even), pairs])
+    return jnp.stack([contact, distance, turned, distance**2, distance * turned, sine**2])
 
 
 def fit(moments: np.ndarray, ridge: float = 1.0) -> np.ndarray:

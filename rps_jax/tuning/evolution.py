@@ -97,8 +97,9 @@ class Descent(Tuning):
     ) -> Search:
         """Search by steps of an optimiser along the `gradients` of the results.
 
-        The arrays of `windows` are those of `TuneGrad`, and come back with the results. The steps
-        after those by windows start at the vector with the best validation.
+        The arrays of `windows` are those of `TuneGrad`, and come back with the results. After
+        `window_steps`, or once the results drop windows, slopes start at the vector with the best
+        validation.
         """
         vector, state, base = self.base, rule.init(jnp.asarray(self.base)), np.array(np.nan)
         best, least = vector, np.inf
@@ -107,11 +108,12 @@ class Descent(Tuning):
             base, vector = results["base"], results["vectors"][0]
             if results["validation"] < least:
                 best, least = vector, float(results["validation"])
+            was_windows = bool(windows and windows["windows"])
             slopes = jnp.nan_to_num(jnp.asarray(results["gradients"][0]), posinf=0.0, neginf=0.0)
             change, state = rule.update(slopes, state, jnp.asarray(vector))
             vector = vector + np.asarray(change)
             windows = {name: results[name] for name in windows}
-            if following == window_steps and windows["windows"]:
+            if was_windows and (following == window_steps or not windows["windows"]):
                 windows, vector = windows | {"windows": np.array(0.0)}, best
             if windows and following % refresh == 0:
                 windows = windows | {"anchors": vector[None]}
@@ -171,12 +173,14 @@ class TuneES(Descent):
     # Options that the other estimator alone uses; the manifests of 0.4 lack those of cma.
     UNUSED: ClassVar = {
         "cma": ("estimator", "learning_rate", "sigma", "pairs"),
+        "sep_cma": ("learning_rate", "sigma", "pairs"),
         "antithetic": ("population", "spread", "prior"),
     }
 
-    estimator: Literal["cma", "antithetic"] = "cma"
-    """Method: cma (CMA-ES), or antithetic (steps along slopes of whole trials, by random steps of
-    the parameters and their opposites)."""
+    estimator: Literal["cma", "sep_cma", "antithetic"] = "cma"
+    """Method: cma (CMA-ES), sep_cma (with a diagonal covariance, for hundreds of parameters), or
+    antithetic (steps along slopes of whole trials, by random steps of the parameters and their
+    opposites)."""
     population: int = option(64, 4, 100_000)
     """Number of candidates in a generation of cma."""
     generations: int = option(50, 1, 1_000_000)
@@ -203,7 +207,7 @@ class TuneES(Descent):
 
     def search(self) -> Search:
         """Search by CMA-ES of the package cmaes, or by a descent; `center` is the mean."""
-        if self.estimator == "cma":
+        if self.estimator != "antithetic":
             return self._search()
         rate = self.learning_rate
         rule = optimiser("fixed_length", "cosine_decay", rate, self.generations)
@@ -211,7 +215,8 @@ class TuneES(Descent):
 
     def _search(self) -> Search:
         seed = int(np.random.SeedSequence((self.setting.seed, 0)).generate_state(1)[0])
-        strategy = cmaes.CMA(self.base, self.spread, population_size=self.population, seed=seed)
+        kind = cmaes.SepCMA if self.estimator == "sep_cma" else cmaes.CMA
+        strategy = kind(self.base, self.spread, population_size=self.population, seed=seed)
         while True:
             vectors = np.stack([strategy.ask() for _ in range(self.population)])
             results = yield {"vectors": vectors, "center": strategy.mean.copy()}

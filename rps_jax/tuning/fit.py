@@ -88,7 +88,7 @@ class Fitted:
     @styled
     def plot(self) -> Figure:
         """Draw each quantity's posterior and prior; pale if undetermined."""
-        names = list(map(str, self.data.quantity.values))
+        names = self.data.quantity.values.tolist()
         figure, axes = tiles(len(names), 4, (WIDTH / 4, 1.25), (0, 0.4))
         for ax, name in zip(axes.ravel(), names, strict=False):
             column = self.data.sel(quantity=name)
@@ -136,7 +136,7 @@ class Fit(LawQuestion[Fitted], DomainQuestion[Fitted], LogsQuestion):
     """
 
     TITLE = "A domain fitted to logs"
-    QUICK: ClassVar[Mapping[str, Any]] = {"worlds": 768, "window": 20.0}
+    QUICK: ClassVar = {"worlds": 768, "window": 20.0}
     # The values of the logs matter.
     IGNORED_FIELDS = ("logs", "topics", "columns")
 
@@ -156,8 +156,11 @@ class Fit(LawQuestion[Fitted], DomainQuestion[Fitted], LogsQuestion):
         paths = [Path(log) for log in several if not isinstance(log, Trace)]
         if self.columns and not any(map(is_table, paths)):
             raise errors.not_allowed("columns", self.columns, "no log is a table; omit it")
-        shell = self.ranges.robot.shell
-        return [logs_.read(log, shell, self.topics, self.columns) for log in several]
+        robot = self.ranges.robot
+        raw = [logs_.read(log, robot.shell, self.topics, self.columns) for log in several]
+        for log in raw:
+            log.columns["twist"] = robot.twist_of_middle(log.columns["twist"])
+        return raw
 
     @cached_property
     def bank(self) -> Bank:
@@ -249,11 +252,12 @@ class Fit(LawQuestion[Fitted], DomainQuestion[Fitted], LogsQuestion):
         return f"law {self.label}, in closed loop"
 
     def report(self, results: Fitted, run: Run) -> Sequence[Section]:
-        data = results.data
+        data, fitted = results.data, f"{self.out}/fitted.json"  # with robot and task
+        sweep = self.next_command("sweep", domain=fitted, laws=self.label, robot=None, task=None)
         text = (
             "Median and 90 % interval. A quantity is undetermined if its interval is at least "
             f"{UNDETERMINED:.0%} of the prior's: the logs do not determine it, and its range is "
-            f"unchanged. `rps sweep --domain {self.out}/fitted.json` simulates the fitted domain."
+            f"unchanged. `{sweep}` simulates the fitted domain."
         )
         if (share := float(data.outside.mean())) > 0.05:
             counts = (data.outside.to_series() > 0).groupby(logs_.meaning).agg(["sum", "size"])
@@ -476,7 +480,7 @@ def table(data: xr.Dataset) -> Rows:
 def correlations(data: xr.Dataset) -> Rows:
     """Return a header and the pairs of quantities that the logs determine only in combination."""
     correlation = data.correlation.values
-    names = [str(q) for q in data.quantity.values]
+    names = data.quantity.values.tolist()
     pairs = [
         (i, j)
         for i, j in np.argwhere(np.tril(abs(correlation), -1) > 0.5)

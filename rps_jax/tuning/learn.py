@@ -5,7 +5,7 @@
 
 import functools
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, fields, replace
 from functools import partial
@@ -35,7 +35,6 @@ from rps_jax.runs.question import Run, SimulationQuestion, TaskOption, call_of
 from rps_jax.spec import Spec
 from rps_jax.trials.env import SHAPED_REWARD, PushEnv
 from rps_jax.trials.progress import Bar, Progress, ProgressCallback
-from rps_jax.trials.results import labelled
 from rps_jax.trials.setting import Setting, Split, seed_of
 from rps_jax.trials.trial import Rules
 from rps_jax.tuning import collection
@@ -89,14 +88,14 @@ class Learn(PPO, TaskOption, SimulationQuestion[xr.Dataset]):
     TITLE = "A learned law"
     IGNORED_FIELDS = ("minutes", "updates", "every", "task")
     REPORTS_TIMES = True
-    RENAMED: ClassVar[Mapping[str, str]] = {
+    RENAMED: ClassVar = {
         "hard": "prioritised",
         "enough": "success_threshold",
         "level": "initial_level",
         "spread": "action_std",
         "average": "ema_updates",
     }
-    QUICK: ClassVar[Mapping[str, Any]] = {
+    QUICK: ClassVar = {
         "domain": ("wide,objects=random_box",),
         "network": "mlp",
         "width": 32,
@@ -151,18 +150,19 @@ class Learn(PPO, TaskOption, SimulationQuestion[xr.Dataset]):
         errors.check_each_once("domain", self.domains)
         for domain in self.domains:
             errors.check_name("skin of a domain to learn in", domain.skin, ("capacitive",))
-            errors.check_name("drive of a robot to learn with", domain.robot.drive, ("omni",))
         self.setting.simulator.check_traced()
         count = self.num_envs * sum(len(domain.objects) for domain in self.domains)
         if self.num_minibatches > count:
             rule = f"there are only {count} worlds; raise num_envs"
             raise errors.not_allowed("num_minibatches", self.num_minibatches, rule)
         if self.initial:
-            kind, width, taxels, hold = initial = policies.read(self.initial).network
-            counts = (domain.robot.shell.count for domain in self.domains)
-            if {Network(self.network, self.width, x, self.hold) for x in counts} != {initial}:
+            initial = policies.read(self.initial).network
+            kind, width, taxels, hold, actions = initial
+            sizes = {(x.robot.shell.count, 2 + (x.robot.drive == "omni")) for x in self.domains}
+            if {Network(self.network, self.width, x, self.hold, n) for x, n in sizes} != {initial}:
                 options = f"network = {kind}, width = {width} and hold = {hold:g} s"
                 rule = f"its network needs {options}, and robots with {taxels} taxels"
+                rule += ", which move sideways" if actions == 3 else ", which do not move sideways"
                 raise errors.not_allowed("initial", self.initial, rule)
         period = self.setting.physics.control_period
         errors.check_number("hold", self.hold, at_least=0.999 * period, unit="s")
@@ -356,9 +356,7 @@ class _Learner:
         Checkpoints(self.folder).put(_CHECKPOINT, files.encode_arrays(**leaves), ".npz")
         files.write_bytes(self.folder / "policy.npz", policies.encode(self.policy()))
         columns = zip(METRICS, state[-1].T, strict=True)
-        variables = labelled(
-            **{name: ("update", x, METRICS[name].unit, METRICS[name].about) for name, x in columns}
-        )
+        variables = {name: ("update", x, METRICS[name].attributes) for name, x in columns}
         times = {"compile": self.compile, "run": self.elapsed - self.compile}
         curve = xr.Dataset(variables, {"update": np.arange(len(self.curve)) + 1}, times)
         files.write_csv(self.folder / "curve.csv", curve.to_dataframe())

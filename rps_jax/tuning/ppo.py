@@ -117,7 +117,7 @@ class PPO:
 class TrainState(NamedTuple):
     """Weights of the policy and the value function, and the state of their optimiser."""
 
-    weights: Weights  # "actor", "critic", and "log_std" (3,) of the actions
+    weights: Weights  # "actor", "critic", and "log_std" (A,) of the actions
     ema: Weights  # "actor" averaged over the last updates, which is the law
     optimiser: optax.OptState
     learning_rate: jax.Array  # ()
@@ -130,7 +130,7 @@ class TrainState(NamedTuple):
         weights: Weights = {
             "actor": read(ppo.initial).weights if ppo.initial else network.init(actor),
             "critic": networks.init_weights(networks.critic_shapes(inputs, ppo.width), critic),
-            "log_std": jnp.full(3, math.log(ppo.action_std)),
+            "log_std": jnp.full(network.actions, math.log(ppo.action_std)),
         }
         ema = jax.tree.map(jnp.copy, weights["actor"])
         return cls(weights, ema, _optimiser().init(weights), jnp.asarray(ppo.learning_rate, float))
@@ -142,7 +142,7 @@ class Transition(NamedTuple):
     obs: jax.Array  # (F,) inputs of the network
     privileged: jax.Array  # (P,) inputs of the value function alone
     first: jax.Array  # () bool: first of its trial
-    action: jax.Array  # (3,) [1] unbounded
+    action: jax.Array  # (A,) [1] unbounded
     log_prob: jax.Array  # ()
     value: jax.Array  # () before the action
     next_value: jax.Array  # () after the action, before a restart of the world
@@ -178,7 +178,7 @@ def critic_inputs(obs: jax.Array, privileged: jax.Array) -> jax.Array:
 
 
 def log_prob(action: jax.Array, mean: jax.Array, log_std: jax.Array) -> jax.Array:
-    """Return the log density (...) of actions (..., 3) [1], independent and normal."""
+    """Return the log density (...) of actions (..., A) [1], independent and normal."""
     z = (action - mean) / jnp.exp(log_std)
     return jnp.sum(-0.5 * z * z - log_std - 0.5 * math.log(2 * math.pi), axis=-1)
 
@@ -190,7 +190,7 @@ def surrogate(ratio: jax.Array, advantage: jax.Array, clip_eps: float) -> jax.Ar
 
 
 def means(network: Network, actor: Weights, hidden: jax.Array, steps: Transition) -> jax.Array:
-    """Return mean actions (T, N, 3), from the hidden state (N, 2, H) before the first action."""
+    """Return mean actions (T, N, A), from the hidden state (N, 2, H) before the first action."""
     if network.kind == "mlp":
         return network.apply(actor, hidden[None], steps.obs)[1]
 

@@ -8,7 +8,6 @@ runs the search and checkpoints every generation, so a killed run resumes.
 from __future__ import annotations
 
 import functools
-import shlex
 from collections.abc import Callable, Generator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -21,7 +20,7 @@ import xarray as xr
 
 from rps_jax import errors
 from rps_jax.analysis import statistics, tables
-from rps_jax.analysis.figures import tuning as figures
+from rps_jax.analysis.figures import sweeps as figures
 from rps_jax.analysis.report import Picture, Section
 from rps_jax.control import registry
 from rps_jax.control.base import LawParams, unit_of_leaf
@@ -73,7 +72,7 @@ class Tuning(TaskOption, LawQuestion[xr.Dataset]):
 
     IGNORED_FIELDS = ("budget", "generations", "task")
     REPORTS_TIMES = True
-    QUICK: ClassVar[dict[str, Any]] = {
+    QUICK: ClassVar = {
         # The few parameters that matter most, since few trials cannot determine more; cylinders on
         # the quasi-static model, which compile and run fastest.
         "tuned": ("K_h", "K_v", "l_cr", "d_th"),
@@ -316,7 +315,8 @@ class Tuning(TaskOption, LawQuestion[xr.Dataset]):
             law = f"{start},{run.folder / TUNED}"
             text += (
                 f" The law with these parameters is `{law}`; "
-                f"`rps ladder --laws {shlex.join([start, law])}` tests it on all objects."
+                f"`{self.next_command('ladder', laws=[start, law], domain=self.domain)}` tests it "
+                "on all objects."
             )
         rows = [["parameter", "start", "tuned"]]
         columns = results.parameter.values, self.space.values(self.base), results.tuned.values

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from rps_jax import errors
-from rps_jax.geometry.solid import SIDES
+from rps_jax.geometry.solid import SIDES, SUPPORTS
 from rps_jax.record import files
 from rps_jax.record.files import JsonObject
 from rps_jax.record.folder import describe_difference
@@ -50,7 +50,11 @@ def robot_field(name: str) -> str:
 
 _POSITIVE = 1e-3
 # Labels of the three draws of the velocity error.
-VELOCITY_ERRORS = {f"{name}_error": f"error of {name}" for name in ("v_x", "v_y", "omega")}
+VELOCITY_ERRORS = {
+    "v_x_error": "error of v_x or left wheel",
+    "v_y_error": "error of v_y",
+    "omega_error": "error of omega or right wheel",
+}
 
 
 @dataclass(frozen=True)
@@ -90,6 +94,11 @@ class Domain:
     # stands on its corners or its rim.
     feet: Annotated[
         Range | None, Quantity("1", "feet, of the way to the outline", ge=0.1, le=1)
+    ] = None
+    # Pressure under objects without feet: 0 even, 1 along the rim, 2 at the corners, or between
+    # for mixtures; also by name, as support=even. None: that of the physics.
+    support: Annotated[
+        Range | None, Quantity("1", "pressure from even over rim to corners", ge=0, le=2)
     ] = None
     friction_ground: Annotated[
         Range, Quantity("1", "friction object-ground", ge=_POSITIVE, le=10)
@@ -227,6 +236,8 @@ class Domain:
         if self.feet is not None and not set(self.objects) <= set(RANDOM):
             objects = f"{self.feet} with objects = {self.objects}"
             raise errors.not_allowed("domain feet", objects, "only random objects have drawn feet")
+        if self.feet is not None and self.support is not None:
+            raise errors.not_allowed("domain support", self.support, "leave it out, or feet")
         unused = {name: cause for name, cause in self.idle.items() if name in _DECLARED}
         check_unused(self, "domain ", unused, PERFECT, _HARDWARE, _HOSTILE)
         for name, interval in dict(self.custom).items():
@@ -332,7 +343,7 @@ class Domain:
     def families(self) -> tuple[str, ...]:
         """Shape family of each of `objects`."""
         names = [(FAMILIES | RANDOM)[name] for name in self.objects]
-        on_feet = self.feet is not None or self.boundary_factor is not None
+        on_feet = (self.feet, self.support, self.boundary_factor) != (None, None, None)
         return tuple("prism" if on_feet and name == "box" else name for name in names)
 
     def family_of(self, index: int) -> str:
@@ -354,7 +365,7 @@ def quantities_of(*owners: Owner) -> tuple[str, ...]:
 
 
 # Quantities that only random objects draw.
-OBJECT_QUANTITIES = {*quantities_of("object")} - {"friction_ground", "friction_robot"}
+OBJECT_QUANTITIES = {*quantities_of("object")} - {"support", "friction_ground", "friction_robot"}
 # Columns of a table of worlds, with their labels.
 LABELS: dict[str, str] = {
     **{name: quantity.about for name, quantity in QUANTITIES.items() if quantity.reported},
@@ -526,6 +537,10 @@ _FORMS: dict[str, tuple[Callable[[Any], Any], str]] = {
     "targets": (
         lambda pairs: tuple((float(x), float(y)) for x, y in pairs),
         "pairs of x and y [m], as [[2, 0]]",
+    ),
+    "support": (
+        lambda x: range_of(None, SUPPORTS.get(x, x) if isinstance(x, str) else x),
+        "even, rim or corners, or low and high, as [0, 2]",
     ),
     "skin": (str, "its name"),
     "custom": (

@@ -98,6 +98,8 @@ def draw_at(
     targets, course = domain.task.courses(inputs)
     key = [np.floor(u[name] * 2**32).astype(np.uint32) for name in ("key_0", "key_1")]
     solids, surroundings = _solid(name, at, u), _surroundings(at, targets)
+    if "support" in at and solids.feet is None:
+        solids = solid.on_support(solids, at["support"])
     if surroundings.boundary is not None:  # each foot has the friction of its side
         solids = solid.standing(solids)
     drawn = Draw(

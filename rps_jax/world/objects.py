@@ -110,7 +110,11 @@ def custom_solids(names: Iterable[str]) -> JsonObject:
 
     They are rounded, so that all processors give the same.
     """
-    solids = {text_of(name): REGISTERED[name].solid for name in names if name in REGISTERED}
+    rows = {name: REGISTERED[name].solid._asdict() for name in names if name in REGISTERED}
+    for row in rows.values():
+        if row["pads"] is None:  # as records of version 0.4
+            del row["pads"]
+    solids = {text_of(name): row for name, row in rows.items()}
     return options.to_json(jax.tree.map(lambda x: np.round(x, 9), solids))
 
 
@@ -162,10 +166,10 @@ def register_object(
         `footprint` in its element `custom`, with a radius or corners x y x y ... [m], or else the
         geom `object`, if it is a box or a cylinder. The height of the solid is that of this geom.
         It reaches from that geom to the convex hull of all geoms, within 2 %.
-      feet: positions (S, 2) [m] of 3 to 8 points on which it stands, in the body's frame, or with
-        weights (S, 3) [m, m, 1], as of springs; by default its corners or its rim. Only the engine
-        quasistatic accepts different weights: the others compute the load of each foot from the
-        tilt of the object, on ground of uniform stiffness.
+      feet: positions (S, 2) [m] of 3 to 8 points on which it stands, in the body's frame, also with
+        weights (S, 3) [m, m, 1], as of springs that share the load, and with factors of friction
+        with the ground (S, 4) [m, m, 1, 1], as 0.02 of a castor. By default it has the support of
+        the physics: its corners or its rim, or even pressure with `physics=default,support=even`.
 
     Raises:
       InputError: the name is one of the paper's, or file, footprint or feet are invalid.
@@ -202,14 +206,18 @@ def register_object(
         footprint = fp.polygon(footprint)
     family, vertices, radius = _outline(label, footprint)
     _check_extent(label, model, vertices, radius)
-    body = model.body("object")
+    body, pads = model.body("object"), None
     if feet is not None:
         family, vertices = "cylinder" if radius else "prism", solid.padded(vertices)
         feet = solid.check_feet(f"{label}: feet", feet, body.ipos[:2], at_most=SIDES)
-        missing = np.repeat(feet[-1:] * [1, 1, 0], SIDES - len(feet), axis=0)
-        feet = np.concatenate([feet, missing])
+        missing = np.repeat(feet[-1:] * [1, 1, 0, 1], SIDES - len(feet), axis=0)
+        rows, equal = np.concatenate([feet, missing]), np.ptp(feet[:, 2]) == 0
+        if not equal or np.any(feet[:, 3] != 1):  # a mean weight of 1
+            rows[:, 2] /= feet[:, 2].mean()
+            pads = np.column_stack([rows[:, 3], np.zeros(SIDES)])
+        feet = rows[:, :3]
     single = solid_of_body(body, vertices, radius, _height(label, model))
-    REGISTERED[name] = Registered(path, single._replace(feet=feet))
+    REGISTERED[name] = Registered(path, single._replace(feet=feet, pads=pads))
     FAMILIES[name] = family
 
 

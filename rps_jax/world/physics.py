@@ -5,6 +5,7 @@ from dataclasses import dataclass, fields, replace
 from typing import Literal
 
 from rps_jax import errors
+from rps_jax.geometry.solid import Support
 from rps_jax.record.options import check_fields, option, parse_changes
 
 
@@ -31,9 +32,13 @@ class Physics:
     base_solref: tuple[float, float] = option((0.02, 1.0), above=0)  # MuJoCo's default
     ground_solref: tuple[float, float] = option((0.1, 0.2), above=0)
     ground_impedance: float = option(0.5, above=0, at_most=0.9999)
+    # Pressure under objects without explicit feet: at corners or rim, even, or along the rim.
+    support: Support = "corners"
 
     def __post_init__(self) -> None:
         check_fields(self)
+        if self.support != "corners" and self.cone == "pyramidal":
+            raise errors.not_allowed("support", self.support, "a friction pyramid has corners")
         steps = self.control_period / self.timestep
         if steps < 0.5 or not math.isclose(steps, round(steps), rel_tol=1e-6):
             rule = f"it must be a multiple of timestep = {self.timestep:g} s"

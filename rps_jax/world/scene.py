@@ -29,6 +29,7 @@ Side = Literal["near", "far"]
 OFF_CENTRE = 1e-6
 WALL_HALF, WALL_TOP = 0.001, 2.5  # [m] half thickness and height of walls, which are sheets
 _WALL_FOOT = -0.5  # [m] their lower edge
+_LEAST_TORQUE = 1e-5  # [m] torsional friction of a point, the least in MuJoCo
 
 
 class Friction(NamedTuple):
@@ -61,6 +62,16 @@ class WorldInputs(NamedTuple):
     physics: Physics
     robots: Robot = Robot()  # (n,), or one for all
     surroundings: Surroundings = Surroundings()  # (n,) each
+
+    @property
+    def supported(self) -> "WorldInputs":
+        """Inputs whose solids without feet have the support of the physics."""
+        solids, family, support = self.solids, self.family, self.physics.support
+        if solids.feet is None and support != "corners":
+            solids = solid.on_support(solids, np.full(self.num_worlds, solid.SUPPORTS[support]))
+        if solids.feet is not None and family == "box":  # feet are those of a prism
+            family = "prism"
+        return self._replace(solids=solids, family=family)
 
     @property
     def num_worlds(self) -> int:
@@ -181,15 +192,15 @@ def compile_solid(
         corners, half = single.vertices[distinct], single.height / 2
         faces = [np.column_stack([corners, np.full(len(corners), z)]) for z in (-half, half)]
         spec.mesh("prism").uservert = np.concatenate(faces).ravel()
-    if single.feet is not None and family == "cylinder":
-        _add_feet(spec)
+    if single.feet is not None:
+        _add_feet(spec, family, len(single.feet))
     if single.feet is not None or family == "prism":
         for i, foot in enumerate(foot_positions(single)):
             spec.geom(f"foot_{i}").pos = foot
     body.explicitinertial = True
     body.mass, body.ipos = single.mass, single.p_object_com
     body.iquat, body.inertia = single.q_object_body, single.inertia
-    models = _compile(spec, physics, friction, robot, around)
+    models = _compile(spec, physics, friction, robot, around, single)
     return Scene(family, family, *models, single, robot.shell)
 
 
@@ -234,17 +245,18 @@ def geom_sizes(family: str, solids: Solid) -> Arrays:
     return {}  # a prism is a mesh and points
 
 
-def _add_feet(spec: mujoco.MjSpec) -> None:
-    """Add the feet of a prism to a cylinder; only these touch the ground."""
+def _add_feet(spec: mujoco.MjSpec, family: str, count: int) -> None:
+    """Add feet to a cylinder, or more to a prism; only these touch the ground."""
     default = spec.find_default("ground_object")
-    spec.delete(spec.pair("ground_object"))
+    if family == "cylinder":
+        spec.delete(spec.pair("ground_object"))
     point: dict[str, Any] = {
         "type": mujoco.mjtGeom.mjGEOM_SPHERE,
         "size": [1e-6, 0, 0],
         "mass": 0,
         "group": 3,
     }
-    for i in range(solid.SIDES):
+    for i in range(0 if family == "cylinder" else solid.SIDES, count):
         spec.body("object").add_geom(name=f"foot_{i}", **point)
         pair = {"geomname1": "ground", "geomname2": f"foot_{i}"}
         spec.add_pair(default, name=f"ground_object_{i}", **pair)
@@ -265,17 +277,34 @@ def _add_walls(spec: mujoco.MjSpec, around: Surroundings, physics: Physics) -> N
 
 
 def foot_positions(solids: Solid) -> np.ndarray:
-    """Return the support points (..., N, 3) [m] of solids (...); unused points are at the top.
-
-    The weights of feet are ignored.
-    """
+    """Return the support points (..., N, 3) [m] of solids (...); unused points are at the top."""
     at, weight = solid.support(solids)
     half = np.expand_dims(solids.height / 2, -1)
     return np.concatenate([at, np.where(weight == 0, half, -half)[..., None]], axis=-1)
 
 
+def _set_pads(spec: mujoco.MjSpec, single: Solid, physics: Physics) -> None:
+    """Set the stiffness of each foot by its weight, its friction, and its torque of friction."""
+    impedance, (time, damping) = physics.ground_impedance, physics.ground_solref
+    stiffness = impedance / (1 - impedance)
+    weights = np.asarray(single.feet)[:, 2]
+    for i, ((factor, radius), weight) in enumerate(zip(single.pads, weights, strict=True)):
+        pair = spec.pair(f"ground_object_{i}")
+        # A contact's stiffness is its impedance over the rest; `solref` undoes its other effects.
+        share = 1 - 1 / (1 + stiffness * weight) if weight > 0 else impedance
+        pair.condim, pair.solimp[:2] = 4, share
+        pair.solref[:] = time * impedance / share, damping * (share / impedance) ** 0.5
+        slide = pair.friction[0] * factor
+        pair.friction[:3] = slide, slide, max(slide * radius, _LEAST_TORQUE)
+
+
 def _compile(
-    spec: mujoco.MjSpec, physics: Physics, friction: Friction, robot: Robot, around: Surroundings
+    spec: mujoco.MjSpec,
+    physics: Physics,
+    friction: Friction,
+    robot: Robot,
+    around: Surroundings,
+    single: Solid | None = None,
 ) -> tuple[mujoco.MjModel, mujoco.MjModel]:
     """Compile the full model and the stripped one."""
     _set_robot(spec, robot)
@@ -289,6 +318,8 @@ def _compile(
             pair.solref[:] = physics.ground_solref
             pair.solimp[:2] = physics.ground_impedance
         pair.friction[:2] = friction.robot if of_base else friction.ground
+    if single is not None and single.pads is not None:
+        _set_pads(spec, single, physics)
     if around.walls is not None:
         _add_walls(spec, around, physics)
     if around.slope is not None:

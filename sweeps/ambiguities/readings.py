@@ -73,45 +73,15 @@ READINGS = {
 _THIN = {"skin": IdealSkin(0.001)}
 
 
-def _gazebo(label: str, tolerance: float = 0.001, bearing: float = 0.0, **more: Any) -> Condition:
-    """Return a condition of Gazebo's physics; `params` are of the law, the rest of the physics."""
-    params, case = more.pop("params", {}), {"skin": IdealSkin(tolerance), "bearing": bearing}
-    return Condition(label, _setting(_GAZEBO, **more), params, case)
-
-
 # Ingredients of Gazebo: all together, then one by one.
 GAZEBO = {
     DEFAULT: Condition("the defaults at 1 ms", _setting(_CONE)),
-    "paper_gazebo": _gazebo("`paper_gazebo`: pyramid, skin 1 mm"),
-    "pyramid": _gazebo("pyramid alone, skin 6 mm", 0.006),
-    "pyramid_turned": _gazebo("pyramid alone, turned by 45 degrees", 0.006, math.pi / 4),
+    "paper_gazebo": Condition("`paper_gazebo`: pyramid, skin 1 mm", _setting(_GAZEBO), case=_THIN),
+    "pyramid": Condition(
+        "pyramid alone, skin 6 mm", _setting(_GAZEBO), case={"skin": IdealSkin(0.006)}
+    ),
     "thin": Condition("skin 1 mm alone, isotropic", _setting(_CONE), case=_THIN),
-    "gazebo_turned": _gazebo("`paper_gazebo` turned by 45 degrees", bearing=math.pi / 4),
-    "thin_half": _gazebo("pyramid, skin 0.5 mm", 0.0005),
-    "thin_3mm": _gazebo("pyramid, skin 3 mm", 0.003),
-    "gazebo_drive": _gazebo("`paper_gazebo`, 0.05 m/s after a loss", params={"v_lost": 0.05}),
-    "gazebo_2ms": _gazebo("`paper_gazebo` in steps of 2 ms", timestep=0.002),
-    "gazebo_5ms": _gazebo("`paper_gazebo` in steps of 5 ms", timestep=0.005),
 }
-
-TOLERANCES = (0.5, 1, 2, 3, 4, 5, 6, 8, 10, 12, 15)  # [mm] of the skin
-ON_LOSS = {
-    "creep": ("ahead at 0.01 m/s", {}),
-    "drive": ("ahead at 0.05 m/s", {"v_lost": 0.05}),
-    "keep": ("last contact kept", {"keep_contact": 1.0}),
-}
-
-
-def curve() -> dict[str, Condition]:
-    """Return conditions over skin tolerance [mm] and behaviour on loss of contact."""
-    fused = Setting(engine="fused")
-    return {
-        f"{loss}_{mm:g}mm": Condition(
-            f"{mm:g} mm, {words}", fused, params, {"skin": IdealSkin(mm / 1000)}
-        )
-        for loss, (words, params) in ON_LOSS.items()
-        for mm in TOLERANCES
-    }
 
 
 def cells(results: xr.Dataset) -> list[list[str]]:

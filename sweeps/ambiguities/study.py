@@ -2,8 +2,7 @@
 
     rps sweeps/ambiguities --quick
 
-`--gazebo` runs the ingredients of the paper's simulator instead, and `--curve` tolerances of the
-skin. The readings are in `readings`.
+`--gazebo` runs the ingredients of the paper's simulator instead. The readings are in `readings`.
 """
 
 from __future__ import annotations
@@ -14,7 +13,7 @@ from typing import ClassVar
 
 import xarray as xr
 
-from rps_jax import InputError, errors
+from rps_jax import errors
 from rps_jax.laws import resolve_law
 from rps_jax.questions import call_of
 from rps_jax.world import paper
@@ -32,7 +31,7 @@ class Ambiguities(ConditionStudy):
 
     TITLE = "What the paper leaves open"
     QUICK: ClassVar = {"targets": paper.FEW_TARGETS}
-    GROWS = ("readings", "gazebo", "curve")
+    GROWS = ("readings", "gazebo")
 
     laws: tuple[str, ...] = ()
     """Names of laws; by default rps, and with --gazebo also nps and aps."""
@@ -40,14 +39,11 @@ class Ambiguities(ConditionStudy):
     """Names of the readings; by default all that the laws allow."""
     gazebo: bool = False
     """Whether to run the ingredients of the paper's simulator instead, with all three laws."""
-    curve: bool = False
-    """Whether to run skin tolerances and behaviours on loss of contact instead."""
 
     @property
     def known(self) -> dict[str, Condition]:
         """Readings by name."""
-        known = readings.GAZEBO if self.gazebo else readings.READINGS
-        return readings.curve() if self.curve else known
+        return readings.GAZEBO if self.gazebo else readings.READINGS
 
     @property
     def chosen(self) -> dict[str, Condition]:
@@ -57,8 +53,7 @@ class Ambiguities(ConditionStudy):
             for name, reading in self.known.items()
             if name not in self.refused and not reading.is_default(self.grid.laws)
         ]
-        first = [] if self.curve else [readings.DEFAULT]
-        return {name: self.known[name] for name in (*first, *names)}
+        return {name: self.known[name] for name in (readings.DEFAULT, *names)}
 
     @property
     def refused(self) -> tuple[str, ...]:
@@ -75,8 +70,6 @@ class Ambiguities(ConditionStudy):
     def check(self) -> None:
         """Check the names."""
         super().check()
-        if self.gazebo and self.curve:
-            raise InputError("gazebo and curve are not allowed together: choose one.")
         for name in self.readings:
             errors.check_name("reading", name, self.known)
         for name in self.grid.laws:

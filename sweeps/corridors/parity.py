@@ -101,13 +101,10 @@ class Parity(PlanStudy[xr.DataTree], Study[xr.DataTree]):
         rows = [[*heads, "+/-"]]
         for name in self.rows:
             reference, fused = (results[f"{name} {x}"].success > 0 for x in ENGINES)
-            rates = [tables.share(int(x.sum()), x.size) for x in (reference, fused)]
-            equal = tables.share(int((reference == fused).sum()), fused.size)
-            compared = statistics.compare(reference, fused)
-            row = ROWS[name]
+            rates = (tables.rate(x.values) for x in (reference, fused, reference == fused))
+            changes, row = statistics.compare(reference, fused).changes, ROWS[name]
             worlds = f"`{row.domain}`, {fused.size:,}"
-            changes = compared.changes
-            rows.append([name, f"`{row.task}`", worlds, row.law, *rates, equal, changes])
+            rows.append([name, f"`{row.task}`", worlds, row.law, *rates, changes])
         return [Table(rows, name="tasks_parity", title="Equal outcomes")]
 
 

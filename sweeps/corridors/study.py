@@ -313,7 +313,7 @@ def width_table(results: xr.Dataset, curves: Mapping[tuple[str, str], Curve]) ->
     for row, law in curves:
         outcomes = started.sel(row=row, law=law)
         success = outcomes.success.values > 0
-        rates = [tables.share(int(success[mask].sum()), int(mask.sum())) for mask in masks]
+        rates = [tables.rate(success[mask]) for mask in masks]
         needed = [width_text(curves[row, law], level) for level in LEVELS]
         compared = statistics.compare(started.success.sel(row=row, law=base), outcomes.success)
         against = f"{compared.changes}, p = {compared.p:.2g}" if law != base else ""
@@ -395,7 +395,7 @@ def error_table(results: xr.Dataset, resamples: int = 200, seed: int = 0) -> Row
             for i in range(CENTRES.size):
                 mask = (index == i) & (turn >= low) & (turn < high)
                 values = error[mask & np.isfinite(error)]
-                rates.append(tables.share(int(success[mask].sum()), int(mask.sum())))
+                rates.append(tables.rate(success[mask]))
                 if not values.size:
                     cells.append("-")
                     medians.append(math.inf)
@@ -415,7 +415,7 @@ def error_table(results: xr.Dataset, resamples: int = 200, seed: int = 0) -> Row
 def figure_of(results: xr.Dataset, curves: Mapping[tuple[str, str], Curve]) -> Figure:
     """Draw success against width by law for each turn: bins with 95 % intervals, and the fits."""
     started = _started(results)
-    names = list(map(str, results.row.values))
+    names = results.row.values.tolist()
     figure, axes = tiles(len(names), 2, (5, 3.6), (0, 0.4), sharex=True, sharey=True)
     edges = np.linspace(WIDTHS.low, WIDTHS.high, 8)
     middle = (edges[:-1] + edges[1:]) / 2

@@ -6,14 +6,15 @@ rps sweeps/drives --worlds 10000
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from itertools import product
 from pathlib import Path
 from typing import ClassVar, NamedTuple
 
 import numpy as np
 import xarray as xr
 
-from rps_jax import Setting
+from rps_jax import Rules, Setting
 from rps_jax.analysis import statistics, tables
 from rps_jax.questions import Plan, Run, call_of, option
 from rps_jax.runs.question import TrialQuestion
@@ -28,9 +29,12 @@ class Base(NamedTuple):
 
     robot: str
     law: str
+    rules: Rules | None = None  # by default the setting's
 
 
 FRONT_SKIN = Path(__file__).with_name("front_skin.json")
+DRIFT = f"{Path(__file__).with_name('drift.py')}:DriftParams"
+PATIENT = Rules(horizon=900.0, max_lost=600.0)
 CAR = "ideal,drive=car,turning_radius=0.5"
 DIFFERENTIAL = "ideal,drive=differential"
 BASES: dict[str, Base] = {
@@ -39,8 +43,10 @@ BASES: dict[str, Base] = {
     "differential": Base(DIFFERENTIAL, "unicycle"),
     "differential, axle 0.15 m behind": Base(f"{DIFFERENTIAL},axle=0.15", "unicycle"),
     "differential, axle 0.3 m behind": Base(f"{DIFFERENTIAL},axle=0.3", "unicycle"),
+    "differential, drifting odometry": Base(DIFFERENTIAL, DRIFT),
     "car, R 0.5 m": Base(CAR, "unicycle_car"),
     "car, R 0.5 m, axle 0.3 m behind": Base(f"{CAR},axle=0.3", "unicycle_car"),
+    "car, axle 0.3 m behind, 600 s": Base(f"{CAR},axle=0.3", "unicycle_car", PATIENT),
     "round, holonomic, rps_plus": Base("round", "rps_plus"),
     "round, holonomic, rps_reposition": Base("round", "rps_reposition_round"),
     "round, differential": Base("round,drive=differential", "unicycle_round"),
@@ -71,13 +77,13 @@ class Drives(TrialQuestion[xr.Dataset], Study[xr.Dataset]):
     @property
     def plans(self) -> dict[str, Plan]:
         """The sweep of each row."""
-        return {
-            f"{domain} | {name}": Sweep(
-                BASES[name].law, domain, self.worlds, robot=BASES[name].robot, setting=self.setting
-            ).plan
-            for domain in self.domains
-            for name in self.bases
-        }
+        plans = {}
+        for domain, name in product(self.domains, self.bases):
+            robot, law, rules = BASES[name]
+            setting = replace(self.setting, rules=rules or self.setting.rules)
+            sweep = Sweep(law, domain, self.worlds, robot=robot, setting=setting)
+            plans[f"{domain} | {name}"] = sweep.plan
+        return plans
 
     def check(self) -> None:
         """Check that the engine can step these worlds here."""
@@ -91,7 +97,7 @@ class Drives(TrialQuestion[xr.Dataset], Study[xr.Dataset]):
 
     def answer(self, run: Run) -> xr.Dataset:
         """Sweep each row."""
-        names = ["success", "time", "contact_lost_time", "path_length", "tipped", "stalled"]
+        names = ["success", "time", "contact_lost_time", "repositions", "tipped", "stalled"]
         rows = {row: part[names].isel(law=0, drop=True) for row, part in self.results(run).items()}
         return xr.concat(rows.values(), xr.IndexVariable("row", list(rows)), join="override")
 
@@ -118,7 +124,8 @@ drives = call_of(Drives)
 def drive_table(results: xr.Dataset, max_lost: float) -> Rows:
     """Return a header and a row for each domain and base."""
     header = ["domain", "base", "success", "against holonomic", "median time", "95 %"]
-    rows = [[*header, "median without contact", f"more than {max_lost:g} s without contact"]]
+    header += ["repositions", "median without contact"]
+    rows = [[*header, f"more than {max_lost:g} s without contact"]]
     for row in map(str, results.row.values):
         domain, _, base = row.partition(" | ")
         trials, reference = results.sel(row=row), f"{domain} | {OMNI}"
@@ -128,7 +135,7 @@ def drive_table(results: xr.Dataset, max_lost: float) -> Rows:
             change = statistics.compare(results.sel(row=reference).success, trials.success).changes
         times = trials.time.values[success]
         quantiles = [f"{x:.0f} s" for x in np.quantile(times, (0.5, 0.95))] if times.size else "--"
-        cells = f"{np.median(lost):.0f} s", str(int(np.count_nonzero(lost > max_lost)))
-        share = tables.share(int(success.sum()), success.size)
-        rows.append([domain, base, share, change, *quantiles, *cells])
+        cells = [f"{float(trials.repositions.mean()):.1f}", f"{np.median(lost):.0f} s"]
+        cells.append(str(int(np.count_nonzero(lost > max_lost))))
+        rows.append([domain, base, tables.rate(success), change, *quantiles, *cells])
     return rows

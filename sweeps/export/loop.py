@@ -15,13 +15,13 @@ from rps_jax import Details, Law, Setting, Twist, register_law
 from rps_jax.app.export import program
 from rps_jax.app.shadow import shadow
 from rps_jax.laws import law_of, resolve_law
-from rps_jax.lowering.routine import identifier
 from rps_jax.physics import FRICTION
 from rps_jax.runs.push import recorded_law
 from rps_jax.trials import pushes
 from rps_jax.world import paper
-from rps_jax.worlds import Case, parse_domain
+from rps_jax.worlds import Case, DomainLike, parse_domain
 from sweeps.export.native import TOLERANCE, Native, scale_of
+from sweeps.study_base import part_name
 
 ROUNDINGS = (1, -1, 2, -2, 4, -4, 8, -8)  # rounding errors of a twist, in units of 2^-23
 
@@ -70,7 +70,7 @@ def in_the_loop(name: str, folder: Path) -> Any:
         details = Details.from_obs(getattr(obs, "touch", obs))
         return jax.tree.unflatten(tree, next_state), Twist(*twist), details
 
-    return _registered(f"{identifier(label)}_in_c", law, step, params)
+    return _registered(part_name(label, "in_c"), law, step, params)
 
 
 def nudged(name: str, roundings: int) -> Any:
@@ -84,7 +84,7 @@ def nudged(name: str, roundings: int) -> Any:
         return state, Twist(*changed), details
 
     suffix = f"{abs(roundings)}_{'down' if roundings < 0 else 'up'}"
-    return _registered(f"{identifier(label)}_{suffix}", law, step, params)
+    return _registered(part_name(label, suffix), law, step, params)
 
 
 def _registered(name: str, law: Law, step: Any, params: Any) -> Any:
@@ -133,7 +133,9 @@ def papers_trials(name: str, setting: Setting, folder: Path) -> Outcomes:
     return _compare(name, folder, run, ROUNDINGS)
 
 
-def random_worlds(name: str, domain: str, worlds: int, setting: Setting, folder: Path) -> Outcomes:
+def random_worlds(
+    name: str, domain: DomainLike, worlds: int, setting: Setting, folder: Path
+) -> Outcomes:
     """Return the outcomes in random worlds."""
 
     def run(params: Any) -> Any:
@@ -153,7 +155,7 @@ class Bags(NamedTuple):
     strange: int  # messages that differ when read by an independent library
 
 
-def bags(name: str, domain: str, worlds: int, setting: Setting, folder: Path) -> Bags:
+def bags(name: str, domain: DomainLike, worlds: int, setting: Setting, folder: Path) -> Bags:
     """Write bags of random worlds, read them with `rosbags`, and feed them to their law."""
     from rosbags.highlevel import AnyReader
     from rosbags.typesys import Stores, get_typestore

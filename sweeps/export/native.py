@@ -18,6 +18,7 @@ import shutil
 import subprocess
 import tempfile
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -26,12 +27,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from rps_jax import Law, Twist
+from rps_jax import Law, Observation, Robot, Twist
 from rps_jax.app.export import c, folder, onnx_model, program
 from rps_jax.app.export.program import Program
 from rps_jax.control import validation
 from rps_jax.laws import law_of, resolve_law
-from rps_jax.lowering.routine import Group
 
 Precision = Literal["float", "double"]
 Result = tuple[np.ndarray, np.ndarray]  # twists (n, 3) and memories (n,) of steps
@@ -77,7 +77,7 @@ class Structs:
         self.program, self.real = exported, REAL[form]
         self.dtypes = {name: self._dtype(group) for name, group in exported.groups.items()}
 
-    def _dtype(self, group: Group) -> np.dtype:
+    def _dtype(self, group: Sequence[Any]) -> np.dtype:
         kinds = {"f": self.real, "i": np.int32, "b": np.int32}
         fields: list[Any] = [
             (field.name, kinds[field.kind], field.shape) for field in group if field.size
@@ -222,10 +222,18 @@ class Agreement(NamedTuple):
     off_in_jax: int = 0  # JAX in float32 does
 
 
-def agreement(name: str, form: Form, inputs: int, path: Path, seed: int = 0) -> Agreement:
+def agreement(
+    name: str, form: Form, inputs: int, path: Path, seed: int = 0, robot: str = "ideal"
+) -> Agreement:
     """Compare a law's twist and memory in C or ONNX and in JAX."""
     label, params = resolve_law(name)
-    law, exported = law_of(params), program.program(name)
+    law, exported, base = law_of(params), program.program(name, robot), Robot.parse(robot)
+    if base.drive != "omni":
+
+        def step_of_base(params: Any, memory: Any, obs: Observation) -> Any:
+            return law_of(params).step(params, memory, obs.with_base(base.radius, base))
+
+        law = replace(law, step=step_of_base)
     worlds, real = max(1, min(inputs // STEPS, 5000)), REAL[form]
     native = build_law(form, exported, path, worlds)
     with jax.enable_x64(form == "double"):

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 from functools import partial
 from itertools import product
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Any, ClassVar, Literal
 
 import jax
 import numpy as np
@@ -26,12 +26,10 @@ import xarray as xr
 
 from rps_jax import InputError, Setting
 from rps_jax.app.export import program
-from rps_jax.control.learned import policy
 from rps_jax.physics import PHYSICS
 from rps_jax.questions import Run, call_of, option
 from rps_jax.world import paper
-from rps_jax.world.domain import STORED
-from rps_jax.worlds import Case, parse_domain
+from rps_jax.worlds import Case, DomainLike, parse_domain
 from sweeps.export import loop, native
 from sweeps.study_base import QuickStudy, Table, records, run_parts, text_table
 
@@ -75,7 +73,7 @@ class Export(QuickStudy[xr.DataTree]):
     """Number of random worlds with C in the loop."""
     bags: int = option(4, 1, 1000)
     """Number of random worlds that are recorded as bags, for each law."""
-    domain: Annotated[str, STORED] = "real"
+    domain: DomainLike = "real"
     """Domain of these worlds."""
 
     def check(self) -> None:
@@ -106,7 +104,7 @@ class Export(QuickStudy[xr.DataTree]):
 
     def _inputs(self, law: str, folder: Path) -> xr.Dataset:
         counts: dict[native.Form, int] = {
-            form: self.states if form == "onnx" or law in policy.SHIPPED else self.inputs
+            form: self.states if form == "onnx" or law.startswith("learned") else self.inputs
             for form in _FORMS
         }
         rows = [native.agreement(law, form, count, folder) for form, count in counts.items()]
@@ -289,7 +287,7 @@ def _paper_table(results: xr.Dataset) -> Table:
     return Table(rows, note, title="The paper's trials")
 
 
-def _world_table(domain: str, results: xr.Dataset) -> Table:
+def _world_table(domain: DomainLike, results: xr.Dataset) -> Table:
     note = f"The same worlds of `{domain}` for both; one rounding off; fused engine, float."
     return Table(text_table(_ENDS, records(results, "law")), note, title="Random worlds")
 
@@ -305,7 +303,7 @@ _BAGS = {
 }
 
 
-def _bag_table(domain: str, results: xr.Dataset) -> Table:
+def _bag_table(domain: DomainLike, results: xr.Dataset) -> Table:
     note = (
         f"Worlds of `{domain}`, fused engine. Each law is fed its own bag. The goal is 1e-6, of "
         "differences as shares of the greatest speed and turning rate."

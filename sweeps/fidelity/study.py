@@ -20,6 +20,7 @@ from rps_jax import Rules, Setting
 from rps_jax.analysis import statistics
 from rps_jax.physics import EngineName, Physics, preset
 from rps_jax.questions import Run, call_of
+from rps_jax.trials.progress import no_progress
 from rps_jax.world import paper
 from rps_jax.world.physics import MUJOCO_GROUND
 from sweeps.conditions import Condition, ConditionStudy, Grid, run_conditions
@@ -111,8 +112,8 @@ class Fidelity(ConditionStudy):
         results = super().answer(run)
         short = {name: _early(condition) for name, condition in self.chosen.items()}
         of_rps = self.grid._replace(laws=("rps",))
-        folder = None if run.folder is None else run.folder / "early"
-        early = run_conditions(short, of_rps, folder, slots=run.slots, workers=run.workers)
+        quiet = run._replace(folder=run.folder and run.folder / "early", callback=no_progress)
+        early = run_conditions(short, of_rps, quiet)
         position = early.object_pose.sel(law="rps", pose=["x", "y"])
         squares = ((position - position.sel(condition=REFERENCE)) ** 2).sum("pose")
         results["early_error"] = np.sqrt(squares).drop_vars("law")

@@ -93,8 +93,9 @@ bagged = call_of(Bagged)
 
 def table(results: xr.Dataset) -> Rows:
     """Return header and rows of the table of the page."""
-    logs = results.sel(source=_SOURCES[1])
-    errors = [abs(results[k] - logs[k]) / (logs.high - logs.low) for k in ("low", "high")]
+    of_logs = results.sel(source=_SOURCES[1])
+    width = of_logs.high - of_logs.low
+    errors = [abs(results[k] - of_logs[k]) / width for k in ("low", "high")]
     is_near = np.maximum(*errors) <= _TOLERANCE
     rows = [
         [
@@ -117,7 +118,7 @@ def table(results: xr.Dataset) -> Rows:
         covered = within(fits)
         agreement = ["", ""]
         if source != _SOURCES[1]:
-            agreement = [share(covered == within(logs)), share(is_near.sel(source=source))]
+            agreement = [share(covered == within(of_logs)), share(is_near.sel(source=source))]
         determined = share(covered.astype(float), fits.undetermined == 0)
         rows.append([source, str(results.sizes["log"]), share(covered), determined, *agreement])
     return rows

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import functools
 import multiprocessing
+import os
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -87,7 +88,7 @@ class Methods(FitStudy):
         """
         quiet = run._replace(callback=no_progress)
         context, cpu = multiprocessing.get_context("spawn"), ("cpu",)
-        with context.Pool(device.count_processors(), device.choose, cpu) as pool:
+        with context.Pool(len(os.sched_getaffinity(0)), device.choose, cpu) as pool:
             jobs = [
                 pool.starmap_async(_fit_part, [(self, quiet, method, i) for i in parts], 1)
                 for method, parts in self._parts.items()

@@ -315,7 +315,7 @@ def figure(results: xr.Dataset) -> Figure:
         left.plot(100 * level, 100 * np.array(share), label=kind, lw=1.3)
     left.set(xlabel="level of the interval [%]", ylabel="it holds the truth [%]", title="Honest")
     left.legend(fontsize=8)
-    names = list(map(str, results.quantity.values))
+    names = results.quantity.values.tolist()
     shrink = results.shrinkage.mean("log").values
     for i, kind in enumerate(map(str, results.kind.values)):
         right.plot(100 * shrink[i], np.arange(len(names)) + 0.1 * (i - 2.5), "o", ms=4, label=kind)

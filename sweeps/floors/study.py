@@ -133,16 +133,13 @@ def cost_table(results: xr.Dataset, base: str, masks: Mapping[str, np.ndarray]) 
         for law in map(str, results.law.values):
             trials, level = (results.sel(law=law, floor=x) for x in (floor, base))
             success = trials.success.values > 0
-            shares = [
-                (success & mask, mask) for mask in ({"all": success >= 0} | dict(masks)).values()
-            ]
-            rates = [tables.share(int(x.sum()), int(mask.sum())) for x, mask in shares]
-            time = f"{np.median(trials.time.values[success]):.0f} s" if success.any() else "-"
+            rates = [tables.rate(success[mask]) for mask in (success >= 0, *masks.values())]
+            time = tables.median(trials.time.values[success], "{:.0f} s")
             compared = statistics.compare(level.success, trials.success)
             both = success & (level.success.values > 0)
-            ratio = f"{np.median(trials.time.values[both] / level.time.values[both]):.2f}"
+            ratio = tables.median(trials.time.values[both] / level.time.values[both], "{:.2f}")
             change = f"{compared.changes}, p = {compared.p:.2g}"
-            cells = ["", ""] if floor == base else [change, ratio if both.any() else "-"]
+            cells = ["", ""] if floor == base else [change, ratio]
             rows.append([floor, law, *rates, time, *cells])
     return rows
 

@@ -191,7 +191,7 @@ def table(by_law: Mapping[str, xr.Dataset]) -> Rows:
             for slider in _OBJECTS:
                 trials = outcomes.sel(path=path, slider=slider)
                 success = trials.success.values > 0
-                cells.append(tables.share(int(success.sum()), success.size))
+                cells.append(tables.rate(success))
                 middle, low, high = median(100 * trials.error_mean.values)
                 cells.append(f"{middle:.0f} [{low:.0f}, {high:.0f}]")
             rows.append([law, path, *cells])

@@ -1,108 +1,175 @@
-"""Race derivatives, slopes and evolution: equal wall time and equal simulated time.
+"""Race derivatives, slopes and evolution: equal simulated time and equal wall time.
 
-Each tuning is a run of `rps tune grad` or `rps tune es`, in a separate folder, and is killed after
-some minutes; a second call continues it, up to these minutes. Runs with other seeds, methods or
-problems share the folder, so that a race can be split. The generation with the best validation
-within a budget is tested in worlds that no tuning has met.
+All tunings of a problem run in lockstep: their trials form one batch. Each has a separate folder
+with its generations, so a killed race resumes. The generation with the best validation within a
+budget is tested in worlds that no tuning has met.
 
-    rps sweeps/gradients/race.py --lanes 2 --minutes 5 --seeds 1
-
-The default race has 84 tunings of four minutes, and takes six to seven hours on two cores.
-Several tunings run at once on one GPU and share it equally. Then a budget of wall time is that of a
-loaded GPU.
+rps sweeps/gradients/race.py
 """
 
 from __future__ import annotations
 
 import itertools
-import os
-import shlex
-import subprocess
-import sys
-from collections.abc import Mapping, Sequence
+import threading
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
 import pandas as pd
+import scipy
 import xarray as xr
 
-from rps_jax import InputError, RPSParams, Setting, errors, evaluate
+from rps_jax import RPSParams, Rules, Setting, errors, evaluate
 from rps_jax.analysis import statistics
+from rps_jax.analysis.figures.style import Figure, tiles
 from rps_jax.control import registry
-from rps_jax.questions import Run, call_of, option
+from rps_jax.questions import Picture, Run, call_of, option
+from rps_jax.runs.evaluate import Candidates, CandidateScores, score_candidates
 from rps_jax.runs.question import SimulationQuestion
-from sweeps.study_base import Parts, Rows, Study, Table, part_name
+from rps_jax.trials.progress import Timing, no_progress
+from rps_jax.tuning.descent import TuneGrad
+from rps_jax.tuning.evolution import TuneES
+from rps_jax.tuning.run import Tuning
+from sweeps.study_base import Parts, Study, Table, part_name
 
-TABLES = Path(__file__).with_name("tables.py")
-# Laws and tuned parameters by the number of these.
-COUNTS = {
-    6: "--tuned K_h K_v L beta l_cr d_th",
-    13: "--tuned full",
-    18: "--tuned full --law rps_plus --domain real --objects random_box",
-    **{
-        n: f"--tuned full --law {TABLES}:Table{n} --objects random_cylinder"
-        for n in (64, 512, 2048)
-    },
+TABLES = "sweeps/gradients/tables.py"  # from the root of the repository
+# Options of tunings by the number of tuned parameters: those of RPS, or the entries of tables.
+COUNTS: dict[int, dict[str, Any]] = {
+    6: {"tuned": ("K_h", "K_v", "L", "beta", "l_cr", "d_th")},
+    13: {"tuned": ("full",)},
+    **{n: {"law": f"{TABLES}:Table{n}", "objects": ("random_cylinder",)} for n in (64, 512, 2048)},
 }
-_COMMON = "--horizon 150 --validation 256"
-_ES = f"rps tune es {_COMMON} --generations 1000 --worlds"
-METHODS = {  # commands that are compared
-    "derivatives": f"rps tune grad {_COMMON}",
-    "slopes": f"rps tune es --estimator antithetic {_COMMON}",
-    "evolution": f"{_ES} 64 --population 16",
+FIRST = "derivatives"  # method with which the others are compared
+_LARGE = 500  # parameters from which evolution has a diagonal covariance
+_QUICK = {"worlds": 4, "validation": 4, "objects": ("random_cylinder",)}
+BUDGETS = ("simulated", "wall")
+
+
+class Lockstep:
+    """Batch of the trials of several tunings, each in a thread."""
+
+    def __init__(self, count: int) -> None:
+        """Wait for `count` tunings before each batch."""
+        self.count = count
+        self.device = threading.Lock()  # one tuning differentiates at a time
+        self.programs: dict[Callable[..., Any], Any] = {}  # of all tunings
+        self._waiting: list[tuple[Tuning, list[Candidates], list[Any]]] = []
+        self._changed = threading.Condition()
+
+    def score(self, question: Tuning, tried: list[Candidates]) -> tuple[Any, Timing]:
+        """Return the scores of candidates, once all tunings ask for some.
+
+        A tuning has the share of the wall clock that its trials have of the simulated time.
+        """
+        answer: list[Any] = []
+        with self._changed:
+            self._waiting.append((question, tried, answer))
+            self._run()
+            self._changed.wait_for(lambda: bool(answer))
+        if isinstance(answer[0], BaseException):
+            raise RuntimeError("the batch of all tunings failed") from answer[0]
+        return answer[0]
+
+    def leave(self) -> None:
+        """Wait for a tuning less."""
+        with self._changed:
+            self.count -= 1
+            self._run()
+
+    def _run(self) -> None:
+        if not self._waiting or len(self._waiting) < self.count:
+            return
+        waiting, self._waiting = self._waiting, []
+        requests = [x for _, tried, _ in waiting for x in tried]
+        question, *_ = (question for question, _, _ in waiting)
+        try:
+            scores, timing = score_candidates(requests, question.setting, question.objective)
+            for _, tried, answer in waiting:
+                own, scores = scores[: len(tried)], scores[len(tried) :]
+                time = sum(float(np.sum(x.outcome.time)) for x in own)
+                share = time / max(timing.simulated, 1e-9)
+                answer.append((own, Timing(timing.compile * share, timing.run * share, time)))
+        except BaseException as error:
+            for _, _, answer in waiting:
+                answer.append(error)
+        self._changed.notify_all()
+
+
+class _Paced(Tuning):
+    """Tuning in lockstep with others."""
+
+    pool: ClassVar[Lockstep]
+
+    def _score(self, tried: list[Candidates], run: Run) -> tuple[list[CandidateScores], Timing]:
+        return self.pool.score(self, tried)
+
+    def _test(self, best: np.ndarray, run: Run) -> xr.Dataset:
+        return xr.Dataset()
+
+
+class _Grad(_Paced, TuneGrad):
+    @property
+    def _programs(self) -> dict[Callable[..., Any], Any]:
+        return self.pool.programs
+
+    def _call(self, *inputs: Any) -> Any:
+        with self.pool.device:
+            return super()._call(*inputs)
+
+
+class _ES(_Paced, TuneES):
+    pass
+
+
+METHODS: dict[str, tuple[type[Tuning], dict[str, Any]]] = {
+    "derivatives": (_Grad, {"steps": 16}),
+    "slopes": (_ES, {"estimator": "antithetic", "worlds": 128, "generations": 10}),
+    "evolution": (_ES, {"worlds": 32, "population": 16, "generations": 1000}),
 }
-QUICK_SIZES = (
-    " --objects random_cylinder --engine quasistatic --horizon 20 --validation 4 --worlds 4"
-)
-BUDGETS = ("wall", "simulated")
 
 
 @dataclass(frozen=True)
 class Race(Study[xr.Dataset], SimulationQuestion[xr.Dataset]):
-    """Race derivatives, slopes and evolution: equal wall time and equal simulated time.
+    """Race derivatives, slopes and evolution: equal simulated time and equal wall time.
 
-    The answer has the `success` (tuning, budget, world) of the tuned laws in test worlds, and that
-    of the law at the start, `start_success` (tuning, world). Budgets are `wall` or `simulated` with
-    an amount [s].
+    The answer has the `success` (count, seed, method, budget, world) of the tuned laws in test
+    worlds, and that of the law at the start, `start_success` (count, world). Budgets are `wall` or
+    `simulated` with an amount [s].
     """
 
     TITLE: ClassVar[str] = "Derivatives against evolution"
     CHOICES: ClassVar = {"methods": METHODS}
-    GROWS: ClassVar[tuple[str, ...]] = ("methods", "counts", "seeds")
+    GROWS: ClassVar[tuple[str, ...]] = ("counts",)
     QUICK: ClassVar[Mapping[str, Any]] = {
         "worlds": 4,
         "counts": (64,),
         "seeds": (1,),
         "methods": ("derivatives",),
+        "simulated": (100.0,),
+        "setting.engine": "quasistatic",
+        "setting.rules": Rules(horizon=20.0),
     }
-    IGNORED_FIELDS: ClassVar[tuple[str, ...]] = ("minutes", "lanes", "gpus")
-    DIMENSION: ClassVar[str] = "tuning"
+    DIMENSION: ClassVar[str] = "count"
     REPORTS_TIMES: ClassVar[bool] = True
 
     methods: tuple[str, ...] = tuple(METHODS)
     """derivatives (`rps tune grad`), slopes (antithetic steps in whole trials) or evolution."""
-    counts: tuple[int, ...] = (6, 13, 64, 2048)
-    """Numbers of tuned parameters: 6 and 13 of RPS, 18 of RPS+ in `real`, or the 64, 512 and
-    2,048 entries of tables."""
+    counts: tuple[int, ...] = tuple(COUNTS)
+    """Numbers of tuned parameters: 6 and 13 of RPS, or the 64, 512 and 2,048 entries of tables."""
     seeds: tuple[int, ...] = (1, 2, 3, 4, 5, 6, 7)
     """Seeds of the tunings."""
-    minutes: float = option(4.0, above=0, at_most=1e4, unit="min")
-    """Wall clock after which a tuning is killed [min], with compilation."""
-    wall: tuple[float, ...] = option((10.0, 30.0, 120.0), above=0, unit="s")
+    simulated: tuple[float, ...] = option((1e5, 3e5), above=0, unit="s")
+    """Budgets of simulated time [s]; a differentiated second counts as four. After the largest no
+    generation starts."""
+    wall: tuple[float, ...] = option((10.0, 30.0), above=0, unit="s")
     """Budgets of wall time without compilation [s]."""
-    simulated: tuple[float, ...] = option((6e4, 2e5, 6e5), above=0, unit="s")
-    """Budgets of simulated time [s]; a differentiated second counts as four."""
-    worlds: int = option(2000, 1, 1_000_000)
+    worlds: int = option(400, 1, 1_000_000)
     """Number of test worlds of `wide`."""
-    lanes: int = option(1, 1, 64)
-    """Number of tunings that run at once."""
-    gpus: int = option(0, 0, 8)
-    """Number of GPUs for the tunings; 0 leaves the choice to them."""
-    setting: Setting = field(default=Setting(), kw_only=True)
+    setting: Setting = field(default=Setting(rules=Rules(horizon=150.0)), kw_only=True)
     out: Path | str | None = field(default="runs/race", kw_only=True)
     """Run folder; the tunings have folders there."""
 
@@ -111,59 +178,66 @@ class Race(Study[xr.Dataset], SimulationQuestion[xr.Dataset]):
         for count in self.counts:
             errors.check_name("count", str(count), [str(x) for x in COUNTS])
 
-    def configuration(self) -> dict[str, Any]:
-        """Return all inputs of the answer, with the commands of the tunings."""
-        commands = {name: METHODS[name] for name in self.methods}
-        return super().configuration() | {"commands": commands}
-
-    def tunings(self) -> dict[tuple[str, int, int], str]:
-        """Return the commands of the tunings by method, count and seed."""
-        labels = itertools.product(self.methods, self.counts, self.seeds)
-        sizes = QUICK_SIZES if self.quick else ""
-        return {(m, n, s): f"{METHODS[m]} {COUNTS[n]} --seed {s}{sizes}" for m, n, s in labels}
-
-    def answer(self, run: Run) -> xr.Dataset:
-        """Run the tunings that lack a test, and test all."""
-        assert run.folder is not None
-        stored = () if run.checkpoints is None else run.checkpoints.paths()
-        commands = {
-            run.folder / part_name(*label): command
-            for label, command in self.tunings().items()
-            if part_name(*label) not in stored
-        }
-        run_commands(commands, self.minutes, self.lanes, self.gpus)
-        return super().answer(run)
-
     def parts(self, run: Run) -> Parts:
-        """Return the test of each tuning, by its label."""
-        folder = run.folder or Path(str(self.out))
+        """Return the function that runs and tests the tunings of each count."""
         return {
-            part_name(*label): partial(self._test, folder / part_name(*label), label)
-            for label in self.tunings()
+            n: partial(self._compete, run.folder or Path(str(self.out)), n) for n in self.counts
         }
 
-    def _test(self, folder: Path, label: tuple[str, int, int]) -> xr.Dataset:
-        """Return the success of the best law of a tuning within each budget."""
-        if not (folder / "curve.csv").exists():
-            reason = f"{folder.with_suffix('.log')} tells why; or raise minutes"
-            raise InputError(f"{folder} has no generation: {reason}.")
-        curve = pd.read_csv(folder / "curve.csv")
+    def tuning(self, seed: int, count: int, method: str) -> Tuning:
+        """Return a tuning of the race."""
+        kind, options = METHODS[method]
+        diagonal = {"estimator": "sep_cma"} if method == "evolution" and count >= _LARGE else {}
+        sizes = _QUICK if self.quick else {}
+        limits = {"validation": 64, "budget": max(self.simulated)}
+        setting = replace(self.setting, seed=seed)
+        return kind(**{**COUNTS[count], **limits, **options, **diagonal, **sizes}, setting=setting)
+
+    def _compete(self, folder: Path, count: int) -> xr.Dataset:
+        """Run the tunings of a count, and test their best laws within each budget."""
+        labels = list(itertools.product(self.seeds, (count,), self.methods))
+        folders = [folder / part_name(*label) for label in labels]
+        pool = Lockstep(len(labels))
+
+        def run(question: Tuning, at: Path) -> pd.DataFrame:
+            try:
+                question.answer(Run(at, no_progress))
+                return pd.read_csv(at / "curve.csv")
+            finally:
+                pool.leave()
+
+        questions = [self.tuning(*label) for label in labels]
+        for question, at in zip(questions, folders, strict=True):
+            object.__setattr__(question, "pool", pool)
+            at.mkdir(exist_ok=True)
+        with ThreadPoolExecutor(len(labels)) as threads:
+            curves = list(threads.map(run, questions, folders))
         budgets = [(name, amount) for name in BUDGETS for amount in getattr(self, name)]
-        chosen = [best_within(curve, *budget) for budget in budgets]
-        start, domain = problem(label[1])
-        laws = [start, *(law_of(row, start) for row in chosen)]
+        start, domain = problem(count)
+        best = [best_within(x, *y) for x in curves for y in budgets]
+        columns = [x for x in best[0].index if x.startswith("params.")]
+        values = np.array([row[columns] for row in best], float)
+        _, firsts, inverse = np.unique(values, axis=0, return_index=True, return_inverse=True)
+        chosen = [law_of(best[at], start) for at in firsts]
         options = {"split": "test", "setting": self.setting, "progress": False}
-        scores = evaluate(laws, domain, self.worlds, **options)
+        scores = evaluate([start, *chosen], domain, self.worlds, **options)
         start_success, *tuned = scores.success.values.astype(np.int8)
-        columns = {"method": label[0], "count": label[1], "seed": label[2]}
-        variables = {name: ((), value) for name, value in columns.items()}
-        totals = {"generations": len(curve), "wall": spent(curve, "wall").iloc[-1]}
-        totals |= {"simulated": spent(curve, "simulated").iloc[-1]}
-        variables |= {name: ((), float(value)) for name, value in totals.items()}
-        variables |= {"start_success": ("world", start_success)}
+        dims, shape = ("seed", "method"), (len(self.seeds), len(self.methods))
+        by_tuning = {
+            "generations": [len(curve) for curve in curves],
+            "windows": [curve.get("windows", pd.Series([0.0])).sum() for curve in curves],
+            **{name: [float(spent(x, name).iloc[-1]) for x in curves] for name in BUDGETS},
+        }
+        variables = {name: (dims, np.reshape(x, shape)) for name, x in by_tuning.items()}
+        success = np.array(tuned)[inverse.ravel()].reshape(*shape, len(budgets), -1)
+        names = [f"{name} {amount:g} s" for name, amount in budgets]
         return xr.Dataset(
-            variables | {"success": (("budget", "world"), np.stack(tuned))},
-            {"budget": [f"{name} {amount:g} s" for name, amount in budgets]},
+            variables
+            | {
+                "start_success": ("world", start_success),
+                "success": ((*dims, "budget", "world"), success),
+            },
+            {"seed": list(self.seeds), "method": list(self.methods), "budget": names},
         )
 
     def intro(self, results: xr.Dataset) -> str:
@@ -175,56 +249,44 @@ class Race(Study[xr.Dataset], SimulationQuestion[xr.Dataset]):
 
     def report_tables(self, results: xr.Dataset) -> Sequence[Table]:
         """Return the success of the tunings."""
-        return [Table(table(results), merge="parameters", name="gradients_race", title="Success")]
+        picture = Picture("race", partial(draw, results))
+        columns = [
+            {"name": "parameters", "merge": True},
+            {"name": "equal", "merge": True},
+            {"name": "method"},
+            {"name": "success", "format": "{:.1%}", "rest": "{:.1%}"},
+            {"name": "derivatives ahead by", "format": "{:+.1%}", "rest": "{:+.1%}"},
+            {"name": "by seed"},
+            {"name": "gained, lost"},
+            {"name": "generations"},
+        ]
+        text = "Square brackets: 95 % intervals over the seeds, by Student's t."
+        named = {"name": "gradients_race", "title": "Success", "picture": picture}
+        return [Table(table(results), text, columns, **named)]
 
 
 race = call_of(Race)
 
 
-def run_commands(commands: Mapping[Path, str], minutes: float, lanes: int, gpus: int) -> None:
-    """Run or continue the command of each folder until it ends or its time is up.
-
-    So many `lanes` run at once. They take turns at the GPUs; with 0 GPUs they choose themselves.
-    Each writes to the folder and to a log beside it.
-    """
-
-    def run(index: int, folder: Path) -> None:
-        environment = dict(os.environ, XLA_PYTHON_CLIENT_PREALLOCATE="false")
-        if gpus:
-            environment["CUDA_VISIBLE_DEVICES"] = str(index % gpus)
-        words = shlex.split(commands[folder])[1:]
-        program = [sys.executable, "-m", "rps_jax", *words, "--out", str(folder)]
-        with open(folder.with_suffix(".log"), "a", encoding="utf-8") as log:
-            process = subprocess.Popen(program, env=environment, stdout=log, stderr=log)
-            try:
-                process.wait(60 * minutes)
-            except subprocess.TimeoutExpired:
-                process.kill()
-                process.wait()
-
-    with ThreadPoolExecutor(lanes) as pool:
-        for future in [pool.submit(run, *item) for item in enumerate(commands)]:
-            future.result()
-
-
 def spent(curve: pd.DataFrame, budget: str) -> pd.Series:
-    """Return what each generation of a log has used of a budget, with all before it [s]."""
-    return pd.Series(curve["run" if budget == "wall" else "simulated"]).cumsum()
+    """Return what the vector of each generation of a log has cost: all generations before it [s].
+
+    Its own trials are for the next vector, except for its validation.
+    """
+    return pd.Series(curve["run" if budget == "wall" else "simulated"]).cumsum().shift(fill_value=0)
 
 
 def best_within(curve: pd.DataFrame, budget: str, amount: float) -> pd.Series:
-    """Return the generation with the best validation within a budget; at least the first."""
-    within = curve[(spent(curve, budget) <= amount) | (curve.index == 0)]
+    """Return the generation with the best validation within a budget."""
+    within = curve[spent(curve, budget) <= amount]
     return within.loc[within.validation.idxmin()]
 
 
 def problem(count: int) -> tuple[Any, str]:
     """Return the law at the start and the domain of the test worlds of a problem."""
-    words = shlex.split(COUNTS[count])
-    values = dict(itertools.pairwise(words))
-    _, start = registry.parse_law(values.get("--law", "rps"))
-    objects = f",objects={values['--objects']}" if "--objects" in values else ""
-    return start, f"{values.get('--domain', 'wide')}{objects}"
+    _, start = registry.parse_law(COUNTS[count].get("law", "rps"))
+    objects = COUNTS[count].get("objects", ())
+    return start, ",".join(["wide", *(f"objects={name}" for name in objects)])
 
 
 def law_of(row: pd.Series, start: Any = RPSParams.paper()) -> Any:
@@ -241,25 +303,54 @@ def law_of(row: pd.Series, start: Any = RPSParams.paper()) -> Any:
     return registry.replace_leaves(start, single)
 
 
-def table(results: xr.Dataset) -> Rows:
-    """Return a header and a row per number of parameters, budget and method."""
-    head = ["parameters", "equal", "method", "success, mean", "by seed [%]", "gained, lost"]
-    rows = [[*head, "generations"]]
-    for count in sorted(set(results["count"].values.tolist())):
-        of_count = results.isel(tuning=np.flatnonzero(results["count"] == count))
-        start = of_count.start_success.isel(tuning=0)
-        rows.append([str(count), "", "start", f"{100 * float(start.mean()):.1f} %", "", "", ""])
-        for budget, method in itertools.product(results.budget.values, METHODS):
-            chosen = of_count.isel(tuning=np.flatnonzero(of_count.method == method))
-            if not chosen.sizes["tuning"]:
-                continue
-            success = chosen.success.sel(budget=budget)
-            rates = 100 * success.mean("world").values
-            compared = [statistics.compare(start, x) for x in success]
-            gained, lost = (sum(getattr(c, name) for c in compared) for name in ("gained", "lost"))
-            seeds = ", ".join(f"{x:.1f}" for x in rates)
-            generations = f"{chosen.generations.values.mean():.0f}"
-            label, mean = str(budget).replace(" ", " time, "), f"{rates.mean():.1f} %"
-            counts = f"+{gained} -{lost}"
-            rows.append([str(count), label, method, mean, seeds, counts, generations])
+def interval(values: np.ndarray) -> list[float]:
+    """Return the mean of independent values (n,) and the limits of its 95 % interval."""
+    mean, count = float(values.mean()), values.size
+    if count < 2:
+        return [mean]
+    half = values.std(ddof=1) / np.sqrt(count) * float(scipy.special.stdtrit(count - 1, 0.975))
+    return [mean, mean - half, mean + half]
+
+
+def table(results: xr.Dataset) -> list[list[Any]]:
+    """Return a row per number of parameters, budget and method."""
+    rows: list[list[Any]] = []
+    for count, budget in itertools.product(results["count"].values, results.budget.values):
+        of_count = results.sel(count=count)
+        start = of_count.start_success
+        if budget == results.budget.values[0]:
+            rows.append([str(count), "", "start", float(start.mean()), None, "", "", ""])
+        means = of_count.success.sel(budget=budget).mean("world")
+        for method in map(str, results.method.values):
+            chosen = of_count.sel({"method": method})  # `method` is an argument of `sel`
+            values, ahead = means.sel({"method": method}).values, None
+            if method != FIRST and FIRST in means.method:
+                ahead = interval(means.sel({"method": FIRST}).values - values)
+            compared = [statistics.compare(start, x) for x in chosen.success.sel(budget=budget)]
+            gained, lost = (sum(getattr(c, x) for c in compared) for x in ("gained", "lost"))
+            seeds = ", ".join(f"{100 * x:.1f}" for x in values)
+            counts = f"+{gained} -{lost}", f"{float(chosen.generations.mean()):.0f}"
+            name, amount, unit = str(budget).split()
+            label = f"{name} time, {float(amount):,g} {unit}"
+            rows.append([str(count), label, method, interval(values), ahead, seeds, *counts])
     return rows
+
+
+def draw(results: xr.Dataset) -> Figure:
+    """Return the success against the number of parameters, with a panel for each budget."""
+    sheet, axes = tiles(
+        results.sizes["budget"], 2, (3.5, 2.2), (0.0, 0.0), sharex=True, sharey=True
+    )
+    counts, means = results["count"].values, results.success.mean("world")
+    for ax, budget in zip(axes.ravel(), results.budget.values, strict=False):
+        ax.plot(counts, results.start_success.mean("world"), "k:", label="start")
+        for at, method in enumerate(results.method.values):
+            values = means.sel({"budget": budget, "method": method})
+            mean, *limits = np.transpose([interval(x) for x in values.values])
+            error = np.abs(np.array(limits) - mean) if limits else None
+            marks = {"marker": "o", "markersize": 3, "capsize": 2}
+            ax.errorbar(counts * 1.08**at, mean, error, label=method, **marks)
+        ax.set(xscale="log", xlabel="tuned parameters", ylabel="success", title=f"equal {budget}")
+        ax.grid(alpha=0.3)
+    axes[0, 0].legend()
+    return sheet

@@ -6,23 +6,21 @@ import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import xarray as xr
 
 from rps_jax.physics import Physics, preset
-from rps_jax.record.checkpoint import Checkpoints
-from rps_jax.trials.progress import Progress, ProgressCallback, SequentialProgress, no_progress
+from rps_jax.questions import Run
+from rps_jax.trials.progress import Progress, ProgressCallback, SequentialProgress
 from rps_jax.world.physics import MUJOCO_GROUND
 from sweeps.ground import pushes
 from sweeps.ground.pushes import DISTANCE, OFFSETS, SPEEDS, STEPS, Pushes
-from sweeps.study_base import Rows, load_or_compute, records, text_table
+from sweeps.study_base import Rows, part_of, records, text_table
 
 HEIGHTS = (0.06, 0.13, 0.2, 0.27, 0.34)  # [m] from the lower edge of the base to its upper one
 OBJECTS = ("box", "box_60", "cylinder")
-LIMIT = "limit"  # name of the part that holds the rigid limit
 _DIMS = ("object", "offset", "speed")
 _LIMIT_FIELDS = ("lateral", "force")  # results of the rigid limit beside measured ones
 
@@ -101,34 +99,27 @@ DRAWN = ("ours", "standard", "fast", "lower", "mujocos", "mujocos_10ms", "stiff"
 
 def run(
     names: Sequence[str],
-    folder: Path | None,
+    run: Run,
     *,
     objects: Sequence[str] = OBJECTS,
     offsets: Sequence[float] = OFFSETS,
     steps: int = STEPS,
-    callback: ProgressCallback = no_progress,
 ) -> xr.Dataset:
-    """Pushes (ground, object, offset, speed) and the rigid limit's, run or found in `folder`.
-
-    Without a folder all is kept in memory.
+    """Push on the grounds that the run folder lacks, and return all pushes and the rigid limit.
 
     `limit_lateral` (object, offset, at_height) [m] is where a rigid object ends that is pushed at a
     height. `error` (ground, object, offset, speed) [m] says how far from there an object ended that
     was pushed as high.
-
-    Raises:
-      InputError: the folder holds a ground of the same name that was run otherwise.
     """
-    parts = None if folder is None else Checkpoints(folder)
-    progress, datasets = SequentialProgress(callback), []
-    options = f"{tuple(objects)} {tuple(offsets)}"
-    compute = partial(_limit, objects, offsets, steps)
-    limit = load_or_compute(parts, LIMIT, f"{options} {HEIGHTS} {steps}", compute)
+    progress, datasets = SequentialProgress(run.callback), []
+    options = tuple(objects), tuple(offsets)
+    part = part_of("limit", *options, HEIGHTS, steps)
+    limit = run.checkpoint(part, partial(_limit, *options, steps))
     for name in names:
-        cases = list(itertools.product(objects, offsets, GROUNDS[name].speeds))
-        run_as = f"{options} {replace(GROUNDS[name], what='')!r}"
+        cases = list(itertools.product(*options, GROUNDS[name].speeds))
+        part = part_of(name, *options, replace(GROUNDS[name], what=""))
         compute = partial(_pushes, GROUNDS[name].physics, cases, progress)
-        datasets.append(load_or_compute(parts, name, run_as, compute))
+        datasets.append(run.checkpoint(part, compute))
         progress.finish(len(cases))
         progress(Progress(0, 0.0))
     whole = xr.concat(datasets, xr.IndexVariable("ground", list(names)), join="outer")

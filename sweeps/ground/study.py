@@ -47,7 +47,7 @@ class Ground(QuickStudy[xr.Dataset]):
 
     def answer(self, run: Run) -> xr.Dataset:
         """Push on the grounds that are missing."""
-        return grounds.run(self.grounds, run.folder, callback=run.callback)
+        return grounds.run(self.grounds, run)
 
     def intro(self, results: xr.Dataset) -> str:
         """Describe the pushes."""

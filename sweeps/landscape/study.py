@@ -25,9 +25,8 @@ from rps_jax.trials.batch_run import Candidates, outcomes
 from rps_jax.trials.progress import SequentialProgress
 from rps_jax.trials.setting import seed_of
 from rps_jax.trials.trial import Outcome
-from rps_jax.tuning.run import parse_domains
 from rps_jax.tuning.space import SUBSETS
-from rps_jax.worlds import DomainLike
+from rps_jax.worlds import DomainLike, parse_domain
 from sweeps.landscape.candidates import aims, cloud, front_table, lines, undominated
 
 
@@ -57,7 +56,7 @@ class Landscape(MultiLawQuestion[xr.DataTree]):
     @cached_property
     def domains(self) -> tuple[Domain, ...]:
         """Domains of all candidates."""
-        return parse_domains(self.domain)
+        return tuple(map(parse_domain, self.domain))
 
     def check(self) -> None:
         """Check that the laws are RPS with parameters."""
@@ -163,7 +162,7 @@ def parameters_figure(results: xr.Dataset, log: Collection[str]) -> Figure:
 
     Intervals are Wilson's, of 95 %.
     """
-    names = list(map(str, results.parameter.values))
+    names = results.parameter.values.tolist()
     figure, axes = tiles(len(names), 4, (3, 2.5), (0, 0), sharey=True)
     worlds = int(results.attrs["worlds"])
     for ax, name in zip(axes.ravel(), names, strict=False):

@@ -24,7 +24,6 @@ from rps_jax.analysis.figures.style import Figure, success_rates, tiles
 from rps_jax.geometry.solid import GRAVITY
 from rps_jax.laws import LawParams
 from rps_jax.questions import MultiLawQuestion, Picture, Plan, Run, Section, call_of, option
-from rps_jax.runs.sweep import Sweep
 from rps_jax.trials import pushes
 from rps_jax.worlds import Case, DomainLike, parse_domain
 from sweeps.study_base import PlanStudy, Rows, run_plans
@@ -125,8 +124,7 @@ class Limits(PlanStudy[xr.DataTree], MultiLawQuestion[xr.DataTree]):
 
     def _plan(self, ranges: Domain, robot: Robot | None = None) -> Plan:
         """Return the sweep of a robot."""
-        sweep = Sweep(self.chosen, ranges, self.worlds, robot=robot, setting=self.setting)
-        return sweep.plan
+        return Plan(parse_domain(ranges, robot), self.worlds, self.chosen, self.setting)
 
     @cached_property
     def plans(self) -> dict[str, Plan]:
@@ -244,8 +242,7 @@ def successes(results: Mapping[str, xr.Dataset]) -> Rows:
     for name in (name for name in results if LIMITS[name].robots):
         for value in np.unique(results[name].value.values):
             success = results[name].success.values[:, results[name].value.values == value] > 0
-            rates = [tables.share(int(succeeded.sum()), succeeded.size) for succeeded in success]
-            rows.append([LIMITS[name].label, f"{value:.3g}", *rates])
+            rows.append([LIMITS[name].label, f"{value:.3g}", *map(tables.rate, success)])
     return rows
 
 
@@ -294,7 +291,7 @@ def figure_of(results: Mapping[str, xr.Dataset]) -> Figure:
 
 def turning_figure(results: xr.Dataset) -> Figure:
     """Draw the turning rate that a law asks for, and what each robot makes of it, over time."""
-    names = list(map(str, results.robot.values))
+    names = results.robot.values.tolist()
     figure, axes = tiles(len(names), 1, (8, 1.7), (0, 0), sharex=True, sharey=True)
     for ax, name in zip(axes[:, 0], names, strict=True):
         rates, label = results.sel(robot=name), "asked by the law"

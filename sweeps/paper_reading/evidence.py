@@ -46,7 +46,7 @@ def closest(results: xr.Dataset) -> int:
 
 
 def _names(results: xr.Dataset) -> list[str]:
-    return list(map(str, results.number.values))
+    return results.number.values.tolist()
 
 
 def _cells(results: xr.Dataset) -> list[str]:

@@ -16,7 +16,6 @@ from rps_jax import Domain, Range, RPSParams, Setting
 from rps_jax.laws import LawParams
 from rps_jax.physics import FRICTION, PHYSICS
 from rps_jax.questions import Run
-from rps_jax.robot.skin import LINE, POINT
 from rps_jax.trials import pushes
 from rps_jax.trials.batch_run import Candidates, outcomes
 from rps_jax.trials.jobs import WorldBatch
@@ -32,6 +31,7 @@ from sweeps.paper_reading.unknowns import NAMES, UNKNOWNS, aps_params, params, t
 
 Target = tuple[float, float]
 FIG_6: Target = (-2.0, 0.0)  # box, S1
+_POINT, _LINE = 1, 2  # types of contact
 _BY_OBJECT = {"friction_ground": "ground", "friction_robot": "robot"}  # in the name of an unknown
 _SIMULATED = {"yaw": "yaw", "gap": "sim_gap"}  # quantity of the domain: unknown
 _CORNER = (0.15, 0.25)  # [m] |l| of "0.2 m from the center"
@@ -265,13 +265,13 @@ def observations(trace: xr.Dataset) -> dict[str, float]:
     starts = np.flatnonzero(np.diff(realigning.astype(int), prepend=0) == 1)
     before = slice(first, starts[0] if starts.size else None)
     low, high = _CORNER
-    corner = bool(touched.any() and kind[first] == POINT and low <= -l[first] <= high)
+    corner = bool(touched.any() and kind[first] == _POINT and low <= -l[first] <= high)
     rate = abs(trace.a_r.values[first]) >= _HIGHEST * RPSParams().eta
     return {
         "Fig. 6: success": float(trace.outcome_success),
         "Fig. 6: the right corner touches first": float(corner),
         "Fig. 6: a_r starts near its highest": float(touched.any() and rate),
-        "Fig. 6: line contact before Realignment": float((kind[before] == LINE).any()),
+        "Fig. 6: line contact before Realignment": float((kind[before] == _LINE).any()),
         "Fig. 6: one Realignment State": float(starts.size == 1),
     }
 

@@ -11,8 +11,8 @@ their errors, and the number of rollouts of each push. A reverse pass counts as 
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Callable, Iterator
+from functools import partial, wraps
 from typing import Any, NamedTuple
 
 import jax
@@ -43,6 +43,15 @@ def twists_of(theta: jax.Array) -> jax.Array:
     return jnp.tanh(theta) * LIMITS
 
 
+class Start(NamedTuple):
+    """Pushes (n,) to plan, from a knot on."""
+
+    fields: Any  # (n, ...) of the stage
+    motion: Motion  # (n, ...)
+    target: jax.Array  # (n, 3) [m, m, rad] pose of the object
+    first: jax.Array  # (n,) index of the knot
+
+
 class Simulator:
     """Compiled rollouts of a stage, for plans whose twists are held for `hold` control steps."""
 
@@ -60,52 +69,39 @@ class Simulator:
 
             return jax.lax.fori_loop(0, hold, step, motion)
 
-        def final(fields: Any, motion: Motion, theta: jax.Array, first: jax.Array) -> Any:
-            """Return the final pose of the object (..., 3) from the knot `first` (...) on."""
+        def errors(start: Start, theta: jax.Array) -> Any:
+            """Return the errors (..., 3) of the final pose of the object."""
 
             def step(motion: Motion, inputs: Any) -> tuple[Motion, None]:
                 index, entries = inputs
-                moved, active = knot(fields, motion, entries), index >= first
+                moved, active = knot(start.fields, motion, entries), index >= start.first
                 keep = jax.tree.map(lambda a, b: jnp.where(active[..., None], a, b), moved, motion)
                 return keep, None
 
             inputs = jnp.arange(KNOTS), jnp.moveaxis(theta, -2, 0)
-            motion, _ = jax.lax.scan(step, motion, inputs)
+            motion, _ = jax.lax.scan(step, start.motion, inputs)
             of_one = object_pose if motion.qpos.ndim == 1 else jax.vmap(object_pose)
             position, yaw = of_one(motion.qpos)
-            return jnp.concatenate([position, yaw[..., None]], axis=-1)
-
-        def errors(
-            fields: Any, motion: Motion, target: jax.Array, first: jax.Array, theta: jax.Array
-        ) -> Any:
-            return errors_of(final(fields, motion, theta, first), target)
+            return errors_of(jnp.concatenate([position, yaw[..., None]], axis=-1), start.target)
 
         @jax.jit
-        def samples(
-            fields: Any, motion: Motion, target: jax.Array, first: jax.Array, thetas: jax.Array
-        ) -> Any:
+        def samples(start: Start, thetas: jax.Array) -> Any:
             """Return errors (n, K, 3) of several plans (n, K, KNOTS, 3) of each push."""
             n, k = thetas.shape[:2]
-            inputs = jax.tree.map(
-                lambda x: jnp.repeat(x, k, axis=0), (fields, motion, target, first)
-            )
-            return batched(errors)(*inputs, thetas.reshape(n * k, KNOTS, 3)).reshape(n, k, 3)
+            starts = jax.tree.map(lambda x: jnp.repeat(x, k, axis=0), start)
+            return batched(errors)(starts, thetas.reshape(n * k, KNOTS, 3)).reshape(n, k, 3)
 
         @jax.jit
-        def jacobian(
-            fields: Any, motion: Motion, target: jax.Array, first: jax.Array, theta: jax.Array
-        ) -> Any:
+        def jacobian(start: Start, theta: jax.Array) -> Any:
             """Return errors (n, 3) and derivatives (n, 3, KNOTS * 3) of three reverse passes."""
-            e, pull = jax.vjp(lambda t: errors(fields, motion, target, first, t), theta)
+            e, pull = jax.vjp(partial(errors, start), theta)
             rows = jax.vmap(lambda row: pull(jnp.broadcast_to(row, e.shape))[0])(jnp.eye(3))
             return e, jnp.moveaxis(rows, 0, 1).reshape(len(e), 3, -1)
 
         @jax.jit
-        def gradient(
-            fields: Any, motion: Motion, target: jax.Array, first: jax.Array, theta: jax.Array
-        ) -> Any:
+        def gradient(start: Start, theta: jax.Array) -> Any:
             """Return errors (n, 3) and the gradient (n, KNOTS, 3) of half the sum of squares."""
-            e, pull = jax.vjp(lambda t: errors(fields, motion, target, first, t), theta)
+            e, pull = jax.vjp(partial(errors, start), theta)
             return e, pull(e)[0]
 
         self.samples, self.jacobian, self.gradient = samples, jacobian, gradient
@@ -134,8 +130,8 @@ class Problem(NamedTuple):
 
     def _evaluate(self, function: Callable[..., Any], theta: np.ndarray) -> Any:
         first = jnp.full(len(theta), self.first)
-        inputs = self.fields, self.start, self.target, first
-        return jax.device_get(function(*inputs, jnp.asarray(theta, float)))
+        start = Start(self.fields, self.start, self.target, first)
+        return jax.device_get(function(start, jnp.asarray(theta, float)))
 
     def samples(self, thetas: np.ndarray) -> np.ndarray:
         """Return errors (n, K, 3) of plans (n, K, KNOTS, 3)."""
@@ -171,7 +167,7 @@ def _cost(errors: np.ndarray) -> np.ndarray:
 def _best(method: Method) -> Method:
     """Return the method that yields the best plans so far instead of the last ones."""
 
-    @functools.wraps(method)
+    @wraps(method)
     def run(problem: Problem, theta: np.ndarray) -> Iterator[Plans]:
         errors = np.full((len(theta), 3), np.inf)
         for last, last_errors, count in method(problem, theta):

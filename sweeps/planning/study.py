@@ -30,7 +30,7 @@ from rps_jax.trials.worlds import drawn_worlds
 from rps_jax.world import draws
 from rps_jax.worlds import parse_domain
 from sweeps.planning import plans
-from sweeps.planning.plans import KNOTS, METHODS, Method, Problem, Simulator
+from sweeps.planning.plans import KNOTS, METHODS, Method, Problem, Simulator, Start
 from sweeps.study_base import RANDOM_OBJECTS, QuickStudy, Rows, Table
 
 TOUCHING = replace(parse_domain("wide"), gap=Range(0, 0))
@@ -173,7 +173,9 @@ def reached(simulator: Simulator, fields: Any, start: Motion, seed: int) -> jax.
     theta = np.arctanh(np.clip(np.stack(entries, axis=-1), -0.95, 0.95))
     first = jnp.zeros(len(theta), int)
     zero = jnp.zeros((len(theta), 3))
-    errors = simulator.samples(fields, start, zero, first, jnp.asarray(theta, float)[:, None])
+    errors = simulator.samples(
+        Start(fields, start, zero, first), jnp.asarray(theta, float)[:, None]
+    )
     return errors[:, 0] * plans.TOLERANCE
 
 

@@ -333,28 +333,9 @@ RECIPES: dict[str, Recipe] = {
     ),
     "plans": recipe(f"rps sweeps/planning {_MACHINE}", cores=15),
     "replans": recipe(f"rps sweeps/planning {_MACHINE}", cores=15),
-    "gradients_cosine": recipe(f"rps sweeps/gradients {_MACHINE}", cores=200, gpu=8),
-    "gradients_norm": recipe(f"rps sweeps/gradients {_MACHINE}", cores=200, gpu=8),
-    "gradients_check": recipe(
-        f"rps sweeps/gradients/check.py --worlds 16 --horizons 0.5 2 8 {_MACHINE}", cores=6
-    ),
     "gradients_mjx": recipe(f"rps sweeps/gradients/mjx.py {_MACHINE}", cores=6),
-    "gradients_growth": recipe(f"rps sweeps/gradients/growth.py --worlds 48 {_MACHINE}", cores=10),
-    "gradients_bursts": recipe(f"rps sweeps/gradients/growth.py --worlds 48 {_MACHINE}", cores=10),
-    "gradients_score": recipe(
-        "rps sweeps/gradients/score.py --tuned K_h K_v L beta l_cr d_th --worlds 256 "
-        f"--truth 1024 --delta 0.3 --windows 2 8 30 --taxels 0.03 --fidelity fast {_MACHINE}",
-        cores=12,
-    ),
-    "gradients_race": recipe(
-        "rps sweeps/gradients/race.py --lanes 12 --gpus 1 --minutes 4.75 --wall 210 "
-        f"--simulated 2.4e6 {_MACHINE}",
-        gpu=8,
-    ),
-    "gradients_network": recipe(
-        f"rps sweeps/gradients/network.py --lanes 6 --gpus 3 --minutes 5.5 {_MACHINE}",
-        gpu=20,
-    ),
+    "gradients_direction": recipe(f"rps sweeps/gradients/direction.py {_MACHINE}", cores=30),
+    "gradients_race": recipe(f"rps sweeps/gradients/race.py {_MACHINE}", cores=160),
     "robot": recipe(f"rps sweeps/speed/robot.py {_MACHINE}", cores=1),
     "dependencies": recipe(f"rps sweeps/publish/dependencies.py {_MACHINE}", cores=15),
     "extras": recipe(f"rps sweeps/publish/dependencies.py {_MACHINE}", cores=15),
@@ -428,6 +409,10 @@ RECIPES: dict[str, Recipe] = {
     # After the installation of the third-party engines: see `speed/arena.py`.
     "arena": recipe(f"rps sweeps/speed/arena.py --peers peers {_MACHINE}", gpu=5),
     "derivatives": recipe(f"rps sweeps/speed/derivatives.py {_MACHINE}", cores=2),
+    "environments": recipe(f"rps sweeps/speed/environments.py --worlds 64 {_MACHINE}", cores=3),
+    "environments_gpu": recipe(
+        f"rps sweeps/speed/environments.py --worlds 4096 --file environments_gpu {_MACHINE}", gpu=2
+    ),
     "derivatives_gpu": recipe(
         f"rps sweeps/speed/derivatives.py --worlds 4096 --file derivatives_gpu {_MACHINE}", gpu=2
     ),
@@ -448,5 +433,5 @@ RECIPES: dict[str, Recipe] = {
 # Files of old versions, which are not computed again.
 HISTORY = {
     "tuning_runs": "the runs of 0.1.0 and 0.2.0 that tuned the law",
-    "learned": "the runs of 0.2.0 that trained the laws; `rps sweeps/learned` reads such runs",
+    "learned": "the runs of 0.2.0 that trained the laws",
 }

@@ -93,11 +93,11 @@ def plus_beside_tuned(results: xr.Dataset) -> Rows:
 
 def learned_beside_plus(results: xr.Dataset) -> Rows:
     """Return a header and the rows of all laws of a sweep, world by world against RPS+."""
-    return _beside(results, list(map(str, results.law.values)), "rps_plus")
+    return _beside(results, results.law.values.tolist(), "rps_plus")
 
 
 def _beside(results: xr.Dataset, laws: Sequence[str], base: str) -> Rows:
-    names = list(map(str, results.law.values))
+    names = results.law.values.tolist()
     rows = (_outcome_row(results, names.index(law), names.index(base)) for law in laws)
     return [list(_HEADER), *rows]
 
@@ -133,9 +133,9 @@ def _outcome_row(results: xr.Dataset, law: int, base: int) -> list[str]:
     difference = [compared.changes, f"{compared.p:.2g}"]
     return [
         _run_or_law(str(outcomes.law.item())),
-        tables.share(int(succeeded.sum()), succeeded.size),
+        tables.rate(succeeded),
         ", ".join(tables.percent(succeeded[mask].sum(), mask.sum()) for mask in masks),
-        f"{np.median(time[succeeded]):.1f} s" if succeeded.any() else "-",
+        tables.median(time[succeeded]),
         ", ".join(map(str, counts)),
         *(difference if law != base else ["", ""]),
     ]
@@ -161,7 +161,7 @@ def default_beside_tuned(results: object) -> Rows:
     comparisons = [statistics.compare(*pair) for pair in pairs]
     adjusted = statistics.holm([compared.p for compared in comparisons])
     for law, pair, compared, p in zip(laws, pairs, comparisons, adjusted, strict=True):
-        rates = [tables.share(int(s.sum()), s.size) for s in pair]
+        rates = (tables.rate(success.values) for success in pair)
         rows.append([law, *rates, compared.changes, f"{p:.2g}"])
     return rows
 
@@ -208,8 +208,7 @@ def by_robot(results: xr.Dataset) -> Rows:
 
     def add_row(label: str, mask: np.ndarray) -> None:
         succeeded = results.success.values[:, mask] > 0
-        rates = [tables.share(int(of_law.sum()), of_law.size) for of_law in succeeded]
-        rows.append([label, f"{mask.sum():,}", *rates])
+        rows.append([label, f"{mask.sum():,}", *map(tables.rate, succeeded)])
 
     for low, high in itertools.pairwise((0.5, 0.8, 1, 1.25, 1.5, 2, 3, 5, 10)):
         add_row(f"{low:g} to {high:g}", (margin >= low) & (margin < high))

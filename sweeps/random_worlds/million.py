@@ -21,7 +21,7 @@ import xarray as xr
 
 from rps_jax import Setting
 from rps_jax.analysis import statistics, tables
-from rps_jax.control import registry
+from rps_jax.laws import resolve_law
 from rps_jax.questions import Plan, Run, call_of, option
 from rps_jax.record import files
 from rps_jax.worlds import DomainLike, parse_domain
@@ -58,7 +58,7 @@ class Million(TrialStudy[xr.Dataset]):
 
     def check(self) -> None:
         """Check that the laws and the domain exist."""
-        registry.resolve_laws(self.laws)
+        _ = dict(map(resolve_law, self.laws))
         parse_domain(self.domain)
 
     def num_trials(self) -> int | None:
@@ -98,7 +98,7 @@ class Million(TrialStudy[xr.Dataset]):
 
     def _outcomes(self, law: str, run: Run) -> xr.Dataset:
         """Return the outcomes of one law in compact types."""
-        laws = registry.resolve_laws([law])
+        laws = dict([resolve_law(law)])
         plan = Plan(parse_domain(self.domain), self.worlds, laws, self.test_setting, 16_384)
         (outcomes,) = run_plans(run, {f"sweep_{law}": plan}).values()
         outcomes = outcomes.isel(law=0)
@@ -133,8 +133,7 @@ def table(results: xr.Dataset) -> Rows:
     for law in map(str, results.law.values):
         how = results.how.sel(law=law).values
         counts = np.bincount(how, minlength=len(ENDS))
-        steps, period = results.steps.sel(law=law).values[how == 0], results.attrs["control_period"]
-        median = f"{np.median(steps) * period:.1f} s" if steps.size else "-"
-        share = tables.share(int(counts[0]), how.size)
-        rows.append([law, share, *(f"{int(n):,}" for n in counts[1:]), median])
+        steps = results.steps.sel(law=law).values[how == 0]
+        median = tables.median(steps * results.attrs["control_period"])
+        rows.append([law, tables.rate(how == 0), *(f"{int(n):,}" for n in counts[1:]), median])
     return rows

@@ -20,7 +20,7 @@ import xarray as xr
 
 from rps_jax import Setting
 from rps_jax.analysis import statistics, tables
-from rps_jax.control import registry
+from rps_jax.laws import resolve_law
 from rps_jax.questions import Plan, Run, call_of, option
 from rps_jax.runs import execution, model_panel
 from rps_jax.worlds import parse_domain
@@ -69,7 +69,7 @@ class RandomWorlds(TrialStudy[xr.Dataset]):
 
     def check(self) -> None:
         """Check that the laws and the domains exist."""
-        registry.resolve_laws(self.laws)
+        _ = dict(map(resolve_law, self.laws))
         for name in self.domains:
             parse_domain(name)
 
@@ -88,7 +88,7 @@ class RandomWorlds(TrialStudy[xr.Dataset]):
 
     def plans(self, name: str) -> dict[str, Plan]:
         """Return the plan of each model in a domain, the default model first."""
-        laws = registry.resolve_laws(self.laws)
+        laws = dict(map(resolve_law, self.laws))
         plan = Plan(parse_domain(name), self.worlds, laws, self.setting, 4096)
         plans = {model_panel.REQUESTED: plan}
         if self.panel:
@@ -188,7 +188,7 @@ def _rate_range(by_model: Mapping[str, tuple[int, int]]) -> str:
 
 def panel_table(results: xr.Dataset) -> Rows:
     """Return a header and one row per domain and law: its rate with each model, and their range."""
-    names = [str(name) for name in results.model.values]
+    names = results.model.values.tolist()
     rows = [["domain", "law", *names, "over these models"]]
     for domain, law in _domains_and_laws(results):
         by_model = rates(results, domain, law)

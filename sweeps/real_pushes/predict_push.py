@@ -12,7 +12,7 @@ from scipy.interpolate import make_interp_spline
 
 from rps_jax import errors
 from rps_jax.geometry import footprint, solid
-from rps_jax.trials.results import POSE, labelled
+from rps_jax.trials.results import labelled
 from sweeps.real_pushes import fingers
 
 Support = Literal["feet", "ellipsoid"]
@@ -136,7 +136,7 @@ def predict_push(
         force=(("time", "push", "axis"), force, "N", words),
         gap=(("time", "push", "finger"), gaps, "m", "gap between finger and object"),
     )
-    result = xr.Dataset(columns, {"pose": POSE, "axis": ["x", "y"]}, {"model": model})
+    result = xr.Dataset(columns, {"pose": ["x", "y", "yaw"], "axis": ["x", "y"]}, {"model": model})
     result = result.set_coords("time").transpose("push", ...)
     return result if is_batch else result.isel(push=0)
 

@@ -409,7 +409,7 @@ def _errors(results: xr.Dataset, model: str, rows: np.ndarray) -> Errors:
 def tables(results: xr.Dataset) -> dict[str, Table]:
     """Return the tables of the page by name, for pushes outside the fit."""
     group, test = results.group.values, ~results.fits.values
-    models = list(map(str, results.model.values))
+    models = results.model.values.tolist()
     slow = [name for name in models if name in MUJOCOS]
     quick = [name for name in models if name not in MUJOCOS]
 

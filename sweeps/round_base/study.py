@@ -17,8 +17,7 @@ from rps_jax import Setting
 from rps_jax.analysis import statistics, tables
 from rps_jax.laws import LawsLike
 from rps_jax.questions import MultiLawQuestion, Plan, Run, Section, call_of, option
-from rps_jax.runs.sweep import Sweep
-from rps_jax.worlds import DomainLike
+from rps_jax.worlds import DomainLike, parse_domain
 from sweeps.study_base import PlanStudy, Rows, run_plans
 
 BASES = {"flat": "ideal", "round": "round"}  # robots, 0.58 m wide
@@ -46,9 +45,7 @@ class RoundBase(PlanStudy[xr.Dataset], MultiLawQuestion[xr.Dataset]):
     def plans(self) -> dict[str, Plan]:
         """The sweep of each base."""
         return {
-            base: Sweep(
-                self.chosen, self.domain, self.worlds, robot=robot, setting=self.setting
-            ).plan
+            base: Plan(parse_domain(self.domain, robot), self.worlds, self.chosen, self.setting)
             for base, robot in BASES.items()
         }
 
@@ -82,11 +79,11 @@ def compared(results: xr.Dataset) -> Rows:
         trials = results.sel(law=law)
         flat, curved = (trials.success.sel(base=base) for base in BASES)
         comparison = statistics.compare(flat, curved)
-        rates = (tables.share(int(x.sum()), x.size) for x in (flat, curved))
+        rates = (tables.rate(x.values) for x in (flat, curved))
         points = 100 * (curved.values.astype(float) - flat.values)
         times = [trials.time.sel(base=base).values for base in BASES]
         medians = (
-            f"{np.median(time[x.values > 0]):.0f} s" if x.any() else "-"
+            tables.median(time[x.values > 0], "{:.0f} s")
             for time, x in zip(times, (flat, curved), strict=True)
         )
         both = (flat.values > 0) & (curved.values > 0)

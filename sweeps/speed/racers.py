@@ -60,19 +60,12 @@ def _model(task: Task) -> Any:
     return mujoco.MjModel.from_xml_path(str(task.scene))
 
 
-def _cores() -> int:
-    """Return the number of processors that this process may use."""
-    from rps_jax.engines.device import count_processors  # the process of a trial needs MuJoCo alone
-
-    return count_processors()
-
-
 def rollout(task: Task) -> Racer:
     """MuJoCo's `rollout` on all cores, with the base velocity set once per control period."""
     import mujoco
     from mujoco.rollout import Rollout
 
-    cores = _cores()
+    cores = len(os.sched_getaffinity(0))
     model, substeps = _model(task), 2
     worlds = min(len(task.qpos), 64 * cores)
     datas, pool = [mujoco.MjData(model) for _ in range(cores)], Rollout(nthread=cores)
@@ -107,7 +100,7 @@ def in_c(model: Any, qpos: np.ndarray, seconds: float) -> np.ndarray:
 
 def single(task: Task) -> Racer:
     """Start a process per trial, with one trial per core at a time."""
-    cores = _cores()
+    cores = len(os.sched_getaffinity(0))
     worlds = min(len(task.qpos), 8 * cores)
     words = [sys.executable, __file__, str(task.scene.parent), str(task.seconds)]
 
@@ -130,7 +123,7 @@ def converged(scene: Path, starts: np.ndarray, seconds: float, step: float) -> n
     model = mujoco.MjModel.from_xml_path(str(scene))
     model.opt.timestep, model.opt.tolerance = step, 1e-15
     model.opt.iterations, model.opt.ls_iterations = 100, 50
-    with multiprocessing.get_context("spawn").Pool(_cores()) as pool:
+    with multiprocessing.get_context("spawn").Pool(len(os.sched_getaffinity(0))) as pool:
         return np.array(pool.starmap(in_c, [(model, qpos, seconds) for qpos in starts]))
 
 

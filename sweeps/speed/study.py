@@ -7,6 +7,7 @@
 
 from __future__ import annotations
 
+import os
 import time
 from collections import deque
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
@@ -21,7 +22,6 @@ import xarray as xr
 
 from rps_jax import Rules, Setting
 from rps_jax.analysis.figures.style import Figure, words
-from rps_jax.engines import device
 from rps_jax.engines.mujoco import Batch
 from rps_jax.physics import preset
 from rps_jax.questions import Picture, Run, call_of, option
@@ -43,11 +43,7 @@ from sweeps.study_base import (
 _SPEED = 0.05  # [m/s] of a push in C MuJoCo without a law
 # C MuJoCo on the processor: in the closed loop of a law, by MuJoCo's `rollout`, and one trial at a
 # time.
-IN_C = {
-    "C in closed loop": "closed",
-    "C, mj_step alone": "open",
-    "C, one trial at a time": "serial",
-}
+IN_C = ("C in closed loop", "C, mj_step alone")
 NAMES = (*BATCHED, *IN_C)
 
 
@@ -108,7 +104,7 @@ class Speed(SpeedStudy[xr.Dataset], QuickStudy[xr.Dataset]):
         """Return speeds beside C MuJoCo."""
         fields = ("family", "name", "worlds", "rate")
         points: list[Any] = [tuple(map(row.get, fields)) for row in records(results, "measurement")]
-        picture = Picture("throughput", partial(throughput, points, tuple(IN_C)))
+        picture = Picture("throughput", partial(throughput, points, IN_C))
         return [Table(table(results), title="Simulated seconds in a second", picture=picture)]
 
 
@@ -148,15 +144,13 @@ def batched(program: Program) -> Measurement:
 
 
 def in_c(name: str, family: str, simulated: float = 2.0) -> Measurement:
-    """Time C MuJoCo on all cores with or without the law, or one trial on one core."""
-    physics = preset()
-    how = IN_C[name]
-    threads = 1 if how == "serial" else device.count_processors()
-    worlds = 1 if how == "serial" else 64 * threads
+    """Time C MuJoCo on all cores with or without the law."""
+    physics, threads = preset(), len(os.sched_getaffinity(0))
+    worlds = 64 * threads
     setting = Setting(engine="mujoco", physics=physics)
     part = programs.timed_worlds(family, worlds, setting)
     stage, batch = part.stage, part.worlds
-    if how != "open":
+    if name == IN_C[0]:
         loop = ControlLoop(physics, Rules(horizon=simulated))
 
         def once() -> None:

@@ -44,7 +44,8 @@ def unset_bad_variables() -> list[str]:
     Raises:
       InputError: JAX or tqdm refuses its variables.
     """
-    faults = [fault] if (fault := _unset_bad_flags()) else []
+    parser = _parse_flags()  # meanwhile modules are imported
+    faults = list[str]()
     try:
         os.getcwd()
     except FileNotFoundError:
@@ -57,22 +58,26 @@ def unset_bad_variables() -> list[str]:
                 f"{module} cannot be imported ({error}): correct or unset the environment variable "
                 f"{module.upper()}_... that this names."
             ) from error
-    return faults
+    return [fault, *faults] if (fault := _unset_bad_flags(parser)) else faults
 
 
-def _unset_bad_flags() -> str:
-    """Unset XLA_FLAGS if XLA would abort this process because of it, and return why."""
+def _parse_flags() -> subprocess.Popen[str] | None:
+    """Start a process that aborts if XLA would because of XLA_FLAGS."""
     from rps_jax.engines import device
 
-    flags = os.environ.get("XLA_FLAGS", "")
-    if not flags or device.has_started():
-        return ""
+    if not os.environ.get("XLA_FLAGS") or device.has_started():
+        return None
     command = [sys.executable, "-c", _PARSE_FLAGS]
-    parsed = subprocess.run(command, capture_output=True, text=True, errors="replace")
-    if not parsed.returncode:
+    return subprocess.Popen(command, stderr=subprocess.PIPE, text=True, errors="replace")
+
+
+def _unset_bad_flags(parser: subprocess.Popen[str] | None) -> str:
+    """Unset XLA_FLAGS if the parser aborted because of it, and return why."""
+    errors = parser.communicate()[1] if parser else ""
+    if not parser or not parser.returncode:
         return ""
-    del os.environ["XLA_FLAGS"]
-    match = _FATAL.search(parsed.stderr)
+    flags = os.environ.pop("XLA_FLAGS")
+    match = _FATAL.search(errors)
     reason = match[1].partition(". (")[0] if match else "Check failed"
     rule = "XLA cannot read the value of a flag" if "Check failed" in reason else reason
     return str(not_allowed("XLA_FLAGS", flags, f"{rule}; correct or unset it"))

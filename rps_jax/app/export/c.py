@@ -75,7 +75,8 @@ def header(program: Program, prefix: str) -> str:
         "TABLES": "\n".join([*tables.values(), ""] if tables else []),
         "HELPERS": HELPERS.format(p=p, P=upper),
     }
+    axle = program.about_axle(f"#define {upper}_AXLE {{}}")
     stack = max(map(_stack, (lines["STEP"], lines["SKIN"])))
     about = {"label": program.label, "robot": program.robot, "version": __version__}
     about["stack"] = f"{math.ceil(stack / 1000)} kB"
-    return fill("law.h.in", **lines, **about, p=p, P=upper, taxels=program.taxels)
+    return fill("law.h.in", **lines, **about, p=p, P=upper, taxels=program.taxels, axle=axle)

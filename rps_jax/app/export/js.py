@@ -30,6 +30,7 @@ def module(program: Program, prefix: str) -> str:
         TABLES="\n".join(tables.values()),
         **{"label": program.label, "robot": program.robot, "version": __version__},
         **{"p": prefix, "taxels": program.taxels},
+        axle=program.about_axle("export const AXLE = {};"),
     )
 
 

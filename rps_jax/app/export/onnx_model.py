@@ -48,6 +48,7 @@ def models(program: Program, prefix: str, batch: int | None = None) -> dict[str,
     units = {x.name: x.about for x in (*inputs, *(x for x, _ in pairs))}
     values = {field.name: np.asarray(field.value).tolist() for field in groups["params"]}
     about = {"law": program.label, "robot": program.robot, "params": json.dumps(values)}
+    about |= {} if program.axle is None else {"axle": program.about_axle("{}").strip()}
     about |= {"memory_at_the_start": json.dumps(start), "units": json.dumps(units)}
     target.onnx.helper.set_model_props(model, about)
     target.onnx.checker.check_model(model, full_check=True)

@@ -20,6 +20,12 @@ from rps_jax.robot.skin import LINE, CapacitiveSkin
 from rps_jax.spec import Spec
 
 Leaf: TypeAlias = Any  # an array of JAX or NumPy, or its type
+_AXLE = """
+
+/* The base cannot move sideways. Its axle is this far behind its middle [m], whose pose and twist
+   are those of the law. The base also drives in reverse, where the skin senses nothing: stop it
+   there by a scanner or a bumper. */
+"""
 _REAL = jax.ShapeDtypeStruct((), np.float64)
 
 
@@ -34,10 +40,15 @@ class Program(NamedTuple):
     label: str  # of the law
     robot: str
     senses: str
+    axle: float | None  # [m] behind the middle, of a base that cannot move sideways
     groups: dict[str, Group]
     init: Routine  # params -> memory
     step: Routine  # params, memory, observation -> memory, twist
     skin_step: Routine  # skin_params, skin, scan -> filtered, contact
+
+    def about_axle(self, line: str) -> str:
+        """Return a line that declares the axle [m], after a comment; nothing without an axle."""
+        return "" if self.axle is None else _AXLE + line.format(self.axle)
 
     @property
     def taxels(self) -> int:
@@ -145,4 +156,5 @@ def program(law: registry.LawLike, robot: Any = "ideal", skin: Any = "capacitive
         "skin_params": fields_of(skin_inputs["skin_params"], values),
     }
     name = robot if isinstance(robot, str) else "custom"
-    return Program(label, name, functions.senses, groups, init, law_step, touch)
+    axle = None if base.drive == "omni" else float(base.axle_behind)
+    return Program(label, name, functions.senses, axle, groups, init, law_step, touch)

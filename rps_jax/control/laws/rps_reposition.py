@@ -105,7 +105,8 @@ def step(
     # G2 and G3.
     psi = unicycle.push_direction(middle, base, obs.p_world_target, params.r)
     offset = base - middle
-    way = unicycle.way_around(middle, psi, offset, state.side, ~state.away, params.R, _AHEAD)
+    circle = middle, psi, offset, state.side, ~state.away, params.R, params.R, _AHEAD
+    way = unicycle.way_around(*circle)
     away = state.away | starts
     clear = planar.norm(offset) > params.R - _CLEAR
     at_staging = away & clear & way.is_direct & (planar.norm(way.staging - base) < _ARRIVED)

@@ -12,8 +12,8 @@ heading, u(x) the unit vector at an angle x, and A the axle, a behind the base's
   D2  psi = direction of T - M; the opposite if |T - M| < r and the base stands beyond M
   D3  e = angle of T - C minus theta;  x_C: of C ahead of the axle
 
-Push at v_max until the contact is lost for t_lost, or spent: it leaves the front, or |l| > l_edge;
-within d_near of T, |e| > e_near replaces the last.
+Push at v_max until the contact is lost for t_lost, or spent: it leaves the front, |l| > l_edge, or
+|e| > e_far; within d_near of T, |e| > e_near replaces the last two.
 
   D4  omega = K_e e + K_l (l - l_dead sgn l where |l| > l_dead, else 0)
   D5  omega = K_near v_max sin(e) / x_C   within d_near;  0 without contact
@@ -22,13 +22,20 @@ Retreat straight, until C is `back` ahead of the front. Drive around M in revers
 need not turn away from the object and back. With phi the angle of A - M, and turn the angle from
 phi to psi + pi, which decides the side:
 
-  D6  W = M - (R + a) u(psi)  where turn < carrot,  else  M + (R + a) u(phi +- carrot)
+  D6  W = M - (R_s + a) u(psi)  where turn < carrot,  else  M + (R + a) u(phi +- carrot)
   D7  omega = angle of A - W minus theta,  v = -v_max cos(omega)
 
 Where this angle is large, the base turns on the spot, and a car in reverse. Align: at the last W,
-turn to psi, a car in reverse. Then approach M, which is a push without contact:
+turn to psi, a car in reverse. A touch of the middle of the front on the way is a push; one of a
+corner is a retreat. Then approach M, which is a push without contact:
 
   D8  omega = angle of M - A minus theta
+
+An approach that passes M without contact has missed. The base retreats and drives around a better
+guess of M: first C; after more misses, in turn, a place where an object is not felt:
+
+  D9  M = front + r u(theta), pushed along by dead taxels (first, if |l| was small),
+      or beside and behind the base, on the inside of the last detour, pushed along by its rear
 
 The twist is (v, a omega, omega), with |omega| <= |v| / R of a car. The law senses touch, odometry
 and target; axle and turning radius R are static facts. The smooth law mixes the four modes.
@@ -54,6 +61,9 @@ _ROUND_SIDE = 1.2  # [rad] from the front of a round base
 _LARGE = 0.5  # [rad] heading error above which the base turns on the spot
 _ARRIVED, _ALIGNED = 0.22, 0.26  # [m], [rad] errors at the staging point
 _CLOSE, _BEARING = 0.2, 1.2  # [m], [rad] distance and bearing of a staging point that is passed
+_MIDDLE = 0.25  # [m] offset up to which a touch on the way is a push
+_CORNER = 0.12  # [m] behind the front, up to which other touches on the way stop the base
+_BESIDE = 0.5, 0.75  # [m] behind and beside the middle of the base, D9
 _PAST = 0.5  # [m] of the front beyond M at which an approach has failed
 _OVERSHOOT = 1.5  # [rad] on the circle, after which the base drives back
 _LEAST_ARM = 0.2  # [m] of x_C
@@ -83,6 +93,9 @@ class UnicycleParams(NamedTuple):
     l_edge: Annotated[
         Parameter, Spec("m", "offset of a spent contact", ge=0, tune=Bound(0.1, 0.35))
     ] = 0.3263
+    e_far: Annotated[
+        Parameter, Spec("rad", "error of a spent contact", ge=0, tune=Bound(0.5, 3.2))
+    ] = 1.6
     d_near: Annotated[Parameter, Spec("m", "distance of D5", ge=0, tune=Bound(0.05, 1))] = 0.5245
     e_near: Annotated[
         Parameter, Spec("rad", "error of a spent contact there", ge=0, tune=Bound(0.5, 2.5))
@@ -98,7 +111,10 @@ class UnicycleParams(NamedTuple):
     ] = 1.124
     R: Annotated[
         Parameter, Spec("m", "radius of the circle around M, D6", gt=0, tune=Bound(0.5, 1.4))
-    ] = 0.8454
+    ] = 0.95
+    R_s: Annotated[
+        Parameter, Spec("m", "distance of the last W from M, D6", gt=0, tune=Bound(0.4, 1.4))
+    ] = 0.7
 
 
 class Widths(NamedTuple):
@@ -126,6 +142,7 @@ class UnicycleState(NamedTuple):
     t_lost: Annotated[jax.Array, Spec("s", "time since the last contact")]
     pushed: Annotated[jax.Array, Spec("1", "whether this push had a contact; 0 in an approach")]
     side: Annotated[jax.Array, Spec("1", "1: counter-clockwise around M; -1: clockwise")]
+    misses: Annotated[jax.Array, Spec("1", "approaches since the last contact that missed")]
 
 
 check = partial(spec.check, prefix="unicycle.")
@@ -136,7 +153,7 @@ def init(params: UnicycleParams, temperatures: Widths | None = None) -> Unicycle
     zero = jnp.zeros_like(jnp.asarray(params.r, float))
     no = zero > 0 if temperatures is None else zero
     point = jnp.zeros(2, zero.dtype)
-    return UnicycleState(no, no, no, point, point, zero, no, zero, no, zero + 1)
+    return UnicycleState(no, no, no, point, point, zero, no, zero, no, zero + 1, zero)
 
 
 class Contact(NamedTuple):
@@ -187,6 +204,7 @@ def way_around(
     side: jax.Array,  # [1] the last choice
     chooses: jax.Array,  # bool: whether the side is chosen anew
     radius: Number,  # [m] of the circle
+    distance: Number,  # [m] of the staging point from M
     ahead: Number,  # [rad] of the aim on the circle
     width: Number | None = None,  # [rad] of the smooth switch
 ) -> Way:
@@ -197,7 +215,7 @@ def way_around(
     turn = jnp.mod(side * turn, 2 * jnp.pi)
     turn = jnp.where(turn > 2 * jnp.pi - _OVERSHOOT, turn - 2 * jnp.pi, turn)
     is_direct = soft.greater(ahead, turn, width)
-    staging = middle - radius * planar.unit(psi)
+    staging = middle - distance * planar.unit(psi)
     carrot = middle + radius * planar.unit(phi + side * ahead)
     return Way(side, is_direct, staging, soft.where(is_direct, staging, carrot))
 
@@ -232,7 +250,7 @@ def step(
     sensed = obs._replace(p_robot_contact=contact)
     l = where(touches, sensed.l, state.l)  # noqa: E741
 
-    # D1, and an approach that passes M without contact: then the last contact is a better guess.
+    # D1, and the guess D9 after an approach that passes M without contact.
     p_world_contact = obs.p_world_robot + planar.rotate(yaw, contact)
     middle = p_world_contact + params.r * planar.unit(yaw + normal)
     middle = where(touches, middle, state.p_world_object)
@@ -241,7 +259,14 @@ def step(
     front = obs.p_world_robot + half_length * u
     past = above(jnp.sum((front - middle) * u), _PAST, length)
     missed = and_(and_(and_(push, touched), and_(is_new, not_(touches))), past)
-    middle = where(missed, p_world_contact, middle)
+    small, is_odd = jnp.abs(state.l) < _MIDDLE, jnp.mod(state.misses, 2) > 0.5
+    beside = jnp.stack([jnp.full_like(yaw, -_BESIDE[0]), -_BESIDE[1] * state.side])
+    beside = obs.p_world_robot + planar.rotate(yaw, beside)
+    guess = jnp.where(small ^ is_odd, beside, front + params.r * u)
+    first = state.misses < 0.5
+    middle = where(missed, jnp.where(first, p_world_contact, guess), middle)
+    p_world_contact = where(missed, jnp.where(first, p_world_contact, front), p_world_contact)
+    misses = where(touches, 0.0, where(missed, state.misses + 1, state.misses))
 
     # D2 and D3.
     d = displacement(sensed)
@@ -251,14 +276,16 @@ def step(
     # The end of a push.
     near = above(params.d_near, distance, length)
     spent_near = above(jnp.abs(e), params.e_near, angle)
-    spent = where(near, spent_near, above(jnp.abs(l), params.l_edge, length))
+    spent = or_(above(jnp.abs(l), params.l_edge, length), above(jnp.abs(e), params.e_far, angle))
+    spent = where(near, spent_near, spent)
     spent = or_(spent, not_(on_front))
     is_lost = and_(above(t_lost, params.t_lost, time), not_(is_new))
     is_finished = and_(and_(push, touched), or_(or_(and_(touches, spent), is_lost), missed))
 
     # D6: the side is chosen before the base leaves, and kept on the way.
     offset, chooses = p_world_axle - middle, _is(or_(push, state.retreat))
-    circle = middle, psi, offset, state.side, chooses, params.R + axle, params.carrot
+    radii = params.R + axle, params.R_s + axle
+    circle = middle, psi, offset, state.side, chooses, *radii, params.carrot
     side, is_direct, staging, aim = way_around(*circle, angle)
     error = planar.wrap(planar.direction(aim - p_world_axle) + jnp.pi - yaw)
     remaining = planar.norm(staging - p_world_axle)
@@ -266,16 +293,20 @@ def step(
     is_there = and_(is_direct, or_(above(_ARRIVED, remaining, length), passed))
     face = planar.wrap(psi - yaw)
 
-    # The next modes. A touch of the front on the way is a push, unless it is spent.
-    aligned, hits = above(_ALIGNED, jnp.abs(face), angle), and_(touches, on_front)
+    # The next modes. A touch of the middle of the front on the way is a push, unless it is spent.
+    aligned, in_middle = above(_ALIGNED, jnp.abs(face), angle), above(_MIDDLE, jnp.abs(l), length)
+    hits = and_(and_(touches, on_front), in_middle)
+    is_corner = above(contact[0], half_length - _CORNER, length)
+    stops = and_(and_(touches, is_corner), or_(not_(hits), spent))
+    arrives = or_(hits, stops)
     gap = jnp.sum((p_world_contact - front) * u)
     is_clear = above(gap, params.back, length)
-    stopped = and_(and_(_either(state.around, state.align), hits), spent)
+    stopped = and_(_either(state.around, state.align), stops)
     retreat = _either(is_finished, stopped, and_(state.retreat, not_(is_clear)))
     leaves = and_(state.retreat, is_clear)
-    around = _either(leaves, and_(and_(state.around, not_(is_there)), not_(hits)))
+    around = _either(leaves, and_(and_(state.around, not_(is_there)), not_(arrives)))
     align = _either(and_(state.around, is_there), and_(state.align, not_(aligned)))
-    align = and_(align, not_(hits))
+    align = and_(align, not_(arrives))
 
     # D4, D5, D7 and D8.
     v_max, least = jnp.asarray(params.v_max), obs.turning_radius
@@ -296,7 +327,7 @@ def step(
     if least is not None:
         omega = jnp.clip(omega, -jnp.abs(v) / least, jnp.abs(v) / least)
     memory = UnicycleState(
-        retreat, around, align, middle, p_world_contact, l, touched, t_lost, pushed, side
+        retreat, around, align, middle, p_world_contact, l, touched, t_lost, pushed, side, misses
     )
     details = Details(l, distance, jnp.zeros_like(distance), e, _either(retreat, around, align))
     return memory, Twist(v, axle * omega, omega), details
@@ -326,7 +357,9 @@ PRESETS = {
         t_lost=0.2291,
         back=0.01655,
         carrot=1.19,
+        e_far=3.2,
         R=0.9113,
+        R_s=1.1,
     ),
     "unicycle_round": _TUNED._replace(
         r=0.2088,
@@ -340,7 +373,9 @@ PRESETS = {
         t_lost=1.861,
         back=0.01947,
         carrot=1.419,
+        e_far=3.2,
         R=0.9152,
+        R_s=0.9152,
     ),
     "unicycle_front": _TUNED._replace(
         r=0.2494,
@@ -354,6 +389,8 @@ PRESETS = {
         t_lost=1.179,
         back=0.103,
         carrot=0.8061,
+        e_far=3.2,
         R=1.267,
+        R_s=1.267,
     ),
 }

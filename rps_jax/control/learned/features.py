@@ -173,5 +173,10 @@ def mirror(features: jax.Array) -> jax.Array:
 
 
 def clip_action(action: jax.Array) -> jax.Array:
-    """Saturate an action (..., 3) [1], which is a share of the largest twist, to norm 1."""
+    """Saturate an action [1], (..., 3), or (..., 2) without v_y, to a twist (..., 3) of norm 1.
+
+    Both are shares of the largest twist.
+    """
+    if action.shape[-1] == 2:
+        action = jnp.stack([action[..., 0], jnp.zeros_like(action[..., 0]), action[..., 1]], -1)
     return jnp.stack(Twist(*jnp.moveaxis(action, -1, 0)).saturate(1.0, 1.0), axis=-1)

@@ -14,7 +14,6 @@ from typing import Annotated, Any, Literal, NamedTuple, get_args
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 from rps_jax import errors
 from rps_jax.control.base import OmegaMax, SpeedMax, SuccessDistance
@@ -27,7 +26,7 @@ from rps_jax.spec import Spec, specs_of
 NetworkKind = Literal["mlp", "gru"]
 Shapes = dict[str, tuple[int, ...]]  # of weights, by name
 Weights = dict[str, Any]  # float32 arrays by name, of NumPy or JAX
-_ACTION_SIGNS = np.array([1, -1, -1], np.float32)  # of (v_x, v_y, omega) under the mirror
+_ACTION_SIGNS = {3: (1, -1, -1), 2: (1, -1)}  # of (v_x, v_y, omega) under the mirror, (v_x, omega)
 _REACH = 1.5  # [1] bound on the mean of each component of an action
 
 
@@ -38,12 +37,14 @@ class Network(NamedTuple):
     width: Annotated[int, Spec("1", "pairs of units in a hidden layer")] = 64
     taxels: Annotated[int, Spec("1", "taxels of the skin")] = 42
     hold: Annotated[float, Spec("s", "duration of an action", gt=0, le=10)] = 0.2
+    actions: Annotated[int, Spec("1", "numbers of an action: 3, or 2 without v_y")] = 3
 
     def check(self) -> Network:
         """Return the network; raise InputError for a field that is out of range."""
         errors.check_name("network", self.kind, get_args(NetworkKind))
         errors.check_count("network width", self.width, at_most=1024)
         errors.check_count("network taxels", self.taxels, at_most=10_000)
+        errors.check_count("network actions", self.actions, at_least=2, at_most=3)
         specs_of(Network)["hold"].check("network hold", self.hold)
         return self
 
@@ -53,21 +54,22 @@ class Network(NamedTuple):
         size, n = features.feature_count(self.taxels), self.width
         gru = _dense("memory.gates", 2 * n, 2 * n) | _dense("memory.new", 2 * n, n)
         second = _dense("second", n, n) if self.kind == "mlp" else gru
-        return _dense("first", size, n) | second | _dense("action", n, 3)
+        return _dense("first", size, n) | second | _dense("action", n, self.actions)
 
     def init(self, key: jax.Array) -> Weights:
         """Return random weights, with a mean action near zero."""
         return init_weights(self.shapes, key, small=("action",))
 
     def apply(self, weights: Weights, hidden: jax.Array, inputs: jax.Array) -> Pair:
-        """Map features (..., F) to the hidden state (..., 2, H) and mean action (..., 3) [1]."""
+        """Map features (..., F) to the hidden state (..., 2, H) and mean action (..., A) [1]."""
         x = jnp.tanh(dense(weights, "first", mirror_pairs(inputs)))
         if self.kind == "mlp":
             x = jnp.tanh(dense(weights, "second", x))
         else:
             x = hidden = _apply_gru(weights, hidden, x)
         out = dense(weights, "action", x)
-        mean = 0.5 * (out[..., 0, :] + jnp.asarray(_ACTION_SIGNS, out.dtype) * out[..., 1, :])
+        signs = jnp.asarray(_ACTION_SIGNS[self.actions], out.dtype)
+        mean = 0.5 * (out[..., 0, :] + signs * out[..., 1, :])
         return hidden, _REACH * jnp.tanh(mean / _REACH)
 
 

@@ -9,7 +9,7 @@ import json
 from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, get_args
 
 import numpy as np
 
@@ -18,6 +18,7 @@ from rps_jax.control.base import Law
 from rps_jax.control.learned import network as networks
 from rps_jax.control.learned.network import LearnedParams, Network, Weights
 from rps_jax.record import files
+from rps_jax.robot.robot import DriveKind
 
 FORMAT, VERSION = "rps_jax policy", 1
 SHIPPED = {path.stem: path for path in sorted(Path(__file__).parent.glob("learned*.npz"))}
@@ -57,7 +58,7 @@ def decode(content: bytes, source: Path | str) -> Policy:
             raise ValueError(f"its format is {about['format']}, version {about['version']}")
         if digest != current:
             raise ValueError("its digest does not match")
-        network = Network(*(about["network"][name] for name in Network._fields)).check()
+        network = Network(**about["network"]).check()
         _check_weights(network, arrays)
         task = {
             name: errors.check_finite(f"policy {name}", about["task"][name], above=0, at_most=100)
@@ -117,6 +118,7 @@ def build_law(policy: Policy) -> tuple[str, Law, LearnedParams]:
         partial(networks.step, policy.network, policy.weights),
         "taxels",
         check=check,
+        drives=("omni",) if policy.network.actions == 3 else get_args(DriveKind),
         observe_sent=networks.observe_sent,
     )
     return f"learned_{kind}_{digest}", law, params(*policy.task)

@@ -61,7 +61,9 @@ class Fused(Engine):
         )
         if solids.feet is not None:
             feet = lower(solids.feet[..., :2])
-            bodies = bodies._replace(feet=feet, is_foot=np.sign(solids.feet[..., 2:]))
+            weights = solids.feet[..., 2:]
+            weights = np.sign(weights) if solids.pads is None else weights
+            bodies = bodies._replace(feet=feet, foot_weight=weights, pads=solids.pads)
         around = inputs.surroundings
         if around.walls is not None:
             ends = around.walls.reshape(inputs.num_worlds, -1, 4)

@@ -46,7 +46,8 @@ class Body(NamedTuple):
     base_size: Entries  # (2,) [m] half length and width of the base, or (1,) its radius
     base_z: Entries  # (2,) [m] heights of the base's lower and upper edge
     feet: Entries = None  # (N, 3) [m] of a prism that does not stand on its vertices; later a `Vec`
-    is_foot: Entries = None  # (N, 1) [1] 1 for a foot, 0 for an unused entry
+    foot_weight: Entries = None  # (N, 1) [1] stiffness of a foot; 0 for an unused entry
+    pads: Entries = None  # (N, 2) [1, m] factor of the friction at a foot, and radius of its pad
     gravity: Entries = None  # (3,) [m/s^2] of a floor that is not level
     # (4,) unit normal of a line, its distance [m], and the factor [1] of the friction beyond it
     boundary: Entries = None
@@ -104,9 +105,11 @@ class Contact(NamedTuple):
     n: Vec  # unit normal, towards the object
     t: Vec  # unit tangents
     s: Vec
-    bias: Vec  # [m/s^2] -a_ref
+    bias: tuple[Number, ...]  # [m/s^2] -a_ref
     d: Number  # [kg] stiffness of the normal row; 0 without contact
     friction: Number  # [1]
+    # [m] of a pad, which has a fourth row: the torque of friction about n over the radius
+    radius: Number | None = None
     arm: tuple[Number, Number] | None = None  # [m] from the origin of a base that can be slowed
 
 
@@ -140,18 +143,22 @@ def on_ground(body: Body, state: State, m: Sequence[Vec], physics: Physics) -> C
     u = sp.add(state.v, sp.cross(sp.to_world(m, state.w), at))
     d = _stiff(distance, exists, physics.ground_impedance, body.invweight)
     bias = _bias(k, b, physics.ground_impedance, distance, (u[2], u[0], u[1]))
-    friction = body.friction_ground
+    friction, radius = body.friction_ground, None
+    if body.pads is not None:
+        factor, radius = body.pads
+        d, friction = body.foot_weight[0] * d, factor * friction
+        bias = *bias, radius * (b * sp.to_world(m, state.w)[2])
     if body.boundary is not None:
         x, y, border, factor = body.boundary
         beyond = x * (state.p[0] + r[0]) + y * (state.p[1] + r[1]) > border
         friction = jnp.where(beyond, factor * friction, friction)
-    return Contact(at, sp.Z, sp.X, sp.Y, bias, d, friction)
+    return Contact(at, sp.Z, sp.X, sp.Y, bias, d, friction, radius)
 
 
 def _lower_face(body: Body, m: Sequence[Vec]) -> tuple[Vec, Array]:
     """Return points that may touch the ground, from the centre of mass, and whether they exist."""
     if body.feet is not None:
-        return sp.to_world(m, body.feet), body.is_foot[0] > 0
+        return sp.to_world(m, body.feet), body.foot_weight[0] > 0
     if isinstance(body.vertices, Corners):
         return sp.to_world(m, body.vertices.at), body.vertices.real
     # Three points of a cylinder's rim, the lowest first; the fourth is padding.
@@ -195,7 +202,7 @@ def on_base(body: Body, state: State, m: Sequence[Vec], twist: Vec, physics: Phy
     d = _stiff(distance, True, impedance, body.invweight + body.base_invweight)
     bias = _bias(k, b, impedance, distance, (sp.dot(n, u), sp.dot(t, u), u[2]))
     held = state.driven is None
-    return Contact(r, n, t, sp.Z, bias, d, body.friction_robot, None if held else arm)
+    return Contact(r, n, t, sp.Z, bias, d, body.friction_robot, arm=None if held else arm)
 
 
 Point = tuple[Number, Number]

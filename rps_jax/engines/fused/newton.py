@@ -35,41 +35,44 @@ _FLAT = 1e-3  # [1] share of the initial slope at which a line search ends
 _FAR = 1e9  # upper bound of a line search without a bracket
 
 
-def contact_force(contact: Contact, x: Vec, physics: Physics) -> tuple[Vec, tuple[Number, ...]]:
+Row = tuple[Number, ...]  # along n, t and s, and of a pad its torque about n over its radius
+
+
+def contact_force(contact: Contact, x: Row, physics: Physics) -> tuple[Row, Row]:
     """Return the force [N] along (n, t, s) at J a - aref = x, and the stiffness.
 
-    The stiffness (nn, nt, ns, tt, ts, ss) is minus the derivative of the force.
+    The stiffness (nn, nt, ns, tt, ts, ss) is minus the derivative of the force. A pad has a fourth
+    row, and the entries (nn, nt, ns, nq, tt, ts, tq, ss, sq, qq).
     """
     if physics.cone == "pyramidal":
         return _pyramid(contact, x, physics)
     d, f = contact.d, contact.friction
     d_t = physics.impratio * d
     mu = f * physics.impratio**-0.5
-    n, t, s = mu * x[0], f * x[1], f * x[2]
-    slip = sp.norm((t, s))
+    n, *sideways = mu * x[0], *(f * y for y in x[1:])
+    slip = sp.norm(sideways)
     sticks = mu * n + slip <= 0
     slides = (n < mu * slip) & ~sticks
     d_m = jnp.where(slides, d / (mu * mu * (1 + mu * mu)), 0.0)
     h = n - mu * slip
-    e_t, e_s = t / slip, s / slip
+    way = [y / slip for y in sideways]
     pull = -d_m * h * mu  # normal force of a sliding contact
-    force = pull, -pull * f * e_t, -pull * f * e_s
+    force = pull, *(-pull * f * e for e in way)
     nn = d_m * mu * mu
     along = nn * f * f  # of the slip
     across = pull * f * f / slip
-    stiffness = (
-        nn,
-        -nn * f * e_t,
-        -nn * f * e_s,
-        along * e_t * e_t + across * e_s * e_s,
-        (along - across) * e_t * e_s,
-        along * e_s * e_s + across * e_t * e_t,
-    )
-    sticking = (-d * x[0], -d_t * x[1], -d_t * x[2]), (d, 0.0, 0.0, d_t, 0.0, d_t)
-    return jax.tree.map(lambda a, b: jnp.where(sticks, a, b), sticking, (force, stiffness))
+    stiffness, stuck = [nn, *(-nn * f * e for e in way)], [d, *(0.0 for _ in way)]
+    for i, e in enumerate(way):
+        rest = [across * y * y for j, y in enumerate(way) if j != i]
+        stiffness += [along * e * e + reduce(sp.plus, rest)]
+        stiffness += [(along - across) * e * y for y in way[i + 1 :]]
+        stuck += [d_t, *(0.0 for _ in way[i + 1 :])]
+    sticking = (-d * x[0], *(-d_t * y for y in x[1:])), tuple(stuck)
+    sliding = force, tuple(stiffness)
+    return jax.tree.map(lambda a, b: jnp.where(sticks, a, b), sticking, sliding)
 
 
-def _pyramid(contact: Contact, x: Vec, physics: Physics) -> tuple[Vec, tuple[Number, ...]]:
+def _pyramid(contact: Contact, x: Row, physics: Physics) -> tuple[Row, Row]:
     """Return force and stiffness of four frictionless edges n +- friction t, n +- friction s."""
     f = contact.friction
     d = contact.d * physics.impratio / (2 * f * f * (1 + f * f))
@@ -97,8 +100,8 @@ class Base(NamedTuple):
     tyres: Tyres | None = None  # of an axle that does not move sideways
 
 
-def _rows(contact: Contact, x: Sequence[Vec]) -> Vec:
-    """Return J times accelerations: those of a contact's point along n, t, s.
+def _rows(contact: Contact, x: Sequence[Vec]) -> Row:
+    """Return J times accelerations: those of a contact's point along n, t, s, and about n of a pad.
 
     The acceleration of a base, at and about its origin, is subtracted.
     """
@@ -107,7 +110,15 @@ def _rows(contact: Contact, x: Sequence[Vec]) -> Vec:
     if base and contact.arm is not None:
         (b_x, b_y, turn), (arm_x, arm_y) = *base, contact.arm
         u = sp.sub(u, (b_x - turn * arm_y, b_y + turn * arm_x, 0.0))
-    return sp.dot(contact.n, u), sp.dot(contact.t, u), sp.dot(contact.s, u)
+    rows = sp.dot(contact.n, u), sp.dot(contact.t, u), sp.dot(contact.s, u)
+    if contact.radius is None:
+        return rows
+    return *rows, contact.radius * sp.dot(contact.n, alpha)
+
+
+def _at(contact: Contact, x: Sequence[Vec]) -> Row:
+    """Return J a - a_ref of a contact."""
+    return tuple(map(sp.plus, _rows(contact, x), contact.bias))
 
 
 def _solve(h: list[list[Number]], g: Sequence[Number]) -> list[Number]:
@@ -180,9 +191,12 @@ class Problem(NamedTuple):
                     added = tyres.mass * tyres.sideways[row] * tyres.sideways[column]
                     h[6 + row][6 + column] = h[6 + row][6 + column] + added
         for c in self.contacts:
-            force, k = contact_force(c, sp.add(_rows(c, x), c.bias), physics)
-            f = sp.combine(force, (c.n, c.t, c.s))
-            g[:2] = sp.sub(g[0], _sums(f)), sp.sub(g[1], _sums(sp.cross(c.r, f)))
+            force, k = contact_force(c, _at(c, x), physics)
+            f = sp.combine(force[:3], (c.n, c.t, c.s))
+            torque = sp.cross(c.r, f)
+            if c.radius is not None:
+                torque = sp.add(torque, sp.scale(c.radius * force[3], c.n))
+            g[:2] = sp.sub(g[0], _sums(f)), sp.sub(g[1], _sums(torque))
             if c.arm is not None:
                 g[2] = sp.add(g[2], _sums(_on_base(c.arm, f)))
             _stiffen(h, c, k)
@@ -263,7 +277,7 @@ def _minimise(problem: Problem, physics: Physics) -> list[Vec]:
             bend = bend + sp.dot(base.inertia, _times(e, e))
             if base.tyres is not None:
                 bend = bend + base.tyres.mass * sp.dot(base.tyres.sideways, e) ** 2
-        lines = [(c, sp.add(_rows(c, x), c.bias), _rows(c, d)) for c in problem.contacts]
+        lines = [(c, _at(c, x), _rows(c, d)) for c in problem.contacts]
         # Inner product of step and gradient: twice the decrease of a quadratic cost.
         gain = -sp.dot(step, g)
         length = _line_search(lines, slope, bend, active * gain, physics)
@@ -305,7 +319,7 @@ def wrench_on_base(
       turn: cosine and sine of the base's heading.
       physics: with the friction cone.
     """
-    force, _ = contact_force(contact, sp.add(_rows(contact, x), contact.bias), physics)
+    force, _ = contact_force(contact, _at(contact, x), physics)
     f_x, f_y, torque = _sums(_on_base(arm, sp.combine(force, (contact.n, contact.t, contact.s))))
     c, s = turn
     # Minus: the contacts' force is on the object.
@@ -329,8 +343,19 @@ def _spin(body: Body, m: Sequence[Vec]) -> list[Vec]:
     ]  # type: ignore[return-value]
 
 
-def _stiffen(h: list[list[Number]], c: Contact, k: tuple[Number, ...]) -> None:
+def _stiffen(h: list[list[Number]], c: Contact, k: Row) -> None:
     """Add the contacts' J^T K J to the lower triangle of h."""
+    if c.radius is not None:  # the row of a pad: its couplings to the others, and to itself
+        nn, nt, ns, nq, tt, ts, tq, ss, sq, qq = k
+        k, side = (nn, nt, ns, tt, ts, ss), sp.combine((nq, tq, sq), (c.n, c.t, c.s))
+        spin, arm = sp.scale(c.radius, c.n), sp.cross(c.r, side)
+        for i in range(3):
+            for j in range(3):
+                h[3 + i][j] = sp.plus(h[3 + i][j], sp.total(sp.mul(spin[i], side[j])))
+            for j in range(i + 1):
+                pair = sp.plus(sp.mul(spin[i], arm[j]), sp.mul(arm[i], spin[j]))
+                pair = sp.plus(pair, sp.mul(sp.mul(spin[i], spin[j]), qq))
+                h[3 + i][3 + j] = sp.plus(h[3 + i][3 + j], sp.total(pair))
     nn, nt, ns, tt, ts, ss = k
     # K in the world's axes: columns of Q K Q^T with Q = (n, t, s).
     axes = (c.n, c.t, c.s)
@@ -375,13 +400,13 @@ class _Line(NamedTuple):
     mu: Number
 
 
-def _line(c: Contact, start: Vec, pace: Vec, physics: Physics) -> _Line:
+def _line(c: Contact, start: Row, pace: Row, physics: Physics) -> _Line:
     """Return the line of contacts in the elliptic cone whose rows start at `start`."""
     f = c.friction
     mu = f * physics.impratio**-0.5
-    (n, t, s), (p, q, r) = start, pace
+    (n, *side), (p, *rise) = start, pace
     ff = f * f
-    square, half, bend = ff * (t * t + s * s), ff * (t * q + s * r), ff * (q * q + r * r)
+    square, half, bend = (ff * sp.dot(a, b) for a, b in ((side, side), (side, rise), (rise, rise)))
     return _Line(mu * n, mu * p, square, half, bend, c.d * physics.impratio / ff, mu)
 
 
@@ -404,7 +429,7 @@ def _slope_of_ellipse(line: _Line, x: Number) -> tuple[Number, Number]:
 
 
 def _slope_of_pyramid(
-    lines: tuple[Contact, Vec, Vec], x: Number, physics: Physics
+    lines: tuple[Contact, Row, Row], x: Number, physics: Physics
 ) -> tuple[Number, Number]:
     """Return first and second derivative of the contacts' cost for the friction pyramid."""
     c, start, pace = lines
@@ -416,7 +441,7 @@ def _slope_of_pyramid(
 
 
 def _line_search(
-    lines: list[tuple[Contact, Vec, Vec]],
+    lines: list[tuple[Contact, Row, Row]],
     slope: Number,
     bend: Number,
     steepness: Number,

@@ -213,14 +213,15 @@ def _drive(
 
 def split_entries(body: Body) -> Body:
     """Return bodies (...) with each entry as a separate array, the input of `step`."""
-    leaves = body._replace(vertices=None, feet=None, is_foot=None, walls=None)
+    lists = ("feet", "foot_weight", "pads", "walls")
+    leaves = body._replace(vertices=None, **dict.fromkeys(lists))
     entries = {
         name: _split(leaf) if jnp.ndim(leaf) > jnp.ndim(body.mass) else leaf
         for name, leaf in leaves._asdict().items()
         if leaf is not None
     }
     corners = _split(jnp.moveaxis(body.vertices, -2, 0))
-    for name in ("feet", "is_foot", "walls"):
+    for name in lists:
         if (leaf := getattr(body, name)) is not None:
             entries[name] = _split(jnp.moveaxis(leaf, -2, 0))
     if body.vertices.shape[-2] == 1:

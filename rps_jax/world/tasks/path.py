@@ -12,7 +12,7 @@ from typing import Annotated, Any, ClassVar, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from scipy.interpolate import CubicSpline
+import scipy
 
 from rps_jax import errors
 from rps_jax.geometry import polyline, solid
@@ -212,7 +212,9 @@ class Path(Following):
             return points
         arcs = Polyline.through(points).arcs
         at = np.arange((len(points) - 1) * _PER_SPAN + 1) / _PER_SPAN
-        return CubicSpline(arcs, points)(np.interp(at, np.arange(len(points)), arcs))
+        return scipy.interpolate.CubicSpline(arcs, points)(
+            np.interp(at, np.arange(len(points)), arcs)
+        )
 
     def vertices(self, inputs: CourseInputs) -> np.ndarray:
         """Return the vertices (n, N, 2) [m] of paths, which start at the base's front."""

@@ -18,9 +18,8 @@ from typing import Annotated, Any
 import contourpy
 import jax.numpy as jnp
 import numpy as np
+import scipy
 from PIL import Image
-from scipy import ndimage
-from scipy.sparse import csgraph
 
 from rps_jax import errors
 from rps_jax.geometry import polyline
@@ -208,7 +207,7 @@ def _read_image(file: Mapping[str, Any], starts: Any) -> list[np.ndarray]:
     shades = _shades(Path(str(file.get("image", "an image"))))[::-1]
     occupied = shades if texts["negate"] in ("1", "true") else 1 - shades
     # Unknown cells, and those outside, are walls.
-    labelled: Any = ndimage.label((occupied < low) & (occupied <= high))
+    labelled: Any = scipy.ndimage.label((occupied < low) & (occupied <= high))
     labels = np.pad(labelled[0], 1)
     unit, origin = resolution * np.exp(1j * yaw), complex(x, y)
     cells = (errors.check_array("task start", starts, ("N", 3)) @ (1, 1j, 0) - origin) / unit + 1
@@ -218,7 +217,7 @@ def _read_image(file: Mapping[str, Any], starts: Any) -> list[np.ndarray]:
         rule = "it lies in an obstacle, in unknown cells or outside of the image"
         raise errors.not_allowed("task start", starts, rule)
     free = np.isin(labels, reached)
-    obstacles: Any = ndimage.label(~free, np.ones((3, 3)))
+    obstacles: Any = scipy.ndimage.label(~free, np.ones((3, 3)))
     _check_count(2 * obstacles[1])  # each has two walls or more
     if share := 100 * np.mean(abs(255 * np.pad(shades, 1)[free] - _UNKNOWN) < 0.5):
         _warn_once(
@@ -315,8 +314,10 @@ def _plan(walls: Any, starts: Any, goals: Any, base_radius: float, radius: float
     for i, node in enumerate(nodes):
         is_clear = distances(node, nodes[:i, None], a, b).min(axis=1) > clearance - 1e-9
         lengths[i, :i] = np.where(is_clear, abs(nodes[:i] - node), np.inf)
-    graph = csgraph.csgraph_from_dense(lengths, np.inf)  # an edge may have no length
-    result: Any = csgraph.dijkstra(graph, False, range(begin.size), return_predecessors=True)
+    graph = scipy.sparse.csgraph.csgraph_from_dense(lengths, np.inf)
+    result: Any = scipy.sparse.csgraph.dijkstra(
+        graph, False, range(begin.size), return_predecessors=True
+    )
     routes = list[np.ndarray]()
     for i, j in np.ndindex(begin.size, goal.size):
         route = [begin.size + j]

@@ -56,6 +56,7 @@ class Controller:
         """Compile skin and law before the first step; the law must sense touch or ends.
 
         The skin has the shell of the base; `robot` is the base itself, whose drive the law knows.
+        Odometry and command of a base that cannot move sideways are those of its axle.
         """
         self.limits, self._skin, self._robot = limits, skin, Robot.parse(robot)
         self._params = resolve_law(law)[1]
@@ -94,7 +95,9 @@ class Controller:
     def odometry(self, time: float, x: float, y: float, yaw: float) -> None:
         """Store the pose of the base [m, m, rad]."""
         if np.isfinite([x, y, yaw]).all():
-            self._pose, self._input_times["odometry"] = np.array([x, y, yaw], float), time
+            axle = self._robot.axle_behind
+            self._pose = np.array([x + axle * math.cos(yaw), y + axle * math.sin(yaw), yaw])
+            self._input_times["odometry"] = time
 
     def target(self, time: float, x: float, y: float) -> None:
         """Store the target [m]."""
@@ -175,6 +178,7 @@ class Controller:
             self._pursue()
         law_state, twist = self._decide(period)
         v_x, v_y, omega = map(float, twist)
+        v_y = v_y if self._robot.drive == "omni" else 0.0
         if not np.isfinite([v_x, v_y, omega]).all():
             self._sent = Command(status="the law returns no finite twist")
             return self._sent

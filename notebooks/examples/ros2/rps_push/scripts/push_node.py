@@ -15,6 +15,9 @@ from rclpy.qos import qos_profile_sensor_data
 from rps_push.controller import Command, Controller, Limits
 from std_msgs.msg import Float32MultiArray
 
+from rps_jax import Robot
+from rps_jax.worlds import CapacitiveSkin
+
 # Meaning with unit, and range, of each parameter.
 PARAMETERS = {
     "v_max": ("largest speed in any direction [m/s]", 0.0, 1.0),
@@ -39,12 +42,21 @@ class PushNode(LifecycleNode):
                 description=description, floating_point_range=[allowed]
             )
             self.declare_parameter(name, getattr(defaults, name), descriptor)
+        self.declare_parameter("law", "rps_plus", ParameterDescriptor(description="the law"))
+        self.declare_parameter("robot", "ideal", ParameterDescriptor(description="name or file"))
         self._timer, self._status, self._subscriptions = None, "", []
 
     def on_configure(self, state):
         names = [field.name for field in dataclasses.fields(Limits)]
         limits = Limits(**{name: self.get_parameter(name).value for name in names})
-        self._controller = Controller(limits)
+        law, robot = (self.get_parameter(name).value for name in ("law", "robot"))
+        skin = CapacitiveSkin()._replace(shell=Robot.parse(robot).shell)
+        self._controller = Controller(limits, law, skin, robot)
+        if Robot.parse(robot).drive != "omni":
+            self.get_logger().warning(
+                "the base also drives in reverse, where the skin senses nothing: "
+                "stop it there by a scanner or a bumper"
+            )
         self._twists = self.create_lifecycle_publisher(TwistStamped, "cmd_vel", 1)
         for kind, topic, callback in (
             (Odometry, "odom", self._odometry),

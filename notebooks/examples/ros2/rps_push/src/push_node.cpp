@@ -44,6 +44,9 @@ class PushNode : public rclcpp_lifecycle::LifecycleNode {
     limits.path_age = get_parameter("path_age").as_double();
     limits.lookahead = get_parameter("lookahead").as_double();
     controller_ = std::make_unique<rps_push::Controller>(limits);
+    if (rps_push::has_axle)
+      RCLCPP_WARN(get_logger(), "the base also drives in reverse, where the skin senses nothing: "
+                                "stop it there by a scanner or a bumper");
     twists_ = create_publisher<geometry_msgs::msg::TwistStamped>("cmd_vel", 1);
     const auto latest = rclcpp::SensorDataQoS().keep_last(1);
     odometry_ = create_subscription<nav_msgs::msg::Odometry>(

@@ -15,6 +15,15 @@
 
 namespace rps_push {
 
+// Of a base that cannot move sideways: the odometry is that of its axle, and so is the command.
+#ifdef LAW_AXLE
+constexpr bool has_axle = true;
+constexpr double axle = LAW_AXLE;  // [m] behind the middle, whose pose the law gets
+#else
+constexpr bool has_axle = false;
+constexpr double axle = 0;
+#endif
+
 struct Limits {
   double v_max = 0.05;         // [m/s] speed in any direction
   double omega_max = 0.15;     // [rad/s]
@@ -55,8 +64,8 @@ class Controller {
 
   void odometry(double time, double x, double y, double yaw) {
     if (!(std::isfinite(x) && std::isfinite(y) && std::isfinite(yaw))) return;
-    obs_.p_world_robot[0] = static_cast<law_real>(x);
-    obs_.p_world_robot[1] = static_cast<law_real>(y);
+    obs_.p_world_robot[0] = static_cast<law_real>(x + axle * std::cos(yaw));
+    obs_.p_world_robot[1] = static_cast<law_real>(y + axle * std::sin(yaw));
     obs_.yaw = static_cast<law_real>(yaw);
     odometry_ = time;
   }
@@ -119,6 +128,7 @@ class Controller {
       command.status = "the law returns error " + std::to_string(code);
       return sent_ = command;
     }
+    if (has_axle) twist.v_y = 0;
     const double speed = std::hypot(double(twist.v_x), double(twist.v_y));
     const double share = speed > limits_.v_max ? limits_.v_max / speed : 1.0;
     const double room = limits_.a_max * period, turn = limits_.alpha_max * period;

@@ -1,0 +1,403 @@
+"""Fit friction, pressure and offsets of sensors to pushes of one object by one round finger.
+
+    rps fit object outline.csv pushes.csv --radius 0.00475
+
+Contact alone shows how the camera is placed against the robot and the markers on the object: at the
+end of a push the finger touches the outline. The pressure under the object is the exponential of a
+few smooth functions, and the push that ends at the measured pose has a friction. All are fitted
+together, with priors, to robust residuals (Cauchy).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pandas as pd
+import xarray as xr
+from numpy.typing import ArrayLike
+from scipy.optimize import least_squares
+
+from rps_jax import errors
+from rps_jax.analysis.report import Section
+from rps_jax.engines import finger
+from rps_jax.errors import InputError
+from rps_jax.geometry import planar
+from rps_jax.record.options import option
+from rps_jax.record.table import Table
+from rps_jax.runs.question import Question, Rows, Run, call_of
+
+# Priors (mean, standard deviation) of the parameters; pressures are logarithms per unit of the
+# functions of `_pressure`, offsets are in m and rad.
+PRIOR: Mapping[str, tuple[float, float]] = {
+    "log_friction": (-1.5, 0.4),
+    "ring": (0.3, 1.0),
+    "tilt_x": (0.0, 0.4),
+    "tilt_y": (0.0, 0.4),
+    "saddle": (0.0, 0.4),
+    "shear": (0.0, 0.4),
+    "camera_x": (0.0, 1e-3),
+    "camera_y": (0.0, 1e-3),
+    "marker_x": (0.0, 5e-4),
+    "marker_y": (0.0, 5e-4),
+    "marker_yaw": (0.0, 0.015),
+    "size": (0.0, 5e-3),
+    "finger": (0.0, 1e-4),
+}
+_OFFSETS = {"camera_x": "m", "camera_y": "m", "marker_x": "m", "marker_y": "m", "marker_yaw": "rad"}
+_GAP = 2e-4  # [m] standard deviation of gaps
+_MOST_GAP = 5e-4  # [m] median gap at the end that a fit leaves, at most
+_INSIDE = 5e-3  # [m] of the finger in the object at the start, at most
+# Scatter of a prediction, from other objects: a constant and a share of the motion. Quantiles of
+# errors over the scatter at 90 %, and the number of pushes that they count for in a fit.
+_SCATTER = {"place": (3e-4, 0.045), "turn": (5e-3, 0.075)}
+_QUANTILE, _PSEUDO = {"place": 2.6, "turn": 2.7}, 20
+_FEW, _BATCH = 32, 512  # pushes of a batch
+_PADS = 64
+_COLUMNS = {"push": "", "time": "s", "x": "m", "y": "m", "yaw": "rad", "tip_x": "m", "tip_y": "m"}
+
+
+class Pushes(NamedTuple):
+    """Pushes of one object: arrays of n pushes."""
+
+    path: np.ndarray  # (n, P, 2) [m] of the finger's middle, world; straight between points
+    start: np.ndarray  # (n, 3) [m, m, rad] measured pose of the object before
+    end: np.ndarray  # (n, 3) after; NaN where unknown
+
+
+PushesLike = str | Path | pd.DataFrame | Pushes
+
+
+def read_pushes(pushes: PushesLike) -> Pushes:
+    """Return pushes from a table with a row for each time of each push.
+
+    Columns are `push`, `time` [s], the pose `x`, `y` [m], `yaw` [rad] of the object and the middle
+    `tip_x`, `tip_y` [m] of the finger.
+
+    Raises:
+      InputError: the table lacks a column or numbers, or the times of a push do not increase.
+    """
+    if isinstance(pushes, Pushes):
+        return pushes
+    if isinstance(pushes, pd.DataFrame):
+        if missing := [x for x in _COLUMNS if x not in pushes]:
+            raise InputError(f"pushes lack the column {missing[0]}: give {', '.join(_COLUMNS)}.")
+        columns = {name: np.asarray(pushes[name], float) for name in _COLUMNS}
+    else:
+        table = Table(Path(pushes), f"pushes = {pushes}", _COLUMNS.get, {})
+        table.require(_COLUMNS)
+        columns = {name: table.values_of(name) for name in _COLUMNS}
+    rows = np.column_stack(list(columns.values()))
+    if not len(rows) or not np.isfinite(rows).all():
+        raise errors.not_allowed("pushes", "a table with gaps", "give finite numbers, m and rad")
+    if abs(rows[:, [2, 3, 5, 6]]).max() > 50 or abs(rows[:, 4]).max() > 50:
+        largest = f"numbers up to {abs(rows[:, 2:]).max():.3g}"
+        raise errors.not_allowed("pushes", largest, "give x and y in m and yaw in rad")
+    parts = [rows[rows[:, 0] == name] for name in dict.fromkeys(rows[:, 0])]
+    for part in parts:
+        if len(part) < 2 or (np.diff(part[:, 1]) <= 0).any():
+            rule = "give 2 or more rows whose times increase"
+            raise errors.not_allowed("time", f"that of push {part[0, 0]:g}", rule)
+    length = max(map(len, parts))
+    path = [np.concatenate([x[:, 5:], np.repeat(x[-1:, 5:], length - len(x), 0)]) for x in parts]
+    return Pushes(np.array(path), *(np.array([x[i, 2:5] for x in parts]) for i in (0, -1)))
+
+
+def _pressure(theta: Mapping[str, jax.Array], pads: np.ndarray) -> jax.Array:
+    """Return the shares (S,) of the load of pads of equal density."""
+    at, load = pads[:, :2], pads[:, 2]
+    at = at - load @ at
+    x, y = (at / jnp.sqrt(load @ jnp.sum(at**2, axis=1))).T
+    functions = {"ring": x * x + y * y - 1, "tilt_x": x, "tilt_y": y}
+    functions |= {"saddle": x * x - y * y, "shear": 2 * x * y}
+    logarithm: Any = sum(theta[name] * value for name, value in functions.items())
+    share = load * jnp.exp(jnp.clip(logarithm, -8.0, 8.0))
+    return share / share.sum()
+
+
+def _slider(x: jax.Array, outline: np.ndarray, pads: np.ndarray, radius: float) -> Any:
+    """Return the object that parameters describe, and the offset (2,) [m] of the camera."""
+    theta = dict(zip(PRIOR, x, strict=True))
+    size, shift = 1 + theta["size"], jnp.stack([theta["marker_x"], theta["marker_y"]])
+
+    def placed(points: np.ndarray) -> jax.Array:
+        return planar.rotate(theta["marker_yaw"], size * points) + shift
+
+    support = jnp.column_stack([placed(pads[:, :2]), _pressure(theta, pads), pads[:, 3]])
+    friction = jnp.exp(theta["log_friction"])
+    slider = finger.Slider(placed(outline), support, friction, radius + theta["finger"])
+    return slider, jnp.stack([theta["camera_x"], theta["camera_y"]])
+
+
+@partial(jax.jit, static_argnames="steps")
+def _simulate(
+    x: jax.Array, fixed: tuple, path: jax.Array, start: jax.Array, end: jax.Array, steps: int
+) -> tuple[jax.Array, jax.Array]:
+    """Return final poses (n, 3), and the gaps (n, 2) [m] at measured starts and ends."""
+    slider, camera = _slider(x, *fixed)
+    pushed = finger.push(slider, path + camera, start, steps)
+    gap = jax.vmap(lambda pose, tip: finger.gap_of(slider, pose, tip + camera)[0])
+    gaps = jnp.stack([gap(start, path[:, 0]), gap(end, path[:, -1])], axis=1)
+    return pushed.pose[:, -1], gaps
+
+
+@partial(jax.jit, static_argnames="steps")
+def _derivatives(
+    x: jax.Array, fixed: tuple, path: jax.Array, start: jax.Array, end: jax.Array, steps: int
+) -> tuple[jax.Array, jax.Array]:
+    """Return the derivatives of `_simulate` by the parameters, along the last axis."""
+    return jax.jacfwd(_simulate)(x, fixed, path, start, end, steps)
+
+
+@dataclass(frozen=True)
+class ObjectFit:
+    """Fitted object: parameters, their covariance, and predictions."""
+
+    data: xr.Dataset  # `mean`, `deviation`, `prior` (parameter), `covariance`, `gap` (push) [m]
+    outline: np.ndarray  # (N, 2) [m] counter-clockwise
+    radius: float  # [m] of the finger
+    quantile: Mapping[str, float]  # of the errors over their scatter, at 90 %
+
+    @property
+    def friction(self) -> float:
+        """Friction between object and finger [1]."""
+        return float(np.exp(self.data["mean"].sel(parameter="log_friction")))
+
+    @property
+    def feet(self) -> np.ndarray:
+        """Pads (S, 5) of the pressure for `register_object`, at most 16."""
+        pads = next(
+            p for n in range(14, 0, -1) if len(p := finger.uniform_pads(self.outline, n)) <= 16
+        )
+        theta = {name: jnp.asarray(float(self.data["mean"].sel(parameter=name))) for name in PRIOR}
+        share = np.asarray(_pressure(theta, pads), float)
+        return np.column_stack([pads[:, :2], share, np.ones(len(pads)), pads[:, 3]])
+
+    def predict(self, pushes: PushesLike) -> xr.Dataset:
+        """Predict pushes.
+
+        Returns:
+          `pose` (push, axis) [m, m, rad] at the end, and the radii `place` [m] and `turn` [rad]
+          (push) within which 90 % of the measured ends are expected.
+        """
+        pushes = read_pushes(pushes)
+        pose, slope = self._pose_and_slope(pushes)
+        scatter = _scatter(pose, slope, pushes.start, self.data.covariance.values)
+        radii = {name: ("push", self.quantile[name] * x) for name, x in scatter.items()}
+        coords = {"axis": ["x", "y", "yaw"]}
+        return xr.Dataset({"pose": (("push", "axis"), pose), **radii}, coords)
+
+    def _pose_and_slope(self, pushes: Pushes) -> tuple[np.ndarray, np.ndarray]:
+        """Return final poses (n, 3) and their derivatives (n, 3, p)."""
+        x, fixed = jnp.asarray(self.data["mean"].values), _fixed(self.outline, self.radius)
+        poses, slopes = [], []
+        for first in range(0, len(pushes.path), _BATCH):
+            part, count = _padded(pushes, first)
+            inputs = (x, fixed, *part, finger.STEPS)
+            poses.append(np.asarray(_simulate(*inputs)[0], float)[:count])
+            slopes.append(np.asarray(_derivatives(*inputs)[0], float)[:count])
+        return np.concatenate(poses), np.concatenate(slopes)
+
+    @property
+    def misplaced(self) -> str:
+        """Sentence about offsets of camera and markers that differ from zero."""
+        words = []
+        for name, unit in _OFFSETS.items():
+            mean, sd = (float(self.data[x].sel(parameter=name)) for x in ("mean", "deviation"))
+            scale, unit = (1e3, "mm") if unit == "m" else (180 / np.pi, "deg")
+            if abs(mean) > 2 * sd:
+                words.append(f"{name} {scale * mean:.2f} +- {scale * sd:.2f} {unit}")
+        listing = ", ".join(words)
+        return (
+            f"The sensors are misplaced: {listing}." if words else "The sensors fit the contacts."
+        )
+
+
+def _fixed(outline: np.ndarray, radius: float) -> tuple[np.ndarray, np.ndarray, float]:
+    """Return outline, pads and radius; unused pads make programs of many outlines one."""
+    pads = finger.uniform_pads(outline)
+    unused = np.repeat(pads[-1:] * [1, 1, 0, 1], max(0, _PADS - len(pads)), axis=0)
+    return outline, np.concatenate([pads, unused]), radius
+
+
+def _padded(pushes: Pushes, first: int) -> tuple[list[jax.Array], int]:
+    """Return a batch of pushes, the last repeated so that sizes are few, and its true size."""
+    part = [np.asarray(x, float)[first : first + _BATCH] for x in pushes]
+    count = len(part[0])
+    missing = (_FEW if count <= _FEW else _BATCH) - count
+    return [jnp.asarray(np.concatenate([x, np.repeat(x[-1:], missing, 0)])) for x in part], count
+
+
+def _scatter(
+    pose: np.ndarray, slope: np.ndarray, start: np.ndarray, covariance: np.ndarray
+) -> dict[str, np.ndarray]:
+    """Return the scatter (n,) of place [m] and turn [rad], of the model and the parameters."""
+    moved = np.linalg.norm(pose[:, :2] - start[:, :2], axis=1)
+    spread = np.einsum("nip,pq,niq->ni", slope, covariance, slope)
+    # The scatter of the model grows with the motion of the object.
+    size = {"place": moved, "turn": np.abs(pose[:, 2] - start[:, 2])}
+    variance = {"place": spread[:, :2].sum(axis=1), "turn": spread[:, 2]}
+    return {
+        name: np.sqrt((least + share * size[name]) ** 2 + variance[name])
+        for name, (least, share) in _SCATTER.items()
+    }
+
+
+def errors_of(pose: np.ndarray, end: np.ndarray) -> dict[str, np.ndarray]:
+    """Return the errors (n,) of poses (n, 3): `place` [m] and `turn` [rad]."""
+    turn = (pose[:, 2] - end[:, 2] + np.pi) % (2 * np.pi) - np.pi
+    return {"place": np.linalg.norm(pose[:, :2] - end[:, :2], axis=1), "turn": np.abs(turn)}
+
+
+def fit(
+    outline: ArrayLike,
+    pushes: PushesLike,
+    radius: float,
+    prior: Mapping[str, tuple[float, float]] = PRIOR,
+) -> ObjectFit:
+    """Fit an object to measured pushes: see `FitObject`."""
+    corners = finger.check_outline(outline)
+    data = read_pushes(pushes)
+    errors.check_finite("radius", radius, at_least=1e-4, at_most=0.5, unit="m")
+    if (unknown := set(prior) - set(PRIOR)) or any(sd <= 0 for _, sd in prior.values()):
+        errors.check_name("parameter of the prior", min(unknown, default=""), PRIOR)
+    count = len(data.path)
+    if count < 3:
+        raise errors.not_allowed("pushes", count, "give 3 or more, better 5")
+    mean, deviation = np.array([{**PRIOR, **prior}[name] for name in PRIOR]).T
+    fixed, (batch, _) = _fixed(corners, radius), _padded(data, 0)
+    if count > _BATCH:
+        raise errors.not_allowed("pushes", count, f"give at most {_BATCH}")
+    size = float(np.ptp(corners, axis=0).max()) / 2
+    end, steps = data.end, finger.STEPS
+
+    def gaps_at(x: np.ndarray) -> np.ndarray:
+        return np.asarray(_simulate(jnp.asarray(x), fixed, *batch, steps)[1], float)[:count]
+
+    first = gaps_at(mean)
+    if (first[:, 0] < -_INSIDE).any():
+        i = int(np.argmin(first[:, 0]))
+        rule = f"it starts {-1e3 * first[i, 0]:.1f} mm inside the object; check outline and units"
+        raise errors.not_allowed("pushes", f"push {i}", rule)
+
+    def residuals(z: np.ndarray) -> np.ndarray:
+        """Return robust residuals of poses and gaps, and those of the priors."""
+        pose, gaps = _simulate(jnp.asarray(mean + deviation * z), fixed, *batch, steps)
+        off, gap = np.asarray(pose, float)[:count] - end, np.asarray(gaps, float)[:count] / _GAP
+        off[:, 2] = size * ((off[:, 2] + np.pi) % (2 * np.pi) - np.pi)
+        rows = np.concatenate([(off / _UNIT).ravel(), np.minimum(gap[:, 0], 0), gap[:, 1]])
+        return np.append(np.nan_to_num(np.sign(rows) * np.sqrt(np.log1p(rows**2))), z)
+
+    def slopes(z: np.ndarray) -> np.ndarray:
+        x, robust = mean + deviation * z, residuals(z)[: -len(z)]
+        pose, gap = (np.asarray(a, float)[:count] for a in _derivatives(x, fixed, *batch, steps))
+        pose = pose / _UNIT * np.array([1, 1, size])[:, None]
+        inside = gap[:, 0] * (gaps_at(x)[:, :1] < 0)
+        rows = np.concatenate([pose.reshape(-1, len(z)), inside / _GAP, gap[:, 1] / _GAP])
+        # Derivative of Cauchy's root loss g = sqrt(log(1 + r^2)), with r^2 = exp(g^2) - 1.
+        square = np.expm1(robust**2)
+        ratio = np.where(square > 1e-12, np.sqrt(square) / np.maximum(abs(robust), 1e-9), 1.0)
+        return np.concatenate([rows * (ratio / (1 + square))[:, None] * deviation, np.eye(len(z))])
+
+    best = least_squares(
+        residuals, np.zeros(len(mean)), jac=slopes, max_nfev=40, ftol=1e-4, xtol=1e-3
+    )
+    x = mean + deviation * best.x
+    gaps = gaps_at(x)[:, 1]
+    if np.median(np.abs(gaps)) > _MOST_GAP:
+        rule = (
+            "after the fit it is at most 0.5 mm if outline, units, finger and pushes are of one "
+            "object and the finger touches it at the end"
+        )
+        words = f"{1e3 * np.median(np.abs(gaps)):.2g} mm (median)"
+        raise errors.not_allowed("gap at the end of the pushes", words, rule)
+    j = slopes(best.x)
+    covariance = np.linalg.inv(j.T @ j)
+    covariance = deviation[:, None] * covariance * deviation
+    columns = {
+        "mean": ("parameter", x),
+        "deviation": ("parameter", np.sqrt(np.diag(covariance))),
+        "prior": (("parameter", "moment"), np.column_stack([mean, deviation])),
+        "covariance": (("parameter", "other"), covariance),
+        "gap": ("push", gaps),
+    }
+    data_set = xr.Dataset(columns, {"parameter": list(PRIOR)})
+    fitted = ObjectFit(data_set, corners, radius, _QUANTILE)
+    return fitted if np.isnan(end).any() else _calibrated(fitted, data)
+
+
+def _calibrated(fitted: ObjectFit, data: Pushes) -> ObjectFit:
+    """Return a fit whose quantiles also are those of its own pushes."""
+    pose, slope = fitted._pose_and_slope(data)
+    scatter = _scatter(pose, slope, data.start, fitted.data.covariance.values)
+    off, count = errors_of(pose, data.end), len(pose)
+    free = count / max(1.0, count - len(PRIOR) / 3)  # parameters take a part of each error
+    own = {name: np.sqrt(free) * np.quantile(off[name] / scatter[name], 0.9) for name in off}
+    share = count / (count + _PSEUDO)
+    quantile = {name: (1 - share) * _QUANTILE[name] + share * own[name] for name in own}
+    return ObjectFit(fitted.data, fitted.outline, fitted.radius, quantile)
+
+
+_UNIT = 1e-3  # [m] scale of Cauchy's loss
+
+
+@dataclass(frozen=True)
+class FitObject(Question[ObjectFit]):
+    """Fit friction, pressure and offsets of sensors to five tracked pushes of one object.
+
+    The finger is round and pushes slowly. The answer has the parameters with their standard
+    deviations, predicts other pushes with intervals, and says how camera and markers are misplaced.
+
+    Examples:
+      >>> import numpy as np
+      >>> import pandas as pd
+      >>> import rps_jax
+      >>> box = [(-0.05, -0.05), (0.05, -0.05), (0.05, 0.05), (-0.05, 0.05)]
+      >>> rows = [(0, 0.0, 0.0, 0.0, 0.0, -0.055, 0.02), (0, 1.0, 0.04, 0.0, 0.0, -0.015, 0.02)]
+      >>> names = ["push", "time", "x", "y", "yaw", "tip_x", "tip_y"]
+      >>> table = pd.DataFrame(rows * 3, columns=names)
+      >>> table["push"] = np.repeat([0, 1, 2], 2)
+      >>> fitted = rps_jax.fit_object(box, table, 0.005)
+      >>> dict(fitted.predict(table).pose.sizes)
+      {'push': 3, 'axis': 3}
+    """
+
+    TITLE = "An object fitted to pushes"
+
+    outline: Any = option((), positional=True)
+    """Corners x, y [m] of a simple polygon in the object's frame: an array, or a table FILE.csv
+    with the columns x and y."""
+    pushes: Any = option((), positional=True)
+    """Table FILE.csv of pushes: push, time, x, y, yaw of the object, tip_x, tip_y of the finger's
+    middle; in Python also a data frame."""
+    radius: float = option(0.005, 1e-4, 0.5, unit="m")
+    """Radius of the finger."""
+    prior: Any = option(None, kw_only=True)
+    """Priors (mean, standard deviation) of parameters by name, in Python; by default `PRIOR`."""
+
+    def answer(self, run: Run) -> ObjectFit:
+        outline = self.outline
+        if isinstance(outline, str | Path):
+            table = Table(Path(outline), f"outline = {outline}", {"x": "m", "y": "m"}.get, {})
+            table.require(("x", "y"))
+            outline = np.column_stack([table.values_of("x"), table.values_of("y")])
+        return fit(outline, self.pushes, self.radius, self.prior or PRIOR)
+
+    def report(self, results: ObjectFit, run: Run) -> Sequence[Section]:
+        data = results.data
+        rows: Rows = [["parameter", "mean", "standard deviation"]]
+        for name in PRIOR:
+            row = data.sel(parameter=name)
+            rows.append([name, f"{float(row['mean']):.4g}", f"{float(row.deviation):.2g}"])
+        gap = 1e3 * float(abs(data.gap).median())
+        text = f"{results.misplaced} The gap at the end of the pushes is {gap:.2f} mm (median)."
+        return [Section("Parameters", text, rows)]
+
+
+fit_object = call_of(FitObject)

@@ -1,0 +1,160 @@
+"""Pushes by one round finger, and objects that are fitted to them."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pandas as pd
+import pytest
+from helpers import refusing
+from numpy.testing import assert_allclose
+
+import rps_jax
+from rps_jax.engines import finger
+from rps_jax.engines.finger import Slider
+from rps_jax.tuning import objects
+from rps_jax.tuning.objects import Pushes
+
+RADIUS, FRICTION = 0.005, 0.3
+SQUARE = np.array([[-0.05, -0.05], [0.05, -0.05], [0.05, 0.05], [-0.05, 0.05]])
+ANGLES = np.pi / 4 * np.arange(8)
+STAR = np.where(np.arange(8) % 2, 0.035, 0.06)[:, None] * np.stack(
+    [np.cos(ANGLES), np.sin(ANGLES)], 1
+)
+WEDGE = np.array([[0.0, 0.0], [0.12, 0.0], [0.0, 0.04]])
+
+
+def slider_of(outline, friction=FRICTION, pads=None):
+    pads = finger.uniform_pads(outline) if pads is None else pads
+    return Slider(*map(jnp.asarray, (outline, pads, friction, RADIUS)))
+
+
+def random_pushes(outline, count, seed=0, length=0.04):
+    """Return straight pushes (n, 2, 2) onto the sides of an outline, and poses (n, 3)."""
+    rng = np.random.default_rng(seed)
+    side = rng.integers(len(outline), size=count)
+    way = np.roll(outline, -1, axis=0)[side] - outline[side]
+    at = outline[side] + rng.uniform(0.2, 0.8, (count, 1)) * way
+    normal = np.stack([way[:, 1], -way[:, 0]], axis=1) / np.linalg.norm(way, axis=1)[:, None]
+    angle = rng.uniform(-0.8, 0.8, count)[:, None]
+    tangent = np.stack([-normal[:, 1], normal[:, 0]], axis=1)
+    start = at + (RADIUS + 5e-4) * normal
+    move = length * (np.sin(angle) * tangent - np.cos(angle) * normal)
+    return np.stack([start, start + move], axis=1), np.zeros((count, 3))
+
+
+def test_a_push_through_the_centre_does_not_turn():
+    """The object moves by what the finger does beyond the gap of 5 mm."""
+    path = jnp.array([[[-0.06, 0.0], [-0.02, 0.0]]])
+    pushed = finger.push(slider_of(SQUARE), path, jnp.zeros((1, 3)))
+    assert_allclose(pushed.pose[0, -1], [0.035, 0.0, 0.0], atol=2e-5)
+    assert_allclose(pushed.gap[0, [0, -1]], [0.005, 0.0], atol=2e-5)
+
+
+def test_the_finger_stays_on_outlines_of_any_shape():
+    for outline in (SQUARE, STAR, WEDGE):
+        path, pose = random_pushes(outline, 64)
+        pushed = finger.push(slider_of(outline), jnp.asarray(path), jnp.asarray(pose))
+        gap = np.asarray(pushed.gap)
+        assert np.isfinite(pushed.pose).all()
+        assert gap.min() > -4e-4
+        assert np.median(np.abs(gap[:, -1])) < 5e-5
+
+
+def test_a_stuck_contact_turns_the_object_with_the_least_power():
+    """A two-pad bar that is pushed at right angles turns about the far pad's side (exact)."""
+    pads = np.array([[-0.04, 0.0, 0.5, 1e-5], [0.04, 0.0, 0.5, 1e-5]])
+    bar = np.array([[-0.06, -0.01], [0.06, -0.01], [0.06, 0.01], [-0.06, 0.01]])
+    start = np.array([[0.05, -0.01 - RADIUS]])
+    path = jnp.asarray(np.stack([start, start + np.array([0.0, 0.001])], axis=1))
+    pushed = finger.push(slider_of(bar, 1.0, pads), path, jnp.zeros((1, 3)), 10)
+    # Two equal pads: the force is beyond the near one, so the bar turns about the far pad.
+    assert_allclose(pushed.pose[0, -1, 2], 0.001 / 0.09, rtol=0.02)
+
+
+@pytest.mark.parametrize("name", ["outline", "pads", "friction", "radius"])
+def test_derivatives_are_those_of_differences(name):
+    path, pose = random_pushes(SQUARE, 12, seed=3)
+    with jax.enable_x64(True):
+        slider = slider_of(SQUARE)
+        value = getattr(slider, name)
+        way = jnp.asarray(np.random.default_rng(1).normal(size=value.shape))
+        way = way * (1e-3 if name != "friction" else 0.1)
+
+        def ends(s):
+            moved = slider._replace(**{name: value + s * way})
+            return finger.push(moved, jnp.asarray(path), jnp.asarray(pose), 20).pose[:, -1]
+
+        exact = jax.jvp(ends, (0.0,), (1.0,))[1]
+        step = 1e-4
+        slope = (ends(step) - ends(-step)) / (2 * step)
+    assert_allclose(exact, slope, rtol=1e-3, atol=1e-3 * float(np.abs(slope).max()))
+
+
+def test_outlines_without_sense_are_refused():
+    with refusing("sides must not cross"):
+        finger.check_outline([(0, 0), (0.1, 0.1), (0.1, 0), (0, 0.1)])
+    with refusing("outline"):
+        finger.check_outline([(0, 0), (90, 0), (90, 90)])
+    with refusing("enclose an area"):
+        finger.check_outline([(0, 0), (0.1, 0.0), (0.2, 0)])
+    assert_allclose(finger.check_outline(SQUARE[::-1]), SQUARE[::-1][::-1])
+
+
+TRUTH = {"log_friction": np.log(0.2), "ring": 0.8, "camera_x": 8e-4, "marker_yaw": 0.02}
+
+
+@pytest.fixture(scope="module")
+def measured():
+    """Noisy pushes of a known object, whose camera and markers are misplaced."""
+    path, pose = random_pushes(SQUARE, 40, seed=5)
+    x = jnp.asarray([TRUTH.get(name, 0.0) for name in objects.PRIOR])
+    inputs = [jnp.asarray(y) for y in (path, pose, pose)]
+    fixed = objects._fixed(SQUARE, RADIUS)
+    end = np.asarray(objects._simulate(x, fixed, *inputs, finger.STEPS)[0], float)
+    end = end + np.random.default_rng(0).normal(size=end.shape) * [2e-4, 2e-4, 2e-3]
+    return Pushes(path, pose, end)
+
+
+def test_a_fit_finds_the_object_and_predicts_other_pushes(measured):
+    few = Pushes(*(x[:12] for x in measured))
+    fitted = objects.fit(SQUARE, few, RADIUS)
+    data = fitted.data
+    for name, value in TRUTH.items():
+        row = data.sel(parameter=name)
+        assert abs(float(row["mean"]) - value) < 3 * float(row.deviation)
+    assert "camera_x" in fitted.misplaced
+    rest = Pushes(*(x[12:] for x in measured))
+    predicted = fitted.predict(rest)
+    off = objects.errors_of(predicted.pose.values, rest.end)
+    assert np.median(off["place"]) < 6e-4
+    assert np.mean(off["place"] < predicted.place.values) > 0.7
+    assert fitted.feet.shape[1] == 5
+    assert len(fitted.feet) <= 16
+
+
+def table_of(pushes):
+    """Return pushes as a table of the command."""
+    rows = []
+    for i, (path, start, end) in enumerate(zip(*pushes, strict=True)):
+        rows += [(i, 0.0, *start, *path[0]), (i, 1.0, *end, *path[-1])]
+    return pd.DataFrame(rows, columns=list(objects._COLUMNS))
+
+
+def test_the_command_reads_tables_and_refuses_what_makes_no_sense(measured, tmp_path):
+    table = table_of(Pushes(*(x[:6] for x in measured)))
+    table.to_csv(tmp_path / "pushes.csv", index=False)
+    pd.DataFrame(SQUARE, columns=["x", "y"]).to_csv(tmp_path / "outline.csv", index=False)
+    paths = str(tmp_path / "outline.csv"), str(tmp_path / "pushes.csv")
+    fitted = rps_jax.fit_object(*paths, RADIUS)
+    assert 0.1 < fitted.friction < 0.4
+    swapped = table.assign(time=1 - table.time)
+    with refusing("times increase"):
+        rps_jax.fit_object(SQUARE, swapped, RADIUS)
+    with refusing("in m and yaw in rad"):
+        rps_jax.fit_object(SQUARE, table.assign(x=1000 * table.x + 900), RADIUS)
+    with refusing("inside the object"):
+        rps_jax.fit_object(2 * SQUARE, table, RADIUS)
+    with refusing("gap at the end"):
+        rps_jax.fit_object(0.9 * SQUARE, table, RADIUS)
+    with refusing("lack the column"):
+        rps_jax.fit_object(SQUARE, table.drop(columns="yaw"), RADIUS)
