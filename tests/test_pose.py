@@ -13,6 +13,8 @@ from numpy.testing import assert_allclose
 import rps_jax
 from rps_jax import Details, Law, Twist
 from rps_jax.control import registry
+from rps_jax.control.laws.pose import PoseParams
+from rps_jax.control.observation import EndsObservation, Observation
 from rps_jax.geometry import footprint as fp
 from rps_jax.robot import skin as skins
 from rps_jax.robot.shell import Shell
@@ -242,6 +244,40 @@ def test_the_law_delivers_boxes_to_poses_and_ends_each_trial():
     good = results.success.values[0] > 0
     assert (results.place_error.values[0][good] < 0.05).all()
     assert (results.heading_error.values[0][good] < 0.1).all()
+
+
+def last_twist(law, weight, K_y, y):
+    """Return the twist (3,) after 30 steps of contact with a face that is off the line by y [m].
+
+    The contact of the last step has a weight.
+    """
+    params = PoseParams(K_y=K_y)
+    truth = jnp.ones((), weight.dtype)
+    target = jnp.array([2.0, y])
+    touch = Observation(jnp.zeros(2), jnp.zeros(()), jnp.array([0.3625, 0.0]), truth, target)
+    touch = touch._replace(yaw_target=jnp.zeros(()))
+    ends, seen = jnp.array([0.15, -0.15]), jnp.ones(2, bool)
+    signals = jnp.zeros(42), jnp.ones(42, bool)
+    obs = EndsObservation(touch, *signals, ends, seen, seen[0], jnp.asarray(0.3625))
+    state = jax.lax.fori_loop(0, 29, lambda _, s: law.step(params, s, obs)[0], law.init(params))
+    obs = obs._replace(touch=touch._replace(in_contact=weight))
+    return jnp.stack(law.step(params, state, obs)[1])
+
+
+def test_the_smooth_law_mixes_its_pushes_by_the_weight_of_the_contact():
+    hard = registry.law_of(PoseParams())
+    smooth = registry.smooth_law(hard)
+    inputs = 0.2, jnp.asarray(0.01)
+    expected = jax.jit(last_twist, static_argnums=0)(hard, jnp.ones((), bool), *inputs)
+    assert expected[0] > 0
+    assert_allclose(expected[1], 0.2 * 0.01, rtol=1e-3)
+    weigh = jax.jit(lambda w, K: last_twist(smooth, w, K, inputs[1]))
+    assert_allclose(weigh(jnp.asarray(1.0), 0.2), expected, atol=1e-7)
+    slopes = jax.jit(jax.jacfwd(lambda w, K: last_twist(smooth, w, K, inputs[1]), (0, 1)))
+    by_weight, by_gain = slopes(jnp.asarray(0.9), 0.2)
+    numeric = (weigh(jnp.asarray(0.91), 0.2) - weigh(jnp.asarray(0.89), 0.2)) / 0.02
+    assert_allclose(by_weight, numeric, atol=2e-4)
+    assert by_gain[1] > 1e-3
 
 
 def test_tolerances_are_options_of_the_task():

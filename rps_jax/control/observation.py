@@ -94,7 +94,7 @@ class TaxelObservation(NamedTuple):
 class EndsObservation(NamedTuple):
     """Observation of a law that also senses where the contact on the front ends."""
 
-    touch: Observation  # `in_contact` is a bool
+    touch: Observation
     signal: Annotated[
         Float[Array, " T"], Spec("1", "filtered relative change of capacitance; 0 for a dead taxel")
     ]

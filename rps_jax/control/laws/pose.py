@@ -48,6 +48,7 @@ import jax
 import jax.numpy as jnp
 
 from rps_jax import spec
+from rps_jax.control import soft
 from rps_jax.control.base import ApproachSpeed, Law, OmegaMax, SpeedMax, SuccessDistance
 from rps_jax.control.observation import Details, EndsObservation, Observation, Twist
 from rps_jax.geometry import planar
@@ -167,8 +168,16 @@ class PoseState(NamedTuple):
 check = partial(spec.check, prefix="pose.")
 
 
-def init(params: PoseParams) -> PoseState:
+class Smooth(NamedTuple):
+    """Smooth form of the law, which has no widths."""
+
+    def check(self) -> None:
+        """Do nothing."""
+
+
+def init(params: PoseParams, temperatures: Smooth | None = None) -> PoseState:
     """Return the state before the first contact."""
+    del temperatures
     zero = jnp.zeros_like(jnp.asarray(params.r, float))
     count, no, point = jnp.zeros((), jnp.int32), zero > 0, jnp.zeros(2, zero.dtype)
     sides = jnp.zeros(4, zero.dtype)
@@ -265,14 +274,19 @@ def observe_sent(
 
 
 def step(
-    params: PoseParams, state: PoseState, obs: EndsObservation
+    params: PoseParams,
+    state: PoseState,
+    obs: EndsObservation,
+    temperatures: Smooth | None = None,
 ) -> tuple[PoseState, Twist, Details]:
-    """Compute one control step."""
+    """Compute one control step; in the smooth form the contact is a weight."""
+    del temperatures
     touch, omni = obs.touch, obs.touch.axle is None
     axle = jnp.asarray(0.0 if touch.axle is None else touch.axle)
     half_length = obs.front
     base, yaw, goal = *filtered_pose(params, state, touch), touch.p_world_target
-    theta, touches = jnp.asarray(touch.yaw_target), jnp.asarray(touch.in_contact)
+    theta, weight = jnp.asarray(touch.yaw_target), jnp.asarray(touch.in_contact)
+    touches = weight if weight.dtype == bool else weight > 0.5
     u = planar.unit(yaw)
     grid = planar.unit(theta + jnp.arange(4) * (jnp.pi / 2))  # (4, 2) d_j
     p_world_front = base + half_length * u
@@ -428,9 +442,9 @@ def step(
     t_even = jnp.where(turns, 0.0, t_even)
 
     # Q6.
-    lateral = jnp.where(touches, jnp.where(last_leg, -y, 0.0), offset)
+    lateral = soft.where(weight, jnp.where(last_leg, -y, 0.0), offset)
     steer = 0.0 if omni else jnp.clip(params.K_h * lateral, -params.h_max, params.h_max)
-    bound = jnp.where(touches, params.omega_push, params.omega_max)
+    bound = soft.where(weight, params.omega_push, params.omega_max)
     omega = jnp.where(touched, jnp.clip(planar.wrap(psi + steer - yaw), -bound, bound), 0.0)
     v = jnp.where(touched, params.v_max, params.v_approach)
     v_last, v_side = (
@@ -438,9 +452,9 @@ def step(
         jnp.clip(-0.5 * beside, 0.015, params.v_max),
     )
     slow = jnp.where(last_leg, v_last, jnp.where(leg % 2 == 1, v_side, v))
-    v = jnp.where(touches & touched, slow, v)
-    bound = jnp.where(touches, params.slope * v, 0.4 * params.v_max)
-    gain = jnp.where(touches, params.K_y, 0.5)
+    v = soft.where(weight, jnp.where(touched, slow, v), v)
+    bound = soft.where(weight, params.slope * v, 0.4 * params.v_max)
+    gain = soft.where(weight, params.K_y, 0.5)
     may_slide = omni & touched & (touches | (t_push == 0))
     v_y = jnp.where(may_slide, jnp.clip(gain * lateral, -bound, bound), 0.0)
     # Q7 and Q8.
@@ -510,6 +524,7 @@ LAW = Law(
     drives=("omni", "differential"),
     room=1.5,
     heading=True,
+    temperatures=Smooth(),
     is_done=is_done,
     observe_sent=observe_sent,
 )

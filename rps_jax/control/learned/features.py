@@ -56,7 +56,7 @@ def ends_observation(
     """Return the observation of a law that senses the ends of contacts: `taxel_observation`."""
     signal = skins.signals(skin, state, footprint)
     alive = state.alive if state.signal.size else jnp.ones(signal.shape, bool)
-    touch = touch._replace(in_contact=reading.contact_type != NONE)
+    del reading  # `touch` has the contact, or its weight of a smooth law
     threshold = getattr(skin, "threshold", CapacitiveSkin().threshold)
     return EndsObservation(
         touch, signal, alive, *skins.ends_of(signal, alive, skin.shell, threshold)
