@@ -379,3 +379,10 @@ def test_only_processors_that_a_process_may_use_are_counted(monkeypatch):
     assert engines.get("fused").workers("cpu") == 3
     monkeypatch.delattr(os, "sched_getaffinity")
     assert device.count_processors() == 128
+
+
+def test_columns_that_are_views_with_strides_are_written():
+    values = np.moveaxis(np.arange(30_000.0).reshape(2, 5000, 3), -1, 0)[0]
+    content = files.encode_results(xr.Dataset({"x": (("row", "time"), values)}))
+    read = files.decode_results(content, "x.nc")
+    np.testing.assert_array_equal(read.x, values)

@@ -62,8 +62,9 @@ class Shadow(BagQuestion[xr.Dataset]):
     def steps(self) -> Arrays:
         """Steps of the bag."""
         law = registry.law_of(self.params)
-        shapes = validation.observation_shapes(law.senses, heading=law.heading)
-        return bags.read(Path(self.file), self.topics, named_leaves(shapes))
+        shapes = validation.observation_shapes(law.senses)
+        names = [*named_leaves(shapes), *(("yaw_target",) if law.heading else ())]
+        return bags.read(Path(self.file), self.topics, names)
 
     def check(self) -> None:
         """Check the law, the robot and the bag."""
