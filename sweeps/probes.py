@@ -93,6 +93,8 @@ PROBES_OF: Mapping[str, tuple[str, ...]] = {
     "floors_*": ("floor",),
     "drives": ("drives", "wide", "hostile", "real"),
     "pose*": ("pose",),
+    "drives_omni": ("wide", "hostile", "real"),
+    "drives_engines": ("drives", "push_mujoco"),
     "engines_*": ("wide", "mujoco", "mjx", "quasistatic"),
     "export_*": ("export_c", "export_js", "wide"),
     "attack": ("attack", "tune_es"),

@@ -134,16 +134,6 @@ def stamps(form: str) -> Change:
 DEG, MM = 180 / np.pi, 1000.0
 TITLES = [*push(1)]
 CAPITALS = renamed(**{name: name.title().replace("_", " ") for name in TITLES})
-UNITS = renamed(
-    time="time [s]",
-    x="x (m)",
-    y=" y [ m ]",
-    yaw="yaw {rad}",
-    v_x="v_x [m/s]",
-    v_y="v_y [m s^-1]",
-    omega="omega / (rad/s)",
-    contact_type="contact_type [-]",
-)
 OTHER = {"time": ("time [ms]", 1e3), "x": ("x [mm]", MM), "y": ("Y (cm)", 100.0)}
 OTHER |= {"yaw": ("yaw [deg]", DEG), "v_x": ("v_x [mm/s]", MM), "omega": ("omega [°/s]", DEG)}
 OTHER |= {"contact_x": ("contact_x [mm]", MM), "contact_y": ("contact_y [mm]", MM)}

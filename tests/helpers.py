@@ -205,10 +205,21 @@ def moved(
 def temporary_names() -> Iterator[None]:
     """Restore the registries at the end of the block."""
     tables = (
-        *(objects.FAMILIES, objects.REGISTERED, registry.LAWS, registry._LAWS_BY_CLASS),
-        *(domain.QUANTITIES, domain.LABELS, domain.REGISTERED, domain.OBJECT_QUANTITIES),
-        *(tasks.TASKS, tasks.QUANTITIES, tasks.UNRANGED, tasks.OUTCOMES, tasks.FAILURES),
-        *(streams._OWNERS, engines._REGISTERED),
+        objects.FAMILIES,
+        objects.REGISTERED,
+        registry.LAWS,
+        registry._LAWS_BY_CLASS,
+        domain.QUANTITIES,
+        domain.LABELS,
+        domain.REGISTERED,
+        domain.OBJECT_QUANTITIES,
+        tasks.TASKS,
+        tasks.QUANTITIES,
+        tasks.UNRANGED,
+        tasks.OUTCOMES,
+        tasks.FAILURES,
+        streams._OWNERS,
+        engines._REGISTERED,
     )
     saved: list[Any] = [table.copy() for table in tables]
     try:

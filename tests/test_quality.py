@@ -30,9 +30,9 @@ def test_the_table_has_intervals_over_the_seeds():
     }
     coords = {"count": [64], "seed": [1, 2], "method": methods, "budget": ["wall 10 s"]}
     start, first, second = race.table(xr.Dataset(variables, coords))
-    assert start[:4] == ["64", "", "start", 0.5]
+    assert start[:4] == ["64", "", "start", 50.0]
     assert first[1:3] == ["wall time, 10 s", "derivatives"]
-    half = 12.7062 * 0.125  # of Student's t with 1 degree of freedom
-    assert_allclose(first[3], [0.875, 0.875 - half, 0.875 + half], rtol=1e-4)
+    half = 12.7062 * 12.5  # of Student's t with 1 degree of freedom
+    assert_allclose(first[3], [87.5, 87.5 - half, 87.5 + half], rtol=1e-4)
     assert first[5:] == ["75.0, 100.0", "+3 -0", "6"]
-    assert_allclose(second[4], [0.25, 0.25, 0.25])
+    assert_allclose(second[4], [25.0, 25.0, 25.0])

@@ -5,16 +5,14 @@ import shlex
 import pytest
 from helpers import ROOT
 
-from rps_jax.app.cli import flags, names
+from rps_jax.app.cli import flags
 from sweeps.learned.variants import VARIANTS, Variants, variants
 
 
 @pytest.mark.parametrize("name", VARIANTS)
 def test_a_variant_has_valid_options(name, monkeypatch):
     monkeypatch.chdir(ROOT)
-    words = shlex.split(Variants().command(name))[2:]
-    question, _ = flags.parse(names.question_type("learn"), "learn", words)
-    question.validate()
+    flags.read(shlex.split(Variants().command(name))[1:])[0].validate()
 
 
 @pytest.mark.slow

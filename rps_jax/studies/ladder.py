@@ -51,11 +51,9 @@ class _TestSweep(Sweep):
     def labelled(self, outcomes: xr.Dataset, run: Run) -> xr.Dataset:
         outcomes = super().labelled(outcomes, run)
         laws = [registry.law_of(self.chosen[str(law)]) for law in outcomes.law.values]
-        about = {"senses": "what the law senses", "drives": "bases that can follow the law"}
-        columns = [law.senses for law in laws], [" ".join(law.drives) for law in laws]
-        pairs = zip(about.items(), columns, strict=True)
-        coords = {name: ("law", x, {"long_name": text}) for (name, text), x in pairs}
-        return outcomes.assign_coords(coords)
+        senses = "law", [x.senses for x in laws], {"long_name": "what the law senses"}
+        drives = "law", [" ".join(x.drives) for x in laws], {"long_name": "bases it can move"}
+        return outcomes.assign_coords(senses=senses, drives=drives)
 
     def report(self, results: xr.Dataset, run: Run) -> Sequence[Section]:
         first, *rest = super().report(results, run)

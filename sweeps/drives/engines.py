@@ -5,7 +5,7 @@ rps sweeps/drives/engines.py --worlds 100
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import ClassVar
 
@@ -26,9 +26,9 @@ class DriveEngines(Drives):
     TITLE: ClassVar[str] = "Drives in two engines"
     QUICK: ClassVar[Mapping[str, object]] = {"worlds": 4}
 
-    bases: tuple[str, ...] = tuple(name for name in BASES if "holonomic" not in name)
+    bases: Sequence[str] = tuple(name for name in BASES if "holonomic" not in name)
     """Names of bases."""
-    domains: tuple[str, ...] = ("wide",)
+    domains: Sequence[str] = ("wide",)
     """Names of domains."""
 
     @property

@@ -66,13 +66,13 @@ class Drives(TrialQuestion[xr.Dataset], Study[xr.Dataset]):
     QUICK: ClassVar[Mapping[str, object]] = {"worlds": 32}
     CHOICES: ClassVar = {"bases": BASES, "domains": DOMAINS}
 
-    bases: Sequence[str] = tuple(BASES)
+    bases: Sequence[str] = (OMNI, *(x for x in BASES if "holonomic" not in x))
     """Names of bases."""
     domains: Sequence[str] = DOMAINS
     """Names of domains."""
     worlds: int = option(10000, 2, 10_000_000)
     """Number of worlds of each domain."""
-    setting: Setting = field(default=Setting("fused", seed=7017), kw_only=True)
+    setting: Setting = field(default=Setting("fused", seed=9029), kw_only=True)
 
     @property
     def plans(self) -> dict[str, Plan]:

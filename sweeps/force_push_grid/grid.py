@@ -143,7 +143,7 @@ def build_law(
         return state, Twist(v_robot[0], v_robot[1], zero), Details.from_obs(touch)
 
     exact = LoadCell(noise=0.0, time_constant=0.05, threshold=0.0)
-    return Law(init, step, "force", check=force_push.check, cell=exact)
+    return Law(init, step, "force", cell=exact)
 
 
 def moments(slider: SliderName) -> np.ndarray:

@@ -15,7 +15,6 @@ from typing import ClassVar
 
 import xarray as xr
 
-from rps_jax.control.laws import force_push_published
 from rps_jax.physics import EngineName, get_engine
 from rps_jax.questions import Run, call_of, option
 from rps_jax.trials.progress import SequentialProgress
@@ -49,7 +48,6 @@ class ForcePushGrid(QuickStudy[xr.Dataset]):
     def check(self) -> None:
         """Check the names, and that the engine supports these pushes."""
         super().check()
-        force_push_published.check(grid.PARAMS)
         engine = get_engine(self.engine)
         engine.check_senses("force")
         engine.check_traced()

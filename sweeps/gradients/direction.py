@@ -104,7 +104,7 @@ class Direction(Study[xr.Dataset], SimulationQuestion[xr.Dataset]):
         columns = [
             {"name": "parameters", "merge": True},
             {"name": "estimate"},
-            {"name": "cosine", "format": "{:.2f}", "rest": "{:.2f}"},
+            {"name": "cosine", "format": "{:.2f}", "rest": " [{:.2f}, {:.2f}]"},
             {"name": "without an error", "format": "{:.2f}"},
             {"name": "simulated", "format": "{:,.0f} s"},
         ]

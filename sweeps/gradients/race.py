@@ -254,8 +254,12 @@ class Race(Study[xr.Dataset], SimulationQuestion[xr.Dataset]):
             {"name": "parameters", "merge": True},
             {"name": "equal", "merge": True},
             {"name": "method"},
-            {"name": "success", "format": "{:.1%}", "rest": "{:.1%}"},
-            {"name": "derivatives ahead by", "format": "{:+.1%}", "rest": "{:+.1%}"},
+            {"name": "success", "format": "{:.1f} %", "rest": " [{:.1f}, {:.1f}]"},
+            {
+                "name": "derivatives ahead by",
+                "format": "{:+.1f} points",
+                "rest": " [{:+.1f}, {:+.1f}]",
+            },
             {"name": "by seed"},
             {"name": "gained, lost"},
             {"name": "generations"},
@@ -319,8 +323,8 @@ def table(results: xr.Dataset) -> list[list[Any]]:
         of_count = results.sel(count=count)
         start = of_count.start_success
         if budget == results.budget.values[0]:
-            rows.append([str(count), "", "start", float(start.mean()), None, "", "", ""])
-        means = of_count.success.sel(budget=budget).mean("world")
+            rows.append([str(count), "", "start", 100 * float(start.mean()), None, "", "", ""])
+        means = 100 * of_count.success.sel(budget=budget).mean("world")
         for method in map(str, results.method.values):
             chosen = of_count.sel({"method": method})  # `method` is an argument of `sel`
             values, ahead = means.sel({"method": method}).values, None
@@ -328,7 +332,7 @@ def table(results: xr.Dataset) -> list[list[Any]]:
                 ahead = interval(means.sel({"method": FIRST}).values - values)
             compared = [statistics.compare(start, x) for x in chosen.success.sel(budget=budget)]
             gained, lost = (sum(getattr(c, x) for c in compared) for x in ("gained", "lost"))
-            seeds = ", ".join(f"{100 * x:.1f}" for x in values)
+            seeds = ", ".join(f"{x:.1f}" for x in values)
             counts = f"+{gained} -{lost}", f"{float(chosen.generations.mean()):.0f}"
             name, amount, unit = str(budget).split()
             label = f"{name} time, {float(amount):,g} {unit}"
@@ -341,16 +345,18 @@ def draw(results: xr.Dataset) -> Figure:
     sheet, axes = tiles(
         results.sizes["budget"], 2, (3.5, 2.2), (0.0, 0.0), sharex=True, sharey=True
     )
-    counts, means = results["count"].values, results.success.mean("world")
+    counts, means = results["count"].values, 100 * results.success.mean("world")
     for ax, budget in zip(axes.ravel(), results.budget.values, strict=False):
-        ax.plot(counts, results.start_success.mean("world"), "k:", label="start")
+        ax.plot(counts, 100 * results.start_success.mean("world"), "k:", label="start")
         for at, method in enumerate(results.method.values):
             values = means.sel({"budget": budget, "method": method})
             mean, *limits = np.transpose([interval(x) for x in values.values])
             error = np.abs(np.array(limits) - mean) if limits else None
             marks = {"marker": "o", "markersize": 3, "capsize": 2}
             ax.errorbar(counts * 1.08**at, mean, error, label=method, **marks)
-        ax.set(xscale="log", xlabel="tuned parameters", ylabel="success", title=f"equal {budget}")
+        ax.set(
+            xscale="log", xlabel="tuned parameters", ylabel="success [%]", title=f"equal {budget}"
+        )
         ax.grid(alpha=0.3)
     axes[0, 0].legend()
     return sheet

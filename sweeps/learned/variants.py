@@ -25,7 +25,6 @@ from rps_jax.analysis import statistics
 from rps_jax.app.cli import flags
 from rps_jax.questions import Run, call_of, option
 from rps_jax.record import provenance
-from rps_jax.tuning.learn import Learn
 from sweeps.study_base import Parts, QuickStudy, Table, write_table
 
 # `learned_gru.npz` and `learned_mlp.npz` are the laws of 0.3, with which variants start.
@@ -115,10 +114,9 @@ class Variants(QuickStudy[xr.Dataset]):
         questions = [self._question(name).configuration() for name in self.variants]
         return super().configuration() | {"learn": questions}
 
-    def _question(self, name: str, *options: str) -> Learn:
+    def _question(self, name: str, *options: str) -> Any:
         """Return the run of a variant, with further options."""
-        words = [*shlex.split(self.command(name))[2:], *options]
-        return flags.parse(Learn, "learn", words)[0]
+        return flags.read([*shlex.split(self.command(name))[1:], *options])[0]
 
     def parts(self, run: Run) -> Parts:
         """Return the run of each variant, by its name."""

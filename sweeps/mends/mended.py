@@ -14,7 +14,7 @@ from rps_jax import Details, Law, Observation, RPSParams, RPSState, Twist, regis
 from rps_jax.control.laws import rps, rps_plus
 from rps_jax.control.observation import displacement
 from rps_jax.geometry import planar
-from rps_jax.laws import law_of
+from rps_jax.laws import law_of, resolve_law
 
 TUNED = RPSParams.tuned()
 
@@ -79,9 +79,8 @@ def step(
     felt = jnp.where(touching, p_world, state.p_world_felt)
     lost = jnp.where(touching, 0.0, state.lost + rps_state.touched)
     p_robot_felt = planar.rotate(-obs.yaw, felt - obs.p_world_robot)
-    plus: Any = rps_plus.RPSPlusParams(
-        params.law, params.d_near, params.press, params.n_lost, params.ahead, params.aside
-    )
+    plus: Any = resolve_law("rps_plus")[1]
+    plus = plus._replace(**{name: getattr(params, name) for name in plus._fields})
     for condition, replacement in (
         (flush, turning),
         (near, rps_plus.translation(plus, d, obs.yaw)),

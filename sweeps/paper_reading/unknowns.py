@@ -7,12 +7,12 @@ simulation and on the hardware; the others belong to one of these.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
 from rps_jax import Range, RPSParams
-from rps_jax.control.laws.aps import APSParams
+from rps_jax.laws import LawParams, resolve_law
 
 Part = Literal["text", "hardware", "simulation"]
 
@@ -83,11 +83,12 @@ def params(u: np.ndarray) -> RPSParams:
     return RPSParams()._replace(**known | {name: values(u, name) for name in _OF_RPS})
 
 
-def aps_params(u: np.ndarray) -> APSParams:
+def aps_params(u: np.ndarray) -> LawParams:
     """Return the parameters of APS (n,) under the readings at points u (n, q)."""
-    known = {name: np.full(len(u), value) for name, value in APSParams()._asdict().items()}
+    aps: Any = resolve_law("aps")[1]
+    known = {name: np.full(len(u), value) for name, value in aps._asdict().items()}
     drawn = {name: values(u, f"aps_{name}") for name in known if f"aps_{name}" in UNKNOWNS}
-    return APSParams()._replace(**known | drawn)
+    return aps._replace(**known | drawn)
 
 
 def redraw_hardware(

@@ -310,8 +310,17 @@ RECIPES: dict[str, Recipe] = {
         gpu=2,
         section="Flat against round",
     ),
-    "drives": recipe(f"rps sweeps/drives {_MACHINE}", cores=600, gpu=20),
-    "pose*": recipe(f"rps sweeps/pose {_MACHINE}", cores=120, gpu=5),
+    "pose_parity": recipe(f"rps sweeps/pose/parity.py --worlds 60 {_MACHINE}", cores=10),
+    "pose*": recipe(f"rps sweeps/pose --worlds 1000 {_MACHINE}", cores=20),
+    "drives": recipe(f"rps sweeps/drives --worlds 5000 {_MACHINE}", cores=300, gpu=6),
+    "drives_omni": recipe(
+        "rps sweeps/drives --seed 7017 --bases 'holonomic, rps_plus' 'holonomic, rps_reposition' "
+        f"'round, holonomic, rps_plus' 'round, holonomic, rps_reposition' {_MACHINE}",
+        cores=200,
+        gpu=5,
+        section="Drives",
+    ),
+    "drives_engines": recipe(f"rps sweeps/drives/engines.py {_MACHINE}", cores=15),
     "corridors_*": recipe(
         "rps sweeps/corridors --laws rps rps_tuned rps_plus learned force_push dipole aps "
         f"rps_tuned,sweeps/corridors/tuned.json {_MACHINE}",

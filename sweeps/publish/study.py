@@ -24,7 +24,7 @@ from typing import Any, Literal
 import xarray as xr
 
 from rps_jax import InputError, errors
-from rps_jax.app.cli import flags, names
+from rps_jax.app.cli import flags
 from rps_jax.questions import Run, Section, call_of
 from rps_jax.record import provenance
 from sweeps import probes
@@ -225,10 +225,9 @@ def run_recipe(name: str, recipe: Recipe, runs: Path, device: str) -> None:
 def _run_command(words: list[str], runs: Path) -> tuple[Sequence[Section], Any, dict[str, Any]]:
     """Run a command; return the sections of its report, its results and its provenance."""
     (_, *options), folder = split_folder(words)
-    name, options = names.split([re.sub(r"\bruns/", f"{runs}/", word) for word in options])
+    options = [re.sub(r"\bruns/", f"{runs}/", word) for word in options]
     out = runs / Path(folder or _folder_name(words)).name
-    options += ["--out", str(out)]
-    question, _ = flags.parse(names.question_type(name), name, options)
+    question, _ = flags.read([*options, "--out", str(out)])
     question.validate()
     arguments, sys.argv = sys.argv, list(words)  # the run folder stores the command
     try:

@@ -13,7 +13,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Annotated, TypeVar, get_args, get_origin
+from typing import Annotated, Any, TypeVar, get_args, get_origin
 
 import tyro
 from tyro import _docstrings, _errors
@@ -26,12 +26,13 @@ from tyro.constructors import (
     StructTypeInfo,
 )
 
+from rps_jax.app.cli import names
 from rps_jax.engines.device import Device
 from rps_jax.errors import InputError, check_name, suggest
 from rps_jax.record import options
 from rps_jax.record.options import option
 from rps_jax.runs.push import FILM_LENGTH, TraceQuestion
-from rps_jax.runs.question import Command, SimulationQuestion, current_names
+from rps_jax.runs.question import Command, Question, SimulationQuestion, current_names
 from rps_jax.spec import Spec, specs_of
 from rps_jax.trials.setting import PhysicsField, Setting
 from rps_jax.trials.trial import Rules
@@ -77,6 +78,12 @@ def session_type(question_type: type) -> type[Session]:
     if issubclass(question_type, TraceQuestion):
         return FilmSession
     return FolderSession if issubclass(question_type, SimulationQuestion) else Session
+
+
+def read(words: list[str]) -> tuple[Question[Any], Session]:
+    """Return the question and session of the words after `rps`."""
+    name, options = names.split(words)
+    return parse(names.question_type(name), name, options)
 
 
 def parse(question_type: type[Q], command: str, words: Sequence[str]) -> tuple[Q, Session]:
