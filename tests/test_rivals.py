@@ -316,7 +316,9 @@ def with_taxels(observation):
 
 
 def with_ends(observation):
-    """Return an observation with an even contact about the contact point, within the front."""
+    """Return an observation with a goal's heading, and an even contact within the front."""
+    heading = planar.direction(jnp.asarray(observation.p_world_target - observation.p_world_robot))
+    observation = observation._replace(yaw_target=heading)
     y = jnp.asarray(observation.p_robot_contact[1])
     ends = jnp.clip(y + jnp.array([0.15, -0.15]), -0.29, 0.29)
     alive, seen = jnp.ones(42, bool), jnp.abs(ends) < 0.29
