@@ -138,7 +138,8 @@ class SceneRenderer:
         if "goal" in self._lines:
             ends = [[*x, _ARROW_HEIGHT] for x in self._lines["goal"]]
             arrow = self._add_geom("mjGEOM_ARROW", np.zeros(3), np.zeros(3), PATH_RGBA)
-            self.mujoco.mjv_connector(arrow, arrow.type, 0.03, *map(np.array, ends))
+            self.mujoco.mjv_connector(arrow, arrow.type, 0.05, *map(np.array, ends))
+            arrow.size[2] *= 2  # MuJoCo draws half of it
         if not np.isnan(contact).any():
             position, size = np.array([*contact, CONTACT_HEIGHT]), np.full(3, CONTACT_RADIUS)
             marker = self._add_geom("mjGEOM_SPHERE", size, position, CONTACT_RGBA)
