@@ -22,6 +22,7 @@ from rps_jax.geometry.arrays import (
     Vector,
 )
 from rps_jax.robot.robot import Robot
+from rps_jax.robot.skin import Ends
 from rps_jax.spec import Spec
 
 # Displacements are clipped to this distance [m], so that no finite float32 overflows.
@@ -69,6 +70,10 @@ class Observation(NamedTuple):
             facts |= {"axle": robot.axle_behind, "turning_radius": robot.turning_radius}
             facts |= {"half_length": robot.half_length}
         return self._replace(**facts)
+
+    def with_ends(self, signal: Array, alive: Array, ends: Ends) -> EndsObservation:
+        """Return it with the signals (T,) of taxels, whether these work, and the ends."""
+        return EndsObservation(self, signal, alive, *ends)
 
     @property
     def l(self) -> Floats:  # noqa: E743

@@ -274,6 +274,11 @@ class CapacitiveSkin(NamedTuple):
         first, last = _extremes(active, middles)
         return state, _reading(jnp.minimum(jnp.sum(active), LINE), first, last)
 
+    def ends(self, state: SkinState) -> Ends:
+        """Return the ends of the contact on the front after a scan: see `ends_of`."""
+        signal = jnp.where(state.alive, state.signal, 0.0)
+        return ends_of(signal, jnp.asarray(state.alive, bool), self.shell, self.threshold)
+
     def sense(
         self, state: SkinState, footprint: Footprint, period: Scalar
     ) -> tuple[SkinState, Reading]:

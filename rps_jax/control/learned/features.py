@@ -58,9 +58,7 @@ def ends_observation(
     alive = state.alive if state.signal.size else jnp.ones(signal.shape, bool)
     del reading  # `touch` has the contact, or its weight of a smooth law
     threshold = getattr(skin, "threshold", CapacitiveSkin().threshold)
-    return EndsObservation(
-        touch, signal, alive, *skins.ends_of(signal, alive, skin.shell, threshold)
-    )
+    return touch.with_ends(signal, alive, skins.ends_of(signal, alive, skin.shell, threshold))
 
 
 # By what a law senses.

@@ -13,8 +13,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from rps_jax import InputError, Observation, Robot
-from rps_jax.laws import EndsObservation, law_of, resolve_law
-from rps_jax.worlds import CapacitiveSkin, PathCourse, Polyline, ends_of
+from rps_jax.laws import law_of, resolve_law
+from rps_jax.worlds import CapacitiveSkin, PathCourse, Polyline
 
 _VERTICES = 1024  # of a path, at most
 
@@ -147,10 +147,9 @@ class Controller:
         self._contact = np.asarray(reading.p_robot_contact), bool(reading.in_contact)
         self._scanned = self._input_times["taxels"] = time
 
-    def _with_ends(self, state: Any, obs: Observation) -> EndsObservation:
+    def _with_ends(self, state: Any, obs: Observation) -> Any:
         signal = jnp.where(state.alive, state.signal, 0.0)
-        ends = ends_of(signal, state.alive, self._skin.shell, self._skin.threshold)
-        return EndsObservation(obs, signal, state.alive, *ends)
+        return obs.with_ends(signal, state.alive, self._skin.ends(state))
 
     def _decide(self, period: float) -> tuple[Any, Any]:
         obs = Observation(self._pose[:2], self._pose[2], *self._contact, self._target, period)
