@@ -97,7 +97,7 @@ class TaxelObservation(NamedTuple):
 
 
 class EndsObservation(NamedTuple):
-    """Observation of a law that also senses where the contact on the front ends."""
+    """Observation of a law that also senses the ends of the contact on the front."""
 
     touch: Observation
     signal: Annotated[

@@ -320,7 +320,7 @@ def signals(skin: Skin, state: SkinState, footprint: Footprint) -> Float[Array, 
 
 
 class Ends(NamedTuple):
-    """Where a contact on the front ends."""
+    """Ends of a contact on the front."""
 
     ends: Float[Array, "2"]  # [m] offsets of the left and the right end; 0 without contact
     seen: Bool[Array, "2"]  # whether the object ends there, not the front or its taxels

@@ -64,7 +64,7 @@ _FLUSH, _UNEVEN = 0.4, -1.0  # [s] of even contact, and of uneven contact
 _HALF = 0.07, 0.5  # [m] half widths of objects
 _CARROT, _AHEAD = 0.5, 1.0  # [rad] of the aim on the circle: omnidirectional or not
 _PAST = 0.35  # [m] of the front beyond the face, at which an approach has failed
-_ASIDE = 0.1  # [m] of the next approach after one that felt nothing
+_SIDESTEP = 0.1  # [m] of the next approach after one that felt nothing
 _WIDER = 0.1  # [m] of the circle, after a touch on the way
 _TURNS = 0.8  # [rad] between base and leg, up to which the base turns while it touches
 
@@ -169,7 +169,7 @@ check = partial(spec.check, prefix="pose.")
 
 
 class Smooth(NamedTuple):
-    """Smooth form of the law, which has no widths."""
+    """Options of the smooth form: none."""
 
     def check(self) -> None:
         """Do nothing."""
@@ -376,7 +376,7 @@ def step(
     is_lost = (t_lost > 0.6) & (state.t_push > 0)
     failed = pushing & touched & (state.t_push == 0) & ~touches & (along > _PAST - behind)
     # Nothing is felt there: the object lies ahead, perhaps at a dead taxel, and is sought aside.
-    ahead_of_front = planar.rotate(yaw, jnp.stack([params.r, state.side * _ASIDE]))
+    ahead_of_front = planar.rotate(yaw, jnp.stack([params.r, state.side * _SIDESTEP]))
     h = jnp.where(failed, grid @ (p_world_front + ahead_of_front - goal) + params.r, h)
     p_world_contact = jnp.where(failed, p_world_front, p_world_contact)
     known, looking = known & ~failed, looking & ~failed
