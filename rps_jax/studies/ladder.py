@@ -31,7 +31,7 @@ from rps_jax.trials.progress import ProgressCallback, SequentialProgress
 from rps_jax.worlds import DomainLike
 
 REFERENCE = "rps_tuned"  # the law that all others are compared with
-_MARKS = "osD^"  # of the senses in the figure
+_MARKS = "osvD^"  # of the senses in the figure
 
 
 def all_laws() -> tuple[str, ...]:
