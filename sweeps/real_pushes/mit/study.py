@@ -149,9 +149,9 @@ class Mit(QuickStudy[xr.Dataset]):
     def _share(self, label: str) -> xr.Dataset:
         """Fit 20 % of the pushes of a cell with the default priors, and predict the others."""
         cell = read(Path(self.data), label)
-        rows = np.split(_order(cell, 0), [len(cell.published) // 5])
-        errors, fitted = self._predicted(cell, *rows, PRIOR)
-        gap = objects.gaps_at_end(cell.outline, _chosen(cell.pushes, rows[0]), RADIUS)
+        rows, others = np.split(_order(cell, 0), [len(cell.published) // 5])
+        errors, fitted = self._predicted(cell, rows, others, PRIOR)
+        gap = objects.gaps_at_end(cell.outline, _chosen(cell.pushes, rows), RADIUS)
         gaps = {"gap_before": np.nanmedian(np.abs(gap)), "gap_after": abs(fitted.data.gap).median()}
         return errors.assign(mean=fitted.data["mean"], **gaps)
 
@@ -181,10 +181,8 @@ class Mit(QuickStudy[xr.Dataset]):
             prior = dict(zip(PRIOR, zip(means.mean(axis=0), spread, strict=True), strict=True))
         by_method = []
         for count in (5, 20):
-            draws = [
-                self._predicted(cell, *np.split(_order(cell, draw), [count]), prior)[0]
-                for draw in range(self.draws)
-            ]
+            orders = [_order(cell, draw) for draw in range(self.draws)]
+            draws = [self._predicted(cell, x[:count], x[count:], prior)[0] for x in orders]
             by_method.append(xr.concat(draws, "draw"))
         off = objects.errors_of(cell.published, cell.pushes.end)
         padding = (0, 700 - len(cell.published))
