@@ -282,6 +282,7 @@ RECIPES: dict[str, Recipe] = {
         section="Grounds beside a rigid object",
     ),
     "straight": recipe(f"rps sweeps/ground/straight.py {_MACHINE}", cores=4),
+    "support*": recipe(f"rps sweeps/ground/support.py {_MACHINE}", cores=1),
     "force_push_grid": recipe("rps sweeps/force_push_grid", cores=4, section="Pushes that succeed"),
     "mends": recipe(
         *_each("rps sweeps/mends --domain {} --worlds 4096 --seed 80", *_WIDE[::-1]),
@@ -310,6 +311,8 @@ RECIPES: dict[str, Recipe] = {
         gpu=2,
         section="Flat against round",
     ),
+    "pose_parity": recipe(f"rps sweeps/pose/parity.py --worlds 30 {_MACHINE}", cores=10),
+    "pose*": recipe(f"rps sweeps/pose --worlds 300 {_MACHINE}", cores=20),
     "drives": recipe(f"rps sweeps/drives --worlds 5000 {_MACHINE}", cores=300, gpu=6),
     "drives_omni": recipe(
         "rps sweeps/drives --seed 7017 --bases 'holonomic, rps_plus' 'holonomic, rps_reposition' "
@@ -318,7 +321,7 @@ RECIPES: dict[str, Recipe] = {
         gpu=5,
         section="Drives",
     ),
-    "drives_engines": recipe(f"rps sweeps/drives/engines.py {_MACHINE}", cores=15),
+    "drives_engines": recipe(f"rps sweeps/drives/engines.py --worlds 60 {_MACHINE}", cores=15),
     "corridors_*": recipe(
         "rps sweeps/corridors --laws rps rps_tuned rps_plus learned force_push dipole aps "
         f"rps_tuned,sweeps/corridors/tuned.json {_MACHINE}",
