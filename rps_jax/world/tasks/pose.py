@@ -173,8 +173,8 @@ class Pose(Task):
         """Return the goals."""
         heading = self.heading.at(inputs.u["heading"]) + inputs.bearing
         tolerances = (np.full(heading.shape, x) for x in (self.d_success, self.yaw_success))
-        course: Any = (inputs.p_world_target, heading, *tolerances)
-        return inputs.p_world_target, PoseCourse(*course)
+        leaves: Any = (inputs.p_world_target, heading, *tolerances)
+        return inputs.p_world_target, PoseCourse(*leaves)
 
 
 TASK = Pose
