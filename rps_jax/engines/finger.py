@@ -108,10 +108,10 @@ def push(
     The leaves of `slider` may have a leading axis B. The finger goes straight between points of a
     path, at any speed.
     """
-    ranks = (2, 2, 0, 0)
-    batched: Any = Slider(
-        *(0 if jnp.ndim(x) > rank else None for x, rank in zip(slider, ranks, strict=True))
-    )
+    axes: list[Any] = [
+        0 if jnp.ndim(x) > rank else None for x, rank in zip(slider, (2, 2, 0, 0), strict=True)
+    ]
+    batched = Slider(*axes)
     one = partial(_push, steps=steps)
     with trace_one_world():
         return jax.vmap(one, in_axes=(batched, 0, 0))(slider, path, pose)
