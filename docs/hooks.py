@@ -78,6 +78,7 @@ TABS: dict[str, list[Any]] = {
         "docs/on_a_robot.md",
         "robots",
         "drives",
+        "pose",
         "limits",
         "export",
         "notebooks/examples/ros2/rps_push/README.md",

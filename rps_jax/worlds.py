@@ -2,7 +2,6 @@
 
 from rps_jax.geometry.polyline import Polyline as Polyline
 from rps_jax.robot.skin import CapacitiveSkin as CapacitiveSkin
-from rps_jax.robot.skin import IdealSkin as IdealSkin
 from rps_jax.trials.case import Case as Case
 from rps_jax.world.domain import DomainLike as DomainLike
 from rps_jax.world.domain import parse_domain as parse_domain

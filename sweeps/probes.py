@@ -54,6 +54,7 @@ PROBES = {
     "feet": f"{_FAST} --domain wide,feet=0.5:0.9 --horizon 60",
     "round": f"{_FAST} --domain wide --robot round {_SHORT}",
     "drives": f"sweep --worlds 24 --laws unicycle --robot ideal,drive=differential {_SHORT}",
+    "pose": f"sweep --worlds 16 --laws pose --task pose --domain {_BOX} --horizon 60",
     "path": f"{_FAST} learned --task path {_SHORT}",
     "corridor": f"{_FAST} learned --task corridor {_SHORT}",
     "floor": f"{_FAST} --domain wide,slope=0:0.05,boundary_factor=1:2 {_SHORT}",
@@ -91,6 +92,7 @@ PROBES_OF: Mapping[str, tuple[str, ...]] = {
     "force_push_grid": ("real", "push_mujoco"),
     "floors_*": ("floor",),
     "drives": ("drives", "wide", "hostile", "real"),
+    "pose*": ("pose",),
     "drives_omni": ("wide", "hostile", "real"),
     "drives_engines": ("drives", "push_mujoco"),
     "engines_*": ("wide", "mujoco", "mjx", "quasistatic"),
@@ -121,7 +123,7 @@ PROBES_OF: Mapping[str, tuple[str, ...]] = {
     "round_base*": ("round",),
     **dict.fromkeys(("arena", "commands*", "compilers*", "costs", "derivatives*", "gpus"), ()),
     **dict.fromkeys(("kernel", "levers", "robot", "speed*", "tasks_cost_*"), ()),
-    **dict.fromkeys(("dependencies", "extras"), ()),
+    **dict.fromkeys(("dependencies", "environments_gpu", "extras"), ()),
 }
 
 

@@ -274,7 +274,7 @@ def test_derivatives_are_dropped_with_a_warning_where_all_scores_are_alike(check
 
 
 def test_features_have_the_target_and_not_the_pose_of_the_object():
-    """Pose and offset of the contact predict failures by what both share with the world."""
+    """With pose and offset, derivatives point against the slopes of whole trials."""
     batch = draw_worlds("wide,objects=random_box,gap=0.3:0.3", setting=SETTING)
     world = jax.tree.map(jnp.asarray, soften_skins(rows(batch.worlds, 0)))
     params = RPSParams.paper()

@@ -49,6 +49,7 @@ LAWS = [
     "learned_small",
     "learned",
     "unicycle",
+    "pose",
 ]
 # Law and robot, one that cannot move sideways.
 DRIVEN = "unicycle_car ideal,drive=car,turning_radius=0.5,axle=0.3"
@@ -99,7 +100,7 @@ def test_a_fault_in_c_is_detected(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("compiler", COMPILERS)
-@pytest.mark.parametrize("name", ["rps_plus", "learned_small", CUSTOM])
+@pytest.mark.parametrize("name", ["rps_plus", "learned_small", "pose", CUSTOM])
 def test_the_folder_compiles_without_a_warning_and_runs(name, compiler, tmp_path, registries):
     exported = program.program(name, "kairos")
     texts = folder.files(exported, "law")

@@ -60,6 +60,7 @@ def recipe_folder(tmp_path, monkeypatch):
     }
     monkeypatch.setattr(study, "RECIPES", recipes)
     monkeypatch.setattr(study, "_SWEEPS", tmp_path)
+    monkeypatch.setattr(probes, "FILE", tmp_path / "publish" / "probes.json")
     return tmp_path
 
 

@@ -22,7 +22,13 @@ from rps_jax.control.laws.guided import GuidedParams
 from rps_jax.control.laws.pursuit import PursuitParams
 from rps_jax.control.laws.rps import RPSParams, RPSState
 from rps_jax.control.laws.rps_plus import RPSPlusParams
-from rps_jax.control.observation import ForceObservation, PoseObservation, TaxelObservation, Twist
+from rps_jax.control.observation import (
+    EndsObservation,
+    ForceObservation,
+    PoseObservation,
+    TaxelObservation,
+    Twist,
+)
 from rps_jax.geometry import planar
 from rps_jax.trials import pushes
 from rps_jax.trials.pushes import Case
@@ -309,6 +315,17 @@ def with_taxels(observation):
     return TaxelObservation(observation, signal, jnp.asarray(False))
 
 
+def with_ends(observation):
+    """Return an observation with a goal's heading, and an even contact within the front."""
+    heading = planar.direction(jnp.asarray(observation.p_world_target - observation.p_world_robot))
+    observation = observation._replace(yaw_target=heading)
+    y = jnp.asarray(observation.p_robot_contact[1])
+    ends = jnp.clip(y + jnp.array([0.15, -0.15]), -0.29, 0.29)
+    alive, seen = jnp.ones(42, bool), jnp.abs(ends) < 0.29
+    even, front = jnp.ones((), bool), jnp.asarray(0.3625)
+    return EndsObservation(observation, jnp.zeros(42), alive, ends, seen, even, front)
+
+
 @partial(jax.jit, static_argnums=0)
 def second_twist(law, params, observation):
     """Return the twist (3,) of a law's second step."""
@@ -325,6 +342,7 @@ def twist_of(name, touch, p_object, force=(-20.0, 5.0)):
         "force": with_force(touch, force),
         "pose": with_pose(touch, p_object),
         "taxels": with_taxels(touch),
+        "ends": with_ends(touch),
     }[law.senses]
     return np.asarray(second_twist(law, params, observation))
 

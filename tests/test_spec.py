@@ -135,8 +135,8 @@ def test_every_number_of_every_law_has_unit_and_meaning():
     """The C header, the module and the model of a law print them."""
     laws = (registry.LAWS | registry._HIDDEN).items()
     records = [program.SkinParams, program.Skin, program.Scan, program.Contact, Twist, Details]
-    for senses in ("touch", "taxels", "force", "pose"):
-        observation = validation.observation_shapes(senses)
+    for senses in ("touch", "taxels", "ends", "force", "pose"):
+        observation = validation.observation_shapes(senses, heading=True)
         assert all(re.match(r"\[.+\] \S", x.about) for x in fields_of(observation)), senses
     for kind in records:
         assert all(re.match(r"\[.+\] \S", str(specs_of(kind)[name])) for name in kind._fields)

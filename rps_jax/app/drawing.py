@@ -63,8 +63,11 @@ def furnish(server: ViserServer) -> None:
 class Drawing:
     """Bodies, paths and arrows of the current push in the 3-D scene."""
 
-    def __init__(self, server: ViserServer, scene: Scene) -> None:
-        """Add the bodies of a scene, in place of the last push."""
+    def __init__(self, server: ViserServer, scene: Scene, turns: bool = False) -> None:
+        """Add the bodies of a scene, in place of the last push.
+
+        With `turns`, the target has a heading, which an arrow shows and a hand can turn.
+        """
         world = self._world = server.scene
         world.remove_by_name(_ROOT)
         world.add_frame(_ROOT, show_axes=False)
@@ -73,10 +76,14 @@ class Drawing:
             TARGET,
             scale=0.45,
             active_axes=(True, True, False),
-            disable_rotations=True,
+            disable_rotations=not turns,
             depth_test=False,
             opacity=0.7,
         )
+        if turns:  # the arrow ends at the target
+            tail, shape = np.array([[[-0.4, 0, 0.02], [0, 0, 0.02]]]), {"head_length": 0.12}
+            colour = _rgb(rendering.PATH_RGBA)
+            world.add_arrows(f"{TARGET}/heading", tail, colour, shaft_radius=0.02, **shape)
         self._base = world.add_frame(f"{_ROOT}/base", show_axes=False)
         self._object = world.add_frame(f"{_ROOT}/object", show_axes=False)
         _add_geoms(world, scene.model)
@@ -113,11 +120,13 @@ class Drawing:
                 position=(*((start + end) / 2), half_height),
             )
 
-    def place_target(self, p_world_target: ArrayLike) -> None:
-        """Put the target at (2,) [m], unless a user drags it."""
+    def place_target(self, p_world_target: ArrayLike, yaw: float | None = None) -> None:
+        """Put the target at (2,) [m] with a heading [rad], unless a user drags it."""
         if not self.held:
             x, y = np.asarray(p_world_target, float)
             self.target.position = (x, y, 0.0)
+            if yaw is not None:
+                self.target.wxyz = solid.quaternion(yaw)
 
     def show(self, past: Sequence[Moment], index: int) -> None:
         """Draw one moment, and the paths up to there."""

@@ -27,7 +27,7 @@ from rps_jax.record.files import Arrays
 from rps_jax.record.options import option
 from rps_jax.robot import robot as robots
 from rps_jax.robot.robot import Robot, RobotLike
-from rps_jax.robot.skin import with_contacts
+from rps_jax.robot.skin import CapacitiveSkin, check_taxels, ends_of, with_contacts
 from rps_jax.runs.question import BagQuestion, Run, call_of
 from rps_jax.tuning.logs import COLUMNS, motion_faults
 from rps_jax.world.tasks.path import PathCourse
@@ -61,8 +61,10 @@ class Shadow(BagQuestion[xr.Dataset]):
     @cached_property
     def steps(self) -> Arrays:
         """Steps of the bag."""
-        shapes = validation.observation_shapes(registry.law_of(self.params).senses)
-        return bags.read(Path(self.file), self.topics, named_leaves(shapes))
+        law = registry.law_of(self.params)
+        shapes = validation.observation_shapes(law.senses)
+        names = [*named_leaves(shapes), *(("yaw_target",) if law.heading else ())]
+        return bags.read(Path(self.file), self.topics, names)
 
     def check(self) -> None:
         """Check the law, the robot and the bag."""
@@ -144,6 +146,17 @@ def pursued(recorded: Arrays, lookahead: float) -> np.ndarray:
     return np.asarray(aims.p_world_target)
 
 
+def recorded_ends(signal: np.ndarray, robot: Robot) -> Arrays:
+    """Return the ends of contacts of recorded signals (N, T), by the default skin.
+
+    A taxel whose signal is always 0 counts as dead.
+    """
+    alive = jnp.asarray((signal != 0).any(axis=0))
+    each = jax.vmap(lambda x: ends_of(x, alive, robot.shell, CapacitiveSkin().threshold))
+    ends = each(jnp.asarray(signal))._asdict()
+    return {**ends, "alive": np.broadcast_to(alive, signal.shape)}
+
+
 def shadowed(law: Law, params: LawParams, recorded: Arrays, robot: Robot = Robot()) -> np.ndarray:
     """Return the twists (N, 3) [m/s, m/s, rad/s] of a law on a robot for observations of a bag.
 
@@ -157,6 +170,9 @@ def shadowed(law: Law, params: LawParams, recorded: Arrays, robot: Robot = Robot
     values = recorded | {"p_world_robot": pose[:, :2], "yaw": pose[:, 2]}
     values |= {"in_contact": contact_type > 0, "line": contact_type == 2}
     values |= {"p_world_target": recorded["target"]}
+    if law.senses == "ends" and "signal" in recorded:
+        check_taxels(recorded["signal"], robot.shell, "the bag")
+        values |= recorded_ends(recorded["signal"], robot)
 
     def value_of(path: Sequence[Any], shape: jax.ShapeDtypeStruct) -> jax.Array:
         """Return the values (N, ...) of a field of the observation."""
@@ -181,5 +197,5 @@ def shadowed(law: Law, params: LawParams, recorded: Arrays, robot: Robot = Robot
 
     sent = jnp.asarray(np.pad(recorded["twist"][:-1], ((1, 0), (0, 0))), float)
     params = jax.tree.map(lambda x: jnp.asarray(x, float), params)
-    shapes = validation.observation_shapes(law.senses)
+    shapes = validation.observation_shapes(law.senses, robot.shell.count, law.heading)
     return np.asarray(run(params, jax.tree_util.tree_map_with_path(value_of, shapes)))

@@ -35,7 +35,7 @@ from rps_jax.runs.push import case_options, end_in_words, program_slots, select_
 from rps_jax.runs.question import Command, call_of
 from rps_jax.trials import pushes
 from rps_jax.trials.case import Case, label_of
-from rps_jax.trials.live import CHUNK, Live
+from rps_jax.trials.live import CHUNK, Live, yaw_target
 from rps_jax.trials.progress import ProgressCallback
 from rps_jax.trials.setting import Setting
 from rps_jax.world import objects, tasks
@@ -255,7 +255,7 @@ class Page:
         self._push, self._error = push, ""
         self._cursor, self._drawn, self._playing = 0.0, (0, 0), True
         with self._server.atomic():
-            self._drawing = Drawing(self._server, push.scene)
+            self._drawing = Drawing(self._server, push.scene, push.live.yaw_target is not None)
             self._drawing.draw_lines(push.live.lines)
             self._connect(self._drawing.target.on_update, self._drag)
 
@@ -282,8 +282,10 @@ class Page:
             if self._drawn != (index, len(past)):
                 self._drawing.show(past, index)
                 self._drawn = index, len(past)
-            target = past[index].worlds.p_world_target[0]
-            self._drawing.place_target(live.p_world_target if index == last else target)
+            worlds = past[index].worlds
+            goal = (live.p_world_target, live.yaw_target)
+            stored = (worlds.p_world_target[0], yaw_target(worlds))
+            self._drawing.place_target(*(goal if index == last else stored))
 
     def _update_panel(self) -> None:
         """Update the texts and buttons of the panel."""
@@ -381,9 +383,11 @@ class Page:
 
     def _drag(self, event: Any) -> None:
         x, y, _ = event.target.position
+        w, *_, z = event.target.wxyz
         if event.target is self._drawing.target:
             self._drawing.held = event.phase != "end"
-            self._disturb(lambda live: live.set_target((float(x), float(y))))
+            yaw = 2 * math.atan2(z, w)
+            self._disturb(lambda live: live.set_target((float(x), float(y)), yaw))
 
     def _disturb(self, act: Callable[[Live], None]) -> None:
         """Disturb the push at the moment at the cursor; later moments are discarded."""

@@ -24,9 +24,10 @@ from rps_jax.spec import Bound as Bound
 from rps_jax.spec import Spec, spec_at, specs_of
 
 # What a law observes in addition to odometry and the target: the contact point (`Observation`),
-# the signal of each taxel as well (`TaxelObservation`), the contact force as well
-# (`ForceObservation`), or the object's position and size (`PoseObservation`).
-Senses = Literal["touch", "taxels", "force", "pose"]
+# the signal of each taxel as well (`TaxelObservation`), the ends of the contact on the front as
+# well (`EndsObservation`), the contact force as well (`ForceObservation`), or the object's position
+# and size (`PoseObservation`).
+Senses = Literal["touch", "taxels", "ends", "force", "pose"]
 
 
 @runtime_checkable
@@ -153,6 +154,11 @@ class Law(Generic[Params, State, Obs]):
     cell: LoadCell = LoadCell()  # the sensor of a law that senses force
     drives: tuple[DriveKind, ...] = ("omni",)  # whose bases can follow its twists
     room: float = 0.0  # [m] without walls around the object, for its detours
+    # Whether it observes the heading of the goal. Of a goal without a heading, this is the
+    # direction from the base's start to the target.
+    heading: bool = False
+    # state -> bool: whether the law declares that it is done, which ends the trial.
+    is_done: Callable[[State], jax.Array] | None = None
     # (params, state, obs, sent twist) -> state, for a law whose state holds its last command.
     observe_sent: Callable[[Params, State, Obs, Twist], State] | None = None
 

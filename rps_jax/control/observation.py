@@ -22,6 +22,7 @@ from rps_jax.geometry.arrays import (
     Vector,
 )
 from rps_jax.robot.robot import Robot
+from rps_jax.robot.skin import Ends
 from rps_jax.spec import Spec
 
 # Displacements are clipped to this distance [m], so that no finite float32 overflows.
@@ -55,6 +56,9 @@ class Observation(NamedTuple):
     half_length: Annotated[
         Number | None, Spec("m", "half length of a rectangle with such an axle")
     ] = None
+    yaw_target: Annotated[
+        Scalar | None, Spec("rad", "heading of the goal, the direction of the last push; or None")
+    ] = None
 
     def with_base(self, radius: Number | None, robot: Robot | None = None) -> Observation:
         """Return it with the static facts of a base.
@@ -66,6 +70,10 @@ class Observation(NamedTuple):
             facts |= {"axle": robot.axle_behind, "turning_radius": robot.turning_radius}
             facts |= {"half_length": robot.half_length}
         return self._replace(**facts)
+
+    def with_ends(self, signal: Array, alive: Array, ends: Ends) -> EndsObservation:
+        """Return it with the signals (T,) of taxels, whether these work, and the ends."""
+        return EndsObservation(self, signal, alive, *ends)
 
     @property
     def l(self) -> Floats:  # noqa: E743
@@ -88,6 +96,26 @@ class TaxelObservation(NamedTuple):
     ]
 
 
+class EndsObservation(NamedTuple):
+    """Observation of a law that also senses the ends of the contact on the front."""
+
+    touch: Observation
+    signal: Annotated[
+        Float[Array, " T"], Spec("1", "filtered relative change of capacitance; 0 for a dead taxel")
+    ]
+    alive: Annotated[Bool[Array, " T"], Spec("1", "whether each taxel works")]
+    ends: Annotated[
+        Float[Array, "2"], Spec("m", "offsets of the contact's left and right end; 0 without one")
+    ]
+    seen: Annotated[
+        Bool[Array, "2"], Spec("1", "whether the object ends there, not the front or its taxels")
+    ]
+    even: Annotated[
+        Bool[Array, ""], Spec("1", "whether a face lies flush on the front, over 3 taxels or more")
+    ]
+    front: Annotated[Scalar, Spec("m", "distance of the front from the base's middle")]
+
+
 class ForceObservation(NamedTuple):
     """Observation of a law that also senses the contact force."""
 
@@ -105,7 +133,9 @@ class PoseObservation(NamedTuple):
     r_object: Annotated[Scalar, Spec("m", "radius of the object's outline")]
 
 
-AnyObservation = Observation | TaxelObservation | ForceObservation | PoseObservation
+AnyObservation = (
+    Observation | TaxelObservation | EndsObservation | ForceObservation | PoseObservation
+)
 
 
 Observed = TypeVar("Observed", bound=AnyObservation)

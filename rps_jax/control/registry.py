@@ -112,7 +112,7 @@ def law_of(params: LawParams | type) -> Law:
 
 def default_law(drive: DriveKind) -> str:
     """Return the name of the law for a base with this drive, if none is named."""
-    return "rps" if drive == "omni" else laws_for(drive)[0]
+    return "rps" if drive == "omni" else "unicycle"
 
 
 def laws_for(drive: DriveKind) -> list[str]:
@@ -153,7 +153,7 @@ def check_params(params: Params) -> Params:
         of their law do not return what a trial needs.
     """
     law = law_of(params)
-    validation.check_law(law.init, law.step, law.senses, params)
+    validation.check_law(law.init, law.step, law.senses, params, heading=law.heading)
     law.check(params)
     return params
 

@@ -22,6 +22,7 @@ from rps_jax.control.base import LawParams, Senses, named_leaves
 from rps_jax.control.observation import (
     AnyObservation,
     Details,
+    EndsObservation,
     ForceObservation,
     Observation,
     PoseObservation,
@@ -44,15 +45,24 @@ _TRACER_ERRORS: dict[type[Exception], str] = {
 }
 
 
-def observation_shapes(senses: Senses, taxels: int = _TAXELS) -> AnyObservation:
-    """Return the observation of a law as `jax.ShapeDtypeStruct` leaves."""
+def observation_shapes(
+    senses: Senses, taxels: int = _TAXELS, heading: bool = False
+) -> AnyObservation:
+    """Return the observation of a law as `jax.ShapeDtypeStruct` leaves.
+
+    That of a law with a `heading` has the heading of the goal.
+    """
     dtype = jnp.result_type(float)
     shape: Callable[..., Any] = lambda *sizes: jax.ShapeDtypeStruct(sizes, dtype)  # noqa: E731
-    flag: Any = jax.ShapeDtypeStruct((), bool)
+    flags: Callable[..., Any] = lambda *sizes: jax.ShapeDtypeStruct(sizes, bool)  # noqa: E731
+    flag = flags()
     touch = Observation(shape(2), shape(), shape(2), flag, shape(2), shape())
+    touch = touch._replace(yaw_target=shape()) if heading else touch
+    signal = shape(taxels)
     observations: dict[Senses, AnyObservation] = {
         "touch": touch,
-        "taxels": TaxelObservation(touch, shape(taxels), flag),
+        "taxels": TaxelObservation(touch, signal, flag),
+        "ends": EndsObservation(touch, signal, flags(taxels), shape(2), flags(2), flag, shape()),
         "force": ForceObservation(touch, shape(2)),
         "pose": PoseObservation(touch, shape(2), shape()),
     }
@@ -60,7 +70,12 @@ def observation_shapes(senses: Senses, taxels: int = _TAXELS) -> AnyObservation:
 
 
 def check_law(
-    init: Function, step: Function, senses: Senses, params: LawParams, taxels: int = _TAXELS
+    init: Function,
+    step: Function,
+    senses: Senses,
+    params: LawParams,
+    taxels: int = _TAXELS,
+    heading: bool = False,
 ) -> None:
     """Raise InputError unless `init` and `step` return what a trial needs on a robot.
 
@@ -79,7 +94,8 @@ def check_law(
             rule = "it must be a real number, or an array of these"
             raise not_allowed(f"params.{name}", repr(value), rule)
     leaves, tree = jax.tree.flatten(params)
-    _check_traced(init, step, senses, tree, tuple(np.shape(leaf) for leaf in leaves), taxels)
+    shapes = tuple(np.shape(leaf) for leaf in leaves)
+    _check_traced(init, step, senses, tree, shapes, taxels, heading)
 
 
 @functools.lru_cache(maxsize=256)
@@ -90,13 +106,15 @@ def _check_traced(
     tree: Any,
     shapes: Sequence[tuple[int, ...]],
     taxels: int,
+    heading: bool,
 ) -> None:
     """Trace both functions of a law, and compare their results with what a trial needs."""
     dtype = jnp.result_type(float)
     params = jax.tree.unflatten(tree, [jax.ShapeDtypeStruct(shape, dtype) for shape in shapes])
     state = _trace("init", init, params)
     name = "step" if taxels == _TAXELS else f"step, for a robot with {taxels} taxels,"
-    results: Any = _trace(name, step, params, state, observation_shapes(senses, taxels))
+    observation = observation_shapes(senses, taxels, heading)
+    results: Any = _trace(name, step, params, state, observation)
 
     def check(fault: str, expected: str) -> None:
         if fault:

@@ -149,10 +149,11 @@ def identity(law: Law) -> str | None:
     It holds the names of the law's functions, at the top of modules of this package, and digests of
     bound arguments, as the weights of a network. The source of the package is a part of every key.
     """
-    names = list(map(_name_of, (law.init, law.step)))
+    functions = law.init, law.step, *((law.is_done,) if law.is_done else ())
+    names = list(map(_name_of, functions))
     if None in names:
         return None
-    return repr((names, law.senses, law.temperatures, law.smooth, law.cell))
+    return repr((names, law.senses, law.heading, law.temperatures, law.smooth, law.cell))
 
 
 def _name_of(function: object) -> object:

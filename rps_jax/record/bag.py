@@ -6,6 +6,7 @@ compression. Each topic has one message per control step, except `/tf` and the m
     /odom           nav_msgs/Odometry              pose of the base and its velocity in its frame
     /target         geometry_msgs/PointStamped     the law's target, on a path a lookahead ahead
                                                    (read, too: PoseStamped)
+    /goal           geometry_msgs/PoseStamped      target with the heading of the goal
     /path           nav_msgs/Path                  of a task, once a second; all of a bag have as
                                                    many poses; one without poses ends the steps
     /walls          visualization_msgs/Marker      of a task, once a second
@@ -82,6 +83,7 @@ class Step(NamedTuple):
     object_pose: Floats | None = None  # (3,) [m, m, rad] for viewers alone
     path: np.ndarray | None = None  # (K, 2) [m] of the task, in the world
     walls: np.ndarray | None = None  # (W, 2, 2) [m] for viewers alone
+    yaw_target: float | None = None  # [rad] heading of the goal
 
 
 def check() -> None:
@@ -117,7 +119,7 @@ def _xy(values: np.ndarray) -> np.ndarray:
     return values[:, :2]
 
 
-_TREE, _RARE = ("tf", "tf_static"), ("target", "path")  # _RARE: topics that are no streams
+_TREE, _RARE = ("tf", "tf_static"), ("target", "goal", "path")  # _RARE: topics that are no streams
 _POSITION = _floats("pose.position.xyz")
 _TF = {"tf2_msgs/TFMessage": _floats("transform.translation.xyz", "transform.rotation.xyzw")}
 _READERS: dict[str, dict[str, Callable[[Any], Floats]]] = {  # of messages, by topic and type
@@ -126,6 +128,7 @@ _READERS: dict[str, dict[str, Callable[[Any], Floats]]] = {  # of messages, by t
         "geometry_msgs/PointStamped": _floats("point.xyz"),
         "geometry_msgs/PoseStamped": _POSITION,
     },
+    "goal": {"geometry_msgs/PoseStamped": _floats("pose.position.xyz", "pose.orientation.xyzw")},
     "path": {"nav_msgs/Path": lambda m: [x for pose in m.poses for x in _POSITION(pose)]},
     "contact": {"geometry_msgs/PolygonStamped": _contact},
     "taxels": {"std_msgs/Float32MultiArray": attrgetter("data")},
@@ -140,6 +143,7 @@ _READERS: dict[str, dict[str, Callable[[Any], Floats]]] = {  # of messages, by t
 _FIELDS: dict[str, tuple[str, Callable[[np.ndarray], np.ndarray]]] = {  # of values (N, k)
     "pose": ("odom", _plane_pose),
     "target": ("target", _xy),
+    "yaw_target": ("goal", lambda v: _plane_pose(v)[:, 2]),
     "path": ("path", lambda v: v.reshape(len(v), -1, 3)[..., :2]),
     "contact_type": ("contact", lambda v: v[:, 3].astype(int)),
     "p_robot_contact": ("contact", lambda v: np.where(v[:, 3:] > 0, v[:, :2], 0.0)),
@@ -188,6 +192,9 @@ def _messages(steps: Iterable[Step]) -> Iterator[tuple[str, int, Message]]:
         child = {"header": odom, "child_frame_id": "base_link"}
         yield "/odom", stamp, {**child, "pose": pose, "twist": {"twist": _velocity(previous, step)}}
         yield "/target", stamp, {"header": odom, "point": _xyz(*step.target)}
+        if step.yaw_target is not None:
+            goal = _pose(*step.target, step.yaw_target)
+            yield "/goal", stamp, {"header": odom, "pose": goal}
         points = [_xyz(*step.p_robot_contact)] * int(step.contact_type)
         yield "/contact", stamp, {"header": base, "polygon": {"points": points}}
         if step.signal is not None:
@@ -538,7 +545,7 @@ def _to_frames(rows: Mapping[str, _Series], edges: Callable[[], _Edges], static:
     odom = rows["odom"]
     odom.refuse((odom.frames != odom.frames[0]).any(axis=1), "a change of frames")
     world, base = odom.frames[0][0] or "odom", odom.frames[0][1] or "base_link"
-    goals: dict[str, str] = dict.fromkeys(("target", "path", "object"), world)
+    goals: dict[str, str] = dict.fromkeys(("target", "goal", "path", "object"), world)
     goals |= dict.fromkeys(("contact", "force", "cmd_vel"), base)
     for key in [key for key in goals if key in rows]:
         row, goal = rows[key], goals[key]
@@ -546,9 +553,10 @@ def _to_frames(rows: Mapping[str, _Series], edges: Callable[[], _Edges], static:
             at = row.frames[:, 0] == frame
             part = row.at(at)
             matrices = _transform(part, frame, goal, edges(), static)
-            if key == "cmd_vel":
+            if key in ("cmd_vel", "goal"):
                 bad = abs(matrices - np.eye(4)).max(axis=(1, 2)) > _SAME
-                part.refuse(bad, f"the frame {frame}", f"publish commands in {goal}")
+                what = "commands" if key == "cmd_vel" else "goals"
+                part.refuse(bad, f"the frame {frame}", f"publish {what} in {goal}")
             else:
                 size = part.values.shape[1] if key == "path" else 3
                 points = part.values[:, :size].reshape(len(part.values), -1, 3)

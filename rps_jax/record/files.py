@@ -273,7 +273,8 @@ def _packed(values: np.ndarray) -> Mapping[str, object]:
         return {}
     if values.dtype.kind in "OU":
         return {"dtype": "S1"} | _COMPRESSION
-    bytes_of_sample = values.reshape(-1)[:_SAMPLE].view(np.uint8).reshape(_SAMPLE, -1)
+    sample = np.ascontiguousarray(values.reshape(-1)[:_SAMPLE])
+    bytes_of_sample = sample.view(np.uint8).reshape(_SAMPLE, -1)
     size = len(zlib.compress(bytes_of_sample.T.tobytes(), 1))
     return _COMPRESSION if size < 0.85 * bytes_of_sample.size else {}
 

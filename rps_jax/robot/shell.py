@@ -89,7 +89,7 @@ class Shell:
     @classmethod
     def of(cls, boards: tuple[Boards, ...], *sizes: Number) -> Shell:
         """Return the shell of a base, or of many bases if the `sizes` are (n,)."""
-        sides = _lengths(*(float(np.max(size)) for size in sizes))
+        sides = side_lengths(*(float(np.max(size)) for size in sizes))
         pitches = [sides[x.side] / x.taxels if x.pitch is None else np.max(x.pitch) for x in boards]
         samples = math.ceil(float(max(pitches)) / _SPACING)
         if len(sizes) == 1:
@@ -124,7 +124,7 @@ class Shell:
         """Return the positions of the rows of boards."""
         x, y = self.half
         corners = {"left": (-x, y), "front": (x, y), "right": (x, -y)}
-        rows, sides = [], _lengths(*self.sizes)
+        rows, sides = [], side_lengths(*self.sizes)
         offsets = {"left": 0.0, "front": sides["left"], "right": sides["left"] + sides["front"]}
         for boards in self.boards:
             along, side = np.array(_ALONG[boards.side]), sides[boards.side]
@@ -168,7 +168,7 @@ class Shell:
             if boards.pitch is None and boards.middle:
                 rule = "without a pitch a row covers the whole side"
                 raise errors.not_allowed("robot boards' middle", boards.middle, rule)
-        sides, previous = _lengths(*self.sizes), (0, 0.0)  # side and end [m] of the row before
+        sides, previous = side_lengths(*self.sizes), (0, 0.0)  # side and end [m] of the row before
         for boards in self.boards:
             first, length = _span(boards, sides[boards.side])
             last, end = first + length, sides[boards.side]
@@ -190,8 +190,8 @@ def _span(row: Boards, side: Number) -> tuple[Number, Number]:
     return (side - length) / 2 + (0.0 if row.middle is None else row.middle), length
 
 
-def _lengths(*sizes: Number) -> dict[Side, Number]:
-    """Return the lengths [m] of the sides of a base: see `Shell.sizes`."""
+def side_lengths(*sizes: Number) -> dict[Side, Number]:
+    """Return the lengths [m] of the sides of a base, by side: see `Shell.sizes`."""
     if len(sizes) == 1:
         return {side: share * _ARC * sizes[0] for side, share in _SHARES.items()}
     x, y = sizes

@@ -41,11 +41,14 @@ from rps_jax.geometry.footprint import Footprint
 from rps_jax.record.files import Arrays
 from rps_jax.record.options import parse_changes
 from rps_jax.robot.base import normal
-from rps_jax.robot.shell import HALF_WIDTH, Row, Shell
+from rps_jax.robot.shell import HALF_WIDTH, Row, Shell, side_lengths
 from rps_jax.spec import Spec
 
 _NODES = 16  # points on each row of boards of the smooth ideal sensor
 _REACH = 8.0  # [1] temperatures beyond the tolerance at which the points end: weight 3e-4
+# [1] of an even contact: the least and the greatest signal over the mean, and the least mean.
+_EVEN, _PROUD, _PRESSED = 0.6, 1.35, 2.0
+_COVERED = 0.5  # [1] signal over that of the neighbour, of a taxel that the object covers
 _NEVER = -1e9  # excess of a dead taxel over the threshold, in temperatures
 
 NONE, POINT, LINE = 0, 1, 2  # contact types, Fig. 6c
@@ -271,6 +274,11 @@ class CapacitiveSkin(NamedTuple):
         first, last = _extremes(active, middles)
         return state, _reading(jnp.minimum(jnp.sum(active), LINE), first, last)
 
+    def ends(self, state: SkinState) -> Ends:
+        """Return the ends of the contact on the front after a scan: see `ends_of`."""
+        signal = jnp.where(state.alive, state.signal, 0.0)
+        return ends_of(signal, jnp.asarray(state.alive, bool), self.shell, self.threshold)
+
     def sense(
         self, state: SkinState, footprint: Footprint, period: Scalar
     ) -> tuple[SkinState, Reading]:
@@ -309,6 +317,65 @@ def signals(skin: Skin, state: SkinState, footprint: Footprint) -> Float[Array, 
         return jnp.where(state.alive, state.signal, 0.0)
     perfect = CapacitiveSkin(shell=skin.shell)
     return perfect._scan(perfect.init(state.key), footprint)[1]
+
+
+class Ends(NamedTuple):
+    """Ends of a contact on the front."""
+
+    ends: Float[Array, "2"]  # [m] offsets of the left and the right end; 0 without contact
+    seen: Bool[Array, "2"]  # whether the object ends there, not the front or its taxels
+    even: Bool[Array, ""]  # whether a face lies flush on the front
+    front: Floats  # [m] of the front from the base's middle
+
+
+def ends_of(
+    signal: Float[Array, " T"], alive: Bool[Array, " T"], shell: Shell, threshold: Scalar
+) -> Ends:
+    """Return the ends of the contact on the front, from the signals [1] of the taxels.
+
+    A contact is even if no inner taxel is much below the mean of the inner ones, which are pressed.
+    The object covers a share of the outermost taxels: their signals over those of their inner
+    neighbours. An end is seen if the contact is even, and the next taxel works and feels nothing,
+    or the outermost one is not covered. Offsets are those of `Observation.l`. The simulated foam
+    senses an object up to 8 mm ahead, without force; a real one needs force, and blurs the ends.
+    """
+    rows, length = shell.rows(), sum(side_lengths(*shell.sizes).values())
+    front = jnp.asarray(shell.half[0], signal.dtype)
+    first = sum(x.taxels for x in shell.boards if x.side == "left")
+    parts, counts = [], [x.taxels for x in shell.boards if x.side == "front"]
+    for boards, row in zip(shell.boards, rows, strict=True):
+        if boards.side == "front":
+            pitch = jnp.asarray(row.length / boards.taxels, signal.dtype)
+            middles = row.offset + pitch * (np.arange(boards.taxels) + 0.5)
+            parts.append(jnp.stack([length / 2 - middles, jnp.full(boards.taxels, pitch)], axis=-1))
+    count = sum(counts)
+    if not count:
+        nothing = jnp.zeros(2, signal.dtype), jnp.zeros(2, bool), jnp.zeros((), bool)
+        return Ends(*nothing, front)
+    signal, alive = signal[first : first + count], alive[first : first + count]
+    active = (signal > threshold) & alive
+    border, empty = jnp.ones(1, bool), jnp.zeros(1, signal.dtype)
+    hidden = jnp.concatenate([border, ~alive[:-1]]), jnp.concatenate([~alive[1:], border])
+    beside = jnp.concatenate([signal[1:], empty]), jnp.concatenate([empty, signal[:-1]])
+    columns = [*jnp.concatenate(parts).T, signal, *hidden, *beside]
+    table = jnp.stack([x.astype(signal.dtype) for x in columns], axis=-1)
+    left, right = _extremes(active, table)
+    inner = active & (table[:, 0] < left[0]) & (table[:, 0] > right[0])
+    total = jnp.sum(inner)
+    outer = jnp.maximum(left[2], right[2])
+    mean = jnp.sum(jnp.where(inner, signal, 0.0)) / jnp.maximum(total, 1)
+    top = jnp.maximum(jnp.where(total > 0, mean, outer), threshold)
+    least = jnp.min(jnp.where(inner, signal, jnp.inf))
+    is_even = (least > _EVEN * top) & (outer < _PROUD * top) & (top > _PRESSED) & (total > 0)
+    # Over the inner neighbour, so that a slight tilt is no end; this may be dead.
+    inside = jnp.stack([left[5], right[6]])
+    inside = jnp.where(inside > threshold, jnp.minimum(inside, top), top)
+    share = jnp.clip(jnp.stack([left[2], right[2]]) / inside, 0.0, 1.0)
+    touches = jnp.any(active)
+    half = jnp.stack([left[1], -right[1]]) * (share - 0.5)
+    ends = jnp.where(touches, jnp.stack([left[0], right[0]]) + half, 0.0)
+    seen = (jnp.stack([left[3], right[4]]) < 0.5) | (share < _COVERED)
+    return Ends(ends, seen & is_even, is_even, front)
 
 
 def check_taxels(signal: np.ndarray, shell: Shell, source: str) -> None:

@@ -96,6 +96,9 @@ class Trace(Trajectory):
             parts = ["never touched"]
         elif "progress" in outcome.task:
             parts.append(f"{100 * float(outcome.task['progress']):.0f} % of the path passed")
+        elif "place_error" in outcome.task:
+            place, turn = (float(outcome.task[f"{x}_error"]) for x in ("place", "heading"))
+            parts.append(f"face off by {place:.3f} m and {turn:.3f} rad")
         parts += tasks.failures_of(outcome.task)
         return (
             f"target ({x:g}, {y:g}) m {'reached' if outcome.success else 'not reached'} at "
@@ -235,8 +238,9 @@ def recorded_law(law: Law, senses: Senses = "taxels") -> Law:
 def bag_steps(trajectory: Trajectory, obs: Any, period: float) -> Iterator[Step]:
     """Yield the steps of a bag of a recorded trial, with its observations (T, ...)."""
     snapshots, touch = trajectory.snapshots, obs.touch
-    lines = trajectory.world.task.lines()
+    lines = {k: x for k, x in trajectory.world.task.lines().items() if k in Step._fields}
     extra = {"signal", "f_robot", "p_world_object", "r_object"} & set(obs._fields)
+    yaws = touch.yaw_target
     for i in range(len(snapshots.time)):
         position, yaw = object_pose(snapshots.qpos[i])
         yield Step(
@@ -247,6 +251,7 @@ def bag_steps(trajectory: Trajectory, obs: Any, period: float) -> Iterator[Step]
             touch.p_robot_contact[i],
             [np.broadcast_to(v, snapshots.time.shape)[i] for v in snapshots.twist],
             object_pose=[*np.asarray(position), float(yaw)],
+            yaw_target=None if yaws is None else float(yaws[i]),
             **{name: getattr(obs, name)[i] for name in extra},
             **lines,
         )

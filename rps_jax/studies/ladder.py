@@ -31,7 +31,7 @@ from rps_jax.trials.progress import ProgressCallback, SequentialProgress
 from rps_jax.worlds import DomainLike
 
 REFERENCE = "rps_tuned"  # the law that all others are compared with
-_MARKS = "osD^"  # of the senses in the figure
+_MARKS = "osvD^"  # of the senses in the figure
 
 
 def all_laws() -> tuple[str, ...]:
@@ -50,7 +50,7 @@ class _TestSweep(Sweep):
 
     def labelled(self, outcomes: xr.Dataset, run: Run) -> xr.Dataset:
         outcomes = super().labelled(outcomes, run)
-        laws = [registry.law_of(self.chosen[str(law)]) for law in outcomes.law.values]
+        laws = [law_of(self.chosen[str(law)]) for law in outcomes.law.values]
         senses = "law", [x.senses for x in laws], {"long_name": "what the law senses"}
         drives = "law", [" ".join(x.drives) for x in laws], {"long_name": "bases it can move"}
         return outcomes.assign_coords(senses=senses, drives=drives)

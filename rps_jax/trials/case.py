@@ -67,9 +67,10 @@ class Case(TrialOptions):
     base that cannot move sideways."""
     task: TaskLike = option("reach", kw_only=True)
     """The task: reach (one target, as in the paper), path (follow a path by a lookahead),
-    corridor (a path between walls that end a trial when touched) or rooms (a planned path among the
-    obstacles of a map), or a file, as JSON of waypoints or of polygons, or a ROS map.yaml.
-    Changes follow, as corridor,width=1.2. Ranges are drawn by the seed."""
+    corridor (a path between walls that end a trial when touched), rooms (a planned path among the
+    obstacles of a map) or pose (the pushed face arrives at the target with a heading), or a file,
+    as JSON of waypoints or of polygons, or a ROS map.yaml. Changes follow, as corridor,width=1.2.
+    Ranges are drawn by the seed."""
     bearing: float = option(0.0, -6.3, 6.3, unit="rad", kw_only=True, hidden=True)
     """Rotation of the whole trial [rad]; only a friction pyramid makes a difference."""
     shift: Shift = option(Shift(), kw_only=True, hidden=True)
@@ -91,6 +92,7 @@ class Case(TrialOptions):
             self.challenge.check_target("target", self.target)
         if self.bearing:
             self.challenge.check_target("bearing", self.bearing)
+        self.challenge.check_goal(self.target, self.base.shell, lambda: scene.width_of(name))
 
     @cached_property
     def object_name(self) -> str:

@@ -15,7 +15,7 @@ import functools
 import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -27,7 +27,7 @@ from rps_jax.control.base import check_finite_leaves
 from rps_jax.control.laws import rps
 from rps_jax.control.laws.rps import RPSParams
 from rps_jax.control.learned import features
-from rps_jax.control.observation import Observation, TaxelObservation, Twist
+from rps_jax.control.observation import EndsObservation, Observation, TaxelObservation, Twist
 from rps_jax.engines import device, native
 from rps_jax.engines.base import ControlPeriod
 from rps_jax.geometry import footprint as fp
@@ -46,6 +46,7 @@ from rps_jax.world.draws import Draw
 from rps_jax.world.opengl import mujoco
 from rps_jax.world.scene import JOINTS, Scene
 from rps_jax.world.tasks import TaskLike
+from rps_jax.world.tasks.pose import PoseCourse
 
 
 class Reward(NamedTuple):
@@ -91,7 +92,10 @@ class PushEnv:
     Observation (T + 2,): the T taxels of the robot, the paper's 42, in the order of `Shell.taxels`,
     each the filtered relative change of its capacitance [1], 0 if it is dead; then the target
     (x, y) [m] in the robot's frame, at the pose that the odometry estimates. Of a path, it is the
-    point of the path a lookahead ahead of the contact.
+    point of the path a lookahead ahead of the contact. A goal with a heading adds its cosine and
+    sine in the robot's frame. With senses="ends", the last T + 5 numbers are the offsets [m] of the
+    left and the right end of the contact, whether each was seen, whether the contact is even, and
+    whether each taxel works.
 
     Action (3,): the twist (v_x, v_y, omega) in the robot's frame, in units of the parameters'
     v_max, v_max and omega_max. (v_x, v_y) is scaled down to a norm of 1, omega is clipped to +-1.
@@ -128,6 +132,7 @@ class PushEnv:
     weights: Reward = Reward()
     worlds: int = option(1024, 1, 1_000_000)
     smooth: bool = False  # whether contact is a weight, for derivatives
+    senses: Literal["taxels", "ends"] = "taxels"  # ends: also of contacts, and the dead taxels
 
     def __post_init__(self) -> None:
         """Check the options, and draw the worlds before a loop is traced."""
@@ -169,7 +174,7 @@ class PushEnv:
         obs = self._observation(world, current, measured)
         info = {"world": world, "index": index, "observation": obs}
         metrics = _metrics(current, measured, zero)
-        return State(current, _obs(current, measured), zero, zero, metrics, info)
+        return State(current, _obs(obs), zero, zero, metrics, info)
 
     @device.standard_jax()
     def step(self, state: State, action: jax.Array) -> State:
@@ -203,7 +208,7 @@ class PushEnv:
         obs = self._observation(world, current, measured)
         return state.replace(
             data=current,
-            obs=_obs(current, measured),
+            obs=_obs(obs),
             reward=jnp.where(ended, 0.0, reward),
             done=current.done.astype(reward.dtype),
             metrics=state.metrics | _metrics(current, measured, jnp.where(ended, 0.0, progress)),
@@ -260,11 +265,13 @@ class PushEnv:
         frozen = soft.tree_where(previous.done, previous, judged)
         return frozen, measured
 
-    def _observation(self, world: World, current: Trial, measured: Measurement) -> TaxelObservation:
-        """Return the observation of a law that senses taxels."""
+    def _observation(
+        self, world: World, current: Trial, measured: Measurement
+    ) -> TaxelObservation | EndsObservation:
+        """Return the observation of a law that senses taxels, or ends."""
         skin = world.skin, current.skin, trial.outline(world, current.qpos)
         touch = measured.observation._replace(period=jnp.asarray(self.dt))
-        return features.taxel_observation(touch, measured.reading, *skin)
+        return features.OBSERVATIONS[self.senses](touch, measured.reading, *skin)
 
     def has_timed_out(self, data: Trial) -> jax.Array:
         """Return whether trials (...) ended by a time limit, and not by success or failure."""
@@ -277,7 +284,8 @@ class PushEnv:
     @property
     def observation_size(self) -> int:
         """Length of an observation."""
-        return self._alone.robot.shell.count + 2
+        count, ends = self._alone.robot.shell.count, self.senses == "ends"
+        return count + 2 + 2 * isinstance(self.table.task, PoseCourse) + (count + 5) * ends
 
     @property
     def action_size(self) -> int:
@@ -376,12 +384,16 @@ class PushEnv:
         return images
 
 
-def _obs(current: Trial, measured: Measurement) -> jax.Array:
-    """Return the observation (T + 2,) of `PushEnv`."""
-    taxels = jnp.where(current.skin.alive, current.skin.signal, 0.0)
-    obs = measured.observation
-    p_robot_target = planar.rotate(-obs.yaw, obs.p_world_target - obs.p_world_robot)
-    return jnp.concatenate([taxels, p_robot_target])
+def _obs(obs: TaxelObservation | EndsObservation) -> jax.Array:
+    """Return the observation (n,) of `PushEnv`."""
+    touch = obs.touch
+    goal = planar.rotate(-touch.yaw, touch.p_world_target - touch.p_world_robot)
+    parts = [obs.signal, goal]
+    if touch.yaw_target is not None:
+        parts.append(planar.unit(touch.yaw_target - touch.yaw))
+    if isinstance(obs, EndsObservation):
+        parts += [obs.ends, obs.seen, obs.even[None], obs.alive]
+    return jnp.concatenate([x.astype(goal.dtype) for x in parts])
 
 
 def _metrics(current: Trial, measured: Measurement, progress: jax.Array) -> dict[str, jax.Array]:

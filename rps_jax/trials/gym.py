@@ -65,7 +65,8 @@ class GymPush(gymnasium.Env[np.ndarray, np.ndarray]):
     Observation, Box (T + 2,) float32: the T taxels of the robot, the paper's 42, in the order of
     `Shell.taxels`, each the filtered relative change of its capacitance [1]; then the target (x, y)
     [m] in the robot frame (x ahead, y to the left), by odometry; of the task `path` it is the point
-    of the path a lookahead ahead.
+    of the path a lookahead ahead. The heading of a goal, and the ends of contacts of senses="ends",
+    follow: see `PushEnv`.
 
     Action, Box (3,) float32 within -1 and 1: the twist (v_x, v_y, omega) in the robot's frame, in
     units of v_max [m/s], v_max and omega_max [rad/s] of `params`. It is held for `hold` [s]. A

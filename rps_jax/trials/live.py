@@ -24,6 +24,7 @@ from rps_jax.trials.batch import stepper
 from rps_jax.trials.jobs import WorldBatch, rows
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import ControlLoop, Outcome, Shift, Snapshot, Trial, World
+from rps_jax.world.tasks.pose import PoseCourse
 
 CHUNK = 25  # steps, at most, between two checks of the clock
 
@@ -81,6 +82,11 @@ class Live:
         return np.asarray(self._worlds.p_world_target[0])
 
     @property
+    def yaw_target(self) -> float | None:
+        """Heading of the goal [rad]; None if it has none."""
+        return yaw_target(self._worlds)
+
+    @property
     def lines(self) -> dict[str, np.ndarray]:
         """Lines of the task for pictures: see `Course.lines`."""
         return rows(self._worlds.task, 0).lines()
@@ -117,17 +123,21 @@ class Live:
             self._trial = rows(self.past[index + 1].trial, None)
             del self.past[index + 1 :]
 
-    def set_target(self, p_world_target: tuple[float, float]) -> None:
-        """Move the target [m].
+    def set_target(self, p_world_target: tuple[float, float], yaw: float | None = None) -> None:
+        """Move the target [m], and turn its heading to `yaw` [rad] if it has one.
 
         Raises:
           InputError: it is not finite, or out of bounds, or the task has its own end.
         """
-        if self.lines:
+        if "path" in self.lines:
             raise errors.not_allowed("target", p_world_target, "the task has its own end")
         target = errors.check_vector("target", p_world_target, at_least=-50, at_most=50, unit="m")
         dtype = self._worlds.p_world_target.dtype
-        self._worlds = self._worlds._replace(p_world_target=np.array([target], dtype))
+        goal, task = np.array([target], dtype), self._worlds.task
+        if isinstance(task, PoseCourse):
+            heading = task.heading if yaw is None else np.array([yaw], dtype)
+            task = task._replace(p_world_goal=goal, heading=heading)
+        self._worlds = self._worlds._replace(p_world_target=goal, task=task)
         self._continue(min_distance=np.full_like(self._trial.min_distance, np.inf))
 
     def shove(self, p_robot: tuple[float, float]) -> None:
@@ -148,6 +158,11 @@ class Live:
         success = np.zeros_like(self._trial.success)
         done = np.array(self._trial.diverged)
         self._trial = self._trial._replace(done=done, success=success, **changes)
+
+
+def yaw_target(worlds: World) -> float | None:
+    """Return the heading of the goal of the first world [rad]; None if it has none."""
+    return float(worlds.task.heading[0]) if isinstance(worlds.task, PoseCourse) else None
 
 
 @jax.jit

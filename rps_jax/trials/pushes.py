@@ -92,7 +92,7 @@ def build(
     for i, (case, target) in enumerate(zip(cases, targets, strict=True)):
         u = {name: values[i : i + 1] for name, values in numbers.items()}
         front = np.array([float(case.base.sizes[0])])
-        end, course = case.challenge.courses(CourseInputs(u, target[None], front))
+        end, course = case.challenge.courses(CourseInputs(u, target[None], front, case.bearing))
         final.append(end[0])
         courses.append(rows(course, 0))
     shifts = zip(*(case.shift for case in cases), strict=True)

@@ -124,8 +124,9 @@ class Setting:
             law = registry.law_of(params)
             registry.check_drive(params, robot.drive)
             self.simulator.check_senses(law.senses)
-            if law.senses == "taxels":
-                check_law(law.init, law.step, law.senses, params, robot.shell.count)
+            if law.senses in ("taxels", "ends"):
+                sizes = robot.shell.count, law.heading
+                check_law(law.init, law.step, law.senses, params, *sizes)
 
     def check_domain(self, domain: Domain, laws: Iterable[LawParams] = ()) -> None:
         """Raise InputError unless the engine can step the worlds of a domain with these laws."""

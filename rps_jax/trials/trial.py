@@ -270,12 +270,16 @@ def contact_of(qpos: Float[Array, "10"], p_robot_contact: Vector) -> Vector:
 
 
 def positions_of(
-    world: World, qpos: Float[Array, "10"], p_robot_contact: Vector, touches: Array
+    world: World,
+    qpos: Float[Array, "10"],
+    p_robot_contact: Vector,
+    touches: Array,
+    declared: Array | None = None,
 ) -> Positions:
     """Return what a task judges, at the positions qpos."""
     contact = contact_of(qpos, p_robot_contact), touches
-    base = qpos[JOINTS.base], world.skin.shell.outline
-    return Positions(world.p_world_target, *contact, *base, *object_pose(qpos), world.footprint)
+    bodies = qpos[JOINTS.base], world.skin.shell.outline, *object_pose(qpos), world.footprint
+    return Positions(world.p_world_target, *contact, *bodies, declared)
 
 
 @jax.jit
@@ -319,10 +323,14 @@ def observe(
     is_lost = ~touch & (trial.contact_steps > 0)
     lost_steps = trial.lost_steps + is_lost
     absent_steps = jnp.where(is_lost, trial.absent_steps + 1, 0)
-    positions = positions_of(world, trial.qpos, reading.p_robot_contact, touch)
+    declared = None if loop.law.is_done is None else loop.law.is_done(trial.law_state)
+    positions = positions_of(world, trial.qpos, reading.p_robot_contact, touch, declared)
     task, aim = world.task.step(trial.task, positions)
-    observation = observation._replace(p_world_target=aim.p_world_target)
-    success = touch & (distance < params.d_success) & aim.at_end
+    aims = {"p_world_target": aim.p_world_target, "yaw_target": aim.yaw_target}
+    observation = observation._replace(**aims)
+    success = aim.success
+    if success is None:
+        success = touch & (distance < params.d_success) & aim.at_end
     tilt = planar.tilt(trial.qpos[JOINTS.object_quaternion])
     tipped = tilt > rules.max_tilt
     over = (time >= rules.horizon) | (lost_steps * period > rules.max_lost) | tipped | aim.failed
@@ -340,7 +348,7 @@ def observe(
         success=success & ~over,
         tilt=jnp.maximum(trial.tilt, tilt),
         tipped=tipped,
-        done=success | over,
+        done=success | over if declared is None else success | over | declared,
         task=task,
     )
     return judged, Measurement(reading, observation, distance)
@@ -369,13 +377,16 @@ def perceive(
     law = loop.law
     judged, measured = observe(world, params, trial, loop)
     obs: Any = measured.observation
+    if law.heading and obs.yaw_target is None:
+        obs = obs._replace(yaw_target=planar.direction(obs.p_world_target))
     if not law.smooth:
         obs = obs._replace(in_contact=measured.reading.contact_type != NONE)
     if law.senses == "pose":
         obs = PoseObservation(obs, object_pose(judged.qpos)[0], fp.circumradius(world.footprint))
-    if law.senses == "taxels":
+    if law.senses in ("taxels", "ends"):
         skin = world.skin, judged.skin, outline(world, judged.qpos)
-        obs = features.taxel_observation(obs, measured.reading, *skin)
+        observation = features.OBSERVATIONS[law.senses]
+        obs = observation(obs, measured.reading, *skin)
     if judged.load is not None and law.senses == "force":
         load, force = law.cell.read(
             judged.load, world.key, judged.steps, loop.physics.control_period

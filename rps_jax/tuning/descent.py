@@ -59,8 +59,8 @@ _ALIKE = (
 class TuneGrad(Descent):
     """Tune a law by exact derivatives of the smooth trial, in mini-batches of random worlds.
 
-    Use `rps tune es` by default, and this for hundreds of parameters and an engine with
-    derivatives; where whole trials do not improve along these, they are dropped and slopes remain.
+    Use `rps tune es` for the parameters of a law, and this for tables and networks of some hundred
+    numbers and more, with an engine that has derivatives.
 
     A step follows the derivatives of windows of some seconds, which start at states of trials of
     the original law; a value function, fitted to these trials, counts what follows a window. After
@@ -364,8 +364,8 @@ def features(world: World, params: LawParams, state: Trial, loop: ControlLoop) -
     and of the bearing of the target from there in the robot frame.
 
     The offset of the contact and the pose of the object are none. They predict failures best, but
-    by what both share with the world: its friction and centre of mass keep the contact off the
-    middle, and no law can change them. A value function of them points the wrong way.
+    with them the derivatives point against the slopes of whole trials. Probably they stand for the
+    friction and the centre of mass of a world, which no law can change.
     """
     _, measured = trial.observe(world, params, state, loop)
     distance = _FAR * jnp.tanh(measured.distance / _FAR)

@@ -149,8 +149,8 @@ def gradient_results(estimate: Estimate) -> dict[str, jax.Array]:
 class TuneES(Descent):
     """Tune a law's parameters by evolution, in many worlds.
 
-    It is the tuner to use by default; `rps tune grad` is for hundreds of parameters and an engine
-    with derivatives.
+    Use it for the parameters of a law, and `rps tune grad` for tables and networks of some hundred
+    numbers and more.
 
     The answer has, by generation, the objective of the candidates, the objective of the mean of
     their distribution in the worlds for validation, and the `params` (generation, parameter) of

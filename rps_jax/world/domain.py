@@ -254,6 +254,7 @@ class Domain:
             self.task.check_target("domain targets", self.targets, "leave them out")
         for target in self.targets:
             scene.check_target(target, self.robot.shell)
+            self.task.check_goal(target, self.robot.shell, self._widest)
         check_ranges(self, "domain ")
         offset, load = self.com_offset.high, self.load_size.high
         if offset + load > 1:

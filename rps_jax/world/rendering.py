@@ -48,6 +48,7 @@ _OPENING = threading.Lock()
 # An image is drawn so many times as fine along either side, and averaged: smoother than the four
 # samples of a pixel that OpenGL would take, and without a GPU in less time.
 _FINER = 2
+_ARROW_HEIGHT = 0.05  # [m] of a goal's arrow above the ground
 _SHADOWS_FROM = 480  # [px] height of an image: they take most of the time without a GPU
 
 _FIX_GL = (
@@ -134,6 +135,11 @@ class SceneRenderer:
             self._add_lines(trail.segments(), trail.rgba, trail.height)
         for start, end in self._lines.get("walls", ()):
             self._add_wall(start, end)
+        if "goal" in self._lines:
+            ends = [[*x, _ARROW_HEIGHT] for x in self._lines["goal"]]
+            arrow = self._add_geom("mjGEOM_ARROW", np.zeros(3), np.zeros(3), PATH_RGBA)
+            self.mujoco.mjv_connector(arrow, arrow.type, 0.05, *map(np.array, ends))
+            arrow.size[2] *= 2  # MuJoCo draws half of it
         if not np.isnan(contact).any():
             position, size = np.array([*contact, CONTACT_HEIGHT]), np.full(3, CONTACT_RADIUS)
             marker = self._add_geom("mjGEOM_SPHERE", size, position, CONTACT_RGBA)

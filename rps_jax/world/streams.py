@@ -75,7 +75,7 @@ def claim(owner: str, *names: str) -> None:
 
 def key_of(seed: int, name: str) -> int:
     """Return the key of Philox for a name: the seed below, a hash of the name above."""
-    return seed + (int.from_bytes(blake2b(name.encode(), digest_size=8).digest(), "big") << 64)
+    return int(seed) + (int.from_bytes(blake2b(name.encode(), digest_size=8).digest(), "big") << 64)
 
 
 def stream(seed: int, name: str, index: np.ndarray) -> np.ndarray:

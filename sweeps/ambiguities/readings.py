@@ -18,7 +18,7 @@ from rps_jax import Robot, Setting
 from rps_jax.analysis import statistics
 from rps_jax.physics import PHYSICS, Physics
 from rps_jax.world import paper
-from rps_jax.worlds import CapacitiveSkin, IdealSkin
+from rps_jax.worlds import CapacitiveSkin
 from sweeps.conditions import Condition
 
 DEFAULT = "default"
@@ -61,16 +61,16 @@ READINGS = {
     "base_98cm": _case("base 0.978 m long instead of 0.725", robot=Robot(half_length=0.489)),
     "base_58cm": _case("base 0.58 m long (square)", robot=Robot(half_length=0.29)),
     "capacitive": _case("capacitive skin of 42 taxels", skin=CapacitiveSkin()),
-    "tolerance_10mm": _case("skin tolerance 10 mm instead of 6", skin=IdealSkin(0.010)),
-    "tolerance_3mm": _case("skin tolerance 3 mm", skin=IdealSkin(0.003)),
-    "tolerance_1mm": _case("skin tolerance 1 mm", skin=IdealSkin(0.001)),
+    "tolerance_10mm": _case("skin tolerance 10 mm instead of 6", skin="ideal,tolerance=0.01"),
+    "tolerance_3mm": _case("skin tolerance 3 mm", skin="ideal,tolerance=0.003"),
+    "tolerance_1mm": _case("skin tolerance 1 mm", skin="ideal,tolerance=0.001"),
     "rear_far": _case("load on the far left corner", rear="far"),
     "gap_0": _case("initial gap 0 instead of 2 cm", gap=0.0),
     "gap_10cm": _case("initial gap 10 cm", gap=0.10),
     "sgn_0": _params("sgn(0) = 1 instead of 0", sgn_0=1.0),
 }
 
-_THIN = {"skin": IdealSkin(0.001)}
+_THIN = {"skin": "ideal,tolerance=0.001"}
 
 
 # Ingredients of Gazebo: all together, then one by one.
@@ -78,7 +78,7 @@ GAZEBO = {
     DEFAULT: Condition("the defaults at 1 ms", _setting(_CONE)),
     "paper_gazebo": Condition("`paper_gazebo`: pyramid, skin 1 mm", _setting(_GAZEBO), case=_THIN),
     "pyramid": Condition(
-        "pyramid alone, skin 6 mm", _setting(_GAZEBO), case={"skin": IdealSkin(0.006)}
+        "pyramid alone, skin 6 mm", _setting(_GAZEBO), case={"skin": "ideal,tolerance=0.006"}
     ),
     "thin": Condition("skin 1 mm alone, isotropic", _setting(_CONE), case=_THIN),
 }

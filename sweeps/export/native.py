@@ -294,7 +294,8 @@ def _in_jax(law: Law, params: Any, real: type, count: int) -> tuple[Callable[...
     The step takes memories and the leaves of observations, and returns memories and twists.
     """
     params = jax.tree.map(lambda x: jnp.asarray(x, real), params)
-    tree = jax.tree.structure(validation.observation_shapes(law.senses))
+    shapes = validation.observation_shapes(law.senses, heading=law.heading)
+    tree = jax.tree.structure(shapes)
 
     def step(memory: Any, leaves: Any) -> tuple[Any, Twist]:
         memory, twist, _ = law.step(params, memory, jax.tree.unflatten(tree, leaves))

@@ -42,7 +42,7 @@ from rps_jax.trials.progress import Progress, ProgressCallback, no_progress
 from rps_jax.trials.trial import ControlLoop, Shift, Snapshot, Trial
 from rps_jax.trials.worlds import build
 from rps_jax.world.scene import JOINTS, Friction, WorldInputs
-from rps_jax.worlds import IdealSkin, Polyline
+from rps_jax.worlds import Case, Polyline
 from sweeps.study_base import Rows
 
 SliderName = Literal["box", "cylinder"]
@@ -216,7 +216,7 @@ def worlds(slider: SliderName, grid: Cells, engine: EngineName) -> WorldBatch:
         np.arange(count),
         WorldInputs(slider, solids, friction, PHYSICS, _ROBOT),
         Setting(engine, PHYSICS),
-        skin=repeated(IdealSkin(shell=_ROBOT.shell)),
+        skin=repeated(Case(skin="ideal").sensor._replace(shell=_ROBOT.shell)),
         p_world_target=np.tile([90.0, 0.0], (count, 1)),  # never reached
         shift=repeated(Shift(p_robot=jnp.zeros(2))),
         qpos=starts(slider, grid),

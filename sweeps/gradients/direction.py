@@ -97,7 +97,8 @@ class Direction(Study[xr.Dataset], SimulationQuestion[xr.Dataset]):
 
         results = question.judge(next(question.search()), 0, score)
         time = sum(simulated) + float(results.get("simulated", 0.0))
-        return jnp.asarray(results["gradients"][0]), float(results["gradient_error"]), time
+        gradient = jnp.asarray(np.asarray(results["gradients"])[0])
+        return gradient, float(results["gradient_error"]), time
 
     def report_tables(self, results: xr.Dataset) -> Sequence[Table]:
         """Return the cosines."""

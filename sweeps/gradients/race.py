@@ -9,6 +9,7 @@ rps sweeps/gradients/race.py
 
 from __future__ import annotations
 
+import functools
 import itertools
 import threading
 from collections.abc import Callable, Mapping, Sequence
@@ -112,13 +113,13 @@ class _Paced(Tuning):
 
 
 class _Grad(_Paced, TuneGrad):
-    @property
+    @functools.cached_property
     def _programs(self) -> dict[Callable[..., Any], Any]:
         return self.pool.programs
 
-    def _call(self, *inputs: Any) -> Any:
+    def _call(self, function: Callable[..., Any], times: dict[str, float], *inputs: Any) -> Any:
         with self.pool.device:
-            return super()._call(*inputs)
+            return super()._call(function, times, *inputs)
 
 
 class _ES(_Paced, TuneES):
@@ -143,7 +144,7 @@ class Race(Study[xr.Dataset], SimulationQuestion[xr.Dataset]):
 
     TITLE: ClassVar[str] = "Derivatives against evolution"
     CHOICES: ClassVar = {"methods": METHODS}
-    GROWS: ClassVar[tuple[str, ...]] = ("counts",)
+    GROWS: ClassVar[tuple[str, ...]] = ("counts", "file")
     QUICK: ClassVar[Mapping[str, Any]] = {
         "worlds": 4,
         "counts": (64,),
@@ -169,6 +170,8 @@ class Race(Study[xr.Dataset], SimulationQuestion[xr.Dataset]):
     """Budgets of wall time without compilation [s]."""
     worlds: int = option(400, 1, 1_000_000)
     """Number of test worlds of `wide`."""
+    file: str = "gradients_race"
+    """Name of the data file."""
     setting: Setting = field(default=Setting(rules=Rules(horizon=150.0)), kw_only=True)
     out: Path | str | None = field(default="runs/race", kw_only=True)
     """Run folder; the tunings have folders there."""
@@ -225,7 +228,9 @@ class Race(Study[xr.Dataset], SimulationQuestion[xr.Dataset]):
         dims, shape = ("seed", "method"), (len(self.seeds), len(self.methods))
         by_tuning = {
             "generations": [len(curve) for curve in curves],
-            "windows": [curve.get("windows", pd.Series([0.0])).sum() for curve in curves],
+            "windows": [
+                float(curve["windows"].sum()) if "windows" in curve else 0.0 for curve in curves
+            ],
             **{name: [float(spent(x, name).iloc[-1]) for x in curves] for name in BUDGETS},
         }
         variables = {name: (dims, np.reshape(x, shape)) for name, x in by_tuning.items()}
@@ -249,7 +254,8 @@ class Race(Study[xr.Dataset], SimulationQuestion[xr.Dataset]):
 
     def report_tables(self, results: xr.Dataset) -> Sequence[Table]:
         """Return the success of the tunings."""
-        picture = Picture("race", partial(draw, results))
+        picture = Picture(self.file.removeprefix("gradients_"), partial(draw, results))
+        several = results.sizes["count"] > 1
         columns = [
             {"name": "parameters", "merge": True},
             {"name": "equal", "merge": True},
@@ -265,7 +271,7 @@ class Race(Study[xr.Dataset], SimulationQuestion[xr.Dataset]):
             {"name": "generations"},
         ]
         text = "Square brackets: 95 % intervals over the seeds, by Student's t."
-        named = {"name": "gradients_race", "title": "Success", "picture": picture}
+        named = {"name": self.file, "title": "Success", "picture": picture if several else None}
         return [Table(table(results), text, columns, **named)]
 
 
@@ -283,7 +289,7 @@ def spent(curve: pd.DataFrame, budget: str) -> pd.Series:
 def best_within(curve: pd.DataFrame, budget: str, amount: float) -> pd.Series:
     """Return the generation with the best validation within a budget."""
     within = curve[spent(curve, budget) <= amount]
-    return within.loc[within.validation.idxmin()]
+    return within.iloc[int(np.nanargmin(within.validation))]
 
 
 def problem(count: int) -> tuple[Any, str]:

@@ -22,7 +22,7 @@ import xarray as xr
 
 from rps_jax.engines.base import Driven
 from rps_jax.engines.mjx import MJXStage
-from rps_jax.engines.mjx_colliders import COLLIDERS, GeomType, mjx
+from rps_jax.engines.mjx_colliders import COLLIDERS, mjx
 from rps_jax.physics import ControlPeriod, Motion
 from rps_jax.questions import Run, call_of, option
 from rps_jax.trials.progress import Progress
@@ -96,7 +96,7 @@ class _TheirBoxes(MJXStage):
     def drive(self, fields: Any, motion: Motion, period: ControlPeriod) -> Driven:
         """Step a batch for one control period."""
         with mock.patch.dict(COLLIDERS):
-            del COLLIDERS[GeomType.BOX, GeomType.BOX]
+            del COLLIDERS[mjx.GeomType.BOX, mjx.GeomType.BOX]
             return super().drive(fields, motion, period)
 
 

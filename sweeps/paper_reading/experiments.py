@@ -6,6 +6,7 @@ import functools
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -24,7 +25,7 @@ from rps_jax.trials.results import trace_dataset
 from rps_jax.trials.trial import Outcome
 from rps_jax.world import paper, points, scene
 from rps_jax.world.draws import Draw
-from rps_jax.worlds import IdealSkin, parse_domain
+from rps_jax.worlds import parse_domain
 from sweeps.paper_reading import printed
 from sweeps.paper_reading.printed import SHORT
 from sweeps.paper_reading.unknowns import NAMES, UNKNOWNS, aps_params, params, texts, values
@@ -94,8 +95,7 @@ class _Trials(Candidates):
             if self.tolerance is None:
                 yield batch
                 continue
-            skin = batch.worlds.skin
-            assert isinstance(skin, IdealSkin)
+            skin: Any = batch.worlds.skin
             drawn = self.tolerance[batch.indices].astype(np.asarray(skin.tolerance).dtype)
             skin = skin._replace(tolerance=drawn)
             yield batch._replace(worlds=batch.worlds._replace(skin=skin))

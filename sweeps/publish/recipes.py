@@ -313,6 +313,8 @@ RECIPES: dict[str, Recipe] = {
         gpu=2,
         section="Flat against round",
     ),
+    "pose_parity": recipe(f"rps sweeps/pose/parity.py --worlds 30 {_MACHINE}", cores=10),
+    "pose*": recipe(f"rps sweeps/pose --worlds 300 {_MACHINE}", cores=20),
     "drives": recipe(f"rps sweeps/drives --worlds 5000 {_MACHINE}", cores=300, gpu=6),
     "drives_omni": recipe(
         "rps sweeps/drives --seed 7017 --bases 'holonomic, rps_plus' 'holonomic, rps_reposition' "
@@ -344,8 +346,12 @@ RECIPES: dict[str, Recipe] = {
     "plans": recipe(f"rps sweeps/planning {_MACHINE}", cores=15),
     "replans": recipe(f"rps sweeps/planning {_MACHINE}", cores=15),
     "gradients_mjx": recipe(f"rps sweeps/gradients/mjx.py {_MACHINE}", cores=6),
-    "gradients_direction": recipe(f"rps sweeps/gradients/direction.py {_MACHINE}", cores=30),
-    "gradients_race": recipe(f"rps sweeps/gradients/race.py {_MACHINE}", cores=160),
+    "gradients_race": recipe(f"rps sweeps/gradients/race.py --counts 64 2048 {_MACHINE}", cores=80),
+    "gradients_race_13": recipe(
+        "rps sweeps/gradients/race.py --counts 13 --simulated 1e5 --wall 10 "
+        f"--file gradients_race_13 {_MACHINE}",
+        cores=20,
+    ),
     "robot": recipe(f"rps sweeps/speed/robot.py {_MACHINE}", cores=1),
     "dependencies": recipe(f"rps sweeps/publish/dependencies.py {_MACHINE}", cores=15),
     "extras": recipe(f"rps sweeps/publish/dependencies.py {_MACHINE}", cores=15),

@@ -124,6 +124,9 @@ def draw_path(ax: Axes, trace: xr.Dataset, snapshots: int = 7) -> None:
         ax.plot(*trace.path.values.T, "-", lw=1, color="0.6", label="path", zorder=0)
     for wall in trace.walls.values if "walls" in trace else ():
         ax.plot(*wall.T, "-", lw=2, color="0.2")
+    if "goal" in trace:
+        tail, tip = trace.goal.values
+        ax.annotate("", tip, tail, arrowprops={"arrowstyle": "->", "color": "C3", "lw": 1.5})
     ax.plot(*target, "*", ms=10, color="C3", label="target")
     ax.add_patch(patches.Circle(target, float(trace.d_success), fill=False, color="C3"))
     ax.set_aspect("equal", adjustable="datalim")

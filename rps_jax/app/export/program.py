@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from rps_jax.control import registry, validation
-from rps_jax.control.observation import TaxelObservation, Twist, with_base
+from rps_jax.control.observation import Twist, with_base
 from rps_jax.errors import not_allowed
 from rps_jax.lowering.routine import Group, Pytree, Routine, fields_of, routine
 from rps_jax.robot import robot as robots
@@ -89,6 +89,12 @@ class Contact(NamedTuple):
     in_contact: Annotated[Leaf, Spec("1", "whether there is a contact")]
     line: Annotated[Leaf, Spec("1", "whether the contact is a line")]
     signal: Annotated[Leaf, Spec("1", "filtered signal of each taxel, 0 of a dead one")]  # (T,)
+    # Of a law that senses the ends of contacts: see `EndsObservation`.
+    alive: Annotated[Leaf, Spec("1", "whether each taxel works")] = None  # (T,)
+    ends: Annotated[Leaf, Spec("m", "offsets of the contact's left and right end")] = None  # (2,)
+    seen: Annotated[Leaf, Spec("1", "whether the object ends there")] = None  # (2,)
+    even: Annotated[Leaf, Spec("1", "whether a face lies flush on the front")] = None
+    front: Annotated[Leaf, Spec("m", "distance of the front from the base's middle")] = None
 
 
 def program(law: registry.LawLike, robot: Any = "ideal", skin: Any = "capacitive") -> Program:
@@ -107,9 +113,8 @@ def program(law: registry.LawLike, robot: Any = "ideal", skin: Any = "capacitive
         raise not_allowed("skin", skin, rule)
     taxels = jax.ShapeDtypeStruct((sensor.shell.count,), np.float64)
     with jax.enable_x64(True):
-        observation = validation.observation_shapes(functions.senses)
-        if isinstance(observation, TaxelObservation):
-            observation = observation._replace(signal=taxels)
+        sizes = sensor.shell.count, functions.heading
+        observation = validation.observation_shapes(functions.senses, *sizes)
         # Parameters are reals, as in a trial, even if the user wrote integers.
         shapes = jax.tree.map(lambda x: jax.ShapeDtypeStruct(np.shape(x), np.float64), params)
         memory = jax.eval_shape(functions.init, shapes)
@@ -127,7 +132,11 @@ def program(law: registry.LawLike, robot: Any = "ideal", skin: Any = "capacitive
         state, reading = scaled.read(state, scan.taxels, scan.period)
         signal = jnp.where(skin.alive, state.signal, 0.0)
         touch = (reading.contact_type, reading.p_robot_contact, reading.in_contact)
-        return {"signal": state.signal}, Contact(*touch, reading.contact_type == LINE, signal)
+        contact = Contact(*touch, reading.contact_type == LINE, signal)
+        if functions.senses == "ends":
+            ends = skins.ends_of(signal, skin.alive, base.shell, scaled.threshold)
+            contact = contact._replace(alive=skin.alive, **ends._asdict())
+        return {"signal": state.signal}, contact
 
     values = SkinParams(*(np.asarray(float(getattr(sensor, x))) for x in SkinParams._fields))
     skin_inputs = {

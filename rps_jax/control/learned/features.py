@@ -15,11 +15,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from rps_jax.control.observation import Observation, TaxelObservation, Twist, displacement
+from rps_jax.control.observation import (
+    EndsObservation,
+    Observation,
+    TaxelObservation,
+    Twist,
+    displacement,
+)
 from rps_jax.geometry import planar
 from rps_jax.geometry.footprint import Footprint
 from rps_jax.robot import skin as skins
-from rps_jax.robot.skin import LINE, NONE, Reading, Skin, SkinState
+from rps_jax.robot.skin import LINE, NONE, CapacitiveSkin, Reading, Skin, SkinState
 from rps_jax.spec import Spec
 
 _BASE = 0.36  # [m] scale of positions on the base
@@ -42,6 +48,21 @@ def taxel_observation(
         skins.signals(skin, state, footprint),
         reading.contact_type == LINE,
     )
+
+
+def ends_observation(
+    touch: Observation, reading: Reading, skin: Skin, state: SkinState, footprint: Footprint
+) -> EndsObservation:
+    """Return the observation of a law that senses the ends of contacts: `taxel_observation`."""
+    signal = skins.signals(skin, state, footprint)
+    alive = state.alive if state.signal.size else jnp.ones(signal.shape, bool)
+    del reading  # `touch` has the contact, or its weight of a smooth law
+    threshold = getattr(skin, "threshold", CapacitiveSkin().threshold)
+    return touch.with_ends(signal, alive, skins.ends_of(signal, alive, skin.shell, threshold))
+
+
+# By what a law senses.
+OBSERVATIONS = {"taxels": taxel_observation, "ends": ends_observation}
 
 
 class TouchState(NamedTuple):

@@ -7,7 +7,7 @@ all drawn quantities, and a pytree that is a `Course`, with the parameters of on
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Hashable, Mapping
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from typing import Any, ClassVar, NamedTuple, Protocol
 
@@ -34,6 +34,8 @@ class Positions(NamedTuple):
     p_world_object: Vector  # [m]
     object_yaw: Scalar  # [rad]
     footprint: Footprint  # of the object, in its own frame
+    # Whether the law declares that it is done; None: it cannot.
+    declared: Bool[Array, ""] | None = None
 
 
 class Aim(NamedTuple):
@@ -42,6 +44,9 @@ class Aim(NamedTuple):
     p_world_target: Vector  # [m] of the law
     at_end: Bool[Array, ""] | bool = True  # whether the trial may succeed now
     failed: Bool[Array, ""] | bool = False
+    yaw_target: Scalar | None = None  # [rad] heading of the goal; None: it has none
+    # The task's own verdict; None: the contact point is within `d_success` of the target.
+    success: Bool[Array, ""] | None = None
 
 
 class Course(Protocol):
@@ -73,6 +78,7 @@ class CourseInputs(NamedTuple):
     u: Mapping[str, np.ndarray]  # (n,) random numbers in [0, 1) of the task's quantities
     p_world_target: np.ndarray  # (n, 2) [m] drawn target of `reach`
     front: np.ndarray  # (n,) [m] x of the base's front
+    bearing: float = 0.0  # [rad] by which the trial is turned
 
 
 @dataclass(frozen=True)
@@ -137,6 +143,14 @@ class Task:
         if not self.HAS_TARGET:
             reason = f"the task {self.kind} has its own end; {rule}"
             raise errors.not_allowed(field, value, reason)
+
+    def check_goal(
+        self, target: Sequence[float], shell: Shell, object_width: Callable[[], float]
+    ) -> None:
+        """Raise InputError for a goal (x, y) [m] that an object in front of a base covers.
+
+        `object_width` loads models.
+        """
 
     def check_room(self, shell: Shell, object_width: Callable[[], float]) -> None:
         """Raise InputError unless a base with this shell and the widest object [m] have room.

@@ -53,7 +53,7 @@ class Controller:
         skin: Any = CapacitiveSkin(),
         robot: Any = "ideal",
     ) -> None:
-        """Compile skin and law before the first step; the law must sense touch.
+        """Compile skin and law before the first step; the law must sense touch or ends.
 
         The skin has the shell of the base; `robot` is the base itself, whose drive the law knows.
         Odometry and command of a base that cannot move sideways are those of its axle.
@@ -67,6 +67,7 @@ class Controller:
             raise InputError(f"{sentence}: choose law unicycle.")
         self._law = law_of(self._params)
         self._scan, self._step = jax.jit(skin.read), jax.jit(self._law.step)
+        self._ends = jax.jit(self._with_ends)
         self._follow = jax.jit(PathCourse.follow)
         self.reset()
         self.path(0.0, [(0.0, 0.0), (1.0, 0.0)])
@@ -80,6 +81,7 @@ class Controller:
         self._skin_state = self._skin.init(jax.random.PRNGKey(0))
         self._law_state = self._law.init(self._params)
         self._pose, self._target, self._contact = np.zeros(3), np.zeros(2), (np.zeros(2), False)
+        self._heading = 0.0
         self._course: PathCourse | None = None
         self._input_times = dict.fromkeys(("odometry", "taxels", "target", "path"), -math.inf)
         self._last = self._scanned = -math.inf
@@ -101,6 +103,12 @@ class Controller:
         """Store the target [m]."""
         if np.isfinite([x, y]).all():
             self._target, self._input_times["target"] = np.array([x, y], float), time
+
+    def goal(self, time: float, x: float, y: float, yaw: float) -> None:
+        """Store a target [m] with the heading of the goal [rad], for a law that observes it."""
+        if np.isfinite([x, y, yaw]).all():
+            self._heading = float(yaw)
+            self.target(time, x, y)
 
     def path(self, time: float, points: Any) -> None:
         """Store a path (K, 2) [m], which replaces the target; no point ends it.
@@ -139,9 +147,17 @@ class Controller:
         self._contact = np.asarray(reading.p_robot_contact), bool(reading.in_contact)
         self._scanned = self._input_times["taxels"] = time
 
+    def _with_ends(self, state: Any, obs: Observation) -> Any:
+        signal = jnp.where(state.alive, state.signal, 0.0)
+        return obs.with_ends(signal, state.alive, self._skin.ends(state))
+
     def _decide(self, period: float) -> tuple[Any, Any]:
         obs = Observation(self._pose[:2], self._pose[2], *self._contact, self._target, period)
         obs = obs.with_base(self._skin.shell.radius, self._robot)
+        if self._law.heading:
+            obs = obs._replace(yaw_target=np.asarray(self._heading))
+        if self._law.senses == "ends":
+            obs = self._ends(self._skin_state, obs)
         return self._step(self._params, self._law_state, obs)[:2]
 
     def tick(self, time: float) -> Command:

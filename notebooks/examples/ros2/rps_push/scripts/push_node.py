@@ -6,7 +6,7 @@ import math
 import time
 
 import rclpy
-from geometry_msgs.msg import PointStamped, TwistStamped
+from geometry_msgs.msg import PointStamped, PoseStamped, TwistStamped
 from nav_msgs.msg import Odometry, Path
 from rcl_interfaces.msg import FloatingPointRange, ParameterDescriptor
 from rclpy.executors import ExternalShutdownException
@@ -62,6 +62,7 @@ class PushNode(LifecycleNode):
             (Odometry, "odom", self._odometry),
             (Float32MultiArray, "taxels", self._taxels),
             (PointStamped, "target", self._target),
+            (PoseStamped, "goal", self._goal),
             (Path, "path", self._path),
         ):
             subscription = self.create_subscription(kind, topic, callback, qos_profile_sensor_data)
@@ -99,6 +100,11 @@ class PushNode(LifecycleNode):
 
     def _target(self, message):
         self._controller.target(clock(), message.point.x, message.point.y)
+
+    def _goal(self, message):
+        p, q = message.pose.position, message.pose.orientation
+        yaw = math.atan2(2 * (q.w * q.z + q.x * q.y), 1 - 2 * (q.y * q.y + q.z * q.z))
+        self._controller.goal(clock(), p.x, p.y, yaw)
 
     def _path(self, message):
         points = [(pose.pose.position.x, pose.pose.position.y) for pose in message.poses]

@@ -6,6 +6,7 @@
 #include <vector>
 
 #include "geometry_msgs/msg/point_stamped.hpp"
+#include "geometry_msgs/msg/pose_stamped.hpp"
 #include "geometry_msgs/msg/twist_stamped.hpp"
 #include "nav_msgs/msg/odometry.hpp"
 #include "nav_msgs/msg/path.hpp"
@@ -62,6 +63,14 @@ class PushNode : public rclcpp_lifecycle::LifecycleNode {
                                   message->data.size(), controller_->taxels());
           controller_->skin(seconds(), message->data);
         });
+    goal_ = create_subscription<geometry_msgs::msg::PoseStamped>(
+        "goal", latest, [this](geometry_msgs::msg::PoseStamped::ConstSharedPtr message) {
+          const auto &p = message->pose.position;
+          const auto &q = message->pose.orientation;
+          const double yaw =
+              std::atan2(2 * (q.w * q.z + q.x * q.y), 1 - 2 * (q.y * q.y + q.z * q.z));
+          controller_->goal(seconds(), p.x, p.y, yaw);
+        });
     target_ = create_subscription<geometry_msgs::msg::PointStamped>(
         "target", latest, [this](geometry_msgs::msg::PointStamped::ConstSharedPtr message) {
           controller_->target(seconds(), message->point.x, message->point.y);
@@ -95,6 +104,7 @@ class PushNode : public rclcpp_lifecycle::LifecycleNode {
     timer_.reset();
     odometry_.reset();
     taxels_.reset();
+    goal_.reset();
     target_.reset();
     path_.reset();
     twists_.reset();
@@ -139,6 +149,7 @@ class PushNode : public rclcpp_lifecycle::LifecycleNode {
   rclcpp_lifecycle::LifecyclePublisher<geometry_msgs::msg::TwistStamped>::SharedPtr twists_;
   rclcpp::Subscription<nav_msgs::msg::Odometry>::SharedPtr odometry_;
   rclcpp::Subscription<std_msgs::msg::Float32MultiArray>::SharedPtr taxels_;
+  rclcpp::Subscription<geometry_msgs::msg::PoseStamped>::SharedPtr goal_;
   rclcpp::Subscription<geometry_msgs::msg::PointStamped>::SharedPtr target_;
   rclcpp::Subscription<nav_msgs::msg::Path>::SharedPtr path_;
   rclcpp::TimerBase::SharedPtr timer_;

@@ -77,6 +77,13 @@ class Controller {
     target_ = time;
   }
 
+  // Store a target [m] with the heading of the goal [rad], for a law that observes it.
+  void goal(double time, double x, double y, double yaw) {
+    if (!std::isfinite(yaw)) return;
+    set_heading(obs_, yaw, 0);
+    target(time, x, y);
+  }
+
   // Store a path [m], which replaces the target; no point ends it. The same path again goes on, and
   // another one starts anew.
   void path(double time, const std::vector<Point> &points) {
@@ -102,6 +109,7 @@ class Controller {
     obs_.p_robot_contact[0] = contact.p_robot_contact[0];
     obs_.p_robot_contact[1] = contact.p_robot_contact[1];
     set_taxels(obs_, contact, 0);
+    set_ends(obs_, contact, 0);
     scanned_ = taxels_ = time;
   }
 
@@ -145,6 +153,28 @@ class Controller {
   }
   template <class Observation>
   static void set_taxels(Observation &, const law_contact &, long) {}
+
+  // For laws that observe the ends of contacts.
+  template <class Observation, class Contact>
+  static auto set_ends(Observation &obs, const Contact &contact, int)
+      -> decltype(obs.ends[0], contact.ends[0], void()) {
+    std::copy(contact.signal, contact.signal + LAW_TAXELS, obs.signal);
+    std::copy(contact.alive, contact.alive + LAW_TAXELS, obs.alive);
+    std::copy(contact.ends, contact.ends + 2, obs.ends);
+    std::copy(contact.seen, contact.seen + 2, obs.seen);
+    obs.even = contact.even;
+    obs.front = contact.front;
+  }
+  template <class Observation, class Contact>
+  static void set_ends(Observation &, const Contact &, long) {}
+
+  // For laws that observe the heading of the goal.
+  template <class Observation>
+  static auto set_heading(Observation &obs, double yaw, int) -> decltype(obs.yaw_target, void()) {
+    obs.yaw_target = static_cast<law_real>(yaw);
+  }
+  template <class Observation>
+  static void set_heading(Observation &, double, long) {}
 
   // Set the target a lookahead ahead on the path, as `PathCourse.follow` of rps_jax does: from the
   // point nearest to the contact, within 1 m of the last one along the path.

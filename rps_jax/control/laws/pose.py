@@ -1,0 +1,542 @@
+"""Deliver an object to a pose by touch: the law of the task `pose`.
+
+The goal is a point T with a heading theta. A box that a flat front pushes straight becomes flush by
+way alone. Once flush it stays in the grid of the goal if the base pushes only along theta + k pi/2,
+k = 0 to 3. So the law pushes in legs: back (k = 2) where too little way is left, sideways (k = 1
+or 3) onto the goal's line, and along theta (k = 0) onto T.
+
+The law remembers the box that it feels, in the grid. With u(x) the unit vector at the angle x and
+d_j = u(theta + j pi/2), the box has the supports h_j = max (p - T) . d_j over its points p. Each is
+known or not. In a leg along d_k, with the middle F of the front, the base's middle P, and the
+offsets e_left and e_right of the ends of an even contact:
+
+  Q1  h_(k+2) = -(F - T) . d_k,  the pushed face
+  Q2  h_(k+1) = (P - T) . d_(k+1) + e_left  and  h_(k+3) = -(P - T) . d_(k+1) - e_right,  if seen
+  Q3  the box moves with the front that touches it; both sides of an axis move by the change of a
+      known one, up to 3 cm; an unknown side is where the contact ends; the first touch of another
+      face keeps the middle of its axis, if that was felt
+
+A contact that is uneven for a second forgets all sides: then the box is a square of half width r
+behind the contact. Let g = h_2 be the way that is left, and m the middle of the box, left of the
+goal's line by y.
+
+  Q4  leg: k = 2 if g < s_min, or s_flush where a side is known;  else k = 1 or 3 towards y = 0 if
+      |y| > y_tol + cap g;  else k = 0
+  Q5  its end: k = 2 at g > s_min + s_back;  k = 1 and 3 at y = 0;  k = 0 at g < stop
+
+The law is done where the last leg ends, unless the contact is uneven or |y| > y_miss. Then it
+chooses again, up to `tries` times. It is also done at the time t_end. With the offset c to the left
+of the base of m, or of the goal's line in a last leg that touches:
+
+  Q6  push: v_x = v_max, slower near the end;  v_y = K_y c within slope v_x;  omega towards the leg
+  Q7  back off by `back`: contact lost or off the front, |c| > l_edge before the last 0.2 m, or a
+      new leg
+  Q8  around m on a circle R beyond the box to a point `gap` behind its face, turned to d_k; push
+  Q9  look: where the last leg does not know an end of its face, c is that of the point `beyond` the
+      end of the contact there; a base that stays in front of the face shifts sideways
+
+Without contact v_free and omega_free are the bounds. A base that cannot move sideways steers in Q6:
+omega towards the leg + K_h c, within h_max; in Q8 it drives forwards or in reverse. The law needs a
+flat front. In its smooth form the contact is a weight that mixes the twists of Q6; modes and legs
+switch.
+"""
+
+from functools import partial
+from typing import Annotated, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from rps_jax import spec
+from rps_jax.control import soft
+from rps_jax.control.base import ApproachSpeed, Law, OmegaMax, SpeedMax, SuccessDistance
+from rps_jax.control.observation import Details, EndsObservation, Observation, Twist
+from rps_jax.geometry import planar
+from rps_jax.geometry.arrays import Array, Parameter
+from rps_jax.spec import Bound, Spec, document
+
+PUSH, BACK, AROUND = 0, 1, 2  # modes
+_SIDE = 0.02  # [m] behind the front, where a contact is on a side
+_EDGE = 0.05  # [m] of contact beyond a known end, which contradicts it
+_SAME = 0.03  # [m] by which a face or an end may have moved between two contacts
+_FACING = 0.25  # [rad] between base and leg, up to which it feels the box
+_FLUSH, _UNEVEN = 0.4, -1.0  # [s] of even contact, and of uneven contact
+_HALF = 0.07, 0.5  # [m] half widths of objects
+_CARROT, _AHEAD = 0.5, 1.0  # [rad] of the aim on the circle: omnidirectional or not
+_PAST = 0.35  # [m] of the front beyond the face, at which an approach has failed
+_SIDESTEP = 0.1  # [m] of the next approach after one that felt nothing
+_WIDER = 0.1  # [m] of the circle, after a touch on the way
+_TURNS = 0.8  # [rad] between base and leg, up to which the base turns while it touches
+
+
+@document
+class PoseParams(NamedTuple):
+    """Parameters of the law."""
+
+    v_max: SpeedMax = 0.05
+    omega_max: OmegaMax = 0.15
+    d_success: SuccessDistance = 0.05
+    v_approach: ApproachSpeed = 0.03
+    v_free: Annotated[Parameter, Spec("m/s", "bound on the speed without contact", gt=0)] = 0.05
+    omega_free: Annotated[Parameter, Spec("rad/s", "bound on |omega| without contact", gt=0)] = 0.15
+    r: Annotated[
+        Parameter, Spec("m", "half width of an unknown object", gt=0, tune=Bound(0.1, 0.4))
+    ] = 0.22
+    s_min: Annotated[
+        Parameter, Spec("m", "least way of the last leg, Q4", ge=0, tune=Bound(0.1, 1))
+    ] = 0.4
+    s_flush: Annotated[
+        Parameter, Spec("m", "the same, once the box was flush, Q4", ge=0, tune=Bound(0.02, 1))
+    ] = 0.3
+    s_back: Annotated[Parameter, Spec("m", "more way, Q5", ge=0, tune=Bound(0, 0.5))] = 0.1
+    y_tol: Annotated[Parameter, Spec("m", "error of a last leg, Q4", ge=0, tune=Bound(0, 0.1))] = (
+        0.02
+    )
+    cap: Annotated[
+        Parameter, Spec("1", "error that the last leg corrects, Q4", ge=0, tune=Bound(0, 0.5))
+    ] = 0.05
+    y_miss: Annotated[
+        Parameter, Spec("m", "error of a last leg that is repeated", ge=0, tune=Bound(0, 0.1))
+    ] = 0.025
+    stop: Annotated[Parameter, Spec("m", "way left at the end, Q5", ge=-0.1)] = 0.004
+    tries: Annotated[Parameter, Spec("1", "number of repetitions", ge=0)] = 3.0
+    slope: Annotated[
+        Parameter, Spec("1", "sideways over forward speed, Q6", ge=0, tune=Bound(0.02, 0.6))
+    ] = 0.12
+    K_y: Annotated[
+        Parameter,
+        Spec("1/s", "gain of the sideways speed, Q6", ge=0, tune=Bound(0.02, 2, log=True)),
+    ] = 0.2
+    K_h: Annotated[
+        Parameter, Spec("rad/m", "gain of the heading, Q6", ge=0, tune=Bound(0.1, 6, log=True))
+    ] = 1.5
+    h_max: Annotated[
+        Parameter, Spec("rad", "bound of this heading", ge=0, tune=Bound(0.01, 0.6))
+    ] = 0.12
+    omega_push: Annotated[
+        Parameter,
+        Spec("rad/s", "bound on |omega| in contact", gt=0, tune=Bound(0.005, 0.15, log=True)),
+    ] = 0.03
+    l_edge: Annotated[
+        Parameter, Spec("m", "offset of a bad contact, Q7", ge=0, tune=Bound(0.05, 0.3))
+    ] = 0.17
+    back: Annotated[Parameter, Spec("m", "retreat, Q7", ge=0, tune=Bound(0.02, 0.6))] = 0.12
+    R: Annotated[
+        Parameter, Spec("m", "radius of the circle beyond the box, Q8", gt=0, tune=Bound(0.4, 1))
+    ] = 0.52
+    gap: Annotated[
+        Parameter, Spec("m", "gap at the staging point, Q8", gt=0, tune=Bound(0.03, 0.6))
+    ] = 0.06
+    beyond: Annotated[
+        Parameter, Spec("m", "of the base beyond the felt end, Q9", ge=-0.2, tune=Bound(-0.1, 0.2))
+    ] = 0.05
+    looks: Annotated[Parameter, Spec("1", "number of looks in a leg, Q9", ge=0)] = 3.0
+    tau: Annotated[
+        Parameter, Spec("s", "time constant of the filter of the pose", ge=0, tune=Bound(0, 2))
+    ] = 0.5
+    t_end: Annotated[Parameter, Spec("s", "time at which the law gives up", gt=0)] = 290.0
+
+
+class PoseState(NamedTuple):
+    """State of the law between two control steps."""
+
+    mode: Annotated[jax.Array, Spec("1", "0 push or approach, 1 back off, 2 drive around")]
+    leg: Annotated[jax.Array, Spec("1", "k, direction of the push in quarter turns from theta")]
+    h: Annotated[jax.Array, Spec("m", "supports of the box in the grid, Q1 to Q3")]  # (4,)
+    known: Annotated[jax.Array, Spec("1", "whether each is known")]  # (4,) bool
+    centred: Annotated[jax.Array, Spec("1", "whether the middle of each axis was felt")]  # (2,)
+    p_world_contact: Annotated[jax.Array, Spec("m", "the last contact")]  # (2,)
+    p_world_front: Annotated[jax.Array, Spec("m", "middle of the front, a step before")]  # (2,)
+    p_world_base: Annotated[jax.Array, Spec("m", "filtered position of the base")]  # (2,)
+    yaw: Annotated[jax.Array, Spec("rad", "filtered heading of the base")]
+    twist: Annotated[jax.Array, Spec("m/s, m/s, rad/s", "last command")]  # (3,)
+    touched: Annotated[jax.Array, Spec("1", "whether there was a contact")]
+    time: Annotated[jax.Array, Spec("s", "time since the start")]
+    t_lost: Annotated[jax.Array, Spec("s", "time since the last contact")]
+    t_push: Annotated[jax.Array, Spec("s", "time in contact of this push; 0 in an approach")]
+    t_even: Annotated[jax.Array, Spec("s", "time of even contact; negative: of uneven contact")]
+    look: Annotated[jax.Array, Spec("m", "Q9, position of the base in the grid, to the left")]
+    looking: Annotated[jax.Array, Spec("1", "whether the base looks for an end")]
+    looks: Annotated[jax.Array, Spec("1", "number of looks in this leg")]
+    tries: Annotated[jax.Array, Spec("1", "number of repetitions")]
+    wider: Annotated[jax.Array, Spec("m", "growth of the circle after touches on the way")]
+    side: Annotated[jax.Array, Spec("1", "1: counter-clockwise around the object; -1: clockwise")]
+    gear: Annotated[jax.Array, Spec("1", "1: forwards around the object; -1: in reverse")]
+    done: Annotated[jax.Array, Spec("1", "whether the law is done")]
+
+
+check = partial(spec.check, prefix="pose.")
+
+
+class Smooth(NamedTuple):
+    """Options of the smooth form: none."""
+
+    def check(self) -> None:
+        """Do nothing."""
+
+
+def init(params: PoseParams, temperatures: Smooth | None = None) -> PoseState:
+    """Return the state before the first contact."""
+    del temperatures
+    zero = jnp.zeros_like(jnp.asarray(params.r, float))
+    count, no, point = jnp.zeros((), jnp.int32), zero > 0, jnp.zeros(2, zero.dtype)
+    sides = jnp.zeros(4, zero.dtype)
+    return PoseState(
+        mode=count,
+        leg=count,
+        h=sides,
+        known=sides > 0,
+        centred=point > 0,
+        p_world_contact=point,
+        p_world_front=point,
+        p_world_base=point,
+        twist=jnp.zeros(3, zero.dtype),
+        **dict.fromkeys(("touched", "looking", "done"), no),
+        **dict.fromkeys(("yaw", "time", "t_lost", "t_push", "t_even", "look"), zero),
+        **dict.fromkeys(("looks", "tries", "wider"), zero),
+        **dict.fromkeys(("side", "gear"), zero + 1),
+    )
+
+
+def _turned(values: Array, leg: Array) -> Array:
+    """Return values (4,) of the four directions, from that of a leg on."""
+    turned = values
+    for k in (1, 2, 3):
+        turned = jnp.where(leg == k, jnp.roll(values, -k), turned)
+    return turned
+
+
+def _turned2(values: Array, leg: Array) -> Array:
+    """Return values (2,) of the two axes, from that of a leg on."""
+    return jnp.where(leg % 2 == 1, values[::-1], values)
+
+
+class Box(NamedTuple):
+    """Box that the law remembers, in the frame of the goal or of a leg."""
+
+    h: Array  # (4,) [m] supports ahead, left, behind and right
+    known: Array  # (4,) bool
+    centred: Array  # (2,) bool: along and across
+
+
+def feel(
+    params: PoseParams, box: Box, front: Array, lateral: Array, obs: EndsObservation, t_even: Array
+) -> Box:
+    """Compute Q1 to Q3: the box in the frame of the leg, at a contact on the front.
+
+    `front` and `lateral` [m] are the positions of the front along, and of the base across the leg.
+    """
+    (ahead, left, behind, right), known, centred = box
+    flush = obs.even & (t_even > _FLUSH)
+    # The pushed face: the box moves with it, or another face is there and the middle stays.
+    near = -front
+    same = known[2] & (jnp.abs(near - behind) < _SAME)
+    middle = jnp.where(centred[0], (ahead - behind) / 2, front + params.r)
+    mirrored = front + 2 * jnp.clip(middle - front, *_HALF)
+    keeps = known[0] & ~known[2]
+    far = jnp.where(same, ahead + behind - near, jnp.where(keeps, ahead, mirrored))
+    ahead, behind = jnp.where(obs.even, far, ahead), jnp.where(obs.even, near, behind)
+    far_known = known[0] & (same | keeps | ~obs.even)
+    # Its ends, as supports to the left and to the right.
+    felt = jnp.stack([lateral + obs.ends[0], -(lateral + obs.ends[1])])
+    sides, seen = jnp.stack([left, right]), obs.seen & flush
+    is_known = known[1::2] & (felt < sides + _EDGE)
+    is_same = is_known & (jnp.abs(felt - sides) < _SAME)
+    share = jnp.where(t_even > 2 * _FLUSH, 0.1, 0.5)
+    measured = jnp.where(is_same, sides + share * (felt - sides), felt)
+    # Where one end is seen and not the other, this moves along if the face is the same.
+    is_known = is_known & (~seen[::-1] | is_same[::-1] | ~known[1::2][::-1])
+    change = jnp.where(known[1::2], measured - sides, 0.0)
+    carried = sides - jnp.where(seen[::-1], change[::-1], 0.0)
+    sides = jnp.where(seen, measured, jnp.where(is_known, carried, felt))
+    is_known = is_known | seen
+    known = jnp.stack([far_known, is_known[0], known[2] | flush, is_known[1]])
+    centred = jnp.stack([centred[0], centred[1] | flush])
+    return Box(jnp.stack([ahead, sides[0], behind, sides[1]]), known, centred)
+
+
+def filtered_pose(params: PoseParams, state: PoseState, obs: Observation) -> tuple[Array, Array]:
+    """Return position (2,) [m] and yaw [rad] of the base, filtered by its last command."""
+    v, omega = state.twist[:2], state.twist[2]
+    guess = state.p_world_base + obs.period * planar.rotate(state.yaw, v)
+    yaw = state.yaw + obs.period * omega
+    share = jnp.where(state.time > 0, obs.period / (params.tau + obs.period), 1.0)
+    error = planar.wrap(jnp.asarray(obs.yaw) - yaw)
+    return guess + share * (obs.p_world_robot - guess), planar.wrap(yaw + share * error)
+
+
+def observe_sent(
+    params: PoseParams, state: PoseState, obs: EndsObservation, sent: Twist
+) -> PoseState:
+    """Return the state with the twist that moved the base."""
+    del params, obs
+    return state._replace(twist=jnp.stack([jnp.asarray(x, state.twist.dtype) for x in sent]))
+
+
+def step(
+    params: PoseParams,
+    state: PoseState,
+    obs: EndsObservation,
+    temperatures: Smooth | None = None,
+) -> tuple[PoseState, Twist, Details]:
+    """Compute one control step; in the smooth form the contact is a weight."""
+    del temperatures
+    touch, omni = obs.touch, obs.touch.axle is None
+    axle = jnp.asarray(0.0 if touch.axle is None else touch.axle)
+    half_length = obs.front
+    base, yaw, goal = *filtered_pose(params, state, touch), touch.p_world_target
+    theta, weight = jnp.asarray(touch.yaw_target), jnp.asarray(touch.in_contact)
+    touches = weight if weight.dtype == bool else weight > 0.5
+    u = planar.unit(yaw)
+    grid = planar.unit(theta + jnp.arange(4) * (jnp.pi / 2))  # (4, 2) d_j
+    p_world_front = base + half_length * u
+    last = planar.rotate(-yaw, state.p_world_contact - base)
+    contact = jnp.where(touches, touch.p_robot_contact, last)
+    p_world_contact = base + planar.rotate(yaw, contact)
+    on_front = contact[0] > half_length - _SIDE
+    normal = jnp.where(on_front, 0.0, jnp.sign(contact[1]) * jnp.pi / 2)
+    first, touched = touches & ~state.touched, state.touched | touches
+    time, t_lost = state.time + touch.period, jnp.where(touches, 0.0, state.t_lost + touch.period)
+    psi = theta + state.leg * (jnp.pi / 2)
+    is_facing = jnp.abs(planar.wrap(psi - yaw)) < _FACING
+    pushing = state.mode == PUSH
+    feels = pushing & touches & on_front & is_facing & state.touched
+
+    # The box. It moves with the front while this touches.
+    change = jnp.where(obs.even, 1.0, jnp.where(state.t_even > 0, -2.0, -1.0)) * touch.period
+    t_even = jnp.where(feels, jnp.clip(state.t_even + change, _UNEVEN - 0.1, 1.5), state.t_even)
+    h = state.h + jnp.where(
+        feels & (state.t_lost < 0.1), grid @ (p_world_front - state.p_world_front), 0.0
+    )
+    leg, fronts, bases = state.leg, grid @ (p_world_front - goal), grid @ (base - goal)
+    along, across = _turned(fronts, leg)[0], _turned(bases, leg)[1]
+    seen_from_leg = Box(_turned(h, leg), _turned(state.known, leg), _turned2(state.centred, leg))
+    felt = feel(params, seen_from_leg, along, across, obs, t_even)
+    felt = Box(
+        _turned(felt.h, -leg % 4), _turned(felt.known, -leg % 4), _turned2(felt.centred, leg)
+    )
+    middle = p_world_contact + params.r * planar.unit(yaw + normal)
+    forgets = first | (feels & (t_even <= _UNEVEN))
+    guess = grid @ (middle - goal) + params.r
+    h = jnp.where(forgets, guess, jnp.where(feels, felt.h, h))
+    known = jnp.where(forgets, False, jnp.where(feels, felt.known, state.known))
+    centred = jnp.where(forgets, False, jnp.where(feels, felt.centred, state.centred))
+
+    # Q4 and Q5.
+    y, way, left = (h[1] - h[3]) / 2, h[2], -fronts[0]
+    both = known[1] & known[3]
+    last_leg = leg == 0
+    s_min = jnp.where(jnp.any(known), params.s_flush, params.s_min)
+    may_try = state.tries < params.tries
+    is_back = (leg == 2) & feels & (way > s_min + params.s_back)
+    beside = jnp.where(leg == 1, y, -y)  # positive beyond the line
+    is_beside = (leg % 2 == 1) & feels & (beside > -0.004)
+    has_looked = both | (state.looks >= params.looks)
+    settled = (state.t_push > 2) & has_looked & ((t_even > 1) | (state.t_push > 6))
+    room = params.y_tol + params.cap * jnp.maximum(left, 0.0)
+    is_off = (
+        last_leg & feels & settled & (jnp.abs(y) > room + 0.01) & may_try & (left > s_min - 0.1)
+    )
+    passed = last_leg & pushing & state.touched & (left < -0.03)
+    at_end = last_leg & feels & (left < params.stop)
+    # A drum is never flush: a long push and a repetition are enough.
+    is_uneven = (t_even < 0.3) & ((state.tries < 1) | (state.t_push < 20))
+    is_blind = (t_even >= 0.3) & ~has_looked
+    off_line = both & (jnp.abs(y) > params.y_miss)
+    misses = at_end & may_try & (is_uneven | is_blind | off_line)
+    repeats = is_off | misses | (passed & may_try)
+    done = state.done | (at_end & ~misses) | (passed & ~may_try) | (time > params.t_end)
+    chooses = first | is_back | is_beside | repeats
+    room = params.y_tol + params.cap * jnp.maximum(way, 0.0)
+    sideways = jnp.where((jnp.abs(y) > room) & ~is_beside, jnp.where(y > 0, 3, 1), 0)
+    leg_next = jnp.where((way < s_min) & ~is_off & ~is_beside, 2, sideways)
+    leg = jnp.where(chooses, leg_next, leg)
+    tries = state.tries + repeats
+    psi = theta + leg * (jnp.pi / 2)
+    face = planar.wrap(psi - yaw)
+    turns = chooses & (jnp.abs(face) > (_TURNS if omni else 0.3))
+    last_leg = leg == 0
+
+    # The box from the leg, and Q9.
+    ahead, box_left, behind, box_right = _turned(h, leg)
+    along, across = _turned(fronts, leg)[0], _turned(bases, leg)[1]
+    middle_across, middle_along = (box_left - box_right) / 2, (ahead - behind) / 2
+    wants = last_leg & feels & ~chooses & (t_even > 0.6) & ~has_looked & (left > 0.03)
+    wants = wants & (state.t_push > 0.6)
+    target = jnp.where(known[1], -h[3] - params.beyond, h[1] + params.beyond)
+    look = jnp.where(wants, target, state.look)
+    looking = (state.looking & ~(feels & (state.t_push > 0.5)) & ~turns) | wants
+    looks = jnp.where(turns, 0.0, state.looks) + wants
+    aim_across = jnp.where(looking, look, middle_across)
+    offset = aim_across - across  # [m] to the left of the base
+
+    # Q7: the end of a push.
+    is_bad = ~on_front | ((jnp.abs(offset) > params.l_edge) & (~last_leg | (left > 0.2)))
+    t_push = jnp.where(pushing, state.t_push + jnp.where(touches, touch.period, 0.0), 0.0)
+    is_lost = (t_lost > 0.6) & (state.t_push > 0)
+    failed = pushing & touched & (state.t_push == 0) & ~touches & (along > _PAST - behind)
+    # Nothing is felt there: the object lies ahead, perhaps at a dead taxel, and is sought aside.
+    ahead_of_front = planar.rotate(yaw, jnp.stack([params.r, state.side * _SIDESTEP]))
+    h = jnp.where(failed, grid @ (p_world_front + ahead_of_front - goal) + params.r, h)
+    p_world_contact = jnp.where(failed, p_world_front, p_world_contact)
+    known, looking = known & ~failed, looking & ~failed
+    patience = jnp.where(looks > 0, 0.1, 0.4)
+    leaves = (touches & is_bad & (t_push > patience)) | is_lost | failed | turns | wants
+    leaves = pushing & touched & leaves
+    hits = (state.mode == AROUND) & touches
+    lands = hits & on_front & ~is_bad & is_facing & ~turns
+    stops = hits & ~lands & (on_front | omni)
+    wider = state.wider + jnp.where(stops, _WIDER, 0.0)
+    wider = jnp.where(feels, 0.0, jnp.minimum(wider, 0.5))
+    gap = jnp.sum((p_world_contact - p_world_front) * u)
+    back = jnp.where((jnp.abs(face) < 0.1) & omni, 0.04, params.back)
+    on_way, at_side = state.wider > 0, jnp.abs(contact[1]) > 0.26
+    is_clear = (gap > back) | (on_way & (t_lost > 1.5)) | (omni & at_side & (t_lost > 2))
+    is_clear = is_clear & (state.mode == BACK)
+
+    # Q8, of the base's middle or of its axle.
+    ahead_u, left_u = planar.unit(psi), planar.unit(psi + jnp.pi / 2)
+    m = goal + middle_along * ahead_u + aim_across * left_u
+    p_world_axle = base - axle * u
+    away = p_world_axle - m
+    phi = planar.direction(away)
+    turn = planar.wrap(psi + jnp.pi - phi)
+    may_choose = (state.mode != AROUND) | (omni & (jnp.abs(turn) < 2.4))
+    side = jnp.where(may_choose, jnp.where(turn >= 0, 1.0, -1.0), state.side)
+    turn = jnp.mod(side * turn, 2 * jnp.pi)
+    turn = jnp.where(turn > 2 * jnp.pi - 1.5, turn - 2 * jnp.pi, turn)
+    carrot = _CARROT if omni else _AHEAD
+    behind_face = omni & (jnp.abs(face) < 0.1) & (along < -behind - 0.02) & (jnp.abs(offset) < 0.7)
+    is_direct = (jnp.abs(turn) < carrot) | behind_face if omni else turn < carrot
+    half_along, half_across = (
+        jnp.clip(x, *_HALF) for x in ((ahead + behind) / 2, (box_left + box_right) / 2)
+    )
+    R_s = half_along + half_length + params.gap + axle + wider
+    R = params.R + jnp.hypot(half_along, half_across) + axle + wider
+    staging = m - jnp.where(behind_face, -jnp.sum(away * ahead_u), R_s) * ahead_u
+    aim = jnp.where(is_direct, staging, m + R * planar.unit(phi + side * carrot))
+    to_aim = aim - p_world_axle
+    remaining = planar.norm(staging - p_world_axle)
+    heading = planar.direction(to_aim)
+    if omni:
+        near = (remaining < 0.02) | ((remaining < 0.3) & (jnp.abs(offset) < 0.02))
+        gear, error = state.gear, face
+    else:
+        errors = [planar.wrap(heading + x - yaw) for x in (0.0, jnp.pi)]
+        ends = [
+            jnp.where(is_direct, jnp.abs(planar.wrap(psi - heading - x)), jnp.pi / 2)
+            for x in (0.0, jnp.pi)
+        ]
+        costs = [jnp.abs(e) + end for e, end in zip(errors, ends, strict=True)]
+        gear = jnp.where(costs[1] < costs[0] + 1.3, -1.0, 1.0)
+        gear = jnp.where(state.mode == AROUND, state.gear, gear)
+        error = jnp.where(gear > 0, *errors)
+        near = (remaining < 0.04) | ((remaining < 0.2) & (jnp.abs(error) > 1.2))
+    arrives = (state.mode == AROUND) & is_direct & near
+    aligned = arrives & (jnp.abs(face) < 0.03)
+
+    mode = jnp.where(is_clear, AROUND, state.mode)
+    mode = jnp.where(aligned | lands, PUSH, mode)
+    mode = jnp.where(leaves | stops, BACK, mode)
+    t_push = jnp.where(mode == PUSH, t_push, 0.0)
+    t_even = jnp.where(turns, 0.0, t_even)
+
+    # Q6.
+    lateral = soft.where(weight, jnp.where(last_leg, -y, 0.0), offset)
+    steer = 0.0 if omni else jnp.clip(params.K_h * lateral, -params.h_max, params.h_max)
+    bound = soft.where(weight, params.omega_push, params.omega_max)
+    omega = jnp.where(touched, jnp.clip(planar.wrap(psi + steer - yaw), -bound, bound), 0.0)
+    v = jnp.where(touched, params.v_max, params.v_approach)
+    v_last, v_side = (
+        jnp.clip(0.5 * left, 0.01, params.v_max),
+        jnp.clip(-0.5 * beside, 0.015, params.v_max),
+    )
+    slow = jnp.where(last_leg, v_last, jnp.where(leg % 2 == 1, v_side, v))
+    v = soft.where(weight, jnp.where(touched, slow, v), v)
+    bound = soft.where(weight, params.slope * v, 0.4 * params.v_max)
+    gain = soft.where(weight, params.K_y, 0.5)
+    may_slide = omni & touched & (touches | (t_push == 0))
+    v_y = jnp.where(may_slide, jnp.clip(gain * lateral, -bound, bound), 0.0)
+    # Q7 and Q8.
+    flee = -contact / jnp.maximum(planar.norm(contact), 1e-3)
+    flee = jnp.where(omni & on_way, flee, -planar.unit(jnp.zeros_like(yaw))) * params.v_free
+    if omni:
+        speed = jnp.minimum(params.v_free, 0.5 * planar.norm(to_aim) + 0.005)
+        drive = planar.rotate(-yaw, planar.unit(heading) * speed)
+        spin = 2 * face
+    else:
+        is_large = jnp.abs(error) > 0.6
+        v_drive = jnp.where(is_large | arrives, 0.0, gear * params.v_free * jnp.cos(error))
+        drive = jnp.stack([v_drive, jnp.zeros_like(v_drive)])
+        spin = jnp.where(arrives, 2 * face, jnp.where(is_large, jnp.sign(error) * jnp.pi, error))
+    free = jnp.where(mode == BACK, flee, drive)
+    v, v_y = jnp.where(mode == PUSH, v, free[0]), jnp.where(mode == PUSH, v_y, free[1])
+    spin = jnp.where(mode == BACK, 0.0, jnp.clip(spin, -params.omega_free, params.omega_free))
+    omega = jnp.where(mode == PUSH, omega, spin)
+    v, v_y, omega = (jnp.where(done, 0.0, x) for x in (v, v_y, omega))
+    if not omni:
+        v_y = v_y + axle * omega
+    bounds = [
+        jnp.where(mode == PUSH, a, b)
+        for a, b in ((params.v_max, params.v_free), (params.omega_max, params.omega_free))
+    ]
+    twist = Twist(v, v_y, omega).saturate(*bounds)
+    distance = planar.norm(jnp.stack([left, y]))
+    details = Details(offset, distance, jnp.zeros_like(distance), face, mode != PUSH)
+    memory = PoseState(
+        mode=mode,
+        leg=leg,
+        h=h,
+        known=known,
+        centred=centred,
+        p_world_contact=p_world_contact,
+        p_world_front=p_world_front,
+        p_world_base=base,
+        yaw=yaw,
+        twist=jnp.stack(twist),
+        touched=touched,
+        time=time,
+        t_lost=t_lost,
+        t_push=t_push,
+        t_even=t_even,
+        look=look,
+        looking=looking,
+        looks=looks,
+        tries=tries,
+        wider=wider,
+        side=side,
+        gear=gear,
+        done=done,
+    )
+    return memory, twist, details
+
+
+def is_done(state: PoseState) -> Array:
+    """Return whether the law is done."""
+    return state.done
+
+
+LAW = Law(
+    init,
+    step,
+    senses="ends",
+    check=check,
+    drives=("omni", "differential"),
+    room=1.5,
+    heading=True,
+    temperatures=Smooth(),
+    is_done=is_done,
+    observe_sent=observe_sent,
+)
+PRESETS = {
+    "pose": PoseParams(),
+    "pose_drive": PoseParams(  # for bases that cannot move sideways
+        s_min=0.6,
+        s_back=0.15,
+        l_edge=0.25,
+        back=0.3,
+        R=0.7,
+        gap=0.3,
+        looks=0.0,
+    ),
+}

@@ -1,0 +1,179 @@
+"""Poses: the face that a base pushes arrives at a place with a heading.
+
+The heading of the goal is the direction of the last push: the outward normal of the pushed face is
+opposite to it. The true face is judged, not the contact, which says nothing of where a face wider
+than the base is sideways. The pushed face is the face nearest to the last contact point. A cylinder
+has no face: its place is the point of its rim that faces the base, its heading the direction of its
+last 0.3 m of way.
+
+A law that declares that it is done (`Law.is_done`) is judged then and only then, so that the
+simulation does not stop it at a lucky moment. Another law is judged in each control step.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Annotated, ClassVar, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+
+from rps_jax import errors
+from rps_jax.geometry import footprint as fp
+from rps_jax.geometry import planar, solid
+from rps_jax.geometry.arrays import Array, Float, Floats
+from rps_jax.record.files import Arrays
+from rps_jax.robot.shell import Shell
+from rps_jax.spec import Spec
+from rps_jax.world.quantity import Quantity, Range
+from rps_jax.world.tasks.base import Aim, CourseInputs, Positions, Task
+
+_SPACING = 0.15  # [m] of way between the stored positions of a cylinder; the heading spans two
+_TURN = 2 * math.pi  # [rad]
+_ARROW = 0.4  # [m] length of the goal's arrow in pictures
+
+
+class PoseProgress(NamedTuple):
+    """Pushed face of a trial, and its errors."""
+
+    face: Float[Array, "*B 3"]  # [m, m, rad] middle and inward normal, in the object's frame
+    way: Float[Array, "*B 3 2"]  # [m] earlier positions of a cylinder, the latest first
+    errors: Float[Array, "*B 3"]  # [m, m, rad] as `outcomes`; NaN before the first touch
+    declared: Floats  # [1] whether the law has declared that it is done
+
+    def outcomes(self) -> dict[str, Array]:
+        """Return the errors of the pushed face, and whether the law ended the trial."""
+        place, sideways, heading = jnp.moveaxis(self.errors, -1, 0)
+        named = {"place_error": place, "sideways_error": sideways, "heading_error": heading}
+        return named | {"declared": self.declared}
+
+
+class PoseCourse(NamedTuple):
+    """Goal of a world, and its tolerances."""
+
+    p_world_goal: Float[Array, "*B 2"]  # [m]
+    heading: Floats  # [rad]
+    d_success: Floats  # [m]
+    yaw_success: Floats  # [rad]
+
+    def start(self) -> PoseProgress:
+        """Return the progress before the first touch."""
+        zero = jnp.zeros_like(self.heading)
+        nothing = jnp.zeros(3, zero.dtype)
+        return PoseProgress(nothing, jnp.full((3, 2), jnp.inf, zero.dtype), nothing + jnp.nan, zero)
+
+    def step(self, progress: PoseProgress, positions: Positions) -> tuple[PoseProgress, Aim]:
+        """Judge the pushed face against the goal."""
+        goal, footprint = positions.p_world_goal, positions.footprint
+        middle, yaw, touches = positions.p_world_object, positions.object_yaw, positions.touches
+        if footprint.vertices.shape[0] < 3:
+            way = _extended(progress.way, middle)
+            place = middle - footprint.radius * planar.unit(self.heading)
+            face, direction = progress.face, planar.direction(middle - way[2])
+        else:
+            contact = planar.rotate(-yaw, positions.p_world_contact - middle)
+            pushed = _pushed_face(footprint, contact, positions.base[2] - yaw)
+            way, face = progress.way, jnp.where(touches, pushed, progress.face)
+            place, direction = middle + planar.rotate(yaw, face[:2]), yaw + face[2]
+        away = planar.rotate(-self.heading, place - goal)
+        turn = planar.wrap(direction - self.heading)
+        values = jnp.stack([planar.norm(away), jnp.abs(away[1]), jnp.abs(turn)])
+        touched = touches | ~jnp.isnan(progress.errors[0])
+        values = jnp.where(touched, values, jnp.nan)
+        declared = positions.declared
+        is_there = touched & (values[0] < self.d_success) & (values[2] < self.yaw_success)
+        success = is_there if declared is None else is_there & declared
+        ended = progress.declared if declared is None else declared.astype(values.dtype)
+        aim = Aim(goal, yaw_target=self.heading, success=success)
+        return PoseProgress(face, way, values, ended), aim
+
+    def remaining(self, progress: PoseProgress, p_world_goal: Array, point: Array) -> Array:
+        """Return the distance to the goal."""
+        return planar.norm(p_world_goal - point)
+
+    def lines(self) -> Arrays:
+        """Return the goal's arrow, which ends at its place."""
+        tip = np.asarray(self.p_world_goal, float)
+        tail = tip - _ARROW * solid.unit(np.asarray(self.heading, float))
+        return {"goal": np.stack([tail, tip], axis=-2)}
+
+
+def _extended(way: Float[Array, "3 2"], middle: Float[Array, "2"]) -> Float[Array, "3 2"]:
+    """Return the stored positions of a way that has come to `middle` [m]."""
+    way = jnp.where(jnp.isfinite(way), way, middle)
+    far = planar.norm(middle - way[0]) > _SPACING
+    return jnp.where(far, jnp.concatenate([middle[None], way[:2]]), way)
+
+
+def _pushed_face(
+    footprint: fp.Footprint, contact: Float[Array, "2"], base_yaw: Floats
+) -> Float[Array, "3"]:
+    """Return the middle and the inward normal of the face nearest to a contact point.
+
+    All are in the object's frame. Near a corner the face that the base looks at is preferred.
+    """
+    start = footprint.vertices
+    along = jnp.roll(start, -1, axis=0) - start
+    length = planar.norm(along)
+    share = jnp.sum((contact - start) * along, axis=-1) / jnp.maximum(length**2, 1e-12)
+    nearest = start + jnp.clip(share, 0, 1)[:, None] * along
+    inward = planar.direction(jnp.stack([-along[:, 1], along[:, 0]], axis=-1))
+    away = planar.norm(contact - nearest) - 0.02 * jnp.cos(inward - base_yaw)
+    away = jnp.where(length > 0, away, jnp.inf)
+    faces = jnp.concatenate([start + along / 2, inward[:, None]], axis=-1)
+    return faces[jnp.argmin(away)]
+
+
+@dataclass(frozen=True)
+class Pose(Task):
+    """Push a face of the object to a place with a heading."""
+
+    kind: str = "pose"
+    HAS_TARGET = True
+    OUTCOMES: ClassVar[dict[str, Spec]] = {
+        "place_error": Spec("m", "distance of the pushed face's middle from the goal at the end"),
+        "sideways_error": Spec("m", "part of it across the goal's heading"),
+        "heading_error": Spec("rad", "angle between the pushed face's normal and the goal's"),
+        "declared": Spec("1", "whether the law declared that it was done"),
+    }
+
+    heading: Annotated[
+        Range,
+        Quantity(
+            "rad",
+            "heading of the goal: the direction of the last push",
+            ge=-_TURN,
+            le=_TURN,
+            owner="course",
+        ),
+    ] = Range(-math.pi, math.pi)
+    d_success: Annotated[float, Spec("m", "greatest error of the place", gt=0, le=1)] = 0.05
+    yaw_success: Annotated[float, Spec("rad", "greatest error of the heading", gt=0, le=3.2)] = 0.1
+
+    def __post_init__(self) -> None:
+        for angle in self.heading[:2]:
+            if abs(angle) > _TURN:
+                rule = "it is beyond 2 pi: give radians, as 1.571 for 90 degrees"
+                raise errors.not_allowed("task heading", f"{angle:g}", rule)
+        super().__post_init__()
+
+    def check_goal(
+        self, target: Sequence[float], shell: Shell, object_width: Callable[[], float]
+    ) -> None:
+        """Raise InputError for a goal (x, y) [m] in the object's start."""
+        (x, y), width = target, object_width()
+        reach = float(shell.half[0]) + width
+        if 0 <= x <= reach and abs(y) <= width / 2:
+            rule = f"the object starts there, up to {reach:.2f} m ahead; choose a target beyond it"
+            raise errors.not_allowed("target", f"({x:g}, {y:g}) m", rule)
+
+    def courses(self, inputs: CourseInputs) -> tuple[np.ndarray, PoseCourse]:
+        """Return the goals."""
+        heading = self.heading.at(inputs.u["heading"]) + inputs.bearing
+        tolerances = (np.full(heading.shape, x) for x in (self.d_success, self.yaw_success))
+        return inputs.p_world_target, PoseCourse(inputs.p_world_target, heading, *tolerances)
+
+
+TASK = Pose

@@ -1,0 +1,296 @@
+"""Goals with a heading: the task, the sense of ends, and the law."""
+
+import math
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import jitted, refusing, rps
+from numpy.testing import assert_allclose
+
+import rps_jax
+from rps_jax import Details, Law, Twist
+from rps_jax.control import registry
+from rps_jax.control.laws.pose import PoseParams
+from rps_jax.control.observation import EndsObservation, Observation
+from rps_jax.geometry import footprint as fp
+from rps_jax.robot import skin as skins
+from rps_jax.robot.shell import Shell
+from rps_jax.robot.skin import CapacitiveSkin
+from rps_jax.trials.case import Case
+from rps_jax.trials.setting import Setting
+from rps_jax.trials.trial import Rules
+from rps_jax.world.tasks import parse_task
+from rps_jax.world.tasks.base import Positions
+from rps_jax.world.tasks.pose import PoseCourse
+
+GOAL, HEADING = np.array([1.0, 0.5]), 0.7
+NO = jnp.zeros((), bool)
+FAST = "pose,v_free=0.2,omega_free=0.5"
+
+
+def course(d_success=0.05, yaw_success=0.1):
+    return PoseCourse(*map(jnp.asarray, (GOAL, HEADING, d_success, yaw_success)))
+
+
+def positions(footprint, place, yaw, contact, touches=True, declared=None):
+    base = jnp.array([0.0, 0.0, HEADING])
+    shell = Shell().outline
+    inputs = jnp.asarray(GOAL), jnp.asarray(contact), jnp.asarray(touches), base, shell
+    bodies = jnp.asarray(place), jnp.asarray(yaw), footprint
+    return Positions(*inputs, *bodies, None if declared is None else jnp.asarray(declared))
+
+
+def judged(at, progress=None):
+    """Return progress and aim of one control step, from the start if no progress is given."""
+    task = course()
+    return jitted(PoseCourse.step)(task, task.start() if progress is None else progress, at)
+
+
+def unit(angle):
+    return np.array([math.cos(angle), math.sin(angle)])
+
+
+@pytest.mark.parametrize("quarter", range(4))
+@pytest.mark.parametrize("along", [-0.5, 0.0, 0.55])
+def test_the_middle_of_the_true_face_is_judged_wherever_it_is_touched(quarter, along):
+    """Each face of a box 0.6 m times 1.2 m, off the goal by (0.02, -0.03) m and 0.05 rad."""
+    half, across = ((0.3, 0.6), (0.6, 0.3))[quarter % 2]
+    along *= across / 0.6
+    heading = HEADING + 0.05
+    normal, left = unit(heading), unit(heading + math.pi / 2)
+    face = GOAL + 0.02 * unit(HEADING) - 0.03 * unit(HEADING + math.pi / 2)
+    yaw = heading - quarter * math.pi / 2
+    contact = face + along * left - 0.004 * normal
+    progress, aim = judged(positions(fp.rectangle(0.3, 0.6), face + half * normal, yaw, contact))
+    results = {k: float(x) for k, x in progress.outcomes().items()}
+    assert results["place_error"] == pytest.approx(math.hypot(0.02, 0.03), abs=2e-6)
+    assert results["sideways_error"] == pytest.approx(0.03, abs=2e-6)
+    assert results["heading_error"] == pytest.approx(0.05, abs=2e-6)
+    assert aim.success
+    assert float(aim.yaw_target) == pytest.approx(HEADING)
+
+
+def test_the_pushed_face_is_the_last_that_was_touched():
+    box, normal = fp.rectangle(0.3, 0.3), unit(HEADING)
+    face = GOAL + 0.1 * normal
+    touching = positions(box, face + 0.3 * normal, HEADING, face)
+    progress, aim = judged(touching)
+    assert not aim.success
+    # It has come to the goal, and the base has left to another side.
+    left = positions(box, GOAL + 0.3 * normal, HEADING, GOAL + 0.6 * normal, touches=False)
+    progress, aim = judged(left, progress)
+    assert aim.success
+    assert float(progress.errors[0]) == pytest.approx(0, abs=2e-6)
+
+
+def test_nothing_is_judged_before_the_first_touch():
+    normal = unit(HEADING)
+    inputs = fp.rectangle(0.3, 0.3), GOAL + 0.3 * normal, HEADING, GOAL
+    progress, aim = judged(positions(*inputs, touches=False))
+    assert not aim.success
+    assert np.isnan(progress.errors).all()
+
+
+@pytest.mark.parametrize("turn", [0.0, 0.4, -2.0])
+def test_the_heading_of_a_cylinder_is_that_of_its_last_way(turn):
+    drum, radius = fp.circle(0.25), 0.25
+    end = GOAL + radius * unit(HEADING)
+    corner, progress = end - 0.5 * unit(HEADING + turn), None
+    steps = [corner + (0.5 - s) * unit(2.5) for s in np.arange(0.5, 0, -0.01)]
+    steps += [corner + s * unit(HEADING + turn) for s in np.arange(0, 0.501, 0.01)]
+    for middle in steps:
+        at = positions(drum, middle, 0.3, middle - radius * unit(HEADING))
+        progress, aim = judged(at, progress)
+    place, sideways, heading = map(float, progress.errors)
+    assert heading == pytest.approx(abs(turn), abs=2e-4)
+    assert max(place, sideways) < 1e-5
+    assert bool(aim.success) == (abs(turn) < 0.1)
+
+
+@pytest.mark.parametrize("declared", [True, False])
+def test_a_law_that_can_declare_is_judged_by_its_word(declared):
+    normal = unit(HEADING)
+    box = fp.rectangle(0.3, 0.3), GOAL + 0.3 * normal, HEADING, GOAL
+    progress, aim = judged(positions(*box, declared=declared))
+    assert bool(aim.success) == declared == bool(progress.declared)
+
+
+class WaitParams(NamedTuple):
+    wait: float = 1.0  # [s]
+    d_success: float = 0.05
+
+
+def wait(params, state, obs):
+    """Wait, then declare to be done."""
+    later = state[0] + obs.period
+    speed = 0.0 * later
+    return (later, later > params.wait), Twist(speed, speed, speed), Details.from_obs(obs)
+
+
+@pytest.mark.parametrize("task", ["pose", "reach"])
+def test_the_word_of_a_law_ends_a_trial(task, registries):
+    def init(params):
+        return jnp.zeros_like(jnp.asarray(params.wait, float)), NO
+
+    law = Law(init, wait, is_done=lambda state: state[1])
+    rps_jax.register_law("wait", law, WaitParams())
+    outcome = rps_jax.push(law="wait", task=task, setting=Setting("quasistatic")).outcome
+    assert float(outcome.time) == pytest.approx(1.02, abs=0.021)
+    assert not outcome.success
+    assert task == "reach" or outcome.task["declared"] == 1
+
+
+CASES = {
+    "push --task pose,heading=90": "task heading = 90 is not allowed: it is beyond 2 pi: give rad",
+    "sweep --task pose,heading=0:7": "task heading = 7 is not allowed: it is beyond 2 pi",
+    "push --task pose,d_success=0": "task d_success = 0",
+    "push --task pose,yaw_success=0": "task yaw_success = 0",
+    "push --task pose --target 0.6 0.1": r"target = \(0.6, 0.1\) m is not allowed: the object st",
+    "push --task pose,yaw=1": "unknown task quantity of pose 'yaw'",
+    "push --law pose,v_free=0": "v_free = 0",
+    "push --law pose --robot f1tenth": "law = pose is not allowed",
+}
+
+
+@pytest.mark.parametrize("command", CASES)
+def test_bad_goals_are_refused_in_one_sentence_before_anything_compiles(
+    command, compiled, capsys, tmp_path
+):
+    assert rps(command, "--out", tmp_path / "run") == 2
+    error = capsys.readouterr().err
+    assert not compiled
+    with refusing(CASES[command]):
+        raise rps_jax.errors.InputError(error)
+
+
+# --- the sense of ends ---------------------------------------------------------------------
+
+
+def ends_at(half, y, tilt=0.0, dead=(), gap=0.0005, skin=CapacitiveSkin()):
+    """Return the ends of a box (0.2, half) at y, in front of the paper's base."""
+    x = 0.3625 + gap + 0.2 * math.cos(tilt) + half * abs(math.sin(tilt))
+    box = fp.place(fp.rectangle(0.2, half), jnp.array([x, y]), tilt)
+    alive = np.ones(42, bool)
+    alive[list(dead)] = False
+    state = skin.init(jax.random.PRNGKey(0))
+    signal = np.where(alive, skin._scan(state, box)[1], 0.0)
+    return skins.ends_of(jnp.asarray(signal), jnp.asarray(alive), Shell(), skin.threshold)
+
+
+def test_the_ends_of_a_flush_face_are_within_a_fifth_of_a_taxel():
+    for half in np.linspace(0.09, 0.16, 7):
+        for y in np.linspace(-0.07, 0.07, 9):
+            found = ends_at(half, y)
+            assert found.seen.all()
+            assert found.even
+            assert_allclose(found.ends, [y + half, y - half], atol=0.01)
+
+
+def test_an_end_beyond_the_front_is_not_seen():
+    for y, seen in ((0.0, [False, False]), (0.2, [False, True]), (-0.2, [True, False])):
+        found = ends_at(0.4, y)
+        assert found.even
+        assert found.seen.tolist() == seen
+
+
+def test_no_end_is_seen_in_an_uneven_contact():
+    for tilt in (0.02, -0.05, 0.3):
+        found = ends_at(0.15, 0.0, tilt)
+        assert not found.even
+        assert not found.seen.any()
+
+
+def test_a_dead_taxel_hides_an_end():
+    """The front has the taxels 15 to 26; the face covers the middle six of them."""
+    covered = 3 * 2 * 0.29 / 12
+    assert ends_at(covered, 0.0).seen.tolist() == [True, True]
+    assert ends_at(covered, 0.0, dead=[17]).seen.tolist() == [False, True]
+    assert ends_at(covered, 0.0, dead=[24]).seen.tolist() == [True, False]
+    inner = ends_at(covered, 0.0, dead=[20])
+    assert inner.even
+    assert inner.seen.all()
+
+
+def test_ends_mirror_with_the_object():
+    for y, tilt in ((0.03, 0.0), (0.1, 0.004), (0.21, 0.0)):
+        a, b = ends_at(0.17, y, tilt), ends_at(0.17, -y, -tilt)
+        assert_allclose(a.ends, -b.ends[::-1], atol=1e-6)
+        assert a.seen.tolist() == b.seen.tolist()[::-1]
+
+
+def test_an_environment_has_the_heading_of_the_goal_and_the_ends():
+    env = rps_jax.PushEnv(domain="wide,yaw_noise=0:0", task="pose", senses="ends", worlds=4)
+    state = jax.jit(env.reset)(jax.random.key(0))
+    assert state.obs.shape == (env.observation_size,) == (42 + 2 + 2 + 5 + 42,)
+    world, obs = state.info["world"], np.asarray(state.obs)
+    assert_allclose(obs[44:46], unit(float(world.task.heading)), atol=1e-6)
+    assert_allclose(obs[51:], world.skin.init(world.key).alive)
+    assert rps_jax.PushEnv(task="pose", worlds=4).observation_size == 46
+    assert rps_jax.PushEnv(worlds=4).observation_size == 44
+
+
+# --- the law -------------------------------------------------------------------------------
+
+
+def test_the_law_delivers_boxes_to_poses_and_ends_each_trial():
+    setting = Setting(rules=Rules(horizon=300.0), split="tune")
+    domain = "wide,objects=random_box"
+    results = rps_jax.sweep(FAST, domain, worlds=8, task="pose", setting=setting)
+    assert int(results.success.sum()) >= 6
+    assert (results.declared > 0).all()
+    good = results.success.values[0] > 0
+    assert (results.place_error.values[0][good] < 0.05).all()
+    assert (results.heading_error.values[0][good] < 0.1).all()
+
+
+def last_twist(law, weight, K_y, y):
+    """Return the twist (3,) after 30 steps of contact with a face that is off the line by y [m].
+
+    The contact of the last step has a weight.
+    """
+    params = PoseParams(K_y=K_y)
+    truth = jnp.ones((), weight.dtype)
+    target = jnp.array([2.0, y])
+    touch = Observation(jnp.zeros(2), jnp.zeros(()), jnp.array([0.3625, 0.0]), truth, target)
+    touch = touch._replace(yaw_target=jnp.zeros(()))
+    ends, seen = jnp.array([0.15, -0.15]), jnp.ones(2, bool)
+    signals = jnp.zeros(42), jnp.ones(42, bool)
+    obs = EndsObservation(touch, *signals, ends, seen, seen[0], jnp.asarray(0.3625))
+    state = jax.lax.fori_loop(0, 29, lambda _, s: law.step(params, s, obs)[0], law.init(params))
+    obs = obs._replace(touch=touch._replace(in_contact=weight))
+    return jnp.stack(law.step(params, state, obs)[1])
+
+
+def test_the_smooth_law_mixes_its_pushes_by_the_weight_of_the_contact():
+    hard = registry.law_of(PoseParams())
+    smooth = registry.smooth_law(hard)
+    inputs = 0.2, jnp.asarray(0.01)
+    expected = jax.jit(last_twist, static_argnums=0)(hard, jnp.ones((), bool), *inputs)
+    assert expected[0] > 0
+    assert_allclose(expected[1], 0.2 * 0.01, rtol=0.2)
+    weigh = jax.jit(lambda w, K: last_twist(smooth, w, K, inputs[1]))
+    assert_allclose(weigh(jnp.asarray(1.0), 0.2), expected, atol=1e-7)
+    slopes = jax.jit(jax.jacfwd(lambda w, K: last_twist(smooth, w, K, inputs[1]), (0, 1)))
+    by_weight, by_gain = slopes(jnp.asarray(0.9), 0.2)
+    numeric = (weigh(jnp.asarray(0.91), 0.2) - weigh(jnp.asarray(0.89), 0.2)) / 0.02
+    assert_allclose(by_weight, numeric, atol=2e-4)
+    assert by_gain[1] > 1e-3
+
+
+def test_tolerances_are_options_of_the_task():
+    task = parse_task("pose,heading=1.2,d_success=0.02,yaw_success=0.05")
+    case = Case(task=task, target=(1.5, 0.5), law="pose")
+    assert case.challenge == task
+    assert str(task) == "pose,heading=1.2:1.2,d_success=0.02,yaw_success=0.05"
+
+
+def test_the_law_asks_for_the_heading_where_the_goal_has_none():
+    """Of a target without a heading it is the direction from the base's start."""
+    trace = rps_jax.push(
+        law="pose", target=(1.5, 0.0), task="reach", setting=Setting("quasistatic")
+    )
+    assert trace.outcome.success
+    assert registry.law_of(registry.LAWS["pose"]).heading
