@@ -124,7 +124,7 @@ PROBES_OF: Mapping[str, tuple[str, ...]] = {
     "round_base*": ("round",),
     **dict.fromkeys(("arena", "commands*", "compilers*", "costs", "derivatives*", "gpus"), ()),
     **dict.fromkeys(("kernel", "levers", "robot", "speed*", "tasks_cost_*"), ()),
-    **dict.fromkeys(("dependencies", "environments_gpu", "extras"), ()),
+    **dict.fromkeys(("dependencies", "environments*", "extras"), ()),
 }
 
 

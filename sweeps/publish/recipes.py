@@ -323,7 +323,7 @@ RECIPES: dict[str, Recipe] = {
         gpu=5,
         section="Drives",
     ),
-    "drives_engines": recipe(f"rps sweeps/drives/engines.py {_MACHINE}", cores=15),
+    "drives_engines": recipe(f"rps sweeps/drives/engines.py --worlds 60 {_MACHINE}", cores=15),
     "corridors_*": recipe(
         "rps sweeps/corridors --laws rps rps_tuned rps_plus learned force_push dipole aps "
         f"rps_tuned,sweeps/corridors/tuned.json {_MACHINE}",
