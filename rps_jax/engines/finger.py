@@ -108,9 +108,8 @@ def push(
     The leaves of `slider` may have a leading axis B. The finger goes straight between points of a
     path, at any speed.
     """
-    batched = jax.tree.map(
-        lambda leaf, rank: 0 if jnp.ndim(leaf) > rank else None, slider, Slider(2, 2, 0, 0)
-    )
+    ranks: Any = Slider(*(2, 2, 0, 0))  # pyright: ignore[reportArgumentType]
+    batched = jax.tree.map(lambda leaf, rank: 0 if jnp.ndim(leaf) > rank else None, slider, ranks)
     one = partial(_push, steps=steps)
     with trace_one_world():
         return jax.vmap(one, in_axes=(batched, 0, 0))(slider, path, pose)
@@ -216,7 +215,7 @@ def _iterate(refine: Callable[[tuple], tuple], start: tuple) -> tuple:
     return jax.lax.while_loop(unfinished, one, (0, start, jnp.asarray(jnp.inf, start[0].dtype)))[1]
 
 
-def _power(pads: tuple, v: Vec) -> jax.Array:
+def _power(pads: tuple, v: Any) -> jax.Array:
     """Return the power of friction at a twist."""
     x, y, share, radius = pads
     u, w = v[0] - v[2] * y, v[1] + v[2] * x
@@ -269,7 +268,8 @@ def _slide(pads: tuple, force: jax.Array, flow: jax.Array, stuck: jax.Array) -> 
     def refine(carry: tuple) -> tuple:
         v: Any = tuple(carry[0])
         gradient, hessian = friction_of_pads(fixed, v, _SMOOTH)
-        change = solved(tuple(g - f for g, f in zip(gradient, pull, strict=True)), hessian)
+        rest: Any = tuple(g - f for g, f in zip(gradient, pull, strict=True))
+        change = solved(rest, hessian)
         tried = [tuple(a - s * b for a, b in zip(v, change, strict=True)) for s in _LENGTHS]
         costs = jnp.stack([cost(x) for x in tried])
         best = jnp.argmin(costs)

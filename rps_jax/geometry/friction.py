@@ -21,7 +21,7 @@ def friction_of_pads(pads: tuple[Number, ...], v: Vec, pace: Number) -> tuple[Ve
     slope: Vec = tuple(sp.total(load * f) for f in flow)  # pyright: ignore[reportAssignmentType]
     one = jnp.ones_like(x)
     metric = one, 0 * x, -y, one, x, x * x + y * y + radius * radius
-    hessian = [
+    hessian: list[Number] = [
         total * sp.total(load * (g - flow[i] * flow[j] / (speed * speed))) + slope[i] * slope[j]
         for g, (i, j) in zip(metric, ENTRIES, strict=True)
     ]

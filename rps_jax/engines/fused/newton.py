@@ -429,7 +429,7 @@ def _slope_of_ellipse(line: _Line, x: Number) -> tuple[Number, Number]:
 
 
 def _slope_of_pyramid(
-    lines: tuple[Contact, Row, Row], x: Number, physics: Physics
+    lines: tuple[Contact, Any, Any], x: Number, physics: Physics
 ) -> tuple[Number, Number]:
     """Return first and second derivative of the contacts' cost for the friction pyramid."""
     c, start, pace = lines

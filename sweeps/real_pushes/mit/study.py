@@ -152,16 +152,17 @@ class Mit(QuickStudy[xr.Dataset]):
         """Fit 20 % of the pushes of a cell with the default priors, and predict the others."""
         cell = read(Path(self.data), label)
         rows = np.split(_order(cell, 0), [len(cell.published) // 5])
-        errors, fitted = self._predicted(cell, *rows, PRIOR)
+        errors, fitted = self._predicted(cell, rows, PRIOR)
         assert fitted is not None
         gap = objects.gaps_at_end(cell.outline, _chosen(cell.pushes, rows[0]), RADIUS)
         gaps = {"gap_before": np.nanmedian(np.abs(gap)), "gap_after": abs(fitted.data.gap).median()}
         return errors.assign(mean=fitted.data["mean"], **gaps)
 
     def _predicted(
-        self, cell: Cell, few: np.ndarray, rest: np.ndarray, prior: Mapping
+        self, cell: Cell, rows: Sequence[np.ndarray], prior: Mapping
     ) -> tuple[xr.Dataset, objects.ObjectFit | None]:
-        """Return the errors (push) of the `rest` after a fit to a `few`, and the fit, if any."""
+        """Return errors (push) after a fit to the first of two sets of rows, and any fit."""
+        few, rest = rows
         chosen, fitted = _chosen(cell.pushes, few), None
         for tried in (prior, PRIOR):  # the gaps may not fit the prior of the others
             with contextlib.suppress(InputError):
@@ -193,7 +194,7 @@ class Mit(QuickStudy[xr.Dataset]):
         by_method = []
         for count in (5, 20):
             draws = [
-                self._predicted(cell, *np.split(_order(cell, draw), [count]), prior)[0]
+                self._predicted(cell, np.split(_order(cell, draw), [count]), prior)[0]
                 for draw in range(self.draws)
             ]
             by_method.append(xr.concat(draws, "draw"))
