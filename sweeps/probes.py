@@ -122,7 +122,9 @@ PROBES_OF: Mapping[str, tuple[str, ...]] = {
     **dict.fromkeys(("million", "random_worlds", "robots"), ("wide", "real")),
     "real": ("real",),
     "round_base*": ("round",),
-    **dict.fromkeys(("arena", "commands*", "compilers*", "costs", "derivatives*", "gpus"), ()),
+    **dict.fromkeys(
+        ("arena", "commands*", "compilers*", "costs", "derivatives*", "environments*", "gpus"), ()
+    ),
     **dict.fromkeys(("kernel", "levers", "robot", "speed*", "tasks_cost_*"), ()),
     **dict.fromkeys(("dependencies", "environments*", "extras"), ()),
 }

@@ -98,7 +98,7 @@ def test_nothing_is_judged_before_the_first_touch():
 def test_the_heading_of_a_cylinder_is_that_of_its_last_way(turn):
     drum, radius = fp.circle(0.25), 0.25
     end = GOAL + radius * unit(HEADING)
-    corner, progress = end - 0.5 * unit(HEADING + turn), None
+    corner, progress, aim = end - 0.5 * unit(HEADING + turn), course().start(), None
     steps = [corner + (0.5 - s) * unit(2.5) for s in np.arange(0.5, 0, -0.01)]
     steps += [corner + s * unit(HEADING + turn) for s in np.arange(0, 0.501, 0.01)]
     for middle in steps:
@@ -107,6 +107,7 @@ def test_the_heading_of_a_cylinder_is_that_of_its_last_way(turn):
     place, sideways, heading = map(float, progress.errors)
     assert heading == pytest.approx(abs(turn), abs=2e-4)
     assert max(place, sideways) < 1e-5
+    assert aim is not None
     assert bool(aim.success) == (abs(turn) < 0.1)
 
 

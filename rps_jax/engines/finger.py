@@ -108,8 +108,10 @@ def push(
     The leaves of `slider` may have a leading axis B. The finger goes straight between points of a
     path, at any speed.
     """
-    ranks: Any = Slider(*(2, 2, 0, 0))  # pyright: ignore[reportArgumentType]
-    batched = jax.tree.map(lambda leaf, rank: 0 if jnp.ndim(leaf) > rank else None, slider, ranks)
+    ranks = (2, 2, 0, 0)
+    batched: Any = Slider(
+        *(0 if jnp.ndim(x) > rank else None for x, rank in zip(slider, ranks, strict=True))
+    )
     one = partial(_push, steps=steps)
     with trace_one_world():
         return jax.vmap(one, in_axes=(batched, 0, 0))(slider, path, pose)
@@ -215,7 +217,7 @@ def _iterate(refine: Callable[[tuple], tuple], start: tuple) -> tuple:
     return jax.lax.while_loop(unfinished, one, (0, start, jnp.asarray(jnp.inf, start[0].dtype)))[1]
 
 
-def _power(pads: tuple, v: Any) -> jax.Array:
+def _power(pads: tuple, v: Vec) -> jax.Array:
     """Return the power of friction at a twist."""
     x, y, share, radius = pads
     u, w = v[0] - v[2] * y, v[1] + v[2] * x
@@ -260,7 +262,8 @@ def _slide(pads: tuple, force: jax.Array, flow: jax.Array, stuck: jax.Array) -> 
     It minimises half of the squared power less the force times the velocity. Guesses are the last
     one, and the twist (3,) of a contact that sticks.
     """
-    fixed, pull, flow, stuck = jax.lax.stop_gradient((pads, (force[0], force[1], 0.0), flow, stuck))
+    constant: Any = jax.lax.stop_gradient((pads, (force[0], force[1], 0.0), flow, stuck))
+    fixed, pull, flow, stuck = constant
 
     def cost(v: Vec) -> jax.Array:
         return _power(fixed, v) ** 2 / 2 - pull[0] * v[0] - pull[1] * v[1]
@@ -268,14 +271,14 @@ def _slide(pads: tuple, force: jax.Array, flow: jax.Array, stuck: jax.Array) -> 
     def refine(carry: tuple) -> tuple:
         v: Any = tuple(carry[0])
         gradient, hessian = friction_of_pads(fixed, v, _SMOOTH)
-        rest: Any = tuple(g - f for g, f in zip(gradient, pull, strict=True))
-        change = solved(rest, hessian)
+        excess: Any = tuple(g - f for g, f in zip(gradient, pull, strict=True))
+        change = solved(excess, hessian)
         tried = [tuple(a - s * b for a, b in zip(v, change, strict=True)) for s in _LENGTHS]
         costs = jnp.stack([cost(x) for x in tried])
         best = jnp.argmin(costs)
         return (jnp.stack([jnp.stack(x) for x in tried])[best],)
 
-    power = _power(fixed, stuck)
+    power = _power(fixed, tuple(stuck))
     scaled = (pull[0] * stuck[0] + pull[1] * stuck[1]) / (power * power) * stuck
     guess = jnp.where(cost(tuple(flow)) < cost(tuple(scaled)), flow, scaled)
     v = tuple(jax.lax.stop_gradient(_iterate(refine, (guess,))[0]))

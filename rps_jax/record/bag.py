@@ -193,7 +193,8 @@ def _messages(steps: Iterable[Step]) -> Iterator[tuple[str, int, Message]]:
         yield "/odom", stamp, {**child, "pose": pose, "twist": {"twist": _velocity(previous, step)}}
         yield "/target", stamp, {"header": odom, "point": _xyz(*step.target)}
         if step.yaw_target is not None:
-            goal = _pose(*step.target, step.yaw_target)
+            x, y = step.target
+            goal = _pose(x, y, step.yaw_target)
             yield "/goal", stamp, {"header": odom, "pose": goal}
         points = [_xyz(*step.p_robot_contact)] * int(step.contact_type)
         yield "/contact", stamp, {"header": base, "polygon": {"points": points}}

@@ -390,7 +390,7 @@ def _obs(obs: TaxelObservation | EndsObservation) -> jax.Array:
     goal = planar.rotate(-touch.yaw, touch.p_world_target - touch.p_world_robot)
     parts = [obs.signal, goal]
     if touch.yaw_target is not None:
-        parts.append(planar.unit(touch.yaw_target - touch.yaw))
+        parts.append(planar.unit(jnp.asarray(touch.yaw_target) - touch.yaw))
     if isinstance(obs, EndsObservation):
         parts += [obs.ends, obs.seen, obs.even[None], obs.alive]
     return jnp.concatenate([x.astype(goal.dtype) for x in parts])

@@ -85,7 +85,7 @@ class TuneGrad(Descent):
       {'generation': 2, 'parameter': 1}
     """
 
-    QUICK = Tuning.QUICK | {
+    QUICK: ClassVar = dict(Tuning.QUICK) | {
         "worlds": 64, "steps": 8, "learning_rate": 0.3, "windows": 64, "trials": 32,
         "window_steps": 4,
     }  # fmt: skip

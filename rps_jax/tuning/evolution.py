@@ -167,7 +167,7 @@ class TuneES(Descent):
       {'generation': 1, 'parameter': 2}
     """
 
-    QUICK = Tuning.QUICK | {
+    QUICK: ClassVar = dict(Tuning.QUICK) | {
         "worlds": 32, "population": 12, "generations": 8, "spread": 1.0,
     }  # fmt: skip
     # Options that the other estimator alone uses; the manifests of 0.4 lack those of cma.

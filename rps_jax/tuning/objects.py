@@ -320,8 +320,9 @@ def fit(
         ratio = np.where(square > 1e-12, np.sqrt(square) / np.maximum(abs(robust), 1e-9), 1.0)
         return np.concatenate([rows * (ratio / (1 + square))[:, None] * deviation, np.eye(len(z))])
 
-    options: Any = {"jac": slopes, "max_nfev": 40, "ftol": 1e-4, "xtol": 1e-3}
-    best = least_squares(residuals, np.zeros(len(mean)), **options)
+    derivatives: Any = slopes  # SciPy's types lack functions
+    start = np.zeros(len(mean))
+    best = least_squares(residuals, start, derivatives, max_nfev=40, ftol=1e-4, xtol=1e-3)
     x = mean + deviation * best.x
     gaps = gaps_at(x)
     touches, gaps = gaps[:, 2] < _APART, gaps[:, 1]

@@ -287,8 +287,10 @@ def _set_pads(spec: mujoco.MjSpec, single: Solid, physics: Physics) -> None:
     """Set the stiffness of each foot by its weight, its friction, and its torque of friction."""
     impedance, (time, damping) = physics.ground_impedance, physics.ground_solref
     stiffness = impedance / (1 - impedance)
-    weights, pads = np.asarray(single.feet)[:, 2], np.asarray(single.pads)
-    for i, ((factor, radius), weight) in enumerate(zip(pads, weights, strict=True)):
+    weights = np.asarray(single.feet)[:, 2]
+    for i, ((factor, radius), weight) in enumerate(
+        zip(np.asarray(single.pads), weights, strict=True)
+    ):
         pair = spec.pair(f"ground_object_{i}")
         # A contact's stiffness is its impedance over the rest; `solref` undoes its other effects.
         share = 1 - 1 / (1 + stiffness * weight) if weight > 0 else impedance

@@ -229,7 +229,8 @@ class Race(Study[xr.Dataset], SimulationQuestion[xr.Dataset]):
         by_tuning = {
             "generations": [len(curve) for curve in curves],
             "windows": [
-                float(curve["windows"].sum()) if "windows" in curve else 0.0 for curve in curves
+                np.sum(curve["windows"].to_numpy()) if "windows" in curve else 0.0
+                for curve in curves
             ],
             **{name: [float(spent(x, name).iloc[-1]) for x in curves] for name in BUDGETS},
         }
@@ -278,12 +279,13 @@ class Race(Study[xr.Dataset], SimulationQuestion[xr.Dataset]):
 race = call_of(Race)
 
 
-def spent(curve: pd.DataFrame, budget: str) -> pd.Series:
+def spent(curve: pd.DataFrame, budget: str) -> Any:
     """Return what the vector of each generation of a log has cost: all generations before it [s].
 
     Its own trials are for the next vector, except for its validation.
     """
-    return pd.Series(curve["run" if budget == "wall" else "simulated"]).cumsum().shift(fill_value=0)
+    column = curve["run" if budget == "wall" else "simulated"].to_numpy()
+    return pd.Series(column, curve.index).cumsum().shift(fill_value=0)
 
 
 def best_within(curve: pd.DataFrame, budget: str, amount: float) -> pd.Series:

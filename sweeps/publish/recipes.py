@@ -313,8 +313,10 @@ RECIPES: dict[str, Recipe] = {
         gpu=2,
         section="Flat against round",
     ),
-    "pose_parity": recipe(f"rps sweeps/pose/parity.py --worlds 30 {_MACHINE}", cores=10),
-    "pose*": recipe(f"rps sweeps/pose --worlds 300 {_MACHINE}", cores=20),
+    "pose_parity": recipe(f"rps sweeps/pose/parity.py --worlds 60 {_MACHINE}", cores=10),
+    **dict.fromkeys(
+        ("pose", "pose_failures"), recipe(f"rps sweeps/pose --worlds 800 {_MACHINE}", cores=20)
+    ),
     "drives": recipe(f"rps sweeps/drives --worlds 5000 {_MACHINE}", cores=300, gpu=6),
     "drives_omni": recipe(
         "rps sweeps/drives --seed 7017 --bases 'holonomic, rps_plus' 'holonomic, rps_reposition' "

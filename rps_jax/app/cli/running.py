@@ -30,6 +30,7 @@ _DISK_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 # Modules that the results and the report need.
 _IMPORTED_EARLY = ("rps_jax.analysis.figures.sweeps", "h5netcdf", "markdown.extensions.tables")
 _interrupts: list[bool] = []  # of this command
+_importers: list[threading.Thread] = []  # that `_import_early` started
 
 
 def exit_code(command: Callable[[], object]) -> int:
@@ -187,11 +188,14 @@ def execute(command: Command[object], session: Session, faults: list[str]) -> No
 def _import_early() -> None:
     """Import what the report needs while trials run, which leaves Python to other threads."""
     imports = map(importlib.import_module, _IMPORTED_EARLY)
-    threading.Thread(target=list, args=(imports,), daemon=True).start()
+    _importers.append(threading.Thread(target=list, args=(imports,), daemon=True))
+    _importers[-1].start()
 
 
 def _report(question: Question[object], results: object, bar: Bar, film: list[Section]) -> Path:
     """Write the report of the results, with the section of a film, and return its path."""
+    while _importers:  # a module that two threads import at once may be incomplete in one
+        _importers.pop().join()
     import xarray as xr
 
     from rps_jax.analysis.report import write_report

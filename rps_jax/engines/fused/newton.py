@@ -432,7 +432,7 @@ def _slope_of_pyramid(
     lines: tuple[Contact, Any, Any], x: Number, physics: Physics
 ) -> tuple[Number, Number]:
     """Return first and second derivative of the contacts' cost for the friction pyramid."""
-    c, start, pace = lines
+    c, start, pace = lines  # rows (n, t, s)
     force, k = _pyramid(c, sp.add(start, sp.scale(x, pace)), physics)
     nn, nt, ns, tt, _, ss = k
     p, q, r = pace

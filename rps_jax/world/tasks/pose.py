@@ -15,7 +15,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Annotated, ClassVar, NamedTuple
+from typing import Annotated, Any, ClassVar, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -173,7 +173,8 @@ class Pose(Task):
         """Return the goals."""
         heading = self.heading.at(inputs.u["heading"]) + inputs.bearing
         tolerances = (np.full(heading.shape, x) for x in (self.d_success, self.yaw_success))
-        return inputs.p_world_target, PoseCourse(inputs.p_world_target, heading, *tolerances)
+        leaves: Any = (inputs.p_world_target, heading, *tolerances)
+        return inputs.p_world_target, PoseCourse(*leaves)
 
 
 TASK = Pose
