@@ -107,6 +107,7 @@ PROBES_OF: Mapping[str, tuple[str, ...]] = {
     "gradients_*": ("planning", "tune_grad", "learn"),
     **dict.fromkeys(("ground", "straight"), ("push_mujoco", "push_fused")),
     "support*": ("wide", "hardware"),
+    "mit*": ("real_pushes",),
     "ceiling": ("ladder", "ceiling"),
     **dict.fromkeys(("ladder", "bearings", "plus", "saturation", "tuned"), ("ladder", *_TRIALS)),
     "rivals_tuned": ("ladder", "tune_es"),

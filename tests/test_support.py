@@ -2,6 +2,7 @@
 
 import re
 from dataclasses import replace
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -76,8 +77,8 @@ def force(at, share, radius, twist):
 
 def twists_under(at, share, radius, wrench, arm):
     """Return the twists (n, 3) of pads under wrenches, by the quasi-static engine's own cost."""
-    pads = tuple(jnp.asarray(x)[:, None] for x in (*at.T, share, np.maximum(radius, 1e-4)))
-    v = tuple(jnp.asarray(x) for x in (wrench / [1, 1, arm * arm]).T)
+    pads: Any = tuple(jnp.asarray(x)[:, None] for x in (*at.T, share, np.maximum(radius, 1e-4)))
+    v: Any = tuple(jnp.asarray(x) for x in (wrench / [1, 1, arm * arm]).T)
     for i in range(80):
         g, h = friction_of_pads(pads, v, 1e-5)
         step = solved(tuple(a - b for a, b in zip(g, wrench.T, strict=True)), h)
@@ -95,7 +96,7 @@ def test_pads_turn_as_the_integral_over_the_distribution(name, kind, most):
     arm = share @ np.linalg.norm(at, axis=1)
     twist = np.random.default_rng(0).normal(size=(400, 3)) / [1, 1, arm]
     wrench = force(at, share, 0.0, twist)
-    row = solid.on_support(solid_of(name), np.array([solid.SUPPORTS[kind]]))
+    row: Any = solid.on_support(solid_of(name), np.array([solid.SUPPORTS[kind]]))
     feet, radius = row.feet[0], row.pads[0, :, 1]
     assert feet[:, 2].sum() == pytest.approx(4)
     found = twists_under(feet[:, :2], feet[:, 2] / 4, radius, wrench, arm)
@@ -108,7 +109,7 @@ def test_pads_turn_as_the_integral_over_the_distribution(name, kind, most):
 
 
 def test_the_corners_of_a_prism_are_points():
-    row = solid.on_support(solid_of("triangle"), np.array([2.0]))
+    row: Any = solid.on_support(solid_of("triangle"), np.array([2.0]))
     used = row.feet[0, :, 2] > 0
     assert_allclose(np.sort(row.feet[0, used, :2], axis=0), np.sort(TRIANGLE, axis=0), atol=1e-12)
     assert_allclose(row.feet[0, used, 2], 4 / 3)
@@ -187,6 +188,7 @@ def test_weights_and_friction_of_feet_turn_a_cart(engine, tmp_path, registries):
 
 def test_engines_agree_on_weighted_feet_and_tilt():
     """C MuJoCo and fused, on pads of unequal weight, with a base that rubs."""
+    inputs: Any
     inputs, qpos = inputs_of("oblong", "even", 0.4, 0.6)
     weight = (
         inputs.solids.feet * np.array([1, 1, 0])
@@ -207,14 +209,14 @@ def test_a_physics_or_a_domain_sets_the_support():
     assert bodies.feet.shape == (2, 16, 3)
     for text, kind in (("even", 0.0), ("rim", 1.0), ("0:2", None)):
         domain = parse_domain(f"wide,objects=random_box,support={text}")
-        drawn = draws.draw(domain, 0, np.arange(8))
+        drawn: Any = draws.draw(domain, 0, np.arange(8))
         values = drawn.values["support"]
         assert (values == kind).all() if kind is not None else np.ptp(values) > 0.5
         assert_allclose(drawn.solid.feet[..., 2].sum(axis=1), 4)
     plain = draws.draw(parse_domain("wide,objects=random_box"), 0, np.arange(8))
     assert plain.solid.feet is None
     assert_array_equal(plain.solid.mass, drawn.solid.mass)
-    named = draws.draw(parse_domain("hardware,support=even"), 0, np.arange(0, 8, 2))
+    named: Any = draws.draw(parse_domain("hardware,support=even"), 0, np.arange(0, 8, 2))
     assert named.solid.feet.shape[1] == 16
 
 

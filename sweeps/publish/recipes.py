@@ -282,7 +282,9 @@ RECIPES: dict[str, Recipe] = {
         section="Grounds beside a rigid object",
     ),
     "straight": recipe(f"rps sweeps/ground/straight.py {_MACHINE}", cores=4),
-    "support*": recipe(f"rps sweeps/ground/support.py {_MACHINE}", cores=1),
+    "support*": recipe(
+        f"rps sweeps/ground/support.py --worlds 120 --hardware 16 {_MACHINE}", cores=1
+    ),
     "force_push_grid": recipe("rps sweeps/force_push_grid", cores=4, section="Pushes that succeed"),
     "mends": recipe(
         *_each("rps sweeps/mends --domain {} --worlds 4096 --seed 80", *_WIDE[::-1]),
@@ -361,6 +363,7 @@ RECIPES: dict[str, Recipe] = {
     ),
     "fit_bags": recipe(f"rps sweeps/fit/bags.py {_MACHINE}", cores=5),
     "fit_methods*": recipe(f"rps sweeps/fit/methods.py {_MACHINE}", cores=25),
+    "mit*": recipe(f"rps sweeps/real_pushes/mit --data FOLDER {_MACHINE}", cores=30),
     "fit_real*": recipe(f"rps sweeps/real_pushes/fit.py {_MACHINE}", cores=12),
     "export_*": recipe(
         f"rps sweeps/export --tables speed {_MACHINE}",

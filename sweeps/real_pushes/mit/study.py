@@ -9,6 +9,7 @@ al. predicts. Nothing of it is in this project; the SHA-256 of each file is in `
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import json
 import re
@@ -42,6 +43,7 @@ CELLS = (
 )
 # Shapes on which nothing was developed; nor was it on plywood.
 UNSEEN = ("rect3", "tri1", "ellip3")
+_PRESSURES = 6  # parameters of friction and pressure, the first ones
 METHODS = ("best published", "5 pushes", "20 pushes", "20 % of the pushes")
 
 
@@ -149,17 +151,25 @@ class Mit(QuickStudy[xr.Dataset]):
     def _share(self, label: str) -> xr.Dataset:
         """Fit 20 % of the pushes of a cell with the default priors, and predict the others."""
         cell = read(Path(self.data), label)
-        rows, others = np.split(_order(cell, 0), [len(cell.published) // 5])
-        errors, fitted = self._predicted(cell, rows, others, PRIOR)
-        gap = objects.gaps_at_end(cell.outline, _chosen(cell.pushes, rows), RADIUS)
+        rows = np.split(_order(cell, 0), [len(cell.published) // 5])
+        errors, fitted = self._predicted(cell, rows, PRIOR)
+        assert fitted is not None
+        gap = objects.gaps_at_end(cell.outline, _chosen(cell.pushes, rows[0]), RADIUS)
         gaps = {"gap_before": np.nanmedian(np.abs(gap)), "gap_after": abs(fitted.data.gap).median()}
         return errors.assign(mean=fitted.data["mean"], **gaps)
 
     def _predicted(
-        self, cell: Cell, few: np.ndarray, rest: np.ndarray, prior: Mapping
-    ) -> tuple[xr.Dataset, objects.ObjectFit]:
-        """Return the errors (push) of the `rest` after a fit to a `few`, and the fit."""
-        fitted = objects.fit(cell.outline, _chosen(cell.pushes, few), RADIUS, prior)
+        self, cell: Cell, rows: Sequence[np.ndarray], prior: Mapping
+    ) -> tuple[xr.Dataset, objects.ObjectFit | None]:
+        """Return errors (push) after a fit to the first of two sets of rows, and any fit."""
+        few, rest = rows
+        chosen, fitted = _chosen(cell.pushes, few), None
+        for tried in (prior, PRIOR):  # the gaps may not fit the prior of the others
+            with contextlib.suppress(InputError):
+                fitted = fitted or objects.fit(cell.outline, chosen, RADIUS, tried)
+        names = [x + y for x in ("place", "turn") for y in ("", "_ratio")]
+        if fitted is None:  # refused
+            return xr.Dataset({x: ("push", np.full(700, np.nan)) for x in names}), None
         predicted = fitted.predict(_chosen(cell.pushes, rest))
         off = objects.errors_of(predicted.pose.values, cell.pushes.end[rest])
         columns = {}
@@ -177,12 +187,16 @@ class Mit(QuickStudy[xr.Dataset]):
         prior = dict(PRIOR)
         if len(others) > 1:
             means = np.array([shares[x]["mean"].values for x in others])
-            spread = np.maximum(means.std(axis=0, ddof=1), 0.3 * np.array([*PRIOR.values()])[:, 1])
+            deviation = np.array([*PRIOR.values()])[:, 1]
+            least = np.where(np.arange(len(PRIOR)) < _PRESSURES, 0.3, 1.0)  # offsets are of a cell
+            spread = np.maximum(means.std(axis=0, ddof=1), least * deviation)
             prior = dict(zip(PRIOR, zip(means.mean(axis=0), spread, strict=True), strict=True))
         by_method = []
         for count in (5, 20):
-            orders = [_order(cell, draw) for draw in range(self.draws)]
-            draws = [self._predicted(cell, x[:count], x[count:], prior)[0] for x in orders]
+            draws = [
+                self._predicted(cell, np.split(_order(cell, draw), [count]), prior)[0]
+                for draw in range(self.draws)
+            ]
             by_method.append(xr.concat(draws, "draw"))
         off = objects.errors_of(cell.published, cell.pushes.end)
         padding = (0, 700 - len(cell.published))
