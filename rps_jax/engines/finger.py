@@ -109,9 +109,8 @@ def push(
     path, at any speed.
     """
     ranks = (2, 2, 0, 0)
-    batched: Any = Slider(
-        *(0 if jnp.ndim(x) > rank else None for x, rank in zip(slider, ranks, strict=True))
-    )
+    axes: Any = (0 if jnp.ndim(x) > rank else None for x, rank in zip(slider, ranks, strict=True))
+    batched = Slider(*axes)
     one = partial(_push, steps=steps)
     with trace_one_world():
         return jax.vmap(one, in_axes=(batched, 0, 0))(slider, path, pose)
