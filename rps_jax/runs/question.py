@@ -391,7 +391,8 @@ class SimulationQuestion(TrialQuestion[T]):
 
     def __post_init__(self) -> None:
         """Set the control period of the robot."""
-        if (robot := self._robot) is not None:
+        robot = self._robot
+        if robot is not None and isinstance(self.setting, Setting):  # `check` refuses others
             object.__setattr__(self, "setting", self.setting.with_robot(parse_robot(robot)))
 
     @property
@@ -463,8 +464,8 @@ class TaskOption:
         if self.robot is not None:
             return self.robot
         domain: Any = getattr(self, "domain", "wide")
-        single = isinstance(domain, str | Domain)
-        return domains.parse_domain(domain if single else next(iter(domain), "wide")).robot
+        several = isinstance(domain, tuple | list)
+        return domains.parse_domain(next(iter(domain), "wide") if several else domain).robot
 
 
 @dataclass(frozen=True)
