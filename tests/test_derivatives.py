@@ -258,7 +258,7 @@ test_invalid_rollouts_are_refused = refusals(
     (ROUTE | {"params": RPSParams(K_h=float("nan"))}, "rps.K_h = nan"),
     (
         ROUTE | {"params": rps_jax.control.registry.LAWS["pursuit"], "smooth": True},
-        "smooth = True .* has no smooth form; choose rps.*, rps_plus, .*or smooth=False",
+        "smooth = True .* has no smooth form; choose .*rps_plus, .*or smooth=False",
     ),
 )
 

@@ -226,7 +226,7 @@ def test_results_hold_every_world_with_its_drawn_quantities(whole, tmp_path):
         assert results[name].attrs["units"] == unit
     undrawn = {name for name in QUANTITIES if BOXES.range_of(name) is None}
     floors = {"slope", "slope_bearing", "boundary_factor", "boundary"}
-    unused = {"foam", "time_constant", "feet"} | floors
+    unused = {"foam", "time_constant", "feet", "support"} | floors
     assert undrawn == {*domain.quantities_of("robot", "course")} | unused
     assert set(LABELS) == {*columns, *undrawn}
     again = outcomes([worlds_of(np.arange(20))])

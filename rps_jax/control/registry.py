@@ -116,8 +116,9 @@ def default_law(drive: DriveKind) -> str:
 
 
 def laws_for(drive: DriveKind) -> list[str]:
-    """Return the names of the offered laws whose twists such a base can follow."""
-    return [name for name, params in LAWS.items() if drive in law_of(params).drives]
+    """Return the offered laws for goals without a heading whose twists such a base can follow."""
+    laws = {name: law_of(params) for name, params in LAWS.items()}
+    return [name for name, law in laws.items() if drive in law.drives and not law.heading]
 
 
 def check_room(params: LawParams, task: str, room: float) -> None:

@@ -98,7 +98,7 @@ class Domain:
     # Pressure under objects without feet: 0 even, 1 along the rim, 2 at the corners, or between
     # for mixtures; also by name, as support=even. None: that of the physics.
     support: Annotated[
-        Range | None, Quantity("1", "pressure from even over rim to corners", ge=0, le=2)
+        Range | None, Quantity("1", "pressure: even, rim or corners", ge=0, le=2)
     ] = None
     friction_ground: Annotated[
         Range, Quantity("1", "friction object-ground", ge=_POSITIVE, le=10)

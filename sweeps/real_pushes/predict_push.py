@@ -111,7 +111,7 @@ def predict_push(
         rule = "fingers start outside and near: give path and pose in one frame, in metres"
         value = f"{moves.sum(axis=0).max():.2g} m long, {gap.min():.2g} m off the object at first"
         raise errors.not_allowed("path", value, rule)
-    support = np.broadcast_to(points - [*p_com, 0.0], (count, *points.shape))
+    support = np.broadcast_to(points[:, :3] - [*p_com, 0.0], (count, len(points), 3))
     shift = np.full(count, friction_ground * height)
     ground = fingers.Ground(support[..., :2], support[..., 2], np.zeros(count), shift)
     chosen = ground.ellipsoid() if model == "ellipsoid" else ground

@@ -31,17 +31,19 @@ from rps_jax.spec import Spec, document
 KNOTS = 60  # default number of offsets
 
 
+Offsets = Annotated[
+    ArrayLike, Spec("1", "offsets of v_x, v_y, omega, in units of bounds")
+]  # (J, 3)
+Hold = Annotated[Parameter, Spec("1", "control steps per offset: 5 s, so that 60 take 300 s", ge=1)]
+
+
 @document
 class GuidedParams(NamedTuple):
     """Parameters of RPS, and the planned offsets."""
 
     law: RPSParams = RPSParams.tuned()
-    offsets: Annotated[ArrayLike, Spec("1", "offsets of v_x, v_y, omega, in units of bounds")] = (
-        np.zeros((KNOTS, 3))
-    )  # (J, 3)
-    hold: Annotated[
-        Parameter, Spec("1", "control steps per offset: 5 s, so that 60 take 300 s", ge=1)
-    ] = 250
+    offsets: Offsets = np.zeros((KNOTS, 3))
+    hold: Hold = 250
 
     @property
     def d_success(self) -> Number:
@@ -54,8 +56,8 @@ class GuidedUnicycleParams(NamedTuple):
     """Parameters of the law for bases that cannot move sideways, and the planned offsets."""
 
     law: UnicycleParams = UnicycleParams()
-    offsets: ArrayLike = np.zeros((KNOTS, 3))
-    hold: Parameter = 250
+    offsets: Offsets = np.zeros((KNOTS, 3))
+    hold: Hold = 250
 
     @property
     def d_success(self) -> Number:

@@ -143,7 +143,7 @@ class Pose(Task):
         Range,
         Quantity(
             "rad",
-            "heading of the goal: the direction of the last push",
+            "heading of the last push",
             ge=-_TURN,
             le=_TURN,
             owner="course",
