@@ -197,6 +197,8 @@ def test_a_base_with_an_axle_is_driven_in_the_frame_of_its_axle(tmp_path):
     for i, (name, time, *_) in enumerate(inputs):
         if name == "odometry":  # of an axle on a straight way, which turns
             inputs[i] = name, time, 0.1 * time, 0.0, 0.1 * time
+        elif name == "target":  # ahead, so that the law pushes
+            inputs[i] = name, time, 2.0, 0.5
     twists, statuses = driven_in_python(controller, inputs)
     assert set(statuses) == {"pushing"}
     assert not twists[:, 1].any()
