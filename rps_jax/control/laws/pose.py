@@ -50,13 +50,13 @@ import jax.numpy as jnp
 from rps_jax import spec
 from rps_jax.control import soft
 from rps_jax.control.base import ApproachSpeed, Law, OmegaMax, SpeedMax, SuccessDistance
+from rps_jax.control.laws.unicycle import contact_of, turn_around
 from rps_jax.control.observation import Details, EndsObservation, Observation, Twist
 from rps_jax.geometry import planar
 from rps_jax.geometry.arrays import Array, Parameter
 from rps_jax.spec import Bound, Spec, document
 
 PUSH, BACK, AROUND = 0, 1, 2  # modes
-_SIDE = 0.02  # [m] behind the front, where a contact is on a side
 _EDGE = 0.05  # [m] of contact beyond a known end, which contradicts it
 _SAME = 0.03  # [m] by which a face or an end may have moved between two contacts
 _FACING = 0.25  # [rad] between base and leg, up to which it feels the box
@@ -290,11 +290,10 @@ def step(
     u = planar.unit(yaw)
     grid = planar.unit(theta + jnp.arange(4) * (jnp.pi / 2))  # (4, 2) d_j
     p_world_front = base + half_length * u
-    last = planar.rotate(-yaw, state.p_world_contact - base)
-    contact = jnp.where(touches, touch.p_robot_contact, last)
+    at = {"p_world_robot": base, "yaw": yaw, "in_contact": touches}
+    flat = touch._replace(base_radius=None, half_length=half_length, **at)
+    _, contact, normal, on_front, _ = contact_of(state.p_world_contact, flat)
     p_world_contact = base + planar.rotate(yaw, contact)
-    on_front = contact[0] > half_length - _SIDE
-    normal = jnp.where(on_front, 0.0, jnp.sign(contact[1]) * jnp.pi / 2)
     first, touched = touches & ~state.touched, state.touched | touches
     time, t_lost = state.time + touch.period, jnp.where(touches, 0.0, state.t_lost + touch.period)
     psi = theta + state.leg * (jnp.pi / 2)
@@ -323,22 +322,22 @@ def step(
     centred = jnp.where(forgets, False, jnp.where(feels, felt.centred, state.centred))
 
     # Q4 and Q5.
-    y, way, left = (h[1] - h[3]) / 2, h[2], -fronts[0]
+    y, way, way_left = (h[1] - h[3]) / 2, h[2], -fronts[0]
     both = known[1] & known[3]
     last_leg = leg == 0
     s_min = jnp.where(jnp.any(known), params.s_flush, params.s_min)
     may_try = state.tries < params.tries
     is_back = (leg == 2) & feels & (way > s_min + params.s_back)
-    beside = jnp.where(leg == 1, y, -y)  # positive beyond the line
-    is_beside = (leg % 2 == 1) & feels & (beside > -0.004)
+    beyond_line = jnp.where(leg == 1, y, -y)  # positive beyond the line
+    is_beside = (leg % 2 == 1) & feels & (beyond_line > -0.004)
     has_looked = both | (state.looks >= params.looks)
     settled = (state.t_push > 2) & has_looked & ((t_even > 1) | (state.t_push > 6))
-    room = params.y_tol + params.cap * jnp.maximum(left, 0.0)
+    room = params.y_tol + params.cap * jnp.maximum(way_left, 0.0)
     is_off = (
-        last_leg & feels & settled & (jnp.abs(y) > room + 0.01) & may_try & (left > s_min - 0.1)
+        last_leg & feels & settled & (jnp.abs(y) > room + 0.01) & may_try & (way_left > s_min - 0.1)
     )
-    passed = last_leg & pushing & state.touched & (left < -0.03)
-    at_end = last_leg & feels & (left < params.stop)
+    passed = last_leg & pushing & state.touched & (way_left < -0.03)
+    at_end = last_leg & feels & (way_left < params.stop)
     # A drum is never flush: a long push and a repetition are enough.
     is_uneven = (t_even < 0.3) & ((state.tries < 1) | (state.t_push < 20))
     is_blind = (t_even >= 0.3) & ~has_looked
@@ -361,7 +360,7 @@ def step(
     ahead, box_left, behind, box_right = _turned(h, leg)
     along, across = _turned(fronts, leg)[0], _turned(bases, leg)[1]
     middle_across, middle_along = (box_left - box_right) / 2, (ahead - behind) / 2
-    wants = last_leg & feels & ~chooses & (t_even > 0.6) & ~has_looked & (left > 0.03)
+    wants = last_leg & feels & ~chooses & (t_even > 0.6) & ~has_looked & (way_left > 0.03)
     wants = wants & (state.t_push > 0.6)
     target = jnp.where(known[1], -h[3] - params.beyond, h[1] + params.beyond)
     look = jnp.where(wants, target, state.look)
@@ -371,7 +370,7 @@ def step(
     offset = aim_across - across  # [m] to the left of the base
 
     # Q7: the end of a push.
-    is_bad = ~on_front | ((jnp.abs(offset) > params.l_edge) & (~last_leg | (left > 0.2)))
+    is_bad = ~on_front | ((jnp.abs(offset) > params.l_edge) & (~last_leg | (way_left > 0.2)))
     t_push = jnp.where(pushing, state.t_push + jnp.where(touches, touch.period, 0.0), 0.0)
     is_lost = (t_lost > 0.6) & (state.t_push > 0)
     failed = pushing & touched & (state.t_push == 0) & ~touches & (along > _PAST - behind)
@@ -399,12 +398,9 @@ def step(
     m = goal + middle_along * ahead_u + aim_across * left_u
     p_world_axle = base - axle * u
     away = p_world_axle - m
-    phi = planar.direction(away)
-    turn = planar.wrap(psi + jnp.pi - phi)
-    may_choose = (state.mode != AROUND) | (omni & (jnp.abs(turn) < 2.4))
-    side = jnp.where(may_choose, jnp.where(turn >= 0, 1.0, -1.0), state.side)
-    turn = jnp.mod(side * turn, 2 * jnp.pi)
-    turn = jnp.where(turn > 2 * jnp.pi - 1.5, turn - 2 * jnp.pi, turn)
+    is_short = jnp.abs(planar.wrap(psi + jnp.pi - planar.direction(away))) < 2.4
+    may_choose = (state.mode != AROUND) | (omni & is_short)
+    phi, turn, side = turn_around(psi, away, state.side, may_choose)
     carrot = _CARROT if omni else _AHEAD
     behind_face = omni & (jnp.abs(face) < 0.1) & (along < -behind - 0.02) & (jnp.abs(offset) < 0.7)
     is_direct = (jnp.abs(turn) < carrot) | behind_face if omni else turn < carrot
@@ -448,8 +444,8 @@ def step(
     omega = jnp.where(touched, jnp.clip(planar.wrap(psi + steer - yaw), -bound, bound), 0.0)
     v = jnp.where(touched, params.v_max, params.v_approach)
     v_last, v_side = (
-        jnp.clip(0.5 * left, 0.01, params.v_max),
-        jnp.clip(-0.5 * beside, 0.015, params.v_max),
+        jnp.clip(0.5 * way_left, 0.01, params.v_max),
+        jnp.clip(-0.5 * beyond_line, 0.015, params.v_max),
     )
     slow = jnp.where(last_leg, v_last, jnp.where(leg % 2 == 1, v_side, v))
     v = soft.where(weight, jnp.where(touched, slow, v), v)
@@ -481,7 +477,7 @@ def step(
         for a, b in ((params.v_max, params.v_free), (params.omega_max, params.omega_free))
     ]
     twist = Twist(v, v_y, omega).saturate(*bounds)
-    distance = planar.norm(jnp.stack([left, y]))
+    distance = planar.norm(jnp.stack([way_left, y]))
     details = Details(offset, distance, jnp.zeros_like(distance), face, mode != PUSH)
     memory = PoseState(
         mode=mode,

@@ -197,6 +197,20 @@ class Way(NamedTuple):
     aim: jax.Array  # (2,) [m] W
 
 
+def turn_around(
+    psi: jax.Array, offset: jax.Array, side: jax.Array, chooses: jax.Array
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Return phi and the turn from there to psi + pi [rad], and the side: see D6.
+
+    The `offset` (2,) [m] is from M. Where it `chooses`, the side is that of the shorter turn.
+    """
+    phi = planar.direction(offset)
+    turn = planar.wrap(psi + jnp.pi - phi)
+    side = jnp.where(chooses, jnp.where(turn >= 0, 1.0, -1.0), side)
+    turn = jnp.mod(side * turn, 2 * jnp.pi)
+    return phi, jnp.where(turn > 2 * jnp.pi - _OVERSHOOT, turn - 2 * jnp.pi, turn), side
+
+
 def way_around(
     middle: jax.Array,  # (2,) [m] M
     psi: jax.Array,  # [rad]
@@ -209,11 +223,7 @@ def way_around(
     width: Number | None = None,  # [rad] of the smooth switch
 ) -> Way:
     """Compute D6: the point that the base drives to, on its way to the staging point."""
-    phi = planar.direction(offset)
-    turn = planar.wrap(psi + jnp.pi - phi)
-    side = jnp.where(chooses, jnp.where(turn >= 0, 1.0, -1.0), side)
-    turn = jnp.mod(side * turn, 2 * jnp.pi)
-    turn = jnp.where(turn > 2 * jnp.pi - _OVERSHOOT, turn - 2 * jnp.pi, turn)
+    phi, turn, side = turn_around(psi, offset, side, chooses)
     is_direct = soft.greater(ahead, turn, width)
     staging = middle - distance * planar.unit(psi)
     carrot = middle + radius * planar.unit(phi + side * ahead)
