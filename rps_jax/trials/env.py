@@ -46,7 +46,7 @@ from rps_jax.world.draws import Draw
 from rps_jax.world.opengl import mujoco
 from rps_jax.world.scene import JOINTS, Scene
 from rps_jax.world.tasks import TaskLike
-from rps_jax.world.tasks.pose import PoseCourse
+from rps_jax.world.tasks.base import heading_of
 
 
 class Reward(NamedTuple):
@@ -285,7 +285,7 @@ class PushEnv:
     def observation_size(self) -> int:
         """Length of an observation."""
         count, ends = self._alone.robot.shell.count, self.senses == "ends"
-        return count + 2 + 2 * isinstance(self.table.task, PoseCourse) + (count + 5) * ends
+        return count + 2 + 2 * (heading_of(self.table.task) is not None) + (count + 5) * ends
 
     @property
     def action_size(self) -> int:

@@ -24,7 +24,7 @@ from rps_jax.trials.batch import stepper
 from rps_jax.trials.jobs import WorldBatch, rows
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import ControlLoop, Outcome, Shift, Snapshot, Trial, World
-from rps_jax.world.tasks.pose import PoseCourse
+from rps_jax.world.tasks.base import heading_of
 
 CHUNK = 25  # steps, at most, between two checks of the clock
 
@@ -134,8 +134,8 @@ class Live:
         target = errors.check_vector("target", p_world_target, at_least=-50, at_most=50, unit="m")
         dtype = self._worlds.p_world_target.dtype
         goal, task = np.array([target], dtype), self._worlds.task
-        if isinstance(task, PoseCourse):
-            heading = task.heading if yaw is None else np.array([yaw], dtype)
+        if (heading := heading_of(task)) is not None:
+            heading = heading if yaw is None else np.array([yaw], dtype)
             task = task._replace(p_world_goal=goal, heading=heading)
         self._worlds = self._worlds._replace(p_world_target=goal, task=task)
         self._continue(min_distance=np.full_like(self._trial.min_distance, np.inf))
@@ -162,7 +162,8 @@ class Live:
 
 def yaw_target(worlds: World) -> float | None:
     """Return the heading of the goal of the first world [rad]; None if it has none."""
-    return float(worlds.task.heading[0]) if isinstance(worlds.task, PoseCourse) else None
+    heading: Any = heading_of(worlds.task)
+    return None if heading is None else float(heading[0])
 
 
 @jax.jit

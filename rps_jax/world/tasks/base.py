@@ -14,7 +14,7 @@ from typing import Any, ClassVar, NamedTuple, Protocol
 import numpy as np
 
 from rps_jax import errors
-from rps_jax.geometry.arrays import Array, Bool, Float, Scalar, Vector
+from rps_jax.geometry.arrays import Array, Bool, Float, Floats, Scalar, Vector
 from rps_jax.geometry.footprint import Footprint
 from rps_jax.record.files import Arrays
 from rps_jax.record.options import check_fields
@@ -70,6 +70,11 @@ class Course(Protocol):
     def lines(self) -> Arrays:
         """Return what pictures show: polylines (..., N, 2) [m] by name, `path` and `walls`."""
         ...
+
+
+def heading_of(course: Course) -> Floats | None:
+    """Return the heading of a course's goal [rad], its field `heading`; None if it has none."""
+    return getattr(course, "heading", None)
 
 
 class CourseInputs(NamedTuple):
