@@ -376,3 +376,8 @@ def test_a_used_port_is_refused_in_one_sentence(capsys):
         port = server.getsockname()[1]
         error = refusal(capsys, "view", "--port", port)
     assert f"port = {port} cannot be served on: use another" in error
+
+
+def test_a_setting_of_another_type_is_refused():
+    with refusing("setting = .* is not allowed: give a Setting"):
+        viewer.view(setting=[[1, 2]])

@@ -29,10 +29,9 @@ from rps_jax.control.registry import LawLike
 from rps_jax.errors import InputError
 from rps_jax.record import files
 from rps_jax.record.options import option
-from rps_jax.robot import robot as robots
 from rps_jax.runs.plan import Plan, build_batch, load_plan, scene_of, world_title
 from rps_jax.runs.push import case_options, end_in_words, program_slots, select_law
-from rps_jax.runs.question import Command, call_of
+from rps_jax.runs.question import Command, call_of, set_period
 from rps_jax.trials import pushes
 from rps_jax.trials.case import Case, label_of
 from rps_jax.trials.live import CHUNK, Live, yaw_target
@@ -87,8 +86,7 @@ class View(Command[None], Case):
 
     def __post_init__(self) -> None:
         """Set the control period of the robot; defer the checks of `Case` to `check`."""
-        setting = self.setting.with_robot(robots.parse_robot(self.robot))
-        object.__setattr__(self, "setting", setting)
+        set_period(self, self.robot)
 
     @property
     def case(self) -> Case:

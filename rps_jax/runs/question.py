@@ -383,6 +383,13 @@ class TrialQuestion(QuickQuestion[T]):
         return Run(out, callback, self.slots, self.workers)
 
 
+def set_period(command: Any, robot: RobotLike | None) -> None:
+    """Set the control period of a robot in the setting of a command; `check` refuses others."""
+    if robot is not None and isinstance(command.setting, Setting):
+        setting = command.setting.with_robot(parse_robot(robot))
+        object.__setattr__(command, "setting", setting)
+
+
 @dataclass(frozen=True, kw_only=True)
 class SimulationQuestion(TrialQuestion[T]):
     """Base class of questions that run trials with one setting."""
@@ -391,9 +398,7 @@ class SimulationQuestion(TrialQuestion[T]):
 
     def __post_init__(self) -> None:
         """Set the control period of the robot."""
-        robot = self._robot
-        if robot is not None and isinstance(self.setting, Setting):  # `check` refuses others
-            object.__setattr__(self, "setting", self.setting.with_robot(parse_robot(robot)))
+        set_period(self, self._robot)
 
     @property
     def _robot(self) -> RobotLike | None:
