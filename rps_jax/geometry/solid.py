@@ -164,6 +164,11 @@ def unit(angle: np.ndarray) -> np.ndarray:
     return np.stack([np.cos(angle), np.sin(angle)], axis=-1)
 
 
+def wrap(angle: np.ndarray) -> np.ndarray:
+    """Return angles in [-pi, pi) [rad]."""
+    return (angle + np.pi) % (2 * np.pi) - np.pi
+
+
 def quaternion(yaw: ArrayLike) -> np.ndarray:
     """Return the quaternions (..., 4), scalar first, of turns by `yaw` (...) [rad]."""
     half = np.asarray(yaw) / 2

@@ -28,7 +28,7 @@ from rps_jax import errors
 from rps_jax.analysis.report import Section
 from rps_jax.engines import finger
 from rps_jax.errors import InputError
-from rps_jax.geometry import planar
+from rps_jax.geometry import planar, solid
 from rps_jax.record.options import option
 from rps_jax.record.table import Table
 from rps_jax.runs.question import Question, Rows, Run, call_of
@@ -258,8 +258,8 @@ def _scatter(
 
 def errors_of(pose: np.ndarray, end: np.ndarray) -> dict[str, np.ndarray]:
     """Return the errors (n,) of poses (n, 3): `place` [m] and `turn` [rad]."""
-    turn = (pose[:, 2] - end[:, 2] + np.pi) % (2 * np.pi) - np.pi
-    return {"place": np.linalg.norm(pose[:, :2] - end[:, :2], axis=1), "turn": np.abs(turn)}
+    turn = np.abs(solid.wrap(pose[:, 2] - end[:, 2]))
+    return {"place": np.linalg.norm(pose[:, :2] - end[:, :2], axis=1), "turn": turn}
 
 
 def gaps_at_end(outline: ArrayLike, pushes: PushesLike, radius: float) -> np.ndarray:
@@ -306,7 +306,7 @@ def fit(
         """Return robust residuals of poses and gaps, and those of the priors."""
         pose, gaps = _simulate(jnp.asarray(mean + deviation * z), fixed, *batch, steps)
         off, gap = np.asarray(pose, float)[:count] - end, np.asarray(gaps, float)[:count] / _GAP
-        off[:, 2] = size * ((off[:, 2] + np.pi) % (2 * np.pi) - np.pi)
+        off[:, 2] = size * solid.wrap(off[:, 2])
         rows = np.concatenate([(off / _UNIT).ravel(), gap[:, 0], gap[:, 1]])
         return np.append(np.nan_to_num(np.sign(rows) * np.sqrt(np.log1p(rows**2))), z)
 

@@ -15,7 +15,7 @@ import numpy as np
 import pandas as pd
 
 from rps_jax.geometry import planar
-from rps_jax.geometry.solid import GRAVITY, rotate, supported_load
+from rps_jax.geometry.solid import GRAVITY, rotate, supported_load, wrap
 from sweeps.real_pushes import fingers, pushes
 from sweeps.real_pushes.fingers import Ground, Pushed
 from sweeps.real_pushes.pushes import COM, OUTLINE
@@ -60,7 +60,7 @@ class Cell(NamedTuple):
     def residuals(self, outcome: np.ndarray) -> np.ndarray:
         """Return scaled residuals (..., n, 5) of outcomes; 0 where nothing was measured."""
         r = outcome - self.measured
-        r[..., 2] = pushes.angle(r[..., 2])
+        r[..., 2] = wrap(r[..., 2])
         return np.nan_to_num(r / _SCALE)
 
     def derivatives(self, theta: np.ndarray, motion: Pushed | None = None) -> np.ndarray:

@@ -15,7 +15,7 @@ import pandas as pd
 import xarray as xr
 
 from rps_jax import InputError, errors
-from rps_jax.geometry.solid import rotate
+from rps_jax.geometry.solid import rotate, wrap
 from sweeps.real_pushes import fingers
 from sweeps.real_pushes.fingers import Ground
 from sweeps.real_pushes.predict_push import uniform_pressure
@@ -257,14 +257,9 @@ def with_pusher(table: pd.DataFrame, steps: int) -> np.ndarray:
         np.arctan2(*np.where(double[:, None], points[:, 1] - points[:, 0], [1.0, 0.0])[:, ::-1].T)
         for points in (start, end)
     ]
-    turn = angle(directions[1] - directions[0])
+    turn = wrap(directions[1] - directions[0])
     moved = end[:, 0] + rotate(turn, pre[:, :2] - start[:, 0])
     return np.column_stack([moved, pre[:, 2] + turn])
-
-
-def angle(difference: np.ndarray) -> np.ndarray:
-    """Return angles [rad] between -pi and pi."""
-    return (difference + np.pi) % (2 * np.pi) - np.pi
 
 
 class Errors(NamedTuple):
@@ -281,7 +276,7 @@ def errors_of(predicted: np.ndarray, actual: np.ndarray) -> Errors:
     `both` is the root-mean-square displacement of the object's area: the distance of the centroids
     combined with the rotation times the radius of gyration, 50 mm.
     """
-    turn = np.abs(angle(predicted[..., 2] - actual[..., 2]))
+    turn = np.abs(wrap(predicted[..., 2] - actual[..., 2]))
     centre = [p[..., :2] + rotate(p[..., 2], COM) for p in (predicted, actual)]
     distance = np.linalg.norm(centre[0] - centre[1], axis=-1)
     return Errors(distance, turn, np.hypot(distance, 2 * GYRATION * np.sin(turn / 2)))

@@ -23,6 +23,7 @@ import pandas as pd
 import xarray as xr
 from scipy.stats import t as t_distribution
 
+from rps_jax.geometry.solid import wrap
 from rps_jax.physics import PHYSICS
 from rps_jax.questions import Picture, Run, call_of, option
 from sweeps.real_pushes import contact, pushes
@@ -564,7 +565,7 @@ def _heading_rows(results: xr.Dataset) -> Iterator[list[Any]]:
     """Yield the signed errors of the heading, which an offset of the measurement would share."""
     predicted = results.predicted.sel(model="rigid_feet").values[:, 2]
     measured = results.measured.values[:, 2]
-    off = np.degrees(pushes.angle(predicted - measured))
+    off = np.degrees(wrap(predicted - measured))
     for name in (GROUPS[0], GROUPS[3]):
         group = (results.group.values == name) & ~results.fits.values & np.isfinite(off)
         for i, edge in enumerate(EDGES):
@@ -585,6 +586,6 @@ def _force_rows(results: xr.Dataset) -> Iterator[list[Any]]:
     for group, surface in product(GROUPS[:2], pushes.GROUND):
         rows = is_valid & (results.group.values == group) & (results.surface.values == surface)
         if rows.any():
-            degrees = np.degrees(np.abs(pushes.angle(off[rows])))
+            degrees = np.degrees(np.abs(wrap(off[rows])))
             cells = [np.median(degrees), np.quantile(degrees, 0.9), [*median_interval(ratio[rows])]]
             yield [f"{group}, {surface}", int(rows.sum()), *_rounded(cells)]

@@ -24,6 +24,7 @@ import mujoco
 import numpy as np
 import xarray as xr
 
+from rps_jax.geometry import solid
 from rps_jax.physics import preset
 from rps_jax.questions import Run, call_of, option
 from rps_jax.trials.progress import Progress
@@ -289,7 +290,7 @@ def _row(process: _Process, output: Mapping[str, Any], truth: np.ndarray) -> xr.
     if len(poses):
         true = truth[np.arange(len(poses)) % len(truth)]
         error = np.linalg.norm(poses[:, :2] - true[:, :2], axis=1)
-        turned = np.abs((_yaw(poses) - _yaw(true) + np.pi) % (2 * np.pi) - np.pi)
+        turned = np.abs(solid.wrap(_yaw(poses) - _yaw(true)))
     return xr.Dataset(
         {
             **{name: output[name] for name in ("version", "worlds", "rate")},
