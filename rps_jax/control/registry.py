@@ -112,7 +112,7 @@ def law_of(params: LawParams | type) -> Law:
 
 def default_law(drive: DriveKind) -> str:
     """Return the name of the law for a base with this drive, if none is named."""
-    return "rps" if drive == "omni" else "unicycle"
+    return "rps" if drive == "omni" else laws_for(drive)[0]
 
 
 def laws_for(drive: DriveKind) -> list[str]:
