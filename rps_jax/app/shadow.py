@@ -152,8 +152,8 @@ def recorded_ends(signal: np.ndarray, robot: Robot) -> Arrays:
     A taxel whose signal is always 0 counts as dead.
     """
     alive = jnp.asarray((signal != 0).any(axis=0))
-    each = jax.vmap(lambda x: ends_of(x, alive, robot.shell, CapacitiveSkin().threshold))
-    ends = each(jnp.asarray(signal))._asdict()
+    ends_of_all = jax.vmap(lambda x: ends_of(x, alive, robot.shell, CapacitiveSkin().threshold))
+    ends = ends_of_all(jnp.asarray(signal))._asdict()
     return {**ends, "alive": np.broadcast_to(alive, signal.shape)}
 
 

@@ -66,14 +66,14 @@ def check_outline(outline: ArrayLike) -> np.ndarray:
     ahead = np.roll(corners, -1, axis=0)
     way = ahead - corners
 
-    def left(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    def cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
         return a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
 
-    side = left(way[:, None], corners - corners[:, None])  # of corner j from edge i
-    apart = side * np.roll(side, -1, axis=1) < 0  # the ends of edge j from edge i
-    if np.any(apart & apart.T):
+    side = cross(way[:, None], corners - corners[:, None])  # of corner j from edge i
+    separated = side * np.roll(side, -1, axis=1) < 0  # the ends of edge j from edge i
+    if np.any(separated & separated.T):
         raise errors.not_allowed("outline", corners.tolist(), "its sides must not cross")
-    area = left(corners, ahead).sum() / 2
+    area = cross(corners, ahead).sum() / 2
     if abs(area) < 1e-3 * size**2:
         raise errors.not_allowed("outline", corners.tolist(), "it must enclose an area")
     return corners if area > 0 else corners[::-1]
@@ -112,9 +112,9 @@ def push(
         0 if jnp.ndim(x) > rank else None for x, rank in zip(slider, (2, 2, 0, 0), strict=True)
     ]
     batched = Slider(*axes)
-    one = partial(_push, steps=steps)
+    push_one = partial(_push, steps=steps)
     with trace_one_world():
-        return jax.vmap(one, in_axes=(batched, 0, 0))(slider, path, pose)
+        return jax.vmap(push_one, in_axes=(batched, 0, 0))(slider, path, pose)
 
 
 def _push(slider: Slider, path: jax.Array, pose: jax.Array, steps: int) -> Pushed:
@@ -198,15 +198,15 @@ def _step(slider: Slider, unit: jax.Array, carry: tuple, tip: jax.Array) -> tupl
     angle = jnp.where(touches, twist[2] / unit, 0.0)
     origin = twist[:2] + angle * jnp.stack([contact[1], -contact[0]])
     origin = planar.rotate(pose[2] + angle / 2, jnp.where(touches, origin, 0.0))
-    after = pose + jnp.append(origin, angle)
-    return (after, (spin, flow)), (pose, gap)
+    moved_pose = pose + jnp.append(origin, angle)
+    return (moved_pose, (spin, flow)), (pose, gap)
 
 
 def _iterate(refine: Callable[[tuple], tuple], start: tuple) -> tuple:
     """Return the fixed point of a step, to rounding of its first entry, or the last iterate."""
     enough = 50 * jnp.finfo(start[0].dtype).eps
 
-    def one(carry: tuple) -> tuple:
+    def advance(carry: tuple) -> tuple:
         count, x, _ = carry
         new = refine(x)
         return count + 1, new, jnp.max(jnp.abs(new[0] - x[0]))
@@ -214,7 +214,9 @@ def _iterate(refine: Callable[[tuple], tuple], start: tuple) -> tuple:
     def unfinished(carry: tuple) -> jax.Array:
         return (carry[0] < _ITERATIONS) & (carry[2] > enough)
 
-    return jax.lax.while_loop(unfinished, one, (0, start, jnp.asarray(jnp.inf, start[0].dtype)))[1]
+    return jax.lax.while_loop(
+        unfinished, advance, (0, start, jnp.asarray(jnp.inf, start[0].dtype))
+    )[1]
 
 
 def _power(pads: tuple, v: Vec) -> jax.Array:

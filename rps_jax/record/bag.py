@@ -556,8 +556,8 @@ def _to_frames(rows: Mapping[str, _Series], edges: Callable[[], _Edges], static:
             matrices = _transform(part, frame, goal, edges(), static)
             if key in ("cmd_vel", "goal"):
                 bad = abs(matrices - np.eye(4)).max(axis=(1, 2)) > _SAME
-                what = "commands" if key == "cmd_vel" else "goals"
-                part.refuse(bad, f"the frame {frame}", f"publish {what} in {goal}")
+                messages = "commands" if key == "cmd_vel" else "goals"
+                part.refuse(bad, f"the frame {frame}", f"publish {messages} in {goal}")
             else:
                 size = part.values.shape[1] if key == "path" else 3
                 points = part.values[:, :size].reshape(len(part.values), -1, 3)

@@ -41,7 +41,7 @@ CELLS = (
     *(f"abs {name} 20" for name in NAMES[:-2]),
     *(f"plywood {name} 10" for name in NAMES),
 )
-# Shapes on which nothing was developed; nor was it on plywood.
+# Shapes on which nothing was developed.
 UNSEEN = ("rect3", "tri1", "ellip3")
 _PRESSURES = 6  # parameters of friction and pressure, the first ones
 METHODS = ("best published", "5 pushes", "20 pushes", "20 % of the pushes")
