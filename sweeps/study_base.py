@@ -98,6 +98,13 @@ def text_table(columns: Mapping[str, str], rows: Iterable[Mapping[str, Any]]) ->
     return [list(columns), *(["" if re.search(r"\bnan\b", x) else x for x in row] for row in texts)]
 
 
+def median_interval(values: np.ndarray, resamples: int = 2000) -> tuple[float, float, float]:
+    """Return the median of values (n,) and its 95 % interval by a bootstrap."""
+    drawn = np.random.default_rng(0).choice(values, (resamples, values.size))
+    low, high = np.quantile(np.median(drawn, axis=1), [0.025, 0.975])
+    return float(np.median(values)), float(low), float(high)
+
+
 # --- studies --------------------------------------------------------------------------------
 
 
