@@ -146,7 +146,7 @@ class Mit(QuickStudy[xr.Dataset]):
         parts = {cell: partial(self._few, cell, shares) for cell in self.cells}
         results = run_parts(run, "cell", parts)
         share = xr.concat(shares.values(), xr.IndexVariable("cell", list(shares)))
-        return xr.merge([results, share[["mean", "gap_before", "gap_after"]]])
+        return xr.merge([results, share[["mean"]]])
 
     def _share(self, label: str) -> xr.Dataset:
         """Fit 20 % of the pushes of a cell with the default priors, and predict the others."""
@@ -154,9 +154,7 @@ class Mit(QuickStudy[xr.Dataset]):
         rows = np.split(_order(cell, 0), [len(cell.published) // 5])
         errors, fitted = self._predicted(cell, rows, PRIOR)
         assert fitted is not None
-        gap = objects.gaps_at_end(cell.outline, _chosen(cell.pushes, rows[0]), RADIUS)
-        gaps = {"gap_before": np.nanmedian(np.abs(gap)), "gap_after": abs(fitted.data.gap).median()}
-        return errors.assign(mean=fitted.data["mean"], **gaps)
+        return errors.assign(mean=fitted.data["mean"])
 
     def _predicted(
         self, cell: Cell, rows: Sequence[np.ndarray], prior: Mapping
