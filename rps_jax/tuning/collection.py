@@ -16,6 +16,7 @@ from typing import Any, NamedTuple, TypeVar
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import PyTree
 
 from rps_jax import errors
 from rps_jax.control import soft
@@ -123,12 +124,12 @@ def _unmapped(function: Callable[..., T], *_: Any) -> Callable[..., T]:
 
 
 def _together(
-    envs: Sequence[PushEnv], function: Callable[..., T], inputs: Sequence[tuple[Any, ...]]
+    envs: Sequence[PushEnv], function: Callable[..., T], inputs: Sequence[tuple[PyTree, ...]]
 ) -> list[T]:
     """Map `function(env, ...)` of one world over the inputs (N, ...) of each environment."""
     functions = [partial(function, env) for env in envs]
 
-    def in_xla(*inputs: tuple[Any, ...]) -> list[T]:
+    def in_xla(*inputs: tuple[PyTree, ...]) -> list[T]:
         return [jax.vmap(f)(*x) for f, x in zip(functions, inputs, strict=True)]
 
     run = native.concurrent(functions, in_xla) if all(env.is_native for env in envs) else in_xla
@@ -152,7 +153,7 @@ def _begin(
     return [_with_info(x, world=draw[0]) for x, draw in zip(batches, draws, strict=True)]
 
 
-def _with_info(batch: EnvBatch, **info: Any) -> EnvBatch:
+def _with_info(batch: EnvBatch, **info: PyTree) -> EnvBatch:
     """Return a batch whose states have other information."""
     return batch._replace(states=batch.states.replace(info=batch.states.info | info))
 

@@ -10,13 +10,14 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, fields, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import xarray as xr
 from jax.stages import Lowered
+from jaxtyping import PyTree
 
 from rps_jax import errors
 from rps_jax.analysis import tables
@@ -135,7 +136,7 @@ class Learn(PPO, TaskOption, SimulationQuestion[xr.Dataset]):
 
     # Functions of the algorithm, which a subclass may replace.
     start: ClassVar[Callable[..., RunnerState]] = staticmethod(collection.start)
-    update: ClassVar[Callable[..., tuple[RunnerState, Any]]] = staticmethod(collection.update)
+    update: ClassVar[Callable[..., tuple[RunnerState, PyTree]]] = staticmethod(collection.update)
 
     @functools.cached_property
     def domains(self) -> tuple[Domain, ...]:

@@ -262,15 +262,6 @@ def errors_of(pose: np.ndarray, end: np.ndarray) -> dict[str, np.ndarray]:
     return {"place": np.linalg.norm(pose[:, :2] - end[:, :2], axis=1), "turn": turn}
 
 
-def gaps_at_end(outline: ArrayLike, pushes: PushesLike, radius: float) -> np.ndarray:
-    """Return the gaps (n,) [m] at measured ends of pushes; NaN where the finger slid off."""
-    corners, data = finger.check_outline(outline), read_pushes(pushes)
-    x = jnp.zeros(len(PRIOR))
-    (batch, count), fixed = _padded(data, 0), _fixed(corners, radius)
-    gap = np.asarray(_simulate(x, fixed, *batch, finger.STEPS)[1])[:count]
-    return np.where(gap[:, 2] < _APART, gap[:, 1], np.nan)
-
-
 def fit(
     outline: ArrayLike,
     pushes: PushesLike,
