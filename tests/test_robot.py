@@ -208,7 +208,7 @@ def test_the_force_is_bounded_in_its_direction_by_drive_traction_and_rolling():
 
 
 def test_the_servo_overshoots_once_and_recovers_from_a_stall():
-    """It is a double pole and a zero: it overshoots by exp(-2). After a stall it is at its limit."""
+    """It is a double pole and a zero: it overshoots by exp(-2), and recovers after a stall."""
     robot, dt = Robot(mass=100.0, force_max=200.0), 0.01
     v, integral = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
     velocities = []
