@@ -63,8 +63,8 @@ def contact_force(contact: Contact, x: Row, physics: Physics) -> tuple[Row, Row]
     across = pull * f * f / slip
     stiffness, stuck = [nn, *(-nn * f * e for e in way)], [d, *(0.0 for _ in way)]
     for i, e in enumerate(way):
-        rest = [across * y * y for j, y in enumerate(way) if j != i]
-        stiffness += [along * e * e + reduce(sp.plus, rest)]
+        rest = (across * y * y for j, y in enumerate(way) if j != i)
+        stiffness += [reduce(sp.plus, rest, along * e * e)]
         stiffness += [(along - across) * e * y for y in way[i + 1 :]]
         stuck += [d_t, *(0.0 for _ in way[i + 1 :])]
     sticking = (-d * x[0], *(-d_t * y for y in x[1:])), tuple(stuck)
