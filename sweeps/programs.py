@@ -18,9 +18,8 @@ from rps_jax import Range, RPSParams, Setting
 from rps_jax.laws import LawParams
 from rps_jax.physics import FRICTION, preset
 from rps_jax.trials import pushes, trial
-from rps_jax.trials.jobs import WorldBatch, rows
 from rps_jax.trials.trial import ControlLoop, Trial, World
-from rps_jax.trials.worlds import drawn_worlds
+from rps_jax.trials.worlds import WorldBatch, drawn_worlds, rows
 from rps_jax.world import draws, paper
 from rps_jax.worlds import Case, parse_domain
 

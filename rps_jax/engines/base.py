@@ -26,7 +26,7 @@ import numpy as np
 from rps_jax import engines, errors
 from rps_jax.control.observation import Twist
 from rps_jax.engines import device
-from rps_jax.engines.linear_map import once_differentiable
+from rps_jax.engines.native import once_differentiable
 from rps_jax.geometry.arrays import Float
 from rps_jax.geometry.solid import Solid
 from rps_jax.robot.robot import Robot
@@ -83,7 +83,7 @@ class Stage(Protocol):
         """Step a batch of worlds with these fields (B, ...) for one control period.
 
         A base is a velocity source at its twist. If its force is limited, it is a body that its
-        drive pushes towards the twist: see `robot.drive.push`.
+        drive pushes towards the twist: see `robot.base.push`.
         """
         ...
 

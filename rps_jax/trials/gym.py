@@ -28,7 +28,7 @@ from rps_jax.control import soft
 from rps_jax.engines import device
 from rps_jax.record.files import Arrays
 from rps_jax.trials.env import SHAPED_REWARD, PushEnv, State
-from rps_jax.trials.jobs import rows
+from rps_jax.trials.worlds import rows
 from rps_jax.world import domain as domains
 from rps_jax.world.domain import DomainLike
 

@@ -21,9 +21,9 @@ from rps_jax.geometry.footprint import Footprint
 from rps_jax.robot.skin import CapacitiveSkin, Skin
 from rps_jax.trials import trial
 from rps_jax.trials.batch import stepper
-from rps_jax.trials.jobs import WorldBatch, rows
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import ControlLoop, Outcome, Shift, Snapshot, Trial, World
+from rps_jax.trials.worlds import WorldBatch, rows
 from rps_jax.world.tasks.base import heading_of
 
 CHUNK = 25  # steps, at most, between two checks of the clock

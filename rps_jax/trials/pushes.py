@@ -19,13 +19,12 @@ from rps_jax.geometry import solid
 from rps_jax.robot.base import Odometry
 from rps_jax.robot.robot import Robot
 from rps_jax.trials import trial, worlds
-from rps_jax.trials.batch import stepper
-from rps_jax.trials.batch_run import outcomes
+from rps_jax.trials.batch import outcomes, stepper
 from rps_jax.trials.case import Case
-from rps_jax.trials.jobs import BatchOptions, Job, WorldBatch, rows
 from rps_jax.trials.progress import Progress, ProgressCallback, Timing, no_progress
 from rps_jax.trials.setting import Setting
 from rps_jax.trials.trial import ControlLoop, Outcome, Shift, Snapshot, Trial, World
+from rps_jax.trials.worlds import BatchOptions, Job, WorldBatch, rows
 from rps_jax.world import draws, scene
 from rps_jax.world.objects import FAMILIES
 from rps_jax.world.physics import Physics

@@ -16,12 +16,13 @@ from rps_jax.spec import specs_of
 from rps_jax.trials import trial
 from rps_jax.trials.pushes import Trajectory
 from rps_jax.trials.trial import Outcome
-from rps_jax.world import streams, tasks
+from rps_jax.world import tasks
+from rps_jax.world.quantity import claim
 
 DIMS = ("law", "object", "friction", "target")
 WORLD = "index of the world"
 POSE = xr.Variable("pose", ["x", "y", "yaw"], {"long_name": "x [m], y [m] and yaw [rad]"})
-streams.claim("an outcome", *specs_of(Outcome), "law", "world")
+claim("an outcome", *specs_of(Outcome), "law", "world")
 _TRACED = {**specs_of(Twist), **specs_of(Details)}  # numbers of a trace
 
 

@@ -42,9 +42,8 @@ from rps_jax.geometry import footprint as fp
 from rps_jax.geometry import planar
 from rps_jax.geometry.arrays import Array, Bool, Bools, Float, Floats, Ints, Scalar, Vector
 from rps_jax.geometry.footprint import Footprint
-from rps_jax.robot import base, drive
-from rps_jax.robot.base import Load, Odometry
-from rps_jax.robot.drive import Drive
+from rps_jax.robot import base
+from rps_jax.robot.base import Drive, Load, Odometry
 from rps_jax.robot.robot import Robot
 from rps_jax.robot.skin import NONE, IdealSkin, Reading, Skin, SkinState
 from rps_jax.spec import Spec
@@ -241,7 +240,7 @@ def start(world: World, params: LawParams, law: Law = rps.LAW) -> Trial:
         **dict.fromkeys(("steps", "contact_steps", "lost_steps"), count),
         **dict.fromkeys(("absent_steps", "repositions"), count),
         **dict.fromkeys(("done", "success", "tipped", "diverged", "nan_twist"), false),
-        drive=None if world.robot is None else drive.init_drive(world.qpos),
+        drive=None if world.robot is None else base.init_drive(world.qpos),
         load=base.init_load(world.qpos) if law.senses == "force" else None,
         task=world.task.start(),
     )
@@ -361,13 +360,13 @@ def execute(world: World, trial: Trial, twist: Twist, period: float) -> tuple[Tr
     """
     if trial.twists.shape[0]:
         twists, delayed = base.delay_twist(world.odometry, trial.twists, jnp.stack(twist), period)
-        delayed = drive.apply_errors(world.robot, delayed, world.odometry.velocity_error)
+        delayed = base.apply_errors(world.robot, delayed, world.odometry.velocity_error)
         trial, twist = trial._replace(twists=twists), Twist(*delayed)
     if world.robot is None or trial.drive is None:
         return trial, twist
-    aim = drive.aim(world.robot, trial.drive.aim, jnp.stack(twist), period)
+    aim = base.aim(world.robot, trial.drive.aim, jnp.stack(twist), period)
     trial = trial._replace(drive=trial.drive._replace(aim=aim))
-    return trial, Twist(*drive.apply_slip(world.robot, aim))
+    return trial, Twist(*base.apply_slip(world.robot, aim))
 
 
 def perceive(
@@ -430,7 +429,7 @@ def settle(world: World, previous: Trial, decided: Trial, driven: Driven) -> Tri
     state = decided.drive
     if world.robot is not None and state is not None:
         state = state if integral is None else state._replace(integral=integral)
-        state = drive.count_stalled_steps(world.robot, state, qvel)
+        state = base.count_stalled_steps(world.robot, state, qvel)
     way = planar.norm(qpos[xy] - decided.qpos[xy])
     moved = decided._replace(
         qpos=qpos,
@@ -573,7 +572,7 @@ def outcome(trial: Trial, worlds: World, loop: ControlLoop) -> Outcome:
         tipped=trial.tipped,
         diverged=trial.diverged,
         nan_twist=trial.nan_twist,
-        stalled=drive.has_stalled(trial.drive, period) & ~trial.success & ~trial.diverged,
+        stalled=base.has_stalled(trial.drive, period) & ~trial.success & ~trial.diverged,
         unfelt=trial.done & is_lost & jax.vmap(is_pressed)(worlds, trial.qpos),
         base_pose=trial.qpos[..., JOINTS.base],
         object_pose=pose.reshape(*trial.qpos.shape[:-1], 3),

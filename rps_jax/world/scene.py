@@ -15,7 +15,7 @@ from rps_jax.geometry import solid
 from rps_jax.geometry.footprint import Footprint
 from rps_jax.geometry.solid import Solid
 from rps_jax.record.files import Arrays
-from rps_jax.robot.drive import GRIP
+from rps_jax.robot.base import GRIP
 from rps_jax.robot.robot import Robot
 from rps_jax.robot.shell import Shell
 from rps_jax.world import objects

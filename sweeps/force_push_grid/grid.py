@@ -37,10 +37,9 @@ from rps_jax.physics import EngineName, Physics
 from rps_jax.robot.base import LoadCell, Odometry
 from rps_jax.robot.shell import Boards
 from rps_jax.trials import trial
-from rps_jax.trials.jobs import WorldBatch
 from rps_jax.trials.progress import Progress, ProgressCallback, no_progress
 from rps_jax.trials.trial import ControlLoop, Shift, Snapshot, Trial
-from rps_jax.trials.worlds import build
+from rps_jax.trials.worlds import WorldBatch, build
 from rps_jax.world.scene import JOINTS, Friction, WorldInputs
 from rps_jax.worlds import Case, Polyline
 from sweeps.study_base import Rows
